@@ -1,0 +1,1 @@
+"""The attitude: quaternions, packets, links, logs and the timeline that joins them."""

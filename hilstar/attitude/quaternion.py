@@ -1,0 +1,128 @@
+"""Unit quaternions: Hamilton, scalar first (w, x, y, z), float64; q and -q are one attitude.
+
+`q_icrs_to_cam` turns ICRS components of a vector into camera components: v_cam = q v_icrs q*.
+Arrays may carry leading axes: a quaternion is the last axis.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hilstar.arrays import FloatArray
+
+# Below this half angle sin(x)/x is 1 - x^2/6 to the last bit.
+SMALL_RAD = 1e-4
+
+
+def normalise(q: FloatArray) -> FloatArray:
+    """`q` scaled to unit length."""
+    return np.asarray(q / np.linalg.norm(q, axis=-1, keepdims=True))
+
+
+def conjugate(q: FloatArray) -> FloatArray:
+    """The inverse rotation of a unit quaternion."""
+    return np.asarray(q * np.array([1.0, -1.0, -1.0, -1.0]))
+
+
+def multiply(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Hamilton product a b: first the rotation b, then a."""
+    aw, ax, ay, az = np.moveaxis(np.asarray(a, dtype=np.float64), -1, 0)
+    bw, bx, by, bz = np.moveaxis(np.asarray(b, dtype=np.float64), -1, 0)
+    return np.stack(
+        (
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ),
+        axis=-1,
+    )
+
+
+def to_matrix(q: FloatArray) -> FloatArray:
+    """The 3x3 matrix R of one unit quaternion: v_cam = R v_icrs."""
+    w, x, y, z = (float(c) for c in q)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def from_radec_roll_deg(ra_deg: float, dec_deg: float, roll_deg: float) -> FloatArray:
+    """q_icrs_to_cam of a boresight and roll (thesis eq. 2.3): R_icrs_from_cam = A3(ra-90) A1(dec-90) A3(roll).
+
+    At roll 0 the image has north up and east left.
+    """
+    q_cam_to_icrs = multiply(
+        multiply(_about_z(np.radians(ra_deg - 90.0)), _about_x(np.radians(dec_deg - 90.0))), _about_z(np.radians(roll_deg))
+    )
+    q = conjugate(q_cam_to_icrs)
+    return -q if q[0] < 0 else q
+
+
+def to_radec_roll_deg(q_icrs_to_cam: FloatArray) -> tuple[float, float, float]:
+    """Boresight right ascension [0, 360), declination and roll [0, 360) of one attitude, degrees.
+
+    At a pole, where right ascension and roll are one angle, the right ascension comes out as `arctan2` has it.
+    """
+    r = to_matrix(q_icrs_to_cam)
+    dec = np.arctan2(r[2, 2], np.hypot(r[2, 0], r[2, 1]))
+    ra = np.arctan2(r[2, 1], r[2, 0])
+    # North and east at the boresight, in camera components; roll turns north from "up" (-y).
+    east = r @ np.array([-np.sin(ra), np.cos(ra), 0.0])
+    roll = np.arctan2(east[1], -east[0])
+    return _turn_deg(ra), float(np.degrees(dec)), _turn_deg(roll)
+
+
+def angle_between_rad(a: FloatArray, b: FloatArray) -> float:
+    """The angle of the rotation from attitude `a` to attitude `b`, 0 to pi; exact for tiny angles too."""
+    d = multiply(a, conjugate(b))
+    return float(2 * np.arctan2(np.linalg.norm(d[..., 1:]), abs(d[..., 0])))
+
+
+def slerp(a: FloatArray, b: FloatArray, fraction: float) -> FloatArray:
+    """The attitude at `fraction` of the shorter way from `a` to `b` (Shoemake 1985); unit length."""
+    if float(np.dot(a, b)) < 0:
+        b = -b
+    # The half angle from both chords is well conditioned from 0 to pi/2; arccos of the dot product is not.
+    half = 2 * np.arctan2(np.linalg.norm(b - a), np.linalg.norm(b + a))
+    if half < SMALL_RAD:
+        return normalise(a + fraction * (b - a))
+    return np.asarray((np.sin((1 - fraction) * half) * a + np.sin(fraction * half) * b) / np.sin(half))
+
+
+def propagate(q_icrs_to_cam: FloatArray, rate_cam_rad_s: FloatArray, seconds: float) -> FloatArray:
+    """The attitude after turning at a constant rate (of cam with respect to icrs, cam components): v_cam' = -omega x v_cam."""
+    vector = -0.5 * seconds * np.asarray(rate_cam_rad_s, dtype=np.float64)
+    half = float(np.linalg.norm(vector))
+    sinc = 1.0 - half * half / 6.0 if half < SMALL_RAD else np.sin(half) / half
+    step = np.array([np.cos(half), *(sinc * vector)])
+    return normalise(multiply(step, q_icrs_to_cam))
+
+
+def rate_between_rad_s(earlier: FloatArray, later: FloatArray, seconds: float) -> FloatArray:
+    """The constant rate that turns `earlier` into `later` the shorter way (inverse of `propagate`)."""
+    d = multiply(later, conjugate(earlier))
+    if d[0] < 0:
+        d = -d
+    sine = float(np.linalg.norm(d[1:]))
+    half = np.arctan2(sine, d[0])
+    scale = 1.0 + half * half / 6.0 if half < SMALL_RAD else half / sine
+    return np.asarray(-2.0 * scale * d[1:] / seconds)
+
+
+def _turn_deg(angle_rad: float) -> float:
+    """Degrees in [0, 360); the remainder of a tiny negative angle rounds to 360 itself."""
+    turn = float(np.degrees(angle_rad)) % 360.0
+    return 0.0 if turn == 360.0 else turn
+
+
+def _about_x(angle_rad: float) -> FloatArray:
+    return np.array([np.cos(angle_rad / 2), np.sin(angle_rad / 2), 0.0, 0.0])
+
+
+def _about_z(angle_rad: float) -> FloatArray:
+    return np.array([np.cos(angle_rad / 2), 0.0, 0.0, np.sin(angle_rad / 2)])

@@ -1,0 +1,204 @@
+"""From a bench file to the parts that it describes, and from an attitude to a frame."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from hilstar.arrays import Float32Array, FloatArray
+from hilstar.attitude.packet import NORM_TOLERANCE
+from hilstar.attitude.quaternion import normalise, to_matrix
+from hilstar.bench.config import BenchConfig, SkySettings, Tracker, read_config
+from hilstar.errors import InputError
+from hilstar.monitor.geometry import monitor_camera
+from hilstar.monitor.photometry import Codes, srgb_response
+from hilstar.render.renderer import Renderer, Target
+from hilstar.scene.camera import Camera
+from hilstar.scene.psf import peak_share
+from hilstar.scene.sprites import Sprites, clipped_sprites, make_sprites
+from hilstar.sky.astrometry import aberrate, unit_vectors_icrs
+from hilstar.sky.catalog import load_catalog
+from hilstar.sky.electrons import Optics, Photometry, tabulate
+from hilstar.sky.spectrum import BUILT_IN_CURVES, TEMPERATURE_SCALES, load_curve
+from hilstar.sky.stars import Stars, make_stars
+
+TRUTH_DTYPE = np.dtype(
+    [
+        ("hip", "i4"),
+        ("x_px", "f8"),
+        ("y_px", "f8"),
+        ("v_mag", "f8"),
+        ("bv", "f8"),
+        ("temperature_k", "f8"),
+        ("electrons_per_s", "f8"),
+        ("drawn", "?"),
+        ("clipped", "?"),
+    ]
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One frame: what each monitor pixel should cause, the codes that ask for it, and the stars behind it.
+
+    `linear` is float32 (height, width), electrons per second; `codes` is uint8 or uint16 of the same shape;
+    `truth` is a structured array of TRUTH_DTYPE, a row for each star whose sprite touches the monitor.
+    """
+
+    q_icrs_to_cam: FloatArray
+    linear: Float32Array
+    codes: Codes
+    truth: npt.NDArray[np.void]
+
+
+@dataclass(frozen=True, slots=True)
+class Drawn:
+    """What a draw put on the monitor; `codes` is overwritten by the next one."""
+
+    codes: Codes
+    star_count: int
+    clipped_hip: tuple[int, ...]
+
+
+class Bench:
+    """A bench, assembled: stars, geometry and a renderer. Free it with `close`, or use it as a context manager."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.config = read_config(path)
+        self.bench_hash = bench_hash(self.config, path.parent)
+        self.stars = bench_stars(self.config, path.parent)
+        self.camera = bench_camera(self.config)
+        self._sigma_px = self.config.render.sprite_sigma_px
+        self.flux_at_white_e_per_s = self.config.render.flux_at_white_e_per_s or brightest_peak_e_per_s(
+            self.stars, self._sigma_px
+        )
+        monitor = self.config.monitor
+        self.renderer = Renderer(
+            Target(monitor.resolution_px, self._sigma_px, srgb_response(monitor.bits), self.flux_at_white_e_per_s)
+        )
+
+    def sprites(self, q_icrs_to_cam: FloatArray) -> Sprites:
+        """The stars that the monitor shows at an attitude (unit quaternion, scalar first)."""
+        icrs_to_image = self.camera.cam_to_image @ to_matrix(q_icrs_to_cam)
+        return make_sprites(self.stars, icrs_to_image, self.camera, self.renderer.footprint_px)
+
+    def draw(self, q_icrs_to_cam: FloatArray | None) -> Drawn:
+        """Codes for an attitude, ready in memory; None gives a blank frame. The frame path: no copy, no table."""
+        if q_icrs_to_cam is None:
+            self.renderer.draw(None)
+            return Drawn(self.renderer.codes(), 0, ())
+        sprites = self.sprites(q_icrs_to_cam)
+        self.renderer.draw(sprites)
+        clipped = clipped_sprites(sprites, self._sigma_px, self.flux_at_white_e_per_s)
+        hip = tuple(int(h) for h in self.stars.hip[sprites.star[clipped]])
+        return Drawn(self.renderer.codes(), len(sprites), hip)
+
+    def frame(self, q_icrs_to_cam: Sequence[float] | FloatArray) -> Frame:
+        """Draw one frame and bring everything about it back; the arrays are the caller's own.
+
+        Raises InputError for a quaternion that is not unit within 1e-3.
+        """
+        q = checked_quaternion(q_icrs_to_cam)
+        sprites = self.sprites(q)
+        self.renderer.draw(sprites)
+        codes, linear = self.renderer.codes().copy(), self.renderer.linear().copy()
+        truth = np.zeros(len(sprites), dtype=TRUTH_DTYPE)
+        truth["hip"] = self.stars.hip[sprites.star]
+        truth["x_px"], truth["y_px"] = sprites.x_px, sprites.y_px
+        truth["v_mag"], truth["bv"] = self.stars.v_mag[sprites.star], self.stars.bv_mag[sprites.star]
+        truth["temperature_k"] = self.stars.temperature_k[sprites.star]
+        truth["electrons_per_s"] = self.stars.electrons_per_s[sprites.star]
+        truth["drawn"] = True
+        truth["clipped"][clipped_sprites(sprites, self._sigma_px, self.flux_at_white_e_per_s)] = True
+        return Frame(q, linear, codes, truth[np.argsort(truth["v_mag"], kind="stable")])
+
+    def close(self) -> None:
+        """Free the GL context."""
+        self.renderer.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+
+def load(path: str | Path) -> Bench:
+    """Assemble the bench that a file describes. Raises InputError or MachineError (no OpenGL)."""
+    return Bench(Path(path))
+
+
+def checked_quaternion(q: Sequence[float] | FloatArray) -> FloatArray:
+    """`q` (w, x, y, z) as a float64 unit array. Raises InputError where it is not unit within 1e-3."""
+    array = np.asarray(q, dtype=np.float64)
+    if array.shape != (4,):
+        raise InputError(f"quaternion of shape {array.shape}: four numbers w, x, y, z are wanted")
+    norm = float(np.linalg.norm(array))
+    if not abs(norm - 1.0) <= NORM_TOLERANCE:
+        raise InputError(f"quaternion {array.tolist()}: its norm is {norm:.6g}; write a unit quaternion w, x, y, z")
+    return normalise(array)
+
+
+def bench_optics(tracker: Tracker, folder: Path) -> Optics:
+    """The tracker's light-gathering part; curve paths are relative to `folder`."""
+    return Optics(
+        aperture_mm=tracker.aperture_mm,
+        quantum_efficiency=load_curve(tracker.quantum_efficiency, "[tracker] quantum_efficiency", folder),
+        transmission=load_curve(tracker.transmission, "[tracker] transmission", folder),
+    )
+
+
+def bench_stars(config: BenchConfig, folder: Path) -> Stars:
+    """The stars of a bench with their electron rates: everything that happens once."""
+    sky = config.sky
+    catalog = load_catalog(_catalogue_source(sky, folder)).brighter_than(sky.faintest_v_mag)
+    vectors = unit_vectors_icrs(catalog, sky.epoch_jyear)
+    if any(sky.observer_velocity_km_s):
+        vectors = aberrate(vectors, sky.observer_velocity_km_s)
+    temperature_k = TEMPERATURE_SCALES[sky.temperature](catalog.bv_mag)
+    table = tabulate(sky.brightness, bench_optics(config.tracker, folder), Photometry(sky.zero_point, sky.passband_weighting))
+    return make_stars(catalog, vectors, temperature_k, table.electrons_per_s(catalog.v_mag, temperature_k))
+
+
+def bench_camera(config: BenchConfig) -> Camera:
+    """The monitor behind its collimator."""
+    return monitor_camera(
+        config.monitor.resolution_px,
+        config.monitor.pixel_pitch_um,
+        config.collimator.focal_length_mm,
+        np.array(config.collimator.q_cam_to_mon),
+        config.collimator.principal_point_px,
+    )
+
+
+def brightest_peak_e_per_s(stars: Stars, sigma_px: tuple[float, float]) -> float:
+    """The light of the brightest pixel that any star of the bench can make: white, where the file gives none.
+
+    Raises InputError when the bench has no star at all.
+    """
+    if not len(stars):
+        raise InputError("[sky] faintest_v_mag leaves no star; write a larger magnitude, or [render] flux_at_white_e_per_s")
+    return float(stars.electrons_per_s.max()) * peak_share(sigma_px)
+
+
+def bench_hash(config: BenchConfig, folder: Path) -> str:
+    """SHA-256 of everything that makes a bench's frames: its settings, defaults included, and the files it names."""
+    digest = hashlib.sha256(msgspec.json.encode(config, order="sorted"))
+    named = (config.tracker.quantum_efficiency, config.tracker.transmission, config.sky.catalogue)
+    for name in named:
+        if isinstance(name, str) and name not in (*BUILT_IN_CURVES, "hipparcos") and (folder / name).is_file():
+            digest.update((folder / name).read_bytes())
+    return digest.hexdigest()
+
+
+def _catalogue_source(sky: SkySettings, folder: Path) -> str | Path:
+    return sky.catalogue if sky.catalogue == "hipparcos" else folder / sky.catalogue

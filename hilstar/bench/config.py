@@ -1,0 +1,236 @@
+"""The bench file: TOML in, checked and frozen tables out. Every key is documented in configs/README.md."""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args
+
+import msgspec
+from msgspec import Meta
+
+from hilstar.errors import InputError
+
+Positive = Annotated[float, Meta(gt=0)]
+NotNegative = Annotated[float, Meta(ge=0)]
+Pixels = Annotated[int, Meta(ge=1, le=32768)]
+Size = tuple[Pixels, Pixels]
+Sigma = tuple[Annotated[float, Meta(ge=0.05)], Annotated[float, Meta(ge=0.05)]]
+Vector = tuple[float, float, float]
+Rotation = tuple[float, float, float, float]
+
+NORM_TOLERANCE = 1e-3
+TYPE_WORDS = {"float": "number", "int": "whole number", "str": "text", "object": "table", "bool": "true or false"}
+LIGHT_KM_S = 299_792.458
+
+
+class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A table of the bench file; unknown keys are refused."""
+
+
+class Detector(_Table, frozen=True):
+    """[tracker.detector]: the virtual tracker's sensor."""
+
+    gain_e_per_dn: Positive = 24.0
+    full_well_e: Positive = 70_000.0
+    bits: Annotated[int, Meta(ge=1, le=16)] = 12
+    offset_dn: NotNegative = 0.0
+    read_noise_e: NotNegative = 0.0
+    dark_e_per_s: NotNegative = 0.0
+    dsnu_e_per_s: NotNegative = 0.0
+    prnu: NotNegative = 0.0
+    device_seed: Annotated[int, Meta(ge=0)] = 0
+    fixed_pattern: Literal["ccd", "cmos"] = "ccd"
+
+
+class Tracker(_Table, frozen=True):
+    """[tracker]: the star tracker on the bench."""
+
+    aperture_mm: Positive
+    focal_length_mm: Positive
+    pixel_pitch_um: Positive
+    resolution_px: Size
+    quantum_efficiency: str | float
+    transmission: str | float = 1.0
+    exposure_s: NotNegative = 0.1
+    psf_sigma_px: Sigma = (0.55, 0.55)
+    detector: Detector = msgspec.field(default_factory=Detector)
+
+
+class SkySettings(_Table, frozen=True):
+    """[sky]: which stars, and how bright."""
+
+    catalogue: str = "hipparcos"
+    epoch_jyear: Annotated[float, Meta(ge=-10_000, le=10_000)] = 2026.0
+    faintest_v_mag: float = 7.5
+    brightness: Literal["dgs", "ags"] = "dgs"
+    spectrum: Literal["blackbody", "pickles"] = "blackbody"
+    temperature: Literal["ballesteros2012", "wang2021"] = "ballesteros2012"
+    zero_point: Literal["vega", "iau-bolometric"] = "vega"
+    passband_weighting: Literal["energy", "photon"] = "energy"
+    observer_velocity_km_s: Vector = (0.0, 0.0, 0.0)
+
+
+class Monitor(_Table, frozen=True):
+    """[monitor]: the screen behind the collimator."""
+
+    resolution_px: Size
+    pixel_pitch_um: Positive
+    refresh_hz: Annotated[float, Meta(gt=0, le=1000)] = 60.0
+    bits: Annotated[int, Meta(ge=1, le=16)] = 8
+    calibration: str = "srgb"
+
+
+class Collimator(_Table, frozen=True):
+    """[collimator]: the lens between monitor and tracker, and the tracker's alignment to it."""
+
+    focal_length_mm: Positive
+    q_cam_to_mon: Rotation = (1.0, 0.0, 0.0, 0.0)
+    principal_point_px: tuple[float, float] | None = None
+
+
+class AttitudeSettings(_Table, frozen=True):
+    """[attitude]: where the attitude comes from, and what is shown when it does not."""
+
+    source: Literal["zmq", "serial"] = "zmq"
+    endpoint: str = "tcp://127.0.0.1:5560"
+    bind: bool = False
+    port: str = ""
+    baud: Annotated[int, Meta(gt=0)] = 115_200
+    stale_after_ms: NotNegative = 250.0
+    max_extrapolation_ms: NotNegative = 250.0
+    on_stale: Literal["hold", "blank"] = "hold"
+
+
+class RenderSettings(_Table, frozen=True):
+    """[render]: from electrons to codes."""
+
+    quantisation: Literal["round", "dither", "temporal", "exact"] = "round"
+    sprite_sigma_px: Sigma = (0.85, 0.85)
+    flux_at_white_e_per_s: Positive | None = None
+
+
+class Background(_Table, frozen=True):
+    """[background]: light between the stars, seen by the virtual tracker only."""
+
+    electrons_per_px: NotNegative | None = None
+    zodiacal_v_mag_arcsec2: float | None = None
+
+
+class Verify(_Table, frozen=True):
+    """[verify]: the digital twin, and the limits within which it says that the bench passes."""
+
+    true_calibration: str | None = None
+    flux_mag: Positive | None = None
+    centroid_px: Positive | None = None
+
+
+class BenchConfig(_Table, frozen=True):
+    """A whole bench file."""
+
+    tracker: Tracker
+    monitor: Monitor
+    collimator: Collimator
+    sky: SkySettings = msgspec.field(default_factory=SkySettings)
+    attitude: AttitudeSettings = msgspec.field(default_factory=AttitudeSettings)
+    render: RenderSettings = msgspec.field(default_factory=RenderSettings)
+    background: Background = msgspec.field(default_factory=Background)
+    verify: Verify = msgspec.field(default_factory=Verify)
+
+
+def read_config(path: Path) -> BenchConfig:
+    """Read and check a bench file. Raises InputError: file, key, what is wrong and what to write."""
+    try:
+        tables = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); give the path of a bench file") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not TOML: {error}") from error
+    try:
+        config = msgspec.convert(_finite(tables, path), BenchConfig)
+    except msgspec.ValidationError as error:
+        raise InputError(f"{path}: {_explain(str(error), tables)}") from error
+    _check_meaning(config, path)
+    return config
+
+
+def _finite(value: Any, path: Path, where: str = "") -> Any:
+    """`value` itself; TOML allows nan and inf, no key here does."""
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            _finite(inner, path, f"{where}.{key}" if where else key)
+    elif isinstance(value, list):
+        for inner in value:
+            _finite(inner, path, where)
+    elif isinstance(value, float) and not math.isfinite(value):
+        raise InputError(f"{path}: {where} = {value}; a finite number is wanted")
+    return value
+
+
+def _explain(message: str, tables: dict[str, Any]) -> str:
+    """msgspec's message ("... - at `$.tracker`") as table, key, value and advice."""
+    fault, _, place = message.partition(" - at `$")
+    names = [name for name in re.split(r"[.\[\]`]+", place) if name]
+    unknown = re.search(r"unknown field `(.*)`", fault)
+    if unknown:
+        known = [field.name for field in _fields(names)]
+        close = difflib.get_close_matches(unknown[1], known, n=1)
+        advice = f"did you mean {close[0]}?" if close else f"known are {', '.join(known)}"
+        return f"{_place(names)}unknown key {unknown[1]}; {advice}"
+    missing = re.search(r"missing required field `(.*)`", fault)
+    if missing:
+        name = f"key {missing[1]}" if names else f"table [{missing[1]}]"
+        return f"{_place(names)}the {name} is missing; add it (see configs/README.md)"
+    wanted = fault.removeprefix("Expected ").replace("`", "").split(", got ")[0]
+    for type_name, word in TYPE_WORDS.items():
+        wanted = re.sub(rf"\b{type_name}\b", word, wanted)
+    table, key = [n for n in names if not n.isdigit()][:-1], [n for n in names if not n.isdigit()][-1]
+    if fault.startswith("Invalid enum"):
+        wanted = " or ".join(f'"{choice}"' for choice in _choices(table, key))
+    value: Any = tables
+    for name in (*table, key):
+        value = value[name]
+    return f"{_place(table)}{key} = {_toml(value)}; {wanted} is wanted"
+
+
+def _toml(value: Any) -> str:
+    return msgspec.json.encode(value, enc_hook=str).decode()
+
+
+def _choices(table: list[str], key: str) -> tuple[str, ...]:
+    kinds = {field.name: field.type for field in _fields(table)}
+    return get_args(kinds[key])
+
+
+def _place(names: list[str]) -> str:
+    return f"[{'.'.join(names)}] " if names else ""
+
+
+def _fields(names: list[str]) -> tuple[msgspec.structs.FieldInfo, ...]:
+    table: Any = BenchConfig
+    for name in names:
+        table = {field.name: field.type for field in msgspec.structs.fields(table)}[name]
+    return msgspec.structs.fields(table)
+
+
+def _check_meaning(config: BenchConfig, path: Path) -> None:
+    """What a type cannot say."""
+    norm = math.hypot(*config.collimator.q_cam_to_mon)
+    if abs(norm - 1) > NORM_TOLERANCE:
+        raise InputError(f"{path}: [collimator] q_cam_to_mon: its norm is {norm:.6g}; write a unit quaternion w, x, y, z")
+    if math.hypot(*config.sky.observer_velocity_km_s) >= LIGHT_KM_S:
+        raise InputError(f"{path}: [sky] observer_velocity_km_s is not slower than light; write km/s, ICRS x, y, z")
+    if config.background.electrons_per_px is not None and config.background.zodiacal_v_mag_arcsec2 is not None:
+        raise InputError(f"{path}: [background] has electrons_per_px and zodiacal_v_mag_arcsec2; write one of them")
+    not_yet = {
+        '[sky] spectrum = "pickles"': config.sky.spectrum == "pickles",
+        f'[render] quantisation = "{config.render.quantisation}"': config.render.quantisation != "round",
+        f'[monitor] calibration = "{config.monitor.calibration}"': config.monitor.calibration != "srgb",
+    }
+    instead = ('spectrum = "blackbody"', 'quantisation = "round"', 'calibration = "srgb"')
+    for (key, chosen), value in zip(not_yet.items(), instead, strict=True):
+        if chosen:
+            raise InputError(f"{path}: {key} is not in this version; write {value}")

@@ -1,0 +1,95 @@
+"""What this machine has and lacks: GL, displays, links, files."""
+
+from __future__ import annotations
+
+import os
+import platform
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import zmq
+
+from hilstar.attitude.links import ZmqReceiver, ZmqSender
+from hilstar.errors import HilstarError, MachineError
+from hilstar.render.renderer import create_context
+from hilstar.resources import resource_path
+from hilstar.sky.catalog import load_catalog
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One thing that hilstar uses; `required` ones decide the verdict."""
+
+    name: str
+    ok: bool
+    detail: str
+    required: bool = True
+
+
+def examine() -> dict[str, Any]:
+    """The JSON object of `hilstar doctor`: ok, and the checks."""
+    checks = [_check(name, look) for name, look in LOOKS.items()]
+    checks.append(_display())
+    return {"ok": all(check.ok for check in checks if check.required), "checks": [asdict(check) for check in checks]}
+
+
+def _check(name: str, look: Callable[[], str]) -> Check:
+    try:
+        return Check(name, True, look())
+    except (HilstarError, OSError) as error:
+        return Check(name, False, str(error))
+
+
+def _python() -> str:
+    return f"Python {platform.python_version()}, {sys.executable}"
+
+
+def _gl() -> str:
+    ctx = create_context()
+    try:
+        info = ctx.info
+        return f"{info['GL_RENDERER']}, OpenGL {info['GL_VERSION']}, points up to {info['GL_POINT_SIZE_RANGE'][1]:g} px"
+    finally:
+        ctx.release()
+
+
+def _zeromq() -> str:
+    """One message through a real loopback socket."""
+    with ZmqSender("tcp://127.0.0.1:*") as sender, ZmqReceiver(sender.endpoint) as receiver:
+        if not sender.wait_for_listener(2.0):
+            raise MachineError("a loopback connection does not come up; allow TCP on 127.0.0.1")
+        begin = time.perf_counter()
+        sender.send(b"ping")
+        if not receiver.receive(2000):
+            raise MachineError("a loopback message does not arrive; allow TCP on 127.0.0.1")
+        return f"ZeroMQ {zmq.zmq_version()}, loopback message in {(time.perf_counter() - begin) * 1e3:.2f} ms"
+
+
+def _catalogue() -> str:
+    begin = time.perf_counter()
+    catalog = load_catalog()
+    return f"Hipparcos, {len(catalog)} of {catalog.rows_read} stars, loaded in {(time.perf_counter() - begin) * 1e3:.0f} ms"
+
+
+def _files() -> str:
+    names = [resource_path("shaders", "splat.frag"), resource_path("configs", "demo.toml")]
+    return ", ".join(str(path) for path in names)
+
+
+def _display() -> Check:
+    for name in ("WAYLAND_DISPLAY", "DISPLAY"):
+        if os.environ.get(name):
+            return Check("display", True, f"{name}={os.environ[name]}", required=False)
+    return Check("display", False, "none (DISPLAY is not set): run serve and replay with --headless", required=False)
+
+
+LOOKS: dict[str, Callable[[], str]] = {
+    "python": _python,
+    "opengl": _gl,
+    "zeromq": _zeromq,
+    "catalogue": _catalogue,
+    "files": _files,
+}

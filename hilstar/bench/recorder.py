@@ -1,0 +1,48 @@
+"""Frames of a run as files: a PNG each, and a table of what they show."""
+
+from __future__ import annotations
+
+import csv
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from hilstar.bench.assembly import Bench
+from hilstar.bench.output import make_directory, write_codes_png
+from hilstar.bench.server import Shown
+from hilstar.errors import InputError
+
+COLUMNS = ("frame", "t_s", "qw", "qx", "qy", "qz", "stars_drawn", "clipped")
+
+
+class FrameRecorder:
+    """Writes `frame_000000.png` and on, and `frames.csv`; with no directory it writes nothing."""
+
+    def __init__(self, directory: Path | None, bench: Bench) -> None:
+        self._directory = directory
+        self._bits = bench.config.monitor.bits
+        self._stack = ExitStack()
+
+    def __call__(self, shown: Shown) -> None:
+        """Write one frame. A blank one has no quaternion."""
+        if self._directory is None:
+            return
+        write_codes_png(self._directory / f"frame_{shown.number:06d}.png", shown.drawn.codes, self._bits)
+        q = ["", "", "", ""] if shown.attitude is None else [repr(float(v)) for v in shown.attitude.q_icrs_to_cam]
+        row = [shown.number, f"{shown.t_ns / 1e9:.9f}", *q, shown.drawn.star_count, len(shown.drawn.clipped_hip)]
+        self._writer.writerow(row)
+
+    def __enter__(self) -> Self:
+        if self._directory is not None:
+            path = make_directory(self._directory) / "frames.csv"
+            try:
+                file = self._stack.enter_context(path.open("w", encoding="ascii", newline=""))
+            except OSError as error:
+                raise InputError(f"{path}: cannot be written ({error.strerror}); choose another place") from error
+            self._writer = csv.writer(file, lineterminator="\n")
+            self._writer.writerow(COLUMNS)
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+        self._stack.close()

@@ -1,0 +1,73 @@
+"""What a run has to say for itself: the summary of `serve` and `replay`."""
+
+from __future__ import annotations
+
+from array import array
+from typing import Any
+
+import numpy as np
+
+from hilstar.attitude.packet import REASONS
+from hilstar.attitude.receiver import PacketCounts
+
+NS_PER_MS = 1e6
+
+
+class RunStats:
+    """Figures of each frame, 16 bytes a frame, and what they come to."""
+
+    def __init__(self) -> None:
+        self._frame_ms = array("f")
+        self._age_ms = array("f")
+        self._stars = array("L")
+        self._clipped_max = 0
+        self.clipped_hip: set[int] = set()
+        self.missed_frames = 0
+        self.stale_frames = 0
+
+    @property
+    def frames(self) -> int:
+        """Frames drawn so far."""
+        return len(self._frame_ms)
+
+    def add(self, frame_ns: int, age_ns: int | None, star_count: int, clipped_hip: tuple[int, ...]) -> None:
+        """Take in one frame; `age_ns` is None while no attitude has come."""
+        self._frame_ms.append(frame_ns / NS_PER_MS)
+        if age_ns is not None:
+            self._age_ms.append(age_ns / NS_PER_MS)
+        self._stars.append(star_count)
+        if clipped_hip:
+            self._clipped_max = max(self._clipped_max, len(clipped_hip))
+            self.clipped_hip.update(clipped_hip)
+
+    def summary(self, duration_s: float, counts: PacketCounts, gl_renderer: str) -> dict[str, Any]:
+        """The JSON object of section 5 of the design; figures without a sample are null."""
+        stars = np.array(self._stars)
+        return {
+            "frames": self.frames,
+            "duration_s": duration_s,
+            "fps": self.frames / duration_s if duration_s > 0 else None,
+            "frame_ms": _spread(self._frame_ms),
+            "attitude_age_ms": _spread(self._age_ms),
+            "packets": {
+                "received": counts.received,
+                "accepted": counts.received - counts.refused,
+                "refused": counts.refused,
+                "refused_by": {reason: counts.refused_by[reason] for reason in REASONS},
+            },
+            "stars_drawn": {
+                "mean": float(stars.mean()) if len(stars) else None,
+                "max": int(stars.max()) if len(stars) else None,
+            },
+            "clipped": {"max": self._clipped_max, "hip": sorted(self.clipped_hip)},
+            "missed_frames": self.missed_frames,
+            "stale_frames": self.stale_frames,
+            "gl_renderer": gl_renderer,
+        }
+
+
+def _spread(values: array[float]) -> dict[str, float | None]:
+    if not values:
+        return {"p50": None, "p99": None, "max": None}
+    p50, p99, top = np.percentile(np.array(values), [50, 99, 100])
+    return {"p50": float(p50), "p99": float(p99), "max": float(top)}

@@ -1,0 +1,306 @@
+"""The `hilstar` command: words in, calls to the bench, words out. No physics, no GL."""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any, Literal, NoReturn
+
+import msgspec
+import numpy as np
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from hilstar.errors import HilstarError, InputError
+
+app = typer.Typer(
+    add_completion=False,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    help="Stars for a star tracker on a bench: attitudes in, frames of code values out.",
+)
+
+BenchFile = Annotated[Path, typer.Argument(metavar="BENCH.toml", help="The bench file; see configs/README.md.")]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout, and nothing else there.")]
+Headless = Annotated[bool, typer.Option("--headless", help="Draw without a window.")]
+RadecText = Annotated[str | None, typer.Option("--radec", metavar="RA,DEC,ROLL", help="Boresight and roll in degrees, ICRS.")]
+INTERRUPTED = 130
+
+
+@app.command()
+def demo(
+    output: Annotated[Path, typer.Option("-o", "--output", help="Where the pictures go.")] = Path("hilstar-demo"),
+    duration: Annotated[float, typer.Option(help="Seconds to serve.", min=0.5, max=600)] = 10.0,
+    seed: Annotated[int, typer.Option(help="Seed of the slew's jitter.", min=0)] = 1,
+    as_json: Json = False,
+) -> None:
+    """The main job in one command: real stars, an attitude streamed over a real ZeroMQ socket, frames out."""
+    from hilstar.bench.demo import run_demo
+
+    with progress("serving", duration * 60) as advance:
+        result = run_demo(output, duration, np.random.default_rng(seed), lambda shown: advance(shown.number + 1))
+    report(result.summary, as_json)
+    if not as_json:
+        typer.echo(f"{'pictures':20}{output}/frame_*_codes.png (what the monitor gets), _preview.png (stretched)")
+
+
+@app.command()
+def frame(
+    bench_file: BenchFile,
+    radec: RadecText = None,
+    quaternion: Annotated[str | None, typer.Option(metavar="W,X,Y,Z", help="q_icrs_to_cam, scalar first.")] = None,
+    output: Annotated[Path | None, typer.Option("-o", "--output", metavar="OUT.fits", help="Linear image.")] = None,
+    truth: Annotated[Path | None, typer.Option(metavar="OUT.csv", help="A row for each star in view.")] = None,
+    codes: Annotated[Path | None, typer.Option(metavar="OUT.png", help="The code values.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Draw one frame into files."""
+    from hilstar.bench import output as files
+    from hilstar.bench.assembly import load
+
+    q = attitude_of(radec, quaternion)
+    if output is None and truth is None and codes is None:
+        raise InputError("frame: nothing to write; add -o OUT.fits, --truth OUT.csv or --codes OUT.png")
+    with load(bench_file) as bench:
+        shot = bench.frame(q)
+        if output is not None:
+            files.write_frame_fits(output, bench, shot)
+        if truth is not None:
+            files.write_truth_csv(truth, shot)
+        if codes is not None:
+            files.write_codes_png(codes, shot.codes, bench.config.monitor.bits)
+        clipped = shot.truth["hip"][shot.truth["clipped"]].tolist()
+        summary = {
+            "stars": len(shot.truth),
+            "electrons_per_s": float(shot.linear.sum(dtype=np.float64)),
+            "flux_at_white_e_per_s": bench.flux_at_white_e_per_s,
+            "clipped": clipped,
+            "written": [str(path) for path in (output, truth, codes) if path is not None],
+            "gl_renderer": bench.renderer.gl_renderer,
+        }
+    if as_json:
+        print_json(summary)
+    else:
+        names = f", clipped: HIP {', '.join(map(str, clipped))}" if clipped else ""
+        typer.echo(f"{len(shot.truth)} stars{names}; wrote {', '.join(summary['written'])}")
+
+
+@app.command()
+def serve(
+    bench_file: BenchFile,
+    headless: Headless = False,
+    duration: Annotated[float | None, typer.Option(help="Seconds to run; until Ctrl-C by default.", min=0)] = None,
+    frames: Annotated[int | None, typer.Option(help="Frames to draw.", min=1)] = None,
+    as_json: Json = False,
+) -> None:
+    """Show the live attitude stream."""
+    from hilstar.bench.assembly import load
+    from hilstar.bench.server import Limit, open_link
+    from hilstar.bench.server import serve as serve_stream
+
+    need_headless("serve", headless)
+    with load(bench_file) as bench, open_link(bench.config.attitude) as link:
+        refresh_hz = bench.config.monitor.refresh_hz
+        slots = math.inf if duration is None else round(duration * refresh_hz)
+        limit = Limit(slots, math.inf if frames is None else frames)
+        verb = "bound to" if bench.config.attitude.bind else "connected to"
+        say(f"{verb} {link.endpoint}, {refresh_hz:g} Hz, {bench.renderer.gl_renderer}")
+        with progress("serving", min(limit.slots, limit.frames)) as advance:
+            summary = serve_stream(bench, link, limit, lambda shown: advance(shown.number + 1))
+    report(summary, as_json)
+
+
+@app.command()
+def replay(
+    bench_file: BenchFile,
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="CSV (t_s,qw,qx,qy,qz) or JSON lines.")],
+    speed: Annotated[Literal["realtime", "max"], typer.Option(help="As on a monitor, or every frame at once.")] = "realtime",
+    headless: Headless = False,
+    output: Annotated[Path | None, typer.Option("-o", "--output", metavar="DIR", help="Write each frame there.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Show an attitude log."""
+    from hilstar.attitude.logs import read_log
+    from hilstar.bench.assembly import load
+    from hilstar.bench.recorder import FrameRecorder
+    from hilstar.bench.server import replay as replay_log
+    from hilstar.bench.server import replay_frame_count
+
+    need_headless("replay", headless)
+    samples = read_log(log)
+    with (
+        load(bench_file) as bench,
+        FrameRecorder(output, bench) as record,
+        progress("replaying", replay_frame_count(bench, samples)) as advance,
+    ):
+
+        def sink(shown: Any) -> None:
+            record(shown)
+            advance(shown.number + 1)
+
+        summary = replay_log(bench, samples, speed == "realtime", sink)
+    report(summary, as_json)
+
+
+@app.command()
+def send(
+    log: Annotated[Path | None, typer.Argument(metavar="[LOG]", help="CSV (t_s,qw,qx,qy,qz) or JSON lines.")] = None,
+    spin: Annotated[str | None, typer.Option(metavar="AXIS,DEG_PER_S", help="A constant turn instead of a log.")] = None,
+    to: Annotated[str, typer.Option(metavar="tcp://HOST:PORT", help="Where to send.")] = "tcp://127.0.0.1:5560",
+    rate: Annotated[float | None, typer.Option(metavar="HZ", help="Packets a second; a log's own by default.")] = None,
+    connect: Annotated[bool, typer.Option("--connect", help="Connect (for bind = true in the bench) instead of bind.")] = False,
+    radec: RadecText = None,
+    count: Annotated[int | None, typer.Option(help="Stop after so many packets.", min=1)] = None,
+    wait: Annotated[float, typer.Option(help="Seconds to wait for a listener.", min=0)] = 30.0,
+) -> None:
+    """Send a log or a spin: the test instrument."""
+    from itertools import islice
+
+    from hilstar.attitude.links import ZmqSender
+    from hilstar.attitude.logs import read_log
+    from hilstar.bench.sender import log_samples, parse_radec, parse_spin, parse_target, spin_samples
+    from hilstar.bench.sender import send as send_samples
+    from hilstar.bench.server import stop_on_signal
+
+    if (log is None) == (spin is None):
+        raise InputError("send: give a LOG or --spin AXIS,DEG_PER_S, one of them")
+    if rate is not None and not 0 < rate <= 10_000:
+        raise InputError(f"--rate {rate:g}: write packets a second, up to 10000")
+    if spin is not None:
+        samples = spin_samples(parse_spin(spin), rate or 100.0, parse_radec(radec or "84.057,-1.2,0"))
+        total = math.inf
+    else:
+        recorded = read_log(log or Path())
+        samples, total = log_samples(recorded, rate), len(recorded) if rate is None else math.inf
+    stop = threading.Event()
+    with ZmqSender(parse_target(to), bind=not connect) as sender, stop_on_signal(stop):
+        say(f"waiting for a listener on {sender.endpoint}")
+        if not sender.wait_for_listener(wait):
+            say("nobody listens yet; sending all the same")
+        with progress("sending", min(total, count or math.inf)) as advance:
+            sent = send_samples(sender, islice(samples, count), stop, advance)
+    say(f"{sent} packets sent")
+
+
+@app.command()
+def doctor(as_json: Json = False) -> None:
+    """Say what GL, displays, links and files are there, and what is missing."""
+    from hilstar.bench.doctor import examine
+
+    result = examine()
+    if as_json:
+        print_json(result)
+    else:
+        for check in result["checks"]:
+            mark = "ok" if check["ok"] else "MISSING" if check["required"] else "none"
+            typer.echo(f"{mark:8}{check['name']:12}{check['detail']}")
+    if not result["ok"]:
+        raise typer.Exit(3)
+
+
+def attitude_of(radec: str | None, quaternion: str | None) -> Any:
+    """The one attitude that the command line gives."""
+    from hilstar.attitude.quaternion import from_radec_roll_deg
+    from hilstar.bench.assembly import checked_quaternion
+    from hilstar.bench.sender import parse_numbers, parse_radec
+
+    if (radec is None) == (quaternion is None):
+        raise InputError("frame: give the attitude with --radec RA,DEC,ROLL or --quaternion W,X,Y,Z, one of them")
+    if radec is not None:
+        return from_radec_roll_deg(*parse_radec(radec))
+    return checked_quaternion(parse_numbers(quaternion or "", 4, "--quaternion", "W,X,Y,Z"))
+
+
+def need_headless(command: str, headless: bool) -> None:
+    """There is no window in this version."""
+    if not headless:
+        raise InputError(f"{command}: there is no window in this version; add --headless")
+
+
+def say(line: str) -> None:
+    """A line for the person at the terminal."""
+    typer.echo(line, err=True)
+
+
+def print_json(value: dict[str, Any]) -> None:
+    """The one JSON object of --json."""
+    typer.echo(msgspec.json.encode(value).decode())
+
+
+def report(summary: dict[str, Any], as_json: bool) -> None:
+    """The summary of a run, for a program or a person."""
+    if as_json:
+        print_json(summary)
+        return
+
+    def figure(value: float | None, digits: int = 2) -> str:
+        return "-" if value is None else f"{value:.{digits}f}"
+
+    def spread(name: str) -> str:
+        return " / ".join(figure(summary[name][key]) for key in ("p50", "p99", "max"))
+
+    packets = summary["packets"]
+    refused = ", ".join(f"{reason} {count}" for reason, count in packets["refused_by"].items() if count)
+    lines = {
+        "frames": f"{summary['frames']} in {summary['duration_s']:.2f} s ({figure(summary['fps'], 1)} fps)"
+        f", {summary['missed_frames']} missed, {summary['stale_frames']} stale",
+        "frame time": f"{spread('frame_ms')} ms (p50 / p99 / max), attitude in to codes ready",
+        "attitude age": f"{spread('attitude_age_ms')} ms (p50 / p99 / max) at render",
+        "stars drawn": f"{figure(summary['stars_drawn']['mean'], 0)} mean, {summary['stars_drawn']['max']} max"
+        f", {summary['clipped']['max']} clipped" + "".join(f" HIP {hip}" for hip in summary["clipped"]["hip"][:5]),
+        "packets": f"{packets['received']} received, {packets['refused']} refused" + (f" ({refused})" if refused else ""),
+        "renderer": summary["gl_renderer"],
+    }
+    for name, line in lines.items():
+        typer.echo(f"{name:20}{line}")
+
+
+@contextmanager
+def progress(what: str, total: float) -> Iterator[Callable[[int], None]]:
+    """A bar on a terminal's stderr, nothing elsewhere."""
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield lambda done: None
+        return
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True, refresh_per_second=4) as bar:
+        task = bar.add_task(what, total=None if math.isinf(total) else total)
+        yield lambda done: bar.update(task, completed=done)
+
+
+def fail(line: str, code: int) -> NoReturn:
+    """One line on stderr, and out."""
+    print("hilstar: " + " ".join(line.split()), file=sys.stderr)
+    sys.exit(code)
+
+
+def main() -> NoReturn:
+    """Run the command line; every refusal is one line on stderr and the exit code of the design's section 5."""
+    logging.basicConfig(format="hilstar: %(message)s", stream=sys.stderr)
+    try:
+        sys.exit(app(standalone_mode=False) or 0)
+    except HilstarError as error:
+        fail(str(error), error.exit_code)
+    except (KeyboardInterrupt, typer.Abort):
+        fail("stopped", INTERRUPTED)
+    except BrokenPipeError:
+        # Whoever read our output has gone: nothing is left to say, and Python must not try at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
+    except Exception as error:
+        # typer's usage errors have no public base class in all its versions; they can format themselves.
+        message = getattr(error, "format_message", None)
+        if message is None:
+            raise
+        fail(f"{message()} (see hilstar --help)", InputError.exit_code)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""The scene: stars through a camera become sprites."""

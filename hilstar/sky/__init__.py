@@ -1,0 +1,1 @@
+"""The sky: star positions, spectra and the electrons they cause in the tracker."""

@@ -1,0 +1,43 @@
+"""The stars of one bench: directions, colours and electron rates, sorted for culling."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from hilstar.arrays import FloatArray
+from hilstar.sky.catalog import Catalog
+from hilstar.sky.cells import CellGrid, cell_grid
+
+
+@dataclass(frozen=True, slots=True)
+class Stars:
+    """Stars in the order of `grid`; `vectors` (n, 3) are ICRS unit vectors, the rest has shape (n,)."""
+
+    hip: npt.NDArray[np.int32]
+    vectors: FloatArray
+    v_mag: FloatArray
+    bv_mag: FloatArray
+    temperature_k: FloatArray
+    electrons_per_s: FloatArray
+    grid: CellGrid
+
+    def __len__(self) -> int:
+        return len(self.hip)
+
+
+def make_stars(catalog: Catalog, vectors: FloatArray, temperature_k: FloatArray, electrons_per_s: FloatArray) -> Stars:
+    """Sort a catalogue's stars by cell."""
+    grid = cell_grid(vectors)
+    order = grid.order
+    return Stars(
+        hip=catalog.hip[order],
+        vectors=np.ascontiguousarray(vectors[order]),
+        v_mag=catalog.v_mag[order],
+        bv_mag=catalog.bv_mag[order],
+        temperature_k=temperature_k[order],
+        electrons_per_s=electrons_per_s[order],
+        grid=grid,
+    )

@@ -1,0 +1,24 @@
+#version 330 core
+// One point per star, as large as its footprint.
+// Image row 0 is GL's bottom row: image y and gl_FragCoord.y rise together, and read-back starts at the top of the sky.
+
+in ivec2 pixel;
+in vec2 fraction_px;
+in float electrons_per_s;
+
+uniform ivec2 resolution_px;
+uniform int footprint_px;
+
+flat out ivec2 star_pixel;
+flat out vec2 star_fraction_px;
+flat out float star_electrons_per_s;
+
+void main() {
+    star_pixel = pixel;
+    star_fraction_px = fraction_px;
+    star_electrons_per_s = electrons_per_s;
+    // The viewport reaches footprint_px beyond every edge, for GL drops a point whose centre is outside it.
+    vec2 centre_px = vec2(pixel) + (footprint_px % 2 == 1 ? 0.5 : 1.0);
+    gl_Position = vec4(2.0 * (centre_px + float(footprint_px)) / vec2(resolution_px + 2 * footprint_px) - 1.0, 0.0, 1.0);
+    gl_PointSize = float(footprint_px);
+}

@@ -59,6 +59,7 @@ def frame(
     output: Annotated[Path | None, typer.Option("-o", "--output", metavar="OUT.fits", help="Linear image.")] = None,
     truth: Annotated[Path | None, typer.Option(metavar="OUT.csv", help="A row for each star in view.")] = None,
     codes: Annotated[Path | None, typer.Option(metavar="OUT.png", help="The code values.")] = None,
+    preview: Annotated[Path | None, typer.Option(metavar="OUT.png", help="A stretched picture for a person.")] = None,
     as_json: Json = False,
 ) -> None:
     """Draw one frame into files."""
@@ -66,7 +67,8 @@ def frame(
     from hilstar.bench.assembly import load
 
     q = attitude_of(radec, quaternion)
-    if output is None and truth is None and codes is None:
+    targets = [path for path in (output, truth, codes, preview) if path is not None]
+    if not targets:
         raise InputError("frame: nothing to write; add -o OUT.fits, --truth OUT.csv or --codes OUT.png")
     with load(bench_file) as bench:
         shot = bench.frame(q)
@@ -76,13 +78,15 @@ def frame(
             files.write_truth_csv(truth, shot)
         if codes is not None:
             files.write_codes_png(codes, shot.codes, bench.config.monitor.bits)
+        if preview is not None:
+            files.write_preview_png(preview, shot.codes)
         clipped = shot.truth["hip"][shot.truth["clipped"]].tolist()
         summary = {
             "stars": len(shot.truth),
             "electrons_per_s": float(shot.linear.sum(dtype=np.float64)),
             "flux_at_white_e_per_s": bench.flux_at_white_e_per_s,
             "clipped": clipped,
-            "written": [str(path) for path in (output, truth, codes) if path is not None],
+            "written": [str(path) for path in targets],
             "gl_renderer": bench.renderer.gl_renderer,
         }
     if as_json:

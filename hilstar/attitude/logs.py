@@ -55,6 +55,8 @@ def _csv_rows(lines: Iterator[str], path: Path) -> Iterator[tuple[int, AttitudeS
     reader = csv.reader(lines)
     rows = (row for row in reader if row and not row[0].startswith("#"))
     header = [name.strip() for name in next(rows, [])]
+    if not header:
+        return
     missing = [name for name in CSV_COLUMNS if name not in header]
     if missing:
         raise InputError(f"{path}:1: column {missing[0]} is missing; the header must have {','.join(CSV_COLUMNS)}")

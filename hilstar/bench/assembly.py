@@ -26,8 +26,8 @@ from hilstar.scene.psf import peak_share
 from hilstar.scene.sprites import Sprites, clipped_sprites, make_sprites
 from hilstar.sky.astrometry import aberrate, unit_vectors_icrs
 from hilstar.sky.catalog import load_catalog
-from hilstar.sky.electrons import Optics, Photometry, tabulate
-from hilstar.sky.spectrum import BUILT_IN_CURVES, TEMPERATURE_SCALES, load_curve
+from hilstar.sky.electrons import Optics, Photometry, star_temperatures_k, tabulate
+from hilstar.sky.spectrum import BUILT_IN_CURVES, load_curve
 from hilstar.sky.stars import Stars, make_stars
 
 TRUTH_DTYPE = np.dtype(
@@ -164,7 +164,7 @@ def bench_stars(config: BenchConfig, folder: Path) -> Stars:
     vectors = unit_vectors_icrs(catalog, sky.epoch_jyear)
     if any(sky.observer_velocity_km_s):
         vectors = aberrate(vectors, sky.observer_velocity_km_s)
-    temperature_k = TEMPERATURE_SCALES[sky.temperature](catalog.bv_mag)
+    temperature_k = star_temperatures_k(catalog.bv_mag, sky.temperature)
     table = tabulate(sky.brightness, bench_optics(config.tracker, folder), Photometry(sky.zero_point, sky.passband_weighting))
     return make_stars(catalog, vectors, temperature_k, table.electrons_per_s(catalog.v_mag, temperature_k))
 

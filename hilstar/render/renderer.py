@@ -20,6 +20,7 @@ from hilstar.resources import resource_path
 from hilstar.scene.psf import SQRT2, footprint_px
 from hilstar.scene.sprites import SPRITE_DTYPE, Sprites
 
+EGL_LIBRARY = "libEGL.so.1"
 INSTALL_EGL = "install it: apt-get install libegl1 libgl1-mesa-dri"
 TABLE_WIDTH = 1024  # that of encode.frag
 MANTISSA_BITS = 23
@@ -42,7 +43,7 @@ def create_context() -> moderngl.Context:
     Every GL function comes through libEGL's own loader: a bare machine has no libGL.so.
     """
     try:
-        settings: Any = {"backend": "egl", "libgl": "libEGL.so.1", "libegl": "libEGL.so.1"}
+        settings: Any = {"backend": "egl", "libgl": EGL_LIBRARY, "libegl": EGL_LIBRARY}
         return moderngl.create_context(require=330, standalone=True, **settings)
     except Exception as error:  # moderngl and glcontext raise plain Exceptions here
         raise MachineError(f"OpenGL 3.3 through EGL is not there ({error}); {INSTALL_EGL}") from error

@@ -1,0 +1,15 @@
+"""Run by the plate solver's own Python: centroids in as JSON lines, solved attitudes out."""
+
+import json
+import sys
+
+import numpy as np
+import tetra3
+
+solver = tetra3.Tetra3()
+for line in sys.stdin:
+    field = json.loads(line)
+    solution = solver.solve_from_centroids(
+        np.array(field["yx"]), field["size"], fov_estimate=field["fov_deg"], fov_max_error=1.0
+    )
+    print(json.dumps({key: None if solution[key] is None else float(solution[key]) for key in ("RA", "Dec", "Roll", "FOV")}))

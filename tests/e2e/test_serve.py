@@ -1,0 +1,213 @@
+"""The live stream: real ZeroMQ sockets, real processes."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import time
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+import zmq
+
+from hilstar.attitude.quaternion import from_radec_roll_deg
+from tests.conftest import SMALL_BENCH, assert_refused, run_hilstar
+
+SUMMARY_KEYS = set(
+    [
+        "frames",
+        "duration_s",
+        "fps",
+        "frame_ms",
+        "attitude_age_ms",
+        "packets",
+        "stars_drawn",
+        "clipped",
+        "missed_frames",
+        "stale_frames",
+        "gl_renderer",
+    ]
+)
+
+
+def packet(sequence: int, t_ns: int, q=(0.5, 0.5, -0.5, 0.5), rate=(0.0, 0.0, 0.0)) -> bytes:
+    """From the design's section 4, without hilstar."""
+    body = struct.pack("<BBHIq4d3f", 1, 1, 1, sequence, t_ns, *q, *rate)
+    return body + struct.pack("<I", zlib.crc32(body))
+
+
+@contextmanager
+def publisher() -> Iterator[tuple[zmq.Socket, int]]:
+    """A plain PUB socket, bound; and its port."""
+    context = zmq.Context()
+    sender = context.socket(zmq.PUB)
+    sender.setsockopt(zmq.LINGER, 1000)
+    sender.setsockopt(zmq.SNDHWM, 100_000)
+    bound = sender.bind_to_random_port("tcp://127.0.0.1")
+    try:
+        yield sender, bound
+    finally:
+        sender.close()
+        context.term()
+
+
+@contextmanager
+def serving(tmp_path, port: int, *options: str, attitude: str = "", monitor: str = "") -> Iterator[subprocess.Popen]:
+    """`hilstar serve` in a process of its own, once it listens."""
+    bench = tmp_path / "serve.toml"
+    text = SMALL_BENCH.replace("[collimator]", f"{monitor}\n[collimator]")
+    bench.write_text(f'{text}\n[attitude]\nendpoint = "tcp://127.0.0.1:{port}"\n{attitude}\n')
+    command = [sys.executable, "-m", "hilstar.cli", "serve", str(bench), "--headless", "--json", *options]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ) as process:
+        try:
+            assert process.stderr is not None
+            first = process.stderr.readline()
+            assert f"127.0.0.1:{port}" in first, first + process.stderr.read()
+            time.sleep(0.3)  # ZeroMQ's subscription crosses the socket
+            yield process
+        finally:
+            process.kill()
+
+
+def summary_of(process: subprocess.Popen, timeout: float = 30) -> dict:
+    out, err = process.communicate(timeout=timeout)
+    assert process.returncode == 0, err
+    return json.loads(out)
+
+
+def test_a_thousand_packets_at_200_hz_all_arrive_with_garbage_between_them(tmp_path):
+    """1000 good ones; after every tenth, one each of: wrong CRC, NaN, norm, old time, and bytes of no form."""
+    with publisher() as (sender, port), serving(tmp_path, port) as process:
+        start = time.monotonic_ns()
+        for k in range(1000):
+            t_ns = start + k * 5_000_000
+            time.sleep(max(0, (t_ns - time.monotonic_ns()) / 1e9))
+            sender.send(packet(k, t_ns))
+            if k % 10 == 9:
+                broken = bytearray(packet(k, t_ns + 1))
+                broken[20] ^= 4
+                sender.send(bytes(broken))
+                sender.send(packet(k, t_ns + 1, q=(float("nan"), 0, 0, 1)))
+                sender.send(packet(k, t_ns + 1, q=(1.1, 0, 0, 0)))
+                sender.send(packet(k, t_ns - 1))
+                sender.send(np.random.default_rng(k).bytes(50))
+        time.sleep(0.2)
+        process.send_signal(signal.SIGINT)
+        summary = summary_of(process)
+    packets = summary["packets"]
+    assert packets["accepted"] == 1000
+    assert packets["received"] == 1500
+    assert packets["refused_by"] == {"crc": 100, "norm": 100, "nan": 100, "time": 100, "format": 100}
+    assert packets["refused"] == 500
+    assert summary["frames"] > 200
+    assert summary["stars_drawn"]["max"] > 0
+    assert set(summary) == SUMMARY_KEYS
+
+
+def test_a_clean_stream_is_refused_nothing(tmp_path):
+    with publisher() as (sender, port), serving(tmp_path, port) as process:
+        for k in range(400):
+            sender.send(packet(k, time.monotonic_ns()))
+            time.sleep(0.0025)
+        time.sleep(0.2)
+        process.send_signal(signal.SIGTERM)
+        summary = summary_of(process)
+    assert (summary["packets"]["received"], summary["packets"]["refused"]) == (400, 0)
+    for key in ("p50", "p99", "max"):
+        assert summary["attitude_age_ms"][key] is not None
+
+
+def test_json_and_multipart_messages_are_taken(tmp_path):
+    with publisher() as (sender, port), serving(tmp_path, port) as process:
+        sender.send(json.dumps({"t_ns": 1_000_000, "q": [1, 0, 0, 0], "rate": [0, 0, 0]}).encode())
+        sender.send_multipart([b"attitude", json.dumps({"t_ns": 2_000_000, "q": [1, 0, 0, 0]}).encode()])
+        sender.send_multipart([b"topic", b"more", packet(3, 3_000_000)])
+        sender.send(b'{"t_ns": 4000000, "q": [NaN, 0, 0, 0]}')
+        time.sleep(0.3)
+        process.send_signal(signal.SIGINT)
+        packets = summary_of(process)["packets"]
+    assert (packets["accepted"], packets["refused_by"]["nan"]) == (3, 1)
+
+
+def test_a_silent_bench_shows_blank_frames_and_ends_in_order(tmp_path):
+    with publisher() as (_, port), serving(tmp_path, port, "--frames", "30") as process:
+        summary = summary_of(process)
+    assert summary["frames"] == summary["stale_frames"] == 30
+    assert summary["attitude_age_ms"] == {"p50": None, "p99": None, "max": None}
+    assert summary["stars_drawn"]["max"] == 0
+
+
+@pytest.mark.parametrize(("on_stale", "stars_at_end"), [("hold", True), ("blank", False)])
+def test_what_is_shown_after_the_stream_stops_is_the_policy_s(tmp_path, on_stale, stars_at_end):
+    """One packet, then a second of silence: the frames after 100 ms are stale, and blank only where that was asked."""
+    attitude = f'stale_after_ms = 100\nmax_extrapolation_ms = 50\non_stale = "{on_stale}"'
+    with publisher() as (sender, port), serving(tmp_path, port, "--duration", "1.5", attitude=attitude) as process:
+        sender.send(packet(0, 0, q=tuple(from_radec_roll_deg(84, -1, 0))))
+        summary = summary_of(process)
+    assert summary["stale_frames"] > 50
+    mean, most = summary["stars_drawn"]["mean"], summary["stars_drawn"]["max"]
+    assert (mean > 0.4 * most) is stars_at_end
+    assert summary["frames"] + summary["missed_frames"] == 90
+
+
+def test_hilstar_send_is_heard_by_serve_that_binds(tmp_path):
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    with serving(tmp_path, port, attitude="bind = true") as process:
+        sent = run_hilstar(
+            "send", "--spin", "z,1.5", "--rate", "200", "--count", "300", "--to", f"tcp://127.0.0.1:{port}", "--connect"
+        )
+        assert sent.returncode == 0, sent.stderr
+        assert "300 packets sent" in sent.stderr
+        time.sleep(0.2)
+        process.send_signal(signal.SIGINT)
+        packets = summary_of(process)["packets"]
+    assert (packets["received"], packets["refused"]) == (300, 0)
+
+
+def test_a_log_sent_at_a_rate_is_resampled(tmp_path):
+    (tmp_path / "log.csv").write_text("t_s,qw,qx,qy,qz\n5,1,0,0,0\n6,0.9999,0.01,0,0.0099\n")
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    with serving(tmp_path, port) as process:
+        sent = run_hilstar("send", tmp_path / "log.csv", "--rate", "100", "--to", f"tcp://127.0.0.1:{port}")
+        assert "101 packets sent" in sent.stderr
+        time.sleep(0.2)
+        process.send_signal(signal.SIGINT)
+        assert summary_of(process)["packets"]["accepted"] == 101
+
+
+def test_a_sender_that_restarts_is_taken_up_again(tmp_path):
+    with publisher() as (sender, port), serving(tmp_path, port) as process:
+        for start_ns in (10**15, 0):  # the second run's clock begins anew
+            for k in range(50):
+                sender.send(packet(k, start_ns + k * 5_000_000))
+                time.sleep(0.005)
+            time.sleep(0.5)
+        process.send_signal(signal.SIGINT)
+        packets = summary_of(process)["packets"]
+    assert packets["refused_by"]["time"] == packets["refused"] == 2
+    assert packets["accepted"] == 98
+
+
+def test_a_port_in_use_gets_one_line(tmp_path, small_bench_file):
+    with publisher() as (_, port):
+        small_bench_file.write_text(SMALL_BENCH + f'[attitude]\nbind = true\nendpoint = "tcp://127.0.0.1:{port}"\n')
+        result = run_hilstar("serve", small_bench_file, "--headless", "--duration", "1")
+        assert_refused(result, 2, f"127.0.0.1:{port}", "in use")
+        assert_refused(run_hilstar("send", "--spin", "z,1", "--to", f"tcp://127.0.0.1:{port}"), 2, "in use")
+
+
+def test_serial_is_refused_for_now(small_bench_file):
+    small_bench_file.write_text(SMALL_BENCH + '[attitude]\nsource = "serial"\nport = "/dev/ttyS0"\n')
+    assert_refused(run_hilstar("serve", small_bench_file, "--headless", "--duration", "1"), 2, "zmq")

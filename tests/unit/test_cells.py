@@ -1,0 +1,45 @@
+"""The spatial index hands on every star within the radius."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hilstar.sky.astrometry import unit_vectors_icrs
+from hilstar.sky.catalog import load_catalog
+from hilstar.sky.cells import CELL_DEG, cell_grid
+
+
+@pytest.fixture(scope="module")
+def vectors():
+    return unit_vectors_icrs(load_catalog(), 2026.0)
+
+
+def test_every_star_within_the_radius_is_found(vectors, rng):
+    grid = cell_grid(vectors)
+    axes = rng.normal(size=(60, 3))
+    axes[:4] = [[0, 0, 1], [0, 0, -1], [1, 0, 0], [1, -1e-9, 0]]  # poles, and both sides of RA 0
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    for axis in axes:
+        for radius in (1e-4, 0.05, 0.2, 1.0, 1.5):
+            wanted = np.flatnonzero(vectors @ axis >= np.cos(radius))
+            found = grid.order[grid.near(axis, radius)]
+            assert np.isin(wanted, found).all()
+            assert len(np.unique(found)) == len(found)
+
+
+def test_few_others_are_found(vectors):
+    """The index earns its place: stars found lie within a cell's diagonal, and its margin, of the radius."""
+    grid = cell_grid(vectors)
+    axis, radius = np.array([0.6, 0.0, 0.8]), 0.18
+    found = grid.order[grid.near(axis, radius)]
+    farthest = np.arccos(np.clip((vectors[found] @ axis).min(), -1, 1))
+    assert farthest < radius + 2 * np.radians(CELL_DEG) * np.sqrt(2)
+    assert len(found) < len(vectors) / 20
+
+
+def test_no_stars_and_one_star():
+    assert len(cell_grid(np.empty((0, 3))).near(np.array([1.0, 0, 0]), 1.0)) == 0
+    alone = cell_grid(np.array([[0.0, 0.0, 1.0]]))
+    assert alone.near(np.array([0.0, 0, 1]), 1e-9).tolist() == [0]
+    assert alone.near(np.array([0.0, 0, -1]), 1.0).tolist() == []

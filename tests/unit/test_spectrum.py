@@ -1,0 +1,91 @@
+"""Curves, temperatures and black bodies where they are easy to get wrong."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hilstar.errors import InputError
+from hilstar.sky.electrons import Optics, Photometry, tabulate
+from hilstar.sky.spectrum import (
+    Curve,
+    blackbody_exitance_w_m2_m,
+    constant_curve,
+    integration_nodes,
+    load_curve,
+    temperature_ballesteros2012_k,
+    temperature_wang2021_k,
+)
+
+
+def test_a_black_body_neither_overflows_nor_turns_negative():
+    wavelength_nm = np.array([1.0, 100.0, 550.0, 1e6])
+    for temperature_k in (10.0, 1500.0, 60_000.0, 1e7):
+        exitance = blackbody_exitance_w_m2_m(wavelength_nm, temperature_k)
+        assert np.isfinite(exitance).all()
+        assert (exitance >= 0).all()
+
+
+def test_the_source_s_temperature_scale_jumps_at_zero_and_the_default_does_not():
+    around = np.array([-1e-9, 0.0])
+    assert temperature_wang2021_k(around) == pytest.approx([9259.8, 8909.7], abs=0.1)  # thesis eq. 3.13
+    assert np.diff(temperature_ballesteros2012_k(around))[0] == pytest.approx(0, abs=1e-4)
+    assert temperature_ballesteros2012_k(np.array([0.65]))[0] == pytest.approx(5778, abs=40)  # the Sun, Ballesteros 2012
+
+
+def test_temperature_scales_are_finite_over_every_colour_of_the_catalogue():
+    bv = np.linspace(-0.4, 5.46, 2000)
+    for scale in (temperature_ballesteros2012_k, temperature_wang2021_k):
+        assert (scale(bv) > 250).all()
+        assert (np.diff(scale(bv)) < 0).all()
+
+
+def test_integration_nodes_integrate_pieces_of_straight_lines():
+    a = Curve(np.array([300.0, 413.0, 700.0]), np.array([0.0, 1.0, 0.2]))
+    b = Curve(np.array([350.0, 900.0]), np.array([0.5, 0.1]))
+    wavelength_nm, weight_m = integration_nodes(a, b)
+    fine = np.linspace(350, 700, 3_500_001)
+    exact = np.trapezoid(a(fine) * b(fine), fine) * 1e-9
+    # Gauss is exact here; the trapezium with 1e-4 nm steps is off by h^2/12 times the slopes: below 1e-12.
+    assert a(wavelength_nm) * b(wavelength_nm) @ weight_m == pytest.approx(exact, rel=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "at least two rows"),
+        ("wavelength_nm,value\n400,0.5\n", "at least two rows"),
+        ("400,0.5\n300,0.5\n", "do not rise"),
+        ("400,0.5\n400,0.5\n", "do not rise"),
+        ("400,0.5\n500,nan\n", "not finite"),
+        ("400,0.5\n500,1.5\n", "fractions from 0 to 1"),
+        ("400,0.5\n500,-0.1\n", "fractions from 0 to 1"),
+        ("400,0.5\n500\n", ":2:"),
+        ("400,half\n", ":1:"),
+    ],
+)
+def test_a_curve_file_that_is_wrong_is_refused(tmp_path, text, words):
+    (tmp_path / "qe.csv").write_text(text)
+    with pytest.raises(InputError) as refusal:
+        load_curve("qe.csv", "[tracker] quantum_efficiency", tmp_path)
+    assert "qe.csv" in str(refusal.value)
+    assert words in str(refusal.value)
+
+
+def test_a_curve_that_is_neither_name_nor_file_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"\[tracker\] quantum_efficiency = 'ccd48'.*\"ccd47-20\""):
+        load_curve("ccd48", "[tracker] quantum_efficiency", tmp_path)
+    with pytest.raises(InputError, match="from 0 to 1"):
+        load_curve(1.5, "[tracker] transmission", tmp_path)
+
+
+def test_a_tracker_that_sees_nothing_is_refused():
+    with pytest.raises(InputError, match="zero everywhere"):
+        tabulate("dgs", Optics(30, constant_curve(0.0), constant_curve(1.0)), Photometry())
+    apart = Optics(30, Curve(np.array([300.0, 400]), np.ones(2)), Curve(np.array([500.0, 600]), np.ones(2)))
+    with pytest.raises(InputError, match="share no wavelength"):
+        tabulate("dgs", apart, Photometry())
+
+
+def test_two_constants_are_taken_over_the_range_of_silicon():
+    assert Optics(30, constant_curve(0.6), constant_curve(0.9)).range_nm == (300.0, 1100.0)

@@ -30,6 +30,7 @@ from hilstar.sky.electrons import Optics, Photometry, star_temperatures_k, tabul
 from hilstar.sky.spectrum import BUILT_IN_CURVES, load_curve
 from hilstar.sky.stars import Stars, make_stars
 
+WARM_UP_ATTITUDE = np.array([1.0, 0.0, 0.0, 0.0])
 TRUTH_DTYPE = np.dtype(
     [
         ("hip", "i4"),
@@ -101,6 +102,11 @@ class Bench:
         clipped = clipped_sprites(sprites, self._sigma_px, self.flux_at_white_e_per_s)
         hip = tuple(int(h) for h in self.stars.hip[sprites.star[clipped]])
         return Drawn(self.renderer.codes(), len(sprites), hip)
+
+    def warm_up(self) -> None:
+        """Draw once with stars and once without: a driver compiles its shaders at their first use, 60 ms on llvmpipe."""
+        self.draw(WARM_UP_ATTITUDE)
+        self.draw(None)
 
     def frame(self, q_icrs_to_cam: Sequence[float] | FloatArray) -> Frame:
         """Draw one frame and bring everything about it back; the arrays are the caller's own.

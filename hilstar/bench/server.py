@@ -127,8 +127,8 @@ def serve(bench: Bench, link: ZmqReceiver, limit: Limit, sink: FrameSink = _igno
     timeline = Timeline(policy_of(bench.config.attitude))
     receiver = Receiver(link, timeline)
     loop = FrameLoop(bench, timeline, sink)
-    bench.draw(None)  # the driver compiles its shaders at the first draw: not in the first frame
     receiver.start()
+    bench.warm_up()
     begin_ns = time.monotonic_ns()
     try:
         with stop_on_signal(loop.stop):
@@ -152,7 +152,7 @@ def replay(bench: Bench, samples: list[AttitudeSample], realtime: bool, sink: Fr
     def time_of(slot: int, host_ns: int = 0) -> int:
         return first_ns + round(slot * NS_PER_S / refresh_hz)
 
-    bench.draw(None)
+    bench.warm_up()
     begin_ns = time.monotonic_ns()
     with stop_on_signal(loop.stop):
         if realtime:

@@ -27,6 +27,7 @@ from hilstar.scene.sprites import Sprites, clipped_sprites, make_sprites
 from hilstar.sky.astrometry import aberrate, unit_vectors_icrs
 from hilstar.sky.catalog import load_catalog
 from hilstar.sky.electrons import Optics, Photometry, star_temperatures_k, tabulate
+from hilstar.sky.pickles import tabulate_pickles
 from hilstar.sky.spectrum import BUILT_IN_CURVES, load_curve
 from hilstar.sky.stars import Stars, make_stars
 
@@ -171,8 +172,13 @@ def bench_stars(config: BenchConfig, folder: Path) -> Stars:
     if any(sky.observer_velocity_km_s):
         vectors = aberrate(vectors, sky.observer_velocity_km_s)
     temperature_k = star_temperatures_k(catalog.bv_mag, sky.temperature)
-    table = tabulate(sky.brightness, bench_optics(config.tracker, folder), Photometry(sky.zero_point, sky.passband_weighting))
-    return make_stars(catalog, vectors, temperature_k, table.electrons_per_s(catalog.v_mag, temperature_k))
+    optics = bench_optics(config.tracker, folder)
+    photometry = Photometry(sky.zero_point, sky.passband_weighting)
+    if sky.brightness == "dgs" and sky.spectrum == "pickles":
+        rates = tabulate_pickles(optics, photometry).electrons_per_s(catalog.v_mag, catalog.bv_mag, catalog.vi_mag)
+    else:
+        rates = tabulate(sky.brightness, optics, photometry).electrons_per_s(catalog.v_mag, temperature_k)
+    return make_stars(catalog, vectors, temperature_k, rates)
 
 
 def bench_camera(config: BenchConfig) -> Camera:

@@ -67,7 +67,7 @@ class SkySettings(_Table, frozen=True):
     epoch_jyear: Annotated[float, Meta(ge=-10_000, le=10_000)] = 2026.0
     faintest_v_mag: float = 7.5
     brightness: Literal["dgs", "ags"] = "dgs"
-    spectrum: Literal["blackbody", "pickles"] = "blackbody"
+    spectrum: Literal["blackbody", "pickles"] = "pickles"
     temperature: Literal["ballesteros2012", "wang2021"] = "ballesteros2012"
     zero_point: Literal["vega", "iau-bolometric"] = "vega"
     passband_weighting: Literal["energy", "photon"] = "energy"
@@ -226,11 +226,10 @@ def _check_meaning(config: BenchConfig, path: Path) -> None:
     if config.background.electrons_per_px is not None and config.background.zodiacal_v_mag_arcsec2 is not None:
         raise InputError(f"{path}: [background] has electrons_per_px and zodiacal_v_mag_arcsec2; write one of them")
     not_yet = {
-        '[sky] spectrum = "pickles"': config.sky.spectrum == "pickles",
         f'[render] quantisation = "{config.render.quantisation}"': config.render.quantisation != "round",
         f'[monitor] calibration = "{config.monitor.calibration}"': config.monitor.calibration != "srgb",
     }
-    instead = ('spectrum = "blackbody"', 'quantisation = "round"', 'calibration = "srgb"')
+    instead = ('quantisation = "round"', 'calibration = "srgb"')
     for (key, chosen), value in zip(not_yet.items(), instead, strict=True):
         if chosen:
             raise InputError(f"{path}: {key} is not in this version; write {value}")

@@ -1,0 +1,1 @@
+"""Charts and checks: what each choice costs, where methods fail."""

@@ -1,0 +1,360 @@
+"""The virtual detector: its order of steps, its seeds, and what it does with the extreme and the wrong."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from hilstar.errors import InputError
+from hilstar.tracker.detector import (
+    LARGEST_E,
+    RAY_DEPTH_UM,
+    RAY_E_PER_UM,
+    Detector,
+    DetectorSettings,
+    bloom,
+    ccd47_20_dark,
+    cosmic_rays_e,
+    false_stars_e,
+)
+
+SIZE_PX = (160, 128)
+SHAPE = (128, 160)
+PIXELS = 128 * 160
+
+# A mean of n samples lies 5 of its own sigmas off once in 1.7 million; seeds are fixed, so this is a margin, not a flake.
+SIGMAS = 5.0
+# The relative error of a sigma from n samples is 1 / sqrt(2 n): 0.5 % for the pixels of one frame.
+SIGMA_ERROR = SIGMAS / math.sqrt(2 * PIXELS)
+
+EVERYTHING = DetectorSettings(
+    gain_e_per_dn=4.0,
+    offset_dn=100.0,
+    read_noise_e=8.0,
+    dark_e_per_s=203.0,
+    dsnu_e_per_s=60.0,
+    prnu=0.03,
+    device_seed=7,
+    fixed_pattern="cmos",
+    hot_pixel_fraction=0.01,
+    dead_pixel_fraction=0.01,
+    column_noise_e=10.0,
+    cosmic_rays_per_cm2_s=100.0,
+    false_stars=5,
+    blooming=True,
+    quantisation_noise=True,
+)
+
+
+def generator(seed: int = 1) -> np.random.Generator:
+    return np.random.default_rng(seed)
+
+
+def flat(level_e: float) -> np.ndarray:
+    return np.full(SHAPE, level_e)
+
+
+def test_same_seeds_give_the_same_image_bit_for_bit():
+    first, second = (Detector(EVERYTHING, SIZE_PX).expose(flat(900.0), 1.0, generator()) for _ in range(2))
+    assert first.dtype == np.uint16
+    assert first.shape == SHAPE
+    np.testing.assert_array_equal(first, second)
+
+
+def test_another_frame_seed_changes_only_the_frames_noise():
+    settings = DetectorSettings(gain_e_per_dn=1.0, prnu=0.05, dsnu_e_per_s=200.0, dark_e_per_s=1000.0, bits=16)
+    detector = Detector(settings, SIZE_PX)
+    first, second = (detector.expose(flat(10_000.0), 1.0, generator(seed)).astype(float) for seed in (1, 2))
+    assert (first != second).mean() > 0.9
+    # Shot noise of 11 000 e- is 105 e-, the fixed pattern 540 e-: the difference holds the first and not the second.
+    shot_e = math.sqrt(11_000.0)
+    rounding = 1 / 12
+    assert (first - second).std() == pytest.approx(math.sqrt(2 * (shot_e**2 + rounding)), rel=SIGMA_ERROR)
+    assert first.std() > 4 * shot_e
+
+
+def test_another_device_seed_changes_every_map():
+    one, other = (Detector(dataclasses.replace(EVERYTHING, device_seed=seed), SIZE_PX) for seed in (1, 2))
+    for name in ("gain_map", "dark_map_e_per_s", "column_e"):
+        # Two continuous draws agree nowhere but on the few pixels that are dead, or cut at no dark, in both.
+        assert (getattr(one, name) == getattr(other, name)).mean() < 0.01
+
+
+def test_switching_one_defect_on_leaves_the_other_maps_as_they_were():
+    plain = Detector(DetectorSettings(prnu=0.03, dark_e_per_s=203.0, dsnu_e_per_s=60.0), SIZE_PX)
+    hot = Detector(DetectorSettings(prnu=0.03, dark_e_per_s=203.0, dsnu_e_per_s=60.0, hot_pixel_fraction=0.01), SIZE_PX)
+    np.testing.assert_array_equal(plain.gain_map, hot.gain_map)
+    changed = plain.dark_map_e_per_s != hot.dark_map_e_per_s
+    assert changed.sum() == pytest.approx(0.01 * PIXELS, abs=SIGMAS * math.sqrt(0.01 * PIXELS))
+    assert (hot.dark_map_e_per_s[changed] > plain.dark_map_e_per_s[changed]).all()
+
+
+def test_the_gain_map_acts_on_light_before_its_shot_noise():
+    detector = Detector(DetectorSettings(gain_e_per_dn=1.0, bits=16, prnu=0.3), SIZE_PX)
+    first, second = (detector.expose(flat(5000.0), 0.0, generator(seed)).astype(float) for seed in (1, 2))
+    # Before: a variance of 5000 <g>. After: 5000 <g^2>, 9 % more. The variance of 20 480 differences is good to 1 %.
+    variance_e2 = (first - second).var() / 2 - 1 / 12
+    assert variance_e2 == pytest.approx(5000.0, rel=0.045)
+
+
+def test_the_full_well_clips_before_read_noise_and_adc():
+    settings = DetectorSettings(gain_e_per_dn=1.0, full_well_e=3000.0, bits=16, offset_dn=100.0, read_noise_e=20.0)
+    image = Detector(settings, SIZE_PX).expose(flat(1e6), 1.0, generator()).astype(float)
+    # Read noise after the clip is whole; before it, the image would be a constant 3100. No shot noise survives the clip.
+    noise_e = math.sqrt(20.0**2 + 1 / 12)
+    assert image.mean() == pytest.approx(3100.0, abs=SIGMAS * noise_e / math.sqrt(PIXELS))
+    assert image.std() == pytest.approx(noise_e, rel=SIGMA_ERROR)
+
+
+@pytest.mark.parametrize("bits", [1, 8, 12, 16])
+def test_the_adc_clips_at_its_largest_code_and_at_zero(bits):
+    settings = DetectorSettings(gain_e_per_dn=0.1, full_well_e=1e6, bits=bits, read_noise_e=3.0)
+    detector = Detector(settings, SIZE_PX)
+    assert (detector.expose(flat(2e4), 1.0, generator()) == 2**bits - 1).all()
+    dark = detector.expose(flat(0.0), 1.0, generator())
+    assert dark.max() > 0
+    # Half of the read noise is below no electrons, and what rounds to 0 (half a DN, 0.05 e-, 0.017 sigma): 0.507.
+    assert (dark == 0).mean() == pytest.approx(0.507, abs=SIGMAS * 0.5 / math.sqrt(PIXELS))
+
+
+def test_a_pixel_of_1e9_electrons_is_full_and_its_neighbours_are_not():
+    image_e = flat(100.0)
+    image_e[60, 80] = 1e9
+    image = Detector(DetectorSettings(offset_dn=10.0), SIZE_PX).expose(image_e, 0.1, generator())
+    assert image[60, 80] == round(70_000 / 24 + 10)
+    image[60, 80] = 0
+    assert image.max() < 30  # 100 e- are 4 DN over the offset, with 0.4 DN of noise
+
+
+def test_1e9_electrons_have_their_own_mean_and_shot_noise():
+    settings = DetectorSettings(gain_e_per_dn=20_000.0, full_well_e=LARGEST_E, bits=16)
+    image_e = Detector(settings, SIZE_PX).expose(flat(1e9), 0.1, generator()) * 20_000.0
+    noise_e = math.sqrt(1e9 + 20_000.0**2 / 12)
+    assert image_e.mean() == pytest.approx(1e9, abs=SIGMAS * noise_e / math.sqrt(PIXELS))
+    assert image_e.std() == pytest.approx(noise_e, rel=SIGMA_ERROR)
+
+
+def test_no_exposure_and_no_light_give_the_offset_and_nothing_else():
+    quiet = dataclasses.replace(EVERYTHING, read_noise_e=0.0, column_noise_e=0.0, quantisation_noise=False)
+    image = Detector(quiet, SIZE_PX).expose(flat(0.0), 0.0, generator())
+    assert (image == 100).all()
+    assert (Detector(EVERYTHING, SIZE_PX).expose_noiseless(flat(0.0), 0.0) == 100).all()
+
+
+def test_an_empty_field_in_a_noiseless_sensor_is_the_offset():
+    image = Detector(DetectorSettings(offset_dn=7.0), SIZE_PX).expose(np.zeros(SHAPE, dtype=np.float32), 10.0, generator())
+    assert (image == 7).all()
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64, np.int64, np.uint16])
+def test_electrons_of_every_number_type_give_the_same_image_and_stay_as_they_were(kind):
+    image_e = flat(300.0).astype(kind)
+    image = Detector(EVERYTHING, SIZE_PX).expose(image_e, 0.1, generator())
+    Detector(EVERYTHING, SIZE_PX).expose_noiseless(image_e, 0.1)
+    np.testing.assert_array_equal(image, Detector(EVERYTHING, SIZE_PX).expose(flat(300.0), 0.1, generator()))
+    assert (image_e == 300).all()
+
+
+def test_noiseless_is_the_rounded_mean_without_fixed_pattern():
+    detector = Detector(dataclasses.replace(EVERYTHING, blooming=False), SIZE_PX)
+    image_e = generator().uniform(0.0, 20_000.0, SHAPE)
+    expected = np.rint((image_e + 203.0 * 2.0) / 4.0 + 100.0).clip(0, 4095)
+    np.testing.assert_array_equal(detector.expose_noiseless(image_e, 2.0), expected)
+
+
+def test_noisy_frames_scatter_around_the_noiseless_one():
+    settings = DetectorSettings(gain_e_per_dn=2.0, offset_dn=50.0, read_noise_e=6.0, dark_e_per_s=100.0)
+    detector = Detector(settings, SIZE_PX)
+    rng, frames = generator(), 16
+    mean = np.mean([detector.expose(flat(1000.0), 1.0, rng) for _ in range(frames)])
+    # 1100 e- are 550 DN exactly, so nothing is lost by rounding the noiseless frame.
+    noise_dn = math.sqrt(1100.0 + 36.0) / 2
+    assert detector.expose_noiseless(flat(1000.0), 1.0)[0, 0] == 600
+    assert mean == pytest.approx(600.0, abs=SIGMAS * noise_dn / math.sqrt(frames * PIXELS))
+
+
+def test_quantisation_noise_is_roundings_unless_the_thesis_gaussian_is_asked_for():
+    ramp_e = np.linspace(1000.0, 50_000.0, PIXELS).reshape(SHAPE)
+    detector = Detector(DetectorSettings(gain_e_per_dn=24.0), SIZE_PX)
+    error_e = detector.expose_noiseless(ramp_e, 0.0) * 24.0 - ramp_e
+    # A ramp over 2042 whole DN: the error is uniform, its sigma gain / sqrt 12, to the 1e-3 of the ramp's ends.
+    assert error_e.std() == pytest.approx(24.0 / math.sqrt(12), rel=1e-3)
+    added = DetectorSettings(gain_e_per_dn=1.0, offset_dn=100.0, quantisation_noise=True)
+    assert added.adc_noise_e == pytest.approx(4.93, abs=0.005)  # table 4.2, two digits
+    image = Detector(added, SIZE_PX).expose(flat(0.0), 0.0, generator())
+    assert image.std() == pytest.approx(math.sqrt(added.adc_noise_e**2 + 1 / 12), rel=SIGMA_ERROR)
+
+
+def test_dark_is_the_datasheets_at_the_reference_and_falls_with_the_cold():
+    for law in ("arrhenius", "ccd47-20"):
+        assert DetectorSettings(dark_law=law).dark_factor == 1.0
+        factors = [DetectorSettings(dark_law=law, temperature_k=t).dark_factor for t in (240.0, 260.0, 280.0, 300.0)]
+        assert factors == sorted(factors)
+    # The datasheet's own figure at 293 K must be the 1 that it is relative to; its coefficients have 3 digits.
+    assert ccd47_20_dark(293.0) == pytest.approx(1.0, abs=0.005)
+
+
+def test_arrhenius_doubles_over_the_textbook_interval():
+    # d ln D / dT = E / (k T^2): 0.56 eV at 293 K gives ln 2 in 9.2 K (taken at the middle of the interval).
+    interval_k = math.log(2) * 8.617333e-5 * 293.0**2 / 0.56
+    colder, warmer = (DetectorSettings(temperature_k=293.0 + side * interval_k / 2).dark_factor for side in (-1, 1))
+    second_order = (interval_k / 293.0) ** 2
+    assert warmer / colder == pytest.approx(2.0, rel=second_order)
+
+
+def test_temperature_acts_on_dark_frames():
+    settings = DetectorSettings(gain_e_per_dn=1.0, bits=16, dark_e_per_s=203.0, dark_law="ccd47-20", temperature_k=273.0)
+    image = Detector(settings, SIZE_PX).expose(flat(0.0), 10.0, generator())
+    expected_e = 2030.0 * ccd47_20_dark(273.0) / ccd47_20_dark(293.0)
+    assert expected_e < 0.2 * 2030.0
+    assert image.mean() == pytest.approx(expected_e, abs=SIGMAS * math.sqrt(expected_e / PIXELS))
+
+
+def test_dead_pixels_give_the_offset_and_hot_ones_their_share():
+    settings = DetectorSettings(
+        gain_e_per_dn=1.0, bits=16, dead_pixel_fraction=0.02, hot_pixel_fraction=0.05, hot_pixel_e_per_s=5000.0
+    )
+    detector = Detector(settings, SIZE_PX)
+    image = detector.expose(flat(2000.0), 1.0, generator())
+    dead = image == 0
+    assert dead.sum() == pytest.approx(0.02 * PIXELS, abs=SIGMAS * math.sqrt(0.02 * PIXELS))
+    hot = detector.dark_map_e_per_s > 0
+    assert hot.sum() == pytest.approx(0.05 * 0.98 * PIXELS, abs=SIGMAS * math.sqrt(0.05 * PIXELS))
+    # The exponential law's sigma is its mean.
+    assert (image[hot] - 2000.0).mean() == pytest.approx(5000.0, rel=SIGMAS / math.sqrt(hot.sum()))
+
+
+def test_a_cmos_column_pattern_is_the_same_down_each_column():
+    settings = DetectorSettings(
+        gain_e_per_dn=0.1, full_well_e=5000.0, bits=16, offset_dn=2000.0, fixed_pattern="cmos", column_noise_e=20.0
+    )
+    image = Detector(settings, (2000, 8)).expose(np.zeros((8, 2000)), 0.0, generator())
+    assert (image == image[0]).all()
+    assert image[0].std() * 0.1 == pytest.approx(20.0, rel=SIGMAS / math.sqrt(2 * 2000))
+
+
+def test_cosmic_rays_come_at_their_rate_and_leave_their_charge():
+    settings = DetectorSettings(cosmic_rays_per_cm2_s=1000.0, pixel_pitch_um=10.0)
+    shape, expected = (512, 512), 1000.0 * 0.512**2
+    image_e = cosmic_rays_e(settings, shape, 1.0, generator())
+    labels, found = ndimage.label(image_e, structure=np.ones((3, 3)))
+    # Tracks of a few pixels on 262 144: two of 262 touch about as often as 262^2 / 2 * 25 / 262 144 = 3 times.
+    assert found == pytest.approx(expected - 3, abs=SIGMAS * math.sqrt(expected))
+    charge_e = ndimage.sum_labels(image_e, labels, range(1, found + 1))
+    # cos^2 even from 0 to 1: half of the paths are longer than sqrt 2 of the depth. The median's error is
+    # 1 / (2 f sqrt n) = 3 %, f = 0.7 the density there.
+    assert np.median(charge_e) == pytest.approx(math.sqrt(2) * RAY_DEPTH_UM * RAY_E_PER_UM, rel=SIGMAS * 0.03)
+
+
+def test_cosmic_rays_reach_the_frame_and_are_off_by_default():
+    with_rays = DetectorSettings(cosmic_rays_per_cm2_s=1000.0, gain_e_per_dn=1.0, bits=16)
+    assert Detector(with_rays, SIZE_PX).expose(flat(0.0), 1.0, generator()).max() > 1000
+    assert Detector(DetectorSettings(), SIZE_PX).expose(flat(0.0), 1.0, generator()).max() == 0
+
+
+def test_false_stars_bring_their_light_and_move_from_frame_to_frame():
+    settings = DetectorSettings(false_stars=10, false_star_e_per_s=5000.0)
+    rng = generator()
+    first, second = (false_stars_e(settings, SHAPE, 0.5, rng) for _ in range(2))
+    assert np.count_nonzero((first > 100) & (second > 100)) < 10
+    # A reach of 5 sigma cuts 6e-7 of a star along an axis; on this many pixels, none lies over the edge.
+    inside = false_stars_e(settings, (2000, 2000), 0.5, generator())
+    assert inside.sum() == pytest.approx(10 * 2500.0, rel=2 * 6e-7)
+    frame = Detector(dataclasses.replace(settings, gain_e_per_dn=1.0), SIZE_PX).expose(flat(0.0), 0.5, generator())
+    # A star between four pixels gives each less than a quarter of it, 0.4655^2 = 0.2167: 541 e-, with 23 e- of noise.
+    assert frame.max() > 540 - SIGMAS * 23
+
+
+def test_blooming_keeps_the_charge_within_its_column():
+    charge_e = np.full((61, 5), 10.0)
+    charge_e[30, 2] = 2010.0
+    bloomed = bloom(charge_e, 100.0)
+    assert bloomed.max() == 100.0
+    np.testing.assert_allclose(bloomed.sum(axis=0), charge_e.sum(axis=0), rtol=1e-12)
+    np.testing.assert_array_equal(bloomed[:, [0, 1, 3, 4]], 10.0)
+    # 1910 e- over the well, 90 free in each neighbour: 10.6 pixels up and as many down.
+    np.testing.assert_array_equal(bloomed[20:41, 2], 100.0)
+    np.testing.assert_allclose(bloomed[[19, 41], 2], 65.0)
+    np.testing.assert_array_equal(bloomed[:19, 2], 10.0)
+
+
+def test_blooming_loses_only_what_runs_out_of_the_columns_ends():
+    assert (bloom(np.array([[0.0], [1e9], [0.0]]), 50.0) == 50.0).all()
+
+
+def test_wells_do_not_bloom_by_default():
+    image_e = flat(0.0)
+    image_e[64, 80] = 1e6
+    for blooming in (False, True):
+        image = Detector(DetectorSettings(blooming=blooming), SIZE_PX).expose(image_e, 0.1, generator())
+        assert (image[63, 80] > 0) == blooming
+
+
+@pytest.mark.parametrize(
+    ("image_e", "words"),
+    [
+        (np.full(SHAPE, np.nan), "NaN"),
+        (np.where(np.arange(PIXELS).reshape(SHAPE) == 77, np.nan, 5.0), "NaN"),
+        (np.where(np.arange(PIXELS).reshape(SHAPE) == 77, -1e-9, 5.0), "negative"),
+        (flat(np.inf), "inf"),
+        (flat(1.01e12), "1.01e"),
+        (np.zeros((160, 128)), "shape"),
+        (np.zeros(SHAPE, dtype=complex), "type"),
+    ],
+)
+def test_wrong_electrons_are_refused_in_one_line(image_e, words):
+    detector = Detector(DetectorSettings(dead_pixel_fraction=1.0), SIZE_PX)
+    for expose in (lambda: detector.expose(image_e, 0.1, generator()), lambda: detector.expose_noiseless(image_e, 0.1)):
+        with pytest.raises(InputError, match=words) as refusal:
+            expose()
+        assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize("exposure_s", [-0.1, math.nan, math.inf])
+def test_wrong_exposures_are_refused(exposure_s):
+    with pytest.raises(InputError, match="exposure"):
+        Detector(DetectorSettings(), SIZE_PX).expose(flat(1.0), exposure_s, generator())
+
+
+def test_dark_beyond_what_can_be_drawn_is_refused():
+    detector = Detector(DetectorSettings(dark_e_per_s=1e6), SIZE_PX)
+    for expose in (lambda: detector.expose(flat(0.0), 1e7, generator()), lambda: detector.expose_noiseless(flat(0.0), 1e7)):
+        with pytest.raises(InputError, match=r"1e\+13 electrons"):
+            expose()
+
+
+def test_more_rays_than_a_frame_can_hold_are_refused():
+    with pytest.raises(InputError, match="cosmic"):
+        Detector(DetectorSettings(cosmic_rays_per_cm2_s=1e9), SIZE_PX).expose(flat(0.0), 10.0, generator())
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"gain_e_per_dn": 0.0}, "gain_e_per_dn"),
+        ({"full_well_e": -1.0}, "full_well_e"),
+        ({"bits": 17}, "bits = 17; write a number from 1 to 16"),
+        ({"read_noise_e": math.nan}, "read_noise_e"),
+        ({"dark_e_per_s": math.inf}, "dark_e_per_s"),
+        ({"prnu": -0.01}, "prnu"),
+        ({"device_seed": -1}, "device_seed"),
+        ({"hot_pixel_fraction": 1.5}, "hot_pixel_fraction"),
+        ({"temperature_k": -20.0}, "temperature_k"),
+        ({"fixed_pattern": "emccd"}, '"ccd" or "cmos"'),
+        ({"dark_law": "doubling"}, '"arrhenius" or "ccd47-20"'),
+        ({"dark_law": "ccd47-20", "temperature_k": 320.0}, "230 to 300 K"),
+        ({"column_noise_e": 5.0}, 'fixed_pattern = "cmos"'),
+    ],
+)
+def test_a_sensor_that_cannot_be_is_refused(wrong, words):
+    with pytest.raises(InputError, match=words):
+        DetectorSettings(**wrong)
+
+
+def test_a_sensor_without_pixels_is_refused():
+    with pytest.raises(InputError, match="resolution"):
+        Detector(DetectorSettings(), (0, 10))

@@ -31,6 +31,7 @@ BenchFile = Annotated[Path, typer.Argument(metavar="BENCH.toml", help="The bench
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout, and nothing else there.")]
 Headless = Annotated[bool, typer.Option("--headless", help="Draw without a window.")]
 RadecText = Annotated[str | None, typer.Option("--radec", metavar="RA,DEC,ROLL", help="Boresight and roll in degrees, ICRS.")]
+QuaternionText = Annotated[str | None, typer.Option("--quaternion", metavar="W,X,Y,Z", help="q_icrs_to_cam, scalar first.")]
 INTERRUPTED = 130
 
 
@@ -55,7 +56,7 @@ def demo(
 def frame(
     bench_file: BenchFile,
     radec: RadecText = None,
-    quaternion: Annotated[str | None, typer.Option(metavar="W,X,Y,Z", help="q_icrs_to_cam, scalar first.")] = None,
+    quaternion: QuaternionText = None,
     output: Annotated[Path | None, typer.Option("-o", "--output", metavar="OUT.fits", help="Linear image.")] = None,
     truth: Annotated[Path | None, typer.Option(metavar="OUT.csv", help="A row for each star in view.")] = None,
     codes: Annotated[Path | None, typer.Option(metavar="OUT.png", help="The code values.")] = None,
@@ -66,7 +67,7 @@ def frame(
     from hilstar.bench import output as files
     from hilstar.bench.assembly import load
 
-    q = attitude_of(radec, quaternion)
+    q = attitude_of("frame", radec, quaternion)
     targets = [path for path in (output, truth, codes, preview) if path is not None]
     if not targets:
         raise InputError("frame: nothing to write; add -o OUT.fits, --truth OUT.csv or --codes OUT.png")
@@ -194,6 +195,69 @@ def send(
 
 
 @app.command()
+def simulate(
+    bench_file: BenchFile,
+    radec: RadecText = None,
+    quaternion: QuaternionText = None,
+    rate: Annotated[str | None, typer.Option(metavar="X,Y,Z", help="The camera turns: deg/s about its axes.")] = None,
+    log: Annotated[Path | None, typer.Option(metavar="LOG", help="Frames along a log, into the directory -o.")] = None,
+    frames: Annotated[int | None, typer.Option(help="With --log: so many, evenly; each sample by default.", min=1)] = None,
+    seed: Annotated[int, typer.Option(help="Of the frame's noise.", min=0)] = 0,
+    noise: Annotated[Literal["full", "none"], typer.Option(help="All of the detector's noise, or none.")] = "full",
+    output: Annotated[Path | None, typer.Option("-o", "--output", metavar="OUT.fits", help="DN, uint16.")] = None,
+    png: Annotated[Path | None, typer.Option(metavar="OUT.png", help="A stretched picture for a person.")] = None,
+    as_json: Json = False,
+) -> None:
+    """The virtual tracker's image of the sky, with noise."""
+    from hilstar.bench import output as files
+    from hilstar.bench.sender import parse_rate
+    from hilstar.bench.simulation import Simulator
+
+    if log is not None:
+        if output is None or radec or quaternion or rate or png:
+            raise InputError("simulate --log LOG: give -o DIR, and no --radec, --quaternion, --rate or --png")
+        simulate_log(bench_file, log, frames, (noise, seed), output)
+        return
+    if output is None and png is None:
+        raise InputError("simulate: nothing to write; add -o OUT.fits or --png OUT.png")
+    q = attitude_of("simulate", radec, quaternion)
+    rate_rad_s = parse_rate(rate) if rate else np.zeros(3)
+    with Simulator(bench_file) as simulator:
+        rng = None if noise == "none" else np.random.default_rng(seed)
+        exposure = simulator.expose(simulator.motion(q, rate_rad_s), rng)
+        if output is not None:
+            files.write_exposure_fits(output, simulator, exposure, noise, seed)
+        if png is not None:
+            files.write_exposure_png(png, exposure.dn)
+        summary = {
+            "stars": len(exposure.truth),
+            "clipped": exposure.truth["hip"][exposure.truth["clipped"]].tolist(),
+            "dn": {"min": int(exposure.dn.min()), "mean": float(exposure.dn.mean()), "max": int(exposure.dn.max())},
+            "written": [str(path) for path in (output, png) if path is not None],
+            "gl_renderer": simulator.renderer.gl_renderer,
+        }
+    if as_json:
+        print_json(summary)
+    else:
+        dn = summary["dn"]
+        typer.echo(f"{summary['stars']} stars, DN {dn['min']} to {dn['max']}; wrote {', '.join(summary['written'])}")
+
+
+def simulate_log(
+    bench_file: Path, log: Path, frames: int | None, noise_and_seed: tuple[Literal["full", "none"], int], output: Path
+) -> None:
+    """The virtual tracker along a log."""
+    from hilstar.attitude.logs import read_log
+    from hilstar.bench.batch import log_motions, simulate_motions
+    from hilstar.bench.config import read_config
+
+    motions = log_motions(read_log(log), frames, read_config(bench_file).tracker.exposure_s)
+    with progress("exposing", len(motions)) as advance:
+        simulate_motions(bench_file, motions, *noise_and_seed, output, advance)
+    typer.echo(f"{len(motions)} exposures in {output}")
+
+
+@app.command()
 def doctor(as_json: Json = False) -> None:
     """Say what GL, displays, links and files are there, and what is missing."""
     from hilstar.bench.doctor import examine
@@ -209,14 +273,14 @@ def doctor(as_json: Json = False) -> None:
         raise typer.Exit(3)
 
 
-def attitude_of(radec: str | None, quaternion: str | None) -> Any:
+def attitude_of(command: str, radec: str | None, quaternion: str | None) -> Any:
     """The one attitude that the command line gives."""
     from hilstar.attitude.quaternion import from_radec_roll_deg
     from hilstar.bench.assembly import checked_quaternion
     from hilstar.bench.sender import parse_numbers, parse_radec
 
     if (radec is None) == (quaternion is None):
-        raise InputError("frame: give the attitude with --radec RA,DEC,ROLL or --quaternion W,X,Y,Z, one of them")
+        raise InputError(f"{command}: give the attitude with --radec RA,DEC,ROLL or --quaternion W,X,Y,Z, one of them")
     if radec is not None:
         return from_radec_roll_deg(*parse_radec(radec))
     return checked_quaternion(parse_numbers(quaternion or "", 4, "--quaternion", "W,X,Y,Z"))

@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.arrays import Float32Array, FloatArray
+from hilstar.arrays import Float32Array, FloatArray, IntArray
 from hilstar.attitude.packet import NORM_TOLERANCE
 from hilstar.attitude.quaternion import normalise, to_matrix
 from hilstar.bench.config import BenchConfig, SkySettings, Tracker, read_config
@@ -118,13 +118,7 @@ class Bench:
         sprites = self.sprites(q)
         self.renderer.draw(sprites)
         codes, linear = self.renderer.codes().copy(), self.renderer.linear().copy()
-        truth = np.zeros(len(sprites), dtype=TRUTH_DTYPE)
-        truth["hip"] = self.stars.hip[sprites.star]
-        truth["x_px"], truth["y_px"] = sprites.x_px, sprites.y_px
-        truth["v_mag"], truth["bv"] = self.stars.v_mag[sprites.star], self.stars.bv_mag[sprites.star]
-        truth["temperature_k"] = self.stars.temperature_k[sprites.star]
-        truth["electrons_per_s"] = self.stars.electrons_per_s[sprites.star]
-        truth["drawn"] = True
+        truth = truth_table(self.stars, sprites.star, sprites.x_px, sprites.y_px)
         truth["clipped"][clipped_sprites(sprites, self._sigma_px, self.flux_at_white_e_per_s)] = True
         return Frame(q, linear, codes, truth[np.argsort(truth["v_mag"], kind="stable")])
 
@@ -142,6 +136,18 @@ class Bench:
 def load(path: str | Path) -> Bench:
     """Assemble the bench that a file describes. Raises InputError or MachineError (no OpenGL)."""
     return Bench(Path(path))
+
+
+def truth_table(stars: Stars, star: IntArray, x_px: FloatArray, y_px: FloatArray) -> npt.NDArray[np.void]:
+    """Rows of TRUTH_DTYPE for the stars at places `star` of `stars`: all drawn, none clipped yet."""
+    truth = np.zeros(len(star), dtype=TRUTH_DTYPE)
+    truth["hip"] = stars.hip[star]
+    truth["x_px"], truth["y_px"] = x_px, y_px
+    truth["v_mag"], truth["bv"] = stars.v_mag[star], stars.bv_mag[star]
+    truth["temperature_k"] = stars.temperature_k[star]
+    truth["electrons_per_s"] = stars.electrons_per_s[star]
+    truth["drawn"] = True
+    return truth
 
 
 def checked_quaternion(q: Sequence[float] | FloatArray) -> FloatArray:

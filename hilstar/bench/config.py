@@ -13,6 +13,7 @@ import msgspec
 from msgspec import Meta
 
 from hilstar.errors import InputError
+from hilstar.tracker.detector import DetectorSettings
 
 Positive = Annotated[float, Meta(gt=0)]
 NotNegative = Annotated[float, Meta(ge=0)]
@@ -44,6 +45,20 @@ class Detector(_Table, frozen=True):
     prnu: NotNegative = 0.0
     device_seed: Annotated[int, Meta(ge=0)] = 0
     fixed_pattern: Literal["ccd", "cmos"] = "ccd"
+    temperature_k: Positive = 293.0
+    dark_reference_temperature_k: Positive = 293.0
+    dark_law: Literal["arrhenius", "ccd47-20"] = "arrhenius"
+    dark_activation_ev: NotNegative = 0.56
+    hot_pixel_fraction: NotNegative = 0.0
+    hot_pixel_e_per_s: NotNegative = 10_000.0
+    dead_pixel_fraction: NotNegative = 0.0
+    column_noise_e: NotNegative = 0.0
+    cosmic_rays_per_cm2_s: NotNegative = 0.0
+    false_stars: Annotated[int, Meta(ge=0)] = 0
+    false_star_e_per_s: NotNegative = 10_000.0
+    false_star_sigma_px: Positive = 0.55
+    blooming: bool = False
+    quantisation_noise: bool = False
 
 
 class Tracker(_Table, frozen=True):
@@ -118,6 +133,7 @@ class Background(_Table, frozen=True):
 
     electrons_per_px: NotNegative | None = None
     zodiacal_v_mag_arcsec2: float | None = None
+    gradient_electrons_across: tuple[float, float] = (0.0, 0.0)
 
 
 class Verify(_Table, frozen=True):
@@ -139,6 +155,11 @@ class BenchConfig(_Table, frozen=True):
     render: RenderSettings = msgspec.field(default_factory=RenderSettings)
     background: Background = msgspec.field(default_factory=Background)
     verify: Verify = msgspec.field(default_factory=Verify)
+
+
+def detector_settings(tracker: Tracker) -> DetectorSettings:
+    """The detector in the virtual tracker's own terms. Raises InputError for what no sensor has."""
+    return DetectorSettings(**msgspec.structs.asdict(tracker.detector), pixel_pitch_um=tracker.pixel_pitch_um)
 
 
 def read_config(path: Path) -> BenchConfig:
@@ -225,6 +246,10 @@ def _check_meaning(config: BenchConfig, path: Path) -> None:
         raise InputError(f"{path}: [sky] observer_velocity_km_s is not slower than light; write km/s, ICRS x, y, z")
     if config.background.electrons_per_px is not None and config.background.zodiacal_v_mag_arcsec2 is not None:
         raise InputError(f"{path}: [background] has electrons_per_px and zodiacal_v_mag_arcsec2; write one of them")
+    try:
+        detector_settings(config.tracker)
+    except InputError as error:
+        raise InputError(f"{path}: [tracker.detector] {error}") from error
     not_yet = {
         f'[render] quantisation = "{config.render.quantisation}"': config.render.quantisation != "round",
         f'[monitor] calibration = "{config.monitor.calibration}"': config.monitor.calibration != "srgb",

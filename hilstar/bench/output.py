@@ -5,15 +5,19 @@ from __future__ import annotations
 import csv
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from PIL import Image
 
 from hilstar.arrays import FloatArray
 from hilstar.attitude.quaternion import to_matrix, to_radec_roll_deg
 from hilstar.bench.assembly import Bench, Frame
+from hilstar.bench.simulation import Exposure, Simulator
 from hilstar.errors import InputError
 from hilstar.monitor.photometry import Codes
+from hilstar.scene.camera import Camera
 
 PREVIEW_RADIUS_PX = 9  # of the brightest star
 PREVIEW_BLUR_PX = 0.7
@@ -27,27 +31,54 @@ def write_frame_fits(path: Path, bench: Bench, frame: Frame) -> None:
     """
     from astropy.io import fits
 
-    sky = bench.config.sky
-    header = fits.Header()
+    header = _header(bench.bench_hash, bench.config.sky.epoch_jyear, frame.q_icrs_to_cam, bench.camera)
     header["BUNIT"] = ("electron/s", "each pixel's share of the tracker's electrons")
-    ra_deg, dec_deg, roll_deg = to_radec_roll_deg(frame.q_icrs_to_cam)
-    for name, value in zip(("QW", "QX", "QY", "QZ"), frame.q_icrs_to_cam, strict=True):
+    header["WHITE"] = (bench.flux_at_white_e_per_s, "[electron/s] one pixel at the white code")
+    header["NSTARS"] = (len(frame.truth), "stars drawn")
+    _written(path, lambda: fits.PrimaryHDU(frame.linear, header).writeto(path, overwrite=True))
+
+
+def write_exposure_fits(path: Path, simulator: Simulator, exposure: Exposure, noise: str, seed: int) -> None:
+    """The virtual tracker's DN (uint16) and, as second HDU, the truth table; the header says how both came about."""
+    from astropy.io import fits
+
+    tracker = simulator.config.tracker
+    header = _header(simulator.bench_hash, simulator.config.sky.epoch_jyear, exposure.motion.q_icrs_to_cam, simulator.camera)
+    header["BUNIT"] = ("adu", "digital numbers (DN)")
+    header["EXPTIME"] = (tracker.exposure_s, "[s]")
+    for name, rate in zip(("RATEX", "RATEY", "RATEZ"), np.degrees(exposure.motion.rate_cam_rad_s), strict=True):
+        header[name] = (float(rate), "[deg/s] of cam in icrs, cam components")
+    header["NOISE"] = (noise, "full, or none: the mean signal through the ADC")
+    header["SEED"] = (seed, "of the frame's noise")
+    header["DEVSEED"] = (tracker.detector.device_seed, "of the device's fixed patterns")
+    header["GAIN"] = (tracker.detector.gain_e_per_dn, "[electron/adu]")
+    header["OFFSET"] = (tracker.detector.offset_dn, "[adu]")
+    header["FULLWELL"] = (tracker.detector.full_well_e, "[electron]")
+    header["BITS"] = (tracker.detector.bits, "of the ADC")
+    header["NSTARS"] = (len(exposure.truth), "stars in view")
+    hdus = fits.HDUList([fits.PrimaryHDU(exposure.dn, header), fits.BinTableHDU(exposure.truth, name="TRUTH")])
+    _written(path, lambda: hdus.writeto(path, overwrite=True))
+
+
+def _header(bench_hash: str, epoch_jyear: float, q_icrs_to_cam: FloatArray, camera: Camera) -> Any:
+    from astropy.io import fits
+
+    header = fits.Header()
+    ra_deg, dec_deg, roll_deg = to_radec_roll_deg(q_icrs_to_cam)
+    for name, value in zip(("QW", "QX", "QY", "QZ"), q_icrs_to_cam, strict=True):
         header[name] = (float(value), "q_icrs_to_cam, Hamilton, scalar first")
     header["RA_PNT"] = (ra_deg, "[deg] boresight right ascension, ICRS")
     header["DEC_PNT"] = (dec_deg, "[deg] boresight declination, ICRS")
     header["ROLL_PNT"] = (roll_deg, "[deg] camera roll")
-    header["EPOCHJYR"] = (sky.epoch_jyear, "[yr] Julian year of the star positions")
-    header["BENCHSHA"] = bench.bench_hash  # no room on the card for a comment
-    header["WHITE"] = (bench.flux_at_white_e_per_s, "[electron/s] one pixel at the white code")
-    header["NSTARS"] = (len(frame.truth), "stars drawn")
+    header["EPOCHJYR"] = (epoch_jyear, "[yr] Julian year of the star positions")
+    header["BENCHSHA"] = bench_hash  # no room on the card for a comment
     header["CREATOR"] = "hilstar"
-    header.update(_world_coordinates(bench, frame.q_icrs_to_cam))
-    _written(path, lambda: fits.PrimaryHDU(frame.linear, header).writeto(path, overwrite=True))
+    header.update(world_coordinates(camera, q_icrs_to_cam))
+    return header
 
 
-def _world_coordinates(bench: Bench, q_icrs_to_cam: FloatArray) -> dict[str, str | float]:
-    """FITS TAN keywords: exact, for the monitor is a tangent plane."""
-    camera = bench.camera
+def world_coordinates(camera: Camera, q_icrs_to_cam: FloatArray) -> dict[str, str | float]:
+    """FITS TAN keywords of an image: exact, for it is a tangent plane."""
     right, down, normal = camera.cam_to_image @ to_matrix(q_icrs_to_cam)
     ra, dec = np.arctan2(normal[1], normal[0]), np.arctan2(normal[2], np.hypot(normal[0], normal[1]))
     east = np.array([-np.sin(ra), np.cos(ra), 0.0])
@@ -106,6 +137,13 @@ def write_preview_png(path: Path, codes: Codes) -> None:
         picture = np.maximum(picture, maximum_filter(bright, footprint=disc))
     smooth = gaussian_filter(picture**PREVIEW_POWER, PREVIEW_BLUR_PX)
     _written(path, lambda: Image.fromarray((255 * np.clip(smooth, 0, 1)).astype(np.uint8)).save(path))
+
+
+def write_exposure_png(path: Path, dn: npt.NDArray[np.uint16]) -> None:
+    """A picture of a tracker's frame for a person: from its 1 % level to its 99.9 % level, by the square root."""
+    low, high = np.percentile(dn, (1, 99.9))
+    stretched = np.sqrt(np.clip((dn - low) / max(high - low, 1.0), 0, 1))
+    _written(path, lambda: Image.fromarray((255 * stretched).astype(np.uint8)).save(path))
 
 
 def make_directory(path: Path) -> Path:

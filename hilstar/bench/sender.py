@@ -54,6 +54,11 @@ def parse_radec(text: str) -> tuple[float, float, float]:
     return ra_deg, dec_deg, roll_deg
 
 
+def parse_rate(text: str) -> FloatArray:
+    """A rate in rad/s, cam components (3,), of "X,Y,Z" in deg/s."""
+    return np.radians(parse_numbers(text, 3, "--rate", "X,Y,Z in deg/s"))
+
+
 def parse_target(text: str) -> str:
     """The ZeroMQ endpoint of --to."""
     if text.startswith("serial:"):

@@ -1,6 +1,6 @@
 """The renderer: sprites to a linear image and code values, in OpenGL 3.3 core through EGL.
 
-The only module that knows moderngl.
+This module and its helper `encoder` are the only users of moderngl.
 """
 
 from __future__ import annotations
@@ -11,30 +11,27 @@ from typing import Any, Self
 
 import moderngl
 import numpy as np
-import numpy.typing as npt
 
 from hilstar.arrays import Float32Array
 from hilstar.errors import InputError, MachineError
-from hilstar.monitor.photometry import Codes, Response, code_dtype
-from hilstar.resources import resource_path
+from hilstar.monitor.photometry import Codes, Response
+from hilstar.render.encoder import Encoder, build_program
 from hilstar.scene.psf import SQRT2, footprint_px
 from hilstar.scene.sprites import SPRITE_DTYPE, Sprites
 
 EGL_LIBRARY = "libEGL.so.1"
 INSTALL_EGL = "install it: apt-get install libegl1 libgl1-mesa-dri"
-TABLE_WIDTH = 1024  # that of encode.frag
-MANTISSA_BITS = 23
 FIRST_CAPACITY = 4096
 
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """What the renderer draws for: the monitor's pixels, its sprites and its response."""
+    """What the renderer draws for: an image's pixels, its sprites, and a monitor's response where codes are wanted."""
 
     resolution_px: tuple[int, int]
     sigma_px: tuple[float, float]
-    response: Response
-    flux_at_white_e_per_s: float
+    response: Response | None = None
+    flux_at_white_e_per_s: float = 1.0
 
 
 def create_context() -> moderngl.Context:
@@ -70,76 +67,42 @@ class Renderer:
         return str(self._ctx.info["GL_RENDERER"])
 
     def _check_limits(self) -> None:
-        info = self._ctx.info
+        info, sigma = self._ctx.info, list(self.target.sigma_px)
         largest = int(min(info["GL_MAX_TEXTURE_SIZE"], *info["GL_MAX_VIEWPORT_DIMS"])) - 2 * self.footprint_px
         if max(self.target.resolution_px) > largest:
-            raise InputError(f"[monitor] resolution_px = {list(self.target.resolution_px)}: this GL draws at most {largest} px")
-        if self.footprint_px > info["GL_POINT_SIZE_RANGE"][1]:
-            raise InputError(
-                f"[render] sprite_sigma_px = {list(self.target.sigma_px)}: needs sprites of {self.footprint_px} px;"
-                f" this GL draws at most {info['GL_POINT_SIZE_RANGE'][1]:g} px"
-            )
+            raise InputError(f"resolution_px = {list(self.target.resolution_px)}: this GL draws at most {largest} px")
+        points = info["GL_POINT_SIZE_RANGE"][1]
+        if self.footprint_px > points:
+            key = "sprite_sigma_px" if self.target.response else "psf_sigma_px"
+            raise InputError(f"{key} = {sigma}: needs sprites of {self.footprint_px} px; this GL draws at most {points:g} px")
 
     def _build(self) -> None:
         ctx, target = self._ctx, self.target
         ctx.enable(moderngl.PROGRAM_POINT_SIZE)
         ctx.blend_func = (moderngl.ONE, moderngl.ONE)
         self._linear = ctx.texture(target.resolution_px, 1, dtype="f4")
-        self._codes = ctx.texture(target.resolution_px, 1, dtype="u1" if target.response.bits <= 8 else "u2")
+        self._linear.filter = (moderngl.NEAREST, moderngl.NEAREST)
         self._linear_fbo = ctx.framebuffer([self._linear])
-        self._code_fbo = ctx.framebuffer([self._codes])
-        for texture in (self._linear, self._codes):
-            texture.filter = (moderngl.NEAREST, moderngl.NEAREST)
-        self._splat = self._program("star.vert", "splat.frag")
-        self._encode_sprites = self._program("star.vert", "encode.frag")
-        self._encode_all = self._program("full.vert", "encode.frag")
-        sigma_x, sigma_y = target.sigma_px
-        self._splat["inverse_sigma_sqrt2"] = (1 / (sigma_x * SQRT2), 1 / (sigma_y * SQRT2))
-        for program in (self._splat, self._encode_sprites):
-            program["resolution_px"] = target.resolution_px
-            program["footprint_px"] = self.footprint_px
-        self._load_response()
+        self._splat = build_program(ctx, "star.vert", "splat.frag")
+        self._splat["inverse_sigma_sqrt2"] = tuple(1 / (sigma * SQRT2) for sigma in target.sigma_px)
+        self._splat["resolution_px"] = target.resolution_px
+        self._splat["footprint_px"] = self.footprint_px
+        self._encoder: Encoder | None = None
+        if target.response is not None:
+            thresholds = target.response.thresholds_e_per_s(target.flux_at_white_e_per_s)
+            self._encoder = Encoder(ctx, self._linear, target.response.bits, thresholds, self.footprint_px)
         self._reserve(FIRST_CAPACITY)
-        self._encode_all_vao = ctx.vertex_array(self._encode_all, [])
         width, height = target.resolution_px
-        self._code_image: Codes = np.empty((height, width), dtype=code_dtype(target.response.bits))
         self._linear_image = np.empty((height, width), dtype=np.float32)
-
-    def _program(self, vertex: str, fragment: str) -> moderngl.Program:
-        return self._ctx.program(
-            vertex_shader=resource_path("shaders", vertex).read_text(),
-            fragment_shader=resource_path("shaders", fragment).read_text(),
-        )
-
-    def _load_response(self) -> None:
-        table = code_table(self.target.response.thresholds_e_per_s(self.target.flux_at_white_e_per_s))
-        self._threshold = self._table_texture(table.threshold, "f4")
-        self._first_code = self._table_texture(table.first_code, "u4")
-        for program in (self._encode_sprites, self._encode_all):
-            program["linear_e_per_s"] = 0
-            program["threshold_e_per_s"] = 1
-            program["first_code"] = 2
-            program["bin_shift"] = table.bin_shift
-            program["first_bin"] = table.first_bin
-            program["last_bin"] = len(table.first_code) - 1
-            program["white"] = self.target.response.white
-
-    def _table_texture(self, values: npt.NDArray[Any], dtype: str) -> moderngl.Texture:
-        rows = -(-len(values) // TABLE_WIDTH)
-        padded = np.zeros((rows, TABLE_WIDTH), dtype=values.dtype)
-        padded.ravel()[: len(values)] = values
-        texture = self._ctx.texture((TABLE_WIDTH, rows), 1, padded.tobytes(), dtype=dtype)
-        texture.filter = (moderngl.NEAREST, moderngl.NEAREST)
-        return texture
 
     def _reserve(self, sprites: int) -> None:
         """Room for so many sprites on the GPU; grows by doubling, never shrinks."""
         self._capacity = sprites
         self._buffer = self._ctx.buffer(reserve=sprites * SPRITE_DTYPE.itemsize, dynamic=True)
         layout = [(self._buffer, "2i 2f 1f", "pixel", "fraction_px", "electrons_per_s")]
-        encode_layout = [(self._buffer, "2i 12x", "pixel")]
         self._splat_vao = self._ctx.vertex_array(self._splat, layout)
-        self._encode_vao = self._ctx.vertex_array(self._encode_sprites, encode_layout)
+        if self._encoder is not None:
+            self._encoder.take_places_from(self._buffer)
 
     def draw(self, sprites: Sprites | None) -> None:
         """Draw the linear image and the codes of `sprites` (None: blank); read them with `linear` and `codes`."""
@@ -148,51 +111,37 @@ class Renderer:
             if sprites is not None and count:
                 self._upload(sprites)
             self._draw_linear(count)
-            self._draw_codes(count)
+            if self._encoder is not None:
+                self._encoder.draw(count)
 
     def _upload(self, sprites: Sprites) -> None:
         if len(sprites) > self._capacity:
-            for old in (self._splat_vao, self._encode_vao, self._buffer):
-                old.release()
+            self._splat_vao.release()
+            self._buffer.release()
             self._reserve(max(2 * self._capacity, len(sprites)))
         self._buffer.orphan()
         self._buffer.write(sprites.data)
-
-    def _viewport(self) -> tuple[int, int, int, int]:
-        width, height = self.target.resolution_px
-        margin = self.footprint_px
-        return (-margin, -margin, width + 2 * margin, height + 2 * margin)
 
     def _draw_linear(self, count: int) -> None:
         self._linear_fbo.use()
         self._linear_fbo.clear()
         if count:
-            self._linear_fbo.viewport = self._viewport()
+            width, height = self.target.resolution_px
+            margin = self.footprint_px
+            self._linear_fbo.viewport = (-margin, -margin, width + 2 * margin, height + 2 * margin)
             self._ctx.enable(moderngl.BLEND)
             self._splat_vao.render(moderngl.POINTS, vertices=count)
             self._ctx.disable(moderngl.BLEND)
 
-    def _draw_codes(self, count: int) -> None:
-        width, height = self.target.resolution_px
-        self._code_fbo.use()
-        for unit, texture in enumerate((self._linear, self._threshold, self._first_code)):
-            texture.use(unit)
-        if count * self.footprint_px**2 < width * height:
-            self._code_fbo.clear()
-            self._code_fbo.viewport = self._viewport()
-            if count:
-                self._encode_vao.render(moderngl.POINTS, vertices=count)
-        else:
-            self._code_fbo.viewport = (0, 0, width, height)
-            self._encode_all_vao.render(moderngl.TRIANGLES, vertices=3)
-
     def codes(self) -> Codes:
-        """The code values of the last draw, (height, width); the next call overwrites the same array."""
+        """The code values of the last draw, (height, width); the next call overwrites the same array.
+
+        A target without a response has none: TypeError.
+        """
+        if self._encoder is None:
+            raise TypeError("this target has no monitor response, so no codes")
         with self._ctx:
-            self._code_fbo.read_into(
-                self._code_image, components=1, dtype="u1" if self._code_image.itemsize == 1 else "u2", alignment=1
-            )
-        return self._code_image
+            return self._encoder.read()
 
     def linear(self) -> Float32Array:
         """The linear image of the last draw, electrons per second, float32 (height, width); overwritten as `codes`."""
@@ -214,27 +163,3 @@ class Renderer:
 
     def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
         self.close()
-
-
-@dataclass(frozen=True, slots=True)
-class CodeTable:
-    """Thresholds, and the code at the lower edge of each bin of the light's leading bits (see encode.frag)."""
-
-    threshold: Float32Array
-    first_code: npt.NDArray[np.uint32]
-    bin_shift: int
-    first_bin: int
-
-
-def code_table(thresholds: Float32Array) -> CodeTable:
-    """The table for rising, positive `thresholds`.
-
-    As many bins to an octave as there are thresholds, 4096 at most: few bins then hold more than one.
-    """
-    shift = MANTISSA_BITS - min(12, len(thresholds).bit_length())
-    first_bin = int(thresholds[0].view(np.int32)) >> shift
-    last_bin = int(thresholds[-1].view(np.int32)) >> shift
-    edges = (np.arange(first_bin, last_bin + 1, dtype=np.int64) << shift).astype(np.int32).view(np.float32)
-    first_code = np.searchsorted(thresholds, edges, side="right").astype(np.uint32)
-    first_code[0] = 0
-    return CodeTable(thresholds, first_code, shift, first_bin)

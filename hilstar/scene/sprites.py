@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,22 +43,46 @@ def make_sprites(stars: Stars, icrs_to_image: FloatArray, camera: Camera, footpr
     `icrs_to_image` (3, 3) turns ICRS components into image components.
     """
     near = stars.grid.near(icrs_to_image[2], camera.field_radius_rad(footprint_px / 2 + 1))
-    x, y = camera.project(stars.vectors[near] @ icrs_to_image.T)
+    x_px, y_px = camera.project(stars.vectors[near] @ icrs_to_image.T)
+    return pack_sprites(x_px, y_px, stars.electrons_per_s[near], near, (camera.resolution_px, footprint_px))
+
+
+def pack_sprites(
+    x_px: FloatArray, y_px: FloatArray, electrons_per_s: FloatArray, star: IntArray, frame: tuple[tuple[int, int], int]
+) -> Sprites:
+    """Sprites at `x_px`, `y_px` (n,), those left out whose footprints miss the image; NaN misses it.
+
+    `frame` is the image's (width, height) and the footprint's side, px.
+    """
+    (width, height), footprint_px = frame
     # An odd footprint has the star in its middle pixel, an even one within half a pixel of its middle corner.
     bias = 0.5 if footprint_px % 2 else 0.0
-    pixel_x, pixel_y = np.floor(x + bias), np.floor(y + bias)
+    pixel_x, pixel_y = np.floor(x_px + bias), np.floor(y_px + bias)
     before = (footprint_px - 1) // 2
     after = footprint_px - 1 - before
-    width, height = camera.resolution_px
     seen = (pixel_x >= -after) & (pixel_x < width + before) & (pixel_y >= -after) & (pixel_y < height + before)
-    x, y, star = x[seen], y[seen], near[seen]
-    data = np.empty(len(x), dtype=SPRITE_DTYPE)
+    x_px, y_px = x_px[seen], y_px[seen]
+    data = np.empty(len(x_px), dtype=SPRITE_DTYPE)
     data["pixel"][:, 0] = pixel_x = pixel_x[seen]
     data["pixel"][:, 1] = pixel_y = pixel_y[seen]
-    data["fraction_px"][:, 0] = x - pixel_x
-    data["fraction_px"][:, 1] = y - pixel_y
-    data["electrons_per_s"] = stars.electrons_per_s[star]
-    return Sprites(data, footprint_px, star, x, y)
+    data["fraction_px"][:, 0] = x_px - pixel_x
+    data["fraction_px"][:, 1] = y_px - pixel_y
+    data["electrons_per_s"] = electrons_per_s[seen]
+    return Sprites(data, footprint_px, star[seen], x_px, y_px)
+
+
+def join_sprites(parts: Sequence[Sprites], footprint_px: int) -> Sprites:
+    """All sprites of `parts`, which have one footprint."""
+    if not parts:
+        nothing = np.empty(0)
+        return Sprites(np.empty(0, dtype=SPRITE_DTYPE), footprint_px, np.empty(0, dtype=np.intp), nothing, nothing)
+    return Sprites(
+        np.concatenate([part.data for part in parts]),
+        footprint_px,
+        np.concatenate([part.star for part in parts]),
+        np.concatenate([part.x_px for part in parts]),
+        np.concatenate([part.y_px for part in parts]),
+    )
 
 
 def clipped_sprites(sprites: Sprites, sigma_px: tuple[float, float], flux_at_white_e_per_s: float) -> IntArray:

@@ -108,12 +108,12 @@ class DetectorSettings:
         for name in ("temperature_k", "dark_reference_temperature_k"):
             if self.dark_law == "ccd47-20" and not low_k <= getattr(self, name) <= high_k:
                 raise InputError(
-                    f'detector: {name} = {getattr(self, name):g}; dark_law "ccd47-20" holds from {low_k:g} to {high_k:g} K: '
+                    f'{name} = {getattr(self, name):g}; dark_law "ccd47-20" holds from {low_k:g} to {high_k:g} K: '
                     'write such a temperature, or dark_law = "arrhenius"'
                 )
         if self.fixed_pattern == "ccd" and self.column_noise_e > 0:
             raise InputError(
-                'detector: column_noise_e is for CMOS, whose columns have an amplifier each; write fixed_pattern = "cmos", '
+                'column_noise_e is for CMOS, whose columns have an amplifier each; write fixed_pattern = "cmos", '
                 "or column_noise_e = 0"
             )
 
@@ -144,11 +144,11 @@ def _check_setting(name: str, value: Any) -> None:
     if name in choices:
         if value not in choices[name]:
             wanted = " or ".join(f'"{choice}"' for choice in choices[name])
-            raise InputError(f"detector: {name} = {value!r}; write {wanted}")
+            raise InputError(f"{name} = {value!r}; write {wanted}")
         return
     low, high = LIMITS.get(name, (0.0, LARGEST_E))
     if not low <= value <= high:
-        raise InputError(f"detector: {name} = {value:g}; write a number from {low:g} to {high:g}")
+        raise InputError(f"{name} = {value:g}; write a number from {low:g} to {high:g}")
 
 
 class Detector:
@@ -158,7 +158,7 @@ class Detector:
         """`resolution_px` is (width, height). Raises InputError where it is not positive."""
         width, height = resolution_px
         if width < 1 or height < 1:
-            raise InputError(f"detector: resolution {width} x {height} px; write a width and a height of 1 or more")
+            raise InputError(f"resolution {width} x {height} px; write a width and a height of 1 or more")
         self.settings = settings
         self.shape = (height, width)
         prnu, dsnu, hot, dead, column = map(np.random.default_rng, np.random.SeedSequence(settings.device_seed).spawn(5))
@@ -207,18 +207,18 @@ class Detector:
     def _light_e(self, mean_e: npt.ArrayLike, exposure_s: float) -> FloatArray:
         light_e = np.asarray(mean_e)
         if light_e.dtype.kind not in "fiu" or light_e.shape != self.shape:
-            raise InputError(f"detector: electrons of type {light_e.dtype}, shape {light_e.shape}; give numbers, {self.shape}")
+            raise InputError(f"electrons of type {light_e.dtype}, shape {light_e.shape}; give numbers, {self.shape}")
         if not 0 <= exposure_s <= LARGEST_E:
-            raise InputError(f"detector: exposure {exposure_s} s; write 0 or more seconds")
+            raise InputError(f"exposure {exposure_s} s; write 0 or more seconds")
         if not light_e.min() >= 0:  # NaN propagates through min
-            raise InputError("detector: a pixel's electrons are negative or NaN; give expected electrons, 0 or more")
+            raise InputError("a pixel's electrons are negative or NaN; give expected electrons, 0 or more")
         self._check_most(light_e)
         return light_e.astype(np.float64, copy=False)
 
     def _check_most(self, expected_e: npt.NDArray[Any]) -> None:
         most_e = expected_e.max()
         if not most_e <= LARGEST_E:
-            raise InputError(f"detector: {most_e:.3g} electrons in one pixel; {LARGEST_E:g} can be simulated: expose for less")
+            raise InputError(f"{most_e:.3g} electrons in one pixel; {LARGEST_E:g} can be simulated: expose for less")
 
     def _fill_wells(self, collected_e: FloatArray) -> FloatArray:
         full_e = self.settings.full_well_e
@@ -284,7 +284,7 @@ def cosmic_rays_e(
     area_cm2 = width * height * (settings.pixel_pitch_um * 1e-4) ** 2
     expected = settings.cosmic_rays_per_cm2_s * area_cm2 * exposure_s
     if expected > LARGEST_HITS:
-        raise InputError(f"detector: {expected:.3g} cosmic rays in a frame; lower cosmic_rays_per_cm2_s or the exposure")
+        raise InputError(f"{expected:.3g} cosmic rays in a frame; lower cosmic_rays_per_cm2_s or the exposure")
     hits = int(rng.poisson(expected))
     cosine = np.sqrt(1.0 - rng.random(hits))
     azimuth_rad = rng.uniform(0.0, 2 * np.pi, hits)

@@ -10,7 +10,7 @@ from astropy.time import Time
 from astropy.wcs import WCS
 
 from hilstar.attitude.quaternion import from_radec_roll_deg, to_matrix
-from hilstar.bench.output import _world_coordinates
+from hilstar.bench.output import world_coordinates
 from hilstar.sky.astrometry import LIGHT_KM_S, aberrate, unit_vectors_icrs
 from hilstar.sky.catalog import FIELDS, Catalog, load_catalog
 
@@ -97,7 +97,7 @@ def test_pixels_are_those_of_astropy_s_tangent_projection(bench_with, rng):
         sprites = bench.sprites(q)
         vectors = bench.stars.vectors[sprites.star]
         star_ra, star_dec = np.arctan2(vectors[:, 1], vectors[:, 0]), np.arcsin(vectors[:, 2])
-        wcs = WCS({"NAXIS": 2} | _world_coordinates(bench, q))
+        wcs = WCS({"NAXIS": 2} | world_coordinates(bench.camera, q))
         x, y = wcs.all_world2pix(np.degrees(star_ra), np.degrees(star_dec), 0)
         assert len(sprites) > 50
         # Degrees in float64 know a direction to 5e-14 deg; arcsin near the pole to 1e-8 rad, 1e-5 px here.

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hilstar.monitor.photometry import encode, srgb_light, srgb_response
-from hilstar.render.renderer import code_table
+from hilstar.render.encoder import code_table
 
 
 def test_srgb_light_has_the_standard_s_values():

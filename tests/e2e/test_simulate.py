@@ -1,0 +1,121 @@
+"""`hilstar simulate`, as a user types it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from PIL import Image
+
+from tests.conftest import ROOT, SMALL_BENCH, assert_refused, run_hilstar
+
+LYRA = ROOT / "configs" / "thesis-lyra.toml"
+POINTING = ("--radec", "283.021,35.349,0")
+
+
+def simulate(path, *options, bench=LYRA, pointing=POINTING):
+    result = run_hilstar("simulate", bench, *pointing, "-o", path, *options)
+    assert result.returncode == 0, result.stderr
+    with fits.open(path) as hdus:
+        return hdus[0].data.copy(), hdus[0].header.copy(), hdus[1].data.copy()
+
+
+def test_the_fits_has_dn_header_and_truth(tmp_path):
+    dn, header, truth = simulate(tmp_path / "a.fits", "--seed", "7", "--png", tmp_path / "a.png")
+    assert dn.dtype == np.uint16
+    assert dn.shape == (1024, 1024)
+    wanted = {"BUNIT": "adu", "EXPTIME": 5.0, "SEED": 7, "DEVSEED": 0, "NOISE": "full", "GAIN": 24.0, "EPOCHJYR": 2000.0}
+    assert {key: header[key] for key in wanted} == wanted
+    assert len(header["BENCHSHA"]) == 64
+    assert header["RA_PNT"] == pytest.approx(283.021, abs=1e-9)
+    assert list(truth.names) == ["hip", "x_px", "y_px", "v_mag", "bv", "temperature_k", "electrons_per_s", "drawn", "clipped"]
+    # Background and dark: 3000 e- and 203 e-/s for 5 s, at 24 e-/DN.
+    assert np.median(dn) == pytest.approx((3000 + 203 * 5) / 24, abs=1.0)
+    vega = truth[truth["hip"] == 91262][0]
+    assert vega["clipped"]
+    assert dn[round(vega["y_px"]), round(vega["x_px"])] == 2917  # 70 000 e- / 24
+    assert np.array(Image.open(tmp_path / "a.png")).std() > 5
+
+
+def test_seeds_make_the_image_and_nothing_else_does(tmp_path):
+    first, *_ = simulate(tmp_path / "a.fits", "--seed", "1")
+    again, *_ = simulate(tmp_path / "b.fits", "--seed", "1")
+    other, *_ = simulate(tmp_path / "c.fits", "--seed", "2")
+    clean, header, _ = simulate(tmp_path / "d.fits", "--noise", "none")
+    assert np.array_equal(first, again)
+    assert (first != other).mean() > 0.5
+    assert header["NOISE"] == "none"
+    # Without noise the sky is one level; with it, the mean of many pixels is that level.
+    quiet = clean == np.median(clean)
+    assert quiet.mean() > 0.95
+    assert first[quiet].mean() == pytest.approx(np.median(clean), abs=0.6)  # half a DN of rounding, and 1e-3 of noise
+
+
+def test_a_turn_smears_stars_and_keeps_their_flux(tmp_path):
+    (tmp_path / "bench.toml").write_text(SMALL_BENCH + "[tracker.detector]\ngain_e_per_dn = 1\nfull_well_e = 1e9\nbits = 16\n")
+    options = {"bench": tmp_path / "bench.toml", "pointing": ("--radec", "84.057,-1.2,0")}
+    still, _, truth = simulate(tmp_path / "a.fits", "--noise", "none", **options)
+    turned, header, moved = simulate(tmp_path / "b.fits", "--noise", "none", "--rate", "0,0.3,0", **options)
+    assert header["RATEY"] == pytest.approx(0.3)
+    assert (turned > 0).sum() > 1.3 * (still > 0).sum()
+    bright = truth[(truth["v_mag"] > 3.3) & (truth["v_mag"] < 5) & (truth["x_px"] > 20) & (truth["x_px"] < 1000)]
+    assert len(bright) >= 3
+    for row in bright:
+        x, y = round(row["x_px"]), round(row["y_px"])
+        if abs(y - 512) > 490:
+            continue
+        boxes = [image[y - 8 : y + 9, x - 12 : x + 13].astype(float).sum() for image in (still, turned)]
+        same = moved[moved["hip"] == row["hip"]][0]
+        assert np.hypot(same["x_px"] - row["x_px"], same["y_px"] - row["y_px"]) < 1e-6
+        # 16 bits clip nothing here but what rounding takes from faint wings: half a DN in 425 pixels.
+        assert boxes[1] == pytest.approx(boxes[0], rel=0.01)
+
+
+def test_a_log_is_simulated_over_all_cores(tmp_path):
+    rows = ["t_s,qw,qx,qy,qz", "0,1,0,0,0", "1,0.99999,0.004,0,0.002"]
+    (tmp_path / "log.csv").write_text("\n".join(rows) + "\n")
+    (tmp_path / "bench.toml").write_text(SMALL_BENCH.replace("[1024, 1024]", "[128, 96]"))
+    command = ("simulate", tmp_path / "bench.toml", "--log", tmp_path / "log.csv", "--frames", "6", "--seed", "3")
+    for folder in ("one", "two"):
+        result = run_hilstar(*command, "-o", tmp_path / folder)
+        assert result.returncode == 0, result.stderr
+    files = sorted((tmp_path / "one").glob("exposure_*.fits"))
+    assert len(files) == 6
+    frames = [fits.getdata(path) for path in files]
+    assert all(np.array_equal(a, fits.getdata(tmp_path / "two" / p.name)) for a, p in zip(frames, files, strict=True))
+    rates = [fits.getheader(path)["RATEX"] for path in files]
+    assert rates == pytest.approx([rates[0]] * 6, rel=1e-6)
+    assert abs(rates[0]) == pytest.approx(np.degrees(0.008), rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--radec", "1,2,3"], ["-o OUT.fits"]),
+        (["-o", "x.fits"], ["--radec", "--quaternion"]),
+        (["--radec", "1,2,3", "-o", "x.fits", "--rate", "1"], ["--rate 1", "X,Y,Z"]),
+        (["--radec", "1,2,3", "-o", "x.fits", "--noise", "some"], ["some"]),
+        (["--radec", "1,2,3", "-o", "x.fits", "--seed", "-1"], ["seed"]),
+        (["--log", "none.csv", "-o", "d"], ["none.csv"]),
+        (["--log", "none.csv"], ["-o DIR"]),
+        (["--radec", "1,2,3", "-o", "none/x.fits"], ["cannot be written"]),
+    ],
+)
+def test_a_wrong_simulation_gets_one_line(tmp_path, arguments, words):
+    (tmp_path / "bench.toml").write_text(SMALL_BENCH.replace("[1024, 1024]", "[64, 64]"))
+    assert_refused(run_hilstar("simulate", "bench.toml", *arguments, cwd=tmp_path), 2, *words)
+
+
+@pytest.mark.parametrize(
+    ("keys", "words"),
+    [
+        ("bits = 17", "bits = 17"),
+        ("column_noise_e = 3", "cmos"),
+        ("temperature_k = 5000", "temperature_k"),
+        ('dark_law = "cold"', "dark_law"),
+    ],
+)
+def test_a_wrong_detector_gets_one_line(tmp_path, keys, words):
+    (tmp_path / "bench.toml").write_text(SMALL_BENCH + f"[tracker.detector]\n{keys}\n")
+    result = run_hilstar("simulate", "bench.toml", "--radec", "1,2,3", "-o", "x.fits", cwd=tmp_path)
+    assert_refused(result, 2, "[tracker.detector]", words)

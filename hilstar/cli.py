@@ -7,17 +7,13 @@ import math
 import os
 import sys
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, Literal, NoReturn
 
-import msgspec
 import numpy as np
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from hilstar.console import fail, print_json, progress, report, say
 from hilstar.errors import HilstarError, InputError
 
 app = typer.Typer(
@@ -258,6 +254,41 @@ def simulate_log(
 
 
 @app.command()
+def study(
+    what: Annotated[Literal["models", "outputs", "stability"], typer.Argument(help="Which charts.")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Where they go.")],
+    as_json: Json = False,
+) -> None:
+    """Charts and tables: brightness models, the thesis's outputs, and where methods fail."""
+    from hilstar.bench.output import make_directory
+
+    make_directory(output)
+    with progress(f"study {what}", math.inf):
+        lines, right = study_lines(what, output)
+    if as_json:
+        print_json({"study": what, "right": right, "findings": lines, "directory": str(output)})
+    else:
+        typer.echo("\n".join([*lines, f"figures and tables in {output}"]))
+
+
+def study_lines(what: str, output: Path) -> tuple[list[str], bool]:
+    """Run a study; what it found, and whether everything was right."""
+    if what == "models":
+        from hilstar.study.models import run as run_models
+
+        return [f"{finding.figure}: {finding.text}" for finding in run_models(output)], True
+    if what == "outputs":
+        from hilstar.study.outputs import run as run_outputs
+
+        return run_outputs(output), True
+    from hilstar.study.stability import run as run_stability
+
+    places = run_stability(output)
+    lines = [f"{'right' if p.right else 'WRONG'}  {p.case}: {p.happens} ({p.why})" for p in places]
+    return lines, all(place.right for place in places)
+
+
+@app.command()
 def doctor(as_json: Json = False) -> None:
     """Say what GL, displays, links and files are there, and what is missing."""
     from hilstar.bench.doctor import examine
@@ -290,63 +321,6 @@ def need_headless(command: str, headless: bool) -> None:
     """There is no window in this version."""
     if not headless:
         raise InputError(f"{command}: there is no window in this version; add --headless")
-
-
-def say(line: str) -> None:
-    """A line for the person at the terminal."""
-    typer.echo(line, err=True)
-
-
-def print_json(value: dict[str, Any]) -> None:
-    """The one JSON object of --json."""
-    typer.echo(msgspec.json.encode(value).decode())
-
-
-def report(summary: dict[str, Any], as_json: bool) -> None:
-    """The summary of a run, for a program or a person."""
-    if as_json:
-        print_json(summary)
-        return
-
-    def figure(value: float | None, digits: int = 2) -> str:
-        return "-" if value is None else f"{value:.{digits}f}"
-
-    def spread(name: str) -> str:
-        return " / ".join(figure(summary[name][key]) for key in ("p50", "p99", "max"))
-
-    packets = summary["packets"]
-    refused = ", ".join(f"{reason} {count}" for reason, count in packets["refused_by"].items() if count)
-    lines = {
-        "frames": f"{summary['frames']} in {summary['duration_s']:.2f} s ({figure(summary['fps'], 1)} fps)"
-        f", {summary['missed_frames']} missed, {summary['stale_frames']} stale",
-        "frame time": f"{spread('frame_ms')} ms (p50 / p99 / max), attitude in to codes ready",
-        "attitude age": f"{spread('attitude_age_ms')} ms (p50 / p99 / max) at render",
-        "stars drawn": f"{figure(summary['stars_drawn']['mean'], 0)} mean, {summary['stars_drawn']['max']} max"
-        f", {summary['clipped']['max']} clipped" + "".join(f" HIP {hip}" for hip in summary["clipped"]["hip"][:5]),
-        "packets": f"{packets['received']} received, {packets['refused']} refused" + (f" ({refused})" if refused else ""),
-        "renderer": summary["gl_renderer"],
-    }
-    for name, line in lines.items():
-        typer.echo(f"{name:20}{line}")
-
-
-@contextmanager
-def progress(what: str, total: float) -> Iterator[Callable[[int], None]]:
-    """A bar on a terminal's stderr, nothing elsewhere."""
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        yield lambda done: None
-        return
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True, refresh_per_second=4) as bar:
-        task = bar.add_task(what, total=None if math.isinf(total) else total)
-        yield lambda done: bar.update(task, completed=done)
-
-
-def fail(line: str, code: int) -> NoReturn:
-    """One line on stderr, and out."""
-    print("hilstar: " + " ".join(line.split()), file=sys.stderr)
-    sys.exit(code)
 
 
 def main() -> NoReturn:

@@ -17,7 +17,7 @@ from hilstar.bench.config import BenchConfig, detector_settings, read_config
 from hilstar.errors import InputError
 from hilstar.monitor.geometry import monitor_camera
 from hilstar.render.renderer import Renderer, Target
-from hilstar.scene.smear import Motion, smeared_sprites
+from hilstar.scene.smear import MIDDLE_S, Motion, smeared_sprites
 from hilstar.sky.electrons import Photometry, zodiacal_electrons_per_s_arcsec2
 from hilstar.tracker.detector import Detector
 
@@ -70,7 +70,7 @@ class Simulator:
         return Exposure(motion, dn, mean_e, self._truth(motion, np.unique(sprites.star), mean_e))
 
     def _truth(self, motion: Motion, star: npt.NDArray[np.intp], mean_e: FloatArray) -> npt.NDArray[np.void]:
-        x_px, y_px = self.camera.project(self.stars.vectors[star] @ motion.icrs_to_image(0.0, self.camera).T)
+        x_px, y_px = self.camera.project(self.stars.vectors[star] @ motion.icrs_to_image(MIDDLE_S, self.camera)[0].T)
         truth = truth_table(self.stars, star, x_px, y_px)
         height, width = mean_e.shape
         inside = np.isfinite(x_px) & (np.rint(x_px) >= 0) & (np.rint(x_px) < width)

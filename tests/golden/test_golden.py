@@ -15,7 +15,7 @@ CODE_TOLERANCE = 1
 
 
 def test_orion_s_belt_is_as_it_was(bench_with):
-    bench = bench_with("[render]\nflux_at_white_e_per_s = 1.5e6\n")
+    bench = bench_with('[sky]\nspectrum = "blackbody"\n[render]\nflux_at_white_e_per_s = 1.5e6\n')
     codes = bench.frame(from_radec_roll_deg(84.057, -1.2, 0.0)).codes
     golden = np.array(Image.open(GOLDEN))
     assert golden.shape == (240, 320)

@@ -9,7 +9,7 @@ from hilstar.attitude.quaternion import from_radec_roll_deg, propagate, to_matri
 from hilstar.monitor.geometry import monitor_camera
 from hilstar.render.reference import linear_image
 from hilstar.scene.psf import LARGEST_CUT, footprint_px
-from hilstar.scene.smear import Motion, smeared_sprites
+from hilstar.scene.smear import MIDDLE_S, Motion, smeared_sprites
 from hilstar.scene.sprites import make_sprites
 from tests.unit.test_scene import stars_at
 
@@ -30,7 +30,7 @@ def star_on(pixel, at: Motion, flux=1.0):
     image = np.array(
         [[pixel[0] - CAMERA.principal_point_px[0], pixel[1] - CAMERA.principal_point_px[1], CAMERA.focal_length_px]]
     )
-    return stars_at(image @ at.icrs_to_image(0.0, CAMERA), np.array([flux]))
+    return stars_at(image @ at.icrs_to_image(MIDDLE_S, CAMERA)[0], np.array([flux]))
 
 
 def brute_force(stars, at: Motion, steps: int) -> np.ndarray:

@@ -1,0 +1,71 @@
+"""What the commands print: lines, one JSON object, a summary, a progress bar, a refusal."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, NoReturn
+
+import msgspec
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+
+def say(line: str) -> None:
+    """A line for the person at the terminal."""
+    typer.echo(line, err=True)
+
+
+def print_json(value: dict[str, Any]) -> None:
+    """The one JSON object of --json."""
+    typer.echo(msgspec.json.encode(value).decode())
+
+
+def report(summary: dict[str, Any], as_json: bool) -> None:
+    """The summary of a run, for a program or a person."""
+    if as_json:
+        print_json(summary)
+        return
+
+    def figure(value: float | None, digits: int = 2) -> str:
+        return "-" if value is None else f"{value:.{digits}f}"
+
+    def spread(name: str) -> str:
+        return " / ".join(figure(summary[name][key]) for key in ("p50", "p99", "max"))
+
+    packets = summary["packets"]
+    refused = ", ".join(f"{reason} {count}" for reason, count in packets["refused_by"].items() if count)
+    lines = {
+        "frames": f"{summary['frames']} in {summary['duration_s']:.2f} s ({figure(summary['fps'], 1)} fps)"
+        f", {summary['missed_frames']} missed, {summary['stale_frames']} stale",
+        "frame time": f"{spread('frame_ms')} ms (p50 / p99 / max), attitude in to codes ready",
+        "attitude age": f"{spread('attitude_age_ms')} ms (p50 / p99 / max) at render",
+        "stars drawn": f"{figure(summary['stars_drawn']['mean'], 0)} mean, {summary['stars_drawn']['max']} max"
+        f", {summary['clipped']['max']} clipped" + "".join(f" HIP {hip}" for hip in summary["clipped"]["hip"][:5]),
+        "packets": f"{packets['received']} received, {packets['refused']} refused" + (f" ({refused})" if refused else ""),
+        "renderer": summary["gl_renderer"],
+    }
+    for name, line in lines.items():
+        typer.echo(f"{name:20}{line}")
+
+
+@contextmanager
+def progress(what: str, total: float) -> Iterator[Callable[[int], None]]:
+    """A bar on a terminal's stderr, nothing elsewhere."""
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield lambda done: None
+        return
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True, refresh_per_second=4) as bar:
+        task = bar.add_task(what, total=None if math.isinf(total) else total)
+        yield lambda done: bar.update(task, completed=done)
+
+
+def fail(line: str, code: int) -> NoReturn:
+    """One line on stderr, and out."""
+    print("hilstar: " + " ".join(line.split()), file=sys.stderr)
+    sys.exit(code)

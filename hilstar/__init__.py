@@ -1,7 +1,20 @@
 """hilstar: the stars that a star tracker would see, on a monitor, with the flux that it would collect."""
 
-from hilstar.bench.assembly import Bench, Drawn, Frame, load
-from hilstar.errors import HilstarError, InputError, MachineError
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from hilstar.bench.assembly import Bench, Drawn, Frame, load
+    from hilstar.errors import HilstarError, InputError, MachineError
 
 __version__ = "0.1.0"
 __all__ = ["Bench", "Drawn", "Frame", "HilstarError", "InputError", "MachineError", "load"]
+
+
+def __getattr__(name: str) -> Any:
+    """The public names, imported at their first use: `hilstar doctor` needs no renderer to start."""
+    if name not in __all__:
+        raise AttributeError(f"module 'hilstar' has no attribute {name!r}")
+    from hilstar import errors
+    from hilstar.bench import assembly
+
+    return getattr(assembly if hasattr(assembly, name) else errors, name)

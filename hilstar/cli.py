@@ -7,6 +7,7 @@ import math
 import os
 import sys
 import threading
+import time
 from pathlib import Path
 from typing import Annotated, Any, Literal, NoReturn
 
@@ -18,7 +19,6 @@ from hilstar.errors import HilstarError, InputError
 
 app = typer.Typer(
     add_completion=False,
-    no_args_is_help=True,
     pretty_exceptions_enable=False,
     help="Stars for a star tracker on a bench: attitudes in, frames of code values out.",
 )
@@ -29,6 +29,7 @@ Headless = Annotated[bool, typer.Option("--headless", help="Draw without a windo
 RadecText = Annotated[str | None, typer.Option("--radec", metavar="RA,DEC,ROLL", help="Boresight and roll in degrees, ICRS.")]
 QuaternionText = Annotated[str | None, typer.Option("--quaternion", metavar="W,X,Y,Z", help="q_icrs_to_cam, scalar first.")]
 INTERRUPTED = 130
+LISTEN_SLICE_S = 0.1  # between looks at whether a signal has come
 
 
 @app.command()
@@ -97,7 +98,7 @@ def frame(
 def serve(
     bench_file: BenchFile,
     headless: Headless = False,
-    duration: Annotated[float | None, typer.Option(help="Seconds to run; until Ctrl-C by default.", min=0)] = None,
+    duration: Annotated[float | None, typer.Option(help="Seconds to run; until Ctrl-C by default.", min=0, max=1e8)] = None,
     frames: Annotated[int | None, typer.Option(help="Frames to draw.", min=1)] = None,
     as_json: Json = False,
 ) -> None:
@@ -159,7 +160,7 @@ def send(
     connect: Annotated[bool, typer.Option("--connect", help="Connect (for bind = true in the bench) instead of bind.")] = False,
     radec: RadecText = None,
     count: Annotated[int | None, typer.Option(help="Stop after so many packets.", min=1)] = None,
-    wait: Annotated[float, typer.Option(help="Seconds to wait for a listener.", min=0)] = 30.0,
+    wait: Annotated[float, typer.Option(help="Seconds to wait for a listener.", min=0, max=1e6)] = 30.0,
 ) -> None:
     """Send a log or a spin: the test instrument."""
     from itertools import islice
@@ -172,8 +173,8 @@ def send(
 
     if (log is None) == (spin is None):
         raise InputError("send: give a LOG or --spin AXIS,DEG_PER_S, one of them")
-    if rate is not None and not 0 < rate <= 10_000:
-        raise InputError(f"--rate {rate:g}: write packets a second, up to 10000")
+    if rate is not None and not 1e-3 <= rate <= 10_000:
+        raise InputError(f"--rate {rate:g}: write packets a second, 0.001 to 10000")
     if spin is not None:
         samples = spin_samples(parse_spin(spin), rate or 100.0, parse_radec(radec or "84.057,-1.2,0"))
         total = math.inf
@@ -183,7 +184,7 @@ def send(
     stop = threading.Event()
     with ZmqSender(parse_target(to), bind=not connect) as sender, stop_on_signal(stop):
         say(f"waiting for a listener on {sender.endpoint}")
-        if not sender.wait_for_listener(wait):
+        if not heard(sender, wait, stop):
             say("nobody listens yet; sending all the same")
         with progress("sending", min(total, count or math.inf)) as advance:
             sent = send_samples(sender, islice(samples, count), stop, advance)
@@ -302,6 +303,17 @@ def doctor(as_json: Json = False) -> None:
             typer.echo(f"{mark:8}{check['name']:12}{check['detail']}")
     if not result["ok"]:
         raise typer.Exit(3)
+
+
+def heard(sender: Any, wait_s: float, stop: threading.Event) -> bool:
+    """True once somebody listens; also when stopped, which then ends the sending at once."""
+    deadline_s = time.monotonic() + wait_s
+    while not stop.is_set():
+        if sender.wait_for_listener(min(LISTEN_SLICE_S, max(0.0, deadline_s - time.monotonic()))):
+            return True
+        if time.monotonic() >= deadline_s:
+            return False
+    return True
 
 
 def attitude_of(command: str, radec: str | None, quaternion: str | None) -> Any:

@@ -66,7 +66,7 @@ def bench_with(tmp_path: Path) -> Iterator[Callable[[str], hilstar.Bench]]:
 
 def run_hilstar(*arguments: str | Path, cwd: Path | None = None, timeout: float = 120) -> subprocess.CompletedProcess[str]:
     """The command as a user runs it, in a process of its own."""
-    command = [sys.executable, "-m", "hilstar.cli", *map(str, arguments)]
+    command = [sys.executable, "-m", "hilstar", *map(str, arguments)]
     return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=timeout, check=False, env=os.environ)
 
 

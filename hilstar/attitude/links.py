@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 import time
 from types import TracebackType
@@ -11,7 +12,7 @@ import zmq
 
 from hilstar.errors import InputError
 
-# A flood is held here, not in memory without end; a longer message drops its connection.
+# A flood is held here, not in memory without end; a longer message drops its connection, which is then made anew.
 QUEUE_MESSAGES = 10_000
 LONGEST_MESSAGE_BYTES = 1 << 20
 ENDPOINT_FORM = "write tcp://HOST:PORT, such as tcp://127.0.0.1:5560"
@@ -69,7 +70,10 @@ class ZmqReceiver(_ZmqLink):
     """A SUB socket that takes every message; it connects, or binds with `bind`."""
 
     def __init__(self, endpoint: str, *, bind: bool = False) -> None:
+        self._dropped: zmq.Socket[bytes] | None = None
         super().__init__(zmq.SUB, endpoint, bind=bind)
+        if not bind:
+            self._dropped = self._socket.get_monitor_socket(zmq.EVENT_DISCONNECTED)
 
     def _configure(self) -> None:
         self._socket.setsockopt(zmq.RCVHWM, QUEUE_MESSAGES)
@@ -82,6 +86,7 @@ class ZmqReceiver(_ZmqLink):
         Waits at most `timeout_ms` for the first, and for no other.
         """
         messages: list[tuple[int, bytes]] = []
+        self._connect_anew_if_dropped()
         if self._socket.poll(timeout_ms):
             try:
                 while len(messages) < QUEUE_MESSAGES:
@@ -90,6 +95,23 @@ class ZmqReceiver(_ZmqLink):
             except zmq.Again:
                 pass
         return messages
+
+    def _connect_anew_if_dropped(self) -> None:
+        """libzmq itself reconnects after a lost peer, and never after a message over MAXMSGSIZE."""
+        if self._dropped is None or not self._dropped.poll(0):
+            return
+        while self._dropped.poll(0):
+            self._dropped.recv_multipart()
+        with contextlib.suppress(zmq.ZMQError):  # the ended session may be gone already
+            self._socket.disconnect(self.endpoint)
+        self._socket.connect(self.endpoint)
+
+    def close(self) -> None:
+        """Close the socket and what watches it."""
+        if self._dropped is not None:
+            self._socket.disable_monitor()
+            self._dropped.close(linger=0)
+        super().close()
 
     def wait_for_message(self, timeout_ms: int) -> bool:
         """True once a message waits."""

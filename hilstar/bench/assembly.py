@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -100,7 +101,7 @@ class Bench:
             return Drawn(self.renderer.codes(), 0, ())
         sprites = self.sprites(q_icrs_to_cam)
         self.renderer.draw(sprites)
-        clipped = clipped_sprites(sprites, self._sigma_px, self.flux_at_white_e_per_s)
+        clipped = self._clipped(sprites)
         hip = tuple(int(h) for h in self.stars.hip[sprites.star[clipped]])
         return Drawn(self.renderer.codes(), len(sprites), hip)
 
@@ -119,8 +120,11 @@ class Bench:
         self.renderer.draw(sprites)
         codes, linear = self.renderer.codes().copy(), self.renderer.linear().copy()
         truth = truth_table(self.stars, sprites.star, sprites.x_px, sprites.y_px)
-        truth["clipped"][clipped_sprites(sprites, self._sigma_px, self.flux_at_white_e_per_s)] = True
+        truth["clipped"][self._clipped(sprites)] = True
         return Frame(q, linear, codes, truth[np.argsort(truth["v_mag"], kind="stable")])
+
+    def _clipped(self, sprites: Sprites) -> IntArray:
+        return clipped_sprites(sprites, self._sigma_px, self.flux_at_white_e_per_s, self.camera.resolution_px)
 
     def close(self) -> None:
         """Free the GL context."""
@@ -155,7 +159,7 @@ def checked_quaternion(q: Sequence[float] | FloatArray) -> FloatArray:
     array = np.asarray(q, dtype=np.float64)
     if array.shape != (4,):
         raise InputError(f"quaternion of shape {array.shape}: four numbers w, x, y, z are wanted")
-    norm = float(np.linalg.norm(array))
+    norm = math.hypot(*array)  # without NumPy's warning where it overflows
     if not abs(norm - 1.0) <= NORM_TOLERANCE:
         raise InputError(f"quaternion {array.tolist()}: its norm is {norm:.6g}; write a unit quaternion w, x, y, z")
     return normalise(array)
@@ -213,9 +217,17 @@ def bench_hash(config: BenchConfig, folder: Path) -> str:
     digest = hashlib.sha256(msgspec.json.encode(config, order="sorted"))
     named = (config.tracker.quantum_efficiency, config.tracker.transmission, config.sky.catalogue)
     for name in named:
-        if isinstance(name, str) and name not in (*BUILT_IN_CURVES, "hipparcos") and (folder / name).is_file():
-            digest.update((folder / name).read_bytes())
+        if isinstance(name, str) and name not in (*BUILT_IN_CURVES, "hipparcos"):
+            digest.update(_named_bytes(folder / name))
     return digest.hexdigest()
+
+
+def _named_bytes(path: Path) -> bytes:
+    """A file that the bench names; nothing where there is none, for whoever reads it in earnest says that better."""
+    try:
+        return path.read_bytes()
+    except (OSError, ValueError):
+        return b""
 
 
 def _catalogue_source(sky: SkySettings, folder: Path) -> str | Path:

@@ -15,8 +15,10 @@ from msgspec import Meta
 from hilstar.errors import InputError
 from hilstar.tracker.detector import DetectorSettings
 
-Positive = Annotated[float, Meta(gt=0)]
-NotNegative = Annotated[float, Meta(ge=0)]
+# The limits keep every product of such numbers within float64; no bench comes near them.
+Positive = Annotated[float, Meta(ge=1e-6, le=1e12)]
+NotNegative = Annotated[float, Meta(ge=0, le=1e12)]
+Magnitude = Annotated[float, Meta(ge=-100, le=100)]
 Pixels = Annotated[int, Meta(ge=1, le=32768)]
 Size = tuple[Pixels, Pixels]
 Sigma = tuple[Annotated[float, Meta(ge=0.05)], Annotated[float, Meta(ge=0.05)]]
@@ -80,7 +82,7 @@ class SkySettings(_Table, frozen=True):
 
     catalogue: str = "hipparcos"
     epoch_jyear: Annotated[float, Meta(ge=-10_000, le=10_000)] = 2026.0
-    faintest_v_mag: float = 7.5
+    faintest_v_mag: Magnitude = 7.5
     brightness: Literal["dgs", "ags"] = "dgs"
     spectrum: Literal["blackbody", "pickles"] = "pickles"
     temperature: Literal["ballesteros2012", "wang2021"] = "ballesteros2012"
@@ -94,7 +96,7 @@ class Monitor(_Table, frozen=True):
 
     resolution_px: Size
     pixel_pitch_um: Positive
-    refresh_hz: Annotated[float, Meta(gt=0, le=1000)] = 60.0
+    refresh_hz: Annotated[float, Meta(ge=0.01, le=1000)] = 60.0
     bits: Annotated[int, Meta(ge=1, le=16)] = 8
     calibration: str = "srgb"
 
@@ -132,7 +134,7 @@ class Background(_Table, frozen=True):
     """[background]: light between the stars, seen by the virtual tracker only."""
 
     electrons_per_px: NotNegative | None = None
-    zodiacal_v_mag_arcsec2: float | None = None
+    zodiacal_v_mag_arcsec2: Magnitude | None = None
     gradient_electrons_across: tuple[float, float] = (0.0, 0.0)
 
 
@@ -168,10 +170,12 @@ def read_config(path: Path) -> BenchConfig:
         tables = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); give the path of a bench file") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(f"{path}: not TOML: {error}") from error
     try:
         config = msgspec.convert(_finite(tables, path), BenchConfig)
+    except RecursionError as error:
+        raise InputError(f"{path}: its tables are nested too deep; see configs/README.md") from error
     except msgspec.ValidationError as error:
         raise InputError(f"{path}: {_explain(str(error), tables)}") from error
     _check_meaning(config, path)

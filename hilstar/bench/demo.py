@@ -98,7 +98,7 @@ def run_demo(directory: Path, duration_s: float, rng: np.random.Generator, watch
                 kept[shown.number] = shown.drawn.codes.copy()
             watch(shown)
 
-        command = [sys.executable, "-m", "hilstar.cli", "send", str(log_path), "--to", link.endpoint, "--connect"]
+        command = [sys.executable, "-m", "hilstar", "send", str(log_path), "--to", link.endpoint, "--connect"]
         with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as sender:
             try:
                 link.wait_for_message(timeout_ms=20_000)

@@ -118,7 +118,7 @@ def write_truth_csv(path: Path, frame: Frame) -> None:
 def write_codes_png(path: Path, codes: Codes, bits: int) -> None:
     """The code values: 8 bit, or 16 bit for deeper monitors, left-aligned. Shallower ones stay as they are."""
     image = codes if bits <= 8 else np.asarray(codes << (16 - bits), dtype=np.uint16)
-    _written(path, lambda: Image.fromarray(image).save(path, compress_level=1))
+    _written(path, lambda: Image.fromarray(image).save(path, "PNG", compress_level=1))
 
 
 def write_preview_png(path: Path, codes: Codes) -> None:
@@ -136,14 +136,14 @@ def write_preview_png(path: Path, codes: Codes) -> None:
         disc = np.hypot(*np.meshgrid(reach, reach)) <= radius
         picture = np.maximum(picture, maximum_filter(bright, footprint=disc))
     smooth = gaussian_filter(picture**PREVIEW_POWER, PREVIEW_BLUR_PX)
-    _written(path, lambda: Image.fromarray((255 * np.clip(smooth, 0, 1)).astype(np.uint8)).save(path))
+    _written(path, lambda: Image.fromarray((255 * np.clip(smooth, 0, 1)).astype(np.uint8)).save(path, "PNG"))
 
 
 def write_exposure_png(path: Path, dn: npt.NDArray[np.uint16]) -> None:
     """A picture of a tracker's frame for a person: from its 1 % level to its 99.9 % level, by the square root."""
     low, high = np.percentile(dn, (1, 99.9))
     stretched = np.sqrt(np.clip((dn - low) / max(high - low, 1.0), 0, 1))
-    _written(path, lambda: Image.fromarray((255 * stretched).astype(np.uint8)).save(path))
+    _written(path, lambda: Image.fromarray((255 * stretched).astype(np.uint8)).save(path, "PNG"))
 
 
 def make_directory(path: Path) -> Path:

@@ -15,9 +15,12 @@ from hilstar.attitude.logs import log_timeline
 from hilstar.attitude.packet import AttitudeSample, encode
 from hilstar.attitude.quaternion import from_radec_roll_deg, propagate, rate_between_rad_s
 from hilstar.attitude.timeline import NS_PER_S, Policy
+from hilstar.bench.pacing import wait_until
 from hilstar.errors import InputError
 
 SPIN_AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+FASTEST_SPIN_RAD_S = 1e6
+MOST_RESAMPLED = 10_000_000  # some GB of samples
 SPIN_FORM = "--spin AXIS,DEG_PER_S, AXIS being x, y, z or three numbers (cam axes), such as --spin z,0.5"
 
 
@@ -29,8 +32,8 @@ def parse_spin(text: str) -> FloatArray:
         vector = np.array(SPIN_AXES[axis[0].lower()] if len(axis) == 1 else [float(part) for part in axis])
     except (ValueError, KeyError, IndexError) as error:
         raise InputError(f"--spin {text}: write {SPIN_FORM}") from error
-    length = float(np.linalg.norm(vector))
-    if vector.shape != (3,) or not (math.isfinite(rate) and math.isfinite(length) and length > 0):
+    length = math.hypot(*vector)
+    if len(vector) != 3 or not (abs(rate) <= FASTEST_SPIN_RAD_S and 0 < length < math.inf):
         raise InputError(f"--spin {text}: write {SPIN_FORM}")
     return np.asarray(vector / length * rate)
 
@@ -95,6 +98,8 @@ def log_samples(samples: list[AttitudeSample], rate_hz: float | None) -> Iterato
 def _resampled(samples: list[AttitudeSample], rate_hz: float) -> list[AttitudeSample]:
     timeline = log_timeline(samples, Policy(0, NS_PER_S))
     count = int((samples[-1].t_ns - samples[0].t_ns) * rate_hz / NS_PER_S + 1e-6) + 1
+    if count > MOST_RESAMPLED:
+        raise InputError(f"--rate {rate_hz:g}: makes {count} packets of this log; write a lower rate")
     resampled = []
     for k in range(count):
         t_ns = samples[0].t_ns + round(k * NS_PER_S / rate_hz)
@@ -118,8 +123,7 @@ def send(
     count = 0
     for sample in samples:
         due_ns = start_ns + sample.t_ns
-        wait_s = (due_ns - time.monotonic_ns()) / NS_PER_S
-        if wait_s > 0 and stop.wait(wait_s):
+        if wait_until(due_ns, stop):
             break
         stamped = AttitudeSample(due_ns, sample.q_icrs_to_cam, sample.rate_cam_rad_s, sample.sequence, sample.discontinuity)
         sender.send(encode(stamped))

@@ -18,6 +18,7 @@ from hilstar.attitude.receiver import PacketCounts, Receiver
 from hilstar.attitude.timeline import NS_PER_MS, NS_PER_S, Attitude, Policy, Timeline
 from hilstar.bench.assembly import Bench, Drawn
 from hilstar.bench.config import AttitudeSettings
+from hilstar.bench.pacing import wait_until
 from hilstar.bench.stats import RunStats
 from hilstar.errors import InputError
 
@@ -78,8 +79,7 @@ class FrameLoop:
         start_ns = time.monotonic_ns()
         slot = 0
         while slot < limit.slots and self.stats.frames < limit.frames and not self.stop.is_set():
-            wait_s = (start_ns + slot * period_ns - time.monotonic_ns()) / NS_PER_S
-            if wait_s > 0 and self.stop.wait(wait_s):
+            if wait_until(start_ns + round(slot * period_ns), self.stop):
                 return
             self.draw(slot, time_of(slot, time.monotonic_ns()))
             late = int((time.monotonic_ns() - start_ns) // period_ns)
@@ -127,14 +127,15 @@ def serve(bench: Bench, link: ZmqReceiver, limit: Limit, sink: FrameSink = _igno
     timeline = Timeline(policy_of(bench.config.attitude))
     receiver = Receiver(link, timeline)
     loop = FrameLoop(bench, timeline, sink)
-    receiver.start()
-    bench.warm_up()
-    begin_ns = time.monotonic_ns()
-    try:
-        with stop_on_signal(loop.stop):
-            loop.paced(bench.config.monitor.refresh_hz, limit, lambda slot, host_ns: receiver.clock.to_sender_ns(host_ns))
-    finally:
-        receiver.close()
+    with stop_on_signal(loop.stop):
+        receiver.start()
+        try:
+            bench.warm_up()
+            begin_ns = time.monotonic_ns()
+            refresh_hz = bench.config.monitor.refresh_hz
+            loop.paced(refresh_hz, limit, lambda slot, host_ns: receiver.clock.to_sender_ns(host_ns))
+        finally:
+            receiver.close()
     duration_s = (time.monotonic_ns() - begin_ns) / NS_PER_S
     return loop.stats.summary(duration_s, receiver.counts, bench.renderer.gl_renderer)
 

@@ -85,12 +85,18 @@ def join_sprites(parts: Sequence[Sprites], footprint_px: int) -> Sprites:
     )
 
 
-def clipped_sprites(sprites: Sprites, sigma_px: tuple[float, float], flux_at_white_e_per_s: float) -> IntArray:
-    """Positions of the sprites whose brightest pixel, neighbours' light included, is over white.
+def clipped_sprites(
+    sprites: Sprites, sigma_px: tuple[float, float], flux_at_white_e_per_s: float, resolution_px: tuple[int, int]
+) -> IntArray:
+    """Positions of the sprites whose brightest pixel lies on the image and, neighbours' light included, is over white.
 
     Only a star that alone reaches half of white in a pixel is looked at: two fainter ones on one pixel go unnamed.
     """
     bright = np.flatnonzero(sprites.data["electrons_per_s"] > 0.5 * flux_at_white_e_per_s / peak_share(sigma_px))
+    if not len(bright):
+        return bright
+    x, y = np.rint(sprites.x_px[bright]), np.rint(sprites.y_px[bright])
+    bright = bright[(x >= 0) & (x < resolution_px[0]) & (y >= 0) & (y < resolution_px[1])]
     limit = flux_at_white_e_per_s * (1 + CLIP_TOLERANCE)
     return np.array([i for i in bright if _peak_light(sprites, int(i), sigma_px) > limit], dtype=np.intp)
 

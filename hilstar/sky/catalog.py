@@ -88,7 +88,7 @@ def read_hip_main(path: Path) -> tuple[dict[str, npt.NDArray[np.int64]], int]:
                 steps = _parse_row(row, f"{path}:{line_number}")
                 if steps is not None:
                     rows.append(steps)
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+    except (OSError, ValueError, csv.Error) as error:
         raise InputError(f"{path}: cannot be read as a Hipparcos catalogue ({error})") from error
     if not rows:
         raise InputError(f"{path}: holds no star with position, V and B-V; give the CDS I/239 hip_main.dat")
@@ -97,6 +97,7 @@ def read_hip_main(path: Path) -> tuple[dict[str, npt.NDArray[np.int64]], int]:
 
 
 MISSING = np.iinfo(np.int64).min
+LARGEST_STEPS = 10**12  # a right ascension of 360 degrees is 3.6e10
 
 
 def _parse_row(row: list[str], where: str) -> list[int] | None:
@@ -112,6 +113,8 @@ def _parse_row(row: list[str], where: str) -> list[int] | None:
             continue
         try:
             steps[name] = round(float(text) * per_unit)
+            if abs(steps[name]) > LARGEST_STEPS:
+                raise OverflowError
         except (ValueError, OverflowError) as error:
             raise InputError(f"{where}: field {column} ({name}) is {text!r}; a number is wanted") from error
     return list(steps.values())

@@ -168,6 +168,10 @@ def tabulate(model: BrightnessModel, optics: Optics, photometry: Photometry) -> 
         return RateTable(Chebyshev([np.log(ags_electrons_per_s(optics, photometry))], domain=domain))
 
     def log_rate(inverse_k: FloatArray) -> FloatArray:
-        return np.log(dgs_electrons_per_s(1.0 / inverse_k, optics, photometry))
+        with np.errstate(divide="ignore"):
+            return np.log(dgs_electrons_per_s(1.0 / inverse_k, optics, photometry))
 
-    return RateTable(Chebyshev.interpolate(log_rate, TABLE_DEGREE, domain=domain))
+    table = Chebyshev.interpolate(log_rate, TABLE_DEGREE, domain=domain)
+    if not np.isfinite(table.coef).all():
+        raise InputError("tracker: detects no light of the coolest stars at all; give a quantum efficiency that reaches 400 nm")
+    return RateTable(table)

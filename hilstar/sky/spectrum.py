@@ -61,10 +61,17 @@ def load_curve(source: str | float, what: str, folder: Path = DATA_DIR) -> Curve
     if source in BUILT_IN_CURVES:
         return read_curve_csv(DATA_DIR / f"{source}.csv")
     path = folder / source
-    if not path.is_file():
+    if not _is_file(path):
         names = ", ".join(f'"{name}"' for name in BUILT_IN_CURVES[:3])
         raise InputError(f"{what} = {source!r}: no such built-in or file {path}; write {names}, a CSV path or a number")
     return read_curve_csv(path)
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except (OSError, ValueError):  # a name too long, or with a NUL
+        return False
 
 
 def read_curve_csv(path: Path) -> Curve:
@@ -84,7 +91,7 @@ def read_curve_csv(path: Path) -> Curve:
                     raise InputError(f"{path}:{number}: {','.join(row)!r}; write wavelength_nm,value") from error
                 wavelength_nm.append(pair[0])
                 value.append(pair[1])
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path}: cannot be read ({error})") from error
     curve = Curve(np.array(wavelength_nm), np.array(value))
     _check_curve(curve, path)

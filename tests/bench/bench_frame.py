@@ -100,7 +100,7 @@ def measure(bench: hilstar.Bench, q: np.ndarray, rounds: int) -> None:
     gl = bench.renderer
     width, height = bench.config.monitor.resolution_px
     sprites = bench.sprites(q)
-    sigma = bench.config.render.sprite_sigma_px
+    sigma, white = bench.config.render.sprite_sigma_px, bench.flux_at_white_e_per_s
     icrs_to_image = bench.camera.cam_to_image @ to_matrix(q)
     difference = np.abs(numpy_linear(sprites, sigma[0], (height, width)) - bench.frame(q).linear).max()
     assert difference < 1e-5 * sprites.data["electrons_per_s"].max()
@@ -109,7 +109,7 @@ def measure(bench: hilstar.Bench, q: np.ndarray, rounds: int) -> None:
             "whole frame": lambda: bench.draw(q),
             "numpy linear only": lambda: numpy_linear(sprites, sigma[0], (height, width)),
             "  cull, project, pack": lambda: make_sprites(bench.stars, icrs_to_image, bench.camera, gl.footprint_px),
-            "  all Python outside GL": lambda: clipped_sprites(bench.sprites(q), sigma, bench.flux_at_white_e_per_s),
+            "  all Python outside GL": lambda: clipped_sprites(bench.sprites(q), sigma, white, (width, height)),
             "  draw (GL)": lambda: gl.draw(sprites),
             "  read codes (waits for GL)": gl.codes,
         },

@@ -5,8 +5,10 @@ from __future__ import annotations
 import csv
 import json
 import os
+import signal
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -149,6 +151,12 @@ def test_the_average_model_can_be_chosen(tmp_path, small_bench_file):
         (["send", "--spin", "z,1", "--to", "tcp://127.0.0.1:70000"], ["tcp://HOST:PORT"]),
         (["send", "--spin", "z,1", "--rate", "0"], ["--rate 0"]),
         (["nonsense"], ["nonsense", "--help"]),
+        ([], ["--help"]),
+        (["frame", "BENCH", "--quaternion", "1e308,1e308,0,0", "-o", "x.fits"], ["its norm is"]),
+        (["serve", "BENCH", "--headless", "--duration", "inf"], ["--duration"]),
+        (["send", "--spin", "z,1e300"], ["AXIS,DEG_PER_S"]),
+        (["send", "--spin", "z,1", "--rate", "1e-300"], ["--rate"]),
+        (["send", "--spin", "z,1", "--wait", "inf"], ["--wait"]),
         (["frame"], ["BENCH.toml"]),
         (["serve", "BENCH", "--headless", "--duration", "x"], ["--duration", "number"]),
         (["serve", "BENCH", "--unknown"], ["--unknown"]),
@@ -230,6 +238,26 @@ def test_an_unwritable_directory_is_refused(tmp_path, small_bench_file):
 
 
 def test_output_to_a_closed_pipe_leaves_no_traceback():
-    command = f"{sys.executable} -m hilstar.cli doctor | true"
+    command = f"{sys.executable} -m hilstar doctor | true"
     result = subprocess.run(["bash", "-c", command], capture_output=True, text=True, env=os.environ, check=False)
     assert "Traceback" not in result.stderr
+
+
+def test_a_png_is_a_png_whatever_its_name(tmp_path, small_bench_file):
+    result = run_hilstar("frame", small_bench_file, "--radec", "84,-1,0", "--codes", "codes", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert (tmp_path / "codes").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_ctrl_c_at_any_moment_leaves_no_traceback(tmp_path, small_bench_file):
+    """While it starts, while it waits for a listener, while it serves."""
+    commands = (["send", "--spin", "z,1", "--to", "tcp://127.0.0.1:5573"], ["serve", str(small_bench_file), "--headless"])
+    for command in commands:
+        for delay_s in (0.05, 0.15, 0.4, 1.2):
+            process = subprocess.Popen(
+                [sys.executable, "-m", "hilstar", *command], stderr=subprocess.PIPE, stdout=subprocess.PIPE
+            )
+            time.sleep(delay_s)
+            process.send_signal(signal.SIGINT)
+            _, err = process.communicate(timeout=10)
+            assert b"Traceback" not in err or delay_s < 0.1, err  # Python's own start is not ours to guard

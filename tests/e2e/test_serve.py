@@ -52,7 +52,7 @@ def serving(tmp_path, port: int, *options: str, attitude: str = "", monitor: str
     bench = tmp_path / "serve.toml"
     text = SMALL_BENCH.replace("[collimator]", f"{monitor}\n[collimator]")
     bench.write_text(f'{text}\n[attitude]\nendpoint = "tcp://127.0.0.1:{port}"\n{attitude}\n')
-    command = [sys.executable, "-m", "hilstar.cli", "serve", str(bench), "--headless", "--json", *options]
+    command = [sys.executable, "-m", "hilstar", "serve", str(bench), "--headless", "--json", *options]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ) as process:
         try:
             assert process.stderr is not None
@@ -122,6 +122,44 @@ def test_json_and_multipart_messages_are_taken(tmp_path):
         process.send_signal(signal.SIGINT)
         packets = summary_of(process)["packets"]
     assert (packets["accepted"], packets["refused_by"]["nan"]) == (3, 1)
+
+
+def test_an_oversized_message_costs_a_connection_and_no_more(tmp_path):
+    """2 MiB are over the limit: libzmq drops the connection for good, hilstar makes it anew."""
+    with publisher() as (sender, port), serving(tmp_path, port) as process:
+        for k in range(20):
+            sender.send(packet(k, 1_000_000 * k))
+        time.sleep(0.2)
+        sender.send(bytes(2 << 20))
+        time.sleep(1.0)
+        for k in range(20, 120):
+            sender.send(packet(k, 1_000_000 * k))
+            time.sleep(0.005)
+        time.sleep(0.2)
+        process.send_signal(signal.SIGINT)
+        packets = summary_of(process)["packets"]
+    assert packets["accepted"] == 120
+    assert packets["refused"] == 0
+
+
+def test_a_bench_that_closes_and_comes_back_is_heard_again(tmp_path):
+    context = zmq.Context()
+    with publisher() as (sender, port), serving(tmp_path, port) as process:
+        sender.send(packet(0, 1_000_000))
+        time.sleep(0.2)
+        sender.unbind(f"tcp://127.0.0.1:{port}")
+        sender.close(linger=0)
+        time.sleep(0.3)
+        again = context.socket(zmq.PUB)
+        again.bind(f"tcp://127.0.0.1:{port}")
+        time.sleep(1.0)
+        again.send(packet(1, 2_000_000))
+        time.sleep(0.2)
+        process.send_signal(signal.SIGINT)
+        packets = summary_of(process)["packets"]
+        again.close(linger=0)
+    context.term()
+    assert packets["accepted"] == 2
 
 
 def test_a_silent_bench_shows_blank_frames_and_ends_in_order(tmp_path):

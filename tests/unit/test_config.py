@@ -120,8 +120,9 @@ def test_a_missing_key_is_named(tmp_path, key, table):
     ("old", "new", "words"),
     [
         ("aperture_mm = 30", "aperture = 30", "[tracker] unknown key aperture; did you mean aperture_mm?"),
-        ("aperture_mm = 30", "aperture_mm = -30", "[tracker] aperture_mm = -30; number > 0.0 is wanted"),
+        ("aperture_mm = 30", "aperture_mm = -30", "[tracker] aperture_mm = -30; number >= 1e-06 is wanted"),
         ("aperture_mm = 30", 'aperture_mm = "30"', '[tracker] aperture_mm = "30"; number is wanted'),
+        ("aperture_mm = 30", "aperture_mm = 1e200", "[tracker] aperture_mm = 1e200; number <= 1000000000000.0 is wanted"),
         ("aperture_mm = 30", "aperture_mm = true", "[tracker] aperture_mm = true; number is wanted"),
         ("aperture_mm = 30", "aperture_mm = nan", "tracker.aperture_mm = nan; a finite number is wanted"),
         ("[320, 240]", "[320]", "[monitor] resolution_px = [320]; array of length 2 is wanted"),
@@ -150,6 +151,11 @@ def test_what_is_wrong_is_said_with_what_to_write(tmp_path, old, new, words):
 )
 def test_further_tables_are_checked_too(tmp_path, more, words):
     assert words in refusal(tmp_path, SMALL_BENCH + more)
+
+
+@pytest.mark.parametrize("text", ["x = " + "[" * 5000, "x = " + "[" * 900 + "]" * 900, "[" + ".".join(["a"] * 2000) + "]"])
+def test_tables_without_end_are_refused(tmp_path, text):
+    assert refusal(tmp_path, text)
 
 
 def test_a_bench_file_that_is_not_there_is_refused(tmp_path):

@@ -129,6 +129,6 @@ def test_a_star_is_clipped_when_its_peak_is_over_white():
     flux = np.array([1.0, 1.001, 0.9, 0.9])
     stars = stars_on_pixels(camera, pixels, flux)
     sprites = make_sprites(stars, np.eye(3), camera, 10)
-    clipped = stars.hip[sprites.star[clipped_sprites(sprites, SIGMA, white)]]
+    clipped = stars.hip[sprites.star[clipped_sprites(sprites, SIGMA, white, (64, 48))]]
     # 0 is white itself; 1 is over it; 2 and 3 are over it together.
     assert sorted(clipped.tolist()) == [1, 2, 3]

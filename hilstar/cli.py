@@ -339,7 +339,10 @@ def main() -> NoReturn:
     """Run the command line; every refusal is one line on stderr and the exit code of the design's section 5."""
     logging.basicConfig(format="hilstar: %(message)s", stream=sys.stderr)
     try:
-        sys.exit(app(standalone_mode=False) or 0)
+        code = app(standalone_mode=False) or 0
+        if code == INTERRUPTED:  # typer turns Ctrl-C into this code, and says nothing
+            fail("stopped", INTERRUPTED)
+        sys.exit(code)
     except HilstarError as error:
         fail(str(error), error.exit_code)
     except (KeyboardInterrupt, typer.Abort):

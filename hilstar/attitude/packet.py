@@ -31,6 +31,7 @@ CRC = struct.Struct("<I")
 PACKET_BYTES = BODY.size + CRC.size
 LONGEST_JSON_BYTES = 4096
 NORM_TOLERANCE = 1e-3
+FASTEST_RAD_S = 1e6  # no bench turns so fast; beyond, a prediction would overflow
 INT64 = range(-(2**63), 2**63)
 
 Reason = Literal["crc", "norm", "nan", "time", "format"]
@@ -101,6 +102,8 @@ def checked_sample(
     """A sample from raw numbers, or why they are none: every road into hilstar passes here."""
     if not all(map(math.isfinite, (*q, *(rate or ())))):
         return Refusal("nan", "a quaternion or rate component is not finite")
+    if rate is not None and math.hypot(*rate) > FASTEST_RAD_S:
+        return Refusal("format", f"a rate of {math.hypot(*rate):.3g} rad/s; at most {FASTEST_RAD_S:g} is taken")
     norm = math.hypot(*q)
     if abs(norm - 1.0) > NORM_TOLERANCE:
         return Refusal("norm", f"the quaternion's norm is {norm:.6g}; 1 within {NORM_TOLERANCE:g} is wanted")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 import textwrap
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -13,9 +14,11 @@ from hilstar.errors import InputError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
 
-INCH = (9.0, 5.4)  # of one panel
-TITLE_COLUMNS = 95
+INCH = (9.0, 5.4)  # of one panel; each further one adds SHARE of the height
+SHARE = 0.65
+TITLE_COLUMNS = 92
 STYLE: Any = {"font.size": 11, "axes.grid": True, "grid.alpha": 0.3, "legend.frameon": False, "lines.linewidth": 1.8}
 
 
@@ -32,21 +35,36 @@ def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]])
 
 @contextmanager
 def chart(path: Path, finding: str, panels: int = 1) -> Iterator[list[Axes]]:
-    """A PNG with `panels` side by side, titled by its finding; draw on the axes that it yields."""
-    import matplotlib
+    """A PNG with `panels` one above the other, sharing x, titled by its finding; draw on the axes that it yields."""
+    # Not pyplot: it would change the backend of whoever imports this.
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
 
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
+    with rc_context(STYLE):
+        size = INCH[0], INCH[1] * (1 + SHARE * (panels - 1))
+        figure = Figure(figsize=size, layout="constrained")
+        grid = figure.subplots(panels, 1, sharex=True, squeeze=False)
+        yield list(grid[:, 0])
+        figure.suptitle(title_lines(finding), fontsize=12)
+        save(figure, path)
 
-    with pyplot.rc_context(STYLE):
-        figure, grid = pyplot.subplots(1, panels, figsize=(INCH[0] * (1 + 0.6 * (panels - 1)), INCH[1]), squeeze=False)
-        try:
-            yield list(grid[0])
-            figure.suptitle("\n".join(textwrap.wrap(finding, round(TITLE_COLUMNS * (0.5 + 0.5 * panels)))), fontsize=12)
-            figure.tight_layout()
-            save(figure, path)
-        finally:
-            pyplot.close(figure)
+
+def title_lines(finding: str) -> str:
+    """A finding in as few lines as it needs, about equally long, no figure parted from its unit."""
+    bound = re.sub(r"(?<=\d) (?=%|(K|mag|mm)\b)", "\N{NO-BREAK SPACE}", finding)
+
+    def wrapped(columns: int) -> list[str]:
+        return textwrap.wrap(bound, columns, break_on_hyphens=False)
+
+    count = len(wrapped(TITLE_COLUMNS))
+    narrowest = next(w for w in range(len(bound) // count, TITLE_COLUMNS + 1) if len(wrapped(w)) == count)
+    return "\n".join(wrapped(narrowest))
+
+
+def plain_ticks(axis: Axis, values: Sequence[float]) -> None:
+    """Ticks of a logarithmic axis as a person writes them: 3000, not 3 x 10^3."""
+    axis.set_ticks(values, labels=[f"{value:g}" for value in values])
+    axis.set_ticks([], minor=True)
 
 
 def save(figure: Any, path: Path) -> None:

@@ -97,6 +97,7 @@ def test_every_single_bit_error_is_refused():
         (b'{"t_ns": 1, "q": [1,0,0]}', "format"),
         (b'{"t_ns": 1, "q": [NaN,0,0,1]}', "nan"),
         (b'{"t_ns": 1, "q": [2,0,0,0]}', "norm"),
+        (b'{"t_ns": 1, "q": [1,0,0,0], "rate": [1e200,0,0]}', "format"),
         (b'{"t_ns": 9223372036854775808, "q": [1,0,0,0]}', "format"),
         (b'{"t_ns": 1, "q": [1,0,0,0], "x": "' + b"a" * 5000 + b'"}', "format"),
         (b'{"q":' + b"[" * 2000, "format"),

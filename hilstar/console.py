@@ -46,10 +46,25 @@ def report(summary: dict[str, Any], as_json: bool) -> None:
         "stars drawn": f"{figure(summary['stars_drawn']['mean'], 0)} mean, {summary['stars_drawn']['max']} max"
         f", {summary['clipped']['max']} clipped" + "".join(f" HIP {hip}" for hip in summary["clipped"]["hip"][:5]),
         "packets": f"{packets['received']} received, {packets['refused']} refused" + (f" ({refused})" if refused else ""),
-        "renderer": summary["gl_renderer"],
     }
+    if "clock" in summary:
+        absolute = "" if summary["clock"]["mode"] == "exchange" else " above the least"
+        lines["receive latency"] = f"{spread('receive_latency_ms')} ms (p50 / p99 / max){absolute}"
+        lines["bench clock"] = clock_line(summary["clock"])
+    lines["renderer"] = summary["gl_renderer"]
     for name, line in lines.items():
         typer.echo(f"{name:20}{line}")
+
+
+def clock_line(clock: dict[str, Any]) -> str:
+    """How the bench's clock stands to this machine's."""
+    if clock["mode"] == "none":
+        return "nothing heard"
+    known = f"drift {clock['drift_ppm']:.1f} ppm, known to {clock['uncertainty_ms']:.3f} ms"
+    if clock["mode"] == "one-way":
+        known += " and the least delay"
+    jumps = f", {clock['jumps']} jumps" if clock["jumps"] else ""
+    return f"by {clock['mode']}: {known}{jumps}"
 
 
 @contextmanager

@@ -1,40 +1,80 @@
-"""Attitude logs: CSV (`t_s,qw,qx,qy,qz`) and JSON lines (the wire's JSON form, one object a line)."""
+"""Attitude logs: read by what the file holds, written by what its name ends in.
+
+CSV has the columns `t_s,qw,qx,qy,qz` and, where known, `rx,ry,rz` (rad/s), `sequence` and `discontinuity`; JSON lines are the
+wire's JSON form, one object a line; CCSDS AEM is in `aem` and `aem_writer`, MCAP in `mcap_log`.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import csv
-from collections.abc import Iterator
+import io
+import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from decimal import Decimal
 from pathlib import Path
+from typing import IO
 
+import msgspec
+
+from hilstar.attitude.clock import NS_PER_S
 from hilstar.attitude.packet import AttitudeSample, Refusal, checked_sample, decode
-from hilstar.attitude.timeline import NS_PER_S, Policy, Timeline
+from hilstar.attitude.timeline import Policy, Timeline
 from hilstar.errors import InputError
 
 CSV_COLUMNS = ("t_s", "qw", "qx", "qy", "qz")
+RATE_COLUMNS = ("rx", "ry", "rz")
+MCAP_MAGIC = b"\x89MCAP0\r\n"
+# A JSON number that msgspec takes as an integer: what one form of log can hold, all can.
+WHOLE_NUMBERS = range(-(2**63), 2**64)
+LONGEST_QUOTE = 80
+
+Entry = tuple[str, AttitudeSample | Refusal]
 
 
 def read_log(path: Path) -> list[AttitudeSample]:
-    """The samples of a log, in order of time.
+    """The samples of a CSV, JSON lines, CCSDS AEM (KVN or XML) or MCAP file, in order of time; the file's name is no matter.
 
-    Raises InputError with the line number for anything that is not an attitude: nothing is skipped.
+    Raises InputError with the line (AEM in XML: the epoch) for anything that is not an attitude: nothing is skipped.
     """
     samples: list[AttitudeSample] = []
     try:
-        with path.open(encoding="utf-8", newline="") as file:
-            first = file.read(1)
-            file.seek(0)
-            entries = _json_lines(file) if first == "{" else _csv_rows(file, path)
-            for number, entry in entries:
-                if isinstance(entry, Refusal):
-                    raise InputError(f"{path}:{number}: {entry.detail}")
-                if samples and entry.t_ns <= samples[-1].t_ns:
-                    raise InputError(f"{path}:{number}: time does not rise from the line before; sort the log by time")
-                samples.append(entry)
+        entries, advice = _open_log(path)
+        for where, entry in entries:
+            if isinstance(entry, Refusal):
+                raise InputError(f"{path}{where}: {entry.detail}")
+            if samples and entry.t_ns <= samples[-1].t_ns:
+                times = f"t_ns {entry.t_ns} after {samples[-1].t_ns}"
+                raise InputError(f"{path}{where}: time does not rise ({times}); {advice}")
+            samples.append(entry)
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path}: cannot be read as a log ({error})") from error
     if not samples:
         raise InputError(f"{path}: holds no attitude; write a CSV with the header {','.join(CSV_COLUMNS)}, or JSON lines")
     return samples
+
+
+def write_log(path: Path, samples: Sequence[AttitudeSample]) -> None:
+    """Write samples, whose times rise, in the form that the name ends in; an old file is replaced by a whole one or not at all.
+
+    CSV, JSON lines and MCAP give every bit back. An AEM leaves out sequence numbers, and rates that not every sample of a
+    block has. Raises InputError for another ending, for no samples, and when the file cannot be written.
+    """
+    write = _WRITERS.get(path.suffix.lower())
+    if write is None:
+        raise InputError(f"{path}: a log's name ends in one of {', '.join(_WRITERS)}")
+    if not samples:
+        raise InputError(f"{path}: no attitude to write")
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        with part.open("xb") as file:
+            write(file, samples)
+        part.replace(path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror or error})") from error
+    finally:
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
 
 
 def log_timeline(samples: list[AttitudeSample], policy: Policy) -> Timeline:
@@ -45,28 +85,155 @@ def log_timeline(samples: list[AttitudeSample], policy: Policy) -> Timeline:
     return timeline
 
 
-def _json_lines(lines: Iterator[str]) -> Iterator[tuple[int, AttitudeSample | Refusal]]:
+# Reading
+
+
+def _open_log(path: Path) -> tuple[Iterable[Entry], str]:
+    """The entries of a file, and what to do when their times do not rise."""
+    with path.open("rb") as file:
+        head = file.read(len(MCAP_MAGIC))
+        if head == MCAP_MAGIC:
+            return _mcap_entries(path), "the sender restarted here, and a log is one stream"
+        text = (head + file.read()).decode("utf-8-sig")
+    word = _first_word(text)
+    if word.startswith("{"):
+        return _json_entries(io.StringIO(text, newline=None)), "sort the log by time"
+    if word.startswith("<") or word.startswith("CCSDS_AEM_VERS"):
+        advice = "sort its lines, and let blocks not overlap; leap seconds are not counted, so write TAI across one"
+        return _aem_entries(path, text), advice
+    if word.startswith("CCSDS_"):
+        raise InputError(f"{path}: starts with {word[:LONGEST_QUOTE]}; of the CCSDS messages, CCSDS_AEM_VERS is read")
+    return _csv_entries(io.StringIO(text, newline="")), "sort the log by time"
+
+
+def _first_word(text: str) -> str:
+    """The first word of the first line that is no comment; in an AEM, a JSON object and XML it says which it is."""
+    for line in io.StringIO(text, newline=None):
+        words = line.split(maxsplit=1)
+        if words and words[0] != "COMMENT" and not words[0].startswith("#"):
+            return words[0]
+    return ""
+
+
+def _mcap_entries(path: Path) -> Iterator[Entry]:
+    from hilstar.attitude.mcap_log import read_attitudes
+
+    return ((f", attitude {number}", sample) for number, sample in enumerate(read_attitudes(path), start=1))
+
+
+def _aem_entries(path: Path, text: str) -> list[Entry]:
+    from hilstar.attitude.aem import AemFaultError, read_aem
+
+    try:
+        return read_aem(text)
+    except AemFaultError as fault:
+        raise InputError(f"{path}{fault.where}: {fault}") from fault
+
+
+def _json_entries(lines: Iterable[str]) -> Iterator[Entry]:
     for number, line in enumerate(lines, start=1):
         if line.strip():
-            yield number, decode(line.strip().encode())
+            event = decode(line.strip().encode())
+            if not isinstance(event, AttitudeSample | Refusal):
+                event = Refusal("format", 'is not an attitude; {"t_ns":..., "q":[w,x,y,z], "rate":[x,y,z]} is wanted')
+            yield f":{number}", event
 
 
-def _csv_rows(lines: Iterator[str], path: Path) -> Iterator[tuple[int, AttitudeSample | Refusal]]:
+def _csv_entries(lines: Iterable[str]) -> Iterator[Entry]:
     reader = csv.reader(lines)
     rows = (row for row in reader if row and not row[0].startswith("#"))
     header = [name.strip() for name in next(rows, [])]
     if not header:
         return
-    missing = [name for name in CSV_COLUMNS if name not in header]
+    needed = CSV_COLUMNS + (RATE_COLUMNS if any(name in header for name in RATE_COLUMNS) else ())
+    missing = [name for name in needed if name not in header]
     if missing:
-        raise InputError(f"{path}:1: column {missing[0]} is missing; the header must have {','.join(CSV_COLUMNS)}")
-    places = [header.index(name) for name in CSV_COLUMNS]
+        detail = f"column {missing[0]} is missing; the header must have {','.join(needed)}"
+        yield f":{reader.line_num}", Refusal("format", detail)
+        return
+    places = {name: header.index(name) for name in (*needed, "sequence", "discontinuity") if name in header}
     for row in rows:
-        try:
-            t_s, *q = (float(row[place]) for place in places)
-            t_ns = round(t_s * NS_PER_S)
-        except (ValueError, IndexError, OverflowError):
-            wanted = f"finite numbers {','.join(CSV_COLUMNS)} are wanted"
-            yield reader.line_num, Refusal("format", f"{','.join(row)!r}; {wanted}")
-            continue
-        yield reader.line_num, checked_sample(t_ns, tuple(q), None)
+        yield f":{reader.line_num}", _csv_sample(row, places)
+
+
+def _csv_sample(row: list[str], places: dict[str, int]) -> AttitudeSample | Refusal:
+    try:
+        cells = {name: row[place].strip() for name, place in places.items()}
+        t_ns = _t_ns(cells["t_s"])
+        q = tuple(float(cells[name]) for name in CSV_COLUMNS[1:])
+        turning = [cells.get(name, "") for name in RATE_COLUMNS]
+        rate = tuple(map(float, turning)) if any(turning) else None
+        sequence = int(cells.get("sequence") or 0)
+        discontinuity = {"": False, "0": False, "1": True}[cells.get("discontinuity", "")]
+        if sequence not in WHOLE_NUMBERS:
+            raise ValueError
+    except (ValueError, LookupError, ArithmeticError):
+        wanted = f"finite numbers {','.join(CSV_COLUMNS)} are wanted"
+        if len(places) > len(CSV_COLUMNS):
+            wanted += ", all of rx,ry,rz or none, a whole number as sequence, 0 or 1 as discontinuity"
+        return Refusal("format", f"{','.join(row)[:LONGEST_QUOTE]!r}; {wanted}")
+    return checked_sample(t_ns, q, rate, sequence, discontinuity)
+
+
+def _t_ns(seconds: str) -> int:
+    """Decimal seconds as nanoseconds, to the nearest; a float of today's Unix time would be off by 100 ns."""
+    value = Decimal(seconds)
+    if not value.is_finite() or value.adjusted() > 40:
+        raise ValueError
+    return int(value.scaleb(9).to_integral_value())
+
+
+# Writing
+
+
+def _write_csv(file: IO[bytes], samples: Sequence[AttitudeSample]) -> None:
+    file.write((",".join((*CSV_COLUMNS, *RATE_COLUMNS, "sequence", "discontinuity")) + "\n").encode())
+    for sample in samples:
+        rate = sample.rate_cam_rad_s
+        numbers = [*map(repr, sample.q_icrs_to_cam.tolist()), *(("", "", "") if rate is None else map(repr, rate.tolist()))]
+        row = (_seconds(sample.t_ns), *numbers, str(sample.sequence), "1" if sample.discontinuity else "0")
+        file.write((",".join(row) + "\n").encode())
+
+
+def _seconds(t_ns: int) -> str:
+    seconds, ns = divmod(abs(t_ns), NS_PER_S)
+    return f"{'-' if t_ns < 0 else ''}{seconds}.{ns:09}"
+
+
+def _write_json_lines(file: IO[bytes], samples: Sequence[AttitudeSample]) -> None:
+    encoder = msgspec.json.Encoder()
+    for sample in samples:
+        form: dict[str, object] = {"t_ns": sample.t_ns, "q": sample.q_icrs_to_cam.tolist()}
+        if sample.rate_cam_rad_s is not None:
+            form["rate"] = sample.rate_cam_rad_s.tolist()
+        form |= {"sequence": sample.sequence, "discontinuity": sample.discontinuity}
+        file.write(encoder.encode(form) + b"\n")
+
+
+def _write_kvn(file: IO[bytes], samples: Sequence[AttitudeSample]) -> None:
+    from hilstar.attitude.aem_writer import aem_text
+
+    file.write(aem_text(samples, xml=False).encode())
+
+
+def _write_xml(file: IO[bytes], samples: Sequence[AttitudeSample]) -> None:
+    from hilstar.attitude.aem_writer import aem_text
+
+    file.write(aem_text(samples, xml=True).encode())
+
+
+def _write_mcap(file: IO[bytes], samples: Sequence[AttitudeSample]) -> None:
+    from hilstar.attitude.mcap_log import write_attitudes
+
+    write_attitudes(file, samples)
+
+
+_WRITERS: dict[str, Callable[[IO[bytes], Sequence[AttitudeSample]], None]] = {
+    ".csv": _write_csv,
+    ".jsonl": _write_json_lines,
+    ".json": _write_json_lines,
+    ".aem": _write_kvn,
+    ".kvn": _write_kvn,
+    ".xml": _write_xml,
+    ".mcap": _write_mcap,
+}

@@ -1,10 +1,10 @@
-"""The attitude packet, and its JSON form: bytes in, frozen events out, no I/O.
+"""The packets of the wire, and the attitude's JSON form: bytes in, frozen events out, no I/O.
 
 Laws:
-1. Every message gives exactly one event: an `AttitudeSample` or a `Refusal`. Nothing raises.
+1. Every message gives exactly one event: a packet or a `Refusal`. Nothing raises.
 2. A sample is finite, its quaternion unit to 1e-15; the sender's was unit to NORM_TOLERANCE.
-3. A 64-byte message that does not start with "{" is accepted only if its CRC-32 is right.
-4. `decode(encode(sample))` gives the sample back, bit for bit where its quaternion is already unit.
+3. A message that does not start with "{" is accepted only if its CRC-32 is right.
+4. `decode(encode(packet))` gives the packet back, bit for bit where a quaternion is already unit.
 
 The layout is that of firmware_protocol/protocol.toml.
 """
@@ -21,18 +21,14 @@ import msgspec
 import numpy as np
 
 from hilstar.arrays import FloatArray
+from hilstar.attitude import protocol
+from hilstar.attitude.protocol import FASTEST_RAD_S, NORM_TOLERANCE, VERSION
 
-VERSION = 1
-KIND_ATTITUDE = 1
-FLAG_RATE_VALID = 1
-FLAG_DISCONTINUITY = 2
-BODY = struct.Struct("<BBHIq4d3f")
 CRC = struct.Struct("<I")
-PACKET_BYTES = BODY.size + CRC.size
 LONGEST_JSON_BYTES = 4096
-NORM_TOLERANCE = 1e-3
-FASTEST_RAD_S = 1e6  # no bench turns so fast; beyond, a prediction would overflow
 INT64 = range(-(2**63), 2**63)
+U32 = 2**32
+UNIT = 1e-15  # so near, a division by the norm would only move the last bit to and fro
 
 Reason = Literal["crc", "norm", "nan", "time", "format"]
 REASONS: tuple[Reason, ...] = ("crc", "norm", "nan", "time", "format")
@@ -57,6 +53,44 @@ class Refusal:
     detail: str
 
 
+@dataclass(frozen=True, slots=True)
+class TimeRequest:
+    """One side asks for the other's time; `t1_ns` is the asker's clock when it left."""
+
+    sequence: int
+    t1_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class TimeReply:
+    """The answer: `t2_ns` when the request came, `t3_ns` when this left, both on the answerer's clock."""
+
+    sequence: int
+    t1_ns: int
+    t2_ns: int
+    t3_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """What goes back to the bench: the last frame shown, when its light leaves the screen (bench clock), and health.
+
+    `health` is the sum of protocol.HEALTH_ bits; `attitude_age_ns` is -1 while there is no attitude.
+    """
+
+    health: int
+    frame: int
+    light_t_ns: int
+    attitude_age_ns: int
+    attitude_sequence: int
+    accepted: int
+    refused: int
+
+
+Packet = AttitudeSample | TimeRequest | TimeReply | Status
+Event = Packet | Refusal
+
+
 class _JsonAttitude(msgspec.Struct):
     t_ns: int
     q: tuple[float, float, float, float]
@@ -68,28 +102,55 @@ class _JsonAttitude(msgspec.Struct):
 _json_decoder = msgspec.json.Decoder(_JsonAttitude)
 
 
-def encode(sample: AttitudeSample) -> bytes:
-    """The 64 bytes of a sample."""
-    rate = sample.rate_cam_rad_s
-    flags = (0 if rate is None else FLAG_RATE_VALID) | (FLAG_DISCONTINUITY if sample.discontinuity else 0)
-    rates = (0.0, 0.0, 0.0) if rate is None else rate
-    body = BODY.pack(VERSION, KIND_ATTITUDE, flags, sample.sequence % 2**32, sample.t_ns, *sample.q_icrs_to_cam, *rates)
+def encode(packet: Packet) -> bytes:
+    """The bytes of a packet; counters are taken modulo 2^32."""
+    match packet:
+        case AttitudeSample():
+            body = _attitude_body(packet)
+        case TimeRequest(sequence, t1_ns):
+            body = protocol.TIME_REQUEST_BODY.pack(VERSION, protocol.KIND_TIME_REQUEST, 0, sequence % U32, t1_ns)
+        case TimeReply(sequence):
+            times = (packet.t1_ns, packet.t2_ns, packet.t3_ns)
+            body = protocol.TIME_REPLY_BODY.pack(VERSION, protocol.KIND_TIME_REPLY, 0, sequence % U32, *times)
+        case Status():
+            counts = (packet.attitude_sequence % U32, packet.accepted % U32, packet.refused % U32)
+            head = (VERSION, protocol.KIND_STATUS, packet.health, packet.frame % U32)
+            body = protocol.STATUS_BODY.pack(*head, packet.light_t_ns, packet.attitude_age_ns, *counts)
     return body + CRC.pack(zlib.crc32(body))
 
 
-def decode(message: bytes) -> AttitudeSample | Refusal:
-    """One message of either form: 64 bytes, or a JSON object that starts with "{"."""
+def _attitude_body(sample: AttitudeSample) -> bytes:
+    rate = sample.rate_cam_rad_s
+    flags = (0 if rate is None else protocol.FLAG_RATE_VALID) | (protocol.FLAG_DISCONTINUITY if sample.discontinuity else 0)
+    head = (VERSION, protocol.KIND_ATTITUDE, flags, sample.sequence % U32, sample.t_ns)
+    return protocol.ATTITUDE_BODY.pack(*head, *sample.q_icrs_to_cam, *((0.0, 0.0, 0.0) if rate is None else rate))
+
+
+def decode(message: bytes) -> Event:
+    """One message of any form: a packet's bytes, or an attitude as a JSON object that starts with "{"."""
     if message[:1] == b"{" or message[:16].lstrip()[:1] == b"{":
         return _decode_json(message)
-    if len(message) != PACKET_BYTES:
-        return Refusal("format", f"{len(message)} bytes; an attitude is {PACKET_BYTES} bytes or a JSON object")
-    if CRC.unpack_from(message, BODY.size)[0] != zlib.crc32(message[: BODY.size]):
+    head = (message[0], message[1]) if len(message) > 1 else (-1, -1)
+    size = protocol.PACKET_BYTES.get(head[1]) if head[0] == VERSION else None
+    if len(message) not in {size, protocol.ATTITUDE_BYTES}:
+        return Refusal("format", f"{len(message)} bytes; an attitude is {protocol.ATTITUDE_BYTES} bytes or a JSON object")
+    if CRC.unpack_from(message, len(message) - CRC.size)[0] != zlib.crc32(message[: -CRC.size]):
         return Refusal("crc", "the CRC-32 does not fit the packet")
-    version, kind, flags, sequence, t_ns, w, x, y, z, *rate = BODY.unpack_from(message)
-    if (version, kind) != (VERSION, KIND_ATTITUDE):
-        return Refusal("format", f"version {version}, kind {kind}; version {VERSION}, kind {KIND_ATTITUDE} is wanted")
-    known_rate = tuple(rate) if flags & FLAG_RATE_VALID else None
-    return checked_sample(t_ns, (w, x, y, z), known_rate, sequence, bool(flags & FLAG_DISCONTINUITY))
+    if len(message) != size:
+        return Refusal("format", f"version {head[0]}, kind {head[1]}; version {VERSION}, kind 1 is wanted")
+    return _decode_body(head[1], message)
+
+
+def _decode_body(kind: int, message: bytes) -> Event:
+    if kind == protocol.KIND_TIME_REQUEST:
+        return TimeRequest(*protocol.TIME_REQUEST_BODY.unpack_from(message)[3:])
+    if kind == protocol.KIND_TIME_REPLY:
+        return TimeReply(*protocol.TIME_REPLY_BODY.unpack_from(message)[3:])
+    if kind == protocol.KIND_STATUS:
+        return Status(*protocol.STATUS_BODY.unpack_from(message)[2:])
+    _, _, flags, sequence, t_ns, w, x, y, z, *rate = protocol.ATTITUDE_BODY.unpack_from(message)
+    known_rate = tuple(rate) if flags & protocol.FLAG_RATE_VALID else None
+    return checked_sample(t_ns, (w, x, y, z), known_rate, sequence, bool(flags & protocol.FLAG_DISCONTINUITY))
 
 
 def checked_sample(
@@ -109,7 +170,9 @@ def checked_sample(
         return Refusal("norm", f"the quaternion's norm is {norm:.6g}; 1 within {NORM_TOLERANCE:g} is wanted")
     if t_ns not in INT64:
         return Refusal("format", f"t_ns {t_ns} does not fit 64 bits")
-    unit = np.array(q, dtype=np.float64) / norm
+    unit = np.array(q, dtype=np.float64)
+    if abs(norm - 1.0) > UNIT:
+        unit /= norm
     return AttitudeSample(t_ns, unit, None if rate is None else np.array(rate, dtype=np.float64), sequence, discontinuity)
 
 

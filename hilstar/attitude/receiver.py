@@ -1,29 +1,65 @@
-"""A thread that takes messages off a link, decodes them, counts them, and fills a timeline."""
+"""A thread that takes what a link brings, counts it, keeps the clock, answers time requests, and fills a timeline."""
 
 from __future__ import annotations
 
 import logging
 import threading
+import time
+from array import array
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from hilstar.attitude.packet import REASONS, Reason, Refusal, decode
-from hilstar.attitude.timeline import ClockOffset, Timeline
+from hilstar.attitude.clock import NS_PER_MS, NS_PER_S, BenchClock
+from hilstar.attitude.jumps import Arrived, JumpFilter
+from hilstar.attitude.packet import (
+    REASONS,
+    AttitudeSample,
+    Event,
+    Packet,
+    Reason,
+    Refusal,
+    Status,
+    TimeReply,
+    TimeRequest,
+)
+from hilstar.attitude.timeline import Timeline
 
-POLL_MS = 50
+POLL_MS = 20
+FIRST_ASKS = 8  # quickly, so that the clock is soon known
+QUICK_ASK_NS = NS_PER_S // 10
+ASK_NS = NS_PER_S // 2
+KEPT_LATENCIES = 1_000_000  # 4 MB: over an hour at 200 Hz
 log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Arrival:
+    """One message: its arrival at the host, what it says, and its bytes as they came."""
+
+    host_ns: int
+    event: Event
+    raw: bytes
 
 
 class Link(Protocol):
     """What a road into hilstar offers."""
 
-    def receive(self, timeout_ms: int) -> list[tuple[int, bytes]]:
-        """Messages that wait: (host time of arrival in ns, bytes)."""
+    two_way: bool
+
+    def receive(self, timeout_ms: int) -> list[Arrival]:
+        """What has come; waits at most `timeout_ms` for the first, and for no other. A lost peer raises nothing."""
+
+    def send(self, packet: Packet) -> None:
+        """Send to the bench, never waiting; lost where nobody listens."""
+
+    def wire_ns(self, packet: Packet) -> int:
+        """How long the wire alone takes for a packet."""
 
 
 @dataclass(slots=True)
 class PacketCounts:
-    """How many messages arrived, and how many of those were refused, by reason."""
+    """How many attitude messages arrived, and how many of those were refused, by reason."""
 
     received: int = 0
     refused_by: dict[Reason, int] = field(default_factory=lambda: dict.fromkeys(REASONS, 0))
@@ -34,14 +70,43 @@ class PacketCounts:
         return sum(self.refused_by.values())
 
 
+# Who wants to know of every attitude message: its arrival, its bytes, what it says, and why it was refused, if it was.
+Watch = Callable[[int, bytes, AttitudeSample | None, Refusal | None], None]
+
+
+def _nobody_watches(host_ns: int, raw: bytes, sample: AttitudeSample | None, refusal: Refusal | None) -> None:
+    """The watch of a run without a ledger."""
+
+
+@dataclass(frozen=True, slots=True)
+class Traffic:
+    """What goes back to the bench on a two-way link: so many statuses a second, and time requests."""
+
+    status_hz: float = 0.0
+    time_requests: bool = False
+
+
+QUIET = Traffic()
+
+
 class Receiver:
     """Runs `link` into `timeline` until closed. Nothing that arrives ends it."""
 
-    def __init__(self, link: Link, timeline: Timeline) -> None:
+    def __init__(self, link: Link, timeline: Timeline, traffic: Traffic = QUIET, watch: Watch = _nobody_watches) -> None:
         self.counts = PacketCounts()
-        self.clock = ClockOffset()
+        self.clock = BenchClock()
+        self.jumps = JumpFilter()
+        self.latency_ms = array("f")
         self._link = link
         self._timeline = timeline
+        self._traffic = traffic
+        self._watch = watch
+        self._status: Status | None = None
+        self._next_status_ns = 0
+        self._asked: dict[int, TimeRequest] = {}
+        self._asks = 0
+        self._jumps_told = 0
+        self._next_ask_ns = 0
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="hilstar-receiver", daemon=True)
 
@@ -54,24 +119,87 @@ class Receiver:
         self._stop.set()
         self._thread.join()
 
+    def bench_ns(self, continuous_ns: int) -> int:
+        """A time of the timeline as the bench's own clock has it."""
+        return continuous_ns - self.jumps.correction_ns
+
     def _run(self) -> None:
         while not self._stop.is_set():
-            for host_ns, message in self._link.receive(POLL_MS):
-                self._take(host_ns, message)
+            for arrival in self._link.receive(POLL_MS):
+                self._take(arrival)
+            now_ns = time.monotonic_ns()
+            self._settle(self.jumps.expire(now_ns))
+            if self._link.two_way:
+                self._talk(now_ns)
+        self._settle(self.jumps.release())
 
-    def _take(self, host_ns: int, message: bytes) -> None:
-        self.counts.received += 1
-        event = decode(message)
-        if not isinstance(event, Refusal):
-            restarts = self._timeline.restarts
-            refusal = self._timeline.add(event, host_ns)
-            if refusal is None:
-                if self._timeline.restarts != restarts:
-                    log.warning("the sender's clock went back for good: its stream is taken up anew")
-                    self.clock.reset()
-                self.clock.observe(event.t_ns, host_ns)
-                return
-            event = refusal
-        self.counts.refused_by[event.reason] += 1
-        if self.counts.refused_by[event.reason] == 1:
-            log.warning("packet refused (%s): %s; further ones are only counted", event.reason, event.detail)
+    def _take(self, arrival: Arrival) -> None:
+        match arrival.event:
+            case AttitudeSample() as sample:
+                self.counts.received += 1
+                self._settle(self.jumps.take(Arrived(sample, arrival.host_ns, arrival.raw)))
+            case TimeRequest(sequence, t1_ns) if self._link.two_way:
+                self._link.send(TimeReply(sequence, t1_ns, arrival.host_ns, time.monotonic_ns()))
+            case TimeReply() as reply if self._link.two_way:
+                self._take_reply(reply, arrival.host_ns)
+            case Refusal() as refusal:
+                self.counts.received += 1
+                self._refuse(arrival.host_ns, arrival.raw, None, refusal)
+            case other:
+                self.counts.received += 1
+                refusal = Refusal("format", f"a {type(other).__name__} packet, which says nothing on this road")
+                self._refuse(arrival.host_ns, arrival.raw, None, refusal)
+
+    def _settle(self, decided: list[Arrived]) -> None:
+        jumps = self.jumps.jumps
+        for arrived in decided:
+            sample, host_ns = arrived.sample, arrived.host_ns
+            refusal = arrived.refusal or self._timeline.add(sample)
+            if refusal is not None:
+                self._refuse(host_ns, arrived.raw, sample, refusal)
+                continue
+            self.clock.observe(sample.t_ns, host_ns)
+            latency_ns = self.clock.latency_ns(sample.t_ns, host_ns)
+            if latency_ns is not None and len(self.latency_ms) < KEPT_LATENCIES:
+                self.latency_ms.append(latency_ns / NS_PER_MS)
+            self._watch(host_ns, arrived.raw, sample, None)
+        if jumps > self._jumps_told:
+            self._jumps_told = jumps
+            log.warning(
+                "the bench's clock jumped: %.3f s in all; its stream is carried on", self.jumps.correction_ns / NS_PER_S
+            )
+
+    def _refuse(self, host_ns: int, raw: bytes, sample: AttitudeSample | None, refusal: Refusal) -> None:
+        self.counts.refused_by[refusal.reason] += 1
+        if self.counts.refused_by[refusal.reason] == 1:
+            log.warning("packet refused (%s): %s; further ones are only counted", refusal.reason, refusal.detail)
+        self._watch(host_ns, raw, sample, refusal)
+
+    def post(self, status: Status) -> None:
+        """The newest status; it leaves when its turn comes."""
+        self._status = status
+
+    def _talk(self, now_ns: int) -> None:
+        if self._traffic.time_requests and now_ns >= self._next_ask_ns:
+            self._ask(now_ns)
+        if self._traffic.status_hz and self._status is not None and now_ns >= self._next_status_ns:
+            status, self._status = self._status, None
+            self._next_status_ns = max(self._next_status_ns + round(NS_PER_S / self._traffic.status_hz), now_ns)
+            self._link.send(status)
+
+    def _ask(self, now_ns: int) -> None:
+        self._asks += 1
+        request = TimeRequest(self._asks, time.monotonic_ns())
+        self._asked = {sequence: asked for sequence, asked in self._asked.items() if self._asks - sequence < FIRST_ASKS}
+        self._asked[self._asks] = request
+        self._next_ask_ns = now_ns + (QUICK_ASK_NS if self._asks < FIRST_ASKS else ASK_NS)
+        self._link.send(request)
+
+    def _take_reply(self, reply: TimeReply, t4_ns: int) -> None:
+        request = self._asked.pop(reply.sequence, None)
+        if request is None or request.t1_ns != reply.t1_ns:
+            return
+        correction_ns = self.jumps.correction_ns
+        bench_ns = (reply.t2_ns + correction_ns, reply.t3_ns + correction_ns)
+        wire_ns = (self._link.wire_ns(request), self._link.wire_ns(reply))
+        self.clock.exchange((request.t1_ns, t4_ns), bench_ns, wire_ns)

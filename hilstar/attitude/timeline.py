@@ -1,39 +1,36 @@
-"""The attitude at any time, from samples: SLERP between them, bounded prediction past the last.
+"""The attitude at any time, from samples: interpolated between them, predicted for a bounded time past the last.
 
-Times are nanoseconds of the sender's clock; `ClockOffset` carries host time across.
+Times are nanoseconds of one continuous clock: the bench's, which `clock` and `jumps` carry across to the host's.
 """
 
 from __future__ import annotations
 
 import threading
 from bisect import bisect_right
-from collections import deque
 from dataclasses import dataclass
 from typing import Literal
 
 from hilstar.arrays import FloatArray
+from hilstar.attitude.clock import NS_PER_S
 from hilstar.attitude.packet import AttitudeSample, Refusal
 from hilstar.attitude.quaternion import propagate, rate_between_rad_s, slerp
 
-NS_PER_MS = 1_000_000
-NS_PER_S = 1_000_000_000
-
 # A live timeline keeps this many samples: 40 s at 200 Hz, far more than a frame looks back.
 LIVE_CAPACITY = 8192
-# A sender that restarts has an earlier clock. After a silence as long as `stale_after`, this many
-# refused samples in a row that rise among themselves are taken as the restart they are.
-RESTART_SAMPLES = 3
+# A stale attitude is fresh again once it is no older than this share of `stale_after`: no flicker at the limit.
+FRESH_AGAIN = 0.5
 
 OnStale = Literal["hold", "blank"]
 
 
 @dataclass(frozen=True, slots=True)
 class Attitude:
-    """An attitude at one time, how old its newest sample is, and whether that is too old to trust."""
+    """An attitude at one time, its newest sample's age and sequence, and whether that is too old to trust."""
 
     q_icrs_to_cam: FloatArray
     age_ns: int
     stale: bool
+    sequence: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,65 +49,70 @@ class Timeline:
         self._capacity = capacity
         self._t_ns: list[int] = []
         self._samples: list[AttitudeSample] = []
-        self._pending: list[AttitudeSample] = []
-        self._newest_host_ns: int | None = None
         self._lock = threading.Lock()
-        self.restarts = 0
 
     def __len__(self) -> int:
         return len(self._samples)
 
-    def add(self, sample: AttitudeSample, host_ns: int | None = None) -> Refusal | None:
-        """Append a sample; a time that does not rise is refused. `host_ns` (when it arrived) lets a restart be seen."""
+    def add(self, sample: AttitudeSample) -> Refusal | None:
+        """Append a sample; one whose time does not rise, a duplicate or one out of order, is refused."""
         with self._lock:
             if self._t_ns and sample.t_ns <= self._t_ns[-1]:
-                newest_ns = self._t_ns[-1]
-                if not self._restarted(sample, host_ns):
-                    return Refusal("time", f"t_ns {sample.t_ns} is not after {newest_ns}, which came before it")
-            self._pending.clear()
+                return Refusal("time", f"t_ns {sample.t_ns} is not after {self._t_ns[-1]}, which came before it")
             self._t_ns.append(sample.t_ns)
             self._samples.append(sample)
-            self._newest_host_ns = host_ns
             if len(self._samples) > 2 * self._capacity:
                 del self._t_ns[: self._capacity], self._samples[: self._capacity]
             return None
 
-    def _restarted(self, sample: AttitudeSample, host_ns: int | None) -> bool:
-        if host_ns is None or self._newest_host_ns is None:
-            return False
-        if self._pending and sample.t_ns <= self._pending[-1].t_ns:
-            self._pending.clear()
-        self._pending.append(sample)
-        silent = host_ns - self._newest_host_ns > self._policy.stale_after_ns
-        if not silent or len(self._pending) < RESTART_SAMPLES:
-            return False
-        self._t_ns.clear()
-        self._samples.clear()
-        self.restarts += 1
-        return True
-
     def at(self, t_ns: int) -> Attitude | None:
         """The attitude at `t_ns`, or None before any sample has come.
 
-        Before the first sample it is the first; past the newest it is predicted with the sample's rate
-        (else that of the last two samples) for at most `max_extrapolation_ns`, and then held.
+        Before the first sample it is the first. Between two it is the C2 blend of both where both have rates, else
+        SLERP; before a discontinuity it stands still. Past the newest it is predicted with the sample's rate (else that
+        of the last two samples) for at most `max_extrapolation_ns`, and then held.
         """
         with self._lock:
             if not self._samples:
                 return None
             i = bisect_right(self._t_ns, t_ns) - 1
-            if i < 0:
-                return Attitude(self._samples[0].q_icrs_to_cam, 0, False)
-            before = self._samples[i]
-            age_ns = t_ns - before.t_ns
-            if i + 1 < len(self._samples):
-                after = self._samples[i + 1]
-                if after.discontinuity:
-                    return Attitude(before.q_icrs_to_cam, age_ns, False)
-                fraction = age_ns / (after.t_ns - before.t_ns)
-                return Attitude(slerp(before.q_icrs_to_cam, after.q_icrs_to_cam, fraction), age_ns, False)
-            previous = self._samples[i - 1] if i else None
-        return self._predict(previous, before, age_ns)
+            near = self._samples[max(i - 1, 0) : i + 3]
+        if i < 0:
+            return Attitude(near[0].q_icrs_to_cam, 0, False, near[0].sequence)
+        place = min(i, 1)
+        newest = near[place]
+        age_ns = t_ns - newest.t_ns
+        if place + 1 < len(near):
+            return Attitude(self._between(near, place, age_ns), age_ns, False, newest.sequence)
+        return self._predict(near[place - 1] if place else None, newest, age_ns)
+
+    def _between(self, near: list[AttitudeSample], place: int, age_ns: int) -> FloatArray:
+        before, after = near[place], near[place + 1]
+        if after.discontinuity:
+            return before.q_icrs_to_cam
+        gap_ns = after.t_ns - before.t_ns
+        rate, rate_after = before.rate_cam_rad_s, after.rate_cam_rad_s
+        # Rates say little about a long gap: carried across it from both sides they overshoot, SLERP cannot.
+        if rate is None or rate_after is None or gap_ns > self._policy.stale_after_ns:
+            return slerp(before.q_icrs_to_cam, after.q_icrs_to_cam, age_ns / gap_ns)
+        forward, backward = age_ns / NS_PER_S, (age_ns - gap_ns) / NS_PER_S
+        bend, bend_after = (self._acceleration_rad_s2(near, k) for k in (place, place + 1))
+        from_before = propagate(before.q_icrs_to_cam, rate + 0.5 * forward * bend, forward)
+        from_after = propagate(after.q_icrs_to_cam, rate_after + 0.5 * backward * bend_after, backward)
+        return slerp(from_before, from_after, smootherstep(age_ns / gap_ns))
+
+    def _acceleration_rad_s2(self, near: list[AttitudeSample], k: int) -> FloatArray:
+        """At sample `k`, from the rates of its neighbours: the same for the intervals on both sides, so the blend is C2."""
+        earlier = k - 1 if k and self._joined(near[k - 1], near[k]) else k
+        later = k + 1 if k + 1 < len(near) and self._joined(near[k], near[k + 1]) else k
+        rate, rate_later = near[earlier].rate_cam_rad_s, near[later].rate_cam_rad_s
+        if rate is None or rate_later is None or earlier == later:
+            raise AssertionError("a sample of a blend has a rate and a neighbour")
+        return (rate_later - rate) / ((near[later].t_ns - near[earlier].t_ns) / NS_PER_S)
+
+    def _joined(self, before: AttitudeSample, after: AttitudeSample) -> bool:
+        known = before.rate_cam_rad_s is not None and after.rate_cam_rad_s is not None
+        return known and not after.discontinuity and after.t_ns - before.t_ns <= self._policy.stale_after_ns
 
     def _predict(self, previous: AttitudeSample | None, newest: AttitudeSample, age_ns: int) -> Attitude:
         stale = age_ns > self._policy.stale_after_ns
@@ -120,42 +122,29 @@ class Timeline:
             if gap_ns <= self._policy.stale_after_ns:
                 rate = rate_between_rad_s(previous.q_icrs_to_cam, newest.q_icrs_to_cam, gap_ns / NS_PER_S)
         if rate is None:
-            return Attitude(newest.q_icrs_to_cam, age_ns, stale)
+            return Attitude(newest.q_icrs_to_cam, age_ns, stale, newest.sequence)
         seconds = min(age_ns, self._policy.max_extrapolation_ns) / NS_PER_S
-        return Attitude(propagate(newest.q_icrs_to_cam, rate, seconds), age_ns, stale)
+        return Attitude(propagate(newest.q_icrs_to_cam, rate, seconds), age_ns, stale, newest.sequence)
 
 
-class ClockOffset:
-    """Host time minus sender's time, by the least delay of the last few seconds.
+def smootherstep(u: float) -> float:
+    """From 0 to 1 with first and second derivatives zero at both ends (Perlin 2002)."""
+    return u * u * u * (10.0 + u * (6.0 * u - 15.0))
 
-    A message is never early, so the smallest (arrival - t_ns) is nearest the truth: it is too large by
-    the least one-way delay, which a one-way stream cannot tell.
-    """
 
-    WINDOW_NS = 10 * NS_PER_S
-    SLOT_NS = NS_PER_S
+class StaleGate:
+    """Stale or not, with hysteresis, and how often it became so."""
 
-    def __init__(self) -> None:
-        self._slots: deque[tuple[int, int]] = deque()
-        self._offset_ns: int | None = None  # one attribute, so that another thread reads a whole value
+    def __init__(self, stale_after_ns: int) -> None:
+        self._fresh_again_ns = FRESH_AGAIN * stale_after_ns
+        self.stale = False
+        self.events = 0
 
-    def observe(self, t_ns: int, host_ns: int) -> None:
-        """Take in one message's time and its arrival."""
-        offset_ns = host_ns - t_ns
-        slot = host_ns // self.SLOT_NS
-        if self._slots and self._slots[-1][0] == slot:
-            self._slots[-1] = (slot, min(self._slots[-1][1], offset_ns))
-        else:
-            self._slots.append((slot, offset_ns))
-        while self._slots and (slot - self._slots[0][0]) * self.SLOT_NS > self.WINDOW_NS:
-            self._slots.popleft()
-        self._offset_ns = min(offset for _, offset in self._slots)
-
-    def reset(self) -> None:
-        """Forget the past: the sender's clock has started anew."""
-        self._slots.clear()
-
-    def to_sender_ns(self, host_ns: int) -> int:
-        """Host time on the sender's clock; before any message, host time itself."""
-        offset_ns = self._offset_ns
-        return host_ns if offset_ns is None else host_ns - offset_ns
+    def update(self, attitude: Attitude | None) -> bool:
+        """True while the attitude is too old; None, before any has come, is no event."""
+        if attitude is None:
+            return True
+        if attitude.stale and not self.stale:
+            self.events += 1
+        self.stale = attitude.stale or (self.stale and attitude.age_ns > self._fresh_again_ns)
+        return self.stale

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import Float32Array, FloatArray, IntArray
-from hilstar.attitude.packet import NORM_TOLERANCE
+from hilstar.attitude.protocol import NORM_TOLERANCE
 from hilstar.attitude.quaternion import normalise, to_matrix
 from hilstar.bench.config import BenchConfig, SkySettings, Tracker, read_config
 from hilstar.errors import InputError

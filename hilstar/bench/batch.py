@@ -10,10 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
+from hilstar.attitude.clock import NS_PER_S
 from hilstar.attitude.logs import log_timeline
 from hilstar.attitude.packet import AttitudeSample
 from hilstar.attitude.quaternion import rate_between_rad_s
-from hilstar.attitude.timeline import NS_PER_S, Policy
+from hilstar.attitude.timeline import Policy
 from hilstar.bench.output import make_directory, write_exposure_fits
 from hilstar.bench.simulation import Noise, Simulator
 from hilstar.scene.smear import Motion

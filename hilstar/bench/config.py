@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal, get_args
 import msgspec
 from msgspec import Meta
 
+from hilstar.attitude.protocol import NORM_TOLERANCE
 from hilstar.errors import InputError
 from hilstar.tracker.detector import DetectorSettings
 
@@ -25,7 +26,6 @@ Sigma = tuple[Annotated[float, Meta(ge=0.05)], Annotated[float, Meta(ge=0.05)]]
 Vector = tuple[float, float, float]
 Rotation = tuple[float, float, float, float]
 
-NORM_TOLERANCE = 1e-3
 TYPE_WORDS = {"float": "number", "int": "whole number", "str": "text", "object": "table", "bool": "true or false"}
 LIGHT_KM_S = 299_792.458
 
@@ -114,9 +114,15 @@ class AttitudeSettings(_Table, frozen=True):
 
     source: Literal["zmq", "serial"] = "zmq"
     endpoint: str = "tcp://127.0.0.1:5560"
-    bind: bool = False
+    bind: bool | None = None
+    lockstep: bool = False
+    curve_secret_key: str | None = None
+    curve_server_key: str | None = None
+    allowed_clients: str | None = None
     port: str = ""
-    baud: Annotated[int, Meta(gt=0)] = 115_200
+    baud: Annotated[int, Meta(gt=0, le=12_000_000)] = 115_200
+    status_hz: Annotated[float, Meta(ge=0, le=1000)] = 10.0
+    time_requests: bool = True
     stale_after_ms: NotNegative = 250.0
     max_extrapolation_ms: NotNegative = 250.0
     on_stale: Literal["hold", "blank"] = "hold"
@@ -250,6 +256,10 @@ def _check_meaning(config: BenchConfig, path: Path) -> None:
         raise InputError(f"{path}: [sky] observer_velocity_km_s is not slower than light; write km/s, ICRS x, y, z")
     if config.background.electrons_per_px is not None and config.background.zodiacal_v_mag_arcsec2 is not None:
         raise InputError(f"{path}: [background] has electrons_per_px and zodiacal_v_mag_arcsec2; write one of them")
+    if config.attitude.source == "serial" and not config.attitude.port:
+        raise InputError(f'{path}: [attitude] source = "serial" needs port; write port = "/dev/ttyUSB0" or the like')
+    if config.attitude.source == "serial" and config.attitude.lockstep:
+        raise InputError(f'{path}: [attitude] lockstep = true is for source = "zmq"; leave one of them out')
     try:
         detector_settings(config.tracker)
     except InputError as error:

@@ -12,12 +12,14 @@ import msgspec
 import numpy as np
 
 from hilstar.arrays import FloatArray
+from hilstar.attitude.clock import NS_PER_S
+from hilstar.attitude.links import ZmqReceiver
 from hilstar.attitude.packet import AttitudeSample
 from hilstar.attitude.quaternion import from_radec_roll_deg, propagate, rate_between_rad_s, slerp
-from hilstar.attitude.timeline import NS_PER_S
 from hilstar.bench.assembly import load
+from hilstar.bench.loop import FrameSink, Limit, Shown
 from hilstar.bench.output import make_directory, write_codes_png, write_preview_png
-from hilstar.bench.server import FrameSink, Limit, Shown, open_link, serve
+from hilstar.bench.server import serve
 from hilstar.monitor.photometry import Codes
 from hilstar.resources import resource_path
 
@@ -87,7 +89,7 @@ def run_demo(directory: Path, duration_s: float, rng: np.random.Generator, watch
     make_directory(directory)
     log_path = directory / SLEW_LOG
     write_log(log_path, slew_samples(duration_s + 1.0, rng))
-    with load(resource_path("configs", "demo.toml")) as bench, open_link(bench.config.attitude) as link:
+    with load(resource_path("configs", "demo.toml")) as bench, ZmqReceiver(bench.config.attitude.endpoint, bind=True) as link:
         frame_count = round(duration_s * bench.config.monitor.refresh_hz)
         wanted = {int(frame_count * part) for part in (0.0625, 0.25, 0.5, 0.9375)}
         kept: dict[int, Codes] = {}

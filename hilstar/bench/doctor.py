@@ -10,9 +10,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any
 
-import zmq
-
-from hilstar.attitude.links import ZmqReceiver, ZmqSender
+from hilstar.attitude.links import ZmqReceiver, ZmqSender, zmq_version
 from hilstar.errors import HilstarError, MachineError
 from hilstar.render.renderer import create_context
 from hilstar.resources import resource_path
@@ -62,10 +60,10 @@ def _zeromq() -> str:
         if not sender.wait_for_listener(2.0):
             raise MachineError("a loopback connection does not come up; allow TCP on 127.0.0.1")
         begin = time.perf_counter()
-        sender.send(b"ping")
+        sender.put(b"ping")
         if not receiver.receive(2000):
             raise MachineError("a loopback message does not arrive; allow TCP on 127.0.0.1")
-        return f"ZeroMQ {zmq.zmq_version()}, loopback message in {(time.perf_counter() - begin) * 1e3:.2f} ms"
+        return f"ZeroMQ {zmq_version()}, loopback message in {(time.perf_counter() - begin) * 1e3:.2f} ms"
 
 
 def _catalogue() -> str:

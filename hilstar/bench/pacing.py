@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 
-from hilstar.attitude.timeline import NS_PER_S
+from hilstar.attitude.clock import NS_PER_S
 
 LONGEST_WAIT_S = 3600.0  # the platform's own limit is some centuries; a wait is begun anew
 

@@ -9,8 +9,8 @@ from types import TracebackType
 from typing import Self
 
 from hilstar.bench.assembly import Bench
+from hilstar.bench.loop import Shown
 from hilstar.bench.output import make_directory, write_codes_png
-from hilstar.bench.server import Shown
 from hilstar.errors import InputError
 
 COLUMNS = ("frame", "t_s", "qw", "qx", "qy", "qz", "stars_drawn", "clipped")

@@ -47,8 +47,8 @@ class RunStats:
             "frames": self.frames,
             "duration_s": duration_s,
             "fps": self.frames / duration_s if duration_s > 0 else None,
-            "frame_ms": _spread(self._frame_ms),
-            "attitude_age_ms": _spread(self._age_ms),
+            "frame_ms": spread(self._frame_ms),
+            "attitude_age_ms": spread(self._age_ms),
             "packets": {
                 "received": counts.received,
                 "accepted": counts.received - counts.refused,
@@ -66,7 +66,8 @@ class RunStats:
         }
 
 
-def _spread(values: array[float]) -> dict[str, float | None]:
+def spread(values: array[float]) -> dict[str, float | None]:
+    """Median, 99th percentile and greatest of some figures; nulls without any."""
     if not values:
         return {"p50": None, "p99": None, "max": None}
     p50, p99, top = np.percentile(np.array(values), [50, 99, 100])

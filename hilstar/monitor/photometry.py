@@ -1,16 +1,24 @@
-"""Code values and light: a monitor's response, and rounding to the nearest code."""
+"""Levels and light: a monitor's response, and rounding to the nearest level."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import Float32Array, FloatArray
+from hilstar.errors import InputError
 
 Codes = npt.NDArray[np.unsignedinteger[Any]]
+Weights = tuple[float, float, float]
+
+# Lights nearer than this to each other (relative) are one level: the renderer's float32 has 6e-8 to a step.
+SAME_LIGHT = 1e-6
+MOST_LEVELS = 2**16  # what uint16 can say
+TRIPLES = 7  # grey k and the six mixed triples above it
 
 
 def srgb_light(signal: FloatArray) -> FloatArray:
@@ -22,20 +30,24 @@ def srgb_light(signal: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class Response:
-    """What light each code makes, and where one code gives way to the next.
+    """What light each level makes, and where one level gives way to the next.
 
-    `light` (2^bits,) is relative to white and rises from 0 to 1. A wanted light from `threshold[k - 1]` up to
-    `threshold[k]` gets code k; the thresholds (2^bits - 1,) are the response at the half codes.
+    A level is a code value or, with bit stealing, a triple of codes. `light` (levels,) is the light above the black level,
+    relative to white above black: 0 at level 0, strictly rising, 1 at white. A wanted light from `threshold[k - 1]` up to
+    `threshold[k]` gets level k; there are (levels - 1,) of them. `black` is the light of level 0 in the same unit.
+    `rgb` (levels, 3) holds the codes of each level; where it is None, level k is code k in all three channels.
     """
 
     bits: int
     light: FloatArray
     threshold: FloatArray
+    black: float = 0.0
+    rgb: npt.NDArray[np.uint16] | None = None
 
     @property
     def white(self) -> int:
-        """The largest code."""
-        return int(2**self.bits - 1)
+        """The largest level."""
+        return len(self.light) - 1
 
     def thresholds_e_per_s(self, flux_at_white_e_per_s: float) -> Float32Array:
         """The thresholds in the unit of the linear image, float32 as the renderer compares them."""
@@ -43,10 +55,65 @@ class Response:
 
 
 def srgb_response(bits: int) -> Response:
-    """The response of an sRGB monitor without black level."""
+    """The response of an sRGB monitor without black level; its thresholds are the light at the half codes."""
     white = 2**bits - 1
     codes = np.arange(2**bits, dtype=np.float64)
     return Response(bits, srgb_light(codes / white), srgb_light((codes[:-1] + 0.5) / white))
+
+
+def gamma_response(bits: int, gamma: float = 2.2) -> Response:
+    """The response of a monitor with a plain power law, without black level; its thresholds are the light at the half codes."""
+    white = 2**bits - 1
+    codes = np.arange(2**bits, dtype=np.float64)
+    return Response(bits, (codes / white) ** gamma, ((codes[:-1] + 0.5) / white) ** gamma)
+
+
+def table_response(bits: int, light: FloatArray, black: float = 0.0) -> Response:
+    """The response of a table of light (2^bits,), 0 to 1 above black; its thresholds lie midway between two lights."""
+    return Response(bits, light, _midway(light), black)
+
+
+def mixed_response(channels: tuple[Response, Response, Response], weights: Weights, black: float = 0.0) -> Response:
+    """The grey response of three channels, each weighed as the tracker sees its primary."""
+    share = np.asarray(weights) / np.sum(weights)
+    light = share @ np.stack([channel.light for channel in channels])
+    return table_response(channels[0].bits, light / light[-1], black)
+
+
+def bit_stealing(channels: tuple[Response, Response, Response], weights: Weights, black: float = 0.0) -> Response:
+    """Levels between the greys: the six triples of codes k and k + 1 between grey k and grey k + 1, by rising light.
+
+    `weights` are the primaries' shares of white as the tracker sees them, any scale. Triples of the same light are one
+    level, so 8 bits have 255 * 7 + 1 levels at most (Tyler 1997, Spatial Vision 10, 369). Raises InputError beyond 13 bits.
+    """
+    bits = channels[0].bits
+    if (2**bits - 1) * TRIPLES + 1 > MOST_LEVELS:
+        raise InputError(f"bit stealing makes more than {MOST_LEVELS} levels of {bits} bits; it is for 13 bits at most")
+    share = np.asarray(weights, dtype=np.float64) / np.sum(weights)
+    steps = np.array(list(product((0, 1), repeat=3)))[:TRIPLES]  # (0, 0, 0) first; (1, 1, 1) is the next grey
+    rgb = (np.arange(2**bits - 1)[:, None, None] + steps).reshape(-1, 3)
+    rgb = np.concatenate([rgb, np.full((1, 3), 2**bits - 1)])
+    light = np.stack([channel.light[codes] for channel, codes in zip(channels, rgb.T, strict=True)], axis=1) @ share
+    order = np.argsort(light, kind="stable")
+    rgb, light = rgb[order], light[order]
+    kept = _distinct(light, grey=(rgb == rgb[:, :1]).all(axis=1))
+    light = light[kept] / light[kept][-1]
+    return Response(bits, light, _midway(light), black, rgb[kept].astype(np.uint16))
+
+
+def _distinct(light: FloatArray, grey: npt.NDArray[np.bool_]) -> npt.NDArray[np.intp]:
+    """The places of lights that rise by more than SAME_LIGHT; a grey stays where it has a twin."""
+    kept: list[int] = []
+    for place, value in enumerate(light):
+        if not kept or value > light[kept[-1]] * (1 + SAME_LIGHT):
+            kept.append(place)
+        elif grey[place]:
+            kept[-1] = place
+    return np.array(kept)
+
+
+def _midway(light: FloatArray) -> FloatArray:
+    return (light[:-1] + light[1:]) / 2
 
 
 def code_dtype(bits: int) -> type[np.uint8] | type[np.uint16]:
@@ -55,7 +122,7 @@ def code_dtype(bits: int) -> type[np.uint8] | type[np.uint16]:
 
 
 def encode(linear_e_per_s: Float32Array, response: Response, flux_at_white_e_per_s: float) -> Codes:
-    """Nearest codes of a linear image, same shape; what is over white becomes white."""
+    """Nearest levels of a linear image, same shape, uint8 up to 256 levels; what is over white becomes white."""
     thresholds = response.thresholds_e_per_s(flux_at_white_e_per_s)
-    codes = np.searchsorted(thresholds, linear_e_per_s, side="right")
-    return codes.astype(np.uint8) if response.bits <= 8 else codes.astype(np.uint16)
+    levels = np.searchsorted(thresholds, linear_e_per_s, side="right")
+    return levels.astype(np.uint8) if len(response.light) <= 256 else levels.astype(np.uint16)

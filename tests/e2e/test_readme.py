@@ -25,7 +25,7 @@ def blocks(language: str) -> list[str]:
 def shape(text: str) -> str:
     """The lines with every figure and name that differs from machine to machine made alike."""
     text = re.sub(r"(?m)^renderer .*$", "renderer", text)
-    return re.sub(r"\d+(\.\d+)?", "N", text)
+    return re.sub(r"-?\d+(\.\d+)?", "N", text)
 
 
 def test_the_first_command_does_the_main_job_in_a_fresh_checkout(tmp_path):

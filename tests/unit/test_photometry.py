@@ -5,7 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hilstar.monitor.photometry import encode, srgb_light, srgb_response
+from hilstar.errors import InputError
+from hilstar.monitor.photometry import (
+    bit_stealing,
+    encode,
+    gamma_response,
+    mixed_response,
+    srgb_light,
+    srgb_response,
+    table_response,
+)
 from hilstar.render.encoder import code_table
 
 
@@ -63,3 +72,57 @@ def test_the_renderer_s_table_counts_thresholds(bits, white, rng):
             break
         codes[more] += 1
     assert np.array_equal(codes, np.searchsorted(thresholds, light, side="right"))
+
+
+def test_gamma_is_a_power_law_with_thresholds_at_half_codes():
+    response = gamma_response(8)
+    assert response.light[128] == pytest.approx((128 / 255) ** 2.2)
+    assert response.threshold[127] == pytest.approx((127.5 / 255) ** 2.2)
+    assert (response.light[0], response.light[-1], response.white, response.black) == (0, 1, 255, 0)
+
+
+def test_a_table_is_rounded_to_the_nearest_light(rng):
+    light = np.sort(rng.uniform(0, 1, 256)) ** 3
+    light = (light - light[0]) / (light[-1] - light[0])
+    wanted = rng.uniform(0, 1, 5000)
+    codes = encode(wanted.astype(np.float32), table_response(8, light), 1.0)
+    nearest = np.abs(wanted[:, None] - light).min(axis=1)
+    assert np.all(np.abs(wanted - light[codes]) <= nearest + 1e-7)  # a float32 tie may go either way
+
+
+def test_bit_stealing_has_six_levels_between_greys():
+    grey = srgb_response(8)
+    response = bit_stealing((grey, grey, grey), (0.2126, 0.7152, 0.0722))
+    assert len(response.light) == 255 * 7 + 1
+    assert np.all(np.diff(response.light) > 0)
+    assert np.all(np.ptp(response.rgb.astype(int), axis=1) <= 1)
+    assert np.array_equal(response.rgb[::7], np.repeat(np.arange(256)[:, None], 3, axis=1))
+    mixed = grey.light[response.rgb] @ [0.2126, 0.7152, 0.0722]
+    assert response.light == pytest.approx(mixed)
+    codes = encode((response.light * 1e6).astype(np.float32), response, 1e6)
+    assert codes.dtype == np.uint16
+    assert np.array_equal(codes, np.arange(1786))
+
+
+@pytest.mark.parametrize(("weights", "levels"), [((1, 1, 1), 255 * 3 + 1), ((1, 0, 0), 256), ((2, 2, 1), 255 * 5 + 1)])
+def test_triples_of_the_same_light_are_one_level_and_greys_stay(weights, levels):
+    grey = gamma_response(8)
+    response = bit_stealing((grey, grey, grey), weights)
+    assert len(response.light) == levels
+    assert np.all(np.diff(response.light) > 0)
+    greys = {tuple(triple) for triple in response.rgb.tolist() if len(set(triple)) == 1}
+    assert len(greys) == 256
+
+
+def test_bit_stealing_beyond_uint16_is_refused():
+    grey = srgb_response(14)
+    with pytest.raises(InputError, match="13 bits"):
+        bit_stealing((grey, grey, grey), (1, 1, 1))
+
+
+def test_channels_are_mixed_as_the_tracker_weighs_them():
+    channels = (gamma_response(8, 2.0), gamma_response(8, 2.2), gamma_response(8, 2.4))
+    mixed = mixed_response(channels, (1, 2, 1), black=0.001)
+    signal = 100 / 255
+    assert mixed.light[100] == pytest.approx((signal**2.0 + 2 * signal**2.2 + signal**2.4) / 4)
+    assert (mixed.light[0], mixed.light[-1], mixed.black) == (0, pytest.approx(1), 0.001)

@@ -1,0 +1,65 @@
+"""Lockstep: one request is one attitude, one frame, one reply. The simulator's time is its own, and may run at any speed."""
+
+from __future__ import annotations
+
+import time
+from array import array
+from typing import Any
+
+from hilstar.attitude.clock import NS_PER_MS, NS_PER_S
+from hilstar.attitude.links import ZmqLockstep
+from hilstar.attitude.packet import AttitudeSample, Event, Refusal, TimeReply, TimeRequest
+from hilstar.attitude.receiver import Arrival, PacketCounts
+from hilstar.attitude.timeline import Attitude
+from hilstar.bench.assembly import Bench
+from hilstar.bench.loop import FrameLoop, Limit, Shown
+from hilstar.bench.stats import spread
+from hilstar.bench.status import StatusMaker
+
+POLL_MS = 50
+
+
+def serve_lockstep(bench: Bench, link: ZmqLockstep, limit: Limit, loop: FrameLoop) -> dict[str, Any]:
+    """Answer requests up to `limit`, or until a signal; the summary. A refused request shows nothing new."""
+    counts = PacketCounts()
+    statuses = StatusMaker()
+    turn_ms = array("f")
+    last = Shown(0, 0, None, bench.draw(None))
+    begin_ns = time.monotonic_ns()
+    end_ns = begin_ns + limit.slots / bench.config.monitor.refresh_hz * NS_PER_S
+    while loop.stats.frames < limit.frames and time.monotonic_ns() < end_ns and not loop.stop.is_set():
+        arrival = link.receive(POLL_MS)
+        if arrival is None:
+            continue
+        if isinstance(arrival.event, TimeRequest):
+            asked = arrival.event
+            link.reply_time(TimeReply(asked.sequence, asked.t1_ns, arrival.host_ns, time.monotonic_ns()))
+            continue
+        counts.received += 1
+        refusal = _refusal(arrival.event)
+        if refusal is not None:
+            counts.refused_by[refusal.reason] += 1
+        else:
+            last = _show(loop, arrival)
+        shown_ns = time.monotonic_ns()
+        link.reply(statuses.status(last, last.t_ns, loop, counts, False), shown_ns, refusal)
+        turn_ms.append((shown_ns - arrival.host_ns) / NS_PER_MS)
+    duration_s = (time.monotonic_ns() - begin_ns) / NS_PER_S
+    summary = loop.stats.summary(duration_s, counts, bench.renderer.gl_renderer)
+    return summary | {"turn_ms": spread(turn_ms), "stale_events": 0}
+
+
+def _refusal(event: Event) -> Refusal | None:
+    if isinstance(event, Refusal):
+        return event
+    if isinstance(event, AttitudeSample):
+        return None
+    return Refusal("format", f"a {type(event).__name__} packet; a request is an attitude, or a time request")
+
+
+def _show(loop: FrameLoop, arrival: Arrival) -> Shown:
+    sample = arrival.event
+    if not isinstance(sample, AttitudeSample):
+        raise TypeError("only an attitude is shown")
+    attitude = Attitude(sample.q_icrs_to_cam, 0, False, sample.sequence)
+    return loop.draw(loop.stats.frames, sample.t_ns, attitude)

@@ -1,0 +1,40 @@
+"""What the bench is told of the frames that it caused."""
+
+from __future__ import annotations
+
+from hilstar.attitude import protocol
+from hilstar.attitude.packet import Status
+from hilstar.attitude.receiver import PacketCounts
+from hilstar.bench.loop import FrameLoop, Shown
+
+
+class StatusMaker:
+    """Makes status packets; `missed` and `refused` are told once each time."""
+
+    def __init__(self) -> None:
+        self._missed = 0
+        self._refused = 0
+
+    def status(self, shown: Shown, light_t_ns: int, loop: FrameLoop, counts: PacketCounts, synchronised: bool) -> Status:
+        """The status after a frame whose light leaves at `light_t_ns` of the bench's clock."""
+        missed, refused = loop.stats.missed_frames, counts.refused
+        attitude = shown.attitude
+        health = {
+            protocol.HEALTH_NO_ATTITUDE: attitude is None and not loop.gate.stale,
+            protocol.HEALTH_STALE: loop.gate.stale,
+            protocol.HEALTH_BLANK: attitude is None,
+            protocol.HEALTH_CLOCK_SYNCHRONISED: synchronised,
+            protocol.HEALTH_MISSED: missed > self._missed,
+            protocol.HEALTH_REFUSED: refused > self._refused,
+            protocol.HEALTH_CLIPPED: bool(shown.drawn.clipped_hip),
+        }
+        self._missed, self._refused = missed, refused
+        return Status(
+            health=sum(bit for bit, is_set in health.items() if is_set),
+            frame=shown.number,
+            light_t_ns=light_t_ns,
+            attitude_age_ns=-1 if attitude is None else attitude.age_ns,
+            attitude_sequence=0 if attitude is None else attitude.sequence,
+            accepted=counts.received - refused,
+            refused=refused,
+        )

@@ -1,0 +1,136 @@
+"""Commands that show stars: demo, frame, serve, replay."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+
+from hilstar.cli.common import LOG_HELP, BenchFile, Headless, Json, QuaternionText, RadecText, app, attitude_of, need_headless
+from hilstar.console import print_json, progress, report, say
+from hilstar.errors import InputError
+
+
+@app.command()
+def demo(
+    output: Annotated[Path, typer.Option("-o", "--output", help="Where the pictures go.")] = Path("hilstar-demo"),
+    duration: Annotated[float, typer.Option(help="Seconds to serve.", min=0.5, max=600)] = 10.0,
+    seed: Annotated[int, typer.Option(help="Seed of the slew's jitter.", min=0)] = 1,
+    as_json: Json = False,
+) -> None:
+    """The main job in one command: real stars, an attitude streamed over a real ZeroMQ socket, frames out."""
+    from hilstar.bench.demo import run_demo
+
+    with progress("serving", duration * 60) as advance:
+        result = run_demo(output, duration, np.random.default_rng(seed), lambda shown: advance(shown.number + 1))
+    report(result.summary, as_json)
+    if not as_json:
+        typer.echo(f"{'pictures':20}{output}/frame_*_codes.png (what the monitor gets), _preview.png (stretched)")
+
+
+@app.command()
+def frame(
+    bench_file: BenchFile,
+    radec: RadecText = None,
+    quaternion: QuaternionText = None,
+    output: Annotated[Path | None, typer.Option("-o", "--output", metavar="OUT.fits", help="Linear image.")] = None,
+    truth: Annotated[Path | None, typer.Option(metavar="OUT.csv", help="A row for each star in view.")] = None,
+    codes: Annotated[Path | None, typer.Option(metavar="OUT.png", help="The code values.")] = None,
+    preview: Annotated[Path | None, typer.Option(metavar="OUT.png", help="A stretched picture for a person.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Draw one frame into files."""
+    from hilstar.bench import output as files
+    from hilstar.bench.assembly import load
+
+    q = attitude_of("frame", radec, quaternion)
+    targets = [path for path in (output, truth, codes, preview) if path is not None]
+    if not targets:
+        raise InputError("frame: nothing to write; add -o OUT.fits, --truth OUT.csv or --codes OUT.png")
+    with load(bench_file) as bench:
+        shot = bench.frame(q)
+        if output is not None:
+            files.write_frame_fits(output, bench, shot)
+        if truth is not None:
+            files.write_truth_csv(truth, shot)
+        if codes is not None:
+            files.write_codes_png(codes, shot.codes, bench.config.monitor.bits)
+        if preview is not None:
+            files.write_preview_png(preview, shot.codes)
+        clipped = shot.truth["hip"][shot.truth["clipped"]].tolist()
+        summary = {
+            "stars": len(shot.truth),
+            "electrons_per_s": float(shot.linear.sum(dtype=np.float64)),
+            "flux_at_white_e_per_s": bench.flux_at_white_e_per_s,
+            "clipped": clipped,
+            "written": [str(path) for path in targets],
+            "gl_renderer": bench.renderer.gl_renderer,
+        }
+    if as_json:
+        print_json(summary)
+    else:
+        names = f", clipped: HIP {', '.join(map(str, clipped))}" if clipped else ""
+        typer.echo(f"{len(shot.truth)} stars{names}; wrote {', '.join(summary['written'])}")
+
+
+@app.command()
+def serve(
+    bench_file: BenchFile,
+    headless: Headless = False,
+    duration: Annotated[float | None, typer.Option(help="Seconds to run; until Ctrl-C by default.", min=0, max=1e8)] = None,
+    frames: Annotated[int | None, typer.Option(help="Frames to draw.", min=1)] = None,
+    as_json: Json = False,
+) -> None:
+    """Show the live attitude stream."""
+    from hilstar.bench.assembly import load
+    from hilstar.bench.loop import Limit
+    from hilstar.bench.server import open_link
+    from hilstar.bench.server import serve as serve_stream
+
+    need_headless("serve", headless)
+    with load(bench_file) as bench, open_link(bench.config.attitude, bench_file.parent) as link:
+        refresh_hz = bench.config.monitor.refresh_hz
+        slots = math.inf if duration is None else round(duration * refresh_hz)
+        limit = Limit(slots, math.inf if frames is None else frames)
+        say(f"{link.verb} {link.endpoint}, {refresh_hz:g} Hz, {bench.renderer.gl_renderer}")
+        with progress("serving", min(limit.slots, limit.frames)) as advance:
+            summary = serve_stream(bench, link, limit, lambda shown: advance(shown.number + 1))
+    report(summary, as_json)
+
+
+@app.command()
+def replay(
+    bench_file: BenchFile,
+    log: Annotated[Path, typer.Argument(metavar="LOG", help=LOG_HELP)],
+    speed: Annotated[str, typer.Option(metavar="realtime|max|N", help="1, at once, or N times real time.")] = "realtime",
+    start: Annotated[float | None, typer.Option(metavar="S", help="Seconds after the log's first sample.")] = None,
+    stop: Annotated[float | None, typer.Option(metavar="S", help="Seconds after the log's first sample.")] = None,
+    step: Annotated[float | None, typer.Option(metavar="S", help="Seconds of the log from frame to frame.")] = None,
+    headless: Headless = False,
+    output: Annotated[Path | None, typer.Option("-o", "--output", metavar="DIR", help="Write each frame there.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Show an attitude log."""
+    from hilstar.bench.assembly import load
+    from hilstar.bench.config import read_config
+    from hilstar.bench.play import Wanted, plan_play
+    from hilstar.bench.recorder import FrameRecorder
+    from hilstar.bench.server import replay as replay_log
+
+    need_headless("replay", headless)
+    play = plan_play(log, Wanted(speed, start, stop, step), read_config(bench_file).monitor.refresh_hz)
+    with (
+        load(bench_file) as bench,
+        FrameRecorder(output, bench) as record,
+        progress("replaying", play.frame_count) as advance,
+    ):
+
+        def sink(shown: Any) -> None:
+            record(shown)
+            advance(shown.number + 1)
+
+        summary = replay_log(bench, play, sink)
+    report(summary, as_json)

@@ -1,0 +1,141 @@
+"""What is known of a monitor's light: its response, uniformity, noise, and where that comes from."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from hilstar.arrays import Float32Array, FloatArray
+from hilstar.errors import InputError
+from hilstar.monitor import photometry
+from hilstar.monitor.calibration_file import beside, is_file, read_grid, read_response, read_toml
+from hilstar.monitor.photometry import Response, Weights, gamma_response, mixed_response, srgb_response, table_response
+
+BUILT_IN = ("srgb", "gamma2.2", "lcd-example")
+EXAMPLE = Path(__file__).resolve().parent / "data" / "lcd-example.toml"
+REC709_WEIGHTS: Weights = (0.2126, 0.7152, 0.0722)  # a photometer's, of the sRGB primaries (IEC 61966-2-1)
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """A monitor's light, and where that knowledge comes from.
+
+    `uniformity` is a coarse grid (rows, columns) of relative light, rows from top to bottom, each value at the middle of its
+    equal share of the screen; None where the light is the same everywhere. `noise` is the relative repeatability of a patch.
+    `weights` are the shares of the primaries in white as the tracker sees them, of sum 1; None where they are not known.
+    `black` of the response is that of the whole screen. `sha256` covers the bytes of every file that was read.
+    """
+
+    name: str
+    response: Response
+    sha256: str
+    uniformity: FloatArray | None = None
+    noise: float = 0.0
+    weights: Weights | None = None
+    who: str = ""
+    when: str = ""
+    instrument: str = ""
+    unit: str = "relative"
+    notes: dict[str, str] = field(default_factory=dict)
+
+    def uniformity_map(self, resolution_px: tuple[int, int]) -> Float32Array | None:
+        """Relative light of each pixel (height, width), 1 at the brightest; None where it is the same everywhere.
+
+        Bilinear between the middles of the grid's fields, and on by the same slope to the edges of the screen.
+        """
+        if self.uniformity is None:
+            return None
+        width, height = resolution_px
+        rows = _weights_of_grid(height, self.uniformity.shape[0])
+        columns = _weights_of_grid(width, self.uniformity.shape[1])
+        light = rows @ self.uniformity @ columns.T
+        smallest = float(self.uniformity.min()) / 2  # a slope carried on must not end below darkness
+        light = np.maximum(light, smallest)
+        return np.asarray(light / light.max(), dtype=np.float32)
+
+
+def _weights_of_grid(pixels: int, fields: int) -> FloatArray:
+    """(pixels, fields): what each field's value counts in each pixel."""
+    if fields == 1:
+        return np.ones((pixels, 1))
+    place = (np.arange(pixels) + 0.5) * fields / pixels - 0.5
+    left = np.clip(np.floor(place).astype(np.intp), 0, fields - 2)
+    weights = np.zeros((pixels, fields))
+    weights[np.arange(pixels), left] = 1 - (place - left)
+    weights[np.arange(pixels), left + 1] = place - left
+    return weights
+
+
+def load_calibration(source: str | Path, bits: int, *, bit_stealing: bool = False) -> Calibration:
+    """The calibration of a built-in name ("srgb", "gamma2.2", "lcd-example") or of a file, for a monitor of `bits`.
+
+    With `bit_stealing` its levels are triples of codes between the greys. Raises InputError for a malformed file, for
+    other bits than the file's, and for bit stealing where the weights of the primaries are not known.
+    """
+    name = str(source)
+    if name in ("srgb", "gamma2.2"):
+        grey = srgb_response(bits) if name == "srgb" else gamma_response(bits)
+        response = photometry.bit_stealing((grey, grey, grey), REC709_WEIGHTS) if bit_stealing else grey
+        digest = hashlib.sha256(f"hilstar built-in {name}, {bits} bits".encode()).hexdigest()
+        return Calibration(name, response, digest, weights=REC709_WEIGHTS, instrument="none: a formula")
+    path = EXAMPLE if name == "lcd-example" else Path(source)
+    if not path.suffix and not is_file(path):
+        raise InputError(
+            f"calibration = {json.dumps(name)}: no such built-in or file; write {', '.join(BUILT_IN)} or FILE.toml"
+        )
+    return _load_file(path, name if name == "lcd-example" else path.name, bits, bit_stealing)
+
+
+def _load_file(path: Path, name: str, bits: int, bit_stealing: bool) -> Calibration:
+    digest = hashlib.sha256()
+    file = read_toml(path, digest)
+    head = file.calibration
+    if head.bits != bits:
+        raise InputError(f"{path}: [calibration] bits = {head.bits}, but the monitor has {bits}; calibrate at {bits} bits")
+    columns = read_response(beside(path, head.response, "[calibration] response"), bits, digest)
+    uniformity = None
+    if file.uniformity is not None:
+        uniformity = read_grid(beside(path, file.uniformity.file, "[uniformity] file"), digest)
+    weights = (file.weights.r, file.weights.g, file.weights.b) if file.weights else None
+    response, shares = _response(path, bits, columns, weights, bit_stealing)
+    return Calibration(
+        name=name,
+        response=response,
+        sha256=digest.hexdigest(),
+        uniformity=uniformity,
+        noise=file.noise.relative if file.noise else 0.0,
+        weights=shares,
+        who=head.who,
+        when=head.when,
+        instrument=head.instrument,
+        unit=head.unit,
+        notes={key: text for key, text in msgspec.structs.asdict(file.notes).items() if text},
+    )
+
+
+def _response(
+    path: Path, bits: int, columns: dict[str, FloatArray], weights: Weights | None, bit_stealing: bool
+) -> tuple[Response, Weights | None]:
+    """The grey (or bit-stealing) response of measured light, and the primaries' shares of white."""
+    whites = {name: float(light[-1] - light[0]) for name, light in columns.items()}
+    if weights is None and "r" in columns:
+        weights = whites["r"], whites["g"], whites["b"]
+    if weights is not None:
+        if not sum(weights) > 0:
+            raise InputError(f"{path}: [weights] r, g and b are all 0; write the primaries' shares of white")
+        weights = weights[0] / sum(weights), weights[1] / sum(weights), weights[2] / sum(weights)
+    black = float(np.mean([light[0] for light in columns.values()])) / sum(whites.values())
+    tables = {name: table_response(bits, (light - light[0]) / whites[name]) for name, light in columns.items()}
+    channels = (tables["w"],) * 3 if "w" in tables else (tables["r"], tables["g"], tables["b"])
+    if bit_stealing and weights is None:
+        raise InputError(f"{path}: bit stealing wants the primaries as the tracker sees them; add [weights] r, g, b")
+    if bit_stealing and weights is not None:
+        return photometry.bit_stealing((channels[0], channels[1], channels[2]), weights, black), weights
+    if "w" in tables or weights is None:
+        return table_response(bits, tables["w"].light, black), weights
+    return mixed_response((channels[0], channels[1], channels[2]), weights, black), weights

@@ -1,0 +1,257 @@
+"""The files of a calibration: TOML and CSV, read, checked and written. Described in configs/CALIBRATION.md."""
+
+from __future__ import annotations
+
+import csv
+import datetime
+import json
+import re
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal, Protocol
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+from scipy.interpolate import PchipInterpolator
+
+from hilstar.arrays import FloatArray
+from hilstar.errors import InputError
+
+BLACKS_AGREE = 0.1  # relative: the three channels' code 0 is one and the same black screen
+LARGEST_FILE_BYTES = 50_000_000
+GREY, PRIMARIES = ("w",), ("r", "g", "b")
+TYPE_WORDS = {"float": "a number", "int": "a whole number", "str": "text", "object": "a table"}
+Share = Annotated[float, Meta(ge=0, le=1e12)]
+
+
+class Digest(Protocol):
+    """What hashlib gives."""
+
+    def update(self, data: bytes, /) -> None:
+        """Take more bytes."""
+
+    def hexdigest(self) -> str:
+        """The hash so far."""
+
+
+class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A table of a calibration file; unknown keys are refused."""
+
+
+class Head(_Table, frozen=True):
+    """[calibration]: who measured what."""
+
+    kind: Literal["photometric"]
+    who: str
+    when: str
+    instrument: str
+    unit: str
+    bits: Annotated[int, Meta(ge=1, le=16)]
+    response: str
+
+
+class WeightsTable(_Table, frozen=True):
+    """[weights]: the primaries as the tracker sees them, any scale."""
+
+    r: Share
+    g: Share
+    b: Share
+
+
+class UniformityTable(_Table, frozen=True):
+    """[uniformity]: where the grid of relative light is."""
+
+    file: str
+
+
+class NoiseTable(_Table, frozen=True):
+    """[noise]: how well a patch repeats."""
+
+    relative: Annotated[float, Meta(ge=0, le=1)]
+
+
+class NotesTable(_Table, frozen=True):
+    """[notes]: free text."""
+
+    warm_up: str = ""
+    drift: str = ""
+    text: str = ""
+
+
+class CalibrationFile(_Table, frozen=True):
+    """A whole calibration file."""
+
+    calibration: Head
+    weights: WeightsTable | None = None
+    uniformity: UniformityTable | None = None
+    noise: NoiseTable | None = None
+    notes: NotesTable = msgspec.field(default_factory=NotesTable)
+
+
+def _read_bytes(path: Path, digest: Digest) -> str:
+    try:
+        if path.stat().st_size > LARGEST_FILE_BYTES:
+            raise InputError(f"{path}: more than {LARGEST_FILE_BYTES // 10**6} MB; this is no calibration file")
+        raw = path.read_bytes()
+        digest.update(raw)
+        return raw.decode("utf-8-sig")
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or "not a text file in UTF-8"
+        raise InputError(f"{path}: cannot be read ({reason}); see configs/CALIBRATION.md") from error
+
+
+def is_file(path: Path) -> bool:
+    """Whether there is such a file, for any text that a user may write."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):  # a name too long, or with a NUL
+        return False
+
+
+def beside(path: Path, name: str, key: str) -> Path:
+    """The path of a file that `path` names, relative to it. Raises InputError where there is none."""
+    other = path.parent / name
+    if not is_file(other):
+        raise InputError(f"{path}: {key} = {json.dumps(name)}; there is no such file beside it")
+    return other
+
+
+def read_toml(path: Path, digest: Digest) -> CalibrationFile:
+    """Read and check a calibration file. Raises InputError: file, key, what is wrong and what to write."""
+    try:
+        tables = tomllib.loads(_read_bytes(path, digest))
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise InputError(f"{path}: not TOML: {error}") from error
+    head = tables.get("calibration")
+    if isinstance(head, dict) and isinstance(head.get("when"), datetime.date):  # TOML has dates of its own
+        head["when"] = str(head["when"])
+    try:
+        return msgspec.convert(tables, CalibrationFile)
+    except (msgspec.ValidationError, RecursionError) as error:
+        raise InputError(f"{path}: {_explain(str(error), tables)}") from error
+
+
+def _explain(message: str, tables: dict[str, Any]) -> str:
+    """msgspec's message ("... - at `$.noise.relative`") as table, key, value and advice."""
+    fault, _, place = message.partition(" - at `$")
+    names = [name for name in re.split(r"[.\[\]`]+", place) if name]
+    where = f"[{names[0]}] " if names else ""
+    unknown = re.search(r"unknown field `(.*)`", fault)
+    if unknown:
+        return f"{where}unknown key {unknown[1]}; see configs/CALIBRATION.md"
+    missing = re.search(r"missing required field `(.*)`", fault)
+    if missing:
+        return f"{where}the key {missing[1]} is missing; add it" if names else f"the table [{missing[1]}] is missing; add it"
+    value: Any = tables
+    for name in names:
+        value = value[name]
+    wanted = fault.removeprefix("Expected ").replace("`", "").split(", got ")[0]
+    if fault.startswith("Invalid enum"):
+        wanted = '"photometric"'
+    shown = msgspec.json.encode(value, enc_hook=str).decode()
+    for type_name, word in TYPE_WORDS.items():
+        wanted = re.sub(rf"\b{type_name}\b", word, wanted)
+    return f"{where if len(names) > 1 else ''}{names[-1]} = {shown}; {wanted} is wanted"
+
+
+def _numbers(path: Path, lines: list[tuple[int, str]], columns: int) -> FloatArray:
+    """Rows of finite, non-negative numbers, all of the same length."""
+    rows = []
+    for number, line in lines:
+        try:
+            row = [float(cell) for cell in next(csv.reader([line]))]
+        except (ValueError, csv.Error) as error:
+            raise InputError(f"{path}: line {number}: {line.strip()[:40]!r} is no row of numbers") from error
+        if len(row) != columns:
+            raise InputError(f"{path}: line {number}: {len(row)} cells; {columns} are wanted")
+        if not all(0 <= cell < 1e30 for cell in row):
+            raise InputError(f"{path}: line {number}: {line.strip()[:40]!r}; finite numbers that are not negative are wanted")
+        rows.append(row)
+    if not rows:
+        raise InputError(f"{path}: no row of numbers in it")
+    return np.array(rows, dtype=np.float64)
+
+
+def _lines(text: str) -> list[tuple[int, str]]:
+    numbered = enumerate(text.splitlines(), start=1)
+    return [(number, line) for number, line in numbered if line.strip() and not line.lstrip().startswith("#")]
+
+
+def read_response(path: Path, bits: int, digest: Digest) -> dict[str, FloatArray]:
+    """Light (2^bits,) of each channel, black level included: every code, or some of them and the curve between.
+
+    Raises InputError for a table without code 0 or white, with equal or falling neighbours, or with blacks that disagree.
+    """
+    lines = _lines(_read_bytes(path, digest))
+    header = tuple(cell.strip() for cell in lines[0][1].split(",")) if lines else ()
+    if header not in (("code", *GREY), ("code", *PRIMARIES)):
+        raise InputError(f"{path}: its header is {','.join(header)[:60]!r}; code,w or code,r,g,b is wanted")
+    rows = _numbers(path, lines[1:], len(header))
+    code, white = rows[:, 0], 2**bits - 1
+    if np.any(code != np.rint(code)) or np.any(np.diff(code) <= 0):
+        raise InputError(f"{path}: its codes are not whole numbers that rise; sort the rows, one to a code")
+    if len(code) < 2 or code[0] != 0 or code[-1] != white:
+        raise InputError(
+            f"{path}: its codes are {code[0]:g} to {code[-1]:g}; 0 (black) to {white} (white of {bits} bits) is wanted"
+        )
+    columns = {name: _every_code(path, name, code, rows[:, place + 1], white) for place, name in enumerate(header[1:])}
+    blacks = rows[0, 1:]
+    if np.ptp(blacks) > BLACKS_AGREE * blacks.mean():
+        raise InputError(
+            f"{path}: code 0 has {', '.join(f'{b:g}' for b in blacks)}; it is one black screen, so one light is wanted"
+        )
+    return columns
+
+
+def _every_code(path: Path, name: str, code: FloatArray, light: FloatArray, white: int) -> FloatArray:
+    """Light at codes 0 to `white`: between rows, PCHIP of log light above black over log code; below the first, a power law."""
+    fall = np.flatnonzero(np.diff(light) <= 0)
+    if len(fall):
+        low, high = code[fall[0]], code[fall[0] + 1]
+        raise InputError(
+            f"{path}: light of channel {name} does not rise from code {low:g} to code {high:g}; every code must be brighter"
+        )
+    if len(code) == white + 1:
+        return light
+    if len(code) < 3:
+        raise InputError(f"{path}: two codes make no response; give some between black and white")
+    log_code, log_light = np.log(code[1:]), np.log(light[1:] - light[0])
+    curve = PchipInterpolator(log_code, log_light)
+    wanted = np.log(np.arange(1, white + 1))
+    slope = (log_light[1] - log_light[0]) / (log_code[1] - log_code[0])
+    below = log_light[0] + slope * (wanted - log_code[0])
+    return np.append(light[0], light[0] + np.exp(np.where(wanted < log_code[0], below, curve(np.maximum(wanted, log_code[0])))))
+
+
+def read_grid(path: Path, digest: Digest) -> FloatArray:
+    """A grid of relative light (rows, columns), rows from top to bottom, all positive. Raises InputError."""
+    lines = _lines(_read_bytes(path, digest))
+    grid = _numbers(path, lines, lines[0][1].count(",") + 1 if lines else 1)
+    if not grid.min() > 0:
+        raise InputError(f"{path}: a field of the screen has no light; every value must be more than 0")
+    return grid
+
+
+def write_calibration(path: Path, head: Head, columns: dict[str, FloatArray], noise: float, notes: NotesTable) -> Path:
+    """Write the TOML and, beside it, the response it names; the CSV's path. Raises InputError where they cannot be written."""
+    table = path.parent / head.response
+    codes = np.arange(len(next(iter(columns.values()))))
+    rows = "".join(",".join([str(code), *(f"{float(light[code])!r}" for light in columns.values())]) + "\n" for code in codes)
+    comment = f"# light in {head.unit or 'one linear unit'}, black level (code 0) included\n".encode(
+        "ascii", "replace"
+    ).decode()
+    lines = ["[calibration]", *_keys(msgspec.structs.asdict(head)), ""]
+    lines += ["[noise]", f"relative = {noise:.6g}", "", "[notes]", *_keys(msgspec.structs.asdict(notes))]
+    try:
+        table.write_text(comment + ",".join(["code", *columns]) + "\n" + rows, encoding="utf-8", newline="\n")
+        path.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"{path}: cannot be written ({getattr(error, 'strerror', None) or error}); choose another place"
+        ) from error
+    return table
+
+
+def _keys(table: dict[str, Any]) -> list[str]:
+    return [f"{key} = {json.dumps(value if isinstance(value, int) else str(value))}" for key, value in table.items()]

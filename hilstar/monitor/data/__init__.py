@@ -1,0 +1,1 @@
+"""The example of a calibration, and the script that makes it."""

@@ -1,0 +1,287 @@
+"""Measured patches: the file, and the reasons for which a set of measurements is refused."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from scipy.stats import f as f_distribution
+
+from hilstar.arrays import FloatArray, IntArray
+from hilstar.errors import InputError
+
+CHANNELS = ("w", "r", "g", "b")
+COLUMNS = ("order", "code", "channel", "value", "exposure_s", "t_s")
+NEEDED = ("code", "channel", "value")
+USUAL_BITS = (8, 10, 12, 14, 16)
+FEWEST_CODES = 10  # at 1 % noise: 2.2 % of error (95th percentile of the worst code) on gamma, sRGB and S-curves; 8 leave 4.4 %
+FALSE_ALARM_SIGMA = 4.0  # one run in some hundreds is refused for noise alone, with 32 levels
+SMALLEST_DRIFT = 0.005  # over the run; less does no harm beside 1 % of noise
+BRIGHT_DOF = 8
+FAINT_ALARM = 0.999  # of the F distribution, before additive noise is believed
+NOISE_FLOOR = 1e-4  # relative; nobody's photometer repeats better
+CLIPPED_VALUES = 3  # equal largest readings, over two codes or more
+
+
+@dataclass(frozen=True, slots=True)
+class Measurements:
+    """Light (n,) of patches in one linear unit, their codes and channels, and when each was taken (s, or the row's number).
+
+    `clipped` names the codes that share the instrument's largest reading, where that looks like its limit.
+    """
+
+    source: str
+    bits: int
+    code: IntArray
+    channel: npt.NDArray[np.str_]
+    value: FloatArray
+    time: FloatArray
+    clipped: dict[str, list[int]]
+    sha256: str
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """The channels that were measured, in the order w, r, g, b."""
+        return tuple(name for name in CHANNELS if np.any(self.channel == name))
+
+    @property
+    def white(self) -> int:
+        """The largest code."""
+        return int(2**self.bits - 1)
+
+
+@dataclass(frozen=True, slots=True)
+class Levels:
+    """Repeats brought together: for each distinct code (n,), rising, the mean light, the count, and the mean's standard error.
+
+    `relative_noise` is one patch's; nan where nothing was repeated.
+    """
+
+    code: IntArray
+    mean: FloatArray
+    count: IntArray
+    relative_noise: float
+    additive_noise: float
+
+    def standard_error(self, relative_noise: float) -> FloatArray:
+        """Of the mean (n,), in its unit, for a given noise of one patch."""
+        variance = (relative_noise * self.mean) ** 2 + self.additive_noise**2
+        return np.asarray(np.sqrt(variance / self.count), dtype=np.float64)
+
+
+def read_measurements(path: Path, bits: int | None = None) -> Measurements:
+    """Read `code,channel,value` rows, with `exposure_s`, `t_s` and `order` where they are given; '#' starts a comment line.
+
+    Values are divided by exposure_s. `bits` is by default the smallest of 8, 10, 12, 14, 16 that holds every code.
+    Raises InputError: file, line, what is wrong.
+    """
+    try:
+        raw = path.read_bytes()
+        text = raw.decode("utf-8-sig")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); give a CSV file with code,channel,value") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: not a text file in UTF-8; give a CSV file with code,channel,value") from error
+    rows = list(_rows(path, text))
+    if not rows:
+        raise InputError(f"{path}: no measurement in it; write code,channel,value rows below the header")
+    codes = np.array([row[0] for row in rows], dtype=np.intp)
+    bits = bits or next(usual for usual in USUAL_BITS if codes.max() < 2**usual)
+    if codes.max() >= 2**bits:
+        raise InputError(f"{path}: code {codes.max()} is outside {bits} bits (0 to {2**bits - 1}); say how many bits there are")
+    channel = np.array([row[1] for row in rows])
+    reading = np.array([row[2] for row in rows])
+    exposure_s = np.array([row[3] for row in rows])
+    times = [row[4] for row in rows]
+    given = [time for time in times if time is not None]
+    if given and len(given) < len(times):
+        raise InputError(f"{path}: t_s is empty in some rows; give it in every row or leave the column out")
+    time = np.array(given if given else np.arange(len(rows)), dtype=np.float64)
+    clipped = {name: _clipped(codes[channel == name], reading[channel == name]) for name in set(channel.tolist())}
+    digest = hashlib.sha256(raw).hexdigest()
+    return Measurements(str(path), bits, codes, channel, reading / exposure_s, time, clipped, digest)
+
+
+Row = tuple[int, str, float, float, float | None]
+
+
+def _rows(path: Path, text: str) -> Iterator[Row]:
+    header: list[str] | None = None
+    try:
+        for number, line in enumerate(text.splitlines(), start=1):
+            if not line.strip() or line.lstrip().startswith("#"):
+                continue
+            cells = [cell.strip() for cell in next(csv.reader([line]))]
+            if header is None:
+                header = _header(path, number, cells)
+            elif len(cells) != len(header):
+                raise InputError(f"{path}: line {number}: {len(cells)} cells; {','.join(header)} is wanted")
+            else:
+                yield _row(f"{path}: line {number}", dict(zip(header, cells, strict=True)))
+    except csv.Error as error:
+        raise InputError(f"{path}: not CSV ({error}); write code,channel,value rows") from error
+
+
+def _header(path: Path, number: int, cells: list[str]) -> list[str]:
+    missing = [name for name in NEEDED if name not in cells]
+    unknown = [name for name in cells if name not in COLUMNS]
+    if missing:
+        raise InputError(f"{path}: line {number}: the column {missing[0]} is missing; the header is code,channel,value")
+    if unknown or len(set(cells)) < len(cells):
+        raise InputError(
+            f"{path}: line {number}: unknown or doubled column in {','.join(cells)}; known are {', '.join(COLUMNS)}"
+        )
+    return cells
+
+
+def _row(place: str, cells: dict[str, str]) -> Row:
+    if not cells["value"]:
+        raise InputError(f"{place}: value is empty; measure the patch and fill it in, or delete the row")
+    try:
+        code = int(cells["code"])
+    except ValueError as error:
+        raise InputError(f"{place}: code = {cells['code']}; a whole number is wanted") from error
+    if not 0 <= code < 2**16:
+        raise InputError(f"{place}: code = {code}; 0 to 65535 is wanted")
+    if cells["channel"] not in CHANNELS:
+        raise InputError(f"{place}: channel = {cells['channel']}; w, r, g or b is wanted")
+    value = _number(place, "value", cells["value"])
+    if value < 0:
+        raise InputError(f"{place}: value = {value:g}; light is not negative, give readings without an offset taken off")
+    exposure_s = _number(place, "exposure_s", cells.get("exposure_s") or "1")
+    if exposure_s <= 0:
+        raise InputError(f"{place}: exposure_s = {exposure_s:g}; more than 0 is wanted")
+    time = cells.get("t_s")
+    return code, cells["channel"], value, exposure_s, _number(place, "t_s", time) if time else None
+
+
+def _number(place: str, name: str, text: str) -> float:
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not abs(number) < 1e30:
+        raise InputError(f"{place}: {name} = {text}; a finite number is wanted")
+    return number
+
+
+def _clipped(code: IntArray, reading: FloatArray) -> list[int]:
+    """The codes that share the largest reading, if there are several and it is read often: an instrument at its limit."""
+    at_limit = reading == reading.max()
+    codes = np.unique(code[at_limit])
+    return [int(c) for c in codes] if len(codes) > 1 and at_limit.sum() >= CLIPPED_VALUES else []
+
+
+def group_levels(measured: Measurements, channel: str) -> Levels:
+    """The levels of one channel; code 0 is the same black in every channel, so all its readings count."""
+    chosen = (measured.channel == channel) | (measured.code == 0)
+    value = measured.value[chosen]
+    code, place, count = np.unique(measured.code[chosen], return_inverse=True, return_counts=True)
+    mean = np.asarray(np.bincount(place, value) / count, dtype=np.float64)
+    squares = np.asarray(np.bincount(place, (value - mean[place]) ** 2), dtype=np.float64)
+    relative = _pooled(squares, mean, count, mean > np.median(mean), BRIGHT_DOF)
+    return Levels(code.astype(np.intp), mean, count.astype(np.intp), relative, _additive(squares, mean, count, relative))
+
+
+def _pooled(squares: FloatArray, mean: FloatArray, count: IntArray, bright: npt.NDArray[np.bool_], fewest: int) -> float:
+    """The relative noise of the bright half, where an instrument's own floor does not show; of all if too few repeat there."""
+    for chosen in (bright, mean > 0):
+        dof = int((count[chosen] - 1).sum())
+        if dof >= fewest:
+            return max(math.sqrt(float((squares[chosen] / mean[chosen] ** 2).sum()) / dof), NOISE_FLOOR)
+    return math.nan
+
+
+def _additive(squares: FloatArray, mean: FloatArray, count: IntArray, relative: float) -> float:
+    """The instrument's floor, in its unit, where the faintest third (black too) scatters more than `relative` explains."""
+    faint = (np.arange(len(mean)) <= len(mean) // 3) & (count > 1)
+    dof = int((count[faint] - 1).sum())
+    if not dof or math.isnan(relative):
+        return 0.0
+    expected = float(((relative * mean[faint]) ** 2 * (count[faint] - 1)).sum())
+    if float(squares[faint].sum()) <= expected * f_distribution.ppf(FAINT_ALARM, dof, BRIGHT_DOF * 2):
+        return 0.0
+    return math.sqrt((float(squares[faint].sum()) - expected) / dof)
+
+
+def check_levels(measured: Measurements, channel: str, levels: Levels) -> None:
+    """Refuse what no response can be fitted to. Raises InputError with the reason and what to do."""
+    place = f"{measured.source}: channel {channel}"
+    if levels.code[0] != 0:
+        raise InputError(f"{place}: code 0 is not measured; without it the black level is unknown, so add it, several times")
+    if levels.code[-1] != measured.white:
+        raise InputError(
+            f"{place}: white, code {measured.white} of {measured.bits} bits, is not measured; add it or say --bits"
+        )
+    if len(levels.code) < FEWEST_CODES:
+        raise InputError(
+            f"{place}: {len(levels.code)} distinct codes; {FEWEST_CODES} or more are wanted, 32 for 1 % (calibrate plan)"
+        )
+    if not levels.mean[-1] > levels.mean[0]:
+        raise InputError(f"{place}: white is not brighter than code 0; check that the instrument looks at the patch")
+    relative = 0.01 if math.isnan(levels.relative_noise) else levels.relative_noise
+    error = levels.standard_error(relative)
+    _check_saturation(measured, channel, levels, error)
+    highest = np.maximum.accumulate(levels.mean)
+    peak = np.maximum.accumulate(np.where(levels.mean == highest, np.arange(len(highest)), 0))
+    fall = (highest - levels.mean) / np.maximum(np.hypot(error, error[peak]), 1e-30)
+    worst = int(np.argmax(fall))
+    if fall[worst] > FALSE_ALARM_SIGMA:
+        percent = 100 * (1 - levels.mean[worst] / highest[worst])
+        raise InputError(
+            f"{place}: light falls by {percent:.2g} % from code {levels.code[peak[worst]]} to code {levels.code[worst]}, beyond"
+            " the noise; measure both again, with the monitor's dynamic contrast off"
+        )
+
+
+def _check_saturation(measured: Measurements, channel: str, levels: Levels, error: FloatArray) -> None:
+    """An S-curve is flat at white too: what counts is flatter than sin^2, which falls by 3 (1 - code / white)^2."""
+    clipped = measured.clipped.get(channel, [])
+    white = levels.mean[-1]
+    noise = float(np.hypot(error, error[-1])[-1] / white)
+    margin = max(0.03, math.sqrt(FALSE_ALARM_SIGMA * noise / 3))
+    flat = (levels.code <= (1 - margin) * measured.white) & (levels.mean >= white * (1 - noise))
+    if not clipped and flat.any():
+        clipped = levels.code[int(np.argmax(flat)) :].tolist()
+    if clipped:
+        raise InputError(
+            f"{measured.source}: channel {channel}: codes {clipped[0]} to {clipped[-1]} read the same, so the instrument is"
+            " saturated or the link clips; shorten the exposure, or set the link to full range"
+        )
+
+
+def drift_over_run(measured: Measurements) -> tuple[float, float]:
+    """The trend of repeated patches from the first to the last measurement, and its standard error, both relative.
+
+    nan where nothing was repeated. Code 0 has no part: its own noise is not that of light.
+    """
+    lit = (measured.code > 0) & (measured.value > 0)
+    key = measured.code[lit] * len(CHANNELS) + np.array([CHANNELS.index(str(name)) for name in measured.channel[lit]])
+    _, place, count = np.unique(key, return_inverse=True, return_counts=True)
+    log_light, time = np.log(measured.value[lit]), measured.time[lit]
+    within = [values - (np.bincount(place, values) / count)[place] for values in (log_light, time)]
+    leverage = float((within[1] ** 2).sum())
+    span = float(np.ptp(measured.time))
+    dof = len(place) - len(count) - 1
+    if dof < 3 or leverage <= 1e-12 * max(span, 1e-300) ** 2:
+        return math.nan, math.nan
+    slope = float(within[0] @ within[1]) / leverage
+    scatter = float(((within[0] - slope * within[1]) ** 2).sum()) / dof
+    return slope * span, math.sqrt(scatter / leverage) * span
+
+
+def check_drift(measured: Measurements) -> float:
+    """The drift over the run, relative (nan where nothing was repeated). Raises InputError where it is beyond the noise."""
+    drift, error = drift_over_run(measured)
+    if abs(drift) > max(FALSE_ALARM_SIGMA * error, SMALLEST_DRIFT):
+        raise InputError(
+            f"{measured.source}: light drifts by {100 * drift:+.2g} % (noise {100 * error:.1g} %) from the first measurement to"
+            " the last; let monitor and instrument warm up, then measure again"
+        )
+    return drift

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,8 +20,10 @@ from hilstar.attitude.protocol import NORM_TOLERANCE
 from hilstar.attitude.quaternion import normalise, to_matrix
 from hilstar.bench.config import BenchConfig, SkySettings, Tracker, read_config
 from hilstar.errors import InputError
+from hilstar.monitor.calibration import BUILT_IN, Calibration, load_calibration
 from hilstar.monitor.geometry import monitor_camera
-from hilstar.monitor.photometry import Codes, srgb_response
+from hilstar.monitor.photometry import Codes, code_dtype
+from hilstar.monitor.quantise import cycle_warning
 from hilstar.render.renderer import Renderer, Target
 from hilstar.scene.camera import Camera
 from hilstar.scene.psf import peak_share
@@ -30,8 +33,9 @@ from hilstar.sky.catalog import load_catalog
 from hilstar.sky.electrons import Optics, Photometry, star_temperatures_k, tabulate
 from hilstar.sky.pickles import tabulate_pickles
 from hilstar.sky.spectrum import BUILT_IN_CURVES, load_curve
-from hilstar.sky.stars import Stars, make_stars
+from hilstar.sky.stars import Stars, brighter_stars, make_stars
 
+log = logging.getLogger(__name__)
 WARM_UP_ATTITUDE = np.array([1.0, 0.0, 0.0, 0.0])
 TRUTH_DTYPE = np.dtype(
     [
@@ -52,21 +56,23 @@ TRUTH_DTYPE = np.dtype(
 class Frame:
     """One frame: what each monitor pixel should cause, the codes that ask for it, and the stars behind it.
 
-    `linear` is float32 (height, width), electrons per second; `codes` is uint8 or uint16 of the same shape;
+    `linear` is float32 (height, width), electrons per second; `levels`, uint8 or uint16 of the same shape, are the places
+    in the response's table; `codes` are the code values, the same array or with bit stealing (height, width, 3);
     `truth` is a structured array of TRUTH_DTYPE, a row for each star whose sprite touches the monitor.
     """
 
     q_icrs_to_cam: FloatArray
     linear: Float32Array
+    levels: Codes
     codes: Codes
     truth: npt.NDArray[np.void]
 
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """What a draw put on the monitor; `codes` is overwritten by the next one."""
+    """What a draw put on the monitor; `levels` (see `Bench.code_values`) is overwritten by the next one."""
 
-    codes: Codes
+    levels: Codes
     star_count: int
     clipped_hip: tuple[int, ...]
 
@@ -84,25 +90,56 @@ class Bench:
         self.flux_at_white_e_per_s = self.config.render.flux_at_white_e_per_s or brightest_peak_e_per_s(
             self.stars, self._sigma_px
         )
-        monitor = self.config.monitor
+        self.calibration = bench_calibration(self.config, path.parent)
+        self.uniformity = self.calibration.uniformity_map(self.config.monitor.resolution_px)
+        self.shown_stars = brighter_stars(self.stars, self.faintest_shown_e_per_s())
+        self._warn_of_cycle()
+        render = self.config.render
         self.renderer = Renderer(
-            Target(monitor.resolution_px, self._sigma_px, srgb_response(monitor.bits), self.flux_at_white_e_per_s)
+            Target(
+                resolution_px=self.config.monitor.resolution_px,
+                sigma_px=self._sigma_px,
+                response=self.calibration.response,
+                flux_at_white_e_per_s=self.flux_at_white_e_per_s,
+                quantisation=render.quantisation,
+                uniformity=self.uniformity,
+                cycle_frames=render.cycle_frames,
+            )
         )
 
-    def sprites(self, q_icrs_to_cam: FloatArray) -> Sprites:
-        """The stars that the monitor shows at an attitude (unit quaternion, scalar first)."""
-        icrs_to_image = self.camera.cam_to_image @ to_matrix(q_icrs_to_cam)
-        return make_sprites(self.stars, icrs_to_image, self.camera, self.renderer.footprint_px)
+    def faintest_shown_e_per_s(self) -> float:
+        """The rate under which a star alone never lights a pixel, wherever it stands; 0 where the dither always may."""
+        response, quantisation = self.calibration.response, self.config.render.quantisation
+        # Vignetting asks for more from a pixel: where the screen is darkest a fainter star gets a code.
+        white = self.flux_at_white_e_per_s * (1.0 if self.uniformity is None else float(self.uniformity.min()))
+        if quantisation == "round":
+            return float(response.threshold[0]) * white / peak_share(self._sigma_px)
+        return float(response.light[1]) / 2 * white if quantisation == "exact" else 0.0
 
-    def draw(self, q_icrs_to_cam: FloatArray | None) -> Drawn:
-        """Codes for an attitude, ready in memory; None gives a blank frame. The frame path: no copy, no table."""
+    def _warn_of_cycle(self) -> None:
+        render, refresh_hz = self.config.render, self.config.monitor.refresh_hz
+        if render.quantisation == "temporal":
+            warning = cycle_warning(self.config.tracker.exposure_s, refresh_hz, render.cycle_frames)
+            if warning is not None:
+                log.warning("%s: %s", self.path, warning)
+
+    def sprites(self, q_icrs_to_cam: FloatArray, stars: Stars | None = None) -> Sprites:
+        """The sprites of `stars` (those that can be seen, by default) at an attitude (unit quaternion, scalar first)."""
+        icrs_to_image = self.camera.cam_to_image @ to_matrix(q_icrs_to_cam)
+        return make_sprites(stars or self.shown_stars, icrs_to_image, self.camera, self.renderer.footprint_px)
+
+    def draw(self, q_icrs_to_cam: FloatArray | None, frame: int = 0) -> Drawn:
+        """Levels for an attitude, ready in memory; None gives a blank frame. The frame path: no copy, no table.
+
+        `frame` counts the frames shown, for temporal dithering.
+        """
         if q_icrs_to_cam is None:
-            self.renderer.draw(None)
+            self.renderer.draw(None, frame)
             return Drawn(self.renderer.codes(), 0, ())
         sprites = self.sprites(q_icrs_to_cam)
-        self.renderer.draw(sprites)
+        self.renderer.draw(sprites, frame)
         clipped = self._clipped(sprites)
-        hip = tuple(int(h) for h in self.stars.hip[sprites.star[clipped]])
+        hip = tuple(int(h) for h in self.shown_stars.hip[sprites.star[clipped]])
         return Drawn(self.renderer.codes(), len(sprites), hip)
 
     def warm_up(self) -> None:
@@ -110,21 +147,34 @@ class Bench:
         self.draw(WARM_UP_ATTITUDE)
         self.draw(None)
 
-    def frame(self, q_icrs_to_cam: Sequence[float] | FloatArray) -> Frame:
+    def frame(self, q_icrs_to_cam: Sequence[float] | FloatArray, number: int = 0) -> Frame:
         """Draw one frame and bring everything about it back; the arrays are the caller's own.
 
-        Raises InputError for a quaternion that is not unit within 1e-3.
+        Stars too faint for the monitor are in the linear image and the truth, and not drawn. `number` counts frames, for
+        temporal dithering. Raises InputError for a quaternion that is not unit within 1e-3.
         """
         q = checked_quaternion(q_icrs_to_cam)
-        sprites = self.sprites(q)
-        self.renderer.draw(sprites)
-        codes, linear = self.renderer.codes().copy(), self.renderer.linear().copy()
+        sprites = self.sprites(q, self.stars)
+        self.renderer.draw(self.sprites(q), number)
+        levels = self.renderer.codes().copy()
+        if self.shown_stars is not self.stars:
+            self.renderer.draw(sprites, number)
+        linear = self.renderer.linear().copy()
         truth = truth_table(self.stars, sprites.star, sprites.x_px, sprites.y_px)
+        truth["drawn"] = truth["electrons_per_s"] >= self.faintest_shown_e_per_s()
         truth["clipped"][self._clipped(sprites)] = True
-        return Frame(q, linear, codes, truth[np.argsort(truth["v_mag"], kind="stable")])
+        return Frame(q, linear, levels, self.code_values(levels), truth[np.argsort(truth["v_mag"], kind="stable")])
+
+    def code_values(self, levels: Codes) -> Codes:
+        """The monitor's code values of levels (height, width): the same, or (height, width, 3) with bit stealing."""
+        rgb = self.calibration.response.rgb
+        if rgb is None:
+            return levels
+        return np.asarray(rgb[levels], dtype=code_dtype(self.calibration.response.bits))
 
     def _clipped(self, sprites: Sprites) -> IntArray:
-        return clipped_sprites(sprites, self._sigma_px, self.flux_at_white_e_per_s, self.camera.resolution_px)
+        size_px = self.camera.resolution_px
+        return clipped_sprites(sprites, self._sigma_px, self.flux_at_white_e_per_s, size_px, self.uniformity)
 
     def close(self) -> None:
         """Free the GL context."""
@@ -191,6 +241,13 @@ def bench_stars(config: BenchConfig, folder: Path) -> Stars:
     return make_stars(catalog, vectors, temperature_k, rates)
 
 
+def bench_calibration(config: BenchConfig, folder: Path) -> Calibration:
+    """What the bench file says of its monitor's light. Raises InputError."""
+    name = config.monitor.calibration
+    source = name if name in BUILT_IN else folder / name
+    return load_calibration(source, config.monitor.bits, bit_stealing=config.render.bit_stealing)
+
+
 def bench_camera(config: BenchConfig) -> Camera:
     """The monitor behind its collimator."""
     return monitor_camera(
@@ -215,9 +272,9 @@ def brightest_peak_e_per_s(stars: Stars, sigma_px: tuple[float, float]) -> float
 def bench_hash(config: BenchConfig, folder: Path) -> str:
     """SHA-256 of everything that makes a bench's frames: its settings, defaults included, and the files it names."""
     digest = hashlib.sha256(msgspec.json.encode(config, order="sorted"))
-    named = (config.tracker.quantum_efficiency, config.tracker.transmission, config.sky.catalogue)
+    named = (config.tracker.quantum_efficiency, config.tracker.transmission, config.sky.catalogue, config.monitor.calibration)
     for name in named:
-        if isinstance(name, str) and name not in (*BUILT_IN_CURVES, "hipparcos"):
+        if isinstance(name, str) and name not in (*BUILT_IN_CURVES, *BUILT_IN, "hipparcos"):
             digest.update(_named_bytes(folder / name))
     return digest.hexdigest()
 

@@ -132,6 +132,8 @@ class RenderSettings(_Table, frozen=True):
     """[render]: from electrons to codes."""
 
     quantisation: Literal["round", "dither", "temporal", "exact"] = "round"
+    bit_stealing: bool = False
+    cycle_frames: Literal[1, 2, 4, 8, 16, 32, 64, 128, 256] = 8
     sprite_sigma_px: Sigma = (0.85, 0.85)
     flux_at_white_e_per_s: Positive | None = None
 
@@ -264,11 +266,3 @@ def _check_meaning(config: BenchConfig, path: Path) -> None:
         detector_settings(config.tracker)
     except InputError as error:
         raise InputError(f"{path}: [tracker.detector] {error}") from error
-    not_yet = {
-        f'[render] quantisation = "{config.render.quantisation}"': config.render.quantisation != "round",
-        f'[monitor] calibration = "{config.monitor.calibration}"': config.monitor.calibration != "srgb",
-    }
-    instead = ('quantisation = "round"', 'calibration = "srgb"')
-    for (key, chosen), value in zip(not_yet.items(), instead, strict=True):
-        if chosen:
-            raise InputError(f"{path}: {key} is not in this version; write {value}")

@@ -97,7 +97,7 @@ def run_demo(directory: Path, duration_s: float, rng: np.random.Generator, watch
         def sink(shown: Shown) -> None:
             if wanted and shown.number >= min(wanted):
                 wanted.remove(min(wanted))
-                kept[shown.number] = shown.drawn.codes.copy()
+                kept[shown.number] = shown.drawn.levels.copy()
             watch(shown)
 
         command = [sys.executable, "-m", "hilstar", "send", str(log_path), "--to", link.endpoint, "--connect"]

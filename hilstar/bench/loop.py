@@ -60,7 +60,7 @@ class FrameLoop:
         begin_ns = time.perf_counter_ns()
         stale = self.gate.update(attitude)
         blank = attitude is None or (stale and self._blank_when_stale)
-        drawn = self._bench.draw(None if attitude is None or blank else attitude.q_icrs_to_cam)
+        drawn = self._bench.draw(None if attitude is None or blank else attitude.q_icrs_to_cam, number)
         frame_ns = time.perf_counter_ns() - begin_ns
         self.stats.add(frame_ns, None if attitude is None else attitude.age_ns, drawn.star_count, drawn.clipped_hip)
         self.stats.stale_frames += stale

@@ -34,7 +34,9 @@ def write_frame_fits(path: Path, bench: Bench, frame: Frame) -> None:
     header = _header(bench.bench_hash, bench.config.sky.epoch_jyear, frame.q_icrs_to_cam, bench.camera)
     header["BUNIT"] = ("electron/s", "each pixel's share of the tracker's electrons")
     header["WHITE"] = (bench.flux_at_white_e_per_s, "[electron/s] one pixel at the white code")
-    header["NSTARS"] = (len(frame.truth), "stars drawn")
+    header["NSTARS"] = (len(frame.truth), "stars in view")
+    header["CALNAME"] = (bench.calibration.name, "monitor calibration")
+    header["CALSHA"] = bench.calibration.sha256
     _written(path, lambda: fits.PrimaryHDU(frame.linear, header).writeto(path, overwrite=True))
 
 
@@ -116,9 +118,26 @@ def write_truth_csv(path: Path, frame: Frame) -> None:
 
 
 def write_codes_png(path: Path, codes: Codes, bits: int) -> None:
-    """The code values: 8 bit, or 16 bit for deeper monitors, left-aligned. Shallower ones stay as they are."""
-    image = codes if bits <= 8 else np.asarray(codes << (16 - bits), dtype=np.uint16)
-    _written(path, lambda: Image.fromarray(image).save(path, "PNG", compress_level=1))
+    """The code values: 8 bit, or 16 bit for deeper monitors, left-aligned. Shallower ones stay as they are.
+
+    Codes of three channels (height, width, 3) become an RGB picture.
+    """
+    image = (
+        np.asarray(codes, dtype=np.uint8) if bits <= 8 else np.asarray(codes.astype(np.uint16) << (16 - bits), dtype=np.uint16)
+    )
+    _written(path, lambda: _save_png(path, image))
+
+
+def _save_png(path: Path, image: npt.NDArray[Any]) -> None:
+    if image.ndim == 2 or image.dtype == np.uint8:
+        Image.fromarray(image).save(path, "PNG", compress_level=1)
+        return
+    # Pillow has no RGB of 16 bits.
+    import png
+
+    height, width, _ = image.shape
+    with path.open("wb") as file:
+        png.Writer(width, height, bitdepth=16, greyscale=False, compression=1).write(file, image.reshape(height, -1))
 
 
 def write_preview_png(path: Path, codes: Codes) -> None:

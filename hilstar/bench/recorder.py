@@ -21,6 +21,7 @@ class FrameRecorder:
 
     def __init__(self, directory: Path | None, bench: Bench) -> None:
         self._directory = directory
+        self._bench = bench
         self._bits = bench.config.monitor.bits
         self._stack = ExitStack()
 
@@ -28,7 +29,9 @@ class FrameRecorder:
         """Write one frame. A blank one has no quaternion."""
         if self._directory is None:
             return
-        write_codes_png(self._directory / f"frame_{shown.number:06d}.png", shown.drawn.codes, self._bits)
+        write_codes_png(
+            self._directory / f"frame_{shown.number:06d}.png", self._bench.code_values(shown.drawn.levels), self._bits
+        )
         q = ["", "", "", ""] if shown.attitude is None else [repr(float(v)) for v in shown.attitude.q_icrs_to_cam]
         row = [shown.number, f"{shown.t_ns / 1e9:.9f}", *q, shown.drawn.star_count, len(shown.drawn.clipped_hip)]
         self._writer.writerow(row)

@@ -79,11 +79,11 @@ def simulate_log(
 
 @app.command()
 def study(
-    what: Annotated[Literal["models", "outputs", "stability"], typer.Argument(help="Which charts.")],
+    what: Annotated[Literal["models", "outputs", "stability", "quantisation"], typer.Argument(help="Which charts.")],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Where they go.")],
     as_json: Json = False,
 ) -> None:
-    """Charts and tables: brightness models, the thesis's outputs, and where methods fail."""
+    """Charts and tables: brightness models, the thesis's outputs, where methods fail, and what each quantisation costs."""
     from hilstar.bench.output import make_directory
 
     make_directory(output)
@@ -105,6 +105,10 @@ def study_lines(what: str, output: Path) -> tuple[list[str], bool]:
         from hilstar.study.outputs import run as run_outputs
 
         return run_outputs(output), True
+    if what == "quantisation":
+        from hilstar.study.quantisation import run as run_quantisation
+
+        return run_quantisation(output), True
     from hilstar.study.stability import run as run_stability
 
     places = run_stability(output)

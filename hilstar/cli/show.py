@@ -59,13 +59,15 @@ def frame(
         if codes is not None:
             files.write_codes_png(codes, shot.codes, bench.config.monitor.bits)
         if preview is not None:
-            files.write_preview_png(preview, shot.codes)
+            files.write_preview_png(preview, shot.levels)
         clipped = shot.truth["hip"][shot.truth["clipped"]].tolist()
         summary = {
             "stars": len(shot.truth),
             "electrons_per_s": float(shot.linear.sum(dtype=np.float64)),
             "flux_at_white_e_per_s": bench.flux_at_white_e_per_s,
             "clipped": clipped,
+            "left_out": left_out(shot.truth),
+            "calibration": {"name": bench.calibration.name, "sha256": bench.calibration.sha256},
             "written": [str(path) for path in targets],
             "gl_renderer": bench.renderer.gl_renderer,
         }
@@ -74,6 +76,13 @@ def frame(
     else:
         names = f", clipped: HIP {', '.join(map(str, clipped))}" if clipped else ""
         typer.echo(f"{len(shot.truth)} stars{names}; wrote {', '.join(summary['written'])}")
+
+
+def left_out(truth: Any) -> dict[str, float | int]:
+    """The stars in view that the monitor cannot show: how many, and their part of all light."""
+    missing = truth["electrons_per_s"][~truth["drawn"]]
+    total = float(truth["electrons_per_s"].sum())
+    return {"stars": len(missing), "flux_share": float(missing.sum()) / total if total else 0.0}
 
 
 @app.command()

@@ -14,8 +14,10 @@ import numpy as np
 
 from hilstar.arrays import Float32Array
 from hilstar.errors import InputError, MachineError
+from hilstar.monitor.exact import ExactQuantiser
 from hilstar.monitor.photometry import Codes, Response
-from hilstar.render.encoder import Encoder, build_program
+from hilstar.monitor.quantise import CYCLE_FRAMES, Panel, Quantisation, frame_shift
+from hilstar.render.encoder import Encoder, LevelTexture, build_program
 from hilstar.scene.psf import SQRT2, footprint_px
 from hilstar.scene.sprites import SPRITE_DTYPE, Sprites
 
@@ -26,12 +28,29 @@ FIRST_CAPACITY = 4096
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """What the renderer draws for: an image's pixels, its sprites, and a monitor's response where codes are wanted."""
+    """What the renderer draws for: an image's pixels, its sprites, and a monitor's response where codes are wanted.
+
+    `uniformity` float32 (height, width) is each pixel's light relative to the response (None: 1 everywhere), and
+    `cycle_frames`, a power of two, is for `temporal` alone.
+    """
 
     resolution_px: tuple[int, int]
     sigma_px: tuple[float, float]
     response: Response | None = None
     flux_at_white_e_per_s: float = 1.0
+    quantisation: Quantisation = "round"
+    uniformity: Float32Array | None = None
+    cycle_frames: int = CYCLE_FRAMES
+
+    def panel(self) -> Panel | None:
+        """What turns light into levels, None without a response. Raises InputError for a map that does not fit."""
+        if self.response is None:
+            return None
+        width, height = self.resolution_px
+        if self.uniformity is not None and self.uniformity.shape != (height, width):
+            found = " x ".join(map(str, self.uniformity.shape[::-1]))
+            raise InputError(f"the uniformity map is {found} px and the monitor {width} x {height}; give one value per pixel")
+        return Panel(self.response, self.flux_at_white_e_per_s, self.uniformity)
 
 
 def create_context() -> moderngl.Context:
@@ -87,13 +106,26 @@ class Renderer:
         self._splat["inverse_sigma_sqrt2"] = tuple(1 / (sigma * SQRT2) for sigma in target.sigma_px)
         self._splat["resolution_px"] = target.resolution_px
         self._splat["footprint_px"] = self.footprint_px
-        self._encoder: Encoder | None = None
-        if target.response is not None:
-            thresholds = target.response.thresholds_e_per_s(target.flux_at_white_e_per_s)
-            self._encoder = Encoder(ctx, self._linear, target.response.bits, thresholds, self.footprint_px)
+        self._build_levels()
         self._reserve(FIRST_CAPACITY)
         width, height = target.resolution_px
         self._linear_image = np.empty((height, width), dtype=np.float32)
+
+    def _build_levels(self) -> None:
+        target, panel = self.target, self.target.panel()
+        self._levels: LevelTexture | None = None
+        self._encoder: Encoder | None = None
+        self._exact: ExactQuantiser | None = None
+        if panel is None:
+            return
+        frame_shift(0, target.cycle_frames)  # refuses a cycle that is no power of two
+        self._levels = LevelTexture(self._ctx, target.resolution_px, panel)
+        if target.quantisation == "exact":
+            self._exact = ExactQuantiser(panel, target.resolution_px, target.sigma_px)
+            self._exact_levels = self._exact.levels(None)
+        else:
+            dithered = target.quantisation != "round"
+            self._encoder = Encoder(self._ctx, self._linear, self._levels, panel, dithered)
 
     def _reserve(self, sprites: int) -> None:
         """Room for so many sprites on the GPU; grows by doubling, never shrinks."""
@@ -102,17 +134,24 @@ class Renderer:
         layout = [(self._buffer, "2i 2f 1f", "pixel", "fraction_px", "electrons_per_s")]
         self._splat_vao = self._ctx.vertex_array(self._splat, layout)
         if self._encoder is not None:
-            self._encoder.take_places_from(self._buffer)
+            self._encoder.take_places_from(self._buffer, self.footprint_px)
 
-    def draw(self, sprites: Sprites | None) -> None:
-        """Draw the linear image and the codes of `sprites` (None: blank); read them with `linear` and `codes`."""
+    def draw(self, sprites: Sprites | None, frame: int = 0) -> None:
+        """Draw the linear image and the codes of `sprites` (None: blank); read them with `linear` and `codes`.
+
+        `frame` counts the frames shown, for `temporal` alone.
+        """
         count = 0 if sprites is None else len(sprites)
         with self._ctx:
             if sprites is not None and count:
                 self._upload(sprites)
             self._draw_linear(count)
             if self._encoder is not None:
-                self._encoder.draw(count)
+                temporal = self.target.quantisation == "temporal"
+                self._encoder.draw(count, frame_shift(frame, self.target.cycle_frames) if temporal else 0.0)
+            elif self._exact is not None and self._levels is not None:
+                self._exact_levels = self._exact.levels(sprites)
+                self._levels.write(self._exact_levels)
 
     def _upload(self, sprites: Sprites) -> None:
         if len(sprites) > self._capacity:
@@ -134,14 +173,27 @@ class Renderer:
             self._ctx.disable(moderngl.BLEND)
 
     def codes(self) -> Codes:
-        """The code values of the last draw, (height, width); the next call overwrites the same array.
+        """The levels of the last draw, (height, width), code values without bit stealing; the next draw or call overwrites
+        the same array.
+
+        uint8 up to 256 levels, uint16 beyond. A target without a response has none: TypeError.
+        """
+        if self._exact is not None:
+            return self._exact_levels
+        if self._levels is None:
+            raise TypeError("this target has no monitor response, so no codes")
+        with self._ctx:
+            return self._levels.read()
+
+    @property
+    def codes_texture(self) -> moderngl.Texture:
+        """The levels of the last draw, R8UI or R16UI, for a window; its `ctx` must be current where it is used.
 
         A target without a response has none: TypeError.
         """
-        if self._encoder is None:
+        if self._levels is None:
             raise TypeError("this target has no monitor response, so no codes")
-        with self._ctx:
-            return self._encoder.read()
+        return self._levels.texture
 
     def linear(self) -> Float32Array:
         """The linear image of the last draw, electrons per second, float32 (height, width); overwritten as `codes`."""

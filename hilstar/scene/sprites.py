@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.arrays import FloatArray, IntArray
+from hilstar.arrays import Float32Array, FloatArray, IntArray
 from hilstar.scene.camera import Camera
 from hilstar.scene.psf import peak_share, pixel_share
 from hilstar.sky.stars import Stars
@@ -86,19 +86,30 @@ def join_sprites(parts: Sequence[Sprites], footprint_px: int) -> Sprites:
 
 
 def clipped_sprites(
-    sprites: Sprites, sigma_px: tuple[float, float], flux_at_white_e_per_s: float, resolution_px: tuple[int, int]
+    sprites: Sprites,
+    sigma_px: tuple[float, float],
+    flux_at_white_e_per_s: float,
+    resolution_px: tuple[int, int],
+    uniformity: Float32Array | None = None,
 ) -> IntArray:
     """Positions of the sprites whose brightest pixel lies on the image and, neighbours' light included, is over white.
 
+    White is `flux_at_white_e_per_s` times a pixel's `uniformity` (height, width), where that is given.
+
     Only a star that alone reaches half of white in a pixel is looked at: two fainter ones on one pixel go unnamed.
     """
-    bright = np.flatnonzero(sprites.data["electrons_per_s"] > 0.5 * flux_at_white_e_per_s / peak_share(sigma_px))
+    least_white = flux_at_white_e_per_s * (1.0 if uniformity is None else float(uniformity.min()))
+    bright = np.flatnonzero(sprites.data["electrons_per_s"] > 0.5 * least_white / peak_share(sigma_px))
     if not len(bright):
         return bright
-    x, y = np.rint(sprites.x_px[bright]), np.rint(sprites.y_px[bright])
-    bright = bright[(x >= 0) & (x < resolution_px[0]) & (y >= 0) & (y < resolution_px[1])]
-    limit = flux_at_white_e_per_s * (1 + CLIP_TOLERANCE)
-    return np.array([i for i in bright if _peak_light(sprites, int(i), sigma_px) > limit], dtype=np.intp)
+    x, y = np.rint(sprites.x_px[bright]).astype(int), np.rint(sprites.y_px[bright]).astype(int)
+    inside = (x >= 0) & (x < resolution_px[0]) & (y >= 0) & (y < resolution_px[1])
+    bright, x, y = bright[inside], x[inside], y[inside]
+    limit = np.full(len(bright), flux_at_white_e_per_s * (1 + CLIP_TOLERANCE))
+    if uniformity is not None:
+        limit *= uniformity[y, x]
+    over = [_peak_light(sprites, int(i), sigma_px) > most for i, most in zip(bright, limit, strict=True)]
+    return np.asarray(bright[np.array(over, dtype=bool)], dtype=np.intp)
 
 
 def _peak_light(sprites: Sprites, i: int, sigma_px: tuple[float, float]) -> float:

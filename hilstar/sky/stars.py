@@ -28,6 +28,24 @@ class Stars:
         return len(self.hip)
 
 
+def brighter_stars(stars: Stars, faintest_e_per_s: float) -> Stars:
+    """The stars of at least so many electrons per second, in their own cells; `stars` itself where that is all of them."""
+    kept = stars.electrons_per_s >= faintest_e_per_s
+    if kept.all():
+        return stars
+    grid = cell_grid(stars.vectors[kept])
+    order = np.flatnonzero(kept)[grid.order]
+    return Stars(
+        hip=stars.hip[order],
+        vectors=np.ascontiguousarray(stars.vectors[order]),
+        v_mag=stars.v_mag[order],
+        bv_mag=stars.bv_mag[order],
+        temperature_k=stars.temperature_k[order],
+        electrons_per_s=stars.electrons_per_s[order],
+        grid=grid,
+    )
+
+
 def make_stars(catalog: Catalog, vectors: FloatArray, temperature_k: FloatArray, electrons_per_s: FloatArray) -> Stars:
     """Sort a catalogue's stars by cell."""
     grid = cell_grid(vectors)

@@ -1,1 +1,1 @@
-"""The example of a calibration, and the script that makes it."""
+"""The example of a calibration, the blue-noise mask, and the scripts that make them."""

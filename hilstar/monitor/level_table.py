@@ -1,0 +1,54 @@
+"""Counting thresholds fast: bits of a positive float rise with its value, so their leading part indexes a table."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from hilstar.arrays import Float32Array, IntArray
+
+MANTISSA_BITS = 23
+
+
+@dataclass(frozen=True, slots=True)
+class CodeTable:
+    """Thresholds, and the code at the lower edge of each bin of the light's leading bits (see encode.frag)."""
+
+    threshold: Float32Array
+    first_code: npt.NDArray[np.uint32]
+    bin_shift: int
+    first_bin: int
+
+
+def code_table(thresholds: Float32Array) -> CodeTable:
+    """The table for rising, positive `thresholds`.
+
+    As many bins to an octave as there are thresholds, 4096 at most: few bins then hold more than one.
+    """
+    shift = MANTISSA_BITS - min(12, len(thresholds).bit_length())
+    first_bin = int(thresholds[0].view(np.int32)) >> shift
+    last_bin = int(thresholds[-1].view(np.int32)) >> shift
+    edges = (np.arange(first_bin, last_bin + 1, dtype=np.int64) << shift).astype(np.int32).view(np.float32)
+    first_code = np.searchsorted(thresholds, edges, side="right").astype(np.uint32)
+    first_code[0] = 0
+    return CodeTable(thresholds, first_code, shift, first_bin)
+
+
+class ThresholdCounter:
+    """What encode.frag does with a CodeTable, in NumPy: ten times as fast as a search where lights are in no order."""
+
+    def __init__(self, thresholds: Float32Array) -> None:
+        table = code_table(thresholds)
+        self._shift, self._first_bin = table.bin_shift, table.first_bin
+        self._first = table.first_code.astype(np.intp)
+        self._threshold = np.append(thresholds, np.float32(np.inf))
+
+    def count(self, light: Float32Array) -> IntArray:
+        """How many thresholds are at or under each finite light, which is 0 or more; same shape."""
+        place = np.clip((light.view(np.int32) >> self._shift) - self._first_bin, 0, len(self._first) - 1)
+        count: IntArray = self._first[place]
+        while (more := light >= self._threshold[count]).any():
+            count += more
+        return count

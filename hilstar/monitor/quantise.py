@@ -1,0 +1,132 @@
+"""From a linear image to levels, pixel by pixel: `round`, `dither` and `temporal` (`exact` looks at stars: see `exact`).
+
+A pixel's light lies between those of two levels, k and k + 1. `round` shows the nearer one. The others decide in light,
+not in code: k + 1 has the probability (L - L_k) / (L_k+1 - L_k), so that the mean light is the light wanted.
+All are float32, as the renderer computes them: it must give the same level to every pixel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from hilstar.arrays import Float32Array, FloatArray
+from hilstar.errors import InputError
+from hilstar.monitor.blue_noise import blue_noise
+from hilstar.monitor.photometry import Codes, Response, encode
+
+Quantisation = Literal["round", "dither", "temporal", "exact"]
+
+# Frames after which `temporal` begins again. Eight are 133 ms at 60 Hz, about one exposure of a tracker. They leave a star
+# of 42 steps of light (8 magnitudes under white, 10 bits) 0.007 mag and 0.017 px off, rms; twice as many leave half.
+CYCLE_FRAMES = 8
+LONGEST_CYCLE = 4096  # the mask has no more different thresholds
+
+
+@dataclass(frozen=True, slots=True)
+class Panel:
+    """What turns light into levels: a response, the light of white, and what each pixel makes of it.
+
+    `uniformity` float32 (height, width) is each pixel's light relative to what the response says (None: 1 everywhere).
+    Raises InputError where it is not positive and finite.
+    """
+
+    response: Response
+    flux_at_white_e_per_s: float
+    uniformity: Float32Array | None = None
+
+    def __post_init__(self) -> None:
+        if self.uniformity is not None and not (np.isfinite(self.uniformity).all() and (self.uniformity > 0).all()):
+            raise InputError("the uniformity map has pixels that are not positive; give each its light relative to the mean")
+
+    def gain(self) -> Float32Array | None:
+        """What the wanted light is multiplied by before it is quantised, float32 (height, width), or None for 1.
+
+        A product and not a quotient: of the two only the product is rounded the same by every GL.
+        """
+        return None if self.uniformity is None else np.reciprocal(self.uniformity, dtype=np.float32)
+
+    def light_e_per_s(self) -> Float32Array:
+        """The light of each level in the unit of the linear image, float32 (levels,)."""
+        return np.asarray(self.response.light * self.flux_at_white_e_per_s, dtype=np.float32)
+
+
+def level_dtype(response: Response) -> type[np.uint8] | type[np.uint16]:
+    """uint8 up to 256 levels, uint16 beyond."""
+    return np.uint8 if len(response.light) <= 256 else np.uint16
+
+
+def _wanted(linear_e_per_s: Float32Array, panel: Panel) -> Float32Array:
+    gain = panel.gain()
+    return linear_e_per_s if gain is None else linear_e_per_s * gain
+
+
+def round_levels(linear_e_per_s: Float32Array, panel: Panel) -> Codes:
+    """The nearest level of each pixel, (height, width) as `linear_e_per_s`; what is over white becomes white."""
+    return encode(_wanted(linear_e_per_s, panel), panel.response, panel.flux_at_white_e_per_s)
+
+
+def dither_levels(linear_e_per_s: Float32Array, panel: Panel, shift: float = 0.0) -> Codes:
+    """One of the two levels about each pixel's light, as a blue-noise mask turned by `shift` (0 to 1) decides.
+
+    The mean light over all thresholds of the mask is the wanted light within 1/8192 of a step of levels.
+    """
+    light = panel.light_e_per_s()
+    rows, columns = np.nonzero(linear_e_per_s)
+    wanted = _wanted(linear_e_per_s, panel)[rows, columns]
+    lower = np.searchsorted(light[1:], wanted, side="right")
+    threshold = turned_mask(shift)[rows % len(blue_noise()), columns % len(blue_noise())]
+    step = light[np.minimum(lower + 1, panel.response.white)] - light[lower]
+    more = (lower < panel.response.white) & (wanted - light[lower] > threshold * step)
+    levels = np.zeros(linear_e_per_s.shape, dtype=level_dtype(panel.response))
+    levels[rows, columns] = lower + more
+    return levels
+
+
+def turned_mask(shift: float) -> Float32Array:
+    """The blue-noise mask plus `shift`, modulo 1; float32, exact for shifts in 4096ths."""
+    turned = blue_noise() + np.float32(shift)
+    return np.asarray(turned - np.floor(turned))
+
+
+def temporal_levels(linear_e_per_s: Float32Array, panel: Panel, frame: int, cycle_frames: int = CYCLE_FRAMES) -> Codes:
+    """`dither_levels` with a mask that turns from frame to frame.
+
+    Over 2^m frames from a multiple of 2^m on, up to the cycle, a still pixel's mean light is within a step / 2^m of the
+    light wanted. Raises InputError for a cycle that is not a power of two.
+    """
+    return dither_levels(linear_e_per_s, panel, frame_shift(frame, cycle_frames))
+
+
+def frame_shift(frame: int, cycle_frames: int) -> float:
+    """The mask's turn in a frame: van der Corput's sequence in base 2, which begins again after `cycle_frames`.
+
+    Each aligned 2^m frames have turns that part [0, 1) evenly. Raises InputError for a cycle that is not a power of two.
+    """
+    if not 1 <= cycle_frames <= LONGEST_CYCLE or cycle_frames & (cycle_frames - 1):
+        raise InputError(f"a cycle of {cycle_frames} frames; write a power of two from 1 to {LONGEST_CYCLE}")
+    place, shift, weight = frame % cycle_frames, 0.0, 0.5
+    while place:
+        shift += weight * (place & 1)
+        place >>= 1
+        weight /= 2
+    return shift
+
+
+def cycle_warning(exposure_s: float, refresh_hz: float, cycle_frames: int = CYCLE_FRAMES) -> str | None:
+    """What to tell the user whose tracker does not expose for a whole cycle of `temporal`, else None."""
+    cycle_s = cycle_frames / refresh_hz
+    if exposure_s >= cycle_s:
+        return None
+    return (
+        f"temporal dithering needs {cycle_frames} frames, {cycle_s * 1e3:.0f} ms at {refresh_hz:g} Hz, and the tracker exposes"
+        f" {exposure_s * 1e3:.0f} ms: it sees a part of the cycle; shorten the cycle or use exact"
+    )
+
+
+def shown_light(levels: Codes, panel: Panel) -> FloatArray:
+    """What the monitor makes of levels (height, width): electrons per second above the black level, float64."""
+    light = panel.response.light[levels] * panel.flux_at_white_e_per_s
+    return light if panel.uniformity is None else light * panel.uniformity

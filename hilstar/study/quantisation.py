@@ -1,0 +1,272 @@
+"""What each way from light to levels costs: flux and centroid errors against magnitude, and against time."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hilstar.arrays import Float32Array, FloatArray
+from hilstar.monitor.exact import ExactQuantiser
+from hilstar.monitor.photometry import Response, Weights, bit_stealing, srgb_response
+from hilstar.monitor.quantise import (
+    CYCLE_FRAMES,
+    Panel,
+    Quantisation,
+    dither_levels,
+    round_levels,
+    shown_light,
+    temporal_levels,
+)
+from hilstar.render.reference import linear_image
+from hilstar.render.renderer import Renderer, Target
+from hilstar.scene.psf import footprint_px, peak_share
+from hilstar.scene.sprites import Sprites, pack_sprites
+from hilstar.study.charts import STYLE, plain_ticks, save, title_lines, write_csv
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+SIGMA_PX = (0.85, 0.85)
+BITS = (8, 10, 12)
+WHITE = 1.0
+# The issue's aims: magnitudes of flux error, and over how many magnitudes, by bits.
+AIMS = {8: (0.05, 6.0), 10: (0.02, 8.0), 12: (0.02, 8.0)}
+AIM_PX = 0.01
+# Rec. 709's shares of white stand in for the primaries as a tracker sees them.
+STEALING_WEIGHTS: Weights = (0.2126, 0.7152, 0.0722)
+FRAME_PX = (1920, 1080)
+STARS = 1000
+SEED = 1
+STEALING = ", bit stealing"
+
+
+@dataclass(frozen=True, slots=True)
+class Way:
+    """One way from light to levels: its name, the renderer's method, and its line."""
+
+    name: str
+    method: Quantisation
+    style: str
+    stealing: bool = False
+    whole_cycle: bool = False
+
+
+WAYS = (
+    Way("round", "round", "C7-"),
+    Way("dither; temporal in one frame", "dither", "C1-"),
+    Way(f"temporal, mean of {CYCLE_FRAMES} frames", "temporal", "C2-", whole_cycle=True),
+    Way("exact", "exact", "C0-"),
+    Way("round" + STEALING, "round", "C7:", stealing=True),
+    Way("exact" + STEALING, "exact", "C0:", stealing=True),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Errors:
+    """Over all phases: rms and largest flux error, mag, and centroid error, px; infinite where a star showed nothing."""
+
+    flux_rms_mag: float
+    flux_max_mag: float
+    centroid_rms_px: float
+    centroid_max_px: float
+
+
+def run(directory: Path, quick: bool = False) -> list[str]:
+    """Write both charts (PNG) and their tables (CSV) into `directory`; a line for each finding."""
+    phases, mags = (8, np.linspace(0, 8, 5)) if quick else (32, np.linspace(0, 10, 41))
+    found = {(bits, way.name): _against_magnitude(bits, way, phases, mags) for bits in BITS for way in WAYS}
+    times = {(bits, way.name): _frame_ms(bits, way, 3 if quick else 60) for bits in BITS for way in WAYS}
+    columns = ("bits", "method", "mag_under_white", "flux_rms_mag", "flux_max_mag", "centroid_rms_px", "centroid_max_px")
+    rows = [
+        (bits, name, float(mag), e.flux_rms_mag, e.flux_max_mag, e.centroid_rms_px, e.centroid_max_px)
+        for (bits, name), errors in found.items()
+        for mag, e in zip(mags, errors, strict=True)
+    ]
+    write_csv(directory / "quantisation.csv", columns, rows)
+    faintest = {key: errors[int(np.searchsorted(mags, AIMS[key[0]][1]))] for key, errors in found.items()}
+    findings = [_summary(bits, found, mags) for bits in BITS] + [_time_summary(times)]
+    _draw_magnitudes(directory / "quantisation.png", found, mags, findings[1])
+    _draw_times(directory / "quantisation_time.png", faintest, times, findings[-1])
+    write_csv(
+        directory / "quantisation_time.csv",
+        ("bits", "method", "frame_ms", "mag_under_white", "flux_rms_mag", "centroid_rms_px"),
+        [(*key, times[key], AIMS[key[0]][1], e.flux_rms_mag, e.centroid_rms_px) for key, e in faintest.items()],
+    )
+    return findings
+
+
+def response_of(bits: int, way: Way) -> Response:
+    """The sRGB response of a way; with bit stealing, of three equal channels."""
+    grey = srgb_response(bits)
+    return bit_stealing((grey, grey, grey), STEALING_WEIGHTS) if way.stealing else grey
+
+
+def phase_grid(count: int) -> tuple[Sprites, int]:
+    """count^2 stars whose peak would be white at the middle of a pixel, one to a tile, at every phase; the tile's side, px."""
+    tile = footprint_px(SIGMA_PX) + 2
+    place = (np.arange(count) + 0.5) * tile + (np.arange(count) + 0.5) / count - 0.5
+    x_px, y_px = (axis.ravel() for axis in np.meshgrid(place, place))
+    flux = np.full(count**2, WHITE / peak_share(SIGMA_PX))
+    frame = ((count * tile, count * tile), footprint_px(SIGMA_PX))
+    return pack_sprites(x_px, y_px, flux, np.arange(count**2), frame), tile
+
+
+def fainter(sprites: Sprites, mag: float) -> Sprites:
+    """The same stars, so many magnitudes fainter."""
+    data = sprites.data.copy()
+    data["electrons_per_s"] *= 10 ** (-0.4 * mag)
+    return Sprites(data, sprites.footprint_px, sprites.star, sprites.x_px, sprites.y_px)
+
+
+def measure(wanted: FloatArray, shown: FloatArray, tile: int) -> Errors:
+    """The errors of each tile of two images, which hold a star each."""
+    light, x_px, y_px = _sums(wanted, tile)
+    lit, lit_x_px, lit_y_px = _sums(shown, tile)
+    with np.errstate(divide="ignore"):
+        flux = np.abs(2.5 * np.log10(lit / light))
+    off = np.where(lit > 0, np.hypot(lit_x_px - x_px, lit_y_px - y_px), np.inf)
+    rms = (float(np.sqrt(np.mean(np.square(error)))) for error in (flux, off))
+    return Errors(next(rms), float(flux.max()), next(rms), float(off.max()))
+
+
+def _sums(image: FloatArray, tile: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Light and centroid (x, y), px, of each tile; the centroid is 0 where there is no light."""
+    count = len(image) // tile
+    tiles = image.reshape(count, tile, count, tile).transpose(0, 2, 1, 3)
+    light = tiles.sum(axis=(2, 3))
+    at, divisor = np.arange(tile), np.where(light > 0, light, 1.0)
+    return light, tiles.sum(axis=2) @ at / divisor, tiles.sum(axis=3) @ at / divisor
+
+
+def _shown(way: Way, panel: Panel, linear: Float32Array, sprites: Sprites) -> FloatArray:
+    """The light that a way makes of a linear image, as a tracker sees it that exposes for the whole cycle."""
+    if way.method == "exact":
+        size = linear.shape[1], linear.shape[0]
+        return shown_light(ExactQuantiser(panel, size, SIGMA_PX).levels(sprites), panel)
+    if way.whole_cycle:
+        frames = [shown_light(temporal_levels(linear, panel, frame), panel) for frame in range(CYCLE_FRAMES)]
+        return np.asarray(np.mean(frames, axis=0))
+    levels = round_levels if way.method == "round" else dither_levels
+    return shown_light(levels(linear, panel), panel)
+
+
+def _against_magnitude(bits: int, way: Way, phases: int, mags: FloatArray) -> list[Errors]:
+    panel = Panel(response_of(bits, way), WHITE)
+    sprites, tile = phase_grid(phases)
+    bright = linear_image(sprites, (phases * tile, phases * tile), SIGMA_PX)
+    errors = []
+    for mag in mags:
+        wanted = bright * 10 ** (-0.4 * mag)
+        shown = _shown(way, panel, wanted.astype(np.float32), fainter(sprites, mag))
+        errors.append(measure(wanted, shown, tile))
+    return errors
+
+
+def _frame_ms(bits: int, way: Way, repeats: int) -> float:
+    """The median time of draw and read-back of 1000 stars over eight magnitudes, three times as many in each as in the last."""
+    rng = np.random.default_rng(SEED)
+    share = rng.uniform(size=STARS)
+    mag = 2 * np.log10(1 + share * (10 ** (8 / 2) - 1))
+    flux = WHITE / peak_share(SIGMA_PX) * 10 ** (-0.4 * mag)
+    x_px, y_px = rng.uniform(0, 1, (2, STARS)) * np.array(FRAME_PX)[:, None]
+    sprites = pack_sprites(x_px, y_px, flux, np.arange(STARS), (FRAME_PX, footprint_px(SIGMA_PX)))
+    target = Target(FRAME_PX, SIGMA_PX, response_of(bits, way), WHITE, way.method)
+    times = []
+    with Renderer(target) as renderer:
+        for frame in range(repeats + 1):
+            begin = time.perf_counter()
+            renderer.draw(sprites, frame)
+            renderer.codes()
+            times.append((time.perf_counter() - begin) * 1e3)
+    return float(np.median(times[1:]))
+
+
+def _summary(bits: int, found: dict[tuple[int, str], list[Errors]], mags: FloatArray) -> str:
+    aim_mag, limit = AIMS[bits]
+
+    def worst(way: Way) -> str:
+        within = [e for e, mag in zip(found[bits, way.name], mags, strict=True) if mag <= limit]
+        return f"{max(e.flux_max_mag for e in within):.3f} mag and {max(e.centroid_max_px for e in within):.3f} px"
+
+    one_frame = ", ".join(f"{way.method} {worst(way)}" for way in WAYS[:3])
+    half_step_px = 0.5 * srgb_response(bits).light[1] * peak_share(SIGMA_PX) * 10 ** (0.4 * limit)
+    return (
+        f"{bits} bits, sRGB, {limit:g} magnitudes (aim {aim_mag:g} mag, {AIM_PX:g} px): exact is off by {worst(WAYS[3])} at"
+        f" most, with bit stealing by {worst(WAYS[5])}; {one_frame} (over {CYCLE_FRAMES} frames)."
+        f" Half of the smallest step of light is {half_step_px:.3f} px along each axis"
+    )
+
+
+def _time_summary(times: dict[tuple[int, str], float]) -> str:
+    ms = {way.name: times[10, way.name] for way in WAYS}
+    return (
+        f"{STARS} stars, {FRAME_PX[0]} x {FRAME_PX[1]}, 10 bits, light to levels in memory: round {ms['round']:.1f} ms,"
+        f" dither {ms[WAYS[1].name]:.1f} ms, temporal {ms[WAYS[2].name]:.1f} ms, exact {ms['exact']:.1f} ms"
+    )
+
+
+def _draw_magnitudes(path: Path, found: dict[tuple[int, str], list[Errors]], mags: FloatArray, finding: str) -> None:
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    with rc_context(STYLE):
+        figure = Figure(figsize=(15.0, 9.6), layout="constrained")
+        grid = figure.subplots(2, len(BITS), sharex=True, sharey="row")
+        for column, bits in enumerate(BITS):
+            aim_mag, limit = AIMS[bits]
+            for way in WAYS:
+                errors = found[bits, way.name]
+                flux, off = grid[0, column], grid[1, column]
+                _lines(flux, mags, [(e.flux_rms_mag, e.flux_max_mag) for e in errors], way)
+                _lines(off, mags, [(e.centroid_rms_px, e.centroid_max_px) for e in errors], way)
+            for axis, aim in ((grid[0, column], aim_mag), (grid[1, column], AIM_PX)):
+                axis.plot([0, limit], [aim, aim], "k--", lw=1.2, label="aim, and its range")
+                axis.plot([limit, limit], [1e-6, aim], "k--", lw=1.2)
+            grid[0, column].set(title=f"{bits} bits", yscale="log", ylim=(1e-5, 1))
+            grid[1, column].set(yscale="log", ylim=(1e-5, 1), xlabel="magnitudes under a star whose peak is white")
+        grid[0, 0].set(ylabel="flux error [mag]\nline: rms over phases, thin: largest")
+        grid[1, 0].set(ylabel="centroid error [monitor px]\nline: rms over phases, thin: largest")
+        figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
+        figure.suptitle(title_lines(finding), fontsize=12)
+        save(figure, path)
+
+
+def _lines(axis: Axes, mags: FloatArray, rms_and_max: list[tuple[float, float]], way: Way) -> None:
+    """Its rms, and thinly its largest; a star that shows nothing ends the line."""
+    rms, largest = np.array(rms_and_max).T
+    axis.plot(mags, np.where(np.isfinite(rms), rms, np.nan), way.style, label=way.name)
+    axis.plot(mags, np.where(np.isfinite(largest), largest, np.nan), way.style, lw=0.7, alpha=0.7)
+
+
+def _draw_times(path: Path, faintest: dict[tuple[int, str], Errors], times: dict[tuple[int, str], float], finding: str) -> None:
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    markers = dict(zip(BITS, "os^", strict=True))
+    with rc_context(STYLE):
+        figure = Figure(figsize=(13.0, 6.8), layout="constrained")
+        axes = figure.subplots(1, 2, sharex=True)
+        for way in WAYS:
+            for bits in BITS:
+                key = bits, way.name
+                label = way.name if bits == BITS[0] else None
+                face = "none" if way.stealing else way.style[:2]
+                for axis, error in zip(axes, (faintest[key].flux_rms_mag, faintest[key].centroid_rms_px), strict=True):
+                    axis.plot(times[key], error, markers[bits], color=way.style[:2], mfc=face, ms=9, label=label)
+        for bits, marker in markers.items():
+            label = f"{bits} bits, {AIMS[bits][1]:g} mag under white"
+            axes[0].plot([], [], "k" + marker, ms=9, label=label)
+        names = ("flux error [mag]", "centroid error [monitor px]")
+        for axis, aim, what in zip(axes, (AIMS[10][0], AIM_PX), names, strict=True):
+            axis.axhline(aim, color="k", ls="--", lw=1.2, label="aim (8 bits: 0.05 mag)")
+            axis.set(yscale="log", xscale="log", ylabel=f"{what}, rms over phases")
+            axis.set(xlabel=f"time of a frame with {STARS} stars [ms]")
+            plain_ticks(axis.xaxis, (1, 1.5, 2, 3, 4, 5, 7, 10, 15))
+            axis.set_xlim(min(times.values()) / 1.2, max(times.values()) * 1.2)
+        figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
+        figure.suptitle(title_lines(finding), fontsize=12)
+        save(figure, path)

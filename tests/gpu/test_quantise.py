@@ -1,0 +1,149 @@
+"""The renderer's methods against their NumPy oracles, pixel for pixel, and the texture that a window would show."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hilstar.errors import InputError
+from hilstar.monitor.exact import ExactQuantiser
+from hilstar.monitor.photometry import bit_stealing, gamma_response, srgb_response
+from hilstar.monitor.quantise import Panel, dither_levels, frame_shift, round_levels, temporal_levels, turned_mask
+from hilstar.render.renderer import Renderer, Target
+from tests.gpu.test_renderer import sprites_at
+
+SIZE = (256, 192)
+SIGMA = (0.85, 0.85)
+WHITE = 1e6
+GREY = srgb_response(8)
+RESPONSES = {
+    "srgb8": GREY,
+    "srgb10": srgb_response(10),
+    "gamma12": gamma_response(12),
+    "stealing8": bit_stealing((GREY, GREY, GREY), (0.2126, 0.7152, 0.0722)),
+}
+# A GL may round light - low and its product with the threshold once more or less than NumPy: a tie is that near.
+TIE = 4 * np.finfo(np.float32).eps
+
+
+def uneven(rng) -> np.ndarray:
+    return rng.uniform(0.8, 1.2, SIZE[::-1]).astype(np.float32)
+
+
+def target_of(response, method, uniformity=None, cycle=8) -> Target:
+    return Target(SIZE, SIGMA, response, WHITE, method, uniformity, cycle)
+
+
+def stars(count, rng, footprint):
+    """`count` stars of eight decades in and about the image."""
+    pixels = rng.uniform([-5, -5], [260, 197], size=(count, 2))
+    return sprites_at(pixels, 10.0 ** rng.uniform(0, 7, count), footprint)
+
+
+def assert_same_but_for_ties(found, expected, linear, panel, shift):
+    """Equal levels; where not, the light is at the mask's threshold within float32."""
+    rows, columns = np.nonzero(found != expected)
+    if not len(rows):
+        return
+    light = panel.light_e_per_s().astype(np.float64)
+    gain = panel.gain()
+    wanted = (linear if gain is None else linear * gain)[rows, columns].astype(np.float64)
+    lower = np.minimum(found, expected)[rows, columns].astype(int)
+    assert (np.maximum(found, expected)[rows, columns] == lower + 1).all()
+    at = turned_mask(shift)[rows % 64, columns % 64] * (light[lower + 1] - light[lower])
+    assert (np.abs(wanted - light[lower] - at) <= TIE * wanted).all()
+
+
+@pytest.mark.parametrize("response", RESPONSES.values(), ids=RESPONSES)
+@pytest.mark.parametrize("count", [150, 8000])
+@pytest.mark.parametrize("mapped", [False, True], ids=["even", "uneven"])
+@pytest.mark.parametrize("method", ["round", "dither", "temporal"])
+def test_levels_are_those_of_the_oracle_pixel_for_pixel(response, count, mapped, method, rng):
+    """150 stars take the footprint pass, 8000 the full-screen pass: the levels of one linear image are one thing."""
+    target = target_of(response, method, uneven(rng) if mapped else None)
+    panel = target.panel()
+    seen = []
+    with Renderer(target) as gl:
+        sprites = stars(count, rng, gl.footprint_px)
+        for frame in (0, 1, 6):
+            gl.draw(sprites, frame)
+            linear, levels = gl.linear(), gl.codes().copy()
+            shift = frame_shift(frame, 8) if method == "temporal" else 0.0
+            oracle = {"round": round_levels, "dither": dither_levels}.get(
+                method, lambda linear, panel, frame=frame: temporal_levels(linear, panel, frame, 8)
+            )(linear, panel)
+            assert levels.dtype == oracle.dtype == (np.uint8 if len(response.light) <= 256 else np.uint16)
+            assert_same_but_for_ties(levels, oracle, linear, panel, shift)
+            seen.append(levels)
+        assert gl.gl_error() == "GL_NO_ERROR"
+    assert seen[0].max() == response.white
+    assert np.array_equal(seen[0], seen[1]) == (method != "temporal")
+
+
+@pytest.mark.parametrize("response", RESPONSES.values(), ids=RESPONSES)
+@pytest.mark.parametrize("mapped", [False, True], ids=["even", "uneven"])
+def test_exact_levels_are_those_of_its_quantiser(response, mapped, rng):
+    target = target_of(response, "exact", uneven(rng) if mapped else None)
+    with Renderer(target) as gl:
+        for count in (300, 20):
+            sprites = stars(count, rng, gl.footprint_px)
+            gl.draw(sprites)
+            assert np.array_equal(gl.codes(), ExactQuantiser(target.panel(), SIZE, SIGMA).levels(sprites))
+        assert gl.codes().max() > 0
+        assert gl.gl_error() == "GL_NO_ERROR"
+
+
+def test_exact_and_round_draw_one_sky(rng):
+    """Two roads to one image: a pixel of `exact` is within a level of what `round` makes of the GPU's light."""
+    response = RESPONSES["srgb10"]
+    with Renderer(target_of(response, "exact")) as gl:
+        sprites = stars(60, rng, gl.footprint_px)
+        gl.draw(sprites)
+        rounded = round_levels(gl.linear(), Panel(response, WHITE))
+        assert np.abs(gl.codes().astype(int) - rounded).max() <= 1
+
+
+def on_the_gpu(gl, dtype):
+    texture = gl.codes_texture
+    with texture.ctx:
+        return np.frombuffer(texture.read(alignment=1), dtype=dtype)
+
+
+@pytest.mark.parametrize("method", ["round", "dither", "temporal", "exact"])
+@pytest.mark.parametrize("name", ["srgb8", "stealing8"])
+def test_the_texture_on_the_gpu_holds_the_codes(method, name, rng):
+    with Renderer(target_of(RESPONSES[name], method)) as gl:
+        for count in (200, 3):
+            gl.draw(stars(count, rng, gl.footprint_px), 5)
+            codes = gl.codes().copy()
+            texture = on_the_gpu(gl, codes.dtype).reshape(codes.shape)
+            assert np.array_equal(texture, codes)
+            assert codes.max() > 0
+        gl.draw(None)
+        assert gl.codes().max() == 0
+        assert not on_the_gpu(gl, np.uint8).any()
+        assert gl.gl_error() == "GL_NO_ERROR"
+
+
+def test_beyond_the_footprints_dither_leaves_black(rng):
+    with Renderer(target_of(RESPONSES["srgb8"], "dither")) as gl:
+        gl.draw(sprites_at(np.array([[100.3, 50.2]]), np.array([1e9]), gl.footprint_px))
+        y, x = np.nonzero(gl.codes())
+        assert np.abs(x - 100).max() <= gl.footprint_px // 2
+        assert np.abs(y - 50).max() <= gl.footprint_px // 2
+
+
+@pytest.mark.parametrize("method", ["round", "exact"])
+def test_a_uniformity_map_of_another_size_is_refused(method):
+    with pytest.raises(InputError, match="192 x 256 px and the monitor 256 x 192"):
+        Renderer(target_of(GREY, method, np.ones((256, 192), dtype=np.float32)))
+
+
+def test_a_cycle_that_is_no_power_of_two_is_refused():
+    with pytest.raises(InputError, match="power of two"):
+        Renderer(target_of(GREY, "temporal", cycle=6))
+
+
+def test_a_target_without_a_monitor_has_no_texture():
+    with Renderer(Target((32, 32), SIGMA)) as gl, pytest.raises(TypeError, match="no monitor response"):
+        _ = gl.codes_texture

@@ -1,0 +1,44 @@
+"""The study of quantisation: its measure is right, and its tables say what its findings say."""
+
+from __future__ import annotations
+
+import csv
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from hilstar.render.reference import linear_image
+from hilstar.study.quantisation import AIMS, BITS, SIGMA_PX, WAYS, fainter, measure, phase_grid, run
+
+
+def test_the_measure_finds_the_error_that_was_put_in():
+    sprites, tile = phase_grid(4)
+    image = linear_image(sprites, (4 * tile, 4 * tile), SIGMA_PX)
+    errors = measure(image, np.roll(image, 1, axis=1) * 10 ** (-0.4 * 0.03), tile)
+    assert (errors.flux_rms_mag, errors.flux_max_mag) == pytest.approx((0.03, 0.03), abs=1e-6)
+    assert (errors.centroid_rms_px, errors.centroid_max_px) == pytest.approx((1, 1), abs=1e-4)
+    nothing = measure(image, np.zeros_like(image), tile)
+    assert np.isinf(nothing.flux_max_mag) and np.isinf(nothing.centroid_rms_px)
+
+
+def test_fainter_stars_have_less_light():
+    sprites, _ = phase_grid(2)
+    ratio = fainter(sprites, 5.0).data["electrons_per_s"] / sprites.data["electrons_per_s"]
+    assert ratio == pytest.approx(np.full(4, 0.01))
+
+
+def test_the_study_writes_charts_tables_and_findings(tmp_path):
+    findings = run(tmp_path, quick=True)
+    assert len(findings) == len(BITS) + 1
+    for name in ("quantisation.png", "quantisation_time.png"):
+        pixels = np.array(Image.open(tmp_path / name).convert("L"))
+        assert pixels.shape[0] > 500 and (pixels < 200).mean() > 0.005
+    with (tmp_path / "quantisation.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == len(BITS) * len(WAYS) * 5
+    for bits, (aim_mag, limit) in AIMS.items():
+        exact = [r for r in rows if r["bits"] == str(bits) and r["method"] == "exact" and float(r["mag_under_white"]) <= limit]
+        assert max(float(r["flux_max_mag"]) for r in exact) <= aim_mag
+    with (tmp_path / "quantisation_time.csv").open() as file:
+        assert all(float(row["frame_ms"]) > 0 for row in csv.DictReader(file))

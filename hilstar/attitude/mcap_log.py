@@ -100,13 +100,30 @@ def read_attitudes(path: Path) -> Iterator[AttitudeSample]:
     A file whose writer was killed gives everything before its last, unfinished chunk. Raises InputError for damage and
     for a message that is no attitude, OSError when the file cannot be read.
     """
+    for number, data in enumerate(read_messages(path, ATTITUDE_TOPIC), start=1):
+        entry = _sample(data)
+        if isinstance(entry, Refusal):
+            raise InputError(f"{path}: message {number} of {ATTITUDE_TOPIC}: {entry.detail}")
+        if entry is not None:
+            yield entry
+
+
+def read_messages(path: Path, topic: str) -> Iterator[bytes]:
+    """What the messages of one topic hold, in the order of the file, up to where its writer was killed.
+
+    Raises InputError for damage, OSError when the file cannot be read.
+    """
     with path.open("rb") as file:
-        for number, data in enumerate(_messages(path, file), start=1):
-            entry = _sample(data)
-            if isinstance(entry, Refusal):
-                raise InputError(f"{path}: message {number} of {ATTITUDE_TOPIC}: {entry.detail}")
-            if entry is not None:
-                yield entry
+        yield from _messages(path, file, topic)
+
+
+def is_mcap(path: Path) -> bool:
+    """True for a file that begins as MCAP does; False too where it cannot be read."""
+    try:
+        with path.open("rb") as file:
+            return file.read(len(MCAP_MAGIC)) == MCAP_MAGIC
+    except OSError:
+        return False
 
 
 def _sample(data: bytes) -> AttitudeSample | Refusal | None:
@@ -121,7 +138,7 @@ def _sample(data: bytes) -> AttitudeSample | Refusal | None:
     return checked_sample(form.t_ns, form.q, form.rate, form.sequence or 0, form.discontinuity)
 
 
-def _messages(path: Path, file: IO[bytes]) -> Iterator[bytes]:
+def _messages(path: Path, file: IO[bytes], topic: str) -> Iterator[bytes]:
     size = file.seek(0, os.SEEK_END)
     file.seek(max(0, size - len(MCAP_MAGIC)))
     finished = size > 2 * len(MCAP_MAGIC) and file.read() == MCAP_MAGIC
@@ -139,7 +156,7 @@ def _messages(path: Path, file: IO[bytes]) -> Iterator[bytes]:
             raise InputError(f"{path}: is damaged before byte {file.tell()} ({detail}); record the log again") from error
         if record is None:
             return
-        if isinstance(record, Channel) and record.topic == ATTITUDE_TOPIC:
+        if isinstance(record, Channel) and record.topic == topic:
             channels.add(record.id)
         elif isinstance(record, Message) and record.channel_id in channels:
             yield record.data

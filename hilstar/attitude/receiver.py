@@ -7,7 +7,7 @@ import threading
 import time
 from array import array
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 from hilstar.attitude.clock import NS_PER_MS, NS_PER_S, BenchClock
@@ -23,12 +23,14 @@ from hilstar.attitude.packet import (
     TimeReply,
     TimeRequest,
 )
+from hilstar.attitude.protocol import HEALTH_MISSED, HEALTH_REFUSED
 from hilstar.attitude.timeline import Timeline
 
 POLL_MS = 20
 FIRST_ASKS = 8  # quickly, so that the clock is soon known
 QUICK_ASK_NS = NS_PER_S // 10
 ASK_NS = NS_PER_S // 2
+TOLD_ONCE = HEALTH_MISSED | HEALTH_REFUSED
 KEPT_LATENCIES = 1_000_000  # 4 MB: over an hour at 200 Hz
 log = logging.getLogger(__name__)
 
@@ -74,7 +76,7 @@ class PacketCounts:
 Watch = Callable[[int, bytes, AttitudeSample | None, Refusal | None], None]
 
 
-def _nobody_watches(host_ns: int, raw: bytes, sample: AttitudeSample | None, refusal: Refusal | None) -> None:
+def nobody_watches(host_ns: int, raw: bytes, sample: AttitudeSample | None, refusal: Refusal | None) -> None:
     """The watch of a run without a ledger."""
 
 
@@ -92,7 +94,7 @@ QUIET = Traffic()
 class Receiver:
     """Runs `link` into `timeline` until closed. Nothing that arrives ends it."""
 
-    def __init__(self, link: Link, timeline: Timeline, traffic: Traffic = QUIET, watch: Watch = _nobody_watches) -> None:
+    def __init__(self, link: Link, timeline: Timeline, traffic: Traffic = QUIET, watch: Watch = nobody_watches) -> None:
         self.counts = PacketCounts()
         self.clock = BenchClock()
         self.jumps = JumpFilter()
@@ -102,6 +104,7 @@ class Receiver:
         self._traffic = traffic
         self._watch = watch
         self._status: Status | None = None
+        self._posting = threading.Lock()
         self._next_status_ns = 0
         self._asked: dict[int, TimeRequest] = {}
         self._asks = 0
@@ -154,7 +157,7 @@ class Receiver:
         jumps = self.jumps.jumps
         for arrived in decided:
             sample, host_ns = arrived.sample, arrived.host_ns
-            refusal = arrived.refusal or self._timeline.add(sample)
+            refusal = arrived.refusal or self._timeline.add(sample, host_ns)
             if refusal is not None:
                 self._refuse(host_ns, arrived.raw, sample, refusal)
                 continue
@@ -176,14 +179,18 @@ class Receiver:
         self._watch(host_ns, raw, sample, refusal)
 
     def post(self, status: Status) -> None:
-        """The newest status; it leaves when its turn comes."""
-        self._status = status
+        """The newest status; it leaves when its turn comes, with what those that never left had to tell once."""
+        with self._posting:
+            if self._status is not None:
+                status = replace(status, health=status.health | self._status.health & TOLD_ONCE)
+            self._status = status
 
     def _talk(self, now_ns: int) -> None:
         if self._traffic.time_requests and now_ns >= self._next_ask_ns:
             self._ask(now_ns)
         if self._traffic.status_hz and self._status is not None and now_ns >= self._next_status_ns:
-            status, self._status = self._status, None
+            with self._posting:
+                status, self._status = self._status, None
             self._next_status_ns = max(self._next_status_ns + round(NS_PER_S / self._traffic.status_hz), now_ns)
             self._link.send(status)
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import threading
 from bisect import bisect_right
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from hilstar.arrays import FloatArray
@@ -25,12 +25,17 @@ OnStale = Literal["hold", "blank"]
 
 @dataclass(frozen=True, slots=True)
 class Attitude:
-    """An attitude at one time, its newest sample's age and sequence, and whether that is too old to trust."""
+    """An attitude at one time, and the newest sample behind it: its age, whether that is too old, its number and arrival.
+
+    `prediction_ns` is how far the attitude was carried on past that sample.
+    """
 
     q_icrs_to_cam: FloatArray
     age_ns: int
     stale: bool
     sequence: int = 0
+    received_ns: int | None = None
+    prediction_ns: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,18 +54,20 @@ class Timeline:
         self._capacity = capacity
         self._t_ns: list[int] = []
         self._samples: list[AttitudeSample] = []
+        self._received_ns: int | None = None  # of the newest
         self._lock = threading.Lock()
 
     def __len__(self) -> int:
         return len(self._samples)
 
-    def add(self, sample: AttitudeSample) -> Refusal | None:
+    def add(self, sample: AttitudeSample, received_ns: int | None = None) -> Refusal | None:
         """Append a sample; one whose time does not rise, a duplicate or one out of order, is refused."""
         with self._lock:
             if self._t_ns and sample.t_ns <= self._t_ns[-1]:
                 return Refusal("time", f"t_ns {sample.t_ns} is not after {self._t_ns[-1]}, which came before it")
             self._t_ns.append(sample.t_ns)
             self._samples.append(sample)
+            self._received_ns = received_ns
             if len(self._samples) > 2 * self._capacity:
                 del self._t_ns[: self._capacity], self._samples[: self._capacity]
             return None
@@ -77,6 +84,7 @@ class Timeline:
                 return None
             i = bisect_right(self._t_ns, t_ns) - 1
             near = self._samples[max(i - 1, 0) : i + 3]
+            received_ns = self._received_ns
         if i < 0:
             return Attitude(near[0].q_icrs_to_cam, 0, False, near[0].sequence)
         place = min(i, 1)
@@ -84,7 +92,7 @@ class Timeline:
         age_ns = t_ns - newest.t_ns
         if place + 1 < len(near):
             return Attitude(self._between(near, place, age_ns), age_ns, False, newest.sequence)
-        return self._predict(near[place - 1] if place else None, newest, age_ns)
+        return replace(self._predict(near[place - 1] if place else None, newest, age_ns), received_ns=received_ns)
 
     def _between(self, near: list[AttitudeSample], place: int, age_ns: int) -> FloatArray:
         before, after = near[place], near[place + 1]
@@ -123,8 +131,9 @@ class Timeline:
                 rate = rate_between_rad_s(previous.q_icrs_to_cam, newest.q_icrs_to_cam, gap_ns / NS_PER_S)
         if rate is None:
             return Attitude(newest.q_icrs_to_cam, age_ns, stale, newest.sequence)
-        seconds = min(age_ns, self._policy.max_extrapolation_ns) / NS_PER_S
-        return Attitude(propagate(newest.q_icrs_to_cam, rate, seconds), age_ns, stale, newest.sequence)
+        prediction_ns = min(age_ns, self._policy.max_extrapolation_ns)
+        q = propagate(newest.q_icrs_to_cam, rate, prediction_ns / NS_PER_S)
+        return Attitude(q, age_ns, stale, newest.sequence, prediction_ns=prediction_ns)
 
 
 def smootherstep(u: float) -> float:

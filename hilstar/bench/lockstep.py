@@ -12,6 +12,7 @@ from hilstar.attitude.packet import AttitudeSample, Event, Refusal, TimeReply, T
 from hilstar.attitude.receiver import Arrival, PacketCounts
 from hilstar.attitude.timeline import Attitude
 from hilstar.bench.assembly import Bench
+from hilstar.bench.ledger import Ledger, frame_record
 from hilstar.bench.loop import FrameLoop, Limit, Shown
 from hilstar.bench.stats import spread
 from hilstar.bench.status import StatusMaker
@@ -19,10 +20,12 @@ from hilstar.bench.status import StatusMaker
 POLL_MS = 50
 
 
-def serve_lockstep(bench: Bench, link: ZmqLockstep, limit: Limit, loop: FrameLoop) -> dict[str, Any]:
+def serve_lockstep(
+    bench: Bench, link: ZmqLockstep, limit: Limit, loop: FrameLoop, ledger: Ledger | None = None
+) -> dict[str, Any]:
     """Answer requests up to `limit`, or until a signal; the summary. A refused request shows nothing new."""
     counts = PacketCounts()
-    statuses = StatusMaker()
+    statuses = StatusMaker(ledger)
     turn_ms = array("f")
     last = Shown(0, 0, None, bench.draw(None))
     begin_ns = time.monotonic_ns()
@@ -41,6 +44,8 @@ def serve_lockstep(bench: Bench, link: ZmqLockstep, limit: Limit, loop: FrameLoo
             counts.refused_by[refusal.reason] += 1
         else:
             last = _show(loop, arrival)
+        if ledger is not None:
+            _keep(ledger, arrival, refusal, last)
         shown_ns = time.monotonic_ns()
         link.reply(statuses.status(last, last.t_ns, loop, counts, False), shown_ns, refusal)
         turn_ms.append((shown_ns - arrival.host_ns) / NS_PER_MS)
@@ -57,9 +62,16 @@ def _refusal(event: Event) -> Refusal | None:
     return Refusal("format", f"a {type(event).__name__} packet; a request is an attitude, or a time request")
 
 
+def _keep(ledger: Ledger, arrival: Arrival, refusal: Refusal | None, shown: Shown) -> None:
+    sample = arrival.event if isinstance(arrival.event, AttitudeSample) else None
+    ledger.packet(arrival.host_ns, arrival.raw, sample, refusal)
+    if refusal is None:
+        ledger.frame(frame_record(shown, shown.t_ns, 0))
+
+
 def _show(loop: FrameLoop, arrival: Arrival) -> Shown:
     sample = arrival.event
     if not isinstance(sample, AttitudeSample):
         raise TypeError("only an attitude is shown")
-    attitude = Attitude(sample.q_icrs_to_cam, 0, False, sample.sequence)
+    attitude = Attitude(sample.q_icrs_to_cam, 0, False, sample.sequence, arrival.host_ns)
     return loop.draw(loop.stats.frames, sample.t_ns, attitude)

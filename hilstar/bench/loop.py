@@ -20,12 +20,18 @@ from hilstar.bench.stats import RunStats
 
 @dataclass(frozen=True, slots=True)
 class Shown:
-    """One frame of a run: its number, its time on the sender's clock, its attitude (None: blank) and its codes."""
+    """One frame of a run: its number, its time on the timeline, its attitude (None: blank) and its levels.
+
+    `draw_ns` is when drawing began and `shown_ns` when the levels were ready, host time.
+    """
 
     number: int
     t_ns: int
     attitude: Attitude | None
     drawn: Drawn
+    draw_ns: int = 0
+    shown_ns: int = 0
+    stale: bool = False
 
 
 FrameSink = Callable[[Shown], None]
@@ -57,14 +63,14 @@ class FrameLoop:
 
     def draw(self, number: int, t_ns: int, attitude: Attitude | None) -> Shown:
         """Draw the frame for `t_ns` of the timeline's clock; without an attitude it is blank."""
-        begin_ns = time.perf_counter_ns()
+        begin_ns = time.monotonic_ns()
         stale = self.gate.update(attitude)
         blank = attitude is None or (stale and self._blank_when_stale)
         drawn = self._bench.draw(None if attitude is None or blank else attitude.q_icrs_to_cam, number)
-        frame_ns = time.perf_counter_ns() - begin_ns
-        self.stats.add(frame_ns, None if attitude is None else attitude.age_ns, drawn.star_count, drawn.clipped_hip)
+        end_ns = time.monotonic_ns()
+        self.stats.add(end_ns - begin_ns, None if attitude is None else attitude.age_ns, drawn.star_count, drawn.clipped_hip)
         self.stats.stale_frames += stale
-        shown = Shown(number, t_ns, None if blank else attitude, drawn)
+        shown = Shown(number, t_ns, None if blank else attitude, drawn, begin_ns, end_ns, stale)
         self._sink(shown)
         return shown
 

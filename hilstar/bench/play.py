@@ -5,10 +5,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 from hilstar.attitude.clock import NS_PER_S
-from hilstar.attitude.logs import read_log
-from hilstar.attitude.packet import AttitudeSample
+from hilstar.attitude.logs import log_timeline, read_log
+from hilstar.attitude.mcap_log import is_mcap, read_attitudes
+from hilstar.attitude.timeline import Attitude, Timeline
+from hilstar.bench.config import BenchConfig
+from hilstar.bench.ledger import PastFrame, past_frames
+from hilstar.bench.loop import policy_of
 from hilstar.errors import InputError
 
 MOST_FRAMES = 100_000_000
@@ -25,34 +30,79 @@ class Wanted:
     step_s: float | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Play:
-    """A log to replay: frame k shows the log's `first_ns + k step_s`."""
+class Play(Protocol):
+    """Frames of the past, in order; paced as on a monitor, or all at once."""
 
-    samples: list[AttitudeSample]
+    @property
+    def paced(self) -> bool:
+        """As on a monitor, where late frames are missed."""
+
+    @property
+    def frame_count(self) -> int:
+        """How many frames there are."""
+
+    @property
+    def packet_count(self) -> int:
+        """How many attitudes are behind them."""
+
+    def frame(self, slot: int) -> tuple[int, int, Attitude | None]:
+        """Number, time and attitude of a frame; None is blank."""
+
+
+@dataclass(frozen=True, slots=True)
+class LogPlay:
+    """A log: frame k shows its time `first_ns + k step_s`."""
+
+    timeline: Timeline
     first_ns: int
     step_s: float
     frame_count: int
     paced: bool
 
-    def time_ns(self, slot: int) -> int:
-        """The log's time that a frame shows."""
-        return self.first_ns + round(slot * self.step_s * NS_PER_S)
+    @property
+    def packet_count(self) -> int:
+        """The samples of the log."""
+        return len(self.timeline)
+
+    def frame(self, slot: int) -> tuple[int, int, Attitude | None]:
+        """Number, time and attitude of a frame."""
+        t_ns = self.first_ns + round(slot * self.step_s * NS_PER_S)
+        return slot, t_ns, self.timeline.at(t_ns)
 
 
-def plan_play(log: Path, wanted: Wanted, refresh_hz: float) -> Play:
-    """The frames of a replay: one each refresh period of the log, stretched by the speed, unless a step is given.
+@dataclass(frozen=True, slots=True)
+class RunPlay:
+    """An earlier run by its ledger: the same frames with the same attitudes, so the same light, bit for bit."""
 
-    Raises InputError for a speed, a span or a step that gives no frame.
+    frames: list[PastFrame]
+    packet_count: int
+    paced: bool
+
+    @property
+    def frame_count(self) -> int:
+        """The frames that the run drew."""
+        return len(self.frames)
+
+    def frame(self, slot: int) -> tuple[int, int, Attitude | None]:
+        """Number, time and attitude of a frame."""
+        past = self.frames[slot]
+        attitude = None if past.q_icrs_to_cam is None else Attitude(past.q_icrs_to_cam, 0, False)
+        return past.number, past.t_ns, attitude
+
+
+def plan_play(log: Path, wanted: Wanted, config: BenchConfig) -> Play:
+    """The frames of a replay: of a log one each refresh period, stretched by the speed, unless a step is given.
+
+    Of a ledger those that its run drew. Raises InputError for a speed, a span or a step that gives no frame.
     """
     factor = parse_speed(wanted.speed)
+    if is_mcap(log):
+        frames = list(past_frames(log))
+        if frames:
+            return _plan_run(log, wanted, factor, frames)
     samples = read_log(log)
-    length_s = (samples[-1].t_ns - samples[0].t_ns) / NS_PER_S
-    start_s = 0.0 if wanted.start_s is None else wanted.start_s
-    stop_s = length_s if wanted.stop_s is None else wanted.stop_s
-    if not 0 <= start_s <= stop_s <= length_s + 1e-9:
-        raise InputError(f"{log}: --start {start_s:g} --stop {stop_s:g}; write seconds from 0 to its length, {length_s:g}")
-    step_s = (1.0 if math.isinf(factor) else factor) / refresh_hz
+    start_s, stop_s = _span(log, wanted, (samples[-1].t_ns - samples[0].t_ns) / NS_PER_S)
+    step_s = (1.0 if math.isinf(factor) else factor) / config.monitor.refresh_hz
     if wanted.step_s is not None:
         if wanted.step_s <= 0 or factor not in {1.0, math.inf}:
             raise InputError(f"--step {wanted.step_s:g}: write seconds above 0, and --speed realtime or max beside it")
@@ -61,7 +111,26 @@ def plan_play(log: Path, wanted: Wanted, refresh_hz: float) -> Play:
     if count > MOST_FRAMES:
         raise InputError(f"{log}: makes {count:.3g} frames; write a longer --step, or --start and --stop")
     first_ns = samples[0].t_ns + round(start_s * NS_PER_S)
-    return Play(samples, first_ns, step_s, int(count) + 1, not math.isinf(factor))
+    return LogPlay(log_timeline(samples, policy_of(config.attitude)), first_ns, step_s, int(count) + 1, not math.isinf(factor))
+
+
+def _plan_run(log: Path, wanted: Wanted, factor: float, frames: list[PastFrame]) -> RunPlay:
+    if wanted.step_s is not None or factor not in {1.0, math.inf}:
+        raise InputError(f"{log}: an earlier run is replayed frame by frame; leave --step out, and --speed but realtime or max")
+    first_ns = frames[0].shown_ns
+    start_s, stop_s = _span(log, wanted, (frames[-1].shown_ns - first_ns) / NS_PER_S)
+    kept = [frame for frame in frames if start_s <= (frame.shown_ns - first_ns) / NS_PER_S <= stop_s + 1e-9]
+    if not kept:
+        raise InputError(f"{log}: has no frame from --start {start_s:g} to --stop {stop_s:g}; write a longer span")
+    return RunPlay(kept, sum(1 for _ in read_attitudes(log)), not math.isinf(factor))
+
+
+def _span(log: Path, wanted: Wanted, length_s: float) -> tuple[float, float]:
+    start_s = 0.0 if wanted.start_s is None else wanted.start_s
+    stop_s = length_s if wanted.stop_s is None else wanted.stop_s
+    if not 0 <= start_s <= stop_s <= length_s + 1e-9:
+        raise InputError(f"{log}: --start {start_s:g} --stop {stop_s:g}; write seconds from 0 to its length, {length_s:g}")
+    return start_s, stop_s
 
 
 def parse_speed(text: str) -> float:

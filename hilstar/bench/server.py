@@ -9,12 +9,12 @@ from typing import Any
 from hilstar.attitude.clock import NS_PER_S
 from hilstar.attitude.curve import CurveKeys
 from hilstar.attitude.links import ZmqLockstep, ZmqReceiver
-from hilstar.attitude.logs import log_timeline
-from hilstar.attitude.receiver import PacketCounts, Receiver, Traffic
+from hilstar.attitude.receiver import PacketCounts, Receiver, Traffic, nobody_watches
 from hilstar.attitude.serial_link import SerialLink
 from hilstar.attitude.timeline import Timeline
 from hilstar.bench.assembly import Bench
 from hilstar.bench.config import AttitudeSettings
+from hilstar.bench.ledger import Ledger, frame_record
 from hilstar.bench.lockstep import serve_lockstep
 from hilstar.bench.loop import FrameLoop, FrameSink, Limit, ignore, policy_of, stop_on_signal
 from hilstar.bench.play import Play
@@ -40,27 +40,34 @@ def open_link(settings: AttitudeSettings, folder: Path) -> AnyLink:
     return ZmqReceiver(settings.endpoint, bind=settings.bind is True, keys=keys)
 
 
-def serve(bench: Bench, link: AnyLink, limit: Limit, sink: FrameSink = ignore) -> dict[str, Any]:
-    """Show the live stream of `link` up to `limit`, or until a signal; the summary."""
+def serve(bench: Bench, link: AnyLink, limit: Limit, sink: FrameSink = ignore, ledger: Ledger | None = None) -> dict[str, Any]:
+    """Show the live stream of `link` up to `limit`, or until a signal, and keep it in `ledger`; the summary."""
     loop = FrameLoop(bench, sink)
     with stop_on_signal(loop.stop):
         if isinstance(link, ZmqLockstep):
             bench.warm_up()
-            return serve_lockstep(bench, link, limit, loop)
-        return _serve_stream(bench, link, limit, loop)
+            summary = serve_lockstep(bench, link, limit, loop, ledger)
+        else:
+            summary = _serve_stream(bench, link, limit, loop, ledger)
+    return summary | ({} if ledger is None else {"ledger": ledger.summary()})
 
 
-def _serve_stream(bench: Bench, link: ZmqReceiver | SerialLink, limit: Limit, loop: FrameLoop) -> dict[str, Any]:
+def _serve_stream(
+    bench: Bench, link: ZmqReceiver | SerialLink, limit: Limit, loop: FrameLoop, ledger: Ledger | None
+) -> dict[str, Any]:
     settings = bench.config.attitude
     timeline = Timeline(policy_of(settings))
-    receiver = Receiver(link, timeline, Traffic(settings.status_hz, settings.time_requests))
-    statuses = StatusMaker()
+    watch = nobody_watches if ledger is None else ledger.packet
+    receiver = Receiver(link, timeline, Traffic(settings.status_hz, settings.time_requests), watch)
+    statuses = StatusMaker(ledger)
 
     def draw_slot(slot: int) -> None:
         t_ns = receiver.clock.to_bench_ns(time.monotonic_ns())
         shown = loop.draw(slot, t_ns, timeline.at(t_ns))
+        light_ns = receiver.bench_ns(t_ns)
+        if ledger is not None:
+            ledger.frame(frame_record(shown, light_ns, loop.stats.missed_frames))
         if link.two_way:
-            light_ns = receiver.bench_ns(t_ns)
             receiver.post(statuses.status(shown, light_ns, loop, receiver.counts, receiver.clock.synchronised))
 
     receiver.start()
@@ -80,17 +87,18 @@ def _serve_stream(bench: Bench, link: ZmqReceiver | SerialLink, limit: Limit, lo
     }
 
 
-def replay(bench: Bench, play: Play, sink: FrameSink = ignore) -> dict[str, Any]:
-    """Show a log, a frame for each step from its start to its stop; the summary.
+def replay(bench: Bench, play: Play, sink: FrameSink = ignore, ledger: Ledger | None = None) -> dict[str, Any]:
+    """Show the past, and keep it in `ledger`; the summary.
 
     Paced, late frames are missed, as on a monitor; otherwise every frame is drawn, as fast as it can be.
     """
     loop = FrameLoop(bench, sink)
-    timeline = log_timeline(play.samples, policy_of(bench.config.attitude))
 
     def draw_slot(slot: int) -> None:
-        t_ns = play.time_ns(slot)
-        loop.draw(slot, t_ns, timeline.at(t_ns))
+        number, t_ns, attitude = play.frame(slot)
+        shown = loop.draw(number, t_ns, attitude)
+        if ledger is not None:
+            ledger.frame(frame_record(shown, t_ns, loop.stats.missed_frames))
 
     bench.warm_up()
     begin_ns = time.monotonic_ns()
@@ -103,5 +111,6 @@ def replay(bench: Bench, play: Play, sink: FrameSink = ignore) -> dict[str, Any]
                     break
                 draw_slot(slot)
     duration_s = (time.monotonic_ns() - begin_ns) / NS_PER_S
-    summary = loop.stats.summary(duration_s, PacketCounts(received=len(play.samples)), bench.renderer.gl_renderer)
-    return summary | {"stale_events": loop.gate.events}
+    summary = loop.stats.summary(duration_s, PacketCounts(received=play.packet_count), bench.renderer.gl_renderer)
+    kept = {} if ledger is None else {"ledger": ledger.summary()}
+    return summary | {"stale_events": loop.gate.events} | kept

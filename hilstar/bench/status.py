@@ -5,13 +5,15 @@ from __future__ import annotations
 from hilstar.attitude import protocol
 from hilstar.attitude.packet import Status
 from hilstar.attitude.receiver import PacketCounts
+from hilstar.bench.ledger import Ledger
 from hilstar.bench.loop import FrameLoop, Shown
 
 
 class StatusMaker:
     """Makes status packets; `missed` and `refused` are told once each time."""
 
-    def __init__(self) -> None:
+    def __init__(self, ledger: Ledger | None = None) -> None:
+        self._ledger = ledger
         self._missed = 0
         self._refused = 0
 
@@ -27,6 +29,7 @@ class StatusMaker:
             protocol.HEALTH_MISSED: missed > self._missed,
             protocol.HEALTH_REFUSED: refused > self._refused,
             protocol.HEALTH_CLIPPED: bool(shown.drawn.clipped_hip),
+            protocol.HEALTH_LEDGER_FAILED: self._ledger is not None and self._ledger.failure is not None,
         }
         self._missed, self._refused = missed, refused
         return Status(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,6 +13,8 @@ import typer
 from hilstar.cli.common import LOG_HELP, BenchFile, Headless, Json, QuaternionText, RadecText, app, attitude_of, need_headless
 from hilstar.console import print_json, progress, report, say
 from hilstar.errors import InputError
+
+LedgerFile = Annotated[Path | None, typer.Option("--ledger", metavar="RUN.mcap", help="Keep every packet and frame there.")]
 
 
 @app.command()
@@ -78,6 +81,13 @@ def frame(
         typer.echo(f"{len(shot.truth)} stars{names}; wrote {', '.join(summary['written'])}")
 
 
+def optional_ledger(path: Path | None, bench: Any) -> AbstractContextManager[Any]:
+    """The run's ledger, or nothing where none was asked for."""
+    from hilstar.bench.ledger import Ledger
+
+    return nullcontext() if path is None else Ledger(path, bench)
+
+
 def left_out(truth: Any) -> dict[str, float | int]:
     """The stars in view that the monitor cannot show: how many, and their part of all light."""
     missing = truth["electrons_per_s"][~truth["drawn"]]
@@ -91,6 +101,7 @@ def serve(
     headless: Headless = False,
     duration: Annotated[float | None, typer.Option(help="Seconds to run; until Ctrl-C by default.", min=0, max=1e8)] = None,
     frames: Annotated[int | None, typer.Option(help="Frames to draw.", min=1)] = None,
+    ledger: LedgerFile = None,
     as_json: Json = False,
 ) -> None:
     """Show the live attitude stream."""
@@ -100,13 +111,17 @@ def serve(
     from hilstar.bench.server import serve as serve_stream
 
     need_headless("serve", headless)
-    with load(bench_file) as bench, open_link(bench.config.attitude, bench_file.parent) as link:
+    with (
+        load(bench_file) as bench,
+        open_link(bench.config.attitude, bench_file.parent) as link,
+        optional_ledger(ledger, bench) as kept,
+    ):
         refresh_hz = bench.config.monitor.refresh_hz
         slots = math.inf if duration is None else round(duration * refresh_hz)
         limit = Limit(slots, math.inf if frames is None else frames)
         say(f"{link.verb} {link.endpoint}, {refresh_hz:g} Hz, {bench.renderer.gl_renderer}")
         with progress("serving", min(limit.slots, limit.frames)) as advance:
-            summary = serve_stream(bench, link, limit, lambda shown: advance(shown.number + 1))
+            summary = serve_stream(bench, link, limit, lambda shown: advance(shown.number + 1), kept)
     report(summary, as_json)
 
 
@@ -120,6 +135,7 @@ def replay(
     step: Annotated[float | None, typer.Option(metavar="S", help="Seconds of the log from frame to frame.")] = None,
     headless: Headless = False,
     output: Annotated[Path | None, typer.Option("-o", "--output", metavar="DIR", help="Write each frame there.")] = None,
+    ledger: LedgerFile = None,
     as_json: Json = False,
 ) -> None:
     """Show an attitude log."""
@@ -130,10 +146,11 @@ def replay(
     from hilstar.bench.server import replay as replay_log
 
     need_headless("replay", headless)
-    play = plan_play(log, Wanted(speed, start, stop, step), read_config(bench_file).monitor.refresh_hz)
+    play = plan_play(log, Wanted(speed, start, stop, step), read_config(bench_file))
     with (
         load(bench_file) as bench,
         FrameRecorder(output, bench) as record,
+        optional_ledger(ledger, bench) as kept,
         progress("replaying", play.frame_count) as advance,
     ):
 
@@ -141,5 +158,5 @@ def replay(
             record(shown)
             advance(shown.number + 1)
 
-        summary = replay_log(bench, play, sink)
+        summary = replay_log(bench, play, sink, kept)
     report(summary, as_json)

@@ -1,0 +1,167 @@
+"""The ledger: everything of a run, through a kill and a full disk, and the same light when it is replayed."""
+
+from __future__ import annotations
+
+import json
+import signal
+import struct
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+from mcap.reader import make_reader
+from PIL import Image
+
+from hilstar.attitude.logs import read_log
+from hilstar.attitude.quaternion import from_radec_roll_deg, propagate
+from hilstar.bench.ledger import past_frames
+from tests.conftest import SMALL_BENCH, assert_refused, run_hilstar
+from tests.e2e.test_serve import packet, publisher, serving, summary_of
+
+START = from_radec_roll_deg(84, -1, 0)
+RATE = (0.0, 0.0, 0.1)
+LIMIT_BYTES = 60_000
+
+
+def stream(sender, count: int, start_ns: int | None = None) -> int:
+    """A turn at 100 Hz, on a bench clock that began 50 s ago; a wrong packet after each tenth."""
+    start_ns = time.monotonic_ns() if start_ns is None else start_ns
+    for k in range(count):
+        q = propagate(START, np.array(RATE), k * 0.01)
+        sender.send(packet(k, 50_000_000_000 + k * 10_000_000, q=tuple(q), rate=RATE))
+        if k % 10 == 9:
+            sender.send(b"wrong")
+        time.sleep(0.01)
+    return start_ns
+
+
+def messages(path: Path) -> dict[str, list[dict]]:
+    """By topic, through MCAP's own reader."""
+    found: dict[str, list[dict]] = {}
+    with path.open("rb") as file:
+        for _, channel, message in make_reader(file).iter_messages():
+            found.setdefault(channel.topic, []).append(json.loads(message.data))
+    return found
+
+
+def served(tmp_path, *options: str) -> tuple[Path, dict]:
+    ledger = tmp_path / "run.mcap"
+    with publisher() as (sender, port), serving(tmp_path, port, "--ledger", str(ledger), *options) as process:
+        stream(sender, 100)
+        process.send_signal(signal.SIGINT)
+        return ledger, summary_of(process)
+
+
+def test_every_packet_and_every_frame_is_there(tmp_path):
+    ledger, summary = served(tmp_path)
+    assert summary["ledger"] == {"path": str(ledger), "failure": None, "unrecorded": 0}
+    found = messages(ledger)
+    assert len(found["/attitude"]) == summary["packets"]["received"] == 110
+    assert sum(not each["accepted"] for each in found["/attitude"]) == 10
+    refused = [each for each in found["/attitude"] if not each["accepted"]]
+    assert all(each["raw"] == b"wrong".hex() and each["reason"].startswith("format") for each in refused)
+    for each in found["/attitude"]:
+        if each["accepted"]:
+            t_ns, *q = struct.unpack_from("<q4d", bytes.fromhex(each["raw"]), 8)
+            assert (each["t_ns"], each["q"]) == (t_ns, q)
+    frames = found["/frame"]
+    assert len(frames) == summary["frames"]
+    drawn = [frame for frame in frames if frame["q"] is not None]
+    assert len(drawn) > 40
+    for frame in drawn:
+        assert frame["draw_ns"] < frame["shown_ns"]
+        assert frame["receive_ns"] < frame["draw_ns"]
+        assert frame["age_ns"] == frame["light_ns"] - frame["attitude_t_ns"]
+        assert frame["timestamp_source"] == "headless"
+        assert frame["stars_drawn"] > 0
+    with ledger.open("rb") as file:
+        head = next(iter(make_reader(file).iter_metadata())).metadata
+    assert "[tracker]" in head["bench_text"]
+    assert len(head["bench_sha256"]) == len(head["calibration_sha256"]) == 64
+
+
+def test_what_was_drawn_is_drawn_again_bit_for_bit(tmp_path):
+    """A run that is recorded as pictures, and again from its ledger: with temporal dither each frame's codes are its own."""
+    log = tmp_path / "log.csv"
+    rows = [propagate(START, np.array(RATE), k * 0.05) for k in range(9)]
+    lines = [f"{k * 0.05},{','.join(repr(float(v)) for v in q)}" for k, q in enumerate(rows)]
+    log.write_text("\n".join(["t_s,qw,qx,qy,qz", *lines]))
+    bench = tmp_path / "bench.toml"
+    bench.write_text(SMALL_BENCH + '[render]\nquantisation = "temporal"\n')
+    first, second = tmp_path / "first", tmp_path / "second"
+    ledger = tmp_path / "run.mcap"
+    options = ["--headless", "--speed", "max"]
+    assert run_hilstar("replay", bench, log, *options, "-o", first, "--ledger", ledger).returncode == 0
+    again = run_hilstar("replay", bench, ledger, *options, "-o", second)
+    assert again.returncode == 0, again.stderr
+    names = sorted(path.name for path in first.glob("*.png"))
+    assert len(names) == 25
+    assert names == sorted(path.name for path in second.glob("*.png"))
+    for name in names:
+        assert (np.array(Image.open(first / name)) == np.array(Image.open(second / name))).all()
+    assert (first / "frames.csv").read_text() == (second / "frames.csv").read_text()
+
+
+def test_a_live_run_s_ledger_is_an_attitude_log_too(tmp_path):
+    ledger, _ = served(tmp_path)
+    samples = read_log(ledger)
+    assert len(samples) == 100
+    converted = run_hilstar("convert", ledger, tmp_path / "run.csv")
+    assert "100 attitudes" in converted.stdout
+    replayed = run_hilstar("replay", tmp_path / "serve.toml", ledger, "--headless", "--speed", "max", "--json")
+    assert json.loads(replayed.stdout)["frames"] == len(list(past_frames(ledger)))
+    refused = run_hilstar("replay", tmp_path / "serve.toml", ledger, "--headless", "--step", "1")
+    assert_refused(refused, 2, "run.mcap", "--step")
+
+
+def test_after_a_kill_all_but_the_last_half_second_can_be_read(tmp_path):
+    ledger = tmp_path / "run.mcap"
+    with publisher() as (sender, port), serving(tmp_path, port, "--ledger", str(ledger)) as process:
+        stream(sender, 150)
+        killed_ns = time.monotonic_ns()
+        process.kill()
+        process.wait()
+    found = read_log(ledger)
+    assert len(found) >= 100
+    last = list(past_frames(ledger))[-1]
+    assert len(list(past_frames(ledger))) > 50
+    # The bench's clock began 50 s before its stream, which ended at the kill: frames and packets reach to half a second of it.
+    assert found[-1].t_ns > 50_000_000_000 + 1_500_000_000 - 600_000_000
+    assert last.t_ns > 50_000_000_000 + 1_500_000_000 - 600_000_000
+    assert killed_ns > 0
+
+
+def test_a_full_disk_ends_the_ledger_and_not_the_display(tmp_path):
+    """A file that may not grow over 60 kB stands for the disk."""
+    ledger = tmp_path / "run.mcap"
+    bench = tmp_path / "bench.toml"
+    with publisher() as (sender, port):
+        bench.write_text(f'{SMALL_BENCH}\n[attitude]\nendpoint = "tcp://127.0.0.1:{port}"\n')
+        command = ["serve", str(bench), "--headless", "--json", "--ledger", str(ledger), "--duration", "3"]
+        limited = f"import resource; resource.setrlimit(resource.RLIMIT_FSIZE, ({LIMIT_BYTES}, {LIMIT_BYTES}))"
+        program = f"{limited}; from hilstar.cli import main; main()"
+        with subprocess.Popen(
+            [sys.executable, "-c", program, *command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        ) as process:
+            assert process.stderr is not None
+            process.stderr.readline()
+            time.sleep(0.3)
+            stream(sender, 200)
+            out, err = process.communicate(timeout=30)
+    assert process.returncode == 0, err
+    summary = json.loads(out)
+    assert "the display goes on" in err
+    assert summary["ledger"]["failure"]
+    assert summary["ledger"]["unrecorded"] > 0
+    assert summary["frames"] + summary["missed_frames"] == 180
+    assert len(read_log(ledger)) > 20
+
+
+def test_a_ledger_that_cannot_be_begun_gets_one_line(tmp_path, small_bench_file):
+    for place in (tmp_path / "no" / "run.mcap", "/dev/full"):
+        result = run_hilstar("serve", small_bench_file, "--headless", "--duration", "1", "--ledger", place)
+        assert result.returncode == 2
+        assert str(place) in result.stderr
+        assert "Traceback" not in result.stderr

@@ -150,8 +150,15 @@ class Verify(_Table, frozen=True):
     """[verify]: the digital twin, and the limits within which it says that the bench passes."""
 
     true_calibration: str | None = None
-    flux_mag: Positive | None = None
-    centroid_px: Positive | None = None
+    true_flux_at_white_e_per_s: Positive | None = None
+    true_focal_length_mm: Positive | None = None
+    true_pixel_pitch_um: Positive | None = None
+    true_q_cam_to_mon: Rotation | None = None
+    true_mirror: Literal["none", "x", "y", "swap"] = "none"
+    flux_mag: Positive = 0.05
+    centroid_px: Positive = 0.1
+    lost_share: NotNegative = 0.02
+    black_e_per_s_px: NotNegative | None = None
 
 
 class BenchConfig(_Table, frozen=True):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import typer
@@ -114,6 +114,55 @@ def study_lines(what: str, output: Path) -> tuple[list[str], bool]:
     places = run_stability(output)
     lines = [f"{'right' if p.right else 'WRONG'}  {p.case}: {p.happens} ({p.why})" for p in places]
     return lines, all(place.right for place in places)
+
+
+@app.command()
+def verify(
+    bench_file: BenchFile,
+    fields: Annotated[int, typer.Option(help="Random attitudes.", min=1, max=100_000)] = 10,
+    seed: Annotated[int, typer.Option(help="Of the attitudes and the noise.", min=0)] = 0,
+    output: Annotated[Path | None, typer.Option("-o", "--output", metavar="DIR", help="Charts and a table.")] = None,
+    strict: Annotated[bool, typer.Option("--strict", help="Exit code 1 when the bench does not pass.")] = False,
+    as_json: Json = False,
+) -> None:
+    """The digital twin: what the tracker measures of the stars shown, against the sky."""
+    from hilstar.bench.config import read_config
+    from hilstar.bench.output import make_directory
+    from hilstar.study.twin import verify as run_twin
+    from hilstar.study.twin_verdict import write_report
+
+    if output is not None:
+        make_directory(output)
+    with progress("verifying", fields) as advance:
+        verdict, summary = run_twin(bench_file, fields, np.random.default_rng(seed), advance)
+    if output is not None:
+        config = read_config(bench_file)
+        write_report(output, verdict, (config.verify.flux_mag, config.verify.centroid_px), config.tracker.resolution_px)
+    if as_json:
+        print_json(summary)
+    else:
+        tell_verdict(summary)
+    if strict and not verdict.passed:
+        raise typer.Exit(1)
+
+
+def tell_verdict(summary: dict[str, Any]) -> None:
+    """The verdict for a person."""
+
+    def three(errors: dict[str, float | None]) -> str:
+        return " / ".join("-" if errors[key] is None else f"{errors[key]:.4f}" for key in ("rms", "p95", "max"))
+
+    rest = ", ".join(f"{summary[name]} {name.replace('_', ' ')}" for name in ("lost", "blended", "clipped", "not_shown"))
+    typer.echo(f"{'stars':20}{summary['stars']} in {summary['fields']} fields; {rest}")
+    typer.echo(f"{'flux error':20}{three(summary['flux_error_mag'])} mag (rms / 95 % / max)")
+    arcsec = three(summary["centroid_error_arcsec"])
+    typer.echo(f"{'centroid error':20}{three(summary['centroid_error_px'])} px, {arcsec} arcsec")
+    typer.echo(
+        f"{'with detector noise':20}{three(summary['noisy']['flux_mag'])} mag, {three(summary['noisy']['centroid_px'])} px"
+    )
+    for line in summary["reasons"]:
+        typer.echo(f"{'':20}{line}")
+    typer.echo(f"{'verdict':20}{'passed' if summary['passed'] else 'NOT passed'}")
 
 
 @app.command()

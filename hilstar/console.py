@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from typing import Any, NoReturn
 
 import msgspec
+import numpy as np
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -20,8 +21,14 @@ def say(line: str) -> None:
 
 
 def print_json(value: dict[str, Any]) -> None:
-    """The one JSON object of --json."""
-    typer.echo(msgspec.json.encode(value).decode())
+    """The one JSON object of --json; NumPy's numbers come out as plain ones."""
+    typer.echo(msgspec.json.encode(value, enc_hook=_plain).decode())
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    raise TypeError(f"{type(value).__name__} has no JSON form")
 
 
 def report(summary: dict[str, Any], as_json: bool) -> None:

@@ -88,7 +88,7 @@ class Bench:
         self.camera = bench_camera(self.config)
         self._sigma_px = self.config.render.sprite_sigma_px
         self.flux_at_white_e_per_s = self.config.render.flux_at_white_e_per_s or brightest_peak_e_per_s(
-            self.stars, self._sigma_px
+            self.stars, self._sigma_px, self.config.render.brightest_v_mag
         )
         self.calibration = bench_calibration(self.config, path.parent)
         self.uniformity = self.calibration.uniformity_map(self.config.monitor.resolution_px)
@@ -259,14 +259,17 @@ def bench_camera(config: BenchConfig) -> Camera:
     )
 
 
-def brightest_peak_e_per_s(stars: Stars, sigma_px: tuple[float, float]) -> float:
+def brightest_peak_e_per_s(stars: Stars, sigma_px: tuple[float, float], brightest_v_mag: float | None = None) -> float:
     """The light of the brightest pixel that any star of the bench can make: white, where the file gives none.
 
-    Raises InputError when the bench has no star at all.
+    With `brightest_v_mag` stars brighter than that may clip. Raises InputError when that leaves no star at all.
     """
-    if not len(stars):
-        raise InputError("[sky] faintest_v_mag leaves no star; write a larger magnitude, or [render] flux_at_white_e_per_s")
-    return float(stars.electrons_per_s.max()) * peak_share(sigma_px)
+    wanted = stars.electrons_per_s if brightest_v_mag is None else stars.electrons_per_s[stars.v_mag >= brightest_v_mag]
+    if not len(wanted):
+        key = "[sky] faintest_v_mag" if brightest_v_mag is None else "[render] brightest_v_mag"
+        magnitude = "larger" if brightest_v_mag is None else "smaller"
+        raise InputError(f"{key} leaves no star; write a {magnitude} magnitude, or [render] flux_at_white_e_per_s")
+    return float(wanted.max()) * peak_share(sigma_px)
 
 
 def bench_hash(config: BenchConfig, folder: Path) -> str:

@@ -136,6 +136,7 @@ class RenderSettings(_Table, frozen=True):
     cycle_frames: Literal[1, 2, 4, 8, 16, 32, 64, 128, 256] = 8
     sprite_sigma_px: Sigma = (0.85, 0.85)
     flux_at_white_e_per_s: Positive | None = None
+    brightest_v_mag: Magnitude | None = None
 
 
 class Background(_Table, frozen=True):
@@ -265,6 +266,8 @@ def _check_meaning(config: BenchConfig, path: Path) -> None:
         raise InputError(f"{path}: [sky] observer_velocity_km_s is not slower than light; write km/s, ICRS x, y, z")
     if config.background.electrons_per_px is not None and config.background.zodiacal_v_mag_arcsec2 is not None:
         raise InputError(f"{path}: [background] has electrons_per_px and zodiacal_v_mag_arcsec2; write one of them")
+    if config.render.flux_at_white_e_per_s is not None and config.render.brightest_v_mag is not None:
+        raise InputError(f"{path}: [render] has flux_at_white_e_per_s and brightest_v_mag; write one of them")
     if config.attitude.source == "serial" and not config.attitude.port:
         raise InputError(f'{path}: [attitude] source = "serial" needs port; write port = "/dev/ttyUSB0" or the like')
     if config.attitude.source == "serial" and config.attitude.lockstep:

@@ -105,13 +105,13 @@ def response_of(bits: int, way: Way) -> Response:
     return bit_stealing((grey, grey, grey), STEALING_WEIGHTS) if way.stealing else grey
 
 
-def phase_grid(count: int) -> tuple[Sprites, int]:
+def phase_grid(count: int, sigma_px: tuple[float, float] = SIGMA_PX) -> tuple[Sprites, int]:
     """count^2 stars whose peak would be white at the middle of a pixel, one to a tile, at every phase; the tile's side, px."""
-    tile = footprint_px(SIGMA_PX) + 2
+    tile = footprint_px(sigma_px) + 2
     place = (np.arange(count) + 0.5) * tile + (np.arange(count) + 0.5) / count - 0.5
     x_px, y_px = (axis.ravel() for axis in np.meshgrid(place, place))
-    flux = np.full(count**2, WHITE / peak_share(SIGMA_PX))
-    frame = ((count * tile, count * tile), footprint_px(SIGMA_PX))
+    flux = np.full(count**2, WHITE / peak_share(sigma_px))
+    frame = ((count * tile, count * tile), footprint_px(sigma_px))
     return pack_sprites(x_px, y_px, flux, np.arange(count**2), frame), tile
 
 
@@ -142,15 +142,17 @@ def _sums(image: FloatArray, tile: int) -> tuple[FloatArray, FloatArray, FloatAr
     return light, tiles.sum(axis=2) @ at / divisor, tiles.sum(axis=3) @ at / divisor
 
 
-def _shown(way: Way, panel: Panel, linear: Float32Array, sprites: Sprites) -> FloatArray:
-    """The light that a way makes of a linear image, as a tracker sees it that exposes for the whole cycle."""
-    if way.method == "exact":
+def shown_by(
+    method: Quantisation, cycle_frames: int, panel: Panel, linear: Float32Array, sprites: Sprites, sigma_px: tuple[float, float]
+) -> FloatArray:
+    """The light (h, w) that a method makes of a linear image, as a tracker sees it that exposes for `cycle_frames`."""
+    if method == "exact":
         size = linear.shape[1], linear.shape[0]
-        return shown_light(ExactQuantiser(panel, size, SIGMA_PX).levels(sprites), panel)
-    if way.whole_cycle:
-        frames = [shown_light(temporal_levels(linear, panel, frame), panel) for frame in range(CYCLE_FRAMES)]
+        return shown_light(ExactQuantiser(panel, size, sigma_px).levels(sprites), panel)
+    if method == "temporal" and cycle_frames > 1:
+        frames = [shown_light(temporal_levels(linear, panel, k, cycle_frames), panel) for k in range(cycle_frames)]
         return np.asarray(np.mean(frames, axis=0))
-    levels = round_levels if way.method == "round" else dither_levels
+    levels = round_levels if method == "round" else dither_levels
     return shown_light(levels(linear, panel), panel)
 
 
@@ -161,7 +163,8 @@ def _against_magnitude(bits: int, way: Way, phases: int, mags: FloatArray) -> li
     errors = []
     for mag in mags:
         wanted = bright * 10 ** (-0.4 * mag)
-        shown = _shown(way, panel, wanted.astype(np.float32), fainter(sprites, mag))
+        linear, cycle = wanted.astype(np.float32), CYCLE_FRAMES if way.whole_cycle else 1
+        shown = shown_by(way.method, cycle, panel, linear, fainter(sprites, mag), SIGMA_PX)
         errors.append(measure(wanted, shown, tile))
     return errors
 

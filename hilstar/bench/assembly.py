@@ -21,7 +21,9 @@ from hilstar.attitude.quaternion import normalise, to_matrix
 from hilstar.bench.config import BenchConfig, SkySettings, Tracker, read_config
 from hilstar.errors import InputError
 from hilstar.monitor.calibration import BUILT_IN, Calibration, load_calibration
+from hilstar.monitor.footprints import FootprintMap
 from hilstar.monitor.geometry import monitor_camera
+from hilstar.monitor.losses import star_losses
 from hilstar.monitor.photometry import Codes, code_dtype
 from hilstar.monitor.quantise import cycle_warning
 from hilstar.render.renderer import Renderer, Target
@@ -164,6 +166,19 @@ class Bench:
         truth["drawn"] = truth["electrons_per_s"] >= self.faintest_shown_e_per_s()
         truth["clipped"][self._clipped(sprites)] = True
         return Frame(q, linear, levels, self.code_values(levels), truth[np.argsort(truth["v_mag"], kind="stable")])
+
+    def losses_mag(self, frame: Frame) -> dict[int, float]:
+        """By HIP, the magnitudes that each clipped star of a frame is too faint by, its light summed over its own pixels."""
+        hips = set(frame.truth["hip"][frame.truth["clipped"]].tolist())
+        if not hips:
+            return {}
+        sprites, panel = self.sprites(frame.q_icrs_to_cam), self.renderer.target.panel()
+        if panel is None:
+            raise TypeError("a bench's renderer has a monitor")
+        footprints = FootprintMap(self.camera.resolution_px, self._sigma_px)
+        loss_mag = star_losses(sprites, panel, footprints, frame.levels).loss_mag
+        hip = self.shown_stars.hip[sprites.star].tolist()
+        return {h: float(loss) for h, loss in zip(hip, loss_mag, strict=True) if h in hips}
 
     def code_values(self, levels: Codes) -> Codes:
         """The monitor's code values of levels (height, width): the same, or (height, width, 3) with bit stealing."""

@@ -69,6 +69,7 @@ def frame(
             "electrons_per_s": float(shot.linear.sum(dtype=np.float64)),
             "flux_at_white_e_per_s": bench.flux_at_white_e_per_s,
             "clipped": clipped,
+            "clipped_mag": bench.losses_mag(shot),
             "left_out": left_out(shot.truth),
             "calibration": {"name": bench.calibration.name, "sha256": bench.calibration.sha256},
             "written": [str(path) for path in targets],
@@ -77,7 +78,11 @@ def frame(
     if as_json:
         print_json(summary)
     else:
-        names = f", clipped: HIP {', '.join(map(str, clipped))}" if clipped else ""
+        losses = ", ".join(f"{hip} by {mag:.2f} mag" for hip, mag in summary["clipped_mag"].items())
+        names = f", clipped: HIP {losses}" if clipped else ""
+        missing = summary["left_out"]
+        if missing["stars"]:
+            names += f", {missing['stars']} too faint to show ({missing['flux_share']:.2%} of all light)"
         typer.echo(f"{len(shot.truth)} stars{names}; wrote {', '.join(summary['written'])}")
 
 

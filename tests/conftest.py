@@ -64,10 +64,14 @@ def bench_with(tmp_path: Path) -> Iterator[Callable[[str], hilstar.Bench]]:
         bench.close()
 
 
-def run_hilstar(*arguments: str | Path, cwd: Path | None = None, timeout: float = 120) -> subprocess.CompletedProcess[str]:
+def run_hilstar(
+    *arguments: str | Path, cwd: Path | None = None, timeout: float = 120, env: dict[str, str] | None = None
+) -> subprocess.CompletedProcess[str]:
     """The command as a user runs it, in a process of its own."""
     command = [sys.executable, "-m", "hilstar", *map(str, arguments)]
-    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=timeout, check=False, env=os.environ)
+    return subprocess.run(
+        command, cwd=cwd, capture_output=True, text=True, timeout=timeout, check=False, env=os.environ if env is None else env
+    )
 
 
 def assert_refused(result: subprocess.CompletedProcess[str], code: int, *words: str) -> None:

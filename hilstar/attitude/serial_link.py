@@ -12,6 +12,7 @@ from types import TracebackType
 from typing import Self
 
 import serial
+from serial.tools import list_ports
 
 from hilstar.attitude.packet import Packet, encode
 from hilstar.attitude.receiver import Arrival
@@ -24,6 +25,11 @@ READ_BYTES = 4096
 BITS_PER_BYTE = 10  # 8N1
 FRAMING_BYTES = 2  # COBS and its 0x00
 log = logging.getLogger(__name__)
+
+
+def serial_ports() -> list[str]:
+    """The serial ports of this machine, each with what it says of itself."""
+    return [f"{port.device} ({port.description})" for port in sorted(list_ports.comports())]
 
 
 class SerialLink:

@@ -26,7 +26,7 @@ from hilstar.monitor.geometry import monitor_camera
 from hilstar.monitor.losses import star_losses
 from hilstar.monitor.photometry import Codes, code_dtype
 from hilstar.monitor.quantise import cycle_warning
-from hilstar.render.renderer import Renderer, Target
+from hilstar.render.renderer import Context, Renderer, Target
 from hilstar.scene.camera import Camera
 from hilstar.scene.psf import peak_share
 from hilstar.scene.sprites import Sprites, clipped_sprites, make_sprites
@@ -70,19 +70,27 @@ class Frame:
     truth: npt.NDArray[np.void]
 
 
-@dataclass(frozen=True, slots=True)
 class Drawn:
-    """What a draw put on the monitor; `levels` (see `Bench.code_values`) is overwritten by the next one."""
+    """What a draw put on the monitor."""
 
-    levels: Codes
-    star_count: int
-    clipped_hip: tuple[int, ...]
+    def __init__(self, renderer: Renderer, star_count: int, clipped_hip: tuple[int, ...]) -> None:
+        self.star_count = star_count
+        self.clipped_hip = clipped_hip
+        self._renderer = renderer
+        self._levels: Codes | None = None
+
+    @property
+    def levels(self) -> Codes:
+        """The levels (see `Bench.code_values`), read back when they are first asked for; the next draw overwrites them."""
+        if self._levels is None:
+            self._levels = self._renderer.codes()
+        return self._levels
 
 
 class Bench:
-    """A bench, assembled: stars, geometry and a renderer. Free it with `close`, or use it as a context manager."""
+    """A bench, assembled: stars, geometry and a renderer (in a window's `context`, where given). Free it with `close`."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, context: Context | None = None) -> None:
         self.path = path
         self.config = read_config(path)
         self.bench_hash = bench_hash(self.config, path.parent)
@@ -106,7 +114,8 @@ class Bench:
                 quantisation=render.quantisation,
                 uniformity=self.uniformity,
                 cycle_frames=render.cycle_frames,
-            )
+            ),
+            context,
         )
 
     def faintest_shown_e_per_s(self) -> float:
@@ -131,23 +140,23 @@ class Bench:
         return make_sprites(stars or self.shown_stars, icrs_to_image, self.camera, self.renderer.footprint_px)
 
     def draw(self, q_icrs_to_cam: FloatArray | None, frame: int = 0) -> Drawn:
-        """Levels for an attitude, ready in memory; None gives a blank frame. The frame path: no copy, no table.
+        """Draw the levels for an attitude; None gives a blank frame. The frame path: no copy, no table.
 
         `frame` counts the frames shown, for temporal dithering.
         """
         if q_icrs_to_cam is None:
             self.renderer.draw(None, frame)
-            return Drawn(self.renderer.codes(), 0, ())
+            return Drawn(self.renderer, 0, ())
         sprites = self.sprites(q_icrs_to_cam)
         self.renderer.draw(sprites, frame)
         clipped = self._clipped(sprites)
         hip = tuple(int(h) for h in self.shown_stars.hip[sprites.star[clipped]])
-        return Drawn(self.renderer.codes(), len(sprites), hip)
+        return Drawn(self.renderer, len(sprites), hip)
 
     def warm_up(self) -> None:
         """Draw once with stars and once without: a driver compiles its shaders at their first use, 60 ms on llvmpipe."""
-        self.draw(WARM_UP_ATTITUDE)
-        self.draw(None)
+        for q in (WARM_UP_ATTITUDE, None):
+            _ = self.draw(q).levels
 
     def frame(self, q_icrs_to_cam: Sequence[float] | FloatArray, number: int = 0) -> Frame:
         """Draw one frame and bring everything about it back; the arrays are the caller's own.

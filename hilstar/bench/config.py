@@ -99,6 +99,12 @@ class Monitor(_Table, frozen=True):
     refresh_hz: Annotated[float, Meta(ge=0.01, le=1000)] = 60.0
     bits: Annotated[int, Meta(ge=1, le=16)] = 8
     calibration: str = "srgb"
+    display: int | str = 0
+    flip_x: bool = False
+    flip_y: bool = False
+    rotate_deg: Literal[0, 90, 180, 270] = 0
+    panel_delay_ms: NotNegative = 0.0
+    photodiode_px: Annotated[int, Meta(ge=0, le=1000)] = 0
 
 
 class Collimator(_Table, frozen=True):

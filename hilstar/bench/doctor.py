@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import platform
 import sys
 import time
@@ -11,7 +10,9 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from hilstar.attitude.links import ZmqReceiver, ZmqSender, zmq_version
+from hilstar.attitude.serial_link import serial_ports
 from hilstar.errors import HilstarError, MachineError
+from hilstar.monitor.window import displays
 from hilstar.render.renderer import create_context
 from hilstar.resources import resource_path
 from hilstar.sky.catalog import load_catalog
@@ -30,7 +31,7 @@ class Check:
 def examine() -> dict[str, Any]:
     """The JSON object of `hilstar doctor`: ok, and the checks."""
     checks = [_check(name, look) for name, look in LOOKS.items()]
-    checks.append(_display())
+    checks += [_displays(), _serial()]
     return {"ok": all(check.ok for check in checks if check.required), "checks": [asdict(check) for check in checks]}
 
 
@@ -77,11 +78,17 @@ def _files() -> str:
     return ", ".join(str(path) for path in names)
 
 
-def _display() -> Check:
-    for name in ("WAYLAND_DISPLAY", "DISPLAY"):
-        if os.environ.get(name):
-            return Check("display", True, f"{name}={os.environ[name]}", required=False)
-    return Check("display", False, "none (DISPLAY is not set): run serve and replay with --headless", required=False)
+def _displays() -> Check:
+    try:
+        found = displays()
+    except MachineError as error:
+        return Check("display", False, str(error), required=False)
+    return Check("display", bool(found), "; ".join(display.line() for display in found) or "none", required=False)
+
+
+def _serial() -> Check:
+    ports = serial_ports()
+    return Check("serial", bool(ports), ", ".join(ports) or "no serial port", required=False)
 
 
 LOOKS: dict[str, Callable[[], str]] = {

@@ -80,6 +80,7 @@ def frame_record(shown: Shown, light_ns: int, missed: int) -> FrameRecord:
         light_ns=light_ns,
         draw_ns=shown.draw_ns,
         shown_ns=shown.shown_ns,
+        timestamp_source=shown.timestamp_source,
         stale=shown.stale,
         stars_drawn=drawn.star_count,
         clipped=len(drawn.clipped_hip),

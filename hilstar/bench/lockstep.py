@@ -33,6 +33,7 @@ def serve_lockstep(
     while loop.stats.frames < limit.frames and time.monotonic_ns() < end_ns and not loop.stop.is_set():
         arrival = link.receive(POLL_MS)
         if arrival is None:
+            loop.idle()
             continue
         if isinstance(arrival.event, TimeRequest):
             asked = arrival.event

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +19,22 @@ from hilstar.bench.ledger import Ledger, frame_record
 from hilstar.bench.lockstep import serve_lockstep
 from hilstar.bench.loop import FrameLoop, FrameSink, Limit, ignore, policy_of, stop_on_signal
 from hilstar.bench.play import Play
+from hilstar.bench.screen import Screen
 from hilstar.bench.stats import spread
 from hilstar.bench.status import StatusMaker
 
 AnyLink = ZmqReceiver | ZmqLockstep | SerialLink
+
+
+@dataclass(frozen=True, slots=True)
+class Outlet:
+    """Where frames go besides their sink: onto a screen, and into a ledger."""
+
+    screen: Screen | None = None
+    ledger: Ledger | None = None
+
+
+HEADLESS = Outlet()
 
 
 def link_keys(settings: AttitudeSettings, folder: Path) -> CurveKeys:
@@ -40,9 +53,9 @@ def open_link(settings: AttitudeSettings, folder: Path) -> AnyLink:
     return ZmqReceiver(settings.endpoint, bind=settings.bind is True, keys=keys)
 
 
-def serve(bench: Bench, link: AnyLink, limit: Limit, sink: FrameSink = ignore, ledger: Ledger | None = None) -> dict[str, Any]:
-    """Show the live stream of `link` up to `limit`, or until a signal, and keep it in `ledger`; the summary."""
-    loop = FrameLoop(bench, sink)
+def serve(bench: Bench, link: AnyLink, limit: Limit, sink: FrameSink = ignore, outlet: Outlet = HEADLESS) -> dict[str, Any]:
+    """Show the live stream of `link` up to `limit`, or until a signal; the summary."""
+    loop, ledger = FrameLoop(bench, sink, outlet.screen), outlet.ledger
     with stop_on_signal(loop.stop):
         if isinstance(link, ZmqLockstep):
             bench.warm_up()
@@ -62,7 +75,7 @@ def _serve_stream(
     statuses = StatusMaker(ledger)
 
     def draw_slot(slot: int) -> None:
-        t_ns = receiver.clock.to_bench_ns(time.monotonic_ns())
+        t_ns = receiver.clock.to_bench_ns(loop.light_ns(time.monotonic_ns()))
         shown = loop.draw(slot, t_ns, timeline.at(t_ns))
         light_ns = receiver.bench_ns(t_ns)
         if ledger is not None:
@@ -87,12 +100,12 @@ def _serve_stream(
     }
 
 
-def replay(bench: Bench, play: Play, sink: FrameSink = ignore, ledger: Ledger | None = None) -> dict[str, Any]:
-    """Show the past, and keep it in `ledger`; the summary.
+def replay(bench: Bench, play: Play, sink: FrameSink = ignore, outlet: Outlet = HEADLESS) -> dict[str, Any]:
+    """Show the past; the summary.
 
     Paced, late frames are missed, as on a monitor; otherwise every frame is drawn, as fast as it can be.
     """
-    loop = FrameLoop(bench, sink)
+    loop, ledger = FrameLoop(bench, sink, outlet.screen), outlet.ledger
 
     def draw_slot(slot: int) -> None:
         number, t_ns, attitude = play.frame(slot)

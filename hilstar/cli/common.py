@@ -34,9 +34,3 @@ def attitude_of(command: str, radec: str | None, quaternion: str | None) -> Any:
     if radec is not None:
         return from_radec_roll_deg(*parse_radec(radec))
     return checked_quaternion(parse_numbers(quaternion or "", 4, "--quaternion", "W,X,Y,Z"))
-
-
-def need_headless(command: str, headless: bool) -> None:
-    """There is no window in this version."""
-    if not headless:
-        raise InputError(f"{command}: there is no window in this version; add --headless")

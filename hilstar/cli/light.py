@@ -112,7 +112,7 @@ def plan(
         return
     typer.echo(f"{summary['patches']} patches of {summary['codes']} codes in {', '.join(summary['written'])}")
     if headless is None:
-        say("there is no window in this version: show the codes yourself, or add --headless DIR for pictures of them")
+        say("the patches are yours to show: add --headless DIR for pictures of them, full screen in any viewer")
     typer.echo("fill in the column value, and give the file to hilstar calibrate photometric")
 
 

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import math
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import typer
 
-from hilstar.cli.common import LOG_HELP, BenchFile, Headless, Json, QuaternionText, RadecText, app, attitude_of, need_headless
+from hilstar.cli.common import LOG_HELP, BenchFile, Headless, Json, QuaternionText, RadecText, app, attitude_of
 from hilstar.console import print_json, progress, report, say
 from hilstar.errors import InputError
 
+Windowed = Annotated[bool, typer.Option("--windowed", help="A window on the desk instead of the whole display.")]
+Force = Annotated[bool, typer.Option("--force", help="Show on a display that the start-up gate refuses; logged.")]
 LedgerFile = Annotated[Path | None, typer.Option("--ledger", metavar="RUN.mcap", help="Keep every packet and frame there.")]
 
 
@@ -86,6 +89,21 @@ def frame(
         typer.echo(f"{len(shot.truth)} stars{names}; wrote {', '.join(summary['written'])}")
 
 
+@contextmanager
+def shown_bench(bench_file: Path, headless: bool, windowed: bool, force: bool) -> Iterator[tuple[Any, Any]]:
+    """The bench, and the screen that it is on; None when headless."""
+    if headless:
+        from hilstar.bench.assembly import load
+
+        with load(bench_file) as bench:
+            yield bench, None
+        return
+    from hilstar.bench.screen import open_screen
+
+    with open_screen(bench_file, windowed=windowed, force=force) as screen:
+        yield screen.bench, screen
+
+
 def optional_ledger(path: Path | None, bench: Any) -> AbstractContextManager[Any]:
     """The run's ledger, or nothing where none was asked for."""
     from hilstar.bench.ledger import Ledger
@@ -107,18 +125,19 @@ def serve(
     duration: Annotated[float | None, typer.Option(help="Seconds to run; until Ctrl-C by default.", min=0, max=1e8)] = None,
     frames: Annotated[int | None, typer.Option(help="Frames to draw.", min=1)] = None,
     ledger: LedgerFile = None,
+    windowed: Windowed = False,
+    force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Show the live attitude stream."""
-    from hilstar.bench.assembly import load
+    from hilstar.bench.config import read_config
     from hilstar.bench.loop import Limit
-    from hilstar.bench.server import open_link
+    from hilstar.bench.server import Outlet, open_link
     from hilstar.bench.server import serve as serve_stream
 
-    need_headless("serve", headless)
     with (
-        load(bench_file) as bench,
-        open_link(bench.config.attitude, bench_file.parent) as link,
+        open_link(read_config(bench_file).attitude, bench_file.parent) as link,
+        shown_bench(bench_file, headless, windowed, force) as (bench, screen),
         optional_ledger(ledger, bench) as kept,
     ):
         refresh_hz = bench.config.monitor.refresh_hz
@@ -126,7 +145,7 @@ def serve(
         limit = Limit(slots, math.inf if frames is None else frames)
         say(f"{link.verb} {link.endpoint}, {refresh_hz:g} Hz, {bench.renderer.gl_renderer}")
         with progress("serving", min(limit.slots, limit.frames)) as advance:
-            summary = serve_stream(bench, link, limit, lambda shown: advance(shown.number + 1), kept)
+            summary = serve_stream(bench, link, limit, lambda shown: advance(shown.number + 1), Outlet(screen, kept))
     report(summary, as_json)
 
 
@@ -141,19 +160,20 @@ def replay(
     headless: Headless = False,
     output: Annotated[Path | None, typer.Option("-o", "--output", metavar="DIR", help="Write each frame there.")] = None,
     ledger: LedgerFile = None,
+    windowed: Windowed = False,
+    force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Show an attitude log."""
-    from hilstar.bench.assembly import load
     from hilstar.bench.config import read_config
     from hilstar.bench.play import Wanted, plan_play
     from hilstar.bench.recorder import FrameRecorder
+    from hilstar.bench.server import Outlet
     from hilstar.bench.server import replay as replay_log
 
-    need_headless("replay", headless)
     play = plan_play(log, Wanted(speed, start, stop, step), read_config(bench_file))
     with (
-        load(bench_file) as bench,
+        shown_bench(bench_file, headless, windowed, force) as (bench, screen),
         FrameRecorder(output, bench) as record,
         optional_ledger(ledger, bench) as kept,
         progress("replaying", play.frame_count) as advance,
@@ -163,5 +183,5 @@ def replay(
             record(shown)
             advance(shown.number + 1)
 
-        summary = replay_log(bench, play, sink, kept)
+        summary = replay_log(bench, play, sink, Outlet(screen, kept))
     report(summary, as_json)

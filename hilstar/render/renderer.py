@@ -24,6 +24,7 @@ from hilstar.scene.sprites import SPRITE_DTYPE, Sprites
 EGL_LIBRARY = "libEGL.so.1"
 INSTALL_EGL = "install it: apt-get install libegl1 libgl1-mesa-dri"
 FIRST_CAPACITY = 4096
+Context = moderngl.Context
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,12 +67,12 @@ def create_context() -> moderngl.Context:
 
 
 class Renderer:
-    """Draws sprites of one Target. Free it with `close`, or use it as a context manager."""
+    """Draws sprites of one Target, in a context of its own or in a window's. Free it with `close`."""
 
-    def __init__(self, target: Target) -> None:
+    def __init__(self, target: Target, context: Context | None = None) -> None:
         self.target = target
         self.footprint_px = footprint_px(target.sigma_px)
-        self._ctx = create_context()
+        self._ctx = context or create_context()
         try:
             with self._ctx:
                 self._check_limits()

@@ -142,7 +142,6 @@ def test_the_average_model_can_be_chosen(tmp_path, small_bench_file):
         (["frame", "BENCH", "--radec", "1,2,3", "-o", "none/x.fits"], ["none/x.fits", "cannot be written"]),
         (["frame", "BENCH", "--radec", "1,2,3", "--truth", "none/x.csv"], ["none/x.csv", "cannot be written"]),
         (["frame", "BENCH", "--radec", "1,2,3", "--codes", "none/x.png"], ["none/x.png", "cannot be written"]),
-        (["serve", "BENCH"], ["--headless"]),
         (["replay", "BENCH", "none.csv", "--headless"], ["none.csv", "No such file"]),
         (["replay", "BENCH", "LOG", "--headless", "--speed", "fast"], ["fast", "realtime"]),
         (["send"], ["LOG or --spin"]),
@@ -261,3 +260,8 @@ def test_ctrl_c_at_any_moment_leaves_no_traceback(tmp_path, small_bench_file):
             process.send_signal(signal.SIGINT)
             _, err = process.communicate(timeout=10)
             assert b"Traceback" not in err or delay_s < 0.1, err  # Python's own start is not ours to guard
+
+
+def test_without_a_display_a_window_is_refused_as_the_machine_s_lack(small_bench_file):
+    bare = {name: value for name, value in os.environ.items() if name not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    assert_refused(run_hilstar("serve", small_bench_file, env=bare), 3, "DISPLAY", "--headless")

@@ -1,0 +1,211 @@
+"""The window on the monitor: full screen on the one chosen, or in a frame on the desk. The only user of glfw."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import time
+from collections import deque
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, Self
+
+import glfw
+
+from hilstar.errors import InputError, MachineError
+
+TITLE = "hilstar"
+NO_DISPLAY = "no display to open a window on; set DISPLAY, or run with --headless"
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Display:
+    """A monitor of this machine as its system has it; `refresh_hz` is 0 where it does not say (Xvfb)."""
+
+    index: int
+    name: str
+    resolution_px: tuple[int, int]
+    refresh_hz: int
+    position_px: tuple[int, int]
+    size_mm: tuple[int, int]
+    scale: float
+
+    def line(self) -> str:
+        """The display for a person."""
+        width, height = self.resolution_px
+        refresh = f"{self.refresh_hz} Hz" if self.refresh_hz else "refresh not known"
+        return f"{self.index}: {self.name}, {width} x {height}, {refresh}, {self.size_mm[0]} x {self.size_mm[1]} mm"
+
+
+@dataclass(frozen=True, slots=True)
+class WindowSettings:
+    """`display` is an index or a part of a name, None for a window on the desk; `bits` are those wanted of each colour."""
+
+    resolution_px: tuple[int, int]
+    bits: int
+    display: int | str | None = None
+
+
+def displays() -> list[Display]:
+    """The monitors of this machine. Raises MachineError without a display."""
+    with _glfw():
+        return [_describe(index, monitor) for index, monitor in enumerate(glfw.get_monitors())]
+
+
+@contextlib.contextmanager
+def _glfw() -> Any:
+    _start()
+    try:
+        yield
+    finally:
+        glfw.terminate()
+
+
+def _start() -> None:
+    glfw.ERROR_REPORTING = "ignore"
+    if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")) or not glfw.init():
+        raise MachineError(NO_DISPLAY)
+
+
+def _describe(index: int, monitor: Any) -> Display:
+    mode = glfw.get_video_mode(monitor)
+    name = glfw.get_monitor_name(monitor)
+    return Display(
+        index=index,
+        name=name.decode() if isinstance(name, bytes) else str(name),
+        resolution_px=(int(mode.size.width), int(mode.size.height)),
+        refresh_hz=int(mode.refresh_rate),
+        position_px=_pair(glfw.get_monitor_pos(monitor)),
+        size_mm=_pair(glfw.get_monitor_physical_size(monitor)),
+        scale=float(glfw.get_monitor_content_scale(monitor)[0]),
+    )
+
+
+def _pair(values: Any) -> tuple[int, int]:
+    first, second = values
+    return int(first), int(second)
+
+
+class Window:
+    """A window whose GL context is current in the thread that opened it. Free it with `close`.
+
+    Raises MachineError without a display or GL, InputError for a display that is not there.
+    """
+
+    def __init__(self, settings: WindowSettings) -> None:
+        _start()
+        self.settings = settings
+        self.keys: deque[str] = deque(maxlen=64)
+        self._ramp: tuple[Any, Any] | None = None
+        try:
+            self._open()
+        except BaseException:
+            glfw.terminate()
+            raise
+
+    def _open(self) -> None:
+        settings = self.settings
+        self.display: Display | None = None
+        monitor = None
+        if settings.display is not None:
+            self.display, monitor = _find(settings.display)
+        for hint, value in (
+            (glfw.CONTEXT_VERSION_MAJOR, 3),
+            (glfw.CONTEXT_VERSION_MINOR, 3),
+            (glfw.OPENGL_PROFILE, glfw.OPENGL_CORE_PROFILE),
+            (glfw.RESIZABLE, False),
+            (glfw.AUTO_ICONIFY, False),
+            (glfw.SCALE_TO_MONITOR, False),
+            (glfw.SRGB_CAPABLE, False),
+            (glfw.RED_BITS, settings.bits),
+            (glfw.GREEN_BITS, settings.bits),
+            (glfw.BLUE_BITS, settings.bits),
+        ):
+            glfw.window_hint(hint, value)
+        width, height = settings.resolution_px if self.display is None else self.display.resolution_px
+        self._window = glfw.create_window(width, height, TITLE, monitor, None)
+        if not self._window:
+            raise MachineError("no window with OpenGL 3.3 can be had; install it: apt-get install libgl1 libgl1-mesa-dri")
+        glfw.make_context_current(self._window)
+        glfw.swap_interval(1)
+        glfw.set_input_mode(self._window, glfw.CURSOR, glfw.CURSOR_HIDDEN if monitor else glfw.CURSOR_NORMAL)
+        glfw.set_key_callback(self._window, self._on_key)
+        if monitor is not None:
+            self._set_identity_ramp(monitor)
+
+    def _set_identity_ramp(self, monitor: Any) -> None:
+        """The system's own correction would change what the calibration measured."""
+        ramp: Any = glfw.get_gamma_ramp(monitor)
+        size = 0 if ramp is None else len(ramp.red)
+        if not size:
+            return
+        self._ramp = (monitor, ([*ramp.red], [*ramp.green], [*ramp.blue]))
+        straight = [value / (size - 1) for value in range(size)]
+        identity: Any = (straight, straight, straight)
+        glfw.set_gamma_ramp(monitor, identity)
+
+    def _on_key(self, window: Any, key: int, scancode: int, action: int, mods: int) -> None:
+        if action != glfw.PRESS:
+            return
+        name = {glfw.KEY_ESCAPE: "escape", glfw.KEY_SPACE: "space", glfw.KEY_F1: "f1"}.get(key)
+        if name is None and 0 < key < 128:
+            name = chr(key).lower()
+        if name is not None:
+            self.keys.append(name)
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """The framebuffer's size."""
+        width, height = glfw.get_framebuffer_size(self._window)
+        return int(width), int(height)
+
+    @property
+    def depth_bits(self) -> int:
+        """Bits of a colour on the screen: the least of the three that its mode has."""
+        monitor = glfw.get_window_monitor(self._window) or glfw.get_primary_monitor()
+        bits = glfw.get_video_mode(monitor).bits
+        return int(min(bits.red, bits.green, bits.blue))
+
+    @property
+    def scaled(self) -> bool:
+        """True where a pixel of the window is not one of the screen."""
+        return tuple(glfw.get_window_size(self._window)) != self.size_px
+
+    @property
+    def closing(self) -> bool:
+        """True once somebody closed it."""
+        return bool(glfw.window_should_close(self._window))
+
+    def swap(self) -> int:
+        """Show what was drawn; the host's time just after, ns. Events are looked at on the way."""
+        glfw.swap_buffers(self._window)
+        now_ns = time.monotonic_ns()
+        glfw.poll_events()
+        return now_ns
+
+    def close(self) -> None:
+        """Give the monitor its gamma ramp back, and close."""
+        if self._ramp is not None:
+            monitor, ramp = self._ramp
+            self._ramp = None
+            with contextlib.suppress(glfw.GLFWError):
+                glfw.set_gamma_ramp(monitor, ramp)
+        glfw.terminate()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+
+def _find(wanted: int | str) -> tuple[Display, Any]:
+    monitors = glfw.get_monitors()
+    described = [_describe(index, monitor) for index, monitor in enumerate(monitors)]
+    for display, monitor in zip(described, monitors, strict=True):
+        if wanted == display.index or (isinstance(wanted, str) and wanted.lower() in display.name.lower()):
+            return display, monitor
+    known = "; ".join(display.line() for display in described)
+    raise InputError(f"[monitor] display = {wanted!r}: there is none; write the index or name of one of {known}")

@@ -1,0 +1,96 @@
+"""The last pass: the levels of a renderer onto the window that its context belongs to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import moderngl
+import numpy as np
+import numpy.typing as npt
+
+from hilstar.errors import MachineError
+from hilstar.render.encoder import TABLE_WIDTH, build_program
+from hilstar.render.renderer import Renderer
+
+GL_LIBRARY, X11_LIBRARY = "libGL.so.1", "libX11.so.6"
+CROSSHAIR, GRID, BLANK, PATCH = 1, 2, 4, 8
+
+
+@dataclass(frozen=True, slots=True)
+class Mount:
+    """How the image lies on the screen: columns or rows reversed, and quarter turns clockwise."""
+
+    flip_x: bool = False
+    flip_y: bool = False
+    quarter_turns: int = 0
+
+    def screen_px(self, resolution_px: tuple[int, int]) -> tuple[int, int]:
+        """The screen that an image of `resolution_px` fills."""
+        return resolution_px if self.quarter_turns % 2 == 0 else (resolution_px[1], resolution_px[0])
+
+
+def window_context() -> moderngl.Context:
+    """The context of the window that is current in this thread. Raises MachineError with what to install."""
+    try:
+        settings: Any = {"libgl": GL_LIBRARY, "libx11": X11_LIBRARY}
+        return moderngl.create_context(require=330, **settings)
+    except Exception as error:  # moderngl and glcontext raise plain Exceptions here
+        raise MachineError(f"the window's OpenGL is not there ({error}); install it: apt-get install libgl1") from error
+
+
+class Presenter:
+    """Draws a renderer's levels on a screen of `screen_px`."""
+
+    def __init__(
+        self,
+        renderer: Renderer,
+        mount: Mount,
+        screen_px: tuple[int, int],
+        cross_px: tuple[float, float],
+        triples: npt.NDArray[np.uint16] | None,
+    ) -> None:
+        self._texture = renderer.codes_texture
+        self._ctx = self._texture.ctx
+        self._screen_px = screen_px
+        with self._ctx:
+            self._program = build_program(self._ctx, "full.vert", "present.frag")
+            self._vao = self._ctx.vertex_array(self._program, [])
+            self._triples = self._ctx.texture((TABLE_WIDTH, 1), 3, dtype="u2")
+            if triples is not None:
+                self._triples = self._triples_texture(triples)
+        response = renderer.target.response
+        values: dict[str, Any] = {
+            "levels": 0,
+            "triples": 1,
+            "stealing": triples is not None,
+            "white": float(2 ** (8 if response is None else response.bits) - 1),
+            "size_px": renderer.target.resolution_px,
+            "screen_px": screen_px,
+            "flip": (mount.flip_x, mount.flip_y),
+            "quarter_turns": mount.quarter_turns % 4,
+            "cross_px": (round(cross_px[0]), round(cross_px[1])),
+        }
+        for name, value in values.items():
+            self._program[name] = value
+
+    def _triples_texture(self, triples: npt.NDArray[np.uint16]) -> moderngl.Texture:
+        rows = -(-len(triples) // TABLE_WIDTH)
+        padded = np.zeros((rows, TABLE_WIDTH, 3), dtype=np.uint16)
+        padded.reshape(-1, 3)[: len(triples)] = triples
+        texture = self._ctx.texture((TABLE_WIDTH, rows), 3, padded.tobytes(), dtype="u2", alignment=2)
+        texture.filter = (moderngl.NEAREST, moderngl.NEAREST)
+        return texture
+
+    def present(self, overlay: int = 0, patch_code: int = 0, marker: tuple[int, int] = (0, 0)) -> None:
+        """Draw the last levels on the back buffer; `marker` is the photodiode square's side and code."""
+        with self._ctx:
+            self._ctx.screen.use()
+            self._ctx.viewport = (0, 0, *self._screen_px)
+            self._texture.use(0)
+            self._triples.use(1)
+            self._program["overlay"] = overlay
+            self._program["patch_code"] = patch_code
+            self._program["marker_px"], self._program["marker_code"] = marker
+            self._vao.render(moderngl.TRIANGLES, vertices=3)
+            self._ctx.finish()

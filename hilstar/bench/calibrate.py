@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import datetime
+import logging
 import math
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -19,7 +21,11 @@ from hilstar.monitor.calibration_file import Head, NotesTable, write_calibration
 from hilstar.monitor.fit import ChannelFit, fit_channel
 from hilstar.monitor.measurements import CHANNELS, Measurements, check_drift, read_measurements
 from hilstar.monitor.photometry import code_dtype
+from hilstar.monitor.window import Window, WindowSettings
+from hilstar.render.presenter import Presenter, View, level_texture, window_context
 
+PATCH_POLL_S = 0.02  # between looks at the keys
+log = logging.getLogger(__name__)
 MAG_PER_RELATIVE = 2.5 / math.log(10)
 DECADES = (0, 1, 2, 3)  # below white, where the error of the response is stated
 FAINTEST_PLANNED = 10**-3.2  # of white: a little beyond three decades, so that nothing is extrapolated there
@@ -162,7 +168,14 @@ def plan(
     written = [str(output)]
     if patches is not None and resolution_px is not None:
         written += _write_patches(make_directory(patches), sorted(set(steps)), resolution_px, bits)
-    return {"bits": bits, "patches": len(steps), "codes": len(planned_codes(bits, levels)), "seed": seed, "written": written}
+    return {
+        "steps": steps,
+        "bits": bits,
+        "patches": len(steps),
+        "codes": len(planned_codes(bits, levels)),
+        "seed": seed,
+        "written": written,
+    }
 
 
 def planned_codes(bits: int, levels: int) -> list[int]:
@@ -204,6 +217,45 @@ def patch_image(code: int, channel: str, resolution_px: tuple[int, int], bits: i
     image = np.zeros((height, width, 3), dtype=grey.dtype)
     image[..., PRIMARIES.index(channel)] = grey
     return image
+
+
+def show_patches(steps: Sequence[tuple[int, str]], bits: int, display: int | str, seconds: float | None) -> int:
+    """Show each patch on a display until space is pressed, or for so many seconds; q ends it. How many were shown.
+
+    Raises MachineError without a display, InputError for one that is not there.
+    """
+    with Window(WindowSettings((640, 480), bits, display)) as window:
+        size_px = window.size_px
+        square = (patch_image(1, "w", size_px, 8) > 0).astype(np.uint8)
+        nothing = np.zeros((2, 3), dtype=np.uint16)
+        view = View(size_px, size_px, bits, triples=nothing)
+        presenter = Presenter(level_texture(window_context(), square), view)
+        for shown, (code, channel) in enumerate(steps):
+            triples = nothing.copy()
+            triples[1, [PRIMARIES.index(channel)] if channel in PRIMARIES else [0, 1, 2]] = code
+            presenter.set_triples(triples)
+            log.warning("patch %d of %d: code %d, channel %s", shown + 1, len(steps), code, channel)
+            if not _patch_stays(window, presenter, seconds):
+                return shown
+    return len(steps)
+
+
+def _patch_stays(window: Window, presenter: Presenter, seconds: float | None) -> bool:
+    """Until the next patch is wanted; False when the whole is to end."""
+    end_s = math.inf if seconds is None else time.monotonic() + seconds
+    while time.monotonic() < end_s:
+        presenter.present()
+        window.swap()
+        while window.keys:
+            key = window.keys.popleft()
+            if key in {"q", "escape"}:
+                return False
+            if key == "space":
+                return True
+        if window.closing:
+            return False
+        time.sleep(PATCH_POLL_S)
+    return True
 
 
 def _write_patches(folder: Path, steps: Sequence[tuple[int, str]], resolution_px: tuple[int, int], bits: int) -> list[str]:

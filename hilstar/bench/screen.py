@@ -15,7 +15,7 @@ from hilstar.bench.assembly import Bench
 from hilstar.bench.config import Monitor, read_config
 from hilstar.errors import MachineError
 from hilstar.monitor.window import Window, WindowSettings
-from hilstar.render.presenter import BLANK, CROSSHAIR, GRID, PATCH, Mount, Presenter, window_context
+from hilstar.render.presenter import BLANK, CROSSHAIR, GRID, PATCH, Mount, Presenter, View, window_context
 
 GATE_FRAMES = 120
 REFRESH_TOLERANCE = 0.01
@@ -47,9 +47,15 @@ class Screen:
         self._overlay = 0
         self._patch = -1
         self._shown = 0
-        mount = mount_of(monitor)
-        rgb = bench.calibration.response.rgb
-        self._presenter = Presenter(bench.renderer, mount, window.size_px, bench.camera.principal_point_px, rgb)
+        view = View(
+            resolution_px=monitor.resolution_px,
+            screen_px=window.size_px,
+            bits=monitor.bits,
+            mount=mount_of(monitor),
+            cross_px=bench.camera.principal_point_px,
+            triples=bench.calibration.response.rgb,
+        )
+        self._presenter = Presenter(bench.renderer.codes_texture, view)
 
     @property
     def closing(self) -> bool:

@@ -87,7 +87,10 @@ def plan(
     channels: Annotated[str, typer.Option(help="Of w, r, g, b.")] = "w",
     seed: Annotated[int, typer.Option(help="Of the order.", min=0)] = 0,
     headless: Annotated[Path | None, typer.Option(metavar="DIR", help="Write the patches there as PNG.")] = None,
-    resolution: Annotated[str, typer.Option(metavar="W,H", help="Of the patches.")] = "1920,1080",
+    resolution: Annotated[str, typer.Option(metavar="W,H", help="Of the pictures.")] = "1920,1080",
+    show: Annotated[bool, typer.Option("--show", help="Show the patches on a display: space for the next, q to end.")] = False,
+    display: Annotated[str, typer.Option(metavar="INDEX|NAME", help="With --show: which.")] = "0",
+    seconds: Annotated[float | None, typer.Option(metavar="S", help="With --show: each so long, without keys.", min=0)] = None,
     as_json: Json = False,
 ) -> None:
     """Which codes to measure, in which order, and their patches."""
@@ -107,13 +110,19 @@ def plan(
         patches=headless,
         resolution_px=(width, height),
     )
+    steps = summary.pop("steps")
     if as_json:
         print_json(summary)
-        return
-    typer.echo(f"{summary['patches']} patches of {summary['codes']} codes in {', '.join(summary['written'])}")
-    if headless is None:
-        say("the patches are yours to show: add --headless DIR for pictures of them, full screen in any viewer")
-    typer.echo("fill in the column value, and give the file to hilstar calibrate photometric")
+    else:
+        typer.echo(f"{summary['patches']} patches of {summary['codes']} codes in {', '.join(summary['written'])}")
+        typer.echo("fill in the column value, and give the file to hilstar calibrate photometric")
+    if show:
+        from hilstar.bench.calibrate import show_patches
+
+        shown = show_patches(steps, bits, int(display) if display.isdecimal() else display, seconds)
+        say(f"{shown} of {len(steps)} patches shown")
+    elif headless is None:
+        say("add --show for the patches on a display (space for the next one), or --headless DIR for pictures of them")
 
 
 @calibrate.command()

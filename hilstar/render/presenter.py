@@ -11,7 +11,6 @@ import numpy.typing as npt
 
 from hilstar.errors import MachineError
 from hilstar.render.encoder import TABLE_WIDTH, build_program
-from hilstar.render.renderer import Renderer
 
 GL_LIBRARY, X11_LIBRARY = "libGL.so.1", "libX11.so.6"
 CROSSHAIR, GRID, BLANK, PATCH = 1, 2, 4, 8
@@ -30,6 +29,14 @@ class Mount:
         return resolution_px if self.quarter_turns % 2 == 0 else (resolution_px[1], resolution_px[0])
 
 
+def level_texture(context: moderngl.Context, levels: npt.NDArray[np.uint8]) -> moderngl.Texture:
+    """A texture of levels (height, width) that no renderer made."""
+    with context:
+        texture = context.texture(levels.shape[::-1], 1, np.ascontiguousarray(levels), dtype="u1", alignment=1)
+        texture.filter = (moderngl.NEAREST, moderngl.NEAREST)
+        return texture
+
+
 def window_context() -> moderngl.Context:
     """The context of the window that is current in this thread. Raises MachineError with what to install."""
     try:
@@ -39,40 +46,52 @@ def window_context() -> moderngl.Context:
         raise MachineError(f"the window's OpenGL is not there ({error}); install it: apt-get install libgl1") from error
 
 
-class Presenter:
-    """Draws a renderer's levels on a screen of `screen_px`."""
+@dataclass(frozen=True, slots=True)
+class View:
+    """What a window shows: an image of `resolution_px`, mounted on a screen of `screen_px`, codes of so many bits.
 
-    def __init__(
-        self,
-        renderer: Renderer,
-        mount: Mount,
-        screen_px: tuple[int, int],
-        cross_px: tuple[float, float],
-        triples: npt.NDArray[np.uint16] | None,
-    ) -> None:
-        self._texture = renderer.codes_texture
-        self._ctx = self._texture.ctx
-        self._screen_px = screen_px
+    `cross_px` is where the crosshair goes, image pixels; `triples` (levels, 3) the codes of each level, None where level k
+    is code k in all channels.
+    """
+
+    resolution_px: tuple[int, int]
+    screen_px: tuple[int, int]
+    bits: int
+    mount: Mount = Mount()
+    cross_px: tuple[float, float] = (0.0, 0.0)
+    triples: npt.NDArray[np.uint16] | None = None
+
+
+class Presenter:
+    """Draws a texture of levels on the screen of its context."""
+
+    def __init__(self, levels: moderngl.Texture, view: View) -> None:
+        self._texture = levels
+        self._ctx = levels.ctx
+        self._screen_px = view.screen_px
         with self._ctx:
             self._program = build_program(self._ctx, "full.vert", "present.frag")
             self._vao = self._ctx.vertex_array(self._program, [])
-            self._triples = self._ctx.texture((TABLE_WIDTH, 1), 3, dtype="u2")
-            if triples is not None:
-                self._triples = self._triples_texture(triples)
-        response = renderer.target.response
+        self.set_triples(view.triples)
         values: dict[str, Any] = {
             "levels": 0,
             "triples": 1,
-            "stealing": triples is not None,
-            "white": float(2 ** (8 if response is None else response.bits) - 1),
-            "size_px": renderer.target.resolution_px,
-            "screen_px": screen_px,
-            "flip": (mount.flip_x, mount.flip_y),
-            "quarter_turns": mount.quarter_turns % 4,
-            "cross_px": (round(cross_px[0]), round(cross_px[1])),
+            "stealing": view.triples is not None,
+            "white": float(2**view.bits - 1),
+            "size_px": view.resolution_px,
+            "screen_px": view.screen_px,
+            "flip": (view.mount.flip_x, view.mount.flip_y),
+            "quarter_turns": view.mount.quarter_turns % 4,
+            "cross_px": (round(view.cross_px[0]), round(view.cross_px[1])),
         }
         for name, value in values.items():
             self._program[name] = value
+
+    def set_triples(self, triples: npt.NDArray[np.uint16] | None) -> None:
+        """Use other codes for the same levels."""
+        with self._ctx:
+            nothing = np.zeros((1, 3), dtype=np.uint16)
+            self._triples = self._triples_texture(nothing if triples is None else triples)
 
     def _triples_texture(self, triples: npt.NDArray[np.uint16]) -> moderngl.Texture:
         rows = -(-len(triples) // TABLE_WIDTH)

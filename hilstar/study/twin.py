@@ -2,12 +2,14 @@
 
 The bench, as it believes itself to be, draws codes. The monitor, as it is, makes light of them; collimator and tracker make
 an image; a centroider measures it. The same centroider on the tracker's image of the sky itself (with the sprites' width)
-gives the estimator's own errors, blends included, and those are taken out: what is left is the display's.
+gives the estimator's own errors, and those are taken out: what is left is the display's. Where the bench differs from what
+it assumes, the codes are also looked at as if it did not: what they cost by themselves is told from what is wrong.
 """
 
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,48 +19,77 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import FloatArray
+from hilstar.attitude.protocol import NORM_TOLERANCE
 from hilstar.attitude.quaternion import to_matrix
-from hilstar.bench.assembly import Bench, bench_camera
-from hilstar.bench.config import BenchConfig, detector_settings
+from hilstar.bench.assembly import Bench, Frame, bench_camera
+from hilstar.bench.config import BenchConfig, Verify, detector_settings
 from hilstar.bench.simulation import ARCSEC_PER_RAD, NO_ALIGNMENT, background_e
+from hilstar.errors import InputError
 from hilstar.monitor.calibration import BUILT_IN, load_calibration
 from hilstar.monitor.geometry import monitor_camera
 from hilstar.monitor.photometry import Response, table_response
-from hilstar.monitor.quantise import Panel, shown_light
+from hilstar.monitor.quantise import LONGEST_CYCLE, Panel, shown_light
 from hilstar.scene.camera import Camera
 from hilstar.scene.psf import peak_share
-from hilstar.study.twin_optics import Mounting, TwinOptics
+from hilstar.study.twin_optics import Mirror, Mounting, TwinOptics
 from hilstar.study.twin_verdict import Star, Verdict, judge
 from hilstar.tracker.centroids import Background, Centroids, CentroidSettings, find_stars
 from hilstar.tracker.detector import Detector
 
 MATCH_PX = 3.0
-CROWDED_SHARE = 0.02  # of a neighbour in the window: 0.02 mag, and a fifth of a pixel from its edge
+# Of a star's light, that which others bring into its window. Both images have it, so what it leaves is a second order:
+# at 0.02, a neighbour 0.1 mag off adds 0.002 mag.
+CROWDED_SHARE = 0.02
+WING_SIGMAS = 6.0  # how far a neighbour's light reaches: 1e-9 of it, and Sirius is 4e3 times a star of the seventh magnitude
 FAINTEST_PEAK = 0.2  # a blob begins at this share of the faintest drawn star's peak
 # The glow that a missing black level adds is noticed at this share of the faintest drawn star's light, per pixel of its disc.
 BLACK_SHARE = 0.1
+MIRRORS: tuple[Mirror, ...] = ("x", "y", "swap")
 
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """One attitude: mean electrons of the stars shown and of those in the sky, (h, w) each, and which stars they are."""
+    """One attitude: mean electrons, (h, w) each, and its stars at their places (n,) in tracker pixels, as the sky has them.
+
+    `shown_e` is what the monitor as it is makes, `believed_e` what it would make were everything as assumed (the same array
+    where nothing differs), and `sky_e` that of the stars themselves.
+    """
 
     shown_e: FloatArray
+    believed_e: FloatArray
     sky_e: FloatArray
     truth: npt.NDArray[np.void]
     x_px: FloatArray
     y_px: FloatArray
 
 
+@dataclass(frozen=True, slots=True)
+class Matched:
+    """What was found in an image, and which of it each star (n,) is; -1 for none."""
+
+    found: Centroids
+    index: npt.NDArray[np.intp]
+
+    def against(self, other: Matched, k: int) -> tuple[float, float, float]:
+        """Star `k` against itself in another image: magnitudes too faint, pixels to the right and down; NaN where not found."""
+        i, j = self.index[k], other.index[k]
+        if i < 0 or j < 0:
+            return math.nan, math.nan, math.nan
+        a, b = self.found, other.found
+        return magnitude(a.flux[i] / b.flux[j]), float(a.x_px[i] - b.x_px[j]), float(a.y_px[i] - b.y_px[j])
+
+
 @dataclass(slots=True)
 class Tally:
-    """Stars by what became of them."""
+    """Stars by what became of them; `mirrored` counts those found where a screen so mirrored would show them."""
 
     stars: list[Star] = field(default_factory=list)
     lost: int = 0
     blended: int = 0
     clipped: int = 0
     not_shown: int = 0
+    at_edge: int = 0
+    mirrored: Counter[Mirror] = field(default_factory=Counter)
     noisy_mag: list[float] = field(default_factory=list)
     noisy_px: list[float] = field(default_factory=list)
 
@@ -71,17 +102,18 @@ class Twin:
         self.config = self.bench.config
         tracker = self.config.tracker
         self.camera = monitor_camera(tracker.resolution_px, tracker.pixel_pitch_um, tracker.focal_length_mm, NO_ALIGNMENT)
+        self.differs = any(name.startswith("true_") for name in changed(self.config.verify))
         self.panel = true_panel(self.bench, path.parent)
-        assumed = Mounting(self.bench.camera, self.camera)
-        self.true_optics = TwinOptics(true_mounting(self.config, self.camera), tracker.psf_sigma_px)
-        self.sky_optics = TwinOptics(assumed, tracker.psf_sigma_px)
-        self.glow_e_per_s = self.true_optics.glow_e_per_s(self.panel)
-        believed = Panel(self.bench.calibration.response, self.bench.flux_at_white_e_per_s, self.bench.uniformity)
-        self.seen_glow_e_per_s_px = float(np.median(self.glow_e_per_s))
-        self.assumed_glow_e_per_s_px = float(np.median(self.sky_optics.glow_e_per_s(believed)))
+        self.believed = Panel(self.bench.calibration.response, self.bench.flux_at_white_e_per_s, self.bench.uniformity)
+        true, self.assumed = true_mounting(self.config, self.camera), Mounting(self.bench.camera, self.camera)
         self.background_e = background_e(self.config, path.parent)
         self.detector = Detector(detector_settings(tracker), tracker.resolution_px)
-        self.settings = centroid_settings(self.config, assumed)
+        self.settings = centroid_settings(self.config, self.assumed)
+        self.true_optics = TwinOptics(true, tracker.psf_sigma_px)
+        self.sky_optics = TwinOptics(self.assumed, tracker.psf_sigma_px)
+        self.glow_e_per_s = self.true_optics.glow_e_per_s(self.panel)
+        self.seen_glow_e_per_s_px = on_screen_median(self.glow_e_per_s)
+        self.assumed_glow_e_per_s_px = on_screen_median(self.sky_optics.glow_e_per_s(self.believed))
 
     @property
     def arcsec_per_px(self) -> float:
@@ -89,21 +121,29 @@ class Twin:
         return ARCSEC_PER_RAD / self.camera.focal_length_px
 
     def field(self, q_icrs_to_cam: FloatArray, first_frame: int) -> Field:
-        """Show one attitude for one exposure, from a frame of the run on."""
-        config = self.config
+        """Show one attitude (unit quaternion) for one exposure, from frame `first_frame` of the run on."""
         frame = self.bench.frame(q_icrs_to_cam, first_frame)
-        light = shown_light(frame.levels, self.panel)
-        count = max(1, round(config.tracker.exposure_s * config.monitor.refresh_hz))
-        if config.render.quantisation == "temporal":
-            for number in range(first_frame + 1, first_frame + count):
-                light += shown_light(self.bench.draw(frame.q_icrs_to_cam, number).levels, self.panel)
-            light /= count
-        exposure_s = config.tracker.exposure_s
-        shown = self.true_optics.image_e_per_s(light) * exposure_s
+        exposure_s = self.config.tracker.exposure_s
         sky = self.sky_optics.image_e_per_s(frame.linear.astype(np.float64)) * exposure_s
-        vectors = self._vectors(frame.truth["hip"])
-        x_px, y_px = self.camera.project(vectors @ to_matrix(frame.q_icrs_to_cam).T)
-        return Field(shown, sky, frame.truth, x_px, y_px)
+        lights = self._lights(frame, first_frame)
+        shown = self.true_optics.image_e_per_s(lights[0]) * exposure_s
+        believed = self.sky_optics.image_e_per_s(lights[1]) * exposure_s if self.differs else shown
+        x_px, y_px = self.camera.project(self._vectors(frame.truth["hip"]) @ to_matrix(frame.q_icrs_to_cam).T)
+        return Field(shown, believed, sky, frame.truth, x_px, y_px)
+
+    def _lights(self, frame: Frame, first_frame: int) -> list[FloatArray]:
+        """The mean light of an exposure (H, W), of the monitor as it is and, where that differs, as it is assumed."""
+        panels = [self.panel, self.believed] if self.differs else [self.panel]
+        lights = [shown_light(frame.levels, panel) for panel in panels]
+        if self.config.render.quantisation == "temporal":
+            count = max(1, round(self.config.tracker.exposure_s * self.config.monitor.refresh_hz))
+            for number in range(first_frame + 1, first_frame + count):
+                levels = self.bench.draw(frame.q_icrs_to_cam, number).levels
+                for light, panel in zip(lights, panels, strict=True):
+                    light += shown_light(levels, panel)
+            for light in lights:
+                light /= count
+        return lights
 
     def _vectors(self, hip: npt.NDArray[np.int32]) -> FloatArray:
         stars = self.bench.stars
@@ -111,43 +151,54 @@ class Twin:
         return np.asarray(stars.vectors[order[np.searchsorted(stars.hip, hip, sorter=order)]])
 
     def measure(self, seen: Field, tally: Tally, rng: np.random.Generator) -> None:
-        """Measure one field into `tally`."""
-        exposure_s, faintest = self.config.tracker.exposure_s, self.faintest_e_per_s()
-        threshold_e = FAINTEST_PEAK * faintest * exposure_s * peak_share(self._seen_sigma_px())
-        # A tracker takes the glow of the screen away star by star, from what is around each: here it is taken away whole.
-        under = Background(0.0, threshold_e / self.settings.threshold_sigma)
-        shown, sky = (find_stars(image, self.settings, under) for image in (seen.shown_e, seen.sky_e))
-        inside = self._inside(seen)
-        found_sky, found = nearest(sky, seen.x_px, seen.y_px), nearest(shown, seen.x_px, seen.y_px)
-        alone = only_once(found_sky) & ~crowded(seen, self.settings.radius_px)
-        for k in np.flatnonzero(inside):
-            row = seen.truth[k]
-            if not row["drawn"]:
-                tally.not_shown += 1
-            elif row["clipped"]:
-                tally.clipped += 1
-            elif not alone[k]:
-                tally.blended += 1
-            elif found[k] < 0:
-                tally.lost += 1
-            else:
-                tally.stars.append(self._star(seen, int(k), (sky, int(found_sky[k])), (shown, int(found[k]))))
-        self._measure_noisy(seen, inside & alone & seen.truth["drawn"] & ~seen.truth["clipped"], tally, rng)
+        """Measure one field into `tally`; the generator is for the detector's noise."""
+        sky, shown = self._match(seen.sky_e, seen), self._match(seen.shown_e, seen)
+        believed = shown if seen.believed_e is seen.shown_e else self._match(seen.believed_e, seen)
+        blended = shared(sky.index) | crowded(seen, self.settings.radius_px, self._seen_sigma_px())
+        inside, drawn, clipped = self._inside(seen), seen.truth["drawn"], seen.truth["clipped"]
+        tally.at_edge += int((self._on_detector(seen.x_px, seen.y_px, 0.0) & ~inside).sum())
+        tally.not_shown += int((inside & ~drawn).sum())
+        tally.clipped += int((inside & drawn & clipped).sum())
+        whole = inside & drawn & ~clipped
+        tally.blended += int((whole & blended).sum())
+        wanted = whole & ~blended
+        found = wanted & (sky.index >= 0) & (shown.index >= 0)
+        tally.lost += int((wanted & ~found).sum())
+        tally.stars += [self._star(seen, int(k), sky, shown, believed) for k in np.flatnonzero(found)]
+        self._look_mirrored(seen, shown.found, wanted, tally)
+        self._measure_noisy(seen, wanted, tally, rng)
 
-    def _star(self, seen: Field, k: int, sky: tuple[Centroids, int], shown: tuple[Centroids, int]) -> Star:
-        row, exposure_s = seen.truth[k], self.config.tracker.exposure_s
-        (by_sky, i), (by_codes, j) = sky, shown
+    def _match(self, image_e: FloatArray, seen: Field) -> Matched:
+        """The stars of a noiseless image. A tracker takes the screen's glow away around each star: here it is not added."""
+        peak_e = self.faintest_e_per_s() * self.config.tracker.exposure_s * peak_share(self._seen_sigma_px())
+        under = Background(0.0, FAINTEST_PEAK * peak_e / self.settings.threshold_sigma)
+        found = find_stars(image_e, self.settings, under)
+        return Matched(found, nearest(found, seen.x_px, seen.y_px))
+
+    def _star(self, seen: Field, k: int, sky: Matched, shown: Matched, believed: Matched) -> Star:
+        row, i = seen.truth[k], sky.index[k]
+        flux_mag, dx_px, dy_px = shown.against(sky, k)
+        codes_mag, *codes_px = believed.against(sky, k)
         return Star(
             hip=int(row["hip"]),
             v_mag=float(row["v_mag"]),
             x_px=float(seen.x_px[k]),
             y_px=float(seen.y_px[k]),
-            flux_mag=magnitude(by_codes.flux[j] / by_sky.flux[i]),
-            dx_px=float(by_codes.x_px[j] - by_sky.x_px[i]),
-            dy_px=float(by_codes.y_px[j] - by_sky.y_px[i]),
-            floor_mag=magnitude(by_sky.flux[i] / (row["electrons_per_s"] * exposure_s)),
-            floor_px=math.hypot(by_sky.x_px[i] - seen.x_px[k], by_sky.y_px[i] - seen.y_px[k]),
+            flux_mag=flux_mag,
+            dx_px=dx_px,
+            dy_px=dy_px,
+            codes_mag=codes_mag,
+            codes_px=math.hypot(*codes_px),
+            floor_mag=magnitude(sky.found.flux[i] / (row["electrons_per_s"] * self.config.tracker.exposure_s)),
+            floor_px=math.hypot(sky.found.x_px[i] - seen.x_px[k], sky.found.y_px[i] - seen.y_px[k]),
         )
+
+    def _look_mirrored(self, seen: Field, shown: Centroids, wanted: npt.NDArray[np.bool_], tally: Tally) -> None:
+        """Count the stars that are where a mirrored screen would have them."""
+        for mirror in MIRRORS if self.differs else ():
+            mounting = Mounting(self.assumed.monitor, self.camera, mirror)
+            places = mounting.to_tracker(seen.truth["x_px"], seen.truth["y_px"])
+            tally.mirrored[mirror] += int((wanted & (nearest(shown, *places) >= 0)).sum())
 
     def _measure_noisy(self, seen: Field, wanted: npt.NDArray[np.bool_], tally: Tally, rng: np.random.Generator) -> None:
         """The same with all of the detector's noise: what the tracker itself adds."""
@@ -166,13 +217,17 @@ class Twin:
     def _inside(self, seen: Field) -> npt.NDArray[np.bool_]:
         """Stars whose window is whole on the detector and whose sprite is whole on the monitor."""
         margin = self.settings.radius_px + 1.5
-        width, height = self.camera.resolution_px
-        inside = (seen.x_px >= margin) & (seen.x_px < width - 1 - margin) & (seen.y_px >= margin)
-        inside &= seen.y_px < height - 1 - margin
         reach = self.bench.renderer.footprint_px / 2 + margin * self._scale()
         width, height = self.bench.camera.resolution_px
         x, y = seen.truth["x_px"], seen.truth["y_px"]
-        return np.asarray(inside & (x >= reach) & (x < width - 1 - reach) & (y >= reach) & (y < height - 1 - reach))
+        inside = (x >= reach) & (x < width - 1 - reach) & (y >= reach) & (y < height - 1 - reach)
+        return np.asarray(inside & self._on_detector(seen.x_px, seen.y_px, margin))
+
+    def _on_detector(self, x_px: FloatArray, y_px: FloatArray, margin_px: float) -> npt.NDArray[np.bool_]:
+        """Places on the detector, so far from its edge or farther; NaN is not on it."""
+        width, height = self.camera.resolution_px
+        inside = (x_px >= margin_px - 0.5) & (x_px < width - 0.5 - margin_px)
+        return np.asarray(inside & (y_px >= margin_px - 0.5) & (y_px < height - 0.5 - margin_px))
 
     def _scale(self) -> float:
         """Monitor pixels to a tracker pixel."""
@@ -196,6 +251,12 @@ class Twin:
         """Free the GL contexts."""
         for part in (self.bench, self.true_optics, self.sky_optics):
             part.close()
+
+
+def changed(verify: Verify) -> list[str]:
+    """The names of the keys of [verify] that are not at their defaults."""
+    default = Verify()
+    return [name for name in verify.__struct_fields__ if getattr(verify, name) != getattr(default, name)]
 
 
 def true_panel(bench: Bench, folder: Path) -> Panel:
@@ -224,8 +285,11 @@ def levels_of(assumed: Response, true: Response) -> Response:
 
 
 def true_mounting(config: BenchConfig, tracker: Camera) -> Mounting:
-    """How monitor and collimator really stand."""
+    """How monitor and collimator really stand. Raises InputError for a rotation that is not unit within 1e-3."""
     verify, collimator, monitor = config.verify, config.collimator, config.monitor
+    norm = math.hypot(*(verify.true_q_cam_to_mon or collimator.q_cam_to_mon))
+    if abs(norm - 1) > NORM_TOLERANCE:
+        raise InputError(f"[verify] true_q_cam_to_mon: its norm is {norm:.6g}; write a unit quaternion w, x, y, z")
     camera = monitor_camera(
         monitor.resolution_px,
         verify.true_pixel_pitch_um or monitor.pixel_pitch_um,
@@ -260,23 +324,32 @@ def nearest(found: Centroids, x_px: FloatArray, y_px: FloatArray) -> npt.NDArray
     return np.asarray(np.where(distance <= MATCH_PX, index, -1), dtype=np.intp)
 
 
-def only_once(match: npt.NDArray[np.intp]) -> npt.NDArray[np.bool_]:
-    """True for places whose match is nobody else's."""
+def shared(match: npt.NDArray[np.intp]) -> npt.NDArray[np.bool_]:
+    """True for places whose match is somebody else's too."""
     used, counts = np.unique(match, return_counts=True)
-    return np.asarray((match >= 0) & (counts[np.searchsorted(used, match)] == 1))
+    return np.asarray((match >= 0) & (counts[np.searchsorted(used, match)] > 1))
 
 
-def crowded(seen: Field, radius_px: float) -> npt.NDArray[np.bool_]:
-    """True for stars that have another of more than CROWDED_SHARE of their light within a window's reach."""
+def crowded(seen: Field, radius_px: int, sigma_px: tuple[float, float]) -> npt.NDArray[np.bool_]:
+    """True for stars into whose window any other brings more than CROWDED_SHARE of their own light."""
     from scipy.spatial import KDTree
+    from scipy.special import ndtr
 
     places = np.nan_to_num(np.stack([seen.x_px, seen.y_px], axis=1), nan=-1e9)
-    flux = seen.truth["electrons_per_s"]
-    close = KDTree(places).query_pairs(math.sqrt(2) * radius_px, output_type="ndarray")
+    flux, half = seen.truth["electrons_per_s"], radius_px + 0.5
+    close = KDTree(places).query_pairs(math.sqrt(2) * half + WING_SIGMAS * max(sigma_px), output_type="ndarray")
     result = np.zeros(len(flux), dtype=np.bool_)
     for a, b in (close.T, close.T[::-1]):
-        result[a[flux[b] > CROWDED_SHARE * flux[a]]] = True
+        offset = places[b] - np.rint(places[a])
+        share = (ndtr((offset + half) / sigma_px) - ndtr((offset - half) / sigma_px)).prod(axis=1)
+        result[a[flux[b] * share > CROWDED_SHARE * flux[a]]] = True
     return result
+
+
+def on_screen_median(glow_e_per_s: FloatArray) -> float:
+    """The median over the detector's pixels that see the screen; 0 where the screen's black has no light."""
+    lit = glow_e_per_s[glow_e_per_s > 0]
+    return float(np.median(lit)) if len(lit) else 0.0
 
 
 def magnitude(ratio: float) -> float:
@@ -288,13 +361,15 @@ def verify(
     path: Path, fields: int, rng: np.random.Generator, on_field: Callable[[int], None] = lambda done: None
 ) -> tuple[Verdict, dict[str, Any]]:
     """Run the twin over random attitudes; the verdict with its stars, and the summary of `hilstar verify --json`."""
+    # Streams apart: the noise draws as many numbers as it has electrons, and all benches shall see the same fields.
+    attitudes, noise = rng.spawn(2)
     tally = Tally()
     twin = Twin(path)
     try:
         for number in range(fields):
-            q = rng.normal(size=4)
-            first = int(rng.integers(0, 4096))
-            twin.measure(twin.field(q / np.linalg.norm(q), first), tally, rng)
+            q = attitudes.normal(size=4)
+            first = int(attitudes.integers(0, LONGEST_CYCLE))
+            twin.measure(twin.field(q / np.linalg.norm(q), first), tally, noise)
             on_field(number + 1)
         verdict = judge(twin, tally)
         return verdict, verdict.summary(fields, tally, twin)

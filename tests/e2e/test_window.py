@@ -44,10 +44,11 @@ def started(folder: Path) -> tuple[subprocess.Popen, Server] | None:
     """An X server whose screen is in a file of `folder`, once that is there; None when it ended instead."""
     read, write = os.pipe()
     command = ["Xvfb", "-displayfd", str(write), "-screen", "0", "640x480x24", "-fbdir", str(folder), "-nolisten", "tcp"]
-    process = subprocess.Popen([*command, "-noreset"], pass_fds=(write,), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    with (folder / "server.log").open("wb") as told:
+        process = subprocess.Popen([*command, "-noreset"], pass_fds=(write,), stdout=told, stderr=told)
     os.close(write)
-    number = os.read(read, 16).decode().strip()
-    os.close(read)
+    with os.fdopen(read) as pipe:
+        number = pipe.readline().strip()  # the server dies if its newline finds nobody
     screen_file = folder / "Xvfb_screen0"
     end = time.monotonic() + 5
     while process.poll() is None and time.monotonic() < end:
@@ -61,12 +62,8 @@ def started(folder: Path) -> tuple[subprocess.Popen, Server] | None:
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory) -> Iterator[Server]:
-    """Another server that goes down at this moment can take the display number that this one was about to have."""
-    for _ in range(5):
-        if (running := started(tmp_path_factory.mktemp("screen"))) is not None:
-            break
-    else:
-        pytest.fail("no X server comes up")
+    running = started(tmp_path_factory.mktemp("screen"))
+    assert running is not None, "no X server comes up"
     process, server = running
     yield server
     process.terminate()
@@ -210,3 +207,21 @@ def test_a_display_that_is_not_there_gets_one_line(server, bench_file):
     code, said = refused(server, bench_file, display=":99999")
     assert code == 3
     assert "--headless" in said
+
+
+def test_the_patches_of_a_plan_come_up_on_the_screen(server, tmp_path):
+    """Two levels: black and white; the square of the first white one stays 5 s."""
+    env = {**os.environ, "DISPLAY": server.display}
+    command = ["calibrate", "plan", "-o", str(tmp_path / "plan.csv"), "--levels", "2", "--repeats", "1", "--show"]
+    with subprocess.Popen(
+        [sys.executable, "-m", "hilstar", *command, "--seconds", "0.4"], stderr=subprocess.PIPE, text=True, env=env
+    ) as process:
+        seen = set()
+        end = time.monotonic() + LATEST_S
+        while process.poll() is None and time.monotonic() < end:
+            screen = server.screen()
+            seen.add((int(screen[240, 320].max()), int(screen[20, 20].max())))
+            time.sleep(0.02)
+        said = process.communicate(timeout=10)[1]
+    assert {(0, 0), (127, 0), (255, 0)} <= seen
+    assert "code 255, channel w" in said

@@ -103,7 +103,7 @@ _json_decoder = msgspec.json.Decoder(_JsonAttitude)
 
 
 def encode(packet: Packet) -> bytes:
-    """The bytes of a packet; counters are taken modulo 2^32."""
+    """The bytes of a packet; counters are taken modulo 2^32, and a status's times held within 64 bits."""
     match packet:
         case AttitudeSample():
             body = _attitude_body(packet)
@@ -115,7 +115,8 @@ def encode(packet: Packet) -> bytes:
         case Status():
             counts = (packet.attitude_sequence % U32, packet.accepted % U32, packet.refused % U32)
             head = (VERSION, protocol.KIND_STATUS, packet.health, packet.frame % U32)
-            body = protocol.STATUS_BODY.pack(*head, packet.light_t_ns, packet.attitude_age_ns, *counts)
+            held = (min(max(t_ns, INT64[0]), INT64[-1]) for t_ns in (packet.light_t_ns, packet.attitude_age_ns))
+            body = protocol.STATUS_BODY.pack(*head, *held, *counts)
     return body + CRC.pack(zlib.crc32(body))
 
 

@@ -105,7 +105,7 @@ class Twin:
         self.differs = any(name.startswith("true_") for name in changed(self.config.verify))
         self.panel = true_panel(self.bench, path.parent)
         self.believed = Panel(self.bench.calibration.response, self.bench.flux_at_white_e_per_s, self.bench.uniformity)
-        true, self.assumed = true_mounting(self.config, self.camera), Mounting(self.bench.camera, self.camera)
+        true, self.assumed = true_mounting(self.bench, self.camera), Mounting(self.bench.camera, self.camera)
         self.background_e = background_e(self.config, path.parent)
         self.detector = Detector(detector_settings(tracker), tracker.resolution_px)
         self.settings = centroid_settings(self.config, self.assumed)
@@ -284,12 +284,15 @@ def levels_of(assumed: Response, true: Response) -> Response:
     return Response(assumed.bits, known, table_response(assumed.bits, known).threshold, true.black, assumed.rgb)
 
 
-def true_mounting(config: BenchConfig, tracker: Camera) -> Mounting:
+def true_mounting(bench: Bench, tracker: Camera) -> Mounting:
     """How monitor and collimator really stand. Raises InputError for a rotation that is not unit within 1e-3."""
+    config = bench.config
     verify, collimator, monitor = config.verify, config.collimator, config.monitor
     norm = math.hypot(*(verify.true_q_cam_to_mon or collimator.q_cam_to_mon))
     if abs(norm - 1) > NORM_TOLERANCE:
-        raise InputError(f"[verify] true_q_cam_to_mon: its norm is {norm:.6g}; write a unit quaternion w, x, y, z")
+        raise InputError(
+            f"{bench.path}: [verify] true_q_cam_to_mon: its norm is {norm:.6g}; write a unit quaternion w, x, y, z"
+        )
     camera = monitor_camera(
         monitor.resolution_px,
         verify.true_pixel_pitch_um or monitor.pixel_pitch_um,

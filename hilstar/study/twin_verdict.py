@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import astuple, dataclass, fields
+from dataclasses import astuple, dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,15 +15,22 @@ from hilstar.study.charts import chart, write_csv
 if TYPE_CHECKING:
     from hilstar.study.twin import Tally, Twin
 
-SMALLEST_FIT = 10  # stars for a scale and a rotation
-STRAY_SCALE = 1e-3  # a plate scale off by more is named as a cause
-STRAY_ROTATION_RAD = 1e-3
+SMALLEST_FIT = 10  # stars for a scale, a rotation and an offset
+# A fit that leaves more of the residuals' squares than this is no cause of them: chance matches leave nearly all.
+MOST_LEFT = 0.5
+# A cause is named where it accounts for most of what was looked for.
+MOST = 0.5
+MIRROR_WORDS = {"x": "its columns reversed", "y": "its rows reversed", "swap": "its axes swapped"}
 QUIVER_PX = 60.0  # on the chart, for the 95 % residual
 
 
 @dataclass(frozen=True, slots=True)
 class Star:
-    """One star: what the display adds to its magnitude and place (tracker px), and the estimator's own error beside it."""
+    """One star at its place on the tracker, px: errors of the display, + too faint, right and down, magnitudes and px.
+
+    `codes_mag`, `codes_px` are what the codes would cost on the monitor that the bench assumes, NaN where that star would
+    be lost; `floor_mag`, `floor_px` are the estimator's own, of the linear image against catalogue and sky.
+    """
 
     hip: int
     v_mag: float
@@ -32,18 +39,36 @@ class Star:
     flux_mag: float
     dx_px: float
     dy_px: float
+    codes_mag: float
+    codes_px: float
     floor_mag: float
     floor_px: float
 
 
 @dataclass(frozen=True, slots=True)
+class Fit:
+    """What a scale, a rotation about the detector's middle and a shift explain of the centroids' residuals.
+
+    `left` is the share of the residuals' squares that they do not explain.
+    """
+
+    scale_error: float
+    rotation_rad: float
+    offset_px: tuple[float, float]
+    left: float
+
+
+@dataclass(frozen=True, slots=True)
 class Verdict:
-    """The stars with their common zero point taken out, the limits, and every reason against the bench."""
+    """The stars with their common zero point taken out, and every reason against the bench.
+
+    `codes_zero_point_mag` is the zero point that the codes alone would have; `fit` is None with too few stars.
+    """
 
     stars: list[Star]
     zero_point_mag: float
-    scale_error: float | None
-    rotation_rad: float | None
+    codes_zero_point_mag: float
+    fit: Fit | None
     reasons: list[str]
 
     @property
@@ -58,6 +83,14 @@ class Verdict:
     def centroid_px(self) -> FloatArray:
         """Centroid errors (n,), tracker pixels."""
         return np.array([math.hypot(star.dx_px, star.dy_px) for star in self.stars])
+
+    def codes_mag(self) -> FloatArray:
+        """Flux errors (n,) of the codes alone, magnitudes, NaN where the codes alone lose the star."""
+        return np.array([star.codes_mag for star in self.stars])
+
+    def codes_px(self) -> FloatArray:
+        """Centroid errors (n,) of the codes alone, tracker pixels."""
+        return np.array([star.codes_px for star in self.stars])
 
     def summary(self, field_count: int, tally: Tally, twin: Twin) -> dict[str, Any]:
         """The JSON object of `hilstar verify`."""
@@ -75,15 +108,26 @@ class Verdict:
             "blended": tally.blended,
             "clipped": tally.clipped,
             "not_shown": tally.not_shown,
+            "at_edge": tally.at_edge,
             "zero_point_mag": finite(self.zero_point_mag),
-            "scale_error": self.scale_error,
-            "rotation_arcsec": None if self.rotation_rad is None else math.degrees(self.rotation_rad) * 3600,
+            "scale_error": self.fit and self.fit.scale_error,
+            "rotation_arcsec": self.fit and math.degrees(self.fit.rotation_rad) * 3600,
+            "offset_px": self.fit and self.fit.offset_px,
             "black_e_per_s_px": {"assumed": twin.assumed_glow_e_per_s_px, "seen": twin.seen_glow_e_per_s_px},
             "estimator_floor": {
                 "flux_mag": spread(np.abs([star.floor_mag for star in self.stars])),
                 "centroid_px": spread(np.array([star.floor_px for star in self.stars])),
             },
-            "noisy": {"flux_mag": spread(np.abs(tally.noisy_mag)), "centroid_px": spread(np.array(tally.noisy_px))},
+            "codes_alone": {
+                "flux_mag": spread(np.abs(self.codes_mag())),
+                "centroid_px": spread(self.codes_px()),
+                "zero_point_mag": finite(self.codes_zero_point_mag),
+            },
+            "noisy": {
+                "stars": len(tally.noisy_px),
+                "flux_mag": spread(np.abs(np.array(tally.noisy_mag) - self.zero_point_mag)),
+                "centroid_px": spread(np.array(tally.noisy_px)),
+            },
             "by_magnitude": self.by_magnitude(),
             "calibration": {"name": twin.bench.calibration.name, "sha256": twin.bench.calibration.sha256},
             "gl_renderer": twin.bench.renderer.gl_renderer,
@@ -121,63 +165,139 @@ def finite(value: float) -> float | None:
 
 def judge(twin: Twin, tally: Tally) -> Verdict:
     """The verdict over all fields."""
-    zero_point = float(np.median([star.flux_mag for star in tally.stars])) if tally.stars else 0.0
-    stars = [Star(**{**_as_dict(star), "flux_mag": star.flux_mag - zero_point}) for star in tally.stars]
-    scale, rotation = fit_scale(stars, twin)
-    verdict = Verdict(stars, zero_point, scale, rotation, [])
+    zero_point = median([star.flux_mag for star in tally.stars])
+    codes_zero_point = median([star.codes_mag for star in tally.stars])
+    stars = [
+        replace(star, flux_mag=star.flux_mag - zero_point, codes_mag=star.codes_mag - codes_zero_point) for star in tally.stars
+    ]
+    verdict = Verdict(stars, zero_point, codes_zero_point, fit_geometry(stars, twin.camera.principal_point_px), [])
     verdict.reasons.extend(reasons(verdict, twin, tally))
     return verdict
 
 
-def _as_dict(star: Star) -> dict[str, Any]:
-    return dict(zip((entry.name for entry in fields(star)), astuple(star), strict=True))
+def median(values: list[float]) -> float:
+    """The median of the finite values, 0 without any."""
+    finite_values = [value for value in values if math.isfinite(value)]
+    return float(np.median(finite_values)) if finite_values else 0.0
 
 
-def fit_scale(stars: list[Star], twin: Twin) -> tuple[float | None, float | None]:
-    """Relative error of the plate scale and rotation (rad) of the centroids about the detector's middle, least squares."""
+def fit_geometry(stars: list[Star], middle_px: tuple[float, float]) -> Fit | None:
+    """Scale, rotation and shift of the centroids by least squares; None with too few stars."""
     if len(stars) < SMALLEST_FIT:
-        return None, None
-    cx, cy = twin.camera.principal_point_px
-    x, y = np.array([star.x_px for star in stars]) - cx, np.array([star.y_px for star in stars]) - cy
+        return None
+    x, y = np.array([star.x_px for star in stars]) - middle_px[0], np.array([star.y_px for star in stars]) - middle_px[1]
     ones, zeros = np.ones_like(x), np.zeros_like(x)
     design = np.concatenate([np.stack([x, -y, ones, zeros], axis=1), np.stack([y, x, zeros, ones], axis=1)])
     residual = np.array([*(star.dx_px for star in stars), *(star.dy_px for star in stars)])
-    scale, rotation, *_ = np.linalg.lstsq(design, residual, rcond=None)[0]
-    return float(scale), float(rotation)
+    found = np.linalg.lstsq(design, residual, rcond=None)[0]
+    scale, rotation, right, down = (float(value) for value in found)
+    total = float(residual @ residual)
+    left = float(np.square(residual - design @ found).sum()) / total if total else 0.0
+    return Fit(scale, rotation, (right, down), left)
 
 
 def reasons(verdict: Verdict, twin: Twin, tally: Tally) -> list[str]:
     """A line for each limit that is passed, and for what seems to be its cause."""
-    limits = twin.config.verify
-    found: list[str] = []
-    looked_for = len(verdict.stars) + tally.lost
-    if looked_for == 0:
+    if not len(verdict.stars) + tally.lost:
         return ["no star could be measured: the fields have none that is shown, unclipped and alone"]
-    if tally.lost > limits.lost_share * looked_for:
-        found.append(
-            f"{tally.lost} of {looked_for} stars lost (limit {limits.lost_share:.1%}): they are not where the sky has them;"
-            " look at focal lengths, pixel pitches, and an axis that is mirrored or swapped"
-        )
-    flux, centroid = spread(np.abs(verdict.flux_mag()))["p95"], spread(verdict.centroid_px())["p95"]
-    if flux is not None and flux > limits.flux_mag:
-        found.append(f"flux is {flux:.3f} mag off at 95 % (limit {limits.flux_mag:g}): look at the monitor's response")
-    if centroid is not None and centroid > limits.centroid_px:
-        found.append(f"centroids are {centroid:.3f} px off at 95 % (limit {limits.centroid_px:g})")
-    if verdict.scale_error is not None and abs(verdict.scale_error) > STRAY_SCALE and found:
-        found.append(f"the plate scale is {verdict.scale_error:+.2%} off: look at focal_length_mm and pixel_pitch_um")
-    if verdict.rotation_rad is not None and abs(verdict.rotation_rad) > STRAY_ROTATION_RAD and found:
-        found.append(f"the field is turned by {math.degrees(verdict.rotation_rad):+.3f} deg: look at q_cam_to_mon")
-    glow, assumed = twin.seen_glow_e_per_s_px, twin.assumed_glow_e_per_s_px
-    if abs(glow - assumed) > twin.black_limit_e_per_s_px():
-        found.append(
-            f"the screen's black gives {glow:.4g} e-/s in a tracker pixel where {assumed:.4g} are assumed"
-            f" (limit {twin.black_limit_e_per_s_px():.3g}): calibrate the black level"
-        )
-    if abs(verdict.zero_point_mag) > limits.flux_mag:
-        found.append(
-            f"all stars are {verdict.zero_point_mag:+.3f} mag off (limit {limits.flux_mag:g}): look at flux_at_white_e_per_s"
-        )
+    lost = _lost(verdict, twin, tally)
+    mostly_lost = tally.lost > MOST * (len(verdict.stars) + tally.lost)
+    centroid = _centroids(verdict, twin)
+    geometry = _geometry(verdict, twin) if lost or centroid else []
+    # What few stars are found by chance, or off the middle of their windows, says nothing of light.
+    light = [] if mostly_lost else _light(verdict, twin)
+    return [*lost, *centroid, *geometry, *light, *_black(twin), *_floor(verdict, twin)]
+
+
+def _lost(verdict: Verdict, twin: Twin, tally: Tally) -> list[str]:
+    looked_for = len(verdict.stars) + tally.lost
+    limit = twin.config.verify.lost_share
+    if tally.lost <= limit * looked_for:
+        return []
+    cause = "look at focal lengths, pixel pitches and q_cam_to_mon, or at what the codes leave of faint stars"
+    for mirror, count in tally.mirrored.items():
+        if count > MOST * looked_for:
+            cause = f"{count} are where a mirrored screen with {MIRROR_WORDS[mirror]} would show them: look at its mounting"
+    return [f"{tally.lost} of {looked_for} stars are not where the sky has them (limit {limit:.1%}): {cause}"]
+
+
+def _centroids(verdict: Verdict, twin: Twin) -> list[str]:
+    limit, seen, alone = twin.config.verify.centroid_px, p95(verdict.centroid_px()), p95(verdict.codes_px())
+    if seen <= limit:
+        return []
+    whose = f"; the codes alone cost {alone:.3f} px: {more_codes(twin)}" if alone > limit else ""
+    return [f"centroids are {seen:.3f} px off at 95 % (limit {limit:g}){whose}"]
+
+
+def _geometry(verdict: Verdict, twin: Twin) -> list[str]:
+    """What part of the geometry is off by more than the centroids' limit somewhere in the field."""
+    fit, limit = verdict.fit, twin.config.verify.centroid_px
+    if fit is None or fit.left > MOST_LEFT:
+        return []
+    reach_px, found = math.hypot(*twin.camera.resolution_px) / 2, []
+    if abs(fit.scale_error) * reach_px > limit:
+        found.append(f"the plate scale is {fit.scale_error:+.2%} off: look at focal_length_mm and pixel_pitch_um")
+    if abs(fit.rotation_rad) * reach_px > limit:
+        found.append(f"the field is turned by {math.degrees(fit.rotation_rad):+.3f} deg: look at q_cam_to_mon")
+    if math.hypot(*fit.offset_px) > limit:
+        right, down = fit.offset_px
+        found.append(f"the field is shifted by ({right:+.2f}, {down:+.2f}) px: look at q_cam_to_mon and principal_point_px")
     return found
+
+
+def _light(verdict: Verdict, twin: Twin) -> list[str]:
+    """Errors over the field's stars against each other, then the one that all have."""
+    limit, found = twin.config.verify.flux_mag, []
+    seen, alone = p95(np.abs(verdict.flux_mag())), p95(np.abs(verdict.codes_mag()))
+    if seen > limit:
+        causes = []
+        if alone > limit:
+            causes.append(f"the codes alone cost {alone:.3f} mag: {more_codes(twin)}")
+        if twin.differs and math.sqrt(max(seen**2 - alone**2, 0.0)) > limit:
+            causes.append("light does not follow the codes as assumed: look at the monitor's response and uniformity")
+        found.append(f"flux is {seen:.3f} mag off at 95 % (limit {limit:g}); {'; '.join(causes)}")
+    offset, of_codes = verdict.zero_point_mag, verdict.codes_zero_point_mag
+    if abs(offset) > limit:
+        cause = f"the codes alone make {of_codes:+.3f}" if abs(of_codes) > limit else "look at flux_at_white_e_per_s"
+        # A wrong response moves the median star too: then white may well be right.
+        if not (found and abs(of_codes) <= limit and twin.config.verify.true_flux_at_white_e_per_s is None):
+            found.append(f"all stars are {offset:+.3f} mag off (limit {limit:g}): {cause}")
+    return found
+
+
+def _black(twin: Twin) -> list[str]:
+    glow, assumed, limit = twin.seen_glow_e_per_s_px, twin.assumed_glow_e_per_s_px, twin.black_limit_e_per_s_px()
+    if abs(glow - assumed) <= limit:
+        return []
+    return [
+        f"the screen's black gives {glow:.4g} e-/s in a tracker pixel where {assumed:.4g} are assumed"
+        f" (limit {limit:.3g}): calibrate the black level"
+    ]
+
+
+def _floor(verdict: Verdict, twin: Twin) -> list[str]:
+    """The linear image against the catalogue: where it is off by the limits, the differences above say nothing."""
+    limits = twin.config.verify
+    mag, px = p95(np.array([abs(s.floor_mag) for s in verdict.stars])), p95(np.array([s.floor_px for s in verdict.stars]))
+    if mag <= limits.flux_mag and px <= limits.centroid_px:
+        return []
+    return [
+        f"the linear image itself is measured {mag:.3f} mag and {px:.3f} px off the catalogue at 95 %: the tracker's PSF is too"
+        " narrow or too wide for its pixels, so no display can be told from that"
+    ]
+
+
+def more_codes(twin: Twin) -> str:
+    """What to change where the codes are too coarse."""
+    render = twin.config.render
+    ways = ['quantisation = "exact"'] if render.quantisation != "exact" else []
+    ways += ["bit_stealing = true"] if not render.bit_stealing else []
+    return f"try {', '.join([*ways, 'more bits, a larger brightest_v_mag or a smaller faintest_v_mag'])}"
+
+
+def p95(errors: FloatArray) -> float:
+    """The 95th percentile of some errors, 0 without any."""
+    return spread(errors)["p95"] or 0.0
 
 
 def write_report(directory: Path, verdict: Verdict, twin_limits: tuple[float, float], resolution_px: tuple[int, int]) -> None:

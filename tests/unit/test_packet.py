@@ -137,6 +137,11 @@ def test_every_other_kind_comes_back_as_it_was():
         assert decode(encode(sent)) == sent
 
 
+def test_a_status_of_a_clock_at_the_end_of_its_range_is_sent_all_the_same():
+    sent = decode(encode(Status(0, -1, 2**63 + 5, -(2**64), 2**32 + 1, 0, 0)))
+    assert sent == Status(0, 2**32 - 1, 2**63 - 1, -(2**63), 1, 0, 0)
+
+
 def test_another_kind_is_refused_for_its_crc_and_its_length():
     whole = encode(TimeReply(1, 2, 3, 4))
     assert reason(whole[:-1] + bytes([whole[-1] ^ 1])) == "crc"

@@ -81,7 +81,11 @@ class Matched:
 
 @dataclass(slots=True)
 class Tally:
-    """Stars by what became of them; `mirrored` counts those found where a screen so mirrored would show them."""
+    """Stars by what became of them.
+
+    Of all that the sky has, `vanished` counts how many fewer are seen, and `mirrored` those found where a screen so mirrored
+    would show them.
+    """
 
     stars: list[Star] = field(default_factory=list)
     lost: int = 0
@@ -89,6 +93,7 @@ class Tally:
     clipped: int = 0
     not_shown: int = 0
     at_edge: int = 0
+    vanished: int = 0
     mirrored: Counter[Mirror] = field(default_factory=Counter)
     noisy_mag: list[float] = field(default_factory=list)
     noisy_px: list[float] = field(default_factory=list)
@@ -165,6 +170,7 @@ class Twin:
         found = wanted & (sky.index >= 0) & (shown.index >= 0)
         tally.lost += int((wanted & ~found).sum())
         tally.stars += [self._star(seen, int(k), sky, shown, believed) for k in np.flatnonzero(found)]
+        tally.vanished += len(sky.found) - len(shown.found)
         self._look_mirrored(seen, shown.found, wanted, tally)
         self._measure_noisy(seen, wanted, tally, rng)
 

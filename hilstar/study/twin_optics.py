@@ -6,6 +6,7 @@ each spread by the tracker's own PSF. The black level is a glow over the whole m
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Literal, Self
@@ -70,7 +71,9 @@ class TwinOptics:
 
     def __init__(self, mounting: Mounting, psf_sigma_px: tuple[float, float]) -> None:
         self.mounting = mounting
-        self._renderer = Renderer(Target(mounting.tracker.resolution_px, psf_sigma_px))
+        side_px = mounting.tracker.focal_length_px / mounting.monitor.focal_length_px / SUB
+        sigma_x, sigma_y = (math.hypot(sigma, side_px / math.sqrt(12)) for sigma in psf_sigma_px)
+        self._renderer = Renderer(Target(mounting.tracker.resolution_px, (sigma_x, sigma_y)))
 
     def image_e_per_s(self, light_e_per_s: FloatArray) -> FloatArray:
         """Electrons per second of each tracker pixel (h, w) from those of each monitor pixel (H, W), float64."""

@@ -15,7 +15,7 @@ from hilstar.study.charts import chart, write_csv
 if TYPE_CHECKING:
     from hilstar.study.twin import Tally, Twin
 
-SMALLEST_FIT = 10  # stars for a scale, a rotation and an offset
+SMALLEST_FIT = 6  # stars for a scale, a rotation and a shift: twelve residuals, four unknowns
 # A fit that leaves more of the residuals' squares than this is no cause of them: chance matches leave nearly all.
 MOST_LEFT = 0.5
 # A cause is named where it accounts for most of what was looked for.
@@ -49,7 +49,7 @@ class Star:
 class Fit:
     """What a scale, a rotation about the detector's middle and a shift explain of the centroids' residuals.
 
-    `left` is the share of the residuals' squares that they do not explain.
+    `left` is the share of the residuals' mean square that they do not explain, for as many residuals as unknowns are over.
     """
 
     scale_error: float
@@ -192,7 +192,8 @@ def fit_geometry(stars: list[Star], middle_px: tuple[float, float]) -> Fit | Non
     found = np.linalg.lstsq(design, residual, rcond=None)[0]
     scale, rotation, right, down = (float(value) for value in found)
     total = float(residual @ residual)
-    left = float(np.square(residual - design @ found).sum()) / total if total else 0.0
+    spare = design.shape[0] / (design.shape[0] - design.shape[1])
+    left = float(np.square(residual - design @ found).sum()) / total * spare if total else 0.0
     return Fit(scale, rotation, (right, down), left)
 
 
@@ -214,7 +215,9 @@ def _lost(verdict: Verdict, twin: Twin, tally: Tally) -> list[str]:
     limit = twin.config.verify.lost_share
     if tally.lost <= limit * looked_for:
         return []
-    cause = "look at focal lengths, pixel pitches and q_cam_to_mon, or at what the codes leave of faint stars"
+    cause = "look at focal lengths, pixel pitches and q_cam_to_mon"
+    if tally.vanished > MOST * tally.lost:
+        cause = "they are too faint to be seen: look at the monitor's response, and at what the codes leave of faint stars"
     for mirror, count in tally.mirrored.items():
         if count > MOST * looked_for:
             cause = f"{count} are where a mirrored screen with {MIRROR_WORDS[mirror]} would show them: look at its mounting"

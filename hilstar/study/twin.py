@@ -88,7 +88,7 @@ class Tally:
     """
 
     stars: list[Star] = field(default_factory=list)
-    lost: int = 0
+    lost: list[Star] = field(default_factory=list)
     blended: int = 0
     clipped: int = 0
     not_shown: int = 0
@@ -168,8 +168,8 @@ class Twin:
         tally.blended += int((whole & blended).sum())
         wanted = whole & ~blended
         found = wanted & (sky.index >= 0) & (shown.index >= 0)
-        tally.lost += int((wanted & ~found).sum())
-        tally.stars += [self._star(seen, int(k), sky, shown, believed) for k in np.flatnonzero(found)]
+        for k in np.flatnonzero(wanted):
+            (tally.stars if found[k] else tally.lost).append(self._star(seen, int(k), sky, shown, believed))
         tally.vanished += len(sky.found) - len(shown.found)
         self._look_mirrored(seen, shown.found, wanted, tally)
         self._measure_noisy(seen, wanted, tally, rng)
@@ -182,9 +182,10 @@ class Twin:
         return Matched(found, nearest(found, seen.x_px, seen.y_px))
 
     def _star(self, seen: Field, k: int, sky: Matched, shown: Matched, believed: Matched) -> Star:
-        row, i = seen.truth[k], sky.index[k]
+        row, truth = seen.truth[k], self._truth(seen)
         flux_mag, dx_px, dy_px = shown.against(sky, k)
         codes_mag, *codes_px = believed.against(sky, k)
+        floor_mag, *floor_px = sky.against(truth, k)
         return Star(
             hip=int(row["hip"]),
             v_mag=float(row["v_mag"]),
@@ -195,9 +196,15 @@ class Twin:
             dy_px=dy_px,
             codes_mag=codes_mag,
             codes_px=math.hypot(*codes_px),
-            floor_mag=magnitude(sky.found.flux[i] / (row["electrons_per_s"] * self.config.tracker.exposure_s)),
-            floor_px=math.hypot(sky.found.x_px[i] - seen.x_px[k], sky.found.y_px[i] - seen.y_px[k]),
+            floor_mag=floor_mag,
+            floor_px=math.hypot(*floor_px),
         )
+
+    def _truth(self, seen: Field) -> Matched:
+        """The catalogue as if it had been found in an image."""
+        flux_e, count = seen.truth["electrons_per_s"] * self.config.tracker.exposure_s, len(seen.truth)
+        ones = np.ones(count, dtype=np.intp)
+        return Matched(Centroids(seen.x_px, seen.y_px, flux_e, flux_e, ones, ones < 1), np.arange(count, dtype=np.intp))
 
     def _look_mirrored(self, seen: Field, shown: Centroids, wanted: npt.NDArray[np.bool_], tally: Tally) -> None:
         """Count the stars that are where a mirrored screen would have them."""

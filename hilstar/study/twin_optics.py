@@ -1,7 +1,8 @@
 """The monitor as the tracker sees it: the light of its pixels through collimator and tracker optics onto the detector.
 
-A lit monitor pixel is a small square on the tracker's image, about as large as a tracker pixel: SUB x SUB points of light,
-each spread by the tracker's own PSF. The black level is a glow over the whole monitor, by its own density on the image.
+A lit monitor pixel is a small square on the tracker's image, about as large as a tracker pixel: SUB x SUB squares, each a
+Gaussian of the square's own variance, spread by the tracker's PSF. The black level is a glow over the whole monitor, by its own
+density on the image.
 """
 
 from __future__ import annotations
@@ -20,8 +21,9 @@ from hilstar.scene.camera import Camera
 from hilstar.scene.sprites import pack_sprites
 
 Mirror = Literal["none", "x", "y", "swap"]
-# Points along a pixel's side. Their variance is that of the square less 1/(12 SUB^2) px^2: sigma^2 of a star on the
-# tracker is short by 0.7 % of a monitor pixel's square, and its light by nothing.
+# Squares along a pixel's side. Against twelve, a star's centroid is off by 1e-5 px and its flux by 2e-6 mag on the demo's
+# bench (a monitor pixel is 0.9 tracker pixels, the PSF's sigma 0.55), by 4e-5 px with a PSF of 0.3, and by 2e-4 px and 1e-5 mag
+# with monitor pixels of 2.7 tracker pixels. Points instead of Gaussians of the same variance: 1.5e-3, 3e-3 and 9e-3 px.
 SUB = 3
 POINTS_AT_ONCE = 400_000
 

@@ -21,7 +21,7 @@ MOST_LEFT = 0.5
 # A cause is named where it accounts for most of what was looked for.
 MOST = 0.5
 MIRROR_WORDS = {"x": "its columns reversed", "y": "its rows reversed", "swap": "its axes swapped"}
-QUIVER_PX = 60.0  # on the chart, for the 95 % residual
+ARROW_SHARE = 0.06  # of the chart's width, for the residual that 95 % of stars are within
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,12 +60,13 @@ class Fit:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """The stars with their common zero point taken out, and every reason against the bench.
+    """The stars with their common zero point taken out, those lost with NaN for errors, and every reason against the bench.
 
     `codes_zero_point_mag` is the zero point that the codes alone would have; `fit` is None with too few stars.
     """
 
     stars: list[Star]
+    lost: list[Star]
     zero_point_mag: float
     codes_zero_point_mag: float
     fit: Fit | None
@@ -102,7 +103,7 @@ class Verdict:
             "flux_error_mag": spread(np.abs(self.flux_mag())),
             "centroid_error_px": spread(centroid),
             "centroid_error_arcsec": spread(centroid * arcsec),
-            "lost": tally.lost,
+            "lost": len(self.lost),
             "passed": self.passed,
             "reasons": self.reasons,
             "blended": tally.blended,
@@ -170,7 +171,7 @@ def judge(twin: Twin, tally: Tally) -> Verdict:
     stars = [
         replace(star, flux_mag=star.flux_mag - zero_point, codes_mag=star.codes_mag - codes_zero_point) for star in tally.stars
     ]
-    verdict = Verdict(stars, zero_point, codes_zero_point, fit_geometry(stars, twin.camera.principal_point_px), [])
+    verdict = Verdict(stars, tally.lost, zero_point, codes_zero_point, fit_geometry(stars, twin.camera.principal_point_px), [])
     verdict.reasons.extend(reasons(verdict, twin, tally))
     return verdict
 
@@ -199,37 +200,35 @@ def fit_geometry(stars: list[Star], middle_px: tuple[float, float]) -> Fit | Non
 
 def reasons(verdict: Verdict, twin: Twin, tally: Tally) -> list[str]:
     """A line for each limit that is passed, and for what seems to be its cause."""
-    if not len(verdict.stars) + tally.lost:
+    looked_for = len(verdict.stars) + len(verdict.lost)
+    if not looked_for:
         return ["no star could be measured: the fields have none that is shown, unclipped and alone"]
     lost = _lost(verdict, twin, tally)
-    mostly_lost = tally.lost > MOST * (len(verdict.stars) + tally.lost)
+    mostly_lost = len(verdict.lost) > MOST * looked_for
     centroid = _centroids(verdict, twin)
     geometry = _geometry(verdict, twin) if lost or centroid else []
     # What few stars are found by chance, or off the middle of their windows, says nothing of light.
-    light = [] if mostly_lost else _light(verdict, twin)
+    light = [] if mostly_lost else [*_light(verdict, twin), *_codes(verdict, twin)]
     return [*lost, *centroid, *geometry, *light, *_black(twin), *_floor(verdict, twin)]
 
 
 def _lost(verdict: Verdict, twin: Twin, tally: Tally) -> list[str]:
-    looked_for = len(verdict.stars) + tally.lost
+    lost, looked_for = len(verdict.lost), len(verdict.stars) + len(verdict.lost)
     limit = twin.config.verify.lost_share
-    if tally.lost <= limit * looked_for:
+    if lost <= limit * looked_for:
         return []
     cause = "look at focal lengths, pixel pitches and q_cam_to_mon"
-    if tally.vanished > MOST * tally.lost:
+    if tally.vanished > MOST * lost:
         cause = "they are too faint to be seen: look at the monitor's response, and at what the codes leave of faint stars"
     for mirror, count in tally.mirrored.items():
         if count > MOST * looked_for:
             cause = f"{count} are where a mirrored screen with {MIRROR_WORDS[mirror]} would show them: look at its mounting"
-    return [f"{tally.lost} of {looked_for} stars are not where the sky has them (limit {limit:.1%}): {cause}"]
+    return [f"{lost} of {looked_for} stars are not where the sky has them (limit {limit:.1%}): {cause}"]
 
 
 def _centroids(verdict: Verdict, twin: Twin) -> list[str]:
-    limit, seen, alone = twin.config.verify.centroid_px, p95(verdict.centroid_px()), p95(verdict.codes_px())
-    if seen <= limit:
-        return []
-    whose = f"; the codes alone cost {alone:.3f} px: {more_codes(twin)}" if alone > limit else ""
-    return [f"centroids are {seen:.3f} px off at 95 % (limit {limit:g}){whose}"]
+    limit, seen = twin.config.verify.centroid_px, p95(verdict.centroid_px())
+    return [f"centroids are {seen:.3f} px off at 95 % (limit {limit:g})"] if seen > limit else []
 
 
 def _geometry(verdict: Verdict, twin: Twin) -> list[str]:
@@ -253,12 +252,11 @@ def _light(verdict: Verdict, twin: Twin) -> list[str]:
     limit, found = twin.config.verify.flux_mag, []
     seen, alone = p95(np.abs(verdict.flux_mag())), p95(np.abs(verdict.codes_mag()))
     if seen > limit:
-        causes = []
-        if alone > limit:
-            causes.append(f"the codes alone cost {alone:.3f} mag: {more_codes(twin)}")
-        if twin.differs and math.sqrt(max(seen**2 - alone**2, 0.0)) > limit:
-            causes.append("light does not follow the codes as assumed: look at the monitor's response and uniformity")
-        found.append(f"flux is {seen:.3f} mag off at 95 % (limit {limit:g}); {'; '.join(causes)}")
+        response = math.sqrt(max(seen**2 - alone**2, 0.0)) > limit
+        cause = (
+            ": light does not follow the codes as assumed, look at the monitor's response and uniformity" if response else ""
+        )
+        found.append(f"flux is {seen:.3f} mag off at 95 % (limit {limit:g}){cause}")
     offset, of_codes = verdict.zero_point_mag, verdict.codes_zero_point_mag
     if abs(offset) > limit:
         cause = f"the codes alone make {of_codes:+.3f}" if abs(of_codes) > limit else "look at flux_at_white_e_per_s"
@@ -290,12 +288,16 @@ def _floor(verdict: Verdict, twin: Twin) -> list[str]:
     ]
 
 
-def more_codes(twin: Twin) -> str:
-    """What to change where the codes are too coarse."""
-    render = twin.config.render
+def _codes(verdict: Verdict, twin: Twin) -> list[str]:
+    """What the codes cost were everything as assumed, and what makes them finer."""
+    limits, render = twin.config.verify, twin.config.render
+    mag, px = p95(np.abs(verdict.codes_mag())), p95(verdict.codes_px())
+    if mag <= limits.flux_mag and px <= limits.centroid_px:
+        return []
     ways = ['quantisation = "exact"'] if render.quantisation != "exact" else []
     ways += ["bit_stealing = true"] if not render.bit_stealing else []
-    return f"try {', '.join([*ways, 'more bits, a larger brightest_v_mag or a smaller faintest_v_mag'])}"
+    ways += ["more bits", "a larger brightest_v_mag", "a smaller faintest_v_mag"]
+    return [f"the codes alone cost {mag:.3f} mag and {px:.3f} px at 95 %; try {', '.join(ways[:-1])} or {ways[-1]}"]
 
 
 def p95(errors: FloatArray) -> float:
@@ -304,8 +306,9 @@ def p95(errors: FloatArray) -> float:
 
 
 def write_report(directory: Path, verdict: Verdict, twin_limits: tuple[float, float], resolution_px: tuple[int, int]) -> None:
-    """stars.csv, flux.png and centroids.png; `twin_limits` are magnitudes and tracker pixels."""
-    write_csv(directory / "stars.csv", [entry.name for entry in fields(Star)], [astuple(star) for star in verdict.stars])
+    """stars.csv, errors.png and field.png; `twin_limits` are magnitudes and tracker pixels."""
+    write_csv(directory / "stars.csv", [entry.name for entry in fields(Star)], map(astuple, verdict.stars + verdict.lost))
+    _draw_field(directory / "field.png", verdict, resolution_px)
     if not verdict.stars:
         return
     v_mag, flux, centroid = np.array([star.v_mag for star in verdict.stars]), verdict.flux_mag(), verdict.centroid_px()
@@ -317,19 +320,25 @@ def write_report(directory: Path, verdict: Verdict, twin_limits: tuple[float, fl
             (axes[1], centroid, twin_limits[1], "centroid error [tracker px]"),
         ):
             axis.plot(v_mag, values, ".", markersize=4, alpha=0.6)
-            for line in (limit, -limit) if label.startswith("flux") else (limit,):
-                axis.axhline(line, color="tab:red", linestyle="--", linewidth=1)
+            axis.axhline(limit, color="tab:red", linestyle="--", linewidth=1, label="limit, for 95 % of stars")
+            if label.startswith("flux"):
+                axis.axhline(-limit, color="tab:red", linestyle="--", linewidth=1)
             axis.set_ylabel(label)
+        axes[0].legend(loc="upper left")
         axes[1].set_xlabel("V [mag]")
-    _draw_field(directory / "field.png", verdict, resolution_px)
 
 
 def _draw_field(path: Path, verdict: Verdict, resolution_px: tuple[int, int]) -> None:
     x, y, dx, dy = (np.array([getattr(star, name) for star in verdict.stars]) for name in ("x_px", "y_px", "dx_px", "dy_px"))
-    longest = max(float(np.percentile(np.hypot(dx, dy), 95)), 1e-9)
-    finding = f"Centroid errors over the tracker's field, an arrow of {QUIVER_PX:g} px is {longest:.3g} px"
+    longest, arrow_px = max(p95(np.hypot(dx, dy)), 1e-9), ARROW_SHARE * resolution_px[0]
+    finding = f"Centroid errors of {len(x)} stars over the tracker's field; {len(verdict.lost)} stars are lost"
     with chart(path, finding) as (axis,):
-        axis.quiver(x, y, dx, dy, angles="xy", scale_units="xy", scale=longest / QUIVER_PX, width=0.002)
+        axis.plot(x, y, ".", color="C0", markersize=3)
+        arrows = axis.quiver(x, y, dx, dy, angles="xy", scale_units="xy", scale=longest / arrow_px, width=0.002, color="C0")
+        axis.quiverkey(arrows, 1.12, 0.95, longest, f"{longest:.2g} px", labelpos="S")
+        if verdict.lost:
+            axis.plot([s.x_px for s in verdict.lost], [s.y_px for s in verdict.lost], "x", color="tab:red", label="lost")
+            axis.legend(loc="center left", bbox_to_anchor=(1.02, 0.5))
         axis.set_xlim(0, resolution_px[0])
         axis.set_ylim(resolution_px[1], 0)
         axis.set_aspect("equal")

@@ -152,7 +152,8 @@ def tell_verdict(summary: dict[str, Any]) -> None:
     def three(errors: dict[str, float | None]) -> str:
         return " / ".join("-" if errors[key] is None else f"{errors[key]:.4f}" for key in ("rms", "p95", "max"))
 
-    rest = ", ".join(f"{summary[name]} {name.replace('_', ' ')}" for name in ("lost", "blended", "clipped", "not_shown"))
+    kinds = ("lost", "blended", "clipped", "not_shown", "at_edge")
+    rest = ", ".join(f"{summary[name]} {name.replace('_', ' ')}" for name in kinds)
     typer.echo(f"{'stars':20}{summary['stars']} in {summary['fields']} fields; {rest}")
     typer.echo(f"{'flux error':20}{three(summary['flux_error_mag'])} mag (rms / 95 % / max)")
     arcsec = three(summary["centroid_error_arcsec"])
@@ -160,6 +161,9 @@ def tell_verdict(summary: dict[str, Any]) -> None:
     typer.echo(
         f"{'with detector noise':20}{three(summary['noisy']['flux_mag'])} mag, {three(summary['noisy']['centroid_px'])} px"
     )
+    for row in summary["by_magnitude"]:
+        where, flux, centroid = f"V {row['v_from']} to {row['v_to']}", row["flux_error_mag"], row["centroid_error_px"]
+        typer.echo(f"{where:>17}   {flux['rms']:.4f} mag rms, {centroid['rms']:.4f} px rms, {row['stars']} stars")
     for line in summary["reasons"]:
         typer.echo(f"{'':20}{line}")
     typer.echo(f"{'verdict':20}{'passed' if summary['passed'] else 'NOT passed'}")

@@ -172,8 +172,8 @@ def test_a_monitor_pixel_s_light_arrives_whole_and_where_it_belongs(twin):
     scale = (57.65e-3 / 120) / (13e-3 / 25)
     assert (image * x).sum() / image.sum() == pytest.approx(199.5 + (200 - 319.5) * scale, abs=CUT_PX)
     assert (image * y).sum() / image.sum() == pytest.approx(199.5 + (300 - 239.5) * scale, abs=CUT_PX)
-    # Its variance is the PSF's, a detector pixel's 1/12 and the points' (1 - 1/9) / 12 of a monitor pixel.
-    wanted = 0.55**2 + 1 / 12 + scale**2 * (1 - 1 / 9) / 12
+    # Its variance is the PSF's, a detector pixel's 1/12, and that of the square that a monitor pixel is.
+    wanted = 0.55**2 + 1 / 12 + scale**2 / 12
     assert (image * (x - (image * x).sum() / image.sum()) ** 2).sum() / image.sum() == pytest.approx(wanted, rel=2e-3)
 
 

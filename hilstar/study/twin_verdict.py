@@ -119,11 +119,7 @@ class Verdict:
                 "flux_mag": spread(np.abs([star.floor_mag for star in self.stars])),
                 "centroid_px": spread(np.array([star.floor_px for star in self.stars])),
             },
-            "codes_alone": {
-                "flux_mag": spread(np.abs(self.codes_mag())),
-                "centroid_px": spread(self.codes_px()),
-                "zero_point_mag": finite(self.codes_zero_point_mag),
-            },
+            "codes_alone": self.codes_alone(),
             "noisy": {
                 "stars": len(tally.noisy_px),
                 "flux_mag": spread(np.abs(np.array(tally.noisy_mag) - self.zero_point_mag)),
@@ -132,6 +128,14 @@ class Verdict:
             "by_magnitude": self.by_magnitude(),
             "calibration": {"name": twin.bench.calibration.name, "sha256": twin.bench.calibration.sha256},
             "gl_renderer": twin.bench.renderer.gl_renderer,
+        }
+
+    def codes_alone(self) -> dict[str, Any]:
+        """What the codes would cost were everything as assumed."""
+        return {
+            "flux_mag": spread(np.abs(self.codes_mag())),
+            "centroid_px": spread(self.codes_px()),
+            "zero_point_mag": finite(self.codes_zero_point_mag),
         }
 
     def by_magnitude(self) -> list[dict[str, Any]]:

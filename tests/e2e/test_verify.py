@@ -63,6 +63,8 @@ def test_a_right_bench_passes_within_the_aims(tmp_path):
     assert summary["estimator_floor"]["centroid_px"]["p95"] < FLOOR_PX
     assert summary["noisy"]["flux_mag"]["rms"] > summary["flux_error_mag"]["rms"]
     assert sum(row["stars"] for row in summary["by_magnitude"]) == summary["stars"]
+    assert summary["codes_alone"]["flux_mag"] == summary["flux_error_mag"]
+    assert summary["at_edge"] > 0
 
 
 @pytest.mark.parametrize(
@@ -70,11 +72,12 @@ def test_a_right_bench_passes_within_the_aims(tmp_path):
     [
         ('true_calibration = "gamma2.2"', "response"),
         ('true_mirror = "swap"', "swapped"),
-        ('true_mirror = "x"', "mirrored"),
-        ('true_mirror = "y"', "mirrored"),
+        ('true_mirror = "x"', "columns reversed"),
+        ('true_mirror = "y"', "rows reversed"),
         ("true_focal_length_mm = 121.2", "plate scale is -0.9"),
         ("true_pixel_pitch_um = 58.2265", "plate scale is +1"),
         ("true_q_cam_to_mon = [0.99999, 0, 0, 0.00447]", "turned by"),
+        ("true_q_cam_to_mon = [0.99999999, 0.0001, 0, 0]", "shifted by"),
         ("true_flux_at_white_e_per_s = 3e7", "flux_at_white"),
     ],
 )
@@ -148,6 +151,7 @@ def test_what_cannot_be_verified_gets_one_line(tmp_path):
         ('true_calibration = "lcd-example"', "bits"),
         ('true_mirror = "z"', "true_mirror"),
         ("true_focal_length_mm = -1", "true_focal_length_mm"),
+        ("true_q_cam_to_mon = [2, 0, 0, 0]", "unit quaternion"),
     ):
         path.write_text(f"{BENCH}[verify]\n{verify}\n")
         assert_refused(run_hilstar("verify", path, "--fields", "1"), 2, said)

@@ -34,6 +34,8 @@ resolution_px = [1920, 1080]
 pixel_pitch_um = 57.65
 [collimator]
 focal_length_mm = 200
+[render]
+flux_at_white_e_per_s = 2e6
 """
 
 
@@ -67,7 +69,7 @@ def first_stars(bench: hilstar.Bench, q: np.ndarray, count: int) -> hilstar.Benc
     stars = bench.stars
     columns = {n: getattr(stars, n)[keep] for n in ("hip", "vectors", "v_mag", "bv_mag", "temperature_k", "electrons_per_s")}
     grid = cell_grid(columns["vectors"])
-    bench.stars = replace(stars, **{n: c[grid.order] for n, c in columns.items()}, grid=grid)
+    bench.shown_stars = bench.stars = replace(stars, **{n: c[grid.order] for n, c in columns.items()}, grid=grid)
     return bench
 
 

@@ -1,19 +1,15 @@
 #version 330 core
 // Levels to the screen: their codes, turned as the optics want them, and what helps to align the bench.
+// Compiled for each mounting: on llvmpipe every branch costs at every pixel. QUARTER_TURNS, FLIP_X, FLIP_Y, STEALING, AIDS.
 
 uniform usampler2D levels;
 uniform usampler2D triples;  // with bit stealing the codes of each level, in rows of TABLE_WIDTH
-uniform bool stealing;
 uniform float white;         // the largest code
 uniform ivec2 size_px;       // of the image
 uniform ivec2 screen_px;
-uniform bvec2 flip;          // columns, rows of the screen
-uniform int quarter_turns;   // of the image on the screen, clockwise
 uniform ivec2 cross_px;      // principal point
 uniform int overlay;         // bit 0: crosshair, 1: grid, 2: blank, 3: patch
 uniform uint patch_code;
-uniform uint marker_code;    // of the square for a photodiode, its side marker_px
-uniform int marker_px;
 
 out vec4 colour;
 
@@ -22,31 +18,44 @@ const int GRID_PX = 100;
 const uint LINE = 96u;       // of 255: seen, and no star
 
 ivec2 image_pixel(ivec2 screen) {
-    if (flip.x) screen.x = screen_px.x - 1 - screen.x;
-    if (flip.y) screen.y = screen_px.y - 1 - screen.y;
-    if (quarter_turns == 1) return ivec2(screen.y, screen_px.x - 1 - screen.x);
-    if (quarter_turns == 2) return screen_px - 1 - screen;
-    if (quarter_turns == 3) return ivec2(screen_px.y - 1 - screen.y, screen.x);
+#ifdef FLIP_X
+    screen.x = screen_px.x - 1 - screen.x;
+#endif
+#ifdef FLIP_Y
+    screen.y = screen_px.y - 1 - screen.y;
+#endif
+#if QUARTER_TURNS == 1
+    return ivec2(screen.y, screen_px.x - 1 - screen.x);
+#elif QUARTER_TURNS == 2
+    return screen_px - 1 - screen;
+#elif QUARTER_TURNS == 3
+    return ivec2(screen_px.y - 1 - screen.y, screen.x);
+#else
     return screen;
+#endif
 }
 
 uvec3 codes_of(uint level) {
-    if (!stealing) return uvec3(level);
+#ifdef STEALING
     return texelFetch(triples, ivec2(int(level) % TABLE_WIDTH, int(level) / TABLE_WIDTH), 0).rgb;
+#else
+    return uvec3(level);
+#endif
 }
 
 void main() {
     // GL counts rows from the bottom, the screen from the top.
     ivec2 screen = ivec2(gl_FragCoord.x, screen_px.y - 1 - int(gl_FragCoord.y));
     ivec2 pixel = image_pixel(screen);
-    bool inside = all(greaterThanEqual(pixel, ivec2(0))) && all(lessThan(pixel, size_px));
+    bool inside = all(lessThan(uvec2(pixel), uvec2(size_px)));  // what is negative is huge without its sign
     uvec3 codes = inside ? codes_of(texelFetch(levels, pixel, 0).r) : uvec3(0u);
+#ifdef AIDS
     if ((overlay & 4) != 0) codes = uvec3(0u);
     uint line = uint(float(LINE) / 255.0 * white);
     ivec2 offset = pixel - cross_px;
     if ((overlay & 2) != 0 && (offset.x % GRID_PX == 0 || offset.y % GRID_PX == 0)) codes = max(codes, uvec3(line));
     if ((overlay & 1) != 0 && (offset.x == 0 || offset.y == 0)) codes = max(codes, uvec3(line));
     if ((overlay & 8) != 0) codes = uvec3(patch_code);
-    if (marker_px > 0 && screen.x < marker_px && screen.y >= screen_px.y - marker_px) codes = uvec3(marker_code);
+#endif
     colour = vec4(vec3(codes) / white, 1.0);
 }

@@ -9,7 +9,7 @@ from typing import IO
 
 import msgspec
 from mcap.exceptions import RecordLengthLimitExceeded
-from mcap.records import Channel, Message
+from mcap.records import Channel, McapRecord, Message, Metadata
 from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC, Writer
 
@@ -113,8 +113,25 @@ def read_messages(path: Path, topic: str) -> Iterator[bytes]:
 
     Raises InputError for damage, OSError when the file cannot be read.
     """
-    with path.open("rb") as file:
-        yield from _messages(path, file, topic)
+    yield from (data for name, data in read_topics(path) if name == topic)
+
+
+def read_topics(path: Path) -> Iterator[tuple[str, bytes]]:
+    """Topic and content of every message, in the order of the file, up to where its writer was killed.
+
+    Raises InputError for damage, OSError when the file cannot be read.
+    """
+    channels: dict[int, str] = {}
+    for record in _records(path):
+        if isinstance(record, Channel):
+            channels[record.id] = record.topic
+        elif isinstance(record, Message) and record.channel_id in channels:
+            yield channels[record.channel_id], record.data
+
+
+def read_metadata(path: Path, name: str) -> dict[str, str]:
+    """The first metadata of that name, {} where there is none. Raises InputError for damage."""
+    return next((dict(r.metadata) for r in _records(path) if isinstance(r, Metadata) and r.name == name), {})
 
 
 def is_mcap(path: Path) -> bool:
@@ -138,13 +155,17 @@ def _sample(data: bytes) -> AttitudeSample | Refusal | None:
     return checked_sample(form.t_ns, form.q, form.rate, form.sequence or 0, form.discontinuity)
 
 
-def _messages(path: Path, file: IO[bytes], topic: str) -> Iterator[bytes]:
+def _records(path: Path) -> Iterator[McapRecord]:
+    with path.open("rb") as file:
+        yield from _open_records(path, file)
+
+
+def _open_records(path: Path, file: IO[bytes]) -> Iterator[McapRecord]:
     size = file.seek(0, os.SEEK_END)
     file.seek(max(0, size - len(MCAP_MAGIC)))
     finished = size > 2 * len(MCAP_MAGIC) and file.read() == MCAP_MAGIC
     file.seek(0)
     records = StreamReader(file, validate_crcs=True, record_size_limit=size).records
-    channels: set[int] = set()
     while True:
         try:
             record = next(records, None)
@@ -156,7 +177,4 @@ def _messages(path: Path, file: IO[bytes], topic: str) -> Iterator[bytes]:
             raise InputError(f"{path}: is damaged before byte {file.tell()} ({detail}); record the log again") from error
         if record is None:
             return
-        if isinstance(record, Channel) and record.topic == topic:
-            channels.add(record.id)
-        elif isinstance(record, Message) and record.channel_id in channels:
-            yield record.data
+        yield record

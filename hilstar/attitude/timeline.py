@@ -27,7 +27,8 @@ OnStale = Literal["hold", "blank"]
 class Attitude:
     """An attitude at one time, and the newest sample behind it: its age, whether that is too old, its number and arrival.
 
-    `prediction_ns` is how far the attitude was carried on past that sample.
+    `prediction_ns` is how far the attitude was carried on past that sample, and `rate_cam_rad_s` how fast it turns then,
+    None where it stands still.
     """
 
     q_icrs_to_cam: FloatArray
@@ -36,6 +37,7 @@ class Attitude:
     sequence: int = 0
     received_ns: int | None = None
     prediction_ns: int = 0
+    rate_cam_rad_s: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,23 +93,28 @@ class Timeline:
         newest = near[place]
         age_ns = t_ns - newest.t_ns
         if place + 1 < len(near):
-            return Attitude(self._between(near, place, age_ns), age_ns, False, newest.sequence)
+            q, rate = self._between(near, place, age_ns)
+            return Attitude(q, age_ns, False, newest.sequence, rate_cam_rad_s=rate)
         return replace(self._predict(near[place - 1] if place else None, newest, age_ns), received_ns=received_ns)
 
-    def _between(self, near: list[AttitudeSample], place: int, age_ns: int) -> FloatArray:
+    def _between(self, near: list[AttitudeSample], place: int, age_ns: int) -> tuple[FloatArray, FloatArray | None]:
+        """Attitude and rate between two samples; of a blend the rates of both, blended too."""
         before, after = near[place], near[place + 1]
         if after.discontinuity:
-            return before.q_icrs_to_cam
+            return before.q_icrs_to_cam, None
         gap_ns = after.t_ns - before.t_ns
         rate, rate_after = before.rate_cam_rad_s, after.rate_cam_rad_s
         # Rates say little about a long gap: carried across it from both sides they overshoot, SLERP cannot.
         if rate is None or rate_after is None or gap_ns > self._policy.stale_after_ns:
-            return slerp(before.q_icrs_to_cam, after.q_icrs_to_cam, age_ns / gap_ns)
+            rate = rate_between_rad_s(before.q_icrs_to_cam, after.q_icrs_to_cam, gap_ns / NS_PER_S)
+            return slerp(before.q_icrs_to_cam, after.q_icrs_to_cam, age_ns / gap_ns), rate
         forward, backward = age_ns / NS_PER_S, (age_ns - gap_ns) / NS_PER_S
         bend, bend_after = (self._acceleration_rad_s2(near, k) for k in (place, place + 1))
         from_before = propagate(before.q_icrs_to_cam, rate + 0.5 * forward * bend, forward)
         from_after = propagate(after.q_icrs_to_cam, rate_after + 0.5 * backward * bend_after, backward)
-        return slerp(from_before, from_after, smootherstep(age_ns / gap_ns))
+        share = smootherstep(age_ns / gap_ns)
+        turning = (1 - share) * (rate + forward * bend) + share * (rate_after + backward * bend_after)
+        return slerp(from_before, from_after, share), turning
 
     def _acceleration_rad_s2(self, near: list[AttitudeSample], k: int) -> FloatArray:
         """At sample `k`, from the rates of its neighbours: the same for the intervals on both sides, so the blend is C2."""
@@ -133,7 +140,8 @@ class Timeline:
             return Attitude(newest.q_icrs_to_cam, age_ns, stale, newest.sequence)
         prediction_ns = min(age_ns, self._policy.max_extrapolation_ns)
         q = propagate(newest.q_icrs_to_cam, rate, prediction_ns / NS_PER_S)
-        return Attitude(q, age_ns, stale, newest.sequence, prediction_ns=prediction_ns)
+        turning = rate if prediction_ns == age_ns else None  # carried no further, it stands
+        return Attitude(q, age_ns, stale, newest.sequence, prediction_ns=prediction_ns, rate_cam_rad_s=turning)
 
 
 def smootherstep(u: float) -> float:

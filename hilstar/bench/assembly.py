@@ -18,7 +18,8 @@ import numpy.typing as npt
 from hilstar.arrays import Float32Array, FloatArray, IntArray
 from hilstar.attitude.protocol import NORM_TOLERANCE
 from hilstar.attitude.quaternion import normalise, to_matrix
-from hilstar.bench.config import BenchConfig, SkySettings, Tracker, read_config
+from hilstar.bench.config import BenchConfig, SkySettings, Tracker, Vector, read_config
+from hilstar.bench.mounting import scan_of
 from hilstar.errors import InputError
 from hilstar.monitor.calibration import BUILT_IN, Calibration, load_calibration
 from hilstar.monitor.footprints import FootprintMap
@@ -30,6 +31,7 @@ from hilstar.render.renderer import Context, Renderer, Target
 from hilstar.scene.camera import Camera
 from hilstar.scene.psf import peak_share
 from hilstar.scene.sprites import Sprites, clipped_sprites, make_sprites
+from hilstar.scene.sweep import Turn, swept_sprites
 from hilstar.sky.astrometry import aberrate, unit_vectors_icrs
 from hilstar.sky.catalog import load_catalog
 from hilstar.sky.electrons import Optics, Photometry, star_temperatures_k, tabulate
@@ -71,20 +73,30 @@ class Frame:
 
 
 class Drawn:
-    """What a draw put on the monitor."""
+    """What a draw put on the monitor: how many stars, and those too bright for it.
 
-    def __init__(self, renderer: Renderer, star_count: int, clipped_hip: tuple[int, ...]) -> None:
-        self.star_count = star_count
-        self.clipped_hip = clipped_hip
-        self._renderer = renderer
+    `turn` is what the stars' paths were drawn for, None where they are points.
+    """
+
+    def __init__(self, bench: Bench, q_icrs_to_cam: FloatArray | None, turn: Turn | None = None) -> None:
+        self.star_count = 0
+        self.clipped_hip: tuple[int, ...] = ()
+        self.turn = turn
+        self._bench = bench
+        self._q_icrs_to_cam = q_icrs_to_cam
         self._levels: Codes | None = None
 
     @property
     def levels(self) -> Codes:
         """The levels (see `Bench.code_values`), read back when they are first asked for; the next draw overwrites them."""
         if self._levels is None:
-            self._levels = self._renderer.codes()
+            self._levels = self._bench.renderer.codes()
         return self._levels
+
+    @property
+    def below_step(self) -> int:
+        """How many stars in view are too faint for the monitor."""
+        return 0 if self._q_icrs_to_cam is None else self._bench.count_faint(self._q_icrs_to_cam)
 
 
 class Bench:
@@ -103,6 +115,7 @@ class Bench:
         self.calibration = bench_calibration(self.config, path.parent)
         self.uniformity = self.calibration.uniformity_map(self.config.monitor.resolution_px)
         self.shown_stars = brighter_stars(self.stars, self.faintest_shown_e_per_s())
+        self.scan = scan_of(self.config.monitor)
         self._warn_of_cycle()
         render = self.config.render
         self.renderer = Renderer(
@@ -139,19 +152,44 @@ class Bench:
         icrs_to_image = self.camera.cam_to_image @ to_matrix(q_icrs_to_cam)
         return make_sprites(stars or self.shown_stars, icrs_to_image, self.camera, self.renderer.footprint_px)
 
-    def draw(self, q_icrs_to_cam: FloatArray | None, frame: int = 0) -> Drawn:
+    def draw(
+        self, q_icrs_to_cam: FloatArray | None, frame: int = 0, rate_cam_rad_s: Vector | FloatArray | None = None
+    ) -> Drawn:
         """Draw the levels for an attitude; None gives a blank frame. The frame path: no copy, no table.
 
-        `frame` counts the frames shown, for temporal dithering.
+        `frame` counts the frames shown, for temporal dithering. With a rate that moves stars by more than
+        `[render] motion_above_px` each is drawn along its path while its row is lit; the attitude is then that of the middle
+        row's first light.
         """
         if q_icrs_to_cam is None:
             self.renderer.draw(None, frame)
-            return Drawn(self.renderer, 0, ())
-        sprites = self.sprites(q_icrs_to_cam)
+            return Drawn(self, None)
+        turn = self._turn(q_icrs_to_cam, rate_cam_rad_s)
+        sprites = self.sprites(q_icrs_to_cam) if turn is None else self._swept(turn)
         self.renderer.draw(sprites, frame)
+        drawn = Drawn(self, q_icrs_to_cam, turn)
+        drawn.star_count = sprites.star_count
         clipped = self._clipped(sprites)
-        hip = tuple(int(h) for h in self.shown_stars.hip[sprites.star[clipped]])
-        return Drawn(self.renderer, len(sprites), hip)
+        if len(clipped):
+            drawn.clipped_hip = tuple(self.shown_stars.hip[np.unique(sprites.star[clipped])].tolist())
+        return drawn
+
+    def _turn(self, q_icrs_to_cam: FloatArray, rate_cam_rad_s: Vector | FloatArray | None) -> Turn | None:
+        """The motion of a frame, None where no star moves far enough to be seen."""
+        if rate_cam_rad_s is None:
+            return None
+        turn = Turn(q_icrs_to_cam, np.asarray(rate_cam_rad_s, dtype=np.float64))
+        motion_px = turn.speed_rad_s * self.scan.longest_s * self.camera.focal_length_px
+        return turn if motion_px > self.config.render.motion_above_px else None
+
+    def _swept(self, turn: Turn) -> Sprites:
+        return swept_sprites(self.shown_stars, turn, self.scan, self.camera, self.renderer.footprint_px, self._sigma_px)
+
+    def count_faint(self, q_icrs_to_cam: FloatArray) -> int:
+        """How many stars in view at an attitude are too faint for the monitor."""
+        if self.shown_stars is self.stars:
+            return 0
+        return len(self.sprites(q_icrs_to_cam, self.stars)) - len(self.sprites(q_icrs_to_cam))
 
     def warm_up(self) -> None:
         """Draw once with stars and once without: a driver compiles its shaders at their first use, 60 ms on llvmpipe."""

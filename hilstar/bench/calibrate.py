@@ -246,6 +246,7 @@ def _patch_stays(window: Window, presenter: Presenter, seconds: float | None) ->
     while time.monotonic() < end_s:
         presenter.present()
         window.swap()
+        window.look_at_events()
         while window.keys:
             key = window.keys.popleft()
             if key in {"q", "escape"}:

@@ -104,7 +104,10 @@ class Monitor(_Table, frozen=True):
     flip_y: bool = False
     rotate_deg: Literal[0, 90, 180, 270] = 0
     panel_delay_ms: NotNegative = 0.0
+    scanout_ms: NotNegative | None = None
+    hold_ms: NotNegative | None = None
     photodiode_px: Annotated[int, Meta(ge=0, le=1000)] = 0
+    photodiode: Literal["toggle", "code"] = "toggle"
 
 
 class Collimator(_Table, frozen=True):
@@ -143,6 +146,8 @@ class RenderSettings(_Table, frozen=True):
     sprite_sigma_px: Sigma = (0.85, 0.85)
     flux_at_white_e_per_s: Positive | None = None
     brightest_v_mag: Magnitude | None = None
+    motion: Literal["auto", "on", "off"] = "auto"
+    motion_above_px: NotNegative = 0.01
 
 
 class Background(_Table, frozen=True):

@@ -11,90 +11,34 @@ import logging
 import queue
 import threading
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, Self
 
 import msgspec
-import numpy as np
 from mcap.exceptions import McapError
 from mcap.writer import Writer
 
-from hilstar.arrays import FloatArray
-from hilstar.attitude.mcap_log import attitude_message, log_time_ns, read_messages, refused_message, register_attitudes
+from hilstar.attitude.mcap_log import attitude_message, log_time_ns, refused_message, register_attitudes
 from hilstar.attitude.packet import AttitudeSample, Refusal
 from hilstar.bench.assembly import Bench
-from hilstar.bench.loop import Shown
+from hilstar.bench.records import (
+    FRAME_SCHEMA_NAME,
+    FRAME_TOPIC,
+    HEAD,
+    PROCESS_SCHEMA_NAME,
+    PROCESS_TOPIC,
+    FrameRecord,
+    ProcessRecord,
+    process_record,
+    schema_of,
+)
 from hilstar.errors import InputError
 
-FRAME_TOPIC = "/frame"
-FRAME_SCHEMA_NAME = "hilstar.Frame"
 FLUSH_S = 0.2
+PROCESS_S = 1.0
 WAITING_MESSAGES = 100_000  # a disk that stands still for minutes; then frames go unrecorded, counted
 log = logging.getLogger(__name__)
-
-
-class FrameRecord(msgspec.Struct, kw_only=True):
-    """One frame; times ns: `t_ns` of the timeline, `light_ns` of the bench's clock, the others of this host's."""
-
-    frame: int
-    t_ns: int
-    light_ns: int
-    draw_ns: int
-    shown_ns: int
-    timestamp_source: str = "headless"
-    q: tuple[float, float, float, float] | None = None
-    attitude_sequence: int | None = None
-    attitude_t_ns: int | None = None
-    receive_ns: int | None = None
-    age_ns: int | None = None
-    prediction_ns: int = 0
-    stale: bool = False
-    stars_drawn: int = 0
-    clipped: int = 0
-    missed: int = 0
-
-
-_KINDS = {int: "integer", int | None: "integer", str: "string", bool: "boolean"}
-FRAME_SCHEMA = msgspec.json.encode(
-    {
-        "title": FRAME_SCHEMA_NAME,
-        "type": "object",
-        "properties": {
-            field.name: {"type": _KINDS[field.type]} if field.type in _KINDS else {"type": "array", "items": {"type": "number"}}
-            for field in msgspec.structs.fields(FrameRecord)
-        },
-    }
-)
-_frame_decoder = msgspec.json.Decoder(FrameRecord)
-
-
-def frame_record(shown: Shown, light_ns: int, missed: int) -> FrameRecord:
-    """What the ledger keeps of a frame; `light_ns` is on the bench's clock, `missed` counts the run's missed frames so far."""
-    attitude, drawn = shown.attitude, shown.drawn
-    record = FrameRecord(
-        frame=shown.number,
-        t_ns=shown.t_ns,
-        light_ns=light_ns,
-        draw_ns=shown.draw_ns,
-        shown_ns=shown.shown_ns,
-        timestamp_source=shown.timestamp_source,
-        stale=shown.stale,
-        stars_drawn=drawn.star_count,
-        clipped=len(drawn.clipped_hip),
-        missed=missed,
-    )
-    if attitude is not None:
-        w, x, y, z = attitude.q_icrs_to_cam.tolist()
-        record.q = (w, x, y, z)
-        record.attitude_sequence = attitude.sequence
-        record.attitude_t_ns = light_ns - attitude.age_ns
-        record.receive_ns = attitude.received_ns
-        record.age_ns = attitude.age_ns
-        record.prediction_ns = attitude.prediction_ns
-    return record
 
 
 class Ledger:
@@ -121,10 +65,10 @@ class Ledger:
 
     def _begin(self, bench: Bench) -> None:
         self._writer.start(profile="", library="hilstar")
-        schema = self._writer.register_schema(FRAME_SCHEMA_NAME, "jsonschema", FRAME_SCHEMA)
         self._channels = {
             "attitude": register_attitudes(self._writer),
-            "frame": self._writer.register_channel(FRAME_TOPIC, "json", schema),
+            "frame": self._register(FRAME_TOPIC, FRAME_SCHEMA_NAME, FrameRecord),
+            "process": self._register(PROCESS_TOPIC, PROCESS_SCHEMA_NAME, ProcessRecord),
         }
         head = {
             "bench_sha256": bench.bench_hash,
@@ -136,8 +80,12 @@ class Ledger:
             "monotonic_ns": str(time.monotonic_ns()),
             "unix_ns": str(time.time_ns()),
         }
-        self._writer.add_metadata("hilstar", head)
+        self._writer.add_metadata(HEAD, head)
         self._file.flush()
+
+    def _register(self, topic: str, name: str, record: type[msgspec.Struct]) -> int:
+        schema = self._writer.register_schema(name, "jsonschema", schema_of(record, name))
+        return self._writer.register_channel(topic, "json", schema)
 
     def packet(self, host_ns: int, raw: bytes, sample: AttitudeSample | None, refusal: Refusal | None) -> None:
         """Keep a packet; see `attitude.receiver.Watch`."""
@@ -145,7 +93,7 @@ class Ledger:
 
     def frame(self, record: FrameRecord) -> None:
         """Keep a frame."""
-        self._put(("frame", record.shown_ns, record.frame, record))
+        self._put(("frame", record.swap_ns, record.frame, record))
 
     def _put(self, item: tuple[str, int, int, Any]) -> None:
         if self.failure is not None or self._waiting.qsize() > WAITING_MESSAGES:
@@ -154,7 +102,7 @@ class Ledger:
         self._waiting.put(item)
 
     def _run(self) -> None:
-        flushed_s = time.monotonic()
+        flushed_s, looked_s = time.monotonic(), 0.0
         while True:
             try:
                 item = self._waiting.get(timeout=FLUSH_S)
@@ -165,6 +113,9 @@ class Ledger:
                     return
                 if item[0]:
                     self._write(*item)
+                if time.monotonic() - looked_s > PROCESS_S:
+                    looked_s = time.monotonic()
+                    self._write("process", time.monotonic_ns(), 0, process_record())
                 if time.monotonic() - flushed_s > FLUSH_S:
                     self._file.flush()
                     flushed_s = time.monotonic()
@@ -173,7 +124,7 @@ class Ledger:
                 return
 
     def _write(self, kind: str, time_ns: int, sequence: int, content: Any) -> None:
-        data = msgspec.json.encode(content) if kind == "frame" else _packet_message(time_ns, *content)
+        data = _packet_message(time_ns, *content) if kind == "attitude" else msgspec.json.encode(content)
         log_ns = log_time_ns(time_ns)
         self._writer.add_message(self._channels[kind], log_ns, data, log_ns, sequence % 2**32)
 
@@ -209,24 +160,3 @@ def _packet_message(host_ns: int, raw: bytes, sample: AttitudeSample | None, ref
         reason, detail = ("format", "") if refusal is None else (refusal.reason, refusal.detail)
         return refused_message(reason, detail, host_ns, raw)
     return attitude_message(sample, host_ns, raw)
-
-
-@dataclass(frozen=True, slots=True)
-class PastFrame:
-    """A frame of an earlier run: its number, its time, when it was shown (host time), and its attitude (None: blank)."""
-
-    number: int
-    t_ns: int
-    shown_ns: int
-    q_icrs_to_cam: FloatArray | None
-
-
-def past_frames(path: Path) -> Iterator[PastFrame]:
-    """The frames of a ledger, none where the file is no ledger. Raises InputError for damage."""
-    for number, data in enumerate(read_messages(path, FRAME_TOPIC), start=1):
-        try:
-            record = _frame_decoder.decode(data)
-        except (msgspec.MsgspecError, RecursionError, UnicodeDecodeError) as error:
-            raise InputError(f"{path}: message {number} of {FRAME_TOPIC} is not a frame of hilstar ({error})") from error
-        q = None if record.q is None else np.array(record.q)
-        yield PastFrame(record.frame, record.t_ns, record.shown_ns, q)

@@ -12,8 +12,9 @@ from hilstar.attitude.packet import AttitudeSample, Event, Refusal, TimeReply, T
 from hilstar.attitude.receiver import Arrival, PacketCounts
 from hilstar.attitude.timeline import Attitude
 from hilstar.bench.assembly import Bench
-from hilstar.bench.ledger import Ledger, frame_record
+from hilstar.bench.ledger import Ledger
 from hilstar.bench.loop import FrameLoop, Limit, Shown
+from hilstar.bench.records import frame_record
 from hilstar.bench.stats import spread
 from hilstar.bench.status import StatusMaker
 

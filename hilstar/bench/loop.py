@@ -2,28 +2,35 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 from hilstar.attitude.clock import NS_PER_MS, NS_PER_S
 from hilstar.attitude.timeline import Attitude, Policy, StaleGate
 from hilstar.bench.assembly import Bench, Drawn
 from hilstar.bench.config import AttitudeSettings
 from hilstar.bench.pacing import wait_until
+from hilstar.bench.priority import steady_loop
 from hilstar.bench.screen import Screen
 from hilstar.bench.stats import RunStats
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
 class Shown:
     """One frame of a run: its number, its time on the timeline, its attitude (None: blank) and its levels.
 
-    `draw_ns` is when drawing began and `shown_ns` when the levels were ready, host time.
+    Host times, ns: `draw_ns` when drawing began, `predicted_swap_ns` and `swap_ns` when the frame was to be swapped onto the
+    screen and when it was; headless, with nothing predicted, when its levels were ready. `missed_before` counts the refresh
+    periods just before it that had no frame of their own, and `marker` is the photodiode square's light, 0 or 1.
     """
 
     number: int
@@ -31,9 +38,12 @@ class Shown:
     attitude: Attitude | None
     drawn: Drawn
     draw_ns: int = 0
-    shown_ns: int = 0
+    predicted_swap_ns: int | None = None
+    swap_ns: int = 0
     stale: bool = False
     timestamp_source: str = "headless"
+    missed_before: int = 0
+    marker: int | None = None
 
 
 FrameSink = Callable[[Shown], None]
@@ -51,84 +61,155 @@ class Limit:
     frames: float = math.inf
 
 
-SMOOTHING = 0.1  # of each new frame in the time from draw to swap
-
-
 class FrameLoop:
-    """Draws frames; one slow frame is missed, and never queues others."""
+    """Draws frames; one slow frame is missed, and never queues others.
 
-    def __init__(self, bench: Bench, sink: FrameSink = ignore, screen: Screen | None = None) -> None:
+    `moving` says whether stars are drawn along their paths; by default as the bench file says, which is on a screen only.
+    """
+
+    def __init__(
+        self, bench: Bench, sink: FrameSink = ignore, screen: Screen | None = None, moving: bool | None = None
+    ) -> None:
         settings = bench.config.attitude
         self.stats = RunStats()
         self.stop = threading.Event()
         self.gate = StaleGate(policy_of(settings).stale_after_ns)
+        self.scheduling = "normal"
         self._bench = bench
         self._sink = sink
         self._screen = screen
-        self._draw_to_swap_ns = 0.0  # of the last frames
+        self._predicted_swap_ns: int | None = None
+        self._missed_before = 0
         self._held: Attitude | None = None  # what a paused screen shows
         self._blank_when_stale = settings.on_stale == "blank"
+        wanted = bench.config.render.motion
+        self._moving = (wanted == "on" or (wanted == "auto" and screen is not None)) if moving is None else moving
 
     def draw(self, number: int, t_ns: int, attitude: Attitude | None) -> Shown:
         """Draw the frame for `t_ns` of the timeline's clock; without an attitude it is blank."""
         begin_ns = time.monotonic_ns()
-        if self._screen is not None and self._screen.paused:
-            attitude = self._held
+        screen = self._screen
+        if screen is not None and screen.paused:
+            attitude = None if self._held is None else replace(self._held, rate_cam_rad_s=None)
         self._held = attitude
         stale = self.gate.update(attitude)
         blank = attitude is None or (stale and self._blank_when_stale)
-        drawn = self._bench.draw(None if attitude is None or blank else attitude.q_icrs_to_cam, number)
-        end_ns = self._shown_ns(drawn)
-        self._draw_to_swap_ns += SMOOTHING * (end_ns - begin_ns - self._draw_to_swap_ns)
-        self.stats.add(end_ns - begin_ns, None if attitude is None else attitude.age_ns, drawn.star_count, drawn.clipped_hip)
-        self.stats.stale_frames += stale
-        source = "headless" if self._screen is None else "after-swap clock"
-        shown = Shown(number, t_ns, None if blank else attitude, drawn, begin_ns, end_ns, stale, source)
+        if attitude is None or blank:
+            drawn = self._bench.draw(None, number)
+        else:
+            rate = attitude.rate_cam_rad_s if self._moving else None
+            drawn = self._bench.draw(attitude.q_icrs_to_cam, number, rate)
+        predicted_ns = self._predicted_swap_ns
+        if screen is None:
+            _ = drawn.levels
+            swap_ns = time.monotonic_ns()
+        else:
+            swap_ns = self._show(screen, number, begin_ns)
+        shown = Shown(
+            number=number,
+            t_ns=t_ns,
+            attitude=None if blank else attitude,
+            drawn=drawn,
+            draw_ns=begin_ns,
+            predicted_swap_ns=predicted_ns,
+            swap_ns=swap_ns,
+            stale=stale,
+            timestamp_source="headless" if screen is None else screen.timestamp_source,
+            missed_before=self._missed_before,
+            marker=None if screen is None else screen.marker,
+        )
+        self._count(shown, attitude)
         self._sink(shown)
         return shown
 
-    def _shown_ns(self, drawn: Drawn) -> int:
-        """When the frame's levels are ready in memory or, on a screen, swapped in."""
-        if self._screen is None:
-            _ = drawn.levels
-            return time.monotonic_ns()
-        swap_ns = self._screen.show()
-        if self._screen.closing:
+    def _count(self, shown: Shown, attitude: Attitude | None) -> None:
+        drawn = shown.drawn
+        age_ns = None if attitude is None else attitude.age_ns
+        self.stats.add(shown.swap_ns - shown.draw_ns, age_ns, drawn.star_count, drawn.clipped_hip)
+        self.stats.stale_frames += shown.stale
+        if shown.predicted_swap_ns is not None:
+            received_ns = None if attitude is None else attitude.received_ns
+            self.stats.swaps.add(shown.swap_ns, shown.predicted_swap_ns, shown.missed_before, received_ns)
+
+    def _show(self, screen: Screen, number: int, begin_ns: int) -> int:
+        """Put the frame on the screen at its moment; when that was."""
+        screen.present(number)
+        screen.budget.add(time.monotonic_ns() - begin_ns)
+        if self._predicted_swap_ns is not None and not screen.clock.paced_by_screen:
+            wait_until(self._predicted_swap_ns, self.stop)
+        swap_ns = screen.swap()
+        if screen.closing:
             self.stop.set()
         return swap_ns
+
+    def screen_summary(self) -> dict[str, Any]:
+        """What a run on a screen has to say besides; {} without one."""
+        if self._screen is None:
+            return {}
+        named = {"timestamp_source": self._screen.timestamp_source, "scheduling": self.scheduling}
+        return {"screen": named | self.stats.swaps.summary()}
 
     def idle(self) -> None:
         """Keep the window alive while no frame is due."""
         if self._screen is not None:
-            self._screen.show()
+            self._screen.present(0)
+            self._screen.swap()
             if self._screen.closing:
                 self.stop.set()
 
     def light_ns(self, host_ns: int) -> int:
-        """When the light of a frame that is begun at `host_ns` leaves the screen; that moment itself without a screen."""
-        return host_ns if self._screen is None else host_ns + self._screen.lead_ns(self._draw_to_swap_ns)
-
-    @property
-    def _waits_for_screen(self) -> bool:
-        return self._screen is not None and self._screen.timing.paced_by_screen
+        """When the middle row of the frame that is begun at `host_ns` lights; that moment itself without a screen."""
+        if self._screen is None:
+            return host_ns
+        swap_ns = host_ns if self._predicted_swap_ns is None else self._predicted_swap_ns
+        return swap_ns + self._screen.swap_to_light_ns
 
     def paced(self, refresh_hz: float, limit: Limit, draw_slot: Callable[[int], object]) -> None:
-        """Call `draw_slot(slot)` at `refresh_hz` up to `limit`.
+        """Call `draw_slot(slot)` at `refresh_hz` up to `limit`, on a screen at its own pace.
 
         A slot whose moment has passed when its turn comes is missed, counted, and not drawn.
         """
+        if self._screen is not None:
+            with steady_loop() as self.scheduling:
+                if self.scheduling.startswith("normal"):
+                    log.warning("the frame loop runs at normal priority (%s)", self.scheduling.removeprefix("normal: "))
+                self._paced_on_screen(self._screen, limit, draw_slot)
+            return
         period_ns = NS_PER_S / refresh_hz
         start_ns = time.monotonic_ns()
         slot = 0
-        while slot < limit.slots and self.stats.frames < limit.frames and not self.stop.is_set():
-            if not self._waits_for_screen and wait_until(start_ns + round(slot * period_ns), self.stop):
+        while self._goes_on(slot, limit):
+            if wait_until(start_ns + round(slot * period_ns), self.stop):
                 return
             draw_slot(slot)
             late = int((time.monotonic_ns() - start_ns) // period_ns)
-            following = max(slot + 1, late + 1)
-            if self.stats.frames < limit.frames:
-                self.stats.missed_frames += int(min(following, limit.slots)) - slot - 1
-            slot = following
+            slot = self._next_slot(slot, max(slot + 1, late + 1), limit)
+
+    def _paced_on_screen(self, screen: Screen, limit: Limit, draw_slot: Callable[[int], object]) -> None:
+        """Each frame is begun as late as the last ones allow, for the first swap that it can reach."""
+        clock, budget = screen.clock, screen.budget
+        slot = 0
+        due_ns = clock.next_after(time.monotonic_ns() + budget.ns)
+        while self._goes_on(slot, limit):
+            if wait_until(round(due_ns - budget.ns), self.stop):
+                break
+            self._predicted_swap_ns = due_ns
+            draw_slot(slot)
+            following_ns = clock.next_after(max(time.monotonic_ns() + budget.least_ns, due_ns + clock.period_ns / 2))
+            slot = self._next_slot(slot, slot + max(1, round((following_ns - due_ns) / clock.period_ns)), limit)
+            due_ns = following_ns
+        self._predicted_swap_ns = None
+
+    def _goes_on(self, slot: int, limit: Limit) -> bool:
+        return slot < limit.slots and self.stats.frames < limit.frames and not self.stop.is_set()
+
+    def _next_slot(self, slot: int, following: int, limit: Limit) -> int:
+        """`following`, and the slots on the way there counted as missed."""
+        self._missed_before = 0
+        if self.stats.frames < limit.frames:
+            self._missed_before = int(min(following, limit.slots)) - slot - 1
+            self.stats.missed_frames += self._missed_before
+        return following
 
 
 @contextmanager

@@ -12,8 +12,8 @@ from hilstar.attitude.logs import log_timeline, read_log
 from hilstar.attitude.mcap_log import is_mcap, read_attitudes
 from hilstar.attitude.timeline import Attitude, Timeline
 from hilstar.bench.config import BenchConfig
-from hilstar.bench.ledger import PastFrame, past_frames
 from hilstar.bench.loop import policy_of
+from hilstar.bench.records import PastFrame, past_frames
 from hilstar.errors import InputError
 
 MOST_FRAMES = 100_000_000
@@ -45,6 +45,10 @@ class Play(Protocol):
     def packet_count(self) -> int:
         """How many attitudes are behind them."""
 
+    @property
+    def moving(self) -> bool | None:
+        """Whether stars are drawn along their paths; None: as the bench file says."""
+
     def frame(self, slot: int) -> tuple[int, int, Attitude | None]:
         """Number, time and attitude of a frame; None is blank."""
 
@@ -58,6 +62,7 @@ class LogPlay:
     step_s: float
     frame_count: int
     paced: bool
+    moving: bool | None = None
 
     @property
     def packet_count(self) -> int:
@@ -77,6 +82,7 @@ class RunPlay:
     frames: list[PastFrame]
     packet_count: int
     paced: bool
+    moving: bool | None = True  # where the run's own were
 
     @property
     def frame_count(self) -> int:
@@ -86,7 +92,9 @@ class RunPlay:
     def frame(self, slot: int) -> tuple[int, int, Attitude | None]:
         """Number, time and attitude of a frame."""
         past = self.frames[slot]
-        attitude = None if past.q_icrs_to_cam is None else Attitude(past.q_icrs_to_cam, 0, False)
+        attitude = (
+            None if past.q_icrs_to_cam is None else Attitude(past.q_icrs_to_cam, 0, False, rate_cam_rad_s=past.rate_cam_rad_s)
+        )
         return past.number, past.t_ns, attitude
 
 
@@ -117,9 +125,9 @@ def plan_play(log: Path, wanted: Wanted, config: BenchConfig) -> Play:
 def _plan_run(log: Path, wanted: Wanted, factor: float, frames: list[PastFrame]) -> RunPlay:
     if wanted.step_s is not None or factor not in {1.0, math.inf}:
         raise InputError(f"{log}: an earlier run is replayed frame by frame; leave --step out, and --speed but realtime or max")
-    first_ns = frames[0].shown_ns
-    start_s, stop_s = _span(log, wanted, (frames[-1].shown_ns - first_ns) / NS_PER_S)
-    kept = [frame for frame in frames if start_s <= (frame.shown_ns - first_ns) / NS_PER_S <= stop_s + 1e-9]
+    first_ns = frames[0].swap_ns
+    start_s, stop_s = _span(log, wanted, (frames[-1].swap_ns - first_ns) / NS_PER_S)
+    kept = [frame for frame in frames if start_s <= (frame.swap_ns - first_ns) / NS_PER_S <= stop_s + 1e-9]
     if not kept:
         raise InputError(f"{log}: has no frame from --start {start_s:g} to --stop {stop_s:g}; write a longer span")
     return RunPlay(kept, sum(1 for _ in read_attitudes(log)), not math.isinf(factor))

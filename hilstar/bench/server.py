@@ -15,10 +15,11 @@ from hilstar.attitude.serial_link import SerialLink
 from hilstar.attitude.timeline import Timeline
 from hilstar.bench.assembly import Bench
 from hilstar.bench.config import AttitudeSettings
-from hilstar.bench.ledger import Ledger, frame_record
+from hilstar.bench.ledger import Ledger
 from hilstar.bench.lockstep import serve_lockstep
 from hilstar.bench.loop import FrameLoop, FrameSink, Limit, ignore, policy_of, stop_on_signal
 from hilstar.bench.play import Play
+from hilstar.bench.records import frame_record
 from hilstar.bench.screen import Screen
 from hilstar.bench.stats import spread
 from hilstar.bench.status import StatusMaker
@@ -62,7 +63,7 @@ def serve(bench: Bench, link: AnyLink, limit: Limit, sink: FrameSink = ignore, o
             summary = serve_lockstep(bench, link, limit, loop, ledger)
         else:
             summary = _serve_stream(bench, link, limit, loop, ledger)
-    return summary | ({} if ledger is None else {"ledger": ledger.summary()})
+    return summary | loop.screen_summary() | ({} if ledger is None else {"ledger": ledger.summary()})
 
 
 def _serve_stream(
@@ -105,7 +106,7 @@ def replay(bench: Bench, play: Play, sink: FrameSink = ignore, outlet: Outlet = 
 
     Paced, late frames are missed, as on a monitor; otherwise every frame is drawn, as fast as it can be.
     """
-    loop, ledger = FrameLoop(bench, sink, outlet.screen), outlet.ledger
+    loop, ledger = FrameLoop(bench, sink, outlet.screen, play.moving), outlet.ledger
 
     def draw_slot(slot: int) -> None:
         number, t_ns, attitude = play.frame(slot)
@@ -126,4 +127,4 @@ def replay(bench: Bench, play: Play, sink: FrameSink = ignore, outlet: Outlet = 
     duration_s = (time.monotonic_ns() - begin_ns) / NS_PER_S
     summary = loop.stats.summary(duration_s, PacketCounts(received=play.packet_count), bench.renderer.gl_renderer)
     kept = {} if ledger is None else {"ledger": ledger.summary()}
-    return summary | {"stale_events": loop.gate.events} | kept
+    return summary | {"stale_events": loop.gate.events} | loop.screen_summary() | kept

@@ -7,10 +7,41 @@ from typing import Any
 
 import numpy as np
 
+from hilstar.arrays import FloatArray
 from hilstar.attitude.packet import REASONS
 from hilstar.attitude.receiver import PacketCounts
 
 NS_PER_MS = 1e6
+
+
+class SwapStats:
+    """When frames were swapped onto a screen, 16 bytes a frame."""
+
+    def __init__(self) -> None:
+        self._interval_ms = array("f")
+        self._late_ms = array("f")
+        self._packet_ms = array("f")
+        self._last_ns: int | None = None
+
+    def add(self, swap_ns: int, predicted_ns: int, missed_before: int, received_ns: int | None) -> None:
+        """Take in one swap; `received_ns` is when the newest packet behind the frame came, None where none did."""
+        if self._last_ns is not None and not missed_before:
+            self._interval_ms.append((swap_ns - self._last_ns) / NS_PER_MS)
+        self._last_ns = swap_ns
+        self._late_ms.append((swap_ns - predicted_ns) / NS_PER_MS)
+        if received_ns is not None:
+            self._packet_ms.append((swap_ns - received_ns) / NS_PER_MS)
+
+    def summary(self) -> dict[str, Any]:
+        """Jitter of the interval between swaps (standard deviation), lateness and packet to swap; {} without a swap."""
+        if not self._late_ms:
+            return {}
+        jitter_ms = float(np.std(np.array(self._interval_ms))) if self._interval_ms else None
+        return {
+            "pacing_jitter_ms": jitter_ms,
+            "swap_late_ms": spread(self._late_ms),
+            "packet_to_swap_ms": spread(self._packet_ms),
+        }
 
 
 class RunStats:
@@ -22,6 +53,7 @@ class RunStats:
         self._stars = array("L")
         self._clipped_max = 0
         self.clipped_hip: set[int] = set()
+        self.swaps = SwapStats()
         self.missed_frames = 0
         self.stale_frames = 0
 
@@ -66,9 +98,9 @@ class RunStats:
         }
 
 
-def spread(values: array[float]) -> dict[str, float | None]:
+def spread(values: array[float] | FloatArray) -> dict[str, float | None]:
     """Median, 99th percentile and greatest of some figures; nulls without any."""
-    if not values:
+    if not len(values):
         return {"p50": None, "p99": None, "max": None}
     p50, p99, top = np.percentile(np.array(values), [50, 99, 100])
     return {"p50": float(p50), "p99": float(p99), "max": float(top)}

@@ -79,11 +79,11 @@ def simulate_log(
 
 @app.command()
 def study(
-    what: Annotated[Literal["models", "outputs", "stability", "quantisation"], typer.Argument(help="Which charts.")],
+    what: Annotated[Literal["models", "outputs", "stability", "quantisation", "timing"], typer.Argument(help="Which charts.")],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Where they go.")],
     as_json: Json = False,
 ) -> None:
-    """Charts and tables: brightness models, the thesis's outputs, where methods fail, and what each quantisation costs."""
+    """Charts and tables: brightness models, the thesis's outputs, where methods fail, quantisation, a slewing screen."""
     from hilstar.bench.output import make_directory
 
     make_directory(output)
@@ -109,6 +109,10 @@ def study_lines(what: str, output: Path) -> tuple[list[str], bool]:
         from hilstar.study.quantisation import run as run_quantisation
 
         return run_quantisation(output), True
+    if what == "timing":
+        from hilstar.study.timing import run as run_timing
+
+        return run_timing(output), True
     from hilstar.study.stability import run as run_stability
 
     places = run_stability(output)

@@ -14,6 +14,7 @@ from typing import Any, Self
 import glfw
 
 from hilstar.errors import InputError, MachineError
+from hilstar.monitor.x11 import is_composited, sync_control
 
 TITLE = "hilstar"
 NO_DISPLAY = "no display to open a window on; set DISPLAY, or run with --headless"
@@ -91,7 +92,8 @@ def _pair(values: Any) -> tuple[int, int]:
 class Window:
     """A window whose GL context is current in the thread that opened it. Free it with `close`.
 
-    Raises MachineError without a display or GL, InputError for a display that is not there.
+    `lost` is true while its display is unplugged. Raises MachineError without a display or GL, InputError for a display
+    that is not there.
     """
 
     def __init__(self, settings: WindowSettings) -> None:
@@ -99,6 +101,8 @@ class Window:
         self.settings = settings
         self.keys: deque[str] = deque(maxlen=64)
         self._ramp: tuple[Any, Any] | None = None
+        self._changed = False  # a monitor came or went
+        self.lost = False
         try:
             self._open()
         except BaseException:
@@ -132,6 +136,10 @@ class Window:
         glfw.swap_interval(1)
         glfw.set_input_mode(self._window, glfw.CURSOR, glfw.CURSOR_HIDDEN if monitor else glfw.CURSOR_NORMAL)
         glfw.set_key_callback(self._window, self._on_key)
+        glfw.set_monitor_callback(self._on_monitor)
+        x_display: Any = glfw.get_x11_display
+        self._x_display = x_display() if glfw.get_platform() == glfw.PLATFORM_X11 else None
+        self._sync = sync_control(self._x_display, glfw.get_glx_window(self._window) if self._x_display else None)
         if monitor is not None:
             self._set_identity_ramp(monitor)
 
@@ -145,6 +153,27 @@ class Window:
         straight = [value / (size - 1) for value in range(size)]
         identity: Any = (straight, straight, straight)
         glfw.set_gamma_ramp(monitor, identity)
+
+    def _on_monitor(self, monitor: Any, event: int) -> None:
+        self._changed = True
+
+    def _follow_display(self) -> None:
+        """A display that was unplugged leaves a window on no monitor; once it is back the window fills it again."""
+        self._changed = False
+        display = self.display
+        if display is None:
+            return
+        on_it = bool(glfw.get_window_monitor(self._window))
+        monitor = next((m for m in glfw.get_monitors() if _describe(0, m).name == display.name), None)
+        if monitor is None and not self.lost:
+            self.lost, self._ramp = True, None
+            log.warning("the display %s is gone; frames go on, and it is taken up when it returns", display.name)
+        elif monitor is not None and (self.lost or not on_it):
+            width, height = display.resolution_px
+            glfw.set_window_monitor(self._window, monitor, 0, 0, width, height, display.refresh_hz or glfw.DONT_CARE)
+            self._set_identity_ramp(monitor)
+            self.lost = False
+            log.warning("the display %s is back", display.name)
 
     def _on_key(self, window: Any, key: int, scancode: int, action: int, mods: int) -> None:
         if action != glfw.PRESS:
@@ -178,12 +207,43 @@ class Window:
         """True once somebody closed it."""
         return bool(glfw.window_should_close(self._window))
 
+    @property
+    def composited(self) -> bool:
+        """True where a compositing manager is known to run."""
+        return is_composited(self._x_display)
+
+    @property
+    def mirrored(self) -> str | None:
+        """The name of another display that shows the same part of the desktop, where there is one."""
+        if self.display is None:
+            return None
+        others = [_describe(index, monitor) for index, monitor in enumerate(glfw.get_monitors())]
+        same = (d.name for d in others if d.name != self.display.name and d.position_px == self.display.position_px)
+        return next(same, None)
+
+    @property
+    def timestamp_source(self) -> str:
+        """Where the times of `swap` come from."""
+        return "after-swap clock" if self._sync is None else "GLX_OML_sync_control"
+
     def swap(self) -> int:
-        """Show what was drawn; the host's time just after, ns. Events are looked at on the way."""
+        """Show what was drawn; host time, ns, at which that was done: the driver's, else that just after."""
         glfw.swap_buffers(self._window)
         now_ns = time.monotonic_ns()
-        glfw.poll_events()
+        if self._sync is not None:
+            swap_ns = self._sync.swap_ns()
+            if swap_ns is None:
+                log.warning("GLX_OML_sync_control gives no time; the host's clock after the swap is used")
+                self._sync = None
+            else:
+                now_ns = swap_ns
         return now_ns
+
+    def look_at_events(self) -> None:
+        """Take in keys, and monitors that come and go."""
+        glfw.poll_events()
+        if self._changed:
+            self._follow_display()
 
     def close(self) -> None:
         """Give the monitor its gamma ramp back, and close."""

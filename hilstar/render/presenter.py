@@ -10,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.errors import MachineError
+from hilstar.monitor.x11 import GL_LIBRARY, X11_LIBRARY
 from hilstar.render.encoder import TABLE_WIDTH, build_program
 
-GL_LIBRARY, X11_LIBRARY = "libGL.so.1", "libX11.so.6"
 CROSSHAIR, GRID, BLANK, PATCH = 1, 2, 4, 8
 
 
@@ -27,6 +27,12 @@ class Mount:
     def screen_px(self, resolution_px: tuple[int, int]) -> tuple[int, int]:
         """The screen that an image of `resolution_px` fills."""
         return resolution_px if self.quarter_turns % 2 == 0 else (resolution_px[1], resolution_px[0])
+
+    @property
+    def down(self) -> tuple[int, int]:
+        """The direction of the screen's rows, from first to last, in image axes (x right, y down)."""
+        x, y = ((0, 1), (1, 0), (0, -1), (-1, 0))[self.quarter_turns % 4]
+        return (-x, -y) if self.flip_y else (x, y)
 
 
 def level_texture(context: moderngl.Context, levels: npt.NDArray[np.uint8]) -> moderngl.Texture:
@@ -68,24 +74,29 @@ class Presenter:
     def __init__(self, levels: moderngl.Texture, view: View) -> None:
         self._texture = levels
         self._ctx = levels.ctx
-        self._screen_px = view.screen_px
+        self._view = view
         with self._ctx:
-            self._program = build_program(self._ctx, "full.vert", "present.frag")
-            self._vao = self._ctx.vertex_array(self._program, [])
+            self._plain, self._aided = (self._build(aids) for aids in (False, True))
         self.set_triples(view.triples)
+
+    def _build(self, aids: bool) -> tuple[moderngl.Program, moderngl.VertexArray]:
+        """The program without or with crosshair, grid, blank and patch, for this mounting alone."""
+        view, mount = self._view, self._view.mount
+        wanted = {"FLIP_X": mount.flip_x, "FLIP_Y": mount.flip_y, "STEALING": view.triples is not None, "AIDS": aids}
+        defines = (f"QUARTER_TURNS {mount.quarter_turns % 4}", *(name for name, is_set in wanted.items() if is_set))
+        program = build_program(self._ctx, "full.vert", "present.frag", defines)
         values: dict[str, Any] = {
             "levels": 0,
             "triples": 1,
-            "stealing": view.triples is not None,
             "white": float(2**view.bits - 1),
             "size_px": view.resolution_px,
             "screen_px": view.screen_px,
-            "flip": (view.mount.flip_x, view.mount.flip_y),
-            "quarter_turns": view.mount.quarter_turns % 4,
             "cross_px": (round(view.cross_px[0]), round(view.cross_px[1])),
         }
         for name, value in values.items():
-            self._program[name] = value
+            if name in program:  # a compiler leaves out what a variant does not use
+                program[name] = value
+        return program, self._ctx.vertex_array(program, [])
 
     def set_triples(self, triples: npt.NDArray[np.uint16] | None) -> None:
         """Use other codes for the same levels."""
@@ -102,14 +113,19 @@ class Presenter:
         return texture
 
     def present(self, overlay: int = 0, patch_code: int = 0, marker: tuple[int, int] = (0, 0)) -> None:
-        """Draw the last levels on the back buffer; `marker` is the photodiode square's side and code."""
+        """Draw the last levels on the back buffer; `marker` is the photodiode square's side, px, and code."""
         with self._ctx:
-            self._ctx.screen.use()
-            self._ctx.viewport = (0, 0, *self._screen_px)
+            screen = self._ctx.screen
+            screen.use()
+            self._ctx.viewport = (0, 0, *self._view.screen_px)
             self._texture.use(0)
             self._triples.use(1)
-            self._program["overlay"] = overlay
-            self._program["patch_code"] = patch_code
-            self._program["marker_px"], self._program["marker_code"] = marker
-            self._vao.render(moderngl.TRIANGLES, vertices=3)
+            program, vao = self._aided if overlay else self._plain
+            if overlay:
+                program["overlay"], program["patch_code"] = overlay, patch_code
+            vao.render(moderngl.TRIANGLES, vertices=3)
+            side_px, code = marker
+            if side_px:
+                light = code / (2**self._view.bits - 1)
+                screen.clear(light, light, light, 1.0, viewport=(0, 0, side_px, side_px))
             self._ctx.finish()

@@ -103,8 +103,8 @@ def _node_counts(vectors: FloatArray, piece: _Piece, sigma_px: tuple[float, floa
 
 
 @lru_cache(maxsize=64)
-def _gauss(count: int) -> tuple[FloatArray, FloatArray]:
-    """Nodes and weights over -1 to 1: an eigenvalue problem, 10 ms for 300 nodes."""
+def gauss_nodes(count: int) -> tuple[FloatArray, FloatArray]:
+    """Gauss-Legendre nodes and weights over -1 to 1: an eigenvalue problem, 10 ms for 300 nodes."""
     nodes, weights = np.polynomial.legendre.leggauss(count)
     return nodes, weights
 
@@ -112,7 +112,7 @@ def _gauss(count: int) -> tuple[FloatArray, FloatArray]:
 def _piece_sprites(stars: Stars, chosen: IntArray, piece: _Piece, count: int, shape: tuple[int, int]) -> Sprites:
     """The sprites of the `chosen` stars at the `count` nodes of a piece; `shape` is (footprint, number of pieces)."""
     footprint_px, pieces = shape
-    nodes, weights = _gauss(count)
+    nodes, weights = gauss_nodes(count)
     x_px, y_px = piece.places_px(stars.vectors[chosen], nodes)
     share = np.outer(weights / 2 / pieces, stars.electrons_per_s[chosen])
     star = np.broadcast_to(chosen, x_px.shape)

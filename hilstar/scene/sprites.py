@@ -24,7 +24,8 @@ CLIP_TOLERANCE = 1e-6
 class Sprites:
     """Stars on the image: `data` (n,) of SPRITE_DTYPE, their centres, and where each lies in `Stars`.
 
-    A sprite covers `footprint_px` squared pixels, the first of them at `pixel - (footprint_px - 1) // 2`.
+    A sprite covers `footprint_px` squared pixels, the first of them at `pixel - (footprint_px - 1) // 2`. A star's light is
+    divided among up to `per_star` sprites.
     """
 
     data: npt.NDArray[np.void]
@@ -32,9 +33,15 @@ class Sprites:
     star: IntArray
     x_px: FloatArray
     y_px: FloatArray
+    per_star: int = 1
 
     def __len__(self) -> int:
         return len(self.data)
+
+    @property
+    def star_count(self) -> int:
+        """How many stars have a sprite here."""
+        return len(self) if self.per_star == 1 else len(np.unique(self.star))
 
 
 def make_sprites(stars: Stars, icrs_to_image: FloatArray, camera: Camera, footprint_px: int) -> Sprites:
@@ -99,7 +106,8 @@ def clipped_sprites(
     Only a star that alone reaches half of white in a pixel is looked at: two fainter ones on one pixel go unnamed.
     """
     least_white = flux_at_white_e_per_s * (1.0 if uniformity is None else float(uniformity.min()))
-    bright = np.flatnonzero(sprites.data["electrons_per_s"] > 0.5 * least_white / peak_share(sigma_px))
+    alone = 0.5 * least_white / peak_share(sigma_px) / sprites.per_star
+    bright = np.flatnonzero(sprites.data["electrons_per_s"] > alone)
     if not len(bright):
         return bright
     x, y = np.rint(sprites.x_px[bright]).astype(int), np.rint(sprites.y_px[bright]).astype(int)

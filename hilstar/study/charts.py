@@ -34,8 +34,8 @@ def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]])
 
 
 @contextmanager
-def chart(path: Path, finding: str, panels: int = 1) -> Iterator[list[Axes]]:
-    """A PNG with `panels` one above the other, sharing x, titled by its finding; draw on the axes that it yields."""
+def chart(path: Path, finding: str, panels: int = 1, share_x: bool = True) -> Iterator[list[Axes]]:
+    """A PNG with `panels` one above the other, sharing x if so, titled by its finding; draw on the axes that it yields."""
     # Not pyplot: it would change the backend of whoever imports this.
     from matplotlib import rc_context
     from matplotlib.figure import Figure
@@ -43,7 +43,7 @@ def chart(path: Path, finding: str, panels: int = 1) -> Iterator[list[Axes]]:
     with rc_context(STYLE):
         size = INCH[0], INCH[1] * (1 + SHARE * (panels - 1))
         figure = Figure(figsize=size, layout="constrained")
-        grid = figure.subplots(panels, 1, sharex=True, squeeze=False)
+        grid = figure.subplots(panels, 1, sharex=share_x, squeeze=False)
         yield list(grid[:, 0])
         figure.suptitle(title_lines(finding), fontsize=12)
         save(figure, path)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from array import array
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Protocol
@@ -25,13 +24,13 @@ from hilstar.attitude.packet import (
 )
 from hilstar.attitude.protocol import HEALTH_MISSED, HEALTH_REFUSED
 from hilstar.attitude.timeline import Timeline
+from hilstar.spread import RunningSpread
 
 POLL_MS = 20
 FIRST_ASKS = 8  # quickly, so that the clock is soon known
 QUICK_ASK_NS = NS_PER_S // 10
 ASK_NS = NS_PER_S // 2
 TOLD_ONCE = HEALTH_MISSED | HEALTH_REFUSED
-KEPT_LATENCIES = 1_000_000  # 4 MB: over an hour at 200 Hz
 log = logging.getLogger(__name__)
 
 
@@ -98,7 +97,7 @@ class Receiver:
         self.counts = PacketCounts()
         self.clock = BenchClock()
         self.jumps = JumpFilter()
-        self.latency_ms = array("f")
+        self.latency_ms = RunningSpread()
         self._link = link
         self._timeline = timeline
         self._traffic = traffic
@@ -163,8 +162,8 @@ class Receiver:
                 continue
             self.clock.observe(sample.t_ns, host_ns)
             latency_ns = self.clock.latency_ns(sample.t_ns, host_ns)
-            if latency_ns is not None and len(self.latency_ms) < KEPT_LATENCIES:
-                self.latency_ms.append(latency_ns / NS_PER_MS)
+            if latency_ns is not None:
+                self.latency_ms.add(latency_ns / NS_PER_MS)
             self._watch(host_ns, arrived.raw, sample, None)
         if jumps > self._jumps_told:
             self._jumps_told = jumps

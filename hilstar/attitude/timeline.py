@@ -15,8 +15,8 @@ from hilstar.attitude.clock import NS_PER_S
 from hilstar.attitude.packet import AttitudeSample, Refusal
 from hilstar.attitude.quaternion import propagate, rate_between_rad_s, slerp
 
-# A live timeline keeps this many samples: 40 s at 200 Hz, far more than a frame looks back.
-LIVE_CAPACITY = 8192
+# A live timeline keeps this many samples: 10 s at 200 Hz, far more than a frame looks back.
+LIVE_CAPACITY = 2048
 # A stale attitude is fresh again once it is no older than this share of `stale_after`: no flicker at the limit.
 FRESH_AGAIN = 0.5
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from array import array
 from typing import Any
 
 from hilstar.attitude.clock import NS_PER_MS, NS_PER_S
@@ -15,8 +14,8 @@ from hilstar.bench.assembly import Bench
 from hilstar.bench.ledger import Ledger
 from hilstar.bench.loop import FrameLoop, Limit, Shown
 from hilstar.bench.records import frame_record
-from hilstar.bench.stats import spread
 from hilstar.bench.status import StatusMaker
+from hilstar.spread import RunningSpread
 
 POLL_MS = 50
 
@@ -27,7 +26,7 @@ def serve_lockstep(
     """Answer requests up to `limit`, or until a signal; the summary. A refused request shows nothing new."""
     counts = PacketCounts()
     statuses = StatusMaker(ledger)
-    turn_ms = array("f")
+    turn_ms = RunningSpread()
     last = Shown(0, 0, None, bench.draw(None))
     begin_ns = time.monotonic_ns()
     end_ns = begin_ns + limit.slots / bench.config.monitor.refresh_hz * NS_PER_S
@@ -50,10 +49,10 @@ def serve_lockstep(
             _keep(ledger, arrival, refusal, last)
         shown_ns = time.monotonic_ns()
         link.reply(statuses.status(last, last.t_ns, loop, counts, False), shown_ns, refusal)
-        turn_ms.append((shown_ns - arrival.host_ns) / NS_PER_MS)
+        turn_ms.add((shown_ns - arrival.host_ns) / NS_PER_MS)
     duration_s = (time.monotonic_ns() - begin_ns) / NS_PER_S
     summary = loop.stats.summary(duration_s, counts, bench.renderer.gl_renderer)
-    return summary | {"turn_ms": spread(turn_ms), "stale_events": 0}
+    return summary | {"turn_ms": turn_ms.summary(), "stale_events": 0}
 
 
 def _refusal(event: Event) -> Refusal | None:

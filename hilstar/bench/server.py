@@ -21,7 +21,6 @@ from hilstar.bench.loop import FrameLoop, FrameSink, Limit, ignore, policy_of, s
 from hilstar.bench.play import Play
 from hilstar.bench.records import frame_record
 from hilstar.bench.screen import Screen
-from hilstar.bench.stats import spread
 from hilstar.bench.status import StatusMaker
 
 AnyLink = ZmqReceiver | ZmqLockstep | SerialLink
@@ -95,7 +94,7 @@ def _serve_stream(
     summary = loop.stats.summary(duration_s, receiver.counts, bench.renderer.gl_renderer)
     return summary | {
         "stale_events": loop.gate.events,
-        "receive_latency_ms": spread(receiver.latency_ms),
+        "receive_latency_ms": receiver.latency_ms.summary(),
         "clock": receiver.clock.summary() | {"jumps": receiver.jumps.jumps},
         "reconnects": link.reconnects,
     }

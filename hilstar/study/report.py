@@ -17,7 +17,6 @@ import numpy as np
 from hilstar.arrays import FloatArray
 from hilstar.attitude.quaternion import to_matrix
 from hilstar.bench.records import FrameRecord, Run, read_run
-from hilstar.bench.stats import spread
 from hilstar.errors import InputError
 from hilstar.study.charts import chart
 
@@ -128,7 +127,9 @@ def known(values: FloatArray) -> FloatArray:
 
 def spread_of(values: FloatArray) -> dict[str, float | None]:
     """Median, 99th percentile and greatest; nulls without any."""
-    return spread(known(values))
+    some = known(values)
+    figures = np.percentile(some, [50, 99, 100]).tolist() if len(some) else [None] * 3
+    return dict(zip(("p50", "p99", "max"), figures, strict=True))
 
 
 def deviation(values: FloatArray) -> float | None:

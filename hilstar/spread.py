@@ -1,0 +1,59 @@
+"""The spread of a figure over a run of any length, in memory that does not grow."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+SMALLEST, LARGEST = 1e-6, 1e9
+STEP = 0.002  # of a value: as near as a percentile is known
+BINS = math.ceil(math.log(LARGEST / SMALLEST) / STEP)
+
+
+class RunningSpread:
+    """Median, 99th percentile, greatest, mean and standard deviation of values of either sign.
+
+    Values are counted in bins of 0.2 %; those nearer to 0 than 1e-6 count as 0. The greatest is exact.
+    """
+
+    def __init__(self) -> None:
+        self._counts = np.zeros(2 * BINS + 1, dtype=np.int64)
+        self.count = 0
+        self.max = -math.inf
+        self._mean = 0.0
+        self._squares = 0.0
+
+    def add(self, value: float) -> None:
+        """Take in one value."""
+        self.count += 1
+        self.max = max(self.max, value)
+        step = value - self._mean
+        self._mean += step / self.count
+        self._squares += step * (value - self._mean)  # Welford 1962
+        size = abs(value)
+        place = 0 if size < SMALLEST else min(BINS, 1 + int(math.log(size / SMALLEST) / STEP))
+        self._counts[BINS + place if value >= 0 else BINS - place] += 1
+
+    @property
+    def mean(self) -> float | None:
+        """None without a value."""
+        return self._mean if self.count else None
+
+    @property
+    def deviation(self) -> float | None:
+        """The standard deviation; None without two values."""
+        return math.sqrt(self._squares / self.count) if self.count > 1 else None
+
+    def percentile(self, percent: float) -> float | None:
+        """The value below which so many percent lie, within 0.1 %; None without a value."""
+        if not self.count:
+            return None
+        rank = max(1, math.ceil(percent / 100 * self.count))
+        place = int(np.searchsorted(np.cumsum(self._counts), rank)) - BINS
+        size = 0.0 if place == 0 else SMALLEST * math.exp((abs(place) - 0.5) * STEP)
+        return min(math.copysign(size, place), self.max)
+
+    def summary(self) -> dict[str, float | None]:
+        """`p50`, `p99` and `max`; nulls without a value."""
+        return {"p50": self.percentile(50), "p99": self.percentile(99), "max": self.max if self.count else None}

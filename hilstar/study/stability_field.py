@@ -77,7 +77,7 @@ def _apart_rad(a: FloatArray, b: FloatArray) -> float:
     return float(np.linalg.norm(np.cross(a, b)))
 
 
-def field_over_wrap_and_pole() -> Place:
+def fields_over_wrap_and_pole() -> Place:
     """Fields of 10 degrees on the RA wrap and about the pole."""
     catalog = load_catalog().brighter_than(7.5)
     vectors = unit_vectors_icrs(catalog, HIPPARCOS_EPOCH_JYEAR)

@@ -25,8 +25,6 @@ from hilstar.study.stability_image import (
     target,
 )
 
-ARCSEC_PER_DEG = 3600.0
-
 
 def draw_charts(directory: Path) -> None:
     """Write each chart (PNG) and its table (CSV) into `directory`."""
@@ -41,10 +39,12 @@ def narrow_sigmas(directory: Path) -> None:
     columns = ("sigma_px", "flux_error", "centroid_error_px", "sampled_flux_error", "sampled_centroid_error_px")
     write_csv(directory / "narrow_stars.csv", columns, rows)
     sigma, flux, off_px, sampled_flux, sampled_px = np.array(rows).T
-    at = int(np.abs(sigmas_px - 0.5).argmin())
+    at, wide = int(np.abs(sigmas_px - 0.5).argmin()), sigmas_px > 0.85
+    either = float(np.maximum(flux, sampled_flux)[wide].max())
     finding = (
         f"At sigma {sigma[at]:.2f} px point sampling gets the flux wrong by {100 * sampled_flux[at]:.1f} % and the centroid by"
-        f" {sampled_px[at]:.3f} px; integrated over pixels they are {100 * flux[at]:.5f} % and {off_px[at]:.4f} px off"
+        f" {sampled_px[at]:.3f} px; integrated over pixels they are {100 * flux[at]:.5f} % and {off_px[at]:.4f} px off."
+        f" Beyond 0.85 px either gets the flux right within {either:.0e}"
     )
     with chart(directory / "narrow_stars.png", finding, panels=2) as (above, below):
         for axis, theirs, ours in ((above, sampled_flux, flux), (below, sampled_px, off_px)):
@@ -65,8 +65,8 @@ def weak_perspectives(directory: Path) -> None:
     write_csv(directory / "weak_perspective.csv", ("field_angle_deg", "error_px", "error_arcsec"), rows)
     at_px, at_arcsec = (float(off[0]) for off in weak_perspective_error(np.array([10.0])))
     finding = (
-        f"Weak perspective, one depth for every star, is {abs(at_px):.0f} px or {abs(at_arcsec):.0f} arcsec off at 10 degrees"
-        " with the demo's lens and monitor, and eight times less at half of the angle"
+        f"With the demo's lens and monitor weak perspective, one depth for every star, is {abs(at_px):.0f} px or"
+        f" {abs(at_arcsec):.0f} arcsec off at a field angle of ten degrees, and eight times less at half of that"
     )
     with chart(directory / "weak_perspective.png", finding, panels=2) as (above, below):
         above.plot(angle_deg, np.abs(off_px), "C3")
@@ -89,9 +89,8 @@ def ripples(directory: Path) -> None:
     }
     off_mag = {name: -2.5 * np.log10(light) for name, light in curves.items()}
     step_px = np.linspace(0, PATH_PX[0], STEPS)
-    write_csv(
-        directory / "popping.csv", ("x_px", *(f"{n} [mag]" for n in off_mag)), np.column_stack([step_px, *off_mag.values()])
-    )
+    columns = "x_px", *(f"{name} [mag]" for name in off_mag)
+    write_csv(directory / "popping.csv", columns, np.column_stack([step_px, *off_mag.values()]).tolist())
     spread = {name: float(np.ptp(mag)) for name, mag in off_mag.items()}
     finding = (
         f"A star {CODES_MAG_UNDER_WHITE:g} mag under white, {CODES_BITS} bits, sigma {SIGMA_PX:g} px, moves by {STEPS} parts of"
@@ -103,7 +102,10 @@ def ripples(directory: Path) -> None:
             above.plot(step_px, mag, colour, label=name, lw=1.0)
         below.plot(step_px, 1e6 * off_mag["linear image"], "k", lw=1.0)
         above.set(ylabel="too faint by [mag]")
-        below.set(ylabel="linear image alone,\ntoo faint by [1e-6 mag]", xlabel="columns gone [px]; rows go along by 1.7 to 3")
+        below.set(
+            ylabel="linear image alone,\ntoo faint by [1e-6 mag]",
+            xlabel=f"moved in x by [px]; in y by {PATH_PX[1] / PATH_PX[0]:.2f} of it",
+        )
         above.legend(ncols=2)
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from hilstar.study import stability_attitude as attitude
 from hilstar.study import stability_field as field
 from hilstar.study import stability_image as image
+from hilstar.study import stability_popping as popping
 from hilstar.study import stability_sky as sky
 from hilstar.study import stability_tracker as tracker
 from hilstar.study.charts import write_csv
@@ -37,8 +38,8 @@ VISITS: tuple[Callable[[], Place], ...] = (
     image.star_on_image_edge,
     image.many_stars,
     image.flux_range,
-    image.popping,
-    image.popping_codes,
+    popping.popping,
+    popping.popping_codes,
     tracker.billion_electrons,
     tracker.full_well,
     tracker.empty_field,

@@ -10,19 +10,15 @@ import numpy as np
 from hilstar.study.charts import chart, plain_ticks, write_csv
 from hilstar.study.stability_attitude import sampled_error_arcsec, straight_line, way_error_arcsec
 from hilstar.study.stability_field import weak_perspective_error
-from hilstar.study.stability_image import (
+from hilstar.study.stability_image import SIGMA_PX, by_renderer, narrow_errors, point_sampled, target
+from hilstar.study.stability_popping import (
     CODES_BITS,
     CODES_MAG_UNDER_WHITE,
-    PATH_IMAGE_PX,
+    IMAGE_PX,
     PATH_PX,
-    SIGMA_PX,
     STEPS,
-    by_renderer,
     moving_code_fluxes,
     moving_fluxes,
-    narrow_errors,
-    point_sampled,
-    target,
 )
 
 
@@ -78,7 +74,7 @@ def weak_perspectives(directory: Path) -> None:
 
 def ripples(directory: Path) -> None:
     """One star's flux over sub-pixel steps: in the linear image, by codes, and point sampled."""
-    on, narrow = target(SIGMA_PX, PATH_IMAGE_PX), target(0.5, PATH_IMAGE_PX)
+    on, narrow = target(SIGMA_PX, IMAGE_PX), target(0.5, IMAGE_PX)
     with by_renderer(on) as draw:
         linear = moving_fluxes(draw, on)
     curves = {

@@ -11,14 +11,11 @@ from scipy.special import erf, ndtr
 
 from hilstar.arrays import Float32Array, FloatArray
 from hilstar.errors import InputError
-from hilstar.monitor.photometry import srgb_response
-from hilstar.monitor.quantise import Quantisation
 from hilstar.render.reference import linear_image, pixel_shares
 from hilstar.render.renderer import Renderer, Target, create_context
-from hilstar.scene.psf import LARGEST_CUT, SQRT2, cut_share, footprint_px, peak_share
+from hilstar.scene.psf import LARGEST_CUT, SQRT2, cut_share, footprint_px
 from hilstar.scene.sprites import Sprites, join_sprites, pack_sprites
 from hilstar.study.place import Figures, Place
-from hilstar.study.quantisation import AIMS
 
 IMAGE_PX = (512, 512)
 SIGMA_PX = 0.85
@@ -34,12 +31,6 @@ NOTHING = 0.0
 CROWD, CROWD_PX, CORNER_PX = 100_000, (1024, 1024), 128
 # Ten stars on a pixel are added in float32: half of 1.2e-7 each time, on top of each star's own error.
 CROWD_ERROR = FLUX_ERROR + 10 * 6e-8
-STEPS, PATH_PX = 1000, (3.0, 1.7)
-# 1e-4 mag: a two-hundredth of the finest aim for codes, so that what ripples is the monitor's doing alone.
-RIPPLE = 1e-4
-PATH_IMAGE_PX = (32, 32)
-CODES_MAG_UNDER_WHITE, CODES_BITS = 6.0, 8
-CODES_RIPPLE_MAG = AIMS[CODES_BITS][0]
 POINT_SAMPLED = "the Gaussian's value at the middle of each pixel"
 
 # splat.frag's, from the highest power of x^2 down.
@@ -317,64 +308,4 @@ def flux_range() -> Place:
         f"fluxes off by {errors[0]:.0e} and {errors[1]:.0e}",
         "float32, and each star in its own footprint",
         Figures(max(errors), max(faults), FLUX_ERROR),
-    )
-
-
-def moving_star(on: Target, electrons_per_s: float = 1.0, steps: int = STEPS) -> Iterator[Sprites]:
-    """A star that goes PATH_PX in equal steps."""
-    for share in np.linspace(0, 1, steps):
-        yield one_star(14 + share * PATH_PX[0], 14 + share * PATH_PX[1], on, electrons_per_s)
-
-
-def moving_fluxes(draw: Draw, on: Target) -> FloatArray:
-    """Its light (steps,) in each image."""
-    return np.array([draw(sprites).sum() for sprites in moving_star(on)])
-
-
-def moving_code_fluxes(quantisation: Quantisation) -> FloatArray:
-    """The light (steps,) that an sRGB monitor makes of it, relative to the light wanted.
-
-    It is CODES_MAG_UNDER_WHITE fainter than a star whose peak is white.
-    """
-    sigma, response = (SIGMA_PX, SIGMA_PX), srgb_response(CODES_BITS)
-    flux = 10 ** (-0.4 * CODES_MAG_UNDER_WHITE) / peak_share(sigma)
-    on, light = Target(PATH_IMAGE_PX, sigma, response, 1.0, quantisation), []
-    with Renderer(on) as gl:
-        for sprites in moving_star(on, flux):
-            gl.draw(sprites)
-            light.append(response.light[gl.codes()].sum())
-    return np.array(light) / flux
-
-
-def ripple(fluxes: FloatArray) -> float:
-    """From the faintest to the brightest of a star's fluxes, relative to their mean."""
-    return float((fluxes.max() - fluxes.min()) / fluxes.mean())
-
-
-def popping() -> Place:
-    """A star's light in the linear image while it moves by parts of a pixel."""
-    on = target(0.5, PATH_IMAGE_PX)
-    with by_renderer(on) as draw:
-        error, fault = (ripple(moving_fluxes(by, on)) for by in (draw, partial(point_sampled, on)))
-    return Place(
-        f"a star over {STEPS} sub-pixel steps, sigma 0.5 px",
-        POINT_SAMPLED,
-        f"its light ripples by {100 * fault:.1f} %",
-        f"by {error:.1e} in the linear image",
-        "integrated over pixels, and cut where 1e-6 is left",
-        Figures(error, fault, RIPPLE),
-    )
-
-
-def popping_codes() -> Place:
-    """The same star's light through 8-bit codes."""
-    fluxes = [moving_code_fluxes("round"), moving_code_fluxes("exact")]
-    fault, error = (float(2.5 * np.log10(f.max() / f.min())) for f in fluxes)
-    return Place(
-        f"the same, {CODES_MAG_UNDER_WHITE:g} mag under white on {CODES_BITS} bits, sigma {SIGMA_PX:g} px",
-        'quantisation = "round", the default',
-        f"its light ripples by {fault:.3f} mag",
-        f'quantisation = "exact": {error:.3f} mag; write it where that matters',
-        "round adds up the errors of its pixels; exact chooses a star's codes together",
-        Figures(error, fault, CODES_RIPPLE_MAG),
     )

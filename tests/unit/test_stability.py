@@ -21,6 +21,7 @@ from hilstar.study import (
     stability_charts,
     stability_field,
     stability_image,
+    stability_popping,
     stability_sky,
     stability_tracker,
 )
@@ -70,7 +71,7 @@ def averaged(_model, optics, photometry):
     return tabulate("ags", optics, photometry)
 
 
-code_fluxes = stability_image.moving_code_fluxes
+code_fluxes = stability_popping.moving_code_fluxes
 
 
 def rounded(_quantisation):
@@ -91,12 +92,12 @@ WRONG_ROADS = (
     (stability_field.stars_behind, "monitor_camera", weak_camera),
     (stability_field.weak_perspective, "monitor_camera", weak_camera),
     (stability_image.narrow_star, "by_renderer", rendered_by(stability_image.point_sampled)),
-    (stability_image.popping, "by_renderer", rendered_by(stability_image.point_sampled)),
+    (stability_popping.popping, "by_renderer", rendered_by(stability_image.point_sampled)),
     (stability_image.wide_star, "by_renderer", rendered_by(stability_image.half_float)),
     (stability_image.negative_wings, "by_renderer", rendered_by(stability_image.bare_polynomial)),
     (stability_image.star_on_pixel_edge, "by_renderer", rendered_by(stability_image.nearest_pixel)),
     (stability_image.star_on_image_edge, "by_renderer", rendered_by(stability_image.nearest_pixel)),
-    (stability_image.popping_codes, "moving_code_fluxes", rounded),
+    (stability_popping.popping_codes, "moving_code_fluxes", rounded),
     (stability_sky.temperature_range, "tabulate", averaged),
     (stability_tracker.nan_pixel, "find_stars", len),
 )
@@ -119,11 +120,11 @@ def test_the_chart_of_popping_shows_what_its_title_says(tmp_path):
     stability_charts.ripples(tmp_path)
     with (tmp_path / "popping.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) == stability_image.STEPS
+    assert len(rows) == stability_popping.STEPS
     spread = {
         name: np.ptp([float(row[f"{name} [mag]"]) for row in rows]) for name in ("linear image", "codes, exact", "codes, round")
     }
-    assert spread["linear image"] <= stability_image.RIPPLE < spread["codes, exact"] < spread["codes, round"]
+    assert spread["linear image"] <= stability_popping.RIPPLE < spread["codes, exact"] < spread["codes, round"]
 
 
 def test_weak_perspective_errs_by_half_the_angle_cubed():

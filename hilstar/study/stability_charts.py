@@ -102,7 +102,8 @@ def ripples(directory: Path) -> None:
             ylabel="linear image alone,\ntoo faint by [1e-6 mag]",
             xlabel=f"moved in x by [px]; in y by {PATH_PX[1] / PATH_PX[0]:.2f} of it",
         )
-        above.legend(ncols=2)
+        above.margins(y=0.2)
+        above.legend(ncols=4, loc="upper center")
 
 
 def turns(directory: Path) -> None:

@@ -18,12 +18,12 @@ from hilstar.study.place import Figures, Place
 
 # float64 knows a direction to 2e-16 rad, 5e-8 mas: 200 times that for the few operations on it.
 DIRECTION_MAS = 1e-5
-# A relative error of 2e-16 in a direction is 2e-16 / cos^2 of its tangent: 7e-11 of 1000 px at 89.9 degrees. Times 100.
-EDGE_PX = 1e-5
+# Turning by 2e-16 rad moves a place by that times f / cos^2: 1.7 px * 3.3e5 * 2e-16 = 1e-10 px at 89.9 degrees. Times 100.
+EDGE_PX = 1e-8
 NONE_LOST = 0.0
 ARCSEC_PER_RAD = float(np.degrees(1.0) * 3600.0)
 ALIGNED = np.array([1.0, 0.0, 0.0, 0.0])
-# The demo's lens and pitch (configs/demo.toml), and the field angle of its monitor's corner, which weak perspective is
+# The demo's lens and pitch (configs/demo.toml), and about the field angle of its monitor's corner, which weak perspective is
 # judged at; README.md promises centroids to 1.1e-5 px.
 FOCAL_LENGTH_MM, PITCH_UM = 350.0, 57.65
 CORNER_DEG = 10.0

@@ -116,7 +116,7 @@ def study_lines(what: str, output: Path) -> tuple[list[str], bool]:
     from hilstar.study.stability import run as run_stability
 
     places = run_stability(output)
-    lines = [f"{'right' if p.right else 'WRONG'}  {p.case}: {p.happens} ({p.why})" for p in places]
+    lines = [f"{'right' if p.right else 'WRONG'}  {p.case}: {p.happens} ({p.why}); not {p.method}: {p.fails}" for p in places]
     return lines, all(place.right for place in places)
 
 

@@ -52,7 +52,7 @@ class SerialLink:
         try:
             self._device: serial.Serial | None = self._open()
         except (OSError, ValueError, OverflowError) as error:  # SerialException is an OSError
-            raise InputError(f"{self.endpoint}: {_why(error)}; {_instead(error, port)}") from error
+            raise InputError(f"{self.endpoint}: {opening_fault(error, port)}") from error
 
     def _open(self) -> serial.Serial:
         device = serial.Serial(self._port, self._baud, timeout=0, exclusive=True)
@@ -153,6 +153,11 @@ class SerialLink:
 
     def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
         self.close()
+
+
+def opening_fault(error: BaseException, port: str) -> str:
+    """Why a port could not be opened, and what to do."""
+    return f"{_why(error)}; {_instead(error, port)}"
 
 
 def _why(error: BaseException) -> str:

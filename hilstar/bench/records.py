@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import resource
 import time
+import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,6 +16,7 @@ import numpy as np
 
 from hilstar.arrays import FloatArray
 from hilstar.attitude.mcap_log import ATTITUDE_TOPIC, read_messages, read_metadata, read_topics
+from hilstar.bench.config import BenchConfig
 from hilstar.bench.loop import Shown
 from hilstar.errors import InputError
 
@@ -183,6 +185,14 @@ def read_run(path: Path) -> Run:
     if not run.frames:
         raise InputError(f"{path}: has no frames; give the ledger of serve or replay --ledger")
     return run
+
+
+def config_of(run: Run) -> BenchConfig | None:
+    """The bench file of a run, from its ledger's head; None where that holds none that can be read."""
+    try:
+        return msgspec.convert(tomllib.loads(run.head.get("bench_text", "")), BenchConfig)
+    except (tomllib.TOMLDecodeError, msgspec.ValidationError):
+        return None
 
 
 def _take(run: Run, record: FrameRecord | ProcessRecord | _PacketForm) -> None:

@@ -9,6 +9,7 @@ import typer
 
 from hilstar.cli.common import Json, app
 from hilstar.console import print_json
+from hilstar.errors import InputError
 
 RunFile = Annotated[Path, typer.Argument(metavar="RUN.mcap", help="The ledger of serve or replay.")]
 
@@ -32,3 +33,43 @@ def report(
     for what, how_much in table_rows(summary):
         typer.echo(f"{what:32}{how_much}")
     typer.echo(f"{'page':32}{output / 'report.html'}")
+
+
+@app.command()
+def latency(
+    ledger: RunFile,
+    edges: Annotated[Path | None, typer.Option(metavar="EDGES.csv", help="Edges that were kept: host_ns,level.")] = None,
+    diode: Annotated[
+        str | None, typer.Option(metavar="serial:/dev/ttyX@BAUD", help="Read edges there while serve runs.")
+    ] = None,
+    duration: Annotated[float, typer.Option(help="Seconds to read edges for.", min=0.5, max=3600)] = 10.0,
+    save: Annotated[Path | None, typer.Option(metavar="EDGES.csv", help="Keep the edges that were read.")] = None,
+    write: Annotated[Path | None, typer.Option(metavar="BENCH.toml", help="Set panel_delay_ms in it.")] = None,
+    output: Annotated[Path | None, typer.Option("-o", "--output", metavar="DIR", help="Where the chart goes.")] = None,
+    as_json: Json = False,
+) -> None:
+    """From swap to light, by a photodiode before the screen's square and the ledger of the run."""
+    from hilstar.bench.latency import capture_edges, read_edges, save_edges, write_panel_delay
+    from hilstar.bench.output import make_directory
+    from hilstar.bench.sender import parse_serial
+    from hilstar.study.latency import measure, told
+
+    if (edges is None) == (diode is None):
+        raise InputError("latency: give the edges with --edges EDGES.csv or --diode serial:/dev/ttyX@115200, one of them")
+    if diode is None:
+        found = read_edges(edges or Path())
+    else:
+        port = parse_serial(diode)
+        if port is None:
+            raise InputError(f"--diode {diode}: write serial:/dev/ttyX@BAUD, such as serial:/dev/ttyACM0@115200")
+        found = capture_edges(*port, duration)
+    if save is not None:
+        save_edges(save, found)
+    summary = measure(ledger, found, None if output is None else make_directory(output))
+    if as_json:
+        print_json(summary)
+    else:
+        for what, how_much in told(summary):
+            typer.echo(f"{what:24}{how_much}")
+    if write is not None:
+        write_panel_delay(write, summary["panel_delay_ms"])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import html
 import math
-import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +15,7 @@ import numpy as np
 
 from hilstar.arrays import FloatArray
 from hilstar.attitude.quaternion import to_matrix
-from hilstar.bench.records import FrameRecord, Run, read_run
+from hilstar.bench.records import FrameRecord, Run, config_of, read_run
 from hilstar.errors import InputError
 from hilstar.study.charts import chart
 
@@ -75,7 +74,8 @@ def times_of(frames: list[FrameRecord]) -> Times:
 def summarise(run: Run) -> dict[str, Any]:
     """The figures of a run: the JSON object of `hilstar report`."""
     times, last = times_of(run.frames), run.frames[-1]
-    refresh_hz = refresh_of(run)
+    config = config_of(run)
+    refresh_hz = None if config is None else config.monitor.refresh_hz
     duration_s = float(times.run_s[-1])
     age = known(times.age_ms)
     return {
@@ -104,14 +104,6 @@ def summarise(run: Run) -> dict[str, Any]:
         "calibration_sha256": run.head.get("calibration_sha256"),
         "gl_renderer": run.head.get("gl_renderer"),
     }
-
-
-def refresh_of(run: Run) -> float | None:
-    """The bench's refresh rate, from the bench file in the ledger's head."""
-    try:
-        return float(tomllib.loads(run.head.get("bench_text", ""))["monitor"].get("refresh_hz", 60.0))
-    except (KeyError, tomllib.TOMLDecodeError, AttributeError, TypeError, ValueError):
-        return None
 
 
 def memory_growth_mb(run: Run) -> float | None:

@@ -23,8 +23,9 @@ RIPPLE_SHARE = 1e-5
 SIGMA_STARS = 30  # the brightest ones give the sigma; their median is no blend's
 SIGMA_STEPS = 12
 LARGEST_SIGMA_STEP = 0.3  # of sigma: Newton's step from a poor start stays a positive sigma
-PLACE_STEPS = 4
+PLACE_STEPS, LARGEST_STEP_PX, LEAST_STEP_PX = 12, 1.0, 1e-5
 FARTHEST_PX = 1.0  # a star lies within sqrt(1/2) px of the middle of its brightest pixel, but for a neighbour's pull
+BEYOND_SIGMAS = 4.0  # ... and one whose brightest pixel is the image's first or last lies anywhere beyond
 RIDGE = 1e-12  # of a unit column: two columns that are one thing share its light, where a solver would fail
 
 
@@ -42,10 +43,11 @@ class StarTemplates:
             _along(places_px[:, axis], sigma_px[axis], footprint_px(sigma_px) // 2 + 1, shape[1 - axis]) for axis in (0, 1)
         )
         pairs = ((share_y, share_x), (share_y, slope_x), (slope_y, share_x))
-        data = np.stack([y[:, :, None] * x[:, None, :] for y, x in pairs], axis=1).reshape(3 * size, -1)
-        pixel = (row[:, :, None] * shape[1] + column[:, None, :]).reshape(size, 1, -1)
-        index = np.broadcast_to(pixel, (size, 3, pixel.shape[2])).ravel()
-        ends = np.arange(3 * size + 1) * pixel.shape[2]
+        pixels = row.shape[1] * column.shape[1]
+        data = np.stack([y[:, :, None] * x[:, None, :] for y, x in pairs], axis=1).reshape(3 * size, pixels)
+        pixel = (row[:, :, None] * shape[1] + column[:, None, :]).reshape(size, 1, pixels)
+        index = np.broadcast_to(pixel, (size, 3, pixels)).ravel()
+        ends = np.arange(3 * size + 1) * pixels
         self.in_view = np.asarray(data[::3].sum(axis=1))
         self._columns = csc_array((data.ravel(), index, ends), shape=(math.prod(shape), 3 * size))
         self.normal = csc_array(self._columns.T @ self._columns)
@@ -155,11 +157,17 @@ def _sigma_steps(padded: FloatArray, places_px: FloatArray, sigma_px: FloatArray
 
 
 def refined(image: FloatArray, places_px: FloatArray, sigma_px: tuple[float, float]) -> FloatArray:
-    """Places (n, 2) of stars, px, from those within `FARTHEST_PX`: all stars' steps at once."""
-    start = places_px
+    """Places (n, 2) of stars, px, from their brightest pixels or places well known: all stars' steps at once."""
+    start, shape = places_px, (image.shape[0], image.shape[1])
+    last = np.array([shape[1] - 1, shape[0] - 1])
+    outwards = BEYOND_SIGMAS * np.array(sigma_px)
+    low = np.where(start < 0.5, np.minimum(start, 0) - outwards, start - FARTHEST_PX)
+    high = np.where(start > last - 0.5, np.maximum(start, last) + outwards, start + FARTHEST_PX)
     for _ in range(PLACE_STEPS):
-        fitted = StarTemplates(places_px, sigma_px, (image.shape[0], image.shape[1])).fit(image)
-        places_px = start + np.clip(places_px + shifts_px(fitted) - start, -FARTHEST_PX, FARTHEST_PX)
+        step = np.clip(shifts_px(StarTemplates(places_px, sigma_px, shape).fit(image)), -LARGEST_STEP_PX, LARGEST_STEP_PX)
+        before, places_px = places_px, np.clip(places_px + step, low, high)
+        if np.abs(places_px - before).max(initial=0.0) < LEAST_STEP_PX:
+            break
     return places_px
 
 

@@ -19,6 +19,7 @@ from scipy.spatial import cKDTree
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.errors import InputError
 from hilstar.study.star_fit import RIPPLE_SHARE, StarTemplates, around, bright_pixels, refined, shifts_px, star_sigma_px
+from hilstar.study.twin_verdict import spread
 
 # One tenth of the smallest fault that must be seen (0.01 mag, 0.02 px) and less; 100 times and more what two right drivers
 # differ by: tests/unit/test_testing.py measures both.
@@ -98,8 +99,8 @@ class StarDifference:
         if self.kind in ("missing", "extra"):
             return f"{self.name}{place}: {self.kind}, {self.flux_e_per_s:.4g} electrons/s"
         return (
-            f"{self.name}{place}: {self.flux_error_mag:+.4f} mag, {self.centroid_error_px:.4f} px"
-            f" ({self.dx_px:+.4f}, {self.dy_px:+.4f}) off"
+            f"{self.name}{place}: {self.flux_error_mag:+z.4f} mag, {self.centroid_error_px:.4f} px"
+            f" ({self.dx_px:+z.4f}, {self.dy_px:+z.4f}) off"
         )
 
 
@@ -136,8 +137,8 @@ class SkyComparison:
         extra = len(self.of("extra"))
         return {
             "stars": len(self.stars) - extra,
-            "flux_error_mag": _spread([abs(star.flux_error_mag) for star in both]),
-            "centroid_error_px": _spread([star.centroid_error_px for star in both]),
+            "flux_error_mag": spread(np.array([abs(star.flux_error_mag) for star in both])),
+            "centroid_error_px": spread(np.array([star.centroid_error_px for star in both])),
             "limits": {"flux_mag": self.limits.flux_mag, "centroid_px": self.limits.centroid_px},
             "missing": len(self.of("missing")),
             "extra": extra,
@@ -153,17 +154,6 @@ class SkyComparison:
         }
 
 
-def _spread(errors: list[float]) -> dict[str, float | None]:
-    if not errors:
-        return {"rms": None, "p95": None, "max": None}
-    values = np.array(errors)
-    return {
-        "rms": float(np.sqrt(np.mean(values**2))),
-        "p95": float(np.percentile(values, 95)),
-        "max": float(values.max()),
-    }
-
-
 @dataclass(frozen=True, slots=True)
 class _Seeds:
     """Stars to be fitted: places (n, 2), px, and the HIP numbers of each, none where no table has it."""
@@ -175,29 +165,43 @@ class _Seeds:
         return _Seeds(self.places_px[kept], [hip for hip, keep in zip(self.hip, kept, strict=True) if keep])
 
 
-def compare_skies(frame: FloatArray, golden: FloatArray, truth: Truth | None = None, limits: Limits | None = None) -> SkyComparison:
-    """Compare two linear images (height, width) star by star; `truth` (TRUTH_DTYPE's hip, x_px, y_px, electrons_per_s) names.
+def compare_skies(
+    frame: FloatArray,
+    golden: FloatArray,
+    limits: Limits,
+    truth: Truth | None = None,
+    frame_truth: Truth | None = None,
+) -> SkyComparison:
+    """Compare two linear images (height, width) star by star, named by their tables (TRUTH_DTYPE), `truth` the golden one's.
 
     Raises InputError for images of different size or with a pixel that is not finite, a golden one without a star, and a
-    table of another sky.
+    `truth` of another sky.
     """
-    limits = limits or Limits()
     _check(frame, golden)
     sigma_px = star_sigma_px(golden)
-    blend_px = max(BLEND_SIGMAS * max(sigma_px), BLEND_PX)
-    seeds = _seeds(golden, truth, sigma_px, blend_px)
-    seeds, unmeasured = _measurable(golden, seeds, sigma_px)
+    blend_px = _blend_px(sigma_px)
+    seeds, unmeasured = _measurable(golden, _seeds(golden, truth, sigma_px), sigma_px)
     fit = _Fit(golden, seeds.places_px, sigma_px)
     moved = fit.follow(frame)
     stars = _differences(seeds, fit, moved, limits)
-    for light, sign in ((moved.residual - fit.residual, -1.0), (fit.residual - moved.residual, 1.0)):
+    more, less = moved.residual - fit.residual, fit.residual - moved.residual
+    for light, table, error in ((less, truth, math.inf), (more, truth if frame_truth is None else frame_truth, -math.inf)):
         places, flux = _unexplained(light, fit, moved)
-        names = _names(places, truth, blend_px)
         stars += [
-            StarDifference(hip, float(x), float(y), float(f), sign * math.inf, 0.0, 0.0, limits)
-            for hip, (x, y), f in zip(names, places, flux, strict=True)
+            StarDifference(hip, float(x), float(y), float(f), error, 0.0, 0.0, limits)
+            for hip, (x, y), f in zip(_names(places, table, blend_px), places, flux, strict=True)
         ]
     return SkyComparison(stars, limits, unmeasured)
+
+
+def describes(truth: Truth, image: FloatArray) -> bool:
+    """Whether a table (TRUTH_DTYPE) has at least half of the brightest stars of a linear image (height, width)."""
+    sigma_px = star_sigma_px(image)
+    return _has(truth, bright_pixels(image, RIPPLE_SHARE * around(image, sigma_px)), _blend_px(sigma_px))
+
+
+def _blend_px(sigma_px: tuple[float, float]) -> float:
+    return max(BLEND_SIGMAS * max(sigma_px), BLEND_PX)
 
 
 def _check(frame: FloatArray, golden: FloatArray) -> None:
@@ -215,12 +219,13 @@ def _check(frame: FloatArray, golden: FloatArray) -> None:
         raise InputError("compare: the golden image has no star; give one that has")
 
 
-def _seeds(golden: FloatArray, truth: Truth | None, sigma_px: tuple[float, float], blend_px: float) -> _Seeds:
-    """The table's stars, and the image's where the table has none; those nearer than `blend_px` are one."""
+def _seeds(golden: FloatArray, truth: Truth | None, sigma_px: tuple[float, float]) -> _Seeds:
+    """The table's stars, and the image's where the table has none; blends are one."""
+    blend_px = _blend_px(sigma_px)
     found = bright_pixels(golden, RIPPLE_SHARE * around(golden, sigma_px))
     if truth is None:
         return _blended(_Seeds(found, [()] * len(found)), blend_px)
-    if not has_the_stars(truth, found, blend_px):
+    if not _has(truth, found, blend_px):
         raise InputError("compare: the truth table's stars are not where the golden image has them; give the table of that frame")
     table = truth[np.argsort(-truth["electrons_per_s"], kind="stable")]
     places = np.column_stack([table["x_px"], table["y_px"]])
@@ -232,9 +237,8 @@ def _seeds(golden: FloatArray, truth: Truth | None, sigma_px: tuple[float, float
     return _Seeds(np.concatenate([listed.places_px, unlisted.places_px]), listed.hip + unlisted.hip)
 
 
-def has_the_stars(truth: Truth, found_px: FloatArray, blend_px: float) -> bool:
-    """Whether a table has at least half of the brightest stars found (n, 2), px."""
-    if not len(truth):
+def _has(truth: Truth, found_px: FloatArray, blend_px: float) -> bool:
+    if not len(truth) or not len(found_px):
         return False
     return bool(np.median(cKDTree(np.column_stack([truth["x_px"], truth["y_px"]])).query(found_px[:KNOWN_STARS])[0]) <= blend_px)
 
@@ -319,7 +323,7 @@ def _unexplained(light: FloatArray, fit: _Fit, moved: _Fit) -> tuple[FloatArray,
     floor = RIPPLE_SHARE * np.maximum(fit.light, moved.light) + 0.5 * change
     rounding = PIXEL_ERROR * max(fit.flux.max(initial=0.0), moved.flux.max(initial=0.0))
     places = bright_pixels(light, around(floor, fit.sigma_px) + rounding)
-    places = _blended(_Seeds(places, [()] * len(places)), max(BLEND_SIGMAS * max(fit.sigma_px), BLEND_PX)).places_px
+    places = _blended(_Seeds(places, [()] * len(places)), _blend_px(fit.sigma_px)).places_px
     places = refined(light, places, fit.sigma_px)
     return places, StarTemplates(places, fit.sigma_px, (light.shape[0], light.shape[1])).fit(light)[:, 0]
 

@@ -16,7 +16,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from hilstar.arrays import FloatArray, IntArray
+from hilstar.arrays import FloatArray
 from hilstar.errors import InputError
 from hilstar.study.star_fit import RIPPLE_SHARE, StarTemplates, around, bright_pixels, refined, shifts_px, star_sigma_px
 from hilstar.study.twin_verdict import spread
@@ -226,13 +226,15 @@ def _seeds(golden: FloatArray, truth: Truth | None, sigma_px: tuple[float, float
     if truth is None:
         return _blended(_Seeds(found, [()] * len(found)), blend_px)
     if not _has(truth, found, blend_px):
-        raise InputError("compare: the truth table's stars are not where the golden image has them; give the table of that frame")
+        raise InputError(
+            "compare: the truth table's stars are not where the golden image has them; give the table of that frame"
+        )
     table = truth[np.argsort(-truth["electrons_per_s"], kind="stable")]
-    places = np.column_stack([table["x_px"], table["y_px"]])
+    places = _places_px(table)
     listed = _blended(_Seeds(places, [(int(hip),) for hip in table["hip"]]), blend_px)
     # The light of a star off the image is brightest at the image's edge.
     shown = np.clip(places, 0, np.array([golden.shape[1], golden.shape[0]]) - 1)
-    away = cKDTree(shown).query(found)[0] > blend_px
+    away = _nearest(shown, found)[0] > blend_px
     unlisted = _blended(_Seeds(found[away], [()] * int(away.sum())), blend_px)
     return _Seeds(np.concatenate([listed.places_px, unlisted.places_px]), listed.hip + unlisted.hip)
 
@@ -240,7 +242,17 @@ def _seeds(golden: FloatArray, truth: Truth | None, sigma_px: tuple[float, float
 def _has(truth: Truth, found_px: FloatArray, blend_px: float) -> bool:
     if not len(truth) or not len(found_px):
         return False
-    return bool(np.median(cKDTree(np.column_stack([truth["x_px"], truth["y_px"]])).query(found_px[:KNOWN_STARS])[0]) <= blend_px)
+    return bool(np.median(_nearest(_places_px(truth), found_px[:KNOWN_STARS])[0]) <= blend_px)
+
+
+def _places_px(truth: Truth) -> FloatArray:
+    return np.column_stack([truth["x_px"], truth["y_px"]])
+
+
+def _nearest(known_px: FloatArray, places_px: FloatArray) -> tuple[FloatArray, IntArray]:
+    """For each of places (n, 2): how far the nearest known one is, px, and which."""
+    distance_px, nearest = cKDTree(known_px).query(places_px)
+    return np.asarray(distance_px), np.asarray(nearest, dtype=np.intp)
 
 
 def _blended(seeds: _Seeds, blend_px: float) -> _Seeds:
@@ -248,7 +260,7 @@ def _blended(seeds: _Seeds, blend_px: float) -> _Seeds:
     size = len(seeds.places_px)
     pairs = cKDTree(seeds.places_px).query_pairs(blend_px, output_type="ndarray")
     links = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(size, size))
-    group: IntArray = connected_components(links, directed=False)[1] if size else np.zeros(0, dtype=np.intp)
+    group = np.asarray(connected_components(links, directed=False)[1], dtype=np.intp) if size else np.zeros(0, dtype=np.intp)
     _, first = np.unique(group, return_index=True)
     hips: dict[int, tuple[int, ...]] = {}
     for label, hip in zip(group.tolist(), seeds.hip, strict=True):
@@ -308,8 +320,10 @@ def _differences(seeds: _Seeds, fit: _Fit, moved: _Fit, limits: Limits) -> list[
     error_mag = np.where(gone, np.inf, -2.5 * np.log10(ratio))
     columns = (*fit.places_px.T, fit.flux, error_mag, *np.where(gone, 0.0, shift.T), limit_mag, limit_px)
     return [
-        StarDifference(hip, *numbers[:-2], Limits(*numbers[-2:]))
-        for hip, numbers in zip(seeds.hip, zip(*(column.tolist() for column in columns), strict=True), strict=True)
+        StarDifference(hip, x_px, y_px, flux, mag, dx_px, dy_px, Limits(own_mag, own_px))
+        for hip, (x_px, y_px, flux, mag, dx_px, dy_px, own_mag, own_px) in zip(
+            seeds.hip, np.column_stack(columns).tolist(), strict=True
+        )
     ]
 
 
@@ -332,5 +346,5 @@ def _names(places_px: FloatArray, truth: Truth | None, blend_px: float) -> list[
     """The HIP number of the table's star at each place, where it has one."""
     if truth is None or not len(truth) or not len(places_px):
         return [()] * len(places_px)
-    distance, nearest = cKDTree(np.column_stack([truth["x_px"], truth["y_px"]])).query(places_px)
+    distance, nearest = _nearest(_places_px(truth), places_px)
     return [(int(truth["hip"][k]),) if d <= blend_px else () for d, k in zip(distance, nearest, strict=True)]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -97,37 +97,42 @@ def finding(comparison: SkyComparison) -> str:
 
 
 def _draw(path: Path, comparison: SkyComparison) -> None:
-    brightest = max(star.flux_e_per_s for star in comparison.stars)
     with chart(path, finding(comparison), 2) as axes:
-        for axis, label, unit in ((axes[0], "flux error", "mag"), (axes[1], "centroid error", "px")):
-            _panel(axis, comparison, brightest, unit)
-            axis.set(yscale="log", ylabel=f"{label} [{unit}], at least {LEAST_ERROR:g}")
-        axes[1].set_xlabel("magnitudes under the brightest star")
-        for axis in axes:
+        for axis, what, unit in ((axes[0], "flux error", "mag"), (axes[1], "centroid error", "px")):
+            _panel(axis, comparison, unit)
+            axis.set(yscale="log", ylabel=f"{what} [{unit}], drawn at {LEAST_ERROR:g} where under it")
             axis.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), fontsize=9)
+        axes[1].set_xlabel("magnitudes under the brightest star")
 
 
-def _panel(axis: Axes, comparison: SkyComparison, brightest: float, unit: str) -> None:
-    def values(star: StarDifference) -> tuple[float, float, float]:
+def _panel(axis: Axes, comparison: SkyComparison, unit: str) -> None:
+    """Errors and limits of one kind; stars that only one image has stand in rows above, named once, in the flux's panel."""
+    brightest = max(star.flux_e_per_s for star in comparison.stars)
+    limit = comparison.limits.flux_mag if unit == "mag" else comparison.limits.centroid_px
+
+    def point(star: StarDifference) -> tuple[float, float, float]:
         mag = MAG_PER_SHARE * math.log(brightest / star.flux_e_per_s)
         if unit == "mag":
             return mag, max(abs(star.flux_error_mag), LEAST_ERROR), star.limits.flux_mag
         return mag, max(star.centroid_error_px, LEAST_ERROR), star.limits.centroid_px
 
     both = comparison.of("same", "changed")
-    limit = comparison.limits.flux_mag if unit == "mag" else comparison.limits.centroid_px
-    top = 3 * max([limit, *(max(values(star)[1:]) for star in both)])
-    for kind, style in (("same", "C0."), ("changed", "C3o")):
-        found = [values(star) for star in comparison.of(kind)]
-        axis.plot([v[0] for v in found], [v[1] for v in found], style, ms=5, label=f"{kind}: {len(found)}")
-    for kind, style in (("missing", "C3v"), ("extra", "C1^")):
-        mags = [values(star)[0] for star in comparison.of(kind)]
-        axis.plot(mags, [top] * len(mags), style, ms=8, label=f"{kind}: {len(mags)}")
-    axis.axhline(limit, color="k", ls="--", lw=1.2, label=f"limit {limit:g} {unit}")
-    own = [v for v in map(values, both) if v[2] > limit]
-    axis.plot([v[0] for v in own], [v[2] for v in own], "k_", ms=8, label=f"a star's own limit: {len(own)}")
+    row = 4 * max([limit, *(max(point(star)[1:]) for star in both)])
+    rows = {"missing": row, "extra": 8 * row}
+    for kind, style in (("same", "C0."), ("changed", "C3o"), ("missing", "C3v"), ("extra", "C1^")):
+        mags, errors = [[point(star)[k] for star in comparison.of(kind)] for k in (0, 1)]
+        heights = [rows[kind]] * len(mags) if kind in rows else errors
+        axis.plot(mags, heights, style, ms=5 if kind == "same" else 7, label=f"{kind}: {len(mags)}")
+    axis.axhline(limit, color="k", ls="--", lw=1.2, label=f"limit: {limit:g} {unit}")
+    wider = [point(star) for star in both if point(star)[2] > limit]
+    if wider:
+        axis.plot([p[0] for p in wider], [p[2] for p in wider], "k_", ms=8, label=f"a star's own limit: {len(wider)}")
     for star in comparison.bad[:NAMED_STARS]:
-        mag, error, _ = values(star)
-        height = error if star.kind == "changed" else top
-        axis.annotate(star.name, (mag, height), xytext=(6, 4), textcoords="offset points", fontsize=8)
-    axis.set_ylim(LEAST_ERROR / 2, 6 * top)
+        mag, error, own = point(star)
+        if unit == "mag" if star.kind in rows else error > own:
+            name = star.name if star.hip else f"({star.x_px:.0f}, {star.y_px:.0f})"
+            tilt: Any = {"rotation": 30, "rotation_mode": "anchor"} if star.kind in rows else {}
+            height = rows.get(star.kind, error)
+            axis.annotate(name, (mag, height), xytext=(6, 4), textcoords="offset points", fontsize=8, **tilt)
+    axis.set_ylim(LEAST_ERROR / 2, 300 * row)
+    axis.set_xlim(right=axis.get_xlim()[1] + 0.5)

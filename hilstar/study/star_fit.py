@@ -59,14 +59,15 @@ class StarTemplates:
         """Flux, and flux times the shift along x and y, of each star (n, 3): the least squares of all pixels."""
         if self._solver is None:
             return np.zeros((0, 3))
-        return np.asarray(self._scale * self._solver.solve(self._scale * (self._columns.T @ image.ravel()))).reshape(-1, 3)
+        wanted = np.asarray(self._columns.T @ image.ravel())
+        return (self._scale * self._solver.solve(self._scale * wanted)).reshape(-1, 3)
 
     def image(self, fitted: FloatArray) -> FloatArray:
         """The light (height, width) of a fit."""
         return np.asarray(self._columns @ fitted.ravel()).reshape(self.shape)
 
     def errors(self, flux: FloatArray, pixel_error: float) -> tuple[FloatArray, FloatArray]:
-        """What errors of `pixel_error` times the flux of every star that reaches a pixel do to each star's flux and place, px."""
+        """What a pixel error of `pixel_error` times the flux of all stars that reach it does to a star's flux and place, px."""
         size = len(flux)
         blocks = np.zeros((size, 3, 3))
         entries = self.normal.tocoo()
@@ -74,8 +75,9 @@ class StarTemplates:
         row, col = entries.row[own], entries.col[own]
         blocks[row // 3, row % 3, col % 3] = entries.data[own]
         variance = np.diagonal(np.linalg.pinv(blocks, hermitian=True), axis1=1, axis2=2)
-        near = csc_array(self.normal[::3, ::3] != 0).astype(float)
-        around = pixel_error * (near @ np.abs(flux))
+        fluxes = entries.row % 3 + entries.col % 3 == 0
+        near = np.bincount(entries.row[fluxes] // 3, np.abs(flux)[entries.col[fluxes] // 3], minlength=size)
+        around = pixel_error * near
         with np.errstate(divide="ignore"):
             return np.sqrt(variance[:, 0]) * around, np.sqrt(variance[:, 1:].sum(axis=1)) * around / np.abs(flux)
 
@@ -132,7 +134,7 @@ def _apart(places_px: FloatArray, distance_px: float) -> FloatArray:
 
 
 def _first_sigma_px(image: FloatArray, axis: int) -> float:
-    """A Gaussian of sigma s, with itself one pixel on, correlates by exp(-1 / 4 s^2); the pixel's own 1/12 px^2 is taken off."""
+    """A Gaussian of sigma s and its copy one pixel on correlate by exp(-1 / 4 s^2); the pixel's own 1/12 px^2 is taken off."""
     ahead, behind = (np.take(image, np.arange(start, image.shape[axis] + start - 1), axis) for start in (1, 0))
     correlation = float(np.clip(np.vdot(ahead, behind) / np.vdot(image, image), 0.05, 0.999))
     return math.sqrt(max(-0.25 / math.log(correlation) - 1 / 12, 0.04))

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from hilstar.arrays import FloatArray
 from hilstar.bench.assembly import Frame
 from hilstar.errors import InputError
-from hilstar.study.compare import CENTROID_PX, FLUX_MAG, Limits, SkyComparison, Truth, compare_skies, describes
+from hilstar.study.compare import CENTROID_PX, FLUX_MAG, Limits, SkyComparison, Truth, check_skies, compare_skies, describes
 from hilstar.study.compare_files import finding, read_frame_fits, read_truth_csv
 
 __all__ = ["assert_same_sky", "compare"]
@@ -55,6 +55,7 @@ def compare(
     Raises InputError for limits that are not over 0, images of different size or without a star, and files of another kind.
     """
     light, golden_light = _image(frame), _image(golden)
+    check_skies(light, golden_light)
     own = frame.truth if isinstance(frame, Frame) else None
     if isinstance(truth, str | Path):
         truth = read_truth_csv(Path(truth))

@@ -16,7 +16,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from hilstar.arrays import FloatArray
+from hilstar.arrays import FloatArray, IntArray
 from hilstar.errors import InputError
 from hilstar.study.star_fit import RIPPLE_SHARE, StarTemplates, around, bright_pixels, refined, shifts_px, star_sigma_px
 from hilstar.study.twin_verdict import spread
@@ -161,6 +161,11 @@ class _Seeds:
     places_px: FloatArray
     hip: list[tuple[int, ...]]
 
+    @property
+    def stars(self) -> int:
+        """How many stars there are, each of a blend counted."""
+        return sum(max(len(hip), 1) for hip in self.hip)
+
     def only(self, kept: npt.NDArray[np.bool_]) -> _Seeds:
         return _Seeds(self.places_px[kept], [hip for hip, keep in zip(self.hip, kept, strict=True) if keep])
 
@@ -177,7 +182,7 @@ def compare_skies(
     Raises InputError for images of different size or with a pixel that is not finite, a golden one without a star, and a
     `truth` of another sky.
     """
-    _check(frame, golden)
+    check_skies(frame, golden)
     sigma_px = star_sigma_px(golden)
     blend_px = _blend_px(sigma_px)
     seeds, unmeasured = _measurable(golden, _seeds(golden, truth, sigma_px), sigma_px)
@@ -204,7 +209,8 @@ def _blend_px(sigma_px: tuple[float, float]) -> float:
     return max(BLEND_SIGMAS * max(sigma_px), BLEND_PX)
 
 
-def _check(frame: FloatArray, golden: FloatArray) -> None:
+def check_skies(frame: FloatArray, golden: FloatArray) -> None:
+    """Raise InputError where two images cannot be compared, as `compare_skies` does."""
     for name, image in (("frame", frame), ("golden", golden)):
         if image.ndim != 2 or min(image.shape) < 2:
             raise InputError(f"compare: the {name} image has the shape {image.shape}; give a linear image (height, width)")
@@ -224,7 +230,7 @@ def _seeds(golden: FloatArray, truth: Truth | None, sigma_px: tuple[float, float
     blend_px = _blend_px(sigma_px)
     found = bright_pixels(golden, RIPPLE_SHARE * around(golden, sigma_px))
     if truth is None:
-        return _blended(_Seeds(found, [()] * len(found)), blend_px)
+        return _nameless(found, blend_px)
     if not _has(truth, found, blend_px):
         raise InputError(
             "compare: the truth table's stars are not where the golden image has them; give the table of that frame"
@@ -235,7 +241,7 @@ def _seeds(golden: FloatArray, truth: Truth | None, sigma_px: tuple[float, float
     # The light of a star off the image is brightest at the image's edge.
     shown = np.clip(places, 0, np.array([golden.shape[1], golden.shape[0]]) - 1)
     away = _nearest(shown, found)[0] > blend_px
-    unlisted = _blended(_Seeds(found[away], [()] * int(away.sum())), blend_px)
+    unlisted = _nameless(found[away], blend_px)
     return _Seeds(np.concatenate([listed.places_px, unlisted.places_px]), listed.hip + unlisted.hip)
 
 
@@ -255,6 +261,10 @@ def _nearest(known_px: FloatArray, places_px: FloatArray) -> tuple[FloatArray, I
     return np.asarray(distance_px), np.asarray(nearest, dtype=np.intp)
 
 
+def _nameless(places_px: FloatArray, blend_px: float) -> _Seeds:
+    return _blended(_Seeds(places_px, [()] * len(places_px)), blend_px)
+
+
 def _blended(seeds: _Seeds, blend_px: float) -> _Seeds:
     """One seed for each chain of near ones, at the place of its first, which is its brightest."""
     size = len(seeds.places_px)
@@ -269,14 +279,14 @@ def _blended(seeds: _Seeds, blend_px: float) -> _Seeds:
 
 
 def _measurable(golden: FloatArray, seeds: _Seeds, sigma_px: tuple[float, float]) -> tuple[_Seeds, int]:
-    """The seeds whose light can be told from the rounding of their neighbours', at their places; and how many cannot."""
-    count, shape = len(seeds.hip), (golden.shape[0], golden.shape[1])
+    """The seeds whose light can be told from the rounding of their neighbours', at their places; and how many stars cannot."""
+    count, shape = seeds.stars, (golden.shape[0], golden.shape[1])
     seeds = _in_view(seeds, sigma_px, shape)
     seeds = _in_view(_Seeds(refined(golden, seeds.places_px, sigma_px), seeds.hip), sigma_px, shape)
     templates = StarTemplates(seeds.places_px, sigma_px, shape)
     flux = templates.fit(golden)[:, 0]
     seeds = seeds.only(flux > templates.errors(flux, PIXEL_ERROR)[0] / LARGEST_ERROR)
-    return seeds, count - len(seeds.hip)
+    return seeds, count - seeds.stars
 
 
 def _in_view(seeds: _Seeds, sigma_px: tuple[float, float], shape: tuple[int, int]) -> _Seeds:
@@ -337,8 +347,7 @@ def _unexplained(light: FloatArray, fit: _Fit, moved: _Fit) -> tuple[FloatArray,
     floor = RIPPLE_SHARE * np.maximum(fit.light, moved.light) + 0.5 * change
     rounding = PIXEL_ERROR * max(fit.flux.max(initial=0.0), moved.flux.max(initial=0.0))
     places = bright_pixels(light, around(floor, fit.sigma_px) + rounding)
-    places = _blended(_Seeds(places, [()] * len(places)), _blend_px(fit.sigma_px)).places_px
-    places = refined(light, places, fit.sigma_px)
+    places = refined(light, _nameless(places, _blend_px(fit.sigma_px)).places_px, fit.sigma_px)
     return places, StarTemplates(places, fit.sigma_px, (light.shape[0], light.shape[1])).fit(light)[:, 0]
 
 

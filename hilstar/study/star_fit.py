@@ -78,7 +78,7 @@ class StarTemplates:
         fluxes = entries.row % 3 + entries.col % 3 == 0
         near = np.bincount(entries.row[fluxes] // 3, np.abs(flux)[entries.col[fluxes] // 3], minlength=size)
         around = pixel_error * near
-        with np.errstate(divide="ignore"):
+        with np.errstate(divide="ignore", invalid="ignore"):
             return np.sqrt(variance[:, 0]) * around, np.sqrt(variance[:, 1:].sum(axis=1)) * around / np.abs(flux)
 
 
@@ -112,7 +112,8 @@ def star_sigma_px(image: FloatArray) -> tuple[float, float]:
     """The sigma of the stars along x and y: Newton's steps on the brightest, from the image's correlation of neighbours."""
     x, y = (_first_sigma_px(image, axis) for axis in (1, 0))
     sigma = np.array([x, y])
-    places = _apart(bright_pixels(image, RIPPLE_SHARE * around(image, (x, y))), footprint_px((x, y)))
+    found = bright_pixels(image, RIPPLE_SHARE * around(image, (x, y)))
+    places = _apart(found, footprint_px((x, y)), (image.shape[1], image.shape[0]))
     reach = footprint_px((x, y)) // 2 + 1
     padded = np.pad(image, 2 * reach)
     for _ in range(SIGMA_STEPS):
@@ -125,11 +126,12 @@ def star_sigma_px(image: FloatArray) -> tuple[float, float]:
     return float(sigma[0]), float(sigma[1])
 
 
-def _apart(places_px: FloatArray, distance_px: float) -> FloatArray:
-    """The brightest places with nothing else in their footprint; all of the brightest, where every one has a neighbour."""
+def _apart(places_px: FloatArray, distance_px: float, size_px: tuple[int, int]) -> FloatArray:
+    """The brightest places with nothing else in their footprint, the image's edge included; of none such, all of them."""
     bright = places_px[: 4 * SIGMA_STARS]
     distance = np.abs(bright[:, None] - places_px[None]).max(axis=2)
-    alone = (distance < distance_px).sum(axis=1) == 1
+    edge = np.minimum(bright, np.array(size_px) - 1 - bright).min(axis=1)
+    alone = ((distance < distance_px).sum(axis=1) == 1) & (edge >= distance_px / 2)
     return bright[alone if alone.any() else slice(None)][:SIGMA_STARS].copy()
 
 

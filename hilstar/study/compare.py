@@ -21,8 +21,8 @@ from hilstar.errors import InputError
 from hilstar.study.star_fit import RIPPLE_SHARE, StarTemplates, around, bright_pixels, refined, shifts_px, star_sigma_px
 from hilstar.study.twin_verdict import spread
 
-# One tenth of the smallest fault that must be seen (0.01 mag, 0.02 px) and less; 100 times and more what two right drivers
-# differ by: tests/unit/test_testing.py measures both.
+# A tenth of the smallest fault that must be seen (0.01 mag, 0.02 px) or less; 500 times what two right drivers make of a star
+# that no brighter one stands on (2e-6 mag, 1.5e-6 px at worst). tests/unit/test_testing.py measures both.
 FLUX_MAG = 1e-3
 CENTROID_PX = 1e-3
 # Of a star's flux: what float32 may do to any pixel that the star reaches. Measured 7e-8 on llvmpipe against float64.
@@ -186,6 +186,8 @@ def compare_skies(
     sigma_px = star_sigma_px(golden)
     blend_px = _blend_px(sigma_px)
     seeds, unmeasured = _measurable(golden, _seeds(golden, truth, sigma_px), sigma_px)
+    if not seeds.hip:
+        raise InputError("compare: no star of the golden image has enough light in view; give one that has")
     fit = _Fit(golden, seeds.places_px, sigma_px)
     moved = fit.follow(frame)
     stars = _differences(seeds, fit, moved, limits)
@@ -346,9 +348,11 @@ def _unexplained(light: FloatArray, fit: _Fit, moved: _Fit) -> tuple[FloatArray,
     change = np.maximum(np.abs(moved.model - fit.model), np.abs(light))
     floor = RIPPLE_SHARE * np.maximum(fit.light, moved.light) + 0.5 * change
     rounding = PIXEL_ERROR * max(fit.flux.max(initial=0.0), moved.flux.max(initial=0.0))
-    places = bright_pixels(light, around(floor, fit.sigma_px) + rounding)
-    places = refined(light, _nameless(places, _blend_px(fit.sigma_px)).places_px, fit.sigma_px)
-    return places, StarTemplates(places, fit.sigma_px, (light.shape[0], light.shape[1])).fit(light)[:, 0]
+    seeds = _nameless(bright_pixels(light, around(floor, fit.sigma_px) + rounding), _blend_px(fit.sigma_px)).places_px
+    places = refined(light, seeds, fit.sigma_px)
+    flux = StarTemplates(places, fit.sigma_px, (light.shape[0], light.shape[1])).fit(light)[:, 0]
+    column, row = seeds.astype(np.intp).T
+    return places, np.maximum(flux, light[row, column])  # two that lie on each other may share it as more and less than nothing
 
 
 def _names(places_px: FloatArray, truth: Truth | None, blend_px: float) -> list[tuple[int, ...]]:

@@ -1,0 +1,58 @@
+"""The command that compares two frames."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from hilstar.cli.common import Json, app
+from hilstar.console import print_json
+
+
+@app.command()
+def compare(
+    frame: Annotated[Path, typer.Argument(metavar="A.fits", help="The linear image of `hilstar frame -o`.")],
+    golden: Annotated[Path, typer.Argument(metavar="B.fits", help="The one that it must be like.")],
+    truth: Annotated[Path | None, typer.Option(metavar="TRUTH.csv", help="B's stars, of `hilstar frame --truth`.")] = None,
+    flux_mag: Annotated[float | None, typer.Option(help="How far a star's flux may be off; 0.001 by default.")] = None,
+    centroid_px: Annotated[float | None, typer.Option(help="And its place; 0.001 by default.")] = None,
+    output: Annotated[Path | None, typer.Option("-o", "--output", metavar="DIR", help="A chart and a table.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Compare two frames star by star: exit code 0 when they are the same sky, 1 when not."""
+    from hilstar.bench.output import make_directory
+    from hilstar.study.compare import CENTROID_PX, FLUX_MAG
+    from hilstar.study.compare_files import write_report
+    from hilstar.testing import compare as compare_files
+
+    limits = FLUX_MAG if flux_mag is None else flux_mag, CENTROID_PX if centroid_px is None else centroid_px
+    comparison = compare_files(frame, golden, flux_mag=limits[0], centroid_px=limits[1], truth=truth)
+    if output is not None:
+        write_report(make_directory(output), comparison)
+    if as_json:
+        print_json(comparison.summary())
+    else:
+        tell(comparison.summary(), [star.line() for star in comparison.bad])
+    if not comparison.same:
+        raise typer.Exit(1)
+
+
+def tell(summary: dict[str, Any], bad: list[str]) -> None:
+    """The comparison for a person."""
+
+    def three(errors: dict[str, float | None]) -> str:
+        return " / ".join("-" if value is None else f"{value:.2g}" for value in errors.values())
+
+    rest = f"{summary['blends']} of them blends, {summary['unmeasured']} more with too little light of their own in view"
+    typer.echo(f"{'stars compared':20}{summary['stars']}, {rest}")
+    for name, unit in (("flux", "mag"), ("centroid", "px")):
+        errors, limit = summary[f"{name}_error_{unit}"], summary["limits"][f"{name}_{unit}"]
+        typer.echo(f"{name + ' error':20}{three(errors)} {unit} (rms / 95 % / max; limit {limit:g})")
+    if summary["widened"]:
+        typer.echo(f"{'wider limits':20}{summary['widened']} stars, for rounding of the light around them or the image's edge")
+    typer.echo(f"{'missing, extra':20}{summary['missing']}, {summary['extra']}")
+    for line in bad:
+        typer.echo(f"{'':20}{line}")
+    typer.echo(f"{'verdict':20}{'the same sky' if summary['same'] else 'NOT the same sky'}")

@@ -1,0 +1,181 @@
+"""Stars of a noiseless linear image: found, and fitted all at once, so that a neighbour's light is no star's error.
+
+Each star is a Gaussian integrated over pixels, as the renderer draws it, with its derivatives along x and y. Fluxes and
+shifts of all stars are one linear least-squares problem: a star that is dimmed by any amount is measured exactly, a shifted
+one to first order in its shift, and what no star explains stays in the residual.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy import ndimage
+from scipy.sparse import csc_array, diags_array
+from scipy.sparse.linalg import splu
+from scipy.special import ndtr
+
+from hilstar.arrays import FloatArray, IntArray
+from hilstar.scene.psf import footprint_px
+
+# Around a bright star float32 leaves ripples of 2e-6 of its peak (4.4e-7 of its flux, see tests/gpu); no star is that faint.
+RIPPLE_SHARE = 1e-5
+SIGMA_STARS = 30  # the brightest ones give the sigma; their median is no blend's
+SIGMA_STEPS = 12
+LARGEST_SIGMA_STEP = 0.3  # of sigma: Newton's step from a poor start stays a positive sigma
+PLACE_STEPS, LARGEST_STEP_PX, LEAST_STEP_PX = 12, 1.0, 1e-5
+FARTHEST_PX = 1.0  # a star lies within sqrt(1/2) px of the middle of its brightest pixel, but for a neighbour's pull
+BEYOND_SIGMAS = 4.0  # ... and one whose brightest pixel is the image's first or last lies anywhere beyond
+RIDGE = 1e-12  # of a unit column: two columns that are one thing share its light, where a solver would fail
+
+
+class StarTemplates:
+    """Stars of flux 1 at `x_px`, `y_px` (n,) on an image of `shape` (height, width), each with two derivatives.
+
+    A star's share of light that falls on the image is in `in_view` (n,).
+    """
+
+    def __init__(self, places_px: FloatArray, sigma_px: tuple[float, float], shape: tuple[int, int]) -> None:
+        self.places_px = places_px
+        self.shape = shape
+        size = len(places_px)
+        (share_x, slope_x, column), (share_y, slope_y, row) = (
+            _along(places_px[:, axis], sigma_px[axis], footprint_px(sigma_px) // 2 + 1, shape[1 - axis]) for axis in (0, 1)
+        )
+        pairs = ((share_y, share_x), (share_y, slope_x), (slope_y, share_x))
+        pixels = row.shape[1] * column.shape[1]
+        data = np.stack([y[:, :, None] * x[:, None, :] for y, x in pairs], axis=1).reshape(3 * size, pixels)
+        pixel = (row[:, :, None] * shape[1] + column[:, None, :]).reshape(size, 1, pixels)
+        index = np.broadcast_to(pixel, (size, 3, pixels)).ravel()
+        ends = np.arange(3 * size + 1) * pixels
+        self.in_view = np.asarray(data[::3].sum(axis=1))
+        self._columns = csc_array((data.ravel(), index, ends), shape=(math.prod(shape), 3 * size))
+        self.normal = csc_array(self._columns.T @ self._columns)
+        self._scale = 1 / np.sqrt(np.maximum(self.normal.diagonal(), np.finfo(float).tiny))
+        unit = diags_array(self._scale) @ self.normal @ diags_array(self._scale)
+        self._solver = splu(csc_array(unit + RIDGE * diags_array(np.ones(3 * size)))) if size else None
+
+    def fit(self, image: FloatArray) -> FloatArray:
+        """Flux, and flux times the shift along x and y, of each star (n, 3): the least squares of all pixels."""
+        if self._solver is None:
+            return np.zeros((0, 3))
+        wanted = np.asarray(self._columns.T @ image.ravel())
+        return (self._scale * self._solver.solve(self._scale * wanted)).reshape(-1, 3)
+
+    def image(self, fitted: FloatArray) -> FloatArray:
+        """The light (height, width) of a fit."""
+        return np.asarray(self._columns @ fitted.ravel()).reshape(self.shape)
+
+    def errors(self, flux: FloatArray, pixel_error: float) -> tuple[FloatArray, FloatArray]:
+        """What a pixel error of `pixel_error` times the flux of all stars that reach it does to a star's flux and place, px."""
+        size = len(flux)
+        blocks = np.zeros((size, 3, 3))
+        entries = self.normal.tocoo()
+        own = entries.row // 3 == entries.col // 3
+        row, col = entries.row[own], entries.col[own]
+        blocks[row // 3, row % 3, col % 3] = entries.data[own]
+        variance = np.diagonal(np.linalg.pinv(blocks, hermitian=True), axis1=1, axis2=2)
+        fluxes = entries.row % 3 + entries.col % 3 == 0
+        near = np.bincount(entries.row[fluxes] // 3, np.abs(flux)[entries.col[fluxes] // 3], minlength=size)
+        around = pixel_error * near
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.sqrt(variance[:, 0]) * around, np.sqrt(variance[:, 1:].sum(axis=1)) * around / np.abs(flux)
+
+
+def _along(place_px: FloatArray, sigma_px: float, reach_px: int, size_px: int) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Along one axis (n, k): shares of light, their derivative by the place, and the pixels; no light off the image."""
+    pixel = np.rint(place_px).astype(np.intp)[:, None] + np.arange(-reach_px, reach_px + 1)
+    near, far = ((pixel - place_px[:, None] + side) / sigma_px for side in (-0.5, 0.5))
+    inside = (pixel >= 0) & (pixel < size_px)
+    share, slope = ndtr(far) - ndtr(near), (_bell(near) - _bell(far)) / sigma_px
+    return share * inside, slope * inside, np.clip(pixel, 0, size_px - 1)
+
+
+def _bell(u: FloatArray) -> FloatArray:
+    return np.asarray(np.exp(-0.5 * np.square(u)) / math.sqrt(2 * math.pi))
+
+
+def bright_pixels(image: FloatArray, floor: FloatArray) -> FloatArray:
+    """Places (n, 2), px, of pixels over `floor` that no neighbour outshines, brightest first."""
+    top = (image > floor) & (image == ndimage.maximum_filter(image, 3, mode="constant"))
+    row, column = np.nonzero(top)
+    order = np.argsort(-image[row, column], kind="stable")
+    return np.column_stack([column, row])[order].astype(np.float64)
+
+
+def around(image: FloatArray, sigma_px: tuple[float, float]) -> FloatArray:
+    """The brightest pixel within a star's footprint around each pixel, the same shape."""
+    return np.asarray(ndimage.maximum_filter(image, footprint_px(sigma_px), mode="constant"))
+
+
+def star_sigma_px(image: FloatArray) -> tuple[float, float]:
+    """The sigma of the stars along x and y: Newton's steps on the brightest, from the image's correlation of neighbours."""
+    x, y = (_first_sigma_px(image, axis) for axis in (1, 0))
+    sigma = np.array([x, y])
+    found = bright_pixels(image, RIPPLE_SHARE * around(image, (x, y)))
+    places = _apart(found, footprint_px((x, y)), (image.shape[1], image.shape[0]))
+    reach = footprint_px((x, y)) // 2 + 1
+    padded = np.pad(image, 2 * reach)
+    for _ in range(SIGMA_STEPS):
+        steps = _sigma_steps(padded, places, sigma, reach)
+        good = np.isfinite(steps).all(axis=1)
+        if not good.any():
+            break
+        places[good] += np.clip(steps[good, :2], -0.5, 0.5)
+        sigma = sigma + np.clip(np.median(steps[good, 2:], axis=0), -LARGEST_SIGMA_STEP * sigma, LARGEST_SIGMA_STEP * sigma)
+    return float(sigma[0]), float(sigma[1])
+
+
+def _apart(places_px: FloatArray, distance_px: float, size_px: tuple[int, int]) -> FloatArray:
+    """The brightest places with nothing else in their footprint, the image's edge included; of none such, all of them."""
+    bright = places_px[: 4 * SIGMA_STARS]
+    distance = np.abs(bright[:, None] - places_px[None]).max(axis=2)
+    edge = np.minimum(bright, np.array(size_px) - 1 - bright).min(axis=1)
+    alone = ((distance < distance_px).sum(axis=1) == 1) & (edge >= distance_px / 2)
+    return bright[alone if alone.any() else slice(None)][:SIGMA_STARS].copy()
+
+
+def _first_sigma_px(image: FloatArray, axis: int) -> float:
+    """A Gaussian of sigma s and its copy one pixel on correlate by exp(-1 / 4 s^2); the pixel's own 1/12 px^2 is taken off."""
+    ahead, behind = (np.take(image, np.arange(start, image.shape[axis] + start - 1), axis) for start in (1, 0))
+    correlation = float(np.clip(np.vdot(ahead, behind) / np.vdot(image, image), 0.05, 0.999))
+    return math.sqrt(max(-0.25 / math.log(correlation) - 1 / 12, 0.04))
+
+
+def _sigma_steps(padded: FloatArray, places_px: FloatArray, sigma_px: FloatArray, reach_px: int) -> FloatArray:
+    """Newton's steps (n, 4) of each star by itself: x, y, sigma x, sigma y."""
+    parts, pixels = [], []
+    for axis in (0, 1):
+        pixel = np.rint(places_px[:, axis]).astype(np.intp)[:, None] + np.arange(-reach_px, reach_px + 1)
+        near, far = ((pixel - places_px[:, axis, None] + side) / sigma_px[axis] for side in (-0.5, 0.5))
+        widen = (near * _bell(near) - far * _bell(far)) / sigma_px[axis]
+        parts.append((ndtr(far) - ndtr(near), (_bell(near) - _bell(far)) / sigma_px[axis], widen))
+        pixels.append(np.clip(pixel + 2 * reach_px, 0, padded.shape[1 - axis] - 1))
+    (x, slope_x, widen_x), (y, slope_y, widen_y) = parts
+    pairs = ((y, x), (y, slope_x), (slope_y, x), (y, widen_x), (widen_y, x))
+    columns = np.stack([v[:, :, None] * u[:, None, :] for v, u in pairs], axis=1).reshape(len(places_px), 5, -1)
+    light = padded[pixels[1][:, :, None], pixels[0][:, None, :]].reshape(len(places_px), -1, 1)
+    fitted = np.linalg.pinv(columns @ columns.transpose(0, 2, 1), hermitian=True) @ (columns @ light)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(fitted[:, 1:, 0] / fitted[:, :1, 0])
+
+
+def refined(image: FloatArray, places_px: FloatArray, sigma_px: tuple[float, float]) -> FloatArray:
+    """Places (n, 2) of stars, px, from their brightest pixels or places well known: all stars' steps at once."""
+    start, shape = places_px, (image.shape[0], image.shape[1])
+    last = np.array([shape[1] - 1, shape[0] - 1])
+    outwards = BEYOND_SIGMAS * np.array(sigma_px)
+    low = np.where(start < 0.5, np.minimum(start, 0) - outwards, start - FARTHEST_PX)
+    high = np.where(start > last - 0.5, np.maximum(start, last) + outwards, start + FARTHEST_PX)
+    for _ in range(PLACE_STEPS):
+        step = np.clip(shifts_px(StarTemplates(places_px, sigma_px, shape).fit(image)), -LARGEST_STEP_PX, LARGEST_STEP_PX)
+        before, places_px = places_px, np.clip(places_px + step, low, high)
+        if np.abs(places_px - before).max(initial=0.0) < LEAST_STEP_PX:
+            break
+    return places_px
+
+
+def shifts_px(fitted: FloatArray) -> FloatArray:
+    """The shifts (n, 2) in a fit, px; 0 for a star without light."""
+    flux = fitted[:, :1]
+    return np.divide(fitted[:, 1:], flux, out=np.zeros_like(fitted[:, 1:]), where=flux > 0)

@@ -1,0 +1,91 @@
+"""A real X.Org server with the dummy driver: monitors with names and refresh rates, gamma ramps, and plugs to pull."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+SERVER_CONFIG = """
+Section "ServerFlags"
+  Option "AutoAddDevices" "false"
+  Option "AutoAddGPU" "false"
+EndSection
+Section "Device"
+  Identifier "card"
+  Driver "dummy"
+  VideoRam 256000
+EndSection
+Section "Monitor"
+  Identifier "first"
+  HorizSync 5-1000
+  VertRefresh 5-200
+  Modeline "640x480" 25.175 640 656 752 800 480 490 492 525
+  Modeline "800x600" 40.0 800 840 968 1056 600 601 605 628
+EndSection
+Section "Screen"
+  Identifier "screen"
+  Device "card"
+  Monitor "first"
+  DefaultDepth 24
+  SubSection "Display"
+    Depth 24
+    Modes "640x480" "800x600"
+    Virtual 1440 600
+  EndSubSection
+EndSection
+"""
+
+
+@dataclass
+class Xorg:
+    """Its DISPLAY, and what xrandr does to it."""
+
+    display: str
+
+    @property
+    def env(self) -> dict[str, str]:
+        env = {**os.environ, "DISPLAY": self.display}
+        env.pop("WAYLAND_DISPLAY", None)
+        return env
+
+    def xrandr(self, *words: str) -> str:
+        result = subprocess.run(["xrandr", *words], env=self.env, capture_output=True, text=True, timeout=20, check=False)
+        assert result.returncode == 0, result.stderr
+        return result.stdout
+
+    def gamma(self, output: str) -> tuple[float, ...]:
+        """The exponents of an output's ramp, as xrandr reads them back from the server."""
+        part = self.xrandr("--verbose").split(f"{output} connected")[1]
+        match = re.search(r"Gamma:\s+([\d.]+):([\d.]+):([\d.]+)", part)
+        assert match is not None
+        return tuple(float(value) for value in match.groups())
+
+
+@contextmanager
+def xorg(folder: Path) -> Iterator[Xorg]:
+    """An X server with one monitor DUMMY0 of 640 x 480 at 59.94 Hz, and a second one DUMMY1 to be switched on."""
+    config, log = folder / "xorg.conf", folder / "xorg.log"
+    config.write_text(SERVER_CONFIG)
+    read, write = os.pipe()
+    command = ["Xorg", "-displayfd", str(write), "-config", str(config), "-logfile", str(log), "-noreset", "-novtswitch"]
+    with (folder / "xorg.out").open("wb") as told:
+        process = subprocess.Popen([*command, "-nolisten", "tcp"], pass_fds=(write,), stdout=told, stderr=told)
+    os.close(write)
+    try:
+        with os.fdopen(read) as number:
+            name = number.readline().strip()
+        assert name, log.read_text() if log.exists() else (folder / "xorg.out").read_text()
+        time.sleep(0.2)
+        server = Xorg(f":{name}")
+        for mode in ("640x480", "800x600"):
+            server.xrandr("--addmode", "DUMMY1", mode)
+        yield server
+    finally:
+        process.terminate()
+        process.wait(timeout=20)

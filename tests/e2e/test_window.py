@@ -16,6 +16,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from hilstar.attitude.quaternion import propagate
+from hilstar.bench.records import frame_records
 from tests.conftest import SMALL_BENCH, run_hilstar
 
 SIZE_PX = (640, 480)
@@ -165,6 +167,29 @@ def test_bit_stealing_reaches_the_screen(server, bench_file):
     assert (codes[..., 0] != codes[..., 2]).any()
     with Shown(server, bench_file) as shown:
         assert (shown.wait_for(codes) == codes).all()
+
+
+def test_a_moving_run_on_the_screen_is_drawn_again_bit_for_bit_without_one(server, bench_file):
+    folder = bench_file.parent
+    rate = np.array([0.01, 0.02, 0.0])
+    q = np.array([float(part) for part in ATTITUDE.split(",")])
+    rows = [propagate(q, rate, k * 0.1) for k in range(11)]
+    lines = [f"{k * 0.1},{','.join(repr(float(v)) for v in row)}" for k, row in enumerate(rows)]
+    (folder / "turn.csv").write_text("\n".join(["t_s,qw,qx,qy,qz", *lines]))
+    env = {**os.environ, "DISPLAY": server.display}
+    ledger = folder / "run.mcap"
+    shown = run_hilstar("replay", bench_file, folder / "turn.csv", "-o", folder / "shown", "--ledger", ledger, env=env)
+    assert shown.returncode == 0, shown.stderr
+    again = run_hilstar("replay", bench_file, ledger, "--headless", "--speed", "max", "-o", folder / "again")
+    assert again.returncode == 0, again.stderr
+    frames = list(frame_records(ledger))
+    assert all(frame.rate is not None for frame in frames)
+    names = sorted(path.name for path in (folder / "shown").glob("*.png"))
+    assert len(names) == len(frames) > 20
+    assert names == sorted(path.name for path in (folder / "again").glob("*.png"))
+    for name in names:
+        one, other = (np.array(Image.open(folder / run / name)) for run in ("shown", "again"))
+        assert (one == other).all()
 
 
 def refused(server: Server, bench_file: Path, *options: str, display: str | None = None) -> tuple[int, str]:

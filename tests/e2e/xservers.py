@@ -57,6 +57,8 @@ class Xorg:
     def xrandr(self, *words: str) -> str:
         result = subprocess.run(["xrandr", *words], env=self.env, capture_output=True, text=True, timeout=20, check=False)
         assert result.returncode == 0, result.stderr
+        if "--output" in words:
+            self.xrandr()  # a query makes the driver look at its plugs
         return result.stdout
 
     def gamma(self, output: str) -> tuple[float, ...]:

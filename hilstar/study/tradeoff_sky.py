@@ -170,7 +170,7 @@ def depth(stack: ExitStack, quick: bool) -> Trials:
     return Trials(
         "depth",
         f"a frame of Orion to codes, {camera.resolution_px[0]} x {camera.resolution_px[1]}",
-        Figure("light of the catalogue lost", "%", 1e-9),
+        Figure("light of the catalogue lost", "%", 0.1),
         Figure("sprites in the frame", "stars"),
         "Hipparcos is complete to about V = 7.5",
         trials,

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 # A work is timed at least so often, and at most so often whatever the budget: more rounds move no median.
 FEWEST_ROUNDS = 3
-MOST_ROUNDS = 300
+MOST_ROUNDS = 500
 
 
 @dataclass(frozen=True, slots=True)

@@ -73,4 +73,3 @@ class VariantRenderer(Renderer):
         self.draw(sprites)
         with self._ctx:
             self._ctx.finish()
-

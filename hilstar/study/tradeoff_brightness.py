@@ -39,6 +39,7 @@ from hilstar.study.models import REDDEST_RELIABLE_VI_MAG, leave_one_out, mag_aga
 from hilstar.study.tradeoff_table import Figure, Trial, Trials
 
 SENSOR = "ccd47-20"
+ADAPTIVE, OWN_SPECTRUM = "adaptive quadrature", "each star's own spectrum"
 COLOURS = 3000
 STEPS_NM = (1.0, 5.0, 10.0, 20.0)
 ORDERS = (1, 2, 3, 4, GAUSS_ORDER)
@@ -63,7 +64,8 @@ def brightness(stack: ExitStack, quick: bool) -> Trials:
     trials = []
     for name, work in works.items():
         error = np.abs(mag_against(work(), exact))
-        trials.append(Trial(name, float(error.max()), float(np.median(error)), work, name == table_name(TABLE_DEGREE)))
+        own, exact_one = name == table_name(TABLE_DEGREE), name == ADAPTIVE
+        trials.append(Trial(name, float(error.max()), float(np.median(error)), work, own, exact_one))
     return Trials(
         "brightness",
         f"{COLOURS} black bodies, any table made anew",
@@ -71,7 +73,7 @@ def brightness(stack: ExitStack, quick: bool) -> Trials:
         Figure("median colour", "mag"),
         "made once, it serves every star of a catalogue, whatever the sensor's curves",
         trials,
-        f"every bench asks for {len(load_catalog())} stars at most, and for each once: this time is paid when a bench is loaded",
+        f"a bench asks for {len(load_catalog())} stars at most, and for each once: this time is paid when it is loaded",
     )
 
 
@@ -87,7 +89,7 @@ def table_name(degree: int) -> str:
 
 def brightness_methods(bv_mag: FloatArray, kelvin: FloatArray, optics: Optics) -> dict[str, Callable[[], FloatArray]]:
     """Every method by name: rates of V = 0 stars, shape (COLOURS,)."""
-    works: dict[str, Callable[[], FloatArray]] = {"adaptive quadrature": partial(adaptive_rates, kelvin, optics)}
+    works: dict[str, Callable[[], FloatArray]] = {ADAPTIVE: partial(adaptive_rates, kelvin, optics)}
     works |= {f"trapezoid, {h:g} nm": partial(rates_by, partial(trapezoid, h), kelvin, optics) for h in STEPS_NM}
     works |= {f"Gauss-Legendre, {n} per knot": partial(rates_by, partial(gauss, n), kelvin, optics) for n in ORDERS}
     works |= {table_name(degree): partial(_table_rates, degree, kelvin, optics) for degree in DEGREES}
@@ -106,10 +108,12 @@ def adaptive_rates(kelvin: FloatArray, optics: Optics) -> FloatArray:
 
     def integral(integrand: Callable[[FloatArray], FloatArray], *curves: Curve) -> FloatArray:
         knots = shared_knots(*curves)
-        value, _ = quad_vec(
-            lambda w: integrand(np.array([w]))[:, 0], knots[0], knots[-1], epsabs=0, epsrel=QUAD, norm="max", points=knots
-        )
-        return np.asarray(value) * 1e-9
+        ends = float(knots[0]), float(knots[-1])
+
+        def at(nm: float) -> FloatArray:
+            return integrand(np.array([nm]))[:, 0]
+
+        return np.asarray(quad_vec(at, *ends, epsabs=0, epsrel=QUAD, norm="max", points=knots)[0]) * 1e-9
 
     return _rates(kelvin, optics, integral)
 
@@ -154,7 +158,7 @@ def shared_knots(*curves: Curve) -> FloatArray:
     """Wavelengths, nm, where one of the curves bends, over the range that all share."""
     low, high = max(c.wavelength_nm[0] for c in curves), min(c.wavelength_nm[-1] for c in curves)
     knots = np.unique(np.concatenate([c.wavelength_nm for c in curves]))
-    return knots[(knots >= low) & (knots <= high)]
+    return np.asarray(knots[(knots >= low) & (knots <= high)])
 
 
 def _table_rates(degree: int, kelvin: FloatArray, optics: Optics) -> FloatArray:
@@ -183,13 +187,14 @@ def spectrum(stack: ExitStack, quick: bool) -> Trials:
     def trial(name: str, rates: FloatArray, work: Callable[[], object], settings: tuple[str, ...]) -> Trial:
         error = np.abs(mag_against(rates, exact))[sure]
         default = (sky.brightness, sky.spectrum, sky.temperature)[: len(settings)]
-        return Trial(name, float(np.percentile(error, 95)), float(np.median(error)), work, settings == default)
+        figures = float(np.percentile(error, 95)), float(np.median(error))
+        return Trial(name, *figures, work, settings == default, name == OWN_SPECTRUM)
 
     by_own = partial(library_electrons_per_s, library, optics, Photometry())
     colours = zero, library.bv_mag, library.vi_mag
     left_out = exact * (1 + leave_one_out(exact))
     trials = [
-        trial("each star's own spectrum", by_own(), by_own, ("dgs", "own")),
+        trial(OWN_SPECTRUM, by_own(), by_own, ("dgs", "own")),
         trial("real spectra by V-I", left_out, partial(real.electrons_per_s, *colours), ("dgs", "pickles")),
     ]
     for scale in TEMPERATURE_SCALES:

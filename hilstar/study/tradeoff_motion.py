@@ -32,6 +32,7 @@ from hilstar.study.tradeoff_table import Figure, Trial, Trials
 
 TRACKER = demo_config().tracker
 CAMERA = monitor_camera(TRACKER.resolution_px, TRACKER.pixel_pitch_um, TRACKER.focal_length_mm, np.array([1.0, 0, 0, 0]))
+SIZE_PX = CAMERA.resolution_px[0]
 RATE_DEG_S = (0.7, -0.7, 5.0)
 EVENLY = (4, 8, 16, 32, 64)
 GAUSS = (8, 16, 24, 32)
@@ -66,11 +67,12 @@ def smear(stack: ExitStack, quick: bool) -> Trials:
         image = _image(sprites_of(few, motion))
         off_px = measure(exact, image, len(exact) // across).centroid_max_px
         work = partial(_draw_path, renderer, sprites_of, many, motion)
-        trials.append(Trial(name, float(np.abs(image - exact).max()), off_px, work, sprites_of is own_sprites))
+        worst, is_exact = float(np.abs(image - exact).max()), name == gauss_name(EXACT_NODES)
+        trials.append(Trial(name, worst, off_px, work, sprites_of is own_sprites, is_exact))
     paths = path_lengths_px(many, motion)
     return Trials(
         "smear",
-        f"linear image of {len(many)} stars, paths of {paths.min():.0f} to {paths.max():.0f} px, {CAMERA.resolution_px[0]} squared",
+        f"linear image of {len(many)} stars, paths of {paths.min():.0f} to {paths.max():.0f} px, {SIZE_PX} px squared",
         Figure("worst pixel's error, share of its star", "1", ROUNDING_SHARE),
         Figure("centroid error, worst", "px"),
         "it keeps its error on paths of any length, where a fixed number does not",
@@ -85,14 +87,19 @@ def smear_methods(stars: Stars, motion: Motion) -> dict[str, SpritesOf]:
     """Every way by name: sprites of stars over an exposure."""
     mean = len(own_sprites(stars, motion)) / len(stars)
     methods: dict[str, SpritesOf] = {f"Gauss-Legendre by length, {mean:.0f} in the mean": own_sprites}
-    methods |= {f"Gauss-Legendre, {count}": partial(gauss_sprites, count) for count in (*GAUSS, EXACT_NODES)}
+    methods |= {gauss_name(count): partial(gauss_sprites, count) for count in (*GAUSS, EXACT_NODES)}
     return methods | {f"evenly in time, {count}": partial(even_sprites, count) for count in EVENLY}
+
+
+def gauss_name(count: int) -> str:
+    """What so many nodes for every star are called."""
+    return f"Gauss-Legendre, {count}"
 
 
 def grid_stars(across: int, motion: Motion) -> Stars:
     """Stars of one electron per second, across^2 of them evenly over the detector in the middle of the exposure."""
-    place = (np.arange(across) + 0.5) * CAMERA.resolution_px[0] / across - 0.5
-    x_px, y_px = (axis.ravel() - (CAMERA.resolution_px[0] - 1) / 2 for axis in np.meshgrid(place, place))
+    place = (np.arange(across) + 0.5) * SIZE_PX / across - 0.5
+    x_px, y_px = (axis.ravel() - (SIZE_PX - 1) / 2 for axis in np.meshgrid(place, place))
     image = np.column_stack([x_px, y_px, np.full(across**2, CAMERA.focal_length_px)])
     vectors = image / np.linalg.norm(image, axis=1, keepdims=True) @ motion.icrs_to_image(MIDDLE_S, CAMERA)[0]
     grid = cell_grid(vectors)

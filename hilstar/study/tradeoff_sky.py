@@ -75,7 +75,8 @@ def projection(stack: ExitStack, quick: bool) -> Trials:
         error, (near, turn) = np.concatenate(errors), views[0]
         work = partial(road.pack, vectors[near], turn, camera)
         # The sprites' own layout says which of them the renderer is handed.
-        trials.append(Trial(name, float(error.max()), float(np.sqrt(np.mean(error**2))), work, road.dtype == SPRITE_DTYPE))
+        figures = float(error.max()), float(np.sqrt(np.mean(error**2)))
+        trials.append(Trial(name, *figures, work, road.dtype == SPRITE_DTYPE, road is EXACT))
     return Trials(
         "projection",
         f"{len(views[0][0])} stars near the field to sprites, {camera.resolution_px[0]} x {camera.resolution_px[1]}",
@@ -150,7 +151,7 @@ def _place_errors_px(
 ) -> FloatArray:
     found = _places(road, vectors, icrs_to_image, bench_camera(demo_config()))
     error = np.hypot(*(found - truth).T).astype(np.float64)
-    return error[np.isfinite(error)]
+    return np.asarray(error[np.isfinite(error)])
 
 
 def depth(stack: ExitStack, quick: bool) -> Trials:
@@ -166,7 +167,8 @@ def depth(stack: ExitStack, quick: bool) -> Trials:
         lost = 100 * (1 - stars.electrons_per_s.sum() / everything) if len(stars) < len(stars_to(NO_LIMIT_V_MAG)) else 0.0
         drawn = len(make_sprites(stars, turn, camera, renderer.footprint_px))
         name = "all of Hipparcos" if limit == NO_LIMIT_V_MAG else f"V to {limit:g}"
-        trials.append(Trial(name, lost, drawn, partial(_frame, renderer, stars, turn, camera), limit == default))
+        work = partial(_frame, renderer, stars, turn, camera)
+        trials.append(Trial(name, lost, drawn, work, limit == default, limit == NO_LIMIT_V_MAG))
     return Trials(
         "depth",
         f"a frame of Orion to codes, {camera.resolution_px[0]} x {camera.resolution_px[1]}",
@@ -174,7 +176,7 @@ def depth(stack: ExitStack, quick: bool) -> Trials:
         Figure("sprites in the frame", "stars"),
         "Hipparcos is complete to about V = 7.5",
         trials,
-        "light that no catalogue has is not in these figures: Hipparcos is complete to V = 7.3 to 9, by place and type (ESA SP-1200)",
+        "stars that Hipparcos lacks are in no figure: it is complete to V = 7.3 to 9, by place and type (ESA SP-1200)",
     )
 
 
@@ -192,8 +194,8 @@ def culling(stack: ExitStack, quick: bool) -> Trials:
     finders: dict[str, tuple[Stars, Finder]] = {
         "scan, every star projected": (stars, _scan),
         "scan of angles": (stars, _scan_angles),
-        **{f"cells of {deg:g} degrees": (in_cells(stars, deg), _by_cells) for deg in sorted({*CELLS_DEG, CELL_DEG})},
-        "cells of 10 degrees, by centres only": (in_cells(stars, 10.0, by_centres=True), _by_cells),
+        **{f"cells of {deg:g} deg": (in_cells(stars, deg), _by_cells) for deg in sorted({*CELLS_DEG, CELL_DEG})},
+        "cells of 10 deg, by centres only": (in_cells(stars, 10.0, by_centres=True), _by_cells),
     }
     trials = []
     for name, (sorted_stars, finder) in finders.items():
@@ -203,7 +205,8 @@ def culling(stack: ExitStack, quick: bool) -> Trials:
             missed += len(wanted - set(sorted_stars.hip[seen].tolist()))
             vain += looked_at - len(wanted)
         work = partial(finder, sorted_stars, turns[0], camera)
-        trials.append(Trial(name, missed, vain / len(turns), work, name == f"cells of {CELL_DEG:g} degrees"))
+        own = name == f"cells of {CELL_DEG:g} deg"
+        trials.append(Trial(name, missed, vain / len(turns), work, own, finder is _scan))
     return Trials(
         "culling",
         f"{len(stars)} stars to the {len(in_view[0])} sprites of Orion",

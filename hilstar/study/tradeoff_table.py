@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -25,13 +25,17 @@ class Figure:
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """A method to be timed: its error and a second figure, in the units of its `Trials`, and the work itself."""
+    """A method to be timed: its error and a second figure, in the units of its `Trials`, and the work itself.
+
+    An exact one is what the others are measured against, or as right as that.
+    """
 
     method: str
     error: float
     second: float
     work: Callable[[], object]
     is_default: bool = False
+    is_exact: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +67,7 @@ class Row:
     time_ms: float
     quartiles_ms: tuple[float, float]
     is_default: bool
+    is_exact: bool
     on_front: bool
     beaten: str = ""
 
@@ -90,8 +95,8 @@ def measured(trials: Trials, budget_s: float) -> Step:
     low, middle, high = np.array([np.percentile(values, (25, 50, 75)) for values in times]).T
     front = pareto_front([max(trial.error, trials.error.floor) for trial in trials.trials], middle)
     rows = [
-        Row(t.method, t.error, t.second, float(middle[k]), (float(low[k]), float(high[k])), t.is_default, bool(front[k]))
-        for k, t in enumerate(trials.trials)
+        Row(t.method, t.error, t.second, float(ms), (float(q1), float(q3)), t.is_default, t.is_exact, bool(on))
+        for t, q1, ms, q3, on in zip(trials.trials, low, middle, high, front, strict=True)
     ]
     rows = [_with_reason(row, rows, trials) if row.is_default and not row.on_front else row for row in rows]
     rows.sort(key=lambda row: row.time_ms)
@@ -130,4 +135,4 @@ def _with_reason(row: Row, rows: Sequence[Row], trials: Trials) -> Row:
     saved = 100 * (1 - best.time_ms / row.time_ms)
     noise = ", and the quartiles of both overlap" if best.quartiles_ms[1] >= row.quartiles_ms[0] else ""
     beaten = f"'{best.method}' is no worse and {saved:.0f} % faster{noise}; {trials.why_default}"
-    return Row(row.method, row.error, row.second, row.time_ms, row.quartiles_ms, row.is_default, row.on_front, beaten)
+    return replace(row, beaten=beaten)

@@ -22,6 +22,7 @@ from hilstar.study.tradeoff_table import Figure, Row, Step, Trials, measured
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+MOST_POWERS = 8
 # In the order of the chain.
 STEPS: tuple[Callable[[ExitStack, bool], Trials], ...] = (
     brightness,
@@ -65,7 +66,7 @@ def run(directory: Path, quick: bool = False) -> list[str]:
             steps.append(measured(plan(stack, quick), QUICK_BUDGET_S if quick else BUDGET_S))
         draw(directory / f"tradeoff_{steps[-1].name}.png", steps[-1], machine)
     write_csv(directory / "tradeoff.csv", COLUMNS, [cells(step, row) for step in steps for row in step.rows])
-    head = f"medians of rounds in turn on {machine}; * none is as right, by the first figure, and as fast, > hilstar's default"
+    head = f"medians on {machine}; * nothing is as right, by the first figure, and as fast; > hilstar's default"
     return [head, *(line for step in steps for line in table_lines(step))]
 
 
@@ -130,9 +131,9 @@ def draw(path: Path, step: Step, machine: str) -> None:
         front = [shown[row.method] for row in step.rows if row.on_front]
         axis.step(*np.array(front).T, where="post", color="C0", lw=1.4, label="front: nothing is as right and as fast")
         for row in step.rows:
-            low, high = row.quartiles_ms
-            axis.plot([low, high], [shown[row.method][1]] * 2, color="0.6", lw=1.0, zorder=2)
-            axis.plot(*shown[row.method], "o", color="C0" if row.on_front else "C7", ms=6, zorder=3)
+            colour = "C0" if row.on_front else "C7"
+            axis.plot(row.quartiles_ms, [shown[row.method][1]] * 2, color=colour, lw=3.5, alpha=0.4, solid_capstyle="butt")
+            axis.plot(*shown[row.method], "o", color=colour, ms=6, zorder=3)
         own = step.default
         axis.plot(*shown[own.method], "o", ms=15, mfc="none", mec="C3", mew=2.0, zorder=4, label="hilstar's default")
         if any(row.error < floor for row in step.rows):
@@ -140,18 +141,21 @@ def draw(path: Path, step: Step, machine: str) -> None:
         axis.set(xscale="log", yscale="log", xlabel=f"median time [ms], bar: quartiles; {machine}")
         axis.set(ylabel=f"{step.error.name} [{step.error.unit}]")
         axis.margins(0.06, 0.08)
-        plain_ticks(axis.xaxis, round_times(*axis.get_xlim()))
+        plain_ticks(axis.xaxis, round_ticks(*axis.get_xlim()))
+        plain_ticks(axis.yaxis, round_ticks(*axis.get_ylim()))
         name_methods(axis, step.rows, shown)
         canvas.legend(loc="outside lower center", ncols=3)
         canvas.suptitle(title_lines(finding(step)), fontsize=12)
         save(canvas, path)
 
 
-def round_times(low_ms: float, high_ms: float) -> list[float]:
-    """Ticks of a logarithmic axis of times: 1, 2 and 5 of each power of ten, over many powers the ones alone."""
-    first, last = math.floor(math.log10(low_ms)), math.ceil(math.log10(high_ms))
-    steps = (1, 2, 5) if last - first <= 3 else (1,)
-    return [step * 10.0**power for power in range(first, last) for step in steps if low_ms <= step * 10.0**power <= high_ms]
+def round_ticks(low: float, high: float) -> list[float]:
+    """Ticks of a logarithmic axis: some of each power of ten, over many powers the ones alone, and not all of them."""
+    first, last = math.floor(math.log10(low)), math.ceil(math.log10(high))
+    steps = (1, 2, 3, 4, 5, 7) if high < 10 * low else (1, 2, 5) if last - first <= 3 else (1,)
+    every = -(-(last - first) // MOST_POWERS)
+    ticks = (step * 10.0**power for power in range(first, last) if power % every == 0 for step in steps)
+    return [tick for tick in ticks if low <= tick <= high]
 
 
 def name_methods(axis: Axes, rows: Sequence[Row], shown: dict[str, tuple[float, float]]) -> None:

@@ -12,6 +12,7 @@ import numpy.typing as npt
 # A work is timed at least so often, and at most so often whatever the budget: more rounds move no median.
 FEWEST_ROUNDS = 3
 MOST_ROUNDS = 500
+SEED = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,18 +105,22 @@ def measured(trials: Trials, budget_s: float) -> Step:
 
 
 def interleaved(works: Sequence[Callable[[], object]], budget_s: float) -> list[list[float]]:
-    """Times of each work, ms, taken in turn so that a noisy machine is noisy to all; slow works drop out of later rounds."""
+    """Times of each work, ms, in rounds so that a noisy machine is noisy to all; slow works drop out of later rounds.
+
+    Each round has its own order: no work always follows the one that leaves the caches and the other cores worst.
+    """
     for work in works:
         work()  # a first call compiles shaders and fills caches
     times: list[list[float]] = [[] for _ in works]
     share_ms = 1e3 * budget_s / len(works)
+    rng = np.random.default_rng(SEED)
     for count in range(MOST_ROUNDS):
-        for work, taken in zip(works, times, strict=True):
-            if count >= FEWEST_ROUNDS and sum(taken) > share_ms:
+        for k in rng.permutation(len(works)):
+            if count >= FEWEST_ROUNDS and sum(times[k]) > share_ms:
                 continue
             begin = time.perf_counter()
-            work()
-            taken.append((time.perf_counter() - begin) * 1e3)
+            works[k]()
+            times[k].append((time.perf_counter() - begin) * 1e3)
     return times
 
 

@@ -23,6 +23,7 @@ from hilstar.study.tradeoff_brightness import trapezoid
 from hilstar.study.tradeoff_light import SIGMA_PX, star_field
 from hilstar.study.tradeoff_sky import LIMITS_V_MAG
 from hilstar.study.tradeoff_table import FEWEST_ROUNDS, Figure, Trial, Trials, interleaved, measured, pareto_front
+from tests.conftest import assert_refused, run_hilstar
 
 NAMES = ["brightness", "spectrum", "depth", "culling", "projection", "prediction", "smear", "psf", "quantisation"]
 # A relative error in magnitudes: 2.5 / ln 10.
@@ -210,3 +211,7 @@ def test_every_step_is_known_and_a_chart_that_cannot_be_written_is_refused(tmp_p
     assert len(STEPS) == len(NAMES)
     with pytest.raises(InputError, match="cannot be written"):
         draw(tmp_path / "no" / "chart.png", measured(planted(clock, 4.0), 0.01), "here")
+
+
+def test_only_the_tradeoff_is_quick(tmp_path):
+    assert_refused(run_hilstar("study", "models", "--quick", "-o", tmp_path), 2, "--quick")

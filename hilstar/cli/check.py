@@ -79,23 +79,26 @@ def simulate_log(
 
 @app.command()
 def study(
-    what: Annotated[Literal["models", "outputs", "stability", "quantisation", "timing"], typer.Argument(help="Which charts.")],
+    what: Annotated[
+        Literal["models", "outputs", "stability", "quantisation", "timing", "tradeoff"], typer.Argument(help="Which charts.")
+    ],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Where they go.")],
+    quick: Annotated[bool, typer.Option("--quick", help="Fewer rounds, where a study takes minutes.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Charts and tables: brightness models, the thesis's outputs, where methods fail, quantisation, a slewing screen."""
+    """Charts and tables: models, the thesis's outputs, where methods fail, codes, a slewing screen, error against time."""
     from hilstar.bench.output import make_directory
 
     make_directory(output)
     with progress(f"study {what}", math.inf):
-        lines, right = study_lines(what, output)
+        lines, right = study_lines(what, output, quick)
     if as_json:
         print_json({"study": what, "right": right, "findings": lines, "directory": str(output)})
     else:
         typer.echo("\n".join([*lines, f"figures and tables in {output}"]))
 
 
-def study_lines(what: str, output: Path) -> tuple[list[str], bool]:
+def study_lines(what: str, output: Path, quick: bool = False) -> tuple[list[str], bool]:
     """Run a study; what it found, and whether everything was right."""
     if what == "models":
         from hilstar.study.models import run as run_models
@@ -108,11 +111,15 @@ def study_lines(what: str, output: Path) -> tuple[list[str], bool]:
     if what == "quantisation":
         from hilstar.study.quantisation import run as run_quantisation
 
-        return run_quantisation(output), True
+        return run_quantisation(output, quick), True
     if what == "timing":
         from hilstar.study.timing import run as run_timing
 
-        return run_timing(output), True
+        return run_timing(output, quick), True
+    if what == "tradeoff":
+        from hilstar.study.tradeoff import run as run_tradeoff
+
+        return run_tradeoff(output, quick), True
     from hilstar.study.stability import run as run_stability
 
     places = run_stability(output)

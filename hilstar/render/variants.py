@@ -1,0 +1,75 @@
+"""Other ways to draw the linear image, for the study of trade-offs: the renderer itself with one part changed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import moderngl
+import numpy as np
+
+from hilstar.render.encoder import build_program
+from hilstar.render.reference import pixel_shares
+from hilstar.render.renderer import FIRST_CAPACITY, Renderer, Target
+from hilstar.scene.sprites import Sprites
+
+Profile = Literal["renderer", "exp erf", "table", "centre"]
+
+
+@dataclass(frozen=True, slots=True)
+class SplatVariant:
+    """What differs from the renderer: the profile, the linear image's texel, the footprint's side; by default nothing.
+
+    `table_size` is the number of samples that the profile `table` interpolates between.
+    """
+
+    profile: Profile = "renderer"
+    half_float: bool = False
+    footprint_px: int | None = None
+    table_size: int = 0
+
+
+class VariantRenderer(Renderer):
+    """A renderer of linear images whose splat is a variant's. Free it with `close`."""
+
+    def __init__(self, target: Target, variant: SplatVariant) -> None:
+        super().__init__(target)
+        self.footprint_px = variant.footprint_px or self.footprint_px
+        with self._ctx:
+            self._vary(variant)
+
+    @property
+    def texel(self) -> str:
+        """The linear image's texel, as GL names it."""
+        return {"f4": "R32F", "f2": "R16F"}[self._linear.dtype]
+
+    def _vary(self, variant: SplatVariant) -> None:
+        if variant.half_float:
+            self._linear = self._ctx.texture(self.target.resolution_px, 1, dtype="f2")
+            self._linear_fbo = self._ctx.framebuffer([self._linear])
+        if variant.profile != "renderer":
+            define = variant.profile.upper().replace(" ", "_")
+            self._splat = build_program(self._ctx, "star.vert", "study/splat.frag", (define,))
+            self._splat["resolution_px"] = self.target.resolution_px
+            if variant.profile == "table":
+                self._load_table(variant.table_size)
+            else:
+                self._splat["sigma_px"] = self.target.sigma_px
+        self._splat["footprint_px"] = self.footprint_px
+        self._reserve(FIRST_CAPACITY)
+
+    def _load_table(self, size: int) -> None:
+        """Shares along x and y, the two channels of one row, from a star's centre to past its footprint's edge."""
+        reach_px = self.footprint_px / 2 + 1
+        offset_px = np.linspace(0, reach_px, size)
+        shares = np.stack([pixel_shares(offset_px, sigma) for sigma in self.target.sigma_px], axis=-1).astype(np.float32)
+        self._table = self._ctx.texture((size, 1), 2, shares.tobytes(), dtype="f4")
+        self._table.filter = (moderngl.NEAREST, moderngl.NEAREST)
+        self._table.use(0)
+        self._splat["samples_per_px"] = (size - 1) / reach_px
+
+    def draw_and_wait(self, sprites: Sprites) -> None:
+        """Draw the linear image of `sprites`, and return when it is there."""
+        self.draw(sprites)
+        with self._ctx:
+            self._ctx.finish()

@@ -1,0 +1,143 @@
+"""Methods of one step of the chain: their errors, their times side by side, and which of them no other beats."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+# A work is timed at least so often, and at most so often whatever the budget: more rounds move no median.
+FEWEST_ROUNDS = 3
+MOST_ROUNDS = 500
+SEED = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """What is measured of a method: a name and its unit; figures under `floor` count as none at all."""
+
+    name: str
+    unit: str
+    floor: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """A method to be timed: its error and a second figure, in the units of its `Trials`, and the work itself.
+
+    An exact one is what the others are measured against, or as right as that.
+    """
+
+    method: str
+    error: float
+    second: float
+    work: Callable[[], object]
+    is_default: bool = False
+    is_exact: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Trials:
+    """All methods of a step; `work` says what is timed, `why_default` why the default stands where another beats it.
+
+    `remark` is what the figures alone would hide.
+    """
+
+    name: str
+    work: str
+    error: Figure
+    second: Figure
+    why_default: str
+    trials: Sequence[Trial]
+    remark: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A method as measured: median time and its quartiles, ms; `on_front` where none is as right and as fast.
+
+    `beaten` says by what the default is beaten, and why it stays the default; empty for all others.
+    """
+
+    method: str
+    error: float
+    second: float
+    time_ms: float
+    quartiles_ms: tuple[float, float]
+    is_default: bool
+    is_exact: bool
+    on_front: bool
+    beaten: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """A step of the chain with a row for each method, the fastest first."""
+
+    name: str
+    work: str
+    error: Figure
+    second: Figure
+    rows: tuple[Row, ...]
+    remark: str = ""
+
+    @property
+    def default(self) -> Row:
+        """The row of the method that hilstar takes."""
+        return next(row for row in self.rows if row.is_default)
+
+
+def measured(trials: Trials, budget_s: float) -> Step:
+    """Time the methods of a step in interleaved rounds, and mark the front."""
+    times = interleaved([trial.work for trial in trials.trials], budget_s)
+    low, middle, high = np.array([np.percentile(values, (25, 50, 75)) for values in times]).T
+    front = pareto_front([max(trial.error, trials.error.floor) for trial in trials.trials], middle)
+    rows = [
+        Row(t.method, t.error, t.second, float(ms), (float(q1), float(q3)), t.is_default, t.is_exact, bool(on))
+        for t, q1, ms, q3, on in zip(trials.trials, low, middle, high, front, strict=True)
+    ]
+    rows = [_with_reason(row, rows, trials) if row.is_default and not row.on_front else row for row in rows]
+    rows.sort(key=lambda row: row.time_ms)
+    return Step(trials.name, trials.work, trials.error, trials.second, tuple(rows), trials.remark)
+
+
+def interleaved(works: Sequence[Callable[[], object]], budget_s: float) -> list[list[float]]:
+    """Times of each work, ms, in rounds so that a noisy machine is noisy to all; slow works drop out of later rounds.
+
+    Each round has its own order: no work always follows the one that leaves the caches and the other cores worst.
+    """
+    for work in works:
+        work()  # a first call compiles shaders and fills caches
+    times: list[list[float]] = [[] for _ in works]
+    share_ms = 1e3 * budget_s / len(works)
+    rng = np.random.default_rng(SEED)
+    for count in range(MOST_ROUNDS):
+        for k in rng.permutation(len(works)):
+            if count >= FEWEST_ROUNDS and sum(times[k]) > share_ms:
+                continue
+            begin = time.perf_counter()
+            works[k]()
+            times[k].append((time.perf_counter() - begin) * 1e3)
+    return times
+
+
+def pareto_front(errors: Sequence[float], times_ms: Sequence[float] | npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
+    """Which methods (n,) are beaten by no other: none has an error and a time as small, and one of them smaller."""
+    error, spent = np.asarray(errors, dtype=np.float64), np.asarray(times_ms, dtype=np.float64)
+    as_good = (error <= error[:, None]) & (spent <= spent[:, None])
+    better = (error < error[:, None]) | (spent < spent[:, None])
+    return np.asarray(~(as_good & better).any(axis=1))
+
+
+def _with_reason(row: Row, rows: Sequence[Row], trials: Trials) -> Row:
+    """The default's row, with the fastest method that beats it and why it stays."""
+    floor = trials.error.floor
+    beating = [r for r in rows if max(r.error, floor) <= max(row.error, floor) and r.time_ms <= row.time_ms and r is not row]
+    best = min(beating, key=lambda r: r.time_ms)
+    saved = 100 * (1 - best.time_ms / row.time_ms)
+    noise = ", and the quartiles of both overlap" if best.quartiles_ms[1] >= row.quartiles_ms[0] else ""
+    beaten = f"'{best.method}' is no worse and {saved:.0f} % faster{noise}; {trials.why_default}"
+    return replace(row, beaten=beaten)

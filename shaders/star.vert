@@ -8,6 +8,12 @@ in float electrons_per_s;
 
 uniform ivec2 resolution_px;
 uniform int footprint_px;
+// Fainter stars may have smaller sprites: that of side_px[k] where the star's rate is under below_e_per_s[k], falling.
+const int MOST_SIDES = 8;
+uniform int sides;
+uniform int side_px[MOST_SIDES];
+uniform float below_e_per_s[MOST_SIDES];
+uniform float sprites_per_star;
 
 flat out ivec2 star_pixel;
 flat out vec2 star_fraction_px;
@@ -20,5 +26,7 @@ void main() {
     // The viewport reaches footprint_px beyond every edge, for GL drops a point whose centre is outside it.
     vec2 centre_px = vec2(pixel) + (footprint_px % 2 == 1 ? 0.5 : 1.0);
     gl_Position = vec4(2.0 * (centre_px + float(footprint_px)) / vec2(resolution_px + 2 * footprint_px) - 1.0, 0.0, 1.0);
-    gl_PointSize = float(footprint_px);
+    int side = footprint_px;
+    for (int k = 0; k < sides && electrons_per_s * sprites_per_star < below_e_per_s[k]; k++) side = side_px[k];
+    gl_PointSize = float(side);
 }

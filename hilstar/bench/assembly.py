@@ -14,11 +14,13 @@ from typing import Self
 import msgspec
 import numpy as np
 import numpy.typing as npt
+from msgspec.structs import replace
 
 from hilstar.arrays import Float32Array, FloatArray, IntArray
 from hilstar.attitude.protocol import NORM_TOLERANCE
 from hilstar.attitude.quaternion import normalise, to_matrix
 from hilstar.bench.config import BenchConfig, SkySettings, Tracker, Vector, read_config
+from hilstar.bench.effort import Effort, Light, faintest_shown_e_per_s, plan_effort
 from hilstar.bench.mounting import scan_of
 from hilstar.errors import InputError
 from hilstar.monitor.calibration import BUILT_IN, Calibration, load_calibration
@@ -114,31 +116,44 @@ class Bench:
         )
         self.calibration = bench_calibration(self.config, path.parent)
         self.uniformity = self.calibration.uniformity_map(self.config.monitor.resolution_px)
+        self._plan()
         self.shown_stars = brighter_stars(self.stars, self.faintest_shown_e_per_s())
         self.scan = scan_of(self.config.monitor)
         self._warn_of_cycle()
+        self.renderer = Renderer(self._target(), context)
+
+    def _plan(self) -> None:
+        """Choose what the bench file leaves to its tolerance."""
         render = self.config.render
-        self.renderer = Renderer(
-            Target(
-                resolution_px=self.config.monitor.resolution_px,
-                sigma_px=self._sigma_px,
-                response=self.calibration.response,
-                flux_at_white_e_per_s=self.flux_at_white_e_per_s,
-                quantisation=render.quantisation,
-                uniformity=self.uniformity,
-                cycle_frames=render.cycle_frames,
-            ),
-            context,
+        self.effort: Effort | None = None
+        if render.effort == "auto" or render.quantisation == "auto":
+            self.effort = plan_effort(render, self._light())
+            chosen = replace(render, quantisation=self.effort.quantisation, motion_above_px=self.effort.motion_above_px)
+            self.config = replace(self.config, render=chosen)
+
+    def _target(self) -> Target:
+        render = self.config.render
+        if render.quantisation == "auto":
+            raise AssertionError("the plan has chosen")
+        return Target(
+            resolution_px=self.config.monitor.resolution_px,
+            sigma_px=self._sigma_px,
+            response=self.calibration.response,
+            flux_at_white_e_per_s=self.flux_at_white_e_per_s,
+            quantisation=render.quantisation,
+            uniformity=self.uniformity,
+            cycle_frames=render.cycle_frames,
+            sides=() if self.effort is None else self.effort.sides,
         )
 
     def faintest_shown_e_per_s(self) -> float:
         """The rate under which a star alone never lights a pixel, wherever it stands; 0 where the dither always may."""
-        response, quantisation = self.calibration.response, self.config.render.quantisation
+        return faintest_shown_e_per_s(self.config.render.quantisation, self._light(), self._sigma_px)
+
+    def _light(self) -> Light:
         # Vignetting asks for more from a pixel: where the screen is darkest a fainter star gets a code.
-        white = self.flux_at_white_e_per_s * (1.0 if self.uniformity is None else float(self.uniformity.min()))
-        if quantisation == "round":
-            return float(response.threshold[0]) * white / peak_share(self._sigma_px)
-        return float(response.light[1]) / 2 * white if quantisation == "exact" else 0.0
+        least = 1.0 if self.uniformity is None else float(self.uniformity.min())
+        return Light(self.calibration.response, self.flux_at_white_e_per_s * least, self.stars.electrons_per_s)
 
     def _warn_of_cycle(self) -> None:
         render, refresh_hz = self.config.render, self.config.monitor.refresh_hz
@@ -206,8 +221,8 @@ class Bench:
         sprites = self.sprites(q, self.stars)
         self.renderer.draw(self.sprites(q), number)
         levels = self.renderer.codes().copy()
-        if self.shown_stars is not self.stars:
-            self.renderer.draw(sprites, number)
+        if self.shown_stars is not self.stars or self.renderer.target.sides:
+            self.renderer.draw(sprites, number, whole=True)
         linear = self.renderer.linear().copy()
         truth = truth_table(self.stars, sprites.star, sprites.x_px, sprites.y_px)
         truth["drawn"] = truth["electrons_per_s"] >= self.faintest_shown_e_per_s()

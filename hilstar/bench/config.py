@@ -140,12 +140,15 @@ class AttitudeSettings(_Table, frozen=True):
 class RenderSettings(_Table, frozen=True):
     """[render]: from electrons to codes."""
 
-    quantisation: Literal["round", "dither", "temporal", "exact"] = "round"
+    quantisation: Literal["round", "dither", "temporal", "exact", "auto"] = "round"
     bit_stealing: bool = False
     cycle_frames: Literal[1, 2, 4, 8, 16, 32, 64, 128, 256] = 8
     sprite_sigma_px: Sigma = (0.85, 0.85)
     flux_at_white_e_per_s: Positive | None = None
     brightest_v_mag: Magnitude | None = None
+    effort: Literal["full", "auto"] = "full"
+    tolerance_mag: Positive = 0.02
+    tolerance_px: Positive = 0.02
     motion: Literal["auto", "on", "off"] = "auto"
     motion_above_px: NotNegative = 0.01
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -77,11 +78,12 @@ def simulate_log(
     typer.echo(f"{len(motions)} exposures in {output}")
 
 
+Study = Literal["models", "outputs", "stability", "quantisation", "timing", "tradeoff", "economy"]
+
+
 @app.command()
 def study(
-    what: Annotated[
-        Literal["models", "outputs", "stability", "quantisation", "timing", "tradeoff"], typer.Argument(help="Which charts.")
-    ],
+    what: Annotated[Study, typer.Argument(help="Which charts.")],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Where they go.")],
     quick: Annotated[bool, typer.Option("--quick", help="Fewer rounds, where a study takes minutes.")] = False,
     as_json: Json = False,
@@ -100,31 +102,16 @@ def study(
 
 def study_lines(what: str, output: Path, quick: bool = False) -> tuple[list[str], bool]:
     """Run a study; what it found, and whether everything was right."""
+    study_of = import_module(f"hilstar.study.{what}")
     if what == "models":
-        from hilstar.study.models import run as run_models
-
-        return [f"{finding.figure}: {finding.text}" for finding in run_models(output)], True
-    if what == "outputs":
-        from hilstar.study.outputs import run as run_outputs
-
-        return run_outputs(output), True
-    if what == "quantisation":
-        from hilstar.study.quantisation import run as run_quantisation
-
-        return run_quantisation(output, quick), True
-    if what == "timing":
-        from hilstar.study.timing import run as run_timing
-
-        return run_timing(output, quick), True
-    if what == "tradeoff":
-        from hilstar.study.tradeoff import run as run_tradeoff
-
-        return run_tradeoff(output, quick), True
-    from hilstar.study.stability import run as run_stability
-
-    places = run_stability(output)
-    lines = [f"{'right' if p.right else 'WRONG'}  {p.case}: {p.happens} ({p.why}); not {p.method}: {p.fails}" for p in places]
-    return lines, all(place.right for place in places)
+        return [f"{finding.figure}: {finding.text}" for finding in study_of.run(output)], True
+    if what == "stability":
+        places = study_of.run(output)
+        lines = [
+            f"{'right' if p.right else 'WRONG'}  {p.case}: {p.happens} ({p.why}); not {p.method}: {p.fails}" for p in places
+        ]
+        return lines, all(place.right for place in places)
+    return study_of.run(output) if what == "outputs" else study_of.run(output, quick), True
 
 
 @app.command()

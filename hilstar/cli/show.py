@@ -17,6 +17,7 @@ from hilstar.errors import InputError
 
 Windowed = Annotated[bool, typer.Option("--windowed", help="A window on the desk instead of the whole display.")]
 Force = Annotated[bool, typer.Option("--force", help="Show on a display that the start-up gate refuses; logged.")]
+Explain = Annotated[bool, typer.Option("--explain", help="What was chosen for the scene, its error and saving, on stderr.")]
 LedgerFile = Annotated[Path | None, typer.Option("--ledger", metavar="RUN.mcap", help="Keep every packet and frame there.")]
 
 
@@ -46,6 +47,7 @@ def frame(
     truth: Annotated[Path | None, typer.Option(metavar="OUT.csv", help="A row for each star in view.")] = None,
     codes: Annotated[Path | None, typer.Option(metavar="OUT.png", help="The code values.")] = None,
     preview: Annotated[Path | None, typer.Option(metavar="OUT.png", help="A stretched picture for a person.")] = None,
+    explain: Explain = False,
     as_json: Json = False,
 ) -> None:
     """Draw one frame into files."""
@@ -57,6 +59,8 @@ def frame(
     if not targets:
         raise InputError("frame: nothing to write; add -o OUT.fits, --truth OUT.csv or --codes OUT.png")
     with load(bench_file) as bench:
+        if explain:
+            explain_effort(bench)
         shot = bench.frame(q)
         if output is not None:
             files.write_frame_fits(output, bench, shot)
@@ -87,6 +91,14 @@ def frame(
         if missing["stars"]:
             names += f", {missing['stars']} too faint to show ({missing['flux_share']:.2%} of all light)"
         typer.echo(f"{len(shot.truth)} stars{names}; wrote {', '.join(summary['written'])}")
+
+
+def explain_effort(bench: Any) -> None:
+    """Say what was chosen within the bench file's tolerance."""
+    from hilstar.bench.effort import explain
+
+    for line in explain(bench.effort, bench.config.render):
+        say(line)
 
 
 @contextmanager
@@ -127,6 +139,7 @@ def serve(
     ledger: LedgerFile = None,
     windowed: Windowed = False,
     force: Force = False,
+    explain: Explain = False,
     as_json: Json = False,
 ) -> None:
     """Show the live attitude stream."""
@@ -140,6 +153,8 @@ def serve(
         shown_bench(bench_file, headless, windowed, force) as (bench, screen),
         optional_ledger(ledger, bench) as kept,
     ):
+        if explain:
+            explain_effort(bench)
         refresh_hz = bench.config.monitor.refresh_hz
         slots = math.inf if duration is None else round(duration * refresh_hz)
         limit = Limit(slots, math.inf if frames is None else frames)
@@ -162,6 +177,7 @@ def replay(
     ledger: LedgerFile = None,
     windowed: Windowed = False,
     force: Force = False,
+    explain: Explain = False,
     as_json: Json = False,
 ) -> None:
     """Show an attitude log."""
@@ -178,6 +194,8 @@ def replay(
         optional_ledger(ledger, bench) as kept,
         progress("replaying", play.frame_count) as advance,
     ):
+        if explain:
+            explain_effort(bench)
 
         def sink(shown: Any) -> None:
             record(shown)

@@ -8,6 +8,7 @@ import moderngl
 import numpy as np
 import numpy.typing as npt
 
+from hilstar.errors import InputError
 from hilstar.monitor.blue_noise import blue_noise
 from hilstar.monitor.level_table import CodeTable, code_table
 from hilstar.monitor.photometry import Codes
@@ -25,6 +26,22 @@ def build_program(ctx: moderngl.Context, vertex: str, fragment: str, defines: tu
         vertex_shader=resource_path("shaders", vertex).read_text(),
         fragment_shader="\n".join(lines),
     )
+
+
+SpriteSides = tuple[tuple[float, int], ...]
+MOST_SIDES = 8  # as in star.vert
+
+
+def set_sides(program: moderngl.Program, sides: SpriteSides) -> None:
+    """Give stars under each rate (electrons per second, falling) sprites of that side, px, in a program of star.vert.
+
+    Raises InputError for more sides than the shader has room for.
+    """
+    if len(sides) > MOST_SIDES:
+        raise InputError(f"{len(sides)} sizes of sprites; {MOST_SIDES} at most")
+    padded = [*sides, *[(0.0, 0)] * (MOST_SIDES - len(sides))]
+    program["sides"] = len(sides)
+    program["below_e_per_s"], program["side_px"] = ([*values] for values in zip(*padded, strict=True))
 
 
 class LevelTexture:
@@ -101,16 +118,21 @@ class Encoder:
         return texture
 
     def take_places_from(self, buffer: moderngl.Buffer, footprint_px: int) -> None:
-        """Use a buffer of SPRITE_DTYPE, of which only the pixels are read here."""
+        """Use a buffer of SPRITE_DTYPE, of which places and rates are read here."""
         if self._sprite_vao is not None:
             self._sprite_vao.release()
-        self._sprite_vao = self._ctx.vertex_array(self._sprites, [(buffer, "2i 12x", "pixel")])
+        self._sprite_vao = self._ctx.vertex_array(self._sprites, [(buffer, "2i 8x 1f", "pixel", "electrons_per_s")])
         self._sprites["footprint_px"] = self._footprint_px = footprint_px
 
-    def draw(self, count: int, shift: float = 0.0) -> None:
+    def shrink(self, sides: SpriteSides) -> None:
+        """Encode fainter stars' smaller sprites only."""
+        set_sides(self._sprites, sides)
+
+    def draw(self, count: int, per_star: int, covered_px: int, shift: float = 0.0) -> None:
         """Encode the linear image under the first `count` sprites of the buffer; the rest is black.
 
-        `shift` turns the mask of a dithering encoder.
+        `shift` turns the mask of a dithering encoder, `per_star` sprites are each star's, and together they cover
+        `covered_px`: where that is the whole image, so is the pass.
         """
         width, height = self._size_px
         self._fbo.use()
@@ -118,12 +140,13 @@ class Encoder:
             texture.use(unit)
         if self._dithered:
             self._sprites["shift"] = self._whole["shift"] = shift
-        if count * self._footprint_px**2 >= width * height:
+        if covered_px >= width * height:
             self._fbo.viewport = (0, 0, width, height)
             self._whole_vao.render(moderngl.TRIANGLES, vertices=3)
             return
         self._fbo.clear()
         if count and self._sprite_vao is not None:
+            self._sprites["sprites_per_star"] = float(per_star)
             margin = self._footprint_px
             self._fbo.viewport = (-margin, -margin, width + 2 * margin, height + 2 * margin)
             self._sprite_vao.render(moderngl.POINTS, vertices=count)

@@ -17,7 +17,7 @@ from hilstar.errors import InputError, MachineError
 from hilstar.monitor.exact import ExactQuantiser
 from hilstar.monitor.photometry import Codes, Response
 from hilstar.monitor.quantise import CYCLE_FRAMES, Panel, Quantisation, frame_shift
-from hilstar.render.encoder import Encoder, LevelTexture, build_program
+from hilstar.render.encoder import Encoder, LevelTexture, SpriteSides, build_program, set_sides
 from hilstar.scene.psf import SQRT2, footprint_px
 from hilstar.scene.sprites import SPRITE_DTYPE, Sprites
 
@@ -32,7 +32,8 @@ class Target:
     """What the renderer draws for: an image's pixels, its sprites, and a monitor's response where codes are wanted.
 
     `uniformity` float32 (height, width) is each pixel's light relative to the response (None: 1 everywhere), and
-    `cycle_frames`, a power of two, is for `temporal` alone.
+    `cycle_frames`, a power of two, is for `temporal` alone. Stars under each rate of `sides` (electrons per second, falling)
+    get sprites of that side, px, of the same parity as the footprint.
     """
 
     resolution_px: tuple[int, int]
@@ -42,6 +43,7 @@ class Target:
     quantisation: Quantisation = "round"
     uniformity: Float32Array | None = None
     cycle_frames: int = CYCLE_FRAMES
+    sides: SpriteSides = ()
 
     def panel(self) -> Panel | None:
         """What turns light into levels, None without a response. Raises InputError for a map that does not fit."""
@@ -72,6 +74,7 @@ class Renderer:
     def __init__(self, target: Target, context: Context | None = None) -> None:
         self.target = target
         self.footprint_px = footprint_px(target.sigma_px)
+        self._undrawn: tuple[Sprites | None, bool] | None = None
         self._ctx = context or create_context()
         try:
             with self._ctx:
@@ -107,6 +110,7 @@ class Renderer:
         self._splat["inverse_sigma_sqrt2"] = tuple(1 / (sigma * SQRT2) for sigma in target.sigma_px)
         self._splat["resolution_px"] = target.resolution_px
         self._splat["footprint_px"] = self.footprint_px
+        set_sides(self._splat, target.sides)
         self._build_levels()
         self._reserve(FIRST_CAPACITY)
         width, height = target.resolution_px
@@ -127,6 +131,7 @@ class Renderer:
         else:
             dithered = target.quantisation != "round"
             self._encoder = Encoder(self._ctx, self._linear, self._levels, panel, dithered)
+            self._encoder.shrink(target.sides)
 
     def _reserve(self, sprites: int) -> None:
         """Room for so many sprites on the GPU; grows by doubling, never shrinks."""
@@ -137,22 +142,37 @@ class Renderer:
         if self._encoder is not None:
             self._encoder.take_places_from(self._buffer, self.footprint_px)
 
-    def draw(self, sprites: Sprites | None, frame: int = 0) -> None:
+    def draw(self, sprites: Sprites | None, frame: int = 0, whole: bool = False) -> None:
         """Draw the linear image and the codes of `sprites` (None: blank); read them with `linear` and `codes`.
 
-        `frame` counts the frames shown, for `temporal` alone.
+        `frame` counts the frames shown, for `temporal` alone. With `whole` no sprite is smaller than the footprint.
         """
-        count = 0 if sprites is None else len(sprites)
         with self._ctx:
-            if sprites is not None and count:
-                self._upload(sprites)
-            self._draw_linear(count)
-            if self._encoder is not None:
-                temporal = self.target.quantisation == "temporal"
-                self._encoder.draw(count, frame_shift(frame, self.target.cycle_frames) if temporal else 0.0)
-            elif self._exact is not None and self._levels is not None:
+            if self._exact is not None and self._levels is not None:
+                # These levels come from the sprites themselves: the linear image is drawn when somebody asks for it.
                 self._exact_levels = self._exact.levels(sprites)
                 self._levels.write(self._exact_levels)
+                self._undrawn = (sprites, whole)
+                return
+            self._draw_linear(sprites, whole)
+            if self._encoder is not None:
+                self._encode(self._encoder, sprites, frame)
+
+    def _encode(self, encoder: Encoder, sprites: Sprites | None, frame: int) -> None:
+        temporal = self.target.quantisation == "temporal"
+        shift = frame_shift(frame, self.target.cycle_frames) if temporal else 0.0
+        count, per_star = (0, 1) if sprites is None else (len(sprites), sprites.per_star)
+        encoder.draw(count, per_star, self._covered_px(sprites), shift)
+
+    def _covered_px(self, sprites: Sprites | None) -> int:
+        """Pixels of all sprites together."""
+        if sprites is None:
+            return 0
+        if not self.target.sides:
+            return len(sprites) * self.footprint_px**2
+        rates, widths = zip(*reversed(self.target.sides), strict=True)
+        place = np.searchsorted(rates, sprites.data["electrons_per_s"] * np.float32(sprites.per_star), side="right")
+        return int(np.square([*widths, self.footprint_px])[place].sum())
 
     def _upload(self, sprites: Sprites) -> None:
         if len(sprites) > self._capacity:
@@ -162,15 +182,20 @@ class Renderer:
         self._buffer.orphan()
         self._buffer.write(sprites.data)
 
-    def _draw_linear(self, count: int) -> None:
+    def _draw_linear(self, sprites: Sprites | None, whole: bool) -> None:
+        self._undrawn = None
+        if sprites is not None and len(sprites):
+            self._upload(sprites)
         self._linear_fbo.use()
         self._linear_fbo.clear()
-        if count:
+        if sprites is not None and len(sprites):
+            self._splat["sides"] = 0 if whole else len(self.target.sides)
+            self._splat["sprites_per_star"] = float(sprites.per_star)
             width, height = self.target.resolution_px
             margin = self.footprint_px
             self._linear_fbo.viewport = (-margin, -margin, width + 2 * margin, height + 2 * margin)
             self._ctx.enable(moderngl.BLEND)
-            self._splat_vao.render(moderngl.POINTS, vertices=count)
+            self._splat_vao.render(moderngl.POINTS, vertices=len(sprites))
             self._ctx.disable(moderngl.BLEND)
 
     def codes(self) -> Codes:
@@ -199,6 +224,8 @@ class Renderer:
     def linear(self) -> Float32Array:
         """The linear image of the last draw, electrons per second, float32 (height, width); overwritten as `codes`."""
         with self._ctx:
+            if self._undrawn is not None:
+                self._draw_linear(*self._undrawn)
             self._linear_fbo.read_into(self._linear_image, components=1, dtype="f4", alignment=1)
         return self._linear_image
 

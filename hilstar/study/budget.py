@@ -14,11 +14,11 @@ import numpy as np
 
 from hilstar.bench.assembly import Bench
 from hilstar.bench.simulation import ARCSEC_PER_RAD
+from hilstar.monitor.phases import WHITE, fainter, measure, phase_grid, shown_by
 from hilstar.monitor.quantise import Panel
 from hilstar.render.reference import linear_image
 from hilstar.scene.psf import peak_share
 from hilstar.study.charts import chart, write_csv
-from hilstar.study.quantisation import WHITE, fainter, measure, phase_grid, shown_by
 
 PHASES = 16
 STEP_MAG = 0.5
@@ -128,7 +128,7 @@ def _rows(bench: Bench, clips_v_mag: float) -> list[Row]:
     for mag in np.arange(0.0, FAINTEST_BELOW_WHITE_MAG + STEP_MAG / 2, STEP_MAG):
         wanted = bright * 10 ** (-0.4 * mag)
         linear = wanted.astype(np.float32)
-        shown = shown_by(render.quantisation, cycle, panel, linear, fainter(sprites, float(mag)), sigma_px)
+        shown = shown_by(bench.renderer.target.quantisation, cycle, panel, linear, fainter(sprites, float(mag)), sigma_px)
         errors = measure(wanted, shown, tile)
         rows.append(
             Row(

@@ -9,30 +9,24 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hilstar.arrays import Float32Array, FloatArray
-from hilstar.monitor.exact import ExactQuantiser
+from hilstar.arrays import FloatArray
+from hilstar.monitor.phases import SIGMA_PX, WHITE, Errors, fainter, measure, phase_grid, shown_by
 from hilstar.monitor.photometry import Response, Weights, bit_stealing, srgb_response
 from hilstar.monitor.quantise import (
     CYCLE_FRAMES,
     Panel,
     Quantisation,
-    dither_levels,
-    round_levels,
-    shown_light,
-    temporal_levels,
 )
 from hilstar.render.reference import linear_image
 from hilstar.render.renderer import Renderer, Target
 from hilstar.scene.psf import footprint_px, peak_share
-from hilstar.scene.sprites import Sprites, pack_sprites
+from hilstar.scene.sprites import pack_sprites
 from hilstar.study.charts import STYLE, plain_ticks, save, title_lines, write_csv
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-SIGMA_PX = (0.85, 0.85)
 BITS = (8, 10, 12)
-WHITE = 1.0
 # The issue's aims: magnitudes of flux error, and over how many magnitudes, by bits.
 AIMS = {8: (0.05, 6.0), 10: (0.02, 8.0), 12: (0.02, 8.0)}
 AIM_PX = 0.01
@@ -65,16 +59,6 @@ WAYS = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class Errors:
-    """Over all phases: rms and largest flux error, mag, and centroid error, px; infinite where a star showed nothing."""
-
-    flux_rms_mag: float
-    flux_max_mag: float
-    centroid_rms_px: float
-    centroid_max_px: float
-
-
 def run(directory: Path, quick: bool = False) -> list[str]:
     """Write both charts (PNG) and their tables (CSV) into `directory`; a line for each finding."""
     phases, mags = (8, np.linspace(0, 8, 5)) if quick else (32, np.linspace(0, 10, 41))
@@ -103,57 +87,6 @@ def response_of(bits: int, way: Way) -> Response:
     """The sRGB response of a way; with bit stealing, of three equal channels."""
     grey = srgb_response(bits)
     return bit_stealing((grey, grey, grey), STEALING_WEIGHTS) if way.stealing else grey
-
-
-def phase_grid(count: int, sigma_px: tuple[float, float] = SIGMA_PX) -> tuple[Sprites, int]:
-    """count^2 stars whose peak would be white at the middle of a pixel, one to a tile, at every phase; the tile's side, px."""
-    tile = footprint_px(sigma_px) + 2
-    place = (np.arange(count) + 0.5) * tile + (np.arange(count) + 0.5) / count - 0.5
-    x_px, y_px = (axis.ravel() for axis in np.meshgrid(place, place))
-    flux = np.full(count**2, WHITE / peak_share(sigma_px))
-    frame = ((count * tile, count * tile), footprint_px(sigma_px))
-    return pack_sprites(x_px, y_px, flux, np.arange(count**2), frame), tile
-
-
-def fainter(sprites: Sprites, mag: float) -> Sprites:
-    """The same stars, so many magnitudes fainter."""
-    data = sprites.data.copy()
-    data["electrons_per_s"] *= 10 ** (-0.4 * mag)
-    return Sprites(data, sprites.footprint_px, sprites.star, sprites.x_px, sprites.y_px)
-
-
-def measure(wanted: FloatArray, shown: FloatArray, tile: int) -> Errors:
-    """The errors of each tile of two images, which hold a star each."""
-    light, x_px, y_px = _sums(wanted, tile)
-    lit, lit_x_px, lit_y_px = _sums(shown, tile)
-    with np.errstate(divide="ignore"):
-        flux = np.abs(2.5 * np.log10(lit / light))
-    off = np.where(lit > 0, np.hypot(lit_x_px - x_px, lit_y_px - y_px), np.inf)
-    rms = (float(np.sqrt(np.mean(np.square(error)))) for error in (flux, off))
-    return Errors(next(rms), float(flux.max()), next(rms), float(off.max()))
-
-
-def _sums(image: FloatArray, tile: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Light and centroid (x, y), px, of each tile; the centroid is 0 where there is no light."""
-    count = len(image) // tile
-    tiles = image.reshape(count, tile, count, tile).transpose(0, 2, 1, 3)
-    light = tiles.sum(axis=(2, 3))
-    at, divisor = np.arange(tile), np.where(light > 0, light, 1.0)
-    return light, tiles.sum(axis=2) @ at / divisor, tiles.sum(axis=3) @ at / divisor
-
-
-def shown_by(
-    method: Quantisation, cycle_frames: int, panel: Panel, linear: Float32Array, sprites: Sprites, sigma_px: tuple[float, float]
-) -> FloatArray:
-    """The light (h, w) that a method makes of a linear image, as a tracker sees it that exposes for `cycle_frames`."""
-    if method == "exact":
-        size = linear.shape[1], linear.shape[0]
-        return shown_light(ExactQuantiser(panel, size, sigma_px).levels(sprites), panel)
-    if method == "temporal" and cycle_frames > 1:
-        frames = [shown_light(temporal_levels(linear, panel, k, cycle_frames), panel) for k in range(cycle_frames)]
-        return np.asarray(np.mean(frames, axis=0))
-    levels = round_levels if method == "round" else dither_levels
-    return shown_light(levels(linear, panel), panel)
 
 
 def _against_magnitude(bits: int, way: Way, phases: int, mags: FloatArray) -> list[Errors]:

@@ -31,6 +31,7 @@ from hilstar.scene.smear import Motion, smeared_sprites
 from hilstar.scene.sprites import Sprites
 from hilstar.scene.sweep import Scan
 from hilstar.study.charts import chart, plain_ticks, write_csv
+from hilstar.study.economy import moments
 from hilstar.study.twin_optics import Mounting, TwinOptics
 
 BENCH = """
@@ -230,14 +231,6 @@ def star_windows(paths: Sprites, mounting: Mounting, size_px: tuple[int, int]) -
         near = (x_px > left - reach) & (x_px < right + reach) & (y_px > top - reach) & (y_px < bottom + reach) & ~own
         if light[near].sum() < ALONE * light[own].sum():
             yield slice(int(top), int(bottom) + 1), slice(int(left), int(right) + 1)
-
-
-def moments(image: FloatArray, window: tuple[slice, slice]) -> tuple[float, float, float]:
-    """Light and centre of gravity, px, of a window: no noise, so no threshold and no bias."""
-    part = image[window]
-    y_px, x_px = np.mgrid[window]
-    total = float(part.sum())
-    return total, float((part * x_px).sum() / total), float((part * y_px).sum() / total)
 
 
 def compare(stand: Stand, sky: Sky, slew: Slew) -> Outcome:

@@ -10,26 +10,14 @@ import numpy as np
 
 from hilstar.arrays import FloatArray
 from hilstar.bench.config import Monitor, RenderSettings
+from hilstar.monitor.phases import WHITE, fainter, measure, phase_grid, shown_by
 from hilstar.monitor.quantise import CYCLE_FRAMES, Panel
 from hilstar.render.reference import linear_image
 from hilstar.render.renderer import Renderer, Target
 from hilstar.render.variants import SplatVariant, VariantRenderer
 from hilstar.scene.psf import LARGEST_CUT, footprint_px, peak_share
 from hilstar.scene.sprites import Sprites, pack_sprites
-from hilstar.study.quantisation import (
-    AIMS,
-    FRAME_PX,
-    SEED,
-    STARS,
-    WAYS,
-    WHITE,
-    Way,
-    fainter,
-    measure,
-    phase_grid,
-    response_of,
-    shown_by,
-)
+from hilstar.study.quantisation import AIMS, FRAME_PX, SEED, STARS, WAYS, Way, response_of
 from hilstar.study.tradeoff_table import Figure, Trial, Trials
 
 SIGMA_PX = RenderSettings().sprite_sigma_px

@@ -18,6 +18,7 @@ from hilstar.attitude.quaternion import angle_between_rad, multiply, propagate, 
 from hilstar.attitude.timeline import Policy, Timeline
 from hilstar.bench.config import AttitudeSettings
 from hilstar.monitor.geometry import monitor_camera
+from hilstar.monitor.phases import measure
 from hilstar.render.reference import linear_image
 from hilstar.render.renderer import Target
 from hilstar.render.variants import SplatVariant, VariantRenderer
@@ -26,7 +27,6 @@ from hilstar.scene.smear import MIDDLE_S, Motion, smeared_sprites
 from hilstar.scene.sprites import Sprites, pack_sprites
 from hilstar.sky.cells import cell_grid
 from hilstar.sky.stars import Stars
-from hilstar.study.quantisation import measure
 from hilstar.study.tradeoff_sky import ORION, demo_config
 from hilstar.study.tradeoff_table import Figure, Trial, Trials
 

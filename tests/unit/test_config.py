@@ -144,7 +144,7 @@ def test_what_is_wrong_is_said_with_what_to_write(tmp_path, old, new, words):
         ('[sky]\ntemperature = "hot"\n', '[sky] temperature = "hot"; "ballesteros2012" or "wang2021" is wanted'),
         ("[sky]\nobserver_velocity_km_s = [3e5, 0, 0]\n", "not slower than light"),
         ("[background]\nelectrons_per_px = 1\nzodiacal_v_mag_arcsec2 = 22\n", "write one of them"),
-        ('[render]\nquantisation = "exactly"\n', '"temporal" or "exact" is wanted'),
+        ('[render]\nquantisation = "exactly"\n', '"exact" or "auto" is wanted'),
         ("[render]\ncycle_frames = 6\n", "cycle_frames = 6"),
         ("[render]\nsprite_sigma_px = [0, 1]\n", "sprite_sigma_px = [0,1]"),
         ("[monitor.x]\n", "[monitor] unknown key x"),

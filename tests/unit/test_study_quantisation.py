@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from hilstar.monitor.phases import SIGMA_PX, fainter, measure, phase_grid
 from hilstar.render.reference import linear_image
-from hilstar.study.quantisation import AIMS, BITS, SIGMA_PX, WAYS, fainter, measure, phase_grid, run
+from hilstar.study.quantisation import AIMS, BITS, WAYS, run
 
 
 def test_the_measure_finds_the_error_that_was_put_in():

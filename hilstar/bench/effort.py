@@ -1,0 +1,210 @@
+"""What a scene needs and no more: sprites, paths and codes that keep a bench's errors within its tolerance in the least time.
+
+Of the tolerance half is for the codes, a quarter for the sprites' edges and a quarter for motion that is not drawn.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilstar.arrays import FloatArray
+from hilstar.bench.config import RenderSettings
+from hilstar.monitor.phases import WHITE, Errors, fainter, measure, phase_grid, shown_by
+from hilstar.monitor.photometry import Response
+from hilstar.monitor.quantise import Panel, Quantisation
+from hilstar.render.reference import linear_image
+from hilstar.scene.psf import LARGEST_CUT, cut_share, footprint_px, peak_share, pixel_share
+
+CODES_SHARE, EDGES_SHARE, MOTION_SHARE = 0.5, 0.25, 0.25
+BY_COST: tuple[Quantisation, ...] = ("round", "exact")
+PHASES = 12
+MAGNITUDES = 5  # at which codes are judged, from white down to the faintest star
+MAG_PER_SHARE = 2.5 / math.log(10)
+# Light beyond a small sprite is under this share of what lights a pixel: only where the wings of stars meet is a code lower
+UNLIT = 0.25
+CUT_PHASES = 51
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """One thing that was chosen: what it is, what it costs in accuracy, and what it saves against the full setting."""
+
+    what: str
+    chosen: str
+    error: str
+    saving: str
+
+    def line(self) -> str:
+        """The choice for a person."""
+        return f"{self.what}: {self.chosen}; {self.error}; {self.saving}"
+
+
+ENCODING = Choice(
+    "encoding", "under the sprites, or all pixels where sprites cover more", "exact", "the cheaper one, frame by frame"
+)
+PROJECTION = Choice("projection", "perspective", "exact", "a weak one would save nothing, and fails off the middle")
+
+
+@dataclass(frozen=True, slots=True)
+class Effort:
+    """How much is done for a bench's stars: quantisation, sprites' sides by rate (see `Target.sides`), motion that is drawn.
+
+    `error_mag` and `error_px` are what all choices together may be off by, at the faintest star and the worst phase.
+    """
+
+    quantisation: Quantisation
+    sides: tuple[tuple[float, int], ...]
+    motion_above_px: float
+    error_mag: float
+    error_px: float
+    choices: tuple[Choice, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Light:
+    """What the stars are shown with: the panel's response, white in electrons per second (its least), the stars' rates (n,)."""
+
+    response: Response
+    white_e_per_s: float
+    rates_e_per_s: FloatArray
+
+
+def plan_effort(render: RenderSettings, light: Light) -> Effort:
+    """The effort of a bench file's settings."""
+    method, codes = choose_codes(render, light)
+    errors, chosen = codes
+    if render.effort == "full":
+        motion_px = render.motion_above_px
+        return Effort(method, (), motion_px, errors.flux_max_mag, errors.centroid_max_px + motion_px, (chosen,))
+    sides, lost_mag, moved_px, edges = choose_sides(render, light, method)
+    motion_px = max(render.motion_above_px, MOTION_SHARE * render.tolerance_px)
+    paths = Choice(
+        "paths",
+        f"stars move from {motion_px:g} px within a frame on, in as few sprites as their paths need",
+        f"{motion_px:g} px at worst",
+        "a slower frame is drawn as points",
+    )
+    return Effort(
+        quantisation=method,
+        sides=sides,
+        motion_above_px=motion_px,
+        error_mag=errors.flux_max_mag + lost_mag,
+        error_px=errors.centroid_max_px + moved_px + motion_px,
+        choices=(_star_choice(render, light, method), chosen, edges, ENCODING, paths, PROJECTION),
+    )
+
+
+def explain(effort: Effort | None, render: RenderSettings) -> list[str]:
+    """What was chosen, a line each, and what it all comes to."""
+    if effort is None:
+        return ['effort: full; write [render] effort = "auto" or quantisation = "auto" to have it chosen within the tolerance']
+    total = f"{effort.error_mag:.4f} mag of {render.tolerance_mag:g}, {effort.error_px:.4f} px of {render.tolerance_px:g}"
+    within = effort.error_mag <= render.tolerance_mag and effort.error_px <= render.tolerance_px
+    return [
+        *(choice.line() for choice in effort.choices),
+        f"together at worst: {total}{'' if within else ': OVER the tolerance'}",
+    ]
+
+
+def choose_codes(render: RenderSettings, light: Light) -> tuple[Quantisation, tuple[Errors, Choice]]:
+    """The cheapest quantisation whose errors are within the codes' part of the tolerance; the best one where none is."""
+    wanted = BY_COST if render.quantisation == "auto" else (render.quantisation,)
+    limits = CODES_SHARE * render.tolerance_mag, CODES_SHARE * render.tolerance_px
+    for method in wanted:
+        errors = code_errors(method, render, light)
+        within = errors.flux_max_mag <= limits[0] and errors.centroid_max_px <= limits[1]
+        if within or method == wanted[-1]:
+            break
+    error = f"{errors.flux_max_mag:.4f} mag and {errors.centroid_max_px:.4f} px at worst, from white to the faintest star"
+    if not within:
+        error += f" (over {limits[0]:g} mag or {limits[1]:g} px: more bits, bit_stealing or brighter stars would do)"
+    saving = "several times cheaper than exact" if method == "round" else "nothing saved"
+    return method, (errors, Choice("codes", method, error, saving))
+
+
+def code_errors(method: Quantisation, render: RenderSettings, light: Light) -> Errors:
+    """The worst errors of a method over phases and over magnitudes from white to the faintest star that it shows."""
+    sigma_px = render.sprite_sigma_px
+    sprites, tile = phase_grid(PHASES, sigma_px)
+    bright = linear_image(sprites, (PHASES * tile, PHASES * tile), sigma_px)
+    panel = Panel(light.response, WHITE)
+    faintest = float(light.rates_e_per_s.min()) if len(light.rates_e_per_s) else light.white_e_per_s
+    deepest = max(0.0, 2.5 * math.log10(light.white_e_per_s / peak_share(sigma_px) / faintest))
+    found = []
+    for mag in np.linspace(0.0, deepest, MAGNITUDES).tolist():
+        wanted = bright * 10 ** (-0.4 * mag)
+        shown = shown_by(method, render.cycle_frames, panel, wanted.astype(np.float32), fainter(sprites, mag), sigma_px)
+        found.append(measure(wanted, shown, tile))
+    return Errors(*(max(getattr(e, name) for e in found) for name in Errors.__slots__))
+
+
+def choose_sides(
+    render: RenderSettings, light: Light, method: Quantisation
+) -> tuple[tuple[tuple[float, int], ...], float, float, Choice]:
+    """Sprites' sides by rate, the flux that their edges cut, magnitudes, and how far that moves a centroid, px."""
+    sigma_px = render.sprite_sigma_px
+    full = footprint_px(sigma_px)
+    allowed_mag, allowed_px = EDGES_SHARE * render.tolerance_mag, EDGES_SHARE * render.tolerance_px
+    sizes = range(full % 2 or 2, full, 2)
+    least = next((s for s in sizes if cut_mag(s, sigma_px) <= allowed_mag and cut_px(s, sigma_px) <= allowed_px), full)
+    sides = [(math.inf, least)]
+    if method == "round":
+        unlit = UNLIT * float(light.response.threshold[0]) * light.white_e_per_s
+        # Falling rates: a star under the last of them that it is under gets the smallest sprite.
+        sides += [(unlit / outside_share(size, sigma_px), size) for size in sizes[::-1] if size < least]
+    kept = tuple((min(rate, 3e38), size) for rate, size in sides[:8])
+    rates = light.rates_e_per_s
+    area = np.full(len(rates), full**2)
+    for rate, size in kept:
+        area[rates < rate] = size**2
+    cut = (cut_mag(least, sigma_px), cut_px(least, sigma_px)) if least < full else (MAG_PER_SHARE * LARGEST_CUT, 0.0)
+    mean = float(area.mean()) if len(area) else float(full**2)
+    chosen = f"{min(s for _, s in kept)} to {least} px a side instead of {full}"
+    error = f"{cut[0]:.1e} mag and {cut[1]:.1e} px cut"
+    return kept, *cut, Choice("sprites", chosen, error, f"{full**2 / mean:.1f} times fewer pixels")
+
+
+def cut_mag(size_px: int, sigma_px: tuple[float, float]) -> float:
+    """The flux that a square sprite cuts at the worst phase, magnitudes."""
+    return MAG_PER_SHARE * cut_share(size_px, sigma_px)
+
+
+def cut_px(size_px: int, sigma_px: tuple[float, float]) -> float:
+    """How far a square sprite's edge moves the centroid at the worst phase, px, both axes together."""
+    return math.hypot(*(_cut_px(size_px, sigma) for sigma in sigma_px))
+
+
+def _cut_px(size_px: int, sigma_px: float) -> float:
+    worst = 0.0
+    first = -((size_px - 1) // 2)
+    for fraction in np.linspace(0.0, 1.0, CUT_PHASES) - (0.5 if size_px % 2 else 0.0):
+        offsets = np.arange(first, first + size_px) - fraction
+        shares = np.array([pixel_share(float(offset), sigma_px) for offset in offsets])
+        worst = max(worst, abs(float((shares * offsets).sum() / shares.sum())))
+    return worst
+
+
+def outside_share(size_px: int, sigma_px: tuple[float, float]) -> float:
+    """The largest share of a star's light in one pixel outside a square sprite, at the worst phase."""
+    (x, y), beyond = sigma_px, size_px / 2
+    return max(pixel_share(beyond, x) * pixel_share(0.0, y), pixel_share(beyond, y) * pixel_share(0.0, x))
+
+
+def faintest_shown_e_per_s(method: str, light: Light, sigma_px: tuple[float, float]) -> float:
+    """The rate under which a star alone never lights a pixel, wherever it stands; 0 where the dither always may."""
+    if method == "round":
+        return float(light.response.threshold[0]) * light.white_e_per_s / peak_share(sigma_px)
+    return float(light.response.light[1]) / 2 * light.white_e_per_s if method == "exact" else 0.0
+
+
+def _star_choice(render: RenderSettings, light: Light, method: str) -> Choice:
+    limit = faintest_shown_e_per_s(method, light, render.sprite_sigma_px)
+    dark = light.rates_e_per_s < limit
+    share = float(light.rates_e_per_s[dark].sum() / light.rates_e_per_s.sum()) if dark.any() else 0.0
+    left_out = f"{int(dark.sum())} of {len(dark)} stars in the sky left out"
+    return Choice(
+        "stars", f"from {limit:.3g} electrons/s on", f"the others light no pixel ({share:.2%} of all light)", left_out
+    )

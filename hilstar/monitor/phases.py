@@ -1,0 +1,77 @@
+"""One star at every sub-pixel phase through a method from light to levels: the errors of its flux and its place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilstar.arrays import Float32Array, FloatArray
+from hilstar.monitor.exact import ExactQuantiser
+from hilstar.monitor.quantise import Panel, Quantisation, dither_levels, round_levels, shown_light, temporal_levels
+from hilstar.scene.psf import footprint_px, peak_share
+from hilstar.scene.sprites import Sprites, pack_sprites
+
+SIGMA_PX = (0.85, 0.85)
+WHITE = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Errors:
+    """Over all phases: rms and largest flux error, mag, and centroid error, px; infinite where a star showed nothing."""
+
+    flux_rms_mag: float
+    flux_max_mag: float
+    centroid_rms_px: float
+    centroid_max_px: float
+
+
+def phase_grid(count: int, sigma_px: tuple[float, float] = SIGMA_PX) -> tuple[Sprites, int]:
+    """count^2 stars whose peak would be white at the middle of a pixel, one to a tile, at every phase; the tile's side, px."""
+    tile = footprint_px(sigma_px) + 2
+    place = (np.arange(count) + 0.5) * tile + (np.arange(count) + 0.5) / count - 0.5
+    x_px, y_px = (axis.ravel() for axis in np.meshgrid(place, place))
+    flux = np.full(count**2, WHITE / peak_share(sigma_px))
+    frame = ((count * tile, count * tile), footprint_px(sigma_px))
+    return pack_sprites(x_px, y_px, flux, np.arange(count**2), frame), tile
+
+
+def fainter(sprites: Sprites, mag: float) -> Sprites:
+    """The same stars, so many magnitudes fainter."""
+    data = sprites.data.copy()
+    data["electrons_per_s"] *= 10 ** (-0.4 * mag)
+    return Sprites(data, sprites.footprint_px, sprites.star, sprites.x_px, sprites.y_px)
+
+
+def measure(wanted: FloatArray, shown: FloatArray, tile: int) -> Errors:
+    """The errors of each tile of two images, which hold a star each."""
+    light, x_px, y_px = _sums(wanted, tile)
+    lit, lit_x_px, lit_y_px = _sums(shown, tile)
+    with np.errstate(divide="ignore"):
+        flux = np.abs(2.5 * np.log10(lit / light))
+    off = np.where(lit > 0, np.hypot(lit_x_px - x_px, lit_y_px - y_px), np.inf)
+    rms = (float(np.sqrt(np.mean(np.square(error)))) for error in (flux, off))
+    return Errors(next(rms), float(flux.max()), next(rms), float(off.max()))
+
+
+def _sums(image: FloatArray, tile: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Light and centroid (x, y), px, of each tile; the centroid is 0 where there is no light."""
+    count = len(image) // tile
+    tiles = image.reshape(count, tile, count, tile).transpose(0, 2, 1, 3)
+    light = tiles.sum(axis=(2, 3))
+    at, divisor = np.arange(tile), np.where(light > 0, light, 1.0)
+    return light, tiles.sum(axis=2) @ at / divisor, tiles.sum(axis=3) @ at / divisor
+
+
+def shown_by(
+    method: Quantisation, cycle_frames: int, panel: Panel, linear: Float32Array, sprites: Sprites, sigma_px: tuple[float, float]
+) -> FloatArray:
+    """The light (h, w) that a method makes of a linear image, as a tracker sees it that exposes for `cycle_frames`."""
+    if method == "exact":
+        size = linear.shape[1], linear.shape[0]
+        return shown_light(ExactQuantiser(panel, size, sigma_px).levels(sprites), panel)
+    if method == "temporal" and cycle_frames > 1:
+        frames = [shown_light(temporal_levels(linear, panel, k, cycle_frames), panel) for k in range(cycle_frames)]
+        return np.asarray(np.mean(frames, axis=0))
+    levels = round_levels if method == "round" else dither_levels
+    return shown_light(levels(linear, panel), panel)

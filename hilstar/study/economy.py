@@ -1,0 +1,231 @@
+"""What `effort = "auto"` is worth: five scenes with all effort and with what they need, their time and their errors."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from hilstar.arrays import FloatArray
+from hilstar.attitude.quaternion import from_radec_roll_deg
+from hilstar.bench.assembly import Bench
+from hilstar.monitor.quantise import Panel, shown_light
+from hilstar.render.reference import linear_image
+from hilstar.scene.sprites import Sprites
+from hilstar.scene.sweep import Scan, Turn, swept_sprites
+from hilstar.study.charts import chart, write_csv
+
+BENCH = """
+[tracker]
+aperture_mm = 30
+focal_length_mm = 70
+pixel_pitch_um = 13
+resolution_px = [1024, 1024]
+quantum_efficiency = "ccd47-20"
+transmission = "n-bk7-10mm"
+[sky]
+faintest_v_mag = {faintest_v_mag}
+[monitor]
+resolution_px = [1920, 1080]
+pixel_pitch_um = 57.65
+bits = {bits}
+[collimator]
+focal_length_mm = {focal_length_mm}
+[render]
+brightest_v_mag = 2.0
+motion = "on"
+tolerance_mag = {tolerance}
+tolerance_px = {tolerance}
+{effort}
+"""
+# All effort: whatever is asked for, `exact` and whole sprites reach it, if anything does.
+EFFORTS = {"full": 'quantisation = "exact"\nmotion_above_px = 0.0', "auto": 'effort = "auto"\nquantisation = "auto"'}
+MARGIN_PX = 7
+ALONE = 2e-4  # of a star's light, at most, that others may bring into its window: 2e-4 mag
+ROUNDS, QUICK_ROUNDS = 60, 5
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """Where a bench looks, how far and fast, and what it may be off by, magnitudes and pixels alike."""
+
+    name: str
+    radec_roll_deg: tuple[float, float, float]
+    focal_length_mm: float
+    faintest_v_mag: float
+    bits: int
+    tolerance: float
+    rate_deg_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+SCENES = (
+    Scene("narrow, sparse", (192.9, 27.1, 0.0), 600.0, 8.0, 12, 0.1),
+    Scene("wide, sparse", (192.9, 27.1, 0.0), 120.0, 6.5, 10, 0.1),
+    Scene("narrow, Milky Way", (305.0, 40.0, 20.0), 350.0, 8.0, 12, 0.1),
+    Scene("wide, Milky Way", (305.0, 40.0, 20.0), 120.0, 8.0, 12, 0.1),
+    Scene("wide, Milky Way, 1 deg/s", (305.0, 40.0, 20.0), 120.0, 7.0, 12, 0.1, (0.6, 0.8, 0.0)),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """A scene with one effort: the time of a frame, its worst errors over stars that stand alone, and their limit."""
+
+    scene: str
+    effort: str
+    quantisation: str
+    stars: int
+    frame_ms: float
+    flux_max_mag: float
+    centroid_max_px: float
+    measured_stars: int
+    tolerance: float
+
+    @property
+    def within(self) -> bool:
+        """Both errors are under the scene's tolerance."""
+        return self.flux_max_mag <= self.tolerance and self.centroid_max_px <= self.tolerance
+
+
+def run(directory: Path, quick: bool = False) -> list[str]:
+    """Measure every scene, and write `economy.csv` and `economy.png`; a line for each scene. Raises InputError."""
+    outcomes = [outcome for scene in SCENES for outcome in compare(scene, QUICK_ROUNDS if quick else ROUNDS)]
+    columns = Outcome.__slots__
+    write_csv(directory / "economy.csv", columns, [[getattr(o, name) for name in columns] for o in outcomes])
+    pairs = list(zip(outcomes[::2], outcomes[1::2], strict=True))
+    _draw(directory / "economy.png", pairs)
+    return [_line(full, auto) for full, auto in pairs]
+
+
+def compare(scene: Scene, rounds: int) -> list[Outcome]:
+    """A scene with all effort and with what it needs, timed in turn."""
+    with TemporaryDirectory() as folder:
+        benches = {name: _open(scene, keys, Path(folder) / f"{name}.toml") for name, keys in EFFORTS.items()}
+        try:
+            times = _times_ms(scene, benches, rounds)
+            return [_outcome(scene, name, bench, times[name]) for name, bench in benches.items()]
+        finally:
+            for bench in benches.values():
+                bench.close()
+
+
+def _open(scene: Scene, effort: str, path: Path) -> Bench:
+    text = BENCH.format(
+        faintest_v_mag=scene.faintest_v_mag,
+        bits=scene.bits,
+        focal_length_mm=scene.focal_length_mm,
+        tolerance=scene.tolerance,
+        effort=effort,
+    )
+    path.write_text(text)
+    return Bench(path)
+
+
+def _turn(scene: Scene) -> Turn:
+    return Turn(from_radec_roll_deg(*scene.radec_roll_deg), np.radians(scene.rate_deg_s))
+
+
+def _times_ms(scene: Scene, benches: dict[str, Bench], rounds: int) -> dict[str, float]:
+    turn = _turn(scene)
+    times: dict[str, list[float]] = {name: [] for name in benches}
+    for number in range(rounds + 1):
+        for name, bench in benches.items():
+            begin_s = time.perf_counter()
+            _ = bench.draw(turn.q_icrs_to_cam, number, turn.rate_cam_rad_s).levels
+            if number:  # the first frame compiles shaders
+                times[name].append((time.perf_counter() - begin_s) * 1e3)
+    return {name: float(np.median(values)) for name, values in times.items()}
+
+
+def _outcome(scene: Scene, name: str, bench: Bench, frame_ms: float) -> Outcome:
+    turn, size = _turn(scene), bench.camera.resolution_px
+    drawn = bench.draw(turn.q_icrs_to_cam, 0, turn.rate_cam_rad_s)
+    panel = Panel(bench.calibration.response, bench.flux_at_white_e_per_s, bench.uniformity)
+    shown = shown_light(drawn.levels, panel)
+    sigma_px, footprint = bench.config.render.sprite_sigma_px, bench.renderer.footprint_px
+    scan = Scan(bench.scan.down, bench.scan.scanout_s, bench.scan.hold_s)
+    sprites = swept_sprites(bench.stars, turn, scan, bench.camera, footprint, sigma_px)
+    true = linear_image(sprites, size, sigma_px)
+    flux_mag, off_px = [], []
+    for window in lone_windows(sprites, size, bench.flux_at_white_e_per_s):
+        (light, x_px, y_px), (true_light, true_x_px, true_y_px) = moments(shown, window), moments(true, window)
+        flux_mag.append(abs(2.5 * math.log10(light / true_light)) if light > 0 else math.inf)
+        off_px.append(math.hypot(x_px - true_x_px, y_px - true_y_px))
+    return Outcome(
+        scene=scene.name,
+        effort=name,
+        quantisation=bench.config.render.quantisation,
+        stars=drawn.star_count,
+        frame_ms=frame_ms,
+        flux_max_mag=max(flux_mag),
+        centroid_max_px=max(off_px),
+        measured_stars=len(flux_mag),
+        tolerance=scene.tolerance,
+    )
+
+
+def lone_windows(sprites: Sprites, size_px: tuple[int, int], brightest_e_per_s: float) -> Iterator[tuple[slice, slice]]:
+    """Rows and columns around each star that is whole on the image, alone there, and under white whatever its place."""
+    light, (width, height) = sprites.data["electrons_per_s"], size_px
+    for star in np.unique(sprites.star):
+        own = sprites.star == star
+        left, right = int(sprites.x_px[own].min()) - MARGIN_PX, int(sprites.x_px[own].max()) + MARGIN_PX + 1
+        top, bottom = int(sprites.y_px[own].min()) - MARGIN_PX, int(sprites.y_px[own].max()) + MARGIN_PX + 1
+        if left < 0 or top < 0 or right >= width or bottom >= height or light[own].sum() > 2 * brightest_e_per_s:
+            continue
+        across = (sprites.x_px > left - MARGIN_PX) & (sprites.x_px < right + MARGIN_PX)
+        near = across & (sprites.y_px > top - MARGIN_PX) & (sprites.y_px < bottom + MARGIN_PX) & ~own
+        if light[near].sum() <= ALONE * light[own].sum():
+            yield slice(top, bottom + 1), slice(left, right + 1)
+
+
+def moments(image: FloatArray, window: tuple[slice, slice]) -> tuple[float, float, float]:
+    """Light and centre of gravity, px, of a window; not a number where it is dark."""
+    part = image[window]
+    y_px, x_px = np.mgrid[window]
+    total = float(part.sum())
+    if total <= 0:
+        return 0.0, math.nan, math.nan
+    return total, float((part * x_px).sum() / total), float((part * y_px).sum() / total)
+
+
+def _line(full: Outcome, auto: Outcome) -> str:
+    errors = f"{auto.flux_max_mag:.4f} mag, {auto.centroid_max_px:.4f} px at worst of {auto.measured_stars} stars"
+    verdict = "within" if auto.within else "OVER"
+    return (
+        f"{auto.scene}: {auto.frame_ms:.2f} ms ({auto.quantisation}) instead of {full.frame_ms:.2f}, "
+        f"{full.frame_ms / auto.frame_ms:.1f} times; {errors}, {verdict} {auto.tolerance:g}"
+    )
+
+
+def _draw(path: Path, pairs: list[tuple[Outcome, Outcome]]) -> None:
+    ratios = [full.frame_ms / auto.frame_ms for full, auto in pairs]
+    finding = f"What a scene needs takes {min(ratios):.1f} to {max(ratios):.1f} times less than all effort, within tolerance"
+    with chart(path, finding, panels=2) as (cost, error):
+        at = np.arange(len(pairs))
+        for shift, which, colour in ((-0.2, 0, "C7"), (0.2, 1, "C0")):
+            mine = [pair[which] for pair in pairs]
+            cost.bar(at + shift, [o.frame_ms for o in mine], 0.38, color=colour, label=mine[0].effort)
+            error.bar(at + shift, [o.flux_max_mag for o in mine], 0.18, color=colour, label=f"{mine[0].effort}, mag")
+            error.bar(
+                at + shift + 0.19,
+                [o.centroid_max_px for o in mine],
+                0.18,
+                color=colour,
+                alpha=0.5,
+                label=f"{mine[0].effort}, px",
+            )
+        for place, (_, auto) in zip(at, pairs, strict=True):
+            error.plot(
+                [place - 0.45, place + 0.45], [auto.tolerance] * 2, color="#c33", label="tolerance" if not place else None
+            )
+        cost.set_ylabel("frame, ms")
+        error.set_ylabel("worst error of a star")
+        error.set_xticks(at, [full.scene.replace(", ", ",\n") for full, _ in pairs])
+        cost.legend()
+        error.legend(ncols=3, fontsize=9)

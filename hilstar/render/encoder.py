@@ -30,6 +30,8 @@ def build_program(ctx: moderngl.Context, vertex: str, fragment: str, defines: tu
 
 SpriteSides = tuple[tuple[float, int], ...]
 MOST_SIDES = 8  # as in star.vert
+PLACES = "2i 8x 1f"  # of SPRITE_DTYPE: places and rates
+DEAR_PIXEL = 0.05  # of the image: with more under sprites than this a clear is quicker (measured on llvmpipe: 0.05 to 0.15)
 
 
 def set_sides(program: moderngl.Program, sides: SpriteSides) -> None:
@@ -42,6 +44,39 @@ def set_sides(program: moderngl.Program, sides: SpriteSides) -> None:
     padded = [*sides, *[(0.0, 0)] * (MOST_SIDES - len(sides))]
     program["sides"] = len(sides)
     program["below_e_per_s"], program["side_px"] = ([*values] for values in zip(*padded, strict=True))
+
+
+class Eraser:
+    """Makes an image black again where the last frame's sprites were, or all of it where that is less work.
+
+    On llvmpipe a clear of 1920 x 1080 takes 0.4 ms, as long as 1000 stars. It lives in its renderer's context.
+    """
+
+    def __init__(self, ctx: moderngl.Context, size_px: tuple[int, int], of_levels: bool) -> None:
+        self._ctx = ctx
+        self._size_px = size_px
+        self._program = build_program(ctx, "star.vert", "erase.frag", ("LEVELS",) if of_levels else ())
+        self._program["resolution_px"] = size_px
+        self._vao: moderngl.VertexArray | None = None
+        self._footprint_px = 0
+
+    def take_places_from(self, buffer: moderngl.Buffer, footprint_px: int) -> None:
+        """Use a buffer of SPRITE_DTYPE, of which places are read here."""
+        if self._vao is not None:
+            self._vao.release()
+        self._vao = self._ctx.vertex_array(self._program, [(buffer, PLACES, "pixel", "electrons_per_s")])
+        self._program["footprint_px"] = self._footprint_px = footprint_px
+
+    def erase(self, fbo: moderngl.Framebuffer, count: int | None) -> None:
+        """Make `fbo` black where the first `count` sprites of the buffer are; all of it where that is not known."""
+        width, height = self._size_px
+        fbo.use()
+        if count is None or count * self._footprint_px**2 > width * height * DEAR_PIXEL:
+            fbo.clear()
+        elif count and self._vao is not None:
+            margin = self._footprint_px
+            fbo.viewport = (-margin, -margin, width + 2 * margin, height + 2 * margin)
+            self._vao.render(moderngl.POINTS, vertices=count)
 
 
 class LevelTexture:
@@ -121,7 +156,7 @@ class Encoder:
         """Use a buffer of SPRITE_DTYPE, of which places and rates are read here."""
         if self._sprite_vao is not None:
             self._sprite_vao.release()
-        self._sprite_vao = self._ctx.vertex_array(self._sprites, [(buffer, "2i 8x 1f", "pixel", "electrons_per_s")])
+        self._sprite_vao = self._ctx.vertex_array(self._sprites, [(buffer, PLACES, "pixel", "electrons_per_s")])
         self._sprites["footprint_px"] = self._footprint_px = footprint_px
 
     def shrink(self, sides: SpriteSides) -> None:
@@ -129,7 +164,7 @@ class Encoder:
         set_sides(self._sprites, sides)
 
     def draw(self, count: int, per_star: int, covered_px: int, shift: float = 0.0) -> None:
-        """Encode the linear image under the first `count` sprites of the buffer; the rest is black.
+        """Encode the linear image under the first `count` sprites of the buffer; the rest is black, and was before.
 
         `shift` turns the mask of a dithering encoder, `per_star` sprites are each star's, and together they cover
         `covered_px`: where that is the whole image, so is the pass.
@@ -144,7 +179,6 @@ class Encoder:
             self._fbo.viewport = (0, 0, width, height)
             self._whole_vao.render(moderngl.TRIANGLES, vertices=3)
             return
-        self._fbo.clear()
         if count and self._sprite_vao is not None:
             self._sprites["sprites_per_star"] = float(per_star)
             margin = self._footprint_px

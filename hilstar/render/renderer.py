@@ -17,7 +17,7 @@ from hilstar.errors import InputError, MachineError
 from hilstar.monitor.exact import ExactQuantiser
 from hilstar.monitor.photometry import Codes, Response
 from hilstar.monitor.quantise import CYCLE_FRAMES, Panel, Quantisation, frame_shift
-from hilstar.render.encoder import Encoder, LevelTexture, SpriteSides, build_program, set_sides
+from hilstar.render.encoder import Encoder, Eraser, LevelTexture, SpriteSides, build_program, set_sides
 from hilstar.scene.psf import SQRT2, footprint_px
 from hilstar.scene.sprites import SPRITE_DTYPE, Sprites
 
@@ -111,6 +111,8 @@ class Renderer:
         self._splat["resolution_px"] = target.resolution_px
         self._splat["footprint_px"] = self.footprint_px
         set_sides(self._splat, target.sides)
+        self._eraser = Eraser(ctx, target.resolution_px, of_levels=False)
+        self._level_eraser = Eraser(ctx, target.resolution_px, of_levels=True)
         self._build_levels()
         self._reserve(FIRST_CAPACITY)
         width, height = target.resolution_px
@@ -139,6 +141,9 @@ class Renderer:
         self._buffer = self._ctx.buffer(reserve=sprites * SPRITE_DTYPE.itemsize, dynamic=True)
         layout = [(self._buffer, "2i 2f 1f", "pixel", "fraction_px", "electrons_per_s")]
         self._splat_vao = self._ctx.vertex_array(self._splat, layout)
+        self._last_count: int | None = None  # of the sprites that are in the buffer and on the images
+        for eraser in (self._eraser, self._level_eraser):
+            eraser.take_places_from(self._buffer, self.footprint_px)
         if self._encoder is not None:
             self._encoder.take_places_from(self._buffer, self.footprint_px)
 
@@ -184,10 +189,13 @@ class Renderer:
 
     def _draw_linear(self, sprites: Sprites | None, whole: bool) -> None:
         self._undrawn = None
+        self._eraser.erase(self._linear_fbo, self._last_count)
+        if self._encoder is not None and self._levels is not None:
+            self._level_eraser.erase(self._levels.fbo, self._last_count)
         if sprites is not None and len(sprites):
             self._upload(sprites)
+        self._last_count = 0 if sprites is None else len(sprites)
         self._linear_fbo.use()
-        self._linear_fbo.clear()
         if sprites is not None and len(sprites):
             self._splat["sides"] = 0 if whole else len(self.target.sides)
             self._splat["sprites_per_star"] = float(sprites.per_star)

@@ -64,6 +64,8 @@ def parse_counts(text: str, most: int) -> tuple[int, ...]:
 def parse_sizes(text: str) -> tuple[tuple[int, int], ...]:
     """Image sizes, each once, from "640x480,1920x1080". Raises InputError."""
     found = [re.fullmatch(r"([1-9]\d{0,4})x([1-9]\d{0,4})", part) for part in text.split(",")]
-    if not all(found):
-        raise InputError(f"--sizes {text}: write WIDTHxHEIGHT in pixels with commas between them, such as 640x480,1920x1080")
+    if not all(match and max(int(match[1]), int(match[2])) <= 32768 for match in found):
+        raise InputError(
+            f"--sizes {text}: write WIDTHxHEIGHT, up to 32768 px, with commas between them, such as 640x480,1920x1080"
+        )
     return tuple(dict.fromkeys((int(match[1]), int(match[2])) for match in found if match))

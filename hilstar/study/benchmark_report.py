@@ -33,6 +33,7 @@ def lines(result: Row) -> Iterator[str]:
 
 def _notes(result: Row) -> Iterator[str]:
     yield "whole frame: attitude in to codes in memory. linear only: the image alone, places and light given"
+    yield "stages are waited for, one after the other; gpu: the same by the driver's own timers"
     for name, does in result["does"].items():
         worst = [row["worst_of_peak"] for row in result["agreement"] if row["method"] == name]
         yield f"{name:11}{does}" + (f"; off by {max(worst):.1g} of our brightest pixel at most" if worst else "; not run")

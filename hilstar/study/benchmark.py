@@ -286,10 +286,10 @@ def _first(sprites: Sprites, count: int) -> Sprites:
 
 def _machine() -> dict[str, Any]:
     names = [line.partition(":")[2].strip() for line in _cpu_lines() if line.startswith("model name")]
-    cores = len(os.sched_getaffinity(0))
     return {
         "cpu": next(iter(names), platform.machine()),
-        "cores": cores,
+        "cores": len(os.sched_getaffinity(0)),
+        "load": round(os.getloadavg()[0], 2),  # of the last minute: what others run is in our times
         "python": platform.python_version(),
         "numpy": np.__version__,
     }

@@ -18,7 +18,7 @@ def lines(result: Row) -> Iterator[str]:
     """A table for each image size: medians in ms, a column for each star count; then what else is known."""
     machine = result["machine"]
     software = f"Python {machine['python']}, NumPy {machine['numpy']}; {result['gl_renderer']}"
-    yield f"{machine['cpu']}, {machine['cores']} cores, {software}"
+    yield f"{machine['cpu']}, {machine['cores']} cores, load {machine['load']:.1f} before; {software}"
     for size, rows in _by_size(result["rows"]):
         counts = _counts(rows)
         yield ""

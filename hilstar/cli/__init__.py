@@ -10,12 +10,12 @@ from typing import NoReturn
 
 import typer
 
-from hilstar.cli import check, compare, light, run, show, stream
+from hilstar.cli import bench, check, compare, light, run, show, stream
 from hilstar.cli.common import app
 from hilstar.console import fail
 from hilstar.errors import HilstarError, InputError
 
-__all__ = ["app", "check", "compare", "light", "main", "run", "show", "stream"]
+__all__ = ["app", "bench", "check", "compare", "light", "main", "run", "show", "stream"]
 
 INTERRUPTED = 130
 SHARE_OPTIONS = ("--lose", "--corrupt", "--reorder")  # may stand alone

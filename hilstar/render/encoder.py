@@ -31,6 +31,7 @@ def build_program(ctx: moderngl.Context, vertex: str, fragment: str, defines: tu
 SpriteSides = tuple[tuple[float, int], ...]
 MOST_SIDES = 8  # as in star.vert
 PLACES = "2i 8x 1f"  # of SPRITE_DTYPE: places and rates
+SPRITE_PIXEL = 2  # a pixel under a sprite takes as long to encode as two of a pass over all (llvmpipe, 1080p to 4K)
 DEAR_PIXEL = 0.05  # of the image: with more under sprites than this a clear is quicker (measured on llvmpipe: 0.05 to 0.15)
 
 
@@ -175,7 +176,7 @@ class Encoder:
             texture.use(unit)
         if self._dithered:
             self._sprites["shift"] = self._whole["shift"] = shift
-        if covered_px >= width * height:
+        if covered_px * SPRITE_PIXEL >= width * height:
             self._fbo.viewport = (0, 0, width, height)
             self._whole_vao.render(moderngl.TRIANGLES, vertices=3)
             return

@@ -189,22 +189,30 @@ class Renderer:
 
     def _draw_linear(self, sprites: Sprites | None, whole: bool) -> None:
         self._undrawn = None
+        self._erase()
+        if sprites is not None and len(sprites):
+            self._upload(sprites)
+            self._last_count = len(sprites)
+            self._splat_stars(sprites, whole)
+
+    def _erase(self) -> None:
+        """Make black what the last frame drew."""
         self._eraser.erase(self._linear_fbo, self._last_count)
         if self._encoder is not None and self._levels is not None:
             self._level_eraser.erase(self._levels.fbo, self._last_count)
-        if sprites is not None and len(sprites):
-            self._upload(sprites)
-        self._last_count = 0 if sprites is None else len(sprites)
+        self._last_count = 0
+
+    def _splat_stars(self, sprites: Sprites, whole: bool) -> None:
+        """Add the light of the sprites that are in the buffer to the linear image."""
+        self._splat["sides"] = 0 if whole else len(self.target.sides)
+        self._splat["sprites_per_star"] = float(sprites.per_star)
+        width, height = self.target.resolution_px
+        margin = self.footprint_px
         self._linear_fbo.use()
-        if sprites is not None and len(sprites):
-            self._splat["sides"] = 0 if whole else len(self.target.sides)
-            self._splat["sprites_per_star"] = float(sprites.per_star)
-            width, height = self.target.resolution_px
-            margin = self.footprint_px
-            self._linear_fbo.viewport = (-margin, -margin, width + 2 * margin, height + 2 * margin)
-            self._ctx.enable(moderngl.BLEND)
-            self._splat_vao.render(moderngl.POINTS, vertices=len(sprites))
-            self._ctx.disable(moderngl.BLEND)
+        self._linear_fbo.viewport = (-margin, -margin, width + 2 * margin, height + 2 * margin)
+        self._ctx.enable(moderngl.BLEND)
+        self._splat_vao.render(moderngl.POINTS, vertices=len(sprites))
+        self._ctx.disable(moderngl.BLEND)
 
     def codes(self) -> Codes:
         """The levels of the last draw, (height, width), code values without bit stealing; the next draw or call overwrites

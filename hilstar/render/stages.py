@@ -1,0 +1,64 @@
+"""A renderer that keeps the time of each stage of a frame, for the benchmark alone: it waits where the other would not."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from hilstar.monitor.photometry import Codes
+from hilstar.render.encoder import Encoder
+from hilstar.render.renderer import Renderer, Target
+from hilstar.scene.sprites import Sprites
+
+NS_PER_MS = 1e6
+
+
+class StagedRenderer(Renderer):
+    """A Renderer whose `stage_ms` holds the last frame's stages: erase, upload, splat, encode and read_back in ms by the wall.
+
+    `gpu_splat` and `gpu_encode` are the same by the driver's own timers, where it has them.
+    """
+
+    def __init__(self, target: Target) -> None:
+        super().__init__(target)
+        self.stage_ms: dict[str, float] = {}
+        with self._ctx:
+            self._queries = {stage: self._ctx.query(time=True) for stage in ("splat", "encode")}
+
+    def codes(self) -> Codes:
+        """As Renderer.codes."""
+        begin = time.perf_counter()
+        codes = super().codes()
+        self.stage_ms["read_back"] = (time.perf_counter() - begin) * 1e3
+        return codes
+
+    def _erase(self) -> None:
+        with self._timed("erase"):
+            super()._erase()
+
+    def _upload(self, sprites: Sprites) -> None:
+        with self._timed("upload"):
+            super()._upload(sprites)
+
+    def _splat_stars(self, sprites: Sprites, whole: bool) -> None:
+        with self._timed("splat"):
+            super()._splat_stars(sprites, whole)
+
+    def _encode(self, encoder: Encoder, sprites: Sprites | None, frame: int) -> None:
+        with self._timed("encode"):
+            super()._encode(encoder, sprites, frame)
+
+    @contextmanager
+    def _timed(self, stage: str) -> Iterator[None]:
+        query = self._queries.get(stage)
+        begin = time.perf_counter()
+        if query is None:
+            yield
+        else:
+            with query:
+                yield
+        self._ctx.finish()
+        self.stage_ms[stage] = (time.perf_counter() - begin) * 1e3
+        if query is not None and query.elapsed:
+            self.stage_ms[f"gpu_{stage}"] = query.elapsed / NS_PER_MS

@@ -15,8 +15,8 @@ from hilstar.attitude.clock import NS_PER_S
 from hilstar.attitude.packet import AttitudeSample, Refusal
 from hilstar.attitude.quaternion import propagate, rate_between_rad_s, slerp
 
-# A live timeline keeps this many samples: 10 s at 200 Hz, far more than a frame looks back.
-LIVE_CAPACITY = 2048
+# A live timeline keeps this many samples, 5 s at 200 Hz, or twice as many: far more than a frame looks back.
+LIVE_CAPACITY = 1024
 # A stale attitude is fresh again once it is no older than this share of `stale_after`: no flicker at the limit.
 FRESH_AGAIN = 0.5
 
@@ -138,6 +138,7 @@ class Timeline:
                 rate = rate_between_rad_s(previous.q_icrs_to_cam, newest.q_icrs_to_cam, gap_ns / NS_PER_S)
         if rate is None:
             return Attitude(newest.q_icrs_to_cam, age_ns, stale, newest.sequence)
+        # results/tradeoff.csv, prediction: 5.5 arcsec by the rate of the sample; a cubic spline 17, holding 144.
         prediction_ns = min(age_ns, self._policy.max_extrapolation_ns)
         q = propagate(newest.q_icrs_to_cam, rate, prediction_ns / NS_PER_S)
         turning = rate if prediction_ns == age_ns else None  # carried no further, it stands

@@ -84,6 +84,7 @@ class SkySettings(_Table, frozen=True):
     epoch_jyear: Annotated[float, Meta(ge=-10_000, le=10_000)] = 2026.0
     faintest_v_mag: Magnitude = 7.5
     brightness: Literal["dgs", "ags"] = "dgs"
+    # results/tradeoff.csv, spectrum: real spectra by V-I are 0.026 mag off (95 %), a black body 0.2.
     spectrum: Literal["blackbody", "pickles"] = "pickles"
     temperature: Literal["ballesteros2012", "wang2021"] = "ballesteros2012"
     zero_point: Literal["vega", "iau-bolometric"] = "vega"
@@ -140,6 +141,7 @@ class AttitudeSettings(_Table, frozen=True):
 class RenderSettings(_Table, frozen=True):
     """[render]: from electrons to codes."""
 
+    # results/tradeoff.csv, quantisation: the quickest, and code by code what anyone expects; exact is 9 times as right.
     quantisation: Literal["round", "dither", "temporal", "exact", "auto"] = "round"
     bit_stealing: bool = False
     cycle_frames: Literal[1, 2, 4, 8, 16, 32, 64, 128, 256] = 8
@@ -149,6 +151,7 @@ class RenderSettings(_Table, frozen=True):
     effort: Literal["full", "auto"] = "full"
     tolerance_mag: Positive = 0.02
     tolerance_px: Positive = 0.02
+    # results/timing.csv: 69 arcsec at 2 deg/s without, 0.1 with it.
     motion: Literal["auto", "on", "off"] = "auto"
     motion_above_px: NotNegative = 0.01
 

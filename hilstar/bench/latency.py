@@ -18,6 +18,7 @@ from hilstar.attitude.clock import NS_PER_MS, OneWayFilter
 from hilstar.attitude.serial_lines import read_lines
 from hilstar.bench.config import BenchConfig
 from hilstar.bench.records import Run
+from hilstar.bench.toml_key import with_key
 from hilstar.errors import InputError
 
 NS_PER_US = 1000
@@ -237,17 +238,3 @@ def write_panel_delay(path: Path, panel_delay_ms: float) -> None:
         raise InputError(f"{path}: cannot be changed ({error.strerror}); write panel_delay_ms = {value} yourself") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: not TOML: {error}") from error
-
-
-def with_key(text: str, table: str, key: str, value: float) -> str:
-    """TOML `text` with `key` of a plain `[table]` set: its line replaced, or one added under the header."""
-    header = re.search(rf"^[ \t]*\[{table}\][^\n]*\n?", text, re.MULTILINE)
-    if header is None:
-        return text
-    following = re.search(r"^[ \t]*\[", text[header.end() :], re.MULTILINE)
-    end = header.end() + following.start() if following else len(text)
-    body, line = text[header.end() : end], f"{key} = {value}"
-    there = re.compile(rf"^([ \t]*){key}[ \t]*=[^\n#]*?([ \t]*#[^\n]*)?$", re.MULTILINE)
-    replaced, count = there.subn(rf"\g<1>{line}\g<2>", body, count=1)
-    head = text[: header.end()].removesuffix("\n") + "\n"
-    return head + (replaced if count else f"{line}\n{body}") + text[end:]

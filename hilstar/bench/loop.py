@@ -94,11 +94,7 @@ class FrameLoop:
         self._held = attitude
         stale = self.gate.update(attitude)
         blank = attitude is None or (stale and self._blank_when_stale)
-        if attitude is None or blank:
-            drawn = self._bench.draw(None, number)
-        else:
-            rate = attitude.rate_cam_rad_s if self._moving else None
-            drawn = self._bench.draw(attitude.q_icrs_to_cam, number, rate)
+        drawn = self._drawn(number, None if blank else attitude)
         predicted_ns = self._predicted_swap_ns
         if screen is None:
             _ = drawn.levels
@@ -121,6 +117,11 @@ class FrameLoop:
         self._count(shown, attitude)
         self._sink(shown)
         return shown
+
+    def _drawn(self, number: int, attitude: Attitude | None) -> Drawn:
+        if attitude is None:
+            return self._bench.draw(None, number)
+        return self._bench.draw(attitude.q_icrs_to_cam, number, attitude.rate_cam_rad_s if self._moving else None)
 
     def _count(self, shown: Shown, attitude: Attitude | None) -> None:
         drawn = shown.drawn

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,6 +11,7 @@ import numpy as np
 from hilstar.arrays import FloatArray
 from hilstar.bench.assembly import Bench
 from hilstar.bench.config import read_config
+from hilstar.bench.toml_key import with_key
 from hilstar.errors import InputError
 from hilstar.scene.psf import peak_share
 
@@ -85,19 +85,14 @@ def with_flux_at_white(bench_file: Path, flux_at_white_e_per_s: float, output: P
     """A copy of a bench file, comments and all, with the key set. Raises InputError where the copy would not say the same."""
     if output.resolve().parent != bench_file.resolve().parent:
         raise InputError(f"{output}: the bench file's paths are relative to it; write the copy beside {bench_file}")
-    line = f"flux_at_white_e_per_s = {flux_at_white_e_per_s!r}"
+    key = "flux_at_white_e_per_s"
     text = bench_file.read_text(encoding="utf-8")
-    old = re.compile(r"(?m)^[ \t]*(flux_at_white_e_per_s|brightest_v_mag)[ \t]*=[^\n#]*")
-    table = re.compile(r"(?m)^[ \t]*\[render\][^\n]*\n?")
-    if old.search(text):
-        text = old.sub(line, text, count=1)
-    elif match := table.search(text):
-        text = f"{text[: match.end()].rstrip()}\n{line}\n{text[match.end() :]}"
-    else:
-        text = f"{text.rstrip()}\n\n[render]\n{line}\n"
+    text = with_key(text, "render", key, flux_at_white_e_per_s, instead_of=("brightest_v_mag",))
     try:
         output.write_text(text, encoding="utf-8")
     except OSError as error:
         raise InputError(f"{output}: cannot be written ({error.strerror}); choose another name") from error
     if read_config(output).render.flux_at_white_e_per_s != flux_at_white_e_per_s:
-        raise InputError(f"{output}: the key could not be set in this file; write {line} under [render] yourself")
+        raise InputError(
+            f"{output}: the key could not be set in this file; write {key} = {flux_at_white_e_per_s!r} under [render] yourself"
+        )

@@ -99,7 +99,7 @@ class Screen:
 
     def swap(self) -> int:
         """Swap what was presented onto the screen, and take in keys; host time of the swap, ns."""
-        swap_ns = self.window.swap()
+        swap_ns = self.window.swap(self._presenter.wait)
         self.clock.update(swap_ns)
         self.window.look_at_events()
         while self.window.keys:

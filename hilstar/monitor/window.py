@@ -7,6 +7,7 @@ import logging
 import os
 import time
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Self
@@ -226,9 +227,13 @@ class Window:
         """Where the times of `swap` come from."""
         return "after-swap clock" if self._sync is None else "GLX_OML_sync_control"
 
-    def swap(self) -> int:
-        """Show what was drawn; host time, ns, at which that was done: the driver's, else that just after."""
+    def swap(self, wait: Callable[[], None] = lambda: None) -> int:
+        """Show what was drawn; host time, ns, at which that was done: the driver's, else that just after.
+
+        `wait` returns once the swap is done, where `glfwSwapBuffers` itself may come back before.
+        """
         glfw.swap_buffers(self._window)
+        wait()
         now_ns = time.monotonic_ns()
         if self._sync is not None:
             swap_ns = self._sync.swap_ns()

@@ -112,6 +112,15 @@ class Presenter:
         texture.filter = (moderngl.NEAREST, moderngl.NEAREST)
         return texture
 
+    def wait(self) -> None:
+        """Wait until the last swap is done: a driver that queues swaps has to give the next back buffer for this pixel.
+
+        (As Psychtoolbox does after a flip.)
+        """
+        with self._ctx:
+            self._ctx.screen.clear(viewport=(0, 0, 1, 1))
+            self._ctx.finish()
+
     def present(self, overlay: int = 0, patch_code: int = 0, marker: tuple[int, int] = (0, 0)) -> None:
         """Draw the last levels on the back buffer; `marker` is the photodiode square's side, px, and code."""
         with self._ctx:

@@ -12,6 +12,7 @@ from hilstar.errors import InputError
 
 # The share of a star's flux that may fall outside its footprint, at the worst sub-pixel phase. 1e-5 would do for
 # flux; at sigma 3 px the centroid then moves 1e-4 px, so ten times less is cut, for one pixel more.
+# results/tradeoff.csv, psf: 10 px at sigma 0.85 are on the front; 8 px save a tenth and cut 4e-5 mag.
 LARGEST_CUT = 1e-6
 SQRT2 = math.sqrt(2.0)
 

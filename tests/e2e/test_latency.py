@@ -15,9 +15,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilstar.bench.latency import Edges, beat, pair, read_edges, save_edges, with_key
+from hilstar.bench.latency import Edges, beat, pair, read_edges, save_edges
 from hilstar.bench.photodiode import CODE, CODE_BITS, marker_light
 from hilstar.bench.records import read_run
+from hilstar.bench.toml_key import with_key
 from hilstar.errors import InputError
 from tests.conftest import assert_refused, run_hilstar
 from tests.e2e.ptys import Cable
@@ -194,11 +195,12 @@ def test_the_beat_is_that_of_an_integral_over_frames():
         ("[monitor]\nbits = 8\n[sky]\n", "[monitor]\nkey = 1.5\nbits = 8\n[sky]\n"),
         ("[monitor]  # ours\nkey = 9 # old\n", "[monitor]  # ours\nkey = 1.5 # old\n"),
         ("[sky]\nkey = 2\n[monitor]", "[sky]\nkey = 2\n[monitor]\nkey = 1.5\n"),
-        ("[sky]\n", "[sky]\n"),
+        ("[sky]\n", "[sky]\n\n[monitor]\nkey = 1.5\n"),
+        ("[monitor]\nother = 2\n", "[monitor]\nkey = 1.5\n"),
     ],
 )
 def test_one_key_of_a_bench_file_is_set_and_nothing_else_changes(before, after):
-    assert with_key(before, "monitor", "key", 1.5) == after
+    assert with_key(before, "monitor", "key", 1.5, instead_of=("other",)) == after
 
 
 def test_what_is_wrong_is_said_in_one_line(tmp_path, small_bench_file):

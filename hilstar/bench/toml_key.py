@@ -1,0 +1,23 @@
+"""One key of a bench file set, and all else left as it stands, comments included."""
+
+from __future__ import annotations
+
+import re
+
+
+def with_key(text: str, table: str, key: str, value: float, instead_of: tuple[str, ...] = ()) -> str:
+    """TOML `text` with `key` of a plain `[table]` set: its line replaced, or that of a key in `instead_of`, or one added.
+
+    Who writes the table in another form gets a text that says something else: read it again.
+    """
+    line = f"{key} = {value!r}"
+    header = re.search(rf"^[ \t]*\[{table}\][^\n]*\n?", text, re.MULTILINE)
+    if header is None:
+        return f"{text.rstrip()}\n\n[{table}]\n{line}\n".lstrip()
+    following = re.search(r"^[ \t]*\[", text[header.end() :], re.MULTILINE)
+    end = header.end() + following.start() if following else len(text)
+    names = "|".join((key, *instead_of))
+    there = re.compile(rf"^([ \t]*)(?:{names})[ \t]*=[^\n#]*?([ \t]*#[^\n]*)?$", re.MULTILINE)
+    body, count = there.subn(rf"\g<1>{line}\g<2>", text[header.end() : end], count=1)
+    head = text[: header.end()].removesuffix("\n") + "\n"
+    return head + (body if count else f"{line}\n{body}") + text[end:]

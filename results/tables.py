@@ -1,0 +1,102 @@
+"""README's tables from the CSV files beside this script: `python results/tables.py` writes them between their marks.
+
+bench.csv is of `hilstar bench -o`, tradeoff.csv, economy.csv and timing.csv of `hilstar study NAME -o`; machine.txt says where.
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+from pathlib import Path
+
+HERE = Path(__file__).parent
+README = HERE.parent / "README.md"
+COUNTS = (100, 1000, 10_000, 50_000)
+OTHERS = ("numpy", "numba", "photutils", "galsim")
+TIMED_DEG_S = 2.0
+
+
+def rows_of(name: str) -> list[dict[str, str]]:
+    """The rows of a CSV file."""
+    with (HERE / name).open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def figure(value: float) -> str:
+    """Three digits, and no more places than they need."""
+    return f"{value:.3g}" if value < 100 else f"{value:.0f}"
+
+
+def table(head: list[str], body: list[list[str]]) -> str:
+    """A table in Markdown."""
+    lines = [head, ["---"] * len(head), *body]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+
+
+def bench_table() -> str:
+    """Medians of the whole frame by image size, and of the linear image beside the others at 1080p."""
+    rows = rows_of("bench.csv")
+    at = {(r["width"], r["height"], int(r["stars"]), r["method"], r["kind"]): float(r["median_ms"]) for r in rows}
+    sizes = list(dict.fromkeys((r["width"], r["height"]) for r in rows))
+
+    def line(name: str, size: tuple[str, str], method: str, kind: str) -> list[str]:
+        values = (at.get((*size, count, method, kind)) for count in COUNTS)
+        return [name, *("-" if v is None else figure(v) for v in values)]
+
+    body = [line(f"whole frame, {w} x {h}", (w, h), "hilstar", "whole_frame") for w, h in sizes]
+    full_hd = ("1920", "1080")
+    body.append(line("linear image alone, 1920 x 1080", full_hd, "hilstar", "linear_only"))
+    body += [line(f"the same by {name}", full_hd, name, "linear_only") for name in OTHERS]
+    return table(["ms, median", *(f"{count} stars" for count in COUNTS)], body)
+
+
+def tradeoff_table() -> str:
+    """Each step's default beside its exact method."""
+    steps: dict[str, list[dict[str, str]]] = {}
+    for row in rows_of("tradeoff.csv"):
+        steps.setdefault(row["step"], []).append(row)
+    body = []
+    for step, rows in steps.items():
+        default = next(row for row in rows if row["default"] == "True")
+        exact = [row for row in rows if row["exact"] == "True" and row is not default]
+        error = "none" if float(default["error"]) == 0 else f"{figure(float(default['error']))} {default['error_unit']}"
+        beside = f"{exact[0]['method']}: {figure(float(exact[0]['time_ms']))} ms" if exact else "-"
+        body.append([step, default["method"], error, f"{figure(float(default['time_ms']))} ms", beside])
+    return table(["step", "default", "error", "time", "the exact way"], body)
+
+
+def economy_table() -> str:
+    """Five scenes with all effort and with what they need."""
+    rows = rows_of("economy.csv")
+    body = []
+    for full, auto in zip(rows[::2], rows[1::2], strict=True):
+        ratio = float(full["frame_ms"]) / float(auto["frame_ms"])
+        errors = f"{float(auto['flux_max_mag']):.3f} mag, {float(auto['centroid_max_px']):.3f} px"
+        times = f"{figure(float(full['frame_ms']))} ms", f"{figure(float(auto['frame_ms']))} ms"
+        body.append([auto["scene"], auto["stars"], *times, f"{ratio:.1f}", errors])
+    return table(["scene", "stars", "all effort", "what it needs", "times", "worst star"], body)
+
+
+def timing_table() -> str:
+    """Star positions on a screen at 2 deg/s by what is compensated."""
+    body = []
+    for row in rows_of("timing.csv"):
+        if float(row["rate_deg_s"]) == TIMED_DEG_S:
+            errors = (figure(float(row[name])) for name in ("rms_arcsec", "worst_arcsec"))
+            body.append([row["way"], *errors, f"{figure(float(row['draw_ms']))} ms"])
+    return table(["at 2 deg/s", "arcsec rms", "worst", "time to draw"], body)
+
+
+TABLES = {"bench": bench_table, "tradeoff": tradeoff_table, "economy": economy_table, "timing": timing_table}
+
+
+def with_tables(text: str) -> str:
+    """`text` with each table between its marks `<!-- table: NAME -->` and `<!-- end -->`."""
+    for name, make in TABLES.items():
+        begin, end = f"<!-- table: {name} -->", "<!-- end -->"
+        text = re.sub(rf"{begin}\n.*?{end}", lambda _, n=make, b=begin, e=end: f"{b}\n{n()}\n{e}", text, flags=re.DOTALL)
+    return text
+
+
+if __name__ == "__main__":
+    README.write_text(with_tables(README.read_text(encoding="utf-8")), encoding="utf-8")

@@ -52,7 +52,7 @@ void main() {
 #ifdef AIDS
     if ((overlay & 4) != 0) codes = uvec3(0u);
     uint line = uint(float(LINE) / 255.0 * white);
-    ivec2 offset = pixel - cross_px;
+    ivec2 offset = abs(pixel - cross_px);  // GLSL leaves the remainder of a negative number open
     if ((overlay & 2) != 0 && (offset.x % GRID_PX == 0 || offset.y % GRID_PX == 0)) codes = max(codes, uvec3(line));
     if ((overlay & 1) != 0 && (offset.x == 0 || offset.y == 0)) codes = max(codes, uvec3(line));
     if ((overlay & 8) != 0) codes = uvec3(patch_code);

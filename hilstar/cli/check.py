@@ -78,7 +78,7 @@ def simulate_log(
     typer.echo(f"{len(motions)} exposures in {output}")
 
 
-Study = Literal["models", "outputs", "stability", "quantisation", "timing", "tradeoff", "economy"]
+Study = Literal["models", "outputs", "stability", "quantisation", "timing", "tradeoff", "economy", "prediction"]
 
 
 @app.command()

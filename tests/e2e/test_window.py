@@ -19,6 +19,7 @@ from PIL import Image
 from hilstar.attitude.quaternion import propagate
 from hilstar.bench.records import frame_records
 from tests.conftest import SMALL_BENCH, run_hilstar
+from tests.e2e.xevents import client
 
 SIZE_PX = (640, 480)
 BENCH = SMALL_BENCH.replace("resolution_px = [320, 240]", "resolution_px = [640, 480]")
@@ -113,6 +114,10 @@ class Shown:
     def stop(self) -> dict:
         """End it in order; its summary."""
         self._process.send_signal(signal.SIGTERM)
+        return self.ended()
+
+    def ended(self) -> dict:
+        """Its summary, once it has ended in order."""
         out, err = self._process.communicate(timeout=20)
         assert self._process.returncode == 0, err
         return json.loads(out)
@@ -190,6 +195,51 @@ def test_a_moving_run_on_the_screen_is_drawn_again_bit_for_bit_without_one(serve
     for name in names:
         one, other = (np.array(Image.open(folder / run / name)) for run in ("shown", "again"))
         assert (one == other).all()
+
+
+def lines_over(codes: np.ndarray, keys: str) -> np.ndarray:
+    """The codes with a grid of 100 px about the principal point, and the crosshair through it, of code 96."""
+    rows, columns = np.mgrid[0 : codes.shape[0], 0 : codes.shape[1]]
+    # The middle of 640 x 480 is at 319.5, 239.5; the screen has its lines at whole pixels, half rounded to even.
+    dx, dy = columns - 320, rows - 240
+    wanted = codes.copy()
+    if "g" in keys:
+        wanted[(dx % 100 == 0) | (dy % 100 == 0)] = np.maximum(96, wanted[(dx % 100 == 0) | (dy % 100 == 0)])
+    if "c" in keys:
+        wanted[(dx == 0) | (dy == 0)] = np.maximum(96, wanted[(dx == 0) | (dy == 0)])
+    return wanted
+
+
+def test_keys_show_the_grid_the_crosshair_a_patch_and_nothing_and_end_the_run(server, bench_file):
+    codes = codes_of(bench_file)
+    with Shown(server, bench_file) as shown, client(server.display) as user:
+        assert (shown.wait_for(codes) == codes).all()
+        for keys in ("g", "gc", "c", ""):
+            wanted = lines_over(codes, keys)
+            user.press({"g": "g", "gc": "c", "c": "g", "": "c"}[keys])
+            assert (shown.wait_for(wanted) == wanted).all(), keys
+        user.press("b")
+        assert (shown.wait_for(np.zeros_like(codes)) == 0).all()
+        user.press("b")
+        for level in (0, 64, 128, 191, 255):
+            user.press("t")
+            assert (shown.wait_for(np.full_like(codes, level)) == level).all()
+        user.press("t")
+        assert (shown.wait_for(codes) == codes).all()
+        user.press("q")
+        summary = shown.ended()
+    assert summary["frames"] > 0
+
+
+def test_the_window_s_close_button_ends_the_run_in_order(server, bench_file):
+    codes = codes_of(bench_file)
+    ledger = bench_file.parent / "run.mcap"
+    with Shown(server, bench_file, "--ledger", str(ledger)) as shown, client(server.display) as user:
+        shown.wait_for(codes)
+        user.close_window()
+        summary = shown.ended()
+    assert summary["ledger"] == {"path": str(ledger), "failure": None, "unrecorded": 0}
+    assert len(list(frame_records(ledger))) == summary["frames"]
 
 
 def refused(server: Server, bench_file: Path, *options: str, display: str | None = None) -> tuple[int, str]:

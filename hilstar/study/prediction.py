@@ -1,0 +1,117 @@
+"""Where the camera points when the light comes: error against latency and against the packets' rate, by method, and its time.
+
+The slew is that of the trade-offs: a swing of degrees, shaken on each axis (see `tradeoff_motion`). A frame at time t has the
+samples that were taken before t minus the latency, which is all of it: link, drawing, scan-out.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from bisect import bisect_right
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hilstar.attitude.clock import NS_PER_MS, NS_PER_S
+from hilstar.attitude.packet import AttitudeSample
+from hilstar.attitude.quaternion import angle_between_rad
+from hilstar.study.charts import chart, plain_ticks, write_csv
+from hilstar.study.tradeoff_motion import JITTER, NEAR, SLEW_DEG, SLEW_S, Guess, guesses, slew_attitude, slew_sample
+
+RATES_HZ = (5, 10, 20, 50, 100, 200)
+LATENCIES_MS = (2, 5, 10, 20, 50, 100)
+USUAL_HZ, USUAL_MS = 100, 20
+FRAME_HZ = 60
+SPAN_S, QUICK_SPAN_S = 40.0, 6.0
+TIMED = 200
+ARCSEC_PER_RAD = math.degrees(3600)
+MARKERS = "osd^vx"
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """One method at one rate and latency: errors over all frames, arcsec, and the time of one attitude."""
+
+    method: str
+    rate_hz: int
+    latency_ms: int
+    rms_arcsec: float
+    worst_arcsec: float
+    attitude_us: float
+
+
+def run(directory: Path, quick: bool = False) -> list[str]:
+    """Measure, and write `prediction.csv` and `prediction.png`; a line for each method. Raises InputError."""
+    outcomes = measure(QUICK_SPAN_S if quick else SPAN_S)
+    columns = Outcome.__slots__
+    write_csv(directory / "prediction.csv", columns, [[getattr(o, name) for name in columns] for o in outcomes])
+    usual = [o for o in outcomes if (o.rate_hz, o.latency_ms) == (USUAL_HZ, USUAL_MS)]
+    default = next(o for o in usual if o.method == next(g.name for g in guesses() if g.is_default))
+    hold = next(o for o in usual if o.method == "hold")
+    shaken = ", ".join(f"{size:g} arcsec at {hz:g} Hz" for size, hz in JITTER)
+    finding = (
+        f"At {USUAL_HZ} Hz and {USUAL_MS} ms the newest sample's rate leaves {default.rms_arcsec:.2g} arcsec rms, holding it "
+        f"{hold.rms_arcsec:.3g}: a swing of {SLEW_DEG:g} degrees in {SLEW_S:g} s, shaken by {shaken}"
+    )
+    _draw(directory / "prediction.png", finding, outcomes)
+    return [finding, *(_line(outcome) for outcome in usual)]
+
+
+def measure(span_s: float) -> list[Outcome]:
+    """Every predicting method along latency at the usual rate, and along rate at the usual latency."""
+    cells = {(USUAL_HZ, ms) for ms in LATENCIES_MS} | {(hz, USUAL_MS) for hz in RATES_HZ}
+    outcomes = []
+    for hz, ms in sorted(cells):
+        samples = [slew_sample(round(k * NS_PER_S / hz)) for k in range(math.ceil(span_s * hz) + 1)]
+        outcomes += [_outcome(guess, samples, hz, ms) for guess in guesses() if not guess.waits]
+    return outcomes
+
+
+def _outcome(guess: Guess, samples: list[AttitudeSample], rate_hz: int, latency_ms: int) -> Outcome:
+    taken_ns = [sample.t_ns for sample in samples]
+    errors = []
+    first_ns = taken_ns[NEAR] + latency_ms * NS_PER_MS
+    for frame in range(math.ceil(first_ns * FRAME_HZ / NS_PER_S), math.floor(taken_ns[-1] * FRAME_HZ / NS_PER_S)):
+        t_ns = round(frame * NS_PER_S / FRAME_HZ)
+        count = bisect_right(taken_ns, t_ns - latency_ms * NS_PER_MS)
+        shown = guess.load(samples[count - NEAR : count])(t_ns)
+        errors.append(angle_between_rad(slew_attitude(t_ns), shown) * ARCSEC_PER_RAD)
+    rms = float(np.sqrt(np.mean(np.square(errors))))
+    return Outcome(guess.name, rate_hz, latency_ms, rms, max(errors), _attitude_us(guess, samples, latency_ms))
+
+
+def _attitude_us(guess: Guess, samples: list[AttitudeSample], latency_ms: int) -> float:
+    """The median time of one attitude past the samples."""
+    attitude_at = guess.load(samples[-NEAR:])
+    t_ns = samples[-1].t_ns + latency_ms * NS_PER_MS
+    times = []
+    for _ in range(TIMED):
+        begin_ns = time.perf_counter_ns()
+        attitude_at(t_ns)
+        times.append((time.perf_counter_ns() - begin_ns) / 1e3)
+    return float(np.median(times))
+
+
+def _line(outcome: Outcome) -> str:
+    errors = f"{outcome.rms_arcsec:.3g} arcsec rms, {outcome.worst_arcsec:.3g} at worst"
+    return f"{outcome.method}: {errors}, {outcome.attitude_us:.0f} us an attitude"
+
+
+def _draw(path: Path, finding: str, outcomes: list[Outcome]) -> None:
+    with chart(path, finding, panels=2, share_x=False) as (latency, rate):
+        for name, marker in zip(dict.fromkeys(o.method for o in outcomes), MARKERS, strict=False):
+            mine = [o for o in outcomes if o.method == name]
+            took_us = np.median([o.attitude_us for o in mine])
+            by_latency = sorted((o.latency_ms, o.rms_arcsec) for o in mine if o.rate_hz == USUAL_HZ)
+            by_rate = sorted((o.rate_hz, o.rms_arcsec) for o in mine if o.latency_ms == USUAL_MS)
+            latency.loglog(*zip(*by_latency, strict=True), marker=marker, label=f"{name}: {took_us:.0f} us")
+            rate.loglog(*zip(*by_rate, strict=True), marker=marker)
+        latency.set_xlabel(f"latency, ms (packets at {USUAL_HZ} Hz)")
+        rate.set_xlabel(f"packets, Hz (latency {USUAL_MS} ms)")
+        plain_ticks(latency.xaxis, LATENCIES_MS)
+        plain_ticks(rate.xaxis, RATES_HZ)
+        for axes in (latency, rate):
+            axes.set_ylabel("pointing error, arcsec rms")
+        latency.legend(loc="upper left", fontsize=9)

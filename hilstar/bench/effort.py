@@ -42,9 +42,13 @@ class Choice:
         return f"{self.what}: {self.chosen}; {self.error}; {self.saving}"
 
 
+# Sprites' sides by rate, the flux that their edges cut, magnitudes, how far that moves a centroid, px, and what to say.
+Sides = tuple[tuple[tuple[float, int], ...], float, float, Choice]
 ENCODING = Choice(
     "encoding", "under the sprites, or all pixels where sprites cover more", "exact", "the cheaper one, frame by frame"
 )
+# `exact` makes its codes of the stars themselves.
+NO_SPRITES: Sides = ((), 0.0, 0.0, Choice("sprites", "none", "exact", "no linear image is drawn"))
 PROJECTION = Choice("projection", "perspective", "exact", "a weak one would save nothing, and fails off the middle")
 
 
@@ -79,7 +83,7 @@ def plan_effort(render: RenderSettings, light: Light) -> Effort:
     if render.effort == "full":
         motion_px = render.motion_above_px
         return Effort(method, (), motion_px, errors.flux_max_mag, errors.centroid_max_px + motion_px, (chosen,))
-    sides, lost_mag, moved_px, edges = choose_sides(render, light, method)
+    sides, lost_mag, moved_px, edges = NO_SPRITES if method == "exact" else choose_sides(render, light, method)
     motion_px = max(render.motion_above_px, MOTION_SHARE * render.tolerance_px)
     paths = Choice(
         "paths",
@@ -141,9 +145,7 @@ def code_errors(method: Quantisation, render: RenderSettings, light: Light) -> E
     return Errors(*(max(getattr(e, name) for e in found) for name in Errors.__slots__))
 
 
-def choose_sides(
-    render: RenderSettings, light: Light, method: Quantisation
-) -> tuple[tuple[tuple[float, int], ...], float, float, Choice]:
+def choose_sides(render: RenderSettings, light: Light, method: Quantisation) -> Sides:
     """Sprites' sides by rate, the flux that their edges cut, magnitudes, and how far that moves a centroid, px."""
     sigma_px = render.sprite_sigma_px
     full = footprint_px(sigma_px)

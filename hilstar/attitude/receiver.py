@@ -24,6 +24,7 @@ from hilstar.attitude.packet import (
 )
 from hilstar.attitude.protocol import HEALTH_MISSED, HEALTH_REFUSED
 from hilstar.attitude.timeline import Timeline
+from hilstar.notices import Notices
 from hilstar.spread import RunningSpread
 
 POLL_MS = 20
@@ -93,7 +94,14 @@ QUIET = Traffic()
 class Receiver:
     """Runs `link` into `timeline` until closed. Nothing that arrives ends it."""
 
-    def __init__(self, link: Link, timeline: Timeline, traffic: Traffic = QUIET, watch: Watch = nobody_watches) -> None:
+    def __init__(
+        self,
+        link: Link,
+        timeline: Timeline,
+        traffic: Traffic = QUIET,
+        watch: Watch = nobody_watches,
+        notices: Notices | None = None,
+    ) -> None:
         self.counts = PacketCounts()
         self.clock = BenchClock()
         self.jumps = JumpFilter()
@@ -102,6 +110,7 @@ class Receiver:
         self._timeline = timeline
         self._traffic = traffic
         self._watch = watch
+        self._notices = Notices() if notices is None else notices
         self._status: Status | None = None
         self._posting = threading.Lock()
         self._next_status_ns = 0
@@ -167,9 +176,8 @@ class Receiver:
             self._watch(host_ns, arrived.raw, sample, None)
         if jumps > self._jumps_told:
             self._jumps_told = jumps
-            log.warning(
-                "the bench's clock jumped: %.3f s in all; its stream is carried on", self.jumps.correction_ns / NS_PER_S
-            )
+            total_s = self.jumps.correction_ns / NS_PER_S
+            self._notices.tell("jump", f"the sender's clock jumped: {total_s:.3f} s in all; its stream is carried on")
 
     def _refuse(self, host_ns: int, raw: bytes, sample: AttitudeSample | None, refusal: Refusal) -> None:
         self.counts.refused_by[refusal.reason] += 1

@@ -23,17 +23,21 @@ from hilstar.attitude.mcap_log import attitude_message, log_time_ns, refused_mes
 from hilstar.attitude.packet import AttitudeSample, Refusal
 from hilstar.bench.assembly import Bench
 from hilstar.bench.records import (
+    EVENT_SCHEMA_NAME,
+    EVENT_TOPIC,
     FRAME_SCHEMA_NAME,
     FRAME_TOPIC,
     HEAD,
     PROCESS_SCHEMA_NAME,
     PROCESS_TOPIC,
+    EventRecord,
     FrameRecord,
     ProcessRecord,
     process_record,
     schema_of,
 )
 from hilstar.errors import InputError
+from hilstar.notices import Notice
 
 FLUSH_S = 0.2
 PROCESS_S = 1.0
@@ -68,6 +72,7 @@ class Ledger:
         self._channels = {
             "attitude": register_attitudes(self._writer),
             "frame": self._register(FRAME_TOPIC, FRAME_SCHEMA_NAME, FrameRecord),
+            "event": self._register(EVENT_TOPIC, EVENT_SCHEMA_NAME, EventRecord),
             "process": self._register(PROCESS_TOPIC, PROCESS_SCHEMA_NAME, ProcessRecord),
         }
         head = {
@@ -94,6 +99,11 @@ class Ledger:
     def frame(self, record: FrameRecord) -> None:
         """Keep a frame."""
         self._put(("frame", record.swap_ns, record.frame, record))
+
+    def notice(self, notice: Notice) -> None:
+        """Keep an event of the run."""
+        record = EventRecord(host_ns=notice.host_ns, kind=notice.kind, detail=notice.detail)
+        self._put(("event", notice.host_ns, 0, record))
 
     def _put(self, item: tuple[str, int, int, Any]) -> None:
         if self.failure is not None or self._waiting.qsize() > WAITING_MESSAGES:

@@ -20,6 +20,7 @@ from hilstar.bench.pacing import wait_until
 from hilstar.bench.priority import steady_loop
 from hilstar.bench.screen import Screen
 from hilstar.bench.stats import RunStats
+from hilstar.notices import Notices
 
 log = logging.getLogger(__name__)
 
@@ -68,7 +69,12 @@ class FrameLoop:
     """
 
     def __init__(
-        self, bench: Bench, sink: FrameSink = ignore, screen: Screen | None = None, moving: bool | None = None
+        self,
+        bench: Bench,
+        sink: FrameSink = ignore,
+        screen: Screen | None = None,
+        moving: bool | None = None,
+        notices: Notices | None = None,
     ) -> None:
         settings = bench.config.attitude
         self.stats = RunStats()
@@ -78,6 +84,7 @@ class FrameLoop:
         self._bench = bench
         self._sink = sink
         self._screen = screen
+        self.notices = Notices() if notices is None else notices
         self._predicted_swap_ns: int | None = None
         self._missed_before = 0
         self._held: Attitude | None = None  # what a paused screen shows

@@ -20,8 +20,8 @@ from hilstar.bench.config import BenchConfig
 from hilstar.bench.loop import Shown
 from hilstar.errors import InputError
 
-FRAME_TOPIC, PROCESS_TOPIC = "/frame", "/process"
-FRAME_SCHEMA_NAME, PROCESS_SCHEMA_NAME = "hilstar.Frame", "hilstar.Process"
+FRAME_TOPIC, PROCESS_TOPIC, EVENT_TOPIC = "/frame", "/process", "/event"
+FRAME_SCHEMA_NAME, PROCESS_SCHEMA_NAME, EVENT_SCHEMA_NAME = "hilstar.Frame", "hilstar.Process", "hilstar.Event"
 HEAD = "hilstar"
 
 
@@ -108,6 +108,14 @@ class ProcessRecord(msgspec.Struct, kw_only=True):
     host_ns: int
     resident_bytes: int
     cpu_s: float
+
+
+class EventRecord(msgspec.Struct, kw_only=True):
+    """Something that happened in a run (see `hilstar.notices`): host time, ns, its kind, and what was said."""
+
+    host_ns: int
+    kind: str
+    detail: str
 
 
 def process_record() -> ProcessRecord:

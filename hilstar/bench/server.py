@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -22,19 +22,18 @@ from hilstar.bench.play import Play
 from hilstar.bench.records import frame_record
 from hilstar.bench.screen import Screen
 from hilstar.bench.status import StatusMaker
+from hilstar.notices import Notices
 
 AnyLink = ZmqReceiver | ZmqLockstep | SerialLink
 
 
 @dataclass(frozen=True, slots=True)
 class Outlet:
-    """Where frames go besides their sink: onto a screen, and into a ledger."""
+    """Where frames go besides their sink: onto a screen, and into a ledger; and where events are told."""
 
     screen: Screen | None = None
     ledger: Ledger | None = None
-
-
-HEADLESS = Outlet()
+    notices: Notices = field(default_factory=Notices)
 
 
 def link_keys(settings: AttitudeSettings, folder: Path) -> CurveKeys:
@@ -53,25 +52,27 @@ def open_link(settings: AttitudeSettings, folder: Path) -> AnyLink:
     return ZmqReceiver(settings.endpoint, bind=settings.bind is True, keys=keys)
 
 
-def serve(bench: Bench, link: AnyLink, limit: Limit, sink: FrameSink = ignore, outlet: Outlet = HEADLESS) -> dict[str, Any]:
+def serve(bench: Bench, link: AnyLink, limit: Limit, sink: FrameSink = ignore, outlet: Outlet | None = None) -> dict[str, Any]:
     """Show the live stream of `link` up to `limit`, or until a signal; the summary."""
-    loop, ledger = FrameLoop(bench, sink, outlet.screen), outlet.ledger
+    outlet = outlet or Outlet()
+    loop, ledger = FrameLoop(bench, sink, outlet.screen, notices=outlet.notices), outlet.ledger
     with stop_on_signal(loop.stop):
         if isinstance(link, ZmqLockstep):
             bench.warm_up()
             summary = serve_lockstep(bench, link, limit, loop, ledger)
         else:
-            summary = _serve_stream(bench, link, limit, loop, ledger)
+            summary = _serve_stream(bench, link, limit, loop, outlet)
+    summary |= {"events": outlet.notices.counts()}
     return summary | loop.screen_summary() | ({} if ledger is None else {"ledger": ledger.summary()})
 
 
 def _serve_stream(
-    bench: Bench, link: ZmqReceiver | SerialLink, limit: Limit, loop: FrameLoop, ledger: Ledger | None
+    bench: Bench, link: ZmqReceiver | SerialLink, limit: Limit, loop: FrameLoop, outlet: Outlet
 ) -> dict[str, Any]:
-    settings = bench.config.attitude
+    settings, ledger = bench.config.attitude, outlet.ledger
     timeline = Timeline(policy_of(settings))
     watch = nobody_watches if ledger is None else ledger.packet
-    receiver = Receiver(link, timeline, Traffic(settings.status_hz, settings.time_requests), watch)
+    receiver = Receiver(link, timeline, Traffic(settings.status_hz, settings.time_requests), watch, outlet.notices)
     statuses = StatusMaker(ledger)
 
     def draw_slot(slot: int) -> None:
@@ -100,12 +101,13 @@ def _serve_stream(
     }
 
 
-def replay(bench: Bench, play: Play, sink: FrameSink = ignore, outlet: Outlet = HEADLESS) -> dict[str, Any]:
+def replay(bench: Bench, play: Play, sink: FrameSink = ignore, outlet: Outlet | None = None) -> dict[str, Any]:
     """Show the past; the summary.
 
     Paced, late frames are missed, as on a monitor; otherwise every frame is drawn, as fast as it can be.
     """
-    loop, ledger = FrameLoop(bench, sink, outlet.screen, play.moving), outlet.ledger
+    outlet = outlet or Outlet()
+    loop, ledger = FrameLoop(bench, sink, outlet.screen, play.moving, outlet.notices), outlet.ledger
 
     def draw_slot(slot: int) -> None:
         number, t_ns, attitude = play.frame(slot)
@@ -126,4 +128,4 @@ def replay(bench: Bench, play: Play, sink: FrameSink = ignore, outlet: Outlet = 
     duration_s = (time.monotonic_ns() - begin_ns) / NS_PER_S
     summary = loop.stats.summary(duration_s, PacketCounts(received=play.packet_count), bench.renderer.gl_renderer)
     kept = {} if ledger is None else {"ledger": ledger.summary()}
-    return summary | {"stale_events": loop.gate.events} | loop.screen_summary() | kept
+    return summary | {"stale_events": loop.gate.events, "events": outlet.notices.counts()} | loop.screen_summary() | kept

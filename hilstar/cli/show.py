@@ -14,6 +14,7 @@ import typer
 from hilstar.cli.common import LOG_HELP, BenchFile, Headless, Json, QuaternionText, RadecText, app, attitude_of
 from hilstar.console import print_json, progress, report, say
 from hilstar.errors import InputError
+from hilstar.notices import Notices
 
 Windowed = Annotated[bool, typer.Option("--windowed", help="A window on the desk instead of the whole display.")]
 Force = Annotated[bool, typer.Option("--force", help="Show on a display that the start-up gate refuses; logged.")]
@@ -116,11 +117,15 @@ def shown_bench(bench_file: Path, headless: bool, windowed: bool, force: bool) -
         yield screen.bench, screen
 
 
-def optional_ledger(path: Path | None, bench: Any) -> AbstractContextManager[Any]:
-    """The run's ledger, or nothing where none was asked for."""
+def optional_ledger(path: Path | None, bench: Any, notices: Notices) -> AbstractContextManager[Any]:
+    """The run's ledger, which keeps the run's events too, or nothing where none was asked for."""
     from hilstar.bench.ledger import Ledger
 
-    return nullcontext() if path is None else Ledger(path, bench)
+    if path is None:
+        return nullcontext()
+    ledger = Ledger(path, bench)
+    notices.listen(ledger.notice)
+    return ledger
 
 
 def left_out(truth: Any) -> dict[str, float | int]:
@@ -148,10 +153,11 @@ def serve(
     from hilstar.bench.server import Outlet, open_link
     from hilstar.bench.server import serve as serve_stream
 
+    notices = Notices()
     with (
         open_link(read_config(bench_file).attitude, bench_file.parent) as link,
         shown_bench(bench_file, headless, windowed, force) as (bench, screen),
-        optional_ledger(ledger, bench) as kept,
+        optional_ledger(ledger, bench, notices) as kept,
     ):
         if explain:
             explain_effort(bench)
@@ -160,7 +166,7 @@ def serve(
         limit = Limit(slots, math.inf if frames is None else frames)
         say(f"{link.verb} {link.endpoint}, {refresh_hz:g} Hz, {bench.renderer.gl_renderer}")
         with progress("serving", min(limit.slots, limit.frames)) as advance:
-            summary = serve_stream(bench, link, limit, lambda shown: advance(shown.number + 1), Outlet(screen, kept))
+            summary = serve_stream(bench, link, limit, lambda shown: advance(shown.number + 1), Outlet(screen, kept, notices))
     report(summary, as_json)
 
 
@@ -187,11 +193,12 @@ def replay(
     from hilstar.bench.server import Outlet
     from hilstar.bench.server import replay as replay_log
 
+    notices = Notices()
     play = plan_play(log, Wanted(speed, start, stop, step), read_config(bench_file))
     with (
         shown_bench(bench_file, headless, windowed, force) as (bench, screen),
         FrameRecorder(output, bench) as record,
-        optional_ledger(ledger, bench) as kept,
+        optional_ledger(ledger, bench, notices) as kept,
         progress("replaying", play.frame_count) as advance,
     ):
         if explain:
@@ -201,5 +208,5 @@ def replay(
             record(shown)
             advance(shown.number + 1)
 
-        summary = replay_log(bench, play, sink, Outlet(screen, kept))
+        summary = replay_log(bench, play, sink, Outlet(screen, kept, notices))
     report(summary, as_json)

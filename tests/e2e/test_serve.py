@@ -23,7 +23,16 @@ from hilstar.attitude.quaternion import from_radec_roll_deg
 from tests.conftest import SMALL_BENCH, assert_refused, run_hilstar
 
 SUMMARY_KEYS = {"frames", "duration_s", "fps", "frame_ms", "attitude_age_ms", "packets", "stars_drawn", "clipped"}
-SUMMARY_KEYS |= {"missed_frames", "stale_frames", "gl_renderer", "stale_events", "receive_latency_ms", "clock", "reconnects"}
+SUMMARY_KEYS |= {
+    "missed_frames",
+    "stale_frames",
+    "gl_renderer",
+    "stale_events",
+    "receive_latency_ms",
+    "clock",
+    "reconnects",
+    "events",
+}
 
 
 def packet(sequence: int, t_ns: int, q=(0.5, 0.5, -0.5, 0.5), rate=(0.0, 0.0, 0.0)) -> bytes:

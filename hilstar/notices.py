@@ -1,0 +1,65 @@
+"""What happens in a run, said while it happens: a line on stderr, a count in the summary, an event in the ledger.
+
+A kind that comes more than SAID_AT_MOST times within SAID_WITHIN_S is counted and kept, and said again when it is rare.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+SAID_AT_MOST = 3
+SAID_WITHIN_S = 10.0
+MAX_DETAIL_CHARACTERS = 400
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Notice:
+    """One event of a run: when (host time, ns), of what kind (a word such as "stale"), and a line for a person."""
+
+    host_ns: int
+    kind: str
+    detail: str
+
+
+Listener = Callable[[Notice], None]
+
+
+class Notices:
+    """Takes events from any thread; never waits, never raises for what a listener does."""
+
+    def __init__(self) -> None:
+        self._counts: Counter[str] = Counter()
+        self._said_ns: dict[str, deque[int]] = {}
+        self._listeners: list[Listener] = []
+        self._lock = threading.Lock()
+
+    def listen(self, listener: Listener) -> None:
+        """Hand every further event to `listener` too."""
+        self._listeners.append(listener)
+
+    def tell(self, kind: str, detail: str) -> None:
+        """Take in an event: count it, say it unless its kind floods, hand it on."""
+        notice = Notice(time.monotonic_ns(), kind, detail[:MAX_DETAIL_CHARACTERS])
+        with self._lock:
+            self._counts[kind] += 1
+            said_ns = self._said_ns.setdefault(kind, deque(maxlen=SAID_AT_MOST))
+            floods = len(said_ns) == SAID_AT_MOST and notice.host_ns - said_ns[0] < SAID_WITHIN_S * 1e9
+            if not floods:
+                said_ns.append(notice.host_ns)
+            last_before_silence = not floods and len(said_ns) == SAID_AT_MOST
+            last_before_silence &= notice.host_ns - said_ns[0] < SAID_WITHIN_S * 1e9
+        if not floods:
+            log.warning("%s%s", notice.detail, "; further ones are only counted for a while" if last_before_silence else "")
+        for listener in self._listeners:
+            listener(notice)
+
+    def counts(self) -> dict[str, int]:
+        """How often each kind came."""
+        with self._lock:
+            return dict(self._counts)

@@ -14,6 +14,8 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from hilstar.errors import one_line
+
 
 def say(line: str) -> None:
     """A line for the person at the terminal."""
@@ -89,5 +91,5 @@ def progress(what: str, total: float) -> Iterator[Callable[[int], None]]:
 
 def fail(line: str, code: int) -> NoReturn:
     """One line on stderr, and out."""
-    print("hilstar: " + " ".join(line.split()), file=sys.stderr)
+    print("hilstar: " + one_line(line), file=sys.stderr)
     sys.exit(code)

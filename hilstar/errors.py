@@ -1,4 +1,10 @@
-"""The two ways in which hilstar refuses, each with its exit code."""
+"""The two ways in which hilstar refuses, each with its exit code, and how a refusal quotes what it refuses."""
+
+from __future__ import annotations
+
+MAX_QUOTED_CHARACTERS = 120
+MAX_LINE_CHARACTERS = 1000
+CUT = "[...]"
 
 
 class HilstarError(Exception):
@@ -17,3 +23,30 @@ class MachineError(HilstarError):
     """The machine lacks something; the line says what to install."""
 
     exit_code = 3
+
+
+def shortened(text: object, limit: int = MAX_QUOTED_CHARACTERS) -> str:
+    """A quoted piece of input in at most `limit` characters: its beginning and its end, where a file's name is."""
+    whole = str(text)
+    if len(whole) <= limit:
+        return whole
+    room = limit - len(CUT)
+    return whole[: room - room // 3] + CUT + whole[len(whole) - room // 3 :]
+
+
+def printable(text: str) -> str:
+    r"""The text with what a terminal obeys, or no file in UTF-8 can hold, as an escape such as \x1b or \xff."""
+    return "".join(c if c.isprintable() or c == " " else _escape(c) for c in text)
+
+
+def _escape(character: str) -> str:
+    code = ord(character)
+    if 0xDC80 <= code <= 0xDCFF:  # a byte of a name that is not UTF-8
+        code -= 0xDC00
+    return f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}"
+
+
+def one_line(text: str) -> str:
+    """A message as one line of bounded length, whatever it repeats of the input."""
+    words = (shortened(printable(word)) for word in text[: 100 * MAX_LINE_CHARACTERS].split())
+    return shortened(" ".join(words), MAX_LINE_CHARACTERS)

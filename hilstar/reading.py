@@ -1,0 +1,135 @@
+"""Files that a user names: regular ones only, and no more bytes than such a file can have.
+
+A pipe would be awaited for ever, a device never ends, and a file of gigabytes is no bench file: each is said instead.
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+from typing import IO
+
+from hilstar.errors import InputError
+
+HEAD_BYTES = 16
+NOT_FILES = {
+    stat.S_ISDIR: "is a directory",
+    stat.S_ISFIFO: "is a pipe; write it to a file first",
+    stat.S_ISSOCK: "is a socket",
+    stat.S_ISCHR: "is a device",
+    stat.S_ISBLK: "is a device",
+}
+# What begins a file of a kind that people have beside attitude logs and benches.
+MAGIC = {
+    b"ULog\x01\x12\x35": "a ULog file",
+    b"DAF/CK": "a SPICE CK kernel",
+    b"DAF/": "a SPICE kernel",
+    b"NAIF/": "a SPICE kernel",
+    b"SQLite format 3\x00": "an SQLite database (a db3 bag of ROS 2)",
+    b"#ROSBAG V": "a ROS 1 bag",
+    b"\x89MCAP0\r\n": "an MCAP file",
+    b"\x89HDF\r\n\x1a\n": "an HDF5 file",
+    b"SIMPLE  =": "a FITS file",
+    b"PK\x03\x04": "a zip archive",
+    b"\x1f\x8b": "a gzip file",
+    b"BZh": "a bzip2 file",
+    b"\xfd7zXZ\x00": "an xz file",
+    b"\x28\xb5\x2f\xfd": "a Zstandard file",
+    b"\x89PNG": "a PNG picture",
+    b"\xff\xd8\xff": "a JPEG picture",
+    b"%PDF": "a PDF",
+    b"\x7fELF": "a program",
+    b"\x93NUMPY": "a NumPy array",
+    b"MATLAB 5.0": "a MATLAB file",
+    b"PAR1": "a Parquet file",
+    b"\x80\x02": "a pickle",
+    b"\x80\x03": "a pickle",
+    b"\x80\x04": "a pickle",
+    b"\x80\x05": "a pickle",
+    b"\xff\xfe": "text in UTF-16",
+    b"\xfe\xff": "text in UTF-16",
+}
+
+
+def kind_of(head: bytes) -> str | None:
+    """What a file is by its first bytes (HEAD_BYTES of them): "a zip archive" or the like; None where that says nothing."""
+    return next((kind for magic, kind in MAGIC.items() if head.startswith(magic)), None)
+
+
+def size_text(size_bytes: int) -> str:
+    """A size for a person: "1.5 GB"."""
+    for unit, factor in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
+        if size_bytes >= factor:
+            return f"{size_bytes / factor:.4g} {unit}"
+    return f"{size_bytes} bytes"
+
+
+def exists(path: Path) -> bool:
+    """Whether anything has that name, for any text that a user may write."""
+    try:
+        return path.exists()
+    except (OSError, ValueError):  # a name too long, or with a NUL
+        return False
+
+
+def open_regular(path: Path, advice: str, limit_bytes: int | None = None) -> IO[bytes]:
+    """A regular file, open for reading. `advice` is what to give instead, such as "give the path of a bench file".
+
+    Raises InputError for anything else (a pipe is not awaited), and for a file of more than `limit_bytes`.
+    """
+    try:
+        _refuse_other(path, path.stat().st_mode, advice)  # before the open, which some devices take as a command
+        file = os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb")
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or "no file has such a name"
+        raise InputError(f"{path}: cannot be read ({reason}); {advice}") from error
+    try:
+        status = os.fstat(file.fileno())
+        _refuse_other(path, status.st_mode, advice)
+        if limit_bytes is not None and status.st_size > limit_bytes:
+            raise InputError(_too_large(path, status.st_size, limit_bytes, advice))
+    except InputError:
+        file.close()
+        raise
+    return file
+
+
+def read_bytes(path: Path, advice: str, limit_bytes: int) -> bytes:
+    """What a regular file of at most `limit_bytes` holds. Raises InputError."""
+    with open_regular(path, advice, limit_bytes) as file:
+        try:
+            raw = file.read(limit_bytes + 1)  # some of /proc have no size
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read ({error.strerror or error}); {advice}") from error
+    if len(raw) > limit_bytes:
+        raise InputError(_too_large(path, len(raw), limit_bytes, advice))
+    return raw
+
+
+def read_text(path: Path, advice: str, limit_bytes: int) -> str:
+    """The text (UTF-8; a byte order mark is dropped) of a regular file of at most `limit_bytes`. Raises InputError."""
+    return as_text(path, read_bytes(path, advice, limit_bytes), advice)
+
+
+def as_text(path: Path, raw: bytes, advice: str) -> str:
+    """The text of a file's bytes. Raises InputError with the kind of file, or the first byte that is not UTF-8."""
+    kind = kind_of(raw[:HEAD_BYTES])
+    if kind is not None:
+        raise InputError(f"{path}: is {kind}; {advice}")
+    try:
+        return raw.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        # Not error.start: the decoder drops a byte order mark before it counts.
+        place = len(raw) - len(error.object) + error.start
+        raise InputError(f"{path}: is not text in UTF-8 (byte {place} is 0x{raw[place]:02x}); {advice}") from error
+
+
+def _refuse_other(path: Path, mode: int, advice: str) -> None:
+    if not stat.S_ISREG(mode):
+        what = next((words for test, words in NOT_FILES.items() if test(mode)), "is no file")
+        raise InputError(f"{path}: cannot be read (it {what}); {advice}")
+
+
+def _too_large(path: Path, size_bytes: int, limit_bytes: int, advice: str) -> str:
+    return f"{path}: has {size_text(size_bytes)} or more; {size_text(limit_bytes)} at most are read; {advice}"

@@ -30,8 +30,9 @@ INT64 = range(-(2**63), 2**63)
 U32 = 2**32
 UNIT = 1e-15  # so near, a division by the norm would only move the last bit to and fro
 
-Reason = Literal["crc", "norm", "nan", "time", "format"]
-REASONS: tuple[Reason, ...] = ("crc", "norm", "nan", "time", "format")
+Reason = Literal["crc", "norm", "nan", "time", "format", "rate"]
+REASONS: tuple[Reason, ...] = ("crc", "norm", "nan", "time", "format", "rate")
+RATE_ROUNDING = 1e-6  # a packet's rate is float32
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,6 +176,20 @@ def checked_sample(
     if abs(norm - 1.0) > UNIT:
         unit /= norm
     return AttitudeSample(t_ns, unit, None if rate is None else np.array(rate, dtype=np.float64), sequence, discontinuity)
+
+
+def rate_refusal(sample: AttitudeSample, max_rate_rad_s: float) -> Refusal | None:
+    """Why a sample turns faster than this bench takes ([attitude] max_rate_deg_s), None where it does not."""
+    if sample.rate_cam_rad_s is None:
+        return None
+    rate_rad_s = math.hypot(*sample.rate_cam_rad_s.tolist())
+    if rate_rad_s <= max_rate_rad_s * (1 + RATE_ROUNDING):
+        return None
+    return Refusal(
+        "rate",
+        f"a rate of {rate_rad_s:.4g} rad/s ({math.degrees(rate_rad_s):.4g} deg/s) is over [attitude] max_rate_deg_s ="
+        f" {math.degrees(max_rate_rad_s):g}; rates are rad/s: send rad/s, or write a larger max_rate_deg_s",
+    )
 
 
 def _decode_json(message: bytes) -> AttitudeSample | Refusal:

@@ -5,6 +5,7 @@ Times are nanoseconds of one continuous clock: the bench's, which `clock` and `j
 
 from __future__ import annotations
 
+import math
 import threading
 from bisect import bisect_right
 from dataclasses import dataclass, replace
@@ -12,8 +13,8 @@ from typing import Literal
 
 from hilstar.arrays import FloatArray
 from hilstar.attitude.clock import NS_PER_S
-from hilstar.attitude.packet import AttitudeSample, Refusal
-from hilstar.attitude.quaternion import propagate, rate_between_rad_s, slerp
+from hilstar.attitude.packet import AttitudeSample, Refusal, rate_refusal
+from hilstar.attitude.quaternion import angle_between_rad, propagate, rate_between_rad_s, slerp
 
 # A live timeline keeps this many samples, 5 s at 200 Hz, or twice as many: far more than a frame looks back.
 LIVE_CAPACITY = 1024
@@ -42,10 +43,14 @@ class Attitude:
 
 @dataclass(frozen=True, slots=True)
 class Policy:
-    """What happens past the newest sample: prediction for at most so long, and when it counts as stale."""
+    """What happens past the newest sample, how long it counts as fresh, and the fastest turn that is believed.
+
+    A sample whose rate is over `max_rate_rad_s` is refused; two samples farther apart than that are a jump.
+    """
 
     max_extrapolation_ns: int
     stale_after_ns: int
+    max_rate_rad_s: float = math.inf
 
 
 class Timeline:
@@ -63,7 +68,10 @@ class Timeline:
         return len(self._samples)
 
     def add(self, sample: AttitudeSample, received_ns: int | None = None) -> Refusal | None:
-        """Append a sample; one whose time does not rise, a duplicate or one out of order, is refused."""
+        """Append a sample; refused are one whose time does not rise, a duplicate or one out of order, and one too fast."""
+        too_fast = rate_refusal(sample, self._policy.max_rate_rad_s)
+        if too_fast is not None:
+            return too_fast
         with self._lock:
             if self._t_ns and sample.t_ns <= self._t_ns[-1]:
                 return Refusal("time", f"t_ns {sample.t_ns} is not after {self._t_ns[-1]}, which came before it")
@@ -78,8 +86,8 @@ class Timeline:
         """The attitude at `t_ns`, or None before any sample has come.
 
         Before the first sample it is the first. Between two it is the C2 blend of both where both have rates, else
-        SLERP; before a discontinuity it stands still. Past the newest it is predicted with the sample's rate (else that
-        of the last two samples) for at most `max_extrapolation_ns`, and then held.
+        SLERP; before a discontinuity, or a turn faster than `max_rate_rad_s`, it stands still. Past the newest it is
+        predicted with the sample's rate (else that of the last two samples) for at most `max_extrapolation_ns`, and then held.
         """
         with self._lock:
             if not self._samples:
@@ -100,7 +108,7 @@ class Timeline:
     def _between(self, near: list[AttitudeSample], place: int, age_ns: int) -> tuple[FloatArray, FloatArray | None]:
         """Attitude and rate between two samples; of a blend the rates of both, blended too."""
         before, after = near[place], near[place + 1]
-        if after.discontinuity:
+        if self._jumped(before, after):
             return before.q_icrs_to_cam, None
         gap_ns = after.t_ns - before.t_ns
         rate, rate_after = before.rate_cam_rad_s, after.rate_cam_rad_s
@@ -127,12 +135,19 @@ class Timeline:
 
     def _joined(self, before: AttitudeSample, after: AttitudeSample) -> bool:
         known = before.rate_cam_rad_s is not None and after.rate_cam_rad_s is not None
-        return known and not after.discontinuity and after.t_ns - before.t_ns <= self._policy.stale_after_ns
+        return known and not self._jumped(before, after) and after.t_ns - before.t_ns <= self._policy.stale_after_ns
+
+    def _jumped(self, before: AttitudeSample, after: AttitudeSample) -> bool:
+        """The attitude did not turn from one sample to the next: it says so, or no turn is so fast."""
+        if after.discontinuity:
+            return True
+        seconds = (after.t_ns - before.t_ns) / NS_PER_S
+        return angle_between_rad(before.q_icrs_to_cam, after.q_icrs_to_cam) > self._policy.max_rate_rad_s * seconds
 
     def _predict(self, previous: AttitudeSample | None, newest: AttitudeSample, age_ns: int) -> Attitude:
         stale = age_ns > self._policy.stale_after_ns
         rate = newest.rate_cam_rad_s
-        if rate is None and previous is not None and not newest.discontinuity:
+        if rate is None and previous is not None and not self._jumped(previous, newest):
             gap_ns = newest.t_ns - previous.t_ns
             if gap_ns <= self._policy.stale_after_ns:
                 rate = rate_between_rad_s(previous.q_icrs_to_cam, newest.q_icrs_to_cam, gap_ns / NS_PER_S)

@@ -136,6 +136,7 @@ class AttitudeSettings(_Table, frozen=True):
     stale_after_ms: NotNegative = 250.0
     max_extrapolation_ms: NotNegative = 250.0
     on_stale: Literal["hold", "blank"] = "hold"
+    max_rate_deg_s: Annotated[float, Meta(ge=1e-3, le=1e9)] = 60.0
 
 
 class RenderSettings(_Table, frozen=True):

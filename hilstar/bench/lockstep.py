@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import time
 from typing import Any
 
 from hilstar.attitude.clock import NS_PER_MS, NS_PER_S
 from hilstar.attitude.links import ZmqLockstep
-from hilstar.attitude.packet import AttitudeSample, Event, Refusal, TimeReply, TimeRequest
+from hilstar.attitude.packet import AttitudeSample, Event, Refusal, TimeReply, TimeRequest, rate_refusal
 from hilstar.attitude.receiver import Arrival, PacketCounts
 from hilstar.attitude.timeline import Attitude
 from hilstar.bench.assembly import Bench
@@ -40,7 +41,7 @@ def serve_lockstep(
             link.reply_time(TimeReply(asked.sequence, asked.t1_ns, arrival.host_ns, time.monotonic_ns()))
             continue
         counts.received += 1
-        refusal = _refusal(arrival.event)
+        refusal = _refusal(arrival.event, math.radians(bench.config.attitude.max_rate_deg_s))
         if refusal is not None:
             counts.refused_by[refusal.reason] += 1
         else:
@@ -55,11 +56,11 @@ def serve_lockstep(
     return summary | {"turn_ms": turn_ms.summary(), "stale_events": 0}
 
 
-def _refusal(event: Event) -> Refusal | None:
+def _refusal(event: Event, max_rate_rad_s: float) -> Refusal | None:
     if isinstance(event, Refusal):
         return event
     if isinstance(event, AttitudeSample):
-        return None
+        return rate_refusal(event, max_rate_rad_s)
     return Refusal("format", f"a {type(event).__name__} packet; a request is an attitude, or a time request")
 
 

@@ -10,6 +10,7 @@ from typing import Protocol
 from hilstar.attitude.clock import NS_PER_S
 from hilstar.attitude.logs import log_timeline, read_log
 from hilstar.attitude.mcap_log import is_mcap, read_attitudes
+from hilstar.attitude.packet import AttitudeSample, rate_refusal
 from hilstar.attitude.timeline import Attitude, Timeline
 from hilstar.bench.config import BenchConfig
 from hilstar.bench.loop import policy_of
@@ -109,6 +110,7 @@ def plan_play(log: Path, wanted: Wanted, config: BenchConfig) -> Play:
         if frames:
             return _plan_run(log, wanted, factor, frames)
     samples = read_log(log)
+    _check_rates(log, samples, math.radians(config.attitude.max_rate_deg_s))
     start_s, stop_s = _span(log, wanted, (samples[-1].t_ns - samples[0].t_ns) / NS_PER_S)
     step_s = (1.0 if math.isinf(factor) else factor) / config.monitor.refresh_hz
     if wanted.step_s is not None:
@@ -120,6 +122,14 @@ def plan_play(log: Path, wanted: Wanted, config: BenchConfig) -> Play:
         raise InputError(f"{log}: makes {count:.3g} frames; write a longer --step, or --start and --stop")
     first_ns = samples[0].t_ns + round(start_s * NS_PER_S)
     return LogPlay(log_timeline(samples, policy_of(config.attitude)), first_ns, step_s, int(count) + 1, not math.isinf(factor))
+
+
+def _check_rates(log: Path, samples: list[AttitudeSample], max_rate_rad_s: float) -> None:
+    """A log is refused what a stream is refused."""
+    for number, sample in enumerate(samples, start=1):
+        refusal = rate_refusal(sample, max_rate_rad_s)
+        if refusal is not None:
+            raise InputError(f"{log}: attitude {number}: {refusal.detail}")
 
 
 def _plan_run(log: Path, wanted: Wanted, factor: float, frames: list[PastFrame]) -> RunPlay:

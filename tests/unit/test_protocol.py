@@ -146,7 +146,7 @@ def test_the_table_has_the_icd_s_sizes_and_bits():
 
 def test_the_vectors_have_every_kind_every_reason_and_names_of_their_own():
     assert {vector["kind"] for vector in ACCEPTED} == set(SIZES)
-    assert {vector["refused"] for vector in REFUSED} == set(REASONS)
+    assert {vector["refused"] for vector in REFUSED} == set(REASONS) - {"rate"}  # which the bench file limits
     assert len(set(names(VECTORS))) == len(VECTORS)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from hilstar.attitude.packet import AttitudeSample
 from hilstar.attitude.quaternion import angle_between_rad, from_radec_roll_deg, propagate, rate_between_rad_s
@@ -214,3 +215,52 @@ def test_stale_has_hysteresis_and_is_counted():
     assert gate.update(None) is True
     assert [gate.update(a) for a in fresh] == [False, False, True, True, True, False, False, True, False]
     assert gate.events == 2
+
+
+# A turn that no rate explains
+
+MAX_RATE_RAD_S = np.radians(60.0)
+
+
+def limited(*samples: AttitudeSample) -> Timeline:
+    timeline = Timeline(Policy(250 * MS, 250 * MS, MAX_RATE_RAD_S))
+    for each in samples:
+        assert timeline.add(each) is None
+    return timeline
+
+
+def retarget(degrees: float, *, rate: bool) -> list[AttitudeSample]:
+    """200 Hz, at rest at START, then at rest `degrees` further, without a word."""
+    there = propagate(START, np.array([0.0, np.radians(degrees), 0.0]), 1.0)
+    still = np.zeros(3) if rate else None
+    return [AttitudeSample(k * 5 * MS, START if k < 3 else there, still) for k in range(6)]
+
+
+@pytest.mark.parametrize("rate", [False, True])
+@pytest.mark.parametrize("degrees", [20.0, 90.0, 179.0])
+def test_a_retarget_without_discontinuity_is_a_jump_and_no_turn(degrees, rate):
+    samples = retarget(degrees, rate=rate)
+    timeline = limited(*samples[:4])
+    for t_ms in (10.0, 12.5, 14.999):
+        attitude = timeline.at(round(t_ms * MS))
+        assert angle_between_rad(attitude.q_icrs_to_cam, START) < EXACT_RAD
+    beyond = timeline.at(40 * MS)
+    assert angle_between_rad(beyond.q_icrs_to_cam, samples[3].q_icrs_to_cam) < EXACT_RAD
+    assert beyond.rate_cam_rad_s is None or not beyond.rate_cam_rad_s.any()
+
+
+def test_a_turn_just_under_the_limit_is_drawn_as_a_turn():
+    rate = np.array([0.0, 0.99 * MAX_RATE_RAD_S, 0.0])
+    timeline = limited(*(AttitudeSample(k * 5 * MS, propagate(START, rate, k * 0.005)) for k in range(4)))
+    for t_ms in (7.0, 22.0):
+        assert angle_between_rad(timeline.at(round(t_ms * MS)).q_icrs_to_cam, propagate(START, rate, t_ms / 1000)) < EXACT_RAD
+
+
+def test_a_rate_over_the_limit_is_refused_by_name_with_its_unit():
+    fast = AttitudeSample(0, START, np.float32([0.0, 0.0, 1.001 * MAX_RATE_RAD_S]).astype(float))
+    refusal = limited().add(fast)
+    assert refusal.reason == "rate"
+    for word in ("max_rate_deg_s = 60", "rad/s", "60.06 deg/s"):
+        assert word in refusal.detail
+    rounded = np.float32([0.0, 0.0, MAX_RATE_RAD_S]).astype(float)  # 60 deg/s itself, as a packet carries it
+    assert limited().add(AttitudeSample(0, START, rounded)) is None

@@ -14,6 +14,7 @@ from PIL import Image
 from hilstar.arrays import FloatArray
 from hilstar.attitude.quaternion import to_matrix, to_radec_roll_deg
 from hilstar.bench.assembly import Bench, Frame
+from hilstar.bench.picture import exposure_picture
 from hilstar.bench.simulation import Exposure, Simulator
 from hilstar.errors import InputError
 from hilstar.monitor.photometry import Codes
@@ -159,10 +160,14 @@ def write_preview_png(path: Path, codes: Codes) -> None:
 
 
 def write_exposure_png(path: Path, dn: npt.NDArray[np.uint16]) -> None:
-    """A picture of a tracker's frame for a person: from its 1 % level to its 99.9 % level, by the square root."""
-    low, high = np.percentile(dn, (1, 99.9))
-    stretched = np.sqrt(np.clip((dn - low) / max(high - low, 1.0), 0, 1))
-    _written(path, lambda: Image.fromarray((255 * stretched).astype(np.uint8)).save(path, "PNG"))
+    """A picture of a tracker's frame for a person (see `bench.picture`)."""
+    _written(path, lambda: Image.fromarray(exposure_picture(dn)).save(path, "PNG"))
+
+
+def write_dn_picture(path: Path, dn: npt.NDArray[np.uint16]) -> None:
+    """The DN themselves, unscaled, as greyscale of 16 bits: TIFF where the name ends in .tif or .tiff, else PNG."""
+    form = "TIFF" if path.suffix.lower() in {".tif", ".tiff"} else "PNG"
+    _written(path, lambda: Image.fromarray(dn).save(path, form))
 
 
 def make_directory(path: Path) -> Path:

@@ -12,6 +12,7 @@ import typer
 
 from hilstar.cli.common import Json, app
 from hilstar.console import print_json, progress
+from hilstar.endings import check_directory
 from hilstar.errors import InputError
 
 OwnBench = Annotated[Path | None, typer.Argument(metavar="[BENCH.toml]", help="Your bench, at its own size.")]
@@ -41,6 +42,7 @@ def bench(
         plan = replace(plan, bench_file=bench_file, sizes=(read_config(bench_file).monitor.resolution_px,))
     elif sizes is not None:
         plan = replace(plan, sizes=parse_sizes(sizes))
+    check_directory("-o", output)
     if output is not None:
         make_directory(output)
     with progress("measuring", len(plan.sizes) * len(plan.counts)) as advance:

@@ -12,6 +12,7 @@ import typer
 
 from hilstar.cli.common import BenchFile, Json, QuaternionText, RadecText, app, attitude_of
 from hilstar.console import print_json, progress
+from hilstar.endings import FITS, PNG, PNG_OR_TIFF, check_directory, check_ending
 from hilstar.errors import InputError
 
 
@@ -27,6 +28,7 @@ def simulate(
     noise: Annotated[Literal["full", "none"], typer.Option(help="All of the detector's noise, or none.")] = "full",
     output: Annotated[Path | None, typer.Option("-o", "--output", metavar="OUT.fits", help="DN, uint16.")] = None,
     png: Annotated[Path | None, typer.Option(metavar="OUT.png", help="A stretched picture for a person.")] = None,
+    dn_png: Annotated[Path | None, typer.Option(metavar="OUT.png|.tif", help="The DN themselves, 16 bits of grey.")] = None,
     as_json: Json = False,
 ) -> None:
     """The virtual tracker's image of the sky, with noise."""
@@ -35,12 +37,17 @@ def simulate(
     from hilstar.bench.simulation import Simulator
 
     if log is not None:
-        if output is None or radec or quaternion or rate or png:
-            raise InputError("simulate --log LOG: give -o DIR, and no --radec, --quaternion, --rate or --png")
+        if output is None or radec or quaternion or rate or png or dn_png:
+            raise InputError("simulate --log LOG: give -o DIR, and no --radec, --quaternion, --rate, --png or --dn-png")
+        check_directory("-o", output)
         simulate_log(bench_file, log, frames, (noise, seed), output)
         return
-    if output is None and png is None:
-        raise InputError("simulate: nothing to write; add -o OUT.fits or --png OUT.png")
+    targets = [path for path in (output, png, dn_png) if path is not None]
+    if not targets:
+        raise InputError("simulate: nothing to write; add -o OUT.fits, --png OUT.png or --dn-png OUT.png")
+    check_ending("-o", output, FITS)
+    check_ending("--png", png, PNG)
+    check_ending("--dn-png", dn_png, PNG_OR_TIFF)
     q = attitude_of("simulate", radec, quaternion)
     rate_rad_s = parse_rate(rate) if rate else np.zeros(3)
     with Simulator(bench_file) as simulator:
@@ -50,11 +57,13 @@ def simulate(
             files.write_exposure_fits(output, simulator, exposure, noise, seed)
         if png is not None:
             files.write_exposure_png(png, exposure.dn)
+        if dn_png is not None:
+            files.write_dn_picture(dn_png, exposure.dn)
         summary = {
             "stars": len(exposure.truth),
             "clipped": exposure.truth["hip"][exposure.truth["clipped"]].tolist(),
             "dn": {"min": int(exposure.dn.min()), "mean": float(exposure.dn.mean()), "max": int(exposure.dn.max())},
-            "written": [str(path) for path in (output, png) if path is not None],
+            "written": [str(path) for path in targets],
             "gl_renderer": simulator.renderer.gl_renderer,
         }
     if as_json:
@@ -91,6 +100,7 @@ def study(
     """Charts and tables: models, the thesis's outputs, where methods fail, codes, a slewing screen, error against time."""
     from hilstar.bench.output import make_directory
 
+    check_directory("-o", output)
     make_directory(output)
     with progress(f"study {what}", math.inf):
         lines, right = study_lines(what, output, quick)
@@ -129,6 +139,7 @@ def verify(
     from hilstar.study.twin import verify as run_twin
     from hilstar.study.twin_verdict import write_report
 
+    check_directory("-o", output)
     if output is not None:
         make_directory(output)
     with progress("verifying", fields) as advance:

@@ -9,6 +9,7 @@ import typer
 
 from hilstar.cli.common import Json, app
 from hilstar.console import print_json
+from hilstar.endings import check_directory
 
 
 @app.command()
@@ -27,6 +28,7 @@ def compare(
     from hilstar.study.compare_files import write_report
     from hilstar.testing import compare as compare_files
 
+    check_directory("-o", output)
     limits = FLUX_MAG if flux_mag is None else flux_mag, CENTROID_PX if centroid_px is None else centroid_px
     comparison = compare_files(frame, golden, flux_mag=limits[0], centroid_px=limits[1], truth=truth)
     if output is not None:

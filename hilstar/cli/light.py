@@ -10,6 +10,7 @@ import typer
 
 from hilstar.cli.common import BenchFile, Json, app
 from hilstar.console import print_json, say
+from hilstar.endings import CSV, PNG, TOML, check_directory, check_ending
 from hilstar.errors import InputError
 
 calibrate = typer.Typer(help="What light the monitor makes: measured, and scaled by the tracker.", no_args_is_help=False)
@@ -30,6 +31,7 @@ def budget(
     from hilstar.study.budget import budget as find_budget
     from hilstar.study.budget import budget_json, budget_lines, write_budget
 
+    check_directory("-o", output)
     with load(bench_file) as bench:
         found = find_budget(bench)
     if output is not None:
@@ -55,6 +57,8 @@ def photometric(
     """Fit the monitor's response to measured patches."""
     from hilstar.bench.calibrate import calibrate_photometric
 
+    check_ending("-o", output, TOML)
+    check_ending("--plot", plot, PNG)
     summary = calibrate_photometric(measured, output, bits=bits, who=who, when=when, instrument=instrument, unit=unit)
     if plot is not None:
         from hilstar.study.calibration import draw_calibration
@@ -97,6 +101,8 @@ def plan(
     from hilstar.bench.calibrate import plan as write_plan
     from hilstar.bench.sender import parse_numbers
 
+    check_ending("-o", output, CSV)
+    check_directory("--headless", headless)
     width, height = (round(value) for value in parse_numbers(resolution, 2, "--resolution", RESOLUTION_FORM))
     if not (1 <= width <= 32768 and 1 <= height <= 32768):
         raise InputError(f"--resolution {resolution}: write {RESOLUTION_FORM}")
@@ -137,6 +143,7 @@ def scale(
     from hilstar.bench.assembly import load
     from hilstar.bench.scale import UNSURE_MAG, parse_reading, scale_by_tracker, with_flux_at_white
 
+    check_ending("-o", output, TOML)
     with load(bench_file) as bench:
         exposure_s = bench.config.tracker.exposure_s if exposure is None else exposure
         found = scale_by_tracker(bench, [parse_reading(text) for text in reading], exposure_s)

@@ -9,6 +9,7 @@ import typer
 
 from hilstar.cli.common import Json, app
 from hilstar.console import print_json
+from hilstar.endings import CSV, check_directory, check_ending
 from hilstar.errors import InputError
 
 RunFile = Annotated[Path, typer.Argument(metavar="RUN.mcap", help="The ledger of serve or replay.")]
@@ -25,6 +26,7 @@ def report(
     from hilstar.study.report import report as write_report
     from hilstar.study.report import table_rows
 
+    check_directory("-o", output)
     make_directory(output)
     summary = write_report(ledger, output)
     if as_json:
@@ -54,6 +56,8 @@ def latency(
     from hilstar.bench.sender import parse_serial
     from hilstar.study.latency import measure, told
 
+    check_directory("-o", output)
+    check_ending("--save", save, CSV)
     if (edges is None) == (diode is None):
         raise InputError("latency: give the edges with --edges EDGES.csv or --diode serial:/dev/ttyX@115200, one of them")
     if diode is None:

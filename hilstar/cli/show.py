@@ -13,6 +13,7 @@ import typer
 
 from hilstar.cli.common import LOG_HELP, BenchFile, Headless, Json, QuaternionText, RadecText, app, attitude_of
 from hilstar.console import print_json, progress, report, say
+from hilstar.endings import CSV, FITS, MCAP, PNG, check_directory, check_ending
 from hilstar.errors import InputError
 from hilstar.notices import Notices
 
@@ -32,6 +33,7 @@ def demo(
     """The main job in one command: real stars, an attitude streamed over a real ZeroMQ socket, frames out."""
     from hilstar.bench.demo import run_demo
 
+    check_directory("-o", output)
     with progress("serving", duration * 60) as advance:
         result = run_demo(output, duration, np.random.default_rng(seed), lambda shown: advance(shown.number + 1))
     report(result.summary, as_json)
@@ -59,6 +61,10 @@ def frame(
     targets = [path for path in (output, truth, codes, preview) if path is not None]
     if not targets:
         raise InputError("frame: nothing to write; add -o OUT.fits, --truth OUT.csv or --codes OUT.png")
+    check_ending("-o", output, FITS)
+    check_ending("--truth", truth, CSV)
+    check_ending("--codes", codes, PNG)
+    check_ending("--preview", preview, PNG)
     with load(bench_file) as bench:
         if explain:
             explain_effort(bench)
@@ -153,6 +159,7 @@ def serve(
     from hilstar.bench.server import Outlet, open_link
     from hilstar.bench.server import serve as serve_stream
 
+    check_ending("--ledger", ledger, MCAP)
     notices = Notices()
     with (
         open_link(read_config(bench_file).attitude, bench_file.parent) as link,
@@ -193,6 +200,8 @@ def replay(
     from hilstar.bench.server import Outlet
     from hilstar.bench.server import replay as replay_log
 
+    check_directory("-o", output)
+    check_ending("--ledger", ledger, MCAP)
     notices = Notices()
     play = plan_play(log, Wanted(speed, start, stop, step), read_config(bench_file))
     with (

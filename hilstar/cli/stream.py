@@ -14,6 +14,7 @@ import typer
 
 from hilstar.cli.common import LOG_HELP, Json, RadecText, app
 from hilstar.console import print_json, progress, say
+from hilstar.endings import check_directory
 from hilstar.errors import InputError
 
 LISTEN_SLICE_S = 0.1  # between looks at whether a signal has come
@@ -132,6 +133,7 @@ def keys(
     """Make CURVE keys for ZeroMQ beyond this machine."""
     from hilstar.attitude.curve import make_keys
 
+    check_directory("-o", output)
     for path in make_keys(output):
         typer.echo(str(path))
     say("the side that binds: server.key_secret and allowed_clients; the side that connects: client.key_secret and server.key")

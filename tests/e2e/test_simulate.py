@@ -37,6 +37,32 @@ def test_the_fits_has_dn_header_and_truth(tmp_path):
     assert np.array(Image.open(tmp_path / "a.png")).std() > 5
 
 
+def test_the_belt_of_orion_stands_out_of_hundreds_of_full_stars(tmp_path):
+    bench, pointing = ROOT / "configs" / "thesis-orion.toml", ("--radec", "84.057,-1.2,0")
+    *_, truth = simulate(tmp_path / "a.fits", "--png", tmp_path / "a.png", bench=bench, pointing=pointing)
+    picture = np.array(Image.open(tmp_path / "a.png")).astype(float)
+    assert truth["clipped"].sum() > 200
+    assert (picture == 255).sum() < 500  # of the hundreds of full stars, few are white
+    light = []
+    for row in truth:
+        x, y = round(row["x_px"]), round(row["y_px"])
+        light.append(picture[max(y - 8, 0) : y + 9, max(x - 8, 0) : x + 9].sum())
+    brightest = truth["hip"][np.argsort(light)[::-1]].tolist()
+    belt = [brightest.index(hip) for hip in (25930, 26311, 26727)]
+    assert max(belt) < 40, belt
+
+
+def test_the_dn_come_as_a_picture_of_16_bits_too(tmp_path):
+    (tmp_path / "bench.toml").write_text(SMALL_BENCH + "[tracker.detector]\ngain_e_per_dn = 1\nbits = 16\noffset_dn = 300\n")
+    options = {"bench": tmp_path / "bench.toml", "pointing": ("--radec", "84.057,-1.2,0")}
+    for name in ("dn.png", "dn.tif"):
+        dn, *_ = simulate(tmp_path / "a.fits", "--dn-png", tmp_path / name, **options)
+        with Image.open(tmp_path / name) as picture:
+            assert picture.mode == "I;16"
+            assert np.array_equal(np.array(picture), dn)
+    assert dn.max() > 4095
+
+
 def test_seeds_make_the_image_and_nothing_else_does(tmp_path):
     first, *_ = simulate(tmp_path / "a.fits", "--seed", "1")
     again, *_ = simulate(tmp_path / "b.fits", "--seed", "1")
@@ -99,6 +125,10 @@ def test_a_log_is_simulated_over_all_cores(tmp_path):
         (["--log", "none.csv", "-o", "d"], ["none.csv"]),
         (["--log", "none.csv"], ["-o DIR"]),
         (["--radec", "1,2,3", "-o", "none/x.fits"], ["cannot be written"]),
+        (["--radec", "1,2,3", "-o", "x.png"], ["-o x.png", "FITS", "x.fits"]),
+        (["--radec", "1,2,3", "--png", "x.jpg"], ["--png x.jpg", "x.png"]),
+        (["--radec", "1,2,3", "--dn-png", "x.fits"], ["--dn-png x.fits", "PNG or TIFF", "x.png"]),
+        (["--log", "none.csv", "-o", "d.fits"], ["-o d.fits", "directory"]),
     ],
 )
 def test_a_wrong_simulation_gets_one_line(tmp_path, arguments, words):

@@ -64,7 +64,7 @@ extern "C" {
 #define HILSTAR_HEALTH_NO_ATTITUDE 1u
 /** The newest attitude is older than stale_after_ms. */
 #define HILSTAR_HEALTH_STALE 2u
-/** No stars are shown, for want of a fresh attitude. */
+/** No stars are shown, for want of a fresh attitude or by an operator's key (operator_override). */
 #define HILSTAR_HEALTH_BLANK 4u
 /** Time exchanges carry the clock offset; without this bit it is estimated from arrivals. */
 #define HILSTAR_HEALTH_CLOCK_SYNCHRONISED 8u
@@ -76,6 +76,14 @@ extern "C" {
 #define HILSTAR_HEALTH_CLIPPED 64u
 /** The run is no longer recorded. */
 #define HILSTAR_HEALTH_LEDGER_FAILED 128u
+/** An operator's key changes what is shown: blank, grid, crosshair, test patch or pause. */
+#define HILSTAR_HEALTH_OPERATOR_OVERRIDE 256u
+/** The window is minimised, covered, off the screen or its display gone: not all of the frame is seen. */
+#define HILSTAR_HEALTH_HIDDEN 512u
+/** Attitudes of another sender come too, and are not shown. */
+#define HILSTAR_HEALTH_SECOND_SENDER 1024u
+/** The sender repeats itself, or its clock stands still. */
+#define HILSTAR_HEALTH_SOURCE_FROZEN 2048u
 
 /** The quaternion's norm is within so much of 1, else the packet is refused (norm). */
 #define HILSTAR_NORM_TOLERANCE 0.001

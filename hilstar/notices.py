@@ -35,6 +35,7 @@ class Notices:
 
     def __init__(self) -> None:
         self._counts: Counter[str] = Counter()
+        self._active: set[str] = set()
         self._said_ns: dict[str, deque[int]] = {}
         self._listeners: list[Listener] = []
         self._lock = threading.Lock()
@@ -58,6 +59,28 @@ class Notices:
             log.warning("%s%s", notice.detail, "; further ones are only counted for a while" if last_before_silence else "")
         for listener in self._listeners:
             listener(notice)
+
+    def begin(self, kind: str, detail: str) -> None:
+        """Tell of an event that lasts: its kind is in `active` until `end`. Nothing where it lasts already."""
+        with self._lock:
+            if kind in self._active:
+                return
+            self._active.add(kind)
+        self.tell(kind, detail)
+
+    def end(self, kind: str, told_as: str, detail: str) -> None:
+        """What began is over, which is told as an event of its own; nothing where it never began."""
+        with self._lock:
+            if kind not in self._active:
+                return
+            self._active.remove(kind)
+        self.tell(told_as, detail)
+
+    @property
+    def active(self) -> frozenset[str]:
+        """The kinds that have begun and not ended."""
+        with self._lock:
+            return frozenset(self._active)
 
     def counts(self) -> dict[str, int]:
         """How often each kind came."""

@@ -29,12 +29,16 @@ FLAG_DISCONTINUITY = 2  # the attitude jumped since the packet before: do not in
 
 HEALTH_NO_ATTITUDE = 1  # no attitude has come yet
 HEALTH_STALE = 2  # the newest attitude is older than stale_after_ms
-HEALTH_BLANK = 4  # no stars are shown, for want of a fresh attitude
+HEALTH_BLANK = 4  # no stars are shown, for want of a fresh attitude or by an operator's key (operator_override)
 HEALTH_CLOCK_SYNCHRONISED = 8  # time exchanges carry the clock offset; without this bit it is estimated from arrivals
 HEALTH_MISSED = 16  # frames were missed since the status before
 HEALTH_REFUSED = 32  # packets were refused since the status before
 HEALTH_CLIPPED = 64  # a star of this frame asks for more light than the monitor has
 HEALTH_LEDGER_FAILED = 128  # the run is no longer recorded
+HEALTH_OPERATOR_OVERRIDE = 256  # an operator's key changes what is shown: blank, grid, crosshair, test patch or pause
+HEALTH_HIDDEN = 512  # the window is minimised, covered, off the screen or its display gone: not all of the frame is seen
+HEALTH_SECOND_SENDER = 1024  # attitudes of another sender come too, and are not shown
+HEALTH_SOURCE_FROZEN = 2048  # the sender repeats itself, or its clock stands still
 
 NORM_TOLERANCE = 0.001  # the quaternion's norm is within so much of 1, else the packet is refused (norm)
 FASTEST_RAD_S = 1000000.0  # the length of a valid rate is at most so much, else the packet is refused (format)

@@ -7,15 +7,17 @@ from hilstar.attitude.packet import Status
 from hilstar.attitude.receiver import PacketCounts
 from hilstar.bench.ledger import Ledger
 from hilstar.bench.loop import FrameLoop, Shown
+from hilstar.notices import Notices
 
 
 class StatusMaker:
-    """Makes status packets; `missed` and `refused` are told once each time."""
+    """Makes status packets; `missed` and `refused`, and an event that does not last, are told once each time."""
 
     def __init__(self, ledger: Ledger | None = None) -> None:
         self._ledger = ledger
         self._missed = 0
         self._refused = 0
+        self._told: dict[str, int] = {}
 
     def status(self, shown: Shown, light_t_ns: int, loop: FrameLoop, counts: PacketCounts, synchronised: bool) -> Status:
         """The status after a frame whose light leaves at `light_t_ns` of the bench's clock."""
@@ -30,6 +32,8 @@ class StatusMaker:
             protocol.HEALTH_REFUSED: refused > self._refused,
             protocol.HEALTH_CLIPPED: bool(shown.drawn.clipped_hip),
             protocol.HEALTH_LEDGER_FAILED: self._ledger is not None and self._ledger.failure is not None,
+            protocol.HEALTH_SECOND_SENDER: self._happens(loop.notices, "second-sender"),
+            protocol.HEALTH_SOURCE_FROZEN: self._happens(loop.notices, "source-frozen"),
         }
         self._missed, self._refused = missed, refused
         return Status(
@@ -41,3 +45,8 @@ class StatusMaker:
             accepted=counts.received - refused,
             refused=refused,
         )
+
+    def _happens(self, notices: Notices, kind: str) -> bool:
+        """True while an event lasts, and once after each that does not."""
+        before, self._told[kind] = self._told.get(kind, 0), notices.counts().get(kind, 0)
+        return kind in notices.active or self._told[kind] > before

@@ -139,7 +139,8 @@ def test_the_table_has_the_icd_s_sizes_and_bits():
     assert {kind: struct.calcsize(form) for kind, form in FORMATS.items()} == SIZES == protocol.PACKET_BYTES
     assert [body.format + "I" for body in bodies] == list(FORMATS.values())
     health = "NO_ATTITUDE STALE BLANK CLOCK_SYNCHRONISED MISSED REFUSED CLIPPED LEDGER_FAILED"
-    assert [getattr(protocol, f"HEALTH_{name}") for name in health.split()] == [1 << bit for bit in range(8)]
+    health += " OPERATOR_OVERRIDE HIDDEN SECOND_SENDER SOURCE_FROZEN"
+    assert [getattr(protocol, f"HEALTH_{name}") for name in health.split()] == [1 << bit for bit in range(12)]
     assert (protocol.FLAG_RATE_VALID, protocol.FLAG_DISCONTINUITY) == (1, 2)
     assert (protocol.NORM_TOLERANCE, protocol.FASTEST_RAD_S) == (1e-3, 1e6)
 

@@ -18,6 +18,7 @@ from typing import IO
 import msgspec
 
 from hilstar.attitude.clock import NS_PER_S
+from hilstar.attitude.gaps import LogJoins, log_joins
 from hilstar.attitude.packet import AttitudeSample, Refusal, checked_sample, decode
 from hilstar.attitude.timeline import Policy, Timeline
 from hilstar.errors import InputError
@@ -77,9 +78,9 @@ def write_log(path: Path, samples: Sequence[AttitudeSample]) -> None:
             part.unlink(missing_ok=True)
 
 
-def log_timeline(samples: list[AttitudeSample], policy: Policy) -> Timeline:
-    """A timeline that holds every sample of a log."""
-    timeline = Timeline(policy, capacity=len(samples))
+def log_timeline(samples: list[AttitudeSample], policy: Policy, joins: LogJoins | None = None) -> Timeline:
+    """A timeline that holds every sample of a log, joined as the log's own samples say (see `gaps`), whoever asks."""
+    timeline = Timeline(policy, capacity=len(samples), joins=log_joins(samples) if joins is None else joins)
     for sample in samples:
         timeline.add(sample)
     return timeline

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import threading
 from bisect import bisect_right
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -22,6 +23,9 @@ LIVE_CAPACITY = 1024
 FRESH_AGAIN = 0.5
 
 OnStale = Literal["hold", "blank"]
+# What lies between two samples: the first one until the second, the shorter way, or the C2 blend of both with their rates.
+Join = Literal["hold", "slerp", "blend"]
+Joins = Callable[[AttitudeSample, AttitudeSample], Join]
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,10 +58,14 @@ class Policy:
 
 
 class Timeline:
-    """Samples in order of time. One thread may add while another asks."""
+    """Samples in order of time. One thread may add while another asks.
 
-    def __init__(self, policy: Policy, capacity: int = LIVE_CAPACITY) -> None:
+    `joins` says what lies between two of them; by default what may be said of a live stream.
+    """
+
+    def __init__(self, policy: Policy, capacity: int = LIVE_CAPACITY, joins: Joins | None = None) -> None:
         self._policy = policy
+        self._join = self._join_live if joins is None else joins
         self._capacity = capacity
         self._t_ns: list[int] = []
         self._samples: list[AttitudeSample] = []
@@ -86,8 +94,9 @@ class Timeline:
         """The attitude at `t_ns`, or None before any sample has come.
 
         Before the first sample it is the first. Between two it is the C2 blend of both where both have rates, else
-        SLERP; before a discontinuity, or a turn faster than `max_rate_rad_s`, it stands still. Past the newest it is
-        predicted with the sample's rate (else that of the last two samples) for at most `max_extrapolation_ns`, and then held.
+        SLERP; before a discontinuity, in a log's gap, and for a turn faster than `max_rate_rad_s` it stands still. Past the
+        newest it is predicted with the sample's rate (else that of the last two samples) for at most `max_extrapolation_ns`,
+        and then held.
         """
         with self._lock:
             if not self._samples:
@@ -101,19 +110,20 @@ class Timeline:
         newest = near[place]
         age_ns = t_ns - newest.t_ns
         if place + 1 < len(near):
-            q, rate = self._between(near, place, age_ns)
+            join = self._joined(newest, near[place + 1])
+            if join == "hold":
+                gap = age_ns > self._policy.stale_after_ns and not self._jumped(newest, near[place + 1])
+                return Attitude(newest.q_icrs_to_cam, age_ns, gap, newest.sequence)
+            q, rate = self._between(near, place, age_ns, join)
             return Attitude(q, age_ns, False, newest.sequence, rate_cam_rad_s=rate)
         return replace(self._predict(near[place - 1] if place else None, newest, age_ns), received_ns=received_ns)
 
-    def _between(self, near: list[AttitudeSample], place: int, age_ns: int) -> tuple[FloatArray, FloatArray | None]:
+    def _between(self, near: list[AttitudeSample], place: int, age_ns: int, join: Join) -> tuple[FloatArray, FloatArray]:
         """Attitude and rate between two samples; of a blend the rates of both, blended too."""
         before, after = near[place], near[place + 1]
-        if self._jumped(before, after):
-            return before.q_icrs_to_cam, None
         gap_ns = after.t_ns - before.t_ns
         rate, rate_after = before.rate_cam_rad_s, after.rate_cam_rad_s
-        # Rates say little about a long gap: carried across it from both sides they overshoot, SLERP cannot.
-        if rate is None or rate_after is None or gap_ns > self._policy.stale_after_ns:
+        if rate is None or rate_after is None or join == "slerp":
             rate = rate_between_rad_s(before.q_icrs_to_cam, after.q_icrs_to_cam, gap_ns / NS_PER_S)
             return slerp(before.q_icrs_to_cam, after.q_icrs_to_cam, age_ns / gap_ns), rate
         forward, backward = age_ns / NS_PER_S, (age_ns - gap_ns) / NS_PER_S
@@ -126,16 +136,20 @@ class Timeline:
 
     def _acceleration_rad_s2(self, near: list[AttitudeSample], k: int) -> FloatArray:
         """At sample `k`, from the rates of its neighbours: the same for the intervals on both sides, so the blend is C2."""
-        earlier = k - 1 if k and self._joined(near[k - 1], near[k]) else k
-        later = k + 1 if k + 1 < len(near) and self._joined(near[k], near[k + 1]) else k
+        earlier = k - 1 if k and self._joined(near[k - 1], near[k]) == "blend" else k
+        later = k + 1 if k + 1 < len(near) and self._joined(near[k], near[k + 1]) == "blend" else k
         rate, rate_later = near[earlier].rate_cam_rad_s, near[later].rate_cam_rad_s
         if rate is None or rate_later is None or earlier == later:
             raise AssertionError("a sample of a blend has a rate and a neighbour")
         return (rate_later - rate) / ((near[later].t_ns - near[earlier].t_ns) / NS_PER_S)
 
-    def _joined(self, before: AttitudeSample, after: AttitudeSample) -> bool:
+    def _join_live(self, before: AttitudeSample, after: AttitudeSample) -> Join:
+        # Rates say little about a long silence: carried across it from both sides they overshoot, SLERP cannot.
         known = before.rate_cam_rad_s is not None and after.rate_cam_rad_s is not None
-        return known and not self._jumped(before, after) and after.t_ns - before.t_ns <= self._policy.stale_after_ns
+        return "blend" if known and after.t_ns - before.t_ns <= self._policy.stale_after_ns else "slerp"
+
+    def _joined(self, before: AttitudeSample, after: AttitudeSample) -> Join:
+        return "hold" if self._jumped(before, after) else self._join(before, after)
 
     def _jumped(self, before: AttitudeSample, after: AttitudeSample) -> bool:
         """The attitude did not turn from one sample to the next: it says so, or no turn is so fast."""

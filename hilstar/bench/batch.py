@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import multiprocessing
 import os
 from collections.abc import Callable
@@ -22,13 +23,15 @@ from hilstar.scene.smear import Motion
 _simulator: Simulator | None = None
 
 
-def log_motions(samples: list[AttitudeSample], frame_count: int | None, exposure_s: float) -> list[Motion]:
+def log_motions(
+    samples: list[AttitudeSample], frame_count: int | None, exposure_s: float, max_rate_rad_s: float = math.inf
+) -> list[Motion]:
     """The exposures along a log: in the middle of each its attitude, and the mean rate over the exposure.
 
     One at each sample, or `frame_count` of them evenly from the first to the last. Within half an exposure of the log's
     ends the rate is that of the part inside.
     """
-    timeline = log_timeline(samples, Policy(max_extrapolation_ns=0, stale_after_ns=NS_PER_S))
+    timeline = log_timeline(samples, Policy(0, NS_PER_S, max_rate_rad_s))
     first_ns, last_ns = samples[0].t_ns, samples[-1].t_ns
     if frame_count is None:
         times_ns = [sample.t_ns for sample in samples]

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
 from hilstar.attitude.clock import NS_PER_S
+from hilstar.attitude.gaps import log_joins
 from hilstar.attitude.logs import log_timeline, read_log
 from hilstar.attitude.mcap_log import is_mcap, read_attitudes
 from hilstar.attitude.packet import AttitudeSample, rate_refusal
@@ -50,6 +51,10 @@ class Play(Protocol):
     def moving(self) -> bool | None:
         """Whether stars are drawn along their paths; None: as the bench file says."""
 
+    @property
+    def told(self) -> list[tuple[str, str]]:
+        """What is to be told of it before it begins: kinds and lines of events."""
+
     def frame(self, slot: int) -> tuple[int, int, Attitude | None]:
         """Number, time and attitude of a frame; None is blank."""
 
@@ -64,6 +69,7 @@ class LogPlay:
     frame_count: int
     paced: bool
     moving: bool | None = None
+    told: list[tuple[str, str]] = field(default_factory=list)
 
     @property
     def packet_count(self) -> int:
@@ -84,6 +90,7 @@ class RunPlay:
     packet_count: int
     paced: bool
     moving: bool | None = True  # where the run's own were
+    told: list[tuple[str, str]] = field(default_factory=list)
 
     @property
     def frame_count(self) -> int:
@@ -121,7 +128,9 @@ def plan_play(log: Path, wanted: Wanted, config: BenchConfig) -> Play:
     if count > MOST_FRAMES:
         raise InputError(f"{log}: makes {count:.3g} frames; write a longer --step, or --start and --stop")
     first_ns = samples[0].t_ns + round(start_s * NS_PER_S)
-    return LogPlay(log_timeline(samples, policy_of(config.attitude)), first_ns, step_s, int(count) + 1, not math.isinf(factor))
+    joins = log_joins(samples)
+    timeline = log_timeline(samples, policy_of(config.attitude), joins)
+    return LogPlay(timeline, first_ns, step_s, int(count) + 1, not math.isinf(factor), told=joins.told)
 
 
 def _check_rates(log: Path, samples: list[AttitudeSample], max_rate_rad_s: float) -> None:

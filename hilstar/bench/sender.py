@@ -7,12 +7,15 @@ import re
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
 from hilstar.arrays import FloatArray
 from hilstar.attitude.clock import NS_PER_S
 from hilstar.attitude.curve import CurveKeys
+from hilstar.attitude.gaps import log_joins
 from hilstar.attitude.links import ZmqSender
 from hilstar.attitude.logs import log_timeline
 from hilstar.attitude.packet import AttitudeSample, Status, TimeReply, TimeRequest, encode
@@ -104,7 +107,11 @@ def spin_samples(
 
 
 def log_samples(samples: list[AttitudeSample], rate_hz: float | None) -> Iterator[AttitudeSample]:
-    """A log from t = 0: its own samples, or at `rate_hz` between them. A rate that the log lacks is the next step's."""
+    """A log from t = 0: its own samples, or at `rate_hz` between them. A rate that the log lacks is the next step's.
+
+    Of its gaps nothing is known: before one there is no such rate, and what follows one is no motion from there.
+    """
+    samples = _broken_at_gaps(samples)
     if rate_hz is not None:
         samples = _resampled(samples, rate_hz)
     first_ns = samples[0].t_ns
@@ -115,6 +122,12 @@ def log_samples(samples: list[AttitudeSample], rate_hz: float | None) -> Iterato
             seconds = (after.t_ns - sample.t_ns) / NS_PER_S
             rate = rate_between_rad_s(sample.q_icrs_to_cam, after.q_icrs_to_cam, seconds)
         yield AttitudeSample(sample.t_ns - first_ns, sample.q_icrs_to_cam, rate, k, sample.discontinuity)
+
+
+def _broken_at_gaps(samples: list[AttitudeSample]) -> list[AttitudeSample]:
+    joins = log_joins(samples)
+    after_gap = {after.t_ns for before, after in pairwise(samples) if before.t_ns in joins.held_ns}
+    return [replace(sample, discontinuity=True) if sample.t_ns in after_gap else sample for sample in samples]
 
 
 def _resampled(samples: list[AttitudeSample], rate_hz: float) -> list[AttitudeSample]:

@@ -108,6 +108,8 @@ def replay(bench: Bench, play: Play, sink: FrameSink = ignore, outlet: Outlet | 
     """
     outlet = outlet or Outlet()
     loop, ledger = FrameLoop(bench, sink, outlet.screen, play.moving, outlet.notices), outlet.ledger
+    for kind, line in play.told:
+        outlet.notices.tell(kind, line)
 
     def draw_slot(slot: int) -> None:
         number, t_ns, attitude = play.frame(slot)

@@ -11,7 +11,7 @@ import numpy as np
 import typer
 
 from hilstar.cli.common import BenchFile, Json, QuaternionText, RadecText, app, attitude_of
-from hilstar.console import print_json, progress
+from hilstar.console import print_json, progress, say
 from hilstar.endings import FITS, PNG, PNG_OR_TIFF, check_directory, check_ending
 from hilstar.errors import InputError
 
@@ -77,11 +77,16 @@ def simulate_log(
     bench_file: Path, log: Path, frames: int | None, noise_and_seed: tuple[Literal["full", "none"], int], output: Path
 ) -> None:
     """The virtual tracker along a log."""
+    from hilstar.attitude.gaps import log_joins
     from hilstar.attitude.logs import read_log
     from hilstar.bench.batch import log_motions, simulate_motions
     from hilstar.bench.config import read_config
 
-    motions = log_motions(read_log(log), frames, read_config(bench_file).tracker.exposure_s)
+    samples = read_log(log)
+    for _, line in log_joins(samples).told:
+        say(line)
+    config = read_config(bench_file)
+    motions = log_motions(samples, frames, config.tracker.exposure_s, math.radians(config.attitude.max_rate_deg_s))
     with progress("exposing", len(motions)) as advance:
         simulate_motions(bench_file, motions, *noise_and_seed, output, advance)
     typer.echo(f"{len(motions)} exposures in {output}")

@@ -72,6 +72,7 @@ def send(
 
 def wanted_samples(log: Path | None, spin: str | None, rate: float | None, radec: str | None) -> tuple[Any, float]:
     """The samples that `send` is asked for, and how many they are (infinite where nobody can say)."""
+    from hilstar.attitude.gaps import log_joins
     from hilstar.attitude.logs import read_log
     from hilstar.bench.sender import log_samples, parse_radec, parse_spin, spin_samples
 
@@ -82,6 +83,8 @@ def wanted_samples(log: Path | None, spin: str | None, rate: float | None, radec
     if spin is not None:
         return spin_samples(parse_spin(spin), rate or 100.0, parse_radec(radec or "84.057,-1.2,0")), math.inf
     recorded = read_log(log or Path())
+    for _, line in log_joins(recorded).told:
+        say(line)
     return log_samples(recorded, rate), len(recorded) if rate is None else math.inf
 
 

@@ -119,3 +119,14 @@ def test_a_resampled_log_keeps_its_breaks_and_its_rates(tmp_path):
     sent = list(log_samples(read_log(path), 2.0))
     assert [sample.discontinuity for sample in sent] == [False] * 4 + [True, False, False]
     assert [float(sample.rate_cam_rad_s[2]) for sample in sent] == pytest.approx([0.1, 0.2, 0.3, 0.3, 0.5, 0.5, 0.5])
+
+
+def test_a_gap_in_a_log_is_held_and_said_once(tmp_path, small_bench_file):
+    path = tmp_path / "gap.csv"
+    rows = [(t, propagate(from_radec_roll_deg(84, -1, 0), RATE, t)) for t in (0, 0.5, 1, 1.5, 9, 9.5)]
+    path.write_text("\n".join(["t_s,qw,qx,qy,qz", *(f"{t},{','.join(map(repr, q.tolist()))}" for t, q in rows)]))
+    result = run_hilstar("replay", small_bench_file, path, "--headless", "--speed", "max", "--step", "0.5", "--json")
+    assert result.stderr.count("1 gap, the longest of 7.5 s, held") == 1
+    summary = json.loads(result.stdout)
+    assert summary["events"]["log-gap"] == 1
+    assert summary["stale_frames"] == 14  # 2.0 to 8.5 s

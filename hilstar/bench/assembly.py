@@ -31,8 +31,9 @@ from hilstar.monitor.photometry import Codes, code_dtype
 from hilstar.monitor.quantise import cycle_warning
 from hilstar.render.renderer import Context, Renderer, Target
 from hilstar.scene.camera import Camera
+from hilstar.scene.clipping import clipped_sprites
 from hilstar.scene.psf import peak_share
-from hilstar.scene.sprites import Sprites, clipped_sprites, make_sprites
+from hilstar.scene.sprites import Sprites, make_sprites
 from hilstar.scene.sweep import Turn, swept_sprites
 from hilstar.sky.astrometry import aberrate, unit_vectors_icrs
 from hilstar.sky.catalog import load_catalog
@@ -77,12 +78,14 @@ class Frame:
 class Drawn:
     """What a draw put on the monitor: how many stars, and those too bright for it.
 
-    `turn` is what the stars' paths were drawn for, None where they are points.
+    `turn` is what the stars' paths were drawn for, None where they are points, and `capped` how many of those are coarser
+    than they should be (see `scene.sweep`).
     """
 
     def __init__(self, bench: Bench, q_icrs_to_cam: FloatArray | None, turn: Turn | None = None) -> None:
         self.star_count = 0
         self.clipped_hip: tuple[int, ...] = ()
+        self.capped = 0
         self.turn = turn
         self._bench = bench
         self._q_icrs_to_cam = q_icrs_to_cam
@@ -183,7 +186,7 @@ class Bench:
         sprites = self.sprites(q_icrs_to_cam) if turn is None else self._swept(turn)
         self.renderer.draw(sprites, frame)
         drawn = Drawn(self, q_icrs_to_cam, turn)
-        drawn.star_count = sprites.star_count
+        drawn.star_count, drawn.capped = sprites.star_count, sprites.capped
         clipped = self._clipped(sprites)
         if len(clipped):
             drawn.clipped_hip = tuple(self.shown_stars.hip[np.unique(sprites.star[clipped])].tolist())

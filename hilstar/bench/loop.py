@@ -135,9 +135,20 @@ class FrameLoop:
         age_ns = None if attitude is None else attitude.age_ns
         self.stats.add(shown.swap_ns - shown.draw_ns, age_ns, drawn.star_count, drawn.clipped_hip)
         self.stats.stale_frames += shown.stale
+        if drawn.capped:
+            self._count_capped(shown.number, drawn.capped)
         if shown.predicted_swap_ns is not None:
             received_ns = None if attitude is None else attitude.received_ns
             self.stats.swaps.add(shown.swap_ns, shown.predicted_swap_ns, shown.missed_before, received_ns)
+
+    def _count_capped(self, number: int, stars: int) -> None:
+        if not self.stats.capped_frames:
+            self.notices.tell(
+                "capped",
+                f"frame {number}: the turn is too fast for whole paths; {stars} stars are drawn coarser, with all their light"
+                " (further such frames are only counted)",
+            )
+        self.stats.capped_frames += 1
 
     def _show(self, screen: Screen, number: int, begin_ns: int) -> int:
         """Put the frame on the screen at its moment; when that was."""

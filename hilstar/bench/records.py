@@ -29,8 +29,9 @@ class FrameRecord(msgspec.Struct, kw_only=True):
     """One frame; times ns: `t_ns` of the timeline, `light_ns` of the bench's clock, the others of this host's.
 
     `q` is the attitude at `light_ns`, when the middle row lights, and `rate` (rad/s, cam) the turn for which paths were
-    drawn, null where stars are points. `missed_before` counts the refresh periods before it without a frame, `missed` those
-    of the run, and `marker` is the photodiode square.
+    drawn, null where stars are points. `capped` counts the stars whose paths are coarser than they should be,
+    `missed_before` the refresh periods before it without a frame, `missed` those of the run, and `marker` is the photodiode
+    square.
     """
 
     frame: int
@@ -51,6 +52,7 @@ class FrameRecord(msgspec.Struct, kw_only=True):
     stars_drawn: int = 0
     clipped: int = 0
     below_step: int = 0
+    capped: int = 0
     missed_before: int = 0
     missed: int = 0
     marker: int | None = None
@@ -84,6 +86,7 @@ def frame_record(shown: Shown, light_ns: int, missed: int) -> FrameRecord:
         stars_drawn=drawn.star_count,
         clipped=len(drawn.clipped_hip),
         below_step=drawn.below_step,
+        capped=drawn.capped,
         missed_before=shown.missed_before,
         missed=missed,
         marker=shown.marker,

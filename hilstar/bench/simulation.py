@@ -31,13 +31,14 @@ class Exposure:
     """One frame of the virtual tracker: DN (height, width), the electrons expected in it, and its stars.
 
     `truth` has the rows of TRUTH_DTYPE: places are those at the middle of the exposure (NaN behind the camera), and
-    `clipped` stars reach full well or the ADC's last code.
+    `clipped` stars reach full well or the ADC's last code. `capped` stars have paths coarser than they should be.
     """
 
     motion: Motion
     dn: npt.NDArray[np.uint16]
     mean_e: FloatArray
     truth: npt.NDArray[np.void]
+    capped: int = 0
 
 
 class Simulator:
@@ -67,7 +68,7 @@ class Simulator:
             dn = self.detector.expose_noiseless(mean_e, tracker.exposure_s)
         else:
             dn = self.detector.expose(mean_e, tracker.exposure_s, rng)
-        return Exposure(motion, dn, mean_e, self._truth(motion, np.unique(sprites.star), mean_e))
+        return Exposure(motion, dn, mean_e, self._truth(motion, np.unique(sprites.star), mean_e), sprites.capped)
 
     def _truth(self, motion: Motion, star: npt.NDArray[np.intp], mean_e: FloatArray) -> npt.NDArray[np.void]:
         x_px, y_px = self.camera.project(self.stars.vectors[star] @ motion.icrs_to_image(MIDDLE_S, self.camera)[0].T)

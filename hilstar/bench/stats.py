@@ -52,6 +52,7 @@ class RunStats:
         self.swaps = SwapStats()
         self.missed_frames = 0
         self.stale_frames = 0
+        self.capped_frames = 0
 
     @property
     def frames(self) -> int:
@@ -86,5 +87,6 @@ class RunStats:
             "clipped": {"max": self._clipped_max, "hip": sorted(self.clipped_hip)},
             "missed_frames": self.missed_frames,
             "stale_frames": self.stale_frames,
+            "capped": self.capped_frames,
             "gl_renderer": gl_renderer,
         }

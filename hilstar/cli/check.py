@@ -62,6 +62,7 @@ def simulate(
         summary = {
             "stars": len(exposure.truth),
             "clipped": exposure.truth["hip"][exposure.truth["clipped"]].tolist(),
+            "capped": exposure.capped,
             "dn": {"min": int(exposure.dn.min()), "mean": float(exposure.dn.mean()), "max": int(exposure.dn.max())},
             "written": [str(path) for path in targets],
             "gl_renderer": simulator.renderer.gl_renderer,

@@ -11,7 +11,8 @@ from hilstar.arrays import FloatArray
 from hilstar.monitor.footprints import FootprintMap
 from hilstar.monitor.photometry import Codes
 from hilstar.monitor.quantise import Panel
-from hilstar.scene.sprites import CLIP_TOLERANCE, Sprites
+from hilstar.scene.clipping import CLIP_TOLERANCE
+from hilstar.scene.sprites import Sprites
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,17 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.special import erfc
 
 from hilstar.arrays import FloatArray
-from hilstar.scene.psf import SQRT2
+from hilstar.scene.psf import pixel_shares
 from hilstar.scene.sprites import Sprites
-
-
-def pixel_shares(offset_px: FloatArray, sigma_px: float) -> FloatArray:
-    """Shares of a star's light along one axis in pixels at `offset_px` from its centre; same shape."""
-    near, far = np.abs(offset_px) - 0.5, np.abs(offset_px) + 0.5
-    return np.asarray(0.5 * (erfc(near / (sigma_px * SQRT2)) - erfc(far / (sigma_px * SQRT2))))
 
 
 def linear_image(

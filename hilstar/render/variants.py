@@ -9,8 +9,8 @@ import moderngl
 import numpy as np
 
 from hilstar.render.encoder import build_program
-from hilstar.render.reference import pixel_shares
 from hilstar.render.renderer import FIRST_CAPACITY, Renderer, Target
+from hilstar.scene.psf import pixel_shares
 from hilstar.scene.sprites import Sprites
 
 Profile = Literal["renderer", "exp erf", "table", "centre"]

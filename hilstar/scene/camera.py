@@ -29,6 +29,17 @@ class Camera:
         y = image_vectors[:, 1] * scale + self.principal_point_px[1]
         return x, y
 
+    def fastest_px_s(self, rate_image_rad_s: FloatArray) -> float:
+        """The fastest that a direction crosses the image at a rate (3,) of the camera in image axes, px/s; within 2 %.
+
+        On a grid of 9 x 9 places: a speed's components are quadratic in the place.
+        """
+        edges = [np.linspace(-0.5, size - 0.5, 9) for size in self.resolution_px]
+        x, y = np.meshgrid(*((edge - c) / self.focal_length_px for edge, c in zip(edges, self.principal_point_px, strict=True)))
+        seen = np.stack([x, y, np.ones_like(x)], axis=-1)
+        step = -np.cross(rate_image_rad_s, seen)
+        return float(self.focal_length_px * np.hypot(step[..., 0] - x * step[..., 2], step[..., 1] - y * step[..., 2]).max())
+
     def field_radius_rad(self, margin_px: float) -> float:
         """The angle from the image's normal to its farthest corner, `margin_px` outside it."""
         width, height = self.resolution_px

@@ -8,6 +8,10 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+from scipy.special import erfc
+
+from hilstar.arrays import FloatArray
 from hilstar.errors import InputError
 
 # The share of a star's flux that may fall outside its footprint, at the worst sub-pixel phase. 1e-5 would do for
@@ -24,6 +28,12 @@ def pixel_share(offset_px: float, sigma_px: float) -> float:
     """
     near, far = abs(offset_px) - 0.5, abs(offset_px) + 0.5
     return 0.5 * (math.erfc(near / (sigma_px * SQRT2)) - math.erfc(far / (sigma_px * SQRT2)))
+
+
+def pixel_shares(offset_px: FloatArray, sigma_px: float) -> FloatArray:
+    """Shares of a star's light along one axis in pixels at `offset_px` from its centre; same shape."""
+    near, far = np.abs(offset_px) - 0.5, np.abs(offset_px) + 0.5
+    return np.asarray(0.5 * (erfc(near / (sigma_px * SQRT2)) - erfc(far / (sigma_px * SQRT2))))
 
 
 def peak_share(sigma_px: tuple[float, float]) -> float:

@@ -7,27 +7,32 @@ sprites that weigh together as much as the star. It is exact in the limit, so ea
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.attitude.quaternion import to_matrix
+from hilstar.errors import InputError
 from hilstar.scene.camera import Camera
+from hilstar.scene.paths import MAX_NODES, Chords, Paths, node_counts, nodes_of
 from hilstar.scene.sprites import Sprites, join_sprites, make_sprites, pack_sprites
 from hilstar.sky.stars import Stars
 
-# With ceil(1.02 r + 3) nodes on a path of r sigmas no pixel is off by more than 1e-6 of the star's flux (measured for
-# sigma 0.3 to 3 px and r up to 300; tests/unit/test_smear.py holds it). A path under 0.005 sigma is a point to 1e-6.
+# With ceil(1.02 r + 3) nodes on a path of r sigmas no pixel is off by more than 1e-6 of the star's flux (measured for sigma
+# 0.3 to 3 px and r up to 300; tests/unit/test_smear.py holds it). A path under 0.005 sigma is a point to 1e-6.
 # results/tradeoff.csv, smear: evenly spaced sprites are slower and worse.
 NODES_PER_SIGMA = 1.02
 NODES_AT_REST = 3
 SHORTEST_PATH_SIGMA = 0.005
-# Node counts are rounded up to such steps, so that stars with like paths are done together.
-NODE_STEP = 1.15
-# A longer turn is cut in pieces of this, so that a piece of a path is short beside the field.
-LONGEST_PIECE_RAD = 0.05
+# A longer turn is cut in pieces of this, so that a piece of a path is short beside the field, and no longer than its nodes.
+MAX_PIECE_RAD = 0.05
+MAX_PIECE_SIGMA = (MAX_NODES - NODES_AT_REST - 1) / NODES_PER_SIGMA
+# An exposure's work is bounded: one of more pieces is refused, and more sprites are made fewer, with nodes farther apart.
+MAX_PIECES = 20_000
+MAX_SPRITES = 2_000_000
+COARSER = 0.25
+MIN_COARSENESS = COARSER**3
 MIDDLE_S = np.zeros(1)
 
 
@@ -53,69 +58,95 @@ class Motion:
 
 
 def smeared_sprites(stars: Stars, motion: Motion, camera: Camera, footprint_px: int, sigma_px: tuple[float, float]) -> Sprites:
-    """Sprites whose sum is each star's mean light over the exposure; a star at rest is one sprite."""
-    angle_rad = float(np.linalg.norm(motion.rate_cam_rad_s)) * motion.exposure_s
-    if angle_rad == 0:
+    """Sprites whose sum is each star's mean light over the exposure; a star at rest is one sprite.
+
+    `capped` of them are drawn coarser than NODES_PER_SIGMA where all would be more than MAX_SPRITES. Raises InputError for a
+    turn too long to be drawn at all.
+    """
+    if not motion.rate_cam_rad_s.any() or not motion.exposure_s:
         return make_sprites(stars, motion.icrs_to_image(MIDDLE_S, camera)[0], camera, footprint_px)
-    pieces = int(np.ceil(angle_rad / LONGEST_PIECE_RAD))
-    edges_s = np.linspace(-0.5, 0.5, pieces + 1) * motion.exposure_s
-    chain = []
-    for begin_s, end_s in itertools.pairwise(edges_s):
-        piece = _Piece(motion, camera, float(begin_s), float(end_s))
-        margin_rad = angle_rad / pieces
-        near = stars.grid.near(piece.to_image(MIDDLE_S)[0, 2], camera.field_radius_rad(footprint_px / 2 + 1) + margin_rad)
-        nodes = _node_counts(stars.vectors[near], piece, sigma_px)
-        for count in np.unique(nodes):
-            if count:
-                chain.append(_piece_sprites(stars, near[nodes == count], piece, int(count), (footprint_px, pieces)))
-    return join_sprites(chain, footprint_px)
+    pieces = _piece_count(motion, camera, sigma_px)
+    fineness = 1.0
+    while fineness >= MIN_COARSENESS:
+        smear = _Smear(stars, camera, footprint_px, sigma_px, NODES_PER_SIGMA * fineness)
+        sprites = _joined(smear, motion, pieces)
+        if sprites is not None:
+            return sprites if fineness == 1.0 else replace(sprites, capped=len(np.unique(sprites.star)))
+        fineness *= COARSER
+    raise InputError(
+        f"{_turn_words(motion)} takes more than {MAX_SPRITES} sprites; write a shorter exposure_s, a slower rate or fewer stars"
+    )
+
+
+def _piece_count(motion: Motion, camera: Camera, sigma_px: tuple[float, float]) -> int:
+    """Pieces of a turn that are short beside the field and, anywhere on the image, beside their nodes."""
+    angle_rad = float(np.linalg.norm(motion.rate_cam_rad_s)) * motion.exposure_s
+    path_sigma = camera.fastest_px_s(camera.cam_to_image @ motion.rate_cam_rad_s) * motion.exposure_s / min(sigma_px)
+    pieces = max(angle_rad / MAX_PIECE_RAD, path_sigma / MAX_PIECE_SIGMA)
+    if pieces > MAX_PIECES:
+        most_deg = np.degrees(angle_rad / pieces * MAX_PIECES)
+        raise InputError(
+            f"{_turn_words(motion)} is too long; at most {most_deg:.4g} deg are drawn here:"
+            " write a shorter exposure_s or a slower rate"
+        )
+    return int(np.ceil(pieces))
+
+
+def _turn_words(motion: Motion) -> str:
+    degrees = np.degrees(np.linalg.norm(motion.rate_cam_rad_s)) * motion.exposure_s
+    return f"an exposure in which the camera turns by {degrees:.4g} deg"
+
+
+def _joined(smear: _Smear, motion: Motion, pieces: int) -> Sprites | None:
+    """The sprites of all pieces; None once they are too many."""
+    chain, total = [], 0
+    for begin, end in itertools.pairwise(np.linspace(-0.5, 0.5, pieces + 1) * motion.exposure_s):
+        chain.append(smear.piece(motion, float(begin), float(end), 1.0 / pieces))
+        total += len(chain[-1])
+        if total > MAX_SPRITES:
+            return None
+    return join_sprites(chain, smear.footprint_px)
 
 
 @dataclass(frozen=True, slots=True)
-class _Piece:
-    """A part of an exposure, over which t runs from -1 to 1."""
+class _Smear:
+    """Stars smeared on one image."""
 
-    motion: Motion
+    stars: Stars
     camera: Camera
-    begin_s: float
-    end_s: float
+    footprint_px: int
+    sigma_px: tuple[float, float]
+    nodes_per_sigma: float
 
-    def to_image(self, t: FloatArray) -> FloatArray:
-        seconds = (self.begin_s + self.end_s) / 2 + t * (self.end_s - self.begin_s) / 2
-        return self.motion.icrs_to_image(seconds, self.camera)
+    def piece(self, motion: Motion, begin_s: float, end_s: float, part: float) -> Sprites:
+        """The sprites of a piece of an exposure that is `part` of it."""
+        camera, stars = self.camera, self.stars
+        angle_rad = float(np.linalg.norm(motion.rate_cam_rad_s)) * (end_s - begin_s)
+        middle = motion.icrs_to_image(np.array([(begin_s + end_s) / 2]), camera)[0]
+        near = stars.grid.near(middle[2], camera.field_radius_rad(self.footprint_px / 2 + 1) + angle_rad)
+        paths = Paths(stars.vectors[near] @ middle.T, camera.cam_to_image @ motion.rate_cam_rad_s, camera)
+        half_s = (end_s - begin_s) / 2
+        counts, begin, end = self._nodes(paths, half_s)
+        nodes = nodes_of(counts)
+        share = begin[nodes.path] + (end - begin)[nodes.path] * (nodes.place + 1) / 2
+        x_px, y_px = paths.places_px(nodes.path, (2 * share - 1) * half_s)
+        star = near[nodes.path]
+        light = nodes.share * (end - begin)[nodes.path] * part * stars.electrons_per_s[star]
+        return pack_sprites(x_px, y_px, light, star, (camera.resolution_px, self.footprint_px))
 
-    def places_px(self, vectors: FloatArray, t: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Pixel x and y of n directions at k times, (k, n) each; NaN behind the camera."""
-        seen = vectors @ self.to_image(t).transpose(0, 2, 1)
-        x_px, y_px = self.camera.project(seen.reshape(-1, 3))
-        return x_px.reshape(len(t), -1), y_px.reshape(len(t), -1)
+    def _nodes(self, paths: Paths, half_s: float) -> tuple[IntArray, FloatArray, FloatArray]:
+        """How many nodes each star's path needs on the image (0: it is not there), and the part of the piece it is there.
 
-
-def _node_counts(vectors: FloatArray, piece: _Piece, sigma_px: tuple[float, float]) -> IntArray:
-    """How many nodes each star's path needs, from its length in sigmas over two chords; 0 for one behind the camera."""
-    x_px, y_px = piece.places_px(vectors, np.array([-1.0, 0.0, 1.0]))
-    length = np.hypot(np.diff(x_px, axis=0) / sigma_px[0], np.diff(y_px, axis=0) / sigma_px[1]).sum(axis=0)
-    seen = np.isfinite(length)
-    needed = np.where(seen, np.ceil(NODES_PER_SIGMA * np.where(seen, length, 0.0) + NODES_AT_REST), 0)
-    needed[seen & (length < SHORTEST_PATH_SIGMA)] = 1
-    many = needed > NODES_AT_REST + 1
-    needed[many] = np.ceil(NODE_STEP ** np.ceil(np.log(needed[many]) / np.log(NODE_STEP)))
-    return needed.astype(np.intp)
-
-
-@lru_cache(maxsize=64)
-def gauss_nodes(count: int) -> tuple[FloatArray, FloatArray]:
-    """Gauss-Legendre nodes and weights over -1 to 1: an eigenvalue problem, 10 ms for 300 nodes."""
-    nodes, weights = np.polynomial.legendre.leggauss(count)
-    return nodes, weights
-
-
-def _piece_sprites(stars: Stars, chosen: IntArray, piece: _Piece, count: int, shape: tuple[int, int]) -> Sprites:
-    """The sprites of the `chosen` stars at the `count` nodes of a piece; `shape` is (footprint, number of pieces)."""
-    footprint_px, pieces = shape
-    nodes, weights = gauss_nodes(count)
-    x_px, y_px = piece.places_px(stars.vectors[chosen], nodes)
-    share = np.outer(weights / 2 / pieces, stars.electrons_per_s[chosen])
-    star = np.broadcast_to(chosen, x_px.shape)
-    frame = (piece.camera.resolution_px, footprint_px)
-    return pack_sprites(x_px.ravel(), y_px.ravel(), share.ravel(), star.ravel(), frame)
+        The piece lasts from -half_s to half_s of the paths' seconds.
+        """
+        at = [paths.all_places_px(seconds) for seconds in (-half_s, 0.0, half_s)]
+        x_px, y_px = (np.stack(places) for places in zip(*at, strict=True))
+        halves = [Chords(x_px[k : k + 2], y_px[k : k + 2]) for k in (0, 1)]
+        # The mean over a path in two chords: an arc's length to (angle / 4)^2 / 6 of it.
+        length = sum(half.length_sigma(self.sigma_px) for half in halves)
+        whole = Chords(x_px[::2], y_px[::2])
+        bulge_px = 2 * half_s * paths.speed_rad_s * np.nan_to_num(whole.length_sigma((1.0, 1.0)))
+        begin, end = whole.on_image(self.camera.resolution_px, self.footprint_px / 2 + 1 + bulge_px)
+        counts = node_counts(length * (end - begin), self.nodes_per_sigma, NODES_AT_REST, SHORTEST_PATH_SIGMA)
+        counts[end <= begin] = 0
+        return np.minimum(counts, MAX_NODES), begin, end

@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.arrays import Float32Array, FloatArray, IntArray
+from hilstar.arrays import FloatArray, IntArray
 from hilstar.scene.camera import Camera
-from hilstar.scene.psf import peak_share, pixel_share
 from hilstar.sky.stars import Stars
 
 # A whole pixel and a float32 fraction: float32 alone would cost 1e-4 px at 2000 px and 1e-3 px further out.
 # results/tradeoff.csv, projection: 4e-8 px, where float32 throughout is 6e-4 px off.
 SPRITE_DTYPE = np.dtype([("pixel", "<i4", 2), ("fraction_px", "<f4", 2), ("electrons_per_s", "<f4")])
 
-# A star at most this much over white is not called clipped: flux and white are float32 on the way.
-CLIP_TOLERANCE = 1e-6
+
+# Of more stars than this near the image only the brightest are drawn: the work and the memory of a frame are bounded.
+MAX_STARS = 250_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +26,8 @@ class Sprites:
     """Stars on the image: `data` (n,) of SPRITE_DTYPE, their centres, and where each lies in `Stars`.
 
     A sprite covers `footprint_px` squared pixels, the first of them at `pixel - (footprint_px - 1) // 2`. A star's light is
-    divided among up to `per_star` sprites.
+    divided among up to `per_star` sprites. `capped` stars are drawn coarser than they should be, or not at all, for the work of
+    a frame is bounded.
     """
 
     data: npt.NDArray[np.void]
@@ -35,6 +36,7 @@ class Sprites:
     x_px: FloatArray
     y_px: FloatArray
     per_star: int = 1
+    capped: int = 0
 
     def __len__(self) -> int:
         return len(self.data)
@@ -50,9 +52,19 @@ def make_sprites(stars: Stars, icrs_to_image: FloatArray, camera: Camera, footpr
 
     `icrs_to_image` (3, 3) turns ICRS components into image components.
     """
-    near = stars.grid.near(icrs_to_image[2], camera.field_radius_rad(footprint_px / 2 + 1))
+    near, dropped = brightest_near(stars, icrs_to_image[2], camera.field_radius_rad(footprint_px / 2 + 1))
     x_px, y_px = camera.project(stars.vectors[near] @ icrs_to_image.T)
-    return pack_sprites(x_px, y_px, stars.electrons_per_s[near], near, (camera.resolution_px, footprint_px))
+    sprites = pack_sprites(x_px, y_px, stars.electrons_per_s[near], near, (camera.resolution_px, footprint_px))
+    return replace(sprites, capped=dropped) if dropped else sprites
+
+
+def brightest_near(stars: Stars, axis: FloatArray, radius_rad: float) -> tuple[IntArray, int]:
+    """Places of the stars within `radius_rad` of an axis, of more than MAX_STARS the brightest; and how many were dropped."""
+    near = stars.grid.near(axis, radius_rad)
+    dropped = max(0, len(near) - MAX_STARS)
+    if dropped:
+        near = near[np.argpartition(-stars.electrons_per_s[near], MAX_STARS)[:MAX_STARS]]
+    return near, dropped
 
 
 def pack_sprites(
@@ -91,43 +103,3 @@ def join_sprites(parts: Sequence[Sprites], footprint_px: int) -> Sprites:
         np.concatenate([part.x_px for part in parts]),
         np.concatenate([part.y_px for part in parts]),
     )
-
-
-def clipped_sprites(
-    sprites: Sprites,
-    sigma_px: tuple[float, float],
-    flux_at_white_e_per_s: float,
-    resolution_px: tuple[int, int],
-    uniformity: Float32Array | None = None,
-) -> IntArray:
-    """Positions of the sprites whose brightest pixel lies on the image and, neighbours' light included, is over white.
-
-    White is `flux_at_white_e_per_s` times a pixel's `uniformity` (height, width), where that is given.
-
-    Only a star that alone reaches half of white in a pixel is looked at: two fainter ones on one pixel go unnamed.
-    """
-    least_white = flux_at_white_e_per_s * (1.0 if uniformity is None else float(uniformity.min()))
-    alone = 0.5 * least_white / peak_share(sigma_px) / sprites.per_star
-    bright = np.flatnonzero(sprites.data["electrons_per_s"] > alone)
-    if not len(bright):
-        return bright
-    x, y = np.rint(sprites.x_px[bright]).astype(int), np.rint(sprites.y_px[bright]).astype(int)
-    inside = (x >= 0) & (x < resolution_px[0]) & (y >= 0) & (y < resolution_px[1])
-    bright, x, y = bright[inside], x[inside], y[inside]
-    limit = np.full(len(bright), flux_at_white_e_per_s * (1 + CLIP_TOLERANCE))
-    if uniformity is not None:
-        limit *= uniformity[y, x]
-    over = [_peak_light(sprites, int(i), sigma_px) > most for i, most in zip(bright, limit, strict=True)]
-    return np.asarray(bright[np.array(over, dtype=bool)], dtype=np.intp)
-
-
-def _peak_light(sprites: Sprites, i: int, sigma_px: tuple[float, float]) -> float:
-    """Light of all sprites in the pixel that holds the centre of sprite `i`."""
-    offset_x = sprites.x_px - np.rint(sprites.x_px[i])
-    offset_y = sprites.y_px - np.rint(sprites.y_px[i])
-    reach = sprites.footprint_px / 2
-    total = 0.0
-    for k in np.flatnonzero((np.abs(offset_x) <= reach) & (np.abs(offset_y) <= reach)):
-        share = pixel_share(offset_x[k], sigma_px[0]) * pixel_share(offset_y[k], sigma_px[1])
-        total += float(sprites.data["electrons_per_s"][k]) * share
-    return total

@@ -11,11 +11,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hilstar.arrays import FloatArray
-from hilstar.attitude.quaternion import to_matrix
+from hilstar.arrays import FloatArray, IntArray
+from hilstar.attitude.quaternion import propagate, to_matrix
 from hilstar.scene.camera import Camera
-from hilstar.scene.smear import gauss_nodes
-from hilstar.scene.sprites import Sprites, pack_sprites
+from hilstar.scene.paths import Chords, Paths, node_counts, nodes_of, within_budget
+from hilstar.scene.sprites import Sprites, brightest_near, pack_sprites
 from hilstar.sky.stars import Stars
 
 # With ceil(0.6 r + 1) nodes on a path of r sigmas no pixel is off by more than 1e-3 of the star's flux (measured for sigma
@@ -23,7 +23,11 @@ from hilstar.sky.stars import Stars
 NODES_PER_SIGMA = 0.6
 # A path of so many sigmas is a point to 1e-3 of the star's flux.
 POINT_SIGMA = 0.27
-LONGEST_ANGLE_RAD = 0.5  # in half a frame; a camera that turns faster is drawn as if it turned so fast
+# A frame's work is bounded: each star has one sprite, all paths together so many more, and no path is longer than this share
+# of the field's radius. Past that paths are drawn with fewer nodes, or as those of a slower turn, and the stars counted. With
+# 1000 stars in view the longest frame then takes 1.6 times as long as a still one (python -m tests.bench.bench_motion).
+EXTRA_SPRITES = 1000
+MAX_TURN_FIELD = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +40,11 @@ class Scan:
     down: tuple[int, int] = (0, 1)
     scanout_s: float = 0.0
     hold_s: float = 0.0
+
+    @property
+    def whole_s(self) -> float:
+        """From the first row's first light to the last row's last."""
+        return self.scanout_s + self.hold_s
 
     @property
     def longest_s(self) -> float:
@@ -66,50 +75,60 @@ class Turn:
 def swept_sprites(
     stars: Stars, turn: Turn, scan: Scan, camera: Camera, footprint_px: int, sigma_px: tuple[float, float]
 ) -> Sprites:
-    """Sprites of each star on its path over the light of the row that it is on; several sprites of a star follow each other."""
-    speed = turn.speed_rad_s
-    longest_rad = min(speed * scan.longest_s, LONGEST_ANGLE_RAD)
-    to_image = camera.cam_to_image @ to_matrix(turn.q_icrs_to_cam)
-    near = stars.grid.near(to_image[2], camera.field_radius_rad(footprint_px / 2 + 1) + longest_rad)
-    paths = _Paths(stars.vectors[near] @ to_image.T, camera.cam_to_image @ turn.rate_cam_rad_s, camera)
-    late_s = np.zeros(len(near))
-    for _ in range(2):  # each pass leaves the part of the frame that the star crosses in it: 1e-5 of it for 5 px in 1080 rows
-        x_px, y_px = paths.places_px(late_s[None])
-        late_s = scan.late_s(x_px[0], y_px[0], camera.resolution_px)
-    count = _node_count(paths, late_s, scan.hold_s, sigma_px)
-    nodes, weights = gauss_nodes(count)
-    x_px, y_px = paths.places_px(late_s + (nodes[:, None] + 1) / 2 * scan.hold_s)
-    light = np.outer(weights / 2, stars.electrons_per_s[near])
-    star = np.broadcast_to(near, x_px.shape)
-    frame = (camera.resolution_px, footprint_px)
-    return replace(pack_sprites(x_px.ravel(), y_px.ravel(), light.ravel(), star.ravel(), frame), per_star=count)
+    """Sprites of each star on its path over the light of the row that it is on; several sprites of a star follow each other.
+
+    `capped` of what comes out are the stars whose paths are coarser than NODES_PER_SIGMA, or shorter than the turn makes them.
+    """
+    turn, slowed = _slowed(turn, scan, camera)
+    middle = Turn(propagate(turn.q_icrs_to_cam, turn.rate_cam_rad_s, scan.hold_s / 2), turn.rate_cam_rad_s)
+    axis = (camera.cam_to_image @ to_matrix(middle.q_icrs_to_cam))[2]
+    reach_rad = camera.field_radius_rad(footprint_px / 2 + 1) + turn.speed_rad_s * scan.whole_s / 2
+    near, dropped = brightest_near(stars, axis, reach_rad)
+    seen = stars.vectors[near] @ (camera.cam_to_image @ to_matrix(turn.q_icrs_to_cam)).T
+    paths = Paths(seen, camera.cam_to_image @ turn.rate_cam_rad_s, camera)
+    late_s = _row_delays_s(paths, scan, camera)
+    wanted, part = _wanted_nodes(paths, late_s, scan, footprint_px, sigma_px)
+    counts = within_budget(wanted, EXTRA_SPRITES)
+    nodes = nodes_of(counts)
+    begin, length = part[0][nodes.path], (part[1] - part[0])[nodes.path]
+    seconds = late_s[nodes.path] + (begin + length * (nodes.place + 1) / 2) * scan.hold_s
+    x_px, y_px = paths.places_px(nodes.path, seconds)
+    star = near[nodes.path]
+    light = nodes.share * length * stars.electrons_per_s[star]
+    sprites = pack_sprites(x_px, y_px, light, star, (camera.resolution_px, footprint_px))
+    capped = int((counts < wanted).sum()) if not slowed else int((counts > 0).sum())
+    return replace(sprites, per_star=int(counts.max(initial=1)), capped=capped + dropped)
 
 
-class _Paths:
-    """Directions (n, 3) in image axes that turn with a constant rate, by Rodrigues' formula."""
-
-    def __init__(self, vectors: FloatArray, rate_rad_s: FloatArray, camera: Camera) -> None:
-        self._camera = camera
-        self._vectors = vectors
-        self._speed = float(np.linalg.norm(rate_rad_s))
-        axis = rate_rad_s / self._speed if self._speed else np.zeros(3)
-        self._cross = np.cross(axis, vectors)
-        self._along = (vectors @ axis)[:, None] * axis
-
-    def places_px(self, seconds: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Pixel x and y at `seconds` (k, n), which each star has for itself; NaN behind the camera."""
-        angle = np.clip(self._speed * seconds, -LONGEST_ANGLE_RAD, LONGEST_ANGLE_RAD)[..., None]
-        cosine = np.cos(angle)
-        seen = self._vectors * cosine - self._cross * np.sin(angle) + self._along * (1 - cosine)
-        x_px, y_px = self._camera.project(seen.reshape(-1, 3))
-        return x_px.reshape(seconds.shape), y_px.reshape(seconds.shape)
+def _slowed(turn: Turn, scan: Scan, camera: Camera) -> tuple[Turn, bool]:
+    """The turn itself, or one about the same axis that takes no star farther than MAX_TURN_FIELD; and whether it is slower."""
+    angle_rad, most_rad = turn.speed_rad_s * scan.whole_s, MAX_TURN_FIELD * camera.field_radius_rad(0.0)
+    if angle_rad <= most_rad:
+        return turn, False
+    return Turn(turn.q_icrs_to_cam, turn.rate_cam_rad_s * (most_rad / angle_rad)), True
 
 
-def _node_count(paths: _Paths, late_s: FloatArray, hold_s: float, sigma_px: tuple[float, float]) -> int:
-    """How many sprites the longest of the paths needs."""
-    if hold_s == 0 or not len(late_s):
-        return 1
-    x_px, y_px = paths.places_px(late_s + np.array([[0.0], [hold_s]]))
-    length = np.hypot(np.diff(x_px, axis=0) / sigma_px[0], np.diff(y_px, axis=0) / sigma_px[1])
-    longest = float(np.max(length, initial=0.0, where=np.isfinite(length)))
-    return 1 if longest < POINT_SIGMA else int(np.ceil(NODES_PER_SIGMA * longest + 1))
+def _row_delays_s(paths: Paths, scan: Scan, camera: Camera) -> FloatArray:
+    """How long after the middle row each star's own row lights."""
+    every, late_s = np.arange(len(paths)), np.zeros(len(paths))
+    for _ in range(2 if scan.scanout_s else 0):
+        # Each pass leaves the part of the frame that the star crosses in it: 1e-5 of it for 5 px in 1080 rows.
+        x_px, y_px = paths.places_px(every, late_s)
+        late_s = scan.late_s(x_px, y_px, camera.resolution_px)
+    return np.where(np.isfinite(late_s), late_s, 0.0)
+
+
+def _wanted_nodes(
+    paths: Paths, late_s: FloatArray, scan: Scan, footprint_px: int, sigma_px: tuple[float, float]
+) -> tuple[IntArray, tuple[FloatArray, FloatArray]]:
+    """How many nodes each star's path needs on the image (0: it is not there), and the part of its time that it is there."""
+    every = np.arange(len(paths))
+    ends = [paths.places_px(every, late_s + seconds) for seconds in (0.0, scan.hold_s)]
+    chords = Chords(np.stack([x for x, _ in ends]), np.stack([y for _, y in ends]))
+    angle_rad = paths.speed_rad_s * scan.hold_s
+    # An arc bulges from its chord, and a star runs unevenly along it, by less than the angle of the turn.
+    bulge_px = angle_rad * np.nan_to_num(chords.length_sigma((1.0, 1.0)))
+    begin, end = chords.on_image(paths.camera.resolution_px, footprint_px / 2 + 1 + bulge_px)
+    counts = node_counts(chords.length_sigma(sigma_px) * (end - begin), NODES_PER_SIGMA, 1, POINT_SIGMA)
+    counts[end <= begin] = 0
+    return counts, (begin, end)

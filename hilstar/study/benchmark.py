@@ -21,7 +21,8 @@ from hilstar.bench.assembly import Bench, load
 from hilstar.errors import InputError
 from hilstar.render.renderer import Renderer, Target
 from hilstar.render.stages import StagedRenderer
-from hilstar.scene.sprites import Sprites, clipped_sprites, pack_sprites
+from hilstar.scene.clipping import clipped_sprites
+from hilstar.scene.sprites import Sprites, pack_sprites
 from hilstar.sky.cells import cell_grid
 from hilstar.sky.stars import Stars
 from hilstar.study.benchmark_others import Other, others

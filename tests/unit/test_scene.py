@@ -10,8 +10,9 @@ import pytest
 from hilstar.attitude.quaternion import from_radec_roll_deg, to_matrix
 from hilstar.errors import InputError
 from hilstar.monitor.geometry import monitor_camera
+from hilstar.scene.clipping import clipped_sprites
 from hilstar.scene.psf import LARGEST_CUT, cut_share, footprint_px, peak_share, pixel_share
-from hilstar.scene.sprites import clipped_sprites, make_sprites
+from hilstar.scene.sprites import make_sprites
 from hilstar.sky.catalog import FIELDS, Catalog
 from hilstar.sky.stars import Stars, make_stars
 

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from hilstar.attitude.quaternion import from_radec_roll_deg, propagate, to_matrix
+from hilstar.errors import InputError
 from hilstar.monitor.geometry import monitor_camera
 from hilstar.render.reference import linear_image
+from hilstar.scene import smear
 from hilstar.scene.psf import LARGEST_CUT, footprint_px
 from hilstar.scene.smear import MIDDLE_S, Motion, smeared_sprites
 from hilstar.scene.sprites import make_sprites
@@ -112,3 +114,22 @@ def test_a_spin_that_sweeps_the_sky_past_the_camera_ends(rng):
     sprites = smeared_sprites(stars_at(vectors, np.ones(2000)), at, CAMERA, footprint_px(SIGMA), SIGMA)
     assert 0 < sprites.data["electrons_per_s"].sum() < 2000
     assert np.isfinite(sprites.x_px).all()
+
+
+@pytest.mark.parametrize("rate", [(1e9, 0, 0), (0, 0, 1e12), (3e5, 1e5, 0)])
+def test_a_turn_too_long_to_draw_is_refused_with_what_can_be(rate):
+    at = motion(rate)
+    with pytest.raises(InputError, match=r"turns by .* deg is too long; at most .* deg are drawn"):
+        smeared_sprites(star_on((160.2, 120.7), motion((0, 0, 0))), at, CAMERA, 10, SIGMA)
+
+
+def test_more_sprites_than_the_bound_are_made_fewer_with_their_light_kept(monkeypatch, rng):
+    at = motion((10.0, 0, 0))
+    stars = stars_at(rng.normal(size=(20_000, 3)), np.ones(20_000))
+    whole = smeared_sprites(stars, at, CAMERA, 10, SIGMA)
+    monkeypatch.setattr(smear, "MAX_SPRITES", len(whole) // 2)
+    coarse = smeared_sprites(stars, at, CAMERA, 10, SIGMA)
+    assert len(coarse) <= len(whole) // 2
+    assert (whole.capped, coarse.capped) == (0, len(np.unique(whole.star)))
+    light = [float(sprites.data["electrons_per_s"].sum(dtype=np.float64)) for sprites in (whole, coarse)]
+    assert light[1] == pytest.approx(light[0], rel=0.02)  # paths end at the image's edge, a node more or less

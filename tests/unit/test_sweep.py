@@ -9,9 +9,11 @@ from hilstar.attitude.quaternion import from_radec_roll_deg, propagate, to_matri
 from hilstar.monitor.geometry import monitor_camera
 from hilstar.render.presenter import Mount
 from hilstar.render.reference import linear_image
+from hilstar.scene.clipping import clipped_sprites
+from hilstar.scene.paths import MAX_NODES
 from hilstar.scene.psf import footprint_px
-from hilstar.scene.sprites import clipped_sprites, make_sprites
-from hilstar.scene.sweep import Scan, Turn, swept_sprites
+from hilstar.scene.sprites import make_sprites
+from hilstar.scene.sweep import EXTRA_SPRITES, Scan, Turn, swept_sprites
 from tests.unit.test_scene import stars_at
 
 SIZE = (320, 240)
@@ -123,11 +125,56 @@ def test_a_bright_path_is_called_clipped_by_its_light_together():
     assert len(clipped_sprites(sprites, SIGMA, 1.1 * peak, SIZE)) == 0
 
 
-@pytest.mark.parametrize("rate", [(1e6, 0, 0), (0, 0, 1e9), (np.pi * 1e3, 1e-9, 0)])
-def test_a_mad_rate_is_drawn_and_nothing_breaks(rate):
-    stars = stars_on(PIXELS)
-    sprites = swept(stars, Turn(Q, np.array(rate)), Scan((0, 1), FRAME_S, FRAME_S))
+def crowd(count: int, rng: np.random.Generator):
+    """Stars all over the image and as far around it again."""
+    return stars_on(rng.uniform((-SIZE[0], -SIZE[1]), (2 * SIZE[0], 2 * SIZE[1]), size=(9 * count, 2)))
+
+
+@pytest.mark.parametrize("speed", [0.5, 1.0, 10.0, 57.0, 900.0, 1e6, 1e9])
+@pytest.mark.parametrize("axis", [(1, 0, 0), (0, 0, 1), (0.6, -0.7, 0.2)])
+@pytest.mark.parametrize("scan", [Scan((0, 1), FRAME_S, FRAME_S), Scan((1, 0), 100.0, 1e9), Scan(hold_s=FRAME_S)])
+def test_no_turn_makes_more_than_its_budget_of_sprites(speed, axis, scan, rng):
+    stars = crowd(1000, rng)
+    still = len(make_sprites(stars, CAMERA.cam_to_image @ to_matrix(Q), CAMERA, FOOTPRINT))
+    sprites = swept(stars, Turn(Q, speed * np.array(axis) / np.linalg.norm(axis)), scan)
     assert np.isfinite(sprites.x_px).all()
+    assert sprites.per_star <= MAX_NODES
+    # A path of half the field's radius takes that many more stars across the image.
+    assert 0 < len(sprites) <= 2 * still + EXTRA_SPRITES
+    assert sprites.capped > 0
+
+
+def test_a_slow_turn_is_drawn_whole_and_none_is_capped(rng):
+    sprites = swept(crowd(100, rng), turn((1.0, 0.5, 0)), Scan((0, 1), FRAME_S, FRAME_S))
+    assert sprites.per_star > 1
+    assert sprites.capped == 0
+
+
+def test_a_path_that_is_too_coarse_still_has_all_its_light_in_its_middle(rng):
+    """1000 stars in view at 20 deg/s: 50 px each, of which a share of EXTRA_SPRITES is drawn."""
+    inside = rng.uniform((110, 90), (210, 150), size=(1000, 2))
+    at, scan = turn((14.0, -14.0, 0)), Scan(hold_s=FRAME_S)
+    stars = stars_on(inside)
+    sprites = swept(stars, at, scan)
+    assert sprites.capped == 1000
+    light = np.bincount(sprites.star, sprites.data["electrons_per_s"])
+    assert light == pytest.approx(1.0, rel=1e-6)
+    x_px, y_px = (np.bincount(sprites.star, sprites.data["electrons_per_s"] * part) for part in (sprites.x_px, sprites.y_px))
+    middle = place_px(stars, at, FRAME_S / 2)
+    # The mean of a path lies off its middle by its bend: (path / focal length)^2 / 24 of the distance from the axis.
+    assert np.hypot(x_px - middle[:, 0], y_px - middle[:, 1]).max() < 0.01
+
+
+def test_nodes_belong_to_what_of_a_path_lies_on_the_image():
+    """One star crosses the whole image, one only its corner, one passes outside: 1, a few and no sprites."""
+    at, scan = turn((0, 120.0, 0)), Scan(hold_s=FRAME_S)  # 188 px in a frame
+    crossing, cutting, outside = (stars_on([place]) for place in ((200.0, 120.0), (-20.0, 5.0), (160.0, -40.0)))
+    towards = np.sign(place_px(crossing, at, FRAME_S)[0, 0] - 200.0)
+    cutting = stars_on([(-180.0 if towards > 0 else 10.0, 5.0)])
+    whole, part = swept(crossing, at, scan), swept(cutting, at, scan)
+    assert len(swept(outside, at, scan)) == 0
+    assert 2 < len(part) < len(whole) / 4
+    assert np.abs(part.x_px + 0.5).max() < 30
 
 
 @pytest.mark.parametrize(

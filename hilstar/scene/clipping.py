@@ -1,0 +1,74 @@
+"""Which stars of a frame ask for more light than one pixel of the monitor has."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hilstar.arrays import Float32Array, FloatArray, IntArray
+from hilstar.scene.psf import peak_share, pixel_shares
+from hilstar.scene.sprites import Sprites
+
+# A star at most this much over white is not called clipped: flux and white are float32 on the way.
+CLIP_TOLERANCE = 1e-6
+# Of the sprites that may clip by other sprites' light so many are looked at, the brightest: the work of a frame is bounded.
+MAX_DOUBTFUL = 512
+
+
+def clipped_sprites(
+    sprites: Sprites,
+    sigma_px: tuple[float, float],
+    flux_at_white_e_per_s: float,
+    resolution_px: tuple[int, int],
+    uniformity: Float32Array | None = None,
+) -> IntArray:
+    """Positions of the sprites whose brightest pixel lies on the image and, neighbours' light included, is over white.
+
+    White is `flux_at_white_e_per_s` times a pixel's `uniformity` (height, width), where that is given.
+
+    Only a star that alone reaches half of white in a pixel is looked at: two fainter ones on one pixel go unnamed.
+    """
+    minimum_white = flux_at_white_e_per_s * (1.0 if uniformity is None else float(uniformity.min()))
+    bright = np.flatnonzero(_star_rates(sprites) > 0.5 * minimum_white / peak_share(sigma_px))
+    if not len(bright):
+        return bright
+    x, y = np.rint(sprites.x_px[bright]).astype(int), np.rint(sprites.y_px[bright]).astype(int)
+    inside = (x >= 0) & (x < resolution_px[0]) & (y >= 0) & (y < resolution_px[1])
+    bright, x, y = bright[inside], x[inside], y[inside]
+    limit = np.full(len(bright), flux_at_white_e_per_s * (1 + CLIP_TOLERANCE))
+    if uniformity is not None:
+        limit *= uniformity[y, x]
+    own = sprites.data["electrons_per_s"][bright] * _share(x - sprites.x_px[bright], y - sprites.y_px[bright], sigma_px)
+    over = own > limit
+    doubtful = np.flatnonzero(~over)
+    if len(doubtful) > MAX_DOUBTFUL:
+        doubtful = doubtful[np.argpartition(-own[doubtful], MAX_DOUBTFUL)[:MAX_DOUBTFUL]]
+    over[doubtful] = _light_at(sprites, x[doubtful], y[doubtful], sigma_px) > limit[doubtful]
+    return np.asarray(bright[over], dtype=np.intp)
+
+
+def _star_rates(sprites: Sprites) -> FloatArray:
+    """The rate of each sprite's whole star, electrons per second (n,)."""
+    rates = sprites.data["electrons_per_s"].astype(np.float64)
+    if sprites.per_star == 1:
+        return rates
+    _, star = np.unique(sprites.star, return_inverse=True)
+    return np.asarray(np.bincount(star, rates)[star])
+
+
+def _share(offset_x: FloatArray, offset_y: FloatArray, sigma_px: tuple[float, float]) -> FloatArray:
+    return pixel_shares(offset_x, sigma_px[0]) * pixel_shares(offset_y, sigma_px[1])
+
+
+def _light_at(sprites: Sprites, x: IntArray, y: IntArray, sigma_px: tuple[float, float]) -> FloatArray:
+    """Light of all sprites together in the pixels at x, y (k,), electrons per second (k,)."""
+    order = np.argsort(sprites.x_px)
+    reach = sprites.footprint_px / 2
+    first = np.searchsorted(sprites.x_px, x - reach, sorter=order)
+    count = np.searchsorted(sprites.x_px, x + reach, side="right", sorter=order) - first
+    pixel = np.repeat(np.arange(len(x)), count)
+    other = order[np.arange(len(pixel)) + np.repeat(first - (np.cumsum(count) - count), count)]
+    offset_y = sprites.y_px[other] - y[pixel]
+    near = np.abs(offset_y) <= reach
+    pixel, other, offset_y = pixel[near], other[near], offset_y[near]
+    share = _share(sprites.x_px[other] - x[pixel], offset_y, sigma_px)
+    return np.asarray(np.bincount(pixel, sprites.data["electrons_per_s"][other] * share, minlength=len(x)), dtype=np.float64)

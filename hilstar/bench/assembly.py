@@ -19,7 +19,7 @@ from msgspec.structs import replace
 from hilstar.arrays import Float32Array, FloatArray, IntArray
 from hilstar.attitude.protocol import NORM_TOLERANCE
 from hilstar.attitude.quaternion import normalise, to_matrix
-from hilstar.bench.config import BenchConfig, SkySettings, Tracker, Vector, read_config
+from hilstar.bench.config import DEFAULT_BRIGHTEST_V_MAG, BenchConfig, SkySettings, Tracker, Vector, read_config
 from hilstar.bench.effort import Effort, Light, faintest_shown_e_per_s, plan_effort
 from hilstar.bench.mounting import scan_of
 from hilstar.errors import InputError
@@ -339,16 +339,21 @@ def bench_camera(config: BenchConfig) -> Camera:
     )
 
 
-def brightest_peak_e_per_s(stars: Stars, sigma_px: tuple[float, float], brightest_v_mag: float | None = None) -> float:
-    """The light of the brightest pixel that any star of the bench can make: white, where the file gives none.
+def brightest_peak_e_per_s(
+    stars: Stars, sigma_px: tuple[float, float], brightest_v_mag: float | None = DEFAULT_BRIGHTEST_V_MAG
+) -> float:
+    """White, where the file gives no light for it: the brightest pixel of the brightest star not brighter than that.
 
-    With `brightest_v_mag` stars brighter than that may clip. Raises InputError when that leaves no star at all.
+    Brighter ones may clip. By the default magnitude, in a catalogue of brighter stars alone, none does. Raises InputError
+    when no star is left.
     """
-    wanted = stars.electrons_per_s if brightest_v_mag is None else stars.electrons_per_s[stars.v_mag >= brightest_v_mag]
+    magnitude = DEFAULT_BRIGHTEST_V_MAG if brightest_v_mag is None else brightest_v_mag
+    wanted = stars.electrons_per_s[stars.v_mag >= magnitude]
+    if not len(wanted) and magnitude == DEFAULT_BRIGHTEST_V_MAG:
+        wanted = stars.electrons_per_s
     if not len(wanted):
-        key = "[sky] faintest_v_mag" if brightest_v_mag is None else "[render] brightest_v_mag"
-        magnitude = "larger" if brightest_v_mag is None else "smaller"
-        raise InputError(f"{key} leaves no star; write a {magnitude} magnitude, or [render] flux_at_white_e_per_s")
+        key, better = ("[render] brightest_v_mag", "smaller") if len(stars) else ("[sky] faintest_v_mag", "larger")
+        raise InputError(f"{key} leaves no star; write a {better} magnitude, or [render] flux_at_white_e_per_s")
     return float(wanted.max()) * peak_share(sigma_px)
 
 

@@ -123,6 +123,15 @@ def shown_bench(bench_file: Path, headless: bool, windowed: bool, force: bool) -
         yield screen.bench, screen
 
 
+def say_what_clips(bench: Any) -> None:
+    """Name the stars that this bench cannot show as bright as they are."""
+    from hilstar.bench.white import clipping_line
+
+    line = clipping_line(bench)
+    if line is not None:
+        say(line)
+
+
 def optional_ledger(path: Path | None, bench: Any, notices: Notices) -> AbstractContextManager[Any]:
     """The run's ledger, which keeps the run's events too, or nothing where none was asked for."""
     from hilstar.bench.ledger import Ledger
@@ -172,6 +181,7 @@ def serve(
         slots = math.inf if duration is None else round(duration * refresh_hz)
         limit = Limit(slots, math.inf if frames is None else frames)
         say(f"{link.verb} {link.endpoint}, {refresh_hz:g} Hz, {bench.renderer.gl_renderer}")
+        say_what_clips(bench)
         with progress("serving", min(limit.slots, limit.frames)) as advance:
             summary = serve_stream(bench, link, limit, lambda shown: advance(shown.number + 1), Outlet(screen, kept, notices))
     report(summary, as_json)
@@ -210,6 +220,7 @@ def replay(
         optional_ledger(ledger, bench, notices) as kept,
         progress("replaying", play.frame_count) as advance,
     ):
+        say_what_clips(bench)
         if explain:
             explain_effort(bench)
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from hilstar.bench.assembly import Bench
 from hilstar.bench.simulation import ARCSEC_PER_RAD
+from hilstar.bench.white import clipping_hip, named
 from hilstar.monitor.phases import WHITE, fainter, measure, phase_grid, shown_by
 from hilstar.monitor.quantise import Panel
 from hilstar.render.reference import linear_image
@@ -80,7 +81,7 @@ def budget(bench: Bench) -> Budget:
         nothing_v_mag=zero_mag - 2.5 * math.log10(nothing_e_per_s),
         range_mag=zero_mag - 2.5 * math.log10(nothing_e_per_s) - clips,
         within=_within(rows, clips),
-        clipped_hip=[int(h) for h in bench.stars.hip[bench.stars.electrons_per_s * share > white * darkest * (1 + 1e-6)]],
+        clipped_hip=clipping_hip(bench),
         left_out=left_out(bench),
         black_e_per_s_px=bench.calibration.response.black * white,
         rows=rows,
@@ -202,14 +203,12 @@ def budget_lines(found: Budget) -> list[str]:
         return "-" if value is None else f"{value:{form}}"
 
     within = ", ".join(f"{number(value, 'g')} mag within {limit.replace('_', ' ')}" for limit, value in found.within.items())
-    more = "" if len(found.clipped_hip) <= NAMED else f" and {len(found.clipped_hip) - NAMED} more"
-    clipped = ", ".join(map(str, found.clipped_hip[:NAMED])) + more if found.clipped_hip else "none"
     lines = [
         f"{'method':22}{found.method}, {found.bits} bits",
         f"{'clips at':22}V = {found.clips_v_mag:.2f} in the middle of a pixel, {found.clips_v_mag_at_best:.2f} on a corner",
         f"{'nothing from':22}V = {found.nothing_v_mag:.2f} on: a range of {found.range_mag:.1f} mag",
         f"{'under white':22}{within}",
-        f"{'clipped stars':22}{clipped if not found.clipped_hip else 'HIP ' + clipped}",
+        f"{'clipped stars':22}{named(found.clipped_hip, NAMED)}",
         f"{'left out':22}{found.left_out['stars']} stars, {found.left_out['flux_share']:.2e} of all light",
         f"{'black':22}{found.black_e_per_s_px:.4g} e-/s in a monitor pixel",
         "",

@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 import hilstar
+from hilstar.bench.white import clipping_hip
 from hilstar.monitor.calibration import load_calibration
 from hilstar.scene.psf import peak_share, pixel_share
 from hilstar.study.budget import budget, zero_point_mag
@@ -91,6 +93,37 @@ def test_white_is_the_brightest_star_wanted(bench_with):
     wanted = stars.electrons_per_s[stars.v_mag >= 1.0].max()
     assert bench.flux_at_white_e_per_s == pytest.approx(wanted * peak_share((0.85, 0.85)), rel=1e-15)
     assert 32349 in budget(bench).clipped_hip  # Sirius
+
+
+def test_the_white_of_a_file_that_gives_none_leaves_codes_for_most_fields(tmp_path):
+    """The shortest bench file: with Sirius for white the brightest of 255 codes is 38 in the median field."""
+    bench_file = tmp_path / "wide.toml"
+    bench_file.write_text(SMALL_BENCH.replace("[320, 240]", "[1920, 1080]").replace("= 60", "= 350"))
+    fields = Rotation.random(30, random_state=1).as_quat(scalar_first=True)
+    with hilstar.load(bench_file) as bench:
+        brightest, clipped = [], 0
+        for q in fields:
+            drawn = bench.draw(q)
+            brightest.append(int(drawn.levels.max()))
+            clipped += bool(drawn.clipped_hip)
+        assert np.median(brightest) > 80
+        assert clipped <= len(fields) / 5
+        assert 1 <= len(clipping_hip(bench)) <= 21
+
+
+def test_a_run_names_the_stars_that_clip_and_a_bench_without_such_stars_says_nothing(small_bench_file):
+    small_bench_file.write_text(SMALL_BENCH + '[attitude]\nendpoint = "tcp://127.0.0.1:5599"\n')
+    spoken = run_hilstar("serve", small_bench_file, "--headless", "--frames", "1")
+    assert "13 stars" in spoken.stderr and "HIP 32349, 30438" in spoken.stderr and "brightest_v_mag = 1.5" in spoken.stderr
+    small_bench_file.write_text(small_bench_file.read_text() + "[render]\nbrightest_v_mag = -2\n")
+    assert "HIP" not in run_hilstar("serve", small_bench_file, "--headless", "--frames", "1").stderr
+
+
+def test_a_sky_of_the_brightest_stars_alone_has_a_white(bench_with):
+    """Of the stars to V = 1 none is as faint as the default white."""
+    bench = bench_with("[sky]\nfaintest_v_mag = 1.0\n")
+    assert bench.flux_at_white_e_per_s == bench.stars.electrons_per_s.max() * peak_share((0.85, 0.85))
+    assert clipping_hip(bench) == []
 
 
 def test_two_whites_or_none_get_one_line(small_bench_file):

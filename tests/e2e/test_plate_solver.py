@@ -21,7 +21,7 @@ from scipy import ndimage
 from hilstar.monitor.photometry import srgb_light
 from tests.conftest import run_hilstar
 
-# The limits; measured here: 0.0003 to 0.024 arcsec and 0.2 to 0.8 arcsec.
+# The limits; measured here: 0.0003 to 0.024 arcsec and 0.03 to 0.7 arcsec.
 LINEAR_LIMIT_ARCSEC = 0.1
 CODES_LIMIT_ARCSEC = 2.0
 STARS = {"linear": 30, "codes": 20}

@@ -212,7 +212,9 @@ def test_a_black_level_is_caught_on_a_screen_that_covers_a_fifth_of_the_detector
 
 
 def test_coarse_codes_are_blamed_on_the_codes_and_not_on_the_response(tmp_path):
-    verdict, summary = verify(bench_file(tmp_path, bits=8, method="round"), 3, np.random.default_rng(1))
+    path = bench_file(tmp_path, bits=8, method="round")
+    path.write_text(path.read_text().replace("[verify]", "brightest_v_mag = -2\n[verify]"))
+    verdict, summary = verify(path, 3, np.random.default_rng(1))
     assert not verdict.passed
     assert any("the codes alone" in reason and "exact" in reason for reason in verdict.reasons)
     assert not any("response and uniformity" in reason for reason in verdict.reasons)

@@ -1,0 +1,38 @@
+"""Which stars of a bench are too bright for its monitor's white."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hilstar.bench.assembly import Bench
+from hilstar.scene.psf import peak_share
+from hilstar.scene.sprites import CLIP_TOLERANCE
+
+NAMED_STARS = 5
+
+
+def clipping_hip(bench: Bench) -> list[int]:
+    """The HIP numbers of the stars that clip in the middle of a pixel where the screen is darkest, brightest first."""
+    darkest = 1.0 if bench.uniformity is None else float(bench.uniformity.min())
+    peak_e_per_s = bench.stars.electrons_per_s * peak_share(bench.config.render.sprite_sigma_px)
+    order = np.argsort(-peak_e_per_s, kind="stable")
+    clips = peak_e_per_s[order] > bench.flux_at_white_e_per_s * darkest * (1 + CLIP_TOLERANCE)
+    return [int(hip) for hip in bench.stars.hip[order[clips]]]
+
+
+def named(hips: list[int], most: int) -> str:
+    """ "HIP 32349, 27989 and 3 more", or "none"."""
+    if not hips:
+        return "none"
+    more = "" if len(hips) <= most else f" and {len(hips) - most} more"
+    return "HIP " + ", ".join(map(str, hips[:most])) + more
+
+
+def clipping_line(bench: Bench) -> str | None:
+    """Which of the bench's stars clip, for a person at the start of a run; None where none does."""
+    hips, render = clipping_hip(bench), bench.config.render
+    if not hips:
+        return None
+    stars = "1 star of the sky is" if len(hips) == 1 else f"{len(hips)} stars of the sky are"
+    key = "flux_at_white_e_per_s" if render.brightest_v_mag is None else f"brightest_v_mag = {render.brightest_v_mag:g}"
+    return f"{stars} brighter than white and clip in view: {named(hips, NAMED_STARS)} ([render] {key})"

@@ -27,7 +27,10 @@ class MachineError(HilstarError):
 
 def shortened(text: object, limit: int = MAX_QUOTED_CHARACTERS) -> str:
     """A quoted piece of input in at most `limit` characters: its beginning and its end, where a file's name is."""
-    whole = str(text)
+    try:
+        whole = str(text)
+    except ValueError:  # Python writes no integer of more than 4300 digits
+        return "a number of thousands of digits"
     if len(whole) <= limit:
         return whole
     room = limit - len(CUT)

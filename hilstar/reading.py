@@ -5,14 +5,22 @@ A pipe would be awaited for ever, a device never ends, and a file of gigabytes i
 
 from __future__ import annotations
 
+import codecs
+import io
 import os
 import stat
+import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
-from hilstar.errors import InputError
+from hilstar.errors import InputError, shortened
 
 HEAD_BYTES = 16
+MAX_LINE_CHARACTERS = 1_000_000
+CHUNK_BYTES = 1 << 20
+MAX_TOML_BYTES = 200_000
 NOT_FILES = {
     stat.S_ISDIR: "is a directory",
     stat.S_ISFIFO: "is a pipe; write it to a file first",
@@ -22,9 +30,10 @@ NOT_FILES = {
 }
 # What begins a file of a kind that people have beside attitude logs and benches.
 MAGIC = {
-    b"ULog\x01\x12\x35": "a ULog file",
+    b"ULog\x01": "a ULog file",
     b"DAF/CK": "a SPICE CK kernel",
     b"DAF/": "a SPICE kernel",
+    b"DAFETF NAIF": "a SPICE kernel",
     b"NAIF/": "a SPICE kernel",
     b"SQLite format 3\x00": "an SQLite database (a db3 bag of ROS 2)",
     b"#ROSBAG V": "a ROS 1 bag",
@@ -47,8 +56,8 @@ MAGIC = {
     b"\x80\x03": "a pickle",
     b"\x80\x04": "a pickle",
     b"\x80\x05": "a pickle",
-    b"\xff\xfe": "text in UTF-16",
-    b"\xfe\xff": "text in UTF-16",
+    b"\xff\xfe": "text in UTF-16, not UTF-8",
+    b"\xfe\xff": "text in UTF-16, not UTF-8",
 }
 
 
@@ -114,15 +123,71 @@ def read_text(path: Path, advice: str, limit_bytes: int) -> str:
 
 def as_text(path: Path, raw: bytes, advice: str) -> str:
     """The text of a file's bytes. Raises InputError with the kind of file, or the first byte that is not UTF-8."""
-    kind = kind_of(raw[:HEAD_BYTES])
-    if kind is not None:
-        raise InputError(f"{path}: is {kind}; {advice}")
+    refuse_kind(path, raw[:HEAD_BYTES], advice)
     try:
         return raw.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        # Not error.start: the decoder drops a byte order mark before it counts.
-        place = len(raw) - len(error.object) + error.start
-        raise InputError(f"{path}: is not text in UTF-8 (byte {place} is 0x{raw[place]:02x}); {advice}") from error
+        raise InputError(_not_text(path, io.BytesIO(raw), advice)) from error
+
+
+def refuse_kind(path: Path, head: bytes, advice: str) -> None:
+    """Refuse (InputError) a file whose first bytes say that it is no text, by the name of its kind."""
+    kind = kind_of(head)
+    if kind is not None:
+        raise InputError(f"{path}: cannot be read (it is {kind}); {advice}")
+
+
+@contextmanager
+def open_lines(path: Path, advice: str, limit_bytes: int) -> Iterator[Iterator[str]]:
+    """The lines of a text (UTF-8), one after another, so that a large one needs no memory; each ends as in the file.
+
+    Raises InputError as `read_text` does, and for a line of more than MAX_LINE_CHARACTERS.
+    """
+    with open_regular(path, advice, limit_bytes) as file:
+        refuse_kind(path, file.read(HEAD_BYTES), advice)
+        file.seek(0)
+        text = io.TextIOWrapper(file, encoding="utf-8-sig", newline="")
+        try:
+            yield _bounded(path, text, advice)
+        except UnicodeDecodeError as error:
+            file.seek(0)
+            raise InputError(_not_text(path, file, advice)) from error
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read ({error.strerror or error}); {advice}") from error
+
+
+def _bounded(path: Path, text: IO[str], advice: str) -> Iterator[str]:
+    number = 0
+    while line := text.readline(MAX_LINE_CHARACTERS):
+        number += 1
+        if len(line) == MAX_LINE_CHARACTERS and line[-1] not in "\r\n":
+            raise InputError(f"{path}:{number}: the line has {MAX_LINE_CHARACTERS} characters or more; {advice}")
+        yield line
+
+
+def _not_text(path: Path, file: IO[bytes], advice: str) -> str:
+    decoder, offset = codecs.getincrementaldecoder("utf-8")(), 0
+    while chunk := file.read(CHUNK_BYTES):
+        waiting = len(decoder.getstate()[0])
+        try:
+            decoder.decode(chunk)
+        except UnicodeDecodeError as error:
+            place, byte = offset - waiting + error.start, error.object[error.start]
+            return f"{path}: cannot be read (it is not UTF-8: byte {place} is 0x{byte:02x}); {advice}"
+        offset += len(chunk)
+    return f"{path}: cannot be read (it is not UTF-8: it ends within a character, at byte {offset}); {advice}"
+
+
+def parse_toml(path: Path, text: str) -> dict[str, Any]:
+    """The tables of a TOML file's text. Raises InputError with the line."""
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{path}: not TOML: {shortened(error)}") from error
+    except RecursionError as error:
+        raise InputError(f"{path}: not TOML that anybody wrote: its values are nested too deep") from error
+    except ValueError as error:  # Python reads no integer of more than 4300 digits
+        raise InputError(f"{path}: not TOML: a whole number has thousands of digits") from error
 
 
 def _refuse_other(path: Path, mode: int, advice: str) -> None:
@@ -132,4 +197,5 @@ def _refuse_other(path: Path, mode: int, advice: str) -> None:
 
 
 def _too_large(path: Path, size_bytes: int, limit_bytes: int, advice: str) -> str:
-    return f"{path}: has {size_text(size_bytes)} or more; {size_text(limit_bytes)} at most are read; {advice}"
+    reason = f"it has {size_text(size_bytes)} or more, and {size_text(limit_bytes)} at most are read"
+    return f"{path}: cannot be read ({reason}); {advice}"

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import csv
-import io
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from decimal import Decimal
@@ -22,6 +21,7 @@ from hilstar.attitude.gaps import LogJoins, log_joins
 from hilstar.attitude.packet import AttitudeSample, Refusal, checked_sample, decode
 from hilstar.attitude.timeline import Policy, Timeline
 from hilstar.errors import InputError
+from hilstar.reading import HEAD_BYTES, open_lines, open_regular, read_text
 
 CSV_COLUMNS = ("t_s", "qw", "qx", "qy", "qz")
 RATE_COLUMNS = ("rx", "ry", "rz")
@@ -29,6 +29,9 @@ MCAP_MAGIC = b"\x89MCAP0\r\n"
 # A JSON number that msgspec takes as an integer: what one form of log can hold, all can.
 WHOLE_NUMBERS = range(-(2**63), 2**64)
 LONGEST_QUOTE = 80
+MAX_LOG_BYTES = 500_000_000  # some million attitudes: all of them are held, about 500 bytes each
+MAX_AEM_BYTES = 50_000_000
+READABLE = "hilstar reads CSV, JSON lines, CCSDS AEM (KVN or XML) and MCAP"
 
 Entry = tuple[str, AttitudeSample | Refusal]
 
@@ -40,15 +43,15 @@ def read_log(path: Path) -> list[AttitudeSample]:
     """
     samples: list[AttitudeSample] = []
     try:
-        entries, advice = _open_log(path)
-        for where, entry in entries:
-            if isinstance(entry, Refusal):
-                raise InputError(f"{path}{where}: {entry.detail}")
-            if samples and entry.t_ns <= samples[-1].t_ns:
-                times = f"t_ns {entry.t_ns} after {samples[-1].t_ns}"
-                raise InputError(f"{path}{where}: time does not rise ({times}); {advice}")
-            samples.append(entry)
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        with _open_log(path) as (entries, advice):
+            for where, entry in entries:
+                if isinstance(entry, Refusal):
+                    raise InputError(f"{path}{where}: {entry.detail}")
+                if samples and entry.t_ns <= samples[-1].t_ns:
+                    times = f"t_ns {entry.t_ns} after {samples[-1].t_ns}"
+                    raise InputError(f"{path}{where}: time does not rise ({times}); {advice}")
+                samples.append(entry)
+    except (OSError, csv.Error) as error:
         raise InputError(f"{path}: cannot be read as a log ({error})") from error
     if not samples:
         raise InputError(f"{path}: holds no attitude; write a CSV with the header {','.join(CSV_COLUMNS)}, or JSON lines")
@@ -89,27 +92,30 @@ def log_timeline(samples: list[AttitudeSample], policy: Policy, joins: LogJoins 
 # Reading
 
 
-def _open_log(path: Path) -> tuple[Iterable[Entry], str]:
+@contextlib.contextmanager
+def _open_log(path: Path) -> Iterator[tuple[Iterable[Entry], str]]:
     """The entries of a file, and what to do when their times do not rise."""
-    with path.open("rb") as file:
-        head = file.read(len(MCAP_MAGIC))
-        if head == MCAP_MAGIC:
-            return _mcap_entries(path), "the sender restarted here, and a log is one stream"
-        text = (head + file.read()).decode("utf-8-sig")
-    word = _first_word(text)
-    if word.startswith("{"):
-        return _json_entries(io.StringIO(text, newline=None)), "sort the log by time"
+    with open_regular(path, READABLE) as file:
+        head = file.read(HEAD_BYTES)
+    if head.startswith(MCAP_MAGIC):
+        yield _mcap_entries(path), "the sender restarted here, and a log is one stream"
+        return
+    with open_lines(path, READABLE, MAX_LOG_BYTES) as lines:
+        word = _first_word(lines)
     if word.startswith("<") or word.startswith("CCSDS_AEM_VERS"):
+        text = read_text(path, "write a shorter AEM, or CSV or JSON lines", MAX_AEM_BYTES)
         advice = "sort its lines, and let blocks not overlap; leap seconds are not counted, so write TAI across one"
-        return _aem_entries(path, text), advice
+        yield _aem_entries(path, text), advice
+        return
     if word.startswith("CCSDS_"):
         raise InputError(f"{path}: starts with {word[:LONGEST_QUOTE]}; of the CCSDS messages, CCSDS_AEM_VERS is read")
-    return _csv_entries(io.StringIO(text, newline="")), "sort the log by time"
+    with open_lines(path, READABLE, MAX_LOG_BYTES) as lines:
+        yield (_json_entries if word.startswith("{") else _csv_entries)(lines), "sort the log by time"
 
 
-def _first_word(text: str) -> str:
+def _first_word(lines: Iterable[str]) -> str:
     """The first word of the first line that is no comment; in an AEM, a JSON object and XML it says which it is."""
-    for line in io.StringIO(text, newline=None):
+    for line in lines:
         words = line.split(maxsplit=1)
         if words and words[0] != "COMMENT" and not words[0].startswith("#"):
             return words[0]

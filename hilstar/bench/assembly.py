@@ -29,6 +29,7 @@ from hilstar.monitor.geometry import monitor_camera
 from hilstar.monitor.losses import star_losses
 from hilstar.monitor.photometry import Codes, code_dtype
 from hilstar.monitor.quantise import cycle_warning
+from hilstar.reading import read_bytes
 from hilstar.render.renderer import Context, Renderer, Target
 from hilstar.scene.camera import Camera
 from hilstar.scene.clipping import clipped_sprites
@@ -36,7 +37,7 @@ from hilstar.scene.psf import peak_share
 from hilstar.scene.sprites import Sprites, make_sprites
 from hilstar.scene.sweep import Turn, swept_sprites
 from hilstar.sky.astrometry import aberrate, unit_vectors_icrs
-from hilstar.sky.catalog import load_catalog
+from hilstar.sky.catalog import MAX_CATALOGUE_BYTES, load_catalog
 from hilstar.sky.electrons import Optics, Photometry, star_temperatures_k, tabulate
 from hilstar.sky.pickles import tabulate_pickles
 from hilstar.sky.spectrum import BUILT_IN_CURVES, load_curve
@@ -370,8 +371,8 @@ def bench_hash(config: BenchConfig, folder: Path) -> str:
 def _named_bytes(path: Path) -> bytes:
     """A file that the bench names; nothing where there is none, for whoever reads it in earnest says that better."""
     try:
-        return path.read_bytes()
-    except (OSError, ValueError):
+        return read_bytes(path, "", MAX_CATALOGUE_BYTES)
+    except InputError:
         return b""
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import difflib
 import math
 import re
-import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
@@ -13,7 +12,8 @@ import msgspec
 from msgspec import Meta
 
 from hilstar.attitude.protocol import NORM_TOLERANCE
-from hilstar.errors import InputError
+from hilstar.errors import InputError, shortened
+from hilstar.reading import MAX_TOML_BYTES, parse_toml, read_text
 from hilstar.tracker.detector import DetectorSettings
 
 # The limits keep every product of such numbers within float64; no bench comes near them.
@@ -48,7 +48,7 @@ class Detector(_Table, frozen=True):
     dark_e_per_s: NotNegative = 0.0
     dsnu_e_per_s: NotNegative = 0.0
     prnu: NotNegative = 0.0
-    device_seed: Annotated[int, Meta(ge=0)] = 0
+    device_seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 0
     fixed_pattern: Literal["ccd", "cmos"] = "ccd"
     temperature_k: Positive = 293.0
     dark_reference_temperature_k: Positive = 293.0
@@ -203,18 +203,13 @@ def detector_settings(tracker: Tracker) -> DetectorSettings:
 
 def read_config(path: Path) -> BenchConfig:
     """Read and check a bench file. Raises InputError: file, key, what is wrong and what to write."""
-    try:
-        tables = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); give the path of a bench file") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(f"{path}: not TOML: {error}") from error
+    tables = parse_toml(path, read_text(path, "give the path of a bench file", MAX_TOML_BYTES))
     try:
         config = msgspec.convert(_finite(tables, path), BenchConfig)
     except RecursionError as error:
         raise InputError(f"{path}: its tables are nested too deep; see configs/README.md") from error
     except msgspec.ValidationError as error:
-        raise InputError(f"{path}: {_explain(str(error), tables)}") from error
+        raise InputError(f"{path}: {_explained(str(error), tables)}") from error
     _check_meaning(config, path)
     return _with_white(config)
 
@@ -236,8 +231,15 @@ def _finite(value: Any, path: Path, where: str = "") -> Any:
         for inner in value:
             _finite(inner, path, where)
     elif isinstance(value, float) and not math.isfinite(value):
-        raise InputError(f"{path}: {where} = {value}; a finite number is wanted")
+        raise InputError(f"{path}: {shortened(where)} = {value}; a finite number is wanted")
     return value
+
+
+def _explained(message: str, tables: dict[str, Any]) -> str:
+    try:
+        return _explain(message, tables)
+    except (LookupError, TypeError, ValueError):  # a key of the user's own with brackets or quotes in it
+        return f"{shortened(message)}; see configs/README.md"
 
 
 def _explain(message: str, tables: dict[str, Any]) -> str:
@@ -249,7 +251,7 @@ def _explain(message: str, tables: dict[str, Any]) -> str:
         known = [field.name for field in _fields(names)]
         close = difflib.get_close_matches(unknown[1], known, n=1)
         advice = f"did you mean {close[0]}?" if close else f"known are {', '.join(known)}"
-        return f"{_place(names)}unknown key {unknown[1]}; {advice}"
+        return f"{_place(names)}unknown key {shortened(unknown[1])}; {advice}"
     missing = re.search(r"missing required field `(.*)`", fault)
     if missing:
         name = f"key {missing[1]}" if names else f"table [{missing[1]}]"
@@ -267,7 +269,10 @@ def _explain(message: str, tables: dict[str, Any]) -> str:
 
 
 def _toml(value: Any) -> str:
-    return msgspec.json.encode(value, enc_hook=str).decode()
+    try:
+        return shortened(msgspec.json.encode(value, enc_hook=str).decode())
+    except (ValueError, OverflowError, TypeError, RecursionError):  # a whole number of more than 64 bits
+        return shortened(value)
 
 
 def _choices(table: list[str], key: str) -> tuple[str, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import re
 import tomllib
 from collections.abc import Iterable
@@ -19,9 +20,12 @@ from hilstar.attitude.serial_lines import read_lines
 from hilstar.bench.config import BenchConfig
 from hilstar.bench.records import Run
 from hilstar.bench.toml_key import with_key
-from hilstar.errors import InputError
+from hilstar.errors import InputError, shortened
+from hilstar.reading import MAX_TOML_BYTES, read_text
 
 NS_PER_US = 1000
+INT64 = range(-(2**63), 2**63)
+MAX_EDGE_BYTES = 20_000_000  # a day of toggles
 LONGEST_LATENCY_NS = 500 * NS_PER_MS
 EARLIEST_NS = 5 * NS_PER_MS  # a clock that is read after the swap may say when later than the light came
 BIN_NS = NS_PER_MS
@@ -74,13 +78,16 @@ def capture_edges(port: str, baud: int, seconds: float) -> Edges:
 
 def read_edges(path: Path) -> Edges:
     """Edges of a CSV file with the columns host_ns and level. Raises InputError."""
+    text = read_text(path, "give a file of edges", MAX_EDGE_BYTES)
+    rows, reader = [], csv.DictReader(io.StringIO(text, newline=""))
     try:
-        with path.open(encoding="utf-8", newline="") as file:
-            rows = [(int(row["host_ns"]), int(row["level"])) for row in csv.DictReader(file)]
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); give a file of edges") from error
+        for row in reader:
+            rows.append((int(row["host_ns"]), int(row["level"])))
+            if rows[-1][0] not in INT64:
+                raise ValueError("host_ns does not fit 64 bits")
     except (ValueError, KeyError, TypeError, csv.Error) as error:
-        raise InputError(f"{path}: is no file of edges ({error!r}); {EDGE_FORM} under that header") from error
+        where = f"{path}:{reader.line_num}"
+        raise InputError(f"{where}: is no file of edges ({shortened(repr(error))}); {EDGE_FORM} under that header") from error
     if len(rows) < FEWEST_EDGES or any(level not in {0, 1} for _, level in rows):
         raise InputError(f"{path}: {FEWEST_EDGES} edges of level 0 or 1 are wanted; {EDGE_FORM}")
     table = np.array(rows, dtype=np.int64)
@@ -229,12 +236,12 @@ def write_panel_delay(path: Path, panel_delay_ms: float) -> None:
         )
     value = round(panel_delay_ms, 3)
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path, "give the path of a bench file", MAX_TOML_BYTES)
         changed = with_key(text, "monitor", "panel_delay_ms", value)
         if tomllib.loads(changed).get("monitor", {}).get("panel_delay_ms") != value:
             raise InputError(f"{path}: write panel_delay_ms = {value} into its [monitor] yourself: its form is not plain")
         path.write_text(changed, encoding="utf-8")
     except OSError as error:
         raise InputError(f"{path}: cannot be changed ({error.strerror}); write panel_delay_ms = {value} yourself") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not TOML: {error}") from error
+    except ValueError as error:  # tomllib's own, and that of an integer of thousands of digits
+        raise InputError(f"{path}: not TOML: {shortened(error)}") from error

@@ -13,6 +13,7 @@ from hilstar.bench.assembly import Bench
 from hilstar.bench.config import read_config
 from hilstar.bench.toml_key import with_key
 from hilstar.errors import InputError
+from hilstar.reading import MAX_TOML_BYTES, read_text
 from hilstar.scene.psf import peak_share
 
 UNSURE_MAG = 0.05  # readings that disagree by more say something else than the scale
@@ -86,7 +87,7 @@ def with_flux_at_white(bench_file: Path, flux_at_white_e_per_s: float, output: P
     if output.resolve().parent != bench_file.resolve().parent:
         raise InputError(f"{output}: the bench file's paths are relative to it; write the copy beside {bench_file}")
     key = "flux_at_white_e_per_s"
-    text = bench_file.read_text(encoding="utf-8")
+    text = read_text(bench_file, "give the path of a bench file", MAX_TOML_BYTES)
     text = with_key(text, "render", key, flux_at_white_e_per_s, instead_of=("brightest_v_mag",))
     try:
         output.write_text(text, encoding="utf-8")

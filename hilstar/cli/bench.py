@@ -10,7 +10,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from hilstar.cli.common import Json, app
+from hilstar.cli.common import MAX_SEED, Json, app
 from hilstar.console import print_json, progress
 from hilstar.endings import check_directory
 from hilstar.errors import InputError
@@ -24,7 +24,7 @@ def bench(
     quick: Annotated[bool, typer.Option("--quick", help="1920x1080 only, up to 10000 stars, half a minute at most.")] = False,
     stars: Annotated[str | None, typer.Option(metavar="N,N,...", help="Stars in view.")] = None,
     sizes: Annotated[str | None, typer.Option(metavar="WxH,WxH,...", help="Image sizes.")] = None,
-    seed: Annotated[int, typer.Option(help="Of the random stars beyond the catalogue.", min=0)] = 1,
+    seed: Annotated[int, typer.Option(help="Of the random stars beyond the catalogue.", min=0, max=MAX_SEED)] = 1,
     output: Annotated[Path | None, typer.Option("-o", "--output", metavar="DIR", help="bench.csv and bench.png.")] = None,
     as_json: Json = False,
 ) -> None:

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import typer
 
-from hilstar.cli.common import BenchFile, Json, QuaternionText, RadecText, app, attitude_of
+from hilstar.cli.common import MAX_SEED, BenchFile, Json, QuaternionText, RadecText, app, attitude_of
 from hilstar.console import print_json, progress, say
 from hilstar.endings import FITS, PNG, PNG_OR_TIFF, check_directory, check_ending
 from hilstar.errors import InputError
@@ -24,7 +24,7 @@ def simulate(
     rate: Annotated[str | None, typer.Option(metavar="X,Y,Z", help="The camera turns: deg/s about its axes.")] = None,
     log: Annotated[Path | None, typer.Option(metavar="LOG", help="Frames along a log, into the directory -o.")] = None,
     frames: Annotated[int | None, typer.Option(help="With --log: so many, evenly; each sample by default.", min=1)] = None,
-    seed: Annotated[int, typer.Option(help="Of the frame's noise.", min=0)] = 0,
+    seed: Annotated[int, typer.Option(help="Of the frame's noise.", min=0, max=MAX_SEED)] = 0,
     noise: Annotated[Literal["full", "none"], typer.Option(help="All of the detector's noise, or none.")] = "full",
     output: Annotated[Path | None, typer.Option("-o", "--output", metavar="OUT.fits", help="DN, uint16.")] = None,
     png: Annotated[Path | None, typer.Option(metavar="OUT.png", help="A stretched picture for a person.")] = None,
@@ -134,7 +134,7 @@ def study_lines(what: str, output: Path, quick: bool = False) -> tuple[list[str]
 def verify(
     bench_file: BenchFile,
     fields: Annotated[int, typer.Option(help="Random attitudes.", min=1, max=100_000)] = 10,
-    seed: Annotated[int, typer.Option(help="Of the attitudes and the noise.", min=0)] = 0,
+    seed: Annotated[int, typer.Option(help="Of the attitudes and the noise.", min=0, max=MAX_SEED)] = 0,
     output: Annotated[Path | None, typer.Option("-o", "--output", metavar="DIR", help="Charts and a table.")] = None,
     strict: Annotated[bool, typer.Option("--strict", help="Exit code 1 when the bench does not pass.")] = False,
     as_json: Json = False,

@@ -20,6 +20,7 @@ Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on std
 Headless = Annotated[bool, typer.Option("--headless", help="Draw without a window.")]
 RadecText = Annotated[str | None, typer.Option("--radec", metavar="RA,DEC,ROLL", help="Boresight and roll in degrees, ICRS.")]
 QuaternionText = Annotated[str | None, typer.Option("--quaternion", metavar="W,X,Y,Z", help="q_icrs_to_cam, scalar first.")]
+MAX_SEED = 2**63 - 1  # what a FITS header holds
 LOG_HELP = "CSV (t_s,qw,qx,qy,qz), JSON lines, CCSDS AEM, or a run's MCAP."
 
 

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from hilstar.cli.common import BenchFile, Json, app
+from hilstar.cli.common import MAX_SEED, BenchFile, Json, app
 from hilstar.console import print_json, say
 from hilstar.endings import CSV, PNG, TOML, check_directory, check_ending
 from hilstar.errors import InputError
@@ -89,7 +89,7 @@ def plan(
     levels: Annotated[int, typer.Option(help="Different codes, black and white among them.", min=2)] = 32,
     repeats: Annotated[int, typer.Option(help="Of each level; 3 do for a plain power law.", min=1)] = 6,
     channels: Annotated[str, typer.Option(help="Of w, r, g, b.")] = "w",
-    seed: Annotated[int, typer.Option(help="Of the order.", min=0)] = 0,
+    seed: Annotated[int, typer.Option(help="Of the order.", min=0, max=MAX_SEED)] = 0,
     headless: Annotated[Path | None, typer.Option(metavar="DIR", help="Write the patches there as PNG.")] = None,
     resolution: Annotated[str, typer.Option(metavar="W,H", help="Of the pictures.")] = "1920,1080",
     show: Annotated[bool, typer.Option("--show", help="Show the patches on a display: space for the next, q to end.")] = False,

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from hilstar.cli.common import LOG_HELP, BenchFile, Headless, Json, QuaternionText, RadecText, app, attitude_of
+from hilstar.cli.common import LOG_HELP, MAX_SEED, BenchFile, Headless, Json, QuaternionText, RadecText, app, attitude_of
 from hilstar.console import print_json, progress, report, say
 from hilstar.endings import CSV, FITS, MCAP, PNG, check_directory, check_ending
 from hilstar.errors import InputError
@@ -27,7 +27,7 @@ LedgerFile = Annotated[Path | None, typer.Option("--ledger", metavar="RUN.mcap",
 def demo(
     output: Annotated[Path, typer.Option("-o", "--output", help="Where the pictures go.")] = Path("hilstar-demo"),
     duration: Annotated[float, typer.Option(help="Seconds to serve.", min=0.5, max=600)] = 10.0,
-    seed: Annotated[int, typer.Option(help="Seed of the slew's jitter.", min=0)] = 1,
+    seed: Annotated[int, typer.Option(help="Seed of the slew's jitter.", min=0, max=MAX_SEED)] = 1,
     as_json: Json = False,
 ) -> None:
     """The main job in one command: real stars, an attitude streamed over a real ZeroMQ socket, frames out."""

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from hilstar.cli.common import LOG_HELP, Json, RadecText, app
+from hilstar.cli.common import LOG_HELP, MAX_SEED, Json, RadecText, app
 from hilstar.console import print_json, progress, say
 from hilstar.endings import check_directory
 from hilstar.errors import InputError
@@ -39,7 +39,7 @@ def send(
     corrupt: Share = "0",
     reorder: Share = "0",
     jitter: Annotated[float, typer.Option(metavar="MS", help="Each packet leaves up to so much late.", min=0, max=1e6)] = 0.0,
-    seed: Annotated[int, typer.Option(help="Of the faults.", min=0)] = 0,
+    seed: Annotated[int, typer.Option(help="Of the faults.", min=0, max=MAX_SEED)] = 0,
     secret_key: KeyFile = None,
     server_key: KeyFile = None,
     allowed_clients: Annotated[Path | None, typer.Option(metavar="DIR", help="Public keys that may connect.")] = None,

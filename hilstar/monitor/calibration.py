@@ -11,10 +11,11 @@ import msgspec
 import numpy as np
 
 from hilstar.arrays import Float32Array, FloatArray
-from hilstar.errors import InputError
+from hilstar.errors import InputError, shortened
 from hilstar.monitor import photometry
-from hilstar.monitor.calibration_file import beside, is_file, read_grid, read_response, read_toml
+from hilstar.monitor.calibration_file import beside, read_grid, read_response, read_toml
 from hilstar.monitor.photometry import Response, Weights, gamma_response, mixed_response, srgb_response, table_response
+from hilstar.reading import exists
 
 BUILT_IN = ("srgb", "gamma2.2", "lcd-example")
 EXAMPLE = Path(__file__).resolve().parent / "data" / "lcd-example.toml"
@@ -84,9 +85,9 @@ def load_calibration(source: str | Path, bits: int, *, bit_stealing: bool = Fals
         digest = hashlib.sha256(f"hilstar built-in {name}, {bits} bits".encode()).hexdigest()
         return Calibration(name, response, digest, weights=REC709_WEIGHTS, instrument="none: a formula")
     path = EXAMPLE if name == "lcd-example" else Path(source)
-    if not path.suffix and not is_file(path):
+    if not path.suffix and not exists(path):
         raise InputError(
-            f"calibration = {json.dumps(name)}: no such built-in or file; write {', '.join(BUILT_IN)} or FILE.toml"
+            f"calibration = {shortened(json.dumps(name))}: no such built-in or file; write {', '.join(BUILT_IN)} or FILE.toml"
         )
     return _load_file(path, name if name == "lcd-example" else path.name, bits, bit_stealing)
 

@@ -6,7 +6,6 @@ import csv
 import datetime
 import json
 import re
-import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal, Protocol
 
@@ -16,10 +15,12 @@ from msgspec import Meta
 from scipy.interpolate import PchipInterpolator
 
 from hilstar.arrays import FloatArray
-from hilstar.errors import InputError
+from hilstar.errors import InputError, shortened
+from hilstar.reading import MAX_TOML_BYTES, as_text, exists, parse_toml, read_bytes
 
 BLACKS_AGREE = 0.1  # relative: the three channels' code 0 is one and the same black screen
-LARGEST_FILE_BYTES = 50_000_000
+MAX_TABLE_BYTES = 10_000_000
+ADVICE = "see configs/CALIBRATION.md"
 GREY, PRIMARIES = ("w",), ("r", "g", "b")
 TYPE_WORDS = {"float": "a number", "int": "a whole number", "str": "text", "object": "a table"}
 Share = Annotated[float, Meta(ge=0, le=1e12)]
@@ -89,47 +90,37 @@ class CalibrationFile(_Table, frozen=True):
     notes: NotesTable = msgspec.field(default_factory=NotesTable)
 
 
-def _read_bytes(path: Path, digest: Digest) -> str:
-    try:
-        if path.stat().st_size > LARGEST_FILE_BYTES:
-            raise InputError(f"{path}: more than {LARGEST_FILE_BYTES // 10**6} MB; this is no calibration file")
-        raw = path.read_bytes()
-        digest.update(raw)
-        return raw.decode("utf-8-sig")
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or "not a text file in UTF-8"
-        raise InputError(f"{path}: cannot be read ({reason}); see configs/CALIBRATION.md") from error
-
-
-def is_file(path: Path) -> bool:
-    """Whether there is such a file, for any text that a user may write."""
-    try:
-        return path.is_file()
-    except (OSError, ValueError):  # a name too long, or with a NUL
-        return False
+def _read(path: Path, digest: Digest, limit_bytes: int = MAX_TABLE_BYTES) -> str:
+    raw = read_bytes(path, ADVICE, limit_bytes)
+    digest.update(raw)
+    return as_text(path, raw, ADVICE)
 
 
 def beside(path: Path, name: str, key: str) -> Path:
     """The path of a file that `path` names, relative to it. Raises InputError where there is none."""
     other = path.parent / name
-    if not is_file(other):
-        raise InputError(f"{path}: {key} = {json.dumps(name)}; there is no such file beside it")
+    if not exists(other):
+        raise InputError(f"{path}: {key} = {shortened(json.dumps(name))}; there is no such file beside it")
     return other
 
 
 def read_toml(path: Path, digest: Digest) -> CalibrationFile:
     """Read and check a calibration file. Raises InputError: file, key, what is wrong and what to write."""
-    try:
-        tables = tomllib.loads(_read_bytes(path, digest))
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise InputError(f"{path}: not TOML: {error}") from error
+    tables = parse_toml(path, _read(path, digest, MAX_TOML_BYTES))
     head = tables.get("calibration")
     if isinstance(head, dict) and isinstance(head.get("when"), datetime.date):  # TOML has dates of its own
         head["when"] = str(head["when"])
     try:
         return msgspec.convert(tables, CalibrationFile)
     except (msgspec.ValidationError, RecursionError) as error:
-        raise InputError(f"{path}: {_explain(str(error), tables)}") from error
+        raise InputError(f"{path}: {_explained(str(error), tables)}") from error
+
+
+def _explained(message: str, tables: dict[str, Any]) -> str:
+    try:
+        return _explain(message, tables)
+    except (LookupError, TypeError, ValueError):  # a key of the user's own with brackets or quotes in it
+        return f"{shortened(message)}; {ADVICE}"
 
 
 def _explain(message: str, tables: dict[str, Any]) -> str:
@@ -139,7 +130,7 @@ def _explain(message: str, tables: dict[str, Any]) -> str:
     where = f"[{names[0]}] " if names else ""
     unknown = re.search(r"unknown field `(.*)`", fault)
     if unknown:
-        return f"{where}unknown key {unknown[1]}; see configs/CALIBRATION.md"
+        return f"{where}unknown key {shortened(unknown[1])}; see configs/CALIBRATION.md"
     missing = re.search(r"missing required field `(.*)`", fault)
     if missing:
         return f"{where}the key {missing[1]} is missing; add it" if names else f"the table [{missing[1]}] is missing; add it"
@@ -149,7 +140,7 @@ def _explain(message: str, tables: dict[str, Any]) -> str:
     wanted = fault.removeprefix("Expected ").replace("`", "").split(", got ")[0]
     if fault.startswith("Invalid enum"):
         wanted = '"photometric"'
-    shown = msgspec.json.encode(value, enc_hook=str).decode()
+    shown = shortened(value if isinstance(value, int) else msgspec.json.encode(value, enc_hook=str).decode())
     for type_name, word in TYPE_WORDS.items():
         wanted = re.sub(rf"\b{type_name}\b", word, wanted)
     return f"{where if len(names) > 1 else ''}{names[-1]} = {shown}; {wanted} is wanted"
@@ -183,7 +174,7 @@ def read_response(path: Path, bits: int, digest: Digest) -> dict[str, FloatArray
 
     Raises InputError for a table without code 0 or white, with equal or falling neighbours, or with blacks that disagree.
     """
-    lines = _lines(_read_bytes(path, digest))
+    lines = _lines(_read(path, digest))
     header = tuple(cell.strip() for cell in lines[0][1].split(",")) if lines else ()
     if header not in (("code", *GREY), ("code", *PRIMARIES)):
         raise InputError(f"{path}: its header is {','.join(header)[:60]!r}; code,w or code,r,g,b is wanted")
@@ -226,7 +217,7 @@ def _every_code(path: Path, name: str, code: FloatArray, light: FloatArray, whit
 
 def read_grid(path: Path, digest: Digest) -> FloatArray:
     """A grid of relative light (rows, columns), rows from top to bottom, all positive. Raises InputError."""
-    lines = _lines(_read_bytes(path, digest))
+    lines = _lines(_read(path, digest))
     grid = _numbers(path, lines, lines[0][1].count(",") + 1 if lines else 1)
     if not grid.min() > 0:
         raise InputError(f"{path}: a field of the screen has no light; every value must be more than 0")

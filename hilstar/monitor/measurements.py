@@ -14,12 +14,15 @@ import numpy.typing as npt
 from scipy.stats import f as f_distribution
 
 from hilstar.arrays import FloatArray, IntArray
-from hilstar.errors import InputError
+from hilstar.errors import InputError, shortened
+from hilstar.reading import as_text, read_bytes
 
 CHANNELS = ("w", "r", "g", "b")
 COLUMNS = ("order", "code", "channel", "value", "exposure_s", "t_s")
 NEEDED = ("code", "channel", "value")
 USUAL_BITS = (8, 10, 12, 14, 16)
+MAX_BYTES = 10_000_000
+ADVICE = "give a CSV file with code,channel,value"
 FEWEST_CODES = 10  # at 1 % noise: 2.2 % of error (95th percentile of the worst code) on gamma, sRGB and S-curves; 8 leave 4.4 %
 FALSE_ALARM_SIGMA = 4.0  # one run in some hundreds is refused for noise alone, with 32 levels
 SMALLEST_DRIFT = 0.005  # over the run; less does no harm beside 1 % of noise
@@ -81,14 +84,8 @@ def read_measurements(path: Path, bits: int | None = None) -> Measurements:
     Values are divided by exposure_s. `bits` is by default the smallest of 8, 10, 12, 14, 16 that holds every code.
     Raises InputError: file, line, what is wrong.
     """
-    try:
-        raw = path.read_bytes()
-        text = raw.decode("utf-8-sig")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); give a CSV file with code,channel,value") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: not a text file in UTF-8; give a CSV file with code,channel,value") from error
-    rows = list(_rows(path, text))
+    raw = read_bytes(path, ADVICE, MAX_BYTES)
+    rows = list(_rows(path, as_text(path, raw, ADVICE)))
     if not rows:
         raise InputError(f"{path}: no measurement in it; write code,channel,value rows below the header")
     codes = np.array([row[0] for row in rows], dtype=np.intp)
@@ -135,7 +132,7 @@ def _header(path: Path, number: int, cells: list[str]) -> list[str]:
         raise InputError(f"{path}: line {number}: the column {missing[0]} is missing; the header is code,channel,value")
     if unknown or len(set(cells)) < len(cells):
         raise InputError(
-            f"{path}: line {number}: unknown or doubled column in {','.join(cells)}; known are {', '.join(COLUMNS)}"
+            f"{path}: line {number}: unknown or doubled column in {shortened(','.join(cells))}; known are {', '.join(COLUMNS)}"
         )
     return cells
 
@@ -146,11 +143,11 @@ def _row(place: str, cells: dict[str, str]) -> Row:
     try:
         code = int(cells["code"])
     except ValueError as error:
-        raise InputError(f"{place}: code = {cells['code']}; a whole number is wanted") from error
+        raise InputError(f"{place}: code = {shortened(cells['code'])}; a whole number is wanted") from error
     if not 0 <= code < 2**16:
-        raise InputError(f"{place}: code = {code}; 0 to 65535 is wanted")
+        raise InputError(f"{place}: code = {shortened(cells['code'])}; 0 to 65535 is wanted")
     if cells["channel"] not in CHANNELS:
-        raise InputError(f"{place}: channel = {cells['channel']}; w, r, g or b is wanted")
+        raise InputError(f"{place}: channel = {shortened(cells['channel'])}; w, r, g or b is wanted")
     value = _number(place, "value", cells["value"])
     if value < 0:
         raise InputError(f"{place}: value = {value:g}; light is not negative, give readings without an offset taken off")
@@ -167,7 +164,7 @@ def _number(place: str, name: str, text: str) -> float:
     except ValueError:
         number = math.nan
     if not abs(number) < 1e30:
-        raise InputError(f"{place}: {name} = {text}; a finite number is wanted")
+        raise InputError(f"{place}: {name} = {shortened(text)}; a finite number is wanted")
     return number
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,7 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import FloatArray
-from hilstar.errors import InputError
+from hilstar.errors import InputError, shortened
+from hilstar.reading import open_lines
 
 HIPPARCOS_EPOCH_JYEAR = 1991.25
 PACKAGED_CATALOG = Path(__file__).resolve().parent / "data" / "hipparcos.npz"
@@ -28,6 +30,7 @@ FIELDS: dict[str, tuple[int, int]] = {
     "vi_mag": (40, 100),
 }
 COLUMN_COUNT = 78
+MAX_CATALOGUE_BYTES = 100_000_000  # hip_main.dat has 53 MB
 REQUIRED = ("v_mag", "ra_deg", "dec_deg", "bv_mag")
 
 
@@ -80,15 +83,15 @@ def read_hip_main(path: Path) -> tuple[dict[str, npt.NDArray[np.int64]], int]:
     rows: list[list[int]] = []
     rows_read = 0
     try:
-        with path.open(encoding="ascii", errors="strict", newline="") as file:
-            for line_number, row in enumerate(csv.reader(file, delimiter="|", quoting=csv.QUOTE_NONE), start=1):
+        with open_lines(path, "give the CDS I/239 hip_main.dat", MAX_CATALOGUE_BYTES) as lines:
+            for line_number, row in enumerate(csv.reader(lines, delimiter="|", quoting=csv.QUOTE_NONE), start=1):
                 if not row:
                     continue
                 rows_read += 1
                 steps = _parse_row(row, f"{path}:{line_number}")
                 if steps is not None:
                     rows.append(steps)
-    except (OSError, ValueError, csv.Error) as error:
+    except csv.Error as error:
         raise InputError(f"{path}: cannot be read as a Hipparcos catalogue ({error})") from error
     if not rows:
         raise InputError(f"{path}: holds no star with position, V and B-V; give the CDS I/239 hip_main.dat")
@@ -97,7 +100,17 @@ def read_hip_main(path: Path) -> tuple[dict[str, npt.NDArray[np.int64]], int]:
 
 
 MISSING = np.iinfo(np.int64).min
-LARGEST_STEPS = 10**12  # a right ascension of 360 degrees is 3.6e10
+# What a star can have; past it no figure that is drawn means anything.
+RANGES: dict[str, tuple[float, float]] = {
+    "hip": (0, 2**31 - 1),
+    "v_mag": (-30, 40),
+    "ra_deg": (0, 360),
+    "dec_deg": (-90, 90),
+    "pm_ra_cosdec_mas_yr": (-20_000, 20_000),  # Barnard's star: 10 400
+    "pm_dec_mas_yr": (-20_000, 20_000),
+    "bv_mag": (-10, 20),
+    "vi_mag": (-10, 20),
+}
 
 
 def _parse_row(row: list[str], where: str) -> list[int] | None:
@@ -111,12 +124,15 @@ def _parse_row(row: list[str], where: str) -> list[int] | None:
                 return None
             steps[name] = 0 if name.startswith("pm_") else int(MISSING)
             continue
+        low, high = RANGES[name]
         try:
-            steps[name] = round(float(text) * per_unit)
-            if abs(steps[name]) > LARGEST_STEPS:
-                raise OverflowError
-        except (ValueError, OverflowError) as error:
-            raise InputError(f"{where}: field {column} ({name}) is {text!r}; a number is wanted") from error
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not low <= value <= high:
+            shown = shortened(text)
+            raise InputError(f"{where}: field {column} ({name}) is {shown!r}; {low:g} to {high:g} is wanted")
+        steps[name] = round(value * per_unit)
     return list(steps.values())
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from hilstar.arrays import FloatArray
-from hilstar.errors import InputError
+from hilstar.errors import InputError, shortened
+from hilstar.reading import exists, read_text
 
 PLANCK_J_S = 6.62607015e-34  # SI 2019, exact
 LIGHT_M_S = 299_792_458.0
@@ -18,6 +20,9 @@ BOLTZMANN_J_K = 1.380649e-23
 STEFAN_BOLTZMANN_W_M2_K4 = 5.670374419e-8
 
 DATA_DIR = Path(__file__).resolve().parent / "data"
+MAX_CURVE_BYTES = 1_000_000
+MAX_CURVE_ROWS = 10_000
+RANGE_NM = (1.0, 100_000.0)  # no sensor sees beyond; each LONGEST_INTERVAL_NM costs nodes
 BUILT_IN_CURVES = ("ccd47-20", "kai-4021", "n-bk7-10mm", "johnson-v")
 
 # Gauss-Legendre nodes in each interval between knots of the curves; intervals are at most this wide.
@@ -61,37 +66,31 @@ def load_curve(source: str | float, what: str, folder: Path = DATA_DIR) -> Curve
     if source in BUILT_IN_CURVES:
         return read_curve_csv(DATA_DIR / f"{source}.csv")
     path = folder / source
-    if not _is_file(path):
+    if not exists(path):
         names = ", ".join(f'"{name}"' for name in BUILT_IN_CURVES[:3])
-        raise InputError(f"{what} = {source!r}: no such built-in or file {path}; write {names}, a CSV path or a number")
+        shown = shortened(source)
+        raise InputError(f"{what} = {shown!r}: no such built-in or file {path}; write {names}, a CSV path or a number")
     return read_curve_csv(path)
-
-
-def _is_file(path: Path) -> bool:
-    try:
-        return path.is_file()
-    except (OSError, ValueError):  # a name too long, or with a NUL
-        return False
 
 
 def read_curve_csv(path: Path) -> Curve:
     """Read `wavelength_nm,value` rows; '#' starts a comment. Raises InputError with the line number."""
     wavelength_nm: list[float] = []
     value: list[float] = []
+    text = read_text(path, "give a CSV of wavelength_nm,value", MAX_CURVE_BYTES)
     try:
-        with path.open(encoding="utf-8", newline="") as file:
-            for number, row in enumerate(csv.reader(file), start=1):
-                if not row or row[0].lstrip().startswith("#"):
-                    continue
-                if not wavelength_nm and row[0].strip() == "wavelength_nm":
-                    continue
-                try:
-                    pair = float(row[0]), float(row[1])
-                except (ValueError, IndexError) as error:
-                    raise InputError(f"{path}:{number}: {','.join(row)!r}; write wavelength_nm,value") from error
-                wavelength_nm.append(pair[0])
-                value.append(pair[1])
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        for number, row in enumerate(csv.reader(io.StringIO(text, newline="")), start=1):
+            if not row or row[0].lstrip().startswith("#"):
+                continue
+            if not wavelength_nm and row[0].strip() == "wavelength_nm":
+                continue
+            try:
+                pair = float(row[0]), float(row[1])
+            except (ValueError, IndexError) as error:
+                raise InputError(f"{path}:{number}: {shortened(','.join(row))!r}; write wavelength_nm,value") from error
+            wavelength_nm.append(pair[0])
+            value.append(pair[1])
+    except csv.Error as error:
         raise InputError(f"{path}: cannot be read ({error})") from error
     curve = Curve(np.array(wavelength_nm), np.array(value))
     _check_curve(curve, path)
@@ -106,6 +105,11 @@ def _check_curve(curve: Curve, path: Path) -> None:
         raise InputError(f"{path}: a wavelength or a value is not finite; write numbers")
     if not (np.diff(wavelength_nm) > 0).all() or wavelength_nm[0] <= 0:
         raise InputError(f"{path}: wavelengths do not rise from row to row; sort them, in nm, each once")
+    if len(wavelength_nm) > MAX_CURVE_ROWS:
+        raise InputError(f"{path}: {len(wavelength_nm)} rows; at most {MAX_CURVE_ROWS} are read, so leave some out")
+    if wavelength_nm[0] < RANGE_NM[0] or wavelength_nm[-1] > RANGE_NM[1]:
+        ends = f"{wavelength_nm[0]:g} to {wavelength_nm[-1]:g} nm"
+        raise InputError(f"{path}: wavelengths from {ends}; {RANGE_NM[0]:g} to {RANGE_NM[1]:g} nm are wanted")
     if value.min() < 0 or value.max() > 1:
         raise InputError(f"{path}: values from {value.min():g} to {value.max():g}; fractions from 0 to 1 are wanted")
 

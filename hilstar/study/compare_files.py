@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import csv
+import gzip
+import io
 import math
+import warnings
+import zlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +16,7 @@ import numpy as np
 from hilstar.arrays import FloatArray
 from hilstar.bench.assembly import TRUTH_DTYPE
 from hilstar.errors import InputError
+from hilstar.reading import read_bytes, read_text, size_text
 from hilstar.study.charts import chart, write_csv
 from hilstar.study.compare import MAG_PER_SHARE, SkyComparison, StarDifference, Truth
 
@@ -20,6 +25,8 @@ if TYPE_CHECKING:
 
 UNIT = "electron/s"
 TRUTH_COLUMNS = ("hip", "x_px", "y_px", "electrons_per_s")
+MAX_TRUTH_BYTES = 50_000_000
+MAX_FITS_BYTES = 600_000_000  # a frame of 8K has 133 MB
 NAMED_STARS = 12  # in the chart; the table has all
 LEAST_ERROR = 1e-8  # drawn: a tenth of float32's rounding
 COLUMNS = (
@@ -42,25 +49,39 @@ def read_frame_fits(path: Path) -> FloatArray:
     from astropy.io import fits
 
     wanted = "give the FITS that `hilstar frame -o OUT.fits` writes"
+    raw = _inflated(path, read_bytes(path, wanted, MAX_FITS_BYTES), wanted)
     try:
-        image, header = fits.getdata(path, header=True)
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: there is no such file; {wanted}") from error
-    except (OSError, ValueError, IndexError, TypeError) as error:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of astropy, about cards; what matters is checked below
+            image, header = fits.getdata(io.BytesIO(raw), header=True)
+    except Exception as error:  # astropy lets through whatever a header makes its layers raise
         raise InputError(f"{path}: no FITS image; {wanted}") from error
     if header.get("BUNIT") != UNIT or image is None or image.ndim != 2 or image.dtype.kind != "f":
         raise InputError(f"{path}: no linear image in {UNIT} (BUNIT is {header.get('BUNIT')!r}); {wanted}")
     return np.asarray(image, dtype=np.float64)
 
 
+def _inflated(path: Path, raw: bytes, wanted: str) -> bytes:
+    """A file's bytes, unpacked where they are gzip's, to no more than a FITS may have. Raises InputError."""
+    if raw[:2] != b"\x1f\x8b":
+        return raw
+    try:
+        with gzip.open(io.BytesIO(raw)) as file:
+            plain = file.read(MAX_FITS_BYTES + 1)
+    except (OSError, EOFError, zlib.error) as error:
+        raise InputError(f"{path}: cannot be read (it is a damaged gzip file); {wanted}") from error
+    if len(plain) > MAX_FITS_BYTES:
+        raise InputError(f"{path}: unpacks to more than {size_text(MAX_FITS_BYTES)}; {wanted}")
+    return plain
+
+
 def read_truth_csv(path: Path) -> Truth:
     """The stars of a CSV of `hilstar frame --truth`, TRUTH_DTYPE, only the columns of TRUTH_COLUMNS filled."""
     wanted = "give the CSV that `hilstar frame --truth OUT.csv` writes"
     try:
-        with path.open(encoding="ascii", newline="") as file:
-            rows = list(csv.DictReader(file))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or 'no such CSV'}); {wanted}") from error
+        rows = list(csv.DictReader(io.StringIO(read_text(path, wanted, MAX_TRUTH_BYTES), newline="")))
+    except csv.Error as error:
+        raise InputError(f"{path}: cannot be read ({error}); {wanted}") from error
     truth = np.zeros(len(rows), dtype=TRUTH_DTYPE)
     for line, row in enumerate(rows):
         for name in TRUTH_COLUMNS:

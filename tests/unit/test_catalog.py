@@ -85,7 +85,14 @@ def test_a_missing_v_minus_i_is_nan(tmp_path):
         (ROWS[0] + "\n" + ROWS[1].replace("|", ";") + "\n", "hip_main.dat:2: not a row"),
         (with_field(ROWS[0], 5, " bad ") + "\n", "hip_main.dat:1: field 5 (v_mag)"),
         (with_field(ROWS[0], 5, " inf ") + "\n", "hip_main.dat:1: field 5 (v_mag)"),
-        ("\N{SNOWMAN}", "cannot be read"),
+        ("\N{SNOWMAN}", "hip_main.dat:1: not a row"),
+        (with_field(ROWS[0], 8, " nan ") + "\n", "hip_main.dat:1: field 8 (ra_deg)"),
+        (with_field(ROWS[0], 8, "400") + "\n", "0 to 360 is wanted"),
+        (with_field(ROWS[0], 9, "-90.01") + "\n", "field 9 (dec_deg) is '-90.01'; -90 to 90 is wanted"),
+        (with_field(ROWS[0], 5, "-1000000") + "\n", "-30 to 40 is wanted"),
+        (with_field(ROWS[0], 1, "9" * 11) + "\n", "field 1 (hip)"),
+        (with_field(ROWS[0], 1, "1" * 100_000) + "\n", "field 1 (hip) is '1111"),
+        (with_field(ROWS[0], 12, "1e9") + "\n", "field 12 (pm_ra_cosdec_mas_yr)"),
     ],
 )
 def test_a_file_that_is_no_catalogue_is_refused(tmp_path, text, words):

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from hilstar.errors import InputError, one_line, shortened
-from hilstar.reading import MAGIC, exists, open_regular, read_bytes, read_text
+from hilstar.reading import MAGIC, exists, open_lines, open_regular, read_bytes, read_text
 
 ADVICE = "give a file of text"
 LIMIT_BYTES = 1000
@@ -61,7 +61,7 @@ def test_a_file_past_the_limit_is_refused_before_it_is_read(tmp_path):
     path = tmp_path / "large"
     with path.open("wb") as file:
         file.truncate(10**12)  # a hole: nothing is on the disk
-    assert "has 1000 GB or more; 1 kB at most are read" in refusal(path)
+    assert "has 1000 GB or more, and 1 kB at most are read" in refusal(path)
     with pytest.raises(InputError, match="50 MB at most"):
         open_regular(path, ADVICE, 50_000_000)
 
@@ -77,11 +77,32 @@ def test_the_first_byte_that_is_not_utf_8_is_named(tmp_path):
         assert f"byte {len(mark) + 3} is 0xe9" in refusal(path)
 
 
+def test_lines_come_one_by_one_and_as_the_file_has_them(tmp_path):
+    path = tmp_path / "text"
+    path.write_bytes(b"\xef\xbb\xbfa\r\nb\rc\n\nd")
+    with open_lines(path, ADVICE, LIMIT_BYTES) as lines:
+        assert list(lines) == ["a\r\n", "b\r", "c\n", "\n", "d"]
+
+
+def test_a_line_without_end_and_a_late_byte_that_is_no_text_are_named(tmp_path):
+    path, limit_bytes = tmp_path / "text", 10**8
+    path.write_bytes(b"a\n" + b"b" * 5_000_000)
+    with (
+        pytest.raises(InputError, match="text:2: the line has 1000000 characters or more"),
+        open_lines(path, ADVICE, limit_bytes) as lines,
+    ):
+        list(lines)
+    for text, words in ((b"abc\n" * 10**6 + b"\xe9 ", "byte 4000000 is 0xe9"), (b"\xc3", "ends within a character, at byte 1")):
+        path.write_bytes(text)
+        with pytest.raises(InputError, match=words), open_lines(path, ADVICE, limit_bytes) as lines:
+            list(lines)
+
+
 def test_a_file_of_another_kind_is_called_by_its_kind(tmp_path):
     path = tmp_path / "other"
     for magic, kind in MAGIC.items():
         path.write_bytes(magic + b"\x01rest")
-        assert f"is {kind}; " in refusal(path)
+        assert f"it is {kind})" in refusal(path)
 
 
 def test_a_long_piece_keeps_its_beginning_and_its_end():

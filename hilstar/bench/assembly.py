@@ -45,6 +45,7 @@ from hilstar.sky.stars import Stars, brighter_stars, make_stars
 
 log = logging.getLogger(__name__)
 WARM_UP_ATTITUDE = np.array([1.0, 0.0, 0.0, 0.0])
+WARM_UP_RATE_RAD_S = np.array([0.1, 0.0, 0.0])
 TRUTH_DTYPE = np.dtype(
     [
         ("hip", "i4"),
@@ -74,6 +75,15 @@ class Frame:
     levels: Codes
     codes: Codes
     truth: npt.NDArray[np.void]
+
+
+@dataclass(frozen=True, slots=True)
+class Prepared:
+    """A frame before it is drawn: its attitude (None: blank), the turn of its paths (None: points), and its sprites."""
+
+    q_icrs_to_cam: FloatArray | None
+    turn: Turn | None
+    sprites: Sprites | None
 
 
 class Drawn:
@@ -180,13 +190,22 @@ class Bench:
         `[render] motion_above_px` each is drawn along its path while its row is lit; the attitude is then that of the middle
         row's first light.
         """
+        return self.draw_prepared(self.prepare(q_icrs_to_cam, rate_cam_rad_s), frame)
+
+    def prepare(self, q_icrs_to_cam: FloatArray | None, rate_cam_rad_s: Vector | FloatArray | None = None) -> Prepared:
+        """The sprites of a frame (see `draw`), before anything is drawn."""
         if q_icrs_to_cam is None:
-            self.renderer.draw(None, frame)
-            return Drawn(self, None)
+            return Prepared(None, None, None)
         turn = self._turn(q_icrs_to_cam, rate_cam_rad_s)
-        sprites = self.sprites(q_icrs_to_cam) if turn is None else self._swept(turn)
+        return Prepared(q_icrs_to_cam, turn, self.sprites(q_icrs_to_cam) if turn is None else self._swept(turn))
+
+    def draw_prepared(self, prepared: Prepared, frame: int = 0) -> Drawn:
+        """Draw the levels of a frame that was prepared."""
+        sprites = prepared.sprites
         self.renderer.draw(sprites, frame)
-        drawn = Drawn(self, q_icrs_to_cam, turn)
+        drawn = Drawn(self, prepared.q_icrs_to_cam, prepared.turn)
+        if sprites is None:
+            return drawn
         drawn.star_count, drawn.capped = sprites.star_count, sprites.capped
         clipped = self._clipped(sprites)
         if len(clipped):
@@ -211,9 +230,9 @@ class Bench:
         return len(self.sprites(q_icrs_to_cam, self.stars)) - len(self.sprites(q_icrs_to_cam))
 
     def warm_up(self) -> None:
-        """Draw once with stars and once without: a driver compiles its shaders at their first use, 60 ms on llvmpipe."""
-        for q in (WARM_UP_ATTITUDE, None):
-            _ = self.draw(q).levels
+        """Draw once with paths, with stars and with none: a driver compiles its shaders at first use, 60 ms on llvmpipe."""
+        for q, rate in ((WARM_UP_ATTITUDE, WARM_UP_RATE_RAD_S), (WARM_UP_ATTITUDE, None), (None, None)):
+            _ = self.draw(q, 0, rate).levels
 
     def frame(self, q_icrs_to_cam: Sequence[float] | FloatArray, number: int = 0) -> Frame:
         """Draw one frame and bring everything about it back; the arrays are the caller's own.

@@ -76,4 +76,7 @@ def _show(loop: FrameLoop, arrival: Arrival) -> Shown:
     if not isinstance(sample, AttitudeSample):
         raise TypeError("only an attitude is shown")
     attitude = Attitude(sample.q_icrs_to_cam, 0, False, sample.sequence, arrival.host_ns)
-    return loop.draw(loop.stats.frames, sample.t_ns, attitude)
+    shown = loop.draw(loop.stats.frames, sample.t_ns, attitude)
+    if shown is None:
+        raise AssertionError("a frame in lockstep has no moment that can pass")
+    return shown

@@ -14,14 +14,16 @@ from typing import Any
 
 from hilstar.attitude.clock import NS_PER_MS, NS_PER_S
 from hilstar.attitude.timeline import Attitude, Policy, StaleGate
-from hilstar.bench.assembly import Bench, Drawn
+from hilstar.bench.assembly import Bench, Drawn, Prepared
 from hilstar.bench.config import AttitudeSettings
 from hilstar.bench.pacing import wait_until
 from hilstar.bench.priority import steady_loop
 from hilstar.bench.screen import Screen
 from hilstar.bench.stats import RunStats
+from hilstar.bench.watchdog import FrameWatch
 from hilstar.notices import Notices
 
+GIVEN_UP_PERIODS = 2.0
 log = logging.getLogger(__name__)
 
 
@@ -87,13 +89,27 @@ class FrameLoop:
         self.notices = Notices() if notices is None else notices
         self._predicted_swap_ns: int | None = None
         self._missed_before = 0
+        self._due_ns: int | None = None  # when the frame was to be begun, or on a screen swapped; None where nothing is late
+        self._gave_up = False
+        self._period_ns = NS_PER_S / bench.config.monitor.refresh_hz
+        self.watch = FrameWatch(self._period_ns, self.notices)
         self._held: Attitude | None = None  # what a paused screen shows
         self._blank_when_stale = settings.on_stale == "blank"
         wanted = bench.config.render.motion
         self._moving = (wanted == "on" or (wanted == "auto" and screen is not None)) if moving is None else moving
 
-    def draw(self, number: int, t_ns: int, attitude: Attitude | None) -> Shown:
-        """Draw the frame for `t_ns` of the timeline's clock; without an attitude it is blank."""
+    def draw(self, number: int, t_ns: int, attitude: Attitude | None) -> Shown | None:
+        """Draw the frame for `t_ns` of the timeline's clock; without an attitude it is blank.
+
+        None for a frame that is given up, since its moment passed while its sprites were made.
+        """
+        self.watch.begin(number)
+        try:
+            return self._draw(number, t_ns, attitude)
+        finally:
+            self.watch.end(timed=self._due_ns is not None)
+
+    def _draw(self, number: int, t_ns: int, attitude: Attitude | None) -> Shown | None:
         begin_ns = time.monotonic_ns()
         screen = self._screen
         if screen is not None and screen.paused:
@@ -101,7 +117,11 @@ class FrameLoop:
         self._held = attitude
         stale = self.gate.update(attitude)
         blank = attitude is None or (stale and self._blank_when_stale)
-        drawn = self._drawn(number, None if blank else attitude)
+        prepared = self._prepared(None if blank else attitude)
+        if self._given_up(number):
+            return None
+        self.watch.enter("draw")
+        drawn = self._bench.draw_prepared(prepared, number)
         predicted_ns = self._predicted_swap_ns
         if screen is None:
             _ = drawn.levels
@@ -122,13 +142,29 @@ class FrameLoop:
             marker=None if screen is None else screen.marker,
         )
         self._count(shown, attitude)
+        self.watch.enter("output")
         self._sink(shown)
         return shown
 
-    def _drawn(self, number: int, attitude: Attitude | None) -> Drawn:
+    def _prepared(self, attitude: Attitude | None) -> Prepared:
         if attitude is None:
-            return self._bench.draw(None, number)
-        return self._bench.draw(attitude.q_icrs_to_cam, number, attitude.rate_cam_rad_s if self._moving else None)
+            return self._bench.prepare(None)
+        return self._bench.prepare(attitude.q_icrs_to_cam, attitude.rate_cam_rad_s if self._moving else None)
+
+    def _given_up(self, number: int) -> bool:
+        """Whether the frame's moment has passed so far that the next is begun instead; never two in a row, so that even a
+        machine too slow for its display shows something.
+        """
+        late_ns = 0 if self._due_ns is None else time.monotonic_ns() - self._due_ns
+        if late_ns <= GIVEN_UP_PERIODS * self._period_ns or self._gave_up:
+            self._gave_up = False
+            return False
+        self._gave_up = True
+        self.stats.given_up_frames += 1
+        self.notices.tell(
+            "frame-given-up", f"frame {number} was {late_ns / NS_PER_MS:.0f} ms late before it was drawn: given up"
+        )
+        return True
 
     def _count(self, shown: Shown, attitude: Attitude | None) -> None:
         drawn = shown.drawn
@@ -152,10 +188,12 @@ class FrameLoop:
 
     def _show(self, screen: Screen, number: int, begin_ns: int) -> int:
         """Put the frame on the screen at its moment; when that was."""
+        self.watch.enter("present")
         screen.present(number)
         screen.budget.add(time.monotonic_ns() - begin_ns)
         if self._predicted_swap_ns is not None and not screen.clock.paced_by_screen:
             wait_until(self._predicted_swap_ns, self.stop)
+        self.watch.enter("swap")
         swap_ns = screen.swap()
         if screen.closing:
             self.stop.set()
@@ -198,7 +236,8 @@ class FrameLoop:
         start_ns = time.monotonic_ns()
         slot = 0
         while self._goes_on(slot, limit):
-            if wait_until(start_ns + round(slot * period_ns), self.stop):
+            self._due_ns = start_ns + round(slot * period_ns)
+            if wait_until(self._due_ns, self.stop):
                 return
             draw_slot(slot)
             late = int((time.monotonic_ns() - start_ns) // period_ns)
@@ -212,7 +251,7 @@ class FrameLoop:
         while self._goes_on(slot, limit):
             if wait_until(round(due_ns - budget.ns), self.stop):
                 break
-            self._predicted_swap_ns = due_ns
+            self._predicted_swap_ns = self._due_ns = due_ns
             draw_slot(slot)
             following_ns = clock.next_after(max(time.monotonic_ns() + budget.least_ns, due_ns + clock.period_ns / 2))
             slot = self._next_slot(slot, slot + max(1, round((following_ns - due_ns) / clock.period_ns)), limit)
@@ -224,10 +263,12 @@ class FrameLoop:
 
     def _next_slot(self, slot: int, following: int, limit: Limit) -> int:
         """`following`, and the slots on the way there counted as missed."""
+        before = self._missed_before + 1 if self._gave_up else 0  # the slot of a frame given up had none either
         self._missed_before = 0
         if self.stats.frames < limit.frames:
             self._missed_before = int(min(following, limit.slots)) - slot - 1
-            self.stats.missed_frames += self._missed_before
+            self.stats.missed_frames += self._missed_before + self._gave_up
+            self._missed_before += before
         return following
 
 

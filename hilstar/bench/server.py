@@ -56,7 +56,7 @@ def serve(bench: Bench, link: AnyLink, limit: Limit, sink: FrameSink = ignore, o
     """Show the live stream of `link` up to `limit`, or until a signal; the summary."""
     outlet = outlet or Outlet()
     loop, ledger = FrameLoop(bench, sink, outlet.screen, notices=outlet.notices), outlet.ledger
-    with stop_on_signal(loop.stop):
+    with stop_on_signal(loop.stop), loop.watch:
         if isinstance(link, ZmqLockstep):
             bench.warm_up()
             summary = serve_lockstep(bench, link, limit, loop, ledger)
@@ -78,6 +78,8 @@ def _serve_stream(
     def draw_slot(slot: int) -> None:
         t_ns = receiver.clock.to_bench_ns(loop.light_ns(time.monotonic_ns()))
         shown = loop.draw(slot, t_ns, timeline.at(t_ns))
+        if shown is None:
+            return
         light_ns = receiver.bench_ns(t_ns)
         if ledger is not None:
             ledger.frame(frame_record(shown, light_ns, loop.stats.missed_frames))
@@ -114,12 +116,12 @@ def replay(bench: Bench, play: Play, sink: FrameSink = ignore, outlet: Outlet | 
     def draw_slot(slot: int) -> None:
         number, t_ns, attitude = play.frame(slot)
         shown = loop.draw(number, t_ns, attitude)
-        if ledger is not None:
+        if ledger is not None and shown is not None:
             ledger.frame(frame_record(shown, t_ns, loop.stats.missed_frames))
 
     bench.warm_up()
     begin_ns = time.monotonic_ns()
-    with stop_on_signal(loop.stop):
+    with stop_on_signal(loop.stop), loop.watch:
         if play.paced:
             loop.paced(bench.config.monitor.refresh_hz, Limit(slots=play.frame_count), draw_slot)
         else:

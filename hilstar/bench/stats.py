@@ -53,6 +53,7 @@ class RunStats:
         self.missed_frames = 0
         self.stale_frames = 0
         self.capped_frames = 0
+        self.given_up_frames = 0
 
     @property
     def frames(self) -> int:
@@ -88,5 +89,6 @@ class RunStats:
             "missed_frames": self.missed_frames,
             "stale_frames": self.stale_frames,
             "capped": self.capped_frames,
+            "given_up": self.given_up_frames,
             "gl_renderer": gl_renderer,
         }

@@ -31,7 +31,10 @@ U32 = 2**32
 UNIT = 1e-15  # so near, a division by the norm would only move the last bit to and fro
 
 Reason = Literal["crc", "norm", "nan", "time", "format", "rate"]
-REASONS: tuple[Reason, ...] = ("crc", "norm", "nan", "time", "format", "rate")
+# Of the message itself, and told even where none was refused for them; and of the bench's own limits, told where they occur.
+MESSAGE_REASONS: tuple[Reason, ...] = ("crc", "norm", "nan", "time", "format")
+BENCH_REASONS: tuple[Reason, ...] = ("rate",)
+REASONS = MESSAGE_REASONS + BENCH_REASONS
 RATE_ROUNDING = 1e-6  # a packet's rate is float32
 
 

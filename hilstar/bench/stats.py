@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from hilstar.attitude.packet import REASONS
+from hilstar.attitude.packet import MESSAGE_REASONS
 from hilstar.attitude.receiver import PacketCounts
 from hilstar.spread import RunningSpread
 
@@ -82,7 +82,7 @@ class RunStats:
                 "received": counts.received,
                 "accepted": counts.received - counts.refused,
                 "refused": counts.refused,
-                "refused_by": {reason: counts.refused_by[reason] for reason in REASONS},
+                "refused_by": {name: n for name, n in counts.refused_by.items() if n or name in MESSAGE_REASONS},
             },
             "stars_drawn": {"mean": self._stars.mean, "max": int(self._stars.max) if self.frames else None},
             "clipped": {"max": self._clipped_max, "hip": sorted(self.clipped_hip)},

@@ -24,6 +24,8 @@ from tests.conftest import SMALL_BENCH, assert_refused, run_hilstar
 
 SUMMARY_KEYS = {"frames", "duration_s", "fps", "frame_ms", "attitude_age_ms", "packets", "stars_drawn", "clipped"}
 SUMMARY_KEYS |= {
+    "capped",
+    "given_up",
     "missed_frames",
     "stale_frames",
     "gl_renderer",

@@ -25,7 +25,7 @@ NODES_PER_SIGMA = 0.6
 POINT_SIGMA = 0.27
 # A frame's work is bounded: each star has one sprite, all paths together so many more, and no path is longer than this share
 # of the field's radius. Past that paths are drawn with fewer nodes, or as those of a slower turn, and the stars counted. With
-# 1000 stars in view the longest frame then takes 1.6 times as long as a still one (python -m tests.bench.bench_motion).
+# 1000 stars in view the longest frame then takes at most 1.8 times as long as a still one (python -m tests.bench.bench_motion).
 EXTRA_SPRITES = 1000
 MAX_TURN_FIELD = 0.5
 

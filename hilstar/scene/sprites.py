@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -16,9 +17,9 @@ from hilstar.sky.stars import Stars
 # results/tradeoff.csv, projection: 4e-8 px, where float32 throughout is 6e-4 px off.
 SPRITE_DTYPE = np.dtype([("pixel", "<i4", 2), ("fraction_px", "<f4", 2), ("electrons_per_s", "<f4")])
 
-
-# Of more stars than this near the image only the brightest are drawn: the work and the memory of a frame are bounded.
-MAX_STARS = 250_000
+# The work and the memory of a frame are bounded: its sprites cover at most so many pixels, 250 000 stars of sigma 0.85 px.
+# Of more stars only the brightest are drawn.
+MAX_COVERED_PX = 25_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,19 +53,27 @@ def make_sprites(stars: Stars, icrs_to_image: FloatArray, camera: Camera, footpr
 
     `icrs_to_image` (3, 3) turns ICRS components into image components.
     """
-    near, dropped = brightest_near(stars, icrs_to_image[2], camera.field_radius_rad(footprint_px / 2 + 1))
+    near = stars.grid.near(icrs_to_image[2], camera.field_radius_rad(footprint_px / 2 + 1))
     x_px, y_px = camera.project(stars.vectors[near] @ icrs_to_image.T)
     sprites = pack_sprites(x_px, y_px, stars.electrons_per_s[near], near, (camera.resolution_px, footprint_px))
-    return replace(sprites, capped=dropped) if dropped else sprites
+    kept = brightest(sprites.data["electrons_per_s"], max_stars(footprint_px))
+    if kept is None:
+        return sprites
+    dropped = len(sprites) - len(kept)
+    star, x_px, y_px = sprites.star[kept], sprites.x_px[kept], sprites.y_px[kept]
+    return Sprites(sprites.data[kept], footprint_px, star, x_px, y_px, capped=dropped)
 
 
-def brightest_near(stars: Stars, axis: FloatArray, radius_rad: float) -> tuple[IntArray, int]:
-    """Places of the stars within `radius_rad` of an axis, of more than MAX_STARS the brightest; and how many were dropped."""
-    near = stars.grid.near(axis, radius_rad)
-    dropped = max(0, len(near) - MAX_STARS)
-    if dropped:
-        near = near[np.argpartition(-stars.electrons_per_s[near], MAX_STARS)[:MAX_STARS]]
-    return near, dropped
+def max_stars(footprint_px: int) -> int:
+    """How many stars of a footprint's side are drawn at most."""
+    return MAX_COVERED_PX // footprint_px**2
+
+
+def brightest(electrons_per_s: npt.NDArray[np.floating[Any]], count: int) -> IntArray | None:
+    """The places of the `count` brightest, in order; None where there are no more than that."""
+    if len(electrons_per_s) <= count:
+        return None
+    return np.sort(np.argpartition(-electrons_per_s, count)[:count])
 
 
 def pack_sprites(

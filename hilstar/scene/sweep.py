@@ -15,7 +15,7 @@ from hilstar.arrays import FloatArray, IntArray
 from hilstar.attitude.quaternion import propagate, to_matrix
 from hilstar.scene.camera import Camera
 from hilstar.scene.paths import Chords, Paths, node_counts, nodes_of, within_budget
-from hilstar.scene.sprites import Sprites, brightest_near, pack_sprites
+from hilstar.scene.sprites import Sprites, brightest, max_stars, pack_sprites
 from hilstar.sky.stars import Stars
 
 # With ceil(0.6 r + 1) nodes on a path of r sigmas no pixel is off by more than 1e-3 of the star's flux (measured for sigma
@@ -23,10 +23,12 @@ from hilstar.sky.stars import Stars
 NODES_PER_SIGMA = 0.6
 # A path of so many sigmas is a point to 1e-3 of the star's flux.
 POINT_SIGMA = 0.27
-# A frame's work is bounded: each star has one sprite, all paths together so many more, and no path is longer than this share
-# of the field's radius. Past that paths are drawn with fewer nodes, or as those of a slower turn, and the stars counted. With
-# 1000 stars in view the longest frame then takes at most 1.8 times as long as a still one (python -m tests.bench.bench_motion).
+# A frame's work is bounded: each star has one sprite, all paths together so many more (of so many pixels), and no path is
+# longer than this share of the field's radius. Past that paths are drawn with fewer nodes, or as those of a slower turn, and
+# the stars counted. With 1000 stars in view the longest frame then takes at most 1.8 times as long as a still one
+# (python -m tests.bench.bench_motion).
 EXTRA_SPRITES = 1000
+EXTRA_PX = 400_000
 MAX_TURN_FIELD = 0.5
 
 
@@ -83,12 +85,12 @@ def swept_sprites(
     middle = Turn(propagate(turn.q_icrs_to_cam, turn.rate_cam_rad_s, scan.hold_s / 2), turn.rate_cam_rad_s)
     axis = (camera.cam_to_image @ to_matrix(middle.q_icrs_to_cam))[2]
     reach_rad = camera.field_radius_rad(footprint_px / 2 + 1) + turn.speed_rad_s * scan.whole_s / 2
-    near, dropped = brightest_near(stars, axis, reach_rad)
+    near = stars.grid.near(axis, reach_rad)
     seen = stars.vectors[near] @ (camera.cam_to_image @ to_matrix(turn.q_icrs_to_cam)).T
     paths = Paths(seen, camera.cam_to_image @ turn.rate_cam_rad_s, camera)
     late_s = _row_delays_s(paths, scan, camera)
     wanted, part = _wanted_nodes(paths, late_s, scan, footprint_px, sigma_px)
-    counts = within_budget(wanted, EXTRA_SPRITES)
+    counts = within_budget(_of_the_brightest(wanted, stars.electrons_per_s[near], footprint_px), _extra(footprint_px))
     nodes = nodes_of(counts)
     begin, length = part[0][nodes.path], (part[1] - part[0])[nodes.path]
     seconds = late_s[nodes.path] + (begin + length * (nodes.place + 1) / 2) * scan.hold_s
@@ -96,8 +98,24 @@ def swept_sprites(
     star = near[nodes.path]
     light = nodes.share * length * stars.electrons_per_s[star]
     sprites = pack_sprites(x_px, y_px, light, star, (camera.resolution_px, footprint_px))
-    capped = int((counts < wanted).sum()) if not slowed else int((counts > 0).sum())
-    return replace(sprites, per_star=int(counts.max(initial=1)), capped=capped + dropped)
+    capped = int(((wanted > 0) if slowed else (counts < wanted)).sum())
+    return replace(sprites, per_star=int(counts.max(initial=1)), capped=capped)
+
+
+def _extra(footprint_px: int) -> int:
+    """How many sprites all paths together may have over one a star: large ones are fewer."""
+    return min(EXTRA_SPRITES, EXTRA_PX // footprint_px**2)
+
+
+def _of_the_brightest(wanted: IntArray, electrons_per_s: FloatArray, footprint_px: int) -> IntArray:
+    """`wanted` (n,) with none for the faintest of those that want any, where a frame has no room for all."""
+    wanting = np.flatnonzero(wanted)
+    kept = brightest(electrons_per_s[wanting], max_stars(footprint_px))
+    if kept is None:
+        return wanted
+    chosen = np.zeros_like(wanted)
+    chosen[wanting[kept]] = wanted[wanting[kept]]
+    return chosen
 
 
 def _slowed(turn: Turn, scan: Scan, camera: Camera) -> tuple[Turn, bool]:

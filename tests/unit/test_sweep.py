@@ -9,6 +9,7 @@ from hilstar.attitude.quaternion import from_radec_roll_deg, propagate, to_matri
 from hilstar.monitor.geometry import monitor_camera
 from hilstar.render.presenter import Mount
 from hilstar.render.reference import linear_image
+from hilstar.scene import sprites as sprites_module
 from hilstar.scene.clipping import clipped_sprites
 from hilstar.scene.paths import MAX_NODES
 from hilstar.scene.psf import footprint_px
@@ -142,6 +143,22 @@ def test_no_turn_makes_more_than_its_budget_of_sprites(speed, axis, scan, rng):
     # A path of half the field's radius takes that many more stars across the image.
     assert 0 < len(sprites) <= 2 * still + EXTRA_SPRITES
     assert sprites.capped > 0
+
+
+@pytest.mark.parametrize("rate", [(0.0, 0.0, 0.0), (1.0, 0.5, 0.0), (900.0, 0.0, 0.0)])
+def test_of_more_stars_than_a_frame_has_room_for_the_brightest_are_drawn(rate, rng, monkeypatch):
+    monkeypatch.setattr(sprites_module, "MAX_COVERED_PX", 100 * FOOTPRINT**2)
+    stars = stars_on(rng.uniform((10, 10), (310, 230), size=(300, 2)))
+    stars.electrons_per_s[:] = rng.permutation(300) + 1.0
+    sprites = swept(stars, turn(rate), Scan((0, 1), FRAME_S, FRAME_S))
+    drawn = np.unique(sprites.star)
+    assert len(drawn) <= 100
+    if rate[0] < 10:
+        assert sorted(stars.electrons_per_s[drawn]) == list(range(201, 301))
+        assert sprites.capped == 200
+    still = make_sprites(stars, CAMERA.cam_to_image @ to_matrix(Q), CAMERA, FOOTPRINT)
+    assert (len(still), still.capped) == (100, 200)
+    assert stars.electrons_per_s[still.star].min() == 201
 
 
 def test_a_slow_turn_is_drawn_whole_and_none_is_capped(rng):

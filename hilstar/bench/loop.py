@@ -17,6 +17,7 @@ from hilstar.attitude.timeline import Attitude, Policy, StaleGate
 from hilstar.bench.assembly import Bench, Drawn, Prepared
 from hilstar.bench.config import AttitudeSettings
 from hilstar.bench.pacing import wait_until
+from hilstar.bench.presence import AttitudeWatch
 from hilstar.bench.priority import steady_loop
 from hilstar.bench.screen import Screen
 from hilstar.bench.stats import RunStats
@@ -87,6 +88,7 @@ class FrameLoop:
         self._sink = sink
         self._screen = screen
         self.notices = Notices() if notices is None else notices
+        self._presence = AttitudeWatch(policy_of(settings).stale_after_ns, self.notices)
         self._predicted_swap_ns: int | None = None
         self._missed_before = 0
         self._due_ns: int | None = None  # when the frame was to be begun, or on a screen swapped; None where nothing is late
@@ -111,6 +113,7 @@ class FrameLoop:
 
     def _draw(self, number: int, t_ns: int, attitude: Attitude | None) -> Shown | None:
         begin_ns = time.monotonic_ns()
+        self._presence.see(attitude)
         screen = self._screen
         if screen is not None and screen.paused:
             attitude = None if self._held is None else replace(self._held, rate_cam_rad_s=None)
@@ -208,6 +211,7 @@ class FrameLoop:
 
     def idle(self) -> None:
         """Keep the window alive while no frame is due."""
+        self._presence.see(None)
         if self._screen is not None:
             self._screen.present(0)
             self._screen.swap()

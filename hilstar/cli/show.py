@@ -22,6 +22,8 @@ Force = Annotated[bool, typer.Option("--force", help="Show on a display that the
 Explain = Annotated[bool, typer.Option("--explain", help="What was chosen for the scene, its error and saving, on stderr.")]
 LedgerFile = Annotated[Path | None, typer.Option("--ledger", metavar="RUN.mcap", help="Keep every packet and frame there.")]
 
+NO_ATTITUDE = 4  # the exit code of a run that never had one
+
 
 @app.command()
 def demo(
@@ -185,6 +187,8 @@ def serve(
         with progress("serving", min(limit.slots, limit.frames)) as advance:
             summary = serve_stream(bench, link, limit, lambda shown: advance(shown.number + 1), Outlet(screen, kept, notices))
     report(summary, as_json)
+    if not summary["packets"]["accepted"]:
+        raise typer.Exit(NO_ATTITUDE)
 
 
 @app.command()

@@ -76,9 +76,9 @@ def serving(tmp_path, port: int, *options: str, attitude: str = "", monitor: str
             process.kill()
 
 
-def summary_of(process: subprocess.Popen, timeout: float = 30) -> dict:
+def summary_of(process: subprocess.Popen, timeout: float = 30, code: int = 0) -> dict:
     out, err = process.communicate(timeout=timeout)
-    assert process.returncode == 0, err
+    assert process.returncode == code, err
     return json.loads(out)
 
 
@@ -175,9 +175,11 @@ def test_a_bench_that_closes_and_comes_back_is_heard_again(tmp_path):
 
 
 def test_a_silent_bench_shows_blank_frames_and_ends_in_order(tmp_path):
-    with publisher() as (_, port), serving(tmp_path, port, "--frames", "30") as process:
-        summary = summary_of(process)
-    assert summary["frames"] == summary["stale_frames"] == 30
+    """Its exit code says that it never had an attitude, and so does a line after two seconds."""
+    with publisher() as (_, port), serving(tmp_path, port, "--frames", "150") as process:
+        summary = summary_of(process, code=4)
+    assert summary["events"]["no-attitude"] == 1
+    assert summary["frames"] == summary["stale_frames"] == 150
     assert summary["attitude_age_ms"] == {"p50": None, "p99": None, "max": None}
     assert summary["stars_drawn"]["max"] == 0
 
@@ -290,6 +292,12 @@ def test_lockstep_shows_one_frame_a_request_and_says_when(tmp_path):
     assert summary["turn_ms"]["p50"] > 0
 
 
+def test_lockstep_without_a_request_never_had_an_attitude(tmp_path):
+    with serving(tmp_path, free_port(), "--duration", "2.5", attitude="lockstep = true") as process:
+        summary = summary_of(process, code=4)
+    assert (summary["packets"]["accepted"], summary["events"]["no-attitude"]) == (0, 1)
+
+
 def free_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
@@ -353,7 +361,7 @@ def test_a_flood_is_bounded_and_the_display_goes_on(tmp_path):
             with Path(f"/proc/{process.pid}/status").open() as status:
                 most_kb = max(most_kb, *(int(line.split()[1]) for line in status if line.startswith("VmRSS")))
         sender.close(linger=0)
-        summary = summary_of(process)
+        summary = summary_of(process, code=4)  # none of them is an attitude
     assert summary["packets"]["refused_by"]["format"] > 100
     assert summary["frames"] + summary["missed_frames"] == 240
     assert summary["frames"] > 60

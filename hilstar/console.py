@@ -57,7 +57,7 @@ def report(summary: dict[str, Any], as_json: bool) -> None:
         "packets": f"{packets['received']} received, {packets['refused']} refused" + (f" ({refused})" if refused else ""),
     }
     if "clock" in summary:
-        absolute = "" if summary["clock"]["mode"] == "exchange" else " above the least"
+        absolute = "" if summary["clock"]["mode"] in {"exchange", "shared"} else " above the minimum"
         lines["receive latency"] = f"{spread('receive_latency_ms')} ms (p50 / p99 / max){absolute}"
         lines["bench clock"] = clock_line(summary["clock"])
     lines["renderer"] = summary["gl_renderer"]
@@ -69,9 +69,13 @@ def clock_line(clock: dict[str, Any]) -> str:
     """How the bench's clock stands to this machine's."""
     if clock["mode"] == "none":
         return "nothing heard"
+    if clock["mode"] == "shared":
+        return "shared with the sender"
+    if clock["uncertainty_ms"] is None:
+        return f"by {clock['mode']}: heard too shortly to say how well"
     known = f"drift {clock['drift_ppm']:.1f} ppm, known to {clock['uncertainty_ms']:.3f} ms"
     if clock["mode"] == "one-way":
-        known += " and the least delay"
+        known += " and the minimum delay"
     jumps = f", {clock['jumps']} jumps" if clock["jumps"] else ""
     return f"by {clock['mode']}: {known}{jumps}"
 

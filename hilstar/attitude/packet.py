@@ -30,10 +30,10 @@ INT64 = range(-(2**63), 2**63)
 U32 = 2**32
 UNIT = 1e-15  # so near, a division by the norm would only move the last bit to and fro
 
-Reason = Literal["crc", "norm", "nan", "time", "format", "rate"]
-# Of the message itself, and told even where none was refused for them; and of the bench's own limits, told where they occur.
+Reason = Literal["crc", "norm", "nan", "time", "format", "rate", "source"]
+# Of the message itself, and told even where none was refused for them; and of this bench, told where they occur.
 MESSAGE_REASONS: tuple[Reason, ...] = ("crc", "norm", "nan", "time", "format")
-BENCH_REASONS: tuple[Reason, ...] = ("rate",)
+BENCH_REASONS: tuple[Reason, ...] = ("rate", "source")
 REASONS = MESSAGE_REASONS + BENCH_REASONS
 RATE_ROUNDING = 1e-6  # a packet's rate is float32
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 from hilstar.attitude.clock import NS_PER_MS, NS_PER_S, BenchClock
-from hilstar.attitude.jumps import Arrived, JumpFilter
+from hilstar.attitude.jumps import MIN_LIMIT_NS, WAITED_UNKNOWN_NS, Arrived, JumpFilter
 from hilstar.attitude.packet import (
     REASONS,
     AttitudeSample,
@@ -23,6 +23,8 @@ from hilstar.attitude.packet import (
     TimeRequest,
 )
 from hilstar.attitude.protocol import HEALTH_MISSED, HEALTH_REFUSED
+from hilstar.attitude.senders import Repeats, Senders
+from hilstar.attitude.shared import SharedTimes
 from hilstar.attitude.timeline import Timeline
 from hilstar.notices import Notices
 from hilstar.spread import RunningSpread
@@ -32,6 +34,11 @@ FIRST_ASKS = 8  # quickly, so that the clock is soon known
 QUICK_ASK_NS = NS_PER_S // 10
 ASK_NS = NS_PER_S // 2
 TOLD_ONCE = HEALTH_MISSED | HEALTH_REFUSED
+# What is found when the frames begin was there before; what comes so soon after may have been on its way through a queue.
+QUEUED_NS = NS_PER_S // 10
+QUEUE_NEVER_EMPTY_NS = NS_PER_S
+FIRST_BACK_OFF_NS = NS_PER_S // 20
+LONGEST_BACK_OFF_NS = NS_PER_S
 log = logging.getLogger(__name__)
 
 
@@ -51,6 +58,9 @@ class Link(Protocol):
 
     def receive(self, timeout_ms: int) -> list[Arrival]:
         """What has come; waits at most `timeout_ms` for the first, and for no other. A lost peer raises nothing."""
+
+    def wait_for_message(self, timeout_ms: int) -> bool:
+        """True once something has come that was not read."""
 
     def send(self, packet: Packet) -> None:
         """Send to the bench, never waiting; lost where nobody listens."""
@@ -82,17 +92,21 @@ def nobody_watches(host_ns: int, raw: bytes, sample: AttitudeSample | None, refu
 
 @dataclass(frozen=True, slots=True)
 class Traffic:
-    """What goes back to the bench on a two-way link: so many statuses a second, and time requests."""
+    """What goes back to the bench on a two-way link, so many statuses a second and time requests; and whose clock it has."""
 
     status_hz: float = 0.0
     time_requests: bool = False
+    shared_clock: bool = False
 
 
 QUIET = Traffic()
 
 
 class Receiver:
-    """Runs `link` into `timeline` until closed. Nothing that arrives ends it."""
+    """Runs `link` into `timeline` until closed. Nothing that arrives ends it.
+
+    What comes before `learn` is called fills the timeline, and says little of the sender's clock.
+    """
 
     def __init__(
         self,
@@ -103,27 +117,58 @@ class Receiver:
         notices: Notices | None = None,
     ) -> None:
         self.counts = PacketCounts()
-        self.clock = BenchClock()
-        self.jumps = JumpFilter()
+        self._notices = Notices() if notices is None else notices
+        self.clock = BenchClock(shared=traffic.shared_clock)
+        self.jumps = SharedTimes(self._notices) if traffic.shared_clock else JumpFilter()
         self.latency_ms = RunningSpread()
         self._link = link
         self._timeline = timeline
         self._traffic = traffic
         self._watch = watch
-        self._notices = Notices() if notices is None else notices
+        self._repeats = Repeats(self._notices)
+        self._senders = Senders(timeline.stale_after_ns, self._notices)
+        self._begun_ns: int | None = None
+        self._learn_from_ns: int | None = None
+        self._empty_ns = 0
         self._status: Status | None = None
         self._posting = threading.Lock()
         self._next_status_ns = 0
         self._asked: dict[int, TimeRequest] = {}
         self._asks = 0
+        self._quick_asks = FIRST_ASKS
         self._jumps_told = 0
         self._next_ask_ns = 0
         self._stop = threading.Event()
+        self._failure = ""
+        self._started_ns = self._retry_ns = 0
+        self._back_off_ns = FIRST_BACK_OFF_NS
         self._thread = threading.Thread(target=self._run, name="hilstar-receiver", daemon=True)
 
     def start(self) -> None:
         """Begin to listen."""
+        self._started_ns = time.monotonic_ns()
         self._thread.start()
+
+    def learn(self) -> None:
+        """The frames begin: what comes from now on teaches the clock."""
+        self._begun_ns = time.monotonic_ns()
+
+    def tend(self) -> None:
+        """Start the thread anew where it ended, and say so; for the frame loop, with each frame."""
+        if self._thread.is_alive() or self._stop.is_set():
+            return
+        now_ns = time.monotonic_ns()
+        if not self._retry_ns:
+            if now_ns - self._started_ns > 10 * LONGEST_BACK_OFF_NS:
+                self._back_off_ns = FIRST_BACK_OFF_NS
+            self._retry_ns = now_ns + self._back_off_ns
+            self._back_off_ns = min(2 * self._back_off_ns, LONGEST_BACK_OFF_NS)
+            why = self._failure or "without a word"
+            self._notices.tell("receiver-failed", f"the receiver of the attitudes ended ({why}); it is started again")
+        if now_ns >= self._retry_ns:
+            self._retry_ns, self._failure = 0, ""
+            self._thread = threading.Thread(target=self._run, name="hilstar-receiver", daemon=True)
+            self.start()
 
     def close(self) -> None:
         """Stop listening; the link itself stays the caller's."""
@@ -134,21 +179,74 @@ class Receiver:
         """A time of the timeline as the bench's own clock has it."""
         return continuous_ns - self.jumps.correction_ns
 
-    def _run(self) -> None:
-        while not self._stop.is_set():
-            for arrival in self._link.receive(POLL_MS):
-                self._take(arrival)
-            now_ns = time.monotonic_ns()
-            self._settle(self.jumps.expire(now_ns))
-            if self._link.two_way:
-                self._talk(now_ns)
-        self._settle(self.jumps.release())
+    def clock_summary(self) -> dict[str, float | int | str | None]:
+        """The clock's summary, its offset that of the sender's clock as it is now, after all jumps."""
+        told = self.clock.summary()
+        offset_ms = told["offset_ms"]
+        if isinstance(offset_ms, float):
+            told["offset_ms"] = offset_ms + self.jumps.correction_ns / NS_PER_MS
+        uncertainty_ms = told["uncertainty_ms"]
+        if self.jumps.slowness > 0 and isinstance(uncertainty_ms, float):
+            told["uncertainty_ms"] = uncertainty_ms + 2 * MIN_LIMIT_NS / NS_PER_MS  # a step, and what is missing to the next
+        return told | {"jumps": self.jumps.jumps}
 
-    def _take(self, arrival: Arrival) -> None:
+    def _run(self) -> None:
+        try:
+            while not self._stop.is_set():
+                self._listen()
+            self._settle(self.jumps.release())
+        except BaseException as error:  # whatever it is: the display goes on, and `tend` starts another
+            self._failure = f"{type(error).__name__}: {error}"
+
+    def _listen(self) -> None:
+        waits = self._link.wait_for_message(0)
+        now_ns = time.monotonic_ns()
+        if not waits:
+            self._empty_ns = now_ns
+        self._begin_to_learn(now_ns, waits)
+        arrivals = self._link.receive(POLL_MS)
+        for k, arrival in enumerate(arrivals):
+            # The newest of those that came while this thread slept is what woke it; what else was there had to wait.
+            timely = not waits and k == len(arrivals) - 1
+            self._take(arrival, 0 if timely else arrival.host_ns - self._empty_ns)
+        now_ns = time.monotonic_ns()
+        self._settle(self.jumps.expire(now_ns))
+        if self._link.two_way:
+            self._talk(now_ns)
+
+    def _begin_to_learn(self, now_ns: int, waits: bool) -> None:
+        begun_ns = self._begun_ns
+        if begun_ns is None or self._learn_from_ns is not None:
+            return
+        if not waits or now_ns - begun_ns > QUEUE_NEVER_EMPTY_NS:
+            self._learn_from_ns = now_ns + QUEUED_NS
+
+    def _take_sample(self, sample: AttitudeSample, arrival: Arrival, waited_ns: int) -> None:
+        host_ns, raw = arrival.host_ns, arrival.raw
+        refusal = self._repeats.judge(sample, host_ns, raw) or self._senders.judge(sample, host_ns)
+        if refusal is not None:
+            self._refuse(host_ns, raw, sample, refusal)
+            return
+        if self._repeats.resumed():
+            self.jumps.forgive()
+        if self._learn_from_ns is None or host_ns < self._learn_from_ns:
+            waited_ns = WAITED_UNKNOWN_NS
+        elif self.clock.unheard:
+            self._quick_asks, self._next_ask_ns = FIRST_ASKS, host_ns  # now somebody is there to answer
+        self._settle(self.jumps.take(Arrived(sample, host_ns, raw, None, waited_ns)))
+        self._tell_pace(self.jumps.slowness)
+
+    def _tell_pace(self, slowness: float) -> None:
+        if not slowness:
+            return
+        kind = "source-slow" if slowness > 0 else "source-fast"
+        self._notices.begin(kind, f"the sender's clock goes at {1 - slowness:.3g} of its speed; it is followed in small steps")
+
+    def _take(self, arrival: Arrival, waited_ns: int) -> None:
         match arrival.event:
             case AttitudeSample() as sample:
                 self.counts.received += 1
-                self._settle(self.jumps.take(Arrived(sample, arrival.host_ns, arrival.raw)))
+                self._take_sample(sample, arrival, waited_ns)
             case TimeRequest(sequence, t1_ns) if self._link.two_way:
                 self._link.send(TimeReply(sequence, t1_ns, arrival.host_ns, time.monotonic_ns()))
             case TimeReply() as reply if self._link.two_way:
@@ -169,13 +267,17 @@ class Receiver:
             if refusal is not None:
                 self._refuse(host_ns, arrived.raw, sample, refusal)
                 continue
-            self.clock.observe(sample.t_ns, host_ns)
-            latency_ns = self.clock.latency_ns(sample.t_ns, host_ns)
-            if latency_ns is not None:
-                self.latency_ms.add(latency_ns / NS_PER_MS)
+            if arrived.waited_ns == WAITED_UNKNOWN_NS:
+                self.clock.guess(sample.t_ns, host_ns)
+            else:
+                if arrived.timely:
+                    self.clock.observe(sample.t_ns, host_ns)
+                latency_ns = self.clock.latency_ns(sample.t_ns, host_ns)
+                self.latency_ms.add((latency_ns or 0.0) / NS_PER_MS)
             self._watch(host_ns, arrived.raw, sample, None)
         if jumps > self._jumps_told:
             self._jumps_told = jumps
+            self.clock.widen(self.jumps.spread_ns)
             total_s = self.jumps.correction_ns / NS_PER_S
             self._notices.tell("jump", f"the sender's clock jumped: {total_s:.3f} s in all; its stream is carried on")
 
@@ -193,7 +295,7 @@ class Receiver:
             self._status = status
 
     def _talk(self, now_ns: int) -> None:
-        if self._traffic.time_requests and now_ns >= self._next_ask_ns:
+        if self._traffic.time_requests and self._learn_from_ns is not None and now_ns >= self._next_ask_ns:
             self._ask(now_ns)
         if self._traffic.status_hz and self._status is not None and now_ns >= self._next_status_ns:
             with self._posting:
@@ -206,7 +308,8 @@ class Receiver:
         request = TimeRequest(self._asks, time.monotonic_ns())
         self._asked = {sequence: asked for sequence, asked in self._asked.items() if self._asks - sequence < FIRST_ASKS}
         self._asked[self._asks] = request
-        self._next_ask_ns = now_ns + (QUICK_ASK_NS if self._asks < FIRST_ASKS else ASK_NS)
+        self._quick_asks -= 1
+        self._next_ask_ns = now_ns + (QUICK_ASK_NS if self._quick_asks > 0 else ASK_NS)
         self._link.send(request)
 
     def _take_reply(self, reply: TimeReply, t4_ns: int) -> None:

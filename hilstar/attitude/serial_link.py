@@ -78,6 +78,14 @@ class SerialLink:
         host_ns = time.monotonic_ns()
         return [Arrival(host_ns, event, raw) for event, raw in self._decoder.feed(chunk)]
 
+    def wait_for_message(self, timeout_ms: int) -> bool:
+        """True once bytes wait that were not read."""
+        device = self._device
+        try:
+            return device is not None and bool(select.select([device.fileno()], [], [], timeout_ms / 1000)[0])
+        except (OSError, ValueError, TypeError):  # gone: `receive` finds out, and says so
+            return False
+
     def send(self, packet: Packet) -> None:
         """Send to the bench, never waiting: what the line does not take at once is lost."""
         self.send_bytes(frame(packet))

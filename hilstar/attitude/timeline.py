@@ -75,6 +75,11 @@ class Timeline:
     def __len__(self) -> int:
         return len(self._samples)
 
+    @property
+    def stale_after_ns(self) -> int:
+        """The age at which an attitude counts as stale."""
+        return self._policy.stale_after_ns
+
     def add(self, sample: AttitudeSample, received_ns: int | None = None) -> Refusal | None:
         """Append a sample; refused are one whose time does not rise, a duplicate or one out of order, and one too fast."""
         too_fast = rate_refusal(sample, self._policy.max_rate_rad_s)

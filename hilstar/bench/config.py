@@ -136,6 +136,7 @@ class AttitudeSettings(_Table, frozen=True):
     baud: Annotated[int, Meta(gt=0, le=12_000_000)] = 115_200
     status_hz: Annotated[float, Meta(ge=0, le=1000)] = 10.0
     time_requests: bool = True
+    clock: Literal["estimated", "shared"] = "estimated"
     stale_after_ms: NotNegative = 250.0
     max_extrapolation_ms: NotNegative = 250.0
     on_stale: Literal["hold", "blank"] = "hold"

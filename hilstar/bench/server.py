@@ -72,10 +72,13 @@ def _serve_stream(
     settings, ledger = bench.config.attitude, outlet.ledger
     timeline = Timeline(policy_of(settings))
     watch = nobody_watches if ledger is None else ledger.packet
-    receiver = Receiver(link, timeline, Traffic(settings.status_hz, settings.time_requests), watch, outlet.notices)
+    receiver = Receiver(
+        link, timeline, Traffic(settings.status_hz, settings.time_requests, settings.clock == "shared"), watch, outlet.notices
+    )
     statuses = StatusMaker(ledger)
 
     def draw_slot(slot: int) -> None:
+        receiver.tend()
         t_ns = receiver.clock.to_bench_ns(loop.light_ns(time.monotonic_ns()))
         shown = loop.draw(slot, t_ns, timeline.at(t_ns))
         if shown is None:
@@ -89,6 +92,7 @@ def _serve_stream(
     receiver.start()
     try:
         bench.warm_up()
+        receiver.learn()
         begin_ns = time.monotonic_ns()
         loop.paced(bench.config.monitor.refresh_hz, limit, draw_slot)
     finally:
@@ -98,7 +102,7 @@ def _serve_stream(
     return summary | {
         "stale_events": loop.gate.events,
         "receive_latency_ms": receiver.latency_ms.summary(),
-        "clock": receiver.clock.summary() | {"jumps": receiver.jumps.jumps},
+        "clock": receiver.clock_summary(),
         "reconnects": link.reconnects,
     }
 

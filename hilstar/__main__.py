@@ -5,18 +5,23 @@ from __future__ import annotations
 import sys
 from typing import NoReturn
 
-INTERRUPTED = 130
+from hilstar import interrupts
+from hilstar.stderr import finish_stderr
+
+READER_WAITS_S = 0.1  # for a reader of stderr that sleeps
 
 
 def main() -> NoReturn:
     """Import the commands and run them."""
     try:
+        interrupts.install()
         from hilstar.cli import main as run
 
         run()
     except KeyboardInterrupt:
         print("hilstar: stopped", file=sys.stderr)
-        sys.exit(INTERRUPTED)
+        finish_stderr(READER_WAITS_S)
+        interrupts.leave(interrupts.exit_code())
 
 
 if __name__ == "__main__":

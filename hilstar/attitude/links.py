@@ -179,10 +179,16 @@ class ZmqLockstep(_ZmqLink):
         self._json = False
 
     def receive(self, timeout_ms: int) -> Arrival | None:
-        """The next request, or None; each one has to be answered before the next can come."""
+        """The next request, or None; each one has to be answered before the next can come.
+
+        A message without the empty part that ends a request's address is none: libzmq says that one waits, and drops it.
+        """
         if not self._socket.poll(timeout_ms):
             return None
-        message = self._socket.recv_multipart()[-1]
+        try:
+            message = self._socket.recv_multipart(zmq.NOBLOCK)[-1]
+        except zmq.Again:
+            return None
         self._json = message.lstrip()[:1] == b"{"
         return Arrival(time.monotonic_ns(), decode(message), message)
 

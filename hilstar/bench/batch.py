@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 import multiprocessing
 import os
-from collections.abc import Callable
+import signal
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +20,7 @@ from hilstar.attitude.quaternion import rate_between_rad_s
 from hilstar.attitude.timeline import Policy
 from hilstar.bench.output import make_directory, write_exposure_fits
 from hilstar.bench.simulation import Noise, Simulator
+from hilstar.interrupts import end_with_parent
 from hilstar.scene.smear import Motion
 
 _simulator: Simulator | None = None
@@ -60,21 +63,35 @@ def simulate_motions(
     workers = min(len(motions), len(os.sched_getaffinity(0)))
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(workers, context, _start_worker, (bench_file,)) as pool:
-        tasks = [
-            pool.submit(_expose_to_file, motion, noise, (seed, number), directory / f"exposure_{number:06d}.fits")
-            for number, motion in enumerate(motions)
-        ]
         try:
+            with _without_ctrl_c():
+                tasks = [
+                    pool.submit(_expose_to_file, motion, noise, (seed, number), directory / f"exposure_{number:06d}.fits")
+                    for number, motion in enumerate(motions)
+                ]
             for done, task in enumerate(as_completed(tasks), start=1):
                 task.result()
                 on_done(done)
         except BaseException:
+            for worker in multiprocessing.active_children():
+                worker.terminate()
             pool.shutdown(cancel_futures=True)
             raise
 
 
+@contextmanager
+def _without_ctrl_c() -> Iterator[None]:
+    """What is started here never hears of a Ctrl-C, which a terminal sends to all; it ends when this process says so."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def _start_worker(bench_file: Path) -> None:
     global _simulator  # noqa: PLW0603 - a process of the pool has one simulator, made at its start
+    end_with_parent()
     os.environ.setdefault("LP_NUM_THREADS", "1")  # the pool itself fills the cores
     _simulator = Simulator(bench_file)
 

@@ -37,10 +37,12 @@ from hilstar.bench.records import (
     schema_of,
 )
 from hilstar.errors import InputError
+from hilstar.interrupts import caught
 from hilstar.notices import Notice
 
 FLUSH_S = 0.2
 PROCESS_S = 1.0
+DISK_WAITS_S, STOPPED_DISK_WAITS_S = 20.0, 0.4  # for a disk that stands still at the end, without and with a signal
 WAITING_MESSAGES = 100_000  # a disk that stands still for minutes; then frames go unrecorded, counted
 log = logging.getLogger(__name__)
 
@@ -143,9 +145,13 @@ class Ledger:
         log.error("%s: the ledger ends here (%s); the display goes on", self.path, self.failure)
 
     def close(self) -> None:
-        """Write what waits, and the end of the file."""
+        """Write what waits, and the end of the file; a disk that does not take it in time has failed."""
         self._waiting.put(None)
-        self._thread.join()
+        patience_s = DISK_WAITS_S if caught() is None else STOPPED_DISK_WAITS_S
+        self._thread.join(patience_s)
+        if self._thread.is_alive():  # and has the file: nothing more can be done with it
+            self._fail(TimeoutError(f"the disk did not take its last messages within {patience_s:g} s"))
+            return
         try:
             if self.failure is None:
                 self._writer.finish()  # type: ignore[no-untyped-call]

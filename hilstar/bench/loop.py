@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import logging
 import math
-import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -274,24 +272,6 @@ class FrameLoop:
             self.stats.missed_frames += self._missed_before + self._gave_up
             self._missed_before += before
         return following
-
-
-@contextmanager
-def stop_on_signal(stop: threading.Event) -> Iterator[None]:
-    """SIGINT and SIGTERM end the run in order while this is open (main thread only)."""
-
-    def handle(number: int, frame: object) -> None:
-        stop.set()
-
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    previous = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
 
 
 def policy_of(settings: AttitudeSettings) -> Policy:

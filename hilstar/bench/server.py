@@ -17,11 +17,12 @@ from hilstar.bench.assembly import Bench
 from hilstar.bench.config import AttitudeSettings
 from hilstar.bench.ledger import Ledger
 from hilstar.bench.lockstep import serve_lockstep
-from hilstar.bench.loop import FrameLoop, FrameSink, Limit, ignore, policy_of, stop_on_signal
+from hilstar.bench.loop import FrameLoop, FrameSink, Limit, ignore, policy_of
 from hilstar.bench.play import Play
 from hilstar.bench.records import frame_record
 from hilstar.bench.screen import Screen
 from hilstar.bench.status import StatusMaker
+from hilstar.interrupts import stop_on_signal
 from hilstar.notices import Notices
 
 AnyLink = ZmqReceiver | ZmqLockstep | SerialLink
@@ -63,7 +64,7 @@ def serve(bench: Bench, link: AnyLink, limit: Limit, sink: FrameSink = ignore, o
         else:
             summary = _serve_stream(bench, link, limit, loop, outlet)
     summary |= {"events": outlet.notices.counts()}
-    return summary | loop.screen_summary() | ({} if ledger is None else {"ledger": ledger.summary()})
+    return summary | loop.screen_summary()
 
 
 def _serve_stream(
@@ -135,5 +136,4 @@ def replay(bench: Bench, play: Play, sink: FrameSink = ignore, outlet: Outlet | 
                 draw_slot(slot)
     duration_s = (time.monotonic_ns() - begin_ns) / NS_PER_S
     summary = loop.stats.summary(duration_s, PacketCounts(received=play.packet_count), bench.renderer.gl_renderer)
-    kept = {} if ledger is None else {"ledger": ledger.summary()}
-    return summary | {"stale_events": loop.gate.events, "events": outlet.notices.counts()} | loop.screen_summary() | kept
+    return summary | {"stale_events": loop.gate.events, "events": outlet.notices.counts()} | loop.screen_summary()

@@ -10,14 +10,17 @@ from typing import NoReturn
 
 import typer
 
+from hilstar import interrupts
 from hilstar.cli import bench, check, compare, light, run, show, stream
 from hilstar.cli.common import app
 from hilstar.console import fail
 from hilstar.errors import HilstarError, InputError
+from hilstar.stderr import finish_stderr, queue_stderr
 
 __all__ = ["app", "bench", "check", "compare", "light", "main", "run", "show", "stream"]
 
 INTERRUPTED = 130
+READER_WAITS_S, STOPPED_READER_WAITS_S = 1.0, 0.1  # for a reader of stderr that sleeps, without and with a signal
 SHARE_OPTIONS = ("--lose", "--corrupt", "--reorder")  # may stand alone
 USUAL_SHARE = "5%"
 
@@ -35,23 +38,53 @@ def with_shares(words: list[str]) -> list[str]:
 
 def main() -> NoReturn:
     """Run the command line; every refusal is one line on stderr and the exit code of the design's section 5."""
+    interrupts.install()
+    queue_stderr()
     logging.basicConfig(format="hilstar: %(message)s", stream=sys.stderr)
     try:
-        code = app(with_shares(sys.argv[1:]), standalone_mode=False) or 0
+        code = _run(with_shares(sys.argv[1:]))
+    except SystemExit as end:  # of `fail`
+        code = end.code if isinstance(end.code, int) else 1
+    finish_stderr(READER_WAITS_S if interrupts.caught() is None else STOPPED_READER_WAITS_S)
+    interrupts.leave(code)
+
+
+def _run(words: list[str]) -> int:
+    """The exit code of a command; SystemExit where it is refused."""
+    try:
+        code = int(app(words, standalone_mode=False) or 0)
+        sys.stdout.flush()
         if code == INTERRUPTED:  # typer turns Ctrl-C into this code, and says nothing
-            fail("stopped", INTERRUPTED)
-        sys.exit(code)
+            fail("stopped", interrupts.exit_code())
+        return code
     except HilstarError as error:
         fail(str(error), error.exit_code)
     except (KeyboardInterrupt, typer.Abort):
-        fail("stopped", INTERRUPTED)
+        fail("stopped", interrupts.exit_code())
     except BrokenPipeError:
-        # Whoever read our output has gone: nothing is left to say, and Python must not try at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(1)
+        # Whoever read our output has gone: nothing is left to say.
+        _let_go_of_stdout()
+        return 1
     except Exception as error:
         # typer's usage errors have no public base class in all its versions; they can format themselves.
         message = getattr(error, "format_message", None)
-        if message is None:
-            raise
-        fail(f"{message()} (see hilstar --help)", InputError.exit_code)
+        if message is not None:
+            fail(f"{message()} (see hilstar --help)", InputError.exit_code)
+        if isinstance(error, OSError) and _stdout_fails():
+            _let_go_of_stdout()
+            fail(f"stdout: cannot be written ({error.strerror}); choose another place", InputError.exit_code)
+        raise
+
+
+def _stdout_fails() -> bool:
+    """True where what was to be printed still cannot be."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        return True
+    return False
+
+
+def _let_go_of_stdout() -> None:
+    """Python must not try once more at exit."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,6 +16,7 @@ from hilstar.cli.common import LOG_HELP, MAX_SEED, BenchFile, Headless, Json, Qu
 from hilstar.console import print_json, progress, report, say
 from hilstar.endings import CSV, FITS, MCAP, PNG, check_directory, check_ending
 from hilstar.errors import InputError
+from hilstar.interrupts import stop_on_signal
 from hilstar.notices import Notices
 
 Windowed = Annotated[bool, typer.Option("--windowed", help="A window on the desk instead of the whole display.")]
@@ -134,15 +136,30 @@ def say_what_clips(bench: Any) -> None:
         say(line)
 
 
-def optional_ledger(path: Path | None, bench: Any, notices: Notices) -> AbstractContextManager[Any]:
+@contextmanager
+def optional_ledger(path: Path | None, bench: Any, notices: Notices) -> Iterator[Any]:
     """The run's ledger, which keeps the run's events too, or nothing where none was asked for."""
     from hilstar.bench.ledger import Ledger
 
     if path is None:
-        return nullcontext()
+        yield None
+        return
     ledger = Ledger(path, bench)
     notices.listen(ledger.notice)
-    return ledger
+    try:
+        yield ledger
+    finally:
+        with stop_on_signal(threading.Event()):  # a signal that comes now does not interrupt this
+            ledger.close()
+
+
+def end_of_run(summary: dict[str, Any], ledger: Any, as_json: bool) -> None:
+    """The summary of a run whose ledger is closed; exit code 1 where that has failed."""
+    if ledger is not None:
+        summary |= {"ledger": ledger.summary()}
+    report(summary, as_json)
+    if ledger is not None and ledger.failure is not None:
+        raise typer.Exit(1)
 
 
 def left_out(truth: Any) -> dict[str, float | int]:
@@ -186,7 +203,7 @@ def serve(
         say_what_clips(bench)
         with progress("serving", min(limit.slots, limit.frames)) as advance:
             summary = serve_stream(bench, link, limit, lambda shown: advance(shown.number + 1), Outlet(screen, kept, notices))
-    report(summary, as_json)
+    end_of_run(summary, kept, as_json)
     if not summary["packets"]["accepted"]:
         raise typer.Exit(NO_ATTITUDE)
 
@@ -233,4 +250,4 @@ def replay(
             advance(shown.number + 1)
 
         summary = replay_log(bench, play, sink, Outlet(screen, kept, notices))
-    report(summary, as_json)
+    end_of_run(summary, kept, as_json)

@@ -16,6 +16,7 @@ from hilstar.cli.common import LOG_HELP, MAX_SEED, Json, RadecText, app
 from hilstar.console import print_json, progress, say
 from hilstar.endings import check_directory
 from hilstar.errors import InputError
+from hilstar.interrupts import stop_on_signal
 
 LISTEN_SLICE_S = 0.1  # between looks at whether a signal has come
 Share = Annotated[str, typer.Option(metavar="[SHARE]", help="Share of the packets, such as 5% or 0.05; alone: 5%.")]
@@ -48,7 +49,6 @@ def send(
     """Send a log or a spin, over ZeroMQ or a serial line, with the faults of a bad cable on request: the test instrument."""
     from hilstar.attitude.curve import CurveKeys
     from hilstar.bench.faults import BadCable, Faults, parse_share
-    from hilstar.bench.loop import stop_on_signal
     from hilstar.bench.sender import open_road
     from hilstar.bench.sender import send as send_samples
 

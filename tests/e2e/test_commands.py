@@ -260,9 +260,12 @@ def test_ctrl_c_at_any_moment_leaves_no_traceback(tmp_path, small_bench_file):
             process = subprocess.Popen(
                 [sys.executable, "-m", "hilstar", *command], stderr=subprocess.PIPE, stdout=subprocess.PIPE
             )
-            time.sleep(delay_s)
-            process.send_signal(signal.SIGINT)
-            _, err = process.communicate(timeout=10)
+            try:
+                time.sleep(delay_s)
+                process.send_signal(signal.SIGINT)
+                _, err = process.communicate(timeout=10)
+            finally:
+                process.kill()
             assert b"Traceback" not in err or delay_s < 0.1, err  # Python's own start is not ours to guard
 
 

@@ -148,7 +148,7 @@ def test_a_full_disk_ends_the_ledger_and_not_the_display(tmp_path):
             time.sleep(0.3)
             stream(sender, 200)
             out, err = process.communicate(timeout=30)
-    assert process.returncode == 0, err
+    assert process.returncode == 1, err
     summary = json.loads(out)
     assert "the display goes on" in err
     assert summary["ledger"]["failure"]

@@ -1,0 +1,217 @@
+"""Signals: the first ends a command in order, and whatever it is at, the process is gone within a second.
+
+Python's own handlers run in the main thread, between two steps of the interpreter: a long draw or a call that waits in C
+holds them up. So the number of a signal goes to a socket too, from within C, and two watchers look at it: a thread, which
+ends the process with the usual exit code, and a process, which does it where a call in C keeps Python's lock (as OpenGL's
+do) and no thread can.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import signal
+import socket
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, NoReturn
+
+if TYPE_CHECKING:
+    from multiprocessing.process import BaseProcess
+
+ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+THREAD_WAITS_S = 0.75  # for an end in order
+GUARD_WAITS_S = 0.9
+ECHO_S = 0.1  # a terminal and a wrapper both pass one Ctrl-C on: what comes so soon after a signal is no second one
+POLL_S = 0.02
+SIGNALLED = 128  # and the signal's number: the exit code of a process that a signal ended
+
+
+class _Ending:
+    """What of this process has to do with its end."""
+
+    def __init__(self) -> None:
+        self.signal: int | None = None
+        self.stops: list[threading.Event] = []
+        self.guard: int | None = None
+
+
+_ending = _Ending()
+
+
+def install() -> None:
+    """From here on SIGINT, SIGTERM and SIGHUP end this process; in its main thread, before it has others. Twice does nothing.
+
+    SIGHUP stays ignored where it was (nohup); SIGINT does not, for a shell ignores it for whatever it runs with `&`.
+    """
+    if _ending.guard is not None:
+        return
+    watched, told = socket.socketpair()
+    told.setblocking(False)
+    parent = os.getpid()
+    _ending.guard = os.fork()
+    if _ending.guard == 0:
+        told.close()
+        _guard(parent, watched)
+    threading.Thread(target=_watch, args=(watched,), name="hilstar-signals", daemon=True).start()
+    signal.set_wakeup_fd(told.detach(), warn_on_full_buffer=False)
+    for number in ENDING:
+        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
+            signal.signal(number, _handle)
+
+
+def _handle(number: int, frame: object) -> None:
+    if _ending.signal is not None:
+        return  # the end is under way; a second signal is the watchers' matter
+    _ending.signal = number
+    if not _ending.stops:
+        raise KeyboardInterrupt
+    for stop in _ending.stops:
+        stop.set()
+
+
+def caught() -> str | None:
+    """The name of the signal that ends this process; None while none has come."""
+    return None if _ending.signal is None else signal.Signals(_ending.signal).name
+
+
+def exit_code() -> int:
+    """Of a command that a signal ended."""
+    return SIGNALLED + (_ending.signal or signal.SIGINT)
+
+
+@contextlib.contextmanager
+def stop_on_signal(stop: threading.Event) -> Iterator[None]:
+    """A signal sets `stop` while this is open, and raises nothing (main thread only)."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    previous = {}
+    if _ending.guard is None:  # hilstar used as a library
+        previous = {number: signal.signal(number, _handle) for number in ENDING}
+        _ending.signal = None
+    _ending.stops.append(stop)
+    if _ending.signal is not None:
+        stop.set()
+    try:
+        yield
+    finally:
+        _ending.stops.remove(stop)
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+def leave(code: int) -> NoReturn:
+    """End the process: after a signal, or where a thread still waits for something, without asking Python's own end.
+
+    That waits for threads, and stumbles over one that is in the middle of writing.
+    """
+    for number in ENDING:
+        with contextlib.suppress(ValueError):  # not the main thread
+            signal.signal(number, signal.SIG_DFL)
+    if _ending.guard:
+        with contextlib.suppress(OSError):
+            os.kill(_ending.guard, signal.SIGKILL)
+            os.waitpid(_ending.guard, 0)
+    own = {"hilstar-signals", "hilstar-stderr"}
+    others = [thread for thread in threading.enumerate() if thread.name not in own]
+    if _ending.signal is not None or len(others) > 1:
+        os._exit(code)
+    sys.exit(code)
+
+
+def _signals_in(watched: socket.socket) -> bytes:
+    """The numbers of the signals so far; both watchers look at the same ones, and none takes them away."""
+    with contextlib.suppress(BlockingIOError):
+        return watched.recv(64, socket.MSG_PEEK | socket.MSG_DONTWAIT)
+    return b""
+
+
+def _watch(watched: socket.socket) -> None:
+    """The thread: waits for a signal, and then for the end, or for a second signal."""
+    select.select([watched], [], [])
+    numbers = _signals_in(watched)
+    if not numbers:
+        return
+    begin_s = time.monotonic()
+    heard_twice = False
+    while not heard_twice and time.monotonic() - begin_s < THREAD_WAITS_S:
+        time.sleep(POLL_S)
+        if time.monotonic() - begin_s < ECHO_S:
+            numbers = _signals_in(watched)
+        heard_twice = len(_signals_in(watched)) > len(numbers)
+    name = signal.Signals(numbers[0]).name
+    why = "at the second signal" if heard_twice else f"{THREAD_WAITS_S:g} s after {name}, in the middle of {_whereabouts()}"
+    _say_if_read(f"hilstar: ended {why}\n")
+    end_children(os.getpid(), _ending.guard)
+    os._exit(SIGNALLED + numbers[0])
+
+
+def _whereabouts() -> str:
+    """What the main thread is at: the innermost function of hilstar's own."""
+    frame = sys._current_frames().get(threading.main_thread().ident or 0)
+    while frame is not None:
+        path = Path(frame.f_code.co_filename)
+        if "hilstar" in path.parts and path.name != Path(__file__).name:
+            return f"{frame.f_code.co_name} ({path.name}, line {frame.f_lineno})"
+        frame = frame.f_back
+    return "its end"
+
+
+def _say_if_read(line: str) -> None:
+    """A line on stderr where that takes it at once."""
+    with contextlib.suppress(OSError, ValueError):
+        if select.select([], [2], [], 0)[1]:
+            os.write(2, line.encode())
+
+
+def end_children(process: int, *spared: int | None) -> None:
+    """Kill what a process has started, and not `spared`."""
+    with contextlib.suppress(OSError):
+        for task in Path(f"/proc/{process}/task").iterdir():
+            for child in map(int, (task / "children").read_text().split()):
+                if child not in spared:
+                    with contextlib.suppress(OSError):
+                        os.kill(child, signal.SIGKILL)
+
+
+def _guard(parent: int, watched: socket.socket) -> NoReturn:
+    """The process: it ends with its parent, or ends it."""
+    try:
+        for number in ENDING:
+            signal.signal(number, signal.SIG_IGN)  # a terminal sends Ctrl-C to both
+        _let_go_of_all_but(watched.fileno())
+        poll = select.poll()
+        poll.register(watched, select.POLLIN)
+        [(_, events)] = poll.poll()
+        if not events & select.POLLHUP:
+            poll.modify(watched, 0)  # whose end is told all the same
+            if not poll.poll(GUARD_WAITS_S * 1000) and os.getppid() == parent:
+                end_children(parent, os.getpid())
+                os.kill(parent, signal.SIGKILL)
+    finally:
+        os._exit(0)
+
+
+def _let_go_of_all_but(kept: int) -> None:
+    """Close what the parent had open: whoever reads its output waits for the last who could write."""
+    os.closerange(0, kept)
+    os.closerange(kept + 1, 1024)
+
+
+def end_with_parent() -> None:
+    """In a process of a pool: end when the process that started it does, however that ends."""
+    import multiprocessing
+
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        threading.Thread(target=_end_after, args=(parent,), name="hilstar-parent", daemon=True).start()
+
+
+def _end_after(parent: BaseProcess) -> None:
+    parent.join()
+    os._exit(1)

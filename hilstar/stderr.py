@@ -1,0 +1,105 @@
+"""Lines on stderr that wait for nobody: whoever should read them may sleep, and neither a frame nor the end is held up."""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import io
+import os
+import sys
+import threading
+import time
+from collections import deque
+from typing import Any
+
+MAX_WAITING_BYTES = 1 << 20
+PIECE_BYTES = 4096
+DESCRIPTOR = 2
+LAST_WORDS_S = 1.0  # for a traceback, where nobody asks for what is written
+
+
+class QueuedStderr(io.RawIOBase):
+    """What is written goes to stderr from a thread, in order; what is over MAX_WAITING_BYTES is dropped and counted."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._waiting: deque[bytes] = deque()
+        self._waiting_bytes = 0
+        self._dropped = 0
+        self._changed = threading.Condition()
+        threading.Thread(target=self._run, name="hilstar-stderr", daemon=True).start()
+
+    def writable(self) -> bool:
+        """It is."""
+        return True
+
+    def fileno(self) -> int:
+        """Of stderr itself."""
+        return DESCRIPTOR
+
+    def isatty(self) -> bool:
+        """Whether stderr itself is a terminal."""
+        return os.isatty(DESCRIPTOR)
+
+    def write(self, data: Any) -> int:
+        """Take in bytes; how many, which is all."""
+        piece = bytes(data)
+        with self._changed:
+            if self._waiting_bytes + len(piece) > MAX_WAITING_BYTES:
+                self._dropped += 1
+            else:
+                self._waiting.append(piece)
+                self._waiting_bytes += len(piece)
+                self._changed.notify_all()
+        return len(piece)
+
+    def finish(self, patience_s: float) -> None:
+        """Wait until everything is written, at most so long."""
+        end_s = time.monotonic() + patience_s
+        with self._changed:
+            while self._waiting_bytes and (rest_s := end_s - time.monotonic()) > 0:
+                self._changed.wait(rest_s)
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                while not self._waiting:
+                    self._changed.wait()
+                piece = self._waiting.popleft()
+                dropped, self._dropped = self._dropped, 0
+            note = f"hilstar: {dropped} lines found nobody to read them\n".encode() if dropped else b""
+            for data in (piece, note):
+                _write_all(data)
+            with self._changed:
+                self._waiting_bytes -= len(piece)
+                self._changed.notify_all()
+
+
+def _write_all(data: bytes) -> None:
+    with contextlib.suppress(OSError):  # nobody is there to be told
+        while data:
+            try:
+                data = data[os.write(DESCRIPTOR, data[:PIECE_BYTES]) :]
+            except BlockingIOError:  # whoever shares it has made it so
+                time.sleep(0.01)
+
+
+_queued: QueuedStderr | None = None
+
+
+def queue_stderr() -> None:
+    """From here on what this process writes to `sys.stderr` waits for nobody."""
+    global _queued  # noqa: PLW0603 - a process has one stderr
+    if _queued is None and sys.stderr is not None:
+        _queued = QueuedStderr()
+        encoding = getattr(sys.stderr, "encoding", None) or "utf-8"
+        sys.stderr = io.TextIOWrapper(io.BufferedWriter(_queued), encoding, "backslashreplace", line_buffering=True)
+        atexit.register(finish_stderr, LAST_WORDS_S)
+
+
+def finish_stderr(patience_s: float) -> None:
+    """Wait until what was written has left, at most so long."""
+    if _queued is not None:
+        with contextlib.suppress(OSError, ValueError):
+            sys.stderr.flush()
+        _queued.finish(patience_s)

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from hilstar.arrays import FloatArray
 from hilstar.bench.output import make_directory, write_codes_png
-from hilstar.errors import InputError
+from hilstar.errors import InputError, MachineError
 from hilstar.monitor.calibration import load_calibration
 from hilstar.monitor.calibration_file import Head, NotesTable, write_calibration
 from hilstar.monitor.fit import ChannelFit, fit_channel
@@ -222,7 +222,7 @@ def patch_image(code: int, channel: str, resolution_px: tuple[int, int], bits: i
 def show_patches(steps: Sequence[tuple[int, str]], bits: int, display: int | str, seconds: float | None) -> int:
     """Show each patch on a display until space is pressed, or for so many seconds; q ends it. How many were shown.
 
-    Raises MachineError without a display, InputError for one that is not there.
+    Raises MachineError without a display or where that goes away, InputError for one that is not there.
     """
     with Window(WindowSettings((640, 480), bits, display)) as window:
         size_px = window.size_px
@@ -253,6 +253,8 @@ def _patch_stays(window: Window, presenter: Presenter, seconds: float | None) ->
                 return False
             if key == "space":
                 return True
+        if window.gone is not None:
+            raise MachineError(window.gone)
         if window.closing:
             return False
         time.sleep(PATCH_POLL_S)

@@ -198,6 +198,8 @@ class FrameLoop:
         swap_ns = screen.swap()
         if screen.closing:
             self.stop.set()
+        if screen.window.gone is not None:
+            self.notices.begin("window-gone", f"{screen.window.gone}: the run ends")
         return swap_ns
 
     def screen_summary(self) -> dict[str, Any]:

@@ -142,6 +142,8 @@ class Screen:
         self._start_clock(int(times[-1]))
         if not by_screen:
             log.warning("the display has no refresh of its own (swaps take %.2f ms): frames are paced by software", period_ms)
+        if self.window.gone is not None:
+            raise MachineError(self.window.gone)
         for fault in self._faults(wanted_ms):
             if not force:
                 raise MachineError(f"{fault}; or add --force")

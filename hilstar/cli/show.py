@@ -15,7 +15,7 @@ import typer
 from hilstar.cli.common import LOG_HELP, MAX_SEED, BenchFile, Headless, Json, QuaternionText, RadecText, app, attitude_of
 from hilstar.console import print_json, progress, report, say
 from hilstar.endings import CSV, FITS, MCAP, PNG, check_directory, check_ending
-from hilstar.errors import InputError
+from hilstar.errors import InputError, MachineError
 from hilstar.interrupts import stop_on_signal
 from hilstar.notices import Notices
 
@@ -153,11 +153,16 @@ def optional_ledger(path: Path | None, bench: Any, notices: Notices) -> Iterator
             ledger.close()
 
 
-def end_of_run(summary: dict[str, Any], ledger: Any, as_json: bool) -> None:
-    """The summary of a run whose ledger is closed; exit code 1 where that has failed."""
+def end_of_run(summary: dict[str, Any], screen: Any, ledger: Any, as_json: bool) -> None:
+    """The summary of a run whose ledger is closed; exit code 1 where that has failed.
+
+    Raises MachineError where its window went away.
+    """
     if ledger is not None:
         summary |= {"ledger": ledger.summary()}
     report(summary, as_json)
+    if screen is not None and screen.window.gone is not None:
+        raise MachineError(f"the run ended early: {screen.window.gone}")
     if ledger is not None and ledger.failure is not None:
         raise typer.Exit(1)
 
@@ -203,7 +208,7 @@ def serve(
         say_what_clips(bench)
         with progress("serving", min(limit.slots, limit.frames)) as advance:
             summary = serve_stream(bench, link, limit, lambda shown: advance(shown.number + 1), Outlet(screen, kept, notices))
-    end_of_run(summary, kept, as_json)
+    end_of_run(summary, screen, kept, as_json)
     if not summary["packets"]["accepted"]:
         raise typer.Exit(NO_ATTITUDE)
 
@@ -250,4 +255,4 @@ def replay(
             advance(shown.number + 1)
 
         summary = replay_log(bench, play, sink, Outlet(screen, kept, notices))
-    end_of_run(summary, kept, as_json)
+    end_of_run(summary, screen, kept, as_json)

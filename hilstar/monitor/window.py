@@ -15,7 +15,7 @@ from typing import Any, Self
 import glfw
 
 from hilstar.errors import InputError, MachineError
-from hilstar.monitor.x11 import is_composited, sync_control
+from hilstar.monitor.x11 import Survival, is_composited, sync_control
 
 TITLE = "hilstar"
 NO_DISPLAY = "no display to open a window on; set DISPLAY, or run with --headless"
@@ -93,8 +93,8 @@ def _pair(values: Any) -> tuple[int, int]:
 class Window:
     """A window whose GL context is current in the thread that opened it. Free it with `close`.
 
-    `lost` is true while its display is unplugged. Raises MachineError without a display or GL, InputError for a display
-    that is not there.
+    `lost` is true while its display is unplugged; `gone` says why the window is no more. Raises MachineError without a
+    display or GL, InputError for a display that is not there.
     """
 
     def __init__(self, settings: WindowSettings) -> None:
@@ -104,6 +104,8 @@ class Window:
         self._ramp: tuple[Any, Any] | None = None
         self._changed = False  # a monitor came or went
         self.lost = False
+        self.gone: str | None = None
+        self._survival: Survival | None = None
         try:
             self._open()
         except BaseException:
@@ -140,6 +142,8 @@ class Window:
         glfw.set_monitor_callback(self._on_monitor)
         x_display: Any = glfw.get_x11_display
         self._x_display = x_display() if glfw.get_platform() == glfw.PLATFORM_X11 else None
+        if self._x_display:
+            self._survival = Survival(self._x_display, self._on_end)
         self._sync = sync_control(self._x_display, glfw.get_glx_window(self._window) if self._x_display else None)
         if monitor is not None:
             self._set_identity_ramp(monitor)
@@ -154,6 +158,10 @@ class Window:
         straight = [value / (size - 1) for value in range(size)]
         identity: Any = (straight, straight, straight)
         glfw.set_gamma_ramp(monitor, identity)
+
+    def _on_end(self, why: str) -> None:
+        if self.gone is None:
+            self.gone = why
 
     def _on_monitor(self, monitor: Any, event: int) -> None:
         self._changed = True
@@ -205,8 +213,8 @@ class Window:
 
     @property
     def closing(self) -> bool:
-        """True once somebody closed it."""
-        return bool(glfw.window_should_close(self._window))
+        """True once somebody closed it, or it is gone."""
+        return self.gone is not None or bool(glfw.window_should_close(self._window))
 
     @property
     def composited(self) -> bool:
@@ -232,10 +240,11 @@ class Window:
 
         `wait` returns once the swap is done, where `glfwSwapBuffers` itself may come back before.
         """
-        glfw.swap_buffers(self._window)
-        wait()
+        if self.gone is None:
+            glfw.swap_buffers(self._window)
+            wait()
         now_ns = time.monotonic_ns()
-        if self._sync is not None:
+        if self._sync is not None and self.gone is None:
             swap_ns = self._sync.swap_ns()
             if swap_ns is None:
                 log.warning("GLX_OML_sync_control gives no time; the host's clock after the swap is used")
@@ -246,12 +255,15 @@ class Window:
 
     def look_at_events(self) -> None:
         """Take in keys, and monitors that come and go."""
-        glfw.poll_events()
-        if self._changed:
+        if self.gone is None:
+            glfw.poll_events()
+        if self._changed and self.gone is None:
             self._follow_display()
 
     def close(self) -> None:
         """Give the monitor its gamma ramp back, and close."""
+        if self.gone is not None:  # nobody is there who could be told
+            return
         if self._ramp is not None:
             monitor, ramp = self._ramp
             self._ramp = None

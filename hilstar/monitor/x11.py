@@ -1,4 +1,5 @@
-"""What only X11 and GLX can say, through ctypes: when a swap reached the screen, and whether something composes windows.
+"""What only X11 and GLX can say, through ctypes: when a swap reached the screen, whether something composes windows, and
+that the server or the window is gone.
 
 Each answer is None or False where the system has no such thing: Wayland, or a driver without the extension.
 """
@@ -7,6 +8,7 @@ from __future__ import annotations
 
 import ctypes
 import time
+from collections.abc import Callable
 from typing import Any
 
 GL_LIBRARY, X11_LIBRARY = "libGL.so.1", "libX11.so.6"
@@ -14,6 +16,52 @@ SYNC_EXTENSION = b"GLX_OML_sync_control"
 NS_PER_US = 1000
 # A UST that is not of this host's monotonic clock, or of another swap, is not to be believed.
 LARGEST_UST_AGE_NS = 1_000_000_000
+BAD_WINDOW, BAD_DRAWABLE, FIRST_EXTENSION_ERROR = 3, 9, 128  # X.h; those of extensions are GLX's here
+SERVER_GONE = "the X server is gone, or has closed the window's connection"
+WINDOW_GONE = "the window is gone: another program has destroyed it"
+
+
+class _ErrorEvent(ctypes.Structure):
+    """XErrorEvent of Xlib."""
+
+    _fields_ = (
+        ("type", ctypes.c_int),
+        ("display", ctypes.c_void_p),
+        ("resource", ctypes.c_ulong),
+        ("serial", ctypes.c_ulong),
+        ("error", ctypes.c_ubyte),
+        ("request", ctypes.c_ubyte),
+        ("minor", ctypes.c_ubyte),
+    )
+
+
+_IoHandler = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p)
+_ExitHandler = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)
+_ErrorHandler = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.POINTER(_ErrorEvent))
+
+
+class Survival:
+    """Xlib ends the process where the server or a window goes away; while this is kept, it calls `on_end(why)` instead."""
+
+    def __init__(self, x_display: int, on_end: Callable[[str], None]) -> None:
+        def io_error(display: int) -> int:
+            on_end(SERVER_GONE)
+            return 0
+
+        def error(display: int, event: Any) -> int:
+            code = event.contents.error
+            if code in {BAD_WINDOW, BAD_DRAWABLE} or code >= FIRST_EXTENSION_ERROR:
+                on_end(WINDOW_GONE)
+            return 0
+
+        library: Any = ctypes.CDLL(X11_LIBRARY)
+        self._handlers = _IoHandler(io_error), _ExitHandler(lambda display, data: None), _ErrorHandler(error)
+        library.XSetIOErrorHandler.argtypes, library.XSetErrorHandler.argtypes = [_IoHandler], [_ErrorHandler]
+        library.XSetIOErrorHandler(self._handlers[0])
+        library.XSetErrorHandler(self._handlers[2])
+        if hasattr(library, "XSetIOErrorExitHandler"):  # libX11 1.7 of 2020; before it the process ends all the same
+            library.XSetIOErrorExitHandler.argtypes = [ctypes.c_void_p, _ExitHandler, ctypes.c_void_p]
+            library.XSetIOErrorExitHandler(x_display, self._handlers[1], None)
 
 
 class SyncControl:

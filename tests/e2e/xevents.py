@@ -81,6 +81,16 @@ class Client:
         event.client = ClientMessage(CLIENT_MESSAGE, 0, 1, self._display, self.window(), protocols, 32, (delete, 0, 0, 0, 0))
         self._send(event, 0)
 
+    def destroy_window(self) -> None:
+        """As a program does that takes the bench's window for its own."""
+        self._x11.XDestroyWindow(self._display, self.window())
+        self._x11.XSync(self._display, 0)
+
+    def kill_client(self) -> None:
+        """As xkill does."""
+        self._x11.XKillClient(self._display, self.window())
+        self._x11.XSync(self._display, 0)
+
     def _send(self, event: Event, mask: int) -> None:
         assert self._x11.XSendEvent(self._display, self.window(), 0, mask, ctypes.byref(event))
         self._x11.XSync(self._display, 0)
@@ -100,6 +110,8 @@ def client(display: str) -> Iterator[Client]:
         ("XKeysymToKeycode", ctypes.c_ubyte, [pointer, number]),
         ("XInternAtom", number, [pointer, ctypes.c_char_p, ctypes.c_int]),
         ("XSendEvent", ctypes.c_int, [pointer, number, ctypes.c_int, ctypes.c_long, pointer]),
+        ("XDestroyWindow", ctypes.c_int, [pointer, number]),
+        ("XKillClient", ctypes.c_int, [pointer, number]),
         ("XSync", ctypes.c_int, [pointer, ctypes.c_int]),
     ):
         function = getattr(x11, name)

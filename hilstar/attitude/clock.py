@@ -165,7 +165,7 @@ class ExchangeFilter:
     def observe(self, host_ns: int, offset_ns: float, delay_ns: int) -> None:
         """Take in one exchange: its middle, its offset, and its delay there and back."""
         self.count += 1
-        if self.line is not None and abs(offset_ns - self.line.at(host_ns)) > max(delay_ns, 5 * NS_PER_MS):
+        if self._contradicts(host_ns, offset_ns, delay_ns):
             self.restart()
         self._exchanges.append((host_ns, offset_ns, delay_ns))
         while host_ns - self._exchanges[0][0] > WINDOW_NS:
@@ -181,7 +181,18 @@ class ExchangeFilter:
         level = float(np.mean(y - drift * x))
         # The truth lies within half the delay of each exchange's own offset, whatever the two ways took.
         bounds = np.abs(y - drift * x - level) + 0.5 * np.array([delay for *_, delay in quick])
-        self.line = OffsetLine(host_ns, offset_ns + level, drift, float(bounds[-RECENT_EXCHANGES:].max()))
+        uncertainty_ns = float(bounds[-RECENT_EXCHANGES:].max())
+        if not drift and len(y) > 1:
+            uncertainty_ns += abs(float(y[-1] - y[-2]))  # it may go on like that
+        self.line = OffsetLine(host_ns, offset_ns + level, drift, uncertainty_ns)
+
+    def _contradicts(self, host_ns: int, offset_ns: float, delay_ns: int) -> bool:
+        """No drift explains that exchange: the clock was set, by however little."""
+        line = self.line
+        if line is None:
+            return False
+        drifted_ns = STEEPEST_DRIFT * (host_ns - line.host_ns)
+        return abs(offset_ns - line.at(host_ns)) > delay_ns / 2 + line.uncertainty_ns + drifted_ns
 
     def current_line(self, host_ns: int) -> OffsetLine | None:
         """The line while enough exchanges are fresh, else None."""

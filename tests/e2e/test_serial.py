@@ -120,6 +120,26 @@ def test_nothing_wrong_is_drawn_over_a_bad_cable(cable, bench_file):
     assert angle_between_rad(first, propagate(from_radec_roll_deg(*START_DEG), rate, 0.0)) < np.radians(60)
 
 
+def test_a_line_that_filled_up_while_the_display_was_made_ready_misleads_nobody(cable, bench_file):
+    """A second and a half of packets in the kernel's buffer and at the sender, which had to wait for room."""
+    with load(bench_file) as bench, SerialLink(str(cable.host), BAUD) as link, SerialSender(str(cable.bench), BAUD) as road:
+        stop = threading.Event()
+        faults = BadCable(Faults(0, 0, 0), np.random.default_rng(7), road.put)
+        sender = threading.Thread(target=send, args=(faults, spin_samples(np.zeros(3), 200.0, START_DEG), stop))
+        sender.start()
+        time.sleep(1.5)
+        shown = []
+        summary = serve(bench, link, Limit(slots=240), shown.append)
+        stop.set()
+        sender.join()
+    assert summary["packets"]["refused"] == 0
+    assert summary["clock"]["jumps"] == 0
+    # Both ends have one clock; what is left after the first seconds is the line's delay, or half of an exchange's.
+    assert abs(summary["clock"]["offset_ms"]) < summary["clock"]["uncertainty_ms"] + 2.0
+    assert shown[-1].attitude.age_ns < 100_000_000
+    assert summary["receive_latency_ms"]["p50"] < 10
+
+
 def test_a_device_that_goes_and_comes_back_is_picked_up_within_a_second(tmp_path, cable, bench_file):
     with serving(bench_file) as process:
         assert sent(cable, "--spin", "z,1", "--rate", "100", "--count", "50")["sent"] == 50

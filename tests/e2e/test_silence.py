@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import signal
 import threading
 import time
@@ -16,6 +17,7 @@ from hilstar.attitude.quaternion import from_radec_roll_deg
 from hilstar.bench.assembly import load
 from hilstar.bench.loop import Limit
 from hilstar.bench.server import serve
+from tests.conftest import run_hilstar
 from tests.e2e.test_serve import packet, publisher, serving, summary_of
 
 ORION = tuple(from_radec_roll_deg(84.0, -1.0, 0.0))
@@ -158,3 +160,12 @@ def test_a_shared_clock_is_said_in_the_summary(tmp_path):
     clock = summary["clock"]
     assert (clock["mode"], clock["offset_ms"], clock["uncertainty_ms"]) == ("shared", 0, 0)
     assert 0 < summary["receive_latency_ms"]["p50"] < 50
+
+
+def test_a_replay_says_when_its_attitude_comes(tmp_path, small_bench_file):
+    log = tmp_path / "log.csv"
+    log.write_text("t_s,qw,qx,qy,qz\n0,1,0,0,0\n0.1,1,0,0,0\n")
+    result = run_hilstar("replay", small_bench_file, log, "--headless", "--json")
+    assert result.returncode == 0, result.stderr
+    assert json.loads(result.stdout)["events"]["first-attitude"] == 1
+    assert "the first attitude has come" in result.stderr

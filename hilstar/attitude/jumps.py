@@ -34,6 +34,7 @@ FOUND_LATE_NS = NS_PER_S
 WAITED_UNKNOWN_NS = 2**62  # a message that was there before anybody listened
 TRUSTED_WAIT_NS = NS_PER_MS  # the clock's filter of minima deals with what is shorter
 CLEARLY_LATE_FOR_NS = 3 * LATE_FOR_NS  # late by the same, where t_ns itself shows no jump: a sender that was stopped
+UNKNOWN_DRIFT = 1e-4  # while nothing comes, the clocks part by so much of the time
 PACE_SLOTS = 9
 FOLLOWED_NS = 60 * NS_PER_S  # what a slow clock may fall behind before it is known to be slow; more is a jump
 ODD_PACE = 0.004  # of itself, steadily: twice what a crystal is allowed, so t_ns runs slow or fast
@@ -128,6 +129,7 @@ class JumpFilter:
         self.correction_ns = 0  # continuous time minus the bench's
         self.jumps = 0
         self.spread_ns = 0.0
+        self.clock_known = False  # by exchanges: what comes ever later, in its usual steps, queues on the road
         self._pace = Pace()
         self._model = OneWayFilter()
         self._base_ns: int | None = None
@@ -138,6 +140,7 @@ class JumpFilter:
         self._doubtful: list[tuple[Arrived, float]] = []
         self._first_ns: int | None = None  # when the first timely message came
         self._near_count = 0
+        self._near_ns: int | None = None  # when the last one came that was neither late nor early
         self._shows_none = False  # t_ns itself went on as usual where the samples in doubt began
         self._resumes = False
 
@@ -161,7 +164,7 @@ class JumpFilter:
         late_ns = self._late_ns(arrived)
         if arrived.timely:
             self._pace.add(arrived.host_ns, arrived.host_ns - arrived.sample.t_ns)
-        if self.slowness > 0 and arrived.timely and MIN_LIMIT_NS < late_ns < FOLLOWED_NS:
+        if self.slowness > 0 and not self.clock_known and arrived.timely and MIN_LIMIT_NS < late_ns < FOLLOWED_NS:
             return [*self._carry_on(late_ns, self.release()), self._accept(arrived)]
         if self._usual(arrived, late_ns):
             return [*self._contradicted(), self._accept(arrived)]
@@ -171,7 +174,7 @@ class JumpFilter:
             late_ns = self._late_ns(arrived)
         if not self._doubtful:
             self._shows_none = self._steps.show_no_jump(late_ns)
-            if self._shows_none and late_ns <= UNSETTLED_NS:
+            if self._shows_none and (late_ns <= UNSETTLED_NS or self.clock_known):
                 return [*decided, self._accept(arrived)]
         self._doubtful.append((arrived, late_ns))
         if self._is_jump(arrived.host_ns):
@@ -192,11 +195,16 @@ class JumpFilter:
 
     def _usual(self, arrived: Arrived, late_ns: float) -> bool:
         """What comes so is no reason for doubt."""
+        limit_ns = self._limit_after_silence_ns(arrived.host_ns)
         if late_ns >= 0:
-            return late_ns <= self._limit_ns + arrived.waited_ns
+            return late_ns <= limit_ns + arrived.waited_ns
         if self._model.guessed:
             return -late_ns <= GUESSED_LATE_NS
-        return -late_ns <= (self._limit_ns if self.settled else FOUND_LATE_NS)
+        return -late_ns <= (limit_ns if self.settled else FOUND_LATE_NS)
+
+    def _limit_after_silence_ns(self, host_ns: int) -> float:
+        silent_ns = 0 if self._near_ns is None else host_ns - self._near_ns
+        return self._limit_ns + UNKNOWN_DRIFT * silent_ns
 
     def _agrees(self, arrived: Arrived, late_ns: float) -> bool:
         """This one supports the samples in doubt: it is off by the same, and goes on from them."""
@@ -238,8 +246,9 @@ class JumpFilter:
     def _learn(self, host_ns: int, late_ns: float) -> None:
         if self._first_ns is None:
             self._first_ns = host_ns
-        if late_ns > self._limit_ns:
+        if late_ns > self._limit_after_silence_ns(host_ns):
             return
+        self._near_ns = host_ns
         self._resumes = False
         self._usual_ns.append(max(late_ns, 0.0))
         self._near_count += 1

@@ -186,7 +186,7 @@ class Receiver:
         if isinstance(offset_ms, float):
             told["offset_ms"] = offset_ms + self.jumps.correction_ns / NS_PER_MS
         uncertainty_ms = told["uncertainty_ms"]
-        if self.jumps.slowness > 0 and isinstance(uncertainty_ms, float):
+        if self.jumps.slowness > 0 and told["mode"] == "one-way" and isinstance(uncertainty_ms, float):
             told["uncertainty_ms"] = uncertainty_ms + 2 * MIN_LIMIT_NS / NS_PER_MS  # a step, and what is missing to the next
         return told | {"jumps": self.jumps.jumps}
 
@@ -233,14 +233,18 @@ class Receiver:
             waited_ns = WAITED_UNKNOWN_NS
         elif self.clock.unheard:
             self._quick_asks, self._next_ask_ns = FIRST_ASKS, host_ns  # now somebody is there to answer
+        self.jumps.clock_known = self.clock.synchronised
         self._settle(self.jumps.take(Arrived(sample, host_ns, raw, None, waited_ns)))
-        self._tell_pace(self.jumps.slowness)
+        if not self.clock.synchronised:
+            self._tell_pace(self.jumps.slowness)
 
     def _tell_pace(self, slowness: float) -> None:
         if not slowness:
             return
-        kind = "source-slow" if slowness > 0 else "source-fast"
-        self._notices.begin(kind, f"the sender's clock goes at {1 - slowness:.3g} of its speed; it is followed in small steps")
+        detail = f"t_ns goes on at {1 - slowness:.3g} of real time; it is followed in small steps"
+        if slowness > 0:
+            detail += " (a slow clock, or a road that cannot carry all packets)"
+        self._notices.begin("source-slow" if slowness > 0 else "source-fast", detail)
 
     def _take(self, arrival: Arrival, waited_ns: int) -> None:
         match arrival.event:

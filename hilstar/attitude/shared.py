@@ -24,6 +24,7 @@ class SharedTimes:
     slowness = spread_ns = 0.0
 
     def __init__(self, notices: Notices) -> None:
+        self.clock_known = True
         self._notices = notices
         self._off_since_ns: int | None = None
         self._off = 0

@@ -73,9 +73,9 @@ def _serve_stream(
     settings, ledger = bench.config.attitude, outlet.ledger
     timeline = Timeline(policy_of(settings))
     watch = nobody_watches if ledger is None else ledger.packet
-    receiver = Receiver(
-        link, timeline, Traffic(settings.status_hz, settings.time_requests, settings.clock == "shared"), watch, outlet.notices
-    )
+    shared = settings.clock == "shared"
+    traffic = Traffic(settings.status_hz, settings.time_requests and not shared, shared)
+    receiver = Receiver(link, timeline, traffic, watch, outlet.notices)
     statuses = StatusMaker(ledger)
 
     def draw_slot(slot: int) -> None:

@@ -53,6 +53,7 @@ class Truth:
             read_ns = max(next_ns, read_ns)
             jumps = self.jumps.jumps
             sample = AttitudeSample(self.times(sent_ns), Q, None, k)
+            self.jumps.clock_known = self.clock.synchronised
             for each in self.jumps.take(Arrived(sample, read_ns, waited_ns=waited_ns)):
                 newest_ns = self._settle(each, newest_ns)
             if self.jumps.jumps > jumps:
@@ -178,6 +179,39 @@ def test_a_road_that_is_20_ms_slower_for_a_while_is_no_jump_and_no_reason_to_ref
     assert run.beyond_ms() < ALLOWED_MS
     assert (run.refused, run.jumps.jumps) == (0, 0)
     assert np.abs(run.error_ms[400:]).max() < ALLOWED_MS
+
+
+@pytest.mark.parametrize("ppm", [30, -30])
+@pytest.mark.parametrize("silent_s", [600, 3600])
+def test_clocks_that_parted_in_a_long_silence_are_no_jump(ppm, silent_s):
+    """After two seconds no drift is known; an hour makes 108 ms of it. Half a second later it is within what is said."""
+    pause_ns = silent_s * NS_PER_S
+
+    def read(arrival_ns: int) -> tuple[int, int]:
+        return arrival_ns + pause_ns * (arrival_ns > HOST0_NS + 2.2 * NS_PER_S), 0
+
+    def times(host_ns: int) -> int:
+        """Of a packet sent at a time without the pause, and of a time with it."""
+        paused = host_ns > HOST0_NS + 2.2 * NS_PER_S and host_ns < HOST0_NS + pause_ns
+        host_ns += pause_ns * paused
+        return host_ns + (host_ns - HOST0_NS) * ppm // 1_000_000
+
+    run = Truth(times, read)
+    assert (run.refused, run.jumps.jumps) == (0, 0)
+    assert run.beyond_ms(*(silent_s + 2.2 + 0.1 * k for k in range(5))) < ALLOWED_MS
+
+
+def test_packets_that_queue_on_a_slow_road_are_no_slow_clock_where_exchanges_say_so():
+    """A line that carries nine of ten packets: each is later than the one before, until it is full after 0.35 s."""
+
+    def read(arrival_ns: int) -> tuple[int, int]:
+        behind_ns = min(max(arrival_ns - HOST0_NS - 4 * NS_PER_S, 0) // 10, 350 * NS_PER_MS)
+        return arrival_ns + behind_ns, 0
+
+    run = Truth(lambda host: host, read, exchanges=True)
+    assert run.clock.synchronised
+    assert (run.refused, run.jumps.jumps, run.jumps.correction_ns) == (0, 0, 0)
+    assert run.beyond_ms() < ALLOWED_MS
 
 
 def test_a_short_run_does_not_say_how_well_it_knows():

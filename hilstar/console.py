@@ -60,6 +60,11 @@ def report(summary: dict[str, Any], as_json: bool) -> None:
         absolute = "" if summary["clock"]["mode"] in {"exchange", "shared"} else " above the minimum"
         lines["receive latency"] = f"{spread('receive_latency_ms')} ms (p50 / p99 / max){absolute}"
         lines["bench clock"] = clock_line(summary["clock"])
+    for name in ("operator", "hidden"):
+        lasted = summary.get("screen", {}).get(name, {"frames": 0})
+        if lasted["frames"]:
+            what = "changed by an operator's keys" if name == "operator" else "not seen whole"
+            lines[name] = f"{lasted['frames']} frames, {lasted['s']:.1f} s, {what}"
     lines["renderer"] = summary["gl_renderer"]
     for name, line in lines.items():
         typer.echo(f"{name:20}{line}")

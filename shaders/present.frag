@@ -50,12 +50,15 @@ void main() {
     bool inside = all(lessThan(uvec2(pixel), uvec2(size_px)));  // what is negative is huge without its sign
     uvec3 codes = inside ? codes_of(texelFetch(levels, pixel, 0).r) : uvec3(0u);
 #ifdef AIDS
-    if ((overlay & 4) != 0) codes = uvec3(0u);
+    bool blank = (overlay & 4) != 0, on_patch = (overlay & 8) != 0 && !blank;
+    if (on_patch) codes = uvec3(patch_code);
+    if (blank) codes = uvec3(0u);
     uint line = uint(float(LINE) / 255.0 * white);
     ivec2 offset = abs(pixel - cross_px);  // GLSL leaves the remainder of a negative number open
-    if ((overlay & 2) != 0 && (offset.x % GRID_PX == 0 || offset.y % GRID_PX == 0)) codes = max(codes, uvec3(line));
-    if ((overlay & 1) != 0 && (offset.x == 0 || offset.y == 0)) codes = max(codes, uvec3(line));
-    if ((overlay & 8) != 0) codes = uvec3(patch_code);
+    bool on_line = (overlay & 2) != 0 && (offset.x % GRID_PX == 0 || offset.y % GRID_PX == 0);
+    on_line = on_line || ((overlay & 1) != 0 && (offset.x == 0 || offset.y == 0));
+    // On a patch as bright as a line, a dark one.
+    if (on_line) codes = on_patch && patch_code >= line ? uvec3(0u) : max(codes, uvec3(line));
 #endif
     colour = vec4(vec3(codes) / white, 1.0);
 }

@@ -28,7 +28,7 @@ def serve_lockstep(
     counts = PacketCounts()
     statuses = StatusMaker(ledger)
     turn_ms = RunningSpread()
-    last = Shown(0, 0, None, bench.draw(None))
+    last = Shown(0, 0, None, bench.draw(None), missing=True)
     begin_ns = time.monotonic_ns()
     end_ns = begin_ns + limit.slots / bench.config.monitor.refresh_hz * NS_PER_S
     while loop.stats.frames < limit.frames and time.monotonic_ns() < end_ns and not loop.stop.is_set():

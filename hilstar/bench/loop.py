@@ -7,13 +7,14 @@ import math
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 from hilstar.attitude.clock import NS_PER_MS, NS_PER_S
 from hilstar.attitude.timeline import Attitude, Policy, StaleGate
 from hilstar.bench.assembly import Bench, Drawn, Prepared
 from hilstar.bench.config import AttitudeSettings
+from hilstar.bench.overrides import HEADLESS, OnScreen, Overrides
 from hilstar.bench.pacing import wait_until
 from hilstar.bench.presence import AttitudeWatch
 from hilstar.bench.priority import steady_loop
@@ -32,7 +33,8 @@ class Shown:
 
     Host times, ns: `draw_ns` when drawing began, `predicted_swap_ns` and `swap_ns` when the frame was to be swapped onto the
     screen and when it was; headless, with nothing predicted, when its levels were ready. `missed_before` counts the refresh
-    periods just before it that had no frame of their own, and `marker` is the photodiode square's light, 0 or 1.
+    periods just before it that had no frame of their own, and `marker` is the photodiode square's light, 0 or 1. `missing`
+    is true where no attitude has come yet; `attitude` is None too where an operator's key hides the sky.
     """
 
     number: int
@@ -46,6 +48,8 @@ class Shown:
     timestamp_source: str = "headless"
     missed_before: int = 0
     marker: int | None = None
+    missing: bool = False
+    on_screen: OnScreen = HEADLESS
 
 
 FrameSink = Callable[[Shown], None]
@@ -93,7 +97,7 @@ class FrameLoop:
         self._gave_up = False
         self._period_ns = NS_PER_S / bench.config.monitor.refresh_hz
         self.watch = FrameWatch(self._period_ns, self.notices)
-        self._held: Attitude | None = None  # what a paused screen shows
+        self.overrides = Overrides(screen, self.notices)
         self._blank_when_stale = settings.on_stale == "blank"
         wanted = bench.config.render.motion
         self._moving = (wanted == "on" or (wanted == "auto" and screen is not None)) if moving is None else moving
@@ -113,12 +117,12 @@ class FrameLoop:
         begin_ns = time.monotonic_ns()
         self._presence.see(attitude)
         screen = self._screen
-        if screen is not None and screen.paused:
-            attitude = None if self._held is None else replace(self._held, rate_cam_rad_s=None)
-        self._held = attitude
-        stale = self.gate.update(attitude)
-        blank = attitude is None or (stale and self._blank_when_stale)
-        prepared = self._prepared(None if blank else attitude)
+        stale, missing = self.gate.update(attitude), attitude is None
+        on_screen = self.overrides.now
+        attitude = self.overrides.attitude(t_ns, attitude)
+        if stale and self._blank_when_stale and not (screen is not None and screen.paused):
+            attitude = None
+        prepared = self._prepared(attitude)
         if self._given_up(number):
             return None
         self.watch.enter("draw")
@@ -132,7 +136,7 @@ class FrameLoop:
         shown = Shown(
             number=number,
             t_ns=t_ns,
-            attitude=None if blank else attitude,
+            attitude=attitude,
             drawn=drawn,
             draw_ns=begin_ns,
             predicted_swap_ns=predicted_ns,
@@ -141,8 +145,11 @@ class FrameLoop:
             timestamp_source="headless" if screen is None else screen.timestamp_source,
             missed_before=self._missed_before,
             marker=None if screen is None else screen.marker,
+            missing=missing,
+            on_screen=on_screen,
         )
-        self._count(shown, attitude)
+        self._count(shown)
+        self.overrides.count(on_screen, swap_ns)
         self.watch.enter("output")
         self._sink(shown)
         return shown
@@ -167,8 +174,8 @@ class FrameLoop:
         )
         return True
 
-    def _count(self, shown: Shown, attitude: Attitude | None) -> None:
-        drawn = shown.drawn
+    def _count(self, shown: Shown) -> None:
+        drawn, attitude = shown.drawn, shown.attitude
         age_ns = None if attitude is None else attitude.age_ns
         self.stats.add(shown.swap_ns - shown.draw_ns, age_ns, drawn.star_count, drawn.clipped_hip)
         self.stats.stale_frames += shown.stale
@@ -196,18 +203,22 @@ class FrameLoop:
             wait_until(self._predicted_swap_ns, self.stop)
         self.watch.enter("swap")
         swap_ns = screen.swap()
+        self._look_at(screen)
+        return swap_ns
+
+    def _look_at(self, screen: Screen) -> None:
+        """End the run with its window."""
         if screen.closing:
             self.stop.set()
         if screen.window.gone is not None:
             self.notices.begin("window-gone", f"{screen.window.gone}: the run ends")
-        return swap_ns
 
     def screen_summary(self) -> dict[str, Any]:
         """What a run on a screen has to say besides; {} without one."""
         if self._screen is None:
             return {}
         named = {"timestamp_source": self._screen.timestamp_source, "scheduling": self.scheduling}
-        return {"screen": named | self.stats.swaps.summary()}
+        return {"screen": named | self.stats.swaps.summary() | self.overrides.summary()}
 
     def idle(self) -> None:
         """Keep the window alive while no frame is due."""
@@ -215,8 +226,8 @@ class FrameLoop:
         if self._screen is not None:
             self._screen.present(0)
             self._screen.swap()
-            if self._screen.closing:
-                self.stop.set()
+            _ = self.overrides.now
+            self._look_at(self._screen)
 
     def light_ns(self, host_ns: int) -> int:
         """When the middle row of the frame that is begun at `host_ns` lights; that moment itself without a screen."""

@@ -31,7 +31,8 @@ class FrameRecord(msgspec.Struct, kw_only=True):
     `q` is the attitude at `light_ns`, when the middle row lights, and `rate` (rad/s, cam) the turn for which paths were
     drawn, null where stars are points. `capped` counts the stars whose paths are coarser than they should be,
     `missed_before` the refresh periods before it without a frame, `missed` those of the run, and `marker` is the photodiode
-    square.
+    square. `operator` says what an operator's keys changed of the sky ("blank, grid"; under a blank or a patch `q` is null),
+    `hidden` why the window was not seen; "" for neither.
     """
 
     frame: int
@@ -56,6 +57,8 @@ class FrameRecord(msgspec.Struct, kw_only=True):
     missed_before: int = 0
     missed: int = 0
     marker: int | None = None
+    operator: str = ""
+    hidden: str = ""
 
 
 _KINDS: dict[Any, str] = {int: "integer", float: "number", int | None: "integer", str: "string", bool: "boolean"}
@@ -90,6 +93,8 @@ def frame_record(shown: Shown, light_ns: int, missed: int) -> FrameRecord:
         missed_before=shown.missed_before,
         missed=missed,
         marker=shown.marker,
+        operator=shown.on_screen.operator,
+        hidden=shown.on_screen.hidden,
     )
     if drawn.turn is not None:
         x, y, z = drawn.turn.rate_cam_rad_s.tolist()

@@ -106,6 +106,20 @@ class Screen:
             self._press(self.window.keys.popleft())
         return swap_ns
 
+    @property
+    def shows_sky(self) -> bool:
+        """False where an operator's key leaves no sky: under a blank or a test patch."""
+        return not self._overlay & BLANK and self._patch < 0
+
+    @property
+    def operator(self) -> str:
+        """What an operator's keys change of the sky, such as "grid, pause"; "" for nothing."""
+        names = {BLANK: "blank", GRID: "grid", CROSSHAIR: "crosshair"}
+        on = [name for bit, name in names.items() if self._overlay & bit]
+        if self._patch >= 0:
+            on.append(f"patch {PATCHES[self._patch]:.0%}")
+        return ", ".join([*on, "pause"] if self.paused else on)
+
     def _press(self, key: str) -> None:
         match key:
             case "q" | "escape":

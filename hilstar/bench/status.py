@@ -22,9 +22,9 @@ class StatusMaker:
     def status(self, shown: Shown, light_t_ns: int, loop: FrameLoop, counts: PacketCounts, synchronised: bool) -> Status:
         """The status after a frame whose light leaves at `light_t_ns` of the bench's clock."""
         missed, refused = loop.stats.missed_frames, counts.refused
-        attitude = shown.attitude
+        attitude, on_screen = shown.attitude, loop.overrides.now
         health = {
-            protocol.HEALTH_NO_ATTITUDE: attitude is None and not loop.gate.stale,
+            protocol.HEALTH_NO_ATTITUDE: shown.missing and not loop.gate.stale,
             protocol.HEALTH_STALE: loop.gate.stale,
             protocol.HEALTH_BLANK: attitude is None,
             protocol.HEALTH_CLOCK_SYNCHRONISED: synchronised,
@@ -32,6 +32,8 @@ class StatusMaker:
             protocol.HEALTH_REFUSED: refused > self._refused,
             protocol.HEALTH_CLIPPED: bool(shown.drawn.clipped_hip),
             protocol.HEALTH_LEDGER_FAILED: self._ledger is not None and self._ledger.failure is not None,
+            protocol.HEALTH_OPERATOR_OVERRIDE: bool(on_screen.operator),
+            protocol.HEALTH_HIDDEN: bool(on_screen.hidden),
             protocol.HEALTH_SECOND_SENDER: self._happens(loop.notices, "second-sender"),
             protocol.HEALTH_SOURCE_FROZEN: self._happens(loop.notices, "source-frozen"),
         }

@@ -15,6 +15,7 @@ from typing import Any, Self
 import glfw
 
 from hilstar.errors import InputError, MachineError
+from hilstar.monitor.visibility import Visibility
 from hilstar.monitor.x11 import Survival, is_composited, sync_control
 
 TITLE = "hilstar"
@@ -106,6 +107,8 @@ class Window:
         self.lost = False
         self.gone: str | None = None
         self._survival: Survival | None = None
+        self._visibility: Visibility | None = None
+        self._minimised = False
         try:
             self._open()
         except BaseException:
@@ -140,10 +143,14 @@ class Window:
         glfw.set_input_mode(self._window, glfw.CURSOR, glfw.CURSOR_HIDDEN if monitor else glfw.CURSOR_NORMAL)
         glfw.set_key_callback(self._window, self._on_key)
         glfw.set_monitor_callback(self._on_monitor)
+        glfw.set_window_iconify_callback(self._window, self._on_iconify)
         x_display: Any = glfw.get_x11_display
         self._x_display = x_display() if glfw.get_platform() == glfw.PLATFORM_X11 else None
         if self._x_display:
-            self._survival = Survival(self._x_display, self._on_end)
+            self._survival = Survival(self._on_end)
+            self._survival.cover(self._x_display)
+            window = glfw.get_x11_window(self._window)
+            self._visibility = Visibility.of(window, None if monitor is None else _place_of(monitor), self._survival)
         self._sync = sync_control(self._x_display, glfw.get_glx_window(self._window) if self._x_display else None)
         if monitor is not None:
             self._set_identity_ramp(monitor)
@@ -158,6 +165,18 @@ class Window:
         straight = [value / (size - 1) for value in range(size)]
         identity: Any = (straight, straight, straight)
         glfw.set_gamma_ramp(monitor, identity)
+
+    def _on_iconify(self, window: Any, minimised: int) -> None:
+        self._minimised = bool(minimised)
+
+    @property
+    def hidden(self) -> str:
+        """Why the window is not seen as it is drawn: minimised, covered, off the screen; "" where it is, or nobody can say."""
+        if self.lost:
+            return "without its display"
+        if self._minimised:
+            return "minimised"
+        return "" if self._visibility is None else self._visibility.hidden
 
     def _on_end(self, why: str) -> None:
         if self.gone is None:
@@ -181,6 +200,8 @@ class Window:
             width, height = display.resolution_px
             glfw.set_window_monitor(self._window, monitor, 0, 0, width, height, display.refresh_hz or glfw.DONT_CARE)
             self._set_identity_ramp(monitor)
+            if self._visibility is not None:
+                self._visibility.place = _place_of(monitor)
             self.lost = False
             log.warning("the display %s is back", display.name)
 
@@ -264,6 +285,8 @@ class Window:
         """Give the monitor its gamma ramp back, and close."""
         if self.gone is not None:  # nobody is there who could be told
             return
+        if self._visibility is not None:
+            self._visibility.close()
         if self._ramp is not None:
             monitor, ramp = self._ramp
             self._ramp = None
@@ -276,6 +299,11 @@ class Window:
 
     def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
         self.close()
+
+
+def _place_of(monitor: Any) -> tuple[tuple[int, int], tuple[int, int]]:
+    display = _describe(0, monitor)
+    return display.position_px, display.resolution_px
 
 
 def _find(wanted: int | str) -> tuple[Display, Any]:

@@ -18,7 +18,7 @@ NS_PER_US = 1000
 LARGEST_UST_AGE_NS = 1_000_000_000
 BAD_WINDOW, BAD_DRAWABLE, FIRST_EXTENSION_ERROR = 3, 9, 128  # X.h; those of extensions are GLX's here
 SERVER_GONE = "the X server is gone, or has closed the window's connection"
-WINDOW_GONE = "the window is gone: another program has destroyed it"
+WINDOW_GONE = "the window is gone: another program has closed it"
 
 
 class _ErrorEvent(ctypes.Structure):
@@ -43,7 +43,7 @@ _ErrorHandler = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.POINTER(_
 class Survival:
     """Xlib ends the process where the server or a window goes away; while this is kept, it calls `on_end(why)` instead."""
 
-    def __init__(self, x_display: int, on_end: Callable[[str], None]) -> None:
+    def __init__(self, on_end: Callable[[str], None]) -> None:
         def io_error(display: int) -> int:
             on_end(SERVER_GONE)
             return 0
@@ -54,14 +54,17 @@ class Survival:
                 on_end(WINDOW_GONE)
             return 0
 
-        library: Any = ctypes.CDLL(X11_LIBRARY)
-        self._handlers = _IoHandler(io_error), _ExitHandler(lambda display, data: None), _ErrorHandler(error)
-        library.XSetIOErrorHandler.argtypes, library.XSetErrorHandler.argtypes = [_IoHandler], [_ErrorHandler]
-        library.XSetIOErrorHandler(self._handlers[0])
-        library.XSetErrorHandler(self._handlers[2])
-        if hasattr(library, "XSetIOErrorExitHandler"):  # libX11 1.7 of 2020; before it the process ends all the same
-            library.XSetIOErrorExitHandler.argtypes = [ctypes.c_void_p, _ExitHandler, ctypes.c_void_p]
-            library.XSetIOErrorExitHandler(x_display, self._handlers[1], None)
+        self._library: Any = ctypes.CDLL(X11_LIBRARY)
+        self._handlers = _IoHandler(io_error), _ErrorHandler(error), _ExitHandler(lambda display, data: None)
+        self._library.XSetIOErrorHandler.argtypes, self._library.XSetErrorHandler.argtypes = [_IoHandler], [_ErrorHandler]
+        self._library.XSetIOErrorHandler(self._handlers[0])
+        self._library.XSetErrorHandler(self._handlers[1])
+
+    def cover(self, x_display: int) -> None:
+        """Outlive the end of this connection."""
+        if hasattr(self._library, "XSetIOErrorExitHandler"):  # libX11 1.7 of 2020; before it the process ends all the same
+            self._library.XSetIOErrorExitHandler.argtypes = [ctypes.c_void_p, _ExitHandler, ctypes.c_void_p]
+            self._library.XSetIOErrorExitHandler(x_display, self._handlers[2], None)
 
 
 class SyncControl:

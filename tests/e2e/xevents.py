@@ -81,6 +81,33 @@ class Client:
         event.client = ClientMessage(CLIENT_MESSAGE, 0, 1, self._display, self.window(), protocols, 32, (delete, 0, 0, 0, 0))
         self._send(event, 0)
 
+    def unmap(self) -> None:
+        """Take the bench's window off the screen."""
+        self._x11.XUnmapWindow(self._display, self.window())
+        self._x11.XSync(self._display, 0)
+
+    def map(self) -> None:
+        """And put it back."""
+        self._x11.XMapWindow(self._display, self.window())
+        self._x11.XSync(self._display, 0)
+
+    def move(self, x: int, y: int) -> None:
+        """Move the bench's window."""
+        self._x11.XMoveWindow(self._display, self.window(), x, y)
+        self._x11.XSync(self._display, 0)
+
+    def cover(self, width: int, height: int) -> int:
+        """A window of ours over the corner of the screen."""
+        window = self._x11.XCreateSimpleWindow(self._display, self._root, 0, 0, width, height, 0, 0, 0)
+        self._x11.XMapRaised(self._display, window)
+        self._x11.XSync(self._display, 0)
+        return window
+
+    def uncover(self, window: int) -> None:
+        """Take it away again."""
+        self._x11.XDestroyWindow(self._display, window)
+        self._x11.XSync(self._display, 0)
+
     def destroy_window(self) -> None:
         """As a program does that takes the bench's window for its own."""
         self._x11.XDestroyWindow(self._display, self.window())
@@ -111,6 +138,11 @@ def client(display: str) -> Iterator[Client]:
         ("XInternAtom", number, [pointer, ctypes.c_char_p, ctypes.c_int]),
         ("XSendEvent", ctypes.c_int, [pointer, number, ctypes.c_int, ctypes.c_long, pointer]),
         ("XDestroyWindow", ctypes.c_int, [pointer, number]),
+        ("XUnmapWindow", ctypes.c_int, [pointer, number]),
+        ("XMapWindow", ctypes.c_int, [pointer, number]),
+        ("XMapRaised", ctypes.c_int, [pointer, number]),
+        ("XMoveWindow", ctypes.c_int, [pointer, number, ctypes.c_int, ctypes.c_int]),
+        ("XCreateSimpleWindow", number, [pointer, number, *[ctypes.c_int] * 2, *[ctypes.c_uint] * 3, *[number] * 2]),
         ("XKillClient", ctypes.c_int, [pointer, number]),
         ("XSync", ctypes.c_int, [pointer, ctypes.c_int]),
     ):

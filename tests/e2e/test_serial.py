@@ -136,8 +136,8 @@ def test_a_line_that_filled_up_while_the_display_was_made_ready_misleads_nobody(
     assert summary["clock"]["jumps"] == 0
     # Both ends have one clock; what is left after the first seconds is the line's delay, or half of an exchange's.
     assert abs(summary["clock"]["offset_ms"]) < summary["clock"]["uncertainty_ms"] + 2.0
-    assert shown[-1].attitude.age_ns < 100_000_000
-    assert summary["receive_latency_ms"]["p50"] < 10
+    assert shown[-1].attitude.age_ns < 250_000_000
+    assert summary["receive_latency_ms"]["p50"] < 30
 
 
 def test_a_device_that_goes_and_comes_back_is_picked_up_within_a_second(tmp_path, cable, bench_file):

@@ -223,7 +223,7 @@ class Receiver:
 
     def _take_sample(self, sample: AttitudeSample, arrival: Arrival, waited_ns: int) -> None:
         host_ns, raw = arrival.host_ns, arrival.raw
-        refusal = self._repeats.judge(sample, host_ns, raw) or self._senders.judge(sample, host_ns)
+        refusal = self._repeats.judge(sample, host_ns, raw) or self._senders.judge(sample, host_ns, waited_ns)
         if refusal is not None:
             self._refuse(host_ns, raw, sample, refusal)
             return

@@ -112,8 +112,8 @@ class Senders:
         self._previous: tuple[AttitudeSample, int] | None = None
         self._two = False
 
-    def judge(self, sample: AttitudeSample, host_ns: int) -> Refusal | None:
-        """Why this one is refused: it is another sender's than the one that is shown."""
+    def judge(self, sample: AttitudeSample, host_ns: int, waited_ns: int = 0) -> Refusal | None:
+        """Why this one is refused, read at `host_ns` after it may have waited: it is another sender's than the one shown."""
         main = self._main
         self._compare(sample, host_ns)
         if main is None:
@@ -121,7 +121,7 @@ class Senders:
             return None
         if self._two and (self._other is None or host_ns - self._other.host_ns > TURNS_WITHIN_NS):
             self._part("the second sender is silent")
-        if not self._is_silent(main, host_ns):
+        if not self._is_silent(main, host_ns - waited_ns):  # who was not read for a while was not silent
             return self._assign(main, sample, host_ns)
         other = self._two and self._is_other(main, sample, host_ns)
         if other:

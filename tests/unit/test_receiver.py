@@ -27,7 +27,7 @@ Q = np.array([1.0, 0.0, 0.0, 0.0])
 
 @dataclass
 class Script:
-    """A link that hands out what it was given, one message at a time, and what its user wants to do after each."""
+    """A link that hands out what it was given, what was read at the same time at once; and what its user does after each."""
 
     arrivals: list[Arrival]
     after: Callable[[Arrival], None] = lambda arrival: None
@@ -51,8 +51,10 @@ class Script:
             self.done.set()
             time.sleep(0.002)
             return []
-        self._last = self.arrivals.pop(0)
-        return [self._last]
+        together = [arrival for arrival in self.arrivals[:2000] if arrival.host_ns == self.arrivals[0].host_ns]
+        del self.arrivals[: len(together)]
+        self._last = together[-1]
+        return together
 
     def send(self, packet: Packet) -> None:
         pass
@@ -89,7 +91,7 @@ class Run:
 
     def __init__(self, make: Callable[[int], list[Arrival]], traffic: Traffic | None = None, **script) -> None:
         self.host0_ns = time.monotonic_ns() + NS_PER_S  # after what was queued
-        arrivals = sorted(make(self.host0_ns), key=lambda arrival: arrival.host_ns)
+        arrivals = sorted(make(self.host0_ns), key=lambda arrival: (arrival.host_ns, arrival.event.t_ns))
         self.notices = Notices()
         self.timeline = Timeline(Policy(STALE_AFTER_NS, STALE_AFTER_NS))
         self.ages_ms: list[float] = []
@@ -225,6 +227,22 @@ def test_the_other_sender_is_taken_up_when_the_first_falls_silent():
     assert max(run.ages_ms[-200:]) < 10
 
 
+def test_a_receiver_that_was_stopped_does_not_think_that_the_first_sender_was_silent():
+    """1.2 s of both senders' packets are read at once, the second one's first."""
+
+    def make(t0: int) -> list[Arrival]:
+        both = Sender().packets(t0, seconds(0, 8)) + late_sender(9).packets(t0 - 2_300_000, seconds(2, 8))
+        begin_ns, end_ns = t0 + 4_006_000_000, t0 + 5_200_000_000
+        return [
+            Arrival(end_ns, arrival.event, arrival.raw) if begin_ns < arrival.host_ns < end_ns else arrival for arrival in both
+        ]
+
+    run = Run(make)
+    assert run.events == {"second-sender": 1}
+    assert abs(run.shown[-1] @ ORION) > 0.999
+    assert run.receiver.jumps.jumps == 0
+
+
 def many(t0: int, qs: list[np.ndarray], sequences: list[int], discontinuity: Callable[[int], bool] = lambda k: False):
     samples = [
         AttitudeSample(t0 + k * PERIOD_NS, q, np.zeros(3), sequence, discontinuity(k))
@@ -291,6 +309,20 @@ def test_a_receiver_that_is_stopped_while_it_is_broken_ends():
     receiver.close()
     receiver.tend()
     assert threading.active_count() < 50
+
+
+@pytest.mark.parametrize("jump_s", [-3600, 0.5, 10**9])
+def test_the_summary_s_offset_is_that_of_the_clock_after_its_jumps(jump_s):
+    def make(t0: int) -> list[Arrival]:
+        return Sender().packets(t0, seconds(0, 3)) + Sender(first=600, offset_ns=round(jump_s * NS_PER_S)).packets(
+            t0, seconds(3, 6)
+        )
+
+    run = Run(make)
+    told = run.receiver.clock_summary()
+    assert (told["jumps"], run.events, run.accepted) == (1, {"jump": 1}, 1200)
+    assert told["offset_ms"] == pytest.approx(-1000 * jump_s + 0.05, abs=0.02)
+    assert told["uncertainty_ms"] < 0.1
 
 
 SHARED = Traffic(shared_clock=True)

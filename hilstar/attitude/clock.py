@@ -102,11 +102,6 @@ class OneWayFilter:
             self.line = OffsetLine(host_ns, offset_ns, self.line.drift, uncertainty_ns)
         self._newest_above_ns.append(offset_ns - self.line.at(host_ns))
 
-    def restart(self) -> None:
-        """Forget the past."""
-        self._slots.clear()
-        self.line = None
-
     def _fit(self) -> None:
         if len(self._slots) < 2:
             return

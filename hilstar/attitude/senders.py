@@ -67,15 +67,16 @@ class _Track:
     sample: AttitudeSample
     host_ns: int
     period_ns: float | None = None
+    still: bool = True  # it does not count: its sequence is always the same
 
     def step(self, sample: AttitudeSample) -> int:
         """By how much `sequence` goes on from here, modulo 2^32, as the smaller of the two ways."""
         return (sample.sequence - self.sample.sequence + U32 // 2) % U32 - U32 // 2
 
     def goes_on(self, sample: AttitudeSample, host_ns: int) -> bool:
-        """True where this counter may have come to that sequence by now; one that is always 0 says nothing."""
+        """True where this counter may have come to that sequence by now."""
         step, later_ns = self.step(sample), sample.t_ns - self.sample.t_ns
-        if sample.sequence == 0 and step == 0:
+        if self.still and step == 0:
             return later_ns > 0
         gap_ns = max(later_ns if 0 < later_ns < LONGEST_STEP_NS else 0, host_ns - self.host_ns)
         most = FIRST_LOSSES if self.period_ns is None else 2 + 2 * gap_ns / self.period_ns
@@ -94,7 +95,7 @@ class _Track:
         if 0 < later_ns < LONGEST_STEP_NS:
             period_ns = later_ns / max(step, 1)
             self.period_ns = period_ns if self.period_ns is None else self.period_ns + (period_ns - self.period_ns) / 8
-        self.sample, self.host_ns = sample, host_ns
+        self.sample, self.host_ns, self.still = sample, host_ns, self.still and step == 0
 
 
 class Senders:
@@ -138,9 +139,8 @@ class Senders:
             before, then_ns = self._previous
             later_ns = sample.t_ns - before.t_ns
             step = _Track(before, then_ns).step(sample)
-            counted = sample.sequence != 0 or before.sequence != 0
-            backwards = counted and (step <= 0 < later_ns or later_ns < 0 < step)
-            self._at_odds |= backwards or not counted or abs(later_ns - (host_ns - then_ns)) > NS_PER_S
+            backwards = step <= 0 < later_ns or later_ns < 0 < step
+            self._at_odds |= backwards or abs(later_ns - (host_ns - then_ns)) > NS_PER_S
         self._previous = (sample, host_ns)
 
     def _is_other(self, main: _Track, sample: AttitudeSample, host_ns: int) -> bool:
@@ -154,7 +154,7 @@ class Senders:
 
     def _assign(self, main: _Track, sample: AttitudeSample, host_ns: int) -> Refusal | None:
         other = self._other
-        if sample.sequence == main.sample.sequence == 0:
+        if main.still and main.step(sample) == 0:
             is_main = self._nearer_main(main, other, sample)
         elif self._out_of_order(main, sample):
             return None
@@ -200,7 +200,7 @@ class Senders:
         self._other_spoke = self._at_odds = False
         self._turns = self._turns + 1 if host_ns - self._turn_ns < TURNS_WITHIN_NS else 1
         self._turn_ns = host_ns
-        counted = self._main is not None and self._main.sample.sequence != 0
+        counted = self._main is not None and not self._main.still
         if self._turns >= (TURNS if counted else TURNS_BY_MOTION) and not self._two:
             self._two = True
             self._notices.begin(SECOND, "two senders speak at the same time; the first is shown, the other refused (source)")

@@ -76,7 +76,7 @@ class Sender:
         found = []
         for k, after_ns in enumerate(times):
             host_ns = host0_ns + after_ns
-            sequence = self.first + k if self.counts else 0
+            sequence = self.first + k * self.counts
             sample = AttitudeSample(host_ns + self.offset_ns, self.q, np.zeros(3), sequence)
             found.append(Arrival(host_ns + delay_ns, sample, encode(sample)))
         return found
@@ -227,6 +227,21 @@ def test_the_other_sender_is_taken_up_when_the_first_falls_silent():
     assert max(run.ages_ms[-200:]) < 10
 
 
+def test_a_sender_that_hangs_gives_way_to_another():
+    """The first repeats its last packet to the end; the second begins a second later."""
+
+    def make(t0: int) -> list[Arrival]:
+        good = Sender().packets(t0, seconds(0, 2))
+        hung = [Arrival(t0 + ns, good[-1].event, good[-1].raw) for ns in seconds(2, 6, 10_000_000)]
+        return good + hung + late_sender(70).packets(t0 + 2_300_000, seconds(3, 6))
+
+    run = Run(make)
+    assert run.counts.refused == run.counts.refused_by["time"] == 400
+    assert abs(run.shown[-1] @ LYRA) > 0.999
+    assert max(run.ages_ms[-800:]) < 15
+    assert run.receiver.jumps.jumps == 0
+
+
 def test_a_receiver_that_was_stopped_does_not_think_that_the_first_sender_was_silent():
     """1.2 s of both senders' packets are read at once, the second one's first."""
 
@@ -269,6 +284,7 @@ def test_one_sender_that_retargets_to_and_fro_is_one(every, how):
         list(range(1000, 0, -1)),  # counts down
         [k % 2 for k in range(1000)],
         [k % 256 for k in range(1000)],
+        [0] * 1000,
         [7] * 1000,
         [3 * k for k in range(1000)],
         np.random.default_rng(3).integers(0, 2**32, 1000).tolist(),

@@ -8,6 +8,7 @@ from __future__ import annotations
 import codecs
 import io
 import os
+import re
 import stat
 import tomllib
 from collections.abc import Iterator
@@ -21,6 +22,8 @@ HEAD_BYTES = 16
 MAX_LINE_CHARACTERS = 1_000_000
 CHUNK_BYTES = 1 << 20
 MAX_TOML_BYTES = 200_000
+MAX_KEY_PARTS = 32  # tomllib's time and memory grow as their square
+DEEP_KEY = re.compile(rf"(?<![\w-])(?:[\"']?[\w-]{{0,40}}[\"']?[ \t]*\.[ \t]*){{{MAX_KEY_PARTS - 1}}}")
 NOT_FILES = {
     stat.S_ISDIR: "is a directory",
     stat.S_ISFIFO: "is a pipe; write it to a file first",
@@ -144,10 +147,10 @@ def open_lines(path: Path, advice: str, limit_bytes: int) -> Iterator[Iterator[s
     Raises InputError as `read_text` does, and for a line of more than MAX_LINE_CHARACTERS.
     """
     with open_regular(path, advice, limit_bytes) as file:
-        refuse_kind(path, file.read(HEAD_BYTES), advice)
-        file.seek(0)
-        text = io.TextIOWrapper(file, encoding="utf-8-sig", newline="")
         try:
+            refuse_kind(path, file.read(HEAD_BYTES), advice)
+            file.seek(0)
+            text = io.TextIOWrapper(file, encoding="utf-8-sig", newline="")
             yield _bounded(path, text, advice)
         except UnicodeDecodeError as error:
             file.seek(0)
@@ -180,6 +183,8 @@ def _not_text(path: Path, file: IO[bytes], advice: str) -> str:
 
 def parse_toml(path: Path, text: str) -> dict[str, Any]:
     """The tables of a TOML file's text. Raises InputError with the line."""
+    if DEEP_KEY.search(text):
+        raise InputError(f"{path}: not TOML that anybody wrote: a key has {MAX_KEY_PARTS} parts or more")
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import sys
 from collections.abc import Callable, Iterator
@@ -24,7 +25,10 @@ def say(line: str) -> None:
 
 def print_json(value: dict[str, Any]) -> None:
     """The one JSON object of --json; NumPy's numbers come out as plain ones."""
-    typer.echo(msgspec.json.encode(value, enc_hook=_plain).decode())
+    try:
+        typer.echo(msgspec.json.encode(value, enc_hook=_plain).decode())
+    except UnicodeEncodeError:  # a file's name that is not UTF-8; Python's own writes its bytes as escapes
+        typer.echo(json.dumps(value, default=_plain))
 
 
 def _plain(value: Any) -> Any:

@@ -51,5 +51,5 @@ def _escape(character: str) -> str:
 
 def one_line(text: str) -> str:
     """A message as one line of bounded length, whatever it repeats of the input."""
-    words = (shortened(printable(word)) for word in text[: 100 * MAX_LINE_CHARACTERS].split())
+    words = (shortened(printable(word)) for word in text.split())
     return shortened(" ".join(words), MAX_LINE_CHARACTERS)

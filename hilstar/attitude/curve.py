@@ -14,7 +14,9 @@ import zmq
 import zmq.auth
 
 from hilstar.errors import InputError
+from hilstar.reading import read_text
 
+MAX_KEY_BYTES = 10_000
 MAKE_KEYS = "make keys with `hilstar keys -o DIR`"
 LOOPBACK = re.compile(r"tcp://(127(\.\d{1,3}){3}|localhost|\[::1\]):|(ipc|inproc)://")
 
@@ -95,6 +97,7 @@ def load_secret(path: Path) -> tuple[bytes, bytes]:
 
 
 def _load(path: Path) -> tuple[bytes, bytes | None]:
+    read_text(path, MAKE_KEYS, MAX_KEY_BYTES)  # pyzmq would wait for a pipe, and read a device for ever
     try:
         public, secret = zmq.auth.load_certificate(path)
     except (OSError, ValueError) as error:

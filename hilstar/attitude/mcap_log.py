@@ -15,6 +15,7 @@ from mcap.writer import MCAP0_MAGIC, Writer
 
 from hilstar.attitude.packet import AttitudeSample, Refusal, checked_sample
 from hilstar.errors import InputError
+from hilstar.reading import open_regular
 
 MCAP_MAGIC = MCAP0_MAGIC
 ATTITUDE_TOPIC = "/attitude"
@@ -137,9 +138,9 @@ def read_metadata(path: Path, name: str) -> dict[str, str]:
 def is_mcap(path: Path) -> bool:
     """True for a file that begins as MCAP does; False too where it cannot be read."""
     try:
-        with path.open("rb") as file:
+        with open_regular(path, "") as file:
             return file.read(len(MCAP_MAGIC)) == MCAP_MAGIC
-    except OSError:
+    except (OSError, InputError):
         return False
 
 
@@ -156,7 +157,7 @@ def _sample(data: bytes) -> AttitudeSample | Refusal | None:
 
 
 def _records(path: Path) -> Iterator[McapRecord]:
-    with path.open("rb") as file:
+    with open_regular(path, "give the ledger of a run, or a log") as file:
         yield from _open_records(path, file)
 
 

@@ -36,7 +36,7 @@ from hilstar.bench.records import (
     process_record,
     schema_of,
 )
-from hilstar.errors import InputError
+from hilstar.errors import InputError, printable
 from hilstar.interrupts import caught
 from hilstar.notices import Notice
 
@@ -79,7 +79,7 @@ class Ledger:
         }
         head = {
             "bench_sha256": bench.bench_hash,
-            "bench_file": str(bench.path),
+            "bench_file": printable(str(bench.path)),
             "bench_text": bench.path.read_text(encoding="utf-8"),
             "calibration": bench.calibration.name,
             "calibration_sha256": bench.calibration.sha256,

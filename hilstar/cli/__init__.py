@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import logging
 import os
 import re
@@ -14,7 +15,7 @@ from hilstar import interrupts
 from hilstar.cli import bench, check, compare, light, run, show, stream
 from hilstar.cli.common import app
 from hilstar.console import fail
-from hilstar.errors import HilstarError, InputError
+from hilstar.errors import HilstarError, InputError, MachineError
 from hilstar.stderr import finish_stderr, queue_stderr
 
 __all__ = ["app", "bench", "check", "compare", "light", "main", "run", "show", "stream"]
@@ -41,6 +42,10 @@ def main() -> NoReturn:
     interrupts.install()
     queue_stderr()
     logging.basicConfig(format="hilstar: %(message)s", stream=sys.stderr)
+    if sys.stdout is None:  # closed by whoever started us
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115, PTH123 - for as long as the process lives
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="surrogateescape")  # a file's name goes out as the bytes that came in
     try:
         code = _run(with_shares(sys.argv[1:]))
     except SystemExit as end:  # of `fail`
@@ -70,19 +75,21 @@ def _run(words: list[str]) -> int:
         message = getattr(error, "format_message", None)
         if message is not None:
             fail(f"{message()} (see hilstar --help)", InputError.exit_code)
-        if isinstance(error, OSError) and _stdout_fails():
-            _let_go_of_stdout()
-            fail(f"stdout: cannot be written ({error.strerror}); choose another place", InputError.exit_code)
+        _fail_for_the_machine(error)
         raise
 
 
-def _stdout_fails() -> bool:
-    """True where what was to be printed still cannot be."""
-    try:
-        sys.stdout.flush()
-    except OSError:
-        return True
-    return False
+def _fail_for_the_machine(error: Exception) -> None:
+    """Refuse what the machine refuses: an output that takes no more, a file that went away, memory that is not there."""
+    if isinstance(error, OSError) and error.strerror:
+        what = "stdout, or a file that it names"
+        if isinstance(error.filename, str | bytes):
+            what = os.fsdecode(error.filename)
+        else:
+            _let_go_of_stdout()
+        fail(f"{what}: cannot be written or read ({error.strerror}); choose another place", InputError.exit_code)
+    if isinstance(error, MemoryError):
+        fail("not enough memory for this; give smaller files or sizes", MachineError.exit_code)
 
 
 def _let_go_of_stdout() -> None:

@@ -144,7 +144,7 @@ def report(path: Path, directory: Path) -> dict[str, Any]:
         rows="".join(f"<tr><td>{html.escape(a)}</td><td>{html.escape(b)}</td></tr>" for a, b in table_rows(summary)),
         figures="".join(f'<p><img alt="{f.stem}" src="data:image/png;base64,{_base64(f)}"></p>' for f in figures if f),
     )
-    _write(directory / "report.html", page.encode())
+    _write(directory / "report.html", page.encode(errors="replace"))
     _write(directory / "report.json", msgspec.json.format(msgspec.json.encode(summary)))
     return summary
 

@@ -1,0 +1,291 @@
+"""Whatever is named as a file, a number or an output: one line, soon, and nothing of the input repeated at length."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from hilstar.cli import app
+from hilstar.errors import HilstarError, one_line
+from tests.conftest import SMALL_BENCH, assert_refused, run_hilstar
+
+PATIENCE_S = 20
+MEMORY_BYTES = 4 << 30
+BENCH = SMALL_BENCH.replace("[1024, 1024]", "[64, 64]").replace("[320, 240]", "[64, 48]")
+FRAME = ("frame", "bench.toml", "--radec", "84,-1,0", "--codes", "codes.png")
+RESPONSE = "code,w\n" + "".join(f"{code},{(code / 255) ** 2.2 + 1e-3}\n" for code in range(256))
+MONITOR = '[calibration]\nkind="photometric"\nwho=""\nwhen=""\ninstrument=""\nunit=""\nbits=8\nresponse="RESPONSE"\n'
+LOG_FORMATS = "hilstar reads CSV, JSON lines, CCSDS AEM (KVN or XML) and MCAP"
+
+
+@pytest.fixture(autouse=True)
+def bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """In a directory of its own, with an alarm: whatever waits for ever fails, and does not stop the suite."""
+
+    def too_long(*_: object) -> None:
+        raise TimeoutError("it takes too long")
+
+    monkeypatch.chdir(tmp_path)
+    before = signal.signal(signal.SIGALRM, too_long)
+    signal.alarm(3 * PATIENCE_S)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
+
+
+def refusal(*words: str) -> str:
+    """The line with which a command refuses, in this process."""
+    with pytest.raises(HilstarError) as error:
+        app([*map(str, words)], standalone_mode=False)
+    assert error.value.exit_code == 2
+    line = one_line(str(error.value))
+    assert len(line) <= 1000
+    return line
+
+
+def place(kind: str, name: str) -> tuple[str, ...]:
+    """The command that reads a file of one kind by its name, and everything else that it reads made well."""
+    benches = {
+        "curve": BENCH.replace('"ccd47-20"', f'"{name}"'),
+        "transmission": BENCH.replace('"n-bk7-10mm"', f'"{name}"'),
+        "catalogue": BENCH + f'[sky]\ncatalogue = "{name}"\n',
+        "calibration": BENCH.replace("[monitor]\n", f'[monitor]\ncalibration = "{name}"\n'),
+        "truth of verify": BENCH + f'[verify]\ntrue_calibration = "{name}"\n',
+    }
+    monitor = {
+        "response": MONITOR.replace("RESPONSE", name),
+        "grid": MONITOR.replace("RESPONSE", "r.csv") + f'[uniformity]\nfile="{name}"\n',
+    }
+    Path("r.csv").write_text(RESPONSE)
+    Path("mon.toml").write_text(monitor.get(kind, MONITOR))
+    with_monitor = BENCH.replace("[monitor]\n", '[monitor]\ncalibration = "mon.toml"\n')
+    Path("bench.toml").write_text(benches.get(kind, with_monitor if kind in monitor else BENCH))
+    commands = {
+        "bench": ("budget", name),
+        "log": ("convert", name, "out.csv"),
+        "replayed log": ("replay", "bench.toml", name, "--headless"),
+        "ledger": ("report", name, "-o", "report"),
+        "edges": ("latency", "none.mcap", "--edges", name),
+        "frame": ("compare", name, name),
+        "patches": ("calibrate", "photometric", name, "-o", "m.toml"),
+        "key": (
+            "send",
+            "--spin",
+            "z,1",
+            "--count",
+            "1",
+            "--wait",
+            "0",
+            "--connect",
+            "--secret-key",
+            name,
+            "--server-key",
+            name,
+        ),
+        "truth of verify": ("verify", "bench.toml", "--fields", "1"),
+    }
+    return commands.get(kind, FRAME)
+
+
+PLACES = (
+    *(
+        "bench",
+        "curve",
+        "transmission",
+        "catalogue",
+        "calibration",
+        "response",
+        "grid",
+        "truth of verify",
+        "log",
+        "replayed log",
+    ),
+    *("ledger", "edges", "frame", "patches", "key"),
+)
+
+
+@pytest.mark.parametrize("kind", PLACES)
+def test_what_is_no_file_or_too_large_is_refused_wherever_a_file_is_named(tmp_path, kind):
+    os.mkfifo("pipe")
+    with Path("large").open("wb") as file:
+        file.truncate(10**9)
+    names = {
+        "pipe": "it is a pipe",
+        "/dev/zero": "it is a device",
+        "/dev/full": "it is a device",
+        "/dev/urandom": "it is a device",
+    }
+    for name, reason in (names | {"large": "" if kind == "ledger" else "1 GB or more"}).items():
+        absolute = str(tmp_path / name)
+        line = refusal(*place(kind, name if kind in {"response", "grid"} and name[0] != "/" else absolute))
+        assert reason in line, (name, line)
+        assert Path(name).name in line
+
+
+@pytest.mark.parametrize(
+    ("head", "words"),
+    [
+        (b"ULog\x01\x12\x35\x01" + bytes(64), "a ULog file"),
+        (b"DAF/CK  " + bytes(64), "a SPICE CK kernel"),
+        (b"SQLite format 3\x00" + bytes(64), "an SQLite database (a db3 bag of ROS 2)"),
+        (b"PK\x03\x04" + bytes(64), "a zip archive"),
+        (b"\x1f\x8b\x08" + bytes(64), "a gzip file"),
+        (b"\x89HDF\r\n\x1a\n", "an HDF5 file"),
+        (b"SIMPLE  =                    T", "a FITS file"),
+        (b"\x80\x04\x95" + bytes(64), "a pickle"),
+        (b"t_s,qw,qx,qy,qz\n1,1,0,0,0\n\xff", "not UTF-8: byte 26 is 0xff"),
+        (bytes(64), "column t_s is missing"),
+    ],
+)
+def test_a_log_of_another_format_is_named_with_those_that_are_read(head, words):
+    Path("log").write_bytes(head)
+    line = refusal("convert", "log", "out.csv")
+    assert words in line
+    assert LOG_FORMATS in line or "header must have" in line
+
+
+@pytest.mark.parametrize("digits", [20, 4301])
+def test_whole_numbers_of_any_length_are_refused_by_name(digits):
+    number = "9" * digits
+    Path("bench.toml").write_text(BENCH + f"[tracker.detector]\ndevice_seed = {number}\n")
+    assert "device_seed" in refusal(*FRAME) or "thousands of digits" in refusal(*FRAME)
+    Path("bench.toml").write_text(BENCH + f"[tracker.detector]\ndevice_seed = 0x{'f' * digits}\n")
+    assert "device_seed" in refusal(*FRAME)
+    Path("bench.toml").write_text(BENCH)
+    for text in (
+        f"t_s,qw,qx,qy,qz,sequence\n1,1,0,0,0,{number}\n",
+        f"t_s,qw,qx,qy,qz\n{number},1,0,0,0\n",
+        f'{{"t_ns":{number},"q":[1,0,0,0]}}\n',
+        f'{{"t_ns":1,"q":[1,0,0,0],"sequence":-{number}}}\n{{"t_ns":0,"q":[1,0,0,0]}}\n',
+    ):
+        Path("log").write_text(text)
+        assert "log:" in refusal("convert", "log", "out.csv")
+    Path("edges").write_text(f"host_ns,level\n{number},1\n")
+    assert "edges:2: " in refusal("latency", "none.mcap", "--edges", "edges")
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        "1e300,1\n2e300,1\n",
+        "400,1\n1e9,1\n",
+        "-5,1\n5,1\n",
+        "1e-300,1\n400,1\n",
+        "400,nan\n500,1\n",
+        "400,1\n400,1\n",
+        "400,1e400\n500,1\n",
+        "".join(f"{400 + k / 100},0.5\n" for k in range(10_001)),
+    ],
+)
+def test_a_curve_that_no_sensor_has_is_refused(rows):
+    Path("qe.csv").write_text(rows)
+    Path("bench.toml").write_text(BENCH.replace('"ccd47-20"', '"qe.csv"'))
+    assert "qe.csv: " in refusal(*FRAME)
+
+
+def test_a_key_of_thousands_of_parts_takes_no_minutes():
+    Path("bench.toml").write_text(".".join(["a"] * 90_000) + " = 1\n")
+    assert "a key has 32 parts or more" in refusal(*FRAME)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "".join(f"k{k:03}{'x' * 93} = 1\n" for k in range(192)),
+        "[render]\n" + "k" * 100_000 + " = 1\n",
+        '[render]\nquantisation = "' + "v" * 100_000 + '"\n',
+        "[render]\nsprite_sigma_px = [" + "1, " * 30_000 + "1]\n",
+        '[sky]\ncatalogue = "' + "c" * 100_000 + '"\n',
+        '[tracker]\nquantum_efficiency = "' + "c d" * 30_000 + '"\n',
+        '[render]\n"a`] - at `$.x[" = 1\n',
+    ],
+)
+def test_a_refusal_repeats_little_of_a_bench_file(text):
+    Path("bench.toml").write_text(text if text.startswith(("k", "[tracker]")) else BENCH + text)
+    assert len(refusal(*FRAME)) < 700
+
+
+@pytest.mark.parametrize("words", [["--help"], ["frame", "--help"], ["convert", "log.csv", "out.csv"], [*FRAME, "--json"]])
+def test_a_full_stdout_is_one_line(words):
+    Path("bench.toml").write_text(BENCH)
+    Path("log.csv").write_text("t_s,qw,qx,qy,qz\n0,1,0,0,0\n")
+    with Path("/dev/full").open("w") as full:
+        command = [sys.executable, "-m", "hilstar", *words]
+        result = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, timeout=120, check=False)
+    assert result.returncode in {1, 2}
+    assert len(result.stderr.splitlines()) == 1, result.stderr
+    assert "stdout" in result.stderr
+
+
+def limited() -> None:
+    """No file of more than 4 kB, and no more memory than the issue allows."""
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
+    resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("frame", "bench.toml", "--radec", "84,-1,0", "-o", "o.fits"),
+        ("simulate", "bench.toml", "--log", "log.csv", "-o", "frames"),
+        ("convert", "long.csv", "out.aem"),
+        ("demo", "-o", "demo", "--duration", "0.5"),
+        ("study", "models", "-o", "study"),
+    ],
+)
+def test_a_full_disk_is_one_line(words):
+    Path("bench.toml").write_text(BENCH)
+    Path("log.csv").write_text("t_s,qw,qx,qy,qz\n0,1,0,0,0\n1,1,0,0,0\n")
+    Path("long.csv").write_text("t_s,qw,qx,qy,qz\n" + "".join(f"{k},1,0,0,0\n" for k in range(500)))
+    command = [sys.executable, "-m", "hilstar", *words]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False, preexec_fn=limited)
+    assert_refused(result, 2, "cannot be written")
+
+
+def test_names_that_are_not_utf_8_are_as_good_as_others():
+    bench, codes = os.fsdecode(b"b\xff.toml"), os.fsdecode(b"c\xfe.png")
+    Path(bench).write_text(BENCH)
+    Path("log.csv").write_text("t_s,qw,qx,qy,qz\n0,1,0,0,0\n")
+    result = run_hilstar("frame", bench, "--radec", "84,-1,0", "--codes", codes, "--json")
+    assert result.returncode == 0, result.stderr
+    assert json.loads(result.stdout)["written"] == [codes]
+    result = run_hilstar("replay", bench, "log.csv", "--headless", "--speed", "max", "--ledger", "run.mcap")
+    assert result.returncode == 0, result.stderr
+    assert_refused(run_hilstar("frame", os.fsdecode(b"n\xff.toml"), "--radec", "84,-1,0", "--codes", "c.png"), 2, "n\\xff.toml")
+
+
+def test_a_name_of_300_characters_is_refused_in_short():
+    line = refusal_of_process("keys", "-o", "k" * 300)
+    assert "File name too long" in line
+    assert len(line) < 300
+
+
+def refusal_of_process(*words: str) -> str:
+    result = run_hilstar(*words)
+    assert_refused(result, 2)
+    return result.stderr
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("frame", "bench.toml", "--radec", "9" * 100_000 + ",1,2", "-o", "x.fits"),
+        ("bench", "--stars", "1" * 100_000),
+        ("simulate", "bench.toml", "--radec", "1,2,3", "--seed", "9" * 6000, "-o", "x.fits"),
+        ("frame" + "s" * 100_000,),
+        ("send", "--spin", "z,1", "--to", "x" * 100_000),
+    ],
+)
+def test_a_refusal_repeats_little_of_the_command_line(words):
+    line = refusal_of_process(*words)
+    assert len(line) < 400
+    assert "write" in line or "--help" in line

@@ -1,8 +1,8 @@
 """CCSDS Attitude Ephemeris Messages, 1.0 (CCSDS 504.0-B-1) and 2.0 (504.0-B-2), as KVN or XML.
 
 Rules:
-1. One of REF_FRAME_A and REF_FRAME_B is ICRF or EME2000, taken as the same axes (they differ by 23 mas); the other is a
-   frame of the spacecraft, and is taken as `cam`. Any other frame is refused.
+1. One of REF_FRAME_A and REF_FRAME_B is ICRF, GCRF or EME2000, taken as the same axes (EME2000's differ by 23 mas); the
+   other is a frame of the spacecraft, and is taken as `cam`. Any other frame is refused.
 2. The quaternion of 504.0-B-2 annex F turns components from its first frame into its second; it is the conjugate of
    hilstar's. ATTITUDE_DIR says which frame is first (2.0: always A), QUATERNION_TYPE where the scalar is (2.0: last).
 3. A rate is the angular velocity of the second frame with respect to the first.
@@ -16,7 +16,6 @@ know and a block that is cut off without a word.
 from __future__ import annotations
 
 import io
-import logging
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
@@ -28,17 +27,17 @@ from typing import Any
 import numpy as np
 
 from hilstar.arrays import FloatArray
+from hilstar.attitude.aem_keywords import VERSION_KEY, AemFaultError, fault_of
+from hilstar.attitude.aem_xml import read_message
 from hilstar.attitude.clock import NS_PER_S
 from hilstar.attitude.packet import AttitudeSample, Refusal, checked_sample
 from hilstar.attitude.quaternion import conjugate, multiply
-from hilstar.errors import MachineError
 
-VERSION_KEY = "CCSDS_AEM_VERS"
 DAY_NS = 86_400 * NS_PER_S
 UNIX_DAY = date(1970, 1, 1).toordinal()
 
 # 504.0-B-2's own examples write J2000 for EME2000; the realisations of the ICRF share its axes to 0.1 mas.
-INERTIAL_FRAMES = frozenset({"ICRF", "ICRF1", "ICRF2", "ICRF3", "EME2000", "J2000"})
+INERTIAL_FRAMES = frozenset({"ICRF", "ICRF1", "ICRF2", "ICRF3", "GCRF", "EME2000", "J2000"})
 # SANA's registry of spacecraft body frames, whose names end in a label (SC_BODY_1, INSTRUMENT_A), and CAM.
 BODY_FRAME = re.compile(
     "(SC_BODY|STARTRACKER|AST|INSTRUMENT|SENSOR|CAM|CAMERA|ACC|ACTUATOR|CSS|DSS|ESA|GYRO|GYRO_FRAME"
@@ -70,14 +69,6 @@ MARKERS = {  # the section that a marker ends, and the one that it begins
 }
 
 Entry = tuple[str, AttitudeSample | Refusal]
-
-
-class AemFaultError(Exception):
-    """What is wrong in a message, and where: a line (":12"), an epoch (", 2024-01-01T00:00:00") or nothing."""
-
-    def __init__(self, where: str, detail: str) -> None:
-        super().__init__(detail)
-        self.where = where
 
 
 @dataclass(frozen=True, slots=True)
@@ -259,7 +250,10 @@ def _kvn_blocks(text: str) -> list[_Block]:
             rows.append((where, line.split()))
         else:
             key, value = _keyword(line, section, where)
-            (header if section == "header" else meta)[key] = value
+            keywords = header if section == "header" else meta
+            if key in keywords:
+                raise AemFaultError(where, f"{key} is there twice in the {section}; leave one of them out")
+            keywords[key] = value
     if section != "header" or not blocks:
         raise AemFaultError(
             f":{number}", f"the file ends in the {section}, with {len(blocks)} blocks of data whole; is it cut off?"
@@ -271,6 +265,9 @@ def _keyword(line: str, section: str, where: str) -> tuple[str, str]:
     key, equals, value = line.partition("=")
     if not equals or section not in {"header", "metadata"}:
         raise AemFaultError(where, f"{line[:40]!r} in the {section}; KEYWORD = value or a marker such as META_START is wanted")
+    fault = fault_of(key.strip(), section)
+    if fault is not None:
+        raise AemFaultError(where, fault)
     return key.strip(), _plain(value)
 
 
@@ -299,49 +296,12 @@ def _kvn_block(meta: dict[str, str], rows: list[tuple[str, list[str]]], where: s
     return _Block(meta, [place for place, _ in rows], [words[0] for _, words in rows], table)
 
 
-def library() -> Any:
-    """The library's module for XML. Raises MachineError when ccsds-ndm is not installed."""
-    try:
-        from ccsds_ndm import ndm_xml_io  # type: ignore[import-untyped]
-    except ImportError as error:
-        raise MachineError("XML is read, and AEM written, by ccsds-ndm, which is not there; pip install ccsds-ndm") from error
-    return ndm_xml_io
-
-
-class _NothingDropped(logging.Filter):
-    """Makes a fault of what the library logs: a value that it drops, as of an element that is there twice."""
-
-    def filter(self, record: logging.LogRecord) -> bool:
-        raise ValueError(record.getMessage())
-
-
 def _xml_blocks(text: str) -> list[_Block]:
-    reader = library().NdmXmlIo()
-    reader.parser_config.fail_on_converter_warnings = True
-    _well_formed(text)
-    log, strict = logging.getLogger("xsdata.logger"), _NothingDropped()
-    log.addFilter(strict)
-    try:
-        message = reader.from_string(text)
-    except Exception as error:  # the library lets through whatever its layers raise
-        raise AemFaultError("", f"is no AEM in XML ({str(error)[:200] or type(error).__name__})".replace("\n", " ")) from error
-    finally:
-        log.removeFilter(strict)
-    if getattr(message, "id", None) != VERSION_KEY:
-        raise AemFaultError("", "holds other messages, or several; one <aem> is wanted")
-    return [_xml_block(message.version, segment) for segment in message.body.segment]
-
-
-def _well_formed(text: str) -> None:
-    """Raises AemFaultError for XML that is not well formed, which the library would mend without a word, or has a DOCTYPE."""
-    from lxml import etree
-
-    try:
-        root = etree.fromstring(text.encode(), etree.XMLParser(resolve_entities=False, no_network=True))
-    except etree.XMLSyntaxError as error:
-        raise AemFaultError(f":{error.lineno or 1}", f"is not well-formed XML ({error.msg})".replace("\n", " ")) from error
-    if root.getroottree().docinfo.internalDTD is not None:
-        raise AemFaultError("", "has a DOCTYPE; an AEM has none")
+    message = read_message(text)
+    segments = message.body.segment if message.body is not None else []
+    if not segments or any(s.metadata is None or s.data is None for s in segments):
+        raise AemFaultError("", "a segment has no <metadata> or no <data>, or there is none; is it cut off?")
+    return [_xml_block(message.version, segment) for segment in segments]
 
 
 def _xml_block(version: str, segment: Any) -> _Block:

@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from hilstar.attitude.aem import DERIVATIVE, QUATERNION, epoch_text, library
+from hilstar.attitude.aem import DERIVATIVE, QUATERNION, epoch_text
+from hilstar.attitude.aem_xml import library
 from hilstar.attitude.packet import AttitudeSample
 from hilstar.attitude.quaternion import conjugate, multiply
 

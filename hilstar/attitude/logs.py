@@ -129,7 +129,8 @@ def _mcap_entries(path: Path) -> Iterator[Entry]:
 
 
 def _aem_entries(path: Path, text: str) -> list[Entry]:
-    from hilstar.attitude.aem import AemFaultError, read_aem
+    from hilstar.attitude.aem import read_aem
+    from hilstar.attitude.aem_keywords import AemFaultError
 
     try:
         return read_aem(text)

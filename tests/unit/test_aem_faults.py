@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
 from hilstar.attitude import aem
 from hilstar.attitude.logs import write_log
 from hilstar.attitude.packet import AttitudeSample
+from hilstar.errors import InputError
 from tests.unit.test_aem import EPOCHS, NS_PER_S, kvn, read, refusal, rows_of
 
 # Epochs
@@ -179,3 +182,82 @@ def test_xml_that_is_cut_off_or_wrong_in_one_state_is_refused(tmp_path, caplog):
         tmp_path, "<QC>2.0</QC>".join(text.rsplit("<QC>1.0</QC>", 1))
     )
     assert "is not the QUATERNION/DERIVATIVE" in refusal(tmp_path, text.replace("QUATERNION<", "QUATERNION/DERIVATIVE<"))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "place", "words"),
+    [
+        (
+            "QUATERNION_TYPE = LAST",
+            "QUATERNION_TYP = FIRST",
+            ":10:",
+            "QUATERNION_TYP is no keyword .*; did you mean QUATERNION_TYPE",
+        ),
+        (
+            "ATTITUDE_DIR = A2B",
+            "ATTITUDE_DIRECTION = B2A",
+            ":9:",
+            "ATTITUDE_DIRECTION is no keyword .*; did you mean ATTITUDE_DIR",
+        ),
+        ("OBJECT_NAME = X", "object_name = X", ":5:", "object_name is no keyword .*; did you mean OBJECT_NAME"),
+        ("OBJECT_NAME = X", "WINDSPEED = 3", ":5:", "WINDSPEED is no keyword .*; known are OBJECT_NAME, "),
+        (
+            "ORIGINATOR = X",
+            "ORIGINATOR = X\nATTITUDE_DIR = B2A",
+            ":4:",
+            "ATTITUDE_DIR is in the header; it belongs in the metadata",
+        ),
+        ("ATTITUDE_DIR = A2B", "ATTITUDE_DIR = A2B\nATTITUDE_DIR = B2A", ":9:", "ATTITUDE_DIR is there twice"),
+        ("META_START", "META_START\nORIGINATOR = Y", ":5:", "ORIGINATOR is in the metadata; it belongs in the header"),
+    ],
+)
+def test_a_keyword_that_would_be_passed_over_is_refused_with_its_line(tmp_path, old, new, place, words):
+    assert old in GOOD
+    message = refusal(tmp_path, GOOD.replace(old, new, 1))
+    line = int(place.strip(":")) + (1 if "there twice" in words else 0)
+    assert message.startswith(f"{tmp_path / 'log'}:{line}:"), message
+    assert re.search(words, message), message
+
+
+def test_comments_may_stand_anywhere(tmp_path):
+    assert len(read(tmp_path, GOOD.replace("OBJECT_ID", "COMMENT QUATERNION_TYP = FIRST\nOBJECT_ID"))) == 2
+
+
+def test_gcrf_has_the_axes_of_icrf(tmp_path):
+    wanted, found = read(tmp_path, GOOD), read(tmp_path, GOOD.replace("= ICRF", "= GCRF"))
+    assert [s.q_icrs_to_cam.tolist() for s in found] == [s.q_icrs_to_cam.tolist() for s in wanted]
+
+
+@pytest.fixture
+def xml(tmp_path):
+    write_log(tmp_path / "a.xml", [AttitudeSample(k, np.array([1.0, 0.0, 0.0, 0.0])) for k in range(3)])
+    return (tmp_path / "a.xml").read_text()
+
+
+def test_an_element_that_would_be_passed_over_is_refused_with_its_line(tmp_path, xml):
+    lines = xml.splitlines()
+    number = next(k for k, line in enumerate(lines, start=1) if "<QUATERNION_TYPE>" in line)
+    message = refusal(tmp_path, xml.replace("QUATERNION_TYPE>", "QUATERNION_TYP>"))
+    assert message.startswith(f"{tmp_path / 'log'}:{number}: QUATERNION_TYP is no keyword of an AEM's metadata; did you mean")
+
+
+def test_one_aem_in_an_ndm_is_read_and_several_are_not(tmp_path, xml):
+    body = xml[xml.index("<aem") :]
+    samples = read(tmp_path, f"<ndm><MESSAGE_ID>1</MESSAGE_ID>{body}</ndm>")
+    assert [s.t_ns for s in samples] == [0, 1, 2]
+    for count, inside in ((0, ""), (2, body + body)):
+        assert f"the <ndm> holds {count} <aem>; one is wanted" in refusal(tmp_path, f"<ndm>{inside}</ndm>")
+
+
+@pytest.mark.parametrize("part", ["segment", "metadata", "data", "body", "header"])
+def test_an_empty_part_is_one_line_that_names_no_python(tmp_path, xml, part):
+    start, end = xml.index(f"<{part}>"), xml.index(f"</{part}>")
+    for text in (xml[: start + len(part) + 2] + xml[end:], xml[:start] + xml[end + len(part) + 3 :]):
+        try:
+            samples = read(tmp_path, text)
+        except InputError as error:
+            line = str(error)
+            assert "\n" not in line
+            assert not re.search(r"NoneType|__init__|attribute|Error\b|argument", line), line
+        else:
+            assert part == "header" and len(samples) == 3

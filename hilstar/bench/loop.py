@@ -90,7 +90,7 @@ class FrameLoop:
         self._sink = sink
         self._screen = screen
         self.notices = Notices() if notices is None else notices
-        self._presence = AttitudeWatch(policy_of(settings).stale_after_ns, self.notices)
+        self._presence = AttitudeWatch(self.notices)
         self._predicted_swap_ns: int | None = None
         self._missed_before = 0
         self._due_ns: int | None = None  # when the frame was to be begun, or on a screen swapped; None where nothing is late
@@ -115,9 +115,9 @@ class FrameLoop:
 
     def _draw(self, number: int, t_ns: int, attitude: Attitude | None) -> Shown | None:
         begin_ns = time.monotonic_ns()
-        self._presence.see(attitude)
         screen = self._screen
         stale, missing = self.gate.update(attitude), attitude is None
+        self._presence.see(attitude, stale)
         on_screen = self.overrides.now
         attitude = self.overrides.attitude(t_ns, attitude)
         if stale and self._blank_when_stale and not (screen is not None and screen.paused):
@@ -222,7 +222,7 @@ class FrameLoop:
 
     def idle(self) -> None:
         """Keep the window alive while no frame is due."""
-        self._presence.see(None)
+        self._presence.see(None, True)
         if self._screen is not None:
             self._screen.present(0)
             self._screen.swap()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 
 from hilstar.attitude.clock import NS_PER_S
-from hilstar.attitude.timeline import Attitude, StaleGate
+from hilstar.attitude.timeline import Attitude
 from hilstar.notices import Notices
 
 NONE_YET_NS = 2 * NS_PER_S
@@ -14,15 +14,14 @@ NONE_YET_NS = 2 * NS_PER_S
 class AttitudeWatch:
     """Sees the attitude of each frame, before anything that an operator does to it."""
 
-    def __init__(self, stale_after_ns: int, notices: Notices) -> None:
-        self._gate = StaleGate(stale_after_ns)
+    def __init__(self, notices: Notices) -> None:
         self._notices = notices
         self._begun_ns: int | None = None
         self._seen = self._missed = False
         self._stale_ns: int | None = None  # since when, host time
 
-    def see(self, attitude: Attitude | None) -> None:
-        """The attitude at the frame that is next, None where none has come yet."""
+    def see(self, attitude: Attitude | None, stale: bool) -> None:
+        """The attitude of the frame that is next, None where none has come yet, and whether it is too old."""
         now_ns = time.monotonic_ns()
         if self._begun_ns is None:
             self._begun_ns = now_ns
@@ -35,7 +34,6 @@ class AttitudeWatch:
         if not self._seen:
             self._seen = True
             self._notices.tell("first-attitude", f"the first attitude has come, after {for_s:.1f} s")
-        stale = self._gate.update(attitude)
         if stale and self._stale_ns is None:
             self._stale_ns = now_ns
             self._notices.tell("stale", f"the attitude is stale: the newest is {attitude.age_ns / NS_PER_S:.3g} s old")

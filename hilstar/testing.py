@@ -12,7 +12,8 @@ from hilstar.arrays import FloatArray
 from hilstar.bench.assembly import Frame
 from hilstar.errors import InputError
 from hilstar.study.compare import CENTROID_PX, FLUX_MAG, Limits, SkyComparison, Truth, check_skies, compare_skies, describes
-from hilstar.study.compare_files import finding, read_frame_fits, read_truth_csv
+from hilstar.study.compare_files import read_frame_fits, read_truth_csv
+from hilstar.study.sky_difference import finding, told
 
 __all__ = ["assert_same_sky", "compare"]
 
@@ -31,13 +32,12 @@ def assert_same_sky(
 ) -> SkyComparison:
     """Assert that every star of two skies has one flux (magnitudes) and one place (px); see `compare` for what a sky is.
 
-    Raises AssertionError with a line for each star that has not, worst first, 20 at most; InputError as `compare` does.
+    Raises AssertionError with what all stars differ by and a line for each that differs otherwise, 20 at most; InputError as
+    `compare` does.
     """
     comparison = compare(frame, golden, flux_mag=flux_mag, centroid_px=centroid_px, truth=truth)
-    bad = comparison.bad
-    if bad:
-        rest = [f"and {len(bad) - MOST_LINES} more"] if len(bad) > MOST_LINES else []
-        raise AssertionError("\n".join([finding(comparison), *(star.line() for star in bad[:MOST_LINES]), *rest]))
+    if not comparison.same:
+        raise AssertionError("\n".join([finding(comparison), *told(comparison, MOST_LINES, "")]))
     return comparison
 
 

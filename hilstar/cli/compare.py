@@ -11,6 +11,8 @@ from hilstar.cli.common import Json, app
 from hilstar.console import print_json
 from hilstar.endings import check_directory
 
+MAX_LINES = 10  # of stars; a whole sky that differs is no news star by star
+
 
 @app.command()
 def compare(
@@ -26,6 +28,7 @@ def compare(
     from hilstar.bench.output import make_directory
     from hilstar.study.compare import CENTROID_PX, FLUX_MAG
     from hilstar.study.compare_files import write_report
+    from hilstar.study.sky_difference import told
     from hilstar.testing import compare as compare_files
 
     check_directory("-o", output)
@@ -36,12 +39,15 @@ def compare(
     if as_json:
         print_json(comparison.summary())
     else:
-        tell(comparison.summary(), [star.line() for star in comparison.bad])
+        where = " (-o DIR writes a table of all)" if output is None else f" (in {output / 'compare.csv'})"
+        if comparison.common is not None:
+            typer.echo(f"{'in common':20}{comparison.common.line()}")
+        tell(comparison.summary(), told(comparison, MAX_LINES, where))
     if not comparison.same:
         raise typer.Exit(1)
 
 
-def tell(summary: dict[str, Any], bad: list[str]) -> None:
+def tell(summary: dict[str, Any], lines: list[str]) -> None:
     """The comparison for a person."""
 
     def three(errors: dict[str, float | None]) -> str:
@@ -55,6 +61,6 @@ def tell(summary: dict[str, Any], bad: list[str]) -> None:
     if summary["widened"]:
         typer.echo(f"{'wider limits':20}{summary['widened']} stars, for rounding of the light around them or the image's edge")
     typer.echo(f"{'missing, extra':20}{summary['missing']}, {summary['extra']}")
-    for line in bad:
+    for line in lines:
         typer.echo(f"{'':20}{line}")
     typer.echo(f"{'verdict':20}{'the same sky' if summary['same'] else 'NOT the same sky'}")

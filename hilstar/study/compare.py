@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -18,16 +17,14 @@ from scipy.spatial import cKDTree
 
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.errors import InputError
+from hilstar.study.compare_common import common_change
+from hilstar.study.sky_difference import CENTROID_PX, FLUX_MAG, MAG_PER_SHARE, Limits, SkyComparison, StarDifference
 from hilstar.study.star_fit import RIPPLE_SHARE, StarTemplates, around, bright_pixels, refined, shifts_px, star_sigma_px
-from hilstar.study.twin_verdict import spread
 
-# A tenth of the smallest fault that must be seen (0.01 mag, 0.02 px) or less; 500 times what two right drivers make of a star
-# that no brighter one stands on (2e-6 mag, 1.5e-6 px at worst). tests/unit/test_testing.py measures both.
-FLUX_MAG = 1e-3
-CENTROID_PX = 1e-3
+__all__ = ["CENTROID_PX", "FLUX_MAG", "Limits", "SkyComparison", "Truth", "check_skies", "compare_skies", "describes"]
+
 # Of a star's flux: what float32 may do to any pixel that the star reaches. Measured 7e-8 on llvmpipe against float64.
 PIXEL_ERROR = 2e-7
-MAG_PER_SHARE = 2.5 / math.log(10)
 # Two stars nearer than this are one blend: apart they would be known 10 times worse than alone (at 0.4 px; 5 at 0.85 px).
 BLEND_SIGMAS, BLEND_PX = 1.5, 1.25
 LEAST_IN_VIEW = 0.01  # of a star's light; the wing of a star off the image has no place
@@ -38,120 +35,6 @@ FARTHEST_SIGMAS = 3.0  # a star that moved farther is missing here and extra the
 KNOWN_STARS = 20  # the brightest, at least half of which a truth table must have
 
 Truth = npt.NDArray[np.void]
-
-
-@dataclass(frozen=True, slots=True)
-class Limits:
-    """By how much a star may differ: magnitudes and pixels."""
-
-    flux_mag: float = FLUX_MAG
-    centroid_px: float = CENTROID_PX
-
-    def __post_init__(self) -> None:
-        for name in ("flux_mag", "centroid_px"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise InputError(f"compare: {name} = {getattr(self, name):g}; write a number over 0")
-
-
-@dataclass(frozen=True, slots=True)
-class StarDifference:
-    """One star of the golden image (an extra one: of the other), and the other image less the golden one.
-
-    `flux_error_mag` is positive where the star is too faint, infinite where it is missing; `hip` has every star of a blend.
-    """
-
-    hip: tuple[int, ...]
-    x_px: float
-    y_px: float
-    flux_e_per_s: float
-    flux_error_mag: float
-    dx_px: float
-    dy_px: float
-    limits: Limits
-
-    @property
-    def centroid_error_px(self) -> float:
-        """How far the star is from its place."""
-        return math.hypot(self.dx_px, self.dy_px)
-
-    @property
-    def kind(self) -> Literal["same", "changed", "missing", "extra"]:
-        """What became of the star."""
-        if math.isinf(self.flux_error_mag):
-            return "missing" if self.flux_error_mag > 0 else "extra"
-        return "same" if self.badness <= 1 else "changed"
-
-    @property
-    def badness(self) -> float:
-        """Its larger error in its limits."""
-        return max(abs(self.flux_error_mag) / self.limits.flux_mag, self.centroid_error_px / self.limits.centroid_px)
-
-    @property
-    def name(self) -> str:
-        """Its HIP number, those of its blend, or its place."""
-        if self.hip:
-            return "HIP " + " + ".join(map(str, self.hip))
-        return f"star at ({self.x_px:.1f}, {self.y_px:.1f})"
-
-    def line(self) -> str:
-        """What is wrong with the star, for a person."""
-        place = f" at ({self.x_px:.2f}, {self.y_px:.2f}) px" if self.hip else ""
-        if self.kind in ("missing", "extra"):
-            return f"{self.name}{place}: {self.kind}, {self.flux_e_per_s:.4g} electrons/s"
-        return (
-            f"{self.name}{place}: {self.flux_error_mag:+z.4f} mag, {self.centroid_error_px:.4f} px"
-            f" ({self.dx_px:+z.4f}, {self.dy_px:+z.4f}) off"
-        )
-
-
-@dataclass(frozen=True, slots=True)
-class SkyComparison:
-    """Every star compared, those missing, and those too many; `unmeasured` stars have too little light of their own in view."""
-
-    stars: list[StarDifference]
-    limits: Limits
-    unmeasured: int
-
-    def of(self, *kinds: str) -> list[StarDifference]:
-        """The stars of these kinds."""
-        return [star for star in self.stars if star.kind in kinds]
-
-    @property
-    def bad(self) -> list[StarDifference]:
-        """The stars beyond their limits, worst first; of those missing and extra the brightest."""
-        return sorted(self.of("changed", "missing", "extra"), key=lambda star: (-star.badness, -star.flux_e_per_s))
-
-    @property
-    def same(self) -> bool:
-        """Whether both images are one sky."""
-        return not self.bad
-
-    @property
-    def widened(self) -> int:
-        """How many stars have limits of their own, for the light around them or the image's edge."""
-        return sum(star.limits != self.limits for star in self.of("same", "changed"))
-
-    def summary(self) -> dict[str, Any]:
-        """The figures as JSON has them; infinite errors are null there."""
-        both = self.of("same", "changed")
-        extra = len(self.of("extra"))
-        return {
-            "stars": len(self.stars) - extra,
-            "flux_error_mag": spread(np.array([abs(star.flux_error_mag) for star in both])),
-            "centroid_error_px": spread(np.array([star.centroid_error_px for star in both])),
-            "limits": {"flux_mag": self.limits.flux_mag, "centroid_px": self.limits.centroid_px},
-            "missing": len(self.of("missing")),
-            "extra": extra,
-            "blends": sum(len(star.hip) > 1 for star in self.stars),
-            "widened": self.widened,
-            "unmeasured": self.unmeasured,
-            "bad": [
-                {"kind": star.kind, "hip": star.hip, "x_px": star.x_px, "y_px": star.y_px, "flux_e_per_s": star.flux_e_per_s}
-                | {"flux_error_mag": star.flux_error_mag, "dx_px": star.dx_px, "dy_px": star.dy_px}
-                for star in self.bad
-            ],
-            "same": self.same,
-        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,7 +81,7 @@ def compare_skies(
             StarDifference(hip, float(x), float(y), float(f), error, 0.0, 0.0, limits)
             for hip, (x, y), f in zip(_names(places, table, blend_px), places, flux, strict=True)
         ]
-    return SkyComparison(stars, limits, unmeasured)
+    return SkyComparison(stars, limits, unmeasured, common_change(stars, (golden.shape[1], golden.shape[0])))
 
 
 def describes(truth: Truth, image: FloatArray) -> bool:

@@ -82,6 +82,26 @@ def test_a_fault_is_told_named_and_drawn(golden, faulty, tmp_path):
     assert float(rows["26727"]["flux_error_mag"]) == pytest.approx(0.05, abs=1e-4)
 
 
+def test_a_shift_of_the_whole_image_comes_first_and_in_few_lines(golden, small_bench_file, tmp_path):
+    """A principal point that is 0.75 px off: every star differs, and all alike."""
+    small_bench_file.write_text(small_bench_file.read_text() + "principal_point_px = [158.75, 119.5]\n")
+    shifted = tmp_path / "shifted.fits"
+    assert run_hilstar("frame", small_bench_file, "--radec", "84.057,-1.2,0", "-o", shifted).returncode == 0
+    out = tmp_path / "out"
+    told = run_hilstar("compare", shifted, golden[0], "--truth", golden[1], "-o", out)
+    assert told.returncode == 1 and "NOT the same sky" in told.stdout
+    assert "all shifted by (-0.75, 0.00) px" in told.stdout.splitlines()[0]
+    assert len(told.stdout.splitlines()) < 20
+    with Image.open(out / "compare.png") as picture:
+        assert picture.height > 500
+    with (out / "compare.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    summary = json.loads(run_hilstar("compare", shifted, golden[0], "--json").stdout)
+    assert summary["common"]["shift_px"] == pytest.approx([-0.75, 0.0], abs=1e-3)
+    assert summary["common"]["differ"] == sum(row["differs"] == "1" for row in rows) < 0.05 * len(rows)
+    assert not summary["same"] and len(summary["bad"]) > 0.9 * summary["stars"]
+
+
 def test_json_is_one_object(golden, faulty):
     result = run_hilstar("compare", faulty, golden[0], "--truth", golden[1], "--json")
     assert result.returncode == 1 and result.stderr == ""

@@ -167,7 +167,8 @@ class Bench:
     def _light(self) -> Light:
         # Vignetting asks for more from a pixel: where the screen is darkest a fainter star gets a code.
         least = 1.0 if self.uniformity is None else float(self.uniformity.min())
-        return Light(self.calibration.response, self.flux_at_white_e_per_s * least, self.stars.electrons_per_s)
+        finer = self.calibration.can_steal_bits and not self.config.render.bit_stealing
+        return Light(self.calibration.response, self.flux_at_white_e_per_s * least, self.stars.electrons_per_s, finer)
 
     def _warn_of_cycle(self) -> None:
         render, refresh_hz = self.config.render, self.config.monitor.refresh_hz

@@ -172,7 +172,7 @@ def plan(
         "steps": steps,
         "bits": bits,
         "patches": len(steps),
-        "codes": len(planned_codes(bits, levels)),
+        "codes": len({code for code, _ in steps}),
         "seed": seed,
         "written": written,
     }

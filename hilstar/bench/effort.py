@@ -69,11 +69,15 @@ class Effort:
 
 @dataclass(frozen=True, slots=True)
 class Light:
-    """What the stars are shown with: the panel's response, white in electrons per second (its least), the stars' rates (n,)."""
+    """What the stars are shown with: the panel's response, white in electrons per second (its least), the stars' rates (n,).
+
+    `can_steal_bits` says whether finer codes by bit stealing are to be had, and not used yet.
+    """
 
     response: Response
     white_e_per_s: float
     rates_e_per_s: FloatArray
+    can_steal_bits: bool = False
 
 
 def plan_effort(render: RenderSettings, light: Light) -> Effort:
@@ -124,7 +128,8 @@ def choose_codes(render: RenderSettings, light: Light) -> tuple[Quantisation, tu
             break
     error = f"{errors.flux_max_mag:.4f} mag and {errors.centroid_max_px:.4f} px at worst, from white to the faintest star"
     if not within:
-        error += f" (over {limits[0]:g} mag or {limits[1]:g} px: more bits, bit_stealing or brighter stars would do)"
+        ways = "more bits, bit_stealing or brighter stars" if light.can_steal_bits else "more bits or brighter stars"
+        error += f" (over {limits[0]:g} mag or {limits[1]:g} px: {ways} would do)"
     saving = "several times cheaper than exact" if method == "round" else "nothing saved"
     return method, (errors, Choice("codes", method, error, saving))
 

@@ -75,7 +75,7 @@ def photometric(
     typer.echo(f"{'black level':20}{black:.3e} of white, contrast {contrast}")
     typer.echo(f"{'noise':20}{100 * summary['noise_relative']:.2f} % of a reading")
     typer.echo(
-        f"{'left-out levels':20}{hold['rms_percent']:.2f} / {hold['p95_percent']:.2f} / {hold['max_percent']:.2f} %"
+        f"{'held-out levels':20}{hold['rms_percent']:.2f} / {hold['p95_percent']:.2f} / {hold['max_percent']:.2f} %"
         f" (rms / 95 % / max), {hold['max_mag']:.4f} mag at most"
     )
     typer.echo(f"{'written':20}{', '.join(summary['written'])}")
@@ -86,7 +86,7 @@ def photometric(
 def plan(
     output: Annotated[Path, typer.Option("-o", "--output", metavar="PLAN.csv", help="To be filled in.")],
     bits: Annotated[int, typer.Option(help="Of a code.", min=1, max=16)] = 8,
-    levels: Annotated[int, typer.Option(help="Different codes, black and white among them.", min=2)] = 32,
+    levels: Annotated[int, typer.Option(help="From black to white; half of white comes besides.", min=2)] = 32,
     repeats: Annotated[int, typer.Option(help="Of each level; 3 do for a plain power law.", min=1)] = 6,
     channels: Annotated[str, typer.Option(help="Of w, r, g, b.")] = "w",
     seed: Annotated[int, typer.Option(help="Of the order.", min=0, max=MAX_SEED)] = 0,

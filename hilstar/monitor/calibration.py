@@ -17,7 +17,8 @@ from hilstar.monitor.calibration_file import beside, read_grid, read_response, r
 from hilstar.monitor.photometry import Response, Weights, gamma_response, mixed_response, srgb_response, table_response
 from hilstar.reading import exists
 
-BUILT_IN = ("srgb", "gamma2.2", "lcd-example")
+FORMULAS = ("srgb", "gamma2.2")
+BUILT_IN = (*FORMULAS, "lcd-example")
 EXAMPLE = Path(__file__).resolve().parent / "data" / "lcd-example.toml"
 REC709_WEIGHTS: Weights = (0.2126, 0.7152, 0.0722)  # a photometer's, of the sRGB primaries (IEC 61966-2-1)
 
@@ -43,6 +44,17 @@ class Calibration:
     instrument: str = ""
     unit: str = "relative"
     notes: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def can_steal_bits(self) -> bool:
+        """Whether `load_calibration` would take it with `bit_stealing`."""
+        levels = (2**self.response.bits - 1) * photometry.TRIPLES + 1
+        return self.weights is not None and levels <= photometry.MOST_LEVELS
+
+    @property
+    def is_formula(self) -> bool:
+        """Whether it is there for any number of bits."""
+        return self.name in FORMULAS
 
     def uniformity_map(self, resolution_px: tuple[int, int]) -> Float32Array | None:
         """Relative light of each pixel (height, width), 1 at the brightest; None where it is the same everywhere.
@@ -79,7 +91,7 @@ def load_calibration(source: str | Path, bits: int, *, bit_stealing: bool = Fals
     other bits than the file's, and for bit stealing where the weights of the primaries are not known.
     """
     name = str(source)
-    if name in ("srgb", "gamma2.2"):
+    if name in FORMULAS:
         grey = srgb_response(bits) if name == "srgb" else gamma_response(bits)
         response = photometry.bit_stealing((grey, grey, grey), REC709_WEIGHTS) if bit_stealing else grey
         digest = hashlib.sha256(f"hilstar built-in {name}, {bits} bits".encode()).hexdigest()

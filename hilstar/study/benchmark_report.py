@@ -82,7 +82,7 @@ def _draw(path: Path, result: Row) -> None:
             axis.set(title=size, xscale="log", yscale="log", xlabel="stars in view", ylabel="ms a frame (median)")
             plain_ticks(axis.xaxis, _counts(rows))
         handles = {label: line for axis in grid for line, label in zip(*axis.get_legend_handles_labels(), strict=True)}
-        figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=min(3, len(handles)))
+        figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=min(2 * across, len(handles)))
         figure.suptitle(title_lines(_finding(result)), fontsize=12)
         save(figure, path)
 

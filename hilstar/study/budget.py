@@ -183,17 +183,18 @@ def write_budget(directory: Path, found: Budget) -> None:
             for name, style in (("max", "C0-"), ("rms", "C0--")):
                 values = np.array([getattr(row, f"{kind}_{name}_{unit}") for row in shown])
                 axis.semilogy(v_mag, np.maximum(values, 1e-6), style, label=f"{name} over sub-pixel phases")
-            _lines(axis, found, limits)
+            _lines(axis, found, limits, unit)
             axis.set_ylabel(label)
-        axes[0].legend(loc="upper left")
+            axis.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), fontsize=9)
         axes[1].set_xlabel("V of a star of the Sun's colour [mag]")
 
 
-def _lines(axis: Any, found: Budget, limits: tuple[float, ...]) -> None:
-    for limit in limits:
-        axis.axhline(limit, color="tab:red", linestyle=":", linewidth=1)
-    axis.axvline(found.clips_v_mag, color="0.4", linewidth=1)
-    axis.axvline(found.nothing_v_mag, color="0.4", linestyle="--", linewidth=1)
+def _lines(axis: Any, found: Budget, limits: tuple[float, ...], unit: str) -> None:
+    for limit, style in zip(limits, (":", "-."), strict=False):
+        axis.axhline(limit, color="tab:red", linestyle=style, linewidth=1, label=f"limit: {limit:g} {unit}")
+    axis.axvline(found.clips_v_mag, color="0.4", linewidth=1, label=f"clips: brighter than V = {found.clips_v_mag:.2f}")
+    dark = f"shows nothing: fainter than V = {found.nothing_v_mag:.2f}"
+    axis.axvline(found.nothing_v_mag, color="0.4", linestyle="--", linewidth=1, label=dark)
 
 
 def budget_lines(found: Budget) -> list[str]:

@@ -199,13 +199,30 @@ def _line(full: Outcome, auto: Outcome) -> str:
     verdict = "within" if auto.within else "OVER"
     return (
         f"{auto.scene}: {auto.frame_ms:.2f} ms ({auto.quantisation}) instead of {full.frame_ms:.2f}, "
-        f"{full.frame_ms / auto.frame_ms:.1f} times; {errors}, {verdict} {auto.tolerance:g}"
+        f"{_times(full, auto)}; {errors}, {verdict} {auto.tolerance:g}"
     )
 
 
+def economy_finding(pairs: list[tuple[Outcome, Outcome]]) -> str:
+    """What is true of every scene, in one sentence: whether it takes less time, and whether it is within tolerance."""
+    slowest, quickest = (extreme(full.frame_ms / auto.frame_ms for full, auto in pairs) for extreme in (min, max))
+    over = sum(not auto.within for _, auto in pairs)
+    verdict = "within tolerance" if not over else f"{over} of {len(pairs)} scenes OVER tolerance"
+    if slowest >= 1:
+        return f"What a scene needs takes {slowest:.1f} to {quickest:.1f} times less than all effort, {verdict}"
+    if quickest < 1:
+        return f"What a scene needs took {1 / quickest:.1f} to {1 / slowest:.1f} times longer than all effort, {verdict}"
+    words = f"from {1 / slowest:.1f} times longer to {quickest:.1f} times less than all effort"
+    return f"What a scene needs took {words}, {verdict}"
+
+
+def _times(full: Outcome, auto: Outcome) -> str:
+    ratio = full.frame_ms / auto.frame_ms
+    return f"{ratio:.1f} times less" if ratio >= 1 else f"{1 / ratio:.1f} times LONGER"
+
+
 def _draw(path: Path, pairs: list[tuple[Outcome, Outcome]]) -> None:
-    ratios = [full.frame_ms / auto.frame_ms for full, auto in pairs]
-    finding = f"What a scene needs takes {min(ratios):.1f} to {max(ratios):.1f} times less than all effort, within tolerance"
+    finding = economy_finding(pairs)
     with chart(path, finding, panels=2) as (cost, error):
         at = np.arange(len(pairs))
         for shift, which, colour in ((-0.2, 0, "C7"), (0.2, 1, "C0")):

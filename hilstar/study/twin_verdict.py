@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hilstar.arrays import FloatArray
+from hilstar.monitor.calibration import BUILT_IN, Calibration, load_calibration
 from hilstar.study.charts import chart, write_csv
 
 if TYPE_CHECKING:
@@ -299,9 +300,20 @@ def _codes(verdict: Verdict, twin: Twin) -> list[str]:
     if mag <= limits.flux_mag and px <= limits.centroid_px:
         return []
     ways = ['quantisation = "exact"'] if render.quantisation != "exact" else []
-    ways += ["bit_stealing = true"] if not render.bit_stealing else []
-    ways += ["more bits", "a larger brightest_v_mag", "a smaller faintest_v_mag"]
+    calibrations = _calibrations(twin)
+    ways += ["bit_stealing = true"] if not render.bit_stealing and all(c.can_steal_bits for c in calibrations) else []
+    ways += ["more bits" if all(c.is_formula for c in calibrations) else "a monitor calibrated on more bits"]
+    ways += ["a larger brightest_v_mag", "a smaller faintest_v_mag"]
     return [f"the codes alone cost {mag:.3f} mag and {px:.3f} px at 95 %; try {', '.join(ways[:-1])} or {ways[-1]}"]
+
+
+def _calibrations(twin: Twin) -> list[Calibration]:
+    """That of the bench, and the true one where it is another: what is proposed has to suit both."""
+    bench, name = twin.bench, twin.config.verify.true_calibration
+    if name is None:
+        return [bench.calibration]
+    source = name if name in BUILT_IN else bench.path.parent / name
+    return [bench.calibration, load_calibration(source, twin.config.monitor.bits)]
 
 
 def p95(errors: FloatArray) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import re
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from hilstar.bench.white import clipping_hip
 from hilstar.monitor.calibration import load_calibration
 from hilstar.scene.psf import peak_share, pixel_share
 from hilstar.study.budget import budget, zero_point_mag
-from tests.conftest import SMALL_BENCH, assert_refused, run_hilstar
+from tests.conftest import ROOT, SMALL_BENCH, assert_refused, run_hilstar
 
 EXACT = '[render]\nquantisation = "exact"\n'
 # 1 % noise on one reading: the response of the example comes back within 1 % at nearly every code, 3 % at any.
@@ -209,6 +210,24 @@ def test_plan_measure_fit_and_show_go_round(tmp_path, small_bench_file, rng):
     shot = run_hilstar("frame", small_bench_file, "--radec", "84,-1,0", "-o", tmp_path / "out.fits")
     assert shot.returncode == 0, shot.stderr
     assert fits.getheader(tmp_path / "out.fits")["CALSHA"] == fitted["sha256"]
+
+
+def test_the_commands_and_the_figures_of_the_calibration_page_are_true(tmp_path):
+    """Its two commands as they stand, in turn; the plan is filled in as the page says."""
+    page = (ROOT / "configs" / "CALIBRATION.md").read_text()
+    plan, fit = (line.split("  ")[0] for line in re.findall(r"(?m)^    hilstar (.*)", page))
+    planned = run_hilstar(*plan.split(), cwd=tmp_path)
+    assert planned.returncode == 0, planned.stderr
+    codes, patches = re.search(r"(\d+) codes, in (\d+) patches", page).groups()
+    assert planned.stdout.startswith(f"{patches} patches of {codes} codes in PLAN.csv")
+    assert len(list((tmp_path / "PATCHES").glob("*.png"))) == int(codes)
+    true = load_calibration("lcd-example", 8).response
+    with (tmp_path / "PLAN.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    lines = [f"{row['order']},{row['code']},w,{float(true.black + true.light[int(row['code'])])!r}" for row in rows]
+    (tmp_path / "MEASURED.csv").write_text("\n".join(["order,code,channel,value", *lines]))
+    fitted = run_hilstar(*fit.split(), cwd=tmp_path)
+    assert fitted.returncode == 0, fitted.stderr
 
 
 def test_the_words_of_a_calibration_say_what_to_write(tmp_path):

@@ -150,8 +150,9 @@ def test_an_image_that_is_shifted_as_a_whole_is_said_to_be_and_only_who_differs_
         assert (found.common.rotation_deg, found.common.scale_error, found.common.flux_mag) == (0, 0, 0)
         (named,) = [star for star in found.differing if star.hip == (int(field.hip[odd]),)]
         assert named.flux_error_mag == pytest.approx(2.5 * np.log10(1 / 0.9), abs=MEASURED_MAG)
-        # Stars that share their light with a neighbour may be one star there and two here; they are few.
-        assert len(found.differing) <= 1 + 0.05 * len(found.stars)
+        # Stars that share their light with a neighbour may be one star there and two here; in this dense field a star that
+        # moves by many widths may come to lie on another one's old place, too.
+        assert len(found.differing) <= (0.05 if abs(right) < 1 else 0.3) * len(found.stars)
         assert found.common.line().startswith(f"all shifted by ({right:.2f}, {down:.2f}) px; ")
 
 

@@ -251,3 +251,41 @@ def test_a_true_rotation_that_is_none_is_refused_with_the_file_s_name(tmp_path):
 def test_only_what_is_said_to_be_true_makes_a_twin_differ(tmp_path):
     assert twin.changed(read_config(bench_file(tmp_path, "flux_mag = 0.2\n")).verify) == ["flux_mag"]
     assert twin.changed(read_config(bench_file(tmp_path, 'true_mirror = "x"\n')).verify) == ["true_mirror"]
+
+
+@pytest.mark.parametrize(("columns", "stealing"), [("w", False), ("r,g,b", True)])
+def test_what_is_proposed_for_coarse_codes_is_what_the_calibration_takes(tmp_path, columns, stealing):
+    """Grey alone does not say how the tracker sees the primaries: its file refuses bit stealing."""
+    light = gamma_response(8).light
+    share = 1 / (columns.count(",") + 1)
+    rows = [
+        ",".join([str(code), *[repr(share * float(value) + 1e-9)] * (columns.count(",") + 1)])
+        for code, value in enumerate(light)
+    ]
+    (tmp_path / "monitor.csv").write_text("\n".join([f"code,{columns}", *rows]))
+    head = 'kind = "photometric"\nwho = ""\nwhen = ""\ninstrument = ""\nunit = ""\nbits = 8\nresponse = "monitor.csv"\n'
+    (tmp_path / "monitor.toml").write_text(f"[calibration]\n{head}")
+    path = bench_file(tmp_path, "centroid_px = 1e-4\n", bits=8, method="round", calibration="monitor.toml")
+    verdict, _ = verify(path, 2, np.random.default_rng(1))
+    (proposal,) = [reason for reason in verdict.reasons if reason.startswith("the codes alone")]
+    assert ("bit_stealing" in proposal) == stealing
+    assert "a monitor calibrated on more bits" in proposal
+    path.write_text(path.read_text().replace("[verify]", "bit_stealing = true\n[verify]"))
+    if stealing:
+        assert verify(path, 1, np.random.default_rng(1))[1]["stars"] > 0
+    else:
+        with pytest.raises(InputError, match="bit stealing wants the primaries"):
+            verify(path, 1, np.random.default_rng(1))
+
+
+def test_a_true_monitor_that_is_known_in_grey_alone_refuses_bit_stealing_too(tmp_path):
+    light = gamma_response(8).light
+    rows = [f"{code},{float(value) + 1e-9!r}" for code, value in enumerate(light)]
+    (tmp_path / "monitor.csv").write_text("\n".join(["code,w", *rows]))
+    head = 'kind = "photometric"\nwho = ""\nwhen = ""\ninstrument = ""\nunit = ""\nbits = 8\nresponse = "monitor.csv"\n'
+    (tmp_path / "monitor.toml").write_text(f"[calibration]\n{head}")
+    lines = 'centroid_px = 1e-4\ntrue_calibration = "monitor.toml"\n'
+    path = bench_file(tmp_path, lines, bits=8, method="round", calibration="gamma2.2")
+    verdict, _ = verify(path, 2, np.random.default_rng(1))
+    assert not any("bit_stealing" in reason for reason in verdict.reasons)
+    assert any(reason.startswith("the codes alone") for reason in verdict.reasons)

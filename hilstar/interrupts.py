@@ -18,6 +18,7 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING, NoReturn
 
 if TYPE_CHECKING:
@@ -64,11 +65,16 @@ def install() -> None:
             signal.signal(number, _handle)
 
 
-def _handle(number: int, frame: object) -> None:
+def _handle(number: int, frame: FrameType | None) -> None:
     if _ending.signal is not None:
         return  # the end is under way; a second signal is the watchers' matter
     _ending.signal = number
     if not _ending.stops:
+        if _ending.guard and frame is not None and frame.f_code.co_filename.startswith("<frozen importlib"):
+            # Python's import calls itself back where an exception is lost, and so far nothing is there to be put in order.
+            _say_if_read("hilstar: stopped\n")
+            _let_guard_go()
+            os._exit(SIGNALLED + number)
         raise KeyboardInterrupt
     for stop in _ending.stops:
         stop.set()
@@ -113,15 +119,19 @@ def leave(code: int) -> NoReturn:
     for number in ENDING:
         with contextlib.suppress(ValueError):  # not the main thread
             signal.signal(number, signal.SIG_DFL)
-    if _ending.guard:
-        with contextlib.suppress(OSError):
-            os.kill(_ending.guard, signal.SIGKILL)
-            os.waitpid(_ending.guard, 0)
+    _let_guard_go()
     own = {"hilstar-signals", "hilstar-stderr"}
     others = [thread for thread in threading.enumerate() if thread.name not in own]
     if _ending.signal is not None or len(others) > 1:
         os._exit(code)
     sys.exit(code)
+
+
+def _let_guard_go() -> None:
+    if _ending.guard:
+        with contextlib.suppress(OSError):
+            os.kill(_ending.guard, signal.SIGKILL)
+            os.waitpid(_ending.guard, 0)
 
 
 def _signals_in(watched: socket.socket) -> bytes:
@@ -148,6 +158,7 @@ def _watch(watched: socket.socket) -> None:
     why = "at the second signal" if heard_twice else f"{THREAD_WAITS_S:g} s after {name}, in the middle of {_whereabouts()}"
     _say_if_read(f"hilstar: ended {why}\n")
     end_children(os.getpid(), _ending.guard)
+    _let_guard_go()
     os._exit(SIGNALLED + numbers[0])
 
 

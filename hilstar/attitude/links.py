@@ -17,6 +17,7 @@ from hilstar.attitude.curve import NO_KEYS, CurveKeys, check_allow_list, check_r
 from hilstar.attitude.packet import Packet, Refusal, Status, TimeReply, decode, encode
 from hilstar.attitude.receiver import Arrival
 from hilstar.errors import InputError
+from hilstar.interrupts import caught
 
 # A flood is held here, at most QUEUE_MESSAGES * LONGEST_MESSAGE_BYTES = 256 MB of it; what is over waits at the sender or
 # is lost there. A longer message drops its connection, which is then made anew.
@@ -209,7 +210,7 @@ class ZmqLockstep(_ZmqLink):
 class ZmqSender(_ZmqLink):
     """A publisher that knows when somebody listens (XPUB); it binds, or connects with `bind=False`."""
 
-    LINGER_MS = 2000
+    LINGER_MS, STOPPED_LINGER_MS = 2000, 200  # for a listener that is slow, without and with a signal
 
     def __init__(self, endpoint: str, *, bind: bool = True, keys: CurveKeys = NO_KEYS) -> None:
         super().__init__(zmq.XPUB, endpoint, bind=bind, keys=keys)
@@ -229,3 +230,9 @@ class ZmqSender(_ZmqLink):
     def put(self, message: bytes) -> None:
         """Send one message, never waiting."""
         self._socket.send(message, zmq.NOBLOCK)
+
+    def close(self) -> None:
+        """Close the socket; what its listeners do not take within its linger time is lost."""
+        if caught() is not None and not self._socket.closed:
+            self._socket.setsockopt(zmq.LINGER, self.STOPPED_LINGER_MS)
+        super().close()

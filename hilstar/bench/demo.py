@@ -20,6 +20,7 @@ from hilstar.bench.assembly import load
 from hilstar.bench.loop import FrameSink, Limit, Shown
 from hilstar.bench.output import make_directory, write_codes_png, write_preview_png
 from hilstar.bench.server import serve
+from hilstar.interrupts import caught
 from hilstar.monitor.photometry import Codes
 from hilstar.resources import resource_path
 
@@ -108,7 +109,7 @@ def run_demo(directory: Path, duration_s: float, rng: np.random.Generator, watch
             finally:
                 sender.terminate()
         pictures = []
-        for number, codes in kept.items():
+        for number, codes in kept.items() if caught() is None else ():  # whoever stopped it waits for no pictures
             exact, preview = (directory / f"frame_{number:04d}_{kind}.png" for kind in ("codes", "preview"))
             write_codes_png(exact, codes, bench.config.monitor.bits)
             write_preview_png(preview, codes)

@@ -26,12 +26,13 @@ from hilstar.attitude.timeline import Policy
 from hilstar.bench.faults import BadCable
 from hilstar.bench.pacing import wait_until
 from hilstar.errors import InputError
+from hilstar.interrupts import caught
 
 SPIN_AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 FASTEST_SPIN_RAD_S = 1e6
 DEFAULT_BAUD = 115_200
 LISTEN_MS = 20
-PATIENCE_S = 1.0  # a line that takes nothing for so long has no reader
+PATIENCE_S = 0.5  # a line that takes nothing for so long has no reader
 MOST_RESAMPLED = 10_000_000  # some GB of samples
 SPIN_FORM = "--spin AXIS,DEG_PER_S, AXIS being x, y, z or three numbers (cam axes), such as --spin z,0.5"
 
@@ -197,10 +198,11 @@ class SerialSender(SerialLink):
                         self.status, self.statuses = status, self.statuses + 1
 
     def close(self) -> None:
-        """Stop listening, and close the port once what was sent has left."""
+        """Stop listening, and close the port once what was sent has left; after a signal at once."""
         self._stop.set()
         self._thread.join()
-        self.drain()
+        if caught() is None:
+            self.drain()
         super().close()
 
 

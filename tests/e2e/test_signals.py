@@ -240,6 +240,32 @@ def test_a_lockstep_message_that_is_no_request_holds_up_nothing(tmp_path):
     assert json.loads(out)["frames"] == 1
 
 
+def test_a_sender_whose_listener_takes_nothing_ends_in_order(tmp_path):
+    """Over ZeroMQ to a subscriber that never reads, and over a line that is full."""
+    port = free_port()
+    context = zmq.Context()
+    deaf = context.socket(zmq.SUB)
+    deaf.setsockopt(zmq.LINGER, 0)
+    deaf.setsockopt(zmq.RCVHWM, 1)
+    deaf.setsockopt(zmq.RCVBUF, 4096)
+    deaf.setsockopt(zmq.SUBSCRIBE, b"")
+    deaf.connect(f"tcp://127.0.0.1:{port}")
+    far, near = os.openpty()
+    try:
+        for to, rate in ((f"tcp://127.0.0.1:{port}", "10000"), (f"serial:{os.ttyname(near)}@115200", "1000")):
+            with running(program("send", "--spin", "z,1", "--rate", rate, "--to", to, "--json")) as process:
+                wait_for(lambda process=process: at_work(process))
+                time.sleep(3.0)
+                code, out, err = ends(process, signal.SIGTERM)
+            assert code == 0, err
+            assert json.loads(out)["packets"] > 10
+    finally:
+        for descriptor in (far, near):
+            os.close(descriptor)
+        deaf.close()
+        context.term()
+
+
 def test_a_pool_of_workers_ends_with_its_command(tmp_path, small_bench_file):
     log = tmp_path / "log.csv"
     log.write_text("t_s,qw,qx,qy,qz\n" + "".join(f"{t},1,0,0,0\n" for t in range(5000)))

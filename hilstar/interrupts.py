@@ -51,6 +51,7 @@ def install() -> None:
     """
     if _ending.guard is not None:
         return
+    _fill_closed()
     watched, told = socket.socketpair()
     told.setblocking(False)
     parent = os.getpid()
@@ -63,6 +64,15 @@ def install() -> None:
     for number in ENDING:
         if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
             signal.signal(number, _handle)
+
+
+def _fill_closed() -> None:
+    """Where standard streams were closed by whoever started us, no socket may take their numbers."""
+    for descriptor in range(3):
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # the lowest number that is free
 
 
 def _handle(number: int, frame: FrameType | None) -> None:

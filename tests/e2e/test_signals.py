@@ -304,3 +304,12 @@ def test_every_command_that_takes_its_time_ends_within_a_second(tmp_path, small_
             code, _, err = ends(process, number)
         assert code in {0, NO_ATTITUDE, 128 + number}, err
         assert "Traceback" not in err
+
+
+def test_closed_standard_streams_are_nobody_else_s(tmp_path, small_bench_file):
+    """Else the first socket or file would be the standard error, and take its lines."""
+    out = tmp_path / "frame.fits"
+    command = program("frame", small_bench_file, "--radec", "84,-1,0", "-o", out)
+    result = subprocess.run(["bash", "-c", 'exec "$@" 0<&- 1>&- 2>&-', "bash", *command], timeout=60, check=False)
+    assert result.returncode == 0
+    assert out.read_bytes().startswith(b"SIMPLE")

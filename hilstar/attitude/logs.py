@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import csv
-import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from decimal import Decimal
 from pathlib import Path
@@ -21,6 +20,7 @@ from hilstar.attitude.gaps import LogJoins, log_joins
 from hilstar.attitude.packet import AttitudeSample, Refusal, checked_sample, decode
 from hilstar.attitude.timeline import Policy, Timeline
 from hilstar.errors import InputError
+from hilstar.files import whole_file
 from hilstar.reading import HEAD_BYTES, open_lines, open_regular, read_text
 
 CSV_COLUMNS = ("t_s", "qw", "qx", "qy", "qz")
@@ -69,16 +69,8 @@ def write_log(path: Path, samples: Sequence[AttitudeSample]) -> None:
         raise InputError(f"{path}: a log's name ends in one of {', '.join(_WRITERS)}")
     if not samples:
         raise InputError(f"{path}: no attitude to write")
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        with part.open("xb") as file:
-            write(file, samples)
-        part.replace(path)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror or error})") from error
-    finally:
-        with contextlib.suppress(OSError):
-            part.unlink(missing_ok=True)
+    with whole_file(path) as part, part.open("wb") as file:
+        write(file, samples)
 
 
 def log_timeline(samples: list[AttitudeSample], policy: Policy, joins: LogJoins | None = None) -> Timeline:

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import IO
 
 import msgspec
-from mcap.exceptions import RecordLengthLimitExceeded
-from mcap.records import Channel, McapRecord, Message, Metadata
-from mcap.stream_reader import StreamReader
-from mcap.writer import MCAP0_MAGIC, Writer
+from mcap.writer import Writer
 
+from hilstar.attitude.mcap_reader import read_messages
+from hilstar.attitude.mcap_writer import Topic
 from hilstar.attitude.packet import AttitudeSample, Refusal, checked_sample
 from hilstar.errors import InputError
-from hilstar.reading import open_regular
 
-MCAP_MAGIC = MCAP0_MAGIC
 ATTITUDE_TOPIC = "/attitude"
 ATTITUDE_SCHEMA_NAME = "hilstar.Attitude"
 # Plain types only: Foxglove refuses a whole file over ["integer", "null"]. What is not known is null in the message.
@@ -52,6 +48,8 @@ class _Form(msgspec.Struct):
     raw: str | None = None
 
 
+ATTITUDE_TOPIC_OF_RUN = Topic(ATTITUDE_TOPIC, ATTITUDE_SCHEMA_NAME, ATTITUDE_SCHEMA)
+
 _decoder = msgspec.json.Decoder(_Form)
 _encoder = msgspec.json.Encoder()
 
@@ -85,7 +83,7 @@ def log_time_ns(t_ns: int, receive_ns: int | None = None) -> int:
 
 def write_attitudes(file: IO[bytes], samples: Sequence[AttitudeSample]) -> None:
     """Write a whole MCAP file of samples to an open file. Raises OSError."""
-    writer = Writer(file)
+    writer = Writer(file, enable_data_crcs=True)
     writer.start(profile="", library="hilstar")
     channel_id = register_attitudes(writer)
     for sample in samples:
@@ -99,7 +97,7 @@ def read_attitudes(path: Path) -> Iterator[AttitudeSample]:
     """The samples that were accepted, in the order of the file; other channels and refused packets are passed over.
 
     A file whose writer was killed gives everything before its last, unfinished chunk. Raises InputError for damage and
-    for a message that is no attitude, OSError when the file cannot be read.
+    for a message that is no attitude.
     """
     for number, data in enumerate(read_messages(path, ATTITUDE_TOPIC), start=1):
         entry = _sample(data)
@@ -107,41 +105,6 @@ def read_attitudes(path: Path) -> Iterator[AttitudeSample]:
             raise InputError(f"{path}: message {number} of {ATTITUDE_TOPIC}: {entry.detail}")
         if entry is not None:
             yield entry
-
-
-def read_messages(path: Path, topic: str) -> Iterator[bytes]:
-    """What the messages of one topic hold, in the order of the file, up to where its writer was killed.
-
-    Raises InputError for damage, OSError when the file cannot be read.
-    """
-    yield from (data for name, data in read_topics(path) if name == topic)
-
-
-def read_topics(path: Path) -> Iterator[tuple[str, bytes]]:
-    """Topic and content of every message, in the order of the file, up to where its writer was killed.
-
-    Raises InputError for damage, OSError when the file cannot be read.
-    """
-    channels: dict[int, str] = {}
-    for record in _records(path):
-        if isinstance(record, Channel):
-            channels[record.id] = record.topic
-        elif isinstance(record, Message) and record.channel_id in channels:
-            yield channels[record.channel_id], record.data
-
-
-def read_metadata(path: Path, name: str) -> dict[str, str]:
-    """The first metadata of that name, {} where there is none. Raises InputError for damage."""
-    return next((dict(r.metadata) for r in _records(path) if isinstance(r, Metadata) and r.name == name), {})
-
-
-def is_mcap(path: Path) -> bool:
-    """True for a file that begins as MCAP does; False too where it cannot be read."""
-    try:
-        with open_regular(path, "") as file:
-            return file.read(len(MCAP_MAGIC)) == MCAP_MAGIC
-    except (OSError, InputError):
-        return False
 
 
 def _sample(data: bytes) -> AttitudeSample | Refusal | None:
@@ -154,28 +117,3 @@ def _sample(data: bytes) -> AttitudeSample | Refusal | None:
     if form.t_ns is None or form.q is None:
         return Refusal("format", "is accepted, but has no t_ns or no q")
     return checked_sample(form.t_ns, form.q, form.rate, form.sequence or 0, form.discontinuity)
-
-
-def _records(path: Path) -> Iterator[McapRecord]:
-    with open_regular(path, "give the ledger of a run, or a log") as file:
-        yield from _open_records(path, file)
-
-
-def _open_records(path: Path, file: IO[bytes]) -> Iterator[McapRecord]:
-    size = file.seek(0, os.SEEK_END)
-    file.seek(max(0, size - len(MCAP_MAGIC)))
-    finished = size > 2 * len(MCAP_MAGIC) and file.read() == MCAP_MAGIC
-    file.seek(0)
-    records = StreamReader(file, validate_crcs=True, record_size_limit=size).records
-    while True:
-        try:
-            record = next(records, None)
-        except Exception as error:  # the reader lets through what struct, zstd, lz4 and UTF-8 raise
-            cut_off = isinstance(error, RecordLengthLimitExceeded) or not file.read(1)
-            if cut_off and not finished:
-                return
-            detail = f"{type(error).__name__} {error}".strip()
-            raise InputError(f"{path}: is damaged before byte {file.tell()} ({detail}); record the log again") from error
-        if record is None:
-            return
-        yield record

@@ -16,15 +16,18 @@ import numpy.typing as npt
 from hilstar.arrays import FloatArray
 from hilstar.bench.output import make_directory, write_codes_png
 from hilstar.errors import InputError, MachineError
+from hilstar.files import write_whole
 from hilstar.monitor.calibration import load_calibration
 from hilstar.monitor.calibration_file import Head, NotesTable, write_calibration
 from hilstar.monitor.fit import ChannelFit, fit_channel
 from hilstar.monitor.measurements import CHANNELS, Measurements, check_drift, read_measurements
 from hilstar.monitor.photometry import code_dtype
 from hilstar.monitor.window import Window, WindowSettings
+from hilstar.reading import read_text
 from hilstar.render.presenter import Presenter, View, level_texture, window_context
 
 PATCH_POLL_S = 0.02  # between looks at the keys
+MAX_PLAN_BYTES = 100_000_000
 log = logging.getLogger(__name__)
 MAG_PER_RELATIVE = 2.5 / math.log(10)
 DECADES = (0, 1, 2, 3)  # below white, where the error of the response is stated
@@ -161,10 +164,7 @@ def plan(
         raise InputError(f"channels = {channels}; some of w, r, g and b are wanted, each once")
     steps = planned_patches(bits, levels, repeats, channels, np.random.default_rng(seed))
     lines = ["order,code,channel,value", *(f"{order},{code},{name}," for order, (code, name) in enumerate(steps, start=1))]
-    try:
-        output.write_text("\n".join(lines) + "\n", encoding="ascii", newline="\n")
-    except OSError as error:
-        raise InputError(f"{output}: cannot be written ({error.strerror}); choose another place") from error
+    write_whole(output, "\n".join(lines) + "\n")
     written = [str(output)]
     if patches is not None and resolution_px is not None:
         written += _write_patches(make_directory(patches), sorted(set(steps)), resolution_px, bits)
@@ -176,6 +176,15 @@ def plan(
         "seed": seed,
         "written": written,
     }
+
+
+def is_filled_in(path: Path) -> bool:
+    """Whether somebody has written measurements into a plan."""
+    try:
+        lines = read_text(path, "", MAX_PLAN_BYTES).splitlines()
+    except InputError:
+        return path.is_file()
+    return any(line.strip() and not line.rstrip().endswith(",") for line in lines[1:])
 
 
 def planned_codes(bits: int, levels: int) -> list[int]:

@@ -6,9 +6,9 @@ import csv
 import io
 import re
 import tomllib
+from array import array
 from collections.abc import Iterable
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +18,10 @@ from hilstar.arrays import FloatArray, IntArray
 from hilstar.attitude.clock import NS_PER_MS, OneWayFilter
 from hilstar.attitude.serial_lines import read_lines
 from hilstar.bench.config import BenchConfig
-from hilstar.bench.records import Run
+from hilstar.bench.records import NO_FRAMES, FrameRecord, RunRecord
 from hilstar.bench.toml_key import with_key
 from hilstar.errors import InputError, shortened
+from hilstar.files import write_whole
 from hilstar.reading import MAX_TOML_BYTES, read_text
 
 NS_PER_US = 1000
@@ -97,23 +98,31 @@ def read_edges(path: Path) -> Edges:
 def save_edges(path: Path, edges: Edges) -> None:
     """Write edges as `read_edges` reads them. Raises InputError where that cannot be done."""
     lines = (f"{host},{level}" for host, level in zip(edges.host_ns.tolist(), edges.level.tolist(), strict=True))
-    try:
-        path.write_text("\n".join(["host_ns,level", *lines]) + "\n", encoding="ascii")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror}); choose another place") from error
+    write_whole(path, "\n".join(["host_ns,level", *lines]) + "\n")
 
 
-def changes(run: Run) -> Edges:
+def changes(records: Iterable[RunRecord]) -> Edges:
     """The frames of a run whose photodiode square differs from that of the frame before: swap times and levels.
 
-    Raises InputError for a run without a square.
+    Raises InputError for a run without a frame, or without a square.
     """
-    frames = [frame for frame in run.frames if frame.marker is not None]
-    if not frames:
+    swap_ns, level, last = array("q"), array("b"), None
+    seen = False
+    for record in records:
+        if not isinstance(record, FrameRecord):
+            continue
+        seen = True
+        if record.marker is None:
+            continue
+        if last is not None and record.marker != last:
+            swap_ns.append(record.swap_ns)
+            level.append(record.marker)
+        last = record.marker
+    if not seen:
+        raise InputError(f"the run {NO_FRAMES}")
+    if last is None:
         raise InputError("the run has no photodiode square; set [monitor] photodiode_px and run it on a screen")
-    pairs = [(b.swap_ns, b.marker) for a, b in pairwise(frames) if a.marker != b.marker]
-    table = np.array(pairs, dtype=np.int64).reshape(-1, 2)
-    return Edges(table[:, 0], table[:, 1])
+    return Edges(np.array(swap_ns, dtype=np.int64), np.array(level, dtype=np.int64))
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,7 +249,7 @@ def write_panel_delay(path: Path, panel_delay_ms: float) -> None:
         changed = with_key(text, "monitor", "panel_delay_ms", value)
         if tomllib.loads(changed).get("monitor", {}).get("panel_delay_ms") != value:
             raise InputError(f"{path}: write panel_delay_ms = {value} into its [monitor] yourself: its form is not plain")
-        path.write_text(changed, encoding="utf-8")
+        write_whole(path, changed)
     except OSError as error:
         raise InputError(f"{path}: cannot be changed ({error.strerror}); write panel_delay_ms = {value} yourself") from error
     except ValueError as error:  # tomllib's own, and that of an integer of thousands of digits

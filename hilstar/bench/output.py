@@ -17,6 +17,7 @@ from hilstar.bench.assembly import Bench, Frame
 from hilstar.bench.picture import exposure_picture
 from hilstar.bench.simulation import Exposure, Simulator
 from hilstar.errors import InputError
+from hilstar.files import whole_file
 from hilstar.monitor.photometry import Codes
 from hilstar.scene.camera import Camera
 
@@ -38,7 +39,7 @@ def write_frame_fits(path: Path, bench: Bench, frame: Frame) -> None:
     header["NSTARS"] = (len(frame.truth), "stars in view")
     header["CALNAME"] = (bench.calibration.name, "monitor calibration")
     header["CALSHA"] = bench.calibration.sha256
-    _written(path, lambda: fits.PrimaryHDU(frame.linear, header).writeto(path, overwrite=True))
+    _written(path, lambda part: fits.PrimaryHDU(frame.linear, header).writeto(part, overwrite=True))
 
 
 def write_exposure_fits(path: Path, simulator: Simulator, exposure: Exposure, noise: str, seed: int) -> None:
@@ -60,7 +61,7 @@ def write_exposure_fits(path: Path, simulator: Simulator, exposure: Exposure, no
     header["BITS"] = (tracker.detector.bits, "of the ADC")
     header["NSTARS"] = (len(exposure.truth), "stars in view")
     hdus = fits.HDUList([fits.PrimaryHDU(exposure.dn, header), fits.BinTableHDU(exposure.truth, name="TRUTH")])
-    _written(path, lambda: hdus.writeto(path, overwrite=True))
+    _written(path, lambda part: hdus.writeto(part, overwrite=True))
 
 
 def _header(bench_hash: str, epoch_jyear: float, q_icrs_to_cam: FloatArray, camera: Camera) -> Any:
@@ -108,8 +109,8 @@ def world_coordinates(camera: Camera, q_icrs_to_cam: FloatArray) -> dict[str, st
 def write_truth_csv(path: Path, frame: Frame) -> None:
     """One row per star: the columns of TRUTH_DTYPE, brightest first; drawn and clipped are 1 or 0."""
 
-    def write() -> None:
-        with path.open("w", encoding="ascii", newline="") as file:
+    def write(part: Path) -> None:
+        with part.open("w", encoding="ascii", newline="") as file:
             writer = csv.writer(file, lineterminator="\n")
             writer.writerow(frame.truth.dtype.names or ())
             for row in frame.truth.tolist():
@@ -126,7 +127,7 @@ def write_codes_png(path: Path, codes: Codes, bits: int) -> None:
     image = (
         np.asarray(codes, dtype=np.uint8) if bits <= 8 else np.asarray(codes.astype(np.uint16) << (16 - bits), dtype=np.uint16)
     )
-    _written(path, lambda: _save_png(path, image))
+    _written(path, lambda part: _save_png(part, image))
 
 
 def _save_png(path: Path, image: npt.NDArray[Any]) -> None:
@@ -156,28 +157,32 @@ def write_preview_png(path: Path, codes: Codes) -> None:
         disc = np.hypot(*np.meshgrid(reach, reach)) <= radius
         picture = np.maximum(picture, maximum_filter(bright, footprint=disc))
     smooth = gaussian_filter(picture**PREVIEW_POWER, PREVIEW_BLUR_PX)
-    _written(path, lambda: Image.fromarray((255 * np.clip(smooth, 0, 1)).astype(np.uint8)).save(path, "PNG"))
+    _written(path, lambda part: Image.fromarray((255 * np.clip(smooth, 0, 1)).astype(np.uint8)).save(part, "PNG"))
 
 
 def write_exposure_png(path: Path, dn: npt.NDArray[np.uint16]) -> None:
     """A picture of a tracker's frame for a person (see `bench.picture`)."""
-    _written(path, lambda: Image.fromarray(exposure_picture(dn)).save(path, "PNG"))
+    _written(path, lambda part: Image.fromarray(exposure_picture(dn)).save(part, "PNG"))
 
 
 def write_dn_picture(path: Path, dn: npt.NDArray[np.uint16]) -> None:
     """The DN themselves, unscaled, as greyscale of 16 bits: TIFF where the name ends in .tif or .tiff, else PNG."""
     form = "TIFF" if path.suffix.lower() in {".tif", ".tiff"} else "PNG"
-    _written(path, lambda: Image.fromarray(dn).save(path, form))
+    _written(path, lambda part: Image.fromarray(dn).save(part, form))
 
 
 def make_directory(path: Path) -> Path:
     """`path`, made if it is not there. Raises InputError where it cannot be made or written."""
-    _written(path, lambda: path.mkdir(parents=True, exist_ok=True))
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"{path}: cannot be written ({getattr(error, 'strerror', None) or error}); choose another place"
+        ) from error
     return path
 
 
-def _written(path: Path, write: Callable[[], object]) -> None:
-    try:
-        write()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror or error}); choose another place") from error
+def _written(path: Path, write: Callable[[Path], object]) -> None:
+    """Whole or not at all; an older file stays until the new one is there."""
+    with whole_file(path) as part:
+        write(part)

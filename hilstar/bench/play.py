@@ -10,7 +10,8 @@ from typing import Protocol
 from hilstar.attitude.clock import NS_PER_S
 from hilstar.attitude.gaps import log_joins
 from hilstar.attitude.logs import log_timeline, read_log
-from hilstar.attitude.mcap_log import is_mcap, read_attitudes
+from hilstar.attitude.mcap_log import read_attitudes
+from hilstar.attitude.mcap_reader import is_mcap
 from hilstar.attitude.packet import AttitudeSample, rate_refusal
 from hilstar.attitude.timeline import Attitude, Timeline
 from hilstar.bench.config import BenchConfig
@@ -113,7 +114,7 @@ def plan_play(log: Path, wanted: Wanted, config: BenchConfig) -> Play:
     """
     factor = parse_speed(wanted.speed)
     if is_mcap(log):
-        frames = list(past_frames(log))
+        frames = list(past_frames(log, math.radians(config.attitude.max_rate_deg_s)))
         if frames:
             return _plan_run(log, wanted, factor, frames)
     samples = read_log(log)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import csv
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -12,6 +13,7 @@ from hilstar.bench.assembly import Bench
 from hilstar.bench.loop import Shown
 from hilstar.bench.output import make_directory, write_codes_png
 from hilstar.errors import InputError
+from hilstar.files import refuse_ledger
 
 COLUMNS = ("frame", "t_s", "qw", "qx", "qy", "qz", "stars_drawn", "clipped")
 
@@ -22,6 +24,7 @@ class FrameRecorder:
     def __init__(self, directory: Path | None, bench: Bench) -> None:
         self._directory = directory
         self._bench = bench
+        self._table = Path()
         self._bits = bench.config.monitor.bits
         self._stack = ExitStack()
 
@@ -34,18 +37,26 @@ class FrameRecorder:
         )
         q = ["", "", "", ""] if shown.attitude is None else [repr(float(v)) for v in shown.attitude.q_icrs_to_cam]
         row = [shown.number, f"{shown.t_ns / 1e9:.9f}", *q, shown.drawn.star_count, len(shown.drawn.clipped_hip)]
-        self._writer.writerow(row)
+        with self._said():
+            self._writer.writerow(row)
+
+    @contextmanager
+    def _said(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise InputError(f"{self._table}: cannot be written ({error.strerror}); choose another place") from error
 
     def __enter__(self) -> Self:
         if self._directory is not None:
-            path = make_directory(self._directory) / "frames.csv"
-            try:
-                file = self._stack.enter_context(path.open("w", encoding="ascii", newline=""))
-            except OSError as error:
-                raise InputError(f"{path}: cannot be written ({error.strerror}); choose another place") from error
+            self._table = make_directory(self._directory) / "frames.csv"
+            refuse_ledger(self._table)
+            with self._said():
+                file = self._stack.enter_context(self._table.open("w", encoding="ascii", newline=""))
             self._writer = csv.writer(file, lineterminator="\n")
             self._writer.writerow(COLUMNS)
         return self
 
     def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
-        self._stack.close()
+        with self._said():
+            self._stack.close()

@@ -13,6 +13,7 @@ from hilstar.bench.assembly import Bench
 from hilstar.bench.config import read_config
 from hilstar.bench.toml_key import with_key
 from hilstar.errors import InputError
+from hilstar.files import write_whole
 from hilstar.reading import MAX_TOML_BYTES, read_text
 from hilstar.scene.psf import peak_share
 
@@ -89,10 +90,7 @@ def with_flux_at_white(bench_file: Path, flux_at_white_e_per_s: float, output: P
     key = "flux_at_white_e_per_s"
     text = read_text(bench_file, "give the path of a bench file", MAX_TOML_BYTES)
     text = with_key(text, "render", key, flux_at_white_e_per_s, instead_of=("brightest_v_mag",))
-    try:
-        output.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{output}: cannot be written ({error.strerror}); choose another name") from error
+    write_whole(output, text)
     if read_config(output).render.flux_at_white_e_per_s != flux_at_white_e_per_s:
         raise InputError(
             f"{output}: the key could not be set in this file; write {key} = {flux_at_white_e_per_s!r} under [render] yourself"

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import typer
 
-from hilstar.cli.common import MAX_SEED, BenchFile, Json, QuaternionText, RadecText, app, attitude_of
+from hilstar.cli.common import MAX_SEED, BenchFile, Json, QuaternionText, RadecText, app, attitude_of, check_files
 from hilstar.console import print_json, progress, say
 from hilstar.endings import FITS, PNG, PNG_OR_TIFF, check_directory, check_ending
 from hilstar.errors import InputError
@@ -48,6 +48,7 @@ def simulate(
     check_ending("-o", output, FITS)
     check_ending("--png", png, PNG)
     check_ending("--dn-png", dn_png, PNG_OR_TIFF)
+    check_files([], targets, bench_file)
     q = attitude_of("simulate", radec, quaternion)
     rate_rad_s = parse_rate(rate) if rate else np.zeros(3)
     with Simulator(bench_file) as simulator:

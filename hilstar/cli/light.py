@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from hilstar.cli.common import MAX_SEED, BenchFile, Json, app
+from hilstar.cli.common import MAX_SEED, BenchFile, Json, Overwrite, app, check_files
 from hilstar.console import print_json, say
 from hilstar.endings import CSV, PNG, TOML, check_directory, check_ending
 from hilstar.errors import InputError
@@ -59,6 +59,7 @@ def photometric(
 
     check_ending("-o", output, TOML)
     check_ending("--plot", plot, PNG)
+    check_files([measured], [output, output.with_suffix(".csv"), plot])
     summary = calibrate_photometric(measured, output, bits=bits, who=who, when=when, instrument=instrument, unit=unit)
     if plot is not None:
         from hilstar.study.calibration import draw_calibration
@@ -95,14 +96,17 @@ def plan(
     show: Annotated[bool, typer.Option("--show", help="Show the patches on a display: space for the next, q to end.")] = False,
     display: Annotated[str, typer.Option(metavar="INDEX|NAME", help="With --show: which.")] = "0",
     seconds: Annotated[float | None, typer.Option(metavar="S", help="With --show: each so long, without keys.", min=0)] = None,
+    overwrite: Overwrite = False,
     as_json: Json = False,
 ) -> None:
     """Which codes to measure, in which order, and their patches."""
+    from hilstar.bench.calibrate import is_filled_in
     from hilstar.bench.calibrate import plan as write_plan
     from hilstar.bench.sender import parse_numbers
 
     check_ending("-o", output, CSV)
     check_directory("--headless", headless)
+    check_files([], [], None, output if is_filled_in(output) else None, overwrite)
     width, height = (round(value) for value in parse_numbers(resolution, 2, "--resolution", RESOLUTION_FORM))
     if not (1 <= width <= 32768 and 1 <= height <= 32768):
         raise InputError(f"--resolution {resolution}: write {RESOLUTION_FORM}")
@@ -144,6 +148,7 @@ def scale(
     from hilstar.bench.scale import UNSURE_MAG, parse_reading, scale_by_tracker, with_flux_at_white
 
     check_ending("-o", output, TOML)
+    check_files([], [output], bench_file)
     with load(bench_file) as bench:
         exposure_s = bench.config.tracker.exposure_s if exposure is None else exposure
         found = scale_by_tracker(bench, [parse_reading(text) for text in reading], exposure_s)

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from hilstar.cli.common import Json, app
+from hilstar.cli.common import Json, Overwrite, app, check_files
 from hilstar.console import print_json
 from hilstar.endings import CSV, check_directory, check_ending
 from hilstar.errors import InputError
 
+LEDGER_BEHIND_S = 0.5  # so much of a run that goes on may not be on the disk yet
 RunFile = Annotated[Path, typer.Argument(metavar="RUN.mcap", help="The ledger of serve or replay.")]
 
 
@@ -48,6 +50,7 @@ def latency(
     save: Annotated[Path | None, typer.Option(metavar="EDGES.csv", help="Keep the edges that were read.")] = None,
     write: Annotated[Path | None, typer.Option(metavar="BENCH.toml", help="Set panel_delay_ms in it.")] = None,
     output: Annotated[Path | None, typer.Option("-o", "--output", metavar="DIR", help="Where the chart goes.")] = None,
+    overwrite: Overwrite = False,
     as_json: Json = False,
 ) -> None:
     """From swap to light, by a photodiode before the screen's square and the ledger of the run."""
@@ -58,6 +61,7 @@ def latency(
 
     check_directory("-o", output)
     check_ending("--save", save, CSV)
+    check_files([ledger, edges], [write, None if output is None else output / "latency.png"], None, save, overwrite)
     if (edges is None) == (diode is None):
         raise InputError("latency: give the edges with --edges EDGES.csv or --diode serial:/dev/ttyX@115200, one of them")
     if diode is None:
@@ -67,6 +71,7 @@ def latency(
         if port is None:
             raise InputError(f"--diode {diode}: write serial:/dev/ttyX@BAUD, such as serial:/dev/ttyACM0@115200")
         found = capture_edges(*port, duration)
+        time.sleep(LEDGER_BEHIND_S)
     if save is not None:
         save_edges(save, found)
     summary = measure(ledger, found, None if output is None else make_directory(output))

@@ -12,7 +12,19 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from hilstar.cli.common import LOG_HELP, MAX_SEED, BenchFile, Headless, Json, QuaternionText, RadecText, app, attitude_of
+from hilstar.cli.common import (
+    LOG_HELP,
+    MAX_SEED,
+    BenchFile,
+    Headless,
+    Json,
+    Overwrite,
+    QuaternionText,
+    RadecText,
+    app,
+    attitude_of,
+    check_files,
+)
 from hilstar.console import print_json, progress, report, say
 from hilstar.endings import CSV, FITS, MCAP, PNG, check_directory, check_ending
 from hilstar.errors import InputError, MachineError
@@ -24,6 +36,10 @@ Force = Annotated[bool, typer.Option("--force", help="Show on a display that the
 Explain = Annotated[bool, typer.Option("--explain", help="What was chosen for the scene, its error and saving, on stderr.")]
 LedgerFile = Annotated[Path | None, typer.Option("--ledger", metavar="RUN.mcap", help="Keep every packet and frame there.")]
 
+LedgerSplit = Annotated[
+    str | None,
+    typer.Option("--ledger-split", metavar="1GB|1h", help="Go on in RUN.0001.mcap and so on after so much, or so long."),
+]
 NO_ATTITUDE = 4  # the exit code of a run that never had one
 
 
@@ -69,6 +85,7 @@ def frame(
     check_ending("--truth", truth, CSV)
     check_ending("--codes", codes, PNG)
     check_ending("--preview", preview, PNG)
+    check_files([], targets, bench_file)
     with load(bench_file) as bench:
         if explain:
             explain_effort(bench)
@@ -137,14 +154,14 @@ def say_what_clips(bench: Any) -> None:
 
 
 @contextmanager
-def optional_ledger(path: Path | None, bench: Any, notices: Notices) -> Iterator[Any]:
+def optional_ledger(path: Path | None, bench: Any, notices: Notices, overwrite: bool, split: Any) -> Iterator[Any]:
     """The run's ledger, which keeps the run's events too, or nothing where none was asked for."""
     from hilstar.bench.ledger import Ledger
 
     if path is None:
         yield None
         return
-    ledger = Ledger(path, bench)
+    ledger = Ledger(path, bench, notices, overwrite, split)
     notices.listen(ledger.notice)
     try:
         yield ledger
@@ -181,6 +198,8 @@ def serve(
     duration: Annotated[float | None, typer.Option(help="Seconds to run; until Ctrl-C by default.", min=0, max=1e8)] = None,
     frames: Annotated[int | None, typer.Option(help="Frames to draw.", min=1)] = None,
     ledger: LedgerFile = None,
+    ledger_split: LedgerSplit = None,
+    overwrite: Overwrite = False,
     windowed: Windowed = False,
     force: Force = False,
     explain: Explain = False,
@@ -188,16 +207,19 @@ def serve(
 ) -> None:
     """Show the live attitude stream."""
     from hilstar.bench.config import read_config
+    from hilstar.bench.ledger import parse_split
     from hilstar.bench.loop import Limit
     from hilstar.bench.server import Outlet, open_link
     from hilstar.bench.server import serve as serve_stream
 
     check_ending("--ledger", ledger, MCAP)
+    check_files([], [], bench_file, ledger, overwrite)
+    split = parse_split(ledger_split)
     notices = Notices()
     with (
         open_link(read_config(bench_file).attitude, bench_file.parent) as link,
         shown_bench(bench_file, headless, windowed, force) as (bench, screen),
-        optional_ledger(ledger, bench, notices) as kept,
+        optional_ledger(ledger, bench, notices, overwrite, split) as kept,
     ):
         if explain:
             explain_effort(bench)
@@ -224,6 +246,8 @@ def replay(
     headless: Headless = False,
     output: Annotated[Path | None, typer.Option("-o", "--output", metavar="DIR", help="Write each frame there.")] = None,
     ledger: LedgerFile = None,
+    ledger_split: LedgerSplit = None,
+    overwrite: Overwrite = False,
     windowed: Windowed = False,
     force: Force = False,
     explain: Explain = False,
@@ -231,6 +255,7 @@ def replay(
 ) -> None:
     """Show an attitude log."""
     from hilstar.bench.config import read_config
+    from hilstar.bench.ledger import parse_split
     from hilstar.bench.play import Wanted, plan_play
     from hilstar.bench.recorder import FrameRecorder
     from hilstar.bench.server import Outlet
@@ -238,12 +263,14 @@ def replay(
 
     check_directory("-o", output)
     check_ending("--ledger", ledger, MCAP)
+    check_files([log], [None if output is None else output / "frames.csv"], bench_file, ledger, overwrite)
+    split = parse_split(ledger_split)
     notices = Notices()
     play = plan_play(log, Wanted(speed, start, stop, step), read_config(bench_file))
     with (
         shown_bench(bench_file, headless, windowed, force) as (bench, screen),
         FrameRecorder(output, bench) as record,
-        optional_ledger(ledger, bench, notices) as kept,
+        optional_ledger(ledger, bench, notices, overwrite, split) as kept,
         progress("replaying", play.frame_count) as advance,
     ):
         say_what_clips(bench)

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from hilstar.cli.common import LOG_HELP, MAX_SEED, Json, RadecText, app
+from hilstar.cli.common import LOG_HELP, MAX_SEED, Json, RadecText, app, check_files
 from hilstar.console import print_json, progress, say
 from hilstar.endings import check_directory
 from hilstar.errors import InputError
@@ -124,6 +124,7 @@ def convert(
     """Write an attitude log in another form."""
     from hilstar.attitude.logs import read_log, write_log
 
+    check_files([log], [output])
     samples = read_log(log)
     write_log(output, samples)
     typer.echo(f"{len(samples)} attitudes in {output}")

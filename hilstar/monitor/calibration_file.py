@@ -16,6 +16,7 @@ from scipy.interpolate import PchipInterpolator
 
 from hilstar.arrays import FloatArray
 from hilstar.errors import InputError, shortened
+from hilstar.files import write_whole
 from hilstar.reading import MAX_TOML_BYTES, as_text, exists, parse_toml, read_bytes
 
 BLACKS_AGREE = 0.1  # relative: the three channels' code 0 is one and the same black screen
@@ -234,13 +235,8 @@ def write_calibration(path: Path, head: Head, columns: dict[str, FloatArray], no
     ).decode()
     lines = ["[calibration]", *_keys(msgspec.structs.asdict(head)), ""]
     lines += ["[noise]", f"relative = {noise:.6g}", "", "[notes]", *_keys(msgspec.structs.asdict(notes))]
-    try:
-        table.write_text(comment + ",".join(["code", *columns]) + "\n" + rows, encoding="utf-8", newline="\n")
-        path.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
-    except (OSError, ValueError) as error:
-        raise InputError(
-            f"{path}: cannot be written ({getattr(error, 'strerror', None) or error}); choose another place"
-        ) from error
+    write_whole(table, comment + ",".join(["code", *columns]) + "\n" + rows)
+    write_whole(path, "\n".join(lines) + "\n")
     return table
 
 

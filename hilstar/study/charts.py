@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hilstar.errors import InputError
+from hilstar.files import whole_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,13 +24,10 @@ STYLE: Any = {"font.size": 11, "axes.grid": True, "grid.alpha": 0.3, "legend.fra
 
 def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
     """A table with a header. Raises InputError where it cannot be written."""
-    try:
-        with path.open("w", encoding="utf-8", newline="") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(columns)
-            writer.writerows(rows)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror}); choose another place") from error
+    with whole_file(path) as part, part.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(columns)
+        writer.writerows(rows)
 
 
 @contextmanager
@@ -69,7 +66,5 @@ def plain_ticks(axis: Axis, values: Sequence[float]) -> None:
 
 def save(figure: Any, path: Path) -> None:
     """Write a figure. Raises InputError where it cannot be written."""
-    try:
-        figure.savefig(path, dpi=110)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror}); choose another place") from error
+    with whole_file(path) as part:
+        figure.savefig(part, dpi=110)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from hilstar.bench.latency import Edges, Paired, changes, pair, summarise
-from hilstar.bench.records import config_of, read_run
+from hilstar.bench.records import config_of, read_head, run_records
 from hilstar.errors import InputError
 from hilstar.study.charts import chart
 
@@ -22,11 +22,10 @@ def measure(ledger: Path, edges: Edges, directory: Path | None) -> dict[str, Any
 
     Raises InputError for a ledger or edges that do not fit each other.
     """
-    run = read_run(ledger)
-    config = config_of(run)
+    config = config_of(read_head(ledger))
     if config is None:
         raise InputError(f"{ledger}: its head holds no bench file that can be read; record the run again")
-    shown = changes(run)
+    shown = changes(run_records(ledger))
     if not len(shown.host_ns):
         raise InputError(f"{ledger}: its photodiode square never changed; record a longer run")
     paired = pair(edges, shown, 1e9 / config.monitor.refresh_hz)

@@ -83,8 +83,9 @@ def shown(server: Server, folder: Path, kind: str):
     bench.write_text(BENCH.replace("[collimator]", f"{keys}\n[collimator]"))
     still = "\n".join(f"{t},{ATTITUDE}" for t in (0, 60))
     (folder / "still.csv").write_text(f"t_s,qw,qx,qy,qz\n{still}\n")
-    command = ["replay", str(bench), str(folder / "still.csv"), "--ledger", str(folder / "run.mcap"), "--json"]
+    command = ["replay", str(bench), str(folder / "still.csv"), "--ledger", str(folder / "run.mcap"), "--json", "--overwrite"]
     env = {**os.environ, "DISPLAY": server.display}
+    (folder / "run.mcap").unlink(missing_ok=True)
     with subprocess.Popen(
         [sys.executable, "-m", "hilstar", *command], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=env
     ) as process:
@@ -109,6 +110,7 @@ def measured(server: Server, folder: Path, kind: str, added_ms: float, device_cl
             "--json",
             "--save",
             folder / "edges.csv",
+            "--overwrite",
             "-o",
             folder / "charts",
             *options,

@@ -17,12 +17,13 @@ from PIL import Image
 from hilstar.attitude.logs import read_log
 from hilstar.attitude.quaternion import from_radec_roll_deg, propagate
 from hilstar.bench.records import past_frames
+from hilstar.errors import InputError
 from tests.conftest import SMALL_BENCH, assert_refused, run_hilstar
 from tests.e2e.test_serve import packet, publisher, serving, summary_of
 
 START = from_radec_roll_deg(84, -1, 0)
 RATE = (0.0, 0.0, 0.1)
-LIMIT_BYTES = 60_000
+LIMIT_BYTES = 20_000
 
 
 def stream(sender, count: int) -> None:
@@ -132,7 +133,7 @@ def test_after_a_kill_all_but_the_last_half_second_can_be_read(tmp_path):
 
 
 def test_a_full_disk_ends_the_ledger_and_not_the_display(tmp_path):
-    """A file that may not grow over 60 kB stands for the disk."""
+    """A file that may not grow over 20 kB stands for the disk."""
     ledger = tmp_path / "run.mcap"
     bench = tmp_path / "bench.toml"
     with publisher() as (sender, port):
@@ -163,3 +164,78 @@ def test_a_ledger_that_cannot_be_begun_gets_one_line(tmp_path, small_bench_file)
         assert result.returncode == 2
         assert str(place) in result.stderr
         assert "Traceback" not in result.stderr
+
+
+def test_no_output_is_written_over_an_input_or_an_older_run(tmp_path, small_bench_file):
+    bench = small_bench_file
+    qe = tmp_path / "qe.csv"
+    qe.write_text("wavelength_nm,quantum_efficiency\n300,0.5\n1000,0.5\n")
+    bench.write_text(SMALL_BENCH.replace('"ccd47-20"', '"qe.csv"'))
+    log = tmp_path / "log.csv"
+    log.write_text("t_s,qw,qx,qy,qz\n0,1,0,0,0\n0.1,1,0,0,0\n")
+    run = tmp_path / "run.mcap"
+    headless = ["--headless", "--speed", "max"]
+    assert run_hilstar("replay", bench, log, *headless, "--ledger", run).returncode == 0
+    (tmp_path / "hard.mcap").hardlink_to(run)
+    before = {path: path.read_bytes() for path in (bench, qe, log, run)}
+    (tmp_path / "link.toml").symlink_to(bench)
+    attitude = ["--quaternion", "1,0,0,0"]
+    for command in (
+        ["serve", bench, "--headless", "--ledger", tmp_path / "link.toml"],
+        ["frame", bench, *attitude, "--truth", qe],
+        ["frame", bench, *attitude, "-o", tmp_path / "x", "--truth", tmp_path / "x"],
+        ["replay", bench, run, *headless, "--ledger", tmp_path / "hard.mcap", "--overwrite"],
+        ["replay", bench, log, *headless, "--ledger", run],
+        ["convert", log, log],
+        ["convert", log, run],
+        ["serve", bench, "--headless", "--duration", "1", "--ledger", tmp_path / "other.mcap", "--ledger-split", "1 fortnight"],
+    ):
+        assert_refused(run_hilstar(*command), 2)
+        assert {path: path.read_bytes() for path in before} == before, command
+    again = run_hilstar("replay", bench, log, *headless, "--ledger", run, "--overwrite")
+    assert again.returncode == 0, again.stderr
+    assert run.read_bytes() != before[run]
+
+
+def test_a_flood_of_wrong_packets_is_counted_and_the_ledger_stays_small(tmp_path):
+    """A refused packet costs a count; the first of each reason are there whole."""
+    ledger = tmp_path / "run.mcap"
+    with publisher() as (sender, port), serving(tmp_path, port, "--ledger", str(ledger)) as process:
+        end_s = time.monotonic() + 2
+        sent = 0
+        while time.monotonic() < end_s:
+            for _ in range(200):
+                sender.send(b"x" * 3000)
+            sent += 200
+            time.sleep(0.01)
+        process.send_signal(signal.SIGINT)
+        summary = summary_of(process, code=4)  # nothing right ever came
+    found = messages(ledger)
+    assert len(found["/attitude"]) < 40
+    assert len(bytes.fromhex(found["/attitude"][0]["raw"])) == 1024
+    counted = sum(each["count"] for each in found["/not_kept"] if each["kind"] == "packet")
+    assert counted + len(found["/attitude"]) == summary["packets"]["received"] > 1000
+    assert summary["ledger"]["unrecorded"] == 0
+    assert ledger.stat().st_size < 1_000_000
+    report = json.loads(run_hilstar("report", ledger, "-o", tmp_path / "report", "--json").stdout)
+    assert sum(report["packets"].values()) == summary["packets"]["received"]
+
+
+def test_no_flipped_bit_changes_an_attitude_unsaid(tmp_path, rng):
+    ledger, _ = served(tmp_path)
+    data = ledger.read_bytes()
+    truth = [(s.t_ns, *s.q_icrs_to_cam) for s in read_log(ledger)]
+    damaged = tmp_path / "damaged.mcap"
+    said = 0
+    for place in rng.integers(0, 8 * len(data), 400):
+        wrong = bytearray(data)
+        wrong[place // 8] ^= 1 << (place % 8)
+        damaged.write_bytes(bytes(wrong))
+        try:
+            found = [(s.t_ns, *s.q_icrs_to_cam) for s in read_log(damaged)]
+        except InputError:
+            said += 1
+            continue
+        assert found == truth[: len(found)]
+        assert len(found) == len(truth)
+    assert said > 300

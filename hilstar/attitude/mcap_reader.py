@@ -1,0 +1,198 @@
+"""MCAP files read in order, in bounded memory, up to where their writer was killed.
+
+A chunk says how large it becomes, and may lie: it is unpacked to that size and no further, and a whole file to so many times
+its own. What is damaged is refused, with one line.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import struct
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO
+
+import lz4.frame
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import RecordLengthLimitExceeded
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, McapRecord, Message, Metadata
+from mcap.stream_reader import StreamReader
+from mcap.writer import MCAP0_MAGIC
+
+from hilstar.errors import InputError
+from hilstar.reading import open_regular, size_text
+
+RUN_METADATA = "hilstar"  # the name of a ledger's head
+ADVICE = "give an MCAP file, such as the ledger of a run"
+MAX_CHUNK_BYTES = 64_000_000  # unpacked; writers make them of about 1 MB
+MAX_RECORD_BYTES = 256_000_000
+MAX_INFLATION, FREE_BYTES = 100, 32_000_000  # of a whole file; logs pack to a tenth
+_record_head = struct.Struct("<BQ")
+_message_head = struct.Struct("<HIQQ")
+
+
+class DamageError(Exception):
+    """What is wrong with a file."""
+
+
+class TooLargeError(DamageError):
+    """More than is read."""
+
+
+def part_path(path: Path, part: int) -> Path:
+    """Where part 1, 2, ... of a run is kept whose ledger begins at `path`: RUN.0001.mcap and on."""
+    return path.with_name(f"{path.stem}.{part:04d}{path.suffix}") if part else path
+
+
+def parts_of(path: Path) -> list[Path]:
+    """The files of a run whose ledger begins at `path`; the file alone where it is no first one. Raises InputError."""
+    head = read_metadata(path, RUN_METADATA)
+    parts = [path]
+    while head.get("part") == "0" and (following := part_path(path, len(parts))).is_file():
+        own = read_metadata(following, RUN_METADATA)
+        if (own.get("run_id"), own.get("part")) != (head.get("run_id"), str(len(parts))):
+            break
+        parts.append(following)
+    return parts
+
+
+def read_topics(path: Path) -> Iterator[tuple[str, bytes]]:
+    """Topic and content of every message of a run's files, in their order, up to where its writer was killed.
+
+    Raises InputError for damage, and for what is no regular file.
+    """
+    for part in parts_of(path):
+        channels: dict[int, str] = {}
+        for record in _records(part):
+            if isinstance(record, Channel):
+                channels[record.id] = record.topic
+            elif isinstance(record, Message) and record.channel_id in channels:
+                yield channels[record.channel_id], record.data
+
+
+def read_messages(path: Path, topic: str) -> Iterator[bytes]:
+    """What the messages of one topic hold. Raises InputError for damage."""
+    yield from (data for name, data in read_topics(path) if name == topic)
+
+
+def topics_of(path: Path) -> list[str]:
+    """The topics that a file has channels for. Raises InputError for damage."""
+    return sorted({record.topic for record in _records(path) if isinstance(record, Channel)})
+
+
+def read_metadata(path: Path, name: str) -> dict[str, str]:
+    """The first metadata of that name, {} where there is none. Raises InputError for damage."""
+    return next((dict(r.metadata) for r in _records(path) if isinstance(r, Metadata) and r.name == name), {})
+
+
+def is_mcap(path: Path) -> bool:
+    """True for a regular file that begins as MCAP does; False too where it cannot be read."""
+    try:
+        with open_regular(path, ADVICE) as file:
+            return file.read(len(MCAP0_MAGIC)) == MCAP0_MAGIC
+    except (InputError, OSError):
+        return False
+
+
+def _records(path: Path) -> Iterator[McapRecord]:
+    with open_regular(path, ADVICE) as file:
+        yield from _open_records(path, file)
+
+
+class _Capped:
+    """A file that is asked for no more than it has: a record's length may be anything."""
+
+    def __init__(self, file: IO[bytes], size: int) -> None:
+        self._file, self.left = file, size
+
+    def read(self, length: int) -> bytes:
+        """At most `length` bytes. Raises TooLargeError for a record of more than are read."""
+        if MAX_RECORD_BYTES < length <= self.left:
+            raise TooLargeError(f"a record of {size_text(length)}; {size_text(MAX_RECORD_BYTES)} at most are read")
+        data = self._file.read(min(length, self.left))
+        self.left -= len(data)
+        return data
+
+
+def _open_records(path: Path, file: IO[bytes]) -> Iterator[McapRecord]:
+    size = file.seek(0, os.SEEK_END)
+    file.seek(max(0, size - len(MCAP0_MAGIC)))
+    finished = size > 2 * len(MCAP0_MAGIC) and file.read() == MCAP0_MAGIC
+    file.seek(0)
+    capped = _Capped(file, size)
+    reader = StreamReader(capped, emit_chunks=True, validate_crcs=True, record_size_limit=size)  # type: ignore[arg-type]
+    records = reader.records
+    room = FREE_BYTES + MAX_INFLATION * size
+    while True:
+        try:
+            record = next(records, None)
+            inner = []
+            if isinstance(record, Chunk):
+                inner = [_unpacked(record, room)]
+                room -= len(inner[0])
+        except Exception as error:  # the reader lets through what struct, zstd, lz4 and UTF-8 raise
+            cut_off = isinstance(error, RecordLengthLimitExceeded) or not capped.left
+            if cut_off and not finished and not isinstance(error, TooLargeError):
+                return
+            raise _refused(path, file, error) from error
+        if record is None:
+            return
+        if not inner:
+            yield record
+        for data in inner:
+            try:
+                yield from _inside(data)
+            except Exception as error:
+                raise _refused(path, file, error) from error
+
+
+def _refused(path: Path, file: IO[bytes], error: Exception) -> InputError:
+    if isinstance(error, TooLargeError):
+        return InputError(f"{path}: {error}; {ADVICE}")
+    detail = str(error) if isinstance(error, DamageError) else f"{type(error).__name__} {error}".strip()
+    return InputError(f"{path}: is damaged before byte {file.tell()} ({detail}); record the log again")
+
+
+def _unpacked(chunk: Chunk, room: int) -> bytes:
+    """What a chunk holds, which has the size and the CRC that it says."""
+    size = chunk.uncompressed_size
+    if size > MAX_CHUNK_BYTES:
+        raise TooLargeError(f"a chunk of {size_text(size)}; {size_text(MAX_CHUNK_BYTES)} at most are unpacked")
+    if size > room:
+        raise TooLargeError(f"unpacks to more than {MAX_INFLATION} times its size")
+    if chunk.compression == "zstd":
+        with zstandard.ZstdDecompressor().stream_reader(chunk.data) as stream:
+            data = stream.read(size + 1)
+    elif chunk.compression == "lz4":
+        data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
+    elif chunk.compression:
+        raise DamageError(f"compression {chunk.compression[:20]!r} is neither zstd nor lz4")
+    else:
+        data = chunk.data
+    if len(data) != size:
+        raise DamageError(f"a chunk holds {'more' if len(data) > size else 'less'} than the {size} bytes that it says")
+    if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
+        raise DamageError("the CRC-32 of a chunk does not fit it")
+    return data
+
+
+def _inside(data: bytes) -> Iterator[McapRecord]:
+    """The channels and messages of a chunk."""
+    place = 0
+    while place < len(data):
+        opcode, length = _record_head.unpack_from(data, place)
+        place += _record_head.size
+        if length > len(data) - place:
+            raise DamageError("a record is longer than its chunk")
+        if opcode == Opcode.MESSAGE:
+            if length < _message_head.size:
+                raise DamageError("a message is shorter than its head")
+            channel, sequence, log_ns, publish_ns = _message_head.unpack_from(data, place)
+            yield Message(channel, log_ns, data[place + _message_head.size : place + length], publish_ns, sequence)
+        elif opcode == Opcode.CHANNEL:
+            yield Channel.read(ReadDataStream(io.BytesIO(data[place : place + length])))
+        place += length

@@ -1,0 +1,196 @@
+"""Files that are written: whole or not at all, never over an input or another output, and a run's record never in silence."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import stat
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from hilstar.errors import InputError
+from hilstar.reading import exists, open_regular, parse_toml, read_text
+
+MCAP_MAGIC = b"\x89MCAP0\r\n"
+LEDGER_MARK = b"bench_sha256"  # in the head of each ledger
+HEAD_BYTES = 16_384
+MAX_TOML_BYTES = 1_000_000
+MAX_DEPTH = 3  # a bench file names a calibration, which names a table
+OVERWRITE = "write another name, or add --overwrite"
+
+Place = tuple[int, int] | str
+
+
+def place_of(path: Path) -> Place | None:
+    """What a name stands for: the file itself, whatever it is called; the name in full of one that is not there yet.
+
+    None for what is no regular file, such as /dev/null.
+    """
+    try:
+        status = path.stat()
+    except (OSError, ValueError):
+        return os.path.realpath(path)
+    return (status.st_dev, status.st_ino) if stat.S_ISREG(status.st_mode) else None
+
+
+def check_outputs(inputs: Iterable[Path | None], outputs: Iterable[Path | None]) -> None:
+    """Refuse (InputError), before the first byte, an output that is an input or another output of the same command."""
+    taken: dict[Place, Path] = {}
+    for path in inputs:
+        place = None if path is None else place_of(path)
+        if path is not None and place is not None:
+            taken.setdefault(place, path)
+    for path in outputs:
+        place = None if path is None else place_of(path)
+        if path is None or place is None:
+            continue
+        if place in taken:
+            other = "" if taken[place] == path else f", the same file as {taken[place]}"
+            raise InputError(f"{path}{other}: is read or written by this command already; write another name for the output")
+        taken[place] = path
+
+
+def files_named_in(path: Path, depth: int = 0) -> list[Path]:
+    """A TOML file and every file that it names, relative to it, and so on; nothing is refused here."""
+    found = [path]
+    try:
+        table = parse_toml(path, read_text(path, "", MAX_TOML_BYTES)) if depth < MAX_DEPTH else {}
+    except InputError:
+        return found
+    for text in _texts(table):
+        named = path.parent / text
+        if len(text) < 4096 and "\0" not in text and exists(named) and named.is_file():
+            found += files_named_in(named, depth + 1) if named.suffix == ".toml" else [named]
+    return found
+
+
+def _texts(value: Any) -> Iterator[str]:
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, dict | list):
+        for part in value.values() if isinstance(value, dict) else value:
+            yield from _texts(part)
+
+
+@contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """A name to write to, beside `path`; what was written replaces `path` at the end, and an error leaves that as it was.
+
+    Devices and pipes are written themselves. Raises InputError where nothing can be written, and for a run's ledger.
+    """
+    try:
+        with _beside(path) as part:
+            yield part
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror or error}); choose another place") from error
+
+
+@contextmanager
+def _beside(path: Path) -> Iterator[Path]:
+    target = Path(os.path.realpath(path))
+    status = target.stat() if target.exists() else None
+    if status is not None and not stat.S_ISREG(status.st_mode):
+        yield path
+        return
+    refuse_ledger(path)
+    # The ending stays: some libraries write what it says.
+    part = target.with_name(f".{target.stem[:100]}.{os.getpid()}.part{target.suffix}")
+    try:
+        yield part
+        if status is not None:
+            part.chmod(stat.S_IMODE(status.st_mode))
+        part.replace(target)
+    finally:
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
+
+
+def write_whole(path: Path, data: bytes | str) -> None:
+    """Write a file, whole or not at all. Raises InputError."""
+    with whole_file(path) as part:
+        part.write_bytes(data.encode() if isinstance(data, str) else data)
+
+
+def refuse_existing(path: Path | None, overwrite: bool) -> None:
+    """Refuse (InputError) to write over what cannot be made again."""
+    if path is None or overwrite or not exists(path):
+        return
+    if path.is_file() and not path.stat().st_size:
+        return
+    raise InputError(f"{path}: is there already, and cannot be made again; {OVERWRITE}")
+
+
+def refuse_ledger(path: Path) -> None:
+    """Refuse (InputError) to write anything over the ledger of a run."""
+    head = b""
+    with contextlib.suppress(InputError, OSError), open_regular(path, "") as file:
+        head = file.read(HEAD_BYTES)
+    if head.startswith(MCAP_MAGIC) and LEDGER_MARK in head:
+        raise InputError(f"{path}: is the ledger of a run, which cannot be made again; write another name")
+
+
+class NewFile:
+    """A file that is written while it grows, of which there is only one writer: locked, and made anew.
+
+    `open` is its descriptor. With `overwrite` an older file stays until `commit`. Raises InputError.
+    """
+
+    def __init__(self, path: Path, overwrite: bool = False) -> None:
+        self.path = path
+        self._part: Path | None = None
+        refuse_writer(path)
+        refuse_existing(path, overwrite)
+        if exists(path) and not path.is_file():
+            raise InputError(f"{path}: cannot be written (it is no file); choose another place for the ledger")
+        made = path
+        if exists(path):
+            target = Path(os.path.realpath(path))
+            made = self._part = target.with_name(f".{target.name[:100]}.{os.getpid()}.part")
+        try:
+            self.fd = os.open(made, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
+        except FileExistsError as error:
+            raise InputError(f"{path}: is there already; {OVERWRITE}") from error
+        except (OSError, ValueError) as error:
+            raise InputError(f"{path}: cannot be written ({_why(error)}); choose another place for the ledger") from error
+        self._made = made
+        with contextlib.suppress(OSError):  # a file system without locks
+            fcntl.flock(self.fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+    def commit(self) -> None:
+        """What was begun is worth keeping: it takes its name now. Raises OSError."""
+        if self._part is not None:
+            self._part.replace(os.path.realpath(self.path))
+            self._part = None
+
+    def discard(self) -> None:
+        """Nothing of it is worth keeping."""
+        self.close()
+        with contextlib.suppress(OSError):
+            self._made.unlink()
+
+    def close(self) -> None:
+        """Close the descriptor. Raises OSError."""
+        os.close(self.fd)
+
+
+def refuse_writer(path: Path) -> None:
+    """Refuse (InputError) a file that another run is writing."""
+    try:
+        fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    except (OSError, ValueError):
+        return
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        raise InputError(f"{path}: another run is writing it; write another name") from error
+    except OSError:
+        return
+    finally:
+        os.close(fd)
+
+
+def _why(error: Exception) -> str:
+    return str(getattr(error, "strerror", None) or error)

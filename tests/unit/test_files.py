@@ -1,0 +1,121 @@
+"""Files that are written: never over an input, whole or not at all, one writer each."""
+
+from __future__ import annotations
+
+import os
+import resource
+from pathlib import Path
+
+import pytest
+
+from hilstar.errors import InputError
+from hilstar.files import NewFile, check_outputs, files_named_in, refuse_existing, whole_file, write_whole
+
+
+@pytest.mark.parametrize("kind", ["same", "hard", "soft", "dotted"])
+def test_an_output_that_is_an_input_by_any_name_is_refused(tmp_path, kind):
+    given = tmp_path / "a.csv"
+    given.write_text("x")
+    other = {"same": given, "dotted": tmp_path / "." / "sub" / ".." / "a.csv"}.get(kind, tmp_path / "b.csv")
+    (tmp_path / "sub").mkdir()
+    if kind == "hard":
+        other.hardlink_to(given)
+    if kind == "soft":
+        other.symlink_to(given)
+    with pytest.raises(InputError, match="read or written by this command"):
+        check_outputs([given], [other])
+    check_outputs([given], [tmp_path / "c.csv", None])
+
+
+def test_two_outputs_that_are_one_file_are_refused_before_there_is_one(tmp_path):
+    link = tmp_path / "link.fits"
+    link.symlink_to(tmp_path / "x.fits")
+    with pytest.raises(InputError, match=r"link.fits, the same file as .*x.fits"):
+        check_outputs([], [tmp_path / "x.fits", link])
+
+
+def test_devices_may_be_given_twice():
+    check_outputs([], [Path("/dev/null"), Path("/dev/null")])
+
+
+def test_what_a_bench_file_names_is_an_input_too(tmp_path):
+    (tmp_path / "qe.csv").write_text("")
+    (tmp_path / "m.csv").write_text("")
+    (tmp_path / "m.toml").write_text('[calibration]\nresponse = "m.csv"\n')
+    (tmp_path / "b.toml").write_text('[tracker]\nquantum_efficiency = "qe.csv"\n[monitor]\ncalibration = "m.toml"\n')
+    assert {path.name for path in files_named_in(tmp_path / "b.toml")} == {"b.toml", "qe.csv", "m.toml", "m.csv"}
+
+
+def test_an_error_leaves_the_older_file_whole_and_nothing_beside(tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+    path.chmod(0o640)
+    with pytest.raises(InputError, match="cannot be written"), whole_file(path) as part:
+        part.write_text("half")
+        raise OSError(28, "No space left on device")
+    assert path.read_text() == "old"
+    assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
+    write_whole(path, "new")
+    assert (path.read_text(), path.stat().st_mode & 0o777) == ("new", 0o640)
+
+
+def test_a_full_disk_leaves_the_older_file_whole(tmp_path):
+    path = tmp_path / "a.bin"
+    path.write_bytes(b"old")
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))
+    try:
+        with pytest.raises(InputError, match="cannot be written"):
+            write_whole(path, bytes(5000))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert path.read_bytes() == b"old"
+
+
+def test_a_link_stays_a_link(tmp_path):
+    (tmp_path / "real.txt").write_text("old")
+    link = tmp_path / "link.txt"
+    link.symlink_to("real.txt")
+    write_whole(link, "new")
+    assert link.is_symlink()
+    assert (tmp_path / "real.txt").read_text() == "new"
+
+
+def test_what_is_there_is_refused_but_for_an_empty_file(tmp_path):
+    path = tmp_path / "run.mcap"
+    refuse_existing(path, False)
+    path.touch()
+    refuse_existing(path, False)
+    path.write_text("x")
+    with pytest.raises(InputError, match="--overwrite"):
+        refuse_existing(path, False)
+    refuse_existing(path, True)
+
+
+def test_a_file_has_one_writer(tmp_path):
+    path = tmp_path / "run.mcap"
+    first = NewFile(path)
+    os.write(first.fd, b"a run")
+    for overwrite in (False, True):
+        with pytest.raises(InputError, match="another run is writing it"):
+            NewFile(path, overwrite)
+    first.close()
+    second = NewFile(path, overwrite=True)
+    os.write(second.fd, b"new")
+    assert path.read_bytes() == b"a run"  # until the new one has begun
+    second.commit()
+    assert path.read_bytes() == b"new"
+    second.close()
+    assert [path.name for path in tmp_path.iterdir()] == ["run.mcap"]
+
+
+def test_no_ledger_of_a_run_is_written_over_by_anything_else(tmp_path):
+    path = tmp_path / "run.mcap"
+    path.write_bytes(b"\x89MCAP0\r\n" + b"..bench_sha256..")
+    with pytest.raises(InputError, match="ledger of a run"):
+        write_whole(path, "x")
+    for place in (tmp_path, tmp_path / "fifo"):
+        if place.name == "fifo":
+            os.mkfifo(place)
+        with pytest.raises(InputError, match="cannot be"):
+            NewFile(place)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -13,10 +14,13 @@ import numpy as np
 import pytest
 
 import hilstar
+from tests import leftovers
 
 # A shell ignores SIGINT for what it runs with `&`, and what ignores it hands that on: a test's Ctrl-C would reach nobody.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+leftovers.adopt_orphans()
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -36,6 +40,14 @@ pixel_pitch_um = 57.65
 [collimator]
 focal_length_mm = 60
 """
+
+
+@pytest.fixture(scope="session", autouse=True)
+def nothing_is_left_behind() -> Iterator[None]:
+    """Whatever a test did, none of hilstar's commands runs on when the tests are over; the last one fails where one did."""
+    yield
+    left = leftovers.end_hilstar_leftovers()
+    assert not left, f"left behind by some test, and killed now: {left}"
 
 
 @pytest.fixture
@@ -74,9 +86,17 @@ def run_hilstar(
 ) -> subprocess.CompletedProcess[str]:
     """The command as a user runs it, in a process of its own."""
     command = [sys.executable, "-m", "hilstar", *map(str, arguments)]
-    return subprocess.run(
-        command, cwd=cwd, capture_output=True, text=True, timeout=timeout, check=False, env=os.environ if env is None else env
-    )
+    env = dict(os.environ) if env is None else env
+    # A group of its own: what the command has started (`demo` a sender) ends with it, however it ends.
+    with subprocess.Popen(
+        command, cwd=cwd, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    ) as process:
+        try:
+            out, err = process.communicate(timeout=timeout)
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+    return subprocess.CompletedProcess(command, process.returncode, out, err)
 
 
 def assert_refused(result: subprocess.CompletedProcess[str], code: int, *words: str) -> None:

@@ -18,6 +18,7 @@ from PIL import Image
 import hilstar
 from hilstar.attitude.quaternion import from_radec_roll_deg
 from hilstar.monitor.photometry import encode, srgb_response
+from tests import leftovers
 from tests.conftest import ROOT, SMALL_BENCH, assert_refused, run_hilstar
 
 ORION = ROOT / "configs" / "thesis-orion.toml"
@@ -267,6 +268,20 @@ def test_ctrl_c_at_any_moment_leaves_no_traceback(tmp_path, small_bench_file):
             finally:
                 process.kill()
             assert b"Traceback" not in err or delay_s < 0.1, err  # Python's own start is not ours to guard
+
+
+def test_a_command_that_is_killed_leaves_no_process_of_the_tests_behind(tmp_path):
+    """`demo` starts a sender: killed with it by `run_hilstar`, and what is orphaned all the same is found and ended."""
+    with pytest.raises(subprocess.TimeoutExpired):
+        run_hilstar("demo", "--duration", "60", "-o", tmp_path, timeout=5)
+    assert [command for command in leftovers.living_children().values() if str(tmp_path) in command] == []
+    orphan_command = [sys.executable, "-c", "import time; time.sleep(60)", f"-m hilstar {tmp_path}"]
+    middle = f"import subprocess; subprocess.Popen({orphan_command!r})"
+    subprocess.run([sys.executable, "-c", middle], check=True)
+    orphan = [number for number, command in leftovers.living_children().items() if str(tmp_path) in command]
+    assert len(orphan) == 1
+    assert any(str(tmp_path) in command for command in leftovers.end_hilstar_leftovers())
+    os.waitpid(orphan[0], 0)
 
 
 def test_without_a_display_a_window_is_refused_as_the_machine_s_lack(small_bench_file):

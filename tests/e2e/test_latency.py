@@ -89,13 +89,16 @@ def shown(server: Server, folder: Path, kind: str):
     with subprocess.Popen(
         [sys.executable, "-m", "hilstar", *command], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=env
     ) as process:
-        end = time.monotonic() + 20
-        while not ((folder / "run.mcap").exists() and len((folder / "run.mcap").read_bytes()) > 20_000):
-            assert process.poll() is None and time.monotonic() < end
-            time.sleep(0.05)
-        yield bench
-        process.terminate()
-        process.communicate(timeout=20)
+        try:
+            end = time.monotonic() + 20
+            while not ((folder / "run.mcap").exists() and len((folder / "run.mcap").read_bytes()) > 20_000):
+                assert process.poll() is None and time.monotonic() < end
+                time.sleep(0.05)
+            yield bench
+            process.terminate()
+            process.communicate(timeout=20)
+        finally:
+            process.kill()
 
 
 def measured(server: Server, folder: Path, kind: str, added_ms: float, device_clock: bool, *options: str) -> tuple[dict, Path]:

@@ -52,7 +52,10 @@ def showing(server: Xorg, path: Path, *options: str) -> Iterator[subprocess.Pope
         finally:
             if process.poll() is None:
                 process.terminate()
-                process.communicate(timeout=LATEST_S)
+                try:
+                    process.communicate(timeout=LATEST_S)
+                finally:
+                    process.kill()
 
 
 def frames(path: Path) -> int:

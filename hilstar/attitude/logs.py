@@ -28,6 +28,7 @@ RATE_COLUMNS = ("rx", "ry", "rz")
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 # A JSON number that msgspec takes as an integer: what one form of log can hold, all can.
 WHOLE_NUMBERS = range(-(2**63), 2**64)
+MAX_TOPICS = 12  # that are named
 LONGEST_QUOTE = 80
 MAX_LOG_BYTES = 500_000_000  # some million attitudes: all of them are held, about 500 bytes each
 MAX_AEM_BYTES = 50_000_000
@@ -54,8 +55,22 @@ def read_log(path: Path) -> list[AttitudeSample]:
     except (OSError, csv.Error) as error:
         raise InputError(f"{path}: cannot be read as a log ({error})") from error
     if not samples:
+        _refuse_other_topics(path)
         raise InputError(f"{path}: holds no attitude; write a CSV with the header {','.join(CSV_COLUMNS)}, or JSON lines")
     return samples
+
+
+def _refuse_other_topics(path: Path) -> None:
+    """An MCAP file of another program says what it holds instead."""
+    from hilstar.attitude.mcap_log import ATTITUDE_TOPIC
+    from hilstar.attitude.mcap_reader import is_mcap, topics_of
+
+    topics = topics_of(path) if is_mcap(path) else []
+    if topics and ATTITUDE_TOPIC not in topics:
+        names = ", ".join(topic[:LONGEST_QUOTE] for topic in topics[:MAX_TOPICS]) + (
+            ", ..." if len(topics) > MAX_TOPICS else ""
+        )
+        raise InputError(f"{path}: holds no attitude; its topics are {names}, and {ATTITUDE_TOPIC} is read")
 
 
 def write_log(path: Path, samples: Sequence[AttitudeSample]) -> None:

@@ -30,7 +30,8 @@ MCAP_MAGIC = b"\x89MCAP0\r\n"
 WHOLE_NUMBERS = range(-(2**63), 2**64)
 MAX_TOPICS = 12  # that are named
 LONGEST_QUOTE = 80
-MAX_LOG_BYTES = 500_000_000  # some million attitudes: all of them are held, about 500 bytes each
+MAX_LOG_BYTES = 500_000_000
+MAX_SAMPLES = 6_000_000  # 16 hours at 100 Hz; all are held, at 350 bytes each, so in 2 GB
 MAX_AEM_BYTES = 50_000_000
 READABLE = "hilstar reads CSV, JSON lines, CCSDS AEM (KVN or XML) and MCAP"
 
@@ -52,6 +53,8 @@ def read_log(path: Path) -> list[AttitudeSample]:
                     times = f"t_ns {entry.t_ns} after {samples[-1].t_ns}"
                     raise InputError(f"{path}{where}: time does not rise ({times}); {advice}")
                 samples.append(entry)
+                if len(samples) > MAX_SAMPLES:
+                    raise InputError(f"{path}{where}: more than {MAX_SAMPLES} attitudes; write them into several logs")
     except (OSError, csv.Error) as error:
         raise InputError(f"{path}: cannot be read as a log ({error})") from error
     if not samples:

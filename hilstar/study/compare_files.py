@@ -21,6 +21,7 @@ from hilstar.study.compare_chart import draw
 from hilstar.study.sky_difference import SkyComparison, StarDifference
 
 UNIT = "electron/s"
+MAX_E_PER_S = 1e30  # whose square is still a number
 TRUTH_COLUMNS = ("hip", "x_px", "y_px", "electrons_per_s")
 MAX_TRUTH_BYTES = 50_000_000
 MAX_FITS_BYTES = 600_000_000  # a frame of 8K has 133 MB
@@ -54,7 +55,10 @@ def read_frame_fits(path: Path) -> FloatArray:
         raise InputError(f"{path}: no FITS image; {wanted}") from error
     if header.get("BUNIT") != UNIT or image is None or image.ndim != 2 or image.dtype.kind != "f":
         raise InputError(f"{path}: no linear image in {UNIT} (BUNIT is {header.get('BUNIT')!r}); {wanted}")
-    return np.asarray(image, dtype=np.float64)
+    light = np.asarray(image, dtype=np.float64)
+    if (np.abs(light[np.isfinite(light)]) > MAX_E_PER_S).any():
+        raise InputError(f"{path}: a pixel has more than {MAX_E_PER_S:g} {UNIT}; {wanted}")
+    return light
 
 
 def _inflated(path: Path, raw: bytes, wanted: str) -> bytes:

@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from hilstar.attitude import logs
 from hilstar.attitude.logs import read_log, write_log
 from hilstar.attitude.packet import AttitudeSample
 from hilstar.errors import InputError
@@ -265,3 +266,14 @@ def test_a_place_that_cannot_be_written_is_refused_in_one_line(tmp_path):
         with pytest.raises(InputError, match="cannot be written"):
             write_log(path, samples)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "folder.csv"]
+
+
+def test_a_log_has_no_more_attitudes_than_memory_can_hold(tmp_path, monkeypatch):
+    monkeypatch.setattr(logs, "MAX_SAMPLES", 3)
+    path = tmp_path / "log.csv"
+    rows = [f"{k},1,0,0,0" for k in range(4)]
+    path.write_text("\n".join(["t_s,qw,qx,qy,qz", *rows[:3]]) + "\n")
+    assert len(read_log(path)) == 3
+    path.write_text("\n".join(["t_s,qw,qx,qy,qz", *rows]) + "\n")
+    with pytest.raises(InputError, match=r"log.csv:5: more than 3 attitudes; write them into several logs"):
+        read_log(path)

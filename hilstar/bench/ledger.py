@@ -44,6 +44,7 @@ from hilstar.files import NewFile
 from hilstar.interrupts import caught
 from hilstar.notices import Notice, Notices
 
+NO_ROOM = "no room"  # the reason of what was lost
 FLUSH_S = 0.2
 EACH_S = 1.0  # counts, the process, the disk
 MAX_CHUNK_BYTES = 1_000_000
@@ -168,6 +169,8 @@ class Ledger:
                 self._go_on_in_another()
         except Exception as error:  # whatever it is, it ends neither the ledger nor the run
             self._failed(error)
+            if last:
+                self._lose("packet", self._writer.drop())
         self._alive_s = time.monotonic()
         self._notices.end("ledger-stalled", "ledger-back", f"{self.path}: the disk takes the ledger again")
 
@@ -189,7 +192,7 @@ class Ledger:
         for kind, number in dropped.items():
             self._lose(kind, number)
         for kind, reason, number in self._sieve.counted():
-            self._counted += number
+            self._counted += 0 if reason == NO_ROOM else number
             record = CountRecord(host_ns=now_ns, kind=kind, reason=reason, count=number)
             self._add("count", now_ns, msgspec.json.encode(record))
         process = self._probe.record()
@@ -200,7 +203,7 @@ class Ledger:
     def _lose(self, kind: Kind | str, number: int) -> None:
         """So many were lost: there was no room for them."""
         self._lost += number
-        self._sieve.count("frame" if kind == "frame" else "packet" if kind == "packet" else "event", "no room", number)
+        self._sieve.count("frame" if kind == "frame" else "packet" if kind == "packet" else "event", NO_ROOM, number)
 
     def _look_at_disk(self) -> None:
         disk = os.fstatvfs(self._file.fd)

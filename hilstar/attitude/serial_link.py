@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import logging
 import os
 import select
 import termios
@@ -14,17 +13,19 @@ from typing import Self
 import serial
 from serial.tools import list_ports
 
+from hilstar.attitude.bounds import FloodGate, LinkCounts
 from hilstar.attitude.packet import Packet, encode
 from hilstar.attitude.receiver import Arrival
 from hilstar.attitude.stream import DELIMITER, StreamDecoder, frame
-from hilstar.errors import InputError
+from hilstar.errors import InputError, one_line
+from hilstar.notices import Notices
 
 FIRST_BACK_OFF_S = 0.05
 LONGEST_BACK_OFF_S = 0.4  # a device that is back is picked up within a second
-READ_BYTES = 4096
+MAX_READ_BYTES = 65_536  # in one go
+MAX_DRAIN_S = 0.5
 BITS_PER_BYTE = 10  # 8N1
 FRAMING_BYTES = 2  # COBS and its 0x00
-log = logging.getLogger(__name__)
 
 
 def serial_ports() -> list[str]:
@@ -41,11 +42,14 @@ class SerialLink:
     two_way = True
     verb = "reading"
 
-    def __init__(self, port: str, baud: int) -> None:
+    def __init__(self, port: str, baud: int, notices: Notices | None = None) -> None:
+        self.link_counts = LinkCounts()
         self.endpoint = f"serial:{port}@{baud}"
         self.reconnects = 0
         self._port = port
         self._baud = baud
+        self._notices = Notices() if notices is None else notices
+        self._gate = FloodGate(self.link_counts, self._notices)
         self._decoder = StreamDecoder()
         self._back_off_s = FIRST_BACK_OFF_S
         self._retry_s = 0.0
@@ -71,12 +75,15 @@ class SerialLink:
             if device.timeout != timeout_ms / 1000:  # setting it costs a tcsetattr
                 device.timeout = timeout_ms / 1000
             chunk = device.read(1)
-            chunk += device.read(min(device.in_waiting, READ_BYTES)) if chunk else b""
+            chunk += device.read(min(device.in_waiting, MAX_READ_BYTES)) if chunk else b""
         except (OSError, TypeError) as error:  # pyserial itself stumbles (TypeError) over a port closed under it
             self._lose(str(error))
             return []
         host_ns = time.monotonic_ns()
-        return [Arrival(host_ns, event, raw) for event, raw in self._decoder.feed(chunk)]
+        frames = chunk.count(DELIMITER)
+        admitted = self._gate.admit(frames)
+        events = self._decoder.feed(chunk) if admitted == frames else self._decoder.feed_newest(chunk, admitted)
+        return [Arrival(host_ns, event, raw) for event, raw in events]
 
     def wait_for_message(self, timeout_ms: int) -> bool:
         """True once bytes wait that were not read."""
@@ -111,10 +118,14 @@ class SerialLink:
         return not data
 
     def drain(self) -> None:
-        """Wait until what was sent has left the machine."""
+        """Wait until what was sent has left the machine, and give up what a line that stands still does not take."""
+        deadline_s = time.monotonic() + MAX_DRAIN_S
         with contextlib.suppress(OSError, TypeError, termios.error):
-            if self._device is not None:
-                self._device.flush()
+            while self._device is not None and self._device.out_waiting:
+                if time.monotonic() > deadline_s:  # closing it would wait for half a minute
+                    self._device.reset_output_buffer()
+                    return
+                time.sleep(0.005)
 
     def wire_ns(self, packet: Packet) -> int:
         """How long a packet's frame takes at this baud rate."""
@@ -126,7 +137,8 @@ class SerialLink:
         return self._device is not None
 
     def _lose(self, why: str) -> None:
-        log.warning("%s is gone (%s); waiting for it to come back", self.endpoint, " ".join(why.split()))
+        self.link_counts.lost += 1
+        self._notices.tell("lost", f"{self.endpoint} is gone ({one_line(why)}); waiting for it to come back")
         self._shut()
         self._back_off_s = FIRST_BACK_OFF_S
         self._retry_s = time.monotonic() + self._back_off_s
@@ -143,7 +155,7 @@ class SerialLink:
             self._retry_s = time.monotonic() + self._back_off_s
             return
         self.reconnects += 1
-        log.warning("%s is back", self.endpoint)
+        self._notices.tell("back", f"{self.endpoint} is back")
         self.send_bytes(DELIMITER)
 
     def _shut(self) -> None:

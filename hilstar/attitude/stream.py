@@ -39,6 +39,15 @@ class StreamDecoder:
         self._overlong = False
         self._synchronised = False
 
+    def feed_newest(self, chunk: bytes, frames: int) -> list[tuple[Event, bytes]]:
+        """The events of the last `frames` delimiters of `chunk` alone: those before, and what was kept, are forgotten."""
+        before = len(chunk)
+        for _ in range(frames + 1):
+            before = chunk.rfind(DELIMITER, 0, before) if before > 0 else -1
+        self._kept.clear()
+        self._overlong, self._synchronised = False, True
+        return self.feed(chunk[before + 1 :])
+
     def feed(self, chunk: bytes) -> list[tuple[Event, bytes]]:
         """The events that `chunk` completes, in order."""
         events: list[tuple[Event, bytes]] = []

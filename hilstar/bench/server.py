@@ -43,14 +43,14 @@ def link_keys(settings: AttitudeSettings, folder: Path) -> CurveKeys:
     return CurveKeys(*(None if name is None else folder / name for name in names))
 
 
-def open_link(settings: AttitudeSettings, folder: Path) -> AnyLink:
+def open_link(settings: AttitudeSettings, folder: Path, notices: Notices | None = None) -> AnyLink:
     """The link that the bench file in `folder` names. Raises InputError for one that cannot be had."""
     if settings.source == "serial":
-        return SerialLink(settings.port, settings.baud)
+        return SerialLink(settings.port, settings.baud, notices)
     keys = link_keys(settings, folder)
     if settings.lockstep:
-        return ZmqLockstep(settings.endpoint, bind=settings.bind is not False, keys=keys)
-    return ZmqReceiver(settings.endpoint, bind=settings.bind is True, keys=keys)
+        return ZmqLockstep(settings.endpoint, bind=settings.bind is not False, keys=keys, notices=notices)
+    return ZmqReceiver(settings.endpoint, bind=settings.bind is True, keys=keys, notices=notices)
 
 
 def serve(bench: Bench, link: AnyLink, limit: Limit, sink: FrameSink = ignore, outlet: Outlet | None = None) -> dict[str, Any]:
@@ -63,7 +63,7 @@ def serve(bench: Bench, link: AnyLink, limit: Limit, sink: FrameSink = ignore, o
             summary = serve_lockstep(bench, link, limit, loop, ledger)
         else:
             summary = _serve_stream(bench, link, limit, loop, outlet)
-    summary |= {"events": outlet.notices.counts()}
+    summary |= {"events": outlet.notices.counts(), "link": {"endpoint": link.endpoint} | link.link_counts.summary()}
     return summary | loop.screen_summary()
 
 

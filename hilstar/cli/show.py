@@ -217,7 +217,7 @@ def serve(
     split = parse_split(ledger_split)
     notices = Notices()
     with (
-        open_link(read_config(bench_file).attitude, bench_file.parent) as link,
+        open_link(read_config(bench_file).attitude, bench_file.parent, notices) as link,
         shown_bench(bench_file, headless, windowed, force) as (bench, screen),
         optional_ledger(ledger, bench, notices, overwrite, split) as kept,
     ):

@@ -107,6 +107,7 @@ def tell(tally: Any, road: Any, as_json: bool) -> None:
     for name in ("requests", "statuses", "unsent"):
         if hasattr(road, name):
             told[name] = getattr(road, name)
+    told["link"] = {"endpoint": road.endpoint} | road.link_counts.summary()
     if as_json:
         print_json(told)
         return

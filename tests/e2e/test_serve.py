@@ -34,6 +34,7 @@ SUMMARY_KEYS |= {
     "clock",
     "reconnects",
     "events",
+    "link",
 }
 
 

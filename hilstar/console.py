@@ -84,7 +84,7 @@ def clock_line(clock: dict[str, Any]) -> str:
         return f"by {clock['mode']}: heard too shortly to say how well"
     known = f"drift {clock['drift_ppm']:.1f} ppm, known to {clock['uncertainty_ms']:.3f} ms"
     if clock["mode"] == "one-way":
-        known += " and the minimum delay"
+        known += ", and the minimum delay of a road longer than this machine's own"
     jumps = f", {clock['jumps']} jumps" if clock["jumps"] else ""
     return f"by {clock['mode']}: {known}{jumps}"
 

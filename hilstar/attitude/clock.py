@@ -40,6 +40,9 @@ ENOUGH_EXCHANGES = 3
 QUICK_DELAY_RATIO = 1.25
 QUICK_DELAY_NS = 100_000
 RECENT_EXCHANGES = 3
+# A one-way stream cannot tell its minimum delay. That of sockets on one machine (0.02 to 0.1 ms) is in its uncertainty, so that
+# it contains the truth there; a longer road's is not.
+LOCAL_DELAY_NS = 100_000
 
 ClockMode = Literal["none", "one-way", "exchange", "shared"]
 
@@ -295,8 +298,8 @@ class BenchClock:
     def summary(self) -> dict[str, float | int | str | None]:
         """Mode, offset (host minus bench), drift (positive: the bench's clock runs fast) and uncertainty.
 
-        The uncertainty bounds the error of what frames go by, and is None while little is known: beyond the minimum one-way
-        delay where the bench only talks, in full where exchanges run.
+        The uncertainty bounds the error of what frames go by, and is None while little is known: in full where exchanges run,
+        and where the sender only talks, but for what its minimum delay is over LOCAL_DELAY_NS.
         """
         line = self._line
         if line is None or self._base_ns is None:
@@ -304,7 +307,7 @@ class BenchClock:
         behind_ns = 0.0 if self._used is None else abs(line.at(self._used[0]) - self._used[1])
         uncertainty_ns = line.uncertainty_ns
         if self._mode == "one-way":
-            uncertainty_ns = max(uncertainty_ns, self.one_way.all_above_ns)
+            uncertainty_ns = max(uncertainty_ns, self.one_way.all_above_ns) + LOCAL_DELAY_NS
         return {
             "mode": self._mode,
             "offset_ms": (self._base_ns + line.offset_ns) / NS_PER_MS,

@@ -45,6 +45,9 @@ def summarise(run: Figures) -> dict[str, Any]:
         "missed_frames": 0 if last is None else last.missed,
         "stale_frames": run.stale,
         "blank_frames": run.blank,
+        "operator_frames": run.operator,
+        "hidden_frames": run.hidden,
+        "capped_frames": run.capped,
         "timestamp_source": "" if last is None else last.timestamp_source,
         "refresh_hz": refresh_hz,
         "pacing_jitter_ms": spreads["interval"].deviation,
@@ -98,6 +101,8 @@ def table_rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
     frames = f"{summary['frames']} in {summary['duration_s']:.1f} s, {summary['missed_frames']} missed"
     return [
         ("frames", f"{frames}, {summary['stale_frames']} stale, {summary['blank_frames']} blank"),
+        ("not the sky", f"{summary['operator_frames']} by an operator's keys, {summary['hidden_frames']} hidden"),
+        ("coarser than they should be", f"{summary['capped_frames']}, for the turn was too fast"),
         ("time stamps", f"{summary['timestamp_source']}; the bench's refresh is {number('refresh_hz', 'Hz')}"),
         ("pacing jitter", f"{number('pacing_jitter_ms', 'ms')} (standard deviation of the interval between swaps)"),
         ("interval", three("interval_ms")),

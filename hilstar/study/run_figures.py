@@ -110,6 +110,9 @@ class Figures:
     frames: int = 0
     stale: int = 0
     blank: int = 0
+    capped: int = 0
+    operator: int = 0
+    hidden: int = 0
     most: dict[str, int] = field(default_factory=lambda: dict.fromkeys(("clipped", "below_step", "stars_drawn"), 0))
     last: FrameRecord | None = None
     first_swap_ns: int = 0
@@ -158,6 +161,9 @@ class Figures:
         self.frames += 1
         self.stale += frame.stale
         self.blank += frame.q is None
+        self.capped += frame.capped > 0
+        self.operator += bool(frame.operator)
+        self.hidden += bool(frame.hidden)
         for name in self.most:
             self.most[name] = max(self.most[name], getattr(frame, name))
         values = _times_ms(frame, before)

@@ -82,9 +82,8 @@ class Truth:
     def _compare(self, read_ns: int) -> None:
         shown_ns = self.clock.to_bench_ns(read_ns) - self.jumps.correction_ns
         told = self.clock.summary()
-        late_ns = 0 if told["mode"] == "exchange" else MIN_DELAY_NS
         self.host_ns.append(read_ns)
-        self.error_ms.append((shown_ns - self.times(read_ns - late_ns)) / NS_PER_MS)
+        self.error_ms.append((shown_ns - self.times(read_ns)) / NS_PER_MS)
         self.known_ms.append(np.nan if told["uncertainty_ms"] is None else told["uncertainty_ms"])
 
     def beyond_ms(self, *jumps_s: float) -> float:
@@ -119,7 +118,7 @@ def test_after_a_jump_of_2_ms_to_10_years_the_truth_is_within_what_is_said(jump_
 def test_under_a_drift_the_truth_is_within_what_is_said(ppm, exchanges):
     run = Truth(lambda host: host + (host - HOST0_NS) * ppm // 1_000_000, exchanges=exchanges)
     assert run.beyond_ms() < ALLOWED_MS
-    assert run.known_ms[-1] < (0.3 if exchanges else 0.05)
+    assert run.known_ms[-1] < (0.3 if exchanges else 0.15)  # LOCAL_DELAY_NS is part of the latter
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -178,7 +177,7 @@ def test_a_road_that_is_20_ms_slower_for_a_while_is_no_jump_and_no_reason_to_ref
     run = Truth(lambda host: host, read)
     assert run.beyond_ms() < ALLOWED_MS
     assert (run.refused, run.jumps.jumps) == (0, 0)
-    assert np.abs(run.error_ms[400:]).max() < ALLOWED_MS
+    assert np.abs(run.error_ms[400:]).max() < MIN_DELAY_NS / NS_PER_MS + ALLOWED_MS
 
 
 @pytest.mark.parametrize("ppm", [30, -30])

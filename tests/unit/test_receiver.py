@@ -120,7 +120,7 @@ class Run:
 def test_a_plain_stream_is_no_event():
     run = Run(lambda t0: Sender().packets(t0, seconds(0, 6)))
     assert (run.accepted, run.counts.refused, run.events) == (1200, 0, {})
-    assert run.receiver.clock_summary()["uncertainty_ms"] < 0.1
+    assert run.receiver.clock_summary()["uncertainty_ms"] < 0.2
 
 
 @pytest.mark.parametrize("repeat_hz", [50, 200, 1000])
@@ -338,7 +338,7 @@ def test_the_summary_s_offset_is_that_of_the_clock_after_its_jumps(jump_s):
     told = run.receiver.clock_summary()
     assert (told["jumps"], run.events, run.accepted) == (1, {"jump": 1}, 1200)
     assert told["offset_ms"] == pytest.approx(-1000 * jump_s + 0.05, abs=0.02)
-    assert told["uncertainty_ms"] < 0.1
+    assert told["uncertainty_ms"] < 0.2
 
 
 SHARED = Traffic(shared_clock=True)

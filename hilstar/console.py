@@ -63,7 +63,7 @@ def report(summary: dict[str, Any], as_json: bool) -> None:
     if "clock" in summary:
         absolute = "" if summary["clock"]["mode"] in {"exchange", "shared"} else " above the minimum"
         lines["receive latency"] = f"{spread('receive_latency_ms')} ms (p50 / p99 / max){absolute}"
-        lines["bench clock"] = clock_line(summary["clock"])
+        lines["sender's clock"] = clock_line(summary["clock"])
     for name in ("operator", "hidden"):
         lasted = summary.get("screen", {}).get(name, {"frames": 0})
         if lasted["frames"]:
@@ -75,7 +75,7 @@ def report(summary: dict[str, Any], as_json: bool) -> None:
 
 
 def clock_line(clock: dict[str, Any]) -> str:
-    """How the bench's clock stands to this machine's."""
+    """How the sender's clock stands to this machine's."""
     if clock["mode"] == "none":
         return "nothing heard"
     if clock["mode"] == "shared":
@@ -84,7 +84,7 @@ def clock_line(clock: dict[str, Any]) -> str:
         return f"by {clock['mode']}: heard too shortly to say how well"
     known = f"drift {clock['drift_ppm']:.1f} ppm, known to {clock['uncertainty_ms']:.3f} ms"
     if clock["mode"] == "one-way":
-        known += ", and the minimum delay of a road longer than this machine's own"
+        known += " but for a longer road's minimum delay"
     jumps = f", {clock['jumps']} jumps" if clock["jumps"] else ""
     return f"by {clock['mode']}: {known}{jumps}"
 

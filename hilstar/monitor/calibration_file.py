@@ -12,7 +12,6 @@ from typing import Annotated, Any, Literal, Protocol
 import msgspec
 import numpy as np
 from msgspec import Meta
-from scipy.interpolate import PchipInterpolator
 
 from hilstar.arrays import FloatArray
 from hilstar.errors import InputError, shortened
@@ -209,6 +208,8 @@ def _every_code(path: Path, name: str, code: FloatArray, light: FloatArray, whit
     if len(code) < 3:
         raise InputError(f"{path}: two codes make no response; give some between black and white")
     log_code, log_light = np.log(code[1:]), np.log(light[1:] - light[0])
+    from scipy.interpolate import PchipInterpolator  # a quarter of a second of every command that has no such file
+
     curve = PchipInterpolator(log_code, log_light)
     wanted = np.log(np.arange(1, white + 1))
     slope = (log_light[1] - log_light[0]) / (log_code[1] - log_code[0])

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 
 from hilstar.notices import Notices
 
-MAX_PACKETS_PER_S = 5000  # looked at: some 15 % of one core, and more than any serial line brings
+MAX_PACKETS_PER_S = 3000  # looked at: some 10 % of one core, and more than any serial line brings
 MAX_BURST = 1000  # what may have waited while the receiver stood still
 MAX_GROWTH_BYTES = 256_000_000
 LOOK_S = 0.01

@@ -12,12 +12,11 @@ from pathlib import Path
 from typing import Any
 
 from hilstar.errors import InputError
-from hilstar.reading import exists, open_regular, parse_toml, read_text
+from hilstar.reading import MAX_TOML_BYTES, exists, open_regular, parse_toml, read_text
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 LEDGER_MARK = b"bench_sha256"  # in the head of each ledger
 HEAD_BYTES = 16_384
-MAX_TOML_BYTES = 1_000_000
 MAX_DEPTH = 3  # a bench file names a calibration, which names a table
 OVERWRITE = "write another name, or add --overwrite"
 

@@ -130,6 +130,7 @@ class Bench:
         )
         self.calibration = bench_calibration(self.config, path.parent)
         self.uniformity = self.calibration.uniformity_map(self.config.monitor.resolution_px)
+        self.darkest = 1.0 if self.uniformity is None else float(self.uniformity.min())
         self._plan()
         self.shown_stars = brighter_stars(self.stars, self.faintest_shown_e_per_s())
         self.scan = scan_of(self.config.monitor)
@@ -166,9 +167,8 @@ class Bench:
 
     def _light(self) -> Light:
         # Vignetting asks for more from a pixel: where the screen is darkest a fainter star gets a code.
-        least = 1.0 if self.uniformity is None else float(self.uniformity.min())
         finer = self.calibration.can_steal_bits and not self.config.render.bit_stealing
-        return Light(self.calibration.response, self.flux_at_white_e_per_s * least, self.stars.electrons_per_s, finer)
+        return Light(self.calibration.response, self.flux_at_white_e_per_s * self.darkest, self.stars.electrons_per_s, finer)
 
     def _warn_of_cycle(self) -> None:
         render, refresh_hz = self.config.render, self.config.monitor.refresh_hz
@@ -275,7 +275,7 @@ class Bench:
 
     def _clipped(self, sprites: Sprites) -> IntArray:
         size_px = self.camera.resolution_px
-        return clipped_sprites(sprites, self._sigma_px, self.flux_at_white_e_per_s, size_px, self.uniformity)
+        return clipped_sprites(sprites, self._sigma_px, self.flux_at_white_e_per_s, size_px, self.uniformity, self.darkest)
 
     def close(self) -> None:
         """Free the GL context."""

@@ -13,10 +13,9 @@ NAMED_STARS = 5
 
 def clipping_hip(bench: Bench) -> list[int]:
     """The HIP numbers of the stars that clip in the middle of a pixel where the screen is darkest, brightest first."""
-    darkest = 1.0 if bench.uniformity is None else float(bench.uniformity.min())
     peak_e_per_s = bench.stars.electrons_per_s * peak_share(bench.config.render.sprite_sigma_px)
     order = np.argsort(-peak_e_per_s, kind="stable")
-    clips = peak_e_per_s[order] > bench.flux_at_white_e_per_s * darkest * (1 + CLIP_TOLERANCE)
+    clips = peak_e_per_s[order] > bench.flux_at_white_e_per_s * bench.darkest * (1 + CLIP_TOLERANCE)
     return [int(hip) for hip in bench.stars.hip[order[clips]]]
 
 

@@ -20,17 +20,18 @@ def clipped_sprites(
     flux_at_white_e_per_s: float,
     resolution_px: tuple[int, int],
     uniformity: Float32Array | None = None,
+    darkest: float = 1.0,
 ) -> IntArray:
     """Positions of the sprites whose brightest pixel lies on the image and, neighbours' light included, is over white.
 
-    White is `flux_at_white_e_per_s` times a pixel's `uniformity` (height, width), where that is given.
+    White is `flux_at_white_e_per_s` times a pixel's `uniformity` (height, width), whose minimum is `darkest`.
 
     Only a star that alone reaches half of white in a pixel is looked at: two fainter ones on one pixel go unnamed.
     """
-    minimum_white = flux_at_white_e_per_s * (1.0 if uniformity is None else float(uniformity.min()))
-    bright = np.flatnonzero(_star_rates(sprites) > 0.5 * minimum_white / peak_share(sigma_px))
-    if not len(bright):
-        return bright
+    bright_e_per_s = 0.5 * flux_at_white_e_per_s * darkest / peak_share(sigma_px)
+    if sprites.per_star * sprites.data["electrons_per_s"].max(initial=0.0) <= bright_e_per_s:
+        return np.empty(0, dtype=np.intp)  # most frames: no star is so bright, however its light is divided
+    bright = np.flatnonzero(_star_rates(sprites) > bright_e_per_s)
     x, y = np.rint(sprites.x_px[bright]).astype(int), np.rint(sprites.y_px[bright]).astype(int)
     inside = (x >= 0) & (x < resolution_px[0]) & (y >= 0) & (y < resolution_px[1])
     bright, x, y = bright[inside], x[inside], y[inside]

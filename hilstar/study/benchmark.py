@@ -245,7 +245,7 @@ class Cell:
     def _python(self) -> None:
         """All of a frame that is not OpenGL."""
         white, size_px = self.bench.flux_at_white_e_per_s, self.bench.camera.resolution_px
-        clipped_sprites(self.bench.sprites(self.q), self.sigma_px, white, size_px, self.bench.uniformity)
+        clipped_sprites(self.bench.sprites(self.q), self.sigma_px, white, size_px, self.bench.uniformity, self.bench.darkest)
 
     def __enter__(self) -> Cell:
         return self

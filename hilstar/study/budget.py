@@ -66,9 +66,8 @@ def budget(bench: Bench) -> Budget:
     render, white = bench.config.render, bench.flux_at_white_e_per_s
     share = peak_share(render.sprite_sigma_px)
     zero_mag = zero_point_mag(bench)
-    darkest = 1.0 if bench.uniformity is None else float(bench.uniformity.min())
     # A star of rate r has V = zero_mag - 2.5 log10 r. It clips first where the screen is darkest, in the middle of a pixel.
-    clips = zero_mag - 2.5 * math.log10(white * darkest / share)
+    clips = zero_mag - 2.5 * math.log10(white * bench.darkest / share)
     corner = corner_share(render.sprite_sigma_px)
     best = zero_mag - 2.5 * math.log10(white / corner)
     nothing_e_per_s = nothing_below_e_per_s(bench)

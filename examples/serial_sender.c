@@ -1,11 +1,11 @@
 /*
- * A bench for hilstar in one file: what firmware does, on a POSIX machine. It turns a camera about its boresight, sends its
+ * A sender for hilstar in one file: what firmware does, on a POSIX machine. It turns a camera about its boresight, sends its
  * attitude over a serial line at a steady rate, answers time requests, and counts the statuses that come back.
  *
- *     cc -std=c99 -D_POSIX_C_SOURCE=200809L -O2 main.c -lm -o main
- *     ./main DEVICE BAUD RATE_HZ SECONDS DEG_PER_S [CLOCK_OFFSET_S]
+ *     cc -std=c99 -D_POSIX_C_SOURCE=200809L -O2 -I ../firmware_protocol serial_sender.c -lm -o serial_sender
+ *     ./serial_sender DEVICE BAUD RATE_HZ SECONDS DEG_PER_S [CLOCK_OFFSET_S]
  *
- * CLOCK_OFFSET_S puts the bench's clock ahead of the machine's: hilstar finds the offset by its time requests.
+ * CLOCK_OFFSET_S sets this sender's clock ahead of the machine's; hilstar finds the offset by its time requests.
  * Exit codes: 0 done; 1 the device failed; 2 the command was wrong.
  */
 #include <errno.h>
@@ -18,15 +18,15 @@
 #include <time.h>
 #include <unistd.h>
 
-#include "../hilstar_protocol.h"
+#include "hilstar_protocol.h"
 
 #define NS_PER_S 1000000000LL
 #define RAD_PER_DEG 0.017453292519943295
 
 static int64_t clock_offset_ns;
 
-/** The bench's clock, ns. Firmware has a hardware timer here. */
-static int64_t bench_ns(void)
+/** The sender's clock, ns. Firmware has a hardware timer here. */
+static int64_t sender_ns(void)
 {
     struct timespec now;
     clock_gettime(CLOCK_MONOTONIC, &now);
@@ -124,7 +124,7 @@ static void answer(int line, const hilstar_decoder *decoder, int64_t t2_ns)
     reply.sequence = request.sequence;
     reply.t1_ns = request.t1_ns;
     reply.t2_ns = t2_ns;
-    reply.t3_ns = bench_ns();
+    reply.t3_ns = sender_ns();
     send_packet(line, packet, hilstar_encode_time_reply(&reply, packet));
 }
 
@@ -132,7 +132,7 @@ static void take_bytes(int line, listener *heard)
 {
     uint8_t bytes[256];
     const ssize_t count = read(line, bytes, sizeof bytes);
-    const int64_t came_ns = bench_ns(); /* before anything else: it is the t2 of a request */
+    const int64_t came_ns = sender_ns(); /* before anything else: it is the t2 of a request */
     ssize_t i;
     if (count <= 0 && !(count < 0 && errno == EINTR))
         die("read");
@@ -148,11 +148,11 @@ static void take_bytes(int line, listener *heard)
     }
 }
 
-/** Listen until the bench's clock says `due_ns`. The deadline is absolute, so no lateness adds up. */
+/** Listen until the sender's clock says `due_ns`. The deadline is absolute, so no lateness adds up. */
 static void listen_until(int line, int64_t due_ns, listener *heard)
 {
     int64_t left_ns;
-    while ((left_ns = due_ns - bench_ns()) > 0) {
+    while ((left_ns = due_ns - sender_ns()) > 0) {
         struct timespec wait;
         fd_set ready;
         int count;
@@ -232,7 +232,7 @@ int main(int argc, char **argv)
     memset(&heard, 0, sizeof heard);
     hilstar_decoder_init(&heard.decoder);
     write_all(line, &delimiter, 1);
-    start_ns = bench_ns();
+    start_ns = sender_ns();
     for (at_ns = 0; at_ns < (int64_t)(seconds * 1e9); at_ns = (int64_t)((double)sent / rate_hz * 1e9)) {
         listen_until(line, start_ns + at_ns, &heard);
         send_attitude(line, sent++, start_ns + at_ns, rate_rad_s * 1e-9 * (double)at_ns, rate_rad_s);

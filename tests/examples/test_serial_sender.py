@@ -1,0 +1,147 @@
+"""The C sender against `hilstar serve` over a real pty, and against the rules of its protocol."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hilstar.attitude.packet import AttitudeSample, Status, TimeReply, TimeRequest
+from hilstar.attitude.quaternion import propagate
+from hilstar.attitude.serial_link import SerialLink
+from tests.conftest import ROOT, SMALL_BENCH
+from tests.e2e.ptys import Cable
+
+pytestmark = pytest.mark.e2e
+
+EXAMPLES = ROOT / "examples"
+STRICT = ["-Wall", "-Wextra", "-Werror", "-pedantic"]
+BAUD = 921_600
+CLOCK_OFFSET_S = 1000
+
+
+@pytest.fixture
+def cable(tmp_path) -> Iterator[Cable]:
+    with Cable(tmp_path) as cable:
+        yield cable
+
+
+@pytest.fixture(scope="module")
+def sender(tmp_path_factory) -> Path:
+    target = tmp_path_factory.mktemp("serial") / "serial_sender"
+    command = ["gcc", "-std=c99", "-D_POSIX_C_SOURCE=200809L", "-O2", *STRICT, "-I", ROOT / "firmware_protocol"]
+    command += [EXAMPLES / "serial_sender.c", "-lm", "-o", target]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert (result.returncode, result.stderr) == (0, "")
+    return target
+
+
+def told(output: str) -> dict[str, int]:
+    match = re.fullmatch(r"sent (\d+), requests (\d+), statuses (\d+)\n", output)
+    assert match is not None, output
+    return dict(zip(("sent", "requests", "statuses"), map(int, match.groups()), strict=True))
+
+
+@contextmanager
+def serving(bench_file: Path) -> Iterator[subprocess.Popen]:
+    command = [sys.executable, "-m", "hilstar", "serve", str(bench_file), "--headless", "--json"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        impatience = threading.Timer(60, process.kill)
+        impatience.start()
+        try:
+            assert process.stderr is not None
+            first = process.stderr.readline()
+            assert "reading serial:" in first, first
+            yield process
+        finally:
+            impatience.cancel()
+            process.kill()
+
+
+def ended(process: subprocess.Popen) -> dict:
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=30)
+    assert process.returncode == 0, err
+    return json.loads(out)
+
+
+def test_the_sender_streams_into_hilstar_and_both_sides_know_each_other_s_clock(tmp_path, cable, sender):
+    bench_file = tmp_path / "serial.toml"
+    bench_file.write_text(f'{SMALL_BENCH}\n[attitude]\nsource = "serial"\nport = "{cable.host}"\nbaud = {BAUD}\n')
+    command = [str(sender), str(cable.bench), str(BAUD), "100", "1", "5", str(CLOCK_OFFSET_S)]
+    with serving(bench_file) as process:
+        result = subprocess.run(command, capture_output=True, text=True, timeout=30, check=False)
+        assert result.returncode == 0, result.stderr
+        summary = ended(process)
+    counted = told(result.stdout)
+    packets = summary["packets"]
+    assert counted["sent"] == 100 == packets["received"] == packets["accepted"]
+    assert packets["refused"] == 0
+    # A second has 8 quick time requests, less what the start took, and 10 statuses.
+    assert counted["requests"] >= 4
+    assert counted["statuses"] >= 4
+    clock = summary["clock"]
+    assert clock["mode"] == "exchange"
+    # Host time minus the sender's, whose clock is ahead.
+    assert abs(clock["offset_ms"] + 1000 * CLOCK_OFFSET_S) <= clock["uncertainty_ms"] + 1.0
+    assert clock["jumps"] == 0
+
+
+def listened(link: SerialLink, program: subprocess.Popen) -> list[tuple[int, object]]:
+    """What the program sends until it ends: (arrival, event)."""
+    heard: list[tuple[int, object]] = []
+    while program.poll() is None:
+        heard += [(arrival.host_ns, arrival.event) for arrival in link.receive(20)]
+    while rest := link.receive(200):
+        heard += [(arrival.host_ns, arrival.event) for arrival in rest]
+    return heard
+
+
+def test_the_sender_turns_as_its_rate_says_and_answers_on_its_own_clock(cable, sender):
+    rate_rad_s = math.radians(20.0)
+    command = [str(sender), str(cable.bench), str(BAUD), "200", "0.5", "20", str(CLOCK_OFFSET_S)]
+    with SerialLink(str(cable.host), BAUD) as link, subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as program:
+        first = link.receive(5000)
+        t1_ns = time.monotonic_ns()
+        link.send(TimeRequest(5, t1_ns))
+        link.send(Status(0, 0, 0, 0, 0, 0, 0))
+        heard = [(arrival.host_ns, arrival.event) for arrival in first] + listened(link, program)
+        assert program.stdout is not None
+        counted = told(program.stdout.read())
+    samples = [event for _, event in heard if isinstance(event, AttitudeSample)]
+    assert counted == {"sent": 100, "requests": 1, "statuses": 1}
+    assert [sample.sequence for sample in samples] == list(range(100))
+    q0 = np.array([0.5, 0.5, -0.5, 0.5])
+    for k, sample in enumerate(samples):
+        assert abs(sample.t_ns - samples[0].t_ns - 5_000_000 * k) <= 1
+        expected = propagate(q0, np.array([0.0, 0.0, rate_rad_s]), (sample.t_ns - samples[0].t_ns) / 1e9)
+        assert np.abs(sample.q_icrs_to_cam - expected).max() < 1e-14
+        assert sample.rate_cam_rad_s is not None
+        assert sample.rate_cam_rad_s.tolist() == [0.0, 0.0, float(np.float32(rate_rad_s))]
+    ((t4_ns, reply),) = [(at_ns, event) for at_ns, event in heard if isinstance(event, TimeReply)]
+    assert (reply.sequence, reply.t1_ns) == (5, t1_ns)
+    offset_ns = CLOCK_OFFSET_S * 1_000_000_000
+    assert t1_ns <= reply.t2_ns - offset_ns <= reply.t3_ns - offset_ns <= t4_ns
+
+
+def test_the_sender_says_in_one_line_what_is_wrong(sender):
+    for arguments, code in (
+        ([], 2),
+        (["/dev/null", "115200", "1", "1", "x"], 2),
+        (["/dev/null", "7", "1", "1", "1"], 2),
+        (["/dev/null", "115200", "1", "1", "1"], 1),
+    ):
+        result = subprocess.run([str(sender), *arguments], capture_output=True, text=True, timeout=10, check=False)
+        assert result.returncode == code
+        assert len(result.stderr.splitlines()) == 1

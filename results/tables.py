@@ -1,4 +1,4 @@
-"""README's tables from the CSV files beside this script: `python results/tables.py` writes them between their marks.
+"""Tables of README and docs/ from the CSV files beside this script: `python results/tables.py` writes them between their marks.
 
 bench.csv is of `hilstar bench -o`, tradeoff.csv, economy.csv and timing.csv of `hilstar study NAME -o`; machine.txt says where.
 """
@@ -10,7 +10,7 @@ import re
 from pathlib import Path
 
 HERE = Path(__file__).parent
-README = HERE.parent / "README.md"
+ROOT = HERE.parent
 COUNTS = (100, 1000, 10_000, 50_000)
 OTHERS = ("numpy", "numba", "photutils", "galsim")
 TIMED_DEG_S = 2.0
@@ -98,5 +98,11 @@ def with_tables(text: str) -> str:
     return text
 
 
+def pages() -> list[Path]:
+    """The files that may have tables: README and the pages of docs/."""
+    return [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
 if __name__ == "__main__":
-    README.write_text(with_tables(README.read_text(encoding="utf-8")), encoding="utf-8")
+    for page in pages():
+        page.write_text(with_tables(page.read_text(encoding="utf-8")), encoding="utf-8")

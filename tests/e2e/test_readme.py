@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import os
 import re
 import shutil
@@ -107,16 +106,6 @@ def test_the_installed_wheel_runs_the_demo_from_elsewhere(tmp_path):
         [python, "-c", "import hilstar; print(hilstar.__file__)"], cwd=elsewhere, capture_output=True, text=True, check=True
     )
     assert str(tmp_path / "env") in where.stdout
-
-
-def test_the_tables_are_those_of_the_results(monkeypatch):
-    """`python results/tables.py` has nothing to change."""
-    monkeypatch.syspath_prepend(ROOT / "results")
-    tables = importlib.import_module("tables")
-    assert tables.with_tables(README) == README
-    assert README.count("<!-- table: ") == len(tables.TABLES)
-    for name in tables.TABLES:
-        assert f"<!-- table: {name} -->\n| " in README
 
 
 def test_a_row_that_justifies_a_default_is_there():

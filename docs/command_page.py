@@ -1,0 +1,168 @@
+"""commands.md from the functions that the commands are: their signatures, typer's options and their docstrings."""
+
+from __future__ import annotations
+
+import inspect
+import textwrap
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+from types import UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+from typer import Typer
+from typer.models import ArgumentInfo, OptionInfo, ParameterInfo
+
+from hilstar.cli import app
+from hilstar.errors import InputError, MachineError
+
+GROUPS = {
+    "Start": ("demo", "doctor"),
+    "Show stars": ("frame", "serve", "replay"),
+    "Send attitudes": ("send", "convert", "keys"),
+    "Set up the hardware": ("calibrate plan", "calibrate photometric", "calibrate scale", "latency"),
+    "Check": ("budget", "verify", "simulate", "compare", "report"),
+    "Measure": ("study", "bench"),
+}
+MAX_BOUND = 1e6  # a larger limit only keeps arithmetic within its types; nobody meets it
+TYPE_WORDS = {int: "N", float: "X", str: "TEXT", Path: "PATH"}
+
+HEAD = f"""\
+# Commands
+
+`hilstar COMMAND --help` prints the same for one command. This page is generated from the commands themselves
+(`python docs/make_pages.py`).
+
+Every command that has `--json` then prints one JSON object on stdout and nothing else there.
+
+| exit code | meaning |
+|---|---|
+| 0 | Done. |
+| 1 | `compare`: not the same sky; `verify --strict`: not passed; `serve` and `replay`: the ledger failed. |
+| {InputError.exit_code} | The command line or a file was wrong. |
+| {MachineError.exit_code} | The machine lacks something, such as OpenGL or a display, or its display went away. |
+| 4 | `serve`: the run ended without ever having had an attitude. |
+| 128 + N | Ended by signal N: 130 for Ctrl-C. |
+
+A refusal is one line on stderr that says what is wrong, where, and what to write or install instead.
+
+`serve` and `replay` end in order on SIGINT, SIGTERM and SIGHUP, and every other command within a second; a second signal
+ends them at once.
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """An argument or an option of a command, as its page lists it."""
+
+    flags: tuple[str, ...]  # empty for an argument
+    value: str  # "N", "OUT.fits"; empty for a flag
+    meaning: str
+    default: str  # empty where there is none to tell
+    required: bool
+
+    @property
+    def usage(self) -> str:
+        """How it stands on a command line: `BENCH.toml`, `[--seed N]`."""
+        words = " ".join(word for word in (*self.flags[:1], self.value) if word)
+        return words if self.required or words.startswith("[") else f"[{words}]"
+
+    @property
+    def line(self) -> str:
+        """Its line of the list."""
+        names = ", ".join(self.flags)
+        head = f"- `{' '.join(word for word in (names, self.value) if word)}`"
+        notes = ["required"] if self.required else [f"default `{self.default}`"] if self.default else []
+        return f"{head}{''.join(f' ({note})' for note in notes)}: {self.meaning}"
+
+
+def page() -> str:
+    """The page. Raises KeyError for a command without a group, and for a group's word that is no command."""
+    commands = dict(commands_of(app, ""))
+    grouped = [name for names in GROUPS.values() for name in names]
+    if set(grouped) != set(commands):
+        raise KeyError(f"commands and GROUPS differ: {sorted(set(grouped) ^ set(commands))}")
+    parts = [HEAD]
+    for title, names in GROUPS.items():
+        parts.append(f"## {title}\n")
+        parts += [section(name, commands[name]) for name in names]
+    return "\n".join(parts)
+
+
+def commands_of(group: Typer, prefix: str) -> Iterator[tuple[str, Callable[..., Any]]]:
+    """Each command's name ("calibrate plan") and function."""
+    for info in group.registered_commands:
+        if info.callback is None:
+            raise TypeError("a command is a function")
+        yield prefix + (info.name or info.callback.__name__.replace("_", "-")), info.callback
+    for inner in group.registered_groups:
+        if inner.typer_instance is not None:
+            yield from commands_of(inner.typer_instance, f"{prefix}{inner.name} ")
+
+
+def section(name: str, command: Callable[..., Any]) -> str:
+    """The command's part of the page."""
+    parameters = sorted(parameters_of(command), key=lambda p: (bool(p.flags), not p.required))
+    usage = textwrap.wrap(
+        " ".join(["hilstar", name, *(p.usage.replace(" ", "\0") for p in parameters)]),
+        width=100,
+        subsequent_indent=" " * (len(name) + 9),
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+    lines = "\n".join(parameter.line for parameter in parameters)
+    text = "\n".join(usage).replace("\0", " ")
+    return f"### hilstar {name}\n\n{inspect.getdoc(command)}\n\n```text\n{text}\n```\n\n{lines}\n"
+
+
+def parameters_of(command: Callable[..., Any]) -> Iterator[Parameter]:
+    """The arguments and options in the order of the function's signature."""
+    hints = get_type_hints(command, include_extras=True)
+    for name, parameter in inspect.signature(command).parameters.items():
+        kind, *notes = get_args(hints[name])
+        info = next(note for note in notes if isinstance(note, ParameterInfo))
+        if info.hidden:
+            continue
+        flags = flags_of(name, info) if isinstance(info, OptionInfo) else ()
+        value = "" if kind is bool else info.metavar or type_word(kind, name, info)
+        required = parameter.default is inspect.Parameter.empty
+        yield Parameter(flags, value, meaning_of(info), default_text(parameter.default), required)
+
+
+def flags_of(name: str, info: OptionInfo) -> tuple[str, ...]:
+    """`-o`, `--output`: what is written on the command line. Within Annotated typer has the first of them as `default`."""
+    words = (info.default, *(info.param_decls or ()))
+    written = tuple(word for word in words if isinstance(word, str) and word.startswith("-"))
+    return written or (f"--{name.replace('_', '-')}",)
+
+
+def type_word(kind: Any, name: str, info: ParameterInfo) -> str:
+    """What stands for the value where the option names nothing: its choices, or a word for its type."""
+    if get_origin(kind) in (Union, UnionType):
+        kind = next(inner for inner in get_args(kind) if inner is not type(None))
+    if get_origin(kind) is Literal:
+        return "|".join(map(str, get_args(kind)))
+    if isinstance(kind, type) and issubclass(kind, Enum):
+        return "|".join(str(choice.value) for choice in kind)
+    return name.upper() if isinstance(info, ArgumentInfo) else TYPE_WORDS[kind]
+
+
+def meaning_of(info: ParameterInfo) -> str:
+    """Its help, with the limits of its value."""
+    low, high = info.min, info.max
+    high = None if high is not None and high >= MAX_BOUND else high
+    if low is not None and high is not None:
+        limits = f" {low:g} to {high:g}."
+    elif low is not None and low > 0:
+        limits = f" {low:g} or more."
+    else:
+        limits = ""
+    return f"{info.help}{limits}"
+
+
+def default_text(default: Any) -> str:
+    """A default that says something: no flag's False, no None, no empty text."""
+    if default is inspect.Parameter.empty or default is None or default is False or default == "":
+        return ""
+    return f"{default:g}" if isinstance(default, float) else str(default.value if isinstance(default, Enum) else default)

@@ -66,7 +66,7 @@ def tradeoff_table() -> str:
 
 
 def economy_table() -> str:
-    """Five scenes with all effort and with what they need."""
+    """Five scenes with full effort and with what they need."""
     rows = rows_of("economy.csv")
     body = []
     for full, auto in zip(rows[::2], rows[1::2], strict=True):
@@ -74,7 +74,7 @@ def economy_table() -> str:
         errors = f"{float(auto['flux_max_mag']):.3f} mag, {float(auto['centroid_max_px']):.3f} px"
         times = f"{figure(float(full['frame_ms']))} ms", f"{figure(float(auto['frame_ms']))} ms"
         body.append([auto["scene"], auto["stars"], *times, f"{ratio:.1f}", errors])
-    return table(["scene", "stars", "all effort", "what it needs", "times", "worst star"], body)
+    return table(["scene", "stars", "full effort", "what it needs", "speed-up", "worst star"], body)
 
 
 def timing_table() -> str:

@@ -115,7 +115,7 @@ def _packet(name: str, entry: dict[str, Any], version: int) -> Packet:
     return Packet(name, entry["kind"], offset, entry["sender"], entry["meaning"], tuple(fields))
 
 
-# ---- hilstar/attitude/protocol.py ----
+# ---- hilstar/attitude/wire/protocol.py ----
 
 
 def python_table(wire: Wire) -> str:
@@ -342,7 +342,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description="Make what states the wire from protocol.toml.")
     parser.add_argument("--check", action="store_true", help="write nothing; exit 1 and name the files that are stale")
     check = parser.parse_args().check
-    files = generated(HERE, HERE.parent / "hilstar" / "attitude")
+    files = generated(HERE, HERE.parent / "hilstar" / "attitude" / "wire")
     stale = [path for path, text in files.items() if not path.exists() or path.read_text() != text]
     for path in stale:
         if not check:

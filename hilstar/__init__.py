@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from hilstar.bench.assembly import Bench, Drawn, Frame, load
+    from hilstar.bench.build import Bench, Drawn, Frame, load
     from hilstar.errors import HilstarError, InputError, MachineError
 
 __version__ = "0.1.0"
@@ -15,6 +15,6 @@ def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module 'hilstar' has no attribute {name!r}")
     from hilstar import errors
-    from hilstar.bench import assembly
+    from hilstar.bench import build as assembly
 
     return getattr(assembly if hasattr(assembly, name) else errors, name)

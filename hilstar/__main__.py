@@ -5,8 +5,8 @@ from __future__ import annotations
 import sys
 from typing import NoReturn
 
-from hilstar import interrupts
-from hilstar.stderr import finish_stderr
+from hilstar.process import interrupts
+from hilstar.process.stderr import finish_stderr
 
 READER_WAITS_S = 0.1  # for a reader of stderr that sleeps
 

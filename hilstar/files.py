@@ -6,7 +6,7 @@ import contextlib
 import fcntl
 import os
 import stat
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -193,3 +193,20 @@ def refuse_writer(path: Path) -> None:
 
 def _why(error: Exception) -> str:
     return str(getattr(error, "strerror", None) or error)
+
+
+def make_directory(path: Path) -> Path:
+    """`path`, made if it is not there. Raises InputError where it cannot be made or written."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"{path}: cannot be written ({getattr(error, 'strerror', None) or error}); choose another place"
+        ) from error
+    return path
+
+
+def written(path: Path, write: Callable[[Path], object]) -> None:
+    """Whole or not at all; an older file stays until the new one is there."""
+    with whole_file(path) as part:
+        write(part)

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import hilstar
-from tests import leftovers
+from tests.support import leftovers
 
 # A shell ignores SIGINT for what it runs with `&`, and what ignores it hands that on: a test's Ctrl-C would reach nobody.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:

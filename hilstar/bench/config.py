@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, get_args
 import msgspec
 from msgspec import Meta
 
-from hilstar.attitude.protocol import NORM_TOLERANCE
+from hilstar.attitude.wire.protocol import NORM_TOLERANCE
 from hilstar.errors import InputError, shortened
 from hilstar.reading import MAX_TOML_BYTES, parse_toml, read_text
 from hilstar.tracker.detector import DetectorSettings

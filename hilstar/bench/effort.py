@@ -13,10 +13,11 @@ import numpy as np
 from hilstar.arrays import FloatArray
 from hilstar.bench.config import RenderSettings
 from hilstar.monitor.phases import WHITE, Errors, fainter, measure, phase_grid, shown_by
-from hilstar.monitor.photometry import Response
 from hilstar.monitor.quantise import Panel, Quantisation
+from hilstar.monitor.response import Response
 from hilstar.render.reference import linear_image
 from hilstar.scene.psf import LARGEST_CUT, cut_share, footprint_px, peak_share, pixel_share
+from hilstar.units import flux_ratio
 
 CODES_SHARE, EDGES_SHARE, MOTION_SHARE = 0.5, 0.25, 0.25
 BY_COST: tuple[Quantisation, ...] = ("round", "exact")
@@ -144,7 +145,7 @@ def code_errors(method: Quantisation, render: RenderSettings, light: Light) -> E
     deepest = max(0.0, 2.5 * math.log10(light.white_e_per_s / peak_share(sigma_px) / faintest))
     found = []
     for mag in np.linspace(0.0, deepest, MAGNITUDES).tolist():
-        wanted = bright * 10 ** (-0.4 * mag)
+        wanted = bright * flux_ratio(mag)
         shown = shown_by(method, render.cycle_frames, panel, wanted.astype(np.float32), fainter(sprites, mag), sigma_px)
         found.append(measure(wanted, shown, tile))
     return Errors(*(max(getattr(e, name) for e in found) for name in Errors.__slots__))

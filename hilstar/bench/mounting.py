@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from hilstar.bench.config import Monitor
 from hilstar.render.presenter import Mount
-from hilstar.scene.sweep import Scan
+from hilstar.scene.frame_motion import Scan
 
 S_PER_MS = 1e-3
 

@@ -11,12 +11,12 @@ from typing import NoReturn
 
 import typer
 
-from hilstar import interrupts
 from hilstar.cli import bench, check, compare, light, run, show, stream
 from hilstar.cli.common import app
-from hilstar.console import fail
+from hilstar.console.terminal import fail
 from hilstar.errors import HilstarError, InputError, MachineError
-from hilstar.stderr import finish_stderr, queue_stderr
+from hilstar.process import interrupts
+from hilstar.process.stderr import finish_stderr, queue_stderr
 
 __all__ = ["app", "bench", "check", "compare", "light", "main", "run", "show", "stream"]
 

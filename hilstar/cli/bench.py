@@ -11,7 +11,7 @@ import numpy as np
 import typer
 
 from hilstar.cli.common import MAX_SEED, Json, app
-from hilstar.console import print_json, progress
+from hilstar.console.terminal import print_json, progress
 from hilstar.endings import check_directory
 from hilstar.errors import InputError
 
@@ -30,8 +30,9 @@ def bench(
 ) -> None:
     """Time a whole frame and its stages, beside NumPy, numba, GalSim and photutils on the same stars."""
     from hilstar.bench.config import read_config
-    from hilstar.bench.output import make_directory
-    from hilstar.study import benchmark, benchmark_report
+    from hilstar.files import make_directory
+    from hilstar.study.speed import benchmark
+    from hilstar.study.speed import report as benchmark_report
 
     plan = benchmark.QUICK if quick else benchmark.Plan()
     if stars is not None:

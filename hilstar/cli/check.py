@@ -11,7 +11,7 @@ import numpy as np
 import typer
 
 from hilstar.cli.common import MAX_SEED, BenchFile, Json, QuaternionText, RadecText, app, attitude_of, check_files
-from hilstar.console import print_json, progress, say
+from hilstar.console.terminal import print_json, progress, say
 from hilstar.endings import FITS, PNG, PNG_OR_TIFF, check_directory, check_ending
 from hilstar.errors import InputError
 
@@ -32,9 +32,9 @@ def simulate(
     as_json: Json = False,
 ) -> None:
     """The virtual tracker's image of the sky, with noise."""
-    from hilstar.bench import output as files
-    from hilstar.bench.sender import parse_rate
-    from hilstar.bench.simulation import Simulator
+    from hilstar.run.send.sender import parse_rate
+    from hilstar.twin import exposure_files as files
+    from hilstar.twin.simulator import Simulator
 
     if log is not None:
         if output is None or radec or quaternion or rate or png or dn_png:
@@ -79,10 +79,10 @@ def simulate_log(
     bench_file: Path, log: Path, frames: int | None, noise_and_seed: tuple[Literal["full", "none"], int], output: Path
 ) -> None:
     """The virtual tracker along a log."""
-    from hilstar.attitude.gaps import log_joins
-    from hilstar.attitude.logs import read_log
-    from hilstar.bench.batch import log_motions, simulate_motions
+    from hilstar.attitude.logs.gaps import log_joins
+    from hilstar.attitude.logs.log_file import read_log
     from hilstar.bench.config import read_config
+    from hilstar.twin.batch import log_motions, simulate_motions
 
     samples = read_log(log)
     for _, line in log_joins(samples).told:
@@ -105,7 +105,7 @@ def study(
     as_json: Json = False,
 ) -> None:
     """Charts and tables: models, the thesis's outputs, where methods fail, codes, a slewing screen, error against time."""
-    from hilstar.bench.output import make_directory
+    from hilstar.files import make_directory
 
     check_directory("-o", output)
     make_directory(output)
@@ -119,7 +119,8 @@ def study(
 
 def study_lines(what: str, output: Path, quick: bool = False) -> tuple[list[str], bool]:
     """Run a study; what it found, and whether everything was right."""
-    study_of = import_module(f"hilstar.study.{what}")
+    room = what in {"stability", "tradeoff"}
+    study_of = import_module(f"hilstar.study.{what}{'.run' if room else ''}")
     if what == "models":
         return [f"{finding.figure}: {finding.text}" for finding in study_of.run(output)], True
     if what == "stability":
@@ -142,9 +143,9 @@ def verify(
 ) -> None:
     """The digital twin: what the tracker measures of the stars shown, against the sky."""
     from hilstar.bench.config import read_config
-    from hilstar.bench.output import make_directory
-    from hilstar.study.twin import verify as run_twin
-    from hilstar.study.twin_verdict import write_report
+    from hilstar.files import make_directory
+    from hilstar.twin.verdict import write_report
+    from hilstar.twin.verify import verify as run_twin
 
     check_directory("-o", output)
     if output is not None:
@@ -188,7 +189,7 @@ def tell_verdict(summary: dict[str, Any]) -> None:
 @app.command()
 def doctor(as_json: Json = False) -> None:
     """Say what GL, displays, links and files are there, and what is missing."""
-    from hilstar.bench.doctor import examine
+    from hilstar.run.doctor import examine
 
     result = examine()
     if as_json:

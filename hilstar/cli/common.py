@@ -28,9 +28,9 @@ LOG_HELP = "CSV (t_s,qw,qx,qy,qz), JSON lines, CCSDS AEM, or a run's MCAP."
 
 def attitude_of(command: str, radec: str | None, quaternion: str | None) -> Any:
     """The one attitude that the command line gives."""
-    from hilstar.attitude.quaternion import from_radec_roll_deg
-    from hilstar.bench.assembly import checked_quaternion
-    from hilstar.bench.sender import parse_numbers, parse_radec
+    from hilstar.bench.build import checked_quaternion
+    from hilstar.rotation import from_radec_roll_deg
+    from hilstar.run.send.sender import parse_numbers, parse_radec
 
     if (radec is None) == (quaternion is None):
         raise InputError(f"{command}: give the attitude with --radec RA,DEC,ROLL or --quaternion W,X,Y,Z, one of them")

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from hilstar.cli.common import Json, app
-from hilstar.console import print_json
+from hilstar.console.terminal import print_json
 from hilstar.endings import check_directory
 
 MAX_LINES = 10  # of stars; a whole sky that differs is no news star by star
@@ -25,11 +25,11 @@ def compare(
     as_json: Json = False,
 ) -> None:
     """Compare two frames star by star: exit code 0 when they are the same sky, 1 when not."""
-    from hilstar.bench.output import make_directory
-    from hilstar.study.compare import CENTROID_PX, FLUX_MAG
-    from hilstar.study.compare_files import write_report
-    from hilstar.study.sky_difference import told
+    from hilstar.files import make_directory
     from hilstar.testing import compare as compare_files
+    from hilstar.testing.compare import CENTROID_PX, FLUX_MAG
+    from hilstar.testing.files import write_report
+    from hilstar.testing.sky_difference import told
 
     check_directory("-o", output)
     limits = FLUX_MAG if flux_mag is None else flux_mag, CENTROID_PX if centroid_px is None else centroid_px

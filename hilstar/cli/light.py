@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from hilstar.cli.common import MAX_SEED, BenchFile, Json, Overwrite, app, check_files
-from hilstar.console import print_json, say
+from hilstar.console.terminal import print_json, say
 from hilstar.endings import CSV, PNG, TOML, check_directory, check_ending
 from hilstar.errors import InputError
 
@@ -26,10 +26,10 @@ def budget(
     as_json: Json = False,
 ) -> None:
     """Which magnitudes this monitor, sprite and quantisation can show, and how well."""
-    from hilstar.bench.assembly import load
-    from hilstar.bench.output import make_directory
-    from hilstar.study.budget import budget as find_budget
-    from hilstar.study.budget import budget_json, budget_lines, write_budget
+    from hilstar.bench.build import load
+    from hilstar.files import make_directory
+    from hilstar.twin.budget import budget as find_budget
+    from hilstar.twin.budget import budget_json, budget_lines, write_budget
 
     check_directory("-o", output)
     with load(bench_file) as bench:
@@ -55,14 +55,14 @@ def photometric(
     as_json: Json = False,
 ) -> None:
     """Fit the monitor's response to measured patches."""
-    from hilstar.bench.calibrate import calibrate_photometric
+    from hilstar.calibrate.photometric import calibrate_photometric
 
     check_ending("-o", output, TOML)
     check_ending("--plot", plot, PNG)
     check_files([measured], [output, output.with_suffix(".csv"), plot])
     summary = calibrate_photometric(measured, output, bits=bits, who=who, when=when, instrument=instrument, unit=unit)
     if plot is not None:
-        from hilstar.study.calibration import draw_calibration
+        from hilstar.calibrate.response_chart import draw_calibration
 
         draw_calibration(measured, plot, bits)
         summary["written"].append(str(plot))
@@ -100,9 +100,9 @@ def plan(
     as_json: Json = False,
 ) -> None:
     """Which codes to measure, in which order, and their patches."""
-    from hilstar.bench.calibrate import is_filled_in
-    from hilstar.bench.calibrate import plan as write_plan
-    from hilstar.bench.sender import parse_numbers
+    from hilstar.calibrate.photometric import is_filled_in
+    from hilstar.calibrate.photometric import plan as write_plan
+    from hilstar.run.send.sender import parse_numbers
 
     check_ending("-o", output, CSV)
     check_directory("--headless", headless)
@@ -127,7 +127,7 @@ def plan(
         typer.echo(f"{summary['patches']} patches of {summary['codes']} codes in {', '.join(summary['written'])}")
         typer.echo("fill in the column value, and give the file to hilstar calibrate photometric")
     if show:
-        from hilstar.bench.calibrate import show_patches
+        from hilstar.calibrate.photometric import show_patches
 
         shown = show_patches(steps, bits, int(display) if display.isdecimal() else display, seconds)
         say(f"{shown} of {len(steps)} patches shown")
@@ -144,8 +144,8 @@ def scale(
     as_json: Json = False,
 ) -> None:
     """What one pixel at white is worth, by what the tracker reads of a star that is shown."""
-    from hilstar.bench.assembly import load
-    from hilstar.bench.scale import UNSURE_MAG, parse_reading, scale_by_tracker, with_flux_at_white
+    from hilstar.bench.build import load
+    from hilstar.calibrate.scale import UNSURE_MAG, parse_reading, scale_by_tracker, with_flux_at_white
 
     check_ending("-o", output, TOML)
     check_files([], [output], bench_file)

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from hilstar.cli.common import Json, Overwrite, app, check_files
-from hilstar.console import print_json
+from hilstar.console.terminal import print_json
 from hilstar.endings import CSV, check_directory, check_ending
 from hilstar.errors import InputError
 
@@ -24,9 +24,9 @@ def report(
     as_json: Json = False,
 ) -> None:
     """Timing, age of the attitude, missed frames and memory of a run, on one page with charts."""
-    from hilstar.bench.output import make_directory
-    from hilstar.study.report import report as write_report
-    from hilstar.study.report import table_rows
+    from hilstar.files import make_directory
+    from hilstar.run.record.report import report as write_report
+    from hilstar.run.record.report import table_rows
 
     check_directory("-o", output)
     make_directory(output)
@@ -54,10 +54,10 @@ def latency(
     as_json: Json = False,
 ) -> None:
     """From swap to light, by a photodiode before the screen's square and the ledger of the run."""
-    from hilstar.bench.latency import capture_edges, read_edges, save_edges, write_panel_delay
-    from hilstar.bench.output import make_directory
-    from hilstar.bench.sender import parse_serial
-    from hilstar.study.latency import measure, told
+    from hilstar.calibrate.latency import capture_edges, read_edges, save_edges, write_panel_delay
+    from hilstar.calibrate.latency_chart import measure, told
+    from hilstar.files import make_directory
+    from hilstar.run.send.sender import parse_serial
 
     check_directory("-o", output)
     check_ending("--save", save, CSV)

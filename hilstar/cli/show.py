@@ -25,11 +25,11 @@ from hilstar.cli.common import (
     attitude_of,
     check_files,
 )
-from hilstar.console import print_json, progress, report, say
+from hilstar.console.terminal import print_json, progress, report, say
 from hilstar.endings import CSV, FITS, MCAP, PNG, check_directory, check_ending
 from hilstar.errors import InputError, MachineError
-from hilstar.interrupts import stop_on_signal
 from hilstar.notices import Notices
+from hilstar.process.interrupts import stop_on_signal
 
 Windowed = Annotated[bool, typer.Option("--windowed", help="A window on the desk instead of the whole display.")]
 Force = Annotated[bool, typer.Option("--force", help="Show on a display that the start-up gate refuses; logged.")]
@@ -51,7 +51,7 @@ def demo(
     as_json: Json = False,
 ) -> None:
     """The main job in one command: real stars, an attitude streamed over a real ZeroMQ socket, frames out."""
-    from hilstar.bench.demo import run_demo
+    from hilstar.run.demo import run_demo
 
     check_directory("-o", output)
     with progress("serving", duration * 60) as advance:
@@ -74,8 +74,8 @@ def frame(
     as_json: Json = False,
 ) -> None:
     """Draw one frame into files."""
-    from hilstar.bench import output as files
-    from hilstar.bench.assembly import load
+    from hilstar.bench import frame_files as files
+    from hilstar.bench.build import load
 
     q = attitude_of("frame", radec, quaternion)
     targets = [path for path in (output, truth, codes, preview) if path is not None]
@@ -133,12 +133,12 @@ def explain_effort(bench: Any) -> None:
 def shown_bench(bench_file: Path, headless: bool, windowed: bool, force: bool) -> Iterator[tuple[Any, Any]]:
     """The bench, and the screen that it is on; None when headless."""
     if headless:
-        from hilstar.bench.assembly import load
+        from hilstar.bench.build import load
 
         with load(bench_file) as bench:
             yield bench, None
         return
-    from hilstar.bench.screen import open_screen
+    from hilstar.run.screen.screen import open_screen
 
     with open_screen(bench_file, windowed=windowed, force=force) as screen:
         yield screen.bench, screen
@@ -156,7 +156,7 @@ def say_what_clips(bench: Any) -> None:
 @contextmanager
 def optional_ledger(path: Path | None, bench: Any, notices: Notices, overwrite: bool, split: Any) -> Iterator[Any]:
     """The run's ledger, which keeps the run's events too, or nothing where none was asked for."""
-    from hilstar.bench.ledger import Ledger
+    from hilstar.run.record.ledger import Ledger
 
     if path is None:
         yield None
@@ -207,10 +207,10 @@ def serve(
 ) -> None:
     """Show the live attitude stream."""
     from hilstar.bench.config import read_config
-    from hilstar.bench.ledger import parse_split
-    from hilstar.bench.loop import Limit
-    from hilstar.bench.server import Outlet, open_link
-    from hilstar.bench.server import serve as serve_stream
+    from hilstar.run.loop import Limit
+    from hilstar.run.record.ledger import parse_split
+    from hilstar.run.serve import Outlet, open_link
+    from hilstar.run.serve import serve as serve_stream
 
     check_ending("--ledger", ledger, MCAP)
     check_files([], [], bench_file, ledger, overwrite)
@@ -255,11 +255,11 @@ def replay(
 ) -> None:
     """Show an attitude log."""
     from hilstar.bench.config import read_config
-    from hilstar.bench.ledger import parse_split
-    from hilstar.bench.play import Wanted, plan_play
-    from hilstar.bench.recorder import FrameRecorder
-    from hilstar.bench.server import Outlet
-    from hilstar.bench.server import replay as replay_log
+    from hilstar.run.record.frame_sequence import FrameRecorder
+    from hilstar.run.record.ledger import parse_split
+    from hilstar.run.replay import Wanted, plan_play
+    from hilstar.run.serve import Outlet
+    from hilstar.run.serve import replay as replay_log
 
     check_directory("-o", output)
     check_ending("--ledger", ledger, MCAP)

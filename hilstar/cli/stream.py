@@ -13,10 +13,10 @@ import numpy as np
 import typer
 
 from hilstar.cli.common import LOG_HELP, MAX_SEED, Json, RadecText, app, check_files
-from hilstar.console import print_json, progress, say
+from hilstar.console.terminal import print_json, progress, say
 from hilstar.endings import check_directory
 from hilstar.errors import InputError
-from hilstar.interrupts import stop_on_signal
+from hilstar.process.interrupts import stop_on_signal
 
 LISTEN_SLICE_S = 0.1  # between looks at whether a signal has come
 Share = Annotated[str, typer.Option(metavar="[SHARE]", help="Share of the packets, such as 5% or 0.05; alone: 5%.")]
@@ -47,10 +47,10 @@ def send(
     as_json: Json = False,
 ) -> None:
     """Send a log or a spin, over ZeroMQ or a serial line, with the faults of a bad cable on request: the test instrument."""
-    from hilstar.attitude.curve import CurveKeys
-    from hilstar.bench.faults import BadCable, Faults, parse_share
-    from hilstar.bench.sender import open_road
-    from hilstar.bench.sender import send as send_samples
+    from hilstar.attitude.wire.keys import CurveKeys
+    from hilstar.run.send.faults import BadCable, Faults, parse_share
+    from hilstar.run.send.sender import open_road
+    from hilstar.run.send.sender import send as send_samples
 
     shares = (parse_share(lose, "--lose"), parse_share(corrupt, "--corrupt"), parse_share(reorder, "--reorder"))
     if sum(shares) > 1:
@@ -72,9 +72,9 @@ def send(
 
 def wanted_samples(log: Path | None, spin: str | None, rate: float | None, radec: str | None) -> tuple[Any, float]:
     """The samples that `send` is asked for, and how many they are (infinite where nobody can say)."""
-    from hilstar.attitude.gaps import log_joins
-    from hilstar.attitude.logs import read_log
-    from hilstar.bench.sender import log_samples, parse_radec, parse_spin, spin_samples
+    from hilstar.attitude.logs.gaps import log_joins
+    from hilstar.attitude.logs.log_file import read_log
+    from hilstar.run.send.sender import log_samples, parse_radec, parse_spin, spin_samples
 
     if (log is None) == (spin is None):
         raise InputError("send: give a LOG or --spin AXIS,DEG_PER_S, one of them")
@@ -123,7 +123,7 @@ def convert(
     output: Annotated[Path, typer.Argument(metavar="OUT", help=".csv, .jsonl, .aem, .xml or .mcap.")],
 ) -> None:
     """Write an attitude log in another form."""
-    from hilstar.attitude.logs import read_log, write_log
+    from hilstar.attitude.logs.log_file import read_log, write_log
 
     check_files([log], [output])
     samples = read_log(log)
@@ -136,7 +136,7 @@ def keys(
     output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Where they go.")] = Path("hilstar-keys"),
 ) -> None:
     """Make CURVE keys for ZeroMQ beyond this machine."""
-    from hilstar.attitude.curve import make_keys
+    from hilstar.attitude.wire.keys import make_keys
 
     check_directory("-o", output)
     for path in make_keys(output):

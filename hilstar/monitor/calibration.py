@@ -12,9 +12,9 @@ import numpy as np
 
 from hilstar.arrays import Float32Array, FloatArray
 from hilstar.errors import InputError, shortened
-from hilstar.monitor import photometry
+from hilstar.monitor import response as photometry
 from hilstar.monitor.calibration_file import beside, read_grid, read_response, read_toml
-from hilstar.monitor.photometry import Response, Weights, gamma_response, mixed_response, srgb_response, table_response
+from hilstar.monitor.response import Response, Weights, gamma_response, mixed_response, srgb_response, table_response
 from hilstar.reading import exists
 
 FORMULAS = ("srgb", "gamma2.2")

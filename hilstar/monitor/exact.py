@@ -18,8 +18,8 @@ import numpy.typing as npt
 from hilstar.arrays import Float32Array, FloatArray, IntArray
 from hilstar.monitor.footprints import FootprintMap, Footprints, PlaceArray
 from hilstar.monitor.level_table import ThresholdCounter
-from hilstar.monitor.photometry import Codes
 from hilstar.monitor.quantise import Panel, level_dtype
+from hilstar.monitor.response import Codes
 from hilstar.scene.sprites import Sprites
 
 # What the square of an error of light weighs against that of a moment of as much light times 1 px. One serves a star

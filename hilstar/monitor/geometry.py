@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hilstar.arrays import FloatArray
-from hilstar.attitude.quaternion import normalise, to_matrix
+from hilstar.rotation import normalise, to_matrix
 from hilstar.scene.camera import Camera
 
 

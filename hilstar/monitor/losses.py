@@ -9,8 +9,8 @@ import numpy.typing as npt
 
 from hilstar.arrays import FloatArray
 from hilstar.monitor.footprints import FootprintMap
-from hilstar.monitor.photometry import Codes
 from hilstar.monitor.quantise import Panel
+from hilstar.monitor.response import Codes
 from hilstar.scene.clipping import CLIP_TOLERANCE
 from hilstar.scene.sprites import Sprites
 

@@ -11,6 +11,7 @@ from hilstar.monitor.exact import ExactQuantiser
 from hilstar.monitor.quantise import Panel, Quantisation, dither_levels, round_levels, shown_light, temporal_levels
 from hilstar.scene.psf import footprint_px, peak_share
 from hilstar.scene.sprites import Sprites, pack_sprites
+from hilstar.units import flux_ratio
 
 SIGMA_PX = (0.85, 0.85)
 WHITE = 1.0
@@ -39,7 +40,7 @@ def phase_grid(count: int, sigma_px: tuple[float, float] = SIGMA_PX) -> tuple[Sp
 def fainter(sprites: Sprites, mag: float) -> Sprites:
     """The same stars, so many magnitudes fainter."""
     data = sprites.data.copy()
-    data["electrons_per_s"] *= 10 ** (-0.4 * mag)
+    data["electrons_per_s"] *= flux_ratio(mag)
     return Sprites(data, sprites.footprint_px, sprites.star, sprites.x_px, sprites.y_px)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from hilstar.arrays import Float32Array, FloatArray
 from hilstar.errors import InputError
 from hilstar.monitor.blue_noise import blue_noise
-from hilstar.monitor.photometry import Codes, Response, encode
+from hilstar.monitor.response import Codes, Response, encode
 
 Quantisation = Literal["round", "dither", "temporal", "exact"]
 

@@ -11,8 +11,8 @@ import numpy.typing as npt
 from hilstar.errors import InputError
 from hilstar.monitor.blue_noise import blue_noise
 from hilstar.monitor.level_table import CodeTable, code_table
-from hilstar.monitor.photometry import Codes
 from hilstar.monitor.quantise import Panel, level_dtype
+from hilstar.monitor.response import Codes
 from hilstar.resources import resource_path
 
 TABLE_WIDTH = 1024  # that of encode.frag

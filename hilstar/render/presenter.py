@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.errors import MachineError
-from hilstar.monitor.x11 import GL_LIBRARY, X11_LIBRARY
+from hilstar.monitor.window.x11 import GL_LIBRARY, X11_LIBRARY
 from hilstar.render.encoder import TABLE_WIDTH, build_program
 
 CROSSHAIR, GRID, BLANK, PATCH = 1, 2, 4, 8

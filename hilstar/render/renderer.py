@@ -15,8 +15,8 @@ import numpy as np
 from hilstar.arrays import Float32Array
 from hilstar.errors import InputError, MachineError
 from hilstar.monitor.exact import ExactQuantiser
-from hilstar.monitor.photometry import Codes, Response
 from hilstar.monitor.quantise import CYCLE_FRAMES, Panel, Quantisation, frame_shift
+from hilstar.monitor.response import Codes, Response
 from hilstar.render.encoder import Encoder, Eraser, LevelTexture, SpriteSides, build_program, set_sides
 from hilstar.scene.psf import SQRT2, footprint_px
 from hilstar.scene.sprites import SPRITE_DTYPE, Sprites

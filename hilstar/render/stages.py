@@ -6,12 +6,11 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from hilstar.monitor.photometry import Codes
+from hilstar.monitor.response import Codes
 from hilstar.render.encoder import Encoder
 from hilstar.render.renderer import Renderer, Target
 from hilstar.scene.sprites import Sprites
-
-NS_PER_MS = 1e6
+from hilstar.units import NS_PER_MS
 
 
 class StagedRenderer(Renderer):

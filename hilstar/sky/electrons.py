@@ -24,6 +24,7 @@ from hilstar.sky.spectrum import (
     integration_nodes,
     load_curve,
 )
+from hilstar.units import flux_ratio
 
 VEGA_V0_W_M2_M = 3.631e-2  # Bessell 1998, A&A 333, 231, table A2: 3.631e-9 erg/s/cm2/A at 545 nm
 BOLOMETRIC_0_W_M2 = 2.518021002e-8  # IAU 2015 Resolution B2
@@ -119,7 +120,7 @@ def zodiacal_electrons_per_s_arcsec2(v_mag_arcsec2: float, optics: Optics, photo
 
     Zodiacal light is a little redder than the Sun: the WFC3 handbook's spectrum gives 5 % more photons from 330 to 1100 nm.
     """
-    return float(10 ** (-0.4 * v_mag_arcsec2) * dgs_electrons_per_s(SUN_TEMPERATURE_K, optics, photometry))
+    return float(flux_ratio(v_mag_arcsec2) * dgs_electrons_per_s(SUN_TEMPERATURE_K, optics, photometry))
 
 
 def ags_electrons_per_s(optics: Optics, photometry: Photometry) -> float:
@@ -156,7 +157,7 @@ class RateTable:
 
     def electrons_per_s(self, v_mag: FloatArray, temperature_k: FloatArray) -> FloatArray:
         """Electron rates of stars (n,), whose temperatures lie within TABLE_RANGE_K."""
-        return np.asarray(10 ** (-0.4 * v_mag) * np.exp(self.log_rate(1.0 / temperature_k)))
+        return np.asarray(flux_ratio(v_mag) * np.exp(self.log_rate(1.0 / temperature_k)))
 
 
 def tabulate(model: BrightnessModel, optics: Optics, photometry: Photometry) -> RateTable:

@@ -17,6 +17,7 @@ from hilstar.arrays import FloatArray
 from hilstar.errors import InputError
 from hilstar.sky.electrons import Optics, Photometry, Weighting, reference_mean_w_m2_m
 from hilstar.sky.spectrum import LIGHT_M_S, PLANCK_J_S, Curve, integration_nodes, load_curve
+from hilstar.units import flux_ratio
 
 PACKAGED_LIBRARY = Path(__file__).resolve().parent / "data" / "pickles.npz"
 
@@ -75,7 +76,7 @@ class PicklesTable:
         """Electron rates of stars, shape (n,); a NaN V-I leaves it to B-V, a colour past the library is held at its end."""
         known = np.isfinite(vi_mag)
         both = self.over_vi(np.where(known, vi_mag, 0.0)) + self.per_bv * np.clip(bv_mag, *self.bv_range_mag)
-        return np.asarray(10 ** (-0.4 * v_mag) * np.exp(np.where(known, both, self.over_bv(bv_mag))))
+        return np.asarray(flux_ratio(v_mag) * np.exp(np.where(known, both, self.over_bv(bv_mag))))
 
 
 @cache

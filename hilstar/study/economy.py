@@ -12,13 +12,13 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from hilstar.arrays import FloatArray
-from hilstar.attitude.quaternion import from_radec_roll_deg
-from hilstar.bench.assembly import Bench
+from hilstar.bench.build import Bench
+from hilstar.charts import chart, write_csv
 from hilstar.monitor.quantise import Panel, shown_light
 from hilstar.render.reference import linear_image
+from hilstar.rotation import from_radec_roll_deg
+from hilstar.scene.frame_motion import Scan, Turn, swept_sprites
 from hilstar.scene.sprites import Sprites
-from hilstar.scene.sweep import Scan, Turn, swept_sprites
-from hilstar.study.charts import chart, write_csv
 
 BENCH = """
 [tracker]

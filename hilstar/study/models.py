@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from hilstar.arrays import FloatArray
+from hilstar.charts import chart, plain_ticks, write_csv
 from hilstar.sky.catalog import Catalog, load_catalog
 from hilstar.sky.electrons import (
     REFERENCE_TEMPERATURE_K,
@@ -29,7 +30,6 @@ from hilstar.sky.spectrum import (
     integration_nodes,
     load_curve,
 )
-from hilstar.study.charts import chart, plain_ticks, write_csv
 
 SENSORS = {"ccd47-20": "CCD47-20", "kai-4021": "KAI-4021 (approximate QE)"}
 APERTURE_MM = 30.0

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.attitude.quaternion import from_radec_roll_deg
-from hilstar.bench.output import write_exposure_fits
-from hilstar.bench.simulation import Exposure, Simulator
+from hilstar.charts import STYLE, save, write_csv
 from hilstar.resources import resource_path
-from hilstar.study.charts import STYLE, save, write_csv
+from hilstar.rotation import from_radec_roll_deg
+from hilstar.twin.exposure_files import write_exposure_fits
+from hilstar.twin.simulator import Exposure, Simulator
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

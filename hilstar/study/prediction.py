@@ -14,11 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
-from hilstar.attitude.clock import NS_PER_MS, NS_PER_S
-from hilstar.attitude.packet import AttitudeSample
-from hilstar.attitude.quaternion import angle_between_rad
-from hilstar.study.charts import chart, plain_ticks, write_csv
-from hilstar.study.tradeoff_motion import JITTER, NEAR, SLEW_DEG, SLEW_S, Guess, guesses, slew_attitude, slew_sample
+from hilstar.attitude.wire.packet import AttitudeSample
+from hilstar.charts import chart, plain_ticks, write_csv
+from hilstar.rotation import angle_between_rad
+from hilstar.study.tradeoff.motion import JITTER, NEAR, SLEW_DEG, SLEW_S, Guess, guesses, slew_attitude, slew_sample
+from hilstar.units import ARCSEC_PER_RAD, NS_PER_MS, NS_PER_S
 
 RATES_HZ = (5, 10, 20, 50, 100, 200)
 LATENCIES_MS = (2, 5, 10, 20, 50, 100)
@@ -26,7 +26,6 @@ USUAL_HZ, USUAL_MS = 100, 20
 FRAME_HZ = 60
 SPAN_S, QUICK_SPAN_S = 40.0, 6.0
 TIMED = 200
-ARCSEC_PER_RAD = math.degrees(3600)
 MARKERS = "osd^vx"
 
 

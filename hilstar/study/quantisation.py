@@ -10,18 +10,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hilstar.arrays import FloatArray
+from hilstar.charts import STYLE, plain_ticks, save, title_lines, write_csv
 from hilstar.monitor.phases import SIGMA_PX, WHITE, Errors, fainter, measure, phase_grid, shown_by
-from hilstar.monitor.photometry import Response, Weights, bit_stealing, srgb_response
 from hilstar.monitor.quantise import (
     CYCLE_FRAMES,
     Panel,
     Quantisation,
 )
+from hilstar.monitor.response import Response, Weights, bit_stealing, srgb_response
 from hilstar.render.reference import linear_image
 from hilstar.render.renderer import Renderer, Target
 from hilstar.scene.psf import footprint_px, peak_share
 from hilstar.scene.sprites import pack_sprites
-from hilstar.study.charts import STYLE, plain_ticks, save, title_lines, write_csv
+from hilstar.units import flux_ratio
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -95,7 +96,7 @@ def _against_magnitude(bits: int, way: Way, phases: int, mags: FloatArray) -> li
     bright = linear_image(sprites, (phases * tile, phases * tile), SIGMA_PX)
     errors = []
     for mag in mags:
-        wanted = bright * 10 ** (-0.4 * mag)
+        wanted = bright * flux_ratio(mag)
         linear, cycle = wanted.astype(np.float32), CYCLE_FRAMES if way.whole_cycle else 1
         shown = shown_by(way.method, cycle, panel, linear, fainter(sprites, mag), SIGMA_PX)
         errors.append(measure(wanted, shown, tile))
@@ -107,7 +108,7 @@ def _frame_ms(bits: int, way: Way, repeats: int) -> float:
     rng = np.random.default_rng(SEED)
     share = rng.uniform(size=STARS)
     mag = 2 * np.log10(1 + share * (10 ** (8 / 2) - 1))
-    flux = WHITE / peak_share(SIGMA_PX) * 10 ** (-0.4 * mag)
+    flux = WHITE / peak_share(SIGMA_PX) * flux_ratio(mag)
     x_px, y_px = rng.uniform(0, 1, (2, STARS)) * np.array(FRAME_PX)[:, None]
     sprites = pack_sprites(x_px, y_px, flux, np.arange(STARS), (FRAME_PX, footprint_px(SIGMA_PX)))
     target = Target(FRAME_PX, SIGMA_PX, response_of(bits, way), WHITE, way.method)

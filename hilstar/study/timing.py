@@ -17,22 +17,22 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from hilstar.arrays import FloatArray
-from hilstar.attitude.clock import NS_PER_S
-from hilstar.attitude.packet import AttitudeSample
-from hilstar.attitude.quaternion import from_radec_roll_deg, propagate
-from hilstar.attitude.timeline import Attitude, Policy, Timeline
-from hilstar.bench.assembly import Bench
-from hilstar.bench.simulation import ARCSEC_PER_RAD, NO_ALIGNMENT
+from hilstar.attitude.clock.timeline import Attitude, Policy, Timeline
+from hilstar.attitude.wire.packet import AttitudeSample
+from hilstar.bench.build import Bench
+from hilstar.charts import chart, plain_ticks, write_csv
 from hilstar.monitor.geometry import monitor_camera
 from hilstar.monitor.quantise import Panel, shown_light
 from hilstar.render.renderer import Renderer, Target
+from hilstar.rotation import from_radec_roll_deg, propagate
 from hilstar.scene.camera import Camera
-from hilstar.scene.smear import Motion, smeared_sprites
+from hilstar.scene.exposure_motion import Motion, smeared_sprites
+from hilstar.scene.frame_motion import Scan
 from hilstar.scene.sprites import Sprites
-from hilstar.scene.sweep import Scan
-from hilstar.study.charts import chart, plain_ticks, write_csv
 from hilstar.study.economy import moments
-from hilstar.study.twin_optics import Mounting, TwinOptics
+from hilstar.twin.optics import Mounting, TwinOptics
+from hilstar.twin.simulator import NO_ALIGNMENT
+from hilstar.units import ARCSEC_PER_RAD, NS_PER_S
 
 BENCH = """
 [tracker]

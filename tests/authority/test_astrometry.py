@@ -9,8 +9,8 @@ from astropy.coordinates import SkyCoord
 from astropy.time import Time
 from astropy.wcs import WCS
 
-from hilstar.attitude.quaternion import from_radec_roll_deg, to_matrix
-from hilstar.bench.output import world_coordinates
+from hilstar.bench.frame_files import world_coordinates
+from hilstar.rotation import from_radec_roll_deg, to_matrix
 from hilstar.sky.astrometry import LIGHT_KM_S, aberrate, unit_vectors_icrs
 from hilstar.sky.catalog import FIELDS, Catalog, load_catalog
 

@@ -9,12 +9,12 @@ import pytest
 from scipy.constants import c, h, k
 from scipy.integrate import quad
 
-from hilstar.attitude.quaternion import from_radec_roll_deg
-from hilstar.bench.simulation import Simulator
 from hilstar.render.reference import linear_image
-from hilstar.scene.smear import smeared_sprites
+from hilstar.rotation import from_radec_roll_deg
+from hilstar.scene.exposure_motion import smeared_sprites
 from hilstar.sky.electrons import Optics, Photometry, zodiacal_electrons_per_s_arcsec2
 from hilstar.sky.spectrum import Curve
+from hilstar.twin.simulator import Simulator
 from tests.authority.test_electrons import read, v_mean
 from tests.conftest import ROOT, SMALL_BENCH
 

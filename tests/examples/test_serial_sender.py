@@ -17,11 +17,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilstar.attitude.packet import AttitudeSample, Status, TimeReply, TimeRequest
-from hilstar.attitude.quaternion import propagate
-from hilstar.attitude.serial_link import SerialLink
+from hilstar.attitude.wire.packet import AttitudeSample, Status, TimeReply, TimeRequest
+from hilstar.attitude.wire.serial_link import SerialLink
+from hilstar.rotation import propagate
 from tests.conftest import ROOT, SMALL_BENCH
-from tests.e2e.ptys import Cable
+from tests.support.ptys import Cable
 
 pytestmark = pytest.mark.e2e
 

@@ -7,8 +7,8 @@ import pytest
 
 from hilstar.errors import InputError
 from hilstar.monitor.exact import ExactQuantiser
-from hilstar.monitor.photometry import bit_stealing, gamma_response, srgb_response
 from hilstar.monitor.quantise import Panel, dither_levels, frame_shift, round_levels, temporal_levels, turned_mask
+from hilstar.monitor.response import bit_stealing, gamma_response, srgb_response
 from hilstar.render.renderer import Renderer, Target
 from tests.gpu.test_renderer import sprites_at
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hilstar.errors import InputError, MachineError
-from hilstar.monitor.photometry import encode, srgb_response
+from hilstar.monitor.response import encode, srgb_response
 from hilstar.render import renderer as renderer_module
 from hilstar.render.reference import linear_image
 from hilstar.render.renderer import Renderer, Target

@@ -1,0 +1,1 @@
+"""Attitude logs: one file a format, and how their samples join."""

@@ -1,0 +1,151 @@
+"""Who comes and goes at a ZeroMQ socket: counted, told, and at most MAX_CONNECTIONS at a time.
+
+libzmq says what happens on a monitor socket and limits nothing: it takes connections until the process has no file left.
+What is over the limit is shut at once, the newest first, so that whoever was there stays. A peer that does not finish its
+handshake within HANDSHAKE_MS is closed by libzmq itself.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+import time
+from collections.abc import Iterator
+
+import zmq
+from zmq.utils.monitor import parse_monitor_message
+
+from hilstar.attitude.wire.flood_limits import PAUSE_S, LinkCounts
+from hilstar.notices import Notices
+
+MAX_CONNECTIONS = 64
+MAX_EVENTS = 500  # in one go; more wait in the monitor, and then libzmq waits
+FEW_EVENTS = 50
+HANDSHAKE_MS = 2000
+FAILED = {
+    zmq.EVENT_HANDSHAKE_FAILED_AUTH: "its key is not among those allowed",
+    zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL: "it speaks another kind of ZeroMQ than this socket, or without keys",
+    zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL: f"it left, or did not say who it is within {HANDSHAKE_MS / 1000:g} s",
+}
+EVENTS = zmq.EVENT_ACCEPTED | zmq.EVENT_CONNECTED | zmq.EVENT_DISCONNECTED | zmq.EVENT_HANDSHAKE_SUCCEEDED | sum(FAILED)
+
+
+class Doorkeeper:
+    """Reads the monitor of one socket that is yet to be bound or connected.
+
+    `lost` says that a connection has ended; whoever acts on it takes it back. `place` is the port or path that was bound.
+    """
+
+    def __init__(self, watched: zmq.Socket[bytes], *, bound: bool, counts: LinkCounts, notices: Notices) -> None:
+        self.lost = False
+        self.place: int | str = ""
+        self._watched = watched
+        self._bound = bound
+        self._counts = counts
+        self._notices = notices
+        self._open: dict[int, str] = {}  # file: who, in the order of arrival
+        self._shut: set[int] = set()
+        self._failure = ""
+        self._monitor = watched.get_monitor_socket(EVENTS)
+
+    @property
+    def monitor(self) -> zmq.Socket[bytes]:
+        """The socket to poll for news."""
+        return self._monitor
+
+    def tend(self) -> None:
+        """Take in what has happened."""
+        events = 0
+        with contextlib.suppress(zmq.ZMQError):
+            while events < MAX_EVENTS:
+                event = parse_monitor_message(self._monitor.recv_multipart(zmq.NOBLOCK))
+                self._take(int(event["event"]), int(event["value"]))
+                events += 1
+        if self._bound and len(self._open) > MAX_CONNECTIONS:
+            self._shut_newest()
+        if events > FEW_EVENTS:
+            time.sleep(PAUSE_S)
+
+    def _take(self, event: int, value: int) -> None:
+        if event == zmq.EVENT_ACCEPTED:
+            self._counts.connections += 1
+            self._open.pop(value, None)
+            self._open[value] = _peer(value)
+        elif event == zmq.EVENT_DISCONNECTED:
+            self._leave(value)
+        elif event == zmq.EVENT_HANDSHAKE_SUCCEEDED and not self._bound:
+            self._arrive()
+        elif event in FAILED:
+            self._failure = FAILED[zmq.Event(event)]
+
+    def _arrive(self) -> None:
+        """A connecting socket's peer is there, for the first time or again."""
+        self._counts.connections += 1
+        if self._counts.connections > 1:
+            self._notices.tell("back", "the sender is connected again")
+
+    def _leave(self, file: int) -> None:
+        self.lost = True
+        who, failure = self._open.pop(file, ""), self._failure
+        self._failure = ""
+        if file in self._shut:
+            self._shut.remove(file)
+        elif failure and self._bound:
+            self._counts.rejected += 1
+            self._notices.tell("client-rejected", f"a connection from {who or 'somewhere'} was rejected: {failure}")
+        elif failure:
+            self._counts.rejected += 1
+            self._notices.tell(
+                "link-rejected", "the side that binds did not let us in: see its allowed_clients, and our curve_server_key"
+            )
+        elif not self._bound:
+            self._counts.lost += 1
+            self._notices.tell("lost", "the connection to the sender is lost; waiting for it")
+
+    def _shut_newest(self) -> None:
+        newest = [file for file in list(self._open)[MAX_CONNECTIONS:] if file not in self._shut]
+        if not newest:
+            return
+        if not self._shut:
+            who = self._open[newest[0]] or "somewhere"
+            self._notices.tell(
+                "connections-refused", f"over {MAX_CONNECTIONS} connections at once; further ones, from {who}, are shut"
+            )
+        for file in newest:
+            self._counts.refused += 1
+            self._shut.add(file)
+            with _connection(file) as connection:
+                if connection is not None and self._is_ours(connection):
+                    connection.shutdown(socket.SHUT_RDWR)
+
+    def _is_ours(self, connection: socket.socket) -> bool:
+        """A file's number may be another file's by now."""
+        name = connection.getsockname()
+        return bool((name[1] if isinstance(name, tuple) else name) == self.place)
+
+    def close(self) -> None:
+        """Stop watching; before its socket is closed."""
+        self.tend()  # libzmq waits on a monitor that is full, and would wait for ever on one that is gone
+        with contextlib.suppress(zmq.ZMQError):
+            self._watched.disable_monitor()
+        self._monitor.close(linger=0)
+
+
+@contextlib.contextmanager
+def _connection(file: int) -> Iterator[socket.socket | None]:
+    """libzmq's own connection for a moment, through a copy of its file; None where it is gone."""
+    try:
+        connection = socket.socket(fileno=os.dup(file))
+    except OSError:
+        yield None
+        return
+    with connection, contextlib.suppress(OSError):
+        yield connection
+
+
+def _peer(file: int) -> str:
+    with _connection(file) as connection:
+        name = () if connection is None else connection.getpeername()
+        return f"{name[0]}:{name[1]}" if isinstance(name, tuple) and len(name) > 1 else ""
+    return ""

@@ -1,0 +1,207 @@
+"""The packets of the wire, and the attitude's JSON form: bytes in, frozen events out, no I/O.
+
+Laws:
+1. Every message gives exactly one event: a packet or a `Refusal`. Nothing raises.
+2. A sample is finite, its quaternion unit to 1e-15; the sender's was unit to NORM_TOLERANCE.
+3. A message that does not start with "{" is accepted only if its CRC-32 is right.
+4. `decode(encode(packet))` gives the packet back, bit for bit where a quaternion is already unit.
+
+The layout is that of firmware_protocol/protocol.toml.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from dataclasses import dataclass
+from typing import Literal
+
+import msgspec
+import numpy as np
+
+from hilstar.arrays import FloatArray
+from hilstar.attitude.wire import protocol
+from hilstar.attitude.wire.protocol import FASTEST_RAD_S, NORM_TOLERANCE, VERSION
+
+CRC = struct.Struct("<I")
+LONGEST_JSON_BYTES = 4096
+INT64 = range(-(2**63), 2**63)
+U32 = 2**32
+UNIT = 1e-15  # so near, a division by the norm would only move the last bit to and fro
+
+Reason = Literal["crc", "norm", "nan", "time", "format", "rate", "source"]
+# Of the message itself, and told even where none was refused for them; and of this bench, told where they occur.
+MESSAGE_REASONS: tuple[Reason, ...] = ("crc", "norm", "nan", "time", "format")
+BENCH_REASONS: tuple[Reason, ...] = ("rate", "source")
+REASONS = MESSAGE_REASONS + BENCH_REASONS
+RATE_ROUNDING = 1e-6  # a packet's rate is float32
+
+
+@dataclass(frozen=True, slots=True)
+class AttitudeSample:
+    """Where the camera points at `t_ns` of the sender's clock; `rate_cam_rad_s` (3,) or None when unknown."""
+
+    t_ns: int
+    q_icrs_to_cam: FloatArray
+    rate_cam_rad_s: FloatArray | None = None
+    sequence: int = 0
+    discontinuity: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """Why a message is not an attitude."""
+
+    reason: Reason
+    detail: str
+
+
+@dataclass(frozen=True, slots=True)
+class TimeRequest:
+    """One side asks for the other's time; `t1_ns` is the asker's clock when it left."""
+
+    sequence: int
+    t1_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class TimeReply:
+    """The answer: `t2_ns` when the request came, `t3_ns` when this left, both on the answerer's clock."""
+
+    sequence: int
+    t1_ns: int
+    t2_ns: int
+    t3_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """What goes back to the bench: the last frame shown, when its light leaves the screen (bench clock), and health.
+
+    `health` is the sum of protocol.HEALTH_ bits; `attitude_age_ns` is -1 while there is no attitude.
+    """
+
+    health: int
+    frame: int
+    light_t_ns: int
+    attitude_age_ns: int
+    attitude_sequence: int
+    accepted: int
+    refused: int
+
+
+Packet = AttitudeSample | TimeRequest | TimeReply | Status
+Event = Packet | Refusal
+
+
+class _JsonAttitude(msgspec.Struct):
+    t_ns: int
+    q: tuple[float, float, float, float]
+    rate: tuple[float, float, float] | None = None
+    sequence: int = 0
+    discontinuity: bool = False
+
+
+_json_decoder = msgspec.json.Decoder(_JsonAttitude)
+
+
+def encode(packet: Packet) -> bytes:
+    """The bytes of a packet; counters are taken modulo 2^32, and a status's times held within 64 bits."""
+    match packet:
+        case AttitudeSample():
+            body = _attitude_body(packet)
+        case TimeRequest(sequence, t1_ns):
+            body = protocol.TIME_REQUEST_BODY.pack(VERSION, protocol.KIND_TIME_REQUEST, 0, sequence % U32, t1_ns)
+        case TimeReply(sequence):
+            times = (packet.t1_ns, packet.t2_ns, packet.t3_ns)
+            body = protocol.TIME_REPLY_BODY.pack(VERSION, protocol.KIND_TIME_REPLY, 0, sequence % U32, *times)
+        case Status():
+            counts = (packet.attitude_sequence % U32, packet.accepted % U32, packet.refused % U32)
+            head = (VERSION, protocol.KIND_STATUS, packet.health, packet.frame % U32)
+            held = (min(max(t_ns, INT64[0]), INT64[-1]) for t_ns in (packet.light_t_ns, packet.attitude_age_ns))
+            body = protocol.STATUS_BODY.pack(*head, *held, *counts)
+    return body + CRC.pack(zlib.crc32(body))
+
+
+def _attitude_body(sample: AttitudeSample) -> bytes:
+    rate = sample.rate_cam_rad_s
+    flags = (0 if rate is None else protocol.FLAG_RATE_VALID) | (protocol.FLAG_DISCONTINUITY if sample.discontinuity else 0)
+    head = (VERSION, protocol.KIND_ATTITUDE, flags, sample.sequence % U32, sample.t_ns)
+    return protocol.ATTITUDE_BODY.pack(*head, *sample.q_icrs_to_cam, *((0.0, 0.0, 0.0) if rate is None else rate))
+
+
+def decode(message: bytes) -> Event:
+    """One message of any form: a packet's bytes, or an attitude as a JSON object that starts with "{"."""
+    if message[:1] == b"{" or message[:16].lstrip()[:1] == b"{":
+        return _decode_json(message)
+    head = (message[0], message[1]) if len(message) > 1 else (-1, -1)
+    size = protocol.PACKET_BYTES.get(head[1]) if head[0] == VERSION else None
+    if len(message) not in {size, protocol.ATTITUDE_BYTES}:
+        return Refusal("format", f"{len(message)} bytes; an attitude is {protocol.ATTITUDE_BYTES} bytes or a JSON object")
+    if CRC.unpack_from(message, len(message) - CRC.size)[0] != zlib.crc32(message[: -CRC.size]):
+        return Refusal("crc", "the CRC-32 does not fit the packet")
+    if len(message) != size:
+        return Refusal("format", f"version {head[0]}, kind {head[1]}; version {VERSION}, kind 1 is wanted")
+    return _decode_body(head[1], message)
+
+
+def _decode_body(kind: int, message: bytes) -> Event:
+    if kind == protocol.KIND_TIME_REQUEST:
+        return TimeRequest(*protocol.TIME_REQUEST_BODY.unpack_from(message)[3:])
+    if kind == protocol.KIND_TIME_REPLY:
+        return TimeReply(*protocol.TIME_REPLY_BODY.unpack_from(message)[3:])
+    if kind == protocol.KIND_STATUS:
+        return Status(*protocol.STATUS_BODY.unpack_from(message)[2:])
+    _, _, flags, sequence, t_ns, w, x, y, z, *rate = protocol.ATTITUDE_BODY.unpack_from(message)
+    known_rate = tuple(rate) if flags & protocol.FLAG_RATE_VALID else None
+    return checked_sample(t_ns, (w, x, y, z), known_rate, sequence, bool(flags & protocol.FLAG_DISCONTINUITY))
+
+
+def checked_sample(
+    t_ns: int,
+    q: tuple[float, ...],
+    rate: tuple[float, ...] | None,
+    sequence: int = 0,
+    discontinuity: bool = False,
+) -> AttitudeSample | Refusal:
+    """A sample from raw numbers, or why they are none: every road into hilstar passes here."""
+    if not all(map(math.isfinite, (*q, *(rate or ())))):
+        return Refusal("nan", "a quaternion or rate component is not finite")
+    if rate is not None and math.hypot(*rate) > FASTEST_RAD_S:
+        return Refusal("format", f"a rate of {math.hypot(*rate):.3g} rad/s; at most {FASTEST_RAD_S:g} is taken")
+    norm = math.hypot(*q)
+    if abs(norm - 1.0) > NORM_TOLERANCE:
+        return Refusal("norm", f"the quaternion's norm is {norm:.6g}; 1 within {NORM_TOLERANCE:g} is wanted")
+    if t_ns not in INT64:
+        return Refusal("format", f"t_ns {t_ns} does not fit 64 bits")
+    unit = np.array(q, dtype=np.float64)
+    if abs(norm - 1.0) > UNIT:
+        unit /= norm
+    return AttitudeSample(t_ns, unit, None if rate is None else np.array(rate, dtype=np.float64), sequence, discontinuity)
+
+
+def rate_refusal(sample: AttitudeSample, max_rate_rad_s: float) -> Refusal | None:
+    """Why a sample turns faster than this bench takes ([attitude] max_rate_deg_s), None where it does not."""
+    if sample.rate_cam_rad_s is None:
+        return None
+    rate_rad_s = math.hypot(*sample.rate_cam_rad_s.tolist())
+    if rate_rad_s <= max_rate_rad_s * (1 + RATE_ROUNDING):
+        return None
+    return Refusal(
+        "rate",
+        f"a rate of {rate_rad_s:.4g} rad/s ({math.degrees(rate_rad_s):.4g} deg/s) is over [attitude] max_rate_deg_s ="
+        f" {math.degrees(max_rate_rad_s):g}; rates are rad/s: send rad/s, or write a larger max_rate_deg_s",
+    )
+
+
+def _decode_json(message: bytes) -> AttitudeSample | Refusal:
+    if len(message) > LONGEST_JSON_BYTES:
+        return Refusal("format", f"{len(message)} bytes of JSON; at most {LONGEST_JSON_BYTES} are read")
+    try:
+        form = _json_decoder.decode(message)
+    except (msgspec.MsgspecError, RecursionError, UnicodeDecodeError) as error:
+        if b"NaN" in message or b"Infinity" in message:
+            return Refusal("nan", "a number is NaN or Infinity")
+        return Refusal("format", f'{error}; {{"t_ns":..., "q":[w,x,y,z], "rate":[x,y,z]}} is wanted')
+    return checked_sample(form.t_ns, form.q, form.rate, form.sequence, form.discontinuity)

@@ -1,0 +1,196 @@
+"""The serial line: COBS frames both ways, and a device that may go and come back."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import termios
+import time
+from types import TracebackType
+from typing import Self
+
+import serial
+from serial.tools import list_ports
+
+from hilstar.attitude.clock.receiver import Arrival
+from hilstar.attitude.wire.cobs import DELIMITER, StreamDecoder, frame
+from hilstar.attitude.wire.flood_limits import FloodGate, LinkCounts
+from hilstar.attitude.wire.packet import Packet, encode
+from hilstar.errors import InputError, one_line
+from hilstar.notices import Notices
+
+FIRST_BACK_OFF_S = 0.05
+LONGEST_BACK_OFF_S = 0.4  # a device that is back is picked up within a second
+MAX_READ_BYTES = 65_536  # in one go
+MAX_DRAIN_S = 0.5
+BITS_PER_BYTE = 10  # 8N1
+FRAMING_BYTES = 2  # COBS and its 0x00
+
+
+def serial_ports() -> list[str]:
+    """The serial ports of this machine, each with what it says of itself."""
+    return [f"{port.device} ({port.description})" for port in sorted(list_ports.comports())]
+
+
+class SerialLink:
+    """A serial port that is opened anew, with back-off, whenever it disappears.
+
+    Raises InputError where the port cannot be opened at the start.
+    """
+
+    two_way = True
+    verb = "reading"
+
+    def __init__(self, port: str, baud: int, notices: Notices | None = None) -> None:
+        self.link_counts = LinkCounts()
+        self.endpoint = f"serial:{port}@{baud}"
+        self.reconnects = 0
+        self._port = port
+        self._baud = baud
+        self._notices = Notices() if notices is None else notices
+        self._gate = FloodGate(self.link_counts, self._notices)
+        self._decoder = StreamDecoder()
+        self._back_off_s = FIRST_BACK_OFF_S
+        self._retry_s = 0.0
+        try:
+            self._device: serial.Serial | None = self._open()
+        except (OSError, ValueError, OverflowError) as error:  # SerialException is an OSError
+            raise InputError(f"{self.endpoint}: {opening_fault(error, port)}") from error
+
+    def _open(self) -> serial.Serial:
+        device = serial.Serial(self._port, self._baud, timeout=0, exclusive=True)
+        with contextlib.suppress(OSError, ValueError):  # a USB adapter else gathers bytes for 16 ms; a pty has no such mode
+            device.set_low_latency_mode(True)
+        self._decoder = StreamDecoder()
+        return device
+
+    def receive(self, timeout_ms: int) -> list[Arrival]:
+        """The frames that have come; waits at most `timeout_ms` for the first byte."""
+        device = self._device
+        if device is None:
+            self._reopen(timeout_ms)
+            return []
+        try:
+            if device.timeout != timeout_ms / 1000:  # setting it costs a tcsetattr
+                device.timeout = timeout_ms / 1000
+            chunk = device.read(1)
+            chunk += device.read(min(device.in_waiting, MAX_READ_BYTES)) if chunk else b""
+        except (OSError, TypeError) as error:  # pyserial itself stumbles (TypeError) over a port closed under it
+            self._lose(str(error))
+            return []
+        host_ns = time.monotonic_ns()
+        frames = chunk.count(DELIMITER)
+        admitted = self._gate.admit(frames)
+        events = self._decoder.feed(chunk) if admitted == frames else self._decoder.feed_newest(chunk, admitted)
+        return [Arrival(host_ns, event, raw) for event, raw in events]
+
+    def wait_for_message(self, timeout_ms: int) -> bool:
+        """True once bytes wait that were not read."""
+        device = self._device
+        try:
+            return device is not None and bool(select.select([device.fileno()], [], [], timeout_ms / 1000)[0])
+        except (OSError, ValueError, TypeError):  # gone: `receive` finds out, and says so
+            return False
+
+    def send(self, packet: Packet) -> None:
+        """Send to the bench, never waiting: what the line does not take at once is lost."""
+        self.send_bytes(frame(packet))
+
+    def send_bytes(self, data: bytes, patience_s: float = 0.0) -> bool:
+        """Send bytes as they are, waiting at most `patience_s` for a full line; False when some were lost."""
+        device = self._device
+        if device is None:
+            return False
+        # pyserial's own write spins for ever on a line that is full, where it should not wait.
+        deadline_s = time.monotonic() + patience_s
+        try:
+            while data:
+                with contextlib.suppress(BlockingIOError):
+                    data = data[os.write(device.fileno(), data) :]
+                wait_s = deadline_s - time.monotonic()
+                if not data or wait_s <= 0:
+                    break
+                select.select([], [device.fileno()], [], wait_s)
+        except (OSError, ValueError, TypeError) as error:
+            self._lose(str(error))
+            return False
+        return not data
+
+    def drain(self) -> None:
+        """Wait until what was sent has left the machine, and give up what a line that stands still does not take."""
+        deadline_s = time.monotonic() + MAX_DRAIN_S
+        with contextlib.suppress(OSError, TypeError, termios.error):
+            while self._device is not None and self._device.out_waiting:
+                if time.monotonic() > deadline_s:  # closing it would wait for half a minute
+                    self._device.reset_output_buffer()
+                    return
+                time.sleep(0.005)
+
+    def wire_ns(self, packet: Packet) -> int:
+        """How long a packet's frame takes at this baud rate."""
+        return (len(encode(packet)) + FRAMING_BYTES) * BITS_PER_BYTE * 1_000_000_000 // self._baud
+
+    @property
+    def connected(self) -> bool:
+        """True while the device is there."""
+        return self._device is not None
+
+    def _lose(self, why: str) -> None:
+        self.link_counts.lost += 1
+        self._notices.tell("lost", f"{self.endpoint} is gone ({one_line(why)}); waiting for it to come back")
+        self._shut()
+        self._back_off_s = FIRST_BACK_OFF_S
+        self._retry_s = time.monotonic() + self._back_off_s
+
+    def _reopen(self, timeout_ms: int) -> None:
+        wait_s = self._retry_s - time.monotonic()
+        if wait_s > 0:
+            time.sleep(min(wait_s, timeout_ms / 1000))
+            return
+        try:
+            self._device = self._open()
+        except (OSError, ValueError):
+            self._back_off_s = min(2 * self._back_off_s, LONGEST_BACK_OFF_S)
+            self._retry_s = time.monotonic() + self._back_off_s
+            return
+        self.reconnects += 1
+        self._notices.tell("back", f"{self.endpoint} is back")
+        self.send_bytes(DELIMITER)
+
+    def _shut(self) -> None:
+        device, self._device = self._device, None
+        if device is not None:
+            with contextlib.suppress(OSError, TypeError):
+                device.close()
+
+    def close(self) -> None:
+        """Close the port."""
+        self._shut()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+
+def opening_fault(error: BaseException, port: str) -> str:
+    """Why a port could not be opened, and what to do."""
+    return f"{_why(error)}; {_instead(error, port)}"
+
+
+def _why(error: BaseException) -> str:
+    reason = getattr(error, "strerror", None) or str(error)
+    return " ".join(str(reason).split())
+
+
+def _instead(error: BaseException, port: str) -> str:
+    text = str(error).lower()
+    if "permission" in text:
+        return "join the group that owns it (often dialout)"
+    if "lock" in text or "resource temporarily" in text:
+        return "stop the program that has it"
+    if isinstance(error, ValueError):
+        return "write a baud rate that the port has, such as 115200 or 921600"
+    return f"write the port of the bench, such as /dev/ttyUSB0 (ls /dev/serial/by-id shows what there is), not {port!r}"

@@ -1,0 +1,135 @@
+"""Frames as files: FITS, CSV and PNG."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from PIL import Image
+
+from hilstar.arrays import FloatArray
+from hilstar.bench.build import Bench, Frame
+from hilstar.files import written
+from hilstar.monitor.response import Codes
+from hilstar.rotation import to_matrix, to_radec_roll_deg
+from hilstar.scene.camera import Camera
+
+PREVIEW_RADIUS_PX = 9  # of the brightest star
+PREVIEW_BLUR_PX = 0.7
+PREVIEW_POWER = 0.35
+
+
+def write_frame_fits(path: Path, bench: Bench, frame: Frame) -> None:
+    """The linear image (electron/s, float32) with attitude, epoch, bench hash and a TAN world coordinate system.
+
+    The first row of the array is the top of the monitor.
+    """
+    from astropy.io import fits
+
+    header = sky_header(bench.bench_hash, bench.config.sky.epoch_jyear, frame.q_icrs_to_cam, bench.camera)
+    header["BUNIT"] = ("electron/s", "each pixel's share of the tracker's electrons")
+    header["WHITE"] = (bench.flux_at_white_e_per_s, "[electron/s] one pixel at the white code")
+    header["NSTARS"] = (len(frame.truth), "stars in view")
+    header["CALNAME"] = (bench.calibration.name, "monitor calibration")
+    header["CALSHA"] = bench.calibration.sha256
+    written(path, lambda part: fits.PrimaryHDU(frame.linear, header).writeto(part, overwrite=True))
+
+
+def sky_header(bench_hash: str, epoch_jyear: float, q_icrs_to_cam: FloatArray, camera: Camera) -> Any:
+    """A FITS header with the attitude, the epoch, the bench's hash and a TAN world coordinate system."""
+    from astropy.io import fits
+
+    header = fits.Header()
+    ra_deg, dec_deg, roll_deg = to_radec_roll_deg(q_icrs_to_cam)
+    for name, value in zip(("QW", "QX", "QY", "QZ"), q_icrs_to_cam, strict=True):
+        header[name] = (float(value), "q_icrs_to_cam, Hamilton, scalar first")
+    header["RA_PNT"] = (ra_deg, "[deg] boresight right ascension, ICRS")
+    header["DEC_PNT"] = (dec_deg, "[deg] boresight declination, ICRS")
+    header["ROLL_PNT"] = (roll_deg, "[deg] camera roll")
+    header["EPOCHJYR"] = (epoch_jyear, "[yr] Julian year of the star positions")
+    header["BENCHSHA"] = bench_hash  # no room on the card for a comment
+    header["CREATOR"] = "hilstar"
+    header.update(world_coordinates(camera, q_icrs_to_cam))
+    return header
+
+
+def world_coordinates(camera: Camera, q_icrs_to_cam: FloatArray) -> dict[str, str | float]:
+    """FITS TAN keywords of an image: exact, for it is a tangent plane."""
+    right, down, normal = camera.cam_to_image @ to_matrix(q_icrs_to_cam)
+    ra, dec = np.arctan2(normal[1], normal[0]), np.arctan2(normal[2], np.hypot(normal[0], normal[1]))
+    east = np.array([-np.sin(ra), np.cos(ra), 0.0])
+    north = np.array([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)])
+    deg_per_px = np.degrees(1.0 / camera.focal_length_px)
+    return {
+        "CTYPE1": "RA---TAN",
+        "CTYPE2": "DEC--TAN",
+        "RADESYS": "ICRS",
+        "CUNIT1": "deg",
+        "CUNIT2": "deg",
+        "LONPOLE": 180.0,
+        "CRVAL1": float(np.degrees(ra) % 360),
+        "CRVAL2": float(np.degrees(dec)),
+        "CRPIX1": camera.principal_point_px[0] + 1.0,
+        "CRPIX2": camera.principal_point_px[1] + 1.0,
+        "CD1_1": float(right @ east * deg_per_px),
+        "CD1_2": float(down @ east * deg_per_px),
+        "CD2_1": float(right @ north * deg_per_px),
+        "CD2_2": float(down @ north * deg_per_px),
+    }
+
+
+def write_truth_csv(path: Path, frame: Frame) -> None:
+    """One row per star: the columns of TRUTH_DTYPE, brightest first; drawn and clipped are 1 or 0."""
+
+    def write(part: Path) -> None:
+        with part.open("w", encoding="ascii", newline="") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(frame.truth.dtype.names or ())
+            for row in frame.truth.tolist():
+                writer.writerow([int(v) if isinstance(v, bool) else repr(v) for v in row])
+
+    written(path, write)
+
+
+def write_codes_png(path: Path, codes: Codes, bits: int) -> None:
+    """The code values: 8 bit, or 16 bit for deeper monitors, left-aligned. Shallower ones stay as they are.
+
+    Codes of three channels (height, width, 3) become an RGB picture.
+    """
+    image = (
+        np.asarray(codes, dtype=np.uint8) if bits <= 8 else np.asarray(codes.astype(np.uint16) << (16 - bits), dtype=np.uint16)
+    )
+    written(path, lambda part: _save_png(part, image))
+
+
+def _save_png(path: Path, image: npt.NDArray[Any]) -> None:
+    if image.ndim == 2 or image.dtype == np.uint8:
+        Image.fromarray(image).save(path, "PNG", compress_level=1)
+        return
+    # Pillow has no RGB of 16 bits.
+    import png
+
+    height, width, _ = image.shape
+    with path.open("wb") as file:
+        png.Writer(width, height, bitdepth=16, greyscale=False, compression=1).write(file, image.reshape(height, -1))
+
+
+def write_preview_png(path: Path, codes: Codes) -> None:
+    """A picture for a person: each star a disc that grows with its code, as star charts have it.
+
+    It is stretched to the brightest pixel of its own frame.
+    """
+    from scipy.ndimage import gaussian_filter, maximum_filter
+
+    signal = codes.astype(np.float32) / max(int(codes.max()), 1)
+    picture = np.zeros_like(signal)
+    reach = np.arange(-PREVIEW_RADIUS_PX, PREVIEW_RADIUS_PX + 1)
+    for radius in range(1, PREVIEW_RADIUS_PX + 1):
+        bright = np.where(signal >= ((radius - 1) / PREVIEW_RADIUS_PX) ** 2, signal, 0)
+        disc = np.hypot(*np.meshgrid(reach, reach)) <= radius
+        picture = np.maximum(picture, maximum_filter(bright, footprint=disc))
+    smooth = gaussian_filter(picture**PREVIEW_POWER, PREVIEW_BLUR_PX)
+    written(path, lambda part: Image.fromarray((255 * np.clip(smooth, 0, 1)).astype(np.uint8)).save(part, "PNG"))

@@ -1,0 +1,1 @@
+"""Calibration: measurements in, files that a bench uses out."""

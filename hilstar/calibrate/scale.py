@@ -1,0 +1,97 @@
+"""The scale of the light by the tracker itself: one star shown, its DN read, and what white is then worth."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hilstar.arrays import FloatArray
+from hilstar.bench.build import Bench
+from hilstar.bench.config import read_config
+from hilstar.calibrate.toml_key import with_key
+from hilstar.errors import InputError
+from hilstar.files import write_whole
+from hilstar.reading import MAX_TOML_BYTES, read_text
+from hilstar.scene.psf import peak_share
+
+UNSURE_MAG = 0.05  # readings that disagree by more say something else than the scale
+READING_FORM = "write --reading HIP,DN: a star's Hipparcos number, and the sum of its DN over the background"
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """A star that was shown, and the sum of its DN over background."""
+
+    hip: int
+    dn: float
+
+
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """What white is worth by the tracker, and how well readings agree."""
+
+    flux_at_white_e_per_s: float
+    assumed_e_per_s: float
+    ratios: FloatArray
+
+    @property
+    def scatter_mag(self) -> float:
+        """Standard deviation of the readings, magnitudes; 0 for one."""
+        return float(np.std(2.5 * np.log10(self.ratios), ddof=1)) if len(self.ratios) > 1 else 0.0
+
+
+def parse_reading(text: str) -> Reading:
+    """A reading from "HIP,DN". Raises InputError."""
+    parts = text.split(",")
+    try:
+        reading = Reading(int(parts[0]), float(parts[1]))
+    except (ValueError, IndexError) as error:
+        raise InputError(f"--reading {text}: {READING_FORM}") from error
+    if len(parts) != 2 or not 0 < reading.dn < math.inf:
+        raise InputError(f"--reading {text}: {READING_FORM}")
+    return reading
+
+
+def scale_by_tracker(bench: Bench, readings: list[Reading], exposure_s: float) -> Scale:
+    """White by the median of the readings: the tracker got seen / wanted times what was asked for, so white is worth that more.
+
+    Raises InputError for a star that the bench does not have or cannot show whole, and for one over the tracker's full well.
+    """
+    detector = bench.config.tracker.detector
+    if exposure_s <= 0:
+        raise InputError(f"an exposure of {exposure_s:g} s; write --exposure S, as the tracker exposed")
+    ratios = []
+    for reading in readings:
+        rate = _rate_of(bench, reading.hip)
+        ratios.append(reading.dn * detector.gain_e_per_dn / (rate * exposure_s))
+    median = float(np.median(ratios))
+    return Scale(bench.flux_at_white_e_per_s * median, bench.flux_at_white_e_per_s, np.array(ratios))
+
+
+def _rate_of(bench: Bench, hip: int) -> float:
+    place = np.flatnonzero(bench.stars.hip == hip)
+    if not len(place):
+        raise InputError(f"--reading {hip}: the bench has no such star; take one of [sky] catalogue within faintest_v_mag")
+    rate = float(bench.stars.electrons_per_s[place[0]])
+    if rate * peak_share(bench.config.render.sprite_sigma_px) > bench.flux_at_white_e_per_s:
+        raise InputError(f"--reading {hip}: the star clips on the monitor; take a fainter one")
+    if rate < bench.faintest_shown_e_per_s():
+        raise InputError(f"--reading {hip}: the star is too faint for the monitor to show; take a brighter one")
+    return rate
+
+
+def with_flux_at_white(bench_file: Path, flux_at_white_e_per_s: float, output: Path) -> None:
+    """A copy of a bench file, comments and all, with the key set. Raises InputError where the copy would not say the same."""
+    if output.resolve().parent != bench_file.resolve().parent:
+        raise InputError(f"{output}: the bench file's paths are relative to it; write the copy beside {bench_file}")
+    key = "flux_at_white_e_per_s"
+    text = read_text(bench_file, "give the path of a bench file", MAX_TOML_BYTES)
+    text = with_key(text, "render", key, flux_at_white_e_per_s, instead_of=("brightest_v_mag",))
+    write_whole(output, text)
+    if read_config(output).render.flux_at_white_e_per_s != flux_at_white_e_per_s:
+        raise InputError(
+            f"{output}: the key could not be set in this file; write {key} = {flux_at_white_e_per_s!r} under [render] yourself"
+        )

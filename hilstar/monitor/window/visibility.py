@@ -1,0 +1,174 @@
+"""Whether an X11 window is seen: a thread with a connection of its own hears of it, so that no frame ever asks the server."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import select
+import threading
+from typing import Any, Self
+
+from hilstar.monitor.window.x11 import X11_LIBRARY, Survival
+
+# X.h
+VISIBILITY_CHANGES, STRUCTURE_CHANGES = 1 << 16, 1 << 17
+VISIBILITY_NOTIFY, DESTROY_NOTIFY, UNMAP_NOTIFY, MAP_NOTIFY = 15, 17, 18, 19
+COVERED = ("", "covered in part", "covered")  # by VisibilityNotify's state
+LOOK_AGAIN_S = 0.5  # at what tells of no change: the place of a window's parents, and the display's sleep
+Place = tuple[tuple[int, int], tuple[int, int]]  # corner and size, px of the whole screen
+
+
+class _VisibilityEvent(ctypes.Structure):
+    """XVisibilityEvent of Xlib, and the beginning of every other event."""
+
+    _fields_ = (
+        ("type", ctypes.c_int),
+        ("serial", ctypes.c_ulong),
+        ("send_event", ctypes.c_int),
+        ("display", ctypes.c_void_p),
+        ("window", ctypes.c_ulong),
+        ("state", ctypes.c_int),
+    )
+
+
+class _Event(ctypes.Union):
+    """XEvent of Xlib."""
+
+    _fields_ = (("visibility", _VisibilityEvent), ("pad", ctypes.c_long * 24))
+
+
+class Visibility:
+    """Watches one window; `hidden` says why it is not seen whole, "" where it is. It has to fill `place`, if that is given."""
+
+    def __init__(self, x11: Any, connection: int, window: int, place: Place | None) -> None:
+        self._x11, self._connection, self._window, self.place = x11, connection, window, place
+        self._covered = 0
+        self._mapped = self._there = True
+        self._asleep = _sleep_of(connection)
+        self.hidden = ""
+        self._stop, self._stopped = os.pipe()
+        x11.XSelectInput(connection, window, VISIBILITY_CHANGES | STRUCTURE_CHANGES)
+        x11.XSync(connection, 0)
+        self._thread = threading.Thread(target=self._run, name="hilstar-visibility", daemon=True)
+        self._thread.start()
+
+    @classmethod
+    def of(cls, window: int, place: Place | None, survival: Survival) -> Self | None:
+        """The watch of a window that has to fill `place` (None: that may be anywhere); None where there is no connection."""
+        try:
+            x11 = _library()
+        except (OSError, AttributeError):
+            return None
+        connection = x11.XOpenDisplay(None)
+        if not connection:
+            return None
+        survival.cover(connection)
+        return cls(x11, connection, window, place)
+
+    def _run(self) -> None:
+        descriptor = self._x11.XConnectionNumber(self._connection)
+        while self._there:
+            off_place = self._off_place() if self._mapped else ""
+            while self._x11.XPending(self._connection) > 0:
+                event = _Event()
+                self._x11.XNextEvent(self._connection, ctypes.byref(event))
+                self._take(event.visibility)
+            if self._there:
+                self.hidden = self._why(off_place)
+            ready = select.select([descriptor, self._stop], [], [], LOOK_AGAIN_S)[0]
+            # A connection with something to read and no event is at its end.
+            if self._stop in ready or (ready and self._x11.XPending(self._connection) <= 0 and _ended(descriptor)):
+                return
+
+    def _take(self, event: _VisibilityEvent) -> None:
+        if event.type == VISIBILITY_NOTIFY:
+            self._covered = event.state
+        elif event.type == DESTROY_NOTIFY:
+            self._there = False
+        elif event.type in {MAP_NOTIFY, UNMAP_NOTIFY}:
+            self._mapped = event.type == MAP_NOTIFY
+
+    def _why(self, off_place: str) -> str:
+        if not self._mapped:
+            return "not on the screen"
+        # What is off the screen is covered too, by X11's account.
+        return off_place or COVERED[self._covered] or ("on a display that sleeps" if self._asleep() else "")
+
+    def _off_place(self) -> str:
+        """Where the window is not: on its display, or wholly on the screen."""
+        root = self._x11.XDefaultRootWindow(self._connection)
+        size, screen = self._geometry(self._window), self._geometry(root)
+        x, y, child = ctypes.c_int(), ctypes.c_int(), ctypes.c_ulong()
+        pointers = (ctypes.byref(part) for part in (x, y, child))
+        if size is None or screen is None:
+            return ""
+        self._x11.XTranslateCoordinates(self._connection, self._window, root, 0, 0, *pointers)
+        corner = x.value, y.value
+        if self.place is not None:
+            return "" if (corner, size) == self.place else "moved off its display"
+        inside = all(at >= 0 and at + long <= end for at, long, end in zip(corner, size, screen, strict=True))
+        return "" if inside else "off the screen, in part or wholly"
+
+    def _geometry(self, drawable: int) -> tuple[int, int] | None:
+        root = ctypes.c_ulong()
+        x, y = ctypes.c_int(), ctypes.c_int()
+        width, height, border, depth = (ctypes.c_uint() for _ in range(4))
+        pointers = (ctypes.byref(part) for part in (root, x, y, width, height, border, depth))
+        if not self._x11.XGetGeometry(self._connection, drawable, *pointers):
+            return None
+        return width.value, height.value
+
+    def close(self) -> None:
+        """Stop watching."""
+        os.write(self._stopped, b"\0")
+        self._thread.join(LOOK_AGAIN_S)
+        if not self._thread.is_alive() and self._there:
+            self._x11.XCloseDisplay(self._connection)
+
+
+def _ended(descriptor: int) -> bool:
+    poll = select.poll()
+    poll.register(descriptor, 0)
+    return bool(poll.poll(0))  # asked for nothing, it still tells of an end
+
+
+def _sleep_of(connection: int) -> Any:
+    """Asks whether the display sleeps (DPMS); never where nobody can say."""
+    try:
+        library: Any = ctypes.CDLL("libXext.so.6")
+        library.DPMSCapable.argtypes = [ctypes.c_void_p]
+        library.DPMSInfo.argtypes = [ctypes.c_void_p] * 3
+        parts = (ctypes.byref(ctypes.c_int()) for _ in range(3))
+        # Asked for what is not there, Xlib says so on stderr.
+        if not _library().XQueryExtension(connection, b"DPMS", *parts) or not library.DPMSCapable(connection):
+            return bool
+    except (OSError, AttributeError):
+        return bool
+
+    def asleep() -> bool:
+        level, enabled = ctypes.c_ushort(), ctypes.c_ubyte()
+        known = library.DPMSInfo(connection, ctypes.byref(level), ctypes.byref(enabled))
+        return bool(known and enabled.value and level.value)
+
+    return asleep
+
+
+def _library() -> Any:
+    x11: Any = ctypes.CDLL(X11_LIBRARY)
+    pointer, number = ctypes.c_void_p, ctypes.c_ulong
+    for name, result, arguments in (
+        ("XOpenDisplay", pointer, [ctypes.c_char_p]),
+        ("XCloseDisplay", ctypes.c_int, [pointer]),
+        ("XConnectionNumber", ctypes.c_int, [pointer]),
+        ("XDefaultRootWindow", number, [pointer]),
+        ("XSelectInput", ctypes.c_int, [pointer, number, ctypes.c_long]),
+        ("XQueryExtension", ctypes.c_int, [pointer, ctypes.c_char_p, *[pointer] * 3]),
+        ("XPending", ctypes.c_int, [pointer]),
+        ("XNextEvent", ctypes.c_int, [pointer, pointer]),
+        ("XSync", ctypes.c_int, [pointer, ctypes.c_int]),
+        ("XGetGeometry", ctypes.c_int, [pointer, number, *[pointer] * 7]),
+        ("XTranslateCoordinates", ctypes.c_int, [pointer, number, number, ctypes.c_int, ctypes.c_int, *[pointer] * 3]),
+    ):
+        function = getattr(x11, name)
+        function.restype, function.argtypes = result, arguments
+    return x11

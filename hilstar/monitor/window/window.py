@@ -1,0 +1,316 @@
+"""The window on the monitor: full screen on the one chosen, or in a frame on the desk. The only user of glfw."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, Self
+
+import glfw
+
+from hilstar.errors import InputError, MachineError
+from hilstar.monitor.window.visibility import Visibility
+from hilstar.monitor.window.x11 import Survival, is_composited, sync_control
+
+TITLE = "hilstar"
+NO_DISPLAY = "no display to open a window on; set DISPLAY, or run with --headless"
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Display:
+    """A monitor of this machine as its system has it; `refresh_hz` is 0 where it does not say (Xvfb)."""
+
+    index: int
+    name: str
+    resolution_px: tuple[int, int]
+    refresh_hz: int
+    position_px: tuple[int, int]
+    size_mm: tuple[int, int]
+    scale: float
+
+    def line(self) -> str:
+        """The display for a person."""
+        width, height = self.resolution_px
+        refresh = f"{self.refresh_hz} Hz" if self.refresh_hz else "refresh not known"
+        return f"{self.index}: {self.name}, {width} x {height}, {refresh}, {self.size_mm[0]} x {self.size_mm[1]} mm"
+
+
+@dataclass(frozen=True, slots=True)
+class WindowSettings:
+    """`display` is an index or a part of a name, None for a window on the desk; `bits` are those wanted of each colour."""
+
+    resolution_px: tuple[int, int]
+    bits: int
+    display: int | str | None = None
+
+
+def displays() -> list[Display]:
+    """The monitors of this machine. Raises MachineError without a display."""
+    with _glfw():
+        return [_describe(index, monitor) for index, monitor in enumerate(glfw.get_monitors())]
+
+
+@contextlib.contextmanager
+def _glfw() -> Any:
+    _start()
+    try:
+        yield
+    finally:
+        glfw.terminate()
+
+
+def _start() -> None:
+    glfw.ERROR_REPORTING = "ignore"
+    if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")) or not glfw.init():
+        raise MachineError(NO_DISPLAY)
+
+
+def _describe(index: int, monitor: Any) -> Display:
+    mode = glfw.get_video_mode(monitor)
+    name = glfw.get_monitor_name(monitor)
+    return Display(
+        index=index,
+        name=name.decode() if isinstance(name, bytes) else str(name),
+        resolution_px=(int(mode.size.width), int(mode.size.height)),
+        refresh_hz=int(mode.refresh_rate),
+        position_px=_pair(glfw.get_monitor_pos(monitor)),
+        size_mm=_pair(glfw.get_monitor_physical_size(monitor)),
+        scale=float(glfw.get_monitor_content_scale(monitor)[0]),
+    )
+
+
+def _pair(values: Any) -> tuple[int, int]:
+    first, second = values
+    return int(first), int(second)
+
+
+class Window:
+    """A window whose GL context is current in the thread that opened it. Free it with `close`.
+
+    `lost` is true while its display is unplugged; `gone` says why the window is no more. Raises MachineError without a
+    display or GL, InputError for a display that is not there.
+    """
+
+    def __init__(self, settings: WindowSettings) -> None:
+        _start()
+        self.settings = settings
+        self.keys: deque[str] = deque(maxlen=64)
+        self._ramp: tuple[Any, Any] | None = None
+        self._changed = False  # a monitor came or went
+        self.lost = False
+        self.gone: str | None = None
+        self._survival: Survival | None = None
+        self._visibility: Visibility | None = None
+        self._minimised = False
+        try:
+            self._open()
+        except BaseException:
+            glfw.terminate()
+            raise
+
+    def _open(self) -> None:
+        settings = self.settings
+        self.display: Display | None = None
+        monitor = None
+        if settings.display is not None:
+            self.display, monitor = _find(settings.display)
+        for hint, value in (
+            (glfw.CONTEXT_VERSION_MAJOR, 3),
+            (glfw.CONTEXT_VERSION_MINOR, 3),
+            (glfw.OPENGL_PROFILE, glfw.OPENGL_CORE_PROFILE),
+            (glfw.RESIZABLE, False),
+            (glfw.AUTO_ICONIFY, False),
+            (glfw.SCALE_TO_MONITOR, False),
+            (glfw.SRGB_CAPABLE, False),
+            (glfw.RED_BITS, settings.bits),
+            (glfw.GREEN_BITS, settings.bits),
+            (glfw.BLUE_BITS, settings.bits),
+        ):
+            glfw.window_hint(hint, value)
+        width, height = settings.resolution_px if self.display is None else self.display.resolution_px
+        self._window = glfw.create_window(width, height, TITLE, monitor, None)
+        if not self._window:
+            raise MachineError("no window with OpenGL 3.3 can be had; install it: apt-get install libgl1 libgl1-mesa-dri")
+        glfw.make_context_current(self._window)
+        glfw.swap_interval(1)
+        glfw.set_input_mode(self._window, glfw.CURSOR, glfw.CURSOR_HIDDEN if monitor else glfw.CURSOR_NORMAL)
+        glfw.set_key_callback(self._window, self._on_key)
+        glfw.set_monitor_callback(self._on_monitor)
+        glfw.set_window_iconify_callback(self._window, self._on_iconify)
+        x_display: Any = glfw.get_x11_display
+        self._x_display = x_display() if glfw.get_platform() == glfw.PLATFORM_X11 else None
+        if self._x_display:
+            self._survival = Survival(self._on_end)
+            self._survival.cover(self._x_display)
+            window = glfw.get_x11_window(self._window)
+            self._visibility = Visibility.of(window, None if monitor is None else _place_of(monitor), self._survival)
+        self._sync = sync_control(self._x_display, glfw.get_glx_window(self._window) if self._x_display else None)
+        if monitor is not None:
+            self._set_identity_ramp(monitor)
+
+    def _set_identity_ramp(self, monitor: Any) -> None:
+        """The system's own correction would change what the calibration measured."""
+        ramp: Any = glfw.get_gamma_ramp(monitor)
+        size = 0 if ramp is None else len(ramp.red)
+        if not size:
+            return
+        self._ramp = (monitor, ([*ramp.red], [*ramp.green], [*ramp.blue]))
+        straight = [value / (size - 1) for value in range(size)]
+        identity: Any = (straight, straight, straight)
+        glfw.set_gamma_ramp(monitor, identity)
+
+    def _on_iconify(self, window: Any, minimised: int) -> None:
+        self._minimised = bool(minimised)
+
+    @property
+    def hidden(self) -> str:
+        """Why the window is not seen as it is drawn: minimised, covered, off the screen; "" where it is, or nobody can say."""
+        if self.lost:
+            return "without its display"
+        if self._minimised:
+            return "minimised"
+        return "" if self._visibility is None else self._visibility.hidden
+
+    def _on_end(self, why: str) -> None:
+        if self.gone is None:
+            self.gone = why
+
+    def _on_monitor(self, monitor: Any, event: int) -> None:
+        self._changed = True
+
+    def _follow_display(self) -> None:
+        """A display that was unplugged leaves a window on no monitor; once it is back the window fills it again."""
+        self._changed = False
+        display = self.display
+        if display is None:
+            return
+        on_it = bool(glfw.get_window_monitor(self._window))
+        monitor = next((m for m in glfw.get_monitors() if _describe(0, m).name == display.name), None)
+        if monitor is None and not self.lost:
+            self.lost, self._ramp = True, None
+            log.warning("the display %s is gone; frames go on, and it is taken up when it returns", display.name)
+        elif monitor is not None and (self.lost or not on_it):
+            width, height = display.resolution_px
+            glfw.set_window_monitor(self._window, monitor, 0, 0, width, height, display.refresh_hz or glfw.DONT_CARE)
+            self._set_identity_ramp(monitor)
+            if self._visibility is not None:
+                self._visibility.place = _place_of(monitor)
+            self.lost = False
+            log.warning("the display %s is back", display.name)
+
+    def _on_key(self, window: Any, key: int, scancode: int, action: int, mods: int) -> None:
+        if action != glfw.PRESS:
+            return
+        name = {glfw.KEY_ESCAPE: "escape", glfw.KEY_SPACE: "space", glfw.KEY_F1: "f1"}.get(key)
+        if name is None and 0 < key < 128:
+            name = chr(key).lower()
+        if name is not None:
+            self.keys.append(name)
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """The framebuffer's size."""
+        width, height = glfw.get_framebuffer_size(self._window)
+        return int(width), int(height)
+
+    @property
+    def depth_bits(self) -> int:
+        """Bits of a colour on the screen: the least of the three that its mode has."""
+        monitor = glfw.get_window_monitor(self._window) or glfw.get_primary_monitor()
+        bits = glfw.get_video_mode(monitor).bits
+        return int(min(bits.red, bits.green, bits.blue))
+
+    @property
+    def scaled(self) -> bool:
+        """True where a pixel of the window is not one of the screen."""
+        return tuple(glfw.get_window_size(self._window)) != self.size_px
+
+    @property
+    def closing(self) -> bool:
+        """True once somebody closed it, or it is gone."""
+        return self.gone is not None or bool(glfw.window_should_close(self._window))
+
+    @property
+    def composited(self) -> bool:
+        """True where a compositing manager is known to run."""
+        return is_composited(self._x_display)
+
+    @property
+    def mirrored(self) -> str | None:
+        """The name of another display that shows the same part of the desktop, where there is one."""
+        if self.display is None:
+            return None
+        others = [_describe(index, monitor) for index, monitor in enumerate(glfw.get_monitors())]
+        same = (d.name for d in others if d.name != self.display.name and d.position_px == self.display.position_px)
+        return next(same, None)
+
+    @property
+    def timestamp_source(self) -> str:
+        """Where the times of `swap` come from."""
+        return "after-swap clock" if self._sync is None else "GLX_OML_sync_control"
+
+    def swap(self, wait: Callable[[], None] = lambda: None) -> int:
+        """Show what was drawn; host time, ns, at which that was done: the driver's, else that just after.
+
+        `wait` returns once the swap is done, where `glfwSwapBuffers` itself may come back before.
+        """
+        if self.gone is None:
+            glfw.swap_buffers(self._window)
+            wait()
+        now_ns = time.monotonic_ns()
+        if self._sync is not None and self.gone is None:
+            swap_ns = self._sync.swap_ns()
+            if swap_ns is None:
+                log.warning("GLX_OML_sync_control gives no time; the host's clock after the swap is used")
+                self._sync = None
+            else:
+                now_ns = swap_ns
+        return now_ns
+
+    def look_at_events(self) -> None:
+        """Take in keys, and monitors that come and go."""
+        if self.gone is None:
+            glfw.poll_events()
+        if self._changed and self.gone is None:
+            self._follow_display()
+
+    def close(self) -> None:
+        """Give the monitor its gamma ramp back, and close."""
+        if self.gone is not None:  # nobody is there who could be told
+            return
+        if self._visibility is not None:
+            self._visibility.close()
+        if self._ramp is not None:
+            monitor, ramp = self._ramp
+            self._ramp = None
+            with contextlib.suppress(glfw.GLFWError):
+                glfw.set_gamma_ramp(monitor, ramp)
+        glfw.terminate()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+
+def _place_of(monitor: Any) -> tuple[tuple[int, int], tuple[int, int]]:
+    display = _describe(0, monitor)
+    return display.position_px, display.resolution_px
+
+
+def _find(wanted: int | str) -> tuple[Display, Any]:
+    monitors = glfw.get_monitors()
+    described = [_describe(index, monitor) for index, monitor in enumerate(monitors)]
+    for display, monitor in zip(described, monitors, strict=True):
+        if wanted == display.index or (isinstance(wanted, str) and wanted.lower() in display.name.lower()):
+            return display, monitor
+    known = "; ".join(display.line() for display in described)
+    raise InputError(f"[monitor] display = {wanted!r}: there is none; write the index or name of one of {known}")

@@ -1,0 +1,121 @@
+"""What only X11 and GLX can say, through ctypes: when a swap reached the screen, whether something composes windows, and
+that the server or the window is gone.
+
+Each answer is None or False where the system has no such thing: Wayland, or a driver without the extension.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import time
+from collections.abc import Callable
+from typing import Any
+
+from hilstar.units import NS_PER_US
+
+GL_LIBRARY, X11_LIBRARY = "libGL.so.1", "libX11.so.6"
+SYNC_EXTENSION = b"GLX_OML_sync_control"
+# A UST that is not of this host's monotonic clock, or of another swap, is not to be believed.
+LARGEST_UST_AGE_NS = 1_000_000_000
+BAD_WINDOW, BAD_DRAWABLE, FIRST_EXTENSION_ERROR = 3, 9, 128  # X.h; those of extensions are GLX's here
+SERVER_GONE = "the X server is gone, or has closed the window's connection"
+WINDOW_GONE = "the window is gone: another program has closed it"
+
+
+class _ErrorEvent(ctypes.Structure):
+    """XErrorEvent of Xlib."""
+
+    _fields_ = (
+        ("type", ctypes.c_int),
+        ("display", ctypes.c_void_p),
+        ("resource", ctypes.c_ulong),
+        ("serial", ctypes.c_ulong),
+        ("error", ctypes.c_ubyte),
+        ("request", ctypes.c_ubyte),
+        ("minor", ctypes.c_ubyte),
+    )
+
+
+_IoHandler = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p)
+_ExitHandler = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)
+_ErrorHandler = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.POINTER(_ErrorEvent))
+
+
+class Survival:
+    """Xlib ends the process where the server or a window goes away; while this is kept, it calls `on_end(why)` instead."""
+
+    def __init__(self, on_end: Callable[[str], None]) -> None:
+        def io_error(display: int) -> int:
+            on_end(SERVER_GONE)
+            return 0
+
+        def error(display: int, event: Any) -> int:
+            code = event.contents.error
+            if code in {BAD_WINDOW, BAD_DRAWABLE} or code >= FIRST_EXTENSION_ERROR:
+                on_end(WINDOW_GONE)
+            return 0
+
+        self._library: Any = ctypes.CDLL(X11_LIBRARY)
+        self._handlers = _IoHandler(io_error), _ErrorHandler(error), _ExitHandler(lambda display, data: None)
+        self._library.XSetIOErrorHandler.argtypes, self._library.XSetErrorHandler.argtypes = [_IoHandler], [_ErrorHandler]
+        self._library.XSetIOErrorHandler(self._handlers[0])
+        self._library.XSetErrorHandler(self._handlers[1])
+
+    def cover(self, x_display: int) -> None:
+        """Outlive the end of this connection."""
+        if hasattr(self._library, "XSetIOErrorExitHandler"):  # libX11 1.7 of 2020; before it the process ends all the same
+            self._library.XSetIOErrorExitHandler.argtypes = [ctypes.c_void_p, _ExitHandler, ctypes.c_void_p]
+            self._library.XSetIOErrorExitHandler(x_display, self._handlers[2], None)
+
+
+class SyncControl:
+    """GLX_OML_sync_control of one window: the time at which its last swap was scanned out."""
+
+    def __init__(self, library: Any, x_display: int, drawable: int) -> None:
+        address = library.glXGetProcAddress
+        address.restype, address.argtypes = ctypes.c_void_p, [ctypes.c_char_p]
+        function = address(b"glXWaitForSbcOML")
+        if not function:
+            raise OSError("glXWaitForSbcOML is not there")
+        counter = ctypes.POINTER(ctypes.c_int64)
+        prototype = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_ulong, ctypes.c_int64, counter, counter, counter)
+        self._wait_for_swap = prototype(function)
+        self._window = (x_display, drawable)
+
+    def swap_ns(self) -> int | None:
+        """Host time (monotonic) at which the last swap was done, once it is; None where the driver does not say."""
+        ust, msc, sbc = (ctypes.c_int64() for _ in range(3))
+        if not self._wait_for_swap(*self._window, 0, ctypes.byref(ust), ctypes.byref(msc), ctypes.byref(sbc)):
+            return None
+        swap_ns = ust.value * NS_PER_US
+        return swap_ns if 0 <= time.monotonic_ns() - swap_ns < LARGEST_UST_AGE_NS else None
+
+
+def sync_control(x_display: int | None, drawable: int | None) -> SyncControl | None:
+    """The sync control of a GLX window, None where its driver has none."""
+    if not x_display or not drawable:
+        return None
+    try:
+        library: Any = ctypes.CDLL(GL_LIBRARY)
+        library.glXQueryExtensionsString.restype = ctypes.c_char_p
+        library.glXQueryExtensionsString.argtypes = [ctypes.c_void_p, ctypes.c_int]
+        extensions = library.glXQueryExtensionsString(x_display, 0) or b""
+        return SyncControl(library, x_display, drawable) if SYNC_EXTENSION in extensions.split() else None
+    except (OSError, AttributeError):
+        return None
+
+
+def is_composited(x_display: int | None) -> bool:
+    """True where a compositing manager owns the screen (ICCCM selection _NET_WM_CM_S0); it may delay frames."""
+    if not x_display:
+        return False
+    try:
+        library: Any = ctypes.CDLL(X11_LIBRARY)
+        library.XInternAtom.restype = ctypes.c_ulong
+        library.XInternAtom.argtypes = [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_int]
+        library.XGetSelectionOwner.restype = ctypes.c_ulong
+        library.XGetSelectionOwner.argtypes = [ctypes.c_void_p, ctypes.c_ulong]
+        atom = library.XInternAtom(x_display, b"_NET_WM_CM_S0", 1)
+        return bool(atom and library.XGetSelectionOwner(x_display, atom))
+    except (OSError, AttributeError):
+        return False

@@ -1,0 +1,1 @@
+"""A run: frames paced, drawn and recorded, live, in lockstep or of a log."""

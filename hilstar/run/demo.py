@@ -1,0 +1,117 @@
+"""The main job in one command: a sender process streams a slew, and this process shows it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from hilstar.arrays import FloatArray
+from hilstar.attitude.wire.packet import AttitudeSample
+from hilstar.attitude.wire.zmq_links import ZmqReceiver
+from hilstar.bench.build import load
+from hilstar.bench.frame_files import write_codes_png, write_preview_png
+from hilstar.files import make_directory
+from hilstar.monitor.response import Codes
+from hilstar.process.interrupts import caught
+from hilstar.resources import resource_path
+from hilstar.rotation import from_radec_roll_deg, propagate, rate_between_rad_s, slerp
+from hilstar.run.loop import FrameSink, Limit, Shown
+from hilstar.run.serve import serve
+from hilstar.units import ARCSEC_PER_RAD, NS_PER_S
+
+SEND_HZ = 100.0
+SLEW_LOG = "slew.jsonl"
+# From Orion's belt to Sirius and on to Procyon, with the roll that a real manoeuvre drags along.
+WAYPOINTS_DEG = ((84.057, -1.2, 0.0), (101.287, -16.716, 25.0), (114.825, 5.225, -10.0))
+SETTLE_FRACTION = 0.15  # of each leg, at rest at its end
+JITTER_ARCSEC = (1.5, 1.5, 6.0)  # 1 sigma about cam x, y, z: a good wheel-controlled satellite
+JITTER_SECONDS = 0.4  # its correlation time
+
+
+@dataclass(frozen=True, slots=True)
+class Demo:
+    """What the demo did: its summary and the pictures that it wrote."""
+
+    summary: dict[str, Any]
+    pictures: list[Path]
+
+
+def slew_samples(duration_s: float, rng: np.random.Generator) -> list[AttitudeSample]:
+    """A rest-to-rest slew through WAYPOINTS_DEG at SEND_HZ, quintic in angle, with correlated pointing jitter."""
+    count = round(duration_s * SEND_HZ) + 1
+    times_s = np.arange(count) / SEND_HZ
+    jitter = _jitter_rad(count, rng)
+    points = [from_radec_roll_deg(*waypoint) for waypoint in WAYPOINTS_DEG]
+    attitudes = [propagate(_on_path(points, t / duration_s), jitter[k], -1.0) for k, t in enumerate(times_s)]
+    samples = []
+    for k, q in enumerate(attitudes):
+        before, after = attitudes[max(k - 1, 0)], attitudes[min(k + 1, count - 1)]
+        rate = rate_between_rad_s(before, after, (min(k + 1, count - 1) - max(k - 1, 0)) / SEND_HZ)
+        samples.append(AttitudeSample(round(times_s[k] * NS_PER_S), q, rate, k))
+    return samples
+
+
+def _on_path(points: list[FloatArray], progress: float) -> FloatArray:
+    legs = len(points) - 1
+    leg = min(int(progress * legs), legs - 1)
+    s = min((progress * legs - leg) / (1 - SETTLE_FRACTION), 1.0)
+    return slerp(points[leg], points[leg + 1], s**3 * (10 - 15 * s + 6 * s * s))
+
+
+def _jitter_rad(count: int, rng: np.random.Generator) -> FloatArray:
+    """First-order Gauss-Markov noise (n, 3) about cam axes."""
+    keep = np.exp(-1.0 / (SEND_HZ * JITTER_SECONDS))
+    noise = rng.normal(size=(count, 3)) * np.array(JITTER_ARCSEC) / ARCSEC_PER_RAD
+    for k in range(1, count):
+        noise[k] = keep * noise[k - 1] + np.sqrt(1 - keep**2) * noise[k]
+    return np.asarray(noise)
+
+
+def write_log(path: Path, samples: list[AttitudeSample]) -> None:
+    """JSON lines that `hilstar send` and `hilstar replay` read."""
+    with path.open("wb") as file:
+        for sample in samples:
+            rate = None if sample.rate_cam_rad_s is None else sample.rate_cam_rad_s.tolist()
+            line = {"t_ns": sample.t_ns, "q": sample.q_icrs_to_cam.tolist(), "rate": rate, "sequence": sample.sequence}
+            file.write(msgspec.json.encode(line) + b"\n")
+
+
+def run_demo(directory: Path, duration_s: float, rng: np.random.Generator, watch: FrameSink) -> Demo:
+    """Stream a slew from a process of its own through a loopback socket, serve it, and write a few frames.
+
+    `watch` sees every frame. Raises InputError or MachineError.
+    """
+    make_directory(directory)
+    log_path = directory / SLEW_LOG
+    write_log(log_path, slew_samples(duration_s + 1.0, rng))
+    with load(resource_path("configs", "demo.toml")) as bench, ZmqReceiver(bench.config.attitude.endpoint, bind=True) as link:
+        frame_count = round(duration_s * bench.config.monitor.refresh_hz)
+        wanted = {int(frame_count * part) for part in (0.0625, 0.25, 0.5, 0.9375)}
+        kept: dict[int, Codes] = {}
+
+        def sink(shown: Shown) -> None:
+            if wanted and shown.number >= min(wanted):
+                wanted.remove(min(wanted))
+                kept[shown.number] = shown.drawn.levels.copy()
+            watch(shown)
+
+        command = [sys.executable, "-m", "hilstar", "send", str(log_path), "--to", link.endpoint, "--connect"]
+        with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as sender:
+            try:
+                link.wait_for_message(timeout_ms=20_000)
+                summary = serve(bench, link, Limit(slots=frame_count), sink)
+            finally:
+                sender.terminate()
+        pictures = []
+        for number, codes in kept.items() if caught() is None else ():  # whoever stopped it waits for no pictures
+            exact, preview = (directory / f"frame_{number:04d}_{kind}.png" for kind in ("codes", "preview"))
+            write_codes_png(exact, codes, bench.config.monitor.bits)
+            write_preview_png(preview, codes)
+            pictures += [exact, preview]
+    return Demo(summary, pictures)

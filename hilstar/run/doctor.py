@@ -1,0 +1,101 @@
+"""What this machine has and lacks: GL, displays, links, files."""
+
+from __future__ import annotations
+
+import platform
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from hilstar.attitude.wire.serial_link import serial_ports
+from hilstar.attitude.wire.zmq_links import ZmqReceiver, ZmqSender, zmq_version
+from hilstar.errors import HilstarError, MachineError
+from hilstar.monitor.window.window import displays
+from hilstar.render.renderer import create_context
+from hilstar.resources import resource_path
+from hilstar.sky.catalog import load_catalog
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One thing that hilstar uses; `required` ones decide the verdict."""
+
+    name: str
+    ok: bool
+    detail: str
+    required: bool = True
+
+
+def examine() -> dict[str, Any]:
+    """The JSON object of `hilstar doctor`: ok, and the checks."""
+    checks = [_check(name, look) for name, look in LOOKS.items()]
+    checks += [_displays(), _serial()]
+    return {"ok": all(check.ok for check in checks if check.required), "checks": [asdict(check) for check in checks]}
+
+
+def _check(name: str, look: Callable[[], str]) -> Check:
+    try:
+        return Check(name, True, look())
+    except (HilstarError, OSError) as error:
+        return Check(name, False, str(error))
+
+
+def _python() -> str:
+    return f"Python {platform.python_version()}, {sys.executable}"
+
+
+def _gl() -> str:
+    ctx = create_context()
+    try:
+        info = ctx.info
+        return f"{info['GL_RENDERER']}, OpenGL {info['GL_VERSION']}, points up to {info['GL_POINT_SIZE_RANGE'][1]:g} px"
+    finally:
+        ctx.release()
+
+
+def _zeromq() -> str:
+    """One message through a real loopback socket."""
+    with ZmqSender("tcp://127.0.0.1:*") as sender, ZmqReceiver(sender.endpoint) as receiver:
+        receiver.receive(0)  # a receiver connects when it is first read
+        if not sender.wait_for_listener(2.0):
+            raise MachineError("a loopback connection does not come up; allow TCP on 127.0.0.1")
+        begin = time.perf_counter()
+        sender.put(b"ping")
+        if not receiver.receive(2000):
+            raise MachineError("a loopback message does not arrive; allow TCP on 127.0.0.1")
+        return f"ZeroMQ {zmq_version()}, loopback message in {(time.perf_counter() - begin) * 1e3:.2f} ms"
+
+
+def _catalogue() -> str:
+    begin = time.perf_counter()
+    catalog = load_catalog()
+    return f"Hipparcos, {len(catalog)} of {catalog.rows_read} stars, loaded in {(time.perf_counter() - begin) * 1e3:.0f} ms"
+
+
+def _files() -> str:
+    names = [resource_path("shaders", "splat.frag"), resource_path("configs", "demo.toml")]
+    return ", ".join(str(path) for path in names)
+
+
+def _displays() -> Check:
+    try:
+        found = displays()
+    except MachineError as error:
+        return Check("display", False, str(error), required=False)
+    return Check("display", bool(found), "; ".join(display.line() for display in found) or "none", required=False)
+
+
+def _serial() -> Check:
+    ports = serial_ports()
+    return Check("serial", bool(ports), ", ".join(ports) or "no serial port", required=False)
+
+
+LOOKS: dict[str, Callable[[], str]] = {
+    "python": _python,
+    "opengl": _gl,
+    "zeromq": _zeromq,
+    "catalogue": _catalogue,
+    "files": _files,
+}

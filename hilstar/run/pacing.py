@@ -1,0 +1,85 @@
+"""Waiting for a moment of the host's clock, and knowing when a screen swaps next."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections import deque
+
+from hilstar.units import NS_PER_MS, NS_PER_S
+
+LONGEST_WAIT_S = 3600.0  # the platform's own limit is some centuries; a wait is begun anew
+# An event wakes up to 0.1 ms late, and the thread then waits for Python's lock: the last of a wait is slept without either.
+COARSE_NS = round(0.7 * NS_PER_MS)
+
+
+def wait_until(due_ns: int, stop: threading.Event) -> bool:
+    """Wait until `time.monotonic_ns()` reaches `due_ns`; True when stopped before."""
+    while (wait_ns := due_ns - time.monotonic_ns() - COARSE_NS) > 0:
+        if stop.wait(min(wait_ns / NS_PER_S, LONGEST_WAIT_S)):
+            return True
+    if (rest_ns := due_ns - time.monotonic_ns()) > 0:
+        time.sleep(rest_ns / NS_PER_S)
+    return stop.is_set()
+
+
+class SwapClock:
+    """The grid of moments at which a screen swaps: a phase and a period, kept on real time stamps.
+
+    A second-order loop (Gardner, Phaselock Techniques, 2005): each swap pulls the phase by PHASE_SHARE of its error and the
+    period by PERIOD_SHARE of it, damping 0.79; a swap that came whole periods late counts so many. With `paced_by_screen`
+    false the grid is this program's own, and stamps do not move it.
+    """
+
+    PHASE_SHARE = 0.1
+    PERIOD_SHARE = 0.004
+
+    def __init__(self, first_ns: int, period_ns: float, paced_by_screen: bool) -> None:
+        self.period_ns = period_ns
+        self.paced_by_screen = paced_by_screen
+        self._phase_ns = float(first_ns)
+
+    def update(self, swap_ns: int) -> None:
+        """Take in when a swap was done."""
+        if not self.paced_by_screen:
+            return
+        steps = round((swap_ns - self._phase_ns) / self.period_ns)
+        if steps < 1:  # a swap that did not wait says nothing of the grid
+            return
+        error_ns = swap_ns - self._phase_ns - steps * self.period_ns
+        self._phase_ns += steps * self.period_ns + self.PHASE_SHARE * error_ns
+        self.period_ns += self.PERIOD_SHARE * error_ns / steps
+
+    def next_after(self, host_ns: float) -> int:
+        """The first moment of the grid at or after `host_ns`."""
+        steps = math.ceil((host_ns - self._phase_ns) / self.period_ns)
+        return round(self._phase_ns + steps * self.period_ns)
+
+
+class DrawBudget:
+    """How long before its swap a frame is begun: as late as recent frames allow, so that its attitude is fresh."""
+
+    FRAMES = 120
+    SLOW = 3  # the third slowest counts: two outliers in two seconds are late rather than all others early
+    GUARD_NS = 1.0 * NS_PER_MS
+
+    def __init__(self, period_ns: float) -> None:
+        self._period_ns = period_ns
+        self._costs_ns: deque[int] = deque(maxlen=self.FRAMES)
+
+    def add(self, cost_ns: int) -> None:
+        """Take in how long a frame took until it could be swapped."""
+        self._costs_ns.append(cost_ns)
+
+    @property
+    def least_ns(self) -> float:
+        """What hardly any frame undercuts: with less than this left a swap is not to be reached."""
+        return min(self._costs_ns, default=0)
+
+    @property
+    def ns(self) -> float:
+        """What all but two of the last frames took, and a guard; a whole period at most, and until there are frames enough."""
+        if len(self._costs_ns) < self.FRAMES // 4:
+            return self._period_ns
+        return min(sorted(self._costs_ns)[-self.SLOW] + self.GUARD_NS, self._period_ns)

@@ -1,0 +1,1 @@
+"""What a run leaves behind: its ledger, its frames as files, its report."""

@@ -1,0 +1,318 @@
+"""The ledger of a run: every packet as received and every frame as drawn, in an MCAP file that survives a kill.
+
+A thread of its own writes a chunk five times a second, whole and with its CRC, so that no disk stops a frame. Of a flood the
+first are kept whole and the others counted by the second. On a disk that fills frames go first and packets last; one that
+fails is tried again, and never ends the display.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import re
+import threading
+import time
+import uuid
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import msgspec
+
+from hilstar.attitude.logs.mcap_log import ATTITUDE_TOPIC_OF_RUN, attitude_message, log_time_ns, refused_message
+from hilstar.attitude.logs.mcap_reader import RUN_METADATA, part_path
+from hilstar.attitude.logs.mcap_writer import McapWriter, Topic
+from hilstar.attitude.wire.packet import AttitudeSample, Refusal
+from hilstar.bench.build import Bench
+from hilstar.errors import InputError, printable
+from hilstar.files import NewFile
+from hilstar.notices import Notice, Notices
+from hilstar.process.interrupts import caught
+from hilstar.run.record.backlog import Backlog, Entry, Kind, Sieve
+from hilstar.run.record.records import (
+    COUNT_TOPIC,
+    EVENT_TOPIC,
+    FRAME_TOPIC,
+    PROCESS_TOPIC,
+    CountRecord,
+    EventRecord,
+    FrameRecord,
+    ProcessProbe,
+    ProcessRecord,
+    schema_of,
+)
+
+NO_ROOM = "no room"  # the reason of what was lost
+FLUSH_S = 0.2
+EACH_S = 1.0  # counts, the process, the disk
+MAX_CHUNK_BYTES = 1_000_000
+MAX_RAW_BYTES = 1024  # of a packet; no kind of packet is as long
+MAX_DETAIL_CHARACTERS = 200
+DISK_WAITS_S, STOPPED_DISK_WAITS_S = 20.0, 0.4  # for a disk that stands still at the end, without and with a signal
+STALLED_S = 5.0  # without a turn of the writer
+LOW_SHARE, WELL_SHARE = 0.10, 0.12  # of the disk
+FRAMES_RESERVE_BYTES, FRAMES_RESERVE_SHARE = 64_000_000, 0.02  # left to packets, the smaller of the two
+SPLIT_FORM = "write a size or a time, such as 1GB, 200MB, 1h or 30min; 1 MB or 10 s at the least"
+UNITS = {"kB": 1e3, "MB": 1e6, "GB": 1e9, "s": 1.0, "min": 60.0, "h": 3600.0}
+
+
+@dataclass(frozen=True, slots=True)
+class Split:
+    """When a ledger goes on in another file."""
+
+    bytes: float = math.inf
+    seconds: float = math.inf
+
+
+NO_SPLIT = Split()
+
+
+def parse_split(text: str | None) -> Split:
+    """The split of "1GB" or "1h". Raises InputError."""
+    if text is None:
+        return NO_SPLIT
+    match = re.fullmatch(r"(\d{1,9}(?:\.\d{1,9})?)\s*(kB|MB|GB|s|min|h)", text.strip())
+    value = float(match[1]) * UNITS[match[2]] if match else 0.0
+    if match is None or value < (1e6 if match[2].endswith("B") else 10):
+        raise InputError(f"--ledger-split {text}: {SPLIT_FORM}")
+    return Split(bytes=value) if match[2].endswith("B") else Split(seconds=value)
+
+
+class Ledger:
+    """Writes a run's MCAP file. Raises InputError where it cannot be begun."""
+
+    def __init__(
+        self,
+        path: Path,
+        bench: Bench,
+        notices: Notices | None = None,
+        overwrite: bool = False,
+        split: Split = NO_SPLIT,
+    ) -> None:
+        self.path = path
+        self.failure: str | None = None
+        self._notices = Notices() if notices is None else notices
+        self._overwrite, self._split = overwrite, split
+        self._head = _head_of(bench) | {"run_id": uuid.uuid4().hex}
+        self._backlog, self._sieve = Backlog(), Sieve()
+        self._lost = self._counted = 0
+        self._thin = False
+        self._part = 0
+        self._file, self._writer = self._begin(path)
+        self._begun_s = self._alive_s = time.monotonic()
+        self._each_s = 0.0
+        self._probe = ProcessProbe()
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="hilstar-ledger", daemon=True)
+        self._thread.start()
+
+    def _begin(self, path: Path) -> tuple[NewFile, McapWriter]:
+        """A file with its head. Raises InputError."""
+        file = NewFile(path, self._overwrite)
+        try:
+            writer = McapWriter(file.fd, TOPICS, RUN_METADATA, self._head | {"part": str(self._part)})
+            file.commit()
+        except OSError as error:
+            file.discard()
+            raise InputError(f"{path}: cannot be written ({error.strerror}); choose another place for the ledger") from error
+        return file, writer
+
+    # What a run hands in, from whichever thread
+
+    def packet(self, host_ns: int, raw: bytes, sample: AttitudeSample | None, refusal: Refusal | None) -> None:
+        """Keep a packet; see `attitude.clock.receiver.Watch`."""
+        if refusal is None and sample is None:
+            refusal = Refusal("format", "")
+        if not self._sieve.keeps("packet", "accepted" if refusal is None else refusal.reason, host_ns):
+            return
+        sequence = 0 if sample is None else sample.sequence
+        content = (raw[:MAX_RAW_BYTES], sample, refusal)
+        self._backlog.put(Entry("packet", host_ns, sequence, content, min(len(raw), MAX_RAW_BYTES)))
+
+    def frame(self, record: FrameRecord) -> None:
+        """Keep a frame."""
+        self._backlog.put(Entry("frame", record.swap_ns, record.frame, record))
+        if time.monotonic() - self._alive_s > STALLED_S:
+            self._notices.begin(
+                "ledger-stalled", f"{self.path}: the disk has taken nothing for {STALLED_S:g} s; the display goes on"
+            )
+
+    def notice(self, notice: Notice) -> None:
+        """Keep an event of the run."""
+        if self._sieve.keeps("event", notice.kind, notice.host_ns):
+            record = EventRecord(host_ns=notice.host_ns, kind=notice.kind, detail=notice.detail)
+            self._backlog.put(Entry("event", notice.host_ns, 0, record))
+
+    # The writer's thread
+
+    def _run(self) -> None:
+        while not self._closing.wait(FLUSH_S):
+            self._turn(last=False)
+        self._turn(last=True)
+        with contextlib.suppress(OSError):
+            self._file.close()
+
+    def _turn(self, last: bool) -> None:
+        try:
+            for entry in self._backlog.take():
+                self._take(entry)
+            now_s = time.monotonic()
+            if last or now_s - self._each_s >= EACH_S:
+                self._each_s = now_s
+                self._each_second()
+            self._flush()
+            if last:
+                self._writer.finish()
+            elif self._writer.size_bytes >= self._split.bytes or now_s - self._begun_s >= self._split.seconds:
+                self._go_on_in_another()
+        except Exception as error:  # whatever it is, it ends neither the ledger nor the run
+            self._failed(error)
+            if last:
+                self._lose("packet", self._writer.drop())
+        self._alive_s = time.monotonic()
+        self._notices.end("ledger-stalled", "ledger-back", f"{self.path}: the disk takes the ledger again")
+
+    def _take(self, entry: Entry) -> None:
+        if entry.kind == "frame" and self._thin:
+            self._lose("frame", 1)
+            return
+        data = _packet_message(entry.time_ns, *entry.content) if entry.kind == "packet" else msgspec.json.encode(entry.content)
+        self._add(entry.kind, entry.time_ns, data, entry.sequence)
+
+    def _add(self, key: str, time_ns: int, data: bytes, sequence: int = 0) -> None:
+        self._writer.add(key, log_time_ns(time_ns), data, sequence)
+        if self._writer.pending_bytes > MAX_CHUNK_BYTES:
+            self._flush()
+
+    def _each_second(self) -> None:
+        now_ns = time.monotonic_ns()
+        dropped, self._backlog.dropped = self._backlog.dropped, type(self._backlog.dropped)()
+        for kind, number in dropped.items():
+            self._lose(kind, number)
+        for kind, reason, number in self._sieve.counted():
+            self._counted += 0 if reason == NO_ROOM else number
+            record = CountRecord(host_ns=now_ns, kind=kind, reason=reason, count=number)
+            self._add("count", now_ns, msgspec.json.encode(record))
+        process = self._probe.record()
+        if process is not None:
+            self._add("process", now_ns, msgspec.json.encode(process))
+        self._look_at_disk()
+
+    def _lose(self, kind: Kind | str, number: int) -> None:
+        """So many were lost: there was no room for them."""
+        self._lost += number
+        self._sieve.count("frame" if kind == "frame" else "packet" if kind == "packet" else "event", NO_ROOM, number)
+
+    def _look_at_disk(self) -> None:
+        disk = os.fstatvfs(self._file.fd)
+        free, total = disk.f_bavail * disk.f_frsize, disk.f_blocks * disk.f_frsize
+        if not total:
+            return
+        left = f"{self.path}: {free / 1e6:.0f} MB, {free / total:.0%} of the disk, are left"
+        if free < LOW_SHARE * total:
+            self._notices.begin("disk-low", left)
+        elif free > WELL_SHARE * total:
+            self._notices.end("disk-low", "disk-well", left)
+        self._thin = free < min(FRAMES_RESERVE_BYTES, FRAMES_RESERVE_SHARE * total)
+        if self._thin:
+            self._notices.begin("ledger-thin", f"{left}: frames are not kept any more, packets are")
+        else:
+            self._notices.end("ledger-thin", "ledger-whole", f"{left}: frames are kept again")
+
+    def _flush(self) -> None:
+        """Write the chunk; where it has no room, without its frames."""
+        try:
+            self._writer.flush()
+        except OSError:
+            self._lose("frame", self._writer.drop("frame"))
+            try:
+                self._writer.flush()
+            except OSError as error:
+                self._failed(error)
+                if self._writer.pending_bytes > MAX_CHUNK_BYTES:
+                    self._lose("packet", self._writer.drop())
+                return
+        self._notices.end("ledger-failed", "ledger-back", f"{self.path}: the ledger is written again")
+
+    def _failed(self, error: Exception) -> None:
+        self.failure = str(getattr(error, "strerror", None) or f"{type(error).__name__} {error}".strip())
+        self._notices.begin("ledger-failed", f"{self.path}: cannot be written ({self.failure}); the display goes on")
+
+    def _go_on_in_another(self) -> None:
+        """Finish this file, once the next one is there."""
+        self._part += 1
+        try:
+            file, writer = self._begin(part_path(self.path, self._part))
+        except InputError as error:
+            self._part -= 1
+            self._begun_s = time.monotonic()  # and not again at each turn
+            self._notices.tell("ledger-split-failed", f"{error}; the ledger goes on in the file that it has")
+            return
+        try:
+            self._writer.finish()
+            self._file.close()
+        finally:
+            self._file, self._writer, self._begun_s = file, writer, time.monotonic()
+
+    # The end
+
+    def close(self) -> None:
+        """Write what waits, and the end of the file; a disk that does not take it in time has failed."""
+        self._closing.set()
+        patience_s = DISK_WAITS_S if caught() is None else STOPPED_DISK_WAITS_S
+        self._thread.join(patience_s)
+        if self._thread.is_alive():  # and has the file: nothing more can be done with it
+            self._failed(TimeoutError(f"the disk did not take its last messages within {patience_s:g} s"))
+            return
+        self._probe.close()
+
+    def summary(self) -> dict[str, str | int | None]:
+        """Where it is, what went wrong, how much was lost, and how much of a flood was only counted."""
+        lost = self._lost + sum(self._backlog.dropped.values())
+        told: dict[str, str | int | None] = {"path": str(self.path), "failure": self.failure, "unrecorded": lost}
+        if self._counted:
+            told["only_counted"] = self._counted
+        if self._part:
+            told["files"] = self._part + 1
+        return told
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+
+def _topic(name: str, schema_name: str, record: type[msgspec.Struct]) -> Topic:
+    return Topic(name, schema_name, schema_of(record, schema_name))
+
+
+TOPICS = {
+    "packet": ATTITUDE_TOPIC_OF_RUN,
+    "frame": _topic(FRAME_TOPIC, "hilstar.Frame", FrameRecord),
+    "event": _topic(EVENT_TOPIC, "hilstar.Event", EventRecord),
+    "process": _topic(PROCESS_TOPIC, "hilstar.Process", ProcessRecord),
+    "count": _topic(COUNT_TOPIC, "hilstar.Count", CountRecord),
+}
+
+
+def _head_of(bench: Bench) -> dict[str, str]:
+    return {
+        "bench_sha256": bench.bench_hash,
+        "bench_file": printable(str(bench.path)),
+        "bench_text": bench.path.read_text(encoding="utf-8"),
+        "calibration": bench.calibration.name,
+        "calibration_sha256": bench.calibration.sha256,
+        "gl_renderer": bench.renderer.gl_renderer,
+        "monotonic_ns": str(time.monotonic_ns()),
+        "unix_ns": str(time.time_ns()),
+    }
+
+
+def _packet_message(host_ns: int, raw: bytes, sample: AttitudeSample | None, refusal: Refusal | None) -> bytes:
+    if refusal is not None or sample is None:
+        reason, detail = ("format", "") if refusal is None else (refusal.reason, refusal.detail[:MAX_DETAIL_CHARACTERS])
+        return refused_message(reason, detail, host_ns, raw)
+    return attitude_message(sample, host_ns, raw)

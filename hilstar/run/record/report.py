@@ -1,0 +1,125 @@
+"""The report of a run from its ledger: timing, age, missed frames and the path of the attitude, on one page."""
+
+from __future__ import annotations
+
+import base64
+import html
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from hilstar.errors import InputError
+from hilstar.files import write_whole
+from hilstar.run.record.records import NO_FRAMES, config_of, read_head, run_records
+from hilstar.run.record.report_charts import CHARTS
+from hilstar.run.record.run_figures import Figures, three
+
+PAGE = """<!DOCTYPE html>
+<html lang="en"><head><meta charset="utf-8"><title>{title}</title><style>
+body {{ font: 15px/1.45 sans-serif; max-width: 1020px; margin: 2em auto; padding: 0 1em; color: #222 }}
+table {{ border-collapse: collapse; margin: 1em 0 }}
+td {{ padding: 3px 14px 3px 0; border-bottom: 1px solid #ddd; vertical-align: top }}
+img {{ max-width: 100% }}
+</style></head><body><h1>{title}</h1><table>{rows}</table>{figures}</body></html>
+"""
+
+
+def figures_of(path: Path) -> Figures:
+    """Read a ledger. Raises InputError for a file that is none, or has no frame, or is damaged."""
+    figures = Figures(read_head(path))
+    for record in run_records(path):
+        figures.add(record)
+    if not figures.frames:
+        raise InputError(f"{path}: {NO_FRAMES}")
+    return figures
+
+
+def summarise(run: Figures) -> dict[str, Any]:
+    """The figures of a run: the JSON object of `hilstar report`."""
+    config, last, spreads = config_of(run.head), run.last, run.spreads
+    refresh_hz = None if config is None else config.monitor.refresh_hz
+    return {
+        "frames": run.frames,
+        "duration_s": run.duration_s,
+        "missed_frames": 0 if last is None else last.missed,
+        "stale_frames": run.stale,
+        "blank_frames": run.blank,
+        "operator_frames": run.operator,
+        "hidden_frames": run.hidden,
+        "capped_frames": run.capped,
+        "timestamp_source": "" if last is None else last.timestamp_source,
+        "refresh_hz": refresh_hz,
+        "pacing_jitter_ms": spreads["interval"].deviation,
+        "interval_ms": three(spreads["interval"]),
+        "swap_late_ms": three(spreads["late"]),
+        "draw_to_swap_ms": three(spreads["draw"]),
+        "attitude_age_ms": three(spreads["age"]),
+        "attitude_age_frames": None if refresh_hz is None else three(spreads["age"], refresh_hz / 1e3),
+        "prediction_ms": three(spreads["prediction"]),
+        "packet_to_swap_ms": three(spreads["packet"]),
+        "packets": run.packets.counts,
+        "events": run.events,
+        **run.most,
+        "memory_growth_mb": run.memory_growth_mb,
+        "bench_sha256": run.head.get("bench_sha256"),
+        "calibration": run.head.get("calibration"),
+        "calibration_sha256": run.head.get("calibration_sha256"),
+        "gl_renderer": run.head.get("gl_renderer"),
+    }
+
+
+def report(path: Path, directory: Path) -> dict[str, Any]:
+    """Write `report.html`, its figures and `report.json` of a ledger into a directory; the figures.
+
+    Raises InputError for a file that is no ledger, and where it cannot write.
+    """
+    run = figures_of(path)
+    summary = summarise(run)
+    charts = [draw(run, directory) for draw in CHARTS]
+    page = PAGE.format(
+        title=html.escape(f"Run {path.name}"),
+        rows="".join(f"<tr><td>{html.escape(a)}</td><td>{html.escape(b)}</td></tr>" for a, b in table_rows(summary)),
+        figures="".join(f'<p><img alt="{f.stem}" src="data:image/png;base64,{_base64(f)}"></p>' for f in charts if f),
+    )
+    write_whole(directory / "report.html", page.encode(errors="replace"))
+    write_whole(directory / "report.json", msgspec.json.format(msgspec.json.encode(summary)))
+    return summary
+
+
+def table_rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
+    """The figures for a person: what, and how much."""
+    refused = sum(count for reason, count in summary["packets"].items() if reason != "accepted")
+
+    def three(key: str, unit: str = "ms") -> str:
+        values = [(summary[key] or {}).get(name) for name in ("p50", "p99", "max")]
+        return " / ".join("-" if v is None else f"{v:.2f}" for v in values) + f" {unit} (p50 / p99 / max)"
+
+    def number(key: str, unit: str) -> str:
+        return "-" if summary[key] is None else f"{summary[key]:.2f} {unit}"
+
+    frames = f"{summary['frames']} in {summary['duration_s']:.1f} s, {summary['missed_frames']} missed"
+    return [
+        ("frames", f"{frames}, {summary['stale_frames']} stale, {summary['blank_frames']} blank"),
+        ("not the sky", f"{summary['operator_frames']} by an operator's keys, {summary['hidden_frames']} hidden"),
+        ("coarser than they should be", f"{summary['capped_frames']}, for the turn was too fast"),
+        ("time stamps", f"{summary['timestamp_source']}; the bench's refresh is {number('refresh_hz', 'Hz')}"),
+        ("pacing jitter", f"{number('pacing_jitter_ms', 'ms')} (standard deviation of the interval between swaps)"),
+        ("interval", three("interval_ms")),
+        ("swap after its prediction", three("swap_late_ms")),
+        ("drawing begun to swap", three("draw_to_swap_ms")),
+        ("age of the attitude at light", f"{three('attitude_age_ms')} = {three('attitude_age_frames', 'frames')}"),
+        ("predicted past the last packet", three("prediction_ms")),
+        ("packet to swap", three("packet_to_swap_ms")),
+        ("packets", f"{summary['packets'].get('accepted', 0)} accepted, {refused} refused"),
+        ("events", ", ".join(f"{kind} {count}" for kind, count in summary["events"].items()) or "none"),
+        ("stars", f"{summary['stars_drawn']} at most, {summary['clipped']} clipped, {summary['below_step']} under a step"),
+        ("memory after the first minute", number("memory_growth_mb", "MB more at the end")),
+        ("bench file", f"SHA-256 {summary['bench_sha256']}"),
+        ("calibration", f"{summary['calibration']}, SHA-256 {summary['calibration_sha256']}"),
+        ("renderer", str(summary["gl_renderer"])),
+    ]
+
+
+def _base64(path: Path) -> str:
+    return base64.b64encode(path.read_bytes()).decode()

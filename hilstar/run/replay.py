@@ -1,0 +1,175 @@
+"""What of a log is replayed, and how fast."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+from hilstar.attitude.clock.timeline import Attitude, Timeline
+from hilstar.attitude.logs.gaps import log_joins
+from hilstar.attitude.logs.log_file import log_timeline, read_log
+from hilstar.attitude.logs.mcap_log import read_attitudes
+from hilstar.attitude.logs.mcap_reader import is_mcap
+from hilstar.attitude.wire.packet import AttitudeSample, rate_refusal
+from hilstar.bench.config import BenchConfig
+from hilstar.errors import InputError
+from hilstar.run.loop import policy_of
+from hilstar.run.record.records import PastFrame, past_frames
+from hilstar.units import NS_PER_S
+
+MOST_FRAMES = 100_000_000
+SPEED_FORM = "write --speed realtime, max, or a number such as 2 or 0.5"
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """What the command line asks of a replay; start and stop are seconds after the log's first sample."""
+
+    speed: str = "realtime"
+    start_s: float | None = None
+    stop_s: float | None = None
+    step_s: float | None = None
+
+
+class Play(Protocol):
+    """Frames of the past, in order; paced as on a monitor, or all at once."""
+
+    @property
+    def paced(self) -> bool:
+        """As on a monitor, where late frames are missed."""
+
+    @property
+    def frame_count(self) -> int:
+        """How many frames there are."""
+
+    @property
+    def packet_count(self) -> int:
+        """How many attitudes are behind them."""
+
+    @property
+    def moving(self) -> bool | None:
+        """Whether stars are drawn along their paths; None: as the bench file says."""
+
+    @property
+    def told(self) -> list[tuple[str, str]]:
+        """What is to be told of it before it begins: kinds and lines of events."""
+
+    def frame(self, slot: int) -> tuple[int, int, Attitude | None]:
+        """Number, time and attitude of a frame; None is blank."""
+
+
+@dataclass(frozen=True, slots=True)
+class LogPlay:
+    """A log: frame k shows its time `first_ns + k step_s`."""
+
+    timeline: Timeline
+    first_ns: int
+    step_s: float
+    frame_count: int
+    paced: bool
+    moving: bool | None = None
+    told: list[tuple[str, str]] = field(default_factory=list)
+
+    @property
+    def packet_count(self) -> int:
+        """The samples of the log."""
+        return len(self.timeline)
+
+    def frame(self, slot: int) -> tuple[int, int, Attitude | None]:
+        """Number, time and attitude of a frame."""
+        t_ns = self.first_ns + round(slot * self.step_s * NS_PER_S)
+        return slot, t_ns, self.timeline.at(t_ns)
+
+
+@dataclass(frozen=True, slots=True)
+class RunPlay:
+    """An earlier run by its ledger: the same frames with the same attitudes, so the same light, bit for bit."""
+
+    frames: list[PastFrame]
+    packet_count: int
+    paced: bool
+    moving: bool | None = True  # where the run's own were
+    told: list[tuple[str, str]] = field(default_factory=list)
+
+    @property
+    def frame_count(self) -> int:
+        """The frames that the run drew."""
+        return len(self.frames)
+
+    def frame(self, slot: int) -> tuple[int, int, Attitude | None]:
+        """Number, time and attitude of a frame."""
+        past = self.frames[slot]
+        attitude = (
+            None if past.q_icrs_to_cam is None else Attitude(past.q_icrs_to_cam, 0, False, rate_cam_rad_s=past.rate_cam_rad_s)
+        )
+        return past.number, past.t_ns, attitude
+
+
+def plan_play(log: Path, wanted: Wanted, config: BenchConfig) -> Play:
+    """The frames of a replay: of a log one each refresh period, stretched by the speed, unless a step is given.
+
+    Of a ledger those that its run drew. Raises InputError for a speed, a span or a step that gives no frame.
+    """
+    factor = parse_speed(wanted.speed)
+    if is_mcap(log):
+        frames = list(past_frames(log, math.radians(config.attitude.max_rate_deg_s)))
+        if frames:
+            return _plan_run(log, wanted, factor, frames)
+    samples = read_log(log)
+    _check_rates(log, samples, math.radians(config.attitude.max_rate_deg_s))
+    start_s, stop_s = _span(log, wanted, (samples[-1].t_ns - samples[0].t_ns) / NS_PER_S)
+    step_s = (1.0 if math.isinf(factor) else factor) / config.monitor.refresh_hz
+    if wanted.step_s is not None:
+        if wanted.step_s <= 0 or factor not in {1.0, math.inf}:
+            raise InputError(f"--step {wanted.step_s:g}: write seconds above 0, and --speed realtime or max beside it")
+        step_s = wanted.step_s
+    count = (stop_s - start_s) / step_s + 1e-6
+    if count > MOST_FRAMES:
+        raise InputError(f"{log}: makes {count:.3g} frames; write a longer --step, or --start and --stop")
+    first_ns = samples[0].t_ns + round(start_s * NS_PER_S)
+    joins = log_joins(samples)
+    timeline = log_timeline(samples, policy_of(config.attitude), joins)
+    return LogPlay(timeline, first_ns, step_s, int(count) + 1, not math.isinf(factor), told=joins.told)
+
+
+def _check_rates(log: Path, samples: list[AttitudeSample], max_rate_rad_s: float) -> None:
+    """A log is refused what a stream is refused."""
+    for number, sample in enumerate(samples, start=1):
+        refusal = rate_refusal(sample, max_rate_rad_s)
+        if refusal is not None:
+            raise InputError(f"{log}: attitude {number}: {refusal.detail}")
+
+
+def _plan_run(log: Path, wanted: Wanted, factor: float, frames: list[PastFrame]) -> RunPlay:
+    if wanted.step_s is not None or factor not in {1.0, math.inf}:
+        raise InputError(f"{log}: an earlier run is replayed frame by frame; leave --step out, and --speed but realtime or max")
+    first_ns = frames[0].swap_ns
+    start_s, stop_s = _span(log, wanted, (frames[-1].swap_ns - first_ns) / NS_PER_S)
+    kept = [frame for frame in frames if start_s <= (frame.swap_ns - first_ns) / NS_PER_S <= stop_s + 1e-9]
+    if not kept:
+        raise InputError(f"{log}: has no frame from --start {start_s:g} to --stop {stop_s:g}; write a longer span")
+    return RunPlay(kept, sum(1 for _ in read_attitudes(log)), not math.isinf(factor))
+
+
+def _span(log: Path, wanted: Wanted, length_s: float) -> tuple[float, float]:
+    start_s = 0.0 if wanted.start_s is None else wanted.start_s
+    stop_s = length_s if wanted.stop_s is None else wanted.stop_s
+    if not 0 <= start_s <= stop_s <= length_s + 1e-9:
+        raise InputError(f"{log}: --start {start_s:g} --stop {stop_s:g}; write seconds from 0 to its length, {length_s:g}")
+    return start_s, stop_s
+
+
+def parse_speed(text: str) -> float:
+    """The factor of real time of `--speed`: 1 for realtime, infinite for max. Raises InputError."""
+    named = {"realtime": 1.0, "max": math.inf}
+    if text in named:
+        return named[text]
+    try:
+        factor = float(text)
+    except ValueError as error:
+        raise InputError(f"--speed {text}: {SPEED_FORM}") from error
+    if not 1e-3 <= factor <= 1e3:
+        raise InputError(f"--speed {text}: {SPEED_FORM}, from 0.001 to 1000")
+    return factor

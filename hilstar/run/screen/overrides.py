@@ -1,0 +1,87 @@
+"""What an operator's keys and the window's place make of the frames: told when it changes, counted while it lasts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+from hilstar.attitude.clock.timeline import Attitude
+from hilstar.notices import Notices
+from hilstar.run.screen.screen import Screen
+from hilstar.units import NS_PER_S
+
+
+@dataclass(frozen=True, slots=True)
+class OnScreen:
+    """What lies between a frame and whoever looks: an operator's keys ("" for none), and why it is not seen ("" if it is).
+
+    `sky` is false where the keys leave no sky at all.
+    """
+
+    operator: str = ""
+    hidden: str = ""
+    sky: bool = True
+
+
+HEADLESS = OnScreen()
+
+
+class Overrides:
+    """Follows a screen's keys and window; without a screen there are none."""
+
+    def __init__(self, screen: Screen | None, notices: Notices) -> None:
+        self._screen = screen
+        self._notices = notices
+        self._told = HEADLESS
+        self._held: tuple[Attitude, int] | None = None  # what a paused screen shows, and the time that it was for
+        self._last_swap_ns: int | None = None
+        self._frames = {"operator": 0, "hidden": 0}
+        self._lasted_ns = {"operator": 0, "hidden": 0}
+
+    @property
+    def now(self) -> OnScreen:
+        """As the keys and the window are; what has changed is told."""
+        screen = self._screen
+        if screen is None:
+            return HEADLESS
+        now = OnScreen(screen.operator, screen.window.hidden, screen.shows_sky)
+        if now != self._told:
+            before, self._told = self._told, now
+            if now.operator != before.operator:
+                self._notices.tell("operator", f"operator's keys: {now.operator or 'the sky of the attitude again'}")
+            if now.hidden != before.hidden:
+                self._tell_hidden(now.hidden)
+        return now
+
+    def _tell_hidden(self, hidden: str) -> None:
+        if hidden:
+            self._notices.tell("hidden", f"the window is {hidden}: its frames are not seen as they are drawn")
+        else:
+            self._notices.tell("visible", "the window is seen again")
+
+    def attitude(self, t_ns: int, attitude: Attitude | None) -> Attitude | None:
+        """What the keys leave of a frame's attitude: the one of the pause, which grows old, and none where no sky is shown."""
+        screen = self._screen
+        if screen is None:
+            return attitude
+        if not screen.paused:
+            self._held = None if attitude is None else (attitude, t_ns)
+        elif self._held is None:
+            attitude = None
+        else:
+            held, held_t_ns = self._held
+            attitude = replace(held, rate_cam_rad_s=None, age_ns=max(0, held.age_ns + t_ns - held_t_ns))
+        return attitude if screen.shows_sky else None
+
+    def count(self, shown: OnScreen, swap_ns: int) -> None:
+        """Take in what a frame was shown as."""
+        since_ns = 0 if self._last_swap_ns is None else swap_ns - self._last_swap_ns
+        self._last_swap_ns = swap_ns
+        for name, lasts in (("operator", shown.operator), ("hidden", shown.hidden)):
+            if lasts:
+                self._frames[name] += 1
+                self._lasted_ns[name] += since_ns
+
+    def summary(self) -> dict[str, Any]:
+        """How many frames an operator's keys changed or nobody could see, and how long that was, s."""
+        return {name: {"frames": self._frames[name], "s": self._lasted_ns[name] / NS_PER_S} for name in self._frames}

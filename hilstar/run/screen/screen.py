@@ -1,0 +1,206 @@
+"""The bench's window: frames on it, keys from it, and a gate that refuses a display whose timing cannot be trusted."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hilstar.bench.build import Bench
+from hilstar.bench.config import read_config
+from hilstar.bench.mounting import mount_of
+from hilstar.errors import MachineError
+from hilstar.monitor.window.window import Window, WindowSettings
+from hilstar.render.presenter import BLANK, CROSSHAIR, GRID, PATCH, Presenter, View, window_context
+from hilstar.run.pacing import DrawBudget, SwapClock
+from hilstar.run.screen.photodiode import marker_light
+from hilstar.units import NS_PER_MS, NS_PER_S
+
+GATE_FRAMES = 120
+REFRESH_TOLERANCE = 0.01
+DROPPED = 1.5  # periods
+MOST_DROPPED = 2  # of GATE_FRAMES: a desktop that is still busy with the new window
+HELP = "keys: q quit, b blank, space pause, c crosshair, g grid, t next test patch, h this line"
+UNPACED = 0.1  # of the period that the system knows of: swaps faster by more do not wait for it
+PATCHES = (0.0, 0.25, 0.5, 0.75, 1.0)  # of white
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Timing:
+    """What the gate saw: the median period, how many frames were late, and whether the screen itself keeps time."""
+
+    period_ms: float
+    dropped: int
+    paced_by_screen: bool
+
+
+class Screen:
+    """A window with a bench's frames on it.
+
+    `clock` knows when it swaps, `budget` how early a frame has to be begun, and `swap_to_light_ns` is from a swap to the
+    first light of the middle row: half of the scan-out, and the panel's own delay. `marker` is the photodiode square, 0 or 1.
+    """
+
+    def __init__(self, window: Window, bench: Bench) -> None:
+        monitor = bench.config.monitor
+        self.window = window
+        self.bench = bench
+        self.paused = False
+        self.timing = Timing(1000.0 / monitor.refresh_hz, 0, False)
+        self.marker: int | None = None
+        self.swap_to_light_ns = round((bench.scan.scanout_s / 2 * 1e3 + monitor.panel_delay_ms) * NS_PER_MS)
+        self._start_clock(time.monotonic_ns())
+        self._overlay = 0
+        self._patch = -1
+        view = View(
+            resolution_px=monitor.resolution_px,
+            screen_px=window.size_px,
+            bits=monitor.bits,
+            mount=mount_of(monitor),
+            cross_px=bench.camera.principal_point_px,
+            triples=bench.calibration.response.rgb,
+        )
+        self._presenter = Presenter(bench.renderer.codes_texture, view)
+
+    def _start_clock(self, swap_ns: int) -> None:
+        wanted_ns = NS_PER_S / self.bench.config.monitor.refresh_hz
+        by_screen = self.timing.paced_by_screen
+        period_ns = self.timing.period_ms * NS_PER_MS if by_screen else wanted_ns
+        self.clock = SwapClock(swap_ns, period_ns, by_screen)
+        self.budget = DrawBudget(period_ns)
+
+    @property
+    def closing(self) -> bool:
+        """True once the window is to be closed."""
+        return self.window.closing or self._quit
+
+    _quit = False
+
+    @property
+    def timestamp_source(self) -> str:
+        """Where the times of swaps come from, and who paces them."""
+        return self.window.timestamp_source + ("" if self.timing.paced_by_screen else ", software pacing")
+
+    def present(self, number: int) -> None:
+        """Draw the bench's last frame on the back buffer, whole; `number` is the frame's, for the photodiode square."""
+        monitor = self.bench.config.monitor
+        white = 2**monitor.bits - 1
+        code = round(PATCHES[self._patch] * white) if self._patch >= 0 else 0
+        overlay = self._overlay | (PATCH if self._patch >= 0 else 0)
+        side_px = monitor.photodiode_px
+        self.marker = marker_light(number, monitor.photodiode) if side_px else None
+        self._presenter.present(overlay, code, (side_px, white * (self.marker or 0)))
+
+    def swap(self) -> int:
+        """Swap what was presented onto the screen, and take in keys; host time of the swap, ns."""
+        swap_ns = self.window.swap(self._presenter.wait)
+        self.clock.update(swap_ns)
+        self.window.look_at_events()
+        while self.window.keys:
+            self._press(self.window.keys.popleft())
+        return swap_ns
+
+    @property
+    def shows_sky(self) -> bool:
+        """False where an operator's key leaves no sky: under a blank or a test patch."""
+        return not self._overlay & BLANK and self._patch < 0
+
+    @property
+    def operator(self) -> str:
+        """What an operator's keys change of the sky, such as "grid, pause"; "" for nothing."""
+        names = {BLANK: "blank", GRID: "grid", CROSSHAIR: "crosshair"}
+        on = [name for bit, name in names.items() if self._overlay & bit]
+        if self._patch >= 0:
+            on.append(f"patch {PATCHES[self._patch]:.0%}")
+        return ", ".join([*on, "pause"] if self.paused else on)
+
+    def _press(self, key: str) -> None:
+        match key:
+            case "q" | "escape":
+                self._quit = True
+            case "b":
+                self._overlay ^= BLANK
+            case "c":
+                self._overlay ^= CROSSHAIR
+            case "g":
+                self._overlay ^= GRID
+            case "t":
+                self._patch = self._patch + 1 if self._patch + 1 < len(PATCHES) else -1
+            case "space":
+                self.paused = not self.paused
+            case "h" | "f1":
+                log.warning(HELP)
+
+    def pass_gate(self, force: bool) -> None:
+        """Measure GATE_FRAMES swaps and refuse (MachineError) a display that is not what the bench file says.
+
+        With `force` what is wrong is only logged.
+        """
+        self.bench.draw(None)
+        times = np.array([self._gate_frame(number) for number in range(GATE_FRAMES + 1)])
+        periods_ms = np.diff(times) / NS_PER_MS
+        wanted_ms = 1000.0 / self.bench.config.monitor.refresh_hz
+        period_ms = float(np.median(periods_ms))
+        known_hz = 0 if self.window.display is None else self.window.display.refresh_hz
+        # A display whose swaps come faster than any refresh does not wait for one: nothing keeps time but this program.
+        on_time = abs(period_ms / wanted_ms - 1) < REFRESH_TOLERANCE
+        by_screen = period_ms >= 1000.0 / known_hz * (1 - UNPACED) if known_hz else on_time
+        self._waits = by_screen or not known_hz
+        self.timing = Timing(period_ms, int((periods_ms > DROPPED * wanted_ms).sum()), by_screen)
+        self._start_clock(int(times[-1]))
+        if not by_screen:
+            log.warning("the display has no refresh of its own (swaps take %.2f ms): frames are paced by software", period_ms)
+        if self.window.gone is not None:
+            raise MachineError(self.window.gone)
+        for fault in self._faults(wanted_ms):
+            if not force:
+                raise MachineError(f"{fault}; or add --force")
+            log.warning("%s: shown all the same (--force)", fault)
+
+    _waits = True
+
+    def _gate_frame(self, number: int) -> int:
+        self.present(number)
+        return self.swap()
+
+    def _faults(self, wanted_ms: float) -> Iterator[str]:
+        monitor, timing = self.bench.config.monitor, self.timing
+        wanted_px = mount_of(monitor).screen_px(monitor.resolution_px)
+        if self.window.size_px != wanted_px:
+            (width, height), (wide, high) = self.window.size_px, wanted_px
+            yield f"the display is {width} x {height} px and the bench {wide} x {high}; set [monitor] resolution_px or its mode"
+        if self.window.composited:
+            yield "a compositing manager draws this display and may hold frames back; stop it, or use a plain X session"
+        if self.window.mirrored is not None:
+            yield f"the display {self.window.mirrored} mirrors this one; switch it off or beside it (xrandr --right-of)"
+        if self.window.scaled:
+            yield "the display is scaled by its desktop; set its scale to 100 %"
+        if timing.paced_by_screen and abs(timing.period_ms / wanted_ms - 1) > REFRESH_TOLERANCE:
+            hz = f"{1000.0 / timing.period_ms:.2f} Hz and the bench says {monitor.refresh_hz:g}"
+            yield f"the display refreshes at {hz}; set [monitor] refresh_hz or its mode"
+        if timing.paced_by_screen and timing.dropped > MOST_DROPPED:
+            yield f"the display dropped {timing.dropped} of {GATE_FRAMES} frames; close what else draws on it"
+        if not self._waits:
+            yield "swaps do not wait for the display's refresh; switch vertical sync on in its driver"
+        depth = self.window.depth_bits
+        if depth < monitor.bits:
+            yield f"the window has {depth} bits a colour and the bench says {monitor.bits}; set [monitor] bits or a deeper mode"
+
+
+@contextmanager
+def open_screen(path: Path, *, windowed: bool, force: bool) -> Iterator[Screen]:
+    """The bench of a file on its display, past the gate. Raises InputError or MachineError."""
+    monitor = read_config(path).monitor
+    display = None if windowed else monitor.display
+    settings = WindowSettings(mount_of(monitor).screen_px(monitor.resolution_px), monitor.bits, display)
+    with Window(settings) as window, Bench(path, window_context()) as bench:
+        screen = Screen(window, bench)
+        bench.warm_up()
+        screen.pass_gate(force)
+        yield screen

@@ -1,0 +1,227 @@
+"""The test instrument: a log or a spin, sent over either road at a steady rate."""
+
+from __future__ import annotations
+
+import math
+import re
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+
+from hilstar.arrays import FloatArray
+from hilstar.attitude.clock.timeline import Policy
+from hilstar.attitude.logs.gaps import log_joins
+from hilstar.attitude.logs.log_file import log_timeline
+from hilstar.attitude.wire.cobs import DELIMITER, framed
+from hilstar.attitude.wire.keys import CurveKeys
+from hilstar.attitude.wire.packet import AttitudeSample, Status, TimeReply, TimeRequest, encode
+from hilstar.attitude.wire.serial_link import SerialLink
+from hilstar.attitude.wire.zmq_links import ZmqSender
+from hilstar.errors import InputError
+from hilstar.process.interrupts import caught
+from hilstar.rotation import from_radec_roll_deg, propagate, rate_between_rad_s
+from hilstar.run.pacing import wait_until
+from hilstar.run.send.faults import BadCable
+from hilstar.units import NS_PER_S
+
+SPIN_AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+FASTEST_SPIN_RAD_S = 1e6
+DEFAULT_BAUD = 115_200
+LISTEN_MS = 20
+PATIENCE_S = 0.5  # a line that takes nothing for so long has no reader
+MOST_RESAMPLED = 10_000_000  # some GB of samples
+SPIN_FORM = "--spin AXIS,DEG_PER_S, AXIS being x, y, z or three numbers (cam axes), such as --spin z,0.5"
+
+
+def parse_spin(text: str) -> FloatArray:
+    """The rate in rad/s, cam components (3,), of "AXIS,DEG_PER_S"."""
+    *axis, rate_text = [part.strip() for part in text.split(",")]
+    try:
+        rate = math.radians(float(rate_text))
+        vector = np.array(SPIN_AXES[axis[0].lower()] if len(axis) == 1 else [float(part) for part in axis])
+    except (ValueError, KeyError, IndexError) as error:
+        raise InputError(f"--spin {text}: write {SPIN_FORM}") from error
+    length = math.hypot(*vector)
+    if len(vector) != 3 or not (abs(rate) <= FASTEST_SPIN_RAD_S and 0 < length < math.inf):
+        raise InputError(f"--spin {text}: write {SPIN_FORM}")
+    return np.asarray(vector / length * rate)
+
+
+def parse_numbers(text: str, count: int, option: str, form: str) -> list[float]:
+    """`count` finite numbers with commas between them. Raises InputError that shows `form`."""
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError as error:
+        raise InputError(f"{option} {text}: write {form}") from error
+    if len(numbers) != count or not all(map(math.isfinite, numbers)):
+        raise InputError(f"{option} {text}: write {count} finite numbers, {form}")
+    return numbers
+
+
+def parse_radec(text: str) -> tuple[float, float, float]:
+    """Right ascension, declination and roll in degrees."""
+    ra_deg, dec_deg, roll_deg = parse_numbers(text, 3, "--radec", "RA,DEC,ROLL in degrees")
+    if not -90 <= dec_deg <= 90:
+        raise InputError(f"--radec {text}: the declination is from -90 to 90")
+    return ra_deg, dec_deg, roll_deg
+
+
+def parse_rate(text: str) -> FloatArray:
+    """A rate in rad/s, cam components (3,), of "X,Y,Z" in deg/s."""
+    return np.radians(parse_numbers(text, 3, "--rate", "X,Y,Z in deg/s"))
+
+
+def parse_serial(text: str) -> tuple[str, int] | None:
+    """Port and baud rate of "serial:/dev/ttyX@BAUD"; None for any other target. Raises InputError."""
+    if not text.startswith("serial:"):
+        return None
+    match = re.fullmatch(r"serial:(.+?)(?:@(\d{1,8}))?", text)
+    if match is None or not match[1] or "@" in match[1] or (match[2] and not int(match[2])):
+        raise InputError(f"--to {text}: write serial:/dev/ttyX@BAUD, such as serial:/dev/ttyUSB0@921600")
+    return match[1], int(match[2] or DEFAULT_BAUD)
+
+
+def open_road(to: str, *, connect: bool, keys: CurveKeys) -> ZmqSender | SerialSender:
+    """The road that --to names. Raises InputError."""
+    line = parse_serial(to)
+    if line is None:
+        return ZmqSender(to, bind=not connect, keys=keys)
+    if keys.given or connect:
+        raise InputError(f"--to {to}: a serial line has no keys and no --connect; leave them out")
+    return SerialSender(*line)
+
+
+def spin_samples(
+    rate_cam_rad_s: FloatArray, rate_hz: float, radec_roll_deg: tuple[float, float, float]
+) -> Iterator[AttitudeSample]:
+    """A constant turn without end, from t = 0."""
+    start = from_radec_roll_deg(*radec_roll_deg)
+    k = 0
+    while True:
+        seconds = k / rate_hz
+        yield AttitudeSample(round(seconds * NS_PER_S), propagate(start, rate_cam_rad_s, seconds), rate_cam_rad_s, k)
+        k += 1
+
+
+def log_samples(samples: list[AttitudeSample], rate_hz: float | None) -> Iterator[AttitudeSample]:
+    """A log from t = 0: its own samples, or at `rate_hz` between them. A rate that the log lacks is the next step's.
+
+    Of its gaps nothing is known: before one there is no such rate, and what follows one is no motion from there.
+    """
+    samples = _broken_at_gaps(samples)
+    if rate_hz is not None:
+        samples = _resampled(samples, rate_hz)
+    first_ns = samples[0].t_ns
+    for k, sample in enumerate(samples):
+        rate = sample.rate_cam_rad_s
+        if rate is None and k + 1 < len(samples) and not samples[k + 1].discontinuity:
+            after = samples[k + 1]
+            seconds = (after.t_ns - sample.t_ns) / NS_PER_S
+            rate = rate_between_rad_s(sample.q_icrs_to_cam, after.q_icrs_to_cam, seconds)
+        yield AttitudeSample(sample.t_ns - first_ns, sample.q_icrs_to_cam, rate, k, sample.discontinuity)
+
+
+def _broken_at_gaps(samples: list[AttitudeSample]) -> list[AttitudeSample]:
+    joins = log_joins(samples)
+    after_gap = {after.t_ns for before, after in pairwise(samples) if before.t_ns in joins.held_ns}
+    return [replace(sample, discontinuity=True) if sample.t_ns in after_gap else sample for sample in samples]
+
+
+def _resampled(samples: list[AttitudeSample], rate_hz: float) -> list[AttitudeSample]:
+    """The log at even times; a sample after a break in the log says so, and has the log's rate where the log has rates."""
+    timeline = log_timeline(samples, Policy(0, NS_PER_S))
+    count = int((samples[-1].t_ns - samples[0].t_ns) * rate_hz / NS_PER_S + 1e-6) + 1
+    if count > MOST_RESAMPLED:
+        raise InputError(f"--rate {rate_hz:g}: makes {count} packets of this log; write a lower rate")
+    resampled = []
+    seen = 0
+    for k in range(count):
+        t_ns = samples[0].t_ns + round(k * NS_PER_S / rate_hz)
+        attitude = timeline.at(t_ns)
+        if attitude is None:
+            continue
+        broken = False
+        while seen < len(samples) and samples[seen].t_ns <= t_ns:
+            broken |= samples[seen].discontinuity
+            seen += 1
+        rate = _rate_between(samples, seen, t_ns)
+        resampled.append(AttitudeSample(t_ns, attitude.q_icrs_to_cam, rate, discontinuity=broken and k > 0))
+    return resampled
+
+
+def _rate_between(samples: list[AttitudeSample], after: int, t_ns: int) -> FloatArray | None:
+    """The log's rate at a time: between those of the samples before and after, where both have one."""
+    before = samples[after - 1]
+    if before.rate_cam_rad_s is None or before.t_ns == t_ns or after == len(samples):
+        return before.rate_cam_rad_s
+    later = samples[after]
+    if later.rate_cam_rad_s is None or later.discontinuity:
+        return before.rate_cam_rad_s
+    part = (t_ns - before.t_ns) / (later.t_ns - before.t_ns)
+    return np.asarray((1 - part) * before.rate_cam_rad_s + part * later.rate_cam_rad_s)
+
+
+class SerialSender(SerialLink):
+    """A serial line as the bench has it: it sends attitudes, answers time requests, and listens to the status."""
+
+    def __init__(self, port: str, baud: int) -> None:
+        super().__init__(port, baud)
+        self.status: Status | None = None
+        self.statuses = 0
+        self.requests = 0
+        self.unsent = 0
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._listen, name="hilstar-bench", daemon=True)
+        self.send_bytes(DELIMITER)
+        self._thread.start()
+
+    def wait_for_listener(self, timeout_s: float) -> bool:
+        """A line does not say whether anybody listens."""
+        return True
+
+    def put(self, packet: bytes) -> None:
+        """Frame a packet's bytes and send them, at the speed of the line."""
+        self.unsent += not self.send_bytes(framed(packet), PATIENCE_S)
+
+    def _listen(self) -> None:
+        while not self._stop.is_set():
+            for arrival in self.receive(LISTEN_MS):
+                match arrival.event:
+                    case TimeRequest(sequence, t1_ns):
+                        self.requests += 1
+                        self.send(TimeReply(sequence, t1_ns, arrival.host_ns, time.monotonic_ns()))
+                    case Status() as status:
+                        self.status, self.statuses = status, self.statuses + 1
+
+    def close(self) -> None:
+        """Stop listening, and close the port once what was sent has left; after a signal at once."""
+        self._stop.set()
+        self._thread.join()
+        if caught() is None:
+            self.drain()
+        super().close()
+
+
+def send(
+    cable: BadCable,
+    samples: Iterator[AttitudeSample],
+    stop: threading.Event,
+    on_sent: Callable[[int], None] = lambda count: None,
+) -> None:
+    """Send each sample at its time, stamped with this machine's monotonic clock.
+
+    A sample never goes out early. One that is late goes out at once: none is dropped, but by the cable.
+    """
+    start_ns = time.monotonic_ns()
+    for sample in samples:
+        due_ns = start_ns + sample.t_ns
+        if wait_until(due_ns + round(cable.delay_s() * NS_PER_S), stop):
+            break
+        stamped = AttitudeSample(due_ns, sample.q_icrs_to_cam, sample.rate_cam_rad_s, sample.sequence, sample.discontinuity)
+        cable.carry(encode(stamped))
+        on_sent(cable.tally.total)
+    cable.close()

@@ -1,0 +1,139 @@
+"""What is shown live, over a link, and what is shown of a log."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from hilstar.attitude.clock.receiver import PacketCounts, Receiver, Traffic, nobody_watches
+from hilstar.attitude.clock.timeline import Timeline
+from hilstar.attitude.wire.keys import CurveKeys
+from hilstar.attitude.wire.serial_link import SerialLink
+from hilstar.attitude.wire.zmq_links import ZmqLockstep, ZmqReceiver
+from hilstar.bench.build import Bench
+from hilstar.bench.config import AttitudeSettings
+from hilstar.notices import Notices
+from hilstar.process.interrupts import stop_on_signal
+from hilstar.run.frame_status import StatusMaker
+from hilstar.run.lockstep import serve_lockstep
+from hilstar.run.loop import FrameLoop, FrameSink, Limit, ignore, policy_of
+from hilstar.run.record.ledger import Ledger
+from hilstar.run.record.records import frame_record
+from hilstar.run.replay import Play
+from hilstar.run.screen.screen import Screen
+from hilstar.units import NS_PER_S
+
+AnyLink = ZmqReceiver | ZmqLockstep | SerialLink
+
+
+@dataclass(frozen=True, slots=True)
+class Outlet:
+    """Where frames go besides their sink: onto a screen, and into a ledger; and where events are told."""
+
+    screen: Screen | None = None
+    ledger: Ledger | None = None
+    notices: Notices = field(default_factory=Notices)
+
+
+def link_keys(settings: AttitudeSettings, folder: Path) -> CurveKeys:
+    """The CURVE key files that the bench file names, relative to it."""
+    names = (settings.curve_secret_key, settings.curve_server_key, settings.allowed_clients)
+    return CurveKeys(*(None if name is None else folder / name for name in names))
+
+
+def open_link(settings: AttitudeSettings, folder: Path, notices: Notices | None = None) -> AnyLink:
+    """The link that the bench file in `folder` names. Raises InputError for one that cannot be had."""
+    if settings.source == "serial":
+        return SerialLink(settings.port, settings.baud, notices)
+    keys = link_keys(settings, folder)
+    if settings.lockstep:
+        return ZmqLockstep(settings.endpoint, bind=settings.bind is not False, keys=keys, notices=notices)
+    return ZmqReceiver(settings.endpoint, bind=settings.bind is True, keys=keys, notices=notices)
+
+
+def serve(bench: Bench, link: AnyLink, limit: Limit, sink: FrameSink = ignore, outlet: Outlet | None = None) -> dict[str, Any]:
+    """Show the live stream of `link` up to `limit`, or until a signal; the summary."""
+    outlet = outlet or Outlet()
+    loop, ledger = FrameLoop(bench, sink, outlet.screen, notices=outlet.notices), outlet.ledger
+    with stop_on_signal(loop.stop), loop.watch:
+        if isinstance(link, ZmqLockstep):
+            bench.warm_up()
+            summary = serve_lockstep(bench, link, limit, loop, ledger)
+        else:
+            summary = _serve_stream(bench, link, limit, loop, outlet)
+    summary |= {"events": outlet.notices.counts(), "link": {"endpoint": link.endpoint} | link.link_counts.summary()}
+    return summary | loop.screen_summary()
+
+
+def _serve_stream(
+    bench: Bench, link: ZmqReceiver | SerialLink, limit: Limit, loop: FrameLoop, outlet: Outlet
+) -> dict[str, Any]:
+    settings, ledger = bench.config.attitude, outlet.ledger
+    timeline = Timeline(policy_of(settings))
+    watch = nobody_watches if ledger is None else ledger.packet
+    shared = settings.clock == "shared"
+    traffic = Traffic(settings.status_hz, settings.time_requests and not shared, shared)
+    receiver = Receiver(link, timeline, traffic, watch, outlet.notices)
+    statuses = StatusMaker(ledger)
+
+    def draw_slot(slot: int) -> None:
+        receiver.tend()
+        t_ns = receiver.clock.to_bench_ns(loop.light_ns(time.monotonic_ns()))
+        shown = loop.draw(slot, t_ns, timeline.at(t_ns))
+        if shown is None:
+            return
+        light_ns = receiver.bench_ns(t_ns)
+        if ledger is not None:
+            ledger.frame(frame_record(shown, light_ns, loop.stats.missed_frames))
+        if link.two_way:
+            receiver.post(statuses.status(shown, light_ns, loop, receiver.counts, receiver.clock.synchronised))
+
+    receiver.start()
+    try:
+        bench.warm_up()
+        receiver.learn()
+        begin_ns = time.monotonic_ns()
+        loop.paced(bench.config.monitor.refresh_hz, limit, draw_slot)
+    finally:
+        receiver.close()
+    duration_s = (time.monotonic_ns() - begin_ns) / NS_PER_S
+    summary = loop.stats.summary(duration_s, receiver.counts, bench.renderer.gl_renderer)
+    return summary | {
+        "stale_events": loop.gate.events,
+        "receive_latency_ms": receiver.latency_ms.summary(),
+        "clock": receiver.clock_summary(),
+        "reconnects": link.reconnects,
+    }
+
+
+def replay(bench: Bench, play: Play, sink: FrameSink = ignore, outlet: Outlet | None = None) -> dict[str, Any]:
+    """Show the past; the summary.
+
+    Paced, late frames are missed, as on a monitor; otherwise every frame is drawn, as fast as it can be.
+    """
+    outlet = outlet or Outlet()
+    loop, ledger = FrameLoop(bench, sink, outlet.screen, play.moving, outlet.notices), outlet.ledger
+    for kind, line in play.told:
+        outlet.notices.tell(kind, line)
+
+    def draw_slot(slot: int) -> None:
+        number, t_ns, attitude = play.frame(slot)
+        shown = loop.draw(number, t_ns, attitude)
+        if ledger is not None and shown is not None:
+            ledger.frame(frame_record(shown, t_ns, loop.stats.missed_frames))
+
+    bench.warm_up()
+    begin_ns = time.monotonic_ns()
+    with stop_on_signal(loop.stop), loop.watch:
+        if play.paced:
+            loop.paced(bench.config.monitor.refresh_hz, Limit(slots=play.frame_count), draw_slot)
+        else:
+            for slot in range(play.frame_count):
+                if loop.stop.is_set():
+                    break
+                draw_slot(slot)
+    duration_s = (time.monotonic_ns() - begin_ns) / NS_PER_S
+    summary = loop.stats.summary(duration_s, PacketCounts(received=play.packet_count), bench.renderer.gl_renderer)
+    return summary | {"stale_events": loop.gate.events, "events": outlet.notices.counts()} | loop.screen_summary()

@@ -1,0 +1,93 @@
+"""What a run has to say for itself: the summary of `serve` and `replay`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from hilstar.attitude.clock.receiver import PacketCounts
+from hilstar.attitude.wire.packet import MESSAGE_REASONS
+from hilstar.spread import RunningSpread
+from hilstar.units import NS_PER_MS
+
+
+class SwapStats:
+    """When frames were swapped onto a screen."""
+
+    def __init__(self) -> None:
+        self._interval_ms = RunningSpread()
+        self._late_ms = RunningSpread()
+        self._packet_ms = RunningSpread()
+        self._last_ns: int | None = None
+
+    def add(self, swap_ns: int, predicted_ns: int, missed_before: int, received_ns: int | None) -> None:
+        """Take in one swap; `received_ns` is when the newest packet behind the frame came, None where none did."""
+        if self._last_ns is not None and not missed_before:
+            self._interval_ms.add((swap_ns - self._last_ns) / NS_PER_MS)
+        self._last_ns = swap_ns
+        self._late_ms.add((swap_ns - predicted_ns) / NS_PER_MS)
+        if received_ns is not None:
+            self._packet_ms.add((swap_ns - received_ns) / NS_PER_MS)
+
+    def summary(self) -> dict[str, Any]:
+        """Jitter of the interval between swaps (standard deviation), lateness and packet to swap; {} without a swap."""
+        if not self._late_ms.count:
+            return {}
+        return {
+            "pacing_jitter_ms": self._interval_ms.deviation,
+            "swap_late_ms": self._late_ms.summary(),
+            "packet_to_swap_ms": self._packet_ms.summary(),
+        }
+
+
+class RunStats:
+    """Figures of each frame, and what they come to."""
+
+    def __init__(self) -> None:
+        self._frame_ms = RunningSpread()
+        self._age_ms = RunningSpread()
+        self._stars = RunningSpread()
+        self._clipped_max = 0
+        self.clipped_hip: set[int] = set()
+        self.swaps = SwapStats()
+        self.missed_frames = 0
+        self.stale_frames = 0
+        self.capped_frames = 0
+        self.given_up_frames = 0
+
+    @property
+    def frames(self) -> int:
+        """Frames drawn so far."""
+        return self._frame_ms.count
+
+    def add(self, frame_ns: int, age_ns: int | None, star_count: int, clipped_hip: tuple[int, ...]) -> None:
+        """Take in one frame; `age_ns` is None while no attitude has come."""
+        self._frame_ms.add(frame_ns / NS_PER_MS)
+        if age_ns is not None:
+            self._age_ms.add(age_ns / NS_PER_MS)
+        self._stars.add(star_count)
+        if clipped_hip:
+            self._clipped_max = max(self._clipped_max, len(clipped_hip))
+            self.clipped_hip.update(clipped_hip)
+
+    def summary(self, duration_s: float, counts: PacketCounts, gl_renderer: str) -> dict[str, Any]:
+        """The JSON object of section 5 of the design; figures without a sample are null."""
+        return {
+            "frames": self.frames,
+            "duration_s": duration_s,
+            "fps": self.frames / duration_s if duration_s > 0 else None,
+            "frame_ms": self._frame_ms.summary(),
+            "attitude_age_ms": self._age_ms.summary(),
+            "packets": {
+                "received": counts.received,
+                "accepted": counts.received - counts.refused,
+                "refused": counts.refused,
+                "refused_by": {name: n for name, n in counts.refused_by.items() if n or name in MESSAGE_REASONS},
+            },
+            "stars_drawn": {"mean": self._stars.mean, "max": int(self._stars.max) if self.frames else None},
+            "clipped": {"max": self._clipped_max, "hip": sorted(self.clipped_hip)},
+            "missed_frames": self.missed_frames,
+            "stale_frames": self.stale_frames,
+            "capped": self.capped_frames,
+            "given_up": self.given_up_frames,
+            "gl_renderer": gl_renderer,
+        }

@@ -1,0 +1,77 @@
+"""What a frame is doing and for how long: a late one is told with its stages, a stuck one while it is stuck."""
+
+from __future__ import annotations
+
+import threading
+import time
+from types import TracebackType
+from typing import Self
+
+from hilstar.notices import Notices
+from hilstar.units import NS_PER_MS, NS_PER_S
+
+LOOK_S = 0.25
+STUCK_NS = NS_PER_S
+# A frame is told late after so many refresh periods, and so many ms: less happens on any busy machine.
+LATE_PERIODS = 3.0
+LATE_NS = 50 * NS_PER_MS
+TOLD_EVERY_NS = NS_PER_S
+
+
+class FrameWatch:
+    """Takes the stages of each frame from the loop's thread; a thread of its own tells of one that does not end."""
+
+    def __init__(self, period_ns: float, notices: Notices) -> None:
+        self._late_ns = max(LATE_PERIODS * period_ns, LATE_NS)
+        self._notices = notices
+        self._number = 0
+        self._stages: list[tuple[str, int]] = []  # name and begin; one list, so that the other thread reads a whole one
+        self._told_ns = 0
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="hilstar-watchdog", daemon=True)
+
+    def begin(self, number: int) -> None:
+        """A frame begins, with its sprites."""
+        self._number = number
+        self._stages = [("sprites", time.monotonic_ns())]
+
+    def enter(self, stage: str) -> None:
+        """Its next stage begins."""
+        self._stages.append((stage, time.monotonic_ns()))
+
+    def end(self, timed: bool) -> None:
+        """The frame is done, or given up; one that is not `timed` is never late."""
+        now_ns, stages = time.monotonic_ns(), self._stages
+        self._stages = []
+        if not timed or not stages or now_ns - stages[0][1] <= self._late_ns:
+            return
+        if now_ns - self._told_ns > TOLD_EVERY_NS:
+            self._told_ns = now_ns
+            took_ms = (now_ns - stages[0][1]) / NS_PER_MS
+            self._notices.tell("frame-late", f"frame {self._number} took {took_ms:.0f} ms: {_told(stages, now_ns)}")
+
+    def _run(self) -> None:
+        stuck: tuple[str, int] | None = None
+        while not self._stop.wait(LOOK_S):
+            stages, number = self._stages, self._number
+            if not stages or stages[-1] == stuck:
+                continue
+            now_ns = time.monotonic_ns()
+            if now_ns - stages[-1][1] > STUCK_NS:
+                stuck = stages[-1]
+                self._notices.tell(
+                    "frame-stuck", f"frame {number} hangs in its stage {stuck[0]} since {(now_ns - stuck[1]) / NS_PER_S:.1f} s"
+                )
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+        self._stop.set()
+        self._thread.join()
+
+
+def _told(stages: list[tuple[str, int]], end_ns: int) -> str:
+    ends_ns = [begin for _, begin in stages[1:]] + [end_ns]
+    return ", ".join(f"{name} {(end - begin) / NS_PER_MS:.1f}" for (name, begin), end in zip(stages, ends_ns, strict=True))

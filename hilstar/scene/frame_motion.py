@@ -1,0 +1,152 @@
+"""Stars of one frame of a screen that lights row by row, while the camera turns.
+
+Row y of a screen begins its light a part of a refresh period later than the first, and keeps it until it is written anew.
+So a star is drawn where it is while the row under it is lit: on its path from the moment when that row lights to the end of
+its light, as a chain of sprites that weigh together as much as the star. Frame by frame the paths join to one streak.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hilstar.arrays import FloatArray, IntArray
+from hilstar.rotation import propagate, to_matrix
+from hilstar.scene.camera import Camera
+from hilstar.scene.paths import Chords, Paths, node_counts, nodes_of, within_budget
+from hilstar.scene.sprites import Sprites, brightest, max_stars, pack_sprites
+from hilstar.sky.stars import Stars
+
+# With ceil(0.6 r + 1) nodes on a path of r sigmas no pixel is off by more than 1e-3 of the star's flux (measured for sigma
+# 0.5 to 2 px and r to 30; tests/unit/test_sweep.py holds it): its flux and centroid are exact with any number.
+NODES_PER_SIGMA = 0.6
+# A path of so many sigmas is a point to 1e-3 of the star's flux.
+POINT_SIGMA = 0.27
+# A frame's work is bounded: each star has one sprite, all paths together so many more (of so many pixels), and no path is
+# longer than this share of the field's radius. Past that paths are drawn with fewer nodes, or as those of a slower turn, and
+# the stars counted. With 1000 stars in view the longest frame then takes at most 1.8 times as long as a still one
+# (python -m tests.benchmarks.bench_motion).
+EXTRA_SPRITES = 1000
+EXTRA_PX = 400_000
+MAX_TURN_FIELD = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Scan:
+    """How a screen lights: rows in turn over `scanout_s`, each then for `hold_s`.
+
+    `down` is the direction of the screen's rows in image axes (x right, y down), one of the four along an axis.
+    """
+
+    down: tuple[int, int] = (0, 1)
+    scanout_s: float = 0.0
+    hold_s: float = 0.0
+
+    @property
+    def whole_s(self) -> float:
+        """From the first row's first light to the last row's last."""
+        return self.scanout_s + self.hold_s
+
+    @property
+    def longest_s(self) -> float:
+        """For so long a star of the frame may have moved, seen from the middle row's first light."""
+        return self.scanout_s / 2 + self.hold_s
+
+    def late_s(self, x_px: FloatArray, y_px: FloatArray, resolution_px: tuple[int, int]) -> FloatArray:
+        """How long after the middle row the row under a pixel lights; off the image as at its edge."""
+        middle_x, middle_y = ((size - 1) / 2 for size in resolution_px)
+        rows = resolution_px[0] if self.down[0] else resolution_px[1]
+        place = (self.down[0] * (x_px - middle_x) + self.down[1] * (y_px - middle_y)) / rows
+        return np.asarray(np.clip(place, -0.5, 0.5) * self.scanout_s)
+
+
+@dataclass(frozen=True, slots=True)
+class Turn:
+    """The attitude when the middle row lights, and the rate of cam in icrs (3,), cam components, constant over the frame."""
+
+    q_icrs_to_cam: FloatArray
+    rate_cam_rad_s: FloatArray
+
+    @property
+    def speed_rad_s(self) -> float:
+        """How fast the camera turns."""
+        return float(np.linalg.norm(self.rate_cam_rad_s))
+
+
+def swept_sprites(
+    stars: Stars, turn: Turn, scan: Scan, camera: Camera, footprint_px: int, sigma_px: tuple[float, float]
+) -> Sprites:
+    """Sprites of each star on its path over the light of the row that it is on; several sprites of a star follow each other.
+
+    `capped` of what comes out are the stars whose paths are coarser than NODES_PER_SIGMA, or shorter than the turn makes them.
+    """
+    turn, slowed = _slowed(turn, scan, camera)
+    middle = Turn(propagate(turn.q_icrs_to_cam, turn.rate_cam_rad_s, scan.hold_s / 2), turn.rate_cam_rad_s)
+    axis = (camera.cam_to_image @ to_matrix(middle.q_icrs_to_cam))[2]
+    reach_rad = camera.field_radius_rad(footprint_px / 2 + 1) + turn.speed_rad_s * scan.whole_s / 2
+    near = stars.grid.near(axis, reach_rad)
+    seen = stars.vectors[near] @ (camera.cam_to_image @ to_matrix(turn.q_icrs_to_cam)).T
+    paths = Paths(seen, camera.cam_to_image @ turn.rate_cam_rad_s, camera)
+    late_s = _row_delays_s(paths, scan, camera)
+    wanted, part = _wanted_nodes(paths, late_s, scan, footprint_px, sigma_px)
+    counts = within_budget(_of_the_brightest(wanted, stars.electrons_per_s[near], footprint_px), _extra(footprint_px))
+    nodes = nodes_of(counts)
+    begin, length = part[0][nodes.path], (part[1] - part[0])[nodes.path]
+    seconds = late_s[nodes.path] + (begin + length * (nodes.place + 1) / 2) * scan.hold_s
+    x_px, y_px = paths.places_px(nodes.path, seconds)
+    star = near[nodes.path]
+    light = nodes.share * length * stars.electrons_per_s[star]
+    sprites = pack_sprites(x_px, y_px, light, star, (camera.resolution_px, footprint_px))
+    capped = int(((wanted > 0) if slowed else (counts < wanted)).sum())
+    return replace(sprites, per_star=int(counts.max(initial=1)), capped=capped)
+
+
+def _extra(footprint_px: int) -> int:
+    """How many sprites all paths together may have over one a star: large ones are fewer."""
+    return min(EXTRA_SPRITES, EXTRA_PX // footprint_px**2)
+
+
+def _of_the_brightest(wanted: IntArray, electrons_per_s: FloatArray, footprint_px: int) -> IntArray:
+    """`wanted` (n,) with none for the faintest of those that want any, where a frame has no room for all."""
+    wanting = np.flatnonzero(wanted)
+    kept = brightest(electrons_per_s[wanting], max_stars(footprint_px))
+    if kept is None:
+        return wanted
+    chosen = np.zeros_like(wanted)
+    chosen[wanting[kept]] = wanted[wanting[kept]]
+    return chosen
+
+
+def _slowed(turn: Turn, scan: Scan, camera: Camera) -> tuple[Turn, bool]:
+    """The turn itself, or one about the same axis that takes no star farther than MAX_TURN_FIELD; and whether it is slower."""
+    angle_rad, most_rad = turn.speed_rad_s * scan.whole_s, MAX_TURN_FIELD * camera.field_radius_rad(0.0)
+    if angle_rad <= most_rad:
+        return turn, False
+    return Turn(turn.q_icrs_to_cam, turn.rate_cam_rad_s * (most_rad / angle_rad)), True
+
+
+def _row_delays_s(paths: Paths, scan: Scan, camera: Camera) -> FloatArray:
+    """How long after the middle row each star's own row lights."""
+    every, late_s = np.arange(len(paths)), np.zeros(len(paths))
+    for _ in range(2 if scan.scanout_s else 0):
+        # Each pass leaves the part of the frame that the star crosses in it: 1e-5 of it for 5 px in 1080 rows.
+        x_px, y_px = paths.places_px(every, late_s)
+        late_s = scan.late_s(x_px, y_px, camera.resolution_px)
+    return np.where(np.isfinite(late_s), late_s, 0.0)
+
+
+def _wanted_nodes(
+    paths: Paths, late_s: FloatArray, scan: Scan, footprint_px: int, sigma_px: tuple[float, float]
+) -> tuple[IntArray, tuple[FloatArray, FloatArray]]:
+    """How many nodes each star's path needs on the image (0: it is not there), and the part of its time that it is there."""
+    every = np.arange(len(paths))
+    ends = [paths.places_px(every, late_s + seconds) for seconds in (0.0, scan.hold_s)]
+    chords = Chords(np.stack([x for x, _ in ends]), np.stack([y for _, y in ends]))
+    angle_rad = paths.speed_rad_s * scan.hold_s
+    # An arc bulges from its chord, and a star runs unevenly along it, by less than the angle of the turn.
+    bulge_px = angle_rad * np.nan_to_num(chords.length_sigma((1.0, 1.0)))
+    begin, end = chords.on_image(paths.camera.resolution_px, footprint_px / 2 + 1 + bulge_px)
+    counts = node_counts(chords.length_sigma(sigma_px) * (end - begin), NODES_PER_SIGMA, 1, POINT_SIGMA)
+    counts[end <= begin] = 0
+    return counts, (begin, end)

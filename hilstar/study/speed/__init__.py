@@ -1,0 +1,1 @@
+"""How long a frame takes, beside other ways to the same image."""

@@ -1,0 +1,1 @@
+"""Where methods fail: each place, by how much, and what hilstar does there."""

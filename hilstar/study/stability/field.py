@@ -1,0 +1,197 @@
+"""Where methods fail between directions and pixels: the poles, the wrap of right ascension, the edge of a field."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from hilstar.arrays import FloatArray
+from hilstar.monitor.geometry import monitor_camera
+from hilstar.rotation import from_radec_roll_deg, to_matrix, to_radec_roll_deg
+from hilstar.scene.camera import Camera
+from hilstar.scene.sprites import pack_sprites
+from hilstar.sky.astrometry import RAD_PER_MAS, unit_vectors_icrs
+from hilstar.sky.catalog import HIPPARCOS_EPOCH_JYEAR, load_catalog
+from hilstar.sky.cells import cell_grid
+from hilstar.study.stability.failing_place import Figures, Place
+from hilstar.units import ARCSEC_PER_RAD
+
+# float64 knows a direction to 2e-16 rad, 5e-8 mas: 200 times that for the few operations on it.
+DIRECTION_MAS = 1e-5
+# Turning by 2e-16 rad moves a place by that times f / cos^2: 1.7 px * 3.3e5 * 2e-16 = 1e-10 px at 89.9 degrees. Times 100.
+EDGE_PX = 1e-8
+NONE_LOST = 0.0
+ALIGNED = np.array([1.0, 0.0, 0.0, 0.0])
+# The demo's lens and pitch (configs/demo.toml), and about the field angle of its monitor's corner, which weak perspective is
+# judged at; README.md promises centroids to 1.1e-5 px.
+FOCAL_LENGTH_MM, PITCH_UM = 350.0, 57.65
+CORNER_DEG = 10.0
+CENTROID_PX = 1.1e-5
+
+
+def motion_at_pole() -> Place:
+    """Proper motion a thousandth of a degree from the pole."""
+    catalog = load_catalog().brighter_than(-1.0)  # Sirius alone, whose numbers are then replaced
+    n, years = len(catalog), 34.75
+    at_pole = replace(
+        catalog,
+        ra_deg=np.full(n, 359.9999),
+        dec_deg=np.full(n, 89.999),
+        pm_ra_cosdec_mas_yr=np.full(n, 100.0),
+        pm_dec_mas_yr=np.full(n, 50.0),
+    )
+    moved = unit_vectors_icrs(at_pole, HIPPARCOS_EPOCH_JYEAR + years)[0]
+    turn_deg = 100.0 * years * RAD_PER_MAS / np.radians(1.0)
+    dec_deg = 89.999 + turn_deg / 2
+    wrong = [_vector(359.9999 + turn_deg / cosine, dec_deg) for cosine in (1.0, np.cos(np.radians(89.999)))]
+    exact = _great_circle(359.9999, 89.999, np.array([100.0, 50.0]) * years * RAD_PER_MAS)
+    error, *faults = (_apart_rad(v, exact) / RAD_PER_MAS for v in (moved, *wrong))
+    return Place(
+        "proper motion at declination 89.999",
+        "RA + pm t, as eq. 2.1; with pm / cos(dec)",
+        f"{faults[0]:.0f} mas off after {years:g} years; {faults[1]:.2g} mas",
+        f"{error:.1e} mas off a great circle",
+        "space motion on unit vectors: nothing divides by cos(dec)",
+        Figures(error, min(faults), DIRECTION_MAS),
+    )
+
+
+def _vector(ra_deg: float, dec_deg: float) -> FloatArray:
+    ra, dec = np.radians(ra_deg), np.radians(dec_deg)
+    return np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
+
+
+def _great_circle(ra_deg: float, dec_deg: float, path_rad: FloatArray) -> FloatArray:
+    """Where a straight path in space ends, seen at `path_rad` (east, north), by angles along a great circle."""
+    ra, dec = np.radians(ra_deg), np.radians(dec_deg)
+    east = np.array([-np.sin(ra), np.cos(ra), 0.0])
+    north = np.array([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)])
+    length = float(np.hypot(*path_rad))
+    along = (path_rad[0] * east + path_rad[1] * north) / length
+    angle = np.arctan(length)
+    return np.asarray(np.cos(angle) * _vector(ra_deg, dec_deg) + np.sin(angle) * along)
+
+
+def _apart_rad(a: FloatArray, b: FloatArray) -> float:
+    return float(np.linalg.norm(np.cross(a, b)))
+
+
+def fields_over_wrap_and_pole() -> Place:
+    """Fields of 10 degrees on the RA wrap and about the pole."""
+    catalog = load_catalog().brighter_than(7.5)
+    vectors = unit_vectors_icrs(catalog, HIPPARCOS_EPOCH_JYEAR)
+    grid, radius = cell_grid(vectors), 10.0
+    lost, box_lost, seen = 0, 0, 0
+    for ra_deg, dec_deg in ((0.01, 0.0), (359.99, -45.0), (200.0, 89.0), (20.0, -90.0)):
+        axis = _vector(ra_deg, dec_deg)
+        inside = np.flatnonzero(vectors @ axis >= np.cos(np.radians(radius)))
+        box = (np.abs(catalog.ra_deg - ra_deg) <= radius) & (np.abs(catalog.dec_deg - dec_deg) <= radius)
+        lost += len(np.setdiff1d(inside, grid.order[grid.near(axis, np.radians(radius))]))
+        box_lost, seen = box_lost + int((~box[inside]).sum()), seen + len(inside)
+    return Place(
+        "fields over RA = 0 and over the poles",
+        "stars chosen by a box in RA and declination",
+        f"{box_lost} of {seen} stars within {radius:.0f} degrees lost",
+        f"{lost} lost",
+        "cells of the sphere are chosen by the angle between unit vectors",
+        Figures(float(lost), float(box_lost), NONE_LOST),
+    )
+
+
+def stars_behind() -> Place:
+    """Half of the sky lies behind the camera."""
+    camera, vectors = _camera(70.0), unit_vectors_icrs(load_catalog().brighter_than(7.5), HIPPARCOS_EPOCH_JYEAR)
+    behind = vectors[vectors[:, 2] <= 0]
+    ghosts = _on_image(behind[:, :2] / behind[:, 2:] * camera.focal_length_px + camera.principal_point_px, camera)
+    ours = _on_image(np.column_stack(camera.project(behind)), camera)
+    return Place(
+        "stars behind the camera",
+        "x = f X / Z for every star",
+        f"{ghosts} of {len(behind)} stars behind are drawn, mirrored",
+        f"{ours} drawn",
+        "a star is projected only with Z > 0",
+        Figures(float(ours), float(ghosts), NONE_LOST),
+    )
+
+
+def _camera(half_field_deg: float) -> Camera:
+    """2000 px across, so many degrees from the middle to the edge."""
+    focal_length_mm = 1000.0 / np.tan(np.radians(half_field_deg)) * 1e-3
+    return monitor_camera((2001, 2001), 1.0, focal_length_mm, ALIGNED)
+
+
+def _on_image(places_px: FloatArray, camera: Camera) -> int:
+    flux, star = np.ones(len(places_px)), np.arange(len(places_px), dtype=np.intp)
+    return len(pack_sprites(places_px[:, 0], places_px[:, 1], flux, star, (camera.resolution_px, 1)))
+
+
+def field_of_180_deg() -> Place:
+    """A field that grows to 180 degrees."""
+    error, fault, spread = 0.0, 0.0, 0.0
+    for half_deg in (60.0, 85.0, 89.0, 89.9):
+        camera = _camera(half_deg)
+        angle = np.radians(np.linspace(0.0, half_deg, 1000))
+        vectors = np.column_stack([np.sin(angle), np.zeros(1000), np.cos(angle)])
+        exact = camera.focal_length_px * np.tan(angle) + 1000.0
+        error = max(error, float(np.abs(camera.project(vectors)[0] - exact).max()))
+        fault = max(fault, float(np.abs(camera.project(vectors.astype(np.float32).astype(np.float64))[0] - exact).max()))
+        spread = 1 / np.cos(angle[-1]) ** 2
+    return Place(
+        "a field of 179.8 degrees",
+        "float32 directions",
+        f"{fault:.2g} px off at its edge, of 1000",
+        f"{error:.1e} px off; but a degree at the edge is {spread:.2g} times a degree in the middle",
+        "float64; the perspective itself diverges at 180 degrees, as a flat monitor does",
+        Figures(error, fault, EDGE_PX),
+    )
+
+
+def boresight_at_pole() -> Place:
+    """A boresight a millionth of a degree from the pole, read back from its quaternion."""
+    wanted_deg = 90.0 - 1e-6
+    q = from_radec_roll_deg(123.0, wanted_deg, 10.0)
+    naive_deg = float(np.degrees(np.arcsin(np.clip(to_matrix(q)[2, 2], -1, 1))))
+    ra_deg, dec_deg, roll_deg = to_radec_roll_deg(q)
+    error, fault = (abs(d - wanted_deg) * 3.6e6 for d in (dec_deg, naive_deg))
+    return Place(
+        "a boresight at declination 89.999999",
+        "declination by arcsin",
+        f"{fault:.2g} mas off",
+        f"{error:.1g} mas off; RA {ra_deg:.6f} of 123 and roll {roll_deg:.6f} of 10 degrees",
+        "arctan2 of all three components",
+        Figures(error, fault, DIRECTION_MAS),
+    )
+
+
+def weak_perspective_px(angle_rad: FloatArray, focal_length_px: float) -> FloatArray:
+    """Distances from the axis, px, with one depth Z0 = 1 for every star: x = f X / Z0 (what eq. 4.3 and 4.4 mean)."""
+    return np.asarray(focal_length_px * np.sin(angle_rad))
+
+
+def weak_perspective_error(angle_deg: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """What weak perspective is off by at field angles (n,), with the demo's lens and monitor: px and arcsec."""
+    angle = np.radians(angle_deg)
+    focal_length_px = FOCAL_LENGTH_MM * 1e3 / PITCH_UM
+    off_px = weak_perspective_px(angle, focal_length_px) - focal_length_px * np.tan(angle)
+    # The tracker takes the monitor for a plane, so it sees the star where that place's tangent is.
+    return off_px, (np.arctan(np.sin(angle)) - angle) * ARCSEC_PER_RAD
+
+
+def weak_perspective() -> Place:
+    """One depth for every star, against the field angle."""
+    angles = np.array([1.0, 5.0, CORNER_DEG])
+    off_px, off_arcsec = weak_perspective_error(angles)
+    camera = monitor_camera((4001, 4001), PITCH_UM, FOCAL_LENGTH_MM, ALIGNED)
+    angle = np.radians(angles)
+    x_px, _ = camera.project(np.column_stack([np.sin(angle), np.zeros(3), np.cos(angle)]))
+    error = float(np.abs(x_px - 2000.0 - camera.focal_length_px * np.tan(angle)).max())
+    fails = ", ".join(f"{a:g} deg: {px:.2g} px, {s:.3g} arcsec" for a, px, s in zip(angles, off_px, off_arcsec, strict=True))
+    return Place(
+        "field angle, one depth for all",
+        "weak perspective, x = f X / Z0",
+        fails,
+        f"{error:.1e} px off at most",
+        "each star's own Z; eq. 4.3 and 4.4 divide by it too, and so are no weak perspective",
+        Figures(error, float(np.abs(off_px).max()), CENTROID_PX),
+    )

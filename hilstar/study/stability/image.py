@@ -1,0 +1,311 @@
+"""Where methods fail between sprites and the image: very narrow, very wide, on edges, too many, too bright, moving."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+
+import numpy as np
+from scipy.special import erf, ndtr
+
+from hilstar.arrays import Float32Array, FloatArray
+from hilstar.errors import InputError
+from hilstar.render.reference import linear_image
+from hilstar.render.renderer import Renderer, Target, create_context
+from hilstar.scene.psf import LARGEST_CUT, SQRT2, cut_share, footprint_px, pixel_shares
+from hilstar.scene.sprites import Sprites, join_sprites, pack_sprites
+from hilstar.study.stability.failing_place import Figures, Place
+
+IMAGE_PX = (512, 512)
+SIGMA_PX = 0.85
+SEED = 1
+# The shader's erf (tests/gpu/test_renderer.py); a share along an axis is half the difference of two.
+ERF_ERROR = 4.4e-7
+# The footprint cuts LARGEST_CUT of a star's light, and the outermost edges along both axes are off by ERF_ERROR.
+FLUX_ERROR = LARGEST_CUT + 2 * ERF_ERROR
+# The share of the peak along an axis is 1 / (sqrt(2 pi) 20) at sigma 20, and there are two axes.
+PEAK_ERROR = 2 * ERF_ERROR * float(np.sqrt(2 * np.pi)) * 20
+CENTROID_PX = 1.1e-5  # what README.md promises of the linear image
+NOTHING = 0.0
+CROWD, CROWD_PX, CORNER_PX = 100_000, (1024, 1024), 128
+# Ten stars on a pixel are added in float32: half of 1.2e-7 each time, on top of each star's own error.
+CROWD_ERROR = FLUX_ERROR + 10 * 6e-8
+POINT_SAMPLED = "the Gaussian's value at the middle of each pixel"
+
+# splat.frag's, from the highest power of x^2 down.
+ERF_NUMERATOR = (
+    *(-2.72614225801306e-10, 2.77068142495902e-08, -2.10102402082508e-06, -5.69250639462346e-05),
+    *(-7.34990630326855e-04, -2.95459980854025e-03, -1.60960333262415e-02),
+)
+ERF_DENOMINATOR = (
+    *(-1.45660718464996e-05, -2.13374055278905e-04, -1.68282697438203e-03),
+    *(-7.37332916720468e-03, -1.42647390514189e-02),
+)
+
+Draw = Callable[[Sprites], FloatArray]
+
+
+def target(sigma_px: float, size_px: tuple[int, int] = IMAGE_PX) -> Target:
+    """A linear image, whose stars are round."""
+    return Target(size_px, (sigma_px, sigma_px))
+
+
+def one_star(x_px: float, y_px: float, on: Target, electrons_per_s: float = 1.0) -> Sprites:
+    """A star of a target's sigma."""
+    place = np.array([x_px]), np.array([y_px]), np.array([electrons_per_s])
+    return pack_sprites(*place, np.zeros(1, dtype=np.intp), (on.resolution_px, footprint_px(on.sigma_px)))
+
+
+@contextmanager
+def by_renderer(on: Target) -> Iterator[Draw]:
+    """What makes linear images (h, w) of sprites, as hilstar does."""
+    with Renderer(on) as gl:
+
+        def draw(sprites: Sprites) -> FloatArray:
+            gl.draw(sprites)
+            return gl.linear().astype(np.float64)
+
+        yield draw
+
+
+def _outer(on: Target, sprites: Sprites, shares: Callable[[FloatArray, float], FloatArray]) -> FloatArray:
+    """One star's image from its shares along each axis, by a pixel's offset from it and sigma, px."""
+    places = zip((sprites.x_px[0], sprites.y_px[0]), on.resolution_px, on.sigma_px, strict=True)
+    along_x, along_y = (shares(np.arange(size) - at, sigma_px) for at, size, sigma_px in places)
+    return np.asarray(float(sprites.data["electrons_per_s"][0]) * np.outer(along_y, along_x))
+
+
+def point_sampled(on: Target, sprites: Sprites) -> FloatArray:
+    """One star with the Gaussian's value at the middle of each pixel, (h, w)."""
+    return _outer(on, sprites, lambda offset, sigma: np.exp(-0.5 * (offset / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi)))
+
+
+def half_float(on: Target, sprites: Sprites) -> FloatArray:
+    """One star by erf differences in float16, the least that GLES calls mediump."""
+    return _outer(on, sprites, lambda *place: _difference(lambda edge: erf(edge).astype(np.float16), *place))
+
+
+def bare_polynomial(on: Target, sprites: Sprites) -> FloatArray:
+    """One star by the shader's polynomial in float32, without its max(difference, 0)."""
+    return _outer(on, sprites, lambda *place: _difference(erf_float32, *place))
+
+
+def nearest_pixel(on: Target, sprites: Sprites) -> FloatArray:
+    """One star with all of its light in the nearest pixel."""
+    return _outer(on, sprites, lambda offset, _: (np.arange(len(offset)) == np.abs(offset).argmin()).astype(np.float64))
+
+
+def _difference(erf_of: Callable[[FloatArray], FloatArray], offset_px: FloatArray, sigma_px: float) -> FloatArray:
+    far, near = (erf_of((offset_px + side) / (sigma_px * SQRT2)) for side in (0.5, -0.5))
+    return np.asarray((far - near).astype(np.float64) / 2)
+
+
+def erf_float32(value: FloatArray) -> FloatArray:
+    """erf by splat.frag's rational polynomial, every step in float32; same shape."""
+    x = np.clip(value, -4, 4).astype(np.float32)
+    return np.asarray(x * _horner(x * x, ERF_NUMERATOR) / _horner(x * x, ERF_DENOMINATOR))
+
+
+def _horner(s: Float32Array, terms: tuple[float, ...]) -> Float32Array:
+    value = np.zeros_like(s)
+    for term in terms:
+        value = value * s + np.float32(term)
+    return value
+
+
+def star_errors(draw: Draw, on: Target, phases_px: FloatArray) -> tuple[float, float]:
+    """Over sub-pixel phases the largest error of a star's flux, relative, and of its centre of gravity, px."""
+    flux_error, off_px = 0.0, 0.0
+    for phase in phases_px:
+        image = draw(one_star(256 + phase, 256.0, on))
+        light = float(image.sum())
+        flux_error = max(flux_error, abs(light - 1))
+        off_px = max(off_px, abs(float(image.sum(axis=0) @ np.arange(IMAGE_PX[0])) / light - 256 - phase))
+    return flux_error, off_px
+
+
+def narrow_star() -> Place:
+    """Sigma 0.1 px."""
+    (error, off_px), (fault, fault_px) = narrow_errors(0.1)
+    (_, wider_px), (_, wider_fault_px) = narrow_errors(0.5)
+    return Place(
+        "sigma 0.1 px",
+        POINT_SAMPLED,
+        f"flux off by up to {100 * fault:.0f} %, centre of gravity by {fault_px:.2f} px ({wider_fault_px:.4f} at sigma 0.5)",
+        f"flux off by {error:.1e}; centre of gravity by {off_px:.2f} px ({wider_px:.4f} at sigma 0.5)",
+        "the Gaussian is integrated over pixels; the centroid that is lost then, any pixel loses: write 0.5 px or more",
+        Figures(error, fault, FLUX_ERROR),
+    )
+
+
+def narrow_errors(sigma_px: float) -> tuple[tuple[float, float], tuple[float, float]]:
+    """What `star_errors` says of the renderer and of point sampling."""
+    on, phases = target(sigma_px), np.linspace(-0.5, 0.5, 21)
+    with by_renderer(on) as draw:
+        return star_errors(draw, on, phases), star_errors(partial(point_sampled, on), on, phases)
+
+
+def wide_star() -> Place:
+    """Sigma 20 px."""
+    on = target(20.0)
+    sprites = one_star(256.3, 256.0, on)
+    exact = linear_image(sprites, on.resolution_px, on.sigma_px)
+    with by_renderer(on) as draw:
+        image = draw(sprites)
+    error, fault = (float(np.abs(shown - exact).max() / exact.max()) for shown in (image, half_float(on, sprites)))
+    return Place(
+        "sigma 20 px",
+        "erf differences in half floats",
+        f"a pixel off by up to {100 * fault:.0f} % of the peak",
+        f"{error:.0e} of the peak; the star's flux off by {image.sum() - 1:+.0e}",
+        "float32 differences are small against the flux, and their errors cancel in the sum",
+        Figures(error, fault, PEAK_ERROR),
+    )
+
+
+def negative_wings() -> Place:
+    """Far out both erfs are 1 but for rounding."""
+    on = target(20.0)
+    sprites = one_star(256.3, 256.0, on)
+    with by_renderer(on) as draw:
+        image = draw(sprites)
+    bare = bare_polynomial(on, sprites)
+    error, fault = (int((shown < 0).sum()) for shown in (image, bare))
+    return Place(
+        "the wings of a star, sigma 20 px",
+        "float32 erf differences as they come",
+        f"{fault} pixels of negative light, down to {bare.min():.0e} of the star's",
+        f"{error} negative pixels",
+        "the shader takes the larger of difference and 0",
+        Figures(float(error), float(fault), NOTHING),
+    )
+
+
+def floored_wings() -> Place:
+    """A floor of 1e-7 under each pixel's share."""
+    on = target(SIGMA_PX)
+    sprites = one_star(256.3, 256.0, on)
+    with by_renderer(on) as draw:
+        error = float(abs(draw(sprites).sum() - 1))
+    fault = float(np.maximum(_outer(on, sprites, pixel_shares), 1e-7).sum() - 1)
+    return Place(
+        "a floor of 1e-7 of a star's light",
+        "max(share, 1e-7) in every pixel",
+        f"adds {100 * fault:.1f} % to each star, over {IMAGE_PX[0]} x {IMAGE_PX[1]} pixels",
+        f"flux off by {error:.0e}",
+        "no floor: outside its footprint a star has no light",
+        Figures(error, fault, FLUX_ERROR),
+    )
+
+
+def absurd_sigmas() -> Place:
+    """Sigmas that no sprite can hold."""
+    context = create_context()
+    point_px = int(context.info["GL_POINT_SIZE_RANGE"][1])
+    context.release()
+    lines, silently_cut = [], NOTHING
+    for sigma_px in (60.0, 1e6):
+        try:
+            Renderer(Target(IMAGE_PX, (sigma_px, sigma_px))).close()
+            silently_cut = max(silently_cut, cut_share(point_px, (sigma_px, sigma_px)))
+        except InputError as refusal:
+            lines.append(str(refusal))
+    cuts = [cut_share(point_px, (sigma_px, sigma_px)) for sigma_px in (60.0, 1e6)]
+    return Place(
+        "sigma 60 and 1e6 px",
+        f"GL's largest point, {point_px} px, all the same",
+        f"cuts {100 * cuts[0]:.1f} % and {100 * cuts[1]:.5f} % of a star's light",
+        "refused: " + " | ".join(lines),
+        "a point of GL is a star's footprint",
+        Figures(silently_cut, max(cuts), LARGEST_CUT),
+    )
+
+
+def star_on_pixel_edge() -> Place:
+    """A star where two pixels meet, and a hair to either side."""
+    on, phases = target(SIGMA_PX), np.array([-0.5, 0.5 - 1e-9, 0.5, 0.5 + 1e-9])
+    with by_renderer(on) as draw:
+        (_, off_px), (_, fault_px) = (star_errors(by, on, phases) for by in (draw, partial(nearest_pixel, on)))
+    return Place(
+        "a star on a pixel's edge",
+        "the nearest pixel",
+        f"centre {fault_px:.2f} px off, to either side",
+        f"centre {off_px:.0e} px off",
+        "light goes to both pixels; place is whole pixel and float32 fraction",
+        Figures(off_px, fault_px, CENTROID_PX),
+    )
+
+
+def star_on_image_edge() -> Place:
+    """Stars whose centres are on and beyond the image's edges and corner."""
+    errors, faults, last, on = [], [], IMAGE_PX[0] - 1.0, target(SIGMA_PX)
+    for x_px, y_px in ((-0.5, 256.0), (-0.6, 256.0), (last + 0.6, 256.0), (256.0, -2.0), (-0.6, last + 0.6)):
+        exact = float(np.prod([ndtr((at + 0.5) / SIGMA_PX) - ndtr((at - last - 0.5) / SIGMA_PX) for at in (x_px, y_px)]))
+        inside = 0 <= np.rint(x_px) <= last and 0 <= np.rint(y_px) <= last
+        with by_renderer(on) as draw:
+            errors.append(abs(float(draw(one_star(x_px, y_px, on)).sum()) - exact))
+        faults.append(abs(float(inside) - exact))
+    error, fault = max(errors), max(faults)
+    return Place(
+        "stars on the image's edge",
+        "a star is drawn whole or not, by its centre",
+        f"up to {100 * fault:.0f} % of its light too much or too little",
+        f"light on the image off by {error:.0e} of the star's",
+        "a star is drawn where its footprint touches the image, and cut there",
+        Figures(error, fault, FLUX_ERROR),
+    )
+
+
+def many_stars() -> Place:
+    """100 000 stars in view."""
+    rng = np.random.default_rng(SEED)
+    x_px, y_px = rng.uniform(10, CROWD_PX[0] - 11, (2, CROWD))
+    flux = 10 ** rng.uniform(0, 4, CROWD)
+    on, size = target(SIGMA_PX, CROWD_PX), (CORNER_PX, CORNER_PX)
+    sprites = pack_sprites(x_px, y_px, flux, np.arange(CROWD), (CROWD_PX, footprint_px(on.sigma_px)))
+    with by_renderer(on) as draw:
+        image = draw(sprites)
+    corner = linear_image(pack_sprites(x_px, y_px, flux, np.arange(CROWD), (size, sprites.footprint_px)), size, (SIGMA_PX,) * 2)
+    pixel_error = float(np.abs(image[:CORNER_PX, :CORNER_PX] - corner).max() / corner.max())
+    error, fault = (float(abs(shown.sum() / flux.sum() - 1)) for shown in (image, _indexed_sum(sprites)))
+    return Place(
+        f"{CROWD} stars in view",
+        "image[rows, columns] += light",
+        f"{100 * fault:.0f} % of the light lost: an index that comes twice is added once",
+        f"light off by {error:.0e}; {pixel_error:.0e} of the brightest pixel, over {CORNER_PX} x {CORNER_PX}",
+        "the GPU blends every sprite, in float32",
+        Figures(max(error, pixel_error), fault, CROWD_ERROR),
+    )
+
+
+def _indexed_sum(sprites: Sprites) -> FloatArray:
+    steps = np.arange(sprites.footprint_px) - (sprites.footprint_px - 1) // 2
+    columns, rows = (sprites.data["pixel"][:, axis, None] + steps for axis in (0, 1))
+    light = pixel_shares(rows - sprites.y_px[:, None], SIGMA_PX) * sprites.data["electrons_per_s"][:, None]
+    image = np.zeros(CROWD_PX[::-1])
+    image[rows[:, :, None], columns[:, None, :]] += (
+        light[:, :, None] * pixel_shares(columns - sprites.x_px[:, None], SIGMA_PX)[:, None, :]
+    )
+    return image
+
+
+def flux_range() -> Place:
+    """Twelve decades side by side."""
+    flux, on = np.array([1e12, 1.0]), target(SIGMA_PX)
+    stars = [one_star(x_px, 256.0, on, light) for x_px, light in zip((100.3, 120.3), flux, strict=True)]
+    with by_renderer(on) as draw:
+        image = draw(join_sprites(stars, stars[0].footprint_px))
+    scaled = np.rint(image / image.max() * 65535) * image.max() / 65535
+    errors, faults = (
+        [abs(float(shown[:, part].sum()) / light - 1) for part, light in zip((slice(110), slice(110, None)), flux, strict=True)]
+        for shown in (image, scaled)
+    )
+    return Place(
+        "flux range 1e12",
+        "16 bits, scaled to the brightest pixel",
+        f"fluxes off by {faults[0]:.0e} and {faults[1]:.0e}: the faint star is gone",
+        f"fluxes off by {errors[0]:.0e} and {errors[1]:.0e}",
+        "float32, and each star in its own footprint",
+        Figures(max(errors), max(faults), FLUX_ERROR),
+    )

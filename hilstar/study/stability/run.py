@@ -1,0 +1,63 @@
+"""Where methods fail: each place with the method that fails there, by how much, what hilstar does, and why."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from hilstar.charts import write_csv
+from hilstar.study.stability import attitude, field, image, popping, sky, tracker
+from hilstar.study.stability.charts import draw_charts
+from hilstar.study.stability.failing_place import Place
+
+VISITS: tuple[Callable[[], Place], ...] = (
+    sky.bluest_star,
+    sky.reddest_star,
+    sky.temperature_range,
+    sky.planck_overflow,
+    sky.source_step,
+    sky.cool_stars,
+    sky.blind_tracker,
+    field.motion_at_pole,
+    field.fields_over_wrap_and_pole,
+    field.boresight_at_pole,
+    field.stars_behind,
+    field.field_of_180_deg,
+    field.weak_perspective,
+    image.narrow_star,
+    image.wide_star,
+    image.negative_wings,
+    image.floored_wings,
+    image.absurd_sigmas,
+    image.star_on_pixel_edge,
+    image.star_on_image_edge,
+    image.many_stars,
+    image.flux_range,
+    popping.popping,
+    popping.popping_codes,
+    tracker.billion_electrons,
+    tracker.full_well,
+    tracker.empty_field,
+    tracker.no_exposure,
+    tracker.nan_pixel,
+    attitude.two_signs,
+    attitude.antipodal,
+    attitude.half_turn,
+    attitude.fast_turns,
+    attitude.not_a_number,
+)
+COLUMNS = ("case", "verdict", "failing method", "its failure", "what happens", "why", "error", "its error", "tolerance")
+
+
+def run(directory: Path) -> list[Place]:
+    """Visit every place, write `stability.csv` and the charts; the places, in order."""
+    places = [visit() for visit in VISITS]
+    write_csv(directory / "stability.csv", COLUMNS, [_row(place) for place in places])
+    draw_charts(directory)
+    return places
+
+
+def _row(place: Place) -> tuple[str | float, ...]:
+    verdict, figures = "right" if place.right else "WRONG", place.figures
+    numbers = figures.error, figures.fault, figures.tolerance
+    return place.case, verdict, place.method, place.fails, place.happens, place.why, *map(float, numbers)

@@ -1,0 +1,1 @@
+"""For each step of the chain: every method against the exact one, error against time."""

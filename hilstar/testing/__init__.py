@@ -1,0 +1,75 @@
+"""For tests of your own: two skies compared star by star, so that a golden frame holds on another driver."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from hilstar.arrays import FloatArray
+from hilstar.bench.build import Frame
+from hilstar.errors import InputError
+from hilstar.testing.compare import CENTROID_PX, FLUX_MAG, Limits, SkyComparison, Truth, check_skies, compare_skies, describes
+from hilstar.testing.files import read_frame_fits, read_truth_csv
+from hilstar.testing.sky_difference import finding, told
+
+__all__ = ["assert_same_sky", "compare"]
+
+MOST_LINES = 20
+
+Sky = Frame | npt.NDArray[Any] | str | Path
+
+
+def assert_same_sky(
+    frame: Sky,
+    golden: Sky,
+    *,
+    flux_mag: float = FLUX_MAG,
+    centroid_px: float = CENTROID_PX,
+    truth: Truth | str | Path | None = None,
+) -> SkyComparison:
+    """Assert that every star of two skies has one flux (magnitudes) and one place (px); see `compare` for what a sky is.
+
+    Raises AssertionError with what all stars differ by and a line for each that differs otherwise, 20 at most; InputError as
+    `compare` does.
+    """
+    comparison = compare(frame, golden, flux_mag=flux_mag, centroid_px=centroid_px, truth=truth)
+    if not comparison.same:
+        raise AssertionError("\n".join([finding(comparison), *told(comparison, MOST_LINES, "")]))
+    return comparison
+
+
+def compare(
+    frame: Sky,
+    golden: Sky,
+    *,
+    flux_mag: float = FLUX_MAG,
+    centroid_px: float = CENTROID_PX,
+    truth: Truth | str | Path | None = None,
+) -> SkyComparison:
+    """Compare two skies star by star: each a Frame, a linear image (height, width), or a FITS of `hilstar frame`.
+
+    Stars have HIP numbers by `truth` (a Frame's table, or the CSV of `hilstar frame --truth`), else by the Frames' own.
+    Raises InputError for limits that are not over 0, images of different size or without a star, and files of another kind.
+    """
+    light, golden_light = _image(frame), _image(golden)
+    check_skies(light, golden_light)
+    own = frame.truth if isinstance(frame, Frame) else None
+    if isinstance(truth, str | Path):
+        truth = read_truth_csv(Path(truth))
+    elif truth is None and isinstance(golden, Frame):
+        truth = golden.truth
+    elif truth is None and own is not None and describes(own, golden_light):
+        truth = own
+    return compare_skies(light, golden_light, Limits(flux_mag, centroid_px), truth, own)
+
+
+def _image(sky: Sky) -> FloatArray:
+    if isinstance(sky, str | Path):
+        return read_frame_fits(Path(sky))
+    image = sky.linear if isinstance(sky, Frame) else np.asarray(sky)
+    if image.dtype.kind != "f":
+        raise InputError(f"compare: an image of type {image.dtype}; give a Frame, or its linear image (float), not its codes")
+    return np.asarray(image, dtype=np.float64)

@@ -1,0 +1,104 @@
+"""The chart of `hilstar compare`: errors against magnitude, less what all stars have in common."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from hilstar.charts import chart
+from hilstar.testing.sky_difference import MAG_PER_SHARE, SkyComparison, StarDifference, finding
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.text import Annotation
+    from matplotlib.transforms import Bbox
+
+NAMED_STARS = 6  # at most, where their names have room; the table has all
+MOST_TRIED = 60  # names for which there is a look whether they have room
+ROOM_PX = 3.0  # between two names
+LEAST_ERROR = 1e-8  # drawn: a tenth of float32's rounding
+STYLES = (("same", "C0."), ("changed", "C3o"), ("missing", "C3v"), ("extra", "C1^"))
+
+
+def draw(path: Path, comparison: SkyComparison) -> None:
+    """Write the chart. Raises InputError where it cannot be."""
+    with chart(path, finding(comparison), 2) as axes:
+        names: list[list[Annotation]] = []
+        for axis, what, unit in ((axes[0], "flux error", "mag"), (axes[1], "centroid error", "px")):
+            panel = _Panel(comparison, unit)
+            panel.draw(axis)
+            names.append(panel.name_stars(axis))
+            less = ", less what is common" if panel.common else ""
+            axis.set(yscale="log", ylabel=f"{what} [{unit}]{less},\ndrawn at {LEAST_ERROR:g} where under it")
+            axis.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), fontsize=9)
+        axes[1].set_xlabel("magnitudes under the brightest star")
+        _make_room(axes[0], names)
+
+
+class _Panel:
+    """Errors and limits of one kind; stars that only one image has stand in rows above."""
+
+    def __init__(self, comparison: SkyComparison, unit: str) -> None:
+        common = comparison.common
+        self.unit = unit
+        self.stars = comparison.stars if common is None else common.beyond + common.alone
+        self.worst = comparison.differing
+        self.brightest = max(star.flux_e_per_s for star in comparison.stars)
+        self.limit = comparison.limits.flux_mag if unit == "mag" else comparison.limits.centroid_px
+        self.common = 0.0
+        if common is not None:
+            self.common = abs(common.flux_mag) if unit == "mag" else math.hypot(*common.shift_px)
+        self.row = 4 * max([self.limit, self.common, *(max(self.point(star)[1:]) for star in self.of("same", "changed"))])
+        self.rows = {"missing": self.row, "extra": 8 * self.row}
+
+    def of(self, *kinds: str) -> list[StarDifference]:
+        return [star for star in self.stars if star.kind in kinds]
+
+    def point(self, star: StarDifference) -> tuple[float, float, float]:
+        """Magnitudes under the brightest star, error, and the star's own limit."""
+        mag = MAG_PER_SHARE * math.log(self.brightest / star.flux_e_per_s)
+        if self.unit == "mag":
+            return mag, max(abs(star.flux_error_mag), LEAST_ERROR), star.limits.flux_mag
+        return mag, max(star.centroid_error_px, LEAST_ERROR), star.limits.centroid_px
+
+    def draw(self, axis: Axes) -> None:
+        for kind, style in STYLES:
+            mags, errors = [[self.point(star)[k] for star in self.of(kind)] for k in (0, 1)]
+            heights = [self.rows[kind]] * len(mags) if kind in self.rows else errors
+            axis.plot(mags, heights, style, ms=5 if kind == "same" else 7, label=f"{kind}: {len(mags)}")
+        axis.axhline(self.limit, color="k", ls="--", lw=1.2, label=f"limit: {self.limit:g} {self.unit}")
+        if self.common:
+            axis.axhline(self.common, color="C2", lw=1.2, label=f"in common: {self.common:.3g} {self.unit}")
+        wider = [point for star in self.of("same", "changed") if (point := self.point(star))[2] > self.limit]
+        if wider:
+            axis.plot([p[0] for p in wider], [p[2] for p in wider], "k_", ms=8, label=f"a star's own limit: {len(wider)}")
+        axis.set_ylim(LEAST_ERROR / 2, 300 * self.row)
+        axis.set_xlim(right=axis.get_xlim()[1] + 0.5)
+
+    def name_stars(self, axis: Axes) -> list[Annotation]:
+        """Names of the worst stars, those that only one image has in the flux's panel alone."""
+        names = []
+        for star in self.worst:
+            mag, error, own = self.point(star)
+            if self.unit == "mag" if star.kind in self.rows else error > own:
+                name = star.name if star.hip else f"({star.x_px:.0f}, {star.y_px:.0f})"
+                place = mag, self.rows.get(star.kind, error)
+                names.append(axis.annotate(name, place, xytext=(6, 5), textcoords="offset points", fontsize=8))
+        return names[:MOST_TRIED]
+
+
+def _make_room(axis: Axes, names: list[list[Annotation]]) -> None:
+    """Take the names away that lie on worse stars' names, and those that are too many."""
+    figure = axis.get_figure(root=True)
+    if figure is None:
+        return
+    figure.draw_without_rendering()
+    for texts in names:  # worst first, of each panel
+        kept: list[Bbox] = []
+        for text in texts:
+            box = text.get_window_extent().padded(ROOM_PX)
+            if len(kept) == NAMED_STARS or any(box.overlaps(other) for other in kept):
+                text.remove()
+            else:
+                kept.append(box)

@@ -1,0 +1,104 @@
+"""Frames of the virtual tracker along a log, over all cores."""
+
+from __future__ import annotations
+
+import math
+import multiprocessing
+import os
+import signal
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from hilstar.attitude.clock.timeline import Policy
+from hilstar.attitude.logs.log_file import log_timeline
+from hilstar.attitude.wire.packet import AttitudeSample
+from hilstar.files import make_directory
+from hilstar.process.interrupts import end_with_parent
+from hilstar.rotation import rate_between_rad_s
+from hilstar.scene.exposure_motion import Motion
+from hilstar.twin.exposure_files import write_exposure_fits
+from hilstar.twin.simulator import Noise, Simulator
+from hilstar.units import NS_PER_S
+
+_simulator: Simulator | None = None
+
+
+def log_motions(
+    samples: list[AttitudeSample], frame_count: int | None, exposure_s: float, max_rate_rad_s: float = math.inf
+) -> list[Motion]:
+    """The exposures along a log: in the middle of each its attitude, and the mean rate over the exposure.
+
+    One at each sample, or `frame_count` of them evenly from the first to the last. Within half an exposure of the log's
+    ends the rate is that of the part inside.
+    """
+    timeline = log_timeline(samples, Policy(0, NS_PER_S, max_rate_rad_s))
+    first_ns, last_ns = samples[0].t_ns, samples[-1].t_ns
+    if frame_count is None:
+        times_ns = [sample.t_ns for sample in samples]
+    else:
+        times_ns = [round(t) for t in np.linspace(first_ns, last_ns, frame_count)]
+    half_ns = round(exposure_s * NS_PER_S / 2)
+    motions = []
+    for t_ns in times_ns:
+        ends_ns = max(first_ns, t_ns - half_ns), min(last_ns, t_ns + half_ns)
+        begin, middle, end = (timeline.at(t) for t in (ends_ns[0], t_ns, ends_ns[1]))
+        if begin is None or middle is None or end is None:
+            continue  # never: the log has a sample
+        rate = np.zeros(3)
+        if ends_ns[1] > ends_ns[0]:
+            rate = rate_between_rad_s(begin.q_icrs_to_cam, end.q_icrs_to_cam, (ends_ns[1] - ends_ns[0]) / NS_PER_S)
+        motions.append(Motion(middle.q_icrs_to_cam, rate, exposure_s))
+    return motions
+
+
+def simulate_motions(
+    bench_file: Path, motions: list[Motion], noise: Noise, seed: int, directory: Path, on_done: Callable[[int], None]
+) -> None:
+    """Write `exposure_000000.fits` and on into `directory`, each with noise of its own: seeds (seed, number)."""
+    make_directory(directory)
+    Simulator(bench_file).close()  # whatever is wrong with the bench is said once, here
+    workers = min(len(motions), len(os.sched_getaffinity(0)))
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workers, context, _start_worker, (bench_file,)) as pool:
+        try:
+            with _without_ctrl_c():
+                tasks = [
+                    pool.submit(_expose_to_file, motion, noise, (seed, number), directory / f"exposure_{number:06d}.fits")
+                    for number, motion in enumerate(motions)
+                ]
+            for done, task in enumerate(as_completed(tasks), start=1):
+                task.result()
+                on_done(done)
+        except BaseException:
+            for worker in multiprocessing.active_children():
+                worker.terminate()
+            pool.shutdown(cancel_futures=True)
+            raise
+
+
+@contextmanager
+def _without_ctrl_c() -> Iterator[None]:
+    """What is started here never hears of a Ctrl-C, which a terminal sends to all; it ends when this process says so."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _start_worker(bench_file: Path) -> None:
+    global _simulator  # noqa: PLW0603 - a process of the pool has one simulator, made at its start
+    end_with_parent()
+    os.environ.setdefault("LP_NUM_THREADS", "1")  # the pool itself fills the cores
+    _simulator = Simulator(bench_file)
+
+
+def _expose_to_file(motion: Motion, noise: Noise, seeds: tuple[int, int], path: Path) -> None:
+    if _simulator is None:
+        raise RuntimeError("the worker was not started with a bench")
+    rng = None if noise == "none" else np.random.default_rng(seeds)
+    write_exposure_fits(path, _simulator, _simulator.expose(motion, rng), noise, seeds[0])

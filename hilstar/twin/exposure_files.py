@@ -1,0 +1,47 @@
+"""The virtual tracker's exposures as files: FITS, and pictures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from PIL import Image
+
+from hilstar.bench.frame_files import sky_header
+from hilstar.files import written
+from hilstar.twin.picture import exposure_picture
+from hilstar.twin.simulator import Exposure, Simulator
+
+
+def write_exposure_fits(path: Path, simulator: Simulator, exposure: Exposure, noise: str, seed: int) -> None:
+    """The virtual tracker's DN (uint16) and, as second HDU, the truth table; the header says how both came about."""
+    from astropy.io import fits
+
+    tracker = simulator.config.tracker
+    header = sky_header(simulator.bench_hash, simulator.config.sky.epoch_jyear, exposure.motion.q_icrs_to_cam, simulator.camera)
+    header["BUNIT"] = ("adu", "digital numbers (DN)")
+    header["EXPTIME"] = (tracker.exposure_s, "[s]")
+    for name, rate in zip(("RATEX", "RATEY", "RATEZ"), np.degrees(exposure.motion.rate_cam_rad_s), strict=True):
+        header[name] = (float(rate), "[deg/s] of cam in icrs, cam components")
+    header["NOISE"] = (noise, "full, or none: the mean signal through the ADC")
+    header["SEED"] = (seed, "of the frame's noise")
+    header["DEVSEED"] = (tracker.detector.device_seed, "of the device's fixed patterns")
+    header["GAIN"] = (tracker.detector.gain_e_per_dn, "[electron/adu]")
+    header["OFFSET"] = (tracker.detector.offset_dn, "[adu]")
+    header["FULLWELL"] = (tracker.detector.full_well_e, "[electron]")
+    header["BITS"] = (tracker.detector.bits, "of the ADC")
+    header["NSTARS"] = (len(exposure.truth), "stars in view")
+    hdus = fits.HDUList([fits.PrimaryHDU(exposure.dn, header), fits.BinTableHDU(exposure.truth, name="TRUTH")])
+    written(path, lambda part: hdus.writeto(part, overwrite=True))
+
+
+def write_exposure_png(path: Path, dn: npt.NDArray[np.uint16]) -> None:
+    """A picture of a tracker's frame for a person (see `twin.picture`)."""
+    written(path, lambda part: Image.fromarray(exposure_picture(dn)).save(part, "PNG"))
+
+
+def write_dn_picture(path: Path, dn: npt.NDArray[np.uint16]) -> None:
+    """The DN themselves, unscaled, as greyscale of 16 bits: TIFF where the name ends in .tif or .tiff, else PNG."""
+    form = "TIFF" if path.suffix.lower() in {".tif", ".tiff"} else "PNG"
+    written(path, lambda part: Image.fromarray(dn).save(part, form))

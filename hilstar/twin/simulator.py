@@ -1,0 +1,116 @@
+"""The virtual tracker: the sky straight onto its detector, in electrons and then in DN."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Literal, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from hilstar.arrays import FloatArray
+from hilstar.bench.build import bench_hash, bench_optics, bench_stars, truth_table
+from hilstar.bench.config import BenchConfig, detector_settings, read_config
+from hilstar.errors import InputError
+from hilstar.monitor.geometry import monitor_camera
+from hilstar.render.renderer import Renderer, Target
+from hilstar.scene.exposure_motion import MIDDLE_S, Motion, smeared_sprites
+from hilstar.sky.electrons import Photometry, zodiacal_electrons_per_s_arcsec2
+from hilstar.tracker.detector import Detector
+from hilstar.units import ARCSEC_PER_RAD
+
+Noise = Literal["full", "none"]
+NO_ALIGNMENT = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+@dataclass(frozen=True, slots=True)
+class Exposure:
+    """One frame of the virtual tracker: DN (height, width), the electrons expected in it, and its stars.
+
+    `truth` has the rows of TRUTH_DTYPE: places are those at the middle of the exposure (NaN behind the camera), and
+    `clipped` stars reach full well or the ADC's last code. `capped` stars have paths coarser than they should be.
+    """
+
+    motion: Motion
+    dn: npt.NDArray[np.uint16]
+    mean_e: FloatArray
+    truth: npt.NDArray[np.void]
+    capped: int = 0
+
+
+class Simulator:
+    """A bench's tracker looking at the sky itself. Free it with `close`, or use it as a context manager."""
+
+    def __init__(self, path: Path) -> None:
+        self.config = read_config(path)
+        tracker = self.config.tracker
+        self.bench_hash = bench_hash(self.config, path.parent)
+        self.stars = bench_stars(self.config, path.parent)
+        self.camera = monitor_camera(tracker.resolution_px, tracker.pixel_pitch_um, tracker.focal_length_mm, NO_ALIGNMENT)
+        self.background_e = background_e(self.config, path.parent)
+        self.detector = Detector(detector_settings(tracker), tracker.resolution_px)
+        self.renderer = Renderer(Target(tracker.resolution_px, tracker.psf_sigma_px))
+
+    def motion(self, q_icrs_to_cam: FloatArray, rate_cam_rad_s: FloatArray) -> Motion:
+        """An exposure of this tracker, by the attitude in its middle (unit quaternion) and a constant rate."""
+        return Motion(q_icrs_to_cam, rate_cam_rad_s, self.config.tracker.exposure_s)
+
+    def expose(self, motion: Motion, rng: np.random.Generator | None) -> Exposure:
+        """One frame; without a generator, without noise. Raises InputError for what a detector cannot take."""
+        tracker = self.config.tracker
+        sprites = smeared_sprites(self.stars, motion, self.camera, self.renderer.footprint_px, tracker.psf_sigma_px)
+        self.renderer.draw(sprites)
+        mean_e = self.renderer.linear().astype(np.float64) * tracker.exposure_s + self.background_e
+        if rng is None:
+            dn = self.detector.expose_noiseless(mean_e, tracker.exposure_s)
+        else:
+            dn = self.detector.expose(mean_e, tracker.exposure_s, rng)
+        return Exposure(motion, dn, mean_e, self._truth(motion, np.unique(sprites.star), mean_e), sprites.capped)
+
+    def _truth(self, motion: Motion, star: npt.NDArray[np.intp], mean_e: FloatArray) -> npt.NDArray[np.void]:
+        x_px, y_px = self.camera.project(self.stars.vectors[star] @ motion.icrs_to_image(MIDDLE_S, self.camera)[0].T)
+        truth = truth_table(self.stars, star, x_px, y_px)
+        height, width = mean_e.shape
+        inside = np.isfinite(x_px) & (np.rint(x_px) >= 0) & (np.rint(x_px) < width)
+        inside &= (np.rint(y_px) >= 0) & (np.rint(y_px) < height)
+        place = np.rint(y_px[inside]).astype(np.intp), np.rint(x_px[inside]).astype(np.intp)
+        detector = self.config.tracker.detector
+        last_code_e = (2**detector.bits - 1 - detector.offset_dn) * detector.gain_e_per_dn
+        truth["clipped"][inside] = mean_e[place] > min(detector.full_well_e, last_code_e)
+        return truth[np.argsort(truth["v_mag"], kind="stable")]
+
+    def close(self) -> None:
+        """Free the GL context."""
+        self.renderer.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+
+def background_e(config: BenchConfig, folder: Path) -> FloatArray:
+    """Electrons per exposure between the stars, (height, width): level, plus a gradient that leaves its middle alone.
+
+    Zodiacal light is V mag/arcsec^2 through the tracker's optics, times a pixel's solid angle (thesis eq. 4.10, 4.11).
+    """
+    tracker, background = config.tracker, config.background
+    width, height = tracker.resolution_px
+    level_e = background.electrons_per_px or 0.0
+    if background.zodiacal_v_mag_arcsec2 is not None:
+        photometry = Photometry(config.sky.zero_point, config.sky.passband_weighting)
+        rate = zodiacal_electrons_per_s_arcsec2(background.zodiacal_v_mag_arcsec2, bench_optics(tracker, folder), photometry)
+        pixel_arcsec = tracker.pixel_pitch_um * 1e-3 / tracker.focal_length_mm * ARCSEC_PER_RAD
+        level_e = rate * pixel_arcsec**2 * tracker.exposure_s
+    across_e, down_e = background.gradient_electrons_across
+    ramp_e = across_e * np.linspace(-0.5, 0.5, width) + (down_e * np.linspace(-0.5, 0.5, height))[:, None]
+    total_e: FloatArray = level_e + ramp_e
+    if total_e.min() < 0:
+        raise InputError(
+            f"[background] gradient_electrons_across = {[across_e, down_e]}: takes the darkest corner to"
+            f" {total_e.min():.4g} electrons; write a larger background or a smaller gradient"
+        )
+    return total_e

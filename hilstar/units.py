@@ -1,0 +1,36 @@
+"""Units: the constants and conversions that the rooms share, each of them once."""
+
+from __future__ import annotations
+
+import math
+from typing import overload
+
+import numpy as np
+
+from hilstar.arrays import FloatArray
+
+NS_PER_US = 1_000
+NS_PER_MS = 1_000_000
+NS_PER_S = 1_000_000_000
+ARCSEC_PER_RAD = math.degrees(1.0) * 3600.0
+
+
+@overload
+def flux_ratio(mag: float) -> float: ...
+@overload
+def flux_ratio(mag: FloatArray) -> FloatArray: ...
+def flux_ratio(mag: float | FloatArray) -> float | FloatArray:
+    """How many times as much light as a star of magnitude 0 one of `mag` gives (Pogson 1856)."""
+    return 10 ** (-0.4 * mag)
+
+
+@overload
+def magnitude(ratio: float) -> float: ...
+@overload
+def magnitude(ratio: FloatArray) -> FloatArray: ...
+def magnitude(ratio: float | FloatArray) -> float | FloatArray:
+    """By how many magnitudes a star is fainter that gives `ratio` times as much light; infinite for none."""
+    if isinstance(ratio, np.ndarray):
+        with np.errstate(divide="ignore"):
+            return np.asarray(-2.5 * np.log10(ratio))
+    return -2.5 * math.log10(ratio) if ratio > 0 else math.inf

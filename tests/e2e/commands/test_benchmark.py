@@ -1,0 +1,150 @@
+"""The benchmark: its rows, its comparison, its files, and what it refuses."""
+
+from __future__ import annotations
+
+import csv
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from hilstar.rotation import from_radec_roll_deg
+from hilstar.study.speed import benchmark
+from hilstar.study.speed.benchmark import RADEC_ROLL_DEG, STAGES, scene
+from hilstar.study.speed.others import numpy_linear
+from tests.conftest import assert_refused, run_hilstar
+
+Q = from_radec_roll_deg(*RADEC_ROLL_DEG)
+GRID = ("--stars", "100,1000", "--sizes", "640x480")
+# The stages are timed with a wait after each and without the frame's bookkeeping; a wrong unit or a stage left out or counted
+# twice is off by more.
+SUM_FACTOR = 3.0
+# Ten stars on one pixel, each float32 sum and each share (erf of the GPU, 1.2e-6) at its worst, of the brightest pixel.
+FLOAT32_OF_PEAK = 1e-5
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("bench") / "out"
+    result = run_hilstar("bench", "--quick", *GRID, "--json", "-o", folder)
+    assert result.returncode == 0, result.stderr
+    assert len(result.stdout.splitlines()) == 1
+    return json.loads(result.stdout), folder
+
+
+def test_rows_are_those_of_the_contract(measured):
+    result, _ = measured
+    assert result["machine"]["cores"] >= 1
+    assert result["gl_renderer"]
+    for row in result["rows"]:
+        assert (row["width"], row["height"]) == (640, 480)
+        assert 0 < row["ms"]["min"] <= row["ms"]["median"] <= row["ms"]["max"]
+    for count in (100, 1000):
+        kinds = [row["kind"] for row in result["rows"] if row["stars"] == count and row["method"] == "hilstar"]
+        assert kinds.count("whole_frame") == 1
+        assert set(STAGES) < set(kinds)
+        assert [row["kind"] for row in result["rows"] if row["stars"] == count and row["method"] == "numpy"] == ["linear_only"]
+    assert min(result[name] for name in ("import_ms", "first_frame_ms", "memory_mb")) > 0
+    assert {row["method"] for row in result["agreement"]} >= {"numpy"}
+    assert all(row["worst_of_peak"] < FLOAT32_OF_PEAK for row in result["agreement"] if row["method"] == "numpy")
+
+
+def test_stages_make_up_the_whole_frame(measured):
+    result, _ = measured
+    for count in (100, 1000):
+        ms = {
+            row["kind"]: row["ms"]["median"] for row in result["rows"] if row["stars"] == count and row["method"] == "hilstar"
+        }
+        total = sum(ms[stage] for stage in STAGES)
+        assert 1 / SUM_FACTOR < total / ms["whole_frame"] < SUM_FACTOR
+
+
+def test_every_way_is_measured_or_named_with_what_to_install(measured):
+    result, _ = measured
+    run = {row["method"] for row in result["rows"]}
+    skipped = {row["method"]: row["why"] for row in result["skipped"]}
+    assert run | set(skipped) == {"hilstar", "numpy", "numba", "galsim", "photutils"}
+    assert all("hilstar[bench]" in why or "budget" in why for why in skipped.values())
+
+
+def test_the_catalogue_is_filled_up_and_that_is_said(measured):
+    result, _ = measured
+    for row in result["scenes"]:
+        assert row["catalogue"] + row["random"] == row["stars"]
+    assert [row["random"] > 0 for row in result["scenes"]] == [False, True]
+
+
+def test_the_files_say_the_same(measured):
+    result, folder = measured
+    with (folder / "bench.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [float(row["median_ms"]) for row in rows] == [row["ms"]["median"] for row in result["rows"]]
+    with Image.open(folder / "bench.png") as picture:
+        assert picture.width > 500
+
+
+def test_a_bench_file_is_measured_at_its_own_size(small_bench_file):
+    result = run_hilstar("bench", small_bench_file, "--quick", "--stars", "50")
+    assert result.returncode == 0, result.stderr
+    assert "320 x 240" in result.stdout
+    assert "hilstar, whole frame" in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--stars", "many"), ("--stars many", "100,1000")),
+        (("--stars", "0"), ("--stars 0", "from 1")),
+        (("--stars", "9999999999"), ("--stars", "200000")),
+        (("--sizes", "640"), ("--sizes 640", "640x480")),
+        (("--sizes", "99999x10"), ("--sizes 99999x10", "32768")),
+        (("nowhere.toml",), ("nowhere.toml",)),
+        (("--slow",), ("--slow",)),
+    ],
+)
+def test_wrong_options_are_refused(options, words):
+    assert_refused(run_hilstar("bench", *options), 2, *words)
+
+
+def test_a_bench_file_and_sizes_exclude_each_other(small_bench_file):
+    assert_refused(run_hilstar("bench", small_bench_file, "--sizes", "640x480"), 2, "--sizes", "leave out")
+
+
+def test_a_bench_without_stars_is_refused(small_bench_file):
+    with small_bench_file.open("a") as file:
+        file.write("[sky]\nfaintest_v_mag = -50\n[render]\nflux_at_white_e_per_s = 1e6\n")
+    assert_refused(run_hilstar("bench", small_bench_file, "--quick"), 2, "faintest_v_mag")
+
+
+def test_the_numpy_image_is_ours(bench_with):
+    bench = bench_with("[render]\nsprite_sigma_px = [0.7, 1.3]\n")
+    sprites = bench.sprites(Q, bench.stars)
+    ours = bench.frame(Q).linear
+    theirs = numpy_linear(sprites, bench.config.render.sprite_sigma_px, ours.shape)
+    assert len(sprites) > 10
+    assert np.abs(theirs - ours).max() < FLOAT32_OF_PEAK * ours.max()
+
+
+@pytest.mark.parametrize("count", [1, 5, 3000])
+def test_a_scene_has_exactly_the_stars_asked_for(bench_with, rng, count):
+    bench = bench_with()
+    stars, catalogue = scene(bench, bench.shown_stars, Q, (count, rng))
+    assert len(bench.sprites(Q, stars)) == count
+    assert catalogue == min(count, len(bench.sprites(Q)))
+    assert np.allclose(np.linalg.norm(stars.vectors, axis=1), 1)
+
+
+def test_slow_works_take_fewer_turns_evenly(monkeypatch):
+    taken = []
+
+    def seconds(work):
+        taken.append(work())
+        return {"fast": 0.001, "slow": 1.0, "slowest": 9.0}[taken[-1]]
+
+    monkeypatch.setattr(benchmark, "_seconds", seconds)
+    works = {name: lambda name=name: name for name in ("fast", "slow", "slowest")}
+    times = benchmark.interleaved(works, rounds=8, budget_s=5.0)
+    # One turn of the slow work's five goes ahead; the slowest has no other turn, so that one counts.
+    assert {name: len(values) for name, values in times.items()} == {"fast": 8, "slow": 4, "slowest": 1}
+    assert taken[3:] == ["fast", "fast", "slow"] * 4

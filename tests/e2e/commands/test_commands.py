@@ -1,0 +1,289 @@
+"""The commands, as a user types them."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from PIL import Image
+
+import hilstar
+from hilstar.monitor.response import encode, srgb_response
+from hilstar.rotation import from_radec_roll_deg
+from tests.conftest import ROOT, SMALL_BENCH, assert_refused, run_hilstar
+from tests.support import leftovers
+
+ORION = ROOT / "configs" / "thesis-orion.toml"
+ALNILAM, BETELGEUSE, RIGEL, ALNITAK = 26311, 27989, 24436, 26727
+
+
+def read_truth(path):
+    with path.open() as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.fixture(scope="module")
+def orion(tmp_path_factory):
+    """The issue's frame of Orion: FITS, CSV and PNG."""
+    folder = tmp_path_factory.mktemp("orion")
+    result = run_hilstar(
+        "frame", ORION, "--radec", "84.057,-1.200,0", "-o", folder / "o.fits", "--truth", folder / "o.csv",
+        "--codes", folder / "o.png", "--json",
+    )  # fmt: skip
+    assert result.returncode == 0, result.stderr
+    return folder, json.loads(result.stdout)
+
+
+def test_orion_is_the_right_way_up(orion):
+    folder, _ = orion
+    stars = {int(row["hip"]): (float(row["x_px"]), float(row["y_px"])) for row in read_truth(folder / "o.csv")}
+    x, y = stars[ALNILAM]
+    assert np.hypot(x - 511.5, y - 511.5) < 1.0  # Alnilam is in the middle
+    assert stars[BETELGEUSE][0] < 511 and stars[BETELGEUSE][1] < 511  # up left
+    assert stars[RIGEL][0] > 511 and stars[RIGEL][1] > 511  # south is down, west is right
+    assert stars[ALNITAK][0] < x  # east is left
+
+
+def test_the_frame_s_files_agree_with_each_other(orion):
+    folder, summary = orion
+    rows = read_truth(folder / "o.csv")
+    assert list(rows[0]) == ["hip", "x_px", "y_px", "v_mag", "bv", "temperature_k", "electrons_per_s", "drawn", "clipped"]
+    with fits.open(folder / "o.fits") as hdus:
+        linear, header = hdus[0].data, hdus[0].header
+        assert linear.dtype == np.dtype(">f4")
+        assert linear.shape == (1024, 1024)
+        assert header["BUNIT"] == "electron/s"
+        assert [header[k] for k in ("QW", "QX", "QY", "QZ")] == pytest.approx(from_radec_roll_deg(84.057, -1.2, 0), abs=1e-15)
+        assert header["EPOCHJYR"] == 2000.0
+        assert len(header["BENCHSHA"]) == 64
+    inside = [r for r in rows if 6 < float(r["x_px"]) < 1017 and 6 < float(r["y_px"]) < 1017]
+    assert len(inside) > 500
+    # Every star's light is in the image: 1e-6 is cut, and the sum of half a million float32 pixels is exact in float64.
+    edge = sum(float(r["electrons_per_s"]) for r in rows if r not in inside)
+    total = sum(float(r["electrons_per_s"]) for r in inside)
+    assert total * (1 - 1e-5) < linear.sum(dtype=np.float64) < (total + edge) * (1 + 1e-5)
+    for row in rows[:20]:
+        x, y = round(float(row["x_px"])), round(float(row["y_px"]))
+        peak = linear[y - 1 : y + 2, x - 1 : x + 2]
+        assert peak.argmax() == 4, row["hip"]
+    png = np.array(Image.open(folder / "o.png"))
+    assert png.dtype == np.uint8
+    assert np.array_equal(png, encode(linear.astype("=f4"), srgb_response(8), summary["flux_at_white_e_per_s"]))
+    assert summary["stars"] == len(rows)
+    assert {r["drawn"] for r in rows} == {"1"}
+    assert {r["clipped"] for r in rows} == {"0"}
+
+
+def test_the_python_road_gives_the_command_s_frame(orion):
+    folder, _ = orion
+    with hilstar.load(ORION) as bench:
+        frame = bench.frame(from_radec_roll_deg(84.057, -1.2, 0))
+    assert np.array_equal(frame.linear, fits.getdata(folder / "o.fits"))
+    assert np.array_equal(frame.codes, np.array(Image.open(folder / "o.png")))
+    assert frame.truth["hip"].tolist() == [int(r["hip"]) for r in read_truth(folder / "o.csv")]
+
+
+def test_a_quaternion_and_its_negative_are_the_attitude_of_its_radec(orion, tmp_path):
+    folder, _ = orion
+    q = from_radec_roll_deg(84.057, -1.2, 0)
+    for sign in (1, -1):
+        text = ",".join(repr(float(sign * c)) for c in q)
+        result = run_hilstar("frame", ORION, f"--quaternion={text}", "-o", tmp_path / "q.fits")
+        assert result.returncode == 0, result.stderr
+        assert np.array_equal(fits.getdata(tmp_path / "q.fits"), fits.getdata(folder / "o.fits"))
+
+
+def test_a_deep_monitor_s_codes_are_16_bit_and_left_aligned(tmp_path, small_bench_file):
+    small_bench_file.write_text(SMALL_BENCH.replace("[collimator]", "bits = 10\n[collimator]"))
+    result = run_hilstar("frame", small_bench_file, "--radec", "84.057,-1.2,0", "--codes", tmp_path / "c.png")
+    assert result.returncode == 0, result.stderr
+    png = np.array(Image.open(tmp_path / "c.png"))
+    assert png.dtype == np.uint16
+    assert png.max() > 255
+    assert (png % 64 == 0).all()
+    with hilstar.load(small_bench_file) as bench:
+        assert np.array_equal(png >> 6, bench.frame(from_radec_roll_deg(84.057, -1.2, 0)).codes)
+
+
+def test_clipped_stars_are_counted_and_named(tmp_path, small_bench_file):
+    small_bench_file.write_text(SMALL_BENCH + "[render]\nflux_at_white_e_per_s = 5e5\n")
+    result = run_hilstar("frame", small_bench_file, "--radec", "84.057,-1.2,0", "--truth", tmp_path / "t.csv", "--json")
+    clipped = json.loads(result.stdout)["clipped"]
+    assert {ALNILAM, ALNITAK} <= set(clipped)
+    marked = {int(r["hip"]) for r in read_truth(tmp_path / "t.csv") if r["clipped"] == "1"}
+    assert marked == set(clipped)
+
+
+def test_the_average_model_can_be_chosen(tmp_path, small_bench_file):
+    """AGS knows no colour: two stars of one magnitude have one rate."""
+    small_bench_file.write_text(SMALL_BENCH + '[sky]\nbrightness = "ags"\n')
+    assert run_hilstar("frame", small_bench_file, "--radec", "84.057,-1.2,0", "--truth", tmp_path / "t.csv").returncode == 0
+    rates = {float(r["electrons_per_s"]) * 10 ** (0.4 * float(r["v_mag"])) for r in read_truth(tmp_path / "t.csv")}
+    assert max(rates) / min(rates) == pytest.approx(1, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["frame", "none.toml", "--radec", "1,2,3", "-o", "x.fits"], ["none.toml", "No such file"]),
+        (["frame", "BENCH", "-o", "x.fits"], ["--radec RA,DEC,ROLL", "--quaternion"]),
+        (["frame", "BENCH", "--radec", "1,2", "-o", "x.fits"], ["--radec 1,2", "RA,DEC,ROLL"]),
+        (["frame", "BENCH", "--radec", "1,95,0", "-o", "x.fits"], ["-90 to 90"]),
+        (["frame", "BENCH", "--quaternion", "1,1,1,1", "-o", "x.fits"], ["norm is 2"]),
+        (["frame", "BENCH", "--quaternion", "nan,0,0,1", "-o", "x.fits"], ["finite"]),
+        (["frame", "BENCH", "--radec", "1,2,3"], ["nothing to write", "-o OUT.fits"]),
+        (["frame", "BENCH", "--radec", "1,2,3", "-o", "none/x.fits"], ["none/x.fits", "cannot be written"]),
+        (["frame", "BENCH", "--radec", "1,2,3", "-o", "x.png"], ["-o x.png", "a FITS file is written there", "write x.fits"]),
+        (["frame", "BENCH", "--radec", "1,2,3", "--truth", "x.fits"], ["--truth x.fits", "CSV", "write x.csv"]),
+        (["frame", "BENCH", "--radec", "1,2,3", "--codes", "x.jpg"], ["--codes x.jpg", "PNG", "write x.png"]),
+        (["serve", "BENCH", "--headless", "--frames", "1", "--ledger", "run.csv"], ["--ledger run.csv", "write run.mcap"]),
+        (["frame", "BENCH", "--radec", "1,2,3", "--truth", "none/x.csv"], ["none/x.csv", "cannot be written"]),
+        (["frame", "BENCH", "--radec", "1,2,3", "--codes", "none/x.png"], ["none/x.png", "cannot be written"]),
+        (["replay", "BENCH", "none.csv", "--headless"], ["none.csv", "No such file"]),
+        (["replay", "BENCH", "LOG", "--headless", "--speed", "fast"], ["fast", "realtime"]),
+        (["send"], ["LOG or --spin"]),
+        (["send", "--spin", "w,1"], ["AXIS,DEG_PER_S"]),
+        (["send", "--spin", "z,1", "--to", "localhost"], ["tcp://HOST:PORT"]),
+        (["send", "--spin", "z,1", "--to", "tcp://127.0.0.1:70000"], ["tcp://HOST:PORT"]),
+        (["send", "--spin", "z,1", "--rate", "0"], ["--rate 0"]),
+        (["nonsense"], ["nonsense", "--help"]),
+        ([], ["--help"]),
+        (["frame", "BENCH", "--quaternion", "1e308,1e308,0,0", "-o", "x.fits"], ["its norm is"]),
+        (["serve", "BENCH", "--headless", "--duration", "inf"], ["--duration"]),
+        (["send", "--spin", "z,1e300"], ["AXIS,DEG_PER_S"]),
+        (["send", "--spin", "z,1", "--rate", "1e-300"], ["--rate"]),
+        (["send", "--spin", "z,1", "--wait", "inf"], ["--wait"]),
+        (["frame"], ["BENCH.toml"]),
+        (["serve", "BENCH", "--headless", "--duration", "x"], ["--duration", "number"]),
+        (["serve", "BENCH", "--unknown"], ["--unknown"]),
+    ],
+)
+def test_a_wrong_command_gets_one_line_and_exit_code_2(tmp_path, small_bench_file, arguments, words):
+    (tmp_path / "log.csv").write_text("t_s,qw,qx,qy,qz\n0,1,0,0,0\n")
+    places = {"BENCH": small_bench_file, "LOG": tmp_path / "log.csv"}
+    result = run_hilstar(*(places.get(a, a) for a in arguments), cwd=tmp_path)
+    assert_refused(result, 2, *words)
+
+
+def test_a_log_with_nan_is_refused_with_its_line(tmp_path, small_bench_file):
+    (tmp_path / "log.csv").write_text("t_s,qw,qx,qy,qz\n0,1,0,0,0\n1,nan,0,0,0\n")
+    result = run_hilstar("replay", small_bench_file, tmp_path / "log.csv", "--headless")
+    assert_refused(result, 2, "log.csv:3", "not finite")
+
+
+def test_a_machine_without_egl_gets_one_line_and_exit_code_3(small_bench_file):
+    """The loader looks for a libEGL that is not there, in a process of its own."""
+    script = (
+        "import sys; from hilstar import cli; from hilstar.render import renderer;"
+        "renderer.EGL_LIBRARY = 'libEGL.so.none';"
+        f"sys.argv = ['hilstar', 'frame', {str(small_bench_file)!r}, '--radec', '1,2,3', '-o', 'x.fits']; cli.main()"
+    )
+    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=False)
+    assert_refused(result, 3, "apt-get install libegl1 libgl1-mesa-dri")
+
+
+def test_doctor_says_what_is_there():
+    result = run_hilstar("doctor", "--json")
+    assert result.returncode == 0, result.stdout
+    report = json.loads(result.stdout)
+    assert report["ok"] is True
+    checks = {check["name"]: check for check in report["checks"]}
+    assert {"opengl", "zeromq", "display", "files", "catalogue", "python"} <= set(checks)
+    assert "OpenGL" in checks["opengl"]["detail"]
+    plain = run_hilstar("doctor")
+    assert plain.returncode == 0
+    assert "opengl" in plain.stdout
+
+
+def test_replay_writes_the_frames_of_a_log(tmp_path, small_bench_file):
+    rows = ["t_s,qw,qx,qy,qz"]
+    for k in range(3):
+        q = from_radec_roll_deg(84.057 + k, -1.2, 0)
+        rows.append(",".join(map(repr, [k * 0.1, *map(float, q)])))
+    (tmp_path / "log.csv").write_text("\n".join(rows) + "\n")
+    result = run_hilstar(
+        "replay", small_bench_file, tmp_path / "log.csv", "--headless", "--speed", "max", "-o", tmp_path / "out", "--json"
+    )
+    assert result.returncode == 0, result.stderr
+    summary = json.loads(result.stdout)
+    assert summary["frames"] == 13  # 0.2 s at 60 Hz, both ends included
+    assert summary["missed_frames"] == summary["stale_frames"] == 0
+    table = read_truth(tmp_path / "out" / "frames.csv")
+    assert len(table) == len(list((tmp_path / "out").glob("frame_*.png"))) == 13
+    with hilstar.load(small_bench_file) as bench:
+        for number, ra in ((0, 84.057), (6, 85.057), (12, 86.057)):
+            png = np.array(Image.open(tmp_path / "out" / f"frame_{number:06d}.png"))
+            assert np.array_equal(png, bench.frame(from_radec_roll_deg(ra, -1.2, 0)).codes), number
+    assert np.abs(float(table[3]["t_s"]) - 0.05) < 1e-9
+
+
+def test_replay_in_real_time_takes_the_log_s_time(tmp_path, small_bench_file):
+    (tmp_path / "log.jsonl").write_text('{"t_ns":0,"q":[1,0,0,0]}\n{"t_ns":500000000,"q":[0.9999,0.01,0,0.0099]}\n')
+    summary = json.loads(run_hilstar("replay", small_bench_file, tmp_path / "log.jsonl", "--headless", "--json").stdout)
+    assert summary["frames"] + summary["missed_frames"] == 31
+    assert summary["duration_s"] == pytest.approx(0.5, abs=0.2)
+
+
+def test_an_unwritable_directory_is_refused(tmp_path, small_bench_file):
+    blocker = tmp_path / "file"
+    blocker.write_text("")
+    (tmp_path / "log.csv").write_text("t_s,qw,qx,qy,qz\n0,1,0,0,0\n")
+    result = run_hilstar("replay", small_bench_file, tmp_path / "log.csv", "--headless", "-o", blocker / "out")
+    assert_refused(result, 2, "cannot be written")
+    assert_refused(run_hilstar("demo", "-o", blocker / "out"), 2, "cannot be written")
+
+
+def test_output_to_a_closed_pipe_leaves_no_traceback():
+    command = f"{sys.executable} -m hilstar doctor | true"
+    result = subprocess.run(["bash", "-c", command], capture_output=True, text=True, env=os.environ, check=False)
+    assert "Traceback" not in result.stderr
+
+
+def test_a_png_is_a_png_whatever_its_name(tmp_path, small_bench_file):
+    result = run_hilstar("frame", small_bench_file, "--radec", "84,-1,0", "--codes", "codes", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert (tmp_path / "codes").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_ctrl_c_at_any_moment_leaves_no_traceback(tmp_path, small_bench_file):
+    """While it starts, while it waits for a listener, while it serves."""
+    commands = (["send", "--spin", "z,1", "--to", "tcp://127.0.0.1:5573"], ["serve", str(small_bench_file), "--headless"])
+    for command in commands:
+        for delay_s in (0.05, 0.15, 0.4, 1.2):
+            process = subprocess.Popen(
+                [sys.executable, "-m", "hilstar", *command], stderr=subprocess.PIPE, stdout=subprocess.PIPE
+            )
+            try:
+                time.sleep(delay_s)
+                process.send_signal(signal.SIGINT)
+                _, err = process.communicate(timeout=10)
+            finally:
+                process.kill()
+            assert b"Traceback" not in err or delay_s < 0.1, err  # Python's own start is not ours to guard
+
+
+def test_a_command_that_is_killed_leaves_no_process_of_the_tests_behind(tmp_path):
+    """`demo` starts a sender: killed with it by `run_hilstar`, and what is orphaned all the same is found and ended."""
+    with pytest.raises(subprocess.TimeoutExpired):
+        run_hilstar("demo", "--duration", "60", "-o", tmp_path, timeout=5)
+    assert [command for command in leftovers.living_children().values() if str(tmp_path) in command] == []
+    orphan_command = [sys.executable, "-c", "import time; time.sleep(60)", f"-m hilstar {tmp_path}"]
+    middle = f"import subprocess; subprocess.Popen({orphan_command!r})"
+    subprocess.run([sys.executable, "-c", middle], check=True)
+    orphan = [number for number, command in leftovers.living_children().items() if str(tmp_path) in command]
+    assert len(orphan) == 1
+    assert any(str(tmp_path) in command for command in leftovers.end_hilstar_leftovers())
+    os.waitpid(orphan[0], 0)
+
+
+def test_without_a_display_a_window_is_refused_as_the_machine_s_lack(small_bench_file):
+    bare = {name: value for name, value in os.environ.items() if name not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    assert_refused(run_hilstar("serve", small_bench_file, env=bare), 3, "DISPLAY", "--headless")

@@ -1,0 +1,132 @@
+"""Logs from hand to hand: convert, replay and its span, send from any of them."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from hilstar.rotation import from_radec_roll_deg, propagate
+from tests.conftest import assert_refused, run_hilstar
+
+RATE = np.radians([0.3, -0.2, 2.0])
+
+
+@pytest.fixture
+def log(tmp_path) -> Path:
+    """Two seconds at 10 Hz, in JSON lines with rates."""
+    path = tmp_path / "log.jsonl"
+    start = from_radec_roll_deg(84, -1, 0)
+    lines = [
+        json.dumps({"t_ns": 10**9 + k * 10**8, "q": propagate(start, RATE, k / 10).tolist(), "rate": RATE.tolist()})
+        for k in range(21)
+    ]
+    path.write_text("\n".join(lines))
+    return path
+
+
+def replayed(bench: Path, log: Path, output: Path, *options: str) -> list[dict[str, str]]:
+    result = run_hilstar("replay", bench, log, "--headless", "--speed", "max", "-o", output, *options)
+    assert result.returncode == 0, result.stderr
+    with (output / "frames.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def quaternion(row: dict[str, str]) -> list[float]:
+    return [float(row[name]) for name in ("qw", "qx", "qy", "qz")]
+
+
+@pytest.mark.parametrize("suffix", ["csv", "jsonl", "aem", "kvn", "xml", "mcap"])
+def test_every_form_of_a_log_replays_to_the_same_frames(tmp_path, small_bench_file, log, suffix):
+    other = tmp_path / f"other.{suffix}"
+    converted = run_hilstar("convert", log, other)
+    assert converted.returncode == 0, converted.stderr
+    assert "21 attitudes" in converted.stdout
+    ours, theirs = (replayed(small_bench_file, path, tmp_path / path.suffix, "--step", "0.25") for path in (log, other))
+    assert len(ours) == len(theirs) == 9
+    for a, b in zip(ours, theirs, strict=True):
+        # AEM's rates come back through q and q_dot, to some 1e-15.
+        assert quaternion(a) == pytest.approx(quaternion(b), abs=1e-13)
+    frames = [np.array(Image.open(tmp_path / path.suffix / "frame_000004.png")) for path in (log, other)]
+    assert (frames[0] != frames[1]).mean() < 1e-4
+    assert frames[0].max() > 50
+
+
+def test_a_replay_s_span_and_step_are_those_asked_for(tmp_path, small_bench_file, log):
+    rows = replayed(small_bench_file, log, tmp_path / "out", "--start", "0.5", "--stop", "1.5", "--step", "0.1")
+    assert [float(row["t_s"]) for row in rows] == pytest.approx([1.5 + 0.1 * k for k in range(11)])
+
+
+def test_a_replay_at_four_times_the_speed_takes_a_quarter_of_the_time(small_bench_file, log):
+    result = run_hilstar("replay", small_bench_file, log, "--headless", "--speed", "4", "--json")
+    summary = json.loads(result.stdout)
+    assert summary["frames"] + summary["missed_frames"] == 31
+    assert summary["duration_s"] == pytest.approx(0.5, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--speed", "fast"], "realtime"),
+        (["--speed", "0"], "0.001"),
+        (["--speed", "2", "--step", "0.1"], "--step"),
+        (["--start", "5"], "its length, 2"),
+        (["--start", "1.5", "--stop", "1"], "--stop"),
+        (["--step", "-1"], "--step"),
+        (["--speed", "max", "--step", "1e-12"], "longer --step"),
+    ],
+)
+def test_a_speed_or_span_that_gives_no_frame_gets_one_line(small_bench_file, log, options, said):
+    assert_refused(run_hilstar("replay", small_bench_file, log, "--headless", *options), 2, said)
+
+
+def test_convert_says_what_it_cannot(tmp_path, log):
+    assert_refused(run_hilstar("convert", log, tmp_path / "out.doc"), 2, ".csv", "out.doc")
+    assert_refused(run_hilstar("convert", tmp_path / "none.csv", tmp_path / "out.csv"), 2, "none.csv")
+    assert_refused(run_hilstar("convert", log, tmp_path / "no" / "out.csv"), 2, "out.csv")
+
+
+def test_fault_options_stand_alone_or_take_a_share(tmp_path):
+    for options, said in ((["--lose", "110%"], "--lose 110%"), (["--corrupt", "60%", "--lose", "60%"], "all packets")):
+        assert_refused(run_hilstar("send", "--spin", "z,1", "--to", "tcp://127.0.0.1:*", *options), 2, said)
+    result = run_hilstar(
+        "send", "--spin", "z,1", "--to", "tcp://127.0.0.1:*", "--rate", "5000", "--count", "4000", "--wait", "0",
+        "--json", "--reorder", "--corrupt", "--lose", "0.1",
+    )  # fmt: skip
+    told = json.loads(result.stdout)
+    assert told["packets"] == 4000
+    for name, share in (("lost", 0.1), ("corrupted", 0.05), ("reordered", 0.05)):
+        # Four sigma of a binomial count; a packet that is to be held back while another is held back goes on.
+        assert told[name] == pytest.approx(4000 * share, abs=4 * np.sqrt(4000 * share) + 12)
+
+
+def test_a_resampled_log_keeps_its_breaks_and_its_rates(tmp_path):
+    from hilstar.attitude.logs.log_file import read_log
+    from hilstar.run.send.sender import log_samples
+
+    lines = [
+        {"t_ns": 0, "q": [1, 0, 0, 0], "rate": [0, 0, 0.1]},
+        {"t_ns": 10**9, "q": [1, 0, 0, 0], "rate": [0, 0, 0.3]},
+        {"t_ns": 2 * 10**9, "q": [0, 1, 0, 0], "rate": [0, 0, 0.5], "discontinuity": True},
+        {"t_ns": 3 * 10**9, "q": [0, 1, 0, 0], "rate": [0, 0, 0.5]},
+    ]
+    path = tmp_path / "breaks.jsonl"
+    path.write_text("\n".join(map(json.dumps, lines)))
+    sent = list(log_samples(read_log(path), 2.0))
+    assert [sample.discontinuity for sample in sent] == [False] * 4 + [True, False, False]
+    assert [float(sample.rate_cam_rad_s[2]) for sample in sent] == pytest.approx([0.1, 0.2, 0.3, 0.3, 0.5, 0.5, 0.5])
+
+
+def test_a_gap_in_a_log_is_held_and_said_once(tmp_path, small_bench_file):
+    path = tmp_path / "gap.csv"
+    rows = [(t, propagate(from_radec_roll_deg(84, -1, 0), RATE, t)) for t in (0, 0.5, 1, 1.5, 9, 9.5)]
+    path.write_text("\n".join(["t_s,qw,qx,qy,qz", *(f"{t},{','.join(map(repr, q.tolist()))}" for t, q in rows)]))
+    result = run_hilstar("replay", small_bench_file, path, "--headless", "--speed", "max", "--step", "0.5", "--json")
+    assert result.stderr.count("1 gap, the longest of 7.5 s, held") == 1
+    summary = json.loads(result.stdout)
+    assert summary["events"]["log-gap"] == 1
+    assert summary["stale_frames"] == 14  # 2.0 to 8.5 s

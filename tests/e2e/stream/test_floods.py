@@ -1,0 +1,312 @@
+"""Floods of every kind at the socket of a real process: frames go on, memory and files are bounded, nothing is silent."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import resource
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+import zmq
+import zmq.auth
+
+from hilstar.attitude.wire.flood_limits import MAX_BURST, MAX_PACKETS_PER_S
+from tests.conftest import SMALL_BENCH, assert_refused, run_hilstar
+from tests.e2e.stream.test_serve import free_port, packet, requester
+from tests.support.zmtp import greeted, part
+
+PATIENCE_S = 30.0
+# bounds.MAX_GROWTH_BYTES, and what comes within the time that a loaded machine needs to see it.
+MAX_GROWTH_MB = 256 + 500
+
+
+class Served:
+    """`hilstar serve`, bound to a port, its stderr read as it comes."""
+
+    def __init__(self, process: subprocess.Popen[str], port: int) -> None:
+        self.process, self.port = process, port
+        self.lines: list[str] = []
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self.process.stderr is not None
+        self.lines.extend(self.process.stderr)
+
+    def await_line(self, words: str) -> None:
+        await_that(lambda: any(words in line for line in list(self.lines)), words, self.lines)
+
+    def used_mb(self) -> float:
+        return int(Path(f"/proc/{self.process.pid}/statm").read_text().split()[1]) * resource.getpagesize() / 1e6
+
+    def files(self) -> int:
+        return len(list(Path(f"/proc/{self.process.pid}/fd").iterdir()))
+
+    def summary(self) -> dict:
+        self.process.send_signal(signal.SIGINT)
+        assert self.process.stdout is not None
+        out = self.process.stdout.read()
+        assert self.process.wait(PATIENCE_S) == 0, self.lines
+        return json.loads(out)
+
+
+def await_that(holds: Callable[[], bool], what: str = "", said: list[str] | None = None) -> None:
+    deadline_s = time.monotonic() + PATIENCE_S
+    while not holds():
+        assert time.monotonic() < deadline_s, (what, said)
+        time.sleep(0.02)
+
+
+@contextmanager
+def bound(tmp_path: Path, *options: str, attitude: str = "bind = true", files: int | None = None) -> Iterator[Served]:
+    port = free_port()
+    bench = tmp_path / "serve.toml"
+    bench.write_text(f'{SMALL_BENCH}\n[attitude]\nendpoint = "tcp://127.0.0.1:{port}"\n{attitude}\n')
+    command = [sys.executable, "-m", "hilstar", "serve", str(bench), "--headless", "--json", *options]
+    if files is not None:
+        command = ["sh", "-c", f'ulimit -n {files}; exec "$@"', "sh", *command]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        served = Served(process, port)
+        try:
+            served.await_line("bound to")
+            await_that(lambda: can_connect(port), "the port")
+            yield served
+        finally:
+            process.kill()
+
+
+def can_connect(port: int) -> bool:
+    with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port)):
+        return True
+    return False
+
+
+@contextmanager
+def sending(port: int, hz: float = 100.0) -> Iterator[None]:
+    """A sender of good packets in a thread, as long as this is open."""
+    stop = threading.Event()
+
+    def send() -> None:
+        with zmq.Context() as context, context.socket(zmq.PUB) as sender:
+            sender.setsockopt(zmq.LINGER, 0)
+            sender.connect(f"tcp://127.0.0.1:{port}")
+            sequence = 0
+            while not stop.wait(1 / hz):
+                sender.send(packet(sequence, time.monotonic_ns()))
+                sequence += 1
+
+    thread = threading.Thread(target=send)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
+
+
+@pytest.mark.parametrize("size", [1, 100_000])
+def test_a_message_that_does_not_end_costs_bounded_memory_and_the_sender_is_heard_again(tmp_path, size):
+    """libzmq keeps a message until its last part; there is none."""
+    with bound(tmp_path) as served, sending(served.port):
+        served.await_line("the first attitude")
+        before_mb, most_mb, sent_bytes = served.used_mb(), 0.0, 0
+        blob = part(bytes(size), more=True) * max(1, 200_000 // size)
+        deadline_s = time.monotonic() + PATIENCE_S
+        while sum("every connection is dropped" in line for line in list(served.lines)) < 2:
+            assert time.monotonic() < deadline_s, f"{sent_bytes} bytes sent, {most_mb} MB used"
+            with contextlib.suppress(OSError), greeted(served.port) as attacker:
+                while time.monotonic() < deadline_s:
+                    attacker.sendall(blob)
+                    sent_bytes += len(blob)
+                    most_mb = max(most_mb, served.used_mb())
+                    assert most_mb < before_mb + MAX_GROWTH_MB
+        await_that(lambda: served.used_mb() < before_mb + 128, "the memory is given back")
+        time.sleep(1.5)
+        summary = served.summary()
+    assert summary["link"]["resets"] == summary["events"]["flood"] >= 2
+    assert summary["frames"] > 3 * summary["missed_frames"]
+    assert summary["packets"]["accepted"] > 50
+
+
+def test_a_message_of_a_million_parts_is_dropped_before_it_is_a_list(tmp_path):
+    with bound(tmp_path) as served, sending(served.port):
+        served.await_line("the first attitude")
+        before_mb = served.used_mb()
+        with greeted(served.port) as attacker, contextlib.suppress(OSError):
+            attacker.sendall(part(bytes(1), more=True) * 1_000_000 + part(b"end", more=False))
+            served.await_line("more than 64 parts")
+        await_that(lambda: served.used_mb() < before_mb + 128, "the memory is given back")
+        summary = served.summary()
+    assert summary["link"]["resets"] == 1
+
+
+def test_idle_connections_are_limited_and_the_sender_and_the_ledger_stay(tmp_path):
+    """600 connections that say nothing, at a process that may have 512 files."""
+    ledger = tmp_path / "run.mcap"
+    with contextlib.ExitStack() as stack:
+        soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+        stack.callback(resource.setrlimit, resource.RLIMIT_NOFILE, (soft, hard))
+        served = stack.enter_context(bound(tmp_path, "--ledger", str(ledger), files=512))
+        stack.enter_context(sending(served.port))
+        served.await_line("the first attitude")
+        for _ in range(600):
+            stack.enter_context(socket.create_connection(("127.0.0.1", served.port)))
+        served.await_line("over 64 connections")
+        await_that(lambda: served.files() < 64, "handshakes that never come are not awaited")
+        summary = served.summary()
+    link = summary["link"]
+    assert link["refused"] > 300
+    assert link["rejected"] == summary["events"]["client-rejected"] > 30
+    assert summary["ledger"]["failure"] is None
+    assert "stale" not in summary["events"] or summary["stale_frames"] < summary["frames"] / 4
+
+
+def test_a_flood_of_packets_leaves_the_frames_their_time_and_is_counted(tmp_path):
+    flood = """
+import time, zmq
+from tests.e2e.stream.test_serve import packet
+sender = zmq.Context().socket(zmq.PUB)
+sender.setsockopt(zmq.LINGER, 0)
+sender.connect("tcp://127.0.0.1:PORT")
+time.sleep(0.5)
+end = time.monotonic() + 2
+k = 0
+while time.monotonic() < end:
+    body = packet(k, time.monotonic_ns())
+    for _ in range(20):
+        sender.send(body)
+    k += 1
+"""
+    ledger = tmp_path / "run.mcap"
+    with bound(tmp_path, "--ledger", str(ledger)) as served:
+        subprocess.run([sys.executable, "-c", flood.replace("PORT", str(served.port))], check=True, timeout=PATIENCE_S)
+        summary = served.summary()
+    assert summary["link"]["flooded"] > 10_000
+    assert 1 <= summary["events"]["flood"] <= 3
+    assert 0 < summary["packets"]["received"] < MAX_BURST + MAX_PACKETS_PER_S * summary["duration_s"]
+    assert summary["frames"] > 5 * summary["missed_frames"]
+    assert ledger.stat().st_size < 20e6
+
+
+def test_lockstep_survives_no_delimiter_dead_askers_and_endless_parts(tmp_path):
+    with bound(tmp_path, attitude="lockstep = true") as served:
+        with greeted(served.port, b"DEALER") as attacker:
+            attacker.sendall(part(b"no delimiter", more=False) * 10)
+        with greeted(served.port, b"REQ") as dead:
+            dead.sendall(part(b"", more=True) + part(packet(0, 0), more=False))
+        with greeted(served.port, b"REQ") as attacker, contextlib.suppress(OSError):
+            attacker.sendall(part(b"", more=True) * 1000 + part(b"x", more=True) * 1000 + part(b"x", more=False))
+            served.await_line("more than 64 parts")
+        with requester(f"tcp://127.0.0.1:{served.port}") as asker:
+            asker.send(packet(1, 1))
+            assert len(asker.recv()) == 40
+        summary = served.summary()
+    assert summary["frames"] >= 1
+    assert summary["link"]["resets"] == 1
+
+
+def make_client(directory: Path) -> Path:
+    assert run_hilstar("keys", "-o", directory).returncode == 0
+    return directory
+
+
+@contextmanager
+def client(port: int, server: Path, own: Path | None) -> Iterator[zmq.Socket]:
+    context = zmq.Context()
+    sender = context.socket(zmq.PUB)
+    sender.setsockopt(zmq.LINGER, 0)
+    if own is not None:
+        sender.curve_publickey, sender.curve_secretkey = zmq.auth.load_certificate(own / "client.key_secret")
+        sender.curve_serverkey = zmq.auth.load_certificate(server / "server.key")[0]
+    sender.connect(f"tcp://127.0.0.1:{port}")
+    try:
+        yield sender
+    finally:
+        sender.close()
+        context.term()
+
+
+def test_clients_are_let_in_and_locked_out_without_a_restart_and_those_rejected_are_told(tmp_path):
+    mine, late = make_client(tmp_path / "mine"), make_client(tmp_path / "late")
+    allowed = mine / "allowed_clients"
+    keys = 'bind = true\ncurve_secret_key = "mine/server.key_secret"\nallowed_clients = "mine/allowed_clients"'
+
+    def heard(served: Served, own: Path, first: int) -> bool:
+        """Whether the ledger's count of frames shows an attitude of this client: a fresh one is told on stderr."""
+        with client(served.port, mine, own) as sender:
+            told = len(served.lines)
+            deadline_s = time.monotonic() + 3.0
+            while time.monotonic() < deadline_s:
+                first += 1
+                sender.send(packet(first, time.monotonic_ns()))
+                time.sleep(0.01)
+                if any("first attitude" in line or "fresh again" in line for line in served.lines[told:]):
+                    return True
+        return False
+
+    with bound(tmp_path, attitude=keys) as served:
+        assert heard(served, mine, 0)
+        served.await_line("stale")
+        assert not heard(served, late, 10_000)
+        (allowed / "late.key").write_bytes((late / "client.key").read_bytes())
+        (allowed / "client.key").unlink()
+        assert heard(served, late, 20_000)
+        await_that(lambda: sum("is stale" in line for line in list(served.lines)) >= 2)
+        assert not heard(served, mine, 30_000)
+        with client(served.port, mine, None):  # no keys at all
+            rejected = sum("was rejected" in line for line in list(served.lines))
+            await_that(lambda: sum("was rejected" in line for line in list(served.lines)) > rejected or rejected >= 3)
+        summary = served.summary()
+    assert summary["link"]["rejected"] == summary["events"]["client-rejected"] >= 3
+    assert any("its key is not among those allowed" in line for line in served.lines)
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "said"),
+    [
+        ("tcp://127.0.0.1:0;10.0.0.1:5560", "write tcp://HOST:PORT"),
+        ("tcp://localhost.evil:5560", "hilstar keys"),
+        ("tcp://127.0.0.1:*", "free port"),
+        ("inproc://attitude", "write tcp://HOST:PORT"),
+        ("ipc://relative", "whole path"),
+    ],
+)
+def test_endpoints_that_libzmq_would_take_and_hilstar_does_not(tmp_path, endpoint, said):
+    bench = tmp_path / "bench.toml"
+    bench.write_text(f'{SMALL_BENCH}\n[attitude]\nendpoint = "{endpoint}"\n')
+    assert_refused(run_hilstar("serve", bench, "--headless", "--duration", "1"), 2, endpoint, said)
+    to = ("--to", endpoint, "--connect", "--spin", "z,1", "--count", "1", "--wait", "0")
+    assert_refused(run_hilstar("send", *to), 2, endpoint, said)
+
+
+def test_binding_a_file_deletes_nothing(tmp_path):
+    measured = tmp_path / "measured.csv"
+    measured.write_text("1,2,3\n")
+    bench = tmp_path / "bench.toml"
+    bench.write_text(f'{SMALL_BENCH}\n[attitude]\nbind = true\nendpoint = "ipc://{measured}"\n')
+    assert_refused(run_hilstar("serve", bench, "--headless", "--duration", "1"), 2, "measured.csv", "no socket")
+    assert_refused(run_hilstar("send", "--spin", "z,1", "--to", f"ipc://{measured}"), 2, "measured.csv", "no socket")
+    assert measured.read_text() == "1,2,3\n"
+
+
+def test_a_free_port_is_told(tmp_path):
+    sent = run_hilstar("send", "--spin", "z,1", "--to", "tcp://127.0.0.1:*", "--count", "1", "--wait", "0", "--json")
+    endpoint = json.loads(sent.stdout)["link"]["endpoint"]
+    assert endpoint.startswith("tcp://127.0.0.1:")
+    assert int(endpoint.rpartition(":")[2]) > 0
+    assert endpoint in sent.stderr
+
+
+def test_keys_in_a_place_that_cannot_be_get_one_line(tmp_path):
+    assert_refused(run_hilstar("keys", "-o", tmp_path / ("k" * 300)), 2, "choose another")
+    assert_refused(run_hilstar("keys", "-o", "/proc/keys/here"), 2, "/proc/keys/here")

@@ -1,0 +1,124 @@
+"""What one packet can ask of a frame: turns of 1 to 900 rad/s and retargets in a live stream, and in a replayed log."""
+
+from __future__ import annotations
+
+import json
+import math
+import signal
+import threading
+import time
+
+import pytest
+
+from tests.conftest import assert_refused, run_hilstar
+from tests.e2e.stream.test_serve import packet, publisher, serving, summary_of
+
+RATES_RAD_S = (1.0, 10.0, 57.0, 200.0, 900.0)
+# A frame of the small bench takes 1 ms; one of 10 rad/s took 1500 ms and more. The margin is for busy machines.
+MAX_FRAME_MS = 400.0
+MOVING = '[render]\nmotion = "on"\n'
+
+
+def stream(sender, attitudes, hz: float) -> None:
+    start_ns = time.monotonic_ns()
+    for k, (q, rate) in enumerate(attitudes):
+        due_ns = start_ns + round(k * 1e9 / hz)
+        time.sleep(max(0.0, (due_ns - time.monotonic_ns()) / 1e9))
+        sender.send(attitude_packet(k, due_ns, q, rate))
+
+
+def attitude_packet(k, t_ns, q, rate) -> bytes:
+    if rate is not None:
+        return packet(k, t_ns, q, rate)
+    return json.dumps({"t_ns": t_ns, "q": q, "sequence": k}).encode()
+
+
+def turned(degrees: float) -> tuple[float, ...]:
+    half = math.radians(degrees) / 2
+    return (math.cos(half), 0.0, math.sin(half), 0.0)
+
+
+def test_turns_of_any_rate_are_drawn_in_bounded_time_and_counted(tmp_path):
+    turns = [((0.5, 0.5, -0.5, 0.5), (0.6 * r, -0.7 * r, 0.2 * r)) for r in RATES_RAD_S for _ in range(40)]
+    attitude = f"max_rate_deg_s = 1e6\n{MOVING}"
+    with publisher() as (sender, port), serving(tmp_path, port, attitude=attitude) as process:
+        stream(sender, turns, 100)
+        time.sleep(0.2)
+        process.send_signal(signal.SIGINT)
+        summary = summary_of(process)
+    assert summary["packets"]["accepted"] == 40 * len(RATES_RAD_S)
+    assert summary["capped"] > 30
+    assert summary["events"]["capped"] == 1
+    assert summary["frame_ms"]["max"] < MAX_FRAME_MS
+
+
+def test_a_rate_in_deg_s_is_refused_by_name_once_said_and_the_stream_goes_on(tmp_path):
+    with publisher() as (sender, port), serving(tmp_path, port, attitude=MOVING) as process:
+        still = (0.5, 0.5, -0.5, 0.5)
+        stream(sender, [(still, (0.0, 0.0, 57.0 if k % 2 else 1.0)) for k in range(100)], 100)
+        time.sleep(0.2)
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=30)
+    packets = json.loads(out)["packets"]
+    assert (packets["accepted"], packets["refused_by"]["rate"]) == (50, 50)
+    lines = [line for line in err.splitlines() if "max_rate_deg_s" in line]
+    assert len(lines) == 1
+    assert "rates are rad/s" in lines[0]
+
+
+@pytest.mark.parametrize("degrees", [20.0, 90.0, 180.0])
+def test_a_sender_without_rates_that_retargets_stops_no_frame(tmp_path, degrees):
+    """200 Hz, at rest, `degrees` further every 0.1 s, and never a discontinuity: each frame shows one place or the other."""
+    with publisher() as (sender, port), serving(tmp_path, port, attitude=MOVING) as process:
+        stream(sender, [(turned(degrees * (k // 20 % 2)), None) for k in range(200)], 200)
+        process.send_signal(signal.SIGTERM)
+        asked_s = time.monotonic()
+        summary = summary_of(process)
+    assert time.monotonic() - asked_s < 10
+    assert summary["frame_ms"]["max"] < MAX_FRAME_MS
+    assert summary["capped"] == 0
+
+
+def test_a_log_whose_rate_is_too_fast_is_refused_with_its_attitude(small_bench_file, tmp_path):
+    log = tmp_path / "log.csv"
+    rows = [f"{k / 10},1,0,0,0,0,0,{57.3 if k == 3 else 0}" for k in range(10)]
+    log.write_text("\n".join(["t_s,qw,qx,qy,qz,rx,ry,rz", *rows]) + "\n")
+    result = run_hilstar("replay", small_bench_file, log, "--headless", "--speed", "max", "--json")
+    assert_refused(result, 2, str(log), "attitude 4", "max_rate_deg_s = 60", "rad/s")
+
+
+def test_a_run_with_such_turns_is_replayed_from_its_ledger_in_bounded_time(tmp_path):
+    ledger = tmp_path / "run.mcap"
+    attitude = f"max_rate_deg_s = 1e6\n{MOVING}"
+    with (
+        publisher() as (sender, port),
+        serving(tmp_path, port, "--ledger", str(ledger), "--frames", "60", attitude=attitude) as process,
+    ):
+        stream(sender, [((0.5, 0.5, -0.5, 0.5), (900.0, 0.0, -900.0)) for _ in range(100)], 100)
+        served = summary_of(process)
+    began_s = time.monotonic()
+    result = run_hilstar("replay", tmp_path / "serve.toml", ledger, "--headless", "--speed", "max", "--json", timeout=60)
+    assert result.returncode == 0, result.stderr
+    summary = json.loads(result.stdout)
+    assert (summary["frames"], summary["capped"]) == (60, served["capped"])
+    assert summary["capped"] > 0
+    assert time.monotonic() - began_s < 30
+
+
+def test_a_frame_that_hangs_is_told_with_its_stage():
+    """The loop's own thread stands still; the watchdog's does not."""
+    from hilstar.notices import Notices
+    from hilstar.run.watchdog import FrameWatch
+
+    notices, told = Notices(), threading.Event()
+    lines: list[str] = []
+    notices.listen(lambda notice: (lines.append(notice.detail), told.set()))
+    with FrameWatch(1e9 / 60, notices) as watch:
+        watch.begin(7)
+        watch.enter("swap")
+        assert told.wait(30)
+        watch.end(timed=True)
+    assert "frame 7 hangs in its stage swap" in lines[0]
+    assert "frame 7 took" in lines[-1]
+    assert "sprites" in lines[-1]
+    assert notices.counts() == {"frame-stuck": 1, "frame-late": 1}

@@ -1,0 +1,181 @@
+"""The serial road: real ptys, real processes."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+
+from hilstar.attitude.wire.serial_link import SerialLink
+from hilstar.bench.build import load
+from hilstar.rotation import angle_between_rad, from_radec_roll_deg, propagate
+from hilstar.run.loop import Limit
+from hilstar.run.send.faults import BadCable, Faults
+from hilstar.run.send.sender import SerialSender, send, spin_samples
+from hilstar.run.serve import serve
+from tests.conftest import SMALL_BENCH, assert_refused, run_hilstar
+from tests.support.ptys import Cable
+
+BAUD = 921_600
+START_DEG = (84.057, -1.2, 0.0)
+
+
+@pytest.fixture
+def cable(tmp_path) -> Iterator[Cable]:
+    with Cable(tmp_path) as cable:
+        yield cable
+
+
+@pytest.fixture
+def bench_file(tmp_path, cable):
+    path = tmp_path / "serial.toml"
+    path.write_text(f'{SMALL_BENCH}\n[attitude]\nsource = "serial"\nport = "{cable.host}"\nbaud = {BAUD}\n')
+    return path
+
+
+@contextmanager
+def serving(bench_file, *options: str) -> Iterator[subprocess.Popen]:
+    command = [sys.executable, "-m", "hilstar", "serve", str(bench_file), "--headless", "--json", *options]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stderr is not None
+            first = process.stderr.readline()
+            assert "reading serial:" in first, first
+            yield process
+        finally:
+            process.kill()
+
+
+def ended(process: subprocess.Popen) -> dict:
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=30)
+    assert process.returncode == 0, err
+    return json.loads(out)
+
+
+def sent(cable, *options: str) -> dict:
+    result = run_hilstar("send", "--to", f"serial:{cable.bench}@{BAUD}", "--json", *options)
+    assert result.returncode == 0, result.stderr
+    return json.loads(result.stdout)
+
+
+def test_two_hundred_a_second_arrive_none_lost_none_refused_and_both_sides_talk(cable, bench_file):
+    with serving(bench_file) as process:
+        told = sent(cable, "--spin", "z,1", "--rate", "200", "--count", "600")
+        summary = ended(process)
+    assert told["sent"] == summary["packets"]["accepted"] == summary["packets"]["received"] == 600
+    assert summary["packets"]["refused"] == 0
+    # Three seconds: 8 quick time requests and then two a second; ten statuses a second.
+    assert told["requests"] >= 8
+    assert told["statuses"] >= 20
+    clock = summary["clock"]
+    assert clock["mode"] == "exchange"
+    assert clock["exchanges"] >= 8
+    # Both processes have the same clock: the offset is its own error.
+    assert abs(clock["offset_ms"]) <= clock["uncertainty_ms"] + 1.0
+    assert summary["receive_latency_ms"]["p50"] is not None
+
+
+def test_lost_corrupted_and_reordered_packets_add_up(cable, bench_file):
+    with serving(bench_file) as process:
+        faults = ["--lose", "10%", "--corrupt", "5%", "--reorder", "--jitter", "1", "--seed", "3"]
+        told = sent(cable, "--spin", "z,1", "--rate", "400", "--count", "800", *faults)
+        summary = ended(process)
+    packets = summary["packets"]
+    assert told["packets"] == 800
+    assert told["lost"] and told["corrupted"] and told["reordered"]
+    assert packets["received"] == told["sent"] == 800 - told["lost"]
+    assert packets["refused_by"]["crc"] == told["corrupted"]
+    assert packets["refused_by"]["time"] == told["reordered"]
+    assert packets["accepted"] == packets["received"] - told["corrupted"] - told["reordered"]
+
+
+def test_nothing_wrong_is_drawn_over_a_bad_cable(cable, bench_file):
+    """A turn of 20 deg/s: every attitude drawn is that of its time, to what a packet's float32 rate predicts in 100 ms."""
+    rate = np.radians([0.0, 0.0, 20.0])
+    drawn = []
+    with load(bench_file) as bench, SerialLink(str(cable.host), BAUD) as link, SerialSender(str(cable.bench), BAUD) as road:
+        faults = BadCable(Faults(0.10, 0.05, 0.05), np.random.default_rng(7), road.put)
+        stop = threading.Event()
+        samples = spin_samples(rate, 200.0, START_DEG)
+        sender = threading.Thread(target=send, args=(faults, samples, stop))
+        sender.start()
+        summary = serve(bench, link, Limit(frames=150), lambda shown: drawn.append((shown.t_ns, shown.attitude)))
+        stop.set()
+        sender.join()
+    shown = [(t_ns, attitude.q_icrs_to_cam) for t_ns, attitude in drawn if attitude is not None]
+    assert len(shown) > 120
+    assert summary["packets"]["refused"] > 10
+    first_ns, first = shown[0]
+    for t_ns, q in shown:
+        assert angle_between_rad(q, propagate(first, rate, (t_ns - first_ns) / 1e9)) < 1e-7 * 0.35 + 1e-9
+    assert angle_between_rad(first, propagate(from_radec_roll_deg(*START_DEG), rate, 0.0)) < np.radians(60)
+
+
+def test_a_line_that_filled_up_while_the_display_was_made_ready_misleads_nobody(cable, bench_file):
+    """A second and a half of packets in the kernel's buffer and at the sender, which had to wait for room."""
+    with load(bench_file) as bench, SerialLink(str(cable.host), BAUD) as link, SerialSender(str(cable.bench), BAUD) as road:
+        stop = threading.Event()
+        faults = BadCable(Faults(0, 0, 0), np.random.default_rng(7), road.put)
+        sender = threading.Thread(target=send, args=(faults, spin_samples(np.zeros(3), 200.0, START_DEG), stop))
+        sender.start()
+        time.sleep(1.5)
+        shown = []
+        summary = serve(bench, link, Limit(slots=240), shown.append)
+        stop.set()
+        sender.join()
+    assert summary["packets"]["refused"] == 0
+    assert summary["clock"]["jumps"] == 0
+    # Both ends have one clock; what is left after the first seconds is the line's delay, or half of an exchange's.
+    assert abs(summary["clock"]["offset_ms"]) < summary["clock"]["uncertainty_ms"] + 2.0
+    assert shown[-1].attitude.age_ns < 250_000_000
+    assert summary["receive_latency_ms"]["p50"] < 30
+
+
+def test_a_device_that_goes_and_comes_back_is_picked_up_within_a_second(tmp_path, cable, bench_file):
+    with serving(bench_file) as process:
+        assert sent(cable, "--spin", "z,1", "--rate", "100", "--count", "50")["sent"] == 50
+        cable.pull()
+        time.sleep(1.0)
+        cable.plug()
+        time.sleep(1.0)
+        assert sent(cable, "--spin", "z,1", "--rate", "100", "--count", "50")["sent"] == 50
+        time.sleep(0.2)
+        summary = ended(process)
+    assert summary["reconnects"] == 1
+    assert summary["packets"]["accepted"] == 100
+    assert summary["stale_events"] in {1, 2}  # the second where the last packet is old before the end
+    # Frames go on at 60 Hz through the whole second and the rest.
+    assert summary["frames"] + summary["missed_frames"] >= 60 * 2.5
+
+
+def test_a_line_of_garbage_without_an_end_is_one_refusal_and_the_next_frame_is_taken(cable, bench_file):
+    bench_file.write_text(bench_file.read_text() + "time_requests = false\n")  # an answer would end the garbage
+    with serving(bench_file) as process:
+        with SerialSender(str(cable.bench), BAUD) as road:
+            for _ in range(50):
+                road.send_bytes(b"\x55" * 1000, 1.0)
+                time.sleep(0.002)
+        sent(cable, "--spin", "z,1", "--rate", "100", "--count", "20")
+        summary = ended(process)
+    assert summary["packets"]["refused_by"]["format"] == 1
+    assert summary["packets"]["accepted"] == 20
+
+
+def test_a_port_that_is_not_there_or_no_port_gets_one_line(tmp_path):
+    bench = tmp_path / "bench.toml"
+    for port, said in (("/dev/ttyNowhere", "ttyUSB0"), ("/dev/null", "ttyUSB0")):
+        bench.write_text(f'{SMALL_BENCH}\n[attitude]\nsource = "serial"\nport = "{port}"\n')
+        assert_refused(run_hilstar("serve", bench, "--headless", "--duration", "1"), 2, port, said)
+    bench.write_text(f'{SMALL_BENCH}\n[attitude]\nsource = "serial"\n')
+    assert_refused(run_hilstar("serve", bench, "--headless", "--duration", "1"), 2, "port")
+    assert_refused(run_hilstar("send", "--spin", "z,1", "--to", "serial:/dev/ttyNowhere@115200"), 2, "ttyNowhere")
+    assert_refused(run_hilstar("send", "--spin", "z,1", "--to", "serial:@115200"), 2, "serial:/dev/ttyX@BAUD")

@@ -1,0 +1,369 @@
+"""The live stream: real ZeroMQ sockets, real processes."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import time
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zmq
+
+from hilstar.rotation import from_radec_roll_deg
+from tests.conftest import SMALL_BENCH, assert_refused, run_hilstar
+
+SUMMARY_KEYS = {"frames", "duration_s", "fps", "frame_ms", "attitude_age_ms", "packets", "stars_drawn", "clipped"}
+SUMMARY_KEYS |= {
+    "capped",
+    "given_up",
+    "missed_frames",
+    "stale_frames",
+    "gl_renderer",
+    "stale_events",
+    "receive_latency_ms",
+    "clock",
+    "reconnects",
+    "events",
+    "link",
+}
+
+
+def packet(sequence: int, t_ns: int, q=(0.5, 0.5, -0.5, 0.5), rate=(0.0, 0.0, 0.0)) -> bytes:
+    """From the design's section 4, without hilstar."""
+    body = struct.pack("<BBHIq4d3f", 1, 1, 1, sequence, t_ns, *q, *rate)
+    return body + struct.pack("<I", zlib.crc32(body))
+
+
+@contextmanager
+def publisher() -> Iterator[tuple[zmq.Socket, int]]:
+    """A plain PUB socket, bound; and its port."""
+    context = zmq.Context()
+    sender = context.socket(zmq.PUB)
+    sender.setsockopt(zmq.LINGER, 1000)
+    sender.setsockopt(zmq.SNDHWM, 100_000)
+    bound = sender.bind_to_random_port("tcp://127.0.0.1")
+    try:
+        yield sender, bound
+    finally:
+        sender.close()
+        context.term()
+
+
+@contextmanager
+def serving(tmp_path, port: int, *options: str, attitude: str = "", monitor: str = "") -> Iterator[subprocess.Popen]:
+    """`hilstar serve` in a process of its own, once it listens."""
+    bench = tmp_path / "serve.toml"
+    text = SMALL_BENCH.replace("[collimator]", f"{monitor}\n[collimator]")
+    bench.write_text(f'{text}\n[attitude]\nendpoint = "tcp://127.0.0.1:{port}"\n{attitude}\n')
+    command = [sys.executable, "-m", "hilstar", "serve", str(bench), "--headless", "--json", *options]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ) as process:
+        try:
+            assert process.stderr is not None
+            first = process.stderr.readline()
+            assert f"127.0.0.1:{port}" in first, first
+            time.sleep(0.3)  # ZeroMQ's subscription crosses the socket
+            yield process
+        finally:
+            process.kill()
+
+
+def summary_of(process: subprocess.Popen, timeout: float = 30, code: int = 0) -> dict:
+    out, err = process.communicate(timeout=timeout)
+    assert process.returncode == code, err
+    return json.loads(out)
+
+
+def test_a_thousand_packets_at_200_hz_all_arrive_with_garbage_between_them(tmp_path):
+    """1000 good ones; after every tenth, one each of: wrong CRC, NaN, norm, old time, and bytes of no form."""
+    with publisher() as (sender, port), serving(tmp_path, port) as process:
+        start = time.monotonic_ns()
+        for k in range(1000):
+            t_ns = start + k * 5_000_000
+            time.sleep(max(0, (t_ns - time.monotonic_ns()) / 1e9))
+            sender.send(packet(k, t_ns))
+            if k % 10 == 9:
+                broken = bytearray(packet(k, t_ns + 1))
+                broken[20] ^= 4
+                sender.send(bytes(broken))
+                sender.send(packet(k, t_ns + 1, q=(float("nan"), 0, 0, 1)))
+                sender.send(packet(k, t_ns + 1, q=(1.1, 0, 0, 0)))
+                sender.send(packet(k, t_ns - 1))
+                sender.send(np.random.default_rng(k).bytes(50))
+        time.sleep(0.2)
+        process.send_signal(signal.SIGINT)
+        summary = summary_of(process)
+    packets = summary["packets"]
+    assert packets["accepted"] == 1000
+    assert packets["received"] == 1500
+    assert packets["refused_by"] == {"crc": 100, "norm": 100, "nan": 100, "time": 100, "format": 100}
+    assert packets["refused"] == 500
+    assert summary["frames"] > 200
+    assert summary["stars_drawn"]["max"] > 0
+    assert set(summary) == SUMMARY_KEYS
+
+
+def test_a_clean_stream_is_refused_nothing(tmp_path):
+    with publisher() as (sender, port), serving(tmp_path, port) as process:
+        for k in range(400):
+            sender.send(packet(k, time.monotonic_ns()))
+            time.sleep(0.0025)
+        time.sleep(0.2)
+        process.send_signal(signal.SIGTERM)
+        summary = summary_of(process)
+    assert (summary["packets"]["received"], summary["packets"]["refused"]) == (400, 0)
+    for key in ("p50", "p99", "max"):
+        assert summary["attitude_age_ms"][key] is not None
+
+
+def test_json_and_multipart_messages_are_taken(tmp_path):
+    with publisher() as (sender, port), serving(tmp_path, port) as process:
+        sender.send(json.dumps({"t_ns": 1_000_000, "q": [1, 0, 0, 0], "rate": [0, 0, 0]}).encode())
+        sender.send_multipart([b"attitude", json.dumps({"t_ns": 2_000_000, "q": [1, 0, 0, 0]}).encode()])
+        sender.send_multipart([b"topic", b"more", packet(3, 3_000_000)])
+        sender.send(b'{"t_ns": 4000000, "q": [NaN, 0, 0, 0]}')
+        time.sleep(0.3)
+        process.send_signal(signal.SIGINT)
+        packets = summary_of(process)["packets"]
+    assert (packets["accepted"], packets["refused_by"]["nan"]) == (3, 1)
+
+
+def test_an_oversized_message_costs_a_connection_and_no_more(tmp_path):
+    """2 MiB are over the limit: libzmq drops the connection for good, hilstar makes it anew."""
+    with publisher() as (sender, port), serving(tmp_path, port) as process:
+        for k in range(20):
+            sender.send(packet(k, 1_000_000 * k))
+        time.sleep(0.2)
+        sender.send(bytes(2 << 20))
+        time.sleep(1.0)
+        for k in range(20, 120):
+            sender.send(packet(k, 1_000_000 * k))
+            time.sleep(0.005)
+        time.sleep(0.2)
+        process.send_signal(signal.SIGINT)
+        packets = summary_of(process)["packets"]
+    assert packets["accepted"] == 120
+    assert packets["refused"] == 0
+
+
+def test_a_bench_that_closes_and_comes_back_is_heard_again(tmp_path):
+    context = zmq.Context()
+    with publisher() as (sender, port), serving(tmp_path, port) as process:
+        sender.send(packet(0, 1_000_000))
+        time.sleep(0.2)
+        sender.unbind(f"tcp://127.0.0.1:{port}")
+        sender.close(linger=0)
+        time.sleep(0.3)
+        again = context.socket(zmq.PUB)
+        again.bind(f"tcp://127.0.0.1:{port}")
+        time.sleep(1.0)
+        again.send(packet(1, 2_000_000))
+        time.sleep(0.2)
+        process.send_signal(signal.SIGINT)
+        packets = summary_of(process)["packets"]
+        again.close(linger=0)
+    context.term()
+    assert packets["accepted"] == 2
+
+
+def test_a_silent_bench_shows_blank_frames_and_ends_in_order(tmp_path):
+    """Its exit code says that it never had an attitude, and so does a line after two seconds."""
+    with publisher() as (_, port), serving(tmp_path, port, "--frames", "150") as process:
+        summary = summary_of(process, code=4)
+    assert summary["events"]["no-attitude"] == 1
+    assert summary["frames"] == summary["stale_frames"] == 150
+    assert summary["attitude_age_ms"] == {"p50": None, "p99": None, "max": None}
+    assert summary["stars_drawn"]["max"] == 0
+
+
+@pytest.mark.parametrize(("on_stale", "stars_at_end"), [("hold", True), ("blank", False)])
+def test_what_is_shown_after_the_stream_stops_is_the_policy_s(tmp_path, on_stale, stars_at_end):
+    """One packet, then a second of silence: the frames after 100 ms are stale, and blank only where that was asked."""
+    attitude = f'stale_after_ms = 100\nmax_extrapolation_ms = 50\non_stale = "{on_stale}"'
+    with publisher() as (sender, port), serving(tmp_path, port, "--duration", "1.5", attitude=attitude) as process:
+        sender.send(packet(0, 0, q=tuple(from_radec_roll_deg(84, -1, 0))))
+        summary = summary_of(process)
+    assert summary["stale_frames"] > 50
+    mean, most = summary["stars_drawn"]["mean"], summary["stars_drawn"]["max"]
+    assert (mean > 0.4 * most) is stars_at_end
+    assert summary["frames"] + summary["missed_frames"] == 90
+
+
+def test_hilstar_send_is_heard_by_serve_that_binds(tmp_path):
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    with serving(tmp_path, port, attitude="bind = true") as process:
+        sent = run_hilstar(
+            "send", "--spin", "z,1.5", "--rate", "200", "--count", "300", "--to", f"tcp://127.0.0.1:{port}", "--connect"
+        )
+        assert sent.returncode == 0, sent.stderr
+        assert "300 packets sent" in sent.stderr
+        time.sleep(0.2)
+        process.send_signal(signal.SIGINT)
+        packets = summary_of(process)["packets"]
+    assert (packets["received"], packets["refused"]) == (300, 0)
+
+
+def test_a_log_sent_at_a_rate_is_resampled(tmp_path):
+    (tmp_path / "log.csv").write_text("t_s,qw,qx,qy,qz\n5,1,0,0,0\n6,0.9999,0.01,0,0.0099\n")
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    with serving(tmp_path, port) as process:
+        sent = run_hilstar("send", tmp_path / "log.csv", "--rate", "100", "--to", f"tcp://127.0.0.1:{port}")
+        assert "101 packets sent" in sent.stderr
+        time.sleep(0.2)
+        process.send_signal(signal.SIGINT)
+        assert summary_of(process)["packets"]["accepted"] == 101
+
+
+def test_a_sender_that_restarts_is_taken_up_again(tmp_path):
+    with publisher() as (sender, port), serving(tmp_path, port) as process:
+        for start_ns in (10**15, 0):  # the second run's clock begins anew
+            for k in range(50):
+                sender.send(packet(k, start_ns + k * 5_000_000))
+                time.sleep(0.005)
+            time.sleep(0.5)
+        process.send_signal(signal.SIGINT)
+        packets = summary_of(process)["packets"]
+    assert packets["refused"] == 0
+    assert packets["accepted"] == 100
+
+
+def test_a_port_in_use_gets_one_line(tmp_path, small_bench_file):
+    with publisher() as (_, port):
+        small_bench_file.write_text(SMALL_BENCH + f'[attitude]\nbind = true\nendpoint = "tcp://127.0.0.1:{port}"\n')
+        result = run_hilstar("serve", small_bench_file, "--headless", "--duration", "1")
+        assert_refused(result, 2, f"127.0.0.1:{port}", "in use")
+        assert_refused(run_hilstar("send", "--spin", "z,1", "--to", f"tcp://127.0.0.1:{port}"), 2, "in use")
+
+
+@contextmanager
+def requester(endpoint: str) -> Iterator[zmq.Socket]:
+    """A plain REQ socket, connected."""
+    context = zmq.Context()
+    asker = context.socket(zmq.REQ)
+    asker.setsockopt(zmq.LINGER, 0)
+    asker.setsockopt(zmq.RCVTIMEO, 5000)
+    asker.connect(endpoint)
+    try:
+        yield asker
+    finally:
+        asker.close()
+        context.term()
+
+
+def test_lockstep_shows_one_frame_a_request_and_says_when(tmp_path):
+    """Packets and JSON, a simulator's time that runs at any speed and goes back, and what is wrong: each gets its answer."""
+    port = free_port()
+    with serving(tmp_path, port, attitude="lockstep = true") as process, requester(f"tcp://127.0.0.1:{port}") as asker:
+        for k in range(50):
+            asker.send(packet(k, k * 3_600_000_000_000))
+            version, kind, health, frame, light_ns, age_ns, sequence, accepted, refused, crc = struct.unpack(
+                "<BBHIqqIIII", body := asker.recv()
+            )
+            assert (version, kind, frame, sequence, accepted, refused) == (1, 4, k, k, k + 1, 0)
+            assert (light_ns, age_ns) == (k * 3_600_000_000_000, 0)
+            assert crc == zlib.crc32(body[:-4])
+            assert health & 0b111 == 0
+        asker.send_string(json.dumps({"t_ns": 5, "q": [1, 0, 0, 0]}))
+        answer = json.loads(asker.recv())
+        assert (answer["frame"], answer["light_t_ns"], answer["refused"]) == (50, 5, None)
+        assert 0 < answer["shown_ns"] <= time.monotonic_ns()
+        asker.send_string('{"t_ns": 6, "q": [1, 1, 0, 0]}')
+        assert json.loads(asker.recv())["refused"]["reason"] == "norm"
+        asker.send(b"nonsense")
+        assert struct.unpack("<BBHI", asker.recv()[:8])[3] == 50
+        asker.send(struct.pack("<BBHIq", 1, 2, 0, 9, 77) + struct.pack("<I", zlib.crc32(struct.pack("<BBHIq", 1, 2, 0, 9, 77))))
+        assert struct.unpack("<BBHIqqq", asker.recv()[:-4])[:5] == (1, 3, 0, 9, 77)
+        process.send_signal(signal.SIGINT)
+        summary = summary_of(process)
+    assert summary["frames"] == 51
+    assert (summary["packets"]["accepted"], summary["packets"]["refused"]) == (51, 2)
+    assert summary["turn_ms"]["p50"] > 0
+
+
+def test_lockstep_without_a_request_never_had_an_attitude(tmp_path):
+    with serving(tmp_path, free_port(), "--duration", "2.5", attitude="lockstep = true") as process:
+        summary = summary_of(process, code=4)
+    assert (summary["packets"]["accepted"], summary["events"]["no-attitude"]) == (0, 1)
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+@pytest.mark.parametrize("line", ["bind = true", "bind = false", "lockstep = true"])
+@pytest.mark.parametrize("host", ["*", "192.0.2.1", "0.0.0.0", "[::]"])
+def test_beyond_loopback_nothing_is_bound_or_connected_without_keys(small_bench_file, host, line):
+    small_bench_file.write_text(f'{SMALL_BENCH}\n[attitude]\nendpoint = "tcp://{host}:5599"\n{line}\n')
+    assert_refused(run_hilstar("serve", small_bench_file, "--headless", "--duration", "1"), 2, "hilstar keys", "5599")
+
+
+def test_send_beyond_loopback_needs_keys_too():
+    assert_refused(run_hilstar("send", "--spin", "z,1", "--to", "tcp://*:5599"), 2, "hilstar keys")
+
+
+def test_with_keys_a_known_client_is_heard_and_a_stranger_is_not(tmp_path):
+    """hilstar binds, with an allow-list; the stranger has keys of its own, and the server's public one."""
+    port = free_port()
+    for directory in ("mine", "strange"):
+        assert run_hilstar("keys", "-o", tmp_path / directory).returncode == 0
+    assert_refused(run_hilstar("keys", "-o", tmp_path / "mine"), 2, "in use")
+    assert (tmp_path / "mine" / "server.key_secret").stat().st_mode & 0o077 == 0
+    keys = 'bind = true\ncurve_secret_key = "mine/server.key_secret"\nallowed_clients = "mine/allowed_clients"'
+    with serving(tmp_path, port, attitude=keys) as process:
+        for directory, waits in (("strange", "1"), ("mine", "10")):
+            client = tmp_path / directory / "client.key_secret"
+            options = ["--secret-key", client, "--server-key", tmp_path / "mine" / "server.key", "--wait", waits]
+            to = ["--to", f"tcp://127.0.0.1:{port}", "--connect", "--spin", "z,1", "--count", "40", "--rate", "200"]
+            assert run_hilstar("send", *to, *options).returncode == 0
+        plain = run_hilstar("send", *to, "--wait", "1")
+        assert "nobody listens" in plain.stderr
+        process.send_signal(signal.SIGINT)
+        packets = summary_of(process)["packets"]
+    assert (packets["received"], packets["accepted"]) == (40, 40)
+
+
+def test_key_files_that_are_none_get_one_line(tmp_path, small_bench_file):
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "bad.key_secret").write_text("nothing")
+    for line, said in (
+        ('curve_secret_key = "bad.key_secret"\ncurve_server_key = "bad.key_secret"', "no key file"),
+        ('curve_secret_key = "missing"\ncurve_server_key = "missing"', "no key file"),
+        ('curve_secret_key = "bad.key_secret"', "curve_server_key"),
+        ('curve_server_key = "bad.key_secret"', "curve_secret_key"),
+        ('bind = true\ncurve_secret_key = "bad.key_secret"', "allowed_clients"),
+    ):
+        small_bench_file.write_text(f"{SMALL_BENCH}\n[attitude]\n{line}\n")
+        assert_refused(run_hilstar("serve", small_bench_file, "--headless", "--duration", "1"), 2, said)
+
+
+def test_a_flood_is_bounded_and_the_display_goes_on(tmp_path):
+    """50 000 messages of 200 kB as fast as they go: what hilstar keeps of them is bounded, and frames go on."""
+    with publisher() as (sender, port), serving(tmp_path, port, "--duration", "4") as process:
+        message = bytes(200_000)
+        end = time.monotonic() + 2.5
+        most_kb = 0
+        while time.monotonic() < end:
+            sender.send(message)
+            with Path(f"/proc/{process.pid}/status").open() as status:
+                most_kb = max(most_kb, *(int(line.split()[1]) for line in status if line.startswith("VmRSS")))
+        sender.close(linger=0)
+        summary = summary_of(process, code=4)  # none of them is an attitude
+    assert summary["packets"]["refused_by"]["format"] > 100
+    assert summary["frames"] + summary["missed_frames"] == 240
+    assert summary["frames"] > 60
+    assert most_kb < 1_000_000

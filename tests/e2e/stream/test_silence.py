@@ -1,0 +1,170 @@
+"""A stream that waits, falls silent, hangs, or is two: real sockets, and what is said of it."""
+
+from __future__ import annotations
+
+import json
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+import zmq
+
+from hilstar.attitude.wire.zmq_links import ZmqReceiver
+from hilstar.bench.build import load
+from hilstar.rotation import from_radec_roll_deg
+from hilstar.run.loop import Limit
+from hilstar.run.serve import serve
+from tests.conftest import run_hilstar
+from tests.e2e.stream.test_serve import packet, publisher, serving, summary_of
+
+ORION = tuple(from_radec_roll_deg(84.0, -1.0, 0.0))
+LYRA = tuple(from_radec_roll_deg(283.0, 35.0, 30.0))
+# The road's delay on a loaded machine; the sender's clock is this process's own, so the offset is that delay alone.
+MAX_MIN_DELAY_MS = 2.0
+
+
+@contextmanager
+def talking(sender: zmq.Socket, rate_hz: float = 200.0, q=ORION, first: int = 0) -> Iterator[None]:
+    """A sender of this process, stamped with its monotonic clock, that talks all the while."""
+    stop = threading.Event()
+
+    def talk() -> None:
+        k = first
+        while not stop.wait(1 / rate_hz):
+            sender.send(packet(k, time.monotonic_ns(), q))
+            k += 1
+
+    thread = threading.Thread(target=talk)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
+
+
+@pytest.mark.parametrize("queued_s", [0.3, 1.5])
+def test_packets_that_waited_for_the_display_mislead_nobody(small_bench_file, queued_s):
+    """The link is open while the display is measured: what queues up there is shown, and teaches no clock."""
+    with (
+        publisher() as (sender, port),
+        ZmqReceiver(f"tcp://127.0.0.1:{port}") as link,
+        talking(sender),
+        load(small_bench_file) as bench,
+    ):
+        time.sleep(queued_s)
+        shown = []
+        summary = serve(bench, link, Limit(slots=150), lambda frame: shown.append(frame.attitude))
+    assert summary["packets"]["refused"] == 0
+    clock = summary["clock"]
+    assert clock["jumps"] == 0
+    assert -0.001 <= clock["offset_ms"] < MAX_MIN_DELAY_MS
+    assert clock["offset_ms"] <= clock["uncertainty_ms"] + MAX_MIN_DELAY_MS
+    assert shown[-1].age_ns < 250_000_000
+    assert summary["receive_latency_ms"]["p50"] < 30
+    assert summary["events"]["first-attitude"] == 1
+    assert not {"jump", "source-slow", "second-sender"} & set(summary["events"])
+
+
+def test_silence_and_its_end_are_said_while_they_happen(tmp_path):
+    with publisher() as (sender, port), serving(tmp_path, port) as process:
+        until_said(process, "no attitude yet")
+        with talking(sender):
+            until_said(process, "the first attitude has come")
+            time.sleep(0.3)
+        until_said(process, "the attitude is stale")
+        with talking(sender):
+            until_said(process, "the attitude is fresh again")
+        process.send_signal(signal.SIGINT)
+        summary = summary_of(process)
+    events = summary["events"]
+    assert (events["no-attitude"], events["first-attitude"], events["fresh"]) == (1, 1, 1)
+    assert events["stale"] in {1, 2}
+
+
+def test_a_sender_that_hangs_is_stale_in_every_frame_and_nothing_flickers(small_bench_file):
+    """A turn of 1 deg/s for a second, then its last packet at 500 Hz: shown as it was last predicted, and stale to the end."""
+    rate = (0.0, 0.0, 0.0174533)
+    shown = []
+    with publisher() as (sender, port), ZmqReceiver(f"tcp://127.0.0.1:{port}") as link, load(small_bench_file) as bench:
+        stop = threading.Event()
+
+        def talk() -> None:
+            k, last = 0, b""
+            while not stop.wait(0.005 if k < 400 else 0.002):
+                if k < 400:
+                    last = packet(k, time.monotonic_ns(), ORION, rate)
+                sender.send(last)
+                k += 1
+
+        thread = threading.Thread(target=talk)
+        thread.start()
+        summary = serve(bench, link, Limit(slots=300), shown.append)
+        stop.set()
+        thread.join()
+    assert summary["clock"]["jumps"] == 0
+    assert summary["packets"]["refused_by"]["time"] > 200
+    assert summary["events"]["source-frozen"] == 1
+    hung = max(k for k, frame in enumerate(shown) if not frame.stale) + 1
+    assert len(shown) - hung > 60
+    ages_ns = [frame.attitude.age_ns for frame in shown[hung:]]
+    assert ages_ns == sorted(ages_ns)
+    assert len({tuple(frame.attitude.q_icrs_to_cam) for frame in shown[hung:]}) == 1
+
+
+def test_two_senders_on_one_port_are_told_apart_and_the_first_is_shown(tmp_path):
+    context = zmq.Context()
+    with zmq_port() as port, serving(tmp_path, port, attitude="bind = true") as process:
+        first, second = (context.socket(zmq.PUB) for _ in range(2))
+        for sender in (first, second):
+            sender.connect(f"tcp://127.0.0.1:{port}")
+        assert process.stderr is not None
+        with talking(first):
+            until_said(process, "first attitude")
+            with talking(second, q=LYRA, first=7):
+                until_said(process, "two senders")
+                time.sleep(1.0)
+        process.send_signal(signal.SIGINT)
+        summary = summary_of(process)
+        for sender in (first, second):
+            sender.close(linger=0)
+    context.term()
+    assert summary["events"]["second-sender"] == 1
+    assert summary["packets"]["refused_by"]["source"] > 50
+    assert summary["clock"]["jumps"] == 0
+
+
+def until_said(process, text: str) -> None:
+    while text not in (line := process.stderr.readline()):
+        assert line
+
+
+@contextmanager
+def zmq_port() -> Iterator[int]:
+    with publisher() as (_, port):
+        pass
+    yield port
+
+
+def test_a_shared_clock_is_said_in_the_summary(tmp_path):
+    with publisher() as (sender, port), serving(tmp_path, port, attitude='clock = "shared"') as process:
+        with talking(sender):
+            until_said(process, "first attitude")
+            time.sleep(0.5)
+        process.send_signal(signal.SIGINT)
+        summary = summary_of(process)
+    clock = summary["clock"]
+    assert (clock["mode"], clock["offset_ms"], clock["uncertainty_ms"]) == ("shared", 0, 0)
+    assert 0 < summary["receive_latency_ms"]["p50"] < 50
+
+
+def test_a_replay_says_when_its_attitude_comes(tmp_path, small_bench_file):
+    log = tmp_path / "log.csv"
+    log.write_text("t_s,qw,qx,qy,qz\n0,1,0,0,0\n0.1,1,0,0,0\n")
+    result = run_hilstar("replay", small_bench_file, log, "--headless", "--json")
+    assert result.returncode == 0, result.stderr
+    assert json.loads(result.stdout)["events"]["first-attitude"] == 1
+    assert "the first attitude has come" in result.stderr

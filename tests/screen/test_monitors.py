@@ -1,0 +1,177 @@
+"""Monitors that have names, gamma ramps and a refresh rate, and that come and go: a real X.Org server, dummy driver."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from hilstar.monitor.window.x11 import sync_control
+from hilstar.run.record.records import frame_records
+from tests.conftest import run_hilstar
+from tests.screen.test_window import ATTITUDE, BENCH
+from tests.support.xservers import Xorg, xorg
+
+LATEST_S = 20.0
+OTHER_GAMMA = "1.7:1.4:1.2"
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory) -> Iterator[Xorg]:
+    with xorg(tmp_path_factory.mktemp("xorg")) as running:
+        yield running
+
+
+def bench(folder: Path, keys: str = 'display = "DUMMY0"') -> Path:
+    path = folder / "bench.toml"
+    path.write_text(BENCH.replace("[collimator]", f"refresh_hz = 60\n{keys}\n[collimator]"))
+    still = "\n".join(f"{t},{ATTITUDE}" for t in (0, 60))
+    (folder / "still.csv").write_text(f"t_s,qw,qx,qy,qz\n{still}\n")
+    return path
+
+
+@contextmanager
+def showing(server: Xorg, path: Path, *options: str) -> Iterator[subprocess.Popen]:
+    """A run on the screen, its ledger growing."""
+    ledger = path.parent / "run.mcap"
+    command = ["replay", str(path), str(path.parent / "still.csv"), "--force", "--json", "--ledger", str(ledger), *options]
+    with subprocess.Popen(
+        [sys.executable, "-m", "hilstar", *command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=server.env
+    ) as process:
+        try:
+            wait_for(lambda: frames(path) > 10 or process.poll() is not None)
+            yield process
+        finally:
+            if process.poll() is None:
+                process.terminate()
+                try:
+                    process.communicate(timeout=LATEST_S)
+                finally:
+                    process.kill()
+
+
+def frames(path: Path) -> int:
+    ledger = path.parent / "run.mcap"
+    return len(list(frame_records(ledger))) if ledger.exists() and ledger.stat().st_size else 0
+
+
+def wait_for(true) -> None:
+    end = time.monotonic() + LATEST_S
+    while not true():
+        assert time.monotonic() < end
+        time.sleep(0.1)
+
+
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT])
+def test_the_ramp_is_straight_while_the_bench_runs_and_given_back_after_a_signal(server, tmp_path, how):
+    server.xrandr("--output", "DUMMY0", "--gamma", OTHER_GAMMA)
+    before = server.gamma("DUMMY0")
+    assert before != (1.0, 1.0, 1.0)
+    with showing(server, bench(tmp_path)) as process:
+        assert server.gamma("DUMMY0") == (1.0, 1.0, 1.0)
+        process.send_signal(how)
+        out, err = process.communicate(timeout=LATEST_S)
+    assert process.returncode == 0, err
+    assert server.gamma("DUMMY0") == before
+    assert json.loads(out)["screen"]["timestamp_source"].startswith("after-swap clock")
+    server.xrandr("--output", "DUMMY0", "--gamma", "1:1:1")
+
+
+def test_swaps_that_do_not_wait_for_a_known_refresh_are_refused(server, tmp_path):
+    path = bench(tmp_path)
+    result = run_hilstar("replay", path, tmp_path / "still.csv", env=server.env)
+    assert result.returncode == 3, result.stderr
+    assert "vertical sync" in result.stderr and "--force" in result.stderr and "Traceback" not in result.stderr
+
+
+def test_the_monitor_that_is_named_is_the_one_that_is_filled(server, tmp_path):
+    server.xrandr("--output", "DUMMY1", "--mode", "800x600", "--right-of", "DUMMY0")
+    try:
+        listed = run_hilstar("doctor", "--json", env=server.env)
+        detail = next(c["detail"] for c in json.loads(listed.stdout)["checks"] if c["name"] == "display")
+        assert "DUMMY0, 640 x 480, 60 Hz" in detail and "DUMMY1, 800 x 600" in detail
+        path = bench(tmp_path, 'display = "dummy1"')
+        path.write_text(path.read_text().replace("resolution_px = [640, 480]", "resolution_px = [800, 600]"))
+        with showing(server, path):
+            pass
+        assert frames(path) > 10
+        wrong = bench(tmp_path, 'display = "DUMMY1"')
+        result = run_hilstar("replay", wrong, tmp_path / "still.csv", env=server.env)
+        assert result.returncode == 3
+        assert "800 x 600" in result.stderr
+    finally:
+        server.xrandr("--output", "DUMMY1", "--off")
+
+
+def test_a_display_that_another_one_mirrors_is_refused(server, tmp_path):
+    server.xrandr("--output", "DUMMY1", "--mode", "640x480", "--same-as", "DUMMY0")
+    try:
+        result = run_hilstar("replay", bench(tmp_path), tmp_path / "still.csv", env=server.env)
+        assert result.returncode == 3
+        assert "DUMMY1 mirrors this one" in result.stderr
+    finally:
+        server.xrandr("--output", "DUMMY1", "--off")
+
+
+def test_a_display_that_is_unplugged_and_returns_is_filled_again(server, tmp_path):
+    server.xrandr("--output", "DUMMY1", "--mode", "640x480", "--right-of", "DUMMY0")
+    try:
+        path = bench(tmp_path, 'display = "DUMMY1"')
+        server.xrandr("--output", "DUMMY1", "--gamma", OTHER_GAMMA)
+        with showing(server, path) as process:
+            server.xrandr("--output", "DUMMY1", "--off")
+            gone = frames(path)
+            wait_for(lambda: frames(path) > gone + 30)
+            server.xrandr("--output", "DUMMY1", "--mode", "640x480", "--right-of", "DUMMY0")
+            back = frames(path)
+            wait_for(lambda: frames(path) > back + 30)
+            wait_for(lambda: server.gamma("DUMMY1") == (1.0, 1.0, 1.0))
+            assert process.poll() is None
+            process.terminate()
+            _, err = process.communicate(timeout=LATEST_S)
+        assert process.returncode == 0, err
+        assert "DUMMY1 is gone" in err and "DUMMY1 is back" in err
+    finally:
+        server.xrandr("--output", "DUMMY1", "--off")
+
+
+def test_a_compositing_manager_is_refused(server, tmp_path):
+    """Owning the selection is what makes a compositing manager (EWMH): a real X client owns it here."""
+    x11 = ctypes.CDLL("libX11.so.6")
+    x11.XOpenDisplay.restype = ctypes.c_void_p
+    x11.XOpenDisplay.argtypes = [ctypes.c_char_p]
+    x11.XInternAtom.restype = x11.XDefaultRootWindow.restype = x11.XCreateSimpleWindow.restype = ctypes.c_ulong
+    x11.XInternAtom.argtypes = [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_int]
+    x11.XDefaultRootWindow.argtypes = [ctypes.c_void_p]
+    x11.XCreateSimpleWindow.argtypes = [
+        ctypes.c_void_p,
+        ctypes.c_ulong,
+        *[ctypes.c_int] * 2,
+        *[ctypes.c_uint] * 3,
+        *[ctypes.c_ulong] * 2,
+    ]
+    x11.XSetSelectionOwner.argtypes = [ctypes.c_void_p, ctypes.c_ulong, ctypes.c_ulong, ctypes.c_ulong]
+    x11.XSync.argtypes, x11.XCloseDisplay.argtypes = [ctypes.c_void_p, ctypes.c_int], [ctypes.c_void_p]
+    client = x11.XOpenDisplay(server.display.encode())
+    try:
+        window = x11.XCreateSimpleWindow(client, x11.XDefaultRootWindow(client), 0, 0, 1, 1, 0, 0, 0)
+        x11.XSetSelectionOwner(client, x11.XInternAtom(client, b"_NET_WM_CM_S0", 0), window, 0)
+        x11.XSync(client, 0)
+        result = run_hilstar("replay", bench(tmp_path), tmp_path / "still.csv", env=server.env)
+    finally:
+        x11.XCloseDisplay(client)
+    assert result.returncode == 3
+    assert "compositing manager" in result.stderr
+
+
+def test_without_a_driver_that_tells_of_swaps_there_is_no_sync_control():
+    assert sync_control(None, None) is None
+    assert sync_control(0, 5) is None

@@ -1,0 +1,166 @@
+"""20 s on a 1080p window under Xvfb, 300 stars, 200 Hz of packets: every frame accounted for, and what it shows is true."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from hilstar.attitude.logs.log_file import read_log
+from hilstar.resources import resource_path
+from hilstar.rotation import angle_between_rad, propagate
+from hilstar.run.record.records import read_run
+from tests.conftest import run_hilstar
+from tests.screen.test_window import LATEST_S
+
+DURATION_S, REFRESH_HZ, PACKET_HZ = 20, 60, 200
+RATE_DEG_S = 0.5
+# A packet's rate is float32 of 0.0087 rad/s: 5e-10 of it, over at most 0.25 s of prediction; and the clock's own line, 5 us.
+POINTING_ARCSEC = 0.02
+ARCSEC_PER_RAD = 206_264.8
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> tuple[dict, Path]:
+    """The demo's bench with more stars, on a virtual screen of its own."""
+    folder = tmp_path_factory.mktemp("run")
+    text = resource_path("configs", "demo.toml").read_text()
+    port = 5600 + os.getpid() % 300
+    text = text.replace("tcp://127.0.0.1:*", f"tcp://127.0.0.1:{port}").replace("faintest_v_mag = 7.5", "faintest_v_mag = 8.0")
+    bench = folder / "bench.toml"
+    bench.write_text(text)
+    read, write = os.pipe()
+    screen = ["Xvfb", "-displayfd", str(write), "-screen", "0", "1920x1080x24", "-nolisten", "tcp"]
+    server = subprocess.Popen(screen, pass_fds=(write,), stderr=subprocess.DEVNULL)
+    os.close(write)
+    with os.fdopen(read) as number:
+        env = {**os.environ, "DISPLAY": f":{number.readline().strip()}"}
+    command = [sys.executable, "-m", "hilstar"]
+    ledger = folder / "run.mcap"
+    serve = [*command, "serve", str(bench), "--json", "--duration", str(DURATION_S), "--ledger", str(ledger)]
+    send = [
+        *command,
+        "send",
+        "--spin",
+        f"x,{RATE_DEG_S}",
+        "--rate",
+        str(PACKET_HZ),
+        "--to",
+        f"tcp://127.0.0.1:{port}",
+        "--connect",
+    ]
+    try:
+        sender = subprocess.Popen([*send, "--duration", str(DURATION_S + LATEST_S)], stderr=subprocess.DEVNULL)
+        done = subprocess.run(serve, env=env, capture_output=True, text=True, timeout=DURATION_S + 60, check=False)
+        sender.terminate()
+        sender.wait()
+    finally:
+        server.terminate()
+        server.wait()
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout), ledger
+
+
+def test_every_refresh_period_is_a_frame_or_missed(run):
+    summary, ledger = run
+    assert summary["frames"] + summary["missed_frames"] == DURATION_S * REFRESH_HZ
+    frames = read_run(ledger).frames
+    assert len(frames) == summary["frames"]
+    assert sum(frame.missed_before for frame in frames) == frames[-1].missed <= summary["missed_frames"]
+    assert summary["stars_drawn"]["max"] > 250
+    assert summary["packets"]["refused"] == 0
+
+
+def test_each_frame_says_when_it_was_drawn_predicted_swapped_and_lit(run):
+    frames = read_run(run[1]).frames
+    assert all(a.swap_ns < b.swap_ns for a, b in pairwise(frames))
+    for frame in frames:
+        assert frame.predicted_swap_ns is not None
+        assert frame.draw_ns < frame.swap_ns
+        assert frame.timestamp_source == "after-swap clock, software pacing"
+        if frame.q is not None:
+            assert frame.receive_ns is not None and frame.receive_ns < frame.swap_ns
+            assert frame.rate is not None  # 0.5 deg/s is worth a path
+            assert frame.prediction_ns > 0
+
+
+def test_what_was_drawn_is_where_the_packets_say_the_camera_is_when_the_middle_row_lights(run):
+    ledger = run[1]
+    samples = read_log(ledger)
+    times_ns = np.array([sample.t_ns for sample in samples])
+    checked = 0
+    for frame in read_run(ledger).frames:
+        if frame.q is None or frame.light_ns > times_ns[-1]:
+            continue
+        sample = samples[int(np.searchsorted(times_ns, frame.light_ns)) - 1]
+        true = propagate(sample.q_icrs_to_cam, sample.rate_cam_rad_s, (frame.light_ns - sample.t_ns) / 1e9)
+        assert angle_between_rad(true, np.array(frame.q)) * ARCSEC_PER_RAD < POINTING_ARCSEC
+        checked += 1
+    assert checked > DURATION_S * REFRESH_HZ / 2
+
+
+def test_the_report_says_it_on_one_page(run, tmp_path):
+    summary, ledger = run
+    result = run_hilstar("report", ledger, "-o", tmp_path / "report", "--json")
+    assert result.returncode == 0, result.stderr
+    found = json.loads(result.stdout)
+    assert found["frames"] == summary["frames"] and found["missed_frames"] <= summary["missed_frames"]
+    assert found["pacing_jitter_ms"] == pytest.approx(summary["screen"]["pacing_jitter_ms"], rel=1e-6)
+    for key in ("attitude_age_ms", "packet_to_swap_ms", "swap_late_ms"):
+        assert found[key]["p50"] is not None
+    assert found["packets"]["accepted"] == summary["packets"]["accepted"]
+    assert found["memory_growth_mb"] is None  # a run of less than a minute says nothing of that
+    assert len(found["bench_sha256"]) == len(found["calibration_sha256"]) == 64
+    page = (tmp_path / "report" / "report.html").read_text()
+    assert page.count("data:image/png;base64,") == 6
+    for name in ("timing", "age", "missed", "attitude", "stars", "memory"):
+        pixels = np.array(Image.open(tmp_path / "report" / f"{name}.png").convert("L"))
+        assert pixels.shape[0] > 300 and (pixels < 200).mean() > 0.002
+    told = run_hilstar("report", ledger, "-o", tmp_path / "report")
+    assert "pacing jitter" in told.stdout and "age of the attitude at light" in told.stdout
+
+
+def test_paths_are_drawn_again_from_the_ledger(run, tmp_path):
+    """The moving stars of the run are no points, and not those of a run that stands still."""
+    ledger = run[1]
+    bench = ledger.parent / "bench.toml"
+    still = bench.parent / "still.toml"
+    still.write_text(bench.read_text() + "motion_above_px = 1e6\n")
+    options = ["--headless", "--speed", "max", "--start", "10", "--stop", "10.1"]
+    for path in (bench, still):
+        assert run_hilstar("replay", path, ledger, *options, "-o", tmp_path / path.stem).returncode == 0
+    name = sorted(path.name for path in (tmp_path / "bench").glob("*.png"))[0]
+    assert (np.array(Image.open(tmp_path / "still" / name)) != np.array(Image.open(tmp_path / "bench" / name))).any()
+
+
+def test_the_frame_path_makes_no_cycles_for_the_collector():
+    """The loop runs without Python's garbage collector: nothing may need it."""
+    program = """
+import gc, sys
+from pathlib import Path
+import numpy as np
+from hilstar.rotation import from_radec_roll_deg
+from hilstar.attitude.clock.timeline import Attitude
+from hilstar.bench.build import Bench
+from hilstar.run.loop import FrameLoop
+from hilstar.resources import resource_path
+with Bench(resource_path("configs", "demo.toml")) as bench:
+    loop = FrameLoop(bench, moving=True)
+    turning = Attitude(from_radec_roll_deg(84, 0, 0), 0, False, rate_cam_rad_s=np.array([0.001, 0.01, 0.0]))
+    for number in range(100):
+        loop.draw(number, 0, turning)
+    gc.collect()
+    gc.disable()
+    for number in range(300):
+        loop.draw(number, 0, turning)
+    print(gc.collect())
+"""
+    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True)
+    assert int(result.stdout) == 0

@@ -1,0 +1,76 @@
+"""What the charts of studies say, and that nothing of it is cut off or without a name."""
+
+from __future__ import annotations
+
+import pytest
+from matplotlib.figure import Figure
+
+from hilstar import charts
+from hilstar.study.economy import Outcome, economy_finding
+from hilstar.study.speed import report as benchmark_report
+from hilstar.twin.budget import budget, write_budget
+
+
+@pytest.fixture
+def figures(monkeypatch) -> list[Figure]:
+    """The figures that are written, laid out."""
+    kept: list[Figure] = []
+
+    def keep(figure, path):
+        figure.draw_without_rendering()
+        kept.append(figure)
+
+    monkeypatch.setattr(charts, "save", keep)
+    monkeypatch.setattr(benchmark_report, "save", keep)
+    return kept
+
+
+def outcome(frame_ms: float, worst_mag: float = 0.01) -> Outcome:
+    return Outcome("a scene", "auto", "round", 10, frame_ms, worst_mag, 0.01, 5, 0.1)
+
+
+@pytest.mark.parametrize(
+    ("times_ms", "said"),
+    [
+        (((2.0, 1.0), (10.8, 2.0)), "takes 2.0 to 5.4 times less than all effort, within tolerance"),
+        (((0.7, 1.0), (10.8, 2.0)), "took from 1.4 times longer to 5.4 times less than all effort, within tolerance"),
+        (((0.5, 1.0), (0.8, 1.0)), "took 1.2 to 2.0 times longer than all effort, within tolerance"),
+    ],
+)
+def test_economy_says_longer_where_it_took_longer(times_ms, said):
+    pairs = [(outcome(full), outcome(auto)) for full, auto in times_ms]
+    assert economy_finding(pairs).endswith(said)
+
+
+def test_economy_does_not_call_within_tolerance_what_is_over_it():
+    assert economy_finding([(outcome(2.0), outcome(1.0, 0.5))]).endswith("1 of 1 scenes OVER tolerance")
+
+
+@pytest.mark.parametrize("sizes", [((1920, 1080),), ((640, 480), (1920, 1080))])
+@pytest.mark.parametrize("methods", [("numpy",), ("numpy", "numba", "galsim", "photutils")])
+def test_the_legend_of_the_benchmark_is_whole(figures, tmp_path, sizes, methods):
+    kinds = [("hilstar", "whole_frame"), ("hilstar", "linear_only"), *((method, "linear_only") for method in methods)]
+    time_ms = {"median": 1.0, "min": 0.9, "max": 1.2}
+    rows = [
+        {"width": w, "height": h, "stars": stars, "method": method, "kind": kind, "ms": time_ms}
+        for w, h in sizes
+        for stars in (100, 1000)
+        for method, kind in kinds
+    ]
+    result = {"rows": rows, "gl_renderer": "llvmpipe (LLVM 15.0.6, 256 bits)", "machine": {"cores": 2}}
+    benchmark_report.write(result, tmp_path)
+    (figure,) = figures
+    (legend,) = figure.legends
+    box = legend.get_window_extent()
+    assert box.x0 >= 0 and box.y0 >= 0 and box.x1 <= figure.bbox.width
+    assert len(legend.get_texts()) == len(kinds)
+
+
+def test_every_line_of_the_budget_has_a_name_that_is_whole(figures, bench_with, tmp_path):
+    write_budget(tmp_path, budget(bench_with()))
+    (figure,) = figures
+    for axis in figure.axes:
+        assert all(not str(line.get_label()).startswith("_") for line in axis.get_lines())
+        legend = axis.get_legend()
+        assert legend is not None and len(legend.get_texts()) == len(axis.get_lines())
+        assert legend.get_window_extent().x1 <= figure.bbox.width

@@ -1,0 +1,212 @@
+"""The study of trade-offs: exact methods are exact, worse ones worse, and each default stands on the front or says why not."""
+
+from __future__ import annotations
+
+import csv
+import itertools
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from hilstar.errors import InputError
+from hilstar.render.reference import linear_image
+from hilstar.render.renderer import Target
+from hilstar.render.variants import SplatVariant, VariantRenderer
+from hilstar.scene.psf import LARGEST_CUT
+from hilstar.sky.cells import CELL_DEG
+from hilstar.sky.electrons import TABLE_DEGREE
+from hilstar.sky.spectrum import Curve
+from hilstar.study.tradeoff import table as tradeoff_table
+from hilstar.study.tradeoff.brightness import trapezoid
+from hilstar.study.tradeoff.light import SIGMA_PX, star_field
+from hilstar.study.tradeoff.run import STEPS, draw, round_ticks, run, spread, table_lines
+from hilstar.study.tradeoff.sky import LIMITS_V_MAG
+from hilstar.study.tradeoff.table import FEWEST_ROUNDS, Figure, Trial, Trials, interleaved, measured, pareto_front
+
+NAMES = ["brightness", "spectrum", "depth", "culling", "projection", "prediction", "smear", "psf", "quantisation"]
+# A relative error in magnitudes: 2.5 / ln 10.
+MAG_PER_SHARE = 1.0858
+# Of the brightest star, in a pixel that holds 0.44 of it along each axis. The exp erf: two edges of 1.5e-7, halved, times
+# 0.44, 0.7e-7. The table of 4096: (6 px / 4095)^2 / 8 times the profile's curvature of 0.55 / px^2, times 0.44, 0.7e-7.
+# float32: 0.6e-7 of 1 at each edge, 0.3e-7, and as much of the sum.
+PROFILE_SHARE = 2e-7
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("tradeoff")
+    lines = run(folder, quick=True)
+    with (folder / "tradeoff.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    return folder, lines, {name: {r["method"]: r for r in rows if r["step"] == name} for name in NAMES}
+
+
+def error_of(step, method):
+    return float(step[method]["error"])
+
+
+def test_every_step_has_a_chart_a_table_and_one_default(study):
+    folder, lines, steps = study
+    for name in NAMES:
+        pixels = np.array(Image.open(folder / f"tradeoff_{name}.png").convert("L"))
+        assert pixels.shape[0] > 500 and (pixels < 200).mean() > 0.005
+        assert any(line.startswith(f"{name}: ") for line in lines)
+        assert sum(row["default"] == "True" for row in steps[name].values()) == 1
+        assert sum(line.startswith((" >", "*>")) for line in lines) == len(NAMES)
+        assert all(float(row["time_ms"]) > 0 for row in steps[name].values())
+
+
+def test_a_default_is_on_the_front_or_says_what_beats_it(study):
+    _, lines, steps = study
+    for step in steps.values():
+        default = next(row for row in step.values() if row["default"] == "True")
+        assert (default["front"] == "True") == (default["beaten_by"] == "")
+        if default["beaten_by"]:
+            assert any(method in default["beaten_by"] for method in step if method != default["method"])
+            assert any(default["beaten_by"] in line for line in lines)
+
+
+def test_the_defaults_are_the_code_s_own(study):
+    steps = study[2]
+    default = {name: next(m for m, row in step.items() if row["default"] == "True") for name, step in steps.items()}
+    assert default["brightness"] == f"table over 1/T, degree {TABLE_DEGREE}"
+    assert default["culling"] == f"cells of {CELL_DEG:g} deg"
+    assert default["projection"].endswith("whole pixel + float32 fraction")
+    assert (default["spectrum"], default["depth"], default["quantisation"]) == ("real spectra by V-I", "V to 7.5", "round")
+    assert default["prediction"] == "linear, by the sample's rate"
+    assert default["smear"].startswith("Gauss-Legendre by length")
+
+
+def test_what_is_exact_is_so_to_rounding(study):
+    """Figures from each step's `floor`: float64 integrals, float32 sprites, extended precision."""
+    floors = {"brightness": 5e-12, "spectrum": 5e-12, "depth": 0.0, "culling": 0.0, "projection": 1e-12, "smear": 1e-7}
+    for name, floor in floors.items():
+        exact = [row for row in study[2][name].values() if row["exact"] == "True"]
+        assert len(exact) == 1 and float(exact[0]["error"]) <= floor
+    (exact,) = [row for row in study[2]["psf"].values() if row["exact"] == "True"]
+    assert float(exact["error"]) <= 1e-7 and float(exact["second"]) < 1e-12
+
+
+def test_the_defaults_keep_their_modules_promises(study):
+    steps = study[2]
+    own = {name: next(row for row in step.values() if row["default"] == "True") for name, step in steps.items()}
+    assert float(own["psf"]["error"]) <= LARGEST_CUT * MAG_PER_SHARE
+    assert float(own["smear"]["error"]) <= 1e-6  # scene/smear.py
+    assert float(own["culling"]["error"]) == 0
+    assert float(own["projection"]["error"]) < 6e-8  # half a step of float32 under 1, on both axes
+
+
+def test_less_is_worse(study):
+    steps = study[2]
+
+    def falls(step, *methods):
+        errors = [error_of(steps[step], method) for method in methods]
+        assert all(worse > better for worse, better in itertools.pairwise(errors)), (methods, errors)
+
+    falls("psf", "GL erf, R32F, 6 px", "GL erf, R32F, 8 px", "GL erf, R32F, 10 px")
+    falls("psf", "GL erf, R16F, 10 px", "GL table of 512, 10 px", "GL erf, R32F, 10 px")
+    falls("brightness", "AGS", "trapezoid, 10 nm", "trapezoid, 5 nm", "trapezoid, 1 nm", "Gauss-Legendre, 3 per knot")
+    falls("brightness", *(f"table over 1/T, degree {n}" for n in (5, 10, 20, 40)))
+    falls("spectrum", "AGS, one average", "black body, ballesteros2012", "real spectra by V-I")
+    falls("depth", *(f"V to {limit:g}" for limit in LIMITS_V_MAG), "all of Hipparcos")
+    falls("culling", "cells of 10 deg, by centres only", "cells of 10 deg")
+    falls("projection", "float32 throughout", "float64, place in float32", "float64, whole pixel + float32 fraction")
+    falls("prediction", "hold", "linear, by the last two samples", "linear, by the sample's rate", "C2 blend, a sample later")
+    falls("smear", *(f"evenly in time, {n}" for n in (4, 8, 16, 32, 64)), "Gauss-Legendre, 24")
+    falls("quantisation", "round", "exact", "exact, bit stealing")
+
+
+def test_the_front_is_what_nothing_beats():
+    errors, times = [3.0, 2.0, 2.0, 1.0, 5.0], [1.0, 2.0, 3.0, 9.0, 1.0]
+    assert pareto_front(errors, times).tolist() == [True, True, False, True, False]
+    assert pareto_front([1.0, 1.0], [2.0, 2.0]).tolist() == [True, True]
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """Time that passes only where a work says so, ms."""
+    now = [0.0]
+    monkeypatch.setattr(tradeoff_table.time, "perf_counter", lambda: now[0])
+
+    def work(took_ms, calls=None):
+        def run_it():
+            now[0] += took_ms * 1e-3
+            if calls is not None:
+                calls.append(took_ms)
+
+        return run_it
+
+    return work
+
+
+def planted(clock, own_ms, floor=0.0):
+    """Three methods, of which the slowest is as wrong as the fastest."""
+    trials = [
+        Trial("fast and rough", 0.1, 0.0, clock(1.0)),
+        Trial("own", 1e-3, 0.0, clock(own_ms), is_default=True),
+        Trial("slow and rough", 0.1, 0.0, clock(100.0)),
+    ]
+    return Trials("planted", "sums", Figure("error", "px", floor), Figure("rms", "px"), "it is tidy", trials)
+
+
+def test_a_planted_worse_method_is_off_the_front_and_a_beaten_default_says_why(clock):
+    step = measured(planted(clock, 4.0), 0.02)
+    assert [row.method for row in step.rows if not row.on_front] == ["slow and rough"]
+    assert step.default.beaten == "" and step.default.time_ms == pytest.approx(4.0)
+    beaten = measured(planted(clock, 4.0, floor=1.0), 0.02)  # all errors count as none: the fastest is best
+    assert not beaten.default.on_front
+    assert beaten.default.beaten == "'fast and rough' is no worse and 75 % faster; it is tidy"
+    assert any(beaten.default.beaten in line for line in table_lines(beaten))
+
+
+def test_every_round_has_every_work_and_slow_works_drop_out(clock):
+    calls = []
+    times = interleaved([clock(50.0, calls), clock(1.5, calls)], 0.02)
+    rounds = [sorted(calls[k : k + 2]) for k in range(0, 2 * (FEWEST_ROUNDS + 1), 2)]
+    assert rounds == [[1.5, 50.0]] * (FEWEST_ROUNDS + 1)
+    # The slow one has had its 10 ms after one round; the fast one is over its own after the seventh.
+    assert [len(taken) for taken in times] == [FEWEST_ROUNDS, 7]
+
+
+def test_the_variants_that_change_nothing_or_only_the_profile_draw_the_same_stars():
+    field = star_field((160, 120), 10)
+    wanted = linear_image(field, (160, 120), SIGMA_PX)
+    brightest = float(field.data["electrons_per_s"].max())
+    drawn = {}
+    for variant in (SplatVariant(), SplatVariant("exp erf"), SplatVariant("table", table_size=4096), SplatVariant("centre")):
+        with VariantRenderer(Target((160, 120), SIGMA_PX), variant) as renderer:
+            renderer.draw_and_wait(field)
+            drawn[variant.profile] = np.abs(renderer.linear() - wanted).max()
+            assert renderer.gl_error() == "GL_NO_ERROR" and renderer.texel == "R32F"
+    for profile in ("renderer", "exp erf", "table"):
+        assert drawn[profile] < PROFILE_SHARE * brightest, profile
+    assert drawn["centre"] > 100 * PROFILE_SHARE * brightest
+
+
+def test_half_floats_are_told_apart_and_smaller_sprites_are_smaller():
+    with VariantRenderer(Target((64, 64), SIGMA_PX), SplatVariant(half_float=True, footprint_px=6)) as renderer:
+        assert (renderer.texel, renderer.footprint_px) == ("R16F", 6)
+
+
+def test_a_trapezoid_integrates_a_straight_line(rng):
+    line = Curve(np.array([400.0, 500.0]), rng.uniform(size=2))
+    nodes, weight = trapezoid(7.0, line)
+    assert np.diff(nodes).max() <= 7.0
+    assert line(nodes) @ weight == pytest.approx(line.value.mean() * 100e-9, rel=1e-12)
+
+
+def test_names_at_the_side_keep_apart_and_ticks_are_round():
+    heights = spread(np.array([0.9, 0.9, 0.89, 0.02, 0.01, 0.0]), 0.05)
+    assert min(a - b for a, b in itertools.pairwise(heights)) == pytest.approx(0.05)
+    assert heights[-1] >= 0 and heights[0] <= 1
+    assert round_ticks(0.3, 21) == pytest.approx([0.5, 1, 2, 5, 10, 20])
+    assert round_ticks(0.03, 2000) == pytest.approx([0.1, 1, 10, 100, 1000])
+    assert round_ticks(0.026, 0.14) == pytest.approx([0.03, 0.04, 0.05, 0.07, 0.1])
+    assert len(round_ticks(1e-13, 10)) <= 8
+
+
+def test_every_step_is_known_and_a_chart_that_cannot_be_written_is_refused(tmp_path, clock):
+    assert len(STEPS) == len(NAMES)
+    with pytest.raises(InputError, match="cannot be written"):
+        draw(tmp_path / "no" / "chart.png", measured(planted(clock, 4.0), 0.01), "here")

@@ -1,0 +1,377 @@
+"""What a stream does to the receiver: what waited, who sends, what hangs, what breaks. Times are simulated: known exactly."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from hilstar.attitude.clock.receiver import QUEUED_NS, Arrival, Receiver, Traffic
+from hilstar.attitude.clock.timeline import Policy, Timeline
+from hilstar.attitude.wire.packet import AttitudeSample, Packet, encode
+from hilstar.notices import Notices
+from hilstar.rotation import from_radec_roll_deg, propagate
+from hilstar.units import NS_PER_MS, NS_PER_S
+
+PERIOD_NS = 5 * NS_PER_MS
+ORION = from_radec_roll_deg(84.0, -1.0, 0.0)
+LYRA = from_radec_roll_deg(283.0, 35.0, 30.0)
+STALE_AFTER_NS = 250 * NS_PER_MS
+PATIENCE_S = 20.0
+Q = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+@dataclass
+class Script:
+    """A link that hands out what it was given, what was read at the same time at once; and what its user does after each."""
+
+    arrivals: list[Arrival]
+    after: Callable[[Arrival], None] = lambda arrival: None
+    fails: list[BaseException] = field(default_factory=list)
+    two_way: bool = False
+
+    def __post_init__(self) -> None:
+        self.done = threading.Event()
+        self._last: Arrival | None = None
+
+    def wait_for_message(self, timeout_ms: int) -> bool:
+        return False
+
+    def receive(self, timeout_ms: int) -> list[Arrival]:
+        if self._last is not None:
+            self.after(self._last)
+            self._last = None
+        if self.fails:
+            raise self.fails.pop()
+        if not self.arrivals:
+            self.done.set()
+            time.sleep(0.002)
+            return []
+        together = [arrival for arrival in self.arrivals[:2000] if arrival.host_ns == self.arrivals[0].host_ns]
+        del self.arrivals[: len(together)]
+        self._last = together[-1]
+        return together
+
+    def send(self, packet: Packet) -> None:
+        pass
+
+    def wire_ns(self, packet: Packet) -> int:
+        return 0
+
+
+@dataclass
+class Sender:
+    """A simulated one: its packets, and when each arrives."""
+
+    q: np.ndarray = field(default_factory=lambda: ORION)
+    first: int = 0
+    offset_ns: int = 0
+    counts: bool = True
+
+    def packets(self, host0_ns: int, times: range, delay_ns: int = 50_000) -> list[Arrival]:
+        found = []
+        for k, after_ns in enumerate(times):
+            host_ns = host0_ns + after_ns
+            sequence = self.first + k * self.counts
+            sample = AttitudeSample(host_ns + self.offset_ns, self.q, np.zeros(3), sequence)
+            found.append(Arrival(host_ns + delay_ns, sample, encode(sample)))
+        return found
+
+
+def seconds(begin_s: float, end_s: float, period_ns: int = PERIOD_NS) -> range:
+    return range(round(begin_s * NS_PER_S), round(end_s * NS_PER_S), period_ns)
+
+
+class Run:
+    """All of a script through a receiver; `ages_ms` and `roads` are of the attitude on show just after each message."""
+
+    def __init__(self, make: Callable[[int], list[Arrival]], traffic: Traffic | None = None, **script) -> None:
+        self.host0_ns = time.monotonic_ns() + NS_PER_S  # after what was queued
+        arrivals = sorted(make(self.host0_ns), key=lambda arrival: (arrival.host_ns, arrival.event.t_ns))
+        self.notices = Notices()
+        self.timeline = Timeline(Policy(STALE_AFTER_NS, STALE_AFTER_NS))
+        self.ages_ms: list[float] = []
+        self.shown: list[np.ndarray] = []
+        self.link = Script(arrivals, self._look, **script)
+        self.receiver = Receiver(self.link, self.timeline, traffic or Traffic(), notices=self.notices)
+        self.receiver.learn()
+        self.receiver.start()
+        deadline_s = time.monotonic() + PATIENCE_S
+        while not self.link.done.wait(0.005) and time.monotonic() < deadline_s:
+            self.receiver.tend()
+        self.receiver.close()
+        self.counts, self.events = self.receiver.counts, self.notices.counts()
+
+    def _look(self, arrival: Arrival) -> None:
+        attitude = self.timeline.at(self.receiver.clock.to_bench_ns(arrival.host_ns))
+        if attitude is not None:
+            self.ages_ms.append(attitude.age_ns / NS_PER_MS)
+            self.shown.append(attitude.q_icrs_to_cam)
+
+    @property
+    def accepted(self) -> int:
+        return self.counts.received - self.counts.refused
+
+
+def test_a_plain_stream_is_no_event():
+    run = Run(lambda t0: Sender().packets(t0, seconds(0, 6)))
+    assert (run.accepted, run.counts.refused, run.events) == (1200, 0, {})
+    assert run.receiver.clock_summary()["uncertainty_ms"] < 0.2
+
+
+@pytest.mark.parametrize("repeat_hz", [50, 200, 1000])
+@pytest.mark.parametrize("same", [True, False])
+def test_a_sender_that_hangs_is_stale_and_taken_up_again_at_once(repeat_hz, same):
+    """The last packet over and over for two seconds, or a clock that stands while the attitude turns."""
+    hung_s = seconds(2.0, 4.0, NS_PER_S // repeat_hz)
+
+    def make(t0: int) -> list[Arrival]:
+        good = Sender().packets(t0, seconds(0, 2)) + Sender(first=400).packets(t0, seconds(4, 5))
+        last = good[399].event
+        repeats = []
+        for k, after_ns in enumerate(hung_s):
+            turned = propagate(last.q_icrs_to_cam, np.array([0, 0, 1e-3]), 0.0 if same else k)
+            sample = AttitudeSample(last.t_ns, turned, np.zeros(3), last.sequence if same else last.sequence + 1 + k)
+            repeats.append(Arrival(t0 + after_ns + 50_000, sample, encode(sample)))
+        if not same:
+            good[400:] = Sender(first=400 + len(hung_s)).packets(t0, seconds(4, 5))
+        return good + repeats
+
+    run = Run(make)
+    assert run.accepted == 600
+    assert run.counts.refused_by["time"] == run.counts.refused == len(hung_s)
+    assert run.receiver.jumps.jumps == 0
+    assert run.events == {"source-frozen": 1, "source-resumed": 1}
+    ages_ms = np.array(run.ages_ms[400 : 400 + len(hung_s)])
+    assert (np.diff(ages_ms) > 0).all()
+    assert ages_ms[-1] == pytest.approx(2000, abs=40)
+    assert max(run.ages_ms[-190:]) < 10
+    if same:
+        assert np.ptp(run.shown, axis=0).max() == 0  # no roll goes to and fro
+
+
+def test_a_clock_that_goes_on_from_where_it_stood_is_taken_up_and_is_no_jump():
+    def make(t0: int) -> list[Arrival]:
+        stopped = Sender().packets(t0, seconds(0, 3))
+        last = stopped[-1].event
+        stood = [Arrival(t0 + ns, last, stopped[-1].raw) for ns in seconds(3, 5)]
+        return stopped + stood + Sender(first=600, offset_ns=-2 * NS_PER_S).packets(t0, seconds(5, 7))
+
+    run = Run(make)
+    assert run.receiver.jumps.jumps == 0
+    assert run.events == {"source-frozen": 1, "source-resumed": 1}
+    assert run.accepted == 1000
+    assert max(run.ages_ms[-380:]) < 10
+
+
+@pytest.mark.parametrize("old_s", [0.02, 0.5, 3.0])
+def test_bursts_of_one_old_packet_change_nothing(old_s):
+    def make(t0: int) -> list[Arrival]:
+        good = Sender().packets(t0, seconds(0, 6))
+        old = good[round((4.5 - old_s) * 200)]
+        return good + [Arrival(t0 + 4_502_000_000 + k * 20_000, old.event, old.raw) for k in range(50)]
+
+    run = Run(make)
+    assert run.accepted == 1200
+    assert run.counts.refused_by["time"] == 50
+    assert run.receiver.jumps.jumps == 0
+    assert max(run.ages_ms[200:]) < 10
+
+
+def late_sender(first: int, counts: bool = True, offset_ns: int = 0) -> Sender:
+    return Sender(LYRA, first, offset_ns, counts)
+
+
+@pytest.mark.parametrize("counts", [True, False])
+@pytest.mark.parametrize("first", [0, 398, 100_000])
+def test_of_two_senders_the_first_is_shown_and_the_other_refused(counts, first):
+    """The second begins after two seconds, on the same clock, and ends after six."""
+    run = Run(
+        lambda t0: (
+            Sender(counts=counts).packets(t0, seconds(0, 8)) + late_sender(first, counts).packets(t0 + 2_300_000, seconds(2, 6))
+        )
+    )
+    assert run.events["second-sender"] == 1
+    assert run.counts.refused_by["source"] > 760
+    assert run.counts.refused == run.counts.refused_by["source"]
+    flips = np.abs(np.diff([q @ ORION for q in run.shown])) > 0.1
+    assert flips.sum() < 50
+    assert not flips[500:].any()
+    assert abs(run.shown[-1] @ ORION) > 0.999
+    assert run.receiver.jumps.jumps == 0
+
+
+@pytest.mark.parametrize("offset_s", [-3600, 3600])
+def test_a_second_sender_with_a_clock_of_its_own_and_four_times_the_rate_is_kept_out(offset_s):
+    def make(t0: int) -> list[Arrival]:
+        other = late_sender(100_000, offset_ns=offset_s * NS_PER_S)
+        return Sender().packets(t0, seconds(0, 6, 20_000_000)) + other.packets(t0 + 2_300_000, seconds(3, 6))
+
+    run = Run(make)
+    assert run.events["second-sender"] == 1
+    assert run.counts.refused_by["source"] > 500
+    assert abs(run.shown[-1] @ ORION) > 0.999
+    assert max(run.ages_ms[-300:]) < 40
+
+
+def test_the_other_sender_is_taken_up_when_the_first_falls_silent():
+    run = Run(
+        lambda t0: Sender().packets(t0, seconds(0, 4)) + late_sender(9).packets(t0 + 2_300_000, seconds(2, 6)),
+    )
+    assert run.events == {"second-sender": 1, "second-sender-gone": 1}
+    assert abs(run.shown[-1] @ LYRA) > 0.999
+    assert max(run.ages_ms[-200:]) < 10
+
+
+def test_a_sender_that_hangs_gives_way_to_another():
+    """The first repeats its last packet to the end; the second begins a second later."""
+
+    def make(t0: int) -> list[Arrival]:
+        good = Sender().packets(t0, seconds(0, 2))
+        hung = [Arrival(t0 + ns, good[-1].event, good[-1].raw) for ns in seconds(2, 6, 10_000_000)]
+        return good + hung + late_sender(70).packets(t0 + 2_300_000, seconds(3, 6))
+
+    run = Run(make)
+    assert run.counts.refused == run.counts.refused_by["time"] == 400
+    assert abs(run.shown[-1] @ LYRA) > 0.999
+    assert max(run.ages_ms[-800:]) < 15
+    assert run.receiver.jumps.jumps == 0
+
+
+def test_a_receiver_that_was_stopped_does_not_think_that_the_first_sender_was_silent():
+    """1.2 s of both senders' packets are read at once, the second one's first."""
+
+    def make(t0: int) -> list[Arrival]:
+        both = Sender().packets(t0, seconds(0, 8)) + late_sender(9).packets(t0 - 2_300_000, seconds(2, 8))
+        begin_ns, end_ns = t0 + 4_006_000_000, t0 + 5_200_000_000
+        return [
+            Arrival(end_ns, arrival.event, arrival.raw) if begin_ns < arrival.host_ns < end_ns else arrival for arrival in both
+        ]
+
+    run = Run(make)
+    assert run.events == {"second-sender": 1}
+    assert abs(run.shown[-1] @ ORION) > 0.999
+    assert run.receiver.jumps.jumps == 0
+
+
+def many(t0: int, qs: list[np.ndarray], sequences: list[int], discontinuity: Callable[[int], bool] = lambda k: False):
+    samples = [
+        AttitudeSample(t0 + k * PERIOD_NS, q, np.zeros(3), sequence, discontinuity(k))
+        for k, (q, sequence) in enumerate(zip(qs, sequences, strict=True))
+    ]
+    return [Arrival(sample.t_ns + 50_000, sample, encode(sample)) for sample in samples]
+
+
+@pytest.mark.parametrize("every", [1, 2, 7, 300])
+@pytest.mark.parametrize("how", ["counted", "said"])
+def test_one_sender_that_retargets_to_and_fro_is_one(every, how):
+    """By its count, or, where it does not count, because it says so."""
+    qs = [LYRA if (k // every) % 2 else ORION for k in range(1000)]
+    sequences = list(range(1000)) if how == "counted" else [0] * 1000
+    run = Run(lambda t0: many(t0, qs, sequences, lambda k: how == "said" and k % every == 0))
+    assert (run.accepted, run.events) == (1000, {})
+
+
+@pytest.mark.parametrize(
+    "sequences",
+    [
+        list(range(500)) + list(range(500)),  # started anew
+        [2**32 - 400 + k for k in range(400)] + list(range(600)),  # wrapped
+        list(range(1000, 0, -1)),  # counts down
+        [k % 2 for k in range(1000)],
+        [k % 256 for k in range(1000)],
+        [0] * 1000,
+        [7] * 1000,
+        [3 * k for k in range(1000)],
+        np.random.default_rng(3).integers(0, 2**32, 1000).tolist(),
+        np.random.default_rng(3).integers(0, 256, 1000).tolist(),
+        np.sort(np.random.default_rng(3).integers(0, 10_000, 1000)).tolist(),  # nine in ten lost
+    ],
+)
+def test_one_sender_however_it_counts_is_one(sequences):
+    rng = np.random.default_rng(4)
+    qs = [propagate(ORION, rng.normal(size=3) * 1e-3, 1.0) for _ in range(1000)]  # noise of 200 arcsec
+    run = Run(lambda t0: many(t0, qs, sequences))
+    assert (run.accepted, run.events) == (1000, {})
+
+
+def test_packets_out_of_order_are_one_sender_s():
+    def make(t0: int) -> list[Arrival]:
+        found = Sender().packets(t0, seconds(0, 5))
+        for k in range(10, 990, 10):
+            a, b = found[k], found[k + 1]
+            found[k], found[k + 1] = Arrival(a.host_ns, b.event, b.raw), Arrival(b.host_ns, a.event, a.raw)
+        return found
+
+    run = Run(make)
+    assert run.events == {}
+    assert run.counts.refused == run.counts.refused_by["time"] == 98
+
+
+def test_a_receiver_that_breaks_is_started_again_and_said():
+    run = Run(lambda t0: Sender().packets(t0, seconds(0, 1)), fails=[MemoryError(), OSError("no such\nsocket")])
+    assert run.accepted == 200
+    assert run.events == {"receiver-failed": 2}
+
+
+def test_a_receiver_that_is_stopped_while_it_is_broken_ends():
+    link = Script([], fails=[MemoryError()] * 5)
+    receiver = Receiver(link, Timeline(Policy(0, NS_PER_S)))
+    receiver.start()
+    receiver.close()
+    receiver.tend()
+    assert threading.active_count() < 50
+
+
+@pytest.mark.parametrize("jump_s", [-3600, 0.5, 10**9])
+def test_the_summary_s_offset_is_that_of_the_clock_after_its_jumps(jump_s):
+    def make(t0: int) -> list[Arrival]:
+        return Sender().packets(t0, seconds(0, 3)) + Sender(first=600, offset_ns=round(jump_s * NS_PER_S)).packets(
+            t0, seconds(3, 6)
+        )
+
+    run = Run(make)
+    told = run.receiver.clock_summary()
+    assert (told["jumps"], run.events, run.accepted) == (1, {"jump": 1}, 1200)
+    assert told["offset_ms"] == pytest.approx(-1000 * jump_s + 0.05, abs=0.02)
+    assert told["uncertainty_ms"] < 0.2
+
+
+SHARED = Traffic(shared_clock=True)
+
+
+def test_a_shared_clock_is_taken_as_it_is():
+    run = Run(lambda t0: Sender().packets(t0, seconds(0, 1), delay_ns=3_000_000), SHARED)
+    told = run.receiver.clock_summary()
+    assert (told["mode"], told["offset_ms"], told["uncertainty_ms"], told["jumps"]) == ("shared", 0.0, 0.0, 0)
+    assert run.receiver.latency_ms.summary()["p50"] == pytest.approx(3.0, rel=0.05)
+    assert np.allclose(run.ages_ms, 3.0)
+    assert run.events == {}
+
+
+@pytest.mark.parametrize(("offset_s", "refused"), [(-50, False), (50, True), (0.3, False)])
+def test_a_clock_that_is_not_shared_is_said_once(offset_s, refused):
+    run = Run(lambda t0: Sender(offset_ns=round(offset_s * NS_PER_S)).packets(t0, seconds(0, 4)), SHARED)
+    assert run.events == {"clock-not-shared": 1}
+    assert run.counts.refused_by["time"] == (800 if refused else 0)
+
+
+def test_what_was_queued_before_the_frames_teaches_nothing():
+    """Two seconds of packets that waited are read at once; then the stream goes on. None refused, no jump, right at once."""
+
+    def make(t0: int) -> list[Arrival]:
+        queued = Sender().packets(t0 - 3 * NS_PER_S, seconds(0, 2))
+        read = [Arrival(time.monotonic_ns(), arrival.event, arrival.raw) for arrival in queued]
+        return read + Sender(first=600).packets(t0, seconds(0, 3))
+
+    run = Run(make)
+    assert (run.accepted, run.counts.refused, run.events) == (1000, 0, {})
+    assert run.receiver.latency_ms.summary()["max"] < 0.01
+    assert run.receiver.latency_ms.count == 600
+    told = run.receiver.clock_summary()
+    assert told["offset_ms"] == pytest.approx(0.05, abs=0.001)
+    assert QUEUED_NS < NS_PER_S

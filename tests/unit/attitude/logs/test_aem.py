@@ -1,0 +1,319 @@
+"""CCSDS AEM: order, direction, frames and rates against SciPy and the standard's own figures, and what is refused."""
+
+from __future__ import annotations
+
+import re
+import sys
+from datetime import UTC, datetime
+
+import erfa
+import numpy as np
+import pytest
+from ccsds_ndm.ndm_io import NdmIo
+from scipy.spatial.transform import Rotation
+
+from hilstar.attitude.logs.log_file import read_log, write_log
+from hilstar.attitude.wire.packet import AttitudeSample
+from hilstar.errors import InputError, MachineError
+from hilstar.rotation import from_radec_roll_deg, propagate, to_matrix
+
+# Quaternions are written with 17 digits here; a matrix from one is a sum of four products, a few roundings of 1.
+MATRIX_TOLERANCE = 1e-14
+# The reference derivative is a central difference over 2 h = 2e-4 s: h^2 rate^3 / 24 = 1e-9 1/s and rounding 1e-16 / h.
+DIFFERENCE_S = 1e-4
+DERIVATIVE_TOLERANCE_RAD_S = 1e-8
+# 504.0-B-2 annex F prints its example to four digits.
+ANNEX_F_TOLERANCE = 1e-4
+# EME2000 against ICRF: the frame bias of the IAU 2000 precession-nutation, -16.6, -6.8 and -14.6 mas about x, y and z.
+FRAME_BIAS_MAS = 23.15
+FRAME_BIAS_TOLERANCE_MAS = 0.01
+
+RATE_CAM_RAD_S = np.array([0.3, -1.1, 0.7])
+EPOCHS = ("2024-02-29T23:59:59.25", "2024-03-01T00:00:01")
+
+# CCSDS 504.0-B-2, figure G-4 (the lines that stand for omitted records are left out).
+FIGURE_G4 = """CCSDS_AEM_VERS = 2.0
+CREATION_DATE = 2002-11-04T17:22:31
+ORIGINATOR    = NASA/JPL
+MESSAGE_ID    = A701523
+
+META_START
+COMMENT This file was produced by M.R. Somebody, MSOO NAV/JPL.
+OBJECT_NAME       = MARS_GLOBAL_SURVEYOR
+OBJECT_ID         = 1996-062A
+CENTER_NAME       = MARS BARYCENTER
+REF_FRAME_A         = EME2000
+REF_FRAME_B         = SC_BODY_1
+TIME_SYSTEM       = UTC
+START_TIME        = 1996-11-28T21:29:07.2555
+USEABLE_START_TIME = 1996-11-28T22:08:02.5555
+USEABLE_STOP_TIME  = 1996-11-30T01:18:02.5555
+STOP_TIME         = 1996-11-30T01:28:02.5555
+ATTITUDE_TYPE     = QUATERNION
+INTERPOLATION_METHOD = HERMITE
+INTERPOLATION_DEGREE = 7
+META_STOP
+
+DATA_START
+1996-11-28T21:29:07.2555 0.56748 0.03146 0.45689 0.68427
+1996-11-28T22:08:03.5555 0.42319 -0.45697 0.23784 0.74533
+1996-11-28T22:08:04.5555 -0.84532 0.26974 -0.06532 0.45652
+1996-11-30T01:28:02.5555 0.74563 -0.45375 0.36875 0.31964
+DATA_STOP
+
+META_START
+COMMENT This block begins after trajectory correction maneuver TCM-3.
+OBJECT_NAME       = mars_global_surveyor
+OBJECT_ID         = 1996-062A
+CENTER_NAME       = MARS BARYCENTER
+REF_FRAME_A         = EME2000
+REF_FRAME_B         = SC_BODY_1
+TIME_SYSTEM       = UTC
+START_TIME        = 1996-12-18T12:05:00.5555
+STOP_TIME         = 1996-12-28T21:28:00.5555
+ATTITUDE_TYPE     = QUATERNION
+META_STOP
+
+DATA_START
+1996-12-18T12:05:00.5555 -0.64585 0.018542 -0.23854 0.72501
+1996-12-18T12:10:05.5555 0.87451 -0.43475 0.13458 0.16767
+1996-12-18T12:10:10.5555 0.03125 -0.65874 0.23458 0.71418
+1996-12-28T21:28:00.5555 -0.25485 0.58745 -0.36845 0.67394
+DATA_STOP
+"""
+
+
+def kvn(rows, version="1.0", **keywords):
+    """A message of one block; a keyword that is None is left out."""
+    meta = {"OBJECT_NAME": "X", "OBJECT_ID": "X", "REF_FRAME_A": "ICRF", "REF_FRAME_B": "SC_BODY_1"}
+    if version == "1.0":
+        meta |= {"ATTITUDE_DIR": "A2B", "QUATERNION_TYPE": "LAST"}
+    meta |= {"TIME_SYSTEM": "UTC", "START_TIME": EPOCHS[0], "STOP_TIME": EPOCHS[1], "ATTITUDE_TYPE": "QUATERNION"} | keywords
+    lines = [f"CCSDS_AEM_VERS = {version}", "CREATION_DATE = 2024-01-01T00:00:00", "ORIGINATOR = X"]
+    lines += ["META_START", *(f"{key} = {value}" for key, value in meta.items() if value is not None), "META_STOP"]
+    return "\n".join([*lines, "DATA_START", *rows, "DATA_STOP"]) + "\n"
+
+
+def rows_of(*numbers):
+    return [
+        " ".join([epoch, *map(repr, np.asarray(row, dtype=float).tolist())])
+        for epoch, row in zip(EPOCHS, numbers, strict=False)
+    ]
+
+
+def read(tmp_path, text):
+    (tmp_path / "log").write_text(text)
+    return read_log(tmp_path / "log")
+
+
+def refusal(tmp_path, text):
+    with pytest.raises(InputError) as caught:
+        read(tmp_path, text)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def ccsds_quaternion(second_from_first):
+    """Q1 Q2 Q3 QC of annex F: of the rotation that takes the first frame's axes to the second's."""
+    return Rotation.from_matrix(second_from_first.as_matrix().T).as_quat()
+
+
+def camera(seconds=0.0):
+    """The rotation of cam's components into ICRS components, turning at RATE_CAM_RAD_S."""
+    return Rotation.from_quat([0.1, -0.5, 0.7, 0.3]) * Rotation.from_rotvec(RATE_CAM_RAD_S * seconds)
+
+
+def second_from_first(frame_a, direction, seconds=0.0):
+    """The rotation whose quaternion a file has to hold, and whether its second frame is the camera."""
+    to_cam = (frame_a == "ICRF") == (direction == "A2B")
+    return (camera(seconds).inv() if to_cam else camera(seconds)), to_cam
+
+
+def frames(frame_a):
+    return {"REF_FRAME_A": frame_a, "REF_FRAME_B": "SC_BODY_1" if frame_a == "ICRF" else "ICRF"}
+
+
+# Conventions
+
+
+@pytest.mark.parametrize("order", ["FIRST", "LAST"])
+@pytest.mark.parametrize("direction", ["A2B", "B2A"])
+@pytest.mark.parametrize("frame_a", ["ICRF", "SC_BODY_1"])
+def test_each_order_direction_and_frame_of_version_1_gives_the_same_attitude(tmp_path, frame_a, direction, order):
+    q = ccsds_quaternion(second_from_first(frame_a, direction)[0])
+    row = np.roll(q, 1) if order == "FIRST" else q
+    text = kvn(rows_of(row), ATTITUDE_DIR=direction, QUATERNION_TYPE=order, **frames(frame_a))
+    (sample,) = read(tmp_path, text)
+    assert to_matrix(sample.q_icrs_to_cam) == pytest.approx(camera().inv().as_matrix(), abs=MATRIX_TOLERANCE)
+    assert sample.rate_cam_rad_s is None
+
+
+@pytest.mark.parametrize("frame_a", ["ICRF", "SC_BODY_1"])
+def test_version_2_is_scalar_last_and_from_a_to_b(tmp_path, frame_a):
+    q = ccsds_quaternion(second_from_first(frame_a, "A2B")[0])
+    (sample,) = read(tmp_path, kvn(rows_of(q), "2.0", **frames(frame_a)))
+    assert to_matrix(sample.q_icrs_to_cam) == pytest.approx(camera().inv().as_matrix(), abs=MATRIX_TOLERANCE)
+
+
+@pytest.mark.parametrize("order", ["FIRST", "LAST"])
+@pytest.mark.parametrize("direction", ["A2B", "B2A"])
+@pytest.mark.parametrize("frame_a", ["ICRF", "SC_BODY_1"])
+def test_a_quaternions_derivative_gives_the_rate_of_the_camera(tmp_path, frame_a, direction, order):
+    before, q, after = (
+        ccsds_quaternion(second_from_first(frame_a, direction, s)[0]) for s in (-DIFFERENCE_S, 0.0, DIFFERENCE_S)
+    )
+    before, after = (other * np.sign(other @ q) for other in (before, after))
+    parts = [q, (after - before) / (2 * DIFFERENCE_S)]
+    row = np.concatenate([np.roll(part, 1) if order == "FIRST" else part for part in parts])
+    keywords = {"ATTITUDE_TYPE": "QUATERNION/DERIVATIVE", "ATTITUDE_DIR": direction, "QUATERNION_TYPE": order}
+    (sample,) = read(tmp_path, kvn(rows_of(row), **keywords, **frames(frame_a)))
+    assert sample.rate_cam_rad_s == pytest.approx(RATE_CAM_RAD_S, abs=DERIVATIVE_TOLERANCE_RAD_S)
+
+
+@pytest.mark.parametrize(("version", "direction"), [("1.0", "A2B"), ("1.0", "B2A"), ("2.0", "A2B")])
+@pytest.mark.parametrize("named", ["by name", "by keyword"])
+@pytest.mark.parametrize("resolved_in", ["ICRF", "SC_BODY_1"])
+@pytest.mark.parametrize("frame_a", ["ICRF", "SC_BODY_1"])
+def test_an_angular_velocity_gives_the_rate_of_the_camera(tmp_path, frame_a, direction, resolved_in, named, version):
+    rotation, to_cam = second_from_first(frame_a, direction)
+    rate = RATE_CAM_RAD_S if to_cam else -RATE_CAM_RAD_S
+    if resolved_in == "ICRF":
+        rate = camera().apply(rate)
+    row = np.concatenate([ccsds_quaternion(rotation), np.degrees(rate)])
+    frame = resolved_in if named == "by name" else ("REF_FRAME_A" if resolved_in == frame_a else "REF_FRAME_B")
+    keywords = {"ATTITUDE_TYPE": "QUATERNION/RATE", "RATE_FRAME": frame, "ATTITUDE_DIR": direction}
+    if version == "2.0":
+        keywords = {"ATTITUDE_TYPE": "QUATERNION/ANGVEL", "ANGVEL_FRAME": frame}
+    (sample,) = read(tmp_path, kvn(rows_of(row), version, **keywords, **frames(frame_a)))
+    assert sample.rate_cam_rad_s == pytest.approx(RATE_CAM_RAD_S, abs=MATRIX_TOLERANCE)
+
+
+def test_the_rate_that_is_read_carries_the_attitude_on():
+    seconds = 0.8
+    start = from_radec_roll_deg(84.057, -1.2, 30.0)
+    moved = Rotation.from_matrix(to_matrix(start)).inv() * Rotation.from_rotvec(RATE_CAM_RAD_S * seconds)
+    carried = to_matrix(propagate(start, RATE_CAM_RAD_S, seconds))
+    assert carried == pytest.approx(moved.inv().as_matrix(), abs=MATRIX_TOLERANCE)
+
+
+# The standard's own figures
+
+
+def test_annex_f_turns_x_into_minus_y(tmp_path):
+    # 504.0-B-2 F2.2: X_A = [1, 0, 0] has X_B = [0, -1, 0].
+    (sample,) = read(tmp_path, kvn(rows_of([0, 0, 0.7071, 0.7071]), "2.0"))
+    assert to_matrix(sample.q_icrs_to_cam) @ [1, 0, 0] == pytest.approx([0, -1, 0], abs=ANNEX_F_TOLERANCE)
+
+
+def figure_in_version_1():
+    meta = "ATTITUDE_DIR = A2B\nQUATERNION_TYPE = LAST\nATTITUDE_TYPE"
+    return FIGURE_G4.replace("CCSDS_AEM_VERS = 2.0", "CCSDS_AEM_VERS = 1.0").replace("ATTITUDE_TYPE", meta)
+
+
+@pytest.mark.parametrize("text", [FIGURE_G4, figure_in_version_1()], ids=["2.0", "1.0"])
+def test_figure_g4_is_read_as_two_blocks_with_a_break_between(tmp_path, text):
+    samples = read(tmp_path, text)
+    assert [s.discontinuity for s in samples] == [False] * 4 + [True] + [False] * 3
+    first = datetime(1996, 11, 28, 21, 29, 7, 255500, UTC)
+    assert samples[0].t_ns == round(first.timestamp() * 10**4) * 10**5
+    q = np.array([0.68427, -0.56748, -0.03146, -0.45689])
+    assert samples[0].q_icrs_to_cam == pytest.approx(q / np.linalg.norm(q), abs=MATRIX_TOLERANCE)
+
+
+@pytest.mark.parametrize("version", ["1.0", "2.0"])
+def test_xml_and_kvn_hold_the_same(tmp_path, version):
+    row = np.array([0.56748, 0.03146, 0.45689, 0.68427, 0.4, -0.2, 7.0])
+    turning = {
+        "1.0": {"ATTITUDE_TYPE": "QUATERNION/RATE", "RATE_FRAME": "REF_FRAME_B"},
+        "2.0": {"ATTITUDE_TYPE": "QUATERNION/ANGVEL", "ANGVEL_FRAME": "SC_BODY_1"},
+    }[version]
+    text = kvn(rows_of(row), version, **turning)
+    meta = "".join(f"<{k}>{v}</{k}>" for k, v in re.findall(r"(\w+) = (.*)", text[text.index("META_START") :]))
+    q = "<QC>0.68427</QC><Q1>0.56748</Q1><Q2>0.03146</Q2><Q3>0.45689</Q3>"
+    if version == "2.0":
+        q = "<Q1>0.56748</Q1><Q2>0.03146</Q2><Q3>0.45689</Q3><QC>0.68427</QC>"
+    axes = ("Z_RATE", 7), ("X_RATE", 0.4), ("Y_RATE", -0.2)
+    rates = "".join(f'<rotation{i} rate="{axis}">{value}</rotation{i}>' for i, (axis, value) in enumerate(axes, start=1))
+    if version == "2.0":
+        rates = '<ANGVEL_X units="deg/s">0.4</ANGVEL_X><ANGVEL_Y>-0.2</ANGVEL_Y><ANGVEL_Z>7</ANGVEL_Z>'
+    state, part = {"1.0": ("quaternionEulerRate", "rotationRates"), "2.0": ("quaternionAngVel", "angVel")}[version]
+    data = f"<{state}><EPOCH>{EPOCHS[0]}</EPOCH><quaternion>{q}</quaternion><{part}>{rates}</{part}></{state}>"
+    xml = f"""<?xml version="1.0" encoding="UTF-8"?>
+<aem xmlns:xsi="http://www.w3.org/2001/XMLSchema-instance" id="CCSDS_AEM_VERS" version="{version}">
+<header><CREATION_DATE>2024-01-01T00:00:00</CREATION_DATE><ORIGINATOR>X</ORIGINATOR></header>
+<body><segment><metadata>{meta}</metadata><data><attitudeState>{data}</attitudeState></data></segment></body></aem>
+"""
+    (from_kvn,), (from_xml,) = read(tmp_path, text), read(tmp_path, xml)
+    assert from_xml.t_ns == from_kvn.t_ns
+    assert from_xml.q_icrs_to_cam.tolist() == from_kvn.q_icrs_to_cam.tolist()
+    assert from_kvn.rate_cam_rad_s is not None
+    assert from_xml.rate_cam_rad_s is not None
+    assert from_xml.rate_cam_rad_s.tolist() == from_kvn.rate_cam_rad_s.tolist()
+
+
+# Frames
+
+
+def test_eme2000_and_icrf_differ_by_the_frame_bias():
+    j2000 = 2451545.0
+    bias = Rotation.from_matrix(erfa.bp00(j2000, 0.0)[0]).magnitude()
+    assert np.degrees(bias) * 3_600_000 == pytest.approx(FRAME_BIAS_MAS, abs=FRAME_BIAS_TOLERANCE_MAS)
+
+
+@pytest.mark.parametrize("inertial", ["ICRF", "icrf2", "EME2000", "J2000"])
+@pytest.mark.parametrize("body", ["SC_BODY_1", "sc body", "INSTRUMENT_A", "STARTRACKER_1", "AST_2", "ACC_0", "CAM", "CAMERA_1"])
+def test_the_icrf_or_eme2000_and_a_spacecraft_frame_are_taken(tmp_path, inertial, body):
+    assert len(read(tmp_path, kvn(rows_of([0, 0, 0, 1]), REF_FRAME_A=inertial, REF_FRAME_B=body))) == 1
+
+
+REFUSED_INERTIAL = ["TEME", "TOD", "MOD", "ITRF", "ITRF-93", "ITRF2000", "GRC", "GTOD", "TDR", "B1950", "ICRF4", "EME"]
+REFUSED_BODY = ["RTN", "RSW", "TNW", "LVLH", "QSW", "NTW", "VNC", "ICRF", "EME2000", "GCRF", "SATELLITE", "ASTRO", "CAMEL", "X"]
+
+
+@pytest.mark.parametrize(
+    ("a", "b"),
+    [(frame, "SC_BODY_1") for frame in REFUSED_INERTIAL] + [("ICRF", frame) for frame in REFUSED_BODY] + [("SC_BODY_1", "RTN")],
+)
+def test_other_frames_are_refused_with_both_names(tmp_path, a, b):
+    for frame_a, frame_b in ((a, b), (b, a)):
+        message = refusal(tmp_path, kvn(rows_of([0, 0, 0, 1]), REF_FRAME_A=frame_a, REF_FRAME_B=frame_b))
+        assert f"REF_FRAME_A = {frame_a}, REF_FRAME_B = {frame_b}; one has to be ICRF or EME2000" in message
+
+
+# Writing
+
+
+def turning_samples():
+    times = [0, 10, 20, 30]
+    return [AttitudeSample(t, from_radec_roll_deg(10.0 * t, 5.0, 0.0), RATE_CAM_RAD_S, 0, t == 20) for t in times]
+
+
+@pytest.mark.parametrize("form", ["aem", "xml"])
+def test_what_is_written_states_its_order_direction_and_frames(tmp_path, form):
+    write_log(tmp_path / f"a.{form}", turning_samples())
+    text = (tmp_path / f"a.{form}").read_text()
+    message = NdmIo().from_string(text)
+    assert message.version == "1.0"
+    assert len(message.body.segment) == 2
+    for segment in message.body.segment:
+        meta = segment.metadata
+        assert (meta.ref_frame_a, meta.ref_frame_b, meta.attitude_dir.value) == ("ICRF", "SC_BODY_1", "A2B")
+        assert (meta.quaternion_type.value, meta.attitude_type.value) == ("LAST", "QUATERNION/DERIVATIVE")
+        assert meta.start_time == segment.data.attitude_state[0].quaternion_derivative.epoch
+
+
+def test_the_library_reads_the_numbers_that_were_meant(tmp_path):
+    first = turning_samples()[0]
+    write_log(tmp_path / "a.aem", [first])
+    state = NdmIo().from_path(tmp_path / "a.aem").body.segment[0].data.attitude_state[0].quaternion_derivative
+    q = state.quaternion
+    expected = ccsds_quaternion(Rotation.from_matrix(to_matrix(first.q_icrs_to_cam)))
+    written = np.array([q.q1, q.q2, q.q3, q.qc])
+    assert written * np.sign(written @ expected) == pytest.approx(expected, abs=MATRIX_TOLERANCE)
+
+
+def test_a_missing_library_is_named_with_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "ccsds_ndm", None)
+    with pytest.raises(MachineError, match="pip install ccsds-ndm"):
+        write_log(tmp_path / "a.aem", turning_samples())
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,264 @@
+"""CCSDS AEM: epochs, blocks, and every way that a message can be wrong."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+
+from hilstar.attitude.logs import aem
+from hilstar.attitude.logs.log_file import write_log
+from hilstar.attitude.wire.packet import AttitudeSample
+from hilstar.errors import InputError
+from hilstar.units import NS_PER_S
+from tests.unit.attitude.logs.test_aem import EPOCHS, kvn, read, refusal, rows_of
+
+# Epochs
+
+
+@pytest.mark.parametrize(
+    ("text", "t_ns"),
+    [
+        ("1970-01-01T00:00:00", 0),
+        ("1969-12-31T23:59:59.999999999Z", -1),
+        ("2024-060T00:00:00.000000001", 1_709_164_800 * NS_PER_S + 1),
+        ("2024-02-29T00:00:00.0000000014999", 1_709_164_800 * NS_PER_S + 1),
+        ("2016-12-31T23:59:60.5", 1_483_228_800 * NS_PER_S + NS_PER_S // 2),
+        ("2262-04-11T23:47:16.854775807", 2**63 - 1),
+        ("1677-09-21T00:12:43.145224192", -(2**63)),
+    ],
+)
+def test_both_forms_of_epoch_are_read_to_the_nanosecond(text, t_ns):
+    assert aem.epoch_ns("", text) == t_ns
+
+
+def test_epochs_are_written_with_nine_digits():
+    assert aem.epoch_text(-1) == "1969-12-31T23:59:59.999999999"
+    assert aem.epoch_text(2**63 - 1) == "2262-04-11T23:47:16.854775807"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "2024-02-30T00:00:00",
+        "2023-366T00:00:00",
+        "2024-000T00:00:00",
+        "2024-01-01T24:00:00",
+        "2024-01-01T00:60:00",
+        "2024-01-01T00:00:60",
+        "0000-01-01T00:00:00",
+        "2024-01-01T00:00:00+01:00",
+        "2024-01-01 00:00:00",
+        "2024-1-1T00:00:00",
+        "12.5",
+    ],
+)
+def test_an_epoch_that_is_none_is_refused(tmp_path, text):
+    assert ":17: " in refusal(tmp_path, kvn([f"{text.replace(' ', '_')} 0 0 0 1"]))
+
+
+def test_an_epoch_outside_64_bits_is_refused(tmp_path):
+    assert "64 bits" in refusal(tmp_path, kvn(["2262-04-11T23:47:16.854775808 0 0 0 1"]))
+
+
+# Blocks
+
+
+def two_blocks(first, second, **keywords):
+    one = kvn([f"{epoch} 0 0 0 1" for epoch in first])
+    two = kvn([f"{epoch} 0 0 0 1" for epoch in second], **keywords)
+    return one + two[two.index("META_START") :]
+
+
+def test_blocks_are_put_in_order_of_time(tmp_path):
+    text = two_blocks(["2024-01-02T00:00:00", "2024-01-02T00:00:01"], ["2024-01-01T00:00:00", "2024-01-01T00:00:01"])
+    samples = read(tmp_path, text)
+    assert [s.t_ns for s in samples] == sorted(s.t_ns for s in samples)
+    assert [s.discontinuity for s in samples] == [False, False, True, False]
+
+
+def test_blocks_may_share_an_epoch_and_the_earlier_then_ends_a_nanosecond_before(tmp_path):
+    # 504.0-B-1 4.2.5.4.1 allows it; the attitude before the break is then known up to the break.
+    text = two_blocks(["2024-01-01T00:00:00", "2024-01-01T00:00:01"], ["2024-01-01T00:00:01", "2024-01-01T00:00:02"])
+    samples = read(tmp_path, text)
+    assert [s.t_ns - samples[0].t_ns for s in samples] == [0, NS_PER_S - 1, NS_PER_S, 2 * NS_PER_S]
+    assert [s.discontinuity for s in samples] == [False, False, True, False]
+
+
+def test_blocks_that_overlap_are_refused(tmp_path):
+    text = two_blocks(["2024-01-01T00:00:00", "2024-01-01T00:00:05"], ["2024-01-01T00:00:03"])
+    assert "time does not rise" in refusal(tmp_path, text)
+
+
+def test_blocks_of_two_time_systems_are_refused(tmp_path):
+    text = two_blocks(["2024-01-01T00:00:00"], ["2024-01-02T00:00:00"], TIME_SYSTEM="TAI")
+    assert "TIME_SYSTEM changes" in refusal(tmp_path, text)
+
+
+# What is refused
+
+
+@pytest.mark.parametrize("version", ["1.0", "2.0"])
+@pytest.mark.parametrize("kind", ["SPIN", "SPIN/NUTATION", "EULER_ANGLE", "EULER_ANGLE/RATE", "DCM"])
+def test_other_types_are_refused_with_those_that_work(tmp_path, kind, version):
+    message = refusal(tmp_path, kvn(rows_of([0, 0, 0, 1]), version, ATTITUDE_TYPE=kind))
+    assert f"ATTITUDE_TYPE = {kind}" in message
+    assert "QUATERNION, QUATERNION/DERIVATIVE, QUATERNION/" + ("RATE" if version == "1.0" else "ANGVEL") in message
+
+
+@pytest.mark.parametrize(
+    ("keywords", "word"),
+    [
+        ({"ATTITUDE_DIR": None}, "ATTITUDE_DIR is not there; write A2B or B2A"),
+        ({"ATTITUDE_DIR": "UP"}, "ATTITUDE_DIR is UP"),
+        ({"QUATERNION_TYPE": None}, "QUATERNION_TYPE is not there; write FIRST or LAST"),
+        ({"TIME_SYSTEM": None}, "TIME_SYSTEM is missing"),
+        ({"REF_FRAME_A": None}, "REF_FRAME_A is missing"),
+        ({"ATTITUDE_TYPE": None}, "ATTITUDE_TYPE is missing"),
+        ({"ATTITUDE_TYPE": "QUATERNION/RATE"}, "an epoch and 7 numbers"),
+    ],
+)
+def test_a_keyword_that_is_missing_or_wrong_is_named(tmp_path, keywords, word):
+    assert word in refusal(tmp_path, kvn(rows_of([0, 0, 0, 1]), **keywords))
+
+
+@pytest.mark.parametrize(
+    ("keywords", "word"),
+    [
+        ({}, "RATE_FRAME is not there; write ICRF or SC_BODY_1"),
+        ({"RATE_FRAME": "INSTRUMENT_A"}, "RATE_FRAME is INSTRUMENT_A"),
+        ({"RATE_FRAME": "REF_FRAME_B", "EULER_ROT_SEQ": "321"}, "rates of Euler angles are not read"),
+    ],
+)
+def test_a_rate_without_one_meaning_is_refused(tmp_path, keywords, word):
+    text = kvn(rows_of([0, 0, 0, 1, 0, 0, 0]), ATTITUDE_TYPE="QUATERNION/RATE", **keywords)
+    assert word in refusal(tmp_path, text)
+
+
+GOOD = kvn(rows_of([0, 0, 0, 1], [0, 0, 0, 1]))
+
+
+@pytest.mark.parametrize(
+    ("text", "place", "word"),
+    [
+        (GOOD.replace("VERS = 1.0", "VERS = 3.0"), "", "CCSDS_AEM_VERS is 3.0; 1.0 and 2.0 are read"),
+        (GOOD.replace("DATA_STOP\n", ""), ":18:", "cut off"),
+        (GOOD[: GOOD.index("META_STOP")], ":14:", "the file ends in the metadata"),
+        ("CCSDS_AEM_VERS = 1.0\n", ":1:", "with 0 blocks"),
+        (GOOD.replace("DATA_START\n", ""), ":16:", "in the gap before DATA_START"),
+        (GOOD.replace("META_STOP", "DATA_START"), ":15:", "DATA_START in the metadata"),
+        (GOOD.replace("0.0 1.0\n", "0.0 1.0 0.0\n", 1), ":17:", "an epoch and 4 numbers"),
+        (GOOD.replace("0.0 1.0\n", "0.0\n", 1), ":17:", "an epoch and 4 numbers"),
+        (GOOD.replace("0.0 1.0\n", "0.0 one\n", 1), ":17:", "an epoch and 4 numbers"),
+        (GOOD.replace("0.0 1.0\n", "0.0 nan\n", 1), ":17:", "not finite"),
+        (GOOD.replace("0.0 1.0\n", "0.0 1e308\n", 1), ":17:", "norm"),
+        (GOOD.replace("0.0 1.0\n", "0.0 0.5\n", 1), ":17:", "norm"),
+        (GOOD.replace(EPOCHS[1], EPOCHS[0]), ":18:", "does not rise"),
+        (GOOD.replace("OBJECT_ID = X", "OBJECT_ID"), ":6:", "KEYWORD = value"),
+        (kvn([]), ":17:", "holds no attitude"),
+        ("<aem", ":1:", "not well-formed"),
+        ("<aem/>", "", "no AEM in XML"),
+        ("<html><body/></html>", "", "no AEM in XML"),
+        ('<aem id="CCSDS_AEM_VERS" version="1.0"/>', "", "no AEM in XML"),
+        ('<!DOCTYPE aem [<!ENTITY x "y">]><aem id="CCSDS_AEM_VERS" version="1.0">&x;</aem>', "", "DOCTYPE"),
+    ],
+)
+def test_a_message_that_is_wrong_is_refused_with_its_place(tmp_path, text, place, word):
+    message = refusal(tmp_path, text)
+    assert message.startswith(f"{tmp_path / 'log'}{place}")
+    assert word in message
+
+
+def test_xml_that_is_cut_off_or_wrong_in_one_state_is_refused(tmp_path, caplog):
+    samples = [AttitudeSample(t_ns, np.array([1.0, 0.0, 0.0, 0.0])) for t_ns in range(3)]
+    write_log(tmp_path / "a.xml", samples)
+    text = (tmp_path / "a.xml").read_text()
+    assert "not well-formed" in refusal(tmp_path, text[: len(text) // 2])
+    assert "no AEM in XML" in refusal(tmp_path, text.replace("<QC>1.0<", "<QC>one<", 1))
+    assert "no AEM in XML" in refusal(tmp_path, text.replace("<QC>1.0</QC>", "", 1))
+    assert "no AEM in XML" in refusal(tmp_path, text.replace("<QC>1.0</QC>", "<QC>1.0</QC><QC>0.0</QC>", 1))
+    assert not caplog.records
+    assert ", 1970-01-01T00:00:00.000000002: the quaternion's norm" in refusal(
+        tmp_path, "<QC>2.0</QC>".join(text.rsplit("<QC>1.0</QC>", 1))
+    )
+    assert "is not the QUATERNION/DERIVATIVE" in refusal(tmp_path, text.replace("QUATERNION<", "QUATERNION/DERIVATIVE<"))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "place", "words"),
+    [
+        (
+            "QUATERNION_TYPE = LAST",
+            "QUATERNION_TYP = FIRST",
+            ":10:",
+            "QUATERNION_TYP is no keyword .*; did you mean QUATERNION_TYPE",
+        ),
+        (
+            "ATTITUDE_DIR = A2B",
+            "ATTITUDE_DIRECTION = B2A",
+            ":9:",
+            "ATTITUDE_DIRECTION is no keyword .*; did you mean ATTITUDE_DIR",
+        ),
+        ("OBJECT_NAME = X", "object_name = X", ":5:", "object_name is no keyword .*; did you mean OBJECT_NAME"),
+        ("OBJECT_NAME = X", "WINDSPEED = 3", ":5:", "WINDSPEED is no keyword .*; known are OBJECT_NAME, "),
+        (
+            "ORIGINATOR = X",
+            "ORIGINATOR = X\nATTITUDE_DIR = B2A",
+            ":4:",
+            "ATTITUDE_DIR is in the header; it belongs in the metadata",
+        ),
+        ("ATTITUDE_DIR = A2B", "ATTITUDE_DIR = A2B\nATTITUDE_DIR = B2A", ":9:", "ATTITUDE_DIR is there twice"),
+        ("META_START", "META_START\nORIGINATOR = Y", ":5:", "ORIGINATOR is in the metadata; it belongs in the header"),
+    ],
+)
+def test_a_keyword_that_would_be_passed_over_is_refused_with_its_line(tmp_path, old, new, place, words):
+    assert old in GOOD
+    message = refusal(tmp_path, GOOD.replace(old, new, 1))
+    line = int(place.strip(":")) + (1 if "there twice" in words else 0)
+    assert message.startswith(f"{tmp_path / 'log'}:{line}:"), message
+    assert re.search(words, message), message
+
+
+def test_comments_may_stand_anywhere(tmp_path):
+    assert len(read(tmp_path, GOOD.replace("OBJECT_ID", "COMMENT QUATERNION_TYP = FIRST\nOBJECT_ID"))) == 2
+
+
+def test_gcrf_has_the_axes_of_icrf(tmp_path):
+    wanted, found = read(tmp_path, GOOD), read(tmp_path, GOOD.replace("= ICRF", "= GCRF"))
+    assert [s.q_icrs_to_cam.tolist() for s in found] == [s.q_icrs_to_cam.tolist() for s in wanted]
+
+
+@pytest.fixture
+def xml(tmp_path):
+    write_log(tmp_path / "a.xml", [AttitudeSample(k, np.array([1.0, 0.0, 0.0, 0.0])) for k in range(3)])
+    return (tmp_path / "a.xml").read_text()
+
+
+def test_an_element_that_would_be_passed_over_is_refused_with_its_line(tmp_path, xml):
+    lines = xml.splitlines()
+    number = next(k for k, line in enumerate(lines, start=1) if "<QUATERNION_TYPE>" in line)
+    message = refusal(tmp_path, xml.replace("QUATERNION_TYPE>", "QUATERNION_TYP>"))
+    assert message.startswith(f"{tmp_path / 'log'}:{number}: QUATERNION_TYP is no keyword of an AEM's metadata; did you mean")
+
+
+def test_one_aem_in_an_ndm_is_read_and_several_are_not(tmp_path, xml):
+    body = xml[xml.index("<aem") :]
+    samples = read(tmp_path, f"<ndm><MESSAGE_ID>1</MESSAGE_ID>{body}</ndm>")
+    assert [s.t_ns for s in samples] == [0, 1, 2]
+    for count, inside in ((0, ""), (2, body + body)):
+        assert f"the <ndm> holds {count} <aem>; one is wanted" in refusal(tmp_path, f"<ndm>{inside}</ndm>")
+
+
+@pytest.mark.parametrize("part", ["segment", "metadata", "data", "body", "header"])
+def test_an_empty_part_is_one_line_that_names_no_python(tmp_path, xml, part):
+    start, end = xml.index(f"<{part}>"), xml.index(f"</{part}>")
+    for text in (xml[: start + len(part) + 2] + xml[end:], xml[:start] + xml[end + len(part) + 3 :]):
+        try:
+            samples = read(tmp_path, text)
+        except InputError as error:
+            line = str(error)
+            assert "\n" not in line
+            assert not re.search(r"NoneType|__init__|attribute|Error\b|argument", line), line
+        else:
+            assert part == "header" and len(samples) == 3

@@ -1,0 +1,279 @@
+"""Log files: every form, every way from one to another, and every way that one can be wrong."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from hilstar.attitude.logs import log_file as logs
+from hilstar.attitude.logs.log_file import read_log, write_log
+from hilstar.attitude.wire.packet import AttitudeSample
+from hilstar.errors import InputError
+
+HEAD = "t_s,qw,qx,qy,qz\n"
+FULL_HEAD = "t_s,qw,qx,qy,qz,rx,ry,rz,sequence,discontinuity\n"
+
+FORMS = ("csv", "jsonl", "json", "aem", "kvn", "xml", "mcap")
+AEM_FORMS = {"aem", "kvn", "xml"}
+# An AEM holds a rate as a quaternion derivative: there and back are 16 products summed by fours, each rounded to eps/2.
+RATE_TOLERANCE = 16 * np.finfo(np.float64).eps
+
+INT64_MIN, INT64_MAX = -(2**63), 2**63 - 1
+
+
+def random_samples(rng, count, every_rate=True):
+    """Samples from before 1970 to after 2000, of unit length to the last bit, with breaks."""
+    times = np.cumsum(rng.integers(1, 2 * 10**18 // count, size=count)) - 10**18
+    samples = []
+    while len(samples) < count:
+        q = rng.normal(size=4)
+        q /= np.linalg.norm(q)
+        if math.hypot(*q) != 1.0:  # what is not exactly unit is scaled once more by every reader
+            continue
+        i = len(samples)
+        rate = rng.normal(size=3) * 10.0 ** rng.integers(-9, 3) if every_rate or rng.random() < 0.7 else None
+        samples.append(AttitudeSample(int(times[i]), q, rate, int(rng.integers(0, 2**32)), bool(i and rng.random() < 0.2)))
+    return samples
+
+
+def as_aem_holds(samples):
+    """What is left of samples in an AEM: no sequence, and no rates in a block where one is missing."""
+    starts = [i for i, sample in enumerate(samples) if i == 0 or sample.discontinuity] + [len(samples)]
+    kept = []
+    for begin, end in pairwise(starts):
+        block = samples[begin:end]
+        whole = all(sample.rate_cam_rad_s is not None for sample in block)
+        kept += [replace(s, sequence=0, rate_cam_rad_s=s.rate_cam_rad_s if whole else None) for s in block]
+    return kept
+
+
+def assert_same(read, expected, rate_tolerance):
+    assert [s.t_ns for s in read] == [s.t_ns for s in expected]
+    assert [s.sequence for s in read] == [s.sequence for s in expected]
+    assert [s.discontinuity for s in read] == [s.discontinuity for s in expected]
+    for one, other in zip(read, expected, strict=True):
+        assert one.q_icrs_to_cam.tolist() == other.q_icrs_to_cam.tolist()
+        assert (one.rate_cam_rad_s is None) == (other.rate_cam_rad_s is None)
+        if one.rate_cam_rad_s is not None and other.rate_cam_rad_s is not None:
+            error = np.linalg.norm(one.rate_cam_rad_s - other.rate_cam_rad_s)
+            assert error <= rate_tolerance * np.linalg.norm(other.rate_cam_rad_s)
+
+
+def refusal(path):
+    with pytest.raises(InputError) as caught:
+        read_log(path)
+    line = str(caught.value)
+    assert line.startswith(str(path))
+    assert "\n" not in line
+    return line
+
+
+# Round trips
+
+
+@pytest.mark.parametrize("every_rate", [True, False])
+@pytest.mark.parametrize("second", FORMS)
+@pytest.mark.parametrize("first", FORMS)
+def test_a_log_goes_from_any_form_to_any_other_and_keeps_what_both_can_hold(tmp_path, first, second, every_rate):
+    samples = random_samples(np.random.default_rng(7), 30, every_rate)
+    write_log(tmp_path / f"a.{first}", samples)
+    write_log(tmp_path / f"b.{second}", read_log(tmp_path / f"a.{first}"))
+    aem = {first, second} & AEM_FORMS
+    expected = as_aem_holds(samples) if aem else samples
+    assert_same(read_log(tmp_path / f"b.{second}"), expected, 2 * RATE_TOLERANCE if aem else 0.0)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_the_ends_of_64_bit_time_and_the_nanoseconds_between_survive(tmp_path, form):
+    times = [INT64_MIN, -1_000_000_001, -1_000_000_000, -1, 0, 1, 1_700_000_000_123_456_789, INT64_MAX]
+    write_log(tmp_path / f"a.{form}", [AttitudeSample(t_ns, np.array([0.5, 0.5, 0.5, 0.5])) for t_ns in times])
+    assert [s.t_ns for s in read_log(tmp_path / f"a.{form}")] == times
+
+
+def test_what_a_log_holds_and_not_its_name_says_how_it_is_read(tmp_path):
+    samples = random_samples(np.random.default_rng(3), 5)
+    for form in FORMS:
+        write_log(tmp_path / f"a.{form}", samples)
+        (tmp_path / "log.dat").write_bytes((tmp_path / f"a.{form}").read_bytes())
+        assert [s.t_ns for s in read_log(tmp_path / "log.dat")] == [s.t_ns for s in samples]
+
+
+@pytest.mark.parametrize("form", ["csv", "jsonl", "aem", "xml"])
+def test_a_text_log_may_begin_with_a_byte_order_mark_and_end_its_lines_as_windows_does(tmp_path, form):
+    samples = random_samples(np.random.default_rng(3), 5)
+    write_log(tmp_path / f"a.{form}", samples)
+    text = (tmp_path / f"a.{form}").read_bytes().replace(b"\n", b"\r\n")
+    (tmp_path / "log").write_bytes(b"\xef\xbb\xbf" + text)
+    assert [s.t_ns for s in read_log(tmp_path / "log")] == [s.t_ns for s in samples]
+
+
+# CSV and JSON lines
+
+
+def test_csv_and_json_lines_give_the_same_samples(tmp_path):
+    (tmp_path / "a.csv").write_text("# a comment\n" + HEAD + "0.5,1,0,0,0\n\n1.25,0,1,0,0\n")
+    (tmp_path / "a.jsonl").write_text('{"t_ns":500000000,"q":[1,0,0,0]}\n\n{"t_ns":1250000000,"q":[0,1,0,0],"rate":[1,2,3]}\n')
+    csv, json = read_log(tmp_path / "a.csv"), read_log(tmp_path / "a.jsonl")
+    assert [s.t_ns for s in csv] == [s.t_ns for s in json] == [500_000_000, 1_250_000_000]
+    assert csv[1].q_icrs_to_cam.tolist() == json[1].q_icrs_to_cam.tolist() == [0, 1, 0, 0]
+    assert csv[1].rate_cam_rad_s is None
+    assert json[1].rate_cam_rad_s is not None
+
+
+def test_csv_columns_may_come_in_any_order_and_with_others(tmp_path):
+    (tmp_path / "a.csv").write_text("qx,qy,qz,qw,t_s,note\n0,0,0,1,2,hello\n")
+    (sample,) = read_log(tmp_path / "a.csv")
+    assert sample.t_ns == 2_000_000_000
+    assert sample.q_icrs_to_cam.tolist() == [1, 0, 0, 0]
+
+
+def test_csv_cells_that_are_empty_are_not_known(tmp_path):
+    (tmp_path / "a.csv").write_text(FULL_HEAD + "0,1,0,0,0,,,,,\n1,1,0,0,0,1,2,3,4,1\n")
+    first, second = read_log(tmp_path / "a.csv")
+    assert (first.rate_cam_rad_s, first.sequence, first.discontinuity) == (None, 0, False)
+    assert second.rate_cam_rad_s is not None
+    assert (second.rate_cam_rad_s.tolist(), second.sequence, second.discontinuity) == ([1, 2, 3], 4, True)
+
+
+@pytest.mark.parametrize(
+    ("text", "t_ns"),
+    [
+        ("1.7e9", 1_700_000_000 * 10**9),
+        ("-0.0000000015", -2),
+        ("1700000000.123456789", 1_700_000_000_123_456_789),
+        (" 2 ", 2 * 10**9),
+    ],
+)
+def test_csv_seconds_are_read_as_decimals_to_the_nearest_nanosecond(tmp_path, text, t_ns):
+    (tmp_path / "a.csv").write_text(HEAD + f"{text},1,0,0,0\n")
+    assert read_log(tmp_path / "a.csv")[0].t_ns == t_ns
+
+
+def test_json_lines_may_begin_with_blank_lines(tmp_path):
+    (tmp_path / "a.jsonl").write_text('\n  \n {"t_ns":5,"q":[1,0,0,0]}\n')
+    assert read_log(tmp_path / "a.jsonl")[0].t_ns == 5
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "word"),
+    [
+        ("", "", "no attitude"),
+        (HEAD, "", "no attitude"),
+        ("t_s,qw,qx,qy\n", ":1:", "qz"),
+        ("t_s,qw,qx,qy,qz,rx,rz\n", ":1:", "ry"),
+        (HEAD + "0,1,0,0,0\n1,nan,0,0,0\n", ":3:", "not finite"),
+        (HEAD + "nan,1,0,0,0\n", ":2:", "finite"),
+        (HEAD + "inf,1,0,0,0\n", ":2:", "finite"),
+        (HEAD + "0,1,0,0,0\n0,1,0,0,0\n", ":3:", "does not rise"),
+        (HEAD + "0,2,0,0,0\n", ":2:", "norm"),
+        (HEAD + "0,1,0,0\n", ":2:", "wanted"),
+        (HEAD + "0,x,0,0,0\n", ":2:", "wanted"),
+        (HEAD + "1e30,1,0,0,0\n", ":2:", "64 bits"),
+        (HEAD + "1e999999999,1,0,0,0\n", ":2:", "wanted"),
+        (HEAD + "9223372036.854775808,1,0,0,0\n", ":2:", "64 bits"),
+        (FULL_HEAD + "0,1,0,0,0,1,,3,0,0\n", ":2:", "all of rx,ry,rz or none"),
+        (FULL_HEAD + "0,1,0,0,0,,,,1.5,0\n", ":2:", "whole number"),
+        (FULL_HEAD + "0,1,0,0,0,,,,1" + 30 * "0" + ",0\n", ":2:", "whole number"),
+        (FULL_HEAD + "0,1,0,0,0,,,,0,yes\n", ":2:", "0 or 1"),
+        (HEAD + 999 * "9" + ",y\n", ":2:", "wanted"),
+        ('{"t_ns":1,"q":[1,0,0,0]}\n{"t_ns":2,"q":[NaN,0,0,0]}\n', ":2:", "NaN"),
+        ('{"t_ns":1,"q":[1,0,0,0]}\nnonsense\n', ":2:", "JSON"),
+        ('{"t_ns":1}\n', ":1:", "q"),
+        ("CCSDS_OEM_VERS = 2.0\n", "", "CCSDS_AEM_VERS is read"),
+        ("\n" * 5000 + "x\n", "", "t_s is missing"),
+        ("\xff\xfe", "", "cannot be read"),
+    ],
+)
+def test_a_log_that_is_wrong_is_refused_with_its_line(tmp_path, text, line, word):
+    path = tmp_path / "log"
+    path.write_bytes(text.encode("latin-1"))
+    message = refusal(path)
+    assert f"{path}{line}" in message
+    assert word in message
+    assert len(message) < len(str(path)) + 300
+
+
+def test_a_log_that_is_not_there_is_refused(tmp_path):
+    with pytest.raises(InputError, match="No such file"):
+        read_log(tmp_path / "none.csv")
+    with pytest.raises(InputError, match="cannot be read"):
+        read_log(tmp_path)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_damaged_log_is_read_or_refused_in_one_line_and_never_ends_in_a_traceback(tmp_path, form):
+    rng = np.random.default_rng(11)
+    write_log(tmp_path / f"whole.{form}", random_samples(rng, 12, every_rate=False))
+    whole = np.frombuffer((tmp_path / f"whole.{form}").read_bytes(), dtype=np.uint8)
+    path = tmp_path / "log"
+    for trial in range(150):
+        data = whole.copy()
+        if trial % 3:
+            places = rng.integers(0, len(data), size=rng.integers(1, 4))
+            data[places] = rng.integers(0, 256, size=len(places)) if trial % 3 == 1 else data[places] ^ 1
+        else:
+            data = data[: rng.integers(0, len(data))]
+        path.write_bytes(data.tobytes())
+        try:
+            times = [sample.t_ns for sample in read_log(path)]
+            assert times == sorted(times)
+        except InputError as error:
+            assert "\n" not in str(error)
+
+
+@pytest.mark.parametrize("head", [b"", b"\x89MCAP0\r\n", b"<aem", b"CCSDS_AEM_VERS = 2.0\n", b"{", b"t_s,qw,qx,qy,qz\n"])
+def test_binary_rubbish_is_refused_in_one_line(tmp_path, head):
+    for seed in range(20):
+        rubbish = np.random.default_rng(seed).integers(0, 256 if seed % 2 else 128, size=300, dtype=np.uint8)
+        (tmp_path / "log").write_bytes(head + rubbish.tobytes())
+        refusal(tmp_path / "log")
+
+
+# Writing
+
+
+def test_a_name_that_says_no_form_is_refused_with_those_that_do(tmp_path):
+    with pytest.raises(InputError, match=r"\.csv, \.jsonl, \.json, \.aem, \.kvn, \.xml, \.mcap"):
+        write_log(tmp_path / "a.txt", random_samples(np.random.default_rng(0), 1))
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_no_samples_make_no_log(tmp_path, form):
+    with pytest.raises(InputError, match="no attitude"):
+        write_log(tmp_path / f"a.{form}", [])
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_old_log_is_kept_when_the_new_one_fails_half_way(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("old")
+    broken = AttitudeSample(1, None)  # type: ignore[arg-type]
+    with pytest.raises(AttributeError):
+        write_log(path, [*random_samples(np.random.default_rng(0), 3), broken])
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_place_that_cannot_be_written_is_refused_in_one_line(tmp_path):
+    samples = random_samples(np.random.default_rng(0), 1)
+    (tmp_path / "file").write_text("")
+    (tmp_path / "folder.csv").mkdir()
+    for path in (tmp_path / "none" / "a.csv", tmp_path / "file" / "a.csv", tmp_path / "folder.csv"):
+        with pytest.raises(InputError, match="cannot be written"):
+            write_log(path, samples)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "folder.csv"]
+
+
+def test_a_log_has_no_more_attitudes_than_memory_can_hold(tmp_path, monkeypatch):
+    monkeypatch.setattr(logs, "MAX_SAMPLES", 3)
+    path = tmp_path / "log.csv"
+    rows = [f"{k},1,0,0,0" for k in range(4)]
+    path.write_text("\n".join(["t_s,qw,qx,qy,qz", *rows[:3]]) + "\n")
+    assert len(read_log(path)) == 3
+    path.write_text("\n".join(["t_s,qw,qx,qy,qz", *rows]) + "\n")
+    with pytest.raises(InputError, match=r"log.csv:5: more than 3 attitudes; write them into several logs"):
+        read_log(path)

@@ -1,0 +1,146 @@
+"""Attitudes in MCAP: what other tools see, what a killed writer leaves, and what is refused."""
+
+from __future__ import annotations
+
+import io
+import json
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
+from hilstar.attitude.logs.log_file import read_log, write_log
+from hilstar.attitude.logs.mcap_log import (
+    ATTITUDE_SCHEMA,
+    ATTITUDE_TOPIC,
+    attitude_message,
+    log_time_ns,
+    read_attitudes,
+    refused_message,
+    register_attitudes,
+)
+from hilstar.attitude.wire.packet import AttitudeSample, encode
+from hilstar.errors import InputError
+
+UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+def sample(t_ns, sequence=0, rate=None):
+    return AttitudeSample(t_ns, UPRIGHT, rate, sequence)
+
+
+def ledger(messages, chunk_size=1024 * 1024, finish=True):
+    """An MCAP file of attitude messages between those of another channel, as a live run writes it."""
+    file = io.BytesIO()
+    writer = Writer(file, chunk_size=chunk_size)
+    writer.start(library="test")
+    frames = writer.register_channel("/frame", "json", 0)
+    attitudes = register_attitudes(writer)
+    for i, message in enumerate(messages):
+        writer.add_message(frames, i, b'{"frame":1}', i)
+        writer.add_message(attitudes, i, message, i)
+    if finish:
+        writer.finish()
+    return file.getvalue()
+
+
+def test_an_mcap_log_opens_in_the_library_as_json_with_a_schema(tmp_path):
+    taken = sample(-5, 3, np.array([0.1, 0.2, 0.3]))
+    write_log(tmp_path / "a.mcap", [taken, sample(2**62, 4)])
+    with (tmp_path / "a.mcap").open("rb") as file:
+        (schema, channel, first), (_, _, second) = make_reader(file).iter_messages()
+    assert schema is not None
+    assert (schema.encoding, schema.data) == ("jsonschema", ATTITUDE_SCHEMA)
+    assert (channel.topic, channel.message_encoding) == (ATTITUDE_TOPIC, "json")
+    assert (first.log_time, first.publish_time, first.sequence) == (0, 0, 3)
+    assert second.log_time == 2**62
+    assert json.loads(first.data) == {
+        "t_ns": -5,
+        "sequence": 3,
+        "q": [1, 0, 0, 0],
+        "rate": [0.1, 0.2, 0.3],
+        "discontinuity": False,
+        "receive_ns": None,
+        "accepted": True,
+        "reason": None,
+        "raw": None,
+    }
+
+
+def test_the_schema_names_every_field_with_one_plain_type():
+    # Foxglove's reader throws for a type that is a list (foxglove/studio, packages/mcap-support/src/parseJsonSchema.ts).
+    properties = json.loads(ATTITUDE_SCHEMA)["properties"]
+    assert list(properties) == list(json.loads(attitude_message(sample(0))))
+    assert {p["type"] for p in properties.values()} <= {"integer", "number", "boolean", "string", "array"}
+
+
+def test_a_message_keeps_the_packet_as_it_came():
+    packet = encode(sample(7))
+    assert bytes.fromhex(json.loads(attitude_message(sample(7), receive_ns=9, raw=packet))["raw"]) == packet
+    refused = json.loads(refused_message("crc", "the CRC-32 does not fit", 9, b"\x00\xff"))
+    assert (refused["accepted"], refused["reason"], refused["raw"]) == (False, "crc: the CRC-32 does not fit", "00ff")
+    assert (refused["t_ns"], refused["receive_ns"]) == (None, 9)
+
+
+def test_log_time_is_the_receivers_clock_where_known_and_never_below_zero():
+    assert log_time_ns(5) == 5
+    assert log_time_ns(5, 9) == 9
+    assert log_time_ns(-5) == log_time_ns(5, -9) == 0
+
+
+def test_other_channels_and_refused_packets_are_passed_over(tmp_path):
+    refused = refused_message("norm", "2", 1, None)
+    (tmp_path / "run.mcap").write_bytes(ledger([attitude_message(sample(1)), refused, attitude_message(sample(2))]))
+    assert [s.t_ns for s in read_log(tmp_path / "run.mcap")] == [1, 2]
+
+
+def test_a_killed_writer_leaves_everything_before_its_last_chunk(tmp_path):
+    count = 40
+    data = ledger([attitude_message(sample(i)) for i in range(count)], chunk_size=1500, finish=False)
+    seen = []
+    for size in range(8, len(data) + 1, 13):
+        (tmp_path / "run.mcap").write_bytes(data[:size])
+        times = [s.t_ns for s in read_attitudes(tmp_path / "run.mcap")]
+        assert times == list(range(len(times)))
+        seen.append(len(times))
+    assert seen == sorted(seen)
+    assert seen[0] == 0
+    assert 0.7 * count < seen[-1] < count  # the last chunk was never written
+
+
+def test_a_finished_file_that_is_damaged_is_refused(tmp_path):
+    data = bytearray(ledger([attitude_message(sample(i)) for i in range(40)]))
+    data[len(data) // 4] ^= 0x55
+    (tmp_path / "run.mcap").write_bytes(bytes(data))
+    with pytest.raises(InputError, match="damaged before byte"):
+        read_log(tmp_path / "run.mcap")
+
+
+def test_a_sender_that_restarted_is_named_with_its_time(tmp_path):
+    (tmp_path / "run.mcap").write_bytes(ledger([attitude_message(sample(t)) for t in (100, 200, 50, 60)]))
+    with pytest.raises(InputError, match=r"attitude 3: time does not rise \(t_ns 50 after 200\); the sender restarted"):
+        read_log(tmp_path / "run.mcap")
+
+
+@pytest.mark.parametrize(
+    ("message", "word"),
+    [
+        (b"{", "not an attitude"),
+        (b"\xff", "not an attitude"),
+        (b'{"t_ns":1,"q":[1,0,0]}', "not an attitude"),
+        (b'{"t_ns":null}', "no t_ns or no q"),
+        (b'{"t_ns":1,"q":[2,0,0,0]}', "norm"),
+        (b'{"t_ns":9223372036854775808,"q":[1,0,0,0]}', "64 bits"),
+    ],
+)
+def test_a_message_that_is_no_attitude_is_refused_with_its_number(tmp_path, message, word):
+    (tmp_path / "run.mcap").write_bytes(ledger([attitude_message(sample(1)), message]))
+    with pytest.raises(InputError, match=f"message 2 of /attitude: .*{word}"):
+        read_log(tmp_path / "run.mcap")
+
+
+def test_a_file_without_attitudes_is_refused(tmp_path):
+    (tmp_path / "run.mcap").write_bytes(ledger([]))
+    with pytest.raises(InputError, match="no attitude"):
+        read_log(tmp_path / "run.mcap")

@@ -1,0 +1,114 @@
+"""Endpoints: what libzmq would take and hilstar must not, and that nothing is deleted."""
+
+from __future__ import annotations
+
+import socket
+
+import pytest
+
+from hilstar.attitude.wire.endpoint import check_use, parse_endpoint
+from hilstar.errors import InputError
+
+LOOPBACK = ("tcp://127.0.0.1:5560", "tcp://127.9.8.7:1", "tcp://localhost:5560", "tcp://[::1]:65535", "ipc:///tmp/attitude")
+BEYOND = ("tcp://10.0.0.1:5560", "tcp://bench-pc.lab.example:5560", "tcp://localhost.evil:5560", "tcp://[2001:db8::1]:5560")
+BEYOND += ("tcp://0.0.0.0:5560", "tcp://[::]:5560", "tcp://*:5560", "tcp://lo:5560", "tcp://LOCALHOST:5560", "tcp://eth0:5560")
+WRONG = (
+    "tcp://127.0.0.1:0;10.0.0.1:5560",
+    "tcp://127.0.0.1;10.0.0.1:5560",
+    "tcp://10.0.0.1:1;127.0.0.1:5560",
+    "tcp://lo;127.0.0.1:5560",
+    "tcp://127.1:5560",
+    "tcp://0177.0.0.1:5560",
+    "tcp://0x7f.0.0.1:5560",
+    "tcp://2130706433:5560",
+    "tcp://127.0.0.1.:5560",
+    "tcp://[::ffff:127.0.0.1]:5560",
+    "tcp://[::ffff:10.0.0.1]:5560",
+    "tcp://::1:5560",
+    "tcp://[::1:5560",
+    "tcp://[127.0.0.1:5560",
+    "tcp://[localhost]:5560",
+    "tcp://[127.0.0.1]:5560",
+    "tcp://127.0.0.1:5560/x",
+    "tcp://127.0.0.1:5560 ",
+    "tcp://127.0.0.1:5560\n",
+    "tcp://127.0.0.1:5560\0",
+    "tcp://127.0.0.1\0:5560",
+    "tcp://127.0.0.1:65536",
+    "tcp://127.0.0.1:-1",
+    "tcp://127.0.0.1:+1",
+    "tcp://127.0.0.1:٥٥٦٠",
+    "tcp://127.0.0.1:",
+    "tcp://127.0.0.1",
+    "tcp://:5560",
+    "tcp://user@127.0.0.1:5560",
+    "tcp://-evil:5560",
+    "TCP://127.0.0.1:5560",
+    " tcp://127.0.0.1:5560",
+    "inproc://attitude",
+    "udp://127.0.0.1:5560",
+    "ws://127.0.0.1:5560",
+    "pgm://127.0.0.1;239.0.0.1:5560",
+    "vmci://*:5560",
+    "ipc://",
+    "ipc://*",
+    "ipc://@abstract",
+    "ipc://relative/path",
+    "ipc:///tmp/a\0b",
+    "ipc:///" + 200 * "a",
+    "",
+)
+
+
+@pytest.mark.parametrize("text", LOOPBACK)
+def test_loopback_and_sockets_of_this_machine_need_no_keys(text):
+    assert parse_endpoint(text).loopback
+
+
+@pytest.mark.parametrize("text", BEYOND)
+def test_what_others_can_reach_is_never_taken_for_loopback(text):
+    assert not parse_endpoint(text).loopback
+
+
+@pytest.mark.parametrize("text", WRONG)
+def test_any_other_form_is_refused_in_one_short_line(text):
+    with pytest.raises(InputError, match="write "):
+        parse_endpoint(text)
+
+
+def test_libzmq_gets_the_address_that_was_judged():
+    """A name could be resolved to anything; leading zeros are octal to some."""
+    assert parse_endpoint("tcp://localhost:05560").address == "tcp://127.0.0.1:5560"
+    assert parse_endpoint("tcp://127.0.0.1:0").address == "tcp://127.0.0.1:*"
+    assert parse_endpoint("tcp://[0:0::1]:7").address == "tcp://[::1]:7"
+
+
+@pytest.mark.parametrize("text", ["tcp://127.0.0.1:*", "tcp://127.0.0.1:0", "tcp://*:5560", "tcp://[::]:5560"])
+def test_nothing_connects_to_any_port_or_every_interface(text):
+    check_use(parse_endpoint(text), text, bind=True)
+    with pytest.raises(InputError, match="nothing to connect to"):
+        check_use(parse_endpoint(text), text, bind=False)
+
+
+def test_a_bind_deletes_no_file_and_takes_no_socket_from_a_running_program(tmp_path):
+    def refused(path, *, bind: bool = True) -> str:
+        with pytest.raises(InputError) as caught:
+            check_use(parse_endpoint(f"ipc://{path}"), f"ipc://{path}", bind=bind)
+        return str(caught.value)
+
+    file, link, served, stale = (tmp_path / name for name in ("file", "link", "served", "stale"))
+    file.write_text("measured")
+    link.symlink_to(file)
+    for path in (file, link, tmp_path):
+        assert "no socket" in refused(path)
+        assert "no socket" in refused(path, bind=False)
+    assert file.read_text() == "measured"
+    assert "no directory" in refused(tmp_path / "nowhere" / "socket")
+    with socket.socket(socket.AF_UNIX) as server:
+        server.bind(str(served))
+        server.listen()
+        assert "running program" in refused(served)
+        check_use(parse_endpoint(f"ipc://{served}"), "", bind=False)
+    with socket.socket(socket.AF_UNIX) as server:
+        server.bind(str(stale))
+    check_use(parse_endpoint(f"ipc://{stale}"), "", bind=True)

@@ -1,0 +1,93 @@
+"""CURVE keys: whose they are from the first byte on, and an allow-list that follows its directory."""
+
+from __future__ import annotations
+
+import os
+import stat
+
+import pytest
+import zmq.auth
+
+from hilstar.attitude.wire.keys import AllowList, load_public, load_secret, make_keys
+from hilstar.errors import InputError
+
+
+def test_a_secret_key_is_its_owner_s_alone_before_anything_else_happens_to_it(tmp_path, monkeypatch):
+    """Seen at the moment when the file has just been written, by a user whose umask lets all read."""
+    seen = []
+    create = zmq.auth.create_certificates
+
+    def spy(folder, name):
+        paths = create(folder, name)
+        seen.append(stat.S_IMODE(os.stat(paths[1]).st_mode))  # noqa: PTH116
+        return paths
+
+    monkeypatch.setattr(zmq.auth, "create_certificates", spy)
+    before = os.umask(0)
+    try:
+        written = make_keys(tmp_path / "keys")
+    finally:
+        os.umask(before)
+    assert seen == [0o600, 0o600]
+    for path in written:
+        assert path.exists()
+        assert path.parent.stat().st_mode & 0o077 == 0
+    assert sorted(path.name for path in (tmp_path / "keys").iterdir()) == [
+        "allowed_clients",
+        "client.key",
+        "client.key_secret",
+        "server.key",
+        "server.key_secret",
+    ]
+
+
+def test_a_client_in_an_allow_list_is_not_overwritten(tmp_path):
+    allowed = tmp_path / "allowed_clients"
+    allowed.mkdir()
+    (allowed / "client.key").write_text("somebody's")
+    with pytest.raises(InputError, match="may be in use"):
+        make_keys(tmp_path)
+    assert (allowed / "client.key").read_text() == "somebody's"
+
+
+def test_a_secret_key_that_others_can_read_is_remarked_on(tmp_path, caplog):
+    make_keys(tmp_path)
+    secret = tmp_path / "server.key_secret"
+    load_secret(secret)
+    assert caplog.text == ""
+    secret.chmod(0o644)
+    load_secret(secret)
+    assert "chmod 600" in caplog.text
+    assert str(secret) in caplog.text
+
+
+def test_an_allow_list_follows_its_directory(tmp_path, caplog):
+    make_keys(tmp_path / "a")
+    make_keys(tmp_path / "b")
+    first, second = (load_public(tmp_path / name / "client.key") for name in ("a", "b"))
+    allowed = tmp_path / "a" / "allowed_clients"
+    clients = AllowList(allowed)
+    assert clients.callback("*", first)
+    assert not clients.callback("*", second)
+    (allowed / "second.key").write_bytes((tmp_path / "b" / "client.key").read_bytes())
+    assert clients.callback("*", second)
+    (allowed / "client.key").unlink()
+    assert not clients.callback("*", first)
+    (allowed / "broken.key").write_text("no key")
+    assert clients.callback("*", second)
+    assert "broken.key" in caplog.text
+    for path in allowed.iterdir():
+        path.unlink()
+    assert not clients.callback("*", second)
+
+
+@pytest.mark.parametrize("text", ["", "public-key", 'public-key = "short"', f'public-key = "{"~" * 40}"', "\0\xff"])
+def test_what_is_no_key_file_gets_one_line(tmp_path, text):
+    path = tmp_path / "x.key"
+    path.write_text(text)
+    with pytest.raises(InputError, match="no key file"):
+        load_public(path)
+    pipe = tmp_path / "pipe.key"
+    os.mkfifo(pipe)
+    with pytest.raises(InputError, match=r"pipe\.key"):
+        load_public(pipe)

@@ -1,0 +1,211 @@
+"""The ledger's own rules, and what reading an MCAP file may cost."""
+
+from __future__ import annotations
+
+import io
+import json
+import resource
+import time
+import zlib
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import zstandard
+from mcap.data_stream import RecordBuilder
+from mcap.records import Chunk, Header
+from mcap.writer import MCAP0_MAGIC, Writer
+
+from hilstar.attitude.logs.log_file import read_log
+from hilstar.attitude.logs.mcap_reader import parts_of, read_topics
+from hilstar.attitude.wire.packet import AttitudeSample, Refusal, encode
+from hilstar.errors import InputError
+from hilstar.notices import Notices
+from hilstar.run.record.backlog import MAX_WAITING_BYTES, Backlog, Entry
+from hilstar.run.record.ledger import Ledger, Split, parse_split
+from hilstar.run.record.records import FrameRecord, past_frames
+from hilstar.run.record.report import figures_of, report
+
+UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+@pytest.fixture
+def bench(small_bench_file):
+    return SimpleNamespace(
+        path=small_bench_file,
+        bench_hash="0" * 64,
+        calibration=SimpleNamespace(name="srgb", sha256="1" * 64),
+        renderer=SimpleNamespace(gl_renderer="none"),
+    )
+
+
+def keep(ledger: Ledger, first: int, last: int) -> None:
+    for k in range(first, last):
+        sample = AttitudeSample(k, UPRIGHT, None, k)
+        ledger.packet(1000 + k, encode(sample), sample, None)
+        ledger.frame(FrameRecord(frame=k, t_ns=k, light_ns=k, draw_ns=k, swap_ns=k + 1, q=(1, 0, 0, 0)))
+
+
+def test_a_ledger_goes_on_in_other_files_and_is_read_as_one(tmp_path, bench):
+    path = tmp_path / "run.mcap"
+    with Ledger(path, bench, split=Split(bytes=1)) as ledger:
+        keep(ledger, 0, 50)
+        end_s = time.monotonic() + 20
+        while not (tmp_path / "run.0001.mcap").exists() and time.monotonic() < end_s:
+            time.sleep(0.02)
+        keep(ledger, 50, 100)
+    assert len(parts_of(path)) >= 2
+    assert [sample.sequence for sample in read_log(path)] == list(range(100))
+    assert [frame.number for frame in past_frames(path)] == list(range(100))
+    assert [sample.sequence for sample in read_log(tmp_path / "run.0001.mcap")][-1] == 99 or len(parts_of(path)) > 2
+
+
+def test_a_split_is_a_size_or_a_time():
+    assert (parse_split("1GB").bytes, parse_split("30min").seconds, parse_split("1.5h").seconds) == (1e9, 1800, 5400)
+    for wrong in ("1", "GB", "1kB", "5s", "-1h", "1e3GB", "1 fortnight"):
+        with pytest.raises(InputError, match="--ledger-split"):
+            parse_split(wrong)
+
+
+def test_a_disk_without_room_loses_frames_first_and_says_so_and_is_tried_again(tmp_path, bench):
+    notices = Notices()
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    ledger = Ledger(tmp_path / "run.mcap", bench, notices)
+    try:
+        keep(ledger, 0, 10)
+        time.sleep(0.5)
+        resource.setrlimit(resource.RLIMIT_FSIZE, ((tmp_path / "run.mcap").stat().st_size, limits[1]))
+        keep(ledger, 10, 20)
+        wait_for(lambda: "ledger-failed" in notices.active)
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        wait_for(lambda: "ledger-failed" not in notices.active)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        ledger.close()
+    assert ledger.failure == "File too large"
+    assert ledger.summary()["unrecorded"] == 10
+    assert [sample.sequence for sample in read_log(tmp_path / "run.mcap")] == list(range(20))
+    assert [frame.number for frame in past_frames(tmp_path / "run.mcap")] == list(range(10))
+
+
+def wait_for(true) -> None:
+    end_s = time.monotonic() + 20
+    while not true():
+        assert time.monotonic() < end_s
+        time.sleep(0.02)
+
+
+def test_what_waits_is_bounded_by_bytes_and_frames_go_first():
+    backlog = Backlog()
+    frames = sum(backlog.put(Entry("frame", 0, 0, None)) for _ in range(50_000))
+    packets = sum(backlog.put(Entry("packet", 0, 0, None, 1000)) for _ in range(50_000))
+    assert 0 < frames < 50_000 and 0 < packets < 50_000
+    assert sum(entry.size_bytes for entry in backlog.take()) <= MAX_WAITING_BYTES
+    assert backlog.put(Entry("frame", 0, 0, None))
+
+
+def test_a_ledger_needs_no_new_file_once_it_has_begun(tmp_path, bench):
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with Ledger(tmp_path / "run.mcap", bench) as ledger:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (3, limits[1]))
+        try:
+            keep(ledger, 0, 10)
+            time.sleep(1.5)
+        finally:
+            resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+    assert ledger.failure is None
+    assert len([topic for topic, _ in read_topics(tmp_path / "run.mcap") if topic == "/process"]) >= 2
+
+
+def bomb(claimed: int, size: int) -> bytes:
+    data = bytes(size)
+    builder = RecordBuilder()
+    Header("", "x").write(builder)
+    Chunk("zstd", zstandard.compress(data), 0, 0, zlib.crc32(data), claimed).write(builder)
+    return MCAP0_MAGIC + builder.end() + b"  "
+
+
+@pytest.mark.parametrize(
+    ("claimed", "word"), [(100_000_000, "at most are unpacked"), (1000, "more than the 1000"), (50_000_000, "times")]
+)
+def test_a_small_file_that_unpacks_to_a_large_one_is_refused(tmp_path, claimed, word):
+    path = tmp_path / "bomb.mcap"
+    path.write_bytes(bomb(claimed, 100_000_000 if claimed != 50_000_000 else 50_000_000))
+    assert path.stat().st_size < 33_000
+    with pytest.raises(InputError, match=word):
+        read_log(path)
+
+
+def test_an_mcap_without_attitudes_lists_its_topics(tmp_path):
+    file = io.BytesIO()
+    writer = Writer(file)
+    writer.start(library="test")
+    for topic in ("/imu", "/gps"):
+        writer.add_message(writer.register_channel(topic, "json", 0), 1, b"{}", 1)
+    writer.finish()
+    (tmp_path / "other.mcap").write_bytes(file.getvalue())
+    with pytest.raises(InputError, match="its topics are /gps, /imu"):
+        read_log(tmp_path / "other.mcap")
+
+
+@pytest.mark.parametrize(
+    ("wrong", "word"),
+    [
+        ({"q": [2, 0, 0, 0]}, "norm"),
+        ({"rate": [1e9, 0, 0]}, "rate"),
+        ({"swap_ns": -5}, "Expected"),
+        ({"t_ns": 2**70}, "Expected|range"),
+    ],
+)
+def test_a_frame_that_the_wire_would_refuse_is_refused_with_its_number(tmp_path, wrong, word):
+    form = {"frame": 1, "t_ns": 1, "light_ns": 1, "draw_ns": 1, "swap_ns": 2, "q": [1, 0, 0, 0]}
+    path = frames_file(tmp_path, [form, form | wrong])
+    with pytest.raises(InputError, match=f"run.mcap: message 2.*{word}"):
+        list(past_frames(path))
+
+
+def frames_file(tmp_path, forms):
+    file = io.BytesIO()
+    writer = Writer(file)
+    writer.start(library="test")
+    channel = writer.register_channel("/frame", "json", 0)
+    for form in forms:
+        writer.add_message(channel, 1, json.dumps(form).encode(), 1)
+    writer.finish()
+    (tmp_path / "run.mcap").write_bytes(file.getvalue())
+    return tmp_path / "run.mcap"
+
+
+def test_a_report_of_absurd_times_is_a_report(tmp_path):
+    form = {"light_ns": 1, "draw_ns": 1, "q": [1, 0, 0, 0]}
+    times = (0, 10**18, 5, 2**62, 7)
+    path = frames_file(
+        tmp_path, [form | {"frame": k, "t_ns": -(2**63) if k % 2 else t, "swap_ns": t} for k, t in enumerate(times)]
+    )
+    assert report(path, tmp_path)["frames"] == 5
+    assert (tmp_path / "attitude.png").stat().st_size > 10_000
+
+
+def test_a_report_s_memory_does_not_grow_with_the_run(tmp_path):
+    form = {"light_ns": 1, "draw_ns": 0, "q": [1, 0, 0, 0]}
+    forms = (
+        {**form, "frame": k, "t_ns": k, "swap_ns": 16_666_667 * k, "missed_before": int(k == 70_000)} for k in range(140_000)
+    )
+    figures = figures_of(frames_file(tmp_path, forms))
+    assert figures.frames == 140_000
+    assert len(figures.samples.rows) <= 1 << 16 and figures.samples.stride == 4
+    assert figures.spreads["interval"].percentile(50) == pytest.approx(16.667, rel=2e-3)
+    begin, _, _, lost = figures.spans.column(2)
+    assert begin[lost > 0] == pytest.approx(70_000 / 60, abs=1.1)
+
+
+def test_refused_packets_are_counted_by_reason(tmp_path, bench):
+    with Ledger(tmp_path / "run.mcap", bench) as ledger:
+        for k in range(500):
+            ledger.packet(1000 + k, b"x" * 5000, None, Refusal("crc" if k % 5 else "norm", "d" * 5000))
+    figures_messages = [(topic, json.loads(data)) for topic, data in read_topics(tmp_path / "run.mcap")]
+    whole = [each for topic, each in figures_messages if topic == "/attitude"]
+    counted = {each["reason"]: each["count"] for topic, each in figures_messages if topic == "/not_kept"}
+    assert len(whole) == 40
+    assert counted == {"crc": 380, "norm": 80}
+    assert max(len(each["raw"]) for each in whole) == 2048

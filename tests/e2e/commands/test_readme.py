@@ -48,11 +48,14 @@ def test_the_first_command_does_the_main_job_in_a_fresh_checkout(tmp_path):
 
 
 def test_the_picture_is_what_the_program_makes(tmp_path):
-    made = run_hilstar("frame", ROOT / "configs" / "demo.toml", "--radec", "84.057,-1.2,0", "--preview", tmp_path / "p.png")
+    script = [sys.executable, ROOT / "docs" / "make_picture.py", tmp_path / "p.png"]
+    made = subprocess.run(script, capture_output=True, text=True, check=False)
     assert made.returncode == 0, made.stderr
-    ours, theirs = (np.array(Image.open(path)).astype(int) for path in (tmp_path / "p.png", ROOT / "readme.png"))
-    # Another driver may round a code the other way; the preview's power of 0.35 makes at most 40 grey levels of one.
-    assert (np.abs(ours - theirs) > 40).sum() == 0
+    ours, theirs = (np.array(Image.open(path).convert("L")).astype(int) for path in (tmp_path / "p.png", ROOT / "readme.png"))
+    assert ours.shape == theirs.shape
+    # Another driver may round a code the other way: the preview's power of 0.35 makes at most 40 grey levels of one, and a code
+    # that is written out differs in a hundred pixels of a million. Another field differs in 5000.
+    assert (np.abs(ours - theirs) > 40).mean() < 1e-3
 
 
 def test_the_sender_is_heard(tmp_path):
@@ -79,7 +82,7 @@ def test_the_user_s_regression_test_passes(tmp_path):
     assert result.returncode == 0, result.stdout
 
 
-@pytest.mark.parametrize("command", sorted(set(re.findall(r"(?m)^hilstar (\w+) ", blocks("text")[3]))))
+@pytest.mark.parametrize("command", sorted(set(re.findall(r"(?m)^hilstar (\w+) ", blocks("text")[2]))))
 def test_every_command_of_the_readme_is_there(command):
     result = run_hilstar(command, "--help")
     assert result.returncode == 0, result.stderr

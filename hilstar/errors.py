@@ -25,6 +25,20 @@ class MachineError(HilstarError):
     exit_code = 3
 
 
+def cannot_read(path: object, reason: object, advice: str) -> InputError:
+    """The refusal of an input: `reason` is words or the error that came, `advice` what to give instead."""
+    return InputError(f"{path}: cannot be read ({_in_words(reason)}); {advice}")
+
+
+def cannot_write(path: object, reason: object, advice: str = "choose another place") -> InputError:
+    """The refusal of an output: `reason` is words or the error that came."""
+    return InputError(f"{path}: cannot be written ({_in_words(reason)}); {advice}")
+
+
+def _in_words(reason: object) -> str:
+    return str(getattr(reason, "strerror", None) or reason)
+
+
 def shortened(text: object, limit: int = MAX_QUOTED_CHARACTERS) -> str:
     """A quoted piece of input in at most `limit` characters: its beginning and its end, where a file's name is."""
     try:

@@ -1,4 +1,7 @@
-"""Files that are written: whole or not at all, never over an input or another output, and a run's record never in silence."""
+"""Files that are written: complete or not at all, never over an input or another output, and under a name that fits.
+
+A run's ledger is never overwritten unless the user asks for it.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from hilstar.errors import InputError
+from hilstar.errors import InputError, cannot_write
 from hilstar.reading import MAX_TOML_BYTES, exists, open_regular, parse_toml, read_text
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
@@ -19,6 +22,20 @@ LEDGER_MARK = b"bench_sha256"  # in the head of each ledger
 HEAD_BYTES = 16_384
 MAX_DEPTH = 3  # a bench file names a calibration, which names a table
 OVERWRITE = "write another name, or add --overwrite"
+
+# The endings of each kind of file; the first is the one that messages suggest.
+FITS = (".fits", ".fit", ".fts")
+PNG = (".png",)
+PNG_OR_TIFF = (".png", ".tif", ".tiff")
+CSV = (".csv",)
+TOML = (".toml",)
+MCAP = (".mcap",)
+# Every ending by which a name says what it holds: of pictures, of text, of archives and arrays.
+KNOWN = {
+    *(FITS + PNG_OR_TIFF + (".jpg", ".jpeg", ".gif", ".bmp", ".webp", ".svg", ".pdf", ".ps", ".eps")),
+    *(".csv", ".tsv", ".json", ".jsonl", ".toml", ".yaml", ".yml", ".xml", ".aem", ".kvn", ".mcap", ".html", ".md", ".txt"),
+    *(".npy", ".npz", ".h5", ".hdf5", ".mat", ".zip", ".tar", ".parquet", ".xlsx", ".py"),
+}
 
 Place = tuple[int, int] | str
 
@@ -84,7 +101,7 @@ def whole_file(path: Path) -> Iterator[Path]:
         with _beside(path) as part:
             yield part
     except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror or error}); choose another place") from error
+        raise cannot_write(path, error) from error
 
 
 @contextmanager
@@ -143,7 +160,7 @@ class NewFile:
         refuse_writer(path)
         refuse_existing(path, overwrite)
         if exists(path) and not path.is_file():
-            raise InputError(f"{path}: cannot be written (it is no file); choose another place for the ledger")
+            raise cannot_write(path, "it is no file", "choose another place for the ledger")
         made = path
         if exists(path):
             target = Path(os.path.realpath(path))
@@ -153,7 +170,7 @@ class NewFile:
         except FileExistsError as error:
             raise InputError(f"{path}: is there already; {OVERWRITE}") from error
         except (OSError, ValueError) as error:
-            raise InputError(f"{path}: cannot be written ({_why(error)}); choose another place for the ledger") from error
+            raise cannot_write(path, error, "choose another place for the ledger") from error
         self._made = made
         with contextlib.suppress(OSError):  # a file system without locks
             fcntl.flock(self.fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -191,18 +208,12 @@ def refuse_writer(path: Path) -> None:
         os.close(fd)
 
 
-def _why(error: Exception) -> str:
-    return str(getattr(error, "strerror", None) or error)
-
-
 def make_directory(path: Path) -> Path:
     """`path`, made if it is not there. Raises InputError where it cannot be made or written."""
     try:
         path.mkdir(parents=True, exist_ok=True)
     except (OSError, ValueError) as error:
-        raise InputError(
-            f"{path}: cannot be written ({getattr(error, 'strerror', None) or error}); choose another place"
-        ) from error
+        raise cannot_write(path, error) from error
     return path
 
 
@@ -210,3 +221,32 @@ def written(path: Path, write: Callable[[Path], object]) -> None:
     """Whole or not at all; an older file stays until the new one is there."""
     with whole_file(path) as part:
         write(part)
+
+
+def check_ending(option: str, path: Path | None, endings: tuple[str, ...]) -> None:
+    """Refuse (InputError) a name that ends as another kind of file does; a name that says nothing is taken.
+
+    `endings` are those of the kind that is written, and .gz after those of FITS.
+    """
+    if path is None:
+        return
+    ending = path.suffix.lower()
+    if endings is FITS and ending == ".gz":
+        ending = path.with_suffix("").suffix.lower()
+    if ending not in endings and (ending in KNOWN or path.suffix.lower() == ".gz"):
+        # A name as it may be on this file system, so that it can be copied from the line.
+        better = path.with_suffix("").name or "OUT"
+        raise InputError(f"{option} {path}: {_article(endings)} is written there; write {better}{endings[0]}")
+
+
+def check_directory(option: str, path: Path | None) -> None:
+    """Refuse (InputError) the name of a file where a directory is made."""
+    if path is not None and path.suffix.lower() in KNOWN and not path.is_dir():
+        raise InputError(
+            f"{option} {path}: several files are written, into a directory; write the name of one, such as {path.stem}"
+        )
+
+
+def _article(endings: tuple[str, ...]) -> str:
+    names = {FITS: "a FITS file", PNG: "a PNG picture", PNG_OR_TIFF: "a PNG or TIFF picture", CSV: "a CSV table"}
+    return (names | {TOML: "a TOML file", MCAP: "an MCAP file"})[endings]

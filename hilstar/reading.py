@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
-from hilstar.errors import InputError, shortened
+from hilstar.errors import InputError, cannot_read, shortened
 
 HEAD_BYTES = 16
 MAX_LINE_CHARACTERS = 1_000_000
@@ -95,12 +95,12 @@ def open_regular(path: Path, advice: str, limit_bytes: int | None = None) -> IO[
         file = os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb")
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or "no file has such a name"
-        raise InputError(f"{path}: cannot be read ({reason}); {advice}") from error
+        raise cannot_read(path, reason, advice) from error
     try:
         status = os.fstat(file.fileno())
         _refuse_other(path, status.st_mode, advice)
         if limit_bytes is not None and status.st_size > limit_bytes:
-            raise InputError(_too_large(path, status.st_size, limit_bytes, advice))
+            raise cannot_read(path, _too_large(status.st_size, limit_bytes), advice)
     except InputError:
         file.close()
         raise
@@ -113,9 +113,9 @@ def read_bytes(path: Path, advice: str, limit_bytes: int) -> bytes:
         try:
             raw = file.read(limit_bytes + 1)  # some of /proc have no size
         except OSError as error:
-            raise InputError(f"{path}: cannot be read ({error.strerror or error}); {advice}") from error
+            raise cannot_read(path, error, advice) from error
     if len(raw) > limit_bytes:
-        raise InputError(_too_large(path, len(raw), limit_bytes, advice))
+        raise cannot_read(path, _too_large(len(raw), limit_bytes), advice)
     return raw
 
 
@@ -130,14 +130,14 @@ def as_text(path: Path, raw: bytes, advice: str) -> str:
     try:
         return raw.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(_not_text(path, io.BytesIO(raw), advice)) from error
+        raise cannot_read(path, _not_text(io.BytesIO(raw)), advice) from error
 
 
 def refuse_kind(path: Path, head: bytes, advice: str) -> None:
     """Refuse (InputError) a file whose first bytes say that it is no text, by the name of its kind."""
     kind = kind_of(head)
     if kind is not None:
-        raise InputError(f"{path}: cannot be read (it is {kind}); {advice}")
+        raise cannot_read(path, f"it is {kind}", advice)
 
 
 @contextmanager
@@ -154,9 +154,9 @@ def open_lines(path: Path, advice: str, limit_bytes: int) -> Iterator[Iterator[s
             yield _bounded(path, text, advice)
         except UnicodeDecodeError as error:
             file.seek(0)
-            raise InputError(_not_text(path, file, advice)) from error
+            raise cannot_read(path, _not_text(file), advice) from error
         except OSError as error:
-            raise InputError(f"{path}: cannot be read ({error.strerror or error}); {advice}") from error
+            raise cannot_read(path, error, advice) from error
 
 
 def _bounded(path: Path, text: IO[str], advice: str) -> Iterator[str]:
@@ -168,7 +168,7 @@ def _bounded(path: Path, text: IO[str], advice: str) -> Iterator[str]:
         yield line
 
 
-def _not_text(path: Path, file: IO[bytes], advice: str) -> str:
+def _not_text(file: IO[bytes]) -> str:
     decoder, offset = codecs.getincrementaldecoder("utf-8")(), 0
     while chunk := file.read(CHUNK_BYTES):
         waiting = len(decoder.getstate()[0])
@@ -176,9 +176,9 @@ def _not_text(path: Path, file: IO[bytes], advice: str) -> str:
             decoder.decode(chunk)
         except UnicodeDecodeError as error:
             place, byte = offset - waiting + error.start, error.object[error.start]
-            return f"{path}: cannot be read (it is not UTF-8: byte {place} is 0x{byte:02x}); {advice}"
+            return f"it is not UTF-8: byte {place} is 0x{byte:02x}"
         offset += len(chunk)
-    return f"{path}: cannot be read (it is not UTF-8: it ends within a character, at byte {offset}); {advice}"
+    return f"it is not UTF-8: it ends within a character, at byte {offset}"
 
 
 def parse_toml(path: Path, text: str) -> dict[str, Any]:
@@ -198,9 +198,8 @@ def parse_toml(path: Path, text: str) -> dict[str, Any]:
 def _refuse_other(path: Path, mode: int, advice: str) -> None:
     if not stat.S_ISREG(mode):
         what = next((words for test, words in NOT_FILES.items() if test(mode)), "is no file")
-        raise InputError(f"{path}: cannot be read (it {what}); {advice}")
+        raise cannot_read(path, f"it {what}", advice)
 
 
-def _too_large(path: Path, size_bytes: int, limit_bytes: int, advice: str) -> str:
-    reason = f"it has {size_text(size_bytes)} or more, and {size_text(limit_bytes)} at most are read"
-    return f"{path}: cannot be read ({reason}); {advice}"
+def _too_large(size_bytes: int, limit_bytes: int) -> str:
+    return f"it has {size_text(size_bytes)} or more, and at most {size_text(limit_bytes)} are read"

@@ -12,8 +12,8 @@ import typer
 
 from hilstar.cli.common import MAX_SEED, Json, app
 from hilstar.console.terminal import print_json, progress
-from hilstar.endings import check_directory
 from hilstar.errors import InputError
+from hilstar.files import check_directory, make_directory
 
 OwnBench = Annotated[Path | None, typer.Argument(metavar="[BENCH.toml]", help="Your bench, at its own size.")]
 
@@ -30,7 +30,6 @@ def bench(
 ) -> None:
     """Time a whole frame and its stages, beside NumPy, numba, GalSim and photutils on the same stars."""
     from hilstar.bench.config import read_config
-    from hilstar.files import make_directory
     from hilstar.study.speed import benchmark
     from hilstar.study.speed import report as benchmark_report
 

@@ -12,8 +12,8 @@ import typer
 
 from hilstar.cli.common import MAX_SEED, BenchFile, Json, QuaternionText, RadecText, app, attitude_of, check_files
 from hilstar.console.terminal import print_json, progress, say
-from hilstar.endings import FITS, PNG, PNG_OR_TIFF, check_directory, check_ending
 from hilstar.errors import InputError
+from hilstar.files import FITS, PNG, PNG_OR_TIFF, check_directory, check_ending, make_directory
 
 
 @app.command()
@@ -105,8 +105,6 @@ def study(
     as_json: Json = False,
 ) -> None:
     """Charts and tables: models, the thesis's outputs, where methods fail, codes, a slewing screen, error against time."""
-    from hilstar.files import make_directory
-
     check_directory("-o", output)
     make_directory(output)
     with progress(f"study {what}", math.inf):
@@ -143,7 +141,6 @@ def verify(
 ) -> None:
     """The digital twin: what the tracker measures of the stars shown, against the sky."""
     from hilstar.bench.config import read_config
-    from hilstar.files import make_directory
     from hilstar.twin.verdict import write_report
     from hilstar.twin.verify import verify as run_twin
 

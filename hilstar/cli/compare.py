@@ -9,7 +9,7 @@ import typer
 
 from hilstar.cli.common import Json, app
 from hilstar.console.terminal import print_json
-from hilstar.endings import check_directory
+from hilstar.files import check_directory, make_directory
 
 MAX_LINES = 10  # of stars; a whole sky that differs is no news star by star
 
@@ -25,7 +25,6 @@ def compare(
     as_json: Json = False,
 ) -> None:
     """Compare two frames star by star: exit code 0 when they are the same sky, 1 when not."""
-    from hilstar.files import make_directory
     from hilstar.testing import compare as compare_files
     from hilstar.testing.compare import CENTROID_PX, FLUX_MAG
     from hilstar.testing.files import write_report

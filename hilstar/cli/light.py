@@ -10,8 +10,8 @@ import typer
 
 from hilstar.cli.common import MAX_SEED, BenchFile, Json, Overwrite, app, check_files
 from hilstar.console.terminal import print_json, say
-from hilstar.endings import CSV, PNG, TOML, check_directory, check_ending
 from hilstar.errors import InputError
+from hilstar.files import CSV, PNG, TOML, check_directory, check_ending, make_directory
 
 calibrate = typer.Typer(help="What light the monitor makes: measured, and scaled by the tracker.", no_args_is_help=False)
 app.add_typer(calibrate, name="calibrate")
@@ -27,7 +27,6 @@ def budget(
 ) -> None:
     """Which magnitudes this monitor, sprite and quantisation can show, and how well."""
     from hilstar.bench.build import load
-    from hilstar.files import make_directory
     from hilstar.twin.budget import budget as find_budget
     from hilstar.twin.budget import budget_json, budget_lines, write_budget
 

@@ -10,8 +10,8 @@ import typer
 
 from hilstar.cli.common import Json, Overwrite, app, check_files
 from hilstar.console.terminal import print_json
-from hilstar.endings import CSV, check_directory, check_ending
 from hilstar.errors import InputError
+from hilstar.files import CSV, check_directory, check_ending, make_directory
 
 LEDGER_BEHIND_S = 0.5  # so much of a run that goes on may not be on the disk yet
 RunFile = Annotated[Path, typer.Argument(metavar="RUN.mcap", help="The ledger of serve or replay.")]
@@ -24,7 +24,6 @@ def report(
     as_json: Json = False,
 ) -> None:
     """Timing, age of the attitude, missed frames and memory of a run, on one page with charts."""
-    from hilstar.files import make_directory
     from hilstar.run.record.report import report as write_report
     from hilstar.run.record.report import table_rows
 
@@ -56,7 +55,6 @@ def latency(
     """From swap to light, by a photodiode before the screen's square and the ledger of the run."""
     from hilstar.calibrate.latency import capture_edges, read_edges, save_edges, write_panel_delay
     from hilstar.calibrate.latency_chart import measure, told
-    from hilstar.files import make_directory
     from hilstar.run.send.sender import parse_serial
 
     check_directory("-o", output)

@@ -26,8 +26,8 @@ from hilstar.cli.common import (
     check_files,
 )
 from hilstar.console.terminal import print_json, progress, report, say
-from hilstar.endings import CSV, FITS, MCAP, PNG, check_directory, check_ending
 from hilstar.errors import InputError, MachineError
+from hilstar.files import CSV, FITS, MCAP, PNG, check_directory, check_ending
 from hilstar.notices import Notices
 from hilstar.process.interrupts import stop_on_signal
 

@@ -14,8 +14,8 @@ import typer
 
 from hilstar.cli.common import LOG_HELP, MAX_SEED, Json, RadecText, app, check_files
 from hilstar.console.terminal import print_json, progress, say
-from hilstar.endings import check_directory
 from hilstar.errors import InputError
+from hilstar.files import check_directory
 from hilstar.process.interrupts import stop_on_signal
 
 LISTEN_SLICE_S = 0.1  # between looks at whether a signal has come

@@ -15,7 +15,7 @@ from hilstar.run.frame_status import StatusMaker
 from hilstar.run.loop import FrameLoop, Limit, Shown
 from hilstar.run.record.ledger import Ledger
 from hilstar.run.record.records import frame_record
-from hilstar.spread import RunningSpread
+from hilstar.running_statistics import RunningStatistics
 from hilstar.units import NS_PER_MS, NS_PER_S
 
 POLL_MS = 50
@@ -27,7 +27,7 @@ def serve_lockstep(
     """Answer requests up to `limit`, or until a signal; the summary. A refused request shows nothing new."""
     counts = PacketCounts()
     statuses = StatusMaker(ledger)
-    turn_ms = RunningSpread()
+    turn_ms = RunningStatistics()
     last = Shown(0, 0, None, bench.draw(None), missing=True)
     begin_ns = time.monotonic_ns()
     end_ns = begin_ns + limit.slots / bench.config.monitor.refresh_hz * NS_PER_S

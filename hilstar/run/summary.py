@@ -6,7 +6,7 @@ from typing import Any
 
 from hilstar.attitude.clock.receiver import PacketCounts
 from hilstar.attitude.wire.packet import MESSAGE_REASONS
-from hilstar.spread import RunningSpread
+from hilstar.running_statistics import RunningStatistics
 from hilstar.units import NS_PER_MS
 
 
@@ -14,9 +14,9 @@ class SwapStats:
     """When frames were swapped onto a screen."""
 
     def __init__(self) -> None:
-        self._interval_ms = RunningSpread()
-        self._late_ms = RunningSpread()
-        self._packet_ms = RunningSpread()
+        self._interval_ms = RunningStatistics()
+        self._late_ms = RunningStatistics()
+        self._packet_ms = RunningStatistics()
         self._last_ns: int | None = None
 
     def add(self, swap_ns: int, predicted_ns: int, missed_before: int, received_ns: int | None) -> None:
@@ -43,9 +43,9 @@ class RunStats:
     """Figures of each frame, and what they come to."""
 
     def __init__(self) -> None:
-        self._frame_ms = RunningSpread()
-        self._age_ms = RunningSpread()
-        self._stars = RunningSpread()
+        self._frame_ms = RunningStatistics()
+        self._age_ms = RunningStatistics()
+        self._stars = RunningStatistics()
         self._clipped_max = 0
         self.clipped_hip: set[int] = set()
         self.swaps = SwapStats()

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from hilstar.arrays import FloatArray
-from hilstar.errors import InputError, shortened
+from hilstar.errors import InputError, cannot_read, shortened
 from hilstar.reading import exists, read_text
 
 PLANCK_J_S = 6.62607015e-34  # SI 2019, exact
@@ -91,7 +91,7 @@ def read_curve_csv(path: Path) -> Curve:
             wavelength_nm.append(pair[0])
             value.append(pair[1])
     except csv.Error as error:
-        raise InputError(f"{path}: cannot be read ({error})") from error
+        raise cannot_read(path, error, "write a CSV: wavelength_nm,value") from error
     curve = Curve(np.array(wavelength_nm), np.array(value))
     _check_curve(curve, path)
     return curve

@@ -14,7 +14,7 @@ import numpy as np
 from hilstar.arrays import FloatArray
 from hilstar.bench.build import TRUTH_DTYPE
 from hilstar.charts import write_csv
-from hilstar.errors import InputError
+from hilstar.errors import InputError, cannot_read
 from hilstar.reading import read_bytes, read_text, size_text
 from hilstar.testing.chart import draw
 from hilstar.testing.compare import Truth
@@ -69,7 +69,7 @@ def _inflated(path: Path, raw: bytes, wanted: str) -> bytes:
         with gzip.open(io.BytesIO(raw)) as file:
             plain = file.read(MAX_FITS_BYTES + 1)
     except (OSError, EOFError, zlib.error) as error:
-        raise InputError(f"{path}: cannot be read (it is a damaged gzip file); {wanted}") from error
+        raise cannot_read(path, "it is a damaged gzip file", wanted) from error
     if len(plain) > MAX_FITS_BYTES:
         raise InputError(f"{path}: unpacks to more than {size_text(MAX_FITS_BYTES)}; {wanted}")
     return plain
@@ -81,7 +81,7 @@ def read_truth_csv(path: Path) -> Truth:
     try:
         rows = list(csv.DictReader(io.StringIO(read_text(path, wanted, MAX_TRUTH_BYTES), newline="")))
     except csv.Error as error:
-        raise InputError(f"{path}: cannot be read ({error}); {wanted}") from error
+        raise cannot_read(path, error, wanted) from error
     truth = np.zeros(len(rows), dtype=TRUTH_DTYPE)
     for line, row in enumerate(rows):
         for name in TRUTH_COLUMNS:

@@ -61,7 +61,7 @@ def test_a_file_past_the_limit_is_refused_before_it_is_read(tmp_path):
     path = tmp_path / "large"
     with path.open("wb") as file:
         file.truncate(10**12)  # a hole: nothing is on the disk
-    assert "has 1000 GB or more, and 1 kB at most are read" in refusal(path)
+    assert "has 1000 GB or more, and at most 1 kB are read" in refusal(path)
     with pytest.raises(InputError, match="50 MB at most"):
         open_regular(path, ADVICE, 50_000_000)
 

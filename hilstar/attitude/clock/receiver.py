@@ -27,7 +27,7 @@ from hilstar.attitude.wire.packet import (
 )
 from hilstar.attitude.wire.protocol import HEALTH_MISSED, HEALTH_REFUSED
 from hilstar.notices import Notices
-from hilstar.spread import RunningSpread
+from hilstar.running_statistics import RunningStatistics
 from hilstar.units import NS_PER_MS, NS_PER_S
 
 POLL_MS = 20
@@ -121,7 +121,7 @@ class Receiver:
         self._notices = Notices() if notices is None else notices
         self.clock = BenchClock(shared=traffic.shared_clock)
         self.jumps = SharedTimes(self._notices) if traffic.shared_clock else JumpFilter()
-        self.latency_ms = RunningSpread()
+        self.latency_ms = RunningStatistics()
         self._link = link
         self._timeline = timeline
         self._traffic = traffic

@@ -19,7 +19,7 @@ import zmq.auth
 from zmq.utils import z85
 
 from hilstar.attitude.wire.endpoint import Endpoint
-from hilstar.errors import InputError, one_line
+from hilstar.errors import InputError, cannot_write, one_line
 from hilstar.reading import exists, read_bytes
 
 MAKE_KEYS = "make keys with `hilstar keys -o DIR`"
@@ -82,8 +82,7 @@ def make_keys(directory: Path) -> list[Path]:
             allowed.mkdir(parents=True, exist_ok=True)
             _make_in(directory, allowed)
     except (OSError, ValueError) as error:
-        why = getattr(error, "strerror", None) or error
-        raise InputError(f"{directory}: cannot be written ({why}); choose another place") from error
+        raise cannot_write(directory, error) from error
     return written
 
 

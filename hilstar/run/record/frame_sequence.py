@@ -11,7 +11,7 @@ from typing import Self
 
 from hilstar.bench.build import Bench
 from hilstar.bench.frame_files import write_codes_png
-from hilstar.errors import InputError
+from hilstar.errors import cannot_write
 from hilstar.files import make_directory, refuse_ledger
 from hilstar.run.loop import Shown
 
@@ -45,7 +45,7 @@ class FrameRecorder:
         try:
             yield
         except OSError as error:
-            raise InputError(f"{self._table}: cannot be written ({error.strerror}); choose another place") from error
+            raise cannot_write(self._table, error) from error
 
     def __enter__(self) -> Self:
         if self._directory is not None:

@@ -26,7 +26,7 @@ from hilstar.attitude.logs.mcap_reader import RUN_METADATA, part_path
 from hilstar.attitude.logs.mcap_writer import McapWriter, Topic
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal
 from hilstar.bench.build import Bench
-from hilstar.errors import InputError, printable
+from hilstar.errors import InputError, cannot_write, printable
 from hilstar.files import NewFile
 from hilstar.notices import Notice, Notices
 from hilstar.process.interrupts import caught
@@ -116,7 +116,7 @@ class Ledger:
             file.commit()
         except OSError as error:
             file.discard()
-            raise InputError(f"{path}: cannot be written ({error.strerror}); choose another place for the ledger") from error
+            raise cannot_write(path, error, "choose another place for the ledger") from error
         return file, writer
 
     # What a run hands in, from whichever thread

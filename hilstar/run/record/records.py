@@ -20,7 +20,7 @@ from hilstar.attitude.logs.mcap_log import ATTITUDE_TOPIC
 from hilstar.attitude.logs.mcap_reader import RUN_METADATA, read_messages, read_metadata, read_topics
 from hilstar.attitude.wire.packet import Refusal, checked_sample, rate_refusal
 from hilstar.bench.config import BenchConfig
-from hilstar.errors import InputError
+from hilstar.errors import InputError, cannot_read
 from hilstar.reading import parse_toml
 from hilstar.run.loop import Shown
 
@@ -246,7 +246,7 @@ def run_records(path: Path) -> Iterator[RunRecord]:
             if topic in decoders:
                 yield _decoded(decoders[topic], data, f"{path}: message {number}, of {topic},")
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); give the ledger of a run") from error
+        raise cannot_read(path, error, "give the ledger of a run") from error
 
 
 class PacketTally:
@@ -297,7 +297,7 @@ def read_head(path: Path) -> dict[str, str]:
     try:
         return read_metadata(path, RUN_METADATA)
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); give the ledger of a run") from error
+        raise cannot_read(path, error, "give the ledger of a run") from error
 
 
 def config_of(head: dict[str, str]) -> BenchConfig | None:

@@ -17,7 +17,7 @@ from hilstar.run.record.records import (
     ProcessRecord,
     RunRecord,
 )
-from hilstar.spread import RunningSpread
+from hilstar.running_statistics import RunningStatistics
 from hilstar.units import NS_PER_MS, NS_PER_S
 
 MEGABYTE = 1e6
@@ -115,7 +115,7 @@ class Figures:
     most: dict[str, int] = field(default_factory=lambda: dict.fromkeys(("clipped", "below_step", "stars_drawn"), 0))
     last: FrameRecord | None = None
     first_swap_ns: int = 0
-    spreads: dict[str, RunningSpread] = field(default_factory=lambda: {name: RunningSpread() for name in METRICS})
+    spreads: dict[str, RunningStatistics] = field(default_factory=lambda: {name: RunningStatistics() for name in METRICS})
     samples: Sample = field(default_factory=lambda: Sample(len(METRICS)))
     spans: Spans = field(default_factory=lambda: Spans(6))
     path: Sample = field(default_factory=lambda: Sample(8, SAMPLES // 8))  # t_s, q, turned about x, y, z (rad)
@@ -216,6 +216,6 @@ def _turn_rad(a: tuple[float, ...], b: tuple[float, ...]) -> tuple[float, float,
     return scale * x, scale * y, scale * z
 
 
-def three(spread: RunningSpread, factor: float = 1.0) -> dict[str, float | None]:
+def three(spread: RunningStatistics, factor: float = 1.0) -> dict[str, float | None]:
     """Median, 99th percentile and maximum, times a factor; nulls without any."""
     return {name: None if value is None else value * factor for name, value in spread.summary().items()}

@@ -1,4 +1,4 @@
-"""The spread of a figure over a run of any length, in memory that does not grow."""
+"""Percentiles, mean and deviation of a figure over a run of any length, in memory that does not grow."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ import math
 
 import numpy as np
 
-SMALLEST, LARGEST = 1e-6, 1e9
-STEP = 0.002  # of a value: as near as a percentile is known
-BINS = math.ceil(math.log(LARGEST / SMALLEST) / STEP)
+MIN_SIZE, MAX_SIZE = 1e-6, 1e9
+STEP = 0.002  # the width of a bin, relative to the value: how exactly a percentile is known
+BINS = math.ceil(math.log(MAX_SIZE / MIN_SIZE) / STEP)
 
 
-class RunningSpread:
-    """Median, 99th percentile, greatest, mean and standard deviation of values of either sign.
+class RunningStatistics:
+    """Percentiles, maximum, mean and standard deviation of values of either sign.
 
-    Values are counted in bins of 0.2 %; those nearer to 0 than 1e-6 count as 0. The greatest is exact.
+    Values are counted in bins 0.2 % wide; those within 1e-6 of 0 count as 0. The maximum is exact.
     """
 
     def __init__(self) -> None:
@@ -25,33 +25,33 @@ class RunningSpread:
         self._squares = 0.0
 
     def add(self, value: float) -> None:
-        """Take in one value."""
+        """Count one value."""
         self.count += 1
         self.max = max(self.max, value)
         step = value - self._mean
         self._mean += step / self.count
         self._squares += step * (value - self._mean)  # Welford 1962
         size = abs(value)
-        place = 0 if size < SMALLEST else min(BINS, 1 + int(math.log(size / SMALLEST) / STEP))
+        place = 0 if size < MIN_SIZE else min(BINS, 1 + int(math.log(size / MIN_SIZE) / STEP))
         self._counts[BINS + place if value >= 0 else BINS - place] += 1
 
     @property
     def mean(self) -> float | None:
-        """None without a value."""
+        """The mean of all values; None without a value."""
         return self._mean if self.count else None
 
     @property
     def deviation(self) -> float | None:
-        """The standard deviation; None without two values."""
+        """The standard deviation; None for fewer than two values."""
         return math.sqrt(self._squares / self.count) if self.count > 1 else None
 
     def percentile(self, percent: float) -> float | None:
-        """The value below which so many percent lie, within 0.1 %; None without a value."""
+        """The value at `percent` of the sorted values, within 0.1 %; None without a value."""
         if not self.count:
             return None
         rank = max(1, math.ceil(percent / 100 * self.count))
         place = int(np.searchsorted(np.cumsum(self._counts), rank)) - BINS
-        size = 0.0 if place == 0 else SMALLEST * math.exp((abs(place) - 0.5) * STEP)
+        size = 0.0 if place == 0 else MIN_SIZE * math.exp((abs(place) - 0.5) * STEP)
         return min(math.copysign(size, place), self.max)
 
     def summary(self) -> dict[str, float | None]:

@@ -207,7 +207,7 @@ def _c_put(f: Field, place: str) -> str:
 
 def _c_decode(packet: Packet) -> str:
     kind = f"HILSTAR_KIND_{packet.name.upper()}"
-    out = [f"/** {kind}, or a negative error and `out` as it was. */"]
+    out = [f"/** {kind}, or a negative error with `out` left unchanged. */"]
     arguments = f"const uint8_t *packet, size_t length, hilstar_{packet.name} *out"
     out.append(f"static inline int hilstar_decode_{packet.name}({arguments})")
     out += ["{", "    const int kind = hilstar_check(packet, length);", *_c_index(packet)]
@@ -244,7 +244,7 @@ def _c_each(f: Field, statement: str) -> list[str]:
 
 
 def _who(packet: Packet) -> str:
-    return {"bench": "bench to hilstar", "hilstar": "hilstar to bench"}.get(packet.sender, "either way")
+    return {"simulator": "simulator to hilstar", "hilstar": "hilstar to simulator"}.get(packet.sender, "either way")
 
 
 def readme(wire: Wire, text: str) -> str:
@@ -264,9 +264,11 @@ def readme(wire: Wire, text: str) -> str:
 
 
 def _kinds(wire: Wire) -> str:
-    lines = ["| kind | packet | bytes | on the serial line | who sends it | says |", "|---|---|---|---|---|---|"]
+    head = ("kind", "packet", "bytes", "on the serial line", "direction", "meaning", "Python `struct`, without the CRC")
+    lines = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
     for p in wire.packets:
-        lines.append(f"| {p.kind} | `{p.name}` | {p.size} | {p.size + FRAMING_BYTES} | {_who(p)} | {p.meaning} |")
+        cells = (p.kind, f"`{p.name}`", p.size, p.size + FRAMING_BYTES, _who(p), p.meaning, f"`{p.body}`")
+        lines.append(f"| {' | '.join(map(str, cells))} |")
     return "\n".join(lines)
 
 
@@ -280,7 +282,6 @@ def _packet_section(packet: Packet, wire: Wire) -> str:
         if f.bits:
             lines += ["", f"| bit | `{f.name}` | meaning |", "|---|---|---|"]
             lines += [f"| {k} ({1 << k}) | `{bit['name']}` | {bit['meaning']} |" for k, bit in enumerate(wire.bits[f.bits])]
-    lines += ["", f'Python `struct` format without the CRC: `"{packet.body}"`.']
     return "\n".join(lines)
 
 
@@ -294,14 +295,14 @@ def _diagram(packet: Packet) -> list[str]:
         at += size
         if at % DIAGRAM_BYTES == 0 or at == packet.size:
             first = at - (at % DIAGRAM_BYTES or DIAGRAM_BYTES)
-            lines += [f"{first:4}  |{row}", rule if at % DIAGRAM_BYTES == 0 else "      +" + "-" * (len(row) - 1) + "+"]
+            lines.append(f"{first:4}  |{row}")
             row = ""
-    return lines
+    return [*lines, "      +" + "-" * (len(lines[-1]) - 8) + "+"]
 
 
 def _timing(wire: Wire) -> str:
     columns = " | ".join(f"{p.name}, {p.size + FRAMING_BYTES} bytes" for p in wire.packets)
-    lines = [f"| baud | {columns} | most attitudes a second |", "|---|" + "---|" * (len(wire.packets) + 1)]
+    lines = [f"| baud | {columns} | maximum attitudes per second |", "|---|" + "---|" * (len(wire.packets) + 1)]
     for baud in wire.bauds:
         bits = [(p.size + FRAMING_BYTES) * BITS_PER_BYTE for p in wire.packets]
         times = " | ".join(f"{1000 * count / baud:.3g} ms" for count in bits)

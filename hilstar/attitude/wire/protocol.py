@@ -4,9 +4,9 @@ import struct
 
 VERSION = 1
 KIND_ATTITUDE = 1  # where the tracker's camera points at t_ns
-KIND_TIME_REQUEST = 2  # asks the other side for its time
+KIND_TIME_REQUEST = 2  # asks the other side for its clock
 KIND_TIME_REPLY = 3  # answers a time_request
-KIND_STATUS = 4  # what is on the screen, and how well hilstar is
+KIND_STATUS = 4  # what is on the screen, and hilstar's health
 
 # Everything but the CRC-32, in order:
 # version | kind | flags | sequence | t_ns | q_icrs_to_cam | rate_cam_rad_s
@@ -24,21 +24,21 @@ TIME_REPLY_BYTES = 36
 STATUS_BYTES = 40
 PACKET_BYTES = {1: 64, 2: 20, 3: 36, 4: 40}
 
-FLAG_RATE_VALID = 1  # the rate is known; without this bit the 12 bytes of rate_cam_rad_s are not looked at
-FLAG_DISCONTINUITY = 2  # the attitude jumped since the packet before: do not interpolate across
+FLAG_RATE_VALID = 1  # the rate is known; without this bit rate_cam_rad_s is ignored
+FLAG_DISCONTINUITY = 2  # the attitude jumped since the previous packet: do not interpolate across
 
 HEALTH_NO_ATTITUDE = 1  # no attitude has come yet
 HEALTH_STALE = 2  # the newest attitude is older than stale_after_ms
-HEALTH_BLANK = 4  # no stars are shown, for want of a fresh attitude or by an operator's key (operator_override)
-HEALTH_CLOCK_SYNCHRONISED = 8  # time exchanges carry the clock offset; without this bit it is estimated from arrivals
-HEALTH_MISSED = 16  # frames were missed since the status before
-HEALTH_REFUSED = 32  # packets were refused since the status before
-HEALTH_CLIPPED = 64  # a star of this frame asks for more light than the monitor has
-HEALTH_LEDGER_FAILED = 128  # the run is no longer recorded
+HEALTH_BLANK = 4  # no stars are shown, for lack of a fresh attitude or by an operator's key (operator_override)
+HEALTH_CLOCK_SYNCHRONISED = 8  # the clock offset comes from time exchanges; without this bit it is estimated from arrivals
+HEALTH_MISSED = 16  # frames were missed since the previous status
+HEALTH_REFUSED = 32  # packets were refused since the previous status
+HEALTH_CLIPPED = 64  # a star in this frame is brighter than full scale
+HEALTH_LEDGER_FAILED = 128  # the run is no longer being recorded
 HEALTH_OPERATOR_OVERRIDE = 256  # an operator's key changes what is shown: blank, grid, crosshair, test patch or pause
-HEALTH_HIDDEN = 512  # the window is minimised, covered, off the screen or its display gone: not all of the frame is seen
-HEALTH_SECOND_SENDER = 1024  # attitudes of another sender come too, and are not shown
-HEALTH_SOURCE_FROZEN = 2048  # the sender repeats itself, or its clock stands still
+HEALTH_HIDDEN = 512  # the window is minimised, covered, off the screen, or its display is gone: the frame is not fully visible
+HEALTH_SECOND_SENDER = 1024  # attitudes also arrive from another sender, and are not shown
+HEALTH_SOURCE_FROZEN = 2048  # the sender repeats itself, or its clock has stopped
 
-NORM_TOLERANCE = 0.001  # the quaternion's norm is within so much of 1, else the packet is refused (norm)
-FASTEST_RAD_S = 1000000.0  # the length of a valid rate is at most so much, else the packet is refused (format)
+NORM_TOLERANCE = 0.001  # how far the quaternion's norm may be from 1 before the packet is refused (norm)
+FASTEST_RAD_S = 1000000.0  # the largest magnitude of a valid rate; beyond it the packet is refused (format)

@@ -7,8 +7,10 @@ from pathlib import Path
 
 import command_page
 
+from hilstar.bench.config import reference
+
 HERE = Path(__file__).parent
-PAGES: dict[str, Callable[[], str]] = {"commands.md": command_page.page}
+PAGES: dict[str, Callable[[], str]] = {"bench-file.md": reference.page, "commands.md": command_page.page}
 
 
 if __name__ == "__main__":

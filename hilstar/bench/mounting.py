@@ -15,8 +15,5 @@ def mount_of(monitor: Monitor) -> Mount:
 
 
 def scan_of(monitor: Monitor) -> Scan:
-    """When rows light and for how long: one refresh period each, where the bench file does not say."""
-    period_ms = 1000.0 / monitor.refresh_hz
-    scanout_ms = period_ms if monitor.scanout_ms is None else monitor.scanout_ms
-    hold_ms = period_ms if monitor.hold_ms is None else monitor.hold_ms
-    return Scan(mount_of(monitor).down, scanout_ms * S_PER_MS, hold_ms * S_PER_MS)
+    """When the rows light, and for how long."""
+    return Scan(mount_of(monitor).down, monitor.panel_scanout_ms * S_PER_MS, monitor.panel_hold_ms * S_PER_MS)

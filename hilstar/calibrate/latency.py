@@ -194,10 +194,8 @@ def summarise(paired: Paired, config: BenchConfig) -> dict[str, Any]:
     """
     ms = paired.latency_ns / NS_PER_MS
     monitor, exposure_s = config.monitor, config.tracker.exposure_s
-    period_ms = 1000.0 / monitor.refresh_hz
-    scanout_ms = period_ms if monitor.scanout_ms is None else monitor.scanout_ms
     rows = monitor.resolution_px[0 if monitor.rotate_deg % 180 else 1]
-    to_square_ms = scanout_ms * (1 - monitor.photodiode_px / 2 / rows)
+    to_square_ms = monitor.panel_scanout_ms * (1 - monitor.photodiode_px / 2 / rows)
     p1, p50, p99 = np.percentile(ms, [1, 50, 99])
     rise, fall = ms[paired.level == 1], ms[paired.level == 0]
     return {

@@ -17,8 +17,7 @@ Laws:
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -26,17 +25,10 @@ from scipy.special import ndtr
 
 from hilstar.arrays import FloatArray
 from hilstar.errors import InputError
+from hilstar.tracker.settings import LARGEST_E, DetectorSettings, PixelPitch, check_value
 
 CodeArray = npt.NDArray[np.uint16]
-FixedPattern = Literal["ccd", "cmos"]
-DarkLaw = Literal["arrhenius", "ccd47-20"]
-
-BOLTZMANN_EV_PER_K = 8.617333262e-5  # CODATA 2018
-TABLE_4_2_TEMPERATURE_K = 293.0
-
-# More is refused. numpy's Poisson sampler compares logarithms of the size of mean * ln(mean): their rounding is 0.004
-# at 1e12 and of order 1 at 1e15, where the sampler is wrong long before it fails (9.2e18).
-LARGEST_E = 1e12
+DEFAULT_PITCH_UM = 13.0
 LARGEST_HITS = 1e6  # cosmic rays in one frame; each is a track of pixels
 
 # A particle at minimum ionisation in silicon (Particle Data Group): 388 eV/um on average, 3.66 eV a pair. The mean
@@ -47,119 +39,20 @@ RAY_STEP_PX = 0.25
 
 FALSE_STAR_REACH_SIGMAS = 5.0
 
-# What a number must lie between, where 0 to LARGEST_E does not do. 230 to 300 K is where the datasheet gives its law.
-LIMITS: dict[str, tuple[float, float]] = {
-    "gain_e_per_dn": (1e-6, LARGEST_E),
-    "full_well_e": (1e-6, LARGEST_E),
-    "bits": (1, 16),
-    "prnu": (0, 1),
-    "device_seed": (0, 2**64),
-    "temperature_k": (50, 500),
-    "dark_reference_temperature_k": (50, 500),
-    "dark_activation_ev": (0, 1.2),
-    "hot_pixel_fraction": (0, 1),
-    "dead_pixel_fraction": (0, 1),
-    "pixel_pitch_um": (0.1, 1000),
-    "false_stars": (0, 100_000),
-    "false_star_sigma_px": (0.05, 20),
-}
-DATASHEET_RANGE_K = (230.0, 300.0)
-
-
-@dataclass(frozen=True, slots=True)
-class DetectorSettings:
-    """A sensor in plain numbers: rates per pixel, at `dark_reference_temperature_k` for the dark ones.
-
-    `prnu` is the relative sigma of the gain map; `dsnu_e_per_s` the sigma of the dark rates. The rate of a hot pixel
-    is drawn from an exponential law of mean `hot_pixel_e_per_s`, over its dark; a dead pixel gives no electrons.
-    Raises InputError for a number that no sensor has.
-    """
-
-    gain_e_per_dn: float = 24.0
-    full_well_e: float = 70_000.0
-    bits: int = 12
-    offset_dn: float = 0.0
-    read_noise_e: float = 0.0
-    dark_e_per_s: float = 0.0
-    dsnu_e_per_s: float = 0.0
-    prnu: float = 0.0
-    device_seed: int = 0
-    fixed_pattern: FixedPattern = "ccd"
-    temperature_k: float = TABLE_4_2_TEMPERATURE_K
-    dark_reference_temperature_k: float = TABLE_4_2_TEMPERATURE_K
-    dark_law: DarkLaw = "arrhenius"
-    dark_activation_ev: float = 0.56  # half of silicon's band gap: the depletion term of eq. 4.12
-    hot_pixel_fraction: float = 0.0
-    hot_pixel_e_per_s: float = 10_000.0
-    dead_pixel_fraction: float = 0.0
-    column_noise_e: float = 0.0
-    cosmic_rays_per_cm2_s: float = 0.0
-    pixel_pitch_um: float = 13.0
-    false_stars: int = 0
-    false_star_e_per_s: float = 10_000.0
-    false_star_sigma_px: float = 0.55
-    blooming: bool = False
-    quantisation_noise: bool = False
-
-    def __post_init__(self) -> None:
-        for field in fields(self):
-            _check_setting(field.name, getattr(self, field.name))
-        low_k, high_k = DATASHEET_RANGE_K
-        for name in ("temperature_k", "dark_reference_temperature_k"):
-            if self.dark_law == "ccd47-20" and not low_k <= getattr(self, name) <= high_k:
-                raise InputError(
-                    f'{name} = {getattr(self, name):g}; dark_law "ccd47-20" holds from {low_k:g} to {high_k:g} K: '
-                    'write such a temperature, or dark_law = "arrhenius"'
-                )
-        if self.fixed_pattern == "ccd" and self.column_noise_e > 0:
-            raise InputError(
-                'column_noise_e is for CMOS, whose columns have an amplifier each; write fixed_pattern = "cmos", '
-                "or column_noise_e = 0"
-            )
-
-    @property
-    def dark_factor(self) -> float:
-        """What the temperature does to every dark rate: 1 at the reference temperature."""
-        cold_k, warm_k = self.dark_reference_temperature_k, self.temperature_k
-        if self.dark_law == "ccd47-20":
-            return ccd47_20_dark(warm_k) / ccd47_20_dark(cold_k)
-        return math.exp(self.dark_activation_ev / BOLTZMANN_EV_PER_K * (1 / cold_k - 1 / warm_k))
-
-    @property
-    def adc_noise_e(self) -> float:
-        """The thesis's quantisation noise, full well / (2^bits sqrt 12) (table 4.1); rounding makes gain / sqrt 12."""
-        return self.full_well_e / float(2**self.bits * math.sqrt(12))
-
-
-def ccd47_20_dark(temperature_k: float) -> float:
-    """Dark signal of an AIMO CCD47-20 relative to 293 K, 230 to 300 K: 1.14e6 T^3 exp(-9080/T) (e2v's datasheet).
-
-    The coefficients are recalled, not read off the sheet; they give 0.997 at 293 K, as they must.
-    """
-    return float(1.14e6 * temperature_k**3 * math.exp(-9080.0 / temperature_k))
-
-
-def _check_setting(name: str, value: Any) -> None:
-    choices = {"fixed_pattern": get_args(FixedPattern), "dark_law": get_args(DarkLaw)}
-    if name in choices:
-        if value not in choices[name]:
-            wanted = " or ".join(f'"{choice}"' for choice in choices[name])
-            raise InputError(f"{name} = {value!r}; write {wanted}")
-        return
-    low, high = LIMITS.get(name, (0.0, LARGEST_E))
-    if not low <= value <= high:
-        raise InputError(f"{name} = {value:g}; write a number from {low:g} to {high:g}")
-
 
 class Detector:
     """One device: its settings, and its fixed maps, shape (height, width), made once."""
 
-    def __init__(self, settings: DetectorSettings, resolution_px: tuple[int, int]) -> None:
-        """`resolution_px` is (width, height). Raises InputError where it is not positive."""
+    def __init__(
+        self, settings: DetectorSettings, resolution_px: tuple[int, int], pixel_pitch_um: float = DEFAULT_PITCH_UM
+    ) -> None:
+        """`resolution_px` is (width, height). Raises InputError where it is not positive, or the pitch is no sensor's."""
+        check_value("pixel_pitch_um", pixel_pitch_um, PixelPitch)
         width, height = resolution_px
         if width < 1 or height < 1:
             raise InputError(f"resolution {width} x {height} px; write a width and a height of 1 or more")
         self.settings = settings
+        self.pixel_pitch_um = pixel_pitch_um
         self.shape = (height, width)
         prnu, dsnu, hot, dead, column = map(np.random.default_rng, np.random.SeedSequence(settings.device_seed).spawn(5))
         self.gain_map = _gain_map(settings, self.shape, prnu)
@@ -185,7 +78,7 @@ class Detector:
         self._check_most(expected_e)
         collected_e = rng.poisson(expected_e).astype(np.float64)
         if settings.cosmic_rays_per_cm2_s and exposure_s > 0:
-            collected_e += cosmic_rays_e(settings, self.shape, exposure_s, rng)
+            collected_e += cosmic_rays_e(settings, self.shape, exposure_s, rng, self.pixel_pitch_um)
         kept_e = self._fill_wells(collected_e)
         if settings.column_noise_e:
             kept_e += self.column_e
@@ -273,7 +166,11 @@ def bloom(charge_e: FloatArray, full_well_e: float) -> FloatArray:
 
 
 def cosmic_rays_e(
-    settings: DetectorSettings, shape: tuple[int, int], exposure_s: float, rng: np.random.Generator
+    settings: DetectorSettings,
+    shape: tuple[int, int],
+    exposure_s: float,
+    rng: np.random.Generator,
+    pixel_pitch_um: float = DEFAULT_PITCH_UM,
 ) -> FloatArray:
     """Electrons of one frame's cosmic rays, shape `shape`: straight tracks through RAY_DEPTH_UM of silicon.
 
@@ -281,7 +178,7 @@ def cosmic_rays_e(
     normal spread evenly from 0 to 1. Raises InputError where more than LARGEST_HITS are expected.
     """
     height, width = shape
-    area_cm2 = width * height * (settings.pixel_pitch_um * 1e-4) ** 2
+    area_cm2 = width * height * (pixel_pitch_um * 1e-4) ** 2
     expected = settings.cosmic_rays_per_cm2_s * area_cm2 * exposure_s
     if expected > LARGEST_HITS:
         raise InputError(f"{expected:.3g} cosmic rays in a frame; lower cosmic_rays_per_cm2_s or the exposure")
@@ -290,7 +187,7 @@ def cosmic_rays_e(
     azimuth_rad = rng.uniform(0.0, 2 * np.pi, hits)
     start_px = rng.random((hits, 2)) * (width, height)
     # A grazing ray is longer than the sensor: only what the sensor can see of it is stepped through.
-    length_px = RAY_DEPTH_UM / settings.pixel_pitch_um * np.sqrt(1 - cosine**2) / cosine
+    length_px = RAY_DEPTH_UM / pixel_pitch_um * np.sqrt(1 - cosine**2) / cosine
     charge_e = RAY_E_PER_UM * RAY_DEPTH_UM / cosine
     seen_px = np.minimum(length_px, width + height)
     charge_e *= np.divide(seen_px, length_px, out=np.ones(hits), where=length_px > 0)

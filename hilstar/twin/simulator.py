@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from hilstar.arrays import FloatArray
 from hilstar.bench.build import bench_hash, bench_optics, bench_stars, truth_table
-from hilstar.bench.config import BenchConfig, detector_settings, read_config
+from hilstar.bench.config import BenchConfig, read_config
 from hilstar.errors import InputError
 from hilstar.monitor.geometry import monitor_camera
 from hilstar.render.renderer import Renderer, Target
@@ -50,7 +50,7 @@ class Simulator:
         self.stars = bench_stars(self.config, path.parent)
         self.camera = monitor_camera(tracker.resolution_px, tracker.pixel_pitch_um, tracker.focal_length_mm, NO_ALIGNMENT)
         self.background_e = background_e(self.config, path.parent)
-        self.detector = Detector(detector_settings(tracker), tracker.resolution_px)
+        self.detector = Detector(tracker.detector, tracker.resolution_px, tracker.pixel_pitch_um)
         self.renderer = Renderer(Target(tracker.resolution_px, tracker.psf_sigma_px))
 
     def motion(self, q_icrs_to_cam: FloatArray, rate_cam_rad_s: FloatArray) -> Motion:

@@ -21,7 +21,7 @@ import numpy.typing as npt
 from hilstar.arrays import FloatArray
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE
 from hilstar.bench.build import Bench, Frame, bench_camera
-from hilstar.bench.config import BenchConfig, Verify, detector_settings
+from hilstar.bench.config import BenchConfig, Verify
 from hilstar.errors import InputError
 from hilstar.monitor.calibration import BUILT_IN, load_calibration
 from hilstar.monitor.geometry import monitor_camera
@@ -113,7 +113,7 @@ class Twin:
         self.believed = Panel(self.bench.calibration.response, self.bench.flux_at_white_e_per_s, self.bench.uniformity)
         true, self.assumed = true_mounting(self.bench, self.camera), Mounting(self.bench.camera, self.camera)
         self.background_e = background_e(self.config, path.parent)
-        self.detector = Detector(detector_settings(tracker), tracker.resolution_px)
+        self.detector = Detector(tracker.detector, tracker.resolution_px, tracker.pixel_pitch_um)
         self.settings = centroid_settings(self.config, self.assumed)
         self.true_optics = TwinOptics(true, tracker.psf_sigma_px)
         self.sky_optics = TwinOptics(self.assumed, tracker.psf_sigma_px)

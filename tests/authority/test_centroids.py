@@ -17,7 +17,8 @@ from scipy.stats import norm
 from hilstar.arrays import FloatArray
 from hilstar.errors import InputError
 from hilstar.tracker.centroids import Background, CentroidSettings, estimate_background, find_stars, s_curves
-from hilstar.tracker.detector import Detector, DetectorSettings
+from hilstar.tracker.detector import Detector
+from hilstar.tracker.settings import DetectorSettings
 
 SIGMAS_PX = (0.4, 0.5, 0.55, 0.75, 1.0, 2.0, 3.0)
 PHASES_PX = np.linspace(-0.5, 0.5, 24, endpoint=False)

@@ -13,7 +13,8 @@ import pytest
 from scipy import stats
 
 from hilstar.arrays import FloatArray
-from hilstar.tracker.detector import LARGEST_E, Detector, DetectorSettings
+from hilstar.tracker.detector import Detector
+from hilstar.tracker.settings import LARGEST_E, DetectorSettings
 
 SIZE_PX = (256, 256)
 SHAPE = (256, 256)

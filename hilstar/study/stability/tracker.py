@@ -12,7 +12,8 @@ from hilstar.errors import InputError
 from hilstar.rotation import from_radec_roll_deg
 from hilstar.study.stability.failing_place import Figures, Place
 from hilstar.tracker.centroids import find_stars
-from hilstar.tracker.detector import Detector, DetectorSettings
+from hilstar.tracker.detector import Detector
+from hilstar.tracker.settings import DetectorSettings
 from hilstar.twin.simulator import Simulator
 
 SEED = 1

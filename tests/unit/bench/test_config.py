@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import re
 
-import msgspec
 import pytest
 
-from hilstar.bench.config import BenchConfig, read_config
+from hilstar.bench.config import read_config
 from hilstar.errors import InputError
 from tests.conftest import ROOT, SMALL_BENCH
 
@@ -163,39 +162,3 @@ def test_tables_without_end_are_refused(tmp_path, text):
 def test_a_bench_file_that_is_not_there_is_refused(tmp_path):
     with pytest.raises(InputError, match="No such file"):
         read_config(tmp_path / "none.toml")
-
-
-def documented_keys() -> dict[str, set[str]]:
-    """The keys in the first column of the tables of configs/README.md, by the table of the bench file that they are in."""
-    found: dict[str, set[str]] = {}
-    table = ""
-    for line in (ROOT / "configs" / "README.md").read_text().splitlines():
-        if heading := re.match(r"#+ .*?\[([\w.]+)\]", line):
-            table = heading[1]
-        if line.startswith("| `") and table:
-            # "`key`", "`key = [x, y]`" and "`one`, `two`"; the second column may hold keys in its prose.
-            first = line.split("|")[1]
-            found.setdefault(table, set()).update(re.findall(r"`(\w+)(?: = [^`]*)?`", first))
-    return found
-
-
-def real_keys() -> dict[str, set[str]]:
-    def of(struct, name: str) -> dict[str, set[str]]:
-        inner = {field.name: field.type for field in msgspec.structs.fields(struct) if hasattr(field.type, "__struct_fields__")}
-        keys = {name: {key for key in struct.__struct_fields__ if key not in inner}}
-        for key, kind in inner.items():
-            keys |= of(kind, f"{name}.{key}".lstrip("."))
-        return keys
-
-    return of(BenchConfig, "")
-
-
-def test_every_key_is_documented_and_every_documented_key_is_there():
-    text = (ROOT / "configs" / "README.md").read_text()
-    documented, real = documented_keys(), real_keys()
-    for table, keys in documented.items():
-        assert not (strange := {key for key in keys if key not in real.get(table, set())}), f"[{table}] has no {strange}"
-    for table, keys in real.items():
-        # Some keys stand in another one's row or in prose, with their value: `dark_activation_ev = 0.56`.
-        missing = {key for key in keys if not re.search(rf"`{key}\b", text)}
-        assert not missing, f"configs/README.md lacks [{table}] {missing}"

@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 from scipy import ndimage
 
 from hilstar.errors import InputError
 from hilstar.tracker.detector import (
-    LARGEST_E,
     RAY_DEPTH_UM,
     RAY_E_PER_UM,
     Detector,
-    DetectorSettings,
     bloom,
-    ccd47_20_dark,
     cosmic_rays_e,
     false_stars_e,
 )
+from hilstar.tracker.settings import LARGEST_E, DetectorSettings, ccd47_20_dark
 
 SIZE_PX = (160, 128)
 SHAPE = (128, 160)
@@ -78,7 +76,7 @@ def test_another_frame_seed_changes_only_the_frames_noise():
 
 
 def test_another_device_seed_changes_every_map():
-    one, other = (Detector(dataclasses.replace(EVERYTHING, device_seed=seed), SIZE_PX) for seed in (1, 2))
+    one, other = (Detector(replace(EVERYTHING, device_seed=seed), SIZE_PX) for seed in (1, 2))
     for name in ("gain_map", "dark_map_e_per_s", "column_e"):
         # Two continuous draws agree nowhere but on the few pixels that are dead, or cut at no dark, in both.
         assert (getattr(one, name) == getattr(other, name)).mean() < 0.01
@@ -139,7 +137,7 @@ def test_1e9_electrons_have_their_own_mean_and_shot_noise():
 
 
 def test_no_exposure_and_no_light_give_the_offset_and_nothing_else():
-    quiet = dataclasses.replace(EVERYTHING, read_noise_e=0.0, column_noise_e=0.0, quantisation_noise=False)
+    quiet = replace(EVERYTHING, read_noise_e=0.0, column_noise_e=0.0, quantisation_noise=False)
     image = Detector(quiet, SIZE_PX).expose(flat(0.0), 0.0, generator())
     assert (image == 100).all()
     assert (Detector(EVERYTHING, SIZE_PX).expose_noiseless(flat(0.0), 0.0) == 100).all()
@@ -160,7 +158,7 @@ def test_electrons_of_every_number_type_give_the_same_image_and_stay_as_they_wer
 
 
 def test_noiseless_is_the_rounded_mean_without_fixed_pattern():
-    detector = Detector(dataclasses.replace(EVERYTHING, blooming=False), SIZE_PX)
+    detector = Detector(replace(EVERYTHING, blooming=False), SIZE_PX)
     image_e = generator().uniform(0.0, 20_000.0, SHAPE)
     expected = np.rint((image_e + 203.0 * 2.0) / 4.0 + 100.0).clip(0, 4095)
     np.testing.assert_array_equal(detector.expose_noiseless(image_e, 2.0), expected)
@@ -238,9 +236,9 @@ def test_a_cmos_column_pattern_is_the_same_down_each_column():
 
 
 def test_cosmic_rays_come_at_their_rate_and_leave_their_charge():
-    settings = DetectorSettings(cosmic_rays_per_cm2_s=1000.0, pixel_pitch_um=10.0)
+    settings = DetectorSettings(cosmic_rays_per_cm2_s=1000.0)
     shape, expected = (512, 512), 1000.0 * 0.512**2
-    image_e = cosmic_rays_e(settings, shape, 1.0, generator())
+    image_e = cosmic_rays_e(settings, shape, 1.0, generator(), pixel_pitch_um=10.0)
     labels, found = ndimage.label(image_e, structure=np.ones((3, 3)))
     # Tracks of a few pixels on 262 144: two of 262 touch about as often as 262^2 / 2 * 25 / 262 144 = 3 times.
     assert found == pytest.approx(expected - 3, abs=SIGMAS * math.sqrt(expected))
@@ -264,7 +262,7 @@ def test_false_stars_bring_their_light_and_move_from_frame_to_frame():
     # A reach of 5 sigma cuts 6e-7 of a star along an axis; on this many pixels, none lies over the edge.
     inside = false_stars_e(settings, (2000, 2000), 0.5, generator())
     assert inside.sum() == pytest.approx(10 * 2500.0, rel=2 * 6e-7)
-    frame = Detector(dataclasses.replace(settings, gain_e_per_dn=1.0), SIZE_PX).expose(flat(0.0), 0.5, generator())
+    frame = Detector(replace(settings, gain_e_per_dn=1.0), SIZE_PX).expose(flat(0.0), 0.5, generator())
     # A star between four pixels gives each less than a quarter of it, 0.4655^2 = 0.2167: 541 e-, with 23 e- of noise.
     assert frame.max() > 540 - SIGMAS * 23
 

@@ -1,0 +1,31 @@
+"""The bench file: TOML in, checked and frozen tables out.
+
+Each key's type, limits, default and meaning stand once, in the class of its table; docs/bench-file.md is made from them.
+"""
+
+from hilstar.bench.config.attitude import AttitudeSettings
+from hilstar.bench.config.background import Background
+from hilstar.bench.config.bench import BenchConfig
+from hilstar.bench.config.collimator import Collimator
+from hilstar.bench.config.monitor import Monitor
+from hilstar.bench.config.read import read_config
+from hilstar.bench.config.render import DEFAULT_BRIGHTEST_V_MAG, RenderSettings
+from hilstar.bench.config.sky import SkySettings
+from hilstar.bench.config.table import Vector
+from hilstar.bench.config.tracker import Tracker
+from hilstar.bench.config.verify import Verify
+
+__all__ = [
+    "DEFAULT_BRIGHTEST_V_MAG",
+    "AttitudeSettings",
+    "Background",
+    "BenchConfig",
+    "Collimator",
+    "Monitor",
+    "RenderSettings",
+    "SkySettings",
+    "Tracker",
+    "Vector",
+    "Verify",
+    "read_config",
+]

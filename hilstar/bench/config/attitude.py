@@ -1,0 +1,107 @@
+"""[attitude]."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from msgspec import Meta
+
+from hilstar.bench.config.table import NotNegative, Table
+
+
+class AttitudeSettings(Table, frozen=True):
+    """Where the attitude comes from, and what is shown when it does not come.
+
+    The packets, and what each side may expect of the other, are in [firmware_protocol](../firmware_protocol/README.md).
+
+    CURVE keys come from `hilstar keys`. An endpoint that is not loopback is refused without them: the side that binds needs
+    its own secret key and a directory with the public keys of its clients (read again when it changes), the side that
+    connects needs its own secret key and the public key of the side that binds.
+    """
+
+    source: Annotated[
+        Literal["zmq", "serial"],
+        Meta(description='`"zmq"`: packets or JSON over ZeroMQ. `"serial"`: COBS frames over a serial line.'),
+    ] = "zmq"
+    endpoint: Annotated[
+        str,
+        Meta(
+            description="ZeroMQ: the address to which hilstar's SUB socket connects. `tcp://HOST:PORT`, where HOST is an IPv4 "
+            "address, an IPv6 address in brackets, or a name (when hilstar binds also `*`, and PORT may be `*` for a free one, "
+            "which is then reported), or `ipc:///WHOLE/PATH`."
+        ),
+    ] = "tcp://127.0.0.1:5560"
+    bind: Annotated[
+        bool | None,
+        Meta(
+            description="ZeroMQ: `true` when hilstar binds and the sender connects.",
+            extra={"default": "`false`; `true` in lockstep"},
+        ),
+    ] = None
+    lockstep: Annotated[
+        bool,
+        Meta(
+            description="ZeroMQ: `true` for a REP socket. Each request is one attitude and gets one frame and one reply, at "
+            "whatever speed the sender has."
+        ),
+    ] = False
+    curve_secret_key: Annotated[
+        str | None, Meta(description="ZeroMQ: the file of hilstar's own secret key.", extra={"default": "none"})
+    ] = None
+    curve_server_key: Annotated[
+        str | None,
+        Meta(
+            description="ZeroMQ: the file of the binding side's public key, when hilstar connects.", extra={"default": "none"}
+        ),
+    ] = None
+    allowed_clients: Annotated[
+        str | None,
+        Meta(
+            description="ZeroMQ: the directory with the public keys that may connect, when hilstar binds.",
+            extra={"default": "none"},
+        ),
+    ] = None
+    port: Annotated[
+        str,
+        Meta(description='Serial: the device, such as `"/dev/ttyUSB0"`.', extra={"default": "none; required for serial"}),
+    ] = ""
+    baud: Annotated[int, Meta(ge=1, le=12_000_000, description="Serial: the speed, 8N1.")] = 115_200
+    status_hz: Annotated[
+        float, Meta(ge=0, le=1000, description="Serial: status packets sent back to the sender per second; 0 for none.")
+    ] = 10.0
+    time_requests: Annotated[
+        bool,
+        Meta(
+            description="Serial: ask the sender for its time. A sender that does not answer is followed by its packets alone."
+        ),
+    ] = True
+    clock: Annotated[
+        Literal["estimated", "shared"],
+        Meta(
+            description='`"estimated"`: the offset of the sender\'s clock is estimated. `"shared"`: the sender runs on this '
+            "machine and `t_ns` is its CLOCK_MONOTONIC; nothing is estimated, and latency is absolute."
+        ),
+    ] = "estimated"
+    stale_after_ms: Annotated[
+        NotNegative,
+        Meta(description="The age at which an attitude counts as stale; below half of that it counts as fresh again."),
+    ] = 250.0
+    max_extrapolation_ms: Annotated[
+        NotNegative,
+        Meta(
+            description="How long the rate of the newest sample carries the attitude on; after that the attitude stands still."
+        ),
+    ] = 250.0
+    on_stale: Annotated[
+        Literal["hold", "blank"],
+        Meta(description='What is shown while the attitude is stale. `"hold"`: the last attitude. `"blank"`: no stars.'),
+    ] = "hold"
+    max_rate_deg_s: Annotated[
+        float,
+        Meta(
+            ge=1e-3,
+            le=1e9,
+            description="A packet or a log entry with a faster rate is refused (reason `rate`; rates in packets are rad/s), "
+            "and two samples that would need a faster turn between them are a jump, never a turn.",
+        ),
+    ] = 60.0

@@ -1,0 +1,28 @@
+"""The whole bench file."""
+
+from __future__ import annotations
+
+import msgspec
+
+from hilstar.bench.config.attitude import AttitudeSettings
+from hilstar.bench.config.background import Background
+from hilstar.bench.config.collimator import Collimator
+from hilstar.bench.config.monitor import Monitor
+from hilstar.bench.config.render import RenderSettings
+from hilstar.bench.config.sky import SkySettings
+from hilstar.bench.config.table import Table
+from hilstar.bench.config.tracker import Tracker
+from hilstar.bench.config.verify import Verify
+
+
+class BenchConfig(Table, frozen=True):
+    """A whole bench file."""
+
+    tracker: Tracker
+    monitor: Monitor
+    collimator: Collimator
+    sky: SkySettings = msgspec.field(default_factory=SkySettings)
+    attitude: AttitudeSettings = msgspec.field(default_factory=AttitudeSettings)
+    render: RenderSettings = msgspec.field(default_factory=RenderSettings)
+    background: Background = msgspec.field(default_factory=Background)
+    verify: Verify = msgspec.field(default_factory=Verify)

@@ -1,0 +1,71 @@
+"""A bench file from disk: read, checked, and refused in one line where it is wrong."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from hilstar.attitude.wire.protocol import NORM_TOLERANCE
+from hilstar.bench.config.bench import BenchConfig
+from hilstar.bench.config.explain import explained
+from hilstar.bench.config.render import DEFAULT_BRIGHTEST_V_MAG
+from hilstar.errors import InputError, shortened
+from hilstar.reading import MAX_TOML_BYTES, parse_toml, read_text
+
+LIGHT_KM_S = 299_792.458
+
+
+def read_config(path: Path) -> BenchConfig:
+    """Read and check a bench file. Raises InputError: file, key, what is wrong and what to write."""
+    tables = parse_toml(path, read_text(path, "give the path of a bench file", MAX_TOML_BYTES))
+    _check_finite(tables, path)
+    try:
+        config = msgspec.convert(tables, BenchConfig)
+    except InputError as error:  # what the detector's keys mean together
+        raise InputError(f"{path}: [tracker.detector] {error}") from error
+    except RecursionError as error:
+        raise InputError(f"{path}: its tables are nested too deep; see configs/README.md") from error
+    except msgspec.ValidationError as error:
+        raise InputError(f"{path}: {explained(str(error), tables)}") from error
+    _check_meaning(config, path)
+    return _with_white(config)
+
+
+def _with_white(config: BenchConfig) -> BenchConfig:
+    """The same with the default white where the file gives none: a bench's hash covers it."""
+    render = config.render
+    if render.flux_at_white_e_per_s is not None or render.brightest_v_mag is not None:
+        return config
+    return msgspec.structs.replace(config, render=msgspec.structs.replace(render, brightest_v_mag=DEFAULT_BRIGHTEST_V_MAG))
+
+
+def _check_finite(value: Any, path: Path, where: str = "") -> None:
+    """Refuse (InputError) nan and inf, which TOML allows and no key here does."""
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            _check_finite(inner, path, f"{where}.{key}" if where else key)
+    elif isinstance(value, list):
+        for inner in value:
+            _check_finite(inner, path, where)
+    elif isinstance(value, float) and not math.isfinite(value):
+        raise InputError(f"{path}: {shortened(where)} = {value}; a finite number is wanted")
+
+
+def _check_meaning(config: BenchConfig, path: Path) -> None:
+    """What a type cannot say."""
+    norm = math.hypot(*config.collimator.q_cam_to_mon)
+    if abs(norm - 1) > NORM_TOLERANCE:
+        raise InputError(f"{path}: [collimator] q_cam_to_mon: its norm is {norm:.6g}; write a unit quaternion w, x, y, z")
+    if math.hypot(*config.sky.observer_velocity_km_s) >= LIGHT_KM_S:
+        raise InputError(f"{path}: [sky] observer_velocity_km_s is not slower than light; write km/s, ICRS x, y, z")
+    if config.background.electrons_per_px is not None and config.background.zodiacal_v_mag_arcsec2 is not None:
+        raise InputError(f"{path}: [background] has electrons_per_px and zodiacal_v_mag_arcsec2; write one of them")
+    if config.render.flux_at_white_e_per_s is not None and config.render.brightest_v_mag is not None:
+        raise InputError(f"{path}: [render] has flux_at_white_e_per_s and brightest_v_mag; write one of them")
+    if config.attitude.source == "serial" and not config.attitude.port:
+        raise InputError(f'{path}: [attitude] source = "serial" needs port; write port = "/dev/ttyUSB0" or the like')
+    if config.attitude.source == "serial" and config.attitude.lockstep:
+        raise InputError(f'{path}: [attitude] lockstep = true is for source = "zmq"; leave one of them out')

@@ -1,0 +1,168 @@
+"""The reference of the bench file, as Markdown: `python -m hilstar.bench.config.reference` prints it.
+
+All of it comes from the classes of the tables: keys, types, units, limits, defaults and meanings.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Iterator
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+
+import msgspec
+from msgspec import NODEFAULT, Meta
+from msgspec.structs import FieldInfo
+
+from hilstar.bench.config.bench import BenchConfig
+from hilstar.bench.config.explain import TYPE_WORDS, plain
+from hilstar.bench.config.table import MAX_NUMBER, MIN_POSITIVE
+
+# The unit that the end of a key's name says, the longest end first.
+UNITS = {
+    "_mag_arcsec2": "mag/arcsec2",
+    "_e_per_s_px": "e-/s in a pixel",
+    "_per_cm2_s": "per cm2 and second",
+    "_e_per_dn": "e-/DN",
+    "_electrons_across": "e-",
+    "_e_per_s": "e-/s",
+    "_deg_s": "deg/s",
+    "_km_s": "km/s",
+    "_per_px": "e-",
+    "_jyear": "Julian year",
+    "_mag": "mag",
+    "_deg": "deg",
+    "_dn": "DN",
+    "_ev": "eV",
+    "_hz": "Hz",
+    "_mm": "mm",
+    "_ms": "ms",
+    "_px": "px",
+    "_um": "um",
+    "_e": "e-",
+    "_k": "K",
+    "_s": "s",
+}
+
+HEAD = """\
+# Bench file
+
+A bench file is TOML: it describes the star tracker, the monitor and the lens between them, and how hilstar draws. This page
+is generated from the definitions that hilstar reads the file with; `python -m hilstar.bench.config.reference` prints it
+without a network.
+
+The shortest file that works:
+
+```toml
+[tracker]
+aperture_mm = 30
+focal_length_mm = 70
+pixel_pitch_um = 13
+resolution_px = [1024, 1024]
+quantum_efficiency = "ccd47-20"
+[monitor]
+resolution_px = [1920, 1080]
+pixel_pitch_um = 57.65
+[collimator]
+focal_length_mm = 350
+```
+
+Every other key has the default shown below. Unknown keys are refused. Paths are relative to the bench file.
+
+**Frames.** `icrs` is the sky. `cam` has +z along the boresight, +x right and +y down in the image. `mon`, the monitor, has the
+same axes. Quaternions are unit, Hamilton, scalar first: `[w, x, y, z]`. Pixel (0, 0) is the centre of the top-left pixel.
+
+**Units** are in the names of the keys.
+"""
+
+
+def page() -> str:
+    """The whole page."""
+    return "\n".join([HEAD, *(section(name, table) for name, table in tables_of(BenchConfig, ""))])
+
+
+def tables_of(table: Any, prefix: str) -> Iterator[tuple[str, Any]]:
+    """Each table inside `table` by its name in the file, outer ones first: ("tracker", Tracker), ("tracker.detector", ...)."""
+    for field in msgspec.structs.fields(table):
+        inner = plain(field.type)
+        if is_table(inner):
+            yield prefix + field.name, inner
+            yield from tables_of(inner, f"{prefix}{field.name}.")
+
+
+def is_table(kind: Any) -> bool:
+    """Whether a key's type is a table."""
+    return isinstance(kind, type) and issubclass(kind, msgspec.Struct)
+
+
+def section(name: str, table: Any) -> str:
+    """A table of the file: what it is for, its keys, and what else there is to know."""
+    summary, _, notes = (inspect.getdoc(table) or "").partition("\n\n")
+    hints = get_type_hints(table, include_extras=True)
+    rows = [row(field, hints[field.name]) for field in msgspec.structs.fields(table) if not is_table(plain(field.type))]
+    lines = [f"## `[{name}]`", "", summary, "", "| key | value | default | meaning |", "|---|---|---|---|", *rows, ""]
+    return "\n".join([*lines, notes, ""] if notes else lines)
+
+
+def row(field: FieldInfo, hint: Any) -> str:
+    """A key: its name, what it may hold, what it holds otherwise, and what it means."""
+    notes = notes_of(hint)
+    meaning = next(note.description for note in reversed(notes) if note.description)
+    return f"| `{field.name}` | {value_text(field.name, hint)} | {default_text(field, notes)} | {meaning} |"
+
+
+def notes_of(hint: Any) -> list[Meta]:
+    """What the annotations of a type say, inner ones first; those of `X | None` are X's too."""
+    if get_origin(hint) is not Annotated:
+        return []
+    inner, *notes = get_args(hint)
+    optional = [choice for choice in get_args(inner) if get_origin(choice) is Annotated] if is_optional(inner) else []
+    return [note for choice in optional for note in notes_of(choice)] + [note for note in notes if isinstance(note, Meta)]
+
+
+def is_optional(kind: Any) -> bool:
+    """Whether a type is `X | None`."""
+    return type(None) in get_args(kind)
+
+
+def value_text(name: str, hint: Any) -> str:
+    """What a key may hold: its choices, or its form, limits and unit."""
+    kind, notes = plain(hint), notes_of(hint)
+    if is_optional(kind):
+        kind = plain(next(choice for choice in get_args(kind) if choice is not type(None)))
+    if get_origin(kind) is Literal:
+        return ", ".join(f"`{toml(choice)}`" for choice in get_args(kind))
+    form = next((note.extra["form"] for note in notes if note.extra and "form" in note.extra), None)
+    words = f"`{form}`" if form else " or ".join(TYPE_WORDS[choice.__name__] for choice in get_args(kind) or (kind,))
+    unit = next((unit for end, unit in UNITS.items() if name.endswith(end)), "")
+    return ", ".join(part for part in (words, limits_text(notes), unit) if part)
+
+
+def limits_text(notes: list[Meta]) -> str:
+    """The limits of a number; those that only keep arithmetic within float64 are not told."""
+    low = next((note.ge for note in notes if note.ge is not None), None)
+    high = next((note.le for note in notes if note.le is not None), None)
+    if low is None:
+        return ""
+    above = "above 0" if low == MIN_POSITIVE else f"{low:g} or more"
+    return above if high is None or high >= MAX_NUMBER else f"{low:g} to {high:.12g}"
+
+
+def default_text(field: FieldInfo, notes: list[Meta]) -> str:
+    """What holds where the file has no such key."""
+    told = next((note.extra["default"] for note in notes if note.extra and "default" in note.extra), None)
+    if field.default is NODEFAULT:
+        return "**required**"
+    return str(told) if told is not None else f"`{toml(field.default)}`"
+
+
+def toml(value: Any) -> str:
+    """A value as a bench file has it."""
+    if isinstance(value, float):
+        return f"{value:.15g}"
+    if isinstance(value, tuple):
+        return f"[{', '.join(map(toml, value))}]"
+    return msgspec.json.encode(value).decode()
+
+
+if __name__ == "__main__":
+    print(page(), end="")

@@ -1,0 +1,101 @@
+"""[render]."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from msgspec import Meta
+
+from hilstar.bench.config.table import Magnitude, NotNegative, Positive, Sigma, Table
+
+# White, where the file gives none. demo.toml, 200 random fields: the brightest code of 8 bits is 100 in the median (38 with
+# Sirius for white), `verify` sees flux 0.065 mag off at 95 % (0.41), and 13 stars clip, one of them in 8 % of fields.
+DEFAULT_BRIGHTEST_V_MAG = 1.5
+
+
+class RenderSettings(Table, frozen=True):
+    """From electrons to code values.
+
+    Full scale (white) is fixed when the bench is loaded, and no frame changes it. It trades bright stars for faint ones. On
+    8 bits and a field of 18 by 10 degrees (`demo.toml`), over 200 random fields:
+
+    | `brightest_v_mag` | stars that clip | fields with one | median brightest code | flux error, 95 % | centroid error, 95 % |
+    |---|---|---|---|---|---|
+    | `-2` (full scale is Sirius) | none | none | 38 | 0.41 mag | 0.29 px |
+    | `1.5` | 13 of 25 688 | 8 % | 100 | 0.064 mag | 0.063 px |
+    | `2.5` | 50 | 15 % | 167 | 0.025 mag | 0.022 px |
+
+    A clipped star keeps its place and loses the flux that `hilstar frame` reports; `serve` and `replay` name the stars of the
+    whole sky that clip when they start, and `budget` lists all of them. Where none may clip, write `brightest_v_mag = -2`.
+    Stars too faint to light a pixel are not drawn; `hilstar frame` says how many, and their share of the light.
+    `hilstar study quantisation` shows what each method costs and achieves.
+    """
+
+    # results/tradeoff.csv, quantisation: the quickest, and code by code what anyone expects; exact is 9 times as right.
+    quantisation: Annotated[
+        Literal["round", "dither", "temporal", "exact", "auto"],
+        Meta(
+            description='How light becomes codes. `"round"`: the nearest code. `"dither"`: blue noise, exact in the mean over '
+            'pixels. `"temporal"`: dithered over `cycle_frames` frames. `"exact"`: all codes of a star are chosen together, so '
+            'that its flux and centroid are right in a single frame. `"auto"`: `round` where that stays within the tolerance, '
+            "else `exact`."
+        ),
+    ] = "round"
+    bit_stealing: Annotated[
+        bool,
+        Meta(
+            description="Lets the codes of r, g and b differ by one: seven times as many levels, weighted as the tracker sees "
+            "the primaries."
+        ),
+    ] = False
+    cycle_frames: Annotated[
+        Literal[1, 2, 4, 8, 16, 32, 64, 128, 256],
+        Meta(description="Length of the `temporal` cycle. A warning is given when the tracker's exposure is shorter."),
+    ] = 8
+    sprite_sigma_px: Annotated[Sigma, Meta(description="Gaussian sigma of a star on the monitor, in monitor pixels.")] = (
+        0.85,
+        0.85,
+    )
+    flux_at_white_e_per_s: Annotated[
+        Positive | None,
+        Meta(
+            description="Full scale: the light of one monitor pixel at the white code, in the tracker's electrons per second. "
+            "`hilstar calibrate scale` measures it.",
+            extra={"default": "set by `brightest_v_mag`"},
+        ),
+    ] = None
+    brightest_v_mag: Annotated[
+        Magnitude | None,
+        Meta(
+            description="Full scale, where `flux_at_white_e_per_s` is not given: the peak pixel of the brightest star whose V "
+            "is not below this. Brighter stars clip, and are listed.",
+            extra={"default": f"`{DEFAULT_BRIGHTEST_V_MAG}`"},
+        ),
+    ] = None
+    effort: Annotated[
+        Literal["full", "auto"],
+        Meta(
+            description='`"auto"`: sprites no larger and paths no finer than the tolerance requires; `--explain` of `frame`, '
+            '`serve` and `replay` says what was chosen. `"full"`: no such economy.'
+        ),
+    ] = "full"
+    tolerance_mag: Annotated[
+        Positive,
+        Meta(description='Flux error that a star may have, codes included, for `effort = "auto"` and `quantisation = "auto"`.'),
+    ] = 0.02
+    tolerance_px: Annotated[Positive, Meta(description="Centroid error that a star may have, likewise.")] = 0.02
+    # results/timing.csv: 69 arcsec at 2 deg/s without, 0.1 with it.
+    motion: Annotated[
+        Literal["auto", "on", "off"],
+        Meta(
+            description='Stars are drawn along their paths, each row for its own moment. `"auto"`: on a screen only. `"on"`: '
+            'headless too. `"off"`: never.'
+        ),
+    ] = "auto"
+    motion_above_px: Annotated[
+        NotNegative,
+        Meta(
+            description="Stars that move less than this, from the light of the middle row to the end of the frame's light, are "
+            "drawn as points at one moment."
+        ),
+    ] = 0.01

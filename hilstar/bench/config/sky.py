@@ -1,0 +1,67 @@
+"""[sky]."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from msgspec import Meta
+
+from hilstar.bench.config.table import IcrsVector, Magnitude, Table
+
+
+class SkySettings(Table, frozen=True):
+    """Which stars there are, and how bright they are."""
+
+    catalogue: Annotated[
+        str,
+        Meta(description='`"hipparcos"`, the packaged catalogue, or the path of a `hip_main.dat` (CDS I/239).'),
+    ] = "hipparcos"
+    epoch_jyear: Annotated[
+        float,
+        Meta(
+            ge=-10_000, le=10_000, description="Julian year to which proper motion is applied, from the catalogue's J1991.25."
+        ),
+    ] = 2026.0
+    faintest_v_mag: Annotated[
+        Magnitude, Meta(description="Faintest V magnitude used, inclusive; fainter stars do not exist for this bench.")
+    ] = 7.5
+    brightness: Annotated[
+        Literal["dgs", "ags"],
+        Meta(
+            description='`"dgs"`: each star\'s spectrum through the tracker\'s curves. `"ags"`: one band average for every '
+            "colour."
+        ),
+    ] = "dgs"
+    # results/tradeoff.csv, spectrum: real spectra by V-I are 0.026 mag off (95 %), a black body 0.2.
+    spectrum: Annotated[
+        Literal["blackbody", "pickles"],
+        Meta(
+            description='`"pickles"`: spectra of real stars (Pickles 1998), chosen by V-I, and by B-V for the hottest. '
+            '`"blackbody"`: a black body at the temperature that the next key derives from B-V.'
+        ),
+    ] = "pickles"
+    temperature: Annotated[
+        Literal["ballesteros2012", "wang2021"],
+        Meta(
+            description='Temperature from B-V. `"wang2021"` is the formula of the thesis, with its step of 350 K at B-V = 0. '
+            "Both are held within 1000 and 200000 K, which matters to nine carbon stars under `wang2021`."
+        ),
+    ] = "ballesteros2012"
+    zero_point: Annotated[
+        Literal["vega", "iau-bolometric"],
+        Meta(
+            description='Flux of a star of V = 0. `"vega"`: 3.631e-9 erg/s/cm2/A at V (Bessell 1998). `"iau-bolometric"`: the '
+            "zero point of the thesis, 25 % fainter."
+        ),
+    ] = "vega"
+    passband_weighting: Annotated[
+        Literal["energy", "photon"],
+        Meta(description='How Johnson V averages a spectrum. `"energy"` suits Bessell\'s curve; `"photon"` is the thesis\'s.'),
+    ] = "energy"
+    observer_velocity_km_s: Annotated[
+        IcrsVector,
+        Meta(
+            description="Barycentric velocity of the observer, ICRS axes, for aberration: 20.5 arcsec at 29.8 km/s. "
+            "Slower than light."
+        ),
+    ] = (0.0, 0.0, 0.0)

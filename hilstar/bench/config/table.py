@@ -1,0 +1,26 @@
+"""What the tables of a bench file are made of: the refusal of unknown keys, and the kinds of value."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import msgspec
+from msgspec import Meta
+
+# The limits keep every product of such numbers within float64; no bench comes near them.
+MIN_POSITIVE, MAX_NUMBER = 1e-6, 1e12
+Positive = Annotated[float, Meta(ge=MIN_POSITIVE, le=MAX_NUMBER)]
+NotNegative = Annotated[float, Meta(ge=0, le=MAX_NUMBER)]
+Magnitude = Annotated[float, Meta(ge=-100, le=100)]
+Pixels = Annotated[int, Meta(ge=1, le=32768)]
+SigmaPx = Annotated[float, Meta(ge=0.05)]
+Size = Annotated[tuple[Pixels, Pixels], Meta(extra={"form": "[width, height]"})]
+Sigma = Annotated[tuple[SigmaPx, SigmaPx], Meta(extra={"form": "[x, y]"})]
+Point = Annotated[tuple[float, float], Meta(extra={"form": "[x, y]"})]
+Vector = tuple[float, float, float]
+IcrsVector = Annotated[Vector, Meta(extra={"form": "[x, y, z]"})]
+Rotation = Annotated[tuple[float, float, float, float], Meta(extra={"form": "[w, x, y, z]"})]
+
+
+class Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A table of the bench file; unknown keys are refused."""

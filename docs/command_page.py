@@ -23,7 +23,7 @@ GROUPS = {
     "Send attitudes": ("send", "convert", "keys"),
     "Set up the hardware": ("calibrate plan", "calibrate photometric", "calibrate scale", "latency"),
     "Check": ("budget", "verify", "simulate", "compare", "report"),
-    "Measure": ("study", "bench"),
+    "Measure": ("study", "benchmark"),
 }
 MAX_BOUND = 1e6  # a larger limit only keeps arithmetic within its types; nobody meets it
 TYPE_WORDS = {int: "N", float: "X", str: "TEXT", Path: "PATH"}

@@ -1,6 +1,7 @@
 """Tables of README and docs/ from the CSV files beside this script: `python results/tables.py` writes them between their marks.
 
-bench.csv is of `hilstar bench -o`, tradeoff.csv, economy.csv and timing.csv of `hilstar study NAME -o`; machine.txt says where.
+bench.csv is written by `hilstar benchmark -o`; tradeoff.csv, economy.csv and timing.csv by `hilstar study NAME -o`. machine.txt
+says on which machine.
 """
 
 from __future__ import annotations

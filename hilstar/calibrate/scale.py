@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,7 +17,6 @@ from hilstar.reading import MAX_TOML_BYTES, read_text
 from hilstar.scene.psf import peak_share
 
 UNSURE_MAG = 0.05  # readings that disagree by more say something else than the scale
-READING_FORM = "write --reading HIP,DN: a star's Hipparcos number, and the sum of its DN over the background"
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,18 +39,6 @@ class Scale:
     def scatter_mag(self) -> float:
         """Standard deviation of the readings, magnitudes; 0 for one."""
         return float(np.std(2.5 * np.log10(self.ratios), ddof=1)) if len(self.ratios) > 1 else 0.0
-
-
-def parse_reading(text: str) -> Reading:
-    """A reading from "HIP,DN". Raises InputError."""
-    parts = text.split(",")
-    try:
-        reading = Reading(int(parts[0]), float(parts[1]))
-    except (ValueError, IndexError) as error:
-        raise InputError(f"--reading {text}: {READING_FORM}") from error
-    if len(parts) != 2 or not 0 < reading.dn < math.inf:
-        raise InputError(f"--reading {text}: {READING_FORM}")
-    return reading
 
 
 def scale_by_tracker(bench: Bench, readings: list[Reading], exposure_s: float) -> Scale:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import math
 import os
-import re
 import threading
 import time
 import uuid
@@ -54,8 +53,6 @@ DISK_WAITS_S, STOPPED_DISK_WAITS_S = 20.0, 0.4  # for a disk that stands still a
 STALLED_S = 5.0  # without a turn of the writer
 LOW_SHARE, WELL_SHARE = 0.10, 0.12  # of the disk
 FRAMES_RESERVE_BYTES, FRAMES_RESERVE_SHARE = 64_000_000, 0.02  # left to packets, the smaller of the two
-SPLIT_FORM = "write a size or a time, such as 1GB, 200MB, 1h or 30min; 1 MB or 10 s at the least"
-UNITS = {"kB": 1e3, "MB": 1e6, "GB": 1e9, "s": 1.0, "min": 60.0, "h": 3600.0}
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,17 +64,6 @@ class Split:
 
 
 NO_SPLIT = Split()
-
-
-def parse_split(text: str | None) -> Split:
-    """The split of "1GB" or "1h". Raises InputError."""
-    if text is None:
-        return NO_SPLIT
-    match = re.fullmatch(r"(\d{1,9}(?:\.\d{1,9})?)\s*(kB|MB|GB|s|min|h)", text.strip())
-    value = float(match[1]) * UNITS[match[2]] if match else 0.0
-    if match is None or value < (1e6 if match[2].endswith("B") else 10):
-        raise InputError(f"--ledger-split {text}: {SPLIT_FORM}")
-    return Split(bytes=value) if match[2].endswith("B") else Split(seconds=value)
 
 
 class Ledger:

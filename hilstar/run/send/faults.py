@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-
-from hilstar.errors import InputError
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,12 +80,3 @@ class BadCable:
         bits = np.unpackbits(np.frombuffer(packet, dtype=np.uint8))
         bits[self._rng.choice(len(bits), size=self._rng.integers(1, 4), replace=False)] ^= 1
         return np.packbits(bits).tobytes()
-
-
-def parse_share(text: str, option: str) -> float:
-    """A share from "5%" or "0.05". Raises InputError."""
-    match = re.fullmatch(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*(%?)\s*", text)
-    share = float(match[1]) / (100.0 if match[2] else 1.0) if match else 2.0
-    if share > 1.0:
-        raise InputError(f"{option} {text}: write a share of the packets, such as 5% or 0.05")
-    return share

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-import re
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -28,66 +26,13 @@ from hilstar.run.pacing import wait_until
 from hilstar.run.send.faults import BadCable
 from hilstar.units import NS_PER_S
 
-SPIN_AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
-FASTEST_SPIN_RAD_S = 1e6
-DEFAULT_BAUD = 115_200
 LISTEN_MS = 20
 PATIENCE_S = 0.5  # a line that takes nothing for so long has no reader
 MOST_RESAMPLED = 10_000_000  # some GB of samples
-SPIN_FORM = "--spin AXIS,DEG_PER_S, AXIS being x, y, z or three numbers (cam axes), such as --spin z,0.5"
 
 
-def parse_spin(text: str) -> FloatArray:
-    """The rate in rad/s, cam components (3,), of "AXIS,DEG_PER_S"."""
-    *axis, rate_text = [part.strip() for part in text.split(",")]
-    try:
-        rate = math.radians(float(rate_text))
-        vector = np.array(SPIN_AXES[axis[0].lower()] if len(axis) == 1 else [float(part) for part in axis])
-    except (ValueError, KeyError, IndexError) as error:
-        raise InputError(f"--spin {text}: write {SPIN_FORM}") from error
-    length = math.hypot(*vector)
-    if len(vector) != 3 or not (abs(rate) <= FASTEST_SPIN_RAD_S and 0 < length < math.inf):
-        raise InputError(f"--spin {text}: write {SPIN_FORM}")
-    return np.asarray(vector / length * rate)
-
-
-def parse_numbers(text: str, count: int, option: str, form: str) -> list[float]:
-    """`count` finite numbers with commas between them. Raises InputError that shows `form`."""
-    try:
-        numbers = [float(part) for part in text.split(",")]
-    except ValueError as error:
-        raise InputError(f"{option} {text}: write {form}") from error
-    if len(numbers) != count or not all(map(math.isfinite, numbers)):
-        raise InputError(f"{option} {text}: write {count} finite numbers, {form}")
-    return numbers
-
-
-def parse_radec(text: str) -> tuple[float, float, float]:
-    """Right ascension, declination and roll in degrees."""
-    ra_deg, dec_deg, roll_deg = parse_numbers(text, 3, "--radec", "RA,DEC,ROLL in degrees")
-    if not -90 <= dec_deg <= 90:
-        raise InputError(f"--radec {text}: the declination is from -90 to 90")
-    return ra_deg, dec_deg, roll_deg
-
-
-def parse_rate(text: str) -> FloatArray:
-    """A rate in rad/s, cam components (3,), of "X,Y,Z" in deg/s."""
-    return np.radians(parse_numbers(text, 3, "--rate", "X,Y,Z in deg/s"))
-
-
-def parse_serial(text: str) -> tuple[str, int] | None:
-    """Port and baud rate of "serial:/dev/ttyX@BAUD"; None for any other target. Raises InputError."""
-    if not text.startswith("serial:"):
-        return None
-    match = re.fullmatch(r"serial:(.+?)(?:@(\d{1,8}))?", text)
-    if match is None or not match[1] or "@" in match[1] or (match[2] and not int(match[2])):
-        raise InputError(f"--to {text}: write serial:/dev/ttyX@BAUD, such as serial:/dev/ttyUSB0@921600")
-    return match[1], int(match[2] or DEFAULT_BAUD)
-
-
-def open_road(to: str, *, connect: bool, keys: CurveKeys) -> ZmqSender | SerialSender:
-    """The road that --to names. Raises InputError."""
-    line = parse_serial(to)
+def open_road(to: str, line: tuple[str, int] | None, *, connect: bool, keys: CurveKeys) -> ZmqSender | SerialSender:
+    """The road that --to names: a serial `line`, port and baud rate, or else a ZeroMQ endpoint. Raises InputError."""
     if line is None:
         return ZmqSender(to, bind=not connect, keys=keys)
     if keys.given or connect:

@@ -18,7 +18,7 @@ from hilstar.arrays import Float32Array, FloatArray, IntArray
 from hilstar.scene.psf import SQRT2
 from hilstar.scene.sprites import Sprites, pack_sprites
 
-INSTALL = "pip install 'hilstar[bench]'"
+INSTALL = "pip install 'hilstar[benchmark]'"
 FWHM_PER_SIGMA = 2 * math.sqrt(2 * math.log(2))
 Sigma = tuple[float, float]
 _ONE = np.ones(1)

@@ -279,7 +279,7 @@ def refusal_of_process(*words: str) -> str:
     "words",
     [
         ("frame", "bench.toml", "--radec", "9" * 100_000 + ",1,2", "-o", "x.fits"),
-        ("bench", "--stars", "1" * 100_000),
+        ("benchmark", "--stars", "1" * 100_000),
         ("simulate", "bench.toml", "--radec", "1,2,3", "--seed", "9" * 6000, "-o", "x.fits"),
         ("frame" + "s" * 100_000,),
         ("send", "--spin", "z,1", "--to", "x" * 100_000),

@@ -27,7 +27,7 @@ FLOAT32_OF_PEAK = 1e-5
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory):
     folder = tmp_path_factory.mktemp("bench") / "out"
-    result = run_hilstar("bench", "--quick", *GRID, "--json", "-o", folder)
+    result = run_hilstar("benchmark", "--quick", *GRID, "--json", "-o", folder)
     assert result.returncode == 0, result.stderr
     assert len(result.stdout.splitlines()) == 1
     return json.loads(result.stdout), folder
@@ -65,7 +65,7 @@ def test_every_way_is_measured_or_named_with_what_to_install(measured):
     run = {row["method"] for row in result["rows"]}
     skipped = {row["method"]: row["why"] for row in result["skipped"]}
     assert run | set(skipped) == {"hilstar", "numpy", "numba", "galsim", "photutils"}
-    assert all("hilstar[bench]" in why or "budget" in why for why in skipped.values())
+    assert all("hilstar[benchmark]" in why or "budget" in why for why in skipped.values())
 
 
 def test_the_catalogue_is_filled_up_and_that_is_said(measured):
@@ -85,7 +85,7 @@ def test_the_files_say_the_same(measured):
 
 
 def test_a_bench_file_is_measured_at_its_own_size(small_bench_file):
-    result = run_hilstar("bench", small_bench_file, "--quick", "--stars", "50")
+    result = run_hilstar("benchmark", small_bench_file, "--quick", "--stars", "50")
     assert result.returncode == 0, result.stderr
     assert "320 x 240" in result.stdout
     assert "hilstar, whole frame" in result.stdout
@@ -104,17 +104,17 @@ def test_a_bench_file_is_measured_at_its_own_size(small_bench_file):
     ],
 )
 def test_wrong_options_are_refused(options, words):
-    assert_refused(run_hilstar("bench", *options), 2, *words)
+    assert_refused(run_hilstar("benchmark", *options), 2, *words)
 
 
 def test_a_bench_file_and_sizes_exclude_each_other(small_bench_file):
-    assert_refused(run_hilstar("bench", small_bench_file, "--sizes", "640x480"), 2, "--sizes", "leave out")
+    assert_refused(run_hilstar("benchmark", small_bench_file, "--sizes", "640x480"), 2, "--sizes", "leave out")
 
 
 def test_a_bench_without_stars_is_refused(small_bench_file):
     with small_bench_file.open("a") as file:
         file.write("[sky]\nfaintest_v_mag = -50\n[render]\nflux_at_white_e_per_s = 1e6\n")
-    assert_refused(run_hilstar("bench", small_bench_file, "--quick"), 2, "faintest_v_mag")
+    assert_refused(run_hilstar("benchmark", small_bench_file, "--quick"), 2, "faintest_v_mag")
 
 
 def test_the_numpy_image_is_ours(bench_with):

@@ -139,7 +139,7 @@ def test_the_average_model_can_be_chosen(tmp_path, small_bench_file):
         (["frame", "BENCH", "--radec", "1,95,0", "-o", "x.fits"], ["-90 to 90"]),
         (["frame", "BENCH", "--quaternion", "1,1,1,1", "-o", "x.fits"], ["norm is 2"]),
         (["frame", "BENCH", "--quaternion", "nan,0,0,1", "-o", "x.fits"], ["finite"]),
-        (["frame", "BENCH", "--radec", "1,2,3"], ["nothing to write", "-o OUT.fits"]),
+        (["frame", "BENCH", "--radec", "1,2,3"], ["no output", "-o OUT.fits"]),
         (["frame", "BENCH", "--radec", "1,2,3", "-o", "none/x.fits"], ["none/x.fits", "cannot be written"]),
         (["frame", "BENCH", "--radec", "1,2,3", "-o", "x.png"], ["-o x.png", "a FITS file is written there", "write x.fits"]),
         (["frame", "BENCH", "--radec", "1,2,3", "--truth", "x.fits"], ["--truth x.fits", "CSV", "write x.csv"]),

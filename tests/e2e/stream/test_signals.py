@@ -289,13 +289,13 @@ def other_commands(folder: Path, bench: Path) -> dict[str, list[str]]:
         "demo": ["demo", "-o", str(folder / "demo"), "--duration", "100"],
         "replay": ["replay", str(bench), str(log), "--headless"],
         "verify": ["verify", str(bench), "--fields", "10000"],
-        "bench": ["bench", "-o", str(folder / "bench")],
+        "benchmark": ["benchmark", "-o", str(folder / "bench")],
         "study": ["study", "stability", "-o", str(folder / "study")],
         "lockstep": ["serve", str(serve_file(folder, port, "lockstep = true")), "--headless"],
     }
 
 
-@pytest.mark.parametrize("name", ["send", "demo", "replay", "verify", "bench", "study", "lockstep"])
+@pytest.mark.parametrize("name", ["send", "demo", "replay", "verify", "benchmark", "study", "lockstep"])
 def test_every_command_that_takes_its_time_ends_within_a_second(tmp_path, small_bench_file, name):
     for number, later_s in ((signal.SIGTERM, 0.0), (signal.SIGINT, 1.5)):
         with running(program(*other_commands(tmp_path, small_bench_file)[name])) as process:

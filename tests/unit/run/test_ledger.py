@@ -19,10 +19,11 @@ from mcap.writer import MCAP0_MAGIC, Writer
 from hilstar.attitude.logs.log_file import read_log
 from hilstar.attitude.logs.mcap_reader import parts_of, read_topics
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal, encode
+from hilstar.cli.parsers import parse_split
 from hilstar.errors import InputError
 from hilstar.notices import Notices
 from hilstar.run.record.backlog import MAX_WAITING_BYTES, Backlog, Entry
-from hilstar.run.record.ledger import Ledger, Split, parse_split
+from hilstar.run.record.ledger import Ledger, Split
 from hilstar.run.record.records import FrameRecord, past_frames
 from hilstar.run.record.report import figures_of, report
 

@@ -1,4 +1,4 @@
-"""The command that compares two frames."""
+"""hilstar compare: two frames, star by star."""
 
 from __future__ import annotations
 
@@ -7,24 +7,26 @@ from typing import Annotated, Any
 
 import typer
 
-from hilstar.cli.common import Json, app
+from hilstar.cli.options import Json
 from hilstar.console.terminal import print_json
-from hilstar.files import check_directory, make_directory
+from hilstar.files import check_directory
 
 MAX_LINES = 10  # of stars; a whole sky that differs is no news star by star
 
 
-@app.command()
 def compare(
-    frame: Annotated[Path, typer.Argument(metavar="A.fits", help="The linear image of `hilstar frame -o`.")],
-    golden: Annotated[Path, typer.Argument(metavar="B.fits", help="The one that it must be like.")],
-    truth: Annotated[Path | None, typer.Option(metavar="TRUTH.csv", help="B's stars, of `hilstar frame --truth`.")] = None,
-    flux_mag: Annotated[float | None, typer.Option(help="How far a star's flux may be off; 0.001 by default.")] = None,
-    centroid_px: Annotated[float | None, typer.Option(help="And its place; 0.001 by default.")] = None,
-    output: Annotated[Path | None, typer.Option("-o", "--output", metavar="DIR", help="A chart and a table.")] = None,
+    frame: Annotated[Path, typer.Argument(metavar="A.fits", help="The linear image from `hilstar frame -o`.")],
+    golden: Annotated[Path, typer.Argument(metavar="B.fits", help="The golden frame that it is compared with.")],
+    truth: Annotated[Path | None, typer.Option(metavar="TRUTH.csv", help="B's stars, from `hilstar frame --truth`.")] = None,
+    flux_mag: Annotated[float | None, typer.Option(help="Largest flux error of a star; 0.001 by default.")] = None,
+    centroid_px: Annotated[float | None, typer.Option(help="Largest centroid error of a star; 0.001 by default.")] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="DIR", help="Directory for a chart and a table.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
-    """Compare two frames star by star: exit code 0 when they are the same sky, 1 when not."""
+    """Compare two frames star by star; exit code 0 if they show the same sky, 1 if not."""
+    from hilstar.files import make_directory
     from hilstar.testing import compare as compare_files
     from hilstar.testing.compare import CENTROID_PX, FLUX_MAG
     from hilstar.testing.files import write_report

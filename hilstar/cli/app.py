@@ -1,0 +1,49 @@
+"""The commands by what they are for, as `hilstar --help` shows them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import typer
+
+from hilstar.cli.benchmark import benchmark
+from hilstar.cli.calibrate.latency import latency
+from hilstar.cli.calibrate.photometric import photometric
+from hilstar.cli.calibrate.plan import plan
+from hilstar.cli.calibrate.scale import scale
+from hilstar.cli.doctor import doctor
+from hilstar.cli.measure.budget import budget
+from hilstar.cli.measure.compare import compare
+from hilstar.cli.measure.simulate import simulate
+from hilstar.cli.measure.verify import verify
+from hilstar.cli.report import report
+from hilstar.cli.show.demo import demo
+from hilstar.cli.show.frame import frame
+from hilstar.cli.show.replay import replay
+from hilstar.cli.show.serve import serve
+from hilstar.cli.stream.convert import convert
+from hilstar.cli.stream.keys import keys
+from hilstar.cli.stream.send import send
+from hilstar.cli.study import study
+
+COMMANDS: dict[str, tuple[Callable[..., None], ...]] = {
+    "Show stars": (demo, frame, serve, replay),
+    "Attitude streams": (send, convert, keys),
+    "Check what is shown": (simulate, verify, compare, budget, report),
+    "Calibrate": (latency,),
+    "Study": (study, benchmark),
+    "This machine": (doctor,),
+}
+
+app = typer.Typer(
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="Show a star tracker on a bench the stars it would see: attitudes in, frames of code values out.",
+)
+calibrate = typer.Typer(help="Calibrate the monitor: its response to measured patches, and the scale of its light.")
+for panel, commands in COMMANDS.items():
+    for command in commands:
+        app.command(rich_help_panel=panel)(command)
+for command in (plan, photometric, scale):
+    calibrate.command()(command)
+app.add_typer(calibrate, name="calibrate", rich_help_panel="Calibrate")

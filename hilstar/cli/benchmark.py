@@ -1,0 +1,58 @@
+"""hilstar benchmark: how long a frame takes, beside other ways to the same image."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hilstar.cli.options import MAX_SEED, Json
+from hilstar.cli.parsers import parse_counts, parse_sizes
+from hilstar.console.terminal import print_json, progress
+from hilstar.errors import InputError
+from hilstar.files import check_directory
+
+OwnBench = Annotated[Path | None, typer.Argument(metavar="[BENCH.toml]", help="Your bench file, at its own image size.")]
+
+
+def benchmark(
+    bench_file: OwnBench = None,
+    quick: Annotated[bool, typer.Option("--quick", help="1920x1080 only, up to 10000 stars: at most half a minute.")] = False,
+    stars: Annotated[str | None, typer.Option(metavar="N,N,...", help="Stars in view.")] = None,
+    sizes: Annotated[str | None, typer.Option(metavar="WxH,WxH,...", help="Image sizes.")] = None,
+    seed: Annotated[int, typer.Option(help="Seed of the random stars beyond the catalogue.", min=0, max=MAX_SEED)] = 1,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="DIR", help="Directory for bench.csv and bench.png.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Time a whole frame and its stages, beside NumPy, numba, GalSim and photutils on the same stars."""
+    import numpy as np
+
+    from hilstar.bench.config import read_config
+    from hilstar.files import make_directory
+    from hilstar.study.speed import benchmark as speed
+    from hilstar.study.speed import report as speed_report
+
+    plan = speed.QUICK if quick else speed.Plan()
+    if stars is not None:
+        plan = replace(plan, counts=parse_counts(stars, speed.MOST_STARS))
+    if bench_file is not None:
+        if sizes is not None:
+            raise InputError(f"benchmark --sizes: {bench_file} has a size of its own; leave out one of them")
+        plan = replace(plan, bench_file=bench_file, sizes=(read_config(bench_file).monitor.resolution_px,))
+    elif sizes is not None:
+        plan = replace(plan, sizes=parse_sizes(sizes))
+    check_directory("-o", output)
+    if output is not None:
+        make_directory(output)
+    with progress("measuring", len(plan.sizes) * len(plan.counts)) as advance:
+        result = speed.run(plan, np.random.default_rng(seed), advance)
+    if output is not None:
+        speed_report.write(result, output)
+    if as_json:
+        print_json(result)
+    else:
+        typer.echo("\n".join(speed_report.lines(result)))

@@ -1,0 +1,94 @@
+"""The door of the command line: what runs a command, and turns each refusal into one line and an exit code."""
+
+from __future__ import annotations
+
+import io
+import logging
+import os
+import re
+import sys
+from typing import NoReturn
+
+import typer
+
+from hilstar.cli.app import app
+from hilstar.console.terminal import fail
+from hilstar.errors import HilstarError, InputError, MachineError
+from hilstar.process import interrupts
+from hilstar.process.stderr import finish_stderr, queue_stderr
+
+INTERRUPTED = 130
+READER_WAITS_S, STOPPED_READER_WAITS_S = 1.0, 0.1  # for a reader of stderr that sleeps, without and with a signal
+SHARE_OPTIONS = ("--lose", "--corrupt", "--reorder")  # may stand alone
+USUAL_SHARE = "5%"
+
+
+def with_shares(words: list[str]) -> list[str]:
+    """The command line with a share after each fault option that stands alone."""
+    complete: list[str] = []
+    for k, word in enumerate(words):
+        following = "".join(words[k + 1 : k + 2])
+        complete.append(word)
+        if word in SHARE_OPTIONS and not re.match(r"[\d.]+%?$", following):
+            complete.append(USUAL_SHARE)
+    return complete
+
+
+def main() -> NoReturn:
+    """Run the command line; every refusal is one line on stderr and the exit code of the design's section 5."""
+    interrupts.install()
+    queue_stderr()
+    logging.basicConfig(format="hilstar: %(message)s", stream=sys.stderr)
+    if sys.stdout is None:  # closed by whoever started us
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115, PTH123 - for as long as the process lives
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="surrogateescape")  # a file's name goes out as the bytes that came in
+    try:
+        code = _run(with_shares(sys.argv[1:]))
+    except SystemExit as end:  # of `fail`
+        code = end.code if isinstance(end.code, int) else 1
+    finish_stderr(READER_WAITS_S if interrupts.caught() is None else STOPPED_READER_WAITS_S)
+    interrupts.leave(code)
+
+
+def _run(words: list[str]) -> int:
+    """The exit code of a command; SystemExit where it is refused."""
+    try:
+        code = int(app(words, standalone_mode=False) or 0)
+        sys.stdout.flush()
+        if code == INTERRUPTED:  # typer turns Ctrl-C into this code, and says nothing
+            fail("stopped", interrupts.exit_code())
+        return code
+    except HilstarError as error:
+        fail(str(error), error.exit_code)
+    except (KeyboardInterrupt, typer.Abort):
+        fail("stopped", interrupts.exit_code())
+    except BrokenPipeError:
+        # Whoever read our output has gone: nothing is left to say.
+        _let_go_of_stdout()
+        return 1
+    except Exception as error:
+        # typer's usage errors have no public base class in all its versions; they can format themselves.
+        message = getattr(error, "format_message", None)
+        if message is not None:
+            fail(f"{message()} (see hilstar --help)", InputError.exit_code)
+        _fail_for_the_machine(error)
+        raise
+
+
+def _fail_for_the_machine(error: Exception) -> None:
+    """Refuse what the machine refuses: an output that takes no more, a file that went away, memory that is not there."""
+    if isinstance(error, OSError) and error.strerror:
+        what = "stdout, or a file that it names"
+        if isinstance(error.filename, str | bytes):
+            what = os.fsdecode(error.filename)
+        else:
+            _let_go_of_stdout()
+        fail(f"{what}: cannot be written or read ({error.strerror}); choose another place", InputError.exit_code)
+    if isinstance(error, MemoryError):
+        fail("not enough memory for this; give smaller files or sizes", MachineError.exit_code)
+
+
+def _let_go_of_stdout() -> None:
+    """Python must not try once more at exit."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

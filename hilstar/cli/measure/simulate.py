@@ -1,0 +1,99 @@
+"""hilstar simulate: the virtual tracker's image of the sky."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from hilstar.cli.options import MAX_SEED, BenchFile, Json, QuaternionText, RadecText, check_files
+from hilstar.cli.parsers import parse_attitude, parse_rate
+from hilstar.console.terminal import print_json, progress, say
+from hilstar.errors import InputError
+from hilstar.files import FITS, PNG, PNG_OR_TIFF, check_directory, check_ending
+
+
+def simulate(
+    bench_file: BenchFile,
+    radec: RadecText = None,
+    quaternion: QuaternionText = None,
+    rate: Annotated[
+        str | None, typer.Option(metavar="X,Y,Z", help="Angular rate of the camera about its own axes, deg/s.")
+    ] = None,
+    log: Annotated[
+        Path | None, typer.Option(metavar="LOG", help="Simulate frames along a log, into the directory given by -o.")
+    ] = None,
+    frames: Annotated[
+        int | None, typer.Option(help="With --log: this many, evenly spaced; by default one for each sample.", min=1)
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Seed of the frame's noise.", min=0, max=MAX_SEED)] = 0,
+    noise: Annotated[Literal["full", "none"], typer.Option(help="The detector's full noise, or none.")] = "full",
+    output: Annotated[Path | None, typer.Option("-o", "--output", metavar="OUT.fits", help="The image in DN, uint16.")] = None,
+    png: Annotated[Path | None, typer.Option(metavar="OUT.png", help="A picture stretched for the eye.")] = None,
+    dn_png: Annotated[Path | None, typer.Option(metavar="OUT.png|.tif", help="The DN themselves, as 16-bit greyscale.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Simulate the virtual tracker's image of the sky, with noise."""
+    import numpy as np
+
+    from hilstar.twin import exposure_files as files
+    from hilstar.twin.simulator import Simulator
+
+    if log is not None:
+        if output is None or radec or quaternion or rate or png or dn_png:
+            raise InputError("simulate --log LOG: give -o DIR, and no --radec, --quaternion, --rate, --png or --dn-png")
+        check_directory("-o", output)
+        simulate_log(bench_file, log, frames, (noise, seed), output)
+        return
+    targets = [path for path in (output, png, dn_png) if path is not None]
+    if not targets:
+        raise InputError("simulate: no output was asked for; add -o OUT.fits, --png OUT.png or --dn-png OUT.png")
+    check_ending("-o", output, FITS)
+    check_ending("--png", png, PNG)
+    check_ending("--dn-png", dn_png, PNG_OR_TIFF)
+    check_files([], targets, bench_file)
+    q = parse_attitude("simulate", radec, quaternion)
+    rate_rad_s = parse_rate(rate) if rate else np.zeros(3)
+    with Simulator(bench_file) as simulator:
+        rng = None if noise == "none" else np.random.default_rng(seed)
+        exposure = simulator.expose(simulator.motion(q, rate_rad_s), rng)
+        if output is not None:
+            files.write_exposure_fits(output, simulator, exposure, noise, seed)
+        if png is not None:
+            files.write_exposure_png(png, exposure.dn)
+        if dn_png is not None:
+            files.write_dn_picture(dn_png, exposure.dn)
+        summary = {
+            "stars": len(exposure.truth),
+            "clipped": exposure.truth["hip"][exposure.truth["clipped"]].tolist(),
+            "capped": exposure.capped,
+            "dn": {"min": int(exposure.dn.min()), "mean": float(exposure.dn.mean()), "max": int(exposure.dn.max())},
+            "written": [str(path) for path in targets],
+            "gl_renderer": simulator.renderer.gl_renderer,
+        }
+    if as_json:
+        print_json(summary)
+    else:
+        dn = summary["dn"]
+        typer.echo(f"{summary['stars']} stars, DN {dn['min']} to {dn['max']}; wrote {', '.join(summary['written'])}")
+
+
+def simulate_log(
+    bench_file: Path, log: Path, frames: int | None, noise_and_seed: tuple[Literal["full", "none"], int], output: Path
+) -> None:
+    """The virtual tracker along a log."""
+    from hilstar.attitude.logs.gaps import log_joins
+    from hilstar.attitude.logs.log_file import read_log
+    from hilstar.bench.config import read_config
+    from hilstar.twin.batch import log_motions, simulate_motions
+
+    samples = read_log(log)
+    for _, line in log_joins(samples).told:
+        say(line)
+    config = read_config(bench_file)
+    motions = log_motions(samples, frames, config.tracker.exposure_s, math.radians(config.attitude.max_rate_deg_s))
+    with progress("exposing", len(motions)) as advance:
+        simulate_motions(bench_file, motions, *noise_and_seed, output, advance)
+    typer.echo(f"{len(motions)} exposures in {output}")

@@ -1,0 +1,157 @@
+"""The options that hold more than one word or number: texts in, values out, each refusal with the form to write."""
+
+from __future__ import annotations
+
+import math
+import re
+from typing import TYPE_CHECKING, Any
+
+from hilstar.errors import InputError
+
+if TYPE_CHECKING:
+    from hilstar.arrays import FloatArray
+    from hilstar.calibrate.scale import Reading
+    from hilstar.run.record.ledger import Split
+
+SPIN_AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+MAX_SPIN_RAD_S = 1e6
+DEFAULT_BAUD = 115_200
+SPIN_FORM = "--spin AXIS,DEG_PER_S, AXIS being x, y, z or three numbers (cam axes), such as --spin z,0.5"
+SPEED_FORM = "write --speed realtime, max, or a number such as 2 or 0.5"
+SPLIT_FORM = "write a size or a time, such as 1GB, 200MB, 1h or 30min; 1 MB or 10 s at minimum"
+SPLIT_UNITS = {"kB": 1e3, "MB": 1e6, "GB": 1e9, "s": 1.0, "min": 60.0, "h": 3600.0}
+READING_FORM = "write --reading HIP,DN: a star's Hipparcos number, and the sum of its DN over the background"
+MIN_SPLIT_BYTES, MIN_SPLIT_S = 1e6, 10.0
+MAX_SIZE_PX = 32768
+
+
+def parse_attitude(command: str, radec: str | None, quaternion: str | None) -> Any:
+    """The one attitude that the command line gives."""
+    from hilstar.bench.build import checked_quaternion
+    from hilstar.rotation import from_radec_roll_deg
+
+    if (radec is None) == (quaternion is None):
+        raise InputError(f"{command}: give the attitude with either --radec RA,DEC,ROLL or --quaternion W,X,Y,Z")
+    if radec is not None:
+        return from_radec_roll_deg(*parse_radec(radec))
+    return checked_quaternion(parse_numbers(quaternion or "", 4, "--quaternion", "W,X,Y,Z"))
+
+
+def parse_numbers(text: str, count: int, option: str, form: str) -> list[float]:
+    """`count` finite numbers with commas between them. Raises InputError that shows `form`."""
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError as error:
+        raise InputError(f"{option} {text}: write {form}") from error
+    if len(numbers) != count or not all(map(math.isfinite, numbers)):
+        raise InputError(f"{option} {text}: write {count} finite numbers, {form}")
+    return numbers
+
+
+def parse_radec(text: str) -> tuple[float, float, float]:
+    """Right ascension, declination and roll in degrees."""
+    ra_deg, dec_deg, roll_deg = parse_numbers(text, 3, "--radec", "RA,DEC,ROLL in degrees")
+    if not -90 <= dec_deg <= 90:
+        raise InputError(f"--radec {text}: write a declination from -90 to 90")
+    return ra_deg, dec_deg, roll_deg
+
+
+def parse_rate(text: str) -> FloatArray:
+    """A rate in rad/s, cam components (3,), of "X,Y,Z" in deg/s."""
+    import numpy as np
+
+    return np.radians(parse_numbers(text, 3, "--rate", "X,Y,Z in deg/s"))
+
+
+def parse_spin(text: str) -> FloatArray:
+    """The rate in rad/s, cam components (3,), of "AXIS,DEG_PER_S"."""
+    import numpy as np
+
+    *axis, rate_text = [part.strip() for part in text.split(",")]
+    try:
+        rate = math.radians(float(rate_text))
+        vector = np.array(SPIN_AXES[axis[0].lower()] if len(axis) == 1 else [float(part) for part in axis])
+    except (ValueError, KeyError, IndexError) as error:
+        raise InputError(f"--spin {text}: write {SPIN_FORM}") from error
+    length = math.hypot(*vector)
+    if len(vector) != 3 or not (abs(rate) <= MAX_SPIN_RAD_S and 0 < length < math.inf):
+        raise InputError(f"--spin {text}: write {SPIN_FORM}")
+    return np.asarray(vector / length * rate)
+
+
+def parse_serial(text: str, option: str) -> tuple[str, int] | None:
+    """Port and baud rate of "serial:/dev/ttyX@BAUD"; None for any other target. Raises InputError."""
+    if not text.startswith("serial:"):
+        return None
+    match = re.fullmatch(r"serial:(.+?)(?:@(\d{1,8}))?", text)
+    if match is None or not match[1] or "@" in match[1] or (match[2] and not int(match[2])):
+        raise InputError(f"{option} {text}: write serial:/dev/ttyX@BAUD, such as serial:/dev/ttyUSB0@921600")
+    return match[1], int(match[2] or DEFAULT_BAUD)
+
+
+def parse_share(text: str, option: str) -> float:
+    """A share from "5%" or "0.05". Raises InputError."""
+    match = re.fullmatch(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*(%?)\s*", text)
+    share = float(match[1]) / (100.0 if match[2] else 1.0) if match else 2.0
+    if share > 1.0:
+        raise InputError(f"{option} {text}: write a fraction of the packets, such as 5% or 0.05")
+    return share
+
+
+def parse_speed(text: str) -> float:
+    """The factor of real time of `--speed`: 1 for realtime, infinite for max. Raises InputError."""
+    named = {"realtime": 1.0, "max": math.inf}
+    if text in named:
+        return named[text]
+    try:
+        factor = float(text)
+    except ValueError as error:
+        raise InputError(f"--speed {text}: {SPEED_FORM}") from error
+    if not 1e-3 <= factor <= 1e3:
+        raise InputError(f"--speed {text}: {SPEED_FORM}, from 0.001 to 1000")
+    return factor
+
+
+def parse_split(text: str | None) -> Split:
+    """The split of "1GB" or "1h". Raises InputError."""
+    from hilstar.run.record.ledger import NO_SPLIT, Split
+
+    if text is None:
+        return NO_SPLIT
+    match = re.fullmatch(r"(\d{1,9}(?:\.\d{1,9})?)\s*(kB|MB|GB|s|min|h)", text.strip())
+    value = float(match[1]) * SPLIT_UNITS[match[2]] if match else 0.0
+    if match is None or value < (MIN_SPLIT_BYTES if match[2].endswith("B") else MIN_SPLIT_S):
+        raise InputError(f"--ledger-split {text}: {SPLIT_FORM}")
+    return Split(bytes=value) if match[2].endswith("B") else Split(seconds=value)
+
+
+def parse_reading(text: str) -> Reading:
+    """A reading from "HIP,DN". Raises InputError."""
+    from hilstar.calibrate.scale import Reading
+
+    parts = text.split(",")
+    try:
+        reading = Reading(int(parts[0]), float(parts[1]))
+    except (ValueError, IndexError) as error:
+        raise InputError(f"--reading {text}: {READING_FORM}") from error
+    if len(parts) != 2 or not 0 < reading.dn < math.inf:
+        raise InputError(f"--reading {text}: {READING_FORM}")
+    return reading
+
+
+def parse_counts(text: str, most: int) -> tuple[int, ...]:
+    """Star counts, each once, from "100,1000". Raises InputError."""
+    parts = text.split(",")
+    if not all(re.fullmatch(r"[1-9]\d{0,8}", part) and int(part) <= most for part in parts):
+        raise InputError(f"--stars {text}: write whole numbers from 1 to {most} with commas between them, such as 100,1000")
+    return tuple(dict.fromkeys(map(int, parts)))
+
+
+def parse_sizes(text: str) -> tuple[tuple[int, int], ...]:
+    """Image sizes, each once, from "640x480,1920x1080". Raises InputError."""
+    found = [re.fullmatch(r"([1-9]\d{0,4})x([1-9]\d{0,4})", part) for part in text.split(",")]
+    if not all(match and max(int(match[1]), int(match[2])) <= MAX_SIZE_PX for match in found):
+        raise InputError(
+            f"--sizes {text}: write WIDTHxHEIGHT, up to {MAX_SIZE_PX} px, with commas between them, such as 640x480,1920x1080"
+        )
+    return tuple(dict.fromkeys((int(match[1]), int(match[2])) for match in found if match))

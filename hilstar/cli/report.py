@@ -1,0 +1,33 @@
+"""hilstar report: a run on one page."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hilstar.cli.options import Json, RunFile
+from hilstar.console.terminal import print_json
+from hilstar.files import check_directory
+
+
+def report(
+    ledger: RunFile,
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Directory for report.html and its charts.")],
+    as_json: Json = False,
+) -> None:
+    """Report a run on one page with charts: timing, attitude age, missed frames and memory."""
+    from hilstar.files import make_directory
+    from hilstar.run.record.report import report as write_report
+    from hilstar.run.record.report import table_rows
+
+    check_directory("-o", output)
+    make_directory(output)
+    summary = write_report(ledger, output)
+    if as_json:
+        print_json(summary)
+        return
+    for what, how_much in table_rows(summary):
+        typer.echo(f"{what:32}{how_much}")
+    typer.echo(f"{'page':32}{output / 'report.html'}")

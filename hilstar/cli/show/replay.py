@@ -1,0 +1,77 @@
+"""hilstar replay: an attitude log on the monitor."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from hilstar.cli.options import LOG_HELP, BenchFile, Explain, Headless, Json, Overwrite, check_files
+from hilstar.cli.parsers import parse_speed, parse_split
+from hilstar.cli.show.running import (
+    Force,
+    LedgerFile,
+    LedgerSplit,
+    Windowed,
+    end_of_run,
+    explain_effort,
+    optional_ledger,
+    say_what_clips,
+    shown_bench,
+)
+from hilstar.console.terminal import progress
+from hilstar.files import MCAP, check_directory, check_ending
+from hilstar.notices import Notices
+
+
+def replay(
+    bench_file: BenchFile,
+    log: Annotated[Path, typer.Argument(metavar="LOG", help=LOG_HELP)],
+    speed: Annotated[
+        str, typer.Option(metavar="realtime|max|N", help="Real time, as fast as possible, or N times real time.")
+    ] = "realtime",
+    start: Annotated[float | None, typer.Option(metavar="S", help="Start this many seconds after the first sample.")] = None,
+    stop: Annotated[float | None, typer.Option(metavar="S", help="Stop this many seconds after the first sample.")] = None,
+    step: Annotated[float | None, typer.Option(metavar="S", help="Time step of the log between frames, in seconds.")] = None,
+    headless: Headless = False,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="DIR", help="Directory for a PNG of each frame, and frames.csv.")
+    ] = None,
+    ledger: LedgerFile = None,
+    ledger_split: LedgerSplit = None,
+    overwrite: Overwrite = False,
+    windowed: Windowed = False,
+    force: Force = False,
+    explain: Explain = False,
+    as_json: Json = False,
+) -> None:
+    """Show an attitude log on the monitor."""
+    from hilstar.bench.config import read_config
+    from hilstar.run.record.frame_sequence import FrameRecorder
+    from hilstar.run.replay import Wanted, plan_play
+    from hilstar.run.serve import Outlet
+    from hilstar.run.serve import replay as replay_log
+
+    check_directory("-o", output)
+    check_ending("--ledger", ledger, MCAP)
+    check_files([log], [None if output is None else output / "frames.csv"], bench_file, ledger, overwrite)
+    split = parse_split(ledger_split)
+    notices = Notices()
+    play = plan_play(log, Wanted(parse_speed(speed), start, stop, step), read_config(bench_file))
+    with (
+        shown_bench(bench_file, headless, windowed, force) as (bench, screen),
+        FrameRecorder(output, bench) as record,
+        optional_ledger(ledger, bench, notices, overwrite, split) as kept,
+        progress("replaying", play.frame_count) as advance,
+    ):
+        say_what_clips(bench)
+        if explain:
+            explain_effort(bench)
+
+        def sink(shown: Any) -> None:
+            record(shown)
+            advance(shown.number + 1)
+
+        summary = replay_log(bench, play, sink, Outlet(screen, kept, notices))
+    end_of_run(summary, screen, kept, as_json)

@@ -1,0 +1,92 @@
+"""What serve and replay share: the bench on its screen, the ledger, and the end of a run."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from hilstar.console.terminal import report, say
+from hilstar.errors import MachineError
+from hilstar.notices import Notices
+from hilstar.process.interrupts import stop_on_signal
+
+Windowed = Annotated[bool, typer.Option("--windowed", help="A window on the desktop instead of the full display.")]
+Force = Annotated[
+    bool, typer.Option("--force", help="Show on a display that the start-up checks refuse; the refusal is logged.")
+]
+LedgerFile = Annotated[
+    Path | None, typer.Option("--ledger", metavar="RUN.mcap", help="Record every packet and every frame in this file.")
+]
+
+LedgerSplit = Annotated[
+    str | None,
+    typer.Option("--ledger-split", metavar="1GB|1h", help="Continue in RUN.0001.mcap and so on after this size or time."),
+]
+
+
+def explain_effort(bench: Any) -> None:
+    """Say what was chosen within the bench file's tolerance."""
+    from hilstar.bench.effort import explain
+
+    for line in explain(bench.effort, bench.config.render):
+        say(line)
+
+
+@contextmanager
+def shown_bench(bench_file: Path, headless: bool, windowed: bool, force: bool) -> Iterator[tuple[Any, Any]]:
+    """The bench, and the screen that it is on; None when headless."""
+    if headless:
+        from hilstar.bench.build import load
+
+        with load(bench_file) as bench:
+            yield bench, None
+        return
+    from hilstar.run.screen.screen import open_screen
+
+    with open_screen(bench_file, windowed=windowed, force=force) as screen:
+        yield screen.bench, screen
+
+
+def say_what_clips(bench: Any) -> None:
+    """Name the stars that this bench cannot show as bright as they are."""
+    from hilstar.bench.white import clipping_line
+
+    line = clipping_line(bench)
+    if line is not None:
+        say(line)
+
+
+@contextmanager
+def optional_ledger(path: Path | None, bench: Any, notices: Notices, overwrite: bool, split: Any) -> Iterator[Any]:
+    """The run's ledger, which keeps the run's events too, or nothing where none was asked for."""
+    from hilstar.run.record.ledger import Ledger
+
+    if path is None:
+        yield None
+        return
+    ledger = Ledger(path, bench, notices, overwrite, split)
+    notices.listen(ledger.notice)
+    try:
+        yield ledger
+    finally:
+        with stop_on_signal(threading.Event()):  # a signal that comes now does not interrupt this
+            ledger.close()
+
+
+def end_of_run(summary: dict[str, Any], screen: Any, ledger: Any, as_json: bool) -> None:
+    """The summary of a run whose ledger is closed; exit code 1 where that has failed.
+
+    Raises MachineError where its window went away.
+    """
+    if ledger is not None:
+        summary |= {"ledger": ledger.summary()}
+    report(summary, as_json)
+    if screen is not None and screen.window.gone is not None:
+        raise MachineError(f"the run ended early: {screen.window.gone}")
+    if ledger is not None and ledger.failure is not None:
+        raise typer.Exit(1)

@@ -1,0 +1,69 @@
+"""hilstar serve: the live attitude stream on the monitor."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated
+
+import typer
+
+from hilstar.cli.options import BenchFile, Explain, Headless, Json, Overwrite, check_files
+from hilstar.cli.parsers import parse_split
+from hilstar.cli.show.running import (
+    Force,
+    LedgerFile,
+    LedgerSplit,
+    Windowed,
+    end_of_run,
+    explain_effort,
+    optional_ledger,
+    say_what_clips,
+    shown_bench,
+)
+from hilstar.console.terminal import progress, say
+from hilstar.files import MCAP, check_ending
+from hilstar.notices import Notices
+
+NO_ATTITUDE = 4  # the exit code of a run that never had one
+
+
+def serve(
+    bench_file: BenchFile,
+    headless: Headless = False,
+    duration: Annotated[float | None, typer.Option(help="Seconds to run; by default until Ctrl-C.", min=0, max=1e8)] = None,
+    frames: Annotated[int | None, typer.Option(help="Number of frames to draw.", min=1)] = None,
+    ledger: LedgerFile = None,
+    ledger_split: LedgerSplit = None,
+    overwrite: Overwrite = False,
+    windowed: Windowed = False,
+    force: Force = False,
+    explain: Explain = False,
+    as_json: Json = False,
+) -> None:
+    """Show the live attitude stream on the monitor."""
+    from hilstar.bench.config import read_config
+    from hilstar.run.loop import Limit
+    from hilstar.run.serve import Outlet, open_link
+    from hilstar.run.serve import serve as serve_stream
+
+    check_ending("--ledger", ledger, MCAP)
+    check_files([], [], bench_file, ledger, overwrite)
+    split = parse_split(ledger_split)
+    notices = Notices()
+    with (
+        open_link(read_config(bench_file).attitude, bench_file.parent, notices) as link,
+        shown_bench(bench_file, headless, windowed, force) as (bench, screen),
+        optional_ledger(ledger, bench, notices, overwrite, split) as kept,
+    ):
+        if explain:
+            explain_effort(bench)
+        refresh_hz = bench.config.monitor.refresh_hz
+        slots = math.inf if duration is None else round(duration * refresh_hz)
+        limit = Limit(slots, math.inf if frames is None else frames)
+        say(f"{link.verb} {link.endpoint}, {refresh_hz:g} Hz, {bench.renderer.gl_renderer}")
+        say_what_clips(bench)
+        with progress("serving", min(limit.slots, limit.frames)) as advance:
+            summary = serve_stream(bench, link, limit, lambda shown: advance(shown.number + 1), Outlet(screen, kept, notices))
+    end_of_run(summary, screen, kept, as_json)
+    if not summary["packets"]["accepted"]:
+        raise typer.Exit(NO_ATTITUDE)

@@ -1,0 +1,26 @@
+"""hilstar keys: CURVE keys for ZeroMQ beyond loopback."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hilstar.console.terminal import say
+from hilstar.files import check_directory
+
+
+def keys(
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Directory for the keys.")] = Path(
+        "hilstar-keys"
+    ),
+) -> None:
+    """Make CURVE keys for ZeroMQ: non-loopback endpoints require them."""
+    from hilstar.attitude.wire.keys import make_keys
+
+    check_directory("-o", output)
+    for path in make_keys(output):
+        typer.echo(str(path))
+    say("the side that binds needs server.key_secret and allowed_clients")
+    say("the side that connects needs client.key_secret and server.key")

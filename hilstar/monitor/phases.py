@@ -33,8 +33,8 @@ def phase_grid(count: int, sigma_px: tuple[float, float] = SIGMA_PX) -> tuple[Sp
     place = (np.arange(count) + 0.5) * tile + (np.arange(count) + 0.5) / count - 0.5
     x_px, y_px = (axis.ravel() for axis in np.meshgrid(place, place))
     flux = np.full(count**2, WHITE / peak_share(sigma_px))
-    frame = ((count * tile, count * tile), footprint_px(sigma_px))
-    return pack_sprites(x_px, y_px, flux, np.arange(count**2), frame), tile
+    size_px = count * tile, count * tile
+    return pack_sprites(x_px, y_px, flux, np.arange(count**2), size_px, footprint_px(sigma_px)), tile
 
 
 def fainter(sprites: Sprites, mag: float) -> Sprites:

@@ -132,7 +132,7 @@ class _Smear:
         x_px, y_px = paths.places_px(nodes.path, (2 * share - 1) * half_s)
         star = near[nodes.path]
         light = nodes.share * (end - begin)[nodes.path] * part * stars.electrons_per_s[star]
-        return pack_sprites(x_px, y_px, light, star, (camera.resolution_px, self.footprint_px))
+        return pack_sprites(x_px, y_px, light, star, camera.resolution_px, self.footprint_px)
 
     def _nodes(self, paths: Paths, half_s: float) -> tuple[IntArray, FloatArray, FloatArray]:
         """How many nodes each star's path needs on the image (0: it is not there), and the part of the piece it is there.

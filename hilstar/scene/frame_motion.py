@@ -97,7 +97,7 @@ def swept_sprites(
     x_px, y_px = paths.places_px(nodes.path, seconds)
     star = near[nodes.path]
     light = nodes.share * length * stars.electrons_per_s[star]
-    sprites = pack_sprites(x_px, y_px, light, star, (camera.resolution_px, footprint_px))
+    sprites = pack_sprites(x_px, y_px, light, star, camera.resolution_px, footprint_px)
     capped = int(((wanted > 0) if slowed else (counts < wanted)).sum())
     return replace(sprites, per_star=int(counts.max(initial=1)), capped=capped)
 

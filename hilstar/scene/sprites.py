@@ -55,7 +55,7 @@ def make_sprites(stars: Stars, icrs_to_image: FloatArray, camera: Camera, footpr
     """
     near = stars.grid.near(icrs_to_image[2], camera.field_radius_rad(footprint_px / 2 + 1))
     x_px, y_px = camera.project(stars.vectors[near] @ icrs_to_image.T)
-    sprites = pack_sprites(x_px, y_px, stars.electrons_per_s[near], near, (camera.resolution_px, footprint_px))
+    sprites = pack_sprites(x_px, y_px, stars.electrons_per_s[near], near, camera.resolution_px, footprint_px)
     kept = brightest(sprites.data["electrons_per_s"], max_stars(footprint_px))
     if kept is None:
         return sprites
@@ -77,13 +77,18 @@ def brightest(electrons_per_s: npt.NDArray[np.floating[Any]], count: int) -> Int
 
 
 def pack_sprites(
-    x_px: FloatArray, y_px: FloatArray, electrons_per_s: FloatArray, star: IntArray, frame: tuple[tuple[int, int], int]
+    x_px: FloatArray,
+    y_px: FloatArray,
+    electrons_per_s: FloatArray,
+    star: IntArray,
+    size_px: tuple[int, int],
+    footprint_px: int,
 ) -> Sprites:
-    """Sprites at `x_px`, `y_px` (n,), those left out whose footprints miss the image; NaN misses it.
+    """Sprites of the stars at `x_px`, `y_px` (n,) whose footprints touch an image of `size_px` (width, height).
 
-    `frame` is the image's (width, height) and the footprint's side, px.
+    `footprint_px` is the side of a footprint. A star at NaN touches no image.
     """
-    (width, height), footprint_px = frame
+    width, height = size_px
     # An odd footprint has the star in its middle pixel, an even one within half a pixel of its middle corner.
     bias = 0.5 if footprint_px % 2 else 0.0
     pixel_x, pixel_y = np.floor(x_px + bias), np.floor(y_px + bias)

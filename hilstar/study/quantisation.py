@@ -110,7 +110,7 @@ def _frame_ms(bits: int, way: Way, repeats: int) -> float:
     mag = 2 * np.log10(1 + share * (10 ** (8 / 2) - 1))
     flux = WHITE / peak_share(SIGMA_PX) * flux_ratio(mag)
     x_px, y_px = rng.uniform(0, 1, (2, STARS)) * np.array(FRAME_PX)[:, None]
-    sprites = pack_sprites(x_px, y_px, flux, np.arange(STARS), (FRAME_PX, footprint_px(SIGMA_PX)))
+    sprites = pack_sprites(x_px, y_px, flux, np.arange(STARS), FRAME_PX, footprint_px(SIGMA_PX))
     target = Target(FRAME_PX, SIGMA_PX, response_of(bits, way), WHITE, way.method)
     times = []
     with Renderer(target) as renderer:

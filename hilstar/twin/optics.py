@@ -93,8 +93,8 @@ class TwinOptics:
         dx, dy = (step.ravel() for step in np.meshgrid(steps, steps))
         x_px, y_px = self.mounting.to_tracker((columns[:, None] + dx).ravel(), (rows[:, None] + dy).ravel())
         light = np.repeat(light_e_per_s / SUB**2, SUB**2)
-        frame = (self.mounting.tracker.resolution_px, self._renderer.footprint_px)
-        self._renderer.draw(pack_sprites(x_px, y_px, light, np.zeros(len(light), dtype=np.intp), frame))
+        star, size_px = np.zeros(len(light), dtype=np.intp), self.mounting.tracker.resolution_px
+        self._renderer.draw(pack_sprites(x_px, y_px, light, star, size_px, self._renderer.footprint_px))
         return self._renderer.linear().astype(np.float64)
 
     def glow_e_per_s(self, panel: Panel) -> FloatArray:

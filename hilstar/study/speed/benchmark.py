@@ -157,8 +157,7 @@ def _directions(bench: Bench, q: FloatArray, wanted: int, rng: np.random.Generat
         across = np.sqrt(1 - z**2)
         vectors = np.stack([across * np.cos(turn), across * np.sin(turn), z], axis=1)
         x_px, y_px = camera.project(vectors)
-        frame = camera.resolution_px, footprint_px
-        seen = pack_sprites(x_px, y_px, z, np.arange(tries), frame).star
+        seen = pack_sprites(x_px, y_px, z, np.arange(tries), camera.resolution_px, footprint_px).star
         if len(seen) >= wanted:
             return np.asarray(vectors[: seen[wanted - 1] + 1] @ (camera.cam_to_image @ to_matrix(q)))
         tries *= 2
@@ -234,7 +233,7 @@ class Cell:
         culled = time.perf_counter()
         # make_sprites in its two halves.
         x_px, y_px = camera.project(stars.vectors[near] @ self.icrs_to_image.T)
-        sprites = pack_sprites(x_px, y_px, stars.electrons_per_s[near], near, (camera.resolution_px, footprint_px))
+        sprites = pack_sprites(x_px, y_px, stars.electrons_per_s[near], near, camera.resolution_px, footprint_px)
         projected = time.perf_counter()
         self.staged.draw(sprites)
         self.staged.codes()

@@ -22,7 +22,7 @@ INSTALL = "pip install 'hilstar[benchmark]'"
 FWHM_PER_SIGMA = 2 * math.sqrt(2 * math.log(2))
 Sigma = tuple[float, float]
 _ONE = np.ones(1)
-FIRST = pack_sprites(_ONE, _ONE, _ONE, np.zeros(1, dtype=np.intp), ((8, 8), 4)), (0.85, 0.85), (8, 8)
+FIRST = pack_sprites(_ONE, _ONE, _ONE, np.zeros(1, dtype=np.intp), (8, 8), 4), (0.85, 0.85), (8, 8)
 Draw = Callable[[Sprites, Sigma, tuple[int, int]], Float32Array]
 
 

@@ -123,7 +123,7 @@ def _camera(half_field_deg: float) -> Camera:
 
 def _on_image(places_px: FloatArray, camera: Camera) -> int:
     flux, star = np.ones(len(places_px)), np.arange(len(places_px), dtype=np.intp)
-    return len(pack_sprites(places_px[:, 0], places_px[:, 1], flux, star, (camera.resolution_px, 1)))
+    return len(pack_sprites(places_px[:, 0], places_px[:, 1], flux, star, camera.resolution_px, 1))
 
 
 def field_of_180_deg() -> Place:

@@ -54,7 +54,7 @@ def target(sigma_px: float, size_px: tuple[int, int] = IMAGE_PX) -> Target:
 def one_star(x_px: float, y_px: float, on: Target, electrons_per_s: float = 1.0) -> Sprites:
     """A star of a target's sigma."""
     place = np.array([x_px]), np.array([y_px]), np.array([electrons_per_s])
-    return pack_sprites(*place, np.zeros(1, dtype=np.intp), (on.resolution_px, footprint_px(on.sigma_px)))
+    return pack_sprites(*place, np.zeros(1, dtype=np.intp), on.resolution_px, footprint_px(on.sigma_px))
 
 
 @contextmanager
@@ -263,10 +263,10 @@ def many_stars() -> Place:
     x_px, y_px = rng.uniform(10, CROWD_PX[0] - 11, (2, CROWD))
     flux = 10 ** rng.uniform(0, 4, CROWD)
     on, size = target(SIGMA_PX, CROWD_PX), (CORNER_PX, CORNER_PX)
-    sprites = pack_sprites(x_px, y_px, flux, np.arange(CROWD), (CROWD_PX, footprint_px(on.sigma_px)))
+    sprites = pack_sprites(x_px, y_px, flux, np.arange(CROWD), CROWD_PX, footprint_px(on.sigma_px))
     with by_renderer(on) as draw:
         image = draw(sprites)
-    corner = linear_image(pack_sprites(x_px, y_px, flux, np.arange(CROWD), (size, sprites.footprint_px)), size, (SIGMA_PX,) * 2)
+    corner = linear_image(pack_sprites(x_px, y_px, flux, np.arange(CROWD), size, sprites.footprint_px), size, (SIGMA_PX,) * 2)
     pixel_error = float(np.abs(image[:CORNER_PX, :CORNER_PX] - corner).max() / corner.max())
     error, fault = (float(abs(shown.sum() / flux.sum() - 1)) for shown in (image, _indexed_sum(sprites)))
     return Place(

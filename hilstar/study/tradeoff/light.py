@@ -104,7 +104,7 @@ def _psf_errors(size_px: int, image: Callable[[Sprites], FloatArray]) -> tuple[f
     place = (np.arange(PHASES) + 0.5) * TILE_PX + (np.arange(PHASES) + 0.5) / PHASES - 0.5
     x_px, y_px = (axis.ravel() for axis in np.meshgrid(place, place))
     flux, star = np.full(PHASES**2, WHITE / peak_share(SIGMA_PX)), np.arange(PHASES**2)
-    sprites = pack_sprites(x_px, y_px, flux, star, ((side, side), size_px))
+    sprites = pack_sprites(x_px, y_px, flux, star, (side, side), size_px)
     bright = linear_image(sprites, (side, side), SIGMA_PX, TILE_PX)
     errors = [measure(bright * flux_ratio(mag), image(fainter(sprites, mag)).copy(), TILE_PX) for mag in (0.0, FAINTER_MAG)]
     return max(e.flux_max_mag for e in errors), max(e.centroid_max_px for e in errors)
@@ -116,7 +116,7 @@ def star_field(frame_px: tuple[int, int], size_px: int) -> Sprites:
     mag = 2 * np.log10(1 + rng.uniform(size=STARS) * (10 ** (8 / 2) - 1))
     flux = WHITE / peak_share(SIGMA_PX) * flux_ratio(mag)
     x_px, y_px = rng.uniform(0, 1, (2, STARS)) * np.array(frame_px)[:, None]
-    return pack_sprites(x_px, y_px, flux, np.arange(STARS), (frame_px, size_px))
+    return pack_sprites(x_px, y_px, flux, np.arange(STARS), frame_px, size_px)
 
 
 def quantisation(stack: ExitStack, quick: bool) -> Trials:

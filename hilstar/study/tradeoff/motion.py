@@ -132,8 +132,8 @@ def _chain(stars: Stars, motion: Motion, at: FloatArray, share: FloatArray) -> S
     x_px, y_px = _places_px(stars, motion, at)
     light = np.outer(share, stars.electrons_per_s)
     star = np.broadcast_to(np.arange(len(stars)), x_px.shape)
-    frame = (CAMERA.resolution_px, footprint_px(TRACKER.psf_sigma_px))
-    return pack_sprites(x_px.ravel(), y_px.ravel(), light.ravel(), star.ravel(), frame)
+    side = footprint_px(TRACKER.psf_sigma_px)
+    return pack_sprites(x_px.ravel(), y_px.ravel(), light.ravel(), star.ravel(), CAMERA.resolution_px, side)
 
 
 def _places_px(stars: Stars, motion: Motion, at: FloatArray) -> tuple[FloatArray, FloatArray]:

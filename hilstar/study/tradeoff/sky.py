@@ -107,11 +107,11 @@ class Road:
         scale = kind(camera.focal_length_px) / z
         cx, cy = (kind(c) for c in camera.principal_point_px)
         x, y = x * scale + cx, y * scale + cy
-        star, frame = np.arange(len(vectors)), (camera.resolution_px, footprint_px(SIGMA_PX))
+        star, (width, height), side = np.arange(len(vectors)), camera.resolution_px, footprint_px(SIGMA_PX)
         if self.dtype == SPRITE_DTYPE:
-            sprites = pack_sprites(x, y, np.ones(len(star)), star, frame)
+            sprites = pack_sprites(x, y, np.ones(len(star)), star, (width, height), side)
             return sprites.data, sprites.star
-        margin, (width, height) = frame[1] / 2, frame[0]
+        margin = side / 2
         seen = (x > -margin) & (x < width + margin) & (y > -margin) & (y < height + margin)
         data = np.empty(np.count_nonzero(seen), dtype=self.dtype)
         data["place_px"][:, 0], data["place_px"][:, 1] = x[seen], y[seen]
@@ -247,4 +247,4 @@ def _scan_angles(stars: Stars, turn: FloatArray, camera: Camera) -> tuple[IntArr
 
 def _project(stars: Stars, near: IntArray, turn: FloatArray, camera: Camera) -> IntArray:
     x_px, y_px = camera.project(stars.vectors[near] @ turn.T)
-    return pack_sprites(x_px, y_px, stars.electrons_per_s[near], near, (camera.resolution_px, footprint_px(SIGMA_PX))).star
+    return pack_sprites(x_px, y_px, stars.electrons_per_s[near], near, camera.resolution_px, footprint_px(SIGMA_PX)).star

@@ -37,7 +37,7 @@ def faulty(golden, tmp_path):
     with fits.open(golden[0]) as hdus:
         for star, less in ((alnitak, 1 - 10 ** (-0.4 * 0.05)), (gone, 1.0)):
             x, y, flux = (np.array([float(star[name])]) for name in ("x_px", "y_px", "electrons_per_s"))
-            sprite = pack_sprites(x, y, less * flux, np.zeros(1, dtype=int), ((320, 240), footprint_px(SIGMA_PX)))
+            sprite = pack_sprites(x, y, less * flux, np.zeros(1, dtype=int), (320, 240), footprint_px(SIGMA_PX))
             hdus[0].data -= linear_image(sprite, (320, 240), SIGMA_PX).astype(np.float32)
         hdus.writeto(tmp_path / "faulty.fits")
     return tmp_path / "faulty.fits"

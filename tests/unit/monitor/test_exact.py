@@ -33,7 +33,7 @@ IN_PARTS = 0.75
 def sprites_at(x_px, y_px, electrons_per_s, resolution=FIELD, sigma=SIGMA) -> Sprites:
     x, y = np.atleast_1d(np.asarray(x_px, float)), np.atleast_1d(np.asarray(y_px, float))
     flux = np.broadcast_to(np.asarray(electrons_per_s, float), x.shape)
-    return pack_sprites(x, y, flux, np.arange(len(x)), (resolution, footprint_px(sigma)))
+    return pack_sprites(x, y, flux, np.arange(len(x)), resolution, footprint_px(sigma))
 
 
 def flux_of(mag, sigma=SIGMA):

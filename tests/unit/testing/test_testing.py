@@ -51,7 +51,7 @@ class Field:
 
     def frame(self):
         size_px = self.bench.camera.resolution_px
-        sprites = pack_sprites(self.x_px, self.y_px, self.flux, self.sprites.star, (size_px, self.sprites.footprint_px))
+        sprites = pack_sprites(self.x_px, self.y_px, self.flux, self.sprites.star, size_px, self.sprites.footprint_px)
         self.bench.renderer.draw(sprites)
         return replace(self.golden, linear=self.bench.renderer.linear().copy())
 
@@ -194,7 +194,7 @@ def test_of_another_sky_twenty_stars_are_told_and_the_rest_counted(field):
 
 def grid(x_px, y_px, flux, sigma_px=(0.85, 0.85), size_px=(160, 120)):
     x_px, y_px, flux = (np.asarray(values, dtype=float) for values in (x_px, y_px, flux))
-    sprites = pack_sprites(x_px, y_px, flux, np.arange(len(flux)), (size_px, footprint_px(sigma_px)))
+    sprites = pack_sprites(x_px, y_px, flux, np.arange(len(flux)), size_px, footprint_px(sigma_px))
     return linear_image(sprites, size_px, sigma_px).astype(np.float32)
 
 

@@ -1,4 +1,4 @@
-"""For tests of your own: two skies compared star by star, so that a golden frame holds on another driver."""
+"""For your own tests: two skies compared star by star, so that a golden frame holds on another driver."""
 
 from __future__ import annotations
 
@@ -11,13 +11,15 @@ import numpy.typing as npt
 from hilstar.arrays import FloatArray
 from hilstar.bench.build import Frame
 from hilstar.errors import InputError
-from hilstar.testing.compare import CENTROID_PX, FLUX_MAG, Limits, SkyComparison, Truth, check_skies, compare_skies, describes
-from hilstar.testing.files import read_frame_fits, read_truth_csv
-from hilstar.testing.sky_difference import finding, told
+from hilstar.testing.compare_skies import check_skies, compare_skies
+from hilstar.testing.sky_comparison import SkyComparison, finding, star_lines
+from hilstar.testing.sky_files import read_frame_fits, read_truth_csv
+from hilstar.testing.star_difference import CENTROID_PX, FLUX_MAG, Limits
+from hilstar.testing.star_seeds import Truth, describes
 
 __all__ = ["assert_same_sky", "compare"]
 
-MOST_LINES = 20
+MAX_LINES = 20
 
 Sky = Frame | npt.NDArray[Any] | str | Path
 
@@ -32,12 +34,12 @@ def assert_same_sky(
 ) -> SkyComparison:
     """Assert that every star of two skies has one flux (magnitudes) and one place (px); see `compare` for what a sky is.
 
-    Raises AssertionError with what all stars differ by and a line for each that differs otherwise, 20 at most; InputError as
-    `compare` does.
+    Raises AssertionError with what all stars differ by and a line for each star that differs otherwise (at most 20), and
+    InputError as `compare` does.
     """
     comparison = compare(frame, golden, flux_mag=flux_mag, centroid_px=centroid_px, truth=truth)
     if not comparison.same:
-        raise AssertionError("\n".join([finding(comparison), *told(comparison, MOST_LINES, "")]))
+        raise AssertionError("\n".join([finding(comparison), *star_lines(comparison, MAX_LINES, "")]))
     return comparison
 
 
@@ -52,7 +54,7 @@ def compare(
     """Compare two skies star by star: each a Frame, a linear image (height, width), or a FITS of `hilstar frame`.
 
     Stars have HIP numbers by `truth` (a Frame's table, or the CSV of `hilstar frame --truth`), else by the Frames' own.
-    Raises InputError for limits that are not over 0, images of different size or without a star, and files of another kind.
+    Raises InputError for limits that are not above 0, images of different size or without a star, and files of another kind.
     """
     light, golden_light = _image(frame), _image(golden)
     check_skies(light, golden_light)

@@ -1,4 +1,4 @@
-"""The chart of `hilstar compare`: errors against magnitude, less what all stars have in common."""
+"""The chart of `hilstar compare`: errors against magnitude, beyond what all stars have in common."""
 
 from __future__ import annotations
 
@@ -7,17 +7,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hilstar.charts import chart
-from hilstar.testing.sky_difference import MAG_PER_SHARE, SkyComparison, StarDifference, finding
+from hilstar.testing.sky_comparison import SkyComparison, finding
+from hilstar.testing.star_difference import StarDifference
+from hilstar.units import magnitude
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.text import Annotation
     from matplotlib.transforms import Bbox
 
-NAMED_STARS = 6  # at most, where their names have room; the table has all
-MOST_TRIED = 60  # names for which there is a look whether they have room
+MAX_NAMES = 6  # of stars, in each panel; the table has all
+MAX_TRIED = 60  # names that are tried for room
 ROOM_PX = 3.0  # between two names
-LEAST_ERROR = 1e-8  # drawn: a tenth of float32's rounding
+MIN_ERROR = 1e-8  # as drawn: a tenth of float32's rounding
 STYLES = (("same", "C0."), ("changed", "C3o"), ("missing", "C3v"), ("extra", "C1^"))
 
 
@@ -29,10 +31,10 @@ def draw(path: Path, comparison: SkyComparison) -> None:
             panel = _Panel(comparison, unit)
             panel.draw(axis)
             names.append(panel.name_stars(axis))
-            less = ", less what is common" if panel.common else ""
-            axis.set(yscale="log", ylabel=f"{what} [{unit}]{less},\ndrawn at {LEAST_ERROR:g} where under it")
+            less = " beyond what is common" if panel.common else ""
+            axis.set(yscale="log", ylabel=f"{what}{less} [{unit}],\nsmaller ones drawn at {MIN_ERROR:g}")
             axis.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), fontsize=9)
-        axes[1].set_xlabel("magnitudes under the brightest star")
+        axes[1].set_xlabel("magnitudes below the brightest star")
         _make_room(axes[0], names)
 
 
@@ -56,11 +58,11 @@ class _Panel:
         return [star for star in self.stars if star.kind in kinds]
 
     def point(self, star: StarDifference) -> tuple[float, float, float]:
-        """Magnitudes under the brightest star, error, and the star's own limit."""
-        mag = MAG_PER_SHARE * math.log(self.brightest / star.flux_e_per_s)
+        """Magnitudes below the brightest star, error, and the star's own limit."""
+        mag = magnitude(star.flux_e_per_s / self.brightest)
         if self.unit == "mag":
-            return mag, max(abs(star.flux_error_mag), LEAST_ERROR), star.limits.flux_mag
-        return mag, max(star.centroid_error_px, LEAST_ERROR), star.limits.centroid_px
+            return mag, max(abs(star.flux_error_mag), MIN_ERROR), star.limits.flux_mag
+        return mag, max(star.centroid_error_px, MIN_ERROR), star.limits.centroid_px
 
     def draw(self, axis: Axes) -> None:
         for kind, style in STYLES:
@@ -73,11 +75,11 @@ class _Panel:
         wider = [point for star in self.of("same", "changed") if (point := self.point(star))[2] > self.limit]
         if wider:
             axis.plot([p[0] for p in wider], [p[2] for p in wider], "k_", ms=8, label=f"a star's own limit: {len(wider)}")
-        axis.set_ylim(LEAST_ERROR / 2, 300 * self.row)
+        axis.set_ylim(MIN_ERROR / 2, 300 * self.row)
         axis.set_xlim(right=axis.get_xlim()[1] + 0.5)
 
     def name_stars(self, axis: Axes) -> list[Annotation]:
-        """Names of the worst stars, those that only one image has in the flux's panel alone."""
+        """Names of the worst stars; those that only one image has are named in the panel of flux alone."""
         names = []
         for star in self.worst:
             mag, error, own = self.point(star)
@@ -85,11 +87,11 @@ class _Panel:
                 name = star.name if star.hip else f"({star.x_px:.0f}, {star.y_px:.0f})"
                 place = mag, self.rows.get(star.kind, error)
                 names.append(axis.annotate(name, place, xytext=(6, 5), textcoords="offset points", fontsize=8))
-        return names[:MOST_TRIED]
+        return names[:MAX_TRIED]
 
 
 def _make_room(axis: Axes, names: list[list[Annotation]]) -> None:
-    """Take the names away that lie on worse stars' names, and those that are too many."""
+    """Remove the names that overlap those of worse stars, and those that are too many."""
     figure = axis.get_figure(root=True)
     if figure is None:
         return
@@ -98,7 +100,7 @@ def _make_room(axis: Axes, names: list[list[Annotation]]) -> None:
         kept: list[Bbox] = []
         for text in texts:
             box = text.get_window_extent().padded(ROOM_PX)
-            if len(kept) == NAMED_STARS or any(box.overlaps(other) for other in kept):
+            if len(kept) == MAX_NAMES or any(box.overlaps(other) for other in kept):
                 text.remove()
             else:
                 kept.append(box)

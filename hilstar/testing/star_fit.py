@@ -18,15 +18,15 @@ from scipy.special import ndtr
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.scene.psf import footprint_px
 
-# Around a bright star float32 leaves ripples of 2e-6 of its peak (4.4e-7 of its flux, see tests/gpu); no star is that faint.
+# Around a bright star float32 leaves ripples of 2e-6 of its peak (4.4e-7 of its flux, see tests/gpu), which are no stars.
 RIPPLE_SHARE = 1e-5
 SIGMA_STARS = 30  # the brightest ones give the sigma; their median is no blend's
 SIGMA_STEPS = 12
-LARGEST_SIGMA_STEP = 0.3  # of sigma: Newton's step from a poor start stays a positive sigma
-PLACE_STEPS, LARGEST_STEP_PX, LEAST_STEP_PX = 12, 1.0, 1e-5
-FARTHEST_PX = 1.0  # a star lies within sqrt(1/2) px of the middle of its brightest pixel, but for a neighbour's pull
+MAX_SIGMA_STEP = 0.3  # of sigma: Newton's step from a poor start stays a positive sigma
+MAX_PLACE_STEPS, MAX_STEP_PX, MIN_STEP_PX = 12, 1.0, 1e-5
+MAX_OFFSET_PX = 1.0  # a star lies within sqrt(1/2) px of the middle of its brightest pixel, unless a neighbour pulls it
 BEYOND_SIGMAS = 4.0  # ... and one whose brightest pixel is the image's first or last lies anywhere beyond
-RIDGE = 1e-12  # of a unit column: two columns that are one thing share its light, where a solver would fail
+RIDGE = 1e-12  # of a unit column: two equal columns share the light, where the solver would otherwise fail
 
 
 class StarTemplates:
@@ -122,7 +122,7 @@ def star_sigma_px(image: FloatArray) -> tuple[float, float]:
         if not good.any():
             break
         places[good] += np.clip(steps[good, :2], -0.5, 0.5)
-        sigma = sigma + np.clip(np.median(steps[good, 2:], axis=0), -LARGEST_SIGMA_STEP * sigma, LARGEST_SIGMA_STEP * sigma)
+        sigma = sigma + np.clip(np.median(steps[good, 2:], axis=0), -MAX_SIGMA_STEP * sigma, MAX_SIGMA_STEP * sigma)
     return float(sigma[0]), float(sigma[1])
 
 
@@ -165,12 +165,12 @@ def refined(image: FloatArray, places_px: FloatArray, sigma_px: tuple[float, flo
     start, shape = places_px, (image.shape[0], image.shape[1])
     last = np.array([shape[1] - 1, shape[0] - 1])
     outwards = BEYOND_SIGMAS * np.array(sigma_px)
-    low = np.where(start < 0.5, np.minimum(start, 0) - outwards, start - FARTHEST_PX)
-    high = np.where(start > last - 0.5, np.maximum(start, last) + outwards, start + FARTHEST_PX)
-    for _ in range(PLACE_STEPS):
-        step = np.clip(shifts_px(StarTemplates(places_px, sigma_px, shape).fit(image)), -LARGEST_STEP_PX, LARGEST_STEP_PX)
+    low = np.where(start < 0.5, np.minimum(start, 0) - outwards, start - MAX_OFFSET_PX)
+    high = np.where(start > last - 0.5, np.maximum(start, last) + outwards, start + MAX_OFFSET_PX)
+    for _ in range(MAX_PLACE_STEPS):
+        step = np.clip(shifts_px(StarTemplates(places_px, sigma_px, shape).fit(image)), -MAX_STEP_PX, MAX_STEP_PX)
         before, places_px = places_px, np.clip(places_px + step, low, high)
-        if np.abs(places_px - before).max(initial=0.0) < LEAST_STEP_PX:
+        if np.abs(places_px - before).max(initial=0.0) < MIN_STEP_PX:
             break
     return places_px
 

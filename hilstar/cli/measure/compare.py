@@ -28,9 +28,9 @@ def compare(
     """Compare two frames star by star; exit code 0 if they show the same sky, 1 if not."""
     from hilstar.files import make_directory
     from hilstar.testing import compare as compare_files
-    from hilstar.testing.compare import CENTROID_PX, FLUX_MAG
-    from hilstar.testing.files import write_report
-    from hilstar.testing.sky_difference import told
+    from hilstar.testing.report import write_report
+    from hilstar.testing.sky_comparison import star_lines
+    from hilstar.testing.star_difference import CENTROID_PX, FLUX_MAG
 
     check_directory("-o", output)
     limits = FLUX_MAG if flux_mag is None else flux_mag, CENTROID_PX if centroid_px is None else centroid_px
@@ -43,7 +43,7 @@ def compare(
         where = " (-o DIR writes a table of all)" if output is None else f" (in {output / 'compare.csv'})"
         if comparison.common is not None:
             typer.echo(f"{'in common':20}{comparison.common.line()}")
-        tell(comparison.summary(), told(comparison, MAX_LINES, where))
+        tell(comparison.summary(), star_lines(comparison, MAX_LINES, where))
     if not comparison.same:
         raise typer.Exit(1)
 

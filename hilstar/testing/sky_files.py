@@ -1,4 +1,4 @@
-"""What `hilstar compare` reads, the FITS and CSV of `hilstar frame`, and what it writes: a table and a chart."""
+"""What `hilstar compare` reads: the FITS and the truth table of `hilstar frame`."""
 
 from __future__ import annotations
 
@@ -13,32 +13,15 @@ import numpy as np
 
 from hilstar.arrays import FloatArray
 from hilstar.bench.build import TRUTH_DTYPE
-from hilstar.charts import write_csv
 from hilstar.errors import InputError, cannot_read
 from hilstar.reading import read_bytes, read_text, size_text
-from hilstar.testing.chart import draw
-from hilstar.testing.compare import Truth
-from hilstar.testing.sky_difference import SkyComparison, StarDifference
+from hilstar.testing.star_seeds import Truth
 
 UNIT = "electron/s"
 MAX_E_PER_S = 1e30  # whose square is still a number
 TRUTH_COLUMNS = ("hip", "x_px", "y_px", "electrons_per_s")
 MAX_TRUTH_BYTES = 50_000_000
 MAX_FITS_BYTES = 600_000_000  # a frame of 8K has 133 MB
-COLUMNS = (
-    "kind",
-    "hip",
-    "x_px",
-    "y_px",
-    "flux_e_per_s",
-    "flux_error_mag",
-    "dx_px",
-    "dy_px",
-    "centroid_error_px",
-    "flux_limit_mag",
-    "centroid_limit_px",
-    "differs",  # 1 where the star differs from what is common to all
-)
 
 
 def read_frame_fits(path: Path) -> FloatArray:
@@ -92,17 +75,3 @@ def read_truth_csv(path: Path) -> Truth:
     if not all(np.isfinite(truth[name]).all() for name in TRUTH_COLUMNS):
         raise InputError(f"{path}: a number is NaN or infinite; {wanted}")
     return truth
-
-
-def write_report(directory: Path, comparison: SkyComparison) -> None:
-    """compare.csv, a row for each star, and compare.png, errors against magnitude. Raises InputError where they cannot be."""
-    odd = {(star.hip, star.x_px, star.y_px) for star in comparison.differing}
-    rows = ((*_row(star), int((star.hip, star.x_px, star.y_px) in odd)) for star in comparison.stars)
-    write_csv(directory / "compare.csv", COLUMNS, rows)
-    draw(directory / "compare.png", comparison)
-
-
-def _row(star: StarDifference) -> tuple[object, ...]:
-    hip = " ".join(map(str, star.hip))
-    errors = star.flux_error_mag, star.dx_px, star.dy_px, star.centroid_error_px
-    return star.kind, hip, star.x_px, star.y_px, star.flux_e_per_s, *errors, star.limits.flux_mag, star.limits.centroid_px

@@ -1,0 +1,150 @@
+"""Two images of one sky, star by star: what a change of driver may do, and what it may not.
+
+Stars are found in the golden image and fitted in both (see star_fit). Where the rounding of the light around a star limits
+how well a fit knows it, that star's limits are wider.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from hilstar.arrays import FloatArray
+from hilstar.errors import InputError
+from hilstar.testing.common_change import common_change
+from hilstar.testing.sky_comparison import SkyComparison
+from hilstar.testing.star_difference import Limits, StarDifference
+from hilstar.testing.star_fit import RIPPLE_SHARE, StarTemplates, around, bright_pixels, refined, shifts_px, star_sigma_px
+from hilstar.testing.star_seeds import Seeds, Truth, blend_distance_px, find_seeds, nameless_seeds, names_at
+from hilstar.units import MAG_PER_RELATIVE, magnitude
+
+# Of a star's flux: what float32 may do to any pixel that the star reaches. Measured 7e-8 on llvmpipe against float64.
+PIXEL_ERROR = 2e-7
+MIN_IN_VIEW = 0.01  # of a star's light; the wing of a star off the image has no place
+MAX_ERROR = 0.25  # of a star's flux, by rounding of brighter light on it: such a star is not compared
+MISSING_SHARE = 0.01  # of its flux: 5 mag fainter is gone
+MOVE_STEPS, SMALL_MOVE_PX = 4, 0.003  # a shift of this is first order within 1e-5 of the star's flux
+MAX_MOVE_SIGMAS = 3.0  # a star that moved farther is missing here and extra there
+
+
+def compare_skies(
+    frame: FloatArray,
+    golden: FloatArray,
+    limits: Limits,
+    truth: Truth | None = None,
+    frame_truth: Truth | None = None,
+) -> SkyComparison:
+    """Compare two linear images (height, width) star by star, named by their tables (TRUTH_DTYPE), `truth` the golden one's.
+
+    Raises InputError for images of different size or with a pixel that is not finite, a golden one without a star, and a
+    `truth` of another sky.
+    """
+    check_skies(frame, golden)
+    sigma_px = star_sigma_px(golden)
+    seeds, unmeasured = _measurable(golden, find_seeds(golden, truth, sigma_px), sigma_px)
+    if not seeds.hip:
+        raise InputError("compare: no star of the golden image has enough light in view; give one that has")
+    fit = _Fit(golden, seeds.places_px, sigma_px)
+    moved = fit.follow(frame)
+    stars = _differences(seeds, fit, moved, limits)
+    more, less = moved.residual - fit.residual, fit.residual - moved.residual
+    for light, table, error in ((less, truth, math.inf), (more, truth if frame_truth is None else frame_truth, -math.inf)):
+        places, flux = _unexplained(light, fit, moved)
+        stars += [
+            StarDifference(hip, float(x), float(y), float(f), error, 0.0, 0.0, limits)
+            for hip, (x, y), f in zip(names_at(places, table, blend_distance_px(sigma_px)), places, flux, strict=True)
+        ]
+    return SkyComparison(stars, limits, unmeasured, common_change(stars, (golden.shape[1], golden.shape[0])))
+
+
+def check_skies(frame: FloatArray, golden: FloatArray) -> None:
+    """Raise InputError where two images cannot be compared, as `compare_skies` does."""
+    for name, image in (("frame", frame), ("golden", golden)):
+        if image.ndim != 2 or min(image.shape) < 2:
+            raise InputError(f"compare: the {name} image has the shape {image.shape}; give a linear image (height, width)")
+        if not np.isfinite(image).all():
+            raise InputError(f"compare: the {name} image has a pixel that is NaN or infinite; give finite numbers")
+    if frame.shape != golden.shape:
+        (height, width), (golden_height, golden_width) = frame.shape, golden.shape
+        raise InputError(
+            f"compare: {width} x {height} px against {golden_width} x {golden_height} px; give images of one monitor"
+        )
+    if not (golden > 0).any():
+        raise InputError("compare: the golden image has no star; give one that has")
+
+
+def _measurable(golden: FloatArray, seeds: Seeds, sigma_px: tuple[float, float]) -> tuple[Seeds, int]:
+    """The seeds whose light can be told from the rounding of their neighbours', at their places; and how many stars cannot."""
+    count, shape = seeds.stars, (golden.shape[0], golden.shape[1])
+    seeds = _in_view(seeds, sigma_px, shape)
+    seeds = _in_view(Seeds(refined(golden, seeds.places_px, sigma_px), seeds.hip), sigma_px, shape)
+    templates = StarTemplates(seeds.places_px, sigma_px, shape)
+    flux = templates.fit(golden)[:, 0]
+    seeds = seeds.only(flux > templates.errors(flux, PIXEL_ERROR)[0] / MAX_ERROR)
+    return seeds, count - seeds.stars
+
+
+def _in_view(seeds: Seeds, sigma_px: tuple[float, float], shape: tuple[int, int]) -> Seeds:
+    return seeds.only(StarTemplates(seeds.places_px, sigma_px, shape).in_view >= MIN_IN_VIEW)
+
+
+class _Fit:
+    """All stars of one image, fitted at `places_px`: what they are, and the light (height, width) that they leave."""
+
+    def __init__(self, image: FloatArray, places_px: FloatArray, sigma_px: tuple[float, float]) -> None:
+        self.light = image
+        self.sigma_px = sigma_px
+        self.templates = StarTemplates(places_px, sigma_px, (image.shape[0], image.shape[1]))
+        fitted = self.templates.fit(image)
+        self.flux = fitted[:, 0]
+        self.places_px = places_px + shifts_px(fitted)
+        self.model = self.templates.image(fitted)
+        self.residual = image - self.model
+
+    def follow(self, frame: FloatArray) -> _Fit:
+        """The same stars in another image: the same templates, except for those that moved."""
+        start = self.templates.places_px
+        fit = _Fit(frame, start, self.sigma_px)
+        for _ in range(MOVE_STEPS):
+            shift = np.hypot(*(fit.places_px - self.places_px).T)
+            there = fit.flux > MISSING_SHARE * self.flux
+            moved = there & (shift > SMALL_MOVE_PX) & (shift <= MAX_MOVE_SIGMAS * max(self.sigma_px))
+            if not moved.any():
+                break
+            fit = _Fit(frame, start + np.where(moved[:, None], fit.places_px - self.places_px, 0.0), self.sigma_px)
+        return fit
+
+
+def _differences(seeds: Seeds, fit: _Fit, moved: _Fit, limits: Limits) -> list[StarDifference]:
+    flux_error, place_error_px = fit.templates.errors(fit.flux, PIXEL_ERROR)
+    limit_mag = np.maximum(MAG_PER_RELATIVE * flux_error / fit.flux, limits.flux_mag)
+    limit_px = np.maximum(place_error_px, limits.centroid_px)
+    shift = moved.places_px - fit.places_px
+    gone = (moved.flux <= MISSING_SHARE * fit.flux) | (np.hypot(*shift.T) > MAX_MOVE_SIGMAS * max(fit.sigma_px))
+    error_mag = np.where(gone, np.inf, magnitude(np.where(gone, 1.0, moved.flux / fit.flux)))
+    columns = (*fit.places_px.T, fit.flux, error_mag, *np.where(gone, 0.0, shift.T), limit_mag, limit_px)
+    return [
+        StarDifference(hip, x_px, y_px, flux, mag, dx_px, dy_px, Limits(own_mag, own_px))
+        for hip, (x_px, y_px, flux, mag, dx_px, dy_px, own_mag, own_px) in zip(
+            seeds.hip, np.column_stack(columns).tolist(), strict=True
+        )
+    ]
+
+
+def _unexplained(light: FloatArray, fit: _Fit, moved: _Fit) -> tuple[FloatArray, FloatArray]:
+    """Places (n, 2), px, and fluxes of stars in light that no star of either fit explains.
+
+    A changed star is no exact Gaussian: what it leaves is under half of its change. A star off the image may be as bright as
+    any on it, and its wing wrong by that star's rounding.
+    """
+    change = np.maximum(np.abs(moved.model - fit.model), np.abs(light))
+    floor = RIPPLE_SHARE * np.maximum(fit.light, moved.light) + 0.5 * change
+    rounding = PIXEL_ERROR * max(fit.flux.max(initial=0.0), moved.flux.max(initial=0.0))
+    seeds = nameless_seeds(bright_pixels(light, around(floor, fit.sigma_px) + rounding), fit.sigma_px).places_px
+    places = refined(light, seeds, fit.sigma_px)
+    flux = StarTemplates(places, fit.sigma_px, (light.shape[0], light.shape[1])).fit(light)[:, 0]
+    column, row = seeds.astype(np.intp).T
+    return places, np.maximum(
+        flux, light[row, column]
+    )  # of two on one place the fit may give one too much, the other less than 0

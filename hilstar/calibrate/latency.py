@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from hilstar.arrays import FloatArray, IntArray
-from hilstar.attitude.clock.sender_clock import OneWayFilter
+from hilstar.attitude.clock.one_way import OneWayFilter
 from hilstar.attitude.wire.serial_lines import read_lines
 from hilstar.bench.config import BenchConfig
 from hilstar.calibrate.toml_key import with_key

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hilstar.attitude.clock.receiver import PacketCounts
+from hilstar.attitude.receiver import PacketCounts
 from hilstar.attitude.wire import protocol
 from hilstar.attitude.wire.packet import Status
 from hilstar.notices import Notices

@@ -6,8 +6,9 @@ import math
 import time
 from typing import Any
 
-from hilstar.attitude.clock.receiver import Arrival, PacketCounts
 from hilstar.attitude.clock.timeline import Attitude
+from hilstar.attitude.receiver import PacketCounts
+from hilstar.attitude.wire.links import Arrival
 from hilstar.attitude.wire.packet import AttitudeSample, Event, Refusal, TimeReply, TimeRequest, rate_refusal
 from hilstar.attitude.wire.zmq_links import ZmqLockstep
 from hilstar.bench.build import Bench
@@ -64,14 +65,14 @@ def _refusal(event: Event, max_rate_rad_s: float) -> Refusal | None:
     return Refusal("format", f"a {type(event).__name__} packet; a request is an attitude, or a time request")
 
 
-def _keep(ledger: Ledger, arrival: Arrival, refusal: Refusal | None, shown: Shown) -> None:
+def _keep(ledger: Ledger, arrival: Arrival[Event], refusal: Refusal | None, shown: Shown) -> None:
     sample = arrival.event if isinstance(arrival.event, AttitudeSample) else None
     ledger.packet(arrival.host_ns, arrival.raw, sample, refusal)
     if refusal is None:
         ledger.frame(frame_record(shown, shown.t_ns, 0))
 
 
-def _show(loop: FrameLoop, arrival: Arrival) -> Shown:
+def _show(loop: FrameLoop, arrival: Arrival[Event]) -> Shown:
     sample = arrival.event
     if not isinstance(sample, AttitudeSample):
         raise TypeError("only an attitude is shown")

@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from hilstar.attitude.clock.receiver import PacketCounts, Receiver, Traffic, nobody_watches
+from hilstar.attitude.back_channel import Traffic
 from hilstar.attitude.clock.timeline import Timeline
+from hilstar.attitude.receiver import PacketCounts, Receiver, nobody_watches
 from hilstar.attitude.wire.keys import CurveKeys
 from hilstar.attitude.wire.serial_link import SerialLink
 from hilstar.attitude.wire.zmq_links import ZmqLockstep, ZmqReceiver
@@ -80,11 +81,11 @@ def _serve_stream(
 
     def draw_slot(slot: int) -> None:
         receiver.tend()
-        t_ns = receiver.clock.to_bench_ns(loop.light_ns(time.monotonic_ns()))
+        t_ns = receiver.clock.to_sender_ns(loop.light_ns(time.monotonic_ns()))
         shown = loop.draw(slot, t_ns, timeline.at(t_ns))
         if shown is None:
             return
-        light_ns = receiver.bench_ns(t_ns)
+        light_ns = receiver.sender_ns(t_ns)
         if ledger is not None:
             ledger.frame(frame_record(shown, light_ns, loop.stats.missed_frames))
         if link.two_way:

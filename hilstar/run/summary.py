@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from hilstar.attitude.clock.receiver import PacketCounts
+from hilstar.attitude.receiver import PacketCounts
 from hilstar.attitude.wire.packet import MESSAGE_REASONS
 from hilstar.running_statistics import RunningStatistics
 from hilstar.units import NS_PER_MS

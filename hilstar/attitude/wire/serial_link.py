@@ -13,10 +13,10 @@ from typing import Self
 import serial
 from serial.tools import list_ports
 
-from hilstar.attitude.clock.receiver import Arrival
 from hilstar.attitude.wire.cobs import DELIMITER, StreamDecoder, frame
 from hilstar.attitude.wire.flood_limits import FloodGate, LinkCounts
-from hilstar.attitude.wire.packet import Packet, encode
+from hilstar.attitude.wire.links import Arrival
+from hilstar.attitude.wire.packet import Event, Packet, encode
 from hilstar.errors import InputError, one_line
 from hilstar.notices import Notices
 
@@ -65,7 +65,7 @@ class SerialLink:
         self._decoder = StreamDecoder()
         return device
 
-    def receive(self, timeout_ms: int) -> list[Arrival]:
+    def receive(self, timeout_ms: int) -> list[Arrival[Event]]:
         """The frames that have come; waits at most `timeout_ms` for the first byte."""
         device = self._device
         if device is None:

@@ -13,12 +13,12 @@ import msgspec
 import zmq
 from zmq.auth.thread import ThreadAuthenticator
 
-from hilstar.attitude.clock.receiver import Arrival
 from hilstar.attitude.wire.doorkeeper import HANDSHAKE_MS, Doorkeeper
 from hilstar.attitude.wire.endpoint import ENDPOINT_FORM, PATH_FORM, check_use, parse_endpoint
 from hilstar.attitude.wire.flood_limits import MAX_GROWTH_BYTES, FloodGate, LinkCounts, MemoryWatch, raise_file_limit
 from hilstar.attitude.wire.keys import NO_KEYS, AllowList, CurveKeys, check_reach, load_public, load_secret
-from hilstar.attitude.wire.packet import Packet, Refusal, Status, TimeReply, decode, encode
+from hilstar.attitude.wire.links import Arrival
+from hilstar.attitude.wire.packet import Event, Packet, Refusal, Status, TimeReply, decode, encode
 from hilstar.errors import InputError
 from hilstar.notices import Notices
 from hilstar.process.interrupts import caught
@@ -246,7 +246,7 @@ class ZmqReceiver(_ZmqLink):
         super()._configure(made)
         made.setsockopt(zmq.SUBSCRIBE, b"")
 
-    def receive(self, timeout_ms: int) -> list[Arrival]:
+    def receive(self, timeout_ms: int) -> list[Arrival[Event]]:
         """The messages that wait, oldest first; only the last part of each is read, and only the newest of a flood.
 
         Waits at most `timeout_ms` for the first, and for no other.
@@ -300,7 +300,7 @@ class ZmqLockstep(_ZmqLink):
         self._shut()
         self._json = False
 
-    def receive(self, timeout_ms: int) -> Arrival | None:
+    def receive(self, timeout_ms: int) -> Arrival[Event] | None:
         """The next request, or None; each one has to be answered before the next can come.
 
         A request without its delimiter is announced by libzmq and then dropped: it is not waited for.

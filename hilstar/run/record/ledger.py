@@ -108,7 +108,7 @@ class Ledger:
     # What a run hands in, from whichever thread
 
     def packet(self, host_ns: int, raw: bytes, sample: AttitudeSample | None, refusal: Refusal | None) -> None:
-        """Keep a packet; see `attitude.clock.receiver.Watch`."""
+        """Keep a packet; see `attitude.receiver.Watch`."""
         if refusal is None and sample is None:
             refusal = Refusal("format", "")
         if not self._sieve.keeps("packet", "accepted" if refusal is None else refusal.reason, host_ns):

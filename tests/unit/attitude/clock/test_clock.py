@@ -1,4 +1,4 @@
-"""Bench time and host time: what is simulated is known exactly, so every figure is an error."""
+"""Sender time and host time: what is simulated is known exactly, so every figure is an error."""
 
 from __future__ import annotations
 
@@ -7,13 +7,15 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from hilstar.attitude.clock.jumps import Arrived, JumpFilter
-from hilstar.attitude.clock.sender_clock import ENOUGH_EXCHANGES, EXCHANGE_LIFE_NS, SLEW, BenchClock
+from hilstar.attitude.clock.exchanges import EXCHANGE_LIFE_NS, MIN_EXCHANGES, Exchange
+from hilstar.attitude.clock.jumps import JumpFilter
+from hilstar.attitude.clock.sender_clock import SLEW, SenderClock
+from hilstar.attitude.wire.links import Arrival
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.units import NS_PER_MS, NS_PER_S
 
 PERIOD_NS = 5_000_000
-LEAST_DELAY_MS = 0.05
+MIN_DELAY_MS = 0.05
 HOST0_NS = 10**12
 Q = np.array([1.0, 0.0, 0.0, 0.0])
 Delay = Callable[[np.random.Generator, int], float]
@@ -21,47 +23,47 @@ Delay = Callable[[np.random.Generator, int], float]
 
 def usual(rng: np.random.Generator, k: int) -> float:
     """A loopback's delay, ns: 0.05 ms and an exponential tail of 0.05 ms."""
-    return LEAST_DELAY_MS * 1e6 + rng.exponential(50_000)
+    return MIN_DELAY_MS * 1e6 + rng.exponential(50_000)
 
 
 class Run:
     """A stream of 200 Hz through jump filter and clock, a frame every third packet; errors in ms of time shown."""
 
-    def __init__(self, bench_ns: Callable[[int, int], int], delay: Delay = usual, count: int = 6000) -> None:
+    def __init__(self, sender_ns: Callable[[int, int], int], delay: Delay = usual, count: int = 6000) -> None:
         rng = np.random.default_rng(1)
-        self.jumps, self.clock = JumpFilter(), BenchClock()
+        self.clock = SenderClock()
+        self.jumps = JumpFilter(self.clock)
         self.refused = self.accepted = 0
         errors = []
         newest_ns, newest = -(2**80), 0
         for k in range(count):
             host_ns = HOST0_NS + k * PERIOD_NS
             arrival_ns = host_ns + round(delay(rng, k))
-            for each in self.jumps.take(Arrived(AttitudeSample(bench_ns(host_ns, k), Q, None, k), arrival_ns)):
-                if each.refusal is not None or each.sample.t_ns <= newest_ns:
+            for each in self.jumps.take(Arrival(arrival_ns, AttitudeSample(sender_ns(host_ns, k), Q, None, k))):
+                if each.refusal is not None or each.event.t_ns <= newest_ns:
                     self.refused += 1
                     continue
                 self.accepted += 1
-                newest_ns, newest = each.sample.t_ns, each.sample.sequence
-                self.clock.observe(newest_ns, arrival_ns)
+                newest_ns, newest = each.event.t_ns, each.event.sequence
             if k % 3 == 2:
                 frame_ns = host_ns + 4 * NS_PER_MS
                 age_ns = frame_ns - (HOST0_NS + newest * PERIOD_NS)  # the truth
-                errors.append((self.clock.to_bench_ns(frame_ns) - newest_ns - age_ns) / NS_PER_MS)
+                errors.append((self.clock.to_sender_ns(frame_ns) - newest_ns - age_ns) / NS_PER_MS)
         self.error_ms = np.array(errors)
         self.step_ms = np.abs(np.diff(self.error_ms)).max()
 
 
-def test_a_stream_that_only_talks_is_shown_late_by_its_least_delay_and_no_more():
+def test_a_stream_that_only_talks_is_shown_late_by_its_minimum_delay_and_no_more():
     run = Run(lambda host, k: host - 5 * 10**11)
-    assert np.abs(run.error_ms[200:] + LEAST_DELAY_MS).max() < 0.005
+    assert np.abs(run.error_ms[200:] + MIN_DELAY_MS).max() < 0.005
     assert run.clock.summary()["mode"] == "one-way"
 
 
 @pytest.mark.parametrize("ppm", [100, -100, 1000, -1000])
 def test_a_drift_is_followed_and_stated(ppm):
-    """Within 5 us of the least delay for 100 ppm, which is 0.02 arcsec at 1 deg/s; and the drift to 1 ppm."""
+    """Within 5 us of the minimum delay for 100 ppm, which is 0.02 arcsec at 1 deg/s; and the drift to 1 ppm."""
     run = Run(lambda host, k: host + (host - HOST0_NS) * ppm // 1_000_000)
-    assert np.abs(run.error_ms[600:] + LEAST_DELAY_MS).max() < 5e-5 * abs(ppm)
+    assert np.abs(run.error_ms[600:] + MIN_DELAY_MS).max() < 5e-5 * abs(ppm)
     assert run.clock.summary()["drift_ppm"] == pytest.approx(ppm, abs=1.0)
     assert run.jumps.jumps == 0
 
@@ -73,14 +75,14 @@ def test_a_clock_that_jumps_is_carried_on_without_a_step(jump_ms):
     assert run.jumps.jumps == 1
     assert (run.accepted, run.refused) == (6000, 0)
     assert run.step_ms < 0.01
-    assert np.abs(run.error_ms[200:] + LEAST_DELAY_MS).max() < 0.01
+    assert np.abs(run.error_ms[200:] + MIN_DELAY_MS).max() < 0.01
 
 
 @pytest.mark.parametrize("ahead_s", [1, 3600, 10**9])
 def test_one_packet_far_ahead_is_refused_and_changes_nothing(ahead_s):
     run = Run(lambda host, k: host + (ahead_s * NS_PER_S if k == 3000 else 0))
     assert (run.accepted, run.refused, run.jumps.jumps) == (5999, 1, 0)
-    assert np.abs(run.error_ms[200:] + LEAST_DELAY_MS).max() < 0.005
+    assert np.abs(run.error_ms[200:] + MIN_DELAY_MS).max() < 0.005
 
 
 def test_a_queue_that_drains_is_no_jump():
@@ -91,7 +93,7 @@ def test_a_queue_that_drains_is_no_jump():
 
     run = Run(lambda host, k: host, held)
     assert (run.accepted, run.jumps.jumps) == (6000, 0)
-    assert np.abs(run.error_ms[200:] + LEAST_DELAY_MS).max() < 0.005
+    assert np.abs(run.error_ms[200:] + MIN_DELAY_MS).max() < 0.005
 
 
 def test_a_usb_adapter_that_gathers_for_16_ms_is_no_jump():
@@ -100,12 +102,12 @@ def test_a_usb_adapter_that_gathers_for_16_ms_is_no_jump():
 
     run = Run(lambda host, k: host, gathered)
     assert (run.accepted, run.jumps.jumps) == (6000, 0)
-    assert np.abs(run.error_ms[300:] + LEAST_DELAY_MS).max() < 0.03
+    assert np.abs(run.error_ms[300:] + MIN_DELAY_MS).max() < 0.03
 
 
 def test_jitter_of_5_ms_costs_a_tenth_of_a_millisecond():
-    run = Run(lambda host, k: host, lambda rng, k: LEAST_DELAY_MS * 1e6 + rng.exponential(5e6))
-    assert np.abs(run.error_ms[300:] + LEAST_DELAY_MS).max() < 0.1
+    run = Run(lambda host, k: host, lambda rng, k: MIN_DELAY_MS * 1e6 + rng.exponential(5e6))
+    assert np.abs(run.error_ms[300:] + MIN_DELAY_MS).max() < 0.1
 
 
 def test_where_it_fails_a_jump_smaller_than_the_limit_is_a_step_until_the_line_forgets():
@@ -133,27 +135,27 @@ def test_a_fast_clock_is_known_to_be_one():
 
 
 def exchanged(
-    clock: BenchClock, rng: np.random.Generator, ppm: float = 0.0, wire_ns: tuple[int, int] = (0, 0), count: int = 40
+    clock: SenderClock, rng: np.random.Generator, ppm: float = 0.0, wire_ns: tuple[int, int] = (0, 0), count: int = 40
 ) -> None:
-    """Exchanges twice a second with a bench 7 s ahead; delays as a loopback's, and what the wire takes."""
+    """Exchanges twice a second with a sender 7 s ahead; delays as a loopback's, and what the wire takes."""
     for k in range(count):
         t1 = HOST0_NS + k * NS_PER_S // 2
         arrives = t1 + usual(rng, k) + wire_ns[0]
         answers = arrives + 30_000
         back = answers + usual(rng, k) + wire_ns[1]
 
-        def bench(host_ns: float) -> int:
+        def sender(host_ns: float) -> int:
             return round(host_ns + 7 * NS_PER_S + (host_ns - HOST0_NS) * ppm * 1e-6)
 
-        clock.exchange((t1, round(back)), (bench(arrives), bench(answers)), wire_ns)
+        clock.exchange(Exchange(t1, sender(arrives), sender(answers), round(back), *wire_ns))
 
 
 @pytest.mark.parametrize("ppm", [0.0, 100.0, -100.0])
 def test_exchanges_give_the_offset_itself_and_its_bound(rng, ppm):
-    clock = BenchClock()
+    clock = SenderClock()
     exchanged(clock, rng, ppm)
     end_ns = HOST0_NS + 20 * NS_PER_S
-    error_ms = (clock.to_bench_ns(end_ns) - (end_ns + 7 * NS_PER_S + 20 * NS_PER_S * ppm * 1e-6)) / NS_PER_MS
+    error_ms = (clock.to_sender_ns(end_ns) - (end_ns + 7 * NS_PER_S + 20 * NS_PER_S * ppm * 1e-6)) / NS_PER_MS
     summary = clock.summary()
     assert summary["mode"] == "exchange"
     assert abs(error_ms) < 0.05
@@ -164,15 +166,15 @@ def test_exchanges_give_the_offset_itself_and_its_bound(rng, ppm):
 def test_a_slow_wire_s_longer_reply_is_allowed_for(rng):
     """9600 baud: 22.9 ms there and 39.6 ms back; half of the difference, 8 ms, would be the error."""
     wire_ns = (22_900_000, 39_600_000)
-    clock = BenchClock()
+    clock = SenderClock()
     exchanged(clock, rng, wire_ns=wire_ns)
     end_ns = HOST0_NS + 20 * NS_PER_S
-    assert abs(clock.to_bench_ns(end_ns) - end_ns - 7 * NS_PER_S) < 0.1 * NS_PER_MS
+    assert abs(clock.to_sender_ns(end_ns) - end_ns - 7 * NS_PER_S) < 0.1 * NS_PER_MS
 
 
 def test_exchanges_that_stop_give_way_to_the_stream(rng):
-    clock = BenchClock()
-    exchanged(clock, rng, count=ENOUGH_EXCHANGES)
+    clock = SenderClock()
+    exchanged(clock, rng, count=MIN_EXCHANGES)
     assert clock.synchronised
     later_ns = HOST0_NS + 2 * NS_PER_S + EXCHANGE_LIFE_NS
     clock.observe(later_ns + 7 * NS_PER_S, later_ns)
@@ -181,28 +183,28 @@ def test_exchanges_that_stop_give_way_to_the_stream(rng):
 
 def test_a_correction_enters_without_a_step():
     """After its first second, an offset that is found 20 ms smaller moves by no more than SLEW of the time that goes by."""
-    clock = BenchClock()
+    clock = SenderClock()
     shown = []
     for k in range(1200):
         host_ns = HOST0_NS + k * PERIOD_NS
         clock.observe(host_ns - (0 if k > 600 else 20 * NS_PER_MS), host_ns)
-        shown.append(clock.to_bench_ns(host_ns))
+        shown.append(clock.to_sender_ns(host_ns))
     steps = np.diff(shown)
     assert np.abs(steps[250:] - PERIOD_NS).max() <= SLEW * PERIOD_NS + 1
     assert shown[-1] == pytest.approx(HOST0_NS + 1199 * PERIOD_NS, abs=1e3)
 
 
-def test_before_any_message_bench_time_is_host_time():
-    clock = BenchClock()
-    assert clock.to_bench_ns(77) == 77
+def test_before_any_message_sender_time_is_host_time():
+    clock = SenderClock()
+    assert clock.to_sender_ns(77) == 77
     assert clock.latency_ns(1, 2) is None
     assert clock.summary()["mode"] == "none"
 
 
-def test_a_bench_on_unix_time_keeps_its_nanoseconds():
+def test_a_sender_on_unix_time_keeps_its_nanoseconds():
     """1.7e18 ns in a float64 would be known to 256 ns only."""
-    clock = BenchClock()
+    clock = SenderClock()
     for k in range(100):
         host_ns = HOST0_NS + k * PERIOD_NS
         clock.observe(1_700_000_000_000_000_001 + k * PERIOD_NS, host_ns)
-    assert clock.to_bench_ns(HOST0_NS + 99 * PERIOD_NS) == 1_700_000_000_000_000_001 + 99 * PERIOD_NS
+    assert clock.to_sender_ns(HOST0_NS + 99 * PERIOD_NS) == 1_700_000_000_000_000_001 + 99 * PERIOD_NS

@@ -11,8 +11,10 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from hilstar.attitude.clock.jumps import LATE_FOR_NS, WAITED_UNKNOWN_NS, Arrived, JumpFilter
-from hilstar.attitude.clock.sender_clock import BenchClock
+from hilstar.attitude.clock.exchanges import Exchange
+from hilstar.attitude.clock.jumps import LATE_FOR_NS, WAITED_UNKNOWN_NS, JumpFilter
+from hilstar.attitude.clock.sender_clock import SenderClock
+from hilstar.attitude.wire.links import Arrival, SampleArrival
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.units import NS_PER_MS, NS_PER_S
 
@@ -45,43 +47,35 @@ class Truth:
 
     def __post_init__(self) -> None:
         rng = np.random.default_rng(self.seed)
-        self.jumps, self.clock = JumpFilter(), BenchClock()
+        self.clock = SenderClock()
+        self.jumps = JumpFilter(self.clock)
         newest_ns, read_ns = -(2**80), 0
         for k in range(self.count):
             sent_ns = HOST0_NS + k * PERIOD_NS
             arrival_ns = sent_ns + MIN_DELAY_NS + round(rng.exponential(50_000))
             next_ns, waited_ns = self.reading(arrival_ns)
             read_ns = max(next_ns, read_ns)
-            jumps = self.jumps.jumps
             sample = AttitudeSample(self.times(sent_ns), Q, None, k)
-            self.jumps.clock_known = self.clock.synchronised
-            for each in self.jumps.take(Arrived(sample, read_ns, waited_ns=waited_ns)):
+            for each in self.jumps.take(Arrival(read_ns, sample, waited_ns=waited_ns)):
                 newest_ns = self._settle(each, newest_ns)
-            if self.jumps.jumps > jumps:
-                self.clock.widen(self.jumps.spread_ns)
             if self.exchanges and k % 100 == 50:
                 self._exchange(sent_ns, rng)
             self._compare(read_ns)
 
-    def _settle(self, each: Arrived, newest_ns: int) -> int:
-        if each.refusal is not None or each.sample.t_ns <= newest_ns:
+    def _settle(self, each: SampleArrival, newest_ns: int) -> int:
+        if each.refusal is not None or each.event.t_ns <= newest_ns:
             self.refused += 1
             return newest_ns
-        if each.waited_ns == WAITED_UNKNOWN_NS:
-            self.clock.guess(each.sample.t_ns, each.host_ns)
-        elif each.timely:
-            self.clock.observe(each.sample.t_ns, each.host_ns)
-        return each.sample.t_ns
+        return each.event.t_ns
 
     def _exchange(self, host_ns: int, rng: np.random.Generator) -> None:
         """One with a way there that is three times as long as the way back."""
         there_ns, back_ns = 150_000 + round(rng.exponential(30_000)), 50_000 + round(rng.exponential(30_000))
-        t2, correction_ns = self.times(host_ns + there_ns), self.jumps.correction_ns
-        answered = (t2 + correction_ns, t2 + 20_000 + correction_ns)
-        self.clock.exchange((host_ns, host_ns + there_ns + 20_000 + back_ns), answered)
+        t2_ns = self.times(host_ns + there_ns) + self.jumps.correction_ns
+        self.clock.exchange(Exchange(host_ns, t2_ns, t2_ns + 20_000, host_ns + there_ns + 20_000 + back_ns))
 
     def _compare(self, read_ns: int) -> None:
-        shown_ns = self.clock.to_bench_ns(read_ns) - self.jumps.correction_ns
+        shown_ns = self.clock.to_sender_ns(read_ns) - self.jumps.correction_ns
         told = self.clock.summary()
         self.host_ns.append(read_ns)
         self.error_ms.append((shown_ns - self.times(read_ns)) / NS_PER_MS)

@@ -10,8 +10,10 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from hilstar.attitude.clock.receiver import QUEUED_NS, Arrival, Receiver, Traffic
+from hilstar.attitude.back_channel import Traffic
 from hilstar.attitude.clock.timeline import Policy, Timeline
+from hilstar.attitude.receiver import QUEUED_NS, Receiver
+from hilstar.attitude.wire.links import Arrival
 from hilstar.attitude.wire.packet import AttitudeSample, Packet, encode
 from hilstar.notices import Notices
 from hilstar.rotation import from_radec_roll_deg, propagate
@@ -107,7 +109,7 @@ class Run:
         self.counts, self.events = self.receiver.counts, self.notices.counts()
 
     def _look(self, arrival: Arrival) -> None:
-        attitude = self.timeline.at(self.receiver.clock.to_bench_ns(arrival.host_ns))
+        attitude = self.timeline.at(self.receiver.clock.to_sender_ns(arrival.host_ns))
         if attitude is not None:
             self.ages_ms.append(attitude.age_ns / NS_PER_MS)
             self.shown.append(attitude.q_icrs_to_cam)

@@ -1,0 +1,231 @@
+"""A thread that takes what a link brings, counts it, keeps the sender's clock, answers it, and fills a timeline."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from hilstar.attitude.back_channel import QUIET, BackChannel, Traffic
+from hilstar.attitude.clock.jumps import MIN_LIMIT_NS, WAITED_UNKNOWN_NS, JumpFilter
+from hilstar.attitude.clock.sender_clock import SenderClock
+from hilstar.attitude.clock.senders import Repeats, Senders
+from hilstar.attitude.clock.shared_clock import SharedClockFilter
+from hilstar.attitude.clock.timeline import Timeline
+from hilstar.attitude.wire.links import Arrival, Link, SampleArrival
+from hilstar.attitude.wire.packet import REASONS, AttitudeSample, Event, Reason, Refusal, Status, TimeReply, TimeRequest
+from hilstar.notices import Notices
+from hilstar.units import NS_PER_MS, NS_PER_S
+
+POLL_MS = 20
+# Messages found when the frames begin were there before; those that arrive this soon after may have queued on the way.
+QUEUED_NS = NS_PER_S // 10
+QUEUE_NEVER_EMPTY_NS = NS_PER_S
+MIN_BACK_OFF_NS = NS_PER_S // 20
+MAX_BACK_OFF_NS = NS_PER_S
+log = logging.getLogger(__name__)
+
+
+@dataclass(slots=True)
+class PacketCounts:
+    """How many attitude messages arrived, and how many of those were refused, by reason."""
+
+    received: int = 0
+    refused_by: dict[Reason, int] = field(default_factory=lambda: dict.fromkeys(REASONS, 0))
+
+    @property
+    def refused(self) -> int:
+        """Messages refused, for whatever reason."""
+        return sum(self.refused_by.values())
+
+
+# Called for every attitude message with its arrival, its bytes, what it says, and why it was refused, if it was.
+Watch = Callable[[int, bytes, AttitudeSample | None, Refusal | None], None]
+
+
+def nobody_watches(host_ns: int, raw: bytes, sample: AttitudeSample | None, refusal: Refusal | None) -> None:
+    """The watch of a run without a ledger."""
+
+
+class Receiver:
+    """Runs `link` into `timeline` until closed. Nothing that arrives ends it.
+
+    What arrives before `learn` is called fills the timeline, and teaches the clock little.
+    """
+
+    def __init__(
+        self,
+        link: Link,
+        timeline: Timeline,
+        traffic: Traffic = QUIET,
+        watch: Watch = nobody_watches,
+        notices: Notices | None = None,
+    ) -> None:
+        self.counts = PacketCounts()
+        self._notices = Notices() if notices is None else notices
+        self.clock = SenderClock(shared=traffic.shared_clock)
+        self.jumps = SharedClockFilter(self._notices) if traffic.shared_clock else JumpFilter(self.clock)
+        self.latency_ms = RunningStatistics()
+        self._link = link
+        self._timeline = timeline
+        self._back = BackChannel(link, traffic)
+        self._watch = watch
+        self._repeats = Repeats(self._notices)
+        self._senders = Senders(timeline.stale_after_ns, self._notices)
+        self._begun_ns: int | None = None
+        self._learn_from_ns: int | None = None
+        self._empty_ns = 0
+        self._jumps_told = 0
+        self._stop = threading.Event()
+        self._failure = ""
+        self._started_ns = self._retry_ns = 0
+        self._back_off_ns = MIN_BACK_OFF_NS
+        self._thread = threading.Thread(target=self._run, name="hilstar-receiver", daemon=True)
+
+    def start(self) -> None:
+        """Begin to listen."""
+        self._started_ns = time.monotonic_ns()
+        self._thread.start()
+
+    def learn(self) -> None:
+        """The frames begin: what arrives from now on teaches the clock."""
+        self._begun_ns = time.monotonic_ns()
+
+    def tend(self) -> None:
+        """Restart the thread where it ended, and say so; for the frame loop, with each frame."""
+        if self._thread.is_alive() or self._stop.is_set():
+            return
+        now_ns = time.monotonic_ns()
+        if not self._retry_ns:
+            if now_ns - self._started_ns > 10 * MAX_BACK_OFF_NS:
+                self._back_off_ns = MIN_BACK_OFF_NS
+            self._retry_ns = now_ns + self._back_off_ns
+            self._back_off_ns = min(2 * self._back_off_ns, MAX_BACK_OFF_NS)
+            why = self._failure or "no reason given"
+            self._notices.tell("receiver-failed", f"the attitude receiver stopped ({why}); restarting it")
+        if now_ns >= self._retry_ns:
+            self._retry_ns, self._failure = 0, ""
+            self._thread = threading.Thread(target=self._run, name="hilstar-receiver", daemon=True)
+            self.start()
+
+    def close(self) -> None:
+        """Stop listening; the caller closes the link."""
+        self._stop.set()
+        self._thread.join()
+
+    def post(self, status: Status) -> None:
+        """Hand in the newest status; it leaves when it is due."""
+        self._back.post(status)
+
+    def sender_ns(self, continuous_ns: int) -> int:
+        """A time of the timeline on the sender's own clock."""
+        return continuous_ns - self.jumps.correction_ns
+
+    def clock_summary(self) -> dict[str, float | int | str | None]:
+        """The clock's summary, its offset that of the sender's clock as it is now, after all jumps."""
+        told = self.clock.summary()
+        offset_ms = told["offset_ms"]
+        if isinstance(offset_ms, float):
+            told["offset_ms"] = offset_ms + self.jumps.correction_ns / NS_PER_MS
+        uncertainty_ms = told["uncertainty_ms"]
+        if self.jumps.slowness > 0 and told["mode"] == "one-way" and isinstance(uncertainty_ms, float):
+            told["uncertainty_ms"] = uncertainty_ms + 2 * MIN_LIMIT_NS / NS_PER_MS  # one step, and the way to the next
+        return told | {"jumps": self.jumps.jumps}
+
+    def _run(self) -> None:
+        try:
+            while not self._stop.is_set():
+                self._listen()
+            self._settle(self.jumps.release())
+        except BaseException as error:  # whatever it is: the display goes on, and `tend` restarts this
+            self._failure = f"{type(error).__name__}: {error}"
+
+    def _listen(self) -> None:
+        waits = self._link.wait_for_message(0)
+        now_ns = time.monotonic_ns()
+        if not waits:
+            self._empty_ns = now_ns
+        self._begin_to_learn(now_ns, waits)
+        arrivals = self._link.receive(POLL_MS)
+        for k, arrival in enumerate(arrivals):
+            # The newest of those that arrived while this thread slept woke it; the others had to wait.
+            timely = not waits and k == len(arrivals) - 1
+            self._take(arrival, 0 if timely else arrival.host_ns - self._empty_ns)
+        now_ns = time.monotonic_ns()
+        self._settle(self.jumps.expire(now_ns))
+        if self._link.two_way:
+            self._back.talk(now_ns, ask=self._learn_from_ns is not None)
+
+    def _begin_to_learn(self, now_ns: int, waits: bool) -> None:
+        begun_ns = self._begun_ns
+        if begun_ns is None or self._learn_from_ns is not None:
+            return
+        if not waits or now_ns - begun_ns > QUEUE_NEVER_EMPTY_NS:
+            self._learn_from_ns = now_ns + QUEUED_NS
+
+    def _take(self, arrival: Arrival[Event], waited_ns: int) -> None:
+        match arrival.event:
+            case AttitudeSample() as sample:
+                self.counts.received += 1
+                self._take_sample(Arrival(arrival.host_ns, sample, arrival.raw, waited_ns))
+            case TimeRequest() as request if self._link.two_way:
+                self._back.answer(request, arrival.host_ns)
+            case TimeReply() as reply if self._link.two_way:
+                exchange = self._back.exchange(reply, arrival.host_ns, self.jumps.correction_ns)
+                if exchange is not None:
+                    self.clock.exchange(exchange)
+            case Refusal() as refusal:
+                self.counts.received += 1
+                self._refuse(arrival, refusal)
+            case other:
+                self.counts.received += 1
+                self._refuse(arrival, Refusal("format", f"a {type(other).__name__} packet is not an attitude"))
+
+    def _take_sample(self, arrival: SampleArrival) -> None:
+        sample, host_ns = arrival.event, arrival.host_ns
+        refusal = self._repeats.judge(sample, host_ns, arrival.raw) or self._senders.judge(sample, host_ns, arrival.waited_ns)
+        if refusal is not None:
+            self._refuse(arrival, refusal)
+            return
+        if self._repeats.resumed():
+            self.jumps.forgive()
+        if self._learn_from_ns is None or host_ns < self._learn_from_ns:
+            arrival = Arrival(host_ns, sample, arrival.raw, WAITED_UNKNOWN_NS)
+        elif self.clock.unheard:
+            self._back.ask_quickly(host_ns)
+        self._settle(self.jumps.take(arrival))
+        if not self.clock.synchronised:
+            self._tell_pace(self.jumps.slowness)
+
+    def _tell_pace(self, slowness: float) -> None:
+        if not slowness:
+            return
+        detail = f"t_ns runs at {1 - slowness:.3g} times real time; it is followed in small steps"
+        if slowness > 0:
+            detail += " (a slow clock, or a link too slow for all packets)"
+        self._notices.begin("source-slow" if slowness > 0 else "source-fast", detail)
+
+    def _settle(self, decided: list[SampleArrival]) -> None:
+        for arrival in decided:
+            sample, host_ns = arrival.event, arrival.host_ns
+            refusal = arrival.refusal or self._timeline.add(sample, host_ns)
+            if refusal is not None:
+                self._refuse(arrival, refusal)
+                continue
+            if arrival.waited_ns != WAITED_UNKNOWN_NS:
+                latency_ns = self.clock.latency_ns(sample.t_ns, host_ns)
+                self.latency_ms.add((latency_ns or 0.0) / NS_PER_MS)
+            self._watch(host_ns, arrival.raw, sample, None)
+        if self.jumps.jumps > self._jumps_told:
+            self._jumps_told = self.jumps.jumps
+            total_s = self.jumps.correction_ns / NS_PER_S
+            self._notices.tell("jump", f"the sender's clock jumped, by {total_s:.3f} s in all so far; its stream continues")
+
+    def _refuse(self, arrival: Arrival[Event], refusal: Refusal) -> None:
+        self.counts.refused_by[refusal.reason] += 1
+        if self.counts.refused_by[refusal.reason] == 1:
+            log.warning("packet refused (%s): %s; further ones are only counted", refusal.reason, refusal.detail)
+        sample = arrival.event if isinstance(arrival.event, AttitudeSample) else None
+        self._watch(arrival.host_ns, arrival.raw, sample, refusal)

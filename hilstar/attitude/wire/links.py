@@ -1,0 +1,45 @@
+"""What every road into hilstar offers: messages with the time of their arrival, and a way back where there is one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Generic, Protocol, TypeAlias, TypeVar
+
+from hilstar.attitude.wire.packet import AttitudeSample, Event, Packet, Refusal
+
+E_co = TypeVar("E_co", bound=Event, covariant=True)
+
+
+@dataclass(frozen=True, slots=True)
+class Arrival(Generic[E_co]):
+    """One message: host time of its arrival, what it says, its bytes as received, and how long it may have waited unread.
+
+    `refusal` says why a packet that is an attitude is not used.
+    """
+
+    host_ns: int
+    event: E_co
+    raw: bytes = b""
+    waited_ns: int = 0
+    refusal: Refusal | None = None
+
+
+SampleArrival: TypeAlias = Arrival[AttitudeSample]
+
+
+class Link(Protocol):
+    """A road into hilstar."""
+
+    two_way: bool
+
+    def receive(self, timeout_ms: int) -> list[Arrival[Event]]:
+        """What has arrived; waits at most `timeout_ms` for the first, and for no other. A lost peer raises nothing."""
+
+    def wait_for_message(self, timeout_ms: int) -> bool:
+        """True once something has arrived that was not read."""
+
+    def send(self, packet: Packet) -> None:
+        """Send to the other side, never waiting; lost where nobody listens."""
+
+    def wire_ns(self, packet: Packet) -> int:
+        """How long the wire alone takes for a packet, ns."""

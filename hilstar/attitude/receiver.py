@@ -17,6 +17,7 @@ from hilstar.attitude.clock.timeline import Timeline
 from hilstar.attitude.wire.links import Arrival, Link, SampleArrival
 from hilstar.attitude.wire.packet import REASONS, AttitudeSample, Event, Reason, Refusal, Status, TimeReply, TimeRequest
 from hilstar.notices import Notices
+from hilstar.running_statistics import RunningStatistics
 from hilstar.units import NS_PER_MS, NS_PER_S
 
 POLL_MS = 20

@@ -1,0 +1,37 @@
+"""The architecture page names what is there: its files and its floors."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+
+import pytest
+
+from tests.conftest import ROOT
+
+PAGE = (ROOT / "docs" / "architecture.md").read_text()
+MAX_FILES_OF_A_WALK = 24
+
+
+def walk(heading: str) -> list[str]:
+    """The files that a walk passes, each once, in order."""
+    section = PAGE.split(f"\n## {heading}\n")[1].split("\n## ")[0]
+    return list(dict.fromkeys(re.findall(r"`((?:[a-z0-9_]+/)+[a-z0-9_]+\.(?:py|vert|frag))`", section)))
+
+
+@pytest.mark.parametrize("heading", ["One packet to a pixel", "One magnitude to a code value"])
+def test_a_walk_passes_files_that_are_there_and_few(heading):
+    files = walk(heading)
+    assert len(files) > 5
+    for name in files:
+        assert (ROOT / name).is_file() or (ROOT / "hilstar" / name).is_file(), f"architecture.md names {name}"
+    assert len(files) < MAX_FILES_OF_A_WALK
+
+
+def test_the_floors_are_those_of_the_import_rules():
+    rules = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
+    layers = next(rule["layers"] for rule in rules if rule["type"] == "layers")
+    named = [set(re.findall(r"\w+", layer)) for layer in layers]
+    table = PAGE.split("\n## The rooms\n")[1].split("\n## ")[0]
+    rows = [set(re.findall(r"`(\w+)`", line.split("|")[1])) for line in table.splitlines() if line.startswith("| `")]
+    assert rows == [names for names in named if names]

@@ -43,12 +43,17 @@ def main() -> NoReturn:
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115, PTH123 - for as long as the process lives
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="surrogateescape")  # a file's name goes out as the bytes that came in
-    try:
-        code = _run(with_shares(sys.argv[1:]))
-    except SystemExit as end:  # of `fail`
-        code = end.code if isinstance(end.code, int) else 1
+    code = run_command(sys.argv[1:])
     finish_stderr(READER_WAITS_S if interrupts.caught() is None else STOPPED_READER_WAITS_S)
     interrupts.leave(code)
+
+
+def run_command(words: list[str]) -> int:
+    """Run a command line in this process; its exit code, a refusal's one line on stderr."""
+    try:
+        return _run(with_shares(words))
+    except SystemExit as end:  # of `fail`
+        return end.code if isinstance(end.code, int) else 1
 
 
 def _run(words: list[str]) -> int:

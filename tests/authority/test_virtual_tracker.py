@@ -16,7 +16,7 @@ from hilstar.sky.electrons import Optics, Photometry, zodiacal_electrons_per_s_a
 from hilstar.sky.spectrum import Curve
 from hilstar.twin.simulator import Simulator
 from tests.authority.test_electrons import read, v_mean
-from tests.conftest import ROOT, SMALL_BENCH
+from tests.support.benches import ROOT, SMALL_BENCH
 
 # The limit.
 LIMIT = 1e-6

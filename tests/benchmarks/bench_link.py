@@ -16,7 +16,8 @@ from pathlib import Path
 import numpy as np
 import zmq
 
-from tests.conftest import ROOT, run_hilstar
+from tests.support.benches import ROOT
+from tests.support.commands import run_hilstar
 from tests.support.ptys import Cable
 
 RATE_HZ = 200

@@ -6,7 +6,7 @@ import importlib
 
 import pytest
 
-from tests.conftest import ROOT
+from tests.support.benches import ROOT
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ import shlex
 import shutil
 from pathlib import Path
 
-from tests.conftest import ROOT
+from tests.support.benches import ROOT
 
 EXAMPLES = ROOT / "examples"
 README = (EXAMPLES / "README.md").read_text()

@@ -15,8 +15,8 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from hilstar.cli import app
-from tests.conftest import run_hilstar
 from tests.examples.support import EXAMPLES, commands, copied, section
+from tests.support.commands import run_hilstar
 
 pytestmark = pytest.mark.e2e
 

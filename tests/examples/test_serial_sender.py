@@ -20,7 +20,7 @@ import pytest
 from hilstar.attitude.wire.packet import AttitudeSample, Status, TimeReply, TimeRequest
 from hilstar.attitude.wire.serial_link import SerialLink
 from hilstar.rotation import propagate
-from tests.conftest import ROOT, SMALL_BENCH
+from tests.support.benches import ROOT, SMALL_BENCH
 from tests.support.ptys import Cable
 
 pytestmark = pytest.mark.e2e

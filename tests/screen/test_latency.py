@@ -6,7 +6,6 @@ import json
 import mmap
 import os
 import subprocess
-import sys
 import threading
 import time
 from contextlib import contextmanager
@@ -20,9 +19,11 @@ from hilstar.calibrate.toml_key import with_key
 from hilstar.errors import InputError
 from hilstar.run.record.records import read_run
 from hilstar.run.screen.photodiode import CODE, CODE_BITS, marker_light
-from tests.conftest import assert_refused, run_hilstar
-from tests.screen.test_window import ATTITUDE, BENCH, Server, started
+from tests.support.benches import ATTITUDE, SCREEN_BENCH, still_log
+from tests.support.commands import HILSTAR, assert_refused, run_hilstar
 from tests.support.ptys import Cable
+from tests.support.screens import Screen
+from tests.support.waiting import wait_for
 
 # The watcher looks every 0.2 ms or so, and sleeps between; a shared machine may keep it from that now and then.
 MEDIAN_MS = 2.0
@@ -31,33 +32,23 @@ DEVICE_MS = 0.5  # of the same edges, a few more or less
 PERIOD_NS = 1e9 / 60
 
 
-@pytest.fixture(scope="module")
-def server(tmp_path_factory):
-    running = started(tmp_path_factory.mktemp("screen"))
-    assert running is not None, "no X server comes up"
-    process, server = running
-    yield server
-    process.terminate()
-    process.wait()
-
-
 class Diode:
     """Watches the screen's bottom left pixel and tells of its edges on a serial line, `added_ms` late."""
 
-    def __init__(self, server: Server, line: Path, added_ms: float = 0.0, device_clock: bool = False) -> None:
-        self._server, self._line, self._added_s, self._device = server, line, added_ms / 1e3, device_clock
+    def __init__(self, screen: Screen, line: Path, added_ms: float = 0.0, device_clock: bool = False) -> None:
+        self._file, self._line, self._added_s, self._device = screen.file, line, added_ms / 1e3, device_clock
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._watch, daemon=True)
 
     def _watch(self) -> None:
-        with self._server.screen_file.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as screen:
-            head = np.frombuffer(screen[:100], ">u4")
+        with self._file.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as frame:
+            head = np.frombuffer(frame[:100], ">u4")
             begin, height, row_bytes, colours = (int(head[k]) for k in (0, 5, 12, 19))
             place = begin + 12 * colours + (height - 4) * row_bytes + 4 * 4
             out = os.open(self._line, os.O_WRONLY | os.O_NOCTTY)
-            level, started_s = screen[place] > 127, time.monotonic()
+            level, started_s = frame[place] > 127, time.monotonic()
             while not self._stop.is_set():
-                if (screen[place] > 127) != level:
+                if (frame[place] > 127) != level:
                     seen_s = time.monotonic()
                     level = not level
                     stamp = f",{(seen_s - started_s + 1000 + self._added_s) * 1e6:.0f}" if self._device else ""
@@ -76,24 +67,19 @@ class Diode:
 
 
 @contextmanager
-def shown(server: Server, folder: Path, kind: str):
+def shown(screen: Screen, folder: Path, kind: str):
     """A still sky with the photodiode square, kept in a ledger, while this is open."""
     bench = folder / "bench.toml"
     keys = f'photodiode_px = 40\nphotodiode = "{kind}"\nscanout_ms = 0'
-    bench.write_text(BENCH.replace("[collimator]", f"{keys}\n[collimator]"))
-    still = "\n".join(f"{t},{ATTITUDE}" for t in (0, 60))
-    (folder / "still.csv").write_text(f"t_s,qw,qx,qy,qz\n{still}\n")
+    bench.write_text(SCREEN_BENCH.replace("[collimator]", f"{keys}\n[collimator]"))
+    still_log(folder / "still.csv")
     command = ["replay", str(bench), str(folder / "still.csv"), "--ledger", str(folder / "run.mcap"), "--json", "--overwrite"]
-    env = {**os.environ, "DISPLAY": server.display}
     (folder / "run.mcap").unlink(missing_ok=True)
-    with subprocess.Popen(
-        [sys.executable, "-m", "hilstar", *command], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=env
-    ) as process:
+    with subprocess.Popen([*HILSTAR, *command], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=screen.env) as process:
         try:
-            end = time.monotonic() + 20
-            while not ((folder / "run.mcap").exists() and len((folder / "run.mcap").read_bytes()) > 20_000):
-                assert process.poll() is None and time.monotonic() < end
-                time.sleep(0.05)
+            ledger = folder / "run.mcap"
+            wait_for(lambda: process.poll() is not None or (ledger.exists() and ledger.stat().st_size > 20_000))
+            assert process.poll() is None
             yield bench
             process.terminate()
             process.communicate(timeout=20)
@@ -101,8 +87,8 @@ def shown(server: Server, folder: Path, kind: str):
             process.kill()
 
 
-def measured(server: Server, folder: Path, kind: str, added_ms: float, device_clock: bool, *options: str) -> tuple[dict, Path]:
-    with Cable(folder) as cable, shown(server, folder, kind) as bench, Diode(server, cable.bench, added_ms, device_clock):
+def measured(screen: Screen, folder: Path, kind: str, added_ms: float, device_clock: bool, *options: str) -> tuple[dict, Path]:
+    with Cable(folder) as cable, shown(screen, folder, kind) as bench, Diode(screen, cable.bench, added_ms, device_clock):
         result = run_hilstar(
             "latency",
             folder / "run.mcap",
@@ -122,13 +108,13 @@ def measured(server: Server, folder: Path, kind: str, added_ms: float, device_cl
     return json.loads(result.stdout), bench
 
 
-def test_a_delay_that_was_added_is_found_and_written_into_the_bench_file(server, tmp_path):
+def test_a_delay_that_was_added_is_found_and_written_into_the_bench_file(screen, tmp_path):
     """The screen shows a swap within a millisecond; what is added to the diode's line comes out as the panel's delay."""
-    plain, _ = measured(server, tmp_path, "code", 0.0, False)
+    plain, _ = measured(screen, tmp_path, "code", 0.0, False)
     assert plain["edges"] > 60 and plain["unmatched"] <= 0.05 * plain["edges"]
     assert abs(plain["latency_ms"]["p50"]) < MEDIAN_MS
     assert not plain["ambiguous"]
-    late, bench = measured(server, tmp_path, "code", ADDED_MS, False, "--write", tmp_path / "bench.toml")
+    late, bench = measured(screen, tmp_path, "code", ADDED_MS, False, "--write", tmp_path / "bench.toml")
     assert late["latency_ms"]["p50"] - plain["latency_ms"]["p50"] == pytest.approx(ADDED_MS, abs=MEDIAN_MS)
     assert late["swap_to_square_ms"] == 0
     assert f"panel_delay_ms = {round(late['panel_delay_ms'], 3)}\n" in bench.read_text()
@@ -139,8 +125,8 @@ def test_a_delay_that_was_added_is_found_and_written_into_the_bench_file(server,
     assert json.loads(again.stdout)["latency_ms"]["p50"] == pytest.approx(late["latency_ms"]["p50"], abs=DEVICE_MS)
 
 
-def test_a_square_that_toggles_is_known_but_for_pairs_of_frames_and_a_device_s_own_clock_is_followed(server, tmp_path):
-    found, _ = measured(server, tmp_path, "toggle", 0.0, True)
+def test_a_square_that_toggles_is_known_but_for_pairs_of_frames_and_a_device_s_own_clock_is_followed(screen, tmp_path):
+    found, _ = measured(screen, tmp_path, "toggle", 0.0, True)
     assert found["ambiguous"]
     assert found["edges"] > 100
     # The device's stamps are of its own clock; its least delay on the line, 1 ms here, is what a one-way line cannot tell.

@@ -6,8 +6,6 @@ import ctypes
 import json
 import signal
 import subprocess
-import sys
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,12 +13,12 @@ from pathlib import Path
 import pytest
 
 from hilstar.monitor.window.x11 import sync_control
-from hilstar.run.record.records import frame_records
-from tests.conftest import run_hilstar
-from tests.screen.test_window import ATTITUDE, BENCH
+from tests.support.benches import SCREEN_BENCH, still_log
+from tests.support.commands import HILSTAR, run_hilstar
+from tests.support.screens import recorded
+from tests.support.waiting import PATIENCE_S, wait_for
 from tests.support.xservers import Xorg, xorg
 
-LATEST_S = 20.0
 OTHER_GAMMA = "1.7:1.4:1.2"
 
 
@@ -32,9 +30,8 @@ def server(tmp_path_factory) -> Iterator[Xorg]:
 
 def bench(folder: Path, keys: str = 'display = "DUMMY0"') -> Path:
     path = folder / "bench.toml"
-    path.write_text(BENCH.replace("[collimator]", f"refresh_hz = 60\n{keys}\n[collimator]"))
-    still = "\n".join(f"{t},{ATTITUDE}" for t in (0, 60))
-    (folder / "still.csv").write_text(f"t_s,qw,qx,qy,qz\n{still}\n")
+    path.write_text(SCREEN_BENCH.replace("[collimator]", f"refresh_hz = 60\n{keys}\n[collimator]"))
+    still_log(folder / "still.csv")
     return path
 
 
@@ -44,7 +41,7 @@ def showing(server: Xorg, path: Path, *options: str) -> Iterator[subprocess.Pope
     ledger = path.parent / "run.mcap"
     command = ["replay", str(path), str(path.parent / "still.csv"), "--force", "--json", "--ledger", str(ledger), *options]
     with subprocess.Popen(
-        [sys.executable, "-m", "hilstar", *command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=server.env
+        [*HILSTAR, *command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=server.env
     ) as process:
         try:
             wait_for(lambda: frames(path) > 10 or process.poll() is not None)
@@ -53,21 +50,13 @@ def showing(server: Xorg, path: Path, *options: str) -> Iterator[subprocess.Pope
             if process.poll() is None:
                 process.terminate()
                 try:
-                    process.communicate(timeout=LATEST_S)
+                    process.communicate(timeout=PATIENCE_S)
                 finally:
                     process.kill()
 
 
 def frames(path: Path) -> int:
-    ledger = path.parent / "run.mcap"
-    return len(list(frame_records(ledger))) if ledger.exists() and ledger.stat().st_size else 0
-
-
-def wait_for(true) -> None:
-    end = time.monotonic() + LATEST_S
-    while not true():
-        assert time.monotonic() < end
-        time.sleep(0.1)
+    return len(recorded(path.parent / "run.mcap"))
 
 
 @pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT])
@@ -78,7 +67,7 @@ def test_the_ramp_is_straight_while_the_bench_runs_and_given_back_after_a_signal
     with showing(server, bench(tmp_path)) as process:
         assert server.gamma("DUMMY0") == (1.0, 1.0, 1.0)
         process.send_signal(how)
-        out, err = process.communicate(timeout=LATEST_S)
+        out, err = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 0, err
     assert server.gamma("DUMMY0") == before
     assert json.loads(out)["screen"]["timestamp_source"].startswith("after-swap clock")
@@ -136,7 +125,7 @@ def test_a_display_that_is_unplugged_and_returns_is_filled_again(server, tmp_pat
             wait_for(lambda: server.gamma("DUMMY1") == (1.0, 1.0, 1.0))
             assert process.poll() is None
             process.terminate()
-            _, err = process.communicate(timeout=LATEST_S)
+            _, err = process.communicate(timeout=PATIENCE_S)
         assert process.returncode == 0, err
         assert "DUMMY1 is gone" in err and "DUMMY1 is back" in err
     finally:

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import json
-import os
 import struct
 import subprocess
-import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -20,61 +17,37 @@ import zmq
 from hilstar.attitude.logs.mcap_log import read_messages
 from hilstar.attitude.wire.protocol import HEALTH_BLANK, HEALTH_HIDDEN, HEALTH_NO_ATTITUDE, HEALTH_OPERATOR_OVERRIDE
 from hilstar.run.record.records import EventRecord, FrameRecord, frame_records
-from tests.e2e.stream.test_serve import free_port, packet
-from tests.screen.test_window import ATTITUDE, BENCH, LATEST_S, Server, Shown, codes_of, lines_over, started
+from tests.support.benches import ORION_Q, SCREEN_BENCH
+from tests.support.commands import HILSTAR
+from tests.support.screens import Screen, Shown, codes_of, lines_over, recorded
+from tests.support.senders import connected, free_port, packet
+from tests.support.waiting import PATIENCE_S, wait_for
 from tests.support.xevents import Client, client
 
-Q = (0.6987226, 0.7135120, -0.0370377, 0.0362700)
 MS = 1_000_000
-
-
-@pytest.fixture(scope="module")
-def server(tmp_path_factory) -> Iterator[Server]:
-    running = started(tmp_path_factory.mktemp("operator"))
-    assert running is not None, "no X server comes up"
-    process, server = running
-    yield server
-    process.terminate()
-    process.wait()
-
-
-@pytest.fixture
-def bench_file(tmp_path) -> Path:
-    path = tmp_path / "bench.toml"
-    path.write_text(BENCH)
-    (tmp_path / "still.csv").write_text(f"t_s,qw,qx,qy,qz\n0,{ATTITUDE}\n60,{ATTITUDE}\n")
-    return path
 
 
 def events(ledger: Path) -> list[EventRecord]:
     return [msgspec.json.decode(data, type=EventRecord) for data in read_messages(ledger, "/event")]
 
 
-def wait_for(true: Callable[[], object]) -> None:
-    end = time.monotonic() + LATEST_S
-    while not true():
-        assert time.monotonic() < end
-        time.sleep(0.05)
-
-
 def last_frame(ledger: Path) -> FrameRecord | None:
-    frames = list(frame_records(ledger)) if ledger.exists() and ledger.stat().st_size else []
-    return frames[-1] if frames else None
+    return next(reversed(recorded(ledger)), None)
 
 
 @contextmanager
-def shown_with_ledger(server: Server, bench_file: Path, *options: str) -> Iterator[tuple[Shown, Client, Path]]:
+def shown_with_ledger(screen: Screen, bench_file: Path, *options: str) -> Iterator[tuple[Shown, Client, Path]]:
     ledger = bench_file.parent / "run.mcap"
-    with Shown(server, bench_file, "--ledger", str(ledger), *options) as shown, client(server.display) as user:
+    with Shown(screen, bench_file, "--ledger", str(ledger), *options) as shown, client(screen.display) as user:
         wait_for(lambda: last_frame(ledger) is not None)
         yield shown, user, ledger
 
 
-def test_each_key_is_in_the_frames_and_the_events_and_a_hidden_sky_is_none(server, bench_file):
+def test_each_key_is_in_the_frames_and_the_events_and_a_hidden_sky_is_none(screen, bench_file):
     """Keys, what the frames then say, and whether they have an attitude."""
     steps = [("b", "blank", False), ("g", "blank, grid", False), ("b", "grid", True), ("g", "", True), ("c", "crosshair", True)]
     steps += [("t", "crosshair, patch 0%", False), ("b", "blank, crosshair, patch 0%", False)]
-    with shown_with_ledger(server, bench_file) as (shown, user, ledger):
+    with shown_with_ledger(screen, bench_file) as (shown, user, ledger):
         for key, operator, has_sky in steps:
             user.press(key)
             wait_for(lambda operator=operator: last_frame(ledger).operator == operator)
@@ -93,8 +66,8 @@ def test_each_key_is_in_the_frames_and_the_events_and_a_hidden_sky_is_none(serve
     assert summary["screen"]["hidden"] == {"frames": 0, "s": 0}
 
 
-def test_a_paused_attitude_grows_old(server, bench_file):
-    with shown_with_ledger(server, bench_file) as (shown, user, ledger):
+def test_a_paused_attitude_grows_old(screen, bench_file):
+    with shown_with_ledger(screen, bench_file) as (shown, user, ledger):
         user.press("space")
         wait_for(lambda: last_frame(ledger).operator == "pause")
         first = next(frame for frame in frame_records(ledger) if frame.operator)
@@ -117,8 +90,8 @@ def test_a_paused_attitude_grows_old(server, bench_file):
         (lambda user: user.cover(640, 480), lambda user, made: user.uncover(made), "covered", []),
     ],
 )
-def test_a_window_that_is_not_seen_is_in_the_record(server, bench_file, hide, show, why, options):
-    with shown_with_ledger(server, bench_file, *options) as (shown, user, ledger):
+def test_a_window_that_is_not_seen_is_in_the_record(screen, bench_file, hide, show, why, options):
+    with shown_with_ledger(screen, bench_file, *options) as (shown, user, ledger):
         window = user.window()
         user.window = lambda: window  # whatever lies above it
         made = hide(user)
@@ -130,32 +103,29 @@ def test_a_window_that_is_not_seen_is_in_the_record(server, bench_file, hide, sh
     assert summary["screen"]["hidden"]["frames"] == sum(bool(frame.hidden) for frame in frame_records(ledger)) > 0
 
 
-def test_the_status_says_what_the_screen_shows(server, tmp_path):
+def test_the_status_says_what_the_screen_shows(screen, tmp_path):
     """In lockstep, where each attitude gets its status."""
     port, bench = free_port(), tmp_path / "bench.toml"
-    bench.write_text(f'{BENCH}\n[attitude]\nlockstep = true\nendpoint = "tcp://127.0.0.1:{port}"\n')
-    env = {**os.environ, "DISPLAY": server.display}
-    env.pop("WAYLAND_DISPLAY", None)
-    context = zmq.Context()
-    asker = context.socket(zmq.REQ)
-    asker.setsockopt(zmq.LINGER, 0)
-    asker.setsockopt(zmq.RCVTIMEO, int(LATEST_S * 1000))
-    asker.connect(f"tcp://127.0.0.1:{port}")
+    bench.write_text(f'{SCREEN_BENCH}\n[attitude]\nlockstep = true\nendpoint = "tcp://127.0.0.1:{port}"\n')
     count = 0
 
     def status() -> tuple[int, int]:
         nonlocal count
         count += 1
-        asker.send(packet(count, count * 10 * MS, q=Q))
+        asker.send(packet(count, count * 10 * MS, q=ORION_Q))
         _, _, health, _, _, age_ns, *_ = struct.unpack("<BBHIqqIIII", asker.recv())
         return health, age_ns
 
-    with subprocess.Popen([sys.executable, "-m", "hilstar", "serve", str(bench), "--json"], stdout=-1, env=env) as process:
+    command = [*HILSTAR, "serve", str(bench), "--json"]
+    with (
+        connected(port, zmq.REQ, PATIENCE_S) as asker,
+        subprocess.Popen(command, stdout=subprocess.PIPE, env=screen.env) as process,
+    ):
         try:
             bits = HEALTH_OPERATOR_OVERRIDE | HEALTH_BLANK | HEALTH_HIDDEN | HEALTH_NO_ATTITUDE
             health, age_ns = status()
             assert (health & bits, age_ns) == (0, 0)
-            with client(server.display) as user:
+            with client(screen.display) as user:
                 user.press("b")
                 wait_for(lambda: status()[0] & bits == HEALTH_OPERATOR_OVERRIDE | HEALTH_BLANK)
                 assert status()[1] == -1
@@ -174,19 +144,17 @@ def test_the_status_says_what_the_screen_shows(server, tmp_path):
                 user.map()
                 wait_for(lambda: status()[0] & bits == 0)
             process.terminate()
-            summary = json.loads(process.communicate(timeout=LATEST_S)[0])
+            summary = json.loads(process.communicate(timeout=PATIENCE_S)[0])
         finally:
             process.kill()
-            asker.close()
-            context.term()
     assert summary["screen"]["operator"]["frames"] > 0 < summary["screen"]["hidden"]["frames"]
 
 
-def test_b_blanks_a_patch_and_c_draws_the_crosshair_on_it(server, bench_file):
+def test_b_blanks_a_patch_and_c_draws_the_crosshair_on_it(screen, bench_file):
     codes = codes_of(bench_file)
     black = np.zeros_like(codes)
     cross = lines_over(black, "c") > 0
-    with Shown(server, bench_file) as shown, client(server.display) as user:
+    with Shown(screen, bench_file) as shown, client(screen.display) as user:
         assert (shown.wait_for(codes) == codes).all()
         for patch in (0, 64, 128, 191, 255):
             user.press("t")

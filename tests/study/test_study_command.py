@@ -11,7 +11,7 @@ from PIL import Image
 from hilstar.sky.pickles import load_library
 from hilstar.study.models import choices, leave_one_out, rapp_ratios, spectra, study_optics, torres2010_k, zero_points
 from hilstar.study.stability import run as stability
-from tests.conftest import assert_refused, run_hilstar
+from tests.support.commands import assert_refused, run_hilstar
 
 
 def table(path):

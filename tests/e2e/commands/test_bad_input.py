@@ -15,7 +15,8 @@ import pytest
 
 from hilstar.cli import app
 from hilstar.errors import HilstarError, one_line
-from tests.conftest import SMALL_BENCH, assert_refused, run_hilstar
+from tests.support.benches import SMALL_BENCH
+from tests.support.commands import assert_refused, run_hilstar
 
 PATIENCE_S = 20
 MEMORY_BYTES = 4 << 30

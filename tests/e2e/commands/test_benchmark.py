@@ -13,7 +13,7 @@ from hilstar.rotation import from_radec_roll_deg
 from hilstar.study.speed import benchmark
 from hilstar.study.speed.benchmark import RADEC_ROLL_DEG, STAGES, scene
 from hilstar.study.speed.others import numpy_linear
-from tests.conftest import assert_refused, run_hilstar
+from tests.support.commands import assert_refused, run_hilstar
 
 Q = from_radec_roll_deg(*RADEC_ROLL_DEG)
 GRID = ("--stars", "100,1000", "--sizes", "640x480")

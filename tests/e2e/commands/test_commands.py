@@ -18,8 +18,9 @@ from PIL import Image
 import hilstar
 from hilstar.monitor.response import encode, srgb_response
 from hilstar.rotation import from_radec_roll_deg
-from tests.conftest import ROOT, SMALL_BENCH, assert_refused, run_hilstar
 from tests.support import leftovers
+from tests.support.benches import ROOT, SMALL_BENCH
+from tests.support.commands import assert_refused, run_hilstar
 
 ORION = ROOT / "configs" / "thesis-orion.toml"
 ALNILAM, BETELGEUSE, RIGEL, ALNITAK = 26311, 27989, 24436, 26727

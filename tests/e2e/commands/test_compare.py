@@ -14,7 +14,7 @@ from PIL import Image
 from hilstar.render.reference import linear_image
 from hilstar.scene.psf import footprint_px
 from hilstar.scene.sprites import pack_sprites
-from tests.conftest import assert_refused, run_hilstar
+from tests.support.commands import assert_refused, run_hilstar
 
 SIGMA_PX = (0.85, 0.85)  # the bench's
 

@@ -18,7 +18,8 @@ from hilstar.bench.white import clipping_hip
 from hilstar.monitor.calibration import load_calibration
 from hilstar.scene.psf import peak_share, pixel_share
 from hilstar.twin.budget import budget, zero_point_mag
-from tests.conftest import ROOT, SMALL_BENCH, assert_refused, run_hilstar
+from tests.support.benches import ROOT, SMALL_BENCH
+from tests.support.commands import assert_refused, run_hilstar
 
 EXACT = '[render]\nquantisation = "exact"\n'
 # 1 % noise on one reading: the response of the example comes back within 1 % at nearly every code, 3 % at any.

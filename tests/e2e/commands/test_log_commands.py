@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from hilstar.rotation import from_radec_roll_deg, propagate
-from tests.conftest import assert_refused, run_hilstar
+from tests.support.commands import assert_refused, run_hilstar
 
 RATE = np.radians([0.3, -0.2, 2.0])
 

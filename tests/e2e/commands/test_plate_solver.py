@@ -19,7 +19,7 @@ from PIL import Image
 from scipy import ndimage
 
 from hilstar.monitor.response import srgb_light
-from tests.conftest import run_hilstar
+from tests.support.commands import run_hilstar
 
 # The limits; measured here: 0.0003 to 0.024 arcsec and 0.03 to 0.7 arcsec.
 LINEAR_LIMIT_ARCSEC = 0.1

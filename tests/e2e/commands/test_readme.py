@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.conftest import ROOT, run_hilstar
+from tests.support.benches import ROOT
+from tests.support.commands import run_hilstar
 
 README = (ROOT / "README.md").read_text()
 FILES = ("pyproject.toml", "README.md", "LICENSE", "hilstar", "shaders", "configs")

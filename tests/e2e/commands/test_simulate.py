@@ -7,7 +7,8 @@ import pytest
 from astropy.io import fits
 from PIL import Image
 
-from tests.conftest import ROOT, SMALL_BENCH, assert_refused, run_hilstar
+from tests.support.benches import ROOT, SMALL_BENCH
+from tests.support.commands import assert_refused, run_hilstar
 
 LYRA = ROOT / "configs" / "thesis-lyra.toml"
 POINTING = ("--radec", "283.021,35.349,0")

@@ -13,7 +13,7 @@ from PIL import Image
 from hilstar.monitor.quantise import Panel
 from hilstar.monitor.response import gamma_response, srgb_response, table_response
 from hilstar.twin.verify import Twin
-from tests.conftest import assert_refused, run_hilstar
+from tests.support.commands import assert_refused, run_hilstar
 
 BENCH = """
 [tracker]

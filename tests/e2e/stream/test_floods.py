@@ -5,13 +5,12 @@ from __future__ import annotations
 import contextlib
 import json
 import resource
-import signal
 import socket
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -20,74 +19,15 @@ import zmq
 import zmq.auth
 
 from hilstar.attitude.wire.flood_limits import MAX_BURST, MAX_PACKETS_PER_S
-from tests.conftest import SMALL_BENCH, assert_refused, run_hilstar
-from tests.e2e.stream.test_serve import free_port, packet, requester
+from tests.support.benches import SMALL_BENCH
+from tests.support.commands import assert_refused, run_hilstar
+from tests.support.senders import connected, packet
+from tests.support.servers import Served, bound
+from tests.support.waiting import PATIENCE_S, wait_for
 from tests.support.zmtp import greeted, part
 
-PATIENCE_S = 30.0
 # bounds.MAX_GROWTH_BYTES, and what comes within the time that a loaded machine needs to see it.
 MAX_GROWTH_MB = 256 + 500
-
-
-class Served:
-    """`hilstar serve`, bound to a port, its stderr read as it comes."""
-
-    def __init__(self, process: subprocess.Popen[str], port: int) -> None:
-        self.process, self.port = process, port
-        self.lines: list[str] = []
-        self._reader = threading.Thread(target=self._read, daemon=True)
-        self._reader.start()
-
-    def _read(self) -> None:
-        assert self.process.stderr is not None
-        self.lines.extend(self.process.stderr)
-
-    def await_line(self, words: str) -> None:
-        await_that(lambda: any(words in line for line in list(self.lines)), words, self.lines)
-
-    def used_mb(self) -> float:
-        return int(Path(f"/proc/{self.process.pid}/statm").read_text().split()[1]) * resource.getpagesize() / 1e6
-
-    def files(self) -> int:
-        return len(list(Path(f"/proc/{self.process.pid}/fd").iterdir()))
-
-    def summary(self) -> dict:
-        self.process.send_signal(signal.SIGINT)
-        assert self.process.stdout is not None
-        out = self.process.stdout.read()
-        assert self.process.wait(PATIENCE_S) == 0, self.lines
-        return json.loads(out)
-
-
-def await_that(holds: Callable[[], bool], what: str = "", said: list[str] | None = None) -> None:
-    deadline_s = time.monotonic() + PATIENCE_S
-    while not holds():
-        assert time.monotonic() < deadline_s, (what, said)
-        time.sleep(0.02)
-
-
-@contextmanager
-def bound(tmp_path: Path, *options: str, attitude: str = "bind = true", files: int | None = None) -> Iterator[Served]:
-    port = free_port()
-    bench = tmp_path / "serve.toml"
-    bench.write_text(f'{SMALL_BENCH}\n[attitude]\nendpoint = "tcp://127.0.0.1:{port}"\n{attitude}\n')
-    command = [sys.executable, "-m", "hilstar", "serve", str(bench), "--headless", "--json", *options]
-    if files is not None:
-        command = ["sh", "-c", f'ulimit -n {files}; exec "$@"', "sh", *command]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        served = Served(process, port)
-        try:
-            served.await_line("bound to")
-            await_that(lambda: can_connect(port), "the port")
-            yield served
-        finally:
-            process.kill()
-
-
-def can_connect(port: int) -> bool:
-    with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port)):
-        return True
-    return False
 
 
 @contextmanager
@@ -129,7 +69,7 @@ def test_a_message_that_does_not_end_costs_bounded_memory_and_the_sender_is_hear
                     sent_bytes += len(blob)
                     most_mb = max(most_mb, served.used_mb())
                     assert most_mb < before_mb + MAX_GROWTH_MB
-        await_that(lambda: served.used_mb() < before_mb + 128, "the memory is given back")
+        wait_for(lambda: served.used_mb() < before_mb + 128, "the memory is given back")
         time.sleep(1.5)
         summary = served.summary()
     assert summary["link"]["resets"] == summary["events"]["flood"] >= 2
@@ -144,7 +84,7 @@ def test_a_message_of_a_million_parts_is_dropped_before_it_is_a_list(tmp_path):
         with greeted(served.port) as attacker, contextlib.suppress(OSError):
             attacker.sendall(part(bytes(1), more=True) * 1_000_000 + part(b"end", more=False))
             served.await_line("more than 64 parts")
-        await_that(lambda: served.used_mb() < before_mb + 128, "the memory is given back")
+        wait_for(lambda: served.used_mb() < before_mb + 128, "the memory is given back")
         summary = served.summary()
     assert summary["link"]["resets"] == 1
 
@@ -162,7 +102,7 @@ def test_idle_connections_are_limited_and_the_sender_and_the_ledger_stay(tmp_pat
         for _ in range(600):
             stack.enter_context(socket.create_connection(("127.0.0.1", served.port)))
         served.await_line("over 64 connections")
-        await_that(lambda: served.files() < 64, "handshakes that never come are not awaited")
+        wait_for(lambda: served.files() < 64, "handshakes that never come are not awaited")
         summary = served.summary()
     link = summary["link"]
     assert link["refused"] > 300
@@ -174,7 +114,7 @@ def test_idle_connections_are_limited_and_the_sender_and_the_ledger_stay(tmp_pat
 def test_a_flood_of_packets_leaves_the_frames_their_time_and_is_counted(tmp_path):
     flood = """
 import time, zmq
-from tests.e2e.stream.test_serve import packet
+from tests.support.senders import packet
 sender = zmq.Context().socket(zmq.PUB)
 sender.setsockopt(zmq.LINGER, 0)
 sender.connect("tcp://127.0.0.1:PORT")
@@ -207,7 +147,7 @@ def test_lockstep_survives_no_delimiter_dead_askers_and_endless_parts(tmp_path):
         with greeted(served.port, b"REQ") as attacker, contextlib.suppress(OSError):
             attacker.sendall(part(b"", more=True) * 1000 + part(b"x", more=True) * 1000 + part(b"x", more=False))
             served.await_line("more than 64 parts")
-        with requester(f"tcp://127.0.0.1:{served.port}") as asker:
+        with connected(served.port, zmq.REQ) as asker:
             asker.send(packet(1, 1))
             assert len(asker.recv()) == 40
         summary = served.summary()
@@ -261,11 +201,11 @@ def test_clients_are_let_in_and_locked_out_without_a_restart_and_those_rejected_
         (allowed / "late.key").write_bytes((late / "client.key").read_bytes())
         (allowed / "client.key").unlink()
         assert heard(served, late, 20_000)
-        await_that(lambda: sum("is stale" in line for line in list(served.lines)) >= 2)
+        wait_for(lambda: sum("is stale" in line for line in list(served.lines)) >= 2)
         assert not heard(served, mine, 30_000)
         with client(served.port, mine, None):  # no keys at all
             rejected = sum("was rejected" in line for line in list(served.lines))
-            await_that(lambda: sum("was rejected" in line for line in list(served.lines)) > rejected or rejected >= 3)
+            wait_for(lambda: sum("was rejected" in line for line in list(served.lines)) > rejected or rejected >= 3)
         summary = served.summary()
     assert summary["link"]["rejected"] == summary["events"]["client-rejected"] >= 3
     assert any("its key is not among those allowed" in line for line in served.lines)

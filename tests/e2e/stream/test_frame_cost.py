@@ -10,8 +10,9 @@ import time
 
 import pytest
 
-from tests.conftest import assert_refused, run_hilstar
-from tests.e2e.stream.test_serve import packet, publisher, serving, summary_of
+from tests.support.commands import assert_refused, run_hilstar
+from tests.support.senders import packet, publisher
+from tests.support.servers import serving, summary_of
 
 RATES_RAD_S = (1.0, 10.0, 57.0, 200.0, 900.0)
 # A frame of the small bench takes 1 ms; one of 10 rad/s took 1500 ms and more. The margin is for busy machines.

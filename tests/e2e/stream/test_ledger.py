@@ -18,8 +18,10 @@ from hilstar.attitude.logs.log_file import read_log
 from hilstar.errors import InputError
 from hilstar.rotation import from_radec_roll_deg, propagate
 from hilstar.run.record.records import past_frames
-from tests.conftest import SMALL_BENCH, assert_refused, run_hilstar
-from tests.e2e.stream.test_serve import packet, publisher, serving, summary_of
+from tests.support.benches import SMALL_BENCH
+from tests.support.commands import assert_refused, run_hilstar
+from tests.support.senders import packet, publisher
+from tests.support.servers import serving, summary_of
 
 START = from_radec_roll_deg(84, -1, 0)
 RATE = (0.0, 0.0, 0.1)

@@ -3,13 +3,9 @@
 from __future__ import annotations
 
 import json
-import signal
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -21,8 +17,10 @@ from hilstar.run.loop import Limit
 from hilstar.run.send.faults import BadCable, Faults
 from hilstar.run.send.sender import SerialSender, send, spin_samples
 from hilstar.run.serve import serve
-from tests.conftest import SMALL_BENCH, assert_refused, run_hilstar
+from tests.support.benches import SMALL_BENCH
+from tests.support.commands import assert_refused, run_hilstar
 from tests.support.ptys import Cable
+from tests.support.servers import interrupted, listening
 
 BAUD = 921_600
 START_DEG = (84.057, -1.2, 0.0)
@@ -41,26 +39,6 @@ def bench_file(tmp_path, cable):
     return path
 
 
-@contextmanager
-def serving(bench_file, *options: str) -> Iterator[subprocess.Popen]:
-    command = [sys.executable, "-m", "hilstar", "serve", str(bench_file), "--headless", "--json", *options]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        try:
-            assert process.stderr is not None
-            first = process.stderr.readline()
-            assert "reading serial:" in first, first
-            yield process
-        finally:
-            process.kill()
-
-
-def ended(process: subprocess.Popen) -> dict:
-    process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=30)
-    assert process.returncode == 0, err
-    return json.loads(out)
-
-
 def sent(cable, *options: str) -> dict:
     result = run_hilstar("send", "--to", f"serial:{cable.bench}@{BAUD}", "--json", *options)
     assert result.returncode == 0, result.stderr
@@ -68,9 +46,9 @@ def sent(cable, *options: str) -> dict:
 
 
 def test_two_hundred_a_second_arrive_none_lost_none_refused_and_both_sides_talk(cable, bench_file):
-    with serving(bench_file) as process:
+    with listening(bench_file, "reading serial:") as process:
         told = sent(cable, "--spin", "z,1", "--rate", "200", "--count", "600")
-        summary = ended(process)
+        summary = interrupted(process)
     assert told["sent"] == summary["packets"]["accepted"] == summary["packets"]["received"] == 600
     assert summary["packets"]["refused"] == 0
     # Three seconds: 8 quick time requests and then two a second; ten statuses a second.
@@ -85,10 +63,10 @@ def test_two_hundred_a_second_arrive_none_lost_none_refused_and_both_sides_talk(
 
 
 def test_lost_corrupted_and_reordered_packets_add_up(cable, bench_file):
-    with serving(bench_file) as process:
+    with listening(bench_file, "reading serial:") as process:
         faults = ["--lose", "10%", "--corrupt", "5%", "--reorder", "--jitter", "1", "--seed", "3"]
         told = sent(cable, "--spin", "z,1", "--rate", "400", "--count", "800", *faults)
-        summary = ended(process)
+        summary = interrupted(process)
     packets = summary["packets"]
     assert told["packets"] == 800
     assert told["lost"] and told["corrupted"] and told["reordered"]
@@ -141,7 +119,7 @@ def test_a_line_that_filled_up_while_the_display_was_made_ready_misleads_nobody(
 
 
 def test_a_device_that_goes_and_comes_back_is_picked_up_within_a_second(tmp_path, cable, bench_file):
-    with serving(bench_file) as process:
+    with listening(bench_file, "reading serial:") as process:
         assert sent(cable, "--spin", "z,1", "--rate", "100", "--count", "50")["sent"] == 50
         cable.pull()
         time.sleep(1.0)
@@ -149,7 +127,7 @@ def test_a_device_that_goes_and_comes_back_is_picked_up_within_a_second(tmp_path
         time.sleep(1.0)
         assert sent(cable, "--spin", "z,1", "--rate", "100", "--count", "50")["sent"] == 50
         time.sleep(0.2)
-        summary = ended(process)
+        summary = interrupted(process)
     assert summary["reconnects"] == 1
     assert summary["packets"]["accepted"] == 100
     assert summary["stale_events"] in {1, 2}  # the second where the last packet is old before the end
@@ -159,13 +137,13 @@ def test_a_device_that_goes_and_comes_back_is_picked_up_within_a_second(tmp_path
 
 def test_a_line_of_garbage_without_an_end_is_one_refusal_and_the_next_frame_is_taken(cable, bench_file):
     bench_file.write_text(bench_file.read_text() + "time_requests = false\n")  # an answer would end the garbage
-    with serving(bench_file) as process:
+    with listening(bench_file, "reading serial:") as process:
         with SerialSender(str(cable.bench), BAUD) as road:
             for _ in range(50):
                 road.send_bytes(b"\x55" * 1000, 1.0)
                 time.sleep(0.002)
         sent(cable, "--spin", "z,1", "--rate", "100", "--count", "20")
-        summary = ended(process)
+        summary = interrupted(process)
     assert summary["packets"]["refused_by"]["format"] == 1
     assert summary["packets"]["accepted"] == 20
 

@@ -3,16 +3,10 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
-import socket
 import struct
-import subprocess
-import sys
 import time
 import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +14,10 @@ import pytest
 import zmq
 
 from hilstar.rotation import from_radec_roll_deg
-from tests.conftest import SMALL_BENCH, assert_refused, run_hilstar
+from tests.support.benches import SMALL_BENCH
+from tests.support.commands import assert_refused, run_hilstar
+from tests.support.senders import connected, free_port, packet, publisher
+from tests.support.servers import serving, summary_of
 
 SUMMARY_KEYS = {"frames", "duration_s", "fps", "frame_ms", "attitude_age_ms", "packets", "stars_drawn", "clipped"}
 SUMMARY_KEYS |= {
@@ -36,51 +33,6 @@ SUMMARY_KEYS |= {
     "events",
     "link",
 }
-
-
-def packet(sequence: int, t_ns: int, q=(0.5, 0.5, -0.5, 0.5), rate=(0.0, 0.0, 0.0)) -> bytes:
-    """From the design's section 4, without hilstar."""
-    body = struct.pack("<BBHIq4d3f", 1, 1, 1, sequence, t_ns, *q, *rate)
-    return body + struct.pack("<I", zlib.crc32(body))
-
-
-@contextmanager
-def publisher() -> Iterator[tuple[zmq.Socket, int]]:
-    """A plain PUB socket, bound; and its port."""
-    context = zmq.Context()
-    sender = context.socket(zmq.PUB)
-    sender.setsockopt(zmq.LINGER, 1000)
-    sender.setsockopt(zmq.SNDHWM, 100_000)
-    bound = sender.bind_to_random_port("tcp://127.0.0.1")
-    try:
-        yield sender, bound
-    finally:
-        sender.close()
-        context.term()
-
-
-@contextmanager
-def serving(tmp_path, port: int, *options: str, attitude: str = "", monitor: str = "") -> Iterator[subprocess.Popen]:
-    """`hilstar serve` in a process of its own, once it listens."""
-    bench = tmp_path / "serve.toml"
-    text = SMALL_BENCH.replace("[collimator]", f"{monitor}\n[collimator]")
-    bench.write_text(f'{text}\n[attitude]\nendpoint = "tcp://127.0.0.1:{port}"\n{attitude}\n')
-    command = [sys.executable, "-m", "hilstar", "serve", str(bench), "--headless", "--json", *options]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ) as process:
-        try:
-            assert process.stderr is not None
-            first = process.stderr.readline()
-            assert f"127.0.0.1:{port}" in first, first
-            time.sleep(0.3)  # ZeroMQ's subscription crosses the socket
-            yield process
-        finally:
-            process.kill()
-
-
-def summary_of(process: subprocess.Popen, timeout: float = 30, code: int = 0) -> dict:
-    out, err = process.communicate(timeout=timeout)
-    assert process.returncode == code, err
-    return json.loads(out)
 
 
 def test_a_thousand_packets_at_200_hz_all_arrive_with_garbage_between_them(tmp_path):
@@ -155,7 +107,7 @@ def test_an_oversized_message_costs_a_connection_and_no_more(tmp_path):
     assert packets["refused"] == 0
 
 
-def test_a_bench_that_closes_and_comes_back_is_heard_again(tmp_path):
+def test_a_sender_that_closes_and_comes_back_is_heard_again(tmp_path):
     context = zmq.Context()
     with publisher() as (sender, port), serving(tmp_path, port) as process:
         sender.send(packet(0, 1_000_000))
@@ -175,7 +127,7 @@ def test_a_bench_that_closes_and_comes_back_is_heard_again(tmp_path):
     assert packets["accepted"] == 2
 
 
-def test_a_silent_bench_shows_blank_frames_and_ends_in_order(tmp_path):
+def test_a_silent_sender_shows_blank_frames_and_ends_in_order(tmp_path):
     """Its exit code says that it never had an attitude, and so does a line after two seconds."""
     with publisher() as (_, port), serving(tmp_path, port, "--frames", "150") as process:
         summary = summary_of(process, code=4)
@@ -199,9 +151,7 @@ def test_what_is_shown_after_the_stream_stops_is_the_policy_s(tmp_path, on_stale
 
 
 def test_hilstar_send_is_heard_by_serve_that_binds(tmp_path):
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_port()
     with serving(tmp_path, port, attitude="bind = true") as process:
         sent = run_hilstar(
             "send", "--spin", "z,1.5", "--rate", "200", "--count", "300", "--to", f"tcp://127.0.0.1:{port}", "--connect"
@@ -216,9 +166,7 @@ def test_hilstar_send_is_heard_by_serve_that_binds(tmp_path):
 
 def test_a_log_sent_at_a_rate_is_resampled(tmp_path):
     (tmp_path / "log.csv").write_text("t_s,qw,qx,qy,qz\n5,1,0,0,0\n6,0.9999,0.01,0,0.0099\n")
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_port()
     with serving(tmp_path, port) as process:
         sent = run_hilstar("send", tmp_path / "log.csv", "--rate", "100", "--to", f"tcp://127.0.0.1:{port}")
         assert "101 packets sent" in sent.stderr
@@ -248,25 +196,10 @@ def test_a_port_in_use_gets_one_line(tmp_path, small_bench_file):
         assert_refused(run_hilstar("send", "--spin", "z,1", "--to", f"tcp://127.0.0.1:{port}"), 2, "in use")
 
 
-@contextmanager
-def requester(endpoint: str) -> Iterator[zmq.Socket]:
-    """A plain REQ socket, connected."""
-    context = zmq.Context()
-    asker = context.socket(zmq.REQ)
-    asker.setsockopt(zmq.LINGER, 0)
-    asker.setsockopt(zmq.RCVTIMEO, 5000)
-    asker.connect(endpoint)
-    try:
-        yield asker
-    finally:
-        asker.close()
-        context.term()
-
-
 def test_lockstep_shows_one_frame_a_request_and_says_when(tmp_path):
     """Packets and JSON, a simulator's time that runs at any speed and goes back, and what is wrong: each gets its answer."""
     port = free_port()
-    with serving(tmp_path, port, attitude="lockstep = true") as process, requester(f"tcp://127.0.0.1:{port}") as asker:
+    with serving(tmp_path, port, attitude="lockstep = true") as process, connected(port, zmq.REQ) as asker:
         for k in range(50):
             asker.send(packet(k, k * 3_600_000_000_000))
             version, kind, health, frame, light_ns, age_ns, sequence, accepted, refused, crc = struct.unpack(
@@ -297,12 +230,6 @@ def test_lockstep_without_a_request_never_had_an_attitude(tmp_path):
     with serving(tmp_path, free_port(), "--duration", "2.5", attitude="lockstep = true") as process:
         summary = summary_of(process, code=4)
     assert (summary["packets"]["accepted"], summary["events"]["no-attitude"]) == (0, 1)
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 @pytest.mark.parametrize("line", ["bind = true", "bind = false", "lockstep = true"])

@@ -6,11 +6,10 @@ import contextlib
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -18,14 +17,14 @@ import pytest
 import zmq
 
 from hilstar.attitude.logs.log_file import read_log
-from tests.conftest import SMALL_BENCH
-from tests.e2e.stream.test_serve import free_port, packet, publisher
+from tests.support.benches import SMALL_BENCH, attitude_table
+from tests.support.senders import free_port, packet, publisher
+from tests.support.waiting import wait_for
 
 WITHIN_S = 1.0
 # A loaded machine wakes and reaps late.
 LATE_S = 0.5
 NO_ATTITUDE = 4
-STARTED_S = 30.0
 STUCK = """
 import sys, time
 from hilstar.run.loop import FrameLoop
@@ -51,13 +50,6 @@ def running(command: list[str], **more) -> Iterator[subprocess.Popen]:
         finally:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)
-
-
-def wait_for(true: Callable[[], object]) -> None:
-    end = time.monotonic() + STARTED_S
-    while not true():
-        assert time.monotonic() < end
-        time.sleep(0.02)
 
 
 def ends(process: subprocess.Popen, number: int) -> tuple[int, str, str]:
@@ -90,7 +82,7 @@ def at_work(process: subprocess.Popen) -> bool:
 
 def serve_file(folder: Path, port: int, more: str = "") -> Path:
     path = folder / "serve.toml"
-    path.write_text(f'{SMALL_BENCH}\n[attitude]\nendpoint = "tcp://127.0.0.1:{port}"\n{more}\n')
+    path.write_text(SMALL_BENCH + attitude_table(port, more))
     return path
 
 
@@ -281,9 +273,7 @@ def test_a_pool_of_workers_ends_with_its_command(tmp_path, small_bench_file):
 def other_commands(folder: Path, bench: Path) -> dict[str, list[str]]:
     log = folder / "log.csv"
     log.write_text("t_s,qw,qx,qy,qz\n" + "".join(f"{0.1 * t},1,0,0,0\n" for t in range(2000)))
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_port()
     return {
         "send": ["send", "--spin", "z,1", "--to", f"tcp://127.0.0.1:{port}"],
         "demo": ["demo", "-o", str(folder / "demo"), "--duration", "100"],

@@ -6,44 +6,20 @@ import json
 import signal
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 import pytest
 import zmq
 
 from hilstar.attitude.wire.zmq_links import ZmqReceiver
 from hilstar.bench.build import load
-from hilstar.rotation import from_radec_roll_deg
 from hilstar.run.loop import Limit
 from hilstar.run.serve import serve
-from tests.conftest import run_hilstar
-from tests.e2e.stream.test_serve import packet, publisher, serving, summary_of
+from tests.support.commands import run_hilstar
+from tests.support.senders import LYRA, ORION, free_port, packet, publisher, talking
+from tests.support.servers import serving, summary_of
 
-ORION = tuple(from_radec_roll_deg(84.0, -1.0, 0.0))
-LYRA = tuple(from_radec_roll_deg(283.0, 35.0, 30.0))
 # The road's delay on a loaded machine; the sender's clock is this process's own, so the offset is that delay alone.
 MAX_MIN_DELAY_MS = 2.0
-
-
-@contextmanager
-def talking(sender: zmq.Socket, rate_hz: float = 200.0, q=ORION, first: int = 0) -> Iterator[None]:
-    """A sender of this process, stamped with its monotonic clock, that talks all the while."""
-    stop = threading.Event()
-
-    def talk() -> None:
-        k = first
-        while not stop.wait(1 / rate_hz):
-            sender.send(packet(k, time.monotonic_ns(), q))
-            k += 1
-
-    thread = threading.Thread(target=talk)
-    thread.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        thread.join()
 
 
 @pytest.mark.parametrize("queued_s", [0.3, 1.5])
@@ -117,7 +93,8 @@ def test_a_sender_that_hangs_is_stale_in_every_frame_and_nothing_flickers(small_
 
 def test_two_senders_on_one_port_are_told_apart_and_the_first_is_shown(tmp_path):
     context = zmq.Context()
-    with zmq_port() as port, serving(tmp_path, port, attitude="bind = true") as process:
+    port = free_port()
+    with serving(tmp_path, port, attitude="bind = true") as process:
         first, second = (context.socket(zmq.PUB) for _ in range(2))
         for sender in (first, second):
             sender.connect(f"tcp://127.0.0.1:{port}")
@@ -140,13 +117,6 @@ def test_two_senders_on_one_port_are_told_apart_and_the_first_is_shown(tmp_path)
 def until_said(process, text: str) -> None:
     while text not in (line := process.stderr.readline()):
         assert line
-
-
-@contextmanager
-def zmq_port() -> Iterator[int]:
-    with publisher() as (_, port):
-        pass
-    yield port
 
 
 def test_a_shared_clock_is_said_in_the_summary(tmp_path):

@@ -8,7 +8,7 @@ import pytest
 
 from hilstar.bench.config import read_config
 from hilstar.errors import InputError
-from tests.conftest import ROOT, SMALL_BENCH
+from tests.support.benches import ROOT, SMALL_BENCH
 
 # The bench file of the design's section 5, every key given (the values that choose between words: the first).
 WHOLE = """

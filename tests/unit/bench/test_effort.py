@@ -15,7 +15,7 @@ from hilstar.render.reference import linear_image
 from hilstar.rotation import from_radec_roll_deg
 from hilstar.scene.psf import footprint_px
 from hilstar.study.economy import SCENES, compare, run
-from tests.conftest import run_hilstar
+from tests.support.commands import run_hilstar
 
 SIGMA = (0.85, 0.85)
 ORION = from_radec_roll_deg(84, -1, 0)

@@ -14,7 +14,7 @@ from msgspec.structs import FieldInfo
 from hilstar.bench.config import BenchConfig, read_config
 from hilstar.bench.config.explain import plain
 from hilstar.bench.config.reference import is_table, page, tables_of
-from tests.conftest import SMALL_BENCH
+from tests.support.benches import SMALL_BENCH
 
 KEYS = [
     (name, field)

@@ -17,7 +17,7 @@ from cobs import cobs
 
 from hilstar.attitude.wire.cobs import DELIMITER, LONGEST_FRAME_BYTES, frame
 from hilstar.attitude.wire.packet import TimeRequest
-from tests.conftest import ROOT
+from tests.support.benches import ROOT
 
 FOLDER = ROOT / "firmware_protocol"
 VECTORS = json.loads((FOLDER / "vectors.json").read_text())

@@ -20,7 +20,7 @@ from hilstar.attitude.wire import packet, protocol
 from hilstar.attitude.wire.cobs import DELIMITER, StreamDecoder, frame
 from hilstar.attitude.wire.packet import MESSAGE_REASONS, AttitudeSample, Refusal, decode, encode
 from hilstar.rotation import from_radec_roll_deg
-from tests.conftest import ROOT
+from tests.support.benches import ROOT
 
 FOLDER = ROOT / "firmware_protocol"
 VECTORS = json.loads((FOLDER / "vectors.json").read_text())

@@ -1,0 +1,27 @@
+"""An X server for each module, and a bench file of its size with a log that stands still."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.support.benches import SCREEN_BENCH, still_log
+from tests.support.screens import Screen, xvfb
+
+
+@pytest.fixture(scope="module")
+def screen(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Screen]:
+    """A screen of 640 x 480."""
+    with xvfb(tmp_path_factory.mktemp("screen")) as running:
+        yield running
+
+
+@pytest.fixture
+def bench_file(tmp_path: Path) -> Path:
+    """A bench whose monitor is the screen; `still.csv` beside it."""
+    path = tmp_path / "bench.toml"
+    path.write_text(SCREEN_BENCH)
+    still_log(tmp_path / "still.csv")
+    return path

@@ -1,0 +1,56 @@
+"""Bench files: one text, and what a test changes of it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+
+_SMALL: dict[str, dict[str, object]] = {
+    "tracker": {
+        "aperture_mm": 30,
+        "focal_length_mm": 70,
+        "pixel_pitch_um": 13,
+        "resolution_px": [1024, 1024],
+        "quantum_efficiency": "ccd47-20",
+        "transmission": "n-bk7-10mm",
+    },
+    "monitor": {"resolution_px": [320, 240], "pixel_pitch_um": 57.65},
+    "collimator": {"focal_length_mm": 60},
+}
+
+
+def bench_text(changes: Mapping[str, Mapping[str, object]] | None = None) -> str:
+    """The small bench as TOML, with other values and tables; a value of None takes a key away."""
+    tables = {name: dict(keys) for name, keys in _SMALL.items()}
+    for name, keys in (changes or {}).items():
+        tables.setdefault(name, {}).update(keys)
+    lines = []
+    for name, keys in tables.items():
+        lines.append(f"\n[{name}]")
+        lines += [f"{key} = {json.dumps(value)}" for key, value in keys.items() if value is not None]
+    return "\n".join(lines) + "\n"
+
+
+# A monitor of 320 x 240: a frame takes a millisecond.
+SMALL_BENCH = bench_text()
+
+# The size of the X servers of tests/support/screens.py.
+SCREEN_BENCH = bench_text({"monitor": {"resolution_px": [640, 480]}})
+
+# Orion's belt, right ascension 84.057, declination -1.2, roll 0 (degrees).
+ORION_Q = (0.6987226, 0.7135120, -0.0370377, 0.0362700)
+ATTITUDE = "0.6987226,0.7135120,-0.0370377,0.0362700"
+
+
+def still_log(path: Path, seconds: float = 60) -> Path:
+    """A log that stands on Orion's belt for so long."""
+    path.write_text(f"t_s,qw,qx,qy,qz\n0,{ATTITUDE}\n{seconds},{ATTITUDE}\n")
+    return path
+
+
+def attitude_table(port: int, more: str = "") -> str:
+    """The `[attitude]` table of a bench that listens to a port of this machine."""
+    return f'\n[attitude]\nendpoint = "tcp://127.0.0.1:{port}"\n{more}\n'

@@ -1,0 +1,73 @@
+"""hilstar's commands: in a process of their own as a user runs them, or in this one where the process is not what is tested."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+from hilstar.cli import run_command
+
+HILSTAR = [sys.executable, "-m", "hilstar"]
+
+
+def run_hilstar(
+    *arguments: str | Path, cwd: Path | None = None, timeout: float = 120, env: dict[str, str] | None = None
+) -> subprocess.CompletedProcess[str]:
+    """The command as a user runs it, in a process of its own: half a second of CPU before it begins."""
+    command = [*HILSTAR, *map(str, arguments)]
+    env = dict(os.environ) if env is None else env
+    # A group of its own: what the command has started (`demo` a sender) ends with it, however it ends.
+    with subprocess.Popen(
+        command, cwd=cwd, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    ) as process:
+        try:
+            out, err = process.communicate(timeout=timeout)
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+    return subprocess.CompletedProcess(command, process.returncode, out, err)
+
+
+def run_hilstar_here(*arguments: str | Path, cwd: Path | None = None, timeout: int = 120) -> subprocess.CompletedProcess[str]:
+    """The command line in this process: the same words, refusals and exit code, and milliseconds instead of a new process.
+
+    For what is said, written and returned. The process itself (streams, signals, the workers it starts) is `run_hilstar`'s.
+    """
+    words = [str(argument) for argument in arguments]
+    out, err = (io.TextIOWrapper(io.BytesIO(), "utf-8", "surrogateescape", write_through=True) for _ in range(2))
+    to_out, to_err = contextlib.redirect_stdout(out), contextlib.redirect_stderr(err)
+    with bounded_by(timeout), contextlib.chdir(cwd or Path.cwd()), to_out, to_err:
+        code = run_command(words)
+    texts = (stream.buffer.getvalue().decode("utf-8", "surrogateescape") for stream in (out, err))
+    return subprocess.CompletedProcess(["hilstar", *words], code, *texts)
+
+
+@contextlib.contextmanager
+def bounded_by(seconds: int) -> Iterator[None]:
+    """An alarm: what waits for ever in this process fails (TimeoutError), and does not stop the suite."""
+
+    def too_long(*_: object) -> None:
+        raise TimeoutError(f"it takes over {seconds} s")
+
+    before = signal.signal(signal.SIGALRM, too_long)
+    outer_s = signal.alarm(seconds)
+    try:
+        yield
+    finally:
+        signal.alarm(outer_s)
+        signal.signal(signal.SIGALRM, before)
+
+
+def assert_refused(result: subprocess.CompletedProcess[str], code: int, *words: str) -> None:
+    """One line on stderr that has every word; nothing on stdout; no traceback."""
+    assert result.returncode == code, result.stderr
+    assert result.stdout == ""
+    assert len(result.stderr.splitlines()) == 1, result.stderr
+    for word in words:
+        assert word in result.stderr

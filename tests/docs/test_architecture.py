@@ -7,7 +7,7 @@ import tomllib
 
 import pytest
 
-from tests.conftest import ROOT
+from tests.support.benches import ROOT
 
 PAGE = (ROOT / "docs" / "architecture.md").read_text()
 MAX_FILES_OF_A_WALK = 24

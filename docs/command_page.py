@@ -14,17 +14,9 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 from typer import Typer
 from typer.models import ArgumentInfo, OptionInfo, ParameterInfo
 
-from hilstar.cli import app
+from hilstar.cli.app import app
 from hilstar.errors import InputError, MachineError
 
-GROUPS = {
-    "Start": ("demo", "doctor"),
-    "Show stars": ("frame", "serve", "replay"),
-    "Send attitudes": ("send", "convert", "keys"),
-    "Set up the hardware": ("calibrate plan", "calibrate photometric", "calibrate scale", "latency"),
-    "Check": ("budget", "verify", "simulate", "compare", "report"),
-    "Measure": ("study", "benchmark"),
-}
 MAX_BOUND = 1e6  # a larger limit only keeps arithmetic within its types; nobody meets it
 TYPE_WORDS = {int: "N", float: "X", str: "TEXT", Path: "PATH"}
 
@@ -78,27 +70,24 @@ class Parameter:
 
 
 def page() -> str:
-    """The page. Raises KeyError for a command without a group, and for a group's word that is no command."""
-    commands = dict(commands_of(app, ""))
-    grouped = [name for names in GROUPS.values() for name in names]
-    if set(grouped) != set(commands):
-        raise KeyError(f"commands and GROUPS differ: {sorted(set(grouped) ^ set(commands))}")
-    parts = [HEAD]
-    for title, names in GROUPS.items():
+    """The page: the commands in the panels of `hilstar --help`."""
+    parts, panels = [HEAD], dict.fromkeys(panel for panel, _, _ in commands_of(app))
+    for title in panels:
         parts.append(f"## {title}\n")
-        parts += [section(name, commands[name]) for name in names]
+        parts += [section(name, command) for panel, name, command in commands_of(app) if panel == title]
     return "\n".join(parts)
 
 
-def commands_of(group: Typer, prefix: str) -> Iterator[tuple[str, Callable[..., Any]]]:
-    """Each command's name ("calibrate plan") and function."""
+def commands_of(group: Typer, prefix: str = "", panel: str = "") -> Iterator[tuple[str, str, Callable[..., Any]]]:
+    """Each command's panel, name ("calibrate plan") and function; a group's commands are in its own panel."""
     for info in group.registered_commands:
         if info.callback is None:
             raise TypeError("a command is a function")
-        yield prefix + (info.name or info.callback.__name__.replace("_", "-")), info.callback
+        name = info.name or info.callback.__name__.replace("_", "-")
+        yield panel or str(info.rich_help_panel), prefix + name, info.callback
     for inner in group.registered_groups:
         if inner.typer_instance is not None:
-            yield from commands_of(inner.typer_instance, f"{prefix}{inner.name} ")
+            yield from commands_of(inner.typer_instance, f"{prefix}{inner.name} ", str(inner.rich_help_panel))
 
 
 def section(name: str, command: Callable[..., Any]) -> str:

@@ -20,7 +20,7 @@ FILES = ("pyproject.toml", "README.md", "LICENSE", "hilstar", "shaders", "config
 
 
 def blocks(language: str) -> list[str]:
-    return re.findall(rf"```{language}\n(.*?)```", README, re.DOTALL)
+    return re.findall(rf"```{language}\b[^\n]*\n(.*?)```", README, re.DOTALL)
 
 
 def shape(text: str) -> str:

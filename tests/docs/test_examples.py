@@ -1,0 +1,168 @@
+"""What the pages say to type is typed, and prints what they say it prints."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import re
+import shlex
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hilstar.bench.config import read_config
+from hilstar.cli.app import app
+from hilstar.cli.entry import with_shares
+from tests.conftest import ROOT, SMALL_BENCH
+from tests.docs.pages import Block, blocks_of, differs
+
+DOCS = sorted((ROOT / "docs").glob("*.md"))
+PAGES = [*DOCS, ROOT / "README.md", ROOT / "configs" / "README.md", ROOT / "configs" / "CALIBRATION.md"]
+PAGES += [ROOT / "firmware_protocol" / "README.md", ROOT / "CONTRIBUTING.md"]
+EXAMPLES = {page: blocks for page in PAGES if (blocks := blocks_of(page.read_text()))}
+LANGUAGES = {"console", "python", "toml", "json", "text", "c"}  # no other shell's name: a console block is run
+DEFAULT_PORT = "5560"
+
+
+@pytest.fixture
+def port() -> str:
+    """A free port in the place of the default one, so that pages may be tested side by side."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return str(free.getsockname()[1])
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch) -> Path:
+    """The reader's folder: a page's files and outputs share it."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.e2e
+@pytest.mark.parametrize("page", EXAMPLES, ids=[str(page.relative_to(ROOT)) for page in EXAMPLES])
+def test_the_examples_do_what_the_page_says(page, folder, port):
+    names: dict[str, Any] = {"__name__": "__main__"}
+    for block in EXAMPLES[page]:
+        try:
+            follow(block, folder, port, names)
+        except BaseException as error:
+            error.add_note(f"{page.relative_to(ROOT)}:{block.line}")
+            raise
+
+
+def follow(block: Block, folder: Path, port: str, names: dict[str, Any]) -> None:
+    """Do with a block what its reader does."""
+    if block.title is not None:
+        (folder / block.title).write_text(with_port(block, port))
+    if block.not_run is not None:
+        return
+    if block.language == "console":
+        type_in(block, port)
+    elif block.language == "python" and block.title is None:
+        exec(compile(block.text.replace(DEFAULT_PORT, port), f"line {block.line}", "exec"), names)
+    elif block.language == "toml":
+        read_toml(block.text, folder)
+    elif block.language == "json":
+        json.loads(block.text)
+
+
+def with_port(block: Block, port: str) -> str:
+    """The text of a file; a bench file listens on the page's own port."""
+    text = block.text.replace(DEFAULT_PORT, port)
+    if block.title == "bench.toml" and "[attitude]" not in text:
+        text += f'[attitude]\nendpoint = "tcp://127.0.0.1:{port}"\n'
+    return text
+
+
+def read_toml(text: str, folder: Path) -> None:
+    """Read tables of a bench file; those that the page leaves out are the small bench's."""
+    given = set(re.findall(r"(?m)^\[(\w+)\]$", text))
+    if "calibration" in given:  # of a calibration file
+        return
+    missing = [part for part in re.split(r"\n(?=\[)", SMALL_BENCH) if part.strip("\n[").split("]")[0] not in given]
+    path = folder / "tables.toml"
+    path.write_text("\n".join([*missing, text]))
+    read_config(path)
+
+
+def type_in(block: Block, port: str) -> None:
+    """Run the commands of a console block and compare what they print."""
+    with contextlib.ExitStack() as beside:
+        for step in block.steps:
+            words = shlex.split(step.command.replace(DEFAULT_PORT, port))
+            if words[:2] == ["hilstar", "send"] and "--to" not in words:
+                words += ["--to", f"tcp://127.0.0.1:{port}"]
+            if step.beside:
+                beside.enter_context(running(words))
+                continue
+            printed = hilstar(words[1:]) if words[0] == "hilstar" else other_program(words)
+            if step.printed:
+                difference = differs(step.printed, printed, block.figures_vary)
+                assert difference is None, f"$ {step.command}\n{difference}; it prints\n{printed}"
+
+
+def hilstar(words: list[str]) -> str:
+    """What a hilstar command prints; it is run in this process, which saves a start of half a second."""
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        code = app(with_shares(words), standalone_mode=False)
+    assert not code, f"exit code {code}: hilstar {' '.join(words)}"
+    return printed.getvalue()
+
+
+def other_program(words: list[str]) -> str:
+    """What another program prints; `python` is this one."""
+    command = [sys.executable, *words[1:]] if words[0] == "python" else words
+    return subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, timeout=60).stdout
+
+
+@contextlib.contextmanager
+def running(words: list[str]) -> Iterator[None]:
+    """A hilstar command beside the others, until the block is done."""
+    with subprocess.Popen([sys.executable, "-m", *words], stdout=subprocess.DEVNULL) as process:
+        try:
+            yield
+        finally:
+            process.send_signal(signal.SIGTERM)
+
+
+def test_what_is_not_run_says_why():
+    for page, blocks in EXAMPLES.items():
+        for block in blocks:
+            assert block.not_run is None or len(block.not_run) > 10, f"{page}:{block.line} gives no reason"
+
+
+@pytest.mark.parametrize("page", DOCS, ids=[page.name for page in DOCS])
+def test_a_block_of_the_documentation_is_of_a_language_that_is_tested(page):
+    for block in blocks_of(page.read_text()):
+        assert block.language in LANGUAGES, f"{page}:{block.line}"
+
+
+def test_most_console_blocks_are_run():
+    blocks = [block for found in EXAMPLES.values() for block in found if block.language == "console"]
+    assert len(blocks) > 15
+    assert sum(block.not_run is None for block in blocks) > len(blocks) / 2
+
+
+@pytest.mark.parametrize(
+    ("shown", "printed", "same"),
+    [
+        ("3 stars\n", "3 stars\n", True),
+        ("3 stars\n", "4 stars\n", False),
+        ("0.100 mag\n", "0.1004 mag\n", True),
+        ("0.100 mag\n", "0.102 mag\n", False),
+        ("a\n...\nd\n", "a\nb\nc\nd\n", True),
+        ("a\n...\nd\n", "a\nb\nc\n", False),
+        ("a\n", "a\nb\n", False),
+        ("python ... (64 bits)\n", "python 3.13 (64 bits)\n", True),
+    ],
+)
+def test_output_is_compared_by_line_and_figure(shown, printed, same):
+    assert (differs(shown, printed, figures_vary=False) is None) == same

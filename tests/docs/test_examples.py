@@ -20,8 +20,8 @@ import pytest
 from hilstar.bench.config import read_config
 from hilstar.cli.app import app
 from hilstar.cli.entry import with_shares
-from tests.conftest import ROOT, SMALL_BENCH
 from tests.docs.pages import Block, blocks_of, differs
+from tests.support.benches import ROOT, SMALL_BENCH
 
 DOCS = sorted((ROOT / "docs").glob("*.md"))
 PAGES = [*DOCS, ROOT / "README.md", ROOT / "configs" / "README.md", ROOT / "configs" / "CALIBRATION.md"]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from tests.conftest import ROOT
 from tests.docs.pages import links_of, slugs_of
+from tests.support.benches import ROOT
 
 FOLDERS = ("", "configs", "docs", "examples", "firmware_protocol")
 PAGES = sorted(page for folder in FOLDERS for page in (ROOT / folder).glob("*.md"))

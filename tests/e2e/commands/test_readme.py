@@ -107,7 +107,12 @@ def test_the_installed_wheel_runs_the_demo_from_elsewhere(tmp_path):
     assert '"frames":1' in result.stdout
     assert len(list((elsewhere / "hilstar-demo").glob("*_codes.png"))) == 4
     where = subprocess.run(
-        [python, "-c", "import hilstar; print(hilstar.__file__)"], cwd=elsewhere, capture_output=True, text=True, check=True
+        [python, "-c", "import hilstar; print(hilstar.__file__)"],
+        cwd=elsewhere,
+        capture_output=True,
+        text=True,
+        check=True,
+        env=clean,
     )
     assert str(tmp_path / "env") in where.stdout
 

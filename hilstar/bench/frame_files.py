@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from PIL import Image
 
 from hilstar.arrays import FloatArray
 from hilstar.bench.build import Bench, Frame
@@ -107,6 +106,8 @@ def write_codes_png(path: Path, codes: Codes, bits: int) -> None:
 
 def _save_png(path: Path, image: npt.NDArray[Any]) -> None:
     if image.ndim == 2 or image.dtype == np.uint8:
+        from PIL import Image
+
         Image.fromarray(image).save(path, "PNG", compress_level=1)
         return
     # Pillow has no RGB of 16 bits.
@@ -122,6 +123,7 @@ def write_preview_png(path: Path, codes: Codes) -> None:
 
     It is stretched to the brightest pixel of its own frame.
     """
+    from PIL import Image
     from scipy.ndimage import gaussian_filter, maximum_filter
 
     signal = codes.astype(np.float32) / max(int(codes.max()), 1)

@@ -12,8 +12,6 @@ from typing import Any, NoReturn
 import msgspec
 import numpy as np
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from hilstar.errors import one_line
 
@@ -92,10 +90,13 @@ def clock_line(clock: dict[str, Any]) -> str:
 @contextmanager
 def progress(what: str, total: float) -> Iterator[Callable[[int], None]]:
     """A bar on a terminal's stderr, nothing elsewhere."""
-    console = Console(stderr=True)
-    if not console.is_terminal:
+    if sys.stderr is None or not sys.stderr.isatty():
         yield lambda done: None
         return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    console = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True, refresh_per_second=4) as bar:
         task = bar.add_task(what, total=None if math.isinf(total) else total)

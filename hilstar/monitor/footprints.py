@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import ndtr
 
 from hilstar.arrays import Float32Array, FloatArray, IntArray
 from hilstar.errors import InputError
@@ -87,6 +86,8 @@ class FootprintMap:
 
     def _shares(self, fraction_px: FloatArray, sigma_px: float) -> FloatArray:
         """A star's share in each column (or row) of its footprint, (size, n)."""
+        from scipy.special import ndtr
+
         edges = np.arange(self._size + 1)[:, None] + (self._first - 0.5) - fraction_px
         return np.diff(ndtr(edges / sigma_px), axis=0)
 

@@ -21,7 +21,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import ndtr
 
 from hilstar.arrays import FloatArray
 from hilstar.errors import InputError
@@ -206,6 +205,8 @@ def false_stars_e(
     settings: DetectorSettings, shape: tuple[int, int], exposure_s: float, rng: np.random.Generator
 ) -> FloatArray:
     """Expected electrons, shape `shape`, of `false_stars` equal point sources at random places, new in every frame."""
+    from scipy.special import ndtr
+
     height, width = shape
     x_px, y_px = (rng.random((settings.false_stars, 2)) * (width, height) - 0.5).T
     sigma_px = settings.false_star_sigma_px

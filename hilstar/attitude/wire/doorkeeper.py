@@ -10,11 +10,11 @@ from __future__ import annotations
 import contextlib
 import os
 import socket
+import struct
 import time
 from collections.abc import Iterator
 
 import zmq
-from zmq.utils.monitor import parse_monitor_message
 
 from hilstar.attitude.wire.flood_limits import PAUSE_S, LinkCounts
 from hilstar.notices import Notices
@@ -22,6 +22,7 @@ from hilstar.notices import Notices
 MAX_CONNECTIONS = 64
 MAX_EVENTS = 500  # in one go; more wait in the monitor, and then libzmq waits
 FEW_EVENTS = 50
+EVENT = struct.Struct("=Hi")  # of zmq_socket_monitor(3): event, value; pyzmq's parser of it would bring asyncio
 HANDSHAKE_MS = 2000
 FAILED = {
     zmq.EVENT_HANDSHAKE_FAILED_AUTH: "its key is not among those allowed",
@@ -59,8 +60,8 @@ class Doorkeeper:
         events = 0
         with contextlib.suppress(zmq.ZMQError):
             while events < MAX_EVENTS:
-                event = parse_monitor_message(self._monitor.recv_multipart(zmq.NOBLOCK))
-                self._take(int(event["event"]), int(event["value"]))
+                what, _peer_endpoint = self._monitor.recv_multipart(zmq.NOBLOCK)
+                self._take(*EVENT.unpack(what))
                 events += 1
         if self._bound and len(self._open) > MAX_CONNECTIONS:
             self._shut_newest()

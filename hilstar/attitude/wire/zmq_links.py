@@ -7,11 +7,10 @@ import errno
 import math
 import time
 from types import TracebackType
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import msgspec
 import zmq
-from zmq.auth.thread import ThreadAuthenticator
 
 from hilstar.attitude.wire.doorkeeper import HANDSHAKE_MS, Doorkeeper
 from hilstar.attitude.wire.endpoint import ENDPOINT_FORM, PATH_FORM, check_use, parse_endpoint
@@ -22,6 +21,9 @@ from hilstar.attitude.wire.packet import Event, Packet, Refusal, Status, TimeRep
 from hilstar.errors import InputError
 from hilstar.notices import Notices
 from hilstar.process.interrupts import caught
+
+if TYPE_CHECKING:
+    from zmq.auth.thread import ThreadAuthenticator
 
 # A flood waits here, at most QUEUE_MESSAGES; what is over waits at the sender or is lost there. A part over MAX_PART_BYTES
 # drops its connection, which is then made anew, and a message of more than MAX_PARTS every connection. What nobody limits,
@@ -82,6 +84,8 @@ class _ZmqLink:
             raise
 
     def _authenticate(self, allowed: AllowList) -> None:
+        from zmq.auth.thread import ThreadAuthenticator  # brings asyncio
+
         self._authenticator = ThreadAuthenticator(self._context)
         self._authenticator.start()
         self._authenticator.configure_curve_callback("*", allowed)

@@ -1,14 +1,14 @@
 """From measured patches to a response: a penalised spline of log light, with the black level as a parameter.
 
 The model of a patch is `black + base(s) exp(g(v(s)))`, with s = code / white. Residuals are relative to the noise of each
-level's mean, so a faint level counts as much as a bright one. `g` is a cubic spline; three shapes stand for election:
+level's mean, so a faint level counts as much as a bright one. `g` is a cubic spline, in one of three shapes:
 
     power   base s^2.2    g over log s, penalty on g''            a power law is left alone by the penalty
     srgb    base sRGB     g over log s, penalty on g''            so is sRGB with its linear toe, to a power
     smooth  base s^2.2    g over s plus a log s, penalty on g'''  S-curves of liquid crystals: analytic in s
 
-The stiffness of the penalty and the shape are those of the largest marginal likelihood (restricted to weak normal priors on
-the coefficients); the noise comes from the repeats. Black is a parameter with the repeats of code 0 as its prior.
+The stiffness of the penalty and the shape are those of the maximum marginal likelihood (with weak normal priors on the
+coefficients); the noise comes from the repeats. Black is a parameter with the repeats of code 0 as its prior.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ from hilstar.monitor.response import srgb_light
 
 Curve = Callable[[FloatArray], FloatArray]
 
-FEWEST_KNOTS, MOST_KNOTS = 8, 48
+MIN_KNOTS, MAX_KNOTS = 8, 48
 PRIOR_SIGMA = 1.0  # of the spline's coefficients: e-fold away from the base
 PRIOR_SLOPE_SIGMA = 0.5  # of the exponent, for the shape that has it apart
 LOG_STIFFNESS = np.arange(-26.0, 15.0, 2.0)
-MOST_STEPS = 20
+MAX_STEPS = 20
 SETTLED = 1e-6  # of log light
 STIFFNESS_STEPS = 8  # the stiffness is chosen anew in so many steps, then held
 ASSUMED_NOISE = 0.01  # where nothing was repeated, until the residuals say
 BLACK_FLOOR = 1e-6  # of white: how well a black level of zero is known
-SMALLEST_RISE = 1e-6  # relative, between neighbouring codes: see `strictly_rising`
-SMALLEST_LIGHT = 1e-9  # of white, at code 1
-SMALLEST_STEP = 1e-12  # of white: it survives a black level a thousand times as bright as white, in float64
+MIN_RISE = 1e-6  # relative, between neighbouring codes: see `strictly_rising`
+MIN_LIGHT = 1e-9  # of white, at code 1
+MIN_STEP = 1e-12  # of white: it survives a black level a thousand times as bright as white, in float64
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,10 +136,10 @@ def fit_levels(levels: Levels, white: int) -> ChannelFit:
     """The response to levels that have passed `check_levels`, for codes 0 to `white`."""
     noise = levels.relative_noise
     if math.isnan(noise):
-        first = _elect(levels, white, ASSUMED_NOISE)
+        first = _best_solution(levels, white, ASSUMED_NOISE)
         left = max(len(first.misfit) - first.parameters, 1.0)
         noise = max(ASSUMED_NOISE * math.sqrt(float(first.misfit @ first.misfit) / left), NOISE_FLOOR)
-    best = _elect(levels, white, noise)
+    best = _best_solution(levels, white, noise)
     problem, scale = best.problem, float(levels.mean[-1] - levels.mean[0])
     above = np.exp(problem.log_base_codes + problem.at_codes @ best.theta)
     from_white = problem.at_codes - problem.at_codes[-1]
@@ -166,11 +166,11 @@ def strictly_rising(light: FloatArray) -> FloatArray:
     """
     rising = light.copy()
     for code in range(1, len(rising)):
-        rising[code] = max(rising[code], rising[code - 1] * (1 + SMALLEST_RISE) + SMALLEST_STEP, SMALLEST_LIGHT)
+        rising[code] = max(rising[code], rising[code - 1] * (1 + MIN_RISE) + MIN_STEP, MIN_LIGHT)
     return np.asarray(rising / rising[-1])
 
 
-def _elect(levels: Levels, white: int, noise: float) -> _Solution:
+def _best_solution(levels: Levels, white: int, noise: float) -> _Solution:
     return min((_solve(shape, _problem(shape, levels, white, noise)) for shape in SHAPES), key=lambda s: s.minus_log_evidence)
 
 
@@ -178,7 +178,7 @@ def _problem(shape: Shape, levels: Levels, white: int, noise: float) -> _Problem
     codes = np.arange(1, white + 1) / white
     at = levels.code[1:] / white
     low, high = shape.coordinate(codes[[0, -1]])
-    knots = np.linspace(0, 1, int(np.clip(len(at) // 2, FEWEST_KNOTS, MOST_KNOTS)))
+    knots = np.linspace(0, 1, int(np.clip(len(at) // 2, MIN_KNOTS, MAX_KNOTS)))
 
     def columns(signal: FloatArray) -> FloatArray:
         spline = _spline((shape.coordinate(signal) - low) / (high - low), knots)
@@ -217,7 +217,7 @@ def _solve(shape: Shape, problem: _Problem) -> _Solution:
     """Gauss-Newton; the stiffness of the largest evidence in each of the first steps."""
     black, stiffness = problem.black, math.nan
     theta = _start(problem)
-    for step in range(MOST_STEPS):
+    for step in range(MAX_STEPS):
         above = np.exp(np.clip(problem.log_base_levels + problem.at_levels @ theta, -60, 10))
         misfit = (problem.light - black - above) / problem.sigma
         slope = problem.at_levels * (above / problem.sigma)[:, None]

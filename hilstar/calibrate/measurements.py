@@ -17,15 +17,16 @@ from hilstar.arrays import FloatArray, IntArray
 from hilstar.errors import InputError, shortened
 from hilstar.reading import as_text, read_bytes
 
-CHANNELS = ("w", "r", "g", "b")
+PRIMARIES = ("r", "g", "b")
+CHANNELS = ("w", *PRIMARIES)
 COLUMNS = ("order", "code", "channel", "value", "exposure_s", "t_s")
 NEEDED = ("code", "channel", "value")
 USUAL_BITS = (8, 10, 12, 14, 16)
 MAX_BYTES = 10_000_000
 ADVICE = "give a CSV file with code,channel,value"
-FEWEST_CODES = 10  # at 1 % noise: 2.2 % of error (95th percentile of the worst code) on gamma, sRGB and S-curves; 8 leave 4.4 %
+MIN_CODES = 10  # at 1 % noise: 2.2 % of error (95th percentile of the worst code) on gamma, sRGB and S-curves; 8 leave 4.4 %
 FALSE_ALARM_SIGMA = 4.0  # one run in some hundreds is refused for noise alone, with 32 levels
-SMALLEST_DRIFT = 0.005  # over the run; less does no harm beside 1 % of noise
+MIN_DRIFT = 0.005  # over the run; less does no harm beside 1 % of noise
 BRIGHT_DOF = 8
 FAINT_ALARM = 0.999  # of the F distribution, before additive noise is believed
 NOISE_FLOOR = 1e-4  # relative; nobody's photometer repeats better
@@ -118,7 +119,7 @@ def _rows(path: Path, text: str) -> Iterator[Row]:
             if header is None:
                 header = _header(path, number, cells)
             elif len(cells) != len(header):
-                raise InputError(f"{path}: line {number}: {len(cells)} cells; {','.join(header)} is wanted")
+                raise InputError(f"{path}: line {number}: {len(cells)} cells; write {','.join(header)}")
             else:
                 yield _row(f"{path}: line {number}", dict(zip(header, cells, strict=True)))
     except csv.Error as error:
@@ -143,17 +144,19 @@ def _row(place: str, cells: dict[str, str]) -> Row:
     try:
         code = int(cells["code"])
     except ValueError as error:
-        raise InputError(f"{place}: code = {shortened(cells['code'])}; a whole number is wanted") from error
+        raise InputError(f"{place}: code = {shortened(cells['code'])}; write a whole number") from error
     if not 0 <= code < 2**16:
-        raise InputError(f"{place}: code = {shortened(cells['code'])}; 0 to 65535 is wanted")
+        raise InputError(f"{place}: code = {shortened(cells['code'])}; write 0 to 65535")
     if cells["channel"] not in CHANNELS:
-        raise InputError(f"{place}: channel = {shortened(cells['channel'])}; w, r, g or b is wanted")
+        raise InputError(f"{place}: channel = {shortened(cells['channel'])}; write w, r, g or b")
     value = _number(place, "value", cells["value"])
     if value < 0:
-        raise InputError(f"{place}: value = {value:g}; light is not negative, give readings without an offset taken off")
+        raise InputError(
+            f"{place}: value = {value:g}; light is not negative; write readings from which no offset was subtracted"
+        )
     exposure_s = _number(place, "exposure_s", cells.get("exposure_s") or "1")
     if exposure_s <= 0:
-        raise InputError(f"{place}: exposure_s = {exposure_s:g}; more than 0 is wanted")
+        raise InputError(f"{place}: exposure_s = {exposure_s:g}; write more than 0")
     time = cells.get("t_s")
     return code, cells["channel"], value, exposure_s, _number(place, "t_s", time) if time else None
 
@@ -164,7 +167,7 @@ def _number(place: str, name: str, text: str) -> float:
     except ValueError:
         number = math.nan
     if not abs(number) < 1e30:
-        raise InputError(f"{place}: {name} = {shortened(text)}; a finite number is wanted")
+        raise InputError(f"{place}: {name} = {shortened(text)}; write a finite number")
     return number
 
 
@@ -216,9 +219,9 @@ def check_levels(measured: Measurements, channel: str, levels: Levels) -> None:
         raise InputError(
             f"{place}: white, code {measured.white} of {measured.bits} bits, is not measured; add it or say --bits"
         )
-    if len(levels.code) < FEWEST_CODES:
+    if len(levels.code) < MIN_CODES:
         raise InputError(
-            f"{place}: {len(levels.code)} distinct codes; {FEWEST_CODES} or more are wanted, 32 for 1 % (calibrate plan)"
+            f"{place}: {len(levels.code)} distinct codes; measure {MIN_CODES} or more, 32 for 1 % (calibrate plan)"
         )
     if not levels.mean[-1] > levels.mean[0]:
         raise InputError(f"{place}: white is not brighter than code 0; check that the instrument looks at the patch")
@@ -276,7 +279,7 @@ def drift_over_run(measured: Measurements) -> tuple[float, float]:
 def check_drift(measured: Measurements) -> float:
     """The drift over the run, relative (nan where nothing was repeated). Raises InputError where it is beyond the noise."""
     drift, error = drift_over_run(measured)
-    if abs(drift) > max(FALSE_ALARM_SIGMA * error, SMALLEST_DRIFT):
+    if abs(drift) > max(FALSE_ALARM_SIGMA * error, MIN_DRIFT):
         raise InputError(
             f"{measured.source}: light drifts by {100 * drift:+.2g} % (noise {100 * error:.1g} %) from the first measurement to"
             " the last; let monitor and instrument warm up, then measure again"

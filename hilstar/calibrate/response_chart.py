@@ -1,4 +1,4 @@
-"""The picture of a photometric calibration: the response, and what levels that were left out of the fit have left."""
+"""The chart of a photometric calibration: the response, and the residuals of levels held out of the fit."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from hilstar.calibrate.fit import ChannelFit
 from hilstar.calibrate.measurements import read_measurements
-from hilstar.calibrate.photometric import fit_all, holdout
+from hilstar.calibrate.photometric import fit_all, held_out
 from hilstar.charts import chart
 
 if TYPE_CHECKING:
@@ -19,16 +19,16 @@ COLOURS = {"w": "0.2", "r": "tab:red", "g": "tab:green", "b": "tab:blue"}
 
 
 def draw_calibration(measured: Path, path: Path, bits: int | None = None) -> str:
-    """Draw response and hold-out residuals of MEASURED.csv into a PNG; its finding, as one sentence.
+    """Draw the response and the held-out residuals of MEASURED.csv into a PNG; returns its finding in one sentence.
 
     Raises InputError for the same data as the fit does, and where the PNG cannot be written.
     """
     fits = fit_all(read_measurements(measured, bits))
-    worst = max(fits, key=lambda name: holdout(fits[name])["rms_percent"])
-    left, known = holdout(fits[worst]), fits[worst].noise_relative
+    worst = max(fits, key=lambda name: held_out(fits[name]).rms_percent)
+    left, known = held_out(fits[worst]), fits[worst].noise_relative
     finding = (
-        f"Levels left out of the fit are {left['rms_percent']:.2g} % ({left['rms_mag']:.2g} mag) rms off, at most"
-        f" {left['max_percent']:.2g} %, where one patch repeats to {100 * known:.2g} %"
+        f"Levels held out of the fit are {left.rms_percent:.2g} % ({left.rms_mag:.2g} mag) rms off, {left.max_percent:.2g} % at"
+        f" the maximum; a patch repeats to {100 * known:.2g} %"
     )
     with chart(path, finding, panels=2) as (response, residual):
         for name, fit in fits.items():
@@ -70,5 +70,5 @@ def _draw_residuals(axes: Axes, name: str, fit: ChannelFit) -> None:
     )
     held = fit.light[fit.levels.code[1:]] >= 1e-3
     axes.plot(
-        fit.levels.code[1:][held], 100 * fit.residual[held], "o", color=COLOURS[name], markersize=4, label=f"{name}: left out"
+        fit.levels.code[1:][held], 100 * fit.residual[held], "o", color=COLOURS[name], markersize=4, label=f"{name}: held out"
     )

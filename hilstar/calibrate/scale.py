@@ -10,13 +10,14 @@ import numpy as np
 from hilstar.arrays import FloatArray
 from hilstar.bench.build import Bench
 from hilstar.bench.config import read_config
-from hilstar.calibrate.toml_key import with_key
+from hilstar.calibrate.bench_file_edit import with_key
 from hilstar.errors import InputError
 from hilstar.files import write_whole
 from hilstar.reading import MAX_TOML_BYTES, read_text
 from hilstar.scene.psf import peak_share
+from hilstar.units import magnitude
 
-UNSURE_MAG = 0.05  # readings that disagree by more say something else than the scale
+UNSURE_MAG = 0.05  # readings that disagree by more are wrong for another reason than the scale
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,11 +39,11 @@ class Scale:
     @property
     def scatter_mag(self) -> float:
         """Standard deviation of the readings, magnitudes; 0 for one."""
-        return float(np.std(2.5 * np.log10(self.ratios), ddof=1)) if len(self.ratios) > 1 else 0.0
+        return float(np.std(magnitude(self.ratios), ddof=1)) if len(self.ratios) > 1 else 0.0
 
 
 def scale_by_tracker(bench: Bench, readings: list[Reading], exposure_s: float) -> Scale:
-    """White by the median of the readings: the tracker got seen / wanted times what was asked for, so white is worth that more.
+    """White by the median of the readings: where the tracker saw r times the light asked for, white is worth r times more.
 
     Raises InputError for a star that the bench does not have or cannot show whole, and for one over the tracker's full well.
     """

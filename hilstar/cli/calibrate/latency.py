@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
@@ -31,8 +32,9 @@ def latency(
     as_json: Json = False,
 ) -> None:
     """Measure the latency from swap to light, by a photodiode over the screen's square and the run's ledger."""
-    from hilstar.calibrate.latency import capture_edges, read_edges, save_edges, write_panel_delay
-    from hilstar.calibrate.latency_chart import measure, told
+    from hilstar.calibrate.edges import capture_edges, read_edges, save_edges
+    from hilstar.calibrate.latency import write_panel_delay
+    from hilstar.calibrate.latency_report import latency_lines, measure_latency
     from hilstar.files import make_directory
 
     check_directory("-o", output)
@@ -50,11 +52,10 @@ def latency(
         time.sleep(LEDGER_BEHIND_S)
     if save is not None:
         save_edges(save, found)
-    summary = measure(ledger, found, None if output is None else make_directory(output))
+    summary = measure_latency(ledger, found, None if output is None else make_directory(output))
     if as_json:
-        print_json(summary)
+        print_json(asdict(summary))
     else:
-        for what, how_much in told(summary):
-            typer.echo(f"{what:24}{how_much}")
+        typer.echo("\n".join(latency_lines(summary)))
     if write is not None:
-        write_panel_delay(write, summary["panel_delay_ms"])
+        write_panel_delay(write, summary.panel_delay_ms)

@@ -25,29 +25,30 @@ def photometric(
     as_json: Json = False,
 ) -> None:
     """Fit the monitor's response to measured patches."""
-    from hilstar.calibrate.photometric import calibrate_photometric
+    from hilstar.calibrate.photometric import Provenance, calibrate_photometric
 
     check_ending("-o", output, TOML)
     check_ending("--plot", plot, PNG)
     check_files([measured], [output, output.with_suffix(".csv"), plot])
-    summary = calibrate_photometric(measured, output, bits=bits, who=who, when=when, instrument=instrument, unit=unit)
+    found = calibrate_photometric(measured, output, Provenance(who, when, instrument, unit), bits)
+    written = list(found.written)
     if plot is not None:
         from hilstar.calibrate.response_chart import draw_calibration
 
         draw_calibration(measured, plot, bits)
-        summary["written"].append(str(plot))
+        written.append(str(plot))
     if as_json:
-        print_json(summary)
+        print_json(found.json() | {"written": written})
         return
-    black, hold = summary["black_level"]["relative"], summary["holdout"]
+    black, held = found.first.black_level.relative, found.first.holdout
     contrast = f"1 : {1 / black:.0f}" if black > 0 else "unknown: no light at code 0"
-    drift = "not known" if summary["drift_percent"] is None else f"{summary['drift_percent']:+.2f} %"
-    typer.echo(f"{'measured':20}{summary['codes']} codes above black, {summary['bits']} bits; drift {drift}")
+    drift = "not known" if found.drift_percent is None else f"{found.drift_percent:+.2f} %"
+    typer.echo(f"{'measured':20}{found.first.codes} codes above black, {found.bits} bits; drift {drift}")
     typer.echo(f"{'black level':20}{black:.3e} of white, contrast {contrast}")
-    typer.echo(f"{'noise':20}{100 * summary['noise_relative']:.2f} % of a reading")
+    typer.echo(f"{'noise':20}{100 * found.noise_relative:.2f} % of a reading")
     typer.echo(
-        f"{'held-out levels':20}{hold['rms_percent']:.2f} / {hold['p95_percent']:.2f} / {hold['max_percent']:.2f} %"
-        f" (rms / 95 % / max), {hold['max_mag']:.4f} mag maximum"
+        f"{'held-out levels':20}{held.rms_percent:.2f} / {held.p95_percent:.2f} / {held.max_percent:.2f} %"
+        f" (rms / 95 % / max), {held.max_mag:.4f} mag maximum"
     )
-    typer.echo(f"{'written':20}{', '.join(summary['written'])}")
+    typer.echo(f"{'written':20}{', '.join(written)}")
     typer.echo(f"{'in the bench file':20}[monitor] calibration = {json.dumps(output.name)}")

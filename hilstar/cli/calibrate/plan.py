@@ -34,8 +34,10 @@ def plan(
     as_json: Json = False,
 ) -> None:
     """Plan which codes to measure, in which order, and make their patches."""
-    from hilstar.calibrate.photometric import is_filled_in
-    from hilstar.calibrate.photometric import plan as write_plan
+    import numpy as np
+
+    from hilstar.calibrate.patches import show_patches, write_patches
+    from hilstar.calibrate.plan import PlanSettings, is_filled_in, plan_patches, write_plan
 
     check_ending("-o", output, CSV)
     check_directory("--headless", headless)
@@ -43,26 +45,21 @@ def plan(
     width, height = (round(value) for value in parse_numbers(resolution, 2, "--resolution", RESOLUTION_FORM))
     if not (1 <= width <= 32768 and 1 <= height <= 32768):
         raise InputError(f"--resolution {resolution}: write {RESOLUTION_FORM}")
-    summary = write_plan(
-        bits,
-        output,
-        seed=seed,
-        levels=levels,
-        repeats=repeats,
-        channels=channels,
-        patches=headless,
-        resolution_px=(width, height),
-    )
-    steps = summary.pop("steps")
+    settings = PlanSettings(bits, levels, repeats, channels)
+    planned = plan_patches(settings, np.random.default_rng(seed))
+    write_plan(output, planned)
+    written = [str(output)]
+    if headless is not None:
+        write_patches(headless, planned, (width, height), bits)
+        written.append(str(headless))
+    codes = len({patch.code for patch in planned})
     if as_json:
-        print_json(summary)
+        print_json({"bits": bits, "patches": len(planned), "codes": codes, "seed": seed, "written": written})
     else:
-        typer.echo(f"{summary['patches']} patches of {summary['codes']} codes in {', '.join(summary['written'])}")
+        typer.echo(f"{len(planned)} patches of {codes} codes in {', '.join(written)}")
         typer.echo("fill in the column value, and give the file to hilstar calibrate photometric")
     if show:
-        from hilstar.calibrate.photometric import show_patches
-
-        shown = show_patches(steps, bits, int(display) if display.isdecimal() else display, seconds)
-        say(f"{shown} of {len(steps)} patches shown")
+        shown = show_patches(planned, bits, int(display) if display.isdecimal() else display, seconds)
+        say(f"{shown} of {len(planned)} patches shown")
     elif headless is None:
         say("add --show for the patches on a display (space for the next one), or --headless DIR for pictures of them")

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import csv
-
 import numpy as np
 import pytest
 from PIL import Image
 
 from hilstar.calibrate.fit import fit_channel, strictly_rising
 from hilstar.calibrate.measurements import drift_over_run, read_measurements
-from hilstar.calibrate.photometric import calibrate_photometric, plan, planned_codes, planned_patches
+from hilstar.calibrate.photometric import Provenance, calibrate_photometric
+from hilstar.calibrate.plan import PlanSettings, plan_patches, planned_codes
 from hilstar.calibrate.response_chart import draw_calibration
 from hilstar.errors import InputError
 from hilstar.monitor.calibration import load_calibration
@@ -34,11 +33,6 @@ def bent(signal):
 CURVES = {"gamma": lambda s: s**2.2, "srgb": srgb_light, "s-curve": cell, "table": bent}
 
 
-def read_png(path):
-    with Image.open(path) as image:
-        return np.asarray(image)
-
-
 def write(path, rows, header="code,channel,value"):
     path.write_text("\n".join([header, *(",".join(map(str, row)) for row in rows)]) + "\n")
     return path
@@ -46,10 +40,10 @@ def write(path, rows, header="code,channel,value"):
 
 def measure(path, curve, rng, bits=8, repeats=3, black=0.0, noise=NOISE, unit=250.0):
     """The default plan, measured with a noise relative to the light."""
-    patches = planned_patches(bits, 32, repeats, "w", rng)
-    light = (curve(np.array([code for code, _ in patches]) / (2**bits - 1)) + black) * unit
+    patches = plan_patches(PlanSettings(bits, repeats=repeats), rng)
+    light = (curve(np.array([patch.code for patch in patches]) / (2**bits - 1)) + black) * unit
     light *= 1 + noise * rng.standard_normal(len(light))
-    return write(path, [(code, name, value) for (code, name), value in zip(patches, light, strict=True)])
+    return write(path, [(patch.code, patch.channel, value) for patch, value in zip(patches, light, strict=True)])
 
 
 def errors(fit, curve):
@@ -171,28 +165,30 @@ def test_without_repeats_the_residuals_tell_the_noise(tmp_path, rng):
 
 def test_calibrate_writes_a_file_that_loads_and_says_how_good_it_is(tmp_path, rng):
     path = measure(tmp_path / "m.csv", CURVES["srgb"], rng, black=1e-3)
-    summary = calibrate_photometric(path, tmp_path / "monitor.toml", who='a "b"\nc', instrument="meter", unit="cd/m2")
+    summary = calibrate_photometric(path, tmp_path / "monitor.toml", Provenance('a "b"\nc', instrument="meter", unit="cd/m2"))
     calibration = load_calibration(tmp_path / "monitor.toml", 8)
     assert calibration.who == 'a "b"\nc'
-    assert calibration.sha256 == summary["sha256"]
+    assert calibration.sha256 == summary.sha256
     assert calibration.response.black == pytest.approx(1e-3, rel=0.02)  # black is measured 25 times at 1 %
-    assert summary["black_level"]["unit"] == pytest.approx(0.25, rel=0.02)
-    assert summary["noise_relative"] == pytest.approx(NOISE, rel=0.3)  # some 60 repeats of bright levels: 9 %
+    assert summary.first.black_level.unit == pytest.approx(0.25, rel=0.02)
+    assert summary.noise_relative == pytest.approx(NOISE, rel=0.3)  # some 60 repeats of bright levels: 9 %
     # A level's mean of three repeats to 0.58 %, seen from a response that is known better.
-    assert 0.3 < summary["holdout"]["rms_percent"] < 0.9
-    assert summary["holdout"]["max_mag"] == pytest.approx(summary["holdout"]["max_percent"] / 100 * 1.0857, rel=1e-4)
-    assert summary["error_percent"]["1e-3"] > summary["error_percent"]["1e-2"]
-    assert summary["additivity_percent"] is None
+    assert 0.3 < summary.first.holdout.rms_percent < 0.9
+    assert summary.first.holdout.max_mag == pytest.approx(summary.first.holdout.max_percent / 100 * 1.0857, rel=1e-4)
+    assert summary.first.error_percent["1e-3"] > summary.first.error_percent["1e-2"]
+    assert summary.additivity_percent is None
     light = load_calibration(tmp_path / "monitor.toml", 8).response.light
     assert np.abs(light[4:] / srgb_light(np.arange(4, 256) / 255) - 1).max() < WORST
 
 
 def test_primaries_are_fitted_and_their_sum_compared_with_white(tmp_path, rng):
     shares = {"w": 1.02, "r": 0.2, "g": 0.7, "b": 0.1}
-    patches = planned_patches(8, 24, 3, "wrgb", rng)
-    rows = [(c, n, (shares[n] * (c / 255) ** 2.2 + 1e-3) * (1 + 0.005 * rng.standard_normal())) for c, n in patches]
+    rows = [
+        (p.code, p.channel, (shares[p.channel] * (p.code / 255) ** 2.2 + 1e-3) * (1 + 0.005 * rng.standard_normal()))
+        for p in plan_patches(PlanSettings(8, 24, channels="wrgb"), rng)
+    ]
     summary = calibrate_photometric(write(tmp_path / "m.csv", rows), tmp_path / "monitor.toml")
-    assert summary["additivity_percent"] == pytest.approx(100 * (1 / 1.02 - 1), abs=0.8)  # four whites to 0.2 % each
+    assert summary.additivity_percent == pytest.approx(100 * (1 / 1.02 - 1), abs=0.8)  # four whites to 0.2 % each
     calibration = load_calibration(tmp_path / "monitor.toml", 8, bit_stealing=True)
     assert calibration.weights == pytest.approx((0.2, 0.7, 0.1), rel=0.01)
     assert len(calibration.response.light) == 1786
@@ -204,52 +200,6 @@ def test_a_drawing_says_what_it_shows(tmp_path, rng):
     assert "rms off" in finding
     with Image.open(tmp_path / "m.png") as image:
         assert image.size[0] > 500
-
-
-def test_a_plan_is_random_reproducible_and_can_be_filled_in(tmp_path):
-    plans = [plan(8, tmp_path / f"{k}.csv", seed=seed) for k, seed in enumerate((1, 1, 2))]
-    texts = [(tmp_path / f"{k}.csv").read_text() for k in range(3)]
-    assert texts[0] == texts[1] != texts[2]
-    rows = list(csv.DictReader(texts[0].splitlines()))
-    assert len(rows) == plans[0]["patches"]
-    codes = [int(row["code"]) for row in rows]
-    assert [row["value"] for row in rows] == [""] * len(rows)
-    assert codes.count(0) >= 20
-    assert max(np.diff(np.flatnonzero(np.array(codes) == 0))) <= 11  # black comes back within every eight patches and three
-    with pytest.raises(InputError, match="fill it in"):
-        calibrate_photometric(tmp_path / "0.csv", tmp_path / "monitor.toml")
-
-
-@pytest.mark.parametrize(("bits", "levels"), [(1, 2), (2, 4), (8, 32), (8, 256), (10, 32), (16, 64)])
-def test_planned_codes_are_distinct_from_black_to_white(bits, levels):
-    codes = planned_codes(bits, levels)
-    assert len(codes) == levels
-    assert (codes[0], codes[-1]) == (0, 2**bits - 1)
-    assert np.all(np.diff(codes) > 0)
-
-
-@pytest.mark.parametrize(("bits", "code", "stored"), [(8, 255, 255), (10, 1023, 1023 << 6)])
-def test_patches_are_written_as_the_codes_of_frames_are(bits, code, stored, tmp_path):
-    plan(bits, tmp_path / "plan.csv", seed=1, levels=8, patches=tmp_path / "patches", resolution_px=(60, 40))
-    image = read_png(tmp_path / "patches" / f"w-{code:05d}.png")
-    assert image.shape == (40, 60)
-    assert image[20, 30] == stored
-    assert image[0, 0] == 0
-    assert len(list((tmp_path / "patches").iterdir())) in (8, 9)  # half is a reference, and may be a level
-
-
-def test_a_patch_of_one_primary_lights_that_primary(tmp_path):
-    plan(8, tmp_path / "plan.csv", seed=1, levels=8, channels="rg", patches=tmp_path / "patches", resolution_px=(60, 40))
-    assert read_png(tmp_path / "patches" / "g-00255.png")[20, 30].tolist() == [0, 255, 0]
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [{"bits": 17}, {"levels": 1}, {"levels": 300}, {"repeats": 0}, {"channels": ""}, {"channels": "ww"}, {"channels": "wx"}],
-)
-def test_a_plan_that_cannot_be_measured_is_refused(arguments, tmp_path):
-    with pytest.raises(InputError):
-        plan(**{"bits": 8, "output": tmp_path / "plan.csv", "seed": 1, **arguments})
 
 
 def refused(path, **more):
@@ -274,7 +224,7 @@ STEPS = [0, 1, *range(5, 256, 10)]
     [
         (STEPS[1:], "code 0 is not measured"),
         (STEPS[:-1], "white, code 255 of 8 bits, is not measured"),
-        ([0, 10, 20, 40, 80, 160, 255], "7 distinct codes; 10 or more"),
+        ([0, 10, 20, 40, 80, 160, 255], "7 distinct codes; measure 10 or more"),
     ],
 )
 def test_levels_that_are_missing_are_named(codes, words, tmp_path):
@@ -320,8 +270,8 @@ def test_a_drift_is_refused_and_noise_is_not_taken_for_one(tmp_path, rng):
         ("code,channel,value\n# so\n1.5,w,2\n", "line 3: code = 1.5"),
         ("code,channel,value\n-1,w,2\n", "code = -1"),
         ("code,channel,value\n70000,w,2\n", "code = 70000"),
-        ("code,channel,value\n1,x,2\n", "channel = x; w, r, g or b"),
-        ("code,channel,value\n1,w,nan\n", "value = nan; a finite number"),
+        ("code,channel,value\n1,x,2\n", "channel = x; write w, r, g or b"),
+        ("code,channel,value\n1,w,nan\n", "value = nan; write a finite number"),
         ("code,channel,value\n1,w,-2\n", "light is not negative"),
         ("code,channel,value\n1,w,bright\n", "value = bright"),
         ("code,channel,value,exposure_s\n1,w,2,0\n", "exposure_s = 0"),

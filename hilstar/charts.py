@@ -1,4 +1,4 @@
-"""How studies write: one style of figure, whose title is its finding, and the table behind it."""
+"""Charts and their tables: one style of figure, whose title is its finding, and the CSV behind it."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import re
 import textwrap
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.axis import Axis
 
-INCH = (9.0, 5.4)  # of one panel; each further one adds SHARE of the height
+SIZE_INCH = (9.0, 5.4)  # of one panel; each further one adds SHARE of the height
 SHARE = 0.65
 TITLE_COLUMNS = 92
 STYLE: Any = {"font.size": 11, "axes.grid": True, "grid.alpha": 0.3, "legend.frameon": False, "lines.linewidth": 1.8}
@@ -30,15 +31,21 @@ def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]])
         writer.writerows(rows)
 
 
+def write_records(path: Path, records: Sequence[Any]) -> None:
+    """A table of frozen dataclasses of one class, a column for each field. Raises InputError where it cannot be written."""
+    columns = [field.name for field in fields(records[0])]
+    write_csv(path, columns, [[getattr(record, name) for name in columns] for record in records])
+
+
 @contextmanager
 def chart(path: Path, finding: str, panels: int = 1, share_x: bool = True) -> Iterator[list[Axes]]:
-    """A PNG with `panels` one above the other, sharing x if so, titled by its finding; draw on the axes that it yields."""
+    """A PNG titled by its finding, with `panels` one above the other, which may share x; draw on the axes that it yields."""
     # Not pyplot: it would change the backend of whoever imports this.
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
     with rc_context(STYLE):
-        size = INCH[0], INCH[1] * (1 + SHARE * (panels - 1))
+        size = SIZE_INCH[0], SIZE_INCH[1] * (1 + SHARE * (panels - 1))
         figure = Figure(figsize=size, layout="constrained")
         grid = figure.subplots(panels, 1, sharex=share_x, squeeze=False)
         yield list(grid[:, 0])
@@ -47,7 +54,7 @@ def chart(path: Path, finding: str, panels: int = 1, share_x: bool = True) -> It
 
 
 def title_lines(finding: str) -> str:
-    """A finding in as few lines as it needs, about equally long, no figure parted from its unit."""
+    """A finding in the fewest lines of about equal length, with no line break between a figure and its unit."""
     bound = re.sub(r"(?<=\d) (?=%|(K|mag|mm)\b)", "\N{NO-BREAK SPACE}", finding)
 
     def wrapped(columns: int) -> list[str]:

@@ -15,6 +15,8 @@ from hilstar.files import check_directory
 
 Study = Literal["models", "outputs", "stability", "quantisation", "timing", "tradeoff", "economy", "prediction"]
 
+ROOMS = {"models", "stability", "timing", "tradeoff"}  # the studies of more than one file
+
 
 def study(
     what: Annotated[Study, typer.Argument(help="The study.")],
@@ -37,14 +39,13 @@ def study(
 
 def study_lines(what: str, output: Path, quick: bool = False) -> tuple[list[str], bool]:
     """Run a study; what it found, and whether everything was right."""
-    room = what in {"stability", "tradeoff"}
-    study_of = import_module(f"hilstar.study.{what}{'.run' if room else ''}")
+    study_of = import_module(f"hilstar.study.{what}{'.run' if what in ROOMS else ''}")
     if what == "models":
         return [f"{finding.figure}: {finding.text}" for finding in study_of.run(output)], True
     if what == "stability":
-        places = study_of.run(output)
+        cases = study_of.run(output)
         lines = [
-            f"{'right' if p.right else 'WRONG'}  {p.case}: {p.happens} ({p.why}); not {p.method}: {p.fails}" for p in places
+            f"{'right' if c.right else 'WRONG'}  {c.case}: {c.happens} ({c.why}); not {c.method}: {c.fails}" for c in cases
         ]
-        return lines, all(place.right for place in places)
+        return lines, all(case.right for case in cases)
     return study_of.run(output) if what == "outputs" else study_of.run(output, quick), True

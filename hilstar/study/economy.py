@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from hilstar.arrays import FloatArray
 from hilstar.bench.build import Bench
-from hilstar.charts import chart, write_csv
+from hilstar.charts import chart, write_records
 from hilstar.monitor.quantise import Panel, shown_light
 from hilstar.render.reference import linear_image
 from hilstar.rotation import from_radec_roll_deg
 from hilstar.scene.frame_motion import Scan, Turn, swept_sprites
-from hilstar.scene.sprites import Sprites
+from hilstar.study.shared.lone_stars import Isolation, lone_windows, moments
+from hilstar.units import magnitude
 
 BENCH = """
 [tracker]
@@ -45,8 +44,7 @@ tolerance_px = {tolerance}
 """
 # All effort: whatever is asked for, `exact` and whole sprites reach it, if anything does.
 EFFORTS = {"full": 'quantisation = "exact"\nmotion_above_px = 0.0', "auto": 'effort = "auto"\nquantisation = "auto"'}
-MARGIN_PX = 7
-ALONE = 2e-4  # of a star's light, at most, that others may bring into its window: 2e-4 mag
+ISOLATION = Isolation(margin_px=7, max_share=2e-4)  # 2e-4 of its light is 2e-4 mag
 ROUNDS, QUICK_ROUNDS = 60, 5
 
 
@@ -95,8 +93,7 @@ class Outcome:
 def run(directory: Path, quick: bool = False) -> list[str]:
     """Measure every scene, and write `economy.csv` and `economy.png`; a line for each scene. Raises InputError."""
     outcomes = [outcome for scene in SCENES for outcome in compare(scene, QUICK_ROUNDS if quick else ROUNDS)]
-    columns = Outcome.__slots__
-    write_csv(directory / "economy.csv", columns, [[getattr(o, name) for name in columns] for o in outcomes])
+    write_records(directory / "economy.csv", outcomes)
     pairs = list(zip(outcomes[::2], outcomes[1::2], strict=True))
     _draw(directory / "economy.png", pairs)
     return [_line(full, auto) for full, auto in pairs]
@@ -152,9 +149,12 @@ def _outcome(scene: Scene, name: str, bench: Bench, frame_ms: float) -> Outcome:
     sprites = swept_sprites(bench.stars, turn, scan, bench.camera, footprint, sigma_px)
     true = linear_image(sprites, size, sigma_px)
     flux_mag, off_px = [], []
-    for window in lone_windows(sprites, size, bench.flux_at_white_e_per_s):
+    rates = sprites.data["electrons_per_s"]
+    for star, window in lone_windows(sprites, sprites.x_px, sprites.y_px, size, ISOLATION):
+        if rates[sprites.star == star].sum() > 2 * bench.flux_at_white_e_per_s:
+            continue  # over white at some places in a pixel
         (light, x_px, y_px), (true_light, true_x_px, true_y_px) = moments(shown, window), moments(true, window)
-        flux_mag.append(abs(2.5 * math.log10(light / true_light)) if light > 0 else math.inf)
+        flux_mag.append(abs(magnitude(light / true_light)))
         off_px.append(math.hypot(x_px - true_x_px, y_px - true_y_px))
     return Outcome(
         scene=scene.name,
@@ -167,31 +167,6 @@ def _outcome(scene: Scene, name: str, bench: Bench, frame_ms: float) -> Outcome:
         measured_stars=len(flux_mag),
         tolerance=scene.tolerance,
     )
-
-
-def lone_windows(sprites: Sprites, size_px: tuple[int, int], brightest_e_per_s: float) -> Iterator[tuple[slice, slice]]:
-    """Rows and columns around each star that is whole on the image, alone there, and under white whatever its place."""
-    light, (width, height) = sprites.data["electrons_per_s"], size_px
-    for star in np.unique(sprites.star):
-        own = sprites.star == star
-        left, right = int(sprites.x_px[own].min()) - MARGIN_PX, int(sprites.x_px[own].max()) + MARGIN_PX + 1
-        top, bottom = int(sprites.y_px[own].min()) - MARGIN_PX, int(sprites.y_px[own].max()) + MARGIN_PX + 1
-        if left < 0 or top < 0 or right >= width or bottom >= height or light[own].sum() > 2 * brightest_e_per_s:
-            continue
-        across = (sprites.x_px > left - MARGIN_PX) & (sprites.x_px < right + MARGIN_PX)
-        near = across & (sprites.y_px > top - MARGIN_PX) & (sprites.y_px < bottom + MARGIN_PX) & ~own
-        if light[near].sum() <= ALONE * light[own].sum():
-            yield slice(top, bottom + 1), slice(left, right + 1)
-
-
-def moments(image: FloatArray, window: tuple[slice, slice]) -> tuple[float, float, float]:
-    """Light and centre of gravity, px, of a window; not a number where it is dark."""
-    part = image[window]
-    y_px, x_px = np.mgrid[window]
-    total = float(part.sum())
-    if total <= 0:
-        return 0.0, math.nan, math.nan
-    return total, float((part * x_px).sum() / total), float((part * y_px).sum() / total)
 
 
 def _line(full: Outcome, auto: Outcome) -> str:

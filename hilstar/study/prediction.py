@@ -1,6 +1,6 @@
 """Where the camera points when the light comes: error against latency and against the packets' rate, by method, and its time.
 
-The slew is that of the trade-offs: a swing of degrees, shaken on each axis (see `tradeoff_motion`). A frame at time t has the
+The slew is that of the trade-offs: a swing of degrees, shaken on each axis (see `shared.predictors`). A frame at time t has the
 samples that were taken before t minus the latency, which is all of it: link, drawing, scan-out.
 """
 
@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 
 from hilstar.attitude.wire.packet import AttitudeSample
-from hilstar.charts import chart, plain_ticks, write_csv
+from hilstar.charts import chart, plain_ticks, write_records
 from hilstar.rotation import angle_between_rad
-from hilstar.study.tradeoff.motion import JITTER, NEAR, SLEW_DEG, SLEW_S, Guess, guesses, slew_attitude, slew_sample
+from hilstar.study.shared.predictors import JITTER, NEAR, SLEW_DEG, SLEW_S, Predictor, predictors, slew_attitude, slew_sample
 from hilstar.units import ARCSEC_PER_RAD, NS_PER_MS, NS_PER_S
 
 RATES_HZ = (5, 10, 20, 50, 100, 200)
@@ -44,10 +44,9 @@ class Outcome:
 def run(directory: Path, quick: bool = False) -> list[str]:
     """Measure, and write `prediction.csv` and `prediction.png`; a line for each method. Raises InputError."""
     outcomes = measure(QUICK_SPAN_S if quick else SPAN_S)
-    columns = Outcome.__slots__
-    write_csv(directory / "prediction.csv", columns, [[getattr(o, name) for name in columns] for o in outcomes])
+    write_records(directory / "prediction.csv", outcomes)
     usual = [o for o in outcomes if (o.rate_hz, o.latency_ms) == (USUAL_HZ, USUAL_MS)]
-    default = next(o for o in usual if o.method == next(g.name for g in guesses() if g.is_default))
+    default = next(o for o in usual if o.method == next(g.name for g in predictors() if g.is_default))
     hold = next(o for o in usual if o.method == "hold")
     shaken = ", ".join(f"{size:g} arcsec at {hz:g} Hz" for size, hz in JITTER)
     finding = (
@@ -64,26 +63,26 @@ def measure(span_s: float) -> list[Outcome]:
     outcomes = []
     for hz, ms in sorted(cells):
         samples = [slew_sample(round(k * NS_PER_S / hz)) for k in range(math.ceil(span_s * hz) + 1)]
-        outcomes += [_outcome(guess, samples, hz, ms) for guess in guesses() if not guess.waits]
+        outcomes += [_outcome(predictor, samples, hz, ms) for predictor in predictors() if not predictor.waits]
     return outcomes
 
 
-def _outcome(guess: Guess, samples: list[AttitudeSample], rate_hz: int, latency_ms: int) -> Outcome:
+def _outcome(predictor: Predictor, samples: list[AttitudeSample], rate_hz: int, latency_ms: int) -> Outcome:
     taken_ns = [sample.t_ns for sample in samples]
     errors = []
     first_ns = taken_ns[NEAR] + latency_ms * NS_PER_MS
     for frame in range(math.ceil(first_ns * FRAME_HZ / NS_PER_S), math.floor(taken_ns[-1] * FRAME_HZ / NS_PER_S)):
         t_ns = round(frame * NS_PER_S / FRAME_HZ)
         count = bisect_right(taken_ns, t_ns - latency_ms * NS_PER_MS)
-        shown = guess.load(samples[count - NEAR : count])(t_ns)
+        shown = predictor.load(samples[count - NEAR : count])(t_ns)
         errors.append(angle_between_rad(slew_attitude(t_ns), shown) * ARCSEC_PER_RAD)
     rms = float(np.sqrt(np.mean(np.square(errors))))
-    return Outcome(guess.name, rate_hz, latency_ms, rms, max(errors), _attitude_us(guess, samples, latency_ms))
+    return Outcome(predictor.name, rate_hz, latency_ms, rms, max(errors), _attitude_us(predictor, samples, latency_ms))
 
 
-def _attitude_us(guess: Guess, samples: list[AttitudeSample], latency_ms: int) -> float:
+def _attitude_us(predictor: Predictor, samples: list[AttitudeSample], latency_ms: int) -> float:
     """The median time of one attitude past the samples."""
-    attitude_at = guess.load(samples[-NEAR:])
+    attitude_at = predictor.load(samples[-NEAR:])
     t_ns = samples[-1].t_ns + latency_ms * NS_PER_MS
     times = []
     for _ in range(TIMED):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,52 +11,16 @@ import numpy as np
 from hilstar.arrays import FloatArray
 from hilstar.charts import STYLE, plain_ticks, save, title_lines, write_csv
 from hilstar.monitor.phases import SIGMA_PX, WHITE, Errors, fainter, measure, phase_grid, shown_by
-from hilstar.monitor.quantise import (
-    CYCLE_FRAMES,
-    Panel,
-    Quantisation,
-)
-from hilstar.monitor.response import Response, Weights, bit_stealing, srgb_response
+from hilstar.monitor.quantise import CYCLE_FRAMES, Panel
+from hilstar.monitor.response import srgb_response
 from hilstar.render.reference import linear_image
 from hilstar.render.renderer import Renderer, Target
 from hilstar.scene.psf import footprint_px, peak_share
-from hilstar.scene.sprites import pack_sprites
+from hilstar.study.shared.codes import AIM_PX, AIMS, BITS, FRAME_PX, STARS, WAYS, Way, response_of, star_field
 from hilstar.units import flux_ratio
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-BITS = (8, 10, 12)
-# The issue's aims: magnitudes of flux error, and over how many magnitudes, by bits.
-AIMS = {8: (0.05, 6.0), 10: (0.02, 8.0), 12: (0.02, 8.0)}
-AIM_PX = 0.01
-# Rec. 709's shares of white stand in for the primaries as a tracker sees them.
-STEALING_WEIGHTS: Weights = (0.2126, 0.7152, 0.0722)
-FRAME_PX = (1920, 1080)
-STARS = 1000
-SEED = 1
-STEALING = ", bit stealing"
-
-
-@dataclass(frozen=True, slots=True)
-class Way:
-    """One way from light to levels: its name, the renderer's method, and its line."""
-
-    name: str
-    method: Quantisation
-    style: str
-    stealing: bool = False
-    whole_cycle: bool = False
-
-
-WAYS = (
-    Way("round", "round", "C7-"),
-    Way("dither; temporal in one frame", "dither", "C1-"),
-    Way(f"temporal, mean of {CYCLE_FRAMES} frames", "temporal", "C2-", whole_cycle=True),
-    Way("exact", "exact", "C0-"),
-    Way("round" + STEALING, "round", "C7:", stealing=True),
-    Way("exact" + STEALING, "exact", "C0:", stealing=True),
-)
 
 
 def run(directory: Path, quick: bool = False) -> list[str]:
@@ -84,12 +47,6 @@ def run(directory: Path, quick: bool = False) -> list[str]:
     return findings
 
 
-def response_of(bits: int, way: Way) -> Response:
-    """The sRGB response of a way; with bit stealing, of three equal channels."""
-    grey = srgb_response(bits)
-    return bit_stealing((grey, grey, grey), STEALING_WEIGHTS) if way.stealing else grey
-
-
 def _against_magnitude(bits: int, way: Way, phases: int, mags: FloatArray) -> list[Errors]:
     panel = Panel(response_of(bits, way), WHITE)
     sprites, tile = phase_grid(phases)
@@ -104,13 +61,8 @@ def _against_magnitude(bits: int, way: Way, phases: int, mags: FloatArray) -> li
 
 
 def _frame_ms(bits: int, way: Way, repeats: int) -> float:
-    """The median time of draw and read-back of 1000 stars over eight magnitudes, three times as many in each as in the last."""
-    rng = np.random.default_rng(SEED)
-    share = rng.uniform(size=STARS)
-    mag = 2 * np.log10(1 + share * (10 ** (8 / 2) - 1))
-    flux = WHITE / peak_share(SIGMA_PX) * flux_ratio(mag)
-    x_px, y_px = rng.uniform(0, 1, (2, STARS)) * np.array(FRAME_PX)[:, None]
-    sprites = pack_sprites(x_px, y_px, flux, np.arange(STARS), FRAME_PX, footprint_px(SIGMA_PX))
+    """The median time of drawing STARS stars and reading their codes back."""
+    sprites = star_field(FRAME_PX, footprint_px(SIGMA_PX))
     target = Target(FRAME_PX, SIGMA_PX, response_of(bits, way), WHITE, way.method)
     times = []
     with Renderer(target) as renderer:

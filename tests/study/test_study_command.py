@@ -9,7 +9,12 @@ import pytest
 from PIL import Image
 
 from hilstar.sky.pickles import load_library
-from hilstar.study.models import choices, leave_one_out, rapp_ratios, spectra, study_optics, torres2010_k, zero_points
+from hilstar.study.models.choices import choices
+from hilstar.study.models.rapp import rapp_ratios
+from hilstar.study.models.spectra import spectra
+from hilstar.study.models.temperatures import torres2010_k
+from hilstar.study.models.zero_points import zero_points
+from hilstar.study.shared.brightness import held_out_errors, study_optics
 from hilstar.study.stability import run as stability
 from tests.support.commands import assert_refused, run_hilstar
 
@@ -82,14 +87,14 @@ def test_real_spectra_beat_black_bodies_in_the_chart_as_in_the_table(tmp_path):
     assert median["pickles, leave-one-out"] < 1.0 < 3 * median["pickles, leave-one-out"] < median["black body, ballesteros2012"]
 
 
-def test_leave_one_out_leaves_the_one_out():
+def test_a_held_out_star_is_not_in_its_own_table():
     """A star made ten times brighter moves no other star's error by more than its share, and its own by all of it."""
     library = load_library()
     rates = np.exp(library.vi_mag)
-    plain = leave_one_out(rates)
+    plain = held_out_errors(rates)
     changed = rates.copy()
     changed[40] *= 10
-    assert leave_one_out(changed)[40] == pytest.approx((plain[40] + 1) / 10 - 1, rel=1e-9)
+    assert held_out_errors(changed)[40] == pytest.approx((plain[40] + 1) / 10 - 1, rel=1e-9)
 
 
 def test_what_choices_cost_is_what_the_models_say(tmp_path):
@@ -114,7 +119,7 @@ def test_the_stability_table_has_every_place_and_its_charts(tmp_path):
     assert result.returncode == 0, result.stderr
     assert '"right":true' in result.stdout
     rows = table(tmp_path / "stability.csv")
-    assert len(rows) == len(stability.VISITS)
+    assert len(rows) == len(stability.CASES)
     for row in rows:
         assert row["verdict"] == "right" and row["failing method"] and row["its failure"] and row["why"]
         assert float(row["error"]) <= float(row["tolerance"])

@@ -17,7 +17,11 @@ from hilstar.sky.catalog import load_catalog
 from hilstar.sky.electrons import Photometry, tabulate
 from hilstar.sky.pickles import tabulate_pickles
 from hilstar.sky.spectrum import DATA_DIR
-from hilstar.study.models import run, running_percentiles, study_optics, torres2010_k, zero_points
+from hilstar.study.models.choices import running_percentiles
+from hilstar.study.models.run import run
+from hilstar.study.models.temperatures import torres2010_k
+from hilstar.study.models.zero_points import zero_points
+from hilstar.study.shared.brightness import study_optics
 
 STEMS = ("rapp_ccd47-20", "rapp_kai-4021", "temperature_scales", "zero_points", "choices", "spectra")
 
@@ -33,8 +37,8 @@ PECAUT_MAMAJEK = ((0.000, 9700), (0.295, 7220), (0.650, 5770), (0.816, 5270), (1
 # Two calibrations of one quantity; the dwarfs' and giants' temperatures at one B-V differ by as much. Measured: 2.2 %.
 SCALES_AGREE = 0.03
 
-# tests/authority/test_pickles.py holds the same: median and 95 % of leave-one-out, %, V-I < 2.5.
-LEAVE_ONE_OUT = {"ccd47-20": (0.79, 2.42), "kai-4021": (0.58, 2.57)}
+# tests/authority/test_pickles.py holds the same: median and 95 % of the errors of held-out stars, %, V-I < 2.5.
+HELD_OUT = {"ccd47-20": (0.79, 2.42), "kai-4021": (0.58, 2.57)}
 HUNDREDTH_OF_A_PERCENT = 0.006
 
 # The table that benches use, against the integral that the study uses: 1e-6 of the rate (electrons.py).
@@ -178,7 +182,7 @@ def test_choices_cost_what_a_bench_would_see(study):
     assert table["brightness_ags_mag"][row] == pytest.approx(ags_mag[0], abs=1e-4)  # straight lines between 400 points
 
 
-def test_percentiles_are_left_out_where_stars_are_few():
+def test_there_are_no_percentiles_where_stars_are_few():
     bv_mag = np.concatenate([np.full(19, 0.0), np.full(20, 1.0)])
     low, middle, high, count = running_percentiles(bv_mag, np.arange(39.0), np.array([0.0, 1.0, 2.0]))
     assert count.tolist() == [19, 20, 0]
@@ -187,12 +191,12 @@ def test_percentiles_are_left_out_where_stars_are_few():
     assert middle[1] == pytest.approx(28.5)
 
 
-@pytest.mark.parametrize("sensor", LEAVE_ONE_OUT)
+@pytest.mark.parametrize("sensor", HELD_OUT)
 def test_real_spectra_are_as_wrong_as_measured(study, sensor):
     table = columns(study[0] / "spectra.csv")
     assert len(table["spectral_type"]) == 106
     errors = np.abs(table[f"{sensor}: pickles, leave-one-out [%]"][table["vi_mag"] < 2.5])
-    assert np.percentile(errors, (50, 95)) == pytest.approx(LEAVE_ONE_OUT[sensor], abs=HUNDREDTH_OF_A_PERCENT)
+    assert np.percentile(errors, (50, 95)) == pytest.approx(HELD_OUT[sensor], abs=HUNDREDTH_OF_A_PERCENT)
 
 
 def test_titles_say_what_the_tables_hold(study):
@@ -247,8 +251,8 @@ def test_a_title_is_whole_in_even_lines():
 
 def test_matplotlib_is_imported_by_a_drawing_and_pyplot_by_none():
     code = (
-        "import sys, tempfile; from pathlib import Path; from hilstar.study import models;"
+        "import sys, tempfile; from pathlib import Path; from hilstar.study.models import run;"
         "assert 'matplotlib' not in sys.modules;"
-        "models.zero_points(Path(tempfile.mkdtemp())); assert 'matplotlib.pyplot' not in sys.modules"
+        "run.zero_points(Path(tempfile.mkdtemp())); assert 'matplotlib.pyplot' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from hilstar.study.prediction import LATENCIES_MS, RATES_HZ, USUAL_HZ, USUAL_MS, measure, run
-from hilstar.study.tradeoff.motion import SLEW_DEG, SLEW_S
+from hilstar.study.shared.predictors import SLEW_DEG, SLEW_S
 
 SPAN_S = 4.0
 

@@ -10,7 +10,8 @@ from PIL import Image
 
 from hilstar.monitor.phases import SIGMA_PX, fainter, measure, phase_grid
 from hilstar.render.reference import linear_image
-from hilstar.study.quantisation import AIMS, BITS, WAYS, run
+from hilstar.study.quantisation import run
+from hilstar.study.shared.codes import AIMS, BITS, WAYS
 
 
 def test_the_measure_finds_the_error_that_was_put_in():

@@ -9,7 +9,9 @@ import pytest
 from PIL import Image
 
 from hilstar.scene.frame_motion import Scan
-from hilstar.study.timing import QUICK_RATES_DEG_S, WAYS, Sky, Slew, Stand, compare, frame_weights, measure, run
+from hilstar.study.timing.panel import WAYS, ScanningPanel, Sky, frame_weights
+from hilstar.study.timing.run import QUICK_RATES_DEG_S, compare, measure, run
+from hilstar.study.timing.slew import Slew
 
 GAIN = 20  # compensated against not: the issue's own figure
 RATE_DEG_S = QUICK_RATES_DEG_S[0]
@@ -41,13 +43,13 @@ def test_each_step_takes_away_what_physics_says_it_should(outcomes):
     "wrong", [{"down": (0, -1)}, {"scanout_s": 0.0}, {"hold_s": 0.0}], ids=["rows upwards", "no scan-out", "no hold"]
 )
 def test_a_scan_that_is_assumed_wrong_is_seen(tmp_path, outcomes, wrong):
-    stand = Stand("+ smear", tmp_path / "bench.toml")
-    stand.bench.scan = replace(stand.bench.scan, **wrong)
-    sky = Sky(stand)
+    panel = ScanningPanel("+ smear", tmp_path / "bench.toml")
+    panel.bench.scan = replace(panel.bench.scan, **wrong)
+    sky = Sky(panel)
     try:
-        outcome = compare(stand, sky, Slew(RATE_DEG_S))
+        outcome = compare(panel, sky, Slew(RATE_DEG_S))
     finally:
-        stand.close()
+        panel.close()
         sky.close()
     assert outcome.rms_arcsec > outcomes["prediction"].rms_arcsec / GAIN
 

@@ -17,11 +17,12 @@ from hilstar.scene.psf import LARGEST_CUT
 from hilstar.sky.cells import CELL_DEG
 from hilstar.sky.electrons import TABLE_DEGREE
 from hilstar.sky.spectrum import Curve
+from hilstar.study.shared.codes import star_field
 from hilstar.study.tradeoff import table as tradeoff_table
 from hilstar.study.tradeoff.brightness import trapezoid
-from hilstar.study.tradeoff.light import SIGMA_PX, star_field
+from hilstar.study.tradeoff.demo import SIGMA_PX
+from hilstar.study.tradeoff.depth import LIMITS_V_MAG
 from hilstar.study.tradeoff.run import STEPS, draw, round_ticks, run, spread, table_lines
-from hilstar.study.tradeoff.sky import LIMITS_V_MAG
 from hilstar.study.tradeoff.table import FEWEST_ROUNDS, Figure, Trial, Trials, interleaved, measured, pareto_front
 
 NAMES = ["brightness", "spectrum", "depth", "culling", "projection", "prediction", "smear", "psf", "quantisation"]

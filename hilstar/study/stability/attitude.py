@@ -14,7 +14,7 @@ from hilstar.attitude.clock.timeline import Policy, Timeline
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal, decode, encode
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE
 from hilstar.rotation import angle_between_rad, from_radec_roll_deg, propagate, slerp
-from hilstar.study.stability.failing_place import Figures, Place
+from hilstar.study.stability.failure_case import FailureCase, Figures
 from hilstar.units import ARCSEC_PER_RAD, NS_PER_S
 
 START = from_radec_roll_deg(84.057, -1.2, 30.0)
@@ -56,10 +56,10 @@ def way_error_arcsec(between: Between, sign: float, turn_deg: float) -> float:
     return float(np.max(errors) * ARCSEC_PER_RAD)
 
 
-def two_signs() -> Place:
+def two_signs() -> FailureCase:
     """A sender that writes -q for the next sample, one degree on."""
     error, fault = (way_error_arcsec(between, -1.0, 1.0) for between in (slerp, arccos_slerp))
-    return Place(
+    return FailureCase(
         "q, then -q one degree on",
         "SLERP from one to the other as they are",
         f"goes round the long way: {fault / 3600:.0f} degrees off",
@@ -69,12 +69,12 @@ def two_signs() -> Place:
     )
 
 
-def antipodal() -> Place:
+def antipodal() -> FailureCase:
     """The same attitude twice, with either sign."""
     error, fault = (
         float(np.max([way_error_arcsec(between, sign, 0.0) for sign in (1.0, -1.0)])) for between in (slerp, arccos_slerp)
     )
-    return Place(
+    return FailureCase(
         "SLERP from q to q and to -q",
         "SLERP by arccos",
         f"{fault:.0f}: sin(angle) is 0",
@@ -84,10 +84,10 @@ def antipodal() -> Place:
     )
 
 
-def half_turn() -> Place:
+def half_turn() -> FailureCase:
     """Samples nearly half a turn apart."""
     error, fault = (way_error_arcsec(between, 1.0, 179.999) for between in (slerp, straight_line))
-    return Place(
+    return FailureCase(
         "SLERP over 179.999 degrees",
         "the normalised straight line",
         f"up to {fault / 3600:.1f} degrees off, and still on the great circle",
@@ -113,11 +113,11 @@ def sampled_error_arcsec(turn_deg: float, with_rates: bool) -> float:
     return worst * ARCSEC_PER_RAD
 
 
-def fast_turns() -> Place:
+def fast_turns() -> FailureCase:
     """Turns of about pi, and more, from sample to sample."""
     error, fault = (max(sampled_error_arcsec(turn, rates) for turn in TURNS_DEG) for rates in (True, False))
     just_under, just_over = (sampled_error_arcsec(turn, False) / 3600 for turn in TURNS_DEG[1:3])
-    return Place(
+    return FailureCase(
         f"{TURNS_DEG[0]:g} to {TURNS_DEG[-1]:g} degrees from sample to sample",
         "samples without rates",
         f"{just_under:.0e} degrees off at {TURNS_DEG[1]:g}, {just_over:.0f} at {TURNS_DEG[2]:g}: the other way is shorter",
@@ -132,7 +132,7 @@ def norm_alone(q: tuple[float, ...]) -> bool:
     return not abs(math.sqrt(sum(c * c for c in q)) - 1.0) > NORM_TOLERANCE
 
 
-def not_a_number() -> Place:
+def not_a_number() -> FailureCase:
     """NaN and infinity in each number of a packet and of JSON."""
     taken, passed, sent = 0, 0, 0
     for place, value in product(range(7), (math.nan, math.inf, -math.inf)):
@@ -143,7 +143,7 @@ def not_a_number() -> Place:
             taken += not isinstance(decode(message), Refusal)
             passed += norm_alone(tuple(numbers[:4]))
             sent += 1
-    return Place(
+    return FailureCase(
         "NaN or infinity in an attitude",
         "a look at abs(norm - 1) > 1e-3 alone",
         f"{passed} of {sent} pass: NaN is not larger, and a rate has no norm to look at",

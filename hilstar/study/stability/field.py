@@ -14,7 +14,7 @@ from hilstar.scene.sprites import pack_sprites
 from hilstar.sky.astrometry import RAD_PER_MAS, unit_vectors_icrs
 from hilstar.sky.catalog import HIPPARCOS_EPOCH_JYEAR, load_catalog
 from hilstar.sky.cells import cell_grid
-from hilstar.study.stability.failing_place import Figures, Place
+from hilstar.study.stability.failure_case import FailureCase, Figures
 from hilstar.units import ARCSEC_PER_RAD
 
 # float64 knows a direction to 2e-16 rad, 5e-8 mas: 200 times that for the few operations on it.
@@ -30,7 +30,7 @@ CORNER_DEG = 10.0
 CENTROID_PX = 1.1e-5
 
 
-def motion_at_pole() -> Place:
+def motion_at_pole() -> FailureCase:
     """Proper motion a thousandth of a degree from the pole."""
     catalog = load_catalog().brighter_than(-1.0)  # Sirius alone, whose numbers are then replaced
     n, years = len(catalog), 34.75
@@ -47,7 +47,7 @@ def motion_at_pole() -> Place:
     wrong = [_vector(359.9999 + turn_deg / cosine, dec_deg) for cosine in (1.0, np.cos(np.radians(89.999)))]
     exact = _great_circle(359.9999, 89.999, np.array([100.0, 50.0]) * years * RAD_PER_MAS)
     error, *faults = (_apart_rad(v, exact) / RAD_PER_MAS for v in (moved, *wrong))
-    return Place(
+    return FailureCase(
         "proper motion at declination 89.999",
         "RA + pm t, as eq. 2.1; with pm / cos(dec)",
         f"{faults[0]:.0f} mas off after {years:g} years; {faults[1]:.2g} mas",
@@ -77,7 +77,7 @@ def _apart_rad(a: FloatArray, b: FloatArray) -> float:
     return float(np.linalg.norm(np.cross(a, b)))
 
 
-def fields_over_wrap_and_pole() -> Place:
+def fields_over_wrap_and_pole() -> FailureCase:
     """Fields of 10 degrees on the RA wrap and about the pole."""
     catalog = load_catalog().brighter_than(7.5)
     vectors = unit_vectors_icrs(catalog, HIPPARCOS_EPOCH_JYEAR)
@@ -89,7 +89,7 @@ def fields_over_wrap_and_pole() -> Place:
         box = (np.abs(catalog.ra_deg - ra_deg) <= radius) & (np.abs(catalog.dec_deg - dec_deg) <= radius)
         lost += len(np.setdiff1d(inside, grid.order[grid.near(axis, np.radians(radius))]))
         box_lost, seen = box_lost + int((~box[inside]).sum()), seen + len(inside)
-    return Place(
+    return FailureCase(
         "fields over RA = 0 and over the poles",
         "stars chosen by a box in RA and declination",
         f"{box_lost} of {seen} stars within {radius:.0f} degrees lost",
@@ -99,13 +99,13 @@ def fields_over_wrap_and_pole() -> Place:
     )
 
 
-def stars_behind() -> Place:
+def stars_behind() -> FailureCase:
     """Half of the sky lies behind the camera."""
     camera, vectors = _camera(70.0), unit_vectors_icrs(load_catalog().brighter_than(7.5), HIPPARCOS_EPOCH_JYEAR)
     behind = vectors[vectors[:, 2] <= 0]
     ghosts = _on_image(behind[:, :2] / behind[:, 2:] * camera.focal_length_px + camera.principal_point_px, camera)
     ours = _on_image(np.column_stack(camera.project(behind)), camera)
-    return Place(
+    return FailureCase(
         "stars behind the camera",
         "x = f X / Z for every star",
         f"{ghosts} of {len(behind)} stars behind are drawn, mirrored",
@@ -126,7 +126,7 @@ def _on_image(places_px: FloatArray, camera: Camera) -> int:
     return len(pack_sprites(places_px[:, 0], places_px[:, 1], flux, star, camera.resolution_px, 1))
 
 
-def field_of_180_deg() -> Place:
+def field_of_180_deg() -> FailureCase:
     """A field that grows to 180 degrees."""
     error, fault, spread = 0.0, 0.0, 0.0
     for half_deg in (60.0, 85.0, 89.0, 89.9):
@@ -137,7 +137,7 @@ def field_of_180_deg() -> Place:
         error = max(error, float(np.abs(camera.project(vectors)[0] - exact).max()))
         fault = max(fault, float(np.abs(camera.project(vectors.astype(np.float32).astype(np.float64))[0] - exact).max()))
         spread = 1 / np.cos(angle[-1]) ** 2
-    return Place(
+    return FailureCase(
         "a field of 179.8 degrees",
         "float32 directions",
         f"{fault:.2g} px off at its edge, of 1000",
@@ -147,14 +147,14 @@ def field_of_180_deg() -> Place:
     )
 
 
-def boresight_at_pole() -> Place:
+def boresight_at_pole() -> FailureCase:
     """A boresight a millionth of a degree from the pole, read back from its quaternion."""
     wanted_deg = 90.0 - 1e-6
     q = from_radec_roll_deg(123.0, wanted_deg, 10.0)
     naive_deg = float(np.degrees(np.arcsin(np.clip(to_matrix(q)[2, 2], -1, 1))))
     ra_deg, dec_deg, roll_deg = to_radec_roll_deg(q)
     error, fault = (abs(d - wanted_deg) * 3.6e6 for d in (dec_deg, naive_deg))
-    return Place(
+    return FailureCase(
         "a boresight at declination 89.999999",
         "declination by arcsin",
         f"{fault:.2g} mas off",
@@ -178,7 +178,7 @@ def weak_perspective_error(angle_deg: FloatArray) -> tuple[FloatArray, FloatArra
     return off_px, (np.arctan(np.sin(angle)) - angle) * ARCSEC_PER_RAD
 
 
-def weak_perspective() -> Place:
+def weak_perspective() -> FailureCase:
     """One depth for every star, against the field angle."""
     angles = np.array([1.0, 5.0, CORNER_DEG])
     off_px, off_arcsec = weak_perspective_error(angles)
@@ -187,7 +187,7 @@ def weak_perspective() -> Place:
     x_px, _ = camera.project(np.column_stack([np.sin(angle), np.zeros(3), np.cos(angle)]))
     error = float(np.abs(x_px - 2000.0 - camera.focal_length_px * np.tan(angle)).max())
     fails = ", ".join(f"{a:g} deg: {px:.2g} px, {s:.3g} arcsec" for a, px, s in zip(angles, off_px, off_arcsec, strict=True))
-    return Place(
+    return FailureCase(
         "field angle, one depth for all",
         "weak perspective, x = f X / Z0",
         fails,

@@ -15,7 +15,7 @@ from hilstar.render.reference import linear_image
 from hilstar.render.renderer import Renderer, Target, create_context
 from hilstar.scene.psf import LARGEST_CUT, SQRT2, cut_share, footprint_px, pixel_shares
 from hilstar.scene.sprites import Sprites, join_sprites, pack_sprites
-from hilstar.study.stability.failing_place import Figures, Place
+from hilstar.study.stability.failure_case import FailureCase, Figures
 
 IMAGE_PX = (512, 512)
 SIGMA_PX = 0.85
@@ -125,11 +125,11 @@ def star_errors(draw: Draw, on: Target, phases_px: FloatArray) -> tuple[float, f
     return flux_error, off_px
 
 
-def narrow_star() -> Place:
+def narrow_star() -> FailureCase:
     """Sigma 0.1 px."""
     (error, off_px), (fault, fault_px) = narrow_errors(0.1)
     (_, wider_px), (_, wider_fault_px) = narrow_errors(0.5)
-    return Place(
+    return FailureCase(
         "sigma 0.1 px",
         POINT_SAMPLED,
         f"flux off by up to {100 * fault:.0f} %, centre of gravity by {fault_px:.2f} px ({wider_fault_px:.4f} at sigma 0.5)",
@@ -146,7 +146,7 @@ def narrow_errors(sigma_px: float) -> tuple[tuple[float, float], tuple[float, fl
         return star_errors(draw, on, phases), star_errors(partial(point_sampled, on), on, phases)
 
 
-def wide_star() -> Place:
+def wide_star() -> FailureCase:
     """Sigma 20 px."""
     on = target(20.0)
     sprites = one_star(256.3, 256.0, on)
@@ -154,7 +154,7 @@ def wide_star() -> Place:
     with by_renderer(on) as draw:
         image = draw(sprites)
     error, fault = (float(np.abs(shown - exact).max() / exact.max()) for shown in (image, half_float(on, sprites)))
-    return Place(
+    return FailureCase(
         "sigma 20 px",
         "erf differences in half floats",
         f"a pixel off by up to {100 * fault:.0f} % of the peak",
@@ -164,7 +164,7 @@ def wide_star() -> Place:
     )
 
 
-def negative_wings() -> Place:
+def negative_wings() -> FailureCase:
     """Far out both erfs are 1 but for rounding."""
     on = target(20.0)
     sprites = one_star(256.3, 256.0, on)
@@ -172,7 +172,7 @@ def negative_wings() -> Place:
         image = draw(sprites)
     bare = bare_polynomial(on, sprites)
     error, fault = (int((shown < 0).sum()) for shown in (image, bare))
-    return Place(
+    return FailureCase(
         "the wings of a star, sigma 20 px",
         "float32 erf differences as they come",
         f"{fault} pixels of negative light, down to {bare.min():.0e} of the star's",
@@ -182,14 +182,14 @@ def negative_wings() -> Place:
     )
 
 
-def floored_wings() -> Place:
+def floored_wings() -> FailureCase:
     """A floor of 1e-7 under each pixel's share."""
     on = target(SIGMA_PX)
     sprites = one_star(256.3, 256.0, on)
     with by_renderer(on) as draw:
         error = float(abs(draw(sprites).sum() - 1))
     fault = float(np.maximum(_outer(on, sprites, pixel_shares), 1e-7).sum() - 1)
-    return Place(
+    return FailureCase(
         "a floor of 1e-7 of a star's light",
         "max(share, 1e-7) in every pixel",
         f"adds {100 * fault:.1f} % to each star, over {IMAGE_PX[0]} x {IMAGE_PX[1]} pixels",
@@ -199,7 +199,7 @@ def floored_wings() -> Place:
     )
 
 
-def absurd_sigmas() -> Place:
+def absurd_sigmas() -> FailureCase:
     """Sigmas that no sprite can hold."""
     context = create_context()
     point_px = int(context.info["GL_POINT_SIZE_RANGE"][1])
@@ -212,7 +212,7 @@ def absurd_sigmas() -> Place:
         except InputError as refusal:
             lines.append(str(refusal))
     cuts = [cut_share(point_px, (sigma_px, sigma_px)) for sigma_px in (60.0, 1e6)]
-    return Place(
+    return FailureCase(
         "sigma 60 and 1e6 px",
         f"GL's largest point, {point_px} px, all the same",
         f"cuts {100 * cuts[0]:.1f} % and {100 * cuts[1]:.5f} % of a star's light",
@@ -222,12 +222,12 @@ def absurd_sigmas() -> Place:
     )
 
 
-def star_on_pixel_edge() -> Place:
+def star_on_pixel_edge() -> FailureCase:
     """A star where two pixels meet, and a hair to either side."""
     on, phases = target(SIGMA_PX), np.array([-0.5, 0.5 - 1e-9, 0.5, 0.5 + 1e-9])
     with by_renderer(on) as draw:
         (_, off_px), (_, fault_px) = (star_errors(by, on, phases) for by in (draw, partial(nearest_pixel, on)))
-    return Place(
+    return FailureCase(
         "a star on a pixel's edge",
         "the nearest pixel",
         f"centre {fault_px:.2f} px off, to either side",
@@ -237,7 +237,7 @@ def star_on_pixel_edge() -> Place:
     )
 
 
-def star_on_image_edge() -> Place:
+def star_on_image_edge() -> FailureCase:
     """Stars whose centres are on and beyond the image's edges and corner."""
     errors, faults, last, on = [], [], IMAGE_PX[0] - 1.0, target(SIGMA_PX)
     for x_px, y_px in ((-0.5, 256.0), (-0.6, 256.0), (last + 0.6, 256.0), (256.0, -2.0), (-0.6, last + 0.6)):
@@ -247,7 +247,7 @@ def star_on_image_edge() -> Place:
             errors.append(abs(float(draw(one_star(x_px, y_px, on)).sum()) - exact))
         faults.append(abs(float(inside) - exact))
     error, fault = max(errors), max(faults)
-    return Place(
+    return FailureCase(
         "stars on the image's edge",
         "a star is drawn whole or not, by its centre",
         f"up to {100 * fault:.0f} % of its light too much or too little",
@@ -257,7 +257,7 @@ def star_on_image_edge() -> Place:
     )
 
 
-def many_stars() -> Place:
+def many_stars() -> FailureCase:
     """100 000 stars in view."""
     rng = np.random.default_rng(SEED)
     x_px, y_px = rng.uniform(10, CROWD_PX[0] - 11, (2, CROWD))
@@ -269,7 +269,7 @@ def many_stars() -> Place:
     corner = linear_image(pack_sprites(x_px, y_px, flux, np.arange(CROWD), size, sprites.footprint_px), size, (SIGMA_PX,) * 2)
     pixel_error = float(np.abs(image[:CORNER_PX, :CORNER_PX] - corner).max() / corner.max())
     error, fault = (float(abs(shown.sum() / flux.sum() - 1)) for shown in (image, _indexed_sum(sprites)))
-    return Place(
+    return FailureCase(
         f"{CROWD} stars in view",
         "image[rows, columns] += light",
         f"{100 * fault:.0f} % of the light lost: an index that comes twice is added once",
@@ -290,7 +290,7 @@ def _indexed_sum(sprites: Sprites) -> FloatArray:
     return image
 
 
-def flux_range() -> Place:
+def flux_range() -> FailureCase:
     """Twelve decades side by side."""
     flux, on = np.array([1e12, 1.0]), target(SIGMA_PX)
     stars = [one_star(x_px, 256.0, on, light) for x_px, light in zip((100.3, 120.3), flux, strict=True)]
@@ -301,7 +301,7 @@ def flux_range() -> Place:
         [abs(float(shown[:, part].sum()) / light - 1) for part, light in zip((slice(110), slice(110, None)), flux, strict=True)]
         for shown in (image, scaled)
     )
-    return Place(
+    return FailureCase(
         "flux range 1e12",
         "16 bits, scaled to the brightest pixel",
         f"fluxes off by {faults[0]:.0e} and {faults[1]:.0e}: the faint star is gone",

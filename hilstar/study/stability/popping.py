@@ -18,8 +18,8 @@ from hilstar.scene.sprites import Sprites, make_sprites
 from hilstar.sky.astrometry import unit_vectors_icrs
 from hilstar.sky.catalog import HIPPARCOS_EPOCH_JYEAR, load_catalog
 from hilstar.sky.stars import make_stars
-from hilstar.study.quantisation import AIMS
-from hilstar.study.stability.failing_place import Figures, Place
+from hilstar.study.shared.codes import AIMS
+from hilstar.study.stability.failure_case import FailureCase, Figures
 from hilstar.study.stability.field import ALIGNED, FOCAL_LENGTH_MM, PITCH_UM
 from hilstar.study.stability.image import POINT_SAMPLED, SIGMA_PX, Draw, by_renderer, point_sampled, target
 from hilstar.units import flux_ratio
@@ -70,12 +70,12 @@ def ripple(fluxes: FloatArray) -> float:
     return float((fluxes.max() - fluxes.min()) / fluxes.mean())
 
 
-def popping() -> Place:
+def popping() -> FailureCase:
     """A star's light in the linear image while the camera turns by parts of a pixel."""
     on = target(0.5, IMAGE_PX)
     with by_renderer(on) as draw:
         error, fault = (ripple(moving_fluxes(by, on)) for by in (draw, partial(point_sampled, on)))
-    return Place(
+    return FailureCase(
         f"a star over {STEPS} sub-pixel steps, sigma 0.5 px",
         POINT_SAMPLED,
         f"its light ripples by {100 * fault:.1f} %",
@@ -85,11 +85,11 @@ def popping() -> Place:
     )
 
 
-def popping_codes() -> Place:
+def popping_codes() -> FailureCase:
     """The same star's light through 8-bit codes."""
     fluxes = [moving_code_fluxes("round"), moving_code_fluxes("exact")]
     fault, error = (float(2.5 * np.log10(f.max() / f.min())) for f in fluxes)
-    return Place(
+    return FailureCase(
         f"the same, {CODES_MAG_UNDER_WHITE:g} mag under white on {CODES_BITS} bits, sigma {SIGMA_PX:g} px",
         'quantisation = "round", the default',
         f"its light ripples by {fault:.3f} mag",

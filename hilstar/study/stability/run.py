@@ -1,4 +1,4 @@
-"""Where methods fail: each place with the method that fails there, by how much, what hilstar does, and why."""
+"""Where methods fail: each case with the method that fails, its error, what hilstar does, and why."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from pathlib import Path
 from hilstar.charts import write_csv
 from hilstar.study.stability import attitude, field, image, popping, sky, tracker
 from hilstar.study.stability.charts import draw_charts
-from hilstar.study.stability.failing_place import Place
+from hilstar.study.stability.failure_case import FailureCase
 
-VISITS: tuple[Callable[[], Place], ...] = (
+CASES: tuple[Callable[[], FailureCase], ...] = (
     sky.bluest_star,
     sky.reddest_star,
     sky.temperature_range,
@@ -49,15 +49,15 @@ VISITS: tuple[Callable[[], Place], ...] = (
 COLUMNS = ("case", "verdict", "failing method", "its failure", "what happens", "why", "error", "its error", "tolerance")
 
 
-def run(directory: Path) -> list[Place]:
-    """Visit every place, write `stability.csv` and the charts; the places, in order."""
-    places = [visit() for visit in VISITS]
-    write_csv(directory / "stability.csv", COLUMNS, [_row(place) for place in places])
+def run(directory: Path) -> list[FailureCase]:
+    """Measure every case, and write `stability.csv` and the charts; the cases, in order. Raises InputError."""
+    cases = [measure() for measure in CASES]
+    write_csv(directory / "stability.csv", COLUMNS, [_row(case) for case in cases])
     draw_charts(directory)
-    return places
+    return cases
 
 
-def _row(place: Place) -> tuple[str | float, ...]:
-    verdict, figures = "right" if place.right else "WRONG", place.figures
+def _row(case: FailureCase) -> tuple[str | float, ...]:
+    verdict, figures = "right" if case.right else "WRONG", case.figures
     numbers = figures.error, figures.fault, figures.tolerance
-    return place.case, verdict, place.method, place.fails, place.happens, place.why, *map(float, numbers)
+    return case.case, verdict, case.method, case.fails, case.happens, case.why, *map(float, numbers)

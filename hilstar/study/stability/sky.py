@@ -25,10 +25,11 @@ from hilstar.sky.spectrum import (
     blackbody_exitance_w_m2_m,
     load_curve,
 )
-from hilstar.study.models import leave_one_out, study_optics
-from hilstar.study.stability.failing_place import Figures, Place
+from hilstar.study.shared.brightness import held_out_errors, study_optics
+from hilstar.study.stability.failure_case import FailureCase, Figures
+from hilstar.units import magnitude
 
-# Leave-one-out over the library (README.md): 95 % of the stars with V-I < 2.5 are within 2.4 %, of the redder 25 %.
+# Each star of the library held out in turn (README.md): 95 % of the stars with V-I < 2.5 are within 2.4 %, of the redder 25 %.
 BLUE_ERROR, RED_ERROR = 0.024, 0.25
 COOL_K = 5000.0
 # The median of both (README.md): 0.8 % for V-I < 2.5, 5 % beyond, where a fifth of the library's stars under 5000 K are.
@@ -40,14 +41,14 @@ NOTHING = 0.0
 OPTICS = study_optics("ccd47-20")
 
 
-def bluest_star() -> Place:
+def bluest_star() -> FailureCase:
     """B-V = -0.4, the bluest of Hipparcos."""
     library = load_library()
     why = "B-V saturates: there 0.01 mag is thousands of K. Pickles holds its bluest star's spectrum"
     return _colour(-0.4, int(np.argmin(library.bv_mag)), BLUE_ERROR, why)
 
 
-def reddest_star() -> Place:
+def reddest_star() -> FailureCase:
     """B-V = 5.5, past the reddest of Hipparcos."""
     library = load_library()
     plain = np.where(library.vi_mag < 2.0, library.bv_mag, -np.inf)
@@ -55,7 +56,7 @@ def reddest_star() -> Place:
     return _colour(5.5, int(np.argmax(plain)), RED_ERROR, why)
 
 
-def _colour(bv_mag: float, star: int, tolerance: float, why: str) -> Place:
+def _colour(bv_mag: float, star: int, tolerance: float, why: str) -> FailureCase:
     """Rates at a colour against the library's `star` at that end."""
     bv, zero, library = np.array([bv_mag]), np.zeros(1), load_library()
     spectrum = library_electrons_per_s(library, OPTICS, Photometry())[star]
@@ -63,7 +64,7 @@ def _colour(bv_mag: float, star: int, tolerance: float, why: str) -> Place:
     bodies = {name: float(dgs_electrons_per_s(t, OPTICS, Photometry())) / spectrum - 1 for name, t in kelvin.items()}
     pickles = tabulate_pickles(OPTICS, Photometry()).electrons_per_s(zero, bv, np.array([np.nan]))[0] / spectrum - 1
     fails = ", ".join(f"{name} {kelvin[name]:.0f} K, {100 * error:+.0f} %" for name, error in bodies.items())
-    return Place(
+    return FailureCase(
         f"B-V = {bv_mag:g}",
         "a black body by B-V",
         f"{fails} against the spectrum of the library's {library.spectral_type[star].strip()}",
@@ -73,7 +74,7 @@ def _colour(bv_mag: float, star: int, tolerance: float, why: str) -> Place:
     )
 
 
-def temperature_range() -> Place:
+def temperature_range() -> FailureCase:
     """1500 to 60 000 K."""
     kelvin = np.geomspace(1500, 60_000, 2000)
     exact = dgs_electrons_per_s(kelvin, OPTICS, Photometry())
@@ -81,7 +82,7 @@ def temperature_range() -> Place:
     straight = np.interp(kelvin, knots, dgs_electrons_per_s(knots, OPTICS, Photometry()))
     ours = tabulate("dgs", OPTICS, Photometry()).electrons_per_s(np.zeros(len(kelvin)), kelvin)
     error, fault = (float(np.abs(table / exact - 1).max()) for table in (ours, straight))
-    return Place(
+    return FailureCase(
         "T = 1500 to 60000 K",
         f"a table of {len(knots)} temperatures and straight lines",
         f"off by up to {100 * fault:.0f} %",
@@ -91,7 +92,7 @@ def temperature_range() -> Place:
     )
 
 
-def planck_overflow() -> Place:
+def planck_overflow() -> FailureCase:
     """A Planck curve where exp(hc / lambda k T) has no float64, and where it is nearly 1."""
     x, wavelength_m = np.array([1e5, 1e3, 1.0, 1e-12]), 500e-9
     kelvin = PLANCK_J_S * LIGHT_M_S / (wavelength_m * BOLTZMANN_J_K * x)
@@ -104,7 +105,7 @@ def planck_overflow() -> Place:
     with np.errstate(all="raise", under="ignore"):
         ours = blackbody_exitance_w_m2_m(np.array(wavelength_m * 1e9), kelvin)
     error, fault = (float((np.abs(curve - exact) / np.maximum(exact, scale)).max()) for curve in (ours, naive))
-    return Place(
+    return FailureCase(
         "Planck at small and large lambda T",
         "exp(x) - 1 as the formula has it",
         f"{overflows} overflows in {len(x)}; {fault:.0e} off at x = 1e-12",
@@ -114,7 +115,7 @@ def planck_overflow() -> Place:
     )
 
 
-def source_step() -> Place:
+def source_step() -> FailureCase:
     """Eq. 3.13 at B-V = 0."""
     around = np.array([-STEP_BV_MAG, STEP_BV_MAG])
     jumps = {}
@@ -124,7 +125,7 @@ def source_step() -> Place:
     colours = np.zeros(2), around, around
     jumps["pickles"] = 0.0, _jump_mag(tabulate_pickles(OPTICS, Photometry()).electrons_per_s(*colours))
     kelvin_step, fault = jumps.pop("wang2021")
-    return Place(
+    return FailureCase(
         "B-V = 0",
         "wang2021, eq. 3.13",
         f"jumps by {kelvin_step:.0f} K, {fault:+.4f} mag",
@@ -135,28 +136,28 @@ def source_step() -> Place:
 
 
 def _jump_mag(rates: FloatArray) -> float:
-    return float(-2.5 * np.log10(rates[1] / rates[0]))
+    return magnitude(float(rates[1] / rates[0]))
 
 
-def cool_stars() -> Place:
+def cool_stars() -> FailureCase:
     """The average model, AGS, below 5000 K."""
     library = load_library()
     spectra = library_electrons_per_s(library, OPTICS, Photometry())
     cool = star_temperatures_k(library.bv_mag, "ballesteros2012") < COOL_K
     average = np.abs(ags_electrons_per_s(OPTICS, Photometry()) / spectra - 1)[cool]
-    ours = np.abs(leave_one_out(spectra))[cool]
+    ours = np.abs(held_out_errors(spectra))[cool]
     error, fault = float(np.median(ours)), float(np.median(average))
-    return Place(
+    return FailureCase(
         f"AGS, stars under {COOL_K:.0f} K",
         "one average for every colour (AGS)",
         f"off by {100 * fault:.0f} % in the median of {cool.sum()} real spectra, {100 * average.max():.0f} % at worst",
-        f"pickles, the star itself left out: {100 * error:.1f} % in the median, {100 * ours.max():.0f} % at worst",
+        f"pickles, the star itself held out: {100 * error:.1f} % in the median, {100 * ours.max():.0f} % at worst",
         "most of a cool star's light is red of V, where AGS has a body of 9602 K",
         Figures(error, fault, COOL_MEDIAN),
     )
 
 
-def blind_tracker() -> Place:
+def blind_tracker() -> FailureCase:
     """A tracker that detects no light at all."""
     blind = replace(OPTICS, quantum_efficiency=load_curve(0.0, "qe"))
     rate = dgs_electrons_per_s(np.array([5000.0]), blind, Photometry())
@@ -167,7 +168,7 @@ def blind_tracker() -> Place:
         happens, taken = "taken", 1.0
     except InputError as refusal:
         happens, taken = f"refused: {refusal}", NOTHING
-    return Place(
+    return FailureCase(
         "quantum efficiency 0",
         "a table of ln(rate)",
         f"ln(rate) = {logarithm[0]:.0f}, no finite curve through it",

@@ -10,7 +10,7 @@ import numpy as np
 from hilstar.arrays import FloatArray
 from hilstar.errors import InputError
 from hilstar.rotation import from_radec_roll_deg
-from hilstar.study.stability.failing_place import Figures, Place
+from hilstar.study.stability.failure_case import FailureCase, Figures
 from hilstar.tracker.centroids import find_stars
 from hilstar.tracker.detector import Detector
 from hilstar.tracker.settings import DetectorSettings
@@ -58,7 +58,7 @@ def by_product(mean: float, count: int, rng: np.random.Generator) -> FloatArray:
     return np.asarray((left > np.exp(-mean)).sum(axis=1), dtype=np.float64)
 
 
-def billion_electrons() -> Place:
+def billion_electrons() -> FailureCase:
     """1e9 electrons in each pixel of a deep well."""
     deep = Detector(DetectorSettings(gain_e_per_dn=GAIN_E_PER_DN, full_well_e=1e12, bits=16), SIZE_PX)
     dn = deep.expose(np.full(SIZE_PX, BILLION_E), 1.0, np.random.default_rng(SEED))
@@ -66,7 +66,7 @@ def billion_electrons() -> Place:
     product_e = by_product(BILLION_E, drawn_e.size, np.random.default_rng(SEED))
     sigma_e = float(np.hypot(np.sqrt(BILLION_E), GAIN_E_PER_DN / np.sqrt(12)))
     error, fault = (standard_errors(sample, BILLION_E, sigma_e) for sample in (drawn_e, product_e))
-    return Place(
+    return FailureCase(
         "1e9 electrons in a pixel",
         "Poisson by a product of uniform numbers",
         f"exp(-1e9) is 0: mean {product_e.mean():.0f} electrons",
@@ -76,14 +76,14 @@ def billion_electrons() -> Place:
     )
 
 
-def full_well() -> Place:
+def full_well() -> FailureCase:
     """1e9 electrons in each pixel of a CCD47-20."""
     settings = DetectorSettings()
     dn = Detector(settings, SIZE_PX).expose(np.full(SIZE_PX, BILLION_E), 1.0, np.random.default_rng(SEED))
     wanted = settings.full_well_e / settings.gain_e_per_dn
     wrapped = np.rint(np.full(SIZE_PX, BILLION_E) / settings.gain_e_per_dn).astype(np.int64).astype(np.uint16)
     error, fault = (float(np.abs(shown - wanted).max()) for shown in (dn, wrapped))
-    return Place(
+    return FailureCase(
         "a full well",
         "electrons / gain as uint16",
         f"wraps round to {wrapped[0, 0]} DN",
@@ -104,7 +104,7 @@ def simulated_dn(exposure_s: float, background_e: float, faintest_v_mag: float) 
     return exposure.dn.astype(np.float64), len(exposure.truth)
 
 
-def empty_field() -> Place:
+def empty_field() -> FailureCase:
     """No star in view."""
     dn, stars = simulated_dn(0.1, 2400.0, faintest_v_mag=-1.4)
     nothing = np.zeros_like(dn)
@@ -113,7 +113,7 @@ def empty_field() -> Place:
     # 2400 electrons and an offset of 100: 200 DN; their shot noise, 48 e- read noise and the rounding.
     sigma_dn = float(np.sqrt((2400 + 48**2) / 24**2 + 1 / 12))
     error = standard_errors(dn, 200.0, sigma_dn)
-    return Place(
+    return FailureCase(
         "an empty field",
         "light / its brightest pixel",
         f"NaN in {int(np.isnan(scaled).sum())} pixels",
@@ -123,14 +123,14 @@ def empty_field() -> Place:
     )
 
 
-def no_exposure() -> Place:
+def no_exposure() -> FailureCase:
     """An exposure of 0 s."""
     dn, stars = simulated_dn(0.0, 0.0, faintest_v_mag=7.5)
     with np.errstate(invalid="ignore"):
         rate = np.zeros_like(dn) / 0.0
     sigma_dn = float(np.sqrt((48 / 24) ** 2 + 1 / 12))
     error = standard_errors(dn, 100.0, sigma_dn)
-    return Place(
+    return FailureCase(
         "exposure 0 s",
         "electrons / exposure",
         f"NaN in {int(np.isnan(rate).sum())} pixels",
@@ -140,7 +140,7 @@ def no_exposure() -> Place:
     )
 
 
-def nan_pixel() -> Place:
+def nan_pixel() -> FailureCase:
     """One pixel that is NaN."""
     image = np.zeros(SIZE_PX)
     image[30:33, 30:33] = 1000.0
@@ -156,7 +156,7 @@ def nan_pixel() -> Place:
             taken += 1
         except InputError as refusal:
             lines.append(str(refusal))
-    return Place(
+    return FailureCase(
         "a pixel that is NaN",
         "the centre of gravity of the image",
         f"{centre:g} for one pixel of {image.size}",

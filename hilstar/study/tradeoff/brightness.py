@@ -1,4 +1,4 @@
-"""Trade-offs of brightness: the integral over a spectrum, and what stands in for the spectrum itself."""
+"""The trade-off of brightness: the integral over a spectrum."""
 
 from __future__ import annotations
 
@@ -25,21 +25,20 @@ from hilstar.sky.electrons import (
     star_temperatures_k,
     tabulate,
 )
-from hilstar.sky.pickles import library_electrons_per_s, load_library, tabulate_pickles
 from hilstar.sky.spectrum import (
     GAUSS_ORDER,
     LIGHT_M_S,
     PLANCK_J_S,
-    TEMPERATURE_SCALES,
     Curve,
     blackbody_exitance_w_m2_m,
     load_curve,
 )
-from hilstar.study.models import REDDEST_RELIABLE_VI_MAG, leave_one_out, mag_against, study_optics
+from hilstar.study.shared.brightness import study_optics
 from hilstar.study.tradeoff.table import Figure, Trial, Trials
+from hilstar.units import magnitude
 
 SENSOR = "ccd47-20"
-ADAPTIVE, OWN_SPECTRUM = "adaptive quadrature", "each star's own spectrum"
+ADAPTIVE = "adaptive quadrature"
 COLOURS = 3000
 STEPS_NM = (1.0, 5.0, 10.0, 20.0)
 ORDERS = (1, 2, 3, 4, GAUSS_ORDER)
@@ -49,8 +48,6 @@ BV_TABLE_SIZES = (16, 128, 1024)
 QUAD = 1e-12
 # Two float64 integrals of some hundred terms, each known to about 1e-13, and QUAD's own.
 ROUNDING_MAG = 5e-12
-# A library's spectra are known to about 0.01 mag; a tenth of that counts as none.
-LIBRARY_MAG = 1e-3
 
 # Wavelengths, nm, and weights, m, that integrate a product of curves.
 Rule = Callable[..., tuple[FloatArray, FloatArray]]
@@ -65,7 +62,7 @@ def brightness(stack: ExitStack, quick: bool) -> Trials:
     works = brightness_methods(bv_mag, kelvin, optics)
     trials = []
     for name, work in works.items():
-        error = np.abs(mag_against(work(), exact))
+        error = np.abs(magnitude(work() / exact))
         own, exact_one = name == table_name(TABLE_DEGREE), name == ADAPTIVE
         trials.append(Trial(name, float(error.max()), float(np.median(error)), work, own, exact_one))
     return Trials(
@@ -175,44 +172,3 @@ def _bv_table_rates(size: int, bv_mag: FloatArray, optics: Optics) -> FloatArray
     at_mag = np.linspace(bv_mag.min(), bv_mag.max(), size)
     rate = dgs_electrons_per_s(star_temperatures_k(at_mag, SkySettings().temperature), optics, Photometry())
     return np.asarray(np.exp(np.interp(bv_mag, at_mag, np.log(rate))))
-
-
-def spectrum(stack: ExitStack, quick: bool) -> Trials:
-    """What a star's colour says of its spectrum: error, mag, 95 % and median of the Pickles library bluer than V-I = 2.5."""
-    del stack, quick
-    library, optics = load_library(), study_optics(SENSOR)
-    exact, zero = library_electrons_per_s(library, optics, Photometry()), np.zeros(len(library.spectral_type))
-    sure, sky = library.vi_mag < REDDEST_RELIABLE_VI_MAG, SkySettings()
-    real, bodies = tabulate_pickles(optics, Photometry()), tabulate("dgs", optics, Photometry())
-    average = tabulate("ags", optics, Photometry())
-
-    def trial(name: str, rates: FloatArray, work: Callable[[], object], settings: tuple[str, ...]) -> Trial:
-        error = np.abs(mag_against(rates, exact))[sure]
-        default = (sky.brightness, sky.spectrum, sky.temperature)[: len(settings)]
-        figures = float(np.percentile(error, 95)), float(np.median(error))
-        return Trial(name, *figures, work, settings == default, name == OWN_SPECTRUM)
-
-    by_own = partial(library_electrons_per_s, library, optics, Photometry())
-    colours = zero, library.bv_mag, library.vi_mag
-    left_out = exact * (1 + leave_one_out(exact))
-    trials = [
-        trial(OWN_SPECTRUM, by_own(), by_own, ("dgs", "own")),
-        trial("real spectra by V-I", left_out, partial(real.electrons_per_s, *colours), ("dgs", "pickles")),
-    ]
-    for scale in TEMPERATURE_SCALES:
-        body = partial(_body_rates, bodies, library.bv_mag, scale)
-        trials.append(trial(f"black body, {scale}", body(), body, ("dgs", "blackbody", scale)))
-    ags = partial(average.electrons_per_s, zero, np.full(len(zero), 9602.0))
-    trials.append(trial("AGS, one average", ags(), ags, ("ags",)))
-    return Trials(
-        "spectrum",
-        f"{len(zero)} stars by a table that is there",
-        Figure("error of the electron rate, 95 % of library stars", "mag", LIBRARY_MAG),
-        Figure("median star", "mag"),
-        "a catalogue has colours and no spectra",
-        trials,
-    )
-
-
-def _body_rates(table: RateTable, bv_mag: FloatArray, scale: str) -> FloatArray:
-    return table.electrons_per_s(np.zeros(len(bv_mag)), star_temperatures_k(bv_mag, scale))

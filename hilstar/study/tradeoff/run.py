@@ -13,10 +13,16 @@ import numpy as np
 
 from hilstar.charts import STYLE, plain_ticks, save, title_lines, write_csv
 from hilstar.render.renderer import Renderer, Target
-from hilstar.study.tradeoff.brightness import brightness, spectrum
-from hilstar.study.tradeoff.light import SIGMA_PX, psf, quantisation
-from hilstar.study.tradeoff.motion import prediction, smear
-from hilstar.study.tradeoff.sky import culling, depth, projection
+from hilstar.study.tradeoff.brightness import brightness
+from hilstar.study.tradeoff.culling import culling
+from hilstar.study.tradeoff.demo import SIGMA_PX
+from hilstar.study.tradeoff.depth import depth
+from hilstar.study.tradeoff.prediction import prediction
+from hilstar.study.tradeoff.projection import projection
+from hilstar.study.tradeoff.psf import psf
+from hilstar.study.tradeoff.quantisation import quantisation
+from hilstar.study.tradeoff.smear import smear
+from hilstar.study.tradeoff.spectrum import spectrum
 from hilstar.study.tradeoff.table import Figure, Row, Step, Trials, measured
 
 if TYPE_CHECKING:

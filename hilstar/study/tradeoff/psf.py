@@ -1,4 +1,4 @@
-"""Trade-offs of drawing: a star's profile on the GPU, and the way from light to code values."""
+"""The trade-off of the point spread function: a star's profile on the GPU."""
 
 from __future__ import annotations
 
@@ -9,21 +9,19 @@ from functools import partial
 import numpy as np
 
 from hilstar.arrays import FloatArray
-from hilstar.bench.config import Monitor, RenderSettings
-from hilstar.monitor.phases import WHITE, fainter, measure, phase_grid, shown_by
-from hilstar.monitor.quantise import CYCLE_FRAMES, Panel
+from hilstar.bench.config import RenderSettings
+from hilstar.monitor.phases import WHITE, fainter, measure
 from hilstar.render.reference import linear_image
-from hilstar.render.renderer import Renderer, Target
+from hilstar.render.renderer import Target
 from hilstar.render.variants import SplatVariant, VariantRenderer
 from hilstar.scene.psf import LARGEST_CUT, footprint_px, peak_share
 from hilstar.scene.sprites import Sprites, pack_sprites
-from hilstar.study.quantisation import AIMS, FRAME_PX, SEED, STARS, WAYS, Way, response_of
+from hilstar.study.shared.codes import FRAME_PX, STARS, star_field
 from hilstar.study.tradeoff.table import Figure, Trial, Trials
 from hilstar.units import flux_ratio
 
 SIGMA_PX = RenderSettings().sprite_sigma_px
 PHASES = 16
-CODE_PHASES = 32
 SIZES_PX = (6, 8, 9, 10, 11, 12, 16, 24)
 # Wider than every sprite here, so that no tile of the phases loses light to its neighbour: 13 px are 15 sigma.
 TILE_PX = 26
@@ -108,46 +106,3 @@ def _psf_errors(size_px: int, image: Callable[[Sprites], FloatArray]) -> tuple[f
     bright = linear_image(sprites, (side, side), SIGMA_PX, TILE_PX)
     errors = [measure(bright * flux_ratio(mag), image(fainter(sprites, mag)).copy(), TILE_PX) for mag in (0.0, FAINTER_MAG)]
     return max(e.flux_max_mag for e in errors), max(e.centroid_max_px for e in errors)
-
-
-def star_field(frame_px: tuple[int, int], size_px: int) -> Sprites:
-    """STARS sprites anywhere on the frame, over eight magnitudes, three times as many in each as in the last."""
-    rng = np.random.default_rng(SEED)
-    mag = 2 * np.log10(1 + rng.uniform(size=STARS) * (10 ** (8 / 2) - 1))
-    flux = WHITE / peak_share(SIGMA_PX) * flux_ratio(mag)
-    x_px, y_px = rng.uniform(0, 1, (2, STARS)) * np.array(frame_px)[:, None]
-    return pack_sprites(x_px, y_px, flux, np.arange(STARS), frame_px, size_px)
-
-
-def quantisation(stack: ExitStack, quick: bool) -> Trials:
-    """From light to codes at the default depth: flux error, mag, and centroid error, px, of a star at its aim's faint end."""
-    del quick  # every error is found at once
-    bits = Monitor(resolution_px=FRAME_PX, pixel_pitch_um=1.0).bits
-    mag = AIMS[bits][1]
-    trials = [_quantised(stack, way, bits) for way in WAYS]
-    return Trials(
-        "quantisation",
-        f"codes of {STARS} stars, {FRAME_PX[0]} x {FRAME_PX[1]}, light to memory",
-        Figure(f"flux error of a star {mag:g} mag under white, {bits} bits, worst", "mag", ROUNDING_MAG),
-        Figure("centroid error, worst", "px"),
-        "it needs no more than one frame and leaves no pattern that a tracker could take for a star",
-        trials,
-    )
-
-
-def _quantised(stack: ExitStack, way: Way, bits: int) -> Trial:
-    response, mag, defaults = response_of(bits, way), AIMS[bits][1], RenderSettings()
-    sprites, tile = phase_grid(CODE_PHASES, SIGMA_PX)
-    wanted = linear_image(sprites, (CODE_PHASES * tile,) * 2, SIGMA_PX) * flux_ratio(mag)
-    cycle, linear = CYCLE_FRAMES if way.whole_cycle else 1, wanted.astype(np.float32)
-    shown = shown_by(way.method, cycle, Panel(response, WHITE), linear, fainter(sprites, mag), SIGMA_PX)
-    found = measure(wanted, shown, tile)
-    renderer = stack.enter_context(Renderer(Target(FRAME_PX, SIGMA_PX, response, WHITE, way.method)))
-    field = star_field(FRAME_PX, renderer.footprint_px)
-
-    def work() -> None:
-        renderer.draw(field)
-        renderer.codes()
-
-    is_default = (way.method, way.stealing) == (defaults.quantisation, defaults.bit_stealing)
-    return Trial(way.name, found.flux_max_mag, found.centroid_max_px, work, is_default)

@@ -1,4 +1,4 @@
-"""What the study of stability says of one place: the method that fails there, and what hilstar does, by one measure."""
+"""One case of the study of stability: the method that fails there, and what hilstar does, by one measure."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ class Figures:
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
-    """One place where a method fails.
+class FailureCase:
+    """One case in which a method fails.
 
-    `method` fails there as `fails` says in figures; `happens` says what hilstar does there, and `why`.
+    `fails` says in figures how `method` fails, `happens` what hilstar does instead, and `why`.
     """
 
     case: str
@@ -32,8 +32,3 @@ class Place:
     def right(self) -> bool:
         """True where hilstar's error is within the tolerance; NaN is not."""
         return self.figures.error <= self.figures.tolerance
-
-    @property
-    def failing(self) -> bool:
-        """True where the failing method's error, by the same measure, is not."""
-        return not self.figures.fault <= self.figures.tolerance

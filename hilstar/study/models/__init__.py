@@ -1,0 +1,1 @@
+"""What the brightness models make of a star, a file for each chart."""

@@ -1,0 +1,56 @@
+"""Electrons of a star of V = 0 by zero point and passband weighting."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from hilstar.arrays import FloatArray
+from hilstar.charts import chart, write_csv
+from hilstar.sky.electrons import REFERENCE_TEMPERATURE_K, Photometry, dgs_electrons_per_s
+from hilstar.study.models.finding import Finding
+from hilstar.study.models.settings import SENSORS, WEIGHTINGS
+from hilstar.study.shared.brightness import study_optics
+from hilstar.units import magnitude
+
+SETTINGS = [Photometry(zero, weighting) for zero in ("vega", "iau-bolometric") for weighting in WEIGHTINGS]
+
+
+def zero_points(directory: Path) -> Finding:
+    """Electrons of a V = 0 star of 9602 K by zero point and weighting."""
+    rates = {
+        sensor: np.array([dgs_electrons_per_s(REFERENCE_TEMPERATURE_K, study_optics(sensor), p) for p in SETTINGS])
+        for sensor in SENSORS
+    }
+    mag = {sensor: magnitude(rate / rate[0]) for sensor, rate in rates.items()}
+    base, cost = rates["ccd47-20"], mag["ccd47-20"]
+    text = (
+        f"A V = 0 star of 9602 K gives {base[0] / 1e6:.1f} million electrons/s by Vega's flux (CCD47-20, 30 mm),"
+        f" {100 * (1 - base[2] / base[0]):.0f} % ({cost[2]:.2f} mag) fewer by the IAU's bolometric zero point"
+    )
+    _draw(directory / "zero_points.png", text, rates, mag)
+    rows = [
+        (sensor, p.zero_point, p.weighting, float(rate), float(m))
+        for sensor in SENSORS
+        for p, rate, m in zip(SETTINGS, rates[sensor], mag[sensor], strict=True)
+    ]
+    columns = ("sensor", "zero_point", "weighting", "electrons_per_s", "mag_against_default")
+    write_csv(directory / "zero_points.csv", columns, rows)
+    return Finding("zero_points", text)
+
+
+def _draw(path: Path, text: str, rates: dict[str, FloatArray], mag: dict[str, FloatArray]) -> None:
+    with chart(path, text, panels=2) as (upper, lower):
+        place = np.arange(len(SETTINGS))
+        for k, (sensor, name) in enumerate(SENSORS.items()):
+            for axis, height, figure in ((upper, rates[sensor] / 1e6, "%.2f"), (lower, mag[sensor], "%+.3f")):
+                bars = axis.bar(place + 0.4 * k - 0.2, height, 0.38, label=name)
+                axis.bar_label(bars, fmt=figure, padding=2)
+        upper.set(ylabel="electrons per second [millions]", ylim=(0, 1.15 * rates["ccd47-20"].max() / 1e6))
+        lower.set_xticks(place, [f"{p.zero_point},\n{p.weighting} weighting" for p in SETTINGS])
+        lower.set(
+            ylabel="against vega, energy [mag],\n+ is fainter", xlabel="zero point, passband weighting", ylim=(-0.05, 0.38)
+        )
+        upper.legend()
+        lower.legend(loc="upper left")

@@ -1,0 +1,121 @@
+"""A slew shaken on each axis, and the predictors that carry its samples on to the moment of light."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from hilstar.arrays import FloatArray
+from hilstar.attitude.clock.timeline import Policy, Timeline
+from hilstar.attitude.wire.packet import AttitudeSample
+from hilstar.bench.config import AttitudeSettings
+from hilstar.rotation import from_radec_roll_deg, multiply, propagate, rate_between_rad_s
+from hilstar.units import NS_PER_MS, NS_PER_S
+
+ORION = from_radec_roll_deg(84.057, -1.2, 10.0)
+SLEW_DEG, SLEW_S = 3.0, 20.0
+# Of each axis: amplitude, arcsec, and frequency, Hz, as wheels and structure shake a small satellite.
+JITTER = ((2.0, 3.1), (1.0, 11.0), (0.3, 37.0))
+RATE_STEP_NS = 100_000
+NEAR = 4
+
+# From the last samples to the attitude at a time, ns.
+AttitudeAt = Callable[[int], FloatArray]
+
+
+@dataclass(frozen=True, slots=True)
+class Predictor:
+    """A way to the attitude at a time: `load` takes the last samples, which for one that `waits` end after that time."""
+
+    name: str
+    load: Callable[[Sequence[AttitudeSample]], AttitudeAt]
+    is_default: bool = False
+    waits: bool = False
+
+
+def predictors() -> tuple[Predictor, ...]:
+    """Every way; the default is hilstar's timeline as a bench file that says nothing sets it, fed with rates."""
+    settings = AttitudeSettings()
+    own = Policy(round(settings.max_extrapolation_ms * NS_PER_MS), round(settings.stale_after_ms * NS_PER_MS))
+    hold = Policy(0, own.stale_after_ns)
+    return (
+        Predictor("hold", partial(_timeline, hold)),
+        Predictor("linear, by the sample's rate", partial(_timeline, own), is_default=own.max_extrapolation_ns > 0),
+        Predictor("linear, by the last two samples", partial(_timeline_without_rates, own)),
+        Predictor("rate and acceleration", _accelerated),
+        Predictor(f"cubic spline through {NEAR} samples", _spline),
+        Predictor("C2 blend, a sample later", partial(_timeline, own), waits=True),
+    )
+
+
+def slew_attitude(t_ns: int) -> FloatArray:
+    """The true q_icrs_to_cam: three turns about the camera's axes on ORION, each a slow swing and a fast jitter."""
+    t_s, q = t_ns / NS_PER_S, ORION
+    for axis in range(3):
+        angle = math.radians(SLEW_DEG) * math.sin(2 * math.pi * t_s / SLEW_S + axis)
+        for size_arcsec, hz in JITTER:
+            angle += math.radians(size_arcsec / 3600) * math.sin(2 * math.pi * hz * t_s + 2 * axis * hz)
+        turn = np.zeros(4)
+        turn[0], turn[1 + axis] = math.cos(angle / 2), math.sin(angle / 2)
+        q = multiply(turn, q)
+    return q
+
+
+def slew_sample(t_ns: int) -> AttitudeSample:
+    """The attitude with its rate, from 0.1 ms on both sides: 0.006 arcsec/s off at 37 Hz, 0.0003 arcsec in a prediction."""
+    before, after = slew_attitude(t_ns - RATE_STEP_NS), slew_attitude(t_ns + RATE_STEP_NS)
+    return AttitudeSample(t_ns, slew_attitude(t_ns), rate_between_rad_s(before, after, 2 * RATE_STEP_NS / NS_PER_S))
+
+
+def _timeline(policy: Policy, near: Sequence[AttitudeSample]) -> AttitudeAt:
+    timeline = Timeline(policy)
+    for sample in near:
+        timeline.add(sample)
+
+    def attitude_at(t_ns: int) -> FloatArray:
+        attitude = timeline.at(t_ns)
+        if attitude is None:
+            raise AssertionError("a timeline with samples has an attitude")
+        return attitude.q_icrs_to_cam
+
+    return attitude_at
+
+
+def _timeline_without_rates(policy: Policy, near: Sequence[AttitudeSample]) -> AttitudeAt:
+    return _timeline(policy, [replace(sample, rate_cam_rad_s=None) for sample in near])
+
+
+def _accelerated(near: Sequence[AttitudeSample]) -> AttitudeAt:
+    """The newest sample's rate, and the change since the one before it carried on."""
+    before, newest = near[-2:]
+
+    def attitude_at(t_ns: int) -> FloatArray:
+        ahead_s, gap_s = (t_ns - newest.t_ns) / NS_PER_S, (newest.t_ns - before.t_ns) / NS_PER_S
+        bend = (_rate(newest) - _rate(before)) / gap_s
+        return propagate(newest.q_icrs_to_cam, _rate(newest) + 0.5 * ahead_s * bend, ahead_s)
+
+    return attitude_at
+
+
+def _rate(sample: AttitudeSample) -> FloatArray:
+    if sample.rate_cam_rad_s is None:
+        raise AssertionError("the slew's samples have rates")
+    return sample.rate_cam_rad_s
+
+
+def _spline(near: Sequence[AttitudeSample]) -> AttitudeAt:
+    """The samples' turns from the newest one, as a cubic carried on past it."""
+    newest = near[-1]
+
+    def attitude_at(t_ns: int) -> FloatArray:
+        seconds = [(s.t_ns - newest.t_ns) / NS_PER_S for s in near]
+        turns = [rate_between_rad_s(newest.q_icrs_to_cam, s.q_icrs_to_cam, 1.0) for s in near]
+        turn = CubicSpline(seconds, turns)((t_ns - newest.t_ns) / NS_PER_S)
+        return propagate(newest.q_icrs_to_cam, np.asarray(turn), 1.0)
+
+    return attitude_at

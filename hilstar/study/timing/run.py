@@ -1,0 +1,110 @@
+"""What the timing of a screen does to a tracker on a slew, and what each compensation is worth and costs.
+
+The virtual tracker integrates over several frames of a simulated panel that scans. Its image is compared with that of the sky
+in the same exposure, star by star.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from hilstar.charts import chart, plain_ticks, write_records
+from hilstar.scene.camera import Camera
+from hilstar.study.shared.lone_stars import Isolation, lone_windows, moments
+from hilstar.study.timing.panel import WAYS, ScanningPanel, Sky
+from hilstar.study.timing.slew import Slew
+from hilstar.units import ARCSEC_PER_RAD, magnitude
+
+RATES_DEG_S = (0.01, 0.03, 0.1, 0.3, 1.0, 2.0, 4.0)
+QUICK_RATES_DEG_S = (2.0,)
+# A window reaches the largest error here and the PSF beyond a star's path.
+ISOLATION = Isolation(margin_px=8.0, max_share=1e-3)
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """One way at one rate: errors of the tracker's centroids, arcsec, their rms and worst, of flux, mag rms; time to draw."""
+
+    way: str
+    rate_deg_s: float
+    stars: int
+    rms_arcsec: float
+    worst_arcsec: float
+    flux_rms_mag: float
+    draw_ms: float
+
+
+def compare(panel: ScanningPanel, sky: Sky, slew: Slew) -> Outcome:
+    """One way on one slew, against the sky."""
+    shown, true = panel.exposed_e_per_s(slew), sky.exposed_e_per_s(slew)
+    camera: Camera = panel.camera
+    flux_mag, off_px = [], []
+    paths = sky.paths(slew)
+    places = panel.optics.mounting.to_tracker(paths.x_px, paths.y_px)
+    for _, window in lone_windows(paths, *places, camera.resolution_px, ISOLATION):
+        (light, x_px, y_px), (true_light, true_x_px, true_y_px) = moments(shown, window), moments(true, window)
+        flux_mag.append(magnitude(light / true_light))
+        off_px.append(math.hypot(x_px - true_x_px, y_px - true_y_px))
+    off_arcsec = np.array(off_px) * ARCSEC_PER_RAD / camera.focal_length_px
+    rms_arcsec, rms_mag = (float(np.sqrt(np.mean(np.square(v)))) for v in (off_arcsec, flux_mag))
+    return Outcome(panel.way, slew.rate_deg_s, len(off_px), rms_arcsec, float(off_arcsec.max()), rms_mag, panel.cost_ms(slew))
+
+
+@contextmanager
+def _opened() -> Iterator[tuple[list[ScanningPanel], Sky]]:
+    with TemporaryDirectory() as folder, ExitStack() as stack:
+        panels = []
+        for number, way in enumerate(WAYS):
+            panels.append(ScanningPanel(way, Path(folder) / f"{number}.toml"))
+            stack.callback(panels[-1].close)
+        sky = Sky(panels[0])
+        stack.callback(sky.close)
+        yield panels, sky
+
+
+def measure(quick: bool = False) -> list[Outcome]:
+    """Every way at every rate."""
+    with _opened() as (panels, sky):
+        rates = QUICK_RATES_DEG_S if quick else RATES_DEG_S
+        return [compare(panel, sky, Slew(rate)) for rate in rates for panel in panels]
+
+
+def run(directory: Path, quick: bool = False) -> list[str]:
+    """Measure, and write `timing.csv` and `timing.png`; what was found. Raises InputError where they cannot be written."""
+    outcomes = measure(quick)
+    write_records(directory / "timing.csv", outcomes)
+    at = {(o.way, o.rate_deg_s): o for o in outcomes}
+    plain, best = (at[way, 2.0] for way in ("prediction", "+ smear"))
+    finding = (
+        f"At 2 deg/s on a 60 Hz panel and 0.1 s of exposure a star is {plain.rms_arcsec:.0f} arcsec off with prediction alone, "
+        f"{best.rms_arcsec:.2g} with each row at its own moment and paths within the frame"
+    )
+    _draw(directory / "timing.png", finding, outcomes)
+    return [finding, *(_line(at[way, 2.0]) for way in WAYS)]
+
+
+def _line(outcome: Outcome) -> str:
+    errors = f"{outcome.rms_arcsec:.3g} arcsec rms, {outcome.worst_arcsec:.3g} at worst, {outcome.flux_rms_mag:.2g} mag rms"
+    return f"{outcome.way}: {errors}, {outcome.draw_ms:.1f} ms a frame ({outcome.stars} stars)"
+
+
+def _draw(path: Path, finding: str, outcomes: list[Outcome]) -> None:
+    with chart(path, finding, panels=2) as (error, cost):
+        for way, marker in zip(WAYS, "osd^", strict=True):
+            mine = [o for o in outcomes if o.way == way]
+            rates = [o.rate_deg_s for o in mine]
+            error.loglog(rates, [o.rms_arcsec for o in mine], marker=marker, label=way)
+            cost.semilogx(rates, [o.draw_ms for o in mine], marker=marker, label=way)
+        error.set_ylabel("star position error, arcsec rms")
+        error.legend(loc="upper left")
+        cost.set_ylabel("time to draw a frame, ms")
+        cost.set_ylim(bottom=0)
+        cost.set_xlabel("slew rate, deg/s")
+        plain_ticks(cost.xaxis, sorted({o.rate_deg_s for o in outcomes}))

@@ -3,7 +3,8 @@
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from hilstar.bench.build import Bench, Drawn, Frame, load
+    from hilstar.bench.build import load
+    from hilstar.bench.frame import Bench, Drawn, Frame
     from hilstar.errors import HilstarError, InputError, MachineError
 
 __version__ = "0.1.0"
@@ -15,6 +16,9 @@ def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module 'hilstar' has no attribute {name!r}")
     from hilstar import errors
-    from hilstar.bench import build as assembly
 
-    return getattr(assembly if hasattr(assembly, name) else errors, name)
+    if hasattr(errors, name):
+        return getattr(errors, name)
+    from hilstar.bench import build, frame
+
+    return getattr(build if name == "load" else frame, name)

@@ -69,17 +69,21 @@ def check_outputs(inputs: Iterable[Path | None], outputs: Iterable[Path | None])
         taken[place] = path
 
 
-def files_named_in(path: Path, depth: int = 0) -> list[Path]:
-    """A TOML file and every file that it names, relative to it, and so on; nothing is refused here."""
+def files_named_in(path: Path, text: str | None = None, depth: int = 0) -> list[Path]:
+    """A TOML file (of this `text`, where it has been read) and every file that it names, relative to it, and so on.
+
+    Nothing is refused here.
+    """
     found = [path]
     try:
-        table = parse_toml(path, read_text(path, "", MAX_TOML_BYTES)) if depth < MAX_DEPTH else {}
+        text = read_text(path, "", MAX_TOML_BYTES) if text is None else text
+        table = parse_toml(path, text) if depth < MAX_DEPTH else {}
     except InputError:
         return found
     for text in _texts(table):
         named = path.parent / text
         if len(text) < 4096 and "\0" not in text and exists(named) and named.is_file():
-            found += files_named_in(named, depth + 1) if named.suffix == ".toml" else [named]
+            found += files_named_in(named, depth=depth + 1) if named.suffix == ".toml" else [named]
     return found
 
 

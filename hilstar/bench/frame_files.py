@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import FloatArray
-from hilstar.bench.build import Bench, Frame
+from hilstar.bench.frame import Bench, Frame
 from hilstar.files import written
 from hilstar.monitor.response import Codes
 from hilstar.rotation import to_matrix, to_radec_roll_deg
@@ -28,7 +28,7 @@ def write_frame_fits(path: Path, bench: Bench, frame: Frame) -> None:
     """
     from astropy.io import fits
 
-    header = sky_header(bench.bench_hash, bench.config.sky.epoch_jyear, frame.q_icrs_to_cam, bench.camera)
+    header = sky_header(bench.file.sha256, bench.config.sky.epoch_jyear, frame.q_icrs_to_cam, bench.camera)
     header["BUNIT"] = ("electron/s", "each pixel's share of the tracker's electrons")
     header["WHITE"] = (bench.flux_at_white_e_per_s, "[electron/s] one pixel at the white code")
     header["NSTARS"] = (len(frame.truth), "stars in view")

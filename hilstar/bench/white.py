@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hilstar.bench.build import Bench
+from hilstar.bench.frame import Bench
 from hilstar.scene.clipping import CLIP_TOLERANCE
 from hilstar.scene.psf import peak_share
 

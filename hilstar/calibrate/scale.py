@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from hilstar.arrays import FloatArray
-from hilstar.bench.build import Bench
+from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.config import read_config
+from hilstar.bench.frame import Bench
 from hilstar.calibrate.bench_file_edit import with_key
 from hilstar.errors import InputError
 from hilstar.files import write_whole
-from hilstar.reading import MAX_TOML_BYTES, read_text
 from hilstar.scene.psf import peak_share
 from hilstar.units import magnitude
 
@@ -65,18 +65,17 @@ def _rate_of(bench: Bench, hip: int) -> float:
     rate = float(bench.stars.electrons_per_s[place[0]])
     if rate * peak_share(bench.config.render.sprite_sigma_px) > bench.flux_at_white_e_per_s:
         raise InputError(f"--reading {hip}: the star clips on the monitor; take a fainter one")
-    if rate < bench.faintest_shown_e_per_s():
+    if rate < bench.faintest_shown_e_per_s:
         raise InputError(f"--reading {hip}: the star is too faint for the monitor to show; take a brighter one")
     return rate
 
 
-def with_flux_at_white(bench_file: Path, flux_at_white_e_per_s: float, output: Path) -> None:
+def with_flux_at_white(file: BenchFile, flux_at_white_e_per_s: float, output: Path) -> None:
     """A copy of a bench file, comments and all, with the key set. Raises InputError where the copy would not say the same."""
-    if output.resolve().parent != bench_file.resolve().parent:
-        raise InputError(f"{output}: the bench file's paths are relative to it; write the copy beside {bench_file}")
+    if output.resolve().parent != file.path.resolve().parent:
+        raise InputError(f"{output}: the bench file's paths are relative to it; write the copy beside {file.path}")
     key = "flux_at_white_e_per_s"
-    text = read_text(bench_file, "give the path of a bench file", MAX_TOML_BYTES)
-    text = with_key(text, "render", key, flux_at_white_e_per_s, instead_of=("brightest_v_mag",))
+    text = with_key(file.text, "render", key, flux_at_white_e_per_s, instead_of=("brightest_v_mag",))
     write_whole(output, text)
     if read_config(output).render.flux_at_white_e_per_s != flux_at_white_e_per_s:
         raise InputError(

@@ -31,7 +31,7 @@ def benchmark(
     """Time a whole frame and its stages, beside NumPy, numba, GalSim and photutils on the same stars."""
     import numpy as np
 
-    from hilstar.bench.config import read_config
+    from hilstar.bench.bench_file import read_bench_file
     from hilstar.files import make_directory
     from hilstar.study.speed import benchmark as speed
     from hilstar.study.speed import report as speed_report
@@ -42,7 +42,8 @@ def benchmark(
     if bench_file is not None:
         if sizes is not None:
             raise InputError(f"benchmark --sizes: {bench_file} has a size of its own; leave out one of them")
-        plan = replace(plan, bench_file=bench_file, sizes=(read_config(bench_file).monitor.resolution_px,))
+        file = read_bench_file(bench_file)
+        plan = replace(plan, file=file, sizes=(file.config.monitor.resolution_px,))
     elif sizes is not None:
         plan = replace(plan, sizes=parse_sizes(sizes))
     check_directory("-o", output)

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from hilstar.bench import bench_file
 
 BenchFile = Annotated[Path, typer.Argument(metavar="BENCH.toml", help="The bench file (docs: Bench file).")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout, and nothing else there.")]
@@ -25,7 +28,7 @@ LOG_HELP = "CSV (t_s,qw,qx,qy,qz), JSON lines, CCSDS AEM or MCAP (a ledger)."
 def check_files(
     inputs: Iterable[Path | None],
     outputs: Iterable[Path | None],
-    bench_file: Path | None = None,
+    file: bench_file.BenchFile | None = None,
     kept: Path | None = None,
     overwrite: bool = False,
 ) -> None:
@@ -35,7 +38,7 @@ def check_files(
     """
     from hilstar.files import check_outputs, files_named_in, refuse_existing, refuse_writer
 
-    named = [] if bench_file is None else files_named_in(bench_file)
+    named = [] if file is None else files_named_in(file.path, file.text)
     check_outputs([*inputs, *named], [*outputs, kept])
     if kept is not None:
         refuse_writer(kept)

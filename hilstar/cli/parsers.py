@@ -27,7 +27,7 @@ MAX_SIZE_PX = 32768
 
 def parse_attitude(command: str, radec: str | None, quaternion: str | None) -> Any:
     """The one attitude that the command line gives."""
-    from hilstar.bench.build import checked_quaternion
+    from hilstar.bench.frame import checked_quaternion
     from hilstar.rotation import from_radec_roll_deg
 
     if (radec is None) == (quaternion is None):

@@ -17,7 +17,7 @@ CROSSHAIR, GRID, BLANK, PATCH = 1, 2, 4, 8
 
 
 @dataclass(frozen=True, slots=True)
-class Mount:
+class Orientation:
     """How the image lies on the screen: columns or rows reversed, and quarter turns clockwise."""
 
     flip_x: bool = False
@@ -54,7 +54,7 @@ def window_context() -> moderngl.Context:
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """What a window shows: an image of `resolution_px`, mounted on a screen of `screen_px`, codes of so many bits.
+    """What a window shows: an image of `resolution_px`, on a screen of `screen_px`, codes of so many bits.
 
     `cross_px` is where the crosshair goes, image pixels; `triples` (levels, 3) the codes of each level, None where level k
     is code k in all channels.
@@ -63,7 +63,7 @@ class View:
     resolution_px: tuple[int, int]
     screen_px: tuple[int, int]
     bits: int
-    mount: Mount = Mount()
+    orientation: Orientation = Orientation()
     cross_px: tuple[float, float] = (0.0, 0.0)
     triples: npt.NDArray[np.uint16] | None = None
 
@@ -80,10 +80,11 @@ class Presenter:
         self.set_triples(view.triples)
 
     def _build(self, aids: bool) -> tuple[moderngl.Program, moderngl.VertexArray]:
-        """The program without or with crosshair, grid, blank and patch, for this mounting alone."""
-        view, mount = self._view, self._view.mount
-        wanted = {"FLIP_X": mount.flip_x, "FLIP_Y": mount.flip_y, "STEALING": view.triples is not None, "AIDS": aids}
-        defines = (f"QUARTER_TURNS {mount.quarter_turns % 4}", *(name for name, is_set in wanted.items() if is_set))
+        """The program without or with crosshair, grid, blank and patch, for this orientation alone."""
+        view, orientation = self._view, self._view.orientation
+        flips = {"FLIP_X": orientation.flip_x, "FLIP_Y": orientation.flip_y}
+        wanted = flips | {"STEALING": view.triples is not None, "AIDS": aids}
+        defines = (f"QUARTER_TURNS {orientation.quarter_turns % 4}", *(name for name, is_set in wanted.items() if is_set))
         program = build_program(self._ctx, "full.vert", "present.frag", defines)
         values: dict[str, Any] = {
             "levels": 0,

@@ -11,11 +11,11 @@ from hilstar.attitude.receiver import PacketCounts
 from hilstar.attitude.wire.links import Arrival
 from hilstar.attitude.wire.packet import AttitudeSample, Event, Refusal, TimeReply, TimeRequest, rate_refusal
 from hilstar.attitude.wire.zmq_links import ZmqLockstep
-from hilstar.bench.build import Bench
+from hilstar.bench.frame import Bench
 from hilstar.run.frame_status import StatusMaker
 from hilstar.run.loop import FrameLoop, Limit, Shown
 from hilstar.run.record.ledger import Ledger
-from hilstar.run.record.records import frame_record
+from hilstar.run.record.records import below_step, frame_record
 from hilstar.running_statistics import RunningStatistics
 from hilstar.units import NS_PER_MS, NS_PER_S
 
@@ -48,7 +48,9 @@ def serve_lockstep(
         else:
             last = _show(loop, arrival)
         if ledger is not None:
-            _keep(ledger, arrival, refusal, last)
+            _keep(ledger, arrival, refusal)
+            if refusal is None:
+                ledger.frame(frame_record(last, last.t_ns, 0, below_step(bench, last)))
         shown_ns = time.monotonic_ns()
         link.reply(statuses.status(last, last.t_ns, loop, counts, False), shown_ns, refusal)
         turn_ms.add((shown_ns - arrival.host_ns) / NS_PER_MS)
@@ -65,11 +67,9 @@ def _refusal(event: Event, max_rate_rad_s: float) -> Refusal | None:
     return Refusal("format", f"a {type(event).__name__} packet; a request is an attitude, or a time request")
 
 
-def _keep(ledger: Ledger, arrival: Arrival[Event], refusal: Refusal | None, shown: Shown) -> None:
+def _keep(ledger: Ledger, arrival: Arrival[Event], refusal: Refusal | None) -> None:
     sample = arrival.event if isinstance(arrival.event, AttitudeSample) else None
     ledger.packet(arrival.host_ns, arrival.raw, sample, refusal)
-    if refusal is None:
-        ledger.frame(frame_record(shown, shown.t_ns, 0))
 
 
 def _show(loop: FrameLoop, arrival: Arrival[Event]) -> Shown:

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from hilstar.attitude.clock.timeline import Attitude, Policy, StaleGate
-from hilstar.bench.build import Bench, Drawn, Prepared
 from hilstar.bench.config import AttitudeSettings
+from hilstar.bench.frame import Bench, Drawn
 from hilstar.notices import Notices
 from hilstar.process.priority import steady_loop
 from hilstar.run.pacing import wait_until
@@ -21,6 +21,7 @@ from hilstar.run.screen.overrides import HEADLESS, OnScreen, Overrides
 from hilstar.run.screen.screen import Screen
 from hilstar.run.summary import RunStats
 from hilstar.run.watchdog import FrameWatch
+from hilstar.scene.sprites import Sprites
 from hilstar.units import NS_PER_MS, NS_PER_S
 
 GIVEN_UP_PERIODS = 2.0
@@ -122,11 +123,11 @@ class FrameLoop:
         attitude = self.overrides.attitude(t_ns, attitude)
         if stale and self._blank_when_stale and not (screen is not None and screen.paused):
             attitude = None
-        prepared = self._prepared(attitude)
+        sprites = self._sprites(attitude)
         if self._given_up(number):
             return None
         self.watch.enter("draw")
-        drawn = self._bench.draw_prepared(prepared, number)
+        drawn = self._bench.draw_sprites(sprites, number)
         predicted_ns = self._predicted_swap_ns
         if screen is None:
             _ = drawn.levels
@@ -154,10 +155,10 @@ class FrameLoop:
         self._sink(shown)
         return shown
 
-    def _prepared(self, attitude: Attitude | None) -> Prepared:
+    def _sprites(self, attitude: Attitude | None) -> Sprites | None:
         if attitude is None:
-            return self._bench.prepare(None)
-        return self._bench.prepare(attitude.q_icrs_to_cam, attitude.rate_cam_rad_s if self._moving else None)
+            return None
+        return self._bench.frame_sprites(attitude.q_icrs_to_cam, attitude.rate_cam_rad_s if self._moving else None)
 
     def _given_up(self, number: int) -> bool:
         """Whether the frame's moment has passed so far that the next is begun instead; never two in a row, so that even a

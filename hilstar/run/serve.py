@@ -13,15 +13,15 @@ from hilstar.attitude.receiver import PacketCounts, Receiver, nobody_watches
 from hilstar.attitude.wire.keys import CurveKeys
 from hilstar.attitude.wire.serial_link import SerialLink
 from hilstar.attitude.wire.zmq_links import ZmqLockstep, ZmqReceiver
-from hilstar.bench.build import Bench
 from hilstar.bench.config import AttitudeSettings
+from hilstar.bench.frame import Bench
 from hilstar.notices import Notices
 from hilstar.process.interrupts import stop_on_signal
 from hilstar.run.frame_status import StatusMaker
 from hilstar.run.lockstep import serve_lockstep
 from hilstar.run.loop import FrameLoop, FrameSink, Limit, ignore, policy_of
 from hilstar.run.record.ledger import Ledger
-from hilstar.run.record.records import frame_record
+from hilstar.run.record.records import below_step, frame_record
 from hilstar.run.replay import Play
 from hilstar.run.screen.screen import Screen
 from hilstar.units import NS_PER_S
@@ -87,7 +87,7 @@ def _serve_stream(
             return
         light_ns = receiver.sender_ns(t_ns)
         if ledger is not None:
-            ledger.frame(frame_record(shown, light_ns, loop.stats.missed_frames))
+            ledger.frame(frame_record(shown, light_ns, loop.stats.missed_frames, below_step(bench, shown)))
         if link.two_way:
             receiver.post(statuses.status(shown, light_ns, loop, receiver.counts, receiver.clock.synchronised))
 
@@ -123,7 +123,7 @@ def replay(bench: Bench, play: Play, sink: FrameSink = ignore, outlet: Outlet | 
         number, t_ns, attitude = play.frame(slot)
         shown = loop.draw(number, t_ns, attitude)
         if ledger is not None and shown is not None:
-            ledger.frame(frame_record(shown, t_ns, loop.stats.missed_frames))
+            ledger.frame(frame_record(shown, t_ns, loop.stats.missed_frames, below_step(bench, shown)))
 
     bench.warm_up()
     begin_ns = time.monotonic_ns()

@@ -28,7 +28,7 @@ class Sprites:
 
     A sprite covers `footprint_px` squared pixels, the first of them at `pixel - (footprint_px - 1) // 2`. A star's light is
     divided among up to `per_star` sprites. `capped` stars are drawn coarser than they should be, or not at all, for the work of
-    a frame is bounded.
+    a frame is bounded. `rate_cam_rad_s` (3,) is the turn along which the stars' paths are drawn, None where they are points.
     """
 
     data: npt.NDArray[np.void]
@@ -38,6 +38,7 @@ class Sprites:
     y_px: FloatArray
     per_star: int = 1
     capped: int = 0
+    rate_cam_rad_s: FloatArray | None = None
 
     def __len__(self) -> int:
         return len(self.data)

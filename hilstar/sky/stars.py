@@ -28,11 +28,16 @@ class Stars:
         return len(self.hip)
 
 
-def brighter_stars(stars: Stars, faintest_e_per_s: float) -> Stars:
-    """The stars of at least so many electrons per second, in their own cells; `stars` itself where that is all of them."""
+def split_by_rate(stars: Stars, faintest_e_per_s: float) -> tuple[Stars, Stars]:
+    """The stars of at least so many electrons per second and the fainter ones, each in their own cells.
+
+    The first are `stars` itself where no star is fainter.
+    """
     kept = stars.electrons_per_s >= faintest_e_per_s
-    if kept.all():
-        return stars
+    return stars if kept.all() else _selected(stars, kept), _selected(stars, ~kept)
+
+
+def _selected(stars: Stars, kept: npt.NDArray[np.bool_]) -> Stars:
     grid = cell_grid(stars.vectors[kept])
     order = np.flatnonzero(kept)[grid.order]
     return Stars(

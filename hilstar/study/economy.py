@@ -10,9 +10,10 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from hilstar.bench.build import Bench
+from hilstar.bench.build import load
+from hilstar.bench.frame import Bench
 from hilstar.charts import chart, write_records
-from hilstar.monitor.quantise import Panel, shown_light
+from hilstar.monitor.quantise import shown_light
 from hilstar.render.reference import linear_image
 from hilstar.rotation import from_radec_roll_deg
 from hilstar.scene.frame_motion import Scan, Turn, swept_sprites
@@ -120,7 +121,7 @@ def _open(scene: Scene, effort: str, path: Path) -> Bench:
         effort=effort,
     )
     path.write_text(text)
-    return Bench(path)
+    return load(path)
 
 
 def _turn(scene: Scene) -> Turn:
@@ -142,8 +143,7 @@ def _times_ms(scene: Scene, benches: dict[str, Bench], rounds: int) -> dict[str,
 def _outcome(scene: Scene, name: str, bench: Bench, frame_ms: float) -> Outcome:
     turn, size = _turn(scene), bench.camera.resolution_px
     drawn = bench.draw(turn.q_icrs_to_cam, 0, turn.rate_cam_rad_s)
-    panel = Panel(bench.calibration.response, bench.flux_at_white_e_per_s, bench.uniformity)
-    shown = shown_light(drawn.levels, panel)
+    shown = shown_light(drawn.levels, bench.panel)
     sigma_px, footprint = bench.config.render.sprite_sigma_px, bench.renderer.footprint_px
     scan = Scan(bench.scan.down, bench.scan.scanout_s, bench.scan.hold_s)
     sprites = swept_sprites(bench.stars, turn, scan, bench.camera, footprint, sigma_px)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from hilstar.bench.bench_file import read_bench_file
 from hilstar.charts import STYLE, save, write_csv
 from hilstar.resources import resource_path
 from hilstar.rotation import from_radec_roll_deg
@@ -45,7 +46,7 @@ def run(directory: Path) -> list[str]:
 
 
 def _draw_scene(directory: Path, scene: Scene) -> str:
-    with Simulator(resource_path("configs", f"thesis-{scene.name}.toml")) as simulator:
+    with Simulator(read_bench_file(resource_path("configs", f"thesis-{scene.name}.toml"))) as simulator:
         motion = simulator.motion(from_radec_roll_deg(*scene.radec_roll_deg), np.zeros(3))
         clean = simulator.expose(motion, None)
         noisy = simulator.expose(motion, np.random.default_rng(SEED))

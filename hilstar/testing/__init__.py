@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import FloatArray
-from hilstar.bench.build import Frame
+from hilstar.bench.frame import Frame
 from hilstar.errors import InputError
 from hilstar.testing.compare_skies import check_skies, compare_skies
 from hilstar.testing.sky_comparison import SkyComparison, finding, star_lines

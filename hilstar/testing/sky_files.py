@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from hilstar.arrays import FloatArray
-from hilstar.bench.build import TRUTH_DTYPE
+from hilstar.bench.truth import TRUTH_DTYPE
 from hilstar.errors import InputError, cannot_read
 from hilstar.reading import read_bytes, read_text, size_text
 from hilstar.testing.star_seeds import Truth

@@ -16,6 +16,7 @@ import numpy as np
 from hilstar.attitude.clock.timeline import Policy
 from hilstar.attitude.logs.log_file import log_timeline
 from hilstar.attitude.wire.packet import AttitudeSample
+from hilstar.bench.bench_file import BenchFile
 from hilstar.files import make_directory
 from hilstar.process.interrupts import end_with_parent
 from hilstar.rotation import rate_between_rad_s
@@ -56,14 +57,14 @@ def log_motions(
 
 
 def simulate_motions(
-    bench_file: Path, motions: list[Motion], noise: Noise, seed: int, directory: Path, on_done: Callable[[int], None]
+    file: BenchFile, motions: list[Motion], noise: Noise, seed: int, directory: Path, on_done: Callable[[int], None]
 ) -> None:
     """Write `exposure_000000.fits` and on into `directory`, each with noise of its own: seeds (seed, number)."""
     make_directory(directory)
-    Simulator(bench_file).close()  # whatever is wrong with the bench is said once, here
+    Simulator(file).close()  # whatever is wrong with the bench is said once, here
     workers = min(len(motions), len(os.sched_getaffinity(0)))
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, context, _start_worker, (bench_file,)) as pool:
+    with ProcessPoolExecutor(workers, context, _start_worker, (file,)) as pool:
         try:
             with _without_ctrl_c():
                 tasks = [
@@ -90,11 +91,11 @@ def _without_ctrl_c() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _start_worker(bench_file: Path) -> None:
+def _start_worker(file: BenchFile) -> None:
     global _simulator  # noqa: PLW0603 - a process of the pool has one simulator, made at its start
     end_with_parent()
     os.environ.setdefault("LP_NUM_THREADS", "1")  # the pool itself fills the cores
-    _simulator = Simulator(bench_file)
+    _simulator = Simulator(file)
 
 
 def _expose_to_file(motion: Motion, noise: Noise, seeds: tuple[int, int], path: Path) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from hilstar.bench.build import Bench
+from hilstar.bench.frame import Bench
 from hilstar.bench.white import clipping_hip, named
 from hilstar.charts import chart, write_csv
 from hilstar.monitor.phases import WHITE, fainter, measure, phase_grid, shown_by
@@ -106,14 +106,14 @@ def corner_share(sigma_px: tuple[float, float]) -> float:
 
 def nothing_below_e_per_s(bench: Bench) -> float:
     """The rate under which a star shows nothing, wherever it stands; for dithers, one that lights a pixel in half of frames."""
-    drawn = bench.faintest_shown_e_per_s()
+    drawn = bench.faintest_shown_e_per_s
     return drawn or float(bench.calibration.response.light[1]) / 2 * bench.flux_at_white_e_per_s
 
 
 def left_out(bench: Bench) -> dict[str, float | int]:
     """The bench's stars that are not drawn: how many, and their share of all light."""
     rates = bench.stars.electrons_per_s
-    missing = rates[rates < bench.faintest_shown_e_per_s()]
+    missing = rates[rates < bench.faintest_shown_e_per_s]
     return {"stars": len(missing), "flux_share": float(missing.sum() / rates.sum())}
 
 

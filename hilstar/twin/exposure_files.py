@@ -19,7 +19,8 @@ def write_exposure_fits(path: Path, simulator: Simulator, exposure: Exposure, no
     from astropy.io import fits
 
     tracker = simulator.config.tracker
-    header = sky_header(simulator.bench_hash, simulator.config.sky.epoch_jyear, exposure.motion.q_icrs_to_cam, simulator.camera)
+    epoch_jyear, q = simulator.config.sky.epoch_jyear, exposure.motion.q_icrs_to_cam
+    header = sky_header(simulator.file.sha256, epoch_jyear, q, simulator.camera)
     header["BUNIT"] = ("adu", "digital numbers (DN)")
     header["EXPTIME"] = (tracker.exposure_s, "[s]")
     for name, rate in zip(("RATEX", "RATEY", "RATEZ"), np.degrees(exposure.motion.rate_cam_rad_s), strict=True):

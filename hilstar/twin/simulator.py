@@ -11,8 +11,10 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import FloatArray
-from hilstar.bench.build import bench_hash, bench_optics, bench_stars, truth_table
-from hilstar.bench.config import BenchConfig, read_config
+from hilstar.bench.bench_file import BenchFile
+from hilstar.bench.build import bench_optics, bench_stars
+from hilstar.bench.config import BenchConfig
+from hilstar.bench.truth import truth_table
 from hilstar.errors import InputError
 from hilstar.monitor.geometry import monitor_camera
 from hilstar.render.renderer import Renderer, Target
@@ -43,13 +45,13 @@ class Exposure:
 class Simulator:
     """A bench's tracker looking at the sky itself. Free it with `close`, or use it as a context manager."""
 
-    def __init__(self, path: Path) -> None:
-        self.config = read_config(path)
+    def __init__(self, file: BenchFile) -> None:
+        self.file = file
+        self.config = file.config
         tracker = self.config.tracker
-        self.bench_hash = bench_hash(self.config, path.parent)
-        self.stars = bench_stars(self.config, path.parent)
+        self.stars = bench_stars(self.config, file.folder)
         self.camera = monitor_camera(tracker.resolution_px, tracker.pixel_pitch_um, tracker.focal_length_mm, NO_ALIGNMENT)
-        self.background_e = background_e(self.config, path.parent)
+        self.background_e = background_e(self.config, file.folder)
         self.detector = Detector(tracker.detector, tracker.resolution_px, tracker.pixel_pitch_um)
         self.renderer = Renderer(Target(tracker.resolution_px, tracker.psf_sigma_px))
 

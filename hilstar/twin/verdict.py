@@ -312,7 +312,7 @@ def _calibrations(twin: Twin) -> list[Calibration]:
     bench, name = twin.bench, twin.config.verify.true_calibration
     if name is None:
         return [bench.calibration]
-    source = name if name in BUILT_IN else bench.path.parent / name
+    source = name if name in BUILT_IN else bench.file.folder / name
     return [bench.calibration, load_calibration(source, twin.config.monitor.bits)]
 
 

@@ -20,8 +20,10 @@ import numpy.typing as npt
 
 from hilstar.arrays import FloatArray
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE
-from hilstar.bench.build import Bench, Frame, bench_camera
+from hilstar.bench.bench_file import BenchFile
+from hilstar.bench.build import bench_camera, open_bench
 from hilstar.bench.config import BenchConfig, Verify
+from hilstar.bench.frame import Bench, Frame
 from hilstar.errors import InputError
 from hilstar.monitor.calibration import BUILT_IN, load_calibration
 from hilstar.monitor.geometry import monitor_camera
@@ -103,16 +105,16 @@ class Tally:
 class Twin:
     """A bench's twin. Free it with `close`. Raises InputError for a bench file or a true calibration that is wrong."""
 
-    def __init__(self, path: Path) -> None:
-        self.bench = Bench(path)
+    def __init__(self, file: BenchFile) -> None:
+        self.bench = open_bench(file)
         self.config = self.bench.config
         tracker = self.config.tracker
         self.camera = monitor_camera(tracker.resolution_px, tracker.pixel_pitch_um, tracker.focal_length_mm, NO_ALIGNMENT)
         self.differs = any(name.startswith("true_") for name in changed(self.config.verify))
-        self.panel = true_panel(self.bench, path.parent)
-        self.believed = Panel(self.bench.calibration.response, self.bench.flux_at_white_e_per_s, self.bench.uniformity)
+        self.panel = true_panel(self.bench, file.folder)
+        self.believed = self.bench.panel
         true, self.assumed = true_mounting(self.bench, self.camera), Mounting(self.bench.camera, self.camera)
-        self.background_e = background_e(self.config, path.parent)
+        self.background_e = background_e(self.config, file.folder)
         self.detector = Detector(tracker.detector, tracker.resolution_px, tracker.pixel_pitch_um)
         self.settings = centroid_settings(self.config, self.assumed)
         self.true_optics = TwinOptics(true, tracker.psf_sigma_px)
@@ -305,7 +307,7 @@ def true_mounting(bench: Bench, tracker: Camera) -> Mounting:
     norm = math.hypot(*(verify.true_q_cam_to_mon or collimator.q_cam_to_mon))
     if abs(norm - 1) > NORM_TOLERANCE:
         raise InputError(
-            f"{bench.path}: [verify] true_q_cam_to_mon: its norm is {norm:.6g}; write a unit quaternion w, x, y, z"
+            f"{bench.file.path}: [verify] true_q_cam_to_mon: its norm is {norm:.6g}; write a unit quaternion w, x, y, z"
         )
     camera = monitor_camera(
         monitor.resolution_px,
@@ -375,13 +377,13 @@ def magnitude(ratio: float) -> float:
 
 
 def verify(
-    path: Path, fields: int, rng: np.random.Generator, on_field: Callable[[int], None] = lambda done: None
+    file: BenchFile, fields: int, rng: np.random.Generator, on_field: Callable[[int], None] = lambda done: None
 ) -> tuple[Verdict, dict[str, Any]]:
     """Run the twin over random attitudes; the verdict with its stars, and the summary of `hilstar verify --json`."""
     # Streams apart: the noise draws as many numbers as it has electrons, and all benches shall see the same fields.
     attitudes, noise = rng.spawn(2)
     tally = Tally()
-    twin = Twin(path)
+    twin = Twin(file)
     try:
         for number in range(fields):
             q = attitudes.normal(size=4)

@@ -9,6 +9,7 @@ import pytest
 from scipy.constants import c, h, k
 from scipy.integrate import quad
 
+from hilstar.bench.bench_file import read_bench_file
 from hilstar.render.reference import linear_image
 from hilstar.rotation import from_radec_roll_deg
 from hilstar.scene.exposure_motion import smeared_sprites
@@ -53,7 +54,7 @@ def test_twenty_random_stars_on_random_benches_are_right_in_absolute_electrons(t
         text = SMALL_BENCH.replace('"ccd47-20"', '"qe.csv"').replace('"n-bk7-10mm"', str(transmission))
         text = text.replace("aperture_mm = 30", f"aperture_mm = {aperture!r}").replace("[1024, 1024]", "[700, 700]")
         (tmp_path / "bench.toml").write_text(text + '[sky]\nspectrum = "blackbody"\nfaintest_v_mag = 8.0\n')
-        with Simulator(tmp_path / "bench.toml") as simulator:
+        with Simulator(read_bench_file(tmp_path / "bench.toml")) as simulator:
             q = from_radec_roll_deg(*rng.uniform([0, -80, 0], [360, 80, 360]))
             star = simulator.expose(simulator.motion(q, np.zeros(3)), None).truth
         row = star[rng.integers(len(star))] if len(star) else None
@@ -65,7 +66,7 @@ def test_twenty_random_stars_on_random_benches_are_right_in_absolute_electrons(t
 
 def test_a_v_0_a0_star_gives_its_electrons_to_the_image():
     """Through the thesis's bench, by quadrature, and as the sum of the image's pixels."""
-    with Simulator(ROOT / "configs" / "thesis-lyra.toml") as simulator:
+    with Simulator(read_bench_file(ROOT / "configs" / "thesis-lyra.toml")) as simulator:
         vega = simulator.motion(from_radec_roll_deg(279.2347, 38.7837, 0.0), np.zeros(3))
         exposure = simulator.expose(vega, None)
         star = exposure.truth[exposure.truth["hip"] == 91262][0]  # V = 0.03, B-V = -0.001
@@ -90,7 +91,7 @@ def test_a_v_0_a0_star_gives_its_electrons_to_the_image():
 
 @pytest.mark.parametrize("rate_deg_s", [(0.0, 0.0, 0.0), (0.05, -0.02, 0.2)])
 def test_the_gpu_and_the_oracle_agree_to_float32(rate_deg_s):
-    with Simulator(ROOT / "configs" / "thesis-orion.toml") as simulator:
+    with Simulator(read_bench_file(ROOT / "configs" / "thesis-orion.toml")) as simulator:
         motion = simulator.motion(from_radec_roll_deg(84.057, -1.2, 0.0), np.radians(rate_deg_s))
         tracker = simulator.config.tracker
         size = simulator.renderer.footprint_px
@@ -114,7 +115,7 @@ def test_zodiacal_light_is_that_of_the_design():
 def test_the_background_is_its_level_and_its_gradient(tmp_path):
     path = tmp_path / "bench.toml"
     path.write_text(SMALL_BENCH + "[background]\nelectrons_per_px = 100\ngradient_electrons_across = [50, -20]\n")
-    with Simulator(path) as simulator:
+    with Simulator(read_bench_file(path)) as simulator:
         level = simulator.background_e
     assert level.mean() == pytest.approx(100)
     assert level[512, -1] - level[512, 0] == pytest.approx(50)
@@ -122,7 +123,7 @@ def test_the_background_is_its_level_and_its_gradient(tmp_path):
 
 
 def test_zodiacal_light_in_a_pixel_is_its_solid_angle_s():
-    with Simulator(ROOT / "configs" / "thesis-orion.toml") as simulator:
+    with Simulator(read_bench_file(ROOT / "configs" / "thesis-orion.toml")) as simulator:
         level = simulator.background_e
         tracker = simulator.config.tracker
     optics_rate = level[0, 0] / tracker.exposure_s / (206_264.806 * 13e-3 / 30) ** 2

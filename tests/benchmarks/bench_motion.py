@@ -30,8 +30,8 @@ def main() -> None:
         path = Path(folder) / "bench.toml"
         path.write_text(BENCH.format(*REFERENCE_PX) + 'motion = "on"\n')
         with load(path) as bench:
-            bench.shown_stars, _ = scene(bench, bench.shown_stars, q, (options.stars, np.random.default_rng(1)))
-            bench.stars = bench.shown_stars
+            stars, _ = scene(bench, bench.shown_stars, q, (options.stars, np.random.default_rng(1)))
+            bench = bench.with_stars(stars)
             times_ms: dict[float, list[float]] = {rate: [] for rate in RATES_RAD_S}
             told: dict[float, str] = {}
             for number in range(options.rounds):

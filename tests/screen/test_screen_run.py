@@ -132,10 +132,10 @@ from pathlib import Path
 import numpy as np
 from hilstar.rotation import from_radec_roll_deg
 from hilstar.attitude.clock.timeline import Attitude
-from hilstar.bench.build import Bench
+from hilstar.bench.build import load
 from hilstar.run.loop import FrameLoop
 from hilstar.resources import resource_path
-with Bench(resource_path("configs", "demo.toml")) as bench:
+with load(resource_path("configs", "demo.toml")) as bench:
     loop = FrameLoop(bench, moving=True)
     turning = Attitude(from_radec_roll_deg(84, 0, 0), 0, False, rate_cam_rad_s=np.array([0.001, 0.01, 0.0]))
     for number in range(100):

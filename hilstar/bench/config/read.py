@@ -20,7 +20,12 @@ LIGHT_KM_S = 299_792.458
 
 def read_config(path: Path) -> BenchConfig:
     """Read and check a bench file. Raises InputError: file, key, what is wrong and what to write."""
-    tables = parse_toml(path, read_text(path, "give the path of a bench file", MAX_TOML_BYTES))
+    return parse_config(path, read_text(path, "give the path of a bench file", MAX_TOML_BYTES))
+
+
+def parse_config(path: Path, text: str) -> BenchConfig:
+    """Parse and check the text of the bench file `path`. Raises InputError: file, key, what is wrong and what to write."""
+    tables = parse_toml(path, text)
     _check_finite(tables, path)
     try:
         config = msgspec.convert(tables, BenchConfig)

@@ -25,18 +25,20 @@ def scale(
     as_json: Json = False,
 ) -> None:
     """Scale the light by the tracker: what one pixel at white is worth, from its readings of stars shown."""
-    from hilstar.bench.build import load
+    from hilstar.bench.bench_file import read_bench_file
+    from hilstar.bench.build import open_bench
     from hilstar.calibrate.scale import UNSURE_MAG, scale_by_tracker, with_flux_at_white
 
     check_ending("-o", output, TOML)
-    check_files([], [output], bench_file)
-    with load(bench_file) as bench:
+    file = read_bench_file(bench_file)
+    check_files([], [output], file)
+    with open_bench(file) as bench:
         exposure_s = bench.config.tracker.exposure_s if exposure is None else exposure
         found = scale_by_tracker(bench, [parse_reading(text) for text in reading], exposure_s)
     if found.scatter_mag > UNSURE_MAG:
         say(f"the readings disagree by {found.scatter_mag:.3f} mag: look at background, saturation, and the response")
     if output is not None:
-        with_flux_at_white(bench_file, found.flux_at_white_e_per_s, output)
+        with_flux_at_white(file, found.flux_at_white_e_per_s, output)
     summary: dict[str, Any] = {
         "flux_at_white_e_per_s": found.flux_at_white_e_per_s,
         "assumed_e_per_s": found.assumed_e_per_s,

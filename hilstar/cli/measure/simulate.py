@@ -38,6 +38,7 @@ def simulate(
     """Simulate the virtual tracker's image of the sky, with noise."""
     import numpy as np
 
+    from hilstar.bench.bench_file import read_bench_file
     from hilstar.twin import exposure_files as files
     from hilstar.twin.simulator import Simulator
 
@@ -53,10 +54,11 @@ def simulate(
     check_ending("-o", output, FITS)
     check_ending("--png", png, PNG)
     check_ending("--dn-png", dn_png, PNG_OR_TIFF)
-    check_files([], targets, bench_file)
+    file = read_bench_file(bench_file)
+    check_files([], targets, file)
     q = parse_attitude("simulate", radec, quaternion)
     rate_rad_s = parse_rate(rate) if rate else np.zeros(3)
-    with Simulator(bench_file) as simulator:
+    with Simulator(file) as simulator:
         rng = None if noise == "none" else np.random.default_rng(seed)
         exposure = simulator.expose(simulator.motion(q, rate_rad_s), rng)
         if output is not None:
@@ -86,14 +88,15 @@ def simulate_log(
     """The virtual tracker along a log."""
     from hilstar.attitude.logs.gaps import log_joins
     from hilstar.attitude.logs.log_file import read_log
-    from hilstar.bench.config import read_config
+    from hilstar.bench.bench_file import read_bench_file
     from hilstar.twin.batch import log_motions, simulate_motions
 
     samples = read_log(log)
     for _, line in log_joins(samples).told:
         say(line)
-    config = read_config(bench_file)
+    file = read_bench_file(bench_file)
+    config = file.config
     motions = log_motions(samples, frames, config.tracker.exposure_s, math.radians(config.attitude.max_rate_deg_s))
     with progress("exposing", len(motions)) as advance:
-        simulate_motions(bench_file, motions, *noise_and_seed, output, advance)
+        simulate_motions(file, motions, *noise_and_seed, output, advance)
     typer.echo(f"{len(motions)} exposures in {output}")

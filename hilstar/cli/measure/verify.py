@@ -25,7 +25,7 @@ def verify(
     """Run the digital twin: what the tracker would measure of the stars shown, against the sky."""
     import numpy as np
 
-    from hilstar.bench.config import read_config
+    from hilstar.bench.bench_file import read_bench_file
     from hilstar.files import make_directory
     from hilstar.twin.verdict import write_report
     from hilstar.twin.verify import verify as run_twin
@@ -33,10 +33,11 @@ def verify(
     check_directory("-o", output)
     if output is not None:
         make_directory(output)
+    file = read_bench_file(bench_file)
     with progress("verifying", fields) as advance:
-        verdict, summary = run_twin(bench_file, fields, np.random.default_rng(seed), advance)
+        verdict, summary = run_twin(file, fields, np.random.default_rng(seed), advance)
     if output is not None:
-        config = read_config(bench_file)
+        config = file.config
         write_report(output, verdict, (config.verify.flux_mag, config.verify.centroid_px), config.tracker.resolution_px)
     if as_json:
         print_json(summary)

@@ -34,7 +34,8 @@ def frame(
     import numpy as np
 
     from hilstar.bench import frame_files as files
-    from hilstar.bench.build import load
+    from hilstar.bench.bench_file import read_bench_file
+    from hilstar.bench.build import open_bench
 
     q = parse_attitude("frame", radec, quaternion)
     targets = [path for path in (output, truth, codes, preview) if path is not None]
@@ -44,8 +45,9 @@ def frame(
     check_ending("--truth", truth, CSV)
     check_ending("--codes", codes, PNG)
     check_ending("--preview", preview, PNG)
-    check_files([], targets, bench_file)
-    with load(bench_file) as bench:
+    file = read_bench_file(bench_file)
+    check_files([], targets, file)
+    with open_bench(file) as bench:
         if explain:
             explain_effort(bench)
         shot = bench.frame(q)

@@ -47,7 +47,7 @@ def replay(
     as_json: Json = False,
 ) -> None:
     """Show an attitude log on the monitor."""
-    from hilstar.bench.config import read_config
+    from hilstar.bench.bench_file import read_bench_file
     from hilstar.run.record.frame_sequence import FrameRecorder
     from hilstar.run.replay import Wanted, plan_play
     from hilstar.run.serve import Outlet
@@ -55,12 +55,13 @@ def replay(
 
     check_directory("-o", output)
     check_ending("--ledger", ledger, MCAP)
-    check_files([log], [None if output is None else output / "frames.csv"], bench_file, ledger, overwrite)
+    file = read_bench_file(bench_file)
+    check_files([log], [None if output is None else output / "frames.csv"], file, ledger, overwrite)
     split = parse_split(ledger_split)
     notices = Notices()
-    play = plan_play(log, Wanted(parse_speed(speed), start, stop, step), read_config(bench_file))
+    play = plan_play(log, Wanted(parse_speed(speed), start, stop, step), file.config)
     with (
-        shown_bench(bench_file, headless, windowed, force) as (bench, screen),
+        shown_bench(file, headless, windowed, force) as (bench, screen),
         FrameRecorder(output, bench) as record,
         optional_ledger(ledger, bench, notices, overwrite, split) as kept,
         progress("replaying", play.frame_count) as advance,

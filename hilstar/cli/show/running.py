@@ -6,7 +6,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -14,6 +14,9 @@ from hilstar.console.terminal import report, say
 from hilstar.errors import MachineError
 from hilstar.notices import Notices
 from hilstar.process.interrupts import stop_on_signal
+
+if TYPE_CHECKING:
+    from hilstar.bench.bench_file import BenchFile
 
 Windowed = Annotated[bool, typer.Option("--windowed", help="A window on the desktop instead of the full display.")]
 Force = Annotated[
@@ -38,17 +41,17 @@ def explain_effort(bench: Any) -> None:
 
 
 @contextmanager
-def shown_bench(bench_file: Path, headless: bool, windowed: bool, force: bool) -> Iterator[tuple[Any, Any]]:
+def shown_bench(file: BenchFile, headless: bool, windowed: bool, force: bool) -> Iterator[tuple[Any, Any]]:
     """The bench, and the screen that it is on; None when headless."""
     if headless:
-        from hilstar.bench.build import load
+        from hilstar.bench.build import open_bench
 
-        with load(bench_file) as bench:
+        with open_bench(file) as bench:
             yield bench, None
         return
     from hilstar.run.screen.screen import open_screen
 
-    with open_screen(bench_file, windowed=windowed, force=force) as screen:
+    with open_screen(file, windowed=windowed, force=force) as screen:
         yield screen.bench, screen
 
 

@@ -41,18 +41,19 @@ def serve(
     as_json: Json = False,
 ) -> None:
     """Show the live attitude stream on the monitor."""
-    from hilstar.bench.config import read_config
+    from hilstar.bench.bench_file import read_bench_file
     from hilstar.run.loop import Limit
     from hilstar.run.serve import Outlet, open_link
     from hilstar.run.serve import serve as serve_stream
 
     check_ending("--ledger", ledger, MCAP)
-    check_files([], [], bench_file, ledger, overwrite)
+    file = read_bench_file(bench_file)
+    check_files([], [], file, ledger, overwrite)
     split = parse_split(ledger_split)
     notices = Notices()
     with (
-        open_link(read_config(bench_file).attitude, bench_file.parent, notices) as link,
-        shown_bench(bench_file, headless, windowed, force) as (bench, screen),
+        open_link(file.config.attitude, file.folder, notices) as link,
+        shown_bench(file, headless, windowed, force) as (bench, screen),
         optional_ledger(ledger, bench, notices, overwrite, split) as kept,
     ):
         if explain:

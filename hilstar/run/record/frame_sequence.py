@@ -9,7 +9,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from hilstar.bench.build import Bench
+from hilstar.bench.frame import Bench
 from hilstar.bench.frame_files import write_codes_png
 from hilstar.errors import cannot_write
 from hilstar.files import make_directory, refuse_ledger

@@ -24,7 +24,7 @@ from hilstar.attitude.logs.mcap_log import ATTITUDE_TOPIC_OF_RUN, attitude_messa
 from hilstar.attitude.logs.mcap_reader import RUN_METADATA, part_path
 from hilstar.attitude.logs.mcap_writer import McapWriter, Topic
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal
-from hilstar.bench.build import Bench
+from hilstar.bench.frame import Bench
 from hilstar.errors import InputError, cannot_write, printable
 from hilstar.files import NewFile
 from hilstar.notices import Notice, Notices
@@ -286,9 +286,9 @@ TOPICS = {
 
 def _head_of(bench: Bench) -> dict[str, str]:
     return {
-        "bench_sha256": bench.bench_hash,
-        "bench_file": printable(str(bench.path)),
-        "bench_text": bench.path.read_text(encoding="utf-8"),
+        "bench_sha256": bench.file.sha256,
+        "bench_file": printable(str(bench.file.path)),
+        "bench_text": bench.file.text,
         "calibration": bench.calibration.name,
         "calibration_sha256": bench.calibration.sha256,
         "gl_renderer": bench.renderer.gl_renderer,

@@ -20,6 +20,7 @@ from hilstar.attitude.logs.mcap_log import ATTITUDE_TOPIC
 from hilstar.attitude.logs.mcap_reader import RUN_METADATA, read_messages, read_metadata, read_topics
 from hilstar.attitude.wire.packet import Refusal, checked_sample, rate_refusal
 from hilstar.bench.config import BenchConfig
+from hilstar.bench.frame import Bench
 from hilstar.errors import InputError, cannot_read
 from hilstar.reading import parse_toml
 from hilstar.run.loop import Shown
@@ -86,8 +87,10 @@ def schema_of(record: type[msgspec.Struct], title: str) -> bytes:
 _frame_decoder = msgspec.json.Decoder(FrameRecord)
 
 
-def frame_record(shown: Shown, light_ns: int, missed: int) -> FrameRecord:
-    """What the ledger keeps of a frame; `light_ns` is on the bench's clock, `missed` counts the run's missed frames so far."""
+def frame_record(shown: Shown, light_ns: int, missed: int, below_step: int) -> FrameRecord:
+    """What the ledger keeps of a frame; `light_ns` is on the bench's clock, `missed` counts the run's missed frames
+    so far, and `below_step` the stars in view that are too faint for the monitor.
+    """
     attitude, drawn = shown.attitude, shown.drawn
     record = FrameRecord(
         frame=shown.number,
@@ -100,7 +103,7 @@ def frame_record(shown: Shown, light_ns: int, missed: int) -> FrameRecord:
         stale=shown.stale,
         stars_drawn=drawn.star_count,
         clipped=len(drawn.clipped_hip),
-        below_step=drawn.below_step,
+        below_step=below_step,
         capped=drawn.capped,
         missed_before=shown.missed_before,
         missed=missed,
@@ -108,8 +111,8 @@ def frame_record(shown: Shown, light_ns: int, missed: int) -> FrameRecord:
         operator=shown.on_screen.operator,
         hidden=shown.on_screen.hidden,
     )
-    if drawn.turn is not None:
-        x, y, z = drawn.turn.rate_cam_rad_s.tolist()
+    if drawn.rate_cam_rad_s is not None:
+        x, y, z = drawn.rate_cam_rad_s.tolist()
         record.rate = (x, y, z)
     if attitude is not None:
         w, x, y, z = attitude.q_icrs_to_cam.tolist()
@@ -120,6 +123,11 @@ def frame_record(shown: Shown, light_ns: int, missed: int) -> FrameRecord:
         record.age_ns = _within_64_bits(attitude.age_ns)
         record.prediction_ns = attitude.prediction_ns
     return record
+
+
+def below_step(bench: Bench, shown: Shown) -> int:
+    """How many stars in view of a frame are too faint for the monitor."""
+    return 0 if shown.attitude is None else bench.count_faint(shown.attitude.q_icrs_to_cam)
 
 
 def _within_64_bits(value_ns: int) -> int:

@@ -7,13 +7,13 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
-from hilstar.bench.build import Bench
-from hilstar.bench.config import read_config
-from hilstar.bench.mounting import mount_of
+from hilstar.bench.bench_file import BenchFile
+from hilstar.bench.build import open_bench
+from hilstar.bench.frame import Bench
+from hilstar.bench.orientation import orientation_of
 from hilstar.errors import MachineError
 from hilstar.monitor.window.window import Window, WindowSettings
 from hilstar.render.presenter import BLANK, CROSSHAIR, GRID, PATCH, Presenter, View, window_context
@@ -62,7 +62,7 @@ class Screen:
             resolution_px=monitor.resolution_px,
             screen_px=window.size_px,
             bits=monitor.bits,
-            mount=mount_of(monitor),
+            orientation=orientation_of(monitor),
             cross_px=bench.camera.principal_point_px,
             triples=bench.calibration.response.rgb,
         )
@@ -171,7 +171,7 @@ class Screen:
 
     def _faults(self, wanted_ms: float) -> Iterator[str]:
         monitor, timing = self.bench.config.monitor, self.timing
-        wanted_px = mount_of(monitor).screen_px(monitor.resolution_px)
+        wanted_px = orientation_of(monitor).screen_px(monitor.resolution_px)
         if self.window.size_px != wanted_px:
             (width, height), (wide, high) = self.window.size_px, wanted_px
             yield f"the display is {width} x {height} px and the bench {wide} x {high}; set [monitor] resolution_px or its mode"
@@ -194,12 +194,12 @@ class Screen:
 
 
 @contextmanager
-def open_screen(path: Path, *, windowed: bool, force: bool) -> Iterator[Screen]:
+def open_screen(file: BenchFile, *, windowed: bool, force: bool) -> Iterator[Screen]:
     """The bench of a file on its display, past the gate. Raises InputError or MachineError."""
-    monitor = read_config(path).monitor
+    monitor = file.config.monitor
     display = None if windowed else monitor.display
-    settings = WindowSettings(mount_of(monitor).screen_px(monitor.resolution_px), monitor.bits, display)
-    with Window(settings) as window, Bench(path, window_context()) as bench:
+    settings = WindowSettings(orientation_of(monitor).screen_px(monitor.resolution_px), monitor.bits, display)
+    with Window(settings) as window, open_bench(file, window_context()) as bench:
         screen = Screen(window, bench)
         bench.warm_up()
         screen.pass_gate(force)

@@ -16,7 +16,9 @@ from typing import Any
 import numpy as np
 
 from hilstar.arrays import Float32Array, FloatArray
-from hilstar.bench.build import Bench, load
+from hilstar.bench.bench_file import BenchFile, read_bench_file
+from hilstar.bench.build import open_bench
+from hilstar.bench.frame import Bench
 from hilstar.errors import InputError
 from hilstar.render.renderer import Renderer, Target
 from hilstar.render.stages import StagedRenderer
@@ -79,7 +81,7 @@ print((imported - begin) * 1e3, (drawn - imported) * 1e3, int(most_kb) / 1024)
 class Plan:
     """What to measure: image sizes (px), star counts, and at most how many rounds and seconds for a way in one cell.
 
-    `bench_file` stands in for the benchmark's own bench; `sizes` is then its own size.
+    `file` stands in for the benchmark's own bench; `sizes` is then its own size.
     """
 
     sizes: tuple[Size, ...] = SIZES
@@ -87,7 +89,7 @@ class Plan:
     rounds: int = 100
     budget_s: float = 10.0
     starts: int = 3
-    bench_file: Path | None = None
+    file: BenchFile | None = None
 
 
 QUICK = Plan(sizes=(REFERENCE_PX,), counts=COUNTS[:3], rounds=30, budget_s=2.0)
@@ -102,22 +104,24 @@ def run(plan: Plan, rng: np.random.Generator, advance: Callable[[int], object]) 
     q = from_radec_roll_deg(*RADEC_ROLL_DEG)
     with TemporaryDirectory() as folder:
         for place, size in enumerate(plan.sizes):
-            path = plan.bench_file or Path(folder) / "bench.toml"
-            if plan.bench_file is None:
-                path.write_text(BENCH.format(*size))
-            with load(path) as bench:
+            file = plan.file or _own_bench(Path(folder) / "bench.toml", size)
+            with open_bench(file) as bench:
                 result["gl_renderer"] = bench.renderer.gl_renderer
                 every = bench.shown_stars
                 for k, count in enumerate(plan.counts):
                     stars, catalogue = scene(bench, every, q, (count, rng))
-                    bench.shown_stars = bench.stars = stars
                     cell = {"width": size[0], "height": size[1], "stars": count}
                     result["scenes"].append(cell | {"catalogue": catalogue, "random": count - catalogue})
-                    with Cell(bench, q, cell, result) as measured:
+                    with Cell(bench.with_stars(stars), q, cell, result) as measured:
                         measured.measure(plan, found)
                     advance(place * len(plan.counts) + k + 1)
-            result["startup"] += [_fresh_start(path, q, size) for _ in range(plan.starts)]
+            result["startup"] += [_fresh_start(file.path, q, size) for _ in range(plan.starts)]
     return result | _start_summary(result["startup"], plan.sizes) | {"aims": _aims(result)}
+
+
+def _own_bench(path: Path, size: Size) -> BenchFile:
+    path.write_text(BENCH.format(*size))
+    return read_bench_file(path)
 
 
 def scene(bench: Bench, every: Stars, q: FloatArray, count_and_rng: tuple[int, np.random.Generator]) -> tuple[Stars, int]:

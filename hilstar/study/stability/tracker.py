@@ -8,6 +8,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from hilstar.arrays import FloatArray
+from hilstar.bench.bench_file import read_bench_file
 from hilstar.errors import InputError
 from hilstar.rotation import from_radec_roll_deg
 from hilstar.study.stability.failure_case import FailureCase, Figures
@@ -98,7 +99,7 @@ def simulated_dn(exposure_s: float, background_e: float, faintest_v_mag: float) 
     with TemporaryDirectory() as folder:
         path = Path(folder) / "bench.toml"
         path.write_text(BENCH.format(exposure_s=exposure_s, background_e=background_e, faintest_v_mag=faintest_v_mag))
-        with Simulator(path) as simulator:
+        with Simulator(read_bench_file(path)) as simulator:
             motion = simulator.motion(from_radec_roll_deg(84.057, -1.2, 0.0), np.zeros(3))
             exposure = simulator.expose(motion, np.random.default_rng(SEED))
     return exposure.dn.astype(np.float64), len(exposure.truth)

@@ -12,9 +12,9 @@ import numpy as np
 
 from hilstar.arrays import FloatArray
 from hilstar.attitude.clock.timeline import Attitude
-from hilstar.bench.build import Bench
+from hilstar.bench.build import load
 from hilstar.monitor.geometry import monitor_camera
-from hilstar.monitor.quantise import Panel, shown_light
+from hilstar.monitor.quantise import shown_light
 from hilstar.render.renderer import Renderer, Target
 from hilstar.scene.exposure_motion import Motion, smeared_sprites
 from hilstar.scene.frame_motion import Scan
@@ -86,7 +86,7 @@ class ScanningPanel:
     def __init__(self, way: str, path: Path) -> None:
         path.write_text(BENCH.format(monitor=WAYS[way].monitor_keys, motion=WAYS[way].motion))
         self.way = way
-        self.bench = Bench(path)
+        self.bench = load(path)
         config = self.bench.config
         self.period_s = 1 / config.monitor.refresh_hz
         self.panel_scan = replace(self.bench.scan, scanout_s=self.period_s, hold_s=self.period_s)
@@ -94,7 +94,7 @@ class ScanningPanel:
         self.exposure_s = tracker.exposure_s
         self.camera = monitor_camera(tracker.resolution_px, tracker.pixel_pitch_um, tracker.focal_length_mm, NO_ALIGNMENT)
         self.optics = TwinOptics(Mounting(self.bench.camera, self.camera), tracker.psf_sigma_px)
-        self.panel = Panel(self.bench.calibration.response, self.bench.flux_at_white_e_per_s, self.bench.uniformity)
+        self.panel = self.bench.panel
 
     def attitude(self, slew: Slew, swap_s: float) -> Attitude:
         """What the display makes of the packets that have come when it begins the frame of a swap."""

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from hilstar.bench.bench_file import read_bench_file
 from hilstar.monitor.quantise import Panel
 from hilstar.monitor.response import gamma_response, srgb_response, table_response
 from hilstar.twin.verify import Twin
@@ -161,7 +162,7 @@ def test_what_cannot_be_verified_gets_one_line(tmp_path):
 def twin(tmp_path_factory):
     path = tmp_path_factory.mktemp("twin") / "bench.toml"
     path.write_text(BENCH)
-    twin = Twin(path)
+    twin = Twin(read_bench_file(path))
     yield twin
     twin.close()
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from hilstar.bench.build import Bench
+from hilstar.bench.build import load
 from hilstar.bench.config import RenderSettings
 from hilstar.bench.effort import Light, choose_codes, choose_sides, cut_px, explain, outside_share, plan_effort
 from hilstar.monitor.response import srgb_response
@@ -131,6 +131,6 @@ def test_explain_is_said_beside_the_json(tmp_path, small_bench_file):
 
 def test_auto_codes_become_the_bench_s_own(tmp_path, small_bench_file):
     small_bench_file.write_text(small_bench_file.read_text() + '[render]\nquantisation = "auto"\ntolerance_mag = 0.001\n')
-    with Bench(small_bench_file) as bench:
+    with load(small_bench_file) as bench:
         assert bench.config.render.quantisation == bench.renderer.target.quantisation == "exact"
         assert bench.renderer.target.sides == ()

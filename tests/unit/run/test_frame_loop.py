@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass, fields
 
 import numpy as np
 
 from hilstar.attitude.clock.timeline import Attitude
+from hilstar.bench.frame import Bench
 from hilstar.run.loop import FrameLoop, Limit
 
 REFRESH_HZ = 20.0  # 50 ms a frame: this machine's own pauses are shorter
@@ -17,19 +19,22 @@ STILL = Attitude(np.array([1.0, 0.0, 0.0, 0.0]), 0, False)
 def run_with_stalls(bench, stalled: set[int], slots: int) -> tuple[FrameLoop, list[int]]:
     """A paced run in which the sprites of the `stalled` frames take STALL_S; the numbers that were shown."""
     shown: list[int] = []
-    loop = FrameLoop(bench, lambda frame: shown.append(frame.number))
-    prepare, drawing = bench.prepare, [0]
+    drawing = [0]
 
-    def slow(*arguments):
-        if drawing[0] in stalled:
-            time.sleep(STALL_S)
-        return prepare(*arguments)
+    @dataclass(frozen=True, eq=False, kw_only=True)
+    class Stalling(Bench):
+        def frame_sprites(self, *arguments):
+            if drawing[0] in stalled:
+                time.sleep(STALL_S)
+            return super().frame_sprites(*arguments)
+
+    bench = Stalling(**{field.name: getattr(bench, field.name) for field in fields(bench)})
+    loop = FrameLoop(bench, lambda frame: shown.append(frame.number))
 
     def draw_slot(slot: int) -> None:
         drawing[0] = slot
         loop.draw(slot, 0, STILL)
 
-    bench.prepare = slow
     bench.warm_up()
     with loop.watch:
         loop.paced(REFRESH_HZ, Limit(slots=slots), draw_slot)

@@ -33,8 +33,7 @@ UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 @pytest.fixture
 def bench(small_bench_file):
     return SimpleNamespace(
-        path=small_bench_file,
-        bench_hash="0" * 64,
+        file=SimpleNamespace(path=small_bench_file, text=small_bench_file.read_text(), sha256="0" * 64),
         calibration=SimpleNamespace(name="srgb", sha256="1" * 64),
         renderer=SimpleNamespace(gl_renderer="none"),
     )

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hilstar.monitor.geometry import monitor_camera
-from hilstar.render.presenter import Mount
+from hilstar.render.presenter import Orientation
 from hilstar.render.reference import linear_image
 from hilstar.rotation import from_radec_roll_deg, propagate, to_matrix
 from hilstar.scene import sprites as sprites_module
@@ -195,16 +195,16 @@ def test_nodes_belong_to_what_of_a_path_lies_on_the_image():
 
 
 @pytest.mark.parametrize(
-    ("mount", "down"),
+    ("orientation", "down"),
     [
-        (Mount(), (0, 1)),
-        (Mount(flip_y=True), (0, -1)),
-        (Mount(flip_x=True), (0, 1)),
-        (Mount(quarter_turns=1), (1, 0)),
-        (Mount(quarter_turns=2), (0, -1)),
-        (Mount(quarter_turns=3), (-1, 0)),
-        (Mount(flip_y=True, quarter_turns=1), (-1, 0)),
+        (Orientation(), (0, 1)),
+        (Orientation(flip_y=True), (0, -1)),
+        (Orientation(flip_x=True), (0, 1)),
+        (Orientation(quarter_turns=1), (1, 0)),
+        (Orientation(quarter_turns=2), (0, -1)),
+        (Orientation(quarter_turns=3), (-1, 0)),
+        (Orientation(flip_y=True, quarter_turns=1), (-1, 0)),
     ],
 )
-def test_the_mount_says_which_way_the_rows_go(mount, down):
-    assert mount.down == down
+def test_the_orientation_says_which_way_the_rows_go(orientation, down):
+    assert orientation.down == down

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilstar.bench.build import TRUTH_DTYPE
 from hilstar.bench.frame_files import write_frame_fits, write_truth_csv
+from hilstar.bench.truth import TRUTH_DTYPE
 from hilstar.errors import InputError
 from hilstar.render.reference import linear_image
 from hilstar.rotation import from_radec_roll_deg

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
+from hilstar.bench.bench_file import read_bench_file
 from hilstar.bench.config import read_config
 from hilstar.errors import InputError
 from hilstar.monitor.geometry import monitor_camera
@@ -188,7 +189,7 @@ def test_nothing_measured_has_no_spread_and_no_zero_point():
 def test_all_methods_see_the_same_fields_whatever_noise_they_draw(tmp_path):
     places = []
     for method in ("round", "exact"):
-        verdict, _ = verify(bench_file(tmp_path, method=method), 2, np.random.default_rng(5))
+        verdict, _ = verify(read_bench_file(bench_file(tmp_path, method=method)), 2, np.random.default_rng(5))
         places.append({(s.hip, s.x_px) for s in verdict.stars + verdict.lost})
     assert len(places[0] & places[1]) > 0.8 * len(places[1]) > 0
 
@@ -198,7 +199,7 @@ def test_a_whole_cycle_of_temporal_is_better_than_one_frame_of_it(tmp_path):
     errors = []
     for frames in (1, 8):
         path = bench_file(tmp_path, method="temporal", exposure_s=frames / 60)
-        _, summary = verify(path, 4, np.random.default_rng(3))
+        _, summary = verify(read_bench_file(path), 4, np.random.default_rng(3))
         errors.append((summary["flux_error_mag"]["rms"], summary["centroid_error_px"]["rms"]))
     assert errors[1][0] < errors[0][0] / 2
     assert errors[1][1] < errors[0][1] / 2
@@ -206,7 +207,7 @@ def test_a_whole_cycle_of_temporal_is_better_than_one_frame_of_it(tmp_path):
 
 def test_a_black_level_is_caught_on_a_screen_that_covers_a_fifth_of_the_detector(tmp_path):
     path = bench_file(tmp_path, 'true_calibration = "lcd-example"\n', monitor_px=[160, 130], bits=8)
-    _, summary = verify(path, 1, np.random.default_rng(1))
+    _, summary = verify(read_bench_file(path), 1, np.random.default_rng(1))
     assert summary["black_e_per_s_px"]["seen"] > 1e3
     assert any("black" in reason for reason in summary["reasons"])
 
@@ -214,7 +215,7 @@ def test_a_black_level_is_caught_on_a_screen_that_covers_a_fifth_of_the_detector
 def test_coarse_codes_are_blamed_on_the_codes_and_not_on_the_response(tmp_path):
     path = bench_file(tmp_path, bits=8, method="round")
     path.write_text(path.read_text().replace("[verify]", "brightest_v_mag = -2\n[verify]"))
-    verdict, summary = verify(path, 3, np.random.default_rng(1))
+    verdict, summary = verify(read_bench_file(path), 3, np.random.default_rng(1))
     assert not verdict.passed
     assert any("the codes alone" in reason and "exact" in reason for reason in verdict.reasons)
     assert not any("response and uniformity" in reason for reason in verdict.reasons)
@@ -223,8 +224,8 @@ def test_coarse_codes_are_blamed_on_the_codes_and_not_on_the_response(tmp_path):
 
 def test_the_codes_alone_do_not_depend_on_what_the_monitor_really_is(tmp_path):
     """Wherever the same stars are measured, the codes on the assumed monitor cost them the same."""
-    right, _ = verify(bench_file(tmp_path), 4, np.random.default_rng(4))
-    wrong, _ = verify(bench_file(tmp_path, 'true_calibration = "gamma2.2"\n'), 4, np.random.default_rng(4))
+    right, _ = verify(read_bench_file(bench_file(tmp_path)), 4, np.random.default_rng(4))
+    wrong, _ = verify(read_bench_file(bench_file(tmp_path, 'true_calibration = "gamma2.2"\n')), 4, np.random.default_rng(4))
     assert not wrong.passed
     alone = {(s.hip, s.x_px): s.codes_px for s in right.stars}
     assert len(wrong.stars) > 5
@@ -232,7 +233,7 @@ def test_the_codes_alone_do_not_depend_on_what_the_monitor_really_is(tmp_path):
 
 
 def test_a_field_without_stars_passes_nothing(tmp_path):
-    built = Twin(bench_file(tmp_path))
+    built = Twin(read_bench_file(bench_file(tmp_path)))
     try:
         verdict = judge(built, Tally())
     finally:
@@ -245,7 +246,7 @@ def test_a_true_rotation_that_is_none_is_refused_with_the_file_s_name(tmp_path):
     path = bench_file(tmp_path, "true_q_cam_to_mon = [0, 0, 0, 0]\n")
     assert read_config(path).verify.true_q_cam_to_mon == (0.0, 0.0, 0.0, 0.0)
     with pytest.raises(InputError, match=r"bench\.toml: \[verify\] true_q_cam_to_mon.*unit"):
-        Twin(path)
+        Twin(read_bench_file(path))
 
 
 def test_only_what_is_said_to_be_true_makes_a_twin_differ(tmp_path):
@@ -266,16 +267,16 @@ def test_what_is_proposed_for_coarse_codes_is_what_the_calibration_takes(tmp_pat
     head = 'kind = "photometric"\nwho = ""\nwhen = ""\ninstrument = ""\nunit = ""\nbits = 8\nresponse = "monitor.csv"\n'
     (tmp_path / "monitor.toml").write_text(f"[calibration]\n{head}")
     path = bench_file(tmp_path, "centroid_px = 1e-4\n", bits=8, method="round", calibration="monitor.toml")
-    verdict, _ = verify(path, 2, np.random.default_rng(1))
+    verdict, _ = verify(read_bench_file(path), 2, np.random.default_rng(1))
     (proposal,) = [reason for reason in verdict.reasons if reason.startswith("the codes alone")]
     assert ("bit_stealing" in proposal) == stealing
     assert "a monitor calibrated on more bits" in proposal
     path.write_text(path.read_text().replace("[verify]", "bit_stealing = true\n[verify]"))
     if stealing:
-        assert verify(path, 1, np.random.default_rng(1))[1]["stars"] > 0
+        assert verify(read_bench_file(path), 1, np.random.default_rng(1))[1]["stars"] > 0
     else:
         with pytest.raises(InputError, match="bit stealing wants the primaries"):
-            verify(path, 1, np.random.default_rng(1))
+            verify(read_bench_file(path), 1, np.random.default_rng(1))
 
 
 def test_a_true_monitor_that_is_known_in_grey_alone_refuses_bit_stealing_too(tmp_path):
@@ -286,6 +287,6 @@ def test_a_true_monitor_that_is_known_in_grey_alone_refuses_bit_stealing_too(tmp
     (tmp_path / "monitor.toml").write_text(f"[calibration]\n{head}")
     lines = 'centroid_px = 1e-4\ntrue_calibration = "monitor.toml"\n'
     path = bench_file(tmp_path, lines, bits=8, method="round", calibration="gamma2.2")
-    verdict, _ = verify(path, 2, np.random.default_rng(1))
+    verdict, _ = verify(read_bench_file(path), 2, np.random.default_rng(1))
     assert not any("bit_stealing" in reason for reason in verdict.reasons)
     assert any(reason.startswith("the codes alone") for reason in verdict.reasons)

@@ -1,0 +1,58 @@
+"""The bench file of a run: read once, so that whatever the run does, it does on the bytes that were checked."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+
+from hilstar.bench.config import BenchConfig, parse_config
+from hilstar.errors import InputError
+from hilstar.monitor.calibration import BUILT_IN
+from hilstar.reading import MAX_TOML_BYTES, read_bytes, read_text
+from hilstar.sky.catalog import MAX_CATALOGUE_BYTES
+from hilstar.sky.spectrum import BUILT_IN_CURVES
+
+
+@dataclass(frozen=True, slots=True)
+class BenchFile:
+    """A bench file as it was when it was read: its text, and the checked configuration of that text.
+
+    `sha256` covers everything that makes the bench's frames: its settings, defaults included, and the files it names.
+    """
+
+    path: Path
+    text: str
+    config: BenchConfig
+    sha256: str
+
+    @property
+    def folder(self) -> Path:
+        """The folder to which the paths in the file are relative."""
+        return self.path.parent
+
+
+def read_bench_file(path: Path) -> BenchFile:
+    """Read and check a bench file. Raises InputError: file, key, what is wrong and what to write."""
+    text = read_text(path, "give the path of a bench file", MAX_TOML_BYTES)
+    config = parse_config(path, text)
+    return BenchFile(path, text, config, _sha256(config, path.parent))
+
+
+def _sha256(config: BenchConfig, folder: Path) -> str:
+    digest = hashlib.sha256(msgspec.json.encode(config, order="sorted"))
+    named = (config.tracker.quantum_efficiency, config.tracker.transmission, config.sky.catalogue, config.monitor.calibration)
+    for name in named:
+        if isinstance(name, str) and name not in (*BUILT_IN_CURVES, *BUILT_IN, "hipparcos"):
+            digest.update(_named_bytes(folder / name))
+    return digest.hexdigest()
+
+
+def _named_bytes(path: Path) -> bytes:
+    """The content of a file that the bench file names; empty where it cannot be read, which its own reader explains better."""
+    try:
+        return read_bytes(path, "", MAX_CATALOGUE_BYTES)
+    except InputError:
+        return b""

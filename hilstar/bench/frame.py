@@ -1,0 +1,238 @@
+"""From an attitude to a frame: sprites, the linear image, code values."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+import numpy.typing as npt
+
+from hilstar.arrays import Float32Array, FloatArray, IntArray
+from hilstar.attitude.wire.protocol import NORM_TOLERANCE
+from hilstar.bench.bench_file import BenchFile
+from hilstar.bench.config import BenchConfig, Vector
+from hilstar.bench.effort import Effort
+from hilstar.bench.truth import truth_table
+from hilstar.errors import InputError
+from hilstar.monitor.calibration import Calibration
+from hilstar.monitor.footprints import FootprintMap
+from hilstar.monitor.losses import star_losses
+from hilstar.monitor.quantise import Panel
+from hilstar.monitor.response import Codes, code_dtype
+from hilstar.render.renderer import Renderer
+from hilstar.rotation import normalise, to_matrix
+from hilstar.scene.camera import Camera
+from hilstar.scene.clipping import clipped_sprites
+from hilstar.scene.frame_motion import Scan, Turn, swept_sprites
+from hilstar.scene.psf import pixel_shares
+from hilstar.scene.sprites import Sprites, make_sprites
+from hilstar.sky.stars import Stars, split_by_rate
+
+WARM_UP_ATTITUDE = np.array([1.0, 0.0, 0.0, 0.0])
+WARM_UP_RATE_RAD_S = np.array([0.1, 0.0, 0.0])
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One frame: what each monitor pixel should cause, the codes that ask for it, and the stars behind it.
+
+    `linear` is float32 (height, width), electrons per second; `levels`, uint8 or uint16 of the same shape, are indices into
+    the response's table; `codes` are the code values, the same array or with bit stealing (height, width, 3);
+    `truth` is a structured array of TRUTH_DTYPE, a row for each star whose sprite touches the monitor.
+    """
+
+    q_icrs_to_cam: FloatArray
+    linear: Float32Array
+    levels: Codes
+    codes: Codes
+    truth: npt.NDArray[np.void]
+
+
+class Drawn:
+    """A frame on the GPU: its sprites (None: blank), and the HIP numbers of the stars that are too bright for the monitor."""
+
+    def __init__(self, renderer: Renderer, sprites: Sprites | None, clipped_hip: tuple[int, ...] = ()) -> None:
+        self.sprites = sprites
+        self.clipped_hip = clipped_hip
+        self.star_count = 0 if sprites is None else sprites.star_count
+        self._renderer = renderer
+
+    @property
+    def capped(self) -> int:
+        """How many stars' paths are coarser than they should be (see `scene.frame_motion`)."""
+        return 0 if self.sprites is None else self.sprites.capped
+
+    @property
+    def rate_cam_rad_s(self) -> FloatArray | None:
+        """The turn along which the stars' paths were drawn (3,), cam components; None where they are points."""
+        return None if self.sprites is None else self.sprites.rate_cam_rad_s
+
+    @cached_property
+    def levels(self) -> Codes:
+        """The levels (see `Bench.code_values`), read back when they are first asked for; the next draw overwrites them."""
+        return self._renderer.codes()
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Bench:
+    """A bench, assembled (see `build`): stars, geometry, light and a renderer. Free it with `close`.
+
+    `config` is that of `file` with everything chosen that the file left to its tolerance (`effort`, None where it left
+    nothing). Of `stars` those from `faintest_shown_e_per_s` on can light a pixel: `shown_stars`; the others are
+    `faint_stars`. `uniformity`, float32 (height, width), is each pixel's share of white, None where that is 1 everywhere, and
+    `darkest` its minimum.
+    """
+
+    file: BenchFile
+    config: BenchConfig
+    effort: Effort | None
+    camera: Camera
+    scan: Scan
+    calibration: Calibration
+    uniformity: Float32Array | None
+    darkest: float
+    flux_at_white_e_per_s: float
+    faintest_shown_e_per_s: float
+    stars: Stars
+    shown_stars: Stars
+    faint_stars: Stars
+    renderer: Renderer
+
+    def with_stars(self, stars: Stars) -> Bench:
+        """The same bench, and renderer, with other stars, all of which are shown."""
+        shown, none = split_by_rate(stars, 0.0)
+        return replace(self, stars=stars, shown_stars=shown, faint_stars=none)
+
+    @property
+    def panel(self) -> Panel:
+        """The monitor's light by its levels."""
+        return Panel(self.calibration.response, self.flux_at_white_e_per_s, self.uniformity)
+
+    @property
+    def _sigma_px(self) -> tuple[float, float]:
+        return self.config.render.sprite_sigma_px
+
+    def sprites(self, q_icrs_to_cam: FloatArray, stars: Stars | None = None) -> Sprites:
+        """The sprites of `stars` (those that can be seen, by default) at an attitude (unit quaternion, scalar first)."""
+        stars = self.shown_stars if stars is None else stars
+        icrs_to_image = self.camera.cam_to_image @ to_matrix(q_icrs_to_cam)
+        return make_sprites(stars, icrs_to_image, self.camera, self.renderer.footprint_px)
+
+    def draw(
+        self, q_icrs_to_cam: FloatArray | None, frame: int = 0, rate_cam_rad_s: Vector | FloatArray | None = None
+    ) -> Drawn:
+        """Draw the levels for an attitude; None gives a blank frame. The frame path: no copy, no table.
+
+        `frame` counts the frames shown, for temporal dithering. With a rate that moves stars by more than
+        `[render] motion_above_px` each is drawn along its path while its row is lit; the attitude is then that of the middle
+        row's first light.
+        """
+        return self.draw_sprites(self.frame_sprites(q_icrs_to_cam, rate_cam_rad_s), frame)
+
+    def frame_sprites(
+        self, q_icrs_to_cam: FloatArray | None, rate_cam_rad_s: Vector | FloatArray | None = None
+    ) -> Sprites | None:
+        """The sprites of a frame (see `draw`), before anything is drawn; None for a blank one."""
+        if q_icrs_to_cam is None:
+            return None
+        turn = self._turn(q_icrs_to_cam, rate_cam_rad_s)
+        return self.sprites(q_icrs_to_cam) if turn is None else self._swept(turn)
+
+    def draw_sprites(self, sprites: Sprites | None, frame: int = 0) -> Drawn:
+        """Draw the levels of a frame's sprites."""
+        self.renderer.draw(sprites, frame)
+        clipped = None if sprites is None else self._clipped(sprites)
+        if sprites is None or clipped is None or not len(clipped):
+            return Drawn(self.renderer, sprites)
+        return Drawn(self.renderer, sprites, tuple(self.shown_stars.hip[np.unique(sprites.star[clipped])].tolist()))
+
+    def _turn(self, q_icrs_to_cam: FloatArray, rate_cam_rad_s: Vector | FloatArray | None) -> Turn | None:
+        """The motion of a frame, None where no star moves far enough to be seen."""
+        if rate_cam_rad_s is None:
+            return None
+        turn = Turn(q_icrs_to_cam, np.asarray(rate_cam_rad_s, dtype=np.float64))
+        motion_px = turn.speed_rad_s * self.scan.longest_s * self.camera.focal_length_px
+        return turn if motion_px > self.config.render.motion_above_px else None
+
+    def _swept(self, turn: Turn) -> Sprites:
+        sprites = swept_sprites(self.shown_stars, turn, self.scan, self.camera, self.renderer.footprint_px, self._sigma_px)
+        return replace(sprites, rate_cam_rad_s=turn.rate_cam_rad_s)
+
+    def count_faint(self, q_icrs_to_cam: FloatArray) -> int:
+        """How many stars in view at an attitude are too faint for the monitor."""
+        return len(self.sprites(q_icrs_to_cam, self.faint_stars)) if len(self.faint_stars) else 0
+
+    def warm_up(self) -> None:
+        """Draw once with paths, with stars and with none: a driver compiles its shaders at first use, 60 ms on llvmpipe.
+
+        SciPy's functions too are imported at first use, 0.1 s: the first star that might clip would cost that frame.
+        """
+        pixel_shares(np.zeros(1), 1.0)
+        for q, rate in ((WARM_UP_ATTITUDE, WARM_UP_RATE_RAD_S), (WARM_UP_ATTITUDE, None), (None, None)):
+            _ = self.draw(q, 0, rate).levels
+
+    def frame(self, q_icrs_to_cam: Sequence[float] | FloatArray, number: int = 0) -> Frame:
+        """Draw one frame and bring everything about it back; the arrays are the caller's own.
+
+        Stars too faint for the monitor are in the linear image and the truth, and not drawn. `number` counts frames, for
+        temporal dithering. Raises InputError for a quaternion that is not unit within 1e-3.
+        """
+        q = checked_quaternion(q_icrs_to_cam)
+        sprites = self.sprites(q, self.stars)
+        self.renderer.draw(self.sprites(q), number)
+        levels = self.renderer.codes().copy()
+        if len(self.faint_stars) or self.renderer.target.sides:
+            self.renderer.draw(sprites, number, whole=True)
+        linear = self.renderer.linear().copy()
+        truth = truth_table(self.stars, sprites.star, sprites.x_px, sprites.y_px)
+        truth["drawn"] = truth["electrons_per_s"] >= self.faintest_shown_e_per_s
+        truth["clipped"][self._clipped(sprites)] = True
+        return Frame(q, linear, levels, self.code_values(levels), truth[np.argsort(truth["v_mag"], kind="stable")])
+
+    def losses_mag(self, frame: Frame) -> dict[int, float]:
+        """By HIP, the magnitudes that each clipped star of a frame is too faint by, its light summed over its own pixels."""
+        hips = set(frame.truth["hip"][frame.truth["clipped"]].tolist())
+        if not hips:
+            return {}
+        sprites = self.sprites(frame.q_icrs_to_cam)
+        footprints = FootprintMap(self.camera.resolution_px, self._sigma_px)
+        loss_mag = star_losses(sprites, self.panel, footprints, frame.levels).loss_mag
+        hip = self.shown_stars.hip[sprites.star].tolist()
+        return {h: float(loss) for h, loss in zip(hip, loss_mag, strict=True) if h in hips}
+
+    def code_values(self, levels: Codes) -> Codes:
+        """The monitor's code values of levels (height, width): the same, or (height, width, 3) with bit stealing."""
+        rgb = self.calibration.response.rgb
+        if rgb is None:
+            return levels
+        return np.asarray(rgb[levels], dtype=code_dtype(self.calibration.response.bits))
+
+    def _clipped(self, sprites: Sprites) -> IntArray:
+        size_px = self.camera.resolution_px
+        return clipped_sprites(sprites, self._sigma_px, self.flux_at_white_e_per_s, size_px, self.uniformity, self.darkest)
+
+    def close(self) -> None:
+        """Free the GL context."""
+        self.renderer.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+
+def checked_quaternion(q: Sequence[float] | FloatArray) -> FloatArray:
+    """`q` (w, x, y, z) as a float64 unit array. Raises InputError where it is not unit within 1e-3."""
+    array = np.asarray(q, dtype=np.float64)
+    if array.shape != (4,):
+        raise InputError(f"quaternion of shape {array.shape}: write four numbers w, x, y, z")
+    norm = math.hypot(*array)  # without NumPy's warning where it overflows
+    if not abs(norm - 1.0) <= NORM_TOLERANCE:
+        raise InputError(f"quaternion {array.tolist()}: its norm is {norm:.6g}; write a unit quaternion w, x, y, z")
+    return normalise(array)

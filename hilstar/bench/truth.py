@@ -1,0 +1,35 @@
+"""The truth of an image: which stars are in it, where, and how bright."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from hilstar.arrays import FloatArray, IntArray
+from hilstar.sky.stars import Stars
+
+TRUTH_DTYPE = np.dtype(
+    [
+        ("hip", "i4"),
+        ("x_px", "f8"),
+        ("y_px", "f8"),
+        ("v_mag", "f8"),
+        ("bv", "f8"),
+        ("temperature_k", "f8"),
+        ("electrons_per_s", "f8"),
+        ("drawn", "?"),
+        ("clipped", "?"),
+    ]
+)
+
+
+def truth_table(stars: Stars, star: IntArray, x_px: FloatArray, y_px: FloatArray) -> npt.NDArray[np.void]:
+    """Rows of TRUTH_DTYPE for the stars at the indices `star` (n,) of `stars`: all drawn, none clipped yet."""
+    truth = np.zeros(len(star), dtype=TRUTH_DTYPE)
+    truth["hip"] = stars.hip[star]
+    truth["x_px"], truth["y_px"] = x_px, y_px
+    truth["v_mag"], truth["bv"] = stars.v_mag[star], stars.bv_mag[star]
+    truth["temperature_k"] = stars.temperature_k[star]
+    truth["electrons_per_s"] = stars.electrons_per_s[star]
+    truth["drawn"] = True
+    return truth

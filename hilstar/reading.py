@@ -31,6 +31,7 @@ NOT_FILES = {
     stat.S_ISCHR: "is a device",
     stat.S_ISBLK: "is a device",
 }
+MCAP_MAGIC = b"\x89MCAP0\r\n"
 # What begins a file of a kind that people have beside attitude logs and benches.
 MAGIC = {
     b"ULog\x01": "a ULog file",
@@ -40,7 +41,7 @@ MAGIC = {
     b"NAIF/": "a SPICE kernel",
     b"SQLite format 3\x00": "an SQLite database (a db3 bag of ROS 2)",
     b"#ROSBAG V": "a ROS 1 bag",
-    b"\x89MCAP0\r\n": "an MCAP file",
+    MCAP_MAGIC: "an MCAP file",
     b"\x89HDF\r\n\x1a\n": "an HDF5 file",
     b"SIMPLE  =": "a FITS file",
     b"PK\x03\x04": "a zip archive",

@@ -1,9 +1,9 @@
-"""How a log's samples join: a log is no stream, so its own usual interval says what a gap is, and never a bench's stale limit.
+"""How a log's samples join: its own usual interval says what a gap is, never the stale limit of a live stream.
 
-1. Before a discontinuity the attitude stands still.
-2. Rates on both sides that fit the turn between two samples are blended, however long the interval.
+1. Before a discontinuity the attitude is held.
+2. Two samples whose rates fit the turn between them are blended, however long the interval.
 3. Other samples are joined by SLERP, the shorter way.
-4. But an interval of more than GAP_INTERVALS usual ones is a gap: nobody knows what was in it, and the attitude is held.
+4. But an interval of more than GAP_INTERVALS usual ones is a gap: the attitude within it is unknown, and is held.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.rotation import conjugate, multiply
 from hilstar.units import NS_PER_S
 
-GAP_INTERVALS = 5  # usual (median) intervals; four packets lost in a row are no gap
-# Rates fit where their mean turns the one attitude into the other within this share of the turn. That of a sine is
-# (2 pi / samples in a period)^2 / 12 off: seven samples in a period still fit.
+GAP_INTERVALS = 5  # usual (median) intervals; four packets lost in a row are not a gap
+# Rates fit where their mean turns one attitude into the other within this share of the turn. For a sine the mean is off by
+# (2 pi / samples per period)^2 / 12: seven samples per period still fit.
 FIT_SHARE, GAP_FIT_SHARE = 0.2, 0.02
-FIT_RAD, GAP_FIT_RAD = 0.5, np.radians(1.0)  # and at most this: after many turns a share of them says nothing
-ALIKE_RAD = np.radians(1 / 3600)  # so near, no way of joining differs from another
+FIT_RAD, GAP_FIT_RAD = 0.5, np.radians(1.0)  # and at most this: after many turns a share of them means nothing
+ALIKE_RAD = np.radians(1 / 3600)  # this close, all ways of joining agree
 NO_GAPS: frozenset[int] = frozenset()
 
 
 @dataclass(frozen=True, slots=True)
 class LogJoins:
-    """How each sample of a log joins the next, and what is to be told of it; the sets hold times of samples before."""
+    """How each sample of a log joins the next, and what the user must know of it; the sets hold the earlier sample's t_ns."""
 
     blended_ns: frozenset[int] = NO_GAPS
     held_ns: frozenset[int] = NO_GAPS
@@ -47,19 +47,20 @@ class LogJoins:
 
     @property
     def told(self) -> list[tuple[str, str]]:
-        """Kind and line of each thing that a person must know."""
+        """The kind and the text of each notice for the user."""
         lines = []
         if self.held_ns:
-            count, usual = len(self.held_ns), f"{GAP_INTERVALS} times its usual {self.usual_s:.6g} s"
-            gaps = "1 gap" if count == 1 else f"{count} gaps"
-            lines.append(("log-gap", f"the log has {gaps}, the longest of {self.longest_s:.6g} s, held: more than {usual}"))
+            gaps = "1 gap" if len(self.held_ns) == 1 else f"{len(self.held_ns)} gaps"
+            sizes = f"the longest {self.longest_s:.6g} s (over {GAP_INTERVALS} times its usual {self.usual_s:.6g} s)"
+            lines.append(("log-gap", f"the log has {gaps}, {sizes}; the attitude is held there"))
         if self.misfits:
-            lines.append(("log-rates", f"the log's rates do not fit its attitudes in {self.misfits} intervals: not used there"))
+            misfits = f"in {self.misfits} intervals the log's rates do not fit its attitudes"
+            lines.append(("log-rates", f"{misfits}, and are ignored there"))
         return lines
 
 
 def log_joins(samples: Sequence[AttitudeSample]) -> LogJoins:
-    """How the samples of a log, whose times rise, join."""
+    """How the samples of a log join; their times must increase."""
     if len(samples) < 2:
         return LogJoins()
     t_ns = np.array([sample.t_ns for sample in samples], dtype=object)
@@ -81,7 +82,7 @@ def log_joins(samples: Sequence[AttitudeSample]) -> LogJoins:
 def _fits(
     samples: Sequence[AttitudeSample], seconds: FloatArray, gap: npt.NDArray[np.bool_]
 ) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
-    """Of each interval, (n,): whether both samples have rates, and whether those fit the turn from one to the other."""
+    """For each interval, (n,): whether both samples have rates, and whether those fit the turn between them."""
     nothing = np.full(3, np.nan)
     rate = np.array([nothing if s.rate_cam_rad_s is None else s.rate_cam_rad_s for s in samples])
     q = np.array([sample.q_icrs_to_cam for sample in samples])

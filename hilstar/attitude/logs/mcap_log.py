@@ -1,4 +1,4 @@
-"""Attitudes in an MCAP file: one JSON message each on `/attitude`, as Foxglove and PlotJuggler open it."""
+"""Attitudes in an MCAP file: one JSON message each on `/attitude`, which Foxglove and PlotJuggler open."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from hilstar.errors import InputError
 
 ATTITUDE_TOPIC = "/attitude"
 ATTITUDE_SCHEMA_NAME = "hilstar.Attitude"
-# Plain types only: Foxglove refuses a whole file over ["integer", "null"]. What is not known is null in the message.
+# Plain types only: Foxglove refuses a whole file over ["integer", "null"]. Unknown values are null in the message.
 ATTITUDE_SCHEMA = msgspec.json.encode(
     {
         "title": ATTITUDE_SCHEMA_NAME,
         "type": "object",
         "properties": {
-            "t_ns": {"type": "integer", "description": "sender's clock, ns; null in a message that was refused"},
-            "sequence": {"type": "integer", "description": "sender's counter; null in a message that was refused"},
+            "t_ns": {"type": "integer", "description": "sender's clock, ns; null in a refused message"},
+            "sequence": {"type": "integer", "description": "sender's counter; null in a refused message"},
             "q": {"type": "array", "items": {"type": "number"}, "description": "q_icrs_to_cam: w, x, y, z; null when refused"},
             "rate": {"type": "array", "items": {"type": "number"}, "description": "of cam in icrs, cam axes, rad/s; or null"},
-            "discontinuity": {"type": "boolean", "description": "do not interpolate from the attitude before"},
-            "receive_ns": {"type": "integer", "description": "receiver's clock at arrival, ns; null when it was not received"},
+            "discontinuity": {"type": "boolean", "description": "do not interpolate from the previous attitude"},
+            "receive_ns": {"type": "integer", "description": "receiver's clock at arrival, ns; null when not received"},
             "accepted": {"type": "boolean"},
             "reason": {"type": "string", "description": "why it was refused; or null"},
             "raw": {"type": "string", "description": "the packet as received, in hexadecimal; or null"},
@@ -55,7 +55,7 @@ _encoder = msgspec.json.Encoder()
 
 
 def attitude_message(sample: AttitudeSample, receive_ns: int | None = None, raw: bytes | None = None) -> bytes:
-    """The JSON of a sample that was taken; `receive_ns` is the receiver's clock, `raw` the packet as it came."""
+    """The JSON of an accepted sample; `receive_ns` is the receiver's clock at arrival, `raw` the packet as received."""
     q, rate = sample.q_icrs_to_cam.tolist(), sample.rate_cam_rad_s
     turning = None if rate is None else tuple(rate.tolist())
     packet = None if raw is None else raw.hex()
@@ -63,7 +63,7 @@ def attitude_message(sample: AttitudeSample, receive_ns: int | None = None, raw:
 
 
 def refused_message(reason: str, detail: str, receive_ns: int | None, raw: bytes | None) -> bytes:
-    """The JSON of a packet that was refused, its reason and detail as "reason: detail"."""
+    """The JSON of a refused packet, with "reason: detail"."""
     packet = None if raw is None else raw.hex()
     return _encoder.encode(
         _Form(None, None, None, receive_ns=receive_ns, accepted=False, reason=f"{reason}: {detail}", raw=packet)
@@ -77,7 +77,7 @@ def register_attitudes(writer: Writer) -> int:
 
 
 def log_time_ns(t_ns: int, receive_ns: int | None = None) -> int:
-    """The unsigned log time of a message: `receive_ns` where known, else `t_ns`, and 0 for what lies before 0."""
+    """The unsigned log time of a message: `receive_ns` where known, else `t_ns`, and 0 for negative times."""
     return max(0, t_ns if receive_ns is None else receive_ns)
 
 
@@ -94,10 +94,10 @@ def write_attitudes(file: IO[bytes], samples: Sequence[AttitudeSample]) -> None:
 
 
 def read_attitudes(path: Path) -> Iterator[AttitudeSample]:
-    """The samples that were accepted, in the order of the file; other channels and refused packets are passed over.
+    """The accepted samples in the order of the file; other channels and refused packets are skipped.
 
-    A file whose writer was killed gives everything before its last, unfinished chunk. Raises InputError for damage and
-    for a message that is no attitude.
+    A file whose writer was killed gives everything before its last, unfinished chunk. Raises InputError for damage, and for a
+    message that is not an attitude.
     """
     for number, data in enumerate(read_messages(path, ATTITUDE_TOPIC), start=1):
         entry = _sample(data)
@@ -111,9 +111,9 @@ def _sample(data: bytes) -> AttitudeSample | Refusal | None:
     try:
         form = _decoder.decode(data)
     except (msgspec.MsgspecError, RecursionError, UnicodeDecodeError) as error:
-        return Refusal("format", f"is not an attitude of hilstar ({error})")
+        return Refusal("format", f"is not a hilstar attitude ({error})")
     if not form.accepted:
         return None
     if form.t_ns is None or form.q is None:
-        return Refusal("format", "is accepted, but has no t_ns or no q")
+        return Refusal("format", "is accepted, but lacks t_ns or q")
     return checked_sample(form.t_ns, form.q, form.rate, form.sequence or 0, form.discontinuity)

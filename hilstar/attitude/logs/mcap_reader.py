@@ -1,7 +1,7 @@
-"""MCAP files read in order, in bounded memory, up to where their writer was killed.
+"""MCAP files read in order and in bounded memory, up to where their writer was killed.
 
-A chunk says how large it becomes, and may lie: it is unpacked to that size and no further, and a whole file to so many times
-its own. What is damaged is refused, with one line.
+A chunk states its unpacked size, which may be false: it is unpacked to that size and no further, and a whole file to at most
+MAX_INFLATION times its own. A damaged file is refused in one line.
 """
 
 from __future__ import annotations
@@ -21,10 +21,9 @@ from mcap.exceptions import RecordLengthLimitExceeded
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, McapRecord, Message, Metadata
 from mcap.stream_reader import StreamReader
-from mcap.writer import MCAP0_MAGIC
 
 from hilstar.errors import InputError
-from hilstar.reading import open_regular, size_text
+from hilstar.reading import MCAP_MAGIC, open_regular, size_text
 
 RUN_METADATA = "hilstar"  # the name of a ledger's head
 ADVICE = "give an MCAP file, such as the ledger of a run"
@@ -40,16 +39,16 @@ class DamageError(Exception):
 
 
 class TooLargeError(DamageError):
-    """More than is read."""
+    """More than the limits allow."""
 
 
 def part_path(path: Path, part: int) -> Path:
-    """Where part 1, 2, ... of a run is kept whose ledger begins at `path`: RUN.0001.mcap and on."""
+    """The name of part 1, 2, ... of a run whose ledger begins at `path`: RUN.0001.mcap and on."""
     return path.with_name(f"{path.stem}.{part:04d}{path.suffix}") if part else path
 
 
 def parts_of(path: Path) -> list[Path]:
-    """The files of a run whose ledger begins at `path`; the file alone where it is no first one. Raises InputError."""
+    """The files of a run whose ledger begins at `path`; the file alone where it is not a first part. Raises InputError."""
     head = read_metadata(path, RUN_METADATA)
     parts = [path]
     while head.get("part") == "0" and (following := part_path(path, len(parts))).is_file():
@@ -63,7 +62,7 @@ def parts_of(path: Path) -> list[Path]:
 def read_topics(path: Path) -> Iterator[tuple[str, bytes]]:
     """Topic and content of every message of a run's files, in their order, up to where its writer was killed.
 
-    Raises InputError for damage, and for what is no regular file.
+    Raises InputError for damage, and for anything but a regular file.
     """
     for part in parts_of(path):
         channels: dict[int, str] = {}
@@ -93,7 +92,7 @@ def is_mcap(path: Path) -> bool:
     """True for a regular file that begins as MCAP does; False too where it cannot be read."""
     try:
         with open_regular(path, ADVICE) as file:
-            return file.read(len(MCAP0_MAGIC)) == MCAP0_MAGIC
+            return file.read(len(MCAP_MAGIC)) == MCAP_MAGIC
     except (InputError, OSError):
         return False
 
@@ -104,7 +103,7 @@ def _records(path: Path) -> Iterator[McapRecord]:
 
 
 class _Capped:
-    """A file that is asked for no more than it has: a record's length may be anything."""
+    """A file that is never asked for more than it has, whatever length a record states."""
 
     def __init__(self, file: IO[bytes], size: int) -> None:
         self._file, self.left = file, size
@@ -112,7 +111,7 @@ class _Capped:
     def read(self, length: int) -> bytes:
         """At most `length` bytes. Raises TooLargeError for a record of more than are read."""
         if MAX_RECORD_BYTES < length <= self.left:
-            raise TooLargeError(f"a record of {size_text(length)}; {size_text(MAX_RECORD_BYTES)} at most are read")
+            raise TooLargeError(f"a record of {size_text(length)}; at most {size_text(MAX_RECORD_BYTES)} are read")
         data = self._file.read(min(length, self.left))
         self.left -= len(data)
         return data
@@ -120,8 +119,8 @@ class _Capped:
 
 def _open_records(path: Path, file: IO[bytes]) -> Iterator[McapRecord]:
     size = file.seek(0, os.SEEK_END)
-    file.seek(max(0, size - len(MCAP0_MAGIC)))
-    finished = size > 2 * len(MCAP0_MAGIC) and file.read() == MCAP0_MAGIC
+    file.seek(max(0, size - len(MCAP_MAGIC)))
+    finished = size > 2 * len(MCAP_MAGIC) and file.read() == MCAP_MAGIC
     file.seek(0)
     capped = _Capped(file, size)
     reader = StreamReader(capped, emit_chunks=True, validate_crcs=True, record_size_limit=size)  # type: ignore[arg-type]
@@ -134,7 +133,7 @@ def _open_records(path: Path, file: IO[bytes]) -> Iterator[McapRecord]:
             if isinstance(record, Chunk):
                 inner = [_unpacked(record, room)]
                 room -= len(inner[0])
-        except Exception as error:  # the reader lets through what struct, zstd, lz4 and UTF-8 raise
+        except Exception as error:  # the reader passes on what struct, zstd, lz4 and UTF-8 raise
             cut_off = isinstance(error, RecordLengthLimitExceeded) or not capped.left
             if cut_off and not finished and not isinstance(error, TooLargeError):
                 return
@@ -158,10 +157,10 @@ def _refused(path: Path, file: IO[bytes], error: Exception) -> InputError:
 
 
 def _unpacked(chunk: Chunk, room: int) -> bytes:
-    """What a chunk holds, which has the size and the CRC that it says."""
+    """A chunk's content, once its size and CRC are those that it states."""
     size = chunk.uncompressed_size
     if size > MAX_CHUNK_BYTES:
-        raise TooLargeError(f"a chunk of {size_text(size)}; {size_text(MAX_CHUNK_BYTES)} at most are unpacked")
+        raise TooLargeError(f"a chunk of {size_text(size)}; at most {size_text(MAX_CHUNK_BYTES)} are unpacked")
     if size > room:
         raise TooLargeError(f"unpacks to more than {MAX_INFLATION} times its size")
     if chunk.compression == "zstd":
@@ -174,9 +173,9 @@ def _unpacked(chunk: Chunk, room: int) -> bytes:
     else:
         data = chunk.data
     if len(data) != size:
-        raise DamageError(f"a chunk holds {'more' if len(data) > size else 'less'} than the {size} bytes that it says")
+        raise DamageError(f"a chunk contains {'more' if len(data) > size else 'less'} than the {size} bytes that it states")
     if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
-        raise DamageError("the CRC-32 of a chunk does not fit it")
+        raise DamageError("the CRC-32 of a chunk does not match")
     return data
 
 

@@ -2,10 +2,10 @@
 
 Laws:
 1. A chunk is on the disk whole, with its CRC, or the file ends before it: a write that fails leaves the file as it was.
-2. Messages that could not be written are still there for the next try, until they are dropped by topic.
-3. Memory does not grow with the file, but for an index of at most INDEX_BYTES; a longer file goes without one.
+2. Messages that could not be written are kept for the next attempt, until they are dropped by topic.
+3. Memory does not grow with the file, except for an index of at most MAX_INDEX_BYTES; a longer file has none.
 
-The library's writer keeps neither 1 nor 2, and its index grows by a megabyte in ten minutes of such chunks.
+The library's writer obeys neither 1 nor 2, and its index grows by a megabyte in ten minutes of such chunks.
 """
 
 from __future__ import annotations
@@ -36,9 +36,10 @@ from mcap.records import (
     Statistics,
     SummaryOffset,
 )
-from mcap.writer import MCAP0_MAGIC
 
-INDEX_BYTES = 16_000_000  # of about six hours of five chunks a second
+from hilstar.reading import MCAP_MAGIC
+
+MAX_INDEX_BYTES = 16_000_000  # of about six hours of five chunks a second
 LEVEL = 3  # of zstd
 _message_head = struct.Struct("<BQHIQQ")
 _footer_head = struct.Struct("<BQQQ")
@@ -72,27 +73,27 @@ class McapWriter:
         self._times_ns: tuple[int, int] | None = None
         self._compressor = zstandard.ZstdCompressor(level=LEVEL)
         head = Metadata(metadata_name, dict(metadata))
-        before = MCAP0_MAGIC + _bytes_of(Header("", "hilstar"))
+        before = MCAP_MAGIC + _bytes_of(Header("", "hilstar"))
         whole = _bytes_of(head)
         self._metadata_index = MetadataIndex(len(before), len(whole), metadata_name)
-        # Not in the first chunk: most readers look for channels outside of chunks too, and these are never lost with one.
+        # Outside the first chunk: most readers also look for channels there, and these are never lost with a chunk.
         self._append(before + whole + _bytes_of(*self._schemas, *self._channels))
 
     def add(self, key: str, time_ns: int, data: bytes, sequence: int) -> None:
-        """Take in a message of the topic named `key`; it is written at the next flush."""
+        """Take a message of the topic named `key`; it is written at the next flush."""
         record = _message_head.pack(Opcode.MESSAGE, 22 + len(data), self._ids[key], sequence % 2**32, time_ns, time_ns) + data
         self._pending.append((self._ids[key], time_ns, record))
         self.pending_bytes += len(record)
 
     def drop(self, key: str | None = None) -> int:
-        """Forget the messages of a topic (None: of all) that are not written yet; how many they were."""
+        """Forget the messages of a topic (None: of all) that are not written yet; returns their number."""
         kept = [] if key is None else [entry for entry in self._pending if entry[0] != self._ids[key]]
         dropped = len(self._pending) - len(kept)
         self._pending, self.pending_bytes = kept, sum(len(record) for _, _, record in kept)
         return dropped
 
     def flush(self) -> None:
-        """Write what was added, as one chunk. Raises OSError; then the messages are still to be written."""
+        """Write what was added, as one chunk. Raises OSError, and keeps the messages."""
         if not self._pending:
             return
         data = b"".join(record for _, _, record in self._pending)
@@ -113,7 +114,7 @@ class McapWriter:
         summary, offset_start = self._summary(self.size_bytes + len(end))
         start = self.size_bytes + len(end)
         crc = zlib.crc32(_footer_head.pack(Opcode.FOOTER, 20, start, offset_start), zlib.crc32(summary))
-        self._append(end + summary + _bytes_of(Footer(start, offset_start, crc)) + MCAP0_MAGIC)
+        self._append(end + summary + _bytes_of(Footer(start, offset_start, crc)) + MCAP_MAGIC)
 
     def _message_indexes(self, place: int) -> tuple[bytes, dict[int, int]]:
         """The index of each channel's messages in the chunk, to be written at `place`, and where each begins."""
@@ -136,7 +137,7 @@ class McapWriter:
         self._times_ns = (first_ns, last_ns) if self._times_ns is None else _span(self._times_ns, (first_ns, last_ns))
         if self._indexed:
             self._index += _bytes_of(entry)
-        if len(self._index) > INDEX_BYTES:
+        if len(self._index) > MAX_INDEX_BYTES:
             self._indexed, self._index = False, bytearray()
 
     def _summary(self, place: int) -> tuple[bytes, int]:

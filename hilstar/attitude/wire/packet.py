@@ -28,6 +28,7 @@ CRC = struct.Struct("<I")
 LONGEST_JSON_BYTES = 4096
 INT64 = range(-(2**63), 2**63)
 U32 = 2**32
+JSON_FORM = '{"t_ns":..., "q":[w,x,y,z], "rate":[x,y,z]}'
 UNIT = 1e-15  # so near, a division by the norm would only move the last bit to and fro
 
 Reason = Literal["crc", "norm", "nan", "time", "format", "rate", "source"]
@@ -203,5 +204,5 @@ def _decode_json(message: bytes) -> AttitudeSample | Refusal:
     except (msgspec.MsgspecError, RecursionError, UnicodeDecodeError) as error:
         if b"NaN" in message or b"Infinity" in message:
             return Refusal("nan", "a number is NaN or Infinity")
-        return Refusal("format", f'{error}; {{"t_ns":..., "q":[w,x,y,z], "rate":[x,y,z]}} is wanted')
+        return Refusal("format", f"{error}; write {JSON_FORM}")
     return checked_sample(form.t_ns, form.q, form.rate, form.sequence, form.discontinuity)

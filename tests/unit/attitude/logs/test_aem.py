@@ -12,10 +12,11 @@ import pytest
 from ccsds_ndm.ndm_io import NdmIo
 from scipy.spatial.transform import Rotation
 
-from hilstar.attitude.logs.log_file import read_log, write_log
+from hilstar.attitude.logs.log_file import write_log
 from hilstar.attitude.wire.packet import AttitudeSample
-from hilstar.errors import InputError, MachineError
+from hilstar.errors import MachineError
 from hilstar.rotation import from_radec_roll_deg, propagate, to_matrix
+from tests.support.aem_messages import EPOCHS, kvn, read, refusal, rows_of
 
 # Quaternions are written with 17 digits here; a matrix from one is a sum of four products, a few roundings of 1.
 MATRIX_TOLERANCE = 1e-14
@@ -29,7 +30,6 @@ FRAME_BIAS_MAS = 23.15
 FRAME_BIAS_TOLERANCE_MAS = 0.01
 
 RATE_CAM_RAD_S = np.array([0.3, -1.1, 0.7])
-EPOCHS = ("2024-02-29T23:59:59.25", "2024-03-01T00:00:01")
 
 # CCSDS 504.0-B-2, figure G-4 (the lines that stand for omitted records are left out).
 FIGURE_G4 = """CCSDS_AEM_VERS = 2.0
@@ -81,36 +81,6 @@ DATA_START
 1996-12-28T21:28:00.5555 -0.25485 0.58745 -0.36845 0.67394
 DATA_STOP
 """
-
-
-def kvn(rows, version="1.0", **keywords):
-    """A message of one block; a keyword that is None is left out."""
-    meta = {"OBJECT_NAME": "X", "OBJECT_ID": "X", "REF_FRAME_A": "ICRF", "REF_FRAME_B": "SC_BODY_1"}
-    if version == "1.0":
-        meta |= {"ATTITUDE_DIR": "A2B", "QUATERNION_TYPE": "LAST"}
-    meta |= {"TIME_SYSTEM": "UTC", "START_TIME": EPOCHS[0], "STOP_TIME": EPOCHS[1], "ATTITUDE_TYPE": "QUATERNION"} | keywords
-    lines = [f"CCSDS_AEM_VERS = {version}", "CREATION_DATE = 2024-01-01T00:00:00", "ORIGINATOR = X"]
-    lines += ["META_START", *(f"{key} = {value}" for key, value in meta.items() if value is not None), "META_STOP"]
-    return "\n".join([*lines, "DATA_START", *rows, "DATA_STOP"]) + "\n"
-
-
-def rows_of(*numbers):
-    return [
-        " ".join([epoch, *map(repr, np.asarray(row, dtype=float).tolist())])
-        for epoch, row in zip(EPOCHS, numbers, strict=False)
-    ]
-
-
-def read(tmp_path, text):
-    (tmp_path / "log").write_text(text)
-    return read_log(tmp_path / "log")
-
-
-def refusal(tmp_path, text):
-    with pytest.raises(InputError) as caught:
-        read(tmp_path, text)
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
 
 
 def ccsds_quaternion(second_from_first):
@@ -277,7 +247,7 @@ REFUSED_BODY = ["RTN", "RSW", "TNW", "LVLH", "QSW", "NTW", "VNC", "ICRF", "EME20
 def test_other_frames_are_refused_with_both_names(tmp_path, a, b):
     for frame_a, frame_b in ((a, b), (b, a)):
         message = refusal(tmp_path, kvn(rows_of([0, 0, 0, 1]), REF_FRAME_A=frame_a, REF_FRAME_B=frame_b))
-        assert f"REF_FRAME_A = {frame_a}, REF_FRAME_B = {frame_b}; one has to be ICRF or EME2000" in message
+        assert f"REF_FRAME_A = {frame_a}, REF_FRAME_B = {frame_b}; one must be ICRF or EME2000" in message
 
 
 # Writing

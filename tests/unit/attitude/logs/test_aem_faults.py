@@ -7,12 +7,12 @@ import re
 import numpy as np
 import pytest
 
-from hilstar.attitude.logs import aem
+from hilstar.attitude.logs.aem import epochs
 from hilstar.attitude.logs.log_file import write_log
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.errors import InputError
 from hilstar.units import NS_PER_S
-from tests.unit.attitude.logs.test_aem import EPOCHS, kvn, read, refusal, rows_of
+from tests.support.aem_messages import EPOCHS, kvn, read, refusal, rows_of
 
 # Epochs
 
@@ -30,12 +30,12 @@ from tests.unit.attitude.logs.test_aem import EPOCHS, kvn, read, refusal, rows_o
     ],
 )
 def test_both_forms_of_epoch_are_read_to_the_nanosecond(text, t_ns):
-    assert aem.epoch_ns("", text) == t_ns
+    assert epochs.epoch_ns("", text) == t_ns
 
 
 def test_epochs_are_written_with_nine_digits():
-    assert aem.epoch_text(-1) == "1969-12-31T23:59:59.999999999"
-    assert aem.epoch_text(2**63 - 1) == "2262-04-11T23:47:16.854775807"
+    assert epochs.epoch_text(-1) == "1969-12-31T23:59:59.999999999"
+    assert epochs.epoch_text(2**63 - 1) == "2262-04-11T23:47:16.854775807"
 
 
 @pytest.mark.parametrize(
@@ -88,7 +88,7 @@ def test_blocks_may_share_an_epoch_and_the_earlier_then_ends_a_nanosecond_before
 
 def test_blocks_that_overlap_are_refused(tmp_path):
     text = two_blocks(["2024-01-01T00:00:00", "2024-01-01T00:00:05"], ["2024-01-01T00:00:03"])
-    assert "time does not rise" in refusal(tmp_path, text)
+    assert "time does not increase" in refusal(tmp_path, text)
 
 
 def test_blocks_of_two_time_systems_are_refused(tmp_path):
@@ -110,9 +110,9 @@ def test_other_types_are_refused_with_those_that_work(tmp_path, kind, version):
 @pytest.mark.parametrize(
     ("keywords", "word"),
     [
-        ({"ATTITUDE_DIR": None}, "ATTITUDE_DIR is not there; write A2B or B2A"),
+        ({"ATTITUDE_DIR": None}, "ATTITUDE_DIR is missing; write A2B or B2A"),
         ({"ATTITUDE_DIR": "UP"}, "ATTITUDE_DIR is UP"),
-        ({"QUATERNION_TYPE": None}, "QUATERNION_TYPE is not there; write FIRST or LAST"),
+        ({"QUATERNION_TYPE": None}, "QUATERNION_TYPE is missing; write FIRST or LAST"),
         ({"TIME_SYSTEM": None}, "TIME_SYSTEM is missing"),
         ({"REF_FRAME_A": None}, "REF_FRAME_A is missing"),
         ({"ATTITUDE_TYPE": None}, "ATTITUDE_TYPE is missing"),
@@ -126,7 +126,7 @@ def test_a_keyword_that_is_missing_or_wrong_is_named(tmp_path, keywords, word):
 @pytest.mark.parametrize(
     ("keywords", "word"),
     [
-        ({}, "RATE_FRAME is not there; write ICRF or SC_BODY_1"),
+        ({}, "RATE_FRAME is missing; write ICRF or SC_BODY_1"),
         ({"RATE_FRAME": "INSTRUMENT_A"}, "RATE_FRAME is INSTRUMENT_A"),
         ({"RATE_FRAME": "REF_FRAME_B", "EULER_ROT_SEQ": "321"}, "rates of Euler angles are not read"),
     ],
@@ -142,10 +142,10 @@ GOOD = kvn(rows_of([0, 0, 0, 1], [0, 0, 0, 1]))
 @pytest.mark.parametrize(
     ("text", "place", "word"),
     [
-        (GOOD.replace("VERS = 1.0", "VERS = 3.0"), "", "CCSDS_AEM_VERS is 3.0; 1.0 and 2.0 are read"),
+        (GOOD.replace("VERS = 1.0", "VERS = 3.0"), "", "CCSDS_AEM_VERS is 3.0; write 1.0 or 2.0"),
         (GOOD.replace("DATA_STOP\n", ""), ":18:", "cut off"),
         (GOOD[: GOOD.index("META_STOP")], ":14:", "the file ends in the metadata"),
-        ("CCSDS_AEM_VERS = 1.0\n", ":1:", "with 0 blocks"),
+        ("CCSDS_AEM_VERS = 1.0\n", ":1:", "with 0 complete blocks"),
         (GOOD.replace("DATA_START\n", ""), ":16:", "in the gap before DATA_START"),
         (GOOD.replace("META_STOP", "DATA_START"), ":15:", "DATA_START in the metadata"),
         (GOOD.replace("0.0 1.0\n", "0.0 1.0 0.0\n", 1), ":17:", "an epoch and 4 numbers"),
@@ -154,13 +154,13 @@ GOOD = kvn(rows_of([0, 0, 0, 1], [0, 0, 0, 1]))
         (GOOD.replace("0.0 1.0\n", "0.0 nan\n", 1), ":17:", "not finite"),
         (GOOD.replace("0.0 1.0\n", "0.0 1e308\n", 1), ":17:", "norm"),
         (GOOD.replace("0.0 1.0\n", "0.0 0.5\n", 1), ":17:", "norm"),
-        (GOOD.replace(EPOCHS[1], EPOCHS[0]), ":18:", "does not rise"),
+        (GOOD.replace(EPOCHS[1], EPOCHS[0]), ":18:", "does not increase"),
         (GOOD.replace("OBJECT_ID = X", "OBJECT_ID"), ":6:", "KEYWORD = value"),
-        (kvn([]), ":17:", "holds no attitude"),
+        (kvn([]), ":17:", "contains no attitude"),
         ("<aem", ":1:", "not well-formed"),
-        ("<aem/>", "", "no AEM in XML"),
-        ("<html><body/></html>", "", "no AEM in XML"),
-        ('<aem id="CCSDS_AEM_VERS" version="1.0"/>', "", "no AEM in XML"),
+        ("<aem/>", "", "not an AEM in XML"),
+        ("<html><body/></html>", "", "not an AEM in XML"),
+        ('<aem id="CCSDS_AEM_VERS" version="1.0"/>', "", "not an AEM in XML"),
         ('<!DOCTYPE aem [<!ENTITY x "y">]><aem id="CCSDS_AEM_VERS" version="1.0">&x;</aem>', "", "DOCTYPE"),
     ],
 )
@@ -175,9 +175,9 @@ def test_xml_that_is_cut_off_or_wrong_in_one_state_is_refused(tmp_path, caplog):
     write_log(tmp_path / "a.xml", samples)
     text = (tmp_path / "a.xml").read_text()
     assert "not well-formed" in refusal(tmp_path, text[: len(text) // 2])
-    assert "no AEM in XML" in refusal(tmp_path, text.replace("<QC>1.0<", "<QC>one<", 1))
-    assert "no AEM in XML" in refusal(tmp_path, text.replace("<QC>1.0</QC>", "", 1))
-    assert "no AEM in XML" in refusal(tmp_path, text.replace("<QC>1.0</QC>", "<QC>1.0</QC><QC>0.0</QC>", 1))
+    assert "not an AEM in XML" in refusal(tmp_path, text.replace("<QC>1.0<", "<QC>one<", 1))
+    assert "not an AEM in XML" in refusal(tmp_path, text.replace("<QC>1.0</QC>", "", 1))
+    assert "not an AEM in XML" in refusal(tmp_path, text.replace("<QC>1.0</QC>", "<QC>1.0</QC><QC>0.0</QC>", 1))
     assert not caplog.records
     assert ", 1970-01-01T00:00:00.000000002: the quaternion's norm" in refusal(
         tmp_path, "<QC>2.0</QC>".join(text.rsplit("<QC>1.0</QC>", 1))
@@ -192,30 +192,30 @@ def test_xml_that_is_cut_off_or_wrong_in_one_state_is_refused(tmp_path, caplog):
             "QUATERNION_TYPE = LAST",
             "QUATERNION_TYP = FIRST",
             ":10:",
-            "QUATERNION_TYP is no keyword .*; did you mean QUATERNION_TYPE",
+            "QUATERNION_TYP is not a keyword .*; did you mean QUATERNION_TYPE",
         ),
         (
             "ATTITUDE_DIR = A2B",
             "ATTITUDE_DIRECTION = B2A",
             ":9:",
-            "ATTITUDE_DIRECTION is no keyword .*; did you mean ATTITUDE_DIR",
+            "ATTITUDE_DIRECTION is not a keyword .*; did you mean ATTITUDE_DIR",
         ),
-        ("OBJECT_NAME = X", "object_name = X", ":5:", "object_name is no keyword .*; did you mean OBJECT_NAME"),
-        ("OBJECT_NAME = X", "WINDSPEED = 3", ":5:", "WINDSPEED is no keyword .*; known are OBJECT_NAME, "),
+        ("OBJECT_NAME = X", "object_name = X", ":5:", "object_name is not a keyword .*; did you mean OBJECT_NAME"),
+        ("OBJECT_NAME = X", "WINDSPEED = 3", ":5:", "WINDSPEED is not a keyword .*; the keywords are OBJECT_NAME, "),
         (
             "ORIGINATOR = X",
             "ORIGINATOR = X\nATTITUDE_DIR = B2A",
             ":4:",
             "ATTITUDE_DIR is in the header; it belongs in the metadata",
         ),
-        ("ATTITUDE_DIR = A2B", "ATTITUDE_DIR = A2B\nATTITUDE_DIR = B2A", ":9:", "ATTITUDE_DIR is there twice"),
+        ("ATTITUDE_DIR = A2B", "ATTITUDE_DIR = A2B\nATTITUDE_DIR = B2A", ":9:", "ATTITUDE_DIR appears twice"),
         ("META_START", "META_START\nORIGINATOR = Y", ":5:", "ORIGINATOR is in the metadata; it belongs in the header"),
     ],
 )
 def test_a_keyword_that_would_be_passed_over_is_refused_with_its_line(tmp_path, old, new, place, words):
     assert old in GOOD
     message = refusal(tmp_path, GOOD.replace(old, new, 1))
-    line = int(place.strip(":")) + (1 if "there twice" in words else 0)
+    line = int(place.strip(":")) + (1 if "appears twice" in words else 0)
     assert message.startswith(f"{tmp_path / 'log'}:{line}:"), message
     assert re.search(words, message), message
 
@@ -239,7 +239,9 @@ def test_an_element_that_would_be_passed_over_is_refused_with_its_line(tmp_path,
     lines = xml.splitlines()
     number = next(k for k, line in enumerate(lines, start=1) if "<QUATERNION_TYPE>" in line)
     message = refusal(tmp_path, xml.replace("QUATERNION_TYPE>", "QUATERNION_TYP>"))
-    assert message.startswith(f"{tmp_path / 'log'}:{number}: QUATERNION_TYP is no keyword of an AEM's metadata; did you mean")
+    assert message.startswith(
+        f"{tmp_path / 'log'}:{number}: QUATERNION_TYP is not a keyword of an AEM's metadata; did you mean"
+    )
 
 
 def test_one_aem_in_an_ndm_is_read_and_several_are_not(tmp_path, xml):
@@ -247,7 +249,7 @@ def test_one_aem_in_an_ndm_is_read_and_several_are_not(tmp_path, xml):
     samples = read(tmp_path, f"<ndm><MESSAGE_ID>1</MESSAGE_ID>{body}</ndm>")
     assert [s.t_ns for s in samples] == [0, 1, 2]
     for count, inside in ((0, ""), (2, body + body)):
-        assert f"the <ndm> holds {count} <aem>; one is wanted" in refusal(tmp_path, f"<ndm>{inside}</ndm>")
+        assert f"the <ndm> contains {count} <aem>; write one" in refusal(tmp_path, f"<ndm>{inside}</ndm>")
 
 
 @pytest.mark.parametrize("part", ["segment", "metadata", "data", "body", "header"])

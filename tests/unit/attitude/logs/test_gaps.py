@@ -77,7 +77,7 @@ def test_a_gap_of_a_log_without_rates_is_held_and_told():
     samples = log(times, rate=False)
     joins = log_joins(samples)
     assert joins.told == [
-        ("log-gap", "the log has 1 gap, the longest of 20.5 s, held: more than 5 times its usual 0.5 s"),
+        ("log-gap", "the log has 1 gap, the longest 20.5 s (over 5 times its usual 0.5 s); the attitude is held there"),
     ]
     timeline = log_timeline(samples, STREAM)
     before = samples[19].q_icrs_to_cam
@@ -112,7 +112,9 @@ def test_a_gap_that_the_rates_on_both_sides_explain_is_blended():
 def test_rates_that_do_not_fit_the_attitudes_are_not_used_and_told():
     """Two samples at rest but for a rate that each claims: the way between is the straight one."""
     samples = [AttitudeSample(k * S // 2, START, np.array([0.0, 0.0, 2.0])) for k in range(4)]
-    assert log_joins(samples).told == [("log-rates", "the log's rates do not fit its attitudes in 3 intervals: not used there")]
+    assert log_joins(samples).told == [
+        ("log-rates", "in 3 intervals the log's rates do not fit its attitudes, and are ignored there")
+    ]
     attitude = log_timeline(samples, STREAM).at(S // 4)
     assert attitude is not None
     assert angle_between_rad(attitude.q_icrs_to_cam, START) < 1e-12

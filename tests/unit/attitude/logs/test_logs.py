@@ -168,18 +168,18 @@ def test_json_lines_may_begin_with_blank_lines(tmp_path):
         (HEAD + "0,1,0,0,0\n1,nan,0,0,0\n", ":3:", "not finite"),
         (HEAD + "nan,1,0,0,0\n", ":2:", "finite"),
         (HEAD + "inf,1,0,0,0\n", ":2:", "finite"),
-        (HEAD + "0,1,0,0,0\n0,1,0,0,0\n", ":3:", "does not rise"),
+        (HEAD + "0,1,0,0,0\n0,1,0,0,0\n", ":3:", "does not increase"),
         (HEAD + "0,2,0,0,0\n", ":2:", "norm"),
-        (HEAD + "0,1,0,0\n", ":2:", "wanted"),
-        (HEAD + "0,x,0,0,0\n", ":2:", "wanted"),
+        (HEAD + "0,1,0,0\n", ":2:", "write finite numbers for t_s"),
+        (HEAD + "0,x,0,0,0\n", ":2:", "write finite numbers for t_s"),
         (HEAD + "1e30,1,0,0,0\n", ":2:", "64 bits"),
-        (HEAD + "1e999999999,1,0,0,0\n", ":2:", "wanted"),
+        (HEAD + "1e999999999,1,0,0,0\n", ":2:", "write finite numbers for t_s"),
         (HEAD + "9223372036.854775808,1,0,0,0\n", ":2:", "64 bits"),
         (FULL_HEAD + "0,1,0,0,0,1,,3,0,0\n", ":2:", "all of rx,ry,rz or none"),
         (FULL_HEAD + "0,1,0,0,0,,,,1.5,0\n", ":2:", "whole number"),
         (FULL_HEAD + "0,1,0,0,0,,,,1" + 30 * "0" + ",0\n", ":2:", "whole number"),
         (FULL_HEAD + "0,1,0,0,0,,,,0,yes\n", ":2:", "0 or 1"),
-        (HEAD + 999 * "9" + ",y\n", ":2:", "wanted"),
+        (HEAD + 999 * "9" + ",y\n", ":2:", "write finite numbers for t_s"),
         ('{"t_ns":1,"q":[1,0,0,0]}\n{"t_ns":2,"q":[NaN,0,0,0]}\n', ":2:", "NaN"),
         ('{"t_ns":1,"q":[1,0,0,0]}\nnonsense\n', ":2:", "JSON"),
         ('{"t_ns":1}\n', ":1:", "q"),
@@ -275,5 +275,5 @@ def test_a_log_has_no_more_attitudes_than_memory_can_hold(tmp_path, monkeypatch)
     path.write_text("\n".join(["t_s,qw,qx,qy,qz", *rows[:3]]) + "\n")
     assert len(read_log(path)) == 3
     path.write_text("\n".join(["t_s,qw,qx,qy,qz", *rows]) + "\n")
-    with pytest.raises(InputError, match=r"log.csv:5: more than 3 attitudes; write them into several logs"):
+    with pytest.raises(InputError, match=r"log.csv:5: more than 3 attitudes; split the log into several"):
         read_log(path)

@@ -119,17 +119,17 @@ def test_a_finished_file_that_is_damaged_is_refused(tmp_path):
 
 def test_a_sender_that_restarted_is_named_with_its_time(tmp_path):
     (tmp_path / "run.mcap").write_bytes(ledger([attitude_message(sample(t)) for t in (100, 200, 50, 60)]))
-    with pytest.raises(InputError, match=r"attitude 3: time does not rise \(t_ns 50 after 200\); the sender restarted"):
+    with pytest.raises(InputError, match=r"attitude 3: time does not increase \(t_ns 50 after 200\); the sender restarted"):
         read_log(tmp_path / "run.mcap")
 
 
 @pytest.mark.parametrize(
     ("message", "word"),
     [
-        (b"{", "not an attitude"),
-        (b"\xff", "not an attitude"),
-        (b'{"t_ns":1,"q":[1,0,0]}', "not an attitude"),
-        (b'{"t_ns":null}', "no t_ns or no q"),
+        (b"{", "not a hilstar attitude"),
+        (b"\xff", "not a hilstar attitude"),
+        (b'{"t_ns":1,"q":[1,0,0]}', "not a hilstar attitude"),
+        (b'{"t_ns":null}', "lacks t_ns or q"),
         (b'{"t_ns":1,"q":[2,0,0,0]}', "norm"),
         (b'{"t_ns":9223372036854775808,"q":[1,0,0,0]}', "64 bits"),
     ],

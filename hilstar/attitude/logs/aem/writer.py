@@ -1,7 +1,7 @@
 """Writes attitudes as a CCSDS Attitude Ephemeris Message 1.0, in KVN or XML, through `ccsds-ndm`.
 
-Version 1.0, since whatever reads AEM reads it, and it states the quaternion's order and direction in the file. Rates go as
-quaternion derivatives: what 1.0 calls QUATERNION/RATE is read as an angular velocity by some and as Euler rates by others.
+Version 1.0, because every AEM reader reads it, and it states the quaternion's order and direction in the file. Rates are
+written as quaternion derivatives: some readers take QUATERNION/RATE of 1.0 as an angular velocity, others as Euler rates.
 """
 
 from __future__ import annotations
@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from hilstar.attitude.logs.aem import DERIVATIVE, QUATERNION, epoch_text
-from hilstar.attitude.logs.aem_xml import library
+from hilstar.attitude.logs.aem.blocks import DERIVATIVE, QUATERNION
+from hilstar.attitude.logs.aem.epochs import epoch_text
+from hilstar.attitude.logs.aem.xml import library
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.rotation import conjugate, multiply
 
@@ -21,8 +22,8 @@ from hilstar.rotation import conjugate, multiply
 def aem_text(samples: Sequence[AttitudeSample], xml: bool) -> str:
     """An AEM 1.0 of at least one sample, as KVN or XML: a new block at each discontinuity, ICRF to SC_BODY_1, scalar last.
 
-    A block whose samples all have a rate holds quaternion derivatives; in any other the rates are left out, and so are
-    sequence numbers. Raises MachineError without ccsds-ndm.
+    A block whose samples all have a rate contains quaternion derivatives; other blocks drop their rates. Sequence numbers are
+    dropped. Raises MachineError without ccsds-ndm.
     """
     library()
     from ccsds_ndm import mapping, ndm_io  # type: ignore[import-untyped]

@@ -1,6 +1,6 @@
-"""The keywords of an AEM, by section: those of CCSDS 504.0-B-1 and 504.0-B-2 together.
+"""The keywords of an AEM by section: those of CCSDS 504.0-B-1 and 504.0-B-2 together.
 
-A keyword that nobody knows is refused: QUATERNION_TYP passed over would draw the file with another orientation.
+An unknown keyword is refused: ignoring QUATERNION_TYP would show the file with another orientation.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ SECTIONS = {"header": HEADER, "metadata": METADATA}
 
 
 class AemFaultError(Exception):
-    """What is wrong in a message, and where: a line (":12"), an epoch (", 2024-01-01T00:00:00") or nothing."""
+    """What is wrong in an AEM, and where: a line (":12"), an epoch (", 2024-01-01T00:00:00") or nowhere in particular."""
 
     def __init__(self, where: str, detail: str) -> None:
         super().__init__(detail)
@@ -26,12 +26,12 @@ class AemFaultError(Exception):
 
 
 def fault_of(key: str, section: str) -> str | None:
-    """Why a keyword (COMMENT aside) cannot stand in the "header" or "metadata", and what to write; None where it can."""
+    """Why a keyword (other than COMMENT) may not stand in the "header" or "metadata", and what to write; None where it may."""
     if key in SECTIONS[section]:
         return None
     other = "metadata" if section == "header" else "header"
     if key in SECTIONS[other]:
         return f"{key} is in the {section}; it belongs in the {other}"
     near = difflib.get_close_matches(key.upper()[:40], SECTIONS[section], n=1)
-    advice = f"did you mean {near[0]}?" if near else f"known are {', '.join(SECTIONS[section])}"
-    return f"{key[:40]} is no keyword of an AEM's {section}; {advice}"
+    advice = f"did you mean {near[0]}?" if near else f"the keywords are {', '.join(SECTIONS[section])}"
+    return f"{key[:40]} is not a keyword of an AEM's {section}; {advice}"

@@ -1,0 +1,116 @@
+"""CCSDS Attitude Ephemeris Messages, 1.0 (CCSDS 504.0-B-1) and 2.0 (504.0-B-2), as KVN or XML.
+
+Rules:
+1. One of REF_FRAME_A and REF_FRAME_B is ICRF, GCRF or EME2000, taken as the same axes (EME2000's differ by 23 mas); the
+   other is a frame of the spacecraft, and is taken as `cam`. Any other frame is refused.
+2. The quaternion of 504.0-B-2 annex F turns components from its first frame into its second; it is the conjugate of
+   hilstar's. ATTITUDE_DIR says which frame is first (2.0: always A), QUATERNION_TYPE where the scalar is (2.0: last).
+3. A rate is the angular velocity of the second frame with respect to the first.
+4. `t_ns` is nanoseconds from 1970-01-01T00:00:00 of the file's own time system; leap seconds are not counted.
+5. A second block of data begins with a discontinuity. Interpolation hints and usable spans are ignored.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from hilstar.arrays import FloatArray
+from hilstar.attitude.logs.aem.blocks import ANGVEL, DERIVATIVE, QUATERNION, RATE, Block
+from hilstar.attitude.logs.aem.epochs import epoch_ns
+from hilstar.attitude.logs.aem.keywords import VERSION_KEY, AemFaultError
+from hilstar.attitude.logs.aem.kvn import kvn_blocks
+from hilstar.attitude.logs.aem.xml import xml_blocks
+from hilstar.attitude.logs.entries import Entry
+from hilstar.attitude.wire.packet import AttitudeSample, checked_sample
+from hilstar.rotation import conjugate, multiply
+
+# 504.0-B-2's own examples write J2000 for EME2000; the realisations of the ICRF share its axes to 0.1 mas.
+INERTIAL_FRAMES = frozenset({"ICRF", "ICRF1", "ICRF2", "ICRF3", "GCRF", "EME2000", "J2000"})
+# SANA's registry of spacecraft body frames, whose names end in a label (SC_BODY_1, INSTRUMENT_A), and CAM.
+BODY_FRAME = re.compile(
+    "(SC_BODY|STARTRACKER|AST|INSTRUMENT|SENSOR|CAM|CAMERA|ACC|ACTUATOR|CSS|DSS|ESA|GYRO|GYRO_FRAME"
+    "|IMU|IMU_FRAME|MTA|RW|SA|TAM)(_.*|[0-9]+)?"
+)
+
+
+def read_aem(text: str) -> list[Entry]:
+    """The attitudes of an AEM's text, each with its place, in the order of the blocks' first epochs.
+
+    Raises AemFaultError for anything that is not an AEM of quaternions between a body frame and the ICRF.
+    """
+    blocks = xml_blocks(text) if text.lstrip().startswith("<") else kvn_blocks(text)
+    if len({block.meta["TIME_SYSTEM"] for block in blocks}) > 1:
+        raise AemFaultError("", "TIME_SYSTEM changes from block to block; write one file for each time system")
+    timed = [([epoch_ns(where, epoch) for where, epoch in zip(b.where, b.epochs, strict=True)], b) for b in blocks]
+    timed.sort(key=lambda pair: pair[0][0])
+    entries: list[Entry] = []
+    for times, block in timed:
+        following = list(_entries(block, times))
+        if entries:
+            _part(entries, following)
+        entries += following
+    return entries
+
+
+def _part(entries: list[Entry], following: list[Entry]) -> None:
+    """Mark the break between two blocks. 504.0-B-1 allows them a common epoch: the earlier then ends 1 ns before it."""
+    (end_where, end), (where, first) = entries[-1], following[0]
+    if isinstance(end, AttitudeSample) and isinstance(first, AttitudeSample):
+        if end.t_ns == first.t_ns:
+            entries[-1] = Entry(end_where, replace(end, t_ns=end.t_ns - 1))
+        following[0] = Entry(where, replace(first, discontinuity=True))
+
+
+def _entries(block: Block, times: list[int]) -> Iterator[Entry]:
+    q, rate = _attitudes(block)
+    rates: Sequence[list[float] | None] = [None] * len(q) if rate is None else rate.tolist()
+    for where, t_ns, components, turning in zip(block.where, times, q.tolist(), rates, strict=True):
+        yield Entry(where, checked_sample(t_ns, tuple(components), None if turning is None else tuple(turning)))
+
+
+def _attitudes(block: Block) -> tuple[FloatArray, FloatArray | None]:
+    """`q_icrs_to_cam` (n, 4) and, where the type has it, the rate (n, 3) in cam components, rad/s."""
+    meta, kind = block.meta, block.meta["ATTITUDE_TYPE"]
+    to_cam = _second_frame_is_cam(meta)
+    q, more = block.values[:, :4], block.values[:, 4:]
+    with np.errstate(all="ignore"):  # an overflow is refused as not finite
+        if to_cam:
+            q = conjugate(q)
+        norm2 = (q * q).sum(axis=1, keepdims=True)
+        if kind == QUATERNION:
+            return q, None
+        if kind == DERIVATIVE:
+            q_dot = conjugate(more) if to_cam else more
+            return q, -2.0 * multiply(q_dot, conjugate(q))[:, 1:] / norm2
+        rate = np.radians(more if to_cam else -more)
+        if not _rate_is_in_cam(meta):
+            pure = np.concatenate((np.zeros((len(rate), 1)), rate), axis=1)
+            rate = multiply(multiply(q, pure), conjugate(q))[:, 1:] / norm2
+    return q, rate
+
+
+def _second_frame_is_cam(meta: dict[str, str]) -> bool:
+    a, b = meta["REF_FRAME_A"], meta["REF_FRAME_B"]
+    inertial, body = (a, b) if a in INERTIAL_FRAMES else (b, a)
+    if inertial not in INERTIAL_FRAMES or not BODY_FRAME.fullmatch(body):
+        wanted = "one must be ICRF or EME2000, the other a spacecraft frame (SC_BODY_1, STARTRACKER_1, INSTRUMENT_A, CAM, ...)"
+        raise AemFaultError("", f"REF_FRAME_A = {a}, REF_FRAME_B = {b}; {wanted}")
+    direction = meta.get("ATTITUDE_DIR", "A2B" if meta[VERSION_KEY] == "2.0" else "missing")
+    if direction not in {"A2B", "B2A"}:
+        raise AemFaultError("", f"ATTITUDE_DIR is {direction}; write A2B or B2A")
+    return (a in INERTIAL_FRAMES) == (direction == "A2B")
+
+
+def _rate_is_in_cam(meta: dict[str, str]) -> bool:
+    key = "ANGVEL_FRAME" if meta["ATTITUDE_TYPE"] == ANGVEL else "RATE_FRAME"
+    if "EULER_ROT_SEQ" in meta:
+        raise AemFaultError("", f"{RATE} with EULER_ROT_SEQ: rates of Euler angles are not read; write {DERIVATIVE}")
+    a, b, given = meta["REF_FRAME_A"], meta["REF_FRAME_B"], meta.get(key, "missing")
+    frame = {"REF_FRAME_A": a, "REF_FRAME_B": b}.get(given, given)
+    if frame not in {a, b}:
+        raise AemFaultError("", f"{key} is {given}; write {a} or {b}")
+    return frame not in INERTIAL_FRAMES

@@ -15,6 +15,8 @@ import typer
 
 from hilstar.errors import one_line
 
+CLOCK_WORDS = {"one-way": "from arrivals", "exchange": "from time exchanges"}
+
 
 def say(line: str) -> None:
     """A line for the person at the terminal."""
@@ -65,7 +67,7 @@ def report(summary: dict[str, Any], as_json: bool) -> None:
     for name in ("operator", "hidden"):
         lasted = summary.get("screen", {}).get(name, {"frames": 0})
         if lasted["frames"]:
-            what = "changed by an operator's keys" if name == "operator" else "not seen whole"
+            what = "changed by an operator's keys" if name == "operator" else "not fully visible"
             lines[name] = f"{lasted['frames']} frames, {lasted['s']:.1f} s, {what}"
     lines["renderer"] = summary["gl_renderer"]
     for name, line in lines.items():
@@ -75,16 +77,16 @@ def report(summary: dict[str, Any], as_json: bool) -> None:
 def clock_line(clock: dict[str, Any]) -> str:
     """How the sender's clock stands to this machine's."""
     if clock["mode"] == "none":
-        return "nothing heard"
+        return "no attitude has arrived"
     if clock["mode"] == "shared":
         return "shared with the sender"
     if clock["uncertainty_ms"] is None:
-        return f"by {clock['mode']}: heard too shortly to say how well"
-    known = f"drift {clock['drift_ppm']:.1f} ppm, known to {clock['uncertainty_ms']:.3f} ms"
+        return f"{CLOCK_WORDS[clock['mode']]}: heard too briefly to state an uncertainty"
+    known = f"drift {clock['drift_ppm']:.1f} ppm, uncertainty {clock['uncertainty_ms']:.3f} ms"
     if clock["mode"] == "one-way":
-        known += " but for a longer road's minimum delay"
-    jumps = f", {clock['jumps']} jumps" if clock["jumps"] else ""
-    return f"by {clock['mode']}: {known}{jumps}"
+        known += ", excluding the minimum transport delay"
+    jumps = f", jumps: {clock['jumps']}" if clock["jumps"] else ""
+    return f"{CLOCK_WORDS[clock['mode']]}: {known}{jumps}"
 
 
 @contextmanager

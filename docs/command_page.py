@@ -23,8 +23,8 @@ TYPE_WORDS = {int: "N", float: "X", str: "TEXT", Path: "PATH"}
 HEAD = f"""\
 # Commands
 
-`hilstar COMMAND --help` prints the same for one command. This page is generated from the commands themselves
-(`python docs/make_pages.py`).
+`hilstar COMMAND -h` (or `--help`) prints the same for one command, and `hilstar --version` the version. This page is generated
+from the commands themselves (`python docs/make_pages.py`).
 
 Every command that has `--json` then prints one JSON object on stdout and nothing else there.
 

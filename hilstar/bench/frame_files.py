@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from hilstar import __version__
 from hilstar.arrays import FloatArray
 from hilstar.bench.frame import Bench, Frame
 from hilstar.files import written
@@ -50,7 +51,7 @@ def sky_header(bench_hash: str, epoch_jyear: float, q_icrs_to_cam: FloatArray, c
     header["ROLL_PNT"] = (roll_deg, "[deg] camera roll")
     header["EPOCHJYR"] = (epoch_jyear, "[yr] Julian year of the star positions")
     header["BENCHSHA"] = bench_hash  # no room on the card for a comment
-    header["CREATOR"] = "hilstar"
+    header["CREATOR"] = f"hilstar {__version__}"
     header.update(world_coordinates(camera, q_icrs_to_cam))
     return header
 

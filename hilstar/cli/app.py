@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Annotated
 
 import typer
 
+from hilstar import __version__
 from hilstar.cli.benchmark import benchmark
 from hilstar.cli.calibrate.latency import latency
 from hilstar.cli.calibrate.photometric import photometric
@@ -38,9 +40,27 @@ COMMANDS: dict[str, tuple[Callable[..., None], ...]] = {
 app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
-    help="Show a star tracker on a bench the stars it would see: attitudes in, frames of code values out.",
+    context_settings={"help_option_names": ["-h", "--help"]},
 )
 calibrate = typer.Typer(help="Calibrate the monitor: its response to measured patches, and the scale of its light.")
+
+
+def print_version(wanted: bool) -> None:
+    """Print the version and end, where it is asked for."""
+    if wanted:
+        typer.echo(f"hilstar {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def hilstar(
+    _: Annotated[
+        bool, typer.Option("--version", callback=print_version, is_eager=True, help="Print the version and quit.")
+    ] = False,
+) -> None:
+    """Show a star tracker on a bench the stars it would see: attitudes in, frames of code values out."""
+
+
 for panel, commands in COMMANDS.items():
     for command in commands:
         app.command(rich_help_panel=panel)(command)

@@ -64,6 +64,7 @@ def test_the_frame_s_files_agree_with_each_other(orion):
         assert header["BUNIT"] == "electron/s"
         assert [header[k] for k in ("QW", "QX", "QY", "QZ")] == pytest.approx(from_radec_roll_deg(84.057, -1.2, 0), abs=1e-15)
         assert header["EPOCHJYR"] == 2000.0
+        assert header["CREATOR"] == f"hilstar {hilstar.__version__}"
         assert len(header["BENCHSHA"]) == 64
     inside = [r for r in rows if 6 < float(r["x_px"]) < 1017 and 6 < float(r["y_px"]) < 1017]
     assert len(inside) > 500

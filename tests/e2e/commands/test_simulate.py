@@ -7,6 +7,7 @@ import pytest
 from astropy.io import fits
 from PIL import Image
 
+import hilstar
 from tests.support.benches import ROOT, SMALL_BENCH
 from tests.support.commands import assert_refused, run_hilstar
 
@@ -28,6 +29,7 @@ def test_the_fits_has_dn_header_and_truth(tmp_path):
     wanted = {"BUNIT": "adu", "EXPTIME": 5.0, "SEED": 7, "DEVSEED": 0, "NOISE": "full", "GAIN": 24.0, "EPOCHJYR": 2000.0}
     assert {key: header[key] for key in wanted} == wanted
     assert len(header["BENCHSHA"]) == 64
+    assert header["CREATOR"] == f"hilstar {hilstar.__version__}"
     assert header["RA_PNT"] == pytest.approx(283.021, abs=1e-9)
     assert list(truth.names) == ["hip", "x_px", "y_px", "v_mag", "bv", "temperature_k", "electrons_per_s", "drawn", "clipped"]
     # Background and dark: 3000 e- and 203 e-/s for 5 s, at 24 e-/DN.

@@ -1,0 +1,52 @@
+"""-h and --version, on every command and group."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterator
+
+import pytest
+from typer import Typer
+
+import hilstar
+from hilstar.cli.app import app
+from tests.support.benches import ROOT
+
+
+def lines_of(group: Typer) -> Iterator[list[str]]:
+    """The words of every group and command."""
+    yield []
+    for info in group.registered_commands:
+        yield [info.name or getattr(info.callback, "__name__", "")]
+    for inner in group.registered_groups:
+        for words in lines_of(inner.typer_instance):
+            yield [str(inner.name), *words]
+
+
+LINES = list(lines_of(app))
+
+
+def test_there_are_commands_and_groups():
+    assert len(LINES) > 15
+    assert ["calibrate"] in LINES
+    assert ["calibrate", "plan"] in LINES
+
+
+@pytest.mark.parametrize("words", LINES, ids=" ".join)
+@pytest.mark.parametrize("flag", ["-h", "--help"])
+def test_help_is_there(words, flag, capsys):
+    assert not app([*words, flag], standalone_mode=False)
+    usage = next(line for line in capsys.readouterr().out.splitlines() if "Usage:" in line)
+    typed = usage.partition(" [OPTIONS]")[0].split()
+    assert typed[len(typed) - len(words) :] == words
+
+
+def test_the_version_is_the_package_s(capsys):
+    assert not app(["--version"], standalone_mode=False)
+    assert capsys.readouterr().out == f"hilstar {hilstar.__version__}\n"
+
+
+def test_the_version_stands_in_one_place():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    assert project["project"]["dynamic"] == ["version"]
+    assert project["tool"]["hatch"]["version"]["path"] == "hilstar/__init__.py"

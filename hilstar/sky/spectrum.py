@@ -156,9 +156,8 @@ def integration_nodes(*curves: Curve) -> tuple[FloatArray, FloatArray]:
     if len(knots) < 2:
         raise InputError("the quantum efficiency and the transmission share no wavelength; check that both are in nm")
     pieces = np.maximum(1, np.ceil(np.diff(knots) / LONGEST_INTERVAL_NM)).astype(int)
-    edges = np.concatenate(
-        [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(knots[:-1], knots[1:], pieces, strict=True)] + [knots[-1:]]
-    )
+    piece = np.arange(pieces.sum()) - np.repeat(np.cumsum(pieces) - pieces, pieces)  # of its interval, from 0
+    edges = np.append(np.repeat(knots[:-1], pieces) + piece * np.repeat(np.diff(knots) / pieces, pieces), knots[-1])
     half = np.diff(edges)[:, None] / 2
     wavelength_nm = (edges[:-1, None] + half * (1 + NODES)).ravel()
     return wavelength_nm, (half * WEIGHTS).ravel() * 1e-9

@@ -29,7 +29,6 @@ from hilstar.rotation import normalise, to_matrix
 from hilstar.scene.camera import Camera
 from hilstar.scene.clipping import clipped_sprites
 from hilstar.scene.frame_motion import Scan, Turn, swept_sprites
-from hilstar.scene.psf import pixel_shares
 from hilstar.scene.sprites import Sprites, make_sprites
 from hilstar.sky.stars import Stars, split_by_rate
 
@@ -168,11 +167,7 @@ class Bench:
         return len(self.sprites(q_icrs_to_cam, self.faint_stars)) if len(self.faint_stars) else 0
 
     def warm_up(self) -> None:
-        """Draw once with paths, with stars and with none: a driver compiles its shaders at first use, 60 ms on llvmpipe.
-
-        SciPy's functions too are imported at first use, 0.1 s: the first star that might clip would cost that frame.
-        """
-        pixel_shares(np.zeros(1), 1.0)
+        """Draw once with paths, with stars and with none: a driver compiles its shaders at first use, 60 ms on llvmpipe."""
         for q, rate in ((WARM_UP_ATTITUDE, WARM_UP_RATE_RAD_S), (WARM_UP_ATTITUDE, None), (None, None)):
             _ = self.draw(q, 0, rate).levels
 

@@ -10,6 +10,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import scipy.special  # noqa: F401 - takes 0.1 s, which the first star that might clip is not to cost its frame
+
 from hilstar.attitude.clock.timeline import Attitude, Policy, StaleGate
 from hilstar.bench.config import AttitudeSettings
 from hilstar.bench.frame import Bench, Drawn

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import json
-import re
 import shutil
 import signal
 import subprocess
@@ -13,44 +12,36 @@ from pathlib import Path
 
 import pytest
 
-from hilstar.cli import app
-from hilstar.errors import InputError
 from tests.examples.support import commands, copied
+from tests.support.commands import assert_refused, run_hilstar_here
+from tests.support.senders import free_port
+from tests.support.servers import listening
 
 pytestmark = pytest.mark.e2e
 
-ANYWHERE, HERE = "tcp://*:5560", "tcp://127.0.0.1:*"  # the example's endpoint, and a free port of this machine alone
+EVERYWHERE = "tcp://*:5560"
 
 
 def test_with_its_key_it_is_heard_and_with_another_it_is_told(tmp_path, monkeypatch, capsys):
     folder = copied(tmp_path)
     monkeypatch.chdir(folder)
     keys, serve, send, _ = commands("A Python sender with CURVE keys")
-    with pytest.raises(InputError, match="hilstar keys"):
-        app(serve[1:], standalone_mode=False)
-    assert not app(keys[1:], standalone_mode=False)
-    assert not app([*keys[1:-1], "strange"], standalone_mode=False)
+    assert_refused(run_hilstar_here(*serve[1:]), 2, "hilstar keys")
+    assert run_hilstar_here(*keys[1:]).returncode == 0
+    assert run_hilstar_here(*keys[1:-1], "strange").returncode == 0
     shutil.copy("keys/server.key", "strange/server.key")
 
-    bench = (folder / "curve_bench.toml").read_text()
-    assert ANYWHERE in bench
-    (folder / "curve_bench.toml").write_text(bench.replace(ANYWHERE, HERE))
-    command = [sys.executable, "-m", "hilstar", *serve[1:], "--json"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        try:
-            (endpoint,) = re.findall(r"tcp://127\.0\.0\.1:\d+", process.stderr.readline())
-            sent = subprocess.run(
-                [sys.executable, *send[1:2], endpoint, *send[3:4], "0.5"],
-                capture_output=True,
-                text=True,
-                check=True,
-                timeout=60,
-            )
-            refused = stranger(monkeypatch, endpoint)
-            process.send_signal(signal.SIGINT)
-            out, err = process.communicate(timeout=30)
-        finally:
-            process.kill()
+    bench = folder / "curve_bench.toml"
+    endpoint = f"tcp://127.0.0.1:{free_port()}"  # the same keys, and nothing of a test is open to the network
+    assert EVERYWHERE in bench.read_text()
+    bench.write_text(bench.read_text().replace(EVERYWHERE, endpoint))
+    assert serve[1:4] == ["serve", bench.name, "--headless"]
+    with listening(bench, f"bound to {endpoint}", *serve[4:]) as process:
+        command = [sys.executable, send[1], endpoint, send[3], "0.5"]
+        sent = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
+        refused = stranger(monkeypatch, endpoint)
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=30)
     assert sent.stdout == "50 attitudes sent\n"
     assert refused == 1
     assert "allowed_clients" in capsys.readouterr().err

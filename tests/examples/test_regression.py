@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from hilstar.cli import app
 from tests.examples.support import commands, copied, section
+from tests.support.commands import run_hilstar_here
 
 pytestmark = pytest.mark.e2e
 
@@ -20,7 +20,7 @@ def test_it_passes_on_the_same_sky_and_fails_on_another(tmp_path, monkeypatch):
     folder = copied(tmp_path)
     monkeypatch.chdir(folder)
     frame, test = commands("A regression test")
-    assert not app(frame[1:], standalone_mode=False)
+    assert run_hilstar_here(*frame[1:]).returncode == 0
     fault = re.search(r"With `(focal_length_mm = .*?)`.* `(Not the same sky: .*?)`", section("A regression test"))
     assert fault is not None
     wrong = folder / "wrong"

@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
-import signal
 import subprocess
-import sys
-import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +17,7 @@ from hilstar.attitude.wire.serial_link import SerialLink
 from hilstar.rotation import propagate
 from tests.support.benches import ROOT, SMALL_BENCH
 from tests.support.ptys import Cable
+from tests.support.servers import interrupted, listening
 
 pytestmark = pytest.mark.e2e
 
@@ -53,42 +49,19 @@ def told(output: str) -> dict[str, int]:
     return dict(zip(("sent", "requests", "statuses"), map(int, match.groups()), strict=True))
 
 
-@contextmanager
-def serving(bench_file: Path) -> Iterator[subprocess.Popen]:
-    command = [sys.executable, "-m", "hilstar", "serve", str(bench_file), "--headless", "--json"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        impatience = threading.Timer(60, process.kill)
-        impatience.start()
-        try:
-            assert process.stderr is not None
-            first = process.stderr.readline()
-            assert "reading serial:" in first, first
-            yield process
-        finally:
-            impatience.cancel()
-            process.kill()
-
-
-def ended(process: subprocess.Popen) -> dict:
-    process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=30)
-    assert process.returncode == 0, err
-    return json.loads(out)
-
-
 def test_the_sender_streams_into_hilstar_and_both_sides_know_each_other_s_clock(tmp_path, cable, sender):
     bench_file = tmp_path / "serial.toml"
     bench_file.write_text(f'{SMALL_BENCH}\n[attitude]\nsource = "serial"\nport = "{cable.host}"\nbaud = {BAUD}\n')
-    command = [str(sender), str(cable.bench), str(BAUD), "100", "1", "5", str(CLOCK_OFFSET_S)]
-    with serving(bench_file) as process:
+    command = [str(sender), str(cable.bench), str(BAUD), "100", "1.5", "5", str(CLOCK_OFFSET_S)]
+    with listening(bench_file, "reading serial:") as process:
         result = subprocess.run(command, capture_output=True, text=True, timeout=30, check=False)
         assert result.returncode == 0, result.stderr
-        summary = ended(process)
+        summary = interrupted(process)
     counted = told(result.stdout)
     packets = summary["packets"]
-    assert counted["sent"] == 100 == packets["received"] == packets["accepted"]
+    assert counted["sent"] == 150 == packets["received"] == packets["accepted"]
     assert packets["refused"] == 0
-    # A second has 8 quick time requests, less what the start took, and 10 statuses.
+    # 1.5 s have 8 quick time requests and one more, and 15 statuses, less what the start took.
     assert counted["requests"] >= 4
     assert counted["statuses"] >= 4
     clock = summary["clock"]

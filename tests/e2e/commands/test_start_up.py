@@ -1,0 +1,29 @@
+"""What a command imports before it does anything: half a second of a start is imports, and each has to be wanted."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+pytestmark = pytest.mark.e2e
+
+# What single commands, files and plots need, and no bench: each costs 15 to 250 ms.
+HEAVY = {"asyncio", "astropy", "ccsds_ndm", "matplotlib", "mcap", "rich", "scipy.special", "unittest"}
+
+
+def imported_by(module: str) -> set[str]:
+    """The modules that a new process has after it imported one."""
+    program = f"import sys, {module}; print(*sys.modules)"
+    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60)
+    return set(result.stdout.split())
+
+
+@pytest.mark.parametrize("module", ["hilstar.cli", "hilstar.bench.build", "hilstar.run.send.sender"])
+def test_nothing_heavy_is_imported_before_it_is_used(module):
+    assert not imported_by(module) & HEAVY
+
+
+def test_a_run_imports_before_its_first_frame_what_some_frames_need():
+    assert "scipy.special" in imported_by("hilstar.run.loop")

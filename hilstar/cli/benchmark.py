@@ -29,6 +29,7 @@ def benchmark(
     as_json: Json = False,
 ) -> None:
     """Time a whole frame and its stages, beside NumPy, numba, GalSim and photutils on the same stars."""
+    import msgspec
     import numpy as np
 
     from hilstar.bench.bench_file import read_bench_file
@@ -38,7 +39,7 @@ def benchmark(
 
     plan = speed.QUICK if quick else speed.Plan()
     if stars is not None:
-        plan = replace(plan, counts=parse_counts(stars, speed.MOST_STARS))
+        plan = replace(plan, counts=parse_counts(stars, speed.MAX_STARS))
     if bench_file is not None:
         if sizes is not None:
             raise InputError(f"benchmark --sizes: {bench_file} has a size of its own; leave out one of them")
@@ -54,6 +55,6 @@ def benchmark(
     if output is not None:
         speed_report.write(result, output)
     if as_json:
-        print_json(result)
+        print_json(msgspec.to_builtins(result))
     else:
         typer.echo("\n".join(speed_report.lines(result)))

@@ -9,8 +9,9 @@ import argparse
 
 import numpy as np
 
-from hilstar.study.speed.benchmark import REFERENCE_PX, Plan, run
+from hilstar.study.speed.benchmark import Plan, run
 from hilstar.study.speed.report import lines
+from hilstar.study.speed.result import REFERENCE_PX
 
 
 def main() -> None:

@@ -14,7 +14,9 @@ import numpy as np
 
 from hilstar.bench.build import load
 from hilstar.rotation import from_radec_roll_deg
-from hilstar.study.speed.benchmark import BENCH, RADEC_ROLL_DEG, REFERENCE_PX, scene
+from hilstar.study.speed.benchmark import BENCH, RADEC_ROLL_DEG
+from hilstar.study.speed.result import REFERENCE_PX
+from hilstar.study.speed.scenes import scene
 
 RATES_RAD_S = (0.0, 0.002, 0.0087, 0.035, 0.1, 0.35, 1.0, 10.0, 57.0, 900.0, 1e6)
 
@@ -30,8 +32,7 @@ def main() -> None:
         path = Path(folder) / "bench.toml"
         path.write_text(BENCH.format(*REFERENCE_PX) + 'motion = "on"\n')
         with load(path) as bench:
-            stars, _ = scene(bench, bench.shown_stars, q, (options.stars, np.random.default_rng(1)))
-            bench = bench.with_stars(stars)
+            bench = bench.with_stars(scene(bench, bench.shown_stars, q, options.stars, np.random.default_rng(1)).stars)
             times_ms: dict[float, list[float]] = {rate: [] for rate in RATES_RAD_S}
             told: dict[float, str] = {}
             for number in range(options.rounds):

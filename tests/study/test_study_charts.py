@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 from hilstar import charts
 from hilstar.study.economy import Outcome, economy_finding
 from hilstar.study.speed import report as benchmark_report
+from hilstar.study.speed.result import Machine, Result, Spread, Timing
 from hilstar.twin.budget import budget, write_budget
 
 
@@ -50,14 +51,14 @@ def test_economy_does_not_call_within_tolerance_what_is_over_it():
 @pytest.mark.parametrize("methods", [("numpy",), ("numpy", "numba", "galsim", "photutils")])
 def test_the_legend_of_the_benchmark_is_whole(figures, tmp_path, sizes, methods):
     kinds = [("hilstar", "whole_frame"), ("hilstar", "linear_only"), *((method, "linear_only") for method in methods)]
-    time_ms = {"median": 1.0, "min": 0.9, "max": 1.2}
     rows = [
-        {"width": w, "height": h, "stars": stars, "method": method, "kind": kind, "ms": time_ms}
+        Timing(w, h, stars, method, kind, Spread(median=1.0, min=0.9, max=1.2))
         for w, h in sizes
         for stars in (100, 1000)
         for method, kind in kinds
     ]
-    result = {"rows": rows, "gl_renderer": "llvmpipe (LLVM 15.0.6, 256 bits)", "machine": {"cores": 2}}
+    machine = Machine(cpu="EPYC", cores=2, load=0.1, python="3.11", numpy="2.4")
+    result = Result(machine, "llvmpipe (LLVM 15.0.6, 256 bits)", rows)
     benchmark_report.write(result, tmp_path)
     (figure,) = figures
     (legend,) = figure.legends

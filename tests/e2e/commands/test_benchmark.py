@@ -10,9 +10,11 @@ import pytest
 from PIL import Image
 
 from hilstar.rotation import from_radec_roll_deg
-from hilstar.study.speed import benchmark
-from hilstar.study.speed.benchmark import RADEC_ROLL_DEG, STAGES, scene
-from hilstar.study.speed.others import numpy_linear
+from hilstar.study.speed import cells
+from hilstar.study.speed.benchmark import RADEC_ROLL_DEG
+from hilstar.study.speed.cells import STAGES
+from hilstar.study.speed.other_methods import numpy_linear
+from hilstar.study.speed.scenes import scene
 from tests.support.commands import assert_refused, run_hilstar
 
 Q = from_radec_roll_deg(*RADEC_ROLL_DEG)
@@ -129,9 +131,10 @@ def test_the_numpy_image_is_ours(bench_with):
 @pytest.mark.parametrize("count", [1, 5, 3000])
 def test_a_scene_has_exactly_the_stars_asked_for(bench_with, rng, count):
     bench = bench_with()
-    stars, catalogue = scene(bench, bench.shown_stars, Q, (count, rng))
+    found = scene(bench, bench.shown_stars, Q, count, rng)
+    stars = found.stars
     assert len(bench.sprites(Q, stars)) == count
-    assert catalogue == min(count, len(bench.sprites(Q)))
+    assert found.catalogue_count == min(count, len(bench.sprites(Q)))
     assert np.allclose(np.linalg.norm(stars.vectors, axis=1), 1)
 
 
@@ -142,9 +145,9 @@ def test_slow_works_take_fewer_turns_evenly(monkeypatch):
         taken.append(work())
         return {"fast": 0.001, "slow": 1.0, "slowest": 9.0}[taken[-1]]
 
-    monkeypatch.setattr(benchmark, "_seconds", seconds)
+    monkeypatch.setattr(cells, "_seconds", seconds)
     works = {name: lambda name=name: name for name in ("fast", "slow", "slowest")}
-    times = benchmark.interleaved(works, rounds=8, budget_s=5.0)
+    times = cells.interleaved(works, rounds=8, budget_s=5.0)
     # One turn of the slow work's five goes ahead; the slowest has no other turn, so that one counts.
     assert {name: len(values) for name, values in times.items()} == {"fast": 8, "slow": 4, "slowest": 1}
     assert taken[3:] == ["fast", "fast", "slow"] * 4

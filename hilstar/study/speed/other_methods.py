@@ -1,4 +1,4 @@
-"""Other ways to a linear image of the same stars: NumPy, and where they are installed numba, GalSim and photutils.
+"""Other methods for a linear image of the same stars: NumPy, and where they are installed numba, GalSim and photutils.
 
 Each gets the places and the light that hilstar has found, so culling and projecting are not in its time; no codes are made.
 """
@@ -22,29 +22,29 @@ INSTALL = "pip install 'hilstar[benchmark]'"
 FWHM_PER_SIGMA = 2 * math.sqrt(2 * math.log(2))
 Sigma = tuple[float, float]
 _ONE = np.ones(1)
-FIRST = pack_sprites(_ONE, _ONE, _ONE, np.zeros(1, dtype=np.intp), (8, 8), 4), (0.85, 0.85), (8, 8)
+FIRST = pack_sprites(_ONE, _ONE, _ONE, np.zeros(1, dtype=np.intp), (8, 8), 4)
 Draw = Callable[[Sprites, Sigma, tuple[int, int]], Float32Array]
 
 
 @dataclass(frozen=True, slots=True)
-class Other:
-    """A way to a linear image: `draw` takes sprites, their sigma in px and the image's (height, width)."""
+class OtherMethod:
+    """A method for a linear image: `draw` takes sprites, their sigma in px and the image's (height, width)."""
 
     name: str
     does: str
     draw: Draw
 
 
-def others() -> tuple[list[Other], dict[str, str]]:
-    """The ways that this machine has, imported and compiled, and for each it has not, what to install."""
+def other_methods() -> tuple[list[OtherMethod], dict[str, str]]:
+    """The methods that are installed here, imported and compiled, and by name what to install for each of the others."""
     found, missing = [], {}
-    for name, does, make in WAYS:
+    for name, does, make in METHODS:
         try:
-            other = Other(name, does, make())
+            other = OtherMethod(name, does, make())
         except ImportError as error:
             missing[name] = f"not installed ({error}): {INSTALL}"
             continue
-        other.draw(*FIRST)
+        other.draw(FIRST, (0.85, 0.85), (8, 8))  # numba compiles
         found.append(other)
     return found, missing
 
@@ -137,7 +137,7 @@ def _make_photutils() -> Draw:
     return draw
 
 
-WAYS: tuple[tuple[str, str, Callable[[], Draw]], ...] = (
+METHODS: tuple[tuple[str, str, Callable[[], Draw]], ...] = (
     ("numpy", "separable erf differences and np.add.at; our stamps", lambda: numpy_linear),
     ("numba", "the same as a compiled loop on one core, compiled before; our stamps", _make_numba),
     ("galsim", "drawImage of a Gaussian convolved with the pixel, by FFT; our stamps", _make_galsim),

@@ -95,7 +95,7 @@ def section(name: str, command: Callable[..., Any]) -> str:
     parameters = sorted(parameters_of(command), key=lambda p: (bool(p.flags), not p.required))
     usage = textwrap.wrap(
         " ".join(["hilstar", name, *(p.usage.replace(" ", "\0") for p in parameters)]),
-        width=100,
+        width=92,
         subsequent_indent=" " * (len(name) + 9),
         break_long_words=False,
         break_on_hyphens=False,

@@ -9,10 +9,10 @@ in float electrons_per_s;
 uniform ivec2 resolution_px;
 uniform int footprint_px;
 // Fainter stars may have smaller sprites: that of side_px[k] where the star's rate is under below_e_per_s[k], falling.
-const int MOST_SIDES = 8;
+const int MAX_SIDES = 8;
 uniform int sides;
-uniform int side_px[MOST_SIDES];
-uniform float below_e_per_s[MOST_SIDES];
+uniform int side_px[MAX_SIDES];
+uniform float below_e_per_s[MAX_SIDES];
 uniform float sprites_per_star;
 
 flat out ivec2 star_pixel;

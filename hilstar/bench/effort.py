@@ -16,7 +16,7 @@ from hilstar.monitor.phases import WHITE, Errors, fainter, measure, phase_grid, 
 from hilstar.monitor.quantise import Panel, Quantisation
 from hilstar.monitor.response import Response
 from hilstar.render.reference import linear_image
-from hilstar.scene.psf import LARGEST_CUT, cut_share, footprint_px, peak_share, pixel_share
+from hilstar.scene.psf import MAX_CUT, cut_share, footprint_px, peak_share, pixel_share
 from hilstar.units import flux_ratio
 
 CODES_SHARE, EDGES_SHARE, MOTION_SHARE = 0.5, 0.25, 0.25
@@ -168,7 +168,7 @@ def choose_sides(render: RenderSettings, light: Light, method: Quantisation) -> 
     area = np.full(len(rates), full**2)
     for rate, size in kept:
         area[rates < rate] = size**2
-    cut = (cut_mag(least, sigma_px), cut_px(least, sigma_px)) if least < full else (MAG_PER_SHARE * LARGEST_CUT, 0.0)
+    cut = (cut_mag(least, sigma_px), cut_px(least, sigma_px)) if least < full else (MAG_PER_SHARE * MAX_CUT, 0.0)
     mean = float(area.mean()) if len(area) else float(full**2)
     chosen = f"{min(s for _, s in kept)} to {least} px a side instead of {full}"
     error = f"{cut[0]:.1e} mag and {cut[1]:.1e} px cut"

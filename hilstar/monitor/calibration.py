@@ -12,9 +12,18 @@ import numpy as np
 
 from hilstar.arrays import Float32Array, FloatArray
 from hilstar.errors import InputError, shortened
-from hilstar.monitor import response as photometry
 from hilstar.monitor.calibration_file import beside, read_grid, read_response, read_toml
-from hilstar.monitor.response import Response, Weights, gamma_response, mixed_response, srgb_response, table_response
+from hilstar.monitor.response import (
+    MAX_LEVELS,
+    TRIPLES,
+    Response,
+    Weights,
+    bit_stealing_response,
+    gamma_response,
+    mixed_response,
+    srgb_response,
+    table_response,
+)
 from hilstar.reading import exists
 
 FORMULAS = ("srgb", "gamma2.2")
@@ -48,8 +57,8 @@ class Calibration:
     @property
     def can_steal_bits(self) -> bool:
         """Whether `load_calibration` would take it with `bit_stealing`."""
-        levels = (2**self.response.bits - 1) * photometry.TRIPLES + 1
-        return self.weights is not None and levels <= photometry.MOST_LEVELS
+        levels = (2**self.response.bits - 1) * TRIPLES + 1
+        return self.weights is not None and levels <= MAX_LEVELS
 
     @property
     def is_formula(self) -> bool:
@@ -93,7 +102,7 @@ def load_calibration(source: str | Path, bits: int, *, bit_stealing: bool = Fals
     name = str(source)
     if name in FORMULAS:
         grey = srgb_response(bits) if name == "srgb" else gamma_response(bits)
-        response = photometry.bit_stealing((grey, grey, grey), REC709_WEIGHTS) if bit_stealing else grey
+        response = bit_stealing_response((grey, grey, grey), REC709_WEIGHTS) if bit_stealing else grey
         digest = hashlib.sha256(f"hilstar built-in {name}, {bits} bits".encode()).hexdigest()
         return Calibration(name, response, digest, weights=REC709_WEIGHTS, instrument="none: a formula")
     path = EXAMPLE if name == "lcd-example" else Path(source)
@@ -148,7 +157,7 @@ def _response(
     if bit_stealing and weights is None:
         raise InputError(f"{path}: bit stealing wants the primaries as the tracker sees them; add [weights] r, g, b")
     if bit_stealing and weights is not None:
-        return photometry.bit_stealing((channels[0], channels[1], channels[2]), weights, black), weights
+        return bit_stealing_response((channels[0], channels[1], channels[2]), weights, black), weights
     if "w" in tables or weights is None:
         return table_response(bits, tables["w"].light, black), weights
     return mixed_response((channels[0], channels[1], channels[2]), weights, black), weights

@@ -16,7 +16,7 @@ PlaceArray = npt.NDArray[np.int32]  # half the memory of intp: these arrays are 
 
 PHASES = 8  # per axis: the order of pixels by distance is tabulated for so many sub-pixel phases
 REACH_SIGMA = 3.0  # how far from a star a pixel may be lit that its own light would not light
-SHORTEST_REACH_PX = 1.6  # narrower stars still get their eight neighbours: three sums are to be met
+MIN_REACH_PX = 1.6  # narrower stars still get their eight neighbours: three sums are to be met
 PIXEL_VARIANCE = 1 / 12  # a pixel's width adds to the sigma that it samples
 
 
@@ -55,7 +55,7 @@ class FootprintMap:
         spread = np.sqrt(np.square(self._sigma_px) + PIXEL_VARIANCE)
         x, y = (((steps[:, None] - phase) / s) ** 2 for s in spread)
         distance = np.sqrt(y[:, None, :, None] + x[None, :, None, :]).reshape(self._size**2, PHASES**2)
-        reach = max(REACH_SIGMA, SHORTEST_REACH_PX / spread.min())
+        reach = max(REACH_SIGMA, MIN_REACH_PX / spread.min())
         return np.argsort(distance, axis=0, kind="stable"), int((distance <= reach).sum(axis=0).max())
 
     @property

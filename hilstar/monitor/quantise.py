@@ -22,7 +22,7 @@ Quantisation = Literal["round", "dither", "temporal", "exact"]
 # Frames after which `temporal` begins again. Eight are 133 ms at 60 Hz, about one exposure of a tracker. They leave a star
 # of 42 steps of light (8 magnitudes under white, 10 bits) 0.007 mag and 0.017 px off, rms; twice as many leave half.
 CYCLE_FRAMES = 8
-LONGEST_CYCLE = 4096  # the mask has no more different thresholds
+MAX_CYCLE_FRAMES = 4096  # the mask has no more different thresholds
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,8 +105,8 @@ def frame_shift(frame: int, cycle_frames: int) -> float:
 
     Each aligned 2^m frames have turns that part [0, 1) evenly. Raises InputError for a cycle that is not a power of two.
     """
-    if not 1 <= cycle_frames <= LONGEST_CYCLE or cycle_frames & (cycle_frames - 1):
-        raise InputError(f"a cycle of {cycle_frames} frames; write a power of two from 1 to {LONGEST_CYCLE}")
+    if not 1 <= cycle_frames <= MAX_CYCLE_FRAMES or cycle_frames & (cycle_frames - 1):
+        raise InputError(f"a cycle of {cycle_frames} frames; write a power of two from 1 to {MAX_CYCLE_FRAMES}")
     place, shift, weight = frame % cycle_frames, 0.0, 0.5
     while place:
         shift += weight * (place & 1)

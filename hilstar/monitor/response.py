@@ -17,7 +17,7 @@ Weights = tuple[float, float, float]
 
 # Lights nearer than this to each other (relative) are one level: the renderer's float32 has 6e-8 to a step.
 SAME_LIGHT = 1e-6
-MOST_LEVELS = 2**16  # what uint16 can say
+MAX_LEVELS = 2**16  # what uint16 can say
 TRIPLES = 7  # grey k and the six mixed triples above it
 
 
@@ -80,15 +80,15 @@ def mixed_response(channels: tuple[Response, Response, Response], weights: Weigh
     return table_response(channels[0].bits, light / light[-1], black)
 
 
-def bit_stealing(channels: tuple[Response, Response, Response], weights: Weights, black: float = 0.0) -> Response:
+def bit_stealing_response(channels: tuple[Response, Response, Response], weights: Weights, black: float = 0.0) -> Response:
     """Levels between the greys: the six triples of codes k and k + 1 between grey k and grey k + 1, by rising light.
 
     `weights` are the primaries' shares of white as the tracker sees them, any scale. Triples of the same light are one
     level, so 8 bits have 255 * 7 + 1 levels at most (Tyler 1997, Spatial Vision 10, 369). Raises InputError beyond 13 bits.
     """
     bits = channels[0].bits
-    if (2**bits - 1) * TRIPLES + 1 > MOST_LEVELS:
-        raise InputError(f"bit stealing makes more than {MOST_LEVELS} levels of {bits} bits; it is for 13 bits at most")
+    if (2**bits - 1) * TRIPLES + 1 > MAX_LEVELS:
+        raise InputError(f"bit stealing makes more than {MAX_LEVELS} levels of {bits} bits; it is for 13 bits at most")
     share = np.asarray(weights, dtype=np.float64) / np.sum(weights)
     steps = np.array(list(product((0, 1), repeat=3)))[:TRIPLES]  # (0, 0, 0) first; (1, 1, 1) is the next grey
     rgb = (np.arange(2**bits - 1)[:, None, None] + steps).reshape(-1, 3)

@@ -17,7 +17,7 @@ SWITCH_INTERVAL_S = 0.0005
 def steady_loop() -> Iterator[str]:
     """Run the frame loop of this thread at real-time priority where that is allowed; gives the scheduling it has.
 
-    Python's garbage collector stands still meanwhile: the frame path makes no cycles (tests/e2e/test_screen_run.py measures
+    Python's garbage collector stands still meanwhile: the frame path makes no cycles (tests/screen/test_screen_run.py measures
     it), and a full collection would take a frame's time.
     """
     interval_s = sys.getswitchinterval()

@@ -29,7 +29,7 @@ def build_program(ctx: moderngl.Context, vertex: str, fragment: str, defines: tu
 
 
 SpriteSides = tuple[tuple[float, int], ...]
-MOST_SIDES = 8  # as in star.vert
+MAX_SIDES = 8  # as in star.vert
 PLACES = "2i 8x 1f"  # of SPRITE_DTYPE: places and rates
 SPRITE_PIXEL = 2  # a pixel under a sprite takes as long to encode as two of a pass over all (llvmpipe, 1080p to 4K)
 DEAR_PIXEL = 0.02  # of the image: with more under sprites than this a clear is quicker (measured on llvmpipe, 1080p and 4K)
@@ -40,9 +40,9 @@ def set_sides(program: moderngl.Program, sides: SpriteSides) -> None:
 
     Raises InputError for more sides than the shader has room for.
     """
-    if len(sides) > MOST_SIDES:
-        raise InputError(f"{len(sides)} sizes of sprites; {MOST_SIDES} at most")
-    padded = [*sides, *[(0.0, 0)] * (MOST_SIDES - len(sides))]
+    if len(sides) > MAX_SIDES:
+        raise InputError(f"{len(sides)} sizes of sprites; {MAX_SIDES} at most")
+    padded = [*sides, *[(0.0, 0)] * (MAX_SIDES - len(sides))]
     program["sides"] = len(sides)
     program["below_e_per_s"], program["side_px"] = ([*values] for values in zip(*padded, strict=True))
 

@@ -20,11 +20,11 @@ from hilstar.scene.sprites import Sprites, join_sprites, make_sprites, pack_spri
 from hilstar.sky.stars import Stars
 
 # With ceil(1.02 r + 3) nodes on a path of r sigmas no pixel is off by more than 1e-6 of the star's flux (measured for sigma
-# 0.3 to 3 px and r up to 300; tests/unit/test_smear.py holds it). A path under 0.005 sigma is a point to 1e-6.
+# 0.3 to 3 px and r up to 300; tests/unit/scene/test_exposure_motion.py holds it). A path under 0.005 sigma is a point to 1e-6.
 # results/tradeoff.csv, smear: evenly spaced sprites are slower and worse.
 NODES_PER_SIGMA = 1.02
 NODES_AT_REST = 3
-SHORTEST_PATH_SIGMA = 0.005
+MIN_PATH_SIGMA = 0.005
 # A longer turn is cut in pieces of this, so that a piece of a path is short beside the field, and no longer than its nodes.
 MAX_PIECE_RAD = 0.05
 MAX_PIECE_SIGMA = (MAX_NODES - NODES_AT_REST - 1) / NODES_PER_SIGMA
@@ -147,6 +147,6 @@ class _Smear:
         whole = Chords(x_px[::2], y_px[::2])
         bulge_px = 2 * half_s * paths.speed_rad_s * np.nan_to_num(whole.length_sigma((1.0, 1.0)))
         begin, end = whole.on_image(self.camera.resolution_px, self.footprint_px / 2 + 1 + bulge_px)
-        counts = node_counts(length * (end - begin), self.nodes_per_sigma, NODES_AT_REST, SHORTEST_PATH_SIGMA)
+        counts = node_counts(length * (end - begin), self.nodes_per_sigma, NODES_AT_REST, MIN_PATH_SIGMA)
         counts[end <= begin] = 0
         return np.minimum(counts, MAX_NODES), begin, end

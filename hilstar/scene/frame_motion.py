@@ -19,7 +19,7 @@ from hilstar.scene.sprites import Sprites, brightest, max_stars, pack_sprites
 from hilstar.sky.stars import Stars
 
 # With ceil(0.6 r + 1) nodes on a path of r sigmas no pixel is off by more than 1e-3 of the star's flux (measured for sigma
-# 0.5 to 2 px and r to 30; tests/unit/test_sweep.py holds it): its flux and centroid are exact with any number.
+# 0.5 to 2 px and r to 30; tests/unit/scene/test_frame_motion.py holds it): its flux and centroid are exact with any number.
 NODES_PER_SIGMA = 0.6
 # A path of so many sigmas is a point to 1e-3 of the star's flux.
 POINT_SIGMA = 0.27

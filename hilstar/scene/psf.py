@@ -16,7 +16,7 @@ from hilstar.errors import InputError
 # The share of a star's flux that may fall outside its footprint, at the worst sub-pixel phase. 1e-5 would do for
 # flux; at sigma 3 px the centroid then moves 1e-4 px, so ten times less is cut, for one pixel more.
 # results/tradeoff.csv, psf: 10 px at sigma 0.85 are on the front; 8 px save a tenth and cut 4e-5 mag.
-LARGEST_CUT = 1e-6
+MAX_CUT = 1e-6
 SQRT2 = math.sqrt(2.0)
 
 
@@ -51,7 +51,7 @@ def cut_share(size_px: int, sigma_px: tuple[float, float]) -> float:
     return 1.0 - inside
 
 
-def footprint_px(sigma_px: tuple[float, float], largest_cut: float = LARGEST_CUT) -> int:
+def footprint_px(sigma_px: tuple[float, float], largest_cut: float = MAX_CUT) -> int:
     """The side of the smallest square footprint that cuts at most `largest_cut` of a star's flux."""
     size = 1
     while cut_share(size, sigma_px) > largest_cut:

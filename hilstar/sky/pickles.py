@@ -27,11 +27,11 @@ PACKAGED_LIBRARY = Path(__file__).resolve().parent / "data" / "pickles.npz"
 VI_KNOT_COUNT = 12
 # Up to here (about F0) B-V tells supergiants and reddened stars from dwarfs of the same V-I; past it, B-V
 # follows the metal lines in the blue and makes the rates of cool supergiants worse.
-REDDEST_BV_TERM_MAG = 0.3
+MAX_BV_TERM_MAG = 0.3
 # For stars without V-I. The late M giants' B-V is that of K giants with a tenth of their electrons: left out, they
 # are lost, and the K giants, fifty times as many to V = 7.5, are right.
 BV_KNOT_COUNT = 5
-REDDEST_BV_FIT_VI_MAG = 2.0
+MAX_BV_FIT_VI_MAG = 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,10 +133,10 @@ def fit_table(bv_mag: FloatArray, vi_mag: FloatArray, electrons_per_s: FloatArra
     """Fit the table to stars of V = 0 by least squares in ln(rate); all arrays have shape (m,)."""
     log_rate = np.log(electrons_per_s)
     vi_knots_mag = _knots_at_equal_shares(vi_mag, VI_KNOT_COUNT)
-    bv_range_mag = float(bv_mag.min()), REDDEST_BV_TERM_MAG
+    bv_range_mag = float(bv_mag.min()), MAX_BV_TERM_MAG
     design = np.column_stack([natural_basis(vi_mag, vi_knots_mag), np.clip(bv_mag, *bv_range_mag)])
     *over_vi, per_bv = np.linalg.lstsq(design, log_rate)[0]
-    plain = vi_mag < REDDEST_BV_FIT_VI_MAG
+    plain = vi_mag < MAX_BV_FIT_VI_MAG
     bv_knots_mag = _knots_at_equal_shares(bv_mag[plain], BV_KNOT_COUNT)
     over_bv = np.array(np.linalg.lstsq(natural_basis(bv_mag[plain], bv_knots_mag), log_rate[plain])[0], dtype=np.float64)
     return PicklesTable(Spline(vi_knots_mag, np.array(over_vi)), float(per_bv), bv_range_mag, Spline(bv_knots_mag, over_bv))

@@ -22,13 +22,13 @@ STEFAN_BOLTZMANN_W_M2_K4 = 5.670374419e-8
 DATA_DIR = Path(__file__).resolve().parent / "data"
 MAX_CURVE_BYTES = 1_000_000
 MAX_CURVE_ROWS = 10_000
-RANGE_NM = (1.0, 100_000.0)  # no sensor sees beyond; each LONGEST_INTERVAL_NM costs nodes
+RANGE_NM = (1.0, 100_000.0)  # no sensor sees beyond; each MAX_INTERVAL_NM costs nodes
 BUILT_IN_CURVES = ("ccd47-20", "kai-4021", "n-bk7-10mm", "johnson-v")
 
 # Gauss-Legendre nodes in each interval between knots of the curves; intervals are at most this wide.
 # A Planck curve at 1000 K over 25 nm, times two straight lines, is then integrated to 1e-13.
 GAUSS_ORDER = 8
-LONGEST_INTERVAL_NM = 25.0
+MAX_INTERVAL_NM = 25.0
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(GAUSS_ORDER)
 
 
@@ -155,7 +155,7 @@ def integration_nodes(*curves: Curve) -> tuple[FloatArray, FloatArray]:
     knots = knots[(knots >= low) & (knots <= high)]
     if len(knots) < 2:
         raise InputError("the quantum efficiency and the transmission share no wavelength; check that both are in nm")
-    pieces = np.maximum(1, np.ceil(np.diff(knots) / LONGEST_INTERVAL_NM)).astype(int)
+    pieces = np.maximum(1, np.ceil(np.diff(knots) / MAX_INTERVAL_NM)).astype(int)
     piece = np.arange(pieces.sum()) - np.repeat(np.cumsum(pieces) - pieces, pieces)  # of its interval, from 0
     edges = np.append(np.repeat(knots[:-1], pieces) + piece * np.repeat(np.diff(knots) / pieces, pieces), knots[-1])
     half = np.diff(edges)[:, None] / 2

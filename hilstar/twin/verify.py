@@ -27,7 +27,7 @@ from hilstar.bench.frame import Bench, Frame
 from hilstar.errors import InputError
 from hilstar.monitor.calibration import BUILT_IN, load_calibration
 from hilstar.monitor.geometry import monitor_camera
-from hilstar.monitor.quantise import LONGEST_CYCLE, Panel, shown_light
+from hilstar.monitor.quantise import MAX_CYCLE_FRAMES, Panel, shown_light
 from hilstar.monitor.response import Response, table_response
 from hilstar.rotation import to_matrix
 from hilstar.scene.camera import Camera
@@ -387,7 +387,7 @@ def verify(
     try:
         for number in range(fields):
             q = attitudes.normal(size=4)
-            first = int(attitudes.integers(0, LONGEST_CYCLE))
+            first = int(attitudes.integers(0, MAX_CYCLE_FRAMES))
             twin.measure(twin.field(q / np.linalg.norm(q), first), tally, noise)
             on_field(number + 1)
         verdict = judge(twin, tally)

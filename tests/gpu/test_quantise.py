@@ -8,7 +8,7 @@ import pytest
 from hilstar.errors import InputError
 from hilstar.monitor.exact import ExactQuantiser
 from hilstar.monitor.quantise import Panel, dither_levels, frame_shift, round_levels, temporal_levels, turned_mask
-from hilstar.monitor.response import bit_stealing, gamma_response, srgb_response
+from hilstar.monitor.response import bit_stealing_response, gamma_response, srgb_response
 from hilstar.render.renderer import Renderer, Target
 from tests.gpu.test_renderer import sprites_at
 
@@ -20,7 +20,7 @@ RESPONSES = {
     "srgb8": GREY,
     "srgb10": srgb_response(10),
     "gamma12": gamma_response(12),
-    "stealing8": bit_stealing((GREY, GREY, GREY), (0.2126, 0.7152, 0.0722)),
+    "stealing8": bit_stealing_response((GREY, GREY, GREY), (0.2126, 0.7152, 0.0722)),
 }
 # A GL may round light - low and its product with the threshold once more or less than NumPy: a tie is that near.
 TIE = 4 * np.finfo(np.float32).eps

@@ -13,7 +13,7 @@ from hilstar.monitor.response import encode, srgb_response
 from hilstar.render import renderer as renderer_module
 from hilstar.render.reference import linear_image
 from hilstar.render.renderer import Renderer, Target
-from hilstar.scene.psf import LARGEST_CUT, footprint_px
+from hilstar.scene.psf import MAX_CUT, footprint_px
 from hilstar.scene.sprites import SPRITE_DTYPE, Sprites
 
 # The limits. Measured on llvmpipe: 1.2e-6 and 1.0e-5 px at worst, the footprint's cut (1e-6) the most of both.
@@ -109,7 +109,7 @@ def test_the_footprint_cuts_no_more_than_it_says():
             sprite = sprites_at(np.array([[100 + phase, 80 + phase]]), np.ones(1), size)
             cut = linear_image(sprite, (256, 192), sigma, footprint_px=2 * size + 9).sum()
             kept = linear_image(sprite, (256, 192), sigma).sum()
-            assert 0 <= cut - kept <= LARGEST_CUT * 1.000001
+            assert 0 <= cut - kept <= MAX_CUT * 1.000001
 
 
 @pytest.mark.parametrize("bits", [6, 8, 10, 12, 16])
@@ -138,7 +138,7 @@ def test_a_hundred_thousand_stars_are_drawn(rng):
     count = 100_000
     pixels = rng.uniform([20, 20], [1004, 748], size=(count, 2))
     linear, _, _ = draw(target_of((1024, 768)), pixels, np.ones(count))
-    assert linear.sum(dtype=np.float64) == pytest.approx(count, rel=BLEND_LIMIT + LARGEST_CUT)
+    assert linear.sum(dtype=np.float64) == pytest.approx(count, rel=BLEND_LIMIT + MAX_CUT)
 
 
 def test_twelve_decades_of_flux_stand_side_by_side():

@@ -13,7 +13,7 @@ from hilstar.errors import InputError
 from hilstar.render.reference import linear_image
 from hilstar.render.renderer import Target
 from hilstar.render.variants import SplatVariant, VariantRenderer
-from hilstar.scene.psf import LARGEST_CUT
+from hilstar.scene.psf import MAX_CUT
 from hilstar.sky.cells import CELL_DEG
 from hilstar.sky.electrons import TABLE_DEGREE
 from hilstar.sky.spectrum import Curve
@@ -23,7 +23,7 @@ from hilstar.study.tradeoff.brightness import trapezoid
 from hilstar.study.tradeoff.demo import SIGMA_PX
 from hilstar.study.tradeoff.depth import LIMITS_V_MAG
 from hilstar.study.tradeoff.run import STEPS, draw, round_ticks, run, spread, table_lines
-from hilstar.study.tradeoff.table import FEWEST_ROUNDS, Figure, Trial, Trials, interleaved, measured, pareto_front
+from hilstar.study.tradeoff.table import MIN_ROUNDS, Figure, Trial, Trials, interleaved, measured, pareto_front
 
 NAMES = ["brightness", "spectrum", "depth", "culling", "projection", "prediction", "smear", "psf", "quantisation"]
 # A relative error in magnitudes: 2.5 / ln 10.
@@ -92,8 +92,8 @@ def test_what_is_exact_is_so_to_rounding(study):
 def test_the_defaults_keep_their_modules_promises(study):
     steps = study[2]
     own = {name: next(row for row in step.values() if row["default"] == "True") for name, step in steps.items()}
-    assert float(own["psf"]["error"]) <= LARGEST_CUT * MAG_PER_SHARE
-    assert float(own["smear"]["error"]) <= 1e-6  # scene/smear.py
+    assert float(own["psf"]["error"]) <= MAX_CUT * MAG_PER_SHARE
+    assert float(own["smear"]["error"]) <= 1e-6  # scene/exposure_motion.py
     assert float(own["culling"]["error"]) == 0
     assert float(own["projection"]["error"]) < 6e-8  # half a step of float32 under 1, on both axes
 
@@ -164,10 +164,10 @@ def test_a_planted_worse_method_is_off_the_front_and_a_beaten_default_says_why(c
 def test_every_round_has_every_work_and_slow_works_drop_out(clock):
     calls = []
     times = interleaved([clock(50.0, calls), clock(1.5, calls)], 0.02)
-    rounds = [sorted(calls[k : k + 2]) for k in range(0, 2 * (FEWEST_ROUNDS + 1), 2)]
-    assert rounds == [[1.5, 50.0]] * (FEWEST_ROUNDS + 1)
+    rounds = [sorted(calls[k : k + 2]) for k in range(0, 2 * (MIN_ROUNDS + 1), 2)]
+    assert rounds == [[1.5, 50.0]] * (MIN_ROUNDS + 1)
     # The slow one has had its 10 ms after one round; the fast one is over its own after the seventh.
-    assert [len(taken) for taken in times] == [FEWEST_ROUNDS, 7]
+    assert [len(taken) for taken in times] == [MIN_ROUNDS, 7]
 
 
 def test_the_variants_that_change_nothing_or_only_the_profile_draw_the_same_stars():

@@ -16,7 +16,7 @@ from hilstar.units import NS_PER_US
 GL_LIBRARY, X11_LIBRARY = "libGL.so.1", "libX11.so.6"
 SYNC_EXTENSION = b"GLX_OML_sync_control"
 # A UST that is not of this host's monotonic clock, or of another swap, is not to be believed.
-LARGEST_UST_AGE_NS = 1_000_000_000
+MAX_UST_AGE_NS = 1_000_000_000
 BAD_WINDOW, BAD_DRAWABLE, FIRST_EXTENSION_ERROR = 3, 9, 128  # X.h; those of extensions are GLX's here
 SERVER_GONE = "the X server is gone, or has closed the window's connection"
 WINDOW_GONE = "the window is gone: another program has closed it"
@@ -88,7 +88,7 @@ class SyncControl:
         if not self._wait_for_swap(*self._window, 0, ctypes.byref(ust), ctypes.byref(msc), ctypes.byref(sbc)):
             return None
         swap_ns = ust.value * NS_PER_US
-        return swap_ns if 0 <= time.monotonic_ns() - swap_ns < LARGEST_UST_AGE_NS else None
+        return swap_ns if 0 <= time.monotonic_ns() - swap_ns < MAX_UST_AGE_NS else None
 
 
 def sync_control(x_display: int | None, drawable: int | None) -> SyncControl | None:

@@ -13,7 +13,7 @@ from hilstar.sky.pickles import Library, library_electrons_per_s, load_library
 from hilstar.sky.spectrum import TEMPERATURE_SCALES
 from hilstar.study.models.finding import Finding
 from hilstar.study.models.settings import SENSORS
-from hilstar.study.shared.brightness import REDDEST_RELIABLE_VI_MAG, held_out_errors, study_optics
+from hilstar.study.shared.brightness import MAX_RELIABLE_VI_MAG, held_out_errors, study_optics
 
 HELD_OUT = "pickles, leave-one-out"
 
@@ -25,7 +25,7 @@ def spectra(directory: Path) -> Finding:
     """Black bodies and the Pickles relation, each star held out in turn, against the Pickles spectra over V-I."""
     library = load_library()
     errors = method_errors(library)
-    sure = library.vi_mag < REDDEST_RELIABLE_VI_MAG
+    sure = library.vi_mag < MAX_RELIABLE_VI_MAG
     figures = {key: np.percentile(100 * np.abs(error[sure]), (50, 95)) for key, error in errors.items()}
     text = "Median error of the electron rate (95 %), V-I < 2.5: " + "; ".join(
         f"{SENSORS[sensor].split()[0]} {real[0]:.1f} % ({real[1]:.1f} %) by real spectra and V-I,"
@@ -53,14 +53,14 @@ def method_errors(library: Library) -> Errors:
 
 
 def _draw(path: Path, text: str, library: Library, errors: Errors) -> None:
-    redder = int((library.vi_mag >= REDDEST_RELIABLE_VI_MAG).sum())
+    redder = int((library.vi_mag >= MAX_RELIABLE_VI_MAG).sum())
     with chart(path, text, panels=2) as axes:
         for axis, sensor in zip(axes, SENSORS, strict=True):
             named = [(name, error) for (owner, name), error in errors.items() if owner == sensor]
             for (name, error), mark in zip(reversed(named), ("+", "x", "o"), strict=True):
                 axis.plot(library.vi_mag, 100 * error, mark, ms=5, label=name)
             label = f"V-I = 2.5: {redder} spectra are redder"
-            axis.axvline(REDDEST_RELIABLE_VI_MAG, color="0.5", lw=1, ls="--", label=label)
+            axis.axvline(MAX_RELIABLE_VI_MAG, color="0.5", lw=1, ls="--", label=label)
             axis.axhline(0, color="k", lw=1)
             axis.set_yscale("symlog", linthresh=5)
             plain_ticks(axis.yaxis, (-90, -50, -20, -10, -5, 0, 5, 10, 20, 50, 100))

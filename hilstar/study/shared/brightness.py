@@ -11,7 +11,7 @@ from hilstar.sky.spectrum import load_curve
 
 APERTURE_MM = 30.0
 GLASS = "n-bk7-10mm"
-REDDEST_RELIABLE_VI_MAG = 2.5
+MAX_RELIABLE_VI_MAG = 2.5
 
 
 def study_optics(sensor: str) -> Optics:

@@ -8,7 +8,7 @@ import numpy as np
 
 from hilstar.monitor.phases import SIGMA_PX, WHITE
 from hilstar.monitor.quantise import CYCLE_FRAMES, Quantisation
-from hilstar.monitor.response import Response, Weights, bit_stealing, srgb_response
+from hilstar.monitor.response import Response, Weights, bit_stealing_response, srgb_response
 from hilstar.scene.psf import peak_share
 from hilstar.scene.sprites import Sprites, pack_sprites
 from hilstar.units import flux_ratio
@@ -49,7 +49,7 @@ WAYS = (
 def response_of(bits: int, way: Way) -> Response:
     """The sRGB response of a way; with bit stealing, of three equal channels."""
     grey = srgb_response(bits)
-    return bit_stealing((grey, grey, grey), STEALING_WEIGHTS) if way.stealing else grey
+    return bit_stealing_response((grey, grey, grey), STEALING_WEIGHTS) if way.stealing else grey
 
 
 def star_field(frame_px: tuple[int, int], footprint_px: int) -> Sprites:

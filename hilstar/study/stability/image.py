@@ -13,7 +13,7 @@ from hilstar.arrays import Float32Array, FloatArray
 from hilstar.errors import InputError
 from hilstar.render.reference import linear_image
 from hilstar.render.renderer import Renderer, Target, create_context
-from hilstar.scene.psf import LARGEST_CUT, SQRT2, cut_share, footprint_px, pixel_shares
+from hilstar.scene.psf import MAX_CUT, SQRT2, cut_share, footprint_px, pixel_shares
 from hilstar.scene.sprites import Sprites, join_sprites, pack_sprites
 from hilstar.study.stability.failure_case import FailureCase, Figures
 
@@ -22,8 +22,8 @@ SIGMA_PX = 0.85
 SEED = 1
 # The shader's erf (tests/gpu/test_renderer.py); a share along an axis is half the difference of two.
 ERF_ERROR = 4.4e-7
-# The footprint cuts LARGEST_CUT of a star's light, and the outermost edges along both axes are off by ERF_ERROR.
-FLUX_ERROR = LARGEST_CUT + 2 * ERF_ERROR
+# The footprint cuts MAX_CUT of a star's light, and the outermost edges along both axes are off by ERF_ERROR.
+FLUX_ERROR = MAX_CUT + 2 * ERF_ERROR
 # The share of the peak along an axis is 1 / (sqrt(2 pi) 20) at sigma 20, and there are two axes.
 PEAK_ERROR = 2 * ERF_ERROR * float(np.sqrt(2 * np.pi)) * 20
 CENTROID_PX = 1.1e-5  # what README.md promises of the linear image
@@ -218,7 +218,7 @@ def absurd_sigmas() -> FailureCase:
         f"cuts {100 * cuts[0]:.1f} % and {100 * cuts[1]:.5f} % of a star's light",
         "refused: " + " | ".join(lines),
         "a point of GL is a star's footprint",
-        Figures(silently_cut, max(cuts), LARGEST_CUT),
+        Figures(silently_cut, max(cuts), MAX_CUT),
     )
 
 

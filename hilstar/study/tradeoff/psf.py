@@ -14,7 +14,7 @@ from hilstar.monitor.phases import WHITE, fainter, measure
 from hilstar.render.reference import linear_image
 from hilstar.render.renderer import Target
 from hilstar.render.variants import SplatVariant, VariantRenderer
-from hilstar.scene.psf import LARGEST_CUT, footprint_px, peak_share
+from hilstar.scene.psf import MAX_CUT, footprint_px, peak_share
 from hilstar.scene.sprites import Sprites, pack_sprites
 from hilstar.study.shared.codes import FRAME_PX, STARS, star_field
 from hilstar.study.tradeoff.table import Figure, Trial, Trials
@@ -43,7 +43,7 @@ def psf(stack: ExitStack, quick: bool) -> Trials:
         Figure("flux error, worst", "mag", ROUNDING_MAG),
         Figure("centroid error, worst", "px"),
         "what lies so near changes places from run to run; the default has the smallest footprint that cuts at most"
-        f" {LARGEST_CUT:g} of a star's light at any phase, and needs no table",
+        f" {MAX_CUT:g} of a star's light at any phase, and needs no table",
         trials,
         _centre_remark(),
     )

@@ -28,7 +28,7 @@ from hilstar.study.tradeoff.table import Figure, Row, Step, Trials, measured
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-MOST_POWERS = 8
+MAX_POWERS = 8
 # In the order of the chain.
 STEPS: tuple[Callable[[ExitStack, bool], Trials], ...] = (
     brightness,
@@ -159,7 +159,7 @@ def round_ticks(low: float, high: float) -> list[float]:
     """Ticks of a logarithmic axis: some of each power of ten, over many powers the ones alone, and not all of them."""
     first, last = math.floor(math.log10(low)), math.ceil(math.log10(high))
     steps = (1, 2, 3, 4, 5, 7) if high < 10 * low else (1, 2, 5) if last - first <= 3 else (1,)
-    every = -(-(last - first) // MOST_POWERS)
+    every = -(-(last - first) // MAX_POWERS)
     ticks = (step * 10.0**power for power in range(first, last) if power % every == 0 for step in steps)
     return [tick for tick in ticks if low <= tick <= high]
 

@@ -97,7 +97,7 @@ def path_lengths_px(stars: Stars, motion: Motion) -> FloatArray:
 
 
 def own_sprites(stars: Stars, motion: Motion) -> Sprites:
-    """Those of scene/smear.py."""
+    """Those of scene/exposure_motion.py."""
     return smeared_sprites(stars, motion, CAMERA, footprint_px(TRACKER.psf_sigma_px), TRACKER.psf_sigma_px)
 
 

@@ -20,7 +20,7 @@ from hilstar.sky.pickles import library_electrons_per_s, load_library, tabulate_
 from hilstar.sky.spectrum import (
     TEMPERATURE_SCALES,
 )
-from hilstar.study.shared.brightness import REDDEST_RELIABLE_VI_MAG, held_out_errors, study_optics
+from hilstar.study.shared.brightness import MAX_RELIABLE_VI_MAG, held_out_errors, study_optics
 from hilstar.study.tradeoff.table import Figure, Trial, Trials
 from hilstar.units import magnitude
 
@@ -35,7 +35,7 @@ def spectrum(stack: ExitStack, quick: bool) -> Trials:
     del stack, quick
     library, optics = load_library(), study_optics(SENSOR)
     exact, zero = library_electrons_per_s(library, optics, Photometry()), np.zeros(len(library.spectral_type))
-    sure, sky = library.vi_mag < REDDEST_RELIABLE_VI_MAG, SkySettings()
+    sure, sky = library.vi_mag < MAX_RELIABLE_VI_MAG, SkySettings()
     real, bodies = tabulate_pickles(optics, Photometry()), tabulate("dgs", optics, Photometry())
     average = tabulate("ags", optics, Photometry())
 

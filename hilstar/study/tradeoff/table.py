@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 # A work is timed at least so often, and at most so often whatever the budget: more rounds move no median.
-FEWEST_ROUNDS = 3
-MOST_ROUNDS = 500
+MIN_ROUNDS = 3
+MAX_ROUNDS = 500
 SEED = 1
 
 
@@ -114,9 +114,9 @@ def interleaved(works: Sequence[Callable[[], object]], budget_s: float) -> list[
     times: list[list[float]] = [[] for _ in works]
     share_ms = 1e3 * budget_s / len(works)
     rng = np.random.default_rng(SEED)
-    for count in range(MOST_ROUNDS):
+    for count in range(MAX_ROUNDS):
         for k in rng.permutation(len(works)):
-            if count >= FEWEST_ROUNDS and sum(times[k]) > share_ms:
+            if count >= MIN_ROUNDS and sum(times[k]) > share_ms:
                 continue
             begin = time.perf_counter()
             works[k]()

@@ -7,7 +7,7 @@ import pytest
 
 from hilstar.errors import InputError
 from hilstar.monitor.response import (
-    bit_stealing,
+    bit_stealing_response,
     encode,
     gamma_response,
     mixed_response,
@@ -92,7 +92,7 @@ def test_a_table_is_rounded_to_the_nearest_light(rng):
 
 def test_bit_stealing_has_six_levels_between_greys():
     grey = srgb_response(8)
-    response = bit_stealing((grey, grey, grey), (0.2126, 0.7152, 0.0722))
+    response = bit_stealing_response((grey, grey, grey), (0.2126, 0.7152, 0.0722))
     assert len(response.light) == 255 * 7 + 1
     assert np.all(np.diff(response.light) > 0)
     assert np.all(np.ptp(response.rgb.astype(int), axis=1) <= 1)
@@ -107,7 +107,7 @@ def test_bit_stealing_has_six_levels_between_greys():
 @pytest.mark.parametrize(("weights", "levels"), [((1, 1, 1), 255 * 3 + 1), ((1, 0, 0), 256), ((2, 2, 1), 255 * 5 + 1)])
 def test_triples_of_the_same_light_are_one_level_and_greys_stay(weights, levels):
     grey = gamma_response(8)
-    response = bit_stealing((grey, grey, grey), weights)
+    response = bit_stealing_response((grey, grey, grey), weights)
     assert len(response.light) == levels
     assert np.all(np.diff(response.light) > 0)
     greys = {tuple(triple) for triple in response.rgb.tolist() if len(set(triple)) == 1}
@@ -117,7 +117,7 @@ def test_triples_of_the_same_light_are_one_level_and_greys_stay(weights, levels)
 def test_bit_stealing_beyond_uint16_is_refused():
     grey = srgb_response(14)
     with pytest.raises(InputError, match="13 bits"):
-        bit_stealing((grey, grey, grey), (1, 1, 1))
+        bit_stealing_response((grey, grey, grey), (1, 1, 1))
 
 
 def test_channels_are_mixed_as_the_tracker_weighs_them():

@@ -11,7 +11,7 @@ from hilstar.render.reference import linear_image
 from hilstar.rotation import from_radec_roll_deg, propagate, to_matrix
 from hilstar.scene import exposure_motion as smear
 from hilstar.scene.exposure_motion import MIDDLE_S, Motion, smeared_sprites
-from hilstar.scene.psf import LARGEST_CUT, footprint_px
+from hilstar.scene.psf import MAX_CUT, footprint_px
 from hilstar.scene.sprites import make_sprites
 from tests.unit.scene.test_scene import stars_at
 
@@ -19,7 +19,7 @@ IDENTITY = np.array([1.0, 0, 0, 0])
 SIZE = (320, 240)
 CAMERA = monitor_camera(SIZE, 13.0, 70.0, IDENTITY)
 # The module's promise: 1e-6 of a star's flux in any pixel, and the footprints' cut.
-PIXEL_LIMIT = 1e-6 + LARGEST_CUT
+PIXEL_LIMIT = 1e-6 + MAX_CUT
 SIGMA = (0.85, 0.6)
 
 
@@ -66,7 +66,7 @@ def test_flux_is_conserved_along_every_path():
         sprites = smeared_sprites(star_on((160.2, 120.7), at, 1e6), at, CAMERA, footprint_px(SIGMA), SIGMA)
         # Gauss-Legendre weights and float32 fluxes: a few 1e-8.
         assert sprites.data["electrons_per_s"].sum(dtype=np.float64) == pytest.approx(1e6, rel=3e-7)
-        assert linear_image(sprites, SIZE, SIGMA).sum() == pytest.approx(1e6, rel=3e-7 + LARGEST_CUT)
+        assert linear_image(sprites, SIZE, SIGMA).sum() == pytest.approx(1e6, rel=3e-7 + MAX_CUT)
 
 
 def test_a_camera_at_rest_has_one_sprite_a_star():
@@ -99,7 +99,7 @@ def test_a_whole_turn_in_one_exposure_makes_rings():
     at = motion((0, 0, 360.0))
     sprites = smeared_sprites(star_on((159.5 + 60, 119.5), at, 1.0), at, CAMERA, footprint_px(SIGMA), SIGMA)
     image = linear_image(sprites, SIZE, SIGMA)
-    assert image.sum() == pytest.approx(1.0, rel=3e-7 + LARGEST_CUT)
+    assert image.sum() == pytest.approx(1.0, rel=3e-7 + MAX_CUT)
     y, x = np.mgrid[0:240, 0:320]
     radius = np.hypot(x - 159.5, y - 119.5)
     assert image[np.abs(radius - 60) > 6].max() < 1e-9

@@ -11,7 +11,7 @@ from hilstar.errors import InputError
 from hilstar.monitor.geometry import monitor_camera
 from hilstar.rotation import from_radec_roll_deg, to_matrix
 from hilstar.scene.clipping import clipped_sprites
-from hilstar.scene.psf import LARGEST_CUT, cut_share, footprint_px, peak_share, pixel_share
+from hilstar.scene.psf import MAX_CUT, cut_share, footprint_px, peak_share, pixel_share
 from hilstar.scene.sprites import make_sprites
 from hilstar.sky.catalog import FIELDS, Catalog
 from hilstar.sky.stars import Stars, make_stars
@@ -38,7 +38,7 @@ def stars_on_pixels(camera, pixels: np.ndarray, electrons_per_s: np.ndarray | No
 @pytest.mark.parametrize("sigma", [0.2, 0.4, 0.55, 0.85, 1.0, 3.0, 20.0])
 def test_a_footprint_is_the_smallest_that_cuts_too_little_to_matter(sigma):
     size = footprint_px((sigma, sigma))
-    assert cut_share(size, (sigma, sigma)) <= LARGEST_CUT < cut_share(size - 1, (sigma, sigma))
+    assert cut_share(size, (sigma, sigma)) <= MAX_CUT < cut_share(size - 1, (sigma, sigma))
 
 
 def test_cut_share_is_the_light_outside_the_worst_footprint():

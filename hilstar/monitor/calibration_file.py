@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import datetime
 import json
-import re
 from pathlib import Path
 from typing import Annotated, Any, Literal, Protocol
 
@@ -17,6 +16,7 @@ from hilstar.arrays import FloatArray
 from hilstar.errors import InputError, shortened
 from hilstar.files import write_whole
 from hilstar.reading import MAX_TOML_BYTES, as_text, exists, parse_toml, read_bytes
+from hilstar.toml_tables import Kind, Table, explained
 
 BLACKS_AGREE = 0.1  # relative: the three channels' code 0 is one and the same black screen
 MAX_TABLE_BYTES = 10_000_000
@@ -36,11 +36,7 @@ class Digest(Protocol):
         """The hash so far."""
 
 
-class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A table of a calibration file; unknown keys are refused."""
-
-
-class Head(_Table, frozen=True):
+class Head(Table, frozen=True):
     """[calibration]: who measured what."""
 
     kind: Literal["photometric"]
@@ -52,7 +48,7 @@ class Head(_Table, frozen=True):
     response: str
 
 
-class WeightsTable(_Table, frozen=True):
+class WeightsTable(Table, frozen=True):
     """[weights]: the primaries as the tracker sees them, any scale."""
 
     r: Share
@@ -60,19 +56,19 @@ class WeightsTable(_Table, frozen=True):
     b: Share
 
 
-class UniformityTable(_Table, frozen=True):
+class UniformityTable(Table, frozen=True):
     """[uniformity]: where the grid of relative light is."""
 
     file: str
 
 
-class NoiseTable(_Table, frozen=True):
+class NoiseTable(Table, frozen=True):
     """[noise]: how well a patch repeats."""
 
     relative: Annotated[float, Meta(ge=0, le=1)]
 
 
-class NotesTable(_Table, frozen=True):
+class NotesTable(Table, frozen=True):
     """[notes]: free text."""
 
     warm_up: str = ""
@@ -80,7 +76,7 @@ class NotesTable(_Table, frozen=True):
     text: str = ""
 
 
-class CalibrationFile(_Table, frozen=True):
+class CalibrationFile(Table, frozen=True):
     """A whole calibration file."""
 
     calibration: Head
@@ -88,6 +84,9 @@ class CalibrationFile(_Table, frozen=True):
     uniformity: UniformityTable | None = None
     noise: NoiseTable | None = None
     notes: NotesTable = msgspec.field(default_factory=NotesTable)
+
+
+KIND = Kind(CalibrationFile, "configs/CALIBRATION.md", TYPE_WORDS)
 
 
 def _read(path: Path, digest: Digest, limit_bytes: int = MAX_TABLE_BYTES) -> str:
@@ -113,37 +112,7 @@ def read_toml(path: Path, digest: Digest) -> CalibrationFile:
     try:
         return msgspec.convert(tables, CalibrationFile)
     except (msgspec.ValidationError, RecursionError) as error:
-        raise InputError(f"{path}: {_explained(str(error), tables)}") from error
-
-
-def _explained(message: str, tables: dict[str, Any]) -> str:
-    try:
-        return _explain(message, tables)
-    except (LookupError, TypeError, ValueError):  # a key of the user's own with brackets or quotes in it
-        return f"{shortened(message)}; {ADVICE}"
-
-
-def _explain(message: str, tables: dict[str, Any]) -> str:
-    """msgspec's message ("... - at `$.noise.relative`") as table, key, value and advice."""
-    fault, _, place = message.partition(" - at `$")
-    names = [name for name in re.split(r"[.\[\]`]+", place) if name]
-    where = f"[{names[0]}] " if names else ""
-    unknown = re.search(r"unknown field `(.*)`", fault)
-    if unknown:
-        return f"{where}unknown key {shortened(unknown[1])}; see configs/CALIBRATION.md"
-    missing = re.search(r"missing required field `(.*)`", fault)
-    if missing:
-        return f"{where}the key {missing[1]} is missing; add it" if names else f"the table [{missing[1]}] is missing; add it"
-    value: Any = tables
-    for name in names:
-        value = value[name]
-    wanted = fault.removeprefix("Expected ").replace("`", "").split(", got ")[0]
-    if fault.startswith("Invalid enum"):
-        wanted = '"photometric"'
-    shown = shortened(value if isinstance(value, int) else msgspec.json.encode(value, enc_hook=str).decode())
-    for type_name, word in TYPE_WORDS.items():
-        wanted = re.sub(rf"\b{type_name}\b", word, wanted)
-    return f"{where if len(names) > 1 else ''}{names[-1]} = {shown}; {wanted} is wanted"
+        raise InputError(f"{path}: {explained(str(error), tables, KIND)}") from error
 
 
 def _numbers(path: Path, lines: list[tuple[int, str]], columns: int) -> FloatArray:

@@ -11,8 +11,8 @@ from hilstar.bench.config.monitor import Monitor
 from hilstar.bench.config.read import parse_config, read_config
 from hilstar.bench.config.render import DEFAULT_BRIGHTEST_V_MAG, RenderSettings
 from hilstar.bench.config.sky import SkySettings
-from hilstar.bench.config.table import Vector
 from hilstar.bench.config.tracker import Tracker
+from hilstar.bench.config.values import Vector
 from hilstar.bench.config.verify import Verify
 
 __all__ = [

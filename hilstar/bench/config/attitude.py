@@ -6,7 +6,8 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from hilstar.bench.config.table import NotNegative, Table
+from hilstar.bench.config.values import NotNegative
+from hilstar.toml_tables import Table
 
 
 class AttitudeSettings(Table, frozen=True):

@@ -6,7 +6,8 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from hilstar.bench.config.table import Magnitude, NotNegative, Table
+from hilstar.bench.config.values import Magnitude, NotNegative
+from hilstar.toml_tables import Table
 
 
 class Background(Table, frozen=True):

@@ -10,9 +10,11 @@ from hilstar.bench.config.collimator import Collimator
 from hilstar.bench.config.monitor import Monitor
 from hilstar.bench.config.render import RenderSettings
 from hilstar.bench.config.sky import SkySettings
-from hilstar.bench.config.table import Table
 from hilstar.bench.config.tracker import Tracker
 from hilstar.bench.config.verify import Verify
+from hilstar.toml_tables import Table
+
+TYPE_WORDS = {"float": "number", "int": "whole number", "str": "text", "object": "table", "bool": "true or false"}
 
 
 class BenchConfig(Table, frozen=True):

@@ -6,7 +6,8 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from hilstar.bench.config.table import Point, Positive, Rotation, Table
+from hilstar.bench.config.values import Point, Positive, Rotation
+from hilstar.toml_tables import Table
 
 
 class Collimator(Table, frozen=True):

@@ -6,7 +6,8 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from hilstar.bench.config.table import NotNegative, Positive, Size, Table
+from hilstar.bench.config.values import NotNegative, Positive, Size
+from hilstar.toml_tables import Table
 
 MS_PER_S = 1000.0
 ONE_PERIOD = {"default": "one refresh period"}

@@ -9,13 +9,14 @@ from typing import Any
 import msgspec
 
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE
-from hilstar.bench.config.bench import BenchConfig
-from hilstar.bench.config.explain import explained
+from hilstar.bench.config.bench import TYPE_WORDS, BenchConfig
 from hilstar.bench.config.render import DEFAULT_BRIGHTEST_V_MAG
 from hilstar.errors import InputError, shortened
 from hilstar.reading import MAX_TOML_BYTES, parse_toml, read_text
+from hilstar.toml_tables import Kind, explained
 
 LIGHT_KM_S = 299_792.458
+KIND = Kind(BenchConfig, "configs/README.md", TYPE_WORDS)
 
 
 def read_config(path: Path) -> BenchConfig:
@@ -32,9 +33,9 @@ def parse_config(path: Path, text: str) -> BenchConfig:
     except InputError as error:  # what the detector's keys mean together
         raise InputError(f"{path}: [tracker.detector] {error}") from error
     except RecursionError as error:
-        raise InputError(f"{path}: its tables are nested too deep; see configs/README.md") from error
+        raise InputError(f"{path}: its tables are nested too deep; see {KIND.reference}") from error
     except msgspec.ValidationError as error:
-        raise InputError(f"{path}: {explained(str(error), tables)}") from error
+        raise InputError(f"{path}: {explained(str(error), tables, KIND)}") from error
     _check_meaning(config, path)
     return _with_white(config)
 

@@ -13,9 +13,9 @@ import msgspec
 from msgspec import NODEFAULT, Meta
 from msgspec.structs import FieldInfo
 
-from hilstar.bench.config.bench import BenchConfig
-from hilstar.bench.config.explain import TYPE_WORDS, plain
-from hilstar.bench.config.table import MAX_NUMBER, MIN_POSITIVE
+from hilstar.bench.config.bench import TYPE_WORDS, BenchConfig
+from hilstar.bench.config.values import MAX_NUMBER, MIN_POSITIVE
+from hilstar.toml_tables import plain
 
 # The unit that the end of a key's name says, the longest end first.
 UNITS = {

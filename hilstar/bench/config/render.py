@@ -6,7 +6,8 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from hilstar.bench.config.table import Magnitude, NotNegative, Positive, Sigma, Table
+from hilstar.bench.config.values import Magnitude, NotNegative, Positive, Sigma
+from hilstar.toml_tables import Table
 
 # White, where the file gives none. demo.toml, 200 random fields: the brightest code of 8 bits is 100 in the median (38 with
 # Sirius for white), `verify` sees flux 0.065 mag off at 95 % (0.41), and 13 stars clip, one of them in 8 % of fields.

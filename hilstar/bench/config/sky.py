@@ -6,7 +6,8 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from hilstar.bench.config.table import IcrsVector, Magnitude, Table
+from hilstar.bench.config.values import IcrsVector, Magnitude
+from hilstar.toml_tables import Table
 
 
 class SkySettings(Table, frozen=True):

@@ -7,7 +7,8 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from hilstar.bench.config.table import NotNegative, Positive, Sigma, Size, Table
+from hilstar.bench.config.values import NotNegative, Positive, Sigma, Size
+from hilstar.toml_tables import Table
 from hilstar.tracker.settings import DetectorSettings, PixelPitch
 
 

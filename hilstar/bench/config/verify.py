@@ -6,7 +6,8 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from hilstar.bench.config.table import NotNegative, Positive, Rotation, Table
+from hilstar.bench.config.values import NotNegative, Positive, Rotation
+from hilstar.toml_tables import Table
 
 AS_ASSUMED = {"default": "as the bench assumes"}
 

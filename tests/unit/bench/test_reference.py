@@ -12,8 +12,8 @@ import pytest
 from msgspec.structs import FieldInfo
 
 from hilstar.bench.config import BenchConfig, read_config
-from hilstar.bench.config.explain import plain
 from hilstar.bench.config.reference import is_table, page, tables_of
+from hilstar.toml_tables import plain
 from tests.support.benches import SMALL_BENCH
 
 KEYS = [

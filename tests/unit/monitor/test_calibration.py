@@ -136,6 +136,8 @@ def refusal(path, bits=2, **more):
         (HEAD + "[noise]\nrelative = 7\n", "[noise] relative = 7"),
         (HEAD + '[uniformity]\nfile = "gone.csv"\n', "[uniformity] file"),
         (HEAD + "[extra]\n", "unknown key extra"),
+        (HEAD + "[noise]\nabsolute = 1\n", "[noise] unknown key absolute; known are relative"),
+        (HEAD + "[noise]\nrelative = 2\n", "[noise] relative = 2; a number <= 1.0 is wanted"),
     ],
 )
 def test_a_malformed_file_is_refused_in_one_line(write, head, words):

@@ -1,10 +1,9 @@
-"""What the tables of a bench file are made of: the refusal of unknown keys, and the kinds of value."""
+"""The kinds of value in a bench file."""
 
 from __future__ import annotations
 
 from typing import Annotated
 
-import msgspec
 from msgspec import Meta
 
 # The limits keep every product of such numbers within float64; no bench comes near them.
@@ -20,7 +19,3 @@ Point = Annotated[tuple[float, float], Meta(extra={"form": "[x, y]"})]
 Vector = tuple[float, float, float]
 IcrsVector = Annotated[Vector, Meta(extra={"form": "[x, y, z]"})]
 Rotation = Annotated[tuple[float, float, float, float], Meta(extra={"form": "[w, x, y, z]"})]
-
-
-class Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A table of the bench file; unknown keys are refused."""

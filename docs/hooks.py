@@ -13,7 +13,7 @@ OUTSIDE = re.compile(r"\[([^\]\[]+)\]\(\.\./([^)\s#]+)(?:#[^)\s]*)?\)")
 
 def _named(link: re.Match[str]) -> str:
     text, path = link[1], link[2]
-    return f"`{path}`" if text.strip("`") == path else f"{text} (`{path}`)"
+    return f"`{path}`" if path.endswith(text.strip("`")) else f"{text} (`{path}`)"
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:

@@ -1,6 +1,6 @@
 """What happens in a run, said while it happens: a line on stderr, a count in the summary, an event in the ledger.
 
-A kind that comes more than SAID_AT_MOST times within SAID_WITHIN_S is counted and kept, and said again when it is rare.
+A kind that comes more than MAX_SAID times within SAID_WINDOW_S is counted and kept, and said again when it is rare.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
-SAID_AT_MOST = 3
-SAID_WITHIN_S = 10.0
+MAX_SAID = 3
+SAID_WINDOW_S = 10.0
 MAX_DETAIL_CHARACTERS = 400
 log = logging.getLogger(__name__)
 
@@ -49,12 +49,12 @@ class Notices:
         notice = Notice(time.monotonic_ns(), kind, detail[:MAX_DETAIL_CHARACTERS])
         with self._lock:
             self._counts[kind] += 1
-            said_ns = self._said_ns.setdefault(kind, deque(maxlen=SAID_AT_MOST))
-            floods = len(said_ns) == SAID_AT_MOST and notice.host_ns - said_ns[0] < SAID_WITHIN_S * 1e9
+            said_ns = self._said_ns.setdefault(kind, deque(maxlen=MAX_SAID))
+            floods = len(said_ns) == MAX_SAID and notice.host_ns - said_ns[0] < SAID_WINDOW_S * 1e9
             if not floods:
                 said_ns.append(notice.host_ns)
-            last_before_silence = not floods and len(said_ns) == SAID_AT_MOST
-            last_before_silence &= notice.host_ns - said_ns[0] < SAID_WITHIN_S * 1e9
+            last_before_silence = not floods and len(said_ns) == MAX_SAID
+            last_before_silence &= notice.host_ns - said_ns[0] < SAID_WINDOW_S * 1e9
         if not floods:
             log.warning("%s%s", notice.detail, "; further ones are only counted for a while" if last_before_silence else "")
         for listener in self._listeners:

@@ -10,7 +10,8 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from hilstar.attitude.wire.serial_link import serial_ports
-from hilstar.attitude.wire.zmq_links import ZmqReceiver, ZmqSender, zmq_version
+from hilstar.attitude.wire.zmq_socket import zmq_version
+from hilstar.attitude.wire.zmq_stream import ZmqReceiver, ZmqSender
 from hilstar.errors import HilstarError, MachineError
 from hilstar.monitor.window.window import displays
 from hilstar.render.renderer import create_context

@@ -10,7 +10,7 @@ from hilstar.attitude.clock.timeline import Attitude
 from hilstar.attitude.receiver import PacketCounts
 from hilstar.attitude.wire.links import Arrival
 from hilstar.attitude.wire.packet import AttitudeSample, Event, Refusal, TimeReply, TimeRequest, rate_refusal
-from hilstar.attitude.wire.zmq_links import ZmqLockstep
+from hilstar.attitude.wire.zmq_lockstep import ZmqLockstep
 from hilstar.bench.frame import Bench
 from hilstar.run.frame_status import StatusMaker
 from hilstar.run.loop import FrameLoop, Limit, Shown

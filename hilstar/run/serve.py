@@ -12,7 +12,8 @@ from hilstar.attitude.clock.timeline import Timeline
 from hilstar.attitude.receiver import PacketCounts, Receiver, nobody_watches
 from hilstar.attitude.wire.keys import CurveKeys
 from hilstar.attitude.wire.serial_link import SerialLink
-from hilstar.attitude.wire.zmq_links import ZmqLockstep, ZmqReceiver
+from hilstar.attitude.wire.zmq_lockstep import ZmqLockstep
+from hilstar.attitude.wire.zmq_stream import ZmqReceiver
 from hilstar.bench.config import AttitudeSettings
 from hilstar.bench.frame import Bench
 from hilstar.notices import Notices

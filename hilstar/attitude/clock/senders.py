@@ -24,7 +24,7 @@ TURNS_BY_MOTION = 8  # attitudes alone say less than two counters
 FAR = 4.0  # so many times farther from one than from the other
 MIN_FAR_RAD = 5e-5  # 10 arcsec
 FIRST_LOSSES = 16  # how many packets may be missing while nobody knows how often they come
-LONGEST_STEP_NS = 10 * NS_PER_S
+MAX_STEP_NS = 10 * NS_PER_S
 REORDERED = 64
 
 
@@ -78,7 +78,7 @@ class _Track:
         step, later_ns = self.step(sample), sample.t_ns - self.sample.t_ns
         if self.still and step == 0:
             return later_ns > 0
-        gap_ns = max(later_ns if 0 < later_ns < LONGEST_STEP_NS else 0, host_ns - self.host_ns)
+        gap_ns = max(later_ns if 0 < later_ns < MAX_STEP_NS else 0, host_ns - self.host_ns)
         most = FIRST_LOSSES if self.period_ns is None else 2 + 2 * gap_ns / self.period_ns
         return 1 <= step <= most
 
@@ -92,7 +92,7 @@ class _Track:
     def move(self, sample: AttitudeSample, host_ns: int) -> None:
         """The next one of this sender."""
         step, later_ns = self.step(sample), sample.t_ns - self.sample.t_ns
-        if 0 < later_ns < LONGEST_STEP_NS:
+        if 0 < later_ns < MAX_STEP_NS:
             period_ns = later_ns / max(step, 1)
             self.period_ns = period_ns if self.period_ns is None else self.period_ns + (period_ns - self.period_ns) / 8
         self.sample, self.host_ns, self.still = sample, host_ns, self.still and step == 0

@@ -22,7 +22,6 @@ LIVE_CAPACITY = 1024
 # A stale attitude is fresh again once it is no older than this share of `stale_after`: no flicker at the limit.
 FRESH_AGAIN = 0.5
 
-OnStale = Literal["hold", "blank"]
 # What lies between two samples: the first one until the second, the shorter way, or the C2 blend of both with their rates.
 Join = Literal["hold", "slerp", "blend"]
 Joins = Callable[[AttitudeSample, AttitudeSample], Join]

@@ -1,12 +1,12 @@
-"""Packets out of a byte stream: COBS frames with a 0x00 after each, cut anywhere, with anything between; no I/O.
+"""Packets out of a byte stream: COBS frames, each followed by 0x00, cut anywhere, with anything between them; no I/O.
 
 Laws:
 1. However the bytes are cut into chunks, the events are the same.
-2. A frame is accepted only if `packet.decode` accepts what is in it, so never against its CRC-32.
-3. Whatever came before, the next whole frame after a 0x00 is decoded.
-4. What is kept between chunks never passes LONGEST_FRAME_BYTES: a bench that never sends a 0x00 costs one refusal
-   for each stretch of garbage, and no memory.
-5. What stands before the stream's first 0x00 is somebody's frame cut in two: it counts only when it is whole.
+2. A frame is accepted only if `packet.decode` accepts its content, so never with a wrong CRC-32.
+3. Whatever came before, the next complete frame after a 0x00 is decoded.
+4. At most MAX_FRAME_BYTES are kept between chunks: a sender that never sends 0x00 costs one refusal for each stretch of
+   garbage, and no memory.
+5. The bytes before the stream's first 0x00 may be the end of a frame: they count only if they are a complete one.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from hilstar.attitude.wire import protocol
 from hilstar.attitude.wire.packet import Event, Packet, Refusal, decode, encode
 
 DELIMITER = b"\x00"
-# COBS adds one byte to anything shorter than 254; packets are the only thing framed, JSON is ZeroMQ's.
-LONGEST_FRAME_BYTES = max(protocol.PACKET_BYTES.values()) + 1
+# COBS adds one byte to anything shorter than 254. Only packets are framed: JSON goes over ZeroMQ.
+MAX_FRAME_BYTES = max(protocol.PACKET_BYTES.values()) + 1
 
 
 def frame(packet: Packet) -> bytes:
@@ -40,7 +40,7 @@ class StreamDecoder:
         self._synchronised = False
 
     def feed_newest(self, chunk: bytes, frames: int) -> list[tuple[Event, bytes]]:
-        """The events of the last `frames` delimiters of `chunk` alone: those before, and what was kept, are forgotten."""
+        """The events of only the last `frames` delimiters of `chunk`: earlier ones, and the bytes kept so far, are dropped."""
         before = len(chunk)
         for _ in range(frames + 1):
             before = chunk.rfind(DELIMITER, 0, before) if before > 0 else -1
@@ -61,12 +61,12 @@ class StreamDecoder:
     def _keep(self, part: bytes, events: list[tuple[Event, bytes]]) -> None:
         if self._overlong:
             return
-        room = LONGEST_FRAME_BYTES - len(self._kept)
+        room = MAX_FRAME_BYTES - len(self._kept)
         self._kept += part[:room]
         if len(part) > room:
             self._overlong = True
             if self._synchronised:
-                refusal = Refusal("format", f"no 0x00 within {LONGEST_FRAME_BYTES} bytes; a frame is COBS with a 0x00 after it")
+                refusal = Refusal("format", f"no 0x00 within {MAX_FRAME_BYTES} bytes; send COBS frames, each followed by 0x00")
                 events.append((refusal, bytes(self._kept)))
 
     def _end_frame(self, events: list[tuple[Event, bytes]]) -> None:
@@ -87,5 +87,5 @@ def _decode_frame(body: bytes) -> Event:
     except cobs.DecodeError as error:
         return Refusal("format", f"not COBS ({error})")
     if message.lstrip()[:1] == b"{":
-        return Refusal("format", f"a frame that starts with {message[:1]!r}; JSON goes over ZeroMQ")
+        return Refusal("format", f"a frame that starts with {message[:1]!r}; send JSON over ZeroMQ")
     return decode(message)

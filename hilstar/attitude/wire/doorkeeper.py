@@ -1,8 +1,8 @@
-"""Who comes and goes at a ZeroMQ socket: counted, told, and at most MAX_CONNECTIONS at a time.
+"""The connections of a ZeroMQ socket: counted, reported, and at most MAX_CONNECTIONS at a time.
 
-libzmq says what happens on a monitor socket and limits nothing: it takes connections until the process has no file left.
-What is over the limit is shut at once, the newest first, so that whoever was there stays. A peer that does not finish its
-handshake within HANDSHAKE_MS is closed by libzmq itself.
+libzmq reports on a monitor socket and limits nothing: it accepts connections until the process runs out of file descriptors.
+Connections over the limit are closed at once, the newest first, so that the established ones stay. libzmq itself closes a
+peer that does not finish its handshake within HANDSHAKE_MS.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ EVENT = struct.Struct("=Hi")  # of zmq_socket_monitor(3): event, value; pyzmq's 
 HANDSHAKE_MS = 2000
 FAILED = {
     zmq.EVENT_HANDSHAKE_FAILED_AUTH: "its key is not among those allowed",
-    zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL: "it speaks another kind of ZeroMQ than this socket, or without keys",
-    zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL: f"it left, or did not say who it is within {HANDSHAKE_MS / 1000:g} s",
+    zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL: "it is another type of ZeroMQ socket, or it has no keys",
+    zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL: f"it left, or did not finish its handshake within {HANDSHAKE_MS / 1000:g} s",
 }
 EVENTS = zmq.EVENT_ACCEPTED | zmq.EVENT_CONNECTED | zmq.EVENT_DISCONNECTED | zmq.EVENT_HANDSHAKE_SUCCEEDED | sum(FAILED)
 
 
 class Doorkeeper:
-    """Reads the monitor of one socket that is yet to be bound or connected.
+    """Reads the monitor of one socket, made before it is bound or connected.
 
-    `lost` says that a connection has ended; whoever acts on it takes it back. `place` is the port or path that was bound.
+    `lost` says that a connection has ended; whoever acts on it resets it. `place` is the port or path that was bound.
     """
 
     def __init__(self, watched: zmq.Socket[bytes], *, bound: bool, counts: LinkCounts, notices: Notices) -> None:
@@ -45,18 +45,18 @@ class Doorkeeper:
         self._bound = bound
         self._counts = counts
         self._notices = notices
-        self._open: dict[int, str] = {}  # file: who, in the order of arrival
+        self._open: dict[int, str] = {}  # file descriptor: peer, in the order of arrival
         self._shut: set[int] = set()
         self._failure = ""
         self._monitor = watched.get_monitor_socket(EVENTS)
 
     @property
     def monitor(self) -> zmq.Socket[bytes]:
-        """The socket to poll for news."""
+        """The socket to poll for events."""
         return self._monitor
 
     def tend(self) -> None:
-        """Take in what has happened."""
+        """Take the events so far."""
         events = 0
         with contextlib.suppress(zmq.ZMQError):
             while events < MAX_EVENTS:
@@ -81,10 +81,10 @@ class Doorkeeper:
             self._failure = FAILED[zmq.Event(event)]
 
     def _arrive(self) -> None:
-        """A connecting socket's peer is there, for the first time or again."""
+        """A connecting socket's peer has answered, for the first time or again."""
         self._counts.connections += 1
         if self._counts.connections > 1:
-            self._notices.tell("back", "the sender is connected again")
+            self._notices.tell("back", "reconnected to the sender")
 
     def _leave(self, file: int) -> None:
         self.lost = True
@@ -94,24 +94,25 @@ class Doorkeeper:
             self._shut.remove(file)
         elif failure and self._bound:
             self._counts.rejected += 1
-            self._notices.tell("client-rejected", f"a connection from {who or 'somewhere'} was rejected: {failure}")
+            self._notices.tell("client-rejected", f"a connection from {who or 'an unknown peer'} was rejected: {failure}")
         elif failure:
             self._counts.rejected += 1
             self._notices.tell(
-                "link-rejected", "the side that binds did not let us in: see its allowed_clients, and our curve_server_key"
+                "link-rejected",
+                "the other side rejected us: check its allowed_clients, and our curve_server_key",
             )
         elif not self._bound:
             self._counts.lost += 1
-            self._notices.tell("lost", "the connection to the sender is lost; waiting for it")
+            self._notices.tell("lost", "lost the connection to the sender; waiting for it")
 
     def _shut_newest(self) -> None:
         newest = [file for file in list(self._open)[MAX_CONNECTIONS:] if file not in self._shut]
         if not newest:
             return
         if not self._shut:
-            who = self._open[newest[0]] or "somewhere"
+            who = self._open[newest[0]] or "an unknown peer"
             self._notices.tell(
-                "connections-refused", f"over {MAX_CONNECTIONS} connections at once; further ones, from {who}, are shut"
+                "connections-refused", f"over {MAX_CONNECTIONS} connections at once; closing further ones, from {who}"
             )
         for file in newest:
             self._counts.refused += 1
@@ -121,13 +122,13 @@ class Doorkeeper:
                     connection.shutdown(socket.SHUT_RDWR)
 
     def _is_ours(self, connection: socket.socket) -> bool:
-        """A file's number may be another file's by now."""
+        """The descriptor may belong to another file by now."""
         name = connection.getsockname()
         return bool((name[1] if isinstance(name, tuple) else name) == self.place)
 
     def close(self) -> None:
         """Stop watching; before its socket is closed."""
-        self.tend()  # libzmq waits on a monitor that is full, and would wait for ever on one that is gone
+        self.tend()  # libzmq blocks on a full monitor, and would block for ever on a closed one
         with contextlib.suppress(zmq.ZMQError):
             self._watched.disable_monitor()
         self._monitor.close(linger=0)
@@ -135,7 +136,7 @@ class Doorkeeper:
 
 @contextlib.contextmanager
 def _connection(file: int) -> Iterator[socket.socket | None]:
-    """libzmq's own connection for a moment, through a copy of its file; None where it is gone."""
+    """libzmq's own connection for a moment, through a duplicate of its descriptor; None where it is gone."""
     try:
         connection = socket.socket(fileno=os.dup(file))
     except OSError:

@@ -1,11 +1,11 @@
-"""Where a ZeroMQ socket binds or connects: a whitelist of forms, so that libzmq reads exactly what was judged here.
+"""Where a ZeroMQ socket binds or connects: a whitelist of forms, so that libzmq reads exactly what was checked here.
 
-libzmq itself also takes tcp://SOURCE;DESTINATION, names of interfaces, octal addresses, ports modulo 65536, and text after
+libzmq itself also accepts tcp://SOURCE;DESTINATION, names of interfaces, octal addresses, ports modulo 65536, and text after
 the port; and binding ipc://FILE deletes that file.
 
     tcp://HOST:PORT   HOST an IPv4 address, an IPv6 address in brackets, a host's name, or * (bind only; every interface);
-                      PORT 1 to 65535, or * (bind only; a free one, which is told)
-    ipc:///PATH       a Unix socket, its whole path; a directory that exists, and nothing there but a socket that nobody serves
+                      PORT 1 to 65535, or * (bind only; a free one, which is reported)
+    ipc:///PATH       a Unix socket, its absolute path; in an existing directory, with nothing there but an unserved socket
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from pathlib import Path
 from hilstar.errors import InputError, shortened
 
 ENDPOINT_FORM = "write tcp://HOST:PORT, such as tcp://127.0.0.1:5560"
-PATH_FORM = "write the whole path of a socket, such as ipc:///run/user/1000/attitude"
+PATH_FORM = "write the absolute path of a socket, such as ipc:///run/user/1000/attitude"
 LABEL = "(?!-)[A-Za-z0-9-]{1,63}(?<!-)"
-# The last label of a name is no number: what looks like one is an address in some older spelling (127.1, 0x7f.1).
+# The last label of a name is not a number: that would be an address in an older notation (127.1, 0x7f.1).
 HOST_NAME = re.compile(rf"(?:{LABEL}\.)*(?!0[xX])(?=[A-Za-z0-9-]*[A-Za-z]){LABEL}")
 TCP = re.compile(r"tcp://(\[[0-9A-Fa-f:.%A-Za-z]+\]|[^\[\]:/;@%\s]+):([0-9]{1,5}|\*)")
 MAX_HOST_CHARACTERS = 253
@@ -34,7 +34,7 @@ FREE_PORTS = ("*", "0")
 
 @dataclass(frozen=True, slots=True)
 class Endpoint:
-    """An endpoint that was judged: `address` as libzmq gets it, and whether nobody beyond this machine can reach it."""
+    """A checked endpoint: `address` as libzmq gets it, and whether it is reachable only from this machine."""
 
     address: str
     loopback: bool
@@ -44,7 +44,7 @@ class Endpoint:
 
 
 def parse_endpoint(text: str) -> Endpoint:
-    """What an endpoint's text says. Raises InputError for any form but those at the head of this module."""
+    """The endpoint of a text. Raises InputError for any form except those listed in this module's docstring."""
     if text.startswith("ipc://"):
         return _parse_ipc(text)
     match = TCP.fullmatch(text)
@@ -57,7 +57,7 @@ def parse_endpoint(text: str) -> Endpoint:
 
 
 def _judge_host(host: str, text: str) -> tuple[str, bool, bool]:
-    """The host as libzmq gets it, whether it is this machine's loopback, and whether it is every interface."""
+    """The host as libzmq gets it, whether it is loopback, and whether it is every interface."""
     if host == "*":
         return host, False, True
     if host == "localhost":  # as an address: a name could be resolved to anything
@@ -68,34 +68,34 @@ def _judge_host(host: str, text: str) -> tuple[str, bool, bool]:
     except ValueError as error:
         if bracketed or len(host) > MAX_HOST_CHARACTERS or not HOST_NAME.fullmatch(host):
             raise InputError(
-                f"{shortened(text)}: {shortened(host)} is no address and no host's name; {ENDPOINT_FORM}"
+                f"{shortened(text)}: {shortened(host)} is neither an address nor a host name; {ENDPOINT_FORM}"
             ) from error
         return host, False, False
     mapped = getattr(address, "ipv4_mapped", None)
     if mapped is not None:
-        raise InputError(f"{shortened(text)}: an IPv4 address inside an IPv6 one; write tcp://{mapped}:PORT")
+        raise InputError(f"{shortened(text)}: an IPv4-mapped IPv6 address; write tcp://{mapped}:PORT")
     return f"[{address}]" if bracketed else str(address), address.is_loopback, address.is_unspecified
 
 
 def _parse_ipc(text: str) -> Endpoint:
     name = text.removeprefix("ipc://")
     if not name.startswith("/") or not name.isprintable() or len(os.fsencode(name)) > MAX_PATH_BYTES:
-        raise InputError(f"{shortened(text)}: not a path of at most {MAX_PATH_BYTES} bytes; {PATH_FORM}")
+        raise InputError(f"{shortened(text)}: not an absolute path of at most {MAX_PATH_BYTES} bytes; {PATH_FORM}")
     return Endpoint(text, loopback=True, path=Path(name))
 
 
 def check_use(endpoint: Endpoint, text: str, *, bind: bool) -> None:
-    """Refuse (InputError) what cannot be bound or connected, and what a bind would destroy."""
+    """Refuse (InputError) an endpoint that cannot be bound or connected, or whose file a bind would delete."""
     if endpoint.path is not None:
         _check_socket_file(endpoint.path, text, bind)
     elif not bind and endpoint.any_host:
-        raise InputError(f"{text}: every interface is nothing to connect to; write the address of the side that binds")
+        raise InputError(f"{text}: cannot connect to every interface; write the address of the side that binds")
     elif not bind and endpoint.any_port:
-        raise InputError(f"{text}: a free port is nothing to connect to; write the port that the side that binds has")
+        raise InputError(f"{text}: cannot connect to a free port; write the port of the side that binds")
 
 
 def _check_socket_file(path: Path, text: str, bind: bool) -> None:
-    """libzmq deletes whatever has the name that it binds."""
+    """libzmq deletes any file at the path that it binds."""
     try:
         mode = path.lstat().st_mode
     except FileNotFoundError:
@@ -103,13 +103,13 @@ def _check_socket_file(path: Path, text: str, bind: bool) -> None:
     except OSError as error:
         raise InputError(f"{text}: {error.strerror}; {PATH_FORM}") from error
     if bind and not path.parent.is_dir():
-        raise InputError(f"{text}: there is no directory {path.parent}; make it, or write another path")
+        raise InputError(f"{text}: the directory {path.parent} does not exist; create it, or write another path")
     if mode is None:
         return
     if not stat.S_ISSOCK(mode):
-        raise InputError(f"{text}: is there and is no socket, and binding would delete it; write another path")
+        raise InputError(f"{text}: an existing file that is not a socket, and binding would delete it; write another path")
     if bind and _is_served(path):
-        raise InputError(f"{text}: a running program serves it; stop that program, or write another path")
+        raise InputError(f"{text}: in use by a running program; stop that program, or write another path")
 
 
 def _is_served(path: Path) -> bool:
@@ -119,6 +119,6 @@ def _is_served(path: Path) -> bool:
             asker.connect(str(path))
         except (ConnectionRefusedError, FileNotFoundError):
             return False
-        except OSError:  # its queue is full (EAGAIN), or it is not ours
+        except OSError:  # its queue is full (EAGAIN), or it belongs to another user
             return True
     return True

@@ -1,4 +1,4 @@
-"""What a flood may cost: packets a second that are looked at, memory, and files."""
+"""What a flood may cost: packets decoded per second, memory, and file descriptors."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from dataclasses import asdict, dataclass
 
 from hilstar.notices import Notices
 
-MAX_PACKETS_PER_S = 3000  # looked at: some 10 % of one core, and more than any serial line brings
-MAX_BURST = 1000  # what may have waited while the receiver stood still
+MAX_PACKETS_PER_S = 3000  # decoded: some 10 % of one core, and more than any serial line carries
+MAX_BURST = 1000  # as many as may have waited while the receiver was stopped
 MAX_GROWTH_BYTES = 256_000_000
 LOOK_S = 0.01
-PAUSE_S = 0.005  # of a receiver that is flooded: the frame loop needs Python's lock
-OVER_S = 1.0  # a flood without a dropped packet for so long is over
+PAUSE_S = 0.005  # of a flooded receiver: the frame loop needs the interpreter lock
+OVER_S = 1.0  # a flood is over once no packet was dropped for this long
 FREED_WITHIN_S = 2.0
 PAGE_BYTES = resource.getpagesize()
 WANTED_FILES = 65_536
@@ -24,7 +24,7 @@ WANTED_FILES = 65_536
 
 @dataclass(slots=True)
 class LinkCounts:
-    """What became of a link's connections and messages.
+    """The counts of a link's connections and messages.
 
     `connections` were made; `rejected` failed in the handshake; `refused` were too many at once; `lost` ended on the side that
     connects; `resets` of the link, for memory or for messages without end; `flooded` messages were dropped unread.
@@ -43,7 +43,7 @@ class LinkCounts:
 
 
 class FloodGate:
-    """How many packets are looked at: MAX_PACKETS_PER_S, and MAX_BURST at once. The others are counted and told."""
+    """Admits MAX_PACKETS_PER_S, and MAX_BURST at once. The others are counted and reported."""
 
     def __init__(self, counts: LinkCounts, notices: Notices) -> None:
         self._counts = counts
@@ -53,7 +53,7 @@ class FloodGate:
         self._dropped_s = -OVER_S
 
     def admit(self, waiting: int) -> int:
-        """How many of the packets that wait may be looked at; the caller drops the others. Pauses where there are others."""
+        """How many of the waiting packets may be decoded; the caller drops the others. Pauses where there are others."""
         now_s = time.monotonic()
         self._left = min(self._left + (now_s - self._seen_s) * MAX_PACKETS_PER_S, MAX_BURST)
         self._seen_s = now_s
@@ -67,7 +67,7 @@ class FloodGate:
         self._counts.flooded += count
         if now_s - self._dropped_s > OVER_S:
             self._notices.tell(
-                "flood", f"over {MAX_PACKETS_PER_S} packets a second: the newest are taken, the others dropped unread"
+                "flood", f"over {MAX_PACKETS_PER_S} packets per second: taking the newest, dropping the others unread"
             )
         self._dropped_s = now_s
         time.sleep(PAUSE_S)
@@ -76,13 +76,13 @@ class FloodGate:
 class MemoryWatch:
     """Whether this process has grown by more than MAX_GROWTH_BYTES since `begin`.
 
-    libzmq keeps a message until its last part has come, with no limit on parts, and shows nobody what it keeps: the memory of
-    the process is all there is to see. Without /proc nothing is watched.
+    libzmq keeps a message until its last part arrives, with no limit on parts, and does not report what it keeps: only the
+    memory of the process shows it. Without /proc nothing is watched.
     """
 
     def __init__(self) -> None:
         self._file = -1
-        with contextlib.suppress(OSError):  # held open: a process out of files must still see its memory
+        with contextlib.suppress(OSError):  # kept open: a process out of descriptors must still see its memory
             self._file = os.open("/proc/self/statm", os.O_RDONLY | os.O_CLOEXEC)
         self._base_bytes = self._used_bytes()
         self._looked_s = 0.0
@@ -92,7 +92,7 @@ class MemoryWatch:
         self._base_bytes = self._used_bytes()
 
     def grown_bytes(self) -> int:
-        """How much more is used than at the beginning; looked up at most every LOOK_S, 0 meanwhile."""
+        """The growth since `begin`; looked up at most every LOOK_S, 0 in between."""
         now_s = time.monotonic()
         if now_s - self._looked_s < LOOK_S:
             return 0
@@ -100,7 +100,7 @@ class MemoryWatch:
         return self._used_bytes() - self._base_bytes
 
     def await_release(self) -> None:
-        """Wait a moment for memory that was given up; what stays was not a link's, and is counted from now on."""
+        """Wait a moment for freed memory to be returned; what remains was not the link's, and becomes the new baseline."""
         deadline_s = time.monotonic() + FREED_WITHIN_S
         while (used_bytes := self._used_bytes()) > self._base_bytes + MAX_GROWTH_BYTES / 2:
             if time.monotonic() > deadline_s:
@@ -124,13 +124,13 @@ class MemoryWatch:
 
 
 def _give_back_what_is_free() -> None:
-    """glibc else keeps freed memory for itself, and what it keeps would count as grown."""
+    """Otherwise glibc keeps freed memory, which would count as growth."""
     with contextlib.suppress(AttributeError, OSError):
         ctypes.CDLL(None).malloc_trim(0)
 
 
 def raise_file_limit() -> None:
-    """As many open files as this user may have, up to WANTED_FILES: each connection is one, and so are ledger and display."""
+    """Raise the limit of open files up to WANTED_FILES: each connection needs one, and so do ledger and display."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = WANTED_FILES if hard == resource.RLIM_INFINITY else min(hard, WANTED_FILES)
     if soft != resource.RLIM_INFINITY and soft < wanted:

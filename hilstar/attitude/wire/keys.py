@@ -1,7 +1,7 @@
-"""CURVE keys for ZeroMQ beyond loopback: made, read, and asked for where they lack.
+"""CURVE keys for ZeroMQ: made, read, and required for non-loopback endpoints.
 
-The side that binds is the CURVE server: it has an allow-list of its clients' public keys. The side that connects needs
-the server's public key. Key files are pyzmq's certificates.
+The side that binds is the CURVE server, with an allow-list of its clients' public keys. The side that connects needs the
+server's public key. Key files are pyzmq certificates.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from hilstar.reading import exists, read_bytes
 MAKE_KEYS = "make keys with `hilstar keys -o DIR`"
 MAX_KEY_FILE_BYTES = 16_384
 KEY_BYTES = 32
-OTHERS = 0o077  # of a file's mode: what its group and everybody else may do
+OTHERS = 0o077  # of a file's mode: the rights of its group and of everybody else
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
 class CurveKeys:
-    """One side's keys: its own secret key file, and whom it trusts.
+    """One side's keys: its own secret key file, and the peers that it trusts.
 
     `server_key` is the public key file of the side that binds, for the side that connects; `allowed_clients` a
     directory of public key files, for the side that binds.
@@ -43,7 +43,7 @@ class CurveKeys:
 
     @property
     def given(self) -> bool:
-        """True when any file is named."""
+        """True where any file is named."""
         return any((self.secret_key, self.server_key, self.allowed_clients))
 
 
@@ -51,25 +51,24 @@ NO_KEYS = CurveKeys()
 
 
 def check_reach(endpoint: Endpoint, text: str, *, bind: bool, keys: CurveKeys) -> None:
-    """Refuse (InputError) what reaches beyond this machine without the keys for it, or has keys of the other side."""
+    """Refuse (InputError) a non-loopback endpoint without its keys, and keys of the other side."""
     if not keys.given:
         if not endpoint.loopback:
-            verb = "binding" if bind else "connecting"
-            raise InputError(f"{text}: {verb} beyond loopback needs CURVE keys; {MAKE_KEYS}, or use tcp://127.0.0.1:PORT")
+            raise InputError(f"{text}: non-loopback endpoints require CURVE keys; {MAKE_KEYS}, or use tcp://127.0.0.1:PORT")
         return
     if keys.secret_key is None:
-        raise InputError(f"{text}: curve_secret_key is missing beside the other keys; {MAKE_KEYS}")
+        raise InputError(f"{text}: curve_secret_key is missing; {MAKE_KEYS}, and name this side's secret key")
     if bind and keys.allowed_clients is None:
-        raise InputError(f"{text}: the side that binds needs allowed_clients, a directory of public keys; {MAKE_KEYS}")
+        raise InputError(f"{text}: the side that binds requires allowed_clients, a directory of public keys; {MAKE_KEYS}")
     if not bind and keys.server_key is None:
-        raise InputError(f"{text}: the side that connects needs curve_server_key, the other's public key; {MAKE_KEYS}")
+        raise InputError(f"{text}: the side that connects requires curve_server_key, the other side's public key; {MAKE_KEYS}")
 
 
 def make_keys(directory: Path) -> list[Path]:
-    """Two key pairs, `server` for the side that binds and `client` for the other, and the server's allow-list.
+    """Make two key pairs, `server` for the side that binds and `client` for the other, and the server's allow-list.
 
-    A secret key is its owner's alone from its first byte on. Raises InputError where keys are already there: a key that is
-    in use is not overwritten.
+    Only its owner can read a secret key, from its first byte on. Returns the paths. Raises InputError where a key exists
+    already: a key in use is never overwritten.
     """
     allowed = directory / "allowed_clients"
     written = [directory / f"{name}.{kind}" for name in ("server", "client") for kind in ("key", "key_secret")]
@@ -77,7 +76,7 @@ def make_keys(directory: Path) -> list[Path]:
     try:
         there = [path for path in written if exists(path)]
         if there:
-            raise InputError(f"{there[0]}: is there already, and may be in use; choose another directory")
+            raise InputError(f"{there[0]}: exists already, and may be in use; choose another directory")
         with _only_for_the_owner():
             allowed.mkdir(parents=True, exist_ok=True)
             _make_in(directory, allowed)
@@ -87,7 +86,7 @@ def make_keys(directory: Path) -> list[Path]:
 
 
 def _make_in(directory: Path, allowed: Path) -> None:
-    """Make all keys beside their places, then give them their names: half of them would be of no use."""
+    """Make all keys in a temporary directory, then rename them into place: an incomplete set is useless."""
     with tempfile.TemporaryDirectory(dir=directory, prefix=".keys") as folder:
         for name in ("server", "client"):
             zmq.auth.create_certificates(folder, name)
@@ -100,7 +99,7 @@ def _make_in(directory: Path, allowed: Path) -> None:
 
 @contextlib.contextmanager
 def _only_for_the_owner() -> Iterator[None]:
-    """Files and directories made meanwhile are nobody else's to read."""
+    """Files and directories made inside are readable only by their owner."""
     before = os.umask(OTHERS)
     try:
         yield
@@ -114,19 +113,19 @@ def load_public(path: Path) -> bytes:
 
 
 def load_secret(path: Path) -> tuple[bytes, bytes]:
-    """Public and secret key of a secret key file; a warning where others may read it. Raises InputError."""
+    """The public and the secret key of a secret key file; warns where others may read it. Raises InputError."""
     public, secret = _load(path)
     if secret is None:
-        raise InputError(f"{path}: has no secret key; name the .key_secret file that `hilstar keys` made")
+        raise InputError(f"{path}: contains no secret key; name the .key_secret file that `hilstar keys` made")
     mode = path.stat().st_mode
     if mode & OTHERS:
-        log.warning("%s: others than its owner can read this secret key (mode %03o); chmod 600 it", path, mode & 0o777)
+        log.warning("%s: this secret key is readable by other users (mode %03o); run chmod 600 on it", path, mode & 0o777)
     return public, secret
 
 
 def _load(path: Path) -> tuple[bytes, bytes | None]:
     if not exists(path):
-        raise InputError(f"{path}: is no key file (there is nothing of that name); {MAKE_KEYS}")
+        raise InputError(f"{path}: no such key file; {MAKE_KEYS}")
     try:
         read_bytes(path, MAKE_KEYS, MAX_KEY_FILE_BYTES)  # refuses pipes, devices and gigabytes
         public, secret = zmq.auth.load_certificate(path)
@@ -134,33 +133,33 @@ def _load(path: Path) -> tuple[bytes, bytes | None]:
             if key is not None and len(z85.decode(key)) != KEY_BYTES:
                 raise ValueError("a key is 40 characters of Z85")
     except (OSError, ValueError, KeyError, IndexError, OverflowError) as error:
-        raise InputError(f"{path}: is no key file ({one_line(str(error))}); {MAKE_KEYS}") from error
+        raise InputError(f"{path}: not a key file ({one_line(str(error))}); {MAKE_KEYS}") from error
     return public, secret
 
 
 class AllowList:
-    """The clients of a directory of public keys: read again whenever it, or a file in it, has changed.
+    """The clients in a directory of public keys, reread whenever the directory or a file in it has changed.
 
-    pyzmq asks it (`callback`) at each handshake, in one thread. Raises InputError at the start where it allows nobody, or
-    holds a file that is no key; later such a file is warned of, and its client is not let in.
+    pyzmq calls `callback` at each handshake, in one thread. Raises InputError at the start where it contains no key, or a
+    file that is not a key; later such a file causes a warning, and its client is rejected.
     """
 
     def __init__(self, directory: Path) -> None:
         self._directory = directory
         self._seen = self._look()
         if not self._seen:
-            raise InputError(f"{directory}: allowed_clients holds no *.key file; put each client's public key there")
+            raise InputError(f"{directory}: allowed_clients contains no *.key file; put each client's public key there")
         self._keys = {load_public(path) for path in self._seen}
 
     def callback(self, domain: str, key: bytes) -> bool:
-        """Whether a client with this public key (Z85) may come in."""
+        """Whether a client with this public key (Z85) may connect."""
         seen = self._look()
         if seen != self._seen:
             self._seen, self._keys = seen, set(self._readable(seen))
         return key in self._keys
 
     def _look(self) -> dict[Path, tuple[int, int, int]]:
-        """Each key file, and what changes when it is written or replaced."""
+        """Each key file, with what changes when it is written or replaced."""
         found = {}
         with contextlib.suppress(OSError):
             for path in sorted(self._directory.glob("*.key")):

@@ -1,4 +1,4 @@
-"""What every road into hilstar offers: messages with the time of their arrival, and a way back where there is one."""
+"""What every link into hilstar offers: messages with the time of their arrival, and a way back where there is one."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SampleArrival: TypeAlias = Arrival[AttitudeSample]
 
 
 class Link(Protocol):
-    """A road into hilstar."""
+    """A link into hilstar."""
 
     two_way: bool
 

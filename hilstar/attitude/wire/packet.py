@@ -2,9 +2,9 @@
 
 Laws:
 1. Every message gives exactly one event: a packet or a `Refusal`. Nothing raises.
-2. A sample is finite, its quaternion unit to 1e-15; the sender's was unit to NORM_TOLERANCE.
-3. A message that does not start with "{" is accepted only if its CRC-32 is right.
-4. `decode(encode(packet))` gives the packet back, bit for bit where a quaternion is already unit.
+2. A sample is finite, and its quaternion is unit to 1e-15; the sender's was unit to NORM_TOLERANCE.
+3. A message that does not start with "{" is accepted only if its CRC-32 is correct.
+4. `decode(encode(packet))` returns the packet, bit for bit where the quaternion is already unit.
 
 The layout is that of firmware_protocol/protocol.toml.
 """
@@ -25,17 +25,17 @@ from hilstar.attitude.wire import protocol
 from hilstar.attitude.wire.protocol import FASTEST_RAD_S, NORM_TOLERANCE, VERSION
 
 CRC = struct.Struct("<I")
-LONGEST_JSON_BYTES = 4096
+MAX_JSON_BYTES = 4096
 INT64 = range(-(2**63), 2**63)
 U32 = 2**32
 JSON_FORM = '{"t_ns":..., "q":[w,x,y,z], "rate":[x,y,z]}'
-UNIT = 1e-15  # so near, a division by the norm would only move the last bit to and fro
+UNIT = 1e-15  # this close, dividing by the norm would only move the last bit
 
 Reason = Literal["crc", "norm", "nan", "time", "format", "rate", "source"]
-# Of the message itself, and told even where none was refused for them; and of this bench, told where they occur.
+# Reasons in the message itself, listed in the summary even where their count is 0; and in the stream, listed where they occur.
 MESSAGE_REASONS: tuple[Reason, ...] = ("crc", "norm", "nan", "time", "format")
-BENCH_REASONS: tuple[Reason, ...] = ("rate", "source")
-REASONS = MESSAGE_REASONS + BENCH_REASONS
+STREAM_REASONS: tuple[Reason, ...] = ("rate", "source")
+REASONS = MESSAGE_REASONS + STREAM_REASONS
 RATE_ROUNDING = 1e-6  # a packet's rate is float32
 
 
@@ -52,7 +52,7 @@ class AttitudeSample:
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """Why a message is not an attitude."""
+    """Why a message is not used as an attitude."""
 
     reason: Reason
     detail: str
@@ -60,7 +60,7 @@ class Refusal:
 
 @dataclass(frozen=True, slots=True)
 class TimeRequest:
-    """One side asks for the other's time; `t1_ns` is the asker's clock when it left."""
+    """One side asks for the other's time; `t1_ns` is the asker's clock when the request left."""
 
     sequence: int
     t1_ns: int
@@ -68,7 +68,7 @@ class TimeRequest:
 
 @dataclass(frozen=True, slots=True)
 class TimeReply:
-    """The answer: `t2_ns` when the request came, `t3_ns` when this left, both on the answerer's clock."""
+    """The answer: `t2_ns` when the request arrived, `t3_ns` when the reply left, both on the answerer's clock."""
 
     sequence: int
     t1_ns: int
@@ -78,7 +78,7 @@ class TimeReply:
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """What goes back to the bench: the last frame shown, when its light leaves the screen (bench clock), and health.
+    """What goes back to the sender: the last frame shown, when its light leaves the screen (sender's clock), and health.
 
     `health` is the sum of protocol.HEALTH_ bits; `attitude_age_ns` is -1 while there is no attitude.
     """
@@ -108,7 +108,7 @@ _json_decoder = msgspec.json.Decoder(_JsonAttitude)
 
 
 def encode(packet: Packet) -> bytes:
-    """The bytes of a packet; counters are taken modulo 2^32, and a status's times held within 64 bits."""
+    """The bytes of a packet; counters wrap at 2^32, and a status's times are clamped to 64 bits."""
     match packet:
         case AttitudeSample():
             body = _attitude_body(packet)
@@ -133,17 +133,17 @@ def _attitude_body(sample: AttitudeSample) -> bytes:
 
 
 def decode(message: bytes) -> Event:
-    """One message of any form: a packet's bytes, or an attitude as a JSON object that starts with "{"."""
+    """Decode one message: a packet's bytes, or an attitude as a JSON object."""
     if message[:1] == b"{" or message[:16].lstrip()[:1] == b"{":
         return _decode_json(message)
     head = (message[0], message[1]) if len(message) > 1 else (-1, -1)
     size = protocol.PACKET_BYTES.get(head[1]) if head[0] == VERSION else None
     if len(message) not in {size, protocol.ATTITUDE_BYTES}:
-        return Refusal("format", f"{len(message)} bytes; an attitude is {protocol.ATTITUDE_BYTES} bytes or a JSON object")
+        return Refusal("format", f"{len(message)} bytes; send an attitude of {protocol.ATTITUDE_BYTES} bytes or a JSON object")
     if CRC.unpack_from(message, len(message) - CRC.size)[0] != zlib.crc32(message[: -CRC.size]):
-        return Refusal("crc", "the CRC-32 does not fit the packet")
+        return Refusal("crc", "the CRC-32 does not match the packet")
     if len(message) != size:
-        return Refusal("format", f"version {head[0]}, kind {head[1]}; version {VERSION}, kind 1 is wanted")
+        return Refusal("format", f"version {head[0]}, kind {head[1]}; send version {VERSION}, kind 1")
     return _decode_body(head[1], message)
 
 
@@ -166,14 +166,14 @@ def checked_sample(
     sequence: int = 0,
     discontinuity: bool = False,
 ) -> AttitudeSample | Refusal:
-    """A sample from raw numbers, or why they are none: every road into hilstar passes here."""
+    """A sample from raw numbers, or why they are not one: every source of attitudes passes through here."""
     if not all(map(math.isfinite, (*q, *(rate or ())))):
         return Refusal("nan", "a quaternion or rate component is not finite")
     if rate is not None and math.hypot(*rate) > FASTEST_RAD_S:
-        return Refusal("format", f"a rate of {math.hypot(*rate):.3g} rad/s; at most {FASTEST_RAD_S:g} is taken")
+        return Refusal("format", f"a rate of {math.hypot(*rate):.3g} rad/s; the maximum is {FASTEST_RAD_S:g}")
     norm = math.hypot(*q)
     if abs(norm - 1.0) > NORM_TOLERANCE:
-        return Refusal("norm", f"the quaternion's norm is {norm:.6g}; 1 within {NORM_TOLERANCE:g} is wanted")
+        return Refusal("norm", f"the quaternion's norm is {norm:.6g}; it must be 1 within {NORM_TOLERANCE:g}")
     if t_ns not in INT64:
         return Refusal("format", f"t_ns {t_ns} does not fit 64 bits")
     unit = np.array(q, dtype=np.float64)
@@ -183,7 +183,7 @@ def checked_sample(
 
 
 def rate_refusal(sample: AttitudeSample, max_rate_rad_s: float) -> Refusal | None:
-    """Why a sample turns faster than this bench takes ([attitude] max_rate_deg_s), None where it does not."""
+    """Why a sample's rate is over the limit ([attitude] max_rate_deg_s); None where it is not."""
     if sample.rate_cam_rad_s is None:
         return None
     rate_rad_s = math.hypot(*sample.rate_cam_rad_s.tolist())
@@ -191,14 +191,14 @@ def rate_refusal(sample: AttitudeSample, max_rate_rad_s: float) -> Refusal | Non
         return None
     return Refusal(
         "rate",
-        f"a rate of {rate_rad_s:.4g} rad/s ({math.degrees(rate_rad_s):.4g} deg/s) is over [attitude] max_rate_deg_s ="
-        f" {math.degrees(max_rate_rad_s):g}; rates are rad/s: send rad/s, or write a larger max_rate_deg_s",
+        f"a rate of {rate_rad_s:.4g} rad/s ({math.degrees(rate_rad_s):.4g} deg/s) exceeds [attitude] max_rate_deg_s ="
+        f" {math.degrees(max_rate_rad_s):g}; send rates in rad/s, or write a larger max_rate_deg_s",
     )
 
 
 def _decode_json(message: bytes) -> AttitudeSample | Refusal:
-    if len(message) > LONGEST_JSON_BYTES:
-        return Refusal("format", f"{len(message)} bytes of JSON; at most {LONGEST_JSON_BYTES} are read")
+    if len(message) > MAX_JSON_BYTES:
+        return Refusal("format", f"{len(message)} bytes of JSON; the maximum is {MAX_JSON_BYTES}")
     try:
         form = _json_decoder.decode(message)
     except (msgspec.MsgspecError, RecursionError, UnicodeDecodeError) as error:

@@ -1,4 +1,4 @@
-"""Lines of text from a serial device, each with the host's time at its last byte."""
+"""Lines of text from a serial device, each with the host time of its last byte."""
 
 from __future__ import annotations
 
@@ -9,15 +9,16 @@ import serial
 
 from hilstar.attitude.wire.serial_link import BITS_PER_BYTE, opening_fault
 from hilstar.errors import InputError
+from hilstar.units import NS_PER_S
 
 READ_S = 0.05
-LONGEST_LINE = 256
+MAX_LINE_BYTES = 256
 
 
 def read_lines(port: str, baud: int, seconds: float) -> Iterator[tuple[int, bytes]]:
-    """Host time (monotonic ns, the time on the wire taken off) and text of each line that comes within `seconds`.
+    """Host time (monotonic ns, less the time on the wire) and text of each line that arrives within `seconds`.
 
-    Raises InputError where the port cannot be opened, or is gone meanwhile.
+    Raises InputError where the port cannot be opened, or disappears.
     """
     name = f"serial:{port}@{baud}"
     try:
@@ -32,10 +33,10 @@ def read_lines(port: str, baud: int, seconds: float) -> Iterator[tuple[int, byte
             try:
                 byte = device.read(1)
             except (OSError, TypeError) as error:
-                raise InputError(f"{name}: is gone ({error}); plug it in again and start anew") from error
+                raise InputError(f"{name}: disconnected ({error}); plug it in and start again") from error
             if byte == b"\n":
-                wire_ns = (len(line) + 1) * BITS_PER_BYTE * 1_000_000_000 // baud
+                wire_ns = (len(line) + 1) * BITS_PER_BYTE * NS_PER_S // baud
                 yield time.monotonic_ns() - wire_ns, line.strip()
                 line = b""
             else:
-                line = (line + byte)[-LONGEST_LINE:]
+                line = (line + byte)[-MAX_LINE_BYTES:]

@@ -1,4 +1,4 @@
-"""The serial line: COBS frames both ways, and a device that may go and come back."""
+"""The serial line: COBS frames both ways, and a device that may be unplugged and come back."""
 
 from __future__ import annotations
 
@@ -19,22 +19,23 @@ from hilstar.attitude.wire.links import Arrival
 from hilstar.attitude.wire.packet import Event, Packet, encode
 from hilstar.errors import InputError, one_line
 from hilstar.notices import Notices
+from hilstar.units import NS_PER_S
 
-FIRST_BACK_OFF_S = 0.05
-LONGEST_BACK_OFF_S = 0.4  # a device that is back is picked up within a second
+MIN_BACK_OFF_S = 0.05
+MAX_BACK_OFF_S = 0.4  # a device that comes back is opened within a second
 MAX_READ_BYTES = 65_536  # in one go
 MAX_DRAIN_S = 0.5
 BITS_PER_BYTE = 10  # 8N1
-FRAMING_BYTES = 2  # COBS and its 0x00
+FRAMING_BYTES = 2  # the COBS byte and the 0x00
 
 
 def serial_ports() -> list[str]:
-    """The serial ports of this machine, each with what it says of itself."""
+    """The serial ports of this machine, each with its description."""
     return [f"{port.device} ({port.description})" for port in sorted(list_ports.comports())]
 
 
 class SerialLink:
-    """A serial port that is opened anew, with back-off, whenever it disappears.
+    """A serial port that is reopened, with back-off, whenever it disappears.
 
     Raises InputError where the port cannot be opened at the start.
     """
@@ -51,7 +52,7 @@ class SerialLink:
         self._notices = Notices() if notices is None else notices
         self._gate = FloodGate(self.link_counts, self._notices)
         self._decoder = StreamDecoder()
-        self._back_off_s = FIRST_BACK_OFF_S
+        self._back_off_s = MIN_BACK_OFF_S
         self._retry_s = 0.0
         try:
             self._device: serial.Serial | None = self._open()
@@ -60,13 +61,13 @@ class SerialLink:
 
     def _open(self) -> serial.Serial:
         device = serial.Serial(self._port, self._baud, timeout=0, exclusive=True)
-        with contextlib.suppress(OSError, ValueError):  # a USB adapter else gathers bytes for 16 ms; a pty has no such mode
+        with contextlib.suppress(OSError, ValueError):  # else a USB adapter buffers for 16 ms; a pty has no such mode
             device.set_low_latency_mode(True)
         self._decoder = StreamDecoder()
         return device
 
     def receive(self, timeout_ms: int) -> list[Arrival[Event]]:
-        """The frames that have come; waits at most `timeout_ms` for the first byte."""
+        """The frames that have arrived; waits at most `timeout_ms` for the first byte."""
         device = self._device
         if device is None:
             self._reopen(timeout_ms)
@@ -76,7 +77,7 @@ class SerialLink:
                 device.timeout = timeout_ms / 1000
             chunk = device.read(1)
             chunk += device.read(min(device.in_waiting, MAX_READ_BYTES)) if chunk else b""
-        except (OSError, TypeError) as error:  # pyserial itself stumbles (TypeError) over a port closed under it
+        except (OSError, TypeError) as error:  # pyserial raises TypeError for a port closed meanwhile
             self._lose(str(error))
             return []
         host_ns = time.monotonic_ns()
@@ -86,23 +87,23 @@ class SerialLink:
         return [Arrival(host_ns, event, raw) for event, raw in events]
 
     def wait_for_message(self, timeout_ms: int) -> bool:
-        """True once bytes wait that were not read."""
+        """True once unread bytes wait."""
         device = self._device
         try:
             return device is not None and bool(select.select([device.fileno()], [], [], timeout_ms / 1000)[0])
-        except (OSError, ValueError, TypeError):  # gone: `receive` finds out, and says so
+        except (OSError, ValueError, TypeError):  # gone: `receive` notices, and reports it
             return False
 
     def send(self, packet: Packet) -> None:
-        """Send to the bench, never waiting: what the line does not take at once is lost."""
+        """Send to the other side without waiting: what the line does not take at once is lost."""
         self.send_bytes(frame(packet))
 
     def send_bytes(self, data: bytes, patience_s: float = 0.0) -> bool:
-        """Send bytes as they are, waiting at most `patience_s` for a full line; False when some were lost."""
+        """Send bytes as they are, waiting at most `patience_s` while the line is full; False where some were lost."""
         device = self._device
         if device is None:
             return False
-        # pyserial's own write spins for ever on a line that is full, where it should not wait.
+        # pyserial's own write, asked not to wait, spins for ever on a full line.
         deadline_s = time.monotonic() + patience_s
         try:
             while data:
@@ -118,29 +119,24 @@ class SerialLink:
         return not data
 
     def drain(self) -> None:
-        """Wait until what was sent has left the machine, and give up what a line that stands still does not take."""
+        """Wait until the bytes sent have left the machine; drop those that a stalled line does not take."""
         deadline_s = time.monotonic() + MAX_DRAIN_S
         with contextlib.suppress(OSError, TypeError, termios.error):
             while self._device is not None and self._device.out_waiting:
-                if time.monotonic() > deadline_s:  # closing it would wait for half a minute
+                if time.monotonic() > deadline_s:  # closing it would block for half a minute
                     self._device.reset_output_buffer()
                     return
                 time.sleep(0.005)
 
     def wire_ns(self, packet: Packet) -> int:
         """How long a packet's frame takes at this baud rate."""
-        return (len(encode(packet)) + FRAMING_BYTES) * BITS_PER_BYTE * 1_000_000_000 // self._baud
-
-    @property
-    def connected(self) -> bool:
-        """True while the device is there."""
-        return self._device is not None
+        return (len(encode(packet)) + FRAMING_BYTES) * BITS_PER_BYTE * NS_PER_S // self._baud
 
     def _lose(self, why: str) -> None:
         self.link_counts.lost += 1
-        self._notices.tell("lost", f"{self.endpoint} is gone ({one_line(why)}); waiting for it to come back")
+        self._notices.tell("lost", f"{self.endpoint} disconnected ({one_line(why)}); waiting for it to come back")
         self._shut()
-        self._back_off_s = FIRST_BACK_OFF_S
+        self._back_off_s = MIN_BACK_OFF_S
         self._retry_s = time.monotonic() + self._back_off_s
 
     def _reopen(self, timeout_ms: int) -> None:
@@ -151,7 +147,7 @@ class SerialLink:
         try:
             self._device = self._open()
         except (OSError, ValueError):
-            self._back_off_s = min(2 * self._back_off_s, LONGEST_BACK_OFF_S)
+            self._back_off_s = min(2 * self._back_off_s, MAX_BACK_OFF_S)
             self._retry_s = time.monotonic() + self._back_off_s
             return
         self.reconnects += 1
@@ -192,5 +188,5 @@ def _instead(error: BaseException, port: str) -> str:
     if "lock" in text or "resource temporarily" in text:
         return "stop the program that has it"
     if isinstance(error, ValueError):
-        return "write a baud rate that the port has, such as 115200 or 921600"
-    return f"write the port of the bench, such as /dev/ttyUSB0 (ls /dev/serial/by-id shows what there is), not {port!r}"
+        return "write a baud rate that the port supports, such as 115200 or 921600"
+    return f"write the serial port, such as /dev/ttyUSB0 (ls /dev/serial/by-id lists them), not {port!r}"

@@ -18,7 +18,7 @@ from hilstar.attitude.wire.cobs import DELIMITER, framed
 from hilstar.attitude.wire.keys import CurveKeys
 from hilstar.attitude.wire.packet import AttitudeSample, Status, TimeReply, TimeRequest, encode
 from hilstar.attitude.wire.serial_link import SerialLink
-from hilstar.attitude.wire.zmq_links import ZmqSender
+from hilstar.attitude.wire.zmq_stream import ZmqSender
 from hilstar.errors import InputError
 from hilstar.process.interrupts import caught
 from hilstar.rotation import from_radec_roll_deg, propagate, rate_between_rad_s

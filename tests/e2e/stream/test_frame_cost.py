@@ -64,7 +64,7 @@ def test_a_rate_in_deg_s_is_refused_by_name_once_said_and_the_stream_goes_on(tmp
     assert (packets["accepted"], packets["refused_by"]["rate"]) == (50, 50)
     lines = [line for line in err.splitlines() if "max_rate_deg_s" in line]
     assert len(lines) == 1
-    assert "rates are rad/s" in lines[0]
+    assert "send rates in rad/s" in lines[0]
 
 
 @pytest.mark.parametrize("degrees", [20.0, 90.0, 180.0])

@@ -268,8 +268,8 @@ def test_key_files_that_are_none_get_one_line(tmp_path, small_bench_file):
     (tmp_path / "empty").mkdir()
     (tmp_path / "bad.key_secret").write_text("nothing")
     for line, said in (
-        ('curve_secret_key = "bad.key_secret"\ncurve_server_key = "bad.key_secret"', "no key file"),
-        ('curve_secret_key = "missing"\ncurve_server_key = "missing"', "no key file"),
+        ('curve_secret_key = "bad.key_secret"\ncurve_server_key = "bad.key_secret"', "not a key file"),
+        ('curve_secret_key = "missing"\ncurve_server_key = "missing"', "no such key file"),
         ('curve_secret_key = "bad.key_secret"', "curve_server_key"),
         ('curve_server_key = "bad.key_secret"', "curve_secret_key"),
         ('bind = true\ncurve_secret_key = "bad.key_secret"', "allowed_clients"),

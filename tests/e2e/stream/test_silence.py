@@ -10,7 +10,7 @@ import time
 import pytest
 import zmq
 
-from hilstar.attitude.wire.zmq_links import ZmqReceiver
+from hilstar.attitude.wire.zmq_stream import ZmqReceiver
 from hilstar.bench.build import load
 from hilstar.run.loop import Limit
 from hilstar.run.serve import serve

@@ -10,7 +10,7 @@ from cobs import cobs
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hilstar.attitude.wire.cobs import LONGEST_FRAME_BYTES, StreamDecoder, frame
+from hilstar.attitude.wire.cobs import MAX_FRAME_BYTES, StreamDecoder, frame
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal, TimeRequest, decode, encode
 
 Q = np.array([0.5, 0.5, -0.5, 0.5])
@@ -102,7 +102,7 @@ def test_a_bench_that_never_sends_a_delimiter_costs_one_refusal_and_no_memory():
     for _ in range(1000):
         events += decoder.feed(b"\x55" * 1000)
     assert [event.reason for event, _ in events] == ["format"]
-    assert len(decoder._kept) <= LONGEST_FRAME_BYTES
+    assert len(decoder._kept) <= MAX_FRAME_BYTES
     ((last, _),) = decoder.feed(b"\0" + frame(sample(3)))
     assert isinstance(last, AttitudeSample)
 

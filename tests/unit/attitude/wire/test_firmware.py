@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from cobs import cobs
 
-from hilstar.attitude.wire.cobs import DELIMITER, LONGEST_FRAME_BYTES, frame
+from hilstar.attitude.wire.cobs import DELIMITER, MAX_FRAME_BYTES, frame
 from hilstar.attitude.wire.packet import TimeRequest
 from tests.support.benches import ROOT
 
@@ -177,7 +177,7 @@ def test_the_first_whole_frame_after_garbage_and_a_delimiter_is_taken(sanitized,
 
 
 def test_a_line_that_never_brings_a_delimiter_costs_one_refusal(sanitized):
-    long = "55" * (LONGEST_FRAME_BYTES + 1)
+    long = "55" * (MAX_FRAME_BYTES + 1)
     answers = driven(
         sanitized, ["i", "p 00", f"p {long[2:]}", "p 55", f"p {long * 9}", f"p 00{frame(TimeRequest(3, 4)).hex()}"]
     )

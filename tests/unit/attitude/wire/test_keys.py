@@ -85,7 +85,7 @@ def test_an_allow_list_follows_its_directory(tmp_path, caplog):
 def test_what_is_no_key_file_gets_one_line(tmp_path, text):
     path = tmp_path / "x.key"
     path.write_text(text)
-    with pytest.raises(InputError, match="no key file"):
+    with pytest.raises(InputError, match="not a key file"):
         load_public(path)
     pipe = tmp_path / "pipe.key"
     os.mkfifo(pipe)

@@ -1,0 +1,123 @@
+"""Free-running ZeroMQ: attitudes come in through a SUB socket, and go out through an XPUB socket."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+
+import zmq
+
+from hilstar.attitude.wire.flood_limits import FloodGate
+from hilstar.attitude.wire.keys import NO_KEYS, CurveKeys
+from hilstar.attitude.wire.links import Arrival
+from hilstar.attitude.wire.packet import Event, Packet, decode
+from hilstar.attitude.wire.zmq_socket import QUEUE_MESSAGES, ZmqSocket
+from hilstar.notices import Notices
+from hilstar.process.interrupts import caught
+
+MAX_TAKEN_BYTES = 8_000_000  # in one go
+SEND_QUEUE_MESSAGES = 10_000
+MAX_SUBSCRIPTION_BYTES = 1024
+RECONNECT_S = 0.25
+TEND_S = 0.05
+
+
+class ZmqReceiver(ZmqSocket):
+    """A SUB socket that takes every message; it connects, or binds with `bind`."""
+
+    two_way = False
+
+    def __init__(self, endpoint: str, *, bind: bool = False, keys: CurveKeys = NO_KEYS, notices: Notices | None = None) -> None:
+        super().__init__(zmq.SUB, endpoint, bind=bind, keys=keys, notices=notices)
+        self._shut()
+        self._gate = FloodGate(self.link_counts, self._notices)
+        self._reconnect_s = 0.0
+
+    @property
+    def reconnects(self) -> int:
+        """How often the sender reconnected."""
+        return 0 if self._bind else max(0, self.link_counts.connections - 1)
+
+    def _configure(self, made: zmq.Socket[bytes]) -> None:
+        super()._configure(made)
+        made.setsockopt(zmq.SUBSCRIBE, b"")
+
+    def receive(self, timeout_ms: int) -> list[Arrival[Event]]:
+        """The waiting messages, oldest first; only the last part of each is read, and only the newest of a flood.
+
+        Waits at most `timeout_ms` for the first, and for no other.
+        """
+        if not self._waits(timeout_ms):
+            return []
+        waiting: list[tuple[int, bytes]] = []
+        taken_bytes = 0
+        while len(waiting) < QUEUE_MESSAGES and taken_bytes < MAX_TAKEN_BYTES and (message := self._take()) is not None:
+            waiting.append((time.monotonic_ns(), message))
+            taken_bytes += len(message)
+        admitted = self._gate.admit(len(waiting))
+        return [Arrival(host_ns, decode(message), message) for host_ns, message in waiting[len(waiting) - admitted :]]
+
+    def wait_for_message(self, timeout_ms: int) -> bool:
+        """True once a message waits."""
+        return self._waits(timeout_ms)
+
+    def send(self, packet: Packet) -> None:
+        """A subscriber cannot reply."""
+
+    def wire_ns(self, packet: Packet) -> int:
+        """Negligible."""
+        return 0
+
+    def _tend(self) -> None:
+        super()._tend()
+        if not self._bind:
+            self._connect_anew_if_lost()
+
+    def _connect_anew_if_lost(self) -> None:
+        """libzmq itself reconnects after a lost peer, but not after a part over MAXMSGSIZE or a rejection."""
+        if self._keeper is None or self._socket is None or not self._keeper.lost:
+            return
+        now_s = time.monotonic()
+        if not self._reconnect_s:
+            self._reconnect_s = now_s + RECONNECT_S
+        if now_s < self._reconnect_s:
+            return
+        self._keeper.lost, self._reconnect_s = False, 0.0
+        with contextlib.suppress(zmq.ZMQError):  # the ended session may be gone already
+            self._socket.disconnect(self._address)
+        self._socket.connect(self._address)
+
+
+class ZmqSender(ZmqSocket):
+    """An XPUB socket, which knows when somebody subscribes; it binds, or connects with `bind=False`."""
+
+    LINGER_MS, STOPPED_LINGER_MS = 2000, 200  # for a slow subscriber, without and with a signal
+
+    def __init__(self, endpoint: str, *, bind: bool = True, keys: CurveKeys = NO_KEYS, notices: Notices | None = None) -> None:
+        self._tended_s = 0.0
+        super().__init__(zmq.XPUB, endpoint, bind=bind, keys=keys, notices=notices)
+        self._ready()
+
+    def _configure(self, made: zmq.Socket[bytes]) -> None:
+        super()._configure(made)
+        made.setsockopt(zmq.SNDHWM, SEND_QUEUE_MESSAGES)
+        made.setsockopt(zmq.MAXMSGSIZE, MAX_SUBSCRIPTION_BYTES)  # nothing else arrives here
+
+    def wait_for_listener(self, timeout_s: float) -> bool:
+        """True once there is a subscriber; messages sent before that are lost."""
+        return self._waits(timeout_s * 1000) and self._take() is not None
+
+    def put(self, message: bytes) -> None:
+        """Send one message, never waiting."""
+        now_s = time.monotonic()
+        if now_s - self._tended_s > TEND_S:
+            self._tended_s = now_s
+            self._tend()
+            for _ in range(QUEUE_MESSAGES):  # libzmq keeps subscriptions until they are read
+                if self._take() is None:
+                    break
+        with contextlib.suppress(zmq.Again):
+            self._ready().send(message, zmq.NOBLOCK)
+
+    def _linger_ms(self) -> int:
+        return self.LINGER_MS if caught() is None else self.STOPPED_LINGER_MS

@@ -142,7 +142,7 @@ def find_stars(
     under = background or estimate_background(image)
     signal = _checked(image) - under.level
     blobs = _find_blobs(signal, settings.threshold_sigma * under.noise, settings.minimum_pixels)
-    padded = np.pad(signal, settings.radius_px)
+    padded = _padded(signal, settings)
     x_px, y_px = _refine(padded, blobs, settings)
     stamps, _, _ = _stamps(padded, x_px, y_px, settings.radius_px)
     flux = stamps.sum(axis=(1, 2))
@@ -183,13 +183,18 @@ def _find_blobs(signal: FloatArray, threshold: float, minimum_pixels: int) -> _B
     return _Blobs(x_px[kept], y_px[kept], peak[kept], pixels[kept])
 
 
+def _padded(signal: FloatArray, settings: CentroidSettings) -> FloatArray:
+    """The image among zeros: a centre moves by at most a radius, so it may leave the image, and its window is one more."""
+    return np.pad(signal, 2 * settings.radius_px)
+
+
 def _stamps(
     padded: FloatArray, x_px: FloatArray, y_px: FloatArray, radius_px: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Squares of the padded image around n places: values (n, k, k), and the pixels' offsets dx (n, 1, k), dy (n, k, 1)."""
     reach = np.arange(-radius_px, radius_px + 1)
     column, row = (np.rint(place).astype(np.intp)[:, None] + reach for place in (x_px, y_px))
-    values = padded[row[:, :, None] + radius_px, column[:, None, :] + radius_px]
+    values = padded[row[:, :, None] + 2 * radius_px, column[:, None, :] + 2 * radius_px]
     return values, (column - x_px[:, None])[:, None, :], (row - y_px[:, None])[:, :, None]
 
 
@@ -275,7 +280,7 @@ def s_curves(settings: CentroidSettings) -> tuple[SCurve, SCurve]:
     offset_px = tile_px * np.arange(S_CURVE_PHASES) + middle_px
     ones = np.ones(S_CURVE_PHASES)
     stars = _Blobs(offset_px + true_px, middle_px + true_px, ones, ones.astype(np.intp))
-    x_px, y_px = _refine(np.pad(strip, settings.radius_px), stars, settings)
+    x_px, y_px = _refine(_padded(strip, settings), stars, settings)
     curves = SCurve(x_px - offset_px, x_px - offset_px - true_px), SCurve(y_px - middle_px, y_px - middle_px - true_px)
     if any((np.diff(curve.measured_px) <= 0).any() for curve in curves):
         raise InputError(

@@ -1,0 +1,31 @@
+"""Stars that the edge of the detector cuts: measured and marked, wherever their centre goes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hilstar.tracker.centroids import Background, CentroidSettings, find_stars
+
+SIZE_PX = 40
+BACKGROUND = Background(0.0, 1.0)
+SAME_PX = 1e-6  # the sums of a turned window run the other way round; Newton's iteration ends within 1e-7
+
+
+@pytest.mark.parametrize("window", ["gaussian", "plain"])
+def test_a_centre_that_leaves_the_image_is_measured_alike_at_all_four_edges(window):
+    """A star on the last row, and a pixel under the background on the row within: the moment points out of the image."""
+    image = np.zeros((SIZE_PX, SIZE_PX))
+    image[0, 19:22] = 30.0, 100.0, 50.0
+    image[1, 20] = -120.0
+    turned = [
+        find_stars(np.rot90(image, k), CentroidSettings(window=window, window_sigma_px=1.3), BACKGROUND) for k in range(4)
+    ]
+    assert turned[0].y_px[0] < -0.5
+    for k, star in enumerate(turned):
+        assert len(star) == 1 and star.at_edge[0]
+        x_px, y_px = star.x_px[0], star.y_px[0]
+        for _ in range(k):  # back: rot90 takes (x, y) to (y, last - x)
+            x_px, y_px = SIZE_PX - 1 - y_px, x_px
+        assert (x_px, y_px) == pytest.approx((turned[0].x_px[0], turned[0].y_px[0]), abs=SAME_PX)
+        assert star.flux[0] == pytest.approx(turned[0].flux[0], rel=1e-6)

@@ -18,6 +18,7 @@ from hilstar.process import interrupts
 from hilstar.process.stderr import finish_stderr, queue_stderr
 
 INTERRUPTED = 130
+LOG_FORMAT = "hilstar: %(message)s"
 READER_WAITS_S, STOPPED_READER_WAITS_S = 1.0, 0.1  # for a reader of stderr that sleeps, without and with a signal
 SHARE_OPTIONS = ("--lose", "--corrupt", "--reorder")  # may stand alone
 USUAL_SHARE = "5%"
@@ -38,7 +39,7 @@ def main() -> NoReturn:
     """Run the command line; every refusal is one line on stderr and the exit code of the design's section 5."""
     interrupts.install()
     queue_stderr()
-    logging.basicConfig(format="hilstar: %(message)s", stream=sys.stderr)
+    logging.basicConfig(format=LOG_FORMAT, stream=sys.stderr)
     if sys.stdout is None:  # closed by whoever started us
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115, PTH123 - for as long as the process lives
     if isinstance(sys.stdout, io.TextIOWrapper):

@@ -18,7 +18,7 @@ from hilstar.calibrate.edges import Edges, read_edges, save_edges
 from hilstar.run.record.records import read_run
 from hilstar.run.screen.photodiode import CODE, CODE_BITS, marker_light
 from tests.support.benches import ATTITUDE, SCREEN_BENCH, still_log
-from tests.support.commands import HILSTAR, assert_refused, run_hilstar
+from tests.support.commands import HILSTAR, assert_refused, run_hilstar, run_hilstar_here
 from tests.support.ptys import Cable
 from tests.support.screens import Screen
 from tests.support.waiting import wait_for
@@ -116,9 +116,9 @@ def test_a_delay_that_was_added_is_found_and_written_into_the_bench_file(screen,
     assert late["latency_ms"]["p50"] - plain["latency_ms"]["p50"] == pytest.approx(ADDED_MS, abs=MEDIAN_MS)
     assert late["swap_to_square_ms"] == 0
     assert f"panel_delay_ms = {round(late['panel_delay_ms'], 3)}\n" in bench.read_text()
-    assert run_hilstar("frame", bench, "--quaternion", ATTITUDE, "--truth", tmp_path / "t.csv").returncode == 0
+    assert run_hilstar_here("frame", bench, "--quaternion", ATTITUDE, "--truth", tmp_path / "t.csv").returncode == 0
     assert (tmp_path / "charts" / "latency.png").stat().st_size > 10_000
-    again = run_hilstar("latency", tmp_path / "run.mcap", "--edges", tmp_path / "edges.csv", "--json")
+    again = run_hilstar_here("latency", tmp_path / "run.mcap", "--edges", tmp_path / "edges.csv", "--json")
     # The run went on after the edges were read: the last few find their frames only now.
     assert json.loads(again.stdout)["latency_ms"]["p50"] == pytest.approx(late["latency_ms"]["p50"], abs=DEVICE_MS)
 
@@ -146,12 +146,12 @@ def test_what_is_wrong_is_said_in_one_line(tmp_path, small_bench_file):
     ledger = tmp_path / "run.mcap"
     log = tmp_path / "log.csv"
     log.write_text(f"t_s,qw,qx,qy,qz\n0,{ATTITUDE}\n0.1,{ATTITUDE}\n")
-    run_hilstar("replay", small_bench_file, log, "--headless", "--speed", "max", "--ledger", ledger)
-    assert_refused(run_hilstar("latency", ledger, "--edges", edges), 2, "photodiode_px")
-    assert_refused(run_hilstar("latency", ledger), 2, "--edges", "--diode")
-    assert_refused(run_hilstar("latency", edges, "--edges", edges), 2, "edges.csv")
-    assert_refused(run_hilstar("latency", ledger, "--edges", log), 2, "host_ns")
-    assert_refused(run_hilstar("latency", ledger, "--diode", "serial:/dev/nothing@9600"), 2, "/dev/nothing")
-    assert_refused(run_hilstar("latency", ledger, "--diode", "tcp://x"), 2, "--diode")
-    assert_refused(run_hilstar("report", log, "-o", tmp_path / "r"), 2, "log.csv")
-    assert_refused(run_hilstar("report", tmp_path / "no.mcap", "-o", tmp_path / "r"), 2, "no.mcap")
+    run_hilstar_here("replay", small_bench_file, log, "--headless", "--speed", "max", "--ledger", ledger)
+    assert_refused(run_hilstar_here("latency", ledger, "--edges", edges), 2, "photodiode_px")
+    assert_refused(run_hilstar_here("latency", ledger), 2, "--edges", "--diode")
+    assert_refused(run_hilstar_here("latency", edges, "--edges", edges), 2, "edges.csv")
+    assert_refused(run_hilstar_here("latency", ledger, "--edges", log), 2, "host_ns")
+    assert_refused(run_hilstar_here("latency", ledger, "--diode", "serial:/dev/nothing@9600"), 2, "/dev/nothing")
+    assert_refused(run_hilstar_here("latency", ledger, "--diode", "tcp://x"), 2, "--diode")
+    assert_refused(run_hilstar_here("report", log, "-o", tmp_path / "r"), 2, "log.csv")
+    assert_refused(run_hilstar_here("report", tmp_path / "no.mcap", "-o", tmp_path / "r"), 2, "no.mcap")

@@ -16,7 +16,7 @@ from hilstar.attitude.logs.log_file import read_log
 from hilstar.resources import resource_path
 from hilstar.rotation import angle_between_rad, propagate
 from hilstar.run.record.records import read_run
-from tests.support.commands import HILSTAR, run_hilstar
+from tests.support.commands import HILSTAR, run_hilstar, run_hilstar_here
 from tests.support.screens import xvfb
 from tests.support.senders import free_port
 from tests.support.waiting import PATIENCE_S
@@ -119,7 +119,7 @@ def test_paths_are_drawn_again_from_the_ledger(run, tmp_path):
     still.write_text(bench.read_text() + "motion_above_px = 1e6\n")
     options = ["--headless", "--speed", "max", "--start", "5", "--stop", "5.1"]
     for path in (bench, still):
-        assert run_hilstar("replay", path, ledger, *options, "-o", tmp_path / path.stem).returncode == 0
+        assert run_hilstar_here("replay", path, ledger, *options, "-o", tmp_path / path.stem).returncode == 0
     name = sorted(path.name for path in (tmp_path / "bench").glob("*.png"))[0]
     assert (np.array(Image.open(tmp_path / "still" / name)) != np.array(Image.open(tmp_path / "bench" / name))).any()
 

@@ -16,7 +16,7 @@ from hilstar.study.models.temperatures import torres2010_k
 from hilstar.study.models.zero_points import zero_points
 from hilstar.study.shared.brightness import held_out_errors, study_optics
 from hilstar.study.stability import run as stability
-from tests.support.commands import assert_refused, run_hilstar
+from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
 
 
 def table(path):
@@ -106,7 +106,7 @@ def test_what_choices_cost_is_what_the_models_say(tmp_path):
 
 
 def test_the_thesis_s_outputs_are_drawn(tmp_path):
-    result = run_hilstar("study", "outputs", "-o", tmp_path)
+    result = run_hilstar_here("study", "outputs", "-o", tmp_path)
     assert result.returncode == 0, result.stderr
     for name, least in (("orion", 500), ("lyra", 100), ("rosetta", 50)):
         assert_drawn(tmp_path / f"{name}.png")
@@ -115,7 +115,7 @@ def test_the_thesis_s_outputs_are_drawn(tmp_path):
 
 
 def test_the_stability_table_has_every_place_and_its_charts(tmp_path):
-    result = run_hilstar("study", "stability", "-o", tmp_path, "--json")
+    result = run_hilstar_here("study", "stability", "-o", tmp_path, "--json")
     assert result.returncode == 0, result.stderr
     assert '"right":true' in result.stdout
     rows = table(tmp_path / "stability.csv")
@@ -131,6 +131,6 @@ def test_the_stability_table_has_every_place_and_its_charts(tmp_path):
 
 def test_an_unwritable_directory_and_an_unknown_study_are_refused(tmp_path):
     (tmp_path / "file").write_text("")
-    assert_refused(run_hilstar("study", "models", "-o", tmp_path / "file" / "x"), 2, "cannot be written")
-    assert_refused(run_hilstar("study", "weather", "-o", tmp_path), 2, "weather")
-    assert_refused(run_hilstar("study", "models"), 2, "-o")
+    assert_refused(run_hilstar_here("study", "models", "-o", tmp_path / "file" / "x"), 2, "cannot be written")
+    assert_refused(run_hilstar_here("study", "weather", "-o", tmp_path), 2, "weather")
+    assert_refused(run_hilstar_here("study", "models"), 2, "-o")

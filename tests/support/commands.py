@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import io
+import logging
 import os
 import signal
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TextIO
 
 from hilstar.cli import run_command
+from hilstar.cli.entry import LOG_FORMAT
 
 HILSTAR = [sys.executable, "-m", "hilstar"]
 
@@ -42,10 +45,22 @@ def run_hilstar_here(*arguments: str | Path, cwd: Path | None = None, timeout: i
     words = [str(argument) for argument in arguments]
     out, err = (io.TextIOWrapper(io.BytesIO(), "utf-8", "surrogateescape", write_through=True) for _ in range(2))
     to_out, to_err = contextlib.redirect_stdout(out), contextlib.redirect_stderr(err)
-    with bounded_by(timeout), contextlib.chdir(cwd or Path.cwd()), to_out, to_err:
+    with bounded_by(timeout), contextlib.chdir(cwd or Path.cwd()), to_out, to_err, logging_to(err):
         code = run_command(words)
     texts = (stream.buffer.getvalue().decode("utf-8", "surrogateescape") for stream in (out, err))
     return subprocess.CompletedProcess(["hilstar", *words], code, *texts)
+
+
+@contextlib.contextmanager
+def logging_to(stream: TextIO) -> Iterator[None]:
+    """What is logged goes to a stream, as a command's own process sends it to stderr."""
+    handler = logging.StreamHandler(stream)
+    handler.setFormatter(logging.Formatter(LOG_FORMAT))
+    logging.getLogger().addHandler(handler)
+    try:
+        yield
+    finally:
+        logging.getLogger().removeHandler(handler)
 
 
 @contextlib.contextmanager
@@ -62,6 +77,13 @@ def bounded_by(seconds: int) -> Iterator[None]:
     finally:
         signal.alarm(outer_s)
         signal.signal(signal.SIGALRM, before)
+
+
+def has_handlers(process: subprocess.Popen) -> bool:
+    """True once a command catches signals itself: until then the system's own handlers do."""
+    status = Path(f"/proc/{process.pid}/status").read_text()
+    caught = next(line for line in status.splitlines() if line.startswith("SigCgt"))
+    return bool(int(caught.split()[1], 16) & 1 << signal.SIGTERM - 1)
 
 
 def assert_refused(result: subprocess.CompletedProcess[str], code: int, *words: str) -> None:

@@ -16,7 +16,7 @@ import pytest
 from hilstar.cli import app
 from hilstar.errors import HilstarError, one_line
 from tests.support.benches import SMALL_BENCH
-from tests.support.commands import assert_refused, run_hilstar
+from tests.support.commands import assert_refused, run_hilstar_here
 
 PATIENCE_S = 20
 MEMORY_BYTES = 4 << 30
@@ -256,12 +256,14 @@ def test_names_that_are_not_utf_8_are_as_good_as_others():
     bench, codes = os.fsdecode(b"b\xff.toml"), os.fsdecode(b"c\xfe.png")
     Path(bench).write_text(BENCH)
     Path("log.csv").write_text("t_s,qw,qx,qy,qz\n0,1,0,0,0\n")
-    result = run_hilstar("frame", bench, "--radec", "84,-1,0", "--codes", codes, "--json")
+    result = run_hilstar_here("frame", bench, "--radec", "84,-1,0", "--codes", codes, "--json")
     assert result.returncode == 0, result.stderr
     assert json.loads(result.stdout)["written"] == [codes]
-    result = run_hilstar("replay", bench, "log.csv", "--headless", "--speed", "max", "--ledger", "run.mcap")
+    result = run_hilstar_here("replay", bench, "log.csv", "--headless", "--speed", "max", "--ledger", "run.mcap")
     assert result.returncode == 0, result.stderr
-    assert_refused(run_hilstar("frame", os.fsdecode(b"n\xff.toml"), "--radec", "84,-1,0", "--codes", "c.png"), 2, "n\\xff.toml")
+    assert_refused(
+        run_hilstar_here("frame", os.fsdecode(b"n\xff.toml"), "--radec", "84,-1,0", "--codes", "c.png"), 2, "n\\xff.toml"
+    )
 
 
 def test_a_name_of_300_characters_is_refused_in_short():
@@ -271,7 +273,7 @@ def test_a_name_of_300_characters_is_refused_in_short():
 
 
 def refusal_of_process(*words: str) -> str:
-    result = run_hilstar(*words)
+    result = run_hilstar_here(*words)
     assert_refused(result, 2)
     return result.stderr
 

@@ -55,9 +55,8 @@ def test_rows_are_those_of_the_contract(measured):
 def test_stages_make_up_the_whole_frame(measured):
     result, _ = measured
     for count in (100, 1000):
-        ms = {
-            row["kind"]: row["ms"]["median"] for row in result["rows"] if row["stars"] == count and row["method"] == "hilstar"
-        }
+        # The minimum: what else the machine has to do is in the median.
+        ms = {row["kind"]: row["ms"]["min"] for row in result["rows"] if row["stars"] == count and row["method"] == "hilstar"}
         total = sum(ms[stage] for stage in STAGES)
         assert 1 / SUM_FACTOR < total / ms["whole_frame"] < SUM_FACTOR
 
@@ -87,7 +86,7 @@ def test_the_files_say_the_same(measured):
 
 
 def test_a_bench_file_is_measured_at_its_own_size(small_bench_file):
-    result = run_hilstar("benchmark", small_bench_file, "--quick", "--stars", "50")
+    result = run_hilstar_here("benchmark", small_bench_file, "--quick", "--stars", "50")
     assert result.returncode == 0, result.stderr
     assert "320 x 240" in result.stdout
     assert "hilstar, whole frame" in result.stdout
@@ -106,17 +105,17 @@ def test_a_bench_file_is_measured_at_its_own_size(small_bench_file):
     ],
 )
 def test_wrong_options_are_refused(options, words):
-    assert_refused(run_hilstar("benchmark", *options), 2, *words)
+    assert_refused(run_hilstar_here("benchmark", *options), 2, *words)
 
 
 def test_a_bench_file_and_sizes_exclude_each_other(small_bench_file):
-    assert_refused(run_hilstar("benchmark", small_bench_file, "--sizes", "640x480"), 2, "--sizes", "leave out")
+    assert_refused(run_hilstar_here("benchmark", small_bench_file, "--sizes", "640x480"), 2, "--sizes", "leave out")
 
 
 def test_a_bench_without_stars_is_refused(small_bench_file):
     with small_bench_file.open("a") as file:
         file.write("[sky]\nfaintest_v_mag = -50\n[render]\nflux_at_white_e_per_s = 1e6\n")
-    assert_refused(run_hilstar("benchmark", small_bench_file, "--quick"), 2, "faintest_v_mag")
+    assert_refused(run_hilstar_here("benchmark", small_bench_file, "--quick"), 2, "faintest_v_mag")
 
 
 def test_the_numpy_image_is_ours(bench_with):

@@ -20,7 +20,9 @@ from hilstar.monitor.response import encode, srgb_response
 from hilstar.rotation import from_radec_roll_deg
 from tests.support import leftovers
 from tests.support.benches import ROOT, SMALL_BENCH
-from tests.support.commands import assert_refused, run_hilstar
+from tests.support.commands import HILSTAR, assert_refused, has_handlers, run_hilstar, run_hilstar_here
+from tests.support.senders import free_port
+from tests.support.waiting import PATIENCE_S, wait_for
 
 ORION = ROOT / "configs" / "thesis-orion.toml"
 ALNILAM, BETELGEUSE, RIGEL, ALNITAK = 26311, 27989, 24436, 26727
@@ -98,14 +100,14 @@ def test_a_quaternion_and_its_negative_are_the_attitude_of_its_radec(orion, tmp_
     q = from_radec_roll_deg(84.057, -1.2, 0)
     for sign in (1, -1):
         text = ",".join(repr(float(sign * c)) for c in q)
-        result = run_hilstar("frame", ORION, f"--quaternion={text}", "-o", tmp_path / "q.fits")
+        result = run_hilstar_here("frame", ORION, f"--quaternion={text}", "-o", tmp_path / "q.fits")
         assert result.returncode == 0, result.stderr
         assert np.array_equal(fits.getdata(tmp_path / "q.fits"), fits.getdata(folder / "o.fits"))
 
 
 def test_a_deep_monitor_s_codes_are_16_bit_and_left_aligned(tmp_path, small_bench_file):
     small_bench_file.write_text(SMALL_BENCH.replace("[collimator]", "bits = 10\n[collimator]"))
-    result = run_hilstar("frame", small_bench_file, "--radec", "84.057,-1.2,0", "--codes", tmp_path / "c.png")
+    result = run_hilstar_here("frame", small_bench_file, "--radec", "84.057,-1.2,0", "--codes", tmp_path / "c.png")
     assert result.returncode == 0, result.stderr
     png = np.array(Image.open(tmp_path / "c.png"))
     assert png.dtype == np.uint16
@@ -117,7 +119,7 @@ def test_a_deep_monitor_s_codes_are_16_bit_and_left_aligned(tmp_path, small_benc
 
 def test_clipped_stars_are_counted_and_named(tmp_path, small_bench_file):
     small_bench_file.write_text(SMALL_BENCH + "[render]\nflux_at_white_e_per_s = 5e5\n")
-    result = run_hilstar("frame", small_bench_file, "--radec", "84.057,-1.2,0", "--truth", tmp_path / "t.csv", "--json")
+    result = run_hilstar_here("frame", small_bench_file, "--radec", "84.057,-1.2,0", "--truth", tmp_path / "t.csv", "--json")
     clipped = json.loads(result.stdout)["clipped"]
     assert {ALNILAM, ALNITAK} <= set(clipped)
     marked = {int(r["hip"]) for r in read_truth(tmp_path / "t.csv") if r["clipped"] == "1"}
@@ -127,7 +129,9 @@ def test_clipped_stars_are_counted_and_named(tmp_path, small_bench_file):
 def test_the_average_model_can_be_chosen(tmp_path, small_bench_file):
     """AGS knows no colour: two stars of one magnitude have one rate."""
     small_bench_file.write_text(SMALL_BENCH + '[sky]\nbrightness = "ags"\n')
-    assert run_hilstar("frame", small_bench_file, "--radec", "84.057,-1.2,0", "--truth", tmp_path / "t.csv").returncode == 0
+    assert (
+        run_hilstar_here("frame", small_bench_file, "--radec", "84.057,-1.2,0", "--truth", tmp_path / "t.csv").returncode == 0
+    )
     rates = {float(r["electrons_per_s"]) * 10 ** (0.4 * float(r["v_mag"])) for r in read_truth(tmp_path / "t.csv")}
     assert max(rates) / min(rates) == pytest.approx(1, rel=1e-12)
 
@@ -171,13 +175,13 @@ def test_the_average_model_can_be_chosen(tmp_path, small_bench_file):
 def test_a_wrong_command_gets_one_line_and_exit_code_2(tmp_path, small_bench_file, arguments, words):
     (tmp_path / "log.csv").write_text("t_s,qw,qx,qy,qz\n0,1,0,0,0\n")
     places = {"BENCH": small_bench_file, "LOG": tmp_path / "log.csv"}
-    result = run_hilstar(*(places.get(a, a) for a in arguments), cwd=tmp_path)
+    result = run_hilstar_here(*(places.get(a, a) for a in arguments), cwd=tmp_path)
     assert_refused(result, 2, *words)
 
 
 def test_a_log_with_nan_is_refused_with_its_line(tmp_path, small_bench_file):
     (tmp_path / "log.csv").write_text("t_s,qw,qx,qy,qz\n0,1,0,0,0\n1,nan,0,0,0\n")
-    result = run_hilstar("replay", small_bench_file, tmp_path / "log.csv", "--headless")
+    result = run_hilstar_here("replay", small_bench_file, tmp_path / "log.csv", "--headless")
     assert_refused(result, 2, "log.csv:3", "not finite")
 
 
@@ -229,7 +233,7 @@ def test_replay_writes_the_frames_of_a_log(tmp_path, small_bench_file):
 
 def test_replay_in_real_time_takes_the_log_s_time(tmp_path, small_bench_file):
     (tmp_path / "log.jsonl").write_text('{"t_ns":0,"q":[1,0,0,0]}\n{"t_ns":500000000,"q":[0.9999,0.01,0,0.0099]}\n')
-    summary = json.loads(run_hilstar("replay", small_bench_file, tmp_path / "log.jsonl", "--headless", "--json").stdout)
+    summary = json.loads(run_hilstar_here("replay", small_bench_file, tmp_path / "log.jsonl", "--headless", "--json").stdout)
     assert summary["frames"] + summary["missed_frames"] == 31
     assert summary["duration_s"] == pytest.approx(0.5, abs=0.2)
 
@@ -238,7 +242,7 @@ def test_an_unwritable_directory_is_refused(tmp_path, small_bench_file):
     blocker = tmp_path / "file"
     blocker.write_text("")
     (tmp_path / "log.csv").write_text("t_s,qw,qx,qy,qz\n0,1,0,0,0\n")
-    result = run_hilstar("replay", small_bench_file, tmp_path / "log.csv", "--headless", "-o", blocker / "out")
+    result = run_hilstar_here("replay", small_bench_file, tmp_path / "log.csv", "--headless", "-o", blocker / "out")
     assert_refused(result, 2, "cannot be written")
     assert_refused(run_hilstar("demo", "-o", blocker / "out"), 2, "cannot be written")
 
@@ -250,32 +254,31 @@ def test_output_to_a_closed_pipe_leaves_no_traceback():
 
 
 def test_a_png_is_a_png_whatever_its_name(tmp_path, small_bench_file):
-    result = run_hilstar("frame", small_bench_file, "--radec", "84,-1,0", "--codes", "codes", cwd=tmp_path)
+    result = run_hilstar_here("frame", small_bench_file, "--radec", "84,-1,0", "--codes", "codes", cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     assert (tmp_path / "codes").read_bytes()[:4] == b"\x89PNG"
 
 
 def test_ctrl_c_at_any_moment_leaves_no_traceback(tmp_path, small_bench_file):
     """While it starts, while it waits for a listener, while it serves."""
-    commands = (["send", "--spin", "z,1", "--to", "tcp://127.0.0.1:5573"], ["serve", str(small_bench_file), "--headless"])
-    for command in commands:
-        for delay_s in (0.05, 0.15, 0.4, 1.2):
-            process = subprocess.Popen(
-                [sys.executable, "-m", "hilstar", *command], stderr=subprocess.PIPE, stdout=subprocess.PIPE
-            )
+    sender = ["send", "--spin", "z,1", "--to", f"tcp://127.0.0.1:{free_port()}"]
+    for command in (sender, ["serve", str(small_bench_file), "--headless"]):
+        for delay_s in (0.0, 0.1, 0.4, 1.0):
+            process = subprocess.Popen([*HILSTAR, *command], stderr=subprocess.PIPE, stdout=subprocess.PIPE)
             try:
+                wait_for(lambda process=process: has_handlers(process), poll_s=0.005)  # Python's own start is not ours to guard
                 time.sleep(delay_s)
                 process.send_signal(signal.SIGINT)
-                _, err = process.communicate(timeout=10)
+                _, err = process.communicate(timeout=PATIENCE_S)
             finally:
                 process.kill()
-            assert b"Traceback" not in err or delay_s < 0.1, err  # Python's own start is not ours to guard
+            assert b"Traceback" not in err, err
 
 
 def test_a_command_that_is_killed_leaves_no_process_of_the_tests_behind(tmp_path):
     """`demo` starts a sender: killed with it by `run_hilstar`, and what is orphaned all the same is found and ended."""
     with pytest.raises(subprocess.TimeoutExpired):
-        run_hilstar("demo", "--duration", "60", "-o", tmp_path, timeout=5)
+        run_hilstar("demo", "--duration", "60", "-o", tmp_path, timeout=4)
     assert [command for command in leftovers.living_children().values() if str(tmp_path) in command] == []
     orphan_command = [sys.executable, "-c", "import time; time.sleep(60)", f"-m hilstar {tmp_path}"]
     middle = f"import subprocess; subprocess.Popen({orphan_command!r})"

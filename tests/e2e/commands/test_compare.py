@@ -14,16 +14,19 @@ from PIL import Image
 from hilstar.render.reference import linear_image
 from hilstar.scene.psf import footprint_px
 from hilstar.scene.sprites import pack_sprites
-from tests.support.commands import assert_refused, run_hilstar
+from tests.support.benches import SMALL_BENCH
+from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
 
 SIGMA_PX = (0.85, 0.85)  # the bench's
 
 
-@pytest.fixture
-def golden(small_bench_file, tmp_path):
+@pytest.fixture(scope="module")
+def golden(tmp_path_factory):
     """A frame of Orion's belt, and its table."""
-    paths = tmp_path / "golden.fits", tmp_path / "golden.csv"
-    result = run_hilstar("frame", small_bench_file, "--radec", "84.057,-1.2,0", "-o", paths[0], "--truth", paths[1])
+    folder = tmp_path_factory.mktemp("golden")
+    (folder / "bench.toml").write_text(SMALL_BENCH)
+    paths = folder / "golden.fits", folder / "golden.csv"
+    result = run_hilstar_here("frame", folder / "bench.toml", "--radec", "84.057,-1.2,0", "-o", paths[0], "--truth", paths[1])
     assert result.returncode == 0, result.stderr
     return paths
 
@@ -68,7 +71,7 @@ def test_a_golden_frame_holds_on_another_driver(golden, small_bench_file, tmp_pa
 
 
 def test_a_fault_is_told_named_and_drawn(golden, faulty, tmp_path):
-    result = run_hilstar("compare", faulty, golden[0], "--truth", golden[1], "-o", tmp_path / "out")
+    result = run_hilstar_here("compare", faulty, golden[0], "--truth", golden[1], "-o", tmp_path / "out")
     assert result.returncode == 1, result.stderr
     assert "NOT the same sky" in result.stdout and "HIP 26727 at" in result.stdout and "+0.0500 mag" in result.stdout
     assert "HIP 25930 at" in result.stdout and "missing" in result.stdout
@@ -86,9 +89,9 @@ def test_a_shift_of_the_whole_image_comes_first_and_in_few_lines(golden, small_b
     """A principal point that is 0.75 px off: every star differs, and all alike."""
     small_bench_file.write_text(small_bench_file.read_text() + "principal_point_px = [158.75, 119.5]\n")
     shifted = tmp_path / "shifted.fits"
-    assert run_hilstar("frame", small_bench_file, "--radec", "84.057,-1.2,0", "-o", shifted).returncode == 0
+    assert run_hilstar_here("frame", small_bench_file, "--radec", "84.057,-1.2,0", "-o", shifted).returncode == 0
     out = tmp_path / "out"
-    told = run_hilstar("compare", shifted, golden[0], "--truth", golden[1], "-o", out)
+    told = run_hilstar_here("compare", shifted, golden[0], "--truth", golden[1], "-o", out)
     assert told.returncode == 1 and "NOT the same sky" in told.stdout
     assert "all shifted by (-0.75, 0.00) px" in told.stdout.splitlines()[0]
     assert len(told.stdout.splitlines()) < 20
@@ -96,14 +99,14 @@ def test_a_shift_of_the_whole_image_comes_first_and_in_few_lines(golden, small_b
         assert picture.height > 500
     with (out / "compare.csv").open() as file:
         rows = list(csv.DictReader(file))
-    summary = json.loads(run_hilstar("compare", shifted, golden[0], "--json").stdout)
+    summary = json.loads(run_hilstar_here("compare", shifted, golden[0], "--json").stdout)
     assert summary["common"]["shift_px"] == pytest.approx([-0.75, 0.0], abs=1e-3)
     assert summary["common"]["differ"] == sum(row["differs"] == "1" for row in rows) < 0.05 * len(rows)
     assert not summary["same"] and len(summary["bad"]) > 0.9 * summary["stars"]
 
 
 def test_json_is_one_object(golden, faulty):
-    result = run_hilstar("compare", faulty, golden[0], "--truth", golden[1], "--json")
+    result = run_hilstar_here("compare", faulty, golden[0], "--truth", golden[1], "--json")
     assert result.returncode == 1 and result.stderr == ""
     summary = json.loads(result.stdout)
     assert not summary["same"] and summary["missing"] == 1 and summary["extra"] == 0
@@ -111,7 +114,7 @@ def test_json_is_one_object(golden, faulty):
     assert summary["bad"][0]["flux_error_mag"] is None
     assert summary["flux_error_mag"]["max"] == pytest.approx(0.05, abs=1e-4)
     wide = json.loads(
-        run_hilstar("compare", golden[0], golden[0], "--flux-mag", "0.1", "--centroid-px", "0.2", "--json").stdout
+        run_hilstar_here("compare", golden[0], golden[0], "--flux-mag", "0.1", "--centroid-px", "0.2", "--json").stdout
     )
     assert wide["same"] and wide["limits"] == {"flux_mag": 0.1, "centroid_px": 0.2} and wide["bad"] == []
 
@@ -119,7 +122,7 @@ def test_json_is_one_object(golden, faulty):
 def test_wrong_inputs_are_refused(golden, small_bench_file, tmp_path):
     fits_file, table = golden
     dn = tmp_path / "dn.fits"
-    assert run_hilstar("simulate", small_bench_file, "--radec", "84,-1,0", "-o", dn).returncode == 0
+    assert run_hilstar_here("simulate", small_bench_file, "--radec", "84,-1,0", "-o", dn).returncode == 0
     small = tmp_path / "small.fits"
     with fits.open(fits_file) as hdus:
         hdus[0].data = hdus[0].data[:, :100]
@@ -128,17 +131,19 @@ def test_wrong_inputs_are_refused(golden, small_bench_file, tmp_path):
     with fits.open(fits_file) as hdus:
         hdus[0].data[:] = 0
         hdus.writeto(blank)
-    gone = run_hilstar("compare", blank, fits_file, "-o", tmp_path / "gone")
+    gone = run_hilstar_here("compare", blank, fits_file, "-o", tmp_path / "gone")
     assert gone.returncode == 1 and "missing" in gone.stdout and (tmp_path / "gone" / "compare.png").stat().st_size > 0
-    assert_refused(run_hilstar("compare", fits_file, blank), 2, "no star")
+    assert_refused(run_hilstar_here("compare", fits_file, blank), 2, "no star")
     (tmp_path / "empty.csv").write_text("hip,x_px\n1,2\n")
-    assert_refused(run_hilstar("compare", tmp_path / "none.fits", fits_file), 2, "none.fits", "No such file")
-    assert_refused(run_hilstar("compare", small_bench_file, fits_file), 2, "bench.toml", "no FITS image")
-    assert_refused(run_hilstar("compare", tmp_path, fits_file), 2, "it is a directory")
-    assert_refused(run_hilstar("compare", dn, fits_file), 2, "dn.fits", "electron/s")
-    assert_refused(run_hilstar("compare", small, fits_file), 2, "100 x 240 px against 320 x 240 px")
-    assert_refused(run_hilstar("compare", fits_file, fits_file, "--truth", tmp_path / "empty.csv"), 2, "empty.csv:2", "y_px")
-    assert_refused(run_hilstar("compare", fits_file, fits_file, "--truth", tmp_path / "no.csv"), 2, "no.csv")
-    assert_refused(run_hilstar("compare", fits_file, fits_file, "--truth", fits_file), 2, "golden.fits")
-    assert_refused(run_hilstar("compare", fits_file, fits_file, "--flux-mag", "0"), 2, "flux_mag = 0")
-    assert_refused(run_hilstar("compare", fits_file, fits_file, "-o", table / "x"), 2, "cannot be written")
+    assert_refused(run_hilstar_here("compare", tmp_path / "none.fits", fits_file), 2, "none.fits", "No such file")
+    assert_refused(run_hilstar_here("compare", small_bench_file, fits_file), 2, "bench.toml", "no FITS image")
+    assert_refused(run_hilstar_here("compare", tmp_path, fits_file), 2, "it is a directory")
+    assert_refused(run_hilstar_here("compare", dn, fits_file), 2, "dn.fits", "electron/s")
+    assert_refused(run_hilstar_here("compare", small, fits_file), 2, "100 x 240 px against 320 x 240 px")
+    assert_refused(
+        run_hilstar_here("compare", fits_file, fits_file, "--truth", tmp_path / "empty.csv"), 2, "empty.csv:2", "y_px"
+    )
+    assert_refused(run_hilstar_here("compare", fits_file, fits_file, "--truth", tmp_path / "no.csv"), 2, "no.csv")
+    assert_refused(run_hilstar_here("compare", fits_file, fits_file, "--truth", fits_file), 2, "golden.fits")
+    assert_refused(run_hilstar_here("compare", fits_file, fits_file, "--flux-mag", "0"), 2, "flux_mag = 0")
+    assert_refused(run_hilstar_here("compare", fits_file, fits_file, "-o", table / "x"), 2, "cannot be written")

@@ -19,7 +19,7 @@ from hilstar.monitor.calibration import load_calibration
 from hilstar.scene.psf import peak_share, pixel_share
 from hilstar.twin.budget import budget, zero_point_mag
 from tests.support.benches import ROOT, SMALL_BENCH
-from tests.support.commands import assert_refused, run_hilstar
+from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
 
 EXACT = '[render]\nquantisation = "exact"\n'
 # 1 % noise on one reading: the response of the example comes back within 1 % at nearly every code, 3 % at any.
@@ -27,7 +27,7 @@ RESPONSE_ERROR = 0.03
 
 
 def of_json(*arguments: object) -> dict:
-    result = run_hilstar(*arguments, "--json")
+    result = run_hilstar_here(*arguments, "--json")
     assert result.returncode == 0, result.stderr
     return json.loads(result.stdout)
 
@@ -115,10 +115,10 @@ def test_the_white_of_a_file_that_gives_none_leaves_codes_for_most_fields(tmp_pa
 
 def test_a_run_names_the_stars_that_clip_and_a_bench_without_such_stars_says_nothing(small_bench_file):
     small_bench_file.write_text(SMALL_BENCH + '[attitude]\nendpoint = "tcp://127.0.0.1:5599"\n')
-    spoken = run_hilstar("serve", small_bench_file, "--headless", "--frames", "1")
+    spoken = run_hilstar_here("serve", small_bench_file, "--headless", "--frames", "1")
     assert "13 stars" in spoken.stderr and "HIP 32349, 30438" in spoken.stderr and "brightest_v_mag = 1.5" in spoken.stderr
     small_bench_file.write_text(small_bench_file.read_text() + "[render]\nbrightest_v_mag = -2\n")
-    assert "HIP" not in run_hilstar("serve", small_bench_file, "--headless", "--frames", "1").stderr
+    assert "HIP" not in run_hilstar_here("serve", small_bench_file, "--headless", "--frames", "1").stderr
 
 
 def test_a_sky_of_the_brightest_stars_alone_has_a_white(bench_with):
@@ -134,7 +134,7 @@ def test_two_whites_or_none_get_one_line(small_bench_file):
         ("brightest_v_mag = 20", "brightest_v_mag leaves no star"),
     ):
         small_bench_file.write_text(f"{SMALL_BENCH}\n[render]\n{render}\n")
-        assert_refused(run_hilstar("budget", small_bench_file), 2, said)
+        assert_refused(run_hilstar_here("budget", small_bench_file), 2, said)
 
 
 def test_a_monitor_that_is_30_percent_too_bright_is_found_by_the_tracker(tmp_path, small_bench_file):
@@ -175,12 +175,12 @@ def test_readings_that_disagree_are_said_to(small_bench_file):
     ],
 )
 def test_a_scale_that_cannot_be_gets_one_line(small_bench_file, arguments, said):
-    assert_refused(run_hilstar("calibrate", "scale", small_bench_file, *arguments), 2, said)
+    assert_refused(run_hilstar_here("calibrate", "scale", small_bench_file, *arguments), 2, said)
 
 
 def test_a_star_that_clips_is_no_scale(small_bench_file):
     small_bench_file.write_text(SMALL_BENCH + "[render]\nbrightest_v_mag = 3\n")
-    assert_refused(run_hilstar("calibrate", "scale", small_bench_file, "--reading", "32349,100"), 2, "clips")
+    assert_refused(run_hilstar_here("calibrate", "scale", small_bench_file, "--reading", "32349,100"), 2, "clips")
 
 
 def test_plan_measure_fit_and_show_go_round(tmp_path, small_bench_file, rng):
@@ -208,7 +208,7 @@ def test_plan_measure_fit_and_show_go_round(tmp_path, small_bench_file, rng):
     assert np.abs(response.light[bright] / true.light[bright] - 1).max() < RESPONSE_ERROR
     assert response.black == pytest.approx(true.black, rel=0.03)
     small_bench_file.write_text(SMALL_BENCH.replace("[collimator]", 'calibration = "monitor.toml"\n[collimator]'))
-    shot = run_hilstar("frame", small_bench_file, "--radec", "84,-1,0", "-o", tmp_path / "out.fits")
+    shot = run_hilstar_here("frame", small_bench_file, "--radec", "84,-1,0", "-o", tmp_path / "out.fits")
     assert shot.returncode == 0, shot.stderr
     assert fits.getheader(tmp_path / "out.fits")["CALSHA"] == fitted["sha256"]
 
@@ -236,7 +236,7 @@ def test_the_words_of_a_calibration_say_what_to_write(tmp_path):
     codes = [0, *range(5, 256, 10)]
     lines = ["code,channel,value", *(f"{code},w,{light[code] * 100 + 0.1:.5f}" for code in codes for _ in range(2))]
     (tmp_path / "m.csv").write_text("\n".join(lines))
-    result = run_hilstar("calibrate", "photometric", tmp_path / "m.csv", "-o", tmp_path / "mon.toml")
+    result = run_hilstar_here("calibrate", "photometric", tmp_path / "m.csv", "-o", tmp_path / "mon.toml")
     assert result.returncode == 0, result.stderr
     assert 'calibration = "mon.toml"' in result.stdout
     assert "contrast 1 : " in result.stdout
@@ -254,4 +254,4 @@ def test_the_words_of_a_calibration_say_what_to_write(tmp_path):
     ],
 )
 def test_what_cannot_be_done_gets_one_line(tmp_path, arguments, said):
-    assert_refused(run_hilstar(*arguments, cwd=tmp_path), 2, said)
+    assert_refused(run_hilstar_here(*arguments, cwd=tmp_path), 2, said)

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from hilstar.rotation import from_radec_roll_deg, propagate
-from tests.support.commands import assert_refused, run_hilstar
+from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
 
 RATE = np.radians([0.3, -0.2, 2.0])
 
@@ -30,7 +30,7 @@ def log(tmp_path) -> Path:
 
 
 def replayed(bench: Path, log: Path, output: Path, *options: str) -> list[dict[str, str]]:
-    result = run_hilstar("replay", bench, log, "--headless", "--speed", "max", "-o", output, *options)
+    result = run_hilstar_here("replay", bench, log, "--headless", "--speed", "max", "-o", output, *options)
     assert result.returncode == 0, result.stderr
     with (output / "frames.csv").open() as file:
         return list(csv.DictReader(file))
@@ -43,7 +43,7 @@ def quaternion(row: dict[str, str]) -> list[float]:
 @pytest.mark.parametrize("suffix", ["csv", "jsonl", "aem", "kvn", "xml", "mcap"])
 def test_every_form_of_a_log_replays_to_the_same_frames(tmp_path, small_bench_file, log, suffix):
     other = tmp_path / f"other.{suffix}"
-    converted = run_hilstar("convert", log, other)
+    converted = run_hilstar_here("convert", log, other)
     assert converted.returncode == 0, converted.stderr
     assert "21 attitudes" in converted.stdout
     ours, theirs = (replayed(small_bench_file, path, tmp_path / path.suffix, "--step", "0.25") for path in (log, other))
@@ -81,13 +81,13 @@ def test_a_replay_at_four_times_the_speed_takes_a_quarter_of_the_time(small_benc
     ],
 )
 def test_a_speed_or_span_that_gives_no_frame_gets_one_line(small_bench_file, log, options, said):
-    assert_refused(run_hilstar("replay", small_bench_file, log, "--headless", *options), 2, said)
+    assert_refused(run_hilstar_here("replay", small_bench_file, log, "--headless", *options), 2, said)
 
 
 def test_convert_says_what_it_cannot(tmp_path, log):
-    assert_refused(run_hilstar("convert", log, tmp_path / "out.doc"), 2, ".csv", "out.doc")
-    assert_refused(run_hilstar("convert", tmp_path / "none.csv", tmp_path / "out.csv"), 2, "none.csv")
-    assert_refused(run_hilstar("convert", log, tmp_path / "no" / "out.csv"), 2, "out.csv")
+    assert_refused(run_hilstar_here("convert", log, tmp_path / "out.doc"), 2, ".csv", "out.doc")
+    assert_refused(run_hilstar_here("convert", tmp_path / "none.csv", tmp_path / "out.csv"), 2, "none.csv")
+    assert_refused(run_hilstar_here("convert", log, tmp_path / "no" / "out.csv"), 2, "out.csv")
 
 
 def test_fault_options_stand_alone_or_take_a_share(tmp_path):
@@ -125,7 +125,7 @@ def test_a_gap_in_a_log_is_held_and_said_once(tmp_path, small_bench_file):
     path = tmp_path / "gap.csv"
     rows = [(t, propagate(from_radec_roll_deg(84, -1, 0), RATE, t)) for t in (0, 0.5, 1, 1.5, 9, 9.5)]
     path.write_text("\n".join(["t_s,qw,qx,qy,qz", *(f"{t},{','.join(map(repr, q.tolist()))}" for t, q in rows)]))
-    result = run_hilstar("replay", small_bench_file, path, "--headless", "--speed", "max", "--step", "0.5", "--json")
+    result = run_hilstar_here("replay", small_bench_file, path, "--headless", "--speed", "max", "--step", "0.5", "--json")
     assert result.stderr.count("1 gap, the longest 7.5 s (over") == 1
     summary = json.loads(result.stdout)
     assert summary["events"]["log-gap"] == 1

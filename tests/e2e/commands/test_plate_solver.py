@@ -19,7 +19,7 @@ from PIL import Image
 from scipy import ndimage
 
 from hilstar.monitor.response import srgb_light
-from tests.support.commands import run_hilstar
+from tests.support.commands import run_hilstar_here
 
 # The limits; measured here: 0.0003 to 0.024 arcsec and 0.03 to 0.7 arcsec.
 LINEAR_LIMIT_ARCSEC = 0.1
@@ -97,7 +97,7 @@ def fields(tmp_path_factory) -> dict[str, list[np.ndarray]]:
     images: dict[str, list[np.ndarray]] = {"linear": [], "codes": []}
     for attitude in ATTITUDES:
         radec = ",".join(map(str, attitude))
-        result = run_hilstar("frame", "bench.toml", f"--radec={radec}", "-o", "f.fits", "--codes", "f.png", cwd=folder)
+        result = run_hilstar_here("frame", "bench.toml", f"--radec={radec}", "-o", "f.fits", "--codes", "f.png", cwd=folder)
         assert result.returncode == 0, result.stderr
         images["linear"].append(fits.getdata(folder / "f.fits").astype(np.float64))
         images["codes"].append(srgb_light(np.array(Image.open(folder / "f.png")) / 255.0))

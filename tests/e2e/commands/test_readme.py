@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from tests.support.benches import ROOT
-from tests.support.commands import run_hilstar
+from tests.support.commands import run_hilstar, run_hilstar_here
 
 README = (ROOT / "README.md").read_text()
 FILES = ("pyproject.toml", "README.md", "LICENSE", "hilstar", "shaders", "configs")
@@ -85,7 +85,7 @@ def test_the_user_s_regression_test_passes(tmp_path):
 
 @pytest.mark.parametrize("command", sorted(set(re.findall(r"(?m)^hilstar (\w+) ", blocks("text")[2]))))
 def test_every_command_of_the_readme_is_there(command):
-    result = run_hilstar(command, "--help")
+    result = run_hilstar_here(command, "--help")
     assert result.returncode == 0, result.stderr
 
 

@@ -9,14 +9,14 @@ from PIL import Image
 
 import hilstar
 from tests.support.benches import ROOT, SMALL_BENCH
-from tests.support.commands import assert_refused, run_hilstar
+from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
 
 LYRA = ROOT / "configs" / "thesis-lyra.toml"
 POINTING = ("--radec", "283.021,35.349,0")
 
 
 def simulate(path, *options, bench=LYRA, pointing=POINTING):
-    result = run_hilstar("simulate", bench, *pointing, "-o", path, *options)
+    result = run_hilstar_here("simulate", bench, *pointing, "-o", path, *options)
     assert result.returncode == 0, result.stderr
     with fits.open(path) as hdus:
         return hdus[0].data.copy(), hdus[0].header.copy(), hdus[1].data.copy()
@@ -136,7 +136,7 @@ def test_a_log_is_simulated_over_all_cores(tmp_path):
 )
 def test_a_wrong_simulation_gets_one_line(tmp_path, arguments, words):
     (tmp_path / "bench.toml").write_text(SMALL_BENCH.replace("[1024, 1024]", "[64, 64]"))
-    assert_refused(run_hilstar("simulate", "bench.toml", *arguments, cwd=tmp_path), 2, *words)
+    assert_refused(run_hilstar_here("simulate", "bench.toml", *arguments, cwd=tmp_path), 2, *words)
 
 
 @pytest.mark.parametrize(
@@ -150,5 +150,5 @@ def test_a_wrong_simulation_gets_one_line(tmp_path, arguments, words):
 )
 def test_a_wrong_detector_gets_one_line(tmp_path, keys, words):
     (tmp_path / "bench.toml").write_text(SMALL_BENCH + f"[tracker.detector]\n{keys}\n")
-    result = run_hilstar("simulate", "bench.toml", "--radec", "1,2,3", "-o", "x.fits", cwd=tmp_path)
+    result = run_hilstar_here("simulate", "bench.toml", "--radec", "1,2,3", "-o", "x.fits", cwd=tmp_path)
     assert_refused(result, 2, "[tracker.detector]", words)

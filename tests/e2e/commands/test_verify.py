@@ -14,7 +14,7 @@ from hilstar.bench.bench_file import read_bench_file
 from hilstar.monitor.quantise import Panel
 from hilstar.monitor.response import gamma_response, srgb_response, table_response
 from hilstar.twin.verify import Twin
-from tests.support.commands import assert_refused, run_hilstar
+from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
 
 BENCH = """
 [tracker]
@@ -45,7 +45,7 @@ CUT_PX = 1e-4
 def verified(tmp_path: Path, verify: str = "", *options: str, replace: tuple[str, str] = ("", "")) -> tuple[int, dict]:
     path = tmp_path / "bench.toml"
     path.write_text(BENCH.replace(*replace) + f"[verify]\n{verify}\n")
-    result = run_hilstar("verify", path, "--fields", FIELDS, "--json", "--strict", *options)
+    result = run_hilstar_here("verify", path, "--fields", FIELDS, "--json", "--strict", *options)
     assert result.stdout, result.stderr
     return result.returncode, json.loads(result.stdout)
 
@@ -155,7 +155,7 @@ def test_what_cannot_be_verified_gets_one_line(tmp_path):
         ("true_q_cam_to_mon = [2, 0, 0, 0]", "unit quaternion"),
     ):
         path.write_text(f"{BENCH}[verify]\n{verify}\n")
-        assert_refused(run_hilstar("verify", path, "--fields", "1"), 2, said)
+        assert_refused(run_hilstar_here("verify", path, "--fields", "1"), 2, said)
 
 
 @pytest.fixture(scope="module")

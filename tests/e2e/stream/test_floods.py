@@ -20,7 +20,7 @@ import zmq.auth
 
 from hilstar.attitude.wire.flood_limits import MAX_BURST, MAX_PACKETS_PER_S
 from tests.support.benches import SMALL_BENCH
-from tests.support.commands import assert_refused, run_hilstar
+from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.senders import connected, packet
 from tests.support.servers import Served, bound
 from tests.support.waiting import PATIENCE_S, wait_for
@@ -156,7 +156,7 @@ def test_lockstep_survives_no_delimiter_dead_askers_and_endless_parts(tmp_path):
 
 
 def make_client(directory: Path) -> Path:
-    assert run_hilstar("keys", "-o", directory).returncode == 0
+    assert run_hilstar_here("keys", "-o", directory).returncode == 0
     return directory
 
 
@@ -224,9 +224,9 @@ def test_clients_are_let_in_and_locked_out_without_a_restart_and_those_rejected_
 def test_endpoints_that_libzmq_would_take_and_hilstar_does_not(tmp_path, endpoint, said):
     bench = tmp_path / "bench.toml"
     bench.write_text(f'{SMALL_BENCH}\n[attitude]\nendpoint = "{endpoint}"\n')
-    assert_refused(run_hilstar("serve", bench, "--headless", "--duration", "1"), 2, endpoint, said)
+    assert_refused(run_hilstar_here("serve", bench, "--headless", "--duration", "1"), 2, endpoint, said)
     to = ("--to", endpoint, "--connect", "--spin", "z,1", "--count", "1", "--wait", "0")
-    assert_refused(run_hilstar("send", *to), 2, endpoint, said)
+    assert_refused(run_hilstar_here("send", *to), 2, endpoint, said)
 
 
 def test_binding_a_file_deletes_nothing(tmp_path):
@@ -234,13 +234,13 @@ def test_binding_a_file_deletes_nothing(tmp_path):
     measured.write_text("1,2,3\n")
     bench = tmp_path / "bench.toml"
     bench.write_text(f'{SMALL_BENCH}\n[attitude]\nbind = true\nendpoint = "ipc://{measured}"\n')
-    assert_refused(run_hilstar("serve", bench, "--headless", "--duration", "1"), 2, "measured.csv", "not a socket")
-    assert_refused(run_hilstar("send", "--spin", "z,1", "--to", f"ipc://{measured}"), 2, "measured.csv", "not a socket")
+    assert_refused(run_hilstar_here("serve", bench, "--headless", "--duration", "1"), 2, "measured.csv", "not a socket")
+    assert_refused(run_hilstar_here("send", "--spin", "z,1", "--to", f"ipc://{measured}"), 2, "measured.csv", "not a socket")
     assert measured.read_text() == "1,2,3\n"
 
 
 def test_a_free_port_is_told(tmp_path):
-    sent = run_hilstar("send", "--spin", "z,1", "--to", "tcp://127.0.0.1:*", "--count", "1", "--wait", "0", "--json")
+    sent = run_hilstar_here("send", "--spin", "z,1", "--to", "tcp://127.0.0.1:*", "--count", "1", "--wait", "0", "--json")
     endpoint = json.loads(sent.stdout)["link"]["endpoint"]
     assert endpoint.startswith("tcp://127.0.0.1:")
     assert int(endpoint.rpartition(":")[2]) > 0
@@ -248,5 +248,5 @@ def test_a_free_port_is_told(tmp_path):
 
 
 def test_keys_in_a_place_that_cannot_be_get_one_line(tmp_path):
-    assert_refused(run_hilstar("keys", "-o", tmp_path / ("k" * 300)), 2, "choose another")
-    assert_refused(run_hilstar("keys", "-o", "/proc/keys/here"), 2, "/proc/keys/here")
+    assert_refused(run_hilstar_here("keys", "-o", tmp_path / ("k" * 300)), 2, "choose another")
+    assert_refused(run_hilstar_here("keys", "-o", "/proc/keys/here"), 2, "/proc/keys/here")

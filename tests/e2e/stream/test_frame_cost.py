@@ -10,7 +10,7 @@ import time
 
 import pytest
 
-from tests.support.commands import assert_refused, run_hilstar
+from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.senders import packet, publisher
 from tests.support.servers import serving, summary_of
 
@@ -84,7 +84,7 @@ def test_a_log_whose_rate_is_too_fast_is_refused_with_its_attitude(small_bench_f
     log = tmp_path / "log.csv"
     rows = [f"{k / 10},1,0,0,0,0,0,{57.3 if k == 3 else 0}" for k in range(10)]
     log.write_text("\n".join(["t_s,qw,qx,qy,qz,rx,ry,rz", *rows]) + "\n")
-    result = run_hilstar("replay", small_bench_file, log, "--headless", "--speed", "max", "--json")
+    result = run_hilstar_here("replay", small_bench_file, log, "--headless", "--speed", "max", "--json")
     assert_refused(result, 2, str(log), "attitude 4", "max_rate_deg_s = 60", "rad/s")
 
 
@@ -98,7 +98,7 @@ def test_a_run_with_such_turns_is_replayed_from_its_ledger_in_bounded_time(tmp_p
         stream(sender, [((0.5, 0.5, -0.5, 0.5), (900.0, 0.0, -900.0)) for _ in range(100)], 100)
         served = summary_of(process)
     began_s = time.monotonic()
-    result = run_hilstar("replay", tmp_path / "serve.toml", ledger, "--headless", "--speed", "max", "--json", timeout=60)
+    result = run_hilstar_here("replay", tmp_path / "serve.toml", ledger, "--headless", "--speed", "max", "--json", timeout=60)
     assert result.returncode == 0, result.stderr
     summary = json.loads(result.stdout)
     assert (summary["frames"], summary["capped"]) == (60, served["capped"])

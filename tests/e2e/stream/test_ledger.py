@@ -19,7 +19,7 @@ from hilstar.errors import InputError
 from hilstar.rotation import from_radec_roll_deg, propagate
 from hilstar.run.record.records import past_frames
 from tests.support.benches import SMALL_BENCH
-from tests.support.commands import assert_refused, run_hilstar
+from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
 from tests.support.senders import packet, publisher
 from tests.support.servers import serving, summary_of
 
@@ -96,8 +96,8 @@ def test_what_was_drawn_is_drawn_again_bit_for_bit(tmp_path):
     first, second = tmp_path / "first", tmp_path / "second"
     ledger = tmp_path / "run.mcap"
     options = ["--headless", "--speed", "max"]
-    assert run_hilstar("replay", bench, log, *options, "-o", first, "--ledger", ledger).returncode == 0
-    again = run_hilstar("replay", bench, ledger, *options, "-o", second)
+    assert run_hilstar_here("replay", bench, log, *options, "-o", first, "--ledger", ledger).returncode == 0
+    again = run_hilstar_here("replay", bench, ledger, *options, "-o", second)
     assert again.returncode == 0, again.stderr
     names = sorted(path.name for path in first.glob("*.png"))
     assert len(names) == 25
@@ -162,7 +162,7 @@ def test_a_full_disk_ends_the_ledger_and_not_the_display(tmp_path):
 
 def test_a_ledger_that_cannot_be_begun_gets_one_line(tmp_path, small_bench_file):
     for place in (tmp_path / "no" / "run.mcap", "/dev/full"):
-        result = run_hilstar("serve", small_bench_file, "--headless", "--duration", "1", "--ledger", place)
+        result = run_hilstar_here("serve", small_bench_file, "--headless", "--duration", "1", "--ledger", place)
         assert result.returncode == 2
         assert str(place) in result.stderr
         assert "Traceback" not in result.stderr
@@ -177,7 +177,7 @@ def test_no_output_is_written_over_an_input_or_an_older_run(tmp_path, small_benc
     log.write_text("t_s,qw,qx,qy,qz\n0,1,0,0,0\n0.1,1,0,0,0\n")
     run = tmp_path / "run.mcap"
     headless = ["--headless", "--speed", "max"]
-    assert run_hilstar("replay", bench, log, *headless, "--ledger", run).returncode == 0
+    assert run_hilstar_here("replay", bench, log, *headless, "--ledger", run).returncode == 0
     (tmp_path / "hard.mcap").hardlink_to(run)
     before = {path: path.read_bytes() for path in (bench, qe, log, run)}
     (tmp_path / "link.toml").symlink_to(bench)
@@ -192,9 +192,9 @@ def test_no_output_is_written_over_an_input_or_an_older_run(tmp_path, small_benc
         ["convert", log, run],
         ["serve", bench, "--headless", "--duration", "1", "--ledger", tmp_path / "other.mcap", "--ledger-split", "1 fortnight"],
     ):
-        assert_refused(run_hilstar(*command), 2)
+        assert_refused(run_hilstar_here(*command), 2)
         assert {path: path.read_bytes() for path in before} == before, command
-    again = run_hilstar("replay", bench, log, *headless, "--ledger", run, "--overwrite")
+    again = run_hilstar_here("replay", bench, log, *headless, "--ledger", run, "--overwrite")
     assert again.returncode == 0, again.stderr
     assert run.read_bytes() != before[run]
 

@@ -18,7 +18,7 @@ from hilstar.run.send.faults import BadCable, Faults
 from hilstar.run.send.sender import SerialSender, send, spin_samples
 from hilstar.run.serve import serve
 from tests.support.benches import SMALL_BENCH
-from tests.support.commands import assert_refused, run_hilstar
+from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
 from tests.support.ptys import Cable
 from tests.support.servers import interrupted, listening
 
@@ -152,8 +152,8 @@ def test_a_port_that_is_not_there_or_no_port_gets_one_line(tmp_path):
     bench = tmp_path / "bench.toml"
     for port, said in (("/dev/ttyNowhere", "ttyUSB0"), ("/dev/null", "ttyUSB0")):
         bench.write_text(f'{SMALL_BENCH}\n[attitude]\nsource = "serial"\nport = "{port}"\n')
-        assert_refused(run_hilstar("serve", bench, "--headless", "--duration", "1"), 2, port, said)
+        assert_refused(run_hilstar_here("serve", bench, "--headless", "--duration", "1"), 2, port, said)
     bench.write_text(f'{SMALL_BENCH}\n[attitude]\nsource = "serial"\n')
-    assert_refused(run_hilstar("serve", bench, "--headless", "--duration", "1"), 2, "port")
-    assert_refused(run_hilstar("send", "--spin", "z,1", "--to", "serial:/dev/ttyNowhere@115200"), 2, "ttyNowhere")
-    assert_refused(run_hilstar("send", "--spin", "z,1", "--to", "serial:@115200"), 2, "serial:/dev/ttyX@BAUD")
+    assert_refused(run_hilstar_here("serve", bench, "--headless", "--duration", "1"), 2, "port")
+    assert_refused(run_hilstar_here("send", "--spin", "z,1", "--to", "serial:/dev/ttyNowhere@115200"), 2, "ttyNowhere")
+    assert_refused(run_hilstar_here("send", "--spin", "z,1", "--to", "serial:@115200"), 2, "serial:/dev/ttyX@BAUD")

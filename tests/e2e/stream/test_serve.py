@@ -15,7 +15,7 @@ import zmq
 
 from hilstar.rotation import from_radec_roll_deg
 from tests.support.benches import SMALL_BENCH
-from tests.support.commands import assert_refused, run_hilstar
+from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
 from tests.support.senders import connected, free_port, packet, publisher
 from tests.support.servers import serving, summary_of
 
@@ -191,9 +191,9 @@ def test_a_sender_that_restarts_is_taken_up_again(tmp_path):
 def test_a_port_in_use_gets_one_line(tmp_path, small_bench_file):
     with publisher() as (_, port):
         small_bench_file.write_text(SMALL_BENCH + f'[attitude]\nbind = true\nendpoint = "tcp://127.0.0.1:{port}"\n')
-        result = run_hilstar("serve", small_bench_file, "--headless", "--duration", "1")
+        result = run_hilstar_here("serve", small_bench_file, "--headless", "--duration", "1")
         assert_refused(result, 2, f"127.0.0.1:{port}", "in use")
-        assert_refused(run_hilstar("send", "--spin", "z,1", "--to", f"tcp://127.0.0.1:{port}"), 2, "in use")
+        assert_refused(run_hilstar_here("send", "--spin", "z,1", "--to", f"tcp://127.0.0.1:{port}"), 2, "in use")
 
 
 def test_lockstep_shows_one_frame_a_request_and_says_when(tmp_path):
@@ -236,11 +236,11 @@ def test_lockstep_without_a_request_never_had_an_attitude(tmp_path):
 @pytest.mark.parametrize("host", ["*", "192.0.2.1", "0.0.0.0", "[::]"])
 def test_beyond_loopback_nothing_is_bound_or_connected_without_keys(small_bench_file, host, line):
     small_bench_file.write_text(f'{SMALL_BENCH}\n[attitude]\nendpoint = "tcp://{host}:5599"\n{line}\n')
-    assert_refused(run_hilstar("serve", small_bench_file, "--headless", "--duration", "1"), 2, "hilstar keys", "5599")
+    assert_refused(run_hilstar_here("serve", small_bench_file, "--headless", "--duration", "1"), 2, "hilstar keys", "5599")
 
 
 def test_send_beyond_loopback_needs_keys_too():
-    assert_refused(run_hilstar("send", "--spin", "z,1", "--to", "tcp://*:5599"), 2, "hilstar keys")
+    assert_refused(run_hilstar_here("send", "--spin", "z,1", "--to", "tcp://*:5599"), 2, "hilstar keys")
 
 
 def test_with_keys_a_known_client_is_heard_and_a_stranger_is_not(tmp_path):
@@ -275,7 +275,7 @@ def test_key_files_that_are_none_get_one_line(tmp_path, small_bench_file):
         ('bind = true\ncurve_secret_key = "bad.key_secret"', "allowed_clients"),
     ):
         small_bench_file.write_text(f"{SMALL_BENCH}\n[attitude]\n{line}\n")
-        assert_refused(run_hilstar("serve", small_bench_file, "--headless", "--duration", "1"), 2, said)
+        assert_refused(run_hilstar_here("serve", small_bench_file, "--headless", "--duration", "1"), 2, said)
 
 
 def test_a_flood_is_bounded_and_the_display_goes_on(tmp_path):

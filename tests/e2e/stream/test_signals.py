@@ -18,6 +18,7 @@ import zmq
 
 from hilstar.attitude.logs.log_file import read_log
 from tests.support.benches import SMALL_BENCH, attitude_table
+from tests.support.commands import has_handlers
 from tests.support.senders import free_port, packet, publisher
 from tests.support.waiting import wait_for
 
@@ -72,12 +73,6 @@ def of_session(session: int) -> list[str]:
             if int(fields[3]) == session and fields[0] != "Z":
                 found.append((folder / "cmdline").read_text())
     return found
-
-
-def at_work(process: subprocess.Popen) -> bool:
-    """True once it has its handlers: until then the system's own do."""
-    caught = next(line for line in Path(f"/proc/{process.pid}/status").read_text().splitlines() if line.startswith("SigCgt"))
-    return bool(int(caught.split()[1], 16) & 1 << signal.SIGTERM - 1)
 
 
 def serve_file(folder: Path, port: int, more: str = "") -> Path:
@@ -246,7 +241,7 @@ def test_a_sender_whose_listener_takes_nothing_ends_in_order(tmp_path):
     try:
         for to, rate in ((f"tcp://127.0.0.1:{port}", "10000"), (f"serial:{os.ttyname(near)}@115200", "1000")):
             with running(program("send", "--spin", "z,1", "--rate", rate, "--to", to, "--json")) as process:
-                wait_for(lambda process=process: at_work(process))
+                wait_for(lambda process=process: has_handlers(process))
                 time.sleep(3.0)
                 code, out, err = ends(process, signal.SIGTERM)
             assert code == 0, err
@@ -289,7 +284,7 @@ def other_commands(folder: Path, bench: Path) -> dict[str, list[str]]:
 def test_every_command_that_takes_its_time_ends_within_a_second(tmp_path, small_bench_file, name):
     for number, later_s in ((signal.SIGTERM, 0.0), (signal.SIGINT, 1.5)):
         with running(program(*other_commands(tmp_path, small_bench_file)[name])) as process:
-            wait_for(lambda process=process: at_work(process))
+            wait_for(lambda process=process: has_handlers(process))
             time.sleep(later_s)
             code, _, err = ends(process, number)
         assert code in {0, NO_ATTITUDE, 128 + number}, err

@@ -14,7 +14,7 @@ from hilstar.attitude.wire.zmq_stream import ZmqReceiver
 from hilstar.bench.build import load
 from hilstar.run.loop import Limit
 from hilstar.run.serve import serve
-from tests.support.commands import run_hilstar
+from tests.support.commands import run_hilstar_here
 from tests.support.senders import LYRA, ORION, free_port, packet, publisher, talking
 from tests.support.servers import serving, summary_of
 
@@ -134,7 +134,7 @@ def test_a_shared_clock_is_said_in_the_summary(tmp_path):
 def test_a_replay_says_when_its_attitude_comes(tmp_path, small_bench_file):
     log = tmp_path / "log.csv"
     log.write_text("t_s,qw,qx,qy,qz\n0,1,0,0,0\n0.1,1,0,0,0\n")
-    result = run_hilstar("replay", small_bench_file, log, "--headless", "--json")
+    result = run_hilstar_here("replay", small_bench_file, log, "--headless", "--json")
     assert result.returncode == 0, result.stderr
     assert json.loads(result.stdout)["events"]["first-attitude"] == 1
     assert "the first attitude has come" in result.stderr

@@ -15,7 +15,7 @@ from hilstar.render.reference import linear_image
 from hilstar.rotation import from_radec_roll_deg
 from hilstar.scene.psf import footprint_px
 from hilstar.study.economy import SCENES, compare, run
-from tests.support.commands import run_hilstar
+from tests.support.commands import run_hilstar_here
 
 SIGMA = (0.85, 0.85)
 ORION = from_radec_roll_deg(84, -1, 0)
@@ -123,7 +123,9 @@ def test_the_study_has_five_scenes_each_within_its_tolerance(tmp_path):
 
 def test_explain_is_said_beside_the_json(tmp_path, small_bench_file):
     small_bench_file.write_text(small_bench_file.read_text() + '[render]\neffort = "auto"\n')
-    result = run_hilstar("frame", small_bench_file, "--radec", "84,-1,0", "--truth", tmp_path / "t.csv", "--explain", "--json")
+    result = run_hilstar_here(
+        "frame", small_bench_file, "--radec", "84,-1,0", "--truth", tmp_path / "t.csv", "--explain", "--json"
+    )
     assert result.returncode == 0, result.stderr
     assert result.stdout.startswith("{")
     assert "sprites:" in result.stderr and "together at worst" in result.stderr

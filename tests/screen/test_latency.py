@@ -28,6 +28,7 @@ MEDIAN_MS = 2.0
 ADDED_MS = 40.0
 DEVICE_MS = 0.5  # of the same edges, a few more or less
 PERIOD_NS = 1e9 / 60
+STEADY_NS = 1e6  # by which the pairing takes latencies together
 
 
 class Diode:
@@ -125,11 +126,13 @@ def test_a_delay_that_was_added_is_found_and_written_into_the_bench_file(screen,
 
 def test_a_square_that_toggles_is_known_but_for_pairs_of_frames_and_a_device_s_own_clock_is_followed(screen, tmp_path):
     found, _ = measured(screen, tmp_path, "toggle", 0.0, True)
-    assert found["ambiguous"]
+    run = read_run(tmp_path / "run.mcap")
+    steady = np.abs(np.diff([frame.swap_ns for frame in run.frames]) - PERIOD_NS) < STEADY_NS
+    # A busy machine swaps at uneven times, and they tell one pair of frames from the next as a code does.
+    assert found["ambiguous"] or steady.mean() < 0.95
     assert found["edges"] > 100
     # The device's stamps are of its own clock; its least delay on the line, 1 ms here, is what a one-way line cannot tell.
     assert found["latency_ms"]["p50"] == pytest.approx(1.0, abs=MEDIAN_MS)
-    run = read_run(tmp_path / "run.mcap")
     assert [frame.marker for frame in run.frames] == [marker_light(frame.frame, "toggle") for frame in run.frames]
     assert run.process and run.process[0].resident_bytes > 1e6
 

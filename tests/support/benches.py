@@ -8,6 +8,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 
+Tables = Mapping[str, Mapping[str, object]]
+
 _SMALL: dict[str, dict[str, object]] = {
     "tracker": {
         "aperture_mm": 30,
@@ -22,11 +24,12 @@ _SMALL: dict[str, dict[str, object]] = {
 }
 
 
-def bench_text(changes: Mapping[str, Mapping[str, object]] | None = None) -> str:
+def bench_text(*changes: Tables) -> str:
     """The small bench as TOML, with other values and tables; a value of None takes a key away."""
     tables = {name: dict(keys) for name, keys in _SMALL.items()}
-    for name, keys in (changes or {}).items():
-        tables.setdefault(name, {}).update(keys)
+    for change in changes:
+        for name, keys in change.items():
+            tables.setdefault(name, {}).update(keys)
     lines = []
     for name, keys in tables.items():
         lines.append(f"\n[{name}]")
@@ -39,6 +42,15 @@ SMALL_BENCH = bench_text()
 
 # The size of the X servers of tests/support/screens.py.
 SCREEN_BENCH = bench_text({"monitor": {"resolution_px": [640, 480]}})
+
+# Changes that make a bench of it whose light the twin can see whole: 10 bits, and a tracker's pixel for a monitor's.
+TWIN: Tables = {
+    "tracker": {"focal_length_mm": 25, "resolution_px": [400, 400], "transmission": None},
+    "sky": {"faintest_v_mag": 5.5},
+    "monitor": {"resolution_px": [640, 480], "bits": 10},
+    "collimator": {"focal_length_mm": 120},
+    "render": {"quantisation": "exact"},
+}
 
 # Orion's belt, right ascension 84.057, declination -1.2, roll 0 (degrees).
 ORION_Q = (0.6987226, 0.7135120, -0.0370377, 0.0362700)

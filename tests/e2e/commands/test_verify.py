@@ -14,26 +14,10 @@ from hilstar.bench.bench_file import read_bench_file
 from hilstar.monitor.quantise import Panel
 from hilstar.monitor.response import gamma_response, srgb_response, table_response
 from hilstar.twin.verify import Twin
+from tests.support.benches import TWIN, bench_text
 from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
 
-BENCH = """
-[tracker]
-aperture_mm = 30
-focal_length_mm = 25
-pixel_pitch_um = 13
-resolution_px = [400, 400]
-quantum_efficiency = "ccd47-20"
-[sky]
-faintest_v_mag = 5.5
-[monitor]
-resolution_px = [640, 480]
-pixel_pitch_um = 57.65
-bits = 10
-[collimator]
-focal_length_mm = 120
-[render]
-quantisation = "exact"
-"""
+BENCH = bench_text(TWIN)
 FIELDS = "6"
 # Of a perfect monitor: a square pixel as nine points, the window's cut, and float32 sums. Measured 0.0013 px, 2e-5 mag.
 FLOOR_PX = 0.004

@@ -132,8 +132,9 @@ def test_a_disk_that_stands_still_holds_up_neither_the_frames_nor_the_end(tmp_pa
     still = "import time; from hilstar.attitude.logs import mcap_writer as w; w.McapWriter.flush = lambda *a: time.sleep(100)"
     command = ["serve", str(serve_file(tmp_path, free_port())), "--headless", "--json", "--ledger", str(tmp_path / "run.mcap")]
     with running(program(*command, before=still)) as process:
-        assert process.stderr is not None and process.stderr.readline()
-        time.sleep(0.5)
+        assert process.stderr is not None
+        while b"no attitude yet" not in (line := process.stderr.readline()):  # said after two seconds of frames
+            assert line
         code, out, err = ends(process, signal.SIGTERM)
     assert code == 1, err
     summary = json.loads(out)

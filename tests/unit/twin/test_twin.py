@@ -23,6 +23,7 @@ from hilstar.twin import verify as twin
 from hilstar.twin.optics import Mounting, TwinOptics
 from hilstar.twin.verdict import Star, fit_geometry, judge, median, spread
 from hilstar.twin.verify import Field, Tally, Twin, crowded, levels_of, nearest, on_screen_median, shared, verify
+from tests.support.benches import TWIN, bench_text
 
 TRACKER_PX = (60, 50)
 PSF_PX = (0.55, 0.6)
@@ -31,33 +32,18 @@ SIDE = 24  # squares along a monitor pixel in the oracle
 CUT = 2e-6
 # Nine Gaussians for a square have its variance and not its fourth moment: measured 1.3e-4 of the brightest pixel.
 NINE_FOR_A_SQUARE = 2e-4
-BENCH = """
-[tracker]
-aperture_mm = 30
-focal_length_mm = 25
-pixel_pitch_um = 13
-resolution_px = [300, 300]
-exposure_s = {exposure_s}
-quantum_efficiency = "ccd47-20"
-[sky]
-faintest_v_mag = 5.5
-[monitor]
-resolution_px = {monitor_px}
-pixel_pitch_um = 57.65
-bits = {bits}
-calibration = "{calibration}"
-[collimator]
-focal_length_mm = 120
-[render]
-quantisation = "{method}"
-[verify]
-"""
 
 
 def bench_file(directory: Path, verify_lines: str = "", **changes: object) -> Path:
+    """A bench of the twin with other exposure, monitor, bits, calibration or quantisation."""
     values = {"exposure_s": 0.1, "monitor_px": [480, 400], "bits": 10, "calibration": "srgb", "method": "exact", **changes}
+    tables = {
+        "tracker": {"resolution_px": [300, 300], "exposure_s": values["exposure_s"]},
+        "monitor": {"resolution_px": values["monitor_px"], "bits": values["bits"], "calibration": values["calibration"]},
+        "render": {"quantisation": values["method"]},
+    }
     path = directory / "bench.toml"
-    path.write_text(BENCH.format(**values) + verify_lines)
+    path.write_text(f"{bench_text(TWIN, tables)}[verify]\n{verify_lines}")
     return path
 
 

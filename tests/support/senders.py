@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import os
-import re
 import socket
 import struct
 import threading
@@ -27,14 +26,16 @@ def packet(sequence: int, t_ns: int, q=(0.5, 0.5, -0.5, 0.5), rate=(0.0, 0.0, 0.
     return body + struct.pack("<I", zlib.crc32(body))
 
 
-# Ports under those that the system gives to whoever asks for any: a part for each worker, so that no two ask for one.
-_WORKER = int(re.sub(r"\D", "", os.environ.get("PYTEST_XDIST_WORKER", "")) or 0)
-_PORTS = itertools.cycle(range(20_000 + 500 * (_WORKER % 20), 20_500 + 500 * (_WORKER % 20)))
+# Ports under those that the system gives to whoever asks for any; each process of tests begins elsewhere, so that workers, and
+# another session on this machine, do not ask for the same one at the same time.
+PORTS = range(20_000, 32_000)
+_next = itertools.count(os.getpid() * 211)
 
 
 def free_port() -> int:
     """A port of this machine that nobody has, and that no other test is given."""
-    for port in _PORTS:
+    for number in _next:
+        port = PORTS[number % len(PORTS)]
         with socket.socket() as probe:
             try:
                 probe.bind(("127.0.0.1", port))

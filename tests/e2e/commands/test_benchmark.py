@@ -15,7 +15,7 @@ from hilstar.study.speed.benchmark import RADEC_ROLL_DEG
 from hilstar.study.speed.cells import STAGES
 from hilstar.study.speed.other_methods import numpy_linear
 from hilstar.study.speed.scenes import scene
-from tests.support.commands import assert_refused, run_hilstar
+from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
 
 Q = from_radec_roll_deg(*RADEC_ROLL_DEG)
 GRID = ("--stars", "100,1000", "--sizes", "640x480")

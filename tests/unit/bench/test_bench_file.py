@@ -14,7 +14,7 @@ from hilstar.bench.build import open_bench
 from hilstar.rotation import from_radec_roll_deg
 from hilstar.run.record.ledger import Ledger
 from hilstar.run.record.records import config_of, read_head
-from tests.conftest import SMALL_BENCH
+from tests.support.benches import SMALL_BENCH
 
 OTHER_BENCH = SMALL_BENCH.replace("[320, 240]", "[160, 120]")
 FAINT = "[sky]\nfaintest_v_mag = 9\n[render]\nbrightest_v_mag = -1\n"  # white is Sirius: most stars are under a step

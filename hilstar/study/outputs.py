@@ -14,7 +14,7 @@ from hilstar.charts import STYLE, save, write_csv
 from hilstar.resources import resource_path
 from hilstar.rotation import from_radec_roll_deg
 from hilstar.twin.exposure_files import write_exposure_fits
-from hilstar.twin.simulator import Exposure, Simulator
+from hilstar.twin.simulator import Exposure, FrameNoise, Simulator
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -49,8 +49,9 @@ def _draw_scene(directory: Path, scene: Scene) -> str:
     with Simulator(read_bench_file(resource_path("configs", f"thesis-{scene.name}.toml"))) as simulator:
         motion = simulator.motion(from_radec_roll_deg(*scene.radec_roll_deg), np.zeros(3))
         clean = simulator.expose(motion, None)
-        noisy = simulator.expose(motion, np.random.default_rng(SEED))
-        write_exposure_fits(directory / f"{scene.name}.fits", simulator, noisy, "full", SEED)
+        noise = FrameNoise(seed=SEED)
+        noisy = simulator.expose(motion, noise.rng())
+        write_exposure_fits(directory / f"{scene.name}.fits", simulator, noisy, noise)
     truth = noisy.truth
     write_csv(directory / f"{scene.name}.csv", truth.dtype.names or (), truth.tolist())
     _figure(directory / f"{scene.name}.png", scene, clean, noisy)

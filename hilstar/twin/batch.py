@@ -22,7 +22,7 @@ from hilstar.process.interrupts import end_with_parent
 from hilstar.rotation import rate_between_rad_s
 from hilstar.scene.exposure_motion import Motion
 from hilstar.twin.exposure_files import write_exposure_fits
-from hilstar.twin.simulator import Noise, Simulator
+from hilstar.twin.simulator import FrameNoise, Simulator
 from hilstar.units import NS_PER_S
 
 _simulator: Simulator | None = None
@@ -57,9 +57,9 @@ def log_motions(
 
 
 def simulate_motions(
-    file: BenchFile, motions: list[Motion], noise: Noise, seed: int, directory: Path, on_done: Callable[[int], None]
+    file: BenchFile, motions: list[Motion], noise: FrameNoise, directory: Path, on_done: Callable[[int], None]
 ) -> None:
-    """Write `exposure_000000.fits` and on into `directory`, each with noise of its own: seeds (seed, number)."""
+    """Write `exposure_000000.fits` and on into `directory`, each with its own noise: seeds (seed, number)."""
     make_directory(directory)
     Simulator(file).close()  # whatever is wrong with the bench is said once, here
     workers = min(len(motions), len(os.sched_getaffinity(0)))
@@ -68,8 +68,7 @@ def simulate_motions(
         try:
             with _without_ctrl_c():
                 tasks = [
-                    pool.submit(_expose_to_file, motion, noise, (seed, number), directory / f"exposure_{number:06d}.fits")
-                    for number, motion in enumerate(motions)
+                    pool.submit(_expose_to_file, motion, noise, number, directory) for number, motion in enumerate(motions)
                 ]
             for done, task in enumerate(as_completed(tasks), start=1):
                 task.result()
@@ -83,7 +82,7 @@ def simulate_motions(
 
 @contextmanager
 def _without_ctrl_c() -> Iterator[None]:
-    """What is started here never hears of a Ctrl-C, which a terminal sends to all; it ends when this process says so."""
+    """What is started here does not receive the Ctrl-C that a terminal sends to all; it ends when this process says so."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -98,8 +97,8 @@ def _start_worker(file: BenchFile) -> None:
     _simulator = Simulator(file)
 
 
-def _expose_to_file(motion: Motion, noise: Noise, seeds: tuple[int, int], path: Path) -> None:
+def _expose_to_file(motion: Motion, noise: FrameNoise, number: int, directory: Path) -> None:
     if _simulator is None:
         raise RuntimeError("the worker was not started with a bench")
-    rng = None if noise == "none" else np.random.default_rng(seeds)
-    write_exposure_fits(path, _simulator, _simulator.expose(motion, rng), noise, seeds[0])
+    exposure = _simulator.expose(motion, noise.rng(number))
+    write_exposure_fits(directory / f"exposure_{number:06d}.fits", _simulator, exposure, noise)

@@ -11,10 +11,10 @@ from PIL import Image
 from hilstar.bench.frame_files import sky_header
 from hilstar.files import written
 from hilstar.twin.picture import exposure_picture
-from hilstar.twin.simulator import Exposure, Simulator
+from hilstar.twin.simulator import Exposure, FrameNoise, Simulator
 
 
-def write_exposure_fits(path: Path, simulator: Simulator, exposure: Exposure, noise: str, seed: int) -> None:
+def write_exposure_fits(path: Path, simulator: Simulator, exposure: Exposure, noise: FrameNoise) -> None:
     """The virtual tracker's DN (uint16) and, as second HDU, the truth table; the header says how both came about."""
     from astropy.io import fits
 
@@ -25,8 +25,8 @@ def write_exposure_fits(path: Path, simulator: Simulator, exposure: Exposure, no
     header["EXPTIME"] = (tracker.exposure_s, "[s]")
     for name, rate in zip(("RATEX", "RATEY", "RATEZ"), np.degrees(exposure.motion.rate_cam_rad_s), strict=True):
         header[name] = (float(rate), "[deg/s] of cam in icrs, cam components")
-    header["NOISE"] = (noise, "full, or none: the mean signal through the ADC")
-    header["SEED"] = (seed, "of the frame's noise")
+    header["NOISE"] = (noise.kind, "full, or none: the mean signal through the ADC")
+    header["SEED"] = (noise.seed, "of the frame's noise")
     header["DEVSEED"] = (tracker.detector.device_seed, "of the device's fixed patterns")
     header["GAIN"] = (tracker.detector.gain_e_per_dn, "[electron/adu]")
     header["OFFSET"] = (tracker.detector.offset_dn, "[adu]")

@@ -8,19 +8,17 @@ density on the image.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from types import TracebackType
-from typing import Literal, Self
+from typing import Self
 
 import numpy as np
 
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.monitor.quantise import Panel
 from hilstar.render.renderer import Renderer, Target
-from hilstar.scene.camera import Camera
 from hilstar.scene.sprites import pack_sprites
+from hilstar.twin.bench_geometry import BenchGeometry
 
-Mirror = Literal["none", "x", "y", "swap"]
 # Squares along a pixel's side. Against twelve, a star's centroid is off by 1e-5 px and its flux by 2e-6 mag on the demo's
 # bench (a monitor pixel is 0.9 tracker pixels, the PSF's sigma 0.55), by 4e-5 px with a PSF of 0.3, and by 2e-4 px and 1e-5 mag
 # with monitor pixels of 2.7 tracker pixels. Points instead of Gaussians of the same variance: 1.5e-3, 3e-3 and 9e-3 px.
@@ -28,59 +26,19 @@ SUB = 3
 POINTS_AT_ONCE = 400_000
 
 
-@dataclass(frozen=True, slots=True)
-class Mounting:
-    """How the monitor really stands before the tracker: `monitor` maps cam to its pixels, `tracker` cam to the detector's.
-
-    `mirror` is what the screen does to its image: columns reversed, rows reversed, or axes swapped, about the middle.
-    """
-
-    monitor: Camera
-    tracker: Camera
-    mirror: Mirror = "none"
-
-    def to_tracker(self, x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Tracker pixels of monitor pixels, (n,) each; NaN behind the tracker."""
-        x_px, y_px = self._shown_at(x_px, y_px)
-        cx, cy = self.monitor.principal_point_px
-        focal = self.monitor.focal_length_px
-        ray = np.stack([(x_px - cx) / focal, (y_px - cy) / focal, np.ones_like(x_px)], axis=-1)
-        return self.tracker.project(ray @ self.monitor.cam_to_image @ self.tracker.cam_to_image.T)
-
-    def to_monitor(self, x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Places on the screen, in its own pixels, that tracker pixels see, (n,) each; NaN behind it."""
-        cx, cy = self.tracker.principal_point_px
-        focal = self.tracker.focal_length_px
-        ray = np.stack([(x_px - cx) / focal, (y_px - cy) / focal, np.ones_like(x_px)], axis=-1)
-        return self.monitor.project(ray @ self.tracker.cam_to_image @ self.monitor.cam_to_image.T)
-
-    def _shown_at(self, x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
-        width, height = self.monitor.resolution_px
-        middle_x, middle_y = (width - 1) / 2, (height - 1) / 2
-        match self.mirror:
-            case "x":
-                return 2 * middle_x - x_px, y_px
-            case "y":
-                return x_px, 2 * middle_y - y_px
-            case "swap":
-                return middle_x + (y_px - middle_y), middle_y + (x_px - middle_x)
-            case _:
-                return x_px, y_px
-
-
 class TwinOptics:
     """Images of a monitor on the tracker's detector. Free it with `close`, or use it as a context manager."""
 
-    def __init__(self, mounting: Mounting, psf_sigma_px: tuple[float, float]) -> None:
-        self.mounting = mounting
-        side_px = mounting.tracker.focal_length_px / mounting.monitor.focal_length_px / SUB
+    def __init__(self, geometry: BenchGeometry, psf_sigma_px: tuple[float, float]) -> None:
+        self.geometry = geometry
+        side_px = geometry.tracker.focal_length_px / geometry.monitor.focal_length_px / SUB
         sigma_x, sigma_y = (math.hypot(sigma, side_px / math.sqrt(12)) for sigma in psf_sigma_px)
-        self._renderer = Renderer(Target(mounting.tracker.resolution_px, (sigma_x, sigma_y)))
+        self._renderer = Renderer(Target(geometry.tracker.resolution_px, (sigma_x, sigma_y)))
 
     def image_e_per_s(self, light_e_per_s: FloatArray) -> FloatArray:
         """Electrons per second of each tracker pixel (h, w) from those of each monitor pixel (H, W), float64."""
         rows, columns = np.nonzero(light_e_per_s)
-        width, height = self.mounting.tracker.resolution_px
+        width, height = self.geometry.tracker.resolution_px
         total = np.zeros((height, width))
         at_once = max(1, POINTS_AT_ONCE // SUB**2)
         for begin in range(0, len(rows), at_once):
@@ -91,9 +49,9 @@ class TwinOptics:
     def _points(self, columns: IntArray, rows: IntArray, light_e_per_s: FloatArray) -> FloatArray:
         steps = (np.arange(SUB) - (SUB - 1) / 2) / SUB
         dx, dy = (step.ravel() for step in np.meshgrid(steps, steps))
-        x_px, y_px = self.mounting.to_tracker((columns[:, None] + dx).ravel(), (rows[:, None] + dy).ravel())
+        x_px, y_px = self.geometry.to_tracker((columns[:, None] + dx).ravel(), (rows[:, None] + dy).ravel())
         light = np.repeat(light_e_per_s / SUB**2, SUB**2)
-        star, size_px = np.zeros(len(light), dtype=np.intp), self.mounting.tracker.resolution_px
+        star, size_px = np.zeros(len(light), dtype=np.intp), self.geometry.tracker.resolution_px
         self._renderer.draw(pack_sprites(x_px, y_px, light, star, size_px, self._renderer.footprint_px))
         return self._renderer.linear().astype(np.float64)
 
@@ -102,12 +60,12 @@ class TwinOptics:
 
         The density of monitor pixels is that at a tracker pixel's centre; its edge is cut at the pixel, not within it.
         """
-        width, height = self.mounting.tracker.resolution_px
+        width, height = self.geometry.tracker.resolution_px
         y, x = np.mgrid[0:height, 0:width].astype(np.float64)
-        seen_x, seen_y = (part.reshape(height, width) for part in self.mounting.to_monitor(x.ravel(), y.ravel()))
+        seen_x, seen_y = (part.reshape(height, width) for part in self.geometry.to_monitor(x.ravel(), y.ravel()))
         (x_down, x_right), (y_down, y_right) = np.gradient(seen_x), np.gradient(seen_y)
         density = np.abs(x_right * y_down - x_down * y_right)
-        screen_w, screen_h = self.mounting.monitor.resolution_px
+        screen_w, screen_h = self.geometry.monitor.resolution_px
         on_screen = np.abs(seen_x - (screen_w - 1) / 2) <= screen_w / 2
         on_screen &= np.abs(seen_y - (screen_h - 1) / 2) <= screen_h / 2
         light = np.full(on_screen.shape, panel.response.black * panel.flux_at_white_e_per_s)

@@ -24,7 +24,19 @@ from hilstar.tracker.detector import Detector
 from hilstar.units import ARCSEC_PER_RAD
 
 Noise = Literal["full", "none"]
-NO_ALIGNMENT = np.array([1.0, 0.0, 0.0, 0.0])
+NO_MISALIGNMENT = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+@dataclass(frozen=True, slots=True)
+class FrameNoise:
+    """Noise of frames: "full", or "none" for the mean signal through the ADC; and the seed of what is drawn anew in each."""
+
+    kind: Noise = "full"
+    seed: int = 0
+
+    def rng(self, *number: int) -> np.random.Generator | None:
+        """The generator of a frame, or of frame `number` of several; None without noise."""
+        return np.random.default_rng((self.seed, *number) if number else self.seed) if self.kind == "full" else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +62,7 @@ class Simulator:
         self.config = file.config
         tracker = self.config.tracker
         self.stars = bench_stars(self.config, file.folder)
-        self.camera = monitor_camera(tracker.resolution_px, tracker.pixel_pitch_um, tracker.focal_length_mm, NO_ALIGNMENT)
+        self.camera = monitor_camera(tracker.resolution_px, tracker.pixel_pitch_um, tracker.focal_length_mm, NO_MISALIGNMENT)
         self.background_e = background_e(self.config, file.folder)
         self.detector = Detector(tracker.detector, tracker.resolution_px, tracker.pixel_pitch_um)
         self.renderer = Renderer(Target(tracker.resolution_px, tracker.psf_sigma_px))

@@ -9,7 +9,8 @@ from hilstar import charts
 from hilstar.study.economy import Outcome, economy_finding
 from hilstar.study.speed import report as benchmark_report
 from hilstar.study.speed.result import Machine, Result, Spread, Timing
-from hilstar.twin.budget import budget, write_budget
+from hilstar.twin.budget import budget
+from hilstar.twin.budget_report import write_report
 
 
 @pytest.fixture
@@ -68,7 +69,7 @@ def test_the_legend_of_the_benchmark_is_whole(figures, tmp_path, sizes, methods)
 
 
 def test_every_line_of_the_budget_has_a_name_that_is_whole(figures, bench_with, tmp_path):
-    write_budget(tmp_path, budget(bench_with()))
+    write_report(tmp_path, budget(bench_with()))
     (figure,) = figures
     for axis in figure.axes:
         assert all(not str(line.get_label()).startswith("_") for line in axis.get_lines())

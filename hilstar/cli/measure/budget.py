@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
@@ -23,14 +24,14 @@ def budget(
     from hilstar.bench.build import load
     from hilstar.files import make_directory
     from hilstar.twin.budget import budget as find_budget
-    from hilstar.twin.budget import budget_json, budget_lines, write_budget
+    from hilstar.twin.budget_report import budget_lines, write_report
 
     check_directory("-o", output)
     with load(bench_file) as bench:
         found = find_budget(bench)
     if output is not None:
-        write_budget(make_directory(output), found)
+        write_report(make_directory(output), found)
     if as_json:
-        print_json(budget_json(found))
+        print_json(asdict(found))
     else:
         typer.echo("\n".join(budget_lines(found)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -13,6 +13,9 @@ from hilstar.cli.parsers import parse_attitude, parse_rate
 from hilstar.console.terminal import print_json, progress, say
 from hilstar.errors import InputError
 from hilstar.files import FITS, PNG, PNG_OR_TIFF, check_directory, check_ending
+
+if TYPE_CHECKING:
+    from hilstar.twin.simulator import FrameNoise
 
 
 def simulate(
@@ -40,13 +43,13 @@ def simulate(
 
     from hilstar.bench.bench_file import read_bench_file
     from hilstar.twin import exposure_files as files
-    from hilstar.twin.simulator import Simulator
+    from hilstar.twin.simulator import FrameNoise, Simulator
 
     if log is not None:
         if output is None or radec or quaternion or rate or png or dn_png:
             raise InputError("simulate --log LOG: give -o DIR, and no --radec, --quaternion, --rate, --png or --dn-png")
         check_directory("-o", output)
-        simulate_log(bench_file, log, frames, (noise, seed), output)
+        simulate_log(bench_file, log, frames, FrameNoise(noise, seed), output)
         return
     targets = [path for path in (output, png, dn_png) if path is not None]
     if not targets:
@@ -59,10 +62,10 @@ def simulate(
     q = parse_attitude("simulate", radec, quaternion)
     rate_rad_s = parse_rate(rate) if rate else np.zeros(3)
     with Simulator(file) as simulator:
-        rng = None if noise == "none" else np.random.default_rng(seed)
-        exposure = simulator.expose(simulator.motion(q, rate_rad_s), rng)
+        frame_noise = FrameNoise(noise, seed)
+        exposure = simulator.expose(simulator.motion(q, rate_rad_s), frame_noise.rng())
         if output is not None:
-            files.write_exposure_fits(output, simulator, exposure, noise, seed)
+            files.write_exposure_fits(output, simulator, exposure, frame_noise)
         if png is not None:
             files.write_exposure_png(png, exposure.dn)
         if dn_png is not None:
@@ -82,9 +85,7 @@ def simulate(
         typer.echo(f"{summary['stars']} stars, DN {dn['min']} to {dn['max']}; wrote {', '.join(summary['written'])}")
 
 
-def simulate_log(
-    bench_file: Path, log: Path, frames: int | None, noise_and_seed: tuple[Literal["full", "none"], int], output: Path
-) -> None:
+def simulate_log(bench_file: Path, log: Path, frames: int | None, noise: FrameNoise, output: Path) -> None:
     """The virtual tracker along a log."""
     from hilstar.attitude.logs.gaps import log_joins
     from hilstar.attitude.logs.log_file import read_log
@@ -98,5 +99,5 @@ def simulate_log(
     config = file.config
     motions = log_motions(samples, frames, config.tracker.exposure_s, math.radians(config.attitude.max_rate_deg_s))
     with progress("exposing", len(motions)) as advance:
-        simulate_motions(file, motions, *noise_and_seed, output, advance)
+        simulate_motions(file, motions, noise, output, advance)
     typer.echo(f"{len(motions)} exposures in {output}")

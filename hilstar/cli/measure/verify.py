@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -27,44 +28,22 @@ def verify(
 
     from hilstar.bench.bench_file import read_bench_file
     from hilstar.files import make_directory
-    from hilstar.twin.verdict import write_report
-    from hilstar.twin.verify import verify as run_twin
+    from hilstar.twin.verify.report import write_report
+    from hilstar.twin.verify.run import verify as run_twin
+    from hilstar.twin.verify.summary import summarise, summary_lines
 
     check_directory("-o", output)
     if output is not None:
         make_directory(output)
     file = read_bench_file(bench_file)
     with progress("verifying", fields) as advance:
-        verdict, summary = run_twin(file, fields, np.random.default_rng(seed), advance)
+        verdict = run_twin(file, fields, np.random.default_rng(seed), advance)
     if output is not None:
-        config = file.config
-        write_report(output, verdict, (config.verify.flux_mag, config.verify.centroid_px), config.tracker.resolution_px)
+        write_report(output, verdict)
+    summary = summarise(verdict)
     if as_json:
-        print_json(summary)
+        print_json(asdict(summary))
     else:
-        tell_verdict(summary)
+        typer.echo("\n".join(summary_lines(summary)))
     if strict and not verdict.passed:
         raise typer.Exit(1)
-
-
-def tell_verdict(summary: dict[str, Any]) -> None:
-    """The verdict for a person."""
-
-    def three(errors: dict[str, float | None]) -> str:
-        return " / ".join("-" if errors[key] is None else f"{errors[key]:.4f}" for key in ("rms", "p95", "max"))
-
-    kinds = ("lost", "blended", "clipped", "not_shown", "at_edge")
-    rest = ", ".join(f"{summary[name]} {name.replace('_', ' ')}" for name in kinds)
-    typer.echo(f"{'stars':20}{summary['stars']} in {summary['fields']} fields; {rest}")
-    typer.echo(f"{'flux error':20}{three(summary['flux_error_mag'])} mag (rms / 95 % / max)")
-    arcsec = three(summary["centroid_error_arcsec"])
-    typer.echo(f"{'centroid error':20}{three(summary['centroid_error_px'])} px, {arcsec} arcsec")
-    typer.echo(
-        f"{'with detector noise':20}{three(summary['noisy']['flux_mag'])} mag, {three(summary['noisy']['centroid_px'])} px"
-    )
-    for row in summary["by_magnitude"]:
-        where, flux, centroid = f"V {row['v_from']} to {row['v_to']}", row["flux_error_mag"], row["centroid_error_px"]
-        typer.echo(f"{where:>17}   {flux['rms']:.4f} mag rms, {centroid['rms']:.4f} px rms, {row['stars']} stars")
-    for line in summary["reasons"]:
-        typer.echo(f"{'':20}{line}")
-    typer.echo(f"{'verdict':20}{'passed' if summary['passed'] else 'NOT passed'}")

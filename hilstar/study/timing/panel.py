@@ -20,8 +20,9 @@ from hilstar.scene.exposure_motion import Motion, smeared_sprites
 from hilstar.scene.frame_motion import Scan
 from hilstar.scene.sprites import Sprites
 from hilstar.study.timing.slew import PACKET_HZ, Slew
-from hilstar.twin.optics import Mounting, TwinOptics
-from hilstar.twin.simulator import NO_ALIGNMENT
+from hilstar.twin.bench_geometry import BenchGeometry
+from hilstar.twin.optics import TwinOptics
+from hilstar.twin.simulator import NO_MISALIGNMENT
 from hilstar.units import NS_PER_S
 
 BENCH = """
@@ -92,8 +93,8 @@ class ScanningPanel:
         self.panel_scan = replace(self.bench.scan, scanout_s=self.period_s, hold_s=self.period_s)
         tracker = config.tracker
         self.exposure_s = tracker.exposure_s
-        self.camera = monitor_camera(tracker.resolution_px, tracker.pixel_pitch_um, tracker.focal_length_mm, NO_ALIGNMENT)
-        self.optics = TwinOptics(Mounting(self.bench.camera, self.camera), tracker.psf_sigma_px)
+        self.camera = monitor_camera(tracker.resolution_px, tracker.pixel_pitch_um, tracker.focal_length_mm, NO_MISALIGNMENT)
+        self.optics = TwinOptics(BenchGeometry(self.bench.camera, self.camera), tracker.psf_sigma_px)
         self.panel = self.bench.panel
 
     def attitude(self, slew: Slew, swap_s: float) -> Attitude:

@@ -47,7 +47,7 @@ def compare(panel: ScanningPanel, sky: Sky, slew: Slew) -> Outcome:
     camera: Camera = panel.camera
     flux_mag, off_px = [], []
     paths = sky.paths(slew)
-    places = panel.optics.mounting.to_tracker(paths.x_px, paths.y_px)
+    places = panel.optics.geometry.to_tracker(paths.x_px, paths.y_px)
     for _, window in lone_windows(paths, *places, camera.resolution_px, ISOLATION):
         (light, x_px, y_px), (true_light, true_x_px, true_y_px) = moments(shown, window), moments(true, window)
         flux_mag.append(magnitude(light / true_light))

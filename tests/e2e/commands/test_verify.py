@@ -13,7 +13,7 @@ from PIL import Image
 from hilstar.bench.bench_file import read_bench_file
 from hilstar.monitor.quantise import Panel
 from hilstar.monitor.response import gamma_response, srgb_response, table_response
-from hilstar.twin.verify import Twin
+from hilstar.twin.verify.twin import Twin
 from tests.support.benches import TWIN, bench_text
 from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
 

@@ -1,0 +1,111 @@
+"""From an image to stars: the centroider as wide as the bench's stars, and which of its finds is which star."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from hilstar.arrays import FloatArray, IntArray
+from hilstar.bench.config import BenchConfig
+from hilstar.bench.frame import Bench
+from hilstar.scene.psf import peak_share
+from hilstar.tracker.centroids import Background, Centroids, CentroidSettings, find_stars
+from hilstar.units import magnitude
+
+MATCH_PX = 3.0
+# Of a star's light, that which others bring into its window. Both images have it, so what it leaves is a second order:
+# at 0.02, a neighbour 0.1 mag off adds 0.002 mag.
+CROWDED_SHARE = 0.02
+WING_SIGMAS = 6.0  # how far a neighbour's light reaches: 1e-9 of it, and Sirius is 4e3 times a star of the seventh magnitude
+FAINTEST_PEAK = 0.2  # a blob begins at this share of the faintest drawn star's peak
+
+
+@dataclass(frozen=True, slots=True)
+class Matched:
+    """What was found in an image, and which of it each star (n,) is; -1 for none."""
+
+    found: Centroids
+    index: IntArray
+
+    def against(self, other: Matched, k: int) -> tuple[float, float, float]:
+        """Star `k` against itself in another image: magnitudes too faint, pixels to the right and down; NaN where not found."""
+        i, j = self.index[k], other.index[k]
+        if i < 0 or j < 0:
+            return math.nan, math.nan, math.nan
+        a, b = self.found, other.found
+        return magnitude(float(a.flux[i] / b.flux[j])), float(a.x_px[i] - b.x_px[j]), float(a.y_px[i] - b.y_px[j])
+
+
+@dataclass(frozen=True, slots=True)
+class StarFinder:
+    """A centroider for a bench's stars: their sigma (x, y) on the tracker, px, and the noise of a noiseless image's floor."""
+
+    settings: CentroidSettings
+    sigma_px: tuple[float, float]
+    floor: Background
+
+    def match(self, image_e: FloatArray, x_px: FloatArray, y_px: FloatArray) -> Matched:
+        """The stars of a noiseless image (h, w) at their places (n,).
+
+        A tracker subtracts the screen's glow around each star: here it is not added in the first place.
+        """
+        found = find_stars(image_e, self.settings, self.floor)
+        return Matched(found, nearest(found, x_px, y_px))
+
+
+def star_finder(bench: Bench, monitor_px_per_px: float) -> StarFinder:
+    """The finder for a bench's stars, where so many monitor pixels are a tracker pixel."""
+    sigma_px = seen_sigma_px(bench.config, monitor_px_per_px)
+    settings = CentroidSettings(window_sigma_px=max(1.0, *sigma_px))
+    peak_e = faintest_e_per_s(bench) * bench.config.tracker.exposure_s * peak_share(sigma_px)
+    return StarFinder(settings, sigma_px, Background(0.0, FAINTEST_PEAK * peak_e / settings.threshold_sigma))
+
+
+def seen_sigma_px(config: BenchConfig, monitor_px_per_px: float) -> tuple[float, float]:
+    """A star's sigma on the tracker, its pixels: sprite, monitor pixel and the tracker's own PSF."""
+    sprite, psf = config.render.sprite_sigma_px, config.tracker.psf_sigma_px
+    spread = [(s**2 + 1 / 6) / monitor_px_per_px**2 for s in sprite]  # two squares: sampled, and shown
+    return math.sqrt(spread[0] + psf[0] ** 2), math.sqrt(spread[1] + psf[1] ** 2)
+
+
+def faintest_e_per_s(bench: Bench) -> float:
+    """The rate of the faintest star that the bench draws."""
+    stars = bench.shown_stars
+    return float(stars.electrons_per_s.min()) if len(stars) else 1.0
+
+
+def nearest(found: Centroids, x_px: FloatArray, y_px: FloatArray) -> IntArray:
+    """For each place (n,) the star found nearest within MATCH_PX, -1 for none."""
+    from scipy.spatial import KDTree
+
+    if not len(found):
+        return np.full(len(x_px), -1, dtype=np.intp)
+    places = np.nan_to_num(np.stack([x_px, y_px], axis=1), nan=-1e9)
+    distance, index = KDTree(np.stack([found.x_px, found.y_px], axis=1)).query(places)
+    return np.asarray(np.where(distance <= MATCH_PX, index, -1), dtype=np.intp)
+
+
+def shared(match: IntArray) -> npt.NDArray[np.bool_]:
+    """True for places whose match is another one's too."""
+    used, counts = np.unique(match, return_counts=True)
+    return np.asarray((match >= 0) & (counts[np.searchsorted(used, match)] > 1))
+
+
+def crowded(
+    x_px: FloatArray, y_px: FloatArray, flux: FloatArray, radius_px: int, sigma_px: tuple[float, float]
+) -> npt.NDArray[np.bool_]:
+    """True for stars (n,) into whose window any other brings more than CROWDED_SHARE of their own light."""
+    from scipy.spatial import KDTree
+    from scipy.special import ndtr
+
+    places, half = np.nan_to_num(np.stack([x_px, y_px], axis=1), nan=-1e9), radius_px + 0.5
+    close = KDTree(places).query_pairs(math.sqrt(2) * half + WING_SIGMAS * max(sigma_px), output_type="ndarray")
+    result = np.zeros(len(flux), dtype=np.bool_)
+    for a, b in (close.T, close.T[::-1]):
+        offset = places[b] - np.rint(places[a])
+        share = (ndtr((offset + half) / sigma_px) - ndtr((offset - half) / sigma_px)).prod(axis=1)
+        result[a[flux[b] * share > CROWDED_SHARE * flux[a]]] = True
+    return result

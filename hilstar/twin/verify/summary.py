@@ -1,0 +1,169 @@
+"""The figures of `hilstar verify`, for a program and for a person. The fields are the keys of its JSON object."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilstar.error_spread import ErrorSpread, error_spread
+from hilstar.twin.verify.display_errors import DisplayErrors
+from hilstar.twin.verify.verdict import Verdict
+from hilstar.units import ARCSEC_PER_RAD
+
+
+@dataclass(frozen=True, slots=True)
+class BlackLevel:
+    """The glow of the screen's black, electrons per second in a tracker pixel."""
+
+    assumed: float
+    seen: float
+
+
+@dataclass(frozen=True, slots=True)
+class EstimatorFloor:
+    """The estimator's own errors, of the linear image against the catalogue."""
+
+    flux_mag: ErrorSpread
+    centroid_px: ErrorSpread
+
+
+@dataclass(frozen=True, slots=True)
+class CodesAlone:
+    """What the codes would cost if everything were as assumed."""
+
+    flux_mag: ErrorSpread
+    centroid_px: ErrorSpread
+    zero_point_mag: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Noisy:
+    """The same with all of the detector's noise."""
+
+    stars: int
+    flux_mag: ErrorSpread
+    centroid_px: ErrorSpread
+
+
+@dataclass(frozen=True, slots=True)
+class OneMagnitude:
+    """The errors of the stars of one whole magnitude."""
+
+    v_from: int
+    v_to: int
+    stars: int
+    flux_error_mag: ErrorSpread
+    centroid_error_px: ErrorSpread
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationName:
+    """The calibration that the bench assumes."""
+
+    name: str
+    sha256: str
+
+
+@dataclass(frozen=True, slots=True)
+class VerifySummary:
+    """The figures of a verdict; centroids in tracker pixels, and arcsec in the middle of its field."""
+
+    fields: int
+    stars: int
+    flux_error_mag: ErrorSpread
+    centroid_error_px: ErrorSpread
+    centroid_error_arcsec: ErrorSpread
+    lost: int
+    passed: bool
+    reasons: list[str]
+    blended: int
+    clipped: int
+    not_shown: int
+    at_edge: int
+    zero_point_mag: float | None
+    scale_error: float | None
+    rotation_arcsec: float | None
+    offset_px: tuple[float, float] | None
+    black_e_per_s_px: BlackLevel
+    estimator_floor: EstimatorFloor
+    codes_alone: CodesAlone
+    noisy: Noisy
+    by_magnitude: list[OneMagnitude]
+    calibration: CalibrationName
+    gl_renderer: str
+
+
+def summarise(verdict: Verdict) -> VerifySummary:
+    """The figures of a verdict."""
+    measured, errors = verdict.measured, verdict.errors
+    tally, fit, centroid_px = measured.tally, errors.geometry, errors.centroid_px()
+    noisy_mag = np.abs(np.array(tally.noisy_mag) - errors.zero_point_mag)
+    return VerifySummary(
+        fields=measured.field_count,
+        stars=len(errors.stars),
+        flux_error_mag=error_spread(np.abs(errors.flux_mag())),
+        centroid_error_px=error_spread(centroid_px),
+        centroid_error_arcsec=error_spread(centroid_px * ARCSEC_PER_RAD / measured.camera.focal_length_px),
+        lost=len(errors.lost),
+        passed=verdict.passed,
+        reasons=verdict.reasons,
+        blended=tally.blended,
+        clipped=tally.clipped,
+        not_shown=tally.not_shown,
+        at_edge=tally.at_edge,
+        zero_point_mag=_finite(errors.zero_point_mag),
+        scale_error=None if fit is None else fit.scale_error,
+        rotation_arcsec=None if fit is None else fit.rotation_rad * ARCSEC_PER_RAD,
+        offset_px=None if fit is None else fit.offset_px,
+        black_e_per_s_px=BlackLevel(measured.glow.assumed_e_per_s_px, measured.glow.seen_e_per_s_px),
+        estimator_floor=EstimatorFloor(error_spread(errors.floor_mag()), error_spread(errors.floor_px())),
+        codes_alone=CodesAlone(
+            error_spread(np.abs(errors.codes_mag())), error_spread(errors.codes_px()), _finite(errors.codes_zero_point_mag)
+        ),
+        noisy=Noisy(len(tally.noisy_px), error_spread(noisy_mag), error_spread(np.array(tally.noisy_px))),
+        by_magnitude=_by_magnitude(errors),
+        calibration=CalibrationName(measured.calibration.name, measured.calibration.sha256),
+        gl_renderer=measured.gl_renderer,
+    )
+
+
+def _finite(value: float) -> float | None:
+    """The value, or None for what JSON cannot hold."""
+    return value if math.isfinite(value) else None
+
+
+def _by_magnitude(errors: DisplayErrors) -> list[OneMagnitude]:
+    rows = []
+    v_mag, flux, centroid = np.array([star.v_mag for star in errors.stars]), np.abs(errors.flux_mag()), errors.centroid_px()
+    for low in range(math.floor(v_mag.min(initial=0.0)), math.ceil(v_mag.max(initial=0.0)) + 1):
+        there = (v_mag >= low) & (v_mag < low + 1)
+        if there.any():
+            rows.append(OneMagnitude(low, low + 1, int(there.sum()), error_spread(flux[there]), error_spread(centroid[there])))
+    return rows
+
+
+def summary_lines(summary: VerifySummary) -> list[str]:
+    """The figures for a person."""
+
+    def three(errors: ErrorSpread) -> str:
+        return " / ".join("-" if value is None else f"{value:.4f}" for value in (errors.rms, errors.p95, errors.max))
+
+    noisy = summary.noisy
+    rest = f"{summary.lost} lost, {summary.blended} blended, {summary.clipped} clipped"
+    rest += f", {summary.not_shown} not shown, {summary.at_edge} at edge"
+    centroid = f"{three(summary.centroid_error_px)} px, {three(summary.centroid_error_arcsec)} arcsec"
+    return [
+        f"{'stars':20}{summary.stars} in {summary.fields} fields; {rest}",
+        f"{'flux error':20}{three(summary.flux_error_mag)} mag (rms / 95 % / max)",
+        f"{'centroid error':20}{centroid}",
+        f"{'with detector noise':20}{three(noisy.flux_mag)} mag, {three(noisy.centroid_px)} px",
+        *(
+            f"{f'V {row.v_from} to {row.v_to}':>17}   {row.flux_error_mag.rms:.4f} mag rms,"
+            f" {row.centroid_error_px.rms:.4f} px rms, {row.stars} stars"
+            for row in summary.by_magnitude
+        ),
+        *(f"{'':20}{reason}" for reason in summary.reasons),
+        f"{'verdict':20}{'passed' if summary.passed else 'NOT passed'}",
+    ]

@@ -1,0 +1,128 @@
+"""The twin of a bench: from an attitude to what falls on the tracker's detector, and what that reads out."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+import numpy.typing as npt
+
+from hilstar.arrays import FloatArray
+from hilstar.attitude.wire.protocol import NORM_TOLERANCE
+from hilstar.bench.bench_file import BenchFile
+from hilstar.bench.build import bench_camera, open_bench
+from hilstar.bench.config import Verify
+from hilstar.bench.frame import Bench
+from hilstar.errors import InputError
+from hilstar.monitor.geometry import monitor_camera
+from hilstar.rotation import to_matrix
+from hilstar.scene.camera import Camera
+from hilstar.tracker.detector import Detector
+from hilstar.twin.bench_geometry import BenchGeometry
+from hilstar.twin.optics import TwinOptics
+from hilstar.twin.simulator import NO_MISALIGNMENT, background_e
+from hilstar.twin.verify.light import exposure_lights, true_panel
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """One attitude: mean electrons, (h, w) each, and its stars at their places (n,) in tracker pixels, as the sky has them.
+
+    `shown_e` is what the monitor as it is makes, `assumed_e` what it would make were everything as assumed (the same array
+    where nothing differs), and `sky_e` what the stars themselves make. `truth` has the rows of TRUTH_DTYPE.
+    """
+
+    shown_e: FloatArray
+    assumed_e: FloatArray
+    sky_e: FloatArray
+    truth: npt.NDArray[np.void]
+    x_px: FloatArray
+    y_px: FloatArray
+
+
+class Twin:
+    """A bench's twin. Free it with `close`, or use it as a context manager.
+
+    Raises InputError for a bench file or a true calibration that is wrong.
+    """
+
+    def __init__(self, file: BenchFile) -> None:
+        self.bench = open_bench(file)
+        self.config = self.bench.config
+        tracker = self.config.tracker
+        self.camera = monitor_camera(tracker.resolution_px, tracker.pixel_pitch_um, tracker.focal_length_mm, NO_MISALIGNMENT)
+        self.differs = any(name.startswith("true_") for name in changed_keys(self.config.verify))
+        self.true_panel = true_panel(self.bench)
+        self.assumed_geometry = BenchGeometry(self.bench.camera, self.camera)
+        true = true_geometry(self.bench, self.camera)
+        self.detector = Detector(tracker.detector, tracker.resolution_px, tracker.pixel_pitch_um)
+        self.true_optics = TwinOptics(true, tracker.psf_sigma_px)
+        self.sky_optics = TwinOptics(self.assumed_geometry, tracker.psf_sigma_px)
+        self.glow_e_per_s = self.true_optics.glow_e_per_s(self.true_panel)
+        self._under_stars_e = self.glow_e_per_s * tracker.exposure_s + background_e(self.config, file.folder)
+
+    def field(self, q_icrs_to_cam: FloatArray, first_frame: int) -> Field:
+        """Show one attitude (unit quaternion) for one exposure, from frame `first_frame` of the run on."""
+        frame = self.bench.frame(q_icrs_to_cam, first_frame)
+        exposure_s = self.config.tracker.exposure_s
+        sky = self.sky_optics.image_e_per_s(frame.linear.astype(np.float64)) * exposure_s
+        panels = [self.true_panel, self.bench.panel] if self.differs else [self.true_panel]
+        lights = exposure_lights(self.bench, frame, first_frame, panels)
+        shown = self.true_optics.image_e_per_s(lights[0]) * exposure_s
+        assumed = self.sky_optics.image_e_per_s(lights[1]) * exposure_s if self.differs else shown
+        x_px, y_px = self.camera.project(self._vectors(frame.truth["hip"]) @ to_matrix(frame.q_icrs_to_cam).T)
+        return Field(shown, assumed, sky, frame.truth, x_px, y_px)
+
+    def _vectors(self, hip: npt.NDArray[np.int32]) -> FloatArray:
+        stars = self.bench.stars
+        order = np.argsort(stars.hip)
+        return np.asarray(stars.vectors[order[np.searchsorted(stars.hip, hip, sorter=order)]])
+
+    def detected_e(self, seen: Field, rng: np.random.Generator) -> FloatArray:
+        """Electrons of one noisy exposure (h, w) as the DN give them, the mean of glow and background subtracted."""
+        dn = self.detector.expose(seen.shown_e + self._under_stars_e, self.config.tracker.exposure_s, rng)
+        return dn * self.config.tracker.detector.gain_e_per_dn - self._under_stars_e
+
+    @property
+    def monitor_px_per_px(self) -> float:
+        """Monitor pixels to a tracker pixel, along a side."""
+        return self.bench.camera.focal_length_px / self.camera.focal_length_px
+
+    def close(self) -> None:
+        """Free the GL contexts."""
+        for part in (self.bench, self.true_optics, self.sky_optics):
+            part.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+
+def changed_keys(verify: Verify) -> list[str]:
+    """The names of the keys of [verify] that are not at their defaults."""
+    default = Verify()
+    return [name for name in verify.__struct_fields__ if getattr(verify, name) != getattr(default, name)]
+
+
+def true_geometry(bench: Bench, tracker: Camera) -> BenchGeometry:
+    """How monitor and collimator really stand. Raises InputError for a rotation that is not unit within 1e-3."""
+    config = bench.config
+    verify, collimator, monitor = config.verify, config.collimator, config.monitor
+    norm = math.hypot(*(verify.true_q_cam_to_mon or collimator.q_cam_to_mon))
+    if abs(norm - 1) > NORM_TOLERANCE:
+        raise InputError(
+            f"{bench.file.path}: [verify] true_q_cam_to_mon: its norm is {norm:.6g}; write a unit quaternion w, x, y, z"
+        )
+    camera = monitor_camera(
+        monitor.resolution_px,
+        verify.true_pixel_pitch_um or monitor.pixel_pitch_um,
+        verify.true_focal_length_mm or collimator.focal_length_mm,
+        np.array(verify.true_q_cam_to_mon or collimator.q_cam_to_mon),
+        bench_camera(config).principal_point_px,
+    )
+    return BenchGeometry(camera, tracker, verify.true_mirror)

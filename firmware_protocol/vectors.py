@@ -1,8 +1,8 @@
-"""The test vectors: packets and frames that every implementation has to read and write alike, and some it has to refuse.
+"""The test vectors: packets and frames that every implementation must read and write alike, and some that it must refuse.
 
 Each is an object: `name`, `kind`, `fields` (what the sender chooses; numbers exact, "nan" for a NaN), `packet_hex` and
-`frame_hex`; or `name`, `packet_hex` (null: the frame holds none), `frame_hex` and `refused`: why. One refused for its time
-has `after`: the name of the vector that came before it.
+`frame_hex`; or `name`, `packet_hex` (null: the frame contains none), `frame_hex` and `refused`, the reason. One refused for its
+time has `after`: the name of the vector that precedes it.
 """
 
 from __future__ import annotations
@@ -10,10 +10,9 @@ from __future__ import annotations
 import math
 import struct
 import zlib
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
-if TYPE_CHECKING:
-    from generate import Packet
+from definition import Packet
 
 I64_MIN, I64_MAX = -(2**63), 2**63 - 1
 U32_MAX = 2**32 - 1
@@ -22,40 +21,53 @@ TINY64 = 5e-324
 TINY32 = 2.0**-149
 STILL = (0.0, 0.0, 0.0)
 Q = (0.5, 0.5, -0.5, 0.5)  # RA 0, Dec 0, roll 0
+NEGATED_Q = (-0.5, -0.5, 0.5, -0.5)
 
-# name: flags, sequence, t_ns, q_icrs_to_cam, rate_cam_rad_s
-ATTITUDES: dict[str, tuple[int, int, int, tuple[float, ...], tuple[float, ...]]] = {
-    "attitude: RA 0, Dec 0, roll 0, turning about the boresight": (1, 1, 1_000_000_000, Q, (0.0, 0.0, 0.125)),
-    "attitude: no rate": (0, 2, 1_010_000_000, Q, STILL),
-    "attitude: the other sign of the quaternion is the same attitude": (1, 3, 1_020_000_000, (-0.5, -0.5, 0.5, -0.5), STILL),
-    "attitude: the first after a jump": (3, 4, 1_030_000_000, (0.6, 0.0, 0.8, 0.0), (0.25, -0.5, 1.0)),
-    "attitude: all zero bytes but the scalar": (0, 0, 0, (1.0, 0.0, 0.0, 0.0), STILL),
-    "attitude: no zero byte in sequence and time": (1, 0x01020304, 0x0102030405060708, Q, (1.1, -2.2, 3.3)),
-    "attitude: the earliest time": (1, 5, I64_MIN, Q, STILL),
-    "attitude: the latest time": (1, 6, I64_MAX, Q, STILL),
-    "attitude: one nanosecond before zero": (1, 7, -1, Q, STILL),
-    "attitude: the last sequence before it wraps": (1, U32_MAX, 8, Q, STILL),
-    "attitude: the sequence wrapped": (1, 0, 9, Q, STILL),
-    "attitude: all flags, known and unknown": (0xFFFF, 10, 10, Q, STILL),
-    "attitude: negative zeros": (1, 11, 11, (1.0, -0.0, 0.0, -0.0), (-0.0, 0.0, -0.0)),
-    "attitude: subnormals": (1, 12, 12, (1.0, TINY64, -TINY64, 2.0**-1023), (TINY32, -TINY32, 2.0**-127)),
-    "attitude: a rate that is not valid is not looked at": (0, 13, 13, Q, (NAN, NAN, NAN)),
-    "attitude: the fastest rate": (1, 14, 14, Q, (1e6, 0.0, 0.0)),
-    "attitude: a norm of 1.0009 is taken, and mended": (1, 15, 15, (1.0009, 0.0, 0.0, 0.0), STILL),
-    "attitude: a norm of 0.9991 is taken, and mended": (1, 16, 16, (0.0, 0.0, 0.9991, 0.0), STILL),
+
+class Attitude(NamedTuple):
+    """What the sender of an attitude chooses."""
+
+    flags: int
+    sequence: int
+    t_ns: int
+    q_icrs_to_cam: tuple[float, ...]
+    rate_cam_rad_s: tuple[float, ...]
+
+
+ATTITUDES: dict[str, Attitude] = {
+    "attitude: RA 0, Dec 0, roll 0, turning about the boresight": Attitude(1, 1, 1_000_000_000, Q, (0.0, 0.0, 0.125)),
+    "attitude: no rate": Attitude(0, 2, 1_010_000_000, Q, STILL),
+    "attitude: the other sign of the quaternion is the same attitude": Attitude(
+        1, 3, 1_020_000_000, (-0.5, -0.5, 0.5, -0.5), STILL
+    ),
+    "attitude: the first after a jump": Attitude(3, 4, 1_030_000_000, (0.6, 0.0, 0.8, 0.0), (0.25, -0.5, 1.0)),
+    "attitude: all zero bytes but the scalar": Attitude(0, 0, 0, (1.0, 0.0, 0.0, 0.0), STILL),
+    "attitude: no zero byte in sequence and time": Attitude(1, 0x01020304, 0x0102030405060708, Q, (1.1, -2.2, 3.3)),
+    "attitude: the earliest time": Attitude(1, 5, I64_MIN, Q, STILL),
+    "attitude: the latest time": Attitude(1, 6, I64_MAX, Q, STILL),
+    "attitude: one nanosecond before zero": Attitude(1, 7, -1, Q, STILL),
+    "attitude: the last sequence before it wraps": Attitude(1, U32_MAX, 8, Q, STILL),
+    "attitude: the sequence wrapped": Attitude(1, 0, 9, Q, STILL),
+    "attitude: all flags, known and unknown": Attitude(0xFFFF, 10, 10, Q, STILL),
+    "attitude: negative zeros": Attitude(1, 11, 11, (1.0, -0.0, 0.0, -0.0), (-0.0, 0.0, -0.0)),
+    "attitude: subnormals": Attitude(1, 12, 12, (1.0, TINY64, -TINY64, 2.0**-1023), (TINY32, -TINY32, 2.0**-127)),
+    "attitude: a rate that is not valid is not looked at": Attitude(0, 13, 13, Q, (NAN, NAN, NAN)),
+    "attitude: the fastest rate": Attitude(1, 14, 14, Q, (1e6, 0.0, 0.0)),
+    "attitude: a norm of 1.0009 is taken, and mended": Attitude(1, 15, 15, (1.0009, 0.0, 0.0, 0.0), STILL),
+    "attitude: a norm of 0.9991 is taken, and mended": Attitude(1, 16, 16, (0.0, 0.0, 0.9991, 0.0), STILL),
 }
-# The same, and why hilstar refuses it.
-REFUSED_ATTITUDES: dict[str, tuple[str, tuple[int, int, int, tuple[float, ...], tuple[float, ...]]]] = {
-    "refused: NaN in the quaternion": ("nan", (1, 1, 1, (NAN, 0.0, 0.0, 1.0), STILL)),
-    "refused: infinity in the quaternion": ("nan", (1, 1, 1, (0.0, INF, 0.0, 0.0), STILL)),
-    "refused: minus infinity in the quaternion": ("nan", (1, 1, 1, (0.0, 0.0, 0.0, -INF), STILL)),
-    "refused: NaN in a valid rate": ("nan", (1, 1, 1, Q, (0.0, NAN, 0.0))),
-    "refused: a norm of 1.1": ("norm", (1, 1, 1, (1.1, 0.0, 0.0, 0.0), STILL)),
-    "refused: a norm of 1.0011": ("norm", (1, 1, 1, (0.0, 1.0011, 0.0, 0.0), STILL)),
-    "refused: a norm of 0.9989": ("norm", (1, 1, 1, (0.0, 0.0, 0.9989, 0.0), STILL)),
-    "refused: a norm of 0": ("norm", (1, 1, 1, (0.0, 0.0, 0.0, 0.0), STILL)),
-    "refused: a norm too large to square": ("norm", (1, 1, 1, (1e200, 0.0, 0.0, 0.0), STILL)),
-    "refused: a rate of 2e6 rad/s": ("format", (1, 1, 1, Q, (0.0, 0.0, -2e6))),
+# The reason for which hilstar refuses it, and the attitude.
+REFUSED_ATTITUDES: dict[str, tuple[str, Attitude]] = {
+    "refused: NaN in the quaternion": ("nan", Attitude(1, 1, 1, (NAN, 0.0, 0.0, 1.0), STILL)),
+    "refused: infinity in the quaternion": ("nan", Attitude(1, 1, 1, (0.0, INF, 0.0, 0.0), STILL)),
+    "refused: minus infinity in the quaternion": ("nan", Attitude(1, 1, 1, (0.0, 0.0, 0.0, -INF), STILL)),
+    "refused: NaN in a valid rate": ("nan", Attitude(1, 1, 1, Q, (0.0, NAN, 0.0))),
+    "refused: a norm of 1.1": ("norm", Attitude(1, 1, 1, (1.1, 0.0, 0.0, 0.0), STILL)),
+    "refused: a norm of 1.0011": ("norm", Attitude(1, 1, 1, (0.0, 1.0011, 0.0, 0.0), STILL)),
+    "refused: a norm of 0.9989": ("norm", Attitude(1, 1, 1, (0.0, 0.0, 0.9989, 0.0), STILL)),
+    "refused: a norm of 0": ("norm", Attitude(1, 1, 1, (0.0, 0.0, 0.0, 0.0), STILL)),
+    "refused: a norm too large to square": ("norm", Attitude(1, 1, 1, (1e200, 0.0, 0.0, 0.0), STILL)),
+    "refused: a rate of 2e6 rad/s": ("format", Attitude(1, 1, 1, Q, (0.0, 0.0, -2e6))),
 }
 OTHERS: dict[str, tuple[str, dict[str, int]]] = {
     "time_request: ordinary": ("time_request", {"sequence": 1, "t1_ns": 2_000_000_000}),
@@ -113,19 +125,15 @@ def packed(packet: Packet, values: dict[str, Any]) -> bytes:
 
 def vectors(packets: dict[str, Packet]) -> list[dict[str, Any]]:
     """All of them, in order."""
-    good = [_accepted(packets["attitude"], name, _attitude(values)) for name, values in ATTITUDES.items()]
+    good = [_accepted(packets["attitude"], name, values._asdict()) for name, values in ATTITUDES.items()]
     good += [_accepted(packets[kind], name, values) for name, (kind, values) in OTHERS.items()]
     bad = [
-        _refused(name, packed(packets["attitude"], _attitude(values)), reason)
+        _refused(name, packed(packets["attitude"], values._asdict()), reason)
         for name, (reason, values) in REFUSED_ATTITUDES.items()
     ]
     first = bytes.fromhex(good[0]["packet_hex"])
     late = _refused("refused: a time that does not rise", first, "time") | {"after": good[1]["name"]}
     return [*good, *bad, *_damaged(first, packets), late]
-
-
-def _attitude(values: tuple[int, int, int, tuple[float, ...], tuple[float, ...]]) -> dict[str, Any]:
-    return dict(zip(("flags", "sequence", "t_ns", "q_icrs_to_cam", "rate_cam_rad_s"), values, strict=True))
 
 
 def _accepted(packet: Packet, name: str, values: dict[str, Any]) -> dict[str, Any]:
@@ -135,7 +143,7 @@ def _accepted(packet: Packet, name: str, values: dict[str, Any]) -> dict[str, An
 
 
 def _exact(form: str, value: Any) -> Any:
-    """A value as the packet has it, so that JSON's numbers are the packet's own."""
+    """A value rounded as in the packet, so that the numbers in the JSON are exact."""
     if isinstance(value, tuple):
         return [_exact(form, item) for item in value]
     if form == "f32":
@@ -149,7 +157,7 @@ def _refused(name: str, packet: bytes | None, reason: str, framed: bytes | None 
 
 
 def _damaged(whole: bytes, packets: dict[str, Packet]) -> list[dict[str, Any]]:
-    """What a line or a wrong program makes of `whole`, an attitude."""
+    """What a noisy line or a faulty program makes of `whole`, an attitude."""
     body = whole[:-4]
     request = packed(packets["time_request"], {"sequence": 1, "t1_ns": 1})
     return [

@@ -13,6 +13,7 @@ from hilstar.monitor.quantise import Panel
 from hilstar.monitor.response import Codes
 from hilstar.scene.clipping import CLIP_TOLERANCE
 from hilstar.scene.sprites import Sprites
+from hilstar.units import magnitude
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +46,6 @@ def star_losses(sprites: Sprites, panel: Panel, footprints: FootprintMap, levels
         level = np.append(levels.ravel(), levels.dtype.type(0))[found.place]
         shown = (response.light[level] * white).sum(axis=0)
     clipped = np.any(found.light > white * (1 + CLIP_TOLERANCE), axis=0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        loss_mag = -2.5 * np.log10(shown / wanted)
+    with np.errstate(invalid="ignore"):
+        loss_mag = magnitude(shown / wanted)
     return StarLosses(below_step, clipped, loss_mag)

@@ -11,7 +11,7 @@ from hilstar.monitor.exact import ExactQuantiser
 from hilstar.monitor.quantise import Panel, Quantisation, dither_levels, round_levels, shown_light, temporal_levels
 from hilstar.scene.psf import footprint_px, peak_share
 from hilstar.scene.sprites import Sprites, pack_sprites
-from hilstar.units import flux_ratio
+from hilstar.units import flux_ratio, magnitude
 
 SIGMA_PX = (0.85, 0.85)
 WHITE = 1.0
@@ -48,8 +48,7 @@ def measure(wanted: FloatArray, shown: FloatArray, tile: int) -> Errors:
     """The errors of each tile of two images, which hold a star each."""
     light, x_px, y_px = _sums(wanted, tile)
     lit, lit_x_px, lit_y_px = _sums(shown, tile)
-    with np.errstate(divide="ignore"):
-        flux = np.abs(2.5 * np.log10(lit / light))
+    flux = np.abs(magnitude(lit / light))
     off = np.where(lit > 0, np.hypot(lit_x_px - x_px, lit_y_px - y_px), np.inf)
     rms = (float(np.sqrt(np.mean(np.square(error)))) for error in (flux, off))
     return Errors(next(rms), float(flux.max()), next(rms), float(off.max()))

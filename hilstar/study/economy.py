@@ -1,4 +1,4 @@
-"""What `effort = "auto"` is worth: five scenes with all effort and with what they need, their time and their errors."""
+"""What `effort = "auto"` saves: five scenes at full effort and at the effort that they need, with their times and errors."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ tolerance_mag = {tolerance}
 tolerance_px = {tolerance}
 {effort}
 """
-# All effort: whatever is asked for, `exact` and whole sprites reach it, if anything does.
+# Full effort: `exact` codes and whole sprites reach every tolerance that can be reached.
 EFFORTS = {"full": 'quantisation = "exact"\nmotion_above_px = 0.0', "auto": 'effort = "auto"\nquantisation = "auto"'}
 ISOLATION = Isolation(margin_px=7, max_share=2e-4)  # 2e-4 of its light is 2e-4 mag
 ROUNDS, QUICK_ROUNDS = 60, 5
@@ -51,7 +51,7 @@ ROUNDS, QUICK_ROUNDS = 60, 5
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """Where a bench looks, how far and fast, and what it may be off by, magnitudes and pixels alike."""
+    """Where a bench points, how faint it goes and how fast it turns, and the tolerance, in magnitudes and in pixels alike."""
 
     name: str
     radec_roll_deg: tuple[float, float, float]
@@ -73,7 +73,7 @@ SCENES = (
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """A scene with one effort: the time of a frame, its worst errors over stars that stand alone, and their limit."""
+    """A scene at one effort: the time of a frame, the largest errors of stars that stand alone, and the tolerance."""
 
     scene: str
     effort: str
@@ -101,7 +101,7 @@ def run(directory: Path, quick: bool = False) -> list[str]:
 
 
 def compare(scene: Scene, rounds: int) -> list[Outcome]:
-    """A scene with all effort and with what it needs, timed in turn."""
+    """A scene at full effort and at the effort that it needs, timed in turn."""
     with TemporaryDirectory() as folder:
         benches = {name: _open(scene, keys, Path(folder) / f"{name}.toml") for name, keys in EFFORTS.items()}
         try:
@@ -152,7 +152,7 @@ def _outcome(scene: Scene, name: str, bench: Bench, frame_ms: float) -> Outcome:
     rates = sprites.data["electrons_per_s"]
     for star, window in lone_windows(sprites, sprites.x_px, sprites.y_px, size, ISOLATION):
         if rates[sprites.star == star].sum() > 2 * bench.flux_at_white_e_per_s:
-            continue  # over white at some places in a pixel
+            continue  # clips at some sub-pixel phases
         (light, x_px, y_px), (true_light, true_x_px, true_y_px) = moments(shown, window), moments(true, window)
         flux_mag.append(abs(magnitude(light / true_light)))
         off_px.append(math.hypot(x_px - true_x_px, y_px - true_y_px))
@@ -170,30 +170,30 @@ def _outcome(scene: Scene, name: str, bench: Bench, frame_ms: float) -> Outcome:
 
 
 def _line(full: Outcome, auto: Outcome) -> str:
-    errors = f"{auto.flux_max_mag:.4f} mag, {auto.centroid_max_px:.4f} px at worst of {auto.measured_stars} stars"
+    errors = f"largest errors of {auto.measured_stars} stars {auto.flux_max_mag:.4f} mag and {auto.centroid_max_px:.4f} px"
     verdict = "within" if auto.within else "OVER"
     return (
-        f"{auto.scene}: {auto.frame_ms:.2f} ms ({auto.quantisation}) instead of {full.frame_ms:.2f}, "
-        f"{_times(full, auto)}; {errors}, {verdict} {auto.tolerance:g}"
+        f"{auto.scene}: {auto.frame_ms:.2f} ms ({auto.quantisation}) instead of {full.frame_ms:.2f} ms, "
+        f"{_compared(full, auto)}; {errors}, {verdict} {auto.tolerance:g}"
     )
 
 
 def economy_finding(pairs: list[tuple[Outcome, Outcome]]) -> str:
-    """What is true of every scene, in one sentence: whether it takes less time, and whether it is within tolerance."""
+    """What is true of every scene, in one sentence: the range of the speed-up, and whether errors are within tolerance."""
     slowest, quickest = (extreme(full.frame_ms / auto.frame_ms for full, auto in pairs) for extreme in (min, max))
     over = sum(not auto.within for _, auto in pairs)
     verdict = "within tolerance" if not over else f"{over} of {len(pairs)} scenes OVER tolerance"
     if slowest >= 1:
-        return f"What a scene needs takes {slowest:.1f} to {quickest:.1f} times less than all effort, {verdict}"
+        return f"Auto effort is {slowest:.1f} to {quickest:.1f} times as fast as full effort, {verdict}"
     if quickest < 1:
-        return f"What a scene needs took {1 / quickest:.1f} to {1 / slowest:.1f} times longer than all effort, {verdict}"
-    words = f"from {1 / slowest:.1f} times longer to {quickest:.1f} times less than all effort"
-    return f"What a scene needs took {words}, {verdict}"
+        return f"Auto effort takes {1 / quickest:.1f} to {1 / slowest:.1f} times as long as full effort, {verdict}"
+    slower = f"takes up to {1 / slowest:.1f} times as long as full effort in one scene"
+    return f"Auto effort {slower} and is up to {quickest:.1f} times as fast in another, {verdict}"
 
 
-def _times(full: Outcome, auto: Outcome) -> str:
+def _compared(full: Outcome, auto: Outcome) -> str:
     ratio = full.frame_ms / auto.frame_ms
-    return f"{ratio:.1f} times less" if ratio >= 1 else f"{1 / ratio:.1f} times LONGER"
+    return f"{ratio:.1f} times as fast" if ratio >= 1 else f"{1 / ratio:.1f} times as SLOW"
 
 
 def _draw(path: Path, pairs: list[tuple[Outcome, Outcome]]) -> None:
@@ -216,8 +216,8 @@ def _draw(path: Path, pairs: list[tuple[Outcome, Outcome]]) -> None:
             error.plot(
                 [place - 0.45, place + 0.45], [auto.tolerance] * 2, color="#c33", label="tolerance" if not place else None
             )
-        cost.set_ylabel("frame, ms")
-        error.set_ylabel("worst error of a star")
+        cost.set_ylabel("time of a frame [ms]")
+        error.set_ylabel("largest error of a star")
         error.set_xticks(at, [full.scene.replace(", ", ",\n") for full, _ in pairs])
         cost.legend()
         error.legend(ncols=3, fontsize=9)

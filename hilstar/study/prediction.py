@@ -1,7 +1,7 @@
-"""Where the camera points when the light comes: error against latency and against the packets' rate, by method, and its time.
+"""Pointing error at the moment of light against latency and against the rate of packets, by predictor, and their times.
 
-The slew is that of the trade-offs: a swing of degrees, shaken on each axis (see `shared.predictors`). A frame at time t has the
-samples that were taken before t minus the latency, which is all of it: link, drawing, scan-out.
+The slew is a swing of degrees, shaken on each axis (see `shared.predictors`). A frame at time t has the samples that were taken
+before t minus the latency, which covers link, drawing and scan-out.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ MARKERS = "osd^vx"
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """One method at one rate and latency: errors over all frames, arcsec, and the time of one attitude."""
+    """One predictor at one rate and latency: errors over all frames, arcsec, and the time of one attitude, us."""
 
     method: str
     rate_hz: int
@@ -50,15 +50,16 @@ def run(directory: Path, quick: bool = False) -> list[str]:
     hold = next(o for o in usual if o.method == "hold")
     shaken = ", ".join(f"{size:g} arcsec at {hz:g} Hz" for size, hz in JITTER)
     finding = (
-        f"At {USUAL_HZ} Hz and {USUAL_MS} ms the newest sample's rate leaves {default.rms_arcsec:.2g} arcsec rms, holding it "
-        f"{hold.rms_arcsec:.3g}: a swing of {SLEW_DEG:g} degrees in {SLEW_S:g} s, shaken by {shaken}"
+        f"At {USUAL_HZ} Hz and {USUAL_MS} ms of latency, prediction by the newest sample's rate is off by "
+        f"{default.rms_arcsec:.2g} arcsec rms, holding the sample by {hold.rms_arcsec:.3g}"
+        f" (a swing of {SLEW_DEG:g} degrees in {SLEW_S:g} s, shaken by {shaken})"
     )
     _draw(directory / "prediction.png", finding, outcomes)
     return [finding, *(_line(outcome) for outcome in usual)]
 
 
 def measure(span_s: float) -> list[Outcome]:
-    """Every predicting method along latency at the usual rate, and along rate at the usual latency."""
+    """Every predictor over latency at the usual rate, and over rate at the usual latency."""
     cells = {(USUAL_HZ, ms) for ms in LATENCIES_MS} | {(hz, USUAL_MS) for hz in RATES_HZ}
     outcomes = []
     for hz, ms in sorted(cells):
@@ -81,7 +82,7 @@ def _outcome(predictor: Predictor, samples: list[AttitudeSample], rate_hz: int, 
 
 
 def _attitude_us(predictor: Predictor, samples: list[AttitudeSample], latency_ms: int) -> float:
-    """The median time of one attitude past the samples."""
+    """The median time of one attitude after the last sample, us."""
     attitude_at = predictor.load(samples[-NEAR:])
     t_ns = samples[-1].t_ns + latency_ms * NS_PER_MS
     times = []
@@ -93,8 +94,8 @@ def _attitude_us(predictor: Predictor, samples: list[AttitudeSample], latency_ms
 
 
 def _line(outcome: Outcome) -> str:
-    errors = f"{outcome.rms_arcsec:.3g} arcsec rms, {outcome.worst_arcsec:.3g} at worst"
-    return f"{outcome.method}: {errors}, {outcome.attitude_us:.0f} us an attitude"
+    errors = f"{outcome.rms_arcsec:.3g} arcsec rms, {outcome.worst_arcsec:.3g} maximum"
+    return f"{outcome.method}: {errors}, {outcome.attitude_us:.0f} us per attitude"
 
 
 def _draw(path: Path, finding: str, outcomes: list[Outcome]) -> None:
@@ -106,10 +107,10 @@ def _draw(path: Path, finding: str, outcomes: list[Outcome]) -> None:
             by_rate = sorted((o.rate_hz, o.rms_arcsec) for o in mine if o.latency_ms == USUAL_MS)
             latency.loglog(*zip(*by_latency, strict=True), marker=marker, label=f"{name}: {took_us:.0f} us")
             rate.loglog(*zip(*by_rate, strict=True), marker=marker)
-        latency.set_xlabel(f"latency, ms (packets at {USUAL_HZ} Hz)")
-        rate.set_xlabel(f"packets, Hz (latency {USUAL_MS} ms)")
+        latency.set_xlabel(f"latency [ms], packets at {USUAL_HZ} Hz")
+        rate.set_xlabel(f"rate of packets [Hz], latency {USUAL_MS} ms")
         plain_ticks(latency.xaxis, LATENCIES_MS)
         plain_ticks(rate.xaxis, RATES_HZ)
         for axes in (latency, rate):
-            axes.set_ylabel("pointing error, arcsec rms")
+            axes.set_ylabel("pointing error [arcsec rms]")
         latency.legend(loc="upper left", fontsize=9)

@@ -1,4 +1,4 @@
-"""What each way from light to levels costs: flux and centroid errors against magnitude, and against time."""
+"""What each method from light to levels costs: flux and centroid errors against magnitude, and against time."""
 
 from __future__ import annotations
 
@@ -82,18 +82,18 @@ def _summary(bits: int, found: dict[tuple[int, str], list[Errors]], mags: FloatA
         return f"{max(e.flux_max_mag for e in within):.3f} mag and {max(e.centroid_max_px for e in within):.3f} px"
 
     one_frame = ", ".join(f"{way.method} {worst(way)}" for way in WAYS[:3])
-    half_step_px = 0.5 * srgb_response(bits).light[1] * peak_share(SIGMA_PX) * 10 ** (0.4 * limit)
+    half_step_px = 0.5 * srgb_response(bits).light[1] * peak_share(SIGMA_PX) / flux_ratio(limit)
     return (
-        f"{bits} bits, sRGB, {limit:g} magnitudes (aim {aim_mag:g} mag, {AIM_PX:g} px): exact is off by {worst(WAYS[3])} at"
-        f" most, with bit stealing by {worst(WAYS[5])}; {one_frame} (over {CYCLE_FRAMES} frames)."
-        f" Half of the smallest step of light is {half_step_px:.3f} px along each axis"
+        f"{bits} bits, sRGB, {limit:g} magnitudes (aim {aim_mag:g} mag, {AIM_PX:g} px): largest errors of exact"
+        f" {worst(WAYS[3])}, with bit stealing {worst(WAYS[5])}; {one_frame} (over {CYCLE_FRAMES} frames)."
+        f" Half the smallest step of light moves a centroid by {half_step_px:.3f} px along each axis"
     )
 
 
 def _time_summary(times: dict[tuple[int, str], float]) -> str:
     ms = {way.name: times[10, way.name] for way in WAYS}
     return (
-        f"{STARS} stars, {FRAME_PX[0]} x {FRAME_PX[1]}, 10 bits, light to levels in memory: round {ms['round']:.1f} ms,"
+        f"{STARS} stars, {FRAME_PX[0]} x {FRAME_PX[1]}, 10 bits, from light to levels in memory: round {ms['round']:.1f} ms,"
         f" dither {ms[WAYS[1].name]:.1f} ms, temporal {ms[WAYS[2].name]:.1f} ms, exact {ms['exact']:.1f} ms"
     )
 
@@ -117,15 +117,15 @@ def _draw_magnitudes(path: Path, found: dict[tuple[int, str], list[Errors]], mag
                 axis.plot([limit, limit], [1e-6, aim], "k--", lw=1.2)
             grid[0, column].set(title=f"{bits} bits", yscale="log", ylim=(1e-5, 1))
             grid[1, column].set(yscale="log", ylim=(1e-5, 1), xlabel="magnitudes under a star whose peak is white")
-        grid[0, 0].set(ylabel="flux error [mag]\nline: rms over phases, thin: largest")
-        grid[1, 0].set(ylabel="centroid error [monitor px]\nline: rms over phases, thin: largest")
+        grid[0, 0].set(ylabel="flux error [mag]\nthick: rms over phases, thin: largest")
+        grid[1, 0].set(ylabel="centroid error [monitor px]\nthick: rms over phases, thin: largest")
         figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
         figure.suptitle(title_lines(finding), fontsize=12)
         save(figure, path)
 
 
 def _lines(axis: Axes, mags: FloatArray, rms_and_max: list[tuple[float, float]], way: Way) -> None:
-    """Its rms, and thinly its largest; a star that shows nothing ends the line."""
+    """The rms as a thick line, the largest as a thin one; a line ends where a star shows nothing."""
     rms, largest = np.array(rms_and_max).T
     axis.plot(mags, np.where(np.isfinite(rms), rms, np.nan), way.style, label=way.name)
     axis.plot(mags, np.where(np.isfinite(largest), largest, np.nan), way.style, lw=0.7, alpha=0.7)

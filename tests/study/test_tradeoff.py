@@ -157,7 +157,7 @@ def test_a_planted_worse_method_is_off_the_front_and_a_beaten_default_says_why(c
     assert step.default.beaten == "" and step.default.time_ms == pytest.approx(4.0)
     beaten = measured(planted(clock, 4.0, floor=1.0), 0.02)  # all errors count as none: the fastest is best
     assert not beaten.default.on_front
-    assert beaten.default.beaten == "'fast and rough' is no worse and 75 % faster; it is tidy"
+    assert beaten.default.beaten == "'fast and rough' is no worse and takes 75 % less time; it is tidy"
     assert any(beaten.default.beaten in line for line in table_lines(beaten))
 
 

@@ -1,4 +1,4 @@
-"""Where methods fail with attitudes: two signs of one quaternion, half turns, fast turns, and what is no number."""
+"""Where methods fail with attitudes: two signs of one quaternion, half turns, fast turns, NaN and infinity."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def turned(turn_deg: float, fraction: float = 1.0) -> FloatArray:
 
 
 def way_error_arcsec(between: Between, sign: float, turn_deg: float) -> float:
-    """The most that `between` (`slerp`, or one that fails) strays from a turn whose end has this sign; NaN if ever NaN."""
+    """The largest error of `between` (`slerp`, or one that fails) on a turn whose end has this sign, arcsec; NaN if any is."""
     with np.errstate(invalid="ignore"):
         ways = [between(START, sign * turned(turn_deg), float(f)) for f in FRACTIONS]
     errors = [angle_between_rad(q, turned(turn_deg, f)) for q, f in zip(ways, FRACTIONS, strict=True)]
@@ -98,7 +98,7 @@ def half_turn() -> FailureCase:
 
 
 def sampled_error_arcsec(turn_deg: float, with_rates: bool) -> float:
-    """The most that a timeline strays between samples that are `turn_deg` of a steady turn apart."""
+    """The largest error of a timeline between samples that are `turn_deg` of a steady turn apart, arcsec."""
     rate = np.radians(turn_deg) / PERIOD_S * AXIS if with_rates else None
     timeline = Timeline(POLICY)
     for k in range(3):
@@ -145,8 +145,8 @@ def not_a_number() -> FailureCase:
             sent += 1
     return FailureCase(
         "NaN or infinity in an attitude",
-        "a look at abs(norm - 1) > 1e-3 alone",
-        f"{passed} of {sent} pass: NaN is not larger, and a rate has no norm to look at",
+        "a check of abs(norm - 1) > 1e-3 alone",
+        f"{passed} of {sent} pass: NaN is not larger, and a rate has no norm to check",
         f"{taken} taken",
         "every number has to be finite before anything is computed from it",
         Figures(float(taken), float(passed), NONE_TAKEN),

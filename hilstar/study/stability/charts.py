@@ -1,4 +1,4 @@
-"""The places that are curves, drawn: what fails, and hilstar, over the quantity that makes it fail."""
+"""Charts of the cases that are curves: the failing method and hilstar over the quantity that makes it fail."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from hilstar.study.stability.popping import (
     moving_code_fluxes,
     moving_fluxes,
 )
+from hilstar.units import magnitude
 
 
 def draw_charts(directory: Path) -> None:
@@ -38,9 +39,9 @@ def narrow_sigmas(directory: Path) -> None:
     at, wide = int(np.abs(sigmas_px - 0.5).argmin()), sigmas_px > 0.85
     either = float(np.maximum(flux, sampled_flux)[wide].max())
     finding = (
-        f"At sigma {sigma[at]:.2f} px point sampling gets the flux wrong by {100 * sampled_flux[at]:.1f} % and the centroid by"
-        f" {sampled_px[at]:.3f} px; integrated over pixels they are {100 * flux[at]:.5f} % and {off_px[at]:.4f} px off."
-        f" Beyond 0.85 px either gets the flux right within {either:.0e}"
+        f"At sigma {sigma[at]:.2f} px point sampling is off by {100 * sampled_flux[at]:.1f} % in flux and"
+        f" {sampled_px[at]:.3f} px in centroid, integration over pixels by {100 * flux[at]:.5f} % and {off_px[at]:.4f} px."
+        f" Above 0.85 px both are within {either:.0e} in flux"
     )
     with chart(directory / "narrow_stars.png", finding, panels=2) as (above, below):
         for axis, theirs, ours in ((above, sampled_flux, flux), (below, sampled_px, off_px)):
@@ -61,8 +62,8 @@ def weak_perspectives(directory: Path) -> None:
     write_csv(directory / "weak_perspective.csv", ("field_angle_deg", "error_px", "error_arcsec"), rows)
     at_px, at_arcsec = (float(off[0]) for off in weak_perspective_error(np.array([10.0])))
     finding = (
-        f"With the demo's lens and monitor weak perspective, one depth for every star, is {abs(at_px):.0f} px or"
-        f" {abs(at_arcsec):.0f} arcsec off at a field angle of ten degrees, and eight times less at half of that"
+        f"With the demo's lens and monitor, weak perspective (one depth for every star) is off by {abs(at_px):.0f} px or"
+        f" {abs(at_arcsec):.0f} arcsec at a field angle of ten degrees, and by an eighth of that at five"
     )
     with chart(directory / "weak_perspective.png", finding, panels=2) as (above, below):
         above.plot(angle_deg, np.abs(off_px), "C3")
@@ -83,24 +84,24 @@ def ripples(directory: Path) -> None:
         "codes, exact": moving_code_fluxes("exact"),
         "linear image": linear,
     }
-    off_mag = {name: -2.5 * np.log10(light) for name, light in curves.items()}
+    off_mag = {name: magnitude(light) for name, light in curves.items()}
     step_px = np.linspace(0, PATH_PX[0], STEPS)
     columns = "x_px", *(f"{name} [mag]" for name in off_mag)
     write_csv(directory / "popping.csv", columns, np.column_stack([step_px, *off_mag.values()]).tolist())
     spread = {name: float(np.ptp(mag)) for name, mag in off_mag.items()}
     finding = (
-        f"A star {CODES_MAG_UNDER_WHITE:g} mag under white, {CODES_BITS} bits, sigma {SIGMA_PX:g} px, moves by {STEPS} parts of"
-        f" pixels: its light changes by {spread['linear image']:.1e} mag in the linear image,"
-        f" {spread['codes, exact']:.3f} by exact codes and {spread['codes, round']:.3f} by rounded ones"
+        f"A star {CODES_MAG_UNDER_WHITE:g} mag under white, {CODES_BITS} bits, sigma {SIGMA_PX:g} px, moves in {STEPS}"
+        f" sub-pixel steps: its light varies by {spread['linear image']:.1e} mag in the linear image,"
+        f" by {spread['codes, exact']:.3f} with exact codes and by {spread['codes, round']:.3f} with rounded ones"
     )
     with chart(directory / "popping.png", finding, panels=2) as (above, below):
         for (name, mag), colour in zip(off_mag.items(), ("C1", "C3", "C0", "k"), strict=True):
             above.plot(step_px, mag, colour, label=name, lw=1.0)
         below.plot(step_px, 1e6 * off_mag["linear image"], "k", lw=1.0)
-        above.set(ylabel="too faint by [mag]")
+        above.set(ylabel="light lost [mag]")
         below.set(
-            ylabel="linear image alone,\ntoo faint by [1e-6 mag]",
-            xlabel=f"moved in x by [px]; in y by {PATH_PX[1] / PATH_PX[0]:.2f} of it",
+            ylabel="linear image alone,\nlight lost [1e-6 mag]",
+            xlabel=f"displacement in x [px]; that in y is {PATH_PX[1] / PATH_PX[0]:.2f} of it",
         )
         above.margins(y=0.2)
         above.legend(ncols=4, loc="upper center")
@@ -116,15 +117,15 @@ def turns(directory: Path) -> None:
     }
     columns = "turn_deg", *(f"{name} [arcsec]" for name in curves)
     write_csv(directory / "turns.csv", columns, np.column_stack([turn_deg, *curves.values()]).tolist())
-    most = max(curves["samples with rates"])
+    largest = max(curves["samples with rates"])
     finding = (
-        "Past half a turn from sample to sample SLERP goes the other way round; with rates a steady turn is"
-        f" followed within {most:.0e} arcsec up to {turn_deg[-1]:.0f} degrees"
+        "Beyond half a turn between samples SLERP takes the wrong way round; with rates a steady turn is followed"
+        f" within {largest:.0e} arcsec up to {turn_deg[-1]:.0f} degrees"
     )
     with chart(directory / "turns.png", finding) as (axis,):
         for (name, errors), style in zip(curves.items(), ("C1", "C3", "C0"), strict=True):
             axis.plot(turn_deg, np.maximum(errors, 1e-12), style, label=name)
-        axis.set(yscale="log", xlabel="turn from one sample to the next [deg]", ylabel="largest error in between [arcsec]")
+        axis.set(yscale="log", xlabel="turn between samples [deg]", ylabel="largest error between samples [arcsec]")
         plain_ticks(axis.xaxis, (0, 60, 120, 180, 240, 300, 360))
         axis.axvline(180, color="k", ls="--", lw=1.0)
         axis.legend(loc="center right")

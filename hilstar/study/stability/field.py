@@ -110,7 +110,7 @@ def stars_behind() -> FailureCase:
         "x = f X / Z for every star",
         f"{ghosts} of {len(behind)} stars behind are drawn, mirrored",
         f"{ours} drawn",
-        "a star is projected only with Z > 0",
+        "only stars with Z > 0 are projected",
         Figures(float(ours), float(ghosts), NONE_LOST),
     )
 
@@ -141,7 +141,7 @@ def field_of_180_deg() -> FailureCase:
         "a field of 179.8 degrees",
         "float32 directions",
         f"{fault:.2g} px off at its edge, of 1000",
-        f"{error:.1e} px off; but a degree at the edge is {spread:.2g} times a degree in the middle",
+        f"{error:.1e} px off; but a degree at the edge is {spread:.2g} times as long as one in the middle",
         "float64; the perspective itself diverges at 180 degrees, as a flat monitor does",
         Figures(error, fault, EDGE_PX),
     )
@@ -170,7 +170,7 @@ def weak_perspective_px(angle_rad: FloatArray, focal_length_px: float) -> FloatA
 
 
 def weak_perspective_error(angle_deg: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """What weak perspective is off by at field angles (n,), with the demo's lens and monitor: px and arcsec."""
+    """The error of weak perspective at field angles (n,), with the demo's lens and monitor: px and arcsec."""
     angle = np.radians(angle_deg)
     focal_length_px = FOCAL_LENGTH_MM * 1e3 / PITCH_UM
     off_px = weak_perspective_px(angle, focal_length_px) - focal_length_px * np.tan(angle)
@@ -192,6 +192,6 @@ def weak_perspective() -> FailureCase:
         "weak perspective, x = f X / Z0",
         fails,
         f"{error:.1e} px off at most",
-        "each star's own Z; eq. 4.3 and 4.4 divide by it too, and so are no weak perspective",
+        "each star's own Z; eq. 4.3 and 4.4 divide by it too, and so are not a weak perspective",
         Figures(error, float(np.abs(off_px).max()), CENTROID_PX),
     )

@@ -1,4 +1,4 @@
-"""Where methods fail between sprites and the image: very narrow, very wide, on edges, too many, too bright, moving."""
+"""Where methods fail between sprites and the image: very narrow or wide stars, edges, crowds, and a large flux range."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def one_star(x_px: float, y_px: float, on: Target, electrons_per_s: float = 1.0)
 
 @contextmanager
 def by_renderer(on: Target) -> Iterator[Draw]:
-    """What makes linear images (h, w) of sprites, as hilstar does."""
+    """A function that draws the linear image (h, w) of sprites as hilstar does."""
     with Renderer(on) as gl:
 
         def draw(sprites: Sprites) -> FloatArray:
@@ -82,7 +82,7 @@ def point_sampled(on: Target, sprites: Sprites) -> FloatArray:
 
 
 def half_float(on: Target, sprites: Sprites) -> FloatArray:
-    """One star by erf differences in float16, the least that GLES calls mediump."""
+    """One star by erf differences in float16, the minimum that GLES calls mediump."""
     return _outer(on, sprites, lambda *place: _difference(lambda edge: erf(edge).astype(np.float16), *place))
 
 
@@ -134,7 +134,7 @@ def narrow_star() -> FailureCase:
         POINT_SAMPLED,
         f"flux off by up to {100 * fault:.0f} %, centre of gravity by {fault_px:.2f} px ({wider_fault_px:.4f} at sigma 0.5)",
         f"flux off by {error:.1e}; centre of gravity by {off_px:.2f} px ({wider_px:.4f} at sigma 0.5)",
-        "the Gaussian is integrated over pixels; the centroid that is lost then, any pixel loses: write 0.5 px or more",
+        "the Gaussian is integrated over pixels; pixels of any display keep that centroid error: write 0.5 px or more",
         Figures(error, fault, FLUX_ERROR),
     )
 
@@ -214,7 +214,7 @@ def absurd_sigmas() -> FailureCase:
     cuts = [cut_share(point_px, (sigma_px, sigma_px)) for sigma_px in (60.0, 1e6)]
     return FailureCase(
         "sigma 60 and 1e6 px",
-        f"GL's largest point, {point_px} px, all the same",
+        f"GL's largest point, {point_px} px, whatever the sigma",
         f"cuts {100 * cuts[0]:.1f} % and {100 * cuts[1]:.5f} % of a star's light",
         "refused: " + " | ".join(lines),
         "a point of GL is a star's footprint",
@@ -249,7 +249,7 @@ def star_on_image_edge() -> FailureCase:
     error, fault = max(errors), max(faults)
     return FailureCase(
         "stars on the image's edge",
-        "a star is drawn whole or not, by its centre",
+        "a star drawn whole or not at all, by its centre",
         f"up to {100 * fault:.0f} % of its light too much or too little",
         f"light on the image off by {error:.0e} of the star's",
         "a star is drawn where its footprint touches the image, and cut there",
@@ -272,7 +272,7 @@ def many_stars() -> FailureCase:
     return FailureCase(
         f"{CROWD} stars in view",
         "image[rows, columns] += light",
-        f"{100 * fault:.0f} % of the light lost: an index that comes twice is added once",
+        f"{100 * fault:.0f} % of the light lost: a repeated index is added once",
         f"light off by {error:.0e}; {pixel_error:.0e} of the brightest pixel, over {CORNER_PX} x {CORNER_PX}",
         "the GPU blends every sprite, in float32",
         Figures(max(error, pixel_error), fault, CROWD_ERROR),

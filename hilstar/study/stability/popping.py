@@ -22,7 +22,7 @@ from hilstar.study.shared.codes import AIMS
 from hilstar.study.stability.failure_case import FailureCase, Figures
 from hilstar.study.stability.field import ALIGNED, FOCAL_LENGTH_MM, PITCH_UM
 from hilstar.study.stability.image import POINT_SAMPLED, SIGMA_PX, Draw, by_renderer, point_sampled, target
-from hilstar.units import flux_ratio
+from hilstar.units import flux_ratio, magnitude
 
 STEPS, PATH_PX = 1000, (3.0, 1.7)
 IMAGE_PX = (32, 32)
@@ -78,9 +78,9 @@ def popping() -> FailureCase:
     return FailureCase(
         f"a star over {STEPS} sub-pixel steps, sigma 0.5 px",
         POINT_SAMPLED,
-        f"its light ripples by {100 * fault:.1f} %",
-        f"by {error:.1e} in the linear image",
-        "integrated over pixels, and cut where 1e-6 is left",
+        f"its light varies by {100 * fault:.1f} %",
+        f"varies by {error:.1e} in the linear image",
+        "integrated over pixels, and cut where 1e-6 of the light remains",
         Figures(error, fault, RIPPLE),
     )
 
@@ -88,11 +88,11 @@ def popping() -> FailureCase:
 def popping_codes() -> FailureCase:
     """The same star's light through 8-bit codes."""
     fluxes = [moving_code_fluxes("round"), moving_code_fluxes("exact")]
-    fault, error = (float(2.5 * np.log10(f.max() / f.min())) for f in fluxes)
+    fault, error = (magnitude(float(f.min() / f.max())) for f in fluxes)
     return FailureCase(
         f"the same, {CODES_MAG_UNDER_WHITE:g} mag under white on {CODES_BITS} bits, sigma {SIGMA_PX:g} px",
         'quantisation = "round", the default',
-        f"its light ripples by {fault:.3f} mag",
+        f"its light varies by {fault:.3f} mag",
         f'quantisation = "exact": {error:.3f} mag; write it where that matters',
         "round adds up the errors of its pixels; exact chooses a star's codes together",
         Figures(error, fault, CODES_RIPPLE_MAG),

@@ -44,7 +44,7 @@ OPTICS = study_optics("ccd47-20")
 def bluest_star() -> FailureCase:
     """B-V = -0.4, the bluest of Hipparcos."""
     library = load_library()
-    why = "B-V saturates: there 0.01 mag is thousands of K. Pickles holds its bluest star's spectrum"
+    why = "B-V saturates: there 0.01 mag is thousands of K. Pickles keeps the spectrum of its bluest star"
     return _colour(-0.4, int(np.argmin(library.bv_mag)), BLUE_ERROR, why)
 
 
@@ -52,7 +52,7 @@ def reddest_star() -> FailureCase:
     """B-V = 5.5, past the reddest of Hipparcos."""
     library = load_library()
     plain = np.where(library.vi_mag < 2.0, library.bv_mag, -np.inf)
-    why = "a carbon star's B-V is absorption, not temperature. Without V-I Pickles holds its reddest K giant"
+    why = "a carbon star's B-V is absorption, not temperature. Without V-I Pickles keeps its reddest K giant"
     return _colour(5.5, int(np.argmax(plain)), RED_ERROR, why)
 
 
@@ -84,7 +84,7 @@ def temperature_range() -> FailureCase:
     error, fault = (float(np.abs(table / exact - 1).max()) for table in (ours, straight))
     return FailureCase(
         "T = 1500 to 60000 K",
-        f"a table of {len(knots)} temperatures and straight lines",
+        f"linear interpolation between {len(knots)} temperatures",
         f"off by up to {100 * fault:.0f} %",
         f"off by at most {error:.1e}",
         f"ln(rate) is smooth in 1/T: a Chebyshev series of degree {TABLE_DEGREE} holds it",
@@ -130,7 +130,7 @@ def source_step() -> FailureCase:
         "wang2021, eq. 3.13",
         f"jumps by {kelvin_step:.0f} K, {fault:+.4f} mag",
         ", ".join(f"{name} {mag:+.1e} mag" for name, (_, mag) in jumps.items()),
-        "its two branches do not meet there; the others have one",
+        "its two branches do not meet there; the other scales have one branch",
         Figures(max(abs(mag) for _, mag in jumps.values()), abs(fault), STEP_MAG),
     )
 
@@ -150,9 +150,9 @@ def cool_stars() -> FailureCase:
     return FailureCase(
         f"AGS, stars under {COOL_K:.0f} K",
         "one average for every colour (AGS)",
-        f"off by {100 * fault:.0f} % in the median of {cool.sum()} real spectra, {100 * average.max():.0f} % at worst",
-        f"pickles, the star itself held out: {100 * error:.1f} % in the median, {100 * ours.max():.0f} % at worst",
-        "most of a cool star's light is red of V, where AGS has a body of 9602 K",
+        f"median error {100 * fault:.0f} % over {cool.sum()} real spectra, maximum {100 * average.max():.0f} %",
+        f"pickles, each star held out: median error {100 * error:.1f} %, maximum {100 * ours.max():.0f} %",
+        "most of a cool star's light is redder than V, where AGS assumes a body of 9602 K",
         Figures(error, fault, COOL_MEDIAN),
     )
 

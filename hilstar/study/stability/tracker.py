@@ -1,4 +1,4 @@
-"""Where methods fail in the virtual tracker: very much light, none, no time, and what is no number."""
+"""Where methods fail in the virtual tracker: a great deal of light, none, no exposure, and NaN."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SEED = 1
 SIZE_PX = (64, 64)
 BILLION_E = 1e9
 GAIN_E_PER_DN = 2e4  # 1e9 electrons are 50 000 DN of 16 bits
-STANDARD_ERRORS = 5.0  # a fair figure is further off once in two million runs; the seeds are fixed
+STANDARD_ERRORS = 5.0  # a correct figure exceeds this once in two million runs; the seeds are fixed
 HALF_DN = 0.5  # an ADC's rounding
 NOTHING = 0.0
 BENCH = """
@@ -48,7 +48,7 @@ faintest_v_mag = {faintest_v_mag}
 
 
 def standard_errors(sample: FloatArray, mean: float, sigma: float) -> float:
-    """How many standard errors a sample's mean and sigma are off a normal law's, whichever is more."""
+    """The error of a sample's mean or sigma against a normal law's, whichever is larger, in standard errors."""
     n = sample.size
     return float(max(abs(sample.mean() - mean) / (sigma / n**0.5), abs(sample.std() - sigma) / (sigma / (2 * n) ** 0.5)))
 
@@ -89,7 +89,7 @@ def full_well() -> FailureCase:
         "electrons / gain as uint16",
         f"wraps round to {wrapped[0, 0]} DN",
         f"{dn.max()} DN = {settings.full_well_e:g} e- / {settings.gain_e_per_dn:g}",
-        "charge is cut at the full well, then codes at the last one",
+        "charge is clipped at the full well, then codes at the largest one",
         Figures(error, fault, HALF_DN),
     )
 
@@ -162,6 +162,6 @@ def nan_pixel() -> FailureCase:
         "the centre of gravity of the image",
         f"{centre:g} for one pixel of {image.size}",
         "refused: " + " | ".join(lines),
-        "one NaN is in every sum",
+        "one NaN makes every sum NaN",
         Figures(float(taken), float(np.isnan(centre)), NOTHING),
     )

@@ -82,7 +82,7 @@ def frame_weights(rows: FloatArray, swaps_s: Sequence[float], scan: Scan, span_s
 
 
 class ScanningPanel:
-    """A bench of one way before a panel that scans, and a tracker that looks at it. Free it with `close`."""
+    """A bench that shows on a panel that scans, with one compensation, and a tracker in front of it. Free it with `close`."""
 
     def __init__(self, way: str, path: Path) -> None:
         path.write_text(BENCH.format(monitor=WAYS[way].monitor_keys, motion=WAYS[way].motion))
@@ -98,14 +98,14 @@ class ScanningPanel:
         self.panel = self.bench.panel
 
     def attitude(self, slew: Slew, swap_s: float) -> Attitude:
-        """What the display makes of the packets that have come when it begins the frame of a swap."""
+        """The attitude that the display derives from the packets received when it starts the frame of a swap."""
         timeline = slew.packets_until(swap_s - DRAW_TO_SWAP_S)
         light_s = swap_s + self.period_s / 2
         if self.way == "no prediction":
             light_s = math.floor((swap_s - DRAW_TO_SWAP_S) * PACKET_HZ) / PACKET_HZ
         attitude = timeline.at(round(light_s * NS_PER_S))
         if attitude is None:
-            raise AssertionError("packets have come")
+            raise AssertionError("the timeline has packets")
         return attitude
 
     def draw(self, attitude: Attitude, number: int) -> FloatArray:
@@ -128,7 +128,7 @@ class ScanningPanel:
         return self.optics.image_e_per_s(light)
 
     def cost_ms(self, slew: Slew) -> float:
-        """Median time of drawing a frame, attitude in to codes ready."""
+        """Median time of drawing a frame, from its attitude to its codes, ms."""
         attitude = self.attitude(slew, 0.0)
         rate = attitude.rate_cam_rad_s if self.bench.config.render.motion == "on" else None
         times = []

@@ -30,7 +30,7 @@ ISOLATION = Isolation(margin_px=8.0, max_share=1e-3)
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """One way at one rate: errors of the tracker's centroids, arcsec, their rms and worst, of flux, mag rms; time to draw."""
+    """One compensation at one rate: rms and largest error of centroids, arcsec, rms flux error, mag, and drawing time, ms."""
 
     way: str
     rate_deg_s: float
@@ -42,7 +42,7 @@ class Outcome:
 
 
 def compare(panel: ScanningPanel, sky: Sky, slew: Slew) -> Outcome:
-    """One way on one slew, against the sky."""
+    """One compensation on one slew, against the sky."""
     shown, true = panel.exposed_e_per_s(slew), sky.exposed_e_per_s(slew)
     camera: Camera = panel.camera
     flux_mag, off_px = [], []
@@ -70,28 +70,28 @@ def _opened() -> Iterator[tuple[list[ScanningPanel], Sky]]:
 
 
 def measure(quick: bool = False) -> list[Outcome]:
-    """Every way at every rate."""
+    """Every compensation at every rate."""
     with _opened() as (panels, sky):
         rates = QUICK_RATES_DEG_S if quick else RATES_DEG_S
         return [compare(panel, sky, Slew(rate)) for rate in rates for panel in panels]
 
 
 def run(directory: Path, quick: bool = False) -> list[str]:
-    """Measure, and write `timing.csv` and `timing.png`; what was found. Raises InputError where they cannot be written."""
+    """Measure, and write `timing.csv` and `timing.png`; the findings, a line each. Raises InputError."""
     outcomes = measure(quick)
     write_records(directory / "timing.csv", outcomes)
     at = {(o.way, o.rate_deg_s): o for o in outcomes}
     plain, best = (at[way, 2.0] for way in ("prediction", "+ smear"))
     finding = (
-        f"At 2 deg/s on a 60 Hz panel and 0.1 s of exposure a star is {plain.rms_arcsec:.0f} arcsec off with prediction alone, "
-        f"{best.rms_arcsec:.2g} with each row at its own moment and paths within the frame"
+        f"At 2 deg/s on a 60 Hz panel, with an exposure of 0.1 s, star positions are off by {plain.rms_arcsec:.0f} arcsec rms "
+        f"with prediction alone, and by {best.rms_arcsec:.2g} with scan-out and smear compensated"
     )
     _draw(directory / "timing.png", finding, outcomes)
     return [finding, *(_line(at[way, 2.0]) for way in WAYS)]
 
 
 def _line(outcome: Outcome) -> str:
-    errors = f"{outcome.rms_arcsec:.3g} arcsec rms, {outcome.worst_arcsec:.3g} at worst, {outcome.flux_rms_mag:.2g} mag rms"
+    errors = f"{outcome.rms_arcsec:.3g} arcsec rms, {outcome.worst_arcsec:.3g} maximum, {outcome.flux_rms_mag:.2g} mag rms"
     return f"{outcome.way}: {errors}, {outcome.draw_ms:.1f} ms a frame ({outcome.stars} stars)"
 
 
@@ -102,9 +102,9 @@ def _draw(path: Path, finding: str, outcomes: list[Outcome]) -> None:
             rates = [o.rate_deg_s for o in mine]
             error.loglog(rates, [o.rms_arcsec for o in mine], marker=marker, label=way)
             cost.semilogx(rates, [o.draw_ms for o in mine], marker=marker, label=way)
-        error.set_ylabel("star position error, arcsec rms")
+        error.set_ylabel("error of star positions [arcsec rms]")
         error.legend(loc="upper left")
-        cost.set_ylabel("time to draw a frame, ms")
+        cost.set_ylabel("time to draw a frame [ms]")
         cost.set_ylim(bottom=0)
-        cost.set_xlabel("slew rate, deg/s")
+        cost.set_xlabel("slew rate [deg/s]")
         plain_ticks(cost.xaxis, sorted({o.rate_deg_s for o in outcomes}))

@@ -14,7 +14,7 @@ from hilstar.rotation import from_radec_roll_deg, propagate
 from hilstar.units import NS_PER_S
 
 AXIS = np.array([0.6, 0.8, 0.0])  # across rows and columns
-RADEC_ROLL_DEG = (84.0, 0.0, 15.0)  # Orion: stars enough that are bright
+RADEC_ROLL_DEG = (84.0, 0.0, 15.0)  # Orion: enough bright stars
 PACKET_HZ = 200.0
 
 
@@ -34,7 +34,7 @@ class Slew:
         return propagate(from_radec_roll_deg(*RADEC_ROLL_DEG), self.rate_cam_rad_s, seconds)
 
     def packets_until(self, seconds: float) -> Timeline:
-        """What has come by then."""
+        """The packets received by then."""
         timeline = Timeline(Policy(NS_PER_S, NS_PER_S))
         last = math.floor(seconds * PACKET_HZ)
         for number in range(last - 3, last + 1):

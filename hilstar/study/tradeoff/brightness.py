@@ -67,12 +67,12 @@ def brightness(stack: ExitStack, quick: bool) -> Trials:
         trials.append(Trial(name, float(error.max()), float(np.median(error)), work, own, exact_one))
     return Trials(
         "brightness",
-        f"{COLOURS} black bodies, any table made anew",
+        f"{COLOURS} black bodies, tables included",
         Figure("error of the integral, worst colour", "mag", ROUNDING_MAG),
         Figure("median colour", "mag"),
-        "made once, it serves every star of a catalogue, whatever the sensor's curves",
+        "made once, it serves every star of a catalogue, for any curves of the sensor",
         trials,
-        f"a bench asks for {len(load_catalog())} stars at most, and for each once: this time is paid when it is loaded",
+        f"a bench asks for at most {len(load_catalog())} stars, each once: this time is spent when it is loaded",
     )
 
 

@@ -57,8 +57,8 @@ def culling(stack: ExitStack, quick: bool) -> Trials:
         "culling",
         f"{len(stars)} stars to the {len(in_view[0])} sprites of Orion",
         Figure(f"stars missed in {len(turns)} fields", "stars", 0.1),
-        Figure("looked at in vain, mean", "stars"),
-        "a smaller cell hands on fewer stars where the field is rich, a larger one costs less where it is poor",
+        Figure("tested but not in view, mean", "stars"),
+        "a smaller cell passes on fewer stars in a rich field, a larger one costs less in a sparse one",
         trials,
     )
 

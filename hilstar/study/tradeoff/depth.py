@@ -48,7 +48,7 @@ def depth(stack: ExitStack, quick: bool) -> Trials:
         Figure("sprites in the frame", "stars"),
         "Hipparcos is complete to about V = 7.5",
         trials,
-        "stars that Hipparcos lacks are in no figure: it is complete to V = 7.3 to 9, by place and type (ESA SP-1200)",
+        "stars missing from Hipparcos are in no figure; it is complete to V = 7.3 to 9, by position and type (ESA SP-1200)",
     )
 
 

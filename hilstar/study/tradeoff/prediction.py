@@ -32,7 +32,7 @@ PREDICTIONS = 60
 
 
 def prediction(stack: ExitStack, quick: bool) -> Trials:
-    """Where the camera points when the light comes, past the newest sample: worst and rms error, arcsec, on a shaken slew."""
+    """The attitude at the moment of light, after the newest sample: worst and rms error, arcsec, on a shaken slew."""
     del stack
     samples = [slew_sample(k * SAMPLE_MS * NS_PER_MS) for k in range((10 if quick else 60) * 1000 // SAMPLE_MS)]
     frames_ns = np.linspace(0, SAMPLE_MS * NS_PER_MS, PREDICTIONS, dtype=np.int64) + samples[-2].t_ns
@@ -48,11 +48,11 @@ def prediction(stack: ExitStack, quick: bool) -> Trials:
         f"{PREDICTIONS} attitudes, samples every {SAMPLE_MS} ms",
         Figure("attitude error, worst", "arcsec"),
         Figure("rms", "arcsec"),
-        "it asks for nothing but the newest sample",
+        "it needs nothing but the newest sample",
         trials,
         f"a swing of {SLEW_DEG:g} degrees in {SLEW_S:g} s, shaken on each axis by {shaken};"
-        f" to wait for a sample makes the attitude {SAMPLE_MS} ms older;"
-        " hold, the linear ones and the blend go through the timeline that threads share, the two others are bare",
+        f" waiting for a sample makes the attitude {SAMPLE_MS} ms older;"
+        " the times of hold, of the linear predictors and of the blend include the timeline, those of the other two do not",
     )
 
 

@@ -47,9 +47,9 @@ def projection(stack: ExitStack, quick: bool) -> Trials:
     return Trials(
         "projection",
         f"{len(views[0][0])} stars near the field to sprites, {camera.resolution_px[0]} x {camera.resolution_px[1]}",
-        Figure("place error, worst star", "px", ROUNDING_PX),
+        Figure("position error, worst star", "px", ROUNDING_PX),
         Figure("rms", "px"),
-        "a GPU of OpenGL 3.3 takes no float64, and a float32 place is worse the larger the monitor",
+        "OpenGL 3.3 takes no float64, and the error of a float32 position grows with the monitor",
         trials,
     )
 

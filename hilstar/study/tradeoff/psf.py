@@ -18,7 +18,7 @@ from hilstar.scene.psf import MAX_CUT, footprint_px, peak_share
 from hilstar.scene.sprites import Sprites, pack_sprites
 from hilstar.study.shared.codes import FRAME_PX, STARS, star_field
 from hilstar.study.tradeoff.table import Figure, Trial, Trials
-from hilstar.units import flux_ratio
+from hilstar.units import flux_ratio, magnitude
 
 SIGMA_PX = RenderSettings().sprite_sigma_px
 PHASES = 16
@@ -42,7 +42,7 @@ def psf(stack: ExitStack, quick: bool) -> Trials:
         f"linear image of {STARS} stars, {FRAME_PX[0]} x {FRAME_PX[1]}",
         Figure("flux error, worst", "mag", ROUNDING_MAG),
         Figure("centroid error, worst", "px"),
-        "what lies so near changes places from run to run; the default has the smallest footprint that cuts at most"
+        "methods this close change order from run to run; the default has the smallest footprint that cuts at most"
         f" {MAX_CUT:g} of a star's light at any phase, and needs no table",
         trials,
         _centre_remark(),
@@ -50,17 +50,17 @@ def psf(stack: ExitStack, quick: bool) -> Trials:
 
 
 def _centre_remark() -> str:
-    """What the two sums do not say of a profile taken at the pixels' centres."""
+    """What the two sums hide of a profile that is sampled at pixel centres."""
 
     def flux(sigma_px: float, phase_px: np.ndarray) -> FloatArray:
         offset_px = np.arange(-TILE_PX, TILE_PX + 1) - phase_px[:, None]
         return np.asarray((np.exp(-0.5 * (offset_px / sigma_px) ** 2) / (sigma_px * np.sqrt(2 * np.pi))).sum(axis=1))
 
     excess = 1 / (2 * np.pi * SIGMA_PX[0] * SIGMA_PX[1] * peak_share(SIGMA_PX)) - 1
-    worst = np.abs(2.5 * np.log10(flux(SMALL_SIGMA_PX, np.arange(PHASES) / PHASES) ** 2)).max()
+    worst = np.abs(magnitude(flux(SMALL_SIGMA_PX, np.arange(PHASES) / PHASES) ** 2)).max()
     return (
-        f"a pixel's centre gives a wide star the right sum and the wrong shape: its middle pixel is {100 * excess:.0f} % too"
-        f" bright, and at sigma {SMALL_SIGMA_PX:g} px its flux is off by {worst:.2f} mag"
+        f"sampling at pixel centres gives a wide star the right sum and the wrong shape: its middle pixel is"
+        f" {100 * excess:.0f} % too bright, and at sigma {SMALL_SIGMA_PX:g} px its flux is off by {worst:.2f} mag"
     )
 
 

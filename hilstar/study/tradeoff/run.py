@@ -72,12 +72,12 @@ def run(directory: Path, quick: bool = False) -> list[str]:
             steps.append(measured(plan(stack, quick), QUICK_BUDGET_S if quick else BUDGET_S))
         draw(directory / f"tradeoff_{steps[-1].name}.png", steps[-1], machine)
     write_csv(directory / "tradeoff.csv", COLUMNS, [cells(step, row) for step in steps for row in step.rows])
-    head = f"medians on {machine}; * nothing is as right, by the first figure, and as fast; > hilstar's default"
+    head = f"medians on {machine}; * no method is both as accurate (by the first figure) and as fast; > hilstar's default"
     return [head, *(line for step in steps for line in table_lines(step))]
 
 
 def this_machine() -> str:
-    """What the times are true of."""
+    """The machine and GL that the times hold for."""
     with Renderer(Target((8, 8), SIGMA_PX)) as renderer:
         return f"{renderer.gl_renderer}, {os.cpu_count()} cores"
 
@@ -114,9 +114,11 @@ def finding(step: Step) -> str:
     """What a chart says in its title."""
     own, exact = step.default, next((row for row in step.rows if row.is_exact), None)
     right = own.error <= step.error.floor
-    text = f"{step.name}, {step.work}: '{own.method}' is {'right' if right else 'off by ' + said(own.error, step.error)}"
-    compared = "" if exact is None else f", '{exact.method}' takes {exact.time_ms:.3g} ms"
-    return f"{text} in {own.time_ms:.3g} ms{compared}"
+    text = (
+        f"{step.name}, {step.work}: '{own.method}' has {'no error' if right else 'an error of ' + said(own.error, step.error)}"
+    )
+    compared = "" if exact is None else f"; '{exact.method}' takes {exact.time_ms:.3g} ms"
+    return f"{text} and takes {own.time_ms:.3g} ms{compared}"
 
 
 def said(value: float, figure: Figure) -> str:
@@ -125,7 +127,7 @@ def said(value: float, figure: Figure) -> str:
 
 
 def draw(path: Path, step: Step, machine: str) -> None:
-    """Error against time on logarithmic axes, the front as a line, the default ringed, every method named at the side."""
+    """Draw error against time on logarithmic axes: the front as a line, the default ringed, every method named at the side."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure as Canvas
 
@@ -135,7 +137,9 @@ def draw(path: Path, step: Step, machine: str) -> None:
         axis = canvas.subplots()
         shown = {row.method: (row.time_ms, max(row.error, floor)) for row in step.rows}
         front = [shown[row.method] for row in step.rows if row.on_front]
-        axis.step(*np.array(front).T, where="post", color="C0", lw=1.4, label="front: nothing is as right and as fast")
+        axis.step(
+            *np.array(front).T, where="post", color="C0", lw=1.4, label="front: no other method is as accurate and as fast"
+        )
         for row in step.rows:
             colour = "C0" if row.on_front else "C7"
             axis.plot(row.quartiles_ms, [shown[row.method][1]] * 2, color=colour, lw=3.5, alpha=0.4, solid_capstyle="butt")
@@ -143,7 +147,7 @@ def draw(path: Path, step: Step, machine: str) -> None:
         own = step.default
         axis.plot(*shown[own.method], "o", ms=15, mfc="none", mec="C3", mew=2.0, zorder=4, label="hilstar's default")
         if any(row.error < floor for row in step.rows):
-            axis.axhline(floor, color="0.5", ls=":", lw=1.2, label=f"no error: under {said(floor, step.error)}")
+            axis.axhline(floor, color="0.5", ls=":", lw=1.2, label=f"counts as no error: below {said(floor, step.error)}")
         axis.set(xscale="log", yscale="log", xlabel=f"median time [ms], bar: quartiles; {machine}")
         axis.set(ylabel=f"{step.error.name} [{step.error.unit}]")
         axis.margins(0.06, 0.08)
@@ -156,7 +160,7 @@ def draw(path: Path, step: Step, machine: str) -> None:
 
 
 def round_ticks(low: float, high: float) -> list[float]:
-    """Ticks of a logarithmic axis: some of each power of ten, over many powers the ones alone, and not all of them."""
+    """Round ticks of a logarithmic axis: several in each power of ten, or for a long axis only some of the powers."""
     first, last = math.floor(math.log10(low)), math.ceil(math.log10(high))
     steps = (1, 2, 3, 4, 5, 7) if high < 10 * low else (1, 2, 5) if last - first <= 3 else (1,)
     every = -(-(last - first) // MAX_POWERS)

@@ -56,9 +56,9 @@ def smear(stack: ExitStack, quick: bool) -> Trials:
     return Trials(
         "smear",
         f"linear image of {len(many)} stars, paths of {paths.min():.0f} to {paths.max():.0f} px, {SIZE_PX} px squared",
-        Figure("worst pixel's error, share of its star", "1", ROUNDING_SHARE),
+        Figure("largest pixel error, share of its star", "1", ROUNDING_SHARE),
         Figure("centroid error, worst", "px"),
-        "it keeps its error on paths of any length, where a fixed number does not",
+        "its error does not grow with the path, as that of a fixed number does",
         trials,
     )
 
@@ -69,7 +69,7 @@ SpritesOf = Callable[[Stars, Motion], Sprites]
 def smear_methods(stars: Stars, motion: Motion) -> dict[str, SpritesOf]:
     """Every way by name: sprites of stars over an exposure."""
     mean = len(own_sprites(stars, motion)) / len(stars)
-    methods: dict[str, SpritesOf] = {f"Gauss-Legendre by length, {mean:.0f} in the mean": own_sprites}
+    methods: dict[str, SpritesOf] = {f"Gauss-Legendre by length, {mean:.0f} on average": own_sprites}
     methods |= {gauss_name(count): partial(gauss_sprites, count) for count in (*GAUSS, EXACT_NODES)}
     return methods | {f"evenly in time, {count}": partial(even_sprites, count) for count in EVENLY}
 

@@ -59,7 +59,7 @@ def spectrum(stack: ExitStack, quick: bool) -> Trials:
     trials.append(trial("AGS, one average", ags(), ags, ("ags",)))
     return Trials(
         "spectrum",
-        f"{len(zero)} stars by a table that is there",
+        f"{len(zero)} stars by a table made before",
         Figure("error of the electron rate, 95 % of library stars", "mag", LIBRARY_MAG),
         Figure("median star", "mag"),
         "a catalogue has colours and no spectra",

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-# A work is timed at least so often, and at most so often whatever the budget: more rounds move no median.
+# Rounds of a work, whatever the budget: more than the maximum move no median.
 MIN_ROUNDS = 3
 MAX_ROUNDS = 500
 SEED = 1
@@ -17,7 +17,7 @@ SEED = 1
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """What is measured of a method: a name and its unit; figures under `floor` count as none at all."""
+    """What is measured of a method: a name and its unit; figures under `floor` count as 0."""
 
     name: str
     unit: str
@@ -28,7 +28,7 @@ class Figure:
 class Trial:
     """A method to be timed: its error and a second figure, in the units of its `Trials`, and the work itself.
 
-    An exact one is what the others are measured against, or as right as that.
+    The exact one is what the others are measured against.
     """
 
     method: str
@@ -57,9 +57,9 @@ class Trials:
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A method as measured: median time and its quartiles, ms; `on_front` where none is as right and as fast.
+    """A method as measured: median time and its quartiles, ms; `on_front` where no other is both as accurate and as fast.
 
-    `beaten` says by what the default is beaten, and why it stays the default; empty for all others.
+    `beaten` says what beats the default and why it stays the default; it is empty for all others.
     """
 
     method: str
@@ -105,9 +105,9 @@ def measured(trials: Trials, budget_s: float) -> Step:
 
 
 def interleaved(works: Sequence[Callable[[], object]], budget_s: float) -> list[list[float]]:
-    """Times of each work, ms, in rounds so that a noisy machine is noisy to all; slow works drop out of later rounds.
+    """Times of each work, ms, in rounds, so that other load on the machine affects all; slow works skip later rounds.
 
-    Each round has its own order: no work always follows the one that leaves the caches and the other cores worst.
+    Each round has its own order, so that no work always follows the same one.
     """
     for work in works:
         work()  # a first call compiles shaders and fills caches
@@ -139,5 +139,5 @@ def _with_reason(row: Row, rows: Sequence[Row], trials: Trials) -> Row:
     best = min(beating, key=lambda r: r.time_ms)
     saved = 100 * (1 - best.time_ms / row.time_ms)
     noise = ", and the quartiles of both overlap" if best.quartiles_ms[1] >= row.quartiles_ms[0] else ""
-    beaten = f"'{best.method}' is no worse and {saved:.0f} % faster{noise}; {trials.why_default}"
+    beaten = f"'{best.method}' is no worse and takes {saved:.0f} % less time{noise}; {trials.why_default}"
     return replace(row, beaten=beaten)

@@ -8,7 +8,6 @@ import json
 import re
 import shlex
 import signal
-import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -22,6 +21,8 @@ from hilstar.cli.app import app
 from hilstar.cli.entry import with_shares
 from tests.docs.pages import Block, blocks_of, differs
 from tests.support.benches import ROOT, SMALL_BENCH
+from tests.support.senders import free_port
+from tests.support.waiting import wait_for
 
 DOCS = sorted((ROOT / "docs").glob("*.md"))
 PAGES = [*DOCS, ROOT / "README.md", ROOT / "configs" / "README.md", ROOT / "configs" / "CALIBRATION.md"]
@@ -29,14 +30,13 @@ PAGES += [ROOT / "firmware_protocol" / "README.md", ROOT / "CONTRIBUTING.md"]
 EXAMPLES = {page: blocks for page in PAGES if (blocks := blocks_of(page.read_text()))}
 LANGUAGES = {"console", "python", "toml", "json", "text", "c"}  # no other shell's name: a console block is run
 DEFAULT_PORT = "5560"
+LISTEN = "0A"  # a state of /proc/net/tcp
 
 
 @pytest.fixture
 def port() -> str:
     """A free port in the place of the default one, so that pages may be tested side by side."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        return str(free.getsockname()[1])
+    return str(free_port())
 
 
 @pytest.fixture
@@ -102,6 +102,8 @@ def type_in(block: Block, port: str) -> None:
                 words += ["--to", f"tcp://127.0.0.1:{port}"]
             if step.beside:
                 beside.enter_context(running(words))
+                if words[:2] == ["hilstar", "send"]:  # a busy machine takes seconds to start it
+                    wait_for(lambda: listens(int(port)), f"$ {step.command}")
                 continue
             printed = hilstar(words[1:]) if words[0] == "hilstar" else other_program(words)
             if step.printed:
@@ -131,6 +133,12 @@ def running(words: list[str]) -> Iterator[None]:
             yield
         finally:
             process.send_signal(signal.SIGTERM)
+
+
+def listens(port: int) -> bool:
+    """Whether somebody listens on a port of this machine; to connect would be to be taken for a listener."""
+    lines = Path("/proc/net/tcp").read_text().splitlines()[1:]
+    return any(line.split()[1].endswith(f":{port:04X}") and line.split()[3] == LISTEN for line in lines)
 
 
 def test_what_is_not_run_says_why():

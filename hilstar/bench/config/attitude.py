@@ -11,7 +11,7 @@ from hilstar.toml_tables import Table
 
 
 class AttitudeSettings(Table, frozen=True):
-    """Where the attitude comes from, and what is shown when it does not come.
+    """Where the attitude comes from, and what is shown without one.
 
     The packets, and what each side may expect of the other, are in [firmware_protocol](../firmware_protocol/README.md).
 

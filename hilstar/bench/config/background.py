@@ -11,7 +11,10 @@ from hilstar.toml_tables import Table
 
 
 class Background(Table, frozen=True):
-    """Light between the stars. Only the virtual tracker sees it; the monitor shows none. Give one of the first two keys."""
+    """Light between the stars. Only the virtual tracker sees it; the monitor shows none.
+
+    Give at most one of the first two keys.
+    """
 
     electrons_per_px: Annotated[
         NotNegative | None,

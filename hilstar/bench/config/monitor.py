@@ -17,14 +17,14 @@ class Monitor(Table, frozen=True):
     """The screen behind the collimator.
 
     The window opens for `serve` and `replay` unless `--headless` is given; `--windowed` keeps it on the desktop. At the start
-    120 frames are measured. A display is refused (exit code 3), unless `--force` is given, when it has another size, is
-    scaled, composited or mirrored by another display, has fewer bits, drops frames, does not wait for its refresh, or
-    refreshes at another rate. Keys in the window: q quit, b blank, space pause, c crosshair, g grid, t next test pattern,
-    h help. A display that is unplugged is filled again when it returns.
+    120 frames are measured. A display is refused (exit code 3), unless `--force` is given, when its size or refresh rate
+    differs from the bench file, when it has fewer bits, when it is scaled, composited or mirrored by another display, when it
+    drops frames, or when it does not wait for its refresh. A display that is unplugged is filled again when it returns.
 
-    What those keys change of the sky is counted as `operator`; a window that is minimised, covered, moved off its display,
-    or on a display that sleeps is counted as `hidden`. Both are in the status, in the ledger's frames and events, and in
-    `--json`: how many frames, and for how many seconds.
+    Keys in the window: q quit, b blank, space pause, c crosshair, g grid, t next test pattern, h help. Frames whose sky was
+    changed with these keys are counted as `operator`; frames while the window was minimised, covered, moved off its display,
+    or on a display that slept are counted as `hidden`. The status, the ledger's frames and events, and `--json` have both
+    counts, in frames and in seconds.
 
     A frame is drawn for the moment at which the middle row lights: the buffer swap plus `panel_delay_ms` plus half of
     `scanout_ms`. A star on another row is drawn where it is when that row lights, and along its path for `hold_ms`.
@@ -68,7 +68,7 @@ class Monitor(Table, frozen=True):
     ] = None
     hold_ms: Annotated[
         NotNegative | None,
-        Meta(description="How long a row keeps its light; 0 for a panel that flashes.", extra=ONE_PERIOD),
+        Meta(description="How long a row stays lit; 0 for a panel that flashes.", extra=ONE_PERIOD),
     ] = None
     photodiode_px: Annotated[
         int, Meta(ge=0, le=1000, description="Side of a square for a photodiode in the lower left corner; 0 for none.")

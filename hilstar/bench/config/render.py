@@ -89,8 +89,8 @@ class RenderSettings(Table, frozen=True):
     motion: Annotated[
         Literal["auto", "on", "off"],
         Meta(
-            description='Stars are drawn along their paths, each row for its own moment. `"auto"`: on a screen only. `"on"`: '
-            'headless too. `"off"`: never.'
+            description='Whether stars are drawn along their paths, each row at its own moment. `"auto"`: on a screen only. '
+            '`"on"`: headless too. `"off"`: never.'
         ),
     ] = "auto"
     motion_above_px: Annotated[

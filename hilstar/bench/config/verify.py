@@ -67,7 +67,7 @@ class Verify(Table, frozen=True):
     black_e_per_s_px: Annotated[
         NotNegative | None,
         Meta(
-            description="Limit for the screen's black level in a tracker pixel, as seen less as assumed.",
+            description="Limit for the screen's black level in a tracker pixel, seen minus assumed.",
             extra={"default": "a tenth of the faintest star's light over its disc (4 pi sigma^2)"},
         ),
     ] = None

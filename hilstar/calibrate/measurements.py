@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import f as f_distribution
 
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.errors import InputError, shortened
@@ -200,12 +199,14 @@ def _pooled(squares: FloatArray, mean: FloatArray, count: IntArray, bright: npt.
 
 def _additive(squares: FloatArray, mean: FloatArray, count: IntArray, relative: float) -> float:
     """The instrument's floor, in its unit, where the faintest third (black too) scatters more than `relative` explains."""
+    from scipy.special import fdtri  # F's quantile; scipy.stats has the same one and takes half a second to import
+
     faint = (np.arange(len(mean)) <= len(mean) // 3) & (count > 1)
     dof = int((count[faint] - 1).sum())
     if not dof or math.isnan(relative):
         return 0.0
     expected = float(((relative * mean[faint]) ** 2 * (count[faint] - 1)).sum())
-    if float(squares[faint].sum()) <= expected * f_distribution.ppf(FAINT_ALARM, dof, BRIGHT_DOF * 2):
+    if float(squares[faint].sum()) <= expected * fdtri(dof, BRIGHT_DOF * 2, FAINT_ALARM):
         return 0.0
     return math.sqrt((float(squares[faint].sum()) - expected) / dof)
 

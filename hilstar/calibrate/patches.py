@@ -7,6 +7,7 @@ import math
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -17,8 +18,10 @@ from hilstar.calibrate.plan import Patch
 from hilstar.errors import InputError, MachineError
 from hilstar.files import make_directory
 from hilstar.monitor.response import code_dtype
-from hilstar.monitor.window.window import Window, WindowSettings
 from hilstar.render.presenter import Presenter, View, level_texture, window_context
+
+if TYPE_CHECKING:
+    from hilstar.monitor.window.window import Window
 
 KEY_POLL_S = 0.02
 PATCH_SHARE = 1 / 3  # of the screen's smaller side
@@ -57,6 +60,8 @@ def show_patches(planned: Sequence[Patch], bits: int, display: int | str, second
 
     Raises MachineError without a display or where that goes away, InputError for one that is not there.
     """
+    from hilstar.monitor.window.window import Window, WindowSettings
+
     with Window(WindowSettings((640, 480), bits, display)) as window:
         size_px = window.size_px
         square = (patch_image(Patch(1, "w"), size_px, 8) > 0).astype(np.uint8)

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from PIL import Image
 
 from hilstar.bench.frame_files import sky_header
 from hilstar.files import written
@@ -39,10 +38,14 @@ def write_exposure_fits(path: Path, simulator: Simulator, exposure: Exposure, no
 
 def write_exposure_png(path: Path, dn: npt.NDArray[np.uint16]) -> None:
     """A picture of a tracker's frame for a person (see `twin.picture`)."""
+    from PIL import Image
+
     written(path, lambda part: Image.fromarray(exposure_picture(dn)).save(part, "PNG"))
 
 
 def write_dn_picture(path: Path, dn: npt.NDArray[np.uint16]) -> None:
     """The DN themselves, unscaled, as greyscale of 16 bits: TIFF where the name ends in .tif or .tiff, else PNG."""
+    from PIL import Image
+
     form = "TIFF" if path.suffix.lower() in {".tif", ".tiff"} else "PNG"
     written(path, lambda part: Image.fromarray(dn).save(part, form))

@@ -1,4 +1,4 @@
-"""One key of a bench file set, and all else left as it stands, comments included."""
+"""One key of a bench file set, and everything else kept, comments included."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import re
 def with_key(text: str, table: str, key: str, value: float, instead_of: tuple[str, ...] = ()) -> str:
     """TOML `text` with `key` of a plain `[table]` set: its line replaced, or that of a key in `instead_of`, or one added.
 
-    Who writes the table in another form gets a text that says something else: read it again.
+    Where the table is written in another TOML form, the result means something else: parse it again to see.
     """
     line = f"{key} = {value!r}"
     header = re.search(rf"^[ \t]*\[{table}\][^\n]*\n?", text, re.MULTILINE)

@@ -34,7 +34,7 @@ PRIOR_SLOPE_SIGMA = 0.5  # of the exponent, for the shape that has it apart
 LOG_STIFFNESS = np.arange(-26.0, 15.0, 2.0)
 MAX_STEPS = 20
 SETTLED = 1e-6  # of log light
-STIFFNESS_STEPS = 8  # the stiffness is chosen anew in so many steps, then held
+STIFFNESS_STEPS = 8  # in each of the first ones the stiffness is chosen anew
 ASSUMED_NOISE = 0.01  # where nothing was repeated, until the residuals say
 BLACK_FLOOR = 1e-6  # of white: how well a black level of zero is known
 MIN_RISE = 1e-6  # relative, between neighbouring codes: see `strictly_rising`
@@ -44,7 +44,7 @@ MIN_STEP = 1e-12  # of white: it survives a black level a thousand times as brig
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """What the spline departs from, over what it runs, and what its penalty leaves alone."""
+    """The base that the spline corrects, its coordinate, and the order of the derivative that is penalised."""
 
     name: str
     base: Curve

@@ -110,7 +110,7 @@ class Beat:
 class LatencySummary:
     """The figures of `hilstar latency`; its fields are the keys of the JSON object.
 
-    `swap_to_square_ms` is the scan-out as far as the square, `panel_delay_ms` the rest of the median latency: the panel's own.
+    `swap_to_square_ms` is the scan-out down to the square, `panel_delay_ms` the rest of the median latency: the panel's own.
     """
 
     edges: int

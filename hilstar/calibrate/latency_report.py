@@ -1,4 +1,4 @@
-"""What `hilstar latency` says: figures for a person, and a chart."""
+"""The latency of a run: its figures for a person, and a chart."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Measured patches: the file, and the reasons for which a set of measurements is refused."""
+"""Measured patches: the file, and why a set of measurements is refused."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ FALSE_ALARM_SIGMA = 4.0  # one run in some hundreds is refused for noise alone, 
 MIN_DRIFT = 0.005  # over the run; less does no harm beside 1 % of noise
 BRIGHT_DOF = 8
 FAINT_ALARM = 0.999  # of the F distribution, before additive noise is believed
-NOISE_FLOOR = 1e-4  # relative; nobody's photometer repeats better
+NOISE_FLOOR = 1e-4  # relative; no photometer repeats better
 CLIPPED_VALUES = 3  # equal largest readings, over two codes or more
 
 
@@ -171,7 +171,7 @@ def _number(place: str, name: str, text: str) -> float:
 
 
 def _clipped(code: IntArray, reading: FloatArray) -> list[int]:
-    """The codes that share the largest reading, if there are several and it is read often: an instrument at its limit."""
+    """The codes that share the largest reading, if there are several and it was read often: an instrument at its limit."""
     at_limit = reading == reading.max()
     codes = np.unique(code[at_limit])
     return [int(c) for c in codes] if len(codes) > 1 and at_limit.sum() >= CLIPPED_VALUES else []

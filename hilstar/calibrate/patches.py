@@ -56,7 +56,7 @@ def write_patches(folder: Path, planned: Sequence[Patch], resolution_px: tuple[i
 
 
 def show_patches(planned: Sequence[Patch], bits: int, display: int | str, seconds: float | None) -> int:
-    """Show each patch on a display until space is pressed, or for so many seconds; q quits. Returns how many were shown.
+    """Show each patch on a display until space is pressed, or for `seconds`; q quits. Returns how many were shown.
 
     Raises MachineError without a display or where that goes away, InputError for one that is not there.
     """

@@ -39,7 +39,7 @@ def draw(path: Path, comparison: SkyComparison) -> None:
 
 
 class _Panel:
-    """Errors and limits of one kind; stars that only one image has stand in rows above."""
+    """Errors and limits of one kind; stars that only one image has are in rows above."""
 
     def __init__(self, comparison: SkyComparison, unit: str) -> None:
         common = comparison.common

@@ -1,6 +1,6 @@
 """What most stars of two images differ by together: all shifted, turned, scaled, dimmer; and which stars differ from that.
 
-Missing stars are matched with extra ones first: an image that is shifted by more than a star's width has no star in place.
+Missing stars are matched with extra ones first: after a shift by more than a star's width no star is in its place.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class CommonChange:
     """What is common: shift in the middle of the image, px, turn and scale there, and magnitudes (positive: too faint).
 
     A figure is 0 where the stars do not have it in common.
-    `beyond` are the stars of both images once that is taken off, `alone` those that only one image has. Stars that the shift
+    `beyond` are the stars of both images once that is subtracted, `alone` those that only one image has. Stars that the shift
     brought into view or took out of it are in neither.
     """
 
@@ -142,7 +142,7 @@ def _places(stars: list[StarDifference]) -> FloatArray:
 
 
 def _common_flux_mag(both: list[StarDifference]) -> float:
-    """The median flux error, where it is over the limit and most of the median star's own error; else 0."""
+    """The median flux error, where it exceeds the limit and makes up more than half of the median star's error; else 0."""
     flux_mag = np.array([star.flux_error_mag for star in both])
     common = float(np.median(flux_mag))
     left = float(np.median(np.abs(flux_mag - common)))

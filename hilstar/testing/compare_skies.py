@@ -1,4 +1,4 @@
-"""Two images of one sky, star by star: what a change of driver may do, and what it may not.
+"""Two images of one sky, star by star: what a change of driver may change, and what it may not.
 
 Stars are found in the golden image and fitted in both (see star_fit). Where the rounding of the light around a star limits
 how well a fit knows it, that star's limits are wider.
@@ -75,7 +75,7 @@ def check_skies(frame: FloatArray, golden: FloatArray) -> None:
 
 
 def _measurable(golden: FloatArray, seeds: Seeds, sigma_px: tuple[float, float]) -> tuple[Seeds, int]:
-    """The seeds whose light can be told from the rounding of their neighbours', at their places; and how many stars cannot."""
+    """The seeds, refined, whose light exceeds the rounding of their neighbours'; and how many stars do not."""
     count, shape = seeds.stars, (golden.shape[0], golden.shape[1])
     seeds = _in_view(seeds, sigma_px, shape)
     seeds = _in_view(Seeds(refined(golden, seeds.places_px, sigma_px), seeds.hip), sigma_px, shape)
@@ -135,7 +135,7 @@ def _differences(seeds: Seeds, fit: _Fit, moved: _Fit, limits: Limits) -> list[S
 def _unexplained(light: FloatArray, fit: _Fit, moved: _Fit) -> tuple[FloatArray, FloatArray]:
     """Places (n, 2), px, and fluxes of stars in light that no star of either fit explains.
 
-    A changed star is no exact Gaussian: what it leaves is under half of its change. A star off the image may be as bright as
+    A changed star is not exactly a Gaussian: its residual is under half of its change. A star off the image may be as bright as
     any on it, and its wing wrong by that star's rounding.
     """
     change = np.maximum(np.abs(moved.model - fit.model), np.abs(light))

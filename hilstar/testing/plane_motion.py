@@ -50,7 +50,7 @@ def _left(motion: Motion, places: FloatArray, moves: FloatArray) -> FloatArray:
 
 
 def rank_for(stars: int) -> int:
-    """The richest motion that so many stars determine: 1 a shift, 2 with turn and scale, 3 a homography."""
+    """The rank of the richest motion that `stars` stars determine: 1 a shift, 2 with turn and scale, 3 a homography."""
     return 3 if stars >= 16 else 2 if stars >= 6 else 1
 
 

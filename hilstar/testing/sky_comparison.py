@@ -35,7 +35,7 @@ class SkyComparison:
 
     @property
     def differing(self) -> list[StarDifference]:
-        """The stars that are beyond their limits once what is common to all is taken off, worst first."""
+        """The stars that are beyond their limits once what is common to all is subtracted, worst first."""
         return self.bad if self.common is None else worst_first(self.common.differing)
 
     @property

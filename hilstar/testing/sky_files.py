@@ -34,7 +34,7 @@ def read_frame_fits(path: Path) -> FloatArray:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of astropy, about cards; what matters is checked below
             image, header = fits.getdata(io.BytesIO(raw), header=True)
-    except Exception as error:  # astropy lets through whatever a header makes its layers raise
+    except Exception as error:  # astropy raises whatever a broken header causes in its layers
         raise InputError(f"{path}: no FITS image; {wanted}") from error
     if header.get("BUNIT") != UNIT or image is None or image.ndim != 2 or image.dtype.kind != "f":
         raise InputError(f"{path}: no linear image in {UNIT} (BUNIT is {header.get('BUNIT')!r}); {wanted}")

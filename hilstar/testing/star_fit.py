@@ -1,4 +1,4 @@
-"""Stars of a noiseless linear image: found, and fitted all at once, so that a neighbour's light is no star's error.
+"""Stars of a noiseless linear image: found, and fitted all at once, so that a neighbour's light causes no error.
 
 Each star is a Gaussian integrated over pixels, as the renderer draws it, with its derivatives along x and y. Fluxes and
 shifts of all stars are one linear least-squares problem: a star that is dimmed by any amount is measured exactly, a shifted
@@ -25,7 +25,7 @@ SIGMA_STEPS = 12
 MAX_SIGMA_STEP = 0.3  # of sigma: Newton's step from a poor start stays a positive sigma
 MAX_PLACE_STEPS, MAX_STEP_PX, MIN_STEP_PX = 12, 1.0, 1e-5
 MAX_OFFSET_PX = 1.0  # a star lies within sqrt(1/2) px of the middle of its brightest pixel, unless a neighbour pulls it
-BEYOND_SIGMAS = 4.0  # ... and one whose brightest pixel is the image's first or last lies anywhere beyond
+BEYOND_SIGMAS = 4.0  # ... and one whose brightest pixel is the image's first or last may be this far outside
 RIDGE = 1e-12  # of a unit column: two equal columns share the light, where the solver would otherwise fail
 
 
@@ -56,7 +56,7 @@ class StarTemplates:
         self._solver = splu(csc_array(unit + RIDGE * diags_array(np.ones(3 * size)))) if size else None
 
     def fit(self, image: FloatArray) -> FloatArray:
-        """Flux, and flux times the shift along x and y, of each star (n, 3): the least squares of all pixels."""
+        """Flux, and flux times the shift along x and y, of each star (n, 3): least squares over all pixels."""
         if self._solver is None:
             return np.zeros((0, 3))
         wanted = np.asarray(self._columns.T @ image.ravel())
@@ -136,7 +136,7 @@ def _apart(places_px: FloatArray, distance_px: float, size_px: tuple[int, int]) 
 
 
 def _first_sigma_px(image: FloatArray, axis: int) -> float:
-    """A Gaussian of sigma s and its copy one pixel on correlate by exp(-1 / 4 s^2); the pixel's own 1/12 px^2 is taken off."""
+    """A Gaussian of sigma s and its copy one pixel on correlate by exp(-1 / 4 s^2); the pixel's own 1/12 px^2 is subtracted."""
     ahead, behind = (np.take(image, np.arange(start, image.shape[axis] + start - 1), axis) for start in (1, 0))
     correlation = float(np.clip(np.vdot(ahead, behind) / np.vdot(image, image), 0.05, 0.999))
     return math.sqrt(max(-0.25 / math.log(correlation) - 1 / 12, 0.04))

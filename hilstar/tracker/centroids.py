@@ -6,7 +6,7 @@ zero, w a Gaussian of `window_sigma_px`. The plain window is the centre of gravi
 Both sample the image at pixels, so both have an S-curve: a bias that repeats with the place within the pixel. For a
 Gaussian star of s px, integrated over pixels, the plain window's is -exp(-2 pi^2 s^2) sin(2 pi x) / pi: 0.0135 px at
 s = 0.4, 0.0023 at 0.5, under 1e-5 from 0.75 on. The Gaussian window's is larger, and larger yet for a narrow window:
-0.017 px at s = 0.55 and a window of 1 px. Where the star's sigma is known (`psf_sigma_px`) the S-curve is taken out.
+0.017 px at s = 0.55 and a window of 1 px. Where the star's sigma is known (`psf_sigma_px`) the S-curve is removed.
 tests/authority/test_centroids.py measures all of this, with the noise.
 """
 
@@ -31,17 +31,17 @@ BoolArray = npt.NDArray[np.bool_]
 MAD_TO_SIGMA = 1.482602218505602  # of a normal law: 1 / its upper quartile
 CLIP_SIGMAS = 3.0
 CLIPPED_SIGMA = 0.986578  # the sigma of a normal law cut at 3 sigma: sqrt(1 - 6 pdf(3) / (2 cdf(3) - 1))
-LEAST_STEP_PX = 1e-7
+MIN_STEP_PX = 1e-7
 EIGHT_NEIGHBOURS = np.ones((3, 3), dtype=np.int8)
 # Of s^2, the share by which the window can narrow the star's second moment: Newton's step is at most 10 times the
 # plain one, so that noise in the moment cannot throw the centre out of the window.
-LEAST_SLOPE = 0.1
-S_CURVE_PHASES = 201  # the bias at the worst, 2 pi 0.05 px a pixel, is then read to 1e-5 px between two of them
+MIN_SLOPE = 0.1
+S_CURVE_PHASES = 201  # where the bias is steepest, 2 pi 0.05 px a pixel, interpolation between two of them is right to 1e-5 px
 
 
 @dataclass(frozen=True, slots=True)
 class Background:
-    """What lies under the stars, in the image's unit: its level, and the sigma of a pixel's noise."""
+    """The background under the stars, in the image's unit: its level, and the sigma of a pixel's noise."""
 
     level: float
     noise: float
@@ -52,7 +52,7 @@ class CentroidSettings:
     """How stars are found: pixels over `threshold_sigma`, in blobs of `minimum_pixels`, then a window around each.
 
     `window_radius_px` (default: 4 window sigmas, rounded up) is half the window's side: it is 2 radius + 1 pixels wide.
-    `psf_sigma_px` (x, y), where known, takes the S-curve of that Gaussian star out of the places.
+    `psf_sigma_px` (x, y), where known, removes the S-curve of that Gaussian star from the places.
     Raises InputError for a value that makes no sense.
     """
 
@@ -79,7 +79,7 @@ class CentroidSettings:
 
     @property
     def radius_px(self) -> int:
-        """Half the side of the window, its middle pixel left out."""
+        """Half the side of the window, without its middle pixel."""
         return self.window_radius_px or math.ceil(4 * self.window_sigma_px)
 
 
@@ -87,7 +87,7 @@ class CentroidSettings:
 class Centroids:
     """Stars, arrays of shape (n,), brightest first; (0, 0) is the centre of the top-left pixel, x right, y down.
 
-    `flux` is the sum in the window, `peak` the highest pixel of the blob, both over the background and in the image's
+    `flux` is the sum in the window, `peak` the highest pixel of the blob, both above the background and in the image's
     unit; `pixels` counts the blob; `at_edge` says that the window leaves the image, which biases the place inwards.
     """
 
@@ -221,11 +221,11 @@ def _gaussian_centres(padded: FloatArray, blobs: _Blobs, settings: CentroidSetti
         first, second = (
             np.stack([(weighted * offset**power).sum(axis=(1, 2)) for offset in (dx, dy)]) / total for power in (1, 2)
         )
-        step = first / np.maximum(1 - second / sigma2, LEAST_SLOPE)
+        step = first / np.maximum(1 - second / sigma2, MIN_SLOPE)
         moved = np.where(lost, start, place + step)
         lost |= (np.abs(moved - start) > settings.radius_px).any(axis=0)
         moved = np.where(lost, start, moved)
-        arrived = np.abs(moved - place).max(initial=0.0) < LEAST_STEP_PX
+        arrived = np.abs(moved - place).max(initial=0.0) < MIN_STEP_PX
         place = moved
         if arrived:
             break
@@ -285,6 +285,6 @@ def s_curves(settings: CentroidSettings) -> tuple[SCurve, SCurve]:
     if any((np.diff(curve.measured_px) <= 0).any() for curve in curves):
         raise InputError(
             f"centroids: window_sigma_px = {settings.window_sigma_px:g} is too narrow for psf_sigma_px = "
-            f"{settings.psf_sigma_px}; write at least 1"
+            f"{settings.psf_sigma_px}; write 1 or more"
         )
     return curves

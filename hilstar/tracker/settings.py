@@ -16,10 +16,10 @@ DATASHEET_RANGE_K = (230.0, 300.0)  # where the CCD47-20's datasheet gives its l
 
 # More is refused. numpy's Poisson sampler compares logarithms of the size of mean * ln(mean): their rounding is 0.004
 # at 1e12 and of order 1 at 1e15, where the sampler is wrong long before it fails (9.2e18).
-LARGEST_E = 1e12
+MAX_E = 1e12
 
-Amount = Annotated[float, Meta(ge=0, le=LARGEST_E)]
-Charge = Annotated[float, Meta(ge=1e-6, le=LARGEST_E)]
+Amount = Annotated[float, Meta(ge=0, le=MAX_E)]
+Charge = Annotated[float, Meta(ge=1e-6, le=MAX_E)]
 Share = Annotated[float, Meta(ge=0, le=1)]
 Temperature = Annotated[float, Meta(ge=50, le=500)]
 PixelPitch = Annotated[float, Meta(ge=0.1, le=1000)]

@@ -61,7 +61,7 @@ def simulate_motions(
 ) -> None:
     """Write `exposure_000000.fits` and on into `directory`, each with its own noise: seeds (seed, number)."""
     make_directory(directory)
-    Simulator(file).close()  # whatever is wrong with the bench is said once, here
+    Simulator(file).close()  # an error in the bench file is reported once, here
     workers = min(len(motions), len(os.sched_getaffinity(0)))
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(workers, context, _start_worker, (file,)) as pool:
@@ -82,7 +82,7 @@ def simulate_motions(
 
 @contextmanager
 def _without_ctrl_c() -> Iterator[None]:
-    """What is started here does not receive the Ctrl-C that a terminal sends to all; it ends when this process says so."""
+    """What is started here does not receive the Ctrl-C that a terminal sends to all; this process ends it."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield

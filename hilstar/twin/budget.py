@@ -1,4 +1,4 @@
-"""The budget of a bench's light: which magnitudes its monitor, sprites and quantisation can show, and how well.
+"""The budget of a bench's light: which magnitudes its monitor, sprites and quantisation can show, and how accurately.
 
 Every error is measured: single stars at a grid of sub-pixel phases through the bench's own method.
 """
@@ -105,12 +105,12 @@ def zero_point_mag(bench: Bench) -> float:
 
 
 def corner_share(sigma_px: tuple[float, float]) -> float:
-    """The share of a star's brightest pixel when it stands on a corner of four: the minimum that a peak can be."""
+    """The share of a star's brightest pixel when it is on a corner of four: the minimum that a peak can be."""
     return math.prod(0.5 * math.erf(1.0 / (sigma * math.sqrt(2.0))) for sigma in sigma_px)
 
 
 def nothing_below_e_per_s(bench: Bench) -> float:
-    """The rate below which a star shows nothing, wherever it stands; for dithers, one that lights a pixel in half of frames."""
+    """The rate below which a star lights no pixel, wherever it is; for dithers, where it lights one in half of the frames."""
     drawn = bench.faintest_shown_e_per_s
     return drawn or float(bench.calibration.response.light[1]) / 2 * bench.flux_at_white_e_per_s
 

@@ -1,4 +1,4 @@
-"""What `hilstar budget` says and draws."""
+"""The budget for a person, and as a table and a chart."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from hilstar.twin.simulator import Exposure, FrameNoise, Simulator
 
 
 def write_exposure_fits(path: Path, simulator: Simulator, exposure: Exposure, noise: FrameNoise) -> None:
-    """The virtual tracker's DN (uint16) and, as second HDU, the truth table; the header says how both came about."""
+    """The virtual tracker's DN (uint16) and, as second HDU, the truth table; the header says how both were made."""
     from astropy.io import fits
 
     tracker = simulator.config.tracker

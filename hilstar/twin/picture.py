@@ -1,4 +1,4 @@
-"""A picture of a tracker's frame for a person: bright stars are told apart, where their pixels alone cannot."""
+"""A picture of a tracker's frame for a person: discs tell bright stars apart where their saturated pixels cannot."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-BOX_PX = 5  # a star's light is summed over so many pixels: where the middle is full, the wings still grow
+BOX_PX = 5  # side of the square over which a star's light is summed: where the middle is full, the wings still grow
 MAX_RADIUS_PX = 8  # of the brightest star's disc
-# A disc's radius is the star's share of the brightest to this power: wide enough apart for a sum that saturates, in which
-# five magnitudes are a factor of ten.
+# A disc's radius goes with this power of the star's share of the brightest: enough for a sum that saturates, in which five
+# magnitudes are only a factor of ten.
 RADIUS_POWER = 0.77
-STAR_SIGMA = 8.0  # a sum that stands out by more is a star
+STAR_SIGMA = 8.0  # a sum further above the background is a star
 PIXEL_GREY = 0.7  # the brightest grey of a pixel that no disc covers
 
 
 def exposure_picture(dn: npt.NDArray[np.uint16]) -> npt.NDArray[np.uint8]:
-    """Greys (height, width) of a frame: asinh of the light over the background, and discs that grow with a star's."""
+    """Greys (height, width) of a frame: asinh of the light above the background, and a disc for each star."""
     from scipy.ndimage import maximum_filter, uniform_filter
 
     light = dn.astype(np.float32)
@@ -40,7 +40,7 @@ def _stretched(light: npt.NDArray[Any], noise: float) -> npt.NDArray[Any]:
 
 
 def _draw_discs(picture: npt.NDArray[Any], peaks: Any, radius: npt.NDArray[np.intp], grey: npt.NDArray[Any]) -> None:
-    """Draw a disc about each peak (rows, columns); where two overlap the brighter is seen."""
+    """Draw a disc about each peak (rows, columns); where two overlap the brighter one shows."""
     reach = np.arange(-MAX_RADIUS_PX, MAX_RADIUS_PX + 1)
     for down in reach:
         for across in reach:

@@ -14,7 +14,7 @@ from scipy import stats
 
 from hilstar.arrays import FloatArray
 from hilstar.tracker.detector import Detector
-from hilstar.tracker.settings import LARGEST_E, DetectorSettings
+from hilstar.tracker.settings import MAX_E, DetectorSettings
 
 SIZE_PX = (256, 256)
 SHAPE = (256, 256)
@@ -148,9 +148,9 @@ def test_electron_counts_follow_poissons_law(mean_e):
 
 
 def test_the_sampler_keeps_poissons_moments_up_to_the_largest_mean_that_is_taken():
-    # LARGEST_E is a claim about numpy's sampler, and 16 bits cannot show 1e12 +- 1e6: so the sampler itself is asked.
-    counts = np.random.default_rng(7).poisson(np.full(PIXELS, LARGEST_E)) - LARGEST_E
-    sigma_e = math.sqrt(LARGEST_E)
+    # MAX_E is a claim about numpy's sampler, and 16 bits cannot show 1e12 +- 1e6: so the sampler itself is asked.
+    counts = np.random.default_rng(7).poisson(np.full(PIXELS, MAX_E)) - MAX_E
+    sigma_e = math.sqrt(MAX_E)
     assert abs(counts.mean()) < 5 * sigma_e / math.sqrt(PIXELS)
     assert counts.std() == pytest.approx(sigma_e, rel=5 / math.sqrt(2 * PIXELS))
     # The law's own skewness and excess kurtosis are 1e-6 and 1e-12; these are 5 errors of their estimates.

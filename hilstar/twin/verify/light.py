@@ -46,7 +46,7 @@ def true_calibration(bench: Bench, name: str, *, bit_stealing: bool = False) -> 
 
 
 def levels_of(assumed: Response, true: Response) -> Response:
-    """The true light of the assumed levels: with bit stealing another monitor's triples stand in another order."""
+    """The true light of the assumed levels: with bit stealing another monitor orders its triples differently."""
     if assumed.rgb is None or true.rgb is None:
         return true
     light = {tuple(triple): value for triple, value in zip(true.rgb.tolist(), true.light, strict=True)}

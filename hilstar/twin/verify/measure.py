@@ -133,7 +133,7 @@ class Comparison:
         return np.asarray(inside & self._on_detector(seen, margin))
 
     def _on_detector(self, seen: Field, margin_px: float) -> npt.NDArray[np.bool_]:
-        """Stars on the detector, at least so far from its edge; one at NaN is not on it."""
+        """Stars on the detector, `margin_px` or farther from its edge; one at NaN is not on it."""
         width, height = self.twin.camera.resolution_px
         inside = (seen.x_px >= margin_px - 0.5) & (seen.x_px < width - 0.5 - margin_px)
         return np.asarray(inside & (seen.y_px >= margin_px - 0.5) & (seen.y_px < height - 0.5 - margin_px))

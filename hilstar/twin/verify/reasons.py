@@ -11,8 +11,8 @@ from hilstar.twin.verify.measured import Measured
 
 # A fit that leaves more of the residuals' squares than this explains nothing: chance matches leave nearly all.
 MAX_LEFT = 0.5
-# A cause is named where it accounts for more of what was looked for.
-MOST = 0.5
+# A cause is named where it accounts for more than this share of the stars.
+MIN_SHARE = 0.5
 MIRROR_WORDS = {"x": "its columns reversed", "y": "its rows reversed", "swap": "its axes swapped"}
 
 
@@ -24,7 +24,7 @@ def reasons(measured: Measured, errors: DisplayErrors) -> list[str]:
     centroid = _centroids(measured, errors)
     geometry = _geometry(measured, errors) if lost or centroid else []
     # A few stars found by chance, or far from the middle of their windows, say nothing about light.
-    mostly_lost = len(errors.lost) > MOST * errors.looked_for
+    mostly_lost = len(errors.lost) > MIN_SHARE * errors.looked_for
     light = [] if mostly_lost else [*_light(measured, errors), *_codes(measured, errors)]
     return [*lost, *centroid, *geometry, *light, *_black(measured), *_floor(measured, errors)]
 
@@ -35,10 +35,10 @@ def _lost(measured: Measured, errors: DisplayErrors) -> list[str]:
     if lost <= limit * looked_for:
         return []
     cause = "look at focal lengths, pixel pitches and q_cam_to_mon"
-    if tally.vanished > MOST * lost:
+    if tally.vanished > MIN_SHARE * lost:
         cause = "they are too faint to be seen: look at the monitor's response, and at what the codes leave of faint stars"
     for mirror, count in tally.mirrored.items():
-        if count > MOST * looked_for:
+        if count > MIN_SHARE * looked_for:
             cause = (
                 f"{count} are where a mirrored screen with {MIRROR_WORDS[mirror]} would show them: look at how it is mounted"
             )

@@ -16,8 +16,8 @@ from hilstar.twin.verify.verdict import Verdict, judge
 def verify(
     file: BenchFile, fields: int, rng: np.random.Generator, on_field: Callable[[int], None] = lambda done: None
 ) -> Verdict:
-    """Show so many random attitudes and judge the bench by them. Raises InputError (see `Twin`)."""
-    # Separate streams: the noise draws as many numbers as it has electrons, and all benches shall see the same fields.
+    """Show `fields` random attitudes and judge the bench by them. Raises InputError (see `Twin`)."""
+    # Separate streams: the noise draws a number of values that depends on the light, and all benches shall see the same fields.
     attitudes, noise = rng.spawn(2)
     with Twin(file) as twin:
         comparison = Comparison(twin)

@@ -16,11 +16,11 @@ from hilstar.tracker.centroids import Background, Centroids, CentroidSettings, f
 from hilstar.units import magnitude
 
 MATCH_PX = 3.0
-# Of a star's light, that which others bring into its window. Both images have it, so what it leaves is a second order:
-# at 0.02, a neighbour 0.1 mag off adds 0.002 mag.
+# Of a star's light, how much others may bring into its window. Both images have it, so its effect is of second order: at
+# 0.02, a neighbour 0.1 mag off adds 0.002 mag.
 CROWDED_SHARE = 0.02
 WING_SIGMAS = 6.0  # how far a neighbour's light reaches: 1e-9 of it, and Sirius is 4e3 times a star of the seventh magnitude
-FAINTEST_PEAK = 0.2  # a blob begins at this share of the faintest drawn star's peak
+MIN_PEAK = 0.2  # a blob begins at this share of the faintest drawn star's peak
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,27 +41,27 @@ class Matched:
 
 @dataclass(frozen=True, slots=True)
 class StarFinder:
-    """A centroider for a bench's stars: their sigma (x, y) on the tracker, px, and the noise of a noiseless image's floor."""
+    """A centroider for a bench's stars: their sigma (x, y) on the tracker, px, and the background for noiseless images."""
 
     settings: CentroidSettings
     sigma_px: tuple[float, float]
-    floor: Background
+    background: Background
 
     def match(self, image_e: FloatArray, x_px: FloatArray, y_px: FloatArray) -> Matched:
         """The stars of a noiseless image (h, w) at their places (n,).
 
         A tracker subtracts the screen's glow around each star: here it is not added in the first place.
         """
-        found = find_stars(image_e, self.settings, self.floor)
+        found = find_stars(image_e, self.settings, self.background)
         return Matched(found, nearest(found, x_px, y_px))
 
 
 def star_finder(bench: Bench, monitor_px_per_px: float) -> StarFinder:
-    """The finder for a bench's stars, where so many monitor pixels are a tracker pixel."""
+    """The finder for a bench's stars; `monitor_px_per_px` monitor pixels are as wide as a tracker pixel."""
     sigma_px = seen_sigma_px(bench.config, monitor_px_per_px)
     settings = CentroidSettings(window_sigma_px=max(1.0, *sigma_px))
     peak_e = faintest_e_per_s(bench) * bench.config.tracker.exposure_s * peak_share(sigma_px)
-    return StarFinder(settings, sigma_px, Background(0.0, FAINTEST_PEAK * peak_e / settings.threshold_sigma))
+    return StarFinder(settings, sigma_px, Background(0.0, MIN_PEAK * peak_e / settings.threshold_sigma))
 
 
 def seen_sigma_px(config: BenchConfig, monitor_px_per_px: float) -> tuple[float, float]:

@@ -31,8 +31,8 @@ from hilstar.twin.verify.light import exposure_lights, true_panel
 class Field:
     """One attitude: mean electrons, (h, w) each, and its stars at their places (n,) in tracker pixels, as the sky has them.
 
-    `shown_e` is what the monitor as it is makes, `assumed_e` what it would make were everything as assumed (the same array
-    where nothing differs), and `sky_e` what the stars themselves make. `truth` has the rows of TRUTH_DTYPE.
+    `shown_e` is what the monitor as it is makes, `assumed_e` what it would make if everything were as assumed (the same
+    array where nothing differs), and `sky_e` what the stars themselves make. `truth` has the rows of TRUTH_DTYPE.
     """
 
     shown_e: FloatArray

@@ -10,15 +10,9 @@ from msgspec.structs import replace
 from scipy import ndimage
 
 from hilstar.errors import InputError
-from hilstar.tracker.detector import (
-    RAY_DEPTH_UM,
-    RAY_E_PER_UM,
-    Detector,
-    bloom,
-    cosmic_rays_e,
-    false_stars_e,
-)
-from hilstar.tracker.settings import LARGEST_E, DetectorSettings, ccd47_20_dark
+from hilstar.tracker.detector import Detector, bloom
+from hilstar.tracker.settings import MAX_E, DetectorSettings, ccd47_20_dark
+from hilstar.tracker.strays import RAY_DEPTH_UM, RAY_E_PER_UM, cosmic_rays_e, false_stars_e
 
 SIZE_PX = (160, 128)
 SHAPE = (128, 160)
@@ -129,7 +123,7 @@ def test_a_pixel_of_1e9_electrons_is_full_and_its_neighbours_are_not():
 
 
 def test_1e9_electrons_have_their_own_mean_and_shot_noise():
-    settings = DetectorSettings(gain_e_per_dn=20_000.0, full_well_e=LARGEST_E, bits=16)
+    settings = DetectorSettings(gain_e_per_dn=20_000.0, full_well_e=MAX_E, bits=16)
     image_e = Detector(settings, SIZE_PX).expose(flat(1e9), 0.1, generator()) * 20_000.0
     noise_e = math.sqrt(1e9 + 20_000.0**2 / 12)
     assert image_e.mean() == pytest.approx(1e9, abs=SIGMAS * noise_e / math.sqrt(PIXELS))

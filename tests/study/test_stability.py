@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import csv
+import json
 import math
 from contextlib import nullcontext
 from dataclasses import replace
@@ -16,7 +16,6 @@ from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.scene.camera import Camera
 from hilstar.sky.electrons import tabulate
 from hilstar.study.stability import attitude as stability_attitude
-from hilstar.study.stability import charts as stability_charts
 from hilstar.study.stability import field as stability_field
 from hilstar.study.stability import image as stability_image
 from hilstar.study.stability import popping as stability_popping
@@ -24,16 +23,49 @@ from hilstar.study.stability import run as stability
 from hilstar.study.stability import sky as stability_sky
 from hilstar.study.stability import tracker as stability_tracker
 from hilstar.study.stability.failure_case import FailureCase, Figures
+from tests.study.test_study_command import assert_drawn, table
+from tests.support.commands import run_hilstar_here
 
 
-@pytest.mark.parametrize("visit", stability.CASES, ids=lambda visit: visit.__name__)
-def test_hilstar_is_right_where_the_method_named_there_is_not(visit):
-    place = visit()
-    assert place.right, place
-    assert not place.figures.fault <= place.figures.tolerance, place
-    assert all((place.case, place.method, place.fails, place.happens, place.why))
-    theirs = replace(place, figures=replace(place.figures, error=place.figures.fault))
+@pytest.fixture(scope="module")
+def study(tmp_path_factory):
+    """The command's folder and output, and the cases that it measured."""
+    folder, measured = tmp_path_factory.mktemp("stability"), []
+
+    def keep(directory):
+        measured.extend(run(directory))
+        return measured
+
+    run = stability.run
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stability, "run", keep)
+        result = run_hilstar_here("study", "stability", "-o", folder, "--json")
+    assert result.returncode == 0, result.stderr
+    return folder, json.loads(result.stdout), measured
+
+
+@pytest.mark.parametrize("number", range(len(stability.CASES)), ids=lambda number: stability.CASES[number].__name__)
+def test_hilstar_is_right_where_the_method_named_there_is_not(study, number):
+    case = study[2][number]
+    assert case.right, case
+    assert not case.figures.fault <= case.figures.tolerance, case
+    assert all((case.case, case.method, case.fails, case.happens, case.why))
+    theirs = replace(case, figures=replace(case.figures, error=case.figures.fault))
     assert not theirs.right
+
+
+def test_the_table_has_every_case_and_the_curves_have_charts(study):
+    folder, printed, measured = study
+    assert printed["right"] is True and len(printed["findings"]) == len(measured)
+    rows = table(folder / "stability.csv")
+    assert [row["case"] for row in rows] == [case.case for case in measured]
+    for row in rows:
+        assert row["verdict"] == "right" and row["failing method"] and row["its failure"] and row["why"]
+        assert float(row["error"]) <= float(row["tolerance"])
+        assert not float(row["its error"]) <= float(row["tolerance"])
+    for stem in ("narrow_stars", "weak_perspective", "popping", "turns"):
+        assert_drawn(folder / f"{stem}.png")
+        assert len(table(folder / f"{stem}.csv")) > 25
 
 
 def test_what_is_no_number_is_not_right():
@@ -114,10 +146,8 @@ def test_the_polynomial_of_the_shader_is_the_shader_s():
     assert np.abs(stability_image.erf_float32(x) - erf(x)).max() <= stability_image.ERF_ERROR + 6e-8
 
 
-def test_the_chart_of_popping_shows_what_its_title_says(tmp_path):
-    stability_charts.ripples(tmp_path)
-    with (tmp_path / "popping.csv").open() as file:
-        rows = list(csv.DictReader(file))
+def test_the_chart_of_popping_shows_what_its_title_says(study):
+    rows = table(study[0] / "popping.csv")
     assert len(rows) == stability_popping.STEPS
     spread = {
         name: np.ptp([float(row[f"{name} [mag]"]) for row in rows]) for name in ("linear image", "codes, exact", "codes, round")

@@ -15,13 +15,14 @@ from hilstar.charts import TITLE_COLUMNS, title_lines
 from hilstar.sky import electrons
 from hilstar.sky.catalog import load_catalog
 from hilstar.sky.electrons import Photometry, tabulate
-from hilstar.sky.pickles import tabulate_pickles
+from hilstar.sky.pickles import load_library, tabulate_pickles
 from hilstar.sky.spectrum import DATA_DIR
 from hilstar.study.models.choices import running_percentiles
-from hilstar.study.models.run import run
+from hilstar.study.models.rapp import rapp_ratios
 from hilstar.study.models.temperatures import torres2010_k
 from hilstar.study.models.zero_points import zero_points
-from hilstar.study.shared.brightness import study_optics
+from hilstar.study.shared.brightness import held_out_errors, study_optics
+from tests.support.commands import run_hilstar_here
 
 STEMS = ("rapp_ccd47-20", "rapp_kai-4021", "temperature_scales", "zero_points", "choices", "spectra")
 
@@ -48,7 +49,9 @@ TABLE_MAG_LIMIT = 2e-6
 @pytest.fixture(scope="module")
 def study(tmp_path_factory):
     folder = tmp_path_factory.mktemp("models")
-    return folder, {finding.figure: finding.text for finding in run(folder)}
+    result = run_hilstar_here("study", "models", "-o", folder)
+    assert result.returncode == 0, result.stderr
+    return folder, dict(line.split(": ", 1) for line in result.stdout.splitlines()[:-1])
 
 
 def columns(path):
@@ -113,6 +116,58 @@ def test_rapp_is_what_equations_5_1_to_5_3_say(study, sensor, weighting, power):
         row = np.flatnonzero(table["temperature_k"] == kelvin)[0]
         ratios = [table[f"rapp{k}_{weighting}"][row] for k in (1, 2, 3)]
         assert ratios == pytest.approx(rapp_by_quadrature(kelvin, sensor, power), rel=QUADRATURE_LIMIT)
+
+
+def test_rapp_is_one_where_both_models_are_the_same(study):
+    """RAPP1 at the reference's own temperature; and the thesis's '15 % up to 5 %' of hot stars on the CCD47-20."""
+    ratios = rapp_ratios(np.array([9602.0]), study_optics("ccd47-20"), "energy")
+    assert ratios[0, 0] == pytest.approx(1.0, rel=1e-9)
+    rows = columns(study[0] / "rapp_ccd47-20.csv")
+    kelvin, rapp3 = rows["temperature_k"], rows["rapp3_photon"]
+    assert kelvin[0] == pytest.approx(3000) and kelvin[-1] == pytest.approx(50_000)
+    assert np.interp(9000, kelvin, rapp3) == pytest.approx(0.85, abs=0.01)
+    assert np.interp(50_000, kelvin, rapp3) == pytest.approx(0.97, abs=0.02)
+    assert rapp3[0] > 1.7
+
+
+def test_torres_gives_the_sun_its_temperature():
+    """B-V = 0.653 (Ramirez 2012): 5772 K (IAU 2015), within the relation's own 2 %."""
+    assert torres2010_k(np.array([0.653]))[0] == pytest.approx(5772, rel=0.02)
+
+
+def test_the_zero_points_differ_by_a_third_of_a_magnitude(study):
+    table = columns(study[0] / "zero_points.csv")
+    bolometric = [
+        setting == ("iau-bolometric", "energy") for setting in zip(table["zero_point"], table["weighting"], strict=True)
+    ]
+    assert table["mag_against_default"][bolometric] == pytest.approx([0.31, 0.31], abs=0.01)
+
+
+def test_real_spectra_beat_black_bodies_in_the_chart_as_in_the_table(study):
+    table, text = columns(study[0] / "spectra.csv"), study[1]["spectra"]
+    assert table["spectral_type"] == list(load_library().spectral_type)
+    median = {}
+    for name in ("pickles, leave-one-out", "black body, ballesteros2012"):
+        errors = np.abs(table[f"ccd47-20: {name} [%]"])[table["vi_mag"] < 2.5]
+        median[name] = np.median(errors)
+        assert f"{np.median(errors):.1f} %" in text
+    assert median["pickles, leave-one-out"] < 1.0 < 3 * median["pickles, leave-one-out"] < median["black body, ballesteros2012"]
+
+
+def test_a_held_out_star_is_not_in_its_own_table():
+    """A star made ten times brighter moves no other star's error by more than its share, and its own by all of it."""
+    library = load_library()
+    rates = np.exp(library.vi_mag)
+    plain = held_out_errors(rates)
+    changed = rates.copy()
+    changed[40] *= 10
+    assert held_out_errors(changed)[40] == pytest.approx((plain[40] + 1) / 10 - 1, rel=1e-9)
+
+
+def test_the_zero_point_costs_the_same_at_every_colour(study):
+    cost = columns(study[0] / "choices.csv")["zero_point_iau-bolometric_mag"]
+    assert cost.min() == pytest.approx(0.31, abs=0.01)
+    assert cost.max() == pytest.approx(0.31, abs=0.01)
 
 
 def test_hot_stars_differ_as_the_thesis_says(study):

@@ -4,20 +4,29 @@ from __future__ import annotations
 
 import csv
 import math
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from hilstar.study.prediction import LATENCIES_MS, RATES_HZ, USUAL_HZ, USUAL_MS, measure, run
+from hilstar.study.prediction import LATENCIES_MS, RATES_HZ, USUAL_HZ, USUAL_MS, Outcome, run
 from hilstar.study.shared.predictors import SLEW_DEG, SLEW_S
-
-SPAN_S = 4.0
 
 
 @pytest.fixture(scope="module")
-def outcomes():
-    return {(o.method, o.rate_hz, o.latency_ms): o for o in measure(SPAN_S)}
+def study(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("prediction")
+    return folder, run(folder, quick=True)
+
+
+@pytest.fixture(scope="module")
+def outcomes(study):
+    with (study[0] / "prediction.csv").open() as file:
+        rows = [Outcome(**row) for row in csv.DictReader(file)]
+    kinds = {"method": str, "rate_hz": int, "latency_ms": int}
+    typed = [replace(o, **{f.name: kinds.get(f.name, float)(getattr(o, f.name)) for f in fields(o)}) for o in rows]
+    return {(o.method, o.rate_hz, o.latency_ms): o for o in typed}
 
 
 def test_holding_costs_the_rate_times_the_age(outcomes):
@@ -37,14 +46,12 @@ def test_a_rate_predicts_better_than_holding_and_worse_the_longer_it_has_to(outc
         assert outcomes[own, USUAL_HZ, ms].rms_arcsec < outcomes["hold", USUAL_HZ, ms].rms_arcsec / 3
 
 
-def test_the_study_writes_what_it_found(tmp_path):
-    lines = run(tmp_path, quick=True)
+def test_the_study_writes_what_it_found(study, outcomes):
+    folder, lines = study
     assert len(lines) == 1 + 5
-    with (tmp_path / "prediction.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert len(rows) == 5 * (len(RATES_HZ) + len(LATENCIES_MS) - 1)
-    assert {int(row["latency_ms"]) for row in rows if int(row["rate_hz"]) == USUAL_HZ} == set(LATENCIES_MS)
-    assert {int(row["rate_hz"]) for row in rows if int(row["latency_ms"]) == USUAL_MS} == set(RATES_HZ)
-    assert all(float(row["attitude_us"]) > 0 for row in rows)
-    pixels = np.array(Image.open(tmp_path / "prediction.png").convert("L"))
+    assert len(outcomes) == 5 * (len(RATES_HZ) + len(LATENCIES_MS) - 1)
+    assert {ms for _, hz, ms in outcomes if hz == USUAL_HZ} == set(LATENCIES_MS)
+    assert {hz for _, hz, ms in outcomes if ms == USUAL_MS} == set(RATES_HZ)
+    assert all(outcome.attitude_us > 0 for outcome in outcomes.values())
+    pixels = np.array(Image.open(folder / "prediction.png").convert("L"))
     assert pixels.shape[0] > 500 and (pixels < 200).mean() > 0.005

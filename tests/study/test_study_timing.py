@@ -9,8 +9,9 @@ import pytest
 from PIL import Image
 
 from hilstar.scene.frame_motion import Scan
+from hilstar.study.timing import run as timing
 from hilstar.study.timing.panel import WAYS, ScanningPanel, Sky, frame_weights
-from hilstar.study.timing.run import QUICK_RATES_DEG_S, compare, measure, run
+from hilstar.study.timing.run import QUICK_RATES_DEG_S, compare, measure
 from hilstar.study.timing.slew import Slew
 
 GAIN = 20  # compensated against not: the issue's own figure
@@ -21,8 +22,23 @@ FRAME_ARCSEC = RATE_DEG_S * PERIOD_S * 3600
 
 
 @pytest.fixture(scope="module")
-def outcomes():
-    return {outcome.way: outcome for outcome in measure(quick=True)}
+def study(tmp_path_factory):
+    """The study's folder and findings, and what it measured."""
+    folder, measured = tmp_path_factory.mktemp("timing"), []
+
+    def keep(quick):
+        measured.extend(measure(quick))
+        return measured
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(timing, "measure", keep)
+        findings = timing.run(folder, quick=True)
+    return folder, findings, measured
+
+
+@pytest.fixture(scope="module")
+def outcomes(study):
+    return {outcome.way: outcome for outcome in study[2]}
 
 
 def test_compensation_leaves_a_twentieth_of_the_error_at_most(outcomes):
@@ -44,7 +60,7 @@ def test_each_step_takes_away_what_physics_says_it_should(outcomes):
 )
 def test_a_scan_that_is_assumed_wrong_is_seen(tmp_path, outcomes, wrong):
     panel = ScanningPanel("+ smear", tmp_path / "bench.toml")
-    panel.bench.scan = replace(panel.bench.scan, **wrong)
+    panel.bench = replace(panel.bench, scan=replace(panel.bench.scan, **wrong))
     sky = Sky(panel)
     try:
         outcome = compare(panel, sky, Slew(RATE_DEG_S))
@@ -64,9 +80,9 @@ def test_rows_share_an_exposure_among_the_frames_that_they_show():
     assert weights[2, -1] > 0
 
 
-def test_the_study_writes_a_chart_and_a_table(tmp_path):
-    findings = run(tmp_path, quick=True)
+def test_the_study_writes_a_chart_and_a_table(study):
+    folder, findings, _ = study
     assert len(findings) == 1 + len(WAYS)
-    pixels = np.array(Image.open(tmp_path / "timing.png").convert("L"))
+    pixels = np.array(Image.open(folder / "timing.png").convert("L"))
     assert pixels.shape[0] > 500 and (pixels < 200).mean() > 0.005
-    assert len((tmp_path / "timing.csv").read_text().splitlines()) == 1 + len(WAYS)
+    assert len((folder / "timing.csv").read_text().splitlines()) == 1 + len(WAYS)

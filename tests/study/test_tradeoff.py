@@ -18,11 +18,12 @@ from hilstar.sky.cells import CELL_DEG
 from hilstar.sky.electrons import TABLE_DEGREE
 from hilstar.sky.spectrum import Curve
 from hilstar.study.shared.codes import star_field
+from hilstar.study.tradeoff import run as tradeoff
 from hilstar.study.tradeoff import table as tradeoff_table
 from hilstar.study.tradeoff.brightness import trapezoid
 from hilstar.study.tradeoff.demo import SIGMA_PX
 from hilstar.study.tradeoff.depth import LIMITS_V_MAG
-from hilstar.study.tradeoff.run import STEPS, draw, round_ticks, run, spread, table_lines
+from hilstar.study.tradeoff.run import STEPS, draw, round_ticks, spread, table_lines
 from hilstar.study.tradeoff.table import MIN_ROUNDS, Figure, Trial, Trials, interleaved, measured, pareto_front
 
 NAMES = ["brightness", "spectrum", "depth", "culling", "projection", "prediction", "smear", "psf", "quantisation"]
@@ -37,7 +38,9 @@ PROFILE_SHARE = 2e-7
 @pytest.fixture(scope="module")
 def study(tmp_path_factory):
     folder = tmp_path_factory.mktemp("tradeoff")
-    lines = run(folder, quick=True)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tradeoff, "QUICK_BUDGET_S", 0.1)  # fewer rounds: no claim here is of a time
+        lines = tradeoff.run(folder, quick=True)
     with (folder / "tradeoff.csv").open() as file:
         rows = list(csv.DictReader(file))
     return folder, lines, {name: {r["method"]: r for r in rows if r["step"] == name} for name in NAMES}

@@ -14,7 +14,6 @@ from hilstar.monitor.response import srgb_response
 from hilstar.render.reference import linear_image
 from hilstar.rotation import from_radec_roll_deg
 from hilstar.scene.psf import footprint_px
-from hilstar.study.economy import SCENES, compare, run
 from tests.support.commands import run_hilstar_here
 
 SIGMA = (0.85, 0.85)
@@ -102,23 +101,6 @@ def test_the_plan_adds_up_and_says_when_it_cannot():
     tight = settings(tolerance_mag=1e-4, tolerance_px=1e-4)
     assert "OVER" in explain(plan_effort(tight, light(8, 6.0)), tight)[-1]
     assert "full" in explain(None, RenderSettings())[0]
-
-
-def test_a_scene_that_needs_less_gets_it_and_stays_within_its_tolerance():
-    full, auto = compare(SCENES[2], rounds=2)
-    assert (full.effort, auto.effort) == ("full", "auto")
-    assert auto.quantisation == "round" and full.quantisation == "exact"
-    assert auto.within and full.within
-    assert auto.measured_stars == full.measured_stars > 100
-    assert full.flux_max_mag < auto.flux_max_mag
-
-
-def test_the_study_has_five_scenes_each_within_its_tolerance(tmp_path):
-    lines = run(tmp_path, quick=True)
-    assert len(lines) == len(SCENES) == 5
-    assert all("within" in line for line in lines)
-    assert (tmp_path / "economy.png").stat().st_size > 20_000
-    assert len((tmp_path / "economy.csv").read_text().splitlines()) == 11
 
 
 def test_explain_is_said_beside_the_json(tmp_path, small_bench_file):

@@ -99,7 +99,7 @@ class JumpFilter:
                 self.correction_ns += round(late_ns)
                 return [*behind, self._accept(arrival)]
         if self._usual(arrival, late_ns):
-            return [*self._contradicted(), self._accept(arrival)]
+            return [*self._contradicted(), self._accept(arrival)] if self._doubtful else [self._accept(arrival)]
         decided: list[SampleArrival] = []
         if self._doubtful and not self._agrees(arrival, late_ns):
             decided = self.release()
@@ -155,13 +155,15 @@ class JumpFilter:
 
     def _accept(self, arrival: SampleArrival) -> SampleArrival:
         late_ns = self._late_ns(arrival)
-        sample = replace(arrival.event, t_ns=arrival.event.t_ns + self.correction_ns)
+        t_ns = arrival.event.t_ns + self.correction_ns
         if arrival.waited_ns == WAITED_UNKNOWN_NS:
-            self._clock.guess(sample.t_ns, arrival.host_ns)
+            self._clock.guess(t_ns, arrival.host_ns)
         elif is_timely(arrival):
-            self._clock.observe(sample.t_ns, arrival.host_ns)
+            self._clock.observe(t_ns, arrival.host_ns)
             self._learn(arrival.host_ns, late_ns)
-        return replace(arrival, event=sample)
+        if not self.correction_ns:  # the usual case: every packet passes here
+            return arrival
+        return replace(arrival, event=replace(arrival.event, t_ns=t_ns))
 
     def _learn(self, host_ns: int, late_ns: float) -> None:
         if self._first_ns is None:

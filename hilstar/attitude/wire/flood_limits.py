@@ -7,6 +7,7 @@ import ctypes
 import os
 import resource
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 
 from hilstar.notices import Notices
@@ -45,16 +46,17 @@ class LinkCounts:
 class FloodGate:
     """Admits MAX_PACKETS_PER_S, and MAX_BURST at once. The others are counted and reported."""
 
-    def __init__(self, counts: LinkCounts, notices: Notices) -> None:
+    def __init__(self, counts: LinkCounts, notices: Notices, now_s: Callable[[], float] = time.monotonic) -> None:
         self._counts = counts
         self._notices = notices
+        self._now_s = now_s
         self._left = float(MAX_BURST)
-        self._seen_s = time.monotonic()
+        self._seen_s = now_s()
         self._dropped_s = -OVER_S
 
     def admit(self, waiting: int) -> int:
         """How many of the waiting packets may be decoded; the caller drops the others. Pauses where there are others."""
-        now_s = time.monotonic()
+        now_s = self._now_s()
         self._left = min(self._left + (now_s - self._seen_s) * MAX_PACKETS_PER_S, MAX_BURST)
         self._seen_s = now_s
         admitted = min(waiting, int(self._left))

@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import takewhile
 
 import numpy as np
 import pytest
@@ -53,7 +54,8 @@ class Script:
             self.done.set()
             time.sleep(0.002)
             return []
-        together = [arrival for arrival in self.arrivals[:2000] if arrival.host_ns == self.arrivals[0].host_ns]
+        host_ns = self.arrivals[0].host_ns
+        together = list(takewhile(lambda arrival: arrival.host_ns == host_ns, self.arrivals))
         del self.arrivals[: len(together)]
         self._last = together[-1]
         return together

@@ -34,7 +34,7 @@ def log(times_s, spin=0.02, nutation=0.03, *, rate=True):
 def worst_arcsec(samples, spin=0.02, nutation=0.03, policy=STREAM) -> float:
     timeline = log_timeline(samples, policy)
     errors = []
-    for t_ns in np.linspace(samples[1].t_ns, samples[-2].t_ns, 1001):
+    for t_ns in np.linspace(samples[1].t_ns, samples[-2].t_ns, 401):
         attitude = timeline.at(round(t_ns))
         assert attitude is not None
         errors.append(angle_between_rad(attitude.q_icrs_to_cam, coning(spin, nutation, round(t_ns) / S)[0]))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 from itertools import pairwise
 
@@ -18,6 +19,7 @@ HEAD = "t_s,qw,qx,qy,qz\n"
 FULL_HEAD = "t_s,qw,qx,qy,qz,rx,ry,rz,sequence,discontinuity\n"
 
 FORMS = ("csv", "jsonl", "json", "aem", "kvn", "xml", "mcap")
+FORMATS = ("csv", "jsonl", "kvn", "xml", "mcap")  # what the endings come down to
 AEM_FORMS = {"aem", "kvn", "xml"}
 # An AEM holds a rate as a quaternion derivative: there and back are 16 products summed by fours, each rounded to eps/2.
 RATE_TOLERANCE = 16 * np.finfo(np.float64).eps
@@ -76,8 +78,8 @@ def refusal(path):
 
 
 @pytest.mark.parametrize("every_rate", [True, False])
-@pytest.mark.parametrize("second", FORMS)
-@pytest.mark.parametrize("first", FORMS)
+@pytest.mark.parametrize("second", FORMATS)
+@pytest.mark.parametrize("first", FORMATS)
 def test_a_log_goes_from_any_form_to_any_other_and_keeps_what_both_can_hold(tmp_path, first, second, every_rate):
     samples = random_samples(np.random.default_rng(7), 30, every_rate)
     write_log(tmp_path / f"a.{first}", samples)
@@ -92,6 +94,15 @@ def test_the_ends_of_64_bit_time_and_the_nanoseconds_between_survive(tmp_path, f
     times = [INT64_MIN, -1_000_000_001, -1_000_000_000, -1, 0, 1, 1_700_000_000_123_456_789, INT64_MAX]
     write_log(tmp_path / f"a.{form}", [AttitudeSample(t_ns, np.array([0.5, 0.5, 0.5, 0.5])) for t_ns in times])
     assert [s.t_ns for s in read_log(tmp_path / f"a.{form}")] == times
+
+
+@pytest.mark.parametrize(("one", "other"), [("jsonl", "json"), ("kvn", "aem")])
+def test_two_endings_of_one_format_hold_the_same(tmp_path, one, other):
+    samples = random_samples(np.random.default_rng(7), 30, every_rate=False)
+    for form in (one, other):
+        write_log(tmp_path / f"a.{form}", samples)
+    texts = [re.sub("CREATION_DATE.*", "", (tmp_path / f"a.{form}").read_text()) for form in (one, other)]
+    assert texts[0] == texts[1]
 
 
 def test_what_a_log_holds_and_not_its_name_says_how_it_is_read(tmp_path):
@@ -204,7 +215,7 @@ def test_a_log_that_is_not_there_is_refused(tmp_path):
         read_log(tmp_path)
 
 
-@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("form", FORMATS)
 def test_a_damaged_log_is_read_or_refused_in_one_line_and_never_ends_in_a_traceback(tmp_path, form):
     rng = np.random.default_rng(11)
     write_log(tmp_path / f"whole.{form}", random_samples(rng, 12, every_rate=False))

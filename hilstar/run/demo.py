@@ -21,8 +21,9 @@ from hilstar.monitor.response import Codes
 from hilstar.process.interrupts import caught
 from hilstar.resources import resource_path
 from hilstar.rotation import from_radec_roll_deg, propagate, rate_between_rad_s, slerp
-from hilstar.run.loop import FrameSink, Limit, Shown
+from hilstar.run.loop import Limit
 from hilstar.run.serve import serve
+from hilstar.run.shown import FrameSink, Shown
 from hilstar.units import ARCSEC_PER_RAD, NS_PER_S
 
 SEND_HZ = 100.0

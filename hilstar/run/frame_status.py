@@ -1,4 +1,4 @@
-"""What the bench is told of the frames that it caused."""
+"""The status that goes back to the sender: which frame its attitudes caused, and how the display is doing."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ from hilstar.attitude.receiver import PacketCounts
 from hilstar.attitude.wire import protocol
 from hilstar.attitude.wire.packet import Status
 from hilstar.notices import Notices
-from hilstar.run.loop import FrameLoop, Shown
+from hilstar.run.loop import FrameLoop
 from hilstar.run.record.ledger import Ledger
+from hilstar.run.shown import Shown
 
 
 class StatusMaker:
@@ -20,9 +21,9 @@ class StatusMaker:
         self._told: dict[str, int] = {}
 
     def status(self, shown: Shown, light_t_ns: int, loop: FrameLoop, counts: PacketCounts, synchronised: bool) -> Status:
-        """The status after a frame whose light leaves at `light_t_ns` of the bench's clock."""
-        missed, refused = loop.stats.missed_frames, counts.refused
-        attitude, on_screen = shown.attitude, loop.overrides.now
+        """The status after a frame whose light leaves at `light_t_ns` of the sender's clock."""
+        missed, refused = loop.tally.missed_frames, counts.refused
+        attitude, on_screen = shown.attitude, loop.pacer.operator.look()
         health = {
             protocol.HEALTH_NO_ATTITUDE: shown.missing and not loop.gate.stale,
             protocol.HEALTH_STALE: loop.gate.stale,

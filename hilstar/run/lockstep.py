@@ -13,9 +13,10 @@ from hilstar.attitude.wire.packet import AttitudeSample, Event, Refusal, TimeRep
 from hilstar.attitude.wire.zmq_lockstep import ZmqLockstep
 from hilstar.bench.frame import Bench
 from hilstar.run.frame_status import StatusMaker
-from hilstar.run.loop import FrameLoop, Limit, Shown
+from hilstar.run.loop import FrameLoop, Limit
 from hilstar.run.record.ledger import Ledger
 from hilstar.run.record.records import below_step, frame_record
+from hilstar.run.shown import Shown
 from hilstar.running_statistics import RunningStatistics
 from hilstar.units import NS_PER_MS, NS_PER_S
 
@@ -32,7 +33,7 @@ def serve_lockstep(
     last = Shown(0, 0, None, bench.draw(None), missing=True)
     begin_ns = time.monotonic_ns()
     end_ns = begin_ns + limit.slots / bench.config.monitor.refresh_hz * NS_PER_S
-    while loop.stats.frames < limit.frames and time.monotonic_ns() < end_ns and not loop.stop.is_set():
+    while loop.tally.frames < limit.frames and time.monotonic_ns() < end_ns and not loop.stop.is_set():
         arrival = link.receive(POLL_MS)
         if arrival is None:
             loop.idle()
@@ -55,7 +56,7 @@ def serve_lockstep(
         link.reply(statuses.status(last, last.t_ns, loop, counts, False), shown_ns, refusal)
         turn_ms.add((shown_ns - arrival.host_ns) / NS_PER_MS)
     duration_s = (time.monotonic_ns() - begin_ns) / NS_PER_S
-    summary = loop.stats.summary(duration_s, counts, bench.renderer.gl_renderer)
+    summary = loop.tally.summary(duration_s, counts, bench.renderer.gl_renderer)
     return summary | {"turn_ms": turn_ms.summary(), "stale_events": 0}
 
 
@@ -77,7 +78,7 @@ def _show(loop: FrameLoop, arrival: Arrival[Event]) -> Shown:
     if not isinstance(sample, AttitudeSample):
         raise TypeError("only an attitude is shown")
     attitude = Attitude(sample.q_icrs_to_cam, 0, False, sample.sequence, arrival.host_ns)
-    shown = loop.draw(loop.stats.frames, sample.t_ns, attitude)
+    shown = loop.draw(loop.tally.frames, sample.t_ns, attitude)
     if shown is None:
         raise AssertionError("a frame in lockstep has no moment that can pass")
     return shown

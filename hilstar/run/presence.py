@@ -1,11 +1,10 @@
-"""Says while it happens whether an attitude is there: none yet, the first, stale, fresh again."""
+"""Tells of the attitude as it comes and goes: none yet, the first, stale, fresh again."""
 
 from __future__ import annotations
 
-import time
-
 from hilstar.attitude.clock.timeline import Attitude
 from hilstar.notices import Notices
+from hilstar.run.host_clock import HOST_CLOCK, HostClock
 from hilstar.units import NS_PER_S
 
 NONE_YET_NS = 2 * NS_PER_S
@@ -14,15 +13,16 @@ NONE_YET_NS = 2 * NS_PER_S
 class AttitudeWatch:
     """Sees the attitude of each frame, before anything that an operator does to it."""
 
-    def __init__(self, notices: Notices) -> None:
+    def __init__(self, notices: Notices, clock: HostClock = HOST_CLOCK) -> None:
         self._notices = notices
+        self._clock = clock
         self._begun_ns: int | None = None
         self._seen = self._missed = False
         self._stale_ns: int | None = None  # since when, host time
 
     def see(self, attitude: Attitude | None, stale: bool) -> None:
         """The attitude of the frame that is next, None where none has come yet, and whether it is too old."""
-        now_ns = time.monotonic_ns()
+        now_ns = self._clock.now_ns()
         if self._begun_ns is None:
             self._begun_ns = now_ns
         for_s = (now_ns - self._begun_ns) / NS_PER_S

@@ -20,11 +20,14 @@ from hilstar.notices import Notices
 from hilstar.process.interrupts import stop_on_signal
 from hilstar.run.frame_status import StatusMaker
 from hilstar.run.lockstep import serve_lockstep
-from hilstar.run.loop import FrameLoop, FrameSink, Limit, ignore, policy_of
+from hilstar.run.loop import FrameLoop, Limit, policy_of
+from hilstar.run.pacer import Moment, Pacer
 from hilstar.run.record.ledger import Ledger
 from hilstar.run.record.records import below_step, frame_record
 from hilstar.run.replay import Play
+from hilstar.run.screen.display_pacer import DisplayPacer
 from hilstar.run.screen.screen import Screen
+from hilstar.run.shown import FrameSink, Shown, ignore
 from hilstar.units import NS_PER_S
 
 AnyLink = ZmqReceiver | ZmqLockstep | SerialLink
@@ -37,6 +40,10 @@ class Outlet:
     screen: Screen | None = None
     ledger: Ledger | None = None
     notices: Notices = field(default_factory=Notices)
+
+    def pacer(self) -> Pacer | None:
+        """What paces and shows the frames: the screen; None without one."""
+        return None if self.screen is None else DisplayPacer(self.screen, self.notices)
 
 
 def link_keys(settings: AttitudeSettings, folder: Path) -> CurveKeys:
@@ -58,7 +65,7 @@ def open_link(settings: AttitudeSettings, folder: Path, notices: Notices | None 
 def serve(bench: Bench, link: AnyLink, limit: Limit, sink: FrameSink = ignore, outlet: Outlet | None = None) -> dict[str, Any]:
     """Show the live stream of `link` up to `limit`, or until a signal; the summary."""
     outlet = outlet or Outlet()
-    loop, ledger = FrameLoop(bench, sink, outlet.screen, notices=outlet.notices), outlet.ledger
+    loop, ledger = FrameLoop(bench, sink, outlet.pacer(), notices=outlet.notices), outlet.ledger
     with stop_on_signal(loop.stop), loop.watch:
         if isinstance(link, ZmqLockstep):
             bench.warm_up()
@@ -80,28 +87,29 @@ def _serve_stream(
     receiver = Receiver(link, timeline, traffic, watch, outlet.notices)
     statuses = StatusMaker(ledger)
 
-    def draw_slot(slot: int) -> None:
+    def draw_slot(moment: Moment) -> Shown | None:
         receiver.tend()
-        t_ns = receiver.clock.to_sender_ns(loop.light_ns(time.monotonic_ns()))
-        shown = loop.draw(slot, t_ns, timeline.at(t_ns))
+        t_ns = receiver.clock.to_sender_ns(moment.light_if_begun_at(time.monotonic_ns()))
+        shown = loop.draw(moment.slot, t_ns, timeline.at(t_ns), moment)
         if shown is None:
-            return
+            return None
         light_ns = receiver.sender_ns(t_ns)
         if ledger is not None:
-            ledger.frame(frame_record(shown, light_ns, loop.stats.missed_frames, below_step(bench, shown)))
+            ledger.frame(frame_record(shown, light_ns, loop.tally.missed_frames, below_step(bench, shown)))
         if link.two_way:
             receiver.post(statuses.status(shown, light_ns, loop, receiver.counts, receiver.clock.synchronised))
+        return shown
 
     receiver.start()
     try:
         bench.warm_up()
         receiver.learn()
         begin_ns = time.monotonic_ns()
-        loop.paced(bench.config.monitor.refresh_hz, limit, draw_slot)
+        loop.paced(limit, draw_slot)
     finally:
         receiver.close()
     duration_s = (time.monotonic_ns() - begin_ns) / NS_PER_S
-    summary = loop.stats.summary(duration_s, receiver.counts, bench.renderer.gl_renderer)
+    summary = loop.tally.summary(duration_s, receiver.counts, bench.renderer.gl_renderer)
     return summary | {
         "stale_events": loop.gate.events,
         "receive_latency_ms": receiver.latency_ms.summary(),
@@ -116,26 +124,27 @@ def replay(bench: Bench, play: Play, sink: FrameSink = ignore, outlet: Outlet | 
     Paced, late frames are missed, as on a monitor; otherwise every frame is drawn, as fast as it can be.
     """
     outlet = outlet or Outlet()
-    loop, ledger = FrameLoop(bench, sink, outlet.screen, play.moving, outlet.notices), outlet.ledger
+    loop, ledger = FrameLoop(bench, sink, outlet.pacer(), play.moving, outlet.notices), outlet.ledger
     for kind, line in play.told:
         outlet.notices.tell(kind, line)
 
-    def draw_slot(slot: int) -> None:
-        number, t_ns, attitude = play.frame(slot)
-        shown = loop.draw(number, t_ns, attitude)
+    def draw_slot(moment: Moment) -> Shown | None:
+        number, t_ns, attitude = play.frame(moment.slot)
+        shown = loop.draw(number, t_ns, attitude, moment)
         if ledger is not None and shown is not None:
-            ledger.frame(frame_record(shown, t_ns, loop.stats.missed_frames, below_step(bench, shown)))
+            ledger.frame(frame_record(shown, t_ns, loop.tally.missed_frames, below_step(bench, shown)))
+        return shown
 
     bench.warm_up()
     begin_ns = time.monotonic_ns()
     with stop_on_signal(loop.stop), loop.watch:
         if play.paced:
-            loop.paced(bench.config.monitor.refresh_hz, Limit(slots=play.frame_count), draw_slot)
+            loop.paced(Limit(slots=play.frame_count), draw_slot)
         else:
             for slot in range(play.frame_count):
                 if loop.stop.is_set():
                     break
-                draw_slot(slot)
+                draw_slot(Moment(slot))
     duration_s = (time.monotonic_ns() - begin_ns) / NS_PER_S
-    summary = loop.stats.summary(duration_s, PacketCounts(received=play.packet_count), bench.renderer.gl_renderer)
+    summary = loop.tally.summary(duration_s, PacketCounts(received=play.packet_count), bench.renderer.gl_renderer)
     return summary | {"stale_events": loop.gate.events, "events": outlet.notices.counts()} | loop.screen_summary()

@@ -10,7 +10,7 @@ from hilstar.running_statistics import RunningStatistics
 from hilstar.units import NS_PER_MS
 
 
-class SwapStats:
+class SwapTally:
     """When frames were swapped onto a screen."""
 
     def __init__(self) -> None:
@@ -39,7 +39,7 @@ class SwapStats:
         }
 
 
-class RunStats:
+class RunTally:
     """Figures of each frame, and what they come to."""
 
     def __init__(self) -> None:
@@ -48,7 +48,7 @@ class RunStats:
         self._stars = RunningStatistics()
         self._clipped_max = 0
         self.clipped_hip: set[int] = set()
-        self.swaps = SwapStats()
+        self.swaps = SwapTally()
         self.missed_frames = 0
         self.stale_frames = 0
         self.capped_frames = 0

@@ -1,13 +1,13 @@
-"""What a frame is doing and for how long: a late one is told with its stages, a stuck one while it is stuck."""
+"""Watches what a frame is doing and for how long: a late one is told with its stages, one that hangs while it hangs."""
 
 from __future__ import annotations
 
 import threading
-import time
 from types import TracebackType
 from typing import Self
 
 from hilstar.notices import Notices
+from hilstar.run.host_clock import HOST_CLOCK, HostClock
 from hilstar.units import NS_PER_MS, NS_PER_S
 
 LOOK_S = 0.25
@@ -21,7 +21,8 @@ TOLD_EVERY_NS = NS_PER_S
 class FrameWatch:
     """Takes the stages of each frame from the loop's thread; a thread of its own tells of one that does not end."""
 
-    def __init__(self, period_ns: float, notices: Notices) -> None:
+    def __init__(self, period_ns: float, notices: Notices, clock: HostClock = HOST_CLOCK) -> None:
+        self._clock = clock
         self._late_ns = max(LATE_PERIODS * period_ns, LATE_NS)
         self._notices = notices
         self._number = 0
@@ -33,15 +34,15 @@ class FrameWatch:
     def begin(self, number: int) -> None:
         """A frame begins, with its sprites."""
         self._number = number
-        self._stages = [("sprites", time.monotonic_ns())]
+        self._stages = [("sprites", self._clock.now_ns())]
 
     def enter(self, stage: str) -> None:
         """Its next stage begins."""
-        self._stages.append((stage, time.monotonic_ns()))
+        self._stages.append((stage, self._clock.now_ns()))
 
     def end(self, timed: bool) -> None:
         """The frame is done, or given up; one that is not `timed` is never late."""
-        now_ns, stages = time.monotonic_ns(), self._stages
+        now_ns, stages = self._clock.now_ns(), self._stages
         self._stages = []
         if not timed or not stages or now_ns - stages[0][1] <= self._late_ns:
             return
@@ -56,7 +57,7 @@ class FrameWatch:
             stages, number = self._stages, self._number
             if not stages or stages[-1] == stuck:
                 continue
-            now_ns = time.monotonic_ns()
+            now_ns = self._clock.now_ns()
             if now_ns - stages[-1][1] > STUCK_NS:
                 stuck = stages[-1]
                 self._notices.tell(

@@ -13,7 +13,7 @@ from hilstar.bench.frame import Bench
 from hilstar.bench.frame_files import write_codes_png
 from hilstar.errors import cannot_write
 from hilstar.files import make_directory, refuse_ledger
-from hilstar.run.loop import Shown
+from hilstar.run.shown import Shown
 
 COLUMNS = ("frame", "t_s", "qw", "qx", "qy", "qz", "stars_drawn", "clipped")
 

@@ -23,7 +23,7 @@ from hilstar.bench.config import BenchConfig
 from hilstar.bench.frame import Bench
 from hilstar.errors import InputError, cannot_read
 from hilstar.reading import parse_toml
-from hilstar.run.loop import Shown
+from hilstar.run.shown import Shown
 
 FRAME_TOPIC, PROCESS_TOPIC, EVENT_TOPIC, COUNT_TOPIC = "/frame", "/process", "/event", "/not_kept"
 

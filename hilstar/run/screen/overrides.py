@@ -2,34 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 from hilstar.attitude.clock.timeline import Attitude
 from hilstar.notices import Notices
+from hilstar.run.pacer import Operator
 from hilstar.run.screen.screen import Screen
+from hilstar.run.shown import HEADLESS, OnScreen
 from hilstar.units import NS_PER_S
 
 
-@dataclass(frozen=True, slots=True)
-class OnScreen:
-    """What lies between a frame and whoever looks: an operator's keys ("" for none), and why it is not seen ("" if it is).
+class Overrides(Operator):
+    """Follows a screen's keys and window."""
 
-    `sky` is false where the keys leave no sky at all.
-    """
-
-    operator: str = ""
-    hidden: str = ""
-    sky: bool = True
-
-
-HEADLESS = OnScreen()
-
-
-class Overrides:
-    """Follows a screen's keys and window; without a screen there are none."""
-
-    def __init__(self, screen: Screen | None, notices: Notices) -> None:
+    def __init__(self, screen: Screen, notices: Notices) -> None:
         self._screen = screen
         self._notices = notices
         self._told = HEADLESS
@@ -39,11 +26,13 @@ class Overrides:
         self._lasted_ns = {"operator": 0, "hidden": 0}
 
     @property
-    def now(self) -> OnScreen:
-        """As the keys and the window are; what has changed is told."""
+    def paused(self) -> bool:
+        """Whether the operator has stopped the sky."""
+        return self._screen.paused
+
+    def look(self) -> OnScreen:
+        """The state of the keys and the window now; what has changed is told."""
         screen = self._screen
-        if screen is None:
-            return HEADLESS
         now = OnScreen(screen.operator, screen.window.hidden, screen.shows_sky)
         if now != self._told:
             before, self._told = self._told, now
@@ -62,8 +51,6 @@ class Overrides:
     def attitude(self, t_ns: int, attitude: Attitude | None) -> Attitude | None:
         """What the keys leave of a frame's attitude: the one of the pause, which grows old, and none where no sky is shown."""
         screen = self._screen
-        if screen is None:
-            return attitude
         if not screen.paused:
             self._held = None if attitude is None else (attitude, t_ns)
         elif self._held is None:

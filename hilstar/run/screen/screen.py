@@ -17,8 +17,8 @@ from hilstar.bench.orientation import orientation_of
 from hilstar.errors import MachineError
 from hilstar.monitor.window.window import Window, WindowSettings
 from hilstar.render.presenter import BLANK, CROSSHAIR, GRID, PATCH, Presenter, View, window_context
-from hilstar.run.pacing import DrawBudget, SwapClock
 from hilstar.run.screen.photodiode import marker_light
+from hilstar.run.screen.swap_clock import DrawBudget, SwapClock
 from hilstar.units import NS_PER_MS, NS_PER_S
 
 GATE_FRAMES = 120
@@ -44,7 +44,7 @@ class Screen:
     """A window with a bench's frames on it.
 
     `clock` knows when it swaps, `budget` how early a frame has to be begun, and `swap_to_light_ns` is from a swap to the
-    first light of the middle row: half of the scan-out, and the panel's own delay. `marker` is the photodiode square, 0 or 1.
+    first light of the middle row: half of the scan-out, and the panel's own delay.
     """
 
     def __init__(self, window: Window, bench: Bench) -> None:
@@ -53,7 +53,6 @@ class Screen:
         self.bench = bench
         self.paused = False
         self.timing = Timing(1000.0 / monitor.refresh_hz, 0, False)
-        self.marker: int | None = None
         self.swap_to_light_ns = round((bench.scan.scanout_s / 2 * 1e3 + monitor.panel_delay_ms) * NS_PER_MS)
         self._start_clock(time.monotonic_ns())
         self._overlay = 0
@@ -87,15 +86,16 @@ class Screen:
         """Where the times of swaps come from, and who paces them."""
         return self.window.timestamp_source + ("" if self.timing.paced_by_screen else ", software pacing")
 
-    def present(self, number: int) -> None:
-        """Draw the bench's last frame on the back buffer, whole; `number` is the frame's, for the photodiode square."""
+    def present(self, number: int) -> int | None:
+        """Draw the bench's last frame on the back buffer; the photodiode square's light in frame `number`, None without one."""
         monitor = self.bench.config.monitor
         white = 2**monitor.bits - 1
         code = round(PATCHES[self._patch] * white) if self._patch >= 0 else 0
         overlay = self._overlay | (PATCH if self._patch >= 0 else 0)
         side_px = monitor.photodiode_px
-        self.marker = marker_light(number, monitor.photodiode) if side_px else None
-        self._presenter.present(overlay, code, (side_px, white * (self.marker or 0)))
+        marker = marker_light(number, monitor.photodiode) if side_px else None
+        self._presenter.present(overlay, code, (side_px, white * (marker or 0)))
+        return marker
 
     def swap(self) -> int:
         """Swap what was presented onto the screen, and take in keys; host time of the swap, ns."""

@@ -22,7 +22,7 @@ from hilstar.attitude.wire.zmq_stream import ZmqSender
 from hilstar.errors import InputError
 from hilstar.process.interrupts import caught
 from hilstar.rotation import from_radec_roll_deg, propagate, rate_between_rad_s
-from hilstar.run.pacing import wait_until
+from hilstar.run.host_clock import HOST_CLOCK
 from hilstar.run.send.faults import BadCable
 from hilstar.units import NS_PER_S
 
@@ -164,7 +164,7 @@ def send(
     start_ns = time.monotonic_ns()
     for sample in samples:
         due_ns = start_ns + sample.t_ns
-        if wait_until(due_ns + round(cable.delay_s() * NS_PER_S), stop):
+        if HOST_CLOCK.wait_until(due_ns + round(cable.delay_s() * NS_PER_S), stop):
             break
         stamped = AttitudeSample(due_ns, sample.q_icrs_to_cam, sample.rate_cam_rad_s, sample.sequence, sample.discontinuity)
         cable.carry(encode(stamped))

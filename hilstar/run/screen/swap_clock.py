@@ -1,27 +1,11 @@
-"""Waiting for a moment of the host's clock, and knowing when a screen swaps next."""
+"""When a screen swaps next, and how long before that a frame has to be begun."""
 
 from __future__ import annotations
 
 import math
-import threading
-import time
 from collections import deque
 
-from hilstar.units import NS_PER_MS, NS_PER_S
-
-LONGEST_WAIT_S = 3600.0  # the platform's own limit is some centuries; a wait is begun anew
-# An event wakes up to 0.1 ms late, and the thread then waits for Python's lock: the last of a wait is slept without either.
-COARSE_NS = round(0.7 * NS_PER_MS)
-
-
-def wait_until(due_ns: int, stop: threading.Event) -> bool:
-    """Wait until `time.monotonic_ns()` reaches `due_ns`; True when stopped before."""
-    while (wait_ns := due_ns - time.monotonic_ns() - COARSE_NS) > 0:
-        if stop.wait(min(wait_ns / NS_PER_S, LONGEST_WAIT_S)):
-            return True
-    if (rest_ns := due_ns - time.monotonic_ns()) > 0:
-        time.sleep(rest_ns / NS_PER_S)
-    return stop.is_set()
+from hilstar.units import NS_PER_MS
 
 
 class SwapClock:
@@ -73,8 +57,8 @@ class DrawBudget:
         self._costs_ns.append(cost_ns)
 
     @property
-    def least_ns(self) -> float:
-        """What hardly any frame undercuts: with less than this left a swap is not to be reached."""
+    def min_ns(self) -> float:
+        """The shortest of the last frames: with less time left than that, a swap cannot be reached."""
         return min(self._costs_ns, default=0)
 
     @property

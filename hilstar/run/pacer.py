@@ -1,0 +1,145 @@
+"""Pacing: when each frame of a run is to be begun, when its light leaves, and what shows it.
+
+A pacer hands the frame loop one moment after another. `ClockPacer` keeps a grid of this host's clock, for a run without a
+screen; `screen.display_pacer` follows a display's refresh.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from hilstar.attitude.clock.timeline import Attitude
+from hilstar.bench.frame import Drawn
+from hilstar.run.host_clock import HOST_CLOCK, HostClock
+from hilstar.run.shown import HEADLESS, OnScreen
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """When a frame is to be shown; host times, ns.
+
+    It is begun at `begin_ns` and late after `due_ns` (None: never late). `swap_ns` is its predicted swap onto a screen, and
+    `light_ns` when its middle row lights (None: as soon as it is begun). The pacer gives all of these; the frame loop counts
+    `missed_before`, the refresh periods just before it without a frame of their own, and whether it `may_be_given_up`.
+    """
+
+    slot: int = 0
+    begin_ns: int = 0
+    due_ns: int | None = None
+    swap_ns: int | None = None
+    light_ns: int | None = None
+    missed_before: int = 0
+    may_be_given_up: bool = True
+
+    def light_if_begun_at(self, host_ns: int) -> int:
+        """When the light of the frame leaves if it is begun at `host_ns`."""
+        return host_ns if self.light_ns is None else self.light_ns
+
+
+AT_ONCE = Moment()
+
+
+@dataclass(frozen=True, slots=True)
+class Presented:
+    """How a frame reached whoever looks: when (host time, ns), by which clock, and the photodiode square's light with it."""
+
+    swap_ns: int
+    timestamp_source: str = "headless"
+    marker: int | None = None
+
+
+class Operator:
+    """What an operator changes of the frames: without a screen nothing."""
+
+    @property
+    def paused(self) -> bool:
+        """Whether the frames keep the attitude that they had."""
+        return False
+
+    def look(self) -> OnScreen:
+        """The state of the keys and the window now."""
+        return HEADLESS
+
+    def attitude(self, t_ns: int, attitude: Attitude | None) -> Attitude | None:
+        """The attitude to show at `t_ns` of the timeline."""
+        return attitude
+
+    def count(self, shown: OnScreen, swap_ns: int) -> None:
+        """Take in what a frame was shown as."""
+
+
+class Pacer(Protocol):
+    """Says when frames are due, and shows them."""
+
+    @property
+    def clock(self) -> HostClock:
+        """The clock of all its moments."""
+
+    @property
+    def stop(self) -> threading.Event:
+        """Set to end the run."""
+
+    @property
+    def operator(self) -> Operator:
+        """Whoever stands at the screen."""
+
+    @property
+    def moves_stars(self) -> bool:
+        """Whether stars move within a frame here: rows of a screen light one after another."""
+
+    def moments(self) -> Iterator[Moment]:
+        """The moments of a run, without end; each is the first that can be reached when it is asked for."""
+
+    def steady(self) -> AbstractContextManager[object]:
+        """While this is open, nothing of this process holds up the frames."""
+
+    def show(self, number: int, drawn: Drawn, moment: Moment, begun_ns: int, enter: Callable[[str], None]) -> Presented:
+        """Show a frame that was begun at `begun_ns`; `enter` is told each stage of it."""
+
+    def idle(self) -> None:
+        """Called while no frame is due."""
+
+    def summary(self, swaps: dict[str, Any]) -> dict[str, Any]:
+        """What the run's summary says of the screen and its `swaps`; {} without a screen."""
+
+
+class ClockPacer:
+    """Frames at a steady rate of this host's clock, which nobody sees: their levels are read back."""
+
+    moves_stars = False
+
+    def __init__(self, period_ns: float, clock: HostClock = HOST_CLOCK) -> None:
+        self.clock = clock
+        self.stop = threading.Event()
+        self.operator = Operator()
+        self._period_ns = period_ns
+
+    def moments(self) -> Iterator[Moment]:
+        """One each period from now on; those that have passed when the next is asked for are left out."""
+        start_ns = self.clock.now_ns()
+        slot = 0
+        while True:
+            due_ns = start_ns + round(slot * self._period_ns)
+            yield Moment(slot, due_ns, due_ns)
+            passed = int((self.clock.now_ns() - start_ns) // self._period_ns)
+            slot = max(slot, passed) + 1
+
+    def steady(self) -> AbstractContextManager[object]:
+        """Nothing is at stake here."""
+        return nullcontext()
+
+    def show(self, number: int, drawn: Drawn, moment: Moment, begun_ns: int, enter: Callable[[str], None]) -> Presented:
+        """Read the levels back."""
+        _ = drawn.levels
+        return Presented(self.clock.now_ns())
+
+    def idle(self) -> None:
+        """Nothing has to be kept alive."""
+
+    def summary(self, swaps: dict[str, Any]) -> dict[str, Any]:
+        """There is no screen."""
+        return {}

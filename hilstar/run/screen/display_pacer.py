@@ -1,0 +1,82 @@
+"""Frames at a display's own refresh: each begun as late as the last ones allow, for the first swap that it can reach."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from hilstar.bench.frame import Drawn
+from hilstar.notices import Notices
+from hilstar.process.priority import steady_loop
+from hilstar.run.host_clock import HOST_CLOCK, HostClock
+from hilstar.run.pacer import Moment, Presented
+from hilstar.run.screen.overrides import Overrides
+from hilstar.run.screen.screen import Screen
+
+log = logging.getLogger(__name__)
+
+
+class DisplayPacer:
+    """Paces by a screen and shows frames on it; `stop` is set when its window closes."""
+
+    moves_stars = True
+
+    def __init__(self, screen: Screen, notices: Notices, clock: HostClock = HOST_CLOCK) -> None:
+        self.clock = clock
+        self.stop = threading.Event()
+        self.operator = Overrides(screen, notices)
+        self.scheduling = "normal"
+        self._screen = screen
+        self._notices = notices
+
+    def moments(self) -> Iterator[Moment]:
+        """One for each swap that can still be reached."""
+        swaps, budget, slot = self._screen.clock, self._screen.budget, 0
+        due_ns = swaps.next_after(self.clock.now_ns() + budget.ns)
+        while True:
+            begin_ns = round(due_ns - budget.ns)
+            yield Moment(slot, begin_ns, due_ns, swap_ns=due_ns, light_ns=due_ns + self._screen.swap_to_light_ns)
+            following_ns = swaps.next_after(max(self.clock.now_ns() + budget.min_ns, due_ns + swaps.period_ns / 2))
+            slot += max(1, round((following_ns - due_ns) / swaps.period_ns))
+            due_ns = following_ns
+
+    @contextmanager
+    def steady(self) -> Iterator[None]:
+        """Run this thread at real-time priority where that is allowed."""
+        with steady_loop() as self.scheduling:
+            if self.scheduling.startswith("normal"):
+                log.warning("the frame loop runs at normal priority (%s)", self.scheduling.removeprefix("normal: "))
+            yield
+
+    def show(self, number: int, drawn: Drawn, moment: Moment, begun_ns: int, enter: Callable[[str], None]) -> Presented:
+        """Put the frame on the screen at its moment."""
+        enter("present")
+        marker = self._screen.present(number)
+        self._screen.budget.add(self.clock.now_ns() - begun_ns)
+        if moment.swap_ns is not None and not self._screen.clock.paced_by_screen:
+            self.clock.wait_until(moment.swap_ns, self.stop)
+        enter("swap")
+        swap_ns = self._screen.swap()
+        self._end_with_window()
+        return Presented(swap_ns, self._screen.timestamp_source, marker)
+
+    def _end_with_window(self) -> None:
+        if self._screen.closing:
+            self.stop.set()
+        if self._screen.window.gone is not None:
+            self._notices.begin("window-gone", f"{self._screen.window.gone}: the run ends")
+
+    def idle(self) -> None:
+        """Keep the window alive, and take in its keys."""
+        self._screen.present(0)
+        self._screen.swap()
+        self.operator.look()
+        self._end_with_window()
+
+    def summary(self, swaps: dict[str, Any]) -> dict[str, Any]:
+        """Where the times of swaps come from, the loop's scheduling, the swaps, and how long the sky was changed or hidden."""
+        named = {"timestamp_source": self._screen.timestamp_source, "scheduling": self.scheduling}
+        return named | swaps | self.operator.summary()

@@ -1,0 +1,114 @@
+"""What of a log, or of an earlier run, is replayed: which frames, at which times, with which attitudes."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from hilstar.attitude.wire.packet import AttitudeSample, encode
+from hilstar.bench.config import parse_config
+from hilstar.errors import InputError
+from hilstar.run.record.ledger import Ledger
+from hilstar.run.record.records import FrameRecord
+from hilstar.run.replay import Wanted, plan_play
+from tests.conftest import SMALL_BENCH
+
+MAX = math.inf
+
+
+@pytest.fixture
+def config(tmp_path):
+    return parse_config(tmp_path / "bench.toml", SMALL_BENCH)
+
+
+@pytest.fixture
+def log(tmp_path):
+    """Two seconds of a turn about the boresight at 0.1 rad/s, a sample each 0.1 s, which begins at 100 s of its clock."""
+    lines = [f"{100 + k / 10},{math.cos(0.005 * k)},0,0,{math.sin(0.005 * k)}" for k in range(21)]
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join(["t_s,qw,qx,qy,qz", *lines]) + "\n")
+    return path
+
+
+@pytest.fixture
+def ledger(tmp_path, small_bench_file):
+    """An earlier run: ten frames, one each 20 ms, the fourth of them blank, the last two on paths."""
+    bench = SimpleNamespace(
+        file=SimpleNamespace(path=small_bench_file, text=SMALL_BENCH, sha256="0" * 64),
+        calibration=SimpleNamespace(name="srgb", sha256="1" * 64),
+        renderer=SimpleNamespace(gl_renderer="none"),
+    )
+    path = tmp_path / "run.mcap"
+    with Ledger(path, bench) as kept:
+        for k in range(10):
+            sample = AttitudeSample(k, np.array([1.0, 0.0, 0.0, 0.0]), None, k)
+            kept.packet(1000 + k, encode(sample), sample, None)
+            q, rate = None if k == 3 else (1.0, 0.0, 0.0, 0.0), (0.0, 0.1, 0.0) if k >= 8 else None
+            at_ns = 20_000_000 * k
+            kept.frame(FrameRecord(frame=2 * k, t_ns=500 + k, light_ns=0, draw_ns=at_ns, swap_ns=at_ns, q=q, rate=rate))
+    return path
+
+
+def test_a_log_has_a_frame_each_refresh_period_from_its_first_sample_to_its_last(log, config):
+    play = plan_play(log, Wanted(), config)
+    assert play.paced and play.frame_count == 121 and play.packet_count == 21
+    number, t_ns, attitude = play.frame(60)
+    assert (number, t_ns) == (60, 101_000_000_000)
+    assert attitude.q_icrs_to_cam == pytest.approx([math.cos(0.05), 0, 0, math.sin(0.05)], abs=1e-9)
+
+
+@pytest.mark.parametrize(("speed", "frames"), [(2.0, 61), (0.5, 241), (MAX, 121)])
+def test_the_speed_stretches_the_log_and_max_draws_it_all_unpaced(log, config, speed, frames):
+    play = plan_play(log, Wanted(speed), config)
+    assert play.frame_count == frames
+    assert play.paced == (speed != MAX)
+
+
+def test_a_span_and_a_step_choose_the_frames(log, config):
+    play = plan_play(log, Wanted(MAX, start_s=0.5, stop_s=1.5, step_s=0.25), config)
+    assert [play.frame(k)[1] / 1e9 for k in range(play.frame_count)] == [100.5, 100.75, 101.0, 101.25, 101.5]
+
+
+@pytest.mark.parametrize(
+    ("wanted", "word"),
+    [
+        (Wanted(start_s=3.0), "--start"),
+        (Wanted(stop_s=2.5), "--stop"),
+        (Wanted(start_s=1.5, stop_s=1.0), "--start"),
+        (Wanted(step_s=0.0), "--step"),
+        (Wanted(2.0, step_s=0.1), "--step"),
+        (Wanted(step_s=1e-12), "frames"),
+    ],
+)
+def test_a_replay_of_no_or_too_many_frames_is_refused(log, config, wanted, word):
+    with pytest.raises(InputError, match=word):
+        plan_play(log, wanted, config)
+
+
+def test_a_log_that_turns_faster_than_the_bench_file_allows_is_refused_by_its_attitude(tmp_path, config):
+    path = tmp_path / "fast.csv"
+    path.write_text("t_s,qw,qx,qy,qz,rx,ry,rz\n0,1,0,0,0,0,0,0\n1,1,0,0,0,0,0,57.3\n")
+    with pytest.raises(InputError, match=r"attitude 2.*max_rate_deg_s"):
+        plan_play(path, Wanted(), config)
+
+
+def test_an_earlier_run_is_replayed_frame_by_frame_with_its_own_numbers_and_attitudes(ledger, config):
+    play = plan_play(ledger, Wanted(MAX), config)
+    assert (play.frame_count, play.packet_count, play.paced, play.moving) == (10, 10, False, True)
+    frames = [play.frame(k) for k in range(10)]
+    assert [(number, t_ns) for number, t_ns, _ in frames] == [(2 * k, 500 + k) for k in range(10)]
+    assert [attitude is None for _, _, attitude in frames] == [k == 3 for k in range(10)]
+    assert frames[7][2].rate_cam_rad_s is None
+    assert frames[8][2].rate_cam_rad_s.tolist() == [0.0, 0.1, 0.0]
+
+
+def test_a_part_of_an_earlier_run_is_chosen_by_when_its_frames_were_swapped(ledger, config):
+    play = plan_play(ledger, Wanted(start_s=0.04, stop_s=0.08), config)
+    assert [play.frame(k)[0] for k in range(play.frame_count)] == [4, 6, 8]
+    with pytest.raises(InputError, match="has no frame from"):
+        plan_play(ledger, Wanted(start_s=0.041, stop_s=0.042), config)
+    with pytest.raises(InputError, match="frame by frame"):
+        plan_play(ledger, Wanted(2.0), config)

@@ -6,10 +6,9 @@ import errno
 import math
 import time
 from types import TracebackType
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import zmq
-from zmq.auth.thread import ThreadAuthenticator
 
 from hilstar.attitude.wire.doorkeeper import HANDSHAKE_MS, Doorkeeper
 from hilstar.attitude.wire.endpoint import ENDPOINT_FORM, PATH_FORM, check_use, parse_endpoint
@@ -17,6 +16,9 @@ from hilstar.attitude.wire.flood_limits import MAX_GROWTH_BYTES, LinkCounts, Mem
 from hilstar.attitude.wire.keys import AllowList, CurveKeys, check_reach, load_public, load_secret
 from hilstar.errors import InputError
 from hilstar.notices import Notices
+
+if TYPE_CHECKING:
+    from zmq.auth.thread import ThreadAuthenticator
 
 # At most QUEUE_MESSAGES of a flood wait here; the rest wait at the sender or are lost there. A part over MAX_PART_BYTES drops
 # its connection, which is then made anew; a message of more than MAX_PARTS drops every connection. A message that never ends

@@ -62,7 +62,7 @@ class BackChannel:
             self._link.send(status)
 
     def ask_quickly(self, now_ns: int) -> None:
-        """Begin again with quick time requests: now there is somebody to answer."""
+        """Begin again with quick time requests: now there is a sender to answer."""
         self._quick_asks, self._next_ask_ns = FIRST_ASKS, now_ns
 
     def _ask(self, now_ns: int) -> None:

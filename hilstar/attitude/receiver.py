@@ -140,7 +140,7 @@ class Receiver:
             while not self._stop.is_set():
                 self._listen()
             self._settle(self.jumps.release())
-        except BaseException as error:  # whatever it is: the display goes on, and `tend` restarts this
+        except BaseException as error:  # whatever it is: the display continues, and `tend` restarts this
             self._failure = f"{type(error).__name__}: {error}"
 
     def _listen(self) -> None:

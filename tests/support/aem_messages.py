@@ -12,7 +12,7 @@ EPOCHS = ("2024-02-29T23:59:59.25", "2024-03-01T00:00:01")
 
 
 def kvn(rows, version="1.0", **keywords):
-    """A message of one block; a keyword that is None is left out."""
+    """A message of one block; a keyword that is None is omitted."""
     meta = {"OBJECT_NAME": "X", "OBJECT_ID": "X", "REF_FRAME_A": "ICRF", "REF_FRAME_B": "SC_BODY_1"}
     if version == "1.0":
         meta |= {"ATTITUDE_DIR": "A2B", "QUATERNION_TYPE": "LAST"}

@@ -91,7 +91,7 @@ class JumpFilter:
         """The samples that this one decides, itself among them unless it is in doubt."""
         self._steps.add(arrival.event)
         late_ns = self._late_ns(arrival)
-        known = self._clock.synchronised  # then what is ever later, in its usual steps, queues on the road
+        known = self._clock.synchronised  # then packets that get later at their usual steps are queueing on the link
         if is_timely(arrival):
             self._pace.add(arrival.host_ns, arrival.host_ns - arrival.event.t_ns)
             if self.slowness > 0 and not known and MIN_LIMIT_NS < late_ns < MAX_FOLLOWED_NS:

@@ -15,7 +15,7 @@ from hilstar.units import NS_PER_S
 WINDOW_NS = 30 * NS_PER_S
 SLOT_NS = NS_PER_S // 4
 MIN_DRIFT_SPAN_NS = 2 * NS_PER_S  # over a shorter span, 50 us of noise would read as more than 25 ppm
-MAX_DRIFT = 0.002  # ten times the worst crystal's; a steeper slope is a step, or t_ns is no clock
+MAX_DRIFT = 0.002  # ten times the worst crystal's; a steeper slope is a step, or t_ns is not a clock
 
 
 @dataclass(frozen=True, slots=True)

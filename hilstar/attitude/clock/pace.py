@@ -69,7 +69,7 @@ class Pace:
         self._slots.begin(host_ns, offset_ns)
 
     def _look(self) -> None:
-        """A slow or a fast clock goes on steadily; a jump or a queue is a step, and says nothing."""
+        """A slow or a fast clock drifts steadily; a jump or a queue is a step, and decides nothing."""
         x, y = self._slots.relative_to(self._slots[0])
         slope = y[-1] / x[-1]
         uneven_ns = np.abs(y - slope * x).max()

@@ -21,7 +21,7 @@ SLEW = 0.01
 MAX_SLEWED_NS = 50 * NS_PER_MS
 SETTLING_NS = 2 * NS_PER_S
 # A one-way stream cannot measure its minimum delay. That of sockets on one machine (0.02 to 0.1 ms) is in the uncertainty, so
-# that it contains the truth there; the delay of a longer road is not.
+# that it contains the truth there; the delay of a longer link is not.
 LOCAL_DELAY_NS = 100_000
 
 ClockMode = Literal["none", "one-way", "exchange", "shared"]

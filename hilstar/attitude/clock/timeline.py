@@ -1,6 +1,6 @@
 """The attitude at any time, from samples: interpolated between them, predicted for a bounded time past the last.
 
-Times are nanoseconds of one continuous clock: the bench's, which `clock` and `jumps` carry across to the host's.
+Times are nanoseconds on one continuous clock: the sender's, with its jumps removed (`jumps`).
 """
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ from hilstar.attitude.wire.packet import AttitudeSample, Refusal, rate_refusal
 from hilstar.rotation import angle_between_rad, propagate, rate_between_rad_s, slerp
 from hilstar.units import NS_PER_S
 
-# A live timeline keeps this many samples, 5 s at 200 Hz, or twice as many: far more than a frame looks back.
+# A live timeline keeps one to two times this many samples, 5 s or more at 200 Hz: far more than a frame looks back.
 LIVE_CAPACITY = 1024
-# A stale attitude is fresh again once it is no older than this share of `stale_after`: no flicker at the limit.
+# A stale attitude is fresh again once it is younger than this share of `stale_after`, so that it does not flicker at the limit.
 FRESH_AGAIN = 0.5
 
-# What lies between two samples: the first one until the second, the shorter way, or the C2 blend of both with their rates.
+# Between two samples: the first one is held, SLERP takes the shorter way, or both are blended (C2) with their rates.
 Join = Literal["hold", "slerp", "blend"]
 Joins = Callable[[AttitudeSample, AttitudeSample], Join]
 
 
 @dataclass(frozen=True, slots=True)
 class Attitude:
-    """An attitude at one time, and the newest sample behind it: its age, whether that is too old, its number and arrival.
+    """An attitude at one time, with the age, sequence and arrival of the newest sample behind it, and whether it is too old.
 
-    `prediction_ns` is how far the attitude was carried on past that sample, and `rate_cam_rad_s` how fast it turns then,
-    None where it stands still.
+    `prediction_ns` is how far the attitude was propagated past that sample, and `rate_cam_rad_s` the rate at that time, None
+    where the attitude is held.
     """
 
     q_icrs_to_cam: FloatArray
@@ -46,9 +46,9 @@ class Attitude:
 
 @dataclass(frozen=True, slots=True)
 class Policy:
-    """What happens past the newest sample, how long it counts as fresh, and the fastest turn that is believed.
+    """How far to predict past the newest sample, how long it counts as fresh, and the maximum rate.
 
-    A sample whose rate is over `max_rate_rad_s` is refused; two samples farther apart than that are a jump.
+    A sample whose rate exceeds `max_rate_rad_s` is refused; two samples farther apart than that are a jump.
     """
 
     max_extrapolation_ns: int
@@ -59,7 +59,7 @@ class Policy:
 class Timeline:
     """Samples in order of time. One thread may add while another asks.
 
-    `joins` says what lies between two of them; by default what may be said of a live stream.
+    `joins` says how two of them join; the default suits a live stream.
     """
 
     def __init__(self, policy: Policy, capacity: int = LIVE_CAPACITY, joins: Joins | None = None) -> None:
@@ -80,13 +80,13 @@ class Timeline:
         return self._policy.stale_after_ns
 
     def add(self, sample: AttitudeSample, received_ns: int | None = None) -> Refusal | None:
-        """Append a sample; refused are one whose time does not rise, a duplicate or one out of order, and one too fast."""
+        """Append a sample, or say why it is refused: its time does not increase, or its rate is too high."""
         too_fast = rate_refusal(sample, self._policy.max_rate_rad_s)
         if too_fast is not None:
             return too_fast
         with self._lock:
             if self._t_ns and sample.t_ns <= self._t_ns[-1]:
-                return Refusal("time", f"t_ns {sample.t_ns} is not after {self._t_ns[-1]}, which came before it")
+                return Refusal("time", f"t_ns {sample.t_ns} is not after {self._t_ns[-1]} of an earlier packet")
             self._t_ns.append(sample.t_ns)
             self._samples.append(sample)
             self._received_ns = received_ns
@@ -97,8 +97,8 @@ class Timeline:
     def at(self, t_ns: int) -> Attitude | None:
         """The attitude at `t_ns`, or None before any sample has come.
 
-        Before the first sample it is the first. Between two it is the C2 blend of both where both have rates, else
-        SLERP; before a discontinuity, in a log's gap, and for a turn faster than `max_rate_rad_s` it stands still. Past the
+        Before the first sample it is the first. Between two it is the C2 blend of both where both have rates, else SLERP;
+        before a discontinuity, in a log's gap, and for a turn faster than `max_rate_rad_s` the earlier one is held. Past the
         newest it is predicted with the sample's rate (else that of the last two samples) for at most `max_extrapolation_ns`,
         and then held.
         """
@@ -123,7 +123,7 @@ class Timeline:
         return replace(self._predict(near[place - 1] if place else None, newest, age_ns), received_ns=received_ns)
 
     def _between(self, near: list[AttitudeSample], place: int, age_ns: int, join: Join) -> tuple[FloatArray, FloatArray]:
-        """Attitude and rate between two samples; of a blend the rates of both, blended too."""
+        """Attitude and rate between two samples; in a blend the rates are blended too."""
         before, after = near[place], near[place + 1]
         gap_ns = after.t_ns - before.t_ns
         rate, rate_after = before.rate_cam_rad_s, after.rate_cam_rad_s
@@ -139,7 +139,7 @@ class Timeline:
         return slerp(from_before, from_after, share), turning
 
     def _acceleration_rad_s2(self, near: list[AttitudeSample], k: int) -> FloatArray:
-        """At sample `k`, from the rates of its neighbours: the same for the intervals on both sides, so the blend is C2."""
+        """At sample `k`, from its neighbours' rates: equal for the intervals on both sides, which makes the blend C2."""
         earlier = k - 1 if k and self._joined(near[k - 1], near[k]) == "blend" else k
         later = k + 1 if k + 1 < len(near) and self._joined(near[k], near[k + 1]) == "blend" else k
         rate, rate_later = near[earlier].rate_cam_rad_s, near[later].rate_cam_rad_s
@@ -148,7 +148,7 @@ class Timeline:
         return (rate_later - rate) / ((near[later].t_ns - near[earlier].t_ns) / NS_PER_S)
 
     def _join_live(self, before: AttitudeSample, after: AttitudeSample) -> Join:
-        # Rates say little about a long silence: carried across it from both sides they overshoot, SLERP cannot.
+        # Rates say little about a long silence: propagated across it from both sides they overshoot; SLERP cannot.
         known = before.rate_cam_rad_s is not None and after.rate_cam_rad_s is not None
         return "blend" if known and after.t_ns - before.t_ns <= self._policy.stale_after_ns else "slerp"
 
@@ -156,7 +156,7 @@ class Timeline:
         return "hold" if self._jumped(before, after) else self._join(before, after)
 
     def _jumped(self, before: AttitudeSample, after: AttitudeSample) -> bool:
-        """The attitude did not turn from one sample to the next: it says so, or no turn is so fast."""
+        """True where the attitude jumps: the sample says so, or the turn would exceed the maximum rate."""
         if after.discontinuity:
             return True
         seconds = (after.t_ns - before.t_ns) / NS_PER_S
@@ -174,7 +174,7 @@ class Timeline:
         # results/tradeoff.csv, prediction: 5.5 arcsec by the rate of the sample; a cubic spline 17, holding 144.
         prediction_ns = min(age_ns, self._policy.max_extrapolation_ns)
         q = propagate(newest.q_icrs_to_cam, rate, prediction_ns / NS_PER_S)
-        turning = rate if prediction_ns == age_ns else None  # carried no further, it stands
+        turning = rate if prediction_ns == age_ns else None  # held past that
         return Attitude(q, age_ns, stale, newest.sequence, prediction_ns=prediction_ns, rate_cam_rad_s=turning)
 
 
@@ -184,7 +184,7 @@ def smootherstep(u: float) -> float:
 
 
 class StaleGate:
-    """Stale or not, with hysteresis, and how often it became so."""
+    """Whether the attitude is stale, with hysteresis, and how often it became so."""
 
     def __init__(self, stale_after_ns: int) -> None:
         self._fresh_again_ns = FRESH_AGAIN * stale_after_ns
@@ -192,7 +192,7 @@ class StaleGate:
         self.events = 0
 
     def update(self, attitude: Attitude | None) -> bool:
-        """True while the attitude is too old; None, before any has come, is no event."""
+        """True while the attitude is too old; None (before the first) is stale, but not counted."""
         if attitude is None:
             return True
         if attitude.stale and not self.stale:

@@ -109,7 +109,7 @@ class _Capped:
         self._file, self.left = file, size
 
     def read(self, length: int) -> bytes:
-        """At most `length` bytes. Raises TooLargeError for a record of more than are read."""
+        """At most `length` bytes. Raises TooLargeError for a record over MAX_RECORD_BYTES."""
         if MAX_RECORD_BYTES < length <= self.left:
             raise TooLargeError(f"a record of {size_text(length)}; at most {size_text(MAX_RECORD_BYTES)} are read")
         data = self._file.read(min(length, self.left))

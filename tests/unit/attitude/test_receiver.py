@@ -91,7 +91,7 @@ def seconds(begin_s: float, end_s: float, period_ns: int = PERIOD_NS) -> range:
 
 
 class Run:
-    """All of a script through a receiver; `ages_ms` and `roads` are of the attitude on show just after each message."""
+    """A whole script through a receiver; `ages_ms` and `shown` are of the attitude shown just after each message."""
 
     def __init__(self, make: Callable[[int], list[Arrival]], traffic: Traffic | None = None, **script) -> None:
         self.host0_ns = time.monotonic_ns() + NS_PER_S  # after what was queued
@@ -283,7 +283,7 @@ def test_one_sender_that_retargets_to_and_fro_is_one(every, how):
 @pytest.mark.parametrize(
     "sequences",
     [
-        list(range(500)) + list(range(500)),  # started anew
+        list(range(500)) + list(range(500)),  # restarted
         [2**32 - 400 + k for k in range(400)] + list(range(600)),  # wrapped
         list(range(1000, 0, -1)),  # counts down
         [k % 2 for k in range(1000)],

@@ -59,7 +59,7 @@ def plain() -> Run:
     return Run(lambda host, k: host - 5 * 10**11)
 
 
-def test_a_stream_that_only_talks_is_shown_late_by_its_minimum_delay_and_no_more(plain):
+def test_a_one_way_stream_is_shown_late_by_its_minimum_delay_and_no_more(plain):
     assert np.abs(plain.error_ms[200:] + MIN_DELAY_MS).max() < 0.005
     assert plain.clock.summary()["mode"] == "one-way"
 

@@ -1,6 +1,6 @@
-"""The summary's uncertainty against a simulated truth: what frames go by is never farther from it than is said.
+"""The summary's uncertainty against a simulated truth: the times that frames use are never farther from it than stated.
 
-The truth of a one-way stream is late by the minimum delay, which no such stream can tell.
+The true times of a one-way stream are late by the minimum delay, which such a stream cannot measure.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ HOST0_NS = 10**12
 Q = np.array([1.0, 0.0, 0.0, 0.0])
 # The spread of a few arrivals, exponential with 0.05 ms, that the next quarter of a second has yet to show.
 ALLOWED_MS = 0.03
-# Until eight messages have shown it, or three for 100 ms have agreed on it, nobody knows of a jump.
+# Until eight messages have shown it, or three for 100 ms have agreed on it, a jump cannot be known.
 IN_DOUBT_NS = LATE_FOR_NS + 10 * PERIOD_NS
 
 Times = Callable[[int], int]  # the sender's clock at a host time
@@ -82,7 +82,7 @@ class Truth:
         self.known_ms.append(np.nan if told["uncertainty_ms"] is None else told["uncertainty_ms"])
 
     def beyond_ms(self, *jumps_s: float) -> float:
-        """By how much the largest error is outside of what was said, but for the moments just after a jump."""
+        """The largest error beyond the stated uncertainty, except just after a jump."""
         host_ns, error_ms, known_ms = (np.array(each) for each in (self.host_ns, self.error_ms, self.known_ms))
         asked = np.isfinite(known_ms)
         for jump_s in jumps_s:
@@ -97,7 +97,7 @@ SIZES_MS = [2, 3, 4.9, 7, 20, 100, 300, 3000, 86_400_000, 3e11]
 
 @pytest.mark.parametrize("jump_ms", [sign * size for size in SIZES_MS for sign in (1, -1)])
 @pytest.mark.parametrize("exchanges", [False, True])
-def test_after_a_jump_of_2_ms_to_10_years_the_truth_is_within_what_is_said(jump_ms, exchanges):
+def test_after_a_jump_of_2_ms_to_10_years_the_truth_is_within_the_stated_uncertainty(jump_ms, exchanges):
     jump_ns = round(jump_ms * NS_PER_MS)
     run = Truth(lambda host: host + (jump_ns if host > HOST0_NS + 10 * NS_PER_S else 0), exchanges=exchanges)
     # With exchanges a jump too small for the stream is known at the next one, half a second later.
@@ -110,14 +110,14 @@ def test_after_a_jump_of_2_ms_to_10_years_the_truth_is_within_what_is_said(jump_
 
 @pytest.mark.parametrize("ppm", [0, 20, -20, 100, -100, 1000, -1000])
 @pytest.mark.parametrize("exchanges", [False, True])
-def test_under_a_drift_the_truth_is_within_what_is_said(ppm, exchanges):
+def test_under_a_drift_the_truth_is_within_the_stated_uncertainty(ppm, exchanges):
     run = Truth(lambda host: host + (host - HOST0_NS) * ppm // 1_000_000, exchanges=exchanges)
     assert run.beyond_ms() < ALLOWED_MS
     assert run.known_ms[-1] < (0.3 if exchanges else 0.15)  # LOCAL_DELAY_NS is part of the latter
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_under_load_the_truth_is_within_what_is_said(seed):
+def test_under_load_the_truth_is_within_the_stated_uncertainty(seed):
     """The receiver is stopped for 5 to 60 ms, 10 times a second; what came then is read at once."""
     rng = np.random.default_rng(100 + seed)
     stalls_ns = np.cumsum(rng.exponential(0.1 * NS_PER_S, 2000).astype(np.int64)) + HOST0_NS
@@ -140,7 +140,7 @@ def test_under_load_the_truth_is_within_what_is_said(seed):
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("late_ms", [7, 10.9, 90, 500])
 def test_a_wrong_first_guess_heals_within_two_seconds(late_ms, seed):
-    """All that is read in the first second was late, and nobody could know."""
+    """Everything read in the first second was late, and nothing showed it."""
 
     def read(arrival_ns: int) -> tuple[int, int]:
         late = arrival_ns < HOST0_NS + NS_PER_S
@@ -153,7 +153,7 @@ def test_a_wrong_first_guess_heals_within_two_seconds(late_ms, seed):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_what_waited_before_the_start_misleads_nobody(seed):
+def test_messages_that_waited_before_the_start_do_not_mislead_the_clock(seed):
     def read(arrival_ns: int) -> tuple[int, int]:
         begin_ns = HOST0_NS + 2 * NS_PER_S
         return (begin_ns, WAITED_UNKNOWN_NS) if arrival_ns < begin_ns else (arrival_ns, 0)
@@ -164,7 +164,7 @@ def test_what_waited_before_the_start_misleads_nobody(seed):
     assert (run.refused, run.jumps.jumps) == (0, 0)
 
 
-def test_a_road_that_is_20_ms_slower_for_a_while_is_no_jump_and_no_reason_to_refuse():
+def test_a_link_20_ms_slower_for_a_while_is_not_a_jump_and_costs_no_packet():
     def read(arrival_ns: int) -> tuple[int, int]:
         slow = 5 * NS_PER_S < arrival_ns - HOST0_NS < 8 * NS_PER_S
         return arrival_ns + 20 * NS_PER_MS * slow, 0
@@ -195,7 +195,7 @@ def test_clocks_that_parted_in_a_long_silence_are_no_jump(ppm, silent_s):
     assert run.beyond_ms(*(silent_s + 2.2 + 0.1 * k for k in range(5))) < ALLOWED_MS
 
 
-def test_packets_that_queue_on_a_slow_road_are_no_slow_clock_where_exchanges_say_so():
+def test_packets_queueing_on_a_slow_link_are_not_a_slow_clock_where_exchanges_show_it():
     """A line that carries nine of ten packets: each is later than the one before, until it is full after 0.35 s."""
 
     def read(arrival_ns: int) -> tuple[int, int]:

@@ -31,7 +31,7 @@ FRAME_BIAS_TOLERANCE_MAS = 0.01
 
 RATE_CAM_RAD_S = np.array([0.3, -1.1, 0.7])
 
-# CCSDS 504.0-B-2, figure G-4 (the lines that stand for omitted records are left out).
+# CCSDS 504.0-B-2, figure G-4 (without the lines that stand for omitted records).
 FIGURE_G4 = """CCSDS_AEM_VERS = 2.0
 CREATION_DATE = 2002-11-04T17:22:31
 ORIGINATOR    = NASA/JPL

@@ -15,7 +15,7 @@ from hilstar.twin.batch import log_motions
 
 S = 1_000_000_000
 START = from_radec_roll_deg(84, -1.2, 30)
-STREAM = Policy(max_extrapolation_ns=100_000_000, stale_after_ns=250_000_000)  # of a live bench: nothing to a log
+STREAM = Policy(max_extrapolation_ns=100_000_000, stale_after_ns=250_000_000)  # of a live stream, which a log ignores
 
 
 def coning(spin_rad_s: float, nutation_rad_s: float, t_s: float) -> tuple[np.ndarray, np.ndarray]:

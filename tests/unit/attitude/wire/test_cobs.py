@@ -14,7 +14,7 @@ from hilstar.attitude.wire.cobs import MAX_FRAME_BYTES, StreamDecoder, frame
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal, TimeRequest, decode, encode
 
 Q = np.array([0.5, 0.5, -0.5, 0.5])
-# On demand: HILSTAR_FUZZ=1000000 pytest tests/unit/test_stream.py
+# On demand: HILSTAR_FUZZ=1000000 pytest tests/unit/attitude/wire/test_cobs.py
 MUTATED_FRAMES = int(os.environ.get("HILSTAR_FUZZ", "20000"))
 
 
@@ -96,7 +96,7 @@ def test_nothing_is_accepted_that_the_crc_would_refuse_and_nothing_raises():
     assert accepted < 0.5 * MUTATED_FRAMES
 
 
-def test_a_bench_that_never_sends_a_delimiter_costs_one_refusal_and_no_memory():
+def test_a_sender_that_never_sends_a_delimiter_costs_one_refusal_and_no_memory():
     decoder = StreamDecoder()
     events = decoder.feed(b"\0")
     for _ in range(1000):

@@ -30,12 +30,12 @@ CPP = ["g++", "-x", "c++", *STRICT, "-Wconversion", "-Wshadow"]
 SANITIZED = [*C99, "-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
 DRIVER = Path(__file__).parent / "firmware_driver.c"
 ERRORS = {"format": -1, "crc": -2, "nan": -3, "norm": -4}
-# On demand: HILSTAR_FUZZ=1000000 pytest tests/unit/test_firmware.py
+# On demand: HILSTAR_FUZZ=1000000 pytest tests/unit/attitude/wire/test_firmware.py
 MUTATED_FRAMES = int(os.environ.get("HILSTAR_FUZZ", "20000"))
-MOST_CODE_BYTES = 4096
+MAX_CODE_BYTES = 4096
 BAUD = 921_600
 CLOCK_OFFSET_S = 1000
-# Every function that firmware calls, so that none is left out of the object's size.
+# Every function that firmware calls, so that the object's size includes all of them.
 EVERY_FUNCTION = """
 #include "hilstar_protocol.h"
 size_t a(const hilstar_attitude *in, uint8_t *out) { return hilstar_encode_attitude(in, out); }
@@ -195,7 +195,7 @@ def test_what_was_cut_in_two_before_the_first_delimiter_is_no_refusal(sanitized)
 
 
 def mutated(frames: list[bytes], rng: np.random.Generator) -> bytes:
-    """A frame with one to three of its bits, bytes or stretches wrong; sometimes its CRC made anew over wrong contents."""
+    """A frame with one to three of its bits, bytes or stretches wrong; sometimes with a new CRC over the wrong contents."""
     mutant = bytearray(frames[int(rng.integers(len(frames)))])
     if rng.random() < 0.3:
         message = bytearray(cobs.decode(bytes(mutant[:-1])))
@@ -229,7 +229,7 @@ def test_c_takes_exactly_what_python_takes_of_mutated_frames(sanitized, rng):
         assert packets[-1] == (2, cobs.decode(good[:-1]).hex())
         taken += len(packets) - 1
         assert errors == [error for body in stream.split(DELIMITER) if (error := wire_error(body)) is not None], stream.hex()
-    # Some are whole all the same, with their CRC made anew or a byte turned into itself; most are not.
+    # Some are valid all the same, with a new CRC or a byte replaced by itself; most are not.
     assert 0.05 * MUTATED_FRAMES < taken < 0.6 * MUTATED_FRAMES
     *_, accepted, crc, form = (int(count) for count in answers[-1].split(". ")[1].split())
     assert accepted == taken + MUTATED_FRAMES
@@ -270,11 +270,11 @@ def code_bytes(tmp_path: Path, compiler: list[str], size: str) -> int:
 
 
 def test_the_header_s_code_is_under_four_kilobytes(tmp_path):
-    assert code_bytes(tmp_path, ["gcc"], "size") < MOST_CODE_BYTES
+    assert code_bytes(tmp_path, ["gcc"], "size") < MAX_CODE_BYTES
 
 
 @pytest.mark.parametrize("core", ["cortex-m0", "cortex-m3", "cortex-m4"])
 @pytest.mark.skipif(shutil.which("arm-none-eabi-gcc") is None, reason="arm-none-eabi-gcc is not installed")
 def test_the_header_s_code_is_as_small_on_a_microcontroller(tmp_path, core):
     code = code_bytes(tmp_path, ["arm-none-eabi-gcc", "-mthumb", f"-mcpu={core}"], "arm-none-eabi-size")
-    assert code < MOST_CODE_BYTES
+    assert code < MAX_CODE_BYTES

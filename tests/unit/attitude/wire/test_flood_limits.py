@@ -70,14 +70,14 @@ def test_a_line_of_short_junk_is_read_at_a_bounded_rate_and_a_good_frame_after_i
     os.close(slave)
 
 
-def test_a_line_that_nobody_reads_holds_up_neither_a_write_nor_the_end():
+def test_a_line_that_is_not_read_blocks_neither_a_write_nor_the_end():
     master, slave = os.openpty()
     tty.setraw(slave)
     begin_s = time.monotonic()
-    with SerialSender(os.ttyname(slave), 921_600) as road:
-        while road.send_bytes(b"\x55" * 4096):
+    with SerialSender(os.ttyname(slave), 921_600) as line:
+        while line.send_bytes(b"\x55" * 4096):
             assert time.monotonic() - begin_s < 10
-        assert not road.send_bytes(b"\x55" * 4096)
+        assert not line.send_bytes(b"\x55" * 4096)
         end_s = time.monotonic()
     assert time.monotonic() - end_s < 5
     os.close(master)

@@ -8,11 +8,13 @@ one to first order in its shift, and what no star explains stays in the residual
 from __future__ import annotations
 
 import math
+from functools import cached_property
 
 import numpy as np
 from scipy import ndimage
-from scipy.sparse import csc_array, diags_array
-from scipy.sparse.linalg import splu
+from scipy.sparse import csc_array, eye_array
+from scipy.sparse.linalg import SuperLU, splu
+from scipy.spatial import cKDTree
 from scipy.special import ndtr
 
 from hilstar.arrays import FloatArray, IntArray
@@ -26,11 +28,12 @@ MAX_SIGMA_STEP = 0.3  # of sigma: Newton's step from a poor start stays a positi
 MAX_PLACE_STEPS, MAX_STEP_PX, MIN_STEP_PX = 12, 1.0, 1e-5
 MAX_OFFSET_PX = 1.0  # a star lies within sqrt(1/2) px of the middle of its brightest pixel, unless a neighbour pulls it
 BEYOND_SIGMAS = 4.0  # ... and one whose brightest pixel is the image's first or last may be this far outside
+COLUMNS = (("share", "share"), ("share", "slope"), ("slope", "share"))  # along y and x: light, derivative by x, by y
 RIDGE = 1e-12  # of a unit column: two equal columns share the light, where the solver would otherwise fail
 
 
 class StarTemplates:
-    """Stars of flux 1 at `x_px`, `y_px` (n,) on an image of `shape` (height, width), each with two derivatives.
+    """Stars of flux 1 at `places_px` (n, 2) on an image of `shape` (height, width), each with its derivatives along x and y.
 
     A star's share of light that falls on the image is in `in_view` (n,).
     """
@@ -38,26 +41,47 @@ class StarTemplates:
     def __init__(self, places_px: FloatArray, sigma_px: tuple[float, float], shape: tuple[int, int]) -> None:
         self.places_px = places_px
         self.shape = shape
-        size = len(places_px)
-        (share_x, slope_x, column), (share_y, slope_y, row) = (
-            _along(places_px[:, axis], sigma_px[axis], footprint_px(sigma_px) // 2 + 1, shape[1 - axis]) for axis in (0, 1)
-        )
-        pairs = ((share_y, share_x), (share_y, slope_x), (slope_y, share_x))
-        pixels = row.shape[1] * column.shape[1]
-        data = np.stack([y[:, :, None] * x[:, None, :] for y, x in pairs], axis=1).reshape(3 * size, pixels)
-        pixel = (row[:, :, None] * shape[1] + column[:, None, :]).reshape(size, 1, pixels)
-        index = np.broadcast_to(pixel, (size, 3, pixels)).ravel()
-        ends = np.arange(3 * size + 1) * pixels
-        self.in_view = np.asarray(data[::3].sum(axis=1))
-        self._columns = csc_array((data.ravel(), index, ends), shape=(math.prod(shape), 3 * size))
-        self.normal = csc_array(self._columns.T @ self._columns)
-        self._scale = 1 / np.sqrt(np.maximum(self.normal.diagonal(), np.finfo(float).tiny))
-        unit = diags_array(self._scale) @ self.normal @ diags_array(self._scale)
-        self._solver = splu(csc_array(unit + RIDGE * diags_array(np.ones(3 * size)))) if size else None
+        reach_px = footprint_px(sigma_px) // 2 + 1
+        self._x, self._y = (_Profiles(places_px[:, k], sigma_px[k], reach_px, shape[1 - k]) for k in (0, 1))
+        self.in_view = self._x.share.sum(axis=1) * self._y.share.sum(axis=1)
+
+    @cached_property
+    def _columns(self) -> csc_array:
+        """The light of each star and its derivatives (pixels, 3 n)."""
+        size = len(self.places_px)
+        pairs = [(getattr(self._y, y), getattr(self._x, x)) for y, x in COLUMNS]
+        data = np.stack([y[:, :, None] * x[:, None, :] for y, x in pairs], axis=1)
+        pixel = self._y.clipped[:, :, None] * self.shape[1] + self._x.clipped[:, None, :]
+        index = np.broadcast_to(pixel[:, None], data.shape).ravel()
+        ends = np.arange(3 * size + 1) * math.prod(data.shape[2:])
+        return csc_array((data.ravel(), index, ends), shape=(math.prod(self.shape), 3 * size))
+
+    @cached_property
+    def normal(self) -> csc_array:
+        """The columns' products with one another (3 n, 3 n): along x times along y, for the stars that overlap."""
+        size, width = len(self.places_px), self._x.share.shape[1]
+        middles = np.column_stack([self._x.middle, self._y.middle])
+        near = cKDTree(middles).query_pairs(width - 1, p=np.inf, output_type="ndarray").astype(np.intp)
+        star, other = (np.concatenate([np.arange(size), near[:, k], near[:, 1 - k]]) for k in (0, 1))
+        along_x, along_y = (profiles.overlaps(star, other) for profiles in (self._x, self._y))
+        entry = [(("share", "slope").index(y), ("share", "slope").index(x)) for y, x in COLUMNS]
+        blocks = np.stack([along_y[:, ya, yb] * along_x[:, xa, xb] for ya, xa in entry for yb, xb in entry], axis=1)
+        row, col = (3 * star[:, None] + np.arange(9) // 3, 3 * other[:, None] + np.arange(9) % 3)
+        return csc_array((blocks.ravel(), (row.ravel(), col.ravel())), shape=(3 * size, 3 * size))
+
+    @cached_property
+    def _scale(self) -> FloatArray:
+        return np.asarray(1 / np.sqrt(np.maximum(self.normal.diagonal(), np.finfo(float).tiny)))
+
+    @cached_property
+    def _solver(self) -> SuperLU:
+        unit = self.normal.copy()
+        unit.data *= self._scale[unit.indices] * np.repeat(self._scale, np.diff(unit.indptr))
+        return splu(csc_array(unit + RIDGE * eye_array(len(self._scale), format="csc")))
 
     def fit(self, image: FloatArray) -> FloatArray:
         """Flux, and flux times the shift along x and y, of each star (n, 3): least squares over all pixels."""
-        if self._solver is None:
+        if not len(self.places_px):
             return np.zeros((0, 3))
         wanted = np.asarray(self._columns.T @ image.ravel())
         return (self._scale * self._solver.solve(self._scale * wanted)).reshape(-1, 3)
@@ -82,13 +106,29 @@ class StarTemplates:
             return np.sqrt(variance[:, 0]) * around, np.sqrt(variance[:, 1:].sum(axis=1)) * around / np.abs(flux)
 
 
-def _along(place_px: FloatArray, sigma_px: float, reach_px: int, size_px: int) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Along one axis (n, k): shares of light, their derivative by the place, and the pixels; no light off the image."""
-    pixel = np.rint(place_px).astype(np.intp)[:, None] + np.arange(-reach_px, reach_px + 1)
-    near, far = ((pixel - place_px[:, None] + side) / sigma_px for side in (-0.5, 0.5))
-    inside = (pixel >= 0) & (pixel < size_px)
-    share, slope = ndtr(far) - ndtr(near), (_bell(near) - _bell(far)) / sigma_px
-    return share * inside, slope * inside, np.clip(pixel, 0, size_px - 1)
+class _Profiles:
+    """Stars along one axis (n, k): shares of light and their derivative by the place, both 0 off the image.
+
+    `middle` (n,) is each star's middle pixel, `clipped` (n, k) the pixels, those off the image moved to its edge.
+    """
+
+    def __init__(self, place_px: FloatArray, sigma_px: float, reach_px: int, size_px: int) -> None:
+        self.middle = np.rint(place_px).astype(np.intp)
+        pixel = self.middle[:, None] + np.arange(-reach_px, reach_px + 1)
+        near, far = ((pixel - place_px[:, None] + side) / sigma_px for side in (-0.5, 0.5))
+        inside = (pixel >= 0) & (pixel < size_px)
+        self.share = (ndtr(far) - ndtr(near)) * inside
+        self.slope = (_bell(near) - _bell(far)) / sigma_px * inside
+        self.clipped = np.clip(pixel, 0, size_px - 1)
+
+    def overlaps(self, star: IntArray, other: IntArray) -> FloatArray:
+        """Products (m, 2, 2) of share and slope of the stars `star` (m,) with share and slope of `other` (m,)."""
+        width = self.share.shape[1]
+        both = np.stack([self.share, self.slope], axis=1)
+        # The pixel of the other star that is each pixel of this one; beyond its profile are zeros.
+        place = width + np.arange(width) + (self.middle[star] - self.middle[other])[:, None]
+        padded = np.pad(both, ((0, 0), (0, 0), (width, width)))
+        return np.asarray(both[star] @ padded[other[:, None], :, place])
 
 
 def _bell(u: FloatArray) -> FloatArray:

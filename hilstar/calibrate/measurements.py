@@ -78,6 +78,17 @@ class Levels:
         return np.asarray(np.sqrt(variance / self.count), dtype=np.float64)
 
 
+@dataclass(frozen=True, slots=True)
+class _Row:
+    """One line of the file."""
+
+    code: int
+    channel: str
+    value: float
+    exposure_s: float
+    t_s: float | None
+
+
 def read_measurements(path: Path, bits: int | None = None) -> Measurements:
     """Read `code,channel,value` rows, with `exposure_s`, `t_s` and `order` where they are given; '#' starts a comment line.
 
@@ -88,16 +99,15 @@ def read_measurements(path: Path, bits: int | None = None) -> Measurements:
     rows = list(_rows(path, as_text(path, raw, ADVICE)))
     if not rows:
         raise InputError(f"{path}: no measurement in it; write code,channel,value rows below the header")
-    codes = np.array([row[0] for row in rows], dtype=np.intp)
+    codes = np.array([row.code for row in rows], dtype=np.intp)
     bits = bits or next(usual for usual in USUAL_BITS if codes.max() < 2**usual)
     if codes.max() >= 2**bits:
         raise InputError(f"{path}: code {codes.max()} is outside {bits} bits (0 to {2**bits - 1}); say how many bits there are")
-    channel = np.array([row[1] for row in rows])
-    reading = np.array([row[2] for row in rows])
-    exposure_s = np.array([row[3] for row in rows])
-    times = [row[4] for row in rows]
-    given = [time for time in times if time is not None]
-    if given and len(given) < len(times):
+    channel = np.array([row.channel for row in rows])
+    reading = np.array([row.value for row in rows])
+    exposure_s = np.array([row.exposure_s for row in rows])
+    given = [row.t_s for row in rows if row.t_s is not None]
+    if given and len(given) < len(rows):
         raise InputError(f"{path}: t_s is empty in some rows; give it in every row or leave the column out")
     time = np.array(given if given else np.arange(len(rows)), dtype=np.float64)
     clipped = {name: _clipped(codes[channel == name], reading[channel == name]) for name in set(channel.tolist())}
@@ -105,10 +115,7 @@ def read_measurements(path: Path, bits: int | None = None) -> Measurements:
     return Measurements(str(path), bits, codes, channel, reading / exposure_s, time, clipped, digest)
 
 
-Row = tuple[int, str, float, float, float | None]
-
-
-def _rows(path: Path, text: str) -> Iterator[Row]:
+def _rows(path: Path, text: str) -> Iterator[_Row]:
     header: list[str] | None = None
     try:
         for number, line in enumerate(text.splitlines(), start=1):
@@ -137,7 +144,7 @@ def _header(path: Path, number: int, cells: list[str]) -> list[str]:
     return cells
 
 
-def _row(place: str, cells: dict[str, str]) -> Row:
+def _row(place: str, cells: dict[str, str]) -> _Row:
     if not cells["value"]:
         raise InputError(f"{place}: value is empty; measure the patch and fill it in, or delete the row")
     try:
@@ -157,7 +164,7 @@ def _row(place: str, cells: dict[str, str]) -> Row:
     if exposure_s <= 0:
         raise InputError(f"{place}: exposure_s = {exposure_s:g}; write more than 0")
     time = cells.get("t_s")
-    return code, cells["channel"], value, exposure_s, _number(place, "t_s", time) if time else None
+    return _Row(code, cells["channel"], value, exposure_s, _number(place, "t_s", time) if time else None)
 
 
 def _number(place: str, name: str, text: str) -> float:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.constants import c, h, k, sigma
-from scipy.integrate import quad
+from scipy.integrate import quad, quad_vec
 
 from hilstar.sky.catalog import load_catalog
 from hilstar.sky.electrons import Optics, Photometry, ags_electrons_per_s, dgs_electrons_per_s, star_temperatures_k, tabulate
@@ -26,7 +26,7 @@ def read(name: str) -> tuple[np.ndarray, np.ndarray]:
     return np.array(rows, dtype=float).T
 
 
-def planck(wavelength_nm: float, temperature_k: float) -> float:
+def planck(wavelength_nm: float, temperature_k: float | np.ndarray) -> float | np.ndarray:
     """pi B, W/m2/m, written anew from the textbook."""
     m = wavelength_nm * 1e-9
     return 2 * np.pi * h * c**2 / m**5 / np.expm1(h * c / (m * k * temperature_k))
@@ -65,6 +65,26 @@ def independent_rate(temperature_k: float, zero_point: str = "vega", weighting: 
     return float(np.pi / 4 * 0.030**2 * scale * integral(detected, knots) * 1e-9)
 
 
+def independent_rates(temperature_k: np.ndarray) -> np.ndarray:
+    """The same for many black bodies (n,) at once, each integrand in units of its value at 600 nm."""
+    qe_nm, qe = read("ccd47-20")
+    glass_nm, glass = read("n-bk7-10mm")
+    v_nm, v = read("johnson-v")
+    unit = planck(600.0, temperature_k)
+
+    def together(weight, knots_nm: np.ndarray) -> np.ndarray:
+        pieces = (
+            quad_vec(lambda w: planck(w, temperature_k) / unit * weight(w), a, b, epsabs=0, epsrel=1e-10)[0]
+            for a, b in pairwise(knots_nm)
+        )
+        return sum(pieces, np.zeros(len(temperature_k)))
+
+    mean = together(lambda w: np.interp(w, v_nm, v), v_nm) / integral(lambda w: np.interp(w, v_nm, v), v_nm)
+    knots = np.unique(np.concatenate([qe_nm, glass_nm[glass_nm <= 1050]]))
+    detected = together(lambda w: w * 1e-9 / (h * c) * np.interp(w, qe_nm, qe) * np.interp(w, glass_nm, glass), knots)
+    return np.pi / 4 * 0.030**2 * 3.631e-2 / mean * detected * 1e-9
+
+
 @pytest.fixture(scope="module")
 def optics() -> Optics:
     return Optics(30.0, load_curve("ccd47-20", "qe"), load_curve("n-bk7-10mm", "transmission"))
@@ -81,14 +101,13 @@ def test_the_integral_is_the_adaptive_one(optics, zero_point, weighting, tempera
 
 @pytest.mark.parametrize("scale", sorted(TEMPERATURE_SCALES))
 def test_the_table_is_the_integral_for_every_star_of_the_catalogue(optics, scale):
-    """Each colour that occurs in Hipparcos, every one by our integral and 200 of them by the adaptive one."""
+    """Each colour that occurs in Hipparcos, by our integral and by the adaptive one."""
     colours = np.unique(load_catalog().bv_mag)
     temperature_k = star_temperatures_k(colours, scale)
     table = tabulate("dgs", optics, Photometry())
     tabulated = table.electrons_per_s(np.zeros(len(colours)), temperature_k)
     assert np.abs(tabulated / dgs_electrons_per_s(temperature_k, optics, Photometry()) - 1).max() < TABLE_LIMIT
-    for i in np.linspace(0, len(colours) - 1, 200).astype(int):
-        assert tabulated[i] == pytest.approx(independent_rate(temperature_k[i]), rel=TABLE_LIMIT)
+    assert np.abs(tabulated / independent_rates(temperature_k) - 1).max() < TABLE_LIMIT
 
 
 def test_five_magnitudes_are_a_factor_of_a_hundred(optics):
@@ -150,3 +169,9 @@ def test_aperture_and_constant_curves_scale_the_rate():
 def test_n_bk7_transmits_what_the_design_s_table_says():
     curve = load_curve("n-bk7-10mm", "t", Path())
     assert curve(np.array([350.0, 400, 500, 700])) == pytest.approx([0.884, 0.913, 0.916, 0.919], abs=6e-4)
+
+
+def test_the_two_adaptive_integrals_agree():
+    temperatures_k = np.array([1500.0, 3000.0, 5772.0, 21_700.0, 60_000.0])
+    one_by_one = [independent_rate(temperature_k) for temperature_k in temperatures_k]
+    assert independent_rates(temperatures_k) == pytest.approx(one_by_one, rel=QUAD)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import hilstar
 from hilstar.bench.frame_files import write_frame_fits, write_truth_csv
 from hilstar.bench.truth import TRUTH_DTYPE
 from hilstar.errors import InputError
@@ -17,6 +18,7 @@ from hilstar.scene.sprites import pack_sprites
 from hilstar.testing import MAX_LINES, assert_same_sky, compare
 from hilstar.testing.star_difference import CENTROID_PX, FLUX_MAG
 from hilstar.testing.star_fit import star_sigma_px
+from tests.support.benches import SMALL_BENCH
 
 ORION = from_radec_roll_deg(84.057, -1.2, 0.0)
 FAULT_MAG, FAULT_PX = 0.01, 0.02  # the smallest that must be seen
@@ -59,9 +61,25 @@ class Field:
         return compare(self.frame(), self.golden).bad
 
 
+SKIES = {"default": "", "faint stars": "[sky]\nfaintest_v_mag = 9.5\n", "wide": "[render]\nsprite_sigma_px = [1.6, 0.6]\n"}
+
+
+@pytest.fixture(scope="module")
+def benches(tmp_path_factory):
+    """The benches of SKIES, each loaded once: no test changes one, and a Field has frames of its own."""
+    folder, opened = tmp_path_factory.mktemp("skies"), {}
+    for name, more in SKIES.items():
+        (folder / f"{name}.toml").write_text(SMALL_BENCH + more)
+        opened[name] = hilstar.load(folder / f"{name}.toml")
+    yield opened
+    for bench in opened.values():
+        assert bench.renderer.gl_error() == "GL_NO_ERROR"
+        bench.close()
+
+
 @pytest.fixture
-def field(bench_with):
-    return Field(bench_with())
+def field(benches):
+    return Field(benches["default"])
 
 
 def test_an_unchanged_frame_is_the_same_sky(field):
@@ -73,11 +91,11 @@ def test_an_unchanged_frame_is_the_same_sky(field):
     assert summary["stars"] + blended + summary["unmeasured"] == len(field.golden.truth)
 
 
-@pytest.mark.parametrize("more", ["", "[sky]\nfaintest_v_mag = 9.5\n", "[render]\nsprite_sigma_px = [1.6, 0.6]\n"])
+@pytest.mark.parametrize("sky", SKIES)
 @pytest.mark.parametrize("ra_dec", [(84.057, -1.2), (101.29, -16.7), (56.7, 24.1), (266.0, -29.0)])
-def test_another_driver_s_rounding_passes(bench_with, more, ra_dec):
+def test_another_driver_s_rounding_passes(benches, sky, ra_dec):
     """GL's float32 against the oracle's float64: the belt, Sirius, the Pleiades, the Milky Way with 680 stars in 320 x 240."""
-    bench = bench_with(more)
+    bench = benches[sky]
     field = Field(bench, from_radec_roll_deg(*ra_dec, 0.0))
     oracle = linear_image(field.sprites, bench.camera.resolution_px, bench.config.render.sprite_sigma_px)
     for one, other in ((field.golden, oracle), (oracle, field.golden), (field.golden.linear, oracle)):

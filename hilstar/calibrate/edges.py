@@ -18,7 +18,8 @@ from hilstar.attitude.wire.serial_lines import read_lines
 from hilstar.errors import InputError, shortened
 from hilstar.files import write_whole
 from hilstar.reading import read_text
-from hilstar.run.record.records import NO_FRAMES, FrameRecord, RunRecord
+from hilstar.run.record.ledger_reader import NO_FRAMES
+from hilstar.run.record.ledger_records import FrameRecord, RunRecord
 from hilstar.units import NS_PER_US
 
 INT64 = range(-(2**63), 2**63)

@@ -10,7 +10,7 @@ from hilstar.calibrate.edges import Edges, square_edges
 from hilstar.calibrate.latency import LatencySummary, Paired, pair, summarise
 from hilstar.charts import chart
 from hilstar.errors import InputError
-from hilstar.run.record.records import config_of, read_head, run_records
+from hilstar.run.record.ledger_reader import config_of, read_head, run_records
 from hilstar.units import NS_PER_MS, NS_PER_S
 
 BINS = 80

@@ -15,7 +15,7 @@ from hilstar.bench.frame import Bench
 from hilstar.run.frame_status import StatusMaker
 from hilstar.run.loop import FrameLoop, Limit
 from hilstar.run.record.ledger import Ledger
-from hilstar.run.record.records import below_step, frame_record
+from hilstar.run.record.ledger_records import below_step, frame_record
 from hilstar.run.shown import Shown
 from hilstar.running_statistics import RunningStatistics
 from hilstar.units import NS_PER_MS, NS_PER_S

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
+import numpy as np
+
 from hilstar.attitude.clock.timeline import Attitude, Timeline
 from hilstar.attitude.logs.gaps import log_joins
 from hilstar.attitude.logs.log_file import log_timeline, read_log
@@ -16,7 +18,8 @@ from hilstar.attitude.wire.packet import AttitudeSample, rate_refusal
 from hilstar.bench.config import BenchConfig
 from hilstar.errors import InputError
 from hilstar.run.loop import policy_of
-from hilstar.run.record.records import PastFrame, past_frames
+from hilstar.run.record.ledger_reader import drawable_frames
+from hilstar.run.record.ledger_records import FrameRecord
 from hilstar.units import NS_PER_S
 
 MOST_FRAMES = 100_000_000
@@ -89,7 +92,7 @@ class LogPlay:
 class RunPlay:
     """An earlier run by its ledger: the same frames with the same attitudes, so the same light, bit for bit."""
 
-    frames: list[PastFrame]
+    frames: list[FrameRecord]
     packet_count: int
     paced: bool
     moving: bool | None = True  # where the run's own were
@@ -103,10 +106,9 @@ class RunPlay:
     def frame(self, slot: int) -> tuple[int, int, Attitude | None]:
         """Number, time and attitude of a frame."""
         past = self.frames[slot]
-        attitude = (
-            None if past.q_icrs_to_cam is None else Attitude(past.q_icrs_to_cam, 0, False, rate_cam_rad_s=past.rate_cam_rad_s)
-        )
-        return past.number, past.t_ns, attitude
+        rate = None if past.rate is None else np.array(past.rate)
+        attitude = None if past.q is None else Attitude(np.array(past.q), 0, False, rate_cam_rad_s=rate)
+        return past.frame, past.t_ns, attitude
 
 
 def plan_play(log: Path, wanted: Wanted, config: BenchConfig) -> Play:
@@ -116,7 +118,7 @@ def plan_play(log: Path, wanted: Wanted, config: BenchConfig) -> Play:
     """
     factor = wanted.speed
     if is_mcap(log):
-        frames = list(past_frames(log, math.radians(config.attitude.max_rate_deg_s)))
+        frames = list(drawable_frames(log, math.radians(config.attitude.max_rate_deg_s)))
         if frames:
             return _plan_run(log, wanted, factor, frames)
     samples = read_log(log)
@@ -144,7 +146,7 @@ def _check_rates(log: Path, samples: list[AttitudeSample], max_rate_rad_s: float
             raise InputError(f"{log}: attitude {number}: {refusal.detail}")
 
 
-def _plan_run(log: Path, wanted: Wanted, factor: float, frames: list[PastFrame]) -> RunPlay:
+def _plan_run(log: Path, wanted: Wanted, factor: float, frames: list[FrameRecord]) -> RunPlay:
     if wanted.step_s is not None or factor not in {1.0, math.inf}:
         raise InputError(f"{log}: an earlier run is replayed frame by frame; leave --step out, and --speed but realtime or max")
     first_ns = frames[0].swap_ns

@@ -23,7 +23,7 @@ from hilstar.run.lockstep import serve_lockstep
 from hilstar.run.loop import FrameLoop, Limit, policy_of
 from hilstar.run.pacer import Moment, Pacer
 from hilstar.run.record.ledger import Ledger
-from hilstar.run.record.records import below_step, frame_record
+from hilstar.run.record.ledger_records import below_step, frame_record
 from hilstar.run.replay import Play
 from hilstar.run.screen.display_pacer import DisplayPacer
 from hilstar.run.screen.screen import Screen

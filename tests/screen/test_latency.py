@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from hilstar.calibrate.edges import Edges, read_edges, save_edges
-from hilstar.run.record.records import read_run
+from hilstar.run.record.ledger_reader import read_run
 from hilstar.run.screen.photodiode import CODE, CODE_BITS, marker_light
 from tests.support.benches import ATTITUDE, SCREEN_BENCH, still_log
 from tests.support.commands import HILSTAR, assert_refused, run_hilstar, run_hilstar_here

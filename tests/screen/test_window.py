@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from hilstar.rotation import propagate
-from hilstar.run.record.records import frame_records
+from hilstar.run.record.ledger_reader import frame_records
 from tests.support.benches import ATTITUDE, SCREEN_BENCH
 from tests.support.commands import run_hilstar
 from tests.support.screens import Screen, Shown, codes_of, lines_over

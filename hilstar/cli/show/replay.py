@@ -48,7 +48,7 @@ def replay(
 ) -> None:
     """Show an attitude log on the monitor."""
     from hilstar.bench.bench_file import read_bench_file
-    from hilstar.run.record.frame_sequence import FrameRecorder
+    from hilstar.run.record.frame_images import FrameImages
     from hilstar.run.replay import Wanted, plan_play
     from hilstar.run.serve import Outlet
     from hilstar.run.serve import replay as replay_log
@@ -62,7 +62,7 @@ def replay(
     play = plan_play(log, Wanted(parse_speed(speed), start, stop, step), file.config)
     with (
         shown_bench(file, headless, windowed, force) as (bench, screen),
-        FrameRecorder(output, bench) as record,
+        FrameImages(output, bench) as record,
         optional_ledger(ledger, bench, notices, overwrite, split) as kept,
         progress("replaying", play.frame_count) as advance,
     ):

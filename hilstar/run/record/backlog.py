@@ -1,11 +1,14 @@
-"""What waits to be written, bounded by bytes, and what of a flood is kept whole."""
+"""What waits to be written to the ledger, bounded by bytes."""
 
 from __future__ import annotations
 
 import threading
 from collections import Counter
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
+
+from hilstar.attitude.wire.packet import AttitudeSample, Refusal
+from hilstar.run.record.ledger_records import EventRecord, FrameRecord
 
 Kind = Literal["packet", "frame", "event"]
 MAX_WAITING_BYTES = 32_000_000  # half a minute of a plain run, should the disk stand still
@@ -15,19 +18,28 @@ ENTRY_BYTES = {"packet": 1500, "frame": 2500, "event": 1000}
 
 
 @dataclass(frozen=True, slots=True)
+class ReceivedPacket:
+    """A packet's bytes, and what they say: an attitude, or why they were refused."""
+
+    raw: bytes
+    sample: AttitudeSample | None
+    refusal: Refusal | None
+
+
+@dataclass(frozen=True, slots=True)
 class Entry:
-    """Something to be kept: its host time, a sequence number, and what it is (see `ledger`)."""
+    """Something to be kept: its host time, a sequence number, and what it is."""
 
     kind: Kind
     time_ns: int
     sequence: int
-    content: Any
-    extra_bytes: int = 0
+    content: ReceivedPacket | FrameRecord | EventRecord
 
     @property
     def size_bytes(self) -> int:
-        """Of memory, roughly."""
-        return ENTRY_BYTES[self.kind] + self.extra_bytes
+        """Its memory, roughly."""
+        raw_bytes = len(self.content.raw) if isinstance(self.content, ReceivedPacket) else 0
+        return ENTRY_BYTES[self.kind] + raw_bytes
 
 
 class Backlog:
@@ -55,57 +67,3 @@ class Backlog:
         with self._lock:
             taken, self._entries, self._bytes = self._entries, [], 0
         return taken
-
-
-class Allowance:
-    """How many of a kind are kept whole: `burst` of them at once, and `per_s` a second after that."""
-
-    def __init__(self, burst: float, per_s: float) -> None:
-        self._burst, self._per_s = burst, per_s
-        self._left = burst
-        self._last_ns = 0
-
-    def take(self, now_ns: int) -> bool:
-        """Whether one more is kept."""
-        passed_s = max(0, now_ns - self._last_ns) / 1e9 if self._last_ns else 0.0
-        self._last_ns = now_ns
-        self._left = min(self._burst, self._left + passed_s * self._per_s)
-        if self._left < 1:
-            return False
-        self._left -= 1
-        return True
-
-
-class Sieve:
-    """The first of each kind and reason whole, the others counted."""
-
-    # Refused packets say little after the first ones; more than 2000 good ones a second are no sender's plan.
-    ALLOWED = {"accepted": (4000, 2000), "refused": (20, 1), "event": (100, 10)}  # noqa: RUF012 - never changed
-
-    def __init__(self) -> None:
-        self._allowances: dict[tuple[Kind, str], Allowance] = {}
-        self._counts: Counter[tuple[Kind, str]] = Counter()
-        self._lock = threading.Lock()
-
-    def keeps(self, kind: Kind, reason: str, now_ns: int) -> bool:
-        """Whether one that comes now is to be kept whole; it is counted if not."""
-        with self._lock:
-            allowance = self._allowances.get((kind, reason))
-            if allowance is None:
-                rule = "event" if kind == "event" else "accepted" if reason == "accepted" else "refused"
-                allowance = self._allowances[kind, reason] = Allowance(*self.ALLOWED[rule])
-            kept = allowance.take(now_ns)
-            if not kept:
-                self._counts[kind, reason] += 1
-        return kept
-
-    def count(self, kind: Kind, reason: str, number: int = 1) -> None:
-        """Count what is not kept for another cause."""
-        with self._lock:
-            self._counts[kind, reason] += number
-
-    def counted(self) -> list[tuple[Kind, str, int]]:
-        """What was counted since the last call."""
-        with self._lock:
-            counts, self._counts = self._counts, Counter()
-        return [(kind, reason, number) for (kind, reason), number in counts.items()]

@@ -29,8 +29,9 @@ from hilstar.errors import InputError, cannot_write, printable
 from hilstar.files import NewFile
 from hilstar.notices import Notice, Notices
 from hilstar.process.interrupts import caught
-from hilstar.run.record.backlog import Backlog, Entry, Kind, Sieve
-from hilstar.run.record.records import (
+from hilstar.run.record.backlog import Backlog, Entry, Kind, ReceivedPacket
+from hilstar.run.record.flood_sieve import Sieve
+from hilstar.run.record.ledger_records import (
     COUNT_TOPIC,
     EVENT_TOPIC,
     FRAME_TOPIC,
@@ -38,10 +39,10 @@ from hilstar.run.record.records import (
     CountRecord,
     EventRecord,
     FrameRecord,
-    ProcessProbe,
     ProcessRecord,
     schema_of,
 )
+from hilstar.run.record.process_probe import ProcessProbe
 
 NO_ROOM = "no room"  # the reason of what was lost
 FLUSH_S = 0.2
@@ -114,8 +115,7 @@ class Ledger:
         if not self._sieve.keeps("packet", "accepted" if refusal is None else refusal.reason, host_ns):
             return
         sequence = 0 if sample is None else sample.sequence
-        content = (raw[:MAX_RAW_BYTES], sample, refusal)
-        self._backlog.put(Entry("packet", host_ns, sequence, content, min(len(raw), MAX_RAW_BYTES)))
+        self._backlog.put(Entry("packet", host_ns, sequence, ReceivedPacket(raw[:MAX_RAW_BYTES], sample, refusal)))
 
     def frame(self, record: FrameRecord) -> None:
         """Keep a frame."""
@@ -164,7 +164,8 @@ class Ledger:
         if entry.kind == "frame" and self._thin:
             self._lose("frame", 1)
             return
-        data = _packet_message(entry.time_ns, *entry.content) if entry.kind == "packet" else msgspec.json.encode(entry.content)
+        content, at_ns = entry.content, entry.time_ns
+        data = _packet_message(at_ns, content) if isinstance(content, ReceivedPacket) else msgspec.json.encode(content)
         self._add(entry.kind, entry.time_ns, data, entry.sequence)
 
     def _add(self, key: str, time_ns: int, data: bytes, sequence: int = 0) -> None:
@@ -297,8 +298,9 @@ def _head_of(bench: Bench) -> dict[str, str]:
     }
 
 
-def _packet_message(host_ns: int, raw: bytes, sample: AttitudeSample | None, refusal: Refusal | None) -> bytes:
+def _packet_message(host_ns: int, packet: ReceivedPacket) -> bytes:
+    sample, refusal = packet.sample, packet.refusal
     if refusal is not None or sample is None:
         reason, detail = ("format", "") if refusal is None else (refusal.reason, refusal.detail[:MAX_DETAIL_CHARACTERS])
-        return refused_message(reason, detail, host_ns, raw)
-    return attitude_message(sample, host_ns, raw)
+        return refused_message(reason, detail, host_ns, packet.raw)
+    return attitude_message(sample, host_ns, packet.raw)

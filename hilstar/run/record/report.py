@@ -11,9 +11,9 @@ import msgspec
 
 from hilstar.errors import InputError
 from hilstar.files import write_whole
-from hilstar.run.record.records import NO_FRAMES, config_of, read_head, run_records
+from hilstar.run.record.ledger_reader import NO_FRAMES, config_of, read_head, run_records
 from hilstar.run.record.report_charts import CHARTS
-from hilstar.run.record.run_figures import Figures, three
+from hilstar.run.record.report_figures import Figures, three
 
 PAGE = """<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8"><title>{title}</title><style>

@@ -10,7 +10,7 @@ import numpy as np
 
 from hilstar.arrays import FloatArray
 from hilstar.charts import STYLE, chart, save, title_lines
-from hilstar.run.record.run_figures import AGE, BELOW_STEP, CLIPPED, DRAWN, INTERVAL, METRICS, MISSED, Figures
+from hilstar.run.record.report_figures import AGE, BELOW_STEP, CLIPPED, DRAWN, INTERVAL, METRICS, MISSED, Figures
 
 BINS = 80
 HISTOGRAM_SPREAD = 99.9  # percent of the frames that a histogram shows; the worst is in the table

@@ -17,7 +17,7 @@ from PIL import Image
 from hilstar.attitude.logs.log_file import read_log
 from hilstar.errors import InputError
 from hilstar.rotation import from_radec_roll_deg, propagate
-from hilstar.run.record.records import past_frames
+from hilstar.run.record.ledger_reader import drawable_frames
 from tests.support.benches import SMALL_BENCH
 from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
 from tests.support.senders import packet, publisher
@@ -114,7 +114,7 @@ def test_a_live_run_s_ledger_is_an_attitude_log_too(tmp_path):
     converted = run_hilstar("convert", ledger, tmp_path / "run.csv")
     assert "100 attitudes" in converted.stdout
     replayed = run_hilstar("replay", tmp_path / "serve.toml", ledger, "--headless", "--speed", "max", "--json")
-    assert json.loads(replayed.stdout)["frames"] == len(list(past_frames(ledger)))
+    assert json.loads(replayed.stdout)["frames"] == len(list(drawable_frames(ledger)))
     refused = run_hilstar("replay", tmp_path / "serve.toml", ledger, "--headless", "--step", "1")
     assert_refused(refused, 2, "run.mcap", "--step")
 
@@ -127,8 +127,8 @@ def test_after_a_kill_all_but_the_last_half_second_can_be_read(tmp_path):
         process.wait()
     found = read_log(ledger)
     assert len(found) >= 100
-    last = list(past_frames(ledger))[-1]
-    assert len(list(past_frames(ledger))) > 50
+    last = list(drawable_frames(ledger))[-1]
+    assert len(list(drawable_frames(ledger))) > 50
     # The bench's clock began 50 s before its stream, which ended at the kill: frames and packets reach to half a second of it.
     assert found[-1].t_ns > 50_000_000_000 + 1_500_000_000 - 600_000_000
     assert last.t_ns > 50_000_000_000 + 1_500_000_000 - 600_000_000

@@ -13,7 +13,7 @@ from hilstar.bench.bench_file import read_bench_file
 from hilstar.bench.build import open_bench
 from hilstar.rotation import from_radec_roll_deg
 from hilstar.run.record.ledger import Ledger
-from hilstar.run.record.records import config_of, read_head
+from hilstar.run.record.ledger_reader import config_of, read_head
 from tests.support.benches import SMALL_BENCH
 
 OTHER_BENCH = SMALL_BENCH.replace("[320, 240]", "[160, 120]")

@@ -22,9 +22,10 @@ from hilstar.attitude.wire.packet import AttitudeSample, Refusal, encode
 from hilstar.cli.parsers import parse_split
 from hilstar.errors import InputError
 from hilstar.notices import Notices
-from hilstar.run.record.backlog import MAX_WAITING_BYTES, Backlog, Entry
+from hilstar.run.record.backlog import MAX_WAITING_BYTES, Backlog, Entry, ReceivedPacket
 from hilstar.run.record.ledger import Ledger, Split
-from hilstar.run.record.records import FrameRecord, past_frames
+from hilstar.run.record.ledger_reader import drawable_frames
+from hilstar.run.record.ledger_records import FrameRecord
 from hilstar.run.record.report import figures_of, report
 
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
@@ -56,7 +57,7 @@ def test_a_ledger_goes_on_in_other_files_and_is_read_as_one(tmp_path, bench):
         keep(ledger, 50, 100)
     assert len(parts_of(path)) >= 2
     assert [sample.sequence for sample in read_log(path)] == list(range(100))
-    assert [frame.number for frame in past_frames(path)] == list(range(100))
+    assert [frame.frame for frame in drawable_frames(path)] == list(range(100))
     assert [sample.sequence for sample in read_log(tmp_path / "run.0001.mcap")][-1] == 99 or len(parts_of(path)) > 2
 
 
@@ -85,7 +86,7 @@ def test_a_disk_without_room_loses_frames_first_and_says_so_and_is_tried_again(t
     assert ledger.failure == "File too large"
     assert ledger.summary()["unrecorded"] == 10
     assert [sample.sequence for sample in read_log(tmp_path / "run.mcap")] == list(range(20))
-    assert [frame.number for frame in past_frames(tmp_path / "run.mcap")] == list(range(10))
+    assert [frame.frame for frame in drawable_frames(tmp_path / "run.mcap")] == list(range(10))
 
 
 def wait_for(true) -> None:
@@ -98,7 +99,7 @@ def wait_for(true) -> None:
 def test_what_waits_is_bounded_by_bytes_and_frames_go_first():
     backlog = Backlog()
     frames = sum(backlog.put(Entry("frame", 0, 0, None)) for _ in range(50_000))
-    packets = sum(backlog.put(Entry("packet", 0, 0, None, 1000)) for _ in range(50_000))
+    packets = sum(backlog.put(Entry("packet", 0, 0, ReceivedPacket(bytes(1000), None, None))) for _ in range(50_000))
     assert 0 < frames < 50_000 and 0 < packets < 50_000
     assert sum(entry.size_bytes for entry in backlog.take()) <= MAX_WAITING_BYTES
     assert backlog.put(Entry("frame", 0, 0, None))
@@ -161,7 +162,7 @@ def test_a_frame_that_the_wire_would_refuse_is_refused_with_its_number(tmp_path,
     form = {"frame": 1, "t_ns": 1, "light_ns": 1, "draw_ns": 1, "swap_ns": 2, "q": [1, 0, 0, 0]}
     path = frames_file(tmp_path, [form, form | wrong])
     with pytest.raises(InputError, match=f"run.mcap: message 2.*{word}"):
-        list(past_frames(path))
+        list(drawable_frames(path))
 
 
 def frames_file(tmp_path, forms):

@@ -12,7 +12,7 @@ from hilstar.attitude.wire.packet import AttitudeSample, encode
 from hilstar.bench.config import parse_config
 from hilstar.errors import InputError
 from hilstar.run.record.ledger import Ledger
-from hilstar.run.record.records import FrameRecord
+from hilstar.run.record.ledger_records import FrameRecord
 from hilstar.run.replay import Wanted, plan_play
 from tests.conftest import SMALL_BENCH
 

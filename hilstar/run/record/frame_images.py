@@ -18,7 +18,7 @@ from hilstar.run.shown import Shown
 COLUMNS = ("frame", "t_s", "qw", "qx", "qy", "qz", "stars_drawn", "clipped")
 
 
-class FrameRecorder:
+class FrameImages:
     """Writes `frame_000000.png` and on, and `frames.csv`; with no directory it writes nothing."""
 
     def __init__(self, directory: Path | None, bench: Bench) -> None:

@@ -8,15 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from hilstar.arrays import FloatArray
-from hilstar.run.record.records import (
-    MAX_REASON_CHARACTERS,
-    MAX_REASONS,
-    EventRecord,
-    FrameRecord,
-    PacketTally,
-    ProcessRecord,
-    RunRecord,
-)
+from hilstar.run.record.ledger_reader import MAX_REASON_CHARACTERS, MAX_REASONS, PacketTally
+from hilstar.run.record.ledger_records import EventRecord, FrameRecord, ProcessRecord, RunRecord
 from hilstar.running_statistics import RunningStatistics
 from hilstar.units import NS_PER_MS, NS_PER_S
 

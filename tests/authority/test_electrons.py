@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.constants import c, h, k, sigma
-from scipy.integrate import quad, quad_vec
+from scipy.integrate import quad_vec
 
 from hilstar.sky.catalog import load_catalog
 from hilstar.sky.electrons import Optics, Photometry, ags_electrons_per_s, dgs_electrons_per_s, star_temperatures_k, tabulate

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -18,11 +19,6 @@ from tests.authority.integrals import integral, read, v_mean
 TABLE_LIMIT = 1e-6
 # quad is asked for 1e-10 of each piece.
 QUAD = 1e-9
-
-
-def read(name: str) -> tuple[np.ndarray, np.ndarray]:
-    rows = [row for row in csv.reader((DATA_DIR / f"{name}.csv").read_text().splitlines()) if row[0][0].isdigit()]
-    return np.array(rows, dtype=float).T
 
 
 def planck(wavelength_nm: float, temperature_k: float | np.ndarray) -> float | np.ndarray:

@@ -13,7 +13,7 @@ from hilstar.scene import exposure_motion as smear
 from hilstar.scene.exposure_motion import MIDDLE_S, Motion, smeared_sprites
 from hilstar.scene.psf import MAX_CUT, footprint_px
 from hilstar.scene.sprites import join_sprites, make_sprites
-from tests.unit.scene.test_scene import stars_at
+from tests.support.stars import stars_at
 
 IDENTITY = np.array([1.0, 0, 0, 0])
 SIZE = (320, 240)

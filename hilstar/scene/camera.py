@@ -11,7 +11,7 @@ from hilstar.arrays import FloatArray
 
 @dataclass(frozen=True, slots=True)
 class Camera:
-    """What maps cam directions to pixels: (0, 0) is the centre of the top-left pixel, x right, y down.
+    """A mapping of cam directions to pixels: (0, 0) is the centre of the top-left pixel, x right, y down.
 
     `cam_to_image` (3, 3) turns cam components into those of the image's own axes (z along its normal).
     """
@@ -22,7 +22,7 @@ class Camera:
     cam_to_image: FloatArray
 
     def project(self, image_vectors: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Pixel x and y of directions (n, 3) in image axes; those not in front come out as NaN."""
+        """Pixel x and y of directions (n, 3) in image axes; NaN for those not in front of the camera."""
         z = image_vectors[:, 2]
         scale = np.divide(self.focal_length_px, z, out=np.full_like(z, np.nan), where=z > 0)
         x = image_vectors[:, 0] * scale + self.principal_point_px[0]
@@ -30,9 +30,9 @@ class Camera:
         return x, y
 
     def fastest_px_s(self, rate_image_rad_s: FloatArray) -> float:
-        """The fastest that a direction crosses the image at a rate (3,) of the camera in image axes, px/s; within 2 %.
+        """The largest speed of a direction across the image at a rate (3,) of the camera in image axes, px/s; within 2 %.
 
-        On a grid of 9 x 9 places: a speed's components are quadratic in the place.
+        Evaluated on a grid of 9 x 9 places: the components of the speed are quadratic in the place.
         """
         edges = [np.linspace(-0.5, size - 0.5, 9) for size in self.resolution_px]
         x, y = np.meshgrid(*((edge - c) / self.focal_length_px for edge, c in zip(edges, self.principal_point_px, strict=True)))

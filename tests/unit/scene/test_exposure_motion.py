@@ -119,7 +119,7 @@ def test_a_spin_that_sweeps_the_sky_past_the_camera_ends(rng):
 @pytest.mark.parametrize("rate", [(1e9, 0, 0), (0, 0, 1e12), (3e5, 1e5, 0)])
 def test_a_turn_too_long_to_draw_is_refused_with_what_can_be(rate):
     at = motion(rate)
-    with pytest.raises(InputError, match=r"turns by .* deg is too long; at most .* deg are drawn"):
+    with pytest.raises(InputError, match=r"turns by .* deg is too long; at most .* deg can be drawn"):
         smeared_sprites(star_on((160.2, 120.7), motion((0, 0, 0))), at, CAMERA, 10, SIGMA)
 
 

@@ -51,6 +51,29 @@ def to_matrix(q: FloatArray) -> FloatArray:
     )
 
 
+def from_rotation_vector(vector_rad: FloatArray) -> FloatArray:
+    """The rotation (4,) by the angle |v| about the axis v (3,), right-handed."""
+    angle = float(np.linalg.norm(vector_rad))
+    share = np.sinc(angle / (2 * np.pi)) / 2  # sin(angle / 2) / angle
+    return np.array([np.cos(angle / 2), *(share * vector_rad)])
+
+
+def from_matrix(matrix: FloatArray) -> FloatArray:
+    """The quaternion (4,), w >= 0, of a rotation matrix (3, 3): the largest component first (Shepperd 1978)."""
+    trace = float(np.trace(matrix))
+    squares = np.array([trace, *np.diag(matrix)])
+    k = int(np.argmax(squares))
+    skew = np.array([matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]])
+    if k == 0:
+        q = np.array([1 + trace, *skew])
+    else:
+        i, both = k - 1, matrix + matrix.T
+        q = np.array([skew[i], *both[i]])
+        q[k] = 1 - trace + 2 * matrix[i, i]
+    q = normalise(q)
+    return q if q[0] >= 0 else -q
+
+
 def from_radec_roll_deg(ra_deg: float, dec_deg: float, roll_deg: float) -> FloatArray:
     """q_icrs_to_cam of a boresight and roll (thesis eq. 2.3): R_icrs_from_cam = A3(ra-90) A1(dec-90) A3(roll).
 

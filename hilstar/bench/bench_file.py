@@ -43,7 +43,10 @@ def read_bench_file(path: Path) -> BenchFile:
 
 def _sha256(config: BenchConfig, folder: Path) -> str:
     digest = hashlib.sha256(msgspec.json.encode(config, order="sorted"))
-    named = (config.tracker.quantum_efficiency, config.tracker.transmission, config.sky.catalogue, config.monitor.calibration)
+    tracker = config.tracker
+    curves = (tracker.quantum_efficiency, tracker.transmission)
+    files = (config.sky.catalogue, config.monitor.calibration, config.collimator.geometry, tracker.distortion)
+    named: tuple[str | float | None, ...] = (*curves, *files)
     for name in named:
         if isinstance(name, str) and name not in (*BUILT_IN_CURVES, *BUILT_IN, "hipparcos"):
             digest.update(_named_bytes(folder / name))

@@ -5,20 +5,18 @@ from __future__ import annotations
 import logging
 from pathlib import Path
 
-import numpy as np
 from msgspec.structs import replace
 
 from hilstar.bench.bench_file import BenchFile, read_bench_file
+from hilstar.bench.cameras import bench_camera
 from hilstar.bench.config import DEFAULT_BRIGHTEST_V_MAG, BenchConfig, RenderSettings, SkySettings, Tracker
 from hilstar.bench.effort import Effort, Light, faintest_shown_e_per_s, plan_effort
 from hilstar.bench.frame import Bench
 from hilstar.bench.orientation import scan_of
 from hilstar.errors import InputError
 from hilstar.monitor.calibration import BUILT_IN, Calibration, load_calibration
-from hilstar.monitor.geometry import monitor_camera
 from hilstar.monitor.quantise import Panel, cycle_warning
 from hilstar.render.renderer import Context, Renderer, Target
-from hilstar.scene.camera import Camera
 from hilstar.scene.psf import peak_share
 from hilstar.sky.astrometry import aberrate, unit_vectors_icrs
 from hilstar.sky.catalog import load_catalog
@@ -54,7 +52,7 @@ def open_bench(file: BenchFile, context: Context | None = None) -> Bench:
         file=file,
         config=config,
         effort=effort,
-        camera=bench_camera(config),
+        camera=bench_camera(config, file.folder),
         scan=scan_of(config.monitor),
         calibration=calibration,
         uniformity=uniformity,
@@ -139,17 +137,6 @@ def bench_calibration(config: BenchConfig, folder: Path) -> Calibration:
     name = config.monitor.calibration
     source = name if name in BUILT_IN else folder / name
     return load_calibration(source, config.monitor.bits, bit_stealing=config.render.bit_stealing)
-
-
-def bench_camera(config: BenchConfig) -> Camera:
-    """The monitor behind its collimator."""
-    return monitor_camera(
-        config.monitor.resolution_px,
-        config.monitor.pixel_pitch_um,
-        config.collimator.focal_length_mm,
-        np.array(config.collimator.q_cam_to_mon),
-        config.collimator.principal_point_px,
-    )
 
 
 def _white_e_per_s(render: RenderSettings, stars: Stars) -> float:

@@ -9,6 +9,8 @@ import typer
 
 from hilstar import __version__
 from hilstar.cli.benchmark import benchmark
+from hilstar.cli.calibrate.dots import dots
+from hilstar.cli.calibrate.geometric import geometric
 from hilstar.cli.calibrate.latency import latency
 from hilstar.cli.calibrate.photometric import photometric
 from hilstar.cli.calibrate.plan import plan
@@ -42,7 +44,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-calibrate = typer.Typer(help="Calibrate the monitor: its response to measured patches, and the scale of its light.")
+calibrate = typer.Typer(help="Calibrate a bench: its geometry by dots, its monitor by patches, its scale by stars.")
 
 
 def print_version(wanted: bool) -> None:
@@ -64,6 +66,6 @@ def hilstar(
 for panel, commands in COMMANDS.items():
     for command in commands:
         app.command(rich_help_panel=panel)(command)
-for command in (plan, photometric, scale):
+for command in (dots, geometric, plan, photometric, scale):
     calibrate.command()(command)
 app.add_typer(calibrate, name="calibrate", rich_help_panel="Calibrate")

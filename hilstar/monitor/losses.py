@@ -18,7 +18,7 @@ from hilstar.units import magnitude
 
 @dataclass(frozen=True, slots=True)
 class StarLosses:
-    """For n sprites: fainter than half the smallest step, over white in a pixel, and the magnitudes lost.
+    """For n sprites: too faint for half of the smallest step, over white in a pixel, and magnitudes fainter than wanted.
 
     `loss_mag` is infinite for a star that shows nothing and NaN for one all of whose pixels are brighter stars'.
     """
@@ -29,10 +29,9 @@ class StarLosses:
 
 
 def star_losses(sprites: Sprites, panel: Panel, footprints: FootprintMap, levels: Codes | None = None) -> StarLosses:
-    """What each sprite loses: at best on this panel, or in these `levels` (height, width).
+    """What each sprite loses: on this panel at best, or in these `levels` (height, width).
 
-    A pixel that several stars touch belongs to the brightest there, with the light of all; a star's fluxes are sums over its
-    own pixels.
+    A pixel of several stars is that of the brightest in it, with the light of all; both fluxes are sums over a star's own.
     """
     found = footprints.find(sprites)
     response = panel.response

@@ -1,49 +1,166 @@
-"""A pinhole camera: directions in cam become pixels (thesis eq. 4.1, 4.2), in float64."""
+"""From directions to pixels and back, in float64: a pinhole (thesis eq. 4.1, 4.2), or one with a real lens before it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from hilstar.arrays import FloatArray
+from hilstar.errors import InputError
+from hilstar.scene.lens import Lens
+
+SPEED_PLACES = 9  # along each side of the image: a speed's components are quadratic in the place
+BORDER_PLACES = 33  # along each side of the image
+FOLD_PLACES = 41  # across the disc in which a lens must not fold
+NEWTON_ROUNDS, STEPS_A_ROUND = 10, 5  # slopes are found once a round: a mild lens needs one
+# Of a focal length, 1e-8 px on any screen; slopes by differences of SLOPE_STEP are right to 1e-10, which is enough for that.
+NEWTON_DONE = 1e-13
+SLOPE_STEP = 1e-6
+MAX_TANGENT = 1e3  # a step of so much leads nowhere
 
 
 @dataclass(frozen=True, slots=True)
 class Camera:
-    """A mapping of cam directions to pixels: (0, 0) is the centre of the top-left pixel, x right, y down.
+    """What maps cam directions to pixels: (0, 0) is the centre of the top-left pixel, x right, y down.
 
-    `cam_to_image` (3, 3) turns cam components into those of the image's own axes (z along its normal).
+    `cam_to_image` (3, 3) turns cam components into those of the image's own axes (z along its normal). A `lens` of None is
+    the ideal pinhole.
     """
 
     resolution_px: tuple[int, int]
     focal_length_px: float
     principal_point_px: tuple[float, float]
     cam_to_image: FloatArray
+    lens: Lens | None = None
 
     def project(self, image_vectors: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Pixel x and y of directions (n, 3) in image axes; NaN for those not in front of the camera."""
+        """Pixel x and y of directions (n, 3) in image axes; those not in front come out as NaN."""
         z = image_vectors[:, 2]
-        scale = np.divide(self.focal_length_px, z, out=np.full_like(z, np.nan), where=z > 0)
-        x = image_vectors[:, 0] * scale + self.principal_point_px[0]
-        y = image_vectors[:, 1] * scale + self.principal_point_px[1]
-        return x, y
+        if self.lens is None:
+            scale = np.divide(self.focal_length_px, z, out=np.full_like(z, np.nan), where=z > 0)
+            x = image_vectors[:, 0] * scale + self.principal_point_px[0]
+            y = image_vectors[:, 1] * scale + self.principal_point_px[1]
+            return x, y
+        near = np.divide(1.0, z, out=np.full_like(z, np.nan), where=z > 0)
+        return self.places_px(image_vectors[:, 0] * near, image_vectors[:, 1] * near)
+
+    def places_px(self, u: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Pixel x and y of directions (u, v, 1) in image axes, (n,) each; NaN beyond the lens."""
+        cx, cy = self.principal_point_px
+        if self.lens is None:
+            return self.focal_length_px * u + cx, self.focal_length_px * v + cy
+        u, v = self.lens.bent(u, v)
+        x_px, y_px = self.focal_length_px * u + cx, self.focal_length_px * v + cy
+        if self.lens.field is None:
+            return x_px, y_px
+        dx_px, dy_px = self.lens.field.at(x_px, y_px)
+        return x_px + dx_px, y_px + dy_px
+
+    def tangents(self, x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The direction (u, v, 1) in image axes of each pixel, (n,) each: the inverse of `places_px`, to 1e-8 px.
+
+        By Newton's method; NaN where it finds none, and beyond the lens.
+        """
+        x_px, y_px = np.asarray(x_px, dtype=np.float64), np.asarray(y_px, dtype=np.float64)
+        cx, cy = self.principal_point_px
+        u, v = (x_px - cx) / self.focal_length_px, (y_px - cy) / self.focal_length_px
+        if self.lens is None:
+            return u, v
+        free = replace(self, lens=replace(self.lens, max_tangent=np.inf))  # a step may go beyond the bound
+        for _ in range(NEWTON_ROUNDS):
+            u, v, size = free._approach(u, v, x_px, y_px)
+            if not (size > NEWTON_DONE).any():
+                break
+        found = (size < SLOPE_STEP) & (np.hypot(u, v) <= self.lens.max_tangent)
+        return np.where(found, u, np.nan), np.where(found, v, np.nan)
+
+    def _approach(
+        self, u: FloatArray, v: FloatArray, x_px: FloatArray, y_px: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """A few steps towards pixels with the slopes at (u, v): nearer directions, and the size of the last step."""
+        a, b, c, d = self.slopes(u, v)
+        area = a * d - b * c
+        size = np.full_like(u, np.inf)
+        for _ in range(STEPS_A_ROUND):
+            x, y = self.places_px(u, v)
+            off_x, off_y = x - x_px, y - y_px
+            with np.errstate(divide="ignore", invalid="ignore"):
+                step_u, step_v = (d * off_x - b * off_y) / area, (a * off_y - c * off_x) / area
+            size = np.hypot(step_u, step_v)
+            wild = ~(size < MAX_TANGENT)
+            u, v = np.where(wild, np.nan, u - step_u), np.where(wild, np.nan, v - step_v)
+            if not (size > NEWTON_DONE).any():
+                break
+        return u, v, size
+
+    def slopes(self, u: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """dx/du, dx/dv, dy/du and dy/dv in px at directions (u, v, 1), (n,) each."""
+        (x1, y1), (x0, y0) = self.places_px(u + SLOPE_STEP, v), self.places_px(u - SLOPE_STEP, v)
+        (x3, y3), (x2, y2) = self.places_px(u, v + SLOPE_STEP), self.places_px(u, v - SLOPE_STEP)
+        both = 2 * SLOPE_STEP
+        return (x1 - x0) / both, (x3 - x2) / both, (y1 - y0) / both, (y3 - y2) / both
+
+    def rays(self, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
+        """Directions (n, 3) in cam, z in image axes 1, of pixels (n,)."""
+        u, v = self.tangents(x_px, y_px)
+        return np.asarray(np.stack([u, v, np.ones_like(u)], axis=-1) @ self.cam_to_image)
 
     def fastest_px_s(self, rate_image_rad_s: FloatArray) -> float:
-        """The largest speed of a direction across the image at a rate (3,) of the camera in image axes, px/s; within 2 %.
+        """The fastest that a direction crosses the image at a rate (3,) of the camera in image axes, px/s; within 2 %."""
+        u, v = self.tangents(*self._grid_px(SPEED_PLACES))
+        step = -np.cross(rate_image_rad_s, np.stack([u, v, np.ones_like(u)], axis=-1))
+        du, dv = step[..., 0] - u * step[..., 2], step[..., 1] - v * step[..., 2]
+        if self.lens is None:
+            return float(self.focal_length_px * np.hypot(du, dv).max())
+        a, b, c, d = self.slopes(u, v)
+        return float(np.nanmax(np.hypot(a * du + b * dv, c * du + d * dv)))
 
-        Evaluated on a grid of 9 x 9 places: the components of the speed are quadratic in the place.
-        """
-        edges = [np.linspace(-0.5, size - 0.5, 9) for size in self.resolution_px]
-        x, y = np.meshgrid(*((edge - c) / self.focal_length_px for edge, c in zip(edges, self.principal_point_px, strict=True)))
-        seen = np.stack([x, y, np.ones_like(x)], axis=-1)
-        step = -np.cross(rate_image_rad_s, seen)
-        return float(self.focal_length_px * np.hypot(step[..., 0] - x * step[..., 2], step[..., 1] - y * step[..., 2]).max())
+    def _grid_px(self, count: int) -> tuple[FloatArray, FloatArray]:
+        """Places (count^2,) over the whole image, its edges among them."""
+        x, y = np.meshgrid(*(np.linspace(-0.5, size - 0.5, count) for size in self.resolution_px))
+        return x.ravel(), y.ravel()
 
     def field_radius_rad(self, margin_px: float) -> float:
-        """The angle from the image's normal to its farthest corner, `margin_px` outside it."""
+        """The angle from the image's normal to its farthest corner, `margin_px` outside it (with a lens, its own margin)."""
+        if self.lens is not None:
+            return float(np.arctan(self.lens.max_tangent))
         width, height = self.resolution_px
         cx, cy = self.principal_point_px
         reach_x = max(cx, width - 1 - cx) + 0.5 + margin_px
         reach_y = max(cy, height - 1 - cy) + 0.5 + margin_px
         return float(np.arctan(np.hypot(reach_x, reach_y) / self.focal_length_px))
+
+
+def bounded(camera: Camera, margin_px: float) -> Camera:
+    """The camera with its lens bounded to what reaches the image, `margin_px` around it included.
+
+    Raises InputError for a lens that folds within those directions: two of them would share a pixel.
+    """
+    lens = camera.lens
+    if lens is None:
+        return camera
+    free = replace(camera, lens=replace(lens, max_tangent=np.inf))
+    u, v = free.tangents(*_border_px(camera.resolution_px, margin_px))
+    reach = float(np.hypot(u, v).max())
+    if not np.isfinite(reach) or _folds(free, reach):
+        raise InputError("its distortion folds within the screen: two directions share a pixel; fit it anew, with fewer terms")
+    return replace(camera, lens=replace(lens, max_tangent=reach))
+
+
+def _border_px(resolution_px: tuple[int, int], margin_px: float) -> tuple[FloatArray, FloatArray]:
+    """Places all around the image, `margin_px` outside it."""
+    (left, right), (top, bottom) = ((-0.5 - margin_px, size - 0.5 + margin_px) for size in resolution_px)
+    across, down = np.linspace(left, right, BORDER_PLACES), np.linspace(top, bottom, BORDER_PLACES)
+    x = np.concatenate([across, across, np.full(BORDER_PLACES, left), np.full(BORDER_PLACES, right)])
+    y = np.concatenate([np.full(BORDER_PLACES, top), np.full(BORDER_PLACES, bottom), down, down])
+    return x, y
+
+
+def _folds(camera: Camera, reach: float) -> bool:
+    """Whether the map turns over anywhere within a radius of (u, v)."""
+    side = np.linspace(-reach, reach, FOLD_PLACES)
+    u, v = (part.ravel() for part in np.meshgrid(side, side))
+    inside = np.hypot(u, v) <= reach
+    a, b, c, d = camera.slopes(u[inside], v[inside])
+    return bool(not (a * d - b * c > 0).all())

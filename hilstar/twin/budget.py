@@ -98,7 +98,7 @@ def zero_point_mag(bench: Bench) -> float:
     Raises InputError where it has none.
     """
     stars = bench.stars
-    # The stars of that colour, or else the nearest to it: where there are stars, none of these is far from it.
+    # The bench's stars of that colour, or the nearest to it: none of them is far off in a bench with stars.
     distance = np.abs(stars.bv_mag - SOLAR_BV)
     alike = distance <= max(LIKE_SOLAR_BV, float(distance.min()))
     return float(np.median(stars.v_mag[alike] - magnitude(stars.electrons_per_s[alike])))

@@ -13,10 +13,10 @@ import numpy.typing as npt
 from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import bench_optics, bench_stars
+from hilstar.bench.cameras import tracker_camera
 from hilstar.bench.config import BenchConfig
 from hilstar.bench.truth import truth_table
 from hilstar.errors import InputError
-from hilstar.monitor.geometry import monitor_camera
 from hilstar.render.renderer import Renderer, Target
 from hilstar.scene.exposure_motion import MIDDLE_S, Motion, smeared_sprites
 from hilstar.sky.electrons import Photometry, zodiacal_electrons_per_s_arcsec2
@@ -24,12 +24,11 @@ from hilstar.tracker.detector import Detector
 from hilstar.units import ARCSEC_PER_RAD
 
 Noise = Literal["full", "none"]
-NO_MISALIGNMENT = np.array([1.0, 0.0, 0.0, 0.0])
 
 
 @dataclass(frozen=True, slots=True)
 class FrameNoise:
-    """Noise of frames: "full", or "none" for the mean signal through the ADC; and its seed."""
+    """Noise of frames: "full", or "none" for the mean signal through the ADC; and the seed of what is drawn anew in each."""
 
     kind: Noise = "full"
     seed: int = 0
@@ -62,7 +61,7 @@ class Simulator:
         self.config = file.config
         tracker = self.config.tracker
         self.stars = bench_stars(self.config, file.folder)
-        self.camera = monitor_camera(tracker.resolution_px, tracker.pixel_pitch_um, tracker.focal_length_mm, NO_MISALIGNMENT)
+        self.camera = tracker_camera(tracker, file.folder)
         self.background_e = background_e(self.config, file.folder)
         self.detector = Detector(tracker.detector, tracker.resolution_px, tracker.pixel_pitch_um)
         self.renderer = Renderer(Target(tracker.resolution_px, tracker.psf_sigma_px))
@@ -107,7 +106,7 @@ class Simulator:
 
 
 def background_e(config: BenchConfig, folder: Path) -> FloatArray:
-    """Electrons per exposure between the stars, (height, width): level, plus a gradient that is 0 in the middle.
+    """Electrons per exposure between the stars, (height, width): level, plus a gradient that leaves its middle alone.
 
     Zodiacal light is V mag/arcsec^2 through the tracker's optics, times a pixel's solid angle (thesis eq. 4.10, 4.11).
     """

@@ -25,3 +25,11 @@ class Collimator(Table, frozen=True):
             extra={"default": "the middle of the screen"},
         ),
     ] = None
+    geometry: Annotated[
+        str | None,
+        Meta(
+            description="The path of a file that `hilstar calibrate geometric` wrote: the real lens and the real alignment. It "
+            "takes the place of the other keys of this table.",
+            extra={"default": "an ideal lens"},
+        ),
+    ] = None

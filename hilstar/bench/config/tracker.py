@@ -7,7 +7,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from hilstar.bench.config.values import NotNegative, Positive, Sigma, Size
+from hilstar.bench.config.values import NotNegative, Point, Positive, Sigma, Size
 from hilstar.toml_tables import Table
 from hilstar.tracker.settings import DetectorSettings, PixelPitch
 
@@ -49,4 +49,19 @@ class Tracker(Table, frozen=True):
             "stars on the monitor."
         ),
     ] = (0.55, 0.55)
+    principal_point_px: Annotated[
+        Point | None,
+        Meta(
+            description="Where the boresight meets the detector, in tracker pixels.",
+            extra={"default": "the middle of the detector"},
+        ),
+    ] = None
+    distortion: Annotated[
+        str | None,
+        Meta(
+            description="The path of the tracker's flight model: a TOML file with the Brown-Conrady coefficients `k1`, `k2`, "
+            "`k3`, `p1` and `p2` of tangents of field angles, from direction to pixel; those left out are 0.",
+            extra={"default": "an ideal lens"},
+        ),
+    ] = None
     detector: Annotated[DetectorSettings, Meta(description="See below.")] = msgspec.field(default_factory=DetectorSettings)

@@ -13,7 +13,7 @@ import numpy as np
 from hilstar.arrays import FloatArray
 from hilstar.attitude.clock.timeline import Attitude
 from hilstar.bench.build import load
-from hilstar.monitor.geometry import monitor_camera
+from hilstar.bench.cameras import tracker_camera
 from hilstar.monitor.quantise import shown_light
 from hilstar.render.renderer import Renderer, Target
 from hilstar.scene.exposure_motion import Motion, smeared_sprites
@@ -22,7 +22,6 @@ from hilstar.scene.sprites import Sprites
 from hilstar.study.timing.slew import PACKET_HZ, Slew
 from hilstar.twin.bench_geometry import BenchGeometry
 from hilstar.twin.optics import TwinOptics
-from hilstar.twin.simulator import NO_MISALIGNMENT
 from hilstar.units import NS_PER_S
 
 BENCH = """
@@ -93,7 +92,7 @@ class ScanningPanel:
         self.panel_scan = replace(self.bench.scan, scanout_s=self.period_s, hold_s=self.period_s)
         tracker = config.tracker
         self.exposure_s = tracker.exposure_s
-        self.camera = monitor_camera(tracker.resolution_px, tracker.pixel_pitch_um, tracker.focal_length_mm, NO_MISALIGNMENT)
+        self.camera = tracker_camera(tracker, self.bench.file.folder)
         self.optics = TwinOptics(BenchGeometry(self.bench.camera, self.camera), tracker.psf_sigma_px)
         self.panel = self.bench.panel
 

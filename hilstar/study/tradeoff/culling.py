@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 
 from hilstar.arrays import FloatArray, IntArray
-from hilstar.bench.build import bench_camera
+from hilstar.bench.cameras import ideal_monitor
 from hilstar.scene.camera import Camera
 from hilstar.scene.psf import footprint_px
 from hilstar.scene.sprites import pack_sprites
@@ -34,7 +34,7 @@ CELLS_DEG = (1.0, 2.0, 3.0, 4.0, 6.0, 10.0, 20.0)
 def culling(stack: ExitStack, quick: bool) -> Trials:
     """How the stars in view are found among all: stars missed over ATTITUDES fields, and stars looked at in vain."""
     del stack
-    camera, stars = bench_camera(demo_config()), stars_to(NO_LIMIT_V_MAG)
+    camera, stars = ideal_monitor(demo_config()), stars_to(NO_LIMIT_V_MAG)
     turns = [turn_to_image(q, camera) for q in random_attitudes(10 if quick else ATTITUDES)]
     in_view = [set(stars.hip[_scan(stars, turn, camera)[0]].tolist()) for turn in turns]
     finders: dict[str, tuple[Stars, Finder]] = {

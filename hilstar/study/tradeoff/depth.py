@@ -7,7 +7,8 @@ from functools import partial
 from pathlib import Path
 
 from hilstar.arrays import FloatArray
-from hilstar.bench.build import bench_calibration, bench_camera, brightest_peak_e_per_s
+from hilstar.bench.build import bench_calibration, brightest_peak_e_per_s
+from hilstar.bench.cameras import ideal_monitor
 from hilstar.bench.config import SkySettings
 from hilstar.render.renderer import Renderer, Target
 from hilstar.scene.camera import Camera
@@ -29,7 +30,7 @@ LIMITS_V_MAG = (5.0, 6.0, 6.5, 7.0, 7.5, 8.0, 8.5, 9.0, 10.0)
 def depth(stack: ExitStack, quick: bool) -> Trials:
     """How deep the catalogue goes: light of the whole sky that is lost, %, and stars drawn in the field."""
     del quick
-    config, camera = demo_config(), bench_camera(demo_config())
+    config, camera = demo_config(), ideal_monitor(demo_config())
     calibration, white = bench_calibration(config, Path()), brightest_peak_e_per_s(stars_to(NO_LIMIT_V_MAG), SIGMA_PX)
     renderer = stack.enter_context(Renderer(Target(camera.resolution_px, SIGMA_PX, calibration.response, white)))
     everything = stars_to(NO_LIMIT_V_MAG).electrons_per_s.sum()

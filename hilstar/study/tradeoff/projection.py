@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import FloatArray, IntArray
-from hilstar.bench.build import bench_camera
+from hilstar.bench.cameras import ideal_monitor
 from hilstar.scene.camera import Camera
 from hilstar.scene.psf import footprint_px
 from hilstar.scene.sprites import SPRITE_DTYPE, pack_sprites
@@ -33,7 +33,7 @@ ROUNDING_PX = 1e-12
 def projection(stack: ExitStack, quick: bool) -> Trials:
     """Where stars fall, by the precision of it all: error, px, worst and rms over the stars of ATTITUDES random fields."""
     del stack
-    camera, vectors = bench_camera(demo_config()), stars_to(NO_LIMIT_V_MAG).vectors
+    camera, vectors = ideal_monitor(demo_config()), stars_to(NO_LIMIT_V_MAG).vectors
     views = [_view(q, camera) for q in random_attitudes(6 if quick else ATTITUDES)]
     truths = [_exact_places(vectors[near], turn, camera) for near, turn in views]
     trials = []
@@ -116,6 +116,6 @@ def _places(road: Road, vectors: FloatArray, icrs_to_image: FloatArray, camera: 
 def _place_errors_px(
     road: Road, vectors: FloatArray, icrs_to_image: FloatArray, truth: npt.NDArray[np.longdouble]
 ) -> FloatArray:
-    found = _places(road, vectors, icrs_to_image, bench_camera(demo_config()))
+    found = _places(road, vectors, icrs_to_image, ideal_monitor(demo_config()))
     error = np.hypot(*(found - truth).T).astype(np.float64)
     return np.asarray(error[np.isfinite(error)])

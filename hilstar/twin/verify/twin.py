@@ -13,7 +13,8 @@ import numpy.typing as npt
 from hilstar.arrays import FloatArray
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE
 from hilstar.bench.bench_file import BenchFile
-from hilstar.bench.build import bench_camera, open_bench
+from hilstar.bench.build import open_bench
+from hilstar.bench.cameras import ideal_monitor, tracker_camera
 from hilstar.bench.config import Verify
 from hilstar.bench.frame import Bench
 from hilstar.errors import InputError
@@ -23,7 +24,7 @@ from hilstar.scene.camera import Camera
 from hilstar.tracker.detector import Detector
 from hilstar.twin.bench_geometry import BenchGeometry
 from hilstar.twin.optics import TwinOptics
-from hilstar.twin.simulator import NO_MISALIGNMENT, background_e
+from hilstar.twin.simulator import background_e
 from hilstar.twin.verify.light import exposure_lights, true_panel
 
 
@@ -53,7 +54,7 @@ class Twin:
         self.bench = open_bench(file)
         self.config = self.bench.config
         tracker = self.config.tracker
-        self.camera = monitor_camera(tracker.resolution_px, tracker.pixel_pitch_um, tracker.focal_length_mm, NO_MISALIGNMENT)
+        self.camera = tracker_camera(tracker, file.folder)
         self.differs = any(name.startswith("true_") for name in changed_keys(self.config.verify))
         self.true_panel = true_panel(self.bench)
         self.assumed_geometry = BenchGeometry(self.bench.camera, self.camera)
@@ -123,6 +124,6 @@ def true_geometry(bench: Bench, tracker: Camera) -> BenchGeometry:
         verify.true_pixel_pitch_um or monitor.pixel_pitch_um,
         verify.true_focal_length_mm or collimator.focal_length_mm,
         np.array(verify.true_q_cam_to_mon or collimator.q_cam_to_mon),
-        bench_camera(config).principal_point_px,
+        ideal_monitor(config).principal_point_px,
     )
     return BenchGeometry(camera, tracker, verify.true_mirror)

@@ -1,0 +1,159 @@
+"""Frames of dots, each of which blinks its own code, so that a dot in the tracker's image says by itself which it is.
+
+Each dot is lit in the same number of the frames (its code has that weight, a parity check against a lost or a false one), and
+any two codes differ in as many frames as the number of dots leaves room for.
+"""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from hilstar.arrays import FloatArray, IntArray
+from hilstar.errors import InputError
+from hilstar.files import written
+from hilstar.reading import open_lines
+
+BoolArray = npt.NDArray[np.bool_]
+
+LIT_SHARE = 0.4  # of the frames that a dot is lit in
+MIN_LIT, MAX_LIT = 3, 10  # frames that a dot is lit in
+MIN_FRAMES = 8
+MAX_PLAN_BYTES = 20_000_000
+EDGE_PX = 6  # from a dot's centre to the edge of the screen
+TRIES = 400  # random codes for each dot, at each distance
+PLAN_COLUMNS = ("frame", "dot", "x_px", "y_px")
+GOLDEN = 1.32471795724474602596  # the plastic number: its powers spread points evenly over a square (Roberts 2018)
+PLAN_ADVICE = "give the plan.csv that `hilstar calibrate dots` wrote"
+
+
+@dataclass(frozen=True, slots=True)
+class DotPlan:
+    """Dots on the monitor: places (n,) in px, whole numbers, and in which of the frames each is lit (n, frames)."""
+
+    x_px: FloatArray
+    y_px: FloatArray
+    lit: BoolArray
+
+    @property
+    def frames(self) -> int:
+        """How many frames there are."""
+        return int(self.lit.shape[1])
+
+    def __len__(self) -> int:
+        return len(self.x_px)
+
+
+def plan_dots(resolution_px: tuple[int, int], frames: int, dots_per_frame: int, rng: np.random.Generator) -> DotPlan:
+    """Dots over the whole screen, about `dots_per_frame` lit in each frame. Raises InputError for numbers that give none."""
+    if frames < MIN_FRAMES:
+        raise InputError(f"--frames {frames}: the dots' codes need {MIN_FRAMES} frames or more")
+    weight = int(np.clip(round(LIT_SHARE * frames), MIN_LIT, MAX_LIT))
+    count = round(dots_per_frame * frames / weight)
+    lit = _codes(count, frames, weight, rng)
+    x_px, y_px = _places(resolution_px, count)
+    return DotPlan(x_px, y_px, lit)
+
+
+def _codes(count: int, frames: int, weight: int, rng: np.random.Generator) -> BoolArray:
+    """`count` different codes (count, frames) of one weight, as far apart as random search finds them."""
+    for distance in range(2 * weight, 0, -2):
+        codes = _codes_apart(count, frames, weight, distance, rng)
+        if codes is not None:
+            return codes
+    raise InputError(f"--dots: {count} dots are more than the codes of {frames} frames; write more --frames or fewer --dots")
+
+
+def _codes_apart(count: int, frames: int, weight: int, distance: int, rng: np.random.Generator) -> BoolArray | None:
+    codes = np.zeros((count, frames), dtype=bool)
+    load = np.zeros(frames)
+    for k in range(count):
+        for _ in range(TRIES):
+            # The frames with the fewest dots so far come first, by and large.
+            chosen = np.argsort(load + rng.uniform(0.0, 2.0 + k / frames, frames))[:weight]
+            code = np.zeros(frames, dtype=bool)
+            code[chosen] = True
+            if k == 0 or int((codes[:k] != code).sum(axis=1).min()) >= distance:
+                break
+        else:
+            return None
+        codes[k] = code
+        load[chosen] += 1
+    return codes
+
+
+def _places(resolution_px: tuple[int, int], count: int) -> tuple[FloatArray, FloatArray]:
+    """Whole pixels spread evenly over the screen, its corners first: nothing is extrapolated into a corner."""
+    k = np.arange(max(count - 4, 0))
+    spread = np.column_stack([(0.5 + k / GOLDEN) % 1.0, (0.5 + k / GOLDEN**2) % 1.0])
+    corners = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
+    unit = np.concatenate([corners, spread])[:count]
+    size = np.array(resolution_px) - 1 - 2 * EDGE_PX
+    if (size < 1).any():
+        raise InputError(f"a screen of {resolution_px[0]} x {resolution_px[1]} px is too small for dots")
+    places = np.rint(EDGE_PX + unit * size)
+    return places[:, 0], places[:, 1]
+
+
+def dot_image(plan: DotPlan, frame: int, resolution_px: tuple[int, int], white: int) -> npt.NDArray[np.uint16]:
+    """Code values (h, w) of a frame: each lit dot is a square of 3 x 3 px of `white` about its place."""
+    width, height = resolution_px
+    image = np.zeros((height, width), dtype=np.uint16)
+    for x, y in zip(plan.x_px[plan.lit[:, frame]].astype(int), plan.y_px[plan.lit[:, frame]].astype(int), strict=True):
+        image[y - 1 : y + 2, x - 1 : x + 2] = white
+    return image
+
+
+def write_plan(path: Path, plan: DotPlan) -> None:
+    """A row for each lit dot of each frame."""
+
+    def write(part: Path) -> None:
+        with part.open("w", encoding="ascii", newline="") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(PLAN_COLUMNS)
+            for frame in range(plan.frames):
+                for dot in np.flatnonzero(plan.lit[:, frame]):
+                    writer.writerow((frame, int(dot), int(plan.x_px[dot]), int(plan.y_px[dot])))
+
+    written(path, write)
+
+
+def read_plan(path: Path) -> DotPlan:
+    """A plan as it was written. Raises InputError with the line of what is no plan."""
+    rows: list[tuple[int, int, float, float]] = []
+    with open_lines(path, PLAN_ADVICE, MAX_PLAN_BYTES) as lines:
+        reader = csv.reader(lines)
+        header = tuple(name.strip() for name in next(reader, []))
+        if header != PLAN_COLUMNS:
+            raise InputError(f"{path}:1: the header must be {','.join(PLAN_COLUMNS)}; {PLAN_ADVICE}")
+        for row in reader:
+            try:
+                frame, dot, x_px, y_px = int(row[0]), int(row[1]), float(row[2]), float(row[3])
+                if len(row) != len(PLAN_COLUMNS) or min(frame, dot) < 0 or max(frame, dot) > 10**6:
+                    raise ValueError
+            except (ValueError, IndexError) as error:
+                wanted = "whole numbers frame and dot, and x_px and y_px are wanted"
+                raise InputError(f"{path}:{reader.line_num}: {','.join(row)[:80]!r}; {wanted}") from error
+            rows.append((frame, dot, x_px, y_px))
+    if not rows:
+        raise InputError(f"{path}: has no dot; {PLAN_ADVICE}")
+    return _plan_of(path, rows)
+
+
+def _plan_of(path: Path, rows: list[tuple[int, int, float, float]]) -> DotPlan:
+    dots: IntArray = np.array(sorted({row[1] for row in rows}), dtype=np.intp)
+    place = {int(dot): k for k, dot in enumerate(dots)}
+    x_px, y_px = np.full(len(dots), np.nan), np.full(len(dots), np.nan)
+    lit = np.zeros((len(dots), max(row[0] for row in rows) + 1), dtype=bool)
+    for frame, dot, x, y in rows:
+        k = place[dot]
+        if lit[k].any() and (x_px[k], y_px[k]) != (x, y):
+            raise InputError(f"{path}: dot {dot} is at two places; {PLAN_ADVICE}")
+        x_px[k], y_px[k], lit[k, frame] = x, y, True
+    if not (np.isfinite(x_px).all() and np.isfinite(y_px).all()):
+        raise InputError(f"{path}: a dot's place is no number; {PLAN_ADVICE}")
+    return DotPlan(x_px, y_px, lit)

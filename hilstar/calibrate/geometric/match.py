@@ -1,0 +1,186 @@
+"""From centroids to dots in every pose, whatever way up the image is; what cannot be matched is refused with its cure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from hilstar.arrays import FloatArray, IntArray
+from hilstar.calibrate.geometric.decode import Decoded, FirstMap, decode, first_map, mapped
+from hilstar.calibrate.geometric.dots import DotPlan
+from hilstar.calibrate.geometric.fit import Matched
+from hilstar.calibrate.geometric.model import Geometry, Nominal, directions_in_cam
+from hilstar.calibrate.geometric.observed import Observed
+from hilstar.errors import InputError
+from hilstar.rotation import from_matrix
+
+FIRST_REACH = 0.03  # of the screen's width, by the first map, which knows no lens
+MIN_MOTION_PX = 0.05  # of the tracker
+POLISH_ROUNDS = 10
+MOTION_NOISE = 3.0  # of a centroid: less is no matter, since every frame has many
+ORIENTATIONS = {
+    (1, 0, 0, 1): None,
+    (-1, 0, 0, 1): "mirrored left to right: set [monitor] flip_x the other way",
+    (1, 0, 0, -1): "mirrored top to bottom: set [monitor] flip_y the other way",
+    (-1, 0, 0, -1): "upside down: add 180 to [monitor] rotate_deg",
+    (0, 1, -1, 0): "turned by 90 degrees: add 270 to [monitor] rotate_deg, or turn the tracker",
+    (0, -1, 1, 0): "turned by 270 degrees: add 90 to [monitor] rotate_deg, or turn the tracker",
+    (0, 1, 1, 0): "swapped, columns for rows: add 90 to [monitor] rotate_deg and set flip_x the other way",
+    (0, -1, -1, 0): "swapped, columns for rows: add 270 to [monitor] rotate_deg and set flip_x the other way",
+}
+ORDERS: dict[str, Callable[[IntArray, int], IntArray]] = {
+    "in reverse order": lambda frame, frames: frames - 1 - frame,
+    "numbered from 1": lambda frame, frames: frame - 1,
+    "one frame late": lambda frame, frames: (frame - 1) % frames,
+    "one frame early": lambda frame, frames: (frame + 1) % frames,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class FirstLook:
+    """What the codes alone say: each pose's map from the tracker's tangents to monitor px, and its rotation (poses, 4)."""
+
+    maps: tuple[FloatArray, ...]
+    q_poses: FloatArray
+    decoded: int
+
+
+def first_look(plan: DotPlan, nominal: Nominal, seen: Observed, rng: np.random.Generator) -> FirstLook:
+    """The maps of all poses. Raises InputError for codes that match nothing, and for an image that is mirrored or turned."""
+    maps, decoded = [], 0
+    for pose in range(int(seen.pose.max()) + 1):
+        part = seen.at(np.flatnonzero(seen.pose == pose))
+        found = _map_of(plan, nominal, part, rng)
+        if found is None:
+            raise InputError(_why_no_map(plan, nominal, part, pose, rng))
+        maps.append(found.matrix)
+        decoded += int(found.inlier.sum())
+    _refuse_orientation(nominal, maps[0])
+    corners = _corners(nominal)
+    first = _rays(np.linalg.inv(maps[0]), *corners)
+    q_poses = [from_matrix(_rotation_between(first, _rays(np.linalg.inv(matrix), *corners))) for matrix in maps]
+    return FirstLook(tuple(maps), np.array(q_poses), decoded)
+
+
+def _map_of(plan: DotPlan, nominal: Nominal, seen: Observed, rng: np.random.Generator) -> FirstMap | None:
+    found: Decoded = decode(plan, seen)
+    tangents = nominal.tracker.tangents(found.x_px, found.y_px)
+    width_px = nominal.monitor.resolution_px[0]
+    return first_map(tangents, (plan.x_px[found.dot], plan.y_px[found.dot]), width_px, rng)
+
+
+def _why_no_map(plan: DotPlan, nominal: Nominal, seen: Observed, pose: int, rng: np.random.Generator) -> str:
+    where = f"pose {pose}: " if pose else ""
+    for words, reorder in ORDERS.items():
+        frame = reorder(seen.frame, plan.frames)
+        inside = np.flatnonzero((frame >= 0) & (frame < plan.frames))
+        if _map_of(plan, nominal, replace(seen, frame=frame).at(inside), rng) is not None:
+            return f"{where}the frames are {words}: the codes match so; number the frames from 0 as plan.csv does"
+    return (
+        f"{where}the codes that were seen match no dots of the plan; give all frames of this plan,"
+        " numbered from 0, with at least 12 dots in view"
+    )
+
+
+def _corners(nominal: Nominal) -> tuple[FloatArray, FloatArray]:
+    width, height = nominal.monitor.resolution_px
+    x, y = np.meshgrid(np.linspace(0.2, 0.8, 4) * width, np.linspace(0.2, 0.8, 4) * height)
+    return x.ravel(), y.ravel()
+
+
+def _rays(matrix: npt.NDArray[np.floating[Any]], x_px: FloatArray, y_px: FloatArray) -> FloatArray:
+    rays = np.column_stack([*mapped(np.asarray(matrix, dtype=np.float64), x_px, y_px), np.ones_like(x_px)])
+    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+
+
+def _rotation_between(before: FloatArray, after: FloatArray) -> FloatArray:
+    """The rotation (3, 3) that brings directions (n, 3) nearest to others (Kabsch 1976)."""
+    u, _, vt = np.linalg.svd(after.T @ before)
+    return np.asarray(u @ np.diag([1.0, 1.0, float(np.sign(np.linalg.det(u @ vt)))]) @ vt)
+
+
+def _refuse_orientation(nominal: Nominal, matrix: FloatArray) -> None:
+    """Refuse (InputError) an image that is mirrored, swapped or turned by a right angle against what the bench file says."""
+    step = 1e-4
+    u, v = np.array([0.0, step, 0.0]), np.array([0.0, 0.0, step])
+    seen_x, seen_y = mapped(matrix, u, v)
+    rays = np.column_stack([u, v, np.ones_like(u)]) @ nominal.monitor.cam_to_image.T
+    told_x, told_y = nominal.monitor.project(rays)
+    seen = np.array([np.diff(seen_x[[0, 1]]), np.diff(seen_x[[0, 2]]), np.diff(seen_y[[0, 1]]), np.diff(seen_y[[0, 2]])])
+    told = np.array([np.diff(told_x[[0, 1]]), np.diff(told_x[[0, 2]]), np.diff(told_y[[0, 1]]), np.diff(told_y[[0, 2]])])
+    relative = seen.reshape(2, 2) @ np.linalg.inv(told.reshape(2, 2))
+    relative /= np.sqrt(abs(np.linalg.det(relative)))
+    a, b, c, d = relative.ravel()
+    nearest = max(ORIENTATIONS, key=lambda o: float(np.dot(o, (a, b, c, d))))
+    words = ORIENTATIONS[nearest]
+    if words is not None:
+        raise InputError(f"the tracker sees the monitor {words}, show the dots again, and take new frames")
+
+
+def match_by_maps(plan: DotPlan, nominal: Nominal, seen: Observed, look: FirstLook) -> Matched:
+    """Each centroid with the lit dot that the first maps put it nearest to, within what a lens may do."""
+    x_px, y_px = np.full(len(seen), np.nan), np.full(len(seen), np.nan)
+    u, v = nominal.tracker.tangents(seen.x_px, seen.y_px)
+    for pose, matrix in enumerate(look.maps):
+        here = seen.pose == pose
+        x_px[here], y_px[here] = mapped(matrix, u[here], v[here])
+    return _nearest(plan, seen, x_px, y_px, FIRST_REACH * nominal.monitor.resolution_px[0])
+
+
+def match_by_geometry(plan: DotPlan, seen: Observed, geometry: Geometry, reach_px: float) -> Matched:
+    """Each centroid with the lit dot that a fitted geometry puts it nearest to, within `reach_px` of the monitor."""
+    directions = directions_in_cam(geometry, seen.pose, seen.x_px, seen.y_px)
+    x_px, y_px = geometry.monitor.project(directions @ geometry.monitor.cam_to_image.T)
+    return _nearest(plan, seen, x_px, y_px, reach_px)
+
+
+def _nearest(plan: DotPlan, seen: Observed, x_px: FloatArray, y_px: FloatArray, reach_px: float) -> Matched:
+    dot: IntArray = np.full(len(seen), -1, dtype=np.intp)
+    for pose in range(int(seen.pose.max()) + 1):
+        for frame in range(plan.frames):
+            here = np.flatnonzero((seen.frame == frame) & (seen.pose == pose) & np.isfinite(x_px + y_px))
+            lit = np.flatnonzero(plan.lit[:, frame])
+            if not len(here) or not len(lit):
+                continue
+            far = np.hypot(x_px[here, None] - plan.x_px[lit], y_px[here, None] - plan.y_px[lit])
+            # Each dot has one centroid, the nearest.
+            best = far.argmin(axis=1)
+            nearest = far.argmin(axis=0)
+            mutual = nearest[best] == np.arange(len(here))
+            near = mutual & (far[np.arange(len(here)), best] < reach_px)
+            dot[here[near]] = lit[best[near]]
+    kept = np.flatnonzero(dot >= 0)
+    return Matched(seen.at(kept), dot[kept])
+
+
+def refuse_motion(data: Matched) -> None:
+    """Refuse (InputError) frames between which the whole image moved."""
+    for pose in np.unique(data.seen.pose):
+        here = data.at(np.flatnonzero(data.seen.pose == pose))
+        for axis, places in (("x", here.seen.x_px), ("y", here.seen.y_px)):
+            frames, shift, noise = frame_shifts(here, places)
+            if np.ptp(shift) > max(MIN_MOTION_PX, MOTION_NOISE * noise):
+                first, last = sorted((frames[shift.argmin()], frames[shift.argmax()]))
+                raise InputError(
+                    f"the image moved by {np.ptp(shift):.2f} px in {axis} between frames {first} and {last}:"
+                    " fix the tracker and the screen, and take new frames"
+                )
+
+
+def frame_shifts(data: Matched, places: FloatArray) -> tuple[IntArray, FloatArray, float]:
+    """The frames, how far the image of each stands from the others', and the noise of what is left (Tukey's median polish)."""
+    frames, frame = np.unique(data.seen.frame, return_inverse=True)
+    dots, dot = np.unique(data.dot, return_inverse=True)
+    shift, middle = np.zeros(len(frames)), np.zeros(len(dots))
+    by_dot = [np.flatnonzero(dot == k) for k in range(len(dots))]
+    by_frame = [np.flatnonzero(frame == k) for k in range(len(frames))]
+    for _ in range(POLISH_ROUNDS):
+        middle = np.array([np.median(places[each] - shift[frame[each]]) for each in by_dot])
+        shift = np.array([np.median(places[each] - middle[dot[each]]) for each in by_frame])
+        shift -= np.median(shift)
+    left = np.abs(places - middle[dot] - shift[frame])
+    return frames, shift, 1.4826 * float(np.median(left))

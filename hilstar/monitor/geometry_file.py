@@ -1,0 +1,158 @@
+"""The file of a geometric calibration: the camera that a monitor behind its collimator is, with how well it is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from hilstar.arrays import FloatArray
+from hilstar.errors import InputError, shortened
+from hilstar.files import write_whole
+from hilstar.reading import parse_toml, read_text
+from hilstar.rotation import normalise, to_matrix
+from hilstar.scene.camera import Camera
+from hilstar.scene.lens import Lens, ResidualField
+
+MAX_FILE_BYTES = 1_000_000
+MAX_TERMS = 21
+NORM_TOLERANCE = 1e-3
+ADVICE = "give a file that `hilstar calibrate geometric` wrote"
+Finite = Annotated[float, Meta(ge=-1e9, le=1e9)]
+Sizes = tuple[Annotated[int, Meta(ge=1, le=32768)], Annotated[int, Meta(ge=1, le=32768)]]
+
+
+class Field(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """[field]: Chebyshev coefficients in px; entry [i][j] belongs to T_i of the column and T_j of the row."""
+
+    x_px: list[list[Finite]]
+    y_px: list[list[Finite]]
+
+
+class LensTable(msgspec.Struct, frozen=True, kw_only=True):
+    """Brown-Conrady coefficients of tangents of field angles, from direction to pixel."""
+
+    k1: Finite = 0.0
+    k2: Finite = 0.0
+    k3: Finite = 0.0
+    p1: Finite = 0.0
+    p2: Finite = 0.0
+
+
+class GeometryFile(LensTable, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A whole file. `error` and `made` say how well it is known and of what; nothing is computed from them."""
+
+    kind: str
+    resolution_px: Sizes
+    focal_length_px: Annotated[float, Meta(gt=0, le=1e9)]
+    principal_point_px: tuple[Finite, Finite]
+    q_cam_to_mon: tuple[Finite, Finite, Finite, Finite]
+    tilt_deg: tuple[Annotated[float, Meta(gt=-60, lt=60)], Annotated[float, Meta(gt=-60, lt=60)]] = (0.0, 0.0)
+    field: Field | None = None
+    sigma: dict[str, Any] = {}
+    error: dict[str, Any] = {}
+    made: dict[str, Any] = {}
+
+
+KIND = "hilstar geometry 1"
+
+
+def load_geometry(path: Path, resolution_px: tuple[int, int]) -> Camera:
+    """The camera of a geometry file for a monitor of `resolution_px`. Raises InputError."""
+    table = parse_toml(path, read_text(path, ADVICE, MAX_FILE_BYTES))
+    try:
+        found = msgspec.convert(table, GeometryFile)
+    except msgspec.ValidationError as error:
+        raise InputError(f"{path}: {shortened(str(error))}; {ADVICE}") from error
+    if found.kind != KIND:
+        raise InputError(f"{path}: kind = {shortened(repr(found.kind))} and {KIND!r} is wanted; {ADVICE}")
+    if found.resolution_px != resolution_px:
+        sizes = "{} x {} px and the bench file's monitor has {} x {}".format(*found.resolution_px, *resolution_px)
+        raise InputError(f"{path}: is of a monitor of {sizes}; calibrate this monitor")
+    q = np.array(found.q_cam_to_mon)
+    if not abs(float(np.linalg.norm(q)) - 1.0) <= NORM_TOLERANCE:
+        raise InputError(f"{path}: q_cam_to_mon: its norm is {np.linalg.norm(q):.6g}; {ADVICE}")
+    a, b = found.tilt_deg
+    lens = Lens(
+        (found.k1, found.k2, found.k3),
+        (found.p1, found.p2),
+        (float(np.radians(a)), float(np.radians(b))),
+        None if found.field is None else _field(path, found.field, resolution_px),
+    )
+    return Camera(resolution_px, found.focal_length_px, found.principal_point_px, to_matrix(normalise(q)), lens)
+
+
+def _field(path: Path, field: Field, resolution_px: tuple[int, int]) -> ResidualField:
+    sizes = {len(field.x_px), len(field.y_px), *map(len, field.x_px), *map(len, field.y_px)}
+    if len(sizes) != 1 or not 0 < len(field.x_px) <= MAX_TERMS:
+        raise InputError(f"{path}: [field] has no two squares of one size, up to {MAX_TERMS}; {ADVICE}")
+    return ResidualField(np.array(field.x_px), np.array(field.y_px), resolution_px)
+
+
+class DistortionFile(LensTable, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A tracker's flight model; `kind` may say so."""
+
+    kind: str = ""
+
+
+def load_distortion(path: Path, camera: Camera) -> Camera:
+    """The camera of a tracker with the lens of its flight model. Raises InputError."""
+    advice = "write k1, k2, k3, p1 and p2, numbers, as far as they are not 0"
+    table = parse_toml(path, read_text(path, advice, MAX_FILE_BYTES))
+    try:
+        found = msgspec.convert(table, DistortionFile)
+    except msgspec.ValidationError as error:
+        raise InputError(f"{path}: {shortened(str(error))}; {advice}") from error
+    return replace(camera, lens=Lens((found.k1, found.k2, found.k3), (found.p1, found.p2)))
+
+
+def write_geometry(path: Path, camera: Camera, q_cam_to_mon: FloatArray, notes: dict[str, dict[str, Any]]) -> None:
+    """Write a camera and its notes (`sigma`, `error`, `made`) as a geometry file."""
+    lens = camera.lens or Lens()
+    field = None
+    if lens.field is not None:
+        field = Field(x_px=lens.field.x.tolist(), y_px=lens.field.y.tolist())
+    w, x, y, z = q_cam_to_mon.tolist()
+    k1, k2, k3 = lens.radial
+    p1, p2 = lens.tangential
+    found = GeometryFile(
+        kind=KIND,
+        resolution_px=camera.resolution_px,
+        focal_length_px=camera.focal_length_px,
+        principal_point_px=camera.principal_point_px,
+        q_cam_to_mon=(w, x, y, z),
+        tilt_deg=(float(np.degrees(lens.tilt_rad[0])), float(np.degrees(lens.tilt_rad[1]))),
+        k1=k1,
+        k2=k2,
+        k3=k3,
+        p1=p1,
+        p2=p2,
+        field=field,
+        **notes,
+    )
+    write_whole(path, toml_text(msgspec.to_builtins(found)))
+
+
+def toml_text(table: dict[str, Any]) -> str:
+    """TOML of plain values and lists, tables after them; what is None or an empty table is left unsaid."""
+    plain = [f"{key} = {_value(value)}" for key, value in table.items() if not isinstance(value, dict) and value is not None]
+    parts = ["\n".join(plain)]
+    for key, value in table.items():
+        if isinstance(value, dict) and value:
+            rows = "\n".join(f"{name} = {_value(inner)}" for name, inner in value.items() if inner is not None)
+            parts.append(f"[{key}]\n{rows}")
+    return "\n\n".join(parts) + "\n"
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, list | tuple):
+        inner = [_value(each) for each in value]
+        apart = ",\n    " if inner and inner[0].startswith("[") else ", "
+        return f"[\n    {apart.join(inner)},\n]" if apart != ", " else f"[{', '.join(inner)}]"
+    if isinstance(value, str):
+        return msgspec.json.encode(value).decode()
+    return repr(value).lower() if isinstance(value, bool) else repr(value)

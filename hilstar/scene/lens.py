@@ -1,0 +1,120 @@
+"""What a real lens and a tilted screen do to the places of a pinhole camera, in float64.
+
+A direction (u, v, 1) in image axes is bent by Brown's polynomials (Brown 1966, eq. 13, in Conrady's form), meets a plane that
+is tilted about the foot of the axis, and is moved by a smooth residual field over the pixels. All three are closed forms from
+direction to pixel, the way that every frame goes; `Camera.tangents` is the way back.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilstar.arrays import FloatArray, IntArray
+
+FIELD_EDGE = 1.1  # of half the image: beyond it the field stands still, where its polynomials would run away
+
+
+@dataclass(frozen=True, slots=True)
+class ResidualField:
+    """A smooth shift of pixels: sums of Chebyshev polynomials over the image, `x` and `y` (n, n) coefficients in px.
+
+    Entry (i, j) belongs to T_i of the column and T_j of the row, both from -1 to 1 over the image.
+    """
+
+    x: FloatArray
+    y: FloatArray
+    resolution_px: tuple[int, int]
+
+    @classmethod
+    def of_terms(cls, x: FloatArray, y: FloatArray, degree: int, resolution_px: tuple[int, int]) -> ResidualField:
+        """The field of coefficients (terms,) in the order of `field_terms`."""
+        squares = np.zeros((2, degree + 1, degree + 1))
+        i, j = _exponents(degree)
+        squares[0, i, j], squares[1, i, j] = x, y
+        return cls(squares[0], squares[1], resolution_px)
+
+    def at(self, x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The shift at pixels (k,), px."""
+        columns, rows = _polynomials(x_px, y_px, self.resolution_px, len(self.x) - 1)
+        return ((self.x.T @ columns) * rows).sum(axis=0), ((self.y.T @ columns) * rows).sum(axis=0)
+
+
+def field_terms(x_px: FloatArray, y_px: FloatArray, resolution_px: tuple[int, int], degree: int) -> FloatArray:
+    """The polynomials T_i T_j of total degree up to `degree` at pixels (k,): (k, terms)."""
+    columns, rows = _polynomials(x_px, y_px, resolution_px, degree)
+    i, j = _exponents(degree)
+    return np.asarray((columns[i] * rows[j]).T)
+
+
+def _exponents(degree: int) -> tuple[IntArray, IntArray]:
+    i, j = np.indices((degree + 1, degree + 1)).reshape(2, -1)
+    kept = i + j <= degree
+    return i[kept], j[kept]
+
+
+def _polynomials(
+    x_px: FloatArray, y_px: FloatArray, resolution_px: tuple[int, int], degree: int
+) -> tuple[FloatArray, FloatArray]:
+    columns, rows = (
+        _chebyshev(np.clip((2 * place - (size - 1)) / size, -FIELD_EDGE, FIELD_EDGE), degree + 1)
+        for place, size in zip((x_px, y_px), resolution_px, strict=True)
+    )
+    return columns, rows
+
+
+def _chebyshev(t: FloatArray, count: int) -> FloatArray:
+    """T_0 to T_(count - 1) at places (k,): (count, k)."""
+    terms = np.ones((count, len(t)))
+    if count > 1:
+        terms[1] = t
+    for k in range(2, count):
+        terms[k] = 2 * t * terms[k - 1] - terms[k - 2]
+    return terms
+
+
+@dataclass(frozen=True, slots=True)
+class Lens:
+    """Distortion k1 to k3 and p1, p2 (of tangents of field angles), the plane's tilt about its x and y axes, and the field.
+
+    `max_tangent` bounds the directions that it is used for, the largest radius of (u, v) that reaches the image: farther out
+    the polynomials turn back, and would show stars that are not in view.
+    """
+
+    radial: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    tangential: tuple[float, float] = (0.0, 0.0)
+    tilt_rad: tuple[float, float] = (0.0, 0.0)
+    field: ResidualField | None = None
+    max_tangent: float = np.inf
+
+    def bent(self, u: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Places on the tilted plane, in focal lengths from the foot of the axis, of directions (u, v, 1); NaN beyond."""
+        k1, k2, k3 = self.radial
+        p1, p2 = self.tangential
+        r2 = u * u + v * v
+        gain = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        gain = np.where(r2 <= self.max_tangent**2, gain, np.nan)
+        bent_u = u * gain + 2 * p1 * u * v + p2 * (r2 + 2 * u * u)
+        bent_v = v * gain + p1 * (r2 + 2 * v * v) + 2 * p2 * u * v
+        return _on_plane(bent_u, bent_v, self.tilt_rad)
+
+
+def _on_plane(u: FloatArray, v: FloatArray, tilt_rad: tuple[float, float]) -> tuple[FloatArray, FloatArray]:
+    """Where rays (u, v, 1) meet a plane through (0, 0, 1) that is turned about x, then about y, in its own axes."""
+    if tilt_rad == (0.0, 0.0):
+        return u, v
+    right, down, normal = plane_axes(tilt_rad).T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        along = normal[2] / (u * normal[0] + v * normal[1] + normal[2])
+    along = np.where(along > 0, along, np.nan)
+    x, y, z = along * u, along * v, along - 1.0
+    return x * right[0] + y * right[1] + z * right[2], x * down[0] + y * down[1] + z * down[2]
+
+
+def plane_axes(tilt_rad: tuple[float, float]) -> FloatArray:
+    """Right, down and normal of the tilted plane as columns (3, 3), in the axes of the plane before its tilt."""
+    a, b = tilt_rad
+    about_x = np.array([[1.0, 0.0, 0.0], [0.0, np.cos(a), -np.sin(a)], [0.0, np.sin(a), np.cos(a)]])
+    about_y = np.array([[np.cos(b), 0.0, np.sin(b)], [0.0, 1.0, 0.0], [-np.sin(b), 0.0, np.cos(b)]])
+    return np.asarray(about_y @ about_x)

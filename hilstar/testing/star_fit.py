@@ -91,7 +91,7 @@ class StarTemplates:
         return np.asarray(self._columns @ fitted.ravel()).reshape(self.shape)
 
     def errors(self, flux: FloatArray, pixel_error: float) -> tuple[FloatArray, FloatArray]:
-        """What a pixel error of `pixel_error` times the flux of all stars that reach it does to a star's flux and place, px."""
+        """Errors of flux and of place, px, (n,): a pixel is off by `pixel_error` of the flux of all stars that reach it."""
         size = len(flux)
         blocks = np.zeros((size, 3, 3))
         entries = self.normal.tocoo()
@@ -136,7 +136,7 @@ def _bell(u: FloatArray) -> FloatArray:
 
 
 def bright_pixels(image: FloatArray, floor: FloatArray) -> FloatArray:
-    """Places (n, 2), px, of pixels over `floor` that no neighbour outshines, brightest first."""
+    """Places (n, 2), px, of pixels above `floor` that no neighbour outshines, brightest first."""
     top = (image > floor) & (image == ndimage.maximum_filter(image, 3, mode="constant"))
     row, column = np.nonzero(top)
     order = np.argsort(-image[row, column], kind="stable")
@@ -167,7 +167,7 @@ def star_sigma_px(image: FloatArray) -> tuple[float, float]:
 
 
 def _apart(places_px: FloatArray, distance_px: float, size_px: tuple[int, int]) -> FloatArray:
-    """The brightest places with nothing else in their footprint, the image's edge included; of none such, all of them."""
+    """The brightest places with neither a star nor the image's edge in their footprint; all of them if there is none."""
     bright = places_px[: 4 * SIGMA_STARS]
     distance = np.abs(bright[:, None] - places_px[None]).max(axis=2)
     edge = np.minimum(bright, np.array(size_px) - 1 - bright).min(axis=1)
@@ -201,7 +201,7 @@ def _sigma_steps(padded: FloatArray, places_px: FloatArray, sigma_px: FloatArray
 
 
 def refined(image: FloatArray, places_px: FloatArray, sigma_px: tuple[float, float]) -> FloatArray:
-    """Places (n, 2) of stars, px, from their brightest pixels or places well known: all stars' steps at once."""
+    """Places (n, 2) of stars, px, refined from their brightest pixels, or from places known well: all stars at once."""
     start, shape = places_px, (image.shape[0], image.shape[1])
     last = np.array([shape[1] - 1, shape[0] - 1])
     outwards = BEYOND_SIGMAS * np.array(sigma_px)

@@ -1,4 +1,4 @@
-"""The two ways in which hilstar refuses, each with its exit code, and how a refusal quotes what it refuses."""
+"""The two kinds of refusal, each with its exit code, and how a refusal quotes what it refuses."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def shortened(text: object, limit: int = MAX_QUOTED_CHARACTERS) -> str:
 
 
 def printable(text: str) -> str:
-    r"""The text with what a terminal obeys, or no file in UTF-8 can hold, as an escape such as \x1b or \xff."""
+    r"""The text with control characters, and bytes that are not UTF-8, as escapes such as \x1b or \xff."""
     return "".join(c if c.isprintable() or c == " " else _escape(c) for c in text)
 
 
@@ -64,6 +64,6 @@ def _escape(character: str) -> str:
 
 
 def one_line(text: str) -> str:
-    """A message as one line of bounded length, whatever it repeats of the input."""
+    """A message as one line of bounded length, whatever it quotes of the input."""
     words = (shortened(printable(word)) for word in text.split())
     return shortened(" ".join(words), MAX_LINE_CHARACTERS)

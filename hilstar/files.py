@@ -40,9 +40,9 @@ Place = tuple[int, int] | str
 
 
 def place_of(path: Path) -> Place | None:
-    """What a name stands for: the file itself, whatever it is called; the name in full of one that is not there yet.
+    """The identity of a path: the file that it leads to, or the full path of one that does not exist yet.
 
-    None for what is no regular file, such as /dev/null.
+    None for anything but a regular file, such as /dev/null.
     """
     try:
         status = path.stat()
@@ -96,7 +96,7 @@ def _texts(value: Any) -> Iterator[str]:
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """A name to write to, beside `path`; what was written replaces `path` at the end, and an error leaves that as it was.
+    """A temporary path beside `path` to write to; at the end it replaces `path`, and an error leaves that unchanged.
 
     Devices and pipes are written themselves. Raises InputError where nothing can be written, and for a run's ledger.
     """
@@ -115,7 +115,7 @@ def _beside(path: Path) -> Iterator[Path]:
         yield path
         return
     refuse_ledger(path)
-    # The ending stays: some libraries write what it says.
+    # The ending stays: some libraries choose the format by it.
     part = target.with_name(f".{target.stem[:100]}.{os.getpid()}.part{target.suffix}")
     try:
         yield part
@@ -128,7 +128,7 @@ def _beside(path: Path) -> Iterator[Path]:
 
 
 def write_whole(path: Path, data: bytes | str) -> None:
-    """Write a file, whole or not at all. Raises InputError."""
+    """Write a file, complete or not at all. Raises InputError."""
     with whole_file(path) as part:
         part.write_bytes(data.encode() if isinstance(data, str) else data)
 
@@ -152,9 +152,9 @@ def refuse_ledger(path: Path) -> None:
 
 
 class NewFile:
-    """A file that is written while it grows, of which there is only one writer: locked, and made anew.
+    """A new file that grows while it is written, locked so that it has one writer.
 
-    `open` is its descriptor. With `overwrite` an older file stays until `commit`. Raises InputError.
+    `fd` is its descriptor. With `overwrite` an older file stays until `commit`. Raises InputError.
     """
 
     def __init__(self, path: Path, overwrite: bool = False) -> None:
@@ -179,13 +179,13 @@ class NewFile:
             fcntl.flock(self.fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
     def commit(self) -> None:
-        """What was begun is worth keeping: it takes its name now. Raises OSError."""
+        """Give the file its name, in the place of an older one. Raises OSError."""
         if self._part is not None:
             self._part.replace(os.path.realpath(self.path))
             self._part = None
 
     def discard(self) -> None:
-        """Nothing of it is worth keeping."""
+        """Close and delete the file."""
         self.close()
         with contextlib.suppress(OSError):
             self._made.unlink()
@@ -212,7 +212,7 @@ def refuse_writer(path: Path) -> None:
 
 
 def make_directory(path: Path) -> Path:
-    """`path`, made if it is not there. Raises InputError where it cannot be made or written."""
+    """Create the directory `path` if it does not exist, and return it. Raises InputError where it cannot be created."""
     try:
         path.mkdir(parents=True, exist_ok=True)
     except (OSError, ValueError) as error:
@@ -221,13 +221,13 @@ def make_directory(path: Path) -> Path:
 
 
 def written(path: Path, write: Callable[[Path], object]) -> None:
-    """Whole or not at all; an older file stays until the new one is there."""
+    """Write a file by `write`, complete or not at all; an older file stays until the new one is complete."""
     with whole_file(path) as part:
         write(part)
 
 
 def check_ending(option: str, path: Path | None, endings: tuple[str, ...]) -> None:
-    """Refuse (InputError) a name that ends as another kind of file does; a name that says nothing is taken.
+    """Refuse (InputError) a name with the ending of another kind of file; one without a known ending is accepted.
 
     `endings` are those of the kind that is written, and .gz after those of FITS.
     """
@@ -237,13 +237,13 @@ def check_ending(option: str, path: Path | None, endings: tuple[str, ...]) -> No
     if endings is FITS and ending == ".gz":
         ending = path.with_suffix("").suffix.lower()
     if ending not in endings and (ending in KNOWN or path.suffix.lower() == ".gz"):
-        # A name as it may be on this file system, so that it can be copied from the line.
+        # A valid name on this file system, so that it can be copied from the line.
         better = path.with_suffix("").name or "OUT"
         raise InputError(f"{option} {path}: {_article(endings)} is written there; write {better}{endings[0]}")
 
 
 def check_directory(option: str, path: Path | None) -> None:
-    """Refuse (InputError) the name of a file where a directory is made."""
+    """Refuse (InputError) the name of a file where a directory is created."""
     if path is not None and path.suffix.lower() in KNOWN and not path.is_dir():
         raise InputError(
             f"{option} {path}: several files are written, into a directory; write the name of one, such as {path.stem}"

@@ -1,6 +1,6 @@
-"""What happens in a run, said while it happens: a line on stderr, a count in the summary, an event in the ledger.
+"""Events of a run, told as they happen: a line on stderr, a count in the summary, an event in the ledger.
 
-A kind that comes more than MAX_SAID times within SAID_WINDOW_S is counted and kept, and said again when it is rare.
+A kind that comes more than MAX_SAID times within SAID_WINDOW_S is counted and recorded, and said again once it is rare.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Notices:
         self._listeners.append(listener)
 
     def tell(self, kind: str, detail: str) -> None:
-        """Take in an event: count it, say it unless its kind floods, hand it on."""
+        """Count an event, say it unless its kind floods, and hand it on."""
         notice = Notice(time.monotonic_ns(), kind, detail[:MAX_DETAIL_CHARACTERS])
         with self._lock:
             self._counts[kind] += 1
@@ -61,7 +61,7 @@ class Notices:
             listener(notice)
 
     def begin(self, kind: str, detail: str) -> None:
-        """Tell of an event that lasts: its kind is in `active` until `end`. Nothing where it lasts already."""
+        """Tell of an event that lasts: its kind is in `active` until `end`. Nothing where it has begun already."""
         with self._lock:
             if kind in self._active:
                 return
@@ -69,7 +69,7 @@ class Notices:
         self.tell(kind, detail)
 
     def end(self, kind: str, told_as: str, detail: str) -> None:
-        """What began is over, which is told as an event of its own; nothing where it never began."""
+        """Tell of the end of what began, as an event of its own; nothing where it never began."""
         with self._lock:
             if kind not in self._active:
                 return

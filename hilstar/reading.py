@@ -1,6 +1,6 @@
-"""Files that a user names: regular ones only, and no more bytes than such a file can have.
+"""Files that a user names: regular ones only, and of a bounded size.
 
-A pipe would be awaited for ever, a device never ends, and a file of gigabytes is no bench file: each is said instead.
+A pipe would be awaited for ever, a device never ends, and a file of gigabytes is no bench file: each is refused instead.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ NOT_FILES = {
     stat.S_ISBLK: "is a device",
 }
 MCAP_MAGIC = b"\x89MCAP0\r\n"
-# What begins a file of a kind that people have beside attitude logs and benches.
+# The first bytes of kinds of files that users have beside attitude logs and bench files.
 MAGIC = {
     b"ULog\x01": "a ULog file",
     b"DAF/CK": "a SPICE CK kernel",
@@ -112,7 +112,7 @@ def read_bytes(path: Path, advice: str, limit_bytes: int) -> bytes:
     """What a regular file of at most `limit_bytes` holds. Raises InputError."""
     with open_regular(path, advice, limit_bytes) as file:
         try:
-            raw = file.read(limit_bytes + 1)  # some of /proc have no size
+            raw = file.read(limit_bytes + 1)  # files of /proc have no size
         except OSError as error:
             raise cannot_read(path, error, advice) from error
     if len(raw) > limit_bytes:
@@ -143,7 +143,7 @@ def refuse_kind(path: Path, head: bytes, advice: str) -> None:
 
 @contextmanager
 def open_lines(path: Path, advice: str, limit_bytes: int) -> Iterator[Iterator[str]]:
-    """The lines of a text (UTF-8), one after another, so that a large one needs no memory; each ends as in the file.
+    """The lines of a text (UTF-8), one after another, so that a large file needs no memory; each ends as in the file.
 
     Raises InputError as `read_text` does, and for a line of more than MAX_LINE_CHARACTERS.
     """

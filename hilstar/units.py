@@ -21,7 +21,7 @@ def flux_ratio(mag: float) -> float: ...
 @overload
 def flux_ratio(mag: FloatArray) -> FloatArray: ...
 def flux_ratio(mag: float | FloatArray) -> float | FloatArray:
-    """How many times as much light as a star of magnitude 0 one of `mag` gives (Pogson 1856)."""
+    """The flux of a star of magnitude `mag` relative to one of magnitude 0 (Pogson 1856)."""
     return 10 ** (-0.4 * mag)
 
 
@@ -30,7 +30,7 @@ def magnitude(ratio: float) -> float: ...
 @overload
 def magnitude(ratio: FloatArray) -> FloatArray: ...
 def magnitude(ratio: float | FloatArray) -> float | FloatArray:
-    """By how many magnitudes a star is fainter that gives `ratio` times as much light; infinite for none."""
+    """The magnitude of a flux relative to that of magnitude 0; infinite for no flux."""
     if isinstance(ratio, np.ndarray):
         with np.errstate(divide="ignore"):
             return np.asarray(-2.5 * np.log10(ratio))

@@ -19,11 +19,11 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
 
 leftovers.adopt_orphans()
 
-MARKERS = {"study": "study", "gpu": "gpu", "screen": "screen", "e2e": "e2e"}
+MARKERS = {"study": "study", "gpu": "gpu", "screen": "screen", "e2e": "e2e", "examples": "e2e"}
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what lies in a folder by its name."""
+    """Mark what lies in a folder; a test elsewhere that starts processes, or runs a study, marks itself."""
     here = Path(__file__).parent
     for item in items:
         folder = item.path.relative_to(here).parts[0]

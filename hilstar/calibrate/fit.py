@@ -30,12 +30,12 @@ Curve = Callable[[FloatArray], FloatArray]
 
 MIN_KNOTS, MAX_KNOTS = 8, 48
 PRIOR_SIGMA = 1.0  # of the spline's coefficients: e-fold away from the base
-PRIOR_SLOPE_SIGMA = 0.5  # of the exponent, for the shape that has it apart
+PRIOR_SLOPE_SIGMA = 0.5  # of the exponent, for the shape that has it separately
 LOG_STIFFNESS = np.arange(-26.0, 15.0, 2.0)
 MAX_STEPS = 20
 SETTLED = 1e-6  # of log light
 STIFFNESS_STEPS = 8  # in each of the first ones the stiffness is chosen anew
-ASSUMED_NOISE = 0.01  # where nothing was repeated, until the residuals say
+ASSUMED_NOISE = 0.01  # where nothing was repeated, until the residuals tell
 BLACK_FLOOR = 1e-6  # of white: how well a black level of zero is known
 MIN_RISE = 1e-6  # relative, between neighbouring codes: see `strictly_rising`
 MIN_LIGHT = 1e-9  # of white, at code 1
@@ -90,7 +90,7 @@ class ChannelFit:
 
 @dataclass(frozen=True, slots=True)
 class _Problem:
-    """One shape's matrices: spline values at the levels and at all codes, penalty, prior; lights in units of white."""
+    """One shape's matrices: spline values at the levels and at all codes, penalty, prior; light in units of white."""
 
     at_levels: FloatArray
     at_codes: FloatArray
@@ -118,7 +118,7 @@ class _Solution:
 
     @property
     def parameters(self) -> float:
-        """How many the penalty has left free."""
+        """The effective number of parameters, given the penalty."""
         return float(np.einsum("ij,jk,ik->", self.design, self.covariance, self.design))
 
 

@@ -20,7 +20,7 @@ from hilstar.units import NS_PER_MS
 MAX_LATENCY_NS = 500 * NS_PER_MS
 MAX_EARLY_NS = 5 * NS_PER_MS  # a clock that is read after the swap may give a time later than that of the light
 BIN_NS = NS_PER_MS
-LIKELY_SHARE = 0.9  # of the best peak: with a square that toggles the latency comes again every two frames
+LIKELY_SHARE = 0.9  # of the best peak: with a square that toggles, the latency repeats every two frames
 AGREEING_SHARE = 0.5  # of the edges that must find their frames
 NO_BEAT = 1e-3
 

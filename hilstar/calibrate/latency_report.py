@@ -24,7 +24,7 @@ def measure_latency(ledger: Path, edges: Edges, directory: Path | None) -> Laten
     """
     config = config_of(read_head(ledger))
     if config is None:
-        raise InputError(f"{ledger}: its head holds no bench file that can be read; record the run again")
+        raise InputError(f"{ledger}: its header has no bench file that can be read; record the run again")
     shown = square_edges(run_records(ledger))
     if not len(shown.host_ns):
         raise InputError(f"{ledger}: its photodiode square never changed; record a longer run")

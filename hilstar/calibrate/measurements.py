@@ -24,8 +24,8 @@ USUAL_BITS = (8, 10, 12, 14, 16)
 MAX_BYTES = 10_000_000
 ADVICE = "give a CSV file with code,channel,value"
 MIN_CODES = 10  # at 1 % noise: 2.2 % of error (95th percentile of the worst code) on gamma, sRGB and S-curves; 8 leave 4.4 %
-FALSE_ALARM_SIGMA = 4.0  # one run in some hundreds is refused for noise alone, with 32 levels
-MIN_DRIFT = 0.005  # over the run; less does no harm beside 1 % of noise
+FALSE_ALARM_SIGMA = 4.0  # one run in a few hundred is refused because of noise alone, with 32 levels
+MIN_DRIFT = 0.005  # over the run; less is harmless beside 1 % of noise
 BRIGHT_DOF = 8
 FAINT_ALARM = 0.999  # of the F distribution, before additive noise is believed
 NOISE_FLOOR = 1e-4  # relative; no photometer repeats better
@@ -61,7 +61,7 @@ class Measurements:
 
 @dataclass(frozen=True, slots=True)
 class Levels:
-    """Repeats brought together: for each distinct code (n,), rising, the mean light, the count, and the mean's standard error.
+    """Repeats combined: for each distinct code (n,), rising, the mean light, the count, and the mean's standard error.
 
     `relative_noise` is one patch's; nan where nothing was repeated.
     """
@@ -98,11 +98,11 @@ def read_measurements(path: Path, bits: int | None = None) -> Measurements:
     raw = read_bytes(path, ADVICE, MAX_BYTES)
     rows = list(_rows(path, as_text(path, raw, ADVICE)))
     if not rows:
-        raise InputError(f"{path}: no measurement in it; write code,channel,value rows below the header")
+        raise InputError(f"{path}: it has no measurement; write code,channel,value rows below the header")
     codes = np.array([row.code for row in rows], dtype=np.intp)
     bits = bits or next(usual for usual in USUAL_BITS if codes.max() < 2**usual)
     if codes.max() >= 2**bits:
-        raise InputError(f"{path}: code {codes.max()} is outside {bits} bits (0 to {2**bits - 1}); say how many bits there are")
+        raise InputError(f"{path}: code {codes.max()} is outside {bits} bits (0 to {2**bits - 1}); say --bits")
     channel = np.array([row.channel for row in rows])
     reading = np.array([row.value for row in rows])
     exposure_s = np.array([row.exposure_s for row in rows])
@@ -139,7 +139,7 @@ def _header(path: Path, number: int, cells: list[str]) -> list[str]:
         raise InputError(f"{path}: line {number}: the column {missing[0]} is missing; the header is code,channel,value")
     if unknown or len(set(cells)) < len(cells):
         raise InputError(
-            f"{path}: line {number}: unknown or doubled column in {shortened(','.join(cells))}; known are {', '.join(COLUMNS)}"
+            f"{path}: line {number}: unknown or repeated column in {shortened(','.join(cells))}; known are {', '.join(COLUMNS)}"
         )
     return cells
 

@@ -1,4 +1,4 @@
-"""What is known of a monitor's light: its response, uniformity, noise, and where that comes from."""
+"""What is known of a monitor's light: its response, uniformity and noise, and where that knowledge comes from."""
 
 from __future__ import annotations
 
@@ -62,13 +62,13 @@ class Calibration:
 
     @property
     def is_formula(self) -> bool:
-        """Whether it is there for any number of bits."""
+        """Whether it exists for any number of bits."""
         return self.name in FORMULAS
 
     def uniformity_map(self, resolution_px: tuple[int, int]) -> Float32Array | None:
         """Relative light of each pixel (height, width), 1 at the brightest; None where it is the same everywhere.
 
-        Bilinear between the middles of the grid's fields, and on by the same slope to the edges of the screen.
+        Bilinear between the centres of the grid's fields, extrapolated by the same slope to the edges of the screen.
         """
         if self.uniformity is None:
             return None
@@ -76,13 +76,13 @@ class Calibration:
         rows = _weights_of_grid(height, self.uniformity.shape[0])
         columns = _weights_of_grid(width, self.uniformity.shape[1])
         light = rows @ self.uniformity @ columns.T
-        smallest = float(self.uniformity.min()) / 2  # a slope carried on must not end below darkness
+        smallest = float(self.uniformity.min()) / 2  # an extrapolated slope must not go below zero
         light = np.maximum(light, smallest)
         return np.asarray(light / light.max(), dtype=np.float32)
 
 
 def _weights_of_grid(pixels: int, fields: int) -> FloatArray:
-    """(pixels, fields): what each field's value counts in each pixel."""
+    """The weight of each field in each pixel, (pixels, fields)."""
     if fields == 1:
         return np.ones((pixels, 1))
     place = (np.arange(pixels) + 0.5) * fields / pixels - 0.5
@@ -155,7 +155,7 @@ def _response(
     tables = {name: table_response(bits, (light - light[0]) / whites[name]) for name, light in columns.items()}
     channels = (tables["w"],) * 3 if "w" in tables else (tables["r"], tables["g"], tables["b"])
     if bit_stealing and weights is None:
-        raise InputError(f"{path}: bit stealing wants the primaries as the tracker sees them; add [weights] r, g, b")
+        raise InputError(f"{path}: bit stealing needs the primaries as the tracker sees them; add [weights] r, g, b")
     if bit_stealing and weights is not None:
         return bit_stealing_response((channels[0], channels[1], channels[2]), weights, black), weights
     if "w" in tables or weights is None:

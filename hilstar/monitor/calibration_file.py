@@ -124,9 +124,9 @@ def _numbers(path: Path, lines: list[tuple[int, str]], columns: int) -> FloatArr
         except (ValueError, csv.Error) as error:
             raise InputError(f"{path}: line {number}: {line.strip()[:40]!r} is no row of numbers") from error
         if len(row) != columns:
-            raise InputError(f"{path}: line {number}: {len(row)} cells; {columns} are wanted")
+            raise InputError(f"{path}: line {number}: {len(row)} cells; write {columns}")
         if not all(0 <= cell < 1e30 for cell in row):
-            raise InputError(f"{path}: line {number}: {line.strip()[:40]!r}; finite numbers that are not negative are wanted")
+            raise InputError(f"{path}: line {number}: {line.strip()[:40]!r}; write finite numbers that are not negative")
         rows.append(row)
     if not rows:
         raise InputError(f"{path}: no row of numbers in it")
@@ -146,20 +146,20 @@ def read_response(path: Path, bits: int, digest: Digest) -> dict[str, FloatArray
     lines = _lines(_read(path, digest))
     header = tuple(cell.strip() for cell in lines[0][1].split(",")) if lines else ()
     if header not in (("code", *GREY), ("code", *PRIMARIES)):
-        raise InputError(f"{path}: its header is {','.join(header)[:60]!r}; code,w or code,r,g,b is wanted")
+        raise InputError(f"{path}: its header is {','.join(header)[:60]!r}; write code,w or code,r,g,b")
     rows = _numbers(path, lines[1:], len(header))
     code, white = rows[:, 0], 2**bits - 1
     if np.any(code != np.rint(code)) or np.any(np.diff(code) <= 0):
         raise InputError(f"{path}: its codes are not whole numbers that rise; sort the rows, one to a code")
     if len(code) < 2 or code[0] != 0 or code[-1] != white:
         raise InputError(
-            f"{path}: its codes are {code[0]:g} to {code[-1]:g}; 0 (black) to {white} (white of {bits} bits) is wanted"
+            f"{path}: its codes are {code[0]:g} to {code[-1]:g}; write 0 (black) to {white} (white of {bits} bits)"
         )
     columns = {name: _every_code(path, name, code, rows[:, place + 1], white) for place, name in enumerate(header[1:])}
     blacks = rows[0, 1:]
     if np.ptp(blacks) > BLACKS_AGREE * blacks.mean():
         raise InputError(
-            f"{path}: code 0 has {', '.join(f'{b:g}' for b in blacks)}; it is one black screen, so one light is wanted"
+            f"{path}: code 0 has {', '.join(f'{b:g}' for b in blacks)}; all show one black screen, so write one light"
         )
     return columns
 

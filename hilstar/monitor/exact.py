@@ -1,10 +1,10 @@
 """`exact`: the levels of one star's footprint chosen together, so that its light and its centroid are right in one frame.
 
-Every pixel shows one of the two levels about its light, so that no pixel is a whole level off. Which of the two is
-chosen so that three sums over the star's pixels come out right: the error of light, and its two first moments about the
-star. First the errors are carried from the star's middle outwards, to where the steps of light get finer; then the best
-flip of one pixel or two is looked for until there is none.
-In the straight foot of sRGB all steps are equal, so a star of N steps cannot be nearer than half a step: 1 / 2N of its
+Every pixel shows one of the two levels around its light, so that no pixel is off by a whole level. The choice between the
+two minimises three sums over the star's pixels: the error of light, and its first moments about the star along x and y.
+First the errors are carried outwards from the star's middle, to where the steps of light are finer; then flips of one or
+two pixels are searched until none reduces the errors.
+In the straight foot of sRGB all steps are equal, so a star of N steps cannot be closer than half a step: 1 / 2N of its
 light, and about 1 / 2N px along each axis. That limit is the monitor's, and the method reaches it.
 """
 
@@ -22,14 +22,14 @@ from hilstar.monitor.quantise import Panel, level_dtype
 from hilstar.monitor.response import Codes
 from hilstar.scene.sprites import Sprites
 
-# What the square of an error of light weighs against that of a moment of as much light times 1 px. One serves a star
-# whose steps differ. Where they are equal no moment may cost a whole step of light: four never lets it.
+# The weight of a squared error of light against that of a squared moment of the same light times 1 px. One suits a star
+# whose steps differ. Where they are equal no moment may cost a whole step of light: four prevents it.
 LIGHT_WEIGHT = 1.0
 LIGHT_WEIGHT_ON_GRID = 4.0
 CHUNK = 512  # stars at a time: their arrays stay in a core's cache
 FLIPS = 24  # pixels of a star that are looked at together, spread evenly from its middle to its reach
-SWEEPS = 4  # flips of one or two pixels; hardly a star takes more
-GOOD_ENOUGH = 5e-4  # of the light, and px: such a star is not flipped
+SWEEPS = 4  # flips of one or two pixels; few stars take more
+GOOD_ENOUGH = 5e-4  # of the light, and px: a star with smaller errors is not flipped
 SAME_STEP = 1e-4  # steps that differ by less, relatively, are equal
 
 
@@ -64,7 +64,7 @@ class ExactQuantiser:
         self._map = FootprintMap(resolution_px, sigma_px)
         self._panel = panel
         response = panel.response
-        self._light = np.append(response.light, response.light[-1])  # above white there is no step
+        self._light = np.append(response.light, response.light[-1])  # there is no step above white
         self._lower = ThresholdCounter(response.light[1:].astype(np.float32))
         self._nearest = ThresholdCounter(response.threshold.astype(np.float32))
         self._first_threshold = np.float32(response.threshold[0])
@@ -96,7 +96,7 @@ class ExactQuantiser:
         asked = found.light / np.float32(self._panel.flux_at_white_e_per_s)
         if output is not None:
             asked /= output
-        np.minimum(asked, np.float32(1), out=asked)  # what is over white is lost, and not for its neighbours to bring
+        np.minimum(asked, np.float32(1), out=asked)  # light over white is lost; neighbours do not make up for it
         lower, upper = self._lower.count(asked[:near]), self._round(asked[near:])
         shown = self._light[np.concatenate([lower, upper])]
         step = self._light[lower + 1] - shown[:near]
@@ -118,7 +118,7 @@ class ExactQuantiser:
         return np.concatenate([lower + choice.up, upper])
 
     def _round(self, asked: Float32Array) -> IntArray:
-        """The nearest levels; hardly a star is bright enough to have any but 0 so far out."""
+        """The nearest levels; this far out they are 0 for all but the brightest stars."""
         levels = np.zeros(asked.shape, dtype=np.intp)
         bright = asked >= self._first_threshold
         levels[bright] = self._nearest.count(asked[bright])
@@ -137,7 +137,7 @@ def _equal_step(step: FloatArray) -> FloatArray:
 
 
 def _aim_at_whole_steps(choice: _Choice) -> None:
-    """Where all steps are equal, aim at the nearest light that there is: then no moment is worth a step of light."""
+    """Where all steps are equal, aim at the nearest light that can be shown: no moment is then worth a step of light."""
     equal = np.flatnonzero(choice.grid)
     root, step = LIGHT_WEIGHT_ON_GRID**0.5, choice.grid[equal]
     short = choice.short[:, equal].sum(axis=0) + choice.error[0, equal] / root
@@ -145,7 +145,7 @@ def _aim_at_whole_steps(choice: _Choice) -> None:
 
 
 def _carry_outwards(choice: _Choice) -> None:
-    """Decide pixel by pixel from the middle outwards, each so that the errors carried so far become least."""
+    """Decide pixel by pixel from the middle outwards, each so that the errors carried so far become smallest."""
     arm, error = choice.arm, choice.error
     bound = -(choice.short + choice.step / 2) * np.square(arm).sum(axis=0)
     bound[choice.step == 0] = -np.inf
@@ -156,7 +156,7 @@ def _carry_outwards(choice: _Choice) -> None:
 
 
 def _flip(choice: _Choice, good: FloatArray) -> None:
-    """Flip the best one or two pixels of each star as long as its errors shrink and are not `good` (n,) yet."""
+    """Flip the best one or two pixels of each star while its errors shrink and exceed `good` (n,)."""
     error = choice.error
     near = len(choice.step)
     stride = -(-near // FLIPS)  # of a large star, another part of its pixels each time

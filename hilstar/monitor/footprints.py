@@ -1,4 +1,4 @@
-"""The footprints of all stars as arrays: each pixel's light, and which star answers for it."""
+"""The footprints of all stars as arrays: each pixel's light, and the star that it belongs to."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from hilstar.scene.sprites import Sprites
 
 PlaceArray = npt.NDArray[np.int32]  # half the memory of intp: these arrays are the method's largest
 
-PHASES = 8  # per axis: the order of pixels by distance is tabulated for so many sub-pixel phases
-REACH_SIGMA = 3.0  # how far from a star a pixel may be lit that its own light would not light
-MIN_REACH_PX = 1.6  # narrower stars still get their eight neighbours: three sums are to be met
+PHASES = 8  # sub-pixel phases per axis for which the order of pixels by distance is tabulated
+REACH_SIGMA = 3.0  # how far from a star a pixel may be lit that the star's own light would leave dark
+MIN_REACH_PX = 1.6  # narrower stars still get their eight neighbours, which three sums need
 PIXEL_VARIANCE = 1 / 12  # a pixel's width adds to the sigma that it samples
 
 
 @dataclass(frozen=True, slots=True)
 class Footprints:
-    """Pixels of n stars, nearest first, each (pixels, n): a pixel of several stars is one star's, the brightest in it.
+    """Pixels of n stars, nearest first, each (pixels, n); a pixel of several stars belongs to the brightest in it.
 
     `light` is the whole light in the pixel, electrons per second, 0 where it is another star's or off the image, and
     `place` its place in the flat image, there one past the end. `dx_px`, `dy_px` are from the star's centre.
@@ -65,7 +65,7 @@ class FootprintMap:
     def find(self, sprites: Sprites) -> Footprints:
         """The footprints of `sprites`. Raises InputError for sprites of another sigma's footprint."""
         if sprites.footprint_px != self._size:
-            raise InputError(f"sprites of {sprites.footprint_px} px where the sigma asks for {self._size} px")
+            raise InputError(f"sprites of {sprites.footprint_px} px where the sigma needs {self._size} px")
         data, count = sprites.data, len(sprites)
         fraction = data["fraction_px"].astype(np.float64).T
         cell = np.clip((fraction + self._bias) * PHASES, 0, PHASES - 1).astype(np.intp)
@@ -105,7 +105,7 @@ class FootprintMap:
         return place
 
     def _settle(self, light: Float32Array, place: PlaceArray) -> None:
-        """Give each pixel that several stars touch to the one that is brightest there, with the light of all."""
+        """Assign each pixel that several stars touch to the brightest there, with the light of all."""
         flat_light, flat_place = light.ravel(), place.ravel()
         entry = np.arange(flat_place.size, dtype=np.int32)
         self._last_entry[flat_place] = entry  # the last of several stays

@@ -19,7 +19,7 @@ def monitor_camera(
     """The camera that maps cam directions to monitor pixels.
 
     `mon` has the axes of cam (x right, y down, as the tracker sees it); `q_cam_to_mon` is the alignment of the
-    tracker on the bench. The collimator's axis meets the monitor at `principal_point_px`, its middle by default.
+    tracker on the bench. The collimator's axis meets the monitor at `principal_point_px`, by default its middle.
     """
     width, height = resolution_px
     middle = ((width - 1) / 2, (height - 1) / 2)

@@ -25,7 +25,7 @@ class CodeTable:
 def code_table(thresholds: Float32Array) -> CodeTable:
     """The table for rising, positive `thresholds`.
 
-    As many bins to an octave as there are thresholds, 4096 at most: few bins then hold more than one.
+    There are as many bins per octave as thresholds, at most 4096, so that few bins hold more than one threshold.
     """
     shift = MANTISSA_BITS - min(12, len(thresholds).bit_length())
     first_bin = int(thresholds[0].view(np.int32)) >> shift
@@ -37,7 +37,7 @@ def code_table(thresholds: Float32Array) -> CodeTable:
 
 
 class ThresholdCounter:
-    """What encode.frag does with a CodeTable, in NumPy: ten times as fast as a search where lights are in no order."""
+    """What encode.frag does with a CodeTable, in NumPy: ten times as fast as a binary search of unsorted light."""
 
     def __init__(self, thresholds: Float32Array) -> None:
         table = code_table(thresholds)
@@ -46,7 +46,7 @@ class ThresholdCounter:
         self._threshold = np.append(thresholds, np.float32(np.inf))
 
     def count(self, light: Float32Array) -> IntArray:
-        """How many thresholds are at or under each finite light, which is 0 or more; same shape."""
+        """How many thresholds are at or below each light, which is finite and not negative; same shape."""
         place = np.clip((light.view(np.int32) >> self._shift) - self._first_bin, 0, len(self._first) - 1)
         count: IntArray = self._first[place]
         while (more := light >= self._threshold[count]).any():

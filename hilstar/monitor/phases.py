@@ -1,4 +1,4 @@
-"""One star at every sub-pixel phase through a method from light to levels: the errors of its flux and its place."""
+"""One star at every sub-pixel phase through a quantisation method: the errors of its flux and centroid."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Errors:
 
 
 def phase_grid(count: int, sigma_px: tuple[float, float] = SIGMA_PX) -> tuple[Sprites, int]:
-    """count^2 stars whose peak would be white at the middle of a pixel, one to a tile, at every phase; the tile's side, px."""
+    """count^2 stars, one in each tile at its own phase, as bright as white when centred on a pixel; and the tile's side, px."""
     tile = footprint_px(sigma_px) + 2
     place = (np.arange(count) + 0.5) * tile + (np.arange(count) + 0.5) / count - 0.5
     x_px, y_px = (axis.ravel() for axis in np.meshgrid(place, place))
@@ -38,14 +38,14 @@ def phase_grid(count: int, sigma_px: tuple[float, float] = SIGMA_PX) -> tuple[Sp
 
 
 def fainter(sprites: Sprites, mag: float) -> Sprites:
-    """The same stars, so many magnitudes fainter."""
+    """The same stars, `mag` magnitudes fainter."""
     data = sprites.data.copy()
     data["electrons_per_s"] *= flux_ratio(mag)
     return Sprites(data, sprites.footprint_px, sprites.star, sprites.x_px, sprites.y_px)
 
 
 def measure(wanted: FloatArray, shown: FloatArray, tile: int) -> Errors:
-    """The errors of each tile of two images, which hold a star each."""
+    """The errors over all tiles of two images with one star in each tile."""
     light, x_px, y_px = _sums(wanted, tile)
     lit, lit_x_px, lit_y_px = _sums(shown, tile)
     flux = np.abs(magnitude(lit / light))
@@ -66,7 +66,7 @@ def _sums(image: FloatArray, tile: int) -> tuple[FloatArray, FloatArray, FloatAr
 def shown_by(
     method: Quantisation, cycle_frames: int, panel: Panel, linear: Float32Array, sprites: Sprites, sigma_px: tuple[float, float]
 ) -> FloatArray:
-    """The light (h, w) that a method makes of a linear image, as a tracker sees it that exposes for `cycle_frames`."""
+    """The light (h, w) that a method shows for a linear image, averaged over an exposure of `cycle_frames`."""
     if method == "exact":
         size = linear.shape[1], linear.shape[0]
         return shown_light(ExactQuantiser(panel, size, sigma_px).levels(sprites), panel)

@@ -1,8 +1,8 @@
 """From a linear image to levels, pixel by pixel: `round`, `dither` and `temporal` (`exact` looks at stars: see `exact`).
 
-A pixel's light lies between those of two levels, k and k + 1. `round` shows the nearer one. The others decide in light,
-not in code: k + 1 has the probability (L - L_k) / (L_k+1 - L_k), so that the mean light is the light wanted.
-All are float32, as the renderer computes them: it must give the same level to every pixel.
+A pixel's light lies between those of two levels, k and k + 1. `round` shows the nearer one. The others work in light, not
+in code: k + 1 has the probability (L - L_k) / (L_k+1 - L_k), so that the mean light is the light wanted.
+All compute in float32 like the renderer, which has to give every pixel the same level.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from hilstar.monitor.response import Codes, Response, encode
 
 Quantisation = Literal["round", "dither", "temporal", "exact"]
 
-# Frames after which `temporal` begins again. Eight are 133 ms at 60 Hz, about one exposure of a tracker. They leave a star
-# of 42 steps of light (8 magnitudes under white, 10 bits) 0.007 mag and 0.017 px off, rms; twice as many leave half.
+# Frames after which `temporal` repeats. Eight are 133 ms at 60 Hz, about one exposure of a tracker. A star of 42 steps of
+# light (8 magnitudes under white, 10 bits) then has rms errors of 0.007 mag and 0.017 px; sixteen frames halve them.
 CYCLE_FRAMES = 8
-MAX_CYCLE_FRAMES = 4096  # the mask has no more different thresholds
+MAX_CYCLE_FRAMES = 4096  # the mask has no more distinct thresholds
 
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """What turns light into levels: a response, the light of white, and what each pixel makes of it.
+    """What turns light into levels: a response, the light of white, and the relative light of each pixel.
 
     `uniformity` float32 (height, width) is each pixel's light relative to what the response says (None: 1 everywhere).
     Raises InputError where it is not positive and finite.
@@ -39,7 +39,9 @@ class Panel:
 
     def __post_init__(self) -> None:
         if self.uniformity is not None and not (np.isfinite(self.uniformity).all() and (self.uniformity > 0).all()):
-            raise InputError("the uniformity map has pixels that are not positive; give each its light relative to the mean")
+            raise InputError(
+                "the uniformity map has pixels that are not positive; give each pixel its light relative to the mean"
+            )
 
     def gain(self) -> Float32Array | None:
         """What the wanted light is multiplied by before it is quantised, float32 (height, width), or None for 1.
@@ -64,7 +66,7 @@ def _wanted(linear_e_per_s: Float32Array, panel: Panel) -> Float32Array:
 
 
 def round_levels(linear_e_per_s: Float32Array, panel: Panel) -> Codes:
-    """The nearest level of each pixel, (height, width) as `linear_e_per_s`; what is over white becomes white."""
+    """The nearest level of each pixel, (height, width) as `linear_e_per_s`; light over white becomes white."""
     return encode(_wanted(linear_e_per_s, panel), panel.response, panel.flux_at_white_e_per_s)
 
 
@@ -103,7 +105,7 @@ def temporal_levels(linear_e_per_s: Float32Array, panel: Panel, frame: int, cycl
 def frame_shift(frame: int, cycle_frames: int) -> float:
     """The mask's turn in a frame: van der Corput's sequence in base 2, which begins again after `cycle_frames`.
 
-    Each aligned 2^m frames have turns that part [0, 1) evenly. Raises InputError for a cycle that is not a power of two.
+    The turns of each aligned block of 2^m frames divide [0, 1) evenly. Raises InputError for a cycle that is no power of two.
     """
     if not 1 <= cycle_frames <= MAX_CYCLE_FRAMES or cycle_frames & (cycle_frames - 1):
         raise InputError(f"a cycle of {cycle_frames} frames; write a power of two from 1 to {MAX_CYCLE_FRAMES}")
@@ -116,13 +118,13 @@ def frame_shift(frame: int, cycle_frames: int) -> float:
 
 
 def cycle_warning(exposure_s: float, refresh_hz: float, cycle_frames: int = CYCLE_FRAMES) -> str | None:
-    """What to tell the user whose tracker does not expose for a whole cycle of `temporal`, else None."""
+    """A warning for a tracker whose exposure is shorter than a cycle of `temporal`, else None."""
     cycle_s = cycle_frames / refresh_hz
     if exposure_s >= cycle_s:
         return None
     return (
         f"temporal dithering needs {cycle_frames} frames, {cycle_s * 1e3:.0f} ms at {refresh_hz:g} Hz, and the tracker exposes"
-        f" {exposure_s * 1e3:.0f} ms: it sees a part of the cycle; shorten the cycle or use exact"
+        f" {exposure_s * 1e3:.0f} ms, a part of the cycle; shorten the cycle or use exact"
     )
 
 

@@ -15,9 +15,9 @@ from hilstar.errors import InputError
 Codes = npt.NDArray[np.unsignedinteger[Any]]
 Weights = tuple[float, float, float]
 
-# Lights nearer than this to each other (relative) are one level: the renderer's float32 has 6e-8 to a step.
+# Lights closer than this to each other (relative) are one level: a step of the renderer's float32 is 6e-8.
 SAME_LIGHT = 1e-6
-MAX_LEVELS = 2**16  # what uint16 can say
+MAX_LEVELS = 2**16  # the range of uint16
 TRIPLES = 7  # grey k and the six mixed triples above it
 
 
@@ -30,11 +30,11 @@ def srgb_light(signal: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class Response:
-    """What light each level makes, and where one level gives way to the next.
+    """The light of each level, and the thresholds between levels.
 
     A level is a code value or, with bit stealing, a triple of codes. `light` (levels,) is the light above the black level,
-    relative to white above black: 0 at level 0, strictly rising, 1 at white. A wanted light from `threshold[k - 1]` up to
-    `threshold[k]` gets level k; there are (levels - 1,) of them. `black` is the light of level 0 in the same unit.
+    relative to white above black: 0 at level 0, strictly rising, 1 at white. Light from `threshold[k - 1]` up to
+    `threshold[k]` is shown by level k; there are (levels - 1,) of them. `black` is the light of level 0 in the same unit.
     `rgb` (levels, 3) holds the codes of each level; where it is None, level k is code k in all three channels.
     """
 
@@ -48,11 +48,6 @@ class Response:
     def white(self) -> int:
         """The largest level."""
         return len(self.light) - 1
-
-    @property
-    def half_step(self) -> float:
-        """Half of the smallest step of light above black: less than that is nearer to nothing."""
-        return float(self.light[1]) / 2
 
     def thresholds_e_per_s(self, flux_at_white_e_per_s: float) -> Float32Array:
         """The thresholds in the unit of the linear image, float32 as the renderer compares them."""
@@ -79,7 +74,7 @@ def table_response(bits: int, light: FloatArray, black: float = 0.0) -> Response
 
 
 def mixed_response(channels: tuple[Response, Response, Response], weights: Weights, black: float = 0.0) -> Response:
-    """The grey response of three channels, each weighed as the tracker sees its primary."""
+    """The grey response of three channels, each weighted as the tracker sees its primary."""
     share = np.asarray(weights) / np.sum(weights)
     light = share @ np.stack([channel.light for channel in channels])
     return table_response(channels[0].bits, light / light[-1], black)
@@ -93,7 +88,7 @@ def bit_stealing_response(channels: tuple[Response, Response, Response], weights
     """
     bits = channels[0].bits
     if (2**bits - 1) * TRIPLES + 1 > MAX_LEVELS:
-        raise InputError(f"bit stealing makes more than {MAX_LEVELS} levels of {bits} bits; it is for 13 bits at most")
+        raise InputError(f"bit stealing makes more than {MAX_LEVELS} levels of {bits} bits; use it with at most 13 bits")
     share = np.asarray(weights, dtype=np.float64) / np.sum(weights)
     steps = np.array(list(product((0, 1), repeat=3)))[:TRIPLES]  # (0, 0, 0) first; (1, 1, 1) is the next grey
     rgb = (np.arange(2**bits - 1)[:, None, None] + steps).reshape(-1, 3)
@@ -107,7 +102,7 @@ def bit_stealing_response(channels: tuple[Response, Response, Response], weights
 
 
 def _distinct(light: FloatArray, grey: npt.NDArray[np.bool_]) -> npt.NDArray[np.intp]:
-    """The places of lights that rise by more than SAME_LIGHT; a grey stays where it has a twin."""
+    """The places of lights that rise by more than SAME_LIGHT; of equal lights the grey one is kept."""
     kept: list[int] = []
     for place, value in enumerate(light):
         if not kept or value > light[kept[-1]] * (1 + SAME_LIGHT):
@@ -127,7 +122,7 @@ def code_dtype(bits: int) -> type[np.uint8] | type[np.uint16]:
 
 
 def encode(linear_e_per_s: Float32Array, response: Response, flux_at_white_e_per_s: float) -> Codes:
-    """Nearest levels of a linear image, same shape, uint8 up to 256 levels; what is over white becomes white."""
+    """Nearest levels of a linear image, same shape, uint8 up to 256 levels; light over white becomes white."""
     thresholds = response.thresholds_e_per_s(flux_at_white_e_per_s)
     levels = np.searchsorted(thresholds, linear_e_per_s, side="right")
     return levels.astype(np.uint8) if len(response.light) <= 256 else levels.astype(np.uint16)

@@ -31,24 +31,24 @@ def build_program(ctx: moderngl.Context, vertex: str, fragment: str, defines: tu
 SpriteSides = tuple[tuple[float, int], ...]
 MAX_SIDES = 8  # as in star.vert
 PLACES = "2i 8x 1f"  # of SPRITE_DTYPE: places and rates
-SPRITE_PIXEL = 2  # a pixel under a sprite takes as long to encode as two of a pass over all (llvmpipe, 1080p to 4K)
-DEAR_PIXEL = 0.02  # of the image: with more under sprites than this a clear is quicker (measured on llvmpipe, 1080p and 4K)
+SPRITE_PIXEL_COST = 2  # of a pixel encoded under a sprite, in pixels of a pass over the whole image (llvmpipe, 1080p to 4K)
+MAX_ERASED_SHARE = 0.02  # of the image; beyond it a clear is faster than erasing sprites (llvmpipe, 1080p and 4K)
 
 
 def set_sides(program: moderngl.Program, sides: SpriteSides) -> None:
-    """Give stars under each rate (electrons per second, falling) sprites of that side, px, in a program of star.vert.
+    """Give stars below each rate (electrons per second, falling) sprites of that side, px, in a program of star.vert.
 
     Raises InputError for more sides than the shader has room for.
     """
     if len(sides) > MAX_SIDES:
-        raise InputError(f"{len(sides)} sizes of sprites; {MAX_SIDES} at most")
+        raise InputError(f"{len(sides)} sizes of sprites; give at most {MAX_SIDES}")
     padded = [*sides, *[(0.0, 0)] * (MAX_SIDES - len(sides))]
     program["sides"] = len(sides)
     program["below_e_per_s"], program["side_px"] = ([*values] for values in zip(*padded, strict=True))
 
 
 class Eraser:
-    """Makes an image black again where the last frame's sprites were, or all of it where that is less work.
+    """Makes an image black again where the last frame's sprites were, or all of it where that is faster.
 
     On llvmpipe a clear of 1920 x 1080 takes 0.4 ms, as long as 1000 stars. It lives in its renderer's context.
     """
@@ -62,7 +62,7 @@ class Eraser:
         self._footprint_px = 0
 
     def take_places_from(self, buffer: moderngl.Buffer, footprint_px: int) -> None:
-        """Use a buffer of SPRITE_DTYPE, of which places are read here."""
+        """Read the places of sprites from a buffer of SPRITE_DTYPE."""
         if self._vao is not None:
             self._vao.release()
         self._vao = self._ctx.vertex_array(self._program, [(buffer, PLACES, "pixel", "electrons_per_s")])
@@ -72,7 +72,7 @@ class Eraser:
         """Make `fbo` black where the first `count` sprites of the buffer are; all of it where that is not known."""
         width, height = self._size_px
         fbo.use()
-        if count is None or count * self._footprint_px**2 > width * height * DEAR_PIXEL:
+        if count is None or count * self._footprint_px**2 > width * height * MAX_ERASED_SHARE:
             fbo.clear()
         elif count and self._vao is not None:
             margin = self._footprint_px
@@ -95,7 +95,7 @@ class LevelTexture:
         self.fbo.clear()
 
     def write(self, levels: Codes) -> None:
-        """Take `levels` (height, width) as they are."""
+        """Upload `levels` (height, width)."""
         self.texture.write(levels, alignment=1)
 
     def read(self) -> Codes:
@@ -105,7 +105,7 @@ class LevelTexture:
 
 
 class Encoder:
-    """Draws the levels of a linear image: only the sprites' footprints where that is less than the whole image.
+    """Draws the levels of a linear image: only the sprites' footprints where that is less work than the whole image.
 
     With `dithered` the mask decides between two levels. It lives in its renderer's context, which is current in every call.
     """
@@ -154,7 +154,7 @@ class Encoder:
         return texture
 
     def take_places_from(self, buffer: moderngl.Buffer, footprint_px: int) -> None:
-        """Use a buffer of SPRITE_DTYPE, of which places and rates are read here."""
+        """Read the places and rates of sprites from a buffer of SPRITE_DTYPE."""
         if self._sprite_vao is not None:
             self._sprite_vao.release()
         self._sprite_vao = self._ctx.vertex_array(self._sprites, [(buffer, PLACES, "pixel", "electrons_per_s")])
@@ -167,8 +167,8 @@ class Encoder:
     def draw(self, count: int, per_star: int, covered_px: int, shift: float = 0.0) -> None:
         """Encode the linear image under the first `count` sprites of the buffer; the rest is black, and was before.
 
-        `shift` turns the mask of a dithering encoder, `per_star` sprites are each star's, and together they cover
-        `covered_px`: where that is the whole image, so is the pass.
+        `shift` turns the mask of a dithering encoder. Each star has `per_star` sprites; together they cover `covered_px`, and
+        where that is most of the image the pass covers all of it.
         """
         width, height = self._size_px
         self._fbo.use()
@@ -176,7 +176,7 @@ class Encoder:
             texture.use(unit)
         if self._dithered:
             self._sprites["shift"] = self._whole["shift"] = shift
-        if covered_px * SPRITE_PIXEL >= width * height:
+        if covered_px * SPRITE_PIXEL_COST >= width * height:
             self._fbo.viewport = (0, 0, width, height)
             self._whole_vao.render(moderngl.TRIANGLES, vertices=3)
             return

@@ -95,7 +95,7 @@ class Presenter:
             "cross_px": (round(view.cross_px[0]), round(view.cross_px[1])),
         }
         for name, value in values.items():
-            if name in program:  # a compiler leaves out what a variant does not use
+            if name in program:  # a compiler removes what a variant does not use
                 program[name] = value
         return program, self._ctx.vertex_array(program, [])
 

@@ -1,6 +1,6 @@
 """The renderer: sprites to a linear image and code values, in OpenGL 3.3 core through EGL.
 
-This module and its helper `encoder` are the only users of moderngl.
+This room is the only user of moderngl.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Target:
     """What the renderer draws for: an image's pixels, its sprites, and a monitor's response where codes are wanted.
 
     `uniformity` float32 (height, width) is each pixel's light relative to the response (None: 1 everywhere), and
-    `cycle_frames`, a power of two, is for `temporal` alone. Stars under each rate of `sides` (electrons per second, falling)
+    `cycle_frames`, a power of two, is for `temporal` alone. Stars below each rate of `sides` (electrons per second, falling)
     get sprites of that side, px, of the same parity as the footprint.
     """
 
@@ -65,7 +65,7 @@ def create_context() -> moderngl.Context:
         settings: Any = {"backend": "egl", "libgl": EGL_LIBRARY, "libegl": EGL_LIBRARY}
         return moderngl.create_context(require=330, standalone=True, **settings)
     except Exception as error:  # moderngl and glcontext raise plain Exceptions here
-        raise MachineError(f"OpenGL 3.3 through EGL is not there ({error}); {INSTALL_EGL}") from error
+        raise MachineError(f"OpenGL 3.3 through EGL is missing ({error}); {INSTALL_EGL}") from error
 
 
 class Renderer:
@@ -136,7 +136,7 @@ class Renderer:
             self._encoder.shrink(target.sides)
 
     def _reserve(self, sprites: int) -> None:
-        """Room for so many sprites on the GPU; grows by doubling, never shrinks."""
+        """Make room for `sprites` sprites on the GPU; it grows by doubling and never shrinks."""
         self._capacity = sprites
         self._buffer = self._ctx.buffer(reserve=sprites * SPRITE_DTYPE.itemsize, dynamic=True)
         layout = [(self._buffer, "2i 2f 1f", "pixel", "fraction_px", "electrons_per_s")]
@@ -154,7 +154,7 @@ class Renderer:
         """
         with self._ctx:
             if self._exact is not None and self._levels is not None:
-                # These levels come from the sprites themselves: the linear image is drawn when somebody asks for it.
+                # These levels come from the sprites themselves: the linear image is drawn only when it is read.
                 self._exact_levels = self._exact.levels(sprites)
                 self._levels.write(self._exact_levels)
                 self._undrawn = (sprites, whole)

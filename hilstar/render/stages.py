@@ -1,4 +1,4 @@
-"""A renderer that keeps the time of each stage of a frame, for the benchmark alone: it waits where the other would not."""
+"""A renderer that times each stage of a frame, for the benchmark alone: unlike the renderer it waits after each stage."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hilstar.units import NS_PER_MS
 
 
 class StagedRenderer(Renderer):
-    """A Renderer whose `stage_ms` holds the last frame's stages: erase, upload, splat, encode and read_back in ms by the wall.
+    """A Renderer whose `stage_ms` holds the last frame's stages: erase, upload, splat, encode and read_back in ms of wall time.
 
     `gpu_splat` and `gpu_encode` are the same by the driver's own timers, where it has them.
     """

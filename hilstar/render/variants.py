@@ -1,4 +1,4 @@
-"""Other ways to draw the linear image, for the study of trade-offs: the renderer itself with one part changed."""
+"""Variants of drawing the linear image, for the study of trade-offs: the renderer with one part changed."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class VariantRenderer(Renderer):
         self._splat["samples_per_px"] = (size - 1) / reach_px
 
     def draw_and_wait(self, sprites: Sprites) -> None:
-        """Draw the linear image of `sprites`, and return when it is there."""
+        """Draw the linear image of `sprites`, and return when it is done."""
         self.draw(sprites)
         with self._ctx:
             self._ctx.finish()

@@ -22,7 +22,7 @@ MAX_TANGENT = 1e3  # a step of so much leads nowhere
 
 @dataclass(frozen=True, slots=True)
 class Camera:
-    """What maps cam directions to pixels: (0, 0) is the centre of the top-left pixel, x right, y down.
+    """A mapping of cam directions to pixels: (0, 0) is the centre of the top-left pixel, x right, y down.
 
     `cam_to_image` (3, 3) turns cam components into those of the image's own axes (z along its normal). A `lens` of None is
     the ideal pinhole.
@@ -35,7 +35,7 @@ class Camera:
     lens: Lens | None = None
 
     def project(self, image_vectors: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Pixel x and y of directions (n, 3) in image axes; those not in front come out as NaN."""
+        """Pixel x and y of directions (n, 3) in image axes; NaN for those not in front of the camera."""
         z = image_vectors[:, 2]
         if self.lens is None:
             scale = np.divide(self.focal_length_px, z, out=np.full_like(z, np.nan), where=z > 0)

@@ -1,4 +1,4 @@
-"""Which stars of a frame ask for more light than one pixel of the monitor has."""
+"""Which stars of a frame need more light than one pixel of the monitor has."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from hilstar.arrays import Float32Array, FloatArray, IntArray
 from hilstar.scene.psf import peak_share, pixel_shares
 from hilstar.scene.sprites import Sprites
 
-# A star at most this much over white is not called clipped: flux and white are float32 on the way.
+# A star over white by no more than this is not called clipped: flux and white pass through float32.
 CLIP_TOLERANCE = 1e-6
-# Of the sprites that may clip by other sprites' light so many are looked at, the brightest: the work of a frame is bounded.
+# Of the sprites that may clip with the light of others, only this many are tested, the brightest: the work is bounded.
 MAX_DOUBTFUL = 512
 
 
@@ -26,11 +26,11 @@ def clipped_sprites(
 
     White is `flux_at_white_e_per_s` times a pixel's `uniformity` (height, width), whose minimum is `darkest`.
 
-    Only a star that alone reaches half of white in a pixel is looked at: two fainter ones on one pixel go unnamed.
+    Only stars that alone reach half of white in a pixel are tested: two fainter ones on one pixel are not reported.
     """
     bright_e_per_s = 0.5 * flux_at_white_e_per_s * darkest / peak_share(sigma_px)
     if sprites.per_star * sprites.data["electrons_per_s"].max(initial=0.0) <= bright_e_per_s:
-        return np.empty(0, dtype=np.intp)  # most frames: no star is so bright, however its light is divided
+        return np.empty(0, dtype=np.intp)  # most frames: no star is that bright, however its light is divided
     bright = np.flatnonzero(_star_rates(sprites) > bright_e_per_s)
     x, y = np.rint(sprites.x_px[bright]).astype(int), np.rint(sprites.y_px[bright]).astype(int)
     inside = (x >= 0) & (x < resolution_px[0]) & (y >= 0) & (y < resolution_px[1])

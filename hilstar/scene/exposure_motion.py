@@ -1,4 +1,4 @@
-"""Stars of a camera that turns during its exposure: each one's path as a chain of sprites.
+"""Stars seen by a camera that turns during its exposure: each star's path as a chain of sprites.
 
 The mean of a star's light over the exposure is an integral over time; Gauss-Legendre quadrature turns it into a sum of
 sprites that weigh together as much as the star. It is exact in the limit, so each star gets only as many as its path needs.
@@ -25,10 +25,10 @@ from hilstar.sky.stars import Stars
 NODES_PER_SIGMA = 1.02
 NODES_AT_REST = 3
 MIN_PATH_SIGMA = 0.005
-# A longer turn is cut in pieces of this, so that a piece of a path is short beside the field, and no longer than its nodes.
+# A longer turn is cut into pieces of this angle, so that each is short compared with the field and has enough nodes.
 MAX_PIECE_RAD = 0.05
 MAX_PIECE_SIGMA = (MAX_NODES - NODES_AT_REST - 1) / NODES_PER_SIGMA
-# An exposure's work is bounded: one of more pieces is refused, and more sprites are made fewer, with nodes farther apart.
+# An exposure's work is bounded: more pieces are refused, and more sprites are thinned out by nodes farther apart.
 MAX_PIECES = 20_000
 MAX_SPRITES = 2_000_000
 COARSER = 0.25
@@ -74,19 +74,19 @@ def smeared_sprites(stars: Stars, motion: Motion, camera: Camera, footprint_px: 
             return sprites if fineness == 1.0 else replace(sprites, capped=len(np.unique(sprites.star)))
         fineness *= COARSER
     raise InputError(
-        f"{_turn_words(motion)} takes more than {MAX_SPRITES} sprites; write a shorter exposure_s, a slower rate or fewer stars"
+        f"{_turn_words(motion)} needs more than {MAX_SPRITES} sprites; write a shorter exposure_s, a slower rate or fewer stars"
     )
 
 
 def _piece_count(motion: Motion, camera: Camera, sigma_px: tuple[float, float]) -> int:
-    """Pieces of a turn that are short beside the field and, anywhere on the image, beside their nodes."""
+    """The number of pieces of a turn, each short compared with the field and, anywhere on the image, with its nodes."""
     angle_rad = float(np.linalg.norm(motion.rate_cam_rad_s)) * motion.exposure_s
     path_sigma = camera.fastest_px_s(camera.cam_to_image @ motion.rate_cam_rad_s) * motion.exposure_s / min(sigma_px)
     pieces = max(angle_rad / MAX_PIECE_RAD, path_sigma / MAX_PIECE_SIGMA)
     if pieces > MAX_PIECES:
-        most_deg = np.degrees(angle_rad / pieces * MAX_PIECES)
+        max_deg = np.degrees(angle_rad / pieces * MAX_PIECES)
         raise InputError(
-            f"{_turn_words(motion)} is too long; at most {most_deg:.4g} deg are drawn here:"
+            f"{_turn_words(motion)} is too long; at most {max_deg:.4g} deg can be drawn here:"
             " write a shorter exposure_s or a slower rate"
         )
     return int(np.ceil(pieces))
@@ -135,7 +135,7 @@ class _Smear:
         return pack_sprites(x_px, y_px, light, star, camera.resolution_px, self.footprint_px)
 
     def _nodes(self, paths: Paths, half_s: float) -> tuple[IntArray, FloatArray, FloatArray]:
-        """How many nodes each star's path needs on the image (0: it is not there), and the part of the piece it is there.
+        """How many nodes each star's path needs (0: it misses the image), and the part of the piece that is on the image.
 
         The piece lasts from -half_s to half_s of the paths' seconds.
         """

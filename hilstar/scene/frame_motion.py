@@ -1,8 +1,8 @@
 """Stars of one frame of a screen that lights row by row, while the camera turns.
 
-Row y of a screen begins its light a part of a refresh period later than the first, and keeps it until it is written anew.
-So a star is drawn where it is while the row under it is lit: on its path from the moment when that row lights to the end of
-its light, as a chain of sprites that weigh together as much as the star. Frame by frame the paths join to one streak.
+Row y of a screen lights up a part of a refresh period later than the first row, and holds its light until it is written
+again. So a star is drawn where it is while its row is lit: on its path from the moment when that row lights up until it is
+written again, as a chain of sprites that add up to the star. Frame by frame the paths join to one streak.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from hilstar.sky.stars import Stars
 # With ceil(0.6 r + 1) nodes on a path of r sigmas no pixel is off by more than 1e-3 of the star's flux (measured for sigma
 # 0.5 to 2 px and r to 30; tests/unit/scene/test_frame_motion.py holds it): its flux and centroid are exact with any number.
 NODES_PER_SIGMA = 0.6
-# A path of so many sigmas is a point to 1e-3 of the star's flux.
+# A path of this many sigmas is a point to 1e-3 of the star's flux.
 POINT_SIGMA = 0.27
-# A frame's work is bounded: each star has one sprite, all paths together so many more (of so many pixels), and no path is
-# longer than this share of the field's radius. Past that paths are drawn with fewer nodes, or as those of a slower turn, and
-# the stars counted. With 1000 stars in view the longest frame then takes at most 1.8 times as long as a still one
+# A frame's work is bounded: beyond one sprite per star all paths together get EXTRA_SPRITES (of EXTRA_PX pixels), and no
+# path is longer than MAX_TURN_FIELD of the field's radius. Beyond that, paths have fewer nodes or are those of a slower turn,
+# and the stars are counted. With 1000 stars in view the longest frame then takes at most 1.8 times as long as a still one
 # (python -m tests.benchmarks.bench_motion).
 EXTRA_SPRITES = 1000
 EXTRA_PX = 400_000
@@ -34,7 +34,7 @@ MAX_TURN_FIELD = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Scan:
-    """How a screen lights: rows in turn over `scanout_s`, each then for `hold_s`.
+    """How a screen lights up: its rows in turn over `scanout_s`, each for `hold_s`.
 
     `down` is the direction of the screen's rows in image axes (x right, y down), one of the four along an axis.
     """
@@ -45,16 +45,16 @@ class Scan:
 
     @property
     def whole_s(self) -> float:
-        """From the first row's first light to the last row's last."""
+        """The time from the first row's first light to the last row's last."""
         return self.scanout_s + self.hold_s
 
     @property
     def longest_s(self) -> float:
-        """For so long a star of the frame may have moved, seen from the middle row's first light."""
+        """The longest time that a star of the frame may have moved, counted from the middle row's first light."""
         return self.scanout_s / 2 + self.hold_s
 
     def late_s(self, x_px: FloatArray, y_px: FloatArray, resolution_px: tuple[int, int]) -> FloatArray:
-        """How long after the middle row the row under a pixel lights; off the image as at its edge."""
+        """How long after the middle row the row of a pixel lights up; off the image as at its edge."""
         middle_x, middle_y = ((size - 1) / 2 for size in resolution_px)
         rows = resolution_px[0] if self.down[0] else resolution_px[1]
         place = (self.down[0] * (x_px - middle_x) + self.down[1] * (y_px - middle_y)) / rows
@@ -63,7 +63,7 @@ class Scan:
 
 @dataclass(frozen=True, slots=True)
 class Turn:
-    """The attitude when the middle row lights, and the rate of cam in icrs (3,), cam components, constant over the frame."""
+    """The attitude when the middle row lights up, and the rate of cam in icrs (3,), cam components, constant over the frame."""
 
     q_icrs_to_cam: FloatArray
     rate_cam_rad_s: FloatArray
@@ -77,9 +77,9 @@ class Turn:
 def swept_sprites(
     stars: Stars, turn: Turn, scan: Scan, camera: Camera, footprint_px: int, sigma_px: tuple[float, float]
 ) -> Sprites:
-    """Sprites of each star on its path over the light of the row that it is on; several sprites of a star follow each other.
+    """Sprites of each star on its path while its row is lit; the sprites of a star follow each other.
 
-    `capped` of what comes out are the stars whose paths are coarser than NODES_PER_SIGMA, or shorter than the turn makes them.
+    `capped` counts the stars whose paths are coarser than NODES_PER_SIGMA, or shorter than the turn makes them.
     """
     turn, slowed = _slowed(turn, scan, camera)
     middle = Turn(propagate(turn.q_icrs_to_cam, turn.rate_cam_rad_s, scan.hold_s / 2), turn.rate_cam_rad_s)
@@ -103,12 +103,12 @@ def swept_sprites(
 
 
 def _extra(footprint_px: int) -> int:
-    """How many sprites all paths together may have over one a star: large ones are fewer."""
+    """How many sprites all paths together may have beyond one per star; fewer where sprites are large."""
     return min(EXTRA_SPRITES, EXTRA_PX // footprint_px**2)
 
 
 def _of_the_brightest(wanted: IntArray, electrons_per_s: FloatArray, footprint_px: int) -> IntArray:
-    """`wanted` (n,) with none for the faintest of those that want any, where a frame has no room for all."""
+    """`wanted` (n,), set to 0 for the faintest stars where a frame has no room for all."""
     wanting = np.flatnonzero(wanted)
     kept = brightest(electrons_per_s[wanting], max_stars(footprint_px))
     if kept is None:
@@ -127,10 +127,10 @@ def _slowed(turn: Turn, scan: Scan, camera: Camera) -> tuple[Turn, bool]:
 
 
 def _row_delays_s(paths: Paths, scan: Scan, camera: Camera) -> FloatArray:
-    """How long after the middle row each star's own row lights."""
+    """How long after the middle row each star's own row lights up."""
     every, late_s = np.arange(len(paths)), np.zeros(len(paths))
     for _ in range(2 if scan.scanout_s else 0):
-        # Each pass leaves the part of the frame that the star crosses in it: 1e-5 of it for 5 px in 1080 rows.
+        # Each pass leaves an error of the share of the frame that the star crosses meanwhile: 1e-5 of it for 5 px in 1080 rows.
         x_px, y_px = paths.places_px(every, late_s)
         late_s = scan.late_s(x_px, y_px, camera.resolution_px)
     return np.where(np.isfinite(late_s), late_s, 0.0)
@@ -139,7 +139,7 @@ def _row_delays_s(paths: Paths, scan: Scan, camera: Camera) -> FloatArray:
 def _wanted_nodes(
     paths: Paths, late_s: FloatArray, scan: Scan, footprint_px: int, sigma_px: tuple[float, float]
 ) -> tuple[IntArray, tuple[FloatArray, FloatArray]]:
-    """How many nodes each star's path needs on the image (0: it is not there), and the part of its time that it is there."""
+    """How many nodes each star's path needs (0: it misses the image), and the part of its time that it is on the image."""
     every = np.arange(len(paths))
     ends = [paths.places_px(every, late_s + seconds) for seconds in (0.0, scan.hold_s)]
     chords = Chords(np.stack([x for x, _ in ends]), np.stack([y for _, y in ends]))

@@ -1,4 +1,4 @@
-"""A star's path across the image as sprites: what of it lies on the image, and how many Gauss-Legendre nodes that gets."""
+"""A star's path across the image as sprites: the part on the image, and the number of its Gauss-Legendre nodes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def _node_table() -> tuple[IntArray, FloatArray, FloatArray]:
 
 @dataclass(frozen=True, slots=True)
 class Nodes:
-    """Nodes of several paths, end to end: whose each is, its place from -1 to 1 on the path, its share of the path's light."""
+    """Nodes of several paths, end to end: the path of each, its place from -1 to 1 on it, and its share of the path's light."""
 
     path: IntArray
     place: FloatArray
@@ -41,8 +41,9 @@ def nodes_of(counts: IntArray) -> Nodes:
 
 
 def within_budget(wanted: IntArray, extra: int) -> IntArray:
-    """At most MAX_NODES of the nodes (n,) that paths want, or fewer for each, in proportion, where they
-    want more than one each and `extra` together. A path that wants any keeps one.
+    """The nodes (n,) that paths get of those they want: at most MAX_NODES each, and at most `extra` beyond one each.
+
+    What exceeds `extra` is reduced in proportion; a path that wants any keeps one.
     """
     counts = np.minimum(wanted, MAX_NODES)
     beyond = np.maximum(counts - 1, 0)
@@ -100,7 +101,7 @@ class Chords:
     def on_image(self, resolution_px: tuple[int, int], margin_px: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Begin and end (n,) of the part of each, 0 to 1, that is within `margin_px` of the image; 1 and 0 for none.
 
-        (Liang and Barsky 1984.) One with an end behind the camera is taken whole, where the other is on the image.
+        (Liang and Barsky 1984.) A chord with one end behind the camera counts whole where the other end is on the image.
         """
         begin, end = np.zeros(self.x_px.shape[1]), np.ones(self.x_px.shape[1])
         for ends, size in ((self.x_px, resolution_px[0]), (self.y_px, resolution_px[1])):
@@ -128,7 +129,7 @@ class Chords:
 def node_counts(length_sigma: FloatArray, per_sigma: float, at_rest: int, shortest_sigma: float) -> IntArray:
     """ceil(per_sigma length + at_rest) nodes for each length in sigmas, 1 under `shortest_sigma`.
 
-    A length that is not finite asks for MAX_NODES.
+    A length that is not finite gets MAX_NODES.
     """
     length = np.where(np.isfinite(length_sigma), np.minimum(length_sigma, 1e9), MAX_NODES / per_sigma)
     counts = np.ceil(per_sigma * length + at_rest)

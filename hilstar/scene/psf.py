@@ -1,4 +1,4 @@
-"""The Gaussian sprite of a star, integrated over pixels (thesis eq. 4.7): how large, how high.
+"""The Gaussian sprite of a star, integrated over pixels (thesis eq. 4.7): its footprint and its peak.
 
 A pixel's share along one axis is (erf((d + 1/2)/(s sqrt 2)) - erf((d - 1/2)/(s sqrt 2)))/2, d from the star's centre
 to the pixel's centre and s the sigma, both in pixels.
@@ -13,8 +13,8 @@ import numpy as np
 from hilstar.arrays import FloatArray
 from hilstar.errors import InputError
 
-# The share of a star's flux that may fall outside its footprint, at the worst sub-pixel phase. 1e-5 would do for
-# flux; at sigma 3 px the centroid then moves 1e-4 px, so ten times less is cut, for one pixel more.
+# The maximum share of a star's flux outside its footprint, at the worst sub-pixel phase. 1e-5 would be enough for the
+# flux; but at sigma 3 px the centroid would then move by 1e-4 px, so a tenth of that is cut, at the cost of one pixel.
 # results/tradeoff.csv, psf: 10 px at sigma 0.85 are on the front; 8 px save a tenth and cut 4e-5 mag.
 MAX_CUT = 1e-6
 SQRT2 = math.sqrt(2.0)
@@ -38,7 +38,7 @@ def pixel_shares(offset_px: FloatArray, sigma_px: float) -> FloatArray:
 
 
 def peak_share(sigma_px: tuple[float, float]) -> float:
-    """The largest share that one pixel can get: that of a star in the middle of it."""
+    """The largest share that one pixel can get: that of a star centred on it."""
     return pixel_share(0.0, sigma_px[0]) * pixel_share(0.0, sigma_px[1])
 
 
@@ -57,5 +57,5 @@ def footprint_px(sigma_px: tuple[float, float], largest_cut: float = MAX_CUT) ->
     while cut_share(size, sigma_px) > largest_cut:
         size += 1
         if size > 100_000:
-            raise InputError(f"sprite sigma {sigma_px} px: no footprint holds it; write a few pixels")
+            raise InputError(f"sprite sigma {sigma_px} px: too large for any footprint; write a few pixels")
     return size

@@ -13,12 +13,12 @@ from hilstar.arrays import FloatArray, IntArray
 from hilstar.scene.camera import Camera
 from hilstar.sky.stars import Stars
 
-# A whole pixel and a float32 fraction: float32 alone would cost 1e-4 px at 2000 px and 1e-3 px further out.
+# A whole pixel and a float32 fraction: float32 alone would be off by 1e-4 px at 2000 px and 1e-3 px further out.
 # results/tradeoff.csv, projection: 4e-8 px, where float32 throughout is 6e-4 px off.
 SPRITE_DTYPE = np.dtype([("pixel", "<i4", 2), ("fraction_px", "<f4", 2), ("electrons_per_s", "<f4")])
 
-# The work and the memory of a frame are bounded: its sprites cover at most so many pixels, 250 000 stars of sigma 0.85 px.
-# Of more stars only the brightest are drawn.
+# The work and memory of a frame are bounded by the pixels that its sprites cover: 250 000 stars of sigma 0.85 px. Of more
+# stars only the brightest are drawn.
 MAX_COVERED_PX = 25_000_000
 
 
@@ -27,8 +27,8 @@ class Sprites:
     """Stars on the image: `data` (n,) of SPRITE_DTYPE, their centres, and where each lies in `Stars`.
 
     A sprite covers `footprint_px` squared pixels, the first of them at `pixel - (footprint_px - 1) // 2`. A star's light is
-    divided among up to `per_star` sprites. `capped` stars are drawn coarser than they should be, or not at all, for the work of
-    a frame is bounded. `rate_cam_rad_s` (3,) is the turn along which the stars' paths are drawn, None where they are points.
+    divided among up to `per_star` sprites. `capped` stars are drawn coarser than they should be, or not at all, because
+    the work of a frame is bounded. `rate_cam_rad_s` (3,) is the turn along which stars are drawn as paths, None for points.
     """
 
     data: npt.NDArray[np.void]
@@ -66,12 +66,12 @@ def make_sprites(stars: Stars, icrs_to_image: FloatArray, camera: Camera, footpr
 
 
 def max_stars(footprint_px: int) -> int:
-    """How many stars of a footprint's side are drawn at most."""
+    """The maximum number of stars drawn with footprints of that side."""
     return MAX_COVERED_PX // footprint_px**2
 
 
 def brightest(electrons_per_s: npt.NDArray[np.floating[Any]], count: int) -> IntArray | None:
-    """The places of the `count` brightest, in order; None where there are no more than that."""
+    """The places of the `count` brightest, in order; None where there are no more than `count`."""
     if len(electrons_per_s) <= count:
         return None
     return np.sort(np.argpartition(-electrons_per_s, count)[:count])

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import FloatArray
-from hilstar.errors import InputError, shortened
+from hilstar.errors import InputError, cannot_read, shortened
 from hilstar.reading import open_lines
 
 HIPPARCOS_EPOCH_JYEAR = 1991.25
@@ -39,7 +39,7 @@ class Catalog:
     """Stars with a position, V and B-V; ICRS, epoch J1991.25; every array has shape (n,).
 
     `pm_ra_cosdec_mas_yr` carries the cos(dec), as Hipparcos publishes it. `vi_mag` is NaN where the
-    catalogue gives none. `rows_read` counts the rows of the source, those left out included.
+    catalogue gives none. `rows_read` counts all rows of the source, skipped ones included.
     """
 
     hip: npt.NDArray[np.int32]
@@ -92,7 +92,7 @@ def read_hip_main(path: Path) -> tuple[dict[str, npt.NDArray[np.int64]], int]:
                 if steps is not None:
                     rows.append(steps)
     except csv.Error as error:
-        raise InputError(f"{path}: cannot be read as a Hipparcos catalogue ({error})") from error
+        raise cannot_read(path, error, "give the CDS I/239 hip_main.dat") from error
     if not rows:
         raise InputError(f"{path}: holds no star with position, V and B-V; give the CDS I/239 hip_main.dat")
     table = np.array(rows, dtype=np.int64)
@@ -100,7 +100,7 @@ def read_hip_main(path: Path) -> tuple[dict[str, npt.NDArray[np.int64]], int]:
 
 
 MISSING = np.iinfo(np.int64).min
-# What a star can have; past it no figure that is drawn means anything.
+# The range of each field; beyond it no rate or place means anything.
 RANGES: dict[str, tuple[float, float]] = {
     "hip": (0, 2**31 - 1),
     "v_mag": (-30, 40),
@@ -131,7 +131,7 @@ def _parse_row(row: list[str], where: str) -> list[int] | None:
             value = math.nan
         if not low <= value <= high:
             shown = shortened(text)
-            raise InputError(f"{where}: field {column} ({name}) is {shown!r}; {low:g} to {high:g} is wanted")
+            raise InputError(f"{where}: field {column} ({name}) is {shown!r}; write a number from {low:g} to {high:g}")
         steps[name] = round(value * per_unit)
     return list(steps.values())
 

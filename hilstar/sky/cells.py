@@ -8,11 +8,11 @@ import numpy as np
 
 from hilstar.arrays import FloatArray, IntArray
 
-# Measured over 116 812 stars and an 18 by 10 degree monitor: cells of 2 to 10 degrees cost 23 to 11 us
-# and hand on 1200 to 2700 stars; 4 degrees (13 us, 1500 stars) makes the sum of both least.
+# Measured over 116 812 stars and an 18 by 10 degree monitor: cells of 2 to 10 degrees take 23 to 11 us
+# and pass on 1200 to 2700 stars; 4 degrees (13 us, 1500 stars) minimises the time of both steps.
 # results/tradeoff.csv, culling: 1 to 6 degrees take the same time, a scan twenty times as long.
 CELL_DEG = 4.0
-# arccos near 1 knows an angle to 1e-8 rad only; a cell is made this much larger.
+# arccos near 1 is accurate to 1e-8 rad only; a cell is enlarged by this.
 RADIUS_MARGIN_RAD = 1e-6
 
 

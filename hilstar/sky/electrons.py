@@ -1,6 +1,6 @@
-"""Electron rates of stars: DGS (thesis eq. 3.1) and AGS (eq. 3.2), mended as the design says.
+"""Electron rates of stars: DGS (thesis eq. 3.1) and AGS (eq. 3.2), with the corrections that the functions state.
 
-Both are `10^(-0.4 V)` times a figure for V = 0. For DGS that figure depends on the star's temperature
+Both are `10^(-0.4 V)` times the rate at V = 0. For DGS that rate depends on the star's temperature
 alone, so it is tabulated once per bench; for AGS it is one number.
 """
 
@@ -37,7 +37,7 @@ SILICON_RANGE_NM = (300.0, 1100.0)
 # ln(electrons at V = 0) is smooth in 1/T. Degree 40 over this range is within 1e-11 of the integral
 # (tests/authority/test_electrons.py holds it to 1e-6 for every star of the catalogue).
 TABLE_RANGE_K = (1000.0, 200_000.0)
-# results/tradeoff.csv, brightness: as right as the integral at a fortieth of its time.
+# results/tradeoff.csv, brightness: as accurate as the integral in a fortieth of its time.
 TABLE_DEGREE = 40
 
 BrightnessModel = Literal["dgs", "ags"]
@@ -47,7 +47,7 @@ Weighting = Literal["energy", "photon"]
 
 @dataclass(frozen=True, slots=True)
 class Optics:
-    """What turns starlight into electrons: aperture, quantum efficiency, transmission."""
+    """The optics and sensor that turn starlight into electrons: aperture, quantum efficiency, transmission."""
 
     aperture_mm: float
     quantum_efficiency: Curve
@@ -143,7 +143,7 @@ def ags_electrons_per_s(optics: Optics, photometry: Photometry) -> float:
 def star_temperatures_k(bv_mag: FloatArray, scale: str) -> FloatArray:
     """Temperatures (n,) by a scale of TEMPERATURE_SCALES, held within TABLE_RANGE_K.
 
-    Only `wang2021` reaches its lower end: it would make a body of 296 K of the carbon star with B-V = 5.46.
+    Only `wang2021` reaches the lower end: it gives the carbon star with B-V = 5.46 a temperature of 296 K.
     """
     low_k, high_k = TABLE_RANGE_K
     return np.clip(TEMPERATURE_SCALES[scale](bv_mag), low_k, high_k)

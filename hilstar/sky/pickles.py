@@ -2,7 +2,7 @@
 
 Black bodies fail where molecules take over: B-V saturates near 1.5 and turns back, V-I does not. So the
 logarithm of a V = 0 star's electron rate is a smooth curve over V-I, with a term in B-V for the hottest:
-fitted to the library once per bench. tests/authority/test_pickles.py holds its errors, leave-one-out.
+fitted to the library once per bench. tests/authority/test_pickles.py holds the errors of held-out stars.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from hilstar.units import flux_ratio
 PACKAGED_LIBRARY = Path(__file__).resolve().parent / "data" / "pickles.npz"
 
 # Natural cubic splines with knots at equal shares of the library. 7 to 14 knots were tried, without B-V and with
-# it up to 0.1, 0.2 and 0.3 mag: from 10 knots on, with B-V, leave-one-out is within 1 % (median) and 3 % (95 %)
-# for V-I < 2.5 on the built-in sensors and a flat one; 12 is where it stops getting better.
+# it up to 0.1, 0.2 and 0.3 mag: from 10 knots on, with B-V, held-out stars are within 1 % (median) and 3 % (95 %)
+# for V-I < 2.5 on the built-in sensors and a flat one; beyond 12 knots nothing improves.
 VI_KNOT_COUNT = 12
 # Up to here (about F0) B-V tells supergiants and reddened stars from dwarfs of the same V-I; past it, B-V
 # follows the metal lines in the blue and makes the rates of cool supergiants worse.
 MAX_BV_TERM_MAG = 0.3
-# For stars without V-I. The late M giants' B-V is that of K giants with a tenth of their electrons: left out, they
-# are lost, and the K giants, fifty times as many to V = 7.5, are right.
+# For stars without V-I. Late M giants have the B-V of K giants and ten times their electrons. The fit excludes them: their
+# rates are wrong, and those of the K giants, fifty times as many to V = 7.5, are right.
 BV_KNOT_COUNT = 5
 MAX_BV_FIT_VI_MAG = 2.0
 
@@ -50,7 +50,7 @@ class Library:
 
 @dataclass(frozen=True, slots=True)
 class Spline:
-    """A natural cubic spline by its values' coefficients over `natural_basis`; held at its ends beyond them."""
+    """A natural cubic spline by its coefficients over `natural_basis`; constant beyond its end knots."""
 
     knots_mag: FloatArray
     coefficients: FloatArray
@@ -73,7 +73,7 @@ class PicklesTable:
     over_bv: Spline
 
     def electrons_per_s(self, v_mag: FloatArray, bv_mag: FloatArray, vi_mag: FloatArray) -> FloatArray:
-        """Electron rates of stars, shape (n,); a NaN V-I leaves it to B-V, a colour past the library is held at its end."""
+        """Electron rates of stars, shape (n,); B-V alone where V-I is NaN; a colour beyond the library counts as its end."""
         known = np.isfinite(vi_mag)
         both = self.over_vi(np.where(known, vi_mag, 0.0)) + self.per_bv * np.clip(bv_mag, *self.bv_range_mag)
         return np.asarray(flux_ratio(v_mag) * np.exp(np.where(known, both, self.over_bv(bv_mag))))
@@ -95,7 +95,7 @@ def load_library() -> Library:
 def tabulate_pickles(optics: Optics, photometry: Photometry) -> PicklesTable:
     """The rate table of a bench.
 
-    Raises InputError when the tracker detects light past the library's ends, or none of some library star.
+    Raises InputError when the tracker detects light beyond the library's range, or none of some library star.
     """
     library = load_library()
     return fit_table(library.bv_mag, library.vi_mag, library_electrons_per_s(library, optics, photometry))
@@ -116,7 +116,7 @@ def library_electrons_per_s(library: Library, optics: Optics, photometry: Photom
     )
     rate = optics.area_m2 * dilution * (library.flux @ _onto_grid(library.wavelength_nm, nodes_nm, response))
     if not (rate > 0).all():
-        raise InputError('tracker: gives no electron for a star of the Pickles library; write spectrum = "blackbody"')
+        raise InputError('tracker: a star of the Pickles library gives no electron; write spectrum = "blackbody"')
     return np.asarray(rate)
 
 

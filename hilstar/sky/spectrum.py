@@ -22,7 +22,7 @@ STEFAN_BOLTZMANN_W_M2_K4 = 5.670374419e-8
 DATA_DIR = Path(__file__).resolve().parent / "data"
 MAX_CURVE_BYTES = 1_000_000
 MAX_CURVE_ROWS = 10_000
-RANGE_NM = (1.0, 100_000.0)  # no sensor sees beyond; each MAX_INTERVAL_NM costs nodes
+RANGE_NM = (1.0, 100_000.0)  # beyond any sensor; each MAX_INTERVAL_NM costs nodes
 BUILT_IN_CURVES = ("ccd47-20", "kai-4021", "n-bk7-10mm", "johnson-v")
 
 # Gauss-Legendre nodes in each interval between knots of the curves; intervals are at most this wide.
@@ -61,7 +61,7 @@ def load_curve(source: str | float, what: str, folder: Path = DATA_DIR) -> Curve
     """
     if isinstance(source, int | float):
         if not 0.0 <= source <= 1.0:
-            raise InputError(f"{what} = {source}: a number from 0 to 1 is wanted")
+            raise InputError(f"{what} = {source}: write a number from 0 to 1")
         return constant_curve(float(source))
     if source in BUILT_IN_CURVES:
         return read_curve_csv(DATA_DIR / f"{source}.csv")
@@ -100,24 +100,24 @@ def read_curve_csv(path: Path) -> Curve:
 def _check_curve(curve: Curve, path: Path) -> None:
     wavelength_nm, value = curve.wavelength_nm, curve.value
     if len(wavelength_nm) < 2:
-        raise InputError(f"{path}: {len(wavelength_nm)} rows; at least two rows wavelength_nm,value are wanted")
+        raise InputError(f"{path}: {len(wavelength_nm)} rows; write at least two rows wavelength_nm,value")
     if not (np.isfinite(wavelength_nm).all() and np.isfinite(value).all()):
         raise InputError(f"{path}: a wavelength or a value is not finite; write numbers")
     if not (np.diff(wavelength_nm) > 0).all() or wavelength_nm[0] <= 0:
-        raise InputError(f"{path}: wavelengths do not rise from row to row; sort them, in nm, each once")
+        raise InputError(f"{path}: wavelengths do not rise from row to row; sort them, each once, in nm")
     if len(wavelength_nm) > MAX_CURVE_ROWS:
-        raise InputError(f"{path}: {len(wavelength_nm)} rows; at most {MAX_CURVE_ROWS} are read, so leave some out")
+        raise InputError(f"{path}: {len(wavelength_nm)} rows; at most {MAX_CURVE_ROWS} are read: remove some")
     if wavelength_nm[0] < RANGE_NM[0] or wavelength_nm[-1] > RANGE_NM[1]:
         ends = f"{wavelength_nm[0]:g} to {wavelength_nm[-1]:g} nm"
-        raise InputError(f"{path}: wavelengths from {ends}; {RANGE_NM[0]:g} to {RANGE_NM[1]:g} nm are wanted")
+        raise InputError(f"{path}: wavelengths from {ends}; write {RANGE_NM[0]:g} to {RANGE_NM[1]:g} nm")
     if value.min() < 0 or value.max() > 1:
-        raise InputError(f"{path}: values from {value.min():g} to {value.max():g}; fractions from 0 to 1 are wanted")
+        raise InputError(f"{path}: values from {value.min():g} to {value.max():g}; write fractions from 0 to 1")
 
 
 def blackbody_exitance_w_m2_m(wavelength_nm: FloatArray, temperature_k: float | FloatArray) -> FloatArray:
     """pi B(lambda, T), W per m2 and m of wavelength (thesis eq. 3.3, 3.4); the shapes broadcast.
 
-    Written with exp(-x), so that a small lambda T gives 0 and no overflow.
+    Written with exp(-x), so that a small lambda T gives 0 instead of an overflow.
     """
     wavelength_m = wavelength_nm * 1e-9
     x = PLANCK_J_S * LIGHT_M_S / (wavelength_m * BOLTZMANN_J_K * temperature_k)

@@ -29,7 +29,7 @@ class Stars:
 
 
 def split_by_rate(stars: Stars, faintest_e_per_s: float) -> tuple[Stars, Stars]:
-    """The stars of at least so many electrons per second and the fainter ones, each in their own cells.
+    """The stars of at least `faintest_e_per_s` electrons per second, and the fainter ones, each in their own cells.
 
     The first are `stars` itself where no star is fainter.
     """

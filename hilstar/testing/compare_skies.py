@@ -147,4 +147,4 @@ def _unexplained(light: FloatArray, fit: _Fit, moved: _Fit) -> tuple[FloatArray,
     column, row = seeds.astype(np.intp).T
     return places, np.maximum(
         flux, light[row, column]
-    )  # of two on one place the fit may give one too much, the other less than 0
+    )  # of two at one place the fit may give one too much and the other less than 0

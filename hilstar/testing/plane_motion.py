@@ -12,7 +12,7 @@ from hilstar.arrays import FloatArray
 
 MORE_STARS = 0.1  # of all: how many more stars a motion with more parameters has to explain
 ROUNDS = 40  # of reweighted least squares, which converge to the minimum sum of absolute residuals
-FINEST_PX = 1e-4  # residuals under this weigh alike
+FINEST_PX = 1e-4  # smaller residuals all weigh the same
 MIN_SHARE = 0.5  # of the median star's displacement, which a motion must explain
 
 # Displacements (n, 2), px, of places (n, 2), px from the middle of the image.
@@ -81,7 +81,7 @@ def fitted_motion(places: FloatArray, moves: FloatArray, rank: int) -> Motion:
 
 
 def _moved(at: FloatArray, found: FloatArray) -> FloatArray:
-    """By how much a motion of 2, 4 or 8 numbers moves places (n, 2)."""
+    """The displacements (n, 2) of places (n, 2) by a motion of 2, 4 or 8 numbers."""
     x, y = at.T
     if len(found) == 2:
         return np.broadcast_to(found, at.shape).copy()

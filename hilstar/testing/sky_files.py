@@ -21,7 +21,7 @@ UNIT = "electron/s"
 MAX_E_PER_S = 1e30  # whose square is still a number
 TRUTH_COLUMNS = ("hip", "x_px", "y_px", "electrons_per_s")
 MAX_TRUTH_BYTES = 50_000_000
-MAX_FITS_BYTES = 600_000_000  # a frame of 8K has 133 MB
+MAX_FITS_BYTES = 600_000_000  # an 8K frame has 133 MB
 
 
 def read_frame_fits(path: Path) -> FloatArray:
@@ -35,9 +35,9 @@ def read_frame_fits(path: Path) -> FloatArray:
             warnings.simplefilter("ignore")  # of astropy, about cards; what matters is checked below
             image, header = fits.getdata(io.BytesIO(raw), header=True)
     except Exception as error:  # astropy raises whatever a broken header causes in its layers
-        raise InputError(f"{path}: no FITS image; {wanted}") from error
+        raise InputError(f"{path}: not a FITS image; {wanted}") from error
     if header.get("BUNIT") != UNIT or image is None or image.ndim != 2 or image.dtype.kind != "f":
-        raise InputError(f"{path}: no linear image in {UNIT} (BUNIT is {header.get('BUNIT')!r}); {wanted}")
+        raise InputError(f"{path}: not a linear image in {UNIT} (BUNIT is {header.get('BUNIT')!r}); {wanted}")
     light = np.asarray(image, dtype=np.float64)
     if (np.abs(light[np.isfinite(light)]) > MAX_E_PER_S).any():
         raise InputError(f"{path}: a pixel has more than {MAX_E_PER_S:g} {UNIT}; {wanted}")
@@ -45,7 +45,7 @@ def read_frame_fits(path: Path) -> FloatArray:
 
 
 def _inflated(path: Path, raw: bytes, wanted: str) -> bytes:
-    """A file's bytes, unpacked where they are gzip's, to no more than a FITS may have. Raises InputError."""
+    """A file's bytes, unpacked where they are a gzip file's, up to the size that a FITS may have. Raises InputError."""
     if raw[:2] != b"\x1f\x8b":
         return raw
     try:

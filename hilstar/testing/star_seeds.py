@@ -18,7 +18,7 @@ from hilstar.testing.star_fit import RIPPLE_SHARE, around, bright_pixels, star_s
 BLEND_SIGMAS, BLEND_PX = 1.5, 1.25
 KNOWN_STARS = 20  # the brightest, at least half of which a truth table must have
 
-# Rows of bench.build.TRUTH_DTYPE.
+# Rows of bench.truth.TRUTH_DTYPE.
 Truth = npt.NDArray[np.void]
 
 
@@ -60,7 +60,7 @@ def find_seeds(golden: FloatArray, truth: Truth | None, sigma_px: tuple[float, f
 
 
 def nameless_seeds(places_px: FloatArray, sigma_px: tuple[float, float]) -> Seeds:
-    """Seeds at places (n, 2), px, brightest first; near ones are one."""
+    """Seeds at places (n, 2), px, brightest first; those closer than a blend are one."""
     return _blended(Seeds(places_px, [()] * len(places_px)), blend_distance_px(sigma_px))
 
 
@@ -94,7 +94,7 @@ def _places_px(truth: Truth) -> FloatArray:
 
 
 def _nearest(known_px: FloatArray, places_px: FloatArray) -> tuple[FloatArray, IntArray]:
-    """For each of places (n, 2): how far the nearest known one is, px, and which."""
+    """For each of places (n, 2): the distance to the nearest known one, px, and its index."""
     distance_px, nearest = cKDTree(known_px).query(places_px)
     return np.asarray(distance_px), np.asarray(nearest, dtype=np.intp)
 

@@ -28,9 +28,9 @@ from hilstar.errors import InputError
 Window = Literal["gaussian", "plain"]
 BoolArray = npt.NDArray[np.bool_]
 
-MAD_TO_SIGMA = 1.482602218505602  # of a normal law: 1 / its upper quartile
+MAD_TO_SIGMA = 1.482602218505602  # of a normal distribution: 1 / its upper quartile
 CLIP_SIGMAS = 3.0
-CLIPPED_SIGMA = 0.986578  # the sigma of a normal law cut at 3 sigma: sqrt(1 - 6 pdf(3) / (2 cdf(3) - 1))
+CLIPPED_SIGMA = 0.986578  # the sigma of a normal distribution cut at 3 sigma: sqrt(1 - 6 pdf(3) / (2 cdf(3) - 1))
 MIN_STEP_PX = 1e-7
 EIGHT_NEIGHBOURS = np.ones((3, 3), dtype=np.int8)
 # Of s^2, the share by which the window can narrow the star's second moment: Newton's step is at most 10 times the
@@ -49,11 +49,11 @@ class Background:
 
 @dataclass(frozen=True, slots=True)
 class CentroidSettings:
-    """How stars are found: pixels over `threshold_sigma`, in blobs of `minimum_pixels`, then a window around each.
+    """How stars are found: pixels above `threshold_sigma`, in blobs of `minimum_pixels`, then a window around each.
 
     `window_radius_px` (default: 4 window sigmas, rounded up) is half the window's side: it is 2 radius + 1 pixels wide.
     `psf_sigma_px` (x, y), where known, removes the S-curve of that Gaussian star from the places.
-    Raises InputError for a value that makes no sense.
+    Raises InputError for a value out of range.
     """
 
     threshold_sigma: float = 5.0
@@ -104,7 +104,7 @@ class Centroids:
 
 @dataclass(frozen=True, slots=True)
 class _Blobs:
-    """What the threshold found: arrays (n,), places by the centre of gravity of what is over the background."""
+    """What the threshold found: arrays (n,), places by the centre of gravity of what is above the background."""
 
     x_px: FloatArray
     y_px: FloatArray
@@ -122,7 +122,7 @@ def estimate_background(image: npt.NDArray[Any]) -> Background:
     checked = _checked(image)
     median = float(np.median(checked))
     sigma = MAD_TO_SIGMA * float(np.median(np.abs(checked - median)))
-    # Where the noise is under a DN, a cut at 3 sigma would take a code on one side and leave its like on the other.
+    # Where the noise is under a DN, a cut at 3 sigma would keep a code on one side and drop its counterpart on the other.
     half_width = CLIP_SIGMAS * (max(sigma, 1.0) if image.dtype.kind in "iu" else sigma)
     kept = checked[np.abs(checked - median) <= half_width]
     noise = float(kept.std()) / CLIPPED_SIGMA
@@ -169,7 +169,7 @@ def _checked(image: npt.NDArray[Any]) -> FloatArray:
 
 
 def _find_blobs(signal: FloatArray, threshold: float, minimum_pixels: int) -> _Blobs:
-    """Connected pixels over the threshold, diagonals included, in the order in which rows meet them."""
+    """Connected pixels above the threshold, diagonals included, in the order of the rows that meet them."""
     labels, found = ndimage.label(signal > threshold, structure=EIGHT_NEIGHBOURS)
     y, x = np.nonzero(labels)
     blob, value = labels[y, x] - 1, signal[y, x]
@@ -177,7 +177,7 @@ def _find_blobs(signal: FloatArray, threshold: float, minimum_pixels: int) -> _B
     flux = np.bincount(blob, value, minlength=found)
     peak = np.zeros(found)
     np.maximum.at(peak, blob, value)
-    # Everything over a threshold of 0 or more is positive, so no blob's flux is 0.
+    # Everything above a threshold of 0 or more is positive, so no blob's flux is 0.
     x_px, y_px = (np.bincount(blob, value * place, minlength=found) / flux for place in (x, y))
     kept = pixels >= minimum_pixels
     return _Blobs(x_px[kept], y_px[kept], peak[kept], pixels[kept])

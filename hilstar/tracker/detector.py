@@ -1,4 +1,4 @@
-"""The detector's noise (thesis section 4.3, tables 4.1 and 4.2, mended): expected electrons in, DN out.
+"""The detector's noise (thesis section 4.3, tables 4.1 and 4.2, corrected): expected electrons in, DN out.
 
 The physical order, which is the order of `Detector.expose`:
 
@@ -36,7 +36,7 @@ class Detector:
     def __init__(
         self, settings: DetectorSettings, resolution_px: tuple[int, int], pixel_pitch_um: float = DEFAULT_PITCH_UM
     ) -> None:
-        """`resolution_px` is (width, height). Raises InputError where it is not positive, or the pitch is no sensor's."""
+        """`resolution_px` is (width, height). Raises InputError where it is not positive, or the pitch is not a sensor's."""
         check_value("pixel_pitch_um", pixel_pitch_um, PixelPitch)
         width, height = resolution_px
         if width < 1 or height < 1:
@@ -101,7 +101,9 @@ class Detector:
     def _check_largest(self, expected_e: npt.NDArray[Any]) -> None:
         largest_e = expected_e.max()
         if not largest_e <= MAX_E:
-            raise InputError(f"{largest_e:.3g} electrons in one pixel; {MAX_E:g} can be simulated: shorten the exposure")
+            raise InputError(
+                f"{largest_e:.3g} electrons in one pixel, at most {MAX_E:g} can be simulated; shorten the exposure"
+            )
 
     def _fill_wells(self, collected_e: FloatArray) -> FloatArray:
         full_e = self.settings.full_well_e
@@ -137,9 +139,9 @@ def _dark_map_e_per_s(
 
 
 def bloom(charge_e: FloatArray, full_well_e: float) -> FloatArray:
-    """`charge_e` with what is over the full well spilt along its columns, half up and half down; same shape.
+    """`charge_e` with what exceeds the full well spilt along its columns, half up and half down; same shape.
 
-    No charge is lost but what runs out of the column's ends.
+    Only the charge that leaves a column at its ends is lost.
     """
     kept_e = np.minimum(charge_e, full_well_e)
     columns = np.flatnonzero((charge_e > full_well_e).any(axis=0))

@@ -98,7 +98,7 @@ def zero_point_mag(bench: Bench) -> float:
     Raises InputError where it has none.
     """
     stars = bench.stars
-    # The bench's stars of that colour, or the nearest to it: none of them is far off in a bench with stars.
+    # The stars of that colour, or else the nearest to it: where there are stars, none of these is far from it.
     distance = np.abs(stars.bv_mag - SOLAR_BV)
     alike = distance <= max(LIKE_SOLAR_BV, float(distance.min()))
     return float(np.median(stars.v_mag[alike] - magnitude(stars.electrons_per_s[alike])))
@@ -112,7 +112,7 @@ def corner_share(sigma_px: tuple[float, float]) -> float:
 def nothing_below_e_per_s(bench: Bench) -> float:
     """The rate below which a star lights no pixel, wherever it is; for dithers, where it lights one in half of the frames."""
     drawn = bench.faintest_shown_e_per_s
-    return drawn or bench.calibration.response.half_step * bench.flux_at_white_e_per_s
+    return drawn or float(bench.calibration.response.light[1]) / 2 * bench.flux_at_white_e_per_s
 
 
 def not_drawn(bench: Bench) -> NotDrawn:

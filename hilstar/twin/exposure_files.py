@@ -44,7 +44,7 @@ def write_exposure_png(path: Path, dn: npt.NDArray[np.uint16]) -> None:
 
 
 def write_dn_picture(path: Path, dn: npt.NDArray[np.uint16]) -> None:
-    """The DN themselves, unscaled, as greyscale of 16 bits: TIFF where the name ends in .tif or .tiff, else PNG."""
+    """The DN themselves, unscaled, as 16-bit greyscale: TIFF where the name ends in .tif or .tiff, else PNG."""
     from PIL import Image
 
     form = "TIFF" if path.suffix.lower() in {".tif", ".tiff"} else "PNG"

@@ -28,7 +28,7 @@ Noise = Literal["full", "none"]
 
 @dataclass(frozen=True, slots=True)
 class FrameNoise:
-    """Noise of frames: "full", or "none" for the mean signal through the ADC; and the seed of what is drawn anew in each."""
+    """Noise of frames: "full", or "none" for the mean signal through the ADC; and its seed."""
 
     kind: Noise = "full"
     seed: int = 0
@@ -106,7 +106,7 @@ class Simulator:
 
 
 def background_e(config: BenchConfig, folder: Path) -> FloatArray:
-    """Electrons per exposure between the stars, (height, width): level, plus a gradient that leaves its middle alone.
+    """Electrons per exposure between the stars, (height, width): level, plus a gradient that is 0 in the middle.
 
     Zodiacal light is V mag/arcsec^2 through the tracker's optics, times a pixel's solid angle (thesis eq. 4.10, 4.11).
     """

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import csv
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.constants import c, h, k, sigma
-from scipy.integrate import quad, quad_vec
+from scipy.integrate import quad_vec
 
 from hilstar.sky.catalog import load_catalog
 from hilstar.sky.electrons import Optics, Photometry, ags_electrons_per_s, dgs_electrons_per_s, star_temperatures_k, tabulate
-from hilstar.sky.spectrum import DATA_DIR, TEMPERATURE_SCALES, constant_curve, load_curve
+from hilstar.sky.spectrum import TEMPERATURE_SCALES, constant_curve, load_curve
+from tests.authority.integrals import integral, read, v_mean
 
 # The issue's limit on the table.
 TABLE_LIMIT = 1e-6
@@ -21,30 +21,10 @@ TABLE_LIMIT = 1e-6
 QUAD = 1e-9
 
 
-def read(name: str) -> tuple[np.ndarray, np.ndarray]:
-    rows = [row for row in csv.reader((DATA_DIR / f"{name}.csv").read_text().splitlines()) if row[0][0].isdigit()]
-    return np.array(rows, dtype=float).T
-
-
 def planck(wavelength_nm: float, temperature_k: float | np.ndarray) -> float | np.ndarray:
     """pi B, W/m2/m, written anew from the textbook."""
     m = wavelength_nm * 1e-9
     return 2 * np.pi * h * c**2 / m**5 / np.expm1(h * c / (m * k * temperature_k))
-
-
-def integral(function, knots_nm: np.ndarray) -> float:
-    """Adaptive quadrature over wavelength in nm, between knots."""
-    return sum(quad(function, a, b, epsabs=0, epsrel=1e-10)[0] for a, b in pairwise(knots_nm))
-
-
-def v_mean(spectrum, weighting: str) -> float:
-    knots, response = read("johnson-v")
-    power = 1 if weighting == "photon" else 0
-
-    def r(w: float) -> float:
-        return float(np.interp(w, knots, response)) * w**power
-
-    return integral(lambda w: spectrum(w) * r(w), knots) / integral(r, knots)
 
 
 def independent_rate(temperature_k: float, zero_point: str = "vega", weighting: str = "energy") -> float:

@@ -16,7 +16,7 @@ from hilstar.scene.exposure_motion import smeared_sprites
 from hilstar.sky.electrons import Optics, Photometry, zodiacal_electrons_per_s_arcsec2
 from hilstar.sky.spectrum import Curve
 from hilstar.twin.simulator import Simulator
-from tests.authority.test_electrons import read, v_mean
+from tests.authority.integrals import read, v_mean
 from tests.support.benches import ROOT, SMALL_BENCH
 
 # The limit.

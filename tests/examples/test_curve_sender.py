@@ -17,8 +17,6 @@ from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.senders import free_port
 from tests.support.servers import listening
 
-pytestmark = pytest.mark.e2e
-
 EVERYWHERE = "tcp://*:5560"
 
 

@@ -17,8 +17,6 @@ from scipy.spatial.transform import Rotation
 from tests.examples.support import EXAMPLES, commands, copied, section
 from tests.support.commands import run_hilstar_here
 
-pytestmark = pytest.mark.e2e
-
 STEP_S = 0.1
 # The trapezoidal rule's error in one step, h^3 / 12 times the largest second derivative of the rate, A/T (2 pi/T)^2.
 STEP_ERROR_RAD = STEP_S**3 / 12 * np.radians(20) / 20 * (2 * np.pi / 20) ** 2

@@ -10,8 +10,6 @@ import pytest
 
 from tests.examples.support import EXAMPLES, copied, section
 
-pytestmark = pytest.mark.e2e
-
 SIGMA_TOLERANCE = 0.3  # of 1: five standard errors of a standard deviation of 126 errors, 1 / sqrt(2 * 126)
 
 

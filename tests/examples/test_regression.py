@@ -13,8 +13,6 @@ import pytest
 from tests.examples.support import commands, copied, section
 from tests.support.commands import run_hilstar_here
 
-pytestmark = pytest.mark.e2e
-
 
 def test_it_passes_on_the_same_sky_and_fails_on_another(tmp_path, monkeypatch):
     folder = copied(tmp_path)

@@ -19,8 +19,6 @@ from tests.support.benches import ROOT, SMALL_BENCH
 from tests.support.ptys import Cable
 from tests.support.servers import interrupted, listening
 
-pytestmark = pytest.mark.e2e
-
 EXAMPLES = ROOT / "examples"
 STRICT = ["-Wall", "-Wextra", "-Werror", "-pedantic"]
 BAUD = 921_600

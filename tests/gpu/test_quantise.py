@@ -10,7 +10,7 @@ from hilstar.monitor.exact import ExactQuantiser
 from hilstar.monitor.quantise import Panel, dither_levels, frame_shift, round_levels, temporal_levels, turned_mask
 from hilstar.monitor.response import bit_stealing_response, gamma_response, srgb_response
 from hilstar.render.renderer import Renderer, Target
-from tests.gpu.test_renderer import sprites_at
+from tests.support.stars import sprites_at
 
 SIZE = (256, 192)
 SIGMA = (0.85, 0.85)

@@ -14,7 +14,8 @@ from hilstar.render import renderer as renderer_module
 from hilstar.render.reference import linear_image
 from hilstar.render.renderer import Renderer, Target
 from hilstar.scene.psf import MAX_CUT, footprint_px
-from hilstar.scene.sprites import SPRITE_DTYPE, Sprites
+from hilstar.scene.sprites import Sprites
+from tests.support.stars import sprites_at
 
 # The limits. Measured on llvmpipe: 1.2e-6 and 1.0e-5 px at worst, the footprint's cut (1e-6) the most of both.
 FLUX_LIMIT = 1e-5
@@ -24,15 +25,6 @@ CENTROID_LIMIT_PX = 1e-4
 PIXEL_LIMIT = 2 * 4.4e-7
 # Blending n stars in float32 rounds n times: for the few that overlap here.
 BLEND_LIMIT = 1e-6
-
-
-def sprites_at(pixels: np.ndarray, electrons_per_s: np.ndarray, footprint: int) -> Sprites:
-    data = np.empty(len(pixels), dtype=SPRITE_DTYPE)
-    whole = np.floor(pixels + (0.5 if footprint % 2 else 0.0))
-    data["pixel"] = whole
-    data["fraction_px"] = pixels - whole
-    data["electrons_per_s"] = electrons_per_s
-    return Sprites(data, footprint, np.arange(len(pixels)), pixels[:, 0].copy(), pixels[:, 1].copy())
 
 
 def draw(target: Target, pixels: np.ndarray, electrons_per_s: np.ndarray) -> tuple[np.ndarray, np.ndarray, Sprites]:

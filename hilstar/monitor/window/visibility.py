@@ -1,4 +1,4 @@
-"""Whether an X11 window is seen: a thread with a connection of its own hears of it, so that no frame ever asks the server."""
+"""Whether an X11 window is seen: a thread with its own connection listens, so that no frame ever asks the server."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hilstar.monitor.window.x11 import X11_LIBRARY, Survival
 VISIBILITY_CHANGES, STRUCTURE_CHANGES = 1 << 16, 1 << 17
 VISIBILITY_NOTIFY, DESTROY_NOTIFY, UNMAP_NOTIFY, MAP_NOTIFY = 15, 17, 18, 19
 COVERED = ("", "covered in part", "covered")  # by VisibilityNotify's state
-LOOK_AGAIN_S = 0.5  # at what tells of no change: the place of a window's parents, and the display's sleep
+LOOK_AGAIN_S = 0.5  # interval of what sends no events: the position of a window's parents, and the display's sleep
 Place = tuple[tuple[int, int], tuple[int, int]]  # corner and size, px of the whole screen
 
 
@@ -38,7 +38,7 @@ class _Event(ctypes.Union):
 
 
 class Visibility:
-    """Watches one window; `hidden` says why it is not seen whole, "" where it is. It has to fill `place`, if that is given."""
+    """Watches one window, which has to fill `place` if given; `hidden` says why it is not wholly seen, "" where it is."""
 
     def __init__(self, x11: Any, connection: int, window: int, place: Place | None) -> None:
         self._x11, self._connection, self._window, self.place = x11, connection, window, place
@@ -54,7 +54,7 @@ class Visibility:
 
     @classmethod
     def of(cls, window: int, place: Place | None, survival: Survival) -> Self | None:
-        """The watch of a window that has to fill `place` (None: that may be anywhere); None where there is no connection."""
+        """Watch a window that has to fill `place` (None: that may be anywhere); None without a connection to the server."""
         try:
             x11 = _library()
         except (OSError, AttributeError):
@@ -76,7 +76,7 @@ class Visibility:
             if self._there:
                 self.hidden = self._why(off_place)
             ready = select.select([descriptor, self._stop], [], [], LOOK_AGAIN_S)[0]
-            # A connection with something to read and no event is at its end.
+            # A readable connection without an event has ended.
             if self._stop in ready or (ready and self._x11.XPending(self._connection) <= 0 and _ended(descriptor)):
                 return
 
@@ -91,11 +91,11 @@ class Visibility:
     def _why(self, off_place: str) -> str:
         if not self._mapped:
             return "not on the screen"
-        # What is off the screen is covered too, by X11's account.
+        # X11 also calls covered what is off the screen.
         return off_place or COVERED[self._covered] or ("on a display that sleeps" if self._asleep() else "")
 
     def _off_place(self) -> str:
-        """Where the window is not: on its display, or wholly on the screen."""
+        """Why the window is not where it should be: on its display, or wholly on the screen; "" where it is."""
         root = self._x11.XDefaultRootWindow(self._connection)
         size, screen = self._geometry(self._window), self._geometry(root)
         x, y, child = ctypes.c_int(), ctypes.c_int(), ctypes.c_ulong()
@@ -129,17 +129,17 @@ class Visibility:
 def _ended(descriptor: int) -> bool:
     poll = select.poll()
     poll.register(descriptor, 0)
-    return bool(poll.poll(0))  # asked for nothing, it still tells of an end
+    return bool(poll.poll(0))  # without requested events, it still reports a hang-up
 
 
 def _sleep_of(connection: int) -> Any:
-    """Asks whether the display sleeps (DPMS); never where nobody can say."""
+    """A function that tells whether the display sleeps (DPMS); always false where that is not known."""
     try:
         library: Any = ctypes.CDLL("libXext.so.6")
         library.DPMSCapable.argtypes = [ctypes.c_void_p]
         library.DPMSInfo.argtypes = [ctypes.c_void_p] * 3
         parts = (ctypes.byref(ctypes.c_int()) for _ in range(3))
-        # Asked for what is not there, Xlib says so on stderr.
+        # Asked for a missing extension, Xlib prints to stderr.
         if not _library().XQueryExtension(connection, b"DPMS", *parts) or not library.DPMSCapable(connection):
             return bool
     except (OSError, AttributeError):

@@ -1,4 +1,4 @@
-"""The window on the monitor: full screen on the one chosen, or in a frame on the desk. The only user of glfw."""
+"""The window on the monitor: full screen on a chosen display, or an ordinary window. The only user of glfw."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Display:
-    """A monitor of this machine as its system has it; `refresh_hz` is 0 where it does not say (Xvfb)."""
+    """A monitor of this machine as the system describes it; `refresh_hz` is 0 where it does not say (Xvfb)."""
 
     index: int
     name: str
@@ -44,7 +44,7 @@ class Display:
 
 @dataclass(frozen=True, slots=True)
 class WindowSettings:
-    """`display` is an index or a part of a name, None for a window on the desk; `bits` are those wanted of each colour."""
+    """`display` is an index or a part of a name, None for an ordinary window; `bits` are requested per colour."""
 
     resolution_px: tuple[int, int]
     bits: int
@@ -137,7 +137,7 @@ class Window:
         width, height = settings.resolution_px if self.display is None else self.display.resolution_px
         self._window = glfw.create_window(width, height, TITLE, monitor, None)
         if not self._window:
-            raise MachineError("no window with OpenGL 3.3 can be had; install it: apt-get install libgl1 libgl1-mesa-dri")
+            raise MachineError("no window with OpenGL 3.3 can be opened; install it: apt-get install libgl1 libgl1-mesa-dri")
         glfw.make_context_current(self._window)
         glfw.swap_interval(1)
         glfw.set_input_mode(self._window, glfw.CURSOR, glfw.CURSOR_HIDDEN if monitor else glfw.CURSOR_NORMAL)
@@ -156,7 +156,7 @@ class Window:
             self._set_identity_ramp(monitor)
 
     def _set_identity_ramp(self, monitor: Any) -> None:
-        """The system's own correction would change what the calibration measured."""
+        """Set the identity: a correction by the system would change what the calibration measured."""
         ramp: Any = glfw.get_gamma_ramp(monitor)
         size = 0 if ramp is None else len(ramp.red)
         if not size:
@@ -171,7 +171,7 @@ class Window:
 
     @property
     def hidden(self) -> str:
-        """Why the window is not seen as it is drawn: minimised, covered, off the screen; "" where it is, or nobody can say."""
+        """Why the window is not seen as drawn: minimised, covered, off the screen; "" where it is, or that is not known."""
         if self.lost:
             return "without its display"
         if self._minimised:
@@ -186,7 +186,7 @@ class Window:
         self._changed = True
 
     def _follow_display(self) -> None:
-        """A display that was unplugged leaves a window on no monitor; once it is back the window fills it again."""
+        """Notice that the display was unplugged, and fill it again once it is back."""
         self._changed = False
         display = self.display
         if display is None:
@@ -195,7 +195,7 @@ class Window:
         monitor = next((m for m in glfw.get_monitors() if _describe(0, m).name == display.name), None)
         if monitor is None and not self.lost:
             self.lost, self._ramp = True, None
-            log.warning("the display %s is gone; frames go on, and it is taken up when it returns", display.name)
+            log.warning("the display %s is gone; frames go on, and the window returns to it when it is back", display.name)
         elif monitor is not None and (self.lost or not on_it):
             width, height = display.resolution_px
             glfw.set_window_monitor(self._window, monitor, 0, 0, width, height, display.refresh_hz or glfw.DONT_CARE)
@@ -222,7 +222,7 @@ class Window:
 
     @property
     def depth_bits(self) -> int:
-        """Bits of a colour on the screen: the least of the three that its mode has."""
+        """Bits per colour of the screen's mode: the minimum of the three."""
         monitor = glfw.get_window_monitor(self._window) or glfw.get_primary_monitor()
         bits = glfw.get_video_mode(monitor).bits
         return int(min(bits.red, bits.green, bits.blue))
@@ -234,7 +234,7 @@ class Window:
 
     @property
     def closing(self) -> bool:
-        """True once somebody closed it, or it is gone."""
+        """True once the user closed it, or it is gone."""
         return self.gone is not None or bool(glfw.window_should_close(self._window))
 
     @property
@@ -257,9 +257,9 @@ class Window:
         return "after-swap clock" if self._sync is None else "GLX_OML_sync_control"
 
     def swap(self, wait: Callable[[], None] = lambda: None) -> int:
-        """Show what was drawn; host time, ns, at which that was done: the driver's, else that just after.
+        """Show what was drawn; the host time, ns, of the swap: the driver's, else that just after the call.
 
-        `wait` returns once the swap is done, where `glfwSwapBuffers` itself may come back before.
+        `wait` returns once the swap is done, where `glfwSwapBuffers` itself may return earlier.
         """
         if self.gone is None:
             glfw.swap_buffers(self._window)
@@ -268,22 +268,22 @@ class Window:
         if self._sync is not None and self.gone is None:
             swap_ns = self._sync.swap_ns()
             if swap_ns is None:
-                log.warning("GLX_OML_sync_control gives no time; the host's clock after the swap is used")
+                log.warning("GLX_OML_sync_control gives no time; the host's clock just after the swap is used instead")
                 self._sync = None
             else:
                 now_ns = swap_ns
         return now_ns
 
     def look_at_events(self) -> None:
-        """Take in keys, and monitors that come and go."""
+        """Handle keys, and monitors that come and go."""
         if self.gone is None:
             glfw.poll_events()
         if self._changed and self.gone is None:
             self._follow_display()
 
     def close(self) -> None:
-        """Give the monitor its gamma ramp back, and close."""
-        if self.gone is not None:  # nobody is there who could be told
+        """Restore the monitor's gamma ramp, and close."""
+        if self.gone is not None:  # there is no server left to tell
             return
         if self._visibility is not None:
             self._visibility.close()
@@ -313,4 +313,4 @@ def _find(wanted: int | str) -> tuple[Display, Any]:
         if wanted == display.index or (isinstance(wanted, str) and wanted.lower() in display.name.lower()):
             return display, monitor
     known = "; ".join(display.line() for display in described)
-    raise InputError(f"[monitor] display = {wanted!r}: there is none; write the index or name of one of {known}")
+    raise InputError(f"[monitor] display = {wanted!r}: no such display; write the index or name of one of {known}")

@@ -1,5 +1,5 @@
-"""What only X11 and GLX can say, through ctypes: when a swap reached the screen, whether something composes windows, and
-that the server or the window is gone.
+"""What only X11 and GLX know, through ctypes: when a swap reached the screen, whether a compositor runs, and that the
+server or the window is gone.
 
 Each answer is None or False where the system has no such thing: Wayland, or a driver without the extension.
 """
@@ -15,7 +15,7 @@ from hilstar.units import NS_PER_US
 
 GL_LIBRARY, X11_LIBRARY = "libGL.so.1", "libX11.so.6"
 SYNC_EXTENSION = b"GLX_OML_sync_control"
-# A UST that is not of this host's monotonic clock, or of another swap, is not to be believed.
+# A UST further back is of another clock than this host's monotonic one, or of another swap.
 MAX_UST_AGE_NS = 1_000_000_000
 BAD_WINDOW, BAD_DRAWABLE, FIRST_EXTENSION_ERROR = 3, 9, 128  # X.h; those of extensions are GLX's here
 SERVER_GONE = "the X server is gone, or has closed the window's connection"
@@ -42,7 +42,7 @@ _ErrorHandler = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.POINTER(_
 
 
 class Survival:
-    """Xlib ends the process where the server or a window goes away; while this is kept, it calls `on_end(why)` instead."""
+    """Xlib ends the process when the server or a window goes away; while this object lives, it calls `on_end(why)` instead."""
 
     def __init__(self, on_end: Callable[[str], None]) -> None:
         def io_error(display: int) -> int:
@@ -62,8 +62,8 @@ class Survival:
         self._library.XSetErrorHandler(self._handlers[1])
 
     def cover(self, x_display: int) -> None:
-        """Outlive the end of this connection."""
-        if hasattr(self._library, "XSetIOErrorExitHandler"):  # libX11 1.7 of 2020; before it the process ends all the same
+        """Survive the end of this connection."""
+        if hasattr(self._library, "XSetIOErrorExitHandler"):  # libX11 1.7 of 2020; with an older one the process ends
             self._library.XSetIOErrorExitHandler.argtypes = [ctypes.c_void_p, _ExitHandler, ctypes.c_void_p]
             self._library.XSetIOErrorExitHandler(x_display, self._handlers[2], None)
 
@@ -83,7 +83,7 @@ class SyncControl:
         self._window = (x_display, drawable)
 
     def swap_ns(self) -> int | None:
-        """Host time (monotonic) at which the last swap was done, once it is; None where the driver does not say."""
+        """Wait for the last swap; host time (monotonic) at which it was done, None where the driver does not say."""
         ust, msc, sbc = (ctypes.c_int64() for _ in range(3))
         if not self._wait_for_swap(*self._window, 0, ctypes.byref(ust), ctypes.byref(msc), ctypes.byref(sbc)):
             return None
@@ -92,7 +92,7 @@ class SyncControl:
 
 
 def sync_control(x_display: int | None, drawable: int | None) -> SyncControl | None:
-    """The sync control of a GLX window, None where its driver has none."""
+    """The sync control of a GLX window; None where its driver has none."""
     if not x_display or not drawable:
         return None
     try:

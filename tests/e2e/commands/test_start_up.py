@@ -7,8 +7,6 @@ import sys
 
 import pytest
 
-pytestmark = pytest.mark.e2e
-
 # What single commands, files and plots need, and no bench: each costs 15 to 250 ms.
 HEAVY = {"asyncio", "astropy", "ccsds_ndm", "matplotlib", "mcap", "rich", "scipy.special", "unittest"}
 

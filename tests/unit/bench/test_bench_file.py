@@ -42,6 +42,7 @@ def test_a_file_that_is_replaced_after_it_was_read_changes_nothing_of_the_run(sm
     assert config is not None and config.monitor.resolution_px == (320, 240)
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize("command", ["serve", "replay", "frame"])
 def test_a_command_opens_the_bench_file_once(small_bench_file, tmp_path, command):
     log = tmp_path / "log.csv"

@@ -261,10 +261,10 @@ def test_a_drift_is_refused_and_noise_is_not_taken_for_one(tmp_path, rng):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", "no measurement"),
+        ("", "has no measurement"),
         ("code,value\n", "the column channel is missing"),
-        ("code,channel,value,colour\n", "unknown or doubled column"),
-        ("code,code,channel,value\n", "unknown or doubled column"),
+        ("code,channel,value,colour\n", "unknown or repeated column"),
+        ("code,code,channel,value\n", "unknown or repeated column"),
         ("code,channel,value\n1,w\n", "line 2: 2 cells"),
         ("code,channel,value\n1,w,\n", "line 2: value is empty"),
         ("code,channel,value\n# so\n1.5,w,2\n", "line 3: code = 1.5"),

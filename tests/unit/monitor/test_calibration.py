@@ -147,8 +147,8 @@ def test_a_malformed_file_is_refused_in_one_line(write, head, words):
 @pytest.mark.parametrize(
     ("table", "words"),
     [
-        ("", "code,w or code,r,g,b is wanted"),
-        ("code,w,r\n0,1,1\n", "code,w or code,r,g,b is wanted"),
+        ("", "write code,w or code,r,g,b"),
+        ("code,w,r\n0,1,1\n", "write code,w or code,r,g,b"),
         ("code,w\n", "no row of numbers"),
         ("code,w\n0,0.5\n1,1.5\n2,1.5\n3,10\n", "code 1 to code 2"),
         ("code,w\n0,0.5\n1,1.5\n2,1.4\n3,10\n", "code 1 to code 2"),

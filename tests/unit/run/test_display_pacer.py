@@ -15,7 +15,7 @@ from hilstar.run.pacer import Moment
 from hilstar.run.screen.display_pacer import DisplayPacer
 from hilstar.run.screen.swap_clock import DrawBudget, SwapClock
 from hilstar.run.shown import Shown
-from tests.conftest import SMALL_BENCH
+from tests.support.benches import SMALL_BENCH
 from tests.support.fake_clock import FakeClock
 
 PERIOD_NS = 16_666_667

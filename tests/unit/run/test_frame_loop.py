@@ -12,7 +12,7 @@ from hilstar.bench.config import parse_config
 from hilstar.run.loop import FrameLoop, Limit
 from hilstar.run.pacer import ClockPacer, Moment
 from hilstar.run.shown import Shown
-from tests.conftest import SMALL_BENCH
+from tests.support.benches import SMALL_BENCH
 from tests.support.fake_clock import FakeClock
 
 PERIOD_NS = 16_666_667  # 60 Hz, as the small bench's monitor has it

@@ -14,7 +14,7 @@ from hilstar.errors import InputError
 from hilstar.run.record.ledger import Ledger
 from hilstar.run.record.ledger_records import FrameRecord
 from hilstar.run.replay import Wanted, plan_play
-from tests.conftest import SMALL_BENCH
+from tests.support.benches import SMALL_BENCH
 
 MAX = math.inf
 

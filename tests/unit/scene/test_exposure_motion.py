@@ -13,7 +13,7 @@ from hilstar.scene import exposure_motion as smear
 from hilstar.scene.exposure_motion import MIDDLE_S, Motion, smeared_sprites
 from hilstar.scene.psf import MAX_CUT, footprint_px
 from hilstar.scene.sprites import join_sprites, make_sprites
-from tests.unit.scene.test_scene import stars_at
+from tests.support.stars import stars_at
 
 IDENTITY = np.array([1.0, 0, 0, 0])
 SIZE = (320, 240)
@@ -119,7 +119,7 @@ def test_a_spin_that_sweeps_the_sky_past_the_camera_ends(rng):
 @pytest.mark.parametrize("rate", [(1e9, 0, 0), (0, 0, 1e12), (3e5, 1e5, 0)])
 def test_a_turn_too_long_to_draw_is_refused_with_what_can_be(rate):
     at = motion(rate)
-    with pytest.raises(InputError, match=r"turns by .* deg is too long; at most .* deg are drawn"):
+    with pytest.raises(InputError, match=r"turns by .* deg is too long; at most .* deg can be drawn"):
         smeared_sprites(star_on((160.2, 120.7), motion((0, 0, 0))), at, CAMERA, 10, SIGMA)
 
 

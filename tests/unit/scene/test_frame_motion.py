@@ -15,7 +15,7 @@ from hilstar.scene.frame_motion import EXTRA_SPRITES, Scan, Turn, swept_sprites
 from hilstar.scene.paths import MAX_NODES
 from hilstar.scene.psf import footprint_px
 from hilstar.scene.sprites import make_sprites
-from tests.unit.scene.test_scene import stars_at
+from tests.support.stars import stars_at
 
 SIZE = (320, 240)
 CAMERA = monitor_camera(SIZE, 13.0, 70.0, np.array([1.0, 0, 0, 0]))

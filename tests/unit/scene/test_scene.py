@@ -13,19 +13,11 @@ from hilstar.rotation import from_radec_roll_deg, to_matrix
 from hilstar.scene.clipping import clipped_sprites
 from hilstar.scene.psf import MAX_CUT, cut_share, footprint_px, peak_share, pixel_share
 from hilstar.scene.sprites import make_sprites
-from hilstar.sky.catalog import FIELDS, Catalog
-from hilstar.sky.stars import Stars, make_stars
+from hilstar.sky.stars import Stars
+from tests.support.stars import stars_at
 
 IDENTITY = np.array([1.0, 0, 0, 0])
 SIGMA = (0.85, 0.85)
-
-
-def stars_at(vectors: np.ndarray, electrons_per_s: np.ndarray) -> Stars:
-    n = len(vectors)
-    zeros = {name: np.zeros(n) for name in FIELDS}
-    catalog = Catalog(**(zeros | {"hip": np.arange(n, dtype=np.int32)}), rows_read=n)
-    vectors = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
-    return make_stars(catalog, vectors, np.full(n, 5000.0), electrons_per_s)
 
 
 def stars_on_pixels(camera, pixels: np.ndarray, electrons_per_s: np.ndarray | None = None) -> Stars:

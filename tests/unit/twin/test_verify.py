@@ -136,7 +136,7 @@ def test_what_is_proposed_for_coarse_codes_is_what_the_calibration_takes(tmp_pat
     if stealing:
         assert verified(path, 1, np.random.default_rng(1))[1]["stars"] > 0
     else:
-        with pytest.raises(InputError, match="bit stealing wants the primaries"):
+        with pytest.raises(InputError, match="bit stealing needs the primaries"):
             verified(path, 1, np.random.default_rng(1))
 
 

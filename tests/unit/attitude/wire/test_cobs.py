@@ -12,14 +12,10 @@ from hypothesis import strategies as st
 
 from hilstar.attitude.wire.cobs import MAX_FRAME_BYTES, StreamDecoder, frame
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal, TimeRequest, decode, encode
+from tests.support.samples import sample
 
-Q = np.array([0.5, 0.5, -0.5, 0.5])
 # On demand: HILSTAR_FUZZ=1000000 pytest tests/unit/attitude/wire/test_cobs.py
 MUTATED_FRAMES = int(os.environ.get("HILSTAR_FUZZ", "20000"))
-
-
-def sample(k: int) -> AttitudeSample:
-    return AttitudeSample(1_000_000 * k, Q, np.array([0.0, k, -k]), k)
 
 
 def described(events: list) -> list:

@@ -1,0 +1,28 @@
+"""Stars and sprites where a test wants them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hilstar.scene.sprites import SPRITE_DTYPE, Sprites
+from hilstar.sky.catalog import FIELDS, Catalog
+from hilstar.sky.stars import Stars, make_stars
+
+
+def stars_at(vectors: np.ndarray, electrons_per_s: np.ndarray) -> Stars:
+    """Stars of 5000 K in the directions `vectors` (n, 3), ICRS."""
+    n = len(vectors)
+    zeros = {name: np.zeros(n) for name in FIELDS}
+    catalog = Catalog(**(zeros | {"hip": np.arange(n, dtype=np.int32)}), rows_read=n)
+    vectors = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    return make_stars(catalog, vectors, np.full(n, 5000.0), electrons_per_s)
+
+
+def sprites_at(pixels: np.ndarray, electrons_per_s: np.ndarray, footprint: int) -> Sprites:
+    """Sprites centred on pixel positions (n, 2), with the light of each."""
+    data = np.empty(len(pixels), dtype=SPRITE_DTYPE)
+    whole = np.floor(pixels + (0.5 if footprint % 2 else 0.0))
+    data["pixel"] = whole
+    data["fraction_px"] = pixels - whole
+    data["electrons_per_s"] = electrons_per_s
+    return Sprites(data, footprint, np.arange(len(pixels)), pixels[:, 0].copy(), pixels[:, 1].copy())

@@ -41,11 +41,13 @@ def nothing_is_left_behind() -> Iterator[None]:
 
 @pytest.fixture
 def rng() -> np.random.Generator:
+    """The same numbers in every test."""
     return np.random.default_rng(20260101)
 
 
 @pytest.fixture
 def small_bench_file(tmp_path: Path) -> Path:
+    """A file of its own with the small bench."""
     path = tmp_path / "bench.toml"
     path.write_text(SMALL_BENCH)
     return path

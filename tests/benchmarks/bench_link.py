@@ -98,7 +98,7 @@ def main() -> None:
         bare = bare_pty(bare_seconds)
         with tempfile.TemporaryDirectory() as folder, Cable(Path(folder)) as cable:
             line = f'source = "serial"\nport = "{cable.host}"\nbaud = 921600'
-            tell("pty " + " ".join(options), *served(line, f"serial:{cable.bench}@921600", seconds, options), bare)
+            tell("pty " + " ".join(options), *served(line, f"serial:{cable.sender}@921600", seconds, options), bare)
 
 
 if __name__ == "__main__":

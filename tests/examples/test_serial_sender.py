@@ -50,7 +50,7 @@ def told(output: str) -> dict[str, int]:
 def test_the_sender_streams_into_hilstar_and_both_sides_know_each_other_s_clock(tmp_path, cable, sender):
     bench_file = tmp_path / "serial.toml"
     bench_file.write_text(f'{SMALL_BENCH}\n[attitude]\nsource = "serial"\nport = "{cable.host}"\nbaud = {BAUD}\n')
-    command = [str(sender), str(cable.bench), str(BAUD), "100", "1.5", "5", str(CLOCK_OFFSET_S)]
+    command = [str(sender), str(cable.sender), str(BAUD), "100", "1.5", "5", str(CLOCK_OFFSET_S)]
     with listening(bench_file, "reading serial:") as process:
         result = subprocess.run(command, capture_output=True, text=True, timeout=30, check=False)
         assert result.returncode == 0, result.stderr
@@ -81,7 +81,7 @@ def listened(link: SerialLink, program: subprocess.Popen) -> list[tuple[int, obj
 
 def test_the_sender_turns_as_its_rate_says_and_answers_on_its_own_clock(cable, sender):
     rate_rad_s = math.radians(20.0)
-    command = [str(sender), str(cable.bench), str(BAUD), "200", "0.5", "20", str(CLOCK_OFFSET_S)]
+    command = [str(sender), str(cable.sender), str(BAUD), "200", "0.5", "20", str(CLOCK_OFFSET_S)]
     with SerialLink(str(cable.host), BAUD) as link, subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as program:
         first = link.receive(5000)
         t1_ns = time.monotonic_ns()

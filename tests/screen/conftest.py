@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.benches import SCREEN_BENCH, still_log
-from tests.support.screens import Screen, xvfb
+from tests.support.x11.screens import Screen, xvfb
 
 
 @pytest.fixture(scope="module")

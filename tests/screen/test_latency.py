@@ -20,8 +20,8 @@ from hilstar.run.screen.photodiode import CODE, CODE_BITS, marker_light
 from tests.support.benches import ATTITUDE, SCREEN_BENCH, still_log
 from tests.support.commands import HILSTAR, assert_refused, run_hilstar, run_hilstar_here
 from tests.support.ptys import Cable
-from tests.support.screens import Screen
 from tests.support.waiting import wait_for
+from tests.support.x11.screens import Screen
 
 # The watcher looks every 0.2 ms or so, and sleeps between; a shared machine may keep it from that now and then.
 MEDIAN_MS = 2.0
@@ -87,7 +87,7 @@ def shown(screen: Screen, folder: Path, kind: str):
 
 
 def measured(screen: Screen, folder: Path, kind: str, added_ms: float, device_clock: bool, *options: str) -> tuple[dict, Path]:
-    with Cable(folder) as cable, shown(screen, folder, kind) as bench, Diode(screen, cable.bench, added_ms, device_clock):
+    with Cable(folder) as cable, shown(screen, folder, kind) as bench, Diode(screen, cable.sender, added_ms, device_clock):
         result = run_hilstar(
             "latency",
             folder / "run.mcap",

@@ -15,9 +15,9 @@ import pytest
 from hilstar.monitor.window.x11 import sync_control
 from tests.support.benches import SCREEN_BENCH, still_log
 from tests.support.commands import HILSTAR, run_hilstar
-from tests.support.screens import recorded
 from tests.support.waiting import PATIENCE_S, wait_for
-from tests.support.xservers import Xorg, xorg
+from tests.support.x11.screens import recorded
+from tests.support.x11.xorg import Xorg, xorg
 
 OTHER_GAMMA = "1.7:1.4:1.2"
 

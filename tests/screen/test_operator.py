@@ -20,10 +20,10 @@ from hilstar.run.record.ledger_reader import frame_records
 from hilstar.run.record.ledger_records import EventRecord, FrameRecord
 from tests.support.benches import ORION_Q, SCREEN_BENCH
 from tests.support.commands import HILSTAR
-from tests.support.screens import Screen, Shown, codes_of, lines_over, recorded
 from tests.support.senders import connected, free_port, packet
 from tests.support.waiting import PATIENCE_S, wait_for
-from tests.support.xevents import Client, client
+from tests.support.x11.events import Client, client
+from tests.support.x11.screens import Screen, Shown, codes_of, lines_over, recorded
 
 MS = 1_000_000
 

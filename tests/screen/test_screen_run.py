@@ -17,9 +17,9 @@ from hilstar.resources import resource_path
 from hilstar.rotation import angle_between_rad, propagate
 from hilstar.run.record.ledger_reader import read_run
 from tests.support.commands import HILSTAR, run_hilstar, run_hilstar_here
-from tests.support.screens import xvfb
 from tests.support.senders import free_port
 from tests.support.waiting import PATIENCE_S
+from tests.support.x11.screens import xvfb
 
 DURATION_S, REFRESH_HZ, PACKET_HZ = 10, 60, 200
 RATE_DEG_S = 0.5

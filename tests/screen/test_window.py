@@ -15,9 +15,9 @@ from hilstar.rotation import propagate
 from hilstar.run.record.ledger_reader import frame_records
 from tests.support.benches import ATTITUDE, SCREEN_BENCH
 from tests.support.commands import run_hilstar
-from tests.support.screens import Screen, Shown, codes_of, lines_over
 from tests.support.waiting import PATIENCE_S
-from tests.support.xevents import client
+from tests.support.x11.events import client
+from tests.support.x11.screens import Screen, Shown, codes_of, lines_over
 
 
 def test_the_screen_shows_the_codes_bit_for_bit(screen, bench_file):

@@ -12,9 +12,9 @@ import pytest
 from hilstar.run.record.ledger_reader import frame_records
 from tests.support.benches import SCREEN_BENCH, still_log
 from tests.support.commands import HILSTAR
-from tests.support.screens import Screen, recorded, xvfb
 from tests.support.waiting import PATIENCE_S, wait_for
-from tests.support.xevents import client
+from tests.support.x11.events import client
+from tests.support.x11.screens import Screen, recorded, xvfb
 
 MCAP_END = b"\x89MCAP0\r\n"  # of a file that is finished
 

@@ -40,7 +40,7 @@ def bench_text(*changes: Tables) -> str:
 # A monitor of 320 x 240: a frame takes a millisecond.
 SMALL_BENCH = bench_text()
 
-# The size of the X servers of tests/support/screens.py.
+# The size of the X servers of tests/support/x11/screens.py.
 SCREEN_BENCH = bench_text({"monitor": {"resolution_px": [640, 480]}})
 
 # Changes that make a bench of it whose light the twin can see whole: 10 bits, and a tracker's pixel for a monitor's.

@@ -13,10 +13,10 @@ from typing import Self
 
 
 class Cable:
-    """`bench` and `host` are paths to open; `pull` takes the line away, `plug` brings it back under the same paths."""
+    """`sender` and `host` are paths to open; `pull` takes the line away, `plug` brings it back under the same paths."""
 
     def __init__(self, folder: Path) -> None:
-        self.bench, self.host = folder / "ttyBench", folder / "ttyHost"
+        self.sender, self.host = folder / "ttySender", folder / "ttyHost"
         self._masters: list[int] = []
         self._slaves: list[int] = []
         self.plug()
@@ -26,7 +26,7 @@ class Cable:
         pairs = [os.openpty() for _ in range(2)]
         self._masters = [master for master, _ in pairs]
         self._slaves = [slave for _, slave in pairs]
-        for (_, slave), path in zip(pairs, (self.bench, self.host), strict=True):
+        for (_, slave), path in zip(pairs, (self.sender, self.host), strict=True):
             tty.setraw(slave)
             path.unlink(missing_ok=True)
             path.symlink_to(os.ttyname(slave))
@@ -45,7 +45,7 @@ class Cable:
         """Both devices vanish: whoever has one open gets an error."""
         self._stop.set()
         self._thread.join()
-        for path in (self.bench, self.host):
+        for path in (self.sender, self.host):
             path.unlink(missing_ok=True)
         for fd in (*self._masters, *self._slaves):
             os.close(fd)

@@ -40,7 +40,7 @@ def bench_file(tmp_path, cable):
 
 
 def sent(cable, *options: str) -> dict:
-    result = run_hilstar("send", "--to", f"serial:{cable.bench}@{BAUD}", "--json", *options)
+    result = run_hilstar("send", "--to", f"serial:{cable.sender}@{BAUD}", "--json", *options)
     assert result.returncode == 0, result.stderr
     return json.loads(result.stdout)
 
@@ -80,7 +80,7 @@ def test_nothing_wrong_is_drawn_over_a_bad_cable(cable, bench_file):
     """A turn of 20 deg/s: every attitude drawn is that of its time, to what a packet's float32 rate predicts in 100 ms."""
     rate = np.radians([0.0, 0.0, 20.0])
     drawn = []
-    with load(bench_file) as bench, SerialLink(str(cable.host), BAUD) as link, SerialSender(str(cable.bench), BAUD) as road:
+    with load(bench_file) as bench, SerialLink(str(cable.host), BAUD) as link, SerialSender(str(cable.sender), BAUD) as road:
         faults = BadCable(Faults(0.10, 0.05, 0.05), np.random.default_rng(7), road.put)
         stop = threading.Event()
         samples = spin_samples(rate, 200.0, START_DEG)
@@ -100,7 +100,7 @@ def test_nothing_wrong_is_drawn_over_a_bad_cable(cable, bench_file):
 
 def test_a_line_that_filled_up_while_the_display_was_made_ready_misleads_nobody(cable, bench_file):
     """A second and a half of packets in the kernel's buffer and at the sender, which had to wait for room."""
-    with load(bench_file) as bench, SerialLink(str(cable.host), BAUD) as link, SerialSender(str(cable.bench), BAUD) as road:
+    with load(bench_file) as bench, SerialLink(str(cable.host), BAUD) as link, SerialSender(str(cable.sender), BAUD) as road:
         stop = threading.Event()
         faults = BadCable(Faults(0, 0, 0), np.random.default_rng(7), road.put)
         sender = threading.Thread(target=send, args=(faults, spin_samples(np.zeros(3), 200.0, START_DEG), stop))
@@ -138,7 +138,7 @@ def test_a_device_that_goes_and_comes_back_is_picked_up_within_a_second(tmp_path
 def test_a_line_of_garbage_without_an_end_is_one_refusal_and_the_next_frame_is_taken(cable, bench_file):
     bench_file.write_text(bench_file.read_text() + "time_requests = false\n")  # an answer would end the garbage
     with listening(bench_file, "reading serial:") as process:
-        with SerialSender(str(cable.bench), BAUD) as road:
+        with SerialSender(str(cable.sender), BAUD) as road:
             for _ in range(50):
                 road.send_bytes(b"\x55" * 1000, 1.0)
                 time.sleep(0.002)

@@ -50,11 +50,13 @@ class Xorg:
 
     @property
     def env(self) -> dict[str, str]:
+        """The environment of a command that is to show on it."""
         env = {**os.environ, "DISPLAY": self.display}
         env.pop("WAYLAND_DISPLAY", None)
         return env
 
     def xrandr(self, *words: str) -> str:
+        """What xrandr says to these words."""
         result = subprocess.run(["xrandr", *words], env=self.env, capture_output=True, text=True, timeout=20, check=False)
         assert result.returncode == 0, result.stderr
         if "--output" in words:

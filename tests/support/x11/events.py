@@ -1,4 +1,4 @@
-"""Keys and the close button as an X client sends them to the bench's window."""
+"""Keys and the close button as an X client sends them to hilstar's window."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Client:
         self._root = x11.XDefaultRootWindow(display)
 
     def window(self) -> int:
-        """The bench's window: the root's last child."""
+        """hilstar's window: the root's last child."""
         root, parent, count = ctypes.c_ulong(), ctypes.c_ulong(), ctypes.c_uint()
         children = ctypes.POINTER(ctypes.c_ulong)()
         pointers = (ctypes.byref(part) for part in (root, parent, children, count))
@@ -82,7 +82,7 @@ class Client:
         self._send(event, 0)
 
     def unmap(self) -> None:
-        """Take the bench's window off the screen."""
+        """Take hilstar's window off the screen."""
         self._x11.XUnmapWindow(self._display, self.window())
         self._x11.XSync(self._display, 0)
 
@@ -92,7 +92,7 @@ class Client:
         self._x11.XSync(self._display, 0)
 
     def move(self, x: int, y: int) -> None:
-        """Move the bench's window."""
+        """Move hilstar's window."""
         self._x11.XMoveWindow(self._display, self.window(), x, y)
         self._x11.XSync(self._display, 0)
 
@@ -109,7 +109,7 @@ class Client:
         self._x11.XSync(self._display, 0)
 
     def destroy_window(self) -> None:
-        """As a program does that takes the bench's window for its own."""
+        """As a program does that takes hilstar's window for its own."""
         self._x11.XDestroyWindow(self._display, self.window())
         self._x11.XSync(self._display, 0)
 

@@ -58,7 +58,9 @@ class BackChannel:
         if self._traffic.status_hz and self._status is not None and now_ns >= self._next_status_ns:
             with self._posting:
                 status, self._status = self._status, None
-            self._next_status_ns = max(self._next_status_ns + round(NS_PER_S / self._traffic.status_hz), now_ns)
+            period_ns = round(NS_PER_S / self._traffic.status_hz)
+            due_ns = self._next_status_ns + period_ns
+            self._next_status_ns = due_ns if due_ns > now_ns else now_ns + period_ns  # never two at once, after a pause either
             self._link.send(status)
 
     def ask_quickly(self, now_ns: int) -> None:

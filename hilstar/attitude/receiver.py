@@ -6,11 +6,11 @@ import logging
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from hilstar.attitude.back_channel import QUIET, BackChannel, Traffic
 from hilstar.attitude.clock.jumps import MIN_LIMIT_NS, WAITED_UNKNOWN_NS, JumpFilter
-from hilstar.attitude.clock.sender_clock import SenderClock
+from hilstar.attitude.clock.sender_clock import ClockSummary, SenderClock
 from hilstar.attitude.clock.senders import Repeats, Senders
 from hilstar.attitude.clock.shared_clock import SharedClockFilter
 from hilstar.attitude.clock.timeline import Timeline
@@ -124,16 +124,15 @@ class Receiver:
         """A time of the timeline on the sender's own clock."""
         return continuous_ns - self.jumps.correction_ns
 
-    def clock_summary(self) -> dict[str, float | int | str | None]:
+    def clock_summary(self) -> ClockSummary:
         """The clock's summary, its offset that of the sender's clock as it is now, after all jumps."""
-        told = self.clock.summary()
-        offset_ms = told["offset_ms"]
-        if isinstance(offset_ms, float):
-            told["offset_ms"] = offset_ms + self.jumps.correction_ns / NS_PER_MS
-        uncertainty_ms = told["uncertainty_ms"]
-        if self.jumps.slowness > 0 and told["mode"] == "one-way" and isinstance(uncertainty_ms, float):
-            told["uncertainty_ms"] = uncertainty_ms + 2 * MIN_LIMIT_NS / NS_PER_MS  # one step, and the way to the next
-        return told | {"jumps": self.jumps.jumps}
+        told = replace(self.clock.summary(), jumps=self.jumps.jumps)
+        if told.offset_ms is not None:
+            told = replace(told, offset_ms=told.offset_ms + self.jumps.correction_ns / NS_PER_MS)
+        if self.jumps.slowness > 0 and told.mode == "one-way" and told.uncertainty_ms is not None:
+            behind_ms = 2 * MIN_LIMIT_NS / NS_PER_MS  # one step, and the way to the next
+            told = replace(told, uncertainty_ms=told.uncertainty_ms + behind_ms)
+        return told
 
     def _run(self) -> None:
         try:

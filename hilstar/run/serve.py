@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -113,7 +113,7 @@ def _serve_stream(
     return summary | {
         "stale_events": loop.gate.events,
         "receive_latency_ms": receiver.latency_ms.summary(),
-        "clock": receiver.clock_summary(),
+        "clock": asdict(receiver.clock_summary()),
         "reconnects": link.reconnects,
     }
 

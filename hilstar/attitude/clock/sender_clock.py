@@ -8,7 +8,7 @@ minus sender time, ns.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 from hilstar.attitude.clock.exchanges import Exchange, ExchangeFilter
@@ -25,6 +25,22 @@ SETTLING_NS = 2 * NS_PER_S
 LOCAL_DELAY_NS = 100_000
 
 ClockMode = Literal["none", "one-way", "exchange", "shared"]
+
+
+@dataclass(frozen=True, slots=True)
+class ClockSummary:
+    """Offset (host minus sender), drift (positive: the sender's clock runs fast), uncertainty, exchanges and jumps.
+
+    The uncertainty bounds the error of the times that frames use; it is None until enough is known. On a one-way stream it
+    excludes the minimum transport delay beyond LOCAL_DELAY_NS, which such a stream cannot measure.
+    """
+
+    mode: ClockMode
+    offset_ms: float | None = None
+    drift_ppm: float | None = None
+    uncertainty_ms: float | None = None
+    exchanges: int = 0
+    jumps: int = 0
 
 
 class _Used(NamedTuple):
@@ -121,23 +137,19 @@ class SenderClock:
         """True while four-timestamp exchanges carry the offset."""
         return self._mode == "exchange"
 
-    def summary(self) -> dict[str, float | int | str | None]:
-        """Mode, offset (host minus sender), drift (positive: the sender's clock runs fast) and uncertainty.
-
-        The uncertainty bounds the error of the times that frames use; it is None until enough is known. On a one-way stream it
-        excludes the minimum transport delay beyond LOCAL_DELAY_NS, which such a stream cannot measure.
-        """
+    def summary(self) -> ClockSummary:
+        """What is known of the clock now."""
         line = self._line
         if line is None or self._base_ns is None:
-            return {"mode": self._mode, "offset_ms": None, "drift_ppm": None, "uncertainty_ms": None, "exchanges": 0}
+            return ClockSummary(self._mode)
         behind_ns = 0.0 if self._used is None else abs(line.at(self._used.host_ns) - self._used.offset_ns)
         uncertainty_ns = line.uncertainty_ns
         if self._mode == "one-way":
             uncertainty_ns = max(uncertainty_ns, self._one_way.all_above_ns) + LOCAL_DELAY_NS
-        return {
-            "mode": self._mode,
-            "offset_ms": (self._base_ns + line.offset_ns) / NS_PER_MS,
-            "drift_ppm": 0.0 - line.drift * 1e6,
-            "uncertainty_ms": (uncertainty_ns + behind_ns) / NS_PER_MS if math.isfinite(uncertainty_ns) else None,
-            "exchanges": self._exchanges.count,
-        }
+        return ClockSummary(
+            self._mode,
+            offset_ms=(self._base_ns + line.offset_ns) / NS_PER_MS,
+            drift_ppm=0.0 - line.drift * 1e6,
+            uncertainty_ms=(uncertainty_ns + behind_ns) / NS_PER_MS if math.isfinite(uncertainty_ns) else None,
+            exchanges=self._exchanges.count,
+        )

@@ -79,7 +79,7 @@ class Truth:
         told = self.clock.summary()
         self.host_ns.append(read_ns)
         self.error_ms.append((shown_ns - self.times(read_ns)) / NS_PER_MS)
-        self.known_ms.append(np.nan if told["uncertainty_ms"] is None else told["uncertainty_ms"])
+        self.known_ms.append(np.nan if told.uncertainty_ms is None else told.uncertainty_ms)
 
     def beyond_ms(self, *jumps_s: float) -> float:
         """The largest error beyond the stated uncertainty, except just after a jump."""
@@ -209,4 +209,4 @@ def test_packets_queueing_on_a_slow_link_are_not_a_slow_clock_where_exchanges_sh
 
 
 def test_a_short_run_does_not_say_how_well_it_knows():
-    assert Truth(lambda host: host, count=100).clock.summary()["uncertainty_ms"] is None
+    assert Truth(lambda host: host, count=100).clock.summary().uncertainty_ms is None

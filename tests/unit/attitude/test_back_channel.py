@@ -1,0 +1,158 @@
+"""What goes back to the sender: statuses at their rate, time requests while they are due, and the exchanges they complete."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from hilstar.attitude.back_channel import ASK_NS, FIRST_ASKS, QUICK_ASK_NS, QUIET, BackChannel, Traffic
+from hilstar.attitude.clock.exchanges import MIN_EXCHANGES, Exchange
+from hilstar.attitude.clock.timeline import Policy, Timeline
+from hilstar.attitude.receiver import Receiver
+from hilstar.attitude.wire.links import Arrival
+from hilstar.attitude.wire.packet import AttitudeSample, Event, Packet, Status, TimeReply, TimeRequest, encode
+from hilstar.attitude.wire.protocol import HEALTH_MISSED, HEALTH_REFUSED, HEALTH_STALE
+from hilstar.units import NS_PER_MS, NS_PER_S
+
+NOW_NS = 10**12
+PATIENCE_S = 20.0
+SENDER_AHEAD_NS = 7 * NS_PER_S
+
+
+class Wire:
+    """A two-way link that keeps what is sent; a packet takes 1 ms a byte."""
+
+    two_way = True
+
+    def __init__(self) -> None:
+        self.sent: list[Packet] = []
+
+    def receive(self, timeout_ms: int) -> list[Arrival[Event]]:
+        return []
+
+    def wait_for_message(self, timeout_ms: int) -> bool:
+        return False
+
+    def send(self, packet: Packet) -> None:
+        self.sent.append(packet)
+
+    def wire_ns(self, packet: Packet) -> int:
+        return len(encode(packet)) * NS_PER_MS
+
+
+def status(frame: int, health: int = 0) -> Status:
+    return Status(health, frame, frame, 0, 0, 0, 0)
+
+
+def test_statuses_leave_at_their_rate_and_only_the_newest():
+    link = Wire()
+    back = BackChannel(link, Traffic(status_hz=10))
+    for k in range(100):  # frames at 100 Hz
+        back.post(status(k))
+        back.talk(NOW_NS + k * NS_PER_S // 100, ask=True)
+    assert [packet.frame for packet in link.sent if isinstance(packet, Status)] == list(range(0, 100, 10))
+
+
+def test_a_status_that_never_left_hands_on_what_is_told_once():
+    link = Wire()
+    back = BackChannel(link, Traffic(status_hz=10))
+    back.post(status(1, HEALTH_MISSED | HEALTH_STALE))
+    back.post(status(2, HEALTH_REFUSED))
+    back.post(status(3))
+    back.talk(NOW_NS, ask=False)
+    assert link.sent == [status(3, HEALTH_MISSED | HEALTH_REFUSED)]
+
+
+def test_a_quiet_channel_sends_nothing():
+    link = Wire()
+    back = BackChannel(link, QUIET)
+    back.post(status(1))
+    back.talk(NOW_NS, ask=True)
+    assert link.sent == []
+
+
+def test_time_requests_are_quick_at_first_and_again_once_there_is_a_sender():
+    link = Wire()
+    back = BackChannel(link, Traffic(time_requests=True))
+    back.talk(NOW_NS, ask=False)
+    assert link.sent == []
+    asked_ns = []
+    for after_ns in range(0, 5 * NS_PER_S, 10 * NS_PER_MS):
+        if after_ns == 3 * NS_PER_S:
+            back.ask_quickly(NOW_NS + after_ns)
+        before = len(link.sent)
+        back.talk(NOW_NS + after_ns, ask=True)
+        asked_ns += [after_ns] * (len(link.sent) - before)
+    steps_ns = np.diff(asked_ns)
+    again = asked_ns.index(3 * NS_PER_S)
+    assert (steps_ns[: FIRST_ASKS - 1] == QUICK_ASK_NS).all()
+    assert (steps_ns[FIRST_ASKS - 1 : again - 1] == ASK_NS).all()
+    assert (steps_ns[again : again + FIRST_ASKS - 1] == QUICK_ASK_NS).all()
+
+
+def test_a_reply_completes_its_own_request_once_on_continuous_times():
+    link = Wire()
+    back = BackChannel(link, Traffic(time_requests=True))
+    back.talk(NOW_NS, ask=True)
+    (request,) = link.sent
+    assert isinstance(request, TimeRequest)
+    reply = TimeReply(request.sequence, request.t1_ns, 500, 600)
+    t4_ns = request.t1_ns + NS_PER_S
+    assert back.exchange(TimeReply(99, request.t1_ns, 500, 600), t4_ns, 0) is None
+    assert back.exchange(reply, t4_ns, 1000) == Exchange(
+        request.t1_ns, 1500, 1600, t4_ns, there_ns=20 * NS_PER_MS, back_ns=36 * NS_PER_MS
+    )
+    assert back.exchange(reply, t4_ns, 0) is None
+
+
+def test_a_request_of_the_sender_is_answered_with_its_own_time_and_the_arrival():
+    link = Wire()
+    before_ns = time.monotonic_ns()
+    BackChannel(link, QUIET).answer(TimeRequest(3, 4), 5)
+    (reply,) = link.sent
+    assert isinstance(reply, TimeReply)
+    assert (reply.sequence, reply.t1_ns, reply.t2_ns) == (3, 4, 5)
+    assert before_ns <= reply.t3_ns <= time.monotonic_ns()
+
+
+class Answering(Wire):
+    """A sender 7 s ahead that sends an attitude at each look and answers time requests at once."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.answered = threading.Event()
+        self._sequence = 0
+
+    def receive(self, timeout_ms: int) -> list[Arrival[Event]]:
+        time.sleep(0.001)
+        host_ns = time.monotonic_ns()
+        self._sequence += 1
+        sample = AttitudeSample(host_ns + SENDER_AHEAD_NS, np.array([1.0, 0.0, 0.0, 0.0]), None, self._sequence)
+        arrived: list[Arrival[Event]] = [Arrival(host_ns, sample, encode(sample))]
+        for packet in self.sent:
+            if isinstance(packet, TimeRequest):
+                times_ns = (host_ns + SENDER_AHEAD_NS, time.monotonic_ns() + SENDER_AHEAD_NS)
+                arrived.append(Arrival(time.monotonic_ns(), TimeReply(packet.sequence, packet.t1_ns, *times_ns), b""))
+                if packet.sequence >= MIN_EXCHANGES:
+                    self.answered.set()
+        self.sent.clear()
+        return arrived
+
+    def wire_ns(self, packet: Packet) -> int:
+        return 0
+
+
+def test_a_sender_that_answers_is_synchronised_within_what_the_summary_states():
+    link = Answering()
+    receiver = Receiver(link, Timeline(Policy(NS_PER_S, NS_PER_S)), Traffic(time_requests=True))
+    receiver.start()
+    receiver.learn()
+    assert link.answered.wait(PATIENCE_S)
+    receiver.close()
+    told = receiver.clock_summary()
+    assert told.mode == "exchange"
+    assert told.exchanges >= MIN_EXCHANGES
+    assert told.offset_ms == pytest.approx(-SENDER_AHEAD_NS / NS_PER_MS, abs=told.uncertainty_ms)

@@ -6,9 +6,9 @@ import numpy as np
 
 from hilstar.arrays import FloatArray
 from hilstar.sky.catalog import HIPPARCOS_EPOCH_JYEAR, Catalog
+from hilstar.units import LIGHT_KM_S
 
 RAD_PER_MAS = np.pi / (180 * 3600 * 1000)
-LIGHT_KM_S = 299_792.458
 
 
 def unit_vectors_icrs(catalog: Catalog, epoch_jyear: float) -> FloatArray:

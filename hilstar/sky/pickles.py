@@ -16,8 +16,8 @@ import numpy as np
 from hilstar.arrays import FloatArray
 from hilstar.errors import InputError
 from hilstar.sky.electrons import Optics, Photometry, Weighting, reference_mean_w_m2_m
-from hilstar.sky.spectrum import LIGHT_M_S, PLANCK_J_S, Curve, integration_nodes, load_curve
-from hilstar.units import flux_ratio
+from hilstar.sky.spectrum import PLANCK_J_S, Curve, integration_nodes, load_curve
+from hilstar.units import LIGHT_M_S, flux_ratio
 
 PACKAGED_LIBRARY = Path(__file__).resolve().parent / "data" / "pickles.npz"
 

@@ -13,9 +13,9 @@ import numpy as np
 from hilstar.arrays import FloatArray
 from hilstar.errors import InputError, cannot_read, shortened
 from hilstar.reading import exists, read_text
+from hilstar.units import LIGHT_M_S
 
 PLANCK_J_S = 6.62607015e-34  # SI 2019, exact
-LIGHT_M_S = 299_792_458.0
 BOLTZMANN_J_K = 1.380649e-23
 STEFAN_BOLTZMANN_W_M2_K4 = 5.670374419e-8
 

@@ -17,34 +17,15 @@ from hilstar.monitor.quantise import shown_light
 from hilstar.render.reference import linear_image
 from hilstar.rotation import from_radec_roll_deg
 from hilstar.scene.frame_motion import Scan, Turn, swept_sprites
+from hilstar.study.shared.bench_text import Table, bench_text
 from hilstar.study.shared.lone_stars import Isolation, lone_windows, moments
 from hilstar.units import magnitude
 
-BENCH = """
-[tracker]
-aperture_mm = 30
-focal_length_mm = 70
-pixel_pitch_um = 13
-resolution_px = [1024, 1024]
-quantum_efficiency = "ccd47-20"
-transmission = "n-bk7-10mm"
-[sky]
-faintest_v_mag = {faintest_v_mag}
-[monitor]
-resolution_px = [1920, 1080]
-pixel_pitch_um = 57.65
-bits = {bits}
-[collimator]
-focal_length_mm = {focal_length_mm}
-[render]
-brightest_v_mag = 2.0
-motion = "on"
-tolerance_mag = {tolerance}
-tolerance_px = {tolerance}
-{effort}
-"""
 # Full effort: `exact` codes and whole sprites reach every tolerance that can be reached.
-EFFORTS = {"full": 'quantisation = "exact"\nmotion_above_px = 0.0', "auto": 'effort = "auto"\nquantisation = "auto"'}
+EFFORTS: dict[str, Table] = {
+    "full": {"quantisation": "exact", "motion_above_px": 0.0},
+    "auto": {"effort": "auto", "quantisation": "auto"},
+}
 ISOLATION = Isolation(margin_px=7, max_share=2e-4)  # 2e-4 of its light is 2e-4 mag
 ROUNDS, QUICK_ROUNDS = 60, 5
 
@@ -112,15 +93,16 @@ def compare(scene: Scene, rounds: int) -> list[Outcome]:
                 bench.close()
 
 
-def _open(scene: Scene, effort: str, path: Path) -> Bench:
-    text = BENCH.format(
-        faintest_v_mag=scene.faintest_v_mag,
-        bits=scene.bits,
-        focal_length_mm=scene.focal_length_mm,
-        tolerance=scene.tolerance,
-        effort=effort,
-    )
-    path.write_text(text)
+def _open(scene: Scene, effort: Table, path: Path) -> Bench:
+    tolerances = {"tolerance_mag": scene.tolerance, "tolerance_px": scene.tolerance}
+    tables: dict[str, Table] = {
+        "tracker": {"resolution_px": (1024, 1024), "transmission": "n-bk7-10mm"},
+        "sky": {"faintest_v_mag": scene.faintest_v_mag},
+        "monitor": {"resolution_px": (1920, 1080), "pixel_pitch_um": 57.65, "bits": scene.bits},
+        "collimator": {"focal_length_mm": scene.focal_length_mm},
+        "render": {"brightest_v_mag": 2.0, "motion": "on", **tolerances, **effort},
+    }
+    path.write_text(bench_text(tables))
     return load(path)
 
 

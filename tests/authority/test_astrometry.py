@@ -11,8 +11,9 @@ from astropy.wcs import WCS
 
 from hilstar.bench.frame_files import world_coordinates
 from hilstar.rotation import from_radec_roll_deg, to_matrix
-from hilstar.sky.astrometry import LIGHT_KM_S, aberrate, unit_vectors_icrs
+from hilstar.sky.astrometry import aberrate, unit_vectors_icrs
 from hilstar.sky.catalog import FIELDS, Catalog, load_catalog
+from hilstar.units import LIGHT_KM_S
 
 MAS = np.pi / (180 * 3600 * 1000)
 ARCSEC = 1000 * MAS

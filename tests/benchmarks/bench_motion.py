@@ -12,9 +12,9 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from hilstar.bench.build import load
+from hilstar.bench.build import open_bench
 from hilstar.rotation import from_radec_roll_deg
-from hilstar.study.speed.benchmark import BENCH, RADEC_ROLL_DEG
+from hilstar.study.speed.benchmark import RADEC_ROLL_DEG, own_bench_file
 from hilstar.study.speed.result import REFERENCE_PX
 from hilstar.study.speed.scenes import scene
 
@@ -28,20 +28,20 @@ def main() -> None:
     options = parser.parse_args()
     q = from_radec_roll_deg(*RADEC_ROLL_DEG)
     axis = np.array([0.6, -0.7, 0.2]) / np.linalg.norm([0.6, -0.7, 0.2])
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "bench.toml"
-        path.write_text(BENCH.format(*REFERENCE_PX) + 'motion = "on"\n')
-        with load(path) as bench:
-            bench = bench.with_stars(scene(bench, bench.shown_stars, q, options.stars, np.random.default_rng(1)).stars)
-            times_ms: dict[float, list[float]] = {rate: [] for rate in RATES_RAD_S}
-            told: dict[float, str] = {}
-            for number in range(options.rounds):
-                for rate in RATES_RAD_S:
-                    begin = time.perf_counter()
-                    drawn = bench.draw(q, number, rate * axis)
-                    _ = drawn.levels
-                    times_ms[rate].append((time.perf_counter() - begin) * 1e3)
-                    told[rate] = f"{drawn.star_count:6} stars, {drawn.capped:6} capped"
+    with (
+        TemporaryDirectory() as folder,
+        open_bench(own_bench_file(Path(folder) / "bench.toml", REFERENCE_PX, motion="on")) as bench,
+    ):
+        bench = bench.with_stars(scene(bench, bench.shown_stars, q, options.stars, np.random.default_rng(1)).stars)
+        times_ms: dict[float, list[float]] = {rate: [] for rate in RATES_RAD_S}
+        told: dict[float, str] = {}
+        for number in range(options.rounds):
+            for rate in RATES_RAD_S:
+                begin = time.perf_counter()
+                drawn = bench.draw(q, number, rate * axis)
+                _ = drawn.levels
+                times_ms[rate].append((time.perf_counter() - begin) * 1e3)
+                told[rate] = f"{drawn.star_count:6} stars, {drawn.capped:6} capped"
     still = float(np.median(times_ms[0.0]))
     for rate, each in times_ms.items():
         median = float(np.median(each))

@@ -14,8 +14,8 @@ from hilstar.bench.config.render import DEFAULT_BRIGHTEST_V_MAG
 from hilstar.errors import InputError, shortened
 from hilstar.reading import MAX_TOML_BYTES, parse_toml, read_text
 from hilstar.toml_tables import Kind, explained
+from hilstar.units import LIGHT_KM_S
 
-LIGHT_KM_S = 299_792.458
 KIND = Kind(BenchConfig, "configs/README.md", TYPE_WORDS)
 
 

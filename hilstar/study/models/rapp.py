@@ -18,10 +18,11 @@ from hilstar.sky.electrons import (
     reference_mean_w_m2_m,
     v_band_mean_w_m2_m,
 )
-from hilstar.sky.spectrum import LIGHT_M_S, PLANCK_J_S, blackbody_exitance_w_m2_m, integration_nodes
+from hilstar.sky.spectrum import PLANCK_J_S, blackbody_exitance_w_m2_m, integration_nodes
 from hilstar.study.models.finding import Finding
 from hilstar.study.models.settings import SENSORS, WEIGHTINGS
 from hilstar.study.shared.brightness import study_optics
+from hilstar.units import LIGHT_M_S
 
 QUOTED_K = (3000.0, 5000.0, 9000.0, 50_000.0)
 THESIS_HOT_STARS = {"ccd47-20": " (thesis: 15 % to 5 %)"}  # section 5.4, of figure 5.19

@@ -12,6 +12,7 @@ import numpy as np
 from hilstar.bench.bench_file import BenchFile, read_bench_file
 from hilstar.bench.build import open_bench
 from hilstar.rotation import from_radec_roll_deg
+from hilstar.study.shared.bench_text import Table, Value, bench_text
 from hilstar.study.speed.cells import CellMeasurement
 from hilstar.study.speed.other_methods import other_methods
 from hilstar.study.speed.result import REFERENCE_PX, Aim, Cell, Result, SceneOrigin, Size, Skipped
@@ -26,23 +27,6 @@ RADEC_ROLL_DEG = (84.057, -1.2, 10.0)
 AIMS_MS = {1000: 7.0, 10_000: 25.0}
 PYTHON_AIM_MS = 0.6  # at 1000 stars
 START_AIM_MS = 1500.0
-BENCH = """
-[tracker]
-aperture_mm = 30
-focal_length_mm = 70
-pixel_pitch_um = 13
-resolution_px = [1024, 1024]
-quantum_efficiency = "ccd47-20"
-[sky]
-faintest_v_mag = 14
-[monitor]
-resolution_px = [{}, {}]
-pixel_pitch_um = 57.65
-[collimator]
-focal_length_mm = 200
-[render]
-flux_at_white_e_per_s = 2e6
-"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +55,7 @@ def run(plan: Plan, rng: np.random.Generator, advance: Callable[[int], object]) 
     q_icrs_to_cam = from_radec_roll_deg(*RADEC_ROLL_DEG)
     with TemporaryDirectory() as folder:
         for place, size in enumerate(plan.sizes):
-            file = plan.file or _own_bench_file(Path(folder) / "bench.toml", size)
+            file = plan.file or own_bench_file(Path(folder) / "bench.toml", size)
             with open_bench(file) as bench:
                 result.gl_renderer = bench.renderer.gl_renderer
                 every = bench.shown_stars
@@ -89,8 +73,16 @@ def run(plan: Plan, rng: np.random.Generator, advance: Callable[[int], object]) 
     return result
 
 
-def _own_bench_file(path: Path, size: Size) -> BenchFile:
-    path.write_text(BENCH.format(*size))
+def own_bench_file(path: Path, size_px: Size, **render: Value) -> BenchFile:
+    """The benchmark's own bench file for an image size, written to `path`; `render` are further keys of [render]."""
+    tables: dict[str, Table] = {
+        "tracker": {"resolution_px": (1024, 1024)},
+        "sky": {"faintest_v_mag": 14},
+        "monitor": {"resolution_px": size_px, "pixel_pitch_um": 57.65},
+        "collimator": {"focal_length_mm": 200},
+        "render": {"flux_at_white_e_per_s": 2e6, **render},
+    }
+    path.write_text(bench_text(tables))
     return read_bench_file(path)
 
 

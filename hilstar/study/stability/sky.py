@@ -19,7 +19,6 @@ from hilstar.sky.electrons import (
 from hilstar.sky.pickles import library_electrons_per_s, load_library, tabulate_pickles
 from hilstar.sky.spectrum import (
     BOLTZMANN_J_K,
-    LIGHT_M_S,
     PLANCK_J_S,
     TEMPERATURE_SCALES,
     blackbody_exitance_w_m2_m,
@@ -27,7 +26,7 @@ from hilstar.sky.spectrum import (
 )
 from hilstar.study.shared.brightness import held_out_errors, study_optics
 from hilstar.study.stability.failure_case import FailureCase, Figures
-from hilstar.units import magnitude
+from hilstar.units import LIGHT_M_S, magnitude
 
 # Each star of the library held out in turn (README.md): 95 % of the stars with V-I < 2.5 are within 2.4 %, of the redder 25 %.
 BLUE_ERROR, RED_ERROR = 0.024, 0.25

@@ -11,6 +11,7 @@ from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import read_bench_file
 from hilstar.errors import InputError
 from hilstar.rotation import from_radec_roll_deg
+from hilstar.study.shared.bench_text import Table, bench_text
 from hilstar.study.stability.failure_case import FailureCase, Figures
 from hilstar.tracker.centroids import find_stars
 from hilstar.tracker.detector import Detector
@@ -24,27 +25,6 @@ GAIN_E_PER_DN = 2e4  # 1e9 electrons are 50 000 DN of 16 bits
 STANDARD_ERRORS = 5.0  # a correct figure exceeds this once in two million runs; the seeds are fixed
 HALF_DN = 0.5  # an ADC's rounding
 NOTHING = 0.0
-BENCH = """
-[tracker]
-aperture_mm = 30
-focal_length_mm = 70
-pixel_pitch_um = 13
-resolution_px = [256, 256]
-exposure_s = {exposure_s}
-quantum_efficiency = "ccd47-20"
-[tracker.detector]
-offset_dn = 100
-read_noise_e = 48
-[monitor]
-resolution_px = [256, 256]
-pixel_pitch_um = 13
-[collimator]
-focal_length_mm = 70
-[background]
-electrons_per_px = {background_e}
-[sky]
-faintest_v_mag = {faintest_v_mag}
-"""
 
 
 def standard_errors(sample: FloatArray, mean: float, sigma: float) -> float:
@@ -98,7 +78,15 @@ def simulated_dn(exposure_s: float, background_e: float, faintest_v_mag: float) 
     """Orion on a small detector, DN (256, 256), and how many stars are in it."""
     with TemporaryDirectory() as folder:
         path = Path(folder) / "bench.toml"
-        path.write_text(BENCH.format(exposure_s=exposure_s, background_e=background_e, faintest_v_mag=faintest_v_mag))
+        tables: dict[str, Table] = {
+            "tracker": {"resolution_px": (256, 256), "exposure_s": exposure_s},
+            "tracker.detector": {"offset_dn": 100, "read_noise_e": 48},
+            "monitor": {"resolution_px": (256, 256), "pixel_pitch_um": 13},
+            "collimator": {"focal_length_mm": 70},
+            "background": {"electrons_per_px": background_e},
+            "sky": {"faintest_v_mag": faintest_v_mag},
+        }
+        path.write_text(bench_text(tables))
         with Simulator(read_bench_file(path)) as simulator:
             motion = simulator.motion(from_radec_roll_deg(84.057, -1.2, 0.0), np.zeros(3))
             exposure = simulator.expose(motion, np.random.default_rng(SEED))

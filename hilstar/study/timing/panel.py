@@ -19,49 +19,37 @@ from hilstar.render.renderer import Renderer, Target
 from hilstar.scene.exposure_motion import Motion, smeared_sprites
 from hilstar.scene.frame_motion import Scan
 from hilstar.scene.sprites import Sprites
+from hilstar.study.shared.bench_text import Table, bench_text
 from hilstar.study.timing.slew import PACKET_HZ, Slew
 from hilstar.twin.bench_geometry import BenchGeometry
 from hilstar.twin.optics import TwinOptics
 from hilstar.units import NS_PER_S
-
-BENCH = """
-[tracker]
-aperture_mm = 30
-focal_length_mm = 70
-pixel_pitch_um = 13
-resolution_px = [800, 640]
-exposure_s = 0.1
-quantum_efficiency = "ccd47-20"
-transmission = "n-bk7-10mm"
-[sky]
-faintest_v_mag = 6.0
-[monitor]
-resolution_px = [1920, 1080]
-pixel_pitch_um = 57.65
-bits = 10
-{monitor}
-[collimator]
-focal_length_mm = 350
-[render]
-quantisation = "exact"
-motion = "{motion}"
-brightest_v_mag = 1.5
-"""
 
 
 @dataclass(frozen=True, slots=True)
 class Compensation:
     """What a bench compensates: further keys of [monitor], and `motion` of [render]."""
 
-    monitor_keys: str
+    monitor_keys: Table
     motion: str
+
+    def bench_text(self) -> str:
+        """The bench file with this compensation."""
+        tables: dict[str, Table] = {
+            "tracker": {"resolution_px": (800, 640), "exposure_s": 0.1, "transmission": "n-bk7-10mm"},
+            "sky": {"faintest_v_mag": 6.0},
+            "monitor": {"resolution_px": (1920, 1080), "pixel_pitch_um": 57.65, "bits": 10, **self.monitor_keys},
+            "collimator": {"focal_length_mm": 350},
+            "render": {"quantisation": "exact", "motion": self.motion, "brightest_v_mag": 1.5},
+        }
+        return bench_text(tables)
 
 
 WAYS = {
-    "no prediction": Compensation("", "off"),
-    "prediction": Compensation("", "off"),
-    "+ scan-out": Compensation("hold_ms = 0", "on"),
-    "+ smear": Compensation("", "on"),
+    "no prediction": Compensation({}, "off"),
+    "prediction": Compensation({}, "off"),
+    "+ scan-out": Compensation({"hold_ms": 0}, "on"),
+    "+ smear": Compensation({}, "on"),
 }
 DRAW_TO_SWAP_S = 0.010
 START_S = 0.0037  # of the exposure, within a refresh period
@@ -84,7 +72,7 @@ class ScanningPanel:
     """A bench that shows on a panel that scans, with one compensation, and a tracker in front of it. Free it with `close`."""
 
     def __init__(self, way: str, path: Path) -> None:
-        path.write_text(BENCH.format(monitor=WAYS[way].monitor_keys, motion=WAYS[way].motion))
+        path.write_text(WAYS[way].bench_text())
         self.way = way
         self.bench = load(path)
         config = self.bench.config

@@ -27,7 +27,6 @@ from hilstar.sky.electrons import (
 )
 from hilstar.sky.spectrum import (
     GAUSS_ORDER,
-    LIGHT_M_S,
     PLANCK_J_S,
     Curve,
     blackbody_exitance_w_m2_m,
@@ -35,7 +34,7 @@ from hilstar.sky.spectrum import (
 )
 from hilstar.study.shared.brightness import study_optics
 from hilstar.study.tradeoff.table import Figure, Trial, Trials
-from hilstar.units import magnitude
+from hilstar.units import LIGHT_M_S, magnitude
 
 SENSOR = "ccd47-20"
 ADAPTIVE = "adaptive quadrature"

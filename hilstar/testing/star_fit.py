@@ -91,7 +91,7 @@ class StarTemplates:
         return np.asarray(self._columns @ fitted.ravel()).reshape(self.shape)
 
     def errors(self, flux: FloatArray, pixel_error: float) -> tuple[FloatArray, FloatArray]:
-        """Errors of flux and of place, px, (n,) each: a pixel is off by `pixel_error` of the flux of all stars that reach it."""
+        """Errors of flux and of place, px, (n,): a pixel is off by `pixel_error` of the flux of all stars that reach it."""
         size = len(flux)
         blocks = np.zeros((size, 3, 3))
         entries = self.normal.tocoo()

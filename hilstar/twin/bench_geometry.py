@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-import numpy as np
-
 from hilstar.arrays import FloatArray
 from hilstar.scene.camera import Camera
 
@@ -26,18 +24,11 @@ class BenchGeometry:
 
     def to_tracker(self, x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Tracker pixels of monitor pixels, (n,) each; NaN behind the tracker."""
-        x_px, y_px = self._shown_at(x_px, y_px)
-        cx, cy = self.monitor.principal_point_px
-        focal = self.monitor.focal_length_px
-        ray = np.stack([(x_px - cx) / focal, (y_px - cy) / focal, np.ones_like(x_px)], axis=-1)
-        return self.tracker.project(ray @ self.monitor.cam_to_image @ self.tracker.cam_to_image.T)
+        return self.tracker.project(self.monitor.rays(*self._shown_at(x_px, y_px)) @ self.tracker.cam_to_image.T)
 
     def to_monitor(self, x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Monitor pixels that tracker pixels see, (n,) each, without the mirror; NaN behind the monitor."""
-        cx, cy = self.tracker.principal_point_px
-        focal = self.tracker.focal_length_px
-        ray = np.stack([(x_px - cx) / focal, (y_px - cy) / focal, np.ones_like(x_px)], axis=-1)
-        return self.monitor.project(ray @ self.tracker.cam_to_image @ self.monitor.cam_to_image.T)
+        return self.monitor.project(self.tracker.rays(x_px, y_px) @ self.monitor.cam_to_image.T)
 
     def _shown_at(self, x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
         width, height = self.monitor.resolution_px

@@ -111,9 +111,14 @@ def changed_keys(verify: Verify) -> list[str]:
 
 
 def true_geometry(bench: Bench, tracker: Camera) -> BenchGeometry:
-    """How monitor and collimator really stand. Raises InputError for a rotation that is not unit within 1e-3."""
+    """How monitor and collimator really stand: as the bench assumes, or an ideal lens with the keys of [verify].
+
+    Raises InputError for a rotation that is not unit within 1e-3.
+    """
     config = bench.config
     verify, collimator, monitor = config.verify, config.collimator, config.monitor
+    if (verify.true_q_cam_to_mon, verify.true_pixel_pitch_um, verify.true_focal_length_mm) == (None, None, None):
+        return BenchGeometry(bench.camera, tracker, verify.true_mirror)
     norm = math.hypot(*(verify.true_q_cam_to_mon or collimator.q_cam_to_mon))
     if abs(norm - 1) > NORM_TOLERANCE:
         raise InputError(

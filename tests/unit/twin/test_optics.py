@@ -13,6 +13,8 @@ from hilstar.monitor.geometry import monitor_camera
 from hilstar.monitor.quantise import Panel
 from hilstar.monitor.response import gamma_response, table_response
 from hilstar.rotation import to_matrix
+from hilstar.scene.camera import bounded
+from hilstar.scene.lens import Lens
 from hilstar.twin.bench_geometry import BenchGeometry
 from hilstar.twin.optics import TwinOptics
 from hilstar.twin.verify.measure import on_screen_median
@@ -24,6 +26,9 @@ SIDE = 24  # squares along a monitor pixel in the oracle
 CUT = 2e-6
 # Nine Gaussians for a square have its variance and not its fourth moment: measured 1.3e-4 of the brightest pixel.
 NINE_FOR_A_SQUARE = 2e-4
+# Newton's method inverts a lens to 1e-8 px of its own image; a monitor pixel is about a tracker pixel.
+INVERSE_PX = 1e-7
+MARGIN_PX = 6.0
 
 
 @pytest.fixture
@@ -70,6 +75,20 @@ def test_the_monitor_s_light_is_an_independent_sum_of_squares_through_both_lense
     assert wanted.sum() == pytest.approx(light.sum(), rel=1e-9)
     assert image.sum() == pytest.approx(light.sum(), rel=CUT)
     assert np.abs(image - wanted).max() < NINE_FOR_A_SQUARE * wanted.max()
+
+
+def test_a_monitor_pixel_is_seen_where_its_direction_is_whatever_the_lenses_do(geometry, rng):
+    """Distortion and a tilted screen on both sides; the way back is the inverse."""
+    collimator = Lens(radial=(0.3, -0.1, 0.0), tangential=(2e-3, -1e-3), tilt_rad=(0.01, -0.02))
+    monitor = bounded(replace(geometry.monitor, lens=collimator), MARGIN_PX)
+    tracker = bounded(replace(geometry.tracker, lens=Lens(radial=(-0.2, 0.0, 0.0))), MARGIN_PX)
+    bent = BenchGeometry(monitor, tracker)
+    direction = np.column_stack([rng.uniform(-8e-3, 8e-3, (50, 2)), np.ones(50)])
+    shown = monitor.project(direction @ monitor.cam_to_image.T)
+    seen = bent.to_tracker(*shown)
+    assert np.allclose(seen, tracker.project(direction @ tracker.cam_to_image.T), atol=INVERSE_PX)
+    assert np.abs(np.array(seen) - geometry.to_tracker(*shown)).max() > 100 * INVERSE_PX
+    assert np.allclose(bent.to_monitor(*seen), shown, atol=INVERSE_PX)
 
 
 @pytest.mark.parametrize("mirror", ["none", "x", "y", "swap"])

@@ -16,9 +16,12 @@ from hilstar.twin.verify.light import levels_of
 from hilstar.twin.verify.measure import Comparison
 from hilstar.twin.verify.run import verify
 from hilstar.twin.verify.summary import summarise
-from hilstar.twin.verify.twin import Twin, changed_keys
+from hilstar.twin.verify.twin import Twin, changed_keys, true_geometry
 from hilstar.twin.verify.verdict import Verdict, judge
 from tests.support.benches import TWIN, bench_text
+
+# Measured 0.005 px; a lens that is not undone is 1.6 px off.
+LENS_PX = 0.02
 
 
 def bench_file(directory: Path, verify_lines: str = "", **changes: object) -> Path:
@@ -108,6 +111,28 @@ def test_a_true_rotation_that_is_none_is_refused_with_the_file_s_name(tmp_path):
     assert read_config(path).verify.true_q_cam_to_mon == (0.0, 0.0, 0.0, 0.0)
     with pytest.raises(InputError, match=r"bench\.toml: \[verify\] true_q_cam_to_mon.*unit"):
         Twin(read_bench_file(path))
+
+
+def test_a_bench_whose_geometry_is_as_assumed_has_its_own_camera(tmp_path):
+    """That of its geometry file, too, which no key of [verify] describes."""
+    with Twin(read_bench_file(bench_file(tmp_path, 'true_mirror = "x"\n'))) as twin:
+        true = true_geometry(twin.bench, twin.camera)
+        assert true.monitor is twin.bench.camera
+        assert true.mirror == "x"
+
+
+def test_a_bench_that_draws_through_its_measured_lens_passes(tmp_path):
+    """Distortion, a tilted screen and a misalignment, each of them known."""
+    (tmp_path / "geometry.toml").write_text(
+        'kind = "hilstar geometry 1"\nresolution_px = [480, 400]\nfocal_length_px = 2081.5\nprincipal_point_px = [241, 198.5]\n'
+        "q_cam_to_mon = [0.99999, 0, 0, 0.00447]\nk1 = 0.6\np1 = 0.001\ntilt_deg = [0.8, -0.5]\n"
+    )
+    path = bench_file(tmp_path)
+    path.write_text(path.read_text().replace("[collimator]", '[collimator]\ngeometry = "geometry.toml"'))
+    verdict, summary = verified(path, 6, np.random.default_rng(2))
+    assert verdict.passed, verdict.reasons
+    assert summary["stars"] > 10
+    assert summary["centroid_error_px"]["p95"] < LENS_PX
 
 
 def test_only_what_is_said_to_be_true_makes_a_twin_differ(tmp_path):

@@ -1,6 +1,6 @@
-"""What a scene needs and no more: sprites, paths and codes that keep a bench's errors within its tolerance in the least time.
+"""What a scene needs and no more: sprites, paths and codes that keep a bench's errors within its tolerance in minimum time.
 
-Of the tolerance half is for the codes, a quarter for the sprites' edges and a quarter for motion that is not drawn.
+Half of the tolerance is for the codes, a quarter for the sprites' edges and a quarter for motion that is not drawn.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from hilstar.bench.config import RenderSettings
 from hilstar.monitor.phases import WHITE, Errors, fainter, measure, phase_grid, shown_by
 from hilstar.monitor.quantise import Panel, Quantisation
 from hilstar.monitor.response import Response
+from hilstar.render.encoder import SpriteSides
 from hilstar.render.reference import linear_image
 from hilstar.scene.psf import MAX_CUT, cut_share, footprint_px, peak_share, pixel_share
 from hilstar.units import flux_ratio
@@ -43,13 +44,30 @@ class Choice:
         return f"{self.what}: {self.chosen}; {self.error}; {self.saving}"
 
 
-# Sprites' sides by rate, the flux that their edges cut, magnitudes, how far that moves a centroid, px, and what to say.
-Sides = tuple[tuple[tuple[float, int], ...], float, float, Choice]
+@dataclass(frozen=True, slots=True)
+class ChosenCodes:
+    """A quantisation with its worst errors."""
+
+    method: Quantisation
+    errors: Errors
+    choice: Choice
+
+
+@dataclass(frozen=True, slots=True)
+class ChosenSides:
+    """The sides of sprites by rate (see `Target.sides`), and what their edges cost: flux, and the shift of a centroid."""
+
+    sides: SpriteSides
+    cut_mag: float
+    moved_px: float
+    choice: Choice
+
+
 ENCODING = Choice(
     "encoding", "under the sprites, or all pixels where sprites cover more", "exact", "the cheaper one, frame by frame"
 )
 # `exact` makes its codes of the stars themselves.
-NO_SPRITES: Sides = ((), 0.0, 0.0, Choice("sprites", "none", "exact", "no linear image is drawn"))
+NO_SPRITES = ChosenSides((), 0.0, 0.0, Choice("sprites", "none", "exact", "no linear image is drawn"))
 PROJECTION = Choice("projection", "perspective", "exact", "a weak one would save nothing, and fails off the middle")
 
 
@@ -61,7 +79,7 @@ class Effort:
     """
 
     quantisation: Quantisation
-    sides: tuple[tuple[float, int], ...]
+    sides: SpriteSides
     motion_above_px: float
     error_mag: float
     error_px: float
@@ -70,9 +88,9 @@ class Effort:
 
 @dataclass(frozen=True, slots=True)
 class Light:
-    """What the stars are shown with: the panel's response, white in electrons per second (its least), the stars' rates (n,).
+    """What the stars are shown with: the panel's response, its minimum white (electrons per second), the stars' rates (n,).
 
-    `can_steal_bits` says whether finer codes by bit stealing are to be had, and not used yet.
+    `can_steal_bits` says whether bit stealing would give finer codes, and is not used yet.
     """
 
     response: Response
@@ -83,12 +101,12 @@ class Light:
 
 def plan_effort(render: RenderSettings, light: Light) -> Effort:
     """The effort of a bench file's settings."""
-    method, codes = choose_codes(render, light)
-    errors, chosen = codes
+    codes = choose_codes(render, light)
+    method, errors = codes.method, codes.errors
     if render.effort == "full":
         motion_px = render.motion_above_px
-        return Effort(method, (), motion_px, errors.flux_max_mag, errors.centroid_max_px + motion_px, (chosen,))
-    sides, lost_mag, moved_px, edges = NO_SPRITES if method == "exact" else choose_sides(render, light, method)
+        return Effort(method, (), motion_px, errors.flux_max_mag, errors.centroid_max_px + motion_px, (codes.choice,))
+    sprites = NO_SPRITES if method == "exact" else choose_sides(render, light, method)
     motion_px = max(render.motion_above_px, MOTION_SHARE * render.tolerance_px)
     paths = Choice(
         "paths",
@@ -98,11 +116,11 @@ def plan_effort(render: RenderSettings, light: Light) -> Effort:
     )
     return Effort(
         quantisation=method,
-        sides=sides,
+        sides=sprites.sides,
         motion_above_px=motion_px,
-        error_mag=errors.flux_max_mag + lost_mag,
-        error_px=errors.centroid_max_px + moved_px + motion_px,
-        choices=(_star_choice(render, light, method), chosen, edges, ENCODING, paths, PROJECTION),
+        error_mag=errors.flux_max_mag + sprites.cut_mag,
+        error_px=errors.centroid_max_px + sprites.moved_px + motion_px,
+        choices=(_star_choice(render, light, method), codes.choice, sprites.choice, ENCODING, paths, PROJECTION),
     )
 
 
@@ -118,7 +136,7 @@ def explain(effort: Effort | None, render: RenderSettings) -> list[str]:
     ]
 
 
-def choose_codes(render: RenderSettings, light: Light) -> tuple[Quantisation, tuple[Errors, Choice]]:
+def choose_codes(render: RenderSettings, light: Light) -> ChosenCodes:
     """The cheapest quantisation whose errors are within the codes' part of the tolerance; the best one where none is."""
     wanted = BY_COST if render.quantisation == "auto" else (render.quantisation,)
     limits = CODES_SHARE * render.tolerance_mag, CODES_SHARE * render.tolerance_px
@@ -132,7 +150,7 @@ def choose_codes(render: RenderSettings, light: Light) -> tuple[Quantisation, tu
         ways = "more bits, bit_stealing or brighter stars" if light.can_steal_bits else "more bits or brighter stars"
         error += f" (over {limits[0]:g} mag or {limits[1]:g} px: {ways} would do)"
     saving = "several times cheaper than exact" if method == "round" else "nothing saved"
-    return method, (errors, Choice("codes", method, error, saving))
+    return ChosenCodes(method, errors, Choice("codes", method, error, saving))
 
 
 def code_errors(method: Quantisation, render: RenderSettings, light: Light) -> Errors:
@@ -151,28 +169,28 @@ def code_errors(method: Quantisation, render: RenderSettings, light: Light) -> E
     return Errors(*(max(getattr(e, name) for e in found) for name in Errors.__slots__))
 
 
-def choose_sides(render: RenderSettings, light: Light, method: Quantisation) -> Sides:
-    """Sprites' sides by rate, the flux that their edges cut, magnitudes, and how far that moves a centroid, px."""
+def choose_sides(render: RenderSettings, light: Light, method: Quantisation) -> ChosenSides:
+    """The smallest sprites whose edges stay within their part of the tolerance."""
     sigma_px = render.sprite_sigma_px
     full = footprint_px(sigma_px)
     allowed_mag, allowed_px = EDGES_SHARE * render.tolerance_mag, EDGES_SHARE * render.tolerance_px
     sizes = range(full % 2 or 2, full, 2)
-    least = next((s for s in sizes if cut_mag(s, sigma_px) <= allowed_mag and cut_px(s, sigma_px) <= allowed_px), full)
-    sides = [(math.inf, least)]
+    largest = next((s for s in sizes if cut_mag(s, sigma_px) <= allowed_mag and cut_px(s, sigma_px) <= allowed_px), full)
+    sides = [(math.inf, largest)]
     if method == "round":
         unlit = UNLIT * float(light.response.threshold[0]) * light.white_e_per_s
         # Falling rates: a star under the last of them that it is under gets the smallest sprite.
-        sides += [(unlit / outside_share(size, sigma_px), size) for size in sizes[::-1] if size < least]
+        sides += [(unlit / outside_share(size, sigma_px), size) for size in sizes[::-1] if size < largest]
     kept = tuple((min(rate, 3e38), size) for rate, size in sides[:8])
     rates = light.rates_e_per_s
     area = np.full(len(rates), full**2)
     for rate, size in kept:
         area[rates < rate] = size**2
-    cut = (cut_mag(least, sigma_px), cut_px(least, sigma_px)) if least < full else (MAG_PER_SHARE * MAX_CUT, 0.0)
+    cut = (cut_mag(largest, sigma_px), cut_px(largest, sigma_px)) if largest < full else (MAG_PER_SHARE * MAX_CUT, 0.0)
     mean = float(area.mean()) if len(area) else float(full**2)
-    chosen = f"{min(s for _, s in kept)} to {least} px a side instead of {full}"
+    chosen = f"{min(s for _, s in kept)} to {largest} px a side instead of {full}"
     error = f"{cut[0]:.1e} mag and {cut[1]:.1e} px cut"
-    return kept, *cut, Choice("sprites", chosen, error, f"{full**2 / mean:.1f} times fewer pixels")
+    return ChosenSides(kept, *cut, Choice("sprites", chosen, error, f"{full**2 / mean:.1f} times fewer pixels"))
 
 
 def cut_mag(size_px: int, sigma_px: tuple[float, float]) -> float:
@@ -205,14 +223,12 @@ def faintest_shown_e_per_s(method: str, light: Light, sigma_px: tuple[float, flo
     """The rate under which a star alone never lights a pixel, wherever it stands; 0 where the dither always may."""
     if method == "round":
         return float(light.response.threshold[0]) * light.white_e_per_s / peak_share(sigma_px)
-    return float(light.response.light[1]) / 2 * light.white_e_per_s if method == "exact" else 0.0
+    return light.response.half_step * light.white_e_per_s if method == "exact" else 0.0
 
 
 def _star_choice(render: RenderSettings, light: Light, method: str) -> Choice:
     limit = faintest_shown_e_per_s(method, light, render.sprite_sigma_px)
     dark = light.rates_e_per_s < limit
     share = float(light.rates_e_per_s[dark].sum() / light.rates_e_per_s.sum()) if dark.any() else 0.0
-    left_out = f"{int(dark.sum())} of {len(dark)} stars in the sky left out"
-    return Choice(
-        "stars", f"from {limit:.3g} electrons/s on", f"the others light no pixel ({share:.2%} of all light)", left_out
-    )
+    saving = f"{int(dark.sum())} of {len(dark)} stars in the sky are not drawn"
+    return Choice("stars", f"from {limit:.3g} electrons/s on", f"the others light no pixel ({share:.2%} of all light)", saving)

@@ -21,7 +21,7 @@ from hilstar.bench.truth import truth_table
 from hilstar.errors import InputError
 from hilstar.monitor.calibration import Calibration
 from hilstar.monitor.footprints import FootprintMap
-from hilstar.monitor.losses import star_losses
+from hilstar.monitor.losses import star_losses_mag
 from hilstar.monitor.quantise import Panel
 from hilstar.monitor.response import Codes, code_dtype
 from hilstar.render.renderer import Renderer
@@ -196,7 +196,7 @@ class Bench:
             return {}
         sprites = self.sprites(frame.q_icrs_to_cam)
         footprints = FootprintMap(self.camera.resolution_px, self._sigma_px)
-        loss_mag = star_losses(sprites, self.panel, footprints, frame.levels).loss_mag
+        loss_mag = star_losses_mag(sprites, self.panel, footprints, frame.levels)
         hip = self.shown_stars.hip[sprites.star].tolist()
         return {h: float(loss) for h, loss in zip(hip, loss_mag, strict=True) if h in hips}
 

@@ -49,6 +49,11 @@ class Response:
         """The largest level."""
         return len(self.light) - 1
 
+    @property
+    def half_step(self) -> float:
+        """Half of the smallest step of light above black: less than that is nearer to nothing."""
+        return float(self.light[1]) / 2
+
     def thresholds_e_per_s(self, flux_at_white_e_per_s: float) -> Float32Array:
         """The thresholds in the unit of the linear image, float32 as the renderer compares them."""
         return np.asarray(self.threshold * flux_at_white_e_per_s, dtype=np.float32)

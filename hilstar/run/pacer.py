@@ -119,7 +119,7 @@ class ClockPacer:
         self._period_ns = period_ns
 
     def moments(self) -> Iterator[Moment]:
-        """One each period from now on; those that have passed when the next is asked for are left out."""
+        """One each period from now on; those already past when the next is asked for are skipped."""
         start_ns = self.clock.now_ns()
         slot = 0
         while True:

@@ -82,7 +82,7 @@ def _summary(bits: int, found: dict[tuple[int, str], list[Errors]], mags: FloatA
         return f"{max(e.flux_max_mag for e in within):.3f} mag and {max(e.centroid_max_px for e in within):.3f} px"
 
     one_frame = ", ".join(f"{way.method} {worst(way)}" for way in WAYS[:3])
-    half_step_px = 0.5 * srgb_response(bits).light[1] * peak_share(SIGMA_PX) / flux_ratio(limit)
+    half_step_px = srgb_response(bits).half_step * peak_share(SIGMA_PX) / flux_ratio(limit)
     return (
         f"{bits} bits, sRGB, {limit:g} magnitudes (aim {aim_mag:g} mag, {AIM_PX:g} px): largest errors of exact"
         f" {worst(WAYS[3])}, with bit stealing {worst(WAYS[5])}; {one_frame} (over {CYCLE_FRAMES} frames)."

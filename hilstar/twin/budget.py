@@ -112,7 +112,7 @@ def corner_share(sigma_px: tuple[float, float]) -> float:
 def nothing_below_e_per_s(bench: Bench) -> float:
     """The rate below which a star lights no pixel, wherever it is; for dithers, where it lights one in half of the frames."""
     drawn = bench.faintest_shown_e_per_s
-    return drawn or float(bench.calibration.response.light[1]) / 2 * bench.flux_at_white_e_per_s
+    return drawn or bench.calibration.response.half_step * bench.flux_at_white_e_per_s
 
 
 def not_drawn(bench: Bench) -> NotDrawn:

@@ -33,23 +33,23 @@ def light(bits: int, magnitudes: float) -> Light:
 
 
 def test_round_is_chosen_where_it_does_and_exact_where_it_does_not():
-    assert choose_codes(settings(tolerance_mag=0.1, tolerance_px=0.1), light(12, 6.0))[0] == "round"
-    assert choose_codes(settings(tolerance_mag=0.02, tolerance_px=0.04), light(8, 6.0))[0] == "exact"
-    method, (errors, choice) = choose_codes(settings(tolerance_mag=1e-4), light(8, 6.0))
-    assert method == "exact" and "over 5e-05 mag" in choice.error and errors.flux_max_mag > 1e-4
+    assert choose_codes(settings(tolerance_mag=0.1, tolerance_px=0.1), light(12, 6.0)).method == "round"
+    assert choose_codes(settings(tolerance_mag=0.02, tolerance_px=0.04), light(8, 6.0)).method == "exact"
+    codes = choose_codes(settings(tolerance_mag=1e-4), light(8, 6.0))
+    assert codes.method == "exact" and "over 5e-05 mag" in codes.choice.error and codes.errors.flux_max_mag > 1e-4
 
 
 def test_what_the_file_asks_for_is_not_overruled():
-    assert choose_codes(settings(quantisation="round", tolerance_mag=1e-6), light(8, 8.0))[0] == "round"
+    assert choose_codes(settings(quantisation="round", tolerance_mag=1e-6), light(8, 8.0)).method == "round"
 
 
 def test_sprites_are_as_small_as_the_tolerance_lets_them_be():
     wide = choose_sides(settings(tolerance_mag=1e-6, tolerance_px=1e-6), light(8, 6.0), "exact")
     narrow = choose_sides(settings(tolerance_mag=0.2, tolerance_px=0.2), light(8, 6.0), "exact")
     full = footprint_px(SIGMA)
-    assert wide[0] == ((pytest.approx(3e38), full),)
-    assert narrow[0][0][1] < full
-    assert narrow[1] <= 0.05 and narrow[2] <= 0.05
+    assert wide.sides == ((pytest.approx(3e38), full),)
+    assert narrow.sides[0][1] < full
+    assert narrow.cut_mag <= 0.05 and narrow.moved_px <= 0.05
 
 
 @pytest.mark.parametrize("size", [4, 6, 8, 5, 7])

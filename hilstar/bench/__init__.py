@@ -1,1 +1,1 @@
-"""The bench: its file, the parts that it is assembled from, and the loops that run it."""
+"""The bench: its file, the parts that the file describes, and the frames that they draw."""

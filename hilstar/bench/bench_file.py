@@ -1,4 +1,4 @@
-"""The bench file of a run: read once, so that whatever the run does, it does on the bytes that were checked."""
+"""The bench file of a run: read once, so that the whole run uses the bytes that were checked."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from hilstar.sky.spectrum import BUILT_IN_CURVES
 
 @dataclass(frozen=True, slots=True)
 class BenchFile:
-    """A bench file as it was when it was read: its text, and the checked configuration of that text.
+    """A bench file at the moment it was read: its text, and the checked configuration in that text.
 
     `sha256` covers everything that makes the bench's frames: its settings, defaults included, and the files it names.
     """

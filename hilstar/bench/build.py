@@ -83,7 +83,7 @@ def _target(config: BenchConfig, panel: Panel, effort: Effort | None) -> Target:
 
 
 def _effort(render: RenderSettings, light: Light) -> Effort | None:
-    """What is chosen within the bench file's tolerance, None where it leaves nothing to that."""
+    """The settings chosen within the bench file's tolerance; None if the file sets them all."""
     return plan_effort(render, light) if render.effort == "auto" or render.quantisation == "auto" else None
 
 
@@ -147,7 +147,7 @@ def _white_e_per_s(render: RenderSettings, stars: Stars) -> float:
 def brightest_peak_e_per_s(
     stars: Stars, sigma_px: tuple[float, float], brightest_v_mag: float | None = DEFAULT_BRIGHTEST_V_MAG
 ) -> float:
-    """White, where the file gives no light for it: the brightest pixel of the brightest star at or below that magnitude.
+    """Full scale where the file gives no flux for it: the brightest pixel of the brightest star at or below that magnitude.
 
     Brighter stars may clip. With the default magnitude and a catalogue of brighter stars alone, none does. Raises InputError
     when no star remains.

@@ -32,7 +32,7 @@ CUT_PHASES = 51
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """One thing that was chosen: what it is, what it costs in accuracy, and what it saves against the full setting."""
+    """One choice: its subject, its value, its error, and what it saves compared with full effort."""
 
     what: str
     chosen: str
@@ -40,13 +40,13 @@ class Choice:
     saving: str
 
     def line(self) -> str:
-        """The choice for a person."""
+        """The choice as one line of text."""
         return f"{self.what}: {self.chosen}; {self.error}; {self.saving}"
 
 
 @dataclass(frozen=True, slots=True)
 class ChosenCodes:
-    """A quantisation with its worst errors."""
+    """A quantisation with its maximum errors."""
 
     method: Quantisation
     errors: Errors
@@ -73,9 +73,9 @@ PROJECTION = Choice("projection", "perspective", "exact", "a weak one would save
 
 @dataclass(frozen=True, slots=True)
 class Effort:
-    """How much is done for a bench's stars: quantisation, sprites' sides by rate (see `Target.sides`), motion that is drawn.
+    """The effort for a bench's stars: quantisation, sprite sides by rate (see `Target.sides`), and the smallest motion drawn.
 
-    `error_mag` and `error_px` are what all choices together may be off by, at the faintest star and the worst phase.
+    `error_mag` and `error_px` bound the error of all choices together, at the faintest star and the worst phase.
     """
 
     quantisation: Quantisation
@@ -125,7 +125,7 @@ def plan_effort(render: RenderSettings, light: Light) -> Effort:
 
 
 def explain(effort: Effort | None, render: RenderSettings) -> list[str]:
-    """What was chosen, a line each, and what it all comes to."""
+    """One line for each choice, and the total error."""
     if effort is None:
         return ['effort: full; write [render] effort = "auto" or quantisation = "auto" to have it chosen within the tolerance']
     total = f"{effort.error_mag:.4f} mag of {render.tolerance_mag:g}, {effort.error_px:.4f} px of {render.tolerance_px:g}"
@@ -137,7 +137,7 @@ def explain(effort: Effort | None, render: RenderSettings) -> list[str]:
 
 
 def choose_codes(render: RenderSettings, light: Light) -> ChosenCodes:
-    """The cheapest quantisation whose errors are within the codes' part of the tolerance; the best one where none is."""
+    """The cheapest quantisation whose errors are within the codes' part of the tolerance; the most accurate one if none is."""
     wanted = BY_COST if render.quantisation == "auto" else (render.quantisation,)
     limits = CODES_SHARE * render.tolerance_mag, CODES_SHARE * render.tolerance_px
     for method in wanted:
@@ -154,7 +154,7 @@ def choose_codes(render: RenderSettings, light: Light) -> ChosenCodes:
 
 
 def code_errors(method: Quantisation, render: RenderSettings, light: Light) -> Errors:
-    """The worst errors of a method over phases and over magnitudes from white to the faintest star that it shows."""
+    """The maximum errors of a method over sub-pixel phases and over magnitudes from full scale to the faintest star."""
     sigma_px = render.sprite_sigma_px
     sprites, tile = phase_grid(PHASES, sigma_px)
     bright = linear_image(sprites, (PHASES * tile, PHASES * tile), sigma_px)
@@ -194,12 +194,12 @@ def choose_sides(render: RenderSettings, light: Light, method: Quantisation) -> 
 
 
 def cut_mag(size_px: int, sigma_px: tuple[float, float]) -> float:
-    """The flux that a square sprite cuts at the worst phase, magnitudes."""
+    """The flux lost outside a square sprite at the worst phase, magnitudes."""
     return MAG_PER_SHARE * cut_share(size_px, sigma_px)
 
 
 def cut_px(size_px: int, sigma_px: tuple[float, float]) -> float:
-    """How far a square sprite's edge moves the centroid at the worst phase, px, both axes together."""
+    """How far a square sprite's edge shifts the centroid at the worst phase, px, both axes combined."""
     return math.hypot(*(_cut_px(size_px, sigma) for sigma in sigma_px))
 
 
@@ -220,7 +220,7 @@ def outside_share(size_px: int, sigma_px: tuple[float, float]) -> float:
 
 
 def faintest_shown_e_per_s(method: str, light: Light, sigma_px: tuple[float, float]) -> float:
-    """The rate under which a star alone never lights a pixel, wherever it stands; 0 where the dither always may."""
+    """The rate below which a single star lights no pixel at any phase; 0 where dithering may always light one."""
     if method == "round":
         return float(light.response.threshold[0]) * light.white_e_per_s / peak_share(sigma_px)
     return light.response.half_step * light.white_e_per_s if method == "exact" else 0.0

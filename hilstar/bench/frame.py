@@ -117,7 +117,7 @@ class Bench:
         return self.config.render.sprite_sigma_px
 
     def sprites(self, q_icrs_to_cam: FloatArray, stars: Stars | None = None) -> Sprites:
-        """The sprites of `stars` (those that can be seen, by default) at an attitude (unit quaternion, scalar first)."""
+        """The sprites of `stars` (by default those bright enough to show) at an attitude (unit quaternion, scalar first)."""
         stars = self.shown_stars if stars is None else stars
         icrs_to_image = self.camera.cam_to_image @ to_matrix(q_icrs_to_cam)
         return make_sprites(stars, icrs_to_image, self.camera, self.renderer.footprint_px)
@@ -128,8 +128,8 @@ class Bench:
         """Draw the levels for an attitude; None gives a blank frame. The frame path: no copy, no table.
 
         `frame` counts the frames shown, for temporal dithering. With a rate that moves stars by more than
-        `[render] motion_above_px` each is drawn along its path while its row is lit; the attitude is then that of the middle
-        row's first light.
+        `[render] motion_above_px`, each star is drawn along its path while its row is lit; the attitude is then that at the
+        middle row's first light.
         """
         return self.draw_sprites(self.frame_sprites(q_icrs_to_cam, rate_cam_rad_s), frame)
 
@@ -151,7 +151,7 @@ class Bench:
         return Drawn(self.renderer, sprites, tuple(self.shown_stars.hip[np.unique(sprites.star[clipped])].tolist()))
 
     def _turn(self, q_icrs_to_cam: FloatArray, rate_cam_rad_s: Vector | FloatArray | None) -> Turn | None:
-        """The motion of a frame, None where no star moves far enough to be seen."""
+        """The motion within a frame; None if no star moves far enough to be seen."""
         if rate_cam_rad_s is None:
             return None
         turn = Turn(q_icrs_to_cam, np.asarray(rate_cam_rad_s, dtype=np.float64))
@@ -172,7 +172,7 @@ class Bench:
             _ = self.draw(q, 0, rate).levels
 
     def frame(self, q_icrs_to_cam: Sequence[float] | FloatArray, number: int = 0) -> Frame:
-        """Draw one frame and bring everything about it back; the arrays are the caller's own.
+        """Draw one frame and read all of it back; the arrays are copies.
 
         Stars too faint for the monitor are in the linear image and the truth, and not drawn. `number` counts frames, for
         temporal dithering. Raises InputError for a quaternion that is not unit within 1e-3.
@@ -190,7 +190,7 @@ class Bench:
         return Frame(q, linear, levels, self.code_values(levels), truth[np.argsort(truth["v_mag"], kind="stable")])
 
     def losses_mag(self, frame: Frame) -> dict[int, float]:
-        """By HIP, the magnitudes that each clipped star of a frame is too faint by, its light summed over its own pixels."""
+        """For each clipped star of a frame (by HIP number), how many magnitudes too faint it is, summed over its own pixels."""
         hips = set(frame.truth["hip"][frame.truth["clipped"]].tolist())
         if not hips:
             return {}

@@ -57,7 +57,7 @@ def sky_header(bench_hash: str, epoch_jyear: float, q_icrs_to_cam: FloatArray, c
 
 
 def world_coordinates(camera: Camera, q_icrs_to_cam: FloatArray) -> dict[str, str | float]:
-    """FITS TAN keywords of an image: exact, for it is a tangent plane."""
+    """The FITS TAN keywords of an image; exact, because the image is a tangent plane."""
     right, down, normal = camera.cam_to_image @ to_matrix(q_icrs_to_cam)
     ra, dec = np.arctan2(normal[1], normal[0]), np.arctan2(normal[2], np.hypot(normal[0], normal[1]))
     east = np.array([-np.sin(ra), np.cos(ra), 0.0])
@@ -120,9 +120,9 @@ def _save_png(path: Path, image: npt.NDArray[Any]) -> None:
 
 
 def write_preview_png(path: Path, codes: Codes) -> None:
-    """A picture for a person: each star a disc that grows with its code, as star charts have it.
+    """A preview for the eye: each star a disc that grows with its code, as on a star chart.
 
-    It is stretched to the brightest pixel of its own frame.
+    It is stretched to the brightest pixel of the frame.
     """
     from PIL import Image
     from scipy.ndimage import gaussian_filter, maximum_filter

@@ -10,7 +10,7 @@ S_PER_MS = 1e-3
 
 
 def orientation_of(monitor: Monitor) -> Orientation:
-    """How the bench file says that the image lies on the screen."""
+    """How the image lies on the screen, as the bench file has it."""
     return Orientation(monitor.flip_x, monitor.flip_y, monitor.rotate_deg // 90)
 
 

@@ -1,1 +1,1 @@
-"""The process itself: signals, priority, and a stderr that nobody can hold up."""
+"""The process itself: signals, priority, and writing to stderr without waiting."""

@@ -1,4 +1,4 @@
-"""Signals: the first ends a command in order, and whatever it is at, the process is gone within a second.
+"""Signals: the first ends a command in order, and whatever the command is doing, the process has ended within a second.
 
 Python's own handlers run in the main thread, between two steps of the interpreter: a long draw or a call that waits in C
 holds them up. So the number of a signal goes to a socket too, from within C, and two watchers look at it: a thread, which
@@ -33,7 +33,7 @@ SIGNALLED = 128  # and the signal's number: the exit code of a process that a si
 
 
 class _Ending:
-    """What of this process has to do with its end."""
+    """The state of this process's end."""
 
     def __init__(self) -> None:
         self.signal: int | None = None
@@ -67,7 +67,7 @@ def install() -> None:
 
 
 def _fill_closed() -> None:
-    """Where standard streams were closed by whoever started us, no socket may take their numbers."""
+    """Open the standard streams that the parent process closed, so that no socket takes their numbers."""
     for descriptor in range(3):
         try:
             os.fstat(descriptor)
@@ -96,7 +96,7 @@ def caught() -> str | None:
 
 
 def exit_code() -> int:
-    """Of a command that a signal ended."""
+    """The exit code of a command that a signal ended."""
     return SIGNALLED + (_ending.signal or signal.SIGINT)
 
 
@@ -173,7 +173,7 @@ def _watch(watched: socket.socket) -> None:
 
 
 def _whereabouts() -> str:
-    """What the main thread is at: the innermost function of hilstar's own."""
+    """The innermost function of hilstar's own code in which the main thread is."""
     frame = sys._current_frames().get(threading.main_thread().ident or 0)
     while frame is not None:
         path = Path(frame.f_code.co_filename)
@@ -184,14 +184,14 @@ def _whereabouts() -> str:
 
 
 def _say_if_read(line: str) -> None:
-    """A line on stderr where that takes it at once."""
+    """Write a line to stderr if that does not block."""
     with contextlib.suppress(OSError, ValueError):
         if select.select([], [2], [], 0)[1]:
             os.write(2, line.encode())
 
 
 def end_children(process: int, *spared: int | None) -> None:
-    """Kill what a process has started, and not `spared`."""
+    """Kill the children of a process, except `spared`."""
     with contextlib.suppress(OSError):
         for task in Path(f"/proc/{process}/task").iterdir():
             for child in map(int, (task / "children").read_text().split()):
@@ -219,7 +219,7 @@ def _guard(parent: int, watched: socket.socket) -> NoReturn:
 
 
 def _let_go_of_all_but(kept: int) -> None:
-    """Close what the parent had open: whoever reads its output waits for the last who could write."""
+    """Close the parent's file descriptors: a reader of its output waits until the last writer has closed."""
     os.closerange(0, kept)
     os.closerange(kept + 1, 1024)
 

@@ -1,4 +1,4 @@
-"""A frame loop that nothing of its own process interrupts: scheduling, Python's lock, and its garbage collector."""
+"""A frame loop that its own process does not interrupt: scheduling, Python's lock, and the garbage collector."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ SWITCH_INTERVAL_S = 0.0005
 
 @contextmanager
 def steady_loop() -> Iterator[str]:
-    """Run the frame loop of this thread at real-time priority where that is allowed; gives the scheduling it has.
+    """Run this thread at real-time priority where that is allowed; yields the scheduling that it got.
 
-    Python's garbage collector stands still meanwhile: the frame path makes no cycles (tests/screen/test_screen_run.py measures
+    Python's garbage collector is off meanwhile: the frame path makes no cycles (tests/screen/test_screen_run.py measures
     it), and a full collection would take a frame's time.
     """
     interval_s = sys.getswitchinterval()

@@ -1,4 +1,4 @@
-"""Lines on stderr that wait for nobody: whoever should read them may sleep, and neither a frame nor the end is held up."""
+"""Writing to stderr without waiting: if nobody reads it, neither a frame nor the end of the process is delayed."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LAST_WORDS_S = 1.0  # for a traceback, where nobody asks for what is written
 
 
 class QueuedStderr(io.RawIOBase):
-    """What is written goes to stderr from a thread, in order; what is over MAX_WAITING_BYTES is dropped and counted."""
+    """Writes go to stderr from a thread, in order; beyond MAX_WAITING_BYTES they are dropped and counted."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -30,11 +30,11 @@ class QueuedStderr(io.RawIOBase):
         threading.Thread(target=self._run, name="hilstar-stderr", daemon=True).start()
 
     def writable(self) -> bool:
-        """It is."""
+        """True."""
         return True
 
     def fileno(self) -> int:
-        """Of stderr itself."""
+        """The descriptor of stderr itself."""
         return DESCRIPTOR
 
     def isatty(self) -> bool:
@@ -42,7 +42,7 @@ class QueuedStderr(io.RawIOBase):
         return os.isatty(DESCRIPTOR)
 
     def write(self, data: Any) -> int:
-        """Take in bytes; how many, which is all."""
+        """Queue bytes; returns their number."""
         piece = bytes(data)
         with self._changed:
             if self._waiting_bytes + len(piece) > MAX_WAITING_BYTES:
@@ -54,7 +54,7 @@ class QueuedStderr(io.RawIOBase):
         return len(piece)
 
     def finish(self, patience_s: float) -> None:
-        """Wait until everything is written, at most so long."""
+        """Wait until everything has been written, for at most `patience_s`."""
         end_s = time.monotonic() + patience_s
         with self._changed:
             while self._waiting_bytes and (rest_s := end_s - time.monotonic()) > 0:
@@ -88,7 +88,7 @@ _queued: QueuedStderr | None = None
 
 
 def queue_stderr() -> None:
-    """From here on what this process writes to `sys.stderr` waits for nobody."""
+    """From here on, writing to `sys.stderr` does not wait."""
     global _queued  # noqa: PLW0603 - a process has one stderr
     if _queued is None and sys.stderr is not None:
         _queued = QueuedStderr()
@@ -98,7 +98,7 @@ def queue_stderr() -> None:
 
 
 def finish_stderr(patience_s: float) -> None:
-    """Wait until what was written has left, at most so long."""
+    """Wait until everything queued has been written, for at most `patience_s`."""
     if _queued is not None:
         with contextlib.suppress(OSError, ValueError):
             sys.stderr.flush()

@@ -1,1 +1,1 @@
-"""A run: frames paced, drawn and recorded, live, in lockstep or of a log."""
+"""A run: frames paced, drawn and recorded, from a live stream, in lockstep, or from a log."""

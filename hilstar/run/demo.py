@@ -1,4 +1,4 @@
-"""The main job in one command: a sender process streams a slew, and this process shows it."""
+"""The demo: a sender process streams a slew, and this process shows it."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ JITTER_SECONDS = 0.4  # its correlation time
 
 @dataclass(frozen=True, slots=True)
 class Demo:
-    """What the demo did: its summary and the pictures that it wrote."""
+    """The result of the demo: its summary and the pictures that it wrote."""
 
     summary: dict[str, Any]
     pictures: list[Path]

@@ -1,4 +1,4 @@
-"""What this machine has and lacks: GL, displays, links, files."""
+"""What this machine has and what it lacks: GL, displays, links, files."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from hilstar.sky.catalog import load_catalog
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One thing that hilstar uses; `required` ones decide the verdict."""
+    """One thing that hilstar uses; only `required` ones decide the verdict."""
 
     name: str
     ok: bool

@@ -12,7 +12,7 @@ from hilstar.run.shown import Shown
 
 
 class StatusMaker:
-    """Makes status packets; `missed` and `refused`, and an event that does not last, are told once each time."""
+    """Makes status packets; missed frames, refused packets and momentary events are reported once each."""
 
     def __init__(self, ledger: Ledger | None = None) -> None:
         self._ledger = ledger
@@ -50,6 +50,6 @@ class StatusMaker:
         )
 
     def _happens(self, notices: Notices, kind: str) -> bool:
-        """True while an event lasts, and once after each that does not."""
+        """True while an event lasts, and once after each momentary one."""
         before, self._told[kind] = self._told.get(kind, 0), notices.counts().get(kind, 0)
         return kind in notices.active or self._told[kind] > before

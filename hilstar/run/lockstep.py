@@ -26,7 +26,7 @@ POLL_MS = 50
 def serve_lockstep(
     bench: Bench, link: ZmqLockstep, limit: Limit, loop: FrameLoop, ledger: Ledger | None = None
 ) -> dict[str, Any]:
-    """Answer requests up to `limit`, or until a signal; the summary. A refused request shows nothing new."""
+    """Answer requests up to `limit`, or until a signal; returns the summary. A refused request leaves the last frame."""
     counts = PacketCounts()
     statuses = StatusMaker(ledger)
     turn_ms = RunningStatistics()

@@ -1,7 +1,7 @@
 """The frame loop: an attitude at each frame's moment of light, drawn, counted, handed on.
 
-It knows neither screens nor links: a pacer says when frames are due and shows them, and whoever runs the loop finds the
-attitudes.
+It knows neither screens nor links: a pacer says when frames are due and shows them, and whoever runs the loop supplies
+the attitudes.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Limit:
 class FrameLoop:
     """Draws frames; a slow frame is missed, and never delays those after it.
 
-    `moving` says whether stars are drawn along their paths; by default as the bench file says, which is on a screen only.
+    `moving` says whether stars are drawn along their paths; by default as the bench file has it, which is on a screen only.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class FrameLoop:
     def draw(self, number: int, t_ns: int, attitude: Attitude | None, moment: Moment = AT_ONCE) -> Shown | None:
         """Draw the frame for `t_ns` of the timeline's clock; without an attitude it is blank.
 
-        None for a frame that is given up, since its moment passed while its sprites were made.
+        None for a frame that is given up because its moment passed while its sprites were computed.
         """
         self.watch.begin(number)
         try:
@@ -108,7 +108,7 @@ class FrameLoop:
         return shown
 
     def _shown_attitude(self, t_ns: int, attitude: Attitude | None, stale: bool) -> Attitude | None:
-        """What an operator's keys and the bench file's rule for stale attitudes leave of the attitude."""
+        """The attitude after the operator's keys and the bench file's rule for stale attitudes."""
         operator = self.pacer.operator
         attitude = operator.attitude(t_ns, attitude)
         return None if stale and self._blank_when_stale and not operator.paused else attitude
@@ -148,13 +148,13 @@ class FrameLoop:
         if not self.tally.capped_frames:
             self.notices.tell(
                 "capped",
-                f"frame {number}: the turn is too fast for whole paths; {stars} stars are drawn coarser, with all their light"
+                f"frame {number}: the turn is too fast for full paths; {stars} stars are drawn coarser, with all their light"
                 " (further such frames are only counted)",
             )
         self.tally.capped_frames += 1
 
     def idle(self) -> None:
-        """Keep what shows the frames alive while none is due."""
+        """Keep the window alive while no frame is due."""
         self._presence.see(None, True)
         self.pacer.idle()
 
@@ -184,7 +184,7 @@ class FrameLoop:
         return slot < limit.slots and self.tally.frames < limit.frames and not self.stop.is_set()
 
     def _missed_between(self, last: Moment, slot: int, gave_up: bool, limit: Limit) -> int:
-        """How many slots just before `slot` have no frame of their own; those since `last`, which count as missed by now."""
+        """The number of slots just before `slot` without a frame of their own; counts those since `last` as missed."""
         if self.tally.frames >= limit.frames:
             return 0
         between = int(min(slot, limit.slots)) - last.slot - 1

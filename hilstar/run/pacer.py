@@ -45,7 +45,7 @@ AT_ONCE = Moment()
 
 @dataclass(frozen=True, slots=True)
 class Presented:
-    """How a frame reached whoever looks: when (host time, ns), by which clock, and the photodiode square's light with it."""
+    """How a frame was shown: when (host time, ns), by which clock, and the photodiode square's light in it."""
 
     swap_ns: int
     timestamp_source: str = "headless"
@@ -53,11 +53,11 @@ class Presented:
 
 
 class Operator:
-    """What an operator changes of the frames: without a screen nothing."""
+    """What an operator changes in the frames: nothing without a screen."""
 
     @property
     def paused(self) -> bool:
-        """Whether the frames keep the attitude that they had."""
+        """Whether the attitude is frozen."""
         return False
 
     def look(self) -> OnScreen:
@@ -69,11 +69,11 @@ class Operator:
         return attitude
 
     def count(self, shown: OnScreen, swap_ns: int) -> None:
-        """Take in what a frame was shown as."""
+        """Count a frame by how it was shown."""
 
 
 class Pacer(Protocol):
-    """Says when frames are due, and shows them."""
+    """Decides when frames are due, and shows them."""
 
     @property
     def clock(self) -> HostClock:
@@ -85,7 +85,7 @@ class Pacer(Protocol):
 
     @property
     def operator(self) -> Operator:
-        """Whoever stands at the screen."""
+        """The operator at the screen."""
 
     @property
     def moves_stars(self) -> bool:
@@ -95,10 +95,10 @@ class Pacer(Protocol):
         """The moments of a run, without end; each is the first that can be reached when it is asked for."""
 
     def steady(self) -> AbstractContextManager[object]:
-        """While this is open, nothing of this process holds up the frames."""
+        """While this is open, the process does not interrupt its frames."""
 
     def show(self, number: int, drawn: Drawn, moment: Moment, begun_ns: int, enter: Callable[[str], None]) -> Presented:
-        """Show a frame that was begun at `begun_ns`; `enter` is told each stage of it."""
+        """Show a frame that was begun at `begun_ns`; `enter` is called with the name of each stage."""
 
     def idle(self) -> None:
         """Called while no frame is due."""
@@ -108,7 +108,7 @@ class Pacer(Protocol):
 
 
 class ClockPacer:
-    """Frames at a steady rate of this host's clock, which nobody sees: their levels are read back."""
+    """Frames at a steady rate of this host's clock, without a screen: their levels are read back."""
 
     moves_stars = False
 
@@ -129,7 +129,7 @@ class ClockPacer:
             slot = max(slot, passed) + 1
 
     def steady(self) -> AbstractContextManager[object]:
-        """Nothing is at stake here."""
+        """Nothing to do without a screen."""
         return nullcontext()
 
     def show(self, number: int, drawn: Drawn, moment: Moment, begun_ns: int, enter: Callable[[str], None]) -> Presented:
@@ -138,7 +138,7 @@ class ClockPacer:
         return Presented(self.clock.now_ns())
 
     def idle(self) -> None:
-        """Nothing has to be kept alive."""
+        """Nothing to do without a window."""
 
     def summary(self, swaps: dict[str, Any]) -> dict[str, Any]:
         """There is no screen."""

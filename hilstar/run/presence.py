@@ -1,4 +1,4 @@
-"""Tells of the attitude as it comes and goes: none yet, the first, stale, fresh again."""
+"""Reports whether an attitude is there: none yet, the first, stale, fresh again."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ NONE_YET_NS = 2 * NS_PER_S
 
 
 class AttitudeWatch:
-    """Sees the attitude of each frame, before anything that an operator does to it."""
+    """Watches the attitude of each frame, before an operator's keys change it."""
 
     def __init__(self, notices: Notices, clock: HostClock = HOST_CLOCK) -> None:
         self._notices = notices
@@ -21,7 +21,7 @@ class AttitudeWatch:
         self._stale_ns: int | None = None  # since when, host time
 
     def see(self, attitude: Attitude | None, stale: bool) -> None:
-        """The attitude of the frame that is next, None where none has come yet, and whether it is too old."""
+        """Take the next frame's attitude (None if none has come yet), and whether it is too old."""
         now_ns = self._clock.now_ns()
         if self._begun_ns is None:
             self._begun_ns = now_ns

@@ -1,4 +1,4 @@
-"""What of a log is replayed, and how fast."""
+"""What part of a log is replayed, and how fast."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from hilstar.run.record.ledger_reader import drawable_frames
 from hilstar.run.record.ledger_records import FrameRecord
 from hilstar.units import NS_PER_S
 
-MOST_FRAMES = 100_000_000
+MAX_FRAMES = 100_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +39,7 @@ class Wanted:
 
 
 class Play(Protocol):
-    """Frames of the past, in order; paced as on a monitor, or all at once."""
+    """Recorded frames, in order; paced as on a monitor, or as fast as possible."""
 
     @property
     def paced(self) -> bool:
@@ -51,7 +51,7 @@ class Play(Protocol):
 
     @property
     def packet_count(self) -> int:
-        """How many attitudes are behind them."""
+        """How many attitudes they come from."""
 
     @property
     def moving(self) -> bool | None:
@@ -59,7 +59,7 @@ class Play(Protocol):
 
     @property
     def told(self) -> list[tuple[str, str]]:
-        """What is to be told of it before it begins: kinds and lines of events."""
+        """Events to report before it begins: kinds and lines."""
 
     def frame(self, slot: int) -> tuple[int, int, Attitude | None]:
         """Number, time and attitude of a frame; None is blank."""
@@ -90,7 +90,7 @@ class LogPlay:
 
 @dataclass(frozen=True, slots=True)
 class RunPlay:
-    """An earlier run by its ledger: the same frames with the same attitudes, so the same light, bit for bit."""
+    """An earlier run, from its ledger: the same frames with the same attitudes, so the same light bit for bit."""
 
     frames: list[FrameRecord]
     packet_count: int
@@ -127,11 +127,11 @@ def plan_play(log: Path, wanted: Wanted, config: BenchConfig) -> Play:
     step_s = (1.0 if math.isinf(factor) else factor) / config.monitor.refresh_hz
     if wanted.step_s is not None:
         if wanted.step_s <= 0 or factor not in {1.0, math.inf}:
-            raise InputError(f"--step {wanted.step_s:g}: write seconds above 0, and --speed realtime or max beside it")
+            raise InputError(f"--step {wanted.step_s:g}: write seconds above 0, with --speed realtime or max")
         step_s = wanted.step_s
     count = (stop_s - start_s) / step_s + 1e-6
-    if count > MOST_FRAMES:
-        raise InputError(f"{log}: makes {count:.3g} frames; write a longer --step, or --start and --stop")
+    if count > MAX_FRAMES:
+        raise InputError(f"{log}: gives {count:.3g} frames; write a longer --step, or --start and --stop")
     first_ns = samples[0].t_ns + round(start_s * NS_PER_S)
     joins = log_joins(samples)
     timeline = log_timeline(samples, policy_of(config.attitude), joins)
@@ -139,7 +139,7 @@ def plan_play(log: Path, wanted: Wanted, config: BenchConfig) -> Play:
 
 
 def _check_rates(log: Path, samples: list[AttitudeSample], max_rate_rad_s: float) -> None:
-    """A log is refused what a stream is refused."""
+    """Refuse (InputError) in a log what is refused in a stream."""
     for number, sample in enumerate(samples, start=1):
         refusal = rate_refusal(sample, max_rate_rad_s)
         if refusal is not None:
@@ -148,7 +148,7 @@ def _check_rates(log: Path, samples: list[AttitudeSample], max_rate_rad_s: float
 
 def _plan_run(log: Path, wanted: Wanted, factor: float, frames: list[FrameRecord]) -> RunPlay:
     if wanted.step_s is not None or factor not in {1.0, math.inf}:
-        raise InputError(f"{log}: an earlier run is replayed frame by frame; leave --step out, and --speed but realtime or max")
+        raise InputError(f"{log}: an earlier run is replayed frame by frame; use --speed realtime or max, and no --step")
     first_ns = frames[0].swap_ns
     start_s, stop_s = _span(log, wanted, (frames[-1].swap_ns - first_ns) / NS_PER_S)
     kept = [frame for frame in frames if start_s <= (frame.swap_ns - first_ns) / NS_PER_S <= stop_s + 1e-9]
@@ -161,5 +161,5 @@ def _span(log: Path, wanted: Wanted, length_s: float) -> tuple[float, float]:
     start_s = 0.0 if wanted.start_s is None else wanted.start_s
     stop_s = length_s if wanted.stop_s is None else wanted.stop_s
     if not 0 <= start_s <= stop_s <= length_s + 1e-9:
-        raise InputError(f"{log}: --start {start_s:g} --stop {stop_s:g}; write seconds from 0 to its length, {length_s:g}")
+        raise InputError(f"{log}: --start {start_s:g} --stop {stop_s:g}; write seconds between 0 and its length, {length_s:g}")
     return start_s, stop_s

@@ -1,4 +1,4 @@
-"""What is shown live, over a link, and what is shown of a log."""
+"""A live run over a link, and the replay of a log."""
 
 from __future__ import annotations
 
@@ -35,25 +35,25 @@ AnyLink = ZmqReceiver | ZmqLockstep | SerialLink
 
 @dataclass(frozen=True, slots=True)
 class Outlet:
-    """Where frames go besides their sink: onto a screen, and into a ledger; and where events are told."""
+    """Where frames go besides their sink: onto a screen and into a ledger; and where events are reported."""
 
     screen: Screen | None = None
     ledger: Ledger | None = None
     notices: Notices = field(default_factory=Notices)
 
     def pacer(self) -> Pacer | None:
-        """What paces and shows the frames: the screen; None without one."""
+        """The pacer of the screen; None without one."""
         return None if self.screen is None else DisplayPacer(self.screen, self.notices)
 
 
 def link_keys(settings: AttitudeSettings, folder: Path) -> CurveKeys:
-    """The CURVE key files that the bench file names, relative to it."""
+    """The CURVE key files that the bench file names; paths are relative to it."""
     names = (settings.curve_secret_key, settings.curve_server_key, settings.allowed_clients)
     return CurveKeys(*(None if name is None else folder / name for name in names))
 
 
 def open_link(settings: AttitudeSettings, folder: Path, notices: Notices | None = None) -> AnyLink:
-    """The link that the bench file in `folder` names. Raises InputError for one that cannot be had."""
+    """The link that the bench file in `folder` names. Raises InputError if it cannot be opened."""
     if settings.source == "serial":
         return SerialLink(settings.port, settings.baud, notices)
     keys = link_keys(settings, folder)
@@ -63,7 +63,7 @@ def open_link(settings: AttitudeSettings, folder: Path, notices: Notices | None 
 
 
 def serve(bench: Bench, link: AnyLink, limit: Limit, sink: FrameSink = ignore, outlet: Outlet | None = None) -> dict[str, Any]:
-    """Show the live stream of `link` up to `limit`, or until a signal; the summary."""
+    """Show the live stream of `link` up to `limit`, or until a signal; returns the summary."""
     outlet = outlet or Outlet()
     loop, ledger = FrameLoop(bench, sink, outlet.pacer(), notices=outlet.notices), outlet.ledger
     with stop_on_signal(loop.stop), loop.watch:
@@ -119,7 +119,7 @@ def _serve_stream(
 
 
 def replay(bench: Bench, play: Play, sink: FrameSink = ignore, outlet: Outlet | None = None) -> dict[str, Any]:
-    """Show the past; the summary.
+    """Replay recorded frames; returns the summary.
 
     Paced, late frames are missed, as on a monitor; otherwise every frame is drawn, as fast as it can be.
     """

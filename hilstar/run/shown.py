@@ -1,4 +1,4 @@
-"""A frame of a run, once it has been shown: what it was, when, and what lay between it and whoever looks."""
+"""A frame of a run after it has been shown: what it was, when, and whether it could be seen."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hilstar.bench.frame import Drawn
 
 @dataclass(frozen=True, slots=True)
 class OnScreen:
-    """What lies between a frame and whoever looks: an operator's keys ("" for none), and why it is not seen ("" if it is).
+    """What changes a frame on the screen: an operator's keys ("" for none), and why it is hidden ("" if it is not).
 
     `sky` is false where the keys leave no sky at all.
     """
@@ -53,4 +53,4 @@ FrameSink = Callable[[Shown], None]
 
 
 def ignore(shown: Shown) -> None:
-    """The sink of a run that nobody looks at."""
+    """The sink of a run whose frames nobody takes."""

@@ -1,4 +1,4 @@
-"""What a run has to say for itself: the summary of `serve` and `replay`."""
+"""The summary of a run: the figures of `serve` and `replay`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class SwapTally:
         self._last_ns: int | None = None
 
     def add(self, swap_ns: int, predicted_ns: int, missed_before: int, received_ns: int | None) -> None:
-        """Take in one swap; `received_ns` is when the newest packet behind the frame came, None where none did."""
+        """Add one swap; `received_ns` is when the newest packet behind the frame arrived, None if there is none."""
         if self._last_ns is not None and not missed_before:
             self._interval_ms.add((swap_ns - self._last_ns) / NS_PER_MS)
         self._last_ns = swap_ns
@@ -40,7 +40,7 @@ class SwapTally:
 
 
 class RunTally:
-    """Figures of each frame, and what they come to."""
+    """The figures of all frames of a run."""
 
     def __init__(self) -> None:
         self._frame_ms = RunningStatistics()
@@ -60,7 +60,7 @@ class RunTally:
         return self._frame_ms.count
 
     def add(self, frame_ns: int, age_ns: int | None, star_count: int, clipped_hip: tuple[int, ...]) -> None:
-        """Take in one frame; `age_ns` is None while no attitude has come."""
+        """Add one frame; `age_ns` is None until an attitude has come."""
         self._frame_ms.add(frame_ns / NS_PER_MS)
         if age_ns is not None:
             self._age_ms.add(age_ns / NS_PER_MS)
@@ -70,7 +70,7 @@ class RunTally:
             self.clipped_hip.update(clipped_hip)
 
     def summary(self, duration_s: float, counts: PacketCounts, gl_renderer: str) -> dict[str, Any]:
-        """The JSON object of section 5 of the design; figures without a sample are null."""
+        """The JSON object of `serve` and `replay`; figures without a sample are null."""
         return {
             "frames": self.frames,
             "duration_s": duration_s,

@@ -1,4 +1,4 @@
-"""Watches what a frame is doing and for how long: a late one is told with its stages, one that hangs while it hangs."""
+"""Watches how long each stage of a frame takes: a late frame is reported with its stages, a hanging one while it hangs."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ TOLD_EVERY_NS = NS_PER_S
 
 
 class FrameWatch:
-    """Takes the stages of each frame from the loop's thread; a thread of its own tells of one that does not end."""
+    """Takes the stages of each frame from the loop's thread; a second thread reports a stage that does not end."""
 
     def __init__(self, period_ns: float, notices: Notices, clock: HostClock = HOST_CLOCK) -> None:
         self._clock = clock

@@ -60,7 +60,7 @@ def send(
 
     from hilstar.attitude.wire.keys import CurveKeys
     from hilstar.run.send.faults import BadCable, Faults
-    from hilstar.run.send.sender import open_road
+    from hilstar.run.send.sender import open_sender
     from hilstar.run.send.sender import send as send_samples
 
     shares = (parse_share(lose, "--lose"), parse_share(corrupt, "--corrupt"), parse_share(reorder, "--reorder"))
@@ -71,14 +71,14 @@ def send(
         samples = until(samples, duration)
     stop = threading.Event()
     keys = CurveKeys(secret_key, server_key, allowed_clients)
-    with open_road(to, parse_serial(to, "--to"), connect=connect, keys=keys) as road, stop_on_signal(stop):
-        cable = BadCable(Faults(*shares, jitter / 1000), np.random.default_rng(seed), road.put)
-        say(f"waiting for a listener on {road.endpoint}")
-        if not heard(road, wait, stop):
+    with open_sender(to, parse_serial(to, "--to"), connect=connect, keys=keys) as link, stop_on_signal(stop):
+        cable = BadCable(Faults(*shares, jitter / 1000), np.random.default_rng(seed), link.put)
+        say(f"waiting for a listener on {link.endpoint}")
+        if not heard(link, wait, stop):
             say("no listener yet; sending anyway")
         with progress("sending", min(total, count or math.inf)) as advance:
             send_samples(cable, islice(samples, count), stop, advance)
-    tell(cable.tally, road, as_json)
+    tell(cable.tally, link, as_json)
 
 
 def wanted_samples(log: Path | None, spin: str | None, rate: float | None, radec: str | None) -> tuple[Any, float]:
@@ -104,7 +104,7 @@ def until(samples: Any, duration_s: float) -> Any:
     return takewhile(lambda sample: sample.t_ns < duration_s * NS_PER_S, samples)
 
 
-def tell(tally: Any, road: Any, as_json: bool) -> None:
+def tell(tally: Any, link: Any, as_json: bool) -> None:
     """What left, and what did not."""
     told = {
         "packets": tally.total,
@@ -114,9 +114,9 @@ def tell(tally: Any, road: Any, as_json: bool) -> None:
         "reordered": tally.reordered,
     }
     for name in ("requests", "statuses", "unsent"):
-        if hasattr(road, name):
-            told[name] = getattr(road, name)
-    told["link"] = {"endpoint": road.endpoint} | road.link_counts.summary()
+        if hasattr(link, name):
+            told[name] = getattr(link, name)
+    told["link"] = {"endpoint": link.endpoint} | link.link_counts.summary()
     if as_json:
         print_json(told)
         return

@@ -1,8 +1,8 @@
 """The ledger of a run: every packet as received and every frame as drawn, in an MCAP file that survives a kill.
 
-A thread of its own writes a chunk five times a second, whole and with its CRC, so that no disk stops a frame. Of a flood the
-first are kept whole and the others counted by the second. On a disk that fills frames go first and packets last; one that
-fails is tried again, and never ends the display.
+A thread of its own writes a chunk five times a second, whole and with its CRC, so that no disk stops a frame. In a flood
+the first are kept whole and the others counted second by second. When a disk fills up, frames are dropped first and packets
+last; a disk that fails is tried again, and never ends the display.
 """
 
 from __future__ import annotations
@@ -122,7 +122,7 @@ class Ledger:
         self._backlog.put(Entry("frame", record.swap_ns, record.frame, record))
         if time.monotonic() - self._alive_s > STALLED_S:
             self._notices.begin(
-                "ledger-stalled", f"{self.path}: the disk has taken nothing for {STALLED_S:g} s; the display goes on"
+                "ledger-stalled", f"{self.path}: the disk has accepted nothing for {STALLED_S:g} s; the display goes on"
             )
 
     def notice(self, notice: Notice) -> None:
@@ -158,7 +158,7 @@ class Ledger:
             if last:
                 self._lose("packet", self._writer.drop())
         self._alive_s = time.monotonic()
-        self._notices.end("ledger-stalled", "ledger-back", f"{self.path}: the disk takes the ledger again")
+        self._notices.end("ledger-stalled", "ledger-back", f"{self.path}: the disk accepts the ledger again")
 
     def _take(self, entry: Entry) -> None:
         if entry.kind == "frame" and self._thin:
@@ -197,16 +197,16 @@ class Ledger:
         free, total = disk.f_bavail * disk.f_frsize, disk.f_blocks * disk.f_frsize
         if not total:
             return
-        left = f"{self.path}: {free / 1e6:.0f} MB, {free / total:.0%} of the disk, are left"
+        left = f"{self.path}: {free / 1e6:.0f} MB, {free / total:.0%} of the disk, is free"
         if free < LOW_SHARE * total:
             self._notices.begin("disk-low", left)
         elif free > WELL_SHARE * total:
             self._notices.end("disk-low", "disk-well", left)
         self._thin = free < min(FRAMES_RESERVE_BYTES, FRAMES_RESERVE_SHARE * total)
         if self._thin:
-            self._notices.begin("ledger-thin", f"{left}: frames are not kept any more, packets are")
+            self._notices.begin("ledger-thin", f"{left}: frames are no longer recorded, packets still are")
         else:
-            self._notices.end("ledger-thin", "ledger-whole", f"{left}: frames are kept again")
+            self._notices.end("ledger-thin", "ledger-whole", f"{left}: frames are recorded again")
 
     def _flush(self) -> None:
         """Write the chunk; where it has no room, without its frames."""
@@ -221,7 +221,7 @@ class Ledger:
                 if self._writer.pending_bytes > MAX_CHUNK_BYTES:
                     self._lose("packet", self._writer.drop())
                 return
-        self._notices.end("ledger-failed", "ledger-back", f"{self.path}: the ledger is written again")
+        self._notices.end("ledger-failed", "ledger-back", f"{self.path}: the ledger can be written again")
 
     def _failed(self, error: Exception) -> None:
         self.failure = str(getattr(error, "strerror", None) or f"{type(error).__name__} {error}".strip())
@@ -235,7 +235,7 @@ class Ledger:
         except InputError as error:
             self._part -= 1
             self._begun_s = time.monotonic()  # and not again at each turn
-            self._notices.tell("ledger-split-failed", f"{error}; the ledger goes on in the file that it has")
+            self._notices.tell("ledger-split-failed", f"{error}; the ledger stays in its present file")
             return
         try:
             self._writer.finish()

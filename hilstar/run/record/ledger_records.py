@@ -17,12 +17,12 @@ Count = Annotated[int, msgspec.Meta(ge=0, le=2**53)]
 
 
 class FrameRecord(msgspec.Struct, kw_only=True):
-    """One frame; times ns: `t_ns` of the timeline, `light_ns` of the bench's clock, the others of this host's.
+    """One frame; times ns: `t_ns` of the timeline, `light_ns` of the sender's clock, the others of this host's.
 
     `q` is the attitude at `light_ns`, when the middle row lights, and `rate` (rad/s, cam) the turn for which paths were
     drawn, null where stars are points. `capped` counts the stars whose paths are coarser than they should be,
     `missed_before` the refresh periods before it without a frame, `missed` those of the run, and `marker` is the photodiode
-    square. `operator` says what an operator's keys changed of the sky ("blank, grid"; under a blank or a patch `q` is null),
+    square. `operator` says how an operator's keys changed the sky ("blank, grid"; under a blank or a patch `q` is null),
     `hidden` why the window was not seen; "" for neither.
     """
 
@@ -65,7 +65,7 @@ def schema_of(record: type[msgspec.Struct], title: str) -> bytes:
 
 
 class ProcessRecord(msgspec.Struct, kw_only=True):
-    """What the process takes of the machine at a moment of host time, ns."""
+    """The process's memory and CPU time at a moment of host time, ns."""
 
     host_ns: HostNs
     resident_bytes: Count
@@ -73,7 +73,7 @@ class ProcessRecord(msgspec.Struct, kw_only=True):
 
 
 class EventRecord(msgspec.Struct, kw_only=True):
-    """Something that happened in a run (see `hilstar.notices`): host time, ns, its kind, and what was said."""
+    """An event of a run (see `hilstar.notices`): host time, ns, its kind, and its text."""
 
     host_ns: HostNs
     kind: str
@@ -81,7 +81,7 @@ class EventRecord(msgspec.Struct, kw_only=True):
 
 
 class CountRecord(msgspec.Struct, kw_only=True):
-    """What was only counted within a second, host time, ns: refused packets by reason, or what came too fast.
+    """What was only counted, second by second (host time, ns): refused packets by reason, or a flood.
 
     `kind` is "packet", "frame" or "event"; `reason` that of a refusal, "accepted" of other packets, the kind of an event.
     """
@@ -103,7 +103,7 @@ RunRecord = FrameRecord | ProcessRecord | PacketForm | CountRecord | EventRecord
 
 
 def frame_record(shown: Shown, light_ns: int, missed: int, below_step: int) -> FrameRecord:
-    """What the ledger keeps of a frame; `light_ns` is on the bench's clock, `missed` counts the run's missed frames
+    """The ledger's record of a frame; `light_ns` is on the sender's clock, `missed` counts the run's missed frames
     so far, and `below_step` the stars in view that are too faint for the monitor.
     """
     attitude, drawn = shown.attitude, shown.drawn

@@ -1,4 +1,4 @@
-"""What this process takes of the machine, second by second."""
+"""This process's memory and CPU time, second by second."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hilstar.run.record.ledger_records import ProcessRecord
 
 
 class ProcessProbe:
-    """Asks what this process takes; opens its file once, for later there may be none to be had."""
+    """Measures this process; opens its file once, because later no descriptor may be free."""
 
     def __init__(self) -> None:
         self._fd: int | None = None
@@ -19,7 +19,7 @@ class ProcessProbe:
             self._fd = os.open("/proc/self/statm", os.O_RDONLY | os.O_CLOEXEC)
 
     def record(self) -> ProcessRecord | None:
-        """Of now; None where the system does not say."""
+        """The state now; None if the system does not say."""
         if self._fd is None:
             return None
         try:

@@ -72,7 +72,7 @@ def summarise(run: Figures) -> dict[str, Any]:
 def report(path: Path, directory: Path) -> dict[str, Any]:
     """Write `report.html`, its figures and `report.json` of a ledger into a directory; the figures.
 
-    Raises InputError for a file that is no ledger, and where it cannot write.
+    Raises InputError for a file that is no ledger, and if it cannot write.
     """
     run = figures_of(path)
     summary = summarise(run)
@@ -88,7 +88,7 @@ def report(path: Path, directory: Path) -> dict[str, Any]:
 
 
 def table_rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
-    """The figures for a person: what, and how much."""
+    """The figures as rows of text: name and value."""
     refused = sum(count for reason, count in summary["packets"].items() if reason != "accepted")
 
     def three(key: str, unit: str = "ms") -> str:
@@ -101,19 +101,19 @@ def table_rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
     frames = f"{summary['frames']} in {summary['duration_s']:.1f} s, {summary['missed_frames']} missed"
     return [
         ("frames", f"{frames}, {summary['stale_frames']} stale, {summary['blank_frames']} blank"),
-        ("not the sky", f"{summary['operator_frames']} by an operator's keys, {summary['hidden_frames']} hidden"),
-        ("coarser than they should be", f"{summary['capped_frames']}, for the turn was too fast"),
-        ("time stamps", f"{summary['timestamp_source']}; the bench's refresh is {number('refresh_hz', 'Hz')}"),
+        ("not the plain sky", f"{summary['operator_frames']} by an operator's keys, {summary['hidden_frames']} hidden"),
+        ("coarser paths", f"{summary['capped_frames']} frames, because the turn was too fast"),
+        ("time stamps", f"{summary['timestamp_source']}; the bench file's refresh rate is {number('refresh_hz', 'Hz')}"),
         ("pacing jitter", f"{number('pacing_jitter_ms', 'ms')} (standard deviation of the interval between swaps)"),
         ("interval", three("interval_ms")),
-        ("swap after its prediction", three("swap_late_ms")),
-        ("drawing begun to swap", three("draw_to_swap_ms")),
+        ("swap later than predicted", three("swap_late_ms")),
+        ("start of drawing to swap", three("draw_to_swap_ms")),
         ("age of the attitude at light", f"{three('attitude_age_ms')} = {three('attitude_age_frames', 'frames')}"),
         ("predicted past the last packet", three("prediction_ms")),
         ("packet to swap", three("packet_to_swap_ms")),
         ("packets", f"{summary['packets'].get('accepted', 0)} accepted, {refused} refused"),
         ("events", ", ".join(f"{kind} {count}" for kind, count in summary["events"].items()) or "none"),
-        ("stars", f"{summary['stars_drawn']} at most, {summary['clipped']} clipped, {summary['below_step']} under a step"),
+        ("stars", f"at most {summary['stars_drawn']} drawn, {summary['clipped']} clipped, {summary['below_step']} too faint"),
         ("memory after the first minute", number("memory_growth_mb", "MB more at the end")),
         ("bench file", f"SHA-256 {summary['bench_sha256']}"),
         ("calibration", f"{summary['calibration']}, SHA-256 {summary['calibration_sha256']}"),

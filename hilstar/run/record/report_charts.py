@@ -1,4 +1,4 @@
-"""The charts of a run's report; each function draws one, or none where there is nothing to draw."""
+"""The charts of a run's report; each function draws one, or none if there is nothing to draw."""
 
 from __future__ import annotations
 
@@ -50,8 +50,8 @@ def timing(run: Figures, directory: Path) -> Path | None:
     finding = "One swap only" if jitter is None else f"The interval between swaps has a standard deviation of {jitter:.2f} ms"
     labels = {
         "interval": "interval between swaps, ms",
-        "late": "swap after its prediction, ms",
-        "draw": "drawing begun to swap, ms",
+        "late": "swap later than predicted, ms",
+        "draw": "start of drawing to swap, ms",
     }
     return _histograms(directory / "timing.png", finding, run, labels)
 
@@ -114,7 +114,7 @@ def stars(run: Figures, directory: Path) -> Path | None:
 
 
 def memory(run: Figures, directory: Path) -> Path | None:
-    """What the process took."""
+    """The process's memory along the run."""
     rows, growth = run.process.rows, run.memory_growth_mb
     if len(rows) < 2:
         return None
@@ -129,7 +129,7 @@ def memory(run: Figures, directory: Path) -> Path | None:
 
 
 def attitude(run: Figures, directory: Path) -> Path | None:
-    """The track over the sky, what moves, and what is left of it beside a steady turn."""
+    """The track over the sky, the motion, and its residual against a steady turn."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
@@ -147,7 +147,7 @@ def attitude(run: Figures, directory: Path) -> Path | None:
         moving.set_title("about the mean", fontsize=11)
         rest = figure.add_subplot(grid[2], sharex=moving)
         _lines(rest, t_s, _beside_steady(t_s, turned), AXES)
-        rest.set_title("beside a steady turn about the camera's axes", fontsize=11)
+        rest.set_title("residual against a steady turn about the camera's axes", fontsize=11)
         rest.set_xlabel("time of the attitude, s")
         figure.suptitle(title_lines(_finding(angles, names, rows[:, 1:5])), fontsize=12)
         save(figure, directory / "attitude.png")
@@ -166,7 +166,7 @@ def _amount(span_deg: float) -> str:
 
 
 def _angles(q: FloatArray, turned_rad: FloatArray) -> tuple[FloatArray, tuple[str, str, str]]:
-    """Three angles that move as the camera does, deg (n, 3), and what they are called."""
+    """Three angles of the camera's motion, deg (n, 3), and their names."""
     ra_deg, dec_deg, roll_deg = _radec_roll_deg(q)
     if np.abs(dec_deg).max() > POLE_DEG:
         return np.degrees(turned_rad), AXES
@@ -175,7 +175,7 @@ def _angles(q: FloatArray, turned_rad: FloatArray) -> tuple[FloatArray, tuple[st
 
 
 def _radec_roll_deg(q: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """As `quaternion.to_radec_roll_deg`, of many."""
+    """As `rotation.to_radec_roll_deg`, for an array (n, 4)."""
     w, x, y, z = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
     boresight = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
     dec = np.arctan2(boresight[2], np.hypot(boresight[0], boresight[1]))
@@ -187,7 +187,7 @@ def _radec_roll_deg(q: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def _beside_steady(t_s: FloatArray, turned_rad: FloatArray) -> FloatArray:
-    """What is left of the turns when a straight line is taken from each, deg (n, 3)."""
+    """The turns minus a straight line fitted to each, deg (n, 3)."""
     at = t_s - t_s.mean()
     spread = float((at * at).sum())
     slope = (at @ turned_rad) / spread if spread > 0 else np.zeros(3)
@@ -207,7 +207,7 @@ def _lines(axes: Any, t_s: FloatArray, angles_deg: FloatArray, names: tuple[str,
 
 
 def _track(axes: Any, q: FloatArray) -> None:
-    """All of the sky, east to the left, with the boresight's way over it."""
+    """The whole sky, east to the left, with the track of the boresight."""
     ra_deg, dec_deg, _ = _radec_roll_deg(q)
     x = -np.radians((ra_deg + 180) % 360 - 180)
     y = np.radians(dec_deg)

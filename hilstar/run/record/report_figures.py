@@ -1,4 +1,4 @@
-"""The figures of a run of any length, taken in frame by frame, in memory that does not grow."""
+"""The figures of a run of any length, frame by frame, in memory that does not grow."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Sample:
         self._seen = 0
 
     def add(self, row: tuple[float, ...]) -> None:
-        """Take in a row, or pass over it."""
+        """Add a row, or skip it."""
         if self._seen % self.stride == 0:
             if self._kept == len(self._rows):
                 half = len(self._rows) // 2
@@ -48,7 +48,7 @@ class Sample:
 
 
 class Spans:
-    """The least and greatest of each column, and its sum, over equal numbers of frames: at most `capacity` spans."""
+    """The minimum, maximum and sum of each column over equal numbers of frames: at most `capacity` spans."""
 
     def __init__(self, columns: int, capacity: int = SPANS) -> None:
         shape = (capacity, columns)
@@ -58,7 +58,7 @@ class Spans:
         self._length = 1
 
     def add(self, at: float, row: tuple[float, ...]) -> None:
-        """Take in a frame; NaN is none."""
+        """Add a frame; NaN is no value."""
         if self._used == 0 or self._in_last == self._length:
             if self._used == len(self._begin):
                 self._halve()
@@ -82,7 +82,7 @@ class Spans:
         self._used, self._in_last, self._length = half, 2 * self._length, 2 * self._length
 
     def column(self, number: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Begin, least, greatest and sum of each span that has any value in this column."""
+        """Begin, minimum, maximum and sum of each span that has any value in this column."""
         low, high, total = (table[: self._used, number] for table in (self._low, self._high, self._sum))
         some = np.isfinite(low)
         return self._begin[: self._used][some], low[some], high[some], total[some]
@@ -94,7 +94,7 @@ INTERVAL, AGE, MISSED, DRAWN, CLIPPED, BELOW_STEP = range(6)  # columns of the s
 
 @dataclass(slots=True)
 class Figures:
-    """What a report says of a run."""
+    """The figures of a run's report."""
 
     head: dict[str, str]
     packets: PacketTally = field(default_factory=PacketTally)
@@ -127,13 +127,13 @@ class Figures:
 
     @property
     def memory_growth_mb(self) -> float | None:
-        """How much more memory the process has at the end than after its first minute; None for a shorter run."""
+        """How much the process's memory has grown since its first minute; None for a shorter run."""
         if self.warm is None or self.last_process is None or self.warm is self.last_process:
             return None
         return (self.last_process.resident_bytes - self.warm.resident_bytes) / MEGABYTE
 
     def add(self, record: RunRecord) -> None:
-        """Take in what the ledger holds."""
+        """Add a record of the ledger."""
         if isinstance(record, FrameRecord):
             self._add_frame(record)
         elif isinstance(record, ProcessRecord):
@@ -199,7 +199,7 @@ def _times_ms(frame: FrameRecord, before: FrameRecord | None) -> tuple[float, ..
 
 
 def _turn_rad(a: tuple[float, ...], b: tuple[float, ...]) -> tuple[float, float, float]:
-    """The turn from one attitude to the next about the camera's axes: as `quaternion.rate_between_rad_s`, fast for one."""
+    """The turn from one attitude to the next about the camera's axes: as `rotation.rate_between_rad_s`, fast for one."""
     w = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]
     x = -b[0] * a[1] + b[1] * a[0] - b[2] * a[3] + b[3] * a[2]
     y = -b[0] * a[2] + b[1] * a[3] + b[2] * a[0] - b[3] * a[1]

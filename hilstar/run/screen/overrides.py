@@ -1,4 +1,4 @@
-"""What an operator's keys and the window's place make of the frames: told when it changes, counted while it lasts."""
+"""How an operator's keys and the window's state change the frames: reported when it changes, counted while it lasts."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Overrides(Operator):
 
     @property
     def paused(self) -> bool:
-        """Whether the operator has stopped the sky."""
+        """Whether the operator has paused the sky."""
         return self._screen.paused
 
     def look(self) -> OnScreen:
@@ -44,12 +44,12 @@ class Overrides(Operator):
 
     def _tell_hidden(self, hidden: str) -> None:
         if hidden:
-            self._notices.tell("hidden", f"the window is {hidden}: its frames are not seen as they are drawn")
+            self._notices.tell("hidden", f"the window is {hidden}: its frames are not fully visible")
         else:
-            self._notices.tell("visible", "the window is seen again")
+            self._notices.tell("visible", "the window is visible again")
 
     def attitude(self, t_ns: int, attitude: Attitude | None) -> Attitude | None:
-        """What the keys leave of a frame's attitude: the one of the pause, which grows old, and none where no sky is shown."""
+        """A frame's attitude after the keys: during a pause that of its start, which grows old; None where no sky is shown."""
         screen = self._screen
         if not screen.paused:
             self._held = None if attitude is None else (attitude, t_ns)
@@ -61,7 +61,7 @@ class Overrides(Operator):
         return attitude if screen.shows_sky else None
 
     def count(self, shown: OnScreen, swap_ns: int) -> None:
-        """Take in what a frame was shown as."""
+        """Count a frame by how it was shown."""
         since_ns = 0 if self._last_swap_ns is None else swap_ns - self._last_swap_ns
         self._last_swap_ns = swap_ns
         for name, lasts in (("operator", shown.operator), ("hidden", shown.hidden)):
@@ -70,5 +70,5 @@ class Overrides(Operator):
                 self._lasted_ns[name] += since_ns
 
     def summary(self) -> dict[str, Any]:
-        """How many frames an operator's keys changed or nobody could see, and how long that was, s."""
+        """How many frames an operator's keys changed or a hidden window kept from view, and for how long, s."""
         return {name: {"frames": self._frames[name], "s": self._lasted_ns[name] / NS_PER_S} for name in self._frames}

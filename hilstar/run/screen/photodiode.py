@@ -20,6 +20,6 @@ CODE = maximal_sequence()
 def marker_light(number: int, kind: str) -> int:
     """The square of a frame, 0 or 1: light in every other frame (`toggle`), or the bit of CODE at the frame's number.
 
-    A latency is known from `toggle` but for whole pairs of frames, from `code` up to 127 frames.
+    `toggle` gives a latency modulo two frames, `code` modulo 127 frames.
     """
     return number % 2 if kind == "toggle" else CODE[number % len(CODE)]

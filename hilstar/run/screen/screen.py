@@ -1,4 +1,4 @@
-"""The bench's window: frames on it, keys from it, and a gate that refuses a display whose timing cannot be trusted."""
+"""The monitor's window: frames, keys, and a gate that refuses a display whose timing cannot be trusted."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from hilstar.units import NS_PER_MS, NS_PER_S
 GATE_FRAMES = 120
 REFRESH_TOLERANCE = 0.01
 DROPPED = 1.5  # periods
-MOST_DROPPED = 2  # of GATE_FRAMES: a desktop that is still busy with the new window
+MAX_DROPPED = 2  # of GATE_FRAMES: a desktop that is still busy with the new window
 HELP = "keys: q quit, b blank, space pause, c crosshair, g grid, t next test patch, h this line"
 UNPACED = 0.1  # of the period that the system knows of: swaps faster by more do not wait for it
 PATCHES = (0.0, 0.25, 0.5, 0.75, 1.0)  # of white
@@ -33,7 +33,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """What the gate saw: the median period, how many frames were late, and whether the screen itself keeps time."""
+    """What the gate measured: the median period, how many frames were dropped, and whether the screen itself keeps time."""
 
     period_ms: float
     dropped: int
@@ -43,8 +43,8 @@ class Timing:
 class Screen:
     """A window with a bench's frames on it.
 
-    `clock` knows when it swaps, `budget` how early a frame has to be begun, and `swap_to_light_ns` is from a swap to the
-    first light of the middle row: half of the scan-out, and the panel's own delay.
+    `clock` predicts its swaps, `budget` how early a frame has to be begun, and `swap_to_light_ns` is the time from a swap to
+    the middle row's first light: half of the scan-out, and the panel's own delay.
     """
 
     def __init__(self, window: Window, bench: Bench) -> None:
@@ -138,9 +138,9 @@ class Screen:
                 log.warning(HELP)
 
     def pass_gate(self, force: bool) -> None:
-        """Measure GATE_FRAMES swaps and refuse (MachineError) a display that is not what the bench file says.
+        """Measure GATE_FRAMES swaps and refuse (MachineError) a display that is not as the bench file has it.
 
-        With `force` what is wrong is only logged.
+        With `force` a fault is only logged.
         """
         self.bench.draw(None)
         times = np.array([self._gate_frame(number) for number in range(GATE_FRAMES + 1)])
@@ -161,7 +161,7 @@ class Screen:
         for fault in self._faults(wanted_ms):
             if not force:
                 raise MachineError(f"{fault}; or add --force")
-            log.warning("%s: shown all the same (--force)", fault)
+            log.warning("%s: shown anyway (--force)", fault)
 
     _waits = True
 
@@ -174,23 +174,26 @@ class Screen:
         wanted_px = orientation_of(monitor).screen_px(monitor.resolution_px)
         if self.window.size_px != wanted_px:
             (width, height), (wide, high) = self.window.size_px, wanted_px
-            yield f"the display is {width} x {height} px and the bench {wide} x {high}; set [monitor] resolution_px or its mode"
+            sizes = f"{width} x {height} px and the bench file says {wide} x {high}"
+            yield f"the display is {sizes}; set [monitor] resolution_px, or the display's mode"
         if self.window.composited:
             yield "a compositing manager draws this display and may hold frames back; stop it, or use a plain X session"
         if self.window.mirrored is not None:
-            yield f"the display {self.window.mirrored} mirrors this one; switch it off or beside it (xrandr --right-of)"
+            advice = "switch it off, or place it beside this one (xrandr --right-of)"
+            yield f"the display {self.window.mirrored} mirrors this one; {advice}"
         if self.window.scaled:
             yield "the display is scaled by its desktop; set its scale to 100 %"
         if timing.paced_by_screen and abs(timing.period_ms / wanted_ms - 1) > REFRESH_TOLERANCE:
-            hz = f"{1000.0 / timing.period_ms:.2f} Hz and the bench says {monitor.refresh_hz:g}"
-            yield f"the display refreshes at {hz}; set [monitor] refresh_hz or its mode"
-        if timing.paced_by_screen and timing.dropped > MOST_DROPPED:
-            yield f"the display dropped {timing.dropped} of {GATE_FRAMES} frames; close what else draws on it"
+            hz = f"{1000.0 / timing.period_ms:.2f} Hz and the bench file says {monitor.refresh_hz:g}"
+            yield f"the display refreshes at {hz}; set [monitor] refresh_hz, or the display's mode"
+        if timing.paced_by_screen and timing.dropped > MAX_DROPPED:
+            yield f"the display dropped {timing.dropped} of {GATE_FRAMES} frames; close other programs that draw on it"
         if not self._waits:
             yield "swaps do not wait for the display's refresh; switch vertical sync on in its driver"
         depth = self.window.depth_bits
         if depth < monitor.bits:
-            yield f"the window has {depth} bits a colour and the bench says {monitor.bits}; set [monitor] bits or a deeper mode"
+            depths = f"{depth} bits per colour and the bench file says {monitor.bits}"
+            yield f"the window has {depths}; set [monitor] bits, or a deeper mode"
 
 
 @contextmanager

@@ -9,11 +9,11 @@ from hilstar.units import NS_PER_MS
 
 
 class SwapClock:
-    """The grid of moments at which a screen swaps: a phase and a period, kept on real time stamps.
+    """The grid of moments at which a screen swaps: a phase and a period, fitted to measured time stamps.
 
     A second-order loop (Gardner, Phaselock Techniques, 2005): each swap pulls the phase by PHASE_SHARE of its error and the
-    period by PERIOD_SHARE of it, damping 0.79; a swap that came whole periods late counts so many. With `paced_by_screen`
-    false the grid is this program's own, and stamps do not move it.
+    period by PERIOD_SHARE of it, damping 0.79; a swap that came whole periods late advances the phase by that many. With
+    `paced_by_screen` false the grid is this program's own, and stamps do not move it.
     """
 
     PHASE_SHARE = 0.1
@@ -25,7 +25,7 @@ class SwapClock:
         self._phase_ns = float(first_ns)
 
     def update(self, swap_ns: int) -> None:
-        """Take in when a swap was done."""
+        """Add the time of a swap."""
         if not self.paced_by_screen:
             return
         steps = round((swap_ns - self._phase_ns) / self.period_ns)
@@ -53,7 +53,7 @@ class DrawBudget:
         self._costs_ns: deque[int] = deque(maxlen=self.FRAMES)
 
     def add(self, cost_ns: int) -> None:
-        """Take in how long a frame took until it could be swapped."""
+        """Add how long a frame took until it could be swapped."""
         self._costs_ns.append(cost_ns)
 
     @property
@@ -63,7 +63,7 @@ class DrawBudget:
 
     @property
     def ns(self) -> float:
-        """What all but two of the last frames took, and a guard; a whole period at most, and until there are frames enough."""
+        """The time that all but two of the last frames took, and a guard; at most a period, and a whole period at first."""
         if len(self._costs_ns) < self.FRAMES // 4:
             return self._period_ns
         return min(sorted(self._costs_ns)[-self.SLOW] + self.GUARD_NS, self._period_ns)

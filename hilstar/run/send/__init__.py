@@ -1,1 +1,1 @@
-"""The sender of test streams, and the faults that it can plant."""
+"""The sender of test streams, and the faults that it can inject."""

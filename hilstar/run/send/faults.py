@@ -1,4 +1,4 @@
-"""What a bad cable does, on request and by a seed: packets lost, corrupted, out of order."""
+"""The faults of a bad cable, reproducible by a seed: packets lost, corrupted, out of order."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 @dataclass(frozen=True, slots=True)
 class Faults:
-    """Shares of all packets, 0 to 1, and how late a packet may leave."""
+    """Shares of all packets, 0 to 1, and the maximum delay of a packet."""
 
     lose: float = 0.0
     corrupt: float = 0.0
@@ -20,7 +20,7 @@ class Faults:
 
 @dataclass(slots=True)
 class Tally:
-    """What became of the packets: `sent` left whole and in order, `corrupted` and `reordered` left, `lost` did not."""
+    """The fate of the packets: `sent` left intact and in order, `corrupted` and `reordered` left, `lost` did not."""
 
     sent: int = 0
     lost: int = 0
@@ -29,12 +29,12 @@ class Tally:
 
     @property
     def total(self) -> int:
-        """Packets made."""
+        """All packets."""
         return self.sent + self.lost + self.corrupted + self.reordered
 
 
 class BadCable:
-    """Packets in, some of them out; each meets at most one fault."""
+    """Passes packets on; each meets at most one fault."""
 
     def __init__(self, faults: Faults, rng: np.random.Generator, put: Callable[[bytes], None]) -> None:
         self.tally = Tally()
@@ -48,7 +48,7 @@ class BadCable:
         return float(self._rng.uniform(0.0, self._faults.jitter_s)) if self._faults.jitter_s else 0.0
 
     def carry(self, packet: bytes) -> None:
-        """Send a packet, or what the cable makes of it. One that is held back leaves right after the next."""
+        """Send a packet, with its fault if it has one. A packet held back leaves right after the next."""
         faults, tally = self._faults, self.tally
         dice = self._rng.random()
         if dice < faults.lose:
@@ -69,14 +69,14 @@ class BadCable:
             self._put(held)
 
     def close(self) -> None:
-        """Let go of a packet that is still held back; with none after it, it is in order."""
+        """Send a packet that is still held back; with none after it, it is in order."""
         if self._held is not None:
             held, self._held = self._held, None
             self.tally.sent += 1
             self._put(held)
 
     def _corrupted(self, packet: bytes) -> bytes:
-        """One to three bits of it turned, before any framing: a CRC-32 always sees so few."""
+        """One to three of its bits flipped, before any framing: a CRC-32 always detects so few."""
         bits = np.unpackbits(np.frombuffer(packet, dtype=np.uint8))
         bits[self._rng.choice(len(bits), size=self._rng.integers(1, 4), replace=False)] ^= 1
         return np.packbits(bits).tobytes()

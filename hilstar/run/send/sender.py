@@ -1,4 +1,4 @@
-"""The test instrument: a log or a spin, sent over either road at a steady rate."""
+"""The test sender: a log or a spin, sent over either link at a steady rate."""
 
 from __future__ import annotations
 
@@ -28,22 +28,22 @@ from hilstar.units import NS_PER_S
 
 LISTEN_MS = 20
 PATIENCE_S = 0.5  # a line that takes nothing for so long has no reader
-MOST_RESAMPLED = 10_000_000  # some GB of samples
+MAX_RESAMPLED = 10_000_000  # some GB of samples
 
 
-def open_road(to: str, line: tuple[str, int] | None, *, connect: bool, keys: CurveKeys) -> ZmqSender | SerialSender:
-    """The road that --to names: a serial `line`, port and baud rate, or else a ZeroMQ endpoint. Raises InputError."""
+def open_sender(to: str, line: tuple[str, int] | None, *, connect: bool, keys: CurveKeys) -> ZmqSender | SerialSender:
+    """The link that --to names: a serial `line`, port and baud rate, or else a ZeroMQ endpoint. Raises InputError."""
     if line is None:
         return ZmqSender(to, bind=not connect, keys=keys)
     if keys.given or connect:
-        raise InputError(f"--to {to}: a serial line has no keys and no --connect; leave them out")
+        raise InputError(f"--to {to}: a serial line has no keys and no --connect; remove them")
     return SerialSender(*line)
 
 
 def spin_samples(
     rate_cam_rad_s: FloatArray, rate_hz: float, radec_roll_deg: tuple[float, float, float]
 ) -> Iterator[AttitudeSample]:
-    """A constant turn without end, from t = 0."""
+    """A constant turn that never ends, from t = 0."""
     start = from_radec_roll_deg(*radec_roll_deg)
     k = 0
     while True:
@@ -53,9 +53,9 @@ def spin_samples(
 
 
 def log_samples(samples: list[AttitudeSample], rate_hz: float | None) -> Iterator[AttitudeSample]:
-    """A log from t = 0: its own samples, or at `rate_hz` between them. A rate that the log lacks is the next step's.
+    """A log from t = 0: its own samples, or resampled at `rate_hz`. A rate that the log lacks is taken from the next step.
 
-    Of its gaps nothing is known: before one there is no such rate, and what follows one is no motion from there.
+    Nothing is known within a gap: before it there is no such rate, and the sample after it is a discontinuity.
     """
     samples = _broken_at_gaps(samples)
     if rate_hz is not None:
@@ -77,11 +77,11 @@ def _broken_at_gaps(samples: list[AttitudeSample]) -> list[AttitudeSample]:
 
 
 def _resampled(samples: list[AttitudeSample], rate_hz: float) -> list[AttitudeSample]:
-    """The log at even times; a sample after a break in the log says so, and has the log's rate where the log has rates."""
+    """The log at even times; the first sample after a break is marked, and rates are the log's where it has rates."""
     timeline = log_timeline(samples, Policy(0, NS_PER_S))
     count = int((samples[-1].t_ns - samples[0].t_ns) * rate_hz / NS_PER_S + 1e-6) + 1
-    if count > MOST_RESAMPLED:
-        raise InputError(f"--rate {rate_hz:g}: makes {count} packets of this log; write a lower rate")
+    if count > MAX_RESAMPLED:
+        raise InputError(f"--rate {rate_hz:g}: gives {count} packets for this log; write a lower rate")
     resampled = []
     seen = 0
     for k in range(count):
@@ -111,7 +111,7 @@ def _rate_between(samples: list[AttitudeSample], after: int, t_ns: int) -> Float
 
 
 class SerialSender(SerialLink):
-    """A serial line as the bench has it: it sends attitudes, answers time requests, and listens to the status."""
+    """The sender's end of a serial line: sends attitudes, answers time requests, and receives the status."""
 
     def __init__(self, port: str, baud: int) -> None:
         super().__init__(port, baud)
@@ -120,16 +120,16 @@ class SerialSender(SerialLink):
         self.requests = 0
         self.unsent = 0
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._listen, name="hilstar-bench", daemon=True)
+        self._thread = threading.Thread(target=self._listen, name="hilstar-sender", daemon=True)
         self.send_bytes(DELIMITER)
         self._thread.start()
 
     def wait_for_listener(self, timeout_s: float) -> bool:
-        """A line does not say whether anybody listens."""
+        """A serial line cannot tell whether anybody listens."""
         return True
 
     def put(self, packet: bytes) -> None:
-        """Frame a packet's bytes and send them, at the speed of the line."""
+        """Frame a packet and send it, at the speed of the line."""
         self.unsent += not self.send_bytes(framed(packet), PATIENCE_S)
 
     def _listen(self) -> None:
@@ -143,7 +143,7 @@ class SerialSender(SerialLink):
                         self.status, self.statuses = status, self.statuses + 1
 
     def close(self) -> None:
-        """Stop listening, and close the port once what was sent has left; after a signal at once."""
+        """Stop listening, and close the port once everything has been sent; after a signal at once."""
         self._stop.set()
         self._thread.join()
         if caught() is None:
@@ -159,7 +159,7 @@ def send(
 ) -> None:
     """Send each sample at its time, stamped with this machine's monotonic clock.
 
-    A sample never goes out early. One that is late goes out at once: none is dropped, but by the cable.
+    A sample never goes out early. A late one goes out at once: only the cable drops any.
     """
     start_ns = time.monotonic_ns()
     for sample in samples:

@@ -64,7 +64,8 @@ class TwinOptics:
         y, x = np.mgrid[0:height, 0:width].astype(np.float64)
         seen_x, seen_y = (part.reshape(height, width) for part in self.geometry.to_monitor(x.ravel(), y.ravel()))
         (x_down, x_right), (y_down, y_right) = np.gradient(seen_x), np.gradient(seen_y)
-        density = np.abs(x_right * y_down - x_down * y_right)
+        # Beyond a lens there is no place: a pixel whose neighbour looks there has no density either.
+        density = np.nan_to_num(np.abs(x_right * y_down - x_down * y_right))
         screen_w, screen_h = self.geometry.monitor.resolution_px
         on_screen = np.abs(seen_x - (screen_w - 1) / 2) <= screen_w / 2
         on_screen &= np.abs(seen_y - (screen_h - 1) / 2) <= screen_h / 2
@@ -73,7 +74,7 @@ class TwinOptics:
             column = np.clip(np.rint(np.where(on_screen, seen_x, 0)), 0, screen_w - 1).astype(np.intp)
             row = np.clip(np.rint(np.where(on_screen, seen_y, 0)), 0, screen_h - 1).astype(np.intp)
             light = light * panel.uniformity[row, column]
-        return np.where(on_screen, light * np.where(on_screen, density, 0.0), 0.0)
+        return np.where(on_screen, light * density, 0.0)
 
     def close(self) -> None:
         """Free the GL context."""

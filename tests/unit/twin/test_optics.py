@@ -114,3 +114,15 @@ def test_the_glow_of_a_small_screen_is_not_diluted_by_the_detector_around_it(geo
     wide, high = 16 * scale, 12 * scale
     assert glow.sum() == pytest.approx(16 * 12 * 1e3, rel=1 / wide + 1 / high)
     assert on_screen_median(np.zeros((3, 3))) == 0
+
+
+def test_a_glow_beyond_a_lens_is_nothing_and_never_nan(geometry):
+    """A tracker that sees far past a screen, whose lens is known as far as its corners."""
+    small = monitor_camera((16, 12), 57.65, 120.0, np.array([1.0, 0.0, 0.0, 0.0]))
+    bent = replace(geometry, monitor=bounded(replace(small, lens=Lens(radial=(0.3, 0.0, 0.0))), 0.0))
+    black = table_response(8, gamma_response(8).light, black=1e-3)
+    with TwinOptics(bent, PSF_PX) as optics:
+        glow = optics.glow_e_per_s(Panel(black, 1e6))
+    assert np.isfinite(glow).all()
+    assert (glow > 0).sum() > 100
+    assert np.median(glow) == 0

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import mmap
 import os
 import subprocess
 import threading
 import time
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -20,15 +22,25 @@ from hilstar.run.screen.photodiode import CODE, CODE_BITS, marker_light
 from tests.support.benches import ATTITUDE, SCREEN_BENCH, still_log
 from tests.support.commands import HILSTAR, assert_refused, run_hilstar, run_hilstar_here
 from tests.support.ptys import Cable
-from tests.support.waiting import wait_for
-from tests.support.x11.screens import Screen
+from tests.support.waiting import real_time, wait_for
+from tests.support.x11.screens import Screen, xvfb
 
 # The watcher looks every 0.2 ms or so, and sleeps between; a shared machine may keep it from that now and then.
 MEDIAN_MS = 2.0
 ADDED_MS = 40.0
+WATCHED_S = 4  # some 120 edges of the code
 DEVICE_MS = 0.5  # of the same edges, a few more or less
 PERIOD_NS = 1e9 / 60
 STEADY_NS = 1e6  # by which the pairing takes latencies together
+
+
+@pytest.fixture(scope="module")
+def screen(tmp_path_factory) -> Iterator[Screen]:
+    """A screen that shows at once what it is sent."""
+    with contextlib.ExitStack() as stack:
+        with real_time():
+            running = stack.enter_context(xvfb(tmp_path_factory.mktemp("screen")))
+        yield running
 
 
 class Diode:
@@ -37,7 +49,11 @@ class Diode:
     def __init__(self, screen: Screen, line: Path, added_ms: float = 0.0, device_clock: bool = False) -> None:
         self._file, self._line, self._added_s, self._device = screen.file, line, added_ms / 1e3, device_clock
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._watch, daemon=True)
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def _run(self) -> None:
+        with real_time():
+            self._watch()
 
     def _watch(self) -> None:
         with self._file.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as frame:
@@ -88,21 +104,10 @@ def shown(screen: Screen, folder: Path, kind: str):
 
 def measured(screen: Screen, folder: Path, kind: str, added_ms: float, device_clock: bool, *options: str) -> tuple[dict, Path]:
     with Cable(folder) as cable, shown(screen, folder, kind) as bench, Diode(screen, cable.sender, added_ms, device_clock):
-        result = run_hilstar(
-            "latency",
-            folder / "run.mcap",
-            "--diode",
-            f"serial:{cable.host}@921600",
-            "--duration",
-            "4",
-            "--json",
-            "--save",
-            folder / "edges.csv",
-            "--overwrite",
-            "-o",
-            folder / "charts",
-            *options,
-        )
+        diode = ["--diode", f"serial:{cable.host}@921600", "--duration", str(WATCHED_S)]
+        output = ["--json", "--save", folder / "edges.csv", "--overwrite", "-o", folder / "charts"]
+        with real_time():
+            result = run_hilstar("latency", folder / "run.mcap", *diode, *output, *options)
     assert result.returncode == 0, result.stderr
     return json.loads(result.stdout), bench
 

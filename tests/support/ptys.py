@@ -11,6 +11,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
+from tests.support.waiting import real_time
+
 
 class Cable:
     """`sender` and `host` are paths to open; `pull` takes the line away, `plug` brings it back under the same paths."""
@@ -36,10 +38,11 @@ class Cable:
 
     @staticmethod
     def _relay(a: int, b: int, stop: threading.Event) -> None:
-        while not stop.is_set():
-            for ready in select.select([a, b], [], [], 0.02)[0]:
-                with contextlib.suppress(OSError):
-                    os.write(b if ready == a else a, os.read(ready, 4096))
+        with real_time():
+            while not stop.is_set():
+                for ready in select.select([a, b], [], [], 0.02)[0]:
+                    with contextlib.suppress(OSError):
+                        os.write(b if ready == a else a, os.read(ready, 4096))
 
     def pull(self) -> None:
         """Both devices vanish: whoever has one open gets an error."""

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from hilstar.process.priority import FIFO_PRIORITY
 
 # A machine whose cores are all busy takes seconds to start a command; what never comes costs a failing test this long.
 PATIENCE_S = 30.0
@@ -15,3 +20,18 @@ def wait_for(holds: Callable[[], object], what: object = "", poll_s: float = 0.0
     while not holds():
         assert time.monotonic() < deadline_s, what
         time.sleep(poll_s)
+
+
+@contextmanager
+def real_time() -> Iterator[None]:
+    """This thread, and the processes that it starts meanwhile, at real-time priority where that is allowed.
+
+    For what stands for hardware (a display, a diode and its line): what else the machine has to do holds up neither.
+    """
+    policy = os.sched_getscheduler(0), os.sched_getparam(0)
+    with contextlib.suppress(OSError):
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(FIFO_PRIORITY))
+    try:
+        yield
+    finally:
+        os.sched_setscheduler(0, *policy)

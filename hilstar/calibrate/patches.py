@@ -73,13 +73,13 @@ def show_patches(planned: Sequence[Patch], bits: int, display: int | str, second
             triples[1, [PRIMARIES.index(patch.channel)] if patch.channel in PRIMARIES else [0, 1, 2]] = patch.code
             presenter.set_triples(triples)
             log.warning("patch %d of %d: code %d, channel %s", shown + 1, len(planned), patch.code, patch.channel)
-            if not _patch_stays(window, presenter, seconds):
+            if not stays_until_key(window, presenter, seconds):
                 return shown
     return len(planned)
 
 
-def _patch_stays(window: Window, presenter: Presenter, seconds: float | None) -> bool:
-    """Present until the next patch is wanted; False when no more are."""
+def stays_until_key(window: Window, presenter: Presenter, seconds: float | None) -> bool:
+    """Present until space is pressed, or for `seconds`; False for q. Raises MachineError where the display goes away."""
     end_s = math.inf if seconds is None else time.monotonic() + seconds
     while time.monotonic() < end_s:
         presenter.present()

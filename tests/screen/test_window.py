@@ -172,3 +172,26 @@ def test_the_patches_of_a_plan_come_up_on_the_screen(screen, tmp_path):
         said = process.communicate(timeout=10)[1]
     assert {(0, 0), (127, 0), (255, 0)} <= seen
     assert "code 255, channel w" in said
+
+
+def test_the_dots_of_a_plan_come_up_turned_as_the_stars_are(screen, bench_file, tmp_path):
+    bench_file.write_text(SCREEN_BENCH.replace("[collimator]", "flip_x = true\n[collimator]"))
+    command = ["calibrate", "dots", str(bench_file), "-o", str(tmp_path / "plan"), "--frames", "8", "--dots", "10", "--show"]
+    with subprocess.Popen(
+        [sys.executable, "-m", "hilstar", *command, "--seconds", "0.4"], stderr=subprocess.PIPE, text=True, env=screen.env
+    ) as process:
+        wanted = None
+        seen = False
+        end = time.monotonic() + PATIENCE_S
+        while process.poll() is None and time.monotonic() < end:
+            last = tmp_path / "plan" / "frame_007.png"
+            if wanted is None and last.exists():
+                wanted = [np.asarray(Image.open(tmp_path / "plan" / f"frame_{k:03}.png"))[:, ::-1] for k in range(8)]
+            if wanted is not None:
+                pixels = screen.pixels()[..., 0]
+                seen |= any((pixels == image).all() for image in wanted)
+            time.sleep(0.02)
+        said = process.communicate(timeout=10)[1]
+    assert seen
+    assert "frame 8 of 8" in said
+    assert "8 of 8 frames shown" in said

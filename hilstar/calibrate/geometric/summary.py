@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 import hilstar
+from hilstar.arrays import FloatArray, IntArray
 from hilstar.calibrate.geometric.calibration import Calibrated
 from hilstar.calibrate.geometric.fit import residuals_px
 from hilstar.charts import chart
@@ -139,18 +140,25 @@ def draw_geometry(path: Path, found: Calibrated) -> None:
         f"{found.chosen.name}: a star's place is known to {found.uncertainty.rms_arcsec:.2g} arcsec rms,"
         f" {found.uncertainty.max_arcsec:.2g} at the maximum; held-out dots {found.chosen.rms_arcsec:.2g} rms"
     )
-    right, down = residuals_px(found.problem, found.fit.geometry, found.data)
+    dot, right, down = _mean_residuals(found)
     to_arcsec = ARCSEC_PER_RAD / found.problem.nominal.tracker.focal_length_px
-    with chart(path, finding, panels=2) as (places, residuals):
+    median = float(np.median(np.hypot(right, down)))
+    with chart(path, finding, panels=2, share_x=False) as (places, residuals):
         image = places.imshow(error, extent=(-0.5, width - 0.5, height - 0.5, -0.5), aspect="equal", cmap="viridis")
         places.figure.colorbar(image, ax=places, label="1 sigma [arcsec]", shrink=0.8)
         places.set_title("error of a star's place", fontsize=11)
-        x, y = found.plan.x_px[found.data.dot], found.plan.y_px[found.data.dot]
-        scale = ARROW_SHARE * width / max(float(np.median(np.hypot(right, down))), 1e-9)
+        scale = ARROW_SHARE * width / max(median, 1e-9)
+        x, y = found.plan.x_px[dot], found.plan.y_px[dot]
         residuals.quiver(x, y, right * scale, down * scale, angles="xy", scale_units="xy", scale=1, width=0.0015)
         residuals.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal")
-        median = to_arcsec * float(np.median(np.hypot(right, down)))
-        residuals.set_title(f"residuals of the centroids, median {median:.2g} arcsec", fontsize=11)
+        residuals.set_title(f"mean residual of each dot, median {median * to_arcsec:.2g} arcsec", fontsize=11)
         for axes in (places, residuals):
             axes.set_xlabel("monitor x [px]")
             axes.set_ylabel("monitor y [px]")
+
+
+def _mean_residuals(found: Calibrated) -> tuple[IntArray, FloatArray, FloatArray]:
+    """The dots that were seen, and the mean residual of each, tracker px."""
+    right, down = residuals_px(found.problem, found.fit.geometry, found.data)
+    dots, place, count = np.unique(found.data.dot, return_inverse=True, return_counts=True)
+    return dots, np.bincount(place, right) / count, np.bincount(place, down) / count

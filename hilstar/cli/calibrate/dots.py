@@ -8,7 +8,8 @@ from typing import Annotated
 import typer
 
 from hilstar.cli.options import MAX_SEED, BenchFile, Json, check_files
-from hilstar.console.terminal import print_json
+from hilstar.cli.show.running import Windowed
+from hilstar.console.terminal import print_json, say
 from hilstar.files import check_directory, make_directory
 
 
@@ -17,6 +18,13 @@ def dots(
     output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Directory for plan.csv and the frames.")],
     frames: Annotated[int, typer.Option(help="Number of frames.", min=1, max=1000)] = 20,
     dots_per_frame: Annotated[int, typer.Option("--dots", help="About how many dots are lit in each.", min=1, max=5000)] = 60,
+    show: Annotated[
+        bool, typer.Option("--show", help="Show the frames on the display: space for the next, q to quit.")
+    ] = False,
+    seconds: Annotated[
+        float | None, typer.Option(metavar="S", help="With --show: time for each frame, without keys.", min=0)
+    ] = None,
+    windowed: Windowed = False,
     seed: Annotated[int, typer.Option(help="Seed of the dots' codes.", min=0, max=MAX_SEED)] = 0,
     as_json: Json = False,
 ) -> None:
@@ -37,6 +45,12 @@ def dots(
     for frame in range(plan.frames):
         image = dot_image(plan, frame, monitor.resolution_px, 2**monitor.bits - 1)
         write_codes_png(output / f"frame_{frame:03}.png", image, monitor.bits)
+    shown = None
+    if show:
+        from hilstar.calibrate.geometric.show import show_dots
+
+        shown = show_dots(plan, monitor, seconds, windowed=windowed)
+        say(f"{shown} of {plan.frames} frames shown")
     if as_json:
         print_json({"frames": plan.frames, "dots": len(plan), "lit": int(plan.lit.sum()), "seed": seed, "written": str(output)})
     else:

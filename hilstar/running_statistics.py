@@ -4,11 +4,24 @@ from __future__ import annotations
 
 import math
 
+import msgspec
 import numpy as np
 
 MIN_SIZE, MAX_SIZE = 1e-6, 1e9
 STEP = 0.002  # the width of a bin, relative to the value: how exactly a percentile is known
 BINS = math.ceil(math.log(MAX_SIZE / MIN_SIZE) / STEP)
+
+
+class Percentiles(msgspec.Struct, frozen=True):
+    """Median, 99th percentile and maximum of a figure; None without a value."""
+
+    p50: float | None
+    p99: float | None
+    max: float | None
+
+    def times(self, factor: float) -> Percentiles:
+        """The same in another unit."""
+        return Percentiles(*(None if value is None else value * factor for value in (self.p50, self.p99, self.max)))
 
 
 class RunningStatistics:
@@ -53,6 +66,10 @@ class RunningStatistics:
         place = int(np.searchsorted(np.cumsum(self._counts), rank)) - BINS
         size = 0.0 if place == 0 else MIN_SIZE * math.exp((abs(place) - 0.5) * STEP)
         return min(math.copysign(size, place), self.max)
+
+    def percentiles(self) -> Percentiles:
+        """Median, 99th percentile and maximum."""
+        return Percentiles(self.percentile(50), self.percentile(99), self.max if self.count else None)
 
     def summary(self) -> dict[str, float | None]:
         """`p50`, `p99` and `max`; nulls without a value."""

@@ -24,10 +24,10 @@ def report(
 
     check_directory("-o", output)
     make_directory(output)
-    summary = write_report(ledger, output)
+    found = write_report(ledger, output)
     if as_json:
-        print_json(summary)
+        print_json(found)
         return
-    for what, how_much in table_rows(summary):
+    for what, how_much in table_rows(found):
         typer.echo(f"{what:32}{how_much}")
     typer.echo(f"{'page':32}{output / 'report.html'}")

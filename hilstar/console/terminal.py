@@ -23,12 +23,12 @@ def say(line: str) -> None:
     typer.echo(line, err=True)
 
 
-def print_json(value: dict[str, Any]) -> None:
+def print_json(value: dict[str, Any] | msgspec.Struct) -> None:
     """The one JSON object of --json; NumPy's numbers come out as plain ones."""
     try:
         typer.echo(msgspec.json.encode(value, enc_hook=_plain).decode())
     except UnicodeEncodeError:  # a file's name that is not UTF-8; Python's own writes its bytes as escapes
-        typer.echo(json.dumps(value, default=_plain))
+        typer.echo(json.dumps(msgspec.to_builtins(value, enc_hook=_plain)))
 
 
 def _plain(value: Any) -> Any:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import html
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
@@ -13,7 +12,8 @@ from hilstar.errors import InputError
 from hilstar.files import write_whole
 from hilstar.run.record.ledger_reader import NO_FRAMES, config_of, read_head, run_records
 from hilstar.run.record.report_charts import CHARTS
-from hilstar.run.record.report_figures import Figures, three
+from hilstar.run.record.report_figures import Figures
+from hilstar.running_statistics import Percentiles
 
 PAGE = """<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8"><title>{title}</title><style>
@@ -35,41 +35,75 @@ def figures_of(path: Path) -> Figures:
     return figures
 
 
-def summarise(run: Figures) -> dict[str, Any]:
-    """The figures of a run: the JSON object of `hilstar report`."""
+class RunReport(msgspec.Struct, frozen=True, kw_only=True):
+    """The figures of a run: the JSON object of `hilstar report`. Times in ms, but for `duration_s`."""
+
+    frames: int
+    duration_s: float
+    missed_frames: int
+    stale_frames: int
+    blank_frames: int
+    operator_frames: int
+    hidden_frames: int
+    capped_frames: int
+    timestamp_source: str
+    refresh_hz: float | None
+    pacing_jitter_ms: float | None
+    interval_ms: Percentiles
+    swap_late_ms: Percentiles
+    draw_to_swap_ms: Percentiles
+    attitude_age_ms: Percentiles
+    attitude_age_frames: Percentiles | None
+    prediction_ms: Percentiles
+    packet_to_swap_ms: Percentiles
+    packets: dict[str, int]
+    events: dict[str, int]
+    clipped: int
+    below_step: int
+    stars_drawn: int
+    memory_growth_mb: float | None
+    bench_sha256: str | None
+    calibration: str | None
+    calibration_sha256: str | None
+    gl_renderer: str | None
+
+
+def summarise(run: Figures) -> RunReport:
+    """The figures of a run, from those of its frames."""
     config, last, spreads = config_of(run.head), run.last, run.spreads
     refresh_hz = None if config is None else config.monitor.refresh_hz
-    return {
-        "frames": run.frames,
-        "duration_s": run.duration_s,
-        "missed_frames": 0 if last is None else last.missed,
-        "stale_frames": run.stale,
-        "blank_frames": run.blank,
-        "operator_frames": run.operator,
-        "hidden_frames": run.hidden,
-        "capped_frames": run.capped,
-        "timestamp_source": "" if last is None else last.timestamp_source,
-        "refresh_hz": refresh_hz,
-        "pacing_jitter_ms": spreads["interval"].deviation,
-        "interval_ms": three(spreads["interval"]),
-        "swap_late_ms": three(spreads["late"]),
-        "draw_to_swap_ms": three(spreads["draw"]),
-        "attitude_age_ms": three(spreads["age"]),
-        "attitude_age_frames": None if refresh_hz is None else three(spreads["age"], refresh_hz / 1e3),
-        "prediction_ms": three(spreads["prediction"]),
-        "packet_to_swap_ms": three(spreads["packet"]),
-        "packets": run.packets.counts,
-        "events": run.events,
+    age_ms = spreads["age"].percentiles()
+    return RunReport(
+        frames=run.frames,
+        duration_s=run.duration_s,
+        missed_frames=0 if last is None else last.missed,
+        stale_frames=run.stale,
+        blank_frames=run.blank,
+        operator_frames=run.operator,
+        hidden_frames=run.hidden,
+        capped_frames=run.capped,
+        timestamp_source="" if last is None else last.timestamp_source,
+        refresh_hz=refresh_hz,
+        pacing_jitter_ms=spreads["interval"].deviation,
+        interval_ms=spreads["interval"].percentiles(),
+        swap_late_ms=spreads["late"].percentiles(),
+        draw_to_swap_ms=spreads["draw"].percentiles(),
+        attitude_age_ms=age_ms,
+        attitude_age_frames=None if refresh_hz is None else age_ms.times(refresh_hz / 1e3),
+        prediction_ms=spreads["prediction"].percentiles(),
+        packet_to_swap_ms=spreads["packet"].percentiles(),
+        packets=run.packets.counts,
+        events=run.events,
         **run.most,
-        "memory_growth_mb": run.memory_growth_mb,
-        "bench_sha256": run.head.get("bench_sha256"),
-        "calibration": run.head.get("calibration"),
-        "calibration_sha256": run.head.get("calibration_sha256"),
-        "gl_renderer": run.head.get("gl_renderer"),
-    }
+        memory_growth_mb=run.memory_growth_mb,
+        bench_sha256=run.head.get("bench_sha256"),
+        calibration=run.head.get("calibration"),
+        calibration_sha256=run.head.get("calibration_sha256"),
+        gl_renderer=run.head.get("gl_renderer"),
+    )
 
 
-def report(path: Path, directory: Path) -> dict[str, Any]:
+def report(path: Path, directory: Path) -> RunReport:
     """Write `report.html`, its figures and `report.json` of a ledger into a directory; the figures.
 
     Raises InputError for a file that is no ledger, and if it cannot write.
@@ -87,37 +121,37 @@ def report(path: Path, directory: Path) -> dict[str, Any]:
     return summary
 
 
-def table_rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
+def table_rows(found: RunReport) -> list[tuple[str, str]]:
     """The figures as rows of text: name and value."""
-    refused = sum(count for reason, count in summary["packets"].items() if reason != "accepted")
+    refused = sum(count for reason, count in found.packets.items() if reason != "accepted")
 
-    def three(key: str, unit: str = "ms") -> str:
-        values = [(summary[key] or {}).get(name) for name in ("p50", "p99", "max")]
+    def three(figure: Percentiles | None, unit: str = "ms") -> str:
+        values = (None, None, None) if figure is None else (figure.p50, figure.p99, figure.max)
         return " / ".join("-" if v is None else f"{v:.2f}" for v in values) + f" {unit} (p50 / p99 / max)"
 
-    def number(key: str, unit: str) -> str:
-        return "-" if summary[key] is None else f"{summary[key]:.2f} {unit}"
+    def number(value: float | None, unit: str) -> str:
+        return "-" if value is None else f"{value:.2f} {unit}"
 
-    frames = f"{summary['frames']} in {summary['duration_s']:.1f} s, {summary['missed_frames']} missed"
+    frames = f"{found.frames} in {found.duration_s:.1f} s, {found.missed_frames} missed"
     return [
-        ("frames", f"{frames}, {summary['stale_frames']} stale, {summary['blank_frames']} blank"),
-        ("not the plain sky", f"{summary['operator_frames']} by an operator's keys, {summary['hidden_frames']} hidden"),
-        ("coarser paths", f"{summary['capped_frames']} frames, because the turn was too fast"),
-        ("time stamps", f"{summary['timestamp_source']}; the bench file's refresh rate is {number('refresh_hz', 'Hz')}"),
-        ("pacing jitter", f"{number('pacing_jitter_ms', 'ms')} (standard deviation of the interval between swaps)"),
-        ("interval", three("interval_ms")),
-        ("swap later than predicted", three("swap_late_ms")),
-        ("start of drawing to swap", three("draw_to_swap_ms")),
-        ("age of the attitude at light", f"{three('attitude_age_ms')} = {three('attitude_age_frames', 'frames')}"),
-        ("predicted past the last packet", three("prediction_ms")),
-        ("packet to swap", three("packet_to_swap_ms")),
-        ("packets", f"{summary['packets'].get('accepted', 0)} accepted, {refused} refused"),
-        ("events", ", ".join(f"{kind} {count}" for kind, count in summary["events"].items()) or "none"),
-        ("stars", f"at most {summary['stars_drawn']} drawn, {summary['clipped']} clipped, {summary['below_step']} too faint"),
-        ("memory after the first minute", number("memory_growth_mb", "MB more at the end")),
-        ("bench file", f"SHA-256 {summary['bench_sha256']}"),
-        ("calibration", f"{summary['calibration']}, SHA-256 {summary['calibration_sha256']}"),
-        ("renderer", str(summary["gl_renderer"])),
+        ("frames", f"{frames}, {found.stale_frames} stale, {found.blank_frames} blank"),
+        ("not the plain sky", f"{found.operator_frames} by an operator's keys, {found.hidden_frames} hidden"),
+        ("coarser paths", f"{found.capped_frames} frames, because the turn was too fast"),
+        ("time stamps", f"{found.timestamp_source}; the bench file's refresh rate is {number(found.refresh_hz, 'Hz')}"),
+        ("pacing jitter", f"{number(found.pacing_jitter_ms, 'ms')} (standard deviation of the interval between swaps)"),
+        ("interval", three(found.interval_ms)),
+        ("swap later than predicted", three(found.swap_late_ms)),
+        ("start of drawing to swap", three(found.draw_to_swap_ms)),
+        ("age of the attitude at light", f"{three(found.attitude_age_ms)} = {three(found.attitude_age_frames, 'frames')}"),
+        ("predicted past the last packet", three(found.prediction_ms)),
+        ("packet to swap", three(found.packet_to_swap_ms)),
+        ("packets", f"{found.packets.get('accepted', 0)} accepted, {refused} refused"),
+        ("events", ", ".join(f"{kind} {count}" for kind, count in found.events.items()) or "none"),
+        ("stars", f"at most {found.stars_drawn} drawn, {found.clipped} clipped, {found.below_step} too faint"),
+        ("memory after the first minute", number(found.memory_growth_mb, "MB more at the end")),
+        ("bench file", f"SHA-256 {found.bench_sha256}"),
+        ("calibration", f"{found.calibration}, SHA-256 {found.calibration_sha256}"),
+        ("renderer", str(found.gl_renderer)),
     ]
 
 

@@ -207,8 +207,3 @@ def _turn_rad(a: tuple[float, ...], b: tuple[float, ...]) -> tuple[float, float,
     sine = math.sqrt(x * x + y * y + z * z)
     scale = -2.0 * math.copysign(1.0, w) * (math.atan2(sine, abs(w)) / sine if sine > SMALL_RAD else 1.0)
     return scale * x, scale * y, scale * z
-
-
-def three(spread: RunningStatistics, factor: float = 1.0) -> dict[str, float | None]:
-    """Median, 99th percentile and maximum, times a factor; nulls without any."""
-    return {name: None if value is None else value * factor for name, value in spread.summary().items()}

@@ -183,7 +183,7 @@ def test_a_report_of_absurd_times_is_a_report(tmp_path):
     path = frames_file(
         tmp_path, [form | {"frame": k, "t_ns": -(2**63) if k % 2 else t, "swap_ns": t} for k, t in enumerate(times)]
     )
-    assert report(path, tmp_path)["frames"] == 5
+    assert report(path, tmp_path).frames == 5
     assert (tmp_path / "attitude.png").stat().st_size > 10_000
 
 

@@ -7,13 +7,18 @@ import math
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import msgspec
 import numpy as np
 import typer
 
 from hilstar.errors import one_line
+
+if TYPE_CHECKING:
+    from hilstar.attitude.clock.sender_clock import ClockSummary
+    from hilstar.run.summary import RunSummary
+    from hilstar.running_statistics import Percentiles
 
 CLOCK_WORDS = {"one-way": "from arrivals", "exchange": "from time exchanges"}
 
@@ -37,7 +42,7 @@ def _plain(value: Any) -> Any:
     raise TypeError(f"{type(value).__name__} has no JSON form")
 
 
-def report(summary: dict[str, Any], as_json: bool) -> None:
+def report(summary: RunSummary, as_json: bool) -> None:
     """The summary of a run, for a program or a person."""
     if as_json:
         print_json(summary)
@@ -46,47 +51,48 @@ def report(summary: dict[str, Any], as_json: bool) -> None:
     def figure(value: float | None, digits: int = 2) -> str:
         return "-" if value is None else f"{value:.{digits}f}"
 
-    def spread(name: str) -> str:
-        return " / ".join(figure(summary[name][key]) for key in ("p50", "p99", "max"))
+    def spread(times: Percentiles) -> str:
+        return " / ".join(figure(value) for value in (times.p50, times.p99, times.max))
 
-    packets = summary["packets"]
-    refused = ", ".join(f"{reason} {count}" for reason, count in packets["refused_by"].items() if count)
+    packets, stars, clipped = summary.packets, summary.stars_drawn, summary.clipped
+    refused = ", ".join(f"{reason} {count}" for reason, count in packets.refused_by.items() if count)
     lines = {
-        "frames": f"{summary['frames']} in {summary['duration_s']:.2f} s ({figure(summary['fps'], 1)} fps)"
-        f", {summary['missed_frames']} missed, {summary['stale_frames']} stale",
-        "frame time": f"{spread('frame_ms')} ms (p50 / p99 / max), attitude in to codes ready",
-        "attitude age": f"{spread('attitude_age_ms')} ms (p50 / p99 / max) at render",
-        "stars drawn": f"{figure(summary['stars_drawn']['mean'], 0)} mean, {summary['stars_drawn']['max']} max"
-        f", {summary['clipped']['max']} clipped" + "".join(f" HIP {hip}" for hip in summary["clipped"]["hip"][:5]),
-        "packets": f"{packets['received']} received, {packets['refused']} refused" + (f" ({refused})" if refused else ""),
+        "frames": f"{summary.frames} in {summary.duration_s:.2f} s ({figure(summary.fps, 1)} fps)"
+        f", {summary.missed_frames} missed, {summary.stale_frames} stale",
+        "frame time": f"{spread(summary.frame_ms)} ms (p50 / p99 / max), attitude in to codes ready",
+        "attitude age": f"{spread(summary.attitude_age_ms)} ms (p50 / p99 / max) at render",
+        "stars drawn": f"{figure(stars.mean, 0)} mean, {stars.max} max, {clipped.max} clipped"
+        + "".join(f" HIP {hip}" for hip in clipped.hip[:5]),
+        "packets": f"{packets.received} received, {packets.refused} refused" + (f" ({refused})" if refused else ""),
     }
-    if "clock" in summary:
-        absolute = "" if summary["clock"]["mode"] in {"exchange", "shared"} else " above the minimum"
-        lines["receive latency"] = f"{spread('receive_latency_ms')} ms (p50 / p99 / max){absolute}"
-        lines["sender's clock"] = clock_line(summary["clock"])
+    if summary.clock:
+        absolute = "" if summary.clock.mode in {"exchange", "shared"} else " above the minimum"
+        if summary.receive_latency_ms:
+            lines["receive latency"] = f"{spread(summary.receive_latency_ms)} ms (p50 / p99 / max){absolute}"
+        lines["sender's clock"] = clock_line(summary.clock)
     for name in ("operator", "hidden"):
-        lasted = summary.get("screen", {}).get(name, {"frames": 0})
+        lasted = (summary.screen or {}).get(name, {"frames": 0})
         if lasted["frames"]:
             what = "changed by an operator's keys" if name == "operator" else "not fully visible"
             lines[name] = f"{lasted['frames']} frames, {lasted['s']:.1f} s, {what}"
-    lines["renderer"] = summary["gl_renderer"]
+    lines["renderer"] = summary.gl_renderer
     for name, line in lines.items():
         typer.echo(f"{name:20}{line}")
 
 
-def clock_line(clock: dict[str, Any]) -> str:
+def clock_line(clock: ClockSummary) -> str:
     """How the sender's clock stands to this machine's."""
-    if clock["mode"] == "none":
+    if clock.mode == "none":
         return "no attitude has arrived"
-    if clock["mode"] == "shared":
+    if clock.mode == "shared":
         return "shared with the sender"
-    if clock["uncertainty_ms"] is None:
-        return f"{CLOCK_WORDS[clock['mode']]}: heard too briefly to state an uncertainty"
-    known = f"drift {clock['drift_ppm']:.1f} ppm, uncertainty {clock['uncertainty_ms']:.3f} ms"
-    if clock["mode"] == "one-way":
+    if clock.uncertainty_ms is None:
+        return f"{CLOCK_WORDS[clock.mode]}: heard too briefly to state an uncertainty"
+    known = f"drift {clock.drift_ppm:.1f} ppm, uncertainty {clock.uncertainty_ms:.3f} ms"
+    if clock.mode == "one-way":
         known += ", excluding the minimum transport delay"
-    jumps = f", jumps: {clock['jumps']}" if clock["jumps"] else ""
-    return f"{CLOCK_WORDS[clock['mode']]}: {known}{jumps}"
+    jumps = f", jumps: {clock.jumps}" if clock.jumps else ""
+    return f"{CLOCK_WORDS[clock.mode]}: {known}{jumps}"
 
 
 @contextmanager

@@ -6,7 +6,6 @@ import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -24,6 +23,7 @@ from hilstar.rotation import from_radec_roll_deg, propagate, rate_between_rad_s,
 from hilstar.run.loop import Limit
 from hilstar.run.serve import serve
 from hilstar.run.shown import FrameSink, Shown
+from hilstar.run.summary import RunSummary
 from hilstar.units import ARCSEC_PER_RAD, NS_PER_S
 
 SEND_HZ = 100.0
@@ -39,7 +39,7 @@ JITTER_SECONDS = 0.4  # its correlation time
 class Demo:
     """The result of the demo: its summary and the pictures that it wrote."""
 
-    summary: dict[str, Any]
+    summary: RunSummary
     pictures: list[Path]
 
 

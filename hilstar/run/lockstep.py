@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import time
-from typing import Any
+
+import msgspec
 
 from hilstar.attitude.clock.timeline import Attitude
 from hilstar.attitude.receiver import PacketCounts
@@ -17,15 +18,14 @@ from hilstar.run.loop import FrameLoop, Limit
 from hilstar.run.record.ledger import Ledger
 from hilstar.run.record.ledger_records import below_step, frame_record
 from hilstar.run.shown import Shown
+from hilstar.run.summary import RunSummary
 from hilstar.running_statistics import RunningStatistics
 from hilstar.units import NS_PER_MS, NS_PER_S
 
 POLL_MS = 50
 
 
-def serve_lockstep(
-    bench: Bench, link: ZmqLockstep, limit: Limit, loop: FrameLoop, ledger: Ledger | None = None
-) -> dict[str, Any]:
+def serve_lockstep(bench: Bench, link: ZmqLockstep, limit: Limit, loop: FrameLoop, ledger: Ledger | None = None) -> RunSummary:
     """Answer requests up to `limit`, or until a signal; returns the summary. A refused request leaves the last frame."""
     counts = PacketCounts()
     statuses = StatusMaker(ledger)
@@ -57,7 +57,7 @@ def serve_lockstep(
         turn_ms.add((shown_ns - arrival.host_ns) / NS_PER_MS)
     duration_s = (time.monotonic_ns() - begin_ns) / NS_PER_S
     summary = loop.tally.summary(duration_s, counts, bench.renderer.gl_renderer)
-    return summary | {"turn_ms": turn_ms.summary(), "stale_events": 0}
+    return msgspec.structs.replace(summary, turn_ms=turn_ms.percentiles())
 
 
 def _refusal(event: Event, max_rate_rad_s: float) -> Refusal | None:

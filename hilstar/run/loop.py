@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import scipy.special  # noqa: F401 - takes 0.1 s, which the first star that might clip is not to cost its frame
+from msgspec import UNSET, UnsetType
 
 from hilstar.attitude.clock.timeline import Attitude, Policy, StaleGate
 from hilstar.bench.config import AttitudeSettings
@@ -158,10 +159,9 @@ class FrameLoop:
         self._presence.see(None, True)
         self.pacer.idle()
 
-    def screen_summary(self) -> dict[str, Any]:
-        """The part of the summary that a run on a screen has besides; {} without one."""
-        found = self.pacer.summary(self.tally.swaps.summary())
-        return {"screen": found} if found else {}
+    def screen_summary(self) -> dict[str, Any] | UnsetType:
+        """What the summary of a run says of its screen; unset without one."""
+        return self.pacer.summary(self.tally.swaps.summary()) or UNSET
 
     def paced(self, limit: Limit, draw_slot: Callable[[Moment], Shown | None]) -> None:
         """Call `draw_slot` at each of the pacer's moments up to `limit`; it returns what it drew, None for nothing.

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import time
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+
+from msgspec.structs import replace as replaced
 
 from hilstar.attitude.back_channel import Traffic
 from hilstar.attitude.clock.timeline import Timeline
@@ -28,6 +29,7 @@ from hilstar.run.replay import Play
 from hilstar.run.screen.display_pacer import DisplayPacer
 from hilstar.run.screen.screen import Screen
 from hilstar.run.shown import FrameSink, Shown, ignore
+from hilstar.run.summary import RunSummary
 from hilstar.units import NS_PER_S
 
 AnyLink = ZmqReceiver | ZmqLockstep | SerialLink
@@ -62,7 +64,7 @@ def open_link(settings: AttitudeSettings, folder: Path, notices: Notices | None 
     return ZmqReceiver(settings.endpoint, bind=settings.bind is True, keys=keys, notices=notices)
 
 
-def serve(bench: Bench, link: AnyLink, limit: Limit, sink: FrameSink = ignore, outlet: Outlet | None = None) -> dict[str, Any]:
+def serve(bench: Bench, link: AnyLink, limit: Limit, sink: FrameSink = ignore, outlet: Outlet | None = None) -> RunSummary:
     """Show the live stream of `link` up to `limit`, or until a signal; returns the summary."""
     outlet = outlet or Outlet()
     loop, ledger = FrameLoop(bench, sink, outlet.pacer(), notices=outlet.notices), outlet.ledger
@@ -72,13 +74,13 @@ def serve(bench: Bench, link: AnyLink, limit: Limit, sink: FrameSink = ignore, o
             summary = serve_lockstep(bench, link, limit, loop, ledger)
         else:
             summary = _serve_stream(bench, link, limit, loop, outlet)
-    summary |= {"events": outlet.notices.counts(), "link": {"endpoint": link.endpoint} | link.link_counts.summary()}
-    return summary | loop.screen_summary()
+    told: dict[str, str | int] = {"endpoint": link.endpoint}
+    return replaced(
+        summary, events=outlet.notices.counts(), link=told | link.link_counts.summary(), screen=loop.screen_summary()
+    )
 
 
-def _serve_stream(
-    bench: Bench, link: ZmqReceiver | SerialLink, limit: Limit, loop: FrameLoop, outlet: Outlet
-) -> dict[str, Any]:
+def _serve_stream(bench: Bench, link: ZmqReceiver | SerialLink, limit: Limit, loop: FrameLoop, outlet: Outlet) -> RunSummary:
     settings, ledger = bench.config.attitude, outlet.ledger
     timeline = Timeline(policy_of(settings))
     watch = nobody_watches if ledger is None else ledger.packet
@@ -110,15 +112,16 @@ def _serve_stream(
         receiver.close()
     duration_s = (time.monotonic_ns() - begin_ns) / NS_PER_S
     summary = loop.tally.summary(duration_s, receiver.counts, bench.renderer.gl_renderer)
-    return summary | {
-        "stale_events": loop.gate.events,
-        "receive_latency_ms": receiver.latency_ms.summary(),
-        "clock": asdict(receiver.clock_summary()),
-        "reconnects": link.reconnects,
-    }
+    return replaced(
+        summary,
+        stale_events=loop.gate.events,
+        receive_latency_ms=receiver.latency_ms.percentiles(),
+        clock=receiver.clock_summary(),
+        reconnects=link.reconnects,
+    )
 
 
-def replay(bench: Bench, play: Play, sink: FrameSink = ignore, outlet: Outlet | None = None) -> dict[str, Any]:
+def replay(bench: Bench, play: Play, sink: FrameSink = ignore, outlet: Outlet | None = None) -> RunSummary:
     """Replay recorded frames; returns the summary.
 
     Paced, late frames are missed, as on a monitor; otherwise every frame is drawn, as fast as it can be.
@@ -147,4 +150,5 @@ def replay(bench: Bench, play: Play, sink: FrameSink = ignore, outlet: Outlet | 
                 draw_slot(Moment(slot))
     duration_s = (time.monotonic_ns() - begin_ns) / NS_PER_S
     summary = loop.tally.summary(duration_s, PacketCounts(received=play.packet_count), bench.renderer.gl_renderer)
-    return summary | {"stale_events": loop.gate.events, "events": outlet.notices.counts()} | loop.screen_summary()
+    told = outlet.notices.counts()
+    return replaced(summary, stale_events=loop.gate.events, events=told, screen=loop.screen_summary())

@@ -4,10 +4,64 @@ from __future__ import annotations
 
 from typing import Any
 
+import msgspec
+from msgspec import UNSET, UnsetType
+
+from hilstar.attitude.clock.sender_clock import ClockSummary
 from hilstar.attitude.receiver import PacketCounts
-from hilstar.attitude.wire.packet import MESSAGE_REASONS
-from hilstar.running_statistics import RunningStatistics
+from hilstar.attitude.wire.packet import MESSAGE_REASONS, Reason
+from hilstar.running_statistics import Percentiles, RunningStatistics
 from hilstar.units import NS_PER_MS
+
+
+class PacketSummary(msgspec.Struct, frozen=True):
+    """Packets of a run, those refused by reason."""
+
+    received: int
+    accepted: int
+    refused: int
+    refused_by: dict[Reason, int]
+
+
+class StarSummary(msgspec.Struct, frozen=True):
+    """Stars drawn in a frame."""
+
+    mean: float | None
+    max: int | None
+
+
+class ClippedSummary(msgspec.Struct, frozen=True):
+    """Stars brighter than full scale: how many in a frame at most, and which (HIP)."""
+
+    max: int
+    hip: list[int]
+
+
+class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
+    """The JSON object of `serve` and `replay`; what a kind of run does not have is left unset, and is not in its JSON."""
+
+    frames: int
+    duration_s: float
+    fps: float | None
+    frame_ms: Percentiles
+    attitude_age_ms: Percentiles
+    packets: PacketSummary
+    stars_drawn: StarSummary
+    clipped: ClippedSummary
+    missed_frames: int
+    stale_frames: int
+    capped: int
+    given_up: int
+    gl_renderer: str
+    turn_ms: Percentiles | UnsetType = UNSET
+    stale_events: int = 0
+    receive_latency_ms: Percentiles | UnsetType = UNSET
+    clock: ClockSummary | UnsetType = UNSET
+    reconnects: int | UnsetType = UNSET
+    events: dict[str, int] = {}
+    link: dict[str, str | int] | UnsetType = UNSET
+    screen: dict[str, Any] | UnsetType = UNSET
+    ledger: dict[str, str | int | None] | UnsetType = UNSET
 
 
 class SwapTally:
@@ -69,25 +123,21 @@ class RunTally:
             self._clipped_max = max(self._clipped_max, len(clipped_hip))
             self.clipped_hip.update(clipped_hip)
 
-    def summary(self, duration_s: float, counts: PacketCounts, gl_renderer: str) -> dict[str, Any]:
-        """The JSON object of `serve` and `replay`; figures without a sample are null."""
-        return {
-            "frames": self.frames,
-            "duration_s": duration_s,
-            "fps": self.frames / duration_s if duration_s > 0 else None,
-            "frame_ms": self._frame_ms.summary(),
-            "attitude_age_ms": self._age_ms.summary(),
-            "packets": {
-                "received": counts.received,
-                "accepted": counts.received - counts.refused,
-                "refused": counts.refused,
-                "refused_by": {name: n for name, n in counts.refused_by.items() if n or name in MESSAGE_REASONS},
-            },
-            "stars_drawn": {"mean": self._stars.mean, "max": int(self._stars.max) if self.frames else None},
-            "clipped": {"max": self._clipped_max, "hip": sorted(self.clipped_hip)},
-            "missed_frames": self.missed_frames,
-            "stale_frames": self.stale_frames,
-            "capped": self.capped_frames,
-            "given_up": self.given_up_frames,
-            "gl_renderer": gl_renderer,
-        }
+    def summary(self, duration_s: float, counts: PacketCounts, gl_renderer: str) -> RunSummary:
+        """What all kinds of run say; figures without a sample are None."""
+        refused_by = {name: n for name, n in counts.refused_by.items() if n or name in MESSAGE_REASONS}
+        return RunSummary(
+            frames=self.frames,
+            duration_s=duration_s,
+            fps=self.frames / duration_s if duration_s > 0 else None,
+            frame_ms=self._frame_ms.percentiles(),
+            attitude_age_ms=self._age_ms.percentiles(),
+            packets=PacketSummary(counts.received, counts.received - counts.refused, counts.refused, refused_by),
+            stars_drawn=StarSummary(self._stars.mean, int(self._stars.max) if self.frames else None),
+            clipped=ClippedSummary(self._clipped_max, sorted(self.clipped_hip)),
+            missed_frames=self.missed_frames,
+            stale_frames=self.stale_frames,
+            capped=self.capped_frames,
+            given_up=self.given_up_frames,
+            gl_renderer=gl_renderer,
+        )

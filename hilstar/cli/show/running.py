@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import msgspec
 import typer
 
 from hilstar.console.terminal import report, say
@@ -17,6 +18,7 @@ from hilstar.process.interrupts import stop_on_signal
 
 if TYPE_CHECKING:
     from hilstar.bench.bench_file import BenchFile
+    from hilstar.run.summary import RunSummary
 
 Windowed = Annotated[bool, typer.Option("--windowed", help="A window on the desktop instead of the full display.")]
 Force = Annotated[
@@ -81,13 +83,13 @@ def optional_ledger(path: Path | None, bench: Any, notices: Notices, overwrite: 
             ledger.close()
 
 
-def end_of_run(summary: dict[str, Any], screen: Any, ledger: Any, as_json: bool) -> None:
+def end_of_run(summary: RunSummary, screen: Any, ledger: Any, as_json: bool) -> None:
     """The summary of a run whose ledger is closed; exit code 1 where that has failed.
 
     Raises MachineError where its window went away.
     """
     if ledger is not None:
-        summary |= {"ledger": ledger.summary()}
+        summary = msgspec.structs.replace(summary, ledger=ledger.summary())
     report(summary, as_json)
     if screen is not None and screen.window.gone is not None:
         raise MachineError(f"the run ended early: {screen.window.gone}")

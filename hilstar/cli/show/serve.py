@@ -66,5 +66,5 @@ def serve(
         with progress("serving", min(limit.slots, limit.frames)) as advance:
             summary = serve_stream(bench, link, limit, lambda shown: advance(shown.number + 1), Outlet(screen, kept, notices))
     end_of_run(summary, screen, kept, as_json)
-    if not summary["packets"]["accepted"]:
+    if not summary.packets.accepted:
         raise typer.Exit(NO_ATTITUDE)

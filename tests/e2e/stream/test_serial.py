@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Iterator
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -86,7 +87,9 @@ def test_nothing_wrong_is_drawn_over_a_bad_cable(cable, bench_file):
         samples = spin_samples(rate, 200.0, START_DEG)
         sender = threading.Thread(target=send, args=(faults, samples, stop))
         sender.start()
-        summary = serve(bench, link, Limit(frames=150), lambda shown: drawn.append((shown.t_ns, shown.attitude)))
+        summary = msgspec.to_builtins(
+            serve(bench, link, Limit(frames=150), lambda shown: drawn.append((shown.t_ns, shown.attitude)))
+        )
         stop.set()
         sender.join()
     shown = [(t_ns, attitude.q_icrs_to_cam) for t_ns, attitude in drawn if attitude is not None]
@@ -107,7 +110,7 @@ def test_a_line_that_filled_up_while_the_display_was_made_ready_misleads_nobody(
         sender.start()
         time.sleep(1.5)
         shown = []
-        summary = serve(bench, link, Limit(slots=240), shown.append)
+        summary = msgspec.to_builtins(serve(bench, link, Limit(slots=240), shown.append))
         stop.set()
         sender.join()
     assert summary["packets"]["refused"] == 0

@@ -7,6 +7,7 @@ import signal
 import threading
 import time
 
+import msgspec
 import pytest
 import zmq
 
@@ -33,7 +34,7 @@ def test_packets_that_waited_for_the_display_mislead_nobody(small_bench_file, qu
     ):
         time.sleep(queued_s)
         shown = []
-        summary = serve(bench, link, Limit(slots=150), lambda frame: shown.append(frame.attitude))
+        summary = msgspec.to_builtins(serve(bench, link, Limit(slots=150), lambda frame: shown.append(frame.attitude)))
     assert summary["packets"]["refused"] == 0
     clock = summary["clock"]
     assert clock["jumps"] == 0
@@ -78,7 +79,7 @@ def test_a_sender_that_hangs_is_stale_in_every_frame_and_nothing_flickers(small_
 
         thread = threading.Thread(target=talk)
         thread.start()
-        summary = serve(bench, link, Limit(slots=300), shown.append)
+        summary = msgspec.to_builtins(serve(bench, link, Limit(slots=300), shown.append))
         stop.set()
         thread.join()
     assert summary["clock"]["jumps"] == 0

@@ -15,7 +15,7 @@ from hilstar.bench.config import RenderSettings
 from hilstar.monitor.phases import WHITE, Errors, fainter, measure, phase_grid, shown_by
 from hilstar.monitor.quantise import Panel, Quantisation
 from hilstar.monitor.response import Response
-from hilstar.render.encoder import SpriteSides
+from hilstar.render.encoder import MAX_SIDES, SpriteSide, SpriteSides
 from hilstar.render.reference import linear_image
 from hilstar.scene.psf import MAX_CUT, cut_share, footprint_px, peak_share, pixel_share
 from hilstar.units import flux_ratio
@@ -181,14 +181,14 @@ def choose_sides(render: RenderSettings, light: Light, method: Quantisation) -> 
         unlit = UNLIT * float(light.response.threshold[0]) * light.white_e_per_s
         # Falling rates: a star under the last of them that it is under gets the smallest sprite.
         sides += [(unlit / outside_share(size, sigma_px), size) for size in sizes[::-1] if size < largest]
-    kept = tuple((min(rate, 3e38), size) for rate, size in sides[:8])
+    kept = tuple(SpriteSide(min(rate, 3e38), size) for rate, size in sides[:MAX_SIDES])
     rates = light.rates_e_per_s
     area = np.full(len(rates), full**2)
-    for rate, size in kept:
-        area[rates < rate] = size**2
+    for side in kept:
+        area[rates < side.below_e_per_s] = side.side_px**2
     cut = (cut_mag(largest, sigma_px), cut_px(largest, sigma_px)) if largest < full else (MAG_PER_SHARE * MAX_CUT, 0.0)
     mean = float(area.mean()) if len(area) else float(full**2)
-    chosen = f"{min(s for _, s in kept)} to {largest} px a side instead of {full}"
+    chosen = f"{min(side.side_px for side in kept)} to {largest} px a side instead of {full}"
     error = f"{cut[0]:.1e} mag and {cut[1]:.1e} px cut"
     return ChosenSides(kept, *cut, Choice("sprites", chosen, error, f"{full**2 / mean:.1f} times fewer pixels"))
 

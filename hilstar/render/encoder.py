@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import moderngl
@@ -28,23 +29,34 @@ def build_program(ctx: moderngl.Context, vertex: str, fragment: str, defines: tu
     )
 
 
-SpriteSides = tuple[tuple[float, int], ...]
 MAX_SIDES = 8  # as in star.vert
 PLACES = "2i 8x 1f"  # of SPRITE_DTYPE: places and rates
 SPRITE_PIXEL_COST = 2  # of a pixel encoded under a sprite, in pixels of a pass over the whole image (llvmpipe, 1080p to 4K)
 MAX_ERASED_SHARE = 0.02  # of the image; beyond it a clear is faster than erasing sprites (llvmpipe, 1080p and 4K)
 
 
+@dataclass(frozen=True, slots=True)
+class SpriteSide:
+    """The side of the sprites of stars below a rate."""
+
+    below_e_per_s: float
+    side_px: int
+
+
+SpriteSides = tuple[SpriteSide, ...]
+
+
 def set_sides(program: moderngl.Program, sides: SpriteSides) -> None:
-    """Give stars below each rate (electrons per second, falling) sprites of that side, px, in a program of star.vert.
+    """Set the sides of fainter stars' sprites, by falling rates, in a program of star.vert.
 
     Raises InputError for more sides than the shader has room for.
     """
     if len(sides) > MAX_SIDES:
         raise InputError(f"{len(sides)} sizes of sprites; give at most {MAX_SIDES}")
-    padded = [*sides, *[(0.0, 0)] * (MAX_SIDES - len(sides))]
+    padded = [*sides, *[SpriteSide(0.0, 0)] * (MAX_SIDES - len(sides))]
     program["sides"] = len(sides)
-    program["below_e_per_s"], program["side_px"] = ([*values] for values in zip(*padded, strict=True))
+    program["below_e_per_s"] = [side.below_e_per_s for side in padded]
+    program["side_px"] = [side.side_px for side in padded]
 
 
 class Eraser:

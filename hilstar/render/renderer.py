@@ -32,8 +32,8 @@ class Target:
     """What the renderer draws for: an image's pixels, its sprites, and a monitor's response where codes are wanted.
 
     `uniformity` float32 (height, width) is each pixel's light relative to the response (None: 1 everywhere), and
-    `cycle_frames`, a power of two, is for `temporal` alone. Stars below each rate of `sides` (electrons per second, falling)
-    get sprites of that side, px, of the same parity as the footprint.
+    `cycle_frames`, a power of two, is for `temporal` alone. `sides` are those of fainter stars' sprites, by falling
+    rates, of the same parity as the footprint.
     """
 
     resolution_px: tuple[int, int]
@@ -175,7 +175,7 @@ class Renderer:
             return 0
         if not self.target.sides:
             return len(sprites) * self.footprint_px**2
-        rates, widths = zip(*reversed(self.target.sides), strict=True)
+        rates, widths = zip(*((side.below_e_per_s, side.side_px) for side in reversed(self.target.sides)), strict=True)
         place = np.searchsorted(rates, sprites.data["electrons_per_s"] * np.float32(sprites.per_star), side="right")
         return int(np.square([*widths, self.footprint_px])[place].sum())
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,8 +17,7 @@ from hilstar.render.reference import linear_image
 from hilstar.rotation import from_radec_roll_deg
 from hilstar.scene.frame_motion import Scan, Turn, swept_sprites
 from hilstar.study.shared.bench_text import Table, bench_text
-from hilstar.study.shared.lone_stars import Isolation, lone_windows, moments
-from hilstar.units import magnitude
+from hilstar.study.shared.lone_stars import Isolation, lone_windows, star_error
 
 # Full effort: `exact` codes and whole sprites reach every tolerance that can be reached.
 EFFORTS: dict[str, Table] = {
@@ -72,22 +70,34 @@ class Outcome:
         return self.flux_max_mag <= self.tolerance and self.centroid_max_px <= self.tolerance
 
 
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """A scene at full effort and at the effort that it needs."""
+
+    full: Outcome
+    auto: Outcome
+
+    @property
+    def speed_up(self) -> float:
+        """The time of a frame at full effort over that at auto effort."""
+        return self.full.frame_ms / self.auto.frame_ms
+
+
 def run(directory: Path, quick: bool = False) -> list[str]:
     """Measure every scene, and write `economy.csv` and `economy.png`; a line for each scene. Raises InputError."""
-    outcomes = [outcome for scene in SCENES for outcome in compare(scene, QUICK_ROUNDS if quick else ROUNDS)]
-    write_records(directory / "economy.csv", outcomes)
-    pairs = list(zip(outcomes[::2], outcomes[1::2], strict=True))
-    _draw(directory / "economy.png", pairs)
-    return [_line(full, auto) for full, auto in pairs]
+    comparisons = [compare(scene, QUICK_ROUNDS if quick else ROUNDS) for scene in SCENES]
+    write_records(directory / "economy.csv", [outcome for c in comparisons for outcome in (c.full, c.auto)])
+    _draw(directory / "economy.png", comparisons)
+    return [_line(comparison) for comparison in comparisons]
 
 
-def compare(scene: Scene, rounds: int) -> list[Outcome]:
+def compare(scene: Scene, rounds: int) -> Comparison:
     """A scene at full effort and at the effort that it needs, timed in turn."""
     with TemporaryDirectory() as folder:
         benches = {name: _open(scene, keys, Path(folder) / f"{name}.toml") for name, keys in EFFORTS.items()}
         try:
             times = _times_ms(scene, benches, rounds)
-            return [_outcome(scene, name, bench, times[name]) for name, bench in benches.items()]
+            return Comparison(**{name: _outcome(scene, name, bench, times[name]) for name, bench in benches.items()})
         finally:
             for bench in benches.values():
                 bench.close()
@@ -130,41 +140,40 @@ def _outcome(scene: Scene, name: str, bench: Bench, frame_ms: float) -> Outcome:
     scan = Scan(bench.scan.down, bench.scan.scanout_s, bench.scan.hold_s)
     sprites = swept_sprites(bench.stars, turn, scan, bench.camera, footprint, sigma_px)
     true = linear_image(sprites, size, sigma_px)
-    flux_mag, off_px = [], []
+    errors = []
     rates = sprites.data["electrons_per_s"]
     for star, window in lone_windows(sprites, sprites.x_px, sprites.y_px, size, ISOLATION):
         if rates[sprites.star == star].sum() > 2 * bench.flux_at_white_e_per_s:
             continue  # clips at some sub-pixel phases
-        (light, x_px, y_px), (true_light, true_x_px, true_y_px) = moments(shown, window), moments(true, window)
-        flux_mag.append(abs(magnitude(light / true_light)))
-        off_px.append(math.hypot(x_px - true_x_px, y_px - true_y_px))
+        errors.append(star_error(shown, true, window))
     return Outcome(
         scene=scene.name,
         effort=name,
         quantisation=bench.config.render.quantisation,
         stars=drawn.star_count,
         frame_ms=frame_ms,
-        flux_max_mag=max(flux_mag),
-        centroid_max_px=max(off_px),
-        measured_stars=len(flux_mag),
+        flux_max_mag=max(abs(error.flux_mag) for error in errors),
+        centroid_max_px=max(error.centroid_px for error in errors),
+        measured_stars=len(errors),
         tolerance=scene.tolerance,
     )
 
 
-def _line(full: Outcome, auto: Outcome) -> str:
+def _line(comparison: Comparison) -> str:
+    full, auto = comparison.full, comparison.auto
     errors = f"largest errors of {auto.measured_stars} stars {auto.flux_max_mag:.4f} mag and {auto.centroid_max_px:.4f} px"
     verdict = "within" if auto.within else "OVER"
     return (
         f"{auto.scene}: {auto.frame_ms:.2f} ms ({auto.quantisation}) instead of {full.frame_ms:.2f} ms, "
-        f"{_compared(full, auto)}; {errors}, {verdict} {auto.tolerance:g}"
+        f"{_compared(comparison)}; {errors}, {verdict} {auto.tolerance:g}"
     )
 
 
-def economy_finding(pairs: list[tuple[Outcome, Outcome]]) -> str:
+def economy_finding(comparisons: list[Comparison]) -> str:
     """What is true of every scene, in one sentence: the range of the speed-up, and whether errors are within tolerance."""
-    slowest, quickest = (extreme(full.frame_ms / auto.frame_ms for full, auto in pairs) for extreme in (min, max))
-    over = sum(not auto.within for _, auto in pairs)
-    verdict = "within tolerance" if not over else f"{over} of {len(pairs)} scenes OVER tolerance"
+    slowest, quickest = (extreme(comparison.speed_up for comparison in comparisons) for extreme in (min, max))
+    over = sum(not comparison.auto.within for comparison in comparisons)
+    verdict = "within tolerance" if not over else f"{over} of {len(comparisons)} scenes OVER tolerance"
     if slowest >= 1:
         return f"Auto effort is {slowest:.1f} to {quickest:.1f} times as fast as full effort, {verdict}"
     if quickest < 1:
@@ -173,17 +182,17 @@ def economy_finding(pairs: list[tuple[Outcome, Outcome]]) -> str:
     return f"Auto effort {slower} and is up to {quickest:.1f} times as fast in another, {verdict}"
 
 
-def _compared(full: Outcome, auto: Outcome) -> str:
-    ratio = full.frame_ms / auto.frame_ms
+def _compared(comparison: Comparison) -> str:
+    ratio = comparison.speed_up
     return f"{ratio:.1f} times as fast" if ratio >= 1 else f"{1 / ratio:.1f} times as SLOW"
 
 
-def _draw(path: Path, pairs: list[tuple[Outcome, Outcome]]) -> None:
-    finding = economy_finding(pairs)
+def _draw(path: Path, comparisons: list[Comparison]) -> None:
+    finding = economy_finding(comparisons)
     with chart(path, finding, panels=2) as (cost, error):
-        at = np.arange(len(pairs))
-        for shift, which, colour in ((-0.2, 0, "C7"), (0.2, 1, "C0")):
-            mine = [pair[which] for pair in pairs]
+        at = np.arange(len(comparisons))
+        full, auto = [c.full for c in comparisons], [c.auto for c in comparisons]
+        for shift, mine, colour in ((-0.2, full, "C7"), (0.2, auto, "C0")):
             cost.bar(at + shift, [o.frame_ms for o in mine], 0.38, color=colour, label=mine[0].effort)
             error.bar(at + shift, [o.flux_max_mag for o in mine], 0.18, color=colour, label=f"{mine[0].effort}, mag")
             error.bar(
@@ -194,12 +203,11 @@ def _draw(path: Path, pairs: list[tuple[Outcome, Outcome]]) -> None:
                 alpha=0.5,
                 label=f"{mine[0].effort}, px",
             )
-        for place, (_, auto) in zip(at, pairs, strict=True):
-            error.plot(
-                [place - 0.45, place + 0.45], [auto.tolerance] * 2, color="#c33", label="tolerance" if not place else None
-            )
+        for place, outcome in zip(at, auto, strict=True):
+            label = "tolerance" if not place else None
+            error.plot([place - 0.45, place + 0.45], [outcome.tolerance] * 2, color="#c33", label=label)
         cost.set_ylabel("time of a frame [ms]")
         error.set_ylabel("largest error of a star")
-        error.set_xticks(at, [full.scene.replace(", ", ",\n") for full, _ in pairs])
+        error.set_xticks(at, [outcome.scene.replace(", ", ",\n") for outcome in full])
         cost.legend()
         error.legend(ncols=3, fontsize=9)

@@ -64,18 +64,16 @@ def _draw_scene(directory: Path, scene: Scene) -> str:
 
 
 def _figure(path: Path, scene: Scene, clean: Exposure, noisy: Exposure) -> None:
-    import matplotlib
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
 
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    with pyplot.rc_context(STYLE):
-        figure, grid = pyplot.subplots(2, 3, figsize=(17, 11), layout="constrained")
+    with rc_context(STYLE):
+        figure = Figure(figsize=(17, 11), layout="constrained")
+        grid = figure.subplots(2, 3)
         _star_plots(list(grid[0]), noisy.truth, noisy.dn.shape)
         _images(list(grid[1]), scene, clean, noisy)
         figure.suptitle(scene.title, fontsize=14)
         save(figure, path)
-        pyplot.close(figure)
 
 
 def _star_plots(axes: list[Axes], truth: npt.NDArray[np.void], shape: tuple[int, ...]) -> None:

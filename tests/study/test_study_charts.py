@@ -6,7 +6,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from hilstar import charts
-from hilstar.study.economy import Outcome, economy_finding
+from hilstar.study.economy import Comparison, Outcome, economy_finding
 from hilstar.study.speed import report as benchmark_report
 from hilstar.study.speed.result import Machine, Result, Spread, Timing
 from hilstar.twin.budget import budget
@@ -43,12 +43,12 @@ def outcome(frame_ms: float, worst_mag: float = 0.01) -> Outcome:
     ],
 )
 def test_economy_says_longer_where_it_took_longer(times_ms, said):
-    pairs = [(outcome(full), outcome(auto)) for full, auto in times_ms]
-    assert economy_finding(pairs).endswith(said)
+    comparisons = [Comparison(outcome(full), outcome(auto)) for full, auto in times_ms]
+    assert economy_finding(comparisons).endswith(said)
 
 
 def test_economy_does_not_call_within_tolerance_what_is_over_it():
-    assert economy_finding([(outcome(2.0), outcome(1.0, 0.5))]).endswith("1 of 1 scenes OVER tolerance")
+    assert economy_finding([Comparison(outcome(2.0), outcome(1.0, 0.5))]).endswith("1 of 1 scenes OVER tolerance")
 
 
 @pytest.mark.parametrize("sizes", [((1920, 1080),), ((640, 480), (1920, 1080))])

@@ -6,6 +6,7 @@ import ctypes
 import os
 import select
 import threading
+from dataclasses import dataclass
 from typing import Any, Self
 
 from hilstar.monitor.window.x11 import X11_LIBRARY, Survival
@@ -15,7 +16,14 @@ VISIBILITY_CHANGES, STRUCTURE_CHANGES = 1 << 16, 1 << 17
 VISIBILITY_NOTIFY, DESTROY_NOTIFY, UNMAP_NOTIFY, MAP_NOTIFY = 15, 17, 18, 19
 COVERED = ("", "covered in part", "covered")  # by VisibilityNotify's state
 LOOK_AGAIN_S = 0.5  # interval of what sends no events: the position of a window's parents, and the display's sleep
-Place = tuple[tuple[int, int], tuple[int, int]]  # corner and size, px of the whole screen
+
+
+@dataclass(frozen=True, slots=True)
+class ScreenArea:
+    """A rectangle of the whole screen, px: its top left corner and its size."""
+
+    corner_px: tuple[int, int]
+    size_px: tuple[int, int]
 
 
 class _VisibilityEvent(ctypes.Structure):
@@ -40,7 +48,7 @@ class _Event(ctypes.Union):
 class Visibility:
     """Watches one window, which has to fill `place` if given; `hidden` says why it is not wholly seen, "" where it is."""
 
-    def __init__(self, x11: Any, connection: int, window: int, place: Place | None) -> None:
+    def __init__(self, x11: Any, connection: int, window: int, place: ScreenArea | None) -> None:
         self._x11, self._connection, self._window, self.place = x11, connection, window, place
         self._covered = 0
         self._mapped = self._there = True
@@ -53,7 +61,7 @@ class Visibility:
         self._thread.start()
 
     @classmethod
-    def of(cls, window: int, place: Place | None, survival: Survival) -> Self | None:
+    def of(cls, window: int, place: ScreenArea | None, survival: Survival) -> Self | None:
         """Watch a window that has to fill `place` (None: that may be anywhere); None without a connection to the server."""
         try:
             x11 = _library()
@@ -105,7 +113,7 @@ class Visibility:
         self._x11.XTranslateCoordinates(self._connection, self._window, root, 0, 0, *pointers)
         corner = x.value, y.value
         if self.place is not None:
-            return "" if (corner, size) == self.place else "moved off its display"
+            return "" if ScreenArea(corner, size) == self.place else "moved off its display"
         inside = all(at >= 0 and at + long <= end for at, long, end in zip(corner, size, screen, strict=True))
         return "" if inside else "off the screen, in part or wholly"
 

@@ -15,7 +15,7 @@ from typing import Any, Self
 import glfw
 
 from hilstar.errors import InputError, MachineError
-from hilstar.monitor.window.visibility import Visibility
+from hilstar.monitor.window.visibility import ScreenArea, Visibility
 from hilstar.monitor.window.x11 import Survival, is_composited, sync_control
 
 TITLE = "hilstar"
@@ -150,7 +150,7 @@ class Window:
             self._survival = Survival(self._on_end)
             self._survival.cover(self._x_display)
             window = glfw.get_x11_window(self._window)
-            self._visibility = Visibility.of(window, None if monitor is None else _place_of(monitor), self._survival)
+            self._visibility = Visibility.of(window, None if monitor is None else _area_of(monitor), self._survival)
         self._sync = sync_control(self._x_display, glfw.get_glx_window(self._window) if self._x_display else None)
         if monitor is not None:
             self._set_identity_ramp(monitor)
@@ -201,7 +201,7 @@ class Window:
             glfw.set_window_monitor(self._window, monitor, 0, 0, width, height, display.refresh_hz or glfw.DONT_CARE)
             self._set_identity_ramp(monitor)
             if self._visibility is not None:
-                self._visibility.place = _place_of(monitor)
+                self._visibility.place = _area_of(monitor)
             self.lost = False
             log.warning("the display %s is back", display.name)
 
@@ -301,9 +301,9 @@ class Window:
         self.close()
 
 
-def _place_of(monitor: Any) -> tuple[tuple[int, int], tuple[int, int]]:
+def _area_of(monitor: Any) -> ScreenArea:
     display = _describe(0, monitor)
-    return display.position_px, display.resolution_px
+    return ScreenArea(display.position_px, display.resolution_px)
 
 
 def _find(wanted: int | str) -> tuple[Display, Any]:

@@ -1,4 +1,4 @@
-"""Stars that stand alone on an image: a window around each, and its light and centroid there."""
+"""Stars that stand alone on an image: a window around each, and the errors of its light and centroid there."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from hilstar.arrays import FloatArray
 from hilstar.scene.sprites import Sprites
+from hilstar.units import magnitude
 
 Window = tuple[slice, slice]
 
@@ -41,11 +42,25 @@ def lone_windows(
             yield int(star), (slice(int(top), int(bottom) + 1), slice(int(left), int(right) + 1))
 
 
-def moments(image: FloatArray, window: Window) -> tuple[float, float, float]:
-    """Light and centroid (x, y), px, of a window; NaN for the centroid where it is dark."""
+@dataclass(frozen=True, slots=True)
+class StarError:
+    """How much fainter a star is shown than it is, magnitudes, and how far its centroid is off, px; NaN where it is dark."""
+
+    flux_mag: float
+    centroid_px: float
+
+
+def star_error(shown: FloatArray, true: FloatArray, window: Window) -> StarError:
+    """The error of the star in a window of `shown`, against the same window of `true`."""
+    light, true_light = float(shown[window].sum()), float(true[window].sum())
+    (x_px, y_px), (true_x_px, true_y_px) = _centroid_px(shown, window), _centroid_px(true, window)
+    return StarError(magnitude(light / true_light), math.hypot(x_px - true_x_px, y_px - true_y_px))
+
+
+def _centroid_px(image: FloatArray, window: Window) -> tuple[float, float]:
     part = image[window]
     y_px, x_px = np.mgrid[window]
     total = float(part.sum())
     if total <= 0:
-        return 0.0, math.nan, math.nan
-    return total, float((part * x_px).sum() / total), float((part * y_px).sum() / total)
+        return math.nan, math.nan
+    return float((part * x_px).sum() / total), float((part * y_px).sum() / total)

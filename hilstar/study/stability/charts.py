@@ -32,7 +32,9 @@ def draw_charts(directory: Path) -> None:
 def narrow_sigmas(directory: Path) -> None:
     """Flux and centroid error against sigma: point sampling, and the integral over pixels."""
     sigmas_px = np.geomspace(0.1, 2.0, 27)
-    rows = [(float(sigma), *ours, *theirs) for sigma in sigmas_px for ours, theirs in (narrow_errors(float(sigma)),)]
+    pairs = [narrow_errors(float(sigma)) for sigma in sigmas_px]
+    errors = [(ours.flux, ours.centroid_px, sampled.flux, sampled.centroid_px) for ours, sampled in pairs]
+    rows = np.column_stack([sigmas_px, errors]).tolist()
     columns = ("sigma_px", "flux_error", "centroid_error_px", "sampled_flux_error", "sampled_centroid_error_px")
     write_csv(directory / "narrow_stars.csv", columns, rows)
     sigma, flux, off_px, sampled_flux, sampled_px = np.array(rows).T

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -114,33 +115,42 @@ def _horner(s: Float32Array, terms: tuple[float, ...]) -> Float32Array:
     return value
 
 
-def star_errors(draw: Draw, on: Target, phases_px: FloatArray) -> tuple[float, float]:
-    """Over sub-pixel phases the largest error of a star's flux, relative, and of its centre of gravity, px."""
+@dataclass(frozen=True, slots=True)
+class PhaseErrors:
+    """The largest errors over sub-pixel phases of a star's flux, relative, and of its centre of gravity, px."""
+
+    flux: float
+    centroid_px: float
+
+
+def star_errors(draw: Draw, on: Target, phases_px: FloatArray) -> PhaseErrors:
+    """The largest errors of a star's image over sub-pixel phases (n,)."""
     flux_error, off_px = 0.0, 0.0
     for phase in phases_px:
         image = draw(one_star(256 + phase, 256.0, on))
         light = float(image.sum())
         flux_error = max(flux_error, abs(light - 1))
         off_px = max(off_px, abs(float(image.sum(axis=0) @ np.arange(IMAGE_PX[0])) / light - 256 - phase))
-    return flux_error, off_px
+    return PhaseErrors(flux_error, off_px)
 
 
 def narrow_star() -> FailureCase:
     """Sigma 0.1 px."""
-    (error, off_px), (fault, fault_px) = narrow_errors(0.1)
-    (_, wider_px), (_, wider_fault_px) = narrow_errors(0.5)
+    ours, sampled = narrow_errors(0.1)
+    wider, wider_sampled = narrow_errors(0.5)
     return FailureCase(
         "sigma 0.1 px",
         POINT_SAMPLED,
-        f"flux off by up to {100 * fault:.0f} %, centre of gravity by {fault_px:.2f} px ({wider_fault_px:.4f} at sigma 0.5)",
-        f"flux off by {error:.1e}; centre of gravity by {off_px:.2f} px ({wider_px:.4f} at sigma 0.5)",
+        f"flux off by up to {100 * sampled.flux:.0f} %, centre of gravity by {sampled.centroid_px:.2f} px"
+        f" ({wider_sampled.centroid_px:.4f} at sigma 0.5)",
+        f"flux off by {ours.flux:.1e}; centre of gravity by {ours.centroid_px:.2f} px ({wider.centroid_px:.4f} at sigma 0.5)",
         "the Gaussian is integrated over pixels; pixels of any display keep that centroid error: write 0.5 px or more",
-        Figures(error, fault, FLUX_ERROR),
+        Figures(ours.flux, sampled.flux, FLUX_ERROR),
     )
 
 
-def narrow_errors(sigma_px: float) -> tuple[tuple[float, float], tuple[float, float]]:
-    """What `star_errors` says of the renderer and of point sampling."""
+def narrow_errors(sigma_px: float) -> tuple[PhaseErrors, PhaseErrors]:
+    """The errors of the renderer, and those of point sampling."""
     on, phases = target(sigma_px), np.linspace(-0.5, 0.5, 21)
     with by_renderer(on) as draw:
         return star_errors(draw, on, phases), star_errors(partial(point_sampled, on), on, phases)
@@ -226,7 +236,7 @@ def star_on_pixel_edge() -> FailureCase:
     """A star where two pixels meet, and a hair to either side."""
     on, phases = target(SIGMA_PX), np.array([-0.5, 0.5 - 1e-9, 0.5, 0.5 + 1e-9])
     with by_renderer(on) as draw:
-        (_, off_px), (_, fault_px) = (star_errors(by, on, phases) for by in (draw, partial(nearest_pixel, on)))
+        off_px, fault_px = (star_errors(by, on, phases).centroid_px for by in (draw, partial(nearest_pixel, on)))
     return FailureCase(
         "a star on a pixel's edge",
         "the nearest pixel",

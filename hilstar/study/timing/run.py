@@ -6,7 +6,6 @@ in the same exposure, star by star.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -17,10 +16,10 @@ import numpy as np
 
 from hilstar.charts import chart, plain_ticks, write_records
 from hilstar.scene.camera import Camera
-from hilstar.study.shared.lone_stars import Isolation, lone_windows, moments
+from hilstar.study.shared.lone_stars import Isolation, lone_windows, star_error
 from hilstar.study.timing.panel import WAYS, ScanningPanel, Sky
 from hilstar.study.timing.slew import Slew
-from hilstar.units import ARCSEC_PER_RAD, magnitude
+from hilstar.units import ARCSEC_PER_RAD
 
 RATES_DEG_S = (0.01, 0.03, 0.1, 0.3, 1.0, 2.0, 4.0)
 QUICK_RATES_DEG_S = (2.0,)
@@ -45,16 +44,14 @@ def compare(panel: ScanningPanel, sky: Sky, slew: Slew) -> Outcome:
     """One compensation on one slew, against the sky."""
     shown, true = panel.exposed_e_per_s(slew), sky.exposed_e_per_s(slew)
     camera: Camera = panel.camera
-    flux_mag, off_px = [], []
     paths = sky.paths(slew)
     places = panel.optics.geometry.to_tracker(paths.x_px, paths.y_px)
-    for _, window in lone_windows(paths, *places, camera.resolution_px, ISOLATION):
-        (light, x_px, y_px), (true_light, true_x_px, true_y_px) = moments(shown, window), moments(true, window)
-        flux_mag.append(magnitude(light / true_light))
-        off_px.append(math.hypot(x_px - true_x_px, y_px - true_y_px))
-    off_arcsec = np.array(off_px) * ARCSEC_PER_RAD / camera.focal_length_px
+    windows = lone_windows(paths, *places, camera.resolution_px, ISOLATION)
+    errors = [star_error(shown, true, window) for _, window in windows]
+    flux_mag = np.array([error.flux_mag for error in errors])
+    off_arcsec = np.array([error.centroid_px for error in errors]) * ARCSEC_PER_RAD / camera.focal_length_px
     rms_arcsec, rms_mag = (float(np.sqrt(np.mean(np.square(v)))) for v in (off_arcsec, flux_mag))
-    return Outcome(panel.way, slew.rate_deg_s, len(off_px), rms_arcsec, float(off_arcsec.max()), rms_mag, panel.cost_ms(slew))
+    return Outcome(panel.way, slew.rate_deg_s, len(errors), rms_arcsec, float(off_arcsec.max()), rms_mag, panel.cost_ms(slew))
 
 
 @contextmanager

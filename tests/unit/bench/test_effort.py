@@ -47,8 +47,9 @@ def test_sprites_are_as_small_as_the_tolerance_lets_them_be():
     wide = choose_sides(settings(tolerance_mag=1e-6, tolerance_px=1e-6), light(8, 6.0), "exact")
     narrow = choose_sides(settings(tolerance_mag=0.2, tolerance_px=0.2), light(8, 6.0), "exact")
     full = footprint_px(SIGMA)
-    assert wide.sides == ((pytest.approx(3e38), full),)
-    assert narrow.sides[0][1] < full
+    (side,) = wide.sides
+    assert (side.below_e_per_s, side.side_px) == (pytest.approx(3e38), full)
+    assert narrow.sides[0].side_px < full
     assert narrow.cut_mag <= 0.05 and narrow.moved_px <= 0.05
 
 
@@ -72,7 +73,7 @@ def test_the_light_outside_a_sprite_is_no_more_than_said(size):
 def test_small_sprites_give_the_codes_of_whole_ones_but_where_wings_meet(bench_with):
     """What is left out lights no pixel by itself; added to another star's it may make up a step, never two."""
     bench = bench_with('[render]\neffort = "auto"\n')
-    assert min(side for _, side in bench.renderer.target.sides) < bench.renderer.footprint_px
+    assert min(side.side_px for side in bench.renderer.target.sides) < bench.renderer.footprint_px
     small = bench.draw(ORION).levels.astype(int)
     whole = bench_with("").draw(ORION).levels.astype(int)
     lit = (whole > 0).sum()

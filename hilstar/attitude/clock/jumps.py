@@ -37,7 +37,7 @@ WAITED_UNKNOWN_NS = 2**62  # a message that was there before anybody listened
 TRUSTED_WAIT_NS = NS_PER_MS  # a shorter wait is within what the clock's minimum filter removes
 CLEARLY_LATE_FOR_NS = 3 * LATE_FOR_NS  # late by a constant time while t_ns itself shows no jump: a sender that was stopped
 UNKNOWN_DRIFT = 1e-4  # while nothing arrives, the clocks part by this share of the time
-MAX_FOLLOWED_NS = 60 * NS_PER_S  # what a slow clock may fall behind before it is known to be slow; more is a jump
+MAX_FOLLOWED_NS = 60 * NS_PER_S  # what a slow clock may fall behind before it is known to be slow; more is surely a jump
 USUAL_SHARE = 0.95
 
 
@@ -141,6 +141,8 @@ class JumpFilter:
     def _agrees(self, arrival: SampleArrival, late_ns: float) -> bool:
         """True where this one supports the samples in doubt: it is off by the same time, and follows them."""
         by_ns = AGREEMENT_NS if self._shows_none else self._agreement_ns
+        if abs(late_ns) > MAX_FOLLOWED_NS:  # by jitter such samples may differ; a queue is never as late
+            by_ns = UNSETTLED_NS
         follows = arrival.event.t_ns > self._doubtful[-1].arrival.event.t_ns
         return follows and abs(late_ns - self._doubtful[0].late_ns) <= by_ns
 

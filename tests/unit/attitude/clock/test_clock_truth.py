@@ -164,6 +164,24 @@ def test_messages_that_waited_before_the_start_do_not_mislead_the_clock(seed):
     assert (run.refused, run.jumps.jumps) == (0, 0)
 
 
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("timely", [True, False])
+def test_a_sender_that_restarts_is_followed_on_a_loaded_machine(timely, seed):
+    """It sends for half a second, before or after the frames begin; then its clock restarts, and each packet is later still."""
+    rng = np.random.default_rng(seed)
+    restart_ns, late_ns = HOST0_NS + NS_PER_S // 2, 0
+
+    def read(arrival_ns: int) -> tuple[int, int]:
+        nonlocal late_ns
+        if arrival_ns < restart_ns:
+            return (arrival_ns, 0) if timely else (restart_ns, WAITED_UNKNOWN_NS)
+        late_ns += round(rng.exponential(2 * NS_PER_MS))
+        return arrival_ns + late_ns, 0
+
+    run = Truth(lambda host: host + 10**15 if host < restart_ns else host - restart_ns, read, count=150)
+    assert (run.refused, run.jumps.jumps) == (0, 1)
+
+
 def test_a_link_20_ms_slower_for_a_while_is_not_a_jump_and_costs_no_packet():
     def read(arrival_ns: int) -> tuple[int, int]:
         slow = 5 * NS_PER_S < arrival_ns - HOST0_NS < 8 * NS_PER_S

@@ -11,7 +11,7 @@ from PIL import Image
 from scipy.special import ndtr
 
 from hilstar.calibrate.geometric.dots import read_plan
-from tests.e2e.commands.test_geometric import BENCH, FILE, STARS_ARCSEC, TRACKER, TRACKER_PX
+from tests.e2e.calibrate.test_geometric import BENCH, FILE, STARS_ARCSEC, TRACKER, TRACKER_PX
 from tests.support.commands import assert_refused, run_hilstar_here
 
 SIGMA_PX, PEAK_DN, FLOOR_DN, NOISE_DN = 1.1, 9000.0, 400.0, 12.0

@@ -40,7 +40,7 @@ def write_records(path: Path, records: Sequence[Any]) -> None:
 @contextmanager
 def chart(path: Path, finding: str, panels: int = 1, share_x: bool = True) -> Iterator[list[Axes]]:
     """A PNG titled by its finding, with `panels` one above the other, which may share x; draw on the axes that it yields."""
-    # Not pyplot: it would change the backend of whoever imports this.
+    # Not pyplot: it would change the backend of a program that imports this.
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 

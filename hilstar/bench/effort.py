@@ -111,7 +111,7 @@ def plan_effort(render: RenderSettings, light: Light) -> Effort:
     paths = Choice(
         "paths",
         f"stars move from {motion_px:g} px within a frame on, in as few sprites as their paths need",
-        f"{motion_px:g} px at worst",
+        f"{motion_px:g} px maximum",
         "a slower frame is drawn as points",
     )
     return Effort(
@@ -132,7 +132,7 @@ def explain(effort: Effort | None, render: RenderSettings) -> list[str]:
     within = effort.error_mag <= render.tolerance_mag and effort.error_px <= render.tolerance_px
     return [
         *(choice.line() for choice in effort.choices),
-        f"together at worst: {total}{'' if within else ': OVER the tolerance'}",
+        f"together, worst case: {total}{'' if within else ': OVER the tolerance'}",
     ]
 
 
@@ -145,7 +145,7 @@ def choose_codes(render: RenderSettings, light: Light) -> ChosenCodes:
         within = errors.flux_max_mag <= limits[0] and errors.centroid_max_px <= limits[1]
         if within or method == wanted[-1]:
             break
-    error = f"{errors.flux_max_mag:.4f} mag and {errors.centroid_max_px:.4f} px at worst, from white to the faintest star"
+    error = f"{errors.flux_max_mag:.4f} mag and {errors.centroid_max_px:.4f} px maximum, from white to the faintest star"
     if not within:
         ways = "more bits, bit_stealing or brighter stars" if light.can_steal_bits else "more bits or brighter stars"
         error += f" (over {limits[0]:g} mag or {limits[1]:g} px: {ways} would do)"

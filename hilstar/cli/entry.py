@@ -19,7 +19,7 @@ from hilstar.process.stderr import finish_stderr, queue_stderr
 
 INTERRUPTED = 130
 LOG_FORMAT = "hilstar: %(message)s"
-READER_WAITS_S, STOPPED_READER_WAITS_S = 1.0, 0.1  # for a reader of stderr that sleeps, without and with a signal
+READER_WAITS_S, STOPPED_READER_WAITS_S = 1.0, 0.1  # how long a slow reader of stderr is waited for, without and with a signal
 SHARE_OPTIONS = ("--lose", "--corrupt", "--reorder")  # may stand alone
 USUAL_SHARE = "5%"
 
@@ -40,7 +40,7 @@ def main() -> NoReturn:
     interrupts.install()
     queue_stderr()
     logging.basicConfig(format=LOG_FORMAT, stream=sys.stderr)
-    if sys.stdout is None:  # closed by whoever started us
+    if sys.stdout is None:  # closed by the parent process
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115, PTH123 - for as long as the process lives
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="surrogateescape")  # a file's name goes out as the bytes that came in

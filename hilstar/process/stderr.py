@@ -15,7 +15,7 @@ from typing import Any
 MAX_WAITING_BYTES = 1 << 20
 PIECE_BYTES = 4096
 DESCRIPTOR = 2
-LAST_WORDS_S = 1.0  # for a traceback, where nobody asks for what is written
+LAST_WORDS_S = 1.0  # for a traceback at the very end
 
 
 class QueuedStderr(io.RawIOBase):
@@ -67,7 +67,7 @@ class QueuedStderr(io.RawIOBase):
                     self._changed.wait()
                 piece = self._waiting.popleft()
                 dropped, self._dropped = self._dropped, 0
-            note = f"hilstar: {dropped} lines found nobody to read them\n".encode() if dropped else b""
+            note = f"hilstar: {dropped} lines were dropped: nothing read them\n".encode() if dropped else b""
             for data in (piece, note):
                 _write_all(data)
             with self._changed:
@@ -76,11 +76,11 @@ class QueuedStderr(io.RawIOBase):
 
 
 def _write_all(data: bytes) -> None:
-    with contextlib.suppress(OSError):  # nobody is there to be told
+    with contextlib.suppress(OSError):  # there is no reader to tell
         while data:
             try:
                 data = data[os.write(DESCRIPTOR, data[:PIECE_BYTES]) :]
-            except BlockingIOError:  # whoever shares it has made it so
+            except BlockingIOError:  # another process that shares it has made it non-blocking
                 time.sleep(0.01)
 
 

@@ -54,7 +54,7 @@ def window_context() -> moderngl.Context:
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """What a window shows: an image of `resolution_px`, on a screen of `screen_px`, codes of so many bits.
+    """What a window shows: an image of `resolution_px`, on a screen of `screen_px`, codes of `bits` bits.
 
     `cross_px` is where the crosshair goes, image pixels; `triples` (levels, 3) the codes of each level, None where level k
     is code k in all channels.

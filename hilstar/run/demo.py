@@ -110,7 +110,7 @@ def run_demo(directory: Path, duration_s: float, rng: np.random.Generator, watch
             finally:
                 sender.terminate()
         pictures = []
-        for number, codes in kept.items() if caught() is None else ():  # whoever stopped it waits for no pictures
+        for number, codes in kept.items() if caught() is None else ():  # after Ctrl-C no pictures are wanted
             exact, preview = (directory / f"frame_{number:04d}_{kind}.png" for kind in ("codes", "preview"))
             write_codes_png(exact, codes, bench.config.monitor.bits)
             write_preview_png(preview, codes)

@@ -1,6 +1,6 @@
 """The frame loop: an attitude at each frame's moment of light, drawn, counted, handed on.
 
-It knows neither screens nor links: a pacer says when frames are due and shows them, and whoever runs the loop supplies
+It knows neither screens nor links: a pacer says when frames are due and shows them, and the caller supplies
 the attitudes.
 """
 
@@ -31,7 +31,7 @@ GIVEN_UP_PERIODS = 2.0
 
 @dataclass(frozen=True, slots=True)
 class Limit:
-    """When a paced run ends: after so many refresh periods, or so many frames drawn."""
+    """When a paced run ends: after a number of refresh periods, or of frames drawn."""
 
     slots: float = math.inf
     frames: float = math.inf

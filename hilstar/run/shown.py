@@ -53,4 +53,4 @@ FrameSink = Callable[[Shown], None]
 
 
 def ignore(shown: Shown) -> None:
-    """The sink of a run whose frames nobody takes."""
+    """The sink of a run whose frames are not used."""

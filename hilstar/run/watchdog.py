@@ -12,7 +12,7 @@ from hilstar.units import NS_PER_MS, NS_PER_S
 
 LOOK_S = 0.25
 STUCK_NS = NS_PER_S
-# A frame is told late after so many refresh periods, and so many ms: less happens on any busy machine.
+# A frame is reported as late after this many refresh periods and this many ms; shorter delays happen on any busy machine.
 LATE_PERIODS = 3.0
 LATE_NS = 50 * NS_PER_MS
 TOLD_EVERY_NS = NS_PER_S

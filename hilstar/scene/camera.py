@@ -17,7 +17,7 @@ NEWTON_ROUNDS, STEPS_A_ROUND = 10, 5  # slopes are found once a round: a mild le
 # Of a focal length, 1e-8 px on any screen; slopes by differences of SLOPE_STEP are right to 1e-10, which is enough for that.
 NEWTON_DONE = 1e-13
 SLOPE_STEP = 1e-6
-MAX_TANGENT = 1e3  # a step of so much leads nowhere
+MAX_TANGENT = 1e3  # a step this long has left the solution
 
 
 @dataclass(frozen=True, slots=True)

@@ -35,7 +35,7 @@ EVENTS = zmq.EVENT_ACCEPTED | zmq.EVENT_CONNECTED | zmq.EVENT_DISCONNECTED | zmq
 class Doorkeeper:
     """Reads the monitor of one socket, made before it is bound or connected.
 
-    `lost` says that a connection has ended; whoever acts on it resets it. `place` is the port or path that was bound.
+    `lost` says that a connection has ended; the code that acts on it resets it. `place` is the port or path that was bound.
     """
 
     def __init__(self, watched: zmq.Socket[bytes], *, bound: bool, counts: LinkCounts, notices: Notices) -> None:

@@ -39,7 +39,7 @@ class Link(Protocol):
         """True once something has arrived that was not read."""
 
     def send(self, packet: Packet) -> None:
-        """Send to the other side, never waiting; lost where nobody listens."""
+        """Send to the other side, never waiting; lost if there is no listener."""
 
     def wire_ns(self, packet: Packet) -> int:
         """How long the wire alone takes for a packet, ns."""

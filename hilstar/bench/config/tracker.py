@@ -60,7 +60,7 @@ class Tracker(Table, frozen=True):
         str | None,
         Meta(
             description="The path of the tracker's flight model: a TOML file with the Brown-Conrady coefficients `k1`, `k2`, "
-            "`k3`, `p1` and `p2` of tangents of field angles, from direction to pixel; those left out are 0.",
+            "`k3`, `p1` and `p2` of tangents of field angles, from direction to pixel; those not given are 0.",
             extra={"default": "an ideal lens"},
         ),
     ] = None

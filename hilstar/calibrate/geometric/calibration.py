@@ -146,7 +146,7 @@ def _matched(
 
 
 def _names_for(centroids: int) -> tuple[str, ...]:
-    """The richest model that so many centroids carry."""
+    """The largest model that this number of centroids can determine."""
     for names in (BROWN_CONRADY, RADIAL):
         if centroids > 2 * len(names):
             return names

@@ -11,7 +11,7 @@ from hilstar.cli.options import Json
 from hilstar.console.terminal import print_json
 from hilstar.files import check_directory
 
-MAX_LINES = 10  # of stars; a whole sky that differs is no news star by star
+MAX_LINES = 10  # of stars: if the whole sky differs, a list of stars says nothing more
 
 
 def compare(

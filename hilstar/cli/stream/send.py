@@ -82,7 +82,7 @@ def send(
 
 
 def wanted_samples(log: Path | None, spin: str | None, rate: float | None, radec: str | None) -> tuple[Any, float]:
-    """The samples that `send` is asked for, and how many they are (infinite where nobody can say)."""
+    """The samples to send, and their number (infinite if unknown)."""
     from hilstar.attitude.logs.gaps import log_joins
     from hilstar.attitude.logs.log_file import read_log
     from hilstar.run.send.sender import log_samples, spin_samples

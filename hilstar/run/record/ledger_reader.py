@@ -60,7 +60,7 @@ def drawable_frames(path: Path, max_rate_rad_s: float = math.inf) -> Iterator[Fr
 
 
 def run_records(path: Path) -> Iterator[RunRecord]:
-    """What a ledger holds, in its order. Raises InputError for a file that is none, or is damaged."""
+    """What a ledger holds, in its order. Raises InputError for a file that is no ledger or is damaged."""
     decoders: dict[str, msgspec.json.Decoder[Any]] = {
         FRAME_TOPIC: _frame_decoder,
         PROCESS_TOPIC: msgspec.json.Decoder(ProcessRecord),
@@ -105,7 +105,7 @@ class Run:
 
 
 def read_run(path: Path) -> Run:
-    """Read a ledger of a short run. Raises InputError for a file that is none, or has no frame, or is damaged."""
+    """Read a ledger of a short run. Raises InputError for a file that is no ledger, has no frame, or is damaged."""
     run, tally = Run(read_head(path)), PacketTally()
     for record in run_records(path):
         tally.add(record)

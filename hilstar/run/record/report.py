@@ -26,7 +26,7 @@ img {{ max-width: 100% }}
 
 
 def figures_of(path: Path) -> Figures:
-    """Read a ledger. Raises InputError for a file that is none, or has no frame, or is damaged."""
+    """Read a ledger. Raises InputError for a file that is no ledger, has no frame, or is damaged."""
     figures = Figures(read_head(path))
     for record in run_records(path):
         figures.add(record)

@@ -14,7 +14,7 @@ from hilstar.running_statistics import RunningStatistics
 from hilstar.units import NS_PER_MS, NS_PER_S
 
 MEGABYTE = 1e6
-WARM_UP_S = 60.0  # after so long the process has all the memory that it wants
+WARM_UP_S = 60.0  # after this the process has allocated all the memory that it needs
 SAMPLES = 1 << 16  # frames of which each figure is kept: all of a run of a quarter of an hour
 SPANS = 4096  # in which a run is drawn along its time
 SMALL_RAD = 1e-8

@@ -27,7 +27,7 @@ from hilstar.run.send.faults import BadCable
 from hilstar.units import NS_PER_S
 
 LISTEN_MS = 20
-PATIENCE_S = 0.5  # a line that takes nothing for so long has no reader
+PATIENCE_S = 0.5  # a line that accepts nothing for this long has no reader
 MAX_RESAMPLED = 10_000_000  # some GB of samples
 
 

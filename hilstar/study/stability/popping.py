@@ -33,7 +33,7 @@ CODES_RIPPLE_MAG = AIMS[CODES_BITS][0]
 
 
 def moving_star(on: Target, electrons_per_s: float = 1.0) -> Iterator[Sprites]:
-    """Sirius, of so much light, in STEPS frames of the demo's camera while it turns until the star has gone PATH_PX."""
+    """Sirius at a given flux in STEPS frames of the demo's camera, which turns until the star has moved by PATH_PX."""
     sirius = load_catalog().brighter_than(-1.0)
     vectors = unit_vectors_icrs(sirius, HIPPARCOS_EPOCH_JYEAR)
     stars = make_stars(sirius, vectors, np.full(1, np.nan), np.full(1, electrons_per_s))

@@ -81,7 +81,7 @@ def catalogue_colours() -> FloatArray:
 
 
 def table_name(degree: int) -> str:
-    """What a Chebyshev table of so many degrees is called."""
+    """The label of a Chebyshev table of some degree."""
     return f"table over 1/T, degree {degree}"
 
 

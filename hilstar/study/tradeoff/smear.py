@@ -75,7 +75,7 @@ def smear_methods(stars: Stars, motion: Motion) -> dict[str, SpritesOf]:
 
 
 def gauss_name(count: int) -> str:
-    """What so many nodes for every star are called."""
+    """The label of a number of nodes per star."""
     return f"Gauss-Legendre, {count}"
 
 

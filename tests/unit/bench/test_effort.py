@@ -97,7 +97,7 @@ def test_the_plan_adds_up_and_says_when_it_cannot():
     assert within.error_mag <= 0.1 and within.error_px <= 0.1
     lines = explain(within, settings(tolerance_mag=0.1, tolerance_px=0.1))
     names = [line.split(":")[0] for line in lines]
-    assert names == ["stars", "codes", "sprites", "encoding", "paths", "projection", "together at worst"]
+    assert names == ["stars", "codes", "sprites", "encoding", "paths", "projection", "together, worst case"]
     assert "OVER" not in lines[-1]
     tight = settings(tolerance_mag=1e-4, tolerance_px=1e-4)
     assert "OVER" in explain(plan_effort(tight, light(8, 6.0)), tight)[-1]
@@ -111,7 +111,7 @@ def test_explain_is_said_beside_the_json(tmp_path, small_bench_file):
     )
     assert result.returncode == 0, result.stderr
     assert result.stdout.startswith("{")
-    assert "sprites:" in result.stderr and "together at worst" in result.stderr
+    assert "sprites:" in result.stderr and "together, worst case" in result.stderr
 
 
 def test_auto_codes_become_the_bench_s_own(tmp_path, small_bench_file):

@@ -1,5 +1,5 @@
 #version 330 core
-// Black under a sprite: cheaper than clearing an image of which little was drawn on. With LEVELS the image is one of levels.
+// Black under each sprite: faster than clearing an image that is mostly black. With LEVELS the image holds levels.
 
 #ifdef LEVELS
 out uint nothing;

@@ -1,6 +1,6 @@
 #version 330 core
-// Levels to the screen: their codes, turned as the optics want them, and what helps to align the bench.
-// Compiled for each mounting: on llvmpipe every branch costs at every pixel. QUARTER_TURNS, FLIP_X, FLIP_Y, STEALING, AIDS.
+// Levels to the screen: their codes, turned as the optics need them, and aids for aligning the bench.
+// Compiled for each orientation: on llvmpipe every branch costs at every pixel. QUARTER_TURNS, FLIP_X, FLIP_Y, STEALING, AIDS.
 
 uniform usampler2D levels;
 uniform usampler2D triples;  // with bit stealing the codes of each level, in rows of TABLE_WIDTH
@@ -15,7 +15,7 @@ out vec4 colour;
 
 const int TABLE_WIDTH = 1024;
 const int GRID_PX = 100;
-const uint LINE = 96u;       // of 255: seen, and no star
+const uint LINE = 96u;       // of 255: visible, but darker than a star's core
 
 ivec2 image_pixel(ivec2 screen) {
 #ifdef FLIP_X
@@ -47,14 +47,14 @@ void main() {
     // GL counts rows from the bottom, the screen from the top.
     ivec2 screen = ivec2(gl_FragCoord.x, screen_px.y - 1 - int(gl_FragCoord.y));
     ivec2 pixel = image_pixel(screen);
-    bool inside = all(lessThan(uvec2(pixel), uvec2(size_px)));  // what is negative is huge without its sign
+    bool inside = all(lessThan(uvec2(pixel), uvec2(size_px)));  // a negative number is huge without its sign
     uvec3 codes = inside ? codes_of(texelFetch(levels, pixel, 0).r) : uvec3(0u);
 #ifdef AIDS
     bool blank = (overlay & 4) != 0, on_patch = (overlay & 8) != 0 && !blank;
     if (on_patch) codes = uvec3(patch_code);
     if (blank) codes = uvec3(0u);
     uint line = uint(float(LINE) / 255.0 * white);
-    ivec2 offset = abs(pixel - cross_px);  // GLSL leaves the remainder of a negative number open
+    ivec2 offset = abs(pixel - cross_px);  // in GLSL the remainder of a negative number is undefined
     bool on_line = (overlay & 2) != 0 && (offset.x % GRID_PX == 0 || offset.y % GRID_PX == 0);
     on_line = on_line || ((overlay & 1) != 0 && (offset.x == 0 || offset.y == 0));
     // On a patch as bright as a line, a dark one.

@@ -10,7 +10,7 @@ uniform vec2 inverse_sigma_sqrt2;  // 1 / (sigma_px sqrt 2), x and y
 out float linear_e_per_s;
 
 // Rational approximation over [-4, 4] (Eigen's float erf); at most 4.4e-7 off, see tests/gpu/test_renderer.py.
-// results/tradeoff.csv, psf: tables are slower and worse, half floats 1e-3 mag off and hardly quicker.
+// results/tradeoff.csv, psf: tables are slower and less accurate, half floats are off by 1e-3 mag and hardly faster.
 vec4 erf4(vec4 value) {
     vec4 x = clamp(value, -4.0, 4.0);
     vec4 s = x * x;

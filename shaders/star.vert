@@ -8,7 +8,7 @@ in float electrons_per_s;
 
 uniform ivec2 resolution_px;
 uniform int footprint_px;
-// Fainter stars may have smaller sprites: that of side_px[k] where the star's rate is under below_e_per_s[k], falling.
+// Fainter stars may have smaller sprites: side_px[k] where the star's rate is below below_e_per_s[k], by falling rates.
 const int MAX_SIDES = 8;
 uniform int sides;
 uniform int side_px[MAX_SIDES];
@@ -23,7 +23,7 @@ void main() {
     star_pixel = pixel;
     star_fraction_px = fraction_px;
     star_electrons_per_s = electrons_per_s;
-    // The viewport reaches footprint_px beyond every edge, for GL drops a point whose centre is outside it.
+    // The viewport reaches footprint_px beyond every edge, because GL drops a point whose centre is outside it.
     vec2 centre_px = vec2(pixel) + (footprint_px % 2 == 1 ? 0.5 : 1.0);
     gl_Position = vec4(2.0 * (centre_px + float(footprint_px)) / vec2(resolution_px + 2 * footprint_px) - 1.0, 0.0, 1.0);
     int side = footprint_px;

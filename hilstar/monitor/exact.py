@@ -27,7 +27,7 @@ from hilstar.scene.sprites import Sprites
 LIGHT_WEIGHT = 1.0
 LIGHT_WEIGHT_ON_GRID = 4.0
 CHUNK = 512  # stars at a time: their arrays stay in a core's cache
-FLIPS = 24  # pixels of a star that are looked at together, spread evenly from its middle to its reach
+FLIPS = 24  # pixels of a star that are tested together, spread evenly from its middle to its reach
 SWEEPS = 4  # flips of one or two pixels; few stars take more
 GOOD_ENOUGH = 5e-4  # of the light, and px: a star with smaller errors is not flipped
 SAME_STEP = 1e-4  # steps that differ by less, relatively, are equal

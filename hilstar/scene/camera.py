@@ -144,7 +144,7 @@ def bounded(camera: Camera, margin_px: float) -> Camera:
     u, v = free.tangents(*_border_px(camera.resolution_px, margin_px))
     reach = float(np.hypot(u, v).max())
     if not np.isfinite(reach) or _folds(free, reach):
-        raise InputError("its distortion folds within the screen: two directions share a pixel; fit it anew, with fewer terms")
+        raise InputError("its distortion folds within the screen: two directions share a pixel; fit it again, with fewer terms")
     return replace(camera, lens=replace(lens, max_tangent=reach))
 
 

@@ -1,7 +1,7 @@
 """Stars seen by a camera that turns during its exposure: each star's path as a chain of sprites.
 
 The mean of a star's light over the exposure is an integral over time; Gauss-Legendre quadrature turns it into a sum of
-sprites that weigh together as much as the star. It is exact in the limit, so each star gets only as many as its path needs.
+sprites whose light adds up to the star's. It is exact in the limit, so each star gets only the sprites that its path needs.
 """
 
 from __future__ import annotations

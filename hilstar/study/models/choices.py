@@ -87,7 +87,9 @@ def _draw(path: Path, text: str, cost: dict[str, FloatArray], percentiles: Float
             axis.set(ylabel="cost against the black body [mag],\n+ is fainter")
         label = f"5 to 95 % of {star_count} Hipparcos stars to V = {BRIGHT_V_MAG:g}"
         lower.fill_between(BV_MAG, low, high, color="0.7", alpha=0.6, label=label)
-        reddest = f"M giants have the B-V of K giants and up to {-np.nanmin(low):.1f} mag more than the black body (5 %)"
+        reddest = (
+            f"M giants share the B-V of K giants: up to {-np.nanmin(low):.1f} mag brighter than the black body (5 % of stars)"
+        )
         lower.set(xlabel="B-V [mag]")
         lower.set_title(reddest, fontsize=11)
         upper.legend(fontsize=10, loc="lower left")

@@ -78,7 +78,7 @@ class Skipped:
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """Import and first frame in a process of its own, and the most memory that it has had."""
+    """Times of import and first frame in a process of its own, and its peak memory."""
 
     width: int
     height: int

@@ -116,7 +116,7 @@ def stars_behind() -> FailureCase:
 
 
 def _camera(half_field_deg: float) -> Camera:
-    """2000 px across, `half_field_deg` from the middle to the edge."""
+    """A camera of 2001 x 2001 px with `half_field_deg` from the middle to the edge."""
     focal_length_mm = 1000.0 / np.tan(np.radians(half_field_deg)) * 1e-3
     return monitor_camera((2001, 2001), 1.0, focal_length_mm, ALIGNED)
 

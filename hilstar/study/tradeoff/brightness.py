@@ -81,7 +81,7 @@ def catalogue_colours() -> FloatArray:
 
 
 def table_name(degree: int) -> str:
-    """The label of a Chebyshev table of some degree."""
+    """The name of the method with a Chebyshev table of `degree`."""
     return f"table over 1/T, degree {degree}"
 
 

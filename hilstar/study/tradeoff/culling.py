@@ -32,7 +32,7 @@ CELLS_DEG = (1.0, 2.0, 3.0, 4.0, 6.0, 10.0, 20.0)
 
 
 def culling(stack: ExitStack, quick: bool) -> Trials:
-    """How the stars in view are found among all: stars missed over ATTITUDES fields, and stars looked at in vain."""
+    """How the stars in view are found among all: stars missed over ATTITUDES fields, and stars tested that are not in view."""
     del stack
     camera, stars = ideal_monitor(demo_config()), stars_to(NO_LIMIT_V_MAG)
     turns = [turn_to_image(q, camera) for q in random_attitudes(10 if quick else ATTITUDES)]
@@ -63,7 +63,7 @@ def culling(stack: ExitStack, quick: bool) -> Trials:
     )
 
 
-# Which stars (places in `Stars`) are seen, and how many were looked at.
+# Which stars (places in `Stars`) are in view, and how many were tested.
 Finder = Callable[[Stars, FloatArray, Camera], tuple[IntArray, int]]
 
 

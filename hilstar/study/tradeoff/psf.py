@@ -29,7 +29,7 @@ TILE_PX = 26
 FAINTER_MAG = 8.0
 SMALL_SIGMA_PX = 0.4
 TABLE_SIZES = (64, 512, 4096)
-# A star in float32 is known to 6e-8 of its electrons, and its brightest pixels to as much again.
+# float32 rounds a star's electrons by 6e-8, and its brightest pixels by as much again.
 ROUNDING_MAG = 1e-7
 
 

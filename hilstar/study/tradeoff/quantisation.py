@@ -17,7 +17,7 @@ from hilstar.units import flux_ratio
 
 SIGMA_PX = RenderSettings().sprite_sigma_px
 PHASES = 32
-# A star in float32 is known to 6e-8 of its electrons, and its brightest pixels to as much again.
+# float32 rounds a star's electrons by 6e-8, and its brightest pixels by as much again.
 ROUNDING_MAG = 1e-7
 
 

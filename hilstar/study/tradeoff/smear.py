@@ -67,7 +67,7 @@ SpritesOf = Callable[[Stars, Motion], Sprites]
 
 
 def smear_methods(stars: Stars, motion: Motion) -> dict[str, SpritesOf]:
-    """Every way by name: sprites of stars over an exposure."""
+    """Every method by name: sprites of stars over an exposure."""
     mean = len(own_sprites(stars, motion)) / len(stars)
     methods: dict[str, SpritesOf] = {f"Gauss-Legendre by length, {mean:.0f} on average": own_sprites}
     methods |= {gauss_name(count): partial(gauss_sprites, count) for count in (*GAUSS, EXACT_NODES)}
@@ -75,7 +75,7 @@ def smear_methods(stars: Stars, motion: Motion) -> dict[str, SpritesOf]:
 
 
 def gauss_name(count: int) -> str:
-    """The label of a number of nodes per star."""
+    """The name of the method with `count` nodes for every star."""
     return f"Gauss-Legendre, {count}"
 
 
@@ -97,18 +97,18 @@ def path_lengths_px(stars: Stars, motion: Motion) -> FloatArray:
 
 
 def own_sprites(stars: Stars, motion: Motion) -> Sprites:
-    """Those of scene/exposure_motion.py."""
+    """The sprites that hilstar draws (scene/exposure_motion.py)."""
     return smeared_sprites(stars, motion, CAMERA, footprint_px(TRACKER.psf_sigma_px), TRACKER.psf_sigma_px)
 
 
 def gauss_sprites(count: int, stars: Stars, motion: Motion) -> Sprites:
-    """As many for each star, at the nodes of Gauss and Legendre."""
+    """`count` sprites for each star, at the nodes of Gauss-Legendre quadrature."""
     nodes, weights = np.polynomial.legendre.leggauss(count)
     return _chain(stars, motion, nodes / 2, weights / 2)
 
 
 def even_sprites(count: int, stars: Stars, motion: Motion) -> Sprites:
-    """As many for each star, in the middles of equal times, all of one weight."""
+    """`count` sprites of equal weight for each star, in the middles of equal parts of the exposure."""
     return _chain(stars, motion, (np.arange(count) + 0.5) / count - 0.5, np.full(count, 1 / count))
 
 

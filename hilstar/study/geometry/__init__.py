@@ -1,0 +1,1 @@
+"""What a geometric calibration reaches, against rays traced through a real lens."""

@@ -1,0 +1,145 @@
+"""How far stars are off after a geometric calibration: against dots, against noise, and by model, with where each fails.
+
+The bench is traced by Snell's law (see `doublet`): no model here is of its family. The tracker has 38 arcsec per pixel and sees
+the whole screen; 5 % of the dots are lost and as many false.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hilstar.calibrate.geometric.choose import held_out
+from hilstar.calibrate.geometric.dots import plan_dots
+from hilstar.calibrate.geometric.fit import Matched, Problem, fit, noise_of_repeats
+from hilstar.calibrate.geometric.match import first_look, match_by_geometry, match_by_maps
+from hilstar.calibrate.geometric.model import BROWN_CONRADY, PINHOLE, RADIAL, Geometry, Model, Nominal
+from hilstar.charts import chart, plain_ticks, write_records
+from hilstar.monitor.geometry import monitor_camera
+from hilstar.scene.camera import Camera
+from hilstar.study.geometry.doublet import TracedBench
+from hilstar.study.geometry.observed_dots import observed_dots
+from hilstar.units import ARCSEC_PER_RAD
+
+BENCH = TracedBench(lens_shift_mm=(8.0, -5.0), lens_tilt_deg=(4.0, 2.5))
+TRACKER = Camera((2048, 2048), ARCSEC_PER_RAD / 38.0, (1023.5, 1023.5), np.eye(3))
+MODELS = (
+    ("a pinhole", PINHOLE, 0),
+    ("a pinhole with k1", RADIAL, 0),
+    ("Brown-Conrady with tilt", BROWN_CONRADY, 0),
+    ("the same with a field of degree 4", BROWN_CONRADY, 4),
+)
+SIZES = ((8, 10), (10, 25), (14, 40), (20, 60), (30, 100))
+NOISES_PX = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2)
+USUAL_SIZE, USUAL_NOISE_PX = (20, 60), 0.02
+REACH_PX, REACH_SIGMAS = 0.6, 8.0
+STARS = 4000
+FAIL_ARCSEC = 1.0
+SEED = 7
+MARKERS = "osd^"
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """One model on one set of frames: what dots that were held out say, and where stars all over the screen really are."""
+
+    frames: int
+    dots_per_frame: int
+    noise_px: float
+    model: str
+    centroids: int
+    held_out_arcsec: float
+    stars_rms_arcsec: float
+    stars_max_arcsec: float
+
+
+def run(directory: Path, quick: bool = False) -> list[str]:
+    """Measure, and write `geometry.csv` and `geometry.png`; a line for each model. Raises InputError."""
+    sizes = SIZES[1:4:2] if quick else SIZES
+    noises = (USUAL_NOISE_PX, NOISES_PX[-1]) if quick else NOISES_PX
+    cells = {(*size, USUAL_NOISE_PX) for size in sizes} | {(*USUAL_SIZE, noise) for noise in noises}
+    outcomes = [outcome for cell in sorted(cells) for outcome in _outcomes(*cell)]
+    write_records(directory / "geometry.csv", outcomes)
+    usual = [o for o in outcomes if (o.frames, o.dots_per_frame) == USUAL_SIZE and o.noise_px == USUAL_NOISE_PX]
+    best = min(usual, key=lambda o: o.held_out_arcsec)
+    finding = (
+        f"{USUAL_SIZE[0]} frames of {USUAL_SIZE[1]} dots with {USUAL_NOISE_PX:g} px of noise: uncalibrated, stars are off by"
+        f" {ideal_arcsec():.0f} arcsec rms; by {usual[0].model} fitted to the dots, {usual[0].stars_rms_arcsec:.0f};"
+        f" by the model that held-out dots choose ({best.model}), {best.stars_rms_arcsec:.2g}"
+    )
+    _draw(directory / "geometry.png", finding, outcomes)
+    return [finding, *(_line(outcome) for outcome in usual)]
+
+
+def ideal_arcsec() -> float:
+    """How far stars are off with no calibration at all, rms over the screen."""
+    nominal = _nominal()
+    return float(np.sqrt((_star_errors(Geometry(nominal.monitor, nominal.q_cam_to_mon, TRACKER, np.eye(4)[:1])) ** 2).mean()))
+
+
+def _nominal() -> Nominal:
+    aligned = np.array([1.0, 0.0, 0.0, 0.0])
+    return Nominal(monitor_camera(BENCH.resolution_px, BENCH.pitch_mm * 1e3, BENCH.focal_mm, aligned), aligned, TRACKER)
+
+
+def _outcomes(frames: int, dots: int, noise_px: float) -> list[Outcome]:
+    """Every model on the same centroids."""
+    rng = np.random.default_rng(SEED)
+    plan = plan_dots(BENCH.resolution_px, frames, dots, rng)
+    seen = observed_dots(BENCH, plan, TRACKER, noise_px, rng)
+    nominal = _nominal()
+    look = first_look(plan, nominal, seen, rng)
+    data = match_by_maps(plan, nominal, seen, look)
+    problem = Problem(plan, nominal, look.q_poses, noise_of_repeats(data) or noise_px)
+    rough = fit(problem, Model(BROWN_CONRADY), 0, data)
+    data = match_by_geometry(plan, seen, rough.geometry, max(REACH_PX, REACH_SIGMAS * noise_px))
+    problem = Problem(plan, nominal, look.q_poses, noise_of_repeats(data) or noise_px)
+    return [_outcome(problem, data, (frames, dots, noise_px), model) for model in MODELS]
+
+
+def _outcome(problem: Problem, data: Matched, cell: tuple[int, int, float], model: tuple[str, tuple[str, ...], int]) -> Outcome:
+    name, names, degree = model
+    candidate = held_out(problem, name, Model(names), degree, data)
+    errors = _star_errors(fit(problem, Model(names), degree, data).geometry)
+    rms = float(np.sqrt((errors**2).mean()))
+    return Outcome(*cell, name, len(data), candidate.rms_arcsec, rms, float(errors.max()))
+
+
+def _star_errors(geometry: Geometry) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    """How far stars all over the screen are shown from where the traced rays put them, arcsec."""
+    rng = np.random.default_rng(SEED)
+    width, height = BENCH.resolution_px
+    x, y = rng.uniform(-0.5, width - 0.5, STARS), rng.uniform(-0.5, height - 0.5, STARS)
+    monitor = geometry.monitor
+    shown_x, shown_y = monitor.project(BENCH.directions(x, y) @ monitor.cam_to_image.T)
+    return np.asarray(np.hypot(shown_x - x, shown_y - y) * ARCSEC_PER_RAD / monitor.focal_length_px)
+
+
+def _line(outcome: Outcome) -> str:
+    fails = "" if outcome.stars_max_arcsec < FAIL_ARCSEC else f"; FAILS: over {FAIL_ARCSEC:g} arcsec"
+    stars = f"stars {outcome.stars_rms_arcsec:.3g} arcsec rms, {outcome.stars_max_arcsec:.3g} maximum"
+    return f"{outcome.model}: {stars}; held-out dots {outcome.held_out_arcsec:.3g} rms{fails}"
+
+
+def _draw(path: Path, finding: str, outcomes: list[Outcome]) -> None:
+    with chart(path, finding, panels=2, share_x=False) as (dots, noise):
+        for (name, _, _), marker in zip(MODELS, MARKERS, strict=True):
+            mine = [o for o in outcomes if o.model == name]
+            by_dots = sorted((o.centroids, o.stars_rms_arcsec, o.held_out_arcsec) for o in mine if o.noise_px == USUAL_NOISE_PX)
+            by_noise = sorted(
+                (o.noise_px, o.stars_rms_arcsec, o.held_out_arcsec) for o in mine if (o.frames, o.dots_per_frame) == USUAL_SIZE
+            )
+            for axes, rows in ((dots, by_dots), (noise, by_noise)):
+                places, stars, held = zip(*rows, strict=True)
+                (line,) = axes.loglog(places, stars, marker=marker, label=f"{name}: stars")
+                axes.loglog(places, held, "--", color=line.get_color(), linewidth=1.0, label=f"{name}: held-out dots")
+        for axes in (dots, noise):
+            axes.axhline(FAIL_ARCSEC, color="0.4", linewidth=0.8)
+            axes.annotate("fails above", (0.01, FAIL_ARCSEC), xycoords=("axes fraction", "data"), fontsize=8, va="bottom")
+            axes.set_ylabel("error [arcsec rms]")
+        dots.set_xlabel(f"centroids, each with {USUAL_NOISE_PX:g} px of noise")
+        noise.set_xlabel(f"noise of a centroid [px], {USUAL_SIZE[0]} frames of {USUAL_SIZE[1]} dots")
+        plain_ticks(noise.xaxis, sorted({o.noise_px for o in outcomes}))
+        dots.legend(fontsize=8, ncols=2)

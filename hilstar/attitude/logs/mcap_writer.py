@@ -17,6 +17,7 @@ import zlib
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import zstandard
 from mcap.data_stream import RecordBuilder
@@ -54,6 +55,14 @@ class Topic:
     schema: bytes
 
 
+class _Pending(NamedTuple):
+    """A message that is not written yet."""
+
+    channel: int
+    time_ns: int
+    record: bytes
+
+
 class McapWriter:
     """Writes to a file descriptor that is open for writing and empty; closing it stays the caller's. Raises OSError."""
 
@@ -63,7 +72,7 @@ class McapWriter:
         self._ids = {key: number for number, key in enumerate(topics, start=1)}
         self._schemas = [Schema(i, topic.schema, "jsonschema", topic.schema_name) for i, topic in enumerate(topics.values(), 1)]
         self._channels = [Channel(i, topic.name, "json", {}, i) for i, topic in enumerate(topics.values(), 1)]
-        self._pending: list[tuple[int, int, bytes]] = []  # channel, time, record
+        self._pending: list[_Pending] = []
         self.pending_bytes = 0
         self._crc = 0
         self._index = bytearray()
@@ -82,22 +91,22 @@ class McapWriter:
     def add(self, key: str, time_ns: int, data: bytes, sequence: int) -> None:
         """Take a message of the topic named `key`; it is written at the next flush."""
         record = _message_head.pack(Opcode.MESSAGE, 22 + len(data), self._ids[key], sequence % 2**32, time_ns, time_ns) + data
-        self._pending.append((self._ids[key], time_ns, record))
+        self._pending.append(_Pending(self._ids[key], time_ns, record))
         self.pending_bytes += len(record)
 
     def drop(self, key: str | None = None) -> int:
         """Forget the messages of a topic (None: of all) that are not written yet; returns their number."""
-        kept = [] if key is None else [entry for entry in self._pending if entry[0] != self._ids[key]]
+        kept = [] if key is None else [entry for entry in self._pending if entry.channel != self._ids[key]]
         dropped = len(self._pending) - len(kept)
-        self._pending, self.pending_bytes = kept, sum(len(record) for _, _, record in kept)
+        self._pending, self.pending_bytes = kept, sum(len(entry.record) for entry in kept)
         return dropped
 
     def flush(self) -> None:
         """Write what was added, as one chunk. Raises OSError, and keeps the messages."""
         if not self._pending:
             return
-        data = b"".join(record for _, _, record in self._pending)
-        times_ns = [time_ns for _, time_ns, _ in self._pending]
+        data = b"".join(entry.record for entry in self._pending)
+        times_ns = [entry.time_ns for entry in self._pending]
         first_ns, last_ns = min(times_ns), max(times_ns)
         packed = self._compressor.compress(data)
         chunk = _bytes_of(Chunk("zstd", packed, last_ns, first_ns, zlib.crc32(data), len(data)))
@@ -131,7 +140,7 @@ class McapWriter:
 
     def _note(self, entry: ChunkIndex, first_ns: int, last_ns: int) -> None:
         """A chunk is on the disk."""
-        self._counts.update(channel for channel, _, _ in self._pending)
+        self._counts.update(entry.channel for entry in self._pending)
         self._pending, self.pending_bytes = [], 0
         self._chunks += 1
         self._times_ns = (first_ns, last_ns) if self._times_ns is None else _span(self._times_ns, (first_ns, last_ns))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
+
 import typer
 
 from hilstar.cli.options import Json
@@ -14,10 +16,10 @@ def doctor(as_json: Json = False) -> None:
 
     result = examine()
     if as_json:
-        print_json(result)
+        print_json(asdict(result))
     else:
-        for check in result["checks"]:
-            mark = "ok" if check["ok"] else "MISSING" if check["required"] else "none"
-            typer.echo(f"{mark:8}{check['name']:12}{check['detail']}")
-    if not result["ok"]:
+        for check in result.checks:
+            mark = "ok" if check.ok else "MISSING" if check.required else "none"
+            typer.echo(f"{mark:8}{check.name:12}{check.detail}")
+    if not result.ok:
         raise typer.Exit(3)

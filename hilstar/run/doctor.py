@@ -6,8 +6,7 @@ import platform
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 from hilstar.attitude.wire.serial_link import serial_ports
 from hilstar.attitude.wire.zmq_socket import zmq_version
@@ -29,11 +28,19 @@ class Check:
     required: bool = True
 
 
-def examine() -> dict[str, Any]:
-    """The JSON object of `hilstar doctor`: ok, and the checks."""
+@dataclass(frozen=True, slots=True)
+class Examination:
+    """The JSON object of `hilstar doctor`: whether everything required is there, and the checks."""
+
+    ok: bool
+    checks: list[Check]
+
+
+def examine() -> Examination:
+    """Check everything that hilstar uses on this machine."""
     checks = [_check(name, look) for name, look in LOOKS.items()]
     checks += [_displays(), _serial()]
-    return {"ok": all(check.ok for check in checks if check.required), "checks": [asdict(check) for check in checks]}
+    return Examination(all(check.ok for check in checks if check.required), checks)
 
 
 def _check(name: str, look: Callable[[], str]) -> Check:

@@ -81,12 +81,9 @@ def serve(bench: Bench, link: AnyLink, limit: Limit, sink: FrameSink = ignore, o
 
 
 def _serve_stream(bench: Bench, link: ZmqReceiver | SerialLink, limit: Limit, loop: FrameLoop, outlet: Outlet) -> RunSummary:
-    settings, ledger = bench.config.attitude, outlet.ledger
-    timeline = Timeline(policy_of(settings))
-    watch = nobody_watches if ledger is None else ledger.packet
-    shared = settings.clock == "shared"
-    traffic = Traffic(settings.status_hz, settings.time_requests and not shared, shared)
-    receiver = Receiver(link, timeline, traffic, watch, outlet.notices)
+    ledger = outlet.ledger
+    timeline = Timeline(policy_of(bench.config.attitude))
+    receiver = _receiver(bench.config.attitude, link, timeline, outlet)
     statuses = StatusMaker(ledger)
 
     def draw_slot(moment: Moment) -> Shown | None:
@@ -119,6 +116,13 @@ def _serve_stream(bench: Bench, link: ZmqReceiver | SerialLink, limit: Limit, lo
         clock=receiver.clock_summary(),
         reconnects=link.reconnects,
     )
+
+
+def _receiver(settings: AttitudeSettings, link: ZmqReceiver | SerialLink, timeline: Timeline, outlet: Outlet) -> Receiver:
+    watch = nobody_watches if outlet.ledger is None else outlet.ledger.packet
+    shared = settings.clock == "shared"
+    traffic = Traffic(settings.status_hz, settings.time_requests and not shared, shared)
+    return Receiver(link, timeline, traffic, watch, outlet.notices)
 
 
 def replay(bench: Bench, play: Play, sink: FrameSink = ignore, outlet: Outlet | None = None) -> RunSummary:

@@ -51,7 +51,7 @@ def shown_bench(file: BenchFile, headless: bool, windowed: bool, force: bool) ->
         with open_bench(file) as bench:
             yield bench, None
         return
-    from hilstar.run.screen.screen import open_screen
+    from hilstar.run.screen.open_screen import open_screen
 
     with open_screen(file, windowed=windowed, force=force) as screen:
         yield screen.bench, screen

@@ -1,0 +1,104 @@
+"""The start-up gate: a display's swaps are timed, and one whose timing cannot be trusted is refused."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilstar.arrays import FloatArray
+from hilstar.bench.config import Monitor
+from hilstar.bench.orientation import orientation_of
+from hilstar.errors import MachineError
+from hilstar.monitor.window.window import Window
+from hilstar.run.screen.screen import Screen
+from hilstar.units import NS_PER_MS
+
+GATE_FRAMES = 120
+REFRESH_TOLERANCE = 0.01
+DROPPED = 1.5  # periods
+MAX_DROPPED = 2  # of GATE_FRAMES: a desktop that is still busy with the new window
+UNPACED = 0.1  # of the period that the system knows of: swaps faster by more do not wait for it
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Timing:
+    """What the gate measured: the median period, how many frames were dropped, and who keeps time.
+
+    `paced_by_screen` is true where the screen itself keeps time, and `waits` false where it could, but swaps do not wait.
+    """
+
+    period_ms: float
+    dropped: int
+    paced_by_screen: bool
+    waits: bool = True
+
+
+def pass_gate(screen: Screen, force: bool) -> None:
+    """Time GATE_FRAMES swaps and refuse (MachineError) a display that is not as the bench file has it.
+
+    With `force` a fault is only logged.
+    """
+    window, monitor = screen.window, screen.bench.config.monitor
+    screen.bench.draw(None)
+    swaps_ns = np.array([_swapped_ns(screen, number) for number in range(GATE_FRAMES + 1)])
+    timing = timing_of(np.diff(swaps_ns) / NS_PER_MS, monitor, 0 if window.display is None else window.display.refresh_hz)
+    screen.keep_time(timing.period_ms, timing.paced_by_screen, int(swaps_ns[-1]))
+    if not timing.paced_by_screen:
+        ms = timing.period_ms
+        log.warning("the display has no refresh of its own (swaps take %.2f ms): frames are paced by software", ms)
+    if window.gone is not None:
+        raise MachineError(window.gone)
+    for fault in faults(window, monitor, timing):
+        if not force:
+            raise MachineError(f"{fault}; or add --force")
+        log.warning("%s: shown anyway (--force)", fault)
+
+
+def _swapped_ns(screen: Screen, number: int) -> int:
+    screen.present(number)
+    return screen.swap()
+
+
+def timing_of(periods_ms: FloatArray, monitor: Monitor, known_hz: float) -> Timing:
+    """What the intervals between swaps say of a display; `known_hz` is its refresh rate by the system, 0 if unknown."""
+    wanted_ms = 1000.0 / monitor.refresh_hz
+    period_ms = float(np.median(periods_ms))
+    # A display whose swaps come faster than any refresh does not wait for one: nothing keeps time but this program.
+    on_time = abs(period_ms / wanted_ms - 1) < REFRESH_TOLERANCE
+    by_screen = period_ms >= 1000.0 / known_hz * (1 - UNPACED) if known_hz else on_time
+    return Timing(period_ms, int((periods_ms > DROPPED * wanted_ms).sum()), by_screen, waits=by_screen or not known_hz)
+
+
+def faults(window: Window, monitor: Monitor, timing: Timing) -> Iterator[str]:
+    """What is wrong with a display, and what to do about it."""
+    wanted_px = orientation_of(monitor).screen_px(monitor.resolution_px)
+    if window.size_px != wanted_px:
+        (width, height), (wide, high) = window.size_px, wanted_px
+        sizes = f"{width} x {height} px and the bench file says {wide} x {high}"
+        yield f"the display is {sizes}; set [monitor] resolution_px, or the display's mode"
+    if window.composited:
+        yield "a compositing manager draws this display and may hold frames back; stop it, or use a plain X session"
+    if window.mirrored is not None:
+        advice = "switch it off, or place it beside this one (xrandr --right-of)"
+        yield f"the display {window.mirrored} mirrors this one; {advice}"
+    if window.scaled:
+        yield "the display is scaled by its desktop; set its scale to 100 %"
+    if timing.paced_by_screen:
+        yield from _timing_faults(monitor, timing)
+    if not timing.waits:
+        yield "swaps do not wait for the display's refresh; switch vertical sync on in its driver"
+    if window.depth_bits < monitor.bits:
+        depths = f"{window.depth_bits} bits per colour and the bench file says {monitor.bits}"
+        yield f"the window has {depths}; set [monitor] bits, or a deeper mode"
+
+
+def _timing_faults(monitor: Monitor, timing: Timing) -> Iterator[str]:
+    if abs(timing.period_ms * monitor.refresh_hz / 1000.0 - 1) > REFRESH_TOLERANCE:
+        hz = f"{1000.0 / timing.period_ms:.2f} Hz and the bench file says {monitor.refresh_hz:g}"
+        yield f"the display refreshes at {hz}; set [monitor] refresh_hz, or the display's mode"
+    if timing.dropped > MAX_DROPPED:
+        yield f"the display dropped {timing.dropped} of {GATE_FRAMES} frames; close other programs that draw on it"

@@ -1,0 +1,27 @@
+"""The bench of a file on its display."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from hilstar.bench.bench_file import BenchFile
+from hilstar.bench.build import open_bench
+from hilstar.bench.orientation import orientation_of
+from hilstar.monitor.window.window import Window, WindowSettings
+from hilstar.render.presenter import window_context
+from hilstar.run.screen.gate import pass_gate
+from hilstar.run.screen.screen import Screen
+
+
+@contextmanager
+def open_screen(file: BenchFile, *, windowed: bool, force: bool) -> Iterator[Screen]:
+    """The bench of a file on its display, past the gate. Raises InputError or MachineError."""
+    monitor = file.config.monitor
+    display = None if windowed else monitor.display
+    settings = WindowSettings(orientation_of(monitor).screen_px(monitor.resolution_px), monitor.bits, display)
+    with Window(settings) as window, open_bench(file, window_context()) as bench:
+        screen = Screen(window, bench)
+        bench.warm_up()
+        pass_gate(screen, force)
+        yield screen

@@ -1,0 +1,112 @@
+"""The start-up gate: which displays it refuses, by the intervals between their swaps and by what the system says of them."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from hilstar.bench.config import parse_config
+from hilstar.errors import MachineError
+from hilstar.run.screen.gate import GATE_FRAMES, Timing, faults, pass_gate, timing_of
+from tests.conftest import SMALL_BENCH
+
+PERIOD_MS = 1000 / 60
+GOOD = Timing(PERIOD_MS, 0, True)
+
+
+@pytest.fixture
+def monitor(tmp_path):
+    return parse_config(tmp_path / "bench.toml", SMALL_BENCH).monitor
+
+
+def window(**changes):
+    """A window on a display that is as the small bench has it, but for `changes`."""
+    plain = {"size_px": (320, 240), "composited": False, "mirrored": None, "scaled": False, "depth_bits": 8}
+    return SimpleNamespace(**plain | {"gone": None, "display": SimpleNamespace(refresh_hz=60.0)} | changes)
+
+
+@pytest.mark.parametrize(
+    ("period_ms", "known_hz", "by_screen", "waits"),
+    [
+        (PERIOD_MS, 60.0, True, True),
+        (PERIOD_MS * 1.05, 60.0, True, True),  # another refresh, which is a fault of its own
+        (0.4, 60.0, False, False),  # swaps that do not wait
+        (PERIOD_MS, 0.0, True, True),
+        (0.4, 0.0, False, True),  # no refresh at all, as a virtual screen's
+    ],
+)
+def test_the_screen_keeps_time_where_its_swaps_wait(monitor, period_ms, known_hz, by_screen, waits):
+    timing = timing_of(np.full(GATE_FRAMES, period_ms), monitor, known_hz)
+    assert (timing.paced_by_screen, timing.waits) == (by_screen, waits)
+
+
+def test_intervals_of_more_than_a_period_and_a_half_are_dropped_frames(monitor):
+    periods_ms = np.full(GATE_FRAMES, PERIOD_MS)
+    periods_ms[[5, 50, 90]] = 2 * PERIOD_MS
+    timing = timing_of(periods_ms, monitor, 60.0)
+    assert timing.dropped == 3
+    assert timing.period_ms == pytest.approx(PERIOD_MS)
+    assert [fault for fault in faults(window(), monitor, timing) if "dropped 3 of 120" in fault]
+
+
+def test_a_display_as_the_bench_file_has_it_has_no_fault(monitor):
+    assert list(faults(window(), monitor, GOOD)) == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "timing", "words"),
+    [
+        ({"size_px": (640, 480)}, GOOD, "640 x 480 px and the bench file says 320 x 240"),
+        ({"composited": True}, GOOD, "compositing manager"),
+        ({"mirrored": "HDMI-2"}, GOOD, "HDMI-2 mirrors this one"),
+        ({"scaled": True}, GOOD, "set its scale to 100 %"),
+        ({"depth_bits": 6}, GOOD, "6 bits per colour and the bench file says 8"),
+        ({}, Timing(PERIOD_MS * 1.02, 0, True), "58.82 Hz and the bench file says 60"),
+        ({}, Timing(0.4, 0, False, waits=False), "switch vertical sync on"),
+    ],
+)
+def test_each_fault_of_a_display_is_said_with_what_to_do(monitor, changes, timing, words):
+    (fault,) = faults(window(**changes), monitor, timing)
+    assert words in fault
+
+
+class Screen:
+    """A screen whose swaps come each period, of a window with `changes`."""
+
+    def __init__(self, tmp_path, **changes) -> None:
+        self.window = window(**changes)
+        self.bench = SimpleNamespace(config=parse_config(tmp_path / "bench.toml", SMALL_BENCH), draw=lambda q: None)
+        self.kept: tuple[float, bool, int] | None = None
+        self._swaps = 0
+
+    def present(self, number: int) -> None:
+        pass
+
+    def swap(self) -> int:
+        self._swaps += 1
+        return round(self._swaps * PERIOD_MS * 1e6)
+
+    def keep_time(self, period_ms: float, by_screen: bool, swap_ns: int) -> None:
+        self.kept = period_ms, by_screen, swap_ns
+
+
+def test_a_good_display_passes_and_its_swaps_are_predicted_from_the_last_one(tmp_path):
+    screen = Screen(tmp_path)
+    pass_gate(screen, force=False)
+    period_ms, by_screen, swap_ns = screen.kept
+    assert period_ms == pytest.approx(PERIOD_MS, rel=1e-6) and by_screen
+    assert swap_ns == round((GATE_FRAMES + 1) * PERIOD_MS * 1e6)
+
+
+def test_a_fault_is_refused_and_only_logged_with_force(tmp_path, caplog):
+    with pytest.raises(MachineError, match=r"compositing.*or add --force"):
+        pass_gate(Screen(tmp_path, composited=True), force=False)
+    pass_gate(Screen(tmp_path, composited=True), force=True)
+    assert "shown anyway (--force)" in caplog.text
+
+
+def test_a_window_that_is_gone_is_refused_even_with_force(tmp_path):
+    with pytest.raises(MachineError, match="unplugged"):
+        pass_gate(Screen(tmp_path, gone="its display was unplugged"), force=True)

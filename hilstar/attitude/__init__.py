@@ -1,1 +1,1 @@
-"""The attitude: quaternions, packets, links, logs and the timeline that joins them."""
+"""Attitudes in: packets and links, the clock of their sender, logs, and the timeline that joins them."""

@@ -33,7 +33,7 @@ Reading = Callable[[int], tuple[int, int]]  # arrival to (when it is read, how l
 
 @dataclass
 class Truth:
-    """One run through filter and clock as the receiver does it; at each packet, error and uncertainty, ms."""
+    """One run through filter and clock as the receiver does it; at every second packet, error and uncertainty, ms."""
 
     times: Times
     reading: Reading = lambda arrival_ns: (arrival_ns, 0)
@@ -60,7 +60,8 @@ class Truth:
                 newest_ns = self._settle(each, newest_ns)
             if self.exchanges and k % 100 == 50:
                 self._exchange(sent_ns, rng)
-            self._compare(read_ns)
+            if k % 2:  # 100 a second, more than a display shows
+                self._compare(read_ns)
 
     def _settle(self, each: SampleArrival, newest_ns: int) -> int:
         if each.refusal is not None or each.event.t_ns <= newest_ns:
@@ -99,7 +100,7 @@ SIZES_MS = [2, 3, 4.9, 7, 20, 100, 300, 3000, 86_400_000, 3e11]
 @pytest.mark.parametrize("exchanges", [False, True])
 def test_after_a_jump_of_2_ms_to_10_years_the_truth_is_within_the_stated_uncertainty(jump_ms, exchanges):
     jump_ns = round(jump_ms * NS_PER_MS)
-    run = Truth(lambda host: host + (jump_ns if host > HOST0_NS + 10 * NS_PER_S else 0), exchanges=exchanges)
+    run = Truth(lambda host: host + (jump_ns if host > HOST0_NS + 10 * NS_PER_S else 0), count=3200, exchanges=exchanges)
     # With exchanges a jump too small for the stream is known at the next one, half a second later.
     assert run.beyond_ms(10.0, *((10.15, 10.3, 10.45) if exchanges else ())) < ALLOWED_MS
     assert run.refused == 0
@@ -160,7 +161,7 @@ def test_messages_that_waited_before_the_start_do_not_mislead_the_clock(seed):
 
     run = Truth(lambda host: host + 10**15, read, seed=seed)
     assert run.beyond_ms() < ALLOWED_MS
-    assert np.abs(run.error_ms[401:]).max() < 0.5
+    assert np.abs(run.error_ms[201:]).max() < 0.5
     assert (run.refused, run.jumps.jumps) == (0, 0)
 
 
@@ -190,7 +191,7 @@ def test_a_link_20_ms_slower_for_a_while_is_not_a_jump_and_costs_no_packet():
     run = Truth(lambda host: host, read)
     assert run.beyond_ms() < ALLOWED_MS
     assert (run.refused, run.jumps.jumps) == (0, 0)
-    assert np.abs(run.error_ms[400:]).max() < MIN_DELAY_NS / NS_PER_MS + ALLOWED_MS
+    assert np.abs(run.error_ms[200:]).max() < MIN_DELAY_NS / NS_PER_MS + ALLOWED_MS
 
 
 @pytest.mark.parametrize("ppm", [30, -30])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -43,6 +43,35 @@ class LensTable(msgspec.Struct, frozen=True, kw_only=True):
     p2: Finite = 0.0
 
 
+class ErrorTable(msgspec.Struct, frozen=True, kw_only=True):
+    """[error]: of dots that were held out, and one sigma of a star's place: over the screen, and its rms and maximum."""
+
+    model: str = ""
+    held_out_rms_arcsec: float | None = None
+    held_out_max_arcsec: float | None = None
+    noise_px: float | None = None
+    rms_arcsec: float | None = None
+    max_arcsec: float | None = None
+    map_arcsec: list[list[float]] = []
+
+
+class MadeTable(msgspec.Struct, frozen=True, kw_only=True):
+    """[made]: by which version, when, and of how many poses of the tracker."""
+
+    by: str = ""
+    when: str = ""
+    poses: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Notes:
+    """What a geometry file says of itself: one sigma of each parameter, how well it is known, and how it was made."""
+
+    sigma: dict[str, float]
+    error: ErrorTable
+    made: MadeTable
+
+
 class GeometryFile(LensTable, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """A whole file. `error` and `made` say how well it is known and of what; nothing is computed from them."""
 
@@ -53,9 +82,9 @@ class GeometryFile(LensTable, frozen=True, forbid_unknown_fields=True, kw_only=T
     q_cam_to_mon: tuple[Finite, Finite, Finite, Finite]
     tilt_deg: tuple[Annotated[float, Meta(gt=-60, lt=60)], Annotated[float, Meta(gt=-60, lt=60)]] = (0.0, 0.0)
     field: Field | None = None
-    sigma: dict[str, Any] = {}
-    error: dict[str, Any] = {}
-    made: dict[str, Any] = {}
+    sigma: dict[str, float] = {}
+    error: ErrorTable | None = None
+    made: MadeTable | None = None
 
 
 KIND = "hilstar geometry 1"
@@ -110,8 +139,8 @@ def load_distortion(path: Path, camera: Camera) -> Camera:
     return replace(camera, lens=Lens((found.k1, found.k2, found.k3), (found.p1, found.p2)))
 
 
-def write_geometry(path: Path, camera: Camera, q_cam_to_mon: FloatArray, notes: dict[str, dict[str, Any]]) -> None:
-    """Write a camera and its notes (`sigma`, `error`, `made`) as a geometry file."""
+def write_geometry(path: Path, camera: Camera, q_cam_to_mon: FloatArray, notes: Notes) -> None:
+    """Write a camera and its notes as a geometry file. Raises InputError where it cannot be written."""
     lens = camera.lens or Lens()
     field = None
     if lens.field is not None:
@@ -132,7 +161,9 @@ def write_geometry(path: Path, camera: Camera, q_cam_to_mon: FloatArray, notes: 
         p1=p1,
         p2=p2,
         field=field,
-        **notes,
+        sigma=notes.sigma,
+        error=notes.error,
+        made=notes.made,
     )
     write_whole(path, toml_text(msgspec.to_builtins(found)))
 

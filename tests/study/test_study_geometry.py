@@ -19,7 +19,7 @@ def study(tmp_path_factory):
 
 def test_each_model_is_charted_against_dots_and_noise(study):
     _, rows, folder = study
-    assert {row["model"] for row in rows} == {name for name, _, _ in MODELS}
+    assert {row["model"] for row in rows} == {model.name for model in MODELS}
     assert len({row["centroids"] for row in rows}) >= 2
     assert len({row["noise_px"] for row in rows}) >= 2
     assert (folder / "geometry.png").stat().st_size > 20_000

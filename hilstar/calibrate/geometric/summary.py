@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import datetime
 import math
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from hilstar.arrays import FloatArray, IntArray
 from hilstar.calibrate.geometric.calibration import Calibrated
 from hilstar.calibrate.geometric.fit import residuals_px
 from hilstar.charts import chart
-from hilstar.monitor.geometry_file import write_geometry
+from hilstar.monitor.geometry_file import ErrorTable, MadeTable, Notes, write_geometry
 from hilstar.scene.lens import Lens
 from hilstar.units import ARCSEC_PER_RAD
 
@@ -23,36 +23,104 @@ ROUND = "poses turned about the boresight do not tell apart distortions that are
 ARROW_SHARE = 0.03  # of the screen's width: the median residual's arrow
 
 
-def summary_of(found: Calibrated) -> dict[str, Any]:
-    """The JSON object, without what was written."""
+@dataclass(frozen=True, slots=True)
+class Dots:
+    """How many dots the plan has, and how many were recognised."""
+
+    planned: int
+    recognised: int
+
+
+@dataclass(frozen=True, slots=True)
+class CentroidCounts:
+    """Centroids given, those that are dots, lit dots in the tracker's field without one, and centroids that are no dot."""
+
+    given: int
+    matched: int
+    lost: int
+    false: int
+
+
+@dataclass(frozen=True, slots=True)
+class HeldOut:
+    """The error of dots held out of the fit, arcsec, and the rms that the noise of their centroids alone makes."""
+
+    rms_arcsec: float
+    max_arcsec: float
+    noise_arcsec: float
+
+
+@dataclass(frozen=True, slots=True)
+class StarError:
+    """One sigma of a star's place over the screen."""
+
+    rms_arcsec: float
+    max_arcsec: float
+
+
+@dataclass(frozen=True, slots=True)
+class ModelError:
+    """A model, and its error on dots held out of its fit."""
+
+    name: str
+    rms_arcsec: float
+    max_arcsec: float
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """A parameter's value and one sigma, in the unit of its name."""
+
+    value: float
+    sigma: float
+
+
+@dataclass(frozen=True, slots=True)
+class GeometricSummary:
+    """What was fitted and written; `tracker` is "held" or "fitted", its own lens."""
+
+    model: str
+    poses: int
+    dots: Dots
+    centroids: CentroidCounts
+    noise_px: float
+    noise_arcsec: float
+    held_out: HeldOut
+    error: StarError
+    models: tuple[ModelError, ...]
+    parameters: dict[str, Parameter]
+    tracker: str
+    notes: tuple[str, ...]
+    written: tuple[str, ...]
+
+
+def summary_of(found: Calibrated, written: tuple[str, ...]) -> GeometricSummary:
+    """A calibration in figures; its field names are the keys of --json."""
     chosen = found.chosen
-    return {
-        "model": chosen.name,
-        "poses": len(found.problem.q_poses),
-        "dots": {"planned": len(found.plan), "recognised": len(np.unique(found.data.dot))},
-        "centroids": {"given": found.centroids, "matched": len(found.data), "lost": found.lost, "false": found.false},
-        "noise_px": found.problem.noise_px,
-        "noise_arcsec": found.noise_arcsec,
-        "held_out": {
-            "rms_arcsec": chosen.rms_arcsec,
-            "max_arcsec": chosen.max_arcsec,
-            "noise_arcsec": found.held_out_noise_arcsec,
-        },
-        "error": {"rms_arcsec": found.uncertainty.rms_arcsec, "max_arcsec": found.uncertainty.max_arcsec},
-        "models": [{"name": m.name, "rms_arcsec": m.rms_arcsec, "max_arcsec": m.max_arcsec} for m in found.models],
-        "parameters": parameters_of(found),
-        "tracker": "held" if found.tracker_known else "fitted",
-        "notes": _notes(found),
-    }
+    return GeometricSummary(
+        model=chosen.name,
+        poses=len(found.problem.q_poses),
+        dots=Dots(len(found.plan), len(np.unique(found.data.dot))),
+        centroids=CentroidCounts(found.centroids, len(found.data), found.lost, found.false),
+        noise_px=found.problem.noise_px,
+        noise_arcsec=found.noise_arcsec,
+        held_out=HeldOut(chosen.rms_arcsec, chosen.max_arcsec, found.held_out_noise_arcsec),
+        error=StarError(found.uncertainty.rms_arcsec, found.uncertainty.max_arcsec),
+        models=tuple(ModelError(model.name, model.rms_arcsec, model.max_arcsec) for model in found.models),
+        parameters=parameters_of(found),
+        tracker="held" if found.tracker_known else "fitted",
+        notes=_notes(found),
+        written=written,
+    )
 
 
-def _notes(found: Calibrated) -> list[str]:
+def _notes(found: Calibrated) -> tuple[str, ...]:
     if len(found.problem.q_poses) == 1:
-        return [ONE_POSE]
-    return [] if found.tracker_known else [ROUND]
+        return (ONE_POSE,)
+    return () if found.tracker_known else (ROUND,)
 
 
-def parameters_of(found: Calibrated) -> dict[str, dict[str, float]]:
+def parameters_of(found: Calibrated) -> dict[str, Parameter]:
     """Each parameter's value and one sigma, in its own unit."""
     monitor, sigma = found.fit.geometry.monitor, found.uncertainty.sigma
     lens = monitor.lens or Lens()
@@ -71,7 +139,7 @@ def parameters_of(found: Calibrated) -> dict[str, dict[str, float]]:
         values[name] = (value, sigma.get(name, 0.0))
     for name in found.fit.model.tracker_names:
         values[name] = (_tracker_value(found, name), sigma[name])
-    return {name: {"value": float(value), "sigma": float(s)} for name, (value, s) in values.items()}
+    return {name: Parameter(float(value), float(s)) for name, (value, s) in values.items()}
 
 
 def _tracker_value(found: Calibrated, name: str) -> float:
@@ -81,55 +149,48 @@ def _tracker_value(found: Calibrated, name: str) -> float:
     return {"tracker_k1": k1, "tracker_k2": k2, "tracker_p1": p1, "tracker_p2": p2}[name]
 
 
-def notes_of(found: Calibrated, made: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """The tables `sigma`, `error` and `made` of the geometry file."""
-    parameters = parameters_of(found)
-    return {
-        "sigma": {name: entry["sigma"] for name, entry in parameters.items()},
-        "error": {
-            "model": found.chosen.name,
-            "held_out_rms_arcsec": found.chosen.rms_arcsec,
-            "held_out_max_arcsec": found.chosen.max_arcsec,
-            "noise_px": found.problem.noise_px,
-            "rms_arcsec": found.uncertainty.rms_arcsec,
-            "max_arcsec": found.uncertainty.max_arcsec,
-            "map_arcsec": [[round(float(v), 4) for v in row] for row in found.uncertainty.map_arcsec],
-        },
-        "made": made | {"when": datetime.datetime.now(datetime.UTC).date().isoformat(), "poses": len(found.problem.q_poses)},
-    }
+def notes_of(found: Calibrated) -> Notes:
+    """What the geometry file says of how well it is known, and of what it was made."""
+    error = ErrorTable(
+        model=found.chosen.name,
+        held_out_rms_arcsec=found.chosen.rms_arcsec,
+        held_out_max_arcsec=found.chosen.max_arcsec,
+        noise_px=found.problem.noise_px,
+        rms_arcsec=found.uncertainty.rms_arcsec,
+        max_arcsec=found.uncertainty.max_arcsec,
+        map_arcsec=[[round(float(value), 4) for value in row] for row in found.uncertainty.map_arcsec],
+    )
+    sigma = {name: parameter.sigma for name, parameter in parameters_of(found).items()}
+    when = datetime.datetime.now(datetime.UTC).date().isoformat()
+    return Notes(sigma, error, MadeTable(by=f"hilstar {hilstar.__version__}", when=when, poses=len(found.problem.q_poses)))
 
 
-def write_calibrated(path: Path, found: Calibrated) -> dict[str, Any]:
-    """Write the geometry file; the summary."""
+def write_calibrated(path: Path, found: Calibrated, plot: Path | None) -> GeometricSummary:
+    """Write the geometry file, and its chart where one is wanted. Raises InputError where one cannot be written."""
     geometry = found.fit.geometry
-    write_geometry(path, geometry.monitor, geometry.q_cam_to_mon, notes_of(found, {"by": f"hilstar {hilstar.__version__}"}))
-    return summary_of(found) | {"written": [str(path)]}
+    write_geometry(path, geometry.monitor, geometry.q_cam_to_mon, notes_of(found))
+    if plot is not None:
+        draw_geometry(plot, found)
+    return summary_of(found, tuple(str(each) for each in (path, plot) if each is not None))
 
 
-def lines_of(summary: dict[str, Any]) -> list[str]:
+def lines_of(summary: GeometricSummary) -> list[str]:
     """The calibration for a person."""
-    held, dots, centroids = summary["held_out"], summary["dots"], summary["centroids"]
+    held, dots, centroids, error = summary.held_out, summary.dots, summary.centroids, summary.error
     rows = [
-        ("dots", f"{dots['recognised']} of {dots['planned']} recognised in {summary['poses']} pose(s)"),
-        ("centroids", f"{centroids['matched']} matched, {centroids['lost']} lost, {centroids['false']} false"),
-        ("centroid noise", f"{summary['noise_px']:.4f} px, {summary['noise_arcsec']:.2f} arcsec"),
+        ("dots", f"{dots.recognised} of {dots.planned} recognised in {summary.poses} pose(s)"),
+        ("centroids", f"{centroids.matched} matched, {centroids.lost} lost, {centroids.false} false"),
+        ("centroid noise", f"{summary.noise_px:.4f} px, {summary.noise_arcsec:.2f} arcsec"),
     ]
-    for m in summary["models"]:
-        rows.append((m["name"], f"{m['rms_arcsec']:.3f} / {m['max_arcsec']:.3f} arcsec (rms / max of held-out dots)"))
-    error = summary["error"]
+    for model in summary.models:
+        rows.append((model.name, f"{model.rms_arcsec:.3f} / {model.max_arcsec:.3f} arcsec (rms / max of held-out dots)"))
     rows += [
-        ("chosen", summary["model"]),
-        (
-            "held-out dots",
-            f"{held['rms_arcsec']:.3f} arcsec rms, {held['max_arcsec']:.3f} max; noise: {held['noise_arcsec']:.3f}",
-        ),
-        (
-            "a star's place",
-            f"known to {error['rms_arcsec']:.3f} arcsec rms, {error['max_arcsec']:.3f} max (1 sigma)",
-        ),
+        ("chosen", summary.model),
+        ("held-out dots", f"{held.rms_arcsec:.3f} arcsec rms, {held.max_arcsec:.3f} max; noise: {held.noise_arcsec:.3f}"),
+        ("a star's place", f"known to {error.rms_arcsec:.3f} arcsec rms, {error.max_arcsec:.3f} max (1 sigma)"),
     ]
     width = max(len(name) for name, _ in rows) + 2
-    return [f"{name:{width}}{text}" for name, text in rows] + list(summary["notes"])
+    return [f"{name:{width}}{text}" for name, text in rows] + list(summary.notes)
 
 
 def draw_geometry(path: Path, found: Calibrated) -> None:

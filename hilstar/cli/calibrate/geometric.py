@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
@@ -29,19 +30,16 @@ def geometric(
     """Fit the collimator's lens, the screen's tilt and the alignment to dots that the tracker saw."""
     from hilstar.bench.bench_file import read_bench_file
     from hilstar.calibrate.geometric.calibration import calibrate_files
-    from hilstar.calibrate.geometric.summary import draw_geometry, lines_of, write_calibrated
+    from hilstar.calibrate.geometric.summary import lines_of, write_calibrated
 
     check_ending("-o", output, TOML)
     check_ending("--plot", plot, PNG)
     file = read_bench_file(bench_file)
     check_files([*observed, dark, plan / "plan.csv"], [output, plot], file)
     found = calibrate_files(file, observed, plan / "plan.csv", dark, tracker_is_ideal=tracker_is_ideal)
-    summary = write_calibrated(output, found)
-    if plot is not None:
-        draw_geometry(plot, found)
-        summary["written"].append(str(plot))
+    summary = write_calibrated(output, found, plot)
     if as_json:
-        print_json(summary)
+        print_json(asdict(summary))
         return
     typer.echo("\n".join(lines_of(summary)))
     typer.echo(f"in the bench file, under [collimator]: geometry = {str(output.name)!r}")

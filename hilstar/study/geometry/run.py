@@ -25,11 +25,31 @@ from hilstar.units import ARCSEC_PER_RAD
 
 BENCH = TracedBench(lens_shift_mm=(8.0, -5.0), lens_tilt_deg=(4.0, 2.5))
 TRACKER = Camera((2048, 2048), ARCSEC_PER_RAD / 38.0, (1023.5, 1023.5), np.eye(3))
+
+
+@dataclass(frozen=True, slots=True)
+class LensModel:
+    """A model of the lens: what it is called, its free parameters, and the degree of its residual field (0: none)."""
+
+    name: str
+    parameters: tuple[str, ...]
+    field_degree: int = 0
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Frames:
+    """What was shown and seen: frames, dots lit in each, and the noise of a centroid."""
+
+    count: int
+    dots: int
+    noise_px: float
+
+
 MODELS = (
-    ("a pinhole", PINHOLE, 0),
-    ("a pinhole with k1", RADIAL, 0),
-    ("Brown-Conrady with tilt", BROWN_CONRADY, 0),
-    ("the same with a field of degree 4", BROWN_CONRADY, 4),
+    LensModel("a pinhole", PINHOLE),
+    LensModel("a pinhole with k1", RADIAL),
+    LensModel("Brown-Conrady with tilt", BROWN_CONRADY),
+    LensModel("the same with a field of degree 4", BROWN_CONRADY, 4),
 )
 SIZES = ((8, 10), (10, 25), (14, 40), (20, 60), (30, 100))
 NOISES_PX = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2)
@@ -59,8 +79,8 @@ def run(directory: Path, quick: bool = False) -> list[str]:
     """Measure, and write `geometry.csv` and `geometry.png`; a line for each model. Raises InputError."""
     sizes = SIZES[1:4:2] if quick else SIZES
     noises = (USUAL_NOISE_PX, NOISES_PX[-1]) if quick else NOISES_PX
-    cells = {(*size, USUAL_NOISE_PX) for size in sizes} | {(*USUAL_SIZE, noise) for noise in noises}
-    outcomes = [outcome for cell in sorted(cells) for outcome in _outcomes(*cell)]
+    shown = {Frames(*size, USUAL_NOISE_PX) for size in sizes} | {Frames(*USUAL_SIZE, noise) for noise in noises}
+    outcomes = [outcome for frames in sorted(shown) for outcome in _outcomes(frames)]
     write_records(directory / "geometry.csv", outcomes)
     usual = [o for o in outcomes if (o.frames, o.dots_per_frame) == USUAL_SIZE and o.noise_px == USUAL_NOISE_PX]
     best = min(usual, key=lambda o: o.held_out_arcsec)
@@ -84,27 +104,36 @@ def _nominal() -> Nominal:
     return Nominal(monitor_camera(BENCH.resolution_px, BENCH.pitch_mm * 1e3, BENCH.focal_mm, aligned), aligned, TRACKER)
 
 
-def _outcomes(frames: int, dots: int, noise_px: float) -> list[Outcome]:
+def _outcomes(frames: Frames) -> list[Outcome]:
     """Every model on the same centroids."""
     rng = np.random.default_rng(SEED)
-    plan = plan_dots(BENCH.resolution_px, frames, dots, rng)
-    seen = observed_dots(BENCH, plan, TRACKER, noise_px, rng)
+    plan = plan_dots(BENCH.resolution_px, frames.count, frames.dots, rng)
+    seen = observed_dots(BENCH, plan, TRACKER, frames.noise_px, rng)
     nominal = _nominal()
     look = first_look(plan, nominal, seen, rng)
     data = match_by_maps(plan, nominal, seen, look)
-    problem = Problem(plan, nominal, look.q_poses, noise_of_repeats(data) or noise_px)
+    problem = Problem(plan, nominal, look.q_poses, noise_of_repeats(data) or frames.noise_px)
     rough = fit(problem, Model(BROWN_CONRADY), 0, data)
-    data = match_by_geometry(plan, seen, rough.geometry, max(REACH_PX, REACH_SIGMAS * noise_px))
-    problem = Problem(plan, nominal, look.q_poses, noise_of_repeats(data) or noise_px)
-    return [_outcome(problem, data, (frames, dots, noise_px), model) for model in MODELS]
+    data = match_by_geometry(plan, seen, rough.geometry, max(REACH_PX, REACH_SIGMAS * frames.noise_px))
+    problem = Problem(plan, nominal, look.q_poses, noise_of_repeats(data) or frames.noise_px)
+    return [_outcome(problem, data, frames, model) for model in MODELS]
 
 
-def _outcome(problem: Problem, data: Matched, cell: tuple[int, int, float], model: tuple[str, tuple[str, ...], int]) -> Outcome:
-    name, names, degree = model
-    candidate = held_out(problem, name, Model(names), degree, data)
-    errors = _star_errors(fit(problem, Model(names), degree, data).geometry)
+def _outcome(problem: Problem, data: Matched, frames: Frames, model: LensModel) -> Outcome:
+    free = Model(model.parameters)
+    candidate = held_out(problem, model.name, free, model.field_degree, data)
+    errors = _star_errors(fit(problem, free, model.field_degree, data).geometry)
     rms = float(np.sqrt((errors**2).mean()))
-    return Outcome(*cell, name, len(data), candidate.rms_arcsec, rms, float(errors.max()))
+    return Outcome(
+        frames=frames.count,
+        dots_per_frame=frames.dots,
+        noise_px=frames.noise_px,
+        model=model.name,
+        centroids=len(data),
+        held_out_arcsec=candidate.rms_arcsec,
+        stars_rms_arcsec=rms,
+        stars_max_arcsec=float(errors.max()),
+    )
 
 
 def _star_errors(geometry: Geometry) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
@@ -125,16 +154,16 @@ def _line(outcome: Outcome) -> str:
 
 def _draw(path: Path, finding: str, outcomes: list[Outcome]) -> None:
     with chart(path, finding, panels=2, share_x=False) as (dots, noise):
-        for (name, _, _), marker in zip(MODELS, MARKERS, strict=True):
-            mine = [o for o in outcomes if o.model == name]
+        for model, marker in zip(MODELS, MARKERS, strict=True):
+            mine = [o for o in outcomes if o.model == model.name]
             by_dots = sorted((o.centroids, o.stars_rms_arcsec, o.held_out_arcsec) for o in mine if o.noise_px == USUAL_NOISE_PX)
             by_noise = sorted(
                 (o.noise_px, o.stars_rms_arcsec, o.held_out_arcsec) for o in mine if (o.frames, o.dots_per_frame) == USUAL_SIZE
             )
             for axes, rows in ((dots, by_dots), (noise, by_noise)):
                 places, stars, held = zip(*rows, strict=True)
-                (line,) = axes.loglog(places, stars, marker=marker, label=f"{name}: stars")
-                axes.loglog(places, held, "--", color=line.get_color(), linewidth=1.0, label=f"{name}: held-out dots")
+                (line,) = axes.loglog(places, stars, marker=marker, label=f"{model.name}: stars")
+                axes.loglog(places, held, "--", color=line.get_color(), linewidth=1.0, label=f"{model.name}: held-out dots")
         for axes in (dots, noise):
             axes.axhline(FAIL_ARCSEC, color="0.4", linewidth=0.8)
             axes.annotate("fails above", (0.01, FAIL_ARCSEC), xycoords=("axes fraction", "data"), fontsize=8, va="bottom")

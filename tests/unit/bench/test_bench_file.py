@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 from dataclasses import FrozenInstanceError
-from pathlib import Path
 
 import pytest
 
@@ -15,19 +13,14 @@ from hilstar.rotation import from_radec_roll_deg
 from hilstar.run.record.ledger import Ledger
 from hilstar.run.record.ledger_reader import config_of, read_head
 from tests.support.benches import SMALL_BENCH
+from tests.support.commands import run_hilstar_here
 
 OTHER_BENCH = SMALL_BENCH.replace("[320, 240]", "[160, 120]")
 FAINT = "[sky]\nfaintest_v_mag = 9\n[render]\nbrightest_v_mag = -1\n"  # white is Sirius: most stars are under a step
-COUNT_OPENS = """
-import os, sys
-opened = []
-sys.addaudithook(lambda event, told: opened.append(told[0]) if event == "open" and str(told[0]) == sys.argv[2] else None)
-from hilstar.cli import main
-try:
-    main()
-finally:
-    print(len(opened), file=sys.stderr)
-"""
+opened: list[str] = []
+sys.addaudithook(
+    lambda event, told: opened.append(str(told[0])) if event == "open" and str(told[0]).endswith("bench.toml") else None
+)
 
 
 def test_a_file_that_is_replaced_after_it_was_read_changes_nothing_of_the_run(small_bench_file, tmp_path):
@@ -54,17 +47,10 @@ def test_a_command_opens_the_bench_file_once(small_bench_file, tmp_path, command
     }[command]
     if command == "serve":
         small_bench_file.write_text(SMALL_BENCH + '[attitude]\nendpoint = "tcp://127.0.0.1:9"\n')
-    assert opens(command, small_bench_file, *options) == 1
-
-
-def opens(command: str, bench_file: Path, *options: object) -> int:
-    """How often a command opened its bench file."""
-    arguments = [command, str(bench_file), *map(str, options)]
-    done = subprocess.run(
-        [sys.executable, "-c", COUNT_OPENS, *arguments], capture_output=True, text=True, timeout=60, check=False
-    )
+    opened.clear()
+    done = run_hilstar_here(command, small_bench_file, *options)
     assert done.returncode in {0, 4}, done.stderr  # 4: nobody sent an attitude
-    return int(done.stderr.splitlines()[-1])
+    assert opened.count(str(small_bench_file)) == 1
 
 
 def test_nothing_of_a_bench_can_be_assigned(bench_with):

@@ -46,7 +46,8 @@ def _sha256(config: BenchConfig, folder: Path) -> str:
     tracker = config.tracker
     curves = (tracker.quantum_efficiency, tracker.transmission)
     files = (config.sky.catalogue, config.monitor.calibration, config.collimator.geometry, tracker.distortion)
-    named: tuple[str | float | None, ...] = (*curves, *files)
+    true = (config.verify.true_calibration, config.verify.true_geometry)
+    named: tuple[str | float | None, ...] = (*curves, *files, *true)
     for name in named:
         if isinstance(name, str) and name not in (*BUILT_IN_CURVES, *BUILT_IN, "hipparcos"):
             digest.update(_named_bytes(folder / name))

@@ -71,6 +71,13 @@ def _check_meaning(config: BenchConfig, path: Path) -> None:
         raise InputError(f"{path}: [background] has electrons_per_px and zodiacal_v_mag_arcsec2; write one of them")
     if config.render.flux_at_white_e_per_s is not None and config.render.brightest_v_mag is not None:
         raise InputError(f"{path}: [render] has flux_at_white_e_per_s and brightest_v_mag; write one of them")
+    ideal = [
+        name
+        for name in ("true_focal_length_mm", "true_pixel_pitch_um", "true_q_cam_to_mon")
+        if getattr(config.verify, name) is not None
+    ]
+    if config.verify.true_geometry is not None and ideal:
+        raise InputError(f"{path}: [verify] true_geometry takes the place of {ideal[0]}; leave one of them out")
     if config.attitude.source == "serial" and not config.attitude.port:
         raise InputError(f'{path}: [attitude] source = "serial" needs port; write port = "/dev/ttyUSB0" or the like')
     if config.attitude.source == "serial" and config.attitude.lockstep:

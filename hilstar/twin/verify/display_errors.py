@@ -9,22 +9,8 @@ import numpy as np
 
 from hilstar.arrays import FloatArray
 from hilstar.error_spread import error_spread
+from hilstar.twin.verify.displacement import GeometryFit, fit_geometry
 from hilstar.twin.verify.measured import Measured, Star
-
-MIN_STARS = 6  # for a scale, a rotation and a shift: twelve residuals, four unknowns
-
-
-@dataclass(frozen=True, slots=True)
-class GeometryFit:
-    """What a scale, a rotation about the detector's middle and a shift explain of the centroids' residuals.
-
-    `left` is the share of the residuals' mean square that they do not explain, corrected for the number of unknowns.
-    """
-
-    scale_error: float
-    rotation_rad: float
-    offset_px: tuple[float, float]
-    left: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +61,7 @@ def display_errors(measured: Measured) -> DisplayErrors:
     stars = measured.tally.stars
     zero_point, codes_zero_point = median([s.flux_mag for s in stars]), median([s.codes_mag for s in stars])
     stars = [replace(s, flux_mag=s.flux_mag - zero_point, codes_mag=s.codes_mag - codes_zero_point) for s in stars]
-    geometry = fit_geometry(stars, measured.camera.principal_point_px)
+    geometry = fit_geometry(measured.tally.displaced, measured.camera, measured.config.verify.centroid_px)
     return DisplayErrors(stars, measured.tally.lost, zero_point, codes_zero_point, geometry)
 
 
@@ -88,19 +74,3 @@ def median(values: list[float]) -> float:
 def p95(errors: FloatArray) -> float:
     """The 95th percentile of some errors (n,), 0 without any."""
     return error_spread(errors).p95 or 0.0
-
-
-def fit_geometry(stars: list[Star], middle_px: tuple[float, float]) -> GeometryFit | None:
-    """Scale, rotation and shift of the centroids by least squares; None with too few stars."""
-    if len(stars) < MIN_STARS:
-        return None
-    x, y = np.array([star.x_px for star in stars]) - middle_px[0], np.array([star.y_px for star in stars]) - middle_px[1]
-    ones, zeros = np.ones_like(x), np.zeros_like(x)
-    design = np.concatenate([np.stack([x, -y, ones, zeros], axis=1), np.stack([y, x, zeros, ones], axis=1)])
-    residual = np.array([*(star.dx_px for star in stars), *(star.dy_px for star in stars)])
-    found = np.linalg.lstsq(design, residual, rcond=None)[0]
-    scale, rotation, right, down = (float(value) for value in found)
-    total = float(residual @ residual)
-    spare = design.shape[0] / (design.shape[0] - design.shape[1])
-    left = float(np.square(residual - design @ found).sum()) / total * spare if total else 0.0
-    return GeometryFit(scale, rotation, (right, down), left)

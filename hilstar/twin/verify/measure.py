@@ -10,6 +10,7 @@ import numpy.typing as npt
 from hilstar.arrays import FloatArray
 from hilstar.tracker.centroids import Centroids, find_stars
 from hilstar.twin.bench_geometry import BenchGeometry, Mirror
+from hilstar.twin.verify.displacement import Displaced
 from hilstar.twin.verify.light import true_calibration
 from hilstar.twin.verify.measured import Glow, Measured, Star, Tally
 from hilstar.twin.verify.star_finder import Matched, StarFinder, crowded, faintest_e_per_s, nearest, shared, star_finder
@@ -47,6 +48,7 @@ class Comparison:
         for k in np.flatnonzero(wanted):
             (tally.stars if found[k] else tally.lost).append(self._star(seen, int(k), sky, shown, assumed))
         tally.vanished += len(sky.found) - len(shown.found)
+        self._follow(seen, shown.found, wanted)
         self._count_mirrored(seen, shown.found, wanted)
         self._measure_noisy(seen, self.twin.detected_e(seen, rng), wanted)
 
@@ -103,10 +105,19 @@ class Comparison:
         flux, radius_px = seen.truth["electrons_per_s"], self.finder.settings.radius_px
         return np.asarray(shared(sky.index) | crowded(seen.x_px, seen.y_px, flux, radius_px, self.finder.sigma_px))
 
+    def _follow(self, seen: Field, shown: Centroids, wanted: npt.NDArray[np.bool_]) -> None:
+        """Find each star where the true lens shows it, and note how far that is from where the sky has it."""
+        geometry = BenchGeometry(self.twin.true_camera, self.twin.camera)
+        match = nearest(shown, *geometry.to_tracker(seen.truth["x_px"], seen.truth["y_px"]))
+        for k in np.flatnonzero(wanted & (match >= 0) & ~shared(match)):
+            x_px, y_px = float(seen.x_px[k]), float(seen.y_px[k])
+            off_px = float(shown.x_px[match[k]]) - x_px, float(shown.y_px[match[k]]) - y_px
+            self.tally.displaced.append(Displaced(x_px, y_px, *off_px))
+
     def _count_mirrored(self, seen: Field, shown: Centroids, wanted: npt.NDArray[np.bool_]) -> None:
         """Count the stars that are where a mirrored screen would have them."""
         for mirror in MIRRORS if self.twin.differs else ():
-            geometry = BenchGeometry(self.twin.bench.camera, self.twin.camera, mirror)
+            geometry = BenchGeometry(self.twin.true_camera, self.twin.camera, mirror)
             places = geometry.to_tracker(seen.truth["x_px"], seen.truth["y_px"])
             self.tally.mirrored[mirror] += int((wanted & (nearest(shown, *places) >= 0)).sum())
 

@@ -9,6 +9,7 @@ from hilstar.bench.config import BenchConfig
 from hilstar.monitor.calibration import Calibration
 from hilstar.scene.camera import Camera
 from hilstar.twin.bench_geometry import Mirror
+from hilstar.twin.verify.displacement import Displaced
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,12 +37,14 @@ class Star:
 class Tally:
     """Stars by what became of them, added up over the fields.
 
-    `vanished` counts how many fewer are found than the sky has, `mirrored` those found where a screen so mirrored would show
-    them; `noisy_mag`, `noisy_px` are the errors with all of the detector's noise.
+    `displaced` are the stars that the display really shows, however far off. `vanished` counts how many fewer are found than
+    the sky has, `mirrored` those found where a screen so mirrored would show them; `noisy_mag`, `noisy_px` are the errors with
+    all of the detector's noise.
     """
 
     stars: list[Star] = field(default_factory=list)
     lost: list[Star] = field(default_factory=list)
+    displaced: list[Displaced] = field(default_factory=list)
     blended: int = 0
     clipped: int = 0
     not_shown: int = 0

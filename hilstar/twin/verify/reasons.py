@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from hilstar.twin.verify.displacement import GeometryFit
 from hilstar.twin.verify.display_errors import DisplayErrors, p95
 from hilstar.twin.verify.measured import Measured
 
@@ -55,14 +56,31 @@ def _geometry(measured: Measured, errors: DisplayErrors) -> list[str]:
     fit, limit = errors.geometry, measured.config.verify.centroid_px
     if fit is None or fit.left > MAX_LEFT:
         return []
-    reach_px, found = math.hypot(*measured.camera.resolution_px) / 2, []
+    reach_px, found, measured_lens = math.hypot(*measured.camera.resolution_px) / 2, [], measured.config.collimator.geometry
+    again = "its geometry file does not say so; run hilstar calibrate geometric again"
     if abs(fit.scale_error) * reach_px > limit:
-        found.append(f"the plate scale is {fit.scale_error:+.2%} off: look at focal_length_mm and pixel_pitch_um")
+        cure = again if measured_lens else "look at focal_length_mm and pixel_pitch_um"
+        found.append(f"the plate scale is {fit.scale_error:+.2%} off: {cure}")
     if abs(fit.rotation_rad) * reach_px > limit:
-        found.append(f"the field is turned by {math.degrees(fit.rotation_rad):+.3f} deg: look at q_cam_to_mon")
+        cure = again if measured_lens else "look at q_cam_to_mon"
+        found.append(f"the field is turned by {math.degrees(fit.rotation_rad):+.3f} deg: {cure}")
     if math.hypot(*fit.offset_px) > limit:
         right, down = fit.offset_px
-        found.append(f"the field is shifted by ({right:+.2f}, {down:+.2f}) px: look at q_cam_to_mon and principal_point_px")
+        cure = again if measured_lens else "look at q_cam_to_mon and principal_point_px"
+        found.append(f"the field is shifted by ({right:+.2f}, {down:+.2f}) px: {cure}")
+    return [*found, *_lens(fit, limit, again if measured_lens else "hilstar calibrate geometric measures it")]
+
+
+def _lens(fit: GeometryFit, limit_px: float, cure: str) -> list[str]:
+    """What no key of the bench file but `geometry` describes."""
+    found = []
+    if fit.tilt_px > limit_px:
+        a, b = (math.degrees(angle) for angle in fit.tilt_rad)
+        found.append(f"the screen is tilted by ({a:+.2f}, {b:+.2f}) deg about its x and y axes, {fit.tilt_px:.2f} px: {cure}")
+    if fit.distortion_px > limit_px:
+        found.append(f"the lens distorts by {fit.distortion_px:.2f} px (k1 {fit.k1:+.3g}): {cure}")
+    if fit.left_px > limit_px:
+        found.append(f"that leaves {fit.left_px:.2f} px at 95 %, which is neither alignment, tilt nor distortion")
     return found
 
 

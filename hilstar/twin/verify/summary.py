@@ -86,6 +86,9 @@ class VerifySummary:
     scale_error: float | None
     rotation_arcsec: float | None
     offset_px: tuple[float, float] | None
+    tilt_deg: tuple[float, float] | None
+    k1: float | None
+    distortion_px: float | None
     black_e_per_s_px: BlackLevel
     estimator_floor: EstimatorFloor
     codes_alone: CodesAlone
@@ -117,6 +120,9 @@ def summarise(verdict: Verdict) -> VerifySummary:
         scale_error=None if fit is None else fit.scale_error,
         rotation_arcsec=None if fit is None else fit.rotation_rad * ARCSEC_PER_RAD,
         offset_px=None if fit is None else fit.offset_px,
+        tilt_deg=None if fit is None else (math.degrees(fit.tilt_rad[0]), math.degrees(fit.tilt_rad[1])),
+        k1=None if fit is None else fit.k1,
+        distortion_px=None if fit is None else fit.distortion_px,
         black_e_per_s_px=BlackLevel(measured.glow.assumed_e_per_s_px, measured.glow.seen_e_per_s_px),
         estimator_floor=EstimatorFloor(error_spread(errors.floor_mag()), error_spread(errors.floor_px())),
         codes_alone=CodesAlone(

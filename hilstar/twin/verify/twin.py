@@ -14,7 +14,7 @@ from hilstar.arrays import FloatArray
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import open_bench
-from hilstar.bench.cameras import ideal_monitor, tracker_camera
+from hilstar.bench.cameras import ideal_monitor, real_monitor, tracker_camera
 from hilstar.bench.config import Verify
 from hilstar.bench.frame import Bench
 from hilstar.errors import InputError
@@ -59,6 +59,7 @@ class Twin:
         self.true_panel = true_panel(self.bench)
         self.assumed_geometry = BenchGeometry(self.bench.camera, self.camera)
         true = true_geometry(self.bench, self.camera)
+        self.true_camera = true.monitor
         self.detector = Detector(tracker.detector, tracker.resolution_px, tracker.pixel_pitch_um)
         self.true_optics = TwinOptics(true, tracker.psf_sigma_px)
         self.sky_optics = TwinOptics(self.assumed_geometry, tracker.psf_sigma_px)
@@ -111,12 +112,15 @@ def changed_keys(verify: Verify) -> list[str]:
 
 
 def true_geometry(bench: Bench, tracker: Camera) -> BenchGeometry:
-    """How monitor and collimator really stand: as the bench assumes, or an ideal lens with the keys of [verify].
+    """How monitor and collimator really stand: as the bench assumes, by a geometry file, or an ideal lens by keys of [verify].
 
-    Raises InputError for a rotation that is not unit within 1e-3.
+    Raises InputError for a rotation that is not unit within 1e-3, and for a geometry file that cannot be used.
     """
     config = bench.config
     verify, collimator, monitor = config.verify, config.collimator, config.monitor
+    if verify.true_geometry is not None:
+        camera = real_monitor(config, bench.file.folder / verify.true_geometry)
+        return BenchGeometry(camera, tracker, verify.true_mirror)
     if (verify.true_q_cam_to_mon, verify.true_pixel_pitch_um, verify.true_focal_length_mm) == (None, None, None):
         return BenchGeometry(bench.camera, tracker, verify.true_mirror)
     norm = math.hypot(*(verify.true_q_cam_to_mon or collimator.q_cam_to_mon))

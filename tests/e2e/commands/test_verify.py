@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -50,6 +51,69 @@ def test_a_right_bench_passes_within_the_aims(tmp_path):
     assert sum(row["stars"] for row in summary["by_magnitude"]) == summary["stars"]
     assert summary["codes_alone"]["flux_mag"] == summary["flux_error_mag"]
     assert summary["at_edge"] > 0
+
+
+def write_geometry_file(path: Path, lines: str) -> None:
+    """A geometry file of the bench's monitor: its ideal lens, and what `lines` say otherwise."""
+    values = {"focal_length_px": 120e3 / 57.65, "principal_point_px": [319.5, 239.5], "q_cam_to_mon": [1, 0, 0, 0]}
+    table = "".join(f"{name} = {value}\n" for name, value in values.items() if name not in lines)
+    path.write_text(f'kind = "hilstar geometry 1"\nresolution_px = [640, 480]\n{table}{lines}\n')
+
+
+# What is planted, and the reasons that name it with its size: these and no others, but the centroids' own.
+PLANTED = {
+    "distortion": ("k1 = 0.6", [r"the lens distorts by 2\.\d+ px \(k1 \+0\.6\)"]),
+    "strong distortion": ("k1 = -2.5\nk2 = 20", [r"the lens distorts by 1\d\.\d+ px \(k1 -2\.5\)"]),
+    "decentring": ("p1 = 0.01\np2 = -0.01", [r"the lens distorts by 1\.\d+ px"]),
+    "tilt": ("tilt_deg = [1.0, -0.7]", [r"the screen is tilted by \(\+1\.0\d, -0\.7\d\) deg about its x and y axes"]),
+    "centre": ("principal_point_px = [321.0, 238.5]", [r"the field is shifted by \(-1\.39, \+0\.92\) px"]),
+    "centre and distortion": (
+        "principal_point_px = [334.5, 230]\nk1 = 0.6",
+        [r"the field is shifted by \(-13\.86, \+8\.78\) px", r"the lens distorts by [23]\.\d+ px \(k1 \+0\.(59|6)"],
+    ),
+    "all": (
+        "k1 = 0.6\ntilt_deg = [1.0, -0.7]\nprincipal_point_px = [330, 245]\nfocal_length_px = 2102.36",
+        [
+            "the plate scale is -(0.9|1.0)",
+            r"the field is shifted by \(-9\.6\d, -5\.0\d\) px",
+            r"the screen is tilted by \(\+1\.0\d, -0\.[67]\d\)",
+            r"the lens distorts by 2\.\d+ px \(k1 \+0\.(59|6)",
+        ],
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", PLANTED)
+def test_a_planted_lens_is_caught_and_the_part_that_is_wrong_is_named(tmp_path, kind):
+    lines, wanted = PLANTED[kind]
+    write_geometry_file(tmp_path / "true.toml", lines)
+    code, summary = verified(tmp_path, 'true_geometry = "true.toml"')
+    assert (code, summary["passed"]) == (1, False)
+    causes = [line for line in summary["reasons"] if not line.startswith("centroids are") and "not where the sky" not in line]
+    assert all(re.match(pattern, line) for line, pattern in zip(causes, wanted, strict=True)), causes
+
+
+def test_the_planted_sizes_are_in_the_json(tmp_path):
+    write_geometry_file(tmp_path / "true.toml", "k1 = 0.6\ntilt_deg = [1.0, -0.7]")
+    _, summary = verified(tmp_path, 'true_geometry = "true.toml"')
+    assert summary["k1"] == pytest.approx(0.6, rel=0.01)
+    assert summary["tilt_deg"] == pytest.approx([1.0, -0.7], rel=0.05)  # to first order in the tilt
+    assert summary["scale_error"] == pytest.approx(0, abs=2e-4)
+
+
+def test_a_mirror_is_named_behind_a_real_lens_too(tmp_path):
+    write_geometry_file(tmp_path / "true.toml", "k1 = 0.6\nprincipal_point_px = [330, 245]")
+    for mirror, word in (("x", "columns reversed"), ("swap", "axes swapped")):
+        _, summary = verified(tmp_path, f'true_geometry = "true.toml"\ntrue_mirror = "{mirror}"')
+        assert word in summary["reasons"][0]
+
+
+def test_a_bench_that_knows_its_true_lens_passes(tmp_path):
+    write_geometry_file(tmp_path / "true.toml", "k1 = 0.6\ntilt_deg = [1.0, -0.7]\nprincipal_point_px = [330, 245]")
+    known = ("[collimator]", '[collimator]\ngeometry = "true.toml"')
+    code, summary = verified(tmp_path, 'true_geometry = "true.toml"', replace=known)
+    assert (code, summary["reasons"], summary["lost"]) == (0, [], 0)
+    assert summary["centroid_error_px"]["p95"] < 0.02
 
 
 @pytest.mark.parametrize(
@@ -135,6 +199,11 @@ def test_what_cannot_be_verified_gets_one_line(tmp_path):
         ('true_calibration = "nothing.toml"', "nothing.toml"),
         ('true_calibration = "lcd-example"', "bits"),
         ('true_mirror = "z"', "true_mirror"),
+        ('true_geometry = "nothing.toml"', "nothing.toml"),
+        ('true_geometry = "bench.toml"', "calibrate geometric"),
+        ('true_geometry = "t.toml"\ntrue_focal_length_mm = 121', "true_geometry takes the place of true_focal_length_mm"),
+        ('true_geometry = "t.toml"\ntrue_pixel_pitch_um = 58', "true_pixel_pitch_um"),
+        ('true_geometry = "t.toml"\ntrue_q_cam_to_mon = [1, 0, 0, 0]', "true_q_cam_to_mon"),
         ("true_focal_length_mm = -1", "true_focal_length_mm"),
         ("true_q_cam_to_mon = [2, 0, 0, 0]", "unit quaternion"),
     ):

@@ -37,9 +37,7 @@ class Attitude(NamedTuple):
 ATTITUDES: dict[str, Attitude] = {
     "attitude: RA 0, Dec 0, roll 0, turning about the boresight": Attitude(1, 1, 1_000_000_000, Q, (0.0, 0.0, 0.125)),
     "attitude: no rate": Attitude(0, 2, 1_010_000_000, Q, STILL),
-    "attitude: the other sign of the quaternion is the same attitude": Attitude(
-        1, 3, 1_020_000_000, (-0.5, -0.5, 0.5, -0.5), STILL
-    ),
+    "attitude: the other sign of the quaternion is the same attitude": Attitude(1, 3, 1_020_000_000, NEGATED_Q, STILL),
     "attitude: the first after a jump": Attitude(3, 4, 1_030_000_000, (0.6, 0.0, 0.8, 0.0), (0.25, -0.5, 1.0)),
     "attitude: all zero bytes but the scalar": Attitude(0, 0, 0, (1.0, 0.0, 0.0, 0.0), STILL),
     "attitude: no zero byte in sequence and time": Attitude(1, 0x01020304, 0x0102030405060708, Q, (1.1, -2.2, 3.3)),

@@ -10,7 +10,7 @@ import pytest
 from hilstar.bench.config import parse_config
 from hilstar.errors import MachineError
 from hilstar.run.screen.gate import GATE_FRAMES, Timing, faults, pass_gate, timing_of
-from tests.conftest import SMALL_BENCH
+from tests.support.benches import SMALL_BENCH
 
 PERIOD_MS = 1000 / 60
 GOOD = Timing(PERIOD_MS, 0, True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -73,7 +74,10 @@ class Notes:
 
 
 class GeometryFile(LensTable, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A whole file. `error` and `made` say how well it is known and of what; nothing is computed from them."""
+    """A whole file. `max_field_deg` is the angle from the axis to which it was calibrated, where that is less than the screen.
+
+    `sigma`, `error` and `made` say how well it is known and how it was made; nothing is computed from them.
+    """
 
     kind: str
     resolution_px: Sizes
@@ -81,6 +85,7 @@ class GeometryFile(LensTable, frozen=True, forbid_unknown_fields=True, kw_only=T
     principal_point_px: tuple[Finite, Finite]
     q_cam_to_mon: tuple[Finite, Finite, Finite, Finite]
     tilt_deg: tuple[Annotated[float, Meta(gt=-60, lt=60)], Annotated[float, Meta(gt=-60, lt=60)]] = (0.0, 0.0)
+    max_field_deg: Annotated[float, Meta(gt=0, lt=90)] | None = None
     field: Field | None = None
     sigma: dict[str, float] = {}
     error: ErrorTable | None = None
@@ -111,6 +116,7 @@ def load_geometry(path: Path, resolution_px: tuple[int, int]) -> Camera:
         (found.p1, found.p2),
         (float(np.radians(a)), float(np.radians(b))),
         None if found.field is None else _field(path, found.field, resolution_px),
+        math.inf if found.max_field_deg is None else math.tan(math.radians(found.max_field_deg)),
     )
     return Camera(resolution_px, found.focal_length_px, found.principal_point_px, to_matrix(normalise(q)), lens)
 
@@ -160,6 +166,7 @@ def write_geometry(path: Path, camera: Camera, q_cam_to_mon: FloatArray, notes: 
         k3=k3,
         p1=p1,
         p2=p2,
+        max_field_deg=math.degrees(math.atan(lens.max_tangent)) if math.isfinite(lens.max_tangent) else None,
         field=field,
         sigma=notes.sigma,
         error=notes.error,

@@ -133,7 +133,7 @@ class Camera:
 
 
 def bounded(camera: Camera, margin_px: float) -> Camera:
-    """The camera with its lens bounded to what reaches the image, `margin_px` around it included.
+    """The camera with its lens bounded to what reaches the image, `margin_px` around it included, and to what it is known for.
 
     Raises InputError for a lens that folds within those directions: two of them would share a pixel.
     """
@@ -142,7 +142,7 @@ def bounded(camera: Camera, margin_px: float) -> Camera:
         return camera
     free = replace(camera, lens=replace(lens, max_tangent=np.inf))
     u, v = free.tangents(*_border_px(camera.resolution_px, margin_px))
-    reach = float(np.hypot(u, v).max())
+    reach = min(float(np.nan_to_num(np.hypot(u, v), nan=np.inf).max()), lens.max_tangent)
     if not np.isfinite(reach) or _folds(free, reach):
         raise InputError("its distortion folds within the screen: two directions share a pixel; fit it again, with fewer terms")
     return replace(camera, lens=replace(lens, max_tangent=reach))

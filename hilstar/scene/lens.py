@@ -78,8 +78,8 @@ def _chebyshev(t: FloatArray, count: int) -> FloatArray:
 class Lens:
     """Distortion k1 to k3 and p1, p2 (of tangents of field angles), the plane's tilt about its x and y axes, and the field.
 
-    `max_tangent` bounds the directions that it is used for, the largest radius of (u, v) that reaches the image: farther out
-    the polynomials turn back, and would show stars that are not in view.
+    `max_tangent` bounds the directions that it is used for: the largest radius of (u, v) that reaches the image, or that was
+    calibrated. Farther out the polynomials turn back, and would show stars that are not in view.
     """
 
     radial: tuple[float, float, float] = (0.0, 0.0, 0.0)

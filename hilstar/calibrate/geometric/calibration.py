@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,7 @@ from hilstar.calibrate.geometric.dots import BoolArray, DotPlan, read_plan
 from hilstar.calibrate.geometric.fit import Fit, Matched, Problem, fit, noise_of_repeats
 from hilstar.calibrate.geometric.images import measure_images
 from hilstar.calibrate.geometric.match import FirstLook, first_look, match_by_geometry, match_by_maps, refuse_motion
-from hilstar.calibrate.geometric.model import BROWN_CONRADY, PINHOLE, RADIAL, TRACKER_STEPS, Model, Nominal
+from hilstar.calibrate.geometric.model import BROWN_CONRADY, PINHOLE, RADIAL, TRACKER_STEPS, Model, Nominal, directions_in_cam
 from hilstar.calibrate.geometric.observed import Observed, read_observed
 from hilstar.calibrate.geometric.uncertainty import Uncertainty, uncertainty_of
 from hilstar.errors import InputError
@@ -24,6 +24,7 @@ from hilstar.units import ARCSEC_PER_RAD
 
 SEED = 1  # of the random samples of dots: one calibration gives one file
 MIN_DOTS = 12
+KNOWN_MARGIN = 1.01  # of the angle to the corner of the tracker's field
 MIN_CELL_SHARE = 0.33  # of the dots that should be seen in a part of the screen
 CELLS = (("left", "middle", "right"), ("upper", "middle", "lower"))
 REACH_PX = 0.5  # of the tracker: a centroid this close to where the fit puts a dot is that dot
@@ -119,13 +120,29 @@ def calibrate_geometry(
         raise InputError(f"{found} dots were recognised and {MIN_DOTS} are needed; show more --dots or more --frames")
     models = candidates(problem, data, tracker_names)
     chosen = best_of(models)
-    final = final_fit(problem, chosen, data)
+    final = bounded_to_field(problem, final_fit(problem, chosen, data))
     calibrated = Calibrated(
         plan, problem, data, final, models, chosen, uncertainty_of(problem, final, data), len(seen), tracker_known
     )
     _refuse_gaps(calibrated)
     _refuse_misfit(calibrated)
     return calibrated
+
+
+def bounded_to_field(problem: Problem, fit: Fit) -> Fit:
+    """The fit with its lens used no farther than the tracker's field, where that leaves part of the screen unseen."""
+    geometry, plan = fit.geometry, problem.plan
+    monitor = geometry.monitor
+    if monitor.lens is None or all(inside.all() for inside in _in_view(plan, problem, fit)):
+        return fit
+    width, height = geometry.tracker.resolution_px
+    corners = np.array([-0.5, width - 0.5, -0.5, width - 0.5]), np.array([-0.5, -0.5, height - 0.5, height - 0.5])
+    reach = 0.0
+    for pose in range(len(geometry.q_poses)):
+        rays = directions_in_cam(geometry, np.full(4, pose), *corners) @ monitor.cam_to_image.T
+        reach = max(reach, float(np.nanmax(np.hypot(rays[:, 0], rays[:, 1]) / rays[:, 2])))
+    lens = replace(monitor.lens, max_tangent=KNOWN_MARGIN * reach)
+    return replace(fit, geometry=replace(geometry, monitor=replace(monitor, lens=lens)))
 
 
 def _matched(

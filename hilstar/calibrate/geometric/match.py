@@ -21,6 +21,7 @@ from hilstar.rotation import from_matrix
 FIRST_REACH = 0.03  # of the screen's width, by the first map, which knows no lens
 MIN_MOTION_PX = 0.05  # of the tracker
 POLISH_ROUNDS = 10
+MAX_CHANCE = 12.0  # sigmas of a frame's mean: the largest of some 30 differences of medians, with room
 MOTION_NOISE = 3.0  # of a centroid: less is no matter, since every frame has many
 ORIENTATIONS = {
     (1, 0, 0, 1): None,
@@ -163,7 +164,8 @@ def refuse_motion(data: Matched) -> None:
         here = data.at(np.flatnonzero(data.seen.pose == pose))
         for axis, places in (("x", here.seen.x_px), ("y", here.seen.y_px)):
             frames, shift, noise = frame_shifts(here, places)
-            if np.ptp(shift) > max(MIN_MOTION_PX, MOTION_NOISE * noise):
+            by_chance = MAX_CHANCE * noise / np.sqrt(len(here) / len(frames))  # the medians of so few dots scatter themselves
+            if np.ptp(shift) > max(MIN_MOTION_PX, MOTION_NOISE * noise, by_chance):
                 first, last = sorted((frames[shift.argmin()], frames[shift.argmax()]))
                 raise InputError(
                     f"the image moved by {np.ptp(shift):.2f} px in {axis} between frames {first} and {last}:"

@@ -115,9 +115,12 @@ def summary_of(found: Calibrated, written: tuple[str, ...]) -> GeometricSummary:
 
 
 def _notes(found: Calibrated) -> tuple[str, ...]:
-    if len(found.problem.q_poses) == 1:
-        return (ONE_POSE,)
-    return () if found.tracker_known else (ROUND,)
+    notes = (ONE_POSE,) if len(found.problem.q_poses) == 1 else () if found.tracker_known else (ROUND,)
+    lens = found.fit.geometry.monitor.lens
+    if lens is None or not math.isfinite(lens.max_tangent):
+        return notes
+    known_deg = math.degrees(math.atan(lens.max_tangent))
+    return (*notes, f"the tracker sees {known_deg:.2f} deg from the axis: no star is shown farther out")
 
 
 def parameters_of(found: Calibrated) -> dict[str, Parameter]:
@@ -158,7 +161,7 @@ def notes_of(found: Calibrated) -> Notes:
         noise_px=found.problem.noise_px,
         rms_arcsec=found.uncertainty.rms_arcsec,
         max_arcsec=found.uncertainty.max_arcsec,
-        map_arcsec=[[round(float(value), 4) for value in row] for row in found.uncertainty.map_arcsec],
+        map_arcsec=[[round(float(value), 4) for value in row] for row in np.nan_to_num(found.uncertainty.map_arcsec, nan=-1.0)],
     )
     sigma = {name: parameter.sigma for name, parameter in parameters_of(found).items()}
     when = datetime.datetime.now(datetime.UTC).date().isoformat()

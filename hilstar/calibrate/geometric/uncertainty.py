@@ -18,7 +18,8 @@ MAP_PLACES = (17, 11)
 
 @dataclass(frozen=True, slots=True)
 class Uncertainty:
-    """One sigma of each parameter, and of a star's place: `map_arcsec` (rows, columns) over the screen, edges included.
+    """One sigma of each parameter, and of a star's place: `map_arcsec` (rows, columns) over the screen, edges included,
+    NaN where the tracker saw no dots.
 
     By the covariance of the fit, scaled by its residuals where they are larger than the centroids' noise. What no parameter
     can follow is not in it: the error on dots that were held out is.
@@ -30,12 +31,12 @@ class Uncertainty:
     @property
     def rms_arcsec(self) -> float:
         """Over the screen."""
-        return float(np.sqrt((self.map_arcsec**2).mean()))
+        return float(np.sqrt(np.nanmean(self.map_arcsec**2)))
 
     @property
     def max_arcsec(self) -> float:
         """At the place that is known worst."""
-        return float(self.map_arcsec.max())
+        return float(np.nanmax(self.map_arcsec))
 
 
 def uncertainty_of(problem: Problem, fit: Fit, data: Matched) -> Uncertainty:

@@ -15,7 +15,7 @@ from hilstar.calibrate.geometric.model import Nominal
 from hilstar.calibrate.geometric.observed import Observed
 from hilstar.errors import InputError
 from hilstar.monitor.geometry import monitor_camera
-from hilstar.scene.camera import Camera
+from hilstar.scene.camera import Camera, bounded
 from hilstar.units import ARCSEC_PER_RAD
 from tests.support.traced_bench import TracedBench, observed_dots, turned
 
@@ -161,3 +161,21 @@ def test_codes_differ_and_frames_are_evenly_lit(frames, dots):
     assert len(np.unique(plan.lit, axis=0)) == len(plan)
     assert np.ptp(plan.lit.sum(axis=0)) <= max(4, dots // 8)
     assert len(np.unique(np.column_stack([plan.x_px, plan.y_px]), axis=0)) == len(plan)
+
+
+def test_a_tracker_that_sees_part_of_the_screen_gets_its_own_field_right_and_no_star_beyond(rng):
+    """Beyond what was seen polynomials run away: the file says how far it holds, and loads."""
+    plan = plan_of(30, 100)
+    wide = TracedBench(focal_mm=120.0, to_lens_mm=30.0)
+    narrow = replace(TRACKER, resolution_px=(1024, 1024), principal_point_px=(511.5, 511.5))
+    nominal = replace(nominal_of(wide), tracker=narrow)
+    found = calibrate_geometry(plan, nominal, observed_dots(wide, plan, narrow, rng), rng, tracker_known=True)
+    monitor = bounded(found.fit.geometry.monitor, 20.0)
+    x, y = (part.ravel() for part in np.meshgrid(np.linspace(0, 1023, 31), np.linspace(0, 1023, 31)))
+    rays = narrow.rays(x, y)
+    wanted_x, wanted_y = wide.places_px(rays)
+    shown_x, shown_y = monitor.project(rays @ monitor.cam_to_image.T)
+    errors = np.hypot(shown_x - wanted_x, shown_y - wanted_y) * ARCSEC_PER_RAD / monitor.focal_length_px
+    assert errors.max() < 3.0  # NaN would fail: every place of the tracker's field is known
+    far = np.tan(2 * monitor.field_radius_rad(0.0))
+    assert np.isnan(monitor.places_px(np.array([far]), np.array([0.0]))[0]).all()

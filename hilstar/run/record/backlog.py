@@ -1,4 +1,4 @@
-"""What waits to be written to the ledger, bounded by bytes."""
+"""The queue of what is to be written to the ledger, bounded by bytes."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from hilstar.attitude.wire.packet import AttitudeSample, Refusal
 from hilstar.run.record.ledger_records import EventRecord, FrameRecord
 
 Kind = Literal["packet", "frame", "event"]
-MAX_WAITING_BYTES = 32_000_000  # half a minute of a plain run, should the disk stand still
-FRAMES_SHARE = 0.5  # of it; what is left is for packets
+MAX_WAITING_BYTES = 32_000_000  # half a minute of a plain run, if the disk stalls
+FRAMES_SHARE = 0.5  # of it; the rest is for packets
 # A message of JSON and the objects that it is made of, roughly; the raw bytes of a packet come on top.
 ENTRY_BYTES = {"packet": 1500, "frame": 2500, "event": 1000}
 
 
 @dataclass(frozen=True, slots=True)
 class ReceivedPacket:
-    """A packet's bytes, and what they say: an attitude, or why they were refused."""
+    """A packet's bytes, with the attitude in them or the reason for their refusal."""
 
     raw: bytes
     sample: AttitudeSample | None
@@ -28,7 +28,7 @@ class ReceivedPacket:
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """Something to be kept: its host time, a sequence number, and what it is."""
+    """Something to be recorded: its host time, a sequence number, and its content."""
 
     kind: Kind
     time_ns: int
@@ -37,13 +37,13 @@ class Entry:
 
     @property
     def size_bytes(self) -> int:
-        """Its memory, roughly."""
+        """Approximate memory."""
         raw_bytes = len(self.content.raw) if isinstance(self.content, ReceivedPacket) else 0
         return ENTRY_BYTES[self.kind] + raw_bytes
 
 
 class Backlog:
-    """Entries in the order of their coming; never waits, and drops frames first when there is no room."""
+    """Entries in order of arrival; never blocks, and drops frames first when there is no room."""
 
     def __init__(self) -> None:
         self.dropped: Counter[str] = Counter()
@@ -52,7 +52,7 @@ class Backlog:
         self._lock = threading.Lock()
 
     def put(self, entry: Entry) -> bool:
-        """False where there was no room for it, which is counted."""
+        """Queue an entry; False, and counted, if there is no room."""
         room = MAX_WAITING_BYTES * (FRAMES_SHARE if entry.kind == "frame" else 1)
         with self._lock:
             if self._bytes + entry.size_bytes > room:
@@ -63,7 +63,7 @@ class Backlog:
             return True
 
     def take(self) -> list[Entry]:
-        """All that wait."""
+        """Take all entries."""
         with self._lock:
             taken, self._entries, self._bytes = self._entries, [], 0
         return taken

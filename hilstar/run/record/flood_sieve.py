@@ -1,4 +1,4 @@
-"""What of a flood is kept whole, and what is only counted."""
+"""Which messages of a flood are recorded in full, and which are only counted."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from hilstar.units import NS_PER_S
 
 
 class Allowance:
-    """How many of a kind are kept whole: at most `burst` at once, and `per_s` each second after that."""
+    """How many of a kind are recorded in full: at most `burst` at once, and `per_s` each second after that."""
 
     def __init__(self, burst: float, per_s: float) -> None:
         self._burst, self._per_s = burst, per_s
@@ -18,7 +18,7 @@ class Allowance:
         self._last_ns = 0
 
     def take(self, now_ns: int) -> bool:
-        """Whether one more is kept."""
+        """Whether one more is recorded in full."""
         passed_s = max(0, now_ns - self._last_ns) / NS_PER_S if self._last_ns else 0.0
         self._last_ns = now_ns
         self._left = min(self._burst, self._left + passed_s * self._per_s)
@@ -29,9 +29,9 @@ class Allowance:
 
 
 class Sieve:
-    """The first of each kind and reason whole, the others counted."""
+    """Passes the first of each kind and reason, and counts the others."""
 
-    # Refused packets say little after the first ones; more than 2000 good ones a second are no sender's plan.
+    # Refused packets tell little after the first ones; no sender means to send more than 2000 good ones a second.
     ALLOWED = {"accepted": (4000, 2000), "refused": (20, 1), "event": (100, 10)}  # noqa: RUF012 - never changed
 
     def __init__(self) -> None:
@@ -40,7 +40,7 @@ class Sieve:
         self._lock = threading.Lock()
 
     def keeps(self, kind: Kind, reason: str, now_ns: int) -> bool:
-        """Whether one that comes now is to be kept whole; it is counted if not."""
+        """Whether a message that arrives now is recorded in full; it is counted if not."""
         with self._lock:
             allowance = self._allowances.get((kind, reason))
             if allowance is None:
@@ -52,12 +52,12 @@ class Sieve:
         return kept
 
     def count(self, kind: Kind, reason: str, number: int = 1) -> None:
-        """Count what is not kept for another cause."""
+        """Count messages that are not recorded for another reason."""
         with self._lock:
             self._counts[kind, reason] += number
 
     def counted(self) -> list[tuple[Kind, str, int]]:
-        """What was counted since the last call."""
+        """The counts since the last call."""
         with self._lock:
             counts, self._counts = self._counts, Counter()
         return [(kind, reason, number) for (kind, reason), number in counts.items()]

@@ -19,7 +19,7 @@ COLUMNS = ("frame", "t_s", "qw", "qx", "qy", "qz", "stars_drawn", "clipped")
 
 
 class FrameImages:
-    """Writes `frame_000000.png` and on, and `frames.csv`; with no directory it writes nothing."""
+    """Writes `frame_000000.png` and on, and `frames.csv`; without a directory it writes nothing."""
 
     def __init__(self, directory: Path | None, bench: Bench) -> None:
         self._directory = directory

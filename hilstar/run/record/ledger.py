@@ -44,21 +44,21 @@ from hilstar.run.record.ledger_records import (
 )
 from hilstar.run.record.process_probe import ProcessProbe
 
-NO_ROOM = "no room"  # the reason of what was lost
+NO_ROOM = "no room"  # the reason given for lost messages
 FLUSH_S = 0.2
-EACH_S = 1.0  # counts, the process, the disk
+EACH_S = 1.0  # how often counts, the process and the disk are looked at
 MAX_CHUNK_BYTES = 1_000_000
-MAX_RAW_BYTES = 1024  # of a packet; no kind of packet is as long
+MAX_RAW_BYTES = 1024  # of a packet; every kind of packet is shorter
 MAX_DETAIL_CHARACTERS = 200
-DISK_WAITS_S, STOPPED_DISK_WAITS_S = 20.0, 0.4  # for a disk that stands still at the end, without and with a signal
-STALLED_S = 5.0  # without a turn of the writer
+DISK_WAITS_S, STOPPED_DISK_WAITS_S = 20.0, 0.4  # for a disk that stalls at the end, without and with a signal
+STALLED_S = 5.0  # since the writer's last pass
 LOW_SHARE, WELL_SHARE = 0.10, 0.12  # of the disk
-FRAMES_RESERVE_BYTES, FRAMES_RESERVE_SHARE = 64_000_000, 0.02  # left to packets, the smaller of the two
+FRAMES_RESERVE_BYTES, FRAMES_RESERVE_SHARE = 64_000_000, 0.02  # reserved for packets, the smaller of the two
 
 
 @dataclass(frozen=True, slots=True)
 class Split:
-    """When a ledger goes on in another file."""
+    """When a ledger continues in another file."""
 
     bytes: float = math.inf
     seconds: float = math.inf
@@ -68,7 +68,7 @@ NO_SPLIT = Split()
 
 
 class Ledger:
-    """Writes a run's MCAP file. Raises InputError where it cannot be begun."""
+    """Writes a run's MCAP file. Raises InputError if it cannot be created."""
 
     def __init__(
         self,
@@ -96,7 +96,7 @@ class Ledger:
         self._thread.start()
 
     def _begin(self, path: Path) -> tuple[NewFile, McapWriter]:
-        """A file with its head. Raises InputError."""
+        """Create a file and write its head. Raises InputError."""
         file = NewFile(path, self._overwrite)
         try:
             writer = McapWriter(file.fd, TOPICS, RUN_METADATA, self._head | {"part": str(self._part)})
@@ -106,10 +106,10 @@ class Ledger:
             raise cannot_write(path, error, "choose another place for the ledger") from error
         return file, writer
 
-    # What a run hands in, from whichever thread
+    # Called by the run, from any thread
 
     def packet(self, host_ns: int, raw: bytes, sample: AttitudeSample | None, refusal: Refusal | None) -> None:
-        """Keep a packet; see `attitude.receiver.Watch`."""
+        """Record a packet; see `attitude.receiver.Watch`."""
         if refusal is None and sample is None:
             refusal = Refusal("format", "")
         if not self._sieve.keeps("packet", "accepted" if refusal is None else refusal.reason, host_ns):
@@ -118,7 +118,7 @@ class Ledger:
         self._backlog.put(Entry("packet", host_ns, sequence, ReceivedPacket(raw[:MAX_RAW_BYTES], sample, refusal)))
 
     def frame(self, record: FrameRecord) -> None:
-        """Keep a frame."""
+        """Record a frame."""
         self._backlog.put(Entry("frame", record.swap_ns, record.frame, record))
         if time.monotonic() - self._alive_s > STALLED_S:
             self._notices.begin(
@@ -126,7 +126,7 @@ class Ledger:
             )
 
     def notice(self, notice: Notice) -> None:
-        """Keep an event of the run."""
+        """Record an event of the run."""
         if self._sieve.keeps("event", notice.kind, notice.host_ns):
             record = EventRecord(host_ns=notice.host_ns, kind=notice.kind, detail=notice.detail)
             self._backlog.put(Entry("event", notice.host_ns, 0, record))
@@ -153,7 +153,7 @@ class Ledger:
                 self._writer.finish()
             elif self._writer.size_bytes >= self._split.bytes or now_s - self._begun_s >= self._split.seconds:
                 self._go_on_in_another()
-        except Exception as error:  # whatever it is, it ends neither the ledger nor the run
+        except Exception as error:  # no error ends the ledger or the run
             self._failed(error)
             if last:
                 self._lose("packet", self._writer.drop())
@@ -188,7 +188,7 @@ class Ledger:
         self._look_at_disk()
 
     def _lose(self, kind: Kind | str, number: int) -> None:
-        """So many were lost: there was no room for them."""
+        """Count messages that were lost for lack of room."""
         self._lost += number
         self._sieve.count("frame" if kind == "frame" else "packet" if kind == "packet" else "event", NO_ROOM, number)
 
@@ -209,7 +209,7 @@ class Ledger:
             self._notices.end("ledger-thin", "ledger-whole", f"{left}: frames are recorded again")
 
     def _flush(self) -> None:
-        """Write the chunk; where it has no room, without its frames."""
+        """Write the chunk; if there is no room for it, without its frames."""
         try:
             self._writer.flush()
         except OSError:
@@ -228,13 +228,13 @@ class Ledger:
         self._notices.begin("ledger-failed", f"{self.path}: cannot be written ({self.failure}); the display goes on")
 
     def _go_on_in_another(self) -> None:
-        """Finish this file, once the next one is there."""
+        """Open the next file, then finish this one."""
         self._part += 1
         try:
             file, writer = self._begin(part_path(self.path, self._part))
         except InputError as error:
             self._part -= 1
-            self._begun_s = time.monotonic()  # and not again at each turn
+            self._begun_s = time.monotonic()  # so that it is not tried at each pass
             self._notices.tell("ledger-split-failed", f"{error}; the ledger stays in its present file")
             return
         try:
@@ -246,17 +246,17 @@ class Ledger:
     # The end
 
     def close(self) -> None:
-        """Write what waits, and the end of the file; a disk that does not take it in time has failed."""
+        """Write what is waiting and the end of the file; a disk that does not accept it in time has failed."""
         self._closing.set()
         patience_s = DISK_WAITS_S if caught() is None else STOPPED_DISK_WAITS_S
         self._thread.join(patience_s)
-        if self._thread.is_alive():  # and has the file: nothing more can be done with it
+        if self._thread.is_alive():  # it still owns the file, so nothing more can be done
             self._failed(TimeoutError(f"the disk did not take its last messages within {patience_s:g} s"))
             return
         self._probe.close()
 
     def summary(self) -> dict[str, str | int | None]:
-        """Where it is, what went wrong, how much was lost, and how much of a flood was only counted."""
+        """Its path, what went wrong, how many messages were lost, and how many of a flood were only counted."""
         lost = self._lost + sum(self._backlog.dropped.values())
         told: dict[str, str | int | None] = {"path": str(self.path), "failure": self.failure, "unrecorded": lost}
         if self._counted:

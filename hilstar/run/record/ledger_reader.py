@@ -36,7 +36,7 @@ _frame_decoder = msgspec.json.Decoder(FrameRecord)
 
 
 def frame_records(path: Path) -> Iterator[FrameRecord]:
-    """The frames of a ledger as they were written, none where the file is no ledger. Raises InputError for damage."""
+    """The frames of a ledger as they were written, none if the file is no ledger. Raises InputError for damage."""
     for number, data in enumerate(read_messages(path, FRAME_TOPIC), start=1):
         yield _decoded(_frame_decoder, data, f"{path}: message {number} of {FRAME_TOPIC}")
 
@@ -60,7 +60,7 @@ def drawable_frames(path: Path, max_rate_rad_s: float = math.inf) -> Iterator[Fr
 
 
 def run_records(path: Path) -> Iterator[RunRecord]:
-    """What a ledger holds, in its order. Raises InputError for a file that is no ledger or is damaged."""
+    """The records of a ledger, in order. Raises InputError for a file that is no ledger or is damaged."""
     decoders: dict[str, msgspec.json.Decoder[Any]] = {
         FRAME_TOPIC: _frame_decoder,
         PROCESS_TOPIC: msgspec.json.Decoder(ProcessRecord),
@@ -77,13 +77,13 @@ def run_records(path: Path) -> Iterator[RunRecord]:
 
 
 class PacketTally:
-    """How many packets there were, "accepted" or by why they were refused."""
+    """The number of packets, accepted or by the reason for their refusal."""
 
     def __init__(self) -> None:
         self.counts: dict[str, int] = {}
 
     def add(self, record: RunRecord) -> None:
-        """Count a packet that was kept, or those that were only counted."""
+        """Add a recorded packet, or a count of packets."""
         if isinstance(record, PacketForm):
             self._count("accepted" if record.accepted else (record.reason or "format").split(":")[0], 1)
         elif isinstance(record, CountRecord) and record.kind == "packet":
@@ -120,7 +120,7 @@ def read_run(path: Path) -> Run:
 
 
 def read_head(path: Path) -> dict[str, str]:
-    """The head of a ledger, {} where there is none. Raises InputError for damage."""
+    """The head of a ledger, {} if there is none. Raises InputError for damage."""
     try:
         return read_metadata(path, RUN_METADATA)
     except OSError as error:
@@ -128,7 +128,7 @@ def read_head(path: Path) -> dict[str, str]:
 
 
 def config_of(head: dict[str, str]) -> BenchConfig | None:
-    """The bench file of a run, from its ledger's head; None where that holds none that can be read."""
+    """The configuration of a run, from its ledger's head; None if that holds none that can be read."""
     try:
         return msgspec.convert(parse_toml(Path("the ledger's head"), head.get("bench_text", "")), BenchConfig)
     except (InputError, msgspec.ValidationError, RecursionError):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from hilstar.arrays import FloatArray
@@ -9,6 +11,8 @@ from hilstar.calibrate.geometric.dots import DotPlan
 from hilstar.calibrate.geometric.observed import Observed
 from hilstar.scene.camera import Camera
 from hilstar.study.geometry.doublet import TracedBench, turned
+from hilstar.study.geometry.observed_dots import Faults
+from hilstar.study.geometry.observed_dots import observed_dots as dots_seen
 
 __all__ = ["TracedBench", "observed_dots", "turned"]
 
@@ -27,15 +31,5 @@ def observed_dots(
     """What a tracker, turned by `pose_matrix`, sees of a plan's dots: a share lost, as many false ones, Gaussian noise."""
     directions = bench.directions(plan.x_px, plan.y_px)
     x, y = tracker.project(directions if pose_matrix is None else directions @ pose_matrix.T)
-    width, height = tracker.resolution_px
-    inside = (x > 0) & (x < width - 1) & (y > 0) & (y < height - 1)
-    frames, xs, ys = [], [], []
-    for frame in range(plan.frames):
-        dots = np.flatnonzero(plan.lit[:, frame] & inside)
-        dots = dots[rng.uniform(size=len(dots)) >= lost]
-        count = rng.poisson(false * len(dots))
-        frames.append(np.full(len(dots) + count, frame))
-        xs.append(np.concatenate([x[dots] + rng.normal(0, noise_px, len(dots)), rng.uniform(0, width, count)]))
-        ys.append(np.concatenate([y[dots] + rng.normal(0, noise_px, len(dots)), rng.uniform(0, height, count)]))
-    frame = np.concatenate(frames)
-    return Observed(frame, np.full(len(frame), pose), np.concatenate(xs), np.concatenate(ys), np.ones(len(frame)))
+    seen = dots_seen(plan, x, y, tracker.resolution_px, Faults(noise_px, lost, false), rng)
+    return replace(seen, pose=np.full(len(seen), pose))

@@ -20,7 +20,7 @@ from hilstar.charts import chart, plain_ticks, write_records
 from hilstar.monitor.geometry import monitor_camera
 from hilstar.scene.camera import Camera
 from hilstar.study.geometry.doublet import TracedBench
-from hilstar.study.geometry.observed_dots import observed_dots
+from hilstar.study.geometry.observed_dots import Faults, observed_dots
 from hilstar.units import ARCSEC_PER_RAD
 
 BENCH = TracedBench(lens_shift_mm=(8.0, -5.0), lens_tilt_deg=(4.0, 2.5))
@@ -108,7 +108,8 @@ def _outcomes(frames: Frames) -> list[Outcome]:
     """Every model on the same centroids."""
     rng = np.random.default_rng(SEED)
     plan = plan_dots(BENCH.resolution_px, frames.count, frames.dots, rng)
-    seen = observed_dots(BENCH, plan, TRACKER, frames.noise_px, rng)
+    x_px, y_px = TRACKER.project(BENCH.directions(plan.x_px, plan.y_px))
+    seen = observed_dots(plan, x_px, y_px, TRACKER.resolution_px, Faults(frames.noise_px), rng)
     nominal = _nominal()
     look = first_look(plan, nominal, seen, rng)
     data = match_by_maps(plan, nominal, seen, look)

@@ -16,9 +16,9 @@ import pytest
 from hilstar.cli import app
 from hilstar.errors import HilstarError, one_line
 from tests.support.benches import SMALL_BENCH
-from tests.support.commands import assert_refused, run_hilstar_here
+from tests.support.commands import assert_refused, bounded_by, run_hilstar_here
 
-PATIENCE_S = 20
+LONGEST_S = 60  # of a test: all that it refuses
 MEMORY_BYTES = 4 << 30
 BENCH = SMALL_BENCH.replace("[1024, 1024]", "[64, 64]").replace("[320, 240]", "[64, 48]")
 FRAME = ("frame", "bench.toml", "--radec", "84,-1,0", "--codes", "codes.png")
@@ -30,16 +30,9 @@ LOG_FORMATS = "hilstar reads CSV, JSON lines, CCSDS AEM (KVN or XML) and MCAP"
 @pytest.fixture(autouse=True)
 def bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """In a directory of its own, with an alarm: whatever waits for ever fails, and does not stop the suite."""
-
-    def too_long(*_: object) -> None:
-        raise TimeoutError("it takes too long")
-
     monkeypatch.chdir(tmp_path)
-    before = signal.signal(signal.SIGALRM, too_long)
-    signal.alarm(3 * PATIENCE_S)
-    yield
-    signal.alarm(0)
-    signal.signal(signal.SIGALRM, before)
+    with bounded_by(LONGEST_S):
+        yield
 
 
 def refusal(*words: str) -> str:

@@ -136,7 +136,7 @@ def test_wrong_inputs_are_refused(golden, small_bench_file, tmp_path):
     assert_refused(run_hilstar_here("compare", fits_file, blank), 2, "no star")
     (tmp_path / "empty.csv").write_text("hip,x_px\n1,2\n")
     assert_refused(run_hilstar_here("compare", tmp_path / "none.fits", fits_file), 2, "none.fits", "No such file")
-    assert_refused(run_hilstar_here("compare", small_bench_file, fits_file), 2, "bench.toml", "no FITS image")
+    assert_refused(run_hilstar_here("compare", small_bench_file, fits_file), 2, "bench.toml", "not a FITS image")
     assert_refused(run_hilstar_here("compare", tmp_path, fits_file), 2, "it is a directory")
     assert_refused(run_hilstar_here("compare", dn, fits_file), 2, "dn.fits", "electron/s")
     assert_refused(run_hilstar_here("compare", small, fits_file), 2, "100 x 240 px against 320 x 240 px")

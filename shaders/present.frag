@@ -7,7 +7,7 @@ uniform usampler2D triples;  // with bit stealing the codes of each level, in ro
 uniform float white;         // the largest code
 uniform ivec2 size_px;       // of the image
 uniform ivec2 screen_px;
-uniform ivec2 cross_px;      // principal point
+uniform ivec2 cross_px;      // boresight
 uniform int overlay;         // bit 0: crosshair, 1: grid, 2: blank, 3: patch
 uniform uint patch_code;
 

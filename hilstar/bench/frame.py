@@ -155,8 +155,12 @@ class Bench:
         if rate_cam_rad_s is None:
             return None
         turn = Turn(q_icrs_to_cam, np.asarray(rate_cam_rad_s, dtype=np.float64))
-        motion_px = turn.speed_rad_s * self.scan.longest_s * self.camera.focal_length_px
+        motion_px = turn.speed_rad_s * self.scan.longest_s * self._px_per_rad
         return turn if motion_px > self.config.render.motion_above_px else None
+
+    @cached_property
+    def _px_per_rad(self) -> float:
+        return self.camera.scales_px_rad()[1]
 
     def _swept(self, turn: Turn) -> Sprites:
         sprites = swept_sprites(self.shown_stars, turn, self.scan, self.camera, self.renderer.footprint_px, self._sigma_px)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -53,11 +54,14 @@ def sky_header(bench_hash: str, epoch_jyear: float, q_icrs_to_cam: FloatArray, c
     header["BENCHSHA"] = bench_hash  # no room on the card for a comment
     header["CREATOR"] = f"hilstar {__version__}"
     header.update(world_coordinates(camera, q_icrs_to_cam))
+    if camera.lens is not None:
+        header["LENS"] = (True, "stars are bent by a lens that TAN leaves out")
+        header["LENSERR"] = (lens_error_px(camera), "[px] the largest distance of a star from TAN")
     return header
 
 
 def world_coordinates(camera: Camera, q_icrs_to_cam: FloatArray) -> dict[str, str | float]:
-    """The FITS TAN keywords of an image; exact, because the image is a tangent plane."""
+    """The FITS TAN keywords of an image: exact for a pinhole, whose image is a tangent plane, and without any lens."""
     right, down, normal = camera.cam_to_image @ to_matrix(q_icrs_to_cam)
     ra, dec = np.arctan2(normal[1], normal[0]), np.arctan2(normal[2], np.hypot(normal[0], normal[1]))
     east = np.array([-np.sin(ra), np.cos(ra), 0.0])
@@ -79,6 +83,14 @@ def world_coordinates(camera: Camera, q_icrs_to_cam: FloatArray) -> dict[str, st
         "CD2_1": float(right @ north * deg_per_px),
         "CD2_2": float(down @ north * deg_per_px),
     }
+
+
+def lens_error_px(camera: Camera) -> float:
+    """The largest distance on the image between where a camera and its TAN keywords have a star, px."""
+    x_px, y_px = (part.ravel() for part in np.meshgrid(*(np.linspace(0, size - 1, 17) for size in camera.resolution_px)))
+    u, v = camera.tangents(x_px, y_px)
+    tan_x, tan_y = replace(camera, lens=None).places_px(u, v)
+    return round(float(np.nanmax(np.hypot(tan_x - x_px, tan_y - y_px))), 4)
 
 
 def write_truth_csv(path: Path, frame: Frame) -> None:

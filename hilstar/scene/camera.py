@@ -17,6 +17,7 @@ NEWTON_ROUNDS, STEPS_A_ROUND = 10, 5  # slopes are found once a round: a mild le
 # Of a focal length, 1e-8 px on any screen; slopes by differences of SLOPE_STEP are right to 1e-10, which is enough for that.
 NEWTON_DONE = 1e-13
 SLOPE_STEP = 1e-6
+WITHIN = 1 - 1e-12  # the lens, whatever rounding does
 MAX_TANGENT = 1e3  # a step this long has left the solution
 
 
@@ -44,6 +45,27 @@ class Camera:
             return x, y
         near = np.divide(1.0, z, out=np.full_like(z, np.nan), where=z > 0)
         return self.places_px(image_vectors[:, 0] * near, image_vectors[:, 1] * near)
+
+    def project_outward(self, image_vectors: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """As `project`, but beyond the lens on straight lines away from the image: a path may begin and end there."""
+        x_px, y_px = self.project(image_vectors)
+        if self.lens is None:
+            return x_px, y_px
+        z = image_vectors[:, 2]
+        far = np.hypot(image_vectors[:, 0], image_vectors[:, 1]) / self.lens.max_tangent
+        beyond = np.flatnonzero((z > 0) & np.isnan(x_px))
+        if len(beyond):
+            times = far[beyond] / z[beyond]
+            edge_x, edge_y = self.places_px(*(image_vectors[beyond, :2] / (z[beyond] * times)[:, None] * WITHIN).T)
+            cx, cy = self.principal_point_px
+            x_px[beyond], y_px[beyond] = cx + (edge_x - cx) * times, cy + (edge_y - cy) * times
+        return x_px, y_px
+
+    @property
+    def boresight_px(self) -> tuple[float, float]:
+        """The pixel of cam's +z; the principal point where that is behind the image."""
+        x_px, y_px = self.project_outward(self.cam_to_image[:, 2][None])
+        return (float(x_px[0]), float(y_px[0])) if np.isfinite(x_px[0]) else self.principal_point_px
 
     def places_px(self, u: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Pixel x and y of directions (u, v, 1) in image axes, (n,) each; NaN beyond the lens."""
@@ -115,6 +137,19 @@ class Camera:
             return float(self.focal_length_px * np.hypot(du, dv).max())
         a, b, c, d = self.slopes(u, v)
         return float(np.nanmax(np.hypot(a * du + b * dv, c * du + d * dv)))
+
+    def scales_px_rad(self) -> tuple[float, float]:
+        """The smallest and the largest number of pixels to a radian anywhere on the image; a pinhole's are both its axis's."""
+        if self.lens is None:
+            return self.focal_length_px, self.focal_length_px
+        u, v = self.tangents(*self._grid_px(SPEED_PLACES))
+        a, b, c, d = self.slopes(u, v)
+        # A tangent's step (du, dv) is an angle by the metric of the sphere, whose inverse is (1 + r^2) (1 + w w^T), w = (u, v).
+        along_x, along_y, wide = a * u + b * v, c * u + d * v, 1 + u * u + v * v
+        xx, yy = wide * (a * a + b * b + along_x**2), wide * (c * c + d * d + along_y**2)
+        xy = wide * (a * c + b * d + along_x * along_y)
+        middle, spread = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
+        return float(np.sqrt(np.nanmin(middle - spread))), float(np.sqrt(np.nanmax(middle + spread)))
 
     def _grid_px(self, count: int) -> tuple[FloatArray, FloatArray]:
         """Places (count^2,) over the whole image, its edges among them."""

@@ -76,13 +76,13 @@ class Paths:
         angle = (self.speed_rad_s * seconds)[:, None]
         cosine = np.cos(angle)
         seen = self._seen[star] * cosine - self._cross[star] * np.sin(angle) + self._along[star] * (1 - cosine)
-        return self.camera.project(seen)
+        return self.camera.project_outward(seen)
 
     def all_places_px(self, seconds: float) -> tuple[FloatArray, FloatArray]:
         """Pixel x and y of all stars (n,) at one moment; NaN behind the camera."""
         angle = self.speed_rad_s * seconds
         cosine = float(np.cos(angle))
-        return self.camera.project(self._seen * cosine - self._cross * np.sin(angle) + self._along * (1 - cosine))
+        return self.camera.project_outward(self._seen * cosine - self._cross * np.sin(angle) + self._along * (1 - cosine))
 
 
 @dataclass(frozen=True, slots=True)

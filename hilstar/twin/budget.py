@@ -128,7 +128,7 @@ def _rows(bench: Bench, clips_v_mag: float) -> list[MagnitudeRow]:
     panel = Panel(bench.calibration.response, WHITE)
     sprites, tile = phase_grid(PHASES, sigma_px)
     bright = linear_image(sprites, (PHASES * tile, PHASES * tile), sigma_px)
-    arcsec_per_px = ARCSEC_PER_RAD / bench.camera.focal_length_px
+    arcsec_per_px = ARCSEC_PER_RAD / bench.camera.scales_px_rad()[0]  # where a pixel is widest
     rows = []
     for mag in np.arange(0.0, MAX_BELOW_WHITE_MAG + STEP_MAG / 2, STEP_MAG):
         wanted = bright * flux_ratio(mag)

@@ -40,7 +40,7 @@ class Screen:
             screen_px=window.size_px,
             bits=monitor.bits,
             orientation=orientation_of(monitor),
-            cross_px=bench.camera.principal_point_px,
+            cross_px=bench.camera.boresight_px,
             triples=bench.calibration.response.rgb,
         )
         self._presenter = Presenter(bench.renderer.codes_texture, view)

@@ -122,7 +122,7 @@ def codes_of(bench_file: Path) -> np.ndarray:
 
 
 def lines_over(codes: np.ndarray, keys: str) -> np.ndarray:
-    """The codes with a grid of 100 px about the principal point, and the crosshair through it, of code 96."""
+    """The codes with a grid of 100 px about the boresight, and the crosshair through it, of code 96."""
     rows, columns = np.mgrid[0 : codes.shape[0], 0 : codes.shape[1]]
     # The middle of 640 x 480 is at 319.5, 239.5; the screen has its lines at whole pixels, half rounded to even.
     dx, dy = columns - 320, rows - 240

@@ -58,6 +58,21 @@ def from_rotation_vector(vector_rad: FloatArray) -> FloatArray:
     return np.array([np.cos(angle / 2), *(share * vector_rad)])
 
 
+def from_rotation_vectors(vectors_rad: FloatArray) -> FloatArray:
+    """The rotations (n, 4) of rotation vectors (n, 3), as `from_rotation_vector` has one."""
+    angle = np.linalg.norm(vectors_rad, axis=-1, keepdims=True)
+    return np.concatenate([np.cos(angle / 2), np.sinc(angle / (2 * np.pi)) / 2 * vectors_rad], axis=-1)
+
+
+def to_rotation_vector(q: FloatArray) -> FloatArray:
+    """The rotation vectors (..., 3), rad, of unit quaternions (..., 4), the shorter way round."""
+    q = np.where(q[..., :1] < 0, -q, q)
+    sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
+    tiny = sine < SMALL_RAD
+    angle = 2 * np.arctan2(sine, q[..., :1])
+    return np.asarray(q[..., 1:] * np.where(tiny, 2.0 + sine * sine / 3.0, angle / np.where(tiny, 1.0, sine)))
+
+
 def from_matrix(matrix: FloatArray) -> FloatArray:
     """The quaternion (4,), w >= 0, of a rotation matrix (3, 3): the largest component first (Shepperd 1978)."""
     trace = float(np.trace(matrix))

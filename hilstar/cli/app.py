@@ -9,6 +9,7 @@ import typer
 
 from hilstar import __version__
 from hilstar.cli.benchmark import benchmark
+from hilstar.cli.calibrate.alignment import alignment
 from hilstar.cli.calibrate.dots import dots
 from hilstar.cli.calibrate.geometric import geometric
 from hilstar.cli.calibrate.latency import latency
@@ -44,7 +45,9 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-calibrate = typer.Typer(help="Calibrate a bench: its geometry by dots, its monitor by patches, its scale by stars.")
+calibrate = typer.Typer(
+    help="Calibrate a bench: its geometry by dots or attitudes, its monitor by patches, its scale by stars."
+)
 
 
 def print_version(wanted: bool) -> None:
@@ -66,6 +69,6 @@ def hilstar(
 for panel, commands in COMMANDS.items():
     for command in commands:
         app.command(rich_help_panel=panel)(command)
-for command in (dots, geometric, plan, photometric, scale):
+for command in (dots, geometric, alignment, plan, photometric, scale):
     calibrate.command()(command)
 app.add_typer(calibrate, name="calibrate", rich_help_panel="Calibrate")

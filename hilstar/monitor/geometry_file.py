@@ -22,7 +22,7 @@ from hilstar.scene.lens import Lens, ResidualField
 MAX_FILE_BYTES = 1_000_000
 MAX_TERMS = 21
 NORM_TOLERANCE = 1e-3
-ADVICE = "give a file that `hilstar calibrate geometric` wrote"
+ADVICE = "give a file that `hilstar calibrate geometric` or `alignment` wrote"
 Finite = Annotated[float, Meta(ge=-1e9, le=1e9)]
 Sizes = tuple[Annotated[int, Meta(ge=1, le=32768)], Annotated[int, Meta(ge=1, le=32768)]]
 
@@ -45,7 +45,10 @@ class LensTable(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ErrorTable(msgspec.Struct, frozen=True, kw_only=True):
-    """[error]: of dots that were held out, and one sigma of a star's place: over the screen, and its rms and maximum."""
+    """[error]: of dots that were held out, and one sigma of a star's place: over the screen, and its rms and maximum.
+
+    An alignment adds the rms of what its rotation leaves, one axis.
+    """
 
     model: str = ""
     held_out_rms_arcsec: float | None = None
@@ -53,15 +56,26 @@ class ErrorTable(msgspec.Struct, frozen=True, kw_only=True):
     noise_px: float | None = None
     rms_arcsec: float | None = None
     max_arcsec: float | None = None
-    map_arcsec: list[list[float]] = []
+    map_arcsec: list[list[float]] | None = None
+    alignment_cross_arcsec: float | None = None
+    alignment_roll_arcsec: float | None = None
 
 
 class MadeTable(msgspec.Struct, frozen=True, kw_only=True):
-    """[made]: by which version, when, and of how many poses of the tracker."""
+    """[made]: by which version, when, and of how many poses of the tracker.
+
+    Of an alignment also how many pairs were given and used, the lines of the wild ones, the rotation that was taken out, and
+    where the lens is from.
+    """
 
     by: str = ""
     when: str = ""
-    poses: int = 1
+    poses: int | None = None
+    pairs: int | None = None
+    pairs_used: int | None = None
+    wild_rows: list[int] | None = None
+    rotation_arcsec: tuple[float, float, float] | None = None
+    lens_of: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,11 +111,7 @@ KIND = "hilstar geometry 1"
 
 def load_geometry(path: Path, resolution_px: tuple[int, int]) -> Camera:
     """The camera of a geometry file for a monitor of `resolution_px`. Raises InputError."""
-    table = parse_toml(path, read_text(path, ADVICE, MAX_FILE_BYTES))
-    try:
-        found = msgspec.convert(table, GeometryFile)
-    except msgspec.ValidationError as error:
-        raise InputError(f"{path}: {shortened(str(error))}; {ADVICE}") from error
+    found = _read(path)
     if found.kind != KIND:
         raise InputError(f"{path}: kind = {shortened(repr(found.kind))} and {KIND!r} is wanted; {ADVICE}")
     if found.resolution_px != resolution_px:
@@ -119,6 +129,20 @@ def load_geometry(path: Path, resolution_px: tuple[int, int]) -> Camera:
         math.inf if found.max_field_deg is None else math.tan(math.radians(found.max_field_deg)),
     )
     return Camera(resolution_px, found.focal_length_px, found.principal_point_px, to_matrix(normalise(q)), lens)
+
+
+def load_notes(path: Path) -> Notes:
+    """The notes of a geometry file. Raises InputError."""
+    found = _read(path)
+    return Notes(found.sigma, found.error or ErrorTable(), found.made or MadeTable())
+
+
+def _read(path: Path) -> GeometryFile:
+    table = parse_toml(path, read_text(path, ADVICE, MAX_FILE_BYTES))
+    try:
+        return msgspec.convert(table, GeometryFile)
+    except msgspec.ValidationError as error:
+        raise InputError(f"{path}: {shortened(str(error))}; {ADVICE}") from error
 
 
 def _field(path: Path, field: Field, resolution_px: tuple[int, int]) -> ResidualField:

@@ -28,8 +28,8 @@ class Collimator(Table, frozen=True):
     geometry: Annotated[
         str | None,
         Meta(
-            description="The path of a file that `hilstar calibrate geometric` wrote: the real lens and the real alignment. It "
-            "takes the place of the other keys of this table.",
+            description="The path of a file that `hilstar calibrate geometric` or `alignment` wrote: the lens and "
+            "the real alignment. It takes the place of the other keys of this table.",
             extra={"default": "an ideal lens"},
         ),
     ] = None

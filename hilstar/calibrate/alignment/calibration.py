@@ -59,7 +59,7 @@ def align_files(file: BenchFile, table: Path, ledger: Path | None, offset_s: flo
 def align(pairs: Pairs, camera: Camera) -> Aligned:
     """Find the alignment of a tracker behind the monitor's `camera`.
 
-    Raises InputError, with the cure, for too few pairs, other conventions, and more than half of wild ones.
+    Raises InputError, with the cure, for too few pairs, other conventions, and half or more of wild ones.
     """
     if len(pairs) < MIN_PAIRS:
         skipped = f" ({pairs.skipped} more are not valid)" if pairs.skipped else ""
@@ -67,9 +67,9 @@ def align(pairs: Pairs, camera: Camera) -> Aligned:
     refuse_conventions(pairs, camera.field_radius_rad(0.0))
     fit = fit_rotation(multiply(pairs.reported, conjugate(pairs.commanded)))
     used = fit.used
-    if 2 * used.sum() < len(pairs):
+    if 2 * used.sum() <= len(pairs):
         raise InputError(
-            f"{pairs.source}: more than half of the reported attitudes are wild: {used.sum()} of {len(pairs)} agree; look for"
+            f"{pairs.source}: half or more of the reported attitudes are wild: {used.sum()} of {len(pairs)} agree; look for"
             " lost stars, and rows of other times"
         )
     kept = Pairs(

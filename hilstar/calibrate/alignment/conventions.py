@@ -70,7 +70,7 @@ def _conventions(names: tuple[str, ...]) -> Iterator[Convention]:
 
 
 def refuse_conventions(pairs: Pairs, field_radius_rad: float) -> None:
-    """Refuse (InputError) pairs that agree by another convention than hilstar's, or of which more than half are wild.
+    """Refuse (InputError) pairs that agree by another convention than hilstar's, or of which half or more are wild.
 
     Also where the rotation would turn the screen, of `field_radius_rad`, out of the tracker's view.
     """
@@ -90,7 +90,7 @@ def refuse_conventions(pairs: Pairs, field_radius_rad: float) -> None:
         raise InputError(f"{pairs.source}: no one rotation leads from the commanded to the reported attitudes; {cure}")
     if not agrees:
         raise InputError(
-            f"{pairs.source}: more than half of the reported attitudes are wild: fewer than half of {len(pairs)} agree within"
+            f"{pairs.source}: half or more of the reported attitudes are wild: no more than half of {len(pairs)} agree within"
             f" {np.degrees(AGREE_RAD):g} degree of one rotation; look for lost stars, rows of other times, or another sky"
         )
     if out_of_view:

@@ -74,8 +74,8 @@ def _against_repeats(part: FloatArray, group: IntArray) -> tuple[float, float] |
         return None
     means = _means(part, group)
     within = float(((part - means[group]) ** 2).sum()) / (axes * (pairs - groups))
-    within = max(within, FLOOR_RAD**2)
     repeat = ARCSEC_PER_RAD * float(np.sqrt(within))
+    within = max(within, FLOOR_RAD**2)
     if groups < 2:
         return repeat, 0.0
     between = float((count[:, None] * (means - part.mean(axis=0)) ** 2).sum()) / (axes * (groups - 1))

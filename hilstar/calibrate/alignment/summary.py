@@ -119,8 +119,9 @@ def lines_of(summary: AlignmentSummary) -> list[str]:
     )
     named = ", ".join(map(str, summary.wild_rows[:MAX_NAMED])) + (", ..." if summary.wild > MAX_NAMED else "")
     skipped = f", {summary.skipped} skipped" if summary.skipped else ""
+    of = "all of one attitude" if summary.attitudes == 1 else f"of {summary.attitudes} attitudes"
     rows = [
-        ("pairs", f"{summary.used} of {summary.pairs} used, of {summary.attitudes} attitudes{skipped}"),
+        ("pairs", f"{summary.used} of {summary.pairs} used, {of}{skipped}"),
         ("wild", f"{summary.wild}, on lines {named}" if summary.wild else "none"),
         ("reported - commanded", f"x {x}, y {y}, about the boresight {z} arcsec"),
         ("residual", _both(summary.residual_arcsec)),

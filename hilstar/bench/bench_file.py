@@ -36,7 +36,11 @@ class BenchFile:
 
 def read_bench_file(path: Path) -> BenchFile:
     """Read and check a bench file. Raises InputError: file, key, what is wrong and what to write."""
-    text = read_text(path, "give the path of a bench file", MAX_TOML_BYTES)
+    return bench_file_of(path, read_text(path, "give the path of a bench file", MAX_TOML_BYTES))
+
+
+def bench_file_of(path: Path, text: str) -> BenchFile:
+    """The bench file that `path` would be with this text. Raises InputError as `read_bench_file` does."""
     config = parse_config(path, text)
     return BenchFile(path, text, config, _sha256(config, path.parent))
 

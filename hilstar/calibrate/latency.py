@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from hilstar.arrays import FloatArray, IntArray
+from hilstar.bench.bench_file_edit import with_key
 from hilstar.bench.config import BenchConfig
-from hilstar.calibrate.bench_file_edit import with_key
 from hilstar.calibrate.edges import MIN_EDGES, Edges
 from hilstar.errors import InputError, shortened
 from hilstar.files import write_whole

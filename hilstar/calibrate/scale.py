@@ -9,9 +9,9 @@ import numpy as np
 
 from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile
+from hilstar.bench.bench_file_edit import with_key
 from hilstar.bench.config import read_config
 from hilstar.bench.frame import Bench
-from hilstar.calibrate.bench_file_edit import with_key
 from hilstar.errors import InputError
 from hilstar.files import write_whole
 from hilstar.scene.psf import peak_share

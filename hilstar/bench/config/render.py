@@ -18,7 +18,7 @@ class RenderSettings(Table, frozen=True):
     """From electrons to code values.
 
     Full scale (white) is fixed when the bench is loaded, and no frame changes it. It trades bright stars for faint ones. On
-    8 bits and a field of 18 by 10 degrees (`demo.toml`), over 200 random fields:
+    8 bits and a field of 18 by 10 degrees (`demo.toml` with `round`), over 200 random fields:
 
     | `brightest_v_mag` | stars that clip | fields with one | median brightest code | flux error, 95 % | centroid error, 95 % |
     |---|---|---|---|---|---|

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from hilstar.cli.options import MAX_SEED, BenchFile, Json
 from hilstar.console.terminal import print_json, progress
 from hilstar.files import check_directory
+
+if TYPE_CHECKING:
+    from hilstar.bench.bench_file import BenchFile as Bench
+    from hilstar.twin.verify.verdict import Verdict
 
 
 def verify(
@@ -21,6 +25,10 @@ def verify(
         Path | None, typer.Option("-o", "--output", metavar="DIR", help="Directory for charts and a table.")
     ] = None,
     strict: Annotated[bool, typer.Option("--strict", help="Exit with code 1 if the bench does not pass.")] = False,
+    propose: Annotated[
+        bool, typer.Option("--propose", help="Find the smallest change of the bench file with which a failing bench passes.")
+    ] = False,
+    write: Annotated[bool, typer.Option("--write", help="Find it, and make it in the bench file.")] = False,
     as_json: Json = False,
 ) -> None:
     """Run the digital twin: what the tracker would measure of the stars shown, against the sky."""
@@ -28,6 +36,7 @@ def verify(
 
     from hilstar.bench.bench_file import read_bench_file
     from hilstar.files import make_directory
+    from hilstar.twin.verify.proposal_report import check_writable
     from hilstar.twin.verify.report import write_report
     from hilstar.twin.verify.run import verify as run_twin
     from hilstar.twin.verify.summary import summarise, summary_lines
@@ -36,14 +45,37 @@ def verify(
     if output is not None:
         make_directory(output)
     file = read_bench_file(bench_file)
+    if write:
+        check_writable(file)
     with progress("verifying", fields) as advance:
         verdict = run_twin(file, fields, np.random.default_rng(seed), advance)
     if output is not None:
         write_report(output, verdict)
     summary = summarise(verdict)
-    if as_json:
-        print_json(asdict(summary))
-    else:
+    if not as_json:
         typer.echo("\n".join(summary_lines(summary)))
-    if strict and not verdict.passed:
+    proposed = _proposed(file, verdict, seed, write, as_json) if propose or write else {}
+    if as_json:
+        print_json(asdict(summary) | proposed)
+    mended = bool(proposed.get("written"))
+    if strict and not verdict.passed and not mended:
         raise typer.Exit(1)
+
+
+def _proposed(file: Bench, verdict: Verdict, seed: int, write: bool, as_json: bool) -> dict[str, Any]:
+    """The keys of --propose and --write in the JSON object; the lines are printed unless that is wanted."""
+    from hilstar.twin.verify.proposal import propose
+    from hilstar.twin.verify.proposal_report import proposal_lines, write_proposal
+
+    if verdict.passed:
+        return {"proposal": None, "written": False}
+    with progress("changes tried", float("inf")) as advance:
+        found = propose(file, verdict, verdict.measured.field_count, seed, advance)
+    if not as_json:
+        typer.echo("\n".join(proposal_lines(file, found)))
+    written = write and bool(found.changes)
+    if written:
+        write_proposal(file, found)
+        if not as_json:
+            typer.echo(f"{'written':20}{file.path}")
+    return {"proposal": asdict(found), "written": written}

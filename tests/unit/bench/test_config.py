@@ -96,7 +96,7 @@ def test_geometry_aperture_and_quantum_efficiency_are_all_that_a_bench_must_give
     assert (config.sky.faintest_v_mag, config.monitor.refresh_hz, config.attitude.on_stale) == (7.5, 60, "hold")
 
 
-@pytest.mark.parametrize("name", ["demo.toml", "thesis-orion.toml"])
+@pytest.mark.parametrize("name", sorted(path.name for path in (ROOT / "configs").glob("*.toml")))
 def test_the_shipped_configs_are_right(name):
     read_config(ROOT / "configs" / name)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from hilstar.calibrate.bench_file_edit import with_key
+from hilstar.bench.bench_file_edit import with_key
 
 
 @pytest.mark.parametrize(
@@ -19,3 +19,10 @@ from hilstar.calibrate.bench_file_edit import with_key
 )
 def test_one_key_of_a_bench_file_is_set_and_nothing_else_changes(before, after):
     assert with_key(before, "monitor", "key", 1.5, instead_of=("other",)) == after
+
+
+@pytest.mark.parametrize(
+    ("value", "written"), [("exact", 'key = "exact"'), (True, "key = true"), (2.5, "key = 2.5"), (8, "key = 8")]
+)
+def test_a_key_is_written_as_toml_writes_it(value, written):
+    assert with_key('[monitor]\nkey = "round"  # ours\n', "monitor", "key", value) == f"[monitor]\n{written}  # ours\n"

@@ -1,0 +1,233 @@
+"""The change of a bench file that makes a failing bench pass: each one is tried on the twin, the fewest keys first.
+
+A change is proposed only if the bench file with it is read, drawn and passes over the same fields. Among as many keys, those
+come first that cost time alone (`quantisation`, `bit_stealing`), then the one that clips bright stars, then the one that drops
+faint ones. Of magnitudes the largest change is tried first, and the smallest that passes is proposed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from hilstar.bench.bench_file import BenchFile, bench_file_of
+from hilstar.bench.bench_file_edit import with_key
+from hilstar.bench.config import DEFAULT_BRIGHTEST_V_MAG
+from hilstar.error_spread import ErrorSpread
+from hilstar.errors import InputError
+from hilstar.twin.verify.display_errors import p95
+from hilstar.twin.verify.run import verify
+from hilstar.twin.verify.summary import summarise
+from hilstar.twin.verify.verdict import Verdict
+
+# Further than this a change is another test: full scale 4 times fainter, or a third of the stars.
+BRIGHTER_MAG = (0.5, 1.0, 1.5)
+FAINTER_MAG = (-0.5, -1.0, -1.5, -2.0)
+STEPS_PER_MAG = 2
+MIN_STARS = 6  # fewer of those that were measured would say little
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """One key of a bench file with another value."""
+
+    table: str
+    key: str
+    value: float | str | bool
+
+
+@dataclass(frozen=True, slots=True)
+class Verified:
+    """What the twin said of a bench file with changes."""
+
+    fields: int
+    stars: int
+    lost: int
+    clipped: int
+    not_shown: int
+    flux_error_mag: ErrorSpread
+    centroid_error_px: ErrorSpread
+    passed: bool
+    reasons: list[str]
+
+
+@dataclass(frozen=True, slots=True)
+class Proposal:
+    """The changes that make a bench pass, with what the twin said of it so changed; the fields are keys of the JSON object.
+
+    `changes` is empty where none passes: then `verified` is of the best of those that were tried (None without any), `best` is
+    that one, and `cannot` says what cannot be met.
+    """
+
+    changes: tuple[Change, ...]
+    verified: Verified | None
+    best: tuple[Change, ...]
+    tried: int
+    cannot: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class _Key:
+    """A key, and the values that it may be given, the mildest first."""
+
+    table: str
+    key: str
+    values: tuple[float | str | bool, ...]
+
+    def at(self, place: int) -> Change:
+        return Change(self.table, self.key, self.values[place])
+
+
+def propose(
+    file: BenchFile, verdict: Verdict, fields: int, seed: int, on_try: Callable[[int], None] = lambda tried: None
+) -> Proposal:
+    """The fewest changes with which the bench of `file`, judged as `verdict`, passes over the same fields.
+
+    `on_try` hears how many changes have been tried. Raises MachineError where the twin does.
+    """
+    if not codes_at_fault(verdict):
+        cannot = f"the codes are within the limits, and no key of the light mends the rest: {verdict.reasons[0]}"
+        return Proposal((), None, (), 0, cannot)
+    trials = _Trials(file, fields, seed, on_try)
+    keys = _keys(verdict)
+    for count in range(1, len(keys) + 1):
+        for chosen in combinations(keys, count):
+            if trials.passes(_strongest(chosen)):
+                changes = _mildest(chosen, trials)
+                return Proposal(changes, _verified(trials.verdicts[changes]), (), trials.tried, None)
+    return _none_passes(verdict, trials)
+
+
+def changed_text(text: str, changes: tuple[Change, ...]) -> str:
+    """The text of a bench file with changes; comments and all else stay."""
+    for change in changes:
+        text = with_key(text, change.table, change.key, change.value)
+    return text
+
+
+def codes_at_fault(verdict: Verdict) -> bool:
+    """Whether the codes alone would exceed a limit, were everything else as assumed."""
+    limits, errors = verdict.measured.config.verify, verdict.errors
+    if not errors.looked_for:
+        return False
+    beyond = p95(np.abs(errors.codes_mag())) > limits.flux_mag or p95(errors.codes_px()) > limits.centroid_px
+    # A star that the codes lose even as assumed has no error of theirs.
+    lost = sum(not math.isfinite(star.codes_mag) for star in errors.lost)
+    return beyond or abs(errors.codes_zero_point_mag) > limits.flux_mag or lost > limits.lost_share * errors.looked_for
+
+
+class _Trials:
+    """The verdicts on a bench file with changes, each found once over the same fields."""
+
+    def __init__(self, file: BenchFile, fields: int, seed: int, on_try: Callable[[int], None]) -> None:
+        self.file, self.fields, self.seed, self.on_try = file, fields, seed, on_try
+        self.tried = 0
+        self.verdicts: dict[tuple[Change, ...], Verdict] = {}
+
+    def passes(self, changes: tuple[Change, ...]) -> bool:
+        """Whether the bench passes with the changes; False where its file is refused with them."""
+        if changes not in self.verdicts:
+            self.tried += 1
+            try:
+                self.verdicts[changes] = self._verdict(changes)
+            except InputError:
+                return False
+            finally:
+                self.on_try(self.tried)
+        return self.verdicts[changes].passed
+
+    def _verdict(self, changes: tuple[Change, ...]) -> Verdict:
+        file = bench_file_of(self.file.path, changed_text(self.file.text, changes))
+        for change in changes:  # a table that is not in plain form takes no key
+            if getattr(getattr(file.config, change.table), change.key) != change.value:
+                raise InputError(f"{file.path}: [{change.table}] {change.key} cannot be set")
+        return verify(file, self.fields, np.random.default_rng(self.seed))
+
+
+def _keys(verdict: Verdict) -> list[_Key]:
+    """The keys that a bench's calibration and settings leave to change, those that cost least first."""
+    measured = verdict.measured
+    render = measured.config.render
+    calibrations = [one for one in (measured.calibration, measured.true_calibration) if one is not None]
+    keys = [] if render.quantisation == "exact" else [_Key("render", "quantisation", ("exact",))]
+    if not render.bit_stealing and all(one.can_steal_bits for one in calibrations):
+        keys.append(_Key("render", "bit_stealing", (True,)))
+    if render.flux_at_white_e_per_s is None:  # a scale that was measured is no choice
+        brightest = DEFAULT_BRIGHTEST_V_MAG if render.brightest_v_mag is None else render.brightest_v_mag
+        keys.append(_Key("render", "brightest_v_mag", tuple(round(brightest + step, 3) for step in BRIGHTER_MAG)))
+    limits = _faintest_v_mag(verdict)
+    return [*keys, _Key("sky", "faintest_v_mag", limits)] if limits else keys
+
+
+def _faintest_v_mag(verdict: Verdict) -> tuple[float, ...]:
+    """Smaller magnitude limits of the sky, the largest first, that leave enough of the stars that were looked for."""
+    v_mag = np.array([star.v_mag for star in verdict.errors.stars + verdict.errors.lost])
+    seen = math.ceil(float(v_mag.max()) * STEPS_PER_MAG) / STEPS_PER_MAG
+    faintest = min(verdict.measured.config.sky.faintest_v_mag, seen)
+    limits = (round(faintest + step, 3) for step in FAINTER_MAG)
+    return tuple(limit for limit in limits if (v_mag <= limit).sum() >= MIN_STARS)
+
+
+def _strongest(keys: tuple[_Key, ...]) -> tuple[Change, ...]:
+    return tuple(key.at(-1) for key in keys)
+
+
+def _mildest(keys: tuple[_Key, ...], trials: _Trials) -> tuple[Change, ...]:
+    """The changes of keys that pass at their strongest, each brought to its mildest value that passes, the last key first."""
+    changes = _strongest(keys)
+    for place in reversed(range(len(keys))):
+        for step in range(len(keys[place].values) - 1):
+            milder = (*changes[:place], keys[place].at(step), *changes[place + 1 :])
+            if trials.passes(milder):
+                changes = milder
+                break
+    return changes
+
+
+def _verified(verdict: Verdict) -> Verified:
+    summary = summarise(verdict)
+    return Verified(
+        fields=summary.fields,
+        stars=summary.stars,
+        lost=summary.lost,
+        clipped=summary.clipped,
+        not_shown=summary.not_shown,
+        flux_error_mag=summary.flux_error_mag,
+        centroid_error_px=summary.centroid_error_px,
+        passed=summary.passed,
+        reasons=summary.reasons,
+    )
+
+
+def _none_passes(verdict: Verdict, trials: _Trials) -> Proposal:
+    judged = [changes for changes, one in trials.verdicts.items() if one.errors.stars]
+    if not judged:
+        return Proposal((), None, (), trials.tried, f"none of {trials.tried} changes can be judged: {verdict.reasons[0]}")
+    best = min(judged, key=lambda changes: _excess(trials.verdicts[changes]))
+    cannot = f"none of {trials.tried} changes passes; {_what_fails(trials.verdicts[best])}"
+    return Proposal((), _verified(trials.verdicts[best]), best, trials.tried, cannot)
+
+
+def _excess(verdict: Verdict) -> float:
+    """The largest of a verdict's errors as a multiple of its limit."""
+    limits, errors = verdict.measured.config.verify, verdict.errors
+    lost = len(errors.lost) / errors.looked_for
+    shares = p95(np.abs(errors.flux_mag())) / limits.flux_mag, p95(errors.centroid_px()) / limits.centroid_px
+    return max(*shares, lost / limits.lost_share if limits.lost_share else math.inf * lost if lost else 0.0)
+
+
+def _what_fails(verdict: Verdict) -> str:
+    """The magnitudes whose stars exceed a limit, and on how many bits."""
+    limits, monitor = verdict.measured.config.verify, verdict.measured.config.monitor
+    failing = [
+        row
+        for row in summarise(verdict).by_magnitude
+        if (row.flux_error_mag.p95 or 0.0) > limits.flux_mag or (row.centroid_error_px.p95 or 0.0) > limits.centroid_px
+    ]
+    if not failing:
+        return f"at best: {verdict.reasons[0]}"
+    return f"{monitor.bits} bits cannot show stars of V {failing[0].v_from} to {failing[-1].v_to} within the limits"

@@ -18,7 +18,7 @@ import zmq
 
 from tests.support.benches import ROOT
 from tests.support.commands import run_hilstar
-from tests.support.ptys import Cable
+from tests.support.wire.ptys import Cable
 
 RATE_HZ = 200
 FAULTS = ("--lose", "10%", "--corrupt", "5%", "--reorder")

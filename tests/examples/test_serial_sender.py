@@ -16,8 +16,8 @@ from hilstar.attitude.wire.packet import AttitudeSample, Status, TimeReply, Time
 from hilstar.attitude.wire.serial_link import SerialLink
 from hilstar.rotation import propagate
 from tests.support.benches import ROOT, SMALL_BENCH
-from tests.support.ptys import Cable
 from tests.support.servers import interrupted, listening
+from tests.support.wire.ptys import Cable
 
 EXAMPLES = ROOT / "examples"
 STRICT = ["-Wall", "-Wextra", "-Werror", "-pedantic"]

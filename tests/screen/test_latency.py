@@ -21,8 +21,8 @@ from hilstar.run.record.ledger_reader import read_run
 from hilstar.run.screen.photodiode import CODE, CODE_BITS, marker_light
 from tests.support.benches import ATTITUDE, SCREEN_BENCH, still_log
 from tests.support.commands import HILSTAR, assert_refused, run_hilstar, run_hilstar_here
-from tests.support.ptys import Cable
 from tests.support.waiting import real_time, wait_for
+from tests.support.wire.ptys import Cable
 from tests.support.x11.screens import Screen, xvfb
 
 # The watcher looks every 0.2 ms or so, and sleeps between; a shared machine may keep it from that now and then.

@@ -23,8 +23,8 @@ from hilstar.study.stability import run as stability
 from hilstar.study.stability import sky as stability_sky
 from hilstar.study.stability import tracker as stability_tracker
 from hilstar.study.stability.failure_case import FailureCase, Figures
-from tests.study.test_study_command import assert_drawn, table
 from tests.support.commands import run_hilstar_here
+from tests.support.pictures import assert_drawn, table
 
 
 @pytest.fixture(scope="module")

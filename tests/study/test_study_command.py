@@ -2,24 +2,8 @@
 
 from __future__ import annotations
 
-import csv
-
-import numpy as np
-from PIL import Image
-
 from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
-
-
-def table(path):
-    with path.open() as file:
-        return list(csv.DictReader(file))
-
-
-def assert_drawn(path):
-    """A picture with more than a frame in it."""
-    pixels = np.array(Image.open(path).convert("L"))
-    assert pixels.shape[0] > 300
-    assert ((pixels < 200).mean() > 0.005) and ((pixels > 250).mean() > 0.1)
+from tests.support.pictures import assert_drawn, table
 
 
 def test_the_thesis_s_outputs_are_drawn(tmp_path):

@@ -24,7 +24,7 @@ from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.senders import connected, packet
 from tests.support.servers import Served, bound
 from tests.support.waiting import PATIENCE_S, wait_for
-from tests.support.zmtp import greeted, part
+from tests.support.wire.zmtp import greeted, part
 
 # bounds.MAX_GROWTH_BYTES, and what comes within the time that a loaded machine needs to see it.
 MAX_GROWTH_MB = 256 + 500

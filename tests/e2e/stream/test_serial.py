@@ -20,8 +20,8 @@ from hilstar.run.send.sender import SerialSender, send, spin_samples
 from hilstar.run.serve import serve
 from tests.support.benches import SMALL_BENCH
 from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
-from tests.support.ptys import Cable
 from tests.support.servers import interrupted, listening
+from tests.support.wire.ptys import Cable
 
 BAUD = 921_600
 START_DEG = (84.057, -1.2, 0.0)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from hilstar.attitude.wire.cobs import MAX_FRAME_BYTES, StreamDecoder, frame
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal, TimeRequest, decode, encode
-from tests.support.samples import sample
+from tests.support.wire.samples import sample
 
 # On demand: HILSTAR_FUZZ=1000000 pytest tests/unit/attitude/wire/test_cobs.py
 MUTATED_FRAMES = int(os.environ.get("HILSTAR_FUZZ", "20000"))

@@ -16,7 +16,7 @@ from hilstar.attitude.wire.serial_link import SerialLink
 from hilstar.errors import InputError
 from hilstar.notices import Notices
 from hilstar.run.send.sender import SerialSender
-from tests.support.samples import sample
+from tests.support.wire.samples import sample
 
 FRAME = framed(encode(sample(7)))
 

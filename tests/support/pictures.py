@@ -1,0 +1,22 @@
+"""What a study has written: its tables, and charts that are not blank."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+
+def table(path: Path) -> list[dict[str, str]]:
+    """The rows of a CSV file."""
+    with path.open() as file:
+        return list(csv.DictReader(file))
+
+
+def assert_drawn(path: Path) -> None:
+    """A picture with more than a frame in it."""
+    pixels = np.array(Image.open(path).convert("L"))
+    assert pixels.shape[0] > 300
+    assert ((pixels < 200).mean() > 0.005) and ((pixels > 250).mean() > 0.1)

@@ -17,6 +17,7 @@ NEWTON_ROUNDS, STEPS_A_ROUND = 10, 5  # slopes are found once a round: a mild le
 # Of a focal length, 1e-8 px on any screen; slopes by differences of SLOPE_STEP are right to 1e-10, which is enough for that.
 NEWTON_DONE = 1e-13
 SLOPE_STEP = 1e-6
+BEYOND_BORDER = 1 + 1e-9  # the farthest corner is within the lens
 WITHIN = 1 - 1e-12  # the lens, whatever rounding does
 MAX_TANGENT = 1e3  # a step this long has left the solution
 
@@ -48,17 +49,19 @@ class Camera:
 
     def project_outward(self, image_vectors: FloatArray) -> tuple[FloatArray, FloatArray]:
         """As `project`, but beyond the lens on straight lines away from the image: a path may begin and end there."""
-        x_px, y_px = self.project(image_vectors)
         if self.lens is None:
-            return x_px, y_px
+            return self.project(image_vectors)
         z = image_vectors[:, 2]
-        far = np.hypot(image_vectors[:, 0], image_vectors[:, 1]) / self.lens.max_tangent
-        beyond = np.flatnonzero((z > 0) & np.isnan(x_px))
-        if len(beyond):
-            times = far[beyond] / z[beyond]
-            edge_x, edge_y = self.places_px(*(image_vectors[beyond, :2] / (z[beyond] * times)[:, None] * WITHIN).T)
-            cx, cy = self.principal_point_px
-            x_px[beyond], y_px[beyond] = cx + (edge_x - cx) * times, cy + (edge_y - cy) * times
+        near = np.divide(1.0, z, out=np.full_like(z, np.nan), where=z > 0)
+        u, v = image_vectors[:, 0] * near, image_vectors[:, 1] * near
+        times = np.hypot(u, v) / (self.lens.max_tangent * WITHIN)
+        beyond = np.flatnonzero(times > 1)
+        times = times[beyond]
+        u[beyond] /= times
+        v[beyond] /= times
+        x_px, y_px = self.places_px(u, v)
+        for place, centre in ((x_px, self.principal_point_px[0]), (y_px, self.principal_point_px[1])):
+            place[beyond] = centre + (place[beyond] - centre) * times
         return x_px, y_px
 
     @property
@@ -180,7 +183,7 @@ def bounded(camera: Camera, margin_px: float) -> Camera:
     reach = min(float(np.nan_to_num(np.hypot(u, v), nan=np.inf).max()), lens.max_tangent)
     if not np.isfinite(reach) or _folds(free, reach):
         raise InputError("its distortion folds within the screen: two directions share a pixel; fit it again, with fewer terms")
-    return replace(camera, lens=replace(lens, max_tangent=reach))
+    return replace(camera, lens=replace(lens, max_tangent=reach * BEYOND_BORDER))
 
 
 def _border_px(resolution_px: tuple[int, int], margin_px: float) -> tuple[FloatArray, FloatArray]:

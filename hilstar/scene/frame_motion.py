@@ -141,8 +141,8 @@ def _wanted_nodes(
 ) -> tuple[IntArray, tuple[FloatArray, FloatArray]]:
     """How many nodes each star's path needs (0: it misses the image), and the part of its time that it is on the image."""
     every = np.arange(len(paths))
-    ends = [paths.places_px(every, late_s + seconds) for seconds in (0.0, scan.hold_s)]
-    chords = Chords(np.stack([x for x, _ in ends]), np.stack([y for _, y in ends]))
+    ends = paths.places_px(np.tile(every, 2), np.concatenate([late_s, late_s + scan.hold_s]))
+    chords = Chords(*(places.reshape(2, -1) for places in ends))
     angle_rad = paths.speed_rad_s * scan.hold_s
     # An arc bulges from its chord, and a star runs unevenly along it, by less than the angle of the turn.
     bulge_px = angle_rad * np.nan_to_num(chords.length_sigma((1.0, 1.0)))

@@ -38,7 +38,7 @@ class ResidualField:
     def at(self, x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The shift at pixels (k,), px."""
         columns, rows = _polynomials(x_px, y_px, self.resolution_px, len(self.x) - 1)
-        return ((self.x.T @ columns) * rows).sum(axis=0), ((self.y.T @ columns) * rows).sum(axis=0)
+        return np.einsum("ik,ik->k", self.x.T @ columns, rows), np.einsum("ik,ik->k", self.y.T @ columns, rows)
 
 
 def field_terms(x_px: FloatArray, y_px: FloatArray, resolution_px: tuple[int, int], degree: int) -> FloatArray:
@@ -57,20 +57,24 @@ def _exponents(degree: int) -> tuple[IntArray, IntArray]:
 def _polynomials(
     x_px: FloatArray, y_px: FloatArray, resolution_px: tuple[int, int], degree: int
 ) -> tuple[FloatArray, FloatArray]:
-    columns, rows = (
-        _chebyshev(np.clip((2 * place - (size - 1)) / size, -FIELD_EDGE, FIELD_EDGE), degree + 1)
-        for place, size in zip((x_px, y_px), resolution_px, strict=True)
-    )
-    return columns, rows
+    place = np.empty((2, len(x_px)))
+    for row, at, size in zip(place, (x_px, y_px), resolution_px, strict=True):
+        np.multiply(at, 2 / size, out=row)
+        row -= (size - 1) / size
+    terms = _chebyshev(np.clip(place, -FIELD_EDGE, FIELD_EDGE, out=place), degree + 1)
+    return terms[:, 0], terms[:, 1]
 
 
 def _chebyshev(t: FloatArray, count: int) -> FloatArray:
-    """T_0 to T_(count - 1) at places (k,): (count, k)."""
-    terms = np.ones((count, len(t)))
+    """T_0 to T_(count - 1) at places of any shape: (count, ...). Few and large operations: a frame has 0.3 ms for its lens."""
+    terms = np.empty((count, *t.shape))
+    terms[0] = 1.0
     if count > 1:
         terms[1] = t
+    twice = 2 * t
     for k in range(2, count):
-        terms[k] = 2 * t * terms[k - 1] - terms[k - 2]
+        np.multiply(twice, terms[k - 1], out=terms[k])
+        terms[k] -= terms[k - 2]
     return terms
 
 
@@ -94,9 +98,12 @@ class Lens:
         p1, p2 = self.tangential
         r2 = u * u + v * v
         gain = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        gain = np.where(r2 <= self.max_tangent**2, gain, np.nan)
-        bent_u = u * gain + 2 * p1 * u * v + p2 * (r2 + 2 * u * u)
-        bent_v = v * gain + p1 * (r2 + 2 * v * v) + 2 * p2 * u * v
+        gain[~(r2 <= self.max_tangent**2)] = np.nan
+        bent_u, bent_v = u * gain, v * gain
+        if p1 or p2:
+            along = 2 * (p1 * v + p2 * u)
+            bent_u += along * u + p2 * r2
+            bent_v += along * v + p1 * r2
         return _on_plane(bent_u, bent_v, self.tilt_rad)
 
 
@@ -104,12 +111,12 @@ def _on_plane(u: FloatArray, v: FloatArray, tilt_rad: tuple[float, float]) -> tu
     """Where rays (u, v, 1) meet a plane through (0, 0, 1) that is turned about x, then about y, in its own axes."""
     if tilt_rad == (0.0, 0.0):
         return u, v
-    right, down, normal = plane_axes(tilt_rad).T
+    axes = plane_axes(tilt_rad)
+    right, down, normal = axes.T @ np.stack([u, v, np.ones_like(u)])
     with np.errstate(divide="ignore", invalid="ignore"):
-        along = normal[2] / (u * normal[0] + v * normal[1] + normal[2])
-    along = np.where(along > 0, along, np.nan)
-    x, y, z = along * u, along * v, along - 1.0
-    return x * right[0] + y * right[1] + z * right[2], x * down[0] + y * down[1] + z * down[2]
+        along = axes[2, 2] / normal
+    along[~(along > 0)] = np.nan
+    return right * along - axes[2, 0], down * along - axes[2, 1]
 
 
 def plane_axes(tilt_rad: tuple[float, float]) -> FloatArray:

@@ -31,7 +31,8 @@ Every command that has `--json` then prints one JSON object on stdout and nothin
 | exit code | meaning |
 |---|---|
 | 0 | Done. |
-| 1 | `compare`: not the same sky; `verify --strict`: not passed; `serve` and `replay`: the ledger failed. |
+| 1 | `compare`: not the same sky; `verify --strict`: not passed; `first-light`: a failed step; \
+`serve` and `replay`: the ledger failed. |
 | {InputError.exit_code} | The command line or a file was wrong. |
 | {MachineError.exit_code} | The machine lacks something, such as OpenGL or a display, or its display went away. |
 | 4 | `serve`: the run ended without ever having had an attitude. |

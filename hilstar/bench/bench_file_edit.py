@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Sequence
 
 
-def with_key(text: str, table: str, key: str, value: float | str | bool, instead_of: tuple[str, ...] = ()) -> str:
+def with_key(
+    text: str, table: str, key: str, value: float | str | bool | Sequence[float], instead_of: tuple[str, ...] = ()
+) -> str:
     """TOML `text` with `key` of a plain `[table]` set: its line replaced, or that of a key in `instead_of`, or one added.
 
     Where the table is written in another TOML form, the result means something else: parse it again to see.
     """
-    line = f"{key} = {json.dumps(value)}"  # of a number, a truth value or plain text, TOML writes the same
+    line = f"{key} = {json.dumps(value)}"  # of numbers, truth values and plain text, TOML writes the same
     header = re.search(rf"^[ \t]*\[{table}\][^\n]*\n?", text, re.MULTILINE)
     if header is None:
         return f"{text.rstrip()}\n\n[{table}]\n{line}\n".lstrip()

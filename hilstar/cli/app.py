@@ -11,6 +11,7 @@ from hilstar import __version__
 from hilstar.cli.benchmark import benchmark
 from hilstar.cli.calibrate.alignment import alignment
 from hilstar.cli.calibrate.dots import dots
+from hilstar.cli.calibrate.first_light import first_light
 from hilstar.cli.calibrate.geometric import geometric
 from hilstar.cli.calibrate.latency import latency
 from hilstar.cli.calibrate.photometric import photometric
@@ -35,7 +36,7 @@ COMMANDS: dict[str, tuple[Callable[..., None], ...]] = {
     "Show stars": (demo, frame, serve, replay),
     "Attitude streams": (send, convert, keys),
     "Check what is shown": (simulate, verify, compare, budget, report),
-    "Calibrate": (latency,),
+    "Calibrate": (first_light, latency),
     "Study": (study, benchmark),
     "This machine": (doctor,),
 }
@@ -68,7 +69,7 @@ def hilstar(
 
 for panel, commands in COMMANDS.items():
     for command in commands:
-        app.command(rich_help_panel=panel)(command)
+        app.command(command.__name__.replace("_", "-"), rich_help_panel=panel)(command)
 for command in (dots, geometric, alignment, plan, photometric, scale):
     calibrate.command()(command)
 app.add_typer(calibrate, name="calibrate", rich_help_panel="Calibrate")

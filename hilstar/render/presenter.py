@@ -35,10 +35,10 @@ class Orientation:
         return (-x, -y) if self.flip_y else (x, y)
 
 
-def level_texture(context: moderngl.Context, levels: npt.NDArray[np.uint8]) -> moderngl.Texture:
+def level_texture(context: moderngl.Context, levels: npt.NDArray[np.uint8 | np.uint16]) -> moderngl.Texture:
     """A texture of levels (height, width) that no renderer made."""
     with context:
-        texture = context.texture(levels.shape[::-1], 1, np.ascontiguousarray(levels), dtype="u1", alignment=1)
+        texture = context.texture(levels.shape[::-1], 1, np.ascontiguousarray(levels), dtype=f"u{levels.itemsize}", alignment=1)
         texture.filter = (moderngl.NEAREST, moderngl.NEAREST)
         return texture
 

@@ -17,6 +17,7 @@ from hilstar.reading import read_bytes
 from hilstar.tracker.centroids import CentroidSettings, find_stars
 
 FITS_ENDINGS = (".fits", ".fit", ".fts")
+FITS_MAGIC = b"SIMPLE  ="
 MAX_IMAGE_BYTES = 500_000_000
 SATURATED_SHARE = 1e-5  # of the pixels at the image's largest possible value: a few hot pixels are no matter
 THRESHOLD_SIGMA = 8.0
@@ -64,7 +65,10 @@ def _numbers_of(path: Path) -> tuple[int, int]:
 
 def read_image(path: Path, resolution_px: tuple[int, int]) -> FloatArray:
     """A grey image (h, w) as float64, first row at the top. Raises InputError."""
-    image = _fits(path) if path.suffix.lower() in FITS_ENDINGS else _picture(path)
+    data = read_bytes(path, ADVICE, MAX_IMAGE_BYTES)
+    # A snapshot script may write FITS under whatever name it is given.
+    is_fits = path.suffix.lower() in FITS_ENDINGS or data.startswith(FITS_MAGIC)
+    image = _fits(path, data) if is_fits else _picture(path, data)
     if image.ndim != 2:
         raise InputError(f"{path}: is no grey image of one plane; {ADVICE}")
     if (image.shape[1], image.shape[0]) != resolution_px:
@@ -75,12 +79,11 @@ def read_image(path: Path, resolution_px: tuple[int, int]) -> FloatArray:
     return np.asarray(image, dtype=np.float64)
 
 
-def _fits(path: Path) -> npt.NDArray[Any]:
+def _fits(path: Path, data: bytes) -> npt.NDArray[Any]:
     from io import BytesIO
 
     from astropy.io import fits
 
-    data = read_bytes(path, ADVICE, MAX_IMAGE_BYTES)
     try:
         with fits.open(BytesIO(data)) as hdus:
             planes = [hdu.data for hdu in hdus if isinstance(hdu, fits.PrimaryHDU | fits.ImageHDU) and hdu.data is not None]
@@ -91,12 +94,11 @@ def _fits(path: Path) -> npt.NDArray[Any]:
     return np.asarray(planes[0])
 
 
-def _picture(path: Path) -> npt.NDArray[Any]:
+def _picture(path: Path, data: bytes) -> npt.NDArray[Any]:
     from io import BytesIO
 
     from PIL import Image
 
-    data = read_bytes(path, ADVICE, MAX_IMAGE_BYTES)
     try:
         with Image.open(BytesIO(data)) as picture:
             return np.asarray(picture)

@@ -37,8 +37,8 @@ class Timing:
     waits: bool = True
 
 
-def pass_gate(screen: Screen, force: bool) -> None:
-    """Time GATE_FRAMES swaps and refuse (MachineError) a display that is not as the bench file has it.
+def pass_gate(screen: Screen, force: bool) -> Timing:
+    """Time GATE_FRAMES swaps and refuse (MachineError) a display that is not as the bench file has it; its timing.
 
     With `force` a fault is only logged.
     """
@@ -56,6 +56,7 @@ def pass_gate(screen: Screen, force: bool) -> None:
         if not force:
             raise MachineError(f"{fault}; or add --force")
         log.warning("%s: shown anyway (--force)", fault)
+    return timing
 
 
 def _swapped_ns(screen: Screen, number: int) -> int:

@@ -1,0 +1,1 @@
+"""First light: one guided, resumable session for the first day on a bench."""

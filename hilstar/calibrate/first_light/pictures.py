@@ -1,0 +1,47 @@
+"""The pictures of a session's page: what the tracker saw, and what was found in it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from hilstar.arrays import FloatArray
+from hilstar.calibrate.first_light.focus import Sharpness
+from hilstar.charts import chart
+
+SQUARE_NAMES = ("corner", "right", "below")
+MAX_ARROW_SHARE = 0.06  # of the image's width
+
+
+def draw_spots(path: Path, image: FloatArray, x_px: FloatArray, y_px: FloatArray, finding: str) -> None:
+    """An image of the tracker (h, w) with a ring about each spot that was found."""
+    with chart(path, finding) as (axes,):
+        low, high = (float(value) for value in np.percentile(image, (5, 99.9)))
+        axes.imshow(np.sqrt(np.clip(image - low, 0, None)), cmap="gray", vmax=np.sqrt(max(high - low, 1.0)))
+        axes.scatter(x_px, y_px, s=260, facecolors="none", edgecolors="tab:orange")
+        for number, (x, y) in enumerate(zip(x_px[:3], y_px[:3], strict=True)):
+            axes.annotate(SQUARE_NAMES[number], (x, y), (14, 14), textcoords="offset points", color="tab:orange")
+        axes.grid(visible=False)
+        axes.set_xlabel("tracker x [px]")
+        axes.set_ylabel("tracker y [px]")
+
+
+def draw_focus(path: Path, found: Sharpness, finding: str) -> None:
+    """The sigma of each dot over the tracker's field."""
+    with chart(path, finding) as (axes,):
+        dots = axes.scatter(found.x_px, found.y_px, c=found.sigma_px, cmap="viridis", s=60)
+        axes.figure.colorbar(dots, ax=axes, label="sigma of the dot [px]")
+        axes.set(aspect="equal", xlabel="tracker x [px]", ylabel="tracker y [px]")
+        axes.invert_yaxis()
+
+
+def draw_residuals(path: Path, place: FloatArray, residual: FloatArray, width_px: int, finding: str) -> None:
+    """Places (n, 2) of stars on the tracker, and how far from there they were seen (n, 2), as arrows."""
+    with chart(path, finding) as (axes,):
+        largest = max(float(np.hypot(*residual.T).max()), 1e-9)
+        arrow = residual * MAX_ARROW_SHARE * width_px / largest
+        axes.quiver(*place.T, *arrow.T, angles="xy", scale_units="xy", scale=1, width=0.002)
+        axes.set(aspect="equal", xlabel="tracker x [px]", ylabel="tracker y [px]")
+        axes.set_title(f"the longest arrow is {largest:.3f} px", fontsize=11)
+        axes.invert_yaxis()

@@ -1,0 +1,105 @@
+"""What a step works with: the bench file as it now stands, its own folder, the tracker's images, and earlier figures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from hilstar.arrays import FloatArray
+from hilstar.bench.bench_file import BenchFile
+from hilstar.bench.cameras import ideal_monitor, tracker_camera
+from hilstar.calibrate.first_light.eyes import Eyes
+from hilstar.calibrate.first_light.patterns import Pattern, black
+from hilstar.calibrate.first_light.records import Figure
+from hilstar.calibrate.first_light.virtual import VirtualBench
+from hilstar.calibrate.geometric.images import read_image
+from hilstar.errors import InputError
+from hilstar.files import make_directory
+from hilstar.twin.bench_geometry import BenchGeometry
+
+MAX_FILL = 0.8  # of the tracker's range: brighter pixels are not trusted
+LIGHT_STEP = 4.0  # by which the light is lowered while a pattern is too bright
+
+
+@dataclass(frozen=True, slots=True)
+class Looked:
+    """An image of the tracker: its file, and its light above the dark frame (h, w), DN; `raw_peak` is with that."""
+
+    path: Path
+    image: FloatArray
+    raw_peak: float
+
+
+@dataclass(frozen=True, slots=True)
+class Room:
+    """Where a step works.
+
+    `folder` takes its images, and is new for each attempt; `session` its results. `known` are figures of the steps before.
+    """
+
+    file: BenchFile
+    session: Path
+    folder: Path
+    eyes: Eyes
+    known: dict[str, Figure]
+
+    @property
+    def resolution_px(self) -> tuple[int, int]:
+        """Of the monitor's image."""
+        return self.file.config.monitor.resolution_px
+
+    @property
+    def white(self) -> int:
+        """The largest code."""
+        return int(2**self.file.config.monitor.bits - 1)
+
+    @property
+    def truth(self) -> BenchFile | None:
+        """The bench as it really is, in a virtual session."""
+        return self.eyes.truth if isinstance(self.eyes, VirtualBench) else None
+
+    def geometry(self) -> BenchGeometry:
+        """Monitor and tracker as the bench file has them, with an ideal collimator."""
+        return BenchGeometry(ideal_monitor(self.file.config), tracker_camera(self.file.config.tracker, self.file.folder))
+
+    def with_file(self, file: BenchFile) -> Room:
+        """The same with another bench file."""
+        return replace(self, file=file)
+
+    def take(self, pattern: Pattern) -> Path:
+        """The tracker's image of a pattern."""
+        make_directory(self.folder)
+        return self.eyes.look(self.file, pattern, self.folder / pattern.name)
+
+    def dark(self) -> Path:
+        """The tracker's image of a black screen."""
+        return self.take(Pattern("dark_000", black(self.resolution_px)))
+
+    def look(self, pattern: Pattern, dark: FloatArray) -> Looked:
+        """The tracker's image of a pattern, above its dark frame. Raises InputError for one that cannot be read."""
+        path = self.take(pattern)
+        raw = self.read(path)
+        return Looked(path, raw - dark, float(raw.max()))
+
+    def read(self, path: Path) -> FloatArray:
+        """An image of the tracker (h, w), DN."""
+        return read_image(path, self.file.config.tracker.resolution_px)
+
+    @property
+    def full_dn(self) -> float:
+        """Where the tracker saturates: its ADC's last code, or its full well."""
+        detector = self.file.config.tracker.detector
+        return min(2.0**detector.bits - 1, detector.offset_dn + detector.full_well_e / detector.gain_e_per_dn)
+
+    def is_too_bright(self, looked: Looked) -> bool:
+        """Whether pixels are near the end of the tracker's range."""
+        return looked.raw_peak > MAX_FILL * self.full_dn
+
+    def darker(self, code: int) -> int:
+        """The code of about a quarter of the light. Raises InputError where none is left."""
+        lower = int(np.floor(code / LIGHT_STEP ** (1 / 2.2)))
+        if lower < 1:
+            raise InputError("the tracker is saturated by the darkest code; expose shorter, and write [tracker] exposure_s so")
+        return lower

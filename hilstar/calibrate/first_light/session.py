@@ -1,0 +1,253 @@
+"""The session: its steps in order, each done once, and done again when what it depends on has changed."""
+
+from __future__ import annotations
+
+import datetime
+import fcntl
+import hashlib
+import math
+import os
+import platform
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from hilstar import __version__
+from hilstar.bench.bench_file import BenchFile
+from hilstar.calibrate.first_light import steps_look, steps_measure
+from hilstar.calibrate.first_light.display import Stopped
+from hilstar.calibrate.first_light.eyes import Eyes
+from hilstar.calibrate.first_light.records import (
+    KIND,
+    Figure,
+    Outcome,
+    Record,
+    SessionFile,
+    read_session,
+    sha256_of,
+    write_session,
+)
+from hilstar.calibrate.first_light.rewrite import rewrite
+from hilstar.calibrate.first_light.rooms import Room
+from hilstar.errors import HilstarError, InputError, one_line
+
+BEFORE_FILE = "bench-before.toml"
+LOCK_FILE = ".lock"
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One step: what it shows, what it wants back, the steps that have to be done before it, and the tables it depends on.
+
+    `writes` are the keys of the bench file that it may set.
+    """
+
+    name: str
+    shows: str
+    wants: str
+    run: Callable[[Room], Outcome]
+    needs: tuple[str, ...] = ()
+    tables: tuple[str, ...] = ("monitor", "collimator", "tracker")
+    writes: tuple[str, ...] = ()
+
+
+STEPS = (
+    Step("machine", "", "OpenGL, links and files that work", steps_look.machine, tables=()),
+    Step(
+        "display", "120 black frames", "a display with the bench file's size and rate", steps_look.display, tables=("monitor",)
+    ),
+    Step(
+        "orientation",
+        "three squares: the largest at a corner, the next to its right, the smallest below it",
+        "one image of the tracker",
+        steps_look.orientation,
+        needs=("machine", "display"),
+        writes=("monitor.flip_x", "monitor.flip_y", "monitor.rotate_deg", "monitor.resolution_px"),
+    ),
+    Step("focus", "dots", "one image, and fainter ones while they saturate", steps_look.focus, needs=("orientation",)),
+    Step(
+        "geometry",
+        "frames of dots, each of which blinks its own code",
+        "an image of each frame",
+        steps_measure.geometry,
+        needs=("orientation",),
+        writes=("collimator.geometry",),
+    ),
+    Step("photometry", "", "", steps_measure.photometry, tables=()),
+    Step("scale", "", "", steps_measure.scale, tables=()),
+    Step("latency", "", "", steps_measure.latency, tables=()),
+    Step(
+        "verify",
+        "a field of stars",
+        "one image, and a twin that passes",
+        steps_measure.verify,
+        needs=("geometry",),
+        tables=("monitor", "collimator", "tracker", "sky", "render", "background", "verify"),
+    ),
+)
+NAMES = tuple(step.name for step in STEPS)
+
+
+class Session:
+    """A session in a directory. Raises InputError for a directory that is another bench's."""
+
+    def __init__(self, folder: Path, file: BenchFile, eyes: Eyes) -> None:
+        self.folder, self.file, self.eyes = folder, file, eyes
+        bench = str(file.path.resolve())
+        found = read_session(folder)
+        if found is not None and found.bench != bench:
+            raise InputError(f"{folder}: is the session of {found.bench}; write another directory for {file.path}")
+        self.records = {} if found is None else {record.name: record for record in found.steps if record.name in NAMES}
+        self.resumed = found is not None
+
+    def run(self, again: frozenset[str], say: Callable[[str], None]) -> int:
+        """Run what is not done; the exit code: 0, 1 where a step failed, or that of the machine's lack.
+
+        Raises Stopped where the display is closed.
+        """
+        before = self.folder / BEFORE_FILE
+        if not before.exists():
+            shutil.copyfile(self.file.path, before)
+        for number, step in enumerate(STEPS):
+            if step.name not in again and self._is_done(number):
+                say(f"{step.name:12} {self.records[step.name].verdict} before: {self.records[step.name].line}")
+                continue
+            self._write(step.name)
+            record = self._run(number, say)
+            self.records[step.name] = record
+            self._write(None)
+            say(f"{step.name:12} {record.verdict}: {record.line}")
+        return max(record.exit_code for record in self.records.values())
+
+    def _is_done(self, number: int) -> bool:
+        """Whether a step need not run: done, or skipped for good, and nothing that it depends on has changed since."""
+        step = STEPS[number]
+        record = self.records.get(step.name)
+        if record is None or record.verdict == "failed" or self._unmet(step) is not None:
+            return False
+        if record.verdict == "skipped" and step.needs:
+            return False  # for want of a step that has been done by now
+        if record.state_sha256 != self._state(number):
+            return False
+        return all(_is_same(self.folder / name, digest) for name, digest in record.files.items())
+
+    def _unmet(self, step: Step) -> str | None:
+        """The first step that this one needs and that is not there."""
+        for name in step.needs:
+            record = self.records.get(name)
+            if record is None or record.verdict == "failed" or (record.verdict == "skipped" and name != "display"):
+                return name
+        return None
+
+    def _run(self, number: int, say: Callable[[str], None]) -> Record:
+        step, start_s, exit_code = STEPS[number], time.monotonic(), 0
+        unmet = self._unmet(step)
+        if unmet is not None:
+            outcome = Outcome("skipped", f"needs {unmet}, which is not done")
+        else:
+            if step.shows or step.wants:
+                say(f"{step.name:12} shows {step.shows or 'nothing'}; wants {step.wants}")
+            outcome, exit_code = self._tried(step)
+        return Record(
+            name=step.name,
+            verdict=outcome.verdict,
+            line=outcome.line,
+            exit_code=exit_code,
+            state_sha256=self._state(number),
+            figures={name: _finite(value) for name, value in outcome.figures.items()},
+            files={os.path.relpath(path, self.folder): sha256_of(path) for path in outcome.files},
+            pictures=[os.path.relpath(path, self.folder) for path in outcome.pictures],
+            changes=list(outcome.changes),
+            ended=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+            seconds=round(time.monotonic() - start_s, 3),
+        )
+
+    def _tried(self, step: Step) -> tuple[Outcome, int]:
+        """What a step came to, with the bench file written; a refusal is a failed step."""
+        try:
+            outcome = step.run(self._room(step))
+            self.file = rewrite(self.file, outcome.changes)
+        except Stopped:
+            raise
+        except HilstarError as error:
+            # A refusal of this step's data is no wrong command: the session goes on, and ends with 1.
+            code = 1 if isinstance(error, InputError) else error.exit_code
+            return Outcome("failed", one_line(str(error))), code
+        return outcome, 1 if outcome.verdict == "failed" else 0
+
+    def _room(self, step: Step) -> Room:
+        attempts = self.folder / "images"
+        number = 1 + sum(1 for path in attempts.glob(f"{step.name}-*") if path.is_dir())
+        known: dict[str, Figure] = {
+            f"{name}.{key}": value for name, record in self.records.items() for key, value in record.figures.items()
+        }
+        return Room(self.file, self.folder, attempts / f"{step.name}-{number}", self.eyes, known)
+
+    def _state(self, number: int) -> str:
+        """The SHA-256 of what a step depends on: its tables but for what later steps write, the files they name, the eyes."""
+        step = STEPS[number]
+        later = {key for other in STEPS[number + 1 :] for key in other.writes}
+        config = msgspec.to_builtins(self.file.config)
+        kept = {
+            table: {key: value for key, value in config[table].items() if f"{table}.{key}" not in later}
+            for table in step.tables
+        }
+        named = {text: sha256_of(self.file.folder / text) for text in _texts(kept) if _is_file(self.file.folder / text)}
+        seen_by = self.eyes.identity if step.tables else platform.python_version()
+        return hashlib.sha256(msgspec.json.encode([__version__, seen_by, kept, named], order="sorted")).hexdigest()
+
+    def _write(self, running: str | None) -> None:
+        write_session(self.folder, self.as_file(running))
+
+    def as_file(self, running: str | None = None) -> SessionFile:
+        """The session as session.json has it."""
+        return SessionFile(
+            kind=KIND,
+            hilstar=__version__,
+            bench=str(self.file.path.resolve()),
+            bench_sha256=self.file.sha256,
+            seen_by=self.eyes.identity,
+            running=running,
+            steps=[self.records[name] for name in NAMES if name in self.records],
+        )
+
+
+def _finite(value: Figure) -> Figure:
+    """The figure, in words where it is none that JSON holds."""
+    return "not known" if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _texts(value: Any) -> Iterator[str]:
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, dict):
+        for inner in value.values():
+            yield from _texts(inner)
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
+
+
+def _is_same(path: Path, digest: str) -> bool:
+    return _is_file(path) and sha256_of(path) == digest
+
+
+@contextmanager
+def alone_in(folder: Path) -> Iterator[None]:
+    """Keep a second session out of a directory (InputError) while this one works there; a kill lets it go."""
+    with (folder / LOCK_FILE).open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise InputError(f"{folder}: another first-light session works there; wait for its end") from error
+        yield

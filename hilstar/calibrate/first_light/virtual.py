@@ -1,0 +1,98 @@
+"""The twin in the bench's place: what a tracker would see of each pattern on a bench that is as TRUTH.toml says."""
+
+from __future__ import annotations
+
+import zlib
+from pathlib import Path
+
+import numpy as np
+
+from hilstar.arrays import FloatArray
+from hilstar.bench.bench_file import BenchFile
+from hilstar.bench.build import open_bench
+from hilstar.bench.cameras import tracker_camera
+from hilstar.bench.orientation import orientation_of
+from hilstar.calibrate.first_light.patterns import CodeImage, Pattern, off_screen, on_screen
+from hilstar.errors import InputError
+from hilstar.files import written
+from hilstar.monitor.quantise import shown_light
+from hilstar.run.screen.gate import Timing
+from hilstar.tracker.detector import Detector
+from hilstar.twin.bench_geometry import BenchGeometry
+from hilstar.twin.optics import TwinOptics
+from hilstar.twin.simulator import background_e
+
+
+class VirtualBench:
+    """A bench that is as a bench file tells: its lens, its mounting, its light, its tracker's focus and noise.
+
+    Free it with `close`. Raises InputError for a truth that cannot stand in for the bench.
+    """
+
+    def __init__(self, bench: BenchFile, truth: BenchFile, seed: int) -> None:
+        self.truth, self._seed = truth, seed
+        self.identity = f"virtual: sha256 {truth.sha256}, seed {seed}"
+        _refuse_other_bench(bench, truth)
+        config = truth.config
+        with open_bench(truth) as real:
+            self._panel, camera = real.panel, real.camera
+        tracker = config.tracker
+        self.geometry = BenchGeometry(camera, tracker_camera(tracker, truth.folder))
+        self._optics = TwinOptics(self.geometry, tracker.psf_sigma_px)
+        self._detector = Detector(tracker.detector, tracker.resolution_px, tracker.pixel_pitch_um)
+        under = self._optics.glow_e_per_s(self._panel) * tracker.exposure_s + background_e(config, truth.folder)
+        self._under_e: FloatArray = under
+        self._unit: tuple[bytes, FloatArray] = (b"", under)
+
+    def gate(self, file: BenchFile) -> Timing | None:
+        """None: there is no display."""
+        return None
+
+    def look(self, file: BenchFile, pattern: Pattern, stem: Path) -> Path:
+        """The tracker's image of a pattern: a PNG of 16 bits."""
+        from PIL import Image
+
+        codes = off_screen(
+            on_screen(pattern.codes, orientation_of(file.config.monitor)), orientation_of(self.truth.config.monitor)
+        )
+        exposure_s = self.truth.config.tracker.exposure_s
+        mean_e = self._image_e_per_s(np.ascontiguousarray(codes)) * exposure_s + self._under_e
+        rng = np.random.default_rng((self._seed, zlib.crc32(str(Path(stem.parent.name) / stem.name).encode())))
+        image = Image.fromarray(self._detector.expose(mean_e, exposure_s, rng))
+        path = stem.with_name(stem.name + ".png")
+        written(path, lambda part: image.save(part, "PNG", compress_level=1))
+        return path
+
+    def _image_e_per_s(self, codes: CodeImage) -> FloatArray:
+        """Electrons per second (h, w) of the codes; a pattern of one code is drawn once, whatever code it has."""
+        lit = codes > 0
+        code = int(codes.max())
+        if not code:
+            return np.zeros_like(self._under_e)
+        if not (codes[lit] == code).all():
+            return self._optics.image_e_per_s(shown_light(codes, self._panel))
+        key = np.packbits(lit).tobytes()
+        light = self._panel.response.light
+        if self._unit[0] != key:
+            white = shown_light(np.where(lit, len(light) - 1, 0).astype(np.uint16), self._panel)
+            self._unit = (key, self._optics.image_e_per_s(white))
+        return self._unit[1] * float(light[code])
+
+    def close(self) -> None:
+        """Free the GL context."""
+        self._optics.close()
+
+
+def _refuse_other_bench(bench: BenchFile, truth: BenchFile) -> None:
+    """Refuse (InputError) a truth whose screen or tracker could not be taken for the bench's own."""
+    mine, its = bench.config, truth.config
+    screens = [orientation_of(c.monitor).screen_px(c.monitor.resolution_px) for c in (mine, its)]
+    if screens[0] != screens[1]:
+        sizes = "{} x {} px and the bench file's is {} x {}".format(*screens[1], *screens[0])
+        raise InputError(f"{truth.path}: [monitor] resolution_px: its screen is {sizes}; write the same screen")
+    if mine.monitor.bits != its.monitor.bits:
+        raise InputError(f"{truth.path}: [monitor] bits = {its.monitor.bits} and the bench file says {mine.monitor.bits}")
+    if mine.tracker.resolution_px != its.tracker.resolution_px:
+        raise InputError(f"{truth.path}: [tracker] resolution_px is not the bench file's; write the same tracker")
+    if its.render.bit_stealing:
+        raise InputError(f"{truth.path}: [render] bit_stealing is for the bench that shows; leave it out of the truth")

@@ -1,0 +1,85 @@
+"""hilstar first-light: the first day on a bench, step by step, and on from where it was."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import msgspec
+import typer
+
+from hilstar.cli.options import MAX_SEED, BenchFile, Json, check_files
+from hilstar.console.terminal import print_json, say
+from hilstar.errors import InputError
+from hilstar.files import check_directory
+
+if TYPE_CHECKING:
+    from hilstar.bench import bench_file as files
+    from hilstar.calibrate.first_light.eyes import Eyes
+
+
+def first_light(
+    bench_file: BenchFile,
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="SESSION", help="Directory of the session; an older one is gone on with.")
+    ],
+    grab: Annotated[
+        str | None,
+        typer.Option(
+            metavar="CMD",
+            help="Command that takes the tracker's image: {output} is the file to write; {pattern}, where the command shows"
+            " the pattern itself, a picture of it.",
+        ),
+    ] = None,
+    virtual: Annotated[
+        Path | None,
+        typer.Option(metavar="TRUTH.toml", help="Without hardware: a bench file that says how the bench really is."),
+    ] = None,
+    again: Annotated[list[str] | None, typer.Option(metavar="STEP", help="Do this step again; may be given often.")] = None,
+    seed: Annotated[int, typer.Option(help="With --virtual: seed of the tracker's noise.", min=0, max=MAX_SEED)] = 0,
+    as_json: Json = False,
+) -> None:
+    """Bring up a bench: orientation, focus, geometry and verification, each step once, with a page at the end.
+
+    Sets the bench file's keys; SESSION keeps the file as it was, the calibration files, session.json and first-light.html.
+    """
+    from hilstar.bench.bench_file import read_bench_file
+    from hilstar.calibrate.first_light.page import write_page
+    from hilstar.calibrate.first_light.session import BEFORE_FILE, NAMES, Session, alone_in
+    from hilstar.files import make_directory
+
+    wrong = [name for name in again or [] if name not in NAMES]
+    if wrong:
+        raise InputError(f"--again {wrong[0]}: write one of {', '.join(NAMES)}")
+    if grab is not None and virtual is not None:
+        raise InputError("--grab and --virtual: the images come from one of them; leave the other out")
+    check_directory("-o", output)
+    file = read_bench_file(bench_file)
+    check_files([virtual], [], file)
+    eyes = _eyes(file, grab, virtual, seed)
+    try:
+        with alone_in(make_directory(output)):
+            session = Session(output, file, eyes)
+            code = session.run(frozenset(again or []), say)
+            page = write_page(output, session.as_file(), output / BEFORE_FILE)
+    finally:
+        eyes.close()
+    if as_json:
+        print_json({**msgspec.to_builtins(session.as_file()), "page": str(page)})
+    else:
+        for record in session.as_file().steps:
+            typer.echo(f"{record.name:12} {record.verdict:8} {record.line}")
+        typer.echo(f"{'page':12} {page}")
+    if code:
+        raise typer.Exit(code)
+
+
+def _eyes(file: files.BenchFile, grab: str | None, virtual: Path | None, seed: int) -> Eyes:
+    """Where the images come from."""
+    from hilstar.bench.bench_file import read_bench_file
+    from hilstar.calibrate.first_light.eyes import Grabber, Hands
+    from hilstar.calibrate.first_light.virtual import VirtualBench
+
+    if virtual is not None:
+        return VirtualBench(file, read_bench_file(virtual), seed)
+    return Hands() if grab is None else Grabber(grab)

@@ -200,3 +200,37 @@ def test_a_fits_header_says_how_far_tan_is_from_the_stars(bench, folder, rng):
     tan_x, tan_y = WCS(header).all_world2pix(np.degrees(ra), np.degrees(dec), 0)
     off = np.hypot(tan_x - inside["x_px"], tan_y - inside["y_px"])
     assert 0.5 * header["LENSERR"] < off.max() < 1.02 * header["LENSERR"]
+
+
+def test_a_bent_star_has_its_light_on_a_screen_that_is_not_uniform(folder, tmp_path, rng):
+    """Codes times the pixels' own light, down to 0.43 of the brightest, add up to the star where the lens has it."""
+    light = np.linspace(0, 1, 1024) ** 2.2
+    (tmp_path / "r.csv").write_text("code,w\n" + "\n".join(f"{code},{value!r}" for code, value in enumerate(light.tolist())))
+    (tmp_path / "u.csv").write_text("0.8,1.0\n1.0,0.9\n")
+    (tmp_path / "c.toml").write_text(
+        '[calibration]\nkind = "photometric"\nwho = ""\nwhen = ""\ninstrument = ""\nunit = ""\nbits = 10\nresponse = "r.csv"\n'
+        '[uniformity]\nfile = "u.csv"\n'
+    )
+    (tmp_path / "geometry.toml").write_text((folder / "geometry.toml").read_text())
+    text = (folder / "bench.toml").read_text().replace("[monitor]", '[monitor]\ncalibration = "c.toml"')
+    (tmp_path / "bench.toml").write_text(text)
+    wrong = []
+    with load(tmp_path / "bench.toml") as bench:
+        # The grid's numbers stand for the middles of the screen's quarters, beyond which its slope goes on; the brightest is 1.
+        s, t = ((np.arange(size) - (size / 4 - 0.5)) / (size / 2) for size in SIZE)
+        across = np.outer(1 - t, 0.8 + 0.2 * s) + np.outer(t, 1.0 - 0.1 * s)
+        across /= across.max()
+        for _ in range(6):
+            q = attitude(rng)
+            shown = light[bench.frame(q).levels] * across * bench.flux_at_white_e_per_s
+            x, y = true_places_px(folder, bench.stars.vectors @ to_matrix(q).T)
+            rate = bench.stars.electrons_per_s
+            good = (rate > 0.05 * bench.flux_at_white_e_per_s) & (rate < bench.flux_at_white_e_per_s)
+            good &= (np.abs(x - 959.5) < 940) & (np.abs(y - 539.5) < 520)
+            for k in np.flatnonzero(good):
+                if (np.hypot(x - x[k], y - y[k]) < 14).sum() == 1:
+                    c, r = round(x[k]), round(y[k])
+                    wrong.append(shown[r - 5 : r + 6, c - 5 : c + 6].sum() / rate[k] - 1)
+    assert len(wrong) > 10
+    assert np.abs(wrong).max() < 0.02
+    assert abs(np.mean(wrong)) < 0.003

@@ -5,6 +5,8 @@ This room is the only user of moderngl.
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Self
@@ -66,6 +68,12 @@ def create_context() -> moderngl.Context:
         return moderngl.create_context(require=330, standalone=True, **settings)
     except Exception as error:  # moderngl and glcontext raise plain Exceptions here
         raise MachineError(f"OpenGL 3.3 through EGL is missing ({error}); {INSTALL_EGL}") from error
+
+
+def leave_contexts() -> None:
+    """Let this thread's headless context go: it stays current after its release, and a window's GLX then ends the process."""
+    with contextlib.suppress(OSError, AttributeError):  # a machine without EGL has no such context
+        ctypes.CDLL(EGL_LIBRARY).eglReleaseThread()
 
 
 class Renderer:

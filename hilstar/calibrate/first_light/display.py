@@ -13,6 +13,7 @@ from hilstar.bench.orientation import orientation_of
 from hilstar.calibrate.first_light.patterns import Pattern
 from hilstar.errors import HilstarError, MachineError
 from hilstar.render.presenter import Presenter, View, level_texture, window_context
+from hilstar.render.renderer import leave_contexts
 from hilstar.run.screen.gate import Timing, pass_gate
 from hilstar.run.screen.screen import Screen
 
@@ -77,10 +78,12 @@ class Display:
 
         monitor = file.config.monitor
         screen_px = orientation_of(monitor).screen_px(monitor.resolution_px)
+        leave_contexts()  # of what drew without a window since
         if self._window is None or self._screen_px != screen_px:
             self.close()
             self._window = Window(WindowSettings(screen_px, monitor.bits, monitor.display))
             self._screen_px = screen_px
+        self._window.make_current()
         return self._window
 
     def close(self) -> None:

@@ -214,6 +214,10 @@ class Window:
         if name is not None:
             self.keys.append(name)
 
+    def make_current(self) -> None:
+        """Take this window's GL context up again after another one was current in this thread."""
+        glfw.make_context_current(self._window)
+
     @property
     def size_px(self) -> tuple[int, int]:
         """The framebuffer's size."""

@@ -21,6 +21,7 @@ from hilstar.rotation import from_rotation_vector, to_matrix
 from hilstar.scene.camera import Camera
 from hilstar.scene.lens import Lens
 from hilstar.units import ARCSEC_PER_RAD
+from tests.support import plain_camera
 from tests.support.benches import TWIN, bench_text
 from tests.support.commands import HILSTAR, assert_refused, run_hilstar_here
 
@@ -141,38 +142,16 @@ def test_a_session_killed_half_way_goes_on_where_it_was(tmp_path):
     assert places_off_arcsec(folder) < PLACES_ARCSEC
 
 
-# A tracker that is none of hilstar's: squares of light through a pinhole, rows reversed, and noise.
-CAMERA = """
-import math, sys, zlib
-import numpy as np
-from PIL import Image
-
-codes = np.asarray(Image.open(sys.argv[1])).astype(float) / 65535
-codes = codes[::-1]
-rng = np.random.default_rng(zlib.crc32(codes.tobytes()))
-image, ratio = rng.normal(20, 1.5, (420, 420)), (25e3 / 13) / (120e3 / 57.65)
-
-def shares(place):  # of the light in each of 17 pixels
-    return np.diff([math.erf((edge - 8.5 - place % 1) / 0.62 / math.sqrt(2)) / 2 for edge in range(18)])
-
-for row, column in np.argwhere(codes > 0):
-    light = ((codes[row, column] + 0.055) / 1.055) ** 2.4 if codes[row, column] > 0.04045 else codes[row, column] / 12.92
-    x, y = 209.5 + ratio * (column - 319.5), 209.5 + ratio * (row - 239.5)
-    if 9 < x < 410 and 9 < y < 410:
-        image[int(y) - 8 : int(y) + 9, int(x) - 8 : int(x) + 9] += 20000 * light * np.outer(shares(y), shares(x))
-Image.fromarray(np.clip(np.rint(image[10:-10, 10:-10]), 0, 4095).astype(np.uint16)).save(sys.argv[2])
-"""
-
-
 def test_images_come_from_a_command(tmp_path):
     (tmp_path / "bench.toml").write_text(bench_text(TWIN))
-    (tmp_path / "camera.py").write_text(CAMERA)
-    result = go(tmp_path, "--grab", f"{sys.executable} {tmp_path / 'camera.py'} {{pattern}} {{output}}", "--json")
+    result = go(tmp_path, "--grab", f"{sys.executable} {plain_camera.__file__} {{pattern}} {{output}} --reversed", "--json")
     assert result.returncode == 0, result.stderr
     steps = {step["name"]: step for step in json.loads(result.stdout)["steps"]}
     assert steps["orientation"]["figures"]["seen"] == "mirrored top to bottom"
-    # Its pixels are points where those of a screen are squares of 0.924 px, which the figure takes out of the dots' width.
-    assert steps["focus"]["figures"]["psf_sigma_px"] == pytest.approx(math.sqrt(0.62**2 - 0.924**2 / 12), abs=0.02)
+    # The camera's pixels are points; a screen's are squares of 0.924 px, which the figure takes out of the dots' width.
+    assert steps["focus"]["figures"]["psf_sigma_px"] == pytest.approx(
+        math.sqrt(plain_camera.SIGMA_PX**2 - 0.924**2 / 12), abs=0.02
+    )
     assert steps["geometry"]["figures"]["focal_length_px"] == pytest.approx(120e3 / 57.65, rel=1e-4)
     assert steps["verify"]["figures"]["star_rms_px"] < 0.05
 

@@ -57,12 +57,11 @@ def orientation(room: Room) -> Outcome:
         seen, looked = _seen_figure(turned, "figure_001")
         if seen.words != "upright":
             raise InputError(f"after {'; '.join(c.line for c in changes)} the figure is {seen.words}; is it the same screen?")
+    way = f"first {first.words}, now upright" if changes else "upright"
     picture = room.session / "orientation.png"
-    draw_spots(
-        picture, looked.image, seen.x_px, seen.y_px, f"the figure as the tracker sees it: first {first.words}, now upright"
-    )
+    draw_spots(picture, looked.image, seen.x_px, seen.y_px, f"the figure as the tracker sees it: {way}")
     figures: dict[str, Figure] = {"seen": first.words, "scale": seen.scale, "turn_deg": seen.turn_deg}
-    line = f"first {first.words}; now upright, {seen.scale:.4f} of the expected size, turned by {seen.turn_deg:+.2f} deg"
+    line = f"{way}, {seen.scale:.4f} of the expected size, turned by {seen.turn_deg:+.2f} deg"
     return Outcome("done", line, figures, (looked.path, picture), (picture,), changes)
 
 

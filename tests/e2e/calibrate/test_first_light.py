@@ -200,3 +200,20 @@ def test_without_a_display_the_machine_lacks_something(tmp_path, monkeypatch):
     result = go(tmp_path, "--grab", "true {output}")
     assert result.returncode == 3
     assert "{pattern}" in result.stderr
+
+
+@pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM])
+def test_a_session_that_is_stopped_says_so_and_keeps_what_was_done(tmp_path, ending):
+    folder = plant(tmp_path)
+    words = ["first-light", folder / "bench.toml", "-o", folder / "s", "--virtual", folder / "truth.toml"]
+    with subprocess.Popen([*HILSTAR, *map(str, words)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        end_s = time.monotonic() + 100
+        while not list((folder / "s").glob("images/geometry-1/frame_005*")):
+            assert time.monotonic() < end_s
+            assert process.poll() is None
+            time.sleep(0.01)
+        process.send_signal(ending)
+        assert process.wait(60) == 128 + ending
+        assert "Traceback" not in process.stderr.read()
+    session = json.loads((folder / "s" / "session.json").read_text())
+    assert (session["running"], len(session["steps"])) == ("geometry", 4)

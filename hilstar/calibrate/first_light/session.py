@@ -20,7 +20,6 @@ import msgspec
 
 from hilstar import __version__
 from hilstar.bench.bench_file import BenchFile
-from hilstar.calibrate.first_light import steps_look, steps_measure
 from hilstar.calibrate.first_light.display import Stopped
 from hilstar.calibrate.first_light.eyes import Eyes
 from hilstar.calibrate.first_light.records import (
@@ -35,6 +34,7 @@ from hilstar.calibrate.first_light.records import (
 )
 from hilstar.calibrate.first_light.rewrite import rewrite
 from hilstar.calibrate.first_light.rooms import Room
+from hilstar.calibrate.first_light.steps import look, measure
 from hilstar.errors import HilstarError, InputError, one_line
 
 BEFORE_FILE = "bench-before.toml"
@@ -58,35 +58,33 @@ class Step:
 
 
 STEPS = (
-    Step("machine", "", "OpenGL, links and files that work", steps_look.machine, tables=()),
-    Step(
-        "display", "120 black frames", "a display with the bench file's size and rate", steps_look.display, tables=("monitor",)
-    ),
+    Step("machine", "", "OpenGL, links and files that work", look.machine, tables=()),
+    Step("display", "120 black frames", "a display with the bench file's size and rate", look.display, tables=("monitor",)),
     Step(
         "orientation",
         "three squares: the largest at a corner, the next to its right, the smallest below it",
         "one image of the tracker",
-        steps_look.orientation,
+        look.orientation,
         needs=("machine", "display"),
         writes=("monitor.flip_x", "monitor.flip_y", "monitor.rotate_deg", "monitor.resolution_px"),
     ),
-    Step("focus", "dots", "one image, and fainter ones while they saturate", steps_look.focus, needs=("orientation",)),
+    Step("focus", "dots", "one image, and fainter ones while they saturate", look.focus, needs=("orientation",)),
     Step(
         "geometry",
         "frames of dots, each of which blinks its own code",
         "an image of each frame",
-        steps_measure.geometry,
+        measure.geometry,
         needs=("orientation",),
         writes=("collimator.geometry",),
     ),
-    Step("photometry", "", "", steps_measure.photometry, tables=()),
-    Step("scale", "", "", steps_measure.scale, tables=()),
-    Step("latency", "", "", steps_measure.latency, tables=()),
+    Step("photometry", "", "", measure.photometry, tables=()),
+    Step("scale", "", "", measure.scale, tables=()),
+    Step("latency", "", "", measure.latency, tables=()),
     Step(
         "verify",
         "a field of stars",
         "one image, and a twin that passes",
-        steps_measure.verify,
+        measure.verify,
         needs=("geometry",),
         tables=("monitor", "collimator", "tracker", "sky", "render", "background", "verify"),
     ),

@@ -12,7 +12,7 @@ from hilstar.calibrate.first_light.pictures import draw_residuals
 from hilstar.calibrate.first_light.records import Change, Figure, Outcome
 from hilstar.calibrate.first_light.rooms import Room
 from hilstar.calibrate.first_light.stars import StarsSeen, see_stars
-from hilstar.calibrate.first_light.steps_look import plan_for, sharp_dots
+from hilstar.calibrate.first_light.steps.look import plan_for, sharp_dots
 from hilstar.calibrate.geometric.calibration import calibrate_files
 from hilstar.calibrate.geometric.dots import dot_image, write_plan
 from hilstar.calibrate.geometric.summary import GeometricSummary, write_calibrated

@@ -26,6 +26,8 @@ from tests.support.wire.ptys import Cable
 from tests.support.x11.screens import Screen, xvfb
 
 # The watcher looks every 0.2 ms or so, and sleeps between; a shared machine may keep it from that now and then.
+MIN_EDGES, MAX_UNMATCHED = 60, 0.05  # share of the edges
+ATTEMPTS = 3
 MEDIAN_MS = 2.0
 ADDED_MS = 40.0
 WATCHED_S = 4  # some 120 edges of the code
@@ -112,10 +114,18 @@ def measured(screen: Screen, folder: Path, kind: str, added_ms: float, device_cl
     return json.loads(result.stdout), bench
 
 
+def measured_undisturbed(*wanted, **kwargs) -> tuple[dict, Path]:
+    """A measurement in which the diode saw what was shown: the diode is a thread here, and a busy machine holds it up."""
+    for _ in range(ATTEMPTS):
+        found, bench = measured(*wanted, **kwargs)
+        if found["edges"] > MIN_EDGES and found["unmatched"] <= MAX_UNMATCHED * found["edges"]:
+            return found, bench
+    raise AssertionError(f"in each of {ATTEMPTS} measurements too many edges belong to no frame: {found}")
+
+
 def test_a_delay_that_was_added_is_found_and_written_into_the_bench_file(screen, tmp_path):
     """The screen shows a swap within a millisecond; what is added to the diode's line comes out as the panel's delay."""
-    plain, _ = measured(screen, tmp_path, "code", 0.0, False)
-    assert plain["edges"] > 60 and plain["unmatched"] <= 0.05 * plain["edges"]
+    plain, _ = measured_undisturbed(screen, tmp_path, "code", 0.0, False)
     assert abs(plain["latency_ms"]["p50"]) < MEDIAN_MS
     assert not plain["ambiguous"]
     late, bench = measured(screen, tmp_path, "code", ADDED_MS, False, "--write", tmp_path / "bench.toml")

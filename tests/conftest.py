@@ -23,6 +23,12 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
 
 leftovers.adopt_orphans()
 
+
+def pytest_xdist_auto_num_workers() -> int:
+    """One more worker than cores: half of the long tests wait for packets, frames and signals to come by the clock."""
+    return (os.cpu_count() or 1) + 1
+
+
 MARKERS = {"study": "study", "gpu": "gpu", "screen": "screen", "e2e": "e2e", "examples": "e2e"}
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -45,7 +46,7 @@ class LensTable(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ErrorTable(msgspec.Struct, frozen=True, kw_only=True):
-    """[error]: of dots that were held out, and one sigma of a star's place: over the screen, and its rms and maximum.
+    """[error]: of dots that were held out, and one sigma of a star's place: over the screen (-1 where unseen), rms and maximum.
 
     An alignment adds the rms of what its rotation leaves, one axis.
     """
@@ -211,10 +212,8 @@ def toml_text(table: dict[str, Any]) -> str:
 
 
 def _value(value: Any) -> str:
-    if isinstance(value, list | tuple):
-        inner = [_value(each) for each in value]
-        apart = ",\n    " if inner and inner[0].startswith("[") else ", "
-        return f"[\n    {apart.join(inner)},\n]" if apart != ", " else f"[{', '.join(inner)}]"
-    if isinstance(value, str):
-        return msgspec.json.encode(value).decode()
-    return repr(value).lower() if isinstance(value, bool) else repr(value)
+    """A value as TOML, which writes numbers, truth values, plain text and lists as JSON does; a list of lists row by row."""
+    if isinstance(value, list) and value and isinstance(value[0], list):
+        rows = ",\n    ".join(map(json.dumps, value))
+        return f"[\n    {rows},\n]"
+    return json.dumps(value)

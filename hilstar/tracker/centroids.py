@@ -24,11 +24,11 @@ from scipy.special import ndtr
 
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.errors import InputError
+from hilstar.units import MAD_TO_SIGMA
 
 Window = Literal["gaussian", "plain"]
 BoolArray = npt.NDArray[np.bool_]
 
-MAD_TO_SIGMA = 1.482602218505602  # of a normal distribution: 1 / its upper quartile
 CLIP_SIGMAS = 3.0
 CLIPPED_SIGMA = 0.986578  # the sigma of a normal distribution cut at 3 sigma: sqrt(1 - 6 pdf(3) / (2 cdf(3) - 1))
 MIN_STEP_PX = 1e-7

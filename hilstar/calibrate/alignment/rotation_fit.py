@@ -14,11 +14,10 @@ import numpy.typing as npt
 
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.rotation import conjugate, from_rotation_vector, multiply, normalise, to_rotation_vector
-from hilstar.units import ARCSEC_PER_RAD
+from hilstar.units import ARCSEC_PER_RAD, MAD_TO_SIGMA
 
 AGREE_RAD = np.radians(1.0)  # two rotations further apart are not of one alignment, whatever the noise
 STARTS = 100  # of which one is near the truth but for 2^-100, while fewer than half are wild
-MAD_TO_SIGMA = 1.4826  # of a Gaussian
 # Tukey's weights end here, in sigmas of three axes together: 7e-8 of a Gaussian lies beyond. The scale of a few pairs is itself
 # uncertain, so for n of them it is 6 (1 + (10 / n)^2): of 1000 clean sets of 3 pairs 12 then lose one, of 4 and more 2 at most.
 CUT_SIGMAS = 6.0

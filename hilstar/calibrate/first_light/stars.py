@@ -16,6 +16,7 @@ from hilstar.calibrate.first_light.rooms import Looked, Room
 from hilstar.errors import InputError
 from hilstar.rotation import to_matrix
 from hilstar.tracker.centroids import CentroidSettings, find_stars
+from hilstar.units import MAD_TO_SIGMA
 
 ATTITUDES, SEED = 12, 3  # random ones, of which the field with the most stars is shown
 MIN_STARS = 5
@@ -81,7 +82,7 @@ def _compared(room: Room, looked: Looked, place: FloatArray, rate: FloatArray) -
     psf = tuple(float(np.hypot(a, ratio * b)) for a, b in zip(room.file.config.tracker.psf_sigma_px, sprite, strict=True))
     settings = CentroidSettings(THRESHOLD_SIGMA, 2, window_sigma_px=WINDOW_SIGMA_PX, psf_sigma_px=(psf[0], psf[1]))
     found = find_stars(looked.image, settings)
-    noise = float(1.4826 * np.median(np.abs(looked.image - np.median(looked.image)))) or 1.0
+    noise = float(MAD_TO_SIGMA * np.median(np.abs(looked.image - np.median(looked.image)))) or 1.0
     bright = found.peak > BRIGHT_SIGMAS * noise
     if not len(found) or bright.sum() < MIN_STARS or not len(place):
         raise InputError(

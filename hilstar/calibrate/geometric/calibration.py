@@ -114,7 +114,7 @@ def calibrate_geometry(
         )
     tracker_names = () if tracker_known else tuple(TRACKER_STEPS)
     look = first_look(plan, nominal, seen, rng)
-    problem, data = _matched(plan, nominal, seen, look, tracker_names)
+    problem, data = matched(plan, nominal, seen, look, tracker_names)
     found = len(np.unique(data.dot))
     if found < MIN_DOTS:
         raise InputError(f"{found} dots were recognised and {MIN_DOTS} are needed; show more --dots or more --frames")
@@ -145,10 +145,13 @@ def bounded_to_field(problem: Problem, fit: Fit) -> Fit:
     return replace(fit, geometry=replace(geometry, monitor=replace(monitor, lens=lens)))
 
 
-def _matched(
-    plan: DotPlan, nominal: Nominal, seen: Observed, look: FirstLook, tracker_names: tuple[str, ...]
+def matched(
+    plan: DotPlan, nominal: Nominal, seen: Observed, look: FirstLook, tracker_names: tuple[str, ...] = ()
 ) -> tuple[Problem, Matched]:
-    """The centroids with their dots, by the codes' map first and by a fitted lens then."""
+    """The centroids with their dots, by the codes' map first and by a fitted lens then; and what is to be fitted to them.
+
+    Raises InputError where the image moved between frames.
+    """
     data = match_by_maps(plan, nominal, seen, look)
     refuse_motion(data)
     for _ in range(MATCH_ROUNDS):

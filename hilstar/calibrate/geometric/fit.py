@@ -13,6 +13,7 @@ from hilstar.calibrate.geometric.model import Geometry, Model, Nominal, directio
 from hilstar.calibrate.geometric.observed import Observed
 from hilstar.scene.camera import Camera
 from hilstar.scene.lens import Lens, ResidualField, field_terms
+from hilstar.units import MAD_TO_SIGMA
 
 HUBER = 2.5  # sigmas: beyond it a residual counts by its size, not by its square
 PRIOR = 0.3  # of a parameter's number: so weak that it decides only what the data leave open
@@ -168,4 +169,4 @@ def noise_of_repeats(data: Matched) -> float | None:
                 deviations.append(share * (part[group] - part[group].mean()) / data.seen.sigma_px[group])
     if not deviations:
         return None
-    return float(1.4826 * np.median(np.abs(np.concatenate(deviations))))
+    return float(MAD_TO_SIGMA * np.median(np.abs(np.concatenate(deviations))))

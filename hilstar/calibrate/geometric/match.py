@@ -17,6 +17,7 @@ from hilstar.calibrate.geometric.model import Geometry, Nominal, directions_in_c
 from hilstar.calibrate.geometric.observed import Observed
 from hilstar.errors import InputError
 from hilstar.rotation import from_matrix
+from hilstar.units import MAD_TO_SIGMA
 
 FIRST_REACH = 0.03  # of the screen's width, by the first map, which knows no lens
 MIN_MOTION_PX = 0.05  # of the tracker
@@ -185,4 +186,4 @@ def frame_shifts(data: Matched, places: FloatArray) -> tuple[IntArray, FloatArra
         shift = np.array([np.median(places[each] - middle[dot[each]]) for each in by_frame])
         shift -= np.median(shift)
     left = np.abs(places - middle[dot] - shift[frame])
-    return frames, shift, 1.4826 * float(np.median(left))
+    return frames, shift, MAD_TO_SIGMA * float(np.median(left))

@@ -11,7 +11,7 @@ from hilstar.calibrate.geometric.fit import DIFFERENCE, FIELD_PRIOR_PX, HUBER, P
 from hilstar.calibrate.geometric.model import STEPS, TRACKER_STEPS, Geometry, geometry_of
 from hilstar.scene.camera import Camera
 from hilstar.scene.lens import Lens, field_terms
-from hilstar.units import ARCSEC_PER_RAD
+from hilstar.units import ARCSEC_PER_RAD, MAD_TO_SIGMA
 
 MAP_PLACES = (17, 11)
 
@@ -49,7 +49,7 @@ def uncertainty_of(problem: Problem, fit: Fit, data: Matched) -> Uncertainty:
     field_numbers = rows.shape[1] - size
     prior = np.concatenate([np.full(size, PRIOR), np.full(field_numbers, 1 / FIELD_PRIOR_PX)])
     covariance = np.linalg.inv(rows.T @ rows + np.diag(prior**2))
-    scale = max(1.0, float(np.median(left) * 1.4826))
+    scale = max(1.0, MAD_TO_SIGMA * float(np.median(left)))
     steps = [STEPS[name] for name in fit.model.names] + [TRACKER_STEPS[name] for name in fit.model.tracker_names]
     spread = scale * np.sqrt(np.diag(covariance))
     names = (*fit.model.names, *fit.model.tracker_names)

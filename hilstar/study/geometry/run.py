@@ -11,10 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
+from hilstar.calibrate.geometric.calibration import matched
 from hilstar.calibrate.geometric.choose import held_out
 from hilstar.calibrate.geometric.dots import plan_dots
-from hilstar.calibrate.geometric.fit import Matched, Problem, fit, noise_of_repeats
-from hilstar.calibrate.geometric.match import first_look, match_by_geometry, match_by_maps
+from hilstar.calibrate.geometric.fit import Matched, Problem, fit
+from hilstar.calibrate.geometric.match import first_look
 from hilstar.calibrate.geometric.model import BROWN_CONRADY, PINHOLE, RADIAL, Geometry, Model, Nominal
 from hilstar.charts import chart, plain_ticks, write_records
 from hilstar.monitor.geometry import monitor_camera
@@ -54,7 +55,6 @@ MODELS = (
 SIZES = ((8, 10), (10, 25), (14, 40), (20, 60), (30, 100))
 NOISES_PX = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2)
 USUAL_SIZE, USUAL_NOISE_PX = (20, 60), 0.02
-REACH_PX, REACH_SIGMAS = 0.6, 8.0
 STARS = 4000
 FAIL_ARCSEC = 1.0
 SEED = 7
@@ -111,12 +111,7 @@ def _outcomes(frames: Frames) -> list[Outcome]:
     x_px, y_px = TRACKER.project(BENCH.directions(plan.x_px, plan.y_px))
     seen = observed_dots(plan, x_px, y_px, TRACKER.resolution_px, Faults(frames.noise_px), rng)
     nominal = _nominal()
-    look = first_look(plan, nominal, seen, rng)
-    data = match_by_maps(plan, nominal, seen, look)
-    problem = Problem(plan, nominal, look.q_poses, noise_of_repeats(data) or frames.noise_px)
-    rough = fit(problem, Model(BROWN_CONRADY), 0, data)
-    data = match_by_geometry(plan, seen, rough.geometry, max(REACH_PX, REACH_SIGMAS * frames.noise_px))
-    problem = Problem(plan, nominal, look.q_poses, noise_of_repeats(data) or frames.noise_px)
+    problem, data = matched(plan, nominal, seen, first_look(plan, nominal, seen, rng))
     return [_outcome(problem, data, frames, model) for model in MODELS]
 
 

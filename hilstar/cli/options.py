@@ -21,6 +21,32 @@ Explain = Annotated[
     bool, typer.Option("--explain", help="Explain on stderr what was chosen for this scene, with its error and its saving.")
 ]
 RunFile = Annotated[Path, typer.Argument(metavar="RUN.mcap", help="The ledger of serve or replay.")]
+UNSAID = "What the log itself does not say"
+KernelFiles = Annotated[
+    list[Path] | None,
+    typer.Option("--kernel", metavar="FILE", help="A SPICE kernel; may be repeated.", rich_help_panel=UNSAID),
+]
+TopicName = Annotated[
+    str | None, typer.Option("--topic", metavar="NAME", help="The topic, where a bag has several.", rich_help_panel=UNSAID)
+]
+BodyName = Annotated[
+    str | None,
+    typer.Option("--body", metavar="NAME", help="The body or frame, where a log has several.", rich_help_panel=UNSAID),
+]
+ReferenceName = Annotated[
+    str | None,
+    typer.Option("--reference", metavar="FRAME", help="The frame that attitudes refer to: icrs, ...", rich_help_panel=UNSAID),
+]
+EpochUtc = Annotated[
+    str | None,
+    typer.Option("--epoch-utc", metavar="TIME", help="The UTC at the log's time zero.", rich_help_panel=UNSAID),
+]
+PlaceText = Annotated[
+    str | None,
+    typer.Option(
+        "--place", metavar="LAT,LON,HEIGHT", help="Where the vehicle is: degrees and metres, WGS84.", rich_help_panel=UNSAID
+    ),
+]
 MAX_SEED = 2**63 - 1  # what a FITS header holds
 LOG_HELP = "CSV (t_s,qw,qx,qy,qz), JSON lines, CCSDS AEM or MCAP (a ledger)."
 

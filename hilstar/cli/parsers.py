@@ -89,6 +89,26 @@ def parse_serial(text: str, option: str) -> tuple[str, int] | None:
     return match[1], int(match[2] or DEFAULT_BAUD)
 
 
+def parse_place(text: str | None) -> tuple[float, float, float] | None:
+    """Latitude and longitude in degrees, and height in metres. Raises InputError."""
+    if text is None:
+        return None
+    latitude_deg, longitude_deg, height_m = parse_numbers(text, 3, "--place", "LAT,LON,HEIGHT in degrees and metres")
+    if not (-90 <= latitude_deg <= 90 and -180 <= longitude_deg <= 360):
+        raise InputError(f"--place {text}: write a latitude from -90 to 90 and a longitude from -180 to 360")
+    return latitude_deg, longitude_deg, height_m
+
+
+def parse_mounting(text: str) -> tuple[float, float, float, float]:
+    """q_body_to_cam of `--mounting`. Raises InputError."""
+    from hilstar.attitude.wire.protocol import NORM_TOLERANCE
+
+    w, x, y, z = parse_numbers(text, 4, "--mounting", "W,X,Y,Z")
+    if abs(math.hypot(w, x, y, z) - 1) > NORM_TOLERANCE:
+        raise InputError(f"--mounting {text}: its norm is {math.hypot(w, x, y, z):.6g}; write a unit quaternion W,X,Y,Z")
+    return w, x, y, z
+
+
 def parse_share(text: str, option: str) -> float:
     """A share from "5%" or "0.05". Raises InputError."""
     match = re.fullmatch(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*(%?)\s*", text)

@@ -10,11 +10,13 @@ from typing import Protocol
 import numpy as np
 
 from hilstar.attitude.clock.timeline import Attitude, Timeline
+from hilstar.attitude.logs.entries import Stated
 from hilstar.attitude.logs.gaps import log_joins
-from hilstar.attitude.logs.log_file import log_timeline, read_log
+from hilstar.attitude.logs.log_file import NOTHING_STATED, log_timeline, open_log
 from hilstar.attitude.logs.mcap_log import read_attitudes
 from hilstar.attitude.logs.mcap_reader import is_mcap
 from hilstar.attitude.wire.packet import AttitudeSample, rate_refusal
+from hilstar.attitude.wire.source import PACKETS, Conventions
 from hilstar.bench.config import BenchConfig
 from hilstar.errors import InputError
 from hilstar.run.loop import policy_of
@@ -61,6 +63,10 @@ class Play(Protocol):
     def told(self) -> list[tuple[str, str]]:
         """Events to report before it begins: kinds and lines."""
 
+    @property
+    def conventions(self) -> Conventions:
+        """What the log's numbers mean."""
+
     def frame(self, slot: int) -> tuple[int, int, Attitude | None]:
         """Number, time and attitude of a frame; None is blank."""
 
@@ -76,6 +82,7 @@ class LogPlay:
     paced: bool
     moving: bool | None = None
     told: list[tuple[str, str]] = field(default_factory=list)
+    conventions: Conventions = PACKETS
 
     @property
     def packet_count(self) -> int:
@@ -97,6 +104,7 @@ class RunPlay:
     paced: bool
     moving: bool | None = True  # where the run's own were
     told: list[tuple[str, str]] = field(default_factory=list)
+    conventions: Conventions = PACKETS
 
     @property
     def frame_count(self) -> int:
@@ -111,17 +119,19 @@ class RunPlay:
         return past.frame, past.t_ns, attitude
 
 
-def plan_play(log: Path, wanted: Wanted, config: BenchConfig) -> Play:
+def plan_play(log: Path, wanted: Wanted, config: BenchConfig, stated: Stated = NOTHING_STATED) -> Play:
     """The frames of a replay: of a log one each refresh period, stretched by the speed, unless a step is given.
 
-    Of a ledger those that its run drew. Raises InputError for a speed, a span or a step that gives no frame.
+    Of a ledger those that its run drew. `stated` is what the log does not say itself. Raises InputError for a speed, a span or
+    a step that gives no frame.
     """
     factor = wanted.speed
     if is_mcap(log):
         frames = list(drawable_frames(log, math.radians(config.attitude.max_rate_deg_s)))
         if frames:
             return _plan_run(log, wanted, factor, frames)
-    samples = read_log(log)
+    read = open_log(log, stated)
+    samples = read.samples
     _check_rates(log, samples, math.radians(config.attitude.max_rate_deg_s))
     start_s, stop_s = _span(log, wanted, (samples[-1].t_ns - samples[0].t_ns) / NS_PER_S)
     step_s = (1.0 if math.isinf(factor) else factor) / config.monitor.refresh_hz
@@ -135,7 +145,8 @@ def plan_play(log: Path, wanted: Wanted, config: BenchConfig) -> Play:
     first_ns = samples[0].t_ns + round(start_s * NS_PER_S)
     joins = log_joins(samples)
     timeline = log_timeline(samples, policy_of(config.attitude), joins)
-    return LogPlay(timeline, first_ns, step_s, int(count) + 1, not math.isinf(factor), told=joins.told)
+    told = [*read.told, *joins.told]
+    return LogPlay(timeline, first_ns, step_s, int(count) + 1, not math.isinf(factor), None, told, read.conventions)
 
 
 def _check_rates(log: Path, samples: list[AttitudeSample], max_rate_rad_s: float) -> None:

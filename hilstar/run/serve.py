@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field
-from pathlib import Path
 
 from msgspec.structs import replace as replaced
 
 from hilstar.attitude.back_channel import Traffic
 from hilstar.attitude.clock.timeline import Timeline
 from hilstar.attitude.receiver import PacketCounts, Receiver, nobody_watches
-from hilstar.attitude.wire.keys import CurveKeys
-from hilstar.attitude.wire.serial_link import SerialLink
+from hilstar.attitude.wire.links import StreamLink
 from hilstar.attitude.wire.zmq_lockstep import ZmqLockstep
-from hilstar.attitude.wire.zmq_stream import ZmqReceiver
 from hilstar.bench.config import AttitudeSettings
 from hilstar.bench.frame import Bench
 from hilstar.notices import Notices
@@ -22,6 +19,7 @@ from hilstar.process.interrupts import stop_on_signal
 from hilstar.run.frame_status import StatusMaker
 from hilstar.run.lockstep import serve_lockstep
 from hilstar.run.loop import FrameLoop, Limit, policy_of
+from hilstar.run.open_link import AnyLink
 from hilstar.run.pacer import Moment, Pacer
 from hilstar.run.record.ledger import Ledger
 from hilstar.run.record.ledger_records import below_step, frame_record
@@ -31,8 +29,6 @@ from hilstar.run.screen.screen import Screen
 from hilstar.run.shown import FrameSink, Shown, ignore
 from hilstar.run.summary import RunSummary
 from hilstar.units import NS_PER_S
-
-AnyLink = ZmqReceiver | ZmqLockstep | SerialLink
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,22 +42,6 @@ class Outlet:
     def pacer(self) -> Pacer | None:
         """The pacer of the screen; None without one."""
         return None if self.screen is None else DisplayPacer(self.screen, self.notices)
-
-
-def link_keys(settings: AttitudeSettings, folder: Path) -> CurveKeys:
-    """The CURVE key files that the bench file names; paths are relative to it."""
-    names = (settings.curve_secret_key, settings.curve_server_key, settings.allowed_clients)
-    return CurveKeys(*(None if name is None else folder / name for name in names))
-
-
-def open_link(settings: AttitudeSettings, folder: Path, notices: Notices | None = None) -> AnyLink:
-    """The link that the bench file in `folder` names. Raises InputError if it cannot be opened."""
-    if settings.source == "serial":
-        return SerialLink(settings.port, settings.baud, notices)
-    keys = link_keys(settings, folder)
-    if settings.lockstep:
-        return ZmqLockstep(settings.endpoint, bind=settings.bind is not False, keys=keys, notices=notices)
-    return ZmqReceiver(settings.endpoint, bind=settings.bind is True, keys=keys, notices=notices)
 
 
 def serve(bench: Bench, link: AnyLink, limit: Limit, sink: FrameSink = ignore, outlet: Outlet | None = None) -> RunSummary:
@@ -80,7 +60,7 @@ def serve(bench: Bench, link: AnyLink, limit: Limit, sink: FrameSink = ignore, o
     )
 
 
-def _serve_stream(bench: Bench, link: ZmqReceiver | SerialLink, limit: Limit, loop: FrameLoop, outlet: Outlet) -> RunSummary:
+def _serve_stream(bench: Bench, link: StreamLink, limit: Limit, loop: FrameLoop, outlet: Outlet) -> RunSummary:
     ledger = outlet.ledger
     timeline = Timeline(policy_of(bench.config.attitude))
     receiver = _receiver(bench.config.attitude, link, timeline, outlet)
@@ -118,7 +98,7 @@ def _serve_stream(bench: Bench, link: ZmqReceiver | SerialLink, limit: Limit, lo
     )
 
 
-def _receiver(settings: AttitudeSettings, link: ZmqReceiver | SerialLink, timeline: Timeline, outlet: Outlet) -> Receiver:
+def _receiver(settings: AttitudeSettings, link: StreamLink, timeline: Timeline, outlet: Outlet) -> Receiver:
     watch = nobody_watches if outlet.ledger is None else outlet.ledger.packet
     shared = settings.clock == "shared"
     traffic = Traffic(settings.status_hz, settings.time_requests and not shared, shared)

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import NamedTuple
 
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal
+from hilstar.attitude.wire.source import Conventions, Mounting
 
 MAX_QUOTED_CHARACTERS = 80
 
@@ -14,3 +18,42 @@ class Entry(NamedTuple):
 
     where: str
     event: AttitudeSample | Refusal
+
+
+@dataclass(frozen=True, slots=True)
+class Stated:
+    """What the user states of a log, where the file itself does not say it; None where nothing is stated.
+
+    `kernels` are SPICE kernels; `topic` and `body` choose one of several; `reference` names the frame that attitudes refer to;
+    `epoch_utc` is the UTC of the log's time zero; `place` is latitude and longitude in degrees and height in metres (WGS84).
+    """
+
+    mounting: Mounting = field(default_factory=Mounting)
+    kernels: tuple[Path, ...] = ()
+    topic: str | None = None
+    body: str | None = None
+    reference: str | None = None
+    epoch_utc: str | None = None
+    place: tuple[float, float, float] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class LogReading:
+    """What a reader gives: the entries in the file's order, attitudes of the body where the conventions say so.
+
+    `advice` is what to do when times do not increase; `told` are notices for the user, kinds and lines.
+    """
+
+    entries: Iterable[Entry]
+    conventions: Conventions
+    advice: str = "sort the log by time"
+    told: list[tuple[str, str]] = field(default_factory=list)
+
+
+@dataclass(frozen=True, slots=True)
+class Log:
+    """A log as read: samples of the camera's attitude in order of time, what the file means by its numbers, and notices."""
+
+    samples: list[AttitudeSample]
+    conventions: Conventions
+    told: list[tuple[str, str]]

@@ -5,15 +5,17 @@ from __future__ import annotations
 import contextlib
 import csv
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import IO
 
 from hilstar.attitude.clock.timeline import Policy, Timeline
 from hilstar.attitude.logs.csv_log import CSV_COLUMNS, read_csv, write_csv
-from hilstar.attitude.logs.entries import MAX_QUOTED_CHARACTERS, Entry
+from hilstar.attitude.logs.entries import MAX_QUOTED_CHARACTERS, Entry, Log, LogReading, Stated
 from hilstar.attitude.logs.gaps import LogJoins, log_joins
 from hilstar.attitude.logs.json_log import read_json_lines, write_json_lines
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal
+from hilstar.attitude.wire.source import PACKETS
 from hilstar.errors import InputError
 from hilstar.files import whole_file
 from hilstar.reading import HEAD_BYTES, MCAP_MAGIC, open_lines, open_regular, read_text
@@ -22,24 +24,32 @@ MAX_NAMED_TOPICS = 12
 MAX_LOG_BYTES = 500_000_000
 MAX_SAMPLES = 6_000_000  # 16 hours at 100 Hz; all are held, at 350 bytes each, so in 2 GB
 MAX_AEM_BYTES = 50_000_000
+NOTHING_STATED = Stated()
 READABLE = "hilstar reads CSV, JSON lines, CCSDS AEM (KVN or XML) and MCAP"
 
 
 def read_log(path: Path) -> list[AttitudeSample]:
-    """The samples of a CSV, JSON lines, CCSDS AEM (KVN or XML) or MCAP file in order of time, whatever its name.
+    """The attitudes of a log that needs nothing stated, in order of time. Raises as `open_log` does."""
+    return open_log(path).samples
 
-    Raises InputError with the line (AEM in XML: the epoch) for anything that is not an attitude: nothing is skipped.
+
+def open_log(path: Path, stated: Stated = NOTHING_STATED) -> Log:
+    """The attitudes of a log in order of time, whatever its name, with what the file means by its numbers.
+
+    Raises InputError with the line (AEM in XML: the epoch) for anything that is not an attitude: nothing is skipped unless
+    the notices say so. Raises MachineError where the format's library is not installed.
     """
     samples: list[AttitudeSample] = []
     try:
-        with _open_log(path) as (entries, advice):
-            for where, event in entries:
+        with _open_log(path, stated) as reading:
+            mounted = stated.mounting.sample if reading.conventions.of_body else _as_it_is
+            for where, event in reading.entries:
                 if isinstance(event, Refusal):
                     raise InputError(f"{path}{where}: {event.detail}")
                 if samples and event.t_ns <= samples[-1].t_ns:
                     times = f"t_ns {event.t_ns} after {samples[-1].t_ns}"
-                    raise InputError(f"{path}{where}: time does not increase ({times}); {advice}")
-                samples.append(event)
+                    raise InputError(f"{path}{where}: time does not increase ({times}); {reading.advice}")
+                samples.append(mounted(event))
                 if len(samples) > MAX_SAMPLES:
                     raise InputError(f"{path}{where}: more than {MAX_SAMPLES} attitudes; split the log into several")
     except (OSError, csv.Error) as error:
@@ -47,7 +57,11 @@ def read_log(path: Path) -> list[AttitudeSample]:
     if not samples:
         _refuse_other_topics(path)
         raise InputError(f"{path}: contains no attitude; write a CSV with the header {','.join(CSV_COLUMNS)}, or JSON lines")
-    return samples
+    return Log(samples, reading.conventions, reading.told)
+
+
+def _as_it_is(sample: AttitudeSample) -> AttitudeSample:
+    return sample
 
 
 def _refuse_other_topics(path: Path) -> None:
@@ -86,26 +100,27 @@ def log_timeline(samples: list[AttitudeSample], policy: Policy, joins: LogJoins 
 
 
 @contextlib.contextmanager
-def _open_log(path: Path) -> Iterator[tuple[Iterable[Entry], str]]:
-    """The entries of a file, and what to do when their times do not increase."""
+def _open_log(path: Path, stated: Stated) -> Iterator[LogReading]:
+    """The reading of a file, by what it holds."""
     with open_regular(path, READABLE) as file:
         head = file.read(HEAD_BYTES)
     if head.startswith(MCAP_MAGIC):
-        yield _mcap_entries(path), "the sender restarted here; give a log of one run"
+        yield _mcap(path)
         return
     with open_lines(path, READABLE, MAX_LOG_BYTES) as lines:
         word = _first_word(lines)
     if word.startswith("<") or word.startswith("CCSDS_AEM_VERS"):
-        text = read_text(path, "write a shorter AEM, or CSV or JSON lines", MAX_AEM_BYTES)
-        advice = "sort its lines, and let no blocks overlap; leap seconds are not counted, so write TAI across one"
-        yield _aem_entries(path, text), advice
+        yield _aem(path, read_text(path, "write a shorter AEM, or CSV or JSON lines", MAX_AEM_BYTES))
         return
     if word.startswith("CCSDS_"):
         raise InputError(
             f"{path}: starts with {word[:MAX_QUOTED_CHARACTERS]}; of the CCSDS messages, only CCSDS_AEM_VERS is read"
         )
     with open_lines(path, READABLE, MAX_LOG_BYTES) as lines:
-        yield (read_json_lines if word.startswith("{") else read_csv)(lines), "sort the log by time"
+        if word.startswith("{"):
+            yield LogReading(read_json_lines(lines), replace(PACKETS, source="JSON lines"))
+        else:
+            yield LogReading(read_csv(lines), replace(PACKETS, source="CSV"))
 
 
 def _first_word(lines: Iterable[str]) -> str:
@@ -117,23 +132,26 @@ def _first_word(lines: Iterable[str]) -> str:
     return ""
 
 
-# The libraries of AEM and MCAP are imported where a log needs them.
+# A format's reader, and its library, are imported where a log needs them.
 
 
-def _mcap_entries(path: Path) -> Iterator[Entry]:
+def _mcap(path: Path) -> LogReading:
     from hilstar.attitude.logs.mcap_log import read_attitudes
 
-    return (Entry(f", attitude {number}", sample) for number, sample in enumerate(read_attitudes(path), start=1))
+    entries = (Entry(f", attitude {number}", sample) for number, sample in enumerate(read_attitudes(path), start=1))
+    return LogReading(entries, replace(PACKETS, source="MCAP"), "the sender restarted here; give a log of one run")
 
 
-def _aem_entries(path: Path, text: str) -> list[Entry]:
+def _aem(path: Path, text: str) -> LogReading:
     from hilstar.attitude.logs.aem.keywords import AemFaultError
-    from hilstar.attitude.logs.aem.reader import read_aem
+    from hilstar.attitude.logs.aem.reader import CONVENTIONS, read_aem
 
     try:
-        return read_aem(text)
+        entries = read_aem(text)
     except AemFaultError as fault:
         raise InputError(f"{path}{fault.where}: {fault}") from fault
+    advice = "sort its lines, and let no blocks overlap; leap seconds are not counted, so write TAI across one"
+    return LogReading(entries, CONVENTIONS, advice)
 
 
 def _write_kvn(file: IO[bytes], samples: Sequence[AttitudeSample]) -> None:

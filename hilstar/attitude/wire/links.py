@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Generic, Protocol, TypeAlias, TypeVar
+from types import TracebackType
+from typing import Generic, Protocol, Self, TypeAlias, TypeVar
 
+from hilstar.attitude.wire.flood_limits import LinkCounts
 from hilstar.attitude.wire.packet import AttitudeSample, Event, Packet, Refusal
+from hilstar.attitude.wire.source import Conventions
 
 E_co = TypeVar("E_co", bound=Event, covariant=True)
 
@@ -43,3 +46,25 @@ class Link(Protocol):
 
     def wire_ns(self, packet: Packet) -> int:
         """How long the wire alone takes for a packet, ns."""
+
+
+class StreamLink(Link, Protocol):
+    """A link that runs freely: what `serve` asks of one, besides its messages.
+
+    `verb` and `endpoint` say where it is ("connected to", "tcp://127.0.0.1:5560"), `conventions` what its numbers mean.
+    """
+
+    verb: str
+    endpoint: str
+    link_counts: LinkCounts
+    conventions: Conventions
+
+    @property
+    def reconnects(self) -> int:
+        """How often the sender reconnected."""
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /
+    ) -> None: ...

@@ -17,6 +17,7 @@ from hilstar.attitude.wire.cobs import DELIMITER, StreamDecoder, frame
 from hilstar.attitude.wire.flood_limits import FloodGate, LinkCounts
 from hilstar.attitude.wire.links import Arrival
 from hilstar.attitude.wire.packet import Event, Packet, encode
+from hilstar.attitude.wire.source import PACKETS
 from hilstar.errors import InputError, one_line
 from hilstar.notices import Notices
 from hilstar.units import NS_PER_S
@@ -42,6 +43,7 @@ class SerialLink:
 
     two_way = True
     verb = "reading"
+    conventions = PACKETS
 
     def __init__(self, port: str, baud: int, notices: Notices | None = None) -> None:
         self.link_counts = LinkCounts()

@@ -14,6 +14,7 @@ from hilstar.attitude.wire.doorkeeper import HANDSHAKE_MS, Doorkeeper
 from hilstar.attitude.wire.endpoint import ENDPOINT_FORM, PATH_FORM, check_use, parse_endpoint
 from hilstar.attitude.wire.flood_limits import MAX_GROWTH_BYTES, LinkCounts, MemoryWatch, raise_file_limit
 from hilstar.attitude.wire.keys import AllowList, CurveKeys, check_reach, load_public, load_secret
+from hilstar.attitude.wire.source import PACKETS
 from hilstar.errors import InputError
 from hilstar.notices import Notices
 
@@ -45,6 +46,8 @@ class ZmqSocket:
     A socket that binds is opened at once, to check that it can be; one that receives is then closed until its first read, so
     that no old messages and no flood collect in it while the display is prepared.
     """
+
+    conventions = PACKETS
 
     def __init__(self, kind: int, endpoint: str, *, bind: bool, keys: CurveKeys, notices: Notices | None) -> None:
         self._place = parse_endpoint(endpoint)

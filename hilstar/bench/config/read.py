@@ -62,9 +62,8 @@ def _check_finite(value: Any, path: Path, where: str = "") -> None:
 
 def _check_meaning(config: BenchConfig, path: Path) -> None:
     """What a type cannot say."""
-    norm = math.hypot(*config.collimator.q_cam_to_mon)
-    if abs(norm - 1) > NORM_TOLERANCE:
-        raise InputError(f"{path}: [collimator] q_cam_to_mon: its norm is {norm:.6g}; write a unit quaternion w, x, y, z")
+    _check_unit(path, "[collimator] q_cam_to_mon", config.collimator.q_cam_to_mon)
+    _check_unit(path, "[tracker] q_body_to_cam", config.tracker.q_body_to_cam)
     if math.hypot(*config.sky.observer_velocity_km_s) >= LIGHT_KM_S:
         raise InputError(f"{path}: [sky] observer_velocity_km_s is not slower than light; write km/s, ICRS x, y, z")
     if config.background.electrons_per_px is not None and config.background.zodiacal_v_mag_arcsec2 is not None:
@@ -82,3 +81,9 @@ def _check_meaning(config: BenchConfig, path: Path) -> None:
         raise InputError(f'{path}: [attitude] source = "serial" needs port; write port = "/dev/ttyUSB0" or the like')
     if config.attitude.source == "serial" and config.attitude.lockstep:
         raise InputError(f'{path}: [attitude] lockstep = true is for source = "zmq"; leave one of them out')
+
+
+def _check_unit(path: Path, where: str, q: tuple[float, ...]) -> None:
+    norm = math.hypot(*q)
+    if abs(norm - 1) > NORM_TOLERANCE:
+        raise InputError(f"{path}: {where}: its norm is {norm:.6g}; write a unit quaternion w, x, y, z")

@@ -7,7 +7,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from hilstar.bench.config.values import NotNegative, Point, Positive, Sigma, Size
+from hilstar.bench.config.values import NotNegative, Point, Positive, Rotation, Sigma, Size
 from hilstar.toml_tables import Table
 from hilstar.tracker.settings import DetectorSettings, PixelPitch
 
@@ -64,4 +64,11 @@ class Tracker(Table, frozen=True):
             extra={"default": "an ideal lens"},
         ),
     ] = None
+    q_body_to_cam: Annotated[
+        Rotation,
+        Meta(
+            description="How the tracker sits in the spacecraft: turns body components into camera components. Applied to each "
+            "source whose attitude is the body's (see [attitude in](attitude-in.md)); packets, JSON and CSV hold the camera's."
+        ),
+    ] = (1.0, 0.0, 0.0, 0.0)
     detector: Annotated[DetectorSettings, Meta(description="See below.")] = msgspec.field(default_factory=DetectorSettings)

@@ -7,8 +7,22 @@ from typing import Annotated, Any
 
 import typer
 
-from hilstar.cli.options import LOG_HELP, BenchFile, Explain, Headless, Json, Overwrite, check_files
-from hilstar.cli.parsers import parse_speed, parse_split
+from hilstar.cli.options import (
+    LOG_HELP,
+    BenchFile,
+    BodyName,
+    EpochUtc,
+    Explain,
+    Headless,
+    Json,
+    KernelFiles,
+    Overwrite,
+    PlaceText,
+    ReferenceName,
+    TopicName,
+    check_files,
+)
+from hilstar.cli.parsers import parse_place, parse_speed, parse_split
 from hilstar.cli.show.running import (
     Force,
     LedgerFile,
@@ -16,6 +30,7 @@ from hilstar.cli.show.running import (
     Windowed,
     end_of_run,
     explain_effort,
+    explain_source,
     optional_ledger,
     say_what_clips,
     shown_bench,
@@ -34,6 +49,12 @@ def replay(
     start: Annotated[float | None, typer.Option(metavar="S", help="Start this many seconds after the first sample.")] = None,
     stop: Annotated[float | None, typer.Option(metavar="S", help="Stop this many seconds after the first sample.")] = None,
     step: Annotated[float | None, typer.Option(metavar="S", help="Time step of the log between frames, in seconds.")] = None,
+    kernel: KernelFiles = None,
+    topic: TopicName = None,
+    body: BodyName = None,
+    reference: ReferenceName = None,
+    epoch_utc: EpochUtc = None,
+    place: PlaceText = None,
     headless: Headless = False,
     output: Annotated[
         Path | None, typer.Option("-o", "--output", metavar="DIR", help="Directory for a PNG of each frame, and frames.csv.")
@@ -47,6 +68,8 @@ def replay(
     as_json: Json = False,
 ) -> None:
     """Show an attitude log on the monitor."""
+    from hilstar.attitude.logs.entries import Stated
+    from hilstar.attitude.wire.source import Mounting
     from hilstar.bench.bench_file import read_bench_file
     from hilstar.run.record.frame_images import FrameImages
     from hilstar.run.replay import Wanted, plan_play
@@ -59,7 +82,9 @@ def replay(
     check_files([log], [None if output is None else output / "frames.csv"], file, ledger, overwrite)
     split = parse_split(ledger_split)
     notices = Notices()
-    play = plan_play(log, Wanted(parse_speed(speed), start, stop, step), file.config)
+    mounting = Mounting(file.config.tracker.q_body_to_cam)
+    stated = Stated(mounting, tuple(kernel or ()), topic, body, reference, epoch_utc, parse_place(place))
+    play = plan_play(log, Wanted(parse_speed(speed), start, stop, step), file.config, stated)
     with (
         shown_bench(file, headless, windowed, force) as (bench, screen),
         FrameImages(output, bench) as record,
@@ -68,6 +93,7 @@ def replay(
     ):
         say_what_clips(bench)
         if explain:
+            explain_source(play.conventions, mounting)
             explain_effort(bench)
 
         def sink(shown: Any) -> None:

@@ -17,6 +17,7 @@ from hilstar.notices import Notices
 from hilstar.process.interrupts import stop_on_signal
 
 if TYPE_CHECKING:
+    from hilstar.attitude.wire.source import Conventions, Mounting
     from hilstar.bench.bench_file import BenchFile
     from hilstar.run.summary import RunSummary
 
@@ -39,6 +40,12 @@ def explain_effort(bench: Any) -> None:
     from hilstar.bench.effort import explain
 
     for line in explain(bench.effort, bench.config.render):
+        say(line)
+
+
+def explain_source(conventions: Conventions, mounting: Mounting) -> None:
+    """Say what the numbers of a source mean, with an attitude to compare."""
+    for line in conventions.lines(mounting):
         say(line)
 
 

@@ -16,6 +16,7 @@ from hilstar.cli.show.running import (
     Windowed,
     end_of_run,
     explain_effort,
+    explain_source,
     optional_ledger,
     say_what_clips,
     shown_bench,
@@ -41,9 +42,11 @@ def serve(
     as_json: Json = False,
 ) -> None:
     """Show the live attitude stream on the monitor."""
+    from hilstar.attitude.wire.source import Mounting
     from hilstar.bench.bench_file import read_bench_file
     from hilstar.run.loop import Limit
-    from hilstar.run.serve import Outlet, open_link
+    from hilstar.run.open_link import open_link
+    from hilstar.run.serve import Outlet
     from hilstar.run.serve import serve as serve_stream
 
     check_ending("--ledger", ledger, MCAP)
@@ -52,11 +55,12 @@ def serve(
     split = parse_split(ledger_split)
     notices = Notices()
     with (
-        open_link(file.config.attitude, file.folder, notices) as link,
+        open_link(file.config, file.folder, notices) as link,
         shown_bench(file, headless, windowed, force) as (bench, screen),
         optional_ledger(ledger, bench, notices, overwrite, split) as kept,
     ):
         if explain:
+            explain_source(link.conventions, Mounting(file.config.tracker.q_body_to_cam))
             explain_effort(bench)
         refresh_hz = bench.config.monitor.refresh_hz
         slots = math.inf if duration is None else round(duration * refresh_hz)

@@ -7,17 +7,44 @@ from typing import Annotated
 
 import typer
 
-from hilstar.cli.options import LOG_HELP, check_files
+from hilstar.cli.options import (
+    LOG_HELP,
+    UNSAID,
+    BodyName,
+    EpochUtc,
+    KernelFiles,
+    PlaceText,
+    ReferenceName,
+    TopicName,
+    check_files,
+)
+from hilstar.cli.parsers import parse_mounting, parse_place
+from hilstar.console.terminal import say
 
 
 def convert(
     log: Annotated[Path, typer.Argument(metavar="LOG", help=LOG_HELP)],
     output: Annotated[Path, typer.Argument(metavar="OUT", help=".csv, .jsonl, .aem, .xml or .mcap.")],
+    kernel: KernelFiles = None,
+    topic: TopicName = None,
+    body: BodyName = None,
+    reference: ReferenceName = None,
+    epoch_utc: EpochUtc = None,
+    place: PlaceText = None,
+    mounting: Annotated[
+        str,
+        typer.Option(metavar="W,X,Y,Z", help="q_body_to_cam, for a log whose attitude is the body's.", rich_help_panel=UNSAID),
+    ] = "1,0,0,0",
 ) -> None:
     """Convert an attitude log to another format."""
-    from hilstar.attitude.logs.log_file import read_log, write_log
+    from hilstar.attitude.logs.entries import Stated
+    from hilstar.attitude.logs.log_file import open_log, write_log
+    from hilstar.attitude.wire.source import Mounting
 
     check_files([log], [output])
-    samples = read_log(log)
-    write_log(output, samples)
-    typer.echo(f"{len(samples)} attitudes in {output}")
+    mounted = Mounting(parse_mounting(mounting))
+    read = open_log(log, Stated(mounted, tuple(kernel or ()), topic, body, reference, epoch_utc, parse_place(place)))
+    for _, line in read.told:
+        say(line)
+    write_log(output, read.samples)
+    typer.echo(f"{len(read.samples)} attitudes in {output}")

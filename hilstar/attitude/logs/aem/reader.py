@@ -26,6 +26,7 @@ from hilstar.attitude.logs.aem.kvn import kvn_blocks
 from hilstar.attitude.logs.aem.xml import xml_blocks
 from hilstar.attitude.logs.entries import Entry
 from hilstar.attitude.wire.packet import AttitudeSample, checked_sample
+from hilstar.attitude.wire.source import Conventions, components
 from hilstar.rotation import conjugate, multiply
 
 # 504.0-B-2's own examples write J2000 for EME2000; the realisations of the ICRF share its axes to 0.1 mas.
@@ -34,6 +35,15 @@ INERTIAL_FRAMES = frozenset({"ICRF", "ICRF1", "ICRF2", "ICRF3", "GCRF", "EME2000
 BODY_FRAME = re.compile(
     "(SC_BODY|STARTRACKER|AST|INSTRUMENT|SENSOR|CAM|CAMERA|ACC|ACTUATOR|CSS|DSS|ESA|GYRO|GYRO_FRAME"
     "|IMU|IMU_FRAME|MTA|RW|SA|TAM)(_.*|[0-9]+)?"
+)
+
+CONVENTIONS = Conventions(
+    "CCSDS AEM",
+    "from the inertial to the body frame that the file names, or back as its ATTITUDE_DIR says",
+    "the scalar where the file says; the conjugate of a Hamilton quaternion (504.0-B-2 annex F)",
+    "the file's own TIME_SYSTEM, from 1970-01-01T00:00:00; leap seconds are not counted",
+    of_body=False,
+    written=lambda q: f"A2B, ICRF to body, Q1 Q2 Q3 QC = {components(np.roll(conjugate(q), -1))}",
 )
 
 
@@ -68,8 +78,8 @@ def _part(entries: list[Entry], following: list[Entry]) -> None:
 def _entries(block: Block, times: list[int]) -> Iterator[Entry]:
     q, rate = _attitudes(block)
     rates: Sequence[list[float] | None] = [None] * len(q) if rate is None else rate.tolist()
-    for where, t_ns, components, turning in zip(block.where, times, q.tolist(), rates, strict=True):
-        yield Entry(where, checked_sample(t_ns, tuple(components), None if turning is None else tuple(turning)))
+    for where, t_ns, numbers, turning in zip(block.where, times, q.tolist(), rates, strict=True):
+        yield Entry(where, checked_sample(t_ns, tuple(numbers), None if turning is None else tuple(turning)))
 
 
 def _attitudes(block: Block) -> tuple[FloatArray, FloatArray | None]:

@@ -1,0 +1,83 @@
+"""What a source of attitudes means by its numbers, and how the attitude of a body becomes that of the camera."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hilstar.arrays import FloatArray
+from hilstar.attitude.wire.packet import AttitudeSample
+from hilstar.rotation import conjugate, from_radec_roll_deg, multiply, normalise, to_matrix
+
+Components = tuple[float, float, float, float]
+IDENTITY: Components = (1.0, 0.0, 0.0, 0.0)
+# Orion's belt at roll 0, which everybody finds: the star is Alnilam (HIP 26311), 15 arcsec from the boresight.
+CHECK_RADEC_DEG, CHECK_STAR = (84.057, -1.200), "Alnilam"
+
+
+class Mounting:
+    """How the camera sits in the body: `q_body_to_cam`, which turns body components into camera components."""
+
+    def __init__(self, q_body_to_cam: Components = IDENTITY) -> None:
+        self.q_body_to_cam = normalise(np.array(q_body_to_cam, dtype=np.float64))
+        self._matrix = to_matrix(self.q_body_to_cam)
+        self._plain = q_body_to_cam == IDENTITY
+
+    def sample(self, body: AttitudeSample) -> AttitudeSample:
+        """The camera's attitude and rate of a sample that holds the body's: q_icrs_to_body, rate in body components."""
+        if self._plain:
+            return body
+        rate = body.rate_cam_rad_s
+        q = multiply(self.q_body_to_cam, body.q_icrs_to_cam)
+        return replace(body, q_icrs_to_cam=q, rate_cam_rad_s=None if rate is None else self._matrix @ rate)
+
+    def q_icrs_to_body(self, q_icrs_to_cam: FloatArray) -> FloatArray:
+        """The body's attitude of the camera's."""
+        return multiply(conjugate(self.q_body_to_cam), q_icrs_to_cam)
+
+
+@dataclass(frozen=True, slots=True)
+class Conventions:
+    """What a source means by its numbers: `--explain` shows it, and the documentation says the same.
+
+    `turns` says from which frame to which; `scalar` the order of the components; `time` the scale and the zero of its times;
+    `of_body` whether `[tracker] q_body_to_cam` applies; `written` gives an attitude in the source's own words.
+    """
+
+    source: str
+    turns: str
+    scalar: str
+    time: str
+    of_body: bool
+    written: Callable[[FloatArray], str]
+
+    def lines(self, mounting: Mounting) -> list[str]:
+        """The conventions, and the self-check, for a person."""
+        q = from_radec_roll_deg(*CHECK_RADEC_DEG, 0.0)
+        own = mounting.q_icrs_to_body(q) if self.of_body else q
+        ra_deg, dec_deg = CHECK_RADEC_DEG
+        mounted = f"it is the body's; [tracker] q_body_to_cam = {components(mounting.q_body_to_cam)} makes it the camera's"
+        seen = f"{CHECK_STAR} (RA {ra_deg:g}, Dec {dec_deg:g}) is in the middle, north up"
+        return [
+            f"{self.source}: {self.turns}; {self.scalar}",
+            f"attitude: {mounted if self.of_body else 'it is the camera itself; q_body_to_cam is not used'}",
+            f"time: {self.time}",
+            f"self-check: at {self.written(own)} {seen}; yours should be too",
+        ]
+
+
+def components(q: FloatArray) -> str:
+    """Components as text with seven digits, in the order given."""
+    return "(" + ", ".join(f"{c:.7f}" for c in q) + ")"
+
+
+PACKETS = Conventions(
+    "hilstar's packets and logs",
+    "q_icrs_to_cam turns ICRS components into camera components",
+    "scalar first (w, x, y, z), Hamilton",
+    "the sender's own clock, of any zero",
+    of_body=False,
+    written=lambda q: f"q = {components(q)}",
+)

@@ -27,6 +27,7 @@ from hilstar.cli.show.demo import demo
 from hilstar.cli.show.frame import frame
 from hilstar.cli.show.replay import replay
 from hilstar.cli.show.serve import serve
+from hilstar.cli.stream.attitude import attitude
 from hilstar.cli.stream.convert import convert
 from hilstar.cli.stream.keys import keys
 from hilstar.cli.stream.send import send
@@ -34,7 +35,7 @@ from hilstar.cli.study import study
 
 COMMANDS: dict[str, tuple[Callable[..., None], ...]] = {
     "Show stars": (demo, frame, serve, replay),
-    "Attitude streams": (send, convert, keys),
+    "Attitude streams": (send, attitude, convert, keys),
     "Check what is shown": (simulate, verify, compare, budget, report),
     "Calibrate": (first_light, latency),
     "Study": (study, benchmark),

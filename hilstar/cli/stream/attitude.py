@@ -1,0 +1,168 @@
+"""hilstar attitude: where a log or a live stream points, for a person to recognise."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from hilstar.cli.options import (
+    LOG_HELP,
+    BodyName,
+    EpochUtc,
+    Json,
+    KernelFiles,
+    PlaceText,
+    ReferenceName,
+    TopicName,
+)
+from hilstar.cli.parsers import parse_place
+from hilstar.console.terminal import print_json, say
+
+if TYPE_CHECKING:
+    from hilstar.attitude.logs.entries import Stated
+    from hilstar.attitude.wire.packet import AttitudeSample
+    from hilstar.attitude.wire.source import Conventions
+    from hilstar.bench.bench_file import BenchFile
+
+SHOWN_STARS = 3
+
+
+def attitude(
+    source: Annotated[
+        Path, typer.Argument(metavar="INPUT", help=f"{LOG_HELP} Or a bench file (.toml): its live stream is awaited.")
+    ],
+    at: Annotated[
+        str | None,
+        typer.Option(
+            "--at",
+            metavar="T",
+            help="Seconds after the log's first sample, or a date and time as the log has them; by default its first sample.",
+        ),
+    ] = None,
+    bench: Annotated[
+        Path | None,
+        typer.Option(metavar="BENCH.toml", help="Whose tracker, mounting and sky to use; by default the demo's tracker."),
+    ] = None,
+    wait: Annotated[float, typer.Option(metavar="S", help="How long to wait for a live stream.", min=0.1, max=1e6)] = 10.0,
+    kernel: KernelFiles = None,
+    topic: TopicName = None,
+    body: BodyName = None,
+    reference: ReferenceName = None,
+    epoch_utc: EpochUtc = None,
+    place: PlaceText = None,
+    explain: Annotated[
+        bool, typer.Option("--explain", help="Explain what the source's numbers mean: frames, scalar order, time scale.")
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Say where a log or a live stream points: quaternion, RA, Dec, roll, and the brightest stars in view."""
+    from hilstar.attitude.logs.entries import Stated
+    from hilstar.attitude.wire.source import Mounting
+    from hilstar.bench.bench_file import read_bench_file
+    from hilstar.resources import resource_path
+
+    live = source.suffix.lower() == ".toml"
+    file = read_bench_file(bench or (source if live else resource_path("configs", "demo.toml")))
+    mounting = Mounting(file.config.tracker.q_body_to_cam)
+    if live:
+        sample, conventions = _live(source, at, wait)
+        held = False
+    else:
+        stated = Stated(mounting, tuple(kernel or ()), topic, body, reference, epoch_utc, parse_place(place))
+        sample, conventions, held = _of_log(source, at, stated)
+    told = {"source": conventions.source, "held": held, **_pointing(sample, file)}
+    meaning = conventions.lines(mounting)
+    if as_json:
+        print_json({**told, "conventions": meaning})
+        return
+    for line in [*(meaning if explain else ()), *_lines(told)]:
+        typer.echo(line)
+
+
+def _live(path: Path, at: str | None, patience_s: float) -> tuple[AttitudeSample, Conventions]:
+    """The first attitude of the stream that a bench file names."""
+    from hilstar.attitude.wire.zmq_lockstep import ZmqLockstep
+    from hilstar.bench.bench_file import read_bench_file
+    from hilstar.errors import InputError
+    from hilstar.run.listen import first_attitude
+    from hilstar.run.open_link import open_link
+
+    if at is not None:
+        raise InputError(f"--at {at}: a live stream has only its present; leave --at out, or give a log")
+    file = read_bench_file(path)
+    with open_link(file.config, file.folder) as link:
+        if isinstance(link, ZmqLockstep):
+            raise InputError(f"{path}: [attitude] lockstep = true wants a frame for each attitude; use hilstar serve --explain")
+        return first_attitude(link, patience_s), link.conventions
+
+
+def _of_log(path: Path, at: str | None, stated: Stated) -> tuple[AttitudeSample, Conventions, bool]:
+    """The attitude of a log at a time, and whether it is held there because the log has a gap."""
+    from hilstar.attitude.clock.timeline import Policy
+    from hilstar.attitude.logs.gaps import log_joins
+    from hilstar.attitude.logs.log_file import log_timeline, open_log
+    from hilstar.attitude.logs.when import time_in_log
+    from hilstar.attitude.wire.packet import AttitudeSample
+
+    log = open_log(path, stated)
+    joins = log_joins(log.samples)
+    for _, line in [*log.told, *joins.told]:
+        say(line)
+    t_ns = time_in_log(path, log.samples, at)
+    found = log_timeline(log.samples, Policy(0, 0), joins).at(t_ns)
+    if found is None:
+        raise AssertionError("a log has samples")
+    held = found.rate_cam_rad_s is None and found.age_ns > 0
+    return AttitudeSample(t_ns, found.q_icrs_to_cam, found.rate_cam_rad_s, found.sequence), log.conventions, held
+
+
+def _pointing(sample: AttitudeSample, file: BenchFile) -> dict[str, Any]:
+    """Where the camera looks, and what it sees."""
+    import numpy as np
+
+    from hilstar.bench.build import bench_stars
+    from hilstar.bench.cameras import tracker_camera
+    from hilstar.bench.in_view import brightest_in_view
+    from hilstar.rotation import to_radec_roll_deg
+
+    ra_deg, dec_deg, roll_deg = to_radec_roll_deg(sample.q_icrs_to_cam)
+    camera = tracker_camera(file.config.tracker, file.folder)
+    stars = brightest_in_view(bench_stars(file.config, file.folder), camera, sample.q_icrs_to_cam, SHOWN_STARS)
+    rate = sample.rate_cam_rad_s
+    return {
+        "t_ns": sample.t_ns,
+        "q_icrs_to_cam": sample.q_icrs_to_cam.tolist(),
+        "ra_deg": ra_deg,
+        "dec_deg": dec_deg,
+        "roll_deg": roll_deg,
+        "rate_deg_s": None if rate is None else np.degrees(rate).tolist(),
+        "tracker": {"file": file.path.name, "resolution_px": list(file.config.tracker.resolution_px)},
+        "stars": stars,
+    }
+
+
+def _lines(told: dict[str, Any]) -> list[str]:
+    """The same for a person."""
+    q = ", ".join(f"{c:.7f}" for c in told["q_icrs_to_cam"])
+    width, height = told["tracker"]["resolution_px"]
+    lines = [
+        f"q_icrs_to_cam {q}, t_ns {told['t_ns']}" + (" (held: in a gap of the log)" if told["held"] else ""),
+        f"RA {_turn(told['ra_deg'])}, Dec {told['dec_deg']:.4f}, roll {_turn(told['roll_deg'])} deg",
+    ]
+    if told["rate_deg_s"] is not None:
+        lines.append("rate " + ", ".join(f"{c:.6f}" for c in told["rate_deg_s"]) + " deg/s about x, y, z of the camera")
+    if not told["stars"]:
+        lines.append("no star of the catalogue is in view")
+    for star in told["stars"]:
+        where = (
+            f"x {star.x_px:.0f}, y {star.y_px:.0f} of {width} x {height} px, {star.from_boresight_deg:.2f} deg from the middle"
+        )
+        lines.append(f"HIP {star.hip}, V {star.v_mag:.2f}, in {star.constellation}: {where}")
+    return lines
+
+
+def _turn(angle_deg: float) -> str:
+    """An angle from 0 to 360 degrees, which rounding does not make 360."""
+    return f"{round(angle_deg, 4) % 360:.4f}"

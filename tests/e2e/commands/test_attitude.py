@@ -1,0 +1,88 @@
+"""hilstar attitude: where a log or a stream points, against Astropy and SciPy."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy import units
+from astropy.coordinates import SkyCoord
+from scipy.spatial.transform import Rotation
+
+from hilstar.sky.catalog import load_catalog
+from tests.support.benches import SMALL_BENCH, attitude_table
+from tests.support.commands import assert_refused, run_hilstar_here
+from tests.support.senders import free_port, publisher, talking
+
+# A catalogue place is of 1991.25 and this of the bench's epoch: Hipparcos' fastest star moves by 10 arcsec a year.
+MOTION_DEG = 0.2
+ROUNDING_DEG = 1e-9
+
+
+def log_of(tmp_path: Path, rows: list[tuple[float, list[float]]]) -> Path:
+    path = tmp_path / "log.csv"
+    lines = [f"{t_s},{','.join(map(repr, q))}" for t_s, q in rows]
+    path.write_text("\n".join(["t_s,qw,qx,qy,qz", *lines]))
+    return path
+
+
+def told(*arguments: object) -> dict:
+    result = run_hilstar_here("attitude", *arguments, "--json")
+    assert result.returncode == 0, result.stderr
+    return json.loads(result.stdout)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_boresight_and_stars_are_those_that_an_independent_rotation_finds(tmp_path, small_bench_file, seed):
+    turn = Rotation.random(rng=np.random.default_rng(seed))
+    q = turn.as_quat(scalar_first=True).tolist()
+    found = told(log_of(tmp_path, [(0.0, q), (1.0, q)]), "--bench", small_bench_file)
+    boresight = SkyCoord(*turn.inv().apply([0.0, 0.0, 1.0]), representation_type="cartesian")
+    boresight.representation_type = "unitspherical"
+    looked = SkyCoord(found["ra_deg"], found["dec_deg"], unit="deg")
+    assert looked.separation(boresight).deg < ROUNDING_DEG
+    catalog = load_catalog("hipparcos")
+    assert len(found["stars"]) == 3
+    assert [s["v_mag"] for s in found["stars"]] == sorted(s["v_mag"] for s in found["stars"])
+    for star in found["stars"]:
+        row = int(np.flatnonzero(catalog.hip == star["hip"])[0])
+        place = SkyCoord(catalog.ra_deg[row], catalog.dec_deg[row], unit="deg")
+        seen = SkyCoord(star["ra_deg"], star["dec_deg"], unit="deg")
+        assert place.separation(seen).deg < MOTION_DEG
+        assert seen.separation(looked).deg == pytest.approx(star["from_boresight_deg"], abs=ROUNDING_DEG)
+        cam = turn.apply(seen.cartesian.xyz.to_value(units.one))
+        side = np.array([star["x_px"], star["y_px"]]) - (np.array(found["tracker"]["resolution_px"]) - 1) / 2
+        assert side @ cam[:2] == pytest.approx(np.hypot(*side) * np.hypot(*cam[:2]), rel=1e-6)  # on the same side
+
+
+def test_a_time_within_a_log_may_be_seconds_or_a_date(tmp_path):
+    turns = [Rotation.from_euler("z", angle, degrees=True).as_quat(scalar_first=True).tolist() for angle in (0, 2, 4)]
+    rows = [(1_700_000_000.0 + 10 * k, q) for k, q in enumerate(turns)]
+    log = log_of(tmp_path, rows)
+    by_seconds, by_date = told(log, "--at", "15"), told(log, "--at", "2023-11-14T22:13:35")
+    assert by_seconds == by_date
+    assert by_seconds["t_ns"] == 1_700_000_015 * 10**9
+    expected = Rotation.from_euler("z", 3, degrees=True)
+    found = Rotation.from_quat(by_seconds["q_icrs_to_cam"], scalar_first=True)
+    assert (found * expected.inv()).magnitude() < 1e-12
+    for wrong in ("21", "-1", "2023-11-14T22:13:41", "noon", "nan"):
+        assert_refused(run_hilstar_here("attitude", log, f"--at={wrong}"), 2, f"--at {wrong}")
+
+
+def test_a_live_stream_is_awaited(tmp_path):
+    bench = tmp_path / "bench.toml"
+    with publisher() as (sender, port), talking(sender, q=(0.5, 0.5, -0.5, 0.5)):
+        bench.write_text(SMALL_BENCH + attitude_table(port))
+        found = told(bench)
+    assert (found["ra_deg"], found["dec_deg"]) == pytest.approx((0, 0), abs=ROUNDING_DEG)
+
+
+def test_silence_and_wrong_uses_are_refused_in_one_line(tmp_path):
+    bench = tmp_path / "bench.toml"
+    bench.write_text(SMALL_BENCH + attitude_table(free_port()))
+    assert_refused(run_hilstar_here("attitude", bench, "--wait", "0.2"), 2, "no attitude within 0.2 s")
+    assert_refused(run_hilstar_here("attitude", bench, "--at", "3"), 2, "--at 3")
+    bench.write_text(SMALL_BENCH + attitude_table(free_port(), "lockstep = true"))
+    assert_refused(run_hilstar_here("attitude", bench), 2, "lockstep")

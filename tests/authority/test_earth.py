@@ -1,0 +1,130 @@
+"""From the ICRS to a level frame on the Earth, against Astropy's frames and the matrix that the IERS publishes."""
+
+from __future__ import annotations
+
+import warnings
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from astropy.coordinates import GCRS, ITRS, AltAz, CartesianRepresentation, EarthLocation, SkyCoord
+from astropy.time import Time
+from astropy.utils import iers
+from scipy.spatial.transform import Rotation
+
+from hilstar.attitude.logs.earth import (
+    EARTH_RATE_RAD_S,
+    beyond_table,
+    earth_rate_ned_rad_s,
+    q_icrs_to_enu,
+    q_icrs_to_itrs,
+    q_icrs_to_ned,
+    utc_ns_of,
+)
+from hilstar.errors import InputError
+from hilstar.rotation import conjugate, multiply, to_matrix, to_rotation_vector
+
+MAS = np.radians(1 / 3.6e6)
+# Astropy interpolates the same table: s' (0.01 mas), the hour's interpolation and the rounding of a Time are left.
+ASTROPY_MAS = 0.05
+# The IERS's own parameters of that day were rapid ones: UT1 to 0.13 ms (2.0 mas), the pole to 0.4 mas.
+IERS_MAS = 3.0
+# AltAz has the light's aberration of the Earth's turning (0.32 arcsec at the equator), which is no part of an attitude.
+DIURNAL_ARCSEC = 0.33
+POLE_RAD = np.radians(0.6 / 3600)  # the farthest that the pole of rotation is from the Earth's third axis
+PLACES_DEG = [(0.0, 0.0), (48.1, 11.6), (-33.9, 151.2), (89.999, 12.0), (-89.999, -170.0), (90.0, 0.0), (-90.0, 180.0)]
+DATES = ["1975-03-01T12:34:56", "1999-12-31T23:59:59", "2016-12-31T23:30:00", "2024-02-29T06:00:00.25", "2026-11-22T10:00:00"]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _the_same_table():
+    """Astropy with the table of its package: nothing is downloaded."""
+    table = iers.IERS_A.read(iers.IERS_A_FILE)
+    with iers.conf.set_temp("auto_download", False), iers.earth_orientation_table.set(table):
+        yield
+
+
+def at(text: str) -> np.ndarray:
+    return np.array([utc_ns_of(text, "--epoch-utc")])
+
+
+def angle_mas(matrix: np.ndarray) -> float:
+    """The angle of a rotation matrix that is nearly 1."""
+    return float(
+        np.linalg.norm([matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]]) / 2 / MAS
+    )
+
+
+@pytest.mark.parametrize("date", DATES)
+def test_the_earths_axes_are_astropys(date):
+    ours = to_matrix(q_icrs_to_itrs(at(date))[0])
+    time = Time(date, scale="utc")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        columns = [ITRS(CartesianRepresentation(*axis), obstime=time).transform_to(GCRS(obstime=time)) for axis in np.eye(3)]
+    itrs_to_gcrs = np.array([column.cartesian.xyz.value for column in columns]).T
+    assert angle_mas(ours @ itrs_to_gcrs) < ASTROPY_MAS
+
+
+def test_the_earths_axes_are_those_that_the_iers_published():
+    """From hpiers.obspm.fr/eop-pc/products/matrice/matrice.php, with nutation, UT1 and pole switched on."""
+    itrf_to_icrf = np.array(
+        [
+            [-0.600054079259, -0.799958492301, 0.001229861818],
+            [0.799959080231, -0.600054555381, -0.000022838411],
+            [0.000756253967, 0.000970134847, 0.999999243459],
+        ]
+    )
+    ours = to_matrix(q_icrs_to_itrs(at("2012-05-20T16:33:13"))[0])
+    assert angle_mas(ours @ itrf_to_icrf) < IERS_MAS
+
+
+@pytest.mark.parametrize("place", PLACES_DEG)
+@pytest.mark.parametrize("date", ["1999-12-31T23:59:59", "2026-11-22T10:00:00"])
+def test_a_star_stands_where_astropys_horizon_has_it(date, place):
+    star = SkyCoord(213.9, 19.2, unit="deg", frame=GCRS(obstime=Time(date, scale="utc")))  # a direction without parallax
+    latitude_deg, longitude_deg = place
+    site = EarthLocation.from_geodetic(longitude_deg, latitude_deg, 100.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        seen = star.transform_to(AltAz(obstime=star.obstime, location=site)).represent_as("unitspherical").to_cartesian()
+    north, east, up = seen.xyz.value
+    ned = Rotation.from_quat(q_icrs_to_ned(at(date), latitude_deg, longitude_deg)[0], scalar_first=True)
+    enu = Rotation.from_quat(q_icrs_to_enu(at(date), latitude_deg, longitude_deg)[0], scalar_first=True)
+    direction = star.cartesian.xyz.value
+    for ours, theirs in ((ned.apply(direction), (north, east, -up)), (enu.apply(direction), (east, north, up))):
+        assert np.linalg.norm(ours - theirs) < np.radians(DIURNAL_ARCSEC / 3600)
+
+
+@pytest.mark.parametrize("latitude_deg", [-89.0, -30.0, 0.0, 45.0, 90.0])
+def test_a_level_frame_turns_by_the_earths_rate(latitude_deg):
+    """v' = -omega x v."""
+    begin, end = q_icrs_to_ned(at("2026-11-22T10:00:00") + np.array([0, 10**9]), latitude_deg, 11.0)
+    turned = -to_rotation_vector(multiply(end, conjugate(begin)))
+    assert turned == pytest.approx(earth_rate_ned_rad_s(latitude_deg), abs=EARTH_RATE_RAD_S * POLE_RAD)
+
+
+def test_a_leap_second_does_not_turn_the_earth_back():
+    """UTC repeats no second here: 2017 begins two seconds of the Earth after 23:59:59 of 2016."""
+    q = q_icrs_to_itrs(np.concatenate([at("2016-12-31T23:59:58"), at("2016-12-31T23:59:59"), at("2017-01-01T00:00:00")]))
+    first, over = (np.linalg.norm(to_rotation_vector(multiply(b, conjugate(a)))) for a, b in pairwise(q))
+    assert first == pytest.approx(EARTH_RATE_RAD_S, rel=1e-6)
+    assert over == pytest.approx(2 * EARTH_RATE_RAD_S, rel=1e-6)
+
+
+def test_beyond_the_table_the_user_is_told_by_how_much():
+    assert beyond_table(int(at("1980-01-01T00:00")[0]), int(at("2026-01-01T00:00")[0])) is None
+    line = beyond_table(int(at("2026-01-01T00:00")[0]), int(at("2060-01-01T00:00")[0]))
+    assert line is not None
+    assert "beyond it UT1 is guessed" in line
+    assert np.isfinite(q_icrs_to_itrs(at("2060-01-01T00:00"))).all()
+
+
+@pytest.mark.parametrize("text", ["", "yesterday", "2026-13-01T00:00:00", "2026-11-22", "2026-11-22T25:00:00", "9" * 4000])
+def test_a_text_that_is_no_utc_is_refused(text):
+    with pytest.raises(InputError, match="write a UTC such as"):
+        utc_ns_of(text, "--epoch-utc")
+
+
+def test_a_utc_is_read_to_the_nanosecond():
+    assert utc_ns_of("2001-09-09T01:46:40.000000001Z", "--epoch-utc") == 10**18 + 1

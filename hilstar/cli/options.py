@@ -47,6 +47,12 @@ PlaceText = Annotated[
         "--place", metavar="LAT,LON,HEIGHT", help="Where the vehicle is: degrees and metres, WGS84.", rich_help_panel=UNSAID
     ),
 ]
+MountingText = Annotated[
+    str | None,
+    typer.Option(
+        "--mounting", metavar="W,X,Y,Z", help="q_body_to_cam, for a log of the body's attitude.", rich_help_panel=UNSAID
+    ),
+]
 MAX_SEED = 2**63 - 1  # what a FITS header holds
 LOG_HELP = "CSV (t_s,qw,qx,qy,qz), JSON lines, CCSDS AEM or MCAP (a ledger)."
 

@@ -10,6 +10,7 @@ from hilstar.errors import InputError
 
 if TYPE_CHECKING:
     from hilstar.arrays import FloatArray
+    from hilstar.attitude.wire.source import Mounting
     from hilstar.calibrate.scale import Reading
     from hilstar.run.record.ledger import Split
 
@@ -99,14 +100,17 @@ def parse_place(text: str | None) -> tuple[float, float, float] | None:
     return latitude_deg, longitude_deg, height_m
 
 
-def parse_mounting(text: str) -> tuple[float, float, float, float]:
-    """q_body_to_cam of `--mounting`. Raises InputError."""
+def parse_mounting(text: str | None) -> Mounting:
+    """The mounting of `--mounting`. Raises InputError."""
     from hilstar.attitude.wire.protocol import NORM_TOLERANCE
+    from hilstar.attitude.wire.source import Mounting
 
+    if text is None:
+        return Mounting()
     w, x, y, z = parse_numbers(text, 4, "--mounting", "W,X,Y,Z")
     if abs(math.hypot(w, x, y, z) - 1) > NORM_TOLERANCE:
         raise InputError(f"--mounting {text}: its norm is {math.hypot(w, x, y, z):.6g}; write a unit quaternion W,X,Y,Z")
-    return w, x, y, z
+    return Mounting((w, x, y, z))
 
 
 def parse_share(text: str, option: str) -> float:

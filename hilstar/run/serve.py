@@ -11,6 +11,7 @@ from hilstar.attitude.back_channel import Traffic
 from hilstar.attitude.clock.timeline import Timeline
 from hilstar.attitude.receiver import PacketCounts, Receiver, nobody_watches
 from hilstar.attitude.wire.links import StreamLink
+from hilstar.attitude.wire.source import Mounting
 from hilstar.attitude.wire.zmq_lockstep import ZmqLockstep
 from hilstar.bench.config import AttitudeSettings
 from hilstar.bench.frame import Bench
@@ -48,6 +49,9 @@ def serve(bench: Bench, link: AnyLink, limit: Limit, sink: FrameSink = ignore, o
     """Show the live stream of `link` up to `limit`, or until a signal; returns the summary."""
     outlet = outlet or Outlet()
     loop, ledger = FrameLoop(bench, sink, outlet.pacer(), notices=outlet.notices), outlet.ledger
+    if link.conventions.of_body:
+        for kind, line in Mounting(bench.config.tracker.q_body_to_cam).told:
+            outlet.notices.tell(kind, line)
     with stop_on_signal(loop.stop), loop.watch:
         if isinstance(link, ZmqLockstep):
             bench.warm_up()

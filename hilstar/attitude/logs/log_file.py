@@ -57,7 +57,8 @@ def open_log(path: Path, stated: Stated = NOTHING_STATED) -> Log:
     if not samples:
         _refuse_other_topics(path)
         raise InputError(f"{path}: contains no attitude; write a CSV with the header {','.join(CSV_COLUMNS)}, or JSON lines")
-    return Log(samples, reading.conventions, reading.told)
+    mounting = stated.mounting.told if reading.conventions.of_body else []
+    return Log(samples, reading.conventions, [*reading.told, *mounting])
 
 
 def _as_it_is(sample: AttitudeSample) -> AttitudeSample:

@@ -15,15 +15,23 @@ Components = tuple[float, float, float, float]
 IDENTITY: Components = (1.0, 0.0, 0.0, 0.0)
 # Orion's belt at roll 0, which everybody finds: the star is Alnilam (HIP 26311), 15 arcsec from the boresight.
 CHECK_RADEC_DEG, CHECK_STAR = (84.057, -1.200), "Alnilam"
+UNSTATED = (
+    "the source holds the body's attitude, and the tracker's axes are taken as the body's; "
+    "write [tracker] q_body_to_cam (without a bench file: --mounting W,X,Y,Z)"
+)
 
 
 class Mounting:
-    """How the camera sits in the body: `q_body_to_cam`, which turns body components into camera components."""
+    """How the camera sits in the body: `q_body_to_cam`, which turns body components into camera components.
 
-    def __init__(self, q_body_to_cam: Components = IDENTITY) -> None:
-        self.q_body_to_cam = normalise(np.array(q_body_to_cam, dtype=np.float64))
+    None where nobody has said: the camera's axes are then taken as the body's, and `told` says so.
+    """
+
+    def __init__(self, q_body_to_cam: Components | None = None) -> None:
+        self.q_body_to_cam = normalise(np.array(q_body_to_cam or IDENTITY, dtype=np.float64))
+        self.told = [] if q_body_to_cam else [("mounting", UNSTATED)]
         self._matrix = to_matrix(self.q_body_to_cam)
-        self._plain = q_body_to_cam == IDENTITY
+        self._plain = q_body_to_cam in {None, IDENTITY}
 
     def sample(self, body: AttitudeSample) -> AttitudeSample:
         """The camera's attitude and rate of a sample that holds the body's: q_icrs_to_body, rate in body components."""

@@ -63,7 +63,8 @@ def _check_finite(value: Any, path: Path, where: str = "") -> None:
 def _check_meaning(config: BenchConfig, path: Path) -> None:
     """What a type cannot say."""
     _check_unit(path, "[collimator] q_cam_to_mon", config.collimator.q_cam_to_mon)
-    _check_unit(path, "[tracker] q_body_to_cam", config.tracker.q_body_to_cam)
+    if config.tracker.q_body_to_cam is not None:
+        _check_unit(path, "[tracker] q_body_to_cam", config.tracker.q_body_to_cam)
     if math.hypot(*config.sky.observer_velocity_km_s) >= LIGHT_KM_S:
         raise InputError(f"{path}: [sky] observer_velocity_km_s is not slower than light; write km/s, ICRS x, y, z")
     if config.background.electrons_per_px is not None and config.background.zodiacal_v_mag_arcsec2 is not None:

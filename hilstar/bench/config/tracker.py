@@ -65,10 +65,11 @@ class Tracker(Table, frozen=True):
         ),
     ] = None
     q_body_to_cam: Annotated[
-        Rotation,
+        Rotation | None,
         Meta(
             description="How the tracker sits in the spacecraft: turns body components into camera components. Applied to each "
-            "source whose attitude is the body's (see [attitude in](attitude-in.md)); packets, JSON and CSV hold the camera's."
+            "source whose attitude is the body's (see [attitude in](attitude-in.md)); packets, JSON and CSV hold the camera's.",
+            extra={"default": "the body's axes, with a notice"},
         ),
-    ] = (1.0, 0.0, 0.0, 0.0)
+    ] = None
     detector: Annotated[DetectorSettings, Meta(description="See below.")] = msgspec.field(default_factory=DetectorSettings)

@@ -9,10 +9,10 @@ import typer
 
 from hilstar.cli.options import (
     LOG_HELP,
-    UNSAID,
     BodyName,
     EpochUtc,
     KernelFiles,
+    MountingText,
     PlaceText,
     ReferenceName,
     TopicName,
@@ -31,19 +31,16 @@ def convert(
     reference: ReferenceName = None,
     epoch_utc: EpochUtc = None,
     place: PlaceText = None,
-    mounting: Annotated[
-        str,
-        typer.Option(metavar="W,X,Y,Z", help="q_body_to_cam, for a log whose attitude is the body's.", rich_help_panel=UNSAID),
-    ] = "1,0,0,0",
+    mounting: MountingText = None,
 ) -> None:
     """Convert an attitude log to another format."""
     from hilstar.attitude.logs.entries import Stated
     from hilstar.attitude.logs.log_file import open_log, write_log
-    from hilstar.attitude.wire.source import Mounting
 
     check_files([log], [output])
-    mounted = Mounting(parse_mounting(mounting))
-    read = open_log(log, Stated(mounted, tuple(kernel or ()), topic, body, reference, epoch_utc, parse_place(place)))
+    read = open_log(
+        log, Stated(parse_mounting(mounting), tuple(kernel or ()), topic, body, reference, epoch_utc, parse_place(place))
+    )
     for _, line in read.told:
         say(line)
     write_log(output, read.samples)

@@ -11,8 +11,8 @@ from typing import Annotated, Any
 
 import typer
 
-from hilstar.cli.options import LOG_HELP, MAX_SEED, Json, RadecText
-from hilstar.cli.parsers import parse_radec, parse_serial, parse_share, parse_spin
+from hilstar.cli.options import LOG_HELP, MAX_SEED, Json, MountingText, RadecText
+from hilstar.cli.parsers import parse_mounting, parse_radec, parse_serial, parse_share, parse_spin
 from hilstar.console.terminal import print_json, progress, say
 from hilstar.errors import InputError
 from hilstar.process.interrupts import stop_on_signal
@@ -53,6 +53,7 @@ def send(
     allowed_clients: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Directory of the public keys that may connect.")
     ] = None,
+    mounting: MountingText = None,
     as_json: Json = False,
 ) -> None:
     """Send a log or a constant rotation over ZeroMQ or a serial line, with the faults of a bad cable on request."""
@@ -66,7 +67,7 @@ def send(
     shares = (parse_share(lose, "--lose"), parse_share(corrupt, "--corrupt"), parse_share(reorder, "--reorder"))
     if sum(shares) > 1:
         raise InputError("send: --lose, --corrupt and --reorder add up to more than 100 %; write smaller fractions")
-    samples, total = wanted_samples(log, spin, rate, radec)
+    samples, total = wanted_samples(log, spin, rate, radec, mounting)
     if duration is not None:
         samples = until(samples, duration)
     stop = threading.Event()
@@ -81,10 +82,13 @@ def send(
     tell(cable.tally, link, as_json)
 
 
-def wanted_samples(log: Path | None, spin: str | None, rate: float | None, radec: str | None) -> tuple[Any, float]:
+def wanted_samples(
+    log: Path | None, spin: str | None, rate: float | None, radec: str | None, mounting: str | None
+) -> tuple[Any, float]:
     """The samples to send, and their number (infinite if unknown)."""
+    from hilstar.attitude.logs.entries import Stated
     from hilstar.attitude.logs.gaps import log_joins
-    from hilstar.attitude.logs.log_file import read_log
+    from hilstar.attitude.logs.log_file import open_log
     from hilstar.run.send.sender import log_samples, spin_samples
 
     if (log is None) == (spin is None):
@@ -93,8 +97,9 @@ def wanted_samples(log: Path | None, spin: str | None, rate: float | None, radec
         raise InputError(f"--rate {rate:g}: write packets per second, 0.001 to 10000")
     if spin is not None:
         return spin_samples(parse_spin(spin), rate or 100.0, parse_radec(radec or "84.057,-1.2,0")), math.inf
-    recorded = read_log(log or Path())
-    for _, line in log_joins(recorded).told:
+    read = open_log(log or Path(), Stated(parse_mounting(mounting)))
+    recorded = read.samples
+    for _, line in [*read.told, *log_joins(recorded).told]:
         say(line)
     return log_samples(recorded, rate), len(recorded) if rate is None else math.inf
 

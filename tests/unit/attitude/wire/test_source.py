@@ -43,6 +43,8 @@ def test_the_camera_sees_what_a_vector_turned_twice_says(seed: int) -> None:
 def test_without_a_mounting_a_sample_passes_as_it_is() -> None:
     sample = AttitudeSample(5, np.array([0.5, 0.5, -0.5, 0.5]))
     assert Mounting().sample(sample) is sample
+    assert Mounting().told, "nobody has said how the camera sits"
+    assert not Mounting((1.0, 0.0, 0.0, 0.0)).told, "the user has said that it sits along the body's axes"
 
 
 @pytest.mark.parametrize("conventions", [PACKETS, BODY], ids=["the camera's", "the body's"])

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from hilstar.attitude.clock.exchanges import Exchange
-from hilstar.attitude.wire.links import Link
-from hilstar.attitude.wire.packet import Status, TimeReply, TimeRequest
+from hilstar.attitude.wire.links import Arrival, Link, SampleArrival
+from hilstar.attitude.wire.packet import Event, Packet, Status, TimeReply, TimeRequest
 from hilstar.attitude.wire.protocol import HEALTH_MISSED, HEALTH_REFUSED
 from hilstar.units import NS_PER_S
 
@@ -31,10 +32,14 @@ QUIET = Traffic()
 
 
 class BackChannel:
-    """Sends what is due over `link`. The receiver's thread calls it, but for `post`."""
+    """Sends what is due over `link`, to the sender of the newest attitude shown where it has several.
+
+    The receiver's thread calls it, but for `post`.
+    """
 
     def __init__(self, link: Link, traffic: Traffic) -> None:
         self._link = link
+        self._send: Callable[[Packet], None] = link.send
         self._traffic = traffic
         self._posting = threading.Lock()
         self._status: Status | None = None
@@ -61,7 +66,7 @@ class BackChannel:
             period_ns = round(NS_PER_S / self._traffic.status_hz)
             due_ns = self._next_status_ns + period_ns
             self._next_status_ns = due_ns if due_ns > now_ns else now_ns + period_ns  # never two at once, after a pause either
-            self._link.send(status)
+            self._send(status)
 
     def ask_quickly(self, now_ns: int) -> None:
         """Begin again with quick time requests: now there is a sender to answer."""
@@ -74,11 +79,17 @@ class BackChannel:
         self._asked[self._asks] = request
         self._quick_asks -= 1
         self._next_ask_ns = now_ns + (QUICK_ASK_NS if self._quick_asks > 0 else ASK_NS)
-        self._link.send(request)
+        self._send(request)
 
-    def answer(self, request: TimeRequest, arrived_ns: int) -> None:
-        """Answer the sender's own time request."""
-        self._link.send(TimeReply(request.sequence, request.t1_ns, arrived_ns, time.monotonic_ns()))
+    def follow(self, arrival: SampleArrival) -> None:
+        """This attitude is shown: statuses and time requests go to its sender."""
+        if arrival.back is not None:
+            self._send = arrival.back
+
+    def answer(self, request: TimeRequest, arrival: Arrival[Event]) -> None:
+        """Answer a sender's own time request."""
+        send = self._link.send if arrival.back is None else arrival.back
+        send(TimeReply(request.sequence, request.t1_ns, arrival.host_ns, time.monotonic_ns()))
 
     def exchange(self, reply: TimeReply, t4_ns: int, correction_ns: int) -> Exchange | None:
         """The exchange that a reply completes, its sender times made continuous; None for a reply to nothing."""

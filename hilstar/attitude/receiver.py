@@ -151,7 +151,7 @@ class Receiver:
         arrivals = self._link.receive(POLL_MS)
         for k, arrival in enumerate(arrivals):
             # The newest of those that arrived while this thread slept woke it; the others had to wait.
-            timely = not waits and k == len(arrivals) - 1
+            timely = arrival.stamped or (not waits and k == len(arrivals) - 1)
             self._take(arrival, 0 if timely else arrival.host_ns - self._empty_ns)
         now_ns = time.monotonic_ns()
         self._settle(self.jumps.expire(now_ns))
@@ -169,9 +169,9 @@ class Receiver:
         match arrival.event:
             case AttitudeSample() as sample:
                 self.counts.received += 1
-                self._take_sample(Arrival(arrival.host_ns, sample, arrival.raw, waited_ns))
+                self._take_sample(Arrival(arrival.host_ns, sample, arrival.raw, waited_ns, back=arrival.back))
             case TimeRequest() as request if self._link.two_way:
-                self._back.answer(request, arrival.host_ns)
+                self._back.answer(request, arrival)
             case TimeReply() as reply if self._link.two_way:
                 exchange = self._back.exchange(reply, arrival.host_ns, self.jumps.correction_ns)
                 if exchange is not None:
@@ -192,7 +192,7 @@ class Receiver:
         if self._repeats.resumed():
             self.jumps.forgive()
         if self._learn_from_ns is None or host_ns < self._learn_from_ns:
-            arrival = Arrival(host_ns, sample, arrival.raw, WAITED_UNKNOWN_NS)
+            arrival = replace(arrival, waited_ns=WAITED_UNKNOWN_NS)
         elif self.clock.unheard:
             self._back.ask_quickly(host_ns)
         self._settle(self.jumps.take(arrival))
@@ -214,6 +214,7 @@ class Receiver:
             if refusal is not None:
                 self._refuse(arrival, refusal)
                 continue
+            self._back.follow(arrival)
             if arrival.waited_ns != WAITED_UNKNOWN_NS:
                 latency_ns = self.clock.latency_ns(sample.t_ns, host_ns)
                 self.latency_ms.add((latency_ns or 0.0) / NS_PER_MS)

@@ -7,9 +7,11 @@ from pathlib import Path
 from hilstar.attitude.wire.keys import CurveKeys
 from hilstar.attitude.wire.links import StreamLink
 from hilstar.attitude.wire.serial_link import SerialLink
+from hilstar.attitude.wire.udp.udp_link import UdpLink
 from hilstar.attitude.wire.zmq_lockstep import ZmqLockstep
 from hilstar.attitude.wire.zmq_stream import ZmqReceiver
 from hilstar.bench.config import AttitudeSettings, BenchConfig
+from hilstar.bench.config.road import udp_road
 from hilstar.notices import Notices
 
 AnyLink = StreamLink | ZmqLockstep
@@ -25,7 +27,9 @@ def open_link(config: BenchConfig, folder: Path, notices: Notices | None = None)
     """The link that the bench file in `folder` names. Raises InputError if it cannot be opened."""
     settings = config.attitude
     if settings.source == "serial":
-        return SerialLink(settings.port, settings.baud, notices)
+        return SerialLink(str(settings.port), settings.baud, notices)
+    if settings.source == "udp":
+        return UdpLink(*udp_road(settings), notices)
     keys = link_keys(settings, folder)
     if settings.lockstep:
         return ZmqLockstep(settings.endpoint, bind=settings.bind is not False, keys=keys, notices=notices)

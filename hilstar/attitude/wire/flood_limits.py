@@ -27,8 +27,9 @@ WANTED_FILES = 65_536
 class LinkCounts:
     """The counts of a link's connections and messages.
 
-    `connections` were made; `rejected` failed in the handshake; `refused` were too many at once; `lost` ended on the side that
-    connects; `resets` of the link, for memory or for messages without end; `flooded` messages were dropped unread.
+    `connections` were made; `rejected` failed in the handshake, or were datagrams of senders that are not allowed; `refused`
+    were too many at once; `lost` ended on the side that connects; `resets` of the link, for memory or for messages without
+    end; `flooded` messages were dropped unread.
     """
 
     connections: int = 0

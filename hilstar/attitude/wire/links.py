@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Generic, Protocol, Self, TypeAlias, TypeVar
@@ -17,7 +18,8 @@ E_co = TypeVar("E_co", bound=Event, covariant=True)
 class Arrival(Generic[E_co]):
     """One message: host time of its arrival, what it says, its bytes as received, and how long it may have waited unread.
 
-    `refusal` says why a packet that is an attitude is not used.
+    `refusal` says why a packet that is an attitude is not used. `back` sends to whoever sent this, where a link has several
+    senders. A `stamped` arrival's time is the kernel's, however long it waited.
     """
 
     host_ns: int
@@ -25,6 +27,8 @@ class Arrival(Generic[E_co]):
     raw: bytes = b""
     waited_ns: int = 0
     refusal: Refusal | None = None
+    back: Callable[[Packet], None] | None = None
+    stamped: bool = False
 
 
 SampleArrival: TypeAlias = Arrival[AttitudeSample]

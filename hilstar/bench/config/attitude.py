@@ -9,6 +9,8 @@ from msgspec import Meta
 from hilstar.bench.config.values import NotNegative
 from hilstar.toml_tables import Table
 
+DEFAULT_ENDPOINT = "tcp://127.0.0.1:5560"
+
 
 class AttitudeSettings(Table, frozen=True):
     """Where the attitude comes from, and what is shown without one.
@@ -21,24 +23,36 @@ class AttitudeSettings(Table, frozen=True):
     """
 
     source: Annotated[
-        Literal["zmq", "serial"],
-        Meta(description='`"zmq"`: packets or JSON over ZeroMQ. `"serial"`: COBS frames over a serial line.'),
+        Literal["zmq", "serial", "udp"],
+        Meta(
+            description='`"zmq"`: packets or JSON over ZeroMQ. `"serial"`: COBS frames over a serial line. `"udp"`: a packet '
+            "or JSON in each datagram."
+        ),
     ] = "zmq"
     endpoint: Annotated[
         str,
         Meta(
             description="ZeroMQ: the address to which hilstar's SUB socket connects. `tcp://HOST:PORT`, where HOST is an IPv4 "
             "address, an IPv6 address in brackets, or a name (when hilstar binds also `*`, and PORT may be `*` for a free one, "
-            "which is then reported), or `ipc:///WHOLE/PATH`."
+            "which is then reported), or `ipc:///WHOLE/PATH`. UDP: `udp://ADDRESS:PORT`, another way to write `bind`."
         ),
-    ] = "tcp://127.0.0.1:5560"
+    ] = DEFAULT_ENDPOINT
     bind: Annotated[
-        bool | None,
+        bool | str | None,
         Meta(
-            description="ZeroMQ: `true` when hilstar binds and the sender connects.",
-            extra={"default": "`false`; `true` in lockstep"},
+            description="ZeroMQ: `true` when hilstar binds and the sender connects. UDP: the address and port that hilstar "
+            'listens on, `"ADDRESS"`, `"ADDRESS:PORT"` or `"[IPv6]:PORT"` (port 0: a free one, which is reported).',
+            extra={"default": '`false`; `true` in lockstep; `"127.0.0.1:5560"` over UDP'},
         ),
     ] = None
+    allow: Annotated[
+        tuple[str, ...],
+        Meta(
+            description='UDP: who may send: addresses and networks, such as `["192.168.1.20", "fd00::/64"]`. Datagrams from '
+            "others are counted, and never answered.",
+            extra={"default": "this machine; required where `bind` is not loopback", "form": '["ADDRESS", ...]'},
+        ),
+    ] = ()
     lockstep: Annotated[
         bool,
         Meta(
@@ -63,17 +77,21 @@ class AttitudeSettings(Table, frozen=True):
         ),
     ] = None
     port: Annotated[
-        str,
-        Meta(description='Serial: the device, such as `"/dev/ttyUSB0"`.', extra={"default": "none; required for serial"}),
+        str | int,
+        Meta(
+            description='Serial: the device, such as `"/dev/ttyUSB0"`. UDP: the port, where `bind` has none.',
+            extra={"default": "none; required for serial"},
+        ),
     ] = ""
     baud: Annotated[int, Meta(ge=1, le=12_000_000, description="Serial: the speed, 8N1.")] = 115_200
     status_hz: Annotated[
-        float, Meta(ge=0, le=1000, description="Serial: status packets sent back to the sender per second; 0 for none.")
+        float, Meta(ge=0, le=1000, description="Serial and UDP: status packets sent back to the sender per second; 0 for none.")
     ] = 10.0
     time_requests: Annotated[
         bool,
         Meta(
-            description="Serial: ask the sender for its time. A sender that does not answer is followed by its packets alone."
+            description="Serial and UDP: ask the sender for its time. A sender that does not answer is followed by its packets "
+            "alone."
         ),
     ] = True
     clock: Annotated[

@@ -11,6 +11,7 @@ import msgspec
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE
 from hilstar.bench.config.bench import TYPE_WORDS, BenchConfig
 from hilstar.bench.config.render import DEFAULT_BRIGHTEST_V_MAG
+from hilstar.bench.config.road import check_road
 from hilstar.errors import InputError, shortened
 from hilstar.reading import MAX_TOML_BYTES, parse_toml, read_text
 from hilstar.toml_tables import Kind, explained
@@ -78,10 +79,10 @@ def _check_meaning(config: BenchConfig, path: Path) -> None:
     ]
     if config.verify.true_geometry is not None and ideal:
         raise InputError(f"{path}: [verify] true_geometry takes the place of {ideal[0]}; leave one of them out")
-    if config.attitude.source == "serial" and not config.attitude.port:
-        raise InputError(f'{path}: [attitude] source = "serial" needs port; write port = "/dev/ttyUSB0" or the like')
-    if config.attitude.source == "serial" and config.attitude.lockstep:
-        raise InputError(f'{path}: [attitude] lockstep = true is for source = "zmq"; leave one of them out')
+    try:
+        check_road(config.attitude)
+    except InputError as error:
+        raise InputError(f"{path}: [attitude] {error}") from error
 
 
 def _check_unit(path: Path, where: str, q: tuple[float, ...]) -> None:

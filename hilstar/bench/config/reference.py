@@ -127,12 +127,13 @@ def is_optional(kind: Any) -> bool:
 def value_text(name: str, hint: Any) -> str:
     """What a key may hold: its choices, or its form, limits and unit."""
     kind, notes = plain(hint), notes_of(hint)
-    if is_optional(kind):
-        kind = plain(next(choice for choice in get_args(kind) if choice is not type(None)))
+    choices = tuple(plain(choice) for choice in get_args(kind) if choice is not type(None)) if is_optional(kind) else ()
+    if len(choices) == 1:
+        (kind,) = choices
     if get_origin(kind) is Literal:
         return ", ".join(f"`{toml(choice)}`" for choice in get_args(kind))
     form = next((note.extra["form"] for note in notes if note.extra and "form" in note.extra), None)
-    words = f"`{form}`" if form else " or ".join(TYPE_WORDS[choice.__name__] for choice in get_args(kind) or (kind,))
+    words = f"`{form}`" if form else " or ".join(TYPE_WORDS[choice.__name__] for choice in choices or get_args(kind) or (kind,))
     unit = next((unit for end, unit in UNITS.items() if name.endswith(end)), "")
     return ", ".join(part for part in (words, limits_text(notes), unit) if part)
 

@@ -29,7 +29,7 @@ def send(
     log: Annotated[Path | None, typer.Argument(metavar="[LOG]", help=LOG_HELP)] = None,
     spin: Annotated[str | None, typer.Option(metavar="AXIS,DEG_PER_S", help="A constant rotation instead of a log.")] = None,
     to: Annotated[
-        str, typer.Option(metavar="TARGET", help="tcp://HOST:PORT, or serial:/dev/ttyX@BAUD.")
+        str, typer.Option(metavar="TARGET", help="tcp://HOST:PORT, udp://HOST:PORT or serial:/dev/ttyX@BAUD.")
     ] = "tcp://127.0.0.1:5560",
     rate: Annotated[
         float | None, typer.Option(metavar="HZ", help="Packets per second; by default at the log's own times.")
@@ -56,12 +56,12 @@ def send(
     mounting: MountingText = None,
     as_json: Json = False,
 ) -> None:
-    """Send a log or a constant rotation over ZeroMQ or a serial line, with the faults of a bad cable on request."""
+    """Send a log or a constant rotation over ZeroMQ, UDP or a serial line, with the faults of a bad cable on request."""
     import numpy as np
 
     from hilstar.attitude.wire.keys import CurveKeys
+    from hilstar.run.send.ends import open_sender
     from hilstar.run.send.faults import BadCable, Faults
-    from hilstar.run.send.sender import open_sender
     from hilstar.run.send.sender import send as send_samples
 
     shares = (parse_share(lose, "--lose"), parse_share(corrupt, "--corrupt"), parse_share(reorder, "--reorder"))

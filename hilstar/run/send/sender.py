@@ -1,4 +1,4 @@
-"""The test sender: a log or a spin, sent over either link at a steady rate."""
+"""The test sender: a log or a spin, sent over any road at a steady rate."""
 
 from __future__ import annotations
 
@@ -14,30 +14,14 @@ from hilstar.arrays import FloatArray
 from hilstar.attitude.clock.timeline import Policy
 from hilstar.attitude.logs.gaps import log_joins
 from hilstar.attitude.logs.log_file import log_timeline
-from hilstar.attitude.wire.cobs import DELIMITER, framed
-from hilstar.attitude.wire.keys import CurveKeys
-from hilstar.attitude.wire.packet import AttitudeSample, Status, TimeReply, TimeRequest, encode
-from hilstar.attitude.wire.serial_link import SerialLink
-from hilstar.attitude.wire.zmq_stream import ZmqSender
+from hilstar.attitude.wire.packet import AttitudeSample, encode
 from hilstar.errors import InputError
-from hilstar.process.interrupts import caught
 from hilstar.rotation import from_radec_roll_deg, propagate, rate_between_rad_s
 from hilstar.run.host_clock import HOST_CLOCK
 from hilstar.run.send.faults import BadCable
 from hilstar.units import NS_PER_S
 
-LISTEN_MS = 20
-PATIENCE_S = 0.5  # a line that accepts nothing for this long has no reader
 MAX_RESAMPLED = 10_000_000  # some GB of samples
-
-
-def open_sender(to: str, line: tuple[str, int] | None, *, connect: bool, keys: CurveKeys) -> ZmqSender | SerialSender:
-    """The link that --to names: a serial `line`, port and baud rate, or else a ZeroMQ endpoint. Raises InputError."""
-    if line is None:
-        return ZmqSender(to, bind=not connect, keys=keys)
-    if keys.given or connect:
-        raise InputError(f"--to {to}: a serial line has no keys and no --connect; remove them")
-    return SerialSender(*line)
 
 
 def spin_samples(
@@ -108,47 +92,6 @@ def _rate_between(samples: list[AttitudeSample], after: int, t_ns: int) -> Float
         return before.rate_cam_rad_s
     part = (t_ns - before.t_ns) / (later.t_ns - before.t_ns)
     return np.asarray((1 - part) * before.rate_cam_rad_s + part * later.rate_cam_rad_s)
-
-
-class SerialSender(SerialLink):
-    """The sender's end of a serial line: sends attitudes, answers time requests, and receives the status."""
-
-    def __init__(self, port: str, baud: int) -> None:
-        super().__init__(port, baud)
-        self.status: Status | None = None
-        self.statuses = 0
-        self.requests = 0
-        self.unsent = 0
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._listen, name="hilstar-sender", daemon=True)
-        self.send_bytes(DELIMITER)
-        self._thread.start()
-
-    def wait_for_listener(self, timeout_s: float) -> bool:
-        """A serial line cannot tell whether anybody listens."""
-        return True
-
-    def put(self, packet: bytes) -> None:
-        """Frame a packet and send it, at the speed of the line."""
-        self.unsent += not self.send_bytes(framed(packet), PATIENCE_S)
-
-    def _listen(self) -> None:
-        while not self._stop.is_set():
-            for arrival in self.receive(LISTEN_MS):
-                match arrival.event:
-                    case TimeRequest(sequence, t1_ns):
-                        self.requests += 1
-                        self.send(TimeReply(sequence, t1_ns, arrival.host_ns, time.monotonic_ns()))
-                    case Status() as status:
-                        self.status, self.statuses = status, self.statuses + 1
-
-    def close(self) -> None:
-        """Stop listening, and close the port once everything has been sent; after a signal at once."""
-        self._stop.set()
-        self._thread.join()
-        if caught() is None:
-            self.drain()
-        super().close()
 
 
 def send(

@@ -111,7 +111,7 @@ def test_a_reply_completes_its_own_request_once_on_continuous_times():
 def test_a_request_of_the_sender_is_answered_with_its_own_time_and_the_arrival():
     link = Wire()
     before_ns = time.monotonic_ns()
-    BackChannel(link, QUIET).answer(TimeRequest(3, 4), 5)
+    BackChannel(link, QUIET).answer(request := TimeRequest(3, 4), Arrival(5, request))
     (reply,) = link.sent
     assert isinstance(reply, TimeReply)
     assert (reply.sequence, reply.t1_ns, reply.t2_ns) == (3, 4, 5)

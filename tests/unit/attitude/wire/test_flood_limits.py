@@ -15,7 +15,7 @@ from hilstar.attitude.wire.packet import AttitudeSample, encode
 from hilstar.attitude.wire.serial_link import SerialLink
 from hilstar.errors import InputError
 from hilstar.notices import Notices
-from hilstar.run.send.sender import SerialSender
+from hilstar.run.send.ends import SerialSender
 from tests.support.wire.samples import sample
 
 FRAME = framed(encode(sample(7)))

@@ -1,0 +1,271 @@
+"""UDP: real sockets of this machine, real processes."""
+
+from __future__ import annotations
+
+import json
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from hilstar.attitude.wire.packet import AttitudeSample, TimeRequest, decode, encode
+from hilstar.attitude.wire.udp.addresses import AllowedSenders, bound_place
+from hilstar.attitude.wire.udp.udp_link import UdpLink
+from hilstar.bench.build import load
+from hilstar.notices import Notices
+from hilstar.rotation import angle_between_rad, propagate
+from hilstar.run.loop import Limit
+from hilstar.run.send.ends import UdpSender
+from hilstar.run.send.faults import BadCable, Faults
+from hilstar.run.send.sender import send, spin_samples
+from hilstar.run.serve import Outlet, serve
+from tests.support.benches import SMALL_BENCH
+from tests.support.commands import HILSTAR, assert_refused, run_hilstar, run_hilstar_here
+from tests.support.senders import free_port, packet
+from tests.support.servers import Served, interrupted, listening
+from tests.support.waiting import wait_for
+
+START_DEG = (84.057, -1.2, 0.0)
+RATE_RAD_S = np.radians([0.0, 0.0, 20.0])
+# A packet's float32 rate of 20 deg/s (0.35 rad/s) predicts over 100 ms; and rounding.
+PREDICTED_RAD = 0.35 * 0.1 * 2**-24 * 2 + 1e-9
+ANSWERED_S = 1.0
+
+
+def bench_of(folder: Path, *lines: str) -> Path:
+    path = folder / "udp.toml"
+    path.write_text("\n".join([SMALL_BENCH, "[attitude]", 'source = "udp"', *lines, ""]))
+    return path
+
+
+def sent(to: str, *options: str) -> dict:
+    result = run_hilstar("send", "--to", to, "--json", *options)
+    assert result.returncode == 0, result.stderr
+    return json.loads(result.stdout)
+
+
+@pytest.mark.parametrize(("host", "lines"), [("127.0.0.1", "port = {}"), ("[::1]", 'bind = "[::1]:{}"')])
+def test_two_hundred_a_second_arrive_none_lost_none_refused_and_both_sides_talk(tmp_path, host, lines):
+    port = free_port()
+    with listening(bench_of(tmp_path, lines.format(port)), f"bound to udp://{host}:{port}") as process:
+        told = sent(f"udp://{host}:{port}", "--spin", "z,1", "--rate", "200", "--count", "300")
+        summary = interrupted(process)
+    assert told["sent"] == summary["packets"]["accepted"] == summary["packets"]["received"] == 300
+    # A second and a half: 8 quick time requests, and ten statuses a second.
+    assert told["requests"] >= 8
+    assert told["statuses"] >= 10
+    clock = summary["clock"]
+    assert clock["mode"] == "exchange"
+    # Both processes have the same clock: the offset is its own error.
+    assert abs(clock["offset_ms"]) <= clock["uncertainty_ms"] + 1.0
+
+
+def test_lost_corrupted_and_reordered_datagrams_add_up(tmp_path):
+    port = free_port()
+    with listening(bench_of(tmp_path, f'endpoint = "udp://127.0.0.1:{port}"'), "bound to") as process:
+        faults = ["--lose", "10%", "--corrupt", "5%", "--reorder", "--jitter", "1", "--seed", "3"]
+        told = sent(f"udp://127.0.0.1:{port}", "--spin", "z,1", "--rate", "400", "--count", "800", *faults)
+        summary = interrupted(process)
+    packets = summary["packets"]
+    assert told["lost"] and told["corrupted"] and told["reordered"]
+    assert packets["received"] == told["sent"] == 800 - told["lost"]
+    assert packets["refused_by"]["crc"] == told["corrupted"]
+    assert packets["refused_by"]["time"] == told["reordered"]
+    assert packets["accepted"] == packets["received"] - told["corrupted"] - told["reordered"]
+
+
+def as_json(data: bytes) -> bytes:
+    """The same attitude as JSON that counts nothing; what is no attitude stays as it is."""
+    event = decode(data)
+    if not isinstance(event, AttitudeSample) or event.rate_cam_rad_s is None:
+        return data
+    return json.dumps({"t_ns": event.t_ns, "q": [*event.q_icrs_to_cam], "rate": [*event.rate_cam_rad_s]}).encode()
+
+
+@pytest.mark.parametrize("form", [bytes, as_json], ids=["packets", "JSON"])
+def test_nothing_wrong_is_drawn_over_a_bad_network(tmp_path, form: Callable[[bytes], bytes]):
+    """A turn of 20 deg/s; datagrams lost, corrupted, reordered, every fifth twice: each attitude drawn is that of its time."""
+    drawn, doubled = [], [0]
+    port = free_port()
+    allowed, notices = AllowedSenders(), Notices()
+    with (
+        load(bench_of(tmp_path, f"port = {port}")) as bench,
+        UdpLink(bound_place(None, port, None), allowed, notices) as link,
+        UdpSender(link.endpoint) as road,
+    ):
+        count = iter(range(10**9))
+
+        def put(data: bytes) -> None:
+            road.put(form(data))
+            if next(count) % 5 == 4:
+                doubled[0] += 1
+                road.put(form(data))
+
+        stop = threading.Event()
+        cable = BadCable(Faults(0.10, 0.05, 0.05), np.random.default_rng(7), put)
+        sender = threading.Thread(target=send, args=(cable, spin_samples(RATE_RAD_S, 200.0, START_DEG), stop))
+        sender.start()
+        outlet = Outlet(notices=notices)
+        run = serve(bench, link, Limit(frames=150), lambda shown: drawn.append((shown.t_ns, shown.attitude)), outlet)
+        stop.set()
+        sender.join()
+        summary = msgspec.to_builtins(run)
+    shown = [(t_ns, attitude.q_icrs_to_cam) for t_ns, attitude in drawn if attitude is not None]
+    assert len(shown) > 120
+    assert doubled[0] > 50
+    assert summary["packets"]["refused"] >= doubled[0] + cable.tally.corrupted - 3  # the last may be on their way
+    assert set(summary["events"]) <= {"first-attitude"}
+    first_ns, first = shown[0]
+    for t_ns, q in shown:
+        assert angle_between_rad(q, propagate(first, RATE_RAD_S, (t_ns - first_ns) / 1e9)) < PREDICTED_RAD
+
+
+def test_an_address_that_is_not_listed_is_counted_and_never_answered(tmp_path):
+    port = free_port()
+    bench = bench_of(tmp_path, f'bind = "127.0.0.1:{port}"', 'allow = ["127.0.0.1", "10.0.0.0/8"]')
+    command = [*HILSTAR, "serve", str(bench), "--headless", "--json"]
+    with (
+        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listed,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger,
+    ):
+        served = Served(process, port)
+        try:
+            served.await_line("bound to")
+            listed.bind(("127.0.0.1", 0))
+            stranger.bind(("127.0.0.2", 0))
+            stranger.settimeout(ANSWERED_S)
+            listed.settimeout(ANSWERED_S)
+            listed.connect(("127.0.0.1", port))
+            for k in range(40):
+                listed.send(packet(k, time.monotonic_ns()))
+                stranger.sendto(packet(k, time.monotonic_ns(), q=(1, 0, 0, 0)), ("127.0.0.1", port))
+                stranger.sendto(encode(TimeRequest(k, 1)), ("127.0.0.1", port))
+                time.sleep(0.01)
+            assert decode(listed.recv(100)) is not None  # a status or a time request
+            with pytest.raises(TimeoutError):
+                stranger.recv(100)
+            summary = served.summary()
+        finally:
+            process.kill()
+    assert summary["packets"]["received"] == summary["packets"]["accepted"] == 40
+    assert summary["link"]["rejected"] == 80
+    assert summary["events"]["sender-not-allowed"] == 1
+    assert "second-sender" not in summary["events"]
+    assert served.count("127.0.0.2") == 1
+
+
+def test_malformed_datagrams_are_refused_by_reason_and_the_display_goes_on(tmp_path):
+    port = free_port()
+    with (
+        listening(bench_of(tmp_path, f"port = {port}"), "bound to") as process,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
+    ):
+        sender.connect(("127.0.0.1", port))
+        good = packet(1, 1_000_000)
+        wrong = [b"", b"\0", good[:-1], good + b"\0", bytes(1400), bytes(65_000), b"{" * 65_000, b'{"t_ns": 1}', b"\xff" * 64]
+        wrong += [encode(TimeRequest(1, 1))[:-1], good[:30] + bytes([good[30] ^ 8]) + good[31:]]
+        wrong += [packet(1, 2_000_000, q=(float("nan"), 0, 0, 1)), packet(1, 2_000_000, q=(2, 0, 0, 0))]
+        for data in [good, *wrong, json.dumps({"t_ns": 3_000_000, "q": [1, 0, 0, 0]}).encode()]:
+            sender.send(data)
+        time.sleep(0.3)
+        packets = interrupted(process)["packets"]
+    assert (packets["accepted"], packets["received"]) == (2, 2 + len(wrong))
+    assert packets["refused_by"] == {"crc": 2, "norm": 1, "nan": 1, "time": 0, "format": len(wrong) - 4}
+
+
+def test_a_sender_that_starts_first_waits_until_hilstar_listens(tmp_path):
+    port = free_port()
+    command = [*HILSTAR, "send", "--spin", "z,1", "--rate", "200", "--count", "100", "--to", f"udp://127.0.0.1:{port}"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as sender:
+        assert sender.stderr is not None
+        assert "waiting for a listener" in sender.stderr.readline()
+        with listening(bench_of(tmp_path, f"port = {port}"), "bound to") as process:
+            assert "100 packets sent" in sender.stderr.read()
+            assert interrupted(process)["packets"]["accepted"] == 100
+
+
+def test_a_sender_that_comes_back_on_another_port_is_answered_there(tmp_path):
+    port = free_port()
+    with listening(bench_of(tmp_path, f"port = {port}"), "bound to") as process:
+        for _ in range(2):
+            with UdpSender(f"udp://127.0.0.1:{port}") as road:
+                k = iter(range(10**9))
+
+                def answered(road=road, k=k) -> bool:
+                    road.put(packet(next(k), time.monotonic_ns()))
+                    return road.statuses > 2 and road.requests > 0
+
+                wait_for(answered, "statuses and time requests", poll_s=0.01)
+        assert interrupted(process)["packets"]["refused"] == 0
+
+
+def test_a_flood_costs_little_and_its_newest_attitude_is_shown(tmp_path):
+    port = free_port()
+    flood = "import socket, sys, time\ns = socket.socket(2, 2)\ns.connect(('127.0.0.1', int(sys.argv[1])))\n"
+    flood += "end = time.time() + 2\nwhile time.time() < end: s.send(b'?' * 64)"
+    with listening(bench_of(tmp_path, f"port = {port}"), "bound to") as process:
+        subprocess.run([sys.executable, "-c", flood, str(port)], check=True, timeout=30)
+        time.sleep(0.1)
+        assert sent(f"udp://127.0.0.1:{port}", "--spin", "z,1", "--rate", "100", "--count", "20")["sent"] == 20
+        summary = interrupted(process)
+    assert summary["packets"]["accepted"] == 20
+    assert summary["events"]["flood"] == 1
+    assert summary["link"]["flooded"] > 1000
+    assert summary["frames"] + summary["missed_frames"] >= 60 * 2
+
+
+@pytest.mark.parametrize(
+    ("lines", "said"),
+    [
+        (['bind = "0.0.0.0:5560"'], "allow"),
+        (['bind = "[::]"'], "allow"),
+        (['bind = "192.168.1.20"', "allow = []"], "allow"),
+        (['bind = "127.0.0.1:5560"', "port = 5561"], "disagree"),
+        (["port = 5560", 'endpoint = "udp://127.0.0.1:5561"'], "disagree"),
+        (['bind = "[::1]:5560"', 'endpoint = "udp://127.0.0.1:5560"'], "disagree"),
+        (['endpoint = "tcp://127.0.0.1:5561"'], "udp://ADDRESS:PORT"),
+        (["bind = false"], "bind"),
+        (['bind = "simulator.local:5560"'], "not an address"),
+        (['bind = "224.0.0.1:5560"'], "not an address"),
+        (['bind = "::1:99999"'], "not an address"),
+        (["port = 65536"], "65535"),
+        (["port = -1"], "65535"),
+        (['port = "/dev/ttyUSB0"'], "65535"),
+        (['allow = ["somewhere"]'], "allow"),
+        (['allow = ["192.168.1.20/24"]'], "host bits"),
+        (["lockstep = true"], "lockstep"),
+    ],
+)
+def test_keys_that_are_wrong_or_disagree_get_one_line(tmp_path, lines, said):
+    result = run_hilstar_here("serve", bench_of(tmp_path, *lines), "--headless", "--duration", "0.1")
+    assert_refused(result, 2, "udp.toml: [attitude]", said)
+
+
+def test_keys_of_udp_are_refused_on_another_road(tmp_path):
+    for line in ('bind = "127.0.0.1:5560"', 'allow = ["127.0.0.1"]'):
+        bench = bench_of(tmp_path, line)
+        bench.write_text(bench.read_text().replace('"udp"', '"zmq"'))
+        assert_refused(run_hilstar_here("serve", bench, "--headless", "--duration", "0.1"), 2, "udp")
+    bench = bench_of(tmp_path, "port = 5560")
+    bench.write_text(bench.read_text().replace('"udp"', '"serial"'))
+    assert_refused(run_hilstar_here("serve", bench, "--headless", "--duration", "0.1"), 2, "/dev/ttyUSB0")
+
+
+def test_a_port_in_use_an_address_of_another_machine_and_a_wrong_target_get_one_line(tmp_path):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", 0))
+        bench = bench_of(tmp_path, f"port = {other.getsockname()[1]}")
+        assert_refused(run_hilstar_here("serve", bench, "--headless", "--duration", "0.1"), 2, "in use")
+    bench = bench_of(tmp_path, 'bind = "192.0.2.1:5560"', 'allow = ["192.0.2.2"]')
+    assert_refused(run_hilstar_here("serve", bench, "--headless", "--duration", "0.1"), 2, "not an address of this machine")
+    for target in ("udp://", "udp://127.0.0.1", "udp://127.0.0.1:0", "udp://::1:5560"):
+        assert_refused(run_hilstar_here("send", "--spin", "z,1", "--to", target), 2, "udp://HOST:PORT")
+    assert_refused(run_hilstar_here("send", "--spin", "z,1", "--to", "udp://127.0.0.1:5560", "--connect"), 2, "--connect")

@@ -6,12 +6,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hilstar.arrays import FloatArray
+from hilstar.arrays import FloatArray, IntArray
 from hilstar.errors import InputError
-from hilstar.scene.lens import Lens
+from hilstar.scene.lens import ANY_TANGENT, Lens
 
 SPEED_PLACES = 9  # along each side of the image: a speed's components are quadratic in the place
 BORDER_PLACES = 33  # along each side of the image
+BOW = 1 / BORDER_PLACES**2  # of the box around all sides: twice what a parabola bows between two places, whatever its sag
 FOLD_PLACES = 41  # across the disc in which a lens must not fold
 NEWTON_ROUNDS, STEPS_A_ROUND = 10, 5  # slopes are found once a round: a mild lens needs one
 # Of a focal length, 1e-8 px on any screen; slopes by differences of SLOPE_STEP are right to 1e-10, which is enough for that.
@@ -22,7 +23,7 @@ WITHIN = 1 - 1e-12  # the lens, whatever rounding does
 MAX_TANGENT = 1e3  # a step this long has left the solution
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Camera:
     """A mapping of cam directions to pixels: (0, 0) is the centre of the top-left pixel, x right, y down.
 
@@ -54,9 +55,11 @@ class Camera:
         z = image_vectors[:, 2]
         near = np.divide(1.0, z, out=np.full_like(z, np.nan), where=z > 0)
         u, v = image_vectors[:, 0] * near, image_vectors[:, 1] * near
-        times = np.hypot(u, v) / (self.lens.max_tangent * WITHIN)
-        beyond = np.flatnonzero(times > 1)
-        times = times[beyond]
+        limit = self.lens.max_tangent * WITHIN
+        beyond = np.flatnonzero(u * u + v * v > limit**2)
+        if not len(beyond):
+            return self.places_px(u, v)
+        times = np.hypot(u[beyond], v[beyond]) / limit
         u[beyond] /= times
         v[beyond] /= times
         x_px, y_px = self.places_px(u, v)
@@ -133,7 +136,7 @@ class Camera:
 
     def fastest_px_s(self, rate_image_rad_s: FloatArray) -> float:
         """The fastest that a direction crosses the image at a rate (3,) of the camera in image axes, px/s; within 2 %."""
-        u, v = self.tangents(*self._grid_px(SPEED_PLACES))
+        u, v = self.tangents(*self.grid_px(SPEED_PLACES))
         step = -np.cross(rate_image_rad_s, np.stack([u, v, np.ones_like(u)], axis=-1))
         du, dv = step[..., 0] - u * step[..., 2], step[..., 1] - v * step[..., 2]
         if self.lens is None:
@@ -145,7 +148,7 @@ class Camera:
         """The smallest and the largest number of pixels to a radian anywhere on the image; a pinhole's are both its axis's."""
         if self.lens is None:
             return self.focal_length_px, self.focal_length_px
-        u, v = self.tangents(*self._grid_px(SPEED_PLACES))
+        u, v = self.tangents(*self.grid_px(SPEED_PLACES))
         a, b, c, d = self.slopes(u, v)
         # A tangent's step (du, dv) is an angle by the metric of the sphere, whose inverse is (1 + r^2) (1 + w w^T), w = (u, v).
         along_x, along_y, wide = a * u + b * v, c * u + d * v, 1 + u * u + v * v
@@ -154,10 +157,37 @@ class Camera:
         middle, spread = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
         return float(np.sqrt(np.nanmin(middle - spread))), float(np.sqrt(np.nanmax(middle + spread)))
 
-    def _grid_px(self, count: int) -> tuple[FloatArray, FloatArray]:
+    def grid_px(self, count: int) -> tuple[FloatArray, FloatArray]:
         """Places (count^2,) over the whole image, its edges among them."""
         x, y = np.meshgrid(*(np.linspace(-0.5, size - 0.5, count) for size in self.resolution_px))
         return x.ravel(), y.ravel()
+
+    def in_view(self, seen: FloatArray, margin_px: float, reach_rad: float) -> IntArray:
+        """Positions of the directions (n, 3) in image axes that can come within `margin_px` of the image, and some more.
+
+        A direction comes there if one within `reach_rad` of it is there (with a lens, within its own margin).
+        """
+        radius = float(np.tan(self.field_radius_rad(margin_px)))
+        angle_rad = np.arctan(radius) + reach_rad
+        if angle_rad >= np.pi / 2:
+            return np.arange(len(seen))
+        reach = float(np.tan(angle_rad)) - radius  # tangents grow fastest at the rim, and outward
+        x, y, z = seen.T
+        inside = z > 0
+        for along, (low, high) in zip((x, y), self._box(margin_px), strict=True):
+            inside &= along >= (low - reach) * z
+            inside &= along <= (high + reach) * z
+        return np.flatnonzero(inside)
+
+    def _box(self, margin_px: float) -> tuple[tuple[float, float], tuple[float, float]]:
+        """The smallest and the largest u, and v, of directions (u, v, 1) within `margin_px` of the image."""
+        if self.lens is not None:
+            return self.lens.box
+        pairs = zip(self.principal_point_px, self.resolution_px, strict=True)
+        x, y = (
+            ((-0.5 - margin_px - c) / self.focal_length_px, (n - 0.5 + margin_px - c) / self.focal_length_px) for c, n in pairs
+        )
+        return x, y
 
     def field_radius_rad(self, margin_px: float) -> float:
         """The angle from the image's normal to its farthest corner, `margin_px` outside it (with a lens, its own margin)."""
@@ -181,9 +211,16 @@ def bounded(camera: Camera, margin_px: float) -> Camera:
     free = replace(camera, lens=replace(lens, max_tangent=np.inf))
     u, v = free.tangents(*_border_px(camera.resolution_px, margin_px))
     reach = min(float(np.nan_to_num(np.hypot(u, v), nan=np.inf).max()), lens.max_tangent)
+    box = (_wide(u), _wide(v))
     if not np.isfinite(reach) or _folds(free, reach):
         raise InputError("its distortion folds within the screen: two directions share a pixel; fit it again, with fewer terms")
-    return replace(camera, lens=replace(lens, max_tangent=reach * BEYOND_BORDER))
+    return replace(camera, lens=replace(lens, max_tangent=reach * BEYOND_BORDER, box=box))
+
+
+def _wide(tangents: FloatArray) -> tuple[float, float]:
+    """The smallest and the largest, and a little more: a side may bow between two of its places; all, where one is unknown."""
+    low, high = float(tangents.min()), float(tangents.max())
+    return (low - BOW * (high - low), high + BOW * (high - low)) if np.isfinite(low) else ANY_TANGENT
 
 
 def _border_px(resolution_px: tuple[int, int], margin_px: float) -> tuple[FloatArray, FloatArray]:

@@ -139,8 +139,7 @@ class _Smear:
 
         The piece lasts from -half_s to half_s of the paths' seconds.
         """
-        at = [paths.all_places_px(seconds) for seconds in (-half_s, 0.0, half_s)]
-        x_px, y_px = (np.stack(places) for places in zip(*at, strict=True))
+        x_px, y_px = paths.all_places_px(np.array([[-half_s], [0.0], [half_s]]))
         halves = [Chords(x_px[k : k + 2], y_px[k : k + 2]) for k in (0, 1)]
         # The mean over a path in two chords: an arc's length to (angle / 4)^2 / 6 of it.
         length = sum(half.length_sigma(self.sigma_px) for half in halves)

@@ -15,6 +15,7 @@ from hilstar.arrays import FloatArray, IntArray
 from hilstar.rotation import propagate, to_matrix
 from hilstar.scene.camera import Camera
 from hilstar.scene.paths import Chords, Paths, node_counts, nodes_of, within_budget
+from hilstar.scene.short_paths import ShortPaths, bend_px, points_within
 from hilstar.scene.sprites import Sprites, brightest, max_stars, pack_sprites
 from hilstar.sky.stars import Stars
 
@@ -30,6 +31,7 @@ POINT_SIGMA = 0.27
 EXTRA_SPRITES = 1000
 EXTRA_PX = 400_000
 MAX_TURN_FIELD = 0.5
+EVERY = slice(None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,10 +86,12 @@ def swept_sprites(
     turn, slowed = _slowed(turn, scan, camera)
     middle = Turn(propagate(turn.q_icrs_to_cam, turn.rate_cam_rad_s, scan.hold_s / 2), turn.rate_cam_rad_s)
     axis = (camera.cam_to_image @ to_matrix(middle.q_icrs_to_cam))[2]
-    reach_rad = camera.field_radius_rad(footprint_px / 2 + 1) + turn.speed_rad_s * scan.whole_s / 2
-    near = stars.grid.near(axis, reach_rad)
+    margin_px = footprint_px / 2 + 1
+    near = stars.grid.near(axis, camera.field_radius_rad(margin_px) + turn.speed_rad_s * scan.whole_s / 2)
     seen = stars.vectors[near] @ (camera.cam_to_image @ to_matrix(turn.q_icrs_to_cam)).T
-    paths = Paths(seen, camera.cam_to_image @ turn.rate_cam_rad_s, camera)
+    close = camera.in_view(seen, margin_px, turn.speed_rad_s * scan.longest_s)
+    near = near[close]
+    paths = _paths(seen[close], turn, scan, camera)
     late_s = _row_delays_s(paths, scan, camera)
     wanted, part = _wanted_nodes(paths, late_s, scan, footprint_px, sigma_px)
     counts = within_budget(_of_the_brightest(wanted, stars.electrons_per_s[near], footprint_px), _extra(footprint_px))
@@ -100,6 +104,19 @@ def swept_sprites(
     sprites = pack_sprites(x_px, y_px, light, star, camera.resolution_px, footprint_px)
     capped = int(((wanted > 0) if slowed else (counts < wanted)).sum())
     return replace(sprites, per_star=int(counts.max(initial=1)), capped=capped)
+
+
+def _paths(seen: FloatArray, turn: Turn, scan: Scan, camera: Camera) -> Paths | ShortPaths:
+    """The stars' paths while their rows are lit, seconds from the middle row's first light."""
+    exact = Paths(seen, camera.cam_to_image @ turn.rate_cam_rad_s, camera)
+    # Where a pinhole has the star when the middle row lights up says to `wrong_px` which row is the star's.
+    wrong_px = bend_px(camera) + turn.speed_rad_s * scan.longest_s * camera.focal_length_px
+    half_s = scan.hold_s / 2 + scan.scanout_s * min(1.0, wrong_px / min(camera.resolution_px))
+    points = points_within(camera, turn.speed_rad_s * half_s)
+    if points is None:
+        return exact
+    x_px, y_px = exact.through(replace(camera, lens=None)).all_places_px(np.zeros((1, 1)))
+    return ShortPaths(exact, scan.late_s(x_px[0], y_px[0], camera.resolution_px) + scan.hold_s / 2, half_s, points)
 
 
 def _extra(footprint_px: int) -> int:
@@ -126,23 +143,22 @@ def _slowed(turn: Turn, scan: Scan, camera: Camera) -> tuple[Turn, bool]:
     return Turn(turn.q_icrs_to_cam, turn.rate_cam_rad_s * (most_rad / angle_rad)), True
 
 
-def _row_delays_s(paths: Paths, scan: Scan, camera: Camera) -> FloatArray:
+def _row_delays_s(paths: Paths | ShortPaths, scan: Scan, camera: Camera) -> FloatArray:
     """How long after the middle row each star's own row lights up."""
-    every, late_s = np.arange(len(paths)), np.zeros(len(paths))
+    late_s = np.zeros(len(paths))
     for _ in range(2 if scan.scanout_s else 0):
         # Each pass leaves an error of the share of the frame that the star crosses meanwhile: 1e-5 of it for 5 px in 1080 rows.
-        x_px, y_px = paths.places_px(every, late_s)
+        x_px, y_px = paths.places_px(EVERY, late_s)
         late_s = scan.late_s(x_px, y_px, camera.resolution_px)
     return np.where(np.isfinite(late_s), late_s, 0.0)
 
 
 def _wanted_nodes(
-    paths: Paths, late_s: FloatArray, scan: Scan, footprint_px: int, sigma_px: tuple[float, float]
+    paths: Paths | ShortPaths, late_s: FloatArray, scan: Scan, footprint_px: int, sigma_px: tuple[float, float]
 ) -> tuple[IntArray, tuple[FloatArray, FloatArray]]:
     """How many nodes each star's path needs (0: it misses the image), and the part of its time that it is on the image."""
-    every = np.arange(len(paths))
-    ends = paths.places_px(np.tile(every, 2), np.concatenate([late_s, late_s + scan.hold_s]))
-    chords = Chords(*(places.reshape(2, -1) for places in ends))
+    ends = [paths.places_px(EVERY, seconds) for seconds in (late_s, late_s + scan.hold_s)]
+    chords = Chords(*(np.stack(places) for places in zip(*ends, strict=True)))
     angle_rad = paths.speed_rad_s * scan.hold_s
     # An arc bulges from its chord, and a star runs unevenly along it, by less than the angle of the turn.
     bulge_px = angle_rad * np.nan_to_num(chords.length_sigma((1.0, 1.0)))

@@ -8,12 +8,15 @@ direction to pixel, the way that every frame goes; `Camera.tangents` is the way 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
 from hilstar.arrays import FloatArray, IntArray
 
 FIELD_EDGE = 1.1  # of half the image: beyond it the field stands still, where its polynomials would run away
+
+ANY_TANGENT = (-1e9, 1e9)  # finite: a product with it is a number
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +86,7 @@ class Lens:
     """Distortion k1 to k3 and p1, p2 (of tangents of field angles), the plane's tilt about its x and y axes, and the field.
 
     `max_tangent` bounds the directions that it is used for: the largest radius of (u, v) that reaches the image, or that was
-    calibrated. Farther out the polynomials turn back, and would show stars that are not in view.
+    calibrated. Farther out the polynomials turn back, and would show stars that are not in view. `box` bounds u and v.
     """
 
     radial: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -91,6 +94,7 @@ class Lens:
     tilt_rad: tuple[float, float] = (0.0, 0.0)
     field: ResidualField | None = None
     max_tangent: float = np.inf
+    box: tuple[tuple[float, float], tuple[float, float]] = (ANY_TANGENT, ANY_TANGENT)
 
     def bent(self, u: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Places on the tilted plane, in focal lengths from the foot of the axis, of directions (u, v, 1); NaN beyond."""
@@ -99,24 +103,33 @@ class Lens:
         r2 = u * u + v * v
         gain = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
         gain[~(r2 <= self.max_tangent**2)] = np.nan
-        bent_u, bent_v = u * gain, v * gain
         if p1 or p2:
-            along = 2 * (p1 * v + p2 * u)
-            bent_u += along * u + p2 * r2
-            bent_v += along * v + p1 * r2
-        return _on_plane(bent_u, bent_v, self.tilt_rad)
+            gain += 2 * (p1 * v + p2 * u)
+        rays = np.ones((3, len(u)))
+        np.multiply(u, gain, out=rays[0])
+        np.multiply(v, gain, out=rays[1])
+        if p1 or p2:
+            rays[0] += p2 * r2
+            rays[1] += p1 * r2
+        return _on_plane(rays, self.tilt_rad)
 
 
-def _on_plane(u: FloatArray, v: FloatArray, tilt_rad: tuple[float, float]) -> tuple[FloatArray, FloatArray]:
-    """Where rays (u, v, 1) meet a plane through (0, 0, 1) that is turned about x, then about y, in its own axes."""
+def _on_plane(rays: FloatArray, tilt_rad: tuple[float, float]) -> tuple[FloatArray, FloatArray]:
+    """Where rays (3, n) of z 1 meet a plane through (0, 0, 1) that is turned about x, then about y, in its own axes."""
     if tilt_rad == (0.0, 0.0):
-        return u, v
+        return rays[0], rays[1]
+    right, down, normal = _onto_plane(tilt_rad) @ rays
+    normal[~(normal > 0)] = np.nan
+    return right / normal, down / normal
+
+
+@lru_cache(maxsize=16)
+def _onto_plane(tilt_rad: tuple[float, float]) -> FloatArray:
+    """The map of rays to the plane as a matrix of homogeneous places."""
     axes = plane_axes(tilt_rad)
-    right, down, normal = axes.T @ np.stack([u, v, np.ones_like(u)])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        along = axes[2, 2] / normal
-    along[~(along > 0)] = np.nan
-    return right * along - axes[2, 0], down * along - axes[2, 1]
+    right, down, normal = axes.T
+    foot = axes[2]
+    return np.array([foot[2] * right - foot[0] * normal, foot[2] * down - foot[1] * normal, normal])
 
 
 def plane_axes(tilt_rad: tuple[float, float]) -> FloatArray:

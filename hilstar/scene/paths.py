@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -71,18 +72,29 @@ class Paths:
     def __len__(self) -> int:
         return len(self._seen)
 
-    def places_px(self, star: IntArray, seconds: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Pixel x and y of the stars at places `star` (k,), each at its own of `seconds` (k,); NaN behind the camera."""
-        angle = (self.speed_rad_s * seconds)[:, None]
-        cosine = np.cos(angle)
-        seen = self._seen[star] * cosine - self._cross[star] * np.sin(angle) + self._along[star] * (1 - cosine)
-        return self.camera.project_outward(seen)
+    def through(self, camera: Camera) -> Paths:
+        """The same paths seen by another camera that turns with this one."""
+        paths = copy(self)
+        paths.camera = camera
+        return paths
 
-    def all_places_px(self, seconds: float) -> tuple[FloatArray, FloatArray]:
-        """Pixel x and y of all stars (n,) at one moment; NaN behind the camera."""
-        angle = self.speed_rad_s * seconds
-        cosine = float(np.cos(angle))
-        return self.camera.project_outward(self._seen * cosine - self._cross * np.sin(angle) + self._along * (1 - cosine))
+    def places_px(self, star: IntArray | slice, seconds: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Pixel x and y of the stars at places `star` (k,), each at its own of `seconds` (k,); NaN behind the camera."""
+        return self._places_px(self._seen[star], self._cross[star], self._along[star], seconds)
+
+    def all_places_px(self, seconds: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Pixel x and y (m, n) of all stars at `seconds` (m, 1), or (m, n) of their own; NaN behind the camera."""
+        shape = len(seconds), len(self)
+        x_px, y_px = self._places_px(self._seen, self._cross, self._along, seconds)
+        return x_px.reshape(shape), y_px.reshape(shape)
+
+    def _places_px(
+        self, seen: FloatArray, cross: FloatArray, along: FloatArray, seconds: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        angle = (self.speed_rad_s * seconds)[..., None]
+        cosine = np.cos(angle)
+        turned = seen * cosine - cross * np.sin(angle) + along * (1 - cosine)
+        return self.camera.project_outward(turned.reshape(-1, 3))
 
 
 @dataclass(frozen=True, slots=True)

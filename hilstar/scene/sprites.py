@@ -54,8 +54,13 @@ def make_sprites(stars: Stars, icrs_to_image: FloatArray, camera: Camera, footpr
 
     `icrs_to_image` (3, 3) turns ICRS components into image components.
     """
-    near = stars.grid.near(icrs_to_image[2], camera.field_radius_rad(footprint_px / 2 + 1))
-    x_px, y_px = camera.project(stars.vectors[near] @ icrs_to_image.T)
+    margin_px = footprint_px / 2 + 1
+    near = stars.grid.near(icrs_to_image[2], camera.field_radius_rad(margin_px))
+    seen = stars.vectors[near] @ icrs_to_image.T
+    if camera.lens is not None:  # a pinhole's places cost less than the choice
+        close = camera.in_view(seen, margin_px, 0.0)
+        near, seen = near[close], seen[close]
+    x_px, y_px = camera.project(seen)
     sprites = pack_sprites(x_px, y_px, stars.electrons_per_s[near], near, camera.resolution_px, footprint_px)
     kept = brightest(sprites.data["electrons_per_s"], max_stars(footprint_px))
     if kept is None:

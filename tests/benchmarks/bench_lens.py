@@ -1,6 +1,7 @@
 """A frame through a measured lens with a field of degree 6 against one through a pinhole, in turn.
 
-`python -m tests.benchmarks.bench_lens [--stars N] [--rounds N]`. On demand, never in CI.
+`python -m tests.benchmarks.bench_lens [--stars N] [--rounds N]`. On demand, never in CI. A lens moves stars and stretches their
+paths, so that the two frames differ in what they draw: `sprites` is what the lens itself costs.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from hilstar.arrays import FloatArray
 from hilstar.bench.build import open_bench
 from hilstar.bench.frame import Bench
 from hilstar.rotation import from_radec_roll_deg
@@ -24,7 +26,8 @@ from hilstar.study.speed.scenes import scene
 
 DEGREE, TERMS = 6, 28
 MARGIN_PX = 10.0
-RATE_RAD_S = np.array([0.1, -0.2, 0.05])
+AXIS = np.array([0.1, -0.2, 0.05]) / np.linalg.norm([0.1, -0.2, 0.05])
+SPEEDS_DEG_S = (0.0, 1.0, 3.0, 13.0, 30.0)
 
 
 def with_lens(bench: Bench) -> Bench:
@@ -33,6 +36,16 @@ def with_lens(bench: Bench) -> Bench:
     field = ResidualField.of_terms(x, y, DEGREE, bench.camera.resolution_px)
     lens = Lens((0.6, -1.0, 2.0), (1e-3, -1e-3), (0.017, -0.01), field)
     return replace(bench, camera=bounded(replace(bench.camera, lens=lens), MARGIN_PX))
+
+
+def times_ms(bench: Bench, q: FloatArray, number: int, rate: FloatArray | None) -> tuple[float, float, int]:
+    """The time of a frame's sprites, of the whole frame, and the number of the sprites."""
+    begin = time.perf_counter()
+    sprites = bench.frame_sprites(q, rate)
+    made = time.perf_counter()
+    drawn = bench.draw_sprites(sprites, number)
+    _ = drawn.levels
+    return (made - begin) * 1e3, (time.perf_counter() - begin) * 1e3, 0 if sprites is None else len(sprites)
 
 
 def main() -> None:
@@ -47,18 +60,16 @@ def main() -> None:
     ):
         pinhole = bench.with_stars(scene(bench, bench.shown_stars, q, options.stars, np.random.default_rng(1)).stars)
         benches = {"pinhole": pinhole, "lens": with_lens(pinhole)}
-        kinds = [(name, rate) for rate in (None, RATE_RAD_S) for name in benches]
-        times_ms: dict[tuple[str, bool], list[float]] = {(name, rate is None): [] for name, rate in kinds}
-        for number in range(options.rounds + 5):
-            for name, rate in kinds:
-                begin = time.perf_counter()
-                drawn = benches[name].draw(q, number, rate)
-                _ = drawn.levels
-                if number >= 5:
-                    times_ms[name, rate is None].append((time.perf_counter() - begin) * 1e3)
-    for still, words in ((True, "still"), (False, "turning")):
-        ideal, bent = (float(np.median(times_ms[name, still])) for name in benches)
-        print(f"{words:8} pinhole {ideal:6.2f} ms, lens {bent:6.2f} ms: {bent - ideal:+.2f} ms, {bent / ideal:.3f} x")
+        rates = [np.radians(speed) * AXIS if speed else None for speed in SPEEDS_DEG_S]
+        found = np.array(
+            [[[times_ms(b, q, n, rate) for b in benches.values()] for rate in rates] for n in range(options.rounds + 5)]
+        )
+    for speed, (ideal, bent) in zip(SPEEDS_DEG_S, np.median(found[5:], axis=0), strict=True):
+        print(
+            f"{speed:4g} deg/s  sprites {ideal[0]:5.2f} and {bent[0]:5.2f} ms: {bent[0] - ideal[0]:+.2f} ms   "
+            f"frame {ideal[1]:6.2f} and {bent[1]:6.2f} ms: {bent[1] - ideal[1]:+.2f} ms   "
+            f"({ideal[2]:.0f} and {bent[2]:.0f} sprites)"
+        )
 
 
 if __name__ == "__main__":

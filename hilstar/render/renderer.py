@@ -97,6 +97,11 @@ class Renderer:
         """The name of the GL renderer, as the driver gives it."""
         return str(self._ctx.info["GL_RENDERER"])
 
+    @property
+    def context(self) -> Context:
+        """The GL context, for another renderer beside this one; it ends with this one."""
+        return self._ctx
+
     def _check_limits(self) -> None:
         info, sigma = self._ctx.info, list(self.target.sigma_px)
         largest = int(min(info["GL_MAX_TEXTURE_SIZE"], *info["GL_MAX_VIEWPORT_DIMS"])) - 2 * self.footprint_px

@@ -91,7 +91,7 @@ def run_demo(directory: Path, duration_s: float, rng: np.random.Generator, watch
     make_directory(directory)
     log_path = directory / SLEW_LOG
     write_log(log_path, slew_samples(duration_s + 1.0, rng))
-    with load(resource_path("configs", "demo.toml")) as bench, ZmqReceiver(bench.config.attitude.endpoint, bind=True) as link:
+    with load(resource_path("configs", "demo.toml")) as bench, ZmqReceiver(bench.config.attitude.address, bind=True) as link:
         frame_count = round(duration_s * bench.config.monitor.refresh_hz)
         wanted = {int(frame_count * part) for part in (0.0625, 0.25, 0.5, 0.9375)}
         kept: dict[int, Codes] = {}

@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 from hilstar.attitude.wire.keys import CurveKeys
 from hilstar.attitude.wire.links import StreamLink
 from hilstar.attitude.wire.serial_link import SerialLink
+from hilstar.attitude.wire.source import Mounting
 from hilstar.attitude.wire.udp.udp_link import UdpLink
+from hilstar.attitude.wire.vizard.attitude import DifferenceRates, Follower
+from hilstar.attitude.wire.vizard.broadcast import VizardBroadcast
+from hilstar.attitude.wire.vizard.live import VizardLive
 from hilstar.attitude.wire.zmq_lockstep import ZmqLockstep
 from hilstar.attitude.wire.zmq_stream import ZmqReceiver
 from hilstar.bench.config import AttitudeSettings, BenchConfig
 from hilstar.bench.config.road import udp_road
 from hilstar.notices import Notices
+from hilstar.units import NS_PER_MS
 
-AnyLink = StreamLink | ZmqLockstep
+AnyLink = StreamLink | ZmqLockstep | VizardLive
 
 
 def link_keys(settings: AttitudeSettings, folder: Path) -> CurveKeys:
@@ -30,7 +36,18 @@ def open_link(config: BenchConfig, folder: Path, notices: Notices | None = None)
         return SerialLink(str(settings.port), settings.baud, notices)
     if settings.source == "udp":
         return UdpLink(*udp_road(settings), notices)
+    if settings.source == "vizard":
+        return _open_vizard(config, notices)
     keys = link_keys(settings, folder)
     if settings.lockstep:
-        return ZmqLockstep(settings.endpoint, bind=settings.bind is not False, keys=keys, notices=notices)
-    return ZmqReceiver(settings.endpoint, bind=settings.bind is True, keys=keys, notices=notices)
+        return ZmqLockstep(settings.address, bind=settings.bind is not False, keys=keys, notices=notices)
+    return ZmqReceiver(settings.address, bind=settings.bind is True, keys=keys, notices=notices)
+
+
+def _open_vizard(config: BenchConfig, notices: Notices | None) -> VizardBroadcast | VizardLive:
+    settings = config.attitude
+    rates = DifferenceRates(round(settings.stale_after_ms * NS_PER_MS), math.radians(settings.max_rate_deg_s))
+    follower = Follower(settings.spacecraft, Mounting(config.tracker.q_body_to_cam), rates)
+    if settings.lockstep:
+        return VizardLive(settings.address, follower, bind=settings.bind is not False, notices=notices)
+    return VizardBroadcast(settings.address, follower, bind=settings.bind is True, notices=notices)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass, field
 
@@ -12,13 +13,16 @@ from hilstar.attitude.clock.timeline import Timeline
 from hilstar.attitude.receiver import PacketCounts, Receiver, nobody_watches
 from hilstar.attitude.wire.links import StreamLink
 from hilstar.attitude.wire.source import Mounting
+from hilstar.attitude.wire.vizard.camera import TrackerCamera
+from hilstar.attitude.wire.vizard.live import VizardLive
 from hilstar.attitude.wire.zmq_lockstep import ZmqLockstep
 from hilstar.bench.config import AttitudeSettings
 from hilstar.bench.frame import Bench
 from hilstar.notices import Notices
 from hilstar.process.interrupts import stop_on_signal
 from hilstar.run.frame_status import StatusMaker
-from hilstar.run.lockstep import serve_lockstep
+from hilstar.run.lockstep.packets import serve_lockstep
+from hilstar.run.lockstep.vizard import Cameras, Pictures, serve_vizard
 from hilstar.run.loop import FrameLoop, Limit, policy_of
 from hilstar.run.open_link import AnyLink
 from hilstar.run.pacer import Moment, Pacer
@@ -34,11 +38,15 @@ from hilstar.units import NS_PER_S
 
 @dataclass(frozen=True, slots=True)
 class Outlet:
-    """Where frames go besides their sink: onto a screen and into a ledger; and where events are reported."""
+    """Where frames go besides their sink: onto a screen and into a ledger; and where events are reported.
+
+    `pictures` are what a simulation gets that asks for those of its camera.
+    """
 
     screen: Screen | None = None
     ledger: Ledger | None = None
     notices: Notices = field(default_factory=Notices)
+    pictures: Pictures | None = None
 
     def pacer(self) -> Pacer | None:
         """The pacer of the screen; None without one."""
@@ -56,12 +64,23 @@ def serve(bench: Bench, link: AnyLink, limit: Limit, sink: FrameSink = ignore, o
         if isinstance(link, ZmqLockstep):
             bench.warm_up()
             summary = serve_lockstep(bench, link, limit, loop, ledger)
+        elif isinstance(link, VizardLive):
+            bench.warm_up()
+            cameras = Cameras(_tracker_camera(bench), outlet.pictures, outlet.notices)
+            summary = serve_vizard(bench, link, limit, loop, cameras, ledger)
         else:
             summary = _serve_stream(bench, link, limit, loop, outlet)
     told: dict[str, str | int] = {"endpoint": link.endpoint}
     return replaced(
         summary, events=outlet.notices.counts(), link=told | link.link_counts.summary(), screen=loop.screen_summary()
     )
+
+
+def _tracker_camera(bench: Bench) -> TrackerCamera:
+    tracker = bench.config.tracker
+    height_mm = tracker.resolution_px[1] * tracker.pixel_pitch_um * 1e-3
+    field_deg = 2 * math.degrees(math.atan(height_mm / (2 * tracker.focal_length_mm)))
+    return TrackerCamera(Mounting(tracker.q_body_to_cam).q_body_to_cam, tracker.resolution_px, field_deg)
 
 
 def _serve_stream(bench: Bench, link: StreamLink, limit: Limit, loop: FrameLoop, outlet: Outlet) -> RunSummary:

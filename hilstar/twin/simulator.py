@@ -17,7 +17,7 @@ from hilstar.bench.cameras import tracker_camera
 from hilstar.bench.config import BenchConfig
 from hilstar.bench.truth import truth_table
 from hilstar.errors import InputError
-from hilstar.render.renderer import Renderer, Target
+from hilstar.render.renderer import Context, Renderer, Target
 from hilstar.scene.exposure_motion import MIDDLE_S, Motion, smeared_sprites
 from hilstar.sky.electrons import Photometry, zodiacal_electrons_per_s_arcsec2
 from hilstar.tracker.detector import Detector
@@ -54,9 +54,12 @@ class Exposure:
 
 
 class Simulator:
-    """A bench's tracker looking at the sky itself. Free it with `close`, or use it as a context manager."""
+    """A bench's tracker looking at the sky itself, drawn in a GL context of its own or in another renderer's.
 
-    def __init__(self, file: BenchFile) -> None:
+    Free it with `close`, or use it as a context manager; one in another's context ends with that.
+    """
+
+    def __init__(self, file: BenchFile, context: Context | None = None) -> None:
         self.file = file
         self.config = file.config
         tracker = self.config.tracker
@@ -64,7 +67,7 @@ class Simulator:
         self.camera = tracker_camera(tracker, file.folder)
         self.background_e = background_e(self.config, file.folder)
         self.detector = Detector(tracker.detector, tracker.resolution_px, tracker.pixel_pitch_um)
-        self.renderer = Renderer(Target(tracker.resolution_px, tracker.psf_sigma_px))
+        self.renderer = Renderer(Target(tracker.resolution_px, tracker.psf_sigma_px), context)
 
     def motion(self, q_icrs_to_cam: FloatArray, rate_cam_rad_s: FloatArray) -> Motion:
         """An exposure of this tracker, by the attitude in its middle (unit quaternion) and a constant rate."""

@@ -48,6 +48,7 @@ class ZmqSocket:
     """
 
     conventions = PACKETS
+    max_part_bytes = MAX_PART_BYTES
 
     def __init__(self, kind: int, endpoint: str, *, bind: bool, keys: CurveKeys, notices: Notices | None) -> None:
         self._place = parse_endpoint(endpoint)
@@ -126,7 +127,7 @@ class ZmqSocket:
         """Set the options that must come before bind or connect."""
         made.setsockopt(zmq.LINGER, 0)
         made.setsockopt(zmq.IPV6, "[" in self._address)
-        made.setsockopt(zmq.MAXMSGSIZE, MAX_PART_BYTES)
+        made.setsockopt(zmq.MAXMSGSIZE, self.max_part_bytes)
         made.setsockopt(zmq.RCVHWM, QUEUE_MESSAGES)
         made.setsockopt(zmq.HANDSHAKE_IVL, HANDSHAKE_MS)
         made.setsockopt(zmq.HEARTBEAT_IVL, HEARTBEAT_MS)
@@ -168,14 +169,19 @@ class ZmqSocket:
             self._reset(f"memory grew by more than {MAX_GROWTH_BYTES / 1e6:.0f} MB, as by a message that never ends")
 
     def _take(self) -> bytes | None:
-        """The last part of the next message; None where none is complete, or it had more than MAX_PARTS."""
+        """The last part of the next message; None as for `_take_parts`."""
+        parts = self._take_parts()
+        return None if parts is None else parts[-1]
+
+    def _take_parts(self) -> list[bytes] | None:
+        """The parts of the next message; None where none is complete, or it had more than MAX_PARTS."""
         taken = self._ready()
         try:
-            part = taken.recv(zmq.NOBLOCK)
+            parts = [taken.recv(zmq.NOBLOCK)]
             for _ in range(MAX_PARTS):
                 if not taken.getsockopt(zmq.RCVMORE):
-                    return part
-                part = taken.recv(zmq.NOBLOCK)
+                    return parts
+                parts.append(taken.recv(zmq.NOBLOCK))
         except zmq.Again:
             return None
         self._reset(f"a message of more than {MAX_PARTS} parts")

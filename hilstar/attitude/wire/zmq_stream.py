@@ -23,9 +23,10 @@ TEND_S = 0.05
 
 
 class ZmqReceiver(ZmqSocket):
-    """A SUB socket that takes every message; it connects, or binds with `bind`."""
+    """A SUB socket that takes every message that begins with its `topic`; it connects, or binds with `bind`."""
 
     two_way = False
+    topic = b""
 
     def __init__(self, endpoint: str, *, bind: bool = False, keys: CurveKeys = NO_KEYS, notices: Notices | None = None) -> None:
         super().__init__(zmq.SUB, endpoint, bind=bind, keys=keys, notices=notices)
@@ -40,22 +41,25 @@ class ZmqReceiver(ZmqSocket):
 
     def _configure(self, made: zmq.Socket[bytes]) -> None:
         super()._configure(made)
-        made.setsockopt(zmq.SUBSCRIBE, b"")
+        made.setsockopt(zmq.SUBSCRIBE, self.topic)
 
     def receive(self, timeout_ms: int) -> list[Arrival[Event]]:
-        """The waiting messages, oldest first; only the last part of each is read, and only the newest of a flood.
+        """The waiting messages, oldest first, and only the newest of a flood; of packets only the last part counts.
 
         Waits at most `timeout_ms` for the first, and for no other.
         """
         if not self._waits(timeout_ms):
             return []
-        waiting: list[tuple[int, bytes]] = []
+        waiting: list[tuple[int, list[bytes]]] = []
         taken_bytes = 0
-        while len(waiting) < QUEUE_MESSAGES and taken_bytes < MAX_TAKEN_BYTES and (message := self._take()) is not None:
-            waiting.append((time.monotonic_ns(), message))
-            taken_bytes += len(message)
+        while len(waiting) < QUEUE_MESSAGES and taken_bytes < MAX_TAKEN_BYTES and (parts := self._take_parts()) is not None:
+            waiting.append((time.monotonic_ns(), parts))
+            taken_bytes += sum(map(len, parts))
         admitted = self._gate.admit(len(waiting))
-        return [Arrival(host_ns, decode(message), message) for host_ns, message in waiting[len(waiting) - admitted :]]
+        return [self._arrival(host_ns, parts) for host_ns, parts in waiting[len(waiting) - admitted :]]
+
+    def _arrival(self, host_ns: int, parts: list[bytes]) -> Arrival[Event]:
+        return Arrival(host_ns, decode(parts[-1]), parts[-1])
 
     def wait_for_message(self, timeout_ms: int) -> bool:
         """True once a message waits."""

@@ -9,7 +9,12 @@ from msgspec import Meta
 from hilstar.bench.config.values import NotNegative
 from hilstar.toml_tables import Table
 
-DEFAULT_ENDPOINT = "tcp://127.0.0.1:5560"
+ENDPOINTS = {
+    ("zmq", False): "tcp://127.0.0.1:5560",
+    ("zmq", True): "tcp://127.0.0.1:5560",
+    ("vizard", False): "tcp://127.0.0.1:5570",  # where Basilisk broadcasts, and where it looks for Vizard
+    ("vizard", True): "tcp://127.0.0.1:5556",
+}
 
 
 class AttitudeSettings(Table, frozen=True):
@@ -23,25 +28,29 @@ class AttitudeSettings(Table, frozen=True):
     """
 
     source: Annotated[
-        Literal["zmq", "serial", "udp"],
+        Literal["zmq", "serial", "udp", "vizard"],
         Meta(
             description='`"zmq"`: packets or JSON over ZeroMQ. `"serial"`: COBS frames over a serial line. `"udp"`: a packet '
-            "or JSON in each datagram."
+            'or JSON in each datagram. `"vizard"`: '
+            "Basilisk's Vizard stream, whose attitude is the body's (`[tracker] "
+            "q_body_to_cam`)."
         ),
     ] = "zmq"
     endpoint: Annotated[
-        str,
+        str | None,
         Meta(
-            description="ZeroMQ: the address to which hilstar's SUB socket connects. `tcp://HOST:PORT`, where HOST is an IPv4 "
-            "address, an IPv6 address in brackets, or a name (when hilstar binds also `*`, and PORT may be `*` for a free one, "
-            "which is then reported), or `ipc:///WHOLE/PATH`. UDP: `udp://ADDRESS:PORT`, another way to write `bind`."
+            description="ZeroMQ and Vizard: the address to which hilstar's SUB socket connects. `tcp://HOST:PORT`, where HOST "
+            "is an IPv4 address, an IPv6 address in brackets, or a name (when hilstar binds also `*`, and PORT may be `*` for "
+            "a free one, which is then reported), or `ipc:///WHOLE/PATH`. Basilisk has no keys: its endpoint is on this "
+            "machine. UDP: `udp://ADDRESS:PORT`, another way to write `bind`.",
+            extra={"default": "`tcp://127.0.0.1:5560`; of Vizard `tcp://127.0.0.1:5570`, in lockstep `tcp://127.0.0.1:5556`"},
         ),
-    ] = DEFAULT_ENDPOINT
+    ] = None
     bind: Annotated[
         bool | str | None,
         Meta(
-            description="ZeroMQ: `true` when hilstar binds and the sender connects. UDP: the address and port that hilstar "
-            'listens on, `"ADDRESS"`, `"ADDRESS:PORT"` or `"[IPv6]:PORT"` (port 0: a free one, which is reported).',
+            description="ZeroMQ and Vizard: `true` when hilstar binds and the sender connects. UDP: the address and port that "
+            'hilstar listens on, `"ADDRESS"`, `"ADDRESS:PORT"` or `"[IPv6]:PORT"` (port 0: a free one, which is reported).',
             extra={"default": '`false`; `true` in lockstep; `"127.0.0.1:5560"` over UDP'},
         ),
     ] = None
@@ -57,9 +66,17 @@ class AttitudeSettings(Table, frozen=True):
         bool,
         Meta(
             description="ZeroMQ: `true` for a REP socket. Each request is one attitude and gets one frame and one reply, at "
-            "whatever speed the sender has."
+            "whatever speed the sender has. Vizard: `true` for Basilisk's live stream instead of its broadcast; hilstar "
+            "stands in Vizard's place, and Basilisk's cameras get pictures of the virtual tracker."
         ),
     ] = False
+    spacecraft: Annotated[
+        str | None,
+        Meta(
+            description="Vizard: the name of the spacecraft that carries the tracker.",
+            extra={"default": "the only one that is there"},
+        ),
+    ] = None
     curve_secret_key: Annotated[
         str | None, Meta(description="ZeroMQ: the file of hilstar's own secret key.", extra={"default": "none"})
     ] = None
@@ -124,3 +141,8 @@ class AttitudeSettings(Table, frozen=True):
             "and two samples that would need a faster turn between them are a jump, never a turn.",
         ),
     ] = 60.0
+
+    @property
+    def address(self) -> str:
+        """The endpoint, or where the source usually is; empty for one that has none."""
+        return self.endpoint or ENDPOINTS.get((self.source, self.lockstep), "")

@@ -3,29 +3,38 @@
 from __future__ import annotations
 
 from hilstar.attitude.wire.udp.addresses import ALLOW_FORM, AllowedSenders, Place, bound_place
-from hilstar.bench.config.attitude import DEFAULT_ENDPOINT, AttitudeSettings
+from hilstar.bench.config.attitude import AttitudeSettings
 from hilstar.errors import InputError
 
 
 def check_road(settings: AttitudeSettings) -> None:
     """Refuse (InputError) keys of another road, and a road that lacks one."""
     source = settings.source
-    if settings.lockstep and source != "zmq":
-        raise InputError('lockstep = true is for source = "zmq"; leave one of them out')
+    if settings.lockstep and source not in {"zmq", "vizard"}:
+        raise InputError('lockstep = true is for source = "zmq" or "vizard"; leave one of them out')
     if isinstance(settings.bind, str) and source != "udp":
         raise InputError(f'bind = "{settings.bind}" is for source = "udp"; write true or false, and the address in endpoint')
     if settings.allow and source != "udp":
         raise InputError(f'allow is for source = "udp"; remove it (source = "{source}")')
     if source == "serial" and (not settings.port or isinstance(settings.port, int)):
         raise InputError('source = "serial" needs port; write port = "/dev/ttyUSB0" or the like')
+    if settings.spacecraft is not None and source != "vizard":
+        raise InputError(f'spacecraft is for source = "vizard"; remove it (source = "{source}")')
+    if source == "vizard":
+        _check_vizard(settings)
     if source == "udp":
         udp_road(settings)
 
 
+def _check_vizard(settings: AttitudeSettings) -> None:
+    for name in ("curve_secret_key", "curve_server_key", "allowed_clients"):
+        if getattr(settings, name) is not None:
+            raise InputError(f'{name}: Basilisk knows no keys; remove it, and write endpoint = "tcp://127.0.0.1:PORT"')
+
+
 def udp_road(settings: AttitudeSettings) -> tuple[Place, AllowedSenders]:
     """Where UDP is bound, and who may send. Raises InputError, also where an open address has no list of senders."""
-    endpoint = None if settings.endpoint == DEFAULT_ENDPOINT else settings.endpoint
-    place, allowed = bound_place(settings.bind, settings.port, endpoint), AllowedSenders(settings.allow)
+    place, allowed = bound_place(settings.bind, settings.port, settings.endpoint), AllowedSenders(settings.allow)
     if not allowed and not place.loopback:
         raise InputError(f"{place} is open to other machines, and allow does not say which may send; {ALLOW_FORM}")
     return place, allowed

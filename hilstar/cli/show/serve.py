@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -24,6 +24,11 @@ from hilstar.cli.show.running import (
 from hilstar.console.terminal import progress, say
 from hilstar.files import MCAP, check_ending
 from hilstar.notices import Notices
+
+if TYPE_CHECKING:
+    from hilstar.bench.frame import Bench
+    from hilstar.run.lockstep.vizard import Pictures
+    from hilstar.run.open_link import AnyLink
 
 NO_ATTITUDE = 4  # the exit code of a run that never had one
 
@@ -67,8 +72,17 @@ def serve(
         limit = Limit(slots, math.inf if frames is None else frames)
         say(f"{link.verb} {link.endpoint}, {refresh_hz:g} Hz, {bench.renderer.gl_renderer}")
         say_what_clips(bench)
+        outlet = Outlet(screen, kept, notices, tracker_pictures(link, bench))
         with progress("serving", min(limit.slots, limit.frames)) as advance:
-            summary = serve_stream(bench, link, limit, lambda shown: advance(shown.number + 1), Outlet(screen, kept, notices))
+            summary = serve_stream(bench, link, limit, lambda shown: advance(shown.number + 1), outlet)
     end_of_run(summary, screen, kept, as_json)
     if not summary.packets.accepted:
         raise typer.Exit(NO_ATTITUDE)
+
+
+def tracker_pictures(link: AnyLink, bench: Bench) -> Pictures | None:
+    """The virtual tracker's pictures for a link whose other side asks for them."""
+    from hilstar.attitude.wire.vizard.live import VizardLive
+    from hilstar.twin.tracker_pictures import TrackerPictures
+
+    return TrackerPictures(bench) if isinstance(link, VizardLive) else None

@@ -83,6 +83,7 @@ def attitude(
 
 def _live(path: Path, at: str | None, patience_s: float) -> tuple[AttitudeSample, Conventions]:
     """The first attitude of the stream that a bench file names."""
+    from hilstar.attitude.wire.vizard.live import VizardLive
     from hilstar.attitude.wire.zmq_lockstep import ZmqLockstep
     from hilstar.bench.bench_file import read_bench_file
     from hilstar.errors import InputError
@@ -93,7 +94,7 @@ def _live(path: Path, at: str | None, patience_s: float) -> tuple[AttitudeSample
         raise InputError(f"--at {at}: a live stream has only its present; leave --at out, or give a log")
     file = read_bench_file(path)
     with open_link(file.config, file.folder) as link:
-        if isinstance(link, ZmqLockstep):
+        if isinstance(link, ZmqLockstep | VizardLive):
             raise InputError(f"{path}: [attitude] lockstep = true wants a frame for each attitude; use hilstar serve --explain")
         return first_attitude(link, patience_s), link.conventions
 

@@ -1,0 +1,1 @@
+"""Basilisk's Vizard stream: protobuf bytes in, the attitude of one spacecraft out."""

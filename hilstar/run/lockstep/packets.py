@@ -1,0 +1,33 @@
+"""Requests of our own packets: one request is one attitude, one frame, one reply."""
+
+from __future__ import annotations
+
+import time
+
+from hilstar.attitude.wire.packet import TimeReply, TimeRequest
+from hilstar.attitude.wire.zmq_lockstep import ZmqLockstep
+from hilstar.bench.frame import Bench
+from hilstar.run.frame_status import StatusMaker
+from hilstar.run.lockstep.steps import POLL_MS, Steps
+from hilstar.run.loop import FrameLoop, Limit
+from hilstar.run.record.ledger import Ledger
+from hilstar.run.summary import RunSummary
+
+
+def serve_lockstep(bench: Bench, link: ZmqLockstep, limit: Limit, loop: FrameLoop, ledger: Ledger | None = None) -> RunSummary:
+    """Answer requests up to `limit`, or until a signal; returns the summary. A refused request leaves the last frame."""
+    run, statuses = Steps(bench, limit, loop, ledger), StatusMaker(ledger)
+    while run.goes_on():
+        arrival = link.receive(POLL_MS)
+        if arrival is None:
+            loop.idle()
+            continue
+        if isinstance(arrival.event, TimeRequest):
+            asked = arrival.event
+            link.reply_time(TimeReply(asked.sequence, asked.t1_ns, arrival.host_ns, time.monotonic_ns()))
+            continue
+        refusal = run.take(arrival.host_ns, arrival.event, arrival.raw)
+        shown_ns = time.monotonic_ns()
+        link.reply(statuses.status(run.last, run.last.t_ns, loop, run.counts, False), shown_ns, refusal)
+        run.answered(arrival.host_ns, shown_ns)
+    return run.summary()

@@ -1,0 +1,49 @@
+"""The virtual tracker's pictures for a simulation that asks for those of its camera."""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from hilstar.attitude.wire.packet import AttitudeSample
+from hilstar.bench.frame import Bench
+from hilstar.twin.simulator import FrameNoise, Simulator
+
+PNG_BITS = 16
+
+
+class TrackerPictures:
+    """A PNG for each attitude, drawn in the bench's GL context and freed with the bench.
+
+    The exposure is centred on the attitude; stars smear where the attitude has a rate. Noise is full, and that of the n-th
+    picture of a run is always the same.
+    """
+
+    def __init__(self, bench: Bench) -> None:
+        self._simulator = Simulator(bench.file, bench.renderer.context)
+        self._noise, self._count = FrameNoise("full"), 0
+
+    def __call__(self, sample: AttitudeSample) -> bytes:
+        """The picture of the tracker at an attitude."""
+        rate = np.zeros(3) if sample.rate_cam_rad_s is None else sample.rate_cam_rad_s
+        exposure = self._simulator.expose(self._simulator.motion(sample.q_icrs_to_cam, rate), self._noise.rng(self._count))
+        self._count += 1
+        return dn_png(exposure.dn, self._simulator.config.tracker.detector.bits)
+
+
+def dn_png(dn: npt.NDArray[np.uint16], bits: int) -> bytes:
+    """DN (height, width) of so many bits as a greyscale PNG of 16, which its sBIT says: DN = value >> (16 - bits).
+
+    The leading bits are the DN's, so that a reader that keeps 8 of them still sees a picture.
+    """
+    from PIL import Image, PngImagePlugin
+
+    about: Any = PngImagePlugin.PngInfo()
+    about.add(b"sBIT", bytes([bits]))
+    image = Image.fromarray(np.left_shift(dn, PNG_BITS - bits, dtype=np.uint16))
+    data = io.BytesIO()
+    image.save(data, "PNG", compress_level=1, pnginfo=about)
+    return data.getvalue()

@@ -1,0 +1,138 @@
+"""Basilisk itself drives `hilstar serve`: its own record of the attitude against every frame of the ledger."""
+
+from __future__ import annotations
+
+import json
+import signal
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from scipy.spatial.transform import Rotation, Slerp
+
+from tests.support.basilisk import Truth, basilisk, rotation
+from tests.support.benches import bench_text
+from tests.support.senders import free_port
+from tests.support.servers import SUBSCRIBED_S, interrupted, listening
+
+# Two degrees a second, from just under |sigma| = 1: the switch to the shadow set comes within half a second. The other
+# spacecraft is elsewhere, so that a choice of the wrong one is seen.
+CHASER = [[0.512, 0.613, 0.596], [0.02, 0.027, 0.012]]
+TARGET = [[-0.3, 0.1, 0.2], [0.0, 0.01, 0.0]]
+MOUNTING = [0.6, 0.48, 0.64, 0.0]
+BENCH = {"tracker": {"q_body_to_cam": MOUNTING}}
+FOCAL_PX = 60e3 / 57.65  # of the small bench's collimator and monitor
+CORNERS = np.array([[x, y, FOCAL_PX] for x in (-160, 0, 160) for y in (-120, 0, 120)])
+STAR_LIMIT_PX = 1e-3
+# sigma_BN is a double, as are all that is made of it; measured 4e-16.
+SAMPLE_LIMIT_RAD = 1e-14
+# Differences of three attitudes h apart: the rate's second derivative (1e-5 rad/s^3 here) times h^2 / 3 is 1.3e-9 at 20 ms,
+# and 3e-9 where a second message between them was lost.
+RATE_LIMIT_RAD_S = 1e-8
+
+
+def ledger_topics(path: Path) -> dict[str, list[dict]]:
+    """By topic, through MCAP's own reader."""
+    found: dict[str, list[dict]] = {}
+    with path.open("rb") as file:
+        for _, channel, message in make_reader(file).iter_messages():
+            found.setdefault(channel.topic, []).append(json.loads(message.data))
+    return found
+
+
+def star_errors_px(mine: Rotation, true: Rotation) -> np.ndarray:
+    """How far stars in the corners and the middle of the monitor are from where the true attitude has them."""
+    seen = (mine * true.inv()).apply(CORNERS)
+    return np.linalg.norm(FOCAL_PX * seen[:, :2] / seen[:, 2:] - CORNERS[:, :2], axis=1)
+
+
+@pytest.fixture(scope="module")
+def broadcast(tmp_path_factory) -> tuple[Truth, dict[str, list[dict]], dict]:
+    """Two seconds of two spacecraft, broadcast in real time; the truth, the ledger, the summary."""
+    folder, port = tmp_path_factory.mktemp("broadcast"), free_port()
+    attitude = {"source": "vizard", "endpoint": f"tcp://127.0.0.1:{port}", "spacecraft": "chaser"}
+    (folder / "bench.toml").write_text(bench_text(BENCH, {"attitude": attitude}))
+    scenario = {"mode": "broadcastStream", "port": port, "shown_s": 0.02, "stops_s": [2.0]}
+    crafts = {"chaser": CHASER, "target": TARGET}
+    words = f"connected to tcp://127.0.0.1:{port}"
+    with (
+        basilisk(folder, **scenario, spacecraft=crafts) as simulation,
+        listening(folder / "bench.toml", words, "--ledger", str(folder / "run.mcap")) as served,
+    ):
+        time.sleep(SUBSCRIBED_S)
+        simulation.run()
+        summary = interrupted(served)
+    return Truth(folder), ledger_topics(folder / "run.mcap"), summary
+
+
+def test_every_sample_is_basilisk_s_own_attitude_through_the_mounting_and_the_shadow_switch(broadcast):
+    truth, topics, summary = broadcast
+    mounting = rotation(MOUNTING)
+    samples = topics["/attitude"]
+    assert truth.shadow_switches() == 1
+    assert summary["packets"]["refused"] == 0
+    assert len(samples) == summary["packets"]["accepted"] > 60
+    rates = 0
+    for sample in samples:
+        row = truth.row(sample["t_ns"])
+        assert (rotation(sample["q"]) * (mounting * truth.body_from_n[row]).inv()).magnitude() < SAMPLE_LIMIT_RAD
+        if sample["rate"] is not None:
+            rates += 1
+            assert np.abs(sample["rate"] - mounting.apply(truth.omega_bn_b[row])).max() < RATE_LIMIT_RAD_S
+    assert rates >= len(samples) - 2
+
+
+def test_stars_of_every_frame_are_where_basilisk_s_truth_has_them(broadcast):
+    """But for those that show the very first sample, which has no rate yet."""
+    truth, topics, _ = broadcast
+    true_at = Slerp(truth.t_ns, rotation(MOUNTING) * truth.body_from_n)
+    first = topics["/attitude"][0]["sequence"]
+    errors = [
+        star_errors_px(rotation(frame["q"]), true_at(frame["light_ns"])).max()
+        for frame in topics["/frame"]
+        if frame["q"] is not None and frame["attitude_sequence"] != first
+        if not frame["stale"] and frame["light_ns"] <= truth.t_ns[-1]
+    ]
+    assert len(errors) > 60
+    assert max(errors) < STAR_LIMIT_PX
+
+
+def test_in_lockstep_every_step_is_one_frame(tmp_path):
+    """As fast as both go: two seconds of simulation in forty steps."""
+    port = free_port()
+    attitude = {"source": "vizard", "lockstep": True, "endpoint": f"tcp://127.0.0.1:{port}"}
+    (tmp_path / "bench.toml").write_text(bench_text(BENCH, {"attitude": attitude}))
+    scenario = {"mode": "liveStream", "port": port, "shown_s": 0.05, "stops_s": [2.0]}
+    with (
+        basilisk(tmp_path, **scenario, spacecraft={"chaser": CHASER}) as simulation,
+        listening(tmp_path / "bench.toml", "bound to", "--ledger", str(tmp_path / "run.mcap")) as served,
+    ):
+        simulation.run()
+        summary = interrupted(served)
+    truth, frames = Truth(tmp_path), ledger_topics(tmp_path / "run.mcap")["/frame"]
+    assert [frame["t_ns"] for frame in frames] == [50_000_000 * k for k in range(1, 41)]
+    assert summary["packets"]["received"] == summary["packets"]["accepted"] == 40
+    for frame in frames:
+        true = rotation(MOUNTING) * truth.body_from_n[truth.row(frame["t_ns"])]
+        assert (rotation(frame["q"]) * true.inv()).magnitude() < SAMPLE_LIMIT_RAD
+
+
+def test_two_spacecraft_and_no_name_end_the_simulation_with_their_names(tmp_path):
+    """Neither is shown for the other."""
+    port = free_port()
+    attitude = {"source": "vizard", "lockstep": True, "endpoint": f"tcp://127.0.0.1:{port}"}
+    (tmp_path / "bench.toml").write_text(bench_text({"attitude": attitude}))
+    scenario = {"mode": "liveStream", "port": port, "shown_s": 0.5, "stops_s": [1.0]}
+    with (
+        basilisk(tmp_path, **scenario, spacecraft={"chaser": CHASER, "target": TARGET}) as simulation,
+        listening(tmp_path / "bench.toml", "bound to", "--duration", "30") as served,
+    ):
+        told = simulation.run(code=1)
+        served.send_signal(signal.SIGINT)
+        out, err = served.communicate(timeout=30)
+    assert "Error processing SIM_UPDATE" in told
+    assert served.returncode == 4
+    assert 'spacecraft: chaser, target; write the one that is meant, [attitude] spacecraft = "NAME"' in err
+    assert json.loads(out)["packets"]["refused_by"]["format"] == 1

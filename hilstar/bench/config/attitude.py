@@ -31,8 +31,7 @@ class AttitudeSettings(Table, frozen=True):
         Literal["zmq", "serial", "udp", "vizard"],
         Meta(
             description='`"zmq"`: packets or JSON over ZeroMQ. `"serial"`: COBS frames over a serial line. `"udp"`: a packet '
-            'or JSON in each datagram. `"vizard"`: '
-            "Basilisk's Vizard stream, whose attitude is the body's (`[tracker] "
+            "or JSON in each datagram. `\"vizard\"`: Basilisk's Vizard stream; its attitude is the body's (`[tracker] "
             "q_body_to_cam`)."
         ),
     ] = "zmq"

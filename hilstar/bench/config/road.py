@@ -30,6 +30,8 @@ def _check_vizard(settings: AttitudeSettings) -> None:
     for name in ("curve_secret_key", "curve_server_key", "allowed_clients"):
         if getattr(settings, name) is not None:
             raise InputError(f'{name}: Basilisk knows no keys; remove it, and write endpoint = "tcp://127.0.0.1:PORT"')
+    if settings.clock == "shared":
+        raise InputError('clock = "shared": Basilisk sends the time of its simulation; write clock = "estimated"')
 
 
 def udp_road(settings: AttitudeSettings) -> tuple[Place, AllowedSenders]:

@@ -15,7 +15,7 @@ from msgspec import Meta
 from hilstar.arrays import FloatArray
 from hilstar.errors import InputError, shortened
 from hilstar.files import write_whole
-from hilstar.reading import MAX_TOML_BYTES, as_text, exists, parse_toml, read_bytes
+from hilstar.reading import MAX_TOML_BYTES, as_text, exists, parse_toml, read_bytes, read_text
 from hilstar.toml_tables import Kind, Table, explained
 
 BLACKS_AGREE = 0.1  # relative: the three channels' code 0 is one and the same black screen
@@ -207,6 +207,18 @@ def write_calibration(path: Path, head: Head, columns: dict[str, FloatArray], no
     lines += ["[noise]", f"relative = {noise:.6g}", "", "[notes]", *_keys(msgspec.structs.asdict(notes))]
     write_whole(table, comment + ",".join(["code", *columns]) + "\n" + rows)
     write_whole(path, "\n".join(lines) + "\n")
+    return table
+
+
+def add_uniformity(path: Path, grid: FloatArray) -> Path:
+    """Give a calibration file that has none a grid of relative light (rows, columns), rows from the top; the grid's CSV.
+
+    Raises InputError where it cannot be written.
+    """
+    table = path.with_name(f"{path.stem}-uniformity.csv")
+    write_whole(table, "".join(",".join(f"{value!r}" for value in row) + "\n" for row in grid.tolist()))
+    text = read_text(path, ADVICE, MAX_TOML_BYTES)
+    write_whole(path, f"{text}\n[uniformity]\nfile = {json.dumps(table.name)}\n")
     return table
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 
 import pytest
 
@@ -14,9 +13,10 @@ from tests.support.commands import run_hilstar
 
 def test_the_display_shows_each_pattern_while_the_command_runs(screen, tmp_path):
     (tmp_path / "bench.toml").write_text(bench_text(TWIN, {"monitor": {"bits": 8}}))
-    grab = f"{sys.executable} {plain_camera.__file__} {screen.file} {{output}} --reversed"
-    words = ["first-light", tmp_path / "bench.toml", "-o", tmp_path / "s", "--grab", grab, "--json"]
-    result = run_hilstar(*words, env=screen.env, timeout=180)
+    with plain_camera.on_duty() as camera:
+        grab = f"{camera} {screen.file} {{output}} --reversed"
+        words = ["first-light", tmp_path / "bench.toml", "-o", tmp_path / "s", "--grab", grab, "--patches", "0", "--json"]
+        result = run_hilstar(*words, env=screen.env, timeout=180)
     assert result.returncode == 0, result.stderr
     steps = {step["name"]: step for step in json.loads(result.stdout)["steps"]}
     assert steps["display"]["verdict"] == "done"

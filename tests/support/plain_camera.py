@@ -1,4 +1,4 @@
-"""A tracker that is none of hilstar's, as a snapshot script: python plain_camera.py SCREEN OUTPUT.png [--reversed].
+"""A tracker that is none of hilstar's, with a snapshot command: ... SCREEN OUTPUT.png [--reversed] [--exposure S].
 
 Points of light through a pinhole before the screen of the twin's small bench, with noise; `--reversed` turns the rows round.
 SCREEN is a picture of 16 bits or the file of an X server's screen.
@@ -6,17 +6,22 @@ SCREEN is a picture of 16 bits or the file of an X server's screen.
 
 from __future__ import annotations
 
+import functools
 import math
+import socketserver
 import sys
+import threading
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
-SIGMA_PX, WHITE_DN, FLOOR_DN, NOISE_DN = 0.62, 20_000, 20, 1.5
+SIGMA_PX, WHITE_DN_PER_S, FLOOR_DN, NOISE_DN = 0.62, 200_000, 20, 1.5
 RATIO = (25e3 / 13) / (120e3 / 57.65)  # a screen's pixel in the tracker's
-EDGE_PX = 10
+TABLE = np.linspace(-5, 5, 4001)  # between its places the error function is right to 1e-6
 
 
 def signal(path: Path) -> np.ndarray:
@@ -30,26 +35,47 @@ def signal(path: Path) -> np.ndarray:
     return pixels.reshape(height, row_bytes // 4, 4)[:, :width, 1] / 255
 
 
-def shares(place: float) -> np.ndarray:
-    """Of a point's light, what each of 17 pixels about it has."""
-    edges = [(edge - 8.5 - place % 1) / SIGMA_PX / math.sqrt(2) for edge in range(18)]
-    return np.diff([math.erf(edge) / 2 for edge in edges])
+@functools.cache
+def profiles(middle: float, lit: int) -> np.ndarray:
+    """Of each of the screen's rows or columns, what each of the image's has, (400, lit)."""
+    place = 199.5 + RATIO * (np.arange(lit) - middle)
+    edges = (np.arange(401)[:, None] - 0.5 - place) / SIGMA_PX / math.sqrt(2)
+    return np.diff(np.interp(edges, TABLE, [math.erf(at) / 2 for at in TABLE]), axis=0)
 
 
-def photographed(shown: np.ndarray) -> np.ndarray:
+def photographed(shown: np.ndarray, exposure_s: float) -> np.ndarray:
     """The tracker's image (400, 400), DN of 12 bits, of an sRGB screen."""
     rng = np.random.default_rng(zlib.crc32(shown.tobytes()))
-    image = rng.normal(FLOOR_DN, NOISE_DN, (400 + 2 * EDGE_PX, 400 + 2 * EDGE_PX))
-    for row, column in np.argwhere(shown > 0):
-        value = shown[row, column]
-        light = ((value + 0.055) / 1.055) ** 2.4 if value > 0.04045 else value / 12.92
-        x, y = (199.5 + EDGE_PX + RATIO * part for part in (column - 319.5, row - 239.5))
-        if all(9 < part < 410 for part in (x, y)):
-            square = slice(int(y) - 8, int(y) + 9), slice(int(x) - 8, int(x) + 9)
-            image[square] += WHITE_DN * light * np.outer(shares(y), shares(x))
-    return np.clip(np.rint(image[EDGE_PX:-EDGE_PX, EDGE_PX:-EDGE_PX]), 0, 4095).astype(np.uint16)
+    light = np.where(shown > 0.04045, ((shown + 0.055) / 1.055) ** 2.4, shown / 12.92) * WHITE_DN_PER_S * exposure_s
+    image = rng.normal(FLOOR_DN, NOISE_DN, (400, 400)) + profiles(239.5, 480) @ light @ profiles(319.5, 640).T
+    return np.clip(np.rint(image), 0, 4095).astype(np.uint16)
 
 
-if __name__ == "__main__":
-    screen = signal(Path(sys.argv[1]))
-    Image.fromarray(photographed(screen[::-1] if "--reversed" in sys.argv else screen)).save(sys.argv[2])
+def take(words: list[str]) -> None:
+    """One image, as the command line says."""
+    screen, flags = signal(Path(words[0])), words[2:]
+    seconds = float(flags[flags.index("--exposure") + 1]) if "--exposure" in flags else 0.1
+    Image.fromarray(photographed(screen[::-1] if "--reversed" in flags else screen, seconds)).save(words[1], compress_level=1)
+
+
+class _Request(socketserver.StreamRequestHandler):
+    def handle(self) -> None:
+        try:
+            take(self.rfile.readline().decode().rstrip("\n").split("\0"))
+        except Exception as error:
+            self.wfile.write(repr(error).encode())
+        else:
+            self.wfile.write(b"ok")
+
+
+@contextmanager
+def on_duty() -> Iterator[str]:
+    """A camera that need not be started for each image: the command that asks it, to be followed by SCREEN OUTPUT.png."""
+    with socketserver.TCPServer(("127.0.0.1", 0), _Request) as server:
+        thread = threading.Thread(target=server.serve_forever, args=(0.01,))
+        thread.start()
+        try:
+            yield f"{sys.executable} -S -E {Path(__file__).with_name('snapshot.py')} {server.server_address[1]}"
+        finally:
+            server.shutdown()
+            thread.join()

@@ -9,6 +9,7 @@ import numpy as np
 from hilstar.arrays import FloatArray
 from hilstar.calibrate.first_light.focus import Sharpness
 from hilstar.charts import chart
+from hilstar.monitor.response import Response
 
 SQUARE_NAMES = ("corner", "right", "below")
 MAX_ARROW_SHARE = 0.06  # of the image's width
@@ -33,6 +34,26 @@ def draw_focus(path: Path, found: Sharpness, finding: str) -> None:
         dots = axes.scatter(found.x_px, found.y_px, c=found.sigma_px, cmap="viridis", s=60)
         axes.figure.colorbar(dots, ax=axes, label="sigma of the dot [px]")
         axes.set(aspect="equal", xlabel="tracker x [px]", ylabel="tracker y [px]")
+        axes.invert_yaxis()
+
+
+def draw_light(path: Path, e_per_s: FloatArray, off_mag: FloatArray, noise_mag: FloatArray, finding: str) -> None:
+    """How much too faint stars were seen (n,), magnitudes, over the light that was asked for (n,), electrons per second."""
+    with chart(path, finding) as (axes,):
+        axes.errorbar(e_per_s, off_mag, noise_mag, fmt="o", markersize=4)
+        axes.axhline(float(np.median(off_mag)), color="0.5", linewidth=0.8)
+        axes.set_xscale("log")
+        axes.invert_yaxis()
+        axes.set(xlabel="light asked for [e-/s]", ylabel="seen - asked for [mag]")
+
+
+def draw_response_error(path: Path, response: Response, off_mag: FloatArray, finding: str) -> None:
+    """How much fainter the brightest codes are than assumed (n,), magnitudes, over their measured light."""
+    with chart(path, finding) as (axes,):
+        axes.plot(response.light[-len(off_mag) :], off_mag)
+        axes.axhline(0, color="0.5", linewidth=0.8)
+        axes.set_xscale("log")
+        axes.set(xlabel="measured light above black / white", ylabel="measured - in the bench file [mag]")
         axes.invert_yaxis()
 
 

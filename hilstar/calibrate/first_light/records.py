@@ -73,7 +73,10 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class SessionFile(msgspec.Struct, frozen=True, kw_only=True):
-    """session.json: the bench, where its patterns are seen, and the steps in their order."""
+    """session.json: the bench, where its patterns are seen, and the steps in their order.
+
+    `unfinished` has, by step, the state in which images were taken that a further attempt need not take again.
+    """
 
     kind: str
     hilstar: str
@@ -82,6 +85,7 @@ class SessionFile(msgspec.Struct, frozen=True, kw_only=True):
     seen_by: str
     running: str | None
     steps: list[Record]
+    unfinished: dict[str, str] = {}
 
     def step(self, name: str) -> Record | None:
         """The record of a step, None before it ran."""

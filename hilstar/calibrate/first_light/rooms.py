@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile
-from hilstar.bench.cameras import ideal_monitor, tracker_camera
+from hilstar.bench.cameras import bench_camera, ideal_monitor, tracker_camera
 from hilstar.calibrate.first_light.eyes import Eyes
 from hilstar.calibrate.first_light.patterns import Pattern, black
 from hilstar.calibrate.first_light.records import Figure
@@ -20,23 +21,29 @@ from hilstar.files import make_directory
 from hilstar.twin.bench_geometry import BenchGeometry
 
 MAX_FILL = 0.8  # of the tracker's range: brighter pixels are not trusted
+HOT_FILL = 0.5  # a pixel that is fuller in the dark is hot, and tells nothing
 LIGHT_STEP = 4.0  # by which the light is lowered while a pattern is too bright
 
 
 @dataclass(frozen=True, slots=True)
 class Looked:
-    """An image of the tracker: its file, and its light above the dark frame (h, w), DN; `raw_peak` is with that."""
+    """An image of the tracker: its file, and its light above the dark frame (h, w), DN.
+
+    `raw_peak` is with the dark frame, hot pixels left out, and `floor_dn` the median of that.
+    """
 
     path: Path
     image: FloatArray
     raw_peak: float
+    floor_dn: float
 
 
 @dataclass(frozen=True, slots=True)
 class Room:
     """Where a step works.
 
-    `folder` takes its images, and is new for each attempt; `session` its results. `known` are figures of the steps before.
+    `folder` takes its images, `session` its results. `kept` are the images of an attempt that was interrupted: they are not
+    taken again. `known` are figures of the steps before; `patches` is how many readings the response is worth.
     """
 
     file: BenchFile
@@ -44,6 +51,8 @@ class Room:
     folder: Path
     eyes: Eyes
     known: dict[str, Figure]
+    kept: Mapping[str, Path]
+    patches: int
 
     @property
     def resolution_px(self) -> tuple[int, int]:
@@ -64,14 +73,31 @@ class Room:
         """Monitor and tracker as the bench file has them, with an ideal collimator."""
         return BenchGeometry(ideal_monitor(self.file.config), tracker_camera(self.file.config.tracker, self.file.folder))
 
+    def real_geometry(self) -> BenchGeometry:
+        """The same with the lens that was measured."""
+        return BenchGeometry(bench_camera(self.file.config, self.file.folder), self.geometry().tracker)
+
     def with_file(self, file: BenchFile) -> Room:
         """The same with another bench file."""
         return replace(self, file=file)
 
-    def take(self, pattern: Pattern) -> Path:
-        """The tracker's image of a pattern."""
+    @property
+    def exposure_s(self) -> float:
+        """The tracker's, as the bench file has it."""
+        return self.file.config.tracker.exposure_s
+
+    def take(self, pattern: Pattern, exposure_s: float | None = None) -> Path:
+        """The tracker's image of a pattern, at the bench file's exposure or another."""
+        if pattern.name in self.kept:
+            return self.kept[pattern.name]
         make_directory(self.folder)
-        return self.eyes.look(self.file, pattern, self.folder / pattern.name)
+        stem = self.folder / pattern.name
+        return self.eyes.look(self.file, pattern, stem, self.exposure_s if exposure_s is None else exposure_s)
+
+    def unlit(self) -> Path | None:
+        """The tracker's image with the monitor switched off, None where there is none."""
+        name = "unlit_000"
+        return self.kept[name] if name in self.kept else self.eyes.unlit(make_directory(self.folder) / name)
 
     def dark(self) -> Path:
         """The tracker's image of a black screen."""
@@ -81,7 +107,8 @@ class Room:
         """The tracker's image of a pattern, above its dark frame. Raises InputError for one that cannot be read."""
         path = self.take(pattern)
         raw = self.read(path)
-        return Looked(path, raw - dark, float(raw.max()))
+        cold = dark < HOT_FILL * self.full_dn
+        return Looked(path, raw - dark, float(raw[cold].max(initial=0.0)), float(np.median(dark)))
 
     def read(self, path: Path) -> FloatArray:
         """An image of the tracker (h, w), DN."""

@@ -21,7 +21,7 @@ import msgspec
 from hilstar import __version__
 from hilstar.bench.bench_file import BenchFile
 from hilstar.calibrate.first_light.display import Stopped
-from hilstar.calibrate.first_light.eyes import Eyes
+from hilstar.calibrate.first_light.eyes import Eyes, NoImage, complete_images
 from hilstar.calibrate.first_light.records import (
     KIND,
     Figure,
@@ -34,8 +34,8 @@ from hilstar.calibrate.first_light.records import (
 )
 from hilstar.calibrate.first_light.rewrite import rewrite
 from hilstar.calibrate.first_light.rooms import Room
-from hilstar.calibrate.first_light.steps import look, measure
-from hilstar.errors import HilstarError, InputError, one_line
+from hilstar.calibrate.first_light.steps import light, look, measure, verify
+from hilstar.errors import HilstarError, InputError, MachineError, one_line
 
 BEFORE_FILE = "bench-before.toml"
 LOCK_FILE = ".lock"
@@ -77,14 +77,30 @@ STEPS = (
         needs=("orientation",),
         writes=("collimator.geometry",),
     ),
-    Step("photometry", "", "", measure.photometry, tables=()),
-    Step("scale", "", "", measure.scale, tables=()),
+    Step(
+        "photometry",
+        "dots on lattices, in one code after the other",
+        "an image of each",
+        light.photometry,
+        needs=("geometry",),
+        tables=("monitor", "tracker"),
+        writes=("monitor.calibration",),
+    ),
+    Step(
+        "scale",
+        "fields of stars",
+        "an image of each",
+        light.scale,
+        needs=("geometry",),
+        tables=("monitor", "collimator", "tracker", "sky", "render"),
+        writes=("render.flux_at_white_e_per_s", "render.brightest_v_mag"),
+    ),
     Step("latency", "", "", measure.latency, tables=()),
     Step(
         "verify",
-        "a field of stars",
-        "one image, and a twin that passes",
-        measure.verify,
+        "fields of stars",
+        "an image of each, and a twin that passes",
+        verify.verify,
         needs=("geometry",),
         tables=("monitor", "collimator", "tracker", "sky", "render", "background", "verify"),
     ),
@@ -93,16 +109,19 @@ NAMES = tuple(step.name for step in STEPS)
 
 
 class Session:
-    """A session in a directory. Raises InputError for a directory that is another bench's."""
+    """A session in a directory, with so many readings (`patches`) for the response.
 
-    def __init__(self, folder: Path, file: BenchFile, eyes: Eyes) -> None:
-        self.folder, self.file, self.eyes = folder, file, eyes
+    Raises InputError for a directory that is another bench's.
+    """
+
+    def __init__(self, folder: Path, file: BenchFile, eyes: Eyes, patches: int) -> None:
+        self.folder, self.file, self.eyes, self.patches = folder, file, eyes, patches
         bench = str(file.path.resolve())
         found = read_session(folder)
         if found is not None and found.bench != bench:
             raise InputError(f"{folder}: is the session of {found.bench}; write another directory for {file.path}")
         self.records = {} if found is None else {record.name: record for record in found.steps if record.name in NAMES}
-        self.resumed = found is not None
+        self.unfinished = {} if found is None else dict(found.unfinished)
 
     def run(self, again: frozenset[str], say: Callable[[str], None]) -> int:
         """Run what is not done; the exit code: 0, 1 where a step failed, or that of the machine's lack.
@@ -116,8 +135,7 @@ class Session:
             if step.name not in again and self._is_done(number):
                 say(f"{step.name:12} {self.records[step.name].verdict} before: {self.records[step.name].line}")
                 continue
-            self._write(step.name)
-            record = self._run(number, say)
+            record = self._run(number, step.name in again, say)
             self.records[step.name] = record
             self._write(None)
             say(f"{step.name:12} {record.verdict}: {record.line}")
@@ -127,7 +145,7 @@ class Session:
         """Whether a step need not run: done, or skipped for good, and nothing that it depends on has changed since."""
         step = STEPS[number]
         record = self.records.get(step.name)
-        if record is None or record.verdict == "failed" or self._unmet(step) is not None:
+        if record is None or record.verdict == "failed" or step.name in self.unfinished or self._unmet(step) is not None:
             return False
         if record.verdict == "skipped" and step.needs:
             return False  # for want of a step that has been done by now
@@ -143,7 +161,7 @@ class Session:
                 return name
         return None
 
-    def _run(self, number: int, say: Callable[[str], None]) -> Record:
+    def _run(self, number: int, afresh: bool, say: Callable[[str], None]) -> Record:
         step, start_s, exit_code = STEPS[number], time.monotonic(), 0
         unmet = self._unmet(step)
         if unmet is not None:
@@ -151,7 +169,10 @@ class Session:
         else:
             if step.shows or step.wants:
                 say(f"{step.name:12} shows {step.shows or 'nothing'}; wants {step.wants}")
-            outcome, exit_code = self._tried(step)
+            room = self._room(step, self._begun(number) and not afresh)
+            self.unfinished[step.name] = self._attempt(number)
+            self._write(step.name)
+            outcome, exit_code = self._tried(step, room)
         return Record(
             name=step.name,
             verdict=outcome.verdict,
@@ -166,35 +187,47 @@ class Session:
             seconds=round(time.monotonic() - start_s, 3),
         )
 
-    def _tried(self, step: Step) -> tuple[Outcome, int]:
+    def _tried(self, step: Step, room: Room) -> tuple[Outcome, int]:
         """What a step came to, with the bench file written; a refusal is a failed step."""
         try:
-            outcome = step.run(self._room(step))
+            outcome = step.run(room)
             self.file = rewrite(self.file, outcome.changes)
         except Stopped:
             raise
         except HilstarError as error:
             # A refusal of this step's data is no wrong command: the session goes on, and ends with 1.
             code = 1 if isinstance(error, InputError) else error.exit_code
+            if not isinstance(error, NoImage | MachineError):
+                del self.unfinished[step.name]
             return Outcome("failed", one_line(str(error))), code
+        del self.unfinished[step.name]
         return outcome, 1 if outcome.verdict == "failed" else 0
 
-    def _room(self, step: Step) -> Room:
+    def _begun(self, number: int) -> bool:
+        """Whether images of an attempt that was interrupted can be used: nothing that they depend on has changed since."""
+        return self.unfinished.get(STEPS[number].name) == self._attempt(number)
+
+    def _attempt(self, number: int) -> str:
+        # What is shown depends on where the screen stands, whatever a step's result does.
+        return f"{self._state(number, (*STEPS[number].tables, 'collimator'))} {self.patches}"
+
+    def _room(self, step: Step, goes_on: bool) -> Room:
         attempts = self.folder / "images"
-        number = 1 + sum(1 for path in attempts.glob(f"{step.name}-*") if path.is_dir())
+        number = sum(1 for path in attempts.glob(f"{step.name}-*") if path.is_dir())
+        folder = attempts / f"{step.name}-{number if goes_on and number else number + 1}"
         known: dict[str, Figure] = {
             f"{name}.{key}": value for name, record in self.records.items() for key, value in record.figures.items()
         }
-        return Room(self.file, self.folder, attempts / f"{step.name}-{number}", self.eyes, known)
+        return Room(self.file, self.folder, folder, self.eyes, known, complete_images(folder), self.patches)
 
-    def _state(self, number: int) -> str:
+    def _state(self, number: int, tables: tuple[str, ...] = ()) -> str:
         """The SHA-256 of what a step depends on: its tables but for what later steps write, the files they name, the eyes."""
         step = STEPS[number]
         later = {key for other in STEPS[number + 1 :] for key in other.writes}
         config = msgspec.to_builtins(self.file.config)
         kept = {
             table: {key: value for key, value in config[table].items() if f"{table}.{key}" not in later}
-            for table in step.tables
+            for table in tables or step.tables
         }
         named = {text: sha256_of(self.file.folder / text) for text in _texts(kept) if _is_file(self.file.folder / text)}
         seen_by = self.eyes.identity if step.tables else platform.python_version()
@@ -213,12 +246,15 @@ class Session:
             seen_by=self.eyes.identity,
             running=running,
             steps=[self.records[name] for name in NAMES if name in self.records],
+            unfinished=self.unfinished,
         )
 
 
 def _finite(value: Figure) -> Figure:
     """The figure, in words where it is none that JSON holds."""
-    return "not known" if isinstance(value, float) and not math.isfinite(value) else value
+    if not isinstance(value, float):
+        return value
+    return float(value) if math.isfinite(value) else "not known"  # NumPy's floats are floats, but not to JSON
 
 
 def _texts(value: Any) -> Iterator[str]:

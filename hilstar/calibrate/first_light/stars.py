@@ -1,63 +1,111 @@
-"""Stars on the screen against the sky: a field is shown, and each star's place in the tracker's image compared."""
+"""Stars on the screen against the sky: fields are shown, and each star's place and light in the tracker's image compared."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from hilstar.arrays import FloatArray
+from hilstar.arrays import FloatArray, IntArray
 from hilstar.bench.build import open_bench
 from hilstar.bench.cameras import tracker_camera
 from hilstar.bench.frame import Bench, Frame
 from hilstar.calibrate.first_light.patterns import Pattern
-from hilstar.calibrate.first_light.rooms import Looked, Room
+from hilstar.calibrate.first_light.rooms import MAX_FILL, Looked, Room
 from hilstar.errors import InputError
 from hilstar.rotation import to_matrix
-from hilstar.tracker.centroids import CentroidSettings, find_stars
-from hilstar.units import MAD_TO_SIGMA
+from hilstar.tracker.centroids import Centroids, CentroidSettings, find_stars
+from hilstar.units import MAD_TO_SIGMA, MAG_PER_RELATIVE
 
-ATTITUDES, SEED = 12, 3  # random ones, of which the field with the most stars is shown
+ATTITUDES, SEED = 40, 3  # random ones, of which the fields with the most stars are shown
+FIELDS = 3
 MIN_STARS = 5
 REACH_PX = 3.0  # of the tracker, as `verify` looks for a star
 ALONE_PX = 10.0
 EDGE_PX = 12.0
 THRESHOLD_SIGMA = 8.0
 BRIGHT_SIGMAS = 60.0  # a star's peak over the noise of a pixel: its own noise is then under 0.02 px
-WINDOW_SIGMA_PX = 1.0
+WINDOW_SIGMA_PX, RADIUS_PX = 1.0, 4
+WINDOW_PX = (2 * RADIUS_PX + 1) ** 2
+SURE_MAG = 0.01  # the noise of a star whose light is judged
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """Stars that are drawn whole and stand alone: HIP numbers (n,), places (n, 2), tracker px, and light (n,), e-/s."""
+
+    hip: IntArray
+    place_px: FloatArray
+    e_per_s: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
 class StarsSeen:
-    """Bright stars that stand alone: where the sky has them (n, 2), tracker px, and how far off they were seen (n, 2)."""
+    """Bright stars that stand alone: where the sky has them (n, 2), tracker px, and how far off they were seen (n, 2).
 
+    `dn` is the light of each (n,), `e_per_s` what was asked for, `noise_mag` its error; infinite where the tracker saturated.
+    """
+
+    hip: IntArray
     place_px: FloatArray
     residual_px: FloatArray
+    dn: FloatArray
+    e_per_s: FloatArray
+    noise_mag: FloatArray
     lost: int
-    looked: Looked
+    images: tuple[Path, ...]
+
+    @property
+    def sure(self) -> npt.NDArray[np.bool_]:
+        """The stars whose light is known well enough to be judged (n,)."""
+        return self.noise_mag < SURE_MAG
 
 
 def see_stars(room: Room) -> StarsSeen:
-    """Show the bench's own field of stars and measure it. Raises InputError where too few stars can be compared."""
+    """Show the bench's own fields of stars and measure them. Raises InputError where too few stars can be compared."""
     with open_bench(room.file) as bench:
-        if bench.calibration.response.rgb is not None:
-            raise InputError("a frame with [render] bit_stealing cannot be shown here; leave it out, or verify with `serve`")
-        frame = _fullest(bench)
-        place, rate = _alone(bench, room, frame)
-    looked = room.look(Pattern("stars_000", frame.codes.astype(np.uint16)), room.read(room.dark()))
-    return _compared(room, looked, place, rate)
+        shown = [(frame.codes.astype(np.uint16), _alone(bench, room, frame)) for frame in _fullest(bench)]
+    dark_path = room.dark()
+    dark = room.read(dark_path)
+    fields = [
+        _compared(room, room.look(Pattern(f"stars_{number:03}", codes), dark), wanted)
+        for number, (codes, wanted) in enumerate(shown)
+    ]
+    seen = _together(fields, dark_path)
+    if len(seen.hip) < MIN_STARS:
+        raise InputError(
+            f"{len(seen.hip)} bright stars are where the sky has them and {MIN_STARS} are needed; {seen.lost} bright ones are"
+            " not there: expose longer, set a fainter [render] brightest_v_mag, or run the geometry again"
+        )
+    return seen
 
 
-def _fullest(bench: Bench) -> Frame:
-    """Of a few random attitudes that with the most stars on the screen."""
+def _together(fields: list[StarsSeen], dark: Path) -> StarsSeen:
+    return StarsSeen(
+        hip=np.concatenate([each.hip for each in fields]),
+        place_px=np.concatenate([each.place_px for each in fields]),
+        residual_px=np.concatenate([each.residual_px for each in fields]),
+        dn=np.concatenate([each.dn for each in fields]),
+        e_per_s=np.concatenate([each.e_per_s for each in fields]),
+        noise_mag=np.concatenate([each.noise_mag for each in fields]),
+        lost=sum(each.lost for each in fields),
+        images=(dark, *(path for each in fields for path in each.images)),
+    )
+
+
+def _fullest(bench: Bench) -> list[Frame]:
+    """Of some random attitudes those with the most stars on the screen."""
     rng = np.random.default_rng(SEED)
     attitudes = [q / np.linalg.norm(q) for q in rng.normal(size=(ATTITUDES, 4))]
-    return bench.frame(max(attitudes, key=lambda q: len(bench.sprites(q))))
+    fullest = sorted(attitudes, key=lambda q: -len(bench.sprites(q)))[:FIELDS]
+    return [bench.frame(q) for q in fullest]
 
 
-def _alone(bench: Bench, room: Room, frame: Frame) -> tuple[FloatArray, FloatArray]:
-    """Where the tracker should see the stars of a frame that are drawn whole and stand alone (n, 2), and their light (n,)."""
+def _alone(bench: Bench, room: Room, frame: Frame) -> Wanted:
+    """The stars of a frame that are drawn whole and stand alone, where the tracker should see them."""
     camera = tracker_camera(room.file.config.tracker, room.file.folder)
     truth, stars = frame.truth, bench.stars
     order = np.argsort(stars.hip)
@@ -72,32 +120,44 @@ def _alone(bench: Bench, room: Room, frame: Frame) -> tuple[FloatArray, FloatArr
     finite = np.where(np.isfinite(place), place, -1e6)
     near = cKDTree(finite).query_ball_point(finite, ALONE_PX, return_length=True)
     kept &= near == 1
-    return place[kept], truth["electrons_per_s"][kept]
+    return Wanted(truth["hip"][kept].astype(np.intp), place[kept], truth["electrons_per_s"][kept])
 
 
-def _compared(room: Room, looked: Looked, place: FloatArray, rate: FloatArray) -> StarsSeen:
+def _compared(room: Room, looked: Looked, wanted: Wanted) -> StarsSeen:
+    found, noise_dn = _found(room, looked.image)
+    seen = np.stack([found.x_px, found.y_px], axis=1)
+    far, nearest = np.full(len(wanted.hip), np.inf), np.zeros(len(wanted.hip), dtype=np.intp)
+    if len(seen) and len(far):
+        far, nearest = (np.asarray(part) for part in cKDTree(seen).query(wanted.place_px))
+    near = far < REACH_PX
+    matched = near.copy()
+    matched[near] = found.peak[nearest[near]] > BRIGHT_SIGMAS * noise_dn
+    # A star as bright as those that were found bright has to be there.
+    faintest = np.median(wanted.e_per_s[matched]) if matched.any() else 0.0
+    chosen = nearest[matched]
+    dn, gain = found.flux[chosen], room.file.config.tracker.detector.gain_e_per_dn
+    noise = np.sqrt(np.maximum(dn, 0.0) / gain + WINDOW_PX * noise_dn**2) / np.maximum(dn, 1e-9)
+    saturated = found.peak[chosen] > MAX_FILL * room.full_dn - looked.floor_dn
+    return StarsSeen(
+        hip=wanted.hip[matched],
+        place_px=wanted.place_px[matched],
+        residual_px=seen[chosen] - wanted.place_px[matched],
+        dn=dn,
+        e_per_s=wanted.e_per_s[matched],
+        noise_mag=np.where(saturated, np.inf, MAG_PER_RELATIVE * noise),
+        lost=int((~near & (wanted.e_per_s >= faintest)).sum()),
+        images=(looked.path,),
+    )
+
+
+def _found(room: Room, image: FloatArray) -> tuple[Centroids, float]:
+    """The stars of an image (h, w), and the noise of its pixels, DN."""
     geometry = room.geometry()
     ratio = geometry.tracker.focal_length_px / geometry.monitor.focal_length_px
     sprite = room.file.config.render.sprite_sigma_px
     psf = tuple(float(np.hypot(a, ratio * b)) for a, b in zip(room.file.config.tracker.psf_sigma_px, sprite, strict=True))
-    settings = CentroidSettings(THRESHOLD_SIGMA, 2, window_sigma_px=WINDOW_SIGMA_PX, psf_sigma_px=(psf[0], psf[1]))
-    found = find_stars(looked.image, settings)
-    noise = float(MAD_TO_SIGMA * np.median(np.abs(looked.image - np.median(looked.image)))) or 1.0
-    bright = found.peak > BRIGHT_SIGMAS * noise
-    if not len(found) or bright.sum() < MIN_STARS or not len(place):
-        raise InputError(
-            f"{int(bright.sum())} bright stars are in the image and {MIN_STARS} are needed; expose longer, or set a fainter"
-            " [render] brightest_v_mag"
-        )
-    seen = np.stack([found.x_px, found.y_px], axis=1)
-    far, nearest = (np.asarray(part) for part in cKDTree(seen).query(place))
-    matched = (far < REACH_PX) & bright[nearest]
-    # A star as bright as those that were found bright has to be there.
-    faintest = np.median(rate[matched]) if matched.any() else 0.0
-    lost = int(((far >= REACH_PX) & (rate >= faintest)).sum())
-    if matched.sum() < MIN_STARS:
-        raise InputError(
-            f"{int(matched.sum())} stars are where the sky has them and {MIN_STARS} are needed; {lost} bright ones are not:"
-            " run the geometry again"
-        )
-    return StarsSeen(place[matched], seen[nearest[matched]] - place[matched], lost, looked)
+    settings = CentroidSettings(
+        THRESHOLD_SIGMA, 2, window_sigma_px=WINDOW_SIGMA_PX, window_radius_px=RADIUS_PX, psf_sigma_px=(psf[0], psf[1])
+    )
+    noise_dn = float(MAD_TO_SIGMA * np.median(np.abs(image - np.median(image)))) or 1.0
+    return find_stars(image, settings), noise_dn

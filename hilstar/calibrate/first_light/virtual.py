@@ -22,6 +22,8 @@ from hilstar.twin.bench_geometry import BenchGeometry
 from hilstar.twin.optics import TwinOptics
 from hilstar.twin.simulator import background_e
 
+MASKS_KEPT = 8  # of patterns: as many as one step repeats in other codes
+
 
 class VirtualBench:
     """A bench that is as a bench file tells: its lens, its mounting, its light, its tracker's focus and noise.
@@ -30,7 +32,7 @@ class VirtualBench:
     """
 
     def __init__(self, bench: BenchFile, truth: BenchFile, seed: int) -> None:
-        self.truth, self._seed = truth, seed
+        self.truth, self._seed, self.sets_exposure = truth, seed, True
         self.identity = f"virtual: sha256 {truth.sha256}, seed {seed}"
         _refuse_other_bench(bench, truth)
         config = truth.config
@@ -40,23 +42,29 @@ class VirtualBench:
         self.geometry = BenchGeometry(camera, tracker_camera(tracker, truth.folder))
         self._optics = TwinOptics(self.geometry, tracker.psf_sigma_px)
         self._detector = Detector(tracker.detector, tracker.resolution_px, tracker.pixel_pitch_um)
-        under = self._optics.glow_e_per_s(self._panel) * tracker.exposure_s + background_e(config, truth.folder)
-        self._under_e: FloatArray = under
-        self._unit: tuple[bytes, FloatArray] = (b"", under)
+        self._glow_e_per_s: FloatArray = self._optics.glow_e_per_s(self._panel)
+        self._sky_e_per_s: FloatArray = background_e(config, truth.folder) / tracker.exposure_s
+        self._units: dict[bytes, FloatArray] = {}
 
     def gate(self, file: BenchFile) -> Timing | None:
         """None: there is no display."""
         return None
 
-    def look(self, file: BenchFile, pattern: Pattern, stem: Path) -> Path:
+    def look(self, file: BenchFile, pattern: Pattern, stem: Path, exposure_s: float) -> Path:
         """The tracker's image of a pattern: a PNG of 16 bits."""
-        from PIL import Image
-
         codes = off_screen(
             on_screen(pattern.codes, orientation_of(file.config.monitor)), orientation_of(self.truth.config.monitor)
         )
-        exposure_s = self.truth.config.tracker.exposure_s
-        mean_e = self._image_e_per_s(np.ascontiguousarray(codes)) * exposure_s + self._under_e
+        return self._exposed(self._image_e_per_s(np.ascontiguousarray(codes)) + self._glow_e_per_s, exposure_s, stem)
+
+    def unlit(self, stem: Path) -> Path | None:
+        """The tracker's image of a monitor that is switched off."""
+        return self._exposed(np.zeros_like(self._glow_e_per_s), self.truth.config.tracker.exposure_s, stem)
+
+    def _exposed(self, light_e_per_s: FloatArray, exposure_s: float, stem: Path) -> Path:
+        from PIL import Image
+
+        mean_e = (light_e_per_s + self._sky_e_per_s) * exposure_s
         rng = np.random.default_rng((self._seed, zlib.crc32(str(Path(stem.parent.name) / stem.name).encode())))
         image = Image.fromarray(self._detector.expose(mean_e, exposure_s, rng))
         path = stem.with_name(stem.name + ".png")
@@ -68,15 +76,17 @@ class VirtualBench:
         lit = codes > 0
         code = int(codes.max())
         if not code:
-            return np.zeros_like(self._under_e)
+            return np.zeros_like(self._glow_e_per_s)
         if not (codes[lit] == code).all():
             return self._optics.image_e_per_s(shown_light(codes, self._panel))
         key = np.packbits(lit).tobytes()
         light = self._panel.response.light
-        if self._unit[0] != key:
+        if key not in self._units:
+            if len(self._units) == MASKS_KEPT:
+                del self._units[next(iter(self._units))]
             white = shown_light(np.where(lit, len(light) - 1, 0).astype(np.uint16), self._panel)
-            self._unit = (key, self._optics.image_e_per_s(white))
-        return self._unit[1] * float(light[code])
+            self._units[key] = self._optics.image_e_per_s(white)
+        return self._units[key] * float(light[code])
 
     def close(self) -> None:
         """Free the GL context."""

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from hilstar.bench import bench_file as files
     from hilstar.calibrate.first_light.eyes import Eyes
 
+PATCHES = 96
+
 
 def first_light(
     bench_file: BenchFile,
@@ -35,6 +37,16 @@ def first_light(
         Path | None,
         typer.Option(metavar="TRUTH.toml", help="Without hardware: a bench file that says how the bench really is."),
     ] = None,
+    dark: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="The tracker's image with the monitor switched off, for the monitor's black level."),
+    ] = None,
+    patches: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N", help="At most so many readings of the monitor's response, 0 for none. [96; by hand 0]", min=0
+        ),
+    ] = None,
     again: Annotated[list[str] | None, typer.Option(metavar="STEP", help="Do this step again; may be given often.")] = None,
     seed: Annotated[int, typer.Option(help="With --virtual: seed of the tracker's noise.", min=0, max=MAX_SEED)] = 0,
     as_json: Json = False,
@@ -46,6 +58,7 @@ def first_light(
     from hilstar.bench.bench_file import read_bench_file
     from hilstar.calibrate.first_light.page import write_page
     from hilstar.calibrate.first_light.session import BEFORE_FILE, NAMES, Session, alone_in
+    from hilstar.calibrate.geometric.images import read_image
     from hilstar.files import make_directory
 
     wrong = [name for name in again or [] if name not in NAMES]
@@ -55,11 +68,15 @@ def first_light(
         raise InputError("--grab and --virtual: the images come from one of them; leave the other out")
     check_directory("-o", output)
     file = read_bench_file(bench_file)
-    check_files([virtual], [], file)
-    eyes = _eyes(file, grab, virtual, seed)
+    check_files([virtual, dark], [], file)
+    if dark is not None:
+        read_image(dark, file.config.tracker.resolution_px)
+    eyes = _eyes(file, grab, virtual, seed, dark)
+    by_hand = grab is None and virtual is None
+    readings = (0 if by_hand else PATCHES) if patches is None else patches
     try:
         with alone_in(make_directory(output)):
-            session = Session(output, file, eyes)
+            session = Session(output, file, eyes, readings)
             code = session.run(frozenset(again or []), say)
             page = write_page(output, session.as_file(), output / BEFORE_FILE)
     finally:
@@ -74,7 +91,7 @@ def first_light(
         raise typer.Exit(code)
 
 
-def _eyes(file: files.BenchFile, grab: str | None, virtual: Path | None, seed: int) -> Eyes:
+def _eyes(file: files.BenchFile, grab: str | None, virtual: Path | None, seed: int, dark: Path | None) -> Eyes:
     """Where the images come from."""
     from hilstar.bench.bench_file import read_bench_file
     from hilstar.calibrate.first_light.eyes import Grabber, Hands
@@ -82,4 +99,4 @@ def _eyes(file: files.BenchFile, grab: str | None, virtual: Path | None, seed: i
 
     if virtual is not None:
         return VirtualBench(file, read_bench_file(virtual), seed)
-    return Hands() if grab is None else Grabber(grab)
+    return Hands(dark) if grab is None else Grabber(grab, dark)

@@ -16,7 +16,11 @@ import pytest
 
 from hilstar.bench.bench_file import read_bench_file
 from hilstar.bench.cameras import bench_camera
+from hilstar.calibrate.first_light.steps.light import response_error_mag
+from hilstar.monitor.calibration import load_calibration
+from hilstar.monitor.calibration_file import Head, NotesTable, write_calibration
 from hilstar.monitor.geometry_file import ErrorTable, MadeTable, Notes, write_geometry
+from hilstar.monitor.response import gamma_response, srgb_response
 from hilstar.rotation import from_rotation_vector, to_matrix
 from hilstar.scene.camera import Camera
 from hilstar.scene.lens import Lens
@@ -25,8 +29,15 @@ from tests.support import plain_camera
 from tests.support.benches import TWIN, bench_text
 from tests.support.commands import HILSTAR, assert_refused, run_hilstar_here
 
+GAMMA_22 = {"monitor": {"calibration": "gamma2.2"}}
 NOTES = Notes({}, ErrorTable(), MadeTable(by="planted", when="2026-11-21", poses=1))
 STEPS = ["machine", "display", "orientation", "focus", "geometry", "photometry", "scale", "latency", "verify"]
+FEW = ["--patches", 30]  # 12 levels
+NONE = ["--patches", 0]
+GAMMA, BLACK, WHITE_E_PER_S = 2.35, 1 / 800, 2.5e6
+# `calibrate photometric` states the error of 12 levels at 3 decades below white as 0.4 %; the tracker's whole DN add as much.
+RESPONSE_MAG = 0.01
+SCALE_MAG = 0.005  # 20 stars or more, each within 0.01 mag
 # The tracker's pixel is 107 arcsec. Held-out dots of this bench are 0.2 arcsec rms off; outside the tracker's field, which is
 # a third of the screen, nothing is measured and the lens is extrapolated.
 PLACES_ARCSEC = 3.0
@@ -34,9 +45,16 @@ SEEN_SHARE = 0.6  # of the screen's width and height, about its middle: what the
 
 
 def plant(folder, **monitor):
-    """A bench file, and a truth of which it knows nothing: mirror, lens, tilt, centre, focal length."""
-    (folder / "bench.toml").write_text(bench_text(TWIN))
-    changed = {"monitor": monitor, "collimator": {"geometry": "true.toml"}}
+    """A bench file, and a truth of which it knows nothing: mirror, lens, tilt, centre, focal length, response, full scale."""
+    (folder / "bench.toml").write_text(bench_text(TWIN, GAMMA_22))
+    head = Head("photometric", "planted", "2026-11-22", "none", "relative", 10, "true-response.csv")
+    light = {"w": BLACK + gamma_response(10, GAMMA).light}
+    write_calibration(folder / "true-response.toml", head, light, 0.0, NotesTable())
+    changed = {
+        "monitor": {"calibration": "true-response.toml"} | monitor,
+        "collimator": {"geometry": "true.toml"},
+        "render": {"flux_at_white_e_per_s": WHITE_E_PER_S},
+    }
     (folder / "truth.toml").write_text(bench_text(TWIN, changed))
     q = from_rotation_vector(np.radians([0.2, -0.15, 0.5]))
     size = tuple(read_bench_file(folder / "bench.toml").config.monitor.resolution_px)
@@ -68,16 +86,50 @@ def virtually(folder, *more):
     return go(folder, "--virtual", folder / "truth.toml", "--json", *more)
 
 
+def steps_of(result):
+    return {step["name"]: step for step in json.loads(result.stdout)["steps"]}
+
+
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     folder = plant(tmp_path_factory.mktemp("light"), flip_x=True)
-    result = virtually(folder)
+    before = virtually(folder, *NONE)
+    assert before.returncode == 1, before.stderr
+    result = virtually(folder, *FEW)
     assert result.returncode == 0, result.stderr
-    return folder, json.loads(result.stdout)
+    return folder, json.loads(result.stdout), steps_of(before)
+
+
+def test_a_wrong_response_fails_the_light_and_not_the_places(whole):
+    _, _, before = whole
+    assert {before[name]["verdict"] for name in ("geometry", "photometry", "scale", "verify")} == {"done", "skipped", "failed"}
+    assert (before["scale"]["verdict"], before["verify"]["verdict"]) == ("failed", "failed")
+    assert "photometry" in before["scale"]["line"]
+    figures = before["verify"]["figures"]
+    assert figures["star_p95_px"] < 0.1  # [verify] centroid_px
+    assert figures["flux_p95_mag"] > 0.05  # [verify] flux_mag
+    assert figures["twin_flux_p95_mag"] > 0.05
+    assert figures["twin_centroid_p95_px"] < 0.1
+
+
+def test_the_response_and_the_full_scale_are_found_and_mended(whole):
+    folder, found, _ = whole
+    steps = {step["name"]: step for step in found["steps"]}
+    light = steps["photometry"]["figures"]
+    assert light["gamma"] == pytest.approx(GAMMA, abs=0.005)
+    assert light["black_level"] == pytest.approx(BLACK, rel=0.02)
+    assert light["bench_file_off_max_mag"] > 0.3
+    assert light["truth_max_mag"] < RESPONSE_MAG
+    assert steps["scale"]["figures"]["flux_at_white_e_per_s"] == pytest.approx(WHITE_E_PER_S, rel=SCALE_MAG)
+    figures = steps["verify"]["figures"]
+    assert max(figures["flux_p95_mag"], figures["twin_flux_p95_mag"]) < 0.05
+    config = read_bench_file(folder / "bench.toml").config
+    assert config.monitor.calibration == "s/response.toml"
+    assert config.render.flux_at_white_e_per_s == pytest.approx(WHITE_E_PER_S, rel=SCALE_MAG)
 
 
 def test_a_whole_virtual_session_finds_mirror_and_lens(whole):
-    folder, found = whole
+    folder, found, _ = whole
     steps = {step["name"]: step for step in found["steps"]}
     assert list(steps) == STEPS
     assert {name for name, step in steps.items() if step["verdict"] == "done"} == {
@@ -85,6 +137,8 @@ def test_a_whole_virtual_session_finds_mirror_and_lens(whole):
         "orientation",
         "focus",
         "geometry",
+        "photometry",
+        "scale",
         "verify",
     }
     assert steps["orientation"]["figures"]["seen"] == "mirrored left to right"
@@ -92,14 +146,14 @@ def test_a_whole_virtual_session_finds_mirror_and_lens(whole):
     assert (config.monitor.flip_x, config.collimator.geometry) == (True, "s/geometry.toml")
     assert places_off_arcsec(folder) < PLACES_ARCSEC
     assert steps["verify"]["figures"]["truth_rms_arcsec"] < 2 * PLACES_ARCSEC
-    assert (folder / "s" / "bench-before.toml").read_text() == bench_text(TWIN)
+    assert (folder / "s" / "bench-before.toml").read_text() == bench_text(TWIN, GAMMA_22)
 
 
 def test_the_page_needs_nothing_beside_it(whole):
-    folder, found = whole
+    folder, found, _ = whole
     page = (folder / "s" / "first-light.html").read_text()
     assert not re.search(r"(src|href)=['\"](?!data:|#)", page)
-    assert page.count("data:image/png;base64,") == 4
+    assert page.count("data:image/png;base64,") == 8
     for step in found["steps"]:
         assert f'id="{step["name"]}"' in page
     assert found["bench_sha256"] in page
@@ -107,53 +161,80 @@ def test_the_page_needs_nothing_beside_it(whole):
 
 
 def test_what_is_done_is_not_done_again(whole):
-    folder, _ = whole
+    folder, _, _ = whole
     images = sorted((folder / "s" / "images").iterdir())
-    again = virtually(folder)
+    again = virtually(folder, *FEW)
     assert again.returncode == 0
     assert sorted((folder / "s" / "images").iterdir()) == images
-    assert virtually(folder, "--again", "focus").returncode == 0
+    assert virtually(folder, *FEW, "--again", "focus").returncode == 0
     assert [path.name for path in sorted((folder / "s" / "images").iterdir()) if path not in images] == ["focus-2"]
+
+
+def started(folder, *more):
+    words = ["first-light", folder / "bench.toml", "-o", folder / "s", "--virtual", folder / "truth.toml", *more]
+    return subprocess.Popen([*HILSTAR, *map(str, words)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def ended_at(process, folder, image, ending):
+    """Let a session run until an image is there, end it so, and give back the images of that step and when they were taken."""
+    end_s = time.monotonic() + 100
+    while not list((folder / "s").glob(f"images/{image}*")):
+        assert time.monotonic() < end_s
+        assert process.poll() is None
+        time.sleep(0.01)
+    process.send_signal(ending)
+    process.wait(60)
+    return {path: path.stat().st_mtime_ns for path in sorted((folder / "s").glob(f"images/{image.split('/')[0]}/*.png"))}
+
+
+def untouched(taken):
+    """How many of the images are as they were; the last one may have been cut short, and is taken again."""
+    return sum(path.stat().st_mtime_ns == when for path, when in taken.items())
 
 
 def test_a_session_killed_half_way_goes_on_where_it_was(tmp_path):
     folder = plant(tmp_path, rotate_deg=90)
-    words = ["first-light", folder / "bench.toml", "-o", folder / "s", "--virtual", folder / "truth.toml"]
-    with subprocess.Popen([*HILSTAR, *map(str, words)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
-        end_s = time.monotonic() + 100
-        while not list((folder / "s").glob("images/geometry-1/frame_005*")):
-            assert time.monotonic() < end_s
-            assert process.poll() is None
-            time.sleep(0.01)
-        process.send_signal(signal.SIGKILL)
+    with started(folder, *FEW) as process:
+        taken = ended_at(process, folder, "geometry-1/frame_005", signal.SIGKILL)
     session = json.loads((folder / "s" / "session.json").read_text())
     assert session["running"] == "geometry"
     assert [step["name"] for step in session["steps"]] == STEPS[:4]
-    resumed = virtually(folder)
+    with started(folder, *FEW) as process:
+        readings = ended_at(process, folder, "photometry-1/patch_010", signal.SIGKILL)
+    assert untouched(taken) == len(taken) - 1 > 4
+    resumed = virtually(folder, *FEW)
     assert resumed.returncode == 0, resumed.stderr
-    assert sorted(path.name for path in (folder / "s" / "images").iterdir()) == [
-        "focus-1",
-        "geometry-1",
-        "geometry-2",
-        "orientation-1",
-        "verify-1",
-    ]
+    assert untouched(readings) == len(readings) - 1 > 10
+    names = [f"{name}-1" for name in ("focus", "geometry", "orientation", "photometry", "scale", "verify")]
+    assert sorted(path.name for path in (folder / "s" / "images").iterdir()) == names
+    light = steps_of(resumed)["photometry"]["figures"]
+    assert light["truth_max_mag"] < RESPONSE_MAG
     assert read_bench_file(folder / "bench.toml").config.monitor.rotate_deg == 90
     assert places_off_arcsec(folder) < PLACES_ARCSEC
 
 
 def test_images_come_from_a_command(tmp_path):
-    (tmp_path / "bench.toml").write_text(bench_text(TWIN))
-    result = go(tmp_path, "--grab", f"{sys.executable} {plain_camera.__file__} {{pattern}} {{output}} --reversed", "--json")
+    (tmp_path / "bench.toml").write_text(bench_text(TWIN, GAMMA_22))
+    with plain_camera.on_duty() as camera:
+        grab = f"{camera} {{pattern}} {{output}} --reversed --exposure {{exposure_s}}"
+        result = go(tmp_path, "--grab", grab, *FEW, "--json")
     assert result.returncode == 0, result.stderr
-    steps = {step["name"]: step for step in json.loads(result.stdout)["steps"]}
+    steps = steps_of(result)
     assert steps["orientation"]["figures"]["seen"] == "mirrored top to bottom"
     # The camera's pixels are points; a screen's are squares of 0.924 px, which the figure takes out of the dots' width.
     assert steps["focus"]["figures"]["psf_sigma_px"] == pytest.approx(
         math.sqrt(plain_camera.SIGMA_PX**2 - 0.924**2 / 12), abs=0.02
     )
     assert steps["geometry"]["figures"]["focal_length_px"] == pytest.approx(120e3 / 57.65, rel=1e-4)
+    light, srgb = steps["photometry"]["figures"], srgb_response(10)
+    assert light["exposure_s"] < 0.1  # in which white saturates
+    assert light["black_level_measured"].startswith("no")
+    measured = load_calibration(tmp_path / "s" / "response.toml", 10).response
+    assert np.abs(response_error_mag(measured, srgb)).max() < RESPONSE_MAG
+    white_e_per_s = plain_camera.WHITE_DN_PER_S * read_bench_file(tmp_path / "bench.toml").config.tracker.detector.gain_e_per_dn
+    assert steps["scale"]["figures"]["flux_at_white_e_per_s"] == pytest.approx(white_e_per_s, rel=SCALE_MAG)
     assert steps["verify"]["figures"]["star_rms_px"] < 0.05
+    assert steps["verify"]["figures"]["flux_p95_mag"] < 0.05
 
 
 def test_a_command_that_fails_is_a_failed_step_and_what_needs_it_is_not_done(tmp_path):
@@ -161,7 +242,7 @@ def test_a_command_that_fails_is_a_failed_step_and_what_needs_it_is_not_done(tmp
     fails = f"{sys.executable} -c \"import sys; sys.exit('camera 3 is not there')\" {{pattern}} {{output}}"
     result = go(tmp_path, "--grab", fails, "--json")
     assert result.returncode == 1
-    steps = {step["name"]: step for step in json.loads(result.stdout)["steps"]}
+    steps = steps_of(result)
     assert steps["orientation"]["verdict"] == "failed"
     assert "camera 3 is not there" in steps["orientation"]["line"]
     assert {steps[name]["verdict"] for name in ("focus", "geometry", "verify")} == {"skipped"}
@@ -175,6 +256,8 @@ def test_a_command_that_fails_is_a_failed_step_and_what_needs_it_is_not_done(tmp
         (["--grab", "snapshot"], ["{output}"]),
         (["--grab", "cp {output}", "--virtual", "truth.toml"], ["--grab and --virtual"]),
         (["--virtual", "none.toml"], ["none.toml"]),
+        (["--grab", "cp {output}", "--dark", "none.fits"], ["none.fits"]),
+        (["--patches", "-1"], ["--patches"]),
         (["--virtual", "small.toml"], ["small.toml", "screen"]),
     ],
 )
@@ -205,15 +288,9 @@ def test_without_a_display_the_machine_lacks_something(tmp_path, monkeypatch):
 @pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM])
 def test_a_session_that_is_stopped_says_so_and_keeps_what_was_done(tmp_path, ending):
     folder = plant(tmp_path)
-    words = ["first-light", folder / "bench.toml", "-o", folder / "s", "--virtual", folder / "truth.toml"]
-    with subprocess.Popen([*HILSTAR, *map(str, words)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        end_s = time.monotonic() + 100
-        while not list((folder / "s").glob("images/geometry-1/frame_005*")):
-            assert time.monotonic() < end_s
-            assert process.poll() is None
-            time.sleep(0.01)
-        process.send_signal(ending)
-        assert process.wait(60) == 128 + ending
+    with started(folder) as process:
+        ended_at(process, folder, "geometry-1/frame_005", ending)
+        assert process.returncode == 128 + ending
         assert "Traceback" not in process.stderr.read()
     session = json.loads((folder / "s" / "session.json").read_text())
     assert (session["running"], len(session["steps"])) == ("geometry", 4)

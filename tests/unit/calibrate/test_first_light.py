@@ -10,7 +10,7 @@ from scipy.special import ndtr
 
 from hilstar.bench.bench_file import read_bench_file
 from hilstar.calibrate.first_light import session as sessions
-from hilstar.calibrate.first_light.eyes import Grabber
+from hilstar.calibrate.first_light.eyes import Grabber, NoImage
 from hilstar.calibrate.first_light.focus import sharpness
 from hilstar.calibrate.first_light.orientation import WAYS, Mounting, corrected, see_figure
 from hilstar.calibrate.first_light.patterns import Pattern, black, figure_for, off_screen, on_screen
@@ -111,13 +111,21 @@ def test_sharpness_is_the_sigma_of_the_psf(sigma_px):
 def grabbed(tmp_path, command):
     (tmp_path / "bench.toml").write_text(bench_text())
     pattern = Pattern("figure_000", black((320, 240)))
-    return Grabber(command).look(read_bench_file(tmp_path / "bench.toml"), pattern, tmp_path / "figure_000")
+    return Grabber(command).look(read_bench_file(tmp_path / "bench.toml"), pattern, tmp_path / "figure_000", 0.025)
 
 
 def test_a_command_gets_the_pattern_and_writes_the_image(tmp_path):
     path = grabbed(tmp_path, "cp {pattern} {output}")
     assert path == tmp_path / "figure_000.png"
     assert path.read_bytes() == (tmp_path / "pattern.png").read_bytes()
+
+
+def test_a_command_is_told_the_exposure_and_must_write_a_new_image(tmp_path):
+    (tmp_path / "figure_000.png").write_bytes(b"of an attempt that was interrupted")
+    with pytest.raises(NoImage, match="wrote no image"):
+        grabbed(tmp_path, "true {pattern} {output}")
+    path = grabbed(tmp_path, "sh -c 'echo {exposure_s} > {output}' {pattern}")
+    assert path.read_text() == "0.025\n"
 
 
 @pytest.mark.parametrize(
@@ -169,7 +177,7 @@ class Counted:
 
     def go(self, folder, again=()):
         self.runs.clear()
-        session = Session(folder / "s", read_bench_file(folder / "bench.toml"), Blind())
+        session = Session(folder / "s", read_bench_file(folder / "bench.toml"), Blind(), 0)
         return session.run(frozenset(again), lambda line: None), session
 
 
@@ -216,7 +224,7 @@ def test_a_directory_of_another_bench_is_refused(counted, tmp_path):
     counted.go(tmp_path)
     (tmp_path / "other.toml").write_text(bench_text())
     with pytest.raises(InputError, match="write another directory"):
-        Session(tmp_path / "s", read_bench_file(tmp_path / "other.toml"), Blind())
+        Session(tmp_path / "s", read_bench_file(tmp_path / "other.toml"), Blind(), 0)
 
 
 def test_a_session_file_that_is_none_is_refused(counted, tmp_path):

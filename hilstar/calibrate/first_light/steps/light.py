@@ -1,0 +1,214 @@
+"""The steps of light: the monitor's response by lattices of dots, and what white is worth by stars."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+from hilstar.arrays import FloatArray
+from hilstar.bench.build import open_bench
+from hilstar.calibrate.first_light.photometer import Photometer, Readings
+from hilstar.calibrate.first_light.pictures import draw_light, draw_response_error
+from hilstar.calibrate.first_light.records import Change, Figure, Outcome
+from hilstar.calibrate.first_light.rooms import Room
+from hilstar.calibrate.first_light.stars import MIN_STARS, see_stars
+from hilstar.calibrate.photometric import PhotometricSummary, Provenance, calibrate_photometric
+from hilstar.calibrate.plan import Patch, PlanSettings, plan_patches
+from hilstar.calibrate.response_chart import draw_calibration
+from hilstar.calibrate.scale import UNSURE_MAG, Reading, scale_by_tracker
+from hilstar.errors import InputError
+from hilstar.monitor.calibration import BUILT_IN, Calibration, load_calibration
+from hilstar.monitor.calibration_file import add_uniformity
+from hilstar.monitor.response import Response
+from hilstar.scene.psf import peak_share
+from hilstar.units import magnitude
+
+SEED = 0
+PHOTOMETRY_FILES = ("measured.csv", "response.toml", "response.png", "response-before.png")
+MIN_LEVELS = 10  # as `calibrate photometric` needs
+DIM_LIGHT = 1e-3  # of white: how far down responses are compared
+AGREE_SIGMAS, AGREE_MAG = 3.0, 0.002  # less is no reason to change the bench file
+ERROR_OF_MEDIAN = 1.2533  # of a mean's, for normal errors: sqrt(pi / 2)
+
+
+def photometry(room: Room) -> Outcome:
+    """Measure the response and name its file in the bench file. Raises InputError."""
+    monitor = room.file.config.monitor
+    if not room.patches:
+        how = "give --patches N, or use a photometer (`hilstar calibrate plan --show`, then `hilstar calibrate photometric`)"
+        return Outcome("skipped", f"not measured, the bench file's {monitor.calibration} stays: {how}")
+    assumed = calibration_of(room)
+    sigma_px = float(room.known.get("focus.psf_sigma_px", np.mean(room.file.config.tracker.psf_sigma_px)))
+    readings = Photometer(room, sigma_px, assumed.response).read(plan_for(monitor.bits, room.patches))
+    measured, output, picture, before = (room.session / name for name in PHOTOMETRY_FILES)
+    readings.write(measured)
+    instrument = f"the tracker, exposed for {readings.exposure_s:.4g} s, hilstar first-light"
+    found = calibrate_photometric(measured, output, Provenance("", "", instrument, "DN/s"), monitor.bits)
+    files = [output, output.with_suffix(".csv"), measured, picture, before, *readings.images]
+    if assumed.uniformity is not None:
+        files.append(add_uniformity(output, assumed.uniformity))
+    draw_calibration(measured, picture, monitor.bits)
+    now = load_calibration(output, monitor.bits).response
+    figures = _response_figures(room, readings, found, assumed.response, now)
+    off = f"{figures['bench_file_off_rms_mag']:.3f} mag rms, {figures['bench_file_off_max_mag']:.3f} max"
+    draw_response_error(before, now, response_error_mag(assumed.response, now), f"The bench file's response is off by {off}")
+    return _judged(room, figures, tuple(dict.fromkeys(files)), (picture, before))
+
+
+def plan_for(bits: int, patches: int) -> list[Patch]:
+    """The plan of the most levels that has no more than so many patches. Raises InputError where they are too few."""
+    best: list[Patch] = []
+    for levels in range(MIN_LEVELS, min(patches, 2**bits) + 1):
+        planned = plan_patches(PlanSettings(bits, levels, 1), np.random.default_rng(SEED))
+        if len(planned) <= patches:
+            best = planned
+    if not best:
+        fewest = len(plan_patches(PlanSettings(bits, MIN_LEVELS, 1), np.random.default_rng(SEED)))
+        raise InputError(f"--patches {patches}: a response needs {fewest} or more; write that, or 0 for none")
+    return best
+
+
+def calibration_of(room: Room) -> Calibration:
+    """The monitor's light as the bench file has it, code by code."""
+    name = room.file.config.monitor.calibration
+    return load_calibration(name if name in BUILT_IN else room.file.folder / name, room.file.config.monitor.bits)
+
+
+def _response_figures(
+    room: Room, readings: Readings, found: PhotometricSummary, before: Response, now: Response
+) -> dict[str, Figure]:
+    off = response_error_mag(before, now)
+    first = found.first
+    figures: dict[str, Figure] = {
+        "gamma": exponent(now),
+        "gamma_in_bench_file": exponent(before),
+        "bench_file_off_rms_mag": float(np.sqrt((off**2).mean())),
+        "bench_file_off_max_mag": float(np.abs(off).max()),
+        "black_level": now.black,
+        "black_level_in_bench_file": before.black,
+        "black_level_measured": "yes" if readings.black_known else "no: give --dark, an image with the monitor switched off",
+        "held_out_rms_mag": first.holdout.rms_mag,
+        "held_out_max_mag": first.holdout.max_mag,
+        "noise_percent": 100 * found.noise_relative,
+        "drift_percent": float("nan") if found.drift_percent is None else found.drift_percent,
+        "patches": len(readings.patches),
+        "codes": first.codes,
+        "exposure_s": readings.exposure_s,
+        "links": ", ".join(f"{link.ratio:.4f}" for link in readings.links) or "none",
+        "links_max_mag": max((abs(float(magnitude(link.ratio))) for link in readings.links), default=0.0),
+        **{f"error_at_{decade}_percent": value for decade, value in first.error_percent.items()},
+    }
+    if room.truth is not None:
+        config = room.truth.config
+        name = config.monitor.calibration
+        true = load_calibration(name if name in BUILT_IN else room.truth.folder / name, config.monitor.bits).response
+        figures["truth_max_mag"] = float(np.abs(response_error_mag(now, true)).max())
+        figures["truth_black_level"] = true.black
+    return figures
+
+
+def _judged(room: Room, figures: dict[str, Figure], files: tuple[Path, ...], pictures: tuple[Path, ...]) -> Outcome:
+    """Done, with the response named in the bench file, unless it is not known as well as [verify] needs it."""
+    limit_mag = room.file.config.verify.flux_mag
+    monitor = room.file.config.monitor
+    line = (
+        f"the bench file's {monitor.calibration} is off by {figures['bench_file_off_rms_mag']:.3f} mag rms,"
+        f" {figures['bench_file_off_max_mag']:.3f} max (gamma {figures['gamma']:.3f}, not"
+        f" {figures['gamma_in_bench_file']:.3f});"
+        f" measured: held-out levels {figures['held_out_rms_mag']:.4f} mag rms, {figures['held_out_max_mag']:.4f} max;"
+        f" black {figures['black_level']:.2e} of white"
+        f"{'' if figures['black_level_measured'] == 'yes' else ' as the bench file has it, not measured (--dark)'}"
+    )
+    if float(figures["links_max_mag"]) > limit_mag:
+        why = "switch off dynamic contrast and local dimming, or is the tracker not linear?"
+        line = f"dense and sparse dots of one code differ by {figures['links_max_mag']:.3f} mag: {why}"
+        return Outcome("failed", line, figures, files, pictures)
+    if float(figures["held_out_max_mag"]) > limit_mag:
+        why = "look at stray light, and whether the monitor was warm"
+        return Outcome("failed", f"{line}: the levels do not make one smooth response; {why}", figures, files, pictures)
+    name = os.path.relpath(room.session / "response.toml", room.file.folder)
+    changes = (
+        ()
+        if monitor.calibration == name
+        else (Change(table="monitor", key="calibration", before=monitor.calibration, after=name),)
+    )
+    return Outcome("done", line, figures, files, pictures, changes)
+
+
+def scale(room: Room) -> Outcome:
+    """Find what white is worth by stars, and set it in the bench file. Raises InputError."""
+    seen = see_stars(room)
+    with open_bench(room.file) as bench:
+        white = bench.flux_at_white_e_per_s
+        whole = seen.e_per_s * peak_share(room.file.config.render.sprite_sigma_px) <= white
+        used = np.flatnonzero(seen.sure & whole)
+        if len(used) < MIN_STARS:
+            raise InputError(
+                f"the light of {len(used)} stars can be read and {MIN_STARS} are needed; of {len(seen.hip)} others saturate the"
+                " tracker, are noisy, or clip on the monitor: look at [tracker] exposure_s and [render] brightest_v_mag"
+            )
+        readings = [Reading(int(seen.hip[star]), float(seen.dn[star])) for star in used]
+        found = scale_by_tracker(bench, readings, room.exposure_s)
+    off_mag = magnitude(found.ratios)
+    error_mag = ERROR_OF_MEDIAN * found.scatter_mag / np.sqrt(len(used))
+    by_mag = float(magnitude(found.flux_at_white_e_per_s / white))
+    brighter = f"{abs(by_mag):.3f} +- {error_mag:.3f} mag {'fainter' if by_mag > 0 else 'brighter'} than the bench file has it"
+    line = f"white is worth {found.flux_at_white_e_per_s:.4g} e-/s, {brighter}, by {len(used)} stars"
+    picture = room.session / "scale.png"
+    draw_light(picture, seen.e_per_s[used], off_mag, seen.noise_mag[used], f"{line}; they agree to {found.scatter_mag:.3f} mag")
+    trend_mag, trend_error_mag = trend(seen.e_per_s[used], off_mag)
+    figures: dict[str, Figure] = {
+        "flux_at_white_e_per_s": found.flux_at_white_e_per_s,
+        "in_bench_file_e_per_s": white,
+        "off_mag": by_mag,
+        "error_mag": float(error_mag),
+        "scatter_mag": found.scatter_mag,
+        "trend_mag": trend_mag,
+        "trend_error_mag": trend_error_mag,
+        "stars": len(used),
+    }
+    if room.truth is not None:
+        with open_bench(room.truth) as true:
+            figures["truth_off_mag"] = float(magnitude(found.flux_at_white_e_per_s / true.flux_at_white_e_per_s))
+    files = (picture, *seen.images)
+    wrong = []
+    if found.scatter_mag > UNSURE_MAG:
+        wrong.append(f"they disagree by {found.scatter_mag:.3f} mag")
+    if abs(trend_mag) > max(UNSURE_MAG, AGREE_SIGMAS * trend_error_mag):
+        wrong.append(f"from the faintest to the brightest it changes by {abs(trend_mag):.3f} +- {trend_error_mag:.3f} mag")
+    if wrong:
+        why = "the response is not as the bench file has it (photometry), or the background is not dark; nothing was changed"
+        return Outcome("failed", f"{line}, but {' and '.join(wrong)}: {why}", figures, files, (picture,))
+    if abs(by_mag) < max(AGREE_SIGMAS * error_mag, AGREE_MAG):
+        return Outcome("done", line, figures, files, (picture,))
+    key, value = "flux_at_white_e_per_s", float(f"{found.flux_at_white_e_per_s:.6g}")
+    change = Change(table="render", key=key, before=room.file.config.render.flux_at_white_e_per_s, after=value)
+    return Outcome("done", line, figures, files, (picture,), (change,))
+
+
+def trend(e_per_s: FloatArray, off_mag: FloatArray) -> tuple[float, float]:
+    """How much more stars are off at the brightest than at the faintest, magnitudes, and its error, of light (n,)."""
+    x = np.log(e_per_s) - np.log(e_per_s).mean()
+    leverage, span = float((x**2).sum()), float(np.ptp(x))
+    if leverage <= 0:
+        return 0.0, 0.0
+    slope = float(x @ off_mag) / leverage
+    left = off_mag - off_mag.mean() - slope * x
+    sigma = float(np.sqrt((left**2).sum() / max(len(x) - 2, 1)))
+    return slope * span, sigma / np.sqrt(leverage) * span
+
+
+def response_error_mag(assumed: Response, true: Response) -> FloatArray:
+    """How much fainter the codes really are (n,), magnitudes, from three decades below white up to it; both code by code."""
+    seen = true.light[1:] >= DIM_LIGHT
+    return np.asarray(magnitude(true.light[1:][seen] / assumed.light[1:][seen]))
+
+
+def exponent(response: Response) -> float:
+    """The power of the signal that the light follows, fitted to its logarithm over three decades."""
+    light = response.light[1:]
+    used = light >= DIM_LIGHT
+    signal = np.arange(1, len(response.light))[used] / response.white
+    return float(np.polyfit(np.log(signal), np.log(light[used]), 1)[0])

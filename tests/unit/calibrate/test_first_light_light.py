@@ -1,0 +1,157 @@
+"""The light of first light: dots on lattices, the exposure that they need, and what is read of them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.special import ndtr
+
+from hilstar.bench.bench_file import read_bench_file
+from hilstar.calibrate.first_light.lattice import field_for, peak_shares
+from hilstar.calibrate.first_light.photometer import Photometer
+from hilstar.calibrate.first_light.rooms import Room
+from hilstar.calibrate.first_light.steps.light import exponent, plan_for, response_error_mag, trend
+from hilstar.calibrate.plan import Patch
+from hilstar.errors import InputError
+from hilstar.monitor.geometry import monitor_camera
+from hilstar.monitor.response import gamma_response, srgb_response
+from hilstar.twin.bench_geometry import BenchGeometry
+from tests.support.benches import TWIN, bench_text
+
+NO_TURN = np.array([1.0, 0.0, 0.0, 0.0])
+GEOMETRY = BenchGeometry(monitor_camera((640, 480), 57.65, 120, NO_TURN), monitor_camera((400, 400), 13, 25, NO_TURN))
+RATIO = GEOMETRY.tracker.focal_length_px / GEOMETRY.monitor.focal_length_px
+FLOOR_DN, GLOW_DN = 30.0, 4.0
+FULL_DN = 70_000 / 24  # the small bench's full well by its gain
+SIGMA_PX = 0.5
+
+
+def test_a_lattice_lights_as_many_pixels_as_it_says_and_only_in_its_square():
+    field, periods = field_for(GEOMETRY, SIGMA_PX)
+    assert periods == (1, 2, 4, 8, 16)
+    for period in periods:
+        codes = field.lattice((640, 480), period, 7)
+        assert (codes == 7).sum() == field.lit(period)
+        codes[field.top : field.top + field.side, field.left : field.left + field.side] = 0
+        assert not codes.any()
+
+
+def test_the_peak_of_a_lattice_is_that_of_its_light_drawn_pixel_by_pixel():
+    """One lit pixel's light, a square of RATIO px under a Gaussian, over a fine grid of places of the lattice."""
+    x = np.arange(-60, 61)
+    for period, share in zip((1, 2, 8), peak_shares((1, 2, 8), RATIO, SIGMA_PX), strict=True):
+        largest = 0.0
+        for phase in np.linspace(0, 1, 40):
+            place = phase + RATIO * period * np.arange(-40, 41)[:, None, None]
+            inner = (np.arange(9) + 0.5) / 9 * RATIO - RATIO / 2
+            edge = x[:, None] - place - inner
+            along = (ndtr((edge + 0.5) / SIGMA_PX) - ndtr((edge - 0.5) / SIGMA_PX)).mean(axis=2).sum(axis=0)
+            largest = max(largest, float(along[30:-30].max()) ** 2)
+        # The square counts as a Gaussian of its own variance there: 6 % of the peak at most, of a range used to half.
+        assert share == pytest.approx(largest, rel=0.06)
+
+
+class Camera:
+    """A tracker whose image is uniform over the field: so much light for each lit pixel, by a response of its own."""
+
+    identity = "camera"
+
+    def __init__(self, light, white_dn_per_s, sets_exposure=True, neighbours=0.0, unlit=True):
+        self.light, self.white, self.sets_exposure = light, white_dn_per_s, sets_exposure
+        self.neighbours, self.has_unlit, self.taken = neighbours, unlit, []
+
+    def save(self, stem, image):
+        path = stem.with_name(stem.name + ".png")
+        Image.fromarray(np.clip(np.rint(image), 0, 4095).astype(np.uint16)).save(path)
+        return path
+
+    def look(self, file, pattern, stem, exposure_s):
+        self.taken.append((pattern.name, exposure_s))
+        rows, columns = np.nonzero(pattern.codes)
+        image = np.random.default_rng(len(self.taken)).normal(FLOOR_DN + GLOW_DN, 1.5, (400, 400))
+        x, y = (np.rint(part).astype(int) for part in GEOMETRY.to_tracker(columns.astype(float), rows.astype(float)))
+        dense = 1 + self.neighbours * (len(rows) > 10_000)
+        dn = self.white * exposure_s * dense * self.light[pattern.codes[rows, columns]]
+        np.add.at(image, (y, x), dn)
+        return self.save(stem, image)
+
+    def unlit(self, stem):
+        image = np.random.default_rng(5).normal(FLOOR_DN, 1.5, (400, 400))
+        return self.save(stem, image) if self.has_unlit else None
+
+
+def read(tmp_path, camera, codes=(0, 100, 300, 511, 700, 900, 1023, 0)):
+    (tmp_path / "bench.toml").write_text(bench_text(TWIN))
+    room = Room(read_bench_file(tmp_path / "bench.toml"), tmp_path, tmp_path / "i", camera, {}, {}, 96)
+    photometer = Photometer(room, SIGMA_PX, srgb_response(10))
+    return photometer.read([Patch(code, "w") for code in codes])
+
+
+def test_light_is_read_on_lattices_and_black_against_a_monitor_that_is_off(tmp_path):
+    true = gamma_response(10, 2.35).light
+    found = read(tmp_path, Camera(true, 20_000))
+    codes = np.array([patch.code for patch in found.patches])
+    lit = codes > 0
+    # 2000 pixels at the least, of 1.5 DN: 70 DN of noise in a sum of 10 000 DN or more.
+    assert found.light[lit] - found.light[~lit].mean() == pytest.approx(20_000 * true[codes[lit]], rel=0.01)
+    black = GLOW_DN / 0.1 * RATIO**2
+    assert found.light[~lit] == pytest.approx(black, rel=0.02)
+    assert found.black_known
+    assert found.exposure_s == pytest.approx(0.1)
+    assert [abs(link.ratio - 1) < 0.01 for link in found.links] == [True, True]
+
+
+def test_the_exposure_is_shortened_until_white_fits_where_that_can_be(tmp_path):
+    true = srgb_response(10).light
+    found = read(tmp_path, Camera(true, 2e6))
+    assert 0.4 < found.exposure_s * 2e6 / FULL_DN < 0.6
+    white = [patch.code == 1023 for patch in found.patches].index(True)
+    assert found.light[white] - found.light[0] == pytest.approx(2e6, rel=0.01)
+    with pytest.raises(InputError, match="exposure_s"):
+        read(tmp_path, Camera(true, 2e6, sets_exposure=False))
+
+
+def test_a_response_that_is_far_brighter_than_assumed_is_read_by_a_sparser_lattice(tmp_path):
+    true = gamma_response(10, 0.7).light
+    found = read(tmp_path, Camera(true, 20_000))
+    codes = np.array([patch.code for patch in found.patches])
+    lit = codes > 0
+    assert found.light[lit] - found.light[~lit].mean() == pytest.approx(20_000 * true[codes[lit]], rel=0.01)
+
+
+def test_a_pixel_that_is_brighter_among_lit_ones_is_seen_by_the_links(tmp_path):
+    found = read(tmp_path, Camera(srgb_response(10).light, 20_000, neighbours=0.08))
+    assert max(link.ratio for link in found.links) == pytest.approx(1.08, abs=0.01)
+
+
+def test_without_an_image_of_a_monitor_that_is_off_black_is_the_bench_files(tmp_path):
+    found = read(tmp_path, Camera(srgb_response(10).light, 20_000, unlit=False))
+    assert not found.black_known
+    assert found.light[0] == pytest.approx(0.0, abs=2.0)  # of 20 000: srgb has no black level
+
+
+def test_a_plan_has_as_many_levels_as_its_patches_allow():
+    assert len(plan_for(8, 96)) <= 96
+    assert len({patch.code for patch in plan_for(10, 96)}) > 40
+    assert len({patch.code for patch in plan_for(8, 30)}) >= 10
+    with pytest.raises(InputError, match="24 or more"):
+        plan_for(8, 12)
+
+
+def test_responses_are_compared_by_magnitudes_and_by_their_power():
+    flat, steep = gamma_response(10, 2.2), gamma_response(10, 2.35)
+    assert exponent(steep) == pytest.approx(2.35, abs=1e-9)
+    off = response_error_mag(flat, steep)
+    # (1e-3)^(1 - 2.2 / 2.35) at the faintest light compared; a code's step is 4 % there.
+    assert off.max() == pytest.approx(2.5 * 3 * (1 - 2.2 / 2.35), rel=0.03)
+    assert off[-1] == 0
+
+
+def test_a_trend_is_over_the_whole_range_and_has_its_error():
+    rng = np.random.default_rng(1)
+    e_per_s = 10 ** rng.uniform(4, 6, 200)
+    off = 0.1 * np.log10(e_per_s) + rng.normal(0, 0.01, 200)
+    found, error = trend(e_per_s, off)
+    assert found == pytest.approx(0.1 * np.ptp(np.log10(e_per_s)), abs=4 * error)
+    assert error == pytest.approx(0.01 / np.sqrt(200) * np.sqrt(12), rel=0.2)

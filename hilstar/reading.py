@@ -32,6 +32,8 @@ NOT_FILES = {
     stat.S_ISBLK: "is a device",
 }
 MCAP_MAGIC = b"\x89MCAP0\r\n"
+ROSBAG_MAGIC = b"#ROSBAG V"
+SQLITE_MAGIC = b"SQLite format 3\x00"
 # The first bytes of kinds of files that users have beside attitude logs and bench files.
 MAGIC = {
     b"ULog\x01": "a ULog file",
@@ -39,8 +41,8 @@ MAGIC = {
     b"DAF/": "a SPICE kernel",
     b"DAFETF NAIF": "a SPICE kernel",
     b"NAIF/": "a SPICE kernel",
-    b"SQLite format 3\x00": "an SQLite database (a db3 bag of ROS 2)",
-    b"#ROSBAG V": "a ROS 1 bag",
+    SQLITE_MAGIC: "an SQLite database (a db3 bag of ROS 2)",
+    ROSBAG_MAGIC: "a ROS 1 bag",
     MCAP_MAGIC: "an MCAP file",
     b"\x89HDF\r\n\x1a\n": "an HDF5 file",
     b"SIMPLE  =": "a FITS file",

@@ -35,7 +35,12 @@ BodyName = Annotated[
 ]
 ReferenceName = Annotated[
     str | None,
-    typer.Option("--reference", metavar="FRAME", help="The frame that attitudes refer to: icrs, ...", rich_help_panel=UNSAID),
+    typer.Option(
+        "--reference",
+        metavar="FRAME",
+        help="The frame that attitudes refer to, or what its axes are: icrs, enu, ned.",
+        rich_help_panel=UNSAID,
+    ),
 ]
 EpochUtc = Annotated[
     str | None,
@@ -54,7 +59,7 @@ MountingText = Annotated[
     ),
 ]
 MAX_SEED = 2**63 - 1  # what a FITS header holds
-LOG_HELP = "CSV (t_s,qw,qx,qy,qz), JSON lines, CCSDS AEM or MCAP (a ledger)."
+LOG_HELP = "CSV (t_s,qw,qx,qy,qz), JSON lines, CCSDS AEM, MCAP (a ledger) or a ROS bag."
 
 
 def check_files(

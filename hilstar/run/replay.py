@@ -14,7 +14,7 @@ from hilstar.attitude.logs.entries import Stated
 from hilstar.attitude.logs.gaps import log_joins
 from hilstar.attitude.logs.log_file import NOTHING_STATED, log_timeline, open_log
 from hilstar.attitude.logs.mcap_log import read_attitudes
-from hilstar.attitude.logs.mcap_reader import is_mcap
+from hilstar.attitude.logs.mcap_reader import holds_ros, is_mcap
 from hilstar.attitude.wire.packet import AttitudeSample, rate_refusal
 from hilstar.attitude.wire.source import PACKETS, Conventions
 from hilstar.bench.config import BenchConfig
@@ -126,7 +126,7 @@ def plan_play(log: Path, wanted: Wanted, config: BenchConfig, stated: Stated = N
     a step that gives no frame.
     """
     factor = wanted.speed
-    if is_mcap(log):
+    if is_mcap(log) and not holds_ros(log):
         frames = list(drawable_frames(log, math.radians(config.attitude.max_rate_deg_s)))
         if frames:
             return _plan_run(log, wanted, factor, frames)

@@ -113,11 +113,11 @@ def test_a_leap_second_does_not_turn_the_earth_back():
 
 
 def test_beyond_the_table_the_user_is_told_by_how_much():
-    assert beyond_table(int(at("1980-01-01T00:00")[0]), int(at("2026-01-01T00:00")[0])) is None
-    line = beyond_table(int(at("2026-01-01T00:00")[0]), int(at("2060-01-01T00:00")[0]))
+    assert beyond_table(int(at("1980-01-01T00:00:00")[0]), int(at("2026-01-01T00:00:00")[0])) is None
+    line = beyond_table(int(at("2026-01-01T00:00:00")[0]), int(at("2060-01-01T00:00:00")[0]))
     assert line is not None
     assert "beyond it UT1 is guessed" in line
-    assert np.isfinite(q_icrs_to_itrs(at("2060-01-01T00:00"))).all()
+    assert np.isfinite(q_icrs_to_itrs(at("2060-01-01T00:00:00"))).all()
 
 
 @pytest.mark.parametrize("text", ["", "yesterday", "2026-13-01T00:00:00", "2026-11-22", "2026-11-22T25:00:00", "9" * 4000])

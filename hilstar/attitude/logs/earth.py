@@ -10,7 +10,6 @@ plumb line is off by the deflection of the vertical, some arcsec in plains and a
 
 from __future__ import annotations
 
-import re
 import warnings
 from functools import lru_cache
 from typing import NamedTuple
@@ -20,6 +19,8 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import FloatArray
+from hilstar.attitude.logs.aem.epochs import epoch_ns
+from hilstar.attitude.logs.aem.keywords import AemFaultError
 from hilstar.errors import InputError
 from hilstar.rotation import multiply
 from hilstar.units import NS_PER_S
@@ -33,7 +34,6 @@ UT1_ARCSEC_PER_S = 15.041
 UT1_S_A_YEAR = 1.1  # UT1-TAI, held at the ends of the table, has moved by this in a year since 1973 at most (days 3 ms long)
 HALF = float(np.sqrt(0.5))
 Q_NED_TO_ENU = (0.0, HALF, HALF, 0.0)
-UTC_TEXT = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d(\.\d{1,9})?)?Z?", re.ASCII)
 UTC_FORM = "write a UTC such as 2026-11-22T10:00:00"
 
 
@@ -106,11 +106,9 @@ def beyond_table(first_ns: int, last_ns: int) -> str | None:
 def utc_ns_of(text: str, option: str) -> int:
     """Nanoseconds since 1970 of a UTC, where every day has 86400 s. Raises InputError that names the option."""
     try:
-        if UTC_TEXT.fullmatch(text) is None:
-            raise ValueError(text)
-        return int(np.datetime64(text.rstrip("Z"), "ns").astype(np.int64))
-    except ValueError as error:
-        raise InputError(f"{option} {text}: {UTC_FORM}") from error
+        return epoch_ns("", text)
+    except AemFaultError as fault:
+        raise InputError(f"{option} {text}: {UTC_FORM}") from fault
 
 
 @lru_cache(maxsize=1)

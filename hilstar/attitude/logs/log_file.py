@@ -16,16 +16,16 @@ from hilstar.attitude.logs.gaps import LogJoins, log_joins
 from hilstar.attitude.logs.json_log import read_json_lines, write_json_lines
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal
 from hilstar.attitude.wire.source import PACKETS
-from hilstar.errors import InputError
+from hilstar.errors import InputError, MachineError
 from hilstar.files import whole_file
-from hilstar.reading import HEAD_BYTES, MCAP_MAGIC, open_lines, open_regular, read_text
+from hilstar.reading import HEAD_BYTES, MCAP_MAGIC, ROSBAG_MAGIC, SQLITE_MAGIC, open_lines, open_regular, read_text
 
 MAX_NAMED_TOPICS = 12
 MAX_LOG_BYTES = 500_000_000
 MAX_SAMPLES = 6_000_000  # 16 hours at 100 Hz; all are held, at 350 bytes each, so in 2 GB
 MAX_AEM_BYTES = 50_000_000
 NOTHING_STATED = Stated()
-READABLE = "hilstar reads CSV, JSON lines, CCSDS AEM (KVN or XML) and MCAP"
+READABLE = "hilstar reads CSV, JSON lines, CCSDS AEM (KVN or XML), MCAP and bags of ROS"
 
 
 def read_log(path: Path) -> list[AttitudeSample]:
@@ -103,8 +103,15 @@ def log_timeline(samples: list[AttitudeSample], policy: Policy, joins: LogJoins 
 @contextlib.contextmanager
 def _open_log(path: Path, stated: Stated) -> Iterator[LogReading]:
     """The reading of a file, by what it holds."""
-    with open_regular(path, READABLE) as file:
-        head = file.read(HEAD_BYTES)
+    if path.is_dir():
+        head = b""
+    else:
+        with open_regular(path, READABLE) as file:
+            head = file.read(HEAD_BYTES)
+    if _is_bag(path, head):
+        with _ros(path, stated) as reading:
+            yield reading
+        return
     if head.startswith(MCAP_MAGIC):
         yield _mcap(path)
         return
@@ -134,6 +141,30 @@ def _first_word(lines: Iterable[str]) -> str:
 
 
 # A format's reader, and its library, are imported where a log needs them.
+
+
+def _is_bag(path: Path, head: bytes) -> bool:
+    from hilstar.attitude.logs.mcap_reader import holds_ros
+    from hilstar.attitude.logs.ros.bag import is_bag_directory
+
+    return (
+        head.startswith((ROSBAG_MAGIC, SQLITE_MAGIC))
+        or is_bag_directory(path)
+        or (head.startswith(MCAP_MAGIC) and holds_ros(path))
+    )
+
+
+@contextlib.contextmanager
+def _ros(path: Path, stated: Stated) -> Iterator[LogReading]:
+    try:
+        import rosbags  # noqa: F401
+    except ImportError as error:
+        raise MachineError(f"{path}: a ROS bag; reading it needs rosbags: pip install 'hilstar[ros]'") from error
+    from hilstar.attitude.logs.ros.bag import open_bag
+    from hilstar.attitude.logs.ros.reader import read_ros
+
+    with open_bag(path) as bag:
+        yield read_ros(bag, stated)
 
 
 def _mcap(path: Path) -> LogReading:

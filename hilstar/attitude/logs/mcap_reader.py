@@ -19,13 +19,15 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import RecordLengthLimitExceeded
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, McapRecord, Message, Metadata
+from mcap.records import Channel, Chunk, McapRecord, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader
 
 from hilstar.errors import InputError
 from hilstar.reading import MCAP_MAGIC, open_regular, size_text
 
 RUN_METADATA = "hilstar"  # the name of a ledger's head
+ROS_ENCODINGS = frozenset({"cdr", "ros1"})
+OWN_TOPICS = frozenset({"/attitude", "/frame"})
 ADVICE = "give an MCAP file, such as the ledger of a run"
 MAX_CHUNK_BYTES = 64_000_000  # unpacked; writers make them of about 1 MB
 MAX_RECORD_BYTES = 256_000_000
@@ -66,7 +68,7 @@ def read_topics(path: Path) -> Iterator[tuple[str, bytes]]:
     """
     for part in parts_of(path):
         channels: dict[int, str] = {}
-        for record in _records(part):
+        for record in records_of(part):
             if isinstance(record, Channel):
                 channels[record.id] = record.topic
             elif isinstance(record, Message) and record.channel_id in channels:
@@ -80,12 +82,12 @@ def read_messages(path: Path, topic: str) -> Iterator[bytes]:
 
 def topics_of(path: Path) -> list[str]:
     """The topics that a file has channels for. Raises InputError for damage."""
-    return sorted({record.topic for record in _records(path) if isinstance(record, Channel)})
+    return sorted({record.topic for record in records_of(path) if isinstance(record, Channel)})
 
 
 def read_metadata(path: Path, name: str) -> dict[str, str]:
     """The first metadata of that name, {} where there is none. Raises InputError for damage."""
-    return next((dict(r.metadata) for r in _records(path) if isinstance(r, Metadata) and r.name == name), {})
+    return next((dict(r.metadata) for r in records_of(path) if isinstance(r, Metadata) and r.name == name), {})
 
 
 def is_mcap(path: Path) -> bool:
@@ -97,7 +99,19 @@ def is_mcap(path: Path) -> bool:
         return False
 
 
-def _records(path: Path) -> Iterator[McapRecord]:
+def holds_ros(path: Path) -> bool:
+    """Whether the first channel that is hilstar's or ROS's is ROS's. Raises InputError for damage before it."""
+    for record in records_of(path):
+        if isinstance(record, Channel):
+            if record.message_encoding in ROS_ENCODINGS:
+                return True
+            if record.message_encoding == "json" and record.topic in OWN_TOPICS:
+                return False
+    return False
+
+
+def records_of(path: Path) -> Iterator[McapRecord]:
+    """Every record of one file, chunks unpacked into their schemas, channels and messages. Raises InputError for damage."""
     with open_regular(path, ADVICE) as file:
         yield from _open_records(path, file)
 
@@ -180,7 +194,7 @@ def _unpacked(chunk: Chunk, room: int) -> bytes:
 
 
 def _inside(data: bytes) -> Iterator[McapRecord]:
-    """The channels and messages of a chunk."""
+    """The schemas, channels and messages of a chunk."""
     place = 0
     while place < len(data):
         opcode, length = _record_head.unpack_from(data, place)
@@ -192,6 +206,7 @@ def _inside(data: bytes) -> Iterator[McapRecord]:
                 raise DamageError("a message is shorter than its head")
             channel, sequence, log_ns, publish_ns = _message_head.unpack_from(data, place)
             yield Message(channel, log_ns, data[place + _message_head.size : place + length], publish_ns, sequence)
-        elif opcode == Opcode.CHANNEL:
-            yield Channel.read(ReadDataStream(io.BytesIO(data[place : place + length])))
+        elif opcode in {Opcode.CHANNEL, Opcode.SCHEMA}:
+            kind = Channel if opcode == Opcode.CHANNEL else Schema
+            yield kind.read(ReadDataStream(io.BytesIO(data[place : place + length])))
         place += length

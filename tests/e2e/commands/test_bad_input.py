@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from hilstar.attitude.logs.log_file import READABLE
 from hilstar.cli import app
 from hilstar.errors import HilstarError, one_line
 from tests.support.benches import SMALL_BENCH
@@ -24,7 +25,6 @@ BENCH = SMALL_BENCH.replace("[1024, 1024]", "[64, 64]").replace("[320, 240]", "[
 FRAME = ("frame", "bench.toml", "--radec", "84,-1,0", "--codes", "codes.png")
 RESPONSE = "code,w\n" + "".join(f"{code},{(code / 255) ** 2.2 + 1e-3}\n" for code in range(256))
 MONITOR = '[calibration]\nkind="photometric"\nwho=""\nwhen=""\ninstrument=""\nunit=""\nbits=8\nresponse="RESPONSE"\n'
-LOG_FORMATS = "hilstar reads CSV, JSON lines, CCSDS AEM (KVN or XML) and MCAP"
 
 
 @pytest.fixture(autouse=True)
@@ -129,7 +129,6 @@ def test_what_is_no_file_or_too_large_is_refused_wherever_a_file_is_named(tmp_pa
     [
         (b"ULog\x01\x12\x35\x01" + bytes(64), "a ULog file"),
         (b"DAF/CK  " + bytes(64), "a SPICE CK kernel"),
-        (b"SQLite format 3\x00" + bytes(64), "an SQLite database (a db3 bag of ROS 2)"),
         (b"PK\x03\x04" + bytes(64), "a zip archive"),
         (b"\x1f\x8b\x08" + bytes(64), "a gzip file"),
         (b"\x89HDF\r\n\x1a\n", "an HDF5 file"),
@@ -143,7 +142,7 @@ def test_a_log_of_another_format_is_named_with_those_that_are_read(head, words):
     Path("log").write_bytes(head)
     line = refusal("convert", "log", "out.csv")
     assert words in line
-    assert LOG_FORMATS in line or "header must have" in line
+    assert READABLE in line or "header must have" in line
 
 
 @pytest.mark.parametrize("digits", [20, 4301])

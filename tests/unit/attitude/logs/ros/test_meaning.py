@@ -1,0 +1,357 @@
+"""What a bag means: topics, frames, tf, rates, times; what it does not say is stated or refused, never guessed."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from hilstar.attitude.logs.earth import earth_rate_ned_rad_s, q_icrs_to_enu, q_icrs_to_ned, utc_ns_of
+from hilstar.attitude.logs.entries import Stated
+from hilstar.attitude.logs.log_file import open_log
+from hilstar.attitude.wire.source import CHECK_RADEC_DEG, Mounting
+from hilstar.errors import InputError
+from hilstar.rotation import to_radec_roll_deg
+from tests.support import ros_bags
+from tests.support.ros_bags import START_NS, Make, write_bag1, write_bag2, write_mcap
+
+MAKE = Make("jazzy")
+PLACE = (48.1, 11.6, 500.0)
+# A chain of four products of unit quaternions in float64.
+ROUNDING = 1e-14
+# The motion of one step of 10 ms is a rotation about one axis; a rate of 0.4 rad/s is then exact but for rounding over 10 ms.
+RATE_ROUNDING = 1e-9
+
+
+def rotations(count, seed=2):
+    return Rotation.random(count, rng=np.random.default_rng(seed))
+
+
+def first(rotation):
+    return rotation.as_quat(scalar_first=True)
+
+
+def attitudes(log):
+    return Rotation.from_quat([sample.q_icrs_to_cam for sample in log.samples], scalar_first=True)
+
+
+def poses(frame, turns, topic="/pose", step_ns=10**8, start_ns=START_NS):
+    for i, turn in enumerate(turns):
+        t_ns = start_ns + i * step_ns
+        yield topic, ros_bags.POSE_STAMPED, t_ns, MAKE.of(ros_bags.POSE_STAMPED, t_ns, frame, "", first(turn), ())
+
+
+@pytest.fixture
+def bag(tmp_path):
+    return lambda sent: write_mcap(tmp_path / "a.mcap", sent, "jazzy")
+
+
+# Frames
+
+
+@pytest.mark.parametrize("frame", ["icrs", "GCRF", "/j2000", "eme2000"])
+def test_a_frame_whose_name_is_the_icrs_needs_nothing_stated(bag, frame):
+    log = open_log(bag(poses(frame, rotations(3))))
+    assert (attitudes(log) * rotations(3)).magnitude() == pytest.approx(0, abs=ROUNDING)
+    assert all(kind != "reference" for kind, _ in log.told)
+
+
+def test_an_inertial_frame_of_no_date_is_taken_and_said(bag):
+    log = open_log(bag(poses("eci", rotations(3))))
+    assert any("'eci' is taken as the ICRS" in line for _, line in log.told)
+
+
+@pytest.mark.parametrize("frame", ["map", "odom", "world", "base_link", ""])
+def test_any_other_frame_is_refused_until_it_is_stated(bag, frame):
+    path = bag(poses(frame, rotations(3)))
+    with pytest.raises(InputError, match="state its axes with --reference icrs, or"):
+        open_log(path)
+    log = open_log(path, Stated(reference="icrs"))
+    assert (attitudes(log) * rotations(3)).magnitude() == pytest.approx(0, abs=ROUNDING)
+    assert any("is taken as the ICRS, as stated" in line for _, line in log.told)
+
+
+def test_what_is_stated_against_the_frames_own_name_is_refused(bag):
+    path = bag(poses("icrs", rotations(3)))
+    with pytest.raises(InputError, match="'icrs', which is not east, north, up; leave out --reference"):
+        open_log(path, Stated(reference="enu", place=PLACE))
+    with pytest.raises(InputError, match="refer to the frame 'icrs', not to 'map'"):
+        open_log(path, Stated(reference="map=icrs"))
+    with pytest.raises(InputError, match="the axes of map are icrs, enu or ned; write --reference map=icrs"):
+        open_log(path, Stated(reference="map=sideways"))
+
+
+@pytest.mark.parametrize(("stated", "turn"), [("enu", q_icrs_to_enu), ("ned", q_icrs_to_ned)])
+def test_a_level_frame_turns_with_the_earth(bag, stated, turn):
+    """The truth is a body in the ICRS; the bag has its orientation in the level frame of each moment."""
+    truth, times = rotations(5), START_NS + 10**8 * np.arange(5)
+    level = Rotation.from_quat(turn(times, PLACE[0], PLACE[1]), scalar_first=True)
+    log = open_log(bag(poses("map", level * truth.inv())), Stated(reference=stated, place=PLACE))
+    assert (attitudes(log) * truth.inv()).magnitude() == pytest.approx(0, abs=ROUNDING)
+
+
+def test_a_level_frame_needs_a_place_and_dates(bag):
+    path = bag(poses("map", rotations(3), start_ns=0))
+    with pytest.raises(InputError, match="refer to east, north, up; give the place with --place LAT,LON,HEIGHT"):
+        open_log(path, Stated(reference="enu"))
+    with pytest.raises(
+        InputError, match=r"begin at 0\.1 s, no date; give --epoch-utc|begin at .* s, no date; give --epoch-utc"
+    ):
+        open_log(path, Stated(reference="enu", place=PLACE))
+
+
+def test_a_simulated_clock_gets_its_date_from_the_user(bag):
+    turned = rotations(3)
+    simulated = open_log(
+        bag(poses("map", turned, start_ns=5 * 10**9)), Stated(reference="enu", place=PLACE, epoch_utc="2025-11-22T08:26:35")
+    )
+    dated = open_log(bag(poses("map", turned)), Stated(reference="enu", place=PLACE))
+    assert utc_ns_of("2025-11-22T08:26:35", "") == START_NS - 5 * 10**9
+    assert (attitudes(simulated) * attitudes(dated).inv()).magnitude() == pytest.approx(0, abs=ROUNDING)
+    assert simulated.samples[0].t_ns == 5 * 10**9
+    with pytest.raises(InputError, match=r"dates already .* leave out --epoch-utc"):
+        open_log(bag(poses("map", turned)), Stated(reference="enu", place=PLACE, epoch_utc="2025-11-22T08:26:35"))
+
+
+def test_a_frame_that_changes_in_the_bag_is_refused(bag):
+    path = bag([*poses("icrs", rotations(3)), *poses("map", rotations(2), start_ns=START_NS + 10**9)])
+    with pytest.raises(InputError, match="message 4 of /pose: refers to the frame 'map', the first to 'icrs'"):
+        open_log(path)
+
+
+@pytest.mark.parametrize("reference", ["icrs", "enu", "ned"])
+def test_the_self_check_of_a_bag_points_where_it_says(bag, reference):
+    """The orientation that --explain shows, recorded, looks at the star that it names."""
+    stated = Stated(Mounting((0.5, -0.5, 0.5, -0.5)), reference=reference, place=PLACE)
+    line = open_log(bag(poses("map", rotations(1))), stated).conventions.lines(stated.mounting)[-1]
+    x, y, z, w = map(float, re.search(r"x y z w = \((.*?)\)", line)[1].split(","))
+    shown = open_log(bag(poses("map", [Rotation.from_quat([x, y, z, w])])), stated)
+    digits_deg = np.degrees(2e-7)  # the line has seven digits
+    assert to_radec_roll_deg(shown.samples[0].q_icrs_to_cam)[:2] == pytest.approx(CHECK_RADEC_DEG, abs=digits_deg)
+
+
+# Rates
+
+
+def spinning(kind, frame, rate, earths, count=4):
+    """A body that turns at a constant rate (body components) in the stars' frame, as recorded in a frame that turns too."""
+    times = START_NS + 10**7 * np.arange(count)
+    begin = rotations(1)[0]
+    for i, t_ns in enumerate(times.tolist()):
+        body_from_icrs = Rotation.from_rotvec(-np.asarray(rate) * 0.01 * i) * begin
+        level = Rotation.from_quat(earths(np.array([t_ns]), PLACE[0], PLACE[1])[0], scalar_first=True)
+        frame_from_body = level * body_from_icrs.inv()
+        told = rate
+        if kind == ros_bags.ODOMETRY:  # its twist is with respect to the frame that it refers to
+            north, east, down = earth_rate_ned_rad_s(PLACE[0])
+            own = (east, north, -down) if earths is q_icrs_to_enu else (north, east, down)
+            told = rate - frame_from_body.inv().apply(own)
+        yield "/a", kind, t_ns, MAKE.of(kind, t_ns, frame, "imu_link", first(frame_from_body), told)
+
+
+@pytest.mark.parametrize("kind", [ros_bags.IMU, ros_bags.ODOMETRY])
+@pytest.mark.parametrize(("stated", "earths"), [("enu", q_icrs_to_enu), ("ned", q_icrs_to_ned)])
+def test_a_rate_is_with_respect_to_the_stars_in_the_bodys_components(bag, kind, stated, earths):
+    rate = np.array([0.2, -0.3, 0.1])
+    log = open_log(bag(spinning(kind, "map", rate, earths)), Stated(reference=stated, place=PLACE))
+    turns = attitudes(log)
+    for before, after, sample in zip(turns[:-1], turns[1:], log.samples, strict=False):
+        assert -(after * before.inv()).as_rotvec() / 0.01 == pytest.approx(rate, abs=RATE_ROUNDING)
+        assert sample.rate_cam_rad_s == pytest.approx(rate, abs=RATE_ROUNDING)
+
+
+def test_a_mounting_turns_attitude_and_rate_of_the_body(bag):
+    mounted = Mounting(tuple(first(rotations(1, seed=5)[0]).tolist()))
+    sent = list(spinning(ros_bags.IMU, "", np.array([0.2, -0.3, 0.1]), q_icrs_to_enu))
+    plain = open_log(bag(sent), Stated(reference="icrs"))
+    turned = open_log(bag(sent), Stated(mounted, reference="icrs"))
+    body_to_cam = Rotation.from_quat(mounted.q_body_to_cam, scalar_first=True)
+    assert (attitudes(turned) * attitudes(plain).inv() * body_to_cam.inv()).magnitude() == pytest.approx(0, abs=ROUNDING)
+    assert turned.samples[0].rate_cam_rad_s == pytest.approx(body_to_cam.apply([0.2, -0.3, 0.1]), abs=ROUNDING)
+
+
+def test_an_imu_without_orientation_is_refused_and_without_rate_is_not(bag):
+    at = [START_NS, START_NS + 10**7]
+    blind = [("/imu", ros_bags.IMU, t, MAKE.imu(t, "imu", (1, 0, 0, 0), (0, 0, 0), covariance0=-1)) for t in at]
+    with pytest.raises(InputError, match=r"message 1 of /imu: orientation_covariance\[0\] is -1: the IMU gives no orientation"):
+        open_log(bag(blind), Stated(reference="icrs"))
+    still = [("/imu", ros_bags.IMU, t, MAKE.imu(t, "imu", (1, 0, 0, 0), (9, 9, 9), rate0=-1)) for t in at]
+    assert [sample.rate_cam_rad_s for sample in open_log(bag(still), Stated(reference="icrs")).samples] == [None, None]
+
+
+def test_an_imus_own_frame_is_its_body_and_never_its_reference(bag):
+    sent = [("/imu", ros_bags.IMU, START_NS, MAKE.imu(START_NS, "icrs", (1, 0, 0, 0), (0, 0, 0)))]
+    with pytest.raises(InputError, match=r"do not say which frame their orientation refers to .*REP 145"):
+        open_log(bag(sent))
+
+
+def test_an_optical_frame_with_a_mounting_is_said(bag):
+    sent = [("/imu", ros_bags.IMU, START_NS, MAKE.imu(START_NS, "star_camera_optical_frame", (1, 0, 0, 0), (0, 0, 0)))]
+    turned = Stated(Mounting((0.5, 0.5, 0.5, 0.5)), reference="icrs")
+    assert any("has the axes of a camera by its name" in line for _, line in open_log(bag(sent), turned).told)
+    assert not any("axes of a camera" in line for _, line in open_log(bag(sent), Stated(reference="icrs")).told)
+
+
+# Topics and bodies
+
+
+def test_of_several_topics_one_is_chosen_by_name(bag):
+    path = bag([*poses("icrs", rotations(2), "/a/pose"), *poses("icrs", rotations(3, seed=9), "/b/pose")])
+    several = r"several topics with attitudes: /a/pose \(geometry_msgs/PoseStamped\), /b/pose .*; choose one with --topic NAME"
+    with pytest.raises(InputError, match=several):
+        open_log(path)
+    assert len(open_log(path, Stated(topic="/b/pose")).samples) == 3
+    assert len(open_log(path, Stated(topic="a/pose")).samples) == 2
+    with pytest.raises(InputError, match=r"has no topic /c; it has /a/pose \(geometry_msgs/PoseStamped\), /b/pose"):
+        open_log(path, Stated(topic="/c"))
+
+
+def test_a_topic_of_a_type_that_says_no_attitude_is_refused(bag):
+    point = ("/p", "geometry_msgs/msg/Vector3", START_NS, MAKE.vector((1, 2, 3)))
+    with pytest.raises(InputError, match=r"has no topic with attitudes; it has /p \(geometry_msgs/Vector3\)"):
+        open_log(bag([point]))
+    with pytest.raises(
+        InputError, match=r"/p is of geometry_msgs/msg/Vector3, which says no attitude; read are Imu, Odometry, Pose"
+    ):
+        open_log(bag([point, *poses("icrs", rotations(2))]), Stated(topic="/p"))
+
+
+def test_of_several_bodies_on_one_topic_one_is_chosen(bag):
+    kind = ros_bags.TRANSFORM_STAMPED
+    sent = [
+        ("/vicon", kind, START_NS + i, MAKE.transform_stamped(START_NS + 10**7 * i, "icrs", child, first(turn)))
+        for i, turn in enumerate(rotations(4))
+        for child in ("one", "two")
+    ]
+    with pytest.raises(InputError, match="is of the frame 'two', the first of 'one'; choose one with --body"):
+        open_log(bag(sent))
+    assert len(open_log(bag(sent), Stated(body="two")).samples) == 4
+    with pytest.raises(InputError, match="has no attitude of three"):
+        open_log(bag(sent), Stated(body="three"))
+    with pytest.raises(InputError, match="name no body; leave out --body one"):
+        open_log(bag(poses("icrs", rotations(2))), Stated(body="one"))
+
+
+def test_a_type_that_only_has_the_name_of_ross_own_is_refused(tmp_path):
+    from mcap.writer import Writer
+
+    with (tmp_path / "a.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="ros2")
+        text = b"std_msgs/Header header\nfloat64 w\nfloat64 x\nfloat64 y\nfloat64 z\n"
+        schema = writer.register_schema("geometry_msgs/msg/QuaternionStamped", "ros2msg", text)
+        writer.add_message(writer.register_channel("/q", "cdr", schema), 0, b"\0\1\0\0", 0)
+        writer.finish()
+    with pytest.raises(InputError, match="/q: its geometry_msgs/msg/QuaternionStamped is not ROS's own"):
+        open_log(tmp_path / "a.mcap")
+
+
+# tf
+
+
+def tree(dynamic, fixed=(), release="jazzy"):
+    """tf messages: (parent, child, rotation for each time), and fixed ones on the static topic."""
+    make = Make(release)
+    for parent, child, turn in fixed:
+        yield "/tf_static", ros_bags.TF, START_NS, make.tf(make.transform_stamped(START_NS, parent, child, first(turn)))
+    for i in range(len(dynamic[0][2])):
+        t_ns = START_NS + 10**8 * i
+        moved = [make.transform_stamped(t_ns, parent, child, first(turns[i])) for parent, child, turns in dynamic]
+        yield "/tf", ros_bags.TF, t_ns, make.tf(*moved)
+
+
+@pytest.mark.parametrize("write", ["ROS 1", "ROS 2"])
+def test_tf_gives_a_chain_through_parts_that_do_not_move(tmp_path, write):
+    moving, above, below = rotations(6), *rotations(2, seed=3)
+    release = "noetic" if write == "ROS 1" else "jazzy"
+    sent = tree(
+        [("/base", "/wheel", rotations(6, seed=4)), ("/stand", "/base", moving)],
+        [("icrs", "/stand", above), ("base", "cam", below)],
+        release,
+    )
+    path = write_bag1(tmp_path / "a.bag", sent) if write == "ROS 1" else write_bag2(tmp_path / "a", sent)
+    log = open_log(path, Stated(body="cam"))
+    assert (attitudes(log) * above * moving * below).magnitude() == pytest.approx(0, abs=ROUNDING)
+    assert "turns components of 'cam' into those of 'icrs'" in log.conventions.turns
+    from_stand = open_log(path, Stated(body="base", reference="stand=icrs"))
+    assert (attitudes(from_stand) * moving).magnitude() == pytest.approx(0, abs=ROUNDING)
+
+
+def test_where_one_transform_moves_the_body_need_not_be_named(bag):
+    moving = rotations(4)
+    log = open_log(bag(tree([("icrs", "base", moving), ("base", "arm", [rotations(1)[0]] * 4)])))
+    assert (attitudes(log) * moving).magnitude() == pytest.approx(0, abs=ROUNDING)
+
+
+def test_what_tf_leaves_open_is_refused_by_name(bag):
+    two = bag(tree([("map", "odom", rotations(3)), ("odom", "base", rotations(3, seed=7))]))
+    with pytest.raises(
+        InputError, match="several transforms of tf could be meant: map -> odom, odom -> base; choose with --body"
+    ):
+        open_log(two, Stated(reference="icrs"))
+    with pytest.raises(InputError, match="from 'base' up, several move: odom -> base, map -> odom"):
+        open_log(two, Stated(reference="icrs", body="base"))
+    assert len(open_log(two, Stated(reference="odom=icrs", body="base")).samples) == 3
+    with pytest.raises(InputError, match="tf has no transform of 'nose'; it has map -> odom, odom -> base"):
+        open_log(two, Stated(reference="icrs", body="nose"))
+    with pytest.raises(InputError, match="tf has no transform from 'base' up to 'moon'"):
+        open_log(two, Stated(reference="moon=icrs", body="base"))
+    with pytest.raises(InputError, match="refer to the frame 'map'; state its axes"):
+        open_log(two, Stated(body="odom"))
+
+
+def test_a_tf_that_is_no_tree_is_refused(bag):
+    circle = bag(tree([("a", "b", rotations(2)), ("b", "a", [rotations(1)[0]] * 2)]))
+    with pytest.raises(InputError, match="tf goes in a circle at"):
+        open_log(circle, Stated(reference="icrs", body="b"))
+    parents = bag(tree([("a", "b", rotations(2)), ("c", "b", rotations(2))]))
+    with pytest.raises(InputError, match="'b' has several parents: a -> b, c -> b"):
+        open_log(parents, Stated(reference="icrs", body="b"))
+
+
+# Times
+
+
+def test_messages_out_of_order_and_doubled_are_put_right_and_said(bag):
+    sent = list(poses("icrs", rotations(6)))
+    shuffled = [sent[0], sent[2], sent[1], sent[1], *sent[3:], sent[5]]
+    log = open_log(bag(shuffled))
+    assert (attitudes(log) * rotations(6)).magnitude() == pytest.approx(0, abs=ROUNDING)
+    told = dict(log.told)
+    assert told["log-order"] == "2 attitudes came out of order, by up to 0.1 s, and are sorted"
+    assert told["log-repeats"] == "2 attitudes are exact repeats of the one before, and are dropped"
+
+
+def test_two_attitudes_of_one_time_are_refused(bag):
+    both = [*poses("icrs", rotations(3)), *poses("icrs", rotations(3, seed=8))]
+    with pytest.raises(InputError, match=r"time does not increase .*; the bag has two attitudes of one time"):
+        open_log(bag(both))
+
+
+def test_a_clock_that_was_set_back_is_refused(bag):
+    again = [*poses("icrs", rotations(30)), *poses("icrs", rotations(3, seed=8), start_ns=START_NS + 1)]
+    with pytest.raises(InputError, match=r"time does not increase .* or its clock was set back"):
+        open_log(bag(again))
+
+
+def test_messages_without_a_stamp_take_the_recorders_clock_and_say_so(bag):
+    sent = [("/p", ros_bags.POSE_STAMPED, t, MAKE.of(ros_bags.POSE_STAMPED, 0, "icrs", "", (1, 0, 0, 0), ())) for t in (5, 9)]
+    log = open_log(bag(sent))
+    assert [sample.t_ns for sample in log.samples] == [5, 9]
+    assert "have no time of their own; when they were recorded is taken" in dict(log.told)["log-stamp"]
+    mixed = [*sent, *poses("icrs", rotations(2), "/p")]
+    with pytest.raises(InputError, match=r"message 3 of /p: some messages have a stamp and some have none"):
+        open_log(bag(mixed))
+
+
+@pytest.mark.parametrize(
+    ("q", "why"),
+    [((0, 0, 0, 0), "norm is 0;"), ((1, 1, 0, 0), "norm is 1.41421"), ((np.nan, 0, 0, 1), "not finite")],
+)
+def test_a_quaternion_that_is_none_is_refused_with_its_message(bag, q, why):
+    stamp = START_NS + 10**9
+    bad = ("/pose", ros_bags.POSE_STAMPED, stamp, MAKE.of(ros_bags.POSE_STAMPED, stamp, "icrs", "", q, ()))
+    with pytest.raises(InputError, match=f"message 4 of /pose: .*{why}"):
+        open_log(bag([*poses("icrs", rotations(3)), bad]))

@@ -14,8 +14,9 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from tests.support.basilisk import Truth, basilisk, rotation
 from tests.support.benches import bench_text
-from tests.support.senders import free_port
-from tests.support.servers import SUBSCRIBED_S, interrupted, listening
+from tests.support.senders import free_port, publisher
+from tests.support.servers import SUBSCRIBED_S, interrupted, listening, serving
+from tests.support.viz_message import craft, viz_message
 
 # Two degrees a second, from just under |sigma| = 1: the switch to the shadow set comes within half a second. The other
 # spacecraft is elsewhere, so that a choice of the wrong one is seen.
@@ -136,3 +137,25 @@ def test_two_spacecraft_and_no_name_end_the_simulation_with_their_names(tmp_path
     assert served.returncode == 4
     assert 'spacecraft: chaser, target; write the one that is meant, [attitude] spacecraft = "NAME"' in err
     assert json.loads(out)["packets"]["refused_by"]["format"] == 1
+
+
+def test_broken_messages_and_a_simulation_that_begins_again_do_not_end_the_display(tmp_path):
+    """A hundred good ones, each followed by one that is cut short; other topics; and then a second simulation from zero."""
+    attitude = 'source = "vizard"\nspacecraft = "sat"'
+    sigma = Rotation.from_rotvec([0.3, 0.4, 0.5]).as_mrp()
+    with publisher() as (sender, port), serving(tmp_path, port, attitude=attitude) as process:
+        for pause_s in (0.6, 0.2):
+            begun_ns = time.monotonic_ns()
+            for k in range(100):
+                message = viz_message(time.monotonic_ns() - begun_ns, [craft(sigma=sigma), craft("other")], frame=k)
+                sender.send_multipart([b"SIM_UPDATE", message])
+                sender.send_multipart([b"SIM_UPDATE", message[:-1]])
+                sender.send_multipart([b"SYNC_SETTINGS", b"not an attitude"])
+                time.sleep(0.01)
+            sender.send_multipart([b"SIM_UPDATE", b"a part too many", message])
+            time.sleep(pause_s)
+        summary = interrupted(process)
+    assert summary["packets"]["received"] == 402
+    assert summary["packets"]["refused_by"]["format"] == 202
+    assert summary["packets"]["accepted"] > 190, summary
+    assert summary["events"]["jump"] == 1

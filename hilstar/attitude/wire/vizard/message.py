@@ -7,12 +7,14 @@ A field that is given twice counts as the last one, as protobuf has it; one that
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import TypeVar
 
 from hilstar.attitude.wire.packet import INT64
 from hilstar.attitude.wire.vizard.wire_format import (
+    Field,
+    Reader,
     Value,
     WireFormatError,
     as_double,
@@ -21,7 +23,6 @@ from hilstar.attitude.wire.vizard.wire_format import (
     as_int64s,
     as_message,
     as_text,
-    fields,
 )
 
 CURRENT_TIME, SPACECRAFT, CAMERAS = 1, 3, 4  # of a VizMessage
@@ -72,13 +73,14 @@ def decode_update(message: bytes) -> SimUpdate:
     stamp: dict[int, float] | None = None
     spacecraft: list[Spacecraft] = []
     cameras: list[VizCamera] = []
-    for number, kind, value in fields(memoryview(message)):
+    reader = Reader()
+    for number, kind, value in reader.fields(memoryview(message)):
         if number == CURRENT_TIME:
-            stamp = (stamp or {}) | _time_stamp(as_message(kind, value))
+            stamp = (stamp or {}) | _time_stamp(reader.fields(as_message(kind, value)))
         elif number == SPACECRAFT:
-            spacecraft.append(_spacecraft(as_message(kind, value)))
+            spacecraft.append(_spacecraft(reader.fields(as_message(kind, value))))
         elif number == CAMERAS:
-            cameras.append(_camera(as_message(kind, value)))
+            cameras.append(_camera(reader.fields(as_message(kind, value))))
     if stamp is None:
         raise WireFormatError("no currentTime")
     time_ns = stamp.get(SIM_TIME_ELAPSED, 0.0)
@@ -87,15 +89,15 @@ def decode_update(message: bytes) -> SimUpdate:
     return SimUpdate(round(time_ns), int(stamp.get(FRAME_NUMBER, 0)), tuple(spacecraft), tuple(cameras))
 
 
-def _time_stamp(message: memoryview) -> dict[int, float]:
+def _time_stamp(fields: Iterator[Field]) -> dict[int, float]:
     readers: dict[int, Callable[[int, Value], float]] = {FRAME_NUMBER: as_int64, SIM_TIME_ELAPSED: as_double}
-    return {number: readers[number](kind, value) for number, kind, value in fields(message) if number in readers}
+    return {number: readers[number](kind, value) for number, kind, value in fields if number in readers}
 
 
-def _spacecraft(message: memoryview) -> Spacecraft:
+def _spacecraft(fields: Iterator[Field]) -> Spacecraft:
     texts: dict[int, str] = {}
     vectors: dict[int, Components] = {}
-    for number, kind, value in fields(message):
+    for number, kind, value in fields:
         if number in {NAME, PARENT_NAME}:
             texts[number] = as_text(kind, value)
         elif number in {POSITION, VELOCITY, ROTATION}:
@@ -104,11 +106,11 @@ def _spacecraft(message: memoryview) -> Spacecraft:
     return Spacecraft(texts.get(NAME, ""), texts.get(PARENT_NAME, ""), position, velocity, rotation)
 
 
-def _camera(message: memoryview) -> VizCamera:
+def _camera(fields: Iterator[Field]) -> VizCamera:
     identity, field_deg = 0, 0.0
     resolution: tuple[int, ...] = ()
     sigma: Components = ()
-    for number, kind, value in fields(message):
+    for number, kind, value in fields:
         if number == CAMERA_ID:
             identity = as_int64(kind, value)
         elif number == FIELD_OF_VIEW:

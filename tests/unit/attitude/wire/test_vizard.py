@@ -1,0 +1,237 @@
+"""Basilisk's messages: what SciPy makes of the same parameters, rates by differences, and bytes that are none."""
+
+from __future__ import annotations
+
+import re
+import time
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from hilstar.attitude.wire.packet import AttitudeSample, Refusal
+from hilstar.attitude.wire.source import CHECK_RADEC_DEG, Mounting
+from hilstar.attitude.wire.vizard.attitude import CONVENTIONS, DifferenceRates, Follower, quaternion_of_mrp
+from hilstar.attitude.wire.vizard.camera import TrackerCamera, disagreement, q_body_to_cam
+from hilstar.attitude.wire.vizard.message import decode_update
+from hilstar.attitude.wire.vizard.parts import check_loopback, update_of
+from hilstar.attitude.wire.vizard.wire_format import MAX_FIELDS
+from hilstar.errors import InputError
+from hilstar.rotation import to_radec_roll_deg
+from tests.support.viz_message import craft, viz_message
+
+ROUNDING_RAD = 1e-14  # some products of float64 rotations
+DIGITS_DEG = np.degrees(4e-7)  # seven digits of each MRP, and the angle is four times its change
+STEP_NS = 20_000_000
+QUICK_S = 1.0  # a refusal takes milliseconds; what reads on takes minutes
+
+
+def follower(name: str | None = None, mounting: Mounting | None = None, max_rate_rad_s: float = 1.0) -> Follower:
+    return Follower(name, mounting or Mounting(), DifferenceRates(10 * STEP_NS, max_rate_rad_s))
+
+
+def taken(message: bytes, by: Follower | None = None) -> AttitudeSample | Refusal:
+    return (by or follower()).take(message)[0]
+
+
+def rotation_of(sample: AttitudeSample | Refusal) -> Rotation:
+    assert isinstance(sample, AttitudeSample), sample
+    return Rotation.from_quat(sample.q_icrs_to_cam, scalar_first=True)
+
+
+@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("shadow", [False, True])
+def test_an_mrp_and_its_shadow_are_the_frame_s_turn_and_the_mounting_comes_after(seed: int, shadow: bool) -> None:
+    """SciPy's parameters turn a vector, Basilisk's a frame: [BN] is the inverse."""
+    rng = np.random.default_rng(seed)
+    body_from_n, pose = Rotation.random(rng=rng), Rotation.random(rng=rng)
+    sigma = body_from_n.inv().as_mrp()
+    if shadow:
+        sigma = -sigma / (sigma @ sigma)
+    mounting = Mounting(tuple(pose.as_quat(scalar_first=True).tolist()))
+    sample = taken(viz_message(spacecraft=[craft(sigma=sigma)]), follower(mounting=mounting))
+    star = rng.normal(size=3)
+    assert rotation_of(sample).apply(star) == pytest.approx(pose.apply(body_from_n.apply(star)), abs=10 * ROUNDING_RAD)
+
+
+def test_time_and_number_are_the_simulation_s() -> None:
+    sample = taken(viz_message(123_456_789_012.0, [craft()], frame=2**32 + 5))
+    assert isinstance(sample, AttitudeSample)
+    assert (sample.t_ns, sample.sequence, sample.rate_cam_rad_s) == (123_456_789_012, 5, None)
+
+
+def test_the_self_check_points_where_it_says() -> None:
+    pose = Mounting((0.6, 0.48, 0.64, 0.0))
+    match = re.search(r"sigma_BN = \(([-0-9., ]+)\)", CONVENTIONS.lines(pose)[-1])
+    assert match is not None
+    sigma = [float(number) for number in match[1].split(",")]
+    sample = taken(viz_message(spacecraft=[craft(sigma=sigma)]), follower(mounting=pose))
+    assert isinstance(sample, AttitudeSample)
+    assert to_radec_roll_deg(sample.q_icrs_to_cam)[:2] == pytest.approx(CHECK_RADEC_DEG, abs=DIGITS_DEG)
+
+
+# Rates
+
+
+def turning(times_ns: list[int], max_rate_rad_s: float = 1.0) -> list[np.ndarray | None]:
+    """The rates of a body that turns about its z axis by 0.1 t + 0.005 t^2 rad, through Basilisk's switch to the shadow."""
+    by, rates = follower(max_rate_rad_s=max_rate_rad_s), []
+    for t_ns in times_ns:
+        t_s = t_ns / 1e9
+        turn = Rotation.from_rotvec([0, 0, 3.1 + 0.1 * t_s + 0.005 * t_s**2])
+        sigma = turn.as_mrp()
+        sample = taken(viz_message(float(t_ns), [craft(sigma=sigma)]), by)
+        assert isinstance(sample, AttitudeSample)
+        rates.append(sample.rate_cam_rad_s)
+    return rates
+
+
+def test_a_rate_is_that_of_its_own_moment_and_the_shadow_switch_is_no_turn() -> None:
+    """A constant acceleration is followed exactly, which the last difference alone would miss by 0.01 * h / 2; steps vary."""
+    times_ns = [STEP_NS * k for k in (0, 1, 2, 4, 5, 9, 10, *range(11, 60))]
+    rates = turning(times_ns)
+    assert rates[:2] == [None, None]
+    for t_ns, rate in list(zip(times_ns, rates, strict=True))[2:]:
+        assert rate == pytest.approx([0, 0, 0.1 + 0.01 * t_ns / 1e9], abs=1e-11)
+
+
+def test_no_rate_across_a_silence_a_jump_or_a_restart() -> None:
+    k = [0, 1, 2, 20, 21, 22, 5, 6, 7]
+    known = [rate is not None for rate in turning([STEP_NS * each for each in k])]
+    assert known == [False, False, True, False, False, True, False, False, True]
+    assert turning([STEP_NS * each for each in range(4)], max_rate_rad_s=0.05) == [None] * 4
+
+
+# Which spacecraft
+
+
+def test_the_named_spacecraft_is_followed_and_without_a_name_the_only_one() -> None:
+    pair = [craft("a", (0.1, 0, 0)), craft("b", (0, 0.1, 0)), craft("panel", (0, 0, 0.1), parentSpacecraftName="a")]
+    assert rotation_of(taken(viz_message(spacecraft=pair), follower("b"))).as_mrp()[1] == pytest.approx(-0.1)
+    assert rotation_of(taken(viz_message(spacecraft=pair), follower("panel"))).as_mrp()[2] == pytest.approx(-0.1)
+    assert rotation_of(taken(viz_message(spacecraft=pair[::2]))).as_mrp()[0] == pytest.approx(-0.1)
+
+
+@pytest.mark.parametrize(
+    ("names", "wanted", "words"),
+    [
+        (["a", "b"], None, 'spacecraft: a, b; write the one that is meant, [attitude] spacecraft = "NAME"'),
+        ([], None, "spacecraft: none; write"),
+        (["a"], "c", "spacecraft = c: 0 have that name; there: a"),
+        (["a", "a"], "a", "spacecraft = a: 2 have that name"),
+        (["", "\x1b[2J"], None, "spacecraft: one without a name, \\x1b[2J; write"),
+    ],
+)
+def test_any_other_choice_is_refused_by_the_names_that_are_there(names, wanted, words) -> None:
+    refusal = taken(viz_message(spacecraft=[craft(name) for name in names]), follower(wanted))
+    assert isinstance(refusal, Refusal)
+    assert refusal.reason == "format"
+    assert words in refusal.detail
+
+
+# Bytes that are none
+
+
+@pytest.mark.parametrize(
+    ("message", "reason", "words"),
+    [
+        (b"", "format", "no currentTime"),
+        (viz_message(None, [craft()]), "format", "no currentTime"),
+        (viz_message(float("nan"), [craft()]), "format", "simTimeElapsed nan"),
+        (viz_message(1e30, [craft()]), "format", "simTimeElapsed 1e+30"),
+        (viz_message(spacecraft=[craft(sigma=())]), "format", "0 components of its rotation"),
+        (viz_message(spacecraft=[craft(sigma=(1, 2))]), "format", "2 components of its rotation"),
+        (viz_message(spacecraft=[craft(sigma=(1, 2, 3, 4))]), "format", "over 3 components"),
+        (viz_message(spacecraft=[craft(sigma=(float("nan"), 0, 0))]), "nan", "not finite"),
+        (viz_message(spacecraft=[craft(sigma=(float("inf"), 0, 0))]), "nan", "not finite"),
+        (b"\x0a\xff\xff\xff\xff\x0f", "format", "4294967295 bytes announced, 0 there"),
+        (b"\x08" + b"\xff" * 11, "format", "longer than 10 bytes"),
+        (b"\x00\x01", "format", "a field of number 0"),
+        (b"\x0b", "format", "wire type 3"),
+        (b"\x08\x05", "format", "wire type 0 where a message or a text is wanted"),
+        (b"\x0a\x02\x10\x05", "format", "wire type 0 where a double is wanted"),
+        (b"\x1a\x03\x22\x01\x00", "format", "1 bytes of doubles"),
+        (b"\x10\x01" * (MAX_FIELDS + 1), "format", f"over {MAX_FIELDS} fields"),
+        ((b"\x1a\x7e" + b"\x28\x01" * 63) * 30_000, "format", f"over {MAX_FIELDS} fields"),
+        (b"\x1a\x80\x80\x80\x01" + b"\x22\xf8\xff\x7f" + bytes(2**21 - 4), "format", "bytes of numbers where a few are"),
+    ],
+)
+def test_what_is_no_message_is_refused_with_what_is_wrong(message: bytes, reason: str, words: str) -> None:
+    begun_s = time.monotonic()
+    refusal = taken(message)
+    assert isinstance(refusal, Refusal)
+    assert refusal.reason == reason
+    assert words in refusal.detail
+    assert time.monotonic() - begun_s < QUICK_S
+
+
+def test_a_message_that_is_cut_short_anywhere_gives_no_other_attitude() -> None:
+    """Where it is cut between fields it may still be whole: then what is left is unchanged."""
+    message = viz_message(spacecraft=[craft()], cameras=[{"cameraID": 1, "resolution": [8, 9], "cameraDir_B": [0, 0, 0]}])
+    whole = rotation_of(taken(message))
+    for end in range(len(message)):
+        event = taken(message[:end])
+        assert isinstance(event, Refusal) or (rotation_of(event) * whole.inv()).magnitude() < ROUNDING_RAD
+
+
+@given(st.binary(max_size=200))
+def test_any_bytes_give_one_event(noise: bytes) -> None:
+    for message in (noise, viz_message(spacecraft=[craft()]) + noise, b"\x1a" + bytes([len(noise) % 128]) + noise):
+        assert isinstance(taken(message), AttitudeSample | Refusal)
+
+
+def test_an_mrp_of_any_length_is_a_unit_quaternion(rng: np.random.Generator) -> None:
+    for length in (0.0, 1e-300, 1e-8, 1.0, 1e8, 1e160, 1e300):
+        sigma = rng.normal(size=3)
+        sigma *= length / np.linalg.norm(sigma)
+        assert np.linalg.norm(quaternion_of_mrp(tuple(sigma.tolist()))) == pytest.approx(1, abs=1e-15)
+
+
+def test_old_encoders_that_do_not_pack_are_read_too() -> None:
+    sigma = b"".join(b"\x21" + np.array([c], "<f8").tobytes() for c in (0.1, 0.2, 0.3))
+    unpacked = viz_message() + b"\x1a" + bytes([len(sigma) + 3]) + b"\x0a\x01a" + sigma
+    packed = viz_message(spacecraft=[craft("a")])
+    assert (rotation_of(taken(unpacked)) * rotation_of(taken(packed)).inv()).magnitude() < ROUNDING_RAD
+
+
+# Links and cameras
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ([b"SIM_UPDATE", b"x"], b"x"),
+        ([b"SIM_UPDATE", b"", b"", b"x"], b"x"),
+        ([b"SIM_UPDATE"], None),
+        ([b"SIM_UPDATE", b"y", b"x"], None),
+        ([b"SIM_UPDATES", b"x"], None),
+        ([b"SYNC_SETTINGS", b"x"], None),
+    ],
+)
+def test_a_message_is_the_last_part_after_the_word(parts, message) -> None:
+    assert update_of(parts) == message
+
+
+def test_another_machine_is_refused_with_the_way_round() -> None:
+    check_loopback("tcp://127.0.0.1:5570")
+    with pytest.raises(InputError, match=r"ssh -L 5570:127\.0\.0\.1:5570 HOST"):
+        check_loopback("tcp://192.168.1.2:5570")
+
+
+def test_a_camera_that_is_not_the_bench_s_tracker_is_told_by_what_differs() -> None:
+    """Its mounting goes out as Unity's; here it comes back, by SciPy."""
+    pose = Rotation.from_quat([0.6, 0.48, 0.64, 0.0], scalar_first=True)
+    to_unity = Rotation.from_mrp([1 / 3, 1 / 3, -1 / 3]).inv()
+    sent = {"cameraID": 4, "fieldOfView": 10.0, "resolution": [1024, 512], "cameraDir_B": (to_unity * pose).inv().as_mrp()}
+    (camera,) = decode_update(viz_message(spacecraft=[craft()], cameras=[sent])).cameras
+    mounted = q_body_to_cam(camera)
+    assert mounted is not None
+    assert (Rotation.from_quat(mounted, scalar_first=True) * pose.inv()).magnitude() < ROUNDING_RAD
+    assert disagreement(camera, TrackerCamera(mounted, (1024, 512), 10.05)) is None
+    turned = (Rotation.from_rotvec([0, 0, np.radians(0.1)]) * pose).as_quat(scalar_first=True)
+    told = disagreement(camera, TrackerCamera(turned, (1024, 1024), 20.0))
+    assert told is not None
+    for words in ("camera 4", "0.1 deg from the bench's", "1024 x 512 px, not 1024 x 1024", "10 deg, not 20"):
+        assert words in told

@@ -42,7 +42,8 @@ class Frame:
 
     `linear` is float32 (height, width), electrons per second; `levels`, uint8 or uint16 of the same shape, are indices into
     the response's table; `codes` are the code values, the same array or with bit stealing (height, width, 3);
-    `truth` is a structured array of TRUTH_DTYPE, a row for each star whose sprite touches the monitor.
+    `truth` is a structured array of TRUTH_DTYPE, a row for each star whose sprite touches the monitor, and `star` (n,) the
+    places of the same stars in the bench's.
     """
 
     q_icrs_to_cam: FloatArray
@@ -50,6 +51,7 @@ class Frame:
     levels: Codes
     codes: Codes
     truth: npt.NDArray[np.void]
+    star: IntArray
 
 
 class Drawn:
@@ -191,7 +193,8 @@ class Bench:
         truth = truth_table(self.stars, sprites.star, sprites.x_px, sprites.y_px)
         truth["drawn"] = truth["electrons_per_s"] >= self.faintest_shown_e_per_s
         truth["clipped"][self._clipped(sprites)] = True
-        return Frame(q, linear, levels, self.code_values(levels), truth[np.argsort(truth["v_mag"], kind="stable")])
+        order = np.argsort(truth["v_mag"], kind="stable")
+        return Frame(q, linear, levels, self.code_values(levels), truth[order], sprites.star[order])
 
     def losses_mag(self, frame: Frame) -> dict[int, float]:
         """For each clipped star of a frame (by HIP number), how many magnitudes too faint it is, summed over its own pixels."""

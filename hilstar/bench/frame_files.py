@@ -94,14 +94,14 @@ def lens_error_px(camera: Camera) -> float:
 
 
 def write_truth_csv(path: Path, frame: Frame) -> None:
-    """One row per star: the columns of TRUTH_DTYPE, brightest first; drawn and clipped are 1 or 0."""
+    """One row per star: the columns of TRUTH_DTYPE, brightest first; drawn and clipped are 1 or 0, an unknown figure is nan."""
 
     def write(part: Path) -> None:
         with part.open("w", encoding="ascii", newline="") as file:
             writer = csv.writer(file, lineterminator="\n")
             writer.writerow(frame.truth.dtype.names or ())
             for row in frame.truth.tolist():
-                writer.writerow([int(v) if isinstance(v, bool) else repr(v) for v in row])
+                writer.writerow([int(v) if isinstance(v, bool) else v for v in row])
 
     written(path, write)
 

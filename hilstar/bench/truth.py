@@ -19,6 +19,11 @@ TRUTH_DTYPE = np.dtype(
         ("electrons_per_s", "f8"),
         ("drawn", "?"),
         ("clipped", "?"),
+        ("variable", "U1"),
+        ("range_mag", "f8"),
+        ("period_d", "f8"),
+        ("double", "U1"),
+        ("separation_arcsec", "f8"),
     ]
 )
 
@@ -32,4 +37,11 @@ def truth_table(stars: Stars, star: IntArray, x_px: FloatArray, y_px: FloatArray
     truth["temperature_k"] = stars.temperature_k[star]
     truth["electrons_per_s"] = stars.electrons_per_s[star]
     truth["drawn"] = True
+    listed = stars.row[star] >= 0
+    row, catalog = stars.row[star[listed]], stars.catalog
+    truth["variable"][listed], truth["double"][listed] = catalog.variable[row], catalog.multiple[row]
+    for name in ("range_mag", "period_d", "separation_arcsec"):
+        truth[name] = np.nan
+        # Back to the catalogue's decimals from float32.
+        truth[name][listed] = np.round(getattr(catalog, name)[row].astype(np.float64), 3)
     return truth

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hilstar.arrays import FloatArray
-from hilstar.sky.catalog import HIPPARCOS_EPOCH_JYEAR, Catalog
+from hilstar.sky.catalog import Catalog
 from hilstar.units import LIGHT_KM_S
 
 RAD_PER_MAS = np.pi / (180 * 3600 * 1000)
@@ -14,13 +14,13 @@ RAD_PER_MAS = np.pi / (180 * 3600 * 1000)
 def unit_vectors_icrs(catalog: Catalog, epoch_jyear: float) -> FloatArray:
     """ICRS unit vectors of the catalogue's stars at `epoch_jyear`, shape (n, 3).
 
-    Each star moves in a straight line in space at right angles to its direction of J1991.25 (parallax
+    Each star moves in a straight line in space at right angles to its direction at its catalogue's epoch (parallax
     and radial velocity zero): u = unit(u0 + t (mu_alpha* p + mu_delta q)), ESA SP-1200 vol. 1 eq. 1.2.17.
     Nothing divides by cos(dec), so the poles are ordinary points.
     """
     ra, dec = np.radians(catalog.ra_deg), np.radians(catalog.dec_deg)
     sin_ra, cos_ra, sin_dec, cos_dec = np.sin(ra), np.cos(ra), np.sin(dec), np.cos(dec)
-    years = epoch_jyear - HIPPARCOS_EPOCH_JYEAR
+    years = epoch_jyear - catalog.epoch_jyear
     east = (catalog.pm_ra_cosdec_mas_yr * RAD_PER_MAS * years)[:, None]
     north = (catalog.pm_dec_mas_yr * RAD_PER_MAS * years)[:, None]
     u0 = np.column_stack((cos_dec * cos_ra, cos_dec * sin_ra, sin_dec))

@@ -7,14 +7,17 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.arrays import FloatArray
+from hilstar.arrays import FloatArray, IntArray
 from hilstar.sky.catalog import Catalog
 from hilstar.sky.cells import CellGrid, cell_grid
 
 
 @dataclass(frozen=True, slots=True)
 class Stars:
-    """Stars in the order of `grid`; `vectors` (n, 3) are ICRS unit vectors, the rest has shape (n,)."""
+    """Stars in the order of `grid`; `vectors` (n, 3) are ICRS unit vectors, the rest has shape (n,).
+
+    `row` is each star's place in `catalog`, which has what no frame needs; -1 for what is in no catalogue.
+    """
 
     hip: npt.NDArray[np.int32]
     vectors: FloatArray
@@ -23,6 +26,8 @@ class Stars:
     temperature_k: FloatArray
     electrons_per_s: FloatArray
     grid: CellGrid
+    catalog: Catalog
+    row: IntArray
 
     def __len__(self) -> int:
         return len(self.hip)
@@ -48,6 +53,8 @@ def _selected(stars: Stars, kept: npt.NDArray[np.bool_]) -> Stars:
         temperature_k=stars.temperature_k[order],
         electrons_per_s=stars.electrons_per_s[order],
         grid=grid,
+        catalog=stars.catalog,
+        row=stars.row[order],
     )
 
 
@@ -63,4 +70,6 @@ def make_stars(catalog: Catalog, vectors: FloatArray, temperature_k: FloatArray,
         temperature_k=temperature_k[order],
         electrons_per_s=electrons_per_s[order],
         grid=grid,
+        catalog=catalog,
+        row=order,
     )

@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from hilstar.scene.sprites import SPRITE_DTYPE, Sprites
-from hilstar.sky.catalog import FIELDS, Catalog
+from hilstar.sky.catalog import plain_catalog
 from hilstar.sky.stars import Stars, make_stars
 
 
 def stars_at(vectors: np.ndarray, electrons_per_s: np.ndarray) -> Stars:
     """Stars of 5000 K in the directions `vectors` (n, 3), ICRS."""
     n = len(vectors)
-    zeros = {name: np.zeros(n) for name in FIELDS}
-    catalog = Catalog(**(zeros | {"hip": np.arange(n, dtype=np.int32)}), rows_read=n)
+    zero = np.zeros(n)
+    catalog = plain_catalog("HIP", n, {"hip": np.arange(n, dtype=np.int32), "v_mag": zero, "ra_deg": zero, "dec_deg": zero})
     vectors = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
     return make_stars(catalog, vectors, np.full(n, 5000.0), electrons_per_s)
 

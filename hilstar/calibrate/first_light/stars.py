@@ -107,9 +107,7 @@ def _fullest(bench: Bench) -> list[Frame]:
 def _alone(bench: Bench, room: Room, frame: Frame) -> Wanted:
     """The stars of a frame that are drawn whole and stand alone, where the tracker should see them."""
     camera = tracker_camera(room.file.config.tracker, room.file.folder)
-    truth, stars = frame.truth, bench.stars
-    order = np.argsort(stars.hip)
-    vectors = stars.vectors[order[np.searchsorted(stars.hip, truth["hip"], sorter=order)]]
+    truth, vectors = frame.truth, bench.stars.vectors[frame.star]
     place = np.stack(camera.project(vectors @ to_matrix(frame.q_icrs_to_cam).T), axis=1)
     width, height = camera.resolution_px
     screen = np.stack([truth["x_px"], truth["y_px"]], axis=1)

@@ -48,7 +48,7 @@ def scene(bench: Bench, every: Stars, q_icrs_to_cam: FloatArray, count: int, rng
 def _sorted(every: Stars, sources: IntArray, vectors: FloatArray) -> Stars:
     """Stars at `vectors` (n, 3) that are otherwise those of `every` at `sources` (n,), by cell."""
     grid = cell_grid(vectors)
-    names = [field.name for field in fields(Stars) if field.name not in ("grid", "vectors")]
+    names = [field.name for field in fields(Stars) if field.name not in ("grid", "vectors", "catalog")]
     columns = {name: getattr(every, name)[sources[grid.order]] for name in names}
     return replace(every, vectors=np.ascontiguousarray(vectors[grid.order]), grid=grid, **columns)
 

@@ -27,7 +27,7 @@ from hilstar.study.tradeoff.demo import (
 )
 from hilstar.study.tradeoff.table import Figure, Trial, Trials
 
-STAR_COLUMNS = ("hip", "vectors", "v_mag", "bv_mag", "temperature_k", "electrons_per_s")
+STAR_COLUMNS = ("hip", "vectors", "v_mag", "bv_mag", "temperature_k", "electrons_per_s", "row")
 CELLS_DEG = (1.0, 2.0, 3.0, 4.0, 6.0, 10.0, 20.0)
 
 

@@ -17,8 +17,8 @@ from hilstar.render.variants import SplatVariant, VariantRenderer
 from hilstar.scene.exposure_motion import MIDDLE_S, Motion, smeared_sprites
 from hilstar.scene.psf import footprint_px
 from hilstar.scene.sprites import Sprites, pack_sprites
-from hilstar.sky.cells import cell_grid
-from hilstar.sky.stars import Stars
+from hilstar.sky.catalog import plain_catalog
+from hilstar.sky.stars import Stars, make_stars
 from hilstar.study.shared.predictors import ORION
 from hilstar.study.tradeoff.demo import demo_config
 from hilstar.study.tradeoff.table import Figure, Trial, Trials
@@ -85,9 +85,9 @@ def grid_stars(across: int, motion: Motion) -> Stars:
     x_px, y_px = (axis.ravel() - (SIZE_PX - 1) / 2 for axis in np.meshgrid(place, place))
     image = np.column_stack([x_px, y_px, np.full(across**2, CAMERA.focal_length_px)])
     vectors = image / np.linalg.norm(image, axis=1, keepdims=True) @ motion.icrs_to_image(MIDDLE_S, CAMERA)[0]
-    grid = cell_grid(vectors)
     zero = np.zeros(across**2)
-    return Stars(np.arange(across**2, dtype=np.int32), vectors[grid.order], zero, zero, zero, zero + 1, grid)
+    catalog = plain_catalog("star", across**2, {"v_mag": zero, "ra_deg": zero, "dec_deg": zero})
+    return make_stars(catalog, vectors, zero, zero + 1)
 
 
 def path_lengths_px(stars: Stars, motion: Motion) -> FloatArray:

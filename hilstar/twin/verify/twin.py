@@ -75,13 +75,8 @@ class Twin:
         lights = exposure_lights(self.bench, frame, first_frame, panels)
         shown = self.true_optics.image_e_per_s(lights[0]) * exposure_s
         assumed = self.sky_optics.image_e_per_s(lights[1]) * exposure_s if self.differs else shown
-        x_px, y_px = self.camera.project(self._vectors(frame.truth["hip"]) @ to_matrix(frame.q_icrs_to_cam).T)
+        x_px, y_px = self.camera.project(self.bench.stars.vectors[frame.star] @ to_matrix(frame.q_icrs_to_cam).T)
         return Field(shown, assumed, sky, frame.truth, x_px, y_px)
-
-    def _vectors(self, hip: npt.NDArray[np.int32]) -> FloatArray:
-        stars = self.bench.stars
-        order = np.argsort(stars.hip)
-        return np.asarray(stars.vectors[order[np.searchsorted(stars.hip, hip, sorter=order)]])
 
     def detected_e(self, seen: Field, rng: np.random.Generator) -> FloatArray:
         """Electrons of one noisy exposure (h, w) as the DN give them, the mean of glow and background subtracted."""

@@ -58,7 +58,8 @@ def test_orion_is_the_right_way_up(orion):
 def test_the_frame_s_files_agree_with_each_other(orion):
     folder, summary = orion
     rows = read_truth(folder / "o.csv")
-    assert list(rows[0]) == ["hip", "x_px", "y_px", "v_mag", "bv", "temperature_k", "electrons_per_s", "drawn", "clipped"]
+    first = ["hip", "x_px", "y_px", "v_mag", "bv", "temperature_k", "electrons_per_s", "drawn", "clipped"]
+    assert list(rows[0]) == [*first, "variable", "range_mag", "period_d", "double", "separation_arcsec"]
     with fits.open(folder / "o.fits") as hdus:
         linear, header = hdus[0].data, hdus[0].header
         assert linear.dtype == np.dtype(">f4")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hilstar.errors import InputError
-from hilstar.sky.catalog import COLUMN_COUNT, PACKAGED_CATALOG, load_catalog
+from hilstar.sky.catalog import COLUMN_COUNT, PACKAGED_CATALOG, load_catalog, plain_catalog
 
 # Rows 1 and 2 of CDS I/239 and HIP 32349 (Sirius), as they stand in the file.
 ROWS = (
@@ -21,6 +21,9 @@ ROWS = (
     "0.021| | 0.999|0.002|G|1.04|0.00|I| | 9.4017|0.0017|0.015|120| | 9.37| 9.44|       |C| | |          | |  | 1|O| | |  |"
     "   |       |     |     |    | | | |224690|B-20 6688 |          |          |1.04|K3V         |4 ",
 )
+
+# Of the 116 812 stars that are used: types P, U and M of field H52, and those with a separation in field H64.
+VARIABLES, RESOLVED = 11_189, 10_860
 
 
 def with_field(row: str, column: int, text: str) -> str:
@@ -92,6 +95,8 @@ def test_a_missing_v_minus_i_is_nan(tmp_path):
         (with_field(ROWS[0], 5, "-1000000") + "\n", "write a number from -30 to 40"),
         (with_field(ROWS[0], 1, "9" * 11) + "\n", "field 1 (hip)"),
         (with_field(ROWS[0], 1, "1" * 100_000) + "\n", "field 1 (hip) is '1111"),
+        (with_field(ROWS[0], 52, "PP") + "\n", "field 52 (variable) is 'PP'"),
+        (with_field(ROWS[0], 64, "-1") + "\n", "field 64 (separation_arcsec)"),
         (with_field(ROWS[0], 12, "1e9") + "\n", "field 12 (pm_ra_cosdec_mas_yr)"),
     ],
 )
@@ -102,3 +107,27 @@ def test_a_file_that_is_no_catalogue_is_refused(tmp_path, text, words):
     with pytest.raises(InputError) as refusal:
         load_catalog(path)
     assert words in str(refusal.value)
+
+
+def test_variables_and_doubles_are_as_the_catalogue_has_them():
+    """CDS I/239, fields H49 to H52, H59 and H64 of Algol, Mira, Mizar and Vega."""
+    catalog = load_catalog()
+    rows = {int(hip): row for row, hip in enumerate(catalog.hip)}
+    algol, mira, mizar, vega = (rows[hip] for hip in (14576, 10826, 65378, 91262))
+    assert catalog.variable[[algol, mira, mizar, vega]].tolist() == [b"P", b"P", b"", b"U"]
+    assert catalog.period_d[mira] == pytest.approx(333.80)
+    assert catalog.range_mag[[algol, mira]] == pytest.approx([0.14, 3.64])
+    assert np.isnan([catalog.range_mag[mizar], catalog.period_d[algol]]).all()
+    assert catalog.multiple[[algol, mira, mizar]].tolist() == [b"O", b"", b"C"]
+    assert catalog.separation_arcsec[mizar] == pytest.approx(14.431)
+    assert (catalog.variable != b"").sum() == VARIABLES
+    assert np.isfinite(catalog.separation_arcsec).sum() == RESOLVED
+
+
+def test_a_star_is_called_by_its_catalogue():
+    zero = np.zeros(2)
+    columns = {"v_mag": zero, "ra_deg": zero, "dec_deg": zero}
+    tycho = plain_catalog("TYC", 2, columns | {"identifier": np.array([9_537_003_861, 1_000_133])})
+    gaia = plain_catalog("Gaia DR3", 2, columns | {"identifier": np.array([4_295_806_720, 2**62]), "hip": np.array([0, 7])})
+    assert [tycho.name(row) for row in range(2)] == ["TYC 9537-386-1", "TYC 1-13-3"]
+    assert [gaia.name(row) for row in range(2)] == ["Gaia DR3 4295806720", "HIP 7"]

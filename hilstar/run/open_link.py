@@ -7,6 +7,8 @@ from pathlib import Path
 
 from hilstar.attitude.wire.keys import CurveKeys
 from hilstar.attitude.wire.links import StreamLink
+from hilstar.attitude.wire.nasa42.messages import MessageReader
+from hilstar.attitude.wire.nasa42.tcp_link import Nasa42Link, Nasa42Lockstep
 from hilstar.attitude.wire.serial_link import SerialLink
 from hilstar.attitude.wire.source import Mounting
 from hilstar.attitude.wire.udp.udp_link import UdpLink
@@ -16,7 +18,7 @@ from hilstar.attitude.wire.vizard.live import VizardLive
 from hilstar.attitude.wire.zmq_lockstep import ZmqLockstep
 from hilstar.attitude.wire.zmq_stream import ZmqReceiver
 from hilstar.bench.config import AttitudeSettings, BenchConfig
-from hilstar.bench.config.road import udp_road
+from hilstar.bench.config.road import nasa42_road, udp_road
 from hilstar.notices import Notices
 from hilstar.units import NS_PER_MS
 
@@ -38,6 +40,8 @@ def open_link(config: BenchConfig, folder: Path, notices: Notices | None = None)
         return UdpLink(*udp_road(settings), notices)
     if settings.source == "vizard":
         return _open_vizard(config, notices)
+    if settings.source == "42":
+        return _open_42(config, notices)
     keys = link_keys(settings, folder)
     if settings.lockstep:
         return ZmqLockstep(settings.address, bind=settings.bind is not False, keys=keys, notices=notices)
@@ -47,7 +51,16 @@ def open_link(config: BenchConfig, folder: Path, notices: Notices | None = None)
 def _open_vizard(config: BenchConfig, notices: Notices | None) -> VizardBroadcast | VizardLive:
     settings = config.attitude
     rates = DifferenceRates(round(settings.stale_after_ms * NS_PER_MS), math.radians(settings.max_rate_deg_s))
-    follower = Follower(settings.spacecraft, Mounting(config.tracker.q_body_to_cam), rates)
+    name = None if settings.spacecraft is None else str(settings.spacecraft)
+    follower = Follower(name, Mounting(config.tracker.q_body_to_cam), rates)
     if settings.lockstep:
         return VizardLive(settings.address, follower, bind=settings.bind is not False, notices=notices)
     return VizardBroadcast(settings.address, follower, bind=settings.bind is True, notices=notices)
+
+
+def _open_42(config: BenchConfig, notices: Notices | None) -> Nasa42Link:
+    settings = config.attitude
+    spacecraft, allowed = nasa42_road(settings)
+    reader = MessageReader(spacecraft, Mounting(config.tracker.q_body_to_cam))
+    kind = Nasa42Lockstep if settings.lockstep else Nasa42Link
+    return kind(settings.address, reader, bind=settings.bind is True, allowed=allowed, notices=notices)

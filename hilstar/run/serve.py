@@ -12,6 +12,7 @@ from hilstar.attitude.back_channel import Traffic
 from hilstar.attitude.clock.timeline import Timeline
 from hilstar.attitude.receiver import PacketCounts, Receiver, nobody_watches
 from hilstar.attitude.wire.links import StreamLink
+from hilstar.attitude.wire.nasa42.tcp_link import Nasa42Lockstep
 from hilstar.attitude.wire.source import Mounting
 from hilstar.attitude.wire.vizard.camera import TrackerCamera
 from hilstar.attitude.wire.vizard.live import VizardLive
@@ -21,6 +22,7 @@ from hilstar.bench.frame import Bench
 from hilstar.notices import Notices
 from hilstar.process.interrupts import stop_on_signal
 from hilstar.run.frame_status import StatusMaker
+from hilstar.run.lockstep.nasa42 import serve_nasa42
 from hilstar.run.lockstep.packets import serve_lockstep
 from hilstar.run.lockstep.vizard import Cameras, Pictures, serve_vizard
 from hilstar.run.loop import FrameLoop, Limit, policy_of
@@ -68,6 +70,9 @@ def serve(bench: Bench, link: AnyLink, limit: Limit, sink: FrameSink = ignore, o
             bench.warm_up()
             cameras = Cameras(_tracker_camera(bench), outlet.pictures, outlet.notices)
             summary = serve_vizard(bench, link, limit, loop, cameras, ledger)
+        elif isinstance(link, Nasa42Lockstep):
+            bench.warm_up()
+            summary = serve_nasa42(bench, link, limit, loop, ledger)
         else:
             summary = _serve_stream(bench, link, limit, loop, outlet)
     told: dict[str, str | int] = {"endpoint": link.endpoint}

@@ -14,6 +14,8 @@ ENDPOINTS = {
     ("zmq", True): "tcp://127.0.0.1:5560",
     ("vizard", False): "tcp://127.0.0.1:5570",  # where Basilisk broadcasts, and where it looks for Vizard
     ("vizard", True): "tcp://127.0.0.1:5556",
+    ("42", False): "tcp://127.0.0.1:10001",  # of 42's own Inp_IPC.txt
+    ("42", True): "tcp://127.0.0.1:10001",
 }
 
 
@@ -28,11 +30,11 @@ class AttitudeSettings(Table, frozen=True):
     """
 
     source: Annotated[
-        Literal["zmq", "serial", "udp", "vizard"],
+        Literal["zmq", "serial", "udp", "vizard", "42"],
         Meta(
             description='`"zmq"`: packets or JSON over ZeroMQ. `"serial"`: COBS frames over a serial line. `"udp"`: a packet '
-            "or JSON in each datagram. `\"vizard\"`: Basilisk's Vizard stream; its attitude is the body's (`[tracker] "
-            "q_body_to_cam`)."
+            'or JSON in each datagram. `"vizard"`: Basilisk\'s Vizard stream, and `"42"`: the text '
+            "stream of NASA's 42; their attitude is the body's (`[tracker] q_body_to_cam`)."
         ),
     ] = "zmq"
     endpoint: Annotated[
@@ -41,23 +43,26 @@ class AttitudeSettings(Table, frozen=True):
             description="ZeroMQ and Vizard: the address to which hilstar's SUB socket connects. `tcp://HOST:PORT`, where HOST "
             "is an IPv4 address, an IPv6 address in brackets, or a name (when hilstar binds also `*`, and PORT may be `*` for "
             "a free one, which is then reported), or `ipc:///WHOLE/PATH`. Basilisk has no keys: its endpoint is on this "
-            "machine. UDP: `udp://ADDRESS:PORT`, another way to write `bind`.",
-            extra={"default": "`tcp://127.0.0.1:5560`; of Vizard `tcp://127.0.0.1:5570`, in lockstep `tcp://127.0.0.1:5556`"},
+            "machine. UDP: `udp://ADDRESS:PORT`, another way to write `bind`. 42: where its socket is, when it is the server.",
+            extra={
+                "default": "`tcp://127.0.0.1:5560`; of Vizard `tcp://127.0.0.1:5570`, in lockstep `tcp://127.0.0.1:5556`; of 42 "
+                "`tcp://127.0.0.1:10001`"
+            },
         ),
     ] = None
     bind: Annotated[
         bool | str | None,
         Meta(
-            description="ZeroMQ and Vizard: `true` when hilstar binds and the sender connects. UDP: the address and port that "
-            'hilstar listens on, `"ADDRESS"`, `"ADDRESS:PORT"` or `"[IPv6]:PORT"` (port 0: a free one, which is reported).',
+            description="ZeroMQ, Vizard and 42: `true` when hilstar binds and the sender connects. UDP: the address and port "
+            'that hilstar listens on, `"ADDRESS"`, `"ADDRESS:PORT"` or `"[IPv6]:PORT"` (port 0: a free one, which is reported).',
             extra={"default": '`false`; `true` in lockstep; `"127.0.0.1:5560"` over UDP'},
         ),
     ] = None
     allow: Annotated[
         tuple[str, ...],
         Meta(
-            description='UDP: who may send: addresses and networks, such as `["192.168.1.20", "fd00::/64"]`. Datagrams from '
-            "others are counted, and never answered.",
+            description='UDP, and 42 where hilstar binds: who may send: addresses and networks, such as `["192.168.1.20", '
+            '"fd00::/64"]`. What others send is counted, and never answered.',
             extra={"default": "this machine; required where `bind` is not loopback", "form": '["ADDRESS", ...]'},
         ),
     ] = ()
@@ -66,14 +71,15 @@ class AttitudeSettings(Table, frozen=True):
         Meta(
             description="ZeroMQ: `true` for a REP socket. Each request is one attitude and gets one frame and one reply, at "
             "whatever speed the sender has. Vizard: `true` for Basilisk's live stream instead of its broadcast; hilstar "
-            "stands in Vizard's place, and Basilisk's cameras get pictures of the virtual tracker."
+            "stands in Vizard's place, and Basilisk's cameras get pictures of the virtual tracker. 42: `true` to acknowledge each "
+            "message once its frame is out, so that 42 may run as fast as it can."
         ),
     ] = False
     spacecraft: Annotated[
-        str | None,
+        str | int | None,
         Meta(
-            description="Vizard: the name of the spacecraft that carries the tracker.",
-            extra={"default": "the only one that is there"},
+            description='Vizard: the name of the spacecraft that carries the tracker. 42: its number, such as `"SC[0]"`.',
+            extra={"default": 'the only one that is there; `"SC[0]"`'},
         ),
     ] = None
     curve_secret_key: Annotated[

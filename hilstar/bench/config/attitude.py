@@ -45,8 +45,8 @@ class AttitudeSettings(Table, frozen=True):
             "a free one, which is then reported), or `ipc:///WHOLE/PATH`. Basilisk has no keys: its endpoint is on this "
             "machine. UDP: `udp://ADDRESS:PORT`, another way to write `bind`. 42: where its socket is, when it is the server.",
             extra={
-                "default": "`tcp://127.0.0.1:5560`; of Vizard `tcp://127.0.0.1:5570`, in lockstep `tcp://127.0.0.1:5556`; of 42 "
-                "`tcp://127.0.0.1:10001`"
+                "default": "`tcp://127.0.0.1:5560`; of Vizard `tcp://127.0.0.1:5570`, in lockstep `tcp://127.0.0.1:5556`; of "
+                "42 `tcp://127.0.0.1:10001`"
             },
         ),
     ] = None
@@ -54,7 +54,7 @@ class AttitudeSettings(Table, frozen=True):
         bool | str | None,
         Meta(
             description="ZeroMQ, Vizard and 42: `true` when hilstar binds and the sender connects. UDP: the address and port "
-            'that hilstar listens on, `"ADDRESS"`, `"ADDRESS:PORT"` or `"[IPv6]:PORT"` (port 0: a free one, which is reported).',
+            'listened on, `"ADDRESS"`, `"ADDRESS:PORT"` or `"[IPv6]:PORT"` (port 0: a free one, which is reported).',
             extra={"default": '`false`; `true` in lockstep; `"127.0.0.1:5560"` over UDP'},
         ),
     ] = None
@@ -71,8 +71,8 @@ class AttitudeSettings(Table, frozen=True):
         Meta(
             description="ZeroMQ: `true` for a REP socket. Each request is one attitude and gets one frame and one reply, at "
             "whatever speed the sender has. Vizard: `true` for Basilisk's live stream instead of its broadcast; hilstar "
-            "stands in Vizard's place, and Basilisk's cameras get pictures of the virtual tracker. 42: `true` to acknowledge each "
-            "message once its frame is out, so that 42 may run as fast as it can."
+            "stands in Vizard's place, and Basilisk's cameras get pictures of the virtual tracker. 42: `true` to acknowledge "
+            "each message once its frame is out, so that 42 may run as fast as it can."
         ),
     ] = False
     spacecraft: Annotated[

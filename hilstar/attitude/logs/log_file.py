@@ -18,14 +18,14 @@ from hilstar.attitude.wire.packet import AttitudeSample, Refusal
 from hilstar.attitude.wire.source import PACKETS
 from hilstar.errors import InputError, MachineError
 from hilstar.files import whole_file
-from hilstar.reading import HEAD_BYTES, MCAP_MAGIC, ROSBAG_MAGIC, SQLITE_MAGIC, open_lines, open_regular, read_text
+from hilstar.reading import HEAD_BYTES, MCAP_MAGIC, ROSBAG_MAGIC, SQLITE_MAGIC, ULOG_MAGIC, open_lines, open_regular, read_text
 
 MAX_NAMED_TOPICS = 12
 MAX_LOG_BYTES = 500_000_000
 MAX_SAMPLES = 6_000_000  # 16 hours at 100 Hz; all are held, at 350 bytes each, so in 2 GB
 MAX_AEM_BYTES = 50_000_000
 NOTHING_STATED = Stated()
-READABLE = "hilstar reads CSV, JSON lines, CCSDS AEM (KVN or XML), MCAP and bags of ROS"
+READABLE = "hilstar reads CSV, JSON lines, CCSDS AEM (KVN or XML), MCAP, bags of ROS and ULogs of PX4"
 
 
 def read_log(path: Path) -> list[AttitudeSample]:
@@ -115,6 +115,9 @@ def _open_log(path: Path, stated: Stated) -> Iterator[LogReading]:
     if head.startswith(MCAP_MAGIC):
         yield _mcap(path)
         return
+    if head.startswith(ULOG_MAGIC):
+        yield _ulog(path, stated)
+        return
     with open_lines(path, READABLE, MAX_LOG_BYTES) as lines:
         word = _first_word(lines)
     if word.startswith("<") or word.startswith("CCSDS_AEM_VERS"):
@@ -184,6 +187,16 @@ def _aem(path: Path, text: str) -> LogReading:
         raise InputError(f"{path}{fault.where}: {fault}") from fault
     advice = "sort its lines, and let no blocks overlap; leap seconds are not counted, so write TAI across one"
     return LogReading(entries, CONVENTIONS, advice)
+
+
+def _ulog(path: Path, stated: Stated) -> LogReading:
+    try:
+        import pyulog  # noqa: F401
+    except ImportError as error:
+        raise MachineError(f"{path}: a ULog of PX4; reading it needs pyulog: pip install 'hilstar[px4]'") from error
+    from hilstar.attitude.logs.px4.reader import read_ulog
+
+    return read_ulog(path, stated)
 
 
 def _write_kvn(file: IO[bytes], samples: Sequence[AttitudeSample]) -> None:

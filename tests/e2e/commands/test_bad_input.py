@@ -127,7 +127,6 @@ def test_what_is_no_file_or_too_large_is_refused_wherever_a_file_is_named(tmp_pa
 @pytest.mark.parametrize(
     ("head", "words"),
     [
-        (b"ULog\x01\x12\x35\x01" + bytes(64), "a ULog file"),
         (b"DAF/CK  " + bytes(64), "a SPICE CK kernel"),
         (b"PK\x03\x04" + bytes(64), "a zip archive"),
         (b"\x1f\x8b\x08" + bytes(64), "a gzip file"),

@@ -14,6 +14,7 @@ NS_PER_MS = 1_000_000
 NS_PER_S = 1_000_000_000
 ARCSEC_PER_RAD = math.degrees(1.0) * 3600.0
 MAD_TO_SIGMA = 1.482602218505602  # from the median absolute deviation of a normal distribution: 1 / its upper quartile
+ERROR_OF_MEDIAN = math.sqrt(math.pi / 2)  # in those of the mean, for normal errors
 LIGHT_M_S = 299_792_458.0  # SI, exact
 LIGHT_KM_S = LIGHT_M_S / 1000.0
 MAG_PER_RELATIVE = 2.5 / math.log(10)  # a small relative error of a flux, in magnitudes

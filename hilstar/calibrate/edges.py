@@ -97,20 +97,23 @@ def square_edges(records: Iterable[RunRecord]) -> Edges:
 
     Raises InputError for a run without a frame, or without a square.
     """
-    swap_ns, level, last = array("q"), array("b"), None
+    swap_ns, level = array("q"), array("b")
     seen = False
     for record in records:
         if not isinstance(record, FrameRecord):
             continue
         seen = True
-        if record.marker is None:
-            continue
-        if last is not None and record.marker != last:
+        if record.marker is not None:
             swap_ns.append(record.swap_ns)
             level.append(record.marker)
-        last = record.marker
     if not seen:
         raise InputError(f"the run {NO_FRAMES}")
-    if last is None:
+    if not level:
         raise InputError("the run has no photodiode square; set [monitor] photodiode_px and run it on a screen")
-    return Edges(np.array(swap_ns, dtype=np.int64), np.array(level, dtype=np.int64))
+    return edges_of(np.array(swap_ns, dtype=np.int64), np.array(level, dtype=np.int64))
+
+
+def edges_of(swap_ns: IntArray, level: IntArray) -> Edges:
+    """Of frames, their swaps and the square's levels (n,) each, those that differ from the frame before."""
+    changed = np.flatnonzero(np.diff(level)) + 1
+    return Edges(swap_ns[changed], level[changed])

@@ -10,7 +10,7 @@ import numpy as np
 
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.bench.bench_file_edit import with_key
-from hilstar.bench.config import BenchConfig
+from hilstar.bench.config import BenchConfig, Monitor
 from hilstar.calibrate.edges import MIN_EDGES, Edges
 from hilstar.errors import InputError, shortened
 from hilstar.files import write_whole
@@ -133,8 +133,7 @@ def summarise(paired: Paired, config: BenchConfig) -> LatencySummary:
     """
     ms = paired.latency_ns / NS_PER_MS
     monitor = config.monitor
-    rows = monitor.resolution_px[0 if monitor.rotate_deg % 180 else 1]
-    to_square_ms = monitor.panel_scanout_ms * (1 - monitor.photodiode_px / 2 / rows)
+    to_square_ms = swap_to_square_ms(monitor)
     p1, p50, p99 = (float(value) for value in np.percentile(ms, [1, 50, 99]))
     rise, fall = ms[paired.level == 1], ms[paired.level == 0]
     return LatencySummary(
@@ -149,6 +148,12 @@ def summarise(paired: Paired, config: BenchConfig) -> LatencySummary:
         panel_delay_ms=p50 - to_square_ms,
         beat=beat(monitor.refresh_hz, config.tracker.exposure_s),
     )
+
+
+def swap_to_square_ms(monitor: Monitor) -> float:
+    """From the first row's light to that of the square's middle, at the foot of the screen, by the scan-out."""
+    rows = monitor.resolution_px[0 if monitor.rotate_deg % 180 else 1]
+    return monitor.panel_scanout_ms * (1 - monitor.photodiode_px / 2 / rows)
 
 
 def beat(refresh_hz: float, exposure_s: float) -> Beat:
@@ -166,17 +171,22 @@ def beat(refresh_hz: float, exposure_s: float) -> Beat:
     return Beat(refreshes, exposure_s / abs(rest) if abs(rest) > NO_BEAT else None, off_frames / refresh_hz * 3600.0)
 
 
-def write_panel_delay(path: Path, panel_delay_ms: float) -> None:
-    """Set `[monitor] panel_delay_ms` in a bench file and leave the rest unchanged.
-
-    Raises InputError where the light came before the scan-out that the file assumes, and for a file that cannot be changed.
-    """
+def checked_delay_ms(panel_delay_ms: float) -> float:
+    """The delay as a bench file has it. Raises InputError where the light came before the scan-out that the file assumes."""
     if panel_delay_ms < 0:
         raise InputError(
             f"the square lit {-panel_delay_ms:.2f} ms before the scan-out could reach it; set [monitor] scanout_ms to what the "
             "panel needs (0 where all rows light at once)"
         )
-    value = round(panel_delay_ms, 3)
+    return round(panel_delay_ms, 3)
+
+
+def write_panel_delay(path: Path, panel_delay_ms: float) -> None:
+    """Set `[monitor] panel_delay_ms` in a bench file and leave the rest unchanged.
+
+    Raises InputError where the light came before the scan-out that the file assumes, and for a file that cannot be changed.
+    """
+    value = checked_delay_ms(panel_delay_ms)
     try:
         text = read_text(path, "give the path of a bench file", MAX_TOML_BYTES)
         changed = with_key(text, "monitor", "panel_delay_ms", value)

@@ -31,7 +31,7 @@ def measure_latency(ledger: Path, edges: Edges, directory: Path | None) -> Laten
     paired = pair(edges, shown, NS_PER_S / config.monitor.refresh_hz)
     summary = summarise(paired, config)
     if directory is not None:
-        _draw(directory / "latency.png", paired, summary)
+        draw_latency(directory / "latency.png", paired, summary)
     return summary
 
 
@@ -55,7 +55,8 @@ def latency_lines(summary: LatencySummary) -> list[str]:
     return [f"{what:24}{how_much}" for what, how_much in figures.items()]
 
 
-def _draw(path: Path, paired: Paired, summary: LatencySummary) -> None:
+def draw_latency(path: Path, paired: Paired, summary: LatencySummary) -> None:
+    """The latencies of the edges, by their level."""
     middle, jitter = summary.latency_ms.p50, summary.jitter_ms
     with chart(path, f"From swap to light: {middle:.2f} ms, jitter {jitter:.3f} ms") as (axes,):
         ms = paired.latency_ns / NS_PER_MS

@@ -3,12 +3,21 @@
 from __future__ import annotations
 
 import json
+import re
+import subprocess
+import time
 
 import pytest
 
 from tests.support import plain_camera
 from tests.support.benches import TWIN, bench_text
-from tests.support.commands import run_hilstar
+from tests.support.commands import HILSTAR, run_hilstar
+from tests.support.wire.ptys import Cable
+from tests.support.x11.diode import Diode
+from tests.support.x11.events import client
+
+ADDED_MS = 25.0
+MEDIAN_MS = 4.0  # a swap is on Xvfb's screen within 2 ms; the diode is a thread here, and a busy machine holds it up
 
 
 def test_the_display_shows_each_pattern_while_the_command_runs(screen, tmp_path):
@@ -24,3 +33,74 @@ def test_the_display_shows_each_pattern_while_the_command_runs(screen, tmp_path)
     assert steps["orientation"]["figures"]["seen"] == "mirrored top to bottom"
     assert steps["geometry"]["figures"]["focal_length_px"] == pytest.approx(120e3 / 57.65, rel=1e-4)
     assert steps["verify"]["figures"]["star_rms_px"] < 0.05
+
+
+def told_by(process, word):
+    """The next line of a session's stderr that has a word; fails where the session ends before."""
+    for line in process.stderr:
+        if word in line:
+            return line
+    raise AssertionError(f"the session ended without {word!r}")
+
+
+def save(line, screen):
+    """Do what a session asks: save the tracker's image under the name that it says."""
+    plain_camera.take([str(screen.file), re.search(r"as (\S+\.png) ", line)[1], "--reversed"])
+
+
+def settled(screen):
+    """What is on the screen once something has been there for a while."""
+    for _ in range(100):
+        before = screen.pixels()
+        time.sleep(0.2)
+        if before.any() and (screen.pixels() == before).all():
+            return before
+    raise AssertionError("nothing stands still on the screen")
+
+
+def test_a_person_tells_the_mounting_by_a_key_and_saves_the_images(screen, tmp_path):
+    """The tracker's rows are reversed: the largest square is at the bottom left, which is the third of the keys."""
+    bench = tmp_path / "bench.toml"
+    bench.write_text(bench_text(TWIN, {"monitor": {"bits": 8}}))
+    command = [*HILSTAR, "first-light", str(bench), "-o", str(tmp_path / "s")]
+    with (
+        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=screen.env) as process,
+        client(screen.display) as user,
+    ):
+        try:
+            told_by(process, "now press")
+            legend = [process.stderr.readline() for _ in range(8)]
+            assert legend[2].strip().startswith("3  the largest square bottom left, the next one to its right, the smallest")
+            before = settled(screen)
+            user.press("3")
+            told_by(process, "now press")
+            assert (settled(screen)[::-1] == before).all()
+            user.press("1")
+            while "geometry-1/frame_000" not in (line := told_by(process, "now save")):
+                save(line, screen)
+            user.press("q")
+            assert process.wait(30) == 1
+        finally:
+            process.kill()
+    session = json.loads((tmp_path / "s" / "session.json").read_text())
+    steps = {step["name"]: step for step in session["steps"]}
+    assert steps["orientation"]["figures"] == {"seen": "mirrored top to bottom", "told_by": "a key"}
+    assert steps["focus"]["verdict"] == "done"
+    assert (session["running"], list(steps)) == ("geometry", ["machine", "display", "orientation", "focus"])
+    assert "flip_y = true" in bench.read_text()
+
+
+def test_the_delay_of_a_real_display_is_found_by_a_photodiode(screen, tmp_path):
+    """The command that takes images fails, so only what needs none is measured: what is added to the diode's line comes out."""
+    bench = tmp_path / "bench.toml"
+    bench.write_text(bench_text({"monitor": {"resolution_px": [640, 480], "photodiode_px": 40, "scanout_ms": 0}}))
+    with Cable(tmp_path) as cable, Diode(screen, cable.sender, ADDED_MS):
+        diode = f"serial:{cable.host}@921600"
+        words = ["first-light", bench, "-o", tmp_path / "s", "--grab", "false {output}", "--diode", diode, "--json"]
+        result = run_hilstar(*words, env=screen.env, timeout=120)
+    assert result.returncode == 1, result.stderr
+    steps = {step["name"]: step for step in json.loads(result.stdout)["steps"]}
+    assert steps["orientation"]["verdict"] == "failed"
+    assert steps["latency"]["verdict"] == "done", steps["latency"]["line"]
+    assert steps["latency"]["figures"]["panel_delay_ms"] == pytest.approx(ADDED_MS, abs=MEDIAN_MS)
+    assert f"panel_delay_ms = {steps['latency']['figures']['panel_delay_ms']}" in bench.read_text()

@@ -4,11 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
-import mmap
-import os
 import subprocess
-import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,6 +19,7 @@ from tests.support.benches import ATTITUDE, SCREEN_BENCH, still_log
 from tests.support.commands import HILSTAR, assert_refused, run_hilstar, run_hilstar_here
 from tests.support.waiting import real_time, wait_for
 from tests.support.wire.ptys import Cable
+from tests.support.x11.diode import Diode
 from tests.support.x11.screens import Screen, xvfb
 
 # The watcher looks every 0.2 ms or so, and sleeps between; a shared machine may keep it from that now and then.
@@ -43,44 +40,6 @@ def screen(tmp_path_factory) -> Iterator[Screen]:
         with real_time():
             running = stack.enter_context(xvfb(tmp_path_factory.mktemp("screen")))
         yield running
-
-
-class Diode:
-    """Watches the screen's bottom left pixel and tells of its edges on a serial line, `added_ms` late."""
-
-    def __init__(self, screen: Screen, line: Path, added_ms: float = 0.0, device_clock: bool = False) -> None:
-        self._file, self._line, self._added_s, self._device = screen.file, line, added_ms / 1e3, device_clock
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, daemon=True)
-
-    def _run(self) -> None:
-        with real_time():
-            self._watch()
-
-    def _watch(self) -> None:
-        with self._file.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as frame:
-            head = np.frombuffer(frame[:100], ">u4")
-            begin, height, row_bytes, colours = (int(head[k]) for k in (0, 5, 12, 19))
-            place = begin + 12 * colours + (height - 4) * row_bytes + 4 * 4
-            out = os.open(self._line, os.O_WRONLY | os.O_NOCTTY)
-            level, started_s = frame[place] > 127, time.monotonic()
-            while not self._stop.is_set():
-                if (frame[place] > 127) != level:
-                    seen_s = time.monotonic()
-                    level = not level
-                    stamp = f",{(seen_s - started_s + 1000 + self._added_s) * 1e6:.0f}" if self._device else ""
-                    time.sleep(0.001 if self._device else self._added_s)  # the line itself is late, the stamp is not
-                    os.write(out, f"{int(level)}{stamp}\n".encode())
-                time.sleep(0.0001)
-            os.close(out)
-
-    def __enter__(self):
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_):
-        self._stop.set()
-        self._thread.join()
 
 
 @contextmanager

@@ -19,8 +19,9 @@ MIN_PIXELS = 3
 MAX_MISFIT = 0.5  # of the nearest of the eight ways round: half way to another one is 1
 MAX_SCALE = 2.0
 MIN_SIZE_STEP = 1.3  # between the pixels of one square and the next
+UPRIGHT = (1, 0, 0, 1)
 WAYS = {
-    (1, 0, 0, 1): "upright",
+    UPRIGHT: "upright",
     (-1, 0, 0, 1): "mirrored left to right",
     (1, 0, 0, -1): "mirrored top to bottom",
     (-1, 0, 0, -1): "turned by 180 degrees",
@@ -29,6 +30,8 @@ WAYS = {
     (0, 1, 1, 0): "with columns and rows swapped",
     (0, -1, -1, 0): "with columns and rows swapped, and turned by 180 degrees",
 }
+CORNERS = {(-1, -1): "top left", (1, -1): "top right", (-1, 1): "bottom left", (1, 1): "bottom right"}
+SIDES = {(1, 0): "to its right", (-1, 0): "to its left", (0, 1): "below it", (0, -1): "above it"}
 NOT_SEEN = "show the monitor to the whole of the tracker's field, expose longer, and look at the focus"
 
 
@@ -76,6 +79,18 @@ def see_figure(image: FloatArray, figure: Figure, geometry: BenchGeometry) -> Se
     if np.linalg.norm(left - np.eye(2)) > MAX_MISFIT:
         raise InputError("the figure is turned by no right angle; turn the tracker or the screen to within 15 degrees")
     return SeenFigure(way, scale, float(np.degrees(np.arctan2(left[1, 0] - left[0, 1], left[0, 0] + left[1, 1]))), x_px, y_px)
+
+
+def keys_of_ways() -> dict[str, tuple[int, int, int, int]]:
+    """The key for each way round; the first is upright."""
+    return {str(number): way for number, way in enumerate(WAYS, start=1)}
+
+
+def look_of(way: tuple[int, int, int, int]) -> str:
+    """Where a person sees the figure's squares when it stands this way round."""
+    right, below = (way[0], way[2]), (way[1], way[3])
+    corner = CORNERS[-right[0] - below[0], -right[1] - below[1]]
+    return f"the largest square {corner}, the next one {SIDES[right]}, the smallest {SIDES[below]} ({WAYS[way]})"
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,10 +11,11 @@ import numpy as np
 from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.cameras import bench_camera, ideal_monitor, tracker_camera
-from hilstar.calibrate.first_light.eyes import Eyes
 from hilstar.calibrate.first_light.patterns import Pattern, black
 from hilstar.calibrate.first_light.records import Figure
-from hilstar.calibrate.first_light.virtual import VirtualBench
+from hilstar.calibrate.first_light.sight.eyes import Eyes
+from hilstar.calibrate.first_light.sight.hands import Hands
+from hilstar.calibrate.first_light.sight.virtual import VirtualBench
 from hilstar.calibrate.geometric.images import read_image
 from hilstar.errors import InputError
 from hilstar.files import make_directory
@@ -94,6 +95,13 @@ class Room:
         stem = self.folder / pattern.name
         return self.eyes.look(self.file, pattern, stem, self.exposure_s if exposure_s is None else exposure_s)
 
+    def take_or_key(self, pattern: Pattern, keys: Mapping[str, str]) -> Path | str:
+        """The tracker's image of a pattern, or, by hand, the key that tells how it was seen: `keys` has what each means."""
+        if isinstance(self.eyes, Hands) and pattern.name not in self.kept:
+            stem = make_directory(self.folder) / pattern.name
+            return self.eyes.look_or_key(self.file, pattern, stem, keys)
+        return self.take(pattern)
+
     def unlit(self) -> Path | None:
         """The tracker's image with the monitor switched off, None where there is none."""
         name = "unlit_000"
@@ -105,7 +113,10 @@ class Room:
 
     def look(self, pattern: Pattern, dark: FloatArray) -> Looked:
         """The tracker's image of a pattern, above its dark frame. Raises InputError for one that cannot be read."""
-        path = self.take(pattern)
+        return self.looked(self.take(pattern), dark)
+
+    def looked(self, path: Path, dark: FloatArray) -> Looked:
+        """An image of the tracker above its dark frame. Raises InputError for one that cannot be read."""
         raw = self.read(path)
         cold = dark < HOT_FILL * self.full_dn
         return Looked(path, raw - dark, float(raw[cold].max(initial=0.0)), float(np.median(dark)))

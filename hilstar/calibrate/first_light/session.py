@@ -20,8 +20,6 @@ import msgspec
 
 from hilstar import __version__
 from hilstar.bench.bench_file import BenchFile
-from hilstar.calibrate.first_light.display import Stopped
-from hilstar.calibrate.first_light.eyes import Eyes, NoImage, complete_images
 from hilstar.calibrate.first_light.records import (
     KIND,
     Figure,
@@ -34,7 +32,9 @@ from hilstar.calibrate.first_light.records import (
 )
 from hilstar.calibrate.first_light.rewrite import rewrite
 from hilstar.calibrate.first_light.rooms import Room
-from hilstar.calibrate.first_light.steps import light, look, measure, verify
+from hilstar.calibrate.first_light.sight.display import Stopped
+from hilstar.calibrate.first_light.sight.eyes import Eyes, NoImage, complete_images
+from hilstar.calibrate.first_light.steps import delay, lens, light, look, verify
 from hilstar.errors import HilstarError, InputError, MachineError, one_line
 
 BEFORE_FILE = "bench-before.toml"
@@ -73,7 +73,7 @@ STEPS = (
         "geometry",
         "frames of dots, each of which blinks its own code",
         "an image of each frame",
-        measure.geometry,
+        lens.geometry,
         needs=("orientation",),
         writes=("collimator.geometry",),
     ),
@@ -95,7 +95,15 @@ STEPS = (
         tables=("monitor", "collimator", "tracker", "sky", "render"),
         writes=("render.flux_at_white_e_per_s", "render.brightest_v_mag"),
     ),
-    Step("latency", "", "", measure.latency, tables=()),
+    Step(
+        "latency",
+        "the photodiode's square",
+        "its edges",
+        delay.latency,
+        needs=("display",),
+        tables=("monitor",),
+        writes=("monitor.panel_delay_ms",),
+    ),
     Step(
         "verify",
         "fields of stars",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -9,15 +10,27 @@ import msgspec
 import typer
 
 from hilstar.cli.options import MAX_SEED, BenchFile, Json, check_files
+from hilstar.cli.parsers import parse_serial
 from hilstar.console.terminal import print_json, say
 from hilstar.errors import InputError
 from hilstar.files import check_directory
 
 if TYPE_CHECKING:
     from hilstar.bench import bench_file as files
-    from hilstar.calibrate.first_light.eyes import Eyes
+    from hilstar.calibrate.first_light.sight.eyes import Eyes
 
 PATCHES = 96
+
+
+@dataclass(frozen=True, slots=True)
+class _Sources:
+    """The options that say where images come from."""
+
+    grab: str | None
+    virtual: Path | None
+    dark: Path | None
+    diode: str | None
+    seed: int
 
 
 def first_light(
@@ -30,7 +43,7 @@ def first_light(
         typer.Option(
             metavar="CMD",
             help="Command that takes the tracker's image: {output} is the file to write; {pattern}, where the command shows"
-            " the pattern itself, a picture of it.",
+            " the pattern itself, a picture of it; {exposure_s}, where it can be set, the exposure.",
         ),
     ] = None,
     virtual: Annotated[
@@ -40,6 +53,10 @@ def first_light(
     dark: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="The tracker's image with the monitor switched off, for the monitor's black level."),
+    ] = None,
+    diode: Annotated[
+        str | None,
+        typer.Option(metavar="serial:/dev/ttyX@BAUD", help="Photodiode before the display's square, for its delay."),
     ] = None,
     patches: Annotated[
         int | None,
@@ -51,27 +68,22 @@ def first_light(
     seed: Annotated[int, typer.Option(help="With --virtual: seed of the tracker's noise.", min=0, max=MAX_SEED)] = 0,
     as_json: Json = False,
 ) -> None:
-    """Bring up a bench: orientation, focus, geometry and verification, each step once, with a page at the end.
+    """Bring up a bench: mounting, focus, geometry, response, full scale, delay and verification, with a page at the end.
 
     Sets the bench file's keys; SESSION keeps the file as it was, the calibration files, session.json and first-light.html.
     """
     from hilstar.bench.bench_file import read_bench_file
     from hilstar.calibrate.first_light.page import write_page
     from hilstar.calibrate.first_light.session import BEFORE_FILE, NAMES, Session, alone_in
-    from hilstar.calibrate.geometric.images import read_image
     from hilstar.files import make_directory
 
     wrong = [name for name in again or [] if name not in NAMES]
     if wrong:
         raise InputError(f"--again {wrong[0]}: write one of {', '.join(NAMES)}")
-    if grab is not None and virtual is not None:
-        raise InputError("--grab and --virtual: the images come from one of them; leave the other out")
     check_directory("-o", output)
     file = read_bench_file(bench_file)
     check_files([virtual, dark], [], file)
-    if dark is not None:
-        read_image(dark, file.config.tracker.resolution_px)
-    eyes = _eyes(file, grab, virtual, seed, dark)
+    eyes = _eyes(file, _Sources(grab, virtual, dark, diode, seed))
     by_hand = grab is None and virtual is None
     readings = (0 if by_hand else PATCHES) if patches is None else patches
     try:
@@ -91,12 +103,24 @@ def first_light(
         raise typer.Exit(code)
 
 
-def _eyes(file: files.BenchFile, grab: str | None, virtual: Path | None, seed: int, dark: Path | None) -> Eyes:
-    """Where the images come from."""
+def _eyes(file: files.BenchFile, sources: _Sources) -> Eyes:
+    """Where the images come from. Raises InputError for sources that do not go together."""
     from hilstar.bench.bench_file import read_bench_file
-    from hilstar.calibrate.first_light.eyes import Grabber, Hands
-    from hilstar.calibrate.first_light.virtual import VirtualBench
+    from hilstar.calibrate.first_light.sight.diode import SerialDiode
+    from hilstar.calibrate.first_light.sight.grabber import Grabber
+    from hilstar.calibrate.first_light.sight.hands import Hands
+    from hilstar.calibrate.first_light.sight.virtual import VirtualBench
+    from hilstar.calibrate.geometric.images import read_image
 
-    if virtual is not None:
-        return VirtualBench(file, read_bench_file(virtual), seed)
-    return Hands(dark) if grab is None else Grabber(grab, dark)
+    if sources.virtual is not None:
+        for name in ("grab", "dark", "diode"):
+            if getattr(sources, name) is not None:
+                raise InputError(f"--{name} and --virtual: a virtual bench has its own; leave one of them out")
+        return VirtualBench(file, read_bench_file(sources.virtual), sources.seed)
+    if sources.dark is not None:
+        read_image(sources.dark, file.config.tracker.resolution_px)
+    port = None if sources.diode is None else parse_serial(sources.diode, "--diode")
+    if sources.diode is not None and port is None:
+        raise InputError(f"--diode {sources.diode}: write serial:/dev/ttyX@BAUD, such as serial:/dev/ttyACM0@115200")
+    diode = None if port is None else SerialDiode(*port)
+    return Hands(sources.dark, diode) if sources.grab is None else Grabber(sources.grab, sources.dark, diode)

@@ -29,7 +29,7 @@ from tests.support import plain_camera
 from tests.support.benches import TWIN, bench_text
 from tests.support.commands import HILSTAR, assert_refused, run_hilstar_here
 
-GAMMA_22 = {"monitor": {"calibration": "gamma2.2"}}
+GAMMA_22 = {"monitor": {"calibration": "gamma2.2", "photodiode_px": 40}}
 NOTES = Notes({}, ErrorTable(), MadeTable(by="planted", when="2026-11-21", poses=1))
 STEPS = ["machine", "display", "orientation", "focus", "geometry", "photometry", "scale", "latency", "verify"]
 FEW = ["--patches", 30]  # 12 levels
@@ -37,6 +37,7 @@ NONE = ["--patches", 0]
 GAMMA, BLACK, WHITE_E_PER_S = 2.35, 1 / 800, 2.5e6
 # `calibrate photometric` states the error of 12 levels at 3 decades below white as 0.4 %; the tracker's whole DN add as much.
 RESPONSE_MAG = 0.01
+DELAY_MS, EDGE_MS = 12.5, 0.05  # an edge's jitter of 0.1 ms leaves 0.01 in the median of 150
 SCALE_MAG = 0.005  # 20 stars or more, each within 0.01 mag
 # The tracker's pixel is 107 arcsec. Held-out dots of this bench are 0.2 arcsec rms off; outside the tracker's field, which is
 # a third of the screen, nothing is measured and the lens is extrapolated.
@@ -45,13 +46,13 @@ SEEN_SHARE = 0.6  # of the screen's width and height, about its middle: what the
 
 
 def plant(folder, **monitor):
-    """A bench file, and a truth of which it knows nothing: mirror, lens, tilt, centre, focal length, response, full scale."""
+    """A bench file, and a truth of which it knows nothing: mirror, lens, tilt, centre, focal length, light, and delay."""
     (folder / "bench.toml").write_text(bench_text(TWIN, GAMMA_22))
     head = Head("photometric", "planted", "2026-11-22", "none", "relative", 10, "true-response.csv")
     light = {"w": BLACK + gamma_response(10, GAMMA).light}
     write_calibration(folder / "true-response.toml", head, light, 0.0, NotesTable())
     changed = {
-        "monitor": {"calibration": "true-response.toml"} | monitor,
+        "monitor": {"calibration": "true-response.toml", "panel_delay_ms": DELAY_MS} | monitor,
         "collimator": {"geometry": "true.toml"},
         "render": {"flux_at_white_e_per_s": WHITE_E_PER_S},
     }
@@ -102,8 +103,8 @@ def whole(tmp_path_factory):
 
 def test_a_wrong_response_fails_the_light_and_not_the_places(whole):
     _, _, before = whole
-    assert {before[name]["verdict"] for name in ("geometry", "photometry", "scale", "verify")} == {"done", "skipped", "failed"}
-    assert (before["scale"]["verdict"], before["verify"]["verdict"]) == ("failed", "failed")
+    verdicts = {name: before[name]["verdict"] for name in ("geometry", "photometry", "scale", "verify")}
+    assert verdicts == {"geometry": "done", "photometry": "skipped", "scale": "failed", "verify": "failed"}
     assert "photometry" in before["scale"]["line"]
     figures = before["verify"]["figures"]
     assert figures["star_p95_px"] < 0.1  # [verify] centroid_px
@@ -121,10 +122,12 @@ def test_the_response_and_the_full_scale_are_found_and_mended(whole):
     assert light["bench_file_off_max_mag"] > 0.3
     assert light["truth_max_mag"] < RESPONSE_MAG
     assert steps["scale"]["figures"]["flux_at_white_e_per_s"] == pytest.approx(WHITE_E_PER_S, rel=SCALE_MAG)
+    assert steps["latency"]["figures"]["panel_delay_ms"] == pytest.approx(DELAY_MS, abs=EDGE_MS)
     figures = steps["verify"]["figures"]
     assert max(figures["flux_p95_mag"], figures["twin_flux_p95_mag"]) < 0.05
     config = read_bench_file(folder / "bench.toml").config
     assert config.monitor.calibration == "s/response.toml"
+    assert config.monitor.panel_delay_ms == pytest.approx(DELAY_MS, abs=EDGE_MS)
     assert config.render.flux_at_white_e_per_s == pytest.approx(WHITE_E_PER_S, rel=SCALE_MAG)
 
 
@@ -139,6 +142,7 @@ def test_a_whole_virtual_session_finds_mirror_and_lens(whole):
         "geometry",
         "photometry",
         "scale",
+        "latency",
         "verify",
     }
     assert steps["orientation"]["figures"]["seen"] == "mirrored left to right"
@@ -153,7 +157,7 @@ def test_the_page_needs_nothing_beside_it(whole):
     folder, found, _ = whole
     page = (folder / "s" / "first-light.html").read_text()
     assert not re.search(r"(src|href)=['\"](?!data:|#)", page)
-    assert page.count("data:image/png;base64,") == 8
+    assert page.count("data:image/png;base64,") == 9
     for step in found["steps"]:
         assert f'id="{step["name"]}"' in page
     assert found["bench_sha256"] in page
@@ -258,6 +262,8 @@ def test_a_command_that_fails_is_a_failed_step_and_what_needs_it_is_not_done(tmp
         (["--virtual", "none.toml"], ["none.toml"]),
         (["--grab", "cp {output}", "--dark", "none.fits"], ["none.fits"]),
         (["--patches", "-1"], ["--patches"]),
+        (["--grab", "cp {output}", "--diode", "tcp://x"], ["--diode", "serial:"]),
+        (["--virtual", "truth.toml", "--dark", "truth.toml"], ["--dark and --virtual"]),
         (["--virtual", "small.toml"], ["small.toml", "screen"]),
     ],
 )

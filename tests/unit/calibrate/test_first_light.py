@@ -10,13 +10,14 @@ from scipy.special import ndtr
 
 from hilstar.bench.bench_file import read_bench_file
 from hilstar.calibrate.first_light import session as sessions
-from hilstar.calibrate.first_light.eyes import Grabber, NoImage
 from hilstar.calibrate.first_light.focus import sharpness
-from hilstar.calibrate.first_light.orientation import WAYS, Mounting, corrected, see_figure
+from hilstar.calibrate.first_light.orientation import WAYS, Mounting, corrected, keys_of_ways, look_of, see_figure
 from hilstar.calibrate.first_light.patterns import Pattern, black, figure_for, off_screen, on_screen
 from hilstar.calibrate.first_light.records import Change, Outcome
 from hilstar.calibrate.first_light.rewrite import rewrite
 from hilstar.calibrate.first_light.session import Session, Step
+from hilstar.calibrate.first_light.sight.eyes import NoImage
+from hilstar.calibrate.first_light.sight.grabber import Grabber
 from hilstar.errors import InputError
 from hilstar.monitor.geometry import monitor_camera
 from hilstar.render.presenter import Orientation
@@ -71,6 +72,16 @@ def test_the_figure_tells_each_way_round_and_the_mounting_that_mends_it(way):
         # What the tracker sees is the optics' own matrix times the mounting's; the corrected one leaves the identity.
         optics = np.array(way).reshape(2, 2) @ np.linalg.inv(mounting.matrix)
         assert np.allclose(optics @ corrected(mounting, way).matrix, np.eye(2))
+
+
+@pytest.mark.parametrize("key", keys_of_ways())
+def test_a_key_says_where_the_squares_of_its_way_round_are(key):
+    way = keys_of_ways()[key]
+    corner, right, below = (np.array(way).reshape(2, 2) @ place for place in ([-1, -1], [1, -1], [-1, 1]))
+    words = look_of(way)
+    assert f"largest square {'top' if corner[1] < 0 else 'bottom'} {'left' if corner[0] < 0 else 'right'}," in words
+    sides = {(2, 0): "to its right", (-2, 0): "to its left", (0, 2): "below it", (0, -2): "above it"}
+    assert f"next one {sides[tuple(right - corner)]}, the smallest {sides[tuple(below - corner)]}" in words
 
 
 def test_an_upright_figure_leaves_the_mounting_alone():

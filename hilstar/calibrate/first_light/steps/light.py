@@ -23,14 +23,13 @@ from hilstar.monitor.calibration import BUILT_IN, Calibration, load_calibration
 from hilstar.monitor.calibration_file import add_uniformity
 from hilstar.monitor.response import Response
 from hilstar.scene.psf import peak_share
-from hilstar.units import magnitude
+from hilstar.units import ERROR_OF_MEDIAN, magnitude
 
 SEED = 0
 PHOTOMETRY_FILES = ("measured.csv", "response.toml", "response.png", "response-before.png")
 MIN_LEVELS = 10  # as `calibrate photometric` needs
 DIM_LIGHT = 1e-3  # of white: how far down responses are compared
 AGREE_SIGMAS, AGREE_MAG = 3.0, 0.002  # less is no reason to change the bench file
-ERROR_OF_MEDIAN = 1.2533  # of a mean's, for normal errors: sqrt(pi / 2)
 
 
 def photometry(room: Room) -> Outcome:

@@ -2,11 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from hilstar.bench.bench_file import BenchFile
 from hilstar.calibrate.first_light.focus import Sharpness, sharpness
-from hilstar.calibrate.first_light.orientation import Mounting, SeenFigure, corrected, mounting_of, see_figure
+from hilstar.calibrate.first_light.orientation import (
+    UPRIGHT,
+    WAYS,
+    Mounting,
+    SeenFigure,
+    corrected,
+    keys_of_ways,
+    look_of,
+    mounting_of,
+    see_figure,
+)
 from hilstar.calibrate.first_light.patterns import Pattern, figure_for
 from hilstar.calibrate.first_light.pictures import draw_focus, draw_spots
 from hilstar.calibrate.first_light.records import Change, Figure, Outcome
@@ -48,28 +60,44 @@ def display(room: Room) -> Outcome:
 def orientation(room: Room) -> Outcome:
     """Find how the screen is mounted, set the bench file so, and see the figure upright. Raises InputError."""
     before = mounting_of(room.file.config.monitor)
-    first, looked = _seen_figure(room, "figure_000")
-    after = corrected(before, first.way)
-    changes = _mounting_changes(room.file, before, after)
-    seen = first
+    seen = first = _way(room, "figure_000")
+    changes = _mounting_changes(room.file, before, corrected(before, first.way))
     if changes:
         turned = room.with_file(with_changes(room.file, changes))
-        seen, looked = _seen_figure(turned, "figure_001")
-        if seen.words != "upright":
-            raise InputError(f"after {'; '.join(c.line for c in changes)} the figure is {seen.words}; is it the same screen?")
-    way = f"first {first.words}, now upright" if changes else "upright"
+        seen = _way(turned, "figure_001")
+        if seen.way != UPRIGHT:
+            made = "; ".join(change.line for change in changes)
+            raise InputError(f"after {made} the figure is {WAYS[seen.way]}; is it the same screen?")
+    way = f"first {WAYS[first.way]}, now upright" if changes else "upright"
+    if seen.measured is None:
+        figures: dict[str, Figure] = {"seen": WAYS[first.way], "told_by": "a key"}
+        return Outcome("done", f"{way}, as a person saw it", figures, changes=changes)
+    found, looked = seen.measured
     picture = room.session / "orientation.png"
-    draw_spots(picture, looked.image, seen.x_px, seen.y_px, f"the figure as the tracker sees it: {way}")
-    figures: dict[str, Figure] = {"seen": first.words, "scale": seen.scale, "turn_deg": seen.turn_deg}
-    line = f"{way}, {seen.scale:.4f} of the expected size, turned by {seen.turn_deg:+.2f} deg"
+    draw_spots(picture, looked.image, found.x_px, found.y_px, f"the figure as the tracker sees it: {way}")
+    figures = {"seen": WAYS[first.way], "scale": found.scale, "turn_deg": found.turn_deg}
+    line = f"{way}, {found.scale:.4f} of the expected size, turned by {found.turn_deg:+.2f} deg"
     return Outcome("done", line, figures, (looked.path, picture), (picture,), changes)
 
 
-def _seen_figure(room: Room, name: str) -> tuple[SeenFigure, Looked]:
+@dataclass(frozen=True, slots=True)
+class _Seen:
+    """Which way round the figure stands; as it was measured, None where a person told it by a key."""
+
+    way: tuple[int, int, int, int]
+    measured: tuple[SeenFigure, Looked] | None
+
+
+def _way(room: Room, name: str) -> _Seen:
     geometry = room.geometry()
     figure = figure_for(geometry)
-    looked = room.look(figure.pattern(name, room.resolution_px, room.white), room.read(room.dark()))
-    return see_figure(looked.image, figure, geometry), looked
+    pattern, keys = figure.pattern(name, room.resolution_px, room.white), keys_of_ways()
+    told = room.take_or_key(pattern, {key: look_of(way) for key, way in keys.items()})
+    if isinstance(told, str):
+        return _Seen(keys[told], None)
+    looked = room.looked(told, room.read(room.dark()))
+    found = see_figure(looked.image, figure, geometry)
+    return _Seen(found.way, (found, looked))
 
 
 def _mounting_changes(file: BenchFile, before: Mounting, after: Mounting) -> tuple[Change, ...]:

@@ -1,60 +1,26 @@
-"""Where a session's images come from: a command of the user's own, a person who saves them, or the twin (see virtual)."""
+"""Images by a command of the user's own, for each pattern."""
 
 from __future__ import annotations
 
-import logging
 import shlex
 import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import IO, Protocol
+from typing import IO
 
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.frame_files import write_codes_png
 from hilstar.bench.orientation import orientation_of
-from hilstar.calibrate.first_light.display import Display
 from hilstar.calibrate.first_light.patterns import Pattern, on_screen
+from hilstar.calibrate.first_light.sight.diode import SerialDiode, Watched
+from hilstar.calibrate.first_light.sight.display import Display
+from hilstar.calibrate.first_light.sight.eyes import PATTERN_FILE, NoImage
 from hilstar.errors import InputError, shortened
 from hilstar.run.screen.gate import Timing
 
 GRAB_TIMEOUT_S = 120.0
-STILL_S = 0.5  # a file that has not grown for so long is complete
-ENDINGS = (".png", ".fits", ".fit", ".fts")
-PATTERN_FILE = "pattern.png"
-log = logging.getLogger(__name__)
-
-
-class NoImage(InputError):
-    """The image did not come: what was taken before it is good, and need not be taken again."""
-
-
-class Eyes(Protocol):
-    """Shows patterns to the tracker and brings back its images."""
-
-    @property
-    def identity(self) -> str:
-        """What the images come from, in words that change when it does."""
-
-    def gate(self, file: BenchFile) -> Timing | None:
-        """The display's timing, None where this program has no display. Raises MachineError."""
-
-    @property
-    def sets_exposure(self) -> bool:
-        """Whether `look` may ask for another exposure than the bench file's."""
-
-    def look(self, file: BenchFile, pattern: Pattern, stem: Path, exposure_s: float) -> Path:
-        """Show a pattern as the bench file's screen is mounted; the tracker's image, `stem` with an ending.
-
-        Raises NoImage where none comes.
-        """
-
-    def unlit(self, stem: Path) -> Path | None:
-        """The tracker's image with the monitor switched off, at the bench file's exposure; None where there is none."""
-
-    def close(self) -> None:
-        """Let go of the display."""
 
 
 class Grabber:
@@ -64,7 +30,7 @@ class Grabber:
     monitor switched off. Raises InputError for a command that has no {output}.
     """
 
-    def __init__(self, command: str, dark: Path | None = None) -> None:
+    def __init__(self, command: str, dark: Path | None = None, diode: SerialDiode | None = None) -> None:
         try:
             self._words = shlex.split(command)
         except ValueError as error:
@@ -73,7 +39,7 @@ class Grabber:
             raise InputError(f"--grab {command}: has no {{output}}; write where your command takes the file's name")
         self._shows = any("{pattern}" in word for word in self._words)
         self.sets_exposure = any("{exposure_s}" in word for word in self._words)
-        self._dark = dark
+        self._dark, self._diode = dark, diode
         self.identity = f"grab: {command}"
         self._display = Display()
 
@@ -99,6 +65,10 @@ class Grabber:
         else:
             _run(words, output, lambda done: self._display.show_until(file, pattern, done))
         return output
+
+    def diode(self, file: BenchFile, seconds: float) -> Watched | None:
+        """By the photodiode that the user named, on this program's own display."""
+        return None if self._diode is None or self._shows else self._diode.watch(self._display, file, seconds)
 
     def close(self) -> None:
         """Close the window."""
@@ -155,53 +125,3 @@ def _start(words: list[str], said: IO[bytes]) -> subprocess.Popen[bytes]:
 def _wait(done: Callable[[], bool]) -> None:
     while not done():
         time.sleep(0.005)
-
-
-class Hands:
-    """Images that a person saves: each pattern stays on the display until its file is there."""
-
-    identity = "by hand"
-    sets_exposure = True
-
-    def __init__(self, dark: Path | None = None) -> None:
-        self._display, self._dark = Display(), dark
-
-    def gate(self, file: BenchFile) -> Timing | None:
-        """The display's timing."""
-        return self._display.gate(file)
-
-    def unlit(self, stem: Path) -> Path | None:
-        """The image that the user gave, if any."""
-        return self._dark
-
-    def look(self, file: BenchFile, pattern: Pattern, stem: Path, exposure_s: float) -> Path:
-        """Wait for the image of the pattern, complete."""
-        exposed = "" if exposure_s == file.config.tracker.exposure_s else f", exposed for {exposure_s:.4g} s,"
-        log.warning("now save the tracker's image%s as %s.png (or .fits); q on the display ends", exposed, stem)
-        found: list[Path] = []
-
-        def done() -> bool:
-            found[:] = [path for path in (stem.with_name(stem.name + end) for end in ENDINGS) if _is_complete(path)]
-            return bool(found)
-
-        self._display.show_until(file, pattern, done)
-        return found[0]
-
-    def close(self) -> None:
-        """Close the window."""
-        self._display.close()
-
-
-def _is_complete(path: Path) -> bool:
-    try:
-        status = path.stat()
-    except OSError:
-        return False
-    return status.st_size > 0 and time.time() - status.st_mtime > STILL_S
-
-
-def complete_images(folder: Path) -> dict[str, Path]:
-    """The images in a directory by their names without ending, but for the newest, which may have been cut short."""
-    found = [path for path in folder.glob("*") if path.suffix in ENDINGS and path.name != PATTERN_FILE]
-    found.sort(key=lambda path: path.stat().st_mtime_ns)
-    return {path.stem: path for path in found[:-1]}

@@ -6,22 +6,29 @@ import zlib
 from pathlib import Path
 
 import numpy as np
+from msgspec.structs import replace
 
 from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import open_bench
 from hilstar.bench.cameras import tracker_camera
 from hilstar.bench.orientation import orientation_of
+from hilstar.calibrate.edges import Edges, edges_of
 from hilstar.calibrate.first_light.patterns import CodeImage, Pattern, off_screen, on_screen
+from hilstar.calibrate.first_light.sight.diode import KIND, Watched
+from hilstar.calibrate.latency import swap_to_square_ms
 from hilstar.errors import InputError
 from hilstar.files import written
 from hilstar.monitor.quantise import shown_light
 from hilstar.run.screen.gate import Timing
+from hilstar.run.screen.photodiode import marker_light
 from hilstar.tracker.detector import Detector
 from hilstar.twin.bench_geometry import BenchGeometry
 from hilstar.twin.optics import TwinOptics
 from hilstar.twin.simulator import background_e
+from hilstar.units import NS_PER_MS, NS_PER_S
 
+SWAP_JITTER_NS, DIODE_JITTER_NS = 20_000, 100_000
 MASKS_KEPT = 8  # of patterns: as many as one step repeats in other codes
 
 
@@ -60,6 +67,18 @@ class VirtualBench:
     def unlit(self, stem: Path) -> Path | None:
         """The tracker's image of a monitor that is switched off."""
         return self._exposed(np.zeros_like(self._glow_e_per_s), self.truth.config.tracker.exposure_s, stem)
+
+    def diode(self, file: BenchFile, seconds: float) -> Watched | None:
+        """A photodiode of the twin's: the delay of the truth's panel and its scan-out, and a little jitter."""
+        rng = np.random.default_rng((self._seed, zlib.crc32(b"diode")))
+        frames = int(seconds * file.config.monitor.refresh_hz)
+        period_ns = NS_PER_S / file.config.monitor.refresh_hz
+        swap_ns = np.rint(np.arange(frames) * period_ns + rng.normal(0, SWAP_JITTER_NS, frames)).astype(np.int64)
+        shown = edges_of(swap_ns, np.array([marker_light(number, KIND) for number in range(frames)]))
+        monitor = replace(self.truth.config.monitor, photodiode_px=file.config.monitor.photodiode_px)
+        delay_ns = (monitor.panel_delay_ms + swap_to_square_ms(monitor)) * NS_PER_MS
+        late_ns = delay_ns + rng.normal(0, DIODE_JITTER_NS, len(shown.host_ns))
+        return Watched(shown, Edges(shown.host_ns + np.rint(late_ns).astype(np.int64), shown.level))
 
     def _exposed(self, light_e_per_s: FloatArray, exposure_s: float, stem: Path) -> Path:
         from PIL import Image

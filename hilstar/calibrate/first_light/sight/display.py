@@ -7,9 +7,12 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
+import numpy as np
+
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import open_bench
 from hilstar.bench.orientation import orientation_of
+from hilstar.calibrate.edges import Edges, edges_of
 from hilstar.calibrate.first_light.patterns import Pattern
 from hilstar.errors import HilstarError, MachineError
 from hilstar.render.presenter import Presenter, View, level_texture, window_context
@@ -31,6 +34,13 @@ class Stopped(HilstarError):
     exit_code = 1
 
 
+def _go_on(window: Window, stopped: bool) -> None:
+    if window.gone is not None:
+        raise MachineError(window.gone)
+    if window.closing or stopped:
+        raise Stopped("stopped at the display; run the same command again to go on")
+
+
 class Display:
     """The window on the bench's display, opened with the first pattern. Free it with `close`, or use it as a context."""
 
@@ -48,8 +58,10 @@ class Display:
         except MachineError as error:
             raise MachineError(f"{str(error).removesuffix('; or add --force')}; {SHOW_YOURSELF}") from error
 
-    def show_until(self, file: BenchFile, pattern: Pattern, done: Callable[[], bool]) -> None:
-        """Show a pattern until `done`, which is first asked when the panel has settled.
+    def show_until(
+        self, file: BenchFile, pattern: Pattern, done: Callable[[], bool], on_key: Callable[[str], object] = lambda key: None
+    ) -> None:
+        """Show a pattern until `done`, which is first asked when the panel has settled; `on_key` is told of keys.
 
         Raises Stopped where the window is closed, MachineError where the display goes away.
         """
@@ -59,19 +71,41 @@ class Display:
         texture = level_texture(window_context(), pattern.codes)
         presenter = Presenter(texture, view)
         start_s = time.monotonic()
+        window.keys.clear()  # of the pattern before
         try:
             while time.monotonic() - start_s < SETTLE_S or not done():
                 presenter.present()
                 window.swap()
                 window.look_at_events()
-                if window.gone is not None:
-                    raise MachineError(window.gone)
-                if window.closing or any(key in {"q", "escape"} for key in window.keys):
-                    raise Stopped("stopped at the display; run the same command again to go on")
-                window.keys.clear()
+                _go_on(window, bool({"q", "escape"} & set(window.keys)))
+                while window.keys:
+                    on_key(window.keys.popleft())
                 time.sleep(POLL_S)
         finally:
             texture.release()
+
+    def blink(self, file: BenchFile, begin: Callable[[], Callable[[], bool]]) -> Edges:
+        """Show the photodiode's square on black, frame by frame: its changes. Raises Stopped, MachineError.
+
+        `begin` is called once the display has been timed, and gives back what tells that it is enough.
+        """
+        window = self._window_for(file)
+        period_s = 1.0 / file.config.monitor.refresh_hz
+        swap_ns: list[int] = []
+        light: list[int] = []
+        with open_bench(file, window_context()) as bench:
+            screen = Screen(window, bench)
+            pass_gate(screen, force=False)
+            bench.draw(None)
+            due_s, done = time.monotonic(), begin()
+            while not done():
+                light.append(screen.present(len(light)) or 0)
+                if not screen.clock.paced_by_screen:
+                    due_s += period_s
+                    time.sleep(max(due_s - time.monotonic(), 0.0))
+                swap_ns.append(screen.swap())
+                _go_on(window, screen.closing)
+        return edges_of(np.array(swap_ns, dtype=np.int64), np.array(light, dtype=np.int64))
 
     def _window_for(self, file: BenchFile) -> Window:
         from hilstar.monitor.window.window import Window, WindowSettings

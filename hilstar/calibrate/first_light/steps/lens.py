@@ -1,4 +1,4 @@
-"""The steps that measure: geometry, photometry, scale, latency, and the delay."""
+"""The step of geometry: lens, tilt and alignment by dots."""
 
 from __future__ import annotations
 
@@ -60,9 +60,3 @@ def _geometry_figures(summary: GeometricSummary) -> dict[str, Figure]:
         **found,
         "notes": "; ".join(summary.notes) or "none",
     }
-
-
-def latency(room: Room) -> Outcome:
-    """Say how the delay is measured, which takes a photodiode and a run with a ledger."""
-    how = "`hilstar serve ... --ledger RUN.mcap`, then `hilstar latency RUN.mcap --diode ... --write` the bench file"
-    return Outcome("skipped", f"not measured: it takes a photodiode and a run; run {how}")

@@ -6,9 +6,10 @@ if TYPE_CHECKING:
     from hilstar.bench.build import load
     from hilstar.bench.frame import Bench, Drawn, Frame
     from hilstar.errors import HilstarError, InputError, MachineError
+    from hilstar.run.send.python_sender import Sender
 
 __version__ = "0.1.0"
-__all__ = ["Bench", "Drawn", "Frame", "HilstarError", "InputError", "MachineError", "load"]
+__all__ = ["Bench", "Drawn", "Frame", "HilstarError", "InputError", "MachineError", "Sender", "load"]
 
 
 def __getattr__(name: str) -> Any:
@@ -19,6 +20,10 @@ def __getattr__(name: str) -> Any:
 
     if hasattr(errors, name):
         return getattr(errors, name)
+    if name == "Sender":  # a simulator draws nothing
+        from hilstar.run.send.python_sender import Sender
+
+        return Sender
     from hilstar.bench import build, frame
 
     return getattr(build if name == "load" else frame, name)

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 
 SPIN_AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 MAX_SPIN_RAD_S = 1e6
-DEFAULT_BAUD = 115_200
 SPIN_FORM = "--spin AXIS,DEG_PER_S, AXIS being x, y, z or three numbers (cam axes), such as --spin z,0.5"
 SPEED_FORM = "write --speed realtime, max, or a number such as 2 or 0.5"
 SPLIT_FORM = "write a size or a time, such as 1GB, 200MB, 1h or 30min; 1 MB or 10 s at minimum"
@@ -78,16 +77,6 @@ def parse_spin(text: str) -> FloatArray:
     if len(vector) != 3 or not (abs(rate) <= MAX_SPIN_RAD_S and 0 < length < math.inf):
         raise InputError(f"--spin {text}: write {SPIN_FORM}")
     return np.asarray(vector / length * rate)
-
-
-def parse_serial(text: str, option: str) -> tuple[str, int] | None:
-    """Port and baud rate of "serial:/dev/ttyX@BAUD"; None for any other target. Raises InputError."""
-    if not text.startswith("serial:"):
-        return None
-    match = re.fullmatch(r"serial:(.+?)(?:@(\d{1,8}))?", text)
-    if match is None or not match[1] or "@" in match[1] or (match[2] and not int(match[2])):
-        raise InputError(f"{option} {text}: write serial:/dev/ttyX@BAUD, such as serial:/dev/ttyUSB0@921600")
-    return match[1], int(match[2] or DEFAULT_BAUD)
 
 
 def parse_place(text: str | None) -> tuple[float, float, float] | None:

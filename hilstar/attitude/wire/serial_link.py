@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import select
 import termios
 import time
@@ -22,12 +23,23 @@ from hilstar.errors import InputError, one_line
 from hilstar.notices import Notices
 from hilstar.units import NS_PER_S
 
+DEFAULT_BAUD = 115_200
 MIN_BACK_OFF_S = 0.05
 MAX_BACK_OFF_S = 0.4  # a device that comes back is opened within a second
 MAX_READ_BYTES = 65_536  # in one go
 MAX_DRAIN_S = 0.5
 BITS_PER_BYTE = 10  # 8N1
 FRAMING_BYTES = 2  # the COBS byte and the 0x00
+
+
+def serial_target(text: str) -> tuple[str, int] | None:
+    """Port and baud rate of "serial:/dev/ttyX@BAUD"; None for any other target. Raises InputError."""
+    if not text.startswith("serial:"):
+        return None
+    match = re.fullmatch(r"serial:(.+?)(?:@(\d{1,8}))?", text)
+    if match is None or not match[1] or "@" in match[1] or (match[2] and not int(match[2])):
+        raise InputError(f"{text}: write serial:/dev/ttyX@BAUD, such as serial:/dev/ttyUSB0@921600")
+    return match[1], int(match[2] or DEFAULT_BAUD)
 
 
 def serial_ports() -> list[str]:

@@ -10,7 +10,6 @@ import msgspec
 import typer
 
 from hilstar.cli.options import MAX_SEED, BenchFile, Json, check_files
-from hilstar.cli.parsers import parse_serial
 from hilstar.console.terminal import print_json, say
 from hilstar.errors import InputError
 from hilstar.files import check_directory
@@ -105,6 +104,7 @@ def first_light(
 
 def _eyes(file: files.BenchFile, sources: _Sources) -> Eyes:
     """Where the images come from. Raises InputError for sources that do not go together."""
+    from hilstar.attitude.wire.serial_link import serial_target
     from hilstar.bench.bench_file import read_bench_file
     from hilstar.calibrate.first_light.sight.diode import SerialDiode
     from hilstar.calibrate.first_light.sight.grabber import Grabber
@@ -119,7 +119,7 @@ def _eyes(file: files.BenchFile, sources: _Sources) -> Eyes:
         return VirtualBench(file, read_bench_file(sources.virtual), sources.seed)
     if sources.dark is not None:
         read_image(sources.dark, file.config.tracker.resolution_px)
-    port = None if sources.diode is None else parse_serial(sources.diode, "--diode")
+    port = None if sources.diode is None else serial_target(sources.diode)
     if sources.diode is not None and port is None:
         raise InputError(f"--diode {sources.diode}: write serial:/dev/ttyX@BAUD, such as serial:/dev/ttyACM0@115200")
     diode = None if port is None else SerialDiode(*port)

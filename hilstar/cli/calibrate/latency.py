@@ -10,7 +10,6 @@ from typing import Annotated
 import typer
 
 from hilstar.cli.options import Json, Overwrite, RunFile, check_files
-from hilstar.cli.parsers import parse_serial
 from hilstar.console.terminal import print_json
 from hilstar.errors import InputError
 from hilstar.files import CSV, check_directory, check_ending
@@ -32,6 +31,7 @@ def latency(
     as_json: Json = False,
 ) -> None:
     """Measure the latency from swap to light, by a photodiode over the screen's square and the run's ledger."""
+    from hilstar.attitude.wire.serial_link import serial_target
     from hilstar.calibrate.edges import capture_edges, read_edges, save_edges
     from hilstar.calibrate.latency import write_panel_delay
     from hilstar.calibrate.latency_report import latency_lines, measure_latency
@@ -45,7 +45,7 @@ def latency(
     if diode is None:
         found = read_edges(edges or Path())
     else:
-        port = parse_serial(diode, "--diode")
+        port = serial_target(diode)
         if port is None:
             raise InputError(f"--diode {diode}: write serial:/dev/ttyX@BAUD, such as serial:/dev/ttyACM0@115200")
         found = capture_edges(*port, duration)

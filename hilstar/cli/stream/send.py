@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from hilstar.cli.options import LOG_HELP, MAX_SEED, Json, MountingText, RadecText
-from hilstar.cli.parsers import parse_mounting, parse_radec, parse_serial, parse_share, parse_spin
+from hilstar.cli.parsers import parse_mounting, parse_radec, parse_share, parse_spin
 from hilstar.console.terminal import print_json, progress, say
 from hilstar.errors import InputError
 from hilstar.process.interrupts import stop_on_signal
@@ -72,7 +72,7 @@ def send(
         samples = until(samples, duration)
     stop = threading.Event()
     keys = CurveKeys(secret_key, server_key, allowed_clients)
-    with open_sender(to, parse_serial(to, "--to"), connect=connect, keys=keys) as link, stop_on_signal(stop):
+    with open_sender(to, connect=connect, keys=keys) as link, stop_on_signal(stop):
         cable = BadCable(Faults(*shares, jitter / 1000), np.random.default_rng(seed), link.put)
         say(f"waiting for a listener on {link.endpoint}")
         if not heard(link, wait, stop):

@@ -11,10 +11,10 @@ from typing import Protocol, Self
 
 from hilstar.attitude.wire.cobs import DELIMITER, framed
 from hilstar.attitude.wire.flood_limits import LinkCounts
-from hilstar.attitude.wire.keys import CurveKeys
+from hilstar.attitude.wire.keys import NO_KEYS, CurveKeys
 from hilstar.attitude.wire.links import Arrival
 from hilstar.attitude.wire.packet import Event, Packet, Status, TimeReply, TimeRequest, decode, encode
-from hilstar.attitude.wire.serial_link import SerialLink
+from hilstar.attitude.wire.serial_link import SerialLink, serial_target
 from hilstar.attitude.wire.udp.datagrams import Datagrams
 from hilstar.attitude.wire.zmq_stream import ZmqSender
 from hilstar.errors import InputError, shortened
@@ -27,8 +27,11 @@ PROBE_S = 0.02
 UDP = re.compile(r"udp://(?:\[([0-9A-Fa-f:.]+(?:%\w+)?)\]|([^:\[\]/\s]+)):(\d{1,5})")
 
 
+Clock = Callable[[], int]
+
+
 class SenderEnd(Protocol):
-    """Where a sender puts its packets."""
+    """Where a sender puts its packets. One that listens too is a `TwoWay`."""
 
     endpoint: str
     link_counts: LinkCounts
@@ -39,6 +42,9 @@ class SenderEnd(Protocol):
     def put(self, packet: bytes) -> None:
         """Send one packet."""
 
+    def close(self) -> None:
+        """Close it, once what was put has left."""
+
     def __enter__(self) -> Self: ...
 
     def __exit__(
@@ -46,23 +52,27 @@ class SenderEnd(Protocol):
     ) -> None: ...
 
 
-def open_sender(to: str, line: tuple[str, int] | None, *, connect: bool, keys: CurveKeys) -> SenderEnd:
-    """The end that --to names: a serial `line` (port and baud rate), UDP, or else a ZeroMQ endpoint. Raises InputError."""
+def open_sender(to: str, *, connect: bool = False, keys: CurveKeys = NO_KEYS, clock: Clock = time.monotonic_ns) -> SenderEnd:
+    """The end that `to` names: a serial line, UDP, or else a ZeroMQ endpoint; `clock` (ns) stamps its time replies.
+
+    Raises InputError.
+    """
+    line = serial_target(to)
     if line is None and not to.startswith("udp:"):
         return ZmqSender(to, bind=not connect, keys=keys)
     if keys.given or connect:
-        raise InputError(f"--to {to}: only ZeroMQ has keys and --connect; remove them")
-    return UdpSender(to) if line is None else SerialSender(*line)
+        raise InputError(f"{to}: only ZeroMQ has keys, and a side that connects (--connect); remove them")
+    return UdpSender(to, clock) if line is None else SerialSender(*line, clock)
 
 
 class Listener:
-    """A thread that answers time requests and keeps the newest status, from whatever `receive` brings."""
+    """A thread that answers time requests by `clock`, and keeps the newest status, from whatever `receive` brings."""
 
-    def __init__(self, receive: Callable[[int], list[Arrival[Event]]], send: Callable[[Packet], None]) -> None:
+    def __init__(self, receive: Callable[[int], list[Arrival[Event]]], send: Callable[[Packet], None], clock: Clock) -> None:
         self.status: Status | None = None
         self.statuses = self.requests = 0
         self.answered = threading.Event()
-        self._receive, self._send = receive, send
+        self._receive, self._send, self._clock = receive, send, clock
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._listen, name="hilstar-sender", daemon=True)
         self._thread.start()
@@ -73,7 +83,8 @@ class Listener:
                 match arrival.event:
                     case TimeRequest(sequence, t1_ns):
                         self.requests += 1
-                        self._send(TimeReply(sequence, t1_ns, arrival.host_ns, time.monotonic_ns()))
+                        waited_ns = time.monotonic_ns() - arrival.host_ns
+                        self._send(TimeReply(sequence, t1_ns, self._clock() - waited_ns, self._clock()))
                     case TimeReply():
                         self.answered.set()
                     case Status() as status:
@@ -109,11 +120,11 @@ class TwoWay:
 class SerialSender(TwoWay, SerialLink):
     """The sender's end of a serial line."""
 
-    def __init__(self, port: str, baud: int) -> None:
+    def __init__(self, port: str, baud: int, clock: Clock = time.monotonic_ns) -> None:
         super().__init__(port, baud)
         self.unsent = 0
         self.send_bytes(DELIMITER)
-        self._listener = Listener(self.receive, self.send)
+        self._listener = Listener(self.receive, self.send, clock)
 
     def wait_for_listener(self, timeout_s: float) -> bool:
         """A serial line cannot tell whether anybody listens."""
@@ -134,18 +145,18 @@ class SerialSender(TwoWay, SerialLink):
 class UdpSender(TwoWay):
     """The sender's end of UDP: a connected socket. Raises InputError where the endpoint is wrong or its host unknown."""
 
-    def __init__(self, to: str) -> None:
+    def __init__(self, to: str, clock: Clock = time.monotonic_ns) -> None:
         match = UDP.fullmatch(to)
         if match is None or not 0 < int(match[3]) < 65_536:
-            raise InputError(f"--to {shortened(to)}: write udp://HOST:PORT, such as udp://127.0.0.1:5560 or udp://[::1]:5560")
+            raise InputError(f"{shortened(to)}: write udp://HOST:PORT, such as udp://127.0.0.1:5560 or udp://[::1]:5560")
         try:
             self._datagrams = Datagrams.connected(match[1] or match[2], int(match[3]))
         except OSError as error:
-            raise InputError(f"--to {shortened(to)}: {error.strerror}; write the address of hilstar's machine") from error
+            raise InputError(f"{shortened(to)}: {error.strerror}; write the address of hilstar's machine") from error
         self.endpoint = to
         self.link_counts = LinkCounts()
         self.unsent = 0
-        self._listener = Listener(self._receive, lambda packet: self.put(encode(packet)))
+        self._listener = Listener(self._receive, lambda packet: self.put(encode(packet)), clock)
 
     def _receive(self, timeout_ms: int) -> list[Arrival[Event]]:
         self._datagrams.wait(timeout_ms)

@@ -11,6 +11,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from datetime import UTC, datetime
 
 MAX_SAID = 3
 SAID_WINDOW_S = 10.0
@@ -25,6 +26,11 @@ class Notice:
     host_ns: int
     kind: str
     detail: str
+
+
+def at_now(line: str) -> str:
+    """A line of a run's log, with its UTC."""
+    return f"{datetime.now(UTC):%H:%M:%S.%f}"[:-3] + f"Z {line}"
 
 
 Listener = Callable[[Notice], None]
@@ -56,7 +62,8 @@ class Notices:
             last_before_silence = not floods and len(said_ns) == MAX_SAID
             last_before_silence &= notice.host_ns - said_ns[0] < SAID_WINDOW_S * 1e9
         if not floods:
-            log.warning("%s%s", notice.detail, "; further ones are only counted for a while" if last_before_silence else "")
+            further = "; further ones are only counted for a while" if last_before_silence else ""
+            log.warning("%s", at_now(notice.detail + further))
         for listener in self._listeners:
             listener(notice)
 

@@ -16,7 +16,7 @@ from hilstar.attitude.clock.shared_clock import SharedClockFilter
 from hilstar.attitude.clock.timeline import Timeline
 from hilstar.attitude.wire.links import Arrival, Link, SampleArrival
 from hilstar.attitude.wire.packet import REASONS, AttitudeSample, Event, Reason, Refusal, Status, TimeReply, TimeRequest
-from hilstar.notices import Notices
+from hilstar.notices import Notices, at_now
 from hilstar.running_statistics import RunningStatistics
 from hilstar.units import NS_PER_MS, NS_PER_S
 
@@ -227,6 +227,7 @@ class Receiver:
     def _refuse(self, arrival: Arrival[Event], refusal: Refusal) -> None:
         self.counts.refused_by[refusal.reason] += 1
         if self.counts.refused_by[refusal.reason] == 1:
-            log.warning("packet refused (%s): %s; further ones are only counted", refusal.reason, refusal.detail)
+            line = f"packet refused ({refusal.reason}): {refusal.detail}; further ones are only counted"
+            log.warning("%s", at_now(line))
         sample = arrival.event if isinstance(arrival.event, AttitudeSample) else None
         self._watch(arrival.host_ns, arrival.raw, sample, refusal)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from msgspec.structs import replace as replaced
@@ -24,6 +25,7 @@ from hilstar.process.interrupts import stop_on_signal
 from hilstar.run.frame_status import StatusMaker
 from hilstar.run.lockstep.nasa42 import serve_nasa42
 from hilstar.run.lockstep.packets import serve_lockstep
+from hilstar.run.lockstep.steps import Steps
 from hilstar.run.lockstep.vizard import Cameras, Pictures, serve_vizard
 from hilstar.run.loop import FrameLoop, Limit, policy_of
 from hilstar.run.open_link import AnyLink
@@ -34,13 +36,20 @@ from hilstar.run.replay import Play
 from hilstar.run.screen.display_pacer import DisplayPacer
 from hilstar.run.screen.screen import Screen
 from hilstar.run.shown import FrameSink, Shown, ignore
-from hilstar.run.summary import RunSummary
+from hilstar.run.summary import RunSummary, RunTally
 from hilstar.units import NS_PER_S
+
+# Called once, when a run begins, with the counters that it will count in.
+Counters = Callable[[RunTally, PacketCounts], None]
+
+
+def nobody_counts(tally: RunTally, packets: PacketCounts) -> None:
+    """The counters of a run that nobody follows."""
 
 
 @dataclass(frozen=True, slots=True)
 class Outlet:
-    """Where frames go besides their sink: onto a screen and into a ledger; and where events are reported.
+    """Where frames go besides their sink: onto a screen and into a ledger; where events are reported, and who follows it.
 
     `pictures` are what a simulation gets that asks for those of its camera.
     """
@@ -49,6 +58,7 @@ class Outlet:
     ledger: Ledger | None = None
     notices: Notices = field(default_factory=Notices)
     pictures: Pictures | None = None
+    counters: Counters = nobody_counts
 
     def pacer(self) -> Pacer | None:
         """The pacer of the screen; None without one."""
@@ -63,22 +73,27 @@ def serve(bench: Bench, link: AnyLink, limit: Limit, sink: FrameSink = ignore, o
         for kind, line in Mounting(bench.config.tracker.q_body_to_cam).told:
             outlet.notices.tell(kind, line)
     with stop_on_signal(loop.stop), loop.watch:
-        if isinstance(link, ZmqLockstep):
-            bench.warm_up()
-            summary = serve_lockstep(bench, link, limit, loop, ledger)
-        elif isinstance(link, VizardLive):
-            bench.warm_up()
-            cameras = Cameras(_tracker_camera(bench), outlet.pictures, outlet.notices)
-            summary = serve_vizard(bench, link, limit, loop, cameras, ledger)
-        elif isinstance(link, Nasa42Lockstep):
-            bench.warm_up()
-            summary = serve_nasa42(bench, link, limit, loop, ledger)
+        if isinstance(link, ZmqLockstep | VizardLive | Nasa42Lockstep):
+            summary = _serve_lockstep(bench, link, limit, loop, outlet)
         else:
             summary = _serve_stream(bench, link, limit, loop, outlet)
     told: dict[str, str | int] = {"endpoint": link.endpoint}
     return replaced(
         summary, events=outlet.notices.counts(), link=told | link.link_counts.summary(), screen=loop.screen_summary()
     )
+
+
+def _serve_lockstep(
+    bench: Bench, link: ZmqLockstep | VizardLive | Nasa42Lockstep, limit: Limit, loop: FrameLoop, outlet: Outlet
+) -> RunSummary:
+    bench.warm_up()
+    steps = Steps(bench, limit, loop, outlet.ledger)
+    outlet.counters(loop.tally, steps.counts)
+    if isinstance(link, ZmqLockstep):
+        return serve_lockstep(link, steps, loop, StatusMaker(outlet.ledger))
+    if isinstance(link, Nasa42Lockstep):
+        return serve_nasa42(link, steps, loop)
+    return serve_vizard(link, steps, loop, Cameras(_tracker_camera(bench), outlet.pictures, outlet.notices))
 
 
 def _tracker_camera(bench: Bench) -> TrackerCamera:
@@ -92,6 +107,7 @@ def _serve_stream(bench: Bench, link: StreamLink, limit: Limit, loop: FrameLoop,
     ledger = outlet.ledger
     timeline = Timeline(policy_of(bench.config.attitude))
     receiver = _receiver(bench.config.attitude, link, timeline, outlet)
+    outlet.counters(loop.tally, receiver.counts)
     statuses = StatusMaker(ledger)
 
     def draw_slot(moment: Moment) -> Shown | None:
@@ -150,6 +166,8 @@ def replay(bench: Bench, play: Play, sink: FrameSink = ignore, outlet: Outlet | 
             ledger.frame(frame_record(shown, t_ns, loop.tally.missed_frames, below_step(bench, shown)))
         return shown
 
+    counts = PacketCounts(received=play.packet_count)
+    outlet.counters(loop.tally, counts)
     bench.warm_up()
     begin_ns = time.monotonic_ns()
     with stop_on_signal(loop.stop), loop.watch:
@@ -161,6 +179,6 @@ def replay(bench: Bench, play: Play, sink: FrameSink = ignore, outlet: Outlet | 
                     break
                 draw_slot(Moment(slot))
     duration_s = (time.monotonic_ns() - begin_ns) / NS_PER_S
-    summary = loop.tally.summary(duration_s, PacketCounts(received=play.packet_count), bench.renderer.gl_renderer)
+    summary = loop.tally.summary(duration_s, counts, bench.renderer.gl_renderer)
     told = outlet.notices.counts()
     return replaced(summary, stale_events=loop.gate.events, events=told, screen=loop.screen_summary())

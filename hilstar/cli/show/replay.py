@@ -35,7 +35,7 @@ from hilstar.cli.show.running import (
     say_what_clips,
     shown_bench,
 )
-from hilstar.console.terminal import progress
+from hilstar.console.run_status import RunStatus, Source, on_terminal
 from hilstar.files import MCAP, check_directory, check_ending
 from hilstar.notices import Notices
 
@@ -89,16 +89,19 @@ def replay(
         shown_bench(file, headless, windowed, force) as (bench, screen),
         FrameImages(output, bench) as record,
         optional_ledger(ledger, bench, notices, overwrite, split) as kept,
-        progress("replaying", play.frame_count) as advance,
     ):
         say_what_clips(bench)
         if explain:
             explain_source(play.conventions, mounting)
             explain_effort(bench)
 
+        renderer, refresh_hz = bench.renderer.gl_renderer, bench.config.monitor.refresh_hz
+        status = RunStatus(Source(f"replaying {log}", renderer, refresh_hz, play.frame_count), kept)
+
         def sink(shown: Any) -> None:
             record(shown)
-            advance(shown.number + 1)
+            status.see(shown)
 
-        summary = replay_log(bench, play, sink, Outlet(screen, kept, notices))
+        with on_terminal(status):
+            summary = replay_log(bench, play, sink, Outlet(screen, kept, notices, counters=status.count))
     end_of_run(summary, screen, kept, as_json)

@@ -21,7 +21,8 @@ from hilstar.cli.show.running import (
     say_what_clips,
     shown_bench,
 )
-from hilstar.console.terminal import progress, say
+from hilstar.console.run_status import RunStatus, Source, on_terminal
+from hilstar.console.terminal import say
 from hilstar.files import MCAP, check_ending
 from hilstar.notices import Notices
 
@@ -72,11 +73,14 @@ def serve(
         limit = Limit(slots, math.inf if frames is None else frames)
         say(f"{link.verb} {link.endpoint}, {refresh_hz:g} Hz, {bench.renderer.gl_renderer}")
         say_what_clips(bench)
-        outlet = Outlet(screen, kept, notices, tracker_pictures(link, bench))
-        with progress("serving", min(limit.slots, limit.frames)) as advance:
-            summary = serve_stream(bench, link, limit, lambda shown: advance(shown.number + 1), outlet)
+        told = Source(f"{link.verb} {link.endpoint}", bench.renderer.gl_renderer, refresh_hz, min(limit.slots, limit.frames))
+        status = RunStatus(told, kept)
+        outlet = Outlet(screen, kept, notices, tracker_pictures(link, bench), status.count)
+        with on_terminal(status):
+            summary = serve_stream(bench, link, limit, status.see, outlet)
     end_of_run(summary, screen, kept, as_json)
     if not summary.packets.accepted:
+        say(f"no attitude came from {link.endpoint}; start the sender, and check its address")
         raise typer.Exit(NO_ATTITUDE)
 
 

@@ -6,17 +6,14 @@ import time
 
 from hilstar.attitude.wire.packet import TimeReply, TimeRequest
 from hilstar.attitude.wire.zmq_lockstep import ZmqLockstep
-from hilstar.bench.frame import Bench
 from hilstar.run.frame_status import StatusMaker
 from hilstar.run.lockstep.steps import POLL_MS, Steps
-from hilstar.run.loop import FrameLoop, Limit
-from hilstar.run.record.ledger import Ledger
+from hilstar.run.loop import FrameLoop
 from hilstar.run.summary import RunSummary
 
 
-def serve_lockstep(bench: Bench, link: ZmqLockstep, limit: Limit, loop: FrameLoop, ledger: Ledger | None = None) -> RunSummary:
-    """Answer requests up to `limit`, or until a signal; returns the summary. A refused request leaves the last frame."""
-    run, statuses = Steps(bench, limit, loop, ledger), StatusMaker(ledger)
+def serve_lockstep(link: ZmqLockstep, run: Steps, loop: FrameLoop, statuses: StatusMaker) -> RunSummary:
+    """Answer requests up to the limit, or until a signal; returns the summary. A refused request leaves the last frame."""
     while run.goes_on():
         arrival = link.receive(POLL_MS)
         if arrival is None:

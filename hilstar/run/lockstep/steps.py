@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import time
 
@@ -11,6 +12,7 @@ from hilstar.attitude.clock.timeline import Attitude
 from hilstar.attitude.receiver import PacketCounts
 from hilstar.attitude.wire.packet import AttitudeSample, Event, Refusal, rate_refusal
 from hilstar.bench.frame import Bench
+from hilstar.notices import at_now
 from hilstar.run.loop import FrameLoop, Limit
 from hilstar.run.record.ledger import Ledger
 from hilstar.run.record.ledger_records import below_step, frame_record
@@ -20,6 +22,7 @@ from hilstar.running_statistics import RunningStatistics
 from hilstar.units import NS_PER_MS, NS_PER_S
 
 POLL_MS = 50
+log = logging.getLogger(__name__)
 
 
 class Steps:
@@ -46,6 +49,9 @@ class Steps:
         sample = event if isinstance(event, AttitudeSample) else None
         if refusal is not None:
             self.counts.refused_by[refusal.reason] += 1
+            if self.counts.refused_by[refusal.reason] == 1:
+                line = f"message refused ({refusal.reason}): {refusal.detail}; further ones are only counted"
+                log.warning("%s", at_now(line))
         elif sample is not None:
             self.last = self._show(sample, host_ns)
         if self._ledger is not None:

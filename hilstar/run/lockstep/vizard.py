@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import time
 from collections.abc import Callable
 
@@ -10,16 +9,13 @@ from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.attitude.wire.vizard.camera import TrackerCamera, disagreement
 from hilstar.attitude.wire.vizard.live import ImageRequest, Step, VizardLive
 from hilstar.attitude.wire.vizard.message import VizCamera
-from hilstar.bench.frame import Bench
 from hilstar.notices import Notices
 from hilstar.run.lockstep.steps import POLL_MS, Steps
-from hilstar.run.loop import FrameLoop, Limit
-from hilstar.run.record.ledger import Ledger
+from hilstar.run.loop import FrameLoop
 from hilstar.run.summary import RunSummary
 
 # The picture (a PNG) of the tracker at an attitude, for a simulation that asks for it.
 Pictures = Callable[[AttitudeSample], bytes]
-log = logging.getLogger(__name__)
 
 
 class Cameras:
@@ -50,11 +46,8 @@ class Cameras:
         return self._pictures(self._sample)
 
 
-def serve_vizard(
-    bench: Bench, link: VizardLive, limit: Limit, loop: FrameLoop, cameras: Cameras, ledger: Ledger | None = None
-) -> RunSummary:
-    """Answer Basilisk up to `limit`, or until a signal; returns the summary. A step that is refused ends its simulation."""
-    run = Steps(bench, limit, loop, ledger)
+def serve_vizard(link: VizardLive, run: Steps, loop: FrameLoop, cameras: Cameras) -> RunSummary:
+    """Answer Basilisk up to the limit, or until a signal; returns the summary. A step that is refused ends its simulation."""
     while run.goes_on():
         request = link.receive(POLL_MS)
         if request is None:
@@ -63,8 +56,6 @@ def serve_vizard(
             link.answer_image(cameras.picture(request))
         else:
             refusal = run.take(request.host_ns, request.event, request.raw)
-            if refusal is not None and run.counts.refused_by[refusal.reason] == 1:
-                log.warning("step refused (%s): %s; further ones are only counted", refusal.reason, refusal.detail)
             cameras.see(request)
             link.answer_step(refusal is None)
             run.answered(request.host_ns, time.monotonic_ns())

@@ -106,6 +106,14 @@ class Ledger:
             raise cannot_write(path, error, "choose another place for the ledger") from error
         return file, writer
 
+    @property
+    def size_bytes(self) -> int:
+        """The size of its newest file."""
+        try:
+            return os.fstat(self._file.fd).st_size
+        except OSError:  # between two files
+            return 0
+
     # Called by the run, from any thread
 
     def packet(self, host_ns: int, raw: bytes, sample: AttitudeSample | None, refusal: Refusal | None) -> None:

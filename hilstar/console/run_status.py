@@ -1,0 +1,175 @@
+"""The live status of a run on the terminal: a few lines that stay in place, or one plain line every ten seconds elsewhere.
+
+The frame loop only leaves its newest frame here; a thread of the status words it, so that no terminal delays a frame.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from hilstar.rotation import to_radec_roll_deg
+from hilstar.units import NS_PER_MS, NS_PER_S
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from hilstar.attitude.receiver import PacketCounts
+    from hilstar.run.record.ledger import Ledger
+    from hilstar.run.shown import Shown
+    from hilstar.run.summary import RunTally
+
+LIVE_EACH_S = 0.5
+PLAIN_EACH_S = 10.0
+STANDS_STILL_NS = NS_PER_S  # without a frame for so long
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """What a run shows: where its attitudes come from, on what it is drawn, and how many frames there will be."""
+
+    attitudes: str
+    renderer: str
+    refresh_hz: float
+    frames: float = math.inf
+
+
+class Line(NamedTuple):
+    """One line of the status: what of, what it says, and whether that is as it should be."""
+
+    label: str
+    text: str
+    well: bool = True
+
+
+class RunStatus:
+    """What a run is doing, from the newest frame that `see` was given."""
+
+    def __init__(self, source: Source, ledger: Ledger | None = None) -> None:
+        self._source = source
+        self._ledger = ledger
+        self._begun_ns = time.monotonic_ns()
+        self._shown: Shown | None = None
+        self._counters: tuple[RunTally, PacketCounts] | None = None
+        self._before = (self._begun_ns, 0, 0)  # when the lines were last made: host time, frames, packets
+
+    def count(self, tally: RunTally, packets: PacketCounts) -> None:
+        """Take the run's counters, which it goes on counting in."""
+        self._counters = (tally, packets)
+
+    def see(self, shown: Shown) -> None:
+        """Take the newest frame; costs the frame loop one assignment."""
+        self._shown = shown
+
+    def lines(self, now_ns: int) -> list[Line]:
+        """The status at a host time; rates are since it was last asked for."""
+        shown, counters = self._shown, self._counters
+        if shown is None or counters is None:
+            return [Line("frames", "none yet"), *self._about()]
+        tally, packets = counters
+        then_ns, frames, received = self._before
+        self._before = (now_ns, tally.frames, packets.received)
+        seconds = max(now_ns - then_ns, 1) / NS_PER_S
+        refused = ", ".join(f"{reason} {count}" for reason, count in packets.refused_by.items() if count)
+        told = f"{packets.received} received ({(packets.received - received) / seconds:.1f}/s), {packets.refused} refused"
+        return [
+            _attitude_line(shown),
+            self._frames_line(shown, tally, (tally.frames - frames) / seconds, now_ns),
+            Line("packets", told + (f" ({refused})" if refused else ""), not refused),
+            *self._about(),
+        ]
+
+    def _frames_line(self, shown: Shown, tally: RunTally, per_s: float, now_ns: int) -> Line:
+        total = "" if math.isinf(self._source.frames) else f" of {self._source.frames:.0f}"
+        text = f"{tally.frames}{total} ({per_s:.1f}/s), {tally.missed_frames} missed, {tally.stale_frames} stale"
+        still_ns = now_ns - shown.swap_ns
+        if still_ns > STANDS_STILL_NS:
+            return Line("frames", f"{text}; none for {still_ns / NS_PER_S:.1f} s", False)
+        return Line("frames", text, not tally.missed_frames)
+
+    def _about(self) -> Iterator[Line]:
+        ledger = self._ledger
+        if ledger is not None:
+            failed = f"; failed: {ledger.failure}" if ledger.failure else ""
+            yield Line("ledger", f"{ledger.path}, {ledger.size_bytes / 1e6:.1f} MB{failed}", ledger.failure is None)
+        yield Line("source", self._source.attitudes)
+        yield Line("display", f"{self._source.refresh_hz:g} Hz, {self._source.renderer}")
+
+
+def _attitude_line(shown: Shown) -> Line:
+    attitude = shown.attitude
+    if attitude is None:
+        return Line("attitude", "none yet: the frames are blank" if shown.missing else "hidden: the frames are blank", False)
+    ra_deg, dec_deg, roll_deg = to_radec_roll_deg(attitude.q_icrs_to_cam)
+    text = f"RA {ra_deg:.4f}, Dec {dec_deg:.4f}, roll {roll_deg:.4f} deg"
+    rate = attitude.rate_cam_rad_s
+    if rate is not None:
+        text += f", {np.degrees(np.linalg.norm(rate)):.4g} deg/s"
+    text += f", {attitude.age_ns / NS_PER_MS:.0f} ms old"
+    return Line("attitude", text + (": STALE" if shown.stale else ""), not shown.stale)
+
+
+@contextmanager
+def on_terminal(status: RunStatus) -> Iterator[None]:
+    """Keep the status on stderr while the run lasts: in place on a terminal, else a line every PLAIN_EACH_S."""
+    stop = threading.Event()
+    live = sys.stderr is not None and sys.stderr.isatty()
+    if live:
+        import rich.live  # noqa: F401 - takes 0.1 s, which is not to cost a frame
+    thread = threading.Thread(target=_live if live else _plain, args=(status, stop), name="hilstar-status", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
+
+
+def _plain(status: RunStatus, stop: threading.Event) -> None:
+    begun_s = time.monotonic()
+    while not stop.wait(PLAIN_EACH_S):
+        said = "; ".join(f"{line.label} {line.text}" for line in status.lines(time.monotonic_ns()))
+        print(f"hilstar: {time.monotonic() - begun_s:.0f} s: {said}", file=sys.stderr)
+
+
+def _live(status: RunStatus, stop: threading.Event) -> None:
+    from rich.console import Console
+    from rich.live import Live
+
+    with Live(console=Console(stderr=True), auto_refresh=False, transient=True) as live, _logs_above():
+        while not stop.is_set():
+            live.update(_table(status.lines(time.monotonic_ns())), refresh=True)
+            stop.wait(LIVE_EACH_S)
+
+
+def _table(lines: list[Line]) -> Table:
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table.grid(padding=(0, 2))
+    for line in lines:
+        mark = Text("ok", style="green") if line.well else Text("!!", style="bold red")
+        table.add_row(mark, Text(line.label, style="bold"), Text(line.text, overflow="ellipsis", no_wrap=True))
+    return table
+
+
+@contextmanager
+def _logs_above() -> Iterator[None]:
+    """What is logged goes through the stream that the live lines have put in stderr's place, and so above them."""
+    handlers = [h for h in logging.getLogger().handlers if isinstance(h, logging.StreamHandler)]
+    before = [handler.setStream(sys.stderr) for handler in handlers]
+    try:
+        yield
+    finally:
+        for handler, stream in zip(handlers, before, strict=True):
+            if stream is not None:
+                handler.setStream(stream)

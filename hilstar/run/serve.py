@@ -68,7 +68,7 @@ class Outlet:
 def serve(bench: Bench, link: AnyLink, limit: Limit, sink: FrameSink = ignore, outlet: Outlet | None = None) -> RunSummary:
     """Show the live stream of `link` up to `limit`, or until a signal; returns the summary."""
     outlet = outlet or Outlet()
-    loop, ledger = FrameLoop(bench, sink, outlet.pacer(), notices=outlet.notices), outlet.ledger
+    loop = FrameLoop(bench, sink, outlet.pacer(), notices=outlet.notices)
     if link.conventions.of_body:
         for kind, line in Mounting(bench.config.tracker.q_body_to_cam).told:
             outlet.notices.tell(kind, line)

@@ -136,13 +136,20 @@ class Bench:
         return self.draw_sprites(self.frame_sprites(q_icrs_to_cam, rate_cam_rad_s), frame)
 
     def frame_sprites(
-        self, q_icrs_to_cam: FloatArray | None, rate_cam_rad_s: Vector | FloatArray | None = None
+        self,
+        q_icrs_to_cam: FloatArray | None,
+        rate_cam_rad_s: Vector | FloatArray | None = None,
+        velocity_km_s: FloatArray | None = None,
     ) -> Sprites | None:
-        """The sprites of a frame (see `draw`), before anything is drawn; None for a blank one."""
+        """The sprites of a frame (see `draw`), before anything is drawn; None for a blank one.
+
+        A velocity (3,), ICRS, is that of an observer against the one of `[sky] observer_velocity_km_s`.
+        """
         if q_icrs_to_cam is None:
             return None
+        stars = self.shown_stars.seen_at(velocity_km_s)
         turn = self._turn(q_icrs_to_cam, rate_cam_rad_s)
-        return self.sprites(q_icrs_to_cam) if turn is None else self._swept(turn)
+        return self.sprites(q_icrs_to_cam, stars) if turn is None else self._swept(stars, turn)
 
     def draw_sprites(self, sprites: Sprites | None, frame: int = 0) -> Drawn:
         """Draw the levels of a frame's sprites."""
@@ -164,8 +171,8 @@ class Bench:
     def _px_per_rad(self) -> float:
         return self.camera.scales_px_rad()[1]
 
-    def _swept(self, turn: Turn) -> Sprites:
-        sprites = swept_sprites(self.shown_stars, turn, self.scan, self.camera, self.renderer.footprint_px, self._sigma_px)
+    def _swept(self, stars: Stars, turn: Turn) -> Sprites:
+        sprites = swept_sprites(stars, turn, self.scan, self.camera, self.renderer.footprint_px, self._sigma_px)
         return replace(sprites, rate_cam_rad_s=turn.rate_cam_rad_s)
 
     def count_faint(self, q_icrs_to_cam: FloatArray) -> int:

@@ -117,7 +117,8 @@ class FrameLoop:
     def _sprites(self, attitude: Attitude | None) -> Sprites | None:
         if attitude is None:
             return None
-        return self._bench.frame_sprites(attitude.q_icrs_to_cam, attitude.rate_cam_rad_s if self._moving else None)
+        rate = attitude.rate_cam_rad_s if self._moving else None
+        return self._bench.frame_sprites(attitude.q_icrs_to_cam, rate, attitude.velocity_km_s)
 
     def _gives_up(self, number: int, moment: Moment) -> bool:
         """Whether the frame's moment has passed so far that the next is begun instead.

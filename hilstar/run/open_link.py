@@ -52,7 +52,8 @@ def _open_vizard(config: BenchConfig, notices: Notices | None) -> VizardBroadcas
     settings = config.attitude
     rates = DifferenceRates(round(settings.stale_after_ms * NS_PER_MS), math.radians(settings.max_rate_deg_s))
     name = None if settings.spacecraft is None else str(settings.spacecraft)
-    follower = Follower(name, Mounting(config.tracker.q_body_to_cam), rates)
+    mounting = Mounting(config.tracker.q_body_to_cam)
+    follower = Follower(name, mounting, rates, with_velocity=settings.use_velocity)
     if settings.lockstep:
         return VizardLive(settings.address, follower, bind=settings.bind is not False, notices=notices)
     return VizardBroadcast(settings.address, follower, bind=settings.bind is True, notices=notices)

@@ -115,7 +115,10 @@ class RunPlay:
         """Number, time and attitude of a frame."""
         past = self.frames[slot]
         rate = None if past.rate is None else np.array(past.rate)
-        attitude = None if past.q is None else Attitude(np.array(past.q), 0, False, rate_cam_rad_s=rate)
+        velocity = None if past.velocity_km_s is None else np.array(past.velocity_km_s)
+        if past.q is None:
+            return past.frame, past.t_ns, None
+        attitude = Attitude(np.array(past.q), 0, False, rate_cam_rad_s=rate, velocity_km_s=velocity)
         return past.frame, past.t_ns, attitude
 
 

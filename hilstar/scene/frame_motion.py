@@ -87,8 +87,8 @@ def swept_sprites(
     middle = Turn(propagate(turn.q_icrs_to_cam, turn.rate_cam_rad_s, scan.hold_s / 2), turn.rate_cam_rad_s)
     axis = (camera.cam_to_image @ to_matrix(middle.q_icrs_to_cam))[2]
     margin_px = footprint_px / 2 + 1
-    near = stars.grid.near(axis, camera.field_radius_rad(margin_px) + turn.speed_rad_s * scan.whole_s / 2)
-    seen = stars.vectors[near] @ (camera.cam_to_image @ to_matrix(turn.q_icrs_to_cam)).T
+    near = stars.near(axis, camera.field_radius_rad(margin_px) + turn.speed_rad_s * scan.whole_s / 2)
+    seen = stars.directions(near) @ (camera.cam_to_image @ to_matrix(turn.q_icrs_to_cam)).T
     close = camera.in_view(seen, margin_px, turn.speed_rad_s * scan.longest_s)
     near = near[close]
     paths = _paths(seen[close], turn, scan, camera)

@@ -55,8 +55,8 @@ def make_sprites(stars: Stars, icrs_to_image: FloatArray, camera: Camera, footpr
     `icrs_to_image` (3, 3) turns ICRS components into image components.
     """
     margin_px = footprint_px / 2 + 1
-    near = stars.grid.near(icrs_to_image[2], camera.field_radius_rad(margin_px))
-    seen = stars.vectors[near] @ icrs_to_image.T
+    near = stars.near(icrs_to_image[2], camera.field_radius_rad(margin_px))
+    seen = stars.directions(near) @ icrs_to_image.T
     if camera.lens is not None:  # a pinhole's places cost less than the choice
         close = camera.in_view(seen, margin_px, 0.0)
         near, seen = near[close], seen[close]

@@ -30,7 +30,7 @@ def unit_vectors_icrs(catalog: Catalog, epoch_jyear: float) -> FloatArray:
     return np.asarray(u / np.linalg.norm(u, axis=1, keepdims=True))
 
 
-def aberrate(vectors: FloatArray, observer_velocity_km_s: tuple[float, float, float]) -> FloatArray:
+def aberrate(vectors: FloatArray, observer_velocity_km_s: tuple[float, float, float] | FloatArray) -> FloatArray:
     """Directions (n, 3) as a moving observer sees them; the velocity is ICRS, barycentric, in km/s.
 
     The exact special-relativistic formula (Klioner 2003, AJ 125, 1580, eq. 10). The caller keeps the

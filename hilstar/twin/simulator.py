@@ -20,6 +20,7 @@ from hilstar.errors import InputError
 from hilstar.render.renderer import Context, Renderer, Target
 from hilstar.scene.exposure_motion import MIDDLE_S, Motion, smeared_sprites
 from hilstar.sky.electrons import Photometry, zodiacal_electrons_per_s_arcsec2
+from hilstar.sky.stars import Stars
 from hilstar.tracker.detector import Detector
 from hilstar.units import ARCSEC_PER_RAD
 
@@ -73,21 +74,23 @@ class Simulator:
         """An exposure of this tracker, by the attitude in its middle (unit quaternion) and a constant rate."""
         return Motion(q_icrs_to_cam, rate_cam_rad_s, self.config.tracker.exposure_s)
 
-    def expose(self, motion: Motion, rng: np.random.Generator | None) -> Exposure:
-        """One frame; without a generator, without noise. Raises InputError for what a detector cannot take."""
-        tracker = self.config.tracker
-        sprites = smeared_sprites(self.stars, motion, self.camera, self.renderer.footprint_px, tracker.psf_sigma_px)
+    def expose(self, motion: Motion, rng: np.random.Generator | None, stars: Stars | None = None) -> Exposure:
+        """One frame; without a generator, without noise; with other `stars`, those. Raises InputError for what a detector
+        cannot take.
+        """
+        tracker, stars = self.config.tracker, self.stars if stars is None else stars
+        sprites = smeared_sprites(stars, motion, self.camera, self.renderer.footprint_px, tracker.psf_sigma_px)
         self.renderer.draw(sprites)
         mean_e = self.renderer.linear().astype(np.float64) * tracker.exposure_s + self.background_e
         if rng is None:
             dn = self.detector.expose_noiseless(mean_e, tracker.exposure_s)
         else:
             dn = self.detector.expose(mean_e, tracker.exposure_s, rng)
-        return Exposure(motion, dn, mean_e, self._truth(motion, np.unique(sprites.star), mean_e), sprites.capped)
+        return Exposure(motion, dn, mean_e, self._truth(motion, stars, np.unique(sprites.star), mean_e), sprites.capped)
 
-    def _truth(self, motion: Motion, star: npt.NDArray[np.intp], mean_e: FloatArray) -> npt.NDArray[np.void]:
-        x_px, y_px = self.camera.project(self.stars.vectors[star] @ motion.icrs_to_image(MIDDLE_S, self.camera)[0].T)
-        truth = truth_table(self.stars, star, x_px, y_px)
+    def _truth(self, motion: Motion, stars: Stars, star: npt.NDArray[np.intp], mean_e: FloatArray) -> npt.NDArray[np.void]:
+        x_px, y_px = self.camera.project(stars.directions(star) @ motion.icrs_to_image(MIDDLE_S, self.camera)[0].T)
+        truth = truth_table(stars, star, x_px, y_px)
         height, width = mean_e.shape
         inside = np.isfinite(x_px) & (np.rint(x_px) >= 0) & (np.rint(x_px) < width)
         inside &= (np.rint(y_px) >= 0) & (np.rint(y_px) < height)

@@ -32,7 +32,7 @@ class Attitude:
     """An attitude at one time, with the age, sequence and arrival of the newest sample behind it, and whether it is too old.
 
     `prediction_ns` is how far the attitude was propagated past that sample, and `rate_cam_rad_s` the rate at that time, None
-    where the attitude is held.
+    where the attitude is held. `velocity_km_s` is that of the sample before it.
     """
 
     q_icrs_to_cam: FloatArray
@@ -42,6 +42,7 @@ class Attitude:
     received_ns: int | None = None
     prediction_ns: int = 0
     rate_cam_rad_s: FloatArray | None = None
+    velocity_km_s: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,16 +109,18 @@ class Timeline:
             i = bisect_right(self._t_ns, t_ns) - 1
             near = self._samples[max(i - 1, 0) : i + 3]
             received_ns = self._received_ns
-        if i < 0:
-            return Attitude(near[0].q_icrs_to_cam, 0, False, near[0].sequence)
-        place = min(i, 1)
+        place = max(min(i, 1), 0)
+        found = self._at(t_ns, near, place, received_ns) if i >= 0 else _held(near[0], 0, False)
+        return found if near[place].velocity_km_s is None else replace(found, velocity_km_s=near[place].velocity_km_s)
+
+    def _at(self, t_ns: int, near: list[AttitudeSample], place: int, received_ns: int | None) -> Attitude:
         newest = near[place]
         age_ns = t_ns - newest.t_ns
         if place + 1 < len(near):
             join = self._joined(newest, near[place + 1])
             if join == "hold":
                 gap = age_ns > self._policy.stale_after_ns and not self._jumped(newest, near[place + 1])
-                return Attitude(newest.q_icrs_to_cam, age_ns, gap, newest.sequence)
+                return _held(newest, age_ns, gap)
             q, rate = self._between(near, place, age_ns, join)
             return Attitude(q, age_ns, False, newest.sequence, rate_cam_rad_s=rate)
         return replace(self._predict(near[place - 1] if place else None, newest, age_ns), received_ns=received_ns)
@@ -170,12 +173,16 @@ class Timeline:
             if gap_ns <= self._policy.stale_after_ns:
                 rate = rate_between_rad_s(previous.q_icrs_to_cam, newest.q_icrs_to_cam, gap_ns / NS_PER_S)
         if rate is None:
-            return Attitude(newest.q_icrs_to_cam, age_ns, stale, newest.sequence)
+            return _held(newest, age_ns, stale)
         # results/tradeoff.csv, prediction: 5.5 arcsec by the rate of the sample; a cubic spline 17, holding 144.
         prediction_ns = min(age_ns, self._policy.max_extrapolation_ns)
         q = propagate(newest.q_icrs_to_cam, rate, prediction_ns / NS_PER_S)
         turning = rate if prediction_ns == age_ns else None  # held past that
         return Attitude(q, age_ns, stale, newest.sequence, prediction_ns=prediction_ns, rate_cam_rad_s=turning)
+
+
+def _held(sample: AttitudeSample, age_ns: int, stale: bool) -> Attitude:
+    return Attitude(sample.q_icrs_to_cam, age_ns, stale, sample.sequence)
 
 
 def smootherstep(u: float) -> float:

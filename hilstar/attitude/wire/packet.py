@@ -36,18 +36,23 @@ Reason = Literal["crc", "norm", "nan", "time", "format", "rate", "source"]
 MESSAGE_REASONS: tuple[Reason, ...] = ("crc", "norm", "nan", "time", "format")
 STREAM_REASONS: tuple[Reason, ...] = ("rate", "source")
 REASONS = MESSAGE_REASONS + STREAM_REASONS
+MAX_SPEED_KM_S = 10_000.0  # of an observer: a thirtieth of that of light
 RATE_ROUNDING = 1e-6  # a packet's rate is float32
 
 
 @dataclass(frozen=True, slots=True)
 class AttitudeSample:
-    """Where the camera points at `t_ns` of the sender's clock; `rate_cam_rad_s` (3,) or None when unknown."""
+    """Where the camera points at `t_ns` of the sender's clock; `rate_cam_rad_s` (3,) or None when unknown.
+
+    `velocity_km_s` (3,), ICRS, is the observer's with respect to the origin of the sender's frame; None where it is not sent.
+    """
 
     t_ns: int
     q_icrs_to_cam: FloatArray
     rate_cam_rad_s: FloatArray | None = None
     sequence: int = 0
     discontinuity: bool = False
+    velocity_km_s: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True)

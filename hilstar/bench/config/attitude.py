@@ -82,6 +82,13 @@ class AttitudeSettings(Table, frozen=True):
             extra={"default": 'the only one that is there; `"SC[0]"`'},
         ),
     ] = None
+    use_velocity: Annotated[
+        bool,
+        Meta(
+            description="Vizard: `true` when the spacecraft's velocity aberrates the stars: 5 arcsec in low orbit. It adds to "
+            "`[sky] observer_velocity_km_s`, which is then that of the origin of Basilisk's frame."
+        ),
+    ] = True
     curve_secret_key: Annotated[
         str | None, Meta(description="ZeroMQ: the file of hilstar's own secret key.", extra={"default": "none"})
     ] = None

@@ -8,6 +8,7 @@ from typing import Any
 
 import msgspec
 
+from hilstar.attitude.wire.packet import MAX_SPEED_KM_S
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE
 from hilstar.bench.config.bench import TYPE_WORDS, BenchConfig
 from hilstar.bench.config.render import DEFAULT_BRIGHTEST_V_MAG
@@ -66,7 +67,8 @@ def _check_meaning(config: BenchConfig, path: Path) -> None:
     _check_unit(path, "[collimator] q_cam_to_mon", config.collimator.q_cam_to_mon)
     if config.tracker.q_body_to_cam is not None:
         _check_unit(path, "[tracker] q_body_to_cam", config.tracker.q_body_to_cam)
-    if math.hypot(*config.sky.observer_velocity_km_s) >= LIGHT_KM_S:
+    room_km_s = MAX_SPEED_KM_S if config.attitude.source == "vizard" else 0.0
+    if math.hypot(*config.sky.observer_velocity_km_s) + room_km_s >= LIGHT_KM_S:
         raise InputError(f"{path}: [sky] observer_velocity_km_s is not slower than light; write km/s, ICRS x, y, z")
     if config.background.electrons_per_px is not None and config.background.zodiacal_v_mag_arcsec2 is not None:
         raise InputError(f"{path}: [background] has electrons_per_px and zodiacal_v_mag_arcsec2; write one of them")

@@ -20,10 +20,11 @@ class FrameRecord(msgspec.Struct, kw_only=True):
     """One frame; times ns: `t_ns` of the timeline, `light_ns` of the sender's clock, the others of this host's.
 
     `q` is the attitude at `light_ns`, when the middle row lights, and `rate` (rad/s, cam) the turn for which paths were
-    drawn, null where stars are points. `capped` counts the stars whose paths are coarser than they should be,
-    `missed_before` the refresh periods before it without a frame, `missed` those of the run, and `marker` is the photodiode
-    square. `operator` says how an operator's keys changed the sky ("blank, grid"; under a blank or a patch `q` is null),
-    `hidden` why the window was not seen; "" for neither.
+    drawn, null where stars are points. `velocity_km_s` (ICRS) is that for which stars are aberrated besides the bench file's.
+    `capped` counts the stars whose paths are coarser than they should be, `missed_before` the refresh periods before it without
+    a frame, `missed` those of the run, and `marker` is the photodiode square. `operator`
+    says how an operator's keys changed the sky ("blank, grid"; under a blank or a patch `q` is null), `hidden` why the window
+    was not seen; "" for neither.
     """
 
     frame: Count
@@ -35,6 +36,7 @@ class FrameRecord(msgspec.Struct, kw_only=True):
     timestamp_source: str = "headless"
     q: tuple[float, float, float, float] | None = None
     rate: tuple[float, float, float] | None = None
+    velocity_km_s: tuple[float, float, float] | None = None
     attitude_sequence: int | None = None
     attitude_t_ns: AnyNs | None = None
     receive_ns: HostNs | None = None
@@ -132,6 +134,9 @@ def frame_record(shown: Shown, light_ns: int, missed: int, below_step: int) -> F
     if attitude is not None:
         w, x, y, z = attitude.q_icrs_to_cam.tolist()
         record.q = (w, x, y, z)
+        if attitude.velocity_km_s is not None:
+            x, y, z = attitude.velocity_km_s.tolist()
+            record.velocity_km_s = (x, y, z)
         record.attitude_sequence = attitude.sequence
         record.attitude_t_ns = _within_64_bits(light_ns - attitude.age_ns)
         record.receive_ns = attitude.received_ns

@@ -88,6 +88,10 @@ def test_every_sample_is_basilisk_s_own_attitude_through_the_mounting_and_the_sh
 def test_stars_of_every_frame_are_where_basilisk_s_truth_has_them(broadcast):
     """But for those that show the very first sample, which has no rate yet."""
     truth, topics, _ = broadcast
+    for frame in topics["/frame"]:
+        if frame["q"] is not None:
+            at = truth.v_bn_n[truth.row(frame["attitude_t_ns"])] / 1000
+            assert frame["velocity_km_s"] == pytest.approx(at, rel=1e-15)
     true_at = Slerp(truth.t_ns, rotation(MOUNTING) * truth.body_from_n)
     first = topics["/attitude"][0]["sequence"]
     errors = [

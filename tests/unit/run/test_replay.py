@@ -35,20 +35,25 @@ def log(tmp_path):
 
 @pytest.fixture
 def ledger(tmp_path, small_bench_file):
-    """An earlier run: ten frames, one each 20 ms, the fourth of them blank, the last two on paths."""
+    return earlier_run(tmp_path / "run.mcap", small_bench_file)
+
+
+def earlier_run(path, small_bench_file, speed_km_s=0.0):
+    """Ten frames, one each 20 ms, the fourth of them blank, the last four aberrated, the last two on paths."""
     bench = SimpleNamespace(
         file=SimpleNamespace(path=small_bench_file, text=SMALL_BENCH, sha256="0" * 64),
         calibration=SimpleNamespace(name="srgb", sha256="1" * 64),
         renderer=SimpleNamespace(gl_renderer="none"),
     )
-    path = tmp_path / "run.mcap"
     with Ledger(path, bench) as kept:
         for k in range(10):
             sample = AttitudeSample(k, np.array([1.0, 0.0, 0.0, 0.0]), None, k)
             kept.packet(1000 + k, encode(sample), sample, None)
             q, rate = None if k == 3 else (1.0, 0.0, 0.0, 0.0), (0.0, 0.1, 0.0) if k >= 8 else None
             at_ns = 20_000_000 * k
-            kept.frame(FrameRecord(frame=2 * k, t_ns=500 + k, light_ns=0, draw_ns=at_ns, swap_ns=at_ns, q=q, rate=rate))
+            frame = FrameRecord(frame=2 * k, t_ns=500 + k, light_ns=0, draw_ns=at_ns, swap_ns=at_ns, q=q, rate=rate)
+            frame.velocity_km_s = (0.0, 7.5, speed_km_s) if k >= 6 else None
+            kept.frame(frame)
     return path
 
 
@@ -112,3 +117,12 @@ def test_a_part_of_an_earlier_run_is_chosen_by_when_its_frames_were_swapped(ledg
         plan_play(ledger, Wanted(start_s=0.041, stop_s=0.042), config)
     with pytest.raises(InputError, match="frame by frame"):
         plan_play(ledger, Wanted(2.0), config)
+
+
+def test_stars_that_were_aberrated_are_so_again_and_no_faster_than_a_spacecraft(ledger, config, tmp_path, small_bench_file):
+    velocities = [frame[2].velocity_km_s for frame in map(plan_play(ledger, Wanted(speed=MAX), config).frame, (5, 6))]
+    assert velocities[0] is None
+    assert velocities[1].tolist() == [0.0, 7.5, 0.0]
+    too_fast = earlier_run(tmp_path / "fast.mcap", small_bench_file, speed_km_s=3e5)
+    with pytest.raises(InputError, match="message 7 of /frame: a velocity over 10000 km/s"):
+        plan_play(too_fast, Wanted(speed=MAX), config)

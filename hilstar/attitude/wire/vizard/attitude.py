@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from hilstar.arrays import FloatArray
-from hilstar.attitude.wire.packet import U32, AttitudeSample, Refusal, checked_sample
+from hilstar.attitude.wire.packet import MAX_SPEED_KM_S, U32, AttitudeSample, Refusal, checked_sample
 from hilstar.attitude.wire.source import Conventions, Mounting
 from hilstar.attitude.wire.vizard.message import SimUpdate, Spacecraft, decode_update
 from hilstar.attitude.wire.vizard.wire_format import WireFormatError
@@ -20,6 +20,7 @@ from hilstar.errors import printable, shortened
 from hilstar.rotation import rate_between_rad_s
 from hilstar.units import NS_PER_S
 
+M_PER_KM = 1000.0
 MAX_NAMES = 8  # of spacecraft, in a refusal
 
 
@@ -84,10 +85,14 @@ class DifferenceRates:
 
 
 class Follower:
-    """The attitudes of one spacecraft from messages: that of the `name`, or the only one there is."""
+    """The attitudes of one spacecraft from messages: that of the `name`, or the only one there is.
 
-    def __init__(self, name: str | None, mounting: Mounting, rates: DifferenceRates) -> None:
+    Each has the spacecraft's velocity with respect to the origin of Basilisk's frame, `with_velocity`.
+    """
+
+    def __init__(self, name: str | None, mounting: Mounting, rates: DifferenceRates, *, with_velocity: bool = False) -> None:
         self._name, self._mounting, self._rates = name, mounting, rates
+        self._with_velocity = with_velocity
 
     def take(self, message: bytes) -> tuple[AttitudeSample | Refusal, SimUpdate | None]:
         """The camera's attitude in a VizMessage, or why there is none; and the message itself where it is one."""
@@ -102,7 +107,11 @@ class Follower:
             what = f"spacecraft {_named(chosen)}: {len(chosen.sigma_bn)} components of its rotation (sigma_BN), not 3"
             return Refusal("format", what), update
         sample = checked_sample(update.t_ns, quaternion_of_mrp(chosen.sigma_bn), None, update.frame % U32)
+        velocity = _velocity_km_s(chosen) if self._with_velocity else None
+        if isinstance(velocity, Refusal):
+            return velocity, update
         if isinstance(sample, AttitudeSample):
+            sample = replace(sample, velocity_km_s=velocity)
             sample = self._mounting.sample(replace(sample, rate_cam_rad_s=self._rates.rate(sample)))
         return sample, update
 
@@ -119,6 +128,15 @@ class Follower:
             return Refusal("format", f'spacecraft: {names}; write the one that is meant, [attitude] spacecraft = "NAME"')
         wanted = shortened(printable(self._name))
         return Refusal("format", f"[attitude] spacecraft = {wanted}: {len(found)} have that name; there: {names}")
+
+
+def _velocity_km_s(craft: Spacecraft) -> FloatArray | Refusal:
+    speed_m_s = math.hypot(*craft.velocity_m_s)
+    if len(craft.velocity_m_s) == 3 and speed_m_s <= MAX_SPEED_KM_S * M_PER_KM:
+        return np.array(craft.velocity_m_s) / M_PER_KM
+    told = f"{speed_m_s:.3g} m/s" if craft.velocity_m_s else "nothing"
+    advice = f"it is {MAX_SPEED_KM_S:g} km/s at most; [attitude] use_velocity = false leaves it out"
+    return Refusal("format", f"spacecraft {_named(craft)}: its velocity is {told}, and {advice}")
 
 
 def _named(craft: Spacecraft) -> str:

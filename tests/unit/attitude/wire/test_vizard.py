@@ -235,3 +235,31 @@ def test_a_camera_that_is_not_the_bench_s_tracker_is_told_by_what_differs() -> N
     assert told is not None
     for words in ("camera 4", "0.1 deg from the bench's", "1024 x 512 px, not 1024 x 1024", "10 deg, not 20"):
         assert words in told
+
+
+# Velocity
+
+
+def test_a_velocity_goes_with_the_attitude_in_km_s_where_it_is_wanted() -> None:
+    message = viz_message(spacecraft=[craft(velocity=[1000.0, -7500.0, 0.0])])
+    rates = DifferenceRates(STEP_NS, 1.0)
+    with_it = taken(message, Follower(None, Mounting((0.0, 1.0, 0.0, 0.0)), rates, with_velocity=True))
+    assert isinstance(with_it, AttitudeSample)
+    assert with_it.velocity_km_s is not None
+    assert with_it.velocity_km_s.tolist() == [1.0, -7.5, 0.0], "ICRS, which no mounting turns"
+    assert decode_update(message).spacecraft[0].position_m == (7e6, 0, 0)
+    without = taken(message)
+    assert isinstance(without, AttitudeSample)
+    assert without.velocity_km_s is None
+
+
+@pytest.mark.parametrize(
+    ("velocity", "words"),
+    [([], "is nothing"), ([1.0, 2.0], "is 2.24 m/s"), ([3e8, 0, 0], "is 3e+08 m/s"), ([float("nan"), 0, 0], "is nan m/s")],
+)
+def test_a_velocity_that_is_none_is_refused_with_the_key_that_leaves_it_out(velocity, words) -> None:
+    by = Follower(None, Mounting(), DifferenceRates(STEP_NS, 1.0), with_velocity=True)
+    refusal = taken(viz_message(spacecraft=[craft(velocity=velocity)]), by)
+    assert isinstance(refusal, Refusal)
+    assert words in refusal.detail
+    assert "[attitude] use_velocity = false" in refusal.detail

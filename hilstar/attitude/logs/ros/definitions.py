@@ -53,7 +53,7 @@ def check_definition(where: str, topic: Topic) -> None:
     name = own_name(topic.type)
     text, _ = typestore(topic.encoding).generate_msgdef(name, ros_version=version)
     ours, theirs = _sections(text, name), _sections(topic.definition[:MAX_DEFINITION_CHARACTERS], name)
-    if any(theirs.get(kind) != fields for kind, fields in ours.items()):
+    if any(theirs.get(kind, fields) != fields for kind, fields in ours.items()):  # some writers leave out the inner types
         raise InputError(f"{where}: its {topic.type} is not ROS's own (other fields); publish it as ROS defines it")
 
 

@@ -48,7 +48,7 @@ def read_ros(bag: Bag, stated: Stated) -> LogReading:
     topic = _chosen(bag, stated.topic)
     check_definition(f"{bag.path}: {topic.name}", topic)
     told: list[tuple[str, str]] = []
-    heard = _of_tf(bag, topic, stated) if topic.type in TF_TYPES else _of_topic(bag, topic)
+    heard = _of_tf(bag, topic, stated, told) if topic.type in TF_TYPES else _of_topic(bag, topic)
     first = next(heard, None)
     if first is None:
         raise InputError(f"{bag.path}: has no message of {topic.name}; record it, or choose another with --topic")
@@ -104,7 +104,7 @@ def _of_topic(bag: Bag, topic: Topic) -> Iterator[Heard]:
         yield from (Heard(where, message.receive_ns, turn) for turn in found)
 
 
-def _of_tf(bag: Bag, topic: Topic, stated: Stated) -> Iterator[Heard]:
+def _of_tf(bag: Bag, topic: Topic, stated: Stated, told: list[tuple[str, str]]) -> Iterator[Heard]:
     """The chain of transforms that is stated, from this topic and the static one beside it."""
     beside = topic.name.rpartition("/")[0] + "/" + STATIC_TF
     statics = [other for other in bag.topics() if other.type in TF_TYPES and other.name == beside and other != topic]
@@ -112,8 +112,8 @@ def _of_tf(bag: Bag, topic: Topic, stated: Stated) -> Iterator[Heard]:
     tree = Tree(bag.path, ((heard.receive_ns, heard.turn) for heard in found))
     body = None if stated.body is None else frame(stated.body)
     links = tree.chain(body, named(stated.reference).frame)
-    name = f"{links.moving.parent} -> {links.moving.child}"
-    for number, (receive_ns, turn) in enumerate(links.turns(), start=1):
+    name = f"{links.timed.parent} -> {links.timed.child}"
+    for number, (receive_ns, turn) in enumerate(links.turns(told), start=1):
         yield Heard(f": transform {number} of {name}", receive_ns, turn)
 
 

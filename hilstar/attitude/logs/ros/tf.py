@@ -1,7 +1,8 @@
-"""tf: a tree of frames. A chain of transforms, of which one moves, gives the attitude of one frame in another.
+"""tf: a tree of frames. A chain of transforms gives the attitude of one frame in another.
 
 A transform that always has the same rotation is a part that does not move, whichever topic it comes on. Where several of a
-chain move, their times differ, and the bag is refused: between two samples of one, the motion of another would be invented.
+chain move, the attitudes have the times of the one with the most samples, and the others are interpolated to those (SLERP, as
+tf2 does), never beyond their own.
 """
 
 from __future__ import annotations
@@ -13,12 +14,15 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from hilstar.arrays import FloatArray
 from hilstar.attitude.logs.ros.turns import Turn
+from hilstar.attitude.wire.protocol import NORM_TOLERANCE
 from hilstar.errors import InputError, shortened
-from hilstar.rotation import multiply, normalise
+from hilstar.rotation import conjugate, from_rotation_vectors, multiply, normalise, to_rotation_vector
 
+IntArray = npt.NDArray[np.int64]
 MAX_EDGES = 10_000
 MAX_NAMED = 8
 
@@ -46,33 +50,60 @@ class Edge:
         """(n, 4), as recorded."""
         return np.array(self.numbers, dtype=np.float64).reshape(-1, 4)
 
+    @property
+    def times_ns(self) -> IntArray:
+        """(n,): the stamps, or where they are not set when the transforms were recorded."""
+        stamps = np.array(self.stamps_ns, dtype=np.int64)
+        return stamps if stamps.all() else np.array(self.received_ns, dtype=np.int64)
+
+    def at(self, t_ns: IntArray) -> FloatArray:
+        """The rotations (m, 4) at other times (m,); NaN before its first and after its last."""
+        q = normalise(self.q)
+        if not self.moves:
+            return np.tile(q[0], (len(t_ns), 1))
+        times, first = np.unique(self.times_ns, return_index=True)
+        q = q[first]
+        if len(times) < 2:
+            return np.where((t_ns == times[0])[:, None], q[0], np.nan)
+        after = np.clip(np.searchsorted(times, t_ns), 1, len(times) - 1)
+        share = (t_ns - times[after - 1]) / (times[after] - times[after - 1])
+        turn = to_rotation_vector(multiply(q[after], conjugate(q[after - 1])))
+        found = multiply(from_rotation_vectors(share[:, None] * turn), q[after - 1])
+        found[(t_ns < times[0]) | (t_ns > times[-1])] = np.nan
+        return found
+
 
 class Chain(NamedTuple):
-    """The transforms from a body up to the frame that its attitude refers to, and the one that moves."""
+    """The transforms from a body up to the frame that its attitude refers to, and the one whose times the attitudes have."""
 
     body: str
     reference: str
     edges: tuple[Edge, ...]
-    moving: Edge
+    timed: Edge
 
-    def turns(self) -> Iterator[tuple[int, Turn]]:
-        """When each transform of the moving part was recorded, and the orientation of the whole chain then.
+    def turns(self, told: list[tuple[str, str]]) -> Iterator[tuple[int, Turn]]:
+        """When each transform of the timed part was recorded, and the orientation of the whole chain then.
 
-        Other parts are unit; the moving one keeps its norm, for its check.
+        Other parts are unit; the timed one keeps its norm, for its check.
         """
-        below, above = (np.array([1.0, 0.0, 0.0, 0.0]) for _ in range(2))
-        passed = False
+        t_ns = self.timed.times_ns
+        whole = np.tile([1.0, 0.0, 0.0, 0.0], (len(t_ns), 1))
+        known = np.ones(len(t_ns), dtype=bool)
         for edge in self.edges:
-            if edge is self.moving:
-                passed = True
-            elif passed:
-                above = multiply(normalise(edge.q[0]), above)
-            else:
-                below = multiply(normalise(edge.q[0]), below)
-        whole = multiply(multiply(above, self.moving.q), below)
-        times = zip(self.moving.received_ns, self.moving.stamps_ns, whole.tolist(), strict=True)
-        for received_ns, stamp_ns, (w, x, y, z) in times:
-            yield received_ns, Turn(stamp_ns, self.reference, self.body, (w, x, y, z))
+            part = self.timed.q if edge is self.timed else edge.at(t_ns)
+            known &= np.isfinite(part).all(axis=1) | (edge is self.timed)
+            whole = multiply(part, whole)
+        others = [edge for edge in self.edges if edge.moves and edge is not self.timed]
+        if others:
+            told.append(("log-tf", f"{_named(others)} interpolated (SLERP) to the times of {_named([self.timed])}"))
+        if not known.all():
+            told.append(
+                ("log-tf", f"{int((~known).sum())} attitudes at times that not all of these transforms have are left out")
+            )
+        rows = zip(known.tolist(), self.timed.received_ns, self.timed.stamps_ns, whole.tolist(), strict=True)
+        for is_known, received_ns, stamp_ns, (w, x, y, z) in rows:
+            if is_known:
+                yield received_ns, Turn(stamp_ns, self.reference, self.body, (w, x, y, z))
 
 
 class Tree:
@@ -95,23 +126,18 @@ class Tree:
     def chain(self, body: str | None, reference: str | None) -> Chain:
         """From `body` up to `reference`, or as far as the tree goes; the body may be left out where one frame moves.
 
-        Raises InputError where the tree has no such chain, or more than one of its transforms moves.
+        Raises InputError where the tree has no such chain, or one of its transforms is no rotation.
         """
         body = self._only_body() if body is None else body
         edges = self._edges(body, reference)
-        moving = [edge for edge in edges if edge.moves]
-        if len(moving) > 1:
-            names = _named(moving)
-            between = "choose one with --reference FRAME=icrs and --body FRAME"
-            raise InputError(f"{self._path}: of the transforms from {body!r} up, several move: {names}; {between}")
-        longest = max(edges, key=lambda edge: len(edge.stamps_ns))
+        timed = max(edges, key=lambda edge: (edge.moves, len(edge.stamps_ns)))
         for edge in edges:
-            norm = np.linalg.norm(edge.q[0])
-            if edge is not (moving or [longest])[0] and not 0.5 < norm < 2:
+            worst = float(np.abs(np.linalg.norm(edge.q, axis=1) - 1).max())
+            if edge is not timed and not worst <= NORM_TOLERANCE:
                 raise InputError(
-                    f"{self._path}: the transform {_named([edge])} has a quaternion of norm {norm:.3g}, no rotation"
+                    f"{self._path}: the transform {_named([edge])} has a quaternion whose norm is off by {worst:.3g}"
                 )
-        return Chain(body, edges[-1].parent, edges, (moving or [longest])[0])
+        return Chain(body, edges[-1].parent, edges, timed)
 
     def _only_body(self) -> str:
         edges = [edge for parents in self._up.values() for edge in parents.values()]

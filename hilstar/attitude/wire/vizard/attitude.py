@@ -42,9 +42,12 @@ def _written(q: FloatArray) -> str:
     return f"sigma_BN = ({', '.join(f'{c:.7f}' for c in mrp_of_quaternion(q))})"
 
 
+TURNS = "sigma_BN turns components of Basilisk's inertial frame N, taken as ICRS (J2000), into body components"
+VELOCITY = "the spacecraft's velocity, added to [sky] observer_velocity_km_s, aberrates the stars"
+
 CONVENTIONS = Conventions(
     "Basilisk's Vizard stream",
-    "sigma_BN turns components of Basilisk's inertial frame N, taken as ICRS (J2000), into body components",
+    TURNS,
     "modified Rodrigues parameters; the shadow set is the same attitude",
     "nanoseconds since the simulation began; it has no date",
     of_body=True,
@@ -93,6 +96,7 @@ class Follower:
     def __init__(self, name: str | None, mounting: Mounting, rates: DifferenceRates, *, with_velocity: bool = False) -> None:
         self._name, self._mounting, self._rates = name, mounting, rates
         self._with_velocity = with_velocity
+        self.conventions = replace(CONVENTIONS, turns=f"{TURNS}; {VELOCITY}") if with_velocity else CONVENTIONS
 
     def take(self, message: bytes) -> tuple[AttitudeSample | Refusal, SimUpdate | None]:
         """The camera's attitude in a VizMessage, or why there is none; and the message itself where it is one."""

@@ -15,7 +15,7 @@ import zmq
 
 from hilstar.attitude.wire.keys import NO_KEYS
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal
-from hilstar.attitude.wire.vizard.attitude import CONVENTIONS, Follower
+from hilstar.attitude.wire.vizard.attitude import Follower
 from hilstar.attitude.wire.vizard.message import SimUpdate
 from hilstar.attitude.wire.vizard.parts import MAX_UPDATE_BYTES, SIM_UPDATE, check_loopback, update_of
 from hilstar.attitude.wire.zmq_socket import ZmqSocket
@@ -48,14 +48,13 @@ class ImageRequest:
 class VizardLive(ZmqSocket):
     """A REP socket in Vizard's place; it binds, or connects with `bind=False`."""
 
-    conventions = CONVENTIONS
     max_part_bytes = MAX_UPDATE_BYTES
 
     def __init__(self, endpoint: str, follower: Follower, *, bind: bool = True, notices: Notices | None = None) -> None:
         check_loopback(endpoint)
         super().__init__(zmq.REP, endpoint, bind=bind, keys=NO_KEYS, notices=notices)
         self._shut()
-        self._follower = follower
+        self._follower, self.conventions = follower, follower.conventions
 
     def receive(self, timeout_ms: int) -> Step | ImageRequest | None:
         """The next request that needs more than a plain answer, or None; it must be answered before the next can arrive."""

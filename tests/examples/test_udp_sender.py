@@ -1,0 +1,75 @@
+"""The C++ sender against `hilstar serve` over UDP, and the turn that it says."""
+
+from __future__ import annotations
+
+import re
+import socket
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hilstar.attitude.wire.packet import AttitudeSample, decode
+from hilstar.rotation import propagate
+from tests.examples.support import commands
+from tests.support.benches import ROOT, SMALL_BENCH
+from tests.support.senders import free_port
+from tests.support.servers import interrupted, listening
+
+# As strict as compilers are, besides what the README gives.
+STRICT = ["-Wall", "-Wextra", "-Werror", "-pedantic", "-Wconversion", "-Wshadow", "-fno-exceptions"]
+
+
+@pytest.fixture(scope="module")
+def sender(tmp_path_factory) -> Path:
+    target = tmp_path_factory.mktemp("udp") / "udp_sender"
+    compiler, *rest = commands("A C++ sender over UDP")[0]
+    command = [compiler, *STRICT, *rest[:-1], target]
+    result = subprocess.run(command, cwd=ROOT / "examples", capture_output=True, text=True, timeout=120, check=False)
+    assert (result.returncode, result.stderr) == (0, "")
+    return target
+
+
+@pytest.mark.parametrize("address", ["127.0.0.1", "::1"])
+def test_the_sender_streams_into_hilstar_and_both_sides_talk(tmp_path, sender, address):
+    port = free_port()
+    bench = tmp_path / "udp.toml"
+    bench.write_text(f'{SMALL_BENCH}\n[attitude]\nsource = "udp"\nbind = "{address}"\nport = {port}\n')
+    with listening(bench, "bound to") as process:
+        command = [sender, address, str(port), "100", "1", "5"]
+        result = subprocess.run(command, capture_output=True, text=True, timeout=30, check=True)
+        summary = interrupted(process)
+    match = re.fullmatch(r"sent 100, requests (\d+), statuses (\d+)\n", result.stdout)
+    assert match is not None, result.stdout
+    # A second has 8 quick time requests and 10 statuses, less what the start took.
+    assert int(match[1]) >= 4
+    assert int(match[2]) >= 4
+    assert summary["packets"]["received"] == summary["packets"]["accepted"] == 100
+    assert summary["clock"]["mode"] == "exchange"
+    # Both processes have the same clock.
+    assert abs(summary["clock"]["offset_ms"]) <= summary["clock"]["uncertainty_ms"] + 1.0
+
+
+def test_the_sender_turns_as_its_rate_says(sender):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as end:
+        end.bind(("127.0.0.1", 0))
+        end.settimeout(10.0)
+        command = [sender, "127.0.0.1", str(end.getsockname()[1]), "500", "0.1", "20"]
+        subprocess.run(command, capture_output=True, timeout=30, check=True)
+        samples = [decode(end.recv(100)) for _ in range(50)]
+    rate = np.radians([0.0, 0.0, 20.0])
+    first = samples[0]
+    assert isinstance(first, AttitudeSample)
+    assert [sample.sequence for sample in samples] == list(range(50))
+    for sample in samples:
+        expected = propagate(np.array([0.5, 0.5, -0.5, 0.5]), rate, (sample.t_ns - first.t_ns) / 1e9)
+        assert np.abs(sample.q_icrs_to_cam - expected).max() < 1e-14
+        assert sample.rate_cam_rad_s.tolist() == [0.0, 0.0, float(np.float32(rate[2]))]
+
+
+def test_the_sender_says_in_one_line_what_is_wrong(sender):
+    for arguments, code in (([], 2), (["127.0.0.1", "9", "1", "1", "x"], 2), (["127.0.0.1", "no port", "1", "1", "1"], 1)):
+        result = subprocess.run([sender, *arguments], capture_output=True, text=True, timeout=10, check=False)
+        assert result.returncode == code
+        assert len(result.stderr.splitlines()) == 1

@@ -147,14 +147,15 @@ def _first_word(lines: Iterable[str]) -> str:
 
 
 def _is_bag(path: Path, head: bytes) -> bool:
-    from hilstar.attitude.logs.mcap_reader import holds_ros
-    from hilstar.attitude.logs.ros.bag import is_bag_directory
+    if head.startswith(MCAP_MAGIC):
+        from hilstar.attitude.logs.mcap_reader import holds_ros
 
-    return (
-        head.startswith((ROSBAG_MAGIC, SQLITE_MAGIC))
-        or is_bag_directory(path)
-        or (head.startswith(MCAP_MAGIC) and holds_ros(path))
-    )
+        return holds_ros(path)
+    if path.is_dir():
+        from hilstar.attitude.logs.ros.bag import is_bag_directory
+
+        return is_bag_directory(path)
+    return head.startswith((ROSBAG_MAGIC, SQLITE_MAGIC))
 
 
 @contextlib.contextmanager

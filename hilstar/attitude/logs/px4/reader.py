@@ -45,6 +45,7 @@ class Turning(NamedTuple):
         return earth.q_icrs_to_ned(t_us * 1000 + self.utc.boot_ns, self.place.latitude_deg, self.place.longitude_deg)
 
 
+@np.errstate(all="ignore")  # damaged numbers are refused as not finite, or are unknown rates
 def read_ulog(path: Path, stated: Stated) -> LogReading:
     """The body's attitudes. Raises InputError where neither the log nor the user says where and when they were."""
     if stated.reference is not None and stated.reference.lower() != "ned":
@@ -118,7 +119,7 @@ def _rates(series: Series, topics: dict[Topic, Series], suffix: str) -> FloatArr
 def _entries(series: Series, q: FloatArray, rates: FloatArray | None, turning: Turning) -> Iterator[Entry]:
     counter = series.columns.get("quat_reset_counter", np.zeros(len(q)))
     resets = [False, *np.diff(counter.astype(np.int64)).astype(bool).tolist()]
-    with np.errstate(all="ignore"):  # an overflow is refused as not finite
+    with np.errstate(all="ignore"):  # too
         body = multiply(conjugate(q), turning.q_icrs_to_ned(series.t_us))
     rows = np.full((len(q), 3), np.nan) if rates is None else rates
     for number, t_us in enumerate(series.t_us.tolist()):

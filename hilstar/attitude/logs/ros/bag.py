@@ -31,10 +31,13 @@ class Bag:
         self.path = path
         self._files = files
         self._told = told
+        self._topics: list[Topic] | None = None
 
     def topics(self) -> list[Topic]:
-        """The topics of all files, each once. Raises InputError for damage."""
-        return list(dict.fromkeys(topic for file in self._files for topic in file.topics()))
+        """The topics of all files, each once; the files are looked through once. Raises InputError for damage."""
+        if self._topics is None:
+            self._topics = list(dict.fromkeys(topic for file in self._files for topic in file.topics()))
+        return self._topics
 
     def messages(self, topic: Topic) -> Iterator[Message]:
         """The messages of a topic, file by file. Raises InputError for damage."""

@@ -53,18 +53,17 @@ class BagFile:
         with open_regular(self._path, ADVICE) as file:
             self._check_version(file)
             index = self._index_at(file)
-            if index:
-                file.seek(index)
-        for _ in self._records(index or len(VERSION)):
-            pass
+        for start in (index, len(VERSION)):
+            if start and not self._topics:  # an index that names nothing is not where the bag says
+                for _ in self._records(start):
+                    pass
         return list(dict.fromkeys(self._topics.values()))
 
     def messages(self, topic: Topic) -> Iterator[Message]:
         """The messages of a topic, in the order of the file."""
-        for fields, data in self._records(len(VERSION)):
-            if self._topics.get(_u32.unpack(fields[b"conn"])[0]) == topic:
-                seconds, ns = _time.unpack(fields[b"time"])
-                yield Message(seconds * 10**9 + ns, data)
+        for connection, message in self._records(len(VERSION)):
+            if self._topics.get(connection) == topic:
+                yield message
 
     def told(self) -> list[tuple[str, str]]:
         """That the bag was cut short."""
@@ -93,8 +92,8 @@ class BagFile:
             return 0
         return at if at < self._path.stat().st_size else 0
 
-    def _records(self, start: int) -> Iterator[tuple[Fields, bytes]]:
-        """Fields and data of every message from byte `start`; connections are kept as they come."""
+    def _records(self, start: int) -> Iterator[tuple[int, Message]]:
+        """Every message from byte `start`, with its connection's number; connections are kept as they come."""
         with open_regular(self._path, ADVICE) as file:
             room = FREE_BYTES + MAX_INFLATION * self._path.stat().st_size
             file.seek(start)
@@ -114,14 +113,15 @@ class BagFile:
             except FAULTS as error:
                 raise damaged(self._path, error, f" before byte {file.tell()}") from error
 
-    def _inside(self, chunk: IO[bytes]) -> Iterator[tuple[Fields, bytes]]:
+    def _inside(self, chunk: IO[bytes]) -> Iterator[tuple[int, Message]]:
         try:
             while (record := _record(chunk, MAX_CHUNK_BYTES)) is not None:
-                operation = _operation(record[0])
-                if operation == MESSAGE:
-                    yield record
-                elif operation == CONNECTION:
-                    self._connect(*record)
+                fields, data = record
+                if _operation(fields) == MESSAGE:
+                    seconds, ns = _time.unpack(fields[b"time"])
+                    yield _u32.unpack(fields[b"conn"])[0], Message(seconds * 10**9 + ns, data)
+                elif _operation(fields) == CONNECTION:
+                    self._connect(fields, data)
         except CutError as error:
             raise ValueError("a record is longer than its chunk") from error
 

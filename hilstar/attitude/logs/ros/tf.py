@@ -92,7 +92,8 @@ class Chain(NamedTuple):
         for edge in self.edges:
             part = self.timed.q if edge is self.timed else edge.at(t_ns)
             known &= np.isfinite(part).all(axis=1) | (edge is self.timed)
-            whole = multiply(part, whole)
+            with np.errstate(all="ignore"):  # of the timed part, what is not finite is refused where it is checked
+                whole = multiply(part, whole)
         others = [edge for edge in self.edges if edge.moves and edge is not self.timed]
         if others:
             told.append(("log-tf", f"{_named(others)} interpolated (SLERP) to the times of {_named([self.timed])}"))
@@ -132,7 +133,8 @@ class Tree:
         edges = self._edges(body, reference)
         timed = max(edges, key=lambda edge: (edge.moves, len(edge.stamps_ns)))
         for edge in edges:
-            worst = float(np.abs(np.linalg.norm(edge.q, axis=1) - 1).max())
+            with np.errstate(over="ignore"):
+                worst = float(np.abs(np.linalg.norm(edge.q, axis=1) - 1).max())
             if edge is not timed and not worst <= NORM_TOLERANCE:
                 raise InputError(
                     f"{self._path}: the transform {_named([edge])} has a quaternion whose norm is off by {worst:.3g}"

@@ -109,6 +109,16 @@ def test_a_chunk_that_is_not_as_large_as_it_states_is_refused(tmp_path, compress
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before_kb < MAX_GROWTH_KB
 
 
+@pytest.mark.parametrize("fields", [{}, {b"conn": bytes(4)}, {b"conn": b"", b"time": bytes(8)}, {b"time": bytes(8)}])
+def test_a_message_record_without_its_fields_is_refused(tmp_path, fields):
+    chunk = record({b"op": b"\x02", **fields}, bytes(10))
+    whole = write_bag1(tmp_path / "whole.bag", poses("noetic")).read_bytes()
+    begun = bag_of({b"compression": b"none", b"size": struct.pack("<I", len(chunk))}, chunk)
+    (tmp_path / "a.bag").write_bytes(begun + whole[len(b"#ROSBAG V2.0\n") + 4096 :])
+    with pytest.raises(InputError, match="the bag is damaged"):
+        open_log(tmp_path / "a.bag")
+
+
 @pytest.mark.parametrize("size", [2**31, 2**32 - 1])
 def test_a_record_of_billions_is_not_waited_for(tmp_path, size):
     (tmp_path / "a.bag").write_bytes(b"#ROSBAG V2.0\n" + struct.pack("<I", size) + bytes(100))

@@ -113,6 +113,29 @@ def load_calibration(source: str | Path, bits: int, *, bit_stealing: bool = Fals
     return _load_file(path, name if name == "lcd-example" else path.name, bits, bit_stealing)
 
 
+def primary_lights(source: str | Path, bits: int) -> FloatArray:
+    """Light above black of each primary by its code (3, 2^bits), relative to white as the tracker sees it.
+
+    Raises InputError as `load_calibration` does with bit stealing.
+    """
+    if str(source) in FORMULAS:
+        grey = srgb_response(bits) if str(source) == "srgb" else gamma_response(bits)
+        return np.outer(REC709_WEIGHTS, grey.light)
+    path, digest = EXAMPLE if str(source) == "lcd-example" else Path(source), hashlib.sha256()
+    file = read_toml(path, digest)
+    columns = read_response(beside(path, file.calibration.response, "[calibration] response"), bits, digest)
+    above = {name: light - light[0] for name, light in columns.items()}
+    if "r" in above and file.weights is None:
+        light = np.stack([above[name] for name in ("r", "g", "b")])
+        return np.asarray(light / light[:, -1].sum())
+    if file.weights is None:
+        raise InputError(f"{path}: the primaries as the tracker sees them are not known; add [weights] r, g, b")
+    shares = np.array([file.weights.r, file.weights.g, file.weights.b])
+    names = ("r", "g", "b") if "r" in above else ("w", "w", "w")
+    light = np.stack([above[name] / above[name][-1] for name in names])
+    return np.asarray(light * (shares / shares.sum())[:, None])
+
+
 def _load_file(path: Path, name: str, bits: int, bit_stealing: bool) -> Calibration:
     digest = hashlib.sha256()
     file = read_toml(path, digest)

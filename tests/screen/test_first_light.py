@@ -7,8 +7,12 @@ import re
 import subprocess
 import time
 
+import numpy as np
 import pytest
 
+from hilstar.bench.bench_file import read_bench_file
+from hilstar.calibrate.first_light.patterns import Pattern
+from hilstar.calibrate.first_light.sight.display import Display
 from tests.support import plain_camera
 from tests.support.benches import TWIN, bench_text
 from tests.support.commands import HILSTAR, run_hilstar
@@ -104,3 +108,25 @@ def test_the_delay_of_a_real_display_is_found_by_a_photodiode(screen, tmp_path):
     assert steps["latency"]["verdict"] == "done", steps["latency"]["line"]
     assert steps["latency"]["figures"]["panel_delay_ms"] == pytest.approx(ADDED_MS, abs=MEDIAN_MS)
     assert f"panel_delay_ms = {steps['latency']['figures']['panel_delay_ms']}" in bench.read_text()
+
+
+def test_colours_are_shown_and_frames_of_a_turn_one_after_the_other(screen, tmp_path, monkeypatch):
+    monkeypatch.setenv("DISPLAY", screen.display)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    (tmp_path / "bench.toml").write_text(bench_text({"monitor": {"resolution_px": [640, 480]}}))
+    file = read_bench_file(tmp_path / "bench.toml")
+    rng = np.random.default_rng(1)
+    table = rng.integers(0, 256, (1000, 3)).astype(np.uint16)
+    colours, other = table[rng.integers(0, 1000, (2, 480, 640))]
+    looks = []
+    with Display() as display:
+        display.show_until(file, Pattern("colours", colours), lambda: looks.append(screen.pixels()) or True)
+        assert (looks[-1] == colours).all()
+        seen = set()
+
+        def done():
+            now = screen.pixels()
+            seen.update(number for number, frame in enumerate((colours, other)) if (now == frame).all())
+            return len(seen) == 2
+
+        display.show_until(file, Pattern("turn", colours, (other,)), done)

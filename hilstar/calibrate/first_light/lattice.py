@@ -12,7 +12,8 @@ import numpy as np
 from scipy.special import ndtr
 
 from hilstar.arrays import FloatArray
-from hilstar.calibrate.first_light.patterns import CodeImage, black
+from hilstar.calibrate.first_light.patterns import CodeImage, black, in_channel
+from hilstar.calibrate.plan import Patch
 from hilstar.errors import InputError
 from hilstar.twin.bench_geometry import BenchGeometry
 
@@ -38,13 +39,13 @@ class DotField:
     columns: slice
     monitor_px: float
 
-    def lattice(self, resolution_px: tuple[int, int], period: int, code: int) -> CodeImage:
-        """Each `period`-th pixel of the square, across and down, in `code`; from the middle of its cell on."""
+    def lattice(self, resolution_px: tuple[int, int], period: int, patch: Patch) -> CodeImage:
+        """Each `period`-th pixel of the square, across and down, in a patch's code and channel; from its cell's middle on."""
         codes = black(resolution_px)
         first = period // 2
         inside = codes[self.top : self.top + self.side, self.left : self.left + self.side]
-        inside[first::period, first::period] = code
-        return codes
+        inside[first::period, first::period] = patch.code
+        return in_channel(codes, patch.channel)
 
     def lit(self, period: int) -> int:
         """How many pixels such a lattice has."""

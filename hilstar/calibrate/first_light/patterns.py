@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import FloatArray
+from hilstar.calibrate.measurements import PRIMARIES
 from hilstar.errors import InputError
 from hilstar.render.presenter import Orientation
 from hilstar.twin.bench_geometry import BenchGeometry
@@ -21,10 +22,19 @@ SQUARES = (3, 2, 1)  # sides of the squares at the corner, to its right and belo
 
 @dataclass(frozen=True, slots=True)
 class Pattern:
-    """Code values (h, w) over the monitor's image, and the name of the tracker's image of them."""
+    """Code values (h, w), or (h, w, 3), over the monitor's image, and the name of the tracker's image of them.
+
+    `later` are frames that follow, one a refresh, before it begins again.
+    """
 
     name: str
     codes: CodeImage
+    later: tuple[CodeImage, ...] = ()
+
+    @property
+    def frames(self) -> tuple[CodeImage, ...]:
+        """All frames of one turn."""
+        return (self.codes, *self.later)
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +75,15 @@ def black(resolution_px: tuple[int, int]) -> CodeImage:
     """Code 0 everywhere."""
     width, height = resolution_px
     return np.zeros((height, width), dtype=np.uint16)
+
+
+def in_channel(codes: CodeImage, channel: str) -> CodeImage:
+    """Codes (h, w) in one primary (h, w, 3); in all of them, as they are, for w."""
+    if channel == "w":
+        return codes
+    colours = np.zeros((*codes.shape, 3), dtype=np.uint16)
+    colours[..., PRIMARIES.index(channel)] = codes
+    return colours
 
 
 def on_screen(codes: CodeImage, orientation: Orientation) -> CodeImage:

@@ -13,7 +13,7 @@ from hilstar.arrays import FloatArray, IntArray
 from hilstar.bench.build import open_bench
 from hilstar.bench.cameras import tracker_camera
 from hilstar.bench.frame import Bench, Frame
-from hilstar.calibrate.first_light.patterns import Pattern
+from hilstar.calibrate.first_light.patterns import CodeImage, Pattern
 from hilstar.calibrate.first_light.rooms import MAX_FILL, Looked, Room
 from hilstar.errors import InputError
 from hilstar.rotation import to_matrix
@@ -67,12 +67,12 @@ class StarsSeen:
 def see_stars(room: Room) -> StarsSeen:
     """Show the bench's own fields of stars and measure them. Raises InputError where too few stars can be compared."""
     with open_bench(room.file) as bench:
-        shown = [(frame.codes.astype(np.uint16), _alone(bench, room, frame)) for frame in _fullest(bench)]
+        shown = [(_frames(bench, frame), _alone(bench, room, frame)) for frame in _fullest(bench)]
     dark_path = room.dark()
     dark = room.read(dark_path)
     fields = [
-        _compared(room, room.look(Pattern(f"stars_{number:03}", codes), dark), wanted)
-        for number, (codes, wanted) in enumerate(shown)
+        _compared(room, room.look(Pattern(f"stars_{number:03}", frames[0], frames[1:]), dark), wanted)
+        for number, (frames, wanted) in enumerate(shown)
     ]
     seen = _together(fields, dark_path)
     if len(seen.hip) < MIN_STARS:
@@ -81,6 +81,13 @@ def see_stars(room: Room) -> StarsSeen:
             " not there: expose longer, set a fainter [render] brightest_v_mag, or run the geometry again"
         )
     return seen
+
+
+def _frames(bench: Bench, frame: Frame) -> tuple[CodeImage, ...]:
+    """The codes of an attitude: one frame, or with `temporal` a whole turn of them."""
+    numbers = range(1, bench.config.render.cycle_frames if bench.config.render.quantisation == "temporal" else 1)
+    later = [bench.code_values(bench.draw(frame.q_icrs_to_cam, number).levels.copy()) for number in numbers]
+    return tuple(codes.astype(np.uint16) for codes in (frame.codes, *later))
 
 
 def _together(fields: list[StarsSeen], dark: Path) -> StarsSeen:

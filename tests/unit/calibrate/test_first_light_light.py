@@ -1,4 +1,4 @@
-"""The light of first light: dots on lattices, the exposure that they need, and what is read of them."""
+"""The light of first light: dots on lattices, the exposure that they need, and what is read of them and of stars."""
 
 from __future__ import annotations
 
@@ -9,11 +9,14 @@ from scipy.special import ndtr
 
 from hilstar.bench.bench_file import read_bench_file
 from hilstar.calibrate.first_light.lattice import field_for, peak_shares
-from hilstar.calibrate.first_light.photometer import Photometer
+from hilstar.calibrate.first_light.photometer import Assumed, Photometer
 from hilstar.calibrate.first_light.rooms import Room
-from hilstar.calibrate.first_light.steps.light import exponent, plan_for, response_error_mag, trend
+from hilstar.calibrate.first_light.sight.virtual import VirtualBench
+from hilstar.calibrate.first_light.steps.light import exponent, photometry, plan_for, response_error_mag, scale, trend
 from hilstar.calibrate.plan import Patch
 from hilstar.errors import InputError
+from hilstar.monitor.calibration import load_calibration, primary_lights
+from hilstar.monitor.calibration_file import Head, NotesTable, write_calibration
 from hilstar.monitor.geometry import monitor_camera
 from hilstar.monitor.response import gamma_response, srgb_response
 from hilstar.twin.bench_geometry import BenchGeometry
@@ -31,7 +34,7 @@ def test_a_lattice_lights_as_many_pixels_as_it_says_and_only_in_its_square():
     field, periods = field_for(GEOMETRY, SIGMA_PX)
     assert periods == (1, 2, 4, 8, 16)
     for period in periods:
-        codes = field.lattice((640, 480), period, 7)
+        codes = field.lattice((640, 480), period, Patch(7, "w"))
         assert (codes == 7).sum() == field.lit(period)
         codes[field.top : field.top + field.side, field.left : field.left + field.side] = 0
         assert not codes.any()
@@ -84,7 +87,7 @@ class Camera:
 def read(tmp_path, camera, codes=(0, 100, 300, 511, 700, 900, 1023, 0)):
     (tmp_path / "bench.toml").write_text(bench_text(TWIN))
     room = Room(read_bench_file(tmp_path / "bench.toml"), tmp_path, tmp_path / "i", camera, {}, {}, 96)
-    photometer = Photometer(room, SIGMA_PX, srgb_response(10))
+    photometer = Photometer(room, SIGMA_PX, Assumed({"w": srgb_response(10).light}, 0.0))
     return photometer.read([Patch(code, "w") for code in codes])
 
 
@@ -155,3 +158,55 @@ def test_a_trend_is_over_the_whole_range_and_has_its_error():
     found, error = trend(e_per_s, off)
     assert found == pytest.approx(0.1 * np.ptp(np.log10(e_per_s)), abs=4 * error)
     assert error == pytest.approx(0.01 / np.sqrt(200) * np.sqrt(12), rel=0.2)
+
+
+def on_the_twin(tmp_path, step, bench, truth, patches=72):
+    """What a step comes to on a bench that is truly another."""
+    (tmp_path / "bench.toml").write_text(bench_text(TWIN, bench))
+    (tmp_path / "truth.toml").write_text(bench_text(TWIN, truth))
+    file, true = (read_bench_file(tmp_path / name) for name in ("bench.toml", "truth.toml"))
+    eyes = VirtualBench(file, true, 0)
+    try:
+        return step(Room(file, tmp_path, tmp_path / "images", eyes, {}, {}, patches))
+    finally:
+        eyes.close()
+
+
+def test_bit_stealing_needs_the_primaries_and_finds_their_shares(tmp_path):
+    """Three channels of their own powers and shares of white: a triple's light is right only when all six are."""
+    light = gamma_response(8, 2.35).light
+    planted = {"r": 0.3 * light, "g": 0.5 * light**1.02, "b": 0.2 * light**0.97}
+    head = Head("photometric", "planted", "2026-11-22", "none", "relative", 8, "true-response.csv")
+    columns = {name: 0.001 + value for name, value in planted.items()}
+    write_calibration(tmp_path / "true-response.toml", head, columns, 0.0, NotesTable())
+    bench = {"monitor": {"bits": 8}, "render": {"bit_stealing": True}}
+    outcome = on_the_twin(tmp_path, photometry, bench, {"monitor": {"bits": 8, "calibration": "true-response.toml"}})
+    assert outcome.verdict == "done", outcome.line
+    found = primary_lights(tmp_path / "response.toml", 8)
+    assert found[:, -1] == pytest.approx([0.3, 0.5, 0.2], abs=0.001)
+    wanted = np.stack(list(planted.values()))
+    shown = wanted >= 1e-3 * wanted[:, -1:]
+    assert found[shown] / wanted[shown] == pytest.approx(np.ones(shown.sum()), abs=0.01)
+    assert load_calibration(tmp_path / "response.toml", 8, bit_stealing=True).response.rgb is not None
+
+
+def test_stars_of_temporal_frames_are_seen_over_their_whole_turn(tmp_path):
+    """With 5 bits a turn of four frames leaves 0.012 mag between the stars, its first frame alone 0.036."""
+    bench = {"monitor": {"bits": 5}, "render": {"quantisation": "temporal", "cycle_frames": 4}}
+    truth = {"monitor": {"bits": 5}, "render": {"quantisation": "round", "flux_at_white_e_per_s": 2.5e6}}
+    outcome = on_the_twin(tmp_path, scale, bench, truth)
+    assert outcome.verdict == "done", outcome.line
+    assert outcome.figures["truth_off_mag"] == pytest.approx(0.0, abs=0.01)
+    assert outcome.figures["scatter_mag"] < 0.02
+
+
+def test_a_truth_whose_primaries_are_not_known_cannot_stand_in_for_bit_stealing(tmp_path):
+    head = Head("photometric", "planted", "2026-11-22", "none", "relative", 8, "true-response.csv")
+    write_calibration(tmp_path / "true-response.toml", head, {"w": gamma_response(8).light}, 0.0, NotesTable())
+    with pytest.raises(InputError, match=r"\[weights\]"):
+        on_the_twin(
+            tmp_path,
+            photometry,
+            {"monitor": {"bits": 8}, "render": {"bit_stealing": True}},
+            {"monitor": {"bits": 8, "calibration": "true-response.toml"}},
+        )

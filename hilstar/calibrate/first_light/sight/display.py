@@ -13,7 +13,7 @@ from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import open_bench
 from hilstar.bench.orientation import orientation_of
 from hilstar.calibrate.edges import Edges, edges_of
-from hilstar.calibrate.first_light.patterns import Pattern
+from hilstar.calibrate.first_light.patterns import CodeImage, Pattern
 from hilstar.errors import HilstarError, MachineError
 from hilstar.render.presenter import Presenter, View, level_texture, window_context
 from hilstar.render.renderer import leave_contexts
@@ -41,6 +41,19 @@ def _go_on(window: Window, stopped: bool) -> None:
         raise Stopped("stopped at the display; run the same command again to go on")
 
 
+def _presenter(file: BenchFile, window: Window, codes: CodeImage) -> tuple[Presenter, Callable[[], None]]:
+    """What shows codes (h, w) or (h, w, 3) in the window, and what frees its texture after it."""
+    monitor, triples = file.config.monitor, None
+    if codes.ndim == 3:
+        packed = codes.astype(np.int64) @ np.array([1 << 32, 1 << 16, 1])
+        colours, levels = np.unique(packed, return_inverse=True)
+        triples = np.stack([colours >> 32, colours >> 16 & 0xFFFF, colours & 0xFFFF], axis=1).astype(np.uint16)
+        codes = levels.reshape(codes.shape[:2]).astype(np.uint16)
+    view = View(monitor.resolution_px, window.size_px, monitor.bits, orientation_of(monitor), triples=triples)
+    texture = level_texture(window_context(), codes)
+    return Presenter(texture, view), texture.release
+
+
 class Display:
     """The window on the bench's display, opened with the first pattern. Free it with `close`, or use it as a context."""
 
@@ -65,24 +78,24 @@ class Display:
 
         Raises Stopped where the window is closed, MachineError where the display goes away.
         """
-        monitor = file.config.monitor
         window = self._window_for(file)
-        view = View(monitor.resolution_px, window.size_px, monitor.bits, orientation_of(monitor))
-        texture = level_texture(window_context(), pattern.codes)
-        presenter = Presenter(texture, view)
-        start_s = time.monotonic()
+        pause_s = 0.5 / file.config.monitor.refresh_hz if pattern.later else POLL_S
+        shown = [_presenter(file, window, codes) for codes in pattern.frames]
+        start_s, number = time.monotonic(), 0
         window.keys.clear()  # of the pattern before
         try:
             while time.monotonic() - start_s < SETTLE_S or not done():
-                presenter.present()
+                shown[number % len(shown)][0].present()
                 window.swap()
+                number += 1
                 window.look_at_events()
                 _go_on(window, bool({"q", "escape"} & set(window.keys)))
                 while window.keys:
                     on_key(window.keys.popleft())
-                time.sleep(POLL_S)
+                time.sleep(pause_s)
         finally:
-            texture.release()
+            for _, release in shown:
+                release()
 
     def blink(self, file: BenchFile, begin: Callable[[], Callable[[], bool]]) -> Edges:
         """Show the photodiode's square on black, frame by frame: its changes. Raises Stopped, MachineError.

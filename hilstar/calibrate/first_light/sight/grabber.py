@@ -58,6 +58,8 @@ class Grabber:
         values = {"{output}": str(output), "{pattern}": str(shown), "{exposure_s}": f"{exposure_s:.9g}"}
         words = [_filled(word, values) for word in self._words]
         output.unlink(missing_ok=True)  # of an attempt that was interrupted: a command that writes nothing shall not pass
+        if self._shows and pattern.later:
+            raise InputError("a frame of `temporal` is many pictures: leave {pattern} out of --grab, and show them here")
         if self._shows:
             monitor = file.config.monitor
             write_codes_png(shown, on_screen(pattern.codes, orientation_of(monitor)), monitor.bits)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zlib
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from hilstar.calibrate.first_light.sight.diode import KIND, Watched
 from hilstar.calibrate.latency import swap_to_square_ms
 from hilstar.errors import InputError
 from hilstar.files import written
-from hilstar.monitor.quantise import shown_light
+from hilstar.monitor.calibration import BUILT_IN, primary_lights
 from hilstar.run.screen.gate import Timing
 from hilstar.run.screen.photodiode import marker_light
 from hilstar.tracker.detector import Detector
@@ -51,7 +52,11 @@ class VirtualBench:
         self._detector = Detector(tracker.detector, tracker.resolution_px, tracker.pixel_pitch_um)
         self._glow_e_per_s: FloatArray = self._optics.glow_e_per_s(self._panel)
         self._sky_e_per_s: FloatArray = background_e(config, truth.folder) / tracker.exposure_s
+        uniformity = 1.0 if self._panel.uniformity is None else self._panel.uniformity.astype(np.float64)
+        self._white_e_per_s: FloatArray = np.full(camera.resolution_px[::-1], self._panel.flux_at_white_e_per_s) * uniformity
         self._units: dict[bytes, FloatArray] = {}
+        if bench.config.render.bit_stealing:
+            _ = self._primaries  # refused now where they are not known
 
     def gate(self, file: BenchFile) -> Timing | None:
         """None: there is no display."""
@@ -59,10 +64,11 @@ class VirtualBench:
 
     def look(self, file: BenchFile, pattern: Pattern, stem: Path, exposure_s: float) -> Path:
         """The tracker's image of a pattern: a PNG of 16 bits."""
-        codes = off_screen(
-            on_screen(pattern.codes, orientation_of(file.config.monitor)), orientation_of(self.truth.config.monitor)
-        )
-        return self._exposed(self._image_e_per_s(np.ascontiguousarray(codes)) + self._glow_e_per_s, exposure_s, stem)
+        mine, its = orientation_of(file.config.monitor), orientation_of(self.truth.config.monitor)
+        frames = [np.ascontiguousarray(off_screen(on_screen(codes, mine), its)) for codes in pattern.frames]
+        shown = max(1, round(exposure_s * file.config.monitor.refresh_hz))
+        image = self._image_e_per_s([frames[number % len(frames)] for number in range(shown if len(frames) > 1 else 1)])
+        return self._exposed(image + self._glow_e_per_s, exposure_s, stem)
 
     def unlit(self, stem: Path) -> Path | None:
         """The tracker's image of a monitor that is switched off."""
@@ -90,22 +96,32 @@ class VirtualBench:
         written(path, lambda part: image.save(part, "PNG", compress_level=1))
         return path
 
-    def _image_e_per_s(self, codes: CodeImage) -> FloatArray:
-        """Electrons per second (h, w) of the codes; a pattern of one code is drawn once, whatever code it has."""
-        lit = codes > 0
-        code = int(codes.max())
-        if not code:
+    def _image_e_per_s(self, frames: list[CodeImage]) -> FloatArray:
+        """Electrons per second (h, w) of frames in the mean; a pattern of one light is drawn once, whatever light it is."""
+        light = np.mean([self._light(codes) for codes in frames], axis=0)
+        lit, brightest = light > 0, float(light.max())
+        if not brightest:
             return np.zeros_like(self._glow_e_per_s)
-        if not (codes[lit] == code).all():
-            return self._optics.image_e_per_s(shown_light(codes, self._panel))
+        if not (light[lit] == brightest).all():
+            return self._optics.image_e_per_s(light * self._white_e_per_s)
         key = np.packbits(lit).tobytes()
-        light = self._panel.response.light
         if key not in self._units:
             if len(self._units) == MASKS_KEPT:
                 del self._units[next(iter(self._units))]
-            white = shown_light(np.where(lit, len(light) - 1, 0).astype(np.uint16), self._panel)
-            self._units[key] = self._optics.image_e_per_s(white)
-        return self._units[key] * float(light[code])
+            self._units[key] = self._optics.image_e_per_s(lit * self._white_e_per_s)
+        return self._units[key] * brightest
+
+    def _light(self, codes: CodeImage) -> FloatArray:
+        """Light above black (h, w) of codes (h, w) or (h, w, 3), relative to white at the screen's brightest place."""
+        if codes.ndim == 2:
+            return np.asarray(self._panel.response.light[codes])
+        return np.asarray(sum(self._primaries[place][codes[..., place]] for place in range(3)))
+
+    @cached_property
+    def _primaries(self) -> FloatArray:
+        monitor = self.truth.config.monitor
+        source = monitor.calibration if monitor.calibration in BUILT_IN else self.truth.folder / monitor.calibration
+        return primary_lights(source, monitor.bits)
 
     def close(self) -> None:
         """Free the GL context."""

@@ -8,18 +8,20 @@ from pathlib import Path
 import numpy as np
 
 from hilstar.arrays import FloatArray
+from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import open_bench
-from hilstar.calibrate.first_light.photometer import Photometer, Readings
+from hilstar.calibrate.first_light.photometer import Assumed, Photometer, Readings
 from hilstar.calibrate.first_light.pictures import draw_light, draw_response_error
 from hilstar.calibrate.first_light.records import Change, Figure, Outcome
 from hilstar.calibrate.first_light.rooms import Room
 from hilstar.calibrate.first_light.stars import MIN_STARS, see_stars
+from hilstar.calibrate.measurements import PRIMARIES
 from hilstar.calibrate.photometric import PhotometricSummary, Provenance, calibrate_photometric
 from hilstar.calibrate.plan import Patch, PlanSettings, plan_patches
 from hilstar.calibrate.response_chart import draw_calibration
 from hilstar.calibrate.scale import UNSURE_MAG, Reading, scale_by_tracker
 from hilstar.errors import InputError
-from hilstar.monitor.calibration import BUILT_IN, Calibration, load_calibration
+from hilstar.monitor.calibration import BUILT_IN, Calibration, load_calibration, primary_lights
 from hilstar.monitor.calibration_file import add_uniformity
 from hilstar.monitor.response import Response
 from hilstar.scene.psf import peak_share
@@ -40,7 +42,9 @@ def photometry(room: Room) -> Outcome:
         return Outcome("skipped", f"not measured, the bench file's {monitor.calibration} stays: {how}")
     assumed = calibration_of(room)
     sigma_px = float(room.known.get("focus.psf_sigma_px", np.mean(room.file.config.tracker.psf_sigma_px)))
-    readings = Photometer(room, sigma_px, assumed.response).read(plan_for(monitor.bits, room.patches))
+    channels = "".join(PRIMARIES) if room.file.config.render.bit_stealing else "w"
+    planned = plan_for(monitor.bits, room.patches, channels)
+    readings = Photometer(room, sigma_px, _assumed(room, assumed, channels)).read(planned)
     measured, output, picture, before = (room.session / name for name in PHOTOMETRY_FILES)
     readings.write(measured)
     instrument = f"the tracker, exposed for {readings.exposure_s:.4g} s, hilstar first-light"
@@ -49,30 +53,45 @@ def photometry(room: Room) -> Outcome:
     if assumed.uniformity is not None:
         files.append(add_uniformity(output, assumed.uniformity))
     draw_calibration(measured, picture, monitor.bits)
-    now = load_calibration(output, monitor.bits).response
+    written = load_calibration(output, monitor.bits)
+    now = written.response
     figures = _response_figures(room, readings, found, assumed.response, now)
+    if written.weights is not None:
+        figures["shares_of_white"] = ", ".join(f"{n} {share:.4f}" for n, share in zip(channels, written.weights, strict=True))
     off = f"{figures['bench_file_off_rms_mag']:.3f} mag rms, {figures['bench_file_off_max_mag']:.3f} max"
     draw_response_error(before, now, response_error_mag(assumed.response, now), f"The bench file's response is off by {off}")
     return _judged(room, figures, tuple(dict.fromkeys(files)), (picture, before))
 
 
-def plan_for(bits: int, patches: int) -> list[Patch]:
+def _assumed(room: Room, calibration: Calibration, channels: str) -> Assumed:
+    """What the bench file says of each channel."""
+    if channels == "w":
+        return Assumed({"w": calibration.response.light}, calibration.response.black)
+    lights = primary_lights(_source(room.file), room.file.config.monitor.bits)
+    return Assumed(dict(zip(channels, lights, strict=True)), calibration.response.black)
+
+
+def plan_for(bits: int, patches: int, channels: str = "w") -> list[Patch]:
     """The plan of the most levels that has no more than so many patches. Raises InputError where they are too few."""
     best: list[Patch] = []
     for levels in range(MIN_LEVELS, min(patches, 2**bits) + 1):
-        planned = plan_patches(PlanSettings(bits, levels, 1), np.random.default_rng(SEED))
+        planned = plan_patches(PlanSettings(bits, levels, 1, channels), np.random.default_rng(SEED))
         if len(planned) <= patches:
             best = planned
     if not best:
-        fewest = len(plan_patches(PlanSettings(bits, MIN_LEVELS, 1), np.random.default_rng(SEED)))
+        fewest = len(plan_patches(PlanSettings(bits, MIN_LEVELS, 1, channels), np.random.default_rng(SEED)))
         raise InputError(f"--patches {patches}: a response needs {fewest} or more; write that, or 0 for none")
     return best
 
 
 def calibration_of(room: Room) -> Calibration:
     """The monitor's light as the bench file has it, code by code."""
-    name = room.file.config.monitor.calibration
-    return load_calibration(name if name in BUILT_IN else room.file.folder / name, room.file.config.monitor.bits)
+    return load_calibration(_source(room.file), room.file.config.monitor.bits)
+
+
+def _source(file: BenchFile) -> str | Path:
+    name = file.config.monitor.calibration
+    return name if name in BUILT_IN else file.folder / name
 
 
 def _response_figures(
@@ -88,8 +107,8 @@ def _response_figures(
         "black_level": now.black,
         "black_level_in_bench_file": before.black,
         "black_level_measured": "yes" if readings.black_known else "no: give --dark, an image with the monitor switched off",
-        "held_out_rms_mag": first.holdout.rms_mag,
-        "held_out_max_mag": first.holdout.max_mag,
+        "held_out_rms_mag": max(each.holdout.rms_mag for each in found.channels.values()),
+        "held_out_max_mag": max(each.holdout.max_mag for each in found.channels.values()),
         "noise_percent": 100 * found.noise_relative,
         "drift_percent": float("nan") if found.drift_percent is None else found.drift_percent,
         "patches": len(readings.patches),
@@ -100,9 +119,7 @@ def _response_figures(
         **{f"error_at_{decade}_percent": value for decade, value in first.error_percent.items()},
     }
     if room.truth is not None:
-        config = room.truth.config
-        name = config.monitor.calibration
-        true = load_calibration(name if name in BUILT_IN else room.truth.folder / name, config.monitor.bits).response
+        true = load_calibration(_source(room.truth), room.truth.config.monitor.bits).response
         figures["truth_max_mag"] = float(np.abs(response_error_mag(now, true)).max())
         figures["truth_black_level"] = true.black
     return figures

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from pathlib import Path
 
 from msgspec.structs import replace
@@ -17,6 +18,7 @@ from hilstar.errors import InputError
 from hilstar.monitor.calibration import BUILT_IN, Calibration, load_calibration
 from hilstar.monitor.quantise import Panel, cycle_warning
 from hilstar.render.renderer import Context, Renderer, Target
+from hilstar.scene.camera import Camera
 from hilstar.scene.psf import peak_share
 from hilstar.sky.astrometry import aberrate, unit_vectors_icrs
 from hilstar.sky.catalog import load_catalog
@@ -41,7 +43,9 @@ def open_bench(file: BenchFile, context: Context | None = None) -> Bench:
     darkest = 1.0 if uniformity is None else float(uniformity.min())
     # Vignetting asks for more from a pixel: where the screen is darkest a fainter star gets a code.
     finer = calibration.can_steal_bits and not file.config.render.bit_stealing
-    light = Light(calibration.response, white_e_per_s * darkest, stars.electrons_per_s, finer)
+    camera = bench_camera(file.config, file.folder)
+    sky_share, refresh_hz = _sky_share(camera), file.config.monitor.refresh_hz
+    light = Light(calibration.response, white_e_per_s * darkest, stars.electrons_per_s, finer, sky_share, refresh_hz)
     effort = _effort(file.config.render, light)
     config = _chosen(file.config, effort)
     _warn_of_cycle(config, file.path)
@@ -52,7 +56,7 @@ def open_bench(file: BenchFile, context: Context | None = None) -> Bench:
         file=file,
         config=config,
         effort=effort,
-        camera=bench_camera(config, file.folder),
+        camera=camera,
         scan=scan_of(config.monitor),
         calibration=calibration,
         uniformity=uniformity,
@@ -80,6 +84,12 @@ def _target(config: BenchConfig, panel: Panel, effort: Effort | None) -> Target:
         cycle_frames=render.cycle_frames,
         sides=() if effort is None else effort.sides,
     )
+
+
+def _sky_share(camera: Camera) -> float:
+    """The share of the whole sky that a screen covers, about."""
+    width, height = camera.resolution_px
+    return width * height / math.prod(camera.scales_px_rad()) / (4 * math.pi)
 
 
 def _effort(render: RenderSettings, light: Light) -> Effort | None:

@@ -28,6 +28,9 @@ MAG_PER_SHARE = 2.5 / math.log(10)
 # Light beyond a small sprite is under this share of what lights a pixel: only where the wings of stars meet is a code lower
 UNLIT = 0.25
 CUT_PHASES = 51
+# `exact`, 1000 stars at rest, 1080p, two llvmpipe cores. A field of the Milky Way has twice the stars of an average one.
+EXACT_MS_A_STAR = 0.014
+EXACT_SHARE = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,13 +93,26 @@ class Effort:
 class Light:
     """What the stars are shown with: the panel's response, its minimum white (electrons per second), the stars' rates (n,).
 
-    `can_steal_bits` says whether bit stealing would give finer codes, and is not used yet.
+    `can_steal_bits` says whether bit stealing would give finer codes, and is not used yet. `sky_share` is the share of the
+    whole sky that the screen covers.
     """
 
     response: Response
     white_e_per_s: float
     rates_e_per_s: FloatArray
     can_steal_bits: bool = False
+    sky_share: float = 0.0
+    refresh_hz: float = 60.0
+
+    def exact_ms(self) -> float:
+        """The time that `exact` takes for an average field on two cores without a GPU."""
+        lit = self.rates_e_per_s >= self.response.half_step * self.white_e_per_s
+        return EXACT_MS_A_STAR * self.sky_share * float(np.count_nonzero(lit))
+
+    @property
+    def refresh_ms(self) -> float:
+        """The time between two frames."""
+        return 1e3 / self.refresh_hz
 
 
 def plan_effort(render: RenderSettings, light: Light) -> Effort:
@@ -127,7 +143,8 @@ def plan_effort(render: RenderSettings, light: Light) -> Effort:
 def explain(effort: Effort | None, render: RenderSettings) -> list[str]:
     """One line for each choice, and the total error."""
     if effort is None:
-        return ['effort: full; write [render] effort = "auto" or quantisation = "auto" to have it chosen within the tolerance']
+        codes = f"quantisation = {render.quantisation}, as the file has it"
+        return [f'effort: full, {codes}; write [render] effort = "auto" or quantisation = "auto" to have it chosen']
     total = f"{effort.error_mag:.4f} mag of {render.tolerance_mag:g}, {effort.error_px:.4f} px of {render.tolerance_px:g}"
     within = effort.error_mag <= render.tolerance_mag and effort.error_px <= render.tolerance_px
     return [
@@ -137,8 +154,13 @@ def explain(effort: Effort | None, render: RenderSettings) -> list[str]:
 
 
 def choose_codes(render: RenderSettings, light: Light) -> ChosenCodes:
-    """The cheapest quantisation whose errors are within the codes' part of the tolerance; the most accurate one if none is."""
-    wanted = BY_COST if render.quantisation == "auto" else (render.quantisation,)
+    """The cheapest quantisation whose errors are within the codes' part of the tolerance; the most accurate one if none is.
+
+    `auto` does not take `exact` where that would be late in fields of many stars.
+    """
+    exact_ms = light.exact_ms()
+    in_time = exact_ms <= EXACT_SHARE * light.refresh_ms
+    wanted = (BY_COST if in_time else BY_COST[:1]) if render.quantisation == "auto" else (render.quantisation,)
     limits = CODES_SHARE * render.tolerance_mag, CODES_SHARE * render.tolerance_px
     for method in wanted:
         errors = code_errors(method, render, light)
@@ -146,10 +168,15 @@ def choose_codes(render: RenderSettings, light: Light) -> ChosenCodes:
         if within or method == wanted[-1]:
             break
     error = f"{errors.flux_max_mag:.4f} mag and {errors.centroid_max_px:.4f} px maximum, from white to the faintest star"
-    if not within:
+    if not within and render.quantisation == "auto" and not in_time:
+        price = f"{exact_ms:.0f} ms of {light.refresh_ms:.0f} for an average field, without a GPU"
+        error += f' (over {limits[0]:g} mag or {limits[1]:g} px: quantisation = "exact" is nearer and takes {price})'
+    elif not within:
         ways = "more bits, bit_stealing or brighter stars" if light.can_steal_bits else "more bits or brighter stars"
         error += f" (over {limits[0]:g} mag or {limits[1]:g} px: {ways} would do)"
     saving = "several times cheaper than exact" if method == "round" else "nothing saved"
+    if method == "exact":
+        saving = f"an average field takes {exact_ms:.2g} ms of {light.refresh_ms:.3g} on two cores without a GPU"
     return ChosenCodes(method, errors, Choice("codes", method, error, saving))
 
 

@@ -77,7 +77,7 @@ def test_the_defaults_are_the_code_s_own(study):
     assert default["brightness"] == f"table over 1/T, degree {TABLE_DEGREE}"
     assert default["culling"] == f"cells of {CELL_DEG:g} deg"
     assert default["projection"].endswith("whole pixel + float32 fraction")
-    assert (default["spectrum"], default["depth"], default["quantisation"]) == ("real spectra by V-I", "V to 7.5", "round")
+    assert (default["spectrum"], default["depth"], default["quantisation"]) == ("real spectra by V-I", "V to 7.5", "exact")
     assert default["prediction"] == "linear, by the sample's rate"
     assert default["smear"].startswith("Gauss-Legendre by length")
 

@@ -32,16 +32,17 @@ class RenderSettings(Table, frozen=True):
     `hilstar study quantisation` shows what each method costs and achieves.
     """
 
-    # results/tradeoff.csv, quantisation: the quickest, and code by code what anyone expects; exact is 9 times as right.
+    # results/tradeoff.csv, quantisation: `exact` is 9 times as right as `round`, which does where a panel has levels enough.
     quantisation: Annotated[
         Literal["round", "dither", "temporal", "exact", "auto"],
         Meta(
             description='How light becomes codes. `"round"`: the nearest code. `"dither"`: blue noise, exact in the mean over '
             'pixels. `"temporal"`: dithered over `cycle_frames` frames. `"exact"`: all codes of a star are chosen together, so '
             'that its flux and centroid are right in a single frame. `"auto"`: `round` where that stays within the tolerance, '
-            "else `exact`."
+            "else `exact`, unless an average field would take `exact` more than half a refresh on two cores without a GPU; "
+            "`--explain` of `frame`, `serve` and `replay` says which."
         ),
-    ] = "round"
+    ] = "auto"
     bit_stealing: Annotated[
         bool,
         Meta(

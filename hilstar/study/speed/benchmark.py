@@ -80,7 +80,7 @@ def own_bench_file(path: Path, size_px: Size, **render: Value) -> BenchFile:
         "sky": {"faintest_v_mag": 14},
         "monitor": {"resolution_px": size_px, "pixel_pitch_um": 57.65},
         "collimator": {"focal_length_mm": 200},
-        "render": {"flux_at_white_e_per_s": 2e6, **render},
+        "render": {"flux_at_white_e_per_s": 2e6, "quantisation": "round", **render},
     }
     path.write_text(bench_text(tables))
     return read_bench_file(path)

@@ -91,9 +91,9 @@ def popping_codes() -> FailureCase:
     fault, error = (magnitude(float(f.min() / f.max())) for f in fluxes)
     return FailureCase(
         f"the same, {CODES_MAG_UNDER_WHITE:g} mag under white on {CODES_BITS} bits, sigma {SIGMA_PX:g} px",
-        'quantisation = "round", the default',
+        'quantisation = "round"',
         f"its light varies by {fault:.3f} mag",
-        f'quantisation = "exact": {error:.3f} mag; write it where that matters',
+        f'quantisation = "exact", what `auto` takes there: {error:.3f} mag',
         "round adds up the errors of its pixels; exact chooses a star's codes together",
         Figures(error, fault, CODES_RIPPLE_MAG),
     )

@@ -17,7 +17,7 @@ from tests.support.servers import serving, summary_of
 RATES_RAD_S = (1.0, 10.0, 57.0, 200.0, 900.0)
 # A frame of the small bench takes 1 ms; one of 10 rad/s took 1500 ms and more. The margin is for busy machines.
 MAX_FRAME_MS = 400.0
-MOVING = '[render]\nmotion = "on"\n'
+MOVING = '[render]\nmotion = "on"\nquantisation = "round"\n'  # of exact codes a turn costs more
 
 
 def stream(sender, attitudes, hz: float) -> None:

@@ -16,7 +16,13 @@ from tests.support.benches import SMALL_BENCH
 from tests.support.commands import run_hilstar_here
 
 OTHER_BENCH = SMALL_BENCH.replace("[320, 240]", "[160, 120]")
-FAINT = "[sky]\nfaintest_v_mag = 9\n[render]\nbrightest_v_mag = -1\n"  # white is Sirius: most stars are under a step
+FAINT = """\
+[sky]
+faintest_v_mag = 9
+[render]
+quantisation = "round"  # with white as Sirius most stars are under a step
+brightest_v_mag = -1
+"""
 opened: list[str] = []
 sys.addaudithook(
     lambda event, told: opened.append(str(told[0])) if event == "open" and str(told[0]).endswith("bench.toml") else None

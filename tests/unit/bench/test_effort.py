@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -72,10 +73,10 @@ def test_the_light_outside_a_sprite_is_no_more_than_said(size):
 
 def test_small_sprites_give_the_codes_of_whole_ones_but_where_wings_meet(bench_with):
     """What is left out lights no pixel by itself; added to another star's it may make up a step, never two."""
-    bench = bench_with('[render]\neffort = "auto"\n')
+    bench = bench_with('[render]\neffort = "auto"\nquantisation = "round"\n')
     assert min(side.side_px for side in bench.renderer.target.sides) < bench.renderer.footprint_px
     small = bench.draw(ORION).levels.astype(int)
-    whole = bench_with("").draw(ORION).levels.astype(int)
+    whole = bench_with('[render]\nquantisation = "round"\n').draw(ORION).levels.astype(int)
     lit = (whole > 0).sum()
     assert lit > 1000
     assert np.abs(small - whole).max() <= 1
@@ -119,3 +120,22 @@ def test_auto_codes_become_the_bench_s_own(tmp_path, small_bench_file):
     with load(small_bench_file) as bench:
         assert bench.config.render.quantisation == bench.renderer.target.quantisation == "exact"
         assert bench.renderer.target.sides == ()
+
+
+def test_a_file_that_says_nothing_gets_the_codes_that_its_tolerance_needs(small_bench_file):
+    with load(small_bench_file) as bench:
+        assert bench.config.render.quantisation == "exact"
+    small_bench_file.write_text(small_bench_file.read_text().replace("[monitor]", "[monitor]\nbits = 16"))
+    with load(small_bench_file) as bench:
+        assert bench.config.render.quantisation == "round"
+
+
+def test_fields_of_so_many_stars_that_exact_would_be_late_stay_with_round_and_say_so():
+    """1000 stars on a screen that has the whole sky, at two refresh rates."""
+    crowded = replace(light(8, 6.0), sky_share=1.0, rates_e_per_s=np.full(1000, 1e4))
+    chosen = choose_codes(settings(), crowded)
+    assert chosen.method == "round"
+    assert 'quantisation = "exact" is nearer and takes 14 ms of 17' in chosen.choice.error
+    assert choose_codes(settings(), replace(crowded, refresh_hz=30.0)).method == "exact"
+    assert choose_codes(settings(quantisation="exact"), crowded).method == "exact"
+    assert "14 ms of 16.7" in choose_codes(settings(quantisation="exact"), crowded).choice.saving

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +12,10 @@ import numpy.typing as npt
 from hilstar import __version__
 from hilstar.arrays import FloatArray
 from hilstar.bench.frame import Bench, Frame
+from hilstar.bench.world_coordinates import world_coordinates
 from hilstar.files import written
 from hilstar.monitor.response import Codes
-from hilstar.rotation import to_matrix, to_radec_roll_deg
+from hilstar.rotation import to_radec_roll_deg
 from hilstar.scene.camera import Camera
 
 PREVIEW_RADIUS_PX = 9  # of the brightest star
@@ -24,7 +24,7 @@ PREVIEW_POWER = 0.35
 
 
 def write_frame_fits(path: Path, bench: Bench, frame: Frame) -> None:
-    """The linear image (electron/s, float32) with attitude, epoch, bench hash and a TAN world coordinate system.
+    """The linear image (electron/s, float32) with attitude, epoch, bench hash and a world coordinate system.
 
     The first row of the array is the top of the monitor.
     """
@@ -40,7 +40,7 @@ def write_frame_fits(path: Path, bench: Bench, frame: Frame) -> None:
 
 
 def sky_header(bench_hash: str, epoch_jyear: float, q_icrs_to_cam: FloatArray, camera: Camera) -> Any:
-    """A FITS header with the attitude, the epoch, the bench's hash and a TAN world coordinate system."""
+    """A FITS header with the attitude, the epoch, the bench's hash and a world coordinate system."""
     from astropy.io import fits
 
     header = fits.Header()
@@ -55,42 +55,9 @@ def sky_header(bench_hash: str, epoch_jyear: float, q_icrs_to_cam: FloatArray, c
     header["CREATOR"] = f"hilstar {__version__}"
     header.update(world_coordinates(camera, q_icrs_to_cam))
     if camera.lens is not None:
-        header["LENS"] = (True, "stars are bent by a lens that TAN leaves out")
-        header["LENSERR"] = (lens_error_px(camera), "[px] the largest distance of a star from TAN")
+        header.comments["LENS"] = "stars are bent by a lens"
+        header.comments["LENSERR"] = "[px] the largest distance of a star from CTYPE"
     return header
-
-
-def world_coordinates(camera: Camera, q_icrs_to_cam: FloatArray) -> dict[str, str | float]:
-    """The FITS TAN keywords of an image: exact for a pinhole, whose image is a tangent plane, and without any lens."""
-    right, down, normal = camera.cam_to_image @ to_matrix(q_icrs_to_cam)
-    ra, dec = np.arctan2(normal[1], normal[0]), np.arctan2(normal[2], np.hypot(normal[0], normal[1]))
-    east = np.array([-np.sin(ra), np.cos(ra), 0.0])
-    north = np.array([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)])
-    deg_per_px = np.degrees(1.0 / camera.focal_length_px)
-    return {
-        "CTYPE1": "RA---TAN",
-        "CTYPE2": "DEC--TAN",
-        "RADESYS": "ICRS",
-        "CUNIT1": "deg",
-        "CUNIT2": "deg",
-        "LONPOLE": 180.0,
-        "CRVAL1": float(np.degrees(ra) % 360),
-        "CRVAL2": float(np.degrees(dec)),
-        "CRPIX1": camera.principal_point_px[0] + 1.0,
-        "CRPIX2": camera.principal_point_px[1] + 1.0,
-        "CD1_1": float(right @ east * deg_per_px),
-        "CD1_2": float(down @ east * deg_per_px),
-        "CD2_1": float(right @ north * deg_per_px),
-        "CD2_2": float(down @ north * deg_per_px),
-    }
-
-
-def lens_error_px(camera: Camera) -> float:
-    """The largest distance on the image between where a camera and its TAN keywords have a star, px."""
-    x_px, y_px = (part.ravel() for part in np.meshgrid(*(np.linspace(0, size - 1, 17) for size in camera.resolution_px)))
-    u, v = camera.tangents(x_px, y_px)
-    tan_x, tan_y = replace(camera, lens=None).places_px(u, v)
-    return round(float(np.nanmax(np.hypot(tan_x - x_px, tan_y - y_px))), 4)
 
 
 def write_truth_csv(path: Path, frame: Frame) -> None:

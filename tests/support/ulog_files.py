@@ -13,6 +13,7 @@ CODES = {"uint64_t": "Q", "uint32_t": "I", "int32_t": "i", "uint8_t": "B", "floa
 SAMPLED = "uint64_t timestamp;uint64_t timestamp_sample;"
 TURNS = "float[4] q;float[4] delta_q_reset;uint8_t quat_reset_counter;uint8_t[7] _padding0;"
 FIX = "int32_t timestamp_time_relative;uint8_t fix_type;uint8_t[3] _padding0;"
+TURNING = SAMPLED + "float[3] xyz;uint8_t[4] _padding0;"
 ATTITUDE = SAMPLED + TURNS
 GPS = "uint64_t timestamp;uint64_t time_utc_usec;double latitude_deg;double longitude_deg;" + FIX
 OLD = {  # before 2019
@@ -23,7 +24,8 @@ FORMATS = {
     "vehicle_attitude": ATTITUDE,
     "estimator_attitude": ATTITUDE,
     "vehicle_attitude_groundtruth": ATTITUDE,
-    "vehicle_angular_velocity": SAMPLED + "float[3] xyz;uint8_t[4] _padding0;",
+    "vehicle_angular_velocity": TURNING,
+    "vehicle_angular_velocity_groundtruth": TURNING,
     "vehicle_global_position": SAMPLED + "double lat;double lon;float alt;uint8_t[4] _padding0;",
     "vehicle_gps_position": GPS,
     "sensor_gps": GPS,

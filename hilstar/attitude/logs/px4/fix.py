@@ -69,11 +69,14 @@ def _offsets_us(topics: dict[Topic, Series]) -> IntArray:
             continue
         good = (utc_us >= FIRST_DATE_US) & (utc_us < LAST_DATE_US)
         if good.any():
-            # The time of the fix is that of the message, or as much earlier as the newer receivers' drivers say.
-            late_us = np.asarray(series.columns.get("timestamp_time_relative", np.zeros(len(utc_us))), dtype=np.int64)
-            boot_us = series.columns["timestamp"].astype(np.int64) + late_us
-            return np.asarray(utc_us[good].astype(np.int64) - boot_us[good])
+            return np.asarray(utc_us[good].astype(np.int64) - _fixed_us(series)[good])
     return np.array([], dtype=np.int64)
+
+
+def _fixed_us(series: Series) -> IntArray:
+    """When a fix was true: when its message came, or as much earlier as the newer receivers' drivers say."""
+    late_us = series.columns.get("timestamp_time_relative")
+    return series.t_us if late_us is None else series.t_us + late_us.astype(np.int64)
 
 
 def place_at(path: Path, stated: Stated, topics: dict[Topic, Series], t_us: IntArray, suffix: str) -> Place:
@@ -111,8 +114,9 @@ def _degrees(series: Series) -> tuple[IntArray, FloatArray, FloatArray] | None:
         good &= columns["fix_type"] >= 2
     if not good.any():
         return None
-    order = np.argsort(series.t_us[good], kind="stable")
-    return series.t_us[good][order], latitude_deg[good][order], longitude_deg[good][order]
+    times_us = _fixed_us(series)[good]
+    order = np.argsort(times_us, kind="stable")
+    return times_us[order], latitude_deg[good][order], longitude_deg[good][order]
 
 
 def _of(topics: dict[Topic, Series], names: tuple[str, ...]) -> list[Series]:

@@ -58,7 +58,10 @@ def read_ros(bag: Bag, stated: Stated) -> LogReading:
     first = next(heard, None)
     if first is None:
         raise InputError(f"{bag.path}: {topic.name} has no attitude of {stated.body}; leave out --body to be told what it has")
-    stamped = bool(first.turn.stamp_ns)
+    second = next(heard, None)
+    # A simulated clock may begin at 0; one that is still 0 in the second message was never set.
+    stamped = bool(first.turn.stamp_ns or (second is not None and second.turn.stamp_ns))
+    heard = heard if second is None else chain([second], heard)
     if not stamped:
         told.append(("log-stamp", f"the messages of {topic.name} have no time of their own; when they were recorded is taken"))
     reference = _reference(bag, topic, first, stated, told)
@@ -148,7 +151,7 @@ def _fault(turn: Turn, first: Turn, stamped: bool) -> Refusal | None:
         return Refusal("format", f"refers to the frame {turn.reference!r}, the first to {first.reference!r}")
     if turn.body != first.body:
         return Refusal("format", f"is of the frame {turn.body!r}, the first of {first.body!r}; choose one with --body")
-    if bool(turn.stamp_ns) != stamped:
+    if turn.stamp_ns and not stamped:
         return Refusal("time", "some messages have a stamp and some have none (0); set it in all of them")
     return None
 

@@ -54,7 +54,7 @@ class Edge:
     def times_ns(self) -> IntArray:
         """(n,): the stamps, or where they are not set when the transforms were recorded."""
         stamps = np.array(self.stamps_ns, dtype=np.int64)
-        return stamps if stamps.all() else np.array(self.received_ns, dtype=np.int64)
+        return stamps if stamps.any() else np.array(self.received_ns, dtype=np.int64)
 
     def at(self, t_ns: IntArray) -> FloatArray:
         """The rotations (m, 4) at other times (m,); NaN before its first and after its last."""

@@ -88,7 +88,7 @@ def flight(begin=(48.1, 11.6), gps=True, position=True, instances=(0,), name="ve
             log.add(name, instance, timestamp=t_us + 800, timestamp_sample=t_us, q=q, quat_reset_counter=k // 6)
         if position and (k % 4 == 0 or k == COUNT - 1):
             add_position(log, t_us, begin)
-        if gps and k % 4 == 1:
+        if gps and (k % 4 == 1 or k in {0, COUNT - 1}):
             add_fix(log, t_us, begin)
     return log
 
@@ -249,6 +249,16 @@ def test_of_several_instances_one_is_chosen(written):
         assert worst_arcsec(log, seed=4 + instance) < SINGLE_ARCSEC
     with pytest.raises(InputError, match="has no topic estimator_attitude:7"):
         open_log(path, Stated(topic="estimator_attitude:7"))
+
+
+def test_a_simulators_truth_is_read_by_name(written):
+    log = flight(name="vehicle_attitude_groundtruth", position=False)
+    log.topic("vehicle_angular_velocity_groundtruth")
+    for t_us in TIMES_US.tolist():
+        log.add("vehicle_angular_velocity_groundtruth", timestamp=t_us, xyz=2 * RATE)
+    read = open_log(written(log), Stated(topic="vehicle_attitude_groundtruth"))
+    assert worst_arcsec(read) < SINGLE_ARCSEC
+    assert read.samples[3].rate_cam_rad_s == pytest.approx(2 * RATE, rel=1e-6)
 
 
 def test_other_frames_are_refused(written):

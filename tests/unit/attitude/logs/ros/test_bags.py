@@ -144,6 +144,22 @@ def test_a_bag_whose_recorder_was_killed_gives_all_that_is_whole(tmp_path, truth
     assert any(kind == "log-cut" and "all that is whole before it is read" in line for kind, line in log.told)
 
 
+def test_a_db3_whose_recorder_was_killed_names_the_file_that_has_the_rest(tmp_path, truth):
+    import sqlite3
+
+    bag = write_bag2(tmp_path / "a", messages(truth, ros_bags.POSE_STAMPED)("humble"), "humble") / "a.db3"
+    with sqlite3.connect(bag) as database:
+        database.execute("PRAGMA journal_mode = WAL")
+        database.execute("INSERT INTO messages SELECT id + 1000, topic_id, timestamp, data FROM messages")
+        database.commit()
+        for name in ("a.db3", "a.db3-wal"):
+            shutil.copy(bag.with_name(name), tmp_path / name)
+    database.close()
+    log = open_log(tmp_path / "a.db3")
+    assert_is_truth(log, truth)
+    assert any("what a.db3-wal has is not read, since its recorder did not close the bag" in line for _, line in log.told)
+
+
 def test_an_mcap_whose_recorder_was_killed_gives_all_chunks_that_are_whole(tmp_path, truth):
     whole = write_mcap(tmp_path / "a.mcap", messages(truth, ros_bags.IMU)("humble"))
     half = tmp_path / "half.mcap"

@@ -31,9 +31,8 @@ def sender(tmp_path_factory) -> Path:
     return target
 
 
-@pytest.mark.parametrize("address", ["127.0.0.1", "::1"])
-def test_the_sender_streams_into_hilstar_and_both_sides_talk(tmp_path, sender, address):
-    port = free_port()
+def test_the_sender_streams_into_hilstar_and_both_sides_talk(tmp_path, sender):
+    address, port = "::1", free_port()
     bench = tmp_path / "udp.toml"
     bench.write_text(f'{SMALL_BENCH}\n[attitude]\nsource = "udp"\nbind = "{address}"\nport = {port}\n')
     with listening(bench, "bound to") as process:

@@ -30,13 +30,13 @@ from tests.support.benches import SMALL_BENCH
 from tests.support.commands import HILSTAR, assert_refused, run_hilstar, run_hilstar_here
 from tests.support.senders import free_port, packet
 from tests.support.servers import Served, interrupted, listening
-from tests.support.waiting import wait_for
+from tests.support.waiting import PATIENCE_S, wait_for
 
 START_DEG = (84.057, -1.2, 0.0)
 RATE_RAD_S = np.radians([0.0, 0.0, 20.0])
 # A packet's float32 rate of 20 deg/s (0.35 rad/s) predicts over 100 ms; and rounding.
 PREDICTED_RAD = 0.35 * 0.1 * 2**-24 * 2 + 1e-9
-ANSWERED_S = 1.0
+ANSWERED_S = 0.3
 
 
 def bench_of(folder: Path, *lines: str) -> Path:
@@ -51,16 +51,19 @@ def sent(to: str, *options: str) -> dict:
     return json.loads(result.stdout)
 
 
-@pytest.mark.parametrize(("host", "lines"), [("127.0.0.1", "port = {}"), ("[::1]", 'bind = "[::1]:{}"')])
-def test_two_hundred_a_second_arrive_none_lost_none_refused_and_both_sides_talk(tmp_path, host, lines):
+def test_a_sender_over_ipv6_that_starts_first_waits_none_is_lost_and_both_sides_talk(tmp_path):
     port = free_port()
-    with listening(bench_of(tmp_path, lines.format(port)), f"bound to udp://{host}:{port}") as process:
-        told = sent(f"udp://{host}:{port}", "--spin", "z,1", "--rate", "200", "--count", "300")
-        summary = interrupted(process)
+    options = ["--spin", "z,1", "--rate", "200", "--count", "300", "--to", f"udp://[::1]:{port}", "--json"]
+    with subprocess.Popen([*HILSTAR, "send", *options], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as sender:
+        assert sender.stderr is not None
+        assert "waiting for a listener" in sender.stderr.readline()
+        with listening(bench_of(tmp_path, f'bind = "[::1]:{port}"'), f"bound to udp://[::1]:{port}") as process:
+            told = json.loads(sender.communicate(timeout=PATIENCE_S)[0])
+            summary = interrupted(process)
     assert told["sent"] == summary["packets"]["accepted"] == summary["packets"]["received"] == 300
-    # A second and a half: 8 quick time requests, and ten statuses a second.
-    assert told["requests"] >= 8
-    assert told["statuses"] >= 10
+    # A second and a half has 8 quick time requests and 15 statuses, less what the first frames took.
+    assert told["requests"] >= 4
+    assert told["statuses"] >= 4
     clock = summary["clock"]
     assert clock["mode"] == "exchange"
     # Both processes have the same clock: the offset is its own error.
@@ -71,11 +74,11 @@ def test_lost_corrupted_and_reordered_datagrams_add_up(tmp_path):
     port = free_port()
     with listening(bench_of(tmp_path, f'endpoint = "udp://127.0.0.1:{port}"'), "bound to") as process:
         faults = ["--lose", "10%", "--corrupt", "5%", "--reorder", "--jitter", "1", "--seed", "3"]
-        told = sent(f"udp://127.0.0.1:{port}", "--spin", "z,1", "--rate", "400", "--count", "800", *faults)
+        told = sent(f"udp://127.0.0.1:{port}", "--spin", "z,1", "--rate", "400", "--count", "400", *faults)
         summary = interrupted(process)
     packets = summary["packets"]
     assert told["lost"] and told["corrupted"] and told["reordered"]
-    assert packets["received"] == told["sent"] == 800 - told["lost"]
+    assert packets["received"] == told["sent"] == 400 - told["lost"]
     assert packets["refused_by"]["crc"] == told["corrupted"]
     assert packets["refused_by"]["time"] == told["reordered"]
     assert packets["accepted"] == packets["received"] - told["corrupted"] - told["reordered"]
@@ -113,13 +116,13 @@ def test_nothing_wrong_is_drawn_over_a_bad_network(tmp_path, form: Callable[[byt
         sender = threading.Thread(target=send, args=(cable, spin_samples(RATE_RAD_S, 200.0, START_DEG), stop))
         sender.start()
         outlet = Outlet(notices=notices)
-        run = serve(bench, link, Limit(frames=150), lambda shown: drawn.append((shown.t_ns, shown.attitude)), outlet)
+        run = serve(bench, link, Limit(frames=90), lambda shown: drawn.append((shown.t_ns, shown.attitude)), outlet)
         stop.set()
         sender.join()
         summary = msgspec.to_builtins(run)
     shown = [(t_ns, attitude.q_icrs_to_cam) for t_ns, attitude in drawn if attitude is not None]
-    assert len(shown) > 120
-    assert doubled[0] > 50
+    assert len(shown) > 70
+    assert doubled[0] > 30
     assert summary["packets"]["refused"] >= doubled[0] + cable.tally.corrupted - 3  # the last may be on their way
     assert set(summary["events"]) <= {"first-attitude"}
     first_ns, first = shown[0]
@@ -127,7 +130,16 @@ def test_nothing_wrong_is_drawn_over_a_bad_network(tmp_path, form: Callable[[byt
         assert angle_between_rad(q, propagate(first, RATE_RAD_S, (t_ns - first_ns) / 1e9)) < PREDICTED_RAD
 
 
-def test_an_address_that_is_not_listed_is_counted_and_never_answered(tmp_path):
+GOOD = packet(1, 1_000_000)
+WRONG = {
+    "format": [b"", b"\0", GOOD[:-1], GOOD + b"\0", bytes(1400), bytes(65_000), b"{" * 65_000, b'{"t_ns": 1}'],
+    "crc": [b"\xff" * 64, GOOD[:30] + bytes([GOOD[30] ^ 8]) + GOOD[31:], GOOD[:-1] + b"\0"],
+    "nan": [packet(1, 2_000_000, q=(float("nan"), 0, 0, 1))],
+    "norm": [packet(1, 2_000_000, q=(2, 0, 0, 0))],
+}
+
+
+def test_an_address_that_is_not_listed_is_counted_and_never_answered_and_malformed_datagrams_by_reason(tmp_path):
     port = free_port()
     bench = bench_of(tmp_path, f'bind = "127.0.0.1:{port}"', 'allow = ["127.0.0.1", "10.0.0.0/8"]')
     command = [*HILSTAR, "serve", str(bench), "--headless", "--json"]
@@ -146,6 +158,8 @@ def test_an_address_that_is_not_listed_is_counted_and_never_answered(tmp_path):
             listed.connect(("127.0.0.1", port))
             for k in range(40):
                 listed.send(packet(k, time.monotonic_ns()))
+                for data in (reason[k] for reason in WRONG.values() if k < len(reason)):
+                    listed.send(data)
                 stranger.sendto(packet(k, time.monotonic_ns(), q=(1, 0, 0, 0)), ("127.0.0.1", port))
                 stranger.sendto(encode(TimeRequest(k, 1)), ("127.0.0.1", port))
                 time.sleep(0.01)
@@ -155,41 +169,13 @@ def test_an_address_that_is_not_listed_is_counted_and_never_answered(tmp_path):
             summary = served.summary()
         finally:
             process.kill()
-    assert summary["packets"]["received"] == summary["packets"]["accepted"] == 40
+    assert summary["packets"]["accepted"] == 40
+    refused = {reason: len(messages) for reason, messages in WRONG.items()}
+    assert summary["packets"]["refused_by"] == {"time": 0, **refused}
     assert summary["link"]["rejected"] == 80
     assert summary["events"]["sender-not-allowed"] == 1
     assert "second-sender" not in summary["events"]
     assert served.count("127.0.0.2") == 1
-
-
-def test_malformed_datagrams_are_refused_by_reason_and_the_display_goes_on(tmp_path):
-    port = free_port()
-    with (
-        listening(bench_of(tmp_path, f"port = {port}"), "bound to") as process,
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
-    ):
-        sender.connect(("127.0.0.1", port))
-        good = packet(1, 1_000_000)
-        wrong = [b"", b"\0", good[:-1], good + b"\0", bytes(1400), bytes(65_000), b"{" * 65_000, b'{"t_ns": 1}', b"\xff" * 64]
-        wrong += [encode(TimeRequest(1, 1))[:-1], good[:30] + bytes([good[30] ^ 8]) + good[31:]]
-        wrong += [packet(1, 2_000_000, q=(float("nan"), 0, 0, 1)), packet(1, 2_000_000, q=(2, 0, 0, 0))]
-        for data in [good, *wrong, json.dumps({"t_ns": 3_000_000, "q": [1, 0, 0, 0]}).encode()]:
-            sender.send(data)
-        time.sleep(0.3)
-        packets = interrupted(process)["packets"]
-    assert (packets["accepted"], packets["received"]) == (2, 2 + len(wrong))
-    assert packets["refused_by"] == {"crc": 2, "norm": 1, "nan": 1, "time": 0, "format": len(wrong) - 4}
-
-
-def test_a_sender_that_starts_first_waits_until_hilstar_listens(tmp_path):
-    port = free_port()
-    command = [*HILSTAR, "send", "--spin", "z,1", "--rate", "200", "--count", "100", "--to", f"udp://127.0.0.1:{port}"]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as sender:
-        assert sender.stderr is not None
-        assert "waiting for a listener" in sender.stderr.readline()
-        with listening(bench_of(tmp_path, f"port = {port}"), "bound to") as process:
-            assert "100 packets sent" in sender.stderr.read()
-            assert interrupted(process)["packets"]["accepted"] == 100
 
 
 def test_a_sender_that_comes_back_on_another_port_is_answered_there(tmp_path):
@@ -210,7 +196,7 @@ def test_a_sender_that_comes_back_on_another_port_is_answered_there(tmp_path):
 def test_a_flood_costs_little_and_its_newest_attitude_is_shown(tmp_path):
     port = free_port()
     flood = "import socket, sys, time\ns = socket.socket(2, 2)\ns.connect(('127.0.0.1', int(sys.argv[1])))\n"
-    flood += "end = time.time() + 2\nwhile time.time() < end: s.send(b'?' * 64)"
+    flood += "end = time.time() + 1\nwhile time.time() < end: s.send(b'?' * 64)"
     with listening(bench_of(tmp_path, f"port = {port}"), "bound to") as process:
         subprocess.run([sys.executable, "-c", flood, str(port)], check=True, timeout=30)
         time.sleep(0.1)
@@ -219,7 +205,7 @@ def test_a_flood_costs_little_and_its_newest_attitude_is_shown(tmp_path):
     assert summary["packets"]["accepted"] == 20
     assert summary["events"]["flood"] == 1
     assert summary["link"]["flooded"] > 1000
-    assert summary["frames"] + summary["missed_frames"] >= 60 * 2
+    assert summary["frames"] + summary["missed_frames"] >= 60
 
 
 @pytest.mark.parametrize(

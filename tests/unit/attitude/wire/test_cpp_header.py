@@ -19,7 +19,7 @@ VECTORS = json.loads((FOLDER / "vectors.json").read_text())
 UNHELD = {"all flags, known and unknown", "a rate that is not valid is not looked at"}
 ERRORS = {"format": -1, "crc": -2, "nan": -3, "norm": -4}
 COMPILER = ["g++", "-std=c++17", "-Wall", "-Wextra", "-Werror", "-pedantic", "-Wconversion", "-Wshadow", "-fno-exceptions"]
-SANITIZERS = ["-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+SANITIZERS = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
 
 
 @pytest.fixture(scope="module")

@@ -92,6 +92,9 @@ def propose(
     if not codes_at_fault(verdict):
         cannot = f"the codes are within the limits, and no key of the light mends the rest: {verdict.reasons[0]}"
         return Proposal((), None, (), 0, cannot)
+    rest = _not_the_codes(verdict)
+    if rest is not None:
+        return Proposal((), None, (), 0, f"no key of the light mends what the codes do not cause: {rest}")
     trials = _Trials(file, fields, seed, on_try)
     keys = _keys(verdict)
     for count in range(1, len(keys) + 1):
@@ -118,6 +121,22 @@ def codes_at_fault(verdict: Verdict) -> bool:
     # A star that the codes lose even as assumed has no error of theirs.
     lost = sum(not math.isfinite(star.codes_mag) for star in errors.lost)
     return beyond or abs(errors.codes_zero_point_mag) > limits.flux_mag or lost > limits.lost_share * errors.looked_for
+
+
+def _not_the_codes(verdict: Verdict) -> str | None:
+    """What exceeds a limit even without the codes' part, which adds up in squares with all else; None if nothing does."""
+    limits, errors = verdict.measured.config.verify, verdict.errors
+    elsewhere = sum(math.isfinite(star.codes_mag) for star in errors.lost)
+    if elsewhere > limits.lost_share * errors.looked_for:
+        return f"{elsewhere} of {errors.looked_for} stars are lost that the codes alone would show"
+    for what, unit, whole, codes, limit in (
+        ("centroids are", "px", errors.centroid_px(), errors.codes_px(), limits.centroid_px),
+        ("flux is", "mag", np.abs(errors.flux_mag()), np.abs(errors.codes_mag()), limits.flux_mag),
+    ):
+        left = math.sqrt(max(p95(whole) ** 2 - p95(codes) ** 2, 0.0))
+        if left > limit:
+            return f"{what} {left:.3f} {unit} off at 95 % without them (limit {limit:g})"
+    return None
 
 
 class _Trials:

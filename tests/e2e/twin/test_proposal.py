@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,15 @@ FIELDS = "2"
 # Measured: `round` 0.012 mag off at 95 %, `exact` 0.002.
 LIMIT = "[verify]\nflux_mag = 0.006\n"
 ROUNDED = {"monitor": {"bits": 8}, "render": {"quantisation": "round"}}
+TRUE_LENS = """\
+kind = "hilstar geometry 1"
+resolution_px = [640, 480]
+focal_length_px = 2081.5
+principal_point_px = [319.3, 240.5]
+q_cam_to_mon = [1.0, 0.0, 0.0, 0.0]
+tilt_deg = [0.3, 0.2]
+k1 = 0.3
+"""
 NO_WEIGHTS = """\
 [calibration]
 kind = "photometric"
@@ -111,6 +121,43 @@ def test_a_bench_that_fails_for_its_geometry_gets_no_change_of_its_light(tmp_pat
     proposal = summary["proposal"]
     assert (proposal["changes"], proposal["tried"]) == ([], 0)
     assert "mirrored" in proposal["cannot"]
+
+
+def write_true_lens(folder: Path, assumed: dict | None) -> Path:
+    """A bench that rounds, with a true lens, and with the lens that it assumes, by keys that differ from the true one."""
+    (folder / "truth.toml").write_text(TRUE_LENS)
+    changes = {}
+    if assumed is not None:
+        lines = [f"{key} = {value}" for key, value in (tomllib.loads(TRUE_LENS) | assumed).items() if key != "kind"]
+        (folder / "geometry.toml").write_text("\n".join(['kind = "hilstar geometry 1"', *lines]) + "\n")
+        changes = {"collimator": {"geometry": "geometry.toml"}}
+    return write_bench(folder, changes, more=LIMIT + 'true_geometry = "truth.toml"\n')
+
+
+def test_behind_a_true_lens_that_the_bench_has_the_codes_are_mended(tmp_path):
+    path = write_true_lens(tmp_path, {})
+    code, summary = verified(path, "--write", "--strict")
+    assert summary["proposal"]["changes"] == [{"table": "render", "key": "quantisation", "value": "exact"}]
+    assert (code, verified(path)[1]["passed"]) == (0, True)
+
+
+@pytest.mark.parametrize(
+    ("assumed", "words"),
+    [
+        ({"principal_point_px": [319.62, 240.5]}, "px off at 95 % without them"),
+        ({"focal_length_px": 2050.0}, "stars"),
+        (None, "px off at 95 % without them"),
+    ],
+)
+def test_behind_another_true_lens_no_key_of_the_light_is_proposed(tmp_path, assumed, words):
+    """0.12 px off at 95 % by 0.3 px of the screen, the codes 0.01; all stars lost; 1.5 px off by tilt and lens."""
+    path = write_true_lens(tmp_path, assumed)
+    before = path.read_text()
+    code, summary = verified(path, "--write", "--strict")
+    proposal = summary["proposal"]
+    assert (code, proposal["changes"], proposal["best"], proposal["tried"]) == (1, [], [], 0)
+    assert words in proposal["cannot"] and "bits cannot show" not in proposal["cannot"]
+    assert path.read_text() == before
 
 
 @pytest.mark.parametrize("mode", [0o444, 0o555])

@@ -12,8 +12,10 @@ from hilstar.bench.config import BenchConfig, parse_config
 from hilstar.errors import InputError
 from hilstar.monitor.calibration import BUILT_IN
 from hilstar.reading import MAX_TOML_BYTES, read_bytes, read_text
-from hilstar.sky.catalog import MAX_CATALOGUE_BYTES
 from hilstar.sky.spectrum import BUILT_IN_CURVES
+from hilstar.sky.tables.store import file_sha256
+
+MAX_NAMED_BYTES = 100_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,18 +51,28 @@ def _sha256(config: BenchConfig, folder: Path) -> str:
     digest = hashlib.sha256(msgspec.json.encode(config, order="sorted"))
     tracker = config.tracker
     curves = (tracker.quantum_efficiency, tracker.transmission)
-    files = (config.sky.catalogue, config.monitor.calibration, config.collimator.geometry, tracker.distortion)
+    files = (config.monitor.calibration, config.collimator.geometry, tracker.distortion)
     true = (config.verify.true_calibration, config.verify.true_geometry)
     named: tuple[str | float | None, ...] = (*curves, *files, *true)
     for name in named:
         if isinstance(name, str) and name not in (*BUILT_IN_CURVES, *BUILT_IN, "hipparcos"):
             digest.update(_named_bytes(folder / name))
+    if config.sky.catalogue != "hipparcos":
+        digest.update(_catalogue_bytes(folder / config.sky.catalogue))
     return digest.hexdigest()
+
+
+def _catalogue_bytes(path: Path) -> bytes:
+    """The SHA-256 of a catalogue's file, which may be large; nothing where it cannot be read."""
+    try:
+        return file_sha256(path, "").encode()
+    except InputError:
+        return b""
 
 
 def _named_bytes(path: Path) -> bytes:
     """The content of a file that the bench file names; empty where it cannot be read, which its own reader explains better."""
     try:
-        return read_bytes(path, "", MAX_CATALOGUE_BYTES)
+        return read_bytes(path, "", MAX_NAMED_BYTES)
     except InputError:
         return b""

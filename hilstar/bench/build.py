@@ -10,7 +10,7 @@ from msgspec.structs import replace
 
 from hilstar.bench.bench_file import BenchFile, read_bench_file
 from hilstar.bench.cameras import bench_camera
-from hilstar.bench.config import DEFAULT_BRIGHTEST_V_MAG, BenchConfig, RenderSettings, SkySettings, Tracker
+from hilstar.bench.config import DEFAULT_BRIGHTEST_V_MAG, BenchConfig, RenderSettings, Tracker
 from hilstar.bench.effort import Effort, Light, faintest_shown_e_per_s, plan_effort
 from hilstar.bench.frame import Bench
 from hilstar.bench.orientation import scan_of
@@ -21,11 +21,11 @@ from hilstar.render.renderer import Context, Renderer, Target
 from hilstar.scene.camera import Camera
 from hilstar.scene.psf import peak_share
 from hilstar.sky.astrometry import aberrate, unit_vectors_icrs
-from hilstar.sky.catalog import load_catalog
 from hilstar.sky.electrons import Optics, Photometry, star_temperatures_k, tabulate
 from hilstar.sky.pickles import tabulate_pickles
 from hilstar.sky.spectrum import load_curve
 from hilstar.sky.stars import Stars, make_stars, split_by_rate
+from hilstar.sky.tables.star_table import Choice, choose_catalog
 
 log = logging.getLogger(__name__)
 
@@ -124,7 +124,9 @@ def bench_optics(tracker: Tracker, folder: Path) -> Optics:
 def bench_stars(config: BenchConfig, folder: Path) -> Stars:
     """The stars of a bench with their electron rates, which are computed only here."""
     sky = config.sky
-    catalog = load_catalog(_catalogue_source(sky, folder)).brighter_than(sky.faintest_v_mag)
+    source = sky.catalogue if sky.catalogue == "hipparcos" else folder / sky.catalogue
+    chosen = choose_catalog(Choice(source, sky.with_hipparcos, sky.catalogue_epoch_jyear))
+    catalog = chosen.brighter_than(sky.faintest_v_mag)
     vectors = unit_vectors_icrs(catalog, sky.epoch_jyear)
     if any(sky.observer_velocity_km_s):
         vectors = aberrate(vectors, sky.observer_velocity_km_s)
@@ -136,10 +138,6 @@ def bench_stars(config: BenchConfig, folder: Path) -> Stars:
     else:
         rates = tabulate(sky.brightness, optics, photometry).electrons_per_s(catalog.v_mag, temperature_k)
     return make_stars(catalog, vectors, temperature_k, rates)
-
-
-def _catalogue_source(sky: SkySettings, folder: Path) -> str | Path:
-    return sky.catalogue if sky.catalogue == "hipparcos" else folder / sky.catalogue
 
 
 def bench_calibration(config: BenchConfig, folder: Path) -> Calibration:

@@ -21,13 +21,15 @@ def unit_vectors_icrs(catalog: Catalog, epoch_jyear: float) -> FloatArray:
     ra, dec = np.radians(catalog.ra_deg), np.radians(catalog.dec_deg)
     sin_ra, cos_ra, sin_dec, cos_dec = np.sin(ra), np.cos(ra), np.sin(dec), np.cos(dec)
     years = epoch_jyear - catalog.epoch_jyear
-    east = (catalog.pm_ra_cosdec_mas_yr * RAD_PER_MAS * years)[:, None]
-    north = (catalog.pm_dec_mas_yr * RAD_PER_MAS * years)[:, None]
-    u0 = np.column_stack((cos_dec * cos_ra, cos_dec * sin_ra, sin_dec))
-    p = np.column_stack((-sin_ra, cos_ra, np.zeros_like(ra)))
-    q = np.column_stack((-sin_dec * cos_ra, -sin_dec * sin_ra, cos_dec))
-    u = u0 + east * p + north * q
-    return np.asarray(u / np.linalg.norm(u, axis=1, keepdims=True))
+    east = catalog.pm_ra_cosdec_mas_yr * RAD_PER_MAS * years
+    north = catalog.pm_dec_mas_yr * RAD_PER_MAS * years
+    # One component after the other: millions of stars cost half the time and memory of (n, 3) intermediates.
+    u = np.empty((len(ra), 3))
+    u[:, 0] = cos_dec * cos_ra + east * -sin_ra + north * (-sin_dec * cos_ra)
+    u[:, 1] = cos_dec * sin_ra + east * cos_ra + north * (-sin_dec * sin_ra)
+    u[:, 2] = sin_dec + north * cos_dec
+    u /= np.sqrt(np.einsum("ij,ij->i", u, u))[:, None]
+    return u
 
 
 def aberrate(vectors: FloatArray, observer_velocity_km_s: tuple[float, float, float] | FloatArray) -> FloatArray:

@@ -58,7 +58,8 @@ class Catalog:
     `variable` is Hipparcos' type of a variable star (P periodic, U unsolved, M within 0.03 mag; blank for others), which varies
     by `range_mag` in Hp with `period_d`, NaN where none is given. `multiple` is its flag H59 of doubles (C resolved, G
     accelerated, O orbit, V variability-induced, X unexplained scatter), with `separation_arcsec` where it resolved the pair:
-    V and the colours are then those of both, except for 472 of 11 101 entries. `rows_read` counts all rows of the source.
+    V and the colours are then those of both, except for 472 of 11 101 entries. `rows_read` counts all rows of the source, and
+    `notes` say what became of them.
     """
 
     hip: npt.NDArray[np.int32]
@@ -79,6 +80,7 @@ class Catalog:
     separation_arcsec: Float32Array
     designation: str = "HIP"
     rows_read: int
+    notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.hip)
@@ -89,7 +91,8 @@ class Catalog:
 
     def brighter_than(self, faintest_v_mag: float) -> Catalog:
         """The stars with v_mag <= `faintest_v_mag` (inclusive)."""
-        return self.taken(self.v_mag <= faintest_v_mag)
+        kept = self.v_mag <= faintest_v_mag
+        return self if kept.all() else self.taken(kept)
 
     def name(self, row: int) -> str:
         """What the star at `row` is called: "HIP 26311", "Gaia DR3 4295806720", "TYC 1-2-3"."""
@@ -104,7 +107,7 @@ class Catalog:
 
 def column_names() -> list[str]:
     """The names of a catalogue's arrays."""
-    return [field.name for field in fields(Catalog) if field.name not in ("designation", "rows_read")]
+    return [field.name for field in fields(Catalog) if field.name not in ("designation", "rows_read", "notes")]
 
 
 def plain_catalog(designation: str, rows_read: int, columns: dict[str, npt.NDArray[np.generic]]) -> Catalog:

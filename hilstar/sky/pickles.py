@@ -32,6 +32,7 @@ MAX_BV_TERM_MAG = 0.3
 # rates are wrong, and those of the K giants, fifty times as many to V = 7.5, are right.
 BV_KNOT_COUNT = 5
 MAX_BV_FIT_VI_MAG = 2.0
+BLOCK_STARS = 20_000  # evaluated at once: their splines' terms stay within a processor's cache
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,9 +75,15 @@ class PicklesTable:
 
     def electrons_per_s(self, v_mag: FloatArray, bv_mag: FloatArray, vi_mag: FloatArray) -> FloatArray:
         """Electron rates of stars, shape (n,); B-V alone where V-I is NaN; a colour beyond the library counts as its end."""
-        known = np.isfinite(vi_mag)
-        both = self.over_vi(np.where(known, vi_mag, 0.0)) + self.per_bv * np.clip(bv_mag, *self.bv_range_mag)
-        return np.asarray(flux_ratio(v_mag) * np.exp(np.where(known, both, self.over_bv(bv_mag))))
+        log_rate = np.empty(len(v_mag))
+        for begin in range(0, len(v_mag), BLOCK_STARS):
+            part = slice(begin, begin + BLOCK_STARS)
+            vi, bv = vi_mag[part], bv_mag[part]
+            known = np.isfinite(vi)
+            block = log_rate[part]
+            block[known] = self.over_vi(vi[known]) + self.per_bv * np.clip(bv[known], *self.bv_range_mag)
+            block[~known] = self.over_bv(bv[~known])
+        return np.asarray(flux_ratio(v_mag) * np.exp(log_rate))
 
 
 @cache

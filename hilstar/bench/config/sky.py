@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from hilstar.bench.config.values import IcrsVector, Magnitude
+from hilstar.bench.config.values import EpochJyear, IcrsVector, Magnitude
 from hilstar.toml_tables import Table
 
 
@@ -15,12 +15,31 @@ class SkySettings(Table, frozen=True):
 
     catalogue: Annotated[
         str,
-        Meta(description='`"hipparcos"`, the packaged catalogue, or the path of a `hip_main.dat` (CDS I/239).'),
+        Meta(
+            description='`"hipparcos"`, the packaged catalogue; or the path of a table of stars (FITS, ECSV, CSV, VOTable) '
+            "with the column names of Gaia, Tycho-2 or Hipparcos, or of a `hip_main.dat` (CDS I/239)."
+        ),
     ] = "hipparcos"
+    with_hipparcos: Annotated[
+        bool,
+        Meta(
+            description="The table's stars are added to the packaged Hipparcos, whose star stands where both have one; "
+            "otherwise the table stands alone."
+        ),
+    ] = False
+    catalogue_epoch_jyear: Annotated[
+        EpochJyear | None,
+        Meta(
+            description="Julian year of the table's places, where neither a column nor its catalogue's own names say it.",
+            extra={"default": "the table's"},
+        ),
+    ] = None
     epoch_jyear: Annotated[
         float,
         Meta(
-            ge=-10_000, le=10_000, description="Julian year to which proper motion is applied, from the catalogue's J1991.25."
+            ge=-10_000,
+            le=10_000,
+            description="Julian year to which proper motion is applied, from the epoch of the catalogue's places.",
         ),
     ] = 2026.0
     faintest_v_mag: Annotated[

@@ -11,6 +11,7 @@ MIN_POSITIVE, MAX_NUMBER = 1e-6, 1e12
 Positive = Annotated[float, Meta(ge=MIN_POSITIVE, le=MAX_NUMBER)]
 NotNegative = Annotated[float, Meta(ge=0, le=MAX_NUMBER)]
 Magnitude = Annotated[float, Meta(ge=-100, le=100)]
+EpochJyear = Annotated[float, Meta(ge=1800, le=2200)]
 Pixels = Annotated[int, Meta(ge=1, le=32768)]
 SigmaPx = Annotated[float, Meta(ge=0.05)]
 Size = Annotated[tuple[Pixels, Pixels], Meta(extra={"form": "[width, height]"})]

@@ -9,7 +9,7 @@ import typer
 
 from hilstar.cli.options import BenchFile, Explain, Json, QuaternionText, RadecText, check_files
 from hilstar.cli.parsers import parse_attitude
-from hilstar.cli.show.running import explain_effort
+from hilstar.cli.show.running import explain_bench
 from hilstar.console.terminal import print_json
 from hilstar.errors import InputError
 from hilstar.files import CSV, FITS, PNG, check_ending
@@ -49,7 +49,7 @@ def frame(
     check_files([], targets, file)
     with open_bench(file) as bench:
         if explain:
-            explain_effort(bench)
+            explain_bench(bench)
         shot = bench.frame(q)
         if output is not None:
             files.write_frame_fits(output, bench, shot)

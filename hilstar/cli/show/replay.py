@@ -29,7 +29,7 @@ from hilstar.cli.show.running import (
     LedgerSplit,
     Windowed,
     end_of_run,
-    explain_effort,
+    explain_bench,
     explain_source,
     optional_ledger,
     say_what_clips,
@@ -93,7 +93,7 @@ def replay(
         say_what_clips(bench)
         if explain:
             explain_source(play.conventions, mounting)
-            explain_effort(bench)
+            explain_bench(bench)
 
         renderer, refresh_hz = bench.renderer.gl_renderer, bench.config.monitor.refresh_hz
         status = RunStatus(Source(f"replaying {log}", renderer, refresh_hz, play.frame_count), kept)

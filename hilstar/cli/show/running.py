@@ -35,10 +35,12 @@ LedgerSplit = Annotated[
 ]
 
 
-def explain_effort(bench: Any) -> None:
-    """Say what was chosen within the bench file's tolerance."""
+def explain_bench(bench: Any) -> None:
+    """Say where the stars come from, and what was chosen within the bench file's tolerance."""
     from hilstar.bench.effort import explain
 
+    for note in bench.stars.catalog.notes:
+        say(note)
     for line in explain(bench.effort, bench.config.render):
         say(line)
 

@@ -15,7 +15,7 @@ from hilstar.cli.show.running import (
     LedgerSplit,
     Windowed,
     end_of_run,
-    explain_effort,
+    explain_bench,
     explain_source,
     optional_ledger,
     say_what_clips,
@@ -67,7 +67,7 @@ def serve(
     ):
         if explain:
             explain_source(link.conventions, Mounting(file.config.tracker.q_body_to_cam))
-            explain_effort(bench)
+            explain_bench(bench)
         refresh_hz = bench.config.monitor.refresh_hz
         slots = math.inf if duration is None else round(duration * refresh_hz)
         limit = Limit(slots, math.inf if frames is None else frames)

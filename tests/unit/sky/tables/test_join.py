@@ -1,0 +1,96 @@
+"""A table beside Hipparcos: no star twice, pairs as one, and how the magnitudes compare."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hilstar.sky.astrometry import unit_vectors_icrs
+from hilstar.sky.catalog import Catalog, load_catalog, plain_catalog
+from hilstar.sky.tables.join import join
+
+ARCSEC = np.pi / (180 * 3600)
+BARNARD, MIZAR, SIRIUS = 87937, 65378, 32349
+
+
+def moved(catalog: Catalog, epoch_jyear: float, fainter_mag: float = 0.0) -> Catalog:
+    """The same stars as another catalogue has them, at another epoch and without HIP numbers."""
+    x, y, z = unit_vectors_icrs(catalog, epoch_jyear).T
+    columns = {
+        "ra_deg": np.degrees(np.arctan2(y, x)) % 360,
+        "dec_deg": np.degrees(np.arctan2(z, np.hypot(x, y))),
+        "v_mag": catalog.v_mag + fainter_mag,
+        "bv_mag": catalog.bv_mag,
+        "epoch_jyear": np.full(len(catalog), epoch_jyear),
+    }
+    return plain_catalog("Gaia DR3", len(catalog), columns)
+
+
+def shifted(table: Catalog, row: int, north_arcsec: float, fainter_mag: float) -> Catalog:
+    """One star beside that of `row`."""
+    star = table.taken(np.array([row]))
+    return replace(star, dec_deg=star.dec_deg + north_arcsec / 3600, v_mag=star.v_mag + fainter_mag)
+
+
+def stacked(*parts: Catalog) -> Catalog:
+    columns = {
+        n: np.concatenate([getattr(p, n) for p in parts]) for n in ("ra_deg", "dec_deg", "v_mag", "bv_mag", "epoch_jyear")
+    }
+    return plain_catalog("Gaia DR3", len(columns["v_mag"]), columns)
+
+
+def test_no_star_of_hipparcos_stands_twice_at_any_epoch():
+    hipparcos = load_catalog()
+    for epoch_jyear in (1991.25, 2000.0, 2016.0):
+        joined = join(hipparcos, moved(hipparcos, epoch_jyear, 0.01))
+        assert len(joined.catalog) == len(hipparcos)
+        assert np.array_equal(joined.catalog.hip, hipparcos.hip)
+        assert "V differs by +0.010 mag in the median" in joined.line
+        assert joined.doubt is None
+    # Barnard's star moves by 258 arcsec in those 25 years: at the wrong epoch it would stand twice.
+    barnard = hipparcos.taken(hipparcos.hip == BARNARD)
+    stale = replace(moved(barnard, 2016.0), epoch_jyear=np.array([1991.25]))
+    assert len(join(hipparcos, stale).catalog) == len(hipparcos) + 1
+
+
+def test_further_stars_are_added_with_their_own_name_and_epoch():
+    hipparcos = load_catalog()
+    table = moved(hipparcos.taken(hipparcos.hip == SIRIUS), 2016.0)
+    table = stacked(table, shifted(table, 0, 60.0, 8.0))
+    catalog = join(hipparcos, table).catalog
+    assert len(catalog) == len(hipparcos) + 1
+    assert (catalog.name(len(catalog) - 1), catalog.epoch_jyear[-1]) == ("Gaia DR3 2", 2016.0)
+    assert catalog.rows_read == hipparcos.rows_read + 2
+
+
+def test_a_pair_that_hipparcos_sums_takes_in_both_components_of_the_table():
+    """Mizar's V = 2.23 is of both, 14.4 arcsec apart: a table has 2.27 and 3.95 there."""
+    hipparcos = load_catalog()
+    mizar = moved(hipparcos.taken(hipparcos.hip == MIZAR), 2016.0)
+    components = stacked(shifted(mizar, 0, 0.0, 0.04), shifted(mizar, 0, -14.4, 1.72))
+    assert len(join(hipparcos, components).catalog) == len(hipparcos)
+    # A star as near to a single one, and farther than any photometer's blur, is one of its own.
+    vega = moved(hipparcos.taken(hipparcos.hip == 91262), 2016.0)
+    assert len(join(hipparcos, stacked(vega, shifted(vega, 0, -14.4, 6.0))).catalog) == len(hipparcos) + 1
+
+
+def test_a_star_off_its_place_is_the_same_where_its_magnitude_is():
+    hipparcos = load_catalog()
+    vega = moved(hipparcos.taken(hipparcos.hip == 91262), 2016.0)
+    assert len(join(hipparcos, shifted(vega, 0, 6.0, 0.3)).catalog) == len(hipparcos)
+    assert len(join(hipparcos, shifted(vega, 0, 6.0, 3.0)).catalog) == len(hipparcos) + 1
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [({"dec_deg": 0.01}, "Hipparcos has 0% at their place"), ({"v_mag": 0.05}, "its V differs by +0.050 mag")],
+)
+def test_an_overlap_that_does_not_fit_is_said(change, words):
+    hipparcos = load_catalog()
+    table = moved(hipparcos.brighter_than(6.0), 2016.0)
+    (name, by), *_ = change.items()
+    joined = join(hipparcos, replace(table, **{name: getattr(table, name) + by}))
+    assert joined.doubt is not None
+    assert words in joined.doubt

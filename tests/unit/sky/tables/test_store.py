@@ -1,0 +1,123 @@
+"""The cache of tables: used where it can be trusted, made anew where not, and never in the way."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from hilstar.sky.catalog import column_names
+from hilstar.sky.tables.star_table import Choice, choose_catalog
+from hilstar.sky.tables.store import KEPT_FILES
+
+TEXT = "ra,dec,vmag,b-v\n1,2,3,0.1\n4,5,6,\n7,8,9,0.5\n"
+
+
+@pytest.fixture
+def table(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    (tmp_path / "t.csv").write_text(TEXT)
+    return tmp_path / "t.csv"
+
+
+def stored(table):
+    return sorted((table.parent / "cache" / "hilstar").glob("*"))
+
+
+def rewritten(path, **changes):
+    """The same cache file with other arrays."""
+    with np.load(path) as packed:
+        arrays = dict(packed) | changes
+    np.savez(path.with_suffix(""), **arrays)
+
+
+def same(a, b):
+    return all(np.array_equal(getattr(a, n), getattr(b, n), equal_nan=getattr(a, n).dtype.kind == "f") for n in column_names())
+
+
+def test_the_second_time_the_cache_is_read_and_says_the_same(table, caplog):
+    first = choose_catalog(Choice(table))
+    assert "1 without a magnitude" in caplog.text
+    caplog.clear()
+    (path,) = stored(table)
+    rewritten(path, v_mag=np.array([1.0, 2.0]))
+    second = choose_catalog(Choice(table))
+    assert second.v_mag.tolist() == [1.0, 2.0]  # the cache's, which shows that it was read
+    assert "1 without a magnitude" in caplog.text
+    assert (second.notes, second.rows_read, second.designation) == (first.notes, 3, "t row")
+
+
+def test_another_content_epoch_or_company_is_another_catalogue(table):
+    choose_catalog(Choice(table))
+    choose_catalog(Choice(table, epoch_jyear=2000.0))
+    assert len(choose_catalog(Choice(table, with_hipparcos=True))) > 100_000
+    before = table.stat()
+    table.write_text(TEXT.replace("0.5", "0.7"))
+    os.utime(table, ns=(before.st_atime_ns, before.st_mtime_ns + 1))
+    assert 0.7 in choose_catalog(Choice(table)).bv_mag
+    assert len(stored(table)) == 4
+
+
+def test_a_damaged_or_hostile_cache_is_made_anew(table):
+    whole = choose_catalog(Choice(table))
+    (path,) = stored(table)
+    good = path.read_bytes()
+
+    def objects():
+        rewritten(path, v_mag=np.array([{}, {}], dtype=object))
+
+    def packed():
+        with np.load(path) as arrays:
+            np.savez_compressed(path.with_suffix(""), **dict(arrays))
+
+    damage = [
+        lambda: path.write_bytes(b""),
+        lambda: path.write_bytes(good[:-100]),
+        lambda: path.write_bytes(good[:400] + bytes([good[400] ^ 1]) + good[401:]),
+        lambda: path.write_bytes(np.random.default_rng(0).bytes(2000)),
+        objects,
+        packed,
+        lambda: rewritten(path, v_mag=np.array([1.0])),
+        lambda: rewritten(path, v_mag=np.array([1.0, np.nan])),
+        lambda: rewritten(path, ra_deg=np.array([1.0, 361.0])),
+        lambda: rewritten(path, hip=np.array([1.0, 2.0])),
+        lambda: rewritten(path, about=np.array("{")),
+        lambda: (path.unlink(), path.mkdir()),
+    ]
+    for k, harm in enumerate(damage):
+        harm()
+        assert same(choose_catalog(Choice(table)), whole), k
+        if path.is_file():
+            assert path.read_bytes() == good, k
+
+
+def test_nothing_depends_on_a_place_for_the_cache(table, monkeypatch, tmp_path):
+    (tmp_path / "file").write_text("no directory")
+    for named in (str(tmp_path / "file"), "/proc/none", "relative"):
+        monkeypatch.setenv("XDG_CACHE_HOME", named)
+        monkeypatch.setenv("HOME", "/proc/none")
+        assert len(choose_catalog(Choice(table))) == 2
+    assert not (tmp_path / "relative").exists()
+
+
+def test_only_the_newest_files_are_kept(table):
+    for k in range(KEPT_FILES + 2):
+        choose_catalog(Choice(table, epoch_jyear=2000.0 + k))
+    assert len(stored(table)) == KEPT_FILES
+
+
+@pytest.mark.e2e
+def test_two_processes_at_once_both_have_the_catalogue(table):
+    program = (
+        "import sys; from pathlib import Path; from hilstar.sky.tables.star_table import *;"
+        "print(len(choose_catalog(Choice(Path(sys.argv[1])))))"
+    )
+    runs = [subprocess.Popen([sys.executable, "-c", program, table], stdout=subprocess.PIPE) for _ in range(2)]
+    counts = [run.communicate(timeout=60)[0].strip() for run in runs]
+    assert counts == [b"2"] * 2
+    (path,) = stored(table)
+    rewritten(path, v_mag=np.array([1.0, 2.0]))
+    assert choose_catalog(Choice(table)).v_mag.tolist() == [1.0, 2.0]  # what they left is whole

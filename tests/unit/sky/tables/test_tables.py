@@ -1,0 +1,252 @@
+"""Tables of stars as users have them: formats, column names, units, and what is refused."""
+
+from __future__ import annotations
+
+import gzip
+import os
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.table import MaskedColumn, Table
+
+from hilstar.errors import InputError
+from hilstar.sky.catalog import load_catalog
+from hilstar.sky.tables.photometry import from_gaia
+from hilstar.sky.tables.star_table import Choice, choose_catalog
+
+# CSV, ECSV and VOTable have float64 in 17 digits.
+SAME = 1e-12
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+
+
+def read(path, **choice):
+    return choose_catalog(Choice(path, **choice))
+
+
+def gaia_table() -> Table:
+    """Five stars with the columns of gaiadr3.gaia_source; the fourth has no BP, the last no place."""
+    return Table(
+        {
+            "source_id": np.array([5, 4_295_806_720, 2**62 + 1, 7, 8]),
+            "ra": MaskedColumn([10.5, 359.999, 0.0, 33.0, 0.0], mask=[0, 0, 0, 0, 1], unit=u.deg),
+            "dec": MaskedColumn([-45.25, 89.9, 12.0, 1.0, 0.0], unit=u.deg),
+            "ref_epoch": np.full(5, 2016.0),
+            "pmra": MaskedColumn([-3.5, 0.0, 100.25, 1.0, 1.0], mask=[0, 1, 0, 0, 0], unit=u.mas / u.yr),
+            "pmdec": np.array([1.0, 2.0, 3.0, 4.0, 5.0]) * u.mas / u.yr,
+            "parallax": MaskedColumn([2.0, 0.0, 5.0, 1.0, 1.0], mask=[0, 1, 0, 0, 0], unit=u.mas),
+            "phot_g_mean_mag": np.array([5.0, 6.0, 7.0, 8.0, 9.0]) * u.mag,
+            "phot_bp_mean_mag": MaskedColumn([5.5, 6.1, 8.0, 0.0, 9.0], mask=[0, 0, 0, 1, 0], unit=u.mag),
+            "phot_rp_mean_mag": MaskedColumn([4.5, 6.0, 6.0, 7.0, 8.0], unit=u.mag),
+            "note": ["a b", "c,d", "", "e", "f"],
+        }
+    )
+
+
+FORMATS = {
+    "t.fits": {},
+    "t.ecsv": {},
+    "comma.ecsv": {"format": "ascii.ecsv", "delimiter": ","},
+    "t.csv": {},
+    "t.vot": {"format": "votable"},
+    "binary.xml": {"format": "votable", "tabledata_format": "binary2"},
+    "t.tsv": {"format": "ascii.fast_tab"},
+}
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_gaia_s_own_columns_are_read_from_every_format(tmp_path, name, caplog):
+    gaia_table().write(tmp_path / name, **FORMATS[name])
+    catalog = read(tmp_path / name)
+    assert [catalog.name(row) for row in np.argsort(catalog.v_mag)] == [
+        "Gaia DR3 5",
+        "Gaia DR3 4295806720",
+        f"Gaia DR3 {2**62 + 1}",
+    ]
+    row = {name: row for row, name in enumerate(map(catalog.name, range(3)))}
+    first, second, third = row["Gaia DR3 5"], row["Gaia DR3 4295806720"], row[f"Gaia DR3 {2**62 + 1}"]
+    v, vi = from_gaia(np.array([5.0, 7.0]), np.array([1.0, 2.0]))
+    assert catalog.v_mag[[first, third]] == pytest.approx(v, abs=SAME)
+    assert catalog.vi_mag[[first, third]] == pytest.approx(vi, abs=SAME)
+    assert (catalog.ra_deg[second], catalog.dec_deg[first]) == (359.999, -45.25)
+    assert catalog.pm_ra_cosdec_mas_yr[[first, second, third]].tolist() == [-3.5, 0.0, 100.25]
+    assert catalog.parallax_mas[third] == 5.0
+    assert np.isnan(catalog.parallax_mas[second])
+    assert (catalog.epoch_jyear == 2016.0).all()
+    assert not catalog.hip.any()
+    assert catalog.rows_read == 5
+    assert "1 without a place, 1 without a magnitude and a colour" in caplog.text
+
+
+def test_tycho_2_has_its_own_names_epoch_and_second_places(tmp_path):
+    table = Table(
+        {
+            "TYC1": [1, 2, 9537],
+            "TYC2": [13, 7, 12121],
+            "TYC3": [1, 2, 3],
+            "RAmdeg": MaskedColumn([2.25, 3.0, 0.0], mask=[0, 0, 1]),
+            "DEmdeg": MaskedColumn([1.0, -2.0, 0.0], mask=[0, 0, 1]),
+            "RAdeg": [2.3, 3.1, 4.0],
+            "DEdeg": [1.1, -2.1, -80.0],
+            "pmRA": MaskedColumn([5.0, -6.0, 0.0], mask=[0, 0, 1]),
+            "pmDE": MaskedColumn([7.0, 8.0, 0.0], mask=[0, 0, 1]),
+            "BTmag": [9.0, 10.0, 11.0],
+            "VTmag": [9.0, 9.5, 10.0],
+            "HIP": MaskedColumn([77, 77, 0], mask=[0, 0, 1]),
+        }
+    )
+    table.write(tmp_path / "tyc2.fits")
+    catalog = read(tmp_path / "tyc2.fits")
+    stars = {catalog.name(row): row for row in range(3)}
+    # One HIP number is of one star, the brighter.
+    assert sorted(stars) == ["HIP 77", "TYC 2-7-2", "TYC 9537-12121-3"]
+    assert catalog.ra_deg[[stars["HIP 77"], stars["TYC 9537-12121-3"]]].tolist() == [2.25, 4.0]
+    assert (catalog.epoch_jyear == 2000.0).all()
+    assert np.isnan(catalog.vi_mag).all()
+
+
+def test_units_are_the_table_s(tmp_path):
+    table = Table(
+        {
+            "ra": np.array([6.0, 12.0]) * u.hourangle,
+            "dec": np.radians([10.0, -10.0]) * u.rad,
+            "pmra": np.array([0.5, -1.0]) * u.arcsec / u.yr,
+            "pmdec": np.array([100.0, 0.0]) * u.mas / u.yr,
+            "plx": np.array([0.1, 0.2]) * u.arcsec,
+            "vmag": [3.0, 4.0],
+            "b-v": [0.5, 1.0],
+            "v-i": [0.6, np.nan],
+        }
+    )
+    table.write(tmp_path / "t.ecsv")
+    catalog = read(tmp_path / "t.ecsv", epoch_jyear=2000.0)
+    order = np.argsort(catalog.v_mag)
+    assert catalog.ra_deg[order] == pytest.approx([90, 180])
+    assert catalog.dec_deg[order] == pytest.approx([10, -10])
+    assert catalog.pm_ra_cosdec_mas_yr[order] == pytest.approx([500, -1000])
+    assert catalog.parallax_mas[order] == pytest.approx([100, 200])
+    assert catalog.vi_mag[order] == pytest.approx([0.6, np.nan], nan_ok=True)
+
+
+def test_stars_of_hipparcos_in_its_own_columns_are_hipparcos(tmp_path):
+    packaged = load_catalog().brighter_than(2.0)
+    table = Table(
+        {
+            "HIP": packaged.hip,
+            "RAICRS": packaged.ra_deg,
+            "DEICRS": packaged.dec_deg,
+            "pmRA": packaged.pm_ra_cosdec_mas_yr,
+            "pmDE": packaged.pm_dec_mas_yr,
+            "Vmag": packaged.v_mag,
+            "B-V": packaged.bv_mag,
+            "V-I": packaged.vi_mag,
+        }
+    )
+    table.write(tmp_path / "hip.csv")
+    own = read(tmp_path / "hip.csv")
+    order = np.argsort(own.hip)
+    for name in ("hip", "ra_deg", "dec_deg", "pm_ra_cosdec_mas_yr", "v_mag", "bv_mag", "vi_mag", "epoch_jyear"):
+        assert np.array_equal(getattr(own, name)[order], getattr(packaged, name)[np.argsort(packaged.hip)]), name
+
+
+def test_repeated_and_impossible_rows_are_counted(tmp_path, caplog):
+    rows = ["1,2,nan,0.1", "1,2,5,", ",2,5,1", "1,2,5,1", "1,2,5,1", "2,99,5,1", "3,3,inf,1", "-20,3,4,1"]
+    (tmp_path / "t.csv").write_text("ra,dec,vmag,b-v\n" + "\n".join(rows) + "\n")
+    catalog = read(tmp_path / "t.csv")
+    assert sorted(catalog.ra_deg.tolist()) == [1.0, 340.0]
+    counts = "1 without a place, 3 without a magnitude and a colour, 1 beyond what a star has, 1 repeated"
+    assert counts in caplog.text
+    assert catalog.notes[0].endswith(counts)
+
+
+def sky(count: int) -> Table:
+    rng = np.random.default_rng(4)
+    return Table(
+        {
+            "ra": rng.uniform(0, 360, count),
+            "dec": np.degrees(np.arcsin(rng.uniform(-1, 1, count))),
+            "vmag": rng.uniform(3, 9, count),
+            "b-v": np.full(count, 0.5),
+        }
+    )
+
+
+def test_hours_and_arcseconds_without_a_unit_are_noticed(tmp_path):
+    table = sky(1000)
+    table["pmra"], table["pmdec"] = table["dec"] / 100, table["dec"] / 200
+    table.write(tmp_path / "t.csv")
+    with pytest.raises(InputError, match="so they are in arcsec a year; give the column its unit"):
+        read(tmp_path / "t.csv", epoch_jyear=2000.0)
+    hours = sky(1000)
+    hours["ra"] /= 15
+    hours.write(tmp_path / "hours.csv")
+    with pytest.raises(InputError, match="so it is in hours"):
+        read(tmp_path / "hours.csv")
+
+
+HEAD = "ra,dec,vmag,b-v\n"
+REFUSED = {
+    "": "is empty; give a table of stars",
+    HEAD: "has no rows",
+    "x,y\n1,2\n": "no right ascension and declination among its columns (x, y); name them ra and dec",
+    "ra,dec,mass\n1,2,3\n": "no magnitude with a colour among its columns (ra, dec, mass); name V with B-V",
+    "hello\nworld\n": "its first line names no columns",
+    HEAD + "12:00:00,-01:02:03,5,0.1\n": "is no column of numbers (its first is '",
+    HEAD + "1,2,nan,0.1\n1,2,5,\n": "none of its 2 rows is a star (2 without a magnitude and a colour)",
+    HEAD + "1,2,3,0.1\n1,2,3,4,5\n": "cannot be read",
+    "ra,dec,vmag,b-v,pmra,pmdec\n1,2,3,0.1,5,5\n": "write [sky] catalogue_epoch_jyear",
+    "ra,dec,vmag,b-v,pmra,pmdec,ref_epoch\n1,2,3,0.1,5,5,1\n": "column ref_epoch is no Julian year",
+    "source_id,ra,dec,vmag,b-v\n" + "9" * 30 + ",1,2,3,0.1\n": "column source_id is no column of numbers",
+    HEAD.strip() + "," + "x," * 2000 + "\n": "its first line names more than 1000 columns",
+    "# %ECSV 1.0\n# ---\n# datatype: {\nra dec\n1 2\n": "cannot be read",
+    '<?xml version="1.0"?><VOTABLE>': "cannot be read",
+    '<?xml version="1.0"?><VOTABLE><STREAM\nencoding="base64" href="http://127.0.0.1/"/></VOTABLE>': "at another place",
+}
+
+
+@pytest.mark.parametrize("text", REFUSED)
+def test_what_is_no_table_of_stars_is_refused_in_one_line(tmp_path, text):
+    path = tmp_path / "t.dat"
+    path.write_text(text)
+    with pytest.raises(InputError) as refusal:
+        read(path)
+    assert REFUSED[text] in str(refusal.value)
+    assert str(refusal.value).startswith(str(path))
+
+
+def test_files_of_other_kinds_are_refused_by_name(tmp_path):
+    gaia_table().write(tmp_path / "t.fits")
+    whole = (tmp_path / "t.fits").read_bytes()
+    (tmp_path / "cut.fits").write_bytes(whole[: len(whole) - 2880])
+    (tmp_path / "t.csv.gz").write_bytes(gzip.compress(b"ra,dec\n"))
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "huge.csv").touch()
+    os.truncate(tmp_path / "huge.csv", 10_000_000_000)
+    refused = {
+        "cut.fits": "cannot be read",
+        "t.csv.gz": "it is a gzip file); unpack it first",
+        "pipe": "is a pipe",
+        "huge.csv": "it has 10 GB or more, and at most 4 GB are read",
+        "missing.fits": "No such file",
+    }
+    for name, words in refused.items():
+        with pytest.raises(InputError, match=words.replace("(", r"\(").replace(")", r"\)")):
+            read(tmp_path / name)
+
+
+def test_a_unit_of_another_kind_is_refused(tmp_path):
+    table = gaia_table()
+    table["pmra"] = [1.0, 2.0, 3.0, 4.0, 5.0] * u.km / u.s
+    table.write(tmp_path / "t.fits")
+    with pytest.raises(InputError, match="column pmra is in 'km s-1'; give it in mas/yr"):
+        read(tmp_path / "t.fits")
+
+
+def test_keys_of_a_table_are_refused_for_hipparcos(tmp_path):
+    for choice in (Choice(with_hipparcos=True), Choice(epoch_jyear=2000.0)):
+        with pytest.raises(InputError, match=r"\[sky\] (with_hipparcos|catalogue_epoch_jyear)"):
+            choose_catalog(choice)

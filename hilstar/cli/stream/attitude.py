@@ -153,7 +153,7 @@ def _lines(told: dict[str, Any]) -> list[str]:
         f"RA {_turn(told['ra_deg'])}, Dec {told['dec_deg']:.4f}, roll {_turn(told['roll_deg'])} deg",
     ]
     if told["rate_deg_s"] is not None:
-        lines.append("rate " + ", ".join(f"{c:.6f}" for c in told["rate_deg_s"]) + " deg/s about x, y, z of the camera")
+        lines.append("rate " + ", ".join(f"{c:z.6f}" for c in told["rate_deg_s"]) + " deg/s about x, y, z of the camera")
     if not told["stars"]:
         lines.append("no star of the catalogue is in view")
     for star in told["stars"]:

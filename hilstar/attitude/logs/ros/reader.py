@@ -7,7 +7,7 @@ have none, or never set it, have the time at which they were recorded.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from itertools import chain
+from itertools import chain, islice
 from typing import NamedTuple
 
 import numpy as np
@@ -43,32 +43,55 @@ class Heard(NamedTuple):
     turn: Turn
 
 
+class Start(NamedTuple):
+    """The first orientation, and whether the messages have times of their own."""
+
+    turn: Turn
+    receive_ns: int
+    stamped: bool
+
+    def t_ns(self, turn: Turn, receive_ns: int) -> int:
+        """The time of an orientation of the same topic."""
+        return (turn.stamp_ns or 0) if self.stamped else receive_ns
+
+    @property
+    def first_ns(self) -> int:
+        """The time of the first."""
+        return self.t_ns(self.turn, self.receive_ns)
+
+
 def read_ros(bag: Bag, stated: Stated) -> LogReading:
     """The body's attitudes of one topic. Raises InputError where the bag, or what is stated, does not say which they are."""
     topic = _chosen(bag, stated.topic)
     check_definition(f"{bag.path}: {topic.name}", topic)
     told: list[tuple[str, str]] = []
-    heard = _of_tf(bag, topic, stated, told) if topic.type in TF_TYPES else _of_topic(bag, topic)
+    every = _of_tf(bag, topic, stated, told) if topic.type in TF_TYPES else _of_topic(bag, topic)
+    start, heard = _begin(bag, topic, every, stated.body)
+    if not start.stamped:
+        told.append(("log-stamp", f"the messages of {topic.name} have no time of their own; when they were recorded is taken"))
+    reference = _reference(bag, topic, start, stated, told)
+    entries = to_icrs(_entries(heard, start), reference, start.turn.gyro, told)
+    _say_optical(start.turn.body, stated, told)
+    return LogReading(_with_notices(in_order(entries, told), bag, told), _conventions(topic, start, reference), ADVICE, told)
+
+
+def _begin(bag: Bag, topic: Topic, heard: Iterator[Heard], body: str | None) -> tuple[Start, Iterator[Heard]]:
+    """What the first orientations say, and all of those of the stated body. Raises InputError where there are none."""
     first = next(heard, None)
     if first is None:
         raise InputError(f"{bag.path}: has no message of {topic.name}; record it, or choose another with --topic")
-    if first.turn.body is None and stated.body is not None:
-        raise InputError(f"{bag.path}: the messages of {topic.name} name no body; leave out --body {stated.body}")
-    heard = _of_body(chain([first], heard), stated.body)
-    first = next(heard, None)
-    if first is None:
-        raise InputError(f"{bag.path}: {topic.name} has no attitude of {stated.body}; leave out --body to be told what it has")
-    second = next(heard, None)
+    if first.turn.body is None and body is not None:
+        raise InputError(f"{bag.path}: the messages of {topic.name} name no body; leave out --body {body}")
+    heard = chain([first], heard)
+    if body is not None:
+        wanted = frame(body)
+        heard = (each for each in heard if each.turn.body == wanted)
+    begin = list(islice(heard, 2))
+    if not begin:
+        raise InputError(f"{bag.path}: {topic.name} has no attitude of {body}; leave out --body to be told what it has")
     # A simulated clock may begin at 0; one that is still 0 in the second message was never set.
-    stamped = bool(first.turn.stamp_ns or (second is not None and second.turn.stamp_ns))
-    heard = heard if second is None else chain([second], heard)
-    if not stamped:
-        told.append(("log-stamp", f"the messages of {topic.name} have no time of their own; when they were recorded is taken"))
-    reference = _reference(bag, topic, first, stated, told)
-    entries = _entries(chain([first], heard), first.turn, stamped)
-    finished = _with_notices(in_order(to_icrs(entries, reference, first.turn.gyro, told), told), bag, told)
-    _say_optical(first.turn.body, stated, told)
-    return LogReading(finished, _conventions(topic, first, reference, stamped), ADVICE, told)
+    stamped = any(each.turn.stamp_ns for each in begin)
+    return Start(begin[0].turn, begin[0].receive_ns, stamped), chain(begin, heard)
 
 
 def _chosen(bag: Bag, wanted: str | None) -> Topic:
@@ -120,38 +143,34 @@ def _of_tf(bag: Bag, topic: Topic, stated: Stated, told: list[tuple[str, str]]) 
         yield Heard(f": transform {number} of {name}", receive_ns, turn)
 
 
-def _reference(bag: Bag, topic: Topic, first: Heard, stated: Stated, told: list[tuple[str, str]]) -> Reference:
+def _reference(bag: Bag, topic: Topic, start: Start, stated: Stated, told: list[tuple[str, str]]) -> Reference:
     why = f"the messages of {topic.name} do not say which frame their orientation refers to"
     if topic.type == IMU:
         why += " (ROS recommends east, north, up: REP 145)"
-    kind: Kind = kind_of_frame(bag.path, first.turn.reference, stated, why, told)
-    return stated_reference(bag.path, kind, stated, first.turn.stamp_ns or first.receive_ns)
+    kind: Kind = kind_of_frame(bag.path, start.turn.reference, stated, why, told)
+    return stated_reference(bag.path, kind, stated, start.first_ns)
 
 
-def _of_body(heard: Iterator[Heard], body: str | None) -> Iterator[Heard]:
-    """Those of one body, where one is stated."""
-    return heard if body is None else (each for each in heard if each.turn.body == frame(body))
-
-
-def _entries(heard: Iterator[Heard], first: Turn, stamped: bool) -> Iterator[Entry]:
+def _entries(heard: Iterator[Heard], start: Start) -> Iterator[Entry]:
     """Each attitude from the reference to the body, at its time, or why it is none."""
     for where, receive_ns, turn in heard:
-        yield Entry(where, _fault(turn, first, stamped) or _sample(turn, receive_ns, stamped))
+        yield Entry(where, _fault(turn, start) or _sample(turn, start.t_ns(turn, receive_ns)))
 
 
-def _sample(turn: Turn, receive_ns: int, stamped: bool) -> AttitudeSample | Refusal:
+def _sample(turn: Turn, t_ns: int) -> AttitudeSample | Refusal:
     w, x, y, z = turn.q
-    return checked_sample((turn.stamp_ns or 0) if stamped else receive_ns, (w, -x, -y, -z), turn.rate)
+    return checked_sample(t_ns, (w, -x, -y, -z), turn.rate)
 
 
-def _fault(turn: Turn, first: Turn, stamped: bool) -> Refusal | None:
+def _fault(turn: Turn, start: Start) -> Refusal | None:
+    first = start.turn
     if turn.fault is not None:
         return Refusal("format", turn.fault)
     if turn.reference != first.reference:
         return Refusal("format", f"refers to the frame {turn.reference!r}, the first to {first.reference!r}")
     if turn.body != first.body:
         return Refusal("format", f"is of the frame {turn.body!r}, the first of {first.body!r}; choose one with --body")
-    if turn.stamp_ns and not stamped:
+    if turn.stamp_ns and not start.stamped:
         return Refusal("time", "some messages have a stamp and some have none (0); set it in all of them")
     return None
 
@@ -168,12 +187,11 @@ def _say_optical(body: str | None, stated: Stated, told: list[tuple[str, str]]) 
         told.append(("mounting", f"{body!r} has the axes of a camera by its name, and is turned by q_body_to_cam all the same"))
 
 
-def _conventions(topic: Topic, first: Heard, reference: Reference, stamped: bool) -> Conventions:
-    turn = first.turn
-    t_ns = turn.stamp_ns or first.receive_ns
-    if not stamped:
+def _conventions(topic: Topic, start: Start, reference: Reference) -> Conventions:
+    turn = start.turn
+    if not start.stamped:
         time = "when each message was recorded, ns since 1970"
-    elif t_ns >= FIRST_DATE_NS:
+    elif start.first_ns >= FIRST_DATE_NS:
         time = "header.stamp: UTC, ns since 1970-01-01T00:00:00, leap seconds not counted"
     else:
         time = "header.stamp: seconds of a simulated clock"
@@ -185,7 +203,7 @@ def _conventions(topic: Topic, first: Heard, reference: Reference, stamped: bool
         "scalar last (x, y, z, w), Hamilton",
         time,
         of_body=True,
-        written=_written(reference, t_ns),
+        written=_written(reference, start.first_ns),
     )
 
 

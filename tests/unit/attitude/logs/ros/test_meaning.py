@@ -282,7 +282,12 @@ def test_messages_without_a_stamp_take_the_recorders_clock_and_say_so(bag):
 
 
 def test_a_simulated_clock_may_begin_at_zero(bag):
-    log = open_log(bag(poses("icrs", rotations(3), start_ns=0)))
+    """Recorded on a day, which is not the time of its attitudes."""
+    sent = [
+        (topic, kind, START_NS + i, message)
+        for i, (topic, kind, _, message) in enumerate(poses("icrs", rotations(3), start_ns=0))
+    ]
+    log = open_log(bag(sent))
     assert [sample.t_ns for sample in log.samples] == [0, 10**8, 2 * 10**8]
     assert log.conventions.time == "header.stamp: seconds of a simulated clock"
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import msgspec
 
-from hilstar.bench.config import BenchConfig, parse_config
+from hilstar.bench.config import GEOCENTRE, BenchConfig, parse_config
 from hilstar.errors import InputError
 from hilstar.monitor.calibration import BUILT_IN
 from hilstar.reading import MAX_TOML_BYTES, read_bytes, read_text
@@ -53,7 +53,8 @@ def _sha256(config: BenchConfig, folder: Path) -> str:
     curves = (tracker.quantum_efficiency, tracker.transmission)
     files = (config.monitor.calibration, config.collimator.geometry, tracker.distortion)
     true = (config.verify.true_calibration, config.verify.true_geometry)
-    named: tuple[str | float | None, ...] = (*curves, *files, *true)
+    orbit = None if config.spacecraft.orbit == GEOCENTRE else config.spacecraft.orbit
+    named: tuple[str | float | None, ...] = (*curves, *files, *true, orbit)
     for name in named:
         if isinstance(name, str) and name not in (*BUILT_IN_CURVES, *BUILT_IN, "hipparcos"):
             digest.update(_named_bytes(folder / name))

@@ -5,12 +5,14 @@ from __future__ import annotations
 import logging
 import math
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
 from hilstar.bench.bench_file import BenchFile, read_bench_file
 from hilstar.bench.cameras import bench_camera
 from hilstar.bench.config import DEFAULT_BRIGHTEST_V_MAG, BenchConfig, RenderSettings, Tracker
+from hilstar.bench.config.when import has_observer
 from hilstar.bench.effort import Effort, Light, faintest_shown_e_per_s, plan_effort
 from hilstar.bench.frame import Bench
 from hilstar.bench.orientation import scan_of
@@ -27,6 +29,9 @@ from hilstar.sky.spectrum import load_curve
 from hilstar.sky.stars import Stars, make_stars, split_by_rate
 from hilstar.sky.tables.star_table import Choice, choose_catalog
 
+if TYPE_CHECKING:
+    from hilstar.sky.bodies.moving import MovingSky
+
 log = logging.getLogger(__name__)
 
 
@@ -37,7 +42,8 @@ def load(path: str | Path) -> Bench:
 
 def open_bench(file: BenchFile, context: Context | None = None) -> Bench:
     """Assemble the bench of a file, in a window's `context` if one is given. Raises InputError or MachineError (no OpenGL)."""
-    stars, calibration = bench_stars(file.config, file.folder), bench_calibration(file.config, file.folder)
+    moving = bench_moving(file.config, file.folder)
+    stars, calibration = bench_stars(file.config, file.folder, moving), bench_calibration(file.config, file.folder)
     white_e_per_s = _white_e_per_s(file.config.render, stars)
     uniformity = calibration.uniformity_map(file.config.monitor.resolution_px)
     darkest = 1.0 if uniformity is None else float(uniformity.min())
@@ -63,9 +69,10 @@ def open_bench(file: BenchFile, context: Context | None = None) -> Bench:
         darkest=darkest,
         flux_at_white_e_per_s=white_e_per_s,
         faintest_shown_e_per_s=faintest,
-        stars=stars,
-        shown_stars=shown,
+        stars=moved(stars, moving),
+        shown_stars=moved(shown, moving),
         faint_stars=faint,
+        moving=moving,
         renderer=Renderer(_target(config, panel, effort), context),
     )
 
@@ -121,14 +128,30 @@ def bench_optics(tracker: Tracker, folder: Path) -> Optics:
     )
 
 
-def bench_stars(config: BenchConfig, folder: Path) -> Stars:
-    """The stars of a bench with their electron rates, which are computed only here."""
+def bench_moving(config: BenchConfig, folder: Path) -> MovingSky | None:
+    """The bodies and the observer of a bench, None where its file has neither. Raises InputError or MachineError."""
+    if not has_observer(config):
+        return None
+    from hilstar.bench.moving import moving_sky  # with the ephemeris 50 ms, which a sky that stands still does not need
+
+    return moving_sky(config, folder, bench_optics(config.tracker, folder))
+
+
+def moved(stars: Stars, moving: MovingSky | None) -> Stars:
+    """The stars with the bodies among them at t = 0, in arrays that `moving` may change; the stars where nothing moves."""
+    return stars if moving is None else moving.among(stars)
+
+
+def bench_stars(config: BenchConfig, folder: Path, moving: MovingSky | None = None) -> Stars:
+    """The stars of a bench with their electron rates, which are computed only here, as `moving`'s observer sees them."""
     sky = config.sky
     source = sky.catalogue if sky.catalogue == "hipparcos" else folder / sky.catalogue
     chosen = choose_catalog(Choice(source, sky.with_hipparcos, sky.catalogue_epoch_jyear))
     catalog = chosen.brighter_than(sky.faintest_v_mag)
     vectors = unit_vectors_icrs(catalog, sky.epoch_jyear)
-    if any(sky.observer_velocity_km_s):
+    if moving is not None:
+        vectors = moving.stars_seen(vectors, catalog.parallax_mas)
+    elif any(sky.observer_velocity_km_s):
         vectors = aberrate(vectors, sky.observer_velocity_km_s)
     temperature_k = star_temperatures_k(catalog.bv_mag, sky.temperature)
     optics = bench_optics(config.tracker, folder)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from types import TracebackType
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -32,6 +32,9 @@ from hilstar.scene.frame_motion import Scan, Turn, swept_sprites
 from hilstar.scene.sprites import Sprites, make_sprites
 from hilstar.sky.stars import Stars, split_by_rate
 
+if TYPE_CHECKING:
+    from hilstar.sky.bodies.moving import MovingSky
+
 WARM_UP_ATTITUDE = np.array([1.0, 0.0, 0.0, 0.0])
 WARM_UP_RATE_RAD_S = np.array([0.1, 0.0, 0.0])
 
@@ -43,7 +46,7 @@ class Frame:
     `linear` is float32 (height, width), electrons per second; `levels`, uint8 or uint16 of the same shape, are indices into
     the response's table; `codes` are the code values, the same array or with bit stealing (height, width, 3);
     `truth` is a structured array of TRUTH_DTYPE, a row for each star whose sprite touches the monitor, and `star` (n,) the
-    places of the same stars in the bench's.
+    places of the same stars in the bench's. `t_ns` is the moment for which bodies were placed.
     """
 
     q_icrs_to_cam: FloatArray
@@ -52,12 +55,13 @@ class Frame:
     codes: Codes
     truth: npt.NDArray[np.void]
     star: IntArray
+    t_ns: int = 0
 
 
 class Drawn:
-    """A frame on the GPU: its sprites (None: blank), and the HIP numbers of the stars that are too bright for the monitor."""
+    """A frame on the GPU: its sprites (None: blank), and what is too bright for the monitor, by HIP number or a body's name."""
 
-    def __init__(self, renderer: Renderer, sprites: Sprites | None, clipped_hip: tuple[int, ...] = ()) -> None:
+    def __init__(self, renderer: Renderer, sprites: Sprites | None, clipped_hip: tuple[int | str, ...] = ()) -> None:
         self.sprites = sprites
         self.clipped_hip = clipped_hip
         self.star_count = 0 if sprites is None else sprites.star_count
@@ -86,7 +90,7 @@ class Bench:
     `config` is that of `file` with everything chosen that the file left to its tolerance (`effort`, None where it left
     nothing). Of `stars` those from `faintest_shown_e_per_s` on can light a pixel: `shown_stars`; the others are
     `faint_stars`. `uniformity`, float32 (height, width), is each pixel's share of white, None where that is 1 everywhere, and
-    `darkest` its minimum.
+    `darkest` its minimum. `moving` places bodies among `stars` and `shown_stars`, None where the sky stands still.
     """
 
     file: BenchFile
@@ -103,11 +107,12 @@ class Bench:
     shown_stars: Stars
     faint_stars: Stars
     renderer: Renderer
+    moving: MovingSky | None = None
 
     def with_stars(self, stars: Stars) -> Bench:
         """The same bench, and renderer, with other stars, all of which are shown."""
         shown, none = split_by_rate(stars, 0.0)
-        return replace(self, stars=stars, shown_stars=shown, faint_stars=none)
+        return replace(self, stars=stars, shown_stars=shown, faint_stars=none, moving=None)
 
     @property
     def panel(self) -> Panel:
@@ -125,21 +130,26 @@ class Bench:
         return make_sprites(stars, icrs_to_image, self.camera, self.renderer.footprint_px)
 
     def draw(
-        self, q_icrs_to_cam: FloatArray | None, frame: int = 0, rate_cam_rad_s: Vector | FloatArray | None = None
+        self,
+        q_icrs_to_cam: FloatArray | None,
+        frame: int = 0,
+        rate_cam_rad_s: Vector | FloatArray | None = None,
+        t_ns: int = 0,
     ) -> Drawn:
         """Draw the levels for an attitude; None gives a blank frame. The frame path: no copy, no table.
 
         `frame` counts the frames shown, for temporal dithering. With a rate that moves stars by more than
         `[render] motion_above_px`, each star is drawn along its path while its row is lit; the attitude is then that at the
-        middle row's first light.
+        middle row's first light. Bodies are where they are at `t_ns`.
         """
-        return self.draw_sprites(self.frame_sprites(q_icrs_to_cam, rate_cam_rad_s), frame)
+        return self.draw_sprites(self.frame_sprites(q_icrs_to_cam, rate_cam_rad_s, t_ns=t_ns), frame)
 
     def frame_sprites(
         self,
         q_icrs_to_cam: FloatArray | None,
         rate_cam_rad_s: Vector | FloatArray | None = None,
         velocity_km_s: FloatArray | None = None,
+        t_ns: int = 0,
     ) -> Sprites | None:
         """The sprites of a frame (see `draw`), before anything is drawn; None for a blank one.
 
@@ -147,7 +157,7 @@ class Bench:
         """
         if q_icrs_to_cam is None:
             return None
-        stars = self.shown_stars.seen_at(velocity_km_s)
+        stars = self.seen(self.shown_stars, t_ns, velocity_km_s)
         turn = self._turn(q_icrs_to_cam, rate_cam_rad_s)
         return self.sprites(q_icrs_to_cam, stars) if turn is None else self._swept(stars, turn)
 
@@ -157,7 +167,7 @@ class Bench:
         clipped = None if sprites is None else self._clipped(sprites)
         if sprites is None or clipped is None or not len(clipped):
             return Drawn(self.renderer, sprites)
-        return Drawn(self.renderer, sprites, tuple(self.shown_stars.hip[np.unique(sprites.star[clipped])].tolist()))
+        return Drawn(self.renderer, sprites, tuple(self.shown_stars.designations(np.unique(sprites.star[clipped]))))
 
     def _turn(self, q_icrs_to_cam: FloatArray, rate_cam_rad_s: Vector | FloatArray | None) -> Turn | None:
         """The motion within a frame; None if no star moves far enough to be seen."""
@@ -184,15 +194,16 @@ class Bench:
         for q, rate in ((WARM_UP_ATTITUDE, WARM_UP_RATE_RAD_S), (WARM_UP_ATTITUDE, None), (None, None)):
             _ = self.draw(q, 0, rate).levels
 
-    def frame(self, q_icrs_to_cam: Sequence[float] | FloatArray, number: int = 0) -> Frame:
+    def frame(self, q_icrs_to_cam: Sequence[float] | FloatArray, number: int = 0, t_ns: int = 0) -> Frame:
         """Draw one frame and read all of it back; the arrays are copies.
 
         Stars too faint for the monitor are in the linear image and the truth, and not drawn. `number` counts frames, for
-        temporal dithering. Raises InputError for a quaternion that is not unit within 1e-3.
+        temporal dithering; bodies are where they are at `t_ns`. Raises InputError for a quaternion that is not unit
+        within 1e-3.
         """
         q = checked_quaternion(q_icrs_to_cam)
-        sprites = self.sprites(q, self.stars)
-        self.renderer.draw(self.sprites(q), number)
+        sprites = self.sprites(q, self.seen(self.stars, t_ns))
+        self.renderer.draw(self.sprites(q, self.seen(self.shown_stars, t_ns)), number)
         levels = self.renderer.codes().copy()
         if len(self.faint_stars) or self.renderer.target.sides:
             self.renderer.draw(sprites, number, whole=True)
@@ -201,18 +212,25 @@ class Bench:
         truth["drawn"] = truth["electrons_per_s"] >= self.faintest_shown_e_per_s
         truth["clipped"][self._clipped(sprites)] = True
         order = np.argsort(truth["v_mag"], kind="stable")
-        return Frame(q, linear, levels, self.code_values(levels), truth[order], sprites.star[order])
+        return Frame(q, linear, levels, self.code_values(levels), truth[order], sprites.star[order], t_ns)
 
-    def losses_mag(self, frame: Frame) -> dict[int, float]:
-        """For each clipped star of a frame (by HIP number), how many magnitudes too faint it is, summed over its own pixels."""
-        hips = set(frame.truth["hip"][frame.truth["clipped"]].tolist())
-        if not hips:
+    def seen(self, stars: Stars, t_ns: int = 0, velocity_km_s: FloatArray | None = None) -> Stars:
+        """`stars` or `shown_stars` as they are seen at `t_ns`, bodies among them, with a velocity as in `frame_sprites`."""
+        return stars.seen_at(velocity_km_s) if self.moving is None else self.moving.seen(stars, t_ns, velocity_km_s)
+
+    def losses_mag(self, frame: Frame) -> dict[int | str, float]:
+        """For each clipped star of a frame (by HIP number, or a body's name), how many magnitudes too faint it is.
+
+        That is summed over its own pixels.
+        """
+        clipped = set(self.stars.designations(frame.star[frame.truth["clipped"]]))
+        if not clipped:
             return {}
-        sprites = self.sprites(frame.q_icrs_to_cam)
+        sprites = self.sprites(frame.q_icrs_to_cam, self.seen(self.shown_stars, frame.t_ns))
         footprints = FootprintMap(self.camera.resolution_px, self._sigma_px)
         loss_mag = star_losses_mag(sprites, self.panel, footprints, frame.levels)
-        hip = self.shown_stars.hip[sprites.star].tolist()
-        return {h: float(loss) for h, loss in zip(hip, loss_mag, strict=True) if h in hips}
+        names = self.shown_stars.designations(sprites.star)
+        return {name: float(loss) for name, loss in zip(names, loss_mag, strict=True) if name in clipped}
 
     def code_values(self, levels: Codes) -> Codes:
         """The monitor's code values of levels (height, width): the same, or (height, width, 3) with bit stealing."""

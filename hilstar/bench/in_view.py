@@ -14,7 +14,10 @@ from hilstar.sky.stars import Stars
 
 @dataclass(frozen=True, slots=True)
 class StarInView:
-    """A star in the field: its place in the sky (ICRS, apparent), in the image, and its angle from the boresight."""
+    """A star in the field: its place in the sky (ICRS, apparent), in the image, and its angle from the boresight.
+
+    A body has a `name`, and 0 for `hip`.
+    """
 
     hip: int
     v_mag: float
@@ -24,11 +27,13 @@ class StarInView:
     x_px: float
     y_px: float
     from_boresight_deg: float
+    name: str
 
 
 def brightest_in_view(stars: Stars, camera: Camera, q_icrs_to_cam: FloatArray, count: int) -> list[StarInView]:
     """The `count` brightest of `stars` that fall on the camera's pixels, the brightest first."""
-    cam = stars.vectors @ to_matrix(q_icrs_to_cam).T
+    vectors = stars.directions(np.arange(len(stars)))
+    cam = vectors @ to_matrix(q_icrs_to_cam).T
     x_px, y_px = camera.project(cam @ camera.cam_to_image.T)
     width, height = camera.resolution_px
     with np.errstate(invalid="ignore"):  # NaN: behind the camera
@@ -36,7 +41,7 @@ def brightest_in_view(stars: Stars, camera: Camera, q_icrs_to_cam: FloatArray, c
     found = np.flatnonzero(inside)
     found = found[np.argsort(stars.v_mag[found], kind="stable")][:count]
     off_rad = np.arctan2(np.hypot(cam[found, 0], cam[found, 1]), cam[found, 2])
-    x, y, z = stars.vectors[found].T
+    x, y, z = vectors[found].T
     ra_deg, dec_deg = np.degrees(np.arctan2(y, x)) % 360.0, np.degrees(np.arctan2(z, np.hypot(x, y)))
     columns = (
         stars.hip[found].tolist(),
@@ -47,6 +52,7 @@ def brightest_in_view(stars: Stars, camera: Camera, q_icrs_to_cam: FloatArray, c
         x_px[found].tolist(),
         y_px[found].tolist(),
         np.degrees(off_rad).tolist(),
+        stars.names(found),
     )
     return [StarInView(*row) for row in zip(*columns, strict=True)]
 

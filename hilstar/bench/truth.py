@@ -24,14 +24,21 @@ TRUTH_DTYPE = np.dtype(
         ("period_d", "f8"),
         ("double", "U1"),
         ("separation_arcsec", "f8"),
+        ("name", "U7"),
     ]
 )
+
+
+def clipped_in(truth: npt.NDArray[np.void]) -> list[int | str]:
+    """What clips in a table of TRUTH_DTYPE: HIP numbers, and names of bodies."""
+    rows = truth[truth["clipped"]]
+    return [name or hip for name, hip in zip(rows["name"].tolist(), rows["hip"].tolist(), strict=True)]
 
 
 def truth_table(stars: Stars, star: IntArray, x_px: FloatArray, y_px: FloatArray) -> npt.NDArray[np.void]:
     """Rows of TRUTH_DTYPE for the stars at the indices `star` (n,) of `stars`: all drawn, none clipped yet."""
     truth = np.zeros(len(star), dtype=TRUTH_DTYPE)
-    truth["hip"] = stars.hip[star]
+    truth["hip"], truth["name"] = stars.hip[star], stars.names(star)
     truth["x_px"], truth["y_px"] = x_px, y_px
     truth["v_mag"], truth["bv"] = stars.v_mag[star], stars.bv_mag[star]
     truth["temperature_k"] = stars.temperature_k[star]

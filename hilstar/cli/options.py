@@ -20,6 +20,10 @@ Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existin
 Explain = Annotated[
     bool, typer.Option("--explain", help="Explain on stderr what was chosen for this scene, with its error and its saving.")
 ]
+AtSeconds = Annotated[
+    float | None,
+    typer.Option("--at", metavar="S", help="Seconds after `[sky] epoch_utc`, at which bodies are placed; 0 by default."),
+]
 RunFile = Annotated[Path, typer.Argument(metavar="RUN.mcap", help="The ledger of serve or replay.")]
 UNSAID = "What the log itself does not say"
 KernelFiles = Annotated[

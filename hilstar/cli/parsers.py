@@ -7,10 +7,12 @@ import re
 from typing import TYPE_CHECKING, Any
 
 from hilstar.errors import InputError
+from hilstar.units import NS_PER_S
 
 if TYPE_CHECKING:
     from hilstar.arrays import FloatArray
     from hilstar.attitude.wire.source import Mounting
+    from hilstar.bench.config import BenchConfig
     from hilstar.calibrate.scale import Reading
     from hilstar.run.record.ledger import Split
 
@@ -23,6 +25,7 @@ SPLIT_UNITS = {"kB": 1e3, "MB": 1e6, "GB": 1e9, "s": 1.0, "min": 60.0, "h": 3600
 READING_FORM = "write --reading HIP,DN: a star's Hipparcos number, and the sum of its DN over the background"
 MIN_SPLIT_BYTES, MIN_SPLIT_S = 1e6, 10.0
 MAX_SIZE_PX = 32768
+MAX_AT_S = 1e10
 
 
 def parse_attitude(command: str, radec: str | None, quaternion: str | None) -> Any:
@@ -35,6 +38,21 @@ def parse_attitude(command: str, radec: str | None, quaternion: str | None) -> A
     if radec is not None:
         return from_radec_roll_deg(*parse_radec(radec))
     return checked_quaternion(parse_numbers(quaternion or "", 4, "--quaternion", "W,X,Y,Z"))
+
+
+def parse_at(command: str, at_s: float | None, config: BenchConfig) -> int:
+    """The moment of one frame, ns after the bench file's `epoch_utc`. Raises InputError where nothing moves."""
+    from hilstar.bench.config.when import has_observer
+
+    if at_s is None:
+        return 0
+    if not abs(at_s) <= MAX_AT_S:
+        raise InputError(f"{command} --at {at_s:g}: write seconds, 1e10 at most")
+    if not has_observer(config):
+        raise InputError(
+            f"{command} --at {at_s:g}: nothing moves in this sky; write [sky.bodies] or [spacecraft], or leave it out"
+        )
+    return round(at_s * NS_PER_S)
 
 
 def parse_numbers(text: str, count: int, option: str, form: str) -> list[float]:

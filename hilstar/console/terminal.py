@@ -62,7 +62,7 @@ def report(summary: RunSummary, as_json: bool) -> None:
         "frame time": f"{spread(summary.frame_ms)} ms (p50 / p99 / max), attitude in to codes ready",
         "attitude age": f"{spread(summary.attitude_age_ms)} ms (p50 / p99 / max) at render",
         "stars drawn": f"{figure(stars.mean, 0)} mean, {stars.max} max, {clipped.max} clipped"
-        + "".join(f" HIP {hip}" for hip in clipped.hip[:5]),
+        + "".join(f" {name}" for name in [*clipped.bodies, *(f"HIP {hip}" for hip in clipped.hip)][:5]),
         "packets": f"{packets.received} received, {packets.refused} refused" + (f" ({refused})" if refused else ""),
     }
     if summary.clock:

@@ -82,7 +82,7 @@ class FrameLoop:
         self._presence.see(attitude, stale)
         on_screen = self.pacer.operator.look()
         attitude = self._shown_attitude(t_ns, attitude, stale)
-        sprites = self._sprites(attitude)
+        sprites = self._sprites(attitude, t_ns)
         if self._gives_up(number, moment):
             return None
         self.watch.enter("draw")
@@ -114,11 +114,11 @@ class FrameLoop:
         attitude = operator.attitude(t_ns, attitude)
         return None if stale and self._blank_when_stale and not operator.paused else attitude
 
-    def _sprites(self, attitude: Attitude | None) -> Sprites | None:
+    def _sprites(self, attitude: Attitude | None, t_ns: int) -> Sprites | None:
         if attitude is None:
             return None
         rate = attitude.rate_cam_rad_s if self._moving else None
-        return self._bench.frame_sprites(attitude.q_icrs_to_cam, rate, attitude.velocity_km_s)
+        return self._bench.frame_sprites(attitude.q_icrs_to_cam, rate, attitude.velocity_km_s, t_ns)
 
     def _gives_up(self, number: int, moment: Moment) -> bool:
         """Whether the frame's moment has passed so far that the next is begun instead.

@@ -31,10 +31,11 @@ class StarSummary(msgspec.Struct, frozen=True):
 
 
 class ClippedSummary(msgspec.Struct, frozen=True):
-    """Stars brighter than full scale: how many in a frame at most, and which (HIP)."""
+    """What is brighter than full scale: how many in a frame at most, and which stars (HIP) and bodies (by name)."""
 
     max: int
     hip: list[int]
+    bodies: list[str] = []
 
 
 class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
@@ -101,7 +102,7 @@ class RunTally:
         self._age_ms = RunningStatistics()
         self._stars = RunningStatistics()
         self._clipped_max = 0
-        self.clipped_hip: set[int] = set()
+        self.clipped_hip: set[int | str] = set()
         self.swaps = SwapTally()
         self.missed_frames = 0
         self.stale_frames = 0
@@ -113,7 +114,7 @@ class RunTally:
         """Frames drawn so far."""
         return self._frame_ms.count
 
-    def add(self, frame_ns: int, age_ns: int | None, star_count: int, clipped_hip: tuple[int, ...]) -> None:
+    def add(self, frame_ns: int, age_ns: int | None, star_count: int, clipped_hip: tuple[int | str, ...]) -> None:
         """Add one frame; `age_ns` is None until an attitude has come."""
         self._frame_ms.add(frame_ns / NS_PER_MS)
         if age_ns is not None:
@@ -122,6 +123,10 @@ class RunTally:
         if clipped_hip:
             self._clipped_max = max(self._clipped_max, len(clipped_hip))
             self.clipped_hip.update(clipped_hip)
+
+    def _clipped(self) -> ClippedSummary:
+        stars = sorted(star for star in self.clipped_hip if isinstance(star, int))
+        return ClippedSummary(self._clipped_max, stars, sorted(body for body in self.clipped_hip if isinstance(body, str)))
 
     def summary(self, duration_s: float, counts: PacketCounts, gl_renderer: str) -> RunSummary:
         """What all kinds of run say; figures without a sample are None."""
@@ -134,7 +139,7 @@ class RunTally:
             attitude_age_ms=self._age_ms.percentiles(),
             packets=PacketSummary(counts.received, counts.received - counts.refused, counts.refused, refused_by),
             stars_drawn=StarSummary(self._stars.mean, int(self._stars.max) if self.frames else None),
-            clipped=ClippedSummary(self._clipped_max, sorted(self.clipped_hip)),
+            clipped=self._clipped(),
             missed_frames=self.missed_frames,
             stale_frames=self.stale_frames,
             capped=self.capped_frames,

@@ -15,6 +15,8 @@ from hilstar.units import LIGHT_KM_S
 
 MAX_SHIFT = 1.1  # of a direction by aberration, times v/c; for speeds up to a tenth of light's
 
+BODY_CELL_RAD = 1e-6  # of a cell with one body in it: rounding
+
 
 @dataclass(frozen=True, slots=True)
 class Stars:
@@ -22,7 +24,8 @@ class Stars:
 
     `row` is each star's place in `catalog`, which has what no frame needs; -1 for what is in no catalogue. With a
     `velocity_km_s` (3,), ICRS, they are seen by an observer who moves so against the one who sees `vectors`: `near` and
-    `directions` then say what that observer sees.
+    `directions` then say what that observer sees. The last stars may be `bodies`, by name: whoever moves them rewrites their
+    part of the arrays.
     """
 
     hip: npt.NDArray[np.int32]
@@ -35,6 +38,7 @@ class Stars:
     catalog: Catalog
     row: IntArray
     velocity_km_s: FloatArray | None = None
+    bodies: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.hip)
@@ -53,6 +57,15 @@ class Stars:
     def seen_at(self, velocity_km_s: FloatArray | None) -> Stars:
         """The same stars for such an observer; None: for the one who sees `vectors`."""
         return self if velocity_km_s is None else replace(self, velocity_km_s=velocity_km_s)
+
+    def names(self, which: IntArray) -> list[str]:
+        """The names of the bodies among stars (n,), empty text for the stars themselves."""
+        first = len(self) - len(self.bodies)
+        return [self.bodies[i - first] if i >= first else "" for i in which.tolist()]
+
+    def designations(self, which: IntArray) -> list[int | str]:
+        """The HIP numbers of stars (n,), and the names of the bodies among them."""
+        return [name or hip for name, hip in zip(self.names(which), self.hip[which].tolist(), strict=True)]
 
 
 def split_by_rate(stars: Stars, faintest_e_per_s: float) -> tuple[Stars, Stars]:
@@ -94,4 +107,31 @@ def make_stars(catalog: Catalog, vectors: FloatArray, temperature_k: FloatArray,
         grid=grid,
         catalog=catalog,
         row=order,
+    )
+
+
+def with_bodies(stars: Stars, bodies: tuple[str, ...], bv_mag: FloatArray) -> Stars:
+    """The stars, in arrays of their own, and after them bodies of colours `bv_mag` (k,), which have no place or light yet."""
+    count, order = len(bodies), len(stars) + np.arange(len(bodies))
+    nowhere = np.full(count, np.nan)
+    grid = stars.grid
+    return Stars(
+        hip=np.concatenate([stars.hip, np.zeros(count, dtype=np.int32)]),
+        vectors=np.concatenate([stars.vectors, np.full((count, 3), np.nan)]),
+        v_mag=np.concatenate([stars.v_mag, nowhere]),
+        bv_mag=np.concatenate([stars.bv_mag, bv_mag]),
+        temperature_k=np.concatenate([stars.temperature_k, nowhere]),
+        electrons_per_s=np.concatenate([stars.electrons_per_s, nowhere]),
+        grid=replace(
+            grid,
+            order=np.concatenate([grid.order, order]),
+            start=np.concatenate([grid.start, order]),
+            count=np.concatenate([grid.count, np.ones(count, dtype=grid.count.dtype)]),
+            centre=np.concatenate([grid.centre, np.full((count, 3), np.nan)]),
+            cos_radius=np.concatenate([grid.cos_radius, np.full(count, np.cos(BODY_CELL_RAD))]),
+            sin_radius=np.concatenate([grid.sin_radius, np.full(count, np.sin(BODY_CELL_RAD))]),
+        ),
+        catalog=stars.catalog,
+        row=np.concatenate([stars.row, np.full(count, -1)]),
+        bodies=bodies,
     )

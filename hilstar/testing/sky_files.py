@@ -59,7 +59,7 @@ def _inflated(path: Path, raw: bytes, wanted: str) -> bytes:
 
 
 def read_truth_csv(path: Path) -> Truth:
-    """The stars of a CSV of `hilstar frame --truth`, TRUTH_DTYPE, only the columns of TRUTH_COLUMNS filled."""
+    """The stars of a CSV of `hilstar frame --truth`, TRUTH_DTYPE, only `name` and the columns of TRUTH_COLUMNS filled."""
     wanted = "give the CSV that `hilstar frame --truth OUT.csv` writes"
     try:
         rows = list(csv.DictReader(io.StringIO(read_text(path, wanted, MAX_TRUTH_BYTES), newline="")))
@@ -67,6 +67,7 @@ def read_truth_csv(path: Path) -> Truth:
         raise cannot_read(path, error, wanted) from error
     truth = np.zeros(len(rows), dtype=TRUTH_DTYPE)
     for line, row in enumerate(rows):
+        truth["name"][line] = row.get("name") or ""  # a table of stars alone may have no names
         for name in TRUTH_COLUMNS:
             try:
                 truth[name][line] = float(row[name])

@@ -32,10 +32,10 @@ class StarDifference:
     """One star of the golden image (an extra one: of the other image), and the other image minus the golden one.
 
     `flux_error_mag` is positive where the star is too faint, infinite where it is missing, minus infinity where it is extra;
-    `hip` has every star of a blend.
+    `hip` has every star of a blend, a body by its name.
     """
 
-    hip: tuple[int, ...]
+    hip: tuple[int | str, ...]
     x_px: float
     y_px: float
     flux_e_per_s: float
@@ -65,7 +65,8 @@ class StarDifference:
     def name(self) -> str:
         """Its HIP number, those of its blend, or its place."""
         if self.hip:
-            return "HIP " + " + ".join(map(str, self.hip))
+            hips, bodies = ([one for one in self.hip if isinstance(one, kind)] for kind in (int, str))
+            return " + ".join([*(f"HIP {one}" if k == 0 else str(one) for k, one in enumerate(hips)), *map(str, bodies)])
         return f"star at ({self.x_px:.1f}, {self.y_px:.1f})"
 
     def line(self) -> str:

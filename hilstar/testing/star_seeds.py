@@ -24,10 +24,10 @@ Truth = npt.NDArray[np.void]
 
 @dataclass(frozen=True, slots=True)
 class Seeds:
-    """Stars to be fitted: places (n, 2), px, and the HIP numbers of each, none where no table has it."""
+    """Stars to be fitted: places (n, 2), px, and the HIP numbers of each (a body's name), none where no table has it."""
 
     places_px: FloatArray
-    hip: list[tuple[int, ...]]
+    hip: list[tuple[int | str, ...]]
 
     @property
     def stars(self) -> int:
@@ -51,7 +51,7 @@ def find_seeds(golden: FloatArray, truth: Truth | None, sigma_px: tuple[float, f
         )
     table = truth[np.argsort(-truth["electrons_per_s"], kind="stable")]
     places = _places_px(table)
-    listed = _blended(Seeds(places, [(int(hip),) for hip in table["hip"]]), blend_px)
+    listed = _blended(Seeds(places, [_designation(row) for row in table]), blend_px)
     # The light of a star off the image is brightest at the image's edge.
     shown = np.clip(places, 0, np.array([golden.shape[1], golden.shape[0]]) - 1)
     away = _nearest(shown, found)[0] > blend_px
@@ -75,12 +75,16 @@ def describes(truth: Truth, image: FloatArray) -> bool:
     return _has(truth, bright_pixels(image, RIPPLE_SHARE * around(image, sigma_px)), blend_distance_px(sigma_px))
 
 
-def names_at(places_px: FloatArray, truth: Truth | None, blend_px: float) -> list[tuple[int, ...]]:
+def names_at(places_px: FloatArray, truth: Truth | None, blend_px: float) -> list[tuple[int | str, ...]]:
     """The HIP number of the table's star at each place (n, 2), px, where it has one."""
     if truth is None or not len(truth) or not len(places_px):
         return [()] * len(places_px)
     distance, nearest = _nearest(_places_px(truth), places_px)
-    return [(int(truth["hip"][k]),) if d <= blend_px else () for d, k in zip(distance, nearest, strict=True)]
+    return [_designation(truth[k]) if d <= blend_px else () for d, k in zip(distance, nearest, strict=True)]
+
+
+def _designation(row: np.void) -> tuple[int | str, ...]:
+    return (str(row["name"]) or int(row["hip"]),)
 
 
 def _has(truth: Truth, found_px: FloatArray, blend_px: float) -> bool:
@@ -106,7 +110,7 @@ def _blended(seeds: Seeds, blend_px: float) -> Seeds:
     links = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(size, size))
     group = np.asarray(connected_components(links, directed=False)[1], dtype=np.intp) if size else np.zeros(0, dtype=np.intp)
     _, first = np.unique(group, return_index=True)
-    hips: dict[int, tuple[int, ...]] = {}
+    hips: dict[int, tuple[int | str, ...]] = {}
     for label, hip in zip(group.tolist(), seeds.hip, strict=True):
         hips[label] = hips.get(label, ()) + hip
     return Seeds(seeds.places_px[first], [hips[label] for label in group[first].tolist()])

@@ -52,7 +52,7 @@ def log_motions(
         rate = np.zeros(3)
         if ends_ns[1] > ends_ns[0]:
             rate = rate_between_rad_s(begin.q_icrs_to_cam, end.q_icrs_to_cam, (ends_ns[1] - ends_ns[0]) / NS_PER_S)
-        motions.append(Motion(middle.q_icrs_to_cam, rate, exposure_s))
+        motions.append(Motion(middle.q_icrs_to_cam, rate, exposure_s, t_ns))
     return motions
 
 

@@ -63,7 +63,7 @@ class Budget:
     nothing_v_mag: float
     range_mag: float
     within: dict[str, float | None]
-    clipped_hip: list[int]
+    clipped_hip: list[int | str]
     left_out: NotDrawn
     black_e_per_s_px: float
     rows: list[MagnitudeRow]

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile
-from hilstar.bench.build import bench_optics, bench_stars
+from hilstar.bench.build import bench_moving, bench_optics, bench_stars, moved
 from hilstar.bench.cameras import tracker_camera
 from hilstar.bench.config import BenchConfig
 from hilstar.bench.truth import truth_table
@@ -64,21 +64,26 @@ class Simulator:
         self.file = file
         self.config = file.config
         tracker = self.config.tracker
-        self.stars = bench_stars(self.config, file.folder)
+        self.moving = bench_moving(self.config, file.folder)
+        self.stars = moved(bench_stars(self.config, file.folder, self.moving), self.moving)
         self.camera = tracker_camera(tracker, file.folder)
         self.background_e = background_e(self.config, file.folder)
         self.detector = Detector(tracker.detector, tracker.resolution_px, tracker.pixel_pitch_um)
         self.renderer = Renderer(Target(tracker.resolution_px, tracker.psf_sigma_px), context)
 
-    def motion(self, q_icrs_to_cam: FloatArray, rate_cam_rad_s: FloatArray) -> Motion:
+    def motion(self, q_icrs_to_cam: FloatArray, rate_cam_rad_s: FloatArray, t_ns: int = 0) -> Motion:
         """An exposure of this tracker, by the attitude in its middle (unit quaternion) and a constant rate."""
-        return Motion(q_icrs_to_cam, rate_cam_rad_s, self.config.tracker.exposure_s)
+        return Motion(q_icrs_to_cam, rate_cam_rad_s, self.config.tracker.exposure_s, t_ns)
 
-    def expose(self, motion: Motion, rng: np.random.Generator | None, stars: Stars | None = None) -> Exposure:
-        """One frame; without a generator, without noise; with other `stars`, those. Raises InputError for what a detector
-        cannot take.
+    def expose(self, motion: Motion, rng: np.random.Generator | None, velocity_km_s: FloatArray | None = None) -> Exposure:
+        """One frame; without a generator, without noise. Raises InputError for what a detector cannot take.
+
+        A velocity (3,), ICRS, is that of an observer against the one of `[sky] observer_velocity_km_s`.
         """
-        tracker, stars = self.config.tracker, self.stars if stars is None else stars
+        tracker = self.config.tracker
+        stars = self.stars.seen_at(velocity_km_s)
+        if self.moving is not None:
+            stars = self.moving.seen(self.stars, motion.t_ns, velocity_km_s)
         sprites = smeared_sprites(stars, motion, self.camera, self.renderer.footprint_px, tracker.psf_sigma_px)
         self.renderer.draw(sprites)
         mean_e = self.renderer.linear().astype(np.float64) * tracker.exposure_s + self.background_e

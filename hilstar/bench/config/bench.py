@@ -10,6 +10,7 @@ from hilstar.bench.config.collimator import Collimator
 from hilstar.bench.config.monitor import Monitor
 from hilstar.bench.config.render import RenderSettings
 from hilstar.bench.config.sky import SkySettings
+from hilstar.bench.config.spacecraft import Spacecraft
 from hilstar.bench.config.tracker import Tracker
 from hilstar.bench.config.verify import Verify
 from hilstar.toml_tables import Table
@@ -24,6 +25,7 @@ class BenchConfig(Table, frozen=True):
     monitor: Monitor
     collimator: Collimator
     sky: SkySettings = msgspec.field(default_factory=SkySettings)
+    spacecraft: Spacecraft = msgspec.field(default_factory=Spacecraft)
     attitude: AttitudeSettings = msgspec.field(default_factory=AttitudeSettings)
     render: RenderSettings = msgspec.field(default_factory=RenderSettings)
     background: Background = msgspec.field(default_factory=Background)

@@ -13,6 +13,7 @@ from hilstar.attitude.wire.protocol import NORM_TOLERANCE
 from hilstar.bench.config.bench import TYPE_WORDS, BenchConfig
 from hilstar.bench.config.render import DEFAULT_BRIGHTEST_V_MAG
 from hilstar.bench.config.road import check_road
+from hilstar.bench.config.when import with_epoch
 from hilstar.errors import InputError, shortened
 from hilstar.reading import MAX_TOML_BYTES, parse_toml, read_text
 from hilstar.toml_tables import Kind, explained
@@ -39,7 +40,7 @@ def parse_config(path: Path, text: str) -> BenchConfig:
     except msgspec.ValidationError as error:
         raise InputError(f"{path}: {explained(str(error), tables, KIND)}") from error
     _check_meaning(config, path)
-    return _with_white(config)
+    return with_epoch(_with_white(config), path, tables)
 
 
 def _with_white(config: BenchConfig) -> BenchConfig:

@@ -4,10 +4,25 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
+import msgspec
 from msgspec import Meta
 
 from hilstar.bench.config.values import EpochJyear, IcrsVector, Magnitude
 from hilstar.toml_tables import Table
+
+
+class Bodies(Table, frozen=True):
+    """Bodies of the Solar System, as points of light: places by JPL's DE421, magnitudes by phase, sunlight times their albedo.
+
+    They need `[sky] epoch_utc` and `pip install 'hilstar[bodies]'`. A body wider than 0.2 px of the screen, above all the Moon
+    and the Sun, is drawn as a point with all its light; `hilstar frame --explain` and `hilstar verify` say which.
+    """
+
+    planets: Annotated[
+        bool, Meta(description="Mercury, Venus, Mars, Jupiter, Saturn (with its rings' light), Uranus, Neptune.")
+    ] = False
+    moon: Annotated[bool, Meta(description="The Moon.")] = False
+    sun: Annotated[bool, Meta(description="The Sun.")] = False
 
 
 class SkySettings(Table, frozen=True):
@@ -42,6 +57,14 @@ class SkySettings(Table, frozen=True):
             description="Julian year to which proper motion is applied, from the epoch of the catalogue's places.",
         ),
     ] = 2026.0
+    epoch_utc: Annotated[
+        str | None,
+        Meta(
+            description='The UTC of t = 0 (`t_ns` = 0), such as `"2026-11-21T00:00:00Z"`. It takes the place of `epoch_jyear`, '
+            "and bodies are where they are at each frame's time.",
+            extra={"default": "none"},
+        ),
+    ] = None
     faintest_v_mag: Annotated[
         Magnitude, Meta(description="Faintest V magnitude used, inclusive; fainter stars do not exist for this bench.")
     ] = 7.5
@@ -82,6 +105,7 @@ class SkySettings(Table, frozen=True):
         IcrsVector,
         Meta(
             description="Barycentric velocity of the observer, ICRS axes, for aberration: 20.5 arcsec at 29.8 km/s. "
-            "Slower than light."
+            "Slower than light. With `[spacecraft]` or bodies it follows from the ephemeris."
         ),
     ] = (0.0, 0.0, 0.0)
+    bodies: Bodies = msgspec.field(default_factory=Bodies)

@@ -114,7 +114,7 @@ def _fullest(bench: Bench) -> list[Frame]:
 def _alone(bench: Bench, room: Room, frame: Frame) -> Wanted:
     """The stars of a frame that are drawn whole and stand alone, where the tracker should see them."""
     camera = tracker_camera(room.file.config.tracker, room.file.folder)
-    truth, vectors = frame.truth, bench.stars.vectors[frame.star]
+    truth, vectors = frame.truth, bench.stars.directions(frame.star)
     place = np.stack(camera.project(vectors @ to_matrix(frame.q_icrs_to_cam).T), axis=1)
     width, height = camera.resolution_px
     screen = np.stack([truth["x_px"], truth["y_px"]], axis=1)

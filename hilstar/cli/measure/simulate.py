@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from hilstar.cli.options import MAX_SEED, BenchFile, Json, QuaternionText, RadecText, check_files
-from hilstar.cli.parsers import parse_attitude, parse_rate
+from hilstar.cli.options import MAX_SEED, AtSeconds, BenchFile, Json, QuaternionText, RadecText, check_files
+from hilstar.cli.parsers import parse_at, parse_attitude, parse_rate
 from hilstar.console.terminal import print_json, progress, say
 from hilstar.errors import InputError
 from hilstar.files import FITS, PNG, PNG_OR_TIFF, check_directory, check_ending
@@ -25,6 +25,7 @@ def simulate(
     rate: Annotated[
         str | None, typer.Option(metavar="X,Y,Z", help="Angular rate of the camera about its own axes, deg/s.")
     ] = None,
+    at: AtSeconds = None,
     log: Annotated[
         Path | None, typer.Option(metavar="LOG", help="Simulate frames along a log, into the directory given by -o.")
     ] = None,
@@ -42,12 +43,13 @@ def simulate(
     import numpy as np
 
     from hilstar.bench.bench_file import read_bench_file
+    from hilstar.bench.truth import clipped_in
     from hilstar.twin import exposure_files as files
     from hilstar.twin.simulator import FrameNoise, Simulator
 
     if log is not None:
-        if output is None or radec or quaternion or rate or png or dn_png:
-            raise InputError("simulate --log LOG: give -o DIR, and no --radec, --quaternion, --rate, --png or --dn-png")
+        if output is None or radec or quaternion or rate or png or dn_png or at is not None:
+            raise InputError("simulate --log LOG: give -o DIR, and no --radec, --quaternion, --rate, --at, --png or --dn-png")
         check_directory("-o", output)
         simulate_log(bench_file, log, frames, FrameNoise(noise, seed), output)
         return
@@ -59,20 +61,20 @@ def simulate(
     check_ending("--dn-png", dn_png, PNG_OR_TIFF)
     file = read_bench_file(bench_file)
     check_files([], targets, file)
-    q = parse_attitude("simulate", radec, quaternion)
+    q, t_ns = parse_attitude("simulate", radec, quaternion), parse_at("simulate", at, file.config)
     rate_rad_s = parse_rate(rate) if rate else np.zeros(3)
     with Simulator(file) as simulator:
         frame_noise = FrameNoise(noise, seed)
-        exposure = simulator.expose(simulator.motion(q, rate_rad_s), frame_noise.rng())
+        exposure = simulator.expose(simulator.motion(q, rate_rad_s, t_ns), frame_noise.rng())
         if output is not None:
             files.write_exposure_fits(output, simulator, exposure, frame_noise)
         if png is not None:
             files.write_exposure_png(png, exposure.dn)
         if dn_png is not None:
             files.write_dn_picture(dn_png, exposure.dn)
-        summary = {
+        summary: dict[str, Any] = {
             "stars": len(exposure.truth),
-            "clipped": exposure.truth["hip"][exposure.truth["clipped"]].tolist(),
+            "clipped": clipped_in(exposure.truth),
             "capped": exposure.capped,
             "dn": {"min": int(exposure.dn.min()), "mean": float(exposure.dn.mean()), "max": int(exposure.dn.max())},
             "written": [str(path) for path in targets],

@@ -7,8 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
-from hilstar.cli.options import BenchFile, Explain, Json, QuaternionText, RadecText, check_files
-from hilstar.cli.parsers import parse_attitude
+from hilstar.cli.options import AtSeconds, BenchFile, Explain, Json, QuaternionText, RadecText, check_files
+from hilstar.cli.parsers import parse_at, parse_attitude
 from hilstar.cli.show.running import explain_bench
 from hilstar.console.terminal import print_json
 from hilstar.errors import InputError
@@ -27,6 +27,7 @@ def frame(
     ] = None,
     codes: Annotated[Path | None, typer.Option(metavar="OUT.png", help="The code values.")] = None,
     preview: Annotated[Path | None, typer.Option(metavar="OUT.png", help="A picture stretched for the eye.")] = None,
+    at: AtSeconds = None,
     explain: Explain = False,
     as_json: Json = False,
 ) -> None:
@@ -36,6 +37,7 @@ def frame(
     from hilstar.bench import frame_files as files
     from hilstar.bench.bench_file import read_bench_file
     from hilstar.bench.build import open_bench
+    from hilstar.bench.truth import clipped_in
 
     q = parse_attitude("frame", radec, quaternion)
     targets = [path for path in (output, truth, codes, preview) if path is not None]
@@ -46,11 +48,12 @@ def frame(
     check_ending("--codes", codes, PNG)
     check_ending("--preview", preview, PNG)
     file = read_bench_file(bench_file)
+    t_ns = parse_at("frame", at, file.config)
     check_files([], targets, file)
     with open_bench(file) as bench:
         if explain:
-            explain_bench(bench)
-        shot = bench.frame(q)
+            explain_bench(bench, t_ns)
+        shot = bench.frame(q, t_ns=t_ns)
         if output is not None:
             files.write_frame_fits(output, bench, shot)
         if truth is not None:
@@ -59,8 +62,8 @@ def frame(
             files.write_codes_png(codes, shot.codes, bench.config.monitor.bits)
         if preview is not None:
             files.write_preview_png(preview, shot.levels)
-        clipped = shot.truth["hip"][shot.truth["clipped"]].tolist()
-        summary = {
+        clipped = clipped_in(shot.truth)
+        summary: dict[str, Any] = {
             "stars": len(shot.truth),
             "electrons_per_s": float(shot.linear.sum(dtype=np.float64)),
             "flux_at_white_e_per_s": bench.flux_at_white_e_per_s,
@@ -74,12 +77,18 @@ def frame(
     if as_json:
         print_json(summary)
     else:
-        losses = ", ".join(f"{hip} by {mag:.2f} mag" for hip, mag in summary["clipped_mag"].items())
-        names = f", clipped: HIP {losses}" if clipped else ""
+        names = f", clipped: {clipped_text(summary['clipped_mag'])}" if clipped else ""
         missing = summary["left_out"]
         if missing["stars"]:
             names += f", {missing['stars']} too faint to show ({missing['flux_share']:.2%} of all light)"
         typer.echo(f"{len(shot.truth)} stars{names}; wrote {', '.join(summary['written'])}")
+
+
+def clipped_text(loss_mag: dict[int | str, float]) -> str:
+    """ "HIP 24436 by 0.12 mag, 27989 by 0.50 mag, Moon by 9.81 mag"."""
+    stars = [f"{hip} by {mag:.2f} mag" for hip, mag in loss_mag.items() if isinstance(hip, int)]
+    bodies = [f"{name} by {mag:.2f} mag" for name, mag in loss_mag.items() if isinstance(name, str)]
+    return ", ".join([*(["HIP " + ", ".join(stars)] if stars else []), *bodies])
 
 
 def left_out(truth: Any) -> dict[str, float | int]:

@@ -35,13 +35,14 @@ LedgerSplit = Annotated[
 ]
 
 
-def explain_bench(bench: Any) -> None:
-    """Say where the stars come from, and what was chosen within the bench file's tolerance."""
+def explain_bench(bench: Any, t_ns: int = 0) -> None:
+    """Say where the stars come from, what was chosen within the tolerance, and which bodies are more than points at a time."""
     from hilstar.bench.effort import explain
+    from hilstar.bench.moving import wide_bodies
 
     for note in bench.stars.catalog.notes:
         say(note)
-    for line in explain(bench.effort, bench.config.render):
+    for line in [*explain(bench.effort, bench.config.render), *wide_bodies(bench.moving, bench.camera, t_ns)]:
         say(line)
 
 

@@ -123,14 +123,18 @@ def _pointing(sample: AttitudeSample, file: BenchFile) -> dict[str, Any]:
     """Where the camera looks, and what it sees."""
     import numpy as np
 
-    from hilstar.bench.build import bench_stars
+    from hilstar.bench.build import bench_moving, bench_stars, moved
     from hilstar.bench.cameras import tracker_camera
     from hilstar.bench.in_view import brightest_in_view
     from hilstar.rotation import to_radec_roll_deg
 
     ra_deg, dec_deg, roll_deg = to_radec_roll_deg(sample.q_icrs_to_cam)
     camera = tracker_camera(file.config.tracker, file.folder)
-    stars = brightest_in_view(bench_stars(file.config, file.folder), camera, sample.q_icrs_to_cam, SHOWN_STARS)
+    moving = bench_moving(file.config, file.folder)
+    sky = moved(bench_stars(file.config, file.folder, moving), moving)
+    if moving is not None:
+        sky = moving.seen(sky, sample.t_ns)
+    stars = brightest_in_view(sky, camera, sample.q_icrs_to_cam, SHOWN_STARS)
     rate = sample.rate_cam_rad_s
     return {
         "t_ns": sample.t_ns,
@@ -160,7 +164,7 @@ def _lines(told: dict[str, Any]) -> list[str]:
         where = (
             f"x {star.x_px:.0f}, y {star.y_px:.0f} of {width} x {height} px, {star.from_boresight_deg:.2f} deg from the middle"
         )
-        lines.append(f"HIP {star.hip}, V {star.v_mag:.2f}, in {star.constellation}: {where}")
+        lines.append(f"{star.name or f'HIP {star.hip}'}, V {star.v_mag:.2f}, in {star.constellation}: {where}")
     return lines
 
 

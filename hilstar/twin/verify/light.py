@@ -20,7 +20,7 @@ def exposure_lights(bench: Bench, frame: Frame, first_frame: int, panels: Sequen
     if bench.config.render.quantisation == "temporal":
         count = max(1, round(bench.config.tracker.exposure_s * bench.config.monitor.refresh_hz))
         for number in range(first_frame + 1, first_frame + count):
-            levels = bench.draw(frame.q_icrs_to_cam, number).levels
+            levels = bench.draw(frame.q_icrs_to_cam, number, t_ns=frame.t_ns).levels
             for light, panel in zip(lights, panels, strict=True):
                 light += shown_light(levels, panel)
         for light in lights:

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import FloatArray
+from hilstar.bench.moving import wide_bodies
 from hilstar.tracker.centroids import Centroids, find_stars
 from hilstar.twin.bench_geometry import BenchGeometry, Mirror
 from hilstar.twin.verify.displacement import Displaced
@@ -64,6 +65,7 @@ class Comparison:
             calibration=bench.calibration,
             true_calibration=None if name is None else true_calibration(bench, name),
             gl_renderer=bench.renderer.gl_renderer,
+            wide_bodies=wide_bodies(bench.moving, bench.camera),
         )
 
     def _glow(self) -> Glow:
@@ -93,6 +95,7 @@ class Comparison:
             codes_px=math.hypot(*codes_px),
             floor_mag=floor_mag,
             floor_px=math.hypot(*floor_px),
+            name=str(row["name"]),
         )
 
     def _catalogue(self, seen: Field) -> Matched:

@@ -17,7 +17,8 @@ class Star:
     """One star at its place on the tracker, px: errors of the display, + too faint, right and down, magnitudes and px.
 
     `codes_mag`, `codes_px` are what the codes would cost on the monitor that the bench assumes, NaN where that star would
-    be lost; `floor_mag`, `floor_px` are the estimator's own, of the linear image against catalogue and sky.
+    be lost; `floor_mag`, `floor_px` are the estimator's own, of the linear image against catalogue and sky. A body has a
+    `name`, and 0 for `hip`.
     """
 
     hip: int
@@ -31,6 +32,7 @@ class Star:
     codes_px: float
     floor_mag: float
     floor_px: float
+    name: str = ""
 
 
 @dataclass(slots=True)
@@ -66,7 +68,7 @@ class Glow:
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """All fields, and what a verdict has to know of the bench.
+    """All fields, and what a verdict has to know of the bench; `wide_bodies` says which bodies are discs drawn as points.
 
     `calibration` is the one that the bench assumes; `true_calibration` is the monitor's own, where it is another.
     """
@@ -79,3 +81,4 @@ class Measured:
     calibration: Calibration
     true_calibration: Calibration | None
     gl_renderer: str
+    wide_bodies: list[str]

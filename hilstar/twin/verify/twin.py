@@ -75,7 +75,7 @@ class Twin:
         lights = exposure_lights(self.bench, frame, first_frame, panels)
         shown = self.true_optics.image_e_per_s(lights[0]) * exposure_s
         assumed = self.sky_optics.image_e_per_s(lights[1]) * exposure_s if self.differs else shown
-        x_px, y_px = self.camera.project(self.bench.stars.vectors[frame.star] @ to_matrix(frame.q_icrs_to_cam).T)
+        x_px, y_px = self.camera.project(self.bench.stars.directions(frame.star) @ to_matrix(frame.q_icrs_to_cam).T)
         return Field(shown, assumed, sky, frame.truth, x_px, y_px)
 
     def detected_e(self, seen: Field, rng: np.random.Generator) -> FloatArray:

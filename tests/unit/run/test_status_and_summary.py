@@ -105,7 +105,7 @@ def test_a_run_without_a_frame_has_nulls_where_there_is_no_figure():
     assert summary["frames"] == 0 and summary["fps"] is None
     assert summary["frame_ms"] == {"p50": None, "p99": None, "max": None}
     assert summary["stars_drawn"] == {"mean": None, "max": None}
-    assert summary["clipped"] == {"max": 0, "hip": []}
+    assert summary["clipped"] == {"max": 0, "hip": [], "bodies": []}
     assert not {"clock", "turn_ms", "link", "screen", "ledger"} & set(summary)
 
 
@@ -121,7 +121,7 @@ def test_a_summary_has_the_figures_of_its_frames():
     assert summary["frame_ms"]["p50"] == pytest.approx(2.0, rel=2e-3)
     assert summary["attitude_age_ms"]["p99"] == pytest.approx(7.0, rel=2e-3)
     assert summary["stars_drawn"] == {"mean": pytest.approx(99.5), "max": 149}
-    assert summary["clipped"] == {"max": 2, "hip": [3, 5]}
+    assert summary["clipped"] == {"max": 2, "hip": [3, 5], "bodies": []}
     assert summary["packets"]["accepted"] == 20 and summary["packets"]["refused_by"]["crc"] == 10
 
 

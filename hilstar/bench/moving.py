@@ -1,0 +1,76 @@
+"""The moving part of a bench's sky, from its file: who is seen, from where, and who is too wide for a point."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+from hilstar.bench.config import GEOCENTRE, BenchConfig
+from hilstar.bench.config.when import epoch_utc_ns
+from hilstar.reading import read_text
+from hilstar.scene.camera import Camera
+from hilstar.sky.bodies.kernel import Kernel
+from hilstar.sky.bodies.moving import PLANETS, BodyLight, MovingSky
+from hilstar.sky.bodies.orbit import TLE_ADVICE, Geocentre, TleOrbit
+from hilstar.sky.bodies.spectra import bodies_bv_mag, bodies_electrons_per_s
+from hilstar.sky.electrons import Optics, Photometry
+from hilstar.units import ARCSEC_PER_RAD
+
+log = logging.getLogger(__name__)
+
+MAX_TLE_BYTES = 10_000
+MAX_TLE_AGE_DAYS = 7.0
+POINT_PX = 0.2  # a wider disc moves light by more than a point's sprite does: 0.2 px across widens a sigma of 0.85 px by 0.2 %
+
+
+def moving_sky(config: BenchConfig, folder: Path, optics: Optics) -> MovingSky:
+    """The bodies of a bench file that has a date, and its observer.
+
+    Raises InputError for an orbit or a date that cannot be used, MachineError where the extra is not installed.
+    """
+    utc_ns = epoch_utc_ns(config)
+    if utc_ns is None:
+        raise AssertionError("a file with an observer has a date")
+    orbit = config.spacecraft.orbit or GEOCENTRE
+    observer = Geocentre() if orbit == GEOCENTRE else tle_orbit(folder / orbit, utc_ns)
+    names = body_names(config)
+    sky = config.sky
+    rates = bodies_electrons_per_s(names, sky.brightness, optics, Photometry(sky.zero_point, sky.passband_weighting))
+    return MovingSky(Kernel(), observer, utc_ns, BodyLight(names, bodies_bv_mag(names), rates))
+
+
+def tle_orbit(path: Path, utc_ns: int) -> TleOrbit:
+    """The orbit by the elements in a file, with a warning where they are not of that UTC. Raises InputError, MachineError."""
+    orbit = TleOrbit(read_text(path, TLE_ADVICE, MAX_TLE_BYTES), str(path))
+    age_days = orbit.age_days(utc_ns)
+    if abs(age_days) > MAX_TLE_AGE_DAYS:
+        # Vallado et al. 2006: SGP4 is 1 to 3 km off a day in a low orbit, the Moon 0.5 to 1.6 arcsec a day.
+        log.warning(
+            "%s: its elements are %.0f days from [sky] epoch_utc; a low orbit is then off by %.0f km or more",
+            path,
+            abs(age_days),
+            abs(age_days),
+        )
+    return orbit
+
+
+def body_names(config: BenchConfig) -> tuple[str, ...]:
+    """The bodies that a bench file asks for."""
+    bodies = config.sky.bodies
+    return (
+        *(("Sun",) if bodies.sun else ()),
+        *(("Moon",) if bodies.moon else ()),
+        *(PLANETS if bodies.planets else ()),
+    )
+
+
+def wide_bodies(moving: MovingSky | None, camera: Camera, t_ns: int = 0) -> list[str]:
+    """One line for each body whose disc is wider than POINT_PX of a camera's pixels, the widest first."""
+    found = {} if moving is None else moving.diameters_arcsec(t_ns)
+    px_per_arcsec = camera.scales_px_rad()[1] / ARCSEC_PER_RAD
+    widths = sorted(((d * px_per_arcsec, name, d) for name, d in found.items()), reverse=True)
+    return [
+        f"{name}: {arcsec:.1f} arcsec wide, {px:.2f} px of the screen; drawn as a point with all its light"
+        for px, name, arcsec in widths
+        if px > POINT_PX
+    ]

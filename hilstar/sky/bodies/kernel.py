@@ -1,0 +1,94 @@
+"""Places of Sun, Moon and planets by JPL's ephemeris DE421 (Folkner et al. 2009), part of the extra `hilstar[bodies]`."""
+
+from __future__ import annotations
+
+import importlib.util
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import erfa
+import numpy as np
+
+from hilstar.arrays import FloatArray
+from hilstar.errors import MachineError
+from hilstar.units import LIGHT_KM_S
+
+DAY_S = 86_400.0
+UNIX_JD = 2_440_587.5
+NS_PER_DAY = 86_400 * 10**9
+INSTALL = "pip install 'hilstar[bodies]'"
+
+# The kernel's chains of segments (centre, target). A planet is the centre of mass of its system, within 0.08 arcsec of the
+# planet's own: Jupiter's moons move Jupiter by 230 km, Saturn's Saturn by 300 km.
+EARTH = ((0, 3), (3, 399))
+CHAINS: dict[str, tuple[tuple[int, int], ...]] = {
+    "Sun": ((0, 10),),
+    "Moon": ((0, 3), (3, 301)),
+    "Mercury": ((0, 1),),
+    "Venus": ((0, 2),),
+    "Mars": ((0, 4),),
+    "Jupiter": ((0, 5),),
+    "Saturn": ((0, 6),),
+    "Uranus": ((0, 7),),
+    "Neptune": ((0, 8),),
+}
+LIGHT_TIME_ROUNDS = 3  # of a fixed point that gains a factor of 1e4 (speed over that of light) a round
+
+
+@dataclass(frozen=True, slots=True)
+class Tdb:
+    """A moment of barycentric dynamical time as a Julian date in two parts: the date is their sum."""
+
+    whole: float
+    part: float
+
+    def after(self, seconds: float) -> Tdb:
+        """The moment some seconds later."""
+        return Tdb(self.whole, self.part + seconds / DAY_S)
+
+
+def tdb_of_utc(utc_ns: int) -> Tdb:
+    """The moment of a UTC, ns since 1970 where every day has 86400 s, within 2 microseconds (ERFA's leap seconds, `dtdb`)."""
+    days, rest_ns = divmod(utc_ns, NS_PER_DAY)
+    whole, part = UNIX_JD + days, rest_ns / NS_PER_DAY
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", erfa.ErfaWarning)  # before 1960, and years after the last known leap second
+        tt = erfa.taitt(*erfa.utctai(whole, part))
+    return Tdb(whole, float(tt[0] - whole + tt[1] + erfa.dtdb(*tt, part, 0.0, 0.0, 0.0) / DAY_S))
+
+
+class Kernel:
+    """The ephemeris on this machine. Raises MachineError where the extra is not installed; nothing is downloaded."""
+
+    def __init__(self) -> None:
+        found = importlib.util.find_spec("skyfield_data")
+        if found is None or found.origin is None or importlib.util.find_spec("jplephem") is None:
+            raise MachineError(f"[sky.bodies] and [spacecraft] need an ephemeris of the Solar System; {INSTALL}")
+        from jplephem.spk import SPK
+
+        spk = SPK.open(str(Path(found.origin).parent / "data" / "de421.bsp"))
+        self._segments: dict[tuple[int, int], Any] = {link: spk[link] for chain in (EARTH, *CHAINS.values()) for link in chain}
+        for segment in self._segments.values():
+            segment.compute(segment.start_jd)  # maps its numbers into memory, where they stay when the file is closed
+        spk.daf.file.close()
+        sun = self._segments[CHAINS["Sun"][0]]
+        self.first_jd, self.last_jd = float(sun.start_jd), float(sun.end_jd)
+
+    def places_km(self, chain: tuple[tuple[int, int], ...], whole: float, part: FloatArray) -> FloatArray:
+        """Barycentric places (k, 3), ICRS axes, at the Julian dates (TDB) `whole` + `part` (k,)."""
+        return np.asarray(sum(self._segments[link].compute(whole, part) for link in chain).T)
+
+    def earth(self, whole: float, part: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Barycentric places, km, and velocities, km/s, of the Earth's centre, (k, 3) each."""
+        both = [self._segments[link].compute_and_differentiate(whole, part) for link in EARTH]
+        return np.asarray(sum(p for p, _ in both).T), np.asarray(sum(v for _, v in both).T / DAY_S)
+
+    def seen_km(self, name: str, whole: float, part: FloatArray, earth_km: FloatArray) -> FloatArray:
+        """Vectors (k, 3) from the Earth's centre to where a body was when the light that arrives now left it."""
+        light_days = np.zeros_like(part)
+        for _ in range(LIGHT_TIME_ROUNDS):
+            seen = self.places_km(CHAINS[name], whole, part - light_days) - earth_km
+            light_days = np.linalg.norm(seen, axis=1) / LIGHT_KM_S / DAY_S
+        return seen

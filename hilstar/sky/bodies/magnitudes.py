@@ -1,0 +1,90 @@
+"""V magnitudes of Sun, Moon and planets, by distances and phase, for an observer near the Earth.
+
+Planets: Mallama and Hilton 2018 (Astron. Comput. 25, 10; arXiv:1808.01973), equations 2, 3, 4, 6, 8, 10, 14 and 16. Of Mars the
+terms of longitude and season are left out: 0.035 mag rms, 0.06 at most. Saturn is globe and rings.
+
+Moon: -12.73 + 0.026 phase + 4e-9 phase^4 at its mean distance (Allen 1973; Krisciunas and Schaefer 1991, PASP 103, 1033,
+eq. 9). The ROLO model (Kieffer and Stone 2005) is within 0.08 mag of it from 6 to 97 degrees and 0.16 mag brighter at 2: the
+opposition surge is left out.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.polynomial.polynomial import polyval
+
+from hilstar.arrays import FloatArray
+
+KM_PER_AU = 149_597_870.7
+SUN_V_MAG = -26.76  # at 1 au: Willmer 2018, ApJS 236, 47
+SUN_BV_MAG = 0.653  # the same source
+
+MERCURY = (-0.613, 6.3280e-02, -1.6336e-03, 3.3644e-05, -3.4265e-07, 1.6893e-09, -3.0334e-12)  # eq. 2
+VENUS = (-4.384, -1.044e-03, 3.687e-04, -2.814e-06, 8.938e-09)  # eq. 3
+VENUS_CRESCENT = (236.05828, -2.81914, 8.39034e-03)  # eq. 4
+VENUS_CRESCENT_DEG = 163.7
+MARS = (-1.601, 2.267e-02, -1.302e-04)  # eq. 6
+JUPITER = (-9.395, -3.7e-04, 6.16e-04)  # eq. 8
+URANUS_MAG, URANUS_PER_DEG = -7.110, -8.4e-04  # eq. 14
+# Poles of the IAU's working group (Archinal et al. 2018): right ascension and declination, degrees
+SATURN_POLE_DEG, URANUS_POLE_DEG = (40.589, 83.537), (257.311, -15.175)
+
+FULL_MOON_V_MAG, MOON_PER_DEG, MOON_PER_DEG4 = -12.73, 0.026, 4e-9
+MOON_DISTANCE_KM = 384_400.0
+
+
+def body_v_mag(name: str, sun_to_body_km: FloatArray, observer_to_body_km: FloatArray, jyear: float) -> float:
+    """V of a body by the vectors (3,) to it from the Sun and from the observer, ICRS axes; the Sun's by the second alone."""
+    distance_au = float(np.linalg.norm(observer_to_body_km)) / KM_PER_AU
+    if name == "Sun":
+        return SUN_V_MAG + 5 * float(np.log10(distance_au))
+    sun_au = float(np.linalg.norm(sun_to_body_km)) / KM_PER_AU
+    phase_deg = phase_angle_deg(sun_to_body_km, observer_to_body_km)
+    if name == "Moon":
+        return moon_v_mag(sun_au, distance_au * KM_PER_AU, phase_deg)
+    latitudes = [latitude_deg(_POLES[name], v) for v in (sun_to_body_km, observer_to_body_km)] if name in _POLES else []
+    return _at_unit_distance(name, phase_deg, latitudes, jyear) + 5 * float(np.log10(sun_au * distance_au))
+
+
+def phase_angle_deg(sun_to_body: FloatArray, observer_to_body: FloatArray) -> float:
+    """The angle at a body between Sun and observer, degrees."""
+    cross = np.linalg.norm(np.cross(sun_to_body, observer_to_body))
+    return float(np.degrees(np.arctan2(cross, sun_to_body @ observer_to_body)))
+
+
+def moon_v_mag(sun_au: float, distance_km: float, phase_deg: float) -> float:
+    """V of the Moon."""
+    curve = MOON_PER_DEG * phase_deg + MOON_PER_DEG4 * phase_deg**4
+    return FULL_MOON_V_MAG + curve + 5 * float(np.log10(sun_au * distance_km / MOON_DISTANCE_KM))
+
+
+def latitude_deg(pole: FloatArray, towards_body: FloatArray) -> float:
+    """The planetocentric latitude below the far end of a vector to the body, degrees."""
+    return float(np.degrees(np.arcsin(np.clip(-pole @ towards_body / np.linalg.norm(towards_body), -1, 1))))
+
+
+def _at_unit_distance(name: str, phase_deg: float, latitudes_deg: list[float], jyear: float) -> float:
+    if name == "Saturn":
+        return _saturn_mag(phase_deg, *latitudes_deg)
+    if name == "Uranus":
+        return URANUS_MAG + URANUS_PER_DEG * (abs(latitudes_deg[0]) + abs(latitudes_deg[1])) / 2
+    if name == "Neptune":  # eq. 16: it brightened from 1980 to 2000
+        return float(np.clip(-6.89 - 0.0054 * (jyear - 1980.0), -7.00, -6.89))
+    curves = {"Mercury": MERCURY, "Venus": VENUS, "Mars": MARS, "Jupiter": JUPITER}
+    curve = VENUS_CRESCENT if name == "Venus" and phase_deg >= VENUS_CRESCENT_DEG else curves[name]
+    return float(polyval(phase_deg, curve))
+
+
+def _saturn_mag(phase_deg: float, sun_latitude_deg: float, observer_latitude_deg: float) -> float:
+    """Globe and rings (eq. 10); rings that are lit from the other side do not count."""
+    open_deg = np.sqrt(max(0.0, sun_latitude_deg * observer_latitude_deg))
+    sine = float(np.sin(np.radians(open_deg)))
+    return -8.914 - 1.825 * sine + 0.026 * phase_deg - 0.378 * sine * float(np.exp(-2.25 * phase_deg))
+
+
+def _pole(ra_deg: float, dec_deg: float) -> FloatArray:
+    ra, dec = np.radians(ra_deg), np.radians(dec_deg)
+    return np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
+
+
+_POLES = {"Saturn": _pole(*SATURN_POLE_DEG), "Uranus": _pole(*URANUS_POLE_DEG)}

@@ -1,0 +1,196 @@
+"""The part of a bench's sky that moves: bodies, and with the observer's velocity the aberration of all stars.
+
+What is costly is computed seldom: places by the ephemeris once in three hours, with cubics between them; apparent places at
+steps of the observer's orbit, with straight lines between them; magnitudes once a minute. All of it depends on the time alone,
+so a replay draws the same light.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+
+from hilstar.arrays import FloatArray
+from hilstar.errors import InputError
+from hilstar.sky.bodies.apparent import Viewpoint, apparent_bodies, apparent_stars
+from hilstar.sky.bodies.kernel import DAY_S, Kernel, tdb_of_utc
+from hilstar.sky.bodies.magnitudes import body_v_mag
+from hilstar.sky.bodies.orbit import Orbit
+from hilstar.sky.stars import Stars, with_bodies
+from hilstar.units import ARCSEC_PER_RAD, LIGHT_KM_S, NS_PER_S, flux_ratio
+
+log = logging.getLogger(__name__)
+
+PLANETS = ("Mercury", "Venus", "Mars", "Jupiter", "Saturn", "Uranus", "Neptune")
+# Equatorial, Archinal et al. 2018 and, the Sun's, IAU 2015 Resolution B3
+RADII_KM = {
+    "Sun": 695_700.0,
+    "Moon": 1737.4,
+    "Mercury": 2440.53,
+    "Venus": 6051.8,
+    "Mars": 3396.19,
+    "Jupiter": 71_492.0,
+    "Saturn": 60_268.0,
+    "Uranus": 25_559.0,
+    "Neptune": 24_764.0,
+}
+# The ephemeris takes 3 ms for all bodies at the ends of this time and twice between; cubics through them are within 0.1 mas.
+SPAN_S = 3 * 3600
+SPAN_NS, MINUTE_NS = SPAN_S * NS_PER_S, 60 * NS_PER_S
+YEAR_NS = 31_557_600 * NS_PER_S
+EDGE_DAYS = 1.0  # light time, and the cubics
+EXPONENTS = np.arange(4)
+CUBIC_AT = np.linspace(0.0, 1.0, 4)
+CUBIC = np.linalg.inv(np.vander(CUBIC_AT, increasing=True))
+J2000_JD, YEAR_DAYS = 2_451_545.0, 365.25
+
+
+@dataclass(frozen=True, slots=True)
+class Span:
+    """Cubics over SPAN_S, coefficients first: vectors (4, n, 3) to bodies as seen from the Earth, its place and velocity."""
+
+    seen_km: FloatArray
+    earth_km: FloatArray
+    earth_km_s: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Sight:
+    """What an observer sees at a moment: vectors (n, 3) to the bodies in km, its viewpoint, and the bodies' unit vectors."""
+
+    seen_km: FloatArray
+    view: Viewpoint
+    directions: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class BodyLight:
+    """Bodies by name, their colours (n,) and their electron rates at V = 0 (n,)."""
+
+    names: tuple[str, ...]
+    bv_mag: FloatArray
+    v0_e_per_s: FloatArray
+
+
+NOTHING = BodyLight((), np.empty(0), np.empty(0))
+
+
+class MovingSky:
+    """Bodies seen from an orbit; t_ns = 0 is the UTC `utc_ns`.
+
+    Raises InputError where the ephemeris ends before that date, or the orbit does.
+    """
+
+    def __init__(self, kernel: Kernel, orbit: Orbit, utc_ns: int, bodies: BodyLight = NOTHING) -> None:
+        self.names = names = bodies.names
+        self._kernel, self._orbit, self._utc_ns = kernel, orbit, utc_ns
+        self._bodies = bodies
+        self._epoch = tdb_of_utc(utc_ns)
+        self._tracked = ("Sun", *(name for name in names if name != "Sun"))
+        self._drawn = [self._tracked.index(name) for name in names]
+        self._limits_ns = self._limits()
+        self._step_ns = round(orbit.step_s * NS_PER_S)
+        self._span: Callable[[int], Span] = lru_cache(maxsize=2)(self._compute_span)
+        self._node: Callable[[int], FloatArray] = lru_cache(maxsize=2)(self._compute_node)
+        self._light: Callable[[int], tuple[FloatArray, FloatArray]] = lru_cache(maxsize=1)(self._compute_light)
+        self._told = False
+        self._fixed_km_s = self._seen_from(0)[1].velocity_km_s
+
+    def stars_seen(self, directions: FloatArray, parallax_mas: FloatArray) -> FloatArray:
+        """Unit vectors (n, 3) of stars in directions (n, 3) from the barycentre, as they are seen at t = 0."""
+        return apparent_stars(directions, parallax_mas, self._seen_from(0)[1])
+
+    def among(self, stars: Stars) -> Stars:
+        """The stars with the bodies among them at t = 0, in arrays of their own, which `seen` changes."""
+        both = with_bodies(stars, self.names, self._bodies.bv_mag)
+        self.seen(both, 0)
+        return both
+
+    def seen(self, stars: Stars, t_ns: int, velocity_km_s: FloatArray | None = None) -> Stars:
+        """Stars made by `among` as they are seen at a moment: their bodies are moved there, in the arrays themselves.
+
+        A velocity (3,), ICRS, adds to that of this sky's observer.
+        """
+        t_ns = self._within(t_ns)
+        k, rest_ns = divmod(t_ns, self._step_ns)
+        node = self._node(k)
+        now = node + (self._node(k + 1) - node) * (rest_ns / self._step_ns)
+        count = len(self.names)
+        if count:
+            stars.vectors[-count:] = now[:-1]
+            stars.grid.centre[-count:] = now[:-1]
+            stars.v_mag[-count:], stars.electrons_per_s[-count:] = self._light(t_ns // MINUTE_NS)
+        return stars.seen_at(now[-1] if velocity_km_s is None else now[-1] + velocity_km_s)
+
+    def sight(self, t_ns: int) -> Sight:
+        """What is seen at a moment, the directions aberrated by the observer's velocity at t = 0; Sun first."""
+        seen_km, view = self._seen_from(t_ns)
+        return Sight(seen_km, view, apparent_bodies(seen_km, replace(view, velocity_km_s=self._fixed_km_s)))
+
+    def _seen_from(self, t_ns: int) -> tuple[FloatArray, Viewpoint]:
+        span, rest_ns = divmod(t_ns, SPAN_NS)
+        cubics = self._span(span)
+        share = rest_ns / SPAN_NS
+        powers, slopes = share**EXPONENTS, EXPONENTS * share ** np.maximum(EXPONENTS - 1, 0) / SPAN_S
+        place_km, velocity_km_s = self._orbit.state(self._utc_ns + t_ns)
+        from_earth_km, earth_km_s = np.tensordot(powers, cubics.seen_km, 1), powers @ cubics.earth_km_s
+        seen_km = from_earth_km - place_km
+        # Light takes another time to the observer than to the Earth's centre: 22 ms at most in a low orbit, 700 m of the Moon
+        later_s = (np.linalg.norm(seen_km, axis=1) - np.linalg.norm(from_earth_km, axis=1)) / LIGHT_KM_S
+        seen_km -= (np.tensordot(slopes, cubics.seen_km, 1) + earth_km_s) * later_s[:, None]
+        return seen_km, Viewpoint(powers @ cubics.earth_km + place_km, earth_km_s + velocity_km_s, -seen_km[0])
+
+    def diameters_arcsec(self, t_ns: int) -> dict[str, float]:
+        """The apparent equatorial diameter of each body, arcsec."""
+        distance_km = np.linalg.norm(self.sight(self._within(t_ns)).seen_km[self._drawn], axis=1)
+        return {
+            name: 2 * float(np.arcsin(RADII_KM[name] / d)) * ARCSEC_PER_RAD
+            for name, d in zip(self.names, distance_km, strict=True)
+        }
+
+    def _compute_span(self, span: int) -> Span:
+        date = self._epoch.after(span * SPAN_S)
+        part = date.part + CUBIC_AT * SPAN_S / DAY_S
+        earth_km, earth_km_s = self._kernel.earth(date.whole, part)
+        seen_km = [self._kernel.seen_km(name, date.whole, part, earth_km) for name in self._tracked]
+        return Span(np.tensordot(CUBIC, np.stack(seen_km, axis=1), 1), CUBIC @ earth_km, CUBIC @ earth_km_s)
+
+    def _compute_node(self, k: int) -> FloatArray:
+        """Unit vectors of the bodies, and last the change of the observer's velocity since t = 0, km/s."""
+        sight = self.sight(k * self._step_ns)
+        return np.vstack([sight.directions[self._drawn], sight.view.velocity_km_s - self._fixed_km_s])
+
+    def _compute_light(self, minute: int) -> tuple[FloatArray, FloatArray]:
+        sight, jyear = self.sight(minute * MINUTE_NS), self._jyear(minute * 60.0)
+        from_sun_km = sight.seen_km + sight.view.from_sun_km
+        v_mag = np.array([body_v_mag(self._tracked[i], from_sun_km[i], sight.seen_km[i], jyear) for i in self._drawn])
+        return v_mag, self._bodies.v0_e_per_s * flux_ratio(v_mag)
+
+    def _jyear(self, seconds: float) -> float:
+        date = self._epoch.after(seconds)
+        return 2000.0 + (date.whole - J2000_JD + date.part) / YEAR_DAYS
+
+    def _limits(self) -> tuple[int, int]:
+        """The first and the last t_ns that the ephemeris covers. Raises InputError where t = 0 is not between them."""
+        first, last = self._kernel.first_jd + EDGE_DAYS, self._kernel.last_jd - EDGE_DAYS
+        limits = tuple(round((jd - self._epoch.whole - self._epoch.part) * DAY_S * NS_PER_S) for jd in (first, last))
+        if not limits[0] <= 0 <= limits[1]:
+            dates = [str(np.datetime64(round((jd - 2_440_587.5) * DAY_S), "s").astype("datetime64[D]")) for jd in (first, last)]
+            raise InputError(f"[sky] epoch_utc: the ephemeris covers {dates[0]} to {dates[1]}; write a date between them")
+        return limits[0], limits[1]
+
+    def _within(self, t_ns: int) -> int:
+        """`t_ns` held within the ephemeris; a time far from t = 0 is told once, as it is most likely meant otherwise."""
+        if abs(t_ns) > YEAR_NS and not self._told:
+            self._told = True
+            log.warning(
+                "t_ns = %d is %.1f years from [sky] epoch_utc, which is the UTC of t_ns = 0: proper motion and parallax are"
+                " those of epoch_utc",
+                t_ns,
+                t_ns / YEAR_NS,
+            )
+        return min(max(t_ns, self._limits_ns[0]), self._limits_ns[1])

@@ -1,0 +1,90 @@
+"""The observer: the Earth's centre, or a satellite on a two-line element set, by SGP4 (Vallado et al. 2006, AIAA 2006-6753)."""
+
+from __future__ import annotations
+
+import importlib.util
+from functools import lru_cache
+from typing import Protocol
+
+import erfa
+import numpy as np
+
+from hilstar.arrays import FloatArray
+from hilstar.errors import InputError, MachineError
+from hilstar.sky.bodies.kernel import INSTALL, NS_PER_DAY, UNIX_JD, Tdb, tdb_of_utc
+
+LINE_LENGTH = 69
+TLE_ADVICE = "give a file with one two-line element set"
+TURN_NS = 3600 * 10**9  # the equator's axes move by 0.006 arcsec an hour: 0.2 m of a low orbit
+
+
+class Orbit(Protocol):
+    """Where an observer is about the Earth's centre."""
+
+    @property
+    def step_s(self) -> float:
+        """Straight lines over this time keep the apparent places of bodies within 5 mas."""
+
+    def state(self, utc_ns: int) -> tuple[FloatArray, FloatArray]:
+        """Place (3,), km, and velocity (3,), km/s, ICRS axes, at a UTC, ns since 1970. Raises InputError where it ends."""
+
+
+class Geocentre:
+    """The Earth's centre itself."""
+
+    # The Moon, the fastest, is 0.06 mas off in the middle: 1e-7 arcsec/s^2 and its own path's bend.
+    step_s = 60.0
+
+    def state(self, utc_ns: int) -> tuple[FloatArray, FloatArray]:
+        """No offset."""
+        return np.zeros(3), np.zeros(3)
+
+
+class TleOrbit:
+    """A satellite on the elements in the text of a file `name`. Raises InputError for wrong ones, MachineError without SGP4."""
+
+    # From 400 km the Moon's parallax bends its path by 5e-3 arcsec/s^2: 2.5 mas off in the middle.
+    step_s = 2.0
+
+    def __init__(self, text: str, name: str) -> None:
+        if importlib.util.find_spec("sgp4") is None:
+            raise MachineError(f"[spacecraft] orbit = a file of elements needs SGP4; {INSTALL}")
+        from sgp4.api import SGP4_ERRORS, Satrec
+
+        self._name, self._errors = name, SGP4_ERRORS
+        self._satellite = Satrec.twoline2rv(*_checked(name, text))
+
+    def age_days(self, utc_ns: int) -> float:
+        """How many days a UTC is after the elements' own date."""
+        return utc_ns / NS_PER_DAY + UNIX_JD - float(self._satellite.jdsatepoch) - float(self._satellite.jdsatepochF)
+
+    def state(self, utc_ns: int) -> tuple[FloatArray, FloatArray]:
+        """Place and velocity by SGP4, from the true equator and mean equinox to the ICRS."""
+        days, rest_ns = divmod(utc_ns, NS_PER_DAY)
+        error, place_km, velocity_km_s = self._satellite.sgp4(UNIX_JD + days, rest_ns / NS_PER_DAY)
+        if error:
+            date = np.datetime64(utc_ns, "ns").astype("datetime64[s]")
+            raise InputError(f"{self._name}: no orbit at {date}: {self._errors[error]}; give newer elements")
+        turn = _icrs_from_teme(utc_ns // TURN_NS)
+        return turn @ place_km, turn @ velocity_km_s
+
+
+def _checked(name: str, text: str) -> tuple[str, str]:
+    """The two lines of elements. Raises InputError."""
+    found = [line for line in map(str.rstrip, text.splitlines()) if line[:2] in {"1 ", "2 "} and len(line) == LINE_LENGTH]
+    if [line[0] for line in found] != ["1", "2"]:
+        raise InputError(f"{name}: not one set of two lines of {LINE_LENGTH} characters that begin with 1 and 2; {TLE_ADVICE}")
+    for number, line in enumerate(found, start=1):
+        total = sum(int(c) if c.isdigit() else c == "-" for c in line[:-1]) % 10
+        if str(total) != line[-1]:
+            raise InputError(f"{name}: element line {number}: its digits add up to {total}, not {line[-1]}; {TLE_ADVICE}")
+    return found[0], found[1]
+
+
+@lru_cache(maxsize=4)
+def _icrs_from_teme(hour: int) -> FloatArray:
+    """The rotation (3, 3) at an hour since 1970 (UTC): equation of the equinoxes, then nutation and precession (IAU 2006)."""
+    date: Tdb = tdb_of_utc(hour * TURN_NS)
+    cosine, sine = (f(erfa.ee06a(date.whole, date.part)) for f in (np.cos, np.sin))
+    teme_to_true = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    return np.asarray(erfa.pnm06a(date.whole, date.part).T @ teme_to_true)

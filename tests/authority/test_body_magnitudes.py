@@ -1,0 +1,109 @@
+"""Magnitudes and colours of bodies against the papers' own figures, Skyfield and the ROLO model of the Moon."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from skyfield import magnitudelib
+
+from hilstar.sky.bodies import spectra
+from hilstar.sky.bodies.magnitudes import KM_PER_AU, body_v_mag, moon_v_mag, phase_angle_deg
+from hilstar.sky.bodies.moving import PLANETS
+from hilstar.sky.bodies.spectra import bodies_bv_mag, bodies_electrons_per_s
+from hilstar.sky.electrons import Optics, Photometry
+from hilstar.sky.spectrum import BUILT_IN_CURVES, load_curve
+from tests.support.skies import ALL_BODIES, moving_sky, random_utcs_ns
+
+# The program of Mallama and Hilton (Ap_Mag_Output_V3.txt) prints three decimals.
+PRINTED_MAG = 0.0006
+SKYFIELD_MAG = 0.05  # the issue's limit
+ROLO_MAG = 0.08
+# The paper's two photometric systems, measured apart: their rates differ by this at most (measured: 0.051, Uranus)
+SYSTEMS_MAG = 0.06
+
+
+def at(sun_au: float, distance_au: float, phase_deg: float) -> tuple[np.ndarray, np.ndarray]:
+    """Vectors from the Sun and from the observer to a body with these distances and this phase, km."""
+    phase = np.radians(phase_deg)
+    return np.array([sun_au, 0, 0]) * KM_PER_AU, distance_au * KM_PER_AU * np.array([np.cos(phase), np.sin(phase), 0])
+
+
+@pytest.mark.parametrize(
+    ("name", "sun_au", "distance_au", "phase_deg", "v_mag"),
+    [
+        ("Mercury", 0.310295423552, 1.32182643625754, 1.1677, -2.477),
+        ("Mercury", 0.413629222334, 0.92644808718613, 90.1662, 0.181),
+        ("Venus", 0.722722540169, 1.71607489554051, 1.3232, -3.917),
+        ("Venus", 0.721480714554, 0.37762511206278, 124.1348, -4.916),
+        ("Venus", 0.726166592736, 0.28889582420642, 179.1845, -3.090),
+        ("Jupiter", 5.446231815414, 6.44985867459088, 0.2446, -1.667),
+        ("Jupiter", 4.957681473205, 3.95393078136013, 0.3431, -2.934),
+    ],
+)
+def test_the_figures_of_the_paper_s_own_program(name, sun_au, distance_au, phase_deg, v_mag):
+    assert body_v_mag(name, *at(sun_au, distance_au, phase_deg), 2020.0) == pytest.approx(v_mag, abs=PRINTED_MAG)
+
+
+def test_planets_on_200_dates_are_within_a_twentieth_of_skyfield(rng):
+    """Its formulas by the true distances from the Sun, which its own call takes at the barycentre."""
+    functions = {name: getattr(magnitudelib, f"_{name.lower()}_magnitude") for name in PLANETS}
+    poles = {"Saturn": magnitudelib._SATURN_POLE, "Uranus": magnitudelib._URANUS_POLE}
+    for utc in random_utcs_ns(rng, 200):
+        seen = moving_sky(utc).sight(0)
+        jyear = 1970 + utc / 31_557_600e9
+        for name in PLANETS:
+            here = seen.seen_km[ALL_BODIES.index(name)]
+            sun = here + seen.view.from_sun_km
+            sizes = np.linalg.norm(sun) / KM_PER_AU, np.linalg.norm(here) / KM_PER_AU, phase_angle_deg(sun, here)
+            if name in poles:
+                tilts = [np.degrees(np.arccos(poles[name] @ v / np.linalg.norm(v))) - 90 for v in (sun, here)]
+                theirs = functions[name](*sizes, *tilts)
+            else:
+                theirs = functions[name](*sizes, jyear) if name == "Neptune" else functions[name](*sizes)
+            if np.isnan(theirs):
+                continue  # Neptune before 2000, at phases over 1.9 degrees, which Skyfield leaves open
+            assert body_v_mag(name, sun, here, jyear) == pytest.approx(float(theirs), abs=SKYFIELD_MAG), name
+
+
+def rolo_albedo(phase_deg: float) -> float:
+    """Disk-equivalent reflectance at 549.1 nm without libration (Kieffer and Stone 2005, eq. 10, table 4)."""
+    g = np.radians(phase_deg)
+    log_a = -2.10782 - 1.66736 * g + 0.41697 * g**2 - 0.22026 * g**3
+    return float(np.exp(log_a + 0.36814 * np.exp(-phase_deg / 4.06054) - 0.09815 * np.exp(-phase_deg / 12.8802)))
+
+
+@pytest.mark.parametrize(("phase_deg", "limit_mag"), [(2, 0.17), *((g, ROLO_MAG) for g in (6, 10, 20, 30, 45, 60, 75, 90, 97))])
+def test_the_moon_is_as_bright_as_in_the_rolo_model(phase_deg, limit_mag):
+    """V = V_Sun - 2.5 log10(A Omega / pi), eq. 8, with the Moon's 6.4177e-5 sr at 384 400 km."""
+    rolo = -26.76 - 2.5 * np.log10(rolo_albedo(phase_deg) * 6.4177e-5 / np.pi)
+    assert moon_v_mag(1.0, 384_400.0, phase_deg) == pytest.approx(rolo, abs=limit_mag)
+
+
+def test_colours_are_those_of_the_paper():
+    """B-V of its table 3, within what rounding of table 7's albedos leaves (0.001 of 0.06 for Mars: 0.02 mag)."""
+    published = {"Mercury": 0.97, "Venus": 0.70, "Mars": 1.36, "Jupiter": 0.86, "Saturn": 1.07, "Uranus": 0.50, "Neptune": 0.39}
+    assert bodies_bv_mag(tuple(published)) == pytest.approx(list(published.values()), abs=0.02)
+    assert bodies_bv_mag(("Moon",))[0] == pytest.approx(0.92, abs=0.03)  # Allen 1973
+
+
+SLOAN_NM = (354.0, 477.0, 623.0, 762.0, 913.0)  # u' g' r' i' z'
+SLOAN_ALBEDOS = {
+    "Mercury": (0.095, 0.130, 0.169, 0.200, 0.237),
+    "Venus": (0.326, 0.664, 0.712, 0.708, 0.630),
+    "Mars": (0.061, 0.111, 0.245, 0.298, 0.325),
+    "Jupiter": (0.377, 0.509, 0.575, 0.456, 0.348),
+    "Saturn": (0.209, 0.436, 0.618, 0.601, 0.450),
+    "Uranus": (0.541, 0.559, 0.355, 0.120, 0.056),
+    "Neptune": (0.564, 0.533, 0.307, 0.101, 0.048),
+}
+
+
+@pytest.mark.parametrize("sensor", ["ccd47-20", "kai-4021"])
+def test_rates_by_the_paper_s_other_photometric_system_are_the_same(sensor, monkeypatch):
+    assert sensor in BUILT_IN_CURVES
+    optics = Optics(30.0, load_curve(sensor, "qe"), load_curve(1.0, "transmission"))
+    ours = bodies_electrons_per_s(PLANETS, "dgs", optics, Photometry())
+    monkeypatch.setattr(spectra, "BANDS_NM", SLOAN_NM)
+    monkeypatch.setattr(spectra, "ALBEDOS", SLOAN_ALBEDOS)
+    theirs = bodies_electrons_per_s(PLANETS, "dgs", optics, Photometry())
+    assert np.abs(2.5 * np.log10(ours / theirs)).max() < SYSTEMS_MAG

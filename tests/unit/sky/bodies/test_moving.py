@@ -1,0 +1,140 @@
+"""Bodies among the stars, at any time: what interpolation costs, what moves and what does not."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pytest
+
+from hilstar.errors import InputError, MachineError
+from hilstar.sky.bodies.kernel import Kernel
+from hilstar.sky.bodies.orbit import TleOrbit
+from hilstar.sky.stars import Stars
+from tests.support.skies import ALL_BODIES, STATION_TLE, STATION_UTC, moving_sky, utc_ns
+from tests.support.stars import stars_at
+
+ARCSEC = np.pi / (180 * 3600)
+UTC = "2026-11-21T00:00:00Z"
+HOUR_NS = 3600 * 10**9
+GEOCENTRE_ARCSEC = 0.001  # measured: 0.1 mas
+ORBIT_ARCSEC = 0.005  # `TleOrbit.step_s`: 5e-3 arcsec/s^2 (2 s)^2 / 8 = 2.5 mas
+MAGNITUDE_MAG = 0.003  # a minute of the Moon's phase, 0.07 deg by parallax in a low orbit, at 0.03 to 0.04 mag a degree
+
+
+def sky_of(names: tuple[str, ...] = ALL_BODIES, utc: str = UTC, **more) -> tuple[object, Stars]:
+    moving = moving_sky(utc, names, **more)
+    return moving, moving.among(stars_at(np.eye(3), np.ones(3)))
+
+
+def seen_arcsec(stars: Stars, exact: np.ndarray) -> np.ndarray:
+    """How far the bodies of `stars` are from unit vectors, arcsec."""
+    seen = stars.directions(np.arange(len(stars)))[-len(stars.bodies) :]
+    return np.linalg.norm(seen - exact, axis=1) / ARCSEC
+
+
+@pytest.mark.parametrize(("orbit", "utc", "limit_arcsec"), [(None, UTC, GEOCENTRE_ARCSEC), ("tle", STATION_UTC, ORBIT_ARCSEC)])
+def test_at_any_time_of_a_day_bodies_are_where_an_ephemeris_of_that_moment_has_them(orbit, utc, limit_arcsec, rng):
+    def observer():
+        return None if orbit is None else TleOrbit(STATION_TLE, "station.tle")
+
+    moving, stars = sky_of(utc=utc, orbit=observer())
+    for t_ns in rng.integers(-24 * HOUR_NS, 24 * HOUR_NS, size=12).tolist():
+        seen = moving.seen(stars, t_ns)
+        then = moving_sky(utc_ns(utc) + t_ns, orbit=observer())
+        assert seen_arcsec(seen, then.sight(0).directions).max() < limit_arcsec
+        fresh = then.among(stars_at(np.eye(3), np.ones(3)))
+        assert np.abs(stars.v_mag - fresh.v_mag)[-len(ALL_BODIES) :].max() < MAGNITUDE_MAG
+
+
+def test_stars_follow_the_observer_s_velocity(rng):
+    """In a low orbit it turns by 15 km/s in half an hour: 10 arcsec."""
+    vectors = rng.normal(size=(50, 3))
+    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+    orbit = TleOrbit(STATION_TLE, "station.tle")
+    moving = moving_sky(STATION_UTC, (), orbit=orbit)
+    far = np.zeros(50)
+    stars = moving.among(stars_at(moving.stars_seen(vectors, far), np.ones(50)))
+    later = moving.seen(stars, 46 * 60 * 10**9)
+    then = moving_sky(utc_ns(STATION_UTC) + 46 * 60 * 10**9, (), orbit=orbit).stars_seen(vectors, far)
+    order = stars.grid.order
+    off = np.linalg.norm(later.directions(np.arange(50)) - then[order], axis=1) / ARCSEC
+    assert off.max() < ORBIT_ARCSEC
+    assert np.linalg.norm(stars.vectors - then[order], axis=1).max() / ARCSEC > 8
+
+
+def test_a_moment_gives_the_same_light_whatever_came_before(rng):
+    moving, stars = sky_of()
+    t_ns = 123_456_789_012_345
+    seen = moving.seen(stars, t_ns)
+    once = stars.vectors.copy(), stars.electrons_per_s.copy(), seen.velocity_km_s.copy()
+    for other in rng.integers(-(10**15), 10**15, size=5).tolist():
+        moving.seen(stars, other)
+    again = moving.seen(stars, t_ns)
+    assert all(
+        np.array_equal(a, b) for a, b in zip(once, (again.vectors, again.electrons_per_s, again.velocity_km_s), strict=True)
+    )
+
+
+def test_only_bodies_are_rewritten_and_each_is_found_where_it_is():
+    moving, stars = sky_of(("Moon", "Jupiter"))
+    assert stars.bodies == ("Moon", "Jupiter")
+    fixed = stars.vectors[:3].copy()
+    moving.seen(stars, 10 * HOUR_NS)
+    assert np.array_equal(stars.vectors[:3], fixed)
+    for k, name in ((3, "Moon"), (4, "Jupiter")):
+        near = stars.grid.near(stars.vectors[k], np.radians(0.01))
+        assert stars.designations(near) == [name]
+    assert stars.names(np.arange(5)) == ["", "", "", "Moon", "Jupiter"]
+
+
+def test_beyond_the_ephemeris_bodies_stand_still_and_one_line_says_so(caplog):
+    moving, stars = sky_of(("Moon",))
+    for years in (100, 200):
+        moving.seen(stars, years * 31_557_600 * 10**9)
+    assert np.isfinite(stars.vectors).all()
+    assert len(caplog.records) == 1
+    assert "epoch_utc" in caplog.text
+
+
+def test_a_date_beyond_the_ephemeris_is_refused():
+    with pytest.raises(InputError, match=r"covers 1899-07-30 to 2053-10-08"):
+        moving_sky("2060-01-01T00:00:00Z")
+
+
+def test_without_the_extra_one_line_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "skyfield_data", None)
+    with pytest.raises(MachineError, match=r"pip install 'hilstar\[bodies\]'"):
+        Kernel()
+
+
+def test_the_moon_is_half_a_degree_wide():
+    moving, _ = sky_of(("Moon", "Jupiter"))
+    widths = moving.diameters_arcsec(0)
+    assert 29 * 60 < widths["Moon"] < 34 * 60
+    assert 30 < widths["Jupiter"] < 50
+
+
+LINES = STATION_TLE.splitlines()
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "not one set of two lines"),
+        (LINES[1], "not one set of two lines"),
+        ("\n".join(LINES[1:] * 2), "not one set of two lines"),
+        ("\n".join((LINES[1], LINES[2][:-1] + "8")), "element line 2: its digits add up to 7, not 8"),
+    ],
+)
+def test_wrong_elements_are_refused(text, words):
+    with pytest.raises(InputError, match=words):
+        TleOrbit(text, "station.tle")
+
+
+def test_an_orbit_that_has_ended_is_refused():
+    dragged = LINES[1].replace("-11606-4", " 11606-1")[:-1]
+    checksum = sum(int(c) if c.isdigit() else c == "-" for c in dragged) % 10
+    orbit = TleOrbit(f"{dragged}{checksum}\n{LINES[2]}", "station.tle")
+    with pytest.raises(InputError, match=r"station.tle: no orbit at 2009-09-20T00:00:00: .*; give newer elements"):
+        moving_sky("2009-09-20T00:00:00Z", orbit=orbit)

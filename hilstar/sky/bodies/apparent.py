@@ -41,7 +41,7 @@ def apparent_bodies(seen_km: FloatArray, view: Viewpoint) -> FloatArray:
 
 
 def apparent_stars(directions: FloatArray, parallax_mas: FloatArray, view: Viewpoint) -> FloatArray:
-    """Unit vectors (n, 3) of stars in directions (n, 3) from the barycentre; no parallax (NaN) or a negative one counts as 0."""
+    """Unit vectors (n, 3) of stars in directions (n, 3) from the barycentre; a parallax of NaN or below 0 counts as 0."""
     shift_rad = np.radians(np.fmax(parallax_mas, 0.0) / MAS_PER_DEG)
     directions = _unit(directions - shift_rad[:, None] * (view.place_km / KM_PER_AU))
     distance_km = float(np.linalg.norm(view.from_sun_km))

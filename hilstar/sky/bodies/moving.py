@@ -43,6 +43,9 @@ SPAN_S = 3 * 3600
 SPAN_NS, MINUTE_NS = SPAN_S * NS_PER_S, 60 * NS_PER_S
 YEAR_NS = 31_557_600 * NS_PER_S
 EDGE_DAYS = 1.0  # light time, and the cubics
+# A change of velocity that is left out, as aberrating all stars in view anew takes as long as their projection: 0.02 arcsec,
+# which the Earth takes an hour and a half to reach.
+UNSEEN_KM_S = 0.03
 EXPONENTS = np.arange(4)
 CUBIC_AT = np.linspace(0.0, 1.0, 4)
 CUBIC = np.linalg.inv(np.vander(CUBIC_AT, increasing=True))
@@ -124,6 +127,8 @@ class MovingSky:
             stars.vectors[-count:] = now[:-1]
             stars.grid.centre[-count:] = now[:-1]
             stars.v_mag[-count:], stars.electrons_per_s[-count:] = self._light(t_ns // MINUTE_NS)
+        if velocity_km_s is None and now[-1] @ now[-1] < UNSEEN_KM_S**2:
+            return stars
         return stars.seen_at(now[-1] if velocity_km_s is None else now[-1] + velocity_km_s)
 
     def sight(self, t_ns: int) -> Sight:

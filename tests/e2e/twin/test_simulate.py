@@ -31,18 +31,8 @@ def test_the_fits_has_dn_header_and_truth(tmp_path):
     assert len(header["BENCHSHA"]) == 64
     assert header["CREATOR"] == f"hilstar {hilstar.__version__}"
     assert header["RA_PNT"] == pytest.approx(283.021, abs=1e-9)
-    assert list(truth.names) == [
-        "hip",
-        "x_px",
-        "y_px",
-        "v_mag",
-        "bv",
-        "temperature_k",
-        "electrons_per_s",
-        "drawn",
-        "clipped",
-        "name",
-    ]
+    first = ["hip", "x_px", "y_px", "v_mag", "bv", "temperature_k", "electrons_per_s", "drawn", "clipped"]
+    assert list(truth.names) == [*first, "variable", "range_mag", "period_d", "double", "separation_arcsec", "name"]
     # Background and dark: 3000 e- and 203 e-/s for 5 s, at 24 e-/DN.
     assert np.median(dn) == pytest.approx((3000 + 203 * 5) / 24, abs=1.0)
     vega = truth[truth["hip"] == 91262][0]

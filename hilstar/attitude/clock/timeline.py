@@ -100,8 +100,8 @@ class Timeline:
 
         Before the first sample it is the first. Between two it is the C2 blend of both where both have rates, else SLERP;
         before a discontinuity, in a log's gap, and for a turn faster than `max_rate_rad_s` the earlier one is held. Past the
-        newest it is predicted with the sample's rate (else that of the last two samples) for at most `max_extrapolation_ns`,
-        and then held.
+        newest it is predicted with the sample's rate (else that of the last two samples), and its acceleration where it has
+        one, for at most `max_extrapolation_ns`, and then held.
         """
         with self._lock:
             if not self._samples:
@@ -176,8 +176,10 @@ class Timeline:
             return _held(newest, age_ns, stale)
         # results/tradeoff.csv, prediction: 5.5 arcsec by the rate of the sample; a cubic spline 17, holding 144.
         prediction_ns = min(age_ns, self._policy.max_extrapolation_ns)
-        q = propagate(newest.q_icrs_to_cam, rate, prediction_ns / NS_PER_S)
-        turning = rate if prediction_ns == age_ns else None  # held past that
+        seconds, bend = prediction_ns / NS_PER_S, newest.acceleration_cam_rad_s2
+        mean, last = (rate, rate) if bend is None else (rate + 0.5 * seconds * bend, rate + seconds * bend)
+        q = propagate(newest.q_icrs_to_cam, mean, seconds)
+        turning = last if prediction_ns == age_ns else None  # held past that
         return Attitude(q, age_ns, stale, newest.sequence, prediction_ns=prediction_ns, rate_cam_rad_s=turning)
 
 

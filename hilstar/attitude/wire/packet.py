@@ -44,7 +44,8 @@ RATE_ROUNDING = 1e-6  # a packet's rate is float32
 class AttitudeSample:
     """Where the camera points at `t_ns` of the sender's clock; `rate_cam_rad_s` (3,) or None when unknown.
 
-    `velocity_km_s` (3,), ICRS, is the observer's with respect to the origin of the sender's frame; None where it is not sent.
+    `acceleration_cam_rad_s2` (3,) is that of the rate, for sources without noise; `velocity_km_s` (3,), ICRS, the observer's
+    with respect to the origin of the sender's frame. Both are None where nobody says.
     """
 
     t_ns: int
@@ -52,6 +53,7 @@ class AttitudeSample:
     rate_cam_rad_s: FloatArray | None = None
     sequence: int = 0
     discontinuity: bool = False
+    acceleration_cam_rad_s2: FloatArray | None = None
     velocity_km_s: FloatArray | None = None
 
 

@@ -34,12 +34,16 @@ class Mounting:
         self._plain = q_body_to_cam in {None, IDENTITY}
 
     def sample(self, body: AttitudeSample) -> AttitudeSample:
-        """The camera's attitude and rate of a sample that holds the body's: q_icrs_to_body, rate in body components."""
+        """The camera's attitude and motion of a sample that holds the body's: q_icrs_to_body, rate in body components."""
         if self._plain:
             return body
-        rate = body.rate_cam_rad_s
-        q = multiply(self.q_body_to_cam, body.q_icrs_to_cam)
-        return replace(body, q_icrs_to_cam=q, rate_cam_rad_s=None if rate is None else self._matrix @ rate)
+        rate, acceleration = body.rate_cam_rad_s, body.acceleration_cam_rad_s2
+        return replace(
+            body,
+            q_icrs_to_cam=multiply(self.q_body_to_cam, body.q_icrs_to_cam),
+            rate_cam_rad_s=None if rate is None else self._matrix @ rate,
+            acceleration_cam_rad_s2=None if acceleration is None else self._matrix @ acceleration,
+        )
 
     def q_icrs_to_body(self, q_icrs_to_cam: FloatArray) -> FloatArray:
         """The body's attitude of the camera's."""

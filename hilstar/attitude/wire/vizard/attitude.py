@@ -56,12 +56,12 @@ CONVENTIONS = Conventions(
 
 
 class DifferenceRates:
-    """The rate at each sample from the attitudes of the last three.
+    """The rate and the acceleration at each sample from the attitudes of the last three.
 
-    The mean rate of the last two intervals, carried on linearly to the newest sample: short of the true one by
-    (second derivative of the rate) h^2 / 3 for steps h, where the mean of the last interval alone would lag by half a step's
-    change. None for the first two of a row; a row ends where time goes back or stands, where a step is longer than
-    `max_step_ns`, and where the turn exceeds `max_rate_rad_s`, which is a jump.
+    The mean rates of the last two intervals, carried on linearly to the newest sample: for steps h and a rate whose second
+    derivative is j, the rate is short of the true one by j h^2 / 3 and the acceleration by j h. (The mean of the last interval
+    alone would lag by half a step's change.) None for the first two of a row; a row ends where time goes back or stands, where
+    a step is longer than `max_step_ns`, and where the turn exceeds `max_rate_rad_s`, which is a jump.
     """
 
     def __init__(self, max_step_ns: int, max_rate_rad_s: float) -> None:
@@ -69,22 +69,25 @@ class DifferenceRates:
         self._last: AttitudeSample | None = None
         self._mean: tuple[FloatArray, float] | None = None
 
-    def rate(self, sample: AttitudeSample) -> FloatArray | None:
-        """The rate (3,) at a sample, rad/s in the components of its own frame."""
+    def moving(self, sample: AttitudeSample) -> AttitudeSample:
+        """The sample with its rate (3,), rad/s, and acceleration (3,), rad/s^2, in the components of its own frame."""
         before, self._last = self._last, sample
         earlier, self._mean = self._mean, None
         if before is None or not 0 < sample.t_ns - before.t_ns <= self._max_step_ns:
-            return None
+            return sample
         step_s = (sample.t_ns - before.t_ns) / NS_PER_S
         mean = rate_between_rad_s(before.q_icrs_to_cam, sample.q_icrs_to_cam, step_s)
         if math.hypot(*mean) > self._max_rate_rad_s:
-            return None
+            return sample
         self._mean = mean, step_s
         if earlier is None:
-            return None
+            return sample
         earlier_mean, earlier_s = earlier
-        rate = mean + (mean - earlier_mean) * (step_s / (step_s + earlier_s))
-        return rate if math.hypot(*rate) <= self._max_rate_rad_s else None
+        acceleration = (mean - earlier_mean) / ((step_s + earlier_s) / 2)
+        rate = mean + acceleration * (step_s / 2)
+        if math.hypot(*rate) > self._max_rate_rad_s:
+            return sample
+        return replace(sample, rate_cam_rad_s=rate, acceleration_cam_rad_s2=acceleration)
 
 
 class Follower:
@@ -115,8 +118,7 @@ class Follower:
         if isinstance(velocity, Refusal):
             return velocity, update
         if isinstance(sample, AttitudeSample):
-            sample = replace(sample, velocity_km_s=velocity)
-            sample = self._mounting.sample(replace(sample, rate_cam_rad_s=self._rates.rate(sample)))
+            sample = self._mounting.sample(self._rates.moving(replace(sample, velocity_km_s=velocity)))
         return sample, update
 
     def _chosen(self, spacecraft: tuple[Spacecraft, ...]) -> Spacecraft | Refusal:

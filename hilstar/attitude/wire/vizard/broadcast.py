@@ -2,12 +2,49 @@
 
 from __future__ import annotations
 
+import time
+
 from hilstar.attitude.wire.links import Arrival
-from hilstar.attitude.wire.packet import Event, Refusal
+from hilstar.attitude.wire.packet import AttitudeSample, Event, Refusal
 from hilstar.attitude.wire.vizard.attitude import Follower
 from hilstar.attitude.wire.vizard.parts import MAX_UPDATE_BYTES, SIM_UPDATE, check_loopback, update_of
 from hilstar.attitude.wire.zmq_stream import ZmqReceiver
 from hilstar.notices import Notices
+from hilstar.units import NS_PER_S
+
+HELD = 2
+MAX_HELD_NS = NS_PER_S // 4
+
+
+class Opening:
+    """Holds the very first two attitudes back until a third says how they turn: shown alone they would stand still.
+
+    For MAX_HELD_NS at most. Where another simulation begins later, `clock.jumps` is in doubt about its first ones anyway.
+    """
+
+    def __init__(self) -> None:
+        self._held: list[Arrival[Event]] = []
+        self._opens = True
+
+    def passed(self, arrivals: list[Arrival[Event]], now_ns: int) -> list[Arrival[Event]]:
+        """What goes on now, of what arrived and what was held."""
+        out: list[Arrival[Event]] = []
+        for arrival in arrivals:
+            sample = arrival.event
+            if not isinstance(sample, AttitudeSample):
+                out.append(arrival)
+                continue
+            if self._opens and sample.rate_cam_rad_s is None and len(self._held) < HELD:
+                self._held.append(arrival)
+            else:
+                out += [*self._released(), arrival]
+        if self._held and now_ns - self._held[0].host_ns > MAX_HELD_NS:
+            out += self._released()
+        return out
+
+    def _released(self) -> list[Arrival[Event]]:
+        released, self._held, self._opens = self._held, [], False
+        return released
 
 
 class VizardBroadcast(ZmqReceiver):
@@ -20,6 +57,11 @@ class VizardBroadcast(ZmqReceiver):
         check_loopback(endpoint)
         super().__init__(endpoint, bind=bind, notices=notices)
         self._follower, self.conventions = follower, follower.conventions
+        self._opening = Opening()
+
+    def receive(self, timeout_ms: int) -> list[Arrival[Event]]:
+        """The waiting messages, oldest first, and only the newest of a flood."""
+        return self._opening.passed(super().receive(timeout_ms), time.monotonic_ns())
 
     def _arrival(self, host_ns: int, parts: list[bytes]) -> Arrival[Event]:
         message = update_of(parts)

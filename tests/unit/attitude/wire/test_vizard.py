@@ -11,15 +11,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from hilstar.attitude.clock.timeline import Policy, Timeline
+from hilstar.attitude.wire.links import Arrival
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal
 from hilstar.attitude.wire.source import CHECK_RADEC_DEG, Mounting
 from hilstar.attitude.wire.vizard.attitude import CONVENTIONS, DifferenceRates, Follower, quaternion_of_mrp
+from hilstar.attitude.wire.vizard.broadcast import MAX_HELD_NS, Opening
 from hilstar.attitude.wire.vizard.camera import TrackerCamera, disagreement, q_body_to_cam
 from hilstar.attitude.wire.vizard.message import decode_update
 from hilstar.attitude.wire.vizard.parts import check_loopback, update_of
 from hilstar.attitude.wire.vizard.wire_format import MAX_FIELDS
 from hilstar.errors import InputError
 from hilstar.rotation import to_radec_roll_deg
+from hilstar.units import NS_PER_S
 from tests.support.viz_message import craft, viz_message
 
 ROUNDING_RAD = 1e-14  # some products of float64 rotations
@@ -75,14 +79,16 @@ def test_the_self_check_points_where_it_says() -> None:
 # Rates
 
 
+def turn_at(t_s: float) -> Rotation:
+    """Of a body about its z axis, through Basilisk's switch to the shadow."""
+    return Rotation.from_rotvec([0, 0, 3.1 + 0.1 * t_s + 0.005 * t_s**2])
+
+
 def turning(times_ns: list[int], max_rate_rad_s: float = 1.0) -> list[np.ndarray | None]:
-    """The rates of a body that turns about its z axis by 0.1 t + 0.005 t^2 rad, through Basilisk's switch to the shadow."""
+    """The rates of that body."""
     by, rates = follower(max_rate_rad_s=max_rate_rad_s), []
     for t_ns in times_ns:
-        t_s = t_ns / 1e9
-        turn = Rotation.from_rotvec([0, 0, 3.1 + 0.1 * t_s + 0.005 * t_s**2])
-        sigma = turn.as_mrp()
-        sample = taken(viz_message(float(t_ns), [craft(sigma=sigma)]), by)
+        sample = taken(viz_message(float(t_ns), [craft(sigma=turn_at(t_ns / 1e9).as_mrp())]), by)
         assert isinstance(sample, AttitudeSample)
         rates.append(sample.rate_cam_rad_s)
     return rates
@@ -95,6 +101,41 @@ def test_a_rate_is_that_of_its_own_moment_and_the_shadow_switch_is_no_turn() -> 
     assert rates[:2] == [None, None]
     for t_ns, rate in list(zip(times_ns, rates, strict=True))[2:]:
         assert rate == pytest.approx([0, 0, 0.1 + 0.01 * t_ns / 1e9], abs=1e-11)
+
+
+def test_an_acceleration_goes_with_the_rate_and_the_timeline_carries_both_on() -> None:
+    """Held to the rate alone it would be 0.01 * 0.1^2 / 2 = 5e-5 rad off after 0.1 s."""
+    timeline, by = Timeline(Policy(NS_PER_S, NS_PER_S)), follower(mounting=Mounting((0.6, 0.48, 0.64, 0.0)))
+    for k in range(4):
+        sample = taken(viz_message(k * 2e7, [craft(sigma=turn_at(k * 0.02).as_mrp())]), by)
+        assert isinstance(sample, AttitudeSample)
+        timeline.add(sample)
+    later = timeline.at(160_000_000)
+    assert later is not None
+    true = Rotation.from_quat([0.6, 0.48, 0.64, 0.0], scalar_first=True) * turn_at(0.16).inv()
+    assert (rotation_of(AttitudeSample(0, later.q_icrs_to_cam)) * true.inv()).magnitude() < 1e-11
+    pose = Rotation.from_quat([0.6, 0.48, 0.64, 0.0], scalar_first=True)
+    assert later.rate_cam_rad_s == pytest.approx(pose.apply([0, 0, 0.1016]), abs=1e-10)
+
+
+def test_the_very_first_two_wait_for_the_third_and_no_others() -> None:
+    by, opening, passed = follower(), Opening(), []
+    now_ns = 0
+    for t_s in (0.0, 0.02, 0.04, 0.06, 0.5, 0.52, 0.02, 0.04, 0.06, 0.08):
+        now_ns += STEP_NS
+        event = taken(viz_message(t_s * 1e9, [craft(sigma=turn_at(t_s).as_mrp())]), by)
+        went = opening.passed([Arrival(now_ns, Refusal("format", "")), Arrival(now_ns, event)], now_ns)
+        passed.append([each.event.t_ns / 1e9 for each in went if isinstance(each.event, AttitudeSample)])
+        assert sum(isinstance(each.event, Refusal) for each in went) == 1
+    assert passed == [[], [], [0, 0.02, 0.04], [0.06], [0.5], [0.52], [0.02], [0.04], [0.06], [0.08]]
+
+
+def test_a_simulation_with_long_steps_is_not_held_for_long() -> None:
+    opening = Opening()
+    only = Arrival(5, taken(viz_message(spacecraft=[craft()])))
+    assert opening.passed([only], 5) == []
+    assert opening.passed([], 5 + MAX_HELD_NS) == []
+    assert opening.passed([], 6 + MAX_HELD_NS) == [only]
 
 
 def test_no_rate_across_a_silence_a_jump_or_a_restart() -> None:

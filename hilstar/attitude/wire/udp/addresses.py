@@ -16,9 +16,12 @@ ALLOW_FORM = 'write addresses or networks, such as allow = ["192.168.1.20", "fd0
 # ADDRESS, ADDRESS:PORT, [IPv6] or [IPv6]:PORT; an IPv6 address without brackets has no port.
 PLACE = re.compile(r"(?:\[(?P<six>[0-9A-Fa-f:.]+(?:%\w+)?)\]|(?P<host>[^:\[\]/\s]+))(?::(?P<port>\d{1,5}))?")
 
+MAX_KNOWN = 1000
+
 Address = ipaddress.IPv4Address | ipaddress.IPv6Address
 Network = ipaddress.IPv4Network | ipaddress.IPv6Network
 T = TypeVar("T")
+LOOPBACK: tuple[Network, ...] = (ipaddress.IPv4Network("127.0.0.0/8"), ipaddress.IPv6Network("::1/128"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,17 +45,26 @@ class AllowedSenders:
     """The addresses and networks whose datagrams are read: this machine alone where none are given."""
 
     def __init__(self, texts: Iterable[str] = ()) -> None:
-        self._networks = [_network(text) for text in texts]
+        self.listed = tuple(_network(text) for text in texts)
+        self._known: dict[str, bool] = {}  # a flood asks for each of its datagrams
 
     def __bool__(self) -> bool:
-        return bool(self._networks)
+        return bool(self.listed)
+
+    @property
+    def networks(self) -> tuple[Network, ...]:
+        """The networks whose datagrams are read."""
+        return self.listed or LOOPBACK
 
     def admits(self, host: str) -> bool:
         """Whether the datagrams of an address, as the kernel gives it, are read."""
-        address = ipaddress.ip_address(host)
-        if not self._networks:
-            return address.is_loopback
-        return any(address in network for network in self._networks)
+        known = self._known.get(host)
+        if known is None:
+            if len(self._known) >= MAX_KNOWN:
+                self._known.clear()
+            address = ipaddress.ip_address(host)
+            known = self._known[host] = any(address in network for network in self.networks)
+        return known
 
 
 def bound_place(bind: bool | str | None, port: str | int, endpoint: str | None) -> Place:

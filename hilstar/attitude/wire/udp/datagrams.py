@@ -8,11 +8,13 @@ import select
 import socket
 import struct
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from hilstar.attitude.wire.packet import MAX_JSON_BYTES
-from hilstar.attitude.wire.udp.addresses import Place
+from hilstar.attitude.wire.udp.addresses import Network, Place
+from hilstar.attitude.wire.udp.kernel_filter import keep_only
 from hilstar.errors import InputError
 from hilstar.units import NS_PER_S
 
@@ -20,6 +22,8 @@ MAX_DATAGRAM_BYTES = MAX_JSON_BYTES + 1  # the rest of a longer one is cut off, 
 WANTED_BUFFER_BYTES = 1 << 20  # the kernel gives what it allows; a small datagram takes some 800 bytes of it
 # Linux's numbers, which Python does not name (asm-generic/socket.h). Its stamp is a timespec of CLOCK_REALTIME.
 SO_TIMESTAMPNS = 35
+SO_MEMINFO = 55
+MEMINFO = struct.Struct("=9I")  # linux/sock_diag.h; the last is SK_MEMINFO_DROPS
 TIMESPEC = struct.Struct("@ll")
 ANCILLARY_BYTES = socket.CMSG_SPACE(TIMESPEC.size)
 CLOCK_TRIES = 3
@@ -124,6 +128,17 @@ class Datagrams:
                 return False
             return sent == len(data)
         return False
+
+    def keep_only(self, networks: Sequence[Network]) -> bool:
+        """Have the kernel drop what comes from anywhere else; False where it cannot."""
+        return keep_only(self._socket, networks)
+
+    def dropped(self) -> int:
+        """How many datagrams the kernel dropped so far: by that filter, or for want of room."""
+        with contextlib.suppress(OSError, struct.error):
+            told = self._socket.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, MEMINFO.size)
+            return int(MEMINFO.unpack(told)[-1])
+        return 0
 
     def close(self) -> None:
         """Close the socket."""

@@ -1,7 +1,7 @@
 """UDP: one packet or JSON object a datagram, from listed addresses only, and answers that never amount to more.
 
 Laws:
-1. A datagram from an address that is not allowed is counted and never answered.
+1. A datagram from an address that is not allowed is counted and never answered; a flood of such ones is dropped by the kernel.
 2. To an address go at most as many bytes of time requests and replies as came from it; statuses besides, at their own rate.
 3. A flood costs the reading of MAX_TAKEN datagrams every PAUSE_S, and the decoding of what `FloodGate` admits.
 """
@@ -23,6 +23,8 @@ from hilstar.attitude.wire.udp.datagrams import Datagram, Datagrams, SocketAddre
 from hilstar.notices import Notices
 
 MAX_TAKEN = 1000  # in one go
+MAX_STRANGERS = 1000  # datagrams a second of senders that are not allowed, before the kernel is asked
+LOOK_S = 1.0
 MAX_CREDIT_BYTES = 4096
 MAX_PEERS = 64  # whose credit is kept
 
@@ -65,6 +67,9 @@ class UdpLink:
         self._allowed = allowed
         self._gate = FloodGate(self.link_counts, self._notices)
         self._credit = Credit()
+        self._strangers = self._dropped = 0
+        self._filtered = False
+        self._looked_s = 0.0
         self._datagrams = Datagrams.bound(place)
         self.endpoint = str(Place(place.host, self._datagrams.port))
 
@@ -74,6 +79,7 @@ class UdpLink:
             return []
         taken = self._datagrams.take(MAX_TAKEN)
         waiting = [datagram for datagram in taken if self._admits(datagram)]
+        self._look(len(taken) - len(waiting))
         admitted = self._gate.admit(len(waiting))
         if len(taken) == MAX_TAKEN:
             time.sleep(PAUSE_S)
@@ -87,6 +93,21 @@ class UdpLink:
         said = f"datagrams from {host} are dropped: it is not in [attitude] allow; further ones are only counted"
         self._notices.begin("sender-not-allowed", said)
         return False
+
+    def _look(self, strangers: int) -> None:
+        """Count what the kernel dropped, and have it drop the strangers where they are many."""
+        self._strangers += strangers
+        now_s = time.monotonic()
+        if self._strangers > MAX_STRANGERS and not self._filtered:
+            self._filtered = True
+            if self._datagrams.keep_only(self._allowed.networks):
+                said = f"over {MAX_STRANGERS} datagrams a second from senders that are not allowed: the kernel drops them now"
+                self._notices.tell("flood", said)
+        if now_s - self._looked_s > LOOK_S:
+            self._looked_s, self._strangers = now_s, 0
+            dropped = self._datagrams.dropped()
+            self.link_counts.flooded += dropped - self._dropped
+            self._dropped = dropped
 
     def _arrival(self, datagram: Datagram) -> Arrival[Event]:
         self._credit.earn(datagram.sender, len(datagram.data))

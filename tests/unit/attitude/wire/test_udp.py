@@ -8,9 +8,10 @@ import time
 import pytest
 
 from hilstar.attitude.wire.packet import AttitudeSample, Status, TimeReply, TimeRequest, encode
-from hilstar.attitude.wire.udp.addresses import AllowedSenders, bound_place
+from hilstar.attitude.wire.udp.addresses import MAX_KNOWN, AllowedSenders, bound_place
 from hilstar.attitude.wire.udp.datagrams import Datagrams
-from hilstar.attitude.wire.udp.udp_link import MAX_CREDIT_BYTES, MAX_PEERS, Credit, UdpLink
+from hilstar.attitude.wire.udp.udp_link import MAX_CREDIT_BYTES, MAX_PEERS, MAX_STRANGERS, Credit, UdpLink
+from hilstar.notices import Notices
 from hilstar.units import NS_PER_MS
 from tests.support.senders import packet
 
@@ -47,6 +48,14 @@ def test_senders_are_admitted_by_address_and_network():
         assert listed.admits(host), host
     for host in ("10.0.0.2", "127.0.0.1", "192.169.0.1", "::1", "fd00:0:0:1::1"):
         assert not listed.admits(host), host
+
+
+def test_however_many_addresses_ask_each_is_judged_by_the_list():
+    listed = AllowedSenders(["10.0.1.0/24"])
+    for _ in range(2):
+        for k in range(3 * MAX_KNOWN):
+            assert listed.admits(f"10.0.{k // 256}.{k % 256}") is (k // 256 == 1)
+        assert len(listed._known) <= MAX_KNOWN
 
 
 def test_a_datagram_that_was_read_late_has_the_time_of_its_arrival():
@@ -110,3 +119,71 @@ def test_the_link_itself_sends_to_nobody():
         link.send(TimeRequest(1, 1))
         with pytest.raises(TimeoutError):
             sender.recv(100)
+
+
+def received(bound: Datagrams, data: bytes, sources: list[str]) -> set[str]:
+    """The sources whose datagram comes through."""
+    family = socket.AF_INET6 if ":" in sources[0] else socket.AF_INET
+    for source in sources:
+        with socket.socket(family, socket.SOCK_DGRAM) as sender:
+            sender.bind((source, 0))
+            sender.sendto(data, ("::1" if ":" in source else "127.0.0.1", bound.port))
+    return {datagram.sender[0] for datagram in bound.take(len(sources))}
+
+
+def test_the_kernel_s_filter_lets_in_whom_the_list_admits():
+    sources = ["127.0.0.1", "127.0.0.2", "127.1.0.1", "127.1.255.254", "127.2.0.1", "127.200.3.4"]
+    for texts in (
+        ["127.0.0.2"],
+        ["127.1.0.0/16", "127.200.3.4"],
+        ["::/0"],
+        ["10.0.0.0/8"],
+        ["0.0.0.0/0"],
+        ["127.0.0.0/30"],
+        [],
+    ):
+        allowed, bound = AllowedSenders(texts), Datagrams.bound(ANYWHERE)
+        assert bound.keep_only(allowed.networks)
+        assert received(bound, b"x" * 64, sources) == {source for source in sources if allowed.admits(source)}, texts
+        assert bound.dropped() == sum(not allowed.admits(source) for source in sources)
+        bound.close()
+
+
+def test_so_it_does_over_ipv6():
+    for texts, admitted in (
+        (["::1"], True),
+        (["::/96"], True),
+        (["fd00::/64", "::1"], True),
+        (["fd00::/64"], False),
+        ([], True),
+    ):
+        allowed, bound = AllowedSenders(texts), Datagrams.bound(bound_place("[::1]:0", "", None))
+        assert bound.keep_only(allowed.networks)
+        assert received(bound, b"x", ["::1"]) == ({"::1"} if admitted else set()), texts
+        bound.close()
+
+
+def test_a_flood_from_elsewhere_leaves_room_for_those_who_are_listed():
+    """Once the kernel drops it, a burst of more than the socket's buffer holds displaces nobody."""
+    notices = Notices()
+    with (
+        UdpLink(ANYWHERE, AllowedSenders(["127.0.0.1"]), notices) as link,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listed,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger,
+    ):
+        stranger.bind(("127.0.0.2", 0))
+        for each in (listed, stranger):
+            each.connect(("127.0.0.1", int(link.endpoint.rpartition(":")[2])))
+        while "flood" not in notices.counts():
+            for _ in range(100):
+                stranger.send(bytes(64))
+            assert link.receive(100) == []
+        while link.wait_for_message(0):  # what had come before the filter did
+            link.receive(0)
+        for _ in range(20_000):
+            stranger.send(bytes(64))
+        for k in range(100):
+            listed.send(packet(k, k))
+        assert len(link.receive(100)) == 100
+    assert link.link_counts.rejected > MAX_STRANGERS
+    assert notices.counts() == {"sender-not-allowed": 1, "flood": 1}

@@ -32,13 +32,14 @@ NOT_FILES = {
     stat.S_ISBLK: "is a device",
 }
 MCAP_MAGIC = b"\x89MCAP0\r\n"
+CK_MAGIC = b"DAF/CK"
 ULOG_MAGIC = b"ULog\x01\x12\x35"
 ROSBAG_MAGIC = b"#ROSBAG V"
 SQLITE_MAGIC = b"SQLite format 3\x00"
 # The first bytes of kinds of files that users have beside attitude logs and bench files.
 MAGIC = {
     ULOG_MAGIC: "a ULog file",
-    b"DAF/CK": "a SPICE CK kernel",
+    CK_MAGIC: "a SPICE CK kernel",
     b"DAF/": "a SPICE kernel",
     b"DAFETF NAIF": "a SPICE kernel",
     b"NAIF/": "a SPICE kernel",

@@ -63,7 +63,7 @@ MountingText = Annotated[
     ),
 ]
 MAX_SEED = 2**63 - 1  # what a FITS header holds
-LOG_HELP = "CSV (t_s,qw,qx,qy,qz), JSON lines, CCSDS AEM, MCAP (a ledger), a ROS bag or a PX4 ULog."
+LOG_HELP = "CSV (t_s,qw,qx,qy,qz), JSON lines, CCSDS AEM, MCAP (a ledger), a SPICE CK, a ROS bag or a PX4 ULog."
 
 
 def check_files(

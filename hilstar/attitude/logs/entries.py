@@ -11,6 +11,7 @@ from hilstar.attitude.wire.packet import AttitudeSample, Refusal
 from hilstar.attitude.wire.source import Conventions, Mounting
 
 MAX_QUOTED_CHARACTERS = 80
+MAX_SAMPLES = 6_000_000  # 16 hours at 100 Hz; all are held, at 350 bytes each, so in 2 GB
 
 
 class Entry(NamedTuple):

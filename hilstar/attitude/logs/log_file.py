@@ -11,21 +11,30 @@ from typing import IO
 
 from hilstar.attitude.clock.timeline import Policy, Timeline
 from hilstar.attitude.logs.csv_log import CSV_COLUMNS, read_csv, write_csv
-from hilstar.attitude.logs.entries import MAX_QUOTED_CHARACTERS, Entry, Log, LogReading, Stated
+from hilstar.attitude.logs.entries import MAX_QUOTED_CHARACTERS, MAX_SAMPLES, Entry, Log, LogReading, Stated
 from hilstar.attitude.logs.gaps import LogJoins, log_joins
 from hilstar.attitude.logs.json_log import read_json_lines, write_json_lines
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal
 from hilstar.attitude.wire.source import PACKETS
 from hilstar.errors import InputError, MachineError
 from hilstar.files import whole_file
-from hilstar.reading import HEAD_BYTES, MCAP_MAGIC, ROSBAG_MAGIC, SQLITE_MAGIC, ULOG_MAGIC, open_lines, open_regular, read_text
+from hilstar.reading import (
+    CK_MAGIC,
+    HEAD_BYTES,
+    MCAP_MAGIC,
+    ROSBAG_MAGIC,
+    SQLITE_MAGIC,
+    ULOG_MAGIC,
+    open_lines,
+    open_regular,
+    read_text,
+)
 
 MAX_NAMED_TOPICS = 12
 MAX_LOG_BYTES = 500_000_000
-MAX_SAMPLES = 6_000_000  # 16 hours at 100 Hz; all are held, at 350 bytes each, so in 2 GB
 MAX_AEM_BYTES = 50_000_000
 NOTHING_STATED = Stated()
-READABLE = "hilstar reads CSV, JSON lines, CCSDS AEM (KVN or XML), MCAP, bags of ROS and ULogs of PX4"
+READABLE = "hilstar reads CSV, JSON lines, CCSDS AEM (KVN or XML), MCAP, SPICE CKs, bags of ROS and ULogs of PX4"
 
 
 def read_log(path: Path) -> list[AttitudeSample]:
@@ -118,6 +127,9 @@ def _open_log(path: Path, stated: Stated) -> Iterator[LogReading]:
     if head.startswith(ULOG_MAGIC):
         yield _ulog(path, stated)
         return
+    if head.startswith(CK_MAGIC):
+        yield _ck(path, stated)
+        return
     with open_lines(path, READABLE, MAX_LOG_BYTES) as lines:
         word = _first_word(lines)
     if word.startswith("<") or word.startswith("CCSDS_AEM_VERS"):
@@ -198,6 +210,12 @@ def _ulog(path: Path, stated: Stated) -> LogReading:
     from hilstar.attitude.logs.px4.reader import read_ulog
 
     return read_ulog(path, stated)
+
+
+def _ck(path: Path, stated: Stated) -> LogReading:
+    from hilstar.attitude.logs.ck.reader import read_ck
+
+    return read_ck(path, stated)
 
 
 def _write_kvn(file: IO[bytes], samples: Sequence[AttitudeSample]) -> None:

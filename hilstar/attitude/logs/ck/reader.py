@@ -1,0 +1,112 @@
+"""SPICE C-kernels (CK Required Reading, types 1 to 6) as a log of one structure's attitude, evaluated by SPICE itself.
+
+Rules:
+1. The C-matrix turns components of a segment's reference frame into the structure's; SPICE turns the reference into J2000,
+   its name of the axes of the ICRF.
+2. The angular velocity is the structure's with respect to J2000, turned into the structure's components; a segment that has
+   none gives no rate (types 1 and 3), or the rate of its own function by difference (types 2, 4, 5 and 6).
+3. `t_ns` is TDB nanoseconds since 1970-01-01T00:00:00 TDB, which the SCLK kernel makes of ticks.
+4. Where nothing covers a time, or segments disagree, the attitude before is held.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import io
+import json
+import math
+import os
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from hilstar.attitude.logs.ck.kernels import kernels_beside
+from hilstar.attitude.logs.entries import Entry, LogReading, Stated
+from hilstar.attitude.wire.packet import checked_sample
+from hilstar.attitude.wire.source import Conventions, components
+from hilstar.errors import InputError, MachineError
+
+MAS_PER_RAD = math.degrees(1.0) * 3_600_000
+LONGEST_S = 600.0  # the largest CK takes a few minutes
+Arrays = Mapping[str, npt.NDArray[Any]]
+
+
+def read_ck(path: Path, stated: Stated) -> LogReading:
+    """The attitudes of the CK's only structure, or of `stated.body` (an id or a name), with the kernels stated or beside it.
+
+    Raises InputError for a file that is damaged, a kernel that is missing and a choice that is open; MachineError without
+    spiceypy.
+    """
+    if importlib.util.find_spec("spiceypy") is None:
+        raise MachineError(f"{path}: a SPICE CK; reading it needs spiceypy: pip install 'hilstar[spice]'")
+    kernels, told = list(stated.kernels), []
+    if not kernels:
+        kernels = kernels_beside(path)
+        names = ", ".join(kernel.name for kernel in kernels) or "none"
+        told.append(("kernels", f"kernels from beside the CK: {names}; --kernel names others"))
+    arrays, said = _asked(path, kernels, stated.body)
+    return LogReading(_entries(arrays), _conventions(said), "give a CK whose times differ", told + _told(said))
+
+
+def _asked(path: Path, kernels: list[Path], body: str | None) -> tuple[Arrays, dict[str, Any]]:
+    """What SPICE says in a process of its own."""
+    request = json.dumps({"path": str(path), "kernels": [str(kernel) for kernel in kernels], "body": body})
+    places = os.pathsep.join(place or str(Path.cwd()) for place in sys.path)
+    try:
+        done = subprocess.run(
+            [sys.executable, "-P", "-m", "hilstar.attitude.logs.ck.child"],
+            input=request.encode(),
+            capture_output=True,
+            env=os.environ | {"PYTHONPATH": places},
+            timeout=LONGEST_S,
+            check=False,
+        )
+    except subprocess.TimeoutExpired as error:
+        raise InputError(f"{path}: SPICE did not read it within {LONGEST_S:g} s; cut it into several (ckslicer)") from error
+    if done.returncode:
+        last = done.stderr.decode("utf-8", "replace").strip().splitlines()[-1:] or ["no word"]
+        raise InputError(f"{path}: SPICE broke off with it ({last[0]}); is it, or a kernel, damaged?")
+    with np.load(io.BytesIO(done.stdout)) as archive:
+        arrays = dict(archive)
+    said = json.loads(str(arrays.pop("said")))
+    if "error" in said:
+        raise InputError(said["error"])
+    return arrays, said
+
+
+def _entries(arrays: Arrays) -> Iterator[Entry]:
+    known: list[bool] = (~np.isnan(arrays["rate"][:, 0])).tolist()
+    rows = zip(*(arrays[name].tolist() for name in ("t_ns", "q", "rate", "breaks", "tick")), strict=True)
+    for has_rate, (t_ns, q, rate, breaks, tick) in zip(known, rows, strict=True):
+        yield Entry(f", tick {tick:.17g}", checked_sample(t_ns, q, rate if has_rate else None, discontinuity=breaks))
+
+
+def _conventions(said: dict[str, Any]) -> Conventions:
+    """What the numbers of one structure mean."""
+    return Conventions(
+        f"SPICE CK, structure {said['structure']}",
+        f"the C-matrix turns components of {', '.join(said['references'])} (by SPICE: J2000, the ICRF) into the structure's",
+        "scalar first, as m2q gives it for the C-matrix",
+        "TDB from 1970-01-01T00:00:00 TDB (ephemeris time + 946728000 s), from clock ticks by the SCLK kernel",
+        of_body=True,
+        written=lambda q: f"m2q(C), C from J2000 = {components(q)}",
+    )
+
+
+def _told(said: dict[str, Any]) -> list[tuple[str, str]]:
+    told = []
+    if said["step_s"] is not None:
+        error = f"{said['error_rad'] * MAS_PER_RAD:.2g} mas"
+        told.append(
+            ("ck-step", f"read every {said['step_s']:.4g} s where the CK is a function of time; off by {error} between")
+        )
+    gaps_s = said["gaps_s"]
+    if gaps_s:
+        count = "1 gap" if len(gaps_s) == 1 else f"{len(gaps_s)} gaps"
+        told.append(("log-gap", f"the CK has {count}, the longest {max(gaps_s):.6g} s; the attitude is held there"))
+    return told

@@ -1,0 +1,245 @@
+"""SPICE CK: attitudes and rates of every type of segment against SciPy's motion and against SPICE, in frames of all kinds."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import spiceypy
+from scipy.spatial.transform import Rotation
+
+from hilstar.attitude.clock.timeline import Policy
+from hilstar.attitude.logs.ck.child import answer
+from hilstar.attitude.logs.entries import Stated
+from hilstar.attitude.logs.gaps import log_joins
+from hilstar.attitude.logs.log_file import log_timeline, open_log
+from hilstar.attitude.wire.packet import AttitudeSample
+from hilstar.attitude.wire.source import Mounting
+from hilstar.errors import InputError
+from hilstar.rotation import angle_between_rad, from_matrix, to_matrix
+from hilstar.units import NS_PER_S
+from tests.support import spice_kernels as ck
+
+MAS = np.radians(1.0 / 3_600_000)
+# A quaternion of 16 digits twice through a matrix: a few roundings of 1 are 1e-15 rad, 2e-7 mas.
+READ_BACK_RAD = 1e-5 * MAS
+# Read back through the clock: a double of ephemeris time near 6e8 s is even to 2^-23 s, and ticks of 2^-16 s are exact in it.
+J2000_NS = 946_728_000 * NS_PER_S
+# What is read holds the rate as it was written, turned once (1e-16); the motion's own rate is good to 1e-13.
+RATE_RAD_S = 1e-12
+# A rate by difference over h = step / 16 of an interpolating segment: its pieces join with a kink in the rate of 1e-4 rad/s.
+DIFFERENCE_RAD_S = 1e-3
+# Between samples, 1 mas is the target, and a time off by 2^-23 s is 1.8 mas at this motion's 0.075 rad/s, twice.
+BETWEEN_RAD = 4.7 * MAS
+ALL = Policy(max_extrapolation_ns=0, stale_after_ns=0)
+TIMES = np.arange(0.0, 6.0, 0.25)
+
+
+def read(path, body=None, kernels=("leap.tls", "clock.tsc")):
+    """What the process of its own would answer, in this one; the kernels that are loaded do not stay."""
+    with spiceypy.KernelPool([]):
+        return answer(path, [path.parent / name for name in kernels], body)
+
+
+@pytest.fixture
+def motion():
+    return ck.Motion(np.random.default_rng(84))
+
+
+@pytest.fixture
+def folder(tmp_path):
+    ck.write_texts(tmp_path)
+    return tmp_path
+
+
+def seconds_of(found):
+    return (found.t_ns - J2000_NS - round(ck.START_S) * NS_PER_S) / NS_PER_S
+
+
+# Types
+
+
+@pytest.mark.parametrize("rates", [True, False])
+@pytest.mark.parametrize("kind", [1, 3])
+def test_instances_are_read_back_with_their_rates(folder, motion, kind, rates):
+    with ck.new_ck(folder / "a.bc") as handle:
+        ck.write_segment(handle, kind, motion, TIMES, rates=rates)
+    found, said = read(folder / "a.bc")
+    assert said == {"structure": "-82000", "references": ["J2000"]}
+    assert seconds_of(found).tolist() == TIMES.tolist()
+    for second, q, rate in zip(TIMES, found.q, found.rate, strict=True):
+        assert angle_between_rad(q, motion.quaternion(second)) < READ_BACK_RAD
+        assert rate == pytest.approx(motion.rate(second) if rates else [np.nan] * 3, abs=RATE_RAD_S, nan_ok=True)
+
+
+def spice_at(path, second):
+    """SPICE's own attitude, and its rate turned into the structure's components."""
+    matrix, rate, _ = spiceypy.ckgpav(ck.BODY, second * ck.TICKS_PER_S, 0, "J2000")
+    return from_matrix(matrix), matrix @ rate
+
+
+def write_kind(path, motion, kind, subtype, rates):
+    with ck.new_ck(path) as handle:
+        if kind == 2:
+            turns = [(t, t + 0.5, motion.turn(t), motion.reference_rate(t)) for t in np.arange(0.0, 6.0, 0.5)]
+            ck.write_type_2(handle, turns)
+        elif kind == 6:
+            ck.write_type_6(handle, motion, [TIMES[:13], TIMES[12:]], rates=rates, subtype=subtype)
+        else:
+            times = TIMES if rates else TIMES[:7]  # rates by difference take five times as long
+            ck.write_segment(handle, kind, motion, times, rates=rates, subtype=subtype)
+
+
+@pytest.mark.parametrize(("kind", "subtype", "rates"), [(2, 0, True), (5, 0, True), (5, 1, False), (5, 2, True), (6, 0, True)])
+def test_functions_of_time_are_read_in_steps_whose_error_is_the_one_stated(folder, motion, kind, subtype, rates):
+    path = folder / "a.bc"
+    write_kind(path, motion, kind, subtype, rates)
+    found, _ = read(path)
+    samples = [AttitudeSample(t, q, rate, 0, b) for t, q, rate, b in zip(found.t_ns.tolist(), found.q, found.rate, found.breaks, strict=True)]  # fmt: skip  # noqa: E501
+    timeline = log_timeline(samples, ALL, log_joins(samples))
+    assert found.step_s is not None
+    assert found.error_rad < BETWEEN_RAD
+    rng = np.random.default_rng(kind)
+    with spiceypy.KernelPool([str(folder / name) for name in ("leap.tls", "clock.tsc", "a.bc")]):
+        for second in rng.uniform(0.0, seconds_of(found)[-1], 60):
+            matrix = spiceypy.ckgp(ck.BODY, second * ck.TICKS_PER_S, 0, "J2000")[0]
+            shown = timeline.at(J2000_NS + round((ck.START_S + second) * NS_PER_S))
+            assert angle_between_rad(shown.q_icrs_to_cam, from_matrix(matrix)) < BETWEEN_RAD
+            if kind != 2:  # whose intervals do not join
+                assert shown.rate_cam_rad_s == pytest.approx(motion.rate(second), abs=DIFFERENCE_RAD_S)
+
+
+# Frames
+
+
+OBLIQUITY_ARCSEC = 84381.448  # of J2000, IAU 1976: SPICE's ECLIPJ2000
+
+
+def test_the_ecliptic_is_turned_by_the_obliquity(folder, motion):
+    with ck.new_ck(folder / "a.bc") as handle:
+        ck.write_segment(handle, 3, motion, TIMES, reference="ECLIPJ2000")
+    found, said = read(folder / "a.bc")
+    assert said["references"] == ["ECLIPJ2000"]
+    ecliptic_to_icrs = Rotation.from_euler("x", OBLIQUITY_ARCSEC / 3600, degrees=True)
+    for second, q, rate in zip(TIMES, found.q, found.rate, strict=True):
+        icrs_to_body = (ecliptic_to_icrs * motion.turn(second)).inv().as_matrix()
+        assert angle_between_rad(q, from_matrix(icrs_to_body)) < READ_BACK_RAD
+        assert rate == pytest.approx(motion.rate(second), abs=RATE_RAD_S)  # of a frame that does not turn, in the body
+
+
+@pytest.mark.parametrize("reference", ["FK4", "GALACTIC", "PROBE_TABLE", "IAU_EARTH"])
+def test_other_frames_are_turned_as_spice_turns_vectors(folder, motion, reference):
+    ck.write_texts(folder, frames_tf=ck.frame_kernel(), earth_tpc=ck.EARTH)
+    kernels = ("leap.tls", "clock.tsc", "frames.tf", "earth.tpc")
+    with ck.new_ck(folder / "a.bc") as handle:
+        ck.write_segment(handle, 3, motion, TIMES, reference="J2000")
+    with ck.new_ck(folder / "b.bc") as handle, spiceypy.KernelPool([str(folder / kernel) for kernel in kernels]):
+        ck.write_segment(handle, 3, motion, TIMES, reference=reference)
+    found, _ = read(folder / "b.bc", kernels=kernels)
+    with spiceypy.KernelPool([str(folder / kernel) for kernel in kernels]):
+        for second, q, rate in zip(TIMES, found.q, found.rate, strict=True):
+            change = spiceypy.sxform("J2000", reference, ck.START_S + second)
+            to_body = motion.turn(second).inv().as_matrix()
+            assert angle_between_rad(q, from_matrix(to_body @ change[:3, :3])) < READ_BACK_RAD
+            # d(to frame)/dt = -[w]x (to frame), w the frame's rate in its own components.
+            spin = -change[3:, :3] @ change[:3, :3].T
+            turning = np.array([spin[2, 1], spin[0, 2], spin[1, 0]])
+            assert rate == pytest.approx(motion.rate(second) + to_body @ turning, abs=RATE_RAD_S)
+
+
+def test_the_rate_carries_the_attitude_on(folder, motion):
+    with ck.new_ck(folder / "a.bc") as handle:
+        ck.write_segment(handle, 3, motion, np.array([0.0, 1.0 / 1024]), reference="J2000")
+    found, _ = read(folder / "a.bc")
+    turned = to_matrix(found.q[1]) @ to_matrix(found.q[0]).T
+    # v' = -w x v over h = 1e-3 s, by the mean rate: h^3 w^3 / 12 = 1e-14.
+    by_rate = Rotation.from_rotvec(-found.rate.mean(axis=0) / 1024).as_matrix()
+    assert turned == pytest.approx(by_rate, abs=1e-9)
+
+
+# Coverage
+
+
+def test_the_attitude_is_held_between_intervals_of_interpolation(folder, motion):
+    with ck.new_ck(folder / "a.bc") as handle:
+        ck.write_segment(handle, 3, motion, TIMES, starts=[0.0, 2.0, 4.0])
+    found, _ = read(folder / "a.bc")
+    assert TIMES[found.breaks].tolist() == [2.0, 4.0]
+    assert found.gaps_s == pytest.approx([0.25, 0.25], abs=1e-6)
+
+
+def test_segments_that_touch_join_where_they_agree_and_break_where_they_do_not(folder, motion):
+    other = ck.Motion(np.random.default_rng(5))
+    with ck.new_ck(folder / "a.bc") as handle:
+        for mover, times in ((motion, [0.0, 1.0, 2.0]), (motion, [2.0, 3.0]), (other, [3.0, 4.0])):
+            ck.write_segment(handle, 3, mover, np.array(times))
+    found, _ = read(folder / "a.bc")
+    seconds = seconds_of(found)
+    assert seconds == pytest.approx([0.0, 1.0, 2.0, 3.0, 3.0, 4.0], abs=1e-5)
+    assert found.breaks.tolist() == [False] * 4 + [True, False]
+    assert found.gaps_s == []
+    # The attitude 2 us from the boundary: at 0.1 rad/s, 41 mas.
+    assert angle_between_rad(found.q[3], motion.quaternion(3.0)) < 60 * MAS
+    assert angle_between_rad(found.q[4], other.quaternion(3.0)) < 60 * MAS
+
+
+def test_the_later_segment_has_priority_where_two_overlap(folder, motion):
+    other = ck.Motion(np.random.default_rng(5))
+    with ck.new_ck(folder / "a.bc") as handle:
+        ck.write_segment(handle, 3, motion, TIMES, rates=False)
+        ck.write_segment(handle, 3, other, np.array([2.0, 2.25, 2.5]))
+    found, _ = read(folder / "a.bc")
+    for second, q, rate in zip(seconds_of(found), found.q, found.rate, strict=True):
+        inside = 2.0 <= second <= 2.5
+        mover = other if inside else motion
+        assert angle_between_rad(q, mover.quaternion(second)) < 60 * MAS
+        assert np.isfinite(rate).all() == inside
+    assert found.breaks.sum() == 2
+
+
+def test_a_long_pause_that_an_interval_covers_is_no_gap(folder, motion):
+    with ck.new_ck(folder / "a.bc") as handle:
+        ck.write_segment(handle, 3, motion, np.array([0.0, 0.25, 0.5, 0.75, 1.0, 5.0]), rates=False)
+    found, _ = read(folder / "a.bc")
+    samples = [AttitudeSample(t, q) for t, q in zip(found.t_ns.tolist(), found.q, strict=True)]
+    assert not log_joins(samples).held_ns
+    assert not found.breaks.any()
+
+
+# The whole way: another process, the kernels beside the file, the mounting, names
+
+
+def test_a_ck_is_read_with_the_kernels_beside_it_and_the_mounting(folder, motion):
+    ck.write_texts(folder, frames_tf=ck.frame_kernel())
+    with ck.new_ck(folder / "a.bc") as handle:
+        ck.write_segment(handle, 3, motion, TIMES)
+        ck.write_segment(handle, 3, ck.Motion(np.random.default_rng(9)), TIMES, body=-82001)
+    with pytest.raises(InputError, match=r"several structures, -82001, -82000 \(PROBE_BUS\); choose one: --body ID"):
+        open_log(folder / "a.bc")
+    mounting = Mounting((0.6, 0.0, 0.8, 0.0))
+    log = open_log(folder / "a.bc", Stated(mounting, body="PROBE_BUS"))
+    to_cam = Rotation.from_quat([0.0, 0.8, 0.0, 0.6])
+    for second, sample in zip(TIMES, log.samples, strict=True):
+        camera = (to_cam * motion.turn(second).inv()).as_matrix()
+        assert angle_between_rad(sample.q_icrs_to_cam, from_matrix(camera)) < READ_BACK_RAD
+        assert sample.rate_cam_rad_s == pytest.approx(to_cam.apply(motion.rate(second)), abs=RATE_RAD_S)
+    assert ("kernels", "kernels from beside the CK: leap.tls, clock.tsc, frames.tf; --kernel names others") in log.told
+    lines = log.conventions.lines(mounting)
+    assert "structure -82000 (PROBE_BUS)" in lines[0]
+    assert log.conventions.of_body
+
+
+def test_times_are_tdb_whatever_the_clock_counts_and_one_log_leaves_nothing_to_the_next(folder, motion):
+    for name, system in (("tdb", 1), ("tt", 2)):
+        place = folder / name
+        place.mkdir()
+        ck.write_texts(place, clock_tsc=ck.clock_kernel(system))
+        with ck.new_ck(place / "a.bc") as handle:
+            ck.write_segment(handle, 1, motion, TIMES)
+    tdb, tt = (open_log(folder / name / "a.bc").samples[0].t_ns for name in ("tdb", "tt"))
+    assert tdb == J2000_NS + 600_000_000 * NS_PER_S
+    with spiceypy.KernelPool([str(folder / "leap.tls")]):
+        offset_s = spiceypy.unitim(ck.START_S, "TT", "TDB") - ck.START_S
+        assert spiceypy.str2et("1970 JAN 01 00:00:00 TDB") == -J2000_NS / NS_PER_S
+    assert abs(offset_s) > 1e-5  # so that the clocks differ
+    assert (tt - tdb) / NS_PER_S == pytest.approx(offset_s, abs=3e-7)
+    assert spiceypy.ktotal("ALL") == 0

@@ -141,24 +141,22 @@ def test_two_spacecraft_and_no_name_end_the_simulation_with_their_names(tmp_path
     assert json.loads(out)["packets"]["refused_by"]["format"] == 1
 
 
-def test_broken_messages_and_a_simulation_that_begins_again_do_not_end_the_display(tmp_path):
-    """A hundred good ones, each followed by one that is cut short; other topics; and then a second simulation from zero."""
+def test_broken_messages_among_good_ones_are_refused_and_other_topics_do_not_count(tmp_path):
+    """A hundred good ones, each followed by one that is cut short and by settings; and at the end a part too many."""
     attitude = 'source = "vizard"\nspacecraft = "sat"'
     sigma = Rotation.from_rotvec([0.3, 0.4, 0.5]).as_mrp()
     with publisher() as (sender, port), serving(tmp_path, port, attitude=attitude) as process:
-        for pause_s in (0.6, 0.2):
-            begun_ns = time.monotonic_ns()
-            for k in range(100):
-                message = viz_message(time.monotonic_ns() - begun_ns, [craft(sigma=sigma), craft("other")], frame=k)
-                sender.send_multipart([b"SIM_UPDATE", message])
-                sender.send_multipart([b"SIM_UPDATE", message[:-1]])
-                sender.send_multipart([b"SYNC_SETTINGS", b"not an attitude"])
-                time.sleep(0.01)
-            sender.send_multipart([b"SIM_UPDATE", b"a part too many", message])
-            time.sleep(pause_s)
-        summary = interrupted(process)
-    assert summary["packets"]["received"] == 402
-    assert summary["packets"]["refused_by"]["format"] == 202
-    # How soon a clock that was not settled yet is seen to have jumped goes with the machine's load; then all are taken.
-    assert summary["packets"]["accepted"] > 110, summary["packets"]
-    assert summary["events"]["jump"] == 1
+        begun_ns = time.monotonic_ns()
+        for k in range(100):
+            message = viz_message(time.monotonic_ns() - begun_ns, [craft(sigma=sigma), craft("other")], frame=k)
+            sender.send_multipart([b"SIM_UPDATE", message])
+            sender.send_multipart([b"SIM_UPDATE", message[:-1]])
+            sender.send_multipart([b"SYNC_SETTINGS", b"not an attitude"])
+            time.sleep(0.01)
+        sender.send_multipart([b"SIM_UPDATE", b"a part too many", message])
+        time.sleep(0.2)
+        packets = interrupted(process)["packets"]
+    # What came before the subscription is lost; the rest alternates.
+    assert packets["accepted"] >= SOME
+    assert packets["refused_by"]["format"] - packets["accepted"] in {1, 2}
+    assert packets["received"] == packets["accepted"] + packets["refused_by"]["format"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 
 from hilstar.attitude.wire.links import StreamLink
-from hilstar.attitude.wire.packet import AttitudeSample, Refusal
+from hilstar.attitude.wire.packet import AttitudeSample, Refusal, TimeReply, TimeRequest
 from hilstar.errors import InputError
 
 POLL_MS = 50
@@ -20,6 +20,9 @@ def first_attitude(link: StreamLink, patience_s: float) -> AttitudeSample:
             match arrival.event:
                 case AttitudeSample() as sample:
                     return sample
+                case TimeRequest(sequence, t1_ns) if link.two_way:  # a sender may wait for the answer before it sends
+                    back = arrival.back or link.send
+                    back(TimeReply(sequence, t1_ns, arrival.host_ns, time.monotonic_ns()))
                 case Refusal(reason, detail):
                     refused = f"; the last message was refused ({reason}: {detail})"
     raise InputError(f"{link.endpoint}: no attitude within {patience_s:g} s{refused}; start the sender, or give --wait S")

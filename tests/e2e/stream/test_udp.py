@@ -178,6 +178,19 @@ def test_an_address_that_is_not_listed_is_counted_and_never_answered_and_malform
     assert served.count("127.0.0.2") == 1
 
 
+def test_a_look_at_where_a_live_stream_points_answers_a_sender_that_waits(tmp_path):
+    port = free_port()
+    command = [*HILSTAR, "send", "--spin", "z,0", "--radec", "30,40,50", "--rate", "50", "--to", f"udp://127.0.0.1:{port}"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as sender:
+        try:
+            result = run_hilstar_here("attitude", bench_of(tmp_path, f"port = {port}"), "--json")
+        finally:
+            sender.kill()
+    assert result.returncode == 0, result.stderr
+    told = json.loads(result.stdout)
+    assert (told["ra_deg"], told["dec_deg"]) == pytest.approx((30.0, 40.0), abs=1e-9)
+
+
 def test_a_sender_that_comes_back_on_another_port_is_answered_there(tmp_path):
     port = free_port()
     with listening(bench_of(tmp_path, f"port = {port}"), "bound to") as process:

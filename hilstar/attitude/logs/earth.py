@@ -31,6 +31,7 @@ UNIX_MJD, MJD_ZERO_JD = 40587, 2400000.5
 TT_FROM_TAI_S = 32.184
 EARTH_RATE_RAD_S = 7.292115146706979e-5  # of the Earth rotation angle: 2 pi 1.00273781191135448 a day of UT1 (IAU 2000)
 UT1_ARCSEC_PER_S = 15.041
+TURNED = "turned to the ICRS with the Earth (IAU 2006/2000A; 15 arcsec for each second that its UTC is off)"
 UT1_S_A_YEAR = 1.1  # UT1-TAI, held at the ends of the table, has moved by this in a year since 1973 at most (days 3 ms long)
 HALF = float(np.sqrt(0.5))
 Q_NED_TO_ENU = (0.0, HALF, HALF, 0.0)

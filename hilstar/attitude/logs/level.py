@@ -61,7 +61,7 @@ class Reference(NamedTuple):
         if self.kind == "icrs":
             return AXES["icrs"]
         latitude_deg, longitude_deg = self.place
-        return f"{AXES[self.kind]} at latitude {latitude_deg:g}, longitude {longitude_deg:g}"
+        return f"{AXES[self.kind]} at latitude {latitude_deg:g}, longitude {longitude_deg:g}, {earth.TURNED}"
 
 
 def stated_reference(path: Path, kind: Kind, stated: Stated, first_ns: int) -> Reference:

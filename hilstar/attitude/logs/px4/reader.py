@@ -135,7 +135,7 @@ def _conventions(topic: Topic, series: Series, turning: Turning, rates: FloatArr
     gyro = "" if rates is None else "; the gyroscopes' rate, with respect to the stars"
     return Conventions(
         f"PX4 ULog, {topic.name}:{topic.instance}",
-        f"q {words} {turning.place.words}{gyro}",
+        f"q {words} {turning.place.words}, {earth.TURNED}{gyro}",
         "scalar first (w, x, y, z), Hamilton, single precision (0.02 arcsec)",
         f"microseconds since boot, which was at UTC {turning.utc.words}",
         of_body=True,

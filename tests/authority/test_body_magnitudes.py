@@ -16,7 +16,9 @@ from tests.support.skies import ALL_BODIES, moving_sky, random_utcs_ns
 
 # The program of Mallama and Hilton (Ap_Mag_Output_V3.txt) prints three decimals.
 PRINTED_MAG = 0.0006
-SKYFIELD_MAG = 0.05  # the issue's limit
+SKYFIELD_MAG = 1e-6  # the same formulas; its pole of Saturn has eight decimals. Measured: 7e-9
+# Beyond 3.1 and 1.9 degrees of phase it adds a term for spacecraft, 0.021 and 0.015 mag at once.
+SKYFIELD_FAR_MAG = 0.025
 ROLO_MAG = 0.08
 # The paper's two photometric systems, measured apart: their rates differ by this at most (measured: 0.051, Uranus)
 SYSTEMS_MAG = 0.06
@@ -44,7 +46,7 @@ def test_the_figures_of_the_paper_s_own_program(name, sun_au, distance_au, phase
     assert body_v_mag(name, *at(sun_au, distance_au, phase_deg), 2020.0) == pytest.approx(v_mag, abs=PRINTED_MAG)
 
 
-def test_planets_on_200_dates_are_within_a_twentieth_of_skyfield(rng):
+def test_planets_on_200_dates_are_as_bright_as_in_skyfield(rng):
     """Its formulas by the true distances from the Sun, which its own call takes at the barycentre."""
     functions = {name: getattr(magnitudelib, f"_{name.lower()}_magnitude") for name in PLANETS}
     poles = {"Saturn": magnitudelib._SATURN_POLE, "Uranus": magnitudelib._URANUS_POLE}
@@ -62,7 +64,8 @@ def test_planets_on_200_dates_are_within_a_twentieth_of_skyfield(rng):
                 theirs = functions[name](*sizes, jyear) if name == "Neptune" else functions[name](*sizes)
             if np.isnan(theirs):
                 continue  # Neptune before 2000, at phases over 1.9 degrees, which Skyfield leaves open
-            assert body_v_mag(name, sun, here, jyear) == pytest.approx(float(theirs), abs=SKYFIELD_MAG), name
+            limit = SKYFIELD_FAR_MAG if name in {"Uranus", "Neptune"} else SKYFIELD_MAG
+            assert body_v_mag(name, sun, here, jyear) == pytest.approx(float(theirs), abs=limit), name
 
 
 def rolo_albedo(phase_deg: float) -> float:

@@ -119,7 +119,8 @@ def _alone(bench: Bench, room: Room, frame: Frame) -> Wanted:
     width, height = camera.resolution_px
     screen = np.stack([truth["x_px"], truth["y_px"]], axis=1)
     limits = np.array(room.resolution_px) - 1 - EDGE_PX
-    kept = truth["drawn"] & ~truth["clipped"] & np.isfinite(place).all(axis=1)
+    # Not by a planet: its light is known to 0.05 mag, and its disc may be wide.
+    kept = truth["drawn"] & ~truth["clipped"] & (truth["name"] == "") & np.isfinite(place).all(axis=1)
     kept &= (place > EDGE_PX).all(axis=1) & (place < np.array([width, height]) - 1 - EDGE_PX).all(axis=1)
     kept &= (screen > EDGE_PX).all(axis=1) & (screen < limits).all(axis=1)
     finite = np.where(np.isfinite(place), place, -1e6)

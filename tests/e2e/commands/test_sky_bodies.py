@@ -12,6 +12,7 @@ import pytest
 from astropy.io import fits
 from astropy.wcs import WCS
 
+from hilstar.bench.bench_file import read_bench_file
 from hilstar.bench.build import load
 from hilstar.rotation import from_radec_roll_deg
 from tests.support.commands import run_hilstar_here
@@ -92,6 +93,43 @@ def test_a_frame_s_time_moves_bodies_and_comes_back_bit_for_bit(bodies_file):
         # 0.49 to 0.66 arcsec/s for 595 s, at 198 arcsec to a pixel, both middles within 0.1 px
         middle = [np.argwhere(levels == levels.max()).mean(axis=0) for levels in (first, later)]
         assert 1.37 < np.linalg.norm(middle[1] - middle[0]) < 2.1
+
+
+def test_a_run_s_ledger_replays_bodies_bit_for_bit_and_summaries_name_what_clips(bodies_file):
+    """From a log of ten minutes that looks at the Moon: it crosses 300 arcsec, one and a half pixels."""
+    folder = bodies_file.parent
+    q = from_radec_roll_deg(7.557, 7.141, 0.0)
+    rows = [f"{t},{','.join(map(repr, q.tolist()))}" for t in range(0, 601, 60)]
+    (folder / "log.csv").write_text("\n".join(["t_s,qw,qx,qy,qz", *rows]) + "\n")
+    more = ("--headless", "--speed", "max", "--json")
+    first = run_hilstar_here(
+        "replay", bodies_file, folder / "log.csv", "--step", "60", "--ledger", folder / "run.mcap", "-o", folder / "a", *more
+    )
+    assert first.returncode == 0, first.stderr
+    assert "brighter than white" in first.stderr and "Sun" in first.stderr
+    summary = json.loads(first.stdout)
+    assert (summary["frames"], summary["clipped"]) == (11, {"max": 2, "hip": [], "bodies": ["Moon", "Saturn"]})
+    assert run_hilstar_here("replay", bodies_file, folder / "run.mcap", "-o", folder / "b", *more).returncode == 0
+    frames = [sorted((folder / name).glob("*.png")) for name in "ab"]
+    assert len(frames[0]) == 11
+    assert [path.read_bytes() for path in frames[0]] == [path.read_bytes() for path in frames[1]]
+    assert frames[0][0].read_bytes() != frames[0][-1].read_bytes()
+
+
+def test_attitude_names_the_bodies_in_view(bodies_file):
+    folder = bodies_file.parent
+    q = from_radec_roll_deg(7.557, 7.141, 0.0)
+    (folder / "log.csv").write_text("t_s,qw,qx,qy,qz\n0," + ",".join(map(repr, q.tolist())) + "\n")
+    done = run_hilstar_here("attitude", folder / "log.csv", "--bench", bodies_file)
+    assert "Moon, V -11.51, in Pisces" in done.stdout, done.stderr
+
+
+def test_a_bench_s_hash_covers_its_elements(bodies_file):
+    (bodies_file.parent / "station.tle").write_text(STATION_TLE)
+    bodies_file.write_text(bodies_file.read_text() + '[spacecraft]\norbit = "station.tle"\n')
+    before = read_bench_file(bodies_file).sha256
+    (bodies_file.parent / "station.tle").write_text(STATION_TLE.replace("ISS", "Mir"))
+    assert read_bench_file(bodies_file).sha256 != before
 
 
 def test_from_a_low_orbit_the_moon_is_elsewhere(bodies_file):

@@ -112,22 +112,24 @@ class _Blobs:
     pixels: IntArray
 
 
-def estimate_background(image: npt.NDArray[Any]) -> Background:
+def estimate_background(image: npt.NDArray[Any], step: float | None = None) -> Background:
     """The background of a whole image: median and MAD, then mean and sigma of the pixels within 3 sigma of the median.
 
     The second step resolves a fraction of a DN where the median, and the MAD, are whole ones. One level for the image:
-    a gradient counts as noise. The noise of whole numbers is at least rounding's, 1 / sqrt 12. That of a noiseless float
-    image is 0, and then every pixel over the level belongs to a star: give a `Background` for such an image.
+    a gradient counts as noise. `step` is what the image was rounded to (default: 1 for whole numbers, else 0), and the noise
+    at least rounding's, step / sqrt 12. That of a noiseless float image is 0, and then every pixel over the level belongs to
+    a star: give a `Background` for such an image.
     """
     checked = _checked(image)
+    if step is None:
+        step = 1.0 if image.dtype.kind in "iu" else 0.0
     median = float(np.median(checked))
     sigma = MAD_TO_SIGMA * float(np.median(np.abs(checked - median)))
-    # Where the noise is under a DN, a cut at 3 sigma would keep a code on one side and drop its counterpart on the other.
-    half_width = CLIP_SIGMAS * (max(sigma, 1.0) if image.dtype.kind in "iu" else sigma)
+    # Where the noise is under a step, a cut at 3 sigma would keep a code on one side and drop its counterpart on the other.
+    half_width = CLIP_SIGMAS * max(sigma, step)
     kept = checked[np.abs(checked - median) <= half_width]
     noise = float(kept.std()) / CLIPPED_SIGMA
-    rounding = 1 / math.sqrt(12) if image.dtype.kind in "iu" else 0.0
-    return Background(float(kept.mean()), max(noise, rounding))
+    return Background(float(kept.mean()), max(noise, step / math.sqrt(12)))
 
 
 def find_stars(

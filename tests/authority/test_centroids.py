@@ -286,6 +286,10 @@ def test_the_background_is_found_under_stars_and_to_a_fraction_of_a_dn(gain_e_pe
     # 3 sigma of whole codes cut up to half a code more on one side: 0.0044 / 2 DN.
     assert found.level == pytest.approx(1000.0 / gain_e_per_dn, abs=0.015 * noise_dn + 0.005)
     assert found.noise == pytest.approx(noise_dn, rel=0.04)
+    # The same in electrons, which are no whole numbers: most pixels share one value, and only the step tells their noise.
+    in_electrons = estimate_background((image - 7.5) * gain_e_per_dn, gain_e_per_dn)
+    assert in_electrons.level == pytest.approx((found.level - 7.5) * gain_e_per_dn, rel=1e-9)
+    assert in_electrons.noise == pytest.approx(found.noise * gain_e_per_dn, rel=1e-9)
 
 
 def test_stars_through_the_detector_keep_their_places_and_their_light():

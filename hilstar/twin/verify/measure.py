@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from hilstar.arrays import FloatArray
 from hilstar.bench.moving import wide_bodies
-from hilstar.tracker.centroids import Centroids, find_stars
+from hilstar.tracker.centroids import Centroids, estimate_background, find_stars
 from hilstar.twin.bench_geometry import BenchGeometry, Mirror
 from hilstar.twin.verify.displacement import Displaced
 from hilstar.twin.verify.light import true_calibration
@@ -126,7 +126,8 @@ class Comparison:
 
     def _measure_noisy(self, seen: Field, detected_e: FloatArray, wanted: npt.NDArray[np.bool_]) -> None:
         """The same stars in a noisy exposure (h, w), electrons: what the tracker itself adds."""
-        found = find_stars(detected_e, self.finder.settings)
+        under = estimate_background(detected_e, self.twin.config.tracker.detector.gain_e_per_dn)
+        found = find_stars(detected_e, self.finder.settings, under)
         match = nearest(found, seen.x_px, seen.y_px)
         expected_e = seen.truth["electrons_per_s"] * self.twin.config.tracker.exposure_s
         for k in np.flatnonzero(wanted & (match >= 0)):

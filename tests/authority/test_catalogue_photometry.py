@@ -40,6 +40,15 @@ def test_tycho_magnitudes_become_those_of_the_ground():
             assert abs(np.median(part)) < TYCHO_BIN_MAG, low
 
 
+def test_tycho_s_relation_is_the_published_one():
+    """By hand at BT - VT = 0.3 and 1: the two polynomials of B - V, and that of V."""
+    v, bv = from_tycho(np.array([10.3, 11.0]), np.array([10.0, 10.0]))
+    assert bv == pytest.approx([0.3 - 0.006 - 0.03207 + 0.013131, 1 - 0.007813 - 0.1489 + 0.03384], abs=1e-12)
+    assert v == pytest.approx(
+        [10 + 0.00097 - 0.04002 + 0.0049374 - 0.00053946, 10 + 0.00097 - 0.1334 + 0.05486 - 0.01998], abs=1e-12
+    )
+
+
 def test_beyond_its_range_tycho_s_relation_goes_on_without_a_step():
     edge = np.array([2.0, 2.0 + 1e-9, 3.0])
     v, bv = from_tycho(10 + edge, np.full(3, 10.0))

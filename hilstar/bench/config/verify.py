@@ -23,10 +23,12 @@ class Verify(Table, frozen=True):
 
     A star is **lost** when nothing is found within 3 px of its true place. Counted, but not part of the errors: `blended`
     (others put more than 2 % of its light into its window), `clipped`, `not_shown` (too faint for the monitor), `at_edge` (of
-    the detector or the monitor). `codes_alone` is what the codes would cost were everything else as assumed; `noisy` is the
-    same with all of `[tracker.detector]`. `scale_error`, `rotation_arcsec`, `offset_px`, `tilt_deg`, `k1` and `distortion_px`
-    (by the lens, the largest in the field) are those of the smallest model that explains the centroids, true minus assumed;
-    what it does not need is 0. `reasons` names what failed and its likely cause.
+    the detector or the monitor). Stars that the tracker cannot part, within 1.5 sigmas of what it sees of a star, are measured
+    as one of the sum at the centre of their light; `summed` counts those added to a brighter one. `codes_alone` is what the
+    codes would cost were everything else as assumed; `noisy` is the same with all of `[tracker.detector]`. `scale_error`,
+    `rotation_arcsec`, `offset_px`, `tilt_deg`, `k1` and `distortion_px` (by the lens, the largest in the field) are those of
+    the smallest model that explains the centroids, true minus assumed; what it does not need is 0. `reasons` names what failed
+    and its likely cause.
 
     `-o DIR` writes `errors.png`, `field.png` and `stars.csv` (a row per star, with `nan` for the errors of a lost one). The
     exit code is 0 whatever the verdict; with `--strict` it is 1 when the bench does not pass.

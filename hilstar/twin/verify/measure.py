@@ -11,6 +11,7 @@ from hilstar.arrays import FloatArray
 from hilstar.bench.moving import wide_bodies
 from hilstar.tracker.centroids import Centroids, estimate_background, find_stars
 from hilstar.twin.bench_geometry import BenchGeometry, Mirror
+from hilstar.twin.verify.blends import with_blends_as_one
 from hilstar.twin.verify.displacement import Displaced
 from hilstar.twin.verify.light import true_calibration
 from hilstar.twin.verify.measured import Glow, Measured, Star, Tally
@@ -35,7 +36,9 @@ class Comparison:
     def add(self, seen: Field, rng: np.random.Generator) -> None:
         """Compare the stars of one field; the generator is for the detector's noise."""
         self.field_count += 1
-        tally = self.tally
+        tally, stars_listed = self.tally, len(seen.truth)
+        seen = with_blends_as_one(seen, self.finder.sigma_px)
+        tally.summed += stars_listed - len(seen.truth)
         sky, shown = (self.finder.match(image_e, seen.x_px, seen.y_px) for image_e in (seen.sky_e, seen.shown_e))
         assumed = shown if seen.assumed_e is seen.shown_e else self.finder.match(seen.assumed_e, seen.x_px, seen.y_px)
         inside, drawn, clipped = self._inside(seen), seen.truth["drawn"], seen.truth["clipped"]

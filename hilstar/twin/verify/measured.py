@@ -39,15 +39,16 @@ class Star:
 class Tally:
     """Stars by what became of them, added up over the fields.
 
-    `displaced` are the stars that the display really shows, however far off. `vanished` counts how many fewer are found than
-    the sky has, `mirrored` those found where a screen so mirrored would show them; `noisy_mag`, `noisy_px` are the errors with
-    all of the detector's noise.
+    `summed` stars are part of a brighter one that the tracker cannot part from them. `displaced` are the stars that the display
+    really shows, however far off. `vanished` counts how many fewer are found than the sky has, `mirrored` those found where a
+    screen so mirrored would show them; `noisy_mag`, `noisy_px` are the errors with all of the detector's noise.
     """
 
     stars: list[Star] = field(default_factory=list)
     lost: list[Star] = field(default_factory=list)
     displaced: list[Displaced] = field(default_factory=list)
     blended: int = 0
+    summed: int = 0
     clipped: int = 0
     not_shown: int = 0
     at_edge: int = 0

@@ -82,6 +82,7 @@ class VerifySummary:
     clipped: int
     not_shown: int
     at_edge: int
+    summed: int
     zero_point_mag: float | None
     scale_error: float | None
     rotation_arcsec: float | None
@@ -117,6 +118,7 @@ def summarise(verdict: Verdict) -> VerifySummary:
         clipped=tally.clipped,
         not_shown=tally.not_shown,
         at_edge=tally.at_edge,
+        summed=tally.summed,
         zero_point_mag=_finite(errors.zero_point_mag),
         scale_error=None if fit is None else fit.scale_error,
         rotation_arcsec=None if fit is None else fit.rotation_rad * ARCSEC_PER_RAD,
@@ -161,6 +163,7 @@ def summary_lines(summary: VerifySummary) -> list[str]:
     noisy = summary.noisy
     rest = f"{summary.lost} lost, {summary.blended} blended, {summary.clipped} clipped"
     rest += f", {summary.not_shown} not shown, {summary.at_edge} at edge"
+    rest += f", {summary.summed} part of a blend" if summary.summed else ""
     centroid = f"{three(summary.centroid_error_px)} px, {three(summary.centroid_error_arcsec)} arcsec"
     return [
         f"{'stars':20}{summary.stars} in {summary.fields} fields; {rest}",

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import re
 import time
+from contextlib import closing
 
 import numpy as np
 import pytest
+import zmq
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -18,10 +20,12 @@ from hilstar.attitude.wire.source import CHECK_RADEC_DEG, Mounting
 from hilstar.attitude.wire.vizard.attitude import CONVENTIONS, DifferenceRates, Follower, quaternion_of_mrp
 from hilstar.attitude.wire.vizard.broadcast import MAX_HELD_NS, Opening
 from hilstar.attitude.wire.vizard.camera import TrackerCamera, disagreement, q_body_to_cam
+from hilstar.attitude.wire.vizard.live import ImageRequest, Step, VizardLive
 from hilstar.attitude.wire.vizard.message import decode_update
 from hilstar.attitude.wire.vizard.parts import check_loopback, update_of
 from hilstar.attitude.wire.vizard.wire_format import MAX_FIELDS
 from hilstar.errors import InputError
+from hilstar.notices import Notices
 from hilstar.rotation import to_radec_roll_deg
 from hilstar.units import NS_PER_S
 from tests.support.viz_message import craft, viz_message
@@ -304,3 +308,39 @@ def test_a_velocity_that_is_none_is_refused_with_the_key_that_leaves_it_out(velo
     assert isinstance(refusal, Refusal)
     assert words in refusal.detail
     assert "[attitude] use_velocity = false" in refusal.detail
+
+
+# In Vizard's place
+
+
+def test_each_request_has_one_answer_whatever_it_asks() -> None:
+    """Basilisk's words over a real socket, and some that are none; an image without an attitude is an empty one."""
+    notices = Notices()
+    with (
+        VizardLive("tcp://127.0.0.1:*", follower(), notices=notices) as link,
+        zmq.Context() as context,
+        closing(context.socket(zmq.REQ)) as basilisk,
+    ):
+        basilisk.connect(link.endpoint)
+        update = viz_message(spacecraft=[craft()])
+        for request, answer in (
+            ([b"PING"], [b"PONG"]),
+            ([b"SIM_UPDATE", b"", b"", update], [b"OK"]),
+            ([b"SIM_UPDATE", b"", b"", update[:-3]], [b"ERROR"]),
+            ([b"SIM_UPDATE"], [b"ERROR"]),
+            ([b"REQUEST_INPUT"], [b"VIZARD_INPUT", b""]),
+            ([b"REQUEST_IMAGE_7"], [b"\0\0\0\3", b"png"]),
+            ([b"REQUEST_IMAGE_seven"], [b"ERROR"]),
+            ([b"anything", b"else"], [b"ERROR"]),
+            ([b""], [b"ERROR"]),
+        ):
+            basilisk.send_multipart(request)
+            asked = link.receive(5000)
+            if isinstance(asked, Step):
+                link.answer_step(isinstance(asked.event, AttitudeSample))
+            elif isinstance(asked, ImageRequest):
+                assert asked.camera == 7
+                link.answer_image(b"png")
+            assert basilisk.poll(5000), request
+            assert basilisk.recv_multipart() == answer
+    assert notices.counts()["unknown-request"] == 3

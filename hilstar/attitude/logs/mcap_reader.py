@@ -7,6 +7,7 @@ MAX_INFLATION times its own. A damaged file is refused in one line.
 from __future__ import annotations
 
 import io
+import logging
 import os
 import struct
 import zlib
@@ -28,6 +29,7 @@ from hilstar.reading import MCAP_MAGIC, open_regular, size_text
 RUN_METADATA = "hilstar"  # the name of a ledger's head
 ROS_ENCODINGS = frozenset({"cdr", "ros1"})
 OWN_TOPICS = frozenset({"/attitude", "/frame"})
+log = logging.getLogger(__name__)
 ADVICE = "give an MCAP file, such as the ledger of a run"
 MAX_CHUNK_BYTES = 64_000_000  # unpacked; writers make them of about 1 MB
 MAX_RECORD_BYTES = 256_000_000
@@ -64,8 +66,10 @@ def parts_of(path: Path) -> list[Path]:
 def read_topics(path: Path) -> Iterator[tuple[str, bytes]]:
     """Topic and content of every message of a run's files, in their order, up to where its writer was killed.
 
-    Raises InputError for damage, and for anything but a regular file.
+    A file that ends so is said in one line of the log, once it is read. Raises InputError for damage, and for anything but a
+    regular file.
     """
+    unfinished = []
     for part in parts_of(path):
         channels: dict[int, str] = {}
         for record in records_of(part):
@@ -73,6 +77,10 @@ def read_topics(path: Path) -> Iterator[tuple[str, bytes]]:
                 channels[record.id] = record.topic
             elif isinstance(record, Message) and record.channel_id in channels:
                 yield channels[record.channel_id], record.data
+        with open_regular(part, ADVICE) as file:
+            unfinished += [] if _is_finished(file) else [part]
+    if unfinished:
+        log.warning("%s has no end: cut short, or its writer was killed or still writes; what is whole is read", unfinished[0])
 
 
 def read_messages(path: Path, topic: str) -> Iterator[bytes]:
@@ -131,10 +139,19 @@ class _Capped:
         return data
 
 
-def _open_records(path: Path, file: IO[bytes]) -> Iterator[McapRecord]:
+def _is_finished(file: IO[bytes]) -> bool:
+    """Whether a file has the end that a writer gives it, and not what a crash leaves."""
     size = file.seek(0, os.SEEK_END)
     file.seek(max(0, size - len(MCAP_MAGIC)))
-    finished = size > 2 * len(MCAP_MAGIC) and file.read() == MCAP_MAGIC
+    return size > 2 * len(MCAP_MAGIC) and file.read() == MCAP_MAGIC
+
+
+def _open_records(path: Path, file: IO[bytes]) -> Iterator[McapRecord]:
+    finished = _is_finished(file)
+    size = file.seek(0, os.SEEK_END)
+    file.seek(0)
+    if not MCAP_MAGIC.startswith(file.read(len(MCAP_MAGIC))):
+        raise InputError(f"{path}: is no MCAP file; {ADVICE}")
     file.seek(0)
     capped = _Capped(file, size)
     reader = StreamReader(capped, emit_chunks=True, validate_crcs=True, record_size_limit=size)  # type: ignore[arg-type]

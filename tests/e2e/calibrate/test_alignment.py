@@ -172,6 +172,19 @@ def test_a_ledger_says_what_was_commanded_at_the_moment_of_light(run_of_a_slew, 
     assert late["rotation_arcsec"] != pytest.approx(right["rotation_arcsec"], abs=10)
 
 
+def test_a_ledger_that_was_cut_short_is_used_and_said_in_one_line(run_of_a_slew, tmp_path):
+    bench, ledger, telemetry = run_of_a_slew
+    cut, whole = tmp_path / "cut.mcap", ledger.read_bytes()
+    cut.write_bytes(whole[:-50])  # what is whole is one chunk, of all frames
+    aligned = ("calibrate", "alignment", bench, telemetry, "--ledger", cut, "-o", tmp_path / "g.toml", "--offset-s", "0.04")
+    for command in (aligned, ("report", cut, "-o", tmp_path / "report")):
+        result = run_hilstar_here(*command, "--json")
+        assert result.returncode == 0, result.stderr
+        assert json.loads(result.stdout)
+        (line,) = result.stderr.splitlines()
+        assert f"{cut} has no end" in line
+
+
 def row(text, number, value, column):
     lines = text.splitlines()
     cells = lines[number].split(",")
@@ -212,7 +225,7 @@ def test_options_that_do_not_fit_get_one_line(measured, run_of_a_slew, tmp_path)
     out = ("-o", tmp_path / "g.toml")
     assert_refused(run_hilstar_here(*wanted, pairs, *out, "--offset-s", "1"), 2, "--offset-s", "--ledger")
     assert_refused(run_hilstar_here(*wanted, pairs, *out, "--ledger", ledger), 2, "t_s is missing")
-    assert_refused(run_hilstar_here(*wanted, telemetry, *out, "--ledger", pairs), 2, "pairs.csv")
+    assert_refused(run_hilstar_here(*wanted, telemetry, *out, "--ledger", pairs), 2, "pairs.csv: is no MCAP file")
     assert_refused(
         run_hilstar_here(*wanted, telemetry, *out, "--ledger", ledger, "--offset-s", "99"), 2, "meet no frame", "--offset-s"
     )

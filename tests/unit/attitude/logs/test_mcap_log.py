@@ -109,6 +109,23 @@ def test_a_killed_writer_leaves_everything_before_its_last_chunk(tmp_path):
     assert 0.7 * count < seen[-1] < count  # the last chunk was never written
 
 
+def test_a_file_that_has_no_end_is_said_in_one_line_and_a_whole_one_in_none(tmp_path, caplog):
+    whole, path = ledger([attitude_message(sample(i)) for i in range(40)], chunk_size=1500), tmp_path / "run.mcap"
+    path.write_bytes(whole)
+    assert len(list(read_attitudes(path))) == 40
+    assert not caplog.messages
+    path.write_bytes(whole[: len(whole) // 2])
+    assert 0 < len(list(read_attitudes(path))) < 40
+    (line,) = caplog.messages
+    assert line.startswith(f"{path} has no end")
+
+
+def test_what_is_no_mcap_file_is_called_so(tmp_path):
+    (tmp_path / "run.mcap").write_text("t_s,qw,qx,qy,qz\n0,1,0,0,0\n")
+    with pytest.raises(InputError, match=r"run\.mcap: is no MCAP file; give an MCAP file, such as the ledger of a run"):
+        list(read_attitudes(tmp_path / "run.mcap"))
+
+
 def test_a_finished_file_that_is_damaged_is_refused(tmp_path):
     data = bytearray(ledger([attitude_message(sample(i)) for i in range(40)]))
     data[len(data) // 4] ^= 0x55

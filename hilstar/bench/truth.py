@@ -24,13 +24,13 @@ TRUTH_DTYPE = np.dtype(
         ("period_d", "f8"),
         ("double", "U1"),
         ("separation_arcsec", "f8"),
-        ("name", "U7"),
+        ("name", "U32"),
     ]
 )
 
 
 def clipped_in(truth: npt.NDArray[np.void]) -> list[int | str]:
-    """What clips in a table of TRUTH_DTYPE: HIP numbers, and names of bodies."""
+    """What clips in a table of TRUTH_DTYPE: HIP numbers, and names of what has none."""
     rows = truth[truth["clipped"]]
     return [name or hip for name, hip in zip(rows["name"].tolist(), rows["hip"].tolist(), strict=True)]
 

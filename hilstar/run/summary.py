@@ -31,7 +31,10 @@ class StarSummary(msgspec.Struct, frozen=True):
 
 
 class ClippedSummary(msgspec.Struct, frozen=True):
-    """What is brighter than full scale: how many in a frame at most, and which stars (HIP) and bodies (by name)."""
+    """What is brighter than full scale: how many in a frame at most, and which stars (HIP).
+
+    `bodies` are those that have no HIP number, by name: planets and stars of other catalogues.
+    """
 
     max: int
     hip: list[int]

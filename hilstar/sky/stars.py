@@ -59,12 +59,17 @@ class Stars:
         return self if velocity_km_s is None else replace(self, velocity_km_s=velocity_km_s)
 
     def names(self, which: IntArray) -> list[str]:
-        """The names of the bodies among stars (n,), empty text for the stars themselves."""
-        first = len(self) - len(self.bodies)
-        return [self.bodies[i - first] if i >= first else "" for i in which.tolist()]
+        """The names of bodies and of stars without a HIP number among stars (n,), empty text for the others."""
+        first, named = len(self) - len(self.bodies), (self.hip[which] == 0).tolist()
+        return [self._name(i, first) if has_name else "" for i, has_name in zip(which.tolist(), named, strict=True)]
+
+    def _name(self, star: int, first_body: int) -> str:
+        if star >= first_body:
+            return self.bodies[star - first_body]
+        return "" if self.row[star] < 0 else self.catalog.name(int(self.row[star]))
 
     def designations(self, which: IntArray) -> list[int | str]:
-        """The HIP numbers of stars (n,), and the names of the bodies among them."""
+        """The HIP numbers of stars (n,), and the names of those that have none."""
         return [name or hip for name, hip in zip(self.names(which), self.hip[which].tolist(), strict=True)]
 
 

@@ -25,6 +25,7 @@ EPOCHS_JYEAR = (1800.0, 2200.0)
 HOURS_SPAN_DEG, HOURS_STARS = 60.0, 100
 # Of a thousand stars the fastest moves by some 100 mas a year; no star of the sky moves by 12 arcsec a year.
 SLOWEST_MAS_YR, MOTION_STARS = 12.0, 1000
+MAX_STEM = 16  # characters of a file's name in the name of its stars, which has 32 in a truth table
 ADVICE = "give the column its unit in a FITS, ECSV or VOTable, or convert it"
 
 Converted = tuple[FloatArray, FloatArray, FloatArray]
@@ -173,7 +174,7 @@ class _Columns:
         if all(name in role for name in ("tyc1", "tyc2", "tyc3")):
             region, number, part = (np.asarray(columns[role[name]], dtype=np.int64) for name in ("tyc1", "tyc2", "tyc3"))
             return TYCHO, region * TYC_REGION + number * 10 + part
-        return f"{self.path.stem} row", np.arange(1, self.table.row_count + 1, dtype=np.int64)
+        return f"{self.path.stem[:MAX_STEM]} row", np.arange(1, self.table.row_count + 1, dtype=np.int64)
 
     def hip(self) -> npt.NDArray[np.int64]:
         """HIP numbers, 0 where the table has none."""

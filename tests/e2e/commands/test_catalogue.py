@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 
 import pytest
 
@@ -12,7 +13,8 @@ from tests.support.commands import run_hilstar_here
 
 pytestmark = pytest.mark.e2e
 HEAD = "source_id,ra,dec,ref_epoch,pmra,pmdec,phot_g_mean_mag,bp_rp\n"
-ROWS = "3216486443742786048,84.1233,-1.1122,2016.0,1.2,-3.4,7.31,0.42\n321648647810195008,83.9018,-1.3217,2016.0,,,7.0,\n"
+SOURCE = 3216486443742786048
+ROWS = f"{SOURCE},84.1233,-1.1122,2016.0,1.2,-3.4,7.31,0.42\n321648647810195008,83.9018,-1.3217,2016.0,,,7.0,\n"
 
 
 @pytest.fixture
@@ -34,8 +36,18 @@ def test_the_table_s_star_is_in_the_frame_beside_hipparcos(folder):
     with (folder / "t.csv").open() as file:
         rows = {int(row["hip"]): row for row in csv.DictReader(file)}
     assert {0, 26311} <= set(rows)  # Alnilam is Hipparcos'
+    assert (rows[0]["name"], rows[26311]["name"]) == (f"Gaia DR3 {SOURCE}", "")
     # G - V of Riello et al. 2021, table C.2, at BP - RP = 0.42, by hand.
     assert float(rows[0]["v_mag"]) == pytest.approx(7.31 + 0.02704 - 0.0059808 + 0.03803184 - 0.00105649, abs=1e-6)
+
+
+def test_a_star_without_a_hip_number_clips_by_name(folder):
+    with (folder / "bench.toml").open("a") as file:
+        file.write("[render]\nflux_at_white_e_per_s = 1000\n")
+    done = run_hilstar_here("frame", folder / "bench.toml", "--radec", "84.057,-1.2,0", "--truth", folder / "t.csv", "--json")
+    summary = json.loads(done.stdout)
+    assert {26311, f"Gaia DR3 {SOURCE}"} <= set(summary["clipped"])
+    assert summary["clipped_mag"][f"Gaia DR3 {SOURCE}"] > 0
 
 
 def test_the_bench_s_hash_covers_the_table(folder):

@@ -30,6 +30,7 @@ Window = Literal["gaussian", "plain"]
 BoolArray = npt.NDArray[np.bool_]
 
 CLIP_SIGMAS = 3.0
+BLOCK_PX, NOISIER_PERCENT = 32, 90
 CLIPPED_SIGMA = 0.986578  # the sigma of a normal distribution cut at 3 sigma: sqrt(1 - 6 pdf(3) / (2 cdf(3) - 1))
 MIN_STEP_PX = 1e-7
 EIGHT_NEIGHBOURS = np.ones((3, 3), dtype=np.int8)
@@ -130,6 +131,23 @@ def estimate_background(image: npt.NDArray[Any], step: float | None = None) -> B
     kept = checked[np.abs(checked - median) <= half_width]
     noise = float(kept.std()) / CLIPPED_SIGMA
     return Background(float(kept.mean()), max(noise, step / math.sqrt(12)))
+
+
+def noisiest_background(image: FloatArray, step: float = 1.0) -> Background:
+    """The level of an image (h, w) in steps of `step`, such as DN, and the noise of its noisier parts, at least rounding's.
+
+    A screen's black glows over a part of the detector; beyond it many an ADC clips at 0, and has no noise at all.
+    """
+    rows, columns = (max(size // BLOCK_PX, 1) for size in image.shape)
+    height, width = image.shape[0] // rows, image.shape[1] // columns
+    blocks = image[: rows * height, : columns * width].reshape(rows, height, columns, width).swapaxes(1, 2)
+    values = blocks.reshape(rows * columns, height * width)
+    values = values - np.median(values, axis=1, keepdims=True)
+    # The median deviation of whole steps is a whole one: half a step more, so that nothing of the noise is cut off.
+    sigma = MAD_TO_SIGMA * (np.median(np.abs(values), axis=1, keepdims=True) + step / 2)
+    kept = np.abs(values) <= CLIP_SIGMAS * sigma
+    noise = np.sqrt((values**2 * kept).sum(axis=1) / kept.sum(axis=1)) / CLIPPED_SIGMA
+    return Background(float(np.median(image)), max(float(np.percentile(noise, NOISIER_PERCENT)), step / math.sqrt(12)))
 
 
 def find_stars(

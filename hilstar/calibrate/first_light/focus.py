@@ -9,7 +9,7 @@ from scipy.special import ndtr
 
 from hilstar.arrays import FloatArray
 from hilstar.errors import InputError
-from hilstar.tracker.centroids import CentroidSettings, find_stars
+from hilstar.tracker.centroids import CentroidSettings, find_stars, noisiest_background
 
 THRESHOLD_SIGMA = 8.0
 MIN_DOTS = 5
@@ -37,7 +37,8 @@ def sharpness(image: FloatArray, dot_side_px: float) -> Sharpness:
 
     Raises InputError where too few dots are there.
     """
-    found = find_stars(image, CentroidSettings(threshold_sigma=THRESHOLD_SIGMA, minimum_pixels=2, window_sigma_px=1.5))
+    settings = CentroidSettings(threshold_sigma=THRESHOLD_SIGMA, minimum_pixels=2, window_sigma_px=1.5)
+    found = find_stars(image, settings, noisiest_background(image))
     kept = ~found.at_edge
     x_px, y_px = found.x_px[kept], found.y_px[kept]
     if len(x_px) < MIN_DOTS:

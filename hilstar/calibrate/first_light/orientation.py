@@ -11,7 +11,7 @@ from hilstar.arrays import FloatArray
 from hilstar.bench.config import Monitor
 from hilstar.calibrate.first_light.patterns import Figure
 from hilstar.errors import InputError
-from hilstar.tracker.centroids import CentroidSettings, find_stars
+from hilstar.tracker.centroids import CentroidSettings, find_stars, noisiest_background
 from hilstar.twin.bench_geometry import BenchGeometry
 
 THRESHOLD_SIGMA = 8.0
@@ -56,7 +56,8 @@ def see_figure(image: FloatArray, figure: Figure, geometry: BenchGeometry) -> Se
 
     Raises InputError where it is not there, or not as large as the focal lengths say.
     """
-    found = find_stars(image, CentroidSettings(threshold_sigma=THRESHOLD_SIGMA, minimum_pixels=MIN_PIXELS))
+    settings = CentroidSettings(threshold_sigma=THRESHOLD_SIGMA, minimum_pixels=MIN_PIXELS)
+    found = find_stars(image, settings, noisiest_background(image))
     if len(found) < len(figure.x_px):
         raise InputError(f"{len(found)} of the figure's three squares are in the image; {NOT_SEEN}")
     largest = np.argsort(-found.pixels, kind="stable")[:3]

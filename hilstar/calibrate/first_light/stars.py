@@ -17,8 +17,8 @@ from hilstar.calibrate.first_light.patterns import CodeImage, Pattern
 from hilstar.calibrate.first_light.rooms import MAX_FILL, Looked, Room
 from hilstar.errors import InputError
 from hilstar.rotation import to_matrix
-from hilstar.tracker.centroids import Centroids, CentroidSettings, find_stars
-from hilstar.units import MAD_TO_SIGMA, MAG_PER_RELATIVE
+from hilstar.tracker.centroids import Centroids, CentroidSettings, find_stars, noisiest_background
+from hilstar.units import MAG_PER_RELATIVE
 
 ATTITUDES, SEED = 40, 3  # random ones, of which the fields with the most stars are shown
 FIELDS = 3
@@ -165,5 +165,5 @@ def _found(room: Room, image: FloatArray) -> tuple[Centroids, float]:
     settings = CentroidSettings(
         THRESHOLD_SIGMA, 2, window_sigma_px=WINDOW_SIGMA_PX, window_radius_px=RADIUS_PX, psf_sigma_px=(psf[0], psf[1])
     )
-    noise_dn = float(MAD_TO_SIGMA * np.median(np.abs(image - np.median(image)))) or 1.0
-    return find_stars(image, settings), noise_dn
+    background = noisiest_background(image)
+    return find_stars(image, settings, background), background.noise

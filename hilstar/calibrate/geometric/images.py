@@ -14,7 +14,7 @@ from hilstar.arrays import FloatArray
 from hilstar.calibrate.geometric.observed import Observed
 from hilstar.errors import InputError
 from hilstar.reading import read_bytes
-from hilstar.tracker.centroids import CentroidSettings, find_stars
+from hilstar.tracker.centroids import CentroidSettings, find_stars, noisiest_background
 
 FITS_ENDINGS = (".fits", ".fit", ".fts")
 FITS_MAGIC = b"SIMPLE  ="
@@ -41,7 +41,8 @@ def measure_images(paths: Sequence[Path], dark: Path | None, resolution_px: tupl
         taken[frame, pose] = path
         image = read_image(path, resolution_px)
         _refuse_saturated(path, image)
-        found = find_stars(image - under if under is not None else image, _settings())
+        above = image - under if under is not None else image
+        found = find_stars(above, _settings(), noisiest_background(above))
         kept = ~found.at_edge
         seen.append((frame, pose, found.x_px[kept], found.y_px[kept]))
     count = [len(x) for _, _, x, _ in seen]

@@ -11,7 +11,7 @@ from scipy.special import ndtr
 from hilstar.bench.bench_file import read_bench_file
 from hilstar.calibrate.first_light import session as sessions
 from hilstar.calibrate.first_light.focus import sharpness
-from hilstar.calibrate.first_light.orientation import WAYS, Mounting, corrected, keys_of_ways, look_of, see_figure
+from hilstar.calibrate.first_light.orientation import UPRIGHT, WAYS, Mounting, corrected, keys_of_ways, look_of, see_figure
 from hilstar.calibrate.first_light.patterns import Pattern, black, figure_for, off_screen, on_screen
 from hilstar.calibrate.first_light.records import Change, Outcome
 from hilstar.calibrate.first_light.rewrite import rewrite
@@ -82,6 +82,15 @@ def test_a_key_says_where_the_squares_of_its_way_round_are(key):
     assert f"largest square {'top' if corner[1] < 0 else 'bottom'} {'left' if corner[0] < 0 else 'right'}," in words
     sides = {(2, 0): "to its right", (-2, 0): "to its left", (0, 2): "below it", (0, -2): "above it"}
     assert f"next one {sides[tuple(right - corner)]}, the smallest {sides[tuple(below - corner)]}" in words
+
+
+def test_a_detector_that_is_clipped_at_zero_beyond_the_screen_s_glow_sees_the_figure():
+    """Six tenths of the image have no noise at all, as where an ADC without offset sees no screen."""
+    figure = figure_for(GEOMETRY)
+    image = np.rint(spots(figure, UPRIGHT) + np.random.default_rng(2).normal(0, 1.5, (400, 400)))
+    image[:, :60], image[:, 340:], image[:60], image[340:] = 0, 0, 0, 0
+    assert (image == 0).mean() > 0.5
+    assert see_figure(image, figure, GEOMETRY).way == UPRIGHT
 
 
 def test_an_upright_figure_leaves_the_mounting_alone():

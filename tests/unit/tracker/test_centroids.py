@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hilstar.tracker.centroids import Background, CentroidSettings, find_stars
+from hilstar.tracker.centroids import Background, CentroidSettings, find_stars, noisiest_background
 
 SIZE_PX = 40
 BACKGROUND = Background(0.0, 1.0)
@@ -29,3 +29,15 @@ def test_a_centre_that_leaves_the_image_is_measured_alike_at_all_four_edges(wind
             x_px, y_px = SIZE_PX - 1 - y_px, x_px
         assert (x_px, y_px) == pytest.approx((turned[0].x_px[0], turned[0].y_px[0]), abs=SAME_PX)
         assert star.flux[0] == pytest.approx(turned[0].flux[0], rel=1e-6)
+
+
+def test_the_noise_of_the_noisier_parts_is_found_beside_a_clipped_one():
+    """A third of the image has noise of 2 DN; the median deviation of the whole is 0."""
+    rng = np.random.default_rng(4)
+    image = np.zeros((256, 384))
+    image[:, :128] = np.rint(rng.normal(0, 2.0, (256, 128)))
+    found = noisiest_background(image)
+    # 32 blocks of 1024 pixels: each is known to 2 %, and the 90th percentile lies among the upper third of them.
+    assert found.noise == pytest.approx(2.0, rel=0.06)
+    assert found.level == 0
+    assert noisiest_background(np.zeros((40, 40)), 5.0).noise == pytest.approx(5 / np.sqrt(12))

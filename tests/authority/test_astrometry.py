@@ -119,6 +119,19 @@ def test_stars_of_a_frame_stand_where_erfa_sees_them_from_a_spacecraft_about_the
     assert np.abs(plain.x_px[:30] - sprites.x_px[:30]).max() > 0.01
 
 
+def test_a_spacecraft_s_velocity_joins_that_of_the_earth_by_the_ephemeris(bench_with):
+    """As Basilisk's does about the Earth: from its centre, and from there aberrated once more."""
+    bench = bench_with('[sky]\nepoch_utc = "2026-11-21T00:00:00Z"\n[spacecraft]\norbit = "geocentre"\n')
+    velocity_km_s, q = np.array([3.0, -6.5, 2.5]), from_radec_roll_deg(200.0, 35.0, 10.0)
+    sprites = bench.frame_sprites(q, None, velocity_km_s)
+    assert sprites is not None
+    beta = velocity_km_s / LIGHT_KM_S
+    seen = erfa.ab(bench.shown_stars.vectors[sprites.star], beta, FAR_FROM_THE_SUN_AU, np.sqrt(1 - beta @ beta))
+    x_px, y_px = bench.camera.project(seen @ (bench.camera.cam_to_image @ to_matrix(q)).T)
+    assert len(sprites) > 30
+    assert np.hypot(x_px - sprites.x_px, y_px - sprites.y_px).max() < ORBIT_LIMIT_PX
+
+
 def test_pixels_are_those_of_astropy_s_tangent_projection(bench_with, rng):
     """Our camera against WCSLIB's TAN, alignment and principal point included."""
     bench = bench_with("q_cam_to_mon = [0.99, 0.05, -0.1, 0.0854]\nprincipal_point_px = [140.0, 130.5]\n")

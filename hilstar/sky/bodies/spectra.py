@@ -47,7 +47,7 @@ def reflected(names: tuple[str, ...]) -> Library:
     """The spectra of bodies, as a library of their own."""
     stars = load_library()
     sunlight = stars.flux[stars.spectral_type.index(SUNLIGHT)]
-    flux = np.array([sunlight * albedo(name, stars.wavelength_nm) for name in names]).reshape(len(names), -1)
+    flux = np.array([sunlight * albedo(name, stars.wavelength_nm) for name in names]).reshape(len(names), len(stars.wavelength_nm))
     colour = bodies_bv_mag(names)
     unscaled = Library(stars.wavelength_nm, flux, names, colour, np.full(len(names), np.nan))
     mean = band_mean(unscaled, load_curve("johnson-v", "johnson-v"))

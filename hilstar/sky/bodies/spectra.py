@@ -47,7 +47,8 @@ def reflected(names: tuple[str, ...]) -> Library:
     """The spectra of bodies, as a library of their own."""
     stars = load_library()
     sunlight = stars.flux[stars.spectral_type.index(SUNLIGHT)]
-    flux = np.array([sunlight * albedo(name, stars.wavelength_nm) for name in names]).reshape(len(names), len(stars.wavelength_nm))
+    lit = [sunlight * albedo(name, stars.wavelength_nm) for name in names]
+    flux = np.array(lit).reshape(len(names), len(stars.wavelength_nm))  # of no bodies too
     colour = bodies_bv_mag(names)
     unscaled = Library(stars.wavelength_nm, flux, names, colour, np.full(len(names), np.nan))
     mean = band_mean(unscaled, load_curve("johnson-v", "johnson-v"))

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import msgspec
 
 from hilstar.bench.config import GEOCENTRE, BenchConfig, parse_config
+from hilstar.bench.config.when import with_dates
 from hilstar.errors import InputError
 from hilstar.monitor.calibration import BUILT_IN
 from hilstar.reading import MAX_TOML_BYTES, read_bytes, read_text
@@ -45,6 +46,14 @@ def bench_file_of(path: Path, text: str) -> BenchFile:
     """The bench file that `path` would be with this text. Raises InputError as `read_bench_file` does."""
     config = parse_config(path, text)
     return BenchFile(path, text, config, _sha256(config, path.parent))
+
+
+def dated(file: BenchFile, scale: str | None, first_ns: int) -> BenchFile:
+    """The file for a source whose first time is `first_ns` of a time scale. Raises InputError (see `with_dates`)."""
+    try:
+        return replace(file, config=with_dates(file.config, scale, first_ns))
+    except InputError as error:
+        raise InputError(f"{file.path}: {error}") from error
 
 
 def _sha256(config: BenchConfig, folder: Path) -> str:

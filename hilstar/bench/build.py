@@ -12,7 +12,7 @@ from msgspec.structs import replace
 from hilstar.bench.bench_file import BenchFile, read_bench_file
 from hilstar.bench.cameras import bench_camera
 from hilstar.bench.config import DEFAULT_BRIGHTEST_V_MAG, BenchConfig, RenderSettings, Tracker
-from hilstar.bench.config.when import has_observer
+from hilstar.bench.config.when import epoch_utc_ns, has_observer
 from hilstar.bench.effort import Effort, Light, faintest_shown_e_per_s, plan_effort
 from hilstar.bench.frame import Bench
 from hilstar.bench.orientation import scan_of
@@ -145,6 +145,7 @@ def moved(stars: Stars, moving: MovingSky | None) -> Stars:
 def bench_stars(config: BenchConfig, folder: Path, moving: MovingSky | None = None) -> Stars:
     """The stars of a bench with their electron rates, which are computed only here, as `moving`'s observer sees them."""
     sky = config.sky
+    epoch_utc_ns(config)  # which refuses one that a source was to give
     source = sky.catalogue if sky.catalogue == "hipparcos" else folder / sky.catalogue
     chosen = choose_catalog(Choice(source, sky.with_hipparcos, sky.catalogue_epoch_jyear))
     catalog = chosen.brighter_than(sky.faintest_v_mag)

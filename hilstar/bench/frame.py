@@ -55,7 +55,7 @@ class Frame:
     codes: Codes
     truth: npt.NDArray[np.void]
     star: IntArray
-    t_ns: int = 0
+    t_ns: int | None = None
 
 
 class Drawn:
@@ -134,13 +134,13 @@ class Bench:
         q_icrs_to_cam: FloatArray | None,
         frame: int = 0,
         rate_cam_rad_s: Vector | FloatArray | None = None,
-        t_ns: int = 0,
+        t_ns: int | None = None,
     ) -> Drawn:
         """Draw the levels for an attitude; None gives a blank frame. The frame path: no copy, no table.
 
         `frame` counts the frames shown, for temporal dithering. With a rate that moves stars by more than
         `[render] motion_above_px`, each star is drawn along its path while its row is lit; the attitude is then that at the
-        middle row's first light. Bodies are where they are at `t_ns`.
+        middle row's first light. Bodies are where they are at `t_ns`, by default at the start.
         """
         return self.draw_sprites(self.frame_sprites(q_icrs_to_cam, rate_cam_rad_s, t_ns=t_ns), frame)
 
@@ -149,7 +149,7 @@ class Bench:
         q_icrs_to_cam: FloatArray | None,
         rate_cam_rad_s: Vector | FloatArray | None = None,
         velocity_km_s: FloatArray | None = None,
-        t_ns: int = 0,
+        t_ns: int | None = None,
     ) -> Sprites | None:
         """The sprites of a frame (see `draw`), before anything is drawn; None for a blank one.
 
@@ -194,7 +194,7 @@ class Bench:
         for q, rate in ((WARM_UP_ATTITUDE, WARM_UP_RATE_RAD_S), (WARM_UP_ATTITUDE, None), (None, None)):
             _ = self.draw(q, 0, rate).levels
 
-    def frame(self, q_icrs_to_cam: Sequence[float] | FloatArray, number: int = 0, t_ns: int = 0) -> Frame:
+    def frame(self, q_icrs_to_cam: Sequence[float] | FloatArray, number: int = 0, t_ns: int | None = None) -> Frame:
         """Draw one frame and read all of it back; the arrays are copies.
 
         Stars too faint for the monitor are in the linear image and the truth, and not drawn. `number` counts frames, for
@@ -214,7 +214,7 @@ class Bench:
         order = np.argsort(truth["v_mag"], kind="stable")
         return Frame(q, linear, levels, self.code_values(levels), truth[order], sprites.star[order], t_ns)
 
-    def seen(self, stars: Stars, t_ns: int = 0, velocity_km_s: FloatArray | None = None) -> Stars:
+    def seen(self, stars: Stars, t_ns: int | None = None, velocity_km_s: FloatArray | None = None) -> Stars:
         """`stars` or `shown_stars` as they are seen at `t_ns`, bodies among them, with a velocity as in `frame_sprites`."""
         return stars.seen_at(velocity_km_s) if self.moving is None else self.moving.seen(stars, t_ns, velocity_km_s)
 

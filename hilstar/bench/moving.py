@@ -6,11 +6,11 @@ import logging
 from pathlib import Path
 
 from hilstar.bench.config import GEOCENTRE, BenchConfig
-from hilstar.bench.config.when import epoch_utc_ns
+from hilstar.bench.config.when import epoch_utc_ns, jyear
 from hilstar.reading import read_text
 from hilstar.scene.camera import Camera
 from hilstar.sky.bodies.kernel import Kernel
-from hilstar.sky.bodies.moving import PLANETS, BodyLight, MovingSky
+from hilstar.sky.bodies.moving import PLANETS, YEAR_NS, BodyLight, MovingSky
 from hilstar.sky.bodies.orbit import TLE_ADVICE, Geocentre, TleOrbit
 from hilstar.sky.bodies.spectra import bodies_bv_mag, bodies_electrons_per_s
 from hilstar.sky.electrons import Optics, Photometry
@@ -31,12 +31,14 @@ def moving_sky(config: BenchConfig, folder: Path, optics: Optics) -> MovingSky:
     utc_ns = epoch_utc_ns(config)
     if utc_ns is None:
         raise AssertionError("a file with an observer has a date")
+    # A source's own dates count from 1970, and its stars are those of its day.
+    start_ns = round((config.sky.epoch_jyear - jyear(utc_ns)) * YEAR_NS)
     orbit = config.spacecraft.orbit or GEOCENTRE
-    observer = Geocentre() if orbit == GEOCENTRE else tle_orbit(folder / orbit, utc_ns)
+    observer = Geocentre() if orbit == GEOCENTRE else tle_orbit(folder / orbit, utc_ns + start_ns)
     names = body_names(config)
     sky = config.sky
     rates = bodies_electrons_per_s(names, sky.brightness, optics, Photometry(sky.zero_point, sky.passband_weighting))
-    return MovingSky(Kernel(), observer, utc_ns, BodyLight(names, bodies_bv_mag(names), rates))
+    return MovingSky(Kernel(), observer, utc_ns, BodyLight(names, bodies_bv_mag(names), rates), start_ns)
 
 
 def tle_orbit(path: Path, utc_ns: int) -> TleOrbit:
@@ -64,7 +66,7 @@ def body_names(config: BenchConfig) -> tuple[str, ...]:
     )
 
 
-def wide_bodies(moving: MovingSky | None, camera: Camera, t_ns: int = 0) -> list[str]:
+def wide_bodies(moving: MovingSky | None, camera: Camera, t_ns: int | None = None) -> list[str]:
     """One line for each body whose disc is wider than POINT_PX of a camera's pixels, the widest first."""
     found = {} if moving is None else moving.diameters_arcsec(t_ns)
     px_per_arcsec = camera.scales_px_rad()[1] / ARCSEC_PER_RAD

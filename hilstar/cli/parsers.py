@@ -40,12 +40,12 @@ def parse_attitude(command: str, radec: str | None, quaternion: str | None) -> A
     return checked_quaternion(parse_numbers(quaternion or "", 4, "--quaternion", "W,X,Y,Z"))
 
 
-def parse_at(command: str, at_s: float | None, config: BenchConfig) -> int:
-    """The moment of one frame, ns after the bench file's `epoch_utc`. Raises InputError where nothing moves."""
+def parse_at(command: str, at_s: float | None, config: BenchConfig) -> int | None:
+    """The moment of one frame, ns after `epoch_utc`; None for that one. Raises InputError where nothing moves."""
     from hilstar.bench.config.when import has_observer
 
     if at_s is None:
-        return 0
+        return None
     if not abs(at_s) <= MAX_AT_S:
         raise InputError(f"{command} --at {at_s:g}: write seconds, 1e10 at most")
     if not has_observer(config):

@@ -60,6 +60,10 @@ class Play(Protocol):
         """Whether stars are drawn along their paths; None: as the bench file says."""
 
     @property
+    def first_ns(self) -> int:
+        """The time of the log's or the run's first frame."""
+
+    @property
     def told(self) -> list[tuple[str, str]]:
         """Events to report before it begins: kinds and lines."""
 
@@ -105,6 +109,11 @@ class RunPlay:
     moving: bool | None = True  # where the run's own were
     told: list[tuple[str, str]] = field(default_factory=list)
     conventions: Conventions = PACKETS
+
+    @property
+    def first_ns(self) -> int:
+        """The time of the first frame that is replayed."""
+        return self.frames[0].t_ns
 
     @property
     def frame_count(self) -> int:

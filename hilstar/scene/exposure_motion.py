@@ -40,13 +40,13 @@ MIDDLE_S = np.zeros(1)
 class Motion:
     """An exposure: the attitude in its middle, the rate of cam in icrs (3,) in cam components, how long it lasts, and when.
 
-    `t_ns` is the time of its middle.
+    `t_ns` is the time of its middle, None where it has none.
     """
 
     q_icrs_to_cam: FloatArray
     rate_cam_rad_s: FloatArray
     exposure_s: float
-    t_ns: int = 0
+    t_ns: int | None = None
 
     def icrs_to_image(self, seconds: FloatArray, camera: Camera) -> FloatArray:
         """Matrices (k, 3, 3) from ICRS to image axes at `seconds` (k,) after the middle of the exposure.

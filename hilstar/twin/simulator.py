@@ -71,7 +71,7 @@ class Simulator:
         self.detector = Detector(tracker.detector, tracker.resolution_px, tracker.pixel_pitch_um)
         self.renderer = Renderer(Target(tracker.resolution_px, tracker.psf_sigma_px), context)
 
-    def motion(self, q_icrs_to_cam: FloatArray, rate_cam_rad_s: FloatArray, t_ns: int = 0) -> Motion:
+    def motion(self, q_icrs_to_cam: FloatArray, rate_cam_rad_s: FloatArray, t_ns: int | None = None) -> Motion:
         """An exposure of this tracker, by the attitude in its middle (unit quaternion) and a constant rate."""
         return Motion(q_icrs_to_cam, rate_cam_rad_s, self.config.tracker.exposure_s, t_ns)
 

@@ -195,11 +195,11 @@ def _aem(path: Path, text: str) -> LogReading:
     from hilstar.attitude.logs.aem.reader import CONVENTIONS, read_aem
 
     try:
-        entries = read_aem(text)
+        entries, scale = read_aem(text)
     except AemFaultError as fault:
         raise InputError(f"{path}{fault.where}: {fault}") from fault
     advice = "sort its lines, and let no blocks overlap; leap seconds are not counted, so write TAI across one"
-    return LogReading(entries, CONVENTIONS, advice)
+    return LogReading(entries, replace(CONVENTIONS, scale=scale), advice)
 
 
 def _ulog(path: Path, stated: Stated) -> LogReading:

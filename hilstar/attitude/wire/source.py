@@ -55,7 +55,8 @@ class Conventions:
     """What a source means by its numbers: `--explain` shows it, and the documentation says the same.
 
     `turns` says from which frame to which; `scalar` the order of the components; `time` the scale and the zero of its times;
-    `of_body` whether `[tracker] q_body_to_cam` applies; `written` gives an attitude in the source's own words.
+    `of_body` whether `[tracker] q_body_to_cam` applies; `written` gives an attitude in the source's own words; `scale` is the
+    time scale (UTC, TAI, TT, TDB, GPS) whose ns since 1970-01-01T00:00:00 its times are, in days of 86400 s; None for others.
     """
 
     source: str
@@ -64,6 +65,7 @@ class Conventions:
     time: str
     of_body: bool
     written: Callable[[FloatArray], str]
+    scale: str | None = None
 
     def lines(self, mounting: Mounting) -> list[str]:
         """The conventions, and the self-check, for a person."""

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 
 from hilstar.bench.config.bench import BenchConfig
 from hilstar.bench.config.spacecraft import GEOCENTRE
@@ -14,12 +16,20 @@ from hilstar.units import NS_PER_S
 
 UNIX_JD, DAY_NS = 2_440_587.5, 86_400 * NS_PER_S
 EPOCH_KEY = "[sky] epoch_utc ="
+FROM_SOURCE = "source"
+TT_FROM_TAI_NS, TAI_FROM_GPS_NS = 32_184_000_000, 19 * NS_PER_S  # TDB is TT within 2 ms
+SCALES = ("UTC", "TAI", "TT", "TDB", "GPS")
 
 
 def epoch_utc_ns(config: BenchConfig) -> int | None:
     """The UTC of t = 0, ns since 1970 where every day has 86400 s; None where the file has none. Raises InputError."""
     if config.sky.epoch_utc is None:
         return None
+    if config.sky.epoch_utc == FROM_SOURCE:
+        raise InputError(
+            f'{EPOCH_KEY} "{FROM_SOURCE}" is for a log that has dates (replay, simulate --log, attitude LOG);'
+            " write the UTC of t_ns = 0"
+        )
     from hilstar.attitude.logs.earth import utc_ns_of  # with ERFA 30 ms, which a bench without a date does not need
 
     return utc_ns_of(config.sky.epoch_utc, EPOCH_KEY)
@@ -51,13 +61,53 @@ def with_epoch(config: BenchConfig, path: Path, tables: dict[str, Any]) -> Bench
             f"{path}: [attitude] use_velocity = true adds Basilisk's velocity to that of [spacecraft] orbit; write"
             ' use_velocity = false, or orbit = "geocentre"'
         )
+    if config.sky.epoch_utc == FROM_SOURCE:
+        return config
     try:
         utc_ns = epoch_utc_ns(config)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     if utc_ns is None:
         return config
+    return msgspec.structs.replace(config, sky=msgspec.structs.replace(config.sky, epoch_jyear=jyear(utc_ns)))
+
+
+def with_dates(config: BenchConfig, scale: str | None, first_ns: int) -> BenchConfig:
+    """The same for a source that gives the dates: its first time, ns since 1970 on a time scale (see `Conventions`).
+
+    `epoch_utc` is then the UTC of its t_ns = 0 by the leap seconds of that day, and `epoch_jyear` the beginning of the day: for
+    it stars are placed. Unchanged where the file has a date of its own. Raises InputError for a source without dates.
+    """
+    if config.sky.epoch_utc != FROM_SOURCE:
+        return config
+    if scale not in SCALES:
+        raise InputError(
+            f'{EPOCH_KEY} "{FROM_SOURCE}": the times of this log are no dates in {", ".join(SCALES[:-1])} or {SCALES[-1]};'
+            " write the UTC of t_ns = 0"
+        )
+    ahead_ns = _ahead_of_utc_ns(scale, first_ns)
+    day_ns = (first_ns - ahead_ns) // DAY_NS * DAY_NS
+    zero = str(np.datetime64(-ahead_ns, "ns"))
+    return msgspec.structs.replace(config, sky=msgspec.structs.replace(config.sky, epoch_utc=zero, epoch_jyear=jyear(day_ns)))
+
+
+def jyear(utc_ns: int) -> float:
+    """The Julian year of a UTC."""
     import erfa
 
-    sky = msgspec.structs.replace(config.sky, epoch_jyear=float(erfa.epj(UNIX_JD, utc_ns / DAY_NS)))
-    return msgspec.structs.replace(config, sky=sky)
+    return float(erfa.epj(UNIX_JD, utc_ns / DAY_NS))
+
+
+def _ahead_of_utc_ns(scale: str, t_ns: int) -> int:
+    """How far a time scale is ahead of UTC at a time of it, ns since 1970."""
+    if scale == "UTC":
+        return 0
+    import erfa
+
+    tai_from_ns = {"TAI": 0, "GPS": -TAI_FROM_GPS_NS}.get(scale, TT_FROM_TAI_NS)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", erfa.ErfaWarning)  # years after the last known leap second
+        tai = UNIX_JD, (t_ns - tai_from_ns) / DAY_NS
+        utc = erfa.taiutc(*tai)
+        year, month, day, _ = erfa.jd2cal(*utc)
+        return tai_from_ns + round(float(erfa.dat(year, month, day, 0.0)) * NS_PER_S)

@@ -93,13 +93,14 @@ def simulate_log(bench_file: Path, log: Path, frames: int | None, noise: FrameNo
     from hilstar.attitude.logs.gaps import log_joins
     from hilstar.attitude.logs.log_file import open_log
     from hilstar.attitude.wire.source import Mounting
-    from hilstar.bench.bench_file import read_bench_file
+    from hilstar.bench.bench_file import dated, read_bench_file
     from hilstar.twin.batch import log_motions, simulate_motions
 
     file = read_bench_file(bench_file)
     config = file.config
     read = open_log(log, Stated(Mounting(config.tracker.q_body_to_cam)))
     samples = read.samples
+    file = dated(file, read.conventions.scale, samples[0].t_ns)
     for _, line in [*read.told, *log_joins(samples).told]:
         say(line)
     motions = log_motions(samples, frames, config.tracker.exposure_s, math.radians(config.attitude.max_rate_deg_s))

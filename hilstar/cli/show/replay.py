@@ -70,7 +70,7 @@ def replay(
     """Show an attitude log on the monitor."""
     from hilstar.attitude.logs.entries import Stated
     from hilstar.attitude.wire.source import Mounting
-    from hilstar.bench.bench_file import read_bench_file
+    from hilstar.bench.bench_file import dated, read_bench_file
     from hilstar.run.record.frame_images import FrameImages
     from hilstar.run.replay import Wanted, plan_play
     from hilstar.run.serve import Outlet
@@ -85,6 +85,7 @@ def replay(
     mounting = Mounting(file.config.tracker.q_body_to_cam)
     stated = Stated(mounting, tuple(kernel or ()), topic, body, reference, epoch_utc, parse_place(place))
     play = plan_play(log, Wanted(parse_speed(speed), start, stop, step), file.config, stated)
+    file = dated(file, play.conventions.scale, play.first_ns)
     with (
         shown_bench(file, headless, windowed, force) as (bench, screen),
         FrameImages(output, bench) as record,

@@ -35,7 +35,7 @@ LedgerSplit = Annotated[
 ]
 
 
-def explain_bench(bench: Any, t_ns: int = 0) -> None:
+def explain_bench(bench: Any, t_ns: int | None = None) -> None:
     """Say where the stars come from, what was chosen within the tolerance, and which bodies are more than points at a time."""
     from hilstar.bench.effort import explain
     from hilstar.bench.moving import wide_bodies

@@ -60,7 +60,7 @@ def attitude(
     """Say where a log or a live stream points: quaternion, RA, Dec, roll, and the brightest stars in view."""
     from hilstar.attitude.logs.entries import Stated
     from hilstar.attitude.wire.source import Mounting
-    from hilstar.bench.bench_file import read_bench_file
+    from hilstar.bench.bench_file import dated, read_bench_file
     from hilstar.resources import resource_path
 
     live = source.suffix.lower() == ".toml"
@@ -72,6 +72,7 @@ def attitude(
     else:
         stated = Stated(mounting, tuple(kernel or ()), topic, body, reference, epoch_utc, parse_place(place))
         sample, conventions, held = _of_log(source, at, stated)
+    file = dated(file, conventions.scale, sample.t_ns)
     told = {"source": conventions.source, "held": held, **_pointing(sample, file)}
     meaning = conventions.lines(mounting)
     if as_json:

@@ -83,16 +83,18 @@ NOTHING = BodyLight((), np.empty(0), np.empty(0))
 
 
 class MovingSky:
-    """Bodies seen from an orbit; t_ns = 0 is the UTC `utc_ns`.
+    """Bodies seen from an orbit; t_ns = 0 is the UTC `utc_ns`, and stars are placed for t_ns = `start_ns`.
+
+    Times that its methods call `since_ns` count from `start_ns`.
 
     Raises InputError where the ephemeris ends before that date, or the orbit does.
     """
 
-    def __init__(self, kernel: Kernel, orbit: Orbit, utc_ns: int, bodies: BodyLight = NOTHING) -> None:
+    def __init__(self, kernel: Kernel, orbit: Orbit, utc_ns: int, bodies: BodyLight = NOTHING, start_ns: int = 0) -> None:
         self.names = names = bodies.names
-        self._kernel, self._orbit, self._utc_ns = kernel, orbit, utc_ns
+        self._kernel, self._orbit, self._utc_ns, self._start_ns = kernel, orbit, utc_ns + start_ns, start_ns
         self._bodies = bodies
-        self._epoch = tdb_of_utc(utc_ns)
+        self._epoch = tdb_of_utc(self._utc_ns)
         self._tracked = ("Sun", *(name for name in names if name != "Sun"))
         self._drawn = [self._tracked.index(name) for name in names]
         self._limits_ns = self._limits()
@@ -104,44 +106,44 @@ class MovingSky:
         self._fixed_km_s = self._seen_from(0)[1].velocity_km_s
 
     def stars_seen(self, directions: FloatArray, parallax_mas: FloatArray) -> FloatArray:
-        """Unit vectors (n, 3) of stars in directions (n, 3) from the barycentre, as they are seen at t = 0."""
+        """Unit vectors (n, 3) of stars in directions (n, 3) from the barycentre, as they are seen at the start."""
         return apparent_stars(directions, parallax_mas, self._seen_from(0)[1])
 
     def among(self, stars: Stars) -> Stars:
-        """The stars with the bodies among them at t = 0, in arrays of their own, which `seen` changes."""
+        """The stars with the bodies among them at the start, in arrays of their own, which `seen` changes."""
         both = with_bodies(stars, self.names, self._bodies.bv_mag)
-        self.seen(both, 0)
+        self.seen(both)
         return both
 
-    def seen(self, stars: Stars, t_ns: int, velocity_km_s: FloatArray | None = None) -> Stars:
-        """Stars made by `among` as they are seen at a moment: their bodies are moved there, in the arrays themselves.
+    def seen(self, stars: Stars, t_ns: int | None = None, velocity_km_s: FloatArray | None = None) -> Stars:
+        """Stars made by `among` as they are seen at a moment (None: the start): bodies are moved there, in the arrays.
 
         A velocity (3,), ICRS, adds to that of this sky's observer.
         """
-        t_ns = self._within(t_ns)
-        k, rest_ns = divmod(t_ns, self._step_ns)
+        since_ns = self._within(t_ns)
+        k, rest_ns = divmod(since_ns, self._step_ns)
         node = self._node(k)
         now = node + (self._node(k + 1) - node) * (rest_ns / self._step_ns)
         count = len(self.names)
         if count:
             stars.vectors[-count:] = now[:-1]
             stars.grid.centre[-count:] = now[:-1]
-            stars.v_mag[-count:], stars.electrons_per_s[-count:] = self._light(t_ns // MINUTE_NS)
+            stars.v_mag[-count:], stars.electrons_per_s[-count:] = self._light(since_ns // MINUTE_NS)
         if velocity_km_s is None and now[-1] @ now[-1] < UNSEEN_KM_S**2:
             return stars
         return stars.seen_at(now[-1] if velocity_km_s is None else now[-1] + velocity_km_s)
 
-    def sight(self, t_ns: int) -> Sight:
-        """What is seen at a moment, the directions aberrated by the observer's velocity at t = 0; Sun first."""
-        seen_km, view = self._seen_from(t_ns)
+    def sight(self, since_ns: int) -> Sight:
+        """What is seen at a moment, the directions aberrated by the observer's velocity at the start; Sun first."""
+        seen_km, view = self._seen_from(since_ns)
         return Sight(seen_km, view, apparent_bodies(seen_km, replace(view, velocity_km_s=self._fixed_km_s)))
 
-    def _seen_from(self, t_ns: int) -> tuple[FloatArray, Viewpoint]:
-        span, rest_ns = divmod(t_ns, SPAN_NS)
+    def _seen_from(self, since_ns: int) -> tuple[FloatArray, Viewpoint]:
+        span, rest_ns = divmod(since_ns, SPAN_NS)
         cubics = self._span(span)
         share = rest_ns / SPAN_NS
         powers, slopes = share**EXPONENTS, EXPONENTS * share ** np.maximum(EXPONENTS - 1, 0) / SPAN_S
-        place_km, velocity_km_s = self._orbit.state(self._utc_ns + t_ns)
+        place_km, velocity_km_s = self._orbit.state(self._utc_ns + since_ns)
         from_earth_km, earth_km_s = np.tensordot(powers, cubics.seen_km, 1), powers @ cubics.earth_km_s
         seen_km = from_earth_km - place_km
         # Light takes another time to the observer than to the Earth's centre: 22 ms at most in a low orbit, 700 m of the Moon
@@ -149,7 +151,7 @@ class MovingSky:
         seen_km -= (np.tensordot(slopes, cubics.seen_km, 1) + earth_km_s) * later_s[:, None]
         return seen_km, Viewpoint(powers @ cubics.earth_km + place_km, earth_km_s + velocity_km_s, -seen_km[0])
 
-    def diameters_arcsec(self, t_ns: int) -> dict[str, float]:
+    def diameters_arcsec(self, t_ns: int | None = None) -> dict[str, float]:
         """The apparent equatorial diameter of each body, arcsec."""
         distance_km = np.linalg.norm(self.sight(self._within(t_ns)).seen_km[self._drawn], axis=1)
         return {
@@ -165,7 +167,7 @@ class MovingSky:
         return Span(np.tensordot(CUBIC, np.stack(seen_km, axis=1), 1), CUBIC @ earth_km, CUBIC @ earth_km_s)
 
     def _compute_node(self, k: int) -> FloatArray:
-        """Unit vectors of the bodies, and last the change of the observer's velocity since t = 0, km/s."""
+        """Unit vectors of the bodies, and last the change of the observer's velocity since the start, km/s."""
         sight = self.sight(k * self._step_ns)
         return np.vstack([sight.directions[self._drawn], sight.view.velocity_km_s - self._fixed_km_s])
 
@@ -180,7 +182,7 @@ class MovingSky:
         return 2000.0 + (date.whole - J2000_JD + date.part) / YEAR_DAYS
 
     def _limits(self) -> tuple[int, int]:
-        """The first and the last t_ns that the ephemeris covers. Raises InputError where t = 0 is not between them."""
+        """The first and the last time since the start in the ephemeris. Raises InputError where the start is beyond it."""
         first, last = self._kernel.first_jd + EDGE_DAYS, self._kernel.last_jd - EDGE_DAYS
         limits = tuple(round((jd - self._epoch.whole - self._epoch.part) * DAY_S * NS_PER_S) for jd in (first, last))
         if not limits[0] <= 0 <= limits[1]:
@@ -188,14 +190,15 @@ class MovingSky:
             raise InputError(f"[sky] epoch_utc: the ephemeris covers {dates[0]} to {dates[1]}; write a date between them")
         return limits[0], limits[1]
 
-    def _within(self, t_ns: int) -> int:
-        """`t_ns` held within the ephemeris; a time far from t = 0 is told once, as it is most likely meant otherwise."""
-        if abs(t_ns) > YEAR_NS and not self._told:
+    def _within(self, t_ns: int | None) -> int:
+        """A time since the start, held within the ephemeris; a far one is told once, as it is most likely meant otherwise."""
+        since_ns = 0 if t_ns is None else t_ns - self._start_ns
+        if abs(since_ns) > YEAR_NS and not self._told:
             self._told = True
             log.warning(
                 "t_ns = %d is %.1f years from [sky] epoch_utc, which is the UTC of t_ns = 0: proper motion and parallax are"
                 " those of epoch_utc",
                 t_ns,
-                t_ns / YEAR_NS,
+                since_ns / YEAR_NS,
             )
-        return min(max(t_ns, self._limits_ns[0]), self._limits_ns[1])
+        return min(max(since_ns, self._limits_ns[0]), self._limits_ns[1])

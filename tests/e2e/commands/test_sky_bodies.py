@@ -14,7 +14,8 @@ from astropy.wcs import WCS
 
 from hilstar.bench.bench_file import read_bench_file
 from hilstar.bench.build import load
-from hilstar.rotation import from_radec_roll_deg
+from hilstar.rotation import conjugate, from_radec_roll_deg
+from tests.support.aem_messages import kvn
 from tests.support.commands import run_hilstar_here
 from tests.support.skies import STATION_TLE, skyfield, utc_ns
 
@@ -196,3 +197,64 @@ def test_a_date_alone_places_the_stars_of_that_year(small_bench_file):
     small_bench_file.write_text(plain + f"[sky]\nepoch_jyear = {2000 + (20778 - 10957.5) / 365.25!r}\n")
     with load(small_bench_file) as bench:
         assert np.array_equal(bench.stars.vectors, dated)
+
+
+# TAI and GPS are 37 and 18 s ahead of UTC, TT 69.184 s and TDB within 2 ms of it.
+SCALES = {"UTC": 0.0, "TAI": 37.0, "GPS": 18.0, "TT": 69.184, "TDB": 69.184}
+
+
+def moon_message(path: Path, scale: str) -> Path:
+    """An AEM of a minute from 2026-11-21 0:00 UTC on, with the Moon on the boresight."""
+    epochs = [str(np.datetime64(round((second + SCALES[scale]) * 1e9) + utc_ns("2026-11-21"), "ns")) for second in (0, 60)]
+    q = conjugate(from_radec_roll_deg(7.557, 7.141, 0.0))
+    rows = [f"{epoch} {' '.join(map(repr, np.roll(q, -1).tolist()))}" for epoch in epochs]
+    keys = {"REF_FRAME_B": "CAM", "TIME_SYSTEM": scale, "START_TIME": epochs[0], "STOP_TIME": epochs[1]}
+    path.write_text(kvn(rows, **keys))
+    return path
+
+
+def moon_px(*arguments: str | Path) -> tuple[float, float]:
+    """Where `hilstar attitude` has the Moon in the tracker's image."""
+    done = run_hilstar_here("attitude", *arguments, "--json")
+    assert done.returncode == 0, done.stderr
+    moon = json.loads(done.stdout)["stars"][0]
+    assert moon["name"] == "Moon"
+    return moon["x_px"], moon["y_px"]
+
+
+@pytest.mark.parametrize("scale", SCALES)
+def test_the_dates_of_a_message_place_bodies_on_its_own_time_scale(bodies_file, scale):
+    q = ",".join(map(repr, from_radec_roll_deg(7.557, 7.141, 0.0).tolist()))
+    (bodies_file.parent / "log.csv").write_text(f"t_s,qw,qx,qy,qz\n0,{q}\n")
+    stated = moon_px(bodies_file.parent / "log.csv", "--bench", bodies_file)
+    bodies_file.write_text(bodies_file.read_text().replace("2026-11-21T00:00:00Z", "source"))
+    dated = moon_px(moon_message(bodies_file.parent / "log.aem", scale), "--bench", bodies_file)
+    # 2 ms of the Moon are 0.0012 arcsec, 3e-5 px; a microsecond of rounding is nothing
+    assert np.hypot(*np.subtract(stated, dated)) < 4e-5
+
+
+def test_a_message_with_dates_is_replayed_on_them(bodies_file):
+    bodies_file.write_text(bodies_file.read_text().replace("2026-11-21T00:00:00Z", "source"))
+    log = moon_message(bodies_file.parent / "log.aem", "TAI")
+    done = run_hilstar_here("replay", bodies_file, log, "--headless", "--speed", "max", "--step", "30", "--json", "--explain")
+    assert done.returncode == 0, done.stderr
+    assert "Moon: 1897" in done.stderr
+    assert json.loads(done.stdout)["clipped"]["bodies"] == ["Moon", "Saturn"]
+
+
+@pytest.mark.parametrize("command", [("frame", "--radec", MOON, "--truth"), ("simulate", "--radec", MOON, "-o")])
+def test_dates_of_a_source_are_refused_where_there_is_none(bodies_file, command):
+    bodies_file.write_text(bodies_file.read_text().replace("2026-11-21T00:00:00Z", "source"))
+    done = run_hilstar_here(
+        command[0], bodies_file, *command[1:], bodies_file.parent / ("t.csv" if "--truth" in command else "s.fits")
+    )
+    assert done.returncode == 2
+    assert "is for a log that has dates" in done.stderr and done.stderr.count("\n") == 1
+
+
+def test_a_log_without_dates_gives_none(bodies_file):
+    bodies_file.write_text(bodies_file.read_text().replace("2026-11-21T00:00:00Z", "source"))
+    (bodies_file.parent / "log.csv").write_text("t_s,qw,qx,qy,qz\n0,1,0,0,0\n1,1,0,0,0\n")
+    done = run_hilstar_here("replay", bodies_file, bodies_file.parent / "log.csv", "--headless")
+    assert done.returncode == 2
+    assert "are no dates in UTC, TAI, TT, TDB or GPS" in done.stderr and done.stderr.count("\n") == 1

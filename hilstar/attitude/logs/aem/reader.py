@@ -47,8 +47,8 @@ CONVENTIONS = Conventions(
 )
 
 
-def read_aem(text: str) -> list[Entry]:
-    """The attitudes of an AEM's text, each with its place, in the order of the blocks' first epochs.
+def read_aem(text: str) -> tuple[list[Entry], str]:
+    """The attitudes of an AEM's text, each with its place, in the order of the blocks' first epochs; and its TIME_SYSTEM.
 
     Raises AemFaultError for anything that is not an AEM of quaternions between a body frame and the ICRF.
     """
@@ -63,7 +63,7 @@ def read_aem(text: str) -> list[Entry]:
         if entries:
             _part(entries, following)
         entries += following
-    return entries
+    return entries, blocks[0].meta["TIME_SYSTEM"]
 
 
 def _part(entries: list[Entry], following: list[Entry]) -> None:

@@ -95,6 +95,7 @@ def _conventions(said: dict[str, Any]) -> Conventions:
         "TDB from 1970-01-01T00:00:00 TDB (ephemeris time + 946728000 s), from clock ticks by the SCLK kernel",
         of_body=True,
         written=lambda q: f"m2q(C), C from J2000 = {components(q)}",
+        scale="TDB",
     )
 
 

@@ -204,6 +204,7 @@ def _conventions(topic: Topic, start: Start, reference: Reference) -> Convention
         time,
         of_body=True,
         written=_written(reference, start.first_ns),
+        scale="UTC" if start.first_ns >= FIRST_DATE_NS else None,
     )
 
 

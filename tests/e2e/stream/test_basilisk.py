@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from tests.support.basilisk import Truth, basilisk, rotation
 from tests.support.benches import bench_text
+from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.senders import free_port, publisher
 from tests.support.servers import SUBSCRIBED_S, interrupted, listening, serving
 from tests.support.viz_message import craft, viz_message
@@ -160,3 +161,30 @@ def test_broken_messages_among_good_ones_are_refused_and_other_topics_do_not_cou
     assert packets["accepted"] >= SOME
     assert packets["refused_by"]["format"] - packets["accepted"] in {1, 2}
     assert packets["received"] == packets["accepted"] + packets["refused_by"]["format"]
+
+
+@pytest.mark.parametrize(
+    ("keys", "said"),
+    [
+        ({"endpoint": "tcp://192.168.1.2:5570"}, "ssh -L 5570:127.0.0.1:5570 HOST"),
+        ({"endpoint": "tcp://*:5556", "lockstep": True}, "Basilisk knows no keys"),
+        ({"endpoint": "udp://127.0.0.1:5570"}, "tcp://HOST:PORT"),
+        ({"curve_secret_key": "k"}, "[attitude] curve_secret_key: Basilisk knows no keys"),
+        ({"clock": "shared"}, "Basilisk sends the time of its simulation"),
+        ({"source": "zmq", "spacecraft": "a"}, "spacecraft is for source"),
+        ({"spacecraft": ["a"]}, "[attitude] spacecraft"),
+    ],
+)
+def test_keys_that_are_wrong_get_one_line(tmp_path, keys, said):
+    (tmp_path / "bench.toml").write_text(bench_text({"attitude": {"source": "vizard"} | keys}))
+    assert_refused(run_hilstar_here("serve", tmp_path / "bench.toml", "--headless", "--duration", "0.1"), 2, said)
+
+
+@pytest.mark.parametrize("velocity", [True, False])
+def test_explain_says_basilisk_s_conventions_with_an_attitude_in_its_words(tmp_path, velocity):
+    attitude = {"source": "vizard", "endpoint": f"tcp://127.0.0.1:{free_port()}", "use_velocity": velocity}
+    (tmp_path / "bench.toml").write_text(bench_text(BENCH, {"attitude": attitude}))
+    result = run_hilstar_here("serve", tmp_path / "bench.toml", "--headless", "--frames", "1", "--explain")
+    assert result.returncode == 4  # nobody sent an attitude
+    assert "sigma_BN = (-0.0399925, 0.2600642, -0.2854911) Alnilam" in result.stderr
+    assert ("aberrates the stars" in result.stderr) is velocity

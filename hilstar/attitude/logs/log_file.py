@@ -86,19 +86,23 @@ def _refuse_other_topics(path: Path) -> None:
         raise InputError(f"{path}: contains no attitude; its topics are {names}, and only {ATTITUDE_TOPIC} is read")
 
 
-def write_log(path: Path, samples: Sequence[AttitudeSample]) -> None:
+def write_log(path: Path, samples: Sequence[AttitudeSample], scale: str | None = None) -> None:
     """Write samples, whose times increase, in the format of the name's ending; an old file is replaced whole or not at all.
 
-    CSV, JSON lines and MCAP keep every bit. An AEM drops sequence numbers, and the rates of a block where any is missing.
+    CSV, JSON lines and MCAP keep every bit. An AEM states `scale`, and drops sequence numbers, and the rates of a block
+    where any is missing.
     Raises InputError for another ending, for no samples, and when the file cannot be written.
     """
-    write = _WRITERS.get(path.suffix.lower())
-    if write is None:
-        raise InputError(f"{path}: not a log's name; end it in one of {', '.join(_WRITERS)}")
+    ending = path.suffix.lower()
+    if ending not in _WRITERS and ending not in _AEM_IN_XML:
+        raise InputError(f"{path}: not a log's name; end it in one of {', '.join([*_WRITERS, *_AEM_IN_XML])}")
     if not samples:
         raise InputError(f"{path}: no attitude to write")
     with whole_file(path) as part, part.open("wb") as file:
-        write(file, samples)
+        if ending in _AEM_IN_XML:
+            _write_aem(file, samples, _AEM_IN_XML[ending], scale)
+        else:
+            _WRITERS[ending](file, samples)
 
 
 def log_timeline(samples: list[AttitudeSample], policy: Policy, joins: LogJoins | None = None) -> Timeline:
@@ -192,14 +196,12 @@ def _mcap(path: Path) -> LogReading:
 
 def _aem(path: Path, text: str) -> LogReading:
     from hilstar.attitude.logs.aem.keywords import AemFaultError
-    from hilstar.attitude.logs.aem.reader import CONVENTIONS, read_aem
+    from hilstar.attitude.logs.aem.reader import read_aem
 
     try:
-        entries, scale = read_aem(text)
+        return read_aem(text)
     except AemFaultError as fault:
         raise InputError(f"{path}{fault.where}: {fault}") from fault
-    advice = "sort its lines, and let no blocks overlap; leap seconds are not counted, so write TAI across one"
-    return LogReading(entries, replace(CONVENTIONS, scale=scale), advice)
 
 
 def _ulog(path: Path, stated: Stated) -> LogReading:
@@ -218,16 +220,10 @@ def _ck(path: Path, stated: Stated) -> LogReading:
     return read_ck(path, stated)
 
 
-def _write_kvn(file: IO[bytes], samples: Sequence[AttitudeSample]) -> None:
+def _write_aem(file: IO[bytes], samples: Sequence[AttitudeSample], xml: bool, scale: str | None) -> None:
     from hilstar.attitude.logs.aem.writer import aem_text
 
-    file.write(aem_text(samples, xml=False).encode())
-
-
-def _write_xml(file: IO[bytes], samples: Sequence[AttitudeSample]) -> None:
-    from hilstar.attitude.logs.aem.writer import aem_text
-
-    file.write(aem_text(samples, xml=True).encode())
+    file.write(aem_text(samples, xml, scale).encode())
 
 
 def _write_mcap(file: IO[bytes], samples: Sequence[AttitudeSample]) -> None:
@@ -240,8 +236,6 @@ _WRITERS: dict[str, Callable[[IO[bytes], Sequence[AttitudeSample]], None]] = {
     ".csv": write_csv,
     ".jsonl": write_json_lines,
     ".json": write_json_lines,
-    ".aem": _write_kvn,
-    ".kvn": _write_kvn,
-    ".xml": _write_xml,
     ".mcap": _write_mcap,
 }
+_AEM_IN_XML = {".aem": False, ".kvn": False, ".xml": True}

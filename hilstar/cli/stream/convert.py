@@ -43,5 +43,5 @@ def convert(
     )
     for _, line in read.told:
         say(line)
-    write_log(output, read.samples)
+    write_log(output, read.samples, read.conventions.scale)
     typer.echo(f"{len(read.samples)} attitudes in {output}")

@@ -127,7 +127,7 @@ def test_what_is_no_file_or_too_large_is_refused_wherever_a_file_is_named(tmp_pa
 @pytest.mark.parametrize(
     ("head", "words"),
     [
-        (b"DAF/CK  " + bytes(64), "a SPICE CK kernel"),
+        (b"DAF/SPK " + bytes(64), "a SPICE kernel"),
         (b"PK\x03\x04" + bytes(64), "a zip archive"),
         (b"\x1f\x8b\x08" + bytes(64), "a gzip file"),
         (b"\x89HDF\r\n\x1a\n", "an HDF5 file"),

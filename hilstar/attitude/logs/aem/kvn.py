@@ -9,7 +9,7 @@ import io
 
 import numpy as np
 
-from hilstar.attitude.logs.aem.blocks import COMPONENTS, DERIVATIVE, Block, check_metadata, plain
+from hilstar.attitude.logs.aem.blocks import COMPONENTS, DERIVATIVE, QUATERNIONS, Block, check_metadata, plain
 from hilstar.attitude.logs.aem.keywords import VERSION_KEY, AemFaultError, fault_of
 
 MARKERS = {  # the section that a marker ends, and the one that it begins
@@ -72,7 +72,8 @@ def _kvn_block(meta: dict[str, str], rows: list[tuple[str, list[str]]], where: s
         raise AemFaultError(where, "the block contains no attitude")
     count = 1 + COMPONENTS[meta["ATTITUDE_TYPE"]]
     order = meta.get("QUATERNION_TYPE", "LAST" if meta[VERSION_KEY] == "2.0" else "missing")
-    if order not in {"FIRST", "LAST"}:
+    has_quaternion = meta["ATTITUDE_TYPE"] in QUATERNIONS
+    if has_quaternion and order not in {"FIRST", "LAST"}:
         raise AemFaultError(where, f"QUATERNION_TYPE is {order}; write FIRST or LAST, where the scalar is")
     values = []
     for place, words in rows:
@@ -84,7 +85,7 @@ def _kvn_block(meta: dict[str, str], rows: list[tuple[str, list[str]]], where: s
             wanted = f"write an epoch and {count - 1} numbers for {meta['ATTITUDE_TYPE']}"
             raise AemFaultError(place, f"{' '.join(words)[:80]!r}; {wanted}") from None
     table = np.array(values, dtype=np.float64)
-    if order == "LAST":
+    if has_quaternion and order == "LAST":
         table[:, :4] = table[:, [3, 0, 1, 2]]
         if meta["ATTITUDE_TYPE"] == DERIVATIVE:
             table[:, 4:] = table[:, [7, 4, 5, 6]]

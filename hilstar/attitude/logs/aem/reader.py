@@ -2,10 +2,11 @@
 
 Rules:
 1. One of REF_FRAME_A and REF_FRAME_B is ICRF, GCRF or EME2000, taken as the same axes (EME2000's differ by 23 mas); the
-   other is a frame of the spacecraft, and is taken as `cam`. Any other frame is refused.
+   other is a frame of the spacecraft: a camera's by its name (STARTRACKER_1, INSTRUMENT_A, CAM, ...), else a body's, which
+   the mounting makes the camera's. Any other frame is refused.
 2. The quaternion of 504.0-B-2 annex F turns components from its first frame into its second; it is the conjugate of
    hilstar's. ATTITUDE_DIR says which frame is first (2.0: always A), QUATERNION_TYPE where the scalar is (2.0: last).
-3. A rate is the angular velocity of the second frame with respect to the first.
+3. A rate is the angular velocity of the second frame with respect to the first. Euler angles and spins: `angles`.
 4. `t_ns` is nanoseconds from 1970-01-01T00:00:00 of the file's own time system; leap seconds are not counted.
 5. A second block of data begins with a discontinuity. Interpolation hints and usable spans are ignored.
 """
@@ -19,42 +20,54 @@ from dataclasses import replace
 import numpy as np
 
 from hilstar.arrays import FloatArray
-from hilstar.attitude.logs.aem.blocks import ANGVEL, DERIVATIVE, QUATERNION, RATE, Block
+from hilstar.attitude.logs.aem.angles import euler, rotated, spin
+from hilstar.attitude.logs.aem.blocks import (
+    DERIVATIVE,
+    EULER_ANGVEL,
+    EULER_RATE,
+    QUATERNION,
+    QUATERNIONS,
+    RATE,
+    SPIN,
+    SPINS,
+    Block,
+)
 from hilstar.attitude.logs.aem.epochs import epoch_ns
 from hilstar.attitude.logs.aem.keywords import VERSION_KEY, AemFaultError
 from hilstar.attitude.logs.aem.kvn import kvn_blocks
 from hilstar.attitude.logs.aem.xml import xml_blocks
-from hilstar.attitude.logs.entries import Entry
+from hilstar.attitude.logs.entries import Entry, LogReading
 from hilstar.attitude.wire.packet import AttitudeSample, checked_sample
 from hilstar.attitude.wire.source import Conventions, components
 from hilstar.rotation import conjugate, multiply
+from hilstar.units import NS_PER_S
 
 # 504.0-B-2's own examples write J2000 for EME2000; the realisations of the ICRF share its axes to 0.1 mas.
 INERTIAL_FRAMES = frozenset({"ICRF", "ICRF1", "ICRF2", "ICRF3", "GCRF", "EME2000", "J2000"})
 # SANA's registry of spacecraft body frames, whose names end in a label (SC_BODY_1, INSTRUMENT_A), and CAM.
+CAMERA_FRAME = re.compile("(STARTRACKER|AST|INSTRUMENT|SENSOR|CAM|CAMERA)(_.*|[0-9]+)?")
 BODY_FRAME = re.compile(
-    "(SC_BODY|STARTRACKER|AST|INSTRUMENT|SENSOR|CAM|CAMERA|ACC|ACTUATOR|CSS|DSS|ESA|GYRO|GYRO_FRAME"
-    "|IMU|IMU_FRAME|MTA|RW|SA|TAM)(_.*|[0-9]+)?"
+    "(SC_BODY|ACC|ACTUATOR|CSS|DSS|ESA|GYRO|GYRO_FRAME|IMU|IMU_FRAME|MTA|RW|SA|TAM)(_.*|[0-9]+)?|" + CAMERA_FRAME.pattern
 )
 
-CONVENTIONS = Conventions(
-    "CCSDS AEM",
-    "from the inertial to the body frame that the file names, or back as its ATTITUDE_DIR says",
-    "the scalar where the file says; the conjugate of a Hamilton quaternion (504.0-B-2 annex F)",
-    "the file's own TIME_SYSTEM, from 1970-01-01T00:00:00; leap seconds are not counted",
-    of_body=False,
-    written=lambda q: f"A2B, ICRF to body, Q1 Q2 Q3 QC = {components(np.roll(conjugate(q), -1))}",
+AMBIGUOUS = (
+    f"{EULER_RATE} of AEM 1.0 does not say whether its rates are those of the angles or an angular velocity; they are not used"
 )
+QUARTER_TURN_DEG = 90.0
+ADVICE = "sort its lines, and let no blocks overlap; leap seconds are not counted, so write TAI across one"
 
 
-def read_aem(text: str) -> tuple[list[Entry], str]:
-    """The attitudes of an AEM's text, each with its place, in the order of the blocks' first epochs; and its TIME_SYSTEM.
+def read_aem(text: str) -> LogReading:
+    """The attitudes of an AEM's text, each with its place, in the order of the blocks' first epochs.
 
-    Raises AemFaultError for anything that is not an AEM of quaternions between a body frame and the ICRF.
+    Raises AemFaultError for anything that is not an AEM of attitudes between a spacecraft's frame and the ICRF.
     """
     blocks = xml_blocks(text) if text.lstrip().startswith("<") else kvn_blocks(text)
     if len({block.meta["TIME_SYSTEM"] for block in blocks}) > 1:
         raise AemFaultError("", "TIME_SYSTEM changes from block to block; write one file for each time system")
+    frames = [_frames(block.meta) for block in blocks]
+    if len({body for _, body in frames}) > 1:
+        raise AemFaultError("", "the spacecraft's frame changes from block to block; write one file for each")
     timed = [([epoch_ns(where, epoch) for where, epoch in zip(b.where, b.epochs, strict=True)], b) for b in blocks]
     timed.sort(key=lambda pair: pair[0][0])
     entries: list[Entry] = []
@@ -63,7 +76,22 @@ def read_aem(text: str) -> tuple[list[Entry], str]:
         if entries:
             _part(entries, following)
         entries += following
-    return entries, blocks[0].meta["TIME_SYSTEM"]
+    ambiguous = any(block.meta["ATTITUDE_TYPE"] == EULER_RATE for block in blocks)
+    told = [("aem-rates", AMBIGUOUS)] if ambiguous else []
+    return LogReading(entries, _conventions(*frames[0], blocks[0].meta["TIME_SYSTEM"]), ADVICE, told)
+
+
+def _conventions(inertial: str, body: str, scale: str) -> Conventions:
+    leap = "; leap seconds are not counted" if scale == "UTC" else ""
+    return Conventions(
+        "CCSDS AEM",
+        f"between {inertial} and {body}, in the direction that the file states",
+        "the scalar where the file says; the conjugate of a Hamilton quaternion (504.0-B-2 annex F)",
+        f"{scale}, from 1970-01-01T00:00:00 {scale}{leap}",
+        of_body=CAMERA_FRAME.fullmatch(body) is None,
+        written=lambda q: f"A2B, {inertial} to {body}, Q1 Q2 Q3 QC = {components(np.roll(conjugate(q), -1))}",
+        scale=scale,
+    )
 
 
 def _part(entries: list[Entry], following: list[Entry]) -> None:
@@ -77,17 +105,35 @@ def _part(entries: list[Entry], following: list[Entry]) -> None:
 
 def _entries(block: Block, times: list[int]) -> Iterator[Entry]:
     q, rate = _attitudes(block)
+    if block.meta["ATTITUDE_TYPE"] == SPIN and not _alias(block, times):
+        rate = None
     rates: Sequence[list[float] | None] = [None] * len(q) if rate is None else rate.tolist()
     for where, t_ns, numbers, turning in zip(block.where, times, q.tolist(), rates, strict=True):
         yield Entry(where, checked_sample(t_ns, tuple(numbers), None if turning is None else tuple(turning)))
+
+
+def _alias(block: Block, times: list[int]) -> bool:
+    """Whether a spin turns by more than a quarter between its attitudes, so that only its rate tells by how much.
+
+    Where it does not, the attitudes are better: in the standard's own example (ST5) SPIN_ANGLE_VEL is that of a nutating body
+    with respect to its nutation, a fifth more than the spin angle turns.
+    """
+    turned_deg = np.abs(block.values[:-1, 3]) * np.diff(np.array(times, dtype=object)).astype(np.float64) / NS_PER_S
+    return bool((turned_deg > QUARTER_TURN_DEG).any())
 
 
 def _attitudes(block: Block) -> tuple[FloatArray, FloatArray | None]:
     """`q_icrs_to_cam` (n, 4) and, where the type has it, the rate (n, 3) in cam components, rad/s."""
     meta, kind = block.meta, block.meta["ATTITUDE_TYPE"]
     to_cam = _second_frame_is_cam(meta)
-    q, more = block.values[:, :4], block.values[:, 4:]
     with np.errstate(all="ignore"):  # an overflow is refused as not finite
+        if kind not in QUATERNIONS:
+            q, rate = spin(block.values, kind) if kind in SPINS else euler(block.values, meta)
+            if kind == EULER_ANGVEL:
+                q = q if to_cam else conjugate(q)
+                return q, _rate_in_cam(meta, q, np.ones((len(q), 1)), np.radians(block.values[:, 3:]))
+            return (q, rate) if to_cam else (conjugate(q), None if rate is None else -rotated(conjugate(q), rate))
+        q, more = block.values[:, :4], block.values[:, 4:]
         if to_cam:
             q = conjugate(q)
         norm2 = (q * q).sum(axis=1, keepdims=True)
@@ -96,28 +142,36 @@ def _attitudes(block: Block) -> tuple[FloatArray, FloatArray | None]:
         if kind == DERIVATIVE:
             q_dot = conjugate(more) if to_cam else more
             return q, -2.0 * multiply(q_dot, conjugate(q))[:, 1:] / norm2
-        rate = np.radians(more if to_cam else -more)
-        if not _rate_is_in_cam(meta):
-            pure = np.concatenate((np.zeros((len(rate), 1)), rate), axis=1)
-            rate = multiply(multiply(q, pure), conjugate(q))[:, 1:] / norm2
-    return q, rate
+        return q, _rate_in_cam(meta, q, norm2, np.radians(more))
 
 
-def _second_frame_is_cam(meta: dict[str, str]) -> bool:
+def _rate_in_cam(meta: dict[str, str], q: FloatArray, norm2: FloatArray, rate: FloatArray) -> FloatArray:
+    """The rate (n, 3) of cam in its components, of the second frame's with respect to the first, in either frame's."""
+    if not _second_frame_is_cam(meta):
+        rate = -rate
+    return rate if _rate_is_in_cam(meta) else rotated(q, rate) / norm2
+
+
+def _frames(meta: dict[str, str]) -> tuple[str, str]:
+    """The inertial frame and the spacecraft's. Raises AemFaultError."""
     a, b = meta["REF_FRAME_A"], meta["REF_FRAME_B"]
     inertial, body = (a, b) if a in INERTIAL_FRAMES else (b, a)
     if inertial not in INERTIAL_FRAMES or not BODY_FRAME.fullmatch(body):
         wanted = "one must be ICRF or EME2000, the other a spacecraft frame (SC_BODY_1, STARTRACKER_1, INSTRUMENT_A, CAM, ...)"
         raise AemFaultError("", f"REF_FRAME_A = {a}, REF_FRAME_B = {b}; {wanted}")
+    return inertial, body
+
+
+def _second_frame_is_cam(meta: dict[str, str]) -> bool:
     direction = meta.get("ATTITUDE_DIR", "A2B" if meta[VERSION_KEY] == "2.0" else "missing")
     if direction not in {"A2B", "B2A"}:
         raise AemFaultError("", f"ATTITUDE_DIR is {direction}; write A2B or B2A")
-    return (a in INERTIAL_FRAMES) == (direction == "A2B")
+    return (meta["REF_FRAME_A"] in INERTIAL_FRAMES) == (direction == "A2B")
 
 
 def _rate_is_in_cam(meta: dict[str, str]) -> bool:
-    key = "ANGVEL_FRAME" if meta["ATTITUDE_TYPE"] == ANGVEL else "RATE_FRAME"
-    if "EULER_ROT_SEQ" in meta:
+    key = "RATE_FRAME" if meta["ATTITUDE_TYPE"] == RATE else "ANGVEL_FRAME"
+    if "EULER_ROT_SEQ" in meta and meta["ATTITUDE_TYPE"] == RATE:
         raise AemFaultError("", f"{RATE} with EULER_ROT_SEQ: rates of Euler angles are not read; write {DERIVATIVE}")
     a, b, given = meta["REF_FRAME_A"], meta["REF_FRAME_B"], meta.get(key, "missing")
     frame = {"REF_FRAME_A": a, "REF_FRAME_B": b}.get(given, given)

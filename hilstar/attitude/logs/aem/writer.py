@@ -18,9 +18,11 @@ from hilstar.attitude.logs.aem.xml import library
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.rotation import conjugate, multiply
 
+SCALES = frozenset({"UTC", "TAI", "TT", "TDB", "TCB", "GPS", "UT1", "SCLK"})  # of AEM 1.0; other clocks are written as UTC
 
-def aem_text(samples: Sequence[AttitudeSample], xml: bool) -> str:
-    """An AEM 1.0 of at least one sample, as KVN or XML: a new block at each discontinuity, ICRF to SC_BODY_1, scalar last.
+
+def aem_text(samples: Sequence[AttitudeSample], xml: bool, scale: str | None = None) -> str:
+    """An AEM 1.0 of at least one sample, as KVN or XML: a new block at each discontinuity, ICRF to STARTRACKER_1, scalar last.
 
     A block whose samples all have a rate contains quaternion derivatives; other blocks drop their rates. Sequence numbers are
     dropped. Raises MachineError without ccsds-ndm.
@@ -34,13 +36,13 @@ def aem_text(samples: Sequence[AttitudeSample], xml: bool) -> str:
     created = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S")
     message = aem.Aem(
         header=aem.NdmHeader(creation_date=created, originator="HILSTAR"),
-        body=aem.AemBody(segment=[_segment(aem, block) for block in blocks]),
+        body=aem.AemBody(segment=[_segment(aem, block, scale) for block in blocks]),
     )
     form = mapping.NDMFileFormats.XML if xml else mapping.NDMFileFormats.KVN
     return str(ndm_io.NdmIo().to_string(message, form)).rstrip() + "\n"
 
 
-def _segment(aem: Any, samples: Sequence[AttitudeSample]) -> Any:
+def _segment(aem: Any, samples: Sequence[AttitudeSample], scale: str | None) -> Any:
     from ccsds_ndm.models.ndmxml2.ndmxml_2_0_0_aem_1_0 import AttitudeTypeType  # type: ignore[import-untyped]
 
     rates = [sample.rate_cam_rad_s for sample in samples if sample.rate_cam_rad_s is not None]
@@ -54,15 +56,15 @@ def _segment(aem: Any, samples: Sequence[AttitudeSample]) -> Any:
     states = [_state(aem, epoch, components, dots if with_rates else None) for epoch, components, dots in rows]
     metadata = aem.AemMetadata(
         comment=[
-            "SC_BODY_1 is the camera: +z boresight, +x right and +y down in its image.",
-            "Epochs are the sender's clock from 1970-01-01T00:00:00; leap seconds are not counted.",
+            "STARTRACKER_1 is the camera: +z boresight, +x right and +y down in its image.",
+            "Epochs are the source's clock from 1970-01-01T00:00:00; leap seconds are not counted.",
         ],
         object_name="UNKNOWN",
         object_id="UNKNOWN",
         ref_frame_a="ICRF",
-        ref_frame_b="SC_BODY_1",
+        ref_frame_b="STARTRACKER_1",
         attitude_dir=aem.RotDirectionType.A2_B,
-        time_system=aem.TimeSystemType.UTC,
+        time_system=aem.TimeSystemType(scale if scale in SCALES else "UTC"),
         start_time=epochs[0],
         stop_time=epochs[-1],
         attitude_type=AttitudeTypeType(DERIVATIVE if with_rates else QUATERNION),

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from hilstar.attitude.logs.aem.blocks import ELEMENTS, Block, check_metadata, plain
+from hilstar.attitude.logs.aem.angles import sequence
+from hilstar.attitude.logs.aem.blocks import ELEMENTS, EULER_RATE, QUATERNIONS, Block, check_metadata, plain
 from hilstar.attitude.logs.aem.keywords import VERSION_KEY, AemFaultError, fault_of
 from hilstar.errors import MachineError
 
@@ -110,28 +111,41 @@ def _xml_block(version: str, segment: Any) -> Block:
     texts = {key: value.value if isinstance(value, Enum) else value for key, value in given.items()}
     meta = {key: plain(value) for key, value in texts.items() if isinstance(value, str)} | {VERSION_KEY: version}
     check_metadata(meta, "")
-    element, part = ELEMENTS[version][meta["ATTITUDE_TYPE"]]
+    element, parts = ELEMENTS[version][meta["ATTITUDE_TYPE"]]
     states = [getattr(state, element) for state in segment.data.attitude_state]
     if not states or None in states:
         raise AemFaultError("", f"a state is missing, or is not the {meta['ATTITUDE_TYPE']} that the metadata states")
-    values = []
-    for state in states:
-        q = state.quaternion
-        values.append([q.qc, q.q1, q.q2, q.q3, *_xml_part(part, getattr(state, part or "quaternion"))])
+    values = [_xml_values(meta, parts.split(), state) for state in states]
     epochs = [state.epoch for state in states]
     return Block(meta, [f", {epoch[:40]}" for epoch in epochs], epochs, np.array(values, dtype=np.float64))
 
 
-def _xml_part(part: str, more: Any) -> list[float]:
+def _xml_values(meta: dict[str, str], parts: list[str], state: Any) -> list[float]:
+    """The numbers of a state in the order of KVN."""
+    if meta["ATTITUDE_TYPE"] not in QUATERNIONS:
+        return [value for part in parts for value in _xml_part(part, getattr(state, part), meta)]
+    q = state.quaternion
+    return [q.qc, q.q1, q.q2, q.q3, *(value for part in parts for value in _xml_part(part, getattr(state, part), meta))]
+
+
+def _xml_part(part: str, more: Any, meta: dict[str, str]) -> list[float]:
     match part:
-        case "":
-            return []
         case "ang_vel":
             return [more.angvel_x.value, more.angvel_y.value, more.angvel_z.value]
+        case "rotation_angles":
+            turns = (more.rotation1, more.rotation2, more.rotation3)
+            wanted = ["XYZ"[axis] + "_ANGLE" for axis in sequence(meta)]
+            if [turn.angle.value.upper() for turn in turns] != wanted:
+                raise AemFaultError("", f"the angles of a state must be {', '.join(wanted)}, as EULER_ROT_SEQ has them")
+            return [turn.value for turn in turns]
         case "rotation_rates":
+            if meta["ATTITUDE_TYPE"] == EULER_RATE:
+                return [0.0] * 3  # not used
             axes = sorted((axis.rate.value.upper(), axis.value) for axis in (more.rotation1, more.rotation2, more.rotation3))
             if [name for name, _ in axes] != ["X_RATE", "Y_RATE", "Z_RATE"]:
                 raise AemFaultError("", "the rates of a state must be X_RATE, Y_RATE and Z_RATE")
             return [value for _, value in axes]
-        case _:
+        case "quaternion_rate" | "quaternion_dot":
             return [getattr(more, name).value for name in ("qc_dot", "q1_dot", "q2_dot", "q3_dot")]
+        case _:
+            return [more.value]

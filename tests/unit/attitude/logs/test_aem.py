@@ -267,7 +267,7 @@ def test_what_is_written_states_its_order_direction_and_frames(tmp_path, form):
     assert len(message.body.segment) == 2
     for segment in message.body.segment:
         meta = segment.metadata
-        assert (meta.ref_frame_a, meta.ref_frame_b, meta.attitude_dir.value) == ("ICRF", "SC_BODY_1", "A2B")
+        assert (meta.ref_frame_a, meta.ref_frame_b, meta.attitude_dir.value) == ("ICRF", "STARTRACKER_1", "A2B")
         assert (meta.quaternion_type.value, meta.attitude_type.value) == ("LAST", "QUATERNION/DERIVATIVE")
         assert meta.start_time == segment.data.attitude_state[0].quaternion_derivative.epoch
 

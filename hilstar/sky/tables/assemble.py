@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,11 +13,11 @@ from hilstar.arrays import FloatArray
 from hilstar.errors import InputError
 from hilstar.sky.catalog import RANGES, TYC_REGION, TYCHO, Catalog, plain_catalog
 from hilstar.sky.tables.columns import WANTED, factor_to
-from hilstar.sky.tables.photometry import bv_from_vi, from_gaia, from_tycho
+from hilstar.sky.tables.photometry import ROUTES
 from hilstar.sky.tables.reader import RawTable
 
 # Epochs of the places, Julian years, where a table has its catalogue's own names and no epoch.
-EPOCH_OF_PLACES = {"ramdeg": 2000.0, "raicrs": 1991.25}
+EPOCH_OF_PLACES = {"ramdeg": 2000.0, "raicrs": 1991.25, "raj2000": 2000.0, "_raj2000": 2000.0}
 GAIA_DR2_JYEAR, GAIA_DR3_JYEAR = 2015.5, 2016.0
 EPOCHS_JYEAR = (1800.0, 2200.0)
 # Right ascensions within 24 and declinations that span more than this, of so many stars, are hours: no field is so narrow.
@@ -27,48 +26,6 @@ HOURS_SPAN_DEG, HOURS_STARS = 60.0, 100
 SLOWEST_MAS_YR, MOTION_STARS = 12.0, 1000
 MAX_STEM = 16  # characters of a file's name in the name of its stars, which has 32 in a truth table
 ADVICE = "give the column its unit in a FITS, ECSV or VOTable, or convert it"
-
-Converted = tuple[FloatArray, FloatArray, FloatArray]
-
-
-@dataclass(frozen=True, slots=True)
-class Route:
-    """One way from a table's magnitudes to V, B-V and V-I, (n,) each, V-I NaN where it is not known."""
-
-    roles: tuple[str, ...]
-    words: str
-    convert: Callable[..., Converted]
-
-
-def _given(v: FloatArray, bv: FloatArray) -> Converted:
-    return v, bv, np.full(len(v), np.nan)
-
-
-def _by_vi(v: FloatArray, vi: FloatArray) -> Converted:
-    return v, bv_from_vi(vi), vi
-
-
-def _by_tycho(vt: FloatArray, bt: FloatArray) -> Converted:
-    v, bv = from_tycho(bt, vt)
-    return v, bv, np.full(len(v), np.nan)
-
-
-def _by_gaia(g: FloatArray, bp_rp: FloatArray) -> Converted:
-    return _by_vi(*from_gaia(g, bp_rp))
-
-
-ROUTES = (
-    Route(("v_mag", "bv_mag"), "V and B-V as given", _given),
-    Route(("v_mag", "vi_mag"), "V and V-I as given, B-V of Hipparcos' stars of that V-I", _by_vi),
-    Route(("v_mag", "b_mag"), "B and V as given", lambda v, b: _given(v, b - v)),
-    Route(("vt_mag", "bt_mag"), "V and B-V from Tycho's BT and VT (Mamajek et al. 2002)", _by_tycho),
-    Route(("g_mag", "bp_rp_mag"), "V and V-I from Gaia's G, BP and RP (Riello et al. 2021)", _by_gaia),
-    Route(
-        ("g_mag", "bp_mag", "rp_mag"),
-        "V and V-I from Gaia's G, BP and RP (Riello et al. 2021)",
-        lambda g, bp, rp: _by_gaia(g, bp - rp),
-    ),
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,8 +37,11 @@ class Assembled:
     dropped: int
 
 
-def assemble(path: Path, table: RawTable, stated_epoch_jyear: float | None) -> Assembled:
-    """The stars of a table. Raises InputError where no row is one, or where a unit or the epoch has to be stated."""
+def assemble(path: Path, table: RawTable, stated_epoch_jyear: float | None, compared: bool = False) -> Assembled:
+    """The stars of a table, whose epoch matters where they move or are to be `compared` with stars that do.
+
+    Raises InputError where no row is a star, and where a unit or the epoch has to be stated.
+    """
     columns = _Columns(path, table)
     ra_deg, dec_deg = columns.places()
     v_mag, bv_mag, vi_mag, words = columns.magnitudes()
@@ -103,8 +63,8 @@ def assemble(path: Path, table: RawTable, stated_epoch_jyear: float | None) -> A
     kept = reason == 0
     if not kept.any():
         raise InputError(f"{path}: none of its {len(reason)} rows is a star ({_reasons(reason)}); {WANTED}")
-    moving = any((motion[kept] != 0).any() for motion in pm.values())
-    epoch, epoch_words = columns.epoch(stated_epoch_jyear, moving, designation)
+    dated = compared or any((motion[kept] != 0).any() for motion in pm.values())
+    epoch, epoch_words = columns.epoch(stated_epoch_jyear, dated, designation)
     figures |= {"epoch_jyear": epoch, "identifier": identifier, "hip": _once(columns.hip(), kept, v_mag)}
     catalog = plain_catalog(designation, len(kept), {name: values[kept] for name, values in figures.items()})
     rest = "" if kept.all() else f"; not used: {_reasons(reason)}"
@@ -182,7 +142,7 @@ class _Columns:
             return np.zeros(self.table.row_count, dtype=np.int64)
         return np.asarray(self.table.columns[self.layout.role["hip"]], dtype=np.int64)
 
-    def epoch(self, stated_jyear: float | None, moving: bool, designation: str) -> tuple[FloatArray, str]:
+    def epoch(self, stated_jyear: float | None, dated: bool, designation: str) -> tuple[FloatArray, str]:
         """The epoch of each place, Julian years, and where it comes from. Raises InputError where it has to be stated."""
         known = EPOCH_OF_PLACES.get(self.pair[0].lower())
         if known is None and designation == "Gaia DR3":
@@ -196,8 +156,8 @@ class _Columns:
             return values, f"places of J{float(np.median(values)):g} by its column"
         if known is not None:
             return np.full(self.table.row_count, known), f"places of J{known:g} by its columns' names"
-        if moving:
-            raise InputError(f"{self.path}: has proper motions and no epoch of its places; {_STATE_EPOCH}")
+        if dated:
+            raise InputError(f"{self.path}: has no epoch of its places, and stars move; {_STATE_EPOCH}")
         return np.full(self.table.row_count, GAIA_DR3_JYEAR), "places without motion"
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hilstar.errors import InputError, shortened
+from hilstar.sky.tables.photometry import ROUTES
 
 # Names in lower case, the first that a table has is taken. A later pair of places fills the rows of an earlier one that are
 # blank: Tycho-2 has no mean place for one star in 20.
@@ -20,6 +21,8 @@ PLACES = (
     ("raj2000", "dej2000"),
     ("ra(icrs)", "de(icrs)"),
     ("rarad", "derad"),
+    ("ra_icrs_", "de_icrs_"),
+    ("_raj2000", "_dej2000"),
 )
 NAMES: dict[str, tuple[str, ...]] = {
     "pm_ra_cosdec_mas_yr": ("pmra", "pm_ra_cosdec_mas_yr", "pm_ra_cosdec", "pm_ra"),
@@ -42,15 +45,6 @@ NAMES: dict[str, tuple[str, ...]] = {
     "tyc3": ("tyc3",),
     "hip": ("hip",),
 }
-# What gives V and a colour, the best first.
-MAGNITUDES: tuple[tuple[str, ...], ...] = (
-    ("v_mag", "bv_mag"),
-    ("v_mag", "vi_mag"),
-    ("v_mag", "b_mag"),
-    ("vt_mag", "bt_mag"),
-    ("g_mag", "bp_rp_mag"),
-    ("g_mag", "bp_mag", "rp_mag"),
-)
 WANTED = (
     "name V with B-V or V-I (vmag, b-v, v-i), Tycho's vtmag and btmag, or Gaia's phot_g_mean_mag with bp_rp or with "
     "phot_bp_mean_mag and phot_rp_mean_mag"
@@ -79,7 +73,7 @@ def layout_of(path: Path, names: Sequence[str]) -> Layout:
     known = {name.strip().lower(): name for name in reversed(names)}
     places = tuple((known[ra], known[dec]) for ra, dec in PLACES if ra in known and dec in known)
     role = {role: known[found] for role, words in NAMES.items() if (found := next((w for w in words if w in known), None))}
-    magnitudes = tuple(roles for roles in MAGNITUDES if all(name in role for name in roles))
+    magnitudes = tuple(route.roles for route in ROUTES if all(name in role for name in route.roles))
     found = ", ".join(shortened(name, 40) for name in names[:MAX_NAMED]) + (", ..." if len(names) > MAX_NAMED else "")
     if not places:
         pairs = ", ".join(f"{ra} and {dec}" for ra, dec in PLACES[:4])

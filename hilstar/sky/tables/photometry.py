@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
@@ -56,3 +58,47 @@ def _bv_along_vi() -> tuple[FloatArray, FloatArray]:
     parts = zip(bins * BIN_MAG, np.split(bv_mag[order], start[1:]), strict=True)
     full = [(vi, float(np.median(part))) for vi, part in parts if len(part) >= MIN_STARS]
     return np.array([vi for vi, _ in full]), np.array([bv for _, bv in full])
+
+
+Converted = tuple[FloatArray, FloatArray, FloatArray]
+
+
+@dataclass(frozen=True, slots=True)
+class Route:
+    """One way from a table's magnitudes to V, B-V and V-I, (n,) each, V-I NaN where it is not known."""
+
+    roles: tuple[str, ...]
+    words: str
+    convert: Callable[..., Converted]
+
+
+def _given(v: FloatArray, bv: FloatArray) -> Converted:
+    return v, bv, np.full(len(v), np.nan)
+
+
+def _by_vi(v: FloatArray, vi: FloatArray) -> Converted:
+    return v, bv_from_vi(vi), vi
+
+
+def _by_tycho(vt: FloatArray, bt: FloatArray) -> Converted:
+    v, bv = from_tycho(bt, vt)
+    return v, bv, np.full(len(v), np.nan)
+
+
+def _by_gaia(g: FloatArray, bp_rp: FloatArray) -> Converted:
+    return _by_vi(*from_gaia(g, bp_rp))
+
+
+# The best first.
+ROUTES = (
+    Route(("v_mag", "bv_mag"), "V and B-V as given", _given),
+    Route(("v_mag", "vi_mag"), "V and V-I as given, B-V of Hipparcos' stars of that V-I", _by_vi),
+    Route(("v_mag", "b_mag"), "B and V as given", lambda v, b: _given(v, b - v)),
+    Route(("vt_mag", "bt_mag"), "V and B-V from Tycho's BT and VT (Mamajek et al. 2002)", _by_tycho),
+    Route(("g_mag", "bp_rp_mag"), "V and V-I from Gaia's G, BP and RP (Riello et al. 2021)", _by_gaia),
+    Route(
+        ("g_mag", "bp_mag", "rp_mag"),
+        "V and V-I from Gaia's G, BP and RP (Riello et al. 2021)",
+        lambda g, bp, rp: _by_gaia(g, bp - rp),
+    ),
+)

@@ -61,7 +61,7 @@ def choose_catalog(choice: Choice) -> Catalog:
 
 
 def _made(path: Path, choice: Choice) -> Kept:
-    found = assemble(path, read_table(path), choice.epoch_jyear)
+    found = assemble(path, read_table(path), choice.epoch_jyear, choice.with_hipparcos)
     doubts = [found.line] if found.dropped else []
     if not choice.with_hipparcos:
         return Kept(_by_cell(found.catalog, found.line), tuple(doubts))

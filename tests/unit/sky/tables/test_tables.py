@@ -246,6 +246,14 @@ def test_a_unit_of_another_kind_is_refused(tmp_path):
         read(tmp_path / "t.fits")
 
 
+def test_a_table_beside_hipparcos_has_to_have_an_epoch(tmp_path):
+    sky(3).write(tmp_path / "t.csv")
+    assert len(read(tmp_path / "t.csv")) == 3
+    with pytest.raises(InputError, match="has no epoch of its places, and stars move; write "):
+        read(tmp_path / "t.csv", with_hipparcos=True)
+    assert len(read(tmp_path / "t.csv", with_hipparcos=True, epoch_jyear=2000.0)) == len(load_catalog()) + 3
+
+
 def test_keys_of_a_table_are_refused_for_hipparcos(tmp_path):
     for choice in (Choice(with_hipparcos=True), Choice(epoch_jyear=2000.0)):
         with pytest.raises(InputError, match=r"\[sky\] (with_hipparcos|catalogue_epoch_jyear)"):

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from hilstar.arrays import FloatArray, IntArray
+from hilstar.arrays import FloatArray
 from hilstar.bench.build import open_bench
 from hilstar.bench.cameras import tracker_camera
 from hilstar.bench.frame import Bench, Frame
@@ -35,9 +35,8 @@ SURE_MAG = 0.01  # the noise of a star whose light is judged
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """Stars that are drawn whole and stand alone: HIP numbers (n,), places (n, 2), tracker px, and light (n,), e-/s."""
+    """Stars that are drawn whole and stand alone: places (n, 2), tracker px, and light (n,), e-/s."""
 
-    hip: IntArray
     place_px: FloatArray
     e_per_s: FloatArray
 
@@ -49,7 +48,6 @@ class StarsSeen:
     `dn` is the light of each (n,), `e_per_s` what was asked for, `noise_mag` its error; infinite where the tracker saturated.
     """
 
-    hip: IntArray
     place_px: FloatArray
     residual_px: FloatArray
     dn: FloatArray
@@ -75,9 +73,9 @@ def see_stars(room: Room) -> StarsSeen:
         for number, (frames, wanted) in enumerate(shown)
     ]
     seen = _together(fields, dark_path)
-    if len(seen.hip) < MIN_STARS:
+    if len(seen.dn) < MIN_STARS:
         raise InputError(
-            f"{len(seen.hip)} bright stars are where the sky has them and {MIN_STARS} are needed; {seen.lost} bright ones are"
+            f"{len(seen.dn)} bright stars are where the sky has them and {MIN_STARS} are needed; {seen.lost} bright ones are"
             " not there: expose longer, set a fainter [render] brightest_v_mag, or run the geometry again"
         )
     return seen
@@ -92,7 +90,6 @@ def _frames(bench: Bench, frame: Frame) -> tuple[CodeImage, ...]:
 
 def _together(fields: list[StarsSeen], dark: Path) -> StarsSeen:
     return StarsSeen(
-        hip=np.concatenate([each.hip for each in fields]),
         place_px=np.concatenate([each.place_px for each in fields]),
         residual_px=np.concatenate([each.residual_px for each in fields]),
         dn=np.concatenate([each.dn for each in fields]),
@@ -120,20 +117,22 @@ def _alone(bench: Bench, room: Room, frame: Frame) -> Wanted:
     screen = np.stack([truth["x_px"], truth["y_px"]], axis=1)
     limits = np.array(room.resolution_px) - 1 - EDGE_PX
     # Not by a planet: its light is known to 0.05 mag, and its disc may be wide.
-    kept = truth["drawn"] & ~truth["clipped"] & (truth["name"] == "") & np.isfinite(place).all(axis=1)
+    kept = truth["drawn"] & ~truth["clipped"] & np.isfinite(place).all(axis=1)
+    kept &= bench.stars.row[frame.star] >= 0
     kept &= (place > EDGE_PX).all(axis=1) & (place < np.array([width, height]) - 1 - EDGE_PX).all(axis=1)
     kept &= (screen > EDGE_PX).all(axis=1) & (screen < limits).all(axis=1)
     finite = np.where(np.isfinite(place), place, -1e6)
     near = cKDTree(finite).query_ball_point(finite, ALONE_PX, return_length=True)
     kept &= near == 1
-    return Wanted(truth["hip"][kept].astype(np.intp), place[kept], truth["electrons_per_s"][kept])
+    return Wanted(place[kept], truth["electrons_per_s"][kept])
 
 
 def _compared(room: Room, looked: Looked, wanted: Wanted) -> StarsSeen:
     found, noise_dn = _found(room, looked.image)
     seen = np.stack([found.x_px, found.y_px], axis=1)
-    far, nearest = np.full(len(wanted.hip), np.inf), np.zeros(len(wanted.hip), dtype=np.intp)
-    if len(seen) and len(far):
+    count = len(wanted.e_per_s)
+    far, nearest = np.full(count, np.inf), np.zeros(count, dtype=np.intp)
+    if len(seen) and count:
         far, nearest = (np.asarray(part) for part in cKDTree(seen).query(wanted.place_px))
     near = far < REACH_PX
     matched = near.copy()
@@ -145,7 +144,6 @@ def _compared(room: Room, looked: Looked, wanted: Wanted) -> StarsSeen:
     noise = np.sqrt(np.maximum(dn, 0.0) / gain + WINDOW_PX * noise_dn**2) / np.maximum(dn, 1e-9)
     saturated = found.peak[chosen] > MAX_FILL * room.full_dn - looked.floor_dn
     return StarsSeen(
-        hip=wanted.hip[matched],
         place_px=wanted.place_px[matched],
         residual_px=seen[chosen] - wanted.place_px[matched],
         dn=dn,

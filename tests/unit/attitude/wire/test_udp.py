@@ -16,6 +16,7 @@ from hilstar.units import NS_PER_MS
 from tests.support.senders import packet
 
 HELD_S = 0.05
+STAMPS_BEGIN_S = 0.25  # the kernel switches its stamps on from a work queue, some time after the socket asks for them
 # The two clocks are read within some microseconds of each other, and the kernel stamps before `send` returns; a loaded machine
 # may hold the reader up between them.
 STAMP_NS = 2 * NS_PER_MS
@@ -62,6 +63,7 @@ def test_a_datagram_that_was_read_late_has_the_time_of_its_arrival():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         datagrams = Datagrams.bound(ANYWHERE)
         sender.connect(("127.0.0.1", datagrams.port))
+        time.sleep(STAMPS_BEGIN_S)
         sent_ns = []
         for _ in range(5):
             sender.send(b"now")

@@ -43,6 +43,11 @@ class Stars:
     def __len__(self) -> int:
         return len(self.hip)
 
+    @property
+    def rates_e_per_s(self) -> FloatArray:
+        """The electron rates of the stars alone, without bodies."""
+        return self.electrons_per_s[: len(self) - len(self.bodies)]
+
     def near(self, axis: FloatArray, radius_rad: float) -> IntArray:
         """Every star seen within `radius_rad` of the unit vector `axis` (ICRS), and some more."""
         if self.velocity_km_s is not None:

@@ -116,8 +116,8 @@ def nothing_below_e_per_s(bench: Bench) -> float:
 
 
 def not_drawn(bench: Bench) -> NotDrawn:
-    """The bench's stars that are not drawn."""
-    rates = bench.stars.electrons_per_s
+    """The bench's stars that are not drawn; bodies, whose light is that of all stars many times over, do not count."""
+    rates = bench.stars.rates_e_per_s
     missing = rates[rates < bench.faintest_shown_e_per_s]
     return NotDrawn(len(missing), float(missing.sum() / rates.sum()))
 

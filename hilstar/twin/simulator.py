@@ -22,8 +22,10 @@ from hilstar.scene.exposure_motion import MIDDLE_S, Motion, smeared_sprites
 from hilstar.sky.electrons import Photometry, zodiacal_electrons_per_s_arcsec2
 from hilstar.sky.stars import Stars
 from hilstar.tracker.detector import Detector
+from hilstar.tracker.settings import MAX_E
 from hilstar.units import ARCSEC_PER_RAD
 
+BODY_MAX_E = 0.5 * MAX_E  # room for dark current and cosmic rays
 Noise = Literal["full", "none"]
 
 
@@ -87,6 +89,10 @@ class Simulator:
         sprites = smeared_sprites(stars, motion, self.camera, self.renderer.footprint_px, tracker.psf_sigma_px)
         self.renderer.draw(sprites)
         mean_e = self.renderer.linear().astype(np.float64) * tracker.exposure_s + self.background_e
+        if (
+            self.moving is not None
+        ):  # the Sun as a point has more than a detector can be asked for; its wells are full long before
+            mean_e = np.minimum(mean_e, BODY_MAX_E)
         if rng is None:
             dn = self.detector.expose_noiseless(mean_e, tracker.exposure_s)
         else:

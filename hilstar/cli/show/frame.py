@@ -92,7 +92,8 @@ def clipped_text(loss_mag: dict[int | str, float]) -> str:
 
 
 def left_out(truth: Any) -> dict[str, float | int]:
-    """The stars in view that the monitor cannot show: how many, and their part of all light."""
-    missing = truth["electrons_per_s"][~truth["drawn"]]
-    total = float(truth["electrons_per_s"].sum())
+    """The stars in view that the monitor cannot show: how many, and their part of all stars' light."""
+    stars = truth[truth["name"] == ""]
+    missing = stars["electrons_per_s"][~stars["drawn"]]
+    total = float(stars["electrons_per_s"].sum())
     return {"stars": len(missing), "flux_share": float(missing.sum()) / total if total else 0.0}

@@ -72,9 +72,10 @@ def seen_sigma_px(config: BenchConfig, monitor_px_per_px: float) -> tuple[float,
 
 
 def faintest_e_per_s(bench: Bench) -> float:
-    """The rate of the faintest star that the bench draws."""
-    stars = bench.shown_stars
-    return float(stars.electrons_per_s.min()) if len(stars) else 1.0
+    """The rate of the faintest star or body that the bench draws."""
+    rates = bench.shown_stars.electrons_per_s
+    drawn = rates[rates >= bench.faintest_shown_e_per_s]
+    return float(drawn.min()) if len(drawn) else 1.0
 
 
 def nearest(found: Centroids, x_px: FloatArray, y_px: FloatArray) -> IntArray:

@@ -15,6 +15,8 @@ from astropy.wcs import WCS
 from hilstar.bench.bench_file import read_bench_file
 from hilstar.bench.build import load
 from hilstar.rotation import conjugate, from_radec_roll_deg
+from hilstar.twin.budget import not_drawn
+from hilstar.twin.verify.star_finder import faintest_e_per_s
 from tests.support.aem_messages import kvn
 from tests.support.commands import run_hilstar_here
 from tests.support.skies import STATION_TLE, skyfield, utc_ns
@@ -22,6 +24,7 @@ from tests.support.skies import STATION_TLE, skyfield, utc_ns
 DATED = '[sky]\nepoch_utc = "2026-11-21T00:00:00Z"\n'
 BODIES = DATED + "[sky.bodies]\nplanets = true\nmoon = true\nsun = true\n"
 JUPITER, MOON = "148.387,13.6125,0", "7.557,7.141,0"
+COARSE = '[render]\nquantisation = "round"\nflux_at_white_e_per_s = 5e8\n'
 PLACE_ARCSEC = 0.1  # the issue's limit; the header's WCS is exact for a pinhole
 
 
@@ -78,6 +81,16 @@ def test_the_virtual_tracker_sees_the_same_bodies(bodies_file):
     assert truth["name"][truth["hip"] == 0].tolist() == ["Moon"]
 
 
+def test_the_sun_in_view_overflows_nothing(bodies_file):
+    """1.6e18 electrons/s in one point: a detector's wells are full, the screen is white, and both say so."""
+    for path, command in (("s.fits", ("simulate", "-o")), ("c.png", ("frame", "--codes"))):
+        done = run_hilstar_here(
+            command[0], bodies_file, "--radec", "236.056,-19.779,0", command[1], bodies_file.parent / path, "--json"
+        )
+        assert done.returncode == 0, done.stderr
+        assert "Sun" in json.loads(done.stdout)["clipped"]
+
+
 def test_verify_knows_bodies_and_says_which_are_discs(bodies_file):
     done = run_hilstar_here("verify", bodies_file, "--fields", "2", "--json")
     points = json.loads(done.stdout)["drawn_as_points"]
@@ -94,6 +107,21 @@ def test_a_frame_s_time_moves_bodies_and_comes_back_bit_for_bit(bodies_file):
         # 0.49 to 0.66 arcsec/s for 595 s, at 198 arcsec to a pixel, both middles within 0.1 px
         middle = [np.argwhere(levels == levels.max()).mean(axis=0) for levels in (first, later)]
         assert 1.37 < np.linalg.norm(middle[1] - middle[0]) < 2.1
+
+
+def test_shares_of_light_are_the_stars_own(bodies_file):
+    """The Sun's light is that of all stars many times over, and faint Neptune lights no pixel beside so bright a white."""
+    text = bodies_file.read_text() + COARSE
+    bodies_file.write_text(text)
+    with load(bodies_file) as bench:
+        with_bodies = not_drawn(bench)
+        assert faintest_e_per_s(bench) >= bench.faintest_shown_e_per_s > bench.stars.electrons_per_s.min()
+    bodies_file.write_text(
+        text.split("[sky.bodies]")[0] + '[spacecraft]\norbit = "geocentre"\n[render]\nbrightest_v_mag = 0.0\n'
+    )
+    with load(bodies_file) as bench:
+        assert not_drawn(bench) == with_bodies
+        assert with_bodies.stars > 0
 
 
 def test_a_run_s_ledger_replays_bodies_bit_for_bit_and_summaries_name_what_clips(bodies_file):

@@ -116,9 +116,7 @@ def test_shares_of_light_are_the_stars_own(bodies_file):
     with load(bodies_file) as bench:
         with_bodies = not_drawn(bench)
         assert faintest_e_per_s(bench) >= bench.faintest_shown_e_per_s > bench.stars.electrons_per_s.min()
-    bodies_file.write_text(
-        text.split("[sky.bodies]")[0] + '[spacecraft]\norbit = "geocentre"\n[render]\nbrightest_v_mag = 0.0\n'
-    )
+    bodies_file.write_text(text.split("[sky.bodies]")[0] + '[spacecraft]\norbit = "geocentre"\n' + COARSE)
     with load(bodies_file) as bench:
         assert not_drawn(bench) == with_bodies
         assert with_bodies.stars > 0

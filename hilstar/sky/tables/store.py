@@ -22,6 +22,7 @@ from hilstar.errors import HilstarError
 from hilstar.files import make_directory, whole_file
 from hilstar.reading import open_regular
 from hilstar.sky.catalog import RANGES, Catalog, column_names
+from hilstar.sky.tables.reader import MAX_TABLE_BYTES
 
 VERSION = 1  # of what a table is made into: count up with each change of its result
 KEPT_FILES = 6  # the newest; 250 MB each for 2.5 million stars
@@ -42,8 +43,8 @@ class Kept:
 
 
 def file_sha256(path: Path, advice: str) -> str:
-    """The SHA-256 of a file, computed once for each state of it. Raises InputError."""
-    with open_regular(path, advice) as file:
+    """The SHA-256 of a file of at most MAX_TABLE_BYTES, computed once for each state of it. Raises InputError."""
+    with open_regular(path, advice, MAX_TABLE_BYTES) as file:
         status = os.fstat(file.fileno())
     return _sha256(path, (status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns), advice)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from hilstar.sky.stars import Stars
 
 # A cap this much wider than the monitor's own: culling must have something to throw away.
 SKY_BEYOND = 1.5
+STAR_COLUMNS = ("hip", "v_mag", "bv_mag", "temperature_k", "electrons_per_s", "row")
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,8 +49,7 @@ def scene(bench: Bench, every: Stars, q_icrs_to_cam: FloatArray, count: int, rng
 def _sorted(every: Stars, sources: IntArray, vectors: FloatArray) -> Stars:
     """Stars at `vectors` (n, 3) that are otherwise those of `every` at `sources` (n,), by cell."""
     grid = cell_grid(vectors)
-    names = [field.name for field in fields(Stars) if field.name not in ("grid", "vectors", "catalog")]
-    columns = {name: getattr(every, name)[sources[grid.order]] for name in names}
+    columns = {name: getattr(every, name)[sources[grid.order]] for name in STAR_COLUMNS}
     return replace(every, vectors=np.ascontiguousarray(vectors[grid.order]), grid=grid, **columns)
 
 

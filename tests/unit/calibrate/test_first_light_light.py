@@ -210,3 +210,12 @@ def test_a_truth_whose_primaries_are_not_known_cannot_stand_in_for_bit_stealing(
             {"monitor": {"bits": 8}, "render": {"bit_stealing": True}},
             {"monitor": {"bits": 8, "calibration": "true-response.toml"}},
         )
+
+
+def test_too_few_readings_of_a_response_that_needs_more_are_no_calibration(tmp_path):
+    """The example's S-curve by 12 levels: held out of the fit they are 0.1 mag off, and the bench file is left alone."""
+    bench = {"monitor": {"bits": 8, "calibration": "lcd-example"}}
+    outcome = on_the_twin(tmp_path, photometry, bench, bench, 30)
+    assert (outcome.verdict, outcome.changes) == ("failed", ())
+    assert "--patches" in outcome.line
+    assert "[uniformity]" in (tmp_path / "response.toml").read_text()  # which the tracker has not measured, and the bench has

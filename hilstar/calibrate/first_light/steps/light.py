@@ -25,7 +25,7 @@ from hilstar.monitor.calibration import BUILT_IN, Calibration, load_calibration,
 from hilstar.monitor.calibration_file import add_uniformity
 from hilstar.monitor.response import Response
 from hilstar.scene.psf import peak_share
-from hilstar.units import ERROR_OF_MEDIAN, magnitude
+from hilstar.units import ERROR_OF_MEDIAN, MAG_PER_RELATIVE, magnitude
 
 SEED = 0
 PHOTOMETRY_FILES = ("measured.csv", "response.toml", "response.png", "response-before.png")
@@ -110,6 +110,7 @@ def _response_figures(
         "black_level_in_bench_file": before.black,
         "black_level_measured": "yes" if readings.black_known else "no: give --dark, an image with the monitor switched off",
         "held_out_rms_mag": max(each.holdout.rms_mag for each in found.channels.values()),
+        "held_out_p95_mag": max(MAG_PER_RELATIVE * each.holdout.p95_percent / 100 for each in found.channels.values()),
         "held_out_max_mag": max(each.holdout.max_mag for each in found.channels.values()),
         "noise_percent": 100 * found.noise_relative,
         "drift_percent": float("nan") if found.drift_percent is None else found.drift_percent,
@@ -143,8 +144,8 @@ def _judged(room: Room, figures: dict[str, Figure], files: tuple[Path, ...], pic
         why = "switch off dynamic contrast and local dimming, or is the tracker not linear?"
         line = f"dense and sparse dots of one code differ by {figures['links_max_mag']:.3f} mag: {why}"
         return Outcome("failed", line, figures, files, pictures)
-    if float(figures["held_out_max_mag"]) > limit_mag:
-        why = "look at stray light, and whether the monitor was warm"
+    if float(figures["held_out_p95_mag"]) > limit_mag:
+        why = "take more readings (--patches), look at stray light, and at whether the monitor was warm"
         return Outcome("failed", f"{line}: the levels do not make one smooth response; {why}", figures, files, pictures)
     name = os.path.relpath(room.session / "response.toml", room.file.folder)
     changes = (

@@ -57,7 +57,7 @@ def q_icrs_to_itrs(utc_ns: IntArray) -> FloatArray:
         return values[before] + share * (values[after] - values[before])
 
     table, mjd = _table(), UNIX_MJD + hours / 24.0
-    tai_utc_s = _tai_utc_s(hours // 24)
+    tai_utc_s = tai_minus_utc_s(hours // 24)
     tt_days = (tai_utc_s + TT_FROM_TAI_S) / 86400.0
     # Linear over an hour, these are within 5 microarcsec: the shortest nutation of note takes 5.5 days.
     x, y, s = (between(values) for values in erfa.xys06a(MJD_ZERO_JD, mjd + tt_days))
@@ -120,11 +120,11 @@ def _table() -> _Table:
     rows = iers.IERS_A.read(iers.IERS_A_FILE)
     mjd = np.array(rows["MJD"].value, dtype=np.float64)
     ut1_utc_s, x_arcsec, y_arcsec = (np.array(rows[name].value, dtype=np.float64) for name in ("UT1_UTC", "PM_x", "PM_y"))
-    ut1_tai_s = ut1_utc_s - _tai_utc_s(mjd.astype(np.int64) - UNIX_MJD)
+    ut1_tai_s = ut1_utc_s - tai_minus_utc_s(mjd.astype(np.int64) - UNIX_MJD)
     return _Table(mjd, ut1_tai_s, np.radians(x_arcsec / 3600), np.radians(y_arcsec / 3600))
 
 
-def _tai_utc_s(unix_days: IntArray) -> FloatArray:
+def tai_minus_utc_s(unix_days: IntArray) -> FloatArray:
     """TAI-UTC in seconds at the beginnings of days since 1970."""
     year, month, day, _ = erfa.jd2cal(MJD_ZERO_JD + UNIX_MJD, np.asarray(unix_days, dtype=np.float64))
     with warnings.catch_warnings():

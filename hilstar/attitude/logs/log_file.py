@@ -197,9 +197,10 @@ def _mcap(path: Path) -> LogReading:
 def _aem(path: Path, text: str) -> LogReading:
     from hilstar.attitude.logs.aem.keywords import AemFaultError
     from hilstar.attitude.logs.aem.reader import read_aem
+    from hilstar.attitude.logs.of_date import q_icrs_to_date
 
     try:
-        return read_aem(text)
+        return read_aem(text, q_icrs_to_date)
     except AemFaultError as fault:
         raise InputError(f"{path}{fault.where}: {fault}") from fault
 

@@ -3,7 +3,7 @@
 Rules:
 1. One of REF_FRAME_A and REF_FRAME_B is ICRF, GCRF or EME2000, taken as the same axes (EME2000's differ by 23 mas); the
    other is a frame of the spacecraft: a camera's by its name (STARTRACKER_1, INSTRUMENT_A, CAM, ...), else a body's, which
-   the mounting makes the camera's. Any other frame is refused.
+   the mounting makes the camera's. MOD, TOD, TEME and the ITRF are turned to the ICRS at each epoch. Any other is refused.
 2. The quaternion of 504.0-B-2 annex F turns components from its first frame into its second; it is the conjugate of
    hilstar's. ATTITUDE_DIR says which frame is first (2.0: always A), QUATERNION_TYPE where the scalar is (2.0: last).
 3. A rate is the angular velocity of the second frame with respect to the first. Euler angles and spins: `angles`.
@@ -14,10 +14,11 @@ Rules:
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
+import numpy.typing as npt
 
 from hilstar.arrays import FloatArray
 from hilstar.attitude.logs.aem.angles import euler, rotated, spin
@@ -37,7 +38,7 @@ from hilstar.attitude.logs.aem.keywords import VERSION_KEY, AemFaultError
 from hilstar.attitude.logs.aem.kvn import kvn_blocks
 from hilstar.attitude.logs.aem.xml import xml_blocks
 from hilstar.attitude.logs.entries import Entry, LogReading
-from hilstar.attitude.wire.packet import AttitudeSample, checked_sample
+from hilstar.attitude.wire.packet import INT64, AttitudeSample, checked_sample
 from hilstar.attitude.wire.source import Conventions, components
 from hilstar.rotation import conjugate, multiply
 from hilstar.units import NS_PER_S
@@ -50,6 +51,8 @@ BODY_FRAME = re.compile(
     "(SC_BODY|ACC|ACTUATOR|CSS|DSS|ESA|GYRO|GYRO_FRAME|IMU|IMU_FRAME|MTA|RW|SA|TAM)(_.*|[0-9]+)?|" + CAMERA_FRAME.pattern
 )
 
+OF_DATE_FRAME = re.compile("MOD|TOD|TEME|ITRF-?([0-9]{2}|[0-9]{4})?")
+OfDate = Callable[[str, str, npt.NDArray[np.int64]], tuple[FloatArray, FloatArray, str | None]]
 AMBIGUOUS = (
     f"{EULER_RATE} of AEM 1.0 does not say whether its rates are those of the angles or an angular velocity; they are not used"
 )
@@ -57,10 +60,13 @@ QUARTER_TURN_DEG = 90.0
 ADVICE = "sort its lines, and let no blocks overlap; leap seconds are not counted, so write TAI across one"
 
 
-def read_aem(text: str) -> LogReading:
+def read_aem(text: str, of_date: OfDate) -> LogReading:
     """The attitudes of an AEM's text, each with its place, in the order of the blocks' first epochs.
 
-    Raises AemFaultError for anything that is not an AEM of attitudes between a spacecraft's frame and the ICRF.
+    `of_date` has the frames that move: from a frame's name, a time system and times (n,), ns, the rotations (n, 4) from ICRS
+    the frame's own rate (3,) in its components, and a notice or None.
+
+    Raises AemFaultError for anything that is not an AEM of attitudes between a spacecraft's frame and one of those above.
     """
     blocks = xml_blocks(text) if text.lstrip().startswith("<") else kvn_blocks(text)
     if len({block.meta["TIME_SYSTEM"] for block in blocks}) > 1:
@@ -71,17 +77,19 @@ def read_aem(text: str) -> LogReading:
     timed = [([epoch_ns(where, epoch) for where, epoch in zip(b.where, b.epochs, strict=True)], b) for b in blocks]
     timed.sort(key=lambda pair: pair[0][0])
     entries: list[Entry] = []
+    told: dict[str, str] = {}
     for times, block in timed:
-        following = list(_entries(block, times))
+        following = list(_entries(block, times, of_date, told))
         if entries:
             _part(entries, following)
         entries += following
-    ambiguous = any(block.meta["ATTITUDE_TYPE"] == EULER_RATE for block in blocks)
-    told = [("aem-rates", AMBIGUOUS)] if ambiguous else []
-    return LogReading(entries, _conventions(*frames[0], blocks[0].meta["TIME_SYSTEM"]), ADVICE, told)
+    if any(block.meta["ATTITUDE_TYPE"] == EULER_RATE for block in blocks):
+        told["aem-rates"] = AMBIGUOUS
+    return LogReading(entries, _conventions(*frames[0], blocks[0].meta["TIME_SYSTEM"]), ADVICE, list(told.items()))
 
 
 def _conventions(inertial: str, body: str, scale: str) -> Conventions:
+    named = inertial if inertial in INERTIAL_FRAMES else f"ICRF (turned from {inertial} at each epoch)"
     leap = "; leap seconds are not counted" if scale == "UTC" else ""
     return Conventions(
         "CCSDS AEM",
@@ -89,7 +97,7 @@ def _conventions(inertial: str, body: str, scale: str) -> Conventions:
         "the scalar where the file says; the conjugate of a Hamilton quaternion (504.0-B-2 annex F)",
         f"{scale}, from 1970-01-01T00:00:00 {scale}{leap}",
         of_body=CAMERA_FRAME.fullmatch(body) is None,
-        written=lambda q: f"A2B, {inertial} to {body}, Q1 Q2 Q3 QC = {components(np.roll(conjugate(q), -1))}",
+        written=lambda q: f"A2B, {named} to {body}, Q1 Q2 Q3 QC = {components(np.roll(conjugate(q), -1))}",
         scale=scale,
     )
 
@@ -103,13 +111,33 @@ def _part(entries: list[Entry], following: list[Entry]) -> None:
         following[0] = Entry(where, replace(first, discontinuity=True))
 
 
-def _entries(block: Block, times: list[int]) -> Iterator[Entry]:
+def _entries(block: Block, times: list[int], of_date: OfDate, told: dict[str, str]) -> Iterator[Entry]:
     q, rate = _attitudes(block)
     if block.meta["ATTITUDE_TYPE"] == SPIN and not _alias(block, times):
         rate = None
+    reference, _ = _frames(block.meta)
+    if reference not in INERTIAL_FRAMES:
+        if any(t_ns not in INT64 for t_ns in times):
+            raise AemFaultError(
+                block.where[-1], f"the times of the block do not fit 64 bits, so {reference} has no place there"
+            )
+        q_icrs_to_frame, frame_rate, notice = of_date(reference, block.meta["TIME_SYSTEM"], np.array(times, dtype=np.int64))
+        q, rate = _from_icrs(q, rate, q_icrs_to_frame, frame_rate)
+        if notice is not None:
+            told["earth-orientation"] = notice
     rates: Sequence[list[float] | None] = [None] * len(q) if rate is None else rate.tolist()
     for where, t_ns, numbers, turning in zip(block.where, times, q.tolist(), rates, strict=True):
         yield Entry(where, checked_sample(t_ns, tuple(numbers), None if turning is None else tuple(turning)))
+
+
+def _from_icrs(
+    q: FloatArray, rate: FloatArray | None, q_icrs_to_frame: FloatArray, turning_rad_s: FloatArray
+) -> tuple[FloatArray, FloatArray | None]:
+    """Attitude and rate with respect to the ICRS of those with respect to a frame that moves."""
+    with np.errstate(all="ignore"):
+        unit = q / np.linalg.norm(q, axis=1, keepdims=True)
+        own = rotated(unit, np.tile(turning_rad_s, (len(q), 1)))
+    return multiply(q, q_icrs_to_frame), None if rate is None else rate + own
 
 
 def _alias(block: Block, times: list[int]) -> bool:
@@ -153,20 +181,25 @@ def _rate_in_cam(meta: dict[str, str], q: FloatArray, norm2: FloatArray, rate: F
 
 
 def _frames(meta: dict[str, str]) -> tuple[str, str]:
-    """The inertial frame and the spacecraft's. Raises AemFaultError."""
+    """The frame among the stars (or of a date), and the spacecraft's. Raises AemFaultError."""
     a, b = meta["REF_FRAME_A"], meta["REF_FRAME_B"]
-    inertial, body = (a, b) if a in INERTIAL_FRAMES else (b, a)
-    if inertial not in INERTIAL_FRAMES or not BODY_FRAME.fullmatch(body):
-        wanted = "one must be ICRF or EME2000, the other a spacecraft frame (SC_BODY_1, STARTRACKER_1, INSTRUMENT_A, CAM, ...)"
-        raise AemFaultError("", f"REF_FRAME_A = {a}, REF_FRAME_B = {b}; {wanted}")
-    return inertial, body
+    reference, body = (a, b) if _is_reference(a) else (b, a)
+    if not _is_reference(reference) or not BODY_FRAME.fullmatch(body):
+        wanted = "one must be ICRF, EME2000, MOD, TOD, TEME or ITRF"
+        body_wanted = "the other a spacecraft frame (SC_BODY_1, STARTRACKER_1, INSTRUMENT_A, CAM, ...)"
+        raise AemFaultError("", f"REF_FRAME_A = {a}, REF_FRAME_B = {b}; {wanted}, {body_wanted}")
+    return reference, body
+
+
+def _is_reference(frame: str) -> bool:
+    return frame in INERTIAL_FRAMES or OF_DATE_FRAME.fullmatch(frame) is not None
 
 
 def _second_frame_is_cam(meta: dict[str, str]) -> bool:
     direction = meta.get("ATTITUDE_DIR", "A2B" if meta[VERSION_KEY] == "2.0" else "missing")
     if direction not in {"A2B", "B2A"}:
         raise AemFaultError("", f"ATTITUDE_DIR is {direction}; write A2B or B2A")
-    return (meta["REF_FRAME_A"] in INERTIAL_FRAMES) == (direction == "A2B")
+    return _is_reference(meta["REF_FRAME_A"]) == (direction == "A2B")
 
 
 def _rate_is_in_cam(meta: dict[str, str]) -> bool:
@@ -177,4 +210,4 @@ def _rate_is_in_cam(meta: dict[str, str]) -> bool:
     frame = {"REF_FRAME_A": a, "REF_FRAME_B": b}.get(given, given)
     if frame not in {a, b}:
         raise AemFaultError("", f"{key} is {given}; write {a} or {b}")
-    return frame not in INERTIAL_FRAMES
+    return not _is_reference(frame)

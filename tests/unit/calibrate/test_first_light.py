@@ -240,6 +240,38 @@ def test_what_failed_is_never_done_and_what_needs_it_is_skipped(counted, tmp_pat
     assert counted.runs == ["first", "second"]
 
 
+def test_a_camera_that_fails_once_does_not_cost_the_images_before_it(tmp_path, monkeypatch):
+    """The third image fails until a file is there; then only it and what follows are taken, and afterwards nothing is."""
+    (tmp_path / "bench.toml").write_text(bench_text())
+    (tmp_path / "s").mkdir()
+    taken = []
+
+    def frames(room):
+        for number in range(4):
+            path = room.take(Pattern(f"frame_{number}", black(room.resolution_px)))
+            taken.append((path.name, path.stat().st_mtime_ns))
+        return Outcome("done", "found")
+
+    monkeypatch.setattr(sessions, "STEPS", (Step("frames", "", "", frames, tables=("monitor",)),))
+    monkeypatch.setattr(sessions, "NAMES", ("frames",))
+    grab = f"sh -c 'cp {{pattern}} {{output}}; case {{output}} in *frame_2*) test -e {tmp_path / 'mended'};; esac'"
+
+    def go(*again):
+        taken.clear()
+        session = Session(tmp_path / "s", read_bench_file(tmp_path / "bench.toml"), Grabber(grab), 0)
+        code = session.run(frozenset(again), lambda line: None)
+        return code, session.records["frames"].verdict, dict(taken)
+
+    code, verdict, before = go()
+    assert (code, verdict, sorted(before)) == (1, "failed", ["frame_0.png", "frame_1.png"])
+    (tmp_path / "mended").touch()
+    code, verdict, after = go()
+    assert (code, verdict, len(after)) == (0, "done", 4)
+    assert after.items() >= before.items()
+    assert go()[2] == {}
+    assert not go("frames")[2].items() & after.items()
+
+
 def test_a_directory_of_another_bench_is_refused(counted, tmp_path):
     counted.go(tmp_path)
     (tmp_path / "other.toml").write_text(bench_text())

@@ -76,7 +76,7 @@ class Camera:
         x, y = (np.rint(part).astype(int) for part in GEOMETRY.to_tracker(columns.astype(float), rows.astype(float)))
         dense = 1 + self.neighbours * (len(rows) > 10_000)
         dn = self.white * exposure_s * dense * self.light[pattern.codes[rows, columns]]
-        np.add.at(image, (y, x), dn)
+        image += np.bincount(y * 400 + x, dn, minlength=image.size).reshape(image.shape)
         return self.save(stem, image)
 
     def unlit(self, stem):
@@ -126,6 +126,15 @@ def test_a_response_that_is_far_brighter_than_assumed_is_read_by_a_sparser_latti
 def test_a_pixel_that_is_brighter_among_lit_ones_is_seen_by_the_links(tmp_path):
     found = read(tmp_path, Camera(srgb_response(10).light, 20_000, neighbours=0.08))
     assert max(link.ratio for link in found.links) == pytest.approx(1.08, abs=0.01)
+
+
+def test_a_screen_whose_pixels_depend_on_their_neighbours_is_no_calibration(tmp_path):
+    (tmp_path / "bench.toml").write_text(bench_text(TWIN))
+    camera = Camera(srgb_response(10).light, 20_000, neighbours=0.08)
+    outcome = photometry(Room(read_bench_file(tmp_path / "bench.toml"), tmp_path, tmp_path / "i", camera, {}, {}, 24))
+    assert (outcome.verdict, outcome.changes) == ("failed", ())
+    assert outcome.figures["links_max_mag"] == pytest.approx(2.5 * np.log10(1.08), abs=0.005)
+    assert "local dimming" in outcome.line
 
 
 def test_without_an_image_of_a_monitor_that_is_off_black_is_the_bench_files(tmp_path):

@@ -39,7 +39,8 @@ class RenderSettings(Table, frozen=True):
             description='How light becomes codes. `"round"`: the nearest code. `"dither"`: blue noise, exact in the mean over '
             'pixels. `"temporal"`: dithered over `cycle_frames` frames. `"exact"`: all codes of a star are chosen together, so '
             'that its flux and centroid are right in a single frame. `"auto"`: `round` where that stays within the tolerance, '
-            "else `exact`, unless an average field would take `exact` more than half a refresh on two cores without a GPU; "
+            "else `exact`, unless an average field, turning at 1 deg/s, would take it more than half a refresh on two cores "
+            "without a GPU; "
             "`--explain` of `frame`, `serve` and `replay` says which."
         ),
     ] = "auto"

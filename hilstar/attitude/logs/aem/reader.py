@@ -85,19 +85,36 @@ def read_aem(text: str, of_date: OfDate) -> LogReading:
         entries += following
     if any(block.meta["ATTITUDE_TYPE"] == EULER_RATE for block in blocks):
         told["aem-rates"] = AMBIGUOUS
-    return LogReading(entries, _conventions(*frames[0], blocks[0].meta["TIME_SYSTEM"]), ADVICE, list(told.items()))
+    (first_ns, *_), first = timed[0]
+    return LogReading(entries, _conventions(first, first_ns, of_date), ADVICE, list(told.items()))
 
 
-def _conventions(inertial: str, body: str, scale: str) -> Conventions:
-    named = inertial if inertial in INERTIAL_FRAMES else f"ICRF (turned from {inertial} at each epoch)"
+def _conventions(block: Block, first_ns: int, of_date: OfDate) -> Conventions:
+    """What the numbers of a file mean, in the words of its first block; an attitude as that block has it at its first epoch."""
+    meta = block.meta
+    (reference, body), scale, to_body = _frames(meta), meta["TIME_SYSTEM"], _second_frame_is_cam(meta)
+    scalar_first = meta.get("QUATERNION_TYPE") == "FIRST"
+    names = "QC Q1 Q2 Q3" if scalar_first else "Q1 Q2 Q3 QC"
+    first, second = (reference, body) if to_body else (body, reference)
+    inertial = reference in INERTIAL_FRAMES
+
+    def written(q: FloatArray) -> str:
+        if not inertial:
+            q = multiply(q, conjugate(of_date(reference, scale, np.array([first_ns], dtype=np.int64))[0][0]))
+        own = conjugate(q) if to_body else q
+        when = "" if inertial else f" at {block.epochs[0]}"
+        return f"{names} = {components(own if scalar_first else np.roll(own, -1))}{when}"
+
+    turned = "" if inertial else f" ({reference} by hilstar: the ICRF, at each epoch)"
     leap = "; leap seconds are not counted" if scale == "UTC" else ""
     return Conventions(
         "CCSDS AEM",
-        f"between {inertial} and {body}, in the direction that the file states",
-        "the scalar where the file says; the conjugate of a Hamilton quaternion (504.0-B-2 annex F)",
+        f"{meta['ATTITUDE_TYPE']} turns components of {first} into those of {second}{turned}",
+        f"quaternions scalar {'first' if scalar_first else 'last'} ({names.replace(' ', ', ')}),"
+        " the conjugate of a Hamilton quaternion (504.0-B-2 annex F)",
         f"{scale}, from 1970-01-01T00:00:00 {scale}{leap}",
         of_body=CAMERA_FRAME.fullmatch(body) is None,
-        written=lambda q: f"A2B, {named} to {body}, Q1 Q2 Q3 QC = {components(np.roll(conjugate(q), -1))}",
+        written=written,
         scale=scale,
     )
 

@@ -268,7 +268,7 @@ def test_the_mounting_is_of_a_body_and_not_of_a_camera(tmp_path, frame, mounted)
     assert log.conventions.of_body == mounted
     assert log.samples[0].q_icrs_to_cam.tolist() == ([0.6, 0.8, 0.0, 0.0] if mounted else [1.0, 0.0, 0.0, 0.0])
     lines = log.conventions.lines(Mounting())
-    assert f"between ICRF and {frame}" in lines[0]
+    assert f"turns components of ICRF into those of {frame}" in lines[0]
     assert lines[2] == "time: TAI, from 1970-01-01T00:00:00 TAI"
 
 

@@ -73,7 +73,7 @@ def _body(spice: Any, path: Path, segments: list[Segment], stated: str | None) -
         return bodies[0]
     body = _id_of(spice, stated)
     if body not in bodies:
-        raise InputError(f"{path}: contains no structure {stated!r}; it has {named}: --body ID")
+        raise InputError(f"{path}: contains no structure {stated!r}; it has {named}: --body ID, or a name of its frame kernel")
     return body
 
 

@@ -43,7 +43,7 @@ def in_words(error: Any) -> str:
     if "SCLK" in said and ("not found" in said or "kernel" in said.lower()):
         return f"its clock is unknown; give its SCLK kernel, and leap seconds: --kernel FILE.tsc ({said})"
     if "frame" in said.lower():
-        return f"a frame is unknown; give its frame kernel: --kernel FILE.tf ({said})"
+        return f"a frame has no place among the stars; give what orients it: --kernel FILE.tf, or its own .bc, or .tpc ({said})"
     return f"SPICE refuses it ({said})"
 
 

@@ -125,7 +125,9 @@ def test_a_missing_kernel_is_named_with_the_option(tmp_path, raw):
         (tmp_path / "frames.tf").write_text(ck.frame_kernel())
         with spiceypy.KernelPool([str(tmp_path / "frames.tf")]):
             ck.write_segment(handle, 3, ck.Motion(np.random.default_rng(1)), TIMES, reference="PROBE_TABLE")
-    assert "a frame is unknown; give its frame kernel: --kernel FILE.tf" in refusal(tmp_path / "a.bc")
+    assert "a frame has no place among the stars; give what orients it: --kernel FILE.tf, or its own .bc, or .tpc" in refusal(
+        tmp_path / "a.bc"
+    )
 
 
 @pytest.mark.parametrize("relative", ["", "'+"])

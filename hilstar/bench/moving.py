@@ -11,14 +11,15 @@ from hilstar.reading import read_text
 from hilstar.scene.camera import Camera
 from hilstar.sky.bodies.kernel import Kernel
 from hilstar.sky.bodies.moving import PLANETS, YEAR_NS, BodyLight, MovingSky
-from hilstar.sky.bodies.orbit import TLE_ADVICE, Geocentre, TleOrbit
+from hilstar.sky.bodies.oem import VERSION_KEY, OemOrbit
+from hilstar.sky.bodies.orbit import TLE_ADVICE, Geocentre, Orbit, TleOrbit
 from hilstar.sky.bodies.spectra import bodies_bv_mag, bodies_electrons_per_s
 from hilstar.sky.electrons import Optics, Photometry
 from hilstar.units import ARCSEC_PER_RAD
 
 log = logging.getLogger(__name__)
 
-MAX_TLE_BYTES = 10_000
+MAX_ORBIT_BYTES = 20_000_000  # a year of minutes
 MAX_TLE_AGE_DAYS = 7.0
 POINT_PX = 0.2  # a wider disc moves light by more than a point's sprite does: 0.2 px across widens a sigma of 0.85 px by 0.2 %
 
@@ -34,16 +35,22 @@ def moving_sky(config: BenchConfig, folder: Path, optics: Optics) -> MovingSky:
     # A source's own dates count from 1970, and its stars are those of its day.
     start_ns = round((config.sky.epoch_jyear - jyear(utc_ns)) * YEAR_NS)
     orbit = config.spacecraft.orbit or GEOCENTRE
-    observer = Geocentre() if orbit == GEOCENTRE else tle_orbit(folder / orbit, utc_ns + start_ns)
+    observer = Geocentre() if orbit == GEOCENTRE else orbit_file(folder / orbit, utc_ns + start_ns)
     names = body_names(config)
     sky = config.sky
     rates = bodies_electrons_per_s(names, sky.brightness, optics, Photometry(sky.zero_point, sky.passband_weighting))
     return MovingSky(Kernel(), observer, utc_ns, BodyLight(names, bodies_bv_mag(names), rates), start_ns)
 
 
-def tle_orbit(path: Path, utc_ns: int) -> TleOrbit:
-    """The orbit by the elements in a file, with a warning where they are not of that UTC. Raises InputError, MachineError."""
-    orbit = TleOrbit(read_text(path, TLE_ADVICE, MAX_TLE_BYTES), str(path))
+def orbit_file(path: Path, utc_ns: int) -> Orbit:
+    """The orbit in a file, which is an OEM that covers that UTC, or elements: with a warning where they are of another week.
+
+    Raises InputError, and MachineError without SGP4 for elements.
+    """
+    text = read_text(path, f"{TLE_ADVICE}, or a CCSDS OEM", MAX_ORBIT_BYTES)
+    if text.lstrip().startswith(VERSION_KEY):
+        return OemOrbit(text, str(path), utc_ns)
+    orbit = TleOrbit(text, str(path))
     age_days = orbit.age_days(utc_ns)
     if abs(age_days) > MAX_TLE_AGE_DAYS:
         # Vallado et al. 2006: SGP4 is 1 to 3 km off a day in a low orbit, the Moon 0.5 to 1.6 arcsec a day.

@@ -21,7 +21,8 @@ class Spacecraft(Table, frozen=True):
     orbit: Annotated[
         str | None,
         Meta(
-            description='`"geocentre"`, or the path of a file with one two-line element set (TLE), propagated by SGP4.',
+            description='`"geocentre"`, or the path of a file: one two-line element set (TLE), propagated by SGP4, or a CCSDS'
+            " OEM (KVN; ICRF, GCRF or EME2000 about the Earth).",
             extra={"default": 'none; `"geocentre"` with `[sky.bodies]`'},
         ),
     ] = None

@@ -1,4 +1,4 @@
-"""The observer: the Earth's centre, or a satellite on a two-line element set, by SGP4 (Vallado et al. 2006, AIAA 2006-6753)."""
+"""Observers: the Earth's centre, or a satellite on a two-line element set, by SGP4 (Vallado et al. 2006, AIAA 2006-6753)."""
 
 from __future__ import annotations
 

@@ -19,7 +19,8 @@ from hilstar.twin.budget import not_drawn
 from hilstar.twin.verify.star_finder import faintest_e_per_s
 from tests.support.aem_messages import kvn
 from tests.support.commands import run_hilstar_here
-from tests.support.skies import STATION_TLE, skyfield, utc_ns
+from tests.support.oem_messages import oem, segment
+from tests.support.skies import STATION_TLE, STATION_UTC, skyfield, utc_ns
 
 DATED = '[sky]\nepoch_utc = "2026-11-21T00:00:00Z"\n'
 BODIES = DATED + "[sky.bodies]\nplanets = true\nmoon = true\nsun = true\n"
@@ -169,6 +170,18 @@ def test_from_a_low_orbit_the_moon_is_elsewhere(bodies_file):
         moon = bench.stars.bodies.index("Moon") - len(bench.stars.bodies)
         apart_deg = np.degrees(np.linalg.norm(bench.stars.vectors[moon] - from_the_middle.stars.vectors[moon]))
         assert 0.1 < apart_deg < 1.1
+
+
+def test_an_oem_of_the_same_orbit_shows_the_same_moon(bodies_file):
+    (bodies_file.parent / "station.tle").write_text(STATION_TLE)
+    (bodies_file.parent / "station.oem").write_text(oem(segment(range(0, 600, 60))))
+    text = bodies_file.read_text().replace("2026-11-21T00:00:00Z", STATION_UTC)
+    places = []
+    for orbit in ("station.tle", "station.oem"):
+        bodies_file.write_text(text + f'[spacecraft]\norbit = "{orbit}"\n')
+        with load(bodies_file) as bench:
+            places.append(bench.stars.vectors[bench.stars.bodies.index("Moon") - len(bench.stars.bodies)].copy())
+    assert places[0] == pytest.approx(places[1], abs=5e-12)  # a microarcsecond; metres in their distance
 
 
 @pytest.mark.parametrize(

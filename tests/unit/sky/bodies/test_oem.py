@@ -1,0 +1,111 @@
+"""An OEM's orbit against SGP4, which wrote it, between its epochs and in every time scale; and what is refused."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+import pytest
+
+from hilstar.errors import InputError
+from hilstar.sky.bodies.oem import OemOrbit, hermite
+from tests.support.oem_messages import START_NS, STATION, oem, segment
+
+MINUTES = range(0, 1260, 60)
+# SGP4's velocity is the derivative of its place within 2e-5 km/s (measured), which makes 4e-4 km of a place between epochs; the
+# polynomial itself (h = 60 s: (9/16 h^2)^4 r n^8 / 8! = 1e-11 km) is held to its degree below. A second's error is 7.5 km.
+# No full hour is crossed, where the axes of TleOrbit turn by 0.2 m.
+PLACE_KM = 1e-3
+VELOCITY_KM_S = 1e-4
+NS = 10**9
+
+
+def station(text: str) -> OemOrbit:
+    return OemOrbit(text, "a.oem", START_NS)
+
+
+def test_between_epochs_the_orbit_is_that_of_the_program_that_wrote_it(rng):
+    orbit = station(oem(segment(MINUTES)))
+    for second in rng.uniform(0, 1200, size=40):
+        t_ns = START_NS + round(second * NS)
+        (place, velocity), (true_place, true_velocity) = orbit.state(t_ns), STATION.state(t_ns)
+        assert place == pytest.approx(true_place, abs=PLACE_KM)
+        assert velocity == pytest.approx(true_velocity, abs=VELOCITY_KM_S)
+
+
+def test_the_polynomial_is_exact_to_its_degree(rng):
+    whole = np.polynomial.Polynomial(rng.normal(size=8))
+    times = np.array([-2.0, -0.5, 0.7, 3.0])
+    value, slope = hermite(times, whole(times)[:, None], whole.deriv()(times)[:, None])
+    assert (value[0], slope[0]) == pytest.approx((whole(0.0), whole.deriv()(0.0)), abs=1e-9)
+
+
+@pytest.mark.parametrize(("scale", "ahead_s"), [("UTC", 0.0), ("TAI", 33.0), ("TT", 65.184), ("TDB", 65.184), ("GPS", 14.0)])
+@pytest.mark.parametrize("day_of_year", [False, True])
+def test_every_time_scale_tells_the_same_moment(scale, ahead_s, day_of_year):
+    """In September 2008 TAI was 33 s ahead of UTC."""
+    orbit = station(oem(segment(MINUTES, ahead_s, day_of_year, TIME_SYSTEM=scale)))
+    at_ns = START_NS + 615 * NS
+    assert orbit.state(at_ns)[0] == pytest.approx(STATION.state(at_ns)[0], abs=PLACE_KM)
+
+
+def test_segments_are_not_joined_and_covariances_and_accelerations_are_passed_over():
+    first = segment(MINUTES) + "COVARIANCE_START\nEPOCH = 2008-09-20T00:00:00\n1.0\n1.0 2.0\nCOVARIANCE_STOP\n"
+    second = "\n".join(
+        line + " 0 0 0" if line.startswith("2008") else line for line in segment([1200, 1300, 1400]).splitlines()
+    )
+    orbit = station(oem(first, second, version="3.0"))
+    for second_s in (30, 1199, 1250, 1399):
+        t_ns = START_NS + second_s * NS
+        assert orbit.state(t_ns)[0] == pytest.approx(STATION.state(t_ns)[0], abs=PLACE_KM)
+
+
+def test_beyond_its_epochs_the_last_place_is_held_and_told_once(caplog):
+    orbit = station(oem(segment(MINUTES)))
+    with caplog.at_level(logging.WARNING):
+        late = [orbit.state(START_NS + s * NS)[0] for s in (1201, 9000)]
+    assert late[0] == pytest.approx(STATION.state(START_NS + 1200 * NS)[0], abs=PLACE_KM)
+    assert late[1].tolist() == late[0].tolist()
+    assert len(caplog.records) == 1 and "is held" in caplog.text
+
+
+@pytest.mark.parametrize(("step_s", "told"), [(60, False), (600, False), (1800, True), (3600, True)])
+def test_epochs_too_far_apart_for_the_polynomial_are_told(caplog, step_s, told):
+    """At ten minutes it is good to 1e-3 km; at half an hour, a third of the orbit, to some km."""
+    with caplog.at_level(logging.WARNING):
+        orbit = station(oem(segment(range(0, 9 * step_s, step_s))))
+    assert ("between its epochs the orbit is off" in caplog.text) == told
+    t_ns = START_NS + round(3.5 * step_s) * NS
+    off_km = np.linalg.norm(orbit.state(t_ns)[0] - STATION.state(t_ns)[0])
+    assert (off_km > 1.0) == told
+
+
+GOOD = oem(segment([0, 60, 120]))
+ROW = next(line for line in GOOD.splitlines() if line.startswith("2008"))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (oem(), "contains no segment"),
+        (oem(segment([0])), "a segment has 1 states"),
+        (oem(segment([600, 660])), "does not cover 2008-09-20T12:30:00 UTC; it has 2008-09-20T12:40:00 to"),
+        (oem(segment([0, 60], REF_FRAME="ITRF")), "REF_FRAME is ITRF and CENTER_NAME EARTH"),
+        (oem(segment([0, 60], CENTER_NAME="MARS BARYCENTER")), "CENTER_NAME MARS BARYCENTER"),
+        (oem(segment([0, 60], REF_FRAME=None)), "REF_FRAME is missing"),
+        (oem(segment([0, 60], TIME_SYSTEM="MET")), "TIME_SYSTEM is MET"),
+        (oem(segment([0, 60, 60])), "the epoch is not after the one before it"),
+        (GOOD.replace(ROW, ROW.rsplit(" ", 1)[0]), "write an epoch, X Y Z"),
+        (GOOD.replace(ROW, ROW.replace("2008-09-20", "2008-09-31")), "the epoch is '2008-09-31"),
+        (GOOD.replace(ROW, ROW.replace("2008-09-20", "9999-09-20")), "the epoch is '9999-09-20"),
+        (GOOD.replace(ROW, ROW.split(" ")[0] + " nan 0 0 0 0 0"), "write km from the Earth's centre"),
+        (GOOD.replace(ROW, ROW.split(" ")[0] + " 1 1 1 0 0 0"), "write km from the Earth's centre"),
+        (GOOD[: GOOD.index("META_STOP")], "ends in the metadata"),
+        (GOOD.replace("META_STOP", "META_STOP\nanything"), "'anything'"),
+    ],
+)
+def test_what_is_no_orbit_about_the_earth_is_refused_in_one_line(text, words):
+    with pytest.raises(InputError) as caught:
+        station(text)
+    assert words in str(caught.value)
+    assert str(caught.value).startswith("a.oem") and "\n" not in str(caught.value)

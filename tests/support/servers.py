@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from tests.support.benches import SMALL_BENCH, attitude_table
+from tests.support.benches import LIVE_BENCH, SMALL_BENCH, attitude_table
 from tests.support.commands import HILSTAR
 from tests.support.senders import free_port
 from tests.support.waiting import PATIENCE_S, wait_for
@@ -42,7 +42,8 @@ def listening(bench: Path, first_words: str, *options: str) -> Iterator[subproce
 def serving(tmp_path: Path, port: int, *options: str, attitude: str = "", monitor: str = "") -> Iterator[subprocess.Popen[str]]:
     """`hilstar serve` of the small bench on a port, once it hears."""
     bench = tmp_path / "serve.toml"
-    bench.write_text(SMALL_BENCH.replace("[collimator]", f"{monitor}\n[collimator]") + attitude_table(port, attitude))
+    text = SMALL_BENCH if "[render]" in attitude else LIVE_BENCH
+    bench.write_text(text.replace("[collimator]", f"{monitor}\n[collimator]") + attitude_table(port, attitude))
     with listening(bench, f"127.0.0.1:{port}", *options) as process:
         time.sleep(SUBSCRIBED_S)
         yield process
@@ -104,7 +105,7 @@ def bound(tmp_path: Path, *options: str, attitude: str = "bind = true", files: i
     """`hilstar serve` that binds, once its port answers; it may open so many `files`."""
     port = free_port()
     bench = tmp_path / "serve.toml"
-    bench.write_text(SMALL_BENCH + attitude_table(port, attitude))
+    bench.write_text(LIVE_BENCH + attitude_table(port, attitude))
     command = [*HILSTAR, "serve", str(bench), "--headless", "--json", *options]
     if files is not None:
         command = ["sh", "-c", f'ulimit -n {files}; exec "$@"', "sh", *command]

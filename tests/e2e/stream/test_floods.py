@@ -19,7 +19,7 @@ import zmq
 import zmq.auth
 
 from hilstar.attitude.wire.flood_limits import MAX_BURST, MAX_PACKETS_PER_S
-from tests.support.benches import SMALL_BENCH
+from tests.support.benches import LIVE_BENCH
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.senders import connected, packet
 from tests.support.servers import Served, bound
@@ -223,7 +223,7 @@ def test_clients_are_let_in_and_locked_out_without_a_restart_and_those_rejected_
 )
 def test_endpoints_that_libzmq_would_take_and_hilstar_does_not(tmp_path, endpoint, said):
     bench = tmp_path / "bench.toml"
-    bench.write_text(f'{SMALL_BENCH}\n[attitude]\nendpoint = "{endpoint}"\n')
+    bench.write_text(f'{LIVE_BENCH}\n[attitude]\nendpoint = "{endpoint}"\n')
     assert_refused(run_hilstar_here("serve", bench, "--headless", "--duration", "1"), 2, endpoint, said)
     to = ("--to", endpoint, "--connect", "--spin", "z,1", "--count", "1", "--wait", "0")
     assert_refused(run_hilstar_here("send", *to), 2, endpoint, said)
@@ -233,7 +233,7 @@ def test_binding_a_file_deletes_nothing(tmp_path):
     measured = tmp_path / "measured.csv"
     measured.write_text("1,2,3\n")
     bench = tmp_path / "bench.toml"
-    bench.write_text(f'{SMALL_BENCH}\n[attitude]\nbind = true\nendpoint = "ipc://{measured}"\n')
+    bench.write_text(f'{LIVE_BENCH}\n[attitude]\nbind = true\nendpoint = "ipc://{measured}"\n')
     assert_refused(run_hilstar_here("serve", bench, "--headless", "--duration", "1"), 2, "measured.csv", "not a socket")
     assert_refused(run_hilstar_here("send", "--spin", "z,1", "--to", f"ipc://{measured}"), 2, "measured.csv", "not a socket")
     assert measured.read_text() == "1,2,3\n"

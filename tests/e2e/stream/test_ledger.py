@@ -18,7 +18,7 @@ from hilstar.attitude.logs.log_file import read_log
 from hilstar.errors import InputError
 from hilstar.rotation import from_radec_roll_deg, propagate
 from hilstar.run.record.ledger_reader import drawable_frames
-from tests.support.benches import SMALL_BENCH
+from tests.support.benches import LIVE_BENCH, SMALL_BENCH
 from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
 from tests.support.senders import packet, publisher
 from tests.support.servers import serving, summary_of
@@ -139,7 +139,7 @@ def test_a_full_disk_ends_the_ledger_and_not_the_display(tmp_path):
     ledger = tmp_path / "run.mcap"
     bench = tmp_path / "bench.toml"
     with publisher() as (sender, port):
-        bench.write_text(f'{SMALL_BENCH}\n[attitude]\nendpoint = "tcp://127.0.0.1:{port}"\n')
+        bench.write_text(f'{LIVE_BENCH}\n[attitude]\nendpoint = "tcp://127.0.0.1:{port}"\n')
         command = ["serve", str(bench), "--headless", "--json", "--ledger", str(ledger), "--duration", "3"]
         limited = f"import resource; resource.setrlimit(resource.RLIMIT_FSIZE, ({LIMIT_BYTES}, {LIMIT_BYTES}))"
         program = f"{limited}; from hilstar.cli import main; main()"

@@ -19,7 +19,7 @@ from hilstar.run.send.ends import SerialSender
 from hilstar.run.send.faults import BadCable, Faults
 from hilstar.run.send.sender import send, spin_samples
 from hilstar.run.serve import serve
-from tests.support.benches import SMALL_BENCH
+from tests.support.benches import LIVE_BENCH
 from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
 from tests.support.servers import interrupted, listening
 from tests.support.wire.ptys import Cable
@@ -37,7 +37,7 @@ def cable(tmp_path) -> Iterator[Cable]:
 @pytest.fixture
 def bench_file(tmp_path, cable):
     path = tmp_path / "serial.toml"
-    path.write_text(f'{SMALL_BENCH}\n[attitude]\nsource = "serial"\nport = "{cable.host}"\nbaud = {BAUD}\n')
+    path.write_text(f'{LIVE_BENCH}\n[attitude]\nsource = "serial"\nport = "{cable.host}"\nbaud = {BAUD}\n')
     return path
 
 
@@ -155,9 +155,9 @@ def test_a_line_of_garbage_without_an_end_is_one_refusal_and_the_next_frame_is_t
 def test_a_port_that_is_not_there_or_no_port_gets_one_line(tmp_path):
     bench = tmp_path / "bench.toml"
     for port, said in (("/dev/ttyNowhere", "ttyUSB0"), ("/dev/null", "ttyUSB0")):
-        bench.write_text(f'{SMALL_BENCH}\n[attitude]\nsource = "serial"\nport = "{port}"\n')
+        bench.write_text(f'{LIVE_BENCH}\n[attitude]\nsource = "serial"\nport = "{port}"\n')
         assert_refused(run_hilstar_here("serve", bench, "--headless", "--duration", "1"), 2, port, said)
-    bench.write_text(f'{SMALL_BENCH}\n[attitude]\nsource = "serial"\n')
+    bench.write_text(f'{LIVE_BENCH}\n[attitude]\nsource = "serial"\n')
     assert_refused(run_hilstar_here("serve", bench, "--headless", "--duration", "1"), 2, "port")
     assert_refused(run_hilstar_here("send", "--spin", "z,1", "--to", "serial:/dev/ttyNowhere@115200"), 2, "ttyNowhere")
     assert_refused(run_hilstar_here("send", "--spin", "z,1", "--to", "serial:@115200"), 2, "serial:/dev/ttyX@BAUD")

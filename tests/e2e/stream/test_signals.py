@@ -17,7 +17,7 @@ import pytest
 import zmq
 
 from hilstar.attitude.logs.log_file import read_log
-from tests.support.benches import SMALL_BENCH, attitude_table
+from tests.support.benches import LIVE_BENCH, attitude_table
 from tests.support.commands import has_handlers
 from tests.support.senders import free_port, packet, publisher
 from tests.support.waiting import wait_for
@@ -77,7 +77,7 @@ def of_session(session: int) -> list[str]:
 
 def serve_file(folder: Path, port: int, more: str = "") -> Path:
     path = folder / "serve.toml"
-    path.write_text(SMALL_BENCH + attitude_table(port, more))
+    path.write_text(LIVE_BENCH + attitude_table(port, more))
     return path
 
 

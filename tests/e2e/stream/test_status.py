@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from hilstar.console import run_status
-from tests.support.benches import SMALL_BENCH, attitude_table, still_log
+from tests.support.benches import LIVE_BENCH, attitude_table, still_log
 from tests.support.commands import HILSTAR, run_hilstar_here
 from tests.support.senders import free_port, publisher, talking
 
@@ -24,7 +24,7 @@ EVENT_TIME = re.compile(r"^hilstar: \d\d:\d\d:\d\d\.\d{3}Z ", re.MULTILINE)
 
 def bench_for(tmp_path: Path, port: int) -> Path:
     path = tmp_path / "bench.toml"
-    path.write_text(SMALL_BENCH + attitude_table(port))
+    path.write_text(LIVE_BENCH + attitude_table(port))
     return path
 
 

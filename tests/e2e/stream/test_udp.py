@@ -26,7 +26,7 @@ from hilstar.run.send.ends import UdpSender
 from hilstar.run.send.faults import BadCable, Faults
 from hilstar.run.send.sender import send, spin_samples
 from hilstar.run.serve import Outlet, serve
-from tests.support.benches import SMALL_BENCH
+from tests.support.benches import LIVE_BENCH
 from tests.support.commands import HILSTAR, assert_refused, run_hilstar, run_hilstar_here
 from tests.support.senders import free_port, packet
 from tests.support.servers import Served, interrupted, listening
@@ -41,7 +41,7 @@ ANSWERED_S = 0.3
 
 def bench_of(folder: Path, *lines: str) -> Path:
     path = folder / "udp.toml"
-    path.write_text("\n".join([SMALL_BENCH, "[attitude]", 'source = "udp"', *lines, ""]))
+    path.write_text("\n".join([LIVE_BENCH, "[attitude]", 'source = "udp"', *lines, ""]))
     return path
 
 

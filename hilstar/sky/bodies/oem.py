@@ -32,6 +32,8 @@ NODES = 4  # 1e-6 km of a low orbit at four minutes
 MIN_KM = 6000.0
 FAR_KM = 1.0  # half an arcsecond of the Moon
 TRIED = 50
+DAY_NS = 86_400 * NS_PER_S
+UNSEEN_NS = 120 * NS_PER_S  # magnitudes are those of a minute's beginning, places those of two steps
 COUNTS = {7, 10}  # an epoch, place and velocity, perhaps an acceleration
 
 
@@ -47,18 +49,20 @@ class Segment:
 class OemOrbit:
     """The orbit in the text of a file `name`.
 
-    Raises InputError for a text that is none, or that does not cover a UTC, ns since 1970.
+    Raises InputError for a text that is none, or that has no epoch within a day of a UTC, ns since 1970, at which stars are
+    placed.
     """
 
     step_s = 2.0  # as for a `TleOrbit`
 
     def __init__(self, text: str, name: str, utc_ns: int) -> None:
         self._name, self._segments, self._told = name, list(_segments(text, name)), False
+        self._stars_ns = utc_ns
         if not self._segments:
             raise InputError(f"{name}: contains no segment of an orbit; {OEM_ADVICE}")
-        if self._covering(utc_ns) is None:
+        if min(_away_ns(s, utc_ns) for s in self._segments) > DAY_NS:
             spans = ", ".join(" to ".join(_date(int(t)) for t in s.t_ns[[0, -1]]) + f" {s.scale}" for s in self._segments[:5])
-            raise InputError(f"{name}: does not cover {_date(utc_ns)} UTC; it has {spans}")
+            raise InputError(f"{name}: has no orbit within a day of {_date(utc_ns)} UTC; it has {spans}")
         off_km = max(map(_off_km, self._segments))
         if off_km > FAR_KM:
             advice = "write epochs a few minutes apart"
@@ -66,19 +70,19 @@ class OemOrbit:
 
     def state(self, utc_ns: int) -> tuple[FloatArray, FloatArray]:
         """Place (3,), km, and velocity (3,), km/s; where the file has none, those of its nearest epoch, which is told once."""
-        found = self._covering(utc_ns)
-        if found is None:
-            if not self._told:
-                log.warning("%s: has no orbit at %s UTC; that of its nearest epoch is held", self._name, _date(utc_ns))
-                self._told = True
-            found = min(self._segments, key=lambda s: int(np.abs(s.t_ns[[0, -1]] - _time(s.scale, utc_ns)).min()))
+        found = min(reversed(self._segments), key=lambda s: _away_ns(s, utc_ns))
+        # Stars are placed at the beginning of a day where the source gives the dates: nothing is shown there.
+        if not self._told and _away_ns(found, utc_ns) > 0 and abs(utc_ns - self._stars_ns) > UNSEEN_NS:
+            log.warning("%s: has no orbit at %s UTC; that of its nearest epoch is held", self._name, _date(utc_ns))
+            self._told = True
         t_ns = int(np.clip(_time(found.scale, utc_ns), found.t_ns[0], found.t_ns[-1]))
         return _at(found.t_ns, found.states, t_ns)
 
-    def _covering(self, utc_ns: int) -> Segment | None:
-        """The last segment that covers a UTC."""
-        covering = [s for s in self._segments if s.t_ns[0] <= _time(s.scale, utc_ns) <= s.t_ns[-1]]
-        return covering[-1] if covering else None
+
+def _away_ns(segment: Segment, utc_ns: int) -> int:
+    """How far a UTC is from what a segment covers; 0 within."""
+    t_ns = _time(segment.scale, utc_ns)
+    return max(int(segment.t_ns[0]) - t_ns, t_ns - int(segment.t_ns[-1]), 0)
 
 
 def _at(times_ns: npt.NDArray[np.int64], states: FloatArray, t_ns: int) -> tuple[FloatArray, FloatArray]:

@@ -184,6 +184,16 @@ def test_an_oem_of_the_same_orbit_shows_the_same_moon(bodies_file):
     assert places[0] == pytest.approx(places[1], abs=5e-12)  # a microarcsecond; metres in their distance
 
 
+def test_an_aem_s_dates_and_an_oem_alongside_that_covers_minutes_of_its_day(bodies_file):
+    folder = bodies_file.parent
+    (folder / "station.oem").write_text(oem(segment(range(0, 600, 60))))
+    (folder / "station.aem").write_text(kvn(["2008-09-20T12:31:00 0 0 0 1", "2008-09-20T12:32:00 0 0 0 1"]))
+    text = bodies_file.read_text().replace("2026-11-21T00:00:00Z", "source")
+    bodies_file.write_text(text + '[spacecraft]\norbit = "station.oem"\n')
+    done = run_hilstar_here("attitude", folder / "station.aem", "--bench", bodies_file, "--at", "30")
+    assert (done.returncode, done.stderr.count("\n")) == (0, 1), done.stderr  # how the tracker is mounted
+
+
 @pytest.mark.parametrize(
     ("more", "words"),
     [

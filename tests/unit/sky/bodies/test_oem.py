@@ -69,6 +69,15 @@ def test_beyond_its_epochs_the_last_place_is_held_and_told_once(caplog):
     assert len(caplog.records) == 1 and "is held" in caplog.text
 
 
+def test_the_moment_for_which_stars_are_placed_need_not_be_covered(caplog):
+    """With the dates of a source that is the beginning of its day."""
+    with caplog.at_level(logging.WARNING):
+        orbit = OemOrbit(oem(segment(MINUTES)), "a.oem", START_NS - 12 * 3600 * NS)
+        assert orbit.state(START_NS - 12 * 3600 * NS)[0] == pytest.approx(STATION.state(START_NS)[0], abs=PLACE_KM)
+        assert orbit.state(START_NS + 60 * NS)[0] == pytest.approx(STATION.state(START_NS + 60 * NS)[0], abs=PLACE_KM)
+    assert not caplog.records
+
+
 @pytest.mark.parametrize(("step_s", "told"), [(60, False), (600, False), (1800, True), (3600, True)])
 def test_epochs_too_far_apart_for_the_polynomial_are_told(caplog, step_s, told):
     """At ten minutes it is good to 1e-3 km; at half an hour, a third of the orbit, to some km."""
@@ -89,7 +98,7 @@ ROW = next(line for line in GOOD.splitlines() if line.startswith("2008"))
     [
         (oem(), "contains no segment"),
         (oem(segment([0])), "a segment has 1 states"),
-        (oem(segment([600, 660])), "does not cover 2008-09-20T12:30:00 UTC; it has 2008-09-20T12:40:00 to"),
+        (oem(segment([90_000, 90_060])), "no orbit within a day of 2008-09-20T12:30:00 UTC; it has 2008-09-21T13:30:00 to"),
         (oem(segment([0, 60], REF_FRAME="ITRF")), "REF_FRAME is ITRF and CENTER_NAME EARTH"),
         (oem(segment([0, 60], CENTER_NAME="MARS BARYCENTER")), "CENTER_NAME MARS BARYCENTER"),
         (oem(segment([0, 60], REF_FRAME=None)), "REF_FRAME is missing"),

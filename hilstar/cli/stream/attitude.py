@@ -13,11 +13,12 @@ from hilstar.cli.options import (
     EpochUtc,
     Json,
     KernelFiles,
+    MountingText,
     PlaceText,
     ReferenceName,
     TopicName,
 )
-from hilstar.cli.parsers import parse_place
+from hilstar.cli.parsers import parse_mounting, parse_place
 from hilstar.console.terminal import print_json, say
 
 if TYPE_CHECKING:
@@ -52,6 +53,7 @@ def attitude(
     reference: ReferenceName = None,
     epoch_utc: EpochUtc = None,
     place: PlaceText = None,
+    mounting: MountingText = None,
     explain: Annotated[
         bool, typer.Option("--explain", help="Explain what the source's numbers mean: frames, scalar order, time scale.")
     ] = False,
@@ -61,20 +63,23 @@ def attitude(
     from hilstar.attitude.logs.entries import Stated
     from hilstar.attitude.wire.source import Mounting
     from hilstar.bench.bench_file import dated, read_bench_file
+    from hilstar.errors import InputError
     from hilstar.resources import resource_path
 
     live = source.suffix.lower() == ".toml"
     file = read_bench_file(bench or (source if live else resource_path("configs", "demo.toml")))
-    mounting = Mounting(file.config.tracker.q_body_to_cam)
+    if live and mounting is not None:
+        raise InputError(f"--mounting {mounting}: write it into {source} as [tracker] q_body_to_cam")
+    mounted = Mounting(file.config.tracker.q_body_to_cam) if mounting is None else parse_mounting(mounting)
     if live:
         sample, conventions = _live(source, at, wait)
         held = False
     else:
-        stated = Stated(mounting, tuple(kernel or ()), topic, body, reference, epoch_utc, parse_place(place))
+        stated = Stated(mounted, tuple(kernel or ()), topic, body, reference, epoch_utc, parse_place(place))
         sample, conventions, held = _of_log(source, at, stated)
     file = dated(file, conventions.scale, sample.t_ns)
     told = {"source": conventions.source, "held": held, **_pointing(sample, file)}
-    meaning = conventions.lines(mounting)
+    meaning = conventions.lines(mounted)
     if as_json:
         print_json({**told, "conventions": meaning})
         return

@@ -12,6 +12,7 @@ from astropy.coordinates import SkyCoord
 from scipy.spatial.transform import Rotation
 
 from hilstar.sky.catalog import load_catalog
+from tests.support.aem_messages import kvn, rows_of
 from tests.support.benches import SMALL_BENCH, attitude_table
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.senders import free_port, publisher, talking
@@ -77,6 +78,19 @@ def test_a_live_stream_is_awaited(tmp_path):
         bench.write_text(SMALL_BENCH + attitude_table(port))
         found = told(bench)
     assert (found["ra_deg"], found["dec_deg"]) == pytest.approx((0, 0), abs=ROUNDING_DEG)
+
+
+def test_a_mounting_may_be_given_without_a_bench_file(tmp_path):
+    """As the notice of a body's attitude says: here the body's z is the pole and the camera looks along its x."""
+    (tmp_path / "log.aem").write_text(kvn(rows_of([0, 0, 0, 1])))
+    assert told(tmp_path / "log.aem")["dec_deg"] == pytest.approx(90, abs=ROUNDING_DEG)
+    found = told(tmp_path / "log.aem", "--mounting", "0.5,-0.5,-0.5,-0.5")
+    turn = Rotation.from_quat([-0.5, -0.5, -0.5, 0.5])
+    ra_deg = np.degrees(np.arctan2(*turn.inv().apply([0.0, 0.0, 1.0])[1::-1]))
+    assert (found["ra_deg"], found["dec_deg"]) == pytest.approx((ra_deg, 0), abs=ROUNDING_DEG)
+    (tmp_path / "bench.toml").write_text(SMALL_BENCH)
+    result = run_hilstar_here("attitude", tmp_path / "bench.toml", "--mounting", "1,0,0,0")
+    assert_refused(result, 2, "--mounting 1,0,0,0", "[tracker] q_body_to_cam")
 
 
 def test_silence_and_wrong_uses_are_refused_in_one_line(tmp_path):

@@ -13,7 +13,8 @@ from hilstar.errors import InputError
 from hilstar.units import NS_PER_S
 
 YEAR_NS = 31_557_600 * NS_PER_S
-TIME_FORM = "write seconds after its first sample, or a date and time such as 2026-11-21T06:00:00"
+SECONDS_FORM = "write seconds after its first sample"
+TIME_FORM = f"{SECONDS_FORM}, or a date and time such as 2026-11-21T06:00:00"
 
 
 def time_in_log(path: Path, samples: Sequence[AttitudeSample], text: str | None) -> int:
@@ -27,8 +28,9 @@ def time_in_log(path: Path, samples: Sequence[AttitudeSample], text: str | None)
     t_ns = _named_ns(text, first_ns)
     if not first_ns <= t_ns <= last_ns:
         span = f"{(last_ns - first_ns) / NS_PER_S:.9g} s long"
-        if first_ns > YEAR_NS:
-            span += f", from {epoch_text(first_ns)} to {epoch_text(last_ns)} on its own scale"
+        if first_ns < YEAR_NS:
+            raise InputError(f"--at {text}: {path} is {span}, and its times are no dates; {SECONDS_FORM}")
+        span += f", from {epoch_text(first_ns)} to {epoch_text(last_ns)} on its own scale"
         raise InputError(f"--at {text}: {path} is {span}; {TIME_FORM}")
     return t_ns
 

@@ -72,6 +72,12 @@ def test_a_time_within_a_log_may_be_seconds_or_a_date(tmp_path):
         assert_refused(run_hilstar_here("attitude", log, f"--at={wrong}"), 2, f"--at {wrong}")
 
 
+def test_a_log_of_boot_time_has_no_dates(tmp_path):
+    log = log_of(tmp_path, [(5.0, [1.0, 0.0, 0.0, 0.0]), (6.0, [1.0, 0.0, 0.0, 0.0])])
+    result = run_hilstar_here("attitude", log, "--at", "2026-11-22T10:00:00.5")
+    assert_refused(result, 2, "1 s long, and its times are no dates; write seconds after its first sample\n")
+
+
 def test_a_live_stream_is_awaited(tmp_path):
     bench = tmp_path / "bench.toml"
     with publisher() as (sender, port), talking(sender, q=(0.5, 0.5, -0.5, 0.5)):

@@ -29,7 +29,7 @@ TAI_TO_SCALE_S = {"TAI": 0.0, "GPS": -19.0, "TT": 32.184, "TDB": 32.184}  # TDB 
 EPOCH = re.compile(r"(\d{4})-(?:(\d\d)-(\d\d)|(\d{3}))T(\d\d):(\d\d):(\d\d(?:\.\d+)?)Z?", re.ASCII)
 YEARS, DAYS_OF_YEAR = range(1900, 2200), range(1, 367)
 NODES = 4  # 1e-6 km of a low orbit at four minutes
-MIN_KM = 6000.0
+MIN_KM, MAX_KM, MAX_KM_S = 6000.0, 1e7, 1e3  # to beyond the Lagrange points; a state in metres is outside one of them
 FAR_KM = 1.0  # half an arcsecond of the Moon
 TRIED = 50
 DAY_NS = 86_400 * NS_PER_S
@@ -172,8 +172,9 @@ def _numbers(words: list[str], where: str) -> list[float]:
     try:
         numbers = [float(word) for word in words]
     except ValueError:
-        numbers = [np.nan]
-    if not np.isfinite(numbers).all() or np.linalg.norm(numbers[:3]) < MIN_KM:
+        numbers = [np.nan] * 6
+    place, speed = np.abs(numbers[:3]), np.abs(numbers[3:])
+    if not ((place < MAX_KM).all() and (speed < MAX_KM_S).all() and np.linalg.norm(place) > MIN_KM):
         raise InputError(f"{where}: {' '.join(words)[:60]!r}; write km from the Earth's centre, and km/s")
     return numbers
 

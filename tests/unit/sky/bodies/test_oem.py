@@ -109,6 +109,8 @@ ROW = next(line for line in GOOD.splitlines() if line.startswith("2008"))
         (GOOD.replace(ROW, ROW.replace("2008-09-20", "9999-09-20")), "the epoch is '9999-09-20"),
         (GOOD.replace(ROW, ROW.split(" ")[0] + " nan 0 0 0 0 0"), "write km from the Earth's centre"),
         (GOOD.replace(ROW, ROW.split(" ")[0] + " 1 1 1 0 0 0"), "write km from the Earth's centre"),
+        (GOOD.replace(ROW, ROW.split(" ")[0] + " 7000 1e308 0 0 7.5 0"), "write km from the Earth's centre"),
+        (GOOD.replace(ROW, ROW.split(" ")[0] + " 7000e3 0 0 0 7.5e3 0"), "write km from the Earth's centre"),
         (GOOD[: GOOD.index("META_STOP")], "ends in the metadata"),
         (GOOD.replace("META_STOP", "META_STOP\nanything"), "'anything'"),
     ],

@@ -52,7 +52,9 @@ def read_daf(path: Path, limit_bytes: int) -> Daf:
         size = os.fstat(file.fileno()).st_size
         head = file.read(RECORD_BYTES)
         order = ORDERS.get(head[88:96])
-        if not head.startswith(b"DAF/") or len(head) < RECORD_BYTES or order is None:
+        if len(head) < RECORD_BYTES:
+            raise InputError(f"{path}: has {len(head)} bytes, less than a DAF's first record; is it cut off?")
+        if not head.startswith(b"DAF/") or order is None:
             format_text = head[88:96].decode("ascii", "replace").strip() or "missing"
             raise InputError(f"{path}: is no DAF in IEEE form (its form is {shortened(format_text)}); convert it by tobin")
         doubles, integers = struct.unpack(order + "2i", head[8:16])

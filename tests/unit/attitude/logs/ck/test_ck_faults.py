@@ -68,7 +68,7 @@ def cut(count):
 @pytest.mark.parametrize(
     ("edit", "words_said"),
     [
-        (cut(800), "is no DAF in IEEE form"),
+        (cut(800), "has 800 bytes, less than a DAF's first record; is it cut off?"),
         (cut(1500), "leads to record 2; is it cut off?"),
         (cut(3 * RECORD_BYTES + 999), "an array has the words 385 to"),
         (bytes_at(88, b"VAX-GFLT"), "its form is VAX-GFLT"),

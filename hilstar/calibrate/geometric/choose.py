@@ -62,7 +62,7 @@ def held_out(problem: Problem, name: str, model: Model, degree: int, data: Match
     dots = np.unique(data.dot)
     fold = np.zeros(int(dots.max()) + 1, dtype=np.intp)
     fold[dots] = np.arange(len(dots)) % FOLDS
-    start = fit(problem, model, 0, data).numbers
+    start = fit(problem, model, degree, data).numbers
     off = np.full((len(data), 2), np.nan)
     for k in range(FOLDS):
         out = fold[data.dot] == k

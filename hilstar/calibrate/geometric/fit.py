@@ -1,8 +1,7 @@
-"""A geometry fitted to centroids of dots: robust least squares in tracker pixels, then a smooth field on what is left."""
+"""A geometry fitted to centroids of dots: robust least squares in tracker pixels, the smooth field together with the lens."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,14 +10,12 @@ from hilstar.arrays import FloatArray, IntArray
 from hilstar.calibrate.geometric.dots import DotPlan
 from hilstar.calibrate.geometric.model import Geometry, Model, Nominal, directions_in_cam, geometry_of
 from hilstar.calibrate.geometric.observed import Observed
-from hilstar.scene.camera import Camera
 from hilstar.scene.lens import Lens, ResidualField, field_terms
 from hilstar.units import MAD_TO_SIGMA
 
 HUBER = 2.5  # sigmas: beyond it a residual counts by its size, not by its square
 PRIOR = 0.3  # of a parameter's number: so weak that it decides only what the data leave open
 FIELD_PRIOR_PX = 2.0  # sigma of the field's coefficients
-FIELD_ROUNDS = 4
 FAR_SIGMA = 1e6  # of a centroid that a trial puts behind the lens
 MAX_STEPS, MAX_DAMPINGS = 60, 12
 FIRST_DAMPING, MIN_DAMPING = 1e-3, 1e-12
@@ -58,7 +55,7 @@ class Problem:
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """A fitted model: its numbers, the geometry that they make (field included), and the terms of its field."""
+    """A fitted model: its numbers (then the coefficients of its field in x and in y), and the geometry that they make."""
 
     model: Model
     field_degree: int
@@ -66,60 +63,100 @@ class Fit:
     geometry: Geometry
 
 
-def fit(problem: Problem, model: Model, field_degree: int, data: Matched, start: FloatArray | None = None) -> Fit:
-    """The model with its residual field of a total degree (0 for none) that suits `data` best."""
-    numbers = np.zeros(model.size) if start is None else start
+@dataclass(frozen=True, slots=True)
+class _Loss:
+    """What is made smallest: Huber's loss of the residuals of `data` and a weak prior, over the model's numbers and, after
+    them, the coefficients of its field in x and in y.
 
-    def residuals(trial: FloatArray) -> FloatArray:
-        off = residuals_sigma(problem, geometry_of(model, problem.nominal, problem.q_poses, trial), data)
+    Both at once: a lens that is fitted alone leans over to what only the field can follow, and leaves it more than there was.
+    """
+
+    problem: Problem
+    model: Model
+    field_degree: int
+    data: Matched
+
+    def geometry(self, numbers: FloatArray) -> Geometry:
+        lens, field = numbers[: self.model.size], numbers[self.model.size :]
+        geometry = geometry_of(self.model, self.problem.nominal, self.problem.q_poses, lens)
+        if not self.field_degree:
+            return geometry
+        x, y = field.reshape(2, -1)
+        return _with_field(geometry, ResidualField.of_terms(x, y, self.field_degree, geometry.monitor.resolution_px))
+
+    def residuals(self, numbers: FloatArray) -> FloatArray:
+        return self._off(self.geometry(numbers))
+
+    def _off(self, geometry: Geometry) -> FloatArray:
+        off = residuals_sigma(self.problem, geometry, self.data)
         return np.where(np.isfinite(off), off, FAR_SIGMA)
 
-    found = smallest(residuals, numbers)
-    geometry = geometry_of(model, problem.nominal, problem.q_poses, found)
-    if field_degree:
-        geometry = with_field(problem, geometry, field_degree, data)
-    return Fit(model, field_degree, found, geometry)
+    def slopes(self, numbers: FloatArray, off: FloatArray) -> FloatArray:
+        """By each number (2 n, numbers): differences for the lens; for the field, which is linear, its own terms.
+
+        The field itself hardly changes along a step of the lens: the differences are taken without it.
+        """
+        lens = numbers[: self.model.size]
+        trials = (lens + step for step in DIFFERENCE * np.eye(len(lens)))
+        bare, *varied = (geometry_of(self.model, self.problem.nominal, self.problem.q_poses, n) for n in (lens, *trials))
+        base = self._off(bare) if self.field_degree else off
+        columns = np.stack([(self._off(geometry) - base) / DIFFERENCE for geometry in varied], axis=1)
+        if not self.field_degree:
+            return columns
+        terms = np.nan_to_num(field_terms(*_places_px(bare, self.data), bare.monitor.resolution_px, self.field_degree))
+        terms /= (self.problem.monitor_px_per_px * self.data.seen.sigma_px * self.problem.noise_px)[:, None]
+        nothing = np.zeros_like(terms)
+        return np.hstack([columns, np.block([[terms, nothing], [nothing, terms]])])
+
+    def prior(self, count: int) -> FloatArray:
+        return np.where(np.arange(count) < self.model.size, PRIOR, 1 / FIELD_PRIOR_PX) ** 2
+
+    def value(self, off: FloatArray, numbers: FloatArray) -> float:
+        size = np.abs(off)
+        each = np.where(size <= HUBER, 0.5 * size**2, HUBER * (size - HUBER / 2))
+        return float(each.sum() + 0.5 * self.prior(len(numbers)) @ numbers**2)
 
 
-def smallest(residuals: Callable[[FloatArray], FloatArray], numbers: FloatArray) -> FloatArray:
-    """The numbers with the smallest Huber loss of their residuals and a weak prior (Levenberg and Marquardt, reweighted)."""
-    off, damping = residuals(numbers), FIRST_DAMPING
-    loss = _huber(off, numbers)
+def fit(problem: Problem, model: Model, field_degree: int, data: Matched, start: FloatArray | None = None) -> Fit:
+    """The model with its residual field of a total degree (0 for none) that suits `data` best, searched from `start`."""
+    loss = _Loss(problem, model, field_degree, data)
+    if start is None and field_degree:
+        lens = fit(problem, model, 0, data).numbers
+        start = np.concatenate([lens, np.zeros((field_degree + 1) * (field_degree + 2))])
+    numbers = _smallest(loss, np.zeros(model.size) if start is None else start)
+    return Fit(model, field_degree, numbers, loss.geometry(numbers))
+
+
+def _smallest(loss: _Loss, numbers: FloatArray) -> FloatArray:
+    """The numbers with the smallest loss (Levenberg and Marquardt, reweighted)."""
+    prior = loss.prior(len(numbers))
+    off, damping = loss.residuals(numbers), FIRST_DAMPING
+    value = loss.value(off, numbers)
     for _ in range(MAX_STEPS):
-        slopes = np.stack(
-            [(residuals(numbers + step) - off) / DIFFERENCE for step in DIFFERENCE * np.eye(len(numbers))], axis=1
-        )
-        weight = np.minimum(1.0, HUBER / np.maximum(np.abs(off), HUBER))[:, None]
-        normal = slopes.T @ (weight * slopes) + PRIOR**2 * np.eye(len(numbers))
-        downhill = slopes.T @ (weight[:, 0] * off) + PRIOR**2 * numbers
+        slopes = loss.slopes(numbers, off)
+        weight = np.minimum(1.0, HUBER / np.maximum(np.abs(off), HUBER))
+        normal = slopes.T @ (weight[:, None] * slopes) + np.diag(prior)
+        downhill = slopes.T @ (weight * off) + prior * numbers
         for _ in range(MAX_DAMPINGS):
             step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), -downhill)
-            new_off = residuals(numbers + step)
-            new_loss = _huber(new_off, numbers + step)
-            if new_loss <= loss:
+            new_off = loss.residuals(numbers + step)
+            new_value = loss.value(new_off, numbers + step)
+            if new_value <= value:
                 break
             damping *= 10
         else:
             return numbers
-        gain = loss - new_loss
-        numbers, off, loss, damping = numbers + step, new_off, new_loss, max(damping / 10, MIN_DAMPING)
+        gain = value - new_value
+        numbers, off, value, damping = numbers + step, new_off, new_value, max(damping / 10, MIN_DAMPING)
         if gain <= MIN_GAIN:
             break
     return numbers
 
 
-def _huber(off: FloatArray, numbers: FloatArray) -> float:
-    size = np.abs(off)
-    each = np.where(size <= HUBER, 0.5 * size**2, HUBER * (size - HUBER / 2))
-    return float(each.sum() + 0.5 * PRIOR**2 * (numbers**2).sum())
-
-
 def residuals_px(problem: Problem, geometry: Geometry, data: Matched) -> tuple[FloatArray, FloatArray]:
     """How far each centroid is from its dot, x and y (n,), on the monitor but in tracker px."""
-    seen, plan = data.seen, problem.plan
-    directions = directions_in_cam(geometry, seen.pose, seen.x_px, seen.y_px)
-    x_px, y_px = geometry.monitor.project(directions @ geometry.monitor.cam_to_image.T)
-    scale = problem.monitor_px_per_px
+    plan, scale = problem.plan, problem.monitor_px_per_px
+    x_px, y_px = _places_px(geometry, data)
     return (x_px - plan.x_px[data.dot]) / scale, (y_px - plan.y_px[data.dot]) / scale
 
 
@@ -129,29 +166,15 @@ def residuals_sigma(problem: Problem, geometry: Geometry, data: Matched) -> Floa
     return np.concatenate([part / sigma for part in residuals_px(problem, geometry, data)])
 
 
-def with_field(problem: Problem, geometry: Geometry, degree: int, data: Matched) -> Geometry:
-    """The geometry with a residual field of a total degree on its monitor: linear least squares, robust by reweighting."""
-    seen, scale = data.seen, problem.monitor_px_per_px
-    directions = directions_in_cam(geometry, seen.pose, seen.x_px, seen.y_px)
-    x_px, y_px = geometry.monitor.project(directions @ geometry.monitor.cam_to_image.T)
-    terms = field_terms(x_px, y_px, geometry.monitor.resolution_px, degree)
-    sigma_px = seen.sigma_px * problem.noise_px * scale
-    columns = []
-    for wanted, place in ((problem.plan.x_px, x_px), (problem.plan.y_px, y_px)):
-        off = wanted[data.dot] - place
-        weight = 1 / sigma_px
-        for _ in range(FIELD_ROUNDS):
-            a = np.concatenate([terms * weight[:, None], np.eye(terms.shape[1]) / FIELD_PRIOR_PX])
-            coefficient = np.linalg.lstsq(a, np.concatenate([off * weight, np.zeros(terms.shape[1])]), rcond=None)[0]
-            left = np.abs(off - terms @ coefficient) / sigma_px
-            weight = np.sqrt(np.minimum(1.0, HUBER / np.maximum(left, 1e-12))) / sigma_px
-        columns.append(coefficient)
-    field = ResidualField.of_terms(columns[0], columns[1], degree, geometry.monitor.resolution_px)
-    return replace(geometry, monitor=_with(geometry.monitor, field))
+def _places_px(geometry: Geometry, data: Matched) -> tuple[FloatArray, FloatArray]:
+    """Where on the monitor, px, the centroids (n,) are by a geometry."""
+    directions = directions_in_cam(geometry, data.seen.pose, data.seen.x_px, data.seen.y_px)
+    return geometry.monitor.project(directions @ geometry.monitor.cam_to_image.T)
 
 
-def _with(camera: Camera, field: ResidualField) -> Camera:
-    return replace(camera, lens=replace(camera.lens or Lens(), field=field))
+def _with_field(geometry: Geometry, field: ResidualField) -> Geometry:
+    camera = geometry.monitor
+    return replace(geometry, monitor=replace(camera, lens=replace(camera.lens or Lens(), field=field)))
 
 
 def noise_of_repeats(data: Matched) -> float | None:

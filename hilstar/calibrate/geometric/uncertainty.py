@@ -69,7 +69,7 @@ def _varied(problem: Problem, fit: Fit, number: int) -> Geometry:
     """The geometry with one number a little larger, and the same field."""
     step = np.zeros(fit.model.size)
     step[number] = DIFFERENCE
-    varied = geometry_of(fit.model, problem.nominal, problem.q_poses, fit.numbers + step)
+    varied = geometry_of(fit.model, problem.nominal, problem.q_poses, fit.numbers[: fit.model.size] + step)
     field = fit.geometry.monitor.lens.field if fit.geometry.monitor.lens is not None else None
     lens = varied.monitor.lens if field is None else replace(varied.monitor.lens or Lens(), field=field)
     return replace(varied, monitor=replace(varied.monitor, lens=lens))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -70,6 +70,43 @@ def test_a_strong_lens_asks_for_the_field_and_gets_it(rng):
     found = calibrate_geometry(plan, nominal_of(bench), seen, rng, tracker_known=True)
     assert "field" in found.chosen.name
     assert np.sqrt((errors_arcsec(found, bench) ** 2).mean()) < 0.25
+
+
+@dataclass(frozen=True)
+class ThinPrisms:
+    """A bench whose wedged lens displaces by r^2 and r^4 (thin prisms: Weng et al. 1992), besides k1 and k2."""
+
+    resolution_px: tuple[int, int] = BENCH.resolution_px
+    focal_px: float = 6019.0
+    shift_px: tuple[float, float] = (-12.0, 8.0)
+
+    def directions(self, x_px: np.ndarray, y_px: np.ndarray) -> np.ndarray:
+        x, y = (
+            (p - (n - 1) / 2 - s) / self.focal_px
+            for p, n, s in zip((x_px, y_px), self.resolution_px, self.shift_px, strict=True)
+        )
+        u, v = x, y
+        for _ in range(50):
+            bent_x, bent_y = self._bent(u, v)
+            u, v = u + x - bent_x, v + y - bent_y
+        rays = np.stack([u, v, np.ones_like(u)], axis=-1)
+        return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+
+    def _bent(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        r2 = u * u + v * v
+        gain = 1 + 0.4 * r2 - 1.1 * r2**2
+        x = u * gain + 0.012 * r2 + 0.3 * r2**2 + 0.008 * u * v
+        return x, v * gain - 0.009 * r2 - 0.2 * r2**2 + 0.004 * (r2 + 2 * v * v)
+
+
+def test_the_field_and_the_lens_are_fitted_together(rng):
+    # A lens that is fitted first leans over to the prisms: a field of degree 7 then leaves 0.23 arcsec rms, 2.2 maximum.
+    bench = ThinPrisms()
+    plan = plan_of(*MANY[:2])
+    found = calibrate_geometry(plan, nominal_of(BENCH), observed_dots(bench, plan, TRACKER, rng), rng, tracker_known=True)
+    errors = errors_arcsec(found, bench)
+    assert np.sqrt((errors**2).mean()) < 0.18
+    assert found.chosen.field_degree <= 5  # the prisms are of degree 4
 
 
 def test_the_codes_alone_name_every_dot(rng):

@@ -58,7 +58,8 @@ def test_its_stream_is_taken(tmp_path):
     assert call in section("A MATLAB or Octave sender over UDP")
     with listening(bench, "bound to") as process:
         result = octave(call.replace("5560", str(port)).replace("10, ", "1, "))
+        assert "sent 200" in result.stdout, result.stderr
+        assert any("the first attitude has come" in line for line in process.stderr)  # a busy machine begins to read late
         summary = interrupted(process)
-    assert "sent 200" in result.stdout, result.stderr
     assert summary["packets"]["received"] == summary["packets"]["accepted"] == 200
     assert summary["clock"]["jumps"] == 0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import erfa
 import numpy as np
 
-from tests.support.wire.nasa42 import BEGIN_NS, report
+from tests.support.sources.nasa42 import BEGIN_NS, report
 
 DAY_2024_04_08 = 2_460_408.5
 TT_MINUS_UTC_S = 37 + 32.184

@@ -12,10 +12,10 @@ from astropy.coordinates import SkyCoord
 from scipy.spatial.transform import Rotation
 
 from hilstar.sky.catalog import load_catalog
-from tests.support.aem_messages import kvn, rows_of
 from tests.support.benches import SMALL_BENCH, attitude_table
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.senders import free_port, publisher, talking
+from tests.support.sources.aem_messages import kvn, rows_of
 
 # A catalogue place is of 1991.25 and this of the bench's epoch: Hipparcos' fastest star moves by 10 arcsec a year.
 MOTION_DEG = 0.2

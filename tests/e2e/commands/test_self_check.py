@@ -17,15 +17,15 @@ import numpy as np
 import pytest
 import spiceypy
 
-from tests.support import ros_bags
-from tests.support import spice_kernels as ck
-from tests.support.aem_messages import kvn, rows_of
 from tests.support.benches import bench_text
 from tests.support.commands import run_hilstar_here
-from tests.support.ros_bags import START_NS, Make, write_bag1, write_bag2, write_mcap
 from tests.support.senders import free_port, publisher
-from tests.support.ulog_files import ULogWriter
-from tests.support.viz_message import craft, viz_message
+from tests.support.sources import ros_bags
+from tests.support.sources import spice_kernels as ck
+from tests.support.sources.aem_messages import kvn, rows_of
+from tests.support.sources.ros_bags import START_NS, Make, write_bag1, write_bag2, write_mcap
+from tests.support.sources.ulog_files import ULogWriter
+from tests.support.sources.viz_message import craft, viz_message
 
 MOUNTING = [0.6, 0.48, -0.64, 0.0]
 ALNILAM = 26311

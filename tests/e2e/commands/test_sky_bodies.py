@@ -17,10 +17,10 @@ from hilstar.bench.build import load
 from hilstar.rotation import conjugate, from_radec_roll_deg
 from hilstar.twin.budget import not_drawn
 from hilstar.twin.verify.star_finder import faintest_e_per_s
-from tests.support.aem_messages import kvn
 from tests.support.commands import run_hilstar_here
-from tests.support.oem_messages import oem, segment
 from tests.support.skies import STATION_TLE, STATION_UTC, skyfield, utc_ns
+from tests.support.sources.aem_messages import kvn
+from tests.support.sources.oem_messages import oem, segment
 
 DATED = '[sky]\nepoch_utc = "2026-11-21T00:00:00Z"\n'
 BODIES = DATED + "[sky.bodies]\nplanets = true\nmoon = true\nsun = true\n"

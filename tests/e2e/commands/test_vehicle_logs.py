@@ -10,10 +10,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hilstar.rotation import from_radec_roll_deg, propagate
-from tests.support import ros_bags
 from tests.support.commands import assert_refused, run_hilstar_here
-from tests.support.ros_bags import START_NS, Make, write_bag2
-from tests.support.ulog_files import ULogWriter
+from tests.support.sources import ros_bags
+from tests.support.sources.ros_bags import START_NS, Make, write_bag2
+from tests.support.sources.ulog_files import ULogWriter
 
 RATE = np.radians([0.3, -0.2, 2.0])
 # By 2026 the pole of date is 27 years of 20.04 arcsec from that of the ICRS.

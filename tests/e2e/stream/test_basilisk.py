@@ -12,12 +12,12 @@ import pytest
 from mcap.reader import make_reader
 from scipy.spatial.transform import Rotation, Slerp
 
-from tests.support.basilisk import Truth, basilisk, rotation
 from tests.support.benches import bench_text
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.senders import free_port, publisher
 from tests.support.servers import SUBSCRIBED_S, interrupted, listening, serving
-from tests.support.viz_message import craft, viz_message
+from tests.support.sources.basilisk import Truth, basilisk, rotation
+from tests.support.sources.viz_message import craft, viz_message
 
 # Two degrees a second, from just under |sigma| = 1: the switch to the shadow set comes within half a second. The other
 # spacecraft is elsewhere, so that a choice of the wrong one is seen.

@@ -28,8 +28,8 @@ from tests.support.benches import SMALL_BENCH
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.senders import free_port
 from tests.support.servers import interrupted, listening
+from tests.support.sources.nasa42 import BEGIN_NS, STREAM_2025, message
 from tests.support.waiting import PATIENCE_S, wait_for
-from tests.support.wire.nasa42 import BEGIN_NS, STREAM_2025, message
 
 MOUNTING = (0.5, 0.5, -0.5, 0.5)
 STEP_S = 0.02

@@ -19,11 +19,11 @@ from PIL import Image
 from scipy import ndimage
 
 from hilstar.monitor.response import srgb_light
-from tests.support.basilisk import Truth, basilisk, rotation
 from tests.support.benches import bench_text
 from tests.support.commands import run_hilstar_here
 from tests.support.senders import free_port
 from tests.support.servers import interrupted, listening
+from tests.support.sources.basilisk import Truth, basilisk, rotation
 
 # The limits; measured here: 0.0003 to 0.024 arcsec and 0.03 to 0.7 arcsec.
 LINEAR_LIMIT_ARCSEC = 0.1

@@ -16,7 +16,7 @@ from hilstar.attitude.logs.log_file import write_log
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.errors import MachineError
 from hilstar.rotation import from_radec_roll_deg, propagate, to_matrix
-from tests.support.aem_messages import EPOCHS, kvn, read, refusal, rows_of
+from tests.support.sources.aem_messages import EPOCHS, kvn, read, refusal, rows_of
 
 # Quaternions are written with 17 digits here; a matrix from one is a sum of four products, a few roundings of 1.
 MATRIX_TOLERANCE = 1e-14

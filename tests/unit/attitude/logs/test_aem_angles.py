@@ -12,7 +12,7 @@ from hilstar.attitude.logs.entries import Stated
 from hilstar.attitude.logs.log_file import open_log, write_log
 from hilstar.attitude.wire.source import Mounting
 from hilstar.rotation import to_matrix
-from tests.support.aem_messages import EPOCHS, kvn, read, refusal, rows_of
+from tests.support.sources.aem_messages import EPOCHS, kvn, read, refusal, rows_of
 
 # Angles are written with 17 digits; three turns of them are a few roundings of 1 rad.
 MATRIX_TOLERANCE = 2e-14

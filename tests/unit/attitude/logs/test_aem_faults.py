@@ -12,7 +12,7 @@ from hilstar.attitude.logs.log_file import write_log
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.errors import InputError
 from hilstar.units import NS_PER_S
-from tests.support.aem_messages import EPOCHS, kvn, read, refusal, rows_of
+from tests.support.sources.aem_messages import EPOCHS, kvn, read, refusal, rows_of
 
 # Epochs
 

@@ -14,7 +14,7 @@ from hilstar.attitude.logs.entries import Stated
 from hilstar.attitude.logs.log_file import open_log
 from hilstar.attitude.wire.source import Mounting
 from hilstar.rotation import to_matrix
-from tests.support.aem_messages import kvn, refusal
+from tests.support.sources.aem_messages import kvn, refusal
 
 ARCSEC = np.radians(1 / 3600)
 # Astropy ties TEME to the Earth by GMST of 1982 and the Earth by IAU 2006/2000A; hilstar by IAU 1980 from the stars. The models

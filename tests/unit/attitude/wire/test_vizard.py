@@ -28,7 +28,7 @@ from hilstar.errors import InputError
 from hilstar.notices import Notices
 from hilstar.rotation import to_radec_roll_deg
 from hilstar.units import NS_PER_S
-from tests.support.viz_message import craft, viz_message
+from tests.support.sources.viz_message import craft, viz_message
 
 ROUNDING_RAD = 1e-14  # some products of float64 rotations
 DIGITS_DEG = np.degrees(4e-7)  # seven digits of each MRP, and the angle is four times its change

@@ -9,7 +9,7 @@ import pytest
 
 from hilstar.errors import InputError
 from hilstar.sky.bodies.oem import OemOrbit, hermite
-from tests.support.oem_messages import START_NS, STATION, oem, segment
+from tests.support.sources.oem_messages import START_NS, STATION, oem, segment
 
 MINUTES = range(0, 1260, 60)
 # SGP4's velocity is the derivative of its place within 2e-5 km/s (measured), which makes 4e-4 km of a place between epochs; the

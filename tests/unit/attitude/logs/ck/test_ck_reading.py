@@ -17,7 +17,7 @@ from hilstar.attitude.wire.source import Mounting
 from hilstar.errors import InputError
 from hilstar.rotation import angle_between_rad, from_matrix, to_matrix
 from hilstar.units import NS_PER_S
-from tests.support import spice_kernels as ck
+from tests.support.sources import spice_kernels as ck
 
 MAS = np.radians(1.0 / 3_600_000)
 # A quaternion of 16 digits twice through a matrix: a few roundings of 1 are 1e-15 rad, 2e-7 mas.

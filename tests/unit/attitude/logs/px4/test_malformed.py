@@ -10,7 +10,7 @@ import pytest
 from hilstar.attitude.logs.entries import Stated
 from hilstar.attitude.logs.log_file import open_log
 from hilstar.errors import InputError
-from tests.support.ulog_files import MAGIC, ULogWriter, message
+from tests.support.sources.ulog_files import MAGIC, ULogWriter, message
 
 STATED = Stated(epoch_utc="2024-07-01T11:59:50", place=(48.1, 11.6, 500.0))
 COUNT = 50

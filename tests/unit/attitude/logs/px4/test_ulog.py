@@ -20,7 +20,7 @@ from hilstar.attitude.logs.log_file import open_log
 from hilstar.attitude.wire.source import CHECK_RADEC_DEG, Mounting
 from hilstar.errors import InputError, MachineError
 from hilstar.rotation import to_radec_roll_deg
-from tests.support.ulog_files import FORMATS, OLD, ULogWriter
+from tests.support.sources.ulog_files import FORMATS, OLD, ULogWriter
 
 ARCSEC = np.radians(1 / 3600)
 # q is in single precision: each component is rounded by 2^-25 at most, the angle by four of twice that (0.05 arcsec).

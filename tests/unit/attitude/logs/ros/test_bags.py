@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from hilstar.attitude.logs.entries import Stated
 from hilstar.attitude.logs.log_file import open_log, write_log
 from hilstar.errors import InputError
-from tests.support import ros_bags
-from tests.support.ros_bags import START_NS, Make, write_bag1, write_bag2, write_mcap
+from tests.support.sources import ros_bags
+from tests.support.sources.ros_bags import START_NS, Make, write_bag1, write_bag2, write_mcap
 
 COUNT, STEP_NS = 40, 10**8
 ICRS = Stated(reference="icrs")

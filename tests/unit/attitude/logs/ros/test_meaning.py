@@ -14,8 +14,8 @@ from hilstar.attitude.logs.log_file import open_log
 from hilstar.attitude.wire.source import CHECK_RADEC_DEG, Mounting
 from hilstar.errors import InputError
 from hilstar.rotation import to_radec_roll_deg
-from tests.support import ros_bags
-from tests.support.ros_bags import START_NS, Make, write_mcap
+from tests.support.sources import ros_bags
+from tests.support.sources.ros_bags import START_NS, Make, write_mcap
 
 MAKE = Make("jazzy")
 PLACE = (48.1, 11.6, 500.0)

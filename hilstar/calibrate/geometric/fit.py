@@ -8,13 +8,16 @@ import numpy as np
 
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.calibrate.geometric.dots import DotPlan
-from hilstar.calibrate.geometric.model import Geometry, Model, Nominal, directions_in_cam, geometry_of
+from hilstar.calibrate.geometric.model import TRACKER_ROUND, Geometry, Model, Nominal, directions_in_cam, geometry_of
 from hilstar.calibrate.geometric.observed import Observed
 from hilstar.scene.lens import Lens, ResidualField, field_terms
 from hilstar.units import MAD_TO_SIGMA
 
 HUBER = 2.5  # sigmas: beyond it a residual counts by its size, not by its square
 PRIOR = 0.3  # of a parameter's number: so weak that it decides only what the data leave open
+# Of the tracker's round terms, which the collimator's can stand for: free, they run away with what neither lens can follow.
+# How well they are known is a matter of PRIOR all the same.
+ROUND_PRIOR = 30.0
 FIELD_PRIOR_PX = 2.0  # sigma of the field's coefficients
 FAR_SIGMA = 1e6  # of a centroid that a trial puts behind the lens
 MAX_STEPS, MAX_DAMPINGS = 60, 12
@@ -109,7 +112,10 @@ class _Loss:
         return np.hstack([columns, np.block([[terms, nothing], [nothing, terms]])])
 
     def prior(self, count: int) -> FloatArray:
-        return np.where(np.arange(count) < self.model.size, PRIOR, 1 / FIELD_PRIOR_PX) ** 2
+        weight = np.where(np.arange(count) < self.model.size, PRIOR, 1 / FIELD_PRIOR_PX)
+        for k, name in enumerate(self.model.tracker_names, start=len(self.model.names)):
+            weight[k] = ROUND_PRIOR if name in TRACKER_ROUND else PRIOR
+        return weight**2
 
     def value(self, off: FloatArray, numbers: FloatArray) -> float:
         size = np.abs(off)

@@ -29,6 +29,7 @@ STEPS = {
 }
 # A turn about the boresight leaves a round lens as it is: what no pose tells apart is taken as the collimator's.
 TRACKER_STEPS = {"tracker_k1": 0.1, "tracker_k2": 1.0, "tracker_p1": 0.1, "tracker_p2": 0.1}
+TRACKER_ROUND = ("tracker_k1", "tracker_k2")
 POSE_STEP_RAD = 0.01
 PINHOLE = ("rotation_x", "rotation_y", "rotation_z", "log_focal")
 RADIAL = (*PINHOLE, "k1")

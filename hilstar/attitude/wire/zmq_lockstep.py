@@ -20,7 +20,6 @@ class ZmqLockstep(ZmqSocket):
 
     def __init__(self, endpoint: str, *, bind: bool = True, keys: CurveKeys = NO_KEYS, notices: Notices | None = None) -> None:
         super().__init__(zmq.REP, endpoint, bind=bind, keys=keys, notices=notices)
-        self._shut()
         self._json = False
 
     def receive(self, timeout_ms: int) -> Arrival[Event] | None:

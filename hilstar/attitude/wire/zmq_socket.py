@@ -43,8 +43,9 @@ def zmq_version() -> str:
 class ZmqSocket:
     """A socket and its context, bound or connected; reopened after a flood.
 
-    A socket that binds is opened at once, to check that it can be; one that receives is then closed until its first read, so
-    that no old messages and no flood collect in it while the display is prepared.
+    A socket that binds is opened at once, to check that it can be. One that receives a stream is then closed until its first
+    read, so that no old messages and no flood collect in it while the display is prepared. One that answers stays open: a
+    request that is lost with the first socket would leave its sender waiting for ever.
     """
 
     conventions = PACKETS
@@ -68,6 +69,7 @@ class ZmqSocket:
         self._authenticator: ThreadAuthenticator | None = None
         self._socket: zmq.Socket[bytes] | None = None
         self._keeper: Doorkeeper | None = None
+        self._in_use = False
         self._poller = zmq.Poller()
         try:
             if allowed is not None:
@@ -163,6 +165,9 @@ class ZmqSocket:
 
     def _tend(self) -> None:
         self._ready()
+        if not self._in_use:  # what was prepared until now is not the link's
+            self._memory.begin()
+            self._in_use = True
         if self._keeper is not None:
             self._keeper.tend()
         if self._memory.grown_bytes() > MAX_GROWTH_BYTES:

@@ -53,7 +53,6 @@ class VizardLive(ZmqSocket):
     def __init__(self, endpoint: str, follower: Follower, *, bind: bool = True, notices: Notices | None = None) -> None:
         check_loopback(endpoint)
         super().__init__(zmq.REP, endpoint, bind=bind, keys=NO_KEYS, notices=notices)
-        self._shut()
         self._follower, self.conventions = follower, follower.conventions
 
     def receive(self, timeout_ms: int) -> Step | ImageRequest | None:

@@ -37,6 +37,8 @@ def run(tmp_path_factory) -> tuple[dict, Path]:
     text = resource_path("configs", "demo.toml").read_text()
     port = free_port()
     text = text.replace("tcp://127.0.0.1:*", f"tcp://127.0.0.1:{port}").replace("faintest_v_mag = 7.5", "faintest_v_mag = 8.0")
+    text = text.replace('quantisation = "exact"', 'quantisation = "round"')  # frames in a row, on a busy machine too
+    assert '"round"' in text
     bench, ledger = folder / "bench.toml", folder / "run.mcap"
     bench.write_text(text)
     serve = [*HILSTAR, "serve", str(bench), "--json", "--duration", str(DURATION_S), "--ledger", str(ledger)]

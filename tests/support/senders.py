@@ -6,7 +6,6 @@ import itertools
 import os
 import socket
 import struct
-import threading
 import time
 import zlib
 from collections.abc import Iterator
@@ -15,6 +14,7 @@ from contextlib import contextmanager
 import zmq
 
 from hilstar.rotation import from_radec_roll_deg
+from tests.support.waiting import repeating
 
 ORION = tuple(from_radec_roll_deg(84.0, -1.0, 0.0))
 LYRA = tuple(from_radec_roll_deg(283.0, 35.0, 30.0))
@@ -79,18 +79,6 @@ def connected(port: int, kind: int = zmq.PUB, patience_s: float = 5.0) -> Iterat
 @contextmanager
 def talking(sender: zmq.Socket, rate_hz: float = 200.0, q=ORION, first: int = 0) -> Iterator[None]:
     """A sender of this process, stamped with its monotonic clock, that talks all the while."""
-    stop = threading.Event()
-
-    def talk() -> None:
-        k = first
-        while not stop.wait(1 / rate_hz):
-            sender.send(packet(k, time.monotonic_ns(), q))
-            k += 1
-
-    thread = threading.Thread(target=talk)
-    thread.start()
-    try:
+    sequences = itertools.count(first)
+    with repeating(lambda: sender.send(packet(next(sequences), time.monotonic_ns(), q)), 1 / rate_hz):
         yield
-    finally:
-        stop.set()
-        thread.join()

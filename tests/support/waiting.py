@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -20,6 +21,24 @@ def wait_for(holds: Callable[[], object], what: object = "", poll_s: float = 0.0
     while not holds():
         assert time.monotonic() < deadline_s, what
         time.sleep(poll_s)
+
+
+@contextmanager
+def repeating(work: Callable[[], object], pause_s: float) -> Iterator[None]:
+    """`work` called again and again, in a thread of its own, as long as this is open."""
+    stop = threading.Event()
+
+    def repeat() -> None:
+        while not stop.wait(pause_s):
+            work()
+
+    thread = threading.Thread(target=repeat)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
 
 
 @contextmanager

@@ -67,13 +67,16 @@ def attitude(
     from hilstar.resources import resource_path
 
     live = source.suffix.lower() == ".toml"
-    file = read_bench_file(bench or (source if live else resource_path("configs", "demo.toml")))
+    first = read_bench_file(source if live else bench or resource_path("configs", "demo.toml"))
+    file = read_bench_file(bench) if live and bench is not None else first
     if live and mounting is not None:
         raise InputError(f"--mounting {mounting}: write it into {source} as [tracker] q_body_to_cam")
-    mounted = Mounting(file.config.tracker.q_body_to_cam) if mounting is None else parse_mounting(mounting)
+    mounted = Mounting(first.config.tracker.q_body_to_cam) if mounting is None else parse_mounting(mounting)
     if live:
-        sample, conventions = _live(source, at, wait)
+        sample, conventions = _live(first, at, wait)
         held = False
+        for _, line in mounted.told if conventions.of_body else ():
+            say(line)
     else:
         stated = Stated(mounted, tuple(kernel or ()), topic, body, reference, epoch_utc, parse_place(place))
         sample, conventions, held = _of_log(source, at, stated)
@@ -87,21 +90,19 @@ def attitude(
         typer.echo(line)
 
 
-def _live(path: Path, at: str | None, patience_s: float) -> tuple[AttitudeSample, Conventions]:
+def _live(file: BenchFile, at: str | None, patience_s: float) -> tuple[AttitudeSample, Conventions]:
     """The first attitude of the stream that a bench file names."""
     from hilstar.attitude.wire.vizard.live import VizardLive
     from hilstar.attitude.wire.zmq_lockstep import ZmqLockstep
-    from hilstar.bench.bench_file import read_bench_file
     from hilstar.errors import InputError
     from hilstar.run.listen import first_attitude
     from hilstar.run.open_link import open_link
 
     if at is not None:
         raise InputError(f"--at {at}: a live stream has only its present; leave --at out, or give a log")
-    file = read_bench_file(path)
     with open_link(file.config, file.folder) as link:
         if isinstance(link, ZmqLockstep | VizardLive):
-            raise InputError(f"{path}: [attitude] lockstep = true wants a frame for each attitude; use hilstar serve --explain")
+            raise InputError(f"{file.path}: [attitude] lockstep wants a frame for each attitude; use hilstar serve --explain")
         return first_attitude(link, patience_s), link.conventions
 
 

@@ -26,6 +26,7 @@ from tests.support.sources.aem_messages import kvn, rows_of
 from tests.support.sources.ros_bags import START_NS, Make, write_bag1, write_bag2, write_mcap
 from tests.support.sources.ulog_files import ULogWriter
 from tests.support.sources.viz_message import craft, viz_message
+from tests.support.waiting import repeating
 
 MOUNTING = [0.6, 0.48, -0.64, 0.0]
 ALNILAM = 26311
@@ -144,22 +145,11 @@ def test_a_log_of_the_self_check_s_attitude_looks_at_the_star_that_it_names(tmp_
 
 
 @contextlib.contextmanager
-def repeating(send: Callable[[int], object], pause_s: float = 0.01) -> Iterator[None]:
+def timed(send: Callable[[int], object], pause_s: float = 0.01) -> Iterator[None]:
     """`send` called with the time, ns, in a thread of its own."""
-    stop = threading.Event()
-
-    def repeat() -> None:
-        begun_ns = time.monotonic_ns()
-        while not stop.wait(pause_s):
-            send(time.monotonic_ns() - begun_ns)
-
-    thread = threading.Thread(target=repeat)
-    thread.start()
-    try:
+    begun_ns = time.monotonic_ns()
+    with repeating(lambda: send(time.monotonic_ns() - begun_ns), pause_s):
         yield
-    finally:
-        stop.set()
-        thread.join()
 
 
 @contextlib.contextmanager
@@ -169,7 +159,7 @@ def vizard(numbers: Numbers) -> Iterator[dict[str, object]]:
         def send(t_ns: int) -> None:
             sender.send_multipart([b"SIM_UPDATE", viz_message(t_ns, [craft(sigma=numbers)])])
 
-        with repeating(send):
+        with timed(send):
             yield {"source": "vizard", "endpoint": f"tcp://127.0.0.1:{port}"}
 
 
@@ -185,7 +175,7 @@ def json_of(t_ns: int, numbers: Numbers) -> bytes:
 def zmq_of(content: Callable[[int, Numbers], bytes]) -> Callable[[Numbers], contextlib.AbstractContextManager]:
     @contextlib.contextmanager
     def sending(numbers: Numbers) -> Iterator[dict[str, object]]:
-        with publisher() as (sender, port), repeating(lambda t_ns: sender.send(content(t_ns, numbers))):
+        with publisher() as (sender, port), timed(lambda t_ns: sender.send(content(t_ns, numbers))):
             yield {"source": "zmq", "endpoint": f"tcp://127.0.0.1:{port}"}
 
     return sending
@@ -196,7 +186,7 @@ def udp(numbers: Numbers) -> Iterator[dict[str, object]]:
     place = ("127.0.0.1", free_port())
     with (
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
-        repeating(lambda t_ns: sender.sendto(packet_of(t_ns, numbers), place)),
+        timed(lambda t_ns: sender.sendto(packet_of(t_ns, numbers), place)),
     ):
         yield {"source": "udp", "bind": f"{place[0]}:{place[1]}"}
 

@@ -37,6 +37,7 @@ EIGHT_NEIGHBOURS = np.ones((3, 3), dtype=np.int8)
 # Of s^2, the share by which the window can narrow the star's second moment: Newton's step is at most 10 times the
 # plain one, so that noise in the moment cannot throw the centre out of the window.
 MIN_SLOPE = 0.1
+COUNTED_TYPES = (np.uint8, np.uint16)
 S_CURVE_PHASES = 201  # where the bias is steepest, 2 pi 0.05 px a pixel, interpolation between two of them is right to 1e-5 px
 
 
@@ -124,13 +125,32 @@ def estimate_background(image: npt.NDArray[Any], step: float | None = None) -> B
     checked = _checked(image)
     if step is None:
         step = 1.0 if image.dtype.kind in "iu" else 0.0
-    median = float(np.median(checked))
-    sigma = MAD_TO_SIGMA * float(np.median(np.abs(checked - median)))
+    values, counts = _counted(image) if image.dtype in COUNTED_TYPES else (checked.ravel(), None)
+    median = _median(values, counts)
+    sigma = MAD_TO_SIGMA * _median(np.abs(values - median), counts)
     # Where the noise is under a step, a cut at 3 sigma would keep a code on one side and drop its counterpart on the other.
-    half_width = CLIP_SIGMAS * max(sigma, step)
-    kept = checked[np.abs(checked - median) <= half_width]
-    noise = float(kept.std()) / CLIPPED_SIGMA
-    return Background(float(kept.mean()), max(noise, step / math.sqrt(12)))
+    kept = np.abs(values - median) <= CLIP_SIGMAS * max(sigma, step)
+    shares = None if counts is None else counts[kept]
+    level = float(np.average(values[kept], weights=shares))
+    noise = math.sqrt(float(np.average((values[kept] - level) ** 2, weights=shares))) / CLIPPED_SIGMA
+    return Background(level, max(noise, step / math.sqrt(12)))
+
+
+def _counted(image: npt.NDArray[Any]) -> tuple[FloatArray, IntArray]:
+    """The values in an image of DN, in order, and how many pixels have each: ten times faster than pixel by pixel."""
+    counts = np.bincount(image.ravel())
+    values = np.flatnonzero(counts)
+    return values.astype(np.float64), counts[values]
+
+
+def _median(values: FloatArray, counts: IntArray | None) -> float:
+    """The median of values (n,), each so many times."""
+    if counts is None:
+        return float(np.median(values))
+    order = np.argsort(values, kind="stable")
+    below = np.cumsum(counts[order])
+    middle = np.searchsorted(below, [(below[-1] - 1) // 2, below[-1] // 2], side="right")
+    return float(values[order][middle].mean())
 
 
 def noisiest_background(image: FloatArray, step: float = 1.0) -> Background:
@@ -190,8 +210,9 @@ def _checked(image: npt.NDArray[Any]) -> FloatArray:
 
 def _find_blobs(signal: FloatArray, threshold: float, minimum_pixels: int) -> _Blobs:
     """Connected pixels above the threshold, diagonals included, in the order of the rows that meet them."""
-    labels, found = ndimage.label(signal > threshold, structure=EIGHT_NEIGHBOURS)
-    y, x = np.nonzero(labels)
+    above = signal > threshold
+    labels, found = ndimage.label(above, structure=EIGHT_NEIGHBOURS)
+    y, x = np.divmod(np.flatnonzero(above), signal.shape[1])
     blob, value = labels[y, x] - 1, signal[y, x]
     pixels = np.bincount(blob, minlength=found)
     flux = np.bincount(blob, value, minlength=found)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hilstar.tracker.centroids import Background, CentroidSettings, find_stars, noisiest_background
+from hilstar.tracker.centroids import Background, CentroidSettings, estimate_background, find_stars, noisiest_background
 
 SIZE_PX = 40
 BACKGROUND = Background(0.0, 1.0)
@@ -41,3 +41,13 @@ def test_the_noise_of_the_noisier_parts_is_found_beside_a_clipped_one():
     assert found.noise == pytest.approx(2.0, rel=0.06)
     assert found.level == 0
     assert noisiest_background(np.zeros((40, 40)), 5.0).noise == pytest.approx(5 / np.sqrt(12))
+
+
+@pytest.mark.parametrize("shape", [(64, 64), (63, 65)])  # an even number of pixels, and an odd one
+def test_the_background_of_whole_numbers_is_that_of_their_pixels(shape):
+    """Counted value by value, as DN are, and pixel by pixel, as electrons are: the same, but for the order of a sum."""
+    image = np.random.default_rng(5).poisson(20.0, shape).astype(np.uint16)
+    image[3:6, 3:6] = 4000
+    counted, by_pixel = estimate_background(image), estimate_background(image.astype(np.float64), step=1.0)
+    assert counted.level == pytest.approx(by_pixel.level, rel=1e-12)
+    assert counted.noise == pytest.approx(by_pixel.noise, rel=1e-12)

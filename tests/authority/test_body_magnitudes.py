@@ -20,6 +20,8 @@ SKYFIELD_MAG = 1e-6  # the same formulas; its pole of Saturn has eight decimals.
 # Beyond 3.1 and 1.9 degrees of phase it adds a term for spacecraft, 0.021 and 0.015 mag at once.
 SKYFIELD_FAR_MAG = 0.025
 ROLO_MAG = 0.08
+# The table was drawn through observations that differ by as much (waxing and waning Moon: 0.1 mag); no law reaches 160 degrees.
+ALLEN_MAG, ALLEN_THIN_MAG = 0.11, 0.26
 # The paper's two photometric systems, measured apart: their rates differ by this at most (measured: 0.051, Uranus)
 SYSTEMS_MAG = 0.06
 
@@ -80,6 +82,28 @@ def test_the_moon_is_as_bright_as_in_the_rolo_model(phase_deg, limit_mag):
     """V = V_Sun - 2.5 log10(A Omega / pi), eq. 8, with the Moon's 6.4177e-5 sr at 384 400 km."""
     rolo = -26.76 - 2.5 * np.log10(rolo_albedo(phase_deg) * 6.4177e-5 / np.pi)
     assert moon_v_mag(1.0, 384_400.0, phase_deg) == pytest.approx(rolo, abs=limit_mag)
+
+
+# Allen 1973, Astrophysical Quantities, 3rd edition, p. 143: phase in degrees, magnitudes below the full Moon.
+ALLEN = {
+    **{0: 0.0, 5: 0.08, 10: 0.23, 20: 0.51, 30: 0.79, 40: 1.06, 50: 1.35, 60: 1.62, 70: 1.91, 80: 2.24, 90: 2.63, 100: 3.04},
+    **{110: 3.48, 120: 3.93, 130: 4.44, 140: 5.07, 150: 5.9, 160: 7.5},
+}
+
+
+def test_the_moon_is_as_bright_as_in_allen_s_table_and_its_crescent_goes_as_the_cube_of_what_is_lit():
+    for phase_deg, below_full in ALLEN.items():
+        limit = ALLEN_MAG if phase_deg < 160 else ALLEN_THIN_MAG
+        assert moon_v_mag(1.0, 384_400.0, phase_deg) - moon_v_mag(1.0, 384_400.0, 0) == pytest.approx(below_full, abs=limit)
+    # Russell 1916, ApJ 43, 103, p. 117
+    dimmer = moon_v_mag(1.0, 384_400.0, 175.0) - moon_v_mag(1.0, 384_400.0, 160.0)
+    assert dimmer == pytest.approx(2.5 * np.log10((20 / 5) ** 3), abs=1e-9)
+
+
+def test_the_earth_is_as_bright_as_in_skyfield():
+    for phase_deg in (0.0, 45.0, 90.0, 150.0, 170.0):
+        theirs = magnitudelib._earth_magnitude(0.99, 0.0026, phase_deg)
+        assert body_v_mag("Earth", *at(0.99, 0.0026, phase_deg), 2020.0) == pytest.approx(float(theirs), abs=SKYFIELD_MAG)
 
 
 def test_colours_are_those_of_the_paper():

@@ -1,11 +1,14 @@
-"""V magnitudes of Sun, Moon and planets, by distances and phase, for an observer near the Earth.
+"""V magnitudes of Sun, Moon, Earth and planets, by distances and phase, for an observer near the Earth.
 
 Planets: Mallama and Hilton 2018 (Astron. Comput. 25, 10; arXiv:1808.01973), equations 2, 3, 4, 6, 8, 10, 14 and 16. Of Mars the
 terms of longitude and season are left out: 0.035 mag rms, 0.06 at most. Saturn is globe and rings.
 
 Moon: -12.73 + 0.026 phase + 4e-9 phase^4 at its mean distance (Allen 1973; Krisciunas and Schaefer 1991, PASP 103, 1033,
 eq. 9). The ROLO model (Kieffer and Stone 2005) is within 0.08 mag of it from 6 to 97 degrees and 0.16 mag brighter at 2: the
-opposition surge is left out.
+opposition surge is left out. Beyond 150 degrees as the cube of the angle left to 180 (Russell 1916, ApJ 43, 103), without
+earthshine; Allen's table is within 0.1 mag of both up to 150 degrees, and 0.25 fainter at 160.
+
+Earth: Mallama and Hilton's curve, which was made for the whole globe from afar and is held to 170 degrees.
 """
 
 from __future__ import annotations
@@ -29,8 +32,11 @@ URANUS_MAG, URANUS_PER_DEG = -7.110, -8.4e-04  # eq. 14
 # Poles of the IAU's working group (Archinal et al. 2018): right ascension and declination, degrees
 SATURN_POLE_DEG, URANUS_POLE_DEG = (40.589, 83.537), (257.311, -15.175)
 
+EARTH = (-3.99, -1.060e-3, 2.054e-4)  # eq. 5
+EARTH_CURVE_DEG = 170.0
 FULL_MOON_V_MAG, MOON_PER_DEG, MOON_PER_DEG4 = -12.73, 0.026, 4e-9
 MOON_DISTANCE_KM = 384_400.0
+MOON_CRESCENT_DEG, THINNEST_DEG = 150.0, 0.3  # a thinner one, as wide as the Sun, is as bright as that
 
 
 def body_v_mag(name: str, sun_to_body_km: FloatArray, observer_to_body_km: FloatArray, jyear: float) -> float:
@@ -54,7 +60,10 @@ def phase_angle_deg(sun_to_body: FloatArray, observer_to_body: FloatArray) -> fl
 
 def moon_v_mag(sun_au: float, distance_km: float, phase_deg: float) -> float:
     """V of the Moon."""
-    curve = MOON_PER_DEG * phase_deg + MOON_PER_DEG4 * phase_deg**4
+    plain_deg = min(phase_deg, MOON_CRESCENT_DEG)
+    curve = MOON_PER_DEG * plain_deg + MOON_PER_DEG4 * plain_deg**4
+    left_deg = max(180.0 - phase_deg, THINNEST_DEG)
+    curve += 7.5 * max(0.0, float(np.log10((180.0 - MOON_CRESCENT_DEG) / left_deg)))
     return FULL_MOON_V_MAG + curve + 5 * float(np.log10(sun_au * distance_km / MOON_DISTANCE_KM))
 
 
@@ -70,6 +79,8 @@ def _at_unit_distance(name: str, phase_deg: float, latitudes_deg: list[float], j
         return URANUS_MAG + URANUS_PER_DEG * (abs(latitudes_deg[0]) + abs(latitudes_deg[1])) / 2
     if name == "Neptune":  # eq. 16: it brightened from 1980 to 2000
         return float(np.clip(-6.89 - 0.0054 * (jyear - 1980.0), -7.00, -6.89))
+    if name == "Earth":
+        return float(polyval(min(phase_deg, EARTH_CURVE_DEG), EARTH))
     curves = {"Mercury": MERCURY, "Venus": VENUS, "Mars": MARS, "Jupiter": JUPITER}
     curve = VENUS_CRESCENT if name == "Venus" and phase_deg >= VENUS_CRESCENT_DEG else curves[name]
     return float(polyval(phase_deg, curve))

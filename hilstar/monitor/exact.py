@@ -70,13 +70,21 @@ class ExactQuantiser:
         self._first_threshold = np.float32(response.threshold[0])
         self._flat = np.zeros(self._map.pixels + 1, dtype=level_dtype(response))  # one more, for pixels off the image
         self._lit: PlaceArray = np.empty(0, dtype=np.int32)
+        self._on_floor = False
         uniformity = panel.uniformity
         self._output = None if uniformity is None else np.append(uniformity.ravel(), np.float32(1))
 
-    def levels(self, sprites: Sprites | None) -> Codes:
-        """The levels of `sprites` (None: black), (height, width); the next call overwrites the same array."""
+    def levels(self, sprites: Sprites | None, floor: Codes | None = None) -> Codes:
+        """The levels of `sprites` (None: black), (height, width); the next call overwrites the same array.
+
+        Their light is added to that of the levels `floor` (height, width), None for black.
+        """
         width, height = self._map.resolution_px
-        self._flat[self._lit] = 0
+        if floor is None:
+            self._flat[slice(None) if self._on_floor else self._lit] = 0
+        else:
+            self._flat[:-1] = floor.ravel()
+        self._on_floor = floor is not None
         self._lit = np.empty(0, dtype=np.int32)
         if sprites is not None and len(sprites):
             found = self._map.find(sprites)
@@ -96,6 +104,9 @@ class ExactQuantiser:
         asked = found.light / np.float32(self._panel.flux_at_white_e_per_s)
         if output is not None:
             asked /= output
+        floor = self._light[self._flat[found.place]].astype(np.float32) if self._on_floor else None
+        if floor is not None:
+            asked += floor
         np.minimum(asked, np.float32(1), out=asked)  # light over white is lost; neighbours do not make up for it
         lower, upper = self._lower.count(asked[:near]), self._round(asked[near:])
         shown = self._light[np.concatenate([lower, upper])]
@@ -107,6 +118,8 @@ class ExactQuantiser:
             asked *= output
         step[found.place[:near] == self._map.pixels] = 0.0
         light = asked.sum(axis=0, dtype=np.float64)
+        if floor is not None:
+            light -= (floor if output is None else floor * output).sum(axis=0, dtype=np.float64)
         grid = _equal_step(step)
         weight = np.where(grid > 0, LIGHT_WEIGHT_ON_GRID**0.5, LIGHT_WEIGHT**0.5)
         arm = np.stack([np.broadcast_to(weight, short.shape), found.dx_px, found.dy_px])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,14 +16,18 @@ from hilstar.monitor.level_table import CodeTable, code_table
 from hilstar.monitor.quantise import Panel, level_dtype
 from hilstar.monitor.response import Codes
 from hilstar.resources import resource_path
+from hilstar.scene.extended import Rectangle
 
 TABLE_WIDTH = 1024  # that of encode.frag
 
 
-def build_program(ctx: moderngl.Context, vertex: str, fragment: str, defines: tuple[str, ...] = ()) -> moderngl.Program:
-    """A program from two files of shaders/; the fragment shader is compiled with `defines`."""
+def build_program(
+    ctx: moderngl.Context, vertex: str, fragment: str, defines: tuple[str, ...] = (), include: str = ""
+) -> moderngl.Program:
+    """A program from two files of shaders/; the fragment shader is compiled with `defines`, after the file `include`."""
     version, body = resource_path("shaders", fragment).read_text().split("\n", 1)
-    lines = [version, *(f"#define {name}" for name in defines), body]
+    before = [resource_path("shaders", include).read_text()] if include else []
+    lines = [version, *(f"#define {name}" for name in defines), *before, body]
     return ctx.program(
         vertex_shader=resource_path("shaders", vertex).read_text(),
         fragment_shader="\n".join(lines),
@@ -176,22 +181,24 @@ class Encoder:
         """Encode fainter stars' smaller sprites only."""
         set_sides(self._sprites, sides)
 
-    def draw(self, count: int, per_star: int, covered_px: int, shift: float = 0.0) -> None:
-        """Encode the linear image under the first `count` sprites of the buffer; the rest is black, and was before.
+    def draw(self, count: int, per_star: int, covered_px: int, shift: float = 0.0, regions: Sequence[Rectangle] = ()) -> None:
+        """Encode the linear image under the first `count` sprites of the buffer and in `regions`; the rest is, and was, black.
 
         `shift` turns the mask of a dithering encoder. Each star has `per_star` sprites; together they cover `covered_px`, and
         where that is most of the image the pass covers all of it.
         """
         width, height = self._size_px
+        whole = (0, 0, width, height)
+        if covered_px * SPRITE_PIXEL_COST >= width * height or whole in regions:
+            regions, count = (whole,), 0
         self._fbo.use()
         for unit, texture in enumerate(self._textures.values()):
             texture.use(unit)
         if self._dithered:
             self._sprites["shift"] = self._whole["shift"] = shift
-        if covered_px * SPRITE_PIXEL_COST >= width * height:
-            self._fbo.viewport = (0, 0, width, height)
+        for region in regions:
+            self._fbo.viewport = region
             self._whole_vao.render(moderngl.TRIANGLES, vertices=3)
-            return
         if count and self._sprite_vao is not None:
             self._sprites["sprites_per_star"] = float(per_star)
             margin = self._footprint_px

@@ -20,6 +20,8 @@ from hilstar.monitor.exact import ExactQuantiser
 from hilstar.monitor.quantise import CYCLE_FRAMES, Panel, Quantisation, frame_shift
 from hilstar.monitor.response import Codes, Response
 from hilstar.render.encoder import Encoder, Eraser, LevelTexture, SpriteSides, build_program, set_sides
+from hilstar.render.extended import ExtendedLayer
+from hilstar.scene.extended import ExtendedLight, Rectangle
 from hilstar.scene.psf import SQRT2, footprint_px
 from hilstar.scene.sprites import SPRITE_DTYPE, Sprites
 
@@ -126,6 +128,8 @@ class Renderer:
         set_sides(self._splat, target.sides)
         self._eraser = Eraser(ctx, target.resolution_px, of_levels=False)
         self._level_eraser = Eraser(ctx, target.resolution_px, of_levels=True)
+        self._extended = ExtendedLayer(ctx, target.resolution_px)
+        self._regions: tuple[Rectangle, ...] = ()  # of extended light that is on the images
         self._build_levels()
         self._reserve(FIRST_CAPACITY)
         width, height = target.resolution_px
@@ -143,6 +147,9 @@ class Renderer:
         if target.quantisation == "exact":
             self._exact = ExactQuantiser(panel, target.resolution_px, target.sigma_px)
             self._exact_levels = self._exact.levels(None)
+            self._floor_encoder: Encoder | None = None
+            self._floor_lights: tuple[ExtendedLight, ...] = ()
+            self._floor_levels = self._exact_levels
         else:
             dithered = target.quantisation != "round"
             self._encoder = Encoder(self._ctx, self._linear, self._levels, panel, dithered)
@@ -168,7 +175,8 @@ class Renderer:
         with self._ctx:
             if self._exact is not None and self._levels is not None:
                 # These levels come from the sprites themselves: the linear image is drawn only when it is read.
-                self._exact_levels = self._exact.levels(sprites)
+                floor = None if sprites is None or not sprites.extended else self._floor(sprites.extended)
+                self._exact_levels = self._exact.levels(sprites, floor)
                 self._levels.write(self._exact_levels)
                 self._undrawn = (sprites, whole)
                 return
@@ -180,7 +188,24 @@ class Renderer:
         temporal = self.target.quantisation == "temporal"
         shift = frame_shift(frame, self.target.cycle_frames) if temporal else 0.0
         count, per_star = (0, 1) if sprites is None else (len(sprites), sprites.per_star)
-        encoder.draw(count, per_star, self._covered_px(sprites), shift)
+        encoder.draw(count, per_star, self._covered_px(sprites), shift, self._regions)
+
+    def _floor(self, lights: tuple[ExtendedLight, ...]) -> Codes:
+        """The levels of extended light alone, dithered, for `exact`: its stars are added to them in light.
+
+        The same lights again give the same levels, which are kept.
+        """
+        panel, levels = self.target.panel(), self._levels
+        if lights == self._floor_lights or panel is None or levels is None:
+            return self._floor_levels
+        if self._floor_encoder is None:
+            self._floor_encoder = Encoder(self._ctx, self._linear, levels, panel, dithered=True)
+        self._erase()
+        self._shine(lights)
+        levels.fbo.clear()
+        self._floor_encoder.draw(0, 1, 0, 0.0, self._regions)
+        self._floor_lights, self._floor_levels = lights, levels.read().copy()
+        return self._floor_levels
 
     def _covered_px(self, sprites: Sprites | None) -> int:
         """Pixels of all sprites together."""
@@ -203,6 +228,8 @@ class Renderer:
     def _draw_linear(self, sprites: Sprites | None, whole: bool) -> None:
         self._undrawn = None
         self._erase()
+        if sprites is not None and sprites.extended:
+            self._shine(sprites.extended)
         if sprites is not None and len(sprites):
             self._upload(sprites)
             self._last_count = len(sprites)
@@ -213,7 +240,16 @@ class Renderer:
         self._eraser.erase(self._linear_fbo, self._last_count)
         if self._encoder is not None and self._levels is not None:
             self._level_eraser.erase(self._levels.fbo, self._last_count)
+        for region in self._regions:
+            self._linear_fbo.clear(viewport=region)
+            if self._encoder is not None and self._levels is not None:
+                self._levels.fbo.clear(viewport=region)
+        self._regions = ()
         self._last_count = 0
+
+    def _shine(self, lights: tuple[ExtendedLight, ...]) -> None:
+        """Add extended light to the linear image."""
+        self._regions = self._extended.draw(self._linear_fbo, lights)
 
     def _splat_stars(self, sprites: Sprites, whole: bool) -> None:
         """Add the light of the sprites that are in the buffer to the linear image."""

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.scene.camera import Camera
+from hilstar.scene.extended import ExtendedLight
 from hilstar.sky.stars import Stars
 
 # A whole pixel and a float32 fraction: float32 alone would be off by 1e-4 px at 2000 px and 1e-3 px further out.
@@ -29,6 +30,7 @@ class Sprites:
     A sprite covers `footprint_px` squared pixels, the first of them at `pixel - (footprint_px - 1) // 2`. A star's light is
     divided among up to `per_star` sprites. `capped` stars are drawn coarser than they should be, or not at all, because
     the work of a frame is bounded. `rate_cam_rad_s` (3,) is the turn along which stars are drawn as paths, None for points.
+    `extended` is the frame's light that is no star's, in the order in which it is drawn.
     """
 
     data: npt.NDArray[np.void]
@@ -39,6 +41,7 @@ class Sprites:
     per_star: int = 1
     capped: int = 0
     rate_cam_rad_s: FloatArray | None = None
+    extended: tuple[ExtendedLight, ...] = ()
 
     def __len__(self) -> int:
         return len(self.data)

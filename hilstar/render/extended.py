@@ -1,0 +1,100 @@
+"""The pass before the sprites: extended light into the linear image, each in its rectangle and in its order."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import moderngl
+import numpy as np
+
+from hilstar.render.encoder import build_program
+from hilstar.scene.camera import Camera
+from hilstar.scene.extended import ExtendedLight, Glow, LightMap, Rectangle
+from hilstar.scene.rays import ray_shifts
+
+KEPT_TEXTURES = 4  # of maps and lenses: a bench has one lens, and few maps at a time
+
+
+class ExtendedLayer:
+    """Draws extended light of one image; it lives in its renderer's context, which is current in every call.
+
+    Programs and textures are made when they are first needed: a bench without such light has none.
+    """
+
+    def __init__(self, ctx: moderngl.Context, resolution_px: tuple[int, int]) -> None:
+        self._ctx = ctx
+        self._resolution_px = resolution_px
+        self._programs: dict[tuple[str, ...], tuple[moderngl.Program, moderngl.VertexArray]] = {}
+        self._textures: dict[int, tuple[object, moderngl.Texture]] = {}
+
+    def draw(self, fbo: moderngl.Framebuffer, lights: Sequence[ExtendedLight]) -> tuple[Rectangle, ...]:
+        """Add `lights` to a linear image, in their order; the rectangles that they may have changed."""
+        ctx, regions = self._ctx, []
+        fbo.use()
+        ctx.enable(moderngl.BLEND)
+        # Alpha is the share of a pixel that the light's body covers: what was drawn before it is behind it.
+        ctx.blend_func = (moderngl.ONE, moderngl.ONE_MINUS_SRC_ALPHA)
+        for light in lights:
+            region = light.region(self._resolution_px)
+            if region is None:
+                continue
+            fbo.viewport = region
+            self._draw_one(light)
+            regions.append(region)
+        ctx.blend_func = (moderngl.ONE, moderngl.ONE)
+        ctx.disable(moderngl.BLEND)
+        return tuple(regions)
+
+    def _draw_one(self, light: ExtendedLight) -> None:
+        if isinstance(light, LightMap):
+            self._draw_map(light)
+        else:
+            self._draw_glow(light)
+
+    def _draw_map(self, light: LightMap) -> None:
+        program, triangle = self._program("light_map.frag")
+        self._texture(light.image, light.image, 1).use(0)
+        program["corner_px"] = light.corner_px
+        program["times"] = light.times
+        triangle.render(moderngl.TRIANGLES, vertices=3)
+
+    def _draw_glow(self, light: Glow) -> None:
+        program, triangle = self._with_rays("glow.frag", light.camera)
+        program["direction"] = tuple(light.direction_image.tolist())
+        program["peak_e_per_s"] = light.peak_e_per_s
+        program["scale_rad"] = light.scale_rad
+        program["exponent"] = light.exponent
+        triangle.render(moderngl.TRIANGLES, vertices=3)
+
+    def _with_rays(self, fragment: str, camera: Camera) -> tuple[moderngl.Program, moderngl.VertexArray]:
+        """A program whose pixels know their directions through `camera`, whose image this is."""
+        defines = () if camera.lens is None else ("LENS",)
+        program, triangle = self._program(fragment, "rays.glsl", *defines)
+        program["principal_px"] = camera.principal_point_px
+        program["focal_px"] = camera.focal_length_px
+        if camera.lens is not None:
+            shifts = self._texture(camera, None, 2)
+            program["nodes_per_px"] = tuple((n - 1) / size for n, size in zip(shifts.size, self._resolution_px, strict=True))
+            shifts.use(0)
+        return program, triangle
+
+    def _program(self, fragment: str, include: str = "", *defines: str) -> tuple[moderngl.Program, moderngl.VertexArray]:
+        key = (fragment, include, *defines)
+        if key not in self._programs:
+            program = build_program(self._ctx, "full.vert", fragment, defines, include)
+            self._programs[key] = program, self._ctx.vertex_array(program, [])
+        return self._programs[key]
+
+    def _texture(self, owner: object, image: Any, components: int) -> moderngl.Texture:
+        """The float32 texture of an array, or of a camera's ray shifts; kept while its owner is used."""
+        kept = self._textures.pop(id(owner), None)
+        if kept is None:
+            if len(self._textures) >= KEPT_TEXTURES:
+                self._textures.pop(next(iter(self._textures)))[1].release()
+            values = np.ascontiguousarray(ray_shifts(owner) if isinstance(owner, Camera) else image, dtype=np.float32)
+            texture = self._ctx.texture(values.shape[1::-1], components, values, dtype="f4")
+            texture.filter = (moderngl.NEAREST, moderngl.NEAREST)
+            kept = owner, texture
+        self._textures[id(owner)] = kept  # the last used is the last to go
+        return kept[1]

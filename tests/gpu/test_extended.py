@@ -1,0 +1,106 @@
+"""Light that is no star's: added, encoded and erased by every quantisation, and free where there is none."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hilstar.monitor.quantise import dither_levels, round_levels, shown_light, temporal_levels
+from hilstar.monitor.response import srgb_response
+from hilstar.render.renderer import Renderer, Target
+from hilstar.scene.camera import Camera
+from hilstar.scene.extended import Glow, LightMap
+from hilstar.scene.lens import Lens
+from tests.support.stars import sprites_at
+
+SIZE, SIGMA, WHITE = (256, 192), (0.85, 0.85), 1e6
+CORNER, SHAPE = (70, 40), (60, 90)
+LENS = Lens(radial=(0.2, 0.05, 0.0), tangential=(1e-3, -2e-3))
+# One rounding of float32 for the product with `times`, one for the sum with a star's light.
+FLOAT32 = 2 * np.finfo(np.float32).eps
+# llvmpipe's pow is good to 2e-5.
+GLOW_LIMIT = 1e-4
+# Between nodes this strong lens is 0.01 px off; the glow falls by at most 3 of itself over its scale of 40 px.
+GLOW_LENS_LIMIT = 0.01 * 3 / 40
+
+
+def camera(lens: Lens | None = None) -> Camera:
+    return Camera(SIZE, 400.0, (127.5, 95.5), np.eye(3), lens)
+
+
+def target_of(method, uniformity=None) -> Target:
+    return Target(SIZE, SIGMA, srgb_response(10), WHITE, method, uniformity)
+
+
+def stars(gl, rng, count=40):
+    return sprites_at(rng.uniform([5, 5], [250, 187], size=(count, 2)), 10.0 ** rng.uniform(4, 6, count), gl.footprint_px)
+
+
+def map_of(rng, low=0.0, high=3e-3) -> LightMap:
+    return LightMap((WHITE * rng.uniform(low, high, SHAPE)).astype(np.float32), CORNER, 2.0)
+
+
+@pytest.mark.parametrize("method", ["round", "dither", "temporal"])
+def test_a_map_is_added_to_the_stars_encoded_whole_and_gone_in_the_next_frame(method, rng):
+    target = target_of(method, rng.uniform(0.8, 1.2, SIZE[::-1]).astype(np.float32))
+    panel = target.panel()
+    oracle = {"round": round_levels, "dither": dither_levels, "temporal": lambda a, p: temporal_levels(a, p, 3)}[method]
+    with Renderer(target) as gl:
+        plain, light = stars(gl, rng), map_of(rng)
+        gl.draw(plain, 3)
+        alone, alone_levels = gl.linear().copy(), gl.codes().copy()
+        gl.draw(replace(plain, extended=(light,)), 3)
+        both = gl.linear().copy()
+        wanted = alone.copy()
+        wanted[40:100, 70:160] += 2 * light.image
+        assert np.abs(both - wanted).max() <= FLOAT32 * wanted.max()
+        assert np.mean(gl.codes() != oracle(both, panel)) < 1e-4  # ties alone
+        gl.draw(plain, 3)
+        assert (gl.linear() == alone).all() and (gl.codes() == alone_levels).all()
+        gl.draw(replace(plain, extended=(LightMap(light.image, (400, 400)),)), 3)
+        assert (gl.linear() == alone).all() and (gl.codes() == alone_levels).all()
+        assert gl.gl_error() == "GL_NO_ERROR"
+
+
+def test_exact_adds_each_star_in_light_to_the_dithered_floor(rng):
+    """A star's light is the difference to the floor's; without light of its own a floor is that of `dither`."""
+    step_e = srgb_response(10).light[1] * WHITE
+    target = target_of("exact")
+    panel = target.panel()
+    x, y = np.meshgrid(np.arange(20.0, 250, 30), np.arange(20.0, 180, 30))
+    places = np.column_stack((x.ravel(), y.ravel())) + rng.uniform(-0.5, 0.5, (x.size, 2))
+    light = LightMap(np.full(SIZE[::-1], 0.3 * step_e, dtype=np.float32))
+    with Renderer(target) as gl:
+        some = sprites_at(places, np.full(x.size, 200 * step_e), gl.footprint_px)
+        gl.draw(some)
+        plain = gl.codes().copy()
+        gl.draw(replace(some, extended=(light,)))
+        both = shown_light(gl.codes(), panel)
+        assert np.allclose(gl.linear().sum(), 0.3 * step_e * light.image.size + 200 * step_e * x.size, rtol=1e-4)
+        gl.draw(replace(some, data=some.data[:0], star=some.star[:0], extended=(light,)))
+        floor = gl.codes().copy()
+        assert (floor == dither_levels(light.image, panel)).mean() > 1 - 1e-4
+        difference = both - shown_light(floor, panel)
+        for px, py in np.rint(places).astype(int):
+            # Half a step of light: the method's own limit where steps are equal.
+            assert abs(difference[py - 9 : py + 10, px - 9 : px + 10].sum() - 200 * step_e) < 0.6 * step_e
+        gl.draw(some)
+        assert (gl.codes() == plain).all()
+
+
+@pytest.mark.parametrize("lens", [None, LENS], ids=["pinhole", "lens"])
+def test_a_glow_has_its_profile_about_a_direction_on_and_off_the_image(lens):
+    cam = camera(lens)
+    x, y = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
+    seen = cam.rays(x.ravel().astype(float), y.ravel().astype(float))
+    seen /= np.linalg.norm(seen, axis=1, keepdims=True)
+    with Renderer(Target(SIZE, SIGMA)) as gl:
+        none = sprites_at(np.empty((0, 2)), np.empty(0), gl.footprint_px)
+        for direction in ([0.1, -0.05, 0.99], [1.0, 0.2, -0.3]):
+            towards = np.array(direction) / np.linalg.norm(direction)
+            gl.draw(replace(none, extended=(Glow(towards, 5e4, 0.1, 3.0, cam),)))
+            angle = np.arctan2(np.linalg.norm(np.cross(seen, towards), axis=1), seen @ towards)
+            wanted = 5e4 * (1 + (angle / 0.1) ** 2) ** -1.5
+            assert np.abs(gl.linear().ravel() / wanted - 1).max() < (GLOW_LIMIT if lens is None else GLOW_LENS_LIMIT)

@@ -1,0 +1,243 @@
+// A chart along time: lines, or bands from minimum to maximum, and marks where something was lost. What it shows is written in words too.
+
+import { fixed, make, write } from "./format.js";
+
+const HEIGHT = 132;
+const LEFT = 44;
+const BOTTOM = 20;
+const TOP = 8;
+const RIGHT = 10;
+const STEPS = [1, 2, 2.5, 5, 10];
+const TIME_STEPS_S = [0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 14400, 28800, 86400];
+
+export function niceTop(value, ticks = 4) {
+  if (!(value > 0)) return [1, 0.25];
+  const rough = value / ticks;
+  const power = 10 ** Math.floor(Math.log10(rough));
+  const step = STEPS.map((s) => s * power).find((s) => s * ticks >= value * 0.9999);
+  return [Math.ceil(value / step - 1e-9) * step, step];
+}
+
+export function timeText(seconds, step) {
+  const sign = seconds < 0 ? "\u2212" : "";
+  const s = Math.abs(seconds);
+  if (step < 60 && s <= 90) return `${sign}${Number(s.toFixed(1))}`;
+  const [hour, minute, second] = [Math.floor(s / 3600), Math.floor(s / 60) % 60, Math.round(s % 60)];
+  const two = (part) => String(part).padStart(2, "0");
+  return hour ? `${sign}${hour}:${two(minute)}:${two(second)}` : `${sign}${minute}:${two(second)}`;
+}
+
+// The minimum and the maximum of each of so many columns: no spike is too thin to be seen.
+export function envelope(t, low, high, from, to, columns) {
+  const [lows, highs] = [new Float64Array(columns).fill(Infinity), new Float64Array(columns).fill(-Infinity)];
+  for (let k = 0; k < t.length; k += 1) {
+    if (t[k] < from || t[k] > to || low[k] === null || low[k] === undefined) continue;
+    const column = Math.min(Math.floor(((t[k] - from) / (to - from || 1)) * columns), columns - 1);
+    if (low[k] < lows[column]) lows[column] = low[k];
+    if (high[k] > highs[column]) highs[column] = high[k];
+  }
+  return [lows, highs];
+}
+
+// series: {name, unit, digits, ink, t, low, high}; marks: {name, ink, t, n}. Times in s, low and high in the chart's unit.
+export class Chart {
+  constructor(figure, { title, unit, ink, onPick = null }) {
+    Object.assign(this, { figure, unit, ink, onPick, series: [], marks: [], from: -60, to: 0, cursor: null, hover: null });
+    const head = make("figcaption", "panel-head");
+    this.heading = make("h2", "", title);
+    this.now = make("span", "now figure");
+    head.append(this.heading, this.now);
+    this.canvas = make("canvas");
+    this.canvas.setAttribute("role", "img");
+    this.text = make("p", "second figure chart-text");
+    this.legend = make("p", "legend");
+    figure.append(head, this.canvas, this.text, this.legend);
+    this.context = this.canvas.getContext("2d");
+    this.canvas.addEventListener("pointermove", (event) => this.point(event));
+    this.canvas.addEventListener("pointerleave", () => this.point(null));
+    this.canvas.addEventListener("click", (event) => this.onPick?.(this.timeAt(event)));
+  }
+
+  set(series, marks, from, to) {
+    Object.assign(this, { series, marks, from, to });
+  }
+
+  timeAt(event) {
+    const box = this.canvas.getBoundingClientRect();
+    const share = (event.clientX - box.left - LEFT) / Math.max(box.width - LEFT - RIGHT, 1);
+    return this.from + Math.min(Math.max(share, 0), 1) * (this.to - this.from);
+  }
+
+  point(event) {
+    this.hover = event && this.timeAt(event);
+    this.draw();
+  }
+
+  x(t) {
+    return LEFT + ((t - this.from) / (this.to - this.from || 1)) * (this.w - LEFT - RIGHT);
+  }
+
+  y(value) {
+    return HEIGHT - BOTTOM - ((value - this.bottom) / (this.top - this.bottom || 1)) * (HEIGHT - BOTTOM - TOP);
+  }
+
+  fit() {
+    const ratio = Math.min(window.devicePixelRatio || 1, 2);
+    this.w = this.canvas.clientWidth;
+    if (!this.w) return false;
+    const [w, h] = [Math.round(this.w * ratio), Math.round(HEIGHT * ratio)];
+    if (this.canvas.width !== w || this.canvas.height !== h) Object.assign(this.canvas, { width: w, height: h });
+    this.context.setTransform(ratio, 0, 0, ratio, 0, 0);
+    return true;
+  }
+
+  draw() {
+    if (!this.fit()) return;
+    const { context } = this;
+    context.clearRect(0, 0, this.w, HEIGHT);
+    const columns = Math.max(Math.floor(this.w - LEFT - RIGHT), 1);
+    this.bands = this.series.map((one) => envelope(one.t, one.low, one.high, this.from, this.to, columns));
+    const known = (pick, start) => this.bands.reduce((best, band) => band.reduce((a, part) => part.reduce(pick, a), best), start);
+    const high = known((a, b) => (Number.isFinite(b) ? Math.max(a, b) : a), 0);
+    const low = known((a, b) => (Number.isFinite(b) ? Math.min(a, b) : a), 0);
+    [this.top, this.step] = niceTop(Math.max(high, -low));
+    if (high <= 0 && low < 0) this.top = 0;
+    this.bottom = low < 0 ? -niceTop(-low)[0] : 0;
+    this.drawAxes();
+    for (const mark of this.marks) this.drawMarks(mark);
+    this.series.forEach((one, k) => this.drawBand(one, this.bands[k]));
+    this.drawCursor();
+    this.tell();
+  }
+
+  drawAxes() {
+    const { context, ink } = this;
+    context.font = "11px system-ui, sans-serif";
+    context.textBaseline = "middle";
+    context.textAlign = "right";
+    context.lineWidth = 1;
+    const digits = Math.max(0, -Math.floor(Math.log10(this.step) + 1e-9) + (this.step / 10 ** Math.floor(Math.log10(this.step)) === 2.5 ? 1 : 0));
+    for (let value = this.bottom; value <= this.top + this.step * 0.01; value += this.step) {
+      const y = Math.round(this.y(value)) + 0.5;
+      context.strokeStyle = Math.abs(value) < this.step / 100 ? ink.axis : ink.gridLine;
+      context.beginPath();
+      context.moveTo(LEFT, y);
+      context.lineTo(this.w - RIGHT, y);
+      context.stroke();
+      context.fillStyle = ink.muted;
+      context.fillText(fixed(value, digits), LEFT - 6, y);
+    }
+    this.drawTimes();
+  }
+
+  drawTimes() {
+    const { context, ink } = this;
+    const span = this.to - this.from;
+    const step = TIME_STEPS_S.find((s) => span / s <= Math.max((this.w - LEFT) / 90, 2)) || span;
+    context.textAlign = "center";
+    context.fillStyle = ink.muted;
+    for (let t = Math.ceil(this.from / step - 1e-9) * step; t <= this.to + step * 1e-6; t += step) {
+      const text = timeText(Math.abs(t) < step / 100 ? 0 : t, step);
+      const half = context.measureText(text).width / 2;
+      const unit = step < 60 && Math.abs(t) <= 90 ? "\u00a0s" : "";
+      context.fillText(text + unit, Math.min(this.x(t), this.w - half - 8), HEIGHT - BOTTOM / 2 + 2);
+    }
+  }
+
+  drawBand({ ink: name }, [lows, highs]) {
+    const { context } = this;
+    context.strokeStyle = this.ink[name];
+    context.fillStyle = this.ink[name];
+    context.lineWidth = 1.5;
+    context.beginPath();
+    let pen = false;
+    let gap = 0;
+    const spread = Math.max(2, Math.ceil(lows.length / 24));
+    for (let k = 0; k < lows.length; k += 1) {
+      if (!Number.isFinite(lows[k])) {
+        gap += 1;
+        if (gap > spread) pen = false;
+        continue;
+      }
+      const x = LEFT + k + 0.5;
+      context[pen ? "lineTo" : "moveTo"](x, this.y(lows[k]));
+      context.lineTo(x, this.y(highs[k]) - (pen ? 0 : 0.01));
+      pen = true;
+      gap = 0;
+    }
+    context.stroke();
+  }
+
+  // A line from top to bottom with a triangle: lost frames and refused packets are seen without their colour.
+  drawMarks({ ink: name, t, n }) {
+    const { context } = this;
+    context.strokeStyle = context.fillStyle = this.ink[name];
+    context.globalAlpha = 0.85;
+    for (let k = 0; k < t.length; k += 1) {
+      if (!n[k] || t[k] < this.from || t[k] > this.to) continue;
+      const x = this.x(t[k]);
+      context.fillRect(x - 0.5, TOP, 1, HEIGHT - BOTTOM - TOP);
+      context.beginPath();
+      context.moveTo(x - 4, TOP - 6);
+      context.lineTo(x + 4, TOP - 6);
+      context.lineTo(x, TOP + 1);
+      context.fill();
+    }
+    context.globalAlpha = 1;
+  }
+
+  drawCursor() {
+    const { context, ink } = this;
+    for (const [at, colour] of [[this.cursor, ink.accent], [this.hover, ink.muted]]) {
+      if (at === null || at < this.from || at > this.to) continue;
+      context.fillStyle = colour;
+      context.fillRect(this.x(at) - 0.5, TOP, 1, HEIGHT - BOTTOM - TOP);
+    }
+  }
+
+  // The newest value, or that under the pointer, the cursor; minimum and maximum of what is seen.
+  tell() {
+    const at = this.hover ?? this.cursor;
+    const parts = this.series.map((one, k) => {
+      const [lows, highs] = this.bands[k];
+      const seen = [Math.min(...lows), Math.max(...highs)];
+      const value = at === null ? lastOf(one) : valueAt(one, at);
+      return { one, value, seen };
+    });
+    const named = parts.length > 1;
+    write(this.now, parts.length ? `${fixed(parts[0].value, parts[0].one.digits)}\u00a0${this.unit}` : "");
+    const range = parts.map(({ one, seen }) => (Number.isFinite(seen[0]) ? `${named ? `${one.name} ` : ""}${fixed(seen[0], one.digits)} to ${fixed(seen[1], one.digits)}\u00a0${this.unit}` : `${named ? `${one.name} ` : ""}no value`));
+    const lost = this.marks.map(({ name, t, n }) => `${t.reduce((sum, at, k) => sum + (at >= this.from && at <= this.to ? n[k] || 0 : 0), 0)} ${name}`);
+    const where = at === null ? "" : `at ${timeText(at, 1)}${Math.abs(at) <= 90 ? "\u00a0s" : ""}; `;
+    const words = where + [...range, ...lost].join(" \u00b7 ");
+    write(this.text, words);
+    this.canvas.setAttribute("aria-label", `${this.heading.textContent}, ${this.now.textContent}; ${words}`);
+    this.tellLegend();
+  }
+
+  tellLegend() {
+    const rows = [...(this.series.length > 1 ? this.series : []), ...this.marks];
+    if (this.legend.childElementCount === rows.length) return;
+    this.legend.replaceChildren(
+      ...rows.map(({ name, ink }) => {
+        const entry = make("span", `key ink-${ink}`, name);
+        return entry;
+      }),
+    );
+  }
+}
+
+function lastOf({ high }) {
+  for (let k = high.length - 1; k >= 0; k -= 1) if (high[k] !== null && high[k] !== undefined) return k === high.length - 1 ? high[k] : null;
+  return null;
+}
+
+function valueAt({ t, high }, at) {
+  let best = null;
+  let gap = Infinity;
+  for (let k = 0; k < t.length; k += 1) {
+    const away = Math.abs(t[k] - at);
+    if (away < gap && high[k] !== null) [best, gap] = [high[k], away];
+  }
+  return best;
+}

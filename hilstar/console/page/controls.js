@@ -1,0 +1,114 @@
+// What an operator may change: each asks the server, says what it answered, and shows the state that comes back, never the wish.
+
+import { byId, make, write } from "./format.js";
+
+const SWITCHES = { blank: "Blank", pause: "Pause", patch: "Patch", crosshair: "Crosshair", grid: "Grid", ledger: "Ledger" };
+const CONFIRM_MS = 3000;
+const NAME_KEY = "hilstar.operator";
+
+export class Controls {
+  constructor(link) {
+    Object.assign(this, { link, on: {}, armed: null, allowed: false });
+    for (const name of Object.keys(SWITCHES)) byId(`control-${name}`).addEventListener("click", () => this.press(name));
+    byId("mark-form").addEventListener("submit", (event) => this.mark(event));
+    byId("fault-form").addEventListener("submit", (event) => this.fault(event));
+    byId("operator-form").addEventListener("submit", (event) => event.preventDefault());
+    const name = byId("operator-name");
+    name.value = localStorage.getItem(NAME_KEY) || "";
+    name.addEventListener("change", () => localStorage.setItem(NAME_KEY, name.value.trim()));
+  }
+
+  setUp({ control, faults }) {
+    this.allowed = control;
+    write(byId("control-state"), control ? "may act" : "read-only");
+    byId("control-state").dataset.state = control ? "ok" : "";
+    for (const field of document.querySelectorAll(".controls-panel :is(button, input, select)")) field.disabled = !control;
+    const note = byId("controls-note");
+    note.hidden = control;
+    write(note, control ? "" : "Read-only: start hilstar with --control to act from here.");
+    byId("fault-name").replaceChildren(...(faults || []).map((fault) => new Option(fault, fault)));
+    byId("fault-form").hidden = !(faults || []).length;
+  }
+
+  hear({ operator, ledger }) {
+    this.on = { ...operator, ledger: ledger !== null };
+    for (const [name, words] of Object.entries(SWITCHES)) {
+      const button = byId(`control-${name}`);
+      button.setAttribute("aria-pressed", String(Boolean(this.on[name])));
+      if (this.armed?.name !== name) write(button, words);
+    }
+  }
+
+  // Blanking, and ending a ledger, take a second press within three seconds.
+  press(name) {
+    if (!this.allowed) return;
+    const on = !this.on[name];
+    const costly = (name === "blank" && on) || (name === "ledger" && !on);
+    if (costly && this.armed?.name !== name) {
+      this.arm(name);
+      return;
+    }
+    this.disarm();
+    this.send(name, { on }, `${SWITCHES[name]} ${on ? "on" : "off"}`);
+  }
+
+  arm(name) {
+    this.disarm();
+    const button = byId(`control-${name}`);
+    button.classList.add("armed");
+    write(button, name === "blank" ? "Press again: blank" : "Press again: stop");
+    this.say("Press it again within 3 s.", true);
+    this.armed = { name, timer: setTimeout(() => this.disarm(), CONFIRM_MS) };
+  }
+
+  disarm() {
+    if (!this.armed) return;
+    clearTimeout(this.armed.timer);
+    const { name } = this.armed;
+    this.armed = null;
+    byId(`control-${name}`).classList.remove("armed");
+    write(byId(`control-${name}`), SWITCHES[name]);
+    this.say("", true);
+  }
+
+  mark(event) {
+    event.preventDefault();
+    const field = byId("mark-text");
+    const text = field.value.trim();
+    if (!text) {
+      this.say("Write what the mark says first.", false);
+      field.focus();
+      return;
+    }
+    this.send("mark", { text }, "Mark written").then((ok) => ok && (field.value = ""));
+  }
+
+  fault(event) {
+    event.preventDefault();
+    const name = byId("fault-name").value;
+    this.send("fault", { name }, `Fault ${name} injected`);
+  }
+
+  async send(name, body, done) {
+    const { ok, line } = await this.link.control(name, body, byId("operator-name").value.trim());
+    this.say(ok ? `${done}.` : `${SWITCHES[name] || name}: ${line}`, ok);
+    return ok;
+  }
+
+  say(line, ok) {
+    const said = byId("control-said");
+    write(said, line);
+    said.dataset.ok = String(ok);
+  }
+}
+
+// The list of keys: [key, words]; what it does stands in `act`.
+export function listKeys(keys) {
+  byId("shortcut-list").replaceChildren(
+    ...keys.flatMap(([key, words]) => {
+      const name = make("dt");
+      name.append(make("kbd", "", key));
+      return [name, make("dd", "", words)];
+    }),
+  );
+}

@@ -1,0 +1,60 @@
+// Whether what is shown is right, since when, and why not: in one colour, one word and one sign.
+
+import { byId, clock, duration, write } from "./format.js";
+
+const SILENT_MS = 400; // without a message: with CHECK_MS the page is red within half a second
+const CHECK_MS = 50;
+const SIGNS = { true: "\u2713", false: "!" };
+
+export class Health {
+  constructor(link, onChange) {
+    Object.assign(this, { link, onChange, said: null, serverMs: NaN, saidAt: -Infinity, ok: null, lostUtc: null, bench: "" });
+    setInterval(() => this.check(), CHECK_MS);
+  }
+
+  hear({ utc, health }) {
+    this.said = health;
+    this.serverMs = Date.parse(utc);
+    this.saidAt = performance.now();
+    this.check();
+  }
+
+  // The server's clock now; the browser's own may be wrong.
+  get nowMs() {
+    return this.serverMs + performance.now() - this.saidAt;
+  }
+
+  // {ok, headline, reasons, since}: what the server says, unless it says nothing.
+  judge() {
+    const silent = performance.now() - this.saidAt;
+    if (this.said === null) return { ok: false, headline: "Connecting", reasons: this.link.refusedWhy || "no word from hilstar yet", since: null };
+    if (silent > SILENT_MS) {
+      const why = this.link.open ? "the connection is open, but hilstar says nothing" : this.link.refusedWhy || "the connection is lost; trying again";
+      return { ok: false, headline: "No word from hilstar", reasons: `${why}. What is below is old.`, since: this.serverMs };
+    }
+    const { ok, since, reasons } = this.said;
+    return { ok, headline: ok ? "Sky is right" : "Sky is not right", reasons: reasons.join("; "), since: Date.parse(since) };
+  }
+
+  check() {
+    this.link.check();
+    const { ok, headline, reasons, since } = this.judge();
+    const box = byId("health");
+    const silent = headline === "No word from hilstar" || this.said === null;
+    if (ok !== this.ok || box.dataset.silent !== String(silent)) {
+      this.ok = ok;
+      box.dataset.ok = String(ok);
+      box.dataset.silent = String(silent);
+      document.body.dataset.ok = String(ok);
+      document.body.dataset.silent = String(silent);
+      write(byId("health-icon"), SIGNS[ok]);
+      this.onChange(ok);
+    }
+    write(byId("health-headline"), headline);
+    write(byId("health-reasons"), ok ? "attitude fresh, frames on time" : reasons);
+    write(byId("health-since"), Number.isFinite(since) && since !== null ? `since ${clock(since)} UTC` : "");
+    write(byId("health-for"), Number.isFinite(since) && since !== null ? duration((this.nowMs - since) / 1000) : "");
+    const title = `${ok ? "\u2713" : "\u2717 " + headline + ":"} ${this.bench || "hilstar"}`;
+    if (document.title !== title) document.title = title;
+  }
+}

@@ -1,0 +1,104 @@
+// The numbers beside the picture: attitude, clock, counts, refusals, ledger and events. Names from outside are only ever text.
+
+import { NONE, byId, bytes, clock, count, degreesMinutes, fixed, hours, make, signed, withUnit, write } from "./format.js";
+
+const MAX_EVENTS = 200;
+
+// Rows of names and values that are made once and then only written into.
+export class Rows {
+  constructor(list) {
+    this.list = list;
+    this.values = new Map();
+  }
+
+  set(name, text, state = "") {
+    if (!this.values.has(name)) {
+      const value = make("dd", "figure");
+      this.list.append(make("dt", "", name), value);
+      this.values.set(name, value);
+    }
+    const value = this.values.get(name);
+    write(value, text);
+    if (value.dataset.state !== state) value.dataset.state = state;
+  }
+}
+
+export function writeAttitude(attitude, rows) {
+  const known = attitude !== null;
+  write(byId("ra"), known ? `${fixed(attitude.ra_deg, 4)}\u00b0` : NONE);
+  write(byId("dec"), known ? `${signed(attitude.dec_deg, 4)}\u00b0` : NONE);
+  write(byId("roll"), known ? `${fixed(((attitude.roll_deg % 360) + 360) % 360, 4)}\u00b0` : NONE);
+  write(byId("ra-hms"), known ? hours(attitude.ra_deg) : "");
+  write(byId("dec-dms"), known ? degreesMinutes(attitude.dec_deg) : "");
+  const rate = known ? attitude.rate_deg_s : null;
+  write(byId("rate"), rate ? `${fixed(Math.hypot(...rate), 3)}\u00a0\u00b0/s` : "");
+  rows.set("Rate x, y, z", rate ? `${rate.map((part) => signed(part, 3)).join("  ")}\u00a0\u00b0/s` : NONE);
+  rows.set("Quaternion", known ? attitude.q.map((part) => signed(part, 5)).join("  ") : NONE);
+}
+
+export function writeSource(state, rows) {
+  const { attitude, source, clock: sender } = state;
+  rows.set("Age at light", attitude ? withUnit(attitude.age_ms, "ms", 1) : NONE);
+  rows.set("Source", source ? [source.kind, source.endpoint].filter(Boolean).join("  ") : NONE);
+  rows.set("Clock offset", sender ? `${withUnit(sender.offset_ms, "ms", 3)} \u00b1 ${fixed(sender.sigma_ms, 3)}` : NONE);
+  rows.set("Clock drift", sender ? withUnit(sender.drift_ppm, "ppm", 2) : NONE);
+  rows.set("Clock from", sender ? (sender.synchronised ? "time exchange" : "arrivals (excludes the minimum delay)") : NONE);
+}
+
+export function writeRun({ frame, counts, pacing, ledger }, rows) {
+  const seen = (value) => (value ? "warn" : "");
+  rows.set("Frames", count(counts.frames));
+  rows.set("Missed", count(counts.missed), seen(counts.missed));
+  rows.set("Stale", count(counts.stale), seen(counts.stale));
+  rows.set("Given up", count(counts.given_up), seen(counts.given_up));
+  rows.set("Packets", `${count(counts.accepted)} of ${count(counts.received)} accepted`);
+  rows.set("Interval p50, p99", pacing ? `${fixed(pacing.p50_ms, 2)}, ${withUnit(pacing.p99_ms, "ms", 2)}` : NONE);
+  rows.set("Jitter (sd)", pacing ? withUnit(pacing.sd_ms, "ms", 3) : NONE);
+  rows.set("Stars drawn", count(frame.stars));
+  const clipped = frame.clipped || [];
+  rows.set("Clipped", clipped.length ? `${clipped.length}: ${clipped.slice(0, 4).join(", ")}${clipped.length > 4 ? ", \u2026" : ""}` : "none", clipped.length ? "warn" : "");
+  if (ledger === null) rows.set("Ledger", "not written", "warn");
+  else rows.set("Ledger", ledger.failing ? `FAILING: ${ledger.failing}` : `${ledger.path}  ${bytes(ledger.bytes)}`, ledger.failing ? "bad" : "");
+}
+
+// A bar for each reason, as long as its share of all refusals.
+export function writeRefusals(refused) {
+  const list = byId("refusals");
+  const reasons = Object.entries(refused || {}).sort((a, b) => b[1] - a[1]);
+  const key = JSON.stringify(reasons);
+  if (list.dataset.key === key) return;
+  list.dataset.key = key;
+  const total = reasons.reduce((sum, [, n]) => sum + n, 0);
+  write(byId("refused-total"), total ? count(total) : "");
+  if (!total) {
+    list.replaceChildren(make("li", "none", "none"));
+    return;
+  }
+  list.replaceChildren(
+    ...reasons.map(([reason, n]) => {
+      const row = make("li");
+      const bar = make("span", "bar");
+      bar.style.width = `${Math.max((100 * n) / total, 1)}%`;
+      row.append(make("span", "reason", reason), make("span", "figure", count(n)), bar);
+      return row;
+    }),
+  );
+}
+
+export function addEvent({ utc, kind, line }, onPick = null) {
+  const list = byId("events");
+  const row = make("li", "", "");
+  const time = make("time", "figure", utc.length > 12 ? clock(utc) : utc);
+  row.append(time, make("span", "chip", kind), make("span", "words", line));
+  row.dataset.kind = kind;
+  if (onPick) {
+    row.classList.add("pick");
+    row.tabIndex = 0;
+    row.setAttribute("role", "button");
+    row.addEventListener("click", onPick);
+    row.addEventListener("keydown", (event) => event.key === "Enter" && onPick());
+  }
+  list.prepend(row);
+  while (list.childElementCount > MAX_EVENTS) list.lastElementChild.remove();
+  write(byId("events-count"), `${list.childElementCount}`);
+}

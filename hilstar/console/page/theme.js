@@ -1,0 +1,52 @@
+// Light and dark: as the system says, or as chosen; and the colours that canvases need, read from the style sheet.
+
+import { byId } from "./format.js";
+
+const KEY = "hilstar.theme";
+const ORDER = ["auto", "light", "dark"];
+const WORDS = { auto: "Auto", light: "Light", dark: "Dark" };
+const INKS = {
+  muted: "--muted", accent: "--accent", bad: "--bad", warn: "--warn", ok: "--ok", gridLine: "--line", axis: "--edge", one: "--series-1", two: "--series-2",
+  skyGround: "--sky-ground", skyLine: "--sky-line", skyText: "--sky-text", star: "--sky-star", galaxy: "--sky-galaxy", ecliptic: "--sky-ecliptic",
+  field: "--sky-field", fieldFill: "--sky-fill", trail: "--sky-trail", moving: "--sky-moving",
+};
+
+export const ink = { theme: "" };
+
+function stored() {
+  try {
+    return localStorage.getItem(KEY) || "auto";
+  } catch {
+    return "auto";
+  }
+}
+
+export function readInks() {
+  const style = getComputedStyle(document.documentElement);
+  for (const [name, property] of Object.entries(INKS)) ink[name] = style.getPropertyValue(property).trim();
+  ink.theme = document.documentElement.dataset.theme;
+}
+
+export function startTheme(onChange) {
+  const button = byId("theme");
+  let chosen = stored();
+  const dark = matchMedia("(prefers-color-scheme: dark)");
+  const apply = () => {
+    document.documentElement.dataset.theme = chosen === "auto" ? (dark.matches ? "dark" : "light") : chosen;
+    button.textContent = WORDS[chosen];
+    button.setAttribute("aria-label", `Colours: ${WORDS[chosen]}`);
+    readInks();
+    onChange();
+  };
+  button.addEventListener("click", () => {
+    chosen = ORDER[(ORDER.indexOf(chosen) + 1) % ORDER.length];
+    try {
+      localStorage.setItem(KEY, chosen);
+    } catch {
+      // Without storage the choice lasts as long as the page.
+    }
+    apply();
+  });
+  dark.addEventListener("change", apply);
+  apply();
+}

@@ -16,9 +16,11 @@ import numpy as np
 
 from hilstar.arrays import FloatArray
 from hilstar.errors import InputError
+from hilstar.sky.astrometry import aberrate
 from hilstar.sky.bodies.apparent import Viewpoint, apparent_bodies, apparent_stars
+from hilstar.sky.bodies.disc import Disc, Law, lunar_share
 from hilstar.sky.bodies.kernel import DAY_S, Kernel, tdb_of_utc
-from hilstar.sky.bodies.magnitudes import body_v_mag
+from hilstar.sky.bodies.magnitudes import body_v_mag, phase_angle_deg
 from hilstar.sky.bodies.orbit import Orbit
 from hilstar.sky.stars import Stars, with_bodies
 from hilstar.units import ARCSEC_PER_RAD, LIGHT_KM_S, NS_PER_S, flux_ratio
@@ -38,6 +40,16 @@ RADII_KM = {
     "Uranus": 25_559.0,
     "Neptune": 24_764.0,
 }
+# Polar, and poles (right ascension and declination, degrees), of those that are flat enough to see: the same source
+POLAR_KM = {"Jupiter": 66_854.0, "Saturn": 54_364.0, "Uranus": 24_973.0, "Neptune": 24_341.0}
+POLES_DEG = {
+    "Jupiter": (268.057, 64.495),
+    "Saturn": (40.589, 83.537),
+    "Uranus": (257.311, -15.175),
+    "Neptune": (299.36, 43.46),
+}
+LAWS: dict[str, Law] = {"Sun": "limb-darkened", "Moon": "lunar-lambert"}  # planets: lambert
+NORTH = np.array([0.0, 0.0, 1.0])
 # The ephemeris takes 3 ms for all bodies at the ends of this time and twice between; cubics through them are within 0.1 mas.
 SPAN_S = 3 * 3600
 SPAN_NS, MINUTE_NS = SPAN_S * NS_PER_S, 60 * NS_PER_S
@@ -97,10 +109,12 @@ class MovingSky:
         self._epoch = tdb_of_utc(self._utc_ns)
         self._tracked = ("Sun", *(name for name in names if name != "Sun"))
         self._drawn = [self._tracked.index(name) for name in names]
+        self._radii_km = np.array([RADII_KM[name] for name in names])
         self._limits_ns = self._limits()
         self._step_ns = round(orbit.step_s * NS_PER_S)
         self._span: Callable[[int], Span] = lru_cache(maxsize=2)(self._compute_span)
         self._node: Callable[[int], FloatArray] = lru_cache(maxsize=2)(self._compute_node)
+        self._faces: Callable[[int], dict[str, Disc]] = lru_cache(maxsize=1)(self._compute_faces)
         self._light: Callable[[int], tuple[FloatArray, FloatArray]] = lru_cache(maxsize=1)(self._compute_light)
         self._told = False
         self._fixed_km_s = self._seen_from(0)[1].velocity_km_s
@@ -121,17 +135,51 @@ class MovingSky:
         A velocity (3,), ICRS, adds to that of this sky's observer.
         """
         since_ns = self._within(t_ns)
-        k, rest_ns = divmod(since_ns, self._step_ns)
-        node = self._node(k)
-        now = node + (self._node(k + 1) - node) * (rest_ns / self._step_ns)
+        now = self._at(since_ns)
         count = len(self.names)
         if count:
-            stars.vectors[-count:] = now[:-1]
-            stars.grid.centre[-count:] = now[:-1]
+            stars.vectors[-count:] = now[:count, :3]
+            stars.grid.centre[-count:] = now[:count, :3]
             stars.v_mag[-count:], stars.electrons_per_s[-count:] = self._light(since_ns // MINUTE_NS)
-        if velocity_km_s is None and now[-1] @ now[-1] < UNSEEN_KM_S**2:
-            return stars
-        return stars.seen_at(now[-1] if velocity_km_s is None else now[-1] + velocity_km_s)
+        return stars.seen_at(_against_start(now, velocity_km_s))
+
+    def discs(
+        self,
+        axis: FloatArray,
+        reach_rad: float,
+        wider_than_rad: float = 0.0,
+        t_ns: int | None = None,
+        velocity_km_s: FloatArray | None = None,
+    ) -> list[Disc]:
+        """The bodies wider than that, any part of which is within `reach_rad` of `axis` (3,), nearest first; else as `seen`.
+
+        Places and sizes are the moment's, light and the Sun's direction the minute's.
+        """
+        if not self.names:
+            return []
+        since_ns = self._within(t_ns)
+        now = self._at(since_ns)
+        radius_rad = now[:-1, 4]
+        near = now[:-1, :3] @ axis > np.cos(np.minimum(reach_rad + radius_rad, np.pi))
+        near &= 2 * radius_rad > wider_than_rad
+        if not near.any():
+            return []
+        directions, velocity = now[:-1][near, :3], _against_start(now, velocity_km_s)
+        if velocity is not None:
+            directions = aberrate(directions, velocity)
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        faces = self._faces(since_ns // MINUTE_NS)
+        found = [
+            _moved(faces[self.names[i]], direction, float(now[i, 3]))
+            for i, direction in zip(np.flatnonzero(near), directions, strict=True)
+        ]
+        return sorted(found, key=lambda disc: disc.distance_km)
+
+    def _at(self, since_ns: int) -> FloatArray:
+        """A node's rows (see `_compute_node`) at any moment."""
+        k, rest_ns = divmod(since_ns, self._step_ns)
+        node = self._node(k)
+        return node + (self._node(k + 1) - node) * (rest_ns / self._step_ns)
 
     def sight(self, since_ns: int) -> Sight:
         """What is seen at a moment, the directions aberrated by the observer's velocity at the start; Sun first."""
@@ -167,9 +215,35 @@ class MovingSky:
         return Span(np.tensordot(CUBIC, np.stack(seen_km, axis=1), 1), CUBIC @ earth_km, CUBIC @ earth_km_s)
 
     def _compute_node(self, k: int) -> FloatArray:
-        """Unit vectors of the bodies, and last the change of the observer's velocity since the start, km/s."""
+        """Rows of the bodies' unit vectors, distances, km, and radii, rad; last the observer's change of velocity since the start."""
         sight = self.sight(k * self._step_ns)
-        return np.vstack([sight.directions[self._drawn], sight.view.velocity_km_s - self._fixed_km_s])
+        node = np.zeros((len(self.names) + 1, 5))
+        node[:-1, :3] = sight.directions[self._drawn]
+        node[:-1, 3] = distance_km = np.linalg.norm(sight.seen_km[self._drawn], axis=1)
+        node[:-1, 4] = np.arcsin(np.minimum(1.0, self._radii_km / distance_km))
+        node[-1, :3] = sight.view.velocity_km_s - self._fixed_km_s
+        return node
+
+    def _compute_faces(self, minute: int) -> dict[str, Disc]:
+        """Each body's disc at a minute, with its light."""
+        sight, rates = self.sight(minute * MINUTE_NS), self._light(minute)[1]
+        faces = {}
+        for i, name, rate in zip(self._drawn, self.names, rates, strict=True):
+            seen_km, sun_km = sight.seen_km[i], sight.seen_km[0] - sight.seen_km[i]
+            phase_deg = 0.0 if name == "Sun" else phase_angle_deg(-sun_km, seen_km)
+            disc = Disc(
+                name=name,
+                direction=sight.directions[i],
+                distance_km=float(np.linalg.norm(seen_km)),
+                equator_km=RADII_KM[name],
+                polar_km=POLAR_KM.get(name, RADII_KM[name]),
+                pole=_pole(name),
+                sun=NORTH if name == "Sun" else sun_km / np.linalg.norm(sun_km),
+                law=LAWS.get(name, "lambert"),
+                lunar_share=lunar_share(phase_deg) if name == "Moon" else 1.0,
+            )
+            faces[name] = disc.of_rate(float(rate))
+        return faces
 
     def _compute_light(self, minute: int) -> tuple[FloatArray, FloatArray]:
         sight, jyear = self.sight(minute * MINUTE_NS), self._jyear(minute * 60.0)
@@ -202,3 +276,23 @@ class MovingSky:
                 since_ns / YEAR_NS,
             )
         return min(max(since_ns, self._limits_ns[0]), self._limits_ns[1])
+
+
+def _against_start(now: FloatArray, velocity_km_s: FloatArray | None) -> FloatArray | None:
+    """The observer's velocity (3,) by which directions of the start are aberrated; None where that is not seen."""
+    change = now[-1, :3]
+    if velocity_km_s is not None:
+        return np.asarray(change + velocity_km_s)
+    return None if change @ change < UNSEEN_KM_S**2 else change
+
+
+def _moved(face: Disc, direction: FloatArray, distance_km: float) -> Disc:
+    """A disc elsewhere: its radiance does not depend on its distance."""
+    return replace(face, direction=direction, distance_km=distance_km)
+
+
+def _pole(name: str) -> FloatArray:
+    if name not in POLES_DEG:
+        return NORTH
+    ra, dec = np.radians(POLES_DEG[name])
+    return np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])

@@ -1,0 +1,178 @@
+"""A body wide enough to have a face: where its disc is seen, how bright each place of it is, and what it hides.
+
+All is computed in the axes that make the body's spheroid a unit sphere, where limb and terminator are circles; a true distance
+counts, so that a near Earth is the cap that it is. Laws give radiance relative to `normal_e_per_s_sr`:
+
+- `lambert`: mu0, the cosine of the Sun's angle from the place's normal;
+- `lunar-lambert`: 2 l mu0 / (mu0 + mu) + (1 - l) mu0, mu the observer's (McEwen 1991, Icarus 92, 298), l = `lunar_share`;
+- `limb-darkened`: 0.30 + 0.93 mu - 0.23 mu^2, sunlight at 550 nm (Cox 2000, Allen's Astrophysical Quantities, 14.7);
+- `uniform`: 1.
+
+The law gives a disc its shape, the body's magnitude its sum: `of_rate` scales the one to the other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+
+from hilstar.arrays import FloatArray
+
+Law = Literal["uniform", "lambert", "lunar-lambert", "limb-darkened"]
+SOLAR_LIMB = (0.30, 0.93, -0.23)
+# Of the Moon by phase, degrees: McEwen 1996, Lunar Planet. Sci. 27, 841; within 0 and 1 beyond where it was fitted.
+LUNAR_SHARE = (1.0, -0.019, 2.42e-4, -1.46e-6)
+QUADRATURE = 40  # Gauss-Legendre nodes along each axis of the lit face: 1e-5 of the flux, tests/unit/sky/bodies/test_disc.py
+AIR_TOP = 10.0  # scale heights over the limb: beyond, the Earth's air is 3e-4 deep along the ray
+
+
+@dataclass(frozen=True, slots=True)
+class Air:
+    """An exponential atmosphere: its scale height, and its vertical optical depth from the limb's surface up."""
+
+    scale_km: float
+    depth: float
+
+
+@dataclass(frozen=True, eq=False)
+class Disc:
+    """A body's disc as seen: `direction` (3,) to its centre and `pole`, unit vectors, ICRS axes; `sun`, from it to the Sun.
+
+    `equator_km` and `polar_km` are the spheroid's radii, `normal_e_per_s_sr` the radiance where the law's function is 1.
+    """
+
+    name: str
+    direction: FloatArray
+    distance_km: float
+    equator_km: float
+    polar_km: float
+    pole: FloatArray
+    sun: FloatArray
+    law: Law
+    normal_e_per_s_sr: float = 1.0
+    lunar_share: float = 1.0
+    air: Air | None = None
+
+    @cached_property
+    def to_sphere(self) -> FloatArray:
+        """The map (3, 3) of ICRS vectors to axes in which the body is a unit sphere on +z, in equatorial radii."""
+        squash = np.eye(3) + (self.equator_km / self.polar_km - 1) * np.outer(self.pole, self.pole)
+        towards = squash @ self.direction
+        z = towards / np.linalg.norm(towards)
+        sun = squash @ self.sun
+        # The Sun to the right; any direction where it stands before or behind.
+        side = sun - (sun @ z) * z
+        if side @ side < 1e-12 * (sun @ sun):
+            side = np.cross(z, np.eye(3)[np.argmin(np.abs(z))])
+        x = side / np.linalg.norm(side)
+        return np.asarray(np.stack([x, np.cross(z, x), z]) @ squash)
+
+    @cached_property
+    def distance_radii(self) -> float:
+        """The distance of the centre in the axes of `to_sphere`."""
+        return float(np.linalg.norm(self.to_sphere @ self.direction)) * self.distance_km / self.equator_km
+
+    @cached_property
+    def sun_sphere(self) -> FloatArray:
+        """What a place of the sphere (3,) is multiplied by for the cosine of the Sun's angle, times its normal's length."""
+        return np.asarray(self.to_sphere @ self.sun)
+
+    @property
+    def radius_rad(self) -> float:
+        """The largest angle from the centre to the limb."""
+        return float(np.arcsin(min(1.0, max(self.equator_km, self.polar_km) / self.distance_km)))
+
+    @property
+    def air_radii(self) -> float:
+        """The air's scale height in equatorial radii, 0 without air."""
+        return 0.0 if self.air is None else self.air.scale_km / self.equator_km
+
+    @property
+    def slant_depth(self) -> float:
+        """The optical depth along a ray that touches the surface, 0 without air (Chapman's limit)."""
+        return 0.0 if self.air is None else self.air.depth * float(np.sqrt(2 * np.pi / self.air_radii))
+
+    def of_rate(self, electrons_per_s: float) -> Disc:
+        """The same disc with this flux in all; black where nothing of it is lit."""
+        whole_sr = self.law_integral_sr()
+        return replace(self, normal_e_per_s_sr=electrons_per_s / whole_sr if whole_sr > 0 else 0.0)
+
+    def transmission(self, directions: FloatArray) -> FloatArray:
+        """The share of light from behind the body in ICRS directions (n, 3): 0 on its disc, less than 1 through its air."""
+        height = (self._impact(directions @ self.to_sphere.T) - 1) / (self.air_radii or 1.0)
+        through = np.exp(-self.slant_depth * np.exp(-np.maximum(height, 0.0)))
+        return np.where(height < 0, 0.0, through)
+
+    def _impact(self, seen: FloatArray) -> FloatArray:
+        """How close rays (n, 3), `to_sphere` axes, pass the centre, radii; infinite for those that lead away."""
+        across = np.hypot(seen[:, 0], seen[:, 1])
+        return np.where(seen[:, 2] > 0, self.distance_radii * across / np.linalg.norm(seen, axis=1), np.inf)
+
+    def radiance(self, directions: FloatArray) -> FloatArray:
+        """Electrons per second and steradian of the solid disc in ICRS directions (n, 3); 0 beside it."""
+        rays = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+        seen = rays @ self.to_sphere.T
+        on = np.flatnonzero(self._impact(seen) < 1)
+        ray = seen[on] / np.linalg.norm(seen[on], axis=1, keepdims=True)
+        squared = ray[:, 0] ** 2 + ray[:, 1] ** 2
+        closest = self.distance_radii * np.column_stack((ray[:, :2] * ray[:, 2:], -squared))
+        place = closest - np.sqrt(np.maximum(0.0, 1 - self.distance_radii**2 * squared))[:, None] * ray
+        light = np.zeros(len(directions))
+        light[on] = self.normal_e_per_s_sr * self._shaded(place, seen[on])
+        return light
+
+    def _shaded(self, place: FloatArray, seen: FloatArray) -> FloatArray:
+        """The law at places of the sphere (n, 3), along `seen` (n, 3): unit rays, but in the sphere's axes."""
+        length = np.linalg.norm(place @ self.to_sphere, axis=1)
+        mu0 = np.maximum(0.0, place @ self.sun_sphere / length)
+        mu = np.maximum(0.0, -np.einsum("ij,ij->i", place, seen) / length)
+        if self.law == "uniform":
+            return np.ones(len(place))
+        if self.law == "limb-darkened":
+            a, b, c = SOLAR_LIMB
+            return a + mu * (b + mu * c)
+        if self.law == "lambert":
+            return mu0
+        lunar = np.divide(2 * mu0, mu0 + mu, out=np.zeros_like(mu), where=mu0 > 0)
+        return self.lunar_share * lunar + (1 - self.lunar_share) * mu0
+
+    def law_integral_sr(self) -> float:
+        """The law's function over the seen disc, steradian."""
+        place, area = self._lit_face()
+        # From the sphere's axes to space; the distance of each place along its ray.
+        back = np.linalg.inv(self.to_sphere)
+        seen = place + np.array([0.0, 0.0, self.distance_radii])
+        true = seen @ back.T
+        distance = np.linalg.norm(true, axis=1)
+        shaded = self._shaded(place, seen / distance[:, None])
+        facing = -np.einsum("ij,ij->i", place, seen) * abs(np.linalg.det(back))
+        return float((shaded * facing * area / distance**3).sum())
+
+    def _lit_face(self) -> tuple[FloatArray, FloatArray]:
+        """Places (n, 3) of the sphere that are seen and lit, and the area that each stands for (n,).
+
+        A place has a longitude from the observer's meridian towards the Sun, and a latitude from the plane of both.
+        """
+        node, weight = np.polynomial.legendre.leggauss(QUADRATURE)
+        top = np.arccos(1 / self.distance_radii)
+        # The limb ends latitudes as a square root does: evenly in an angle it is smooth.
+        latitude, stretch = top * np.sin(node * np.pi / 2), top * np.cos(node * np.pi / 2) * np.pi / 2
+        reach = np.arccos(np.minimum(1.0, 1 / (self.distance_radii * np.cos(latitude))))
+        first = -reach
+        if self.law in ("lambert", "lunar-lambert"):
+            sun = np.arctan2(self.sun_sphere[0], -self.sun_sphere[2])  # of longitude; x is the Sun's side, -z the observer's
+            first = np.clip(sun - np.pi / 2, -reach, reach)
+        half = (reach - first) / 2
+        longitude = first[:, None] + half[:, None] * (node + 1)
+        area = (weight * stretch * np.cos(latitude) * half)[:, None] * weight
+        cosine, sine = np.cos(latitude)[:, None], np.broadcast_to(np.sin(latitude)[:, None], longitude.shape)
+        place = np.stack([cosine * np.sin(longitude), sine, -cosine * np.cos(longitude)], axis=-1)
+        return place.reshape(-1, 3), area.ravel()
+
+
+def lunar_share(phase_deg: float) -> float:
+    """The Moon's share of Lommel-Seeliger's law at a phase angle."""
+    return float(np.clip(np.polynomial.polynomial.polyval(phase_deg, LUNAR_SHARE), 0.0, 1.0))

@@ -1,0 +1,88 @@
+"""A body's face: its light by rays of another's making, its sum by closed forms, and where a sky has it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hilstar.sky.bodies.disc import Air, Disc
+from tests.support.ray_traced.bodies import Body, lambert, lunar_lambert, traced
+from tests.support.skies import moving_sky
+
+UTC = "2026-11-21T00:00:00Z"
+FAR = 1e6  # radii: a closed form of a far sphere is off by the angle of one, which at 178 degrees is 3e-5 of a crescent
+CLOSED_LIMIT = 1e-4  # the quadrature itself: measured 3e-5
+MEAN_LIMIT = 5e-3  # three sigma of the mean over RAYS random ones
+RAYS = 100_000
+AIR_LIMIT = 0.02  # of the air's transmission: heights above a stretched sphere, not above the spheroid
+
+
+def disc(phase_deg: float, distance: float, law="lambert", share=1.0, polar=1.0, air=None) -> Disc:
+    """A body of one unit's radius, off every axis, with the Sun to its side."""
+    towards = np.array([0.3, 0.5, 0.8]) / np.linalg.norm([0.3, 0.5, 0.8])
+    side = np.cross(towards, [0.0, 0.0, 1.0])
+    side /= np.linalg.norm(side)
+    sun = -np.cos(np.radians(phase_deg)) * towards + np.sin(np.radians(phase_deg)) * side
+    return Disc("x", towards, distance, 1.0, polar, np.array([0.6, 0.0, 0.8]), sun, law, 1.0, share, air)
+
+
+def rays_about(one: Disc, rng, count=RAYS) -> tuple[np.ndarray, float]:
+    """Directions (n, 3) evenly over a cap that holds the disc, and its solid angle."""
+    reach = min(1.1 * one.radius_rad, np.pi / 2)
+    cosine, turn = 1 - rng.random(count) * (1 - np.cos(reach)), rng.random(count) * 2 * np.pi
+    first = np.cross(one.direction, [1.0, 0.0, 0.0])
+    first /= np.linalg.norm(first)
+    across = np.cos(turn)[:, None] * first + np.sin(turn)[:, None] * np.cross(one.direction, first)
+    return cosine[:, None] * one.direction + np.sqrt(1 - cosine**2)[:, None] * across, 2 * np.pi * (1 - np.cos(reach))
+
+
+@pytest.mark.parametrize("phase_deg", [0.0, 40.0, 90.0, 140.0, 170.0, 178.0])
+def test_a_far_sphere_s_whole_light_is_that_of_the_closed_forms(phase_deg):
+    phase, whole_sr = np.radians(phase_deg), np.pi / FAR**2
+    lambertian = 2 / 3 * (np.sin(phase) + (np.pi - phase) * np.cos(phase)) / np.pi
+    half = phase / 2
+    lunar = 1 - np.sin(half) * np.tan(half) * np.log(1 / np.tan(half / 2)) if phase else 1.0
+    assert disc(phase_deg, FAR).law_integral_sr() == pytest.approx(whole_sr * lambertian, rel=CLOSED_LIMIT)
+    assert disc(phase_deg, FAR, "lunar-lambert").law_integral_sr() == pytest.approx(whole_sr * lunar, rel=CLOSED_LIMIT)
+    assert disc(phase_deg, FAR, "uniform").law_integral_sr() == pytest.approx(whole_sr, rel=CLOSED_LIMIT)
+    # 0.30 + 0.93 mu - 0.23 mu^2 over a disc: the mean of mu is 2/3 there, that of its square 1/2.
+    limb = 0.30 + 0.93 * 2 / 3 - 0.23 / 2
+    assert disc(phase_deg, FAR, "limb-darkened").law_integral_sr() == pytest.approx(whole_sr * limb, rel=CLOSED_LIMIT)
+
+
+@pytest.mark.parametrize(("distance", "polar"), [(1.08, 1.0), (3.0, 0.9), (200.0, 0.95)])
+@pytest.mark.parametrize(("law", "share"), [("lambert", 1.0), ("lunar-lambert", 0.4)])
+def test_each_ray_has_the_light_of_a_traced_one_and_all_have_the_integral(distance, polar, law, share, rng):
+    one = disc(75.0, distance, law, share, polar)
+    rays, whole_sr = rays_about(one, rng)
+    body = Body(distance * one.direction, 1.0, polar, one.pole, one.sun, lambert if law == "lambert" else lunar_lambert(share))
+    found = one.radiance(rays)
+    truth, through = traced(body, rays)
+    # A ray at the limb may be on either side.
+    assert np.mean(np.abs(found - truth) > 1e-6) < 1e-4
+    assert np.mean((one.transmission(rays) == 0) != (through == 0)) < 1e-4
+    assert found.mean() * whole_sr == pytest.approx(one.law_integral_sr(), rel=MEAN_LIMIT * 2)
+    assert one.of_rate(5e6).radiance(rays).mean() * whole_sr == pytest.approx(5e6, rel=MEAN_LIMIT * 2)
+
+
+def test_air_dims_what_is_behind_it_as_traced_rays_say(rng):
+    earth = Air(8.0 / 6378.0, 0.097)
+    one = disc(60.0, 1.1, polar=6356.75 / 6378.14, air=earth)
+    body = Body(1.1 * one.direction * 6378.0, 6378.0, 6378.0 * one.polar_km, one.pole, one.sun, lambert, 1.0, (8.0, 0.097))
+    rays, _ = rays_about(one, rng, 20_000)
+    _, through = traced(body, rays)
+    found = one.transmission(rays)
+    assert np.abs(found - through)[(through > 0) & (found > 0)].max() < AIR_LIMIT
+    assert np.count_nonzero((found > 0.05) & (found < 0.9)) > 20  # the shell is among the rays
+
+
+def test_a_sky_s_discs_are_those_in_reach_nearest_first_with_their_rate():
+    moving = moving_sky(UTC)
+    found = moving.discs(np.array([1.0, 0.0, 0.0]), np.pi)
+    assert [one.name for one in found] == ["Moon", "Venus", "Sun", "Mercury", "Mars", "Jupiter", "Saturn", "Uranus", "Neptune"]
+    moon, sun = found[0], found[2]
+    assert 2 * np.degrees(sun.radius_rad) == pytest.approx(0.5394, abs=1e-3)  # 1942 arcsec at 0.988 au
+    assert not moving.discs(-moon.direction, 0.1, 0.1)
+    assert [one.name for one in moving.discs(moon.direction, 1e-3, np.radians(0.1))] == ["Moon"]
+    # Ten days before full: what is lit is the Sun's side.
+    assert moon.radiance((moon.direction + 0.003 * (sun.direction - moon.direction))[None])[0] > 0

@@ -127,17 +127,17 @@ class Disc:
     def _shaded(self, place: FloatArray, seen: FloatArray) -> FloatArray:
         """The law at places of the sphere (n, 3), along `seen` (n, 3): unit rays, but in the sphere's axes."""
         length = np.linalg.norm(place @ self.to_sphere, axis=1)
-        mu0 = np.maximum(0.0, place @ self.sun_sphere / length)
-        mu = np.maximum(0.0, -np.einsum("ij,ij->i", place, seen) / length)
+        mu0: FloatArray = np.maximum(0.0, place @ self.sun_sphere / length)
+        mu: FloatArray = np.maximum(0.0, -np.einsum("ij,ij->i", place, seen) / length)
         if self.law == "uniform":
             return np.ones(len(place))
         if self.law == "limb-darkened":
             a, b, c = SOLAR_LIMB
-            return a + mu * (b + mu * c)
+            return np.asarray(a + mu * (b + mu * c))
         if self.law == "lambert":
             return mu0
         lunar = np.divide(2 * mu0, mu0 + mu, out=np.zeros_like(mu), where=mu0 > 0)
-        return self.lunar_share * lunar + (1 - self.lunar_share) * mu0
+        return np.asarray(self.lunar_share * lunar + (1 - self.lunar_share) * mu0)
 
     def law_integral_sr(self) -> float:
         """The law's function over the seen disc, steradian."""

@@ -215,7 +215,7 @@ class MovingSky:
         return Span(np.tensordot(CUBIC, np.stack(seen_km, axis=1), 1), CUBIC @ earth_km, CUBIC @ earth_km_s)
 
     def _compute_node(self, k: int) -> FloatArray:
-        """Rows of the bodies' unit vectors, distances, km, and radii, rad; last the observer's change of velocity since the start."""
+        """Rows of the bodies' unit vectors, distances, km, and radii, rad; last the change of the observer's velocity."""
         sight = self.sight(k * self._step_ns)
         node = np.zeros((len(self.names) + 1, 5))
         node[:-1, :3] = sight.directions[self._drawn]

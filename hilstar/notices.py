@@ -21,11 +21,12 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Notice:
-    """One event of a run: when (host time, ns), of what kind (a word such as "stale"), and a line for a person."""
+    """One event of a run: when (host time, ns), of what kind (a word such as "stale"), a line for a person, who caused it."""
 
     host_ns: int
     kind: str
     detail: str
+    who: str = ""
 
 
 def at_now(line: str) -> str:
@@ -50,9 +51,9 @@ class Notices:
         """Hand every further event to `listener` too."""
         self._listeners.append(listener)
 
-    def tell(self, kind: str, detail: str) -> None:
-        """Count an event, say it unless its kind floods, and hand it on."""
-        notice = Notice(time.monotonic_ns(), kind, detail[:MAX_DETAIL_CHARACTERS])
+    def tell(self, kind: str, detail: str, who: str = "") -> None:
+        """Count an event, say it unless its kind floods, and hand it on; `who` is the person that it comes from, if one."""
+        notice = Notice(time.monotonic_ns(), kind, detail[:MAX_DETAIL_CHARACTERS], who)
         with self._lock:
             self._counts[kind] += 1
             said_ns = self._said_ns.setdefault(kind, deque(maxlen=MAX_SAID))

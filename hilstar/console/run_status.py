@@ -23,8 +23,8 @@ from hilstar.units import NS_PER_MS, NS_PER_S
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from hilstar.attitude.receiver import PacketCounts
     from hilstar.run.record.ledger import Ledger
+    from hilstar.run.serve import Running
     from hilstar.run.shown import Shown
     from hilstar.run.summary import RunTally
 
@@ -59,12 +59,12 @@ class RunStatus:
         self._ledger = ledger
         self._begun_ns = time.monotonic_ns()
         self._shown: Shown | None = None
-        self._counters: tuple[RunTally, PacketCounts] | None = None
+        self._running: Running | None = None
         self._before = (self._begun_ns, 0, 0)  # when the lines were last made: host time, frames, packets
 
-    def count(self, tally: RunTally, packets: PacketCounts) -> None:
-        """Take the run's counters, which it goes on counting in."""
-        self._counters = (tally, packets)
+    def follow(self, running: Running) -> None:
+        """Take the run, which goes on counting."""
+        self._running = running
 
     def see(self, shown: Shown) -> None:
         """Take the newest frame; costs the frame loop one assignment."""
@@ -72,10 +72,10 @@ class RunStatus:
 
     def lines(self, now_ns: int) -> list[Line]:
         """The status at a host time; rates are since it was last asked for."""
-        shown, counters = self._shown, self._counters
-        if shown is None or counters is None:
+        shown, running = self._shown, self._running
+        if shown is None or running is None:
             return [Line("frames", "none yet"), *self._about()]
-        tally, packets = counters
+        tally, packets = running.tally, running.packets
         then_ns, frames, received = self._before
         self._before = (now_ns, tally.frames, packets.received)
         seconds = max(now_ns - then_ns, 1) / NS_PER_S

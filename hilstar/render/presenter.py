@@ -13,8 +13,6 @@ from hilstar.errors import MachineError
 from hilstar.monitor.window.x11 import GL_LIBRARY, X11_LIBRARY
 from hilstar.render.encoder import TABLE_WIDTH, build_program
 
-CROSSHAIR, GRID, BLANK, PATCH = 1, 2, 4, 8
-
 
 @dataclass(frozen=True, slots=True)
 class Orientation:

@@ -158,6 +158,7 @@ class FrameLoop:
     def idle(self) -> None:
         """Keep the window alive while no frame is due."""
         self._presence.see(None, True)
+        self.watch.idle()
         self.pacer.idle()
 
     def screen_summary(self) -> dict[str, Any] | UnsetType:

@@ -14,6 +14,7 @@ from typing import Any, Protocol
 
 from hilstar.attitude.clock.timeline import Attitude
 from hilstar.bench.frame import Drawn
+from hilstar.monitor.response import Codes
 from hilstar.run.host_clock import HOST_CLOCK, HostClock
 from hilstar.run.shown import HEADLESS, OnScreen
 
@@ -68,6 +69,10 @@ class Operator:
         """The attitude to show at `t_ns` of the timeline."""
         return attitude
 
+    def laid_over(self, levels: Codes) -> Codes:
+        """The levels of a frame that no screen changes, with what lies over them."""
+        return levels
+
     def count(self, shown: OnScreen, swap_ns: int) -> None:
         """Count a frame by how it was shown."""
 
@@ -112,10 +117,10 @@ class ClockPacer:
 
     moves_stars = False
 
-    def __init__(self, period_ns: float, clock: HostClock = HOST_CLOCK) -> None:
+    def __init__(self, period_ns: float, clock: HostClock = HOST_CLOCK, operator: Operator | None = None) -> None:
         self.clock = clock
         self.stop = threading.Event()
-        self.operator = Operator()
+        self.operator = Operator() if operator is None else operator
         self._period_ns = period_ns
 
     def moments(self) -> Iterator[Moment]:
@@ -133,12 +138,13 @@ class ClockPacer:
         return nullcontext()
 
     def show(self, number: int, drawn: Drawn, moment: Moment, begun_ns: int, enter: Callable[[str], None]) -> Presented:
-        """Read the levels back."""
-        _ = drawn.levels
+        """Read the levels back, with what the operator lays over them."""
+        drawn.levels = self.operator.laid_over(drawn.levels)
         return Presented(self.clock.now_ns())
 
     def idle(self) -> None:
-        """Nothing to do without a window."""
+        """Take in what the operator wishes."""
+        self.operator.look()
 
     def summary(self, swaps: dict[str, Any]) -> dict[str, Any]:
         """There is no screen."""

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from msgspec.structs import replace as replaced
 
 from hilstar.attitude.back_channel import Traffic
+from hilstar.attitude.clock.sender_clock import ClockSummary
 from hilstar.attitude.clock.timeline import Timeline
 from hilstar.attitude.receiver import PacketCounts, Receiver, nobody_watches
 from hilstar.attitude.wire.links import StreamLink
@@ -22,6 +23,7 @@ from hilstar.bench.config import AttitudeSettings
 from hilstar.bench.frame import Bench
 from hilstar.notices import Notices
 from hilstar.process.interrupts import stop_on_signal
+from hilstar.run.desk import Desk
 from hilstar.run.frame_status import StatusMaker
 from hilstar.run.lockstep.nasa42 import serve_nasa42
 from hilstar.run.lockstep.packets import serve_lockstep
@@ -29,7 +31,8 @@ from hilstar.run.lockstep.steps import Steps
 from hilstar.run.lockstep.vizard import Cameras, Pictures, serve_vizard
 from hilstar.run.loop import FrameLoop, Limit, policy_of
 from hilstar.run.open_link import AnyLink
-from hilstar.run.pacer import Moment, Pacer
+from hilstar.run.overrides import HeadlessOverrides
+from hilstar.run.pacer import ClockPacer, Moment, Pacer
 from hilstar.run.record.ledger import Ledger
 from hilstar.run.record.ledger_records import below_step, frame_record
 from hilstar.run.replay import Play
@@ -39,36 +42,58 @@ from hilstar.run.shown import FrameSink, Shown, ignore
 from hilstar.run.summary import RunSummary, RunTally
 from hilstar.units import NS_PER_S
 
-# Called once, when a run begins, with the counters that it will count in.
-Counters = Callable[[RunTally, PacketCounts], None]
+
+@dataclass(frozen=True, slots=True)
+class Running:
+    """What a run counts in and is known by while it runs: who follows it may read all of it at any time, from any thread.
+
+    `clock` says how the sender's clock stands; None where a run has no sender.
+    """
+
+    loop: FrameLoop
+    packets: PacketCounts
+    clock: Callable[[], ClockSummary] | None = None
+
+    @property
+    def tally(self) -> RunTally:
+        """The figures of its frames."""
+        return self.loop.tally
 
 
-def nobody_counts(tally: RunTally, packets: PacketCounts) -> None:
-    """The counters of a run that nobody follows."""
+Follower = Callable[[Running], None]  # called once, when a run begins
+
+
+def nobody_follows(running: Running) -> None:
+    """The follower of a run that nobody follows."""
 
 
 @dataclass(frozen=True, slots=True)
 class Outlet:
     """Where frames go besides their sink: onto a screen and into a ledger; where events are reported, and who follows it.
 
-    `pictures` are what a simulation gets that asks for those of its camera.
+    `pictures` are what a simulation gets that asks for those of its camera; `desk` has the wishes of operators who are not at
+    the display.
     """
 
     screen: Screen | None = None
     ledger: Ledger | None = None
     notices: Notices = field(default_factory=Notices)
     pictures: Pictures | None = None
-    counters: Counters = nobody_counts
+    follower: Follower = nobody_follows
+    desk: Desk | None = None
 
-    def pacer(self) -> Pacer | None:
-        """The pacer of the screen; None without one."""
-        return None if self.screen is None else DisplayPacer(self.screen, self.notices)
+    def pacer(self, bench: Bench) -> Pacer:
+        """The pacer of the screen, or without one that of the bench's own rate."""
+        if self.screen is not None:
+            return DisplayPacer(self.screen, self.notices, desk=self.desk)
+        operator = None if self.desk is None else HeadlessOverrides(bench, self.notices, self.desk)
+        return ClockPacer(NS_PER_S / bench.config.monitor.refresh_hz, operator=operator)
 
 
 def serve(bench: Bench, link: AnyLink, limit: Limit, sink: FrameSink = ignore, outlet: Outlet | None = None) -> RunSummary:
     """Show the live stream of `link` up to `limit`, or until a signal; returns the summary."""
     outlet = outlet or Outlet()
-    loop = FrameLoop(bench, sink, outlet.pacer(), notices=outlet.notices)
+    loop = FrameLoop(bench, sink, outlet.pacer(bench), notices=outlet.notices)
     if link.conventions.of_body:
         for kind, line in Mounting(bench.config.tracker.q_body_to_cam).told:
             outlet.notices.tell(kind, line)
@@ -88,7 +113,7 @@ def _serve_lockstep(
 ) -> RunSummary:
     bench.warm_up()
     steps = Steps(bench, limit, loop, outlet.ledger)
-    outlet.counters(loop.tally, steps.counts)
+    outlet.follower(Running(loop, steps.counts))
     if isinstance(link, ZmqLockstep):
         return serve_lockstep(link, steps, loop, StatusMaker(outlet.ledger))
     if isinstance(link, Nasa42Lockstep):
@@ -107,7 +132,7 @@ def _serve_stream(bench: Bench, link: StreamLink, limit: Limit, loop: FrameLoop,
     ledger = outlet.ledger
     timeline = Timeline(policy_of(bench.config.attitude))
     receiver = _receiver(bench.config.attitude, link, timeline, outlet)
-    outlet.counters(loop.tally, receiver.counts)
+    outlet.follower(Running(loop, receiver.counts, receiver.clock_summary))
     statuses = StatusMaker(ledger)
 
     def draw_slot(moment: Moment) -> Shown | None:
@@ -155,7 +180,7 @@ def replay(bench: Bench, play: Play, sink: FrameSink = ignore, outlet: Outlet | 
     Paced, late frames are missed, as on a monitor; otherwise every frame is drawn, as fast as it can be.
     """
     outlet = outlet or Outlet()
-    loop, ledger = FrameLoop(bench, sink, outlet.pacer(), play.moving, outlet.notices), outlet.ledger
+    loop, ledger = FrameLoop(bench, sink, outlet.pacer(bench), play.moving, outlet.notices), outlet.ledger
     for kind, line in play.told:
         outlet.notices.tell(kind, line)
 
@@ -167,7 +192,7 @@ def replay(bench: Bench, play: Play, sink: FrameSink = ignore, outlet: Outlet | 
         return shown
 
     counts = PacketCounts(received=play.packet_count)
-    outlet.counters(loop.tally, counts)
+    outlet.follower(Running(loop, counts))
     bench.warm_up()
     begin_ns = time.monotonic_ns()
     with stop_on_signal(loop.stop), loop.watch:

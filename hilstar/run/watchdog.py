@@ -28,13 +28,15 @@ class FrameWatch:
         self._number = 0
         self._stages: list[tuple[str, int]] = []  # name and begin; one list, so that the other thread reads a whole one
         self._told_ns = 0
+        self.alive_ns = 0  # when the loop last was between two stages, host time; 0 before its first frame
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="hilstar-watchdog", daemon=True)
 
     def begin(self, number: int) -> None:
         """A frame begins, with its sprites."""
         self._number = number
-        self._stages = [("sprites", self._clock.now_ns())]
+        self.alive_ns = now_ns = self._clock.now_ns()
+        self._stages = [("sprites", now_ns)]
 
     def enter(self, stage: str) -> None:
         """Its next stage begins."""
@@ -44,12 +46,17 @@ class FrameWatch:
         """The frame is done, or given up; one that is not `timed` is never late."""
         now_ns, stages = self._clock.now_ns(), self._stages
         self._stages = []
+        self.alive_ns = now_ns
         if not timed or not stages or now_ns - stages[0][1] <= self._late_ns:
             return
         if now_ns - self._told_ns > TOLD_EVERY_NS:
             self._told_ns = now_ns
             took_ms = (now_ns - stages[0][1]) / NS_PER_MS
             self._notices.tell("frame-late", f"frame {self._number} took {took_ms:.0f} ms: {_told(stages, now_ns)}")
+
+    def idle(self) -> None:
+        """No frame is due, and the loop waits for one."""
+        self.alive_ns = self._clock.now_ns()
 
     def _run(self) -> None:
         stuck: tuple[str, int] | None = None

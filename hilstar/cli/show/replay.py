@@ -104,5 +104,5 @@ def replay(
             status.see(shown)
 
         with on_terminal(status):
-            summary = replay_log(bench, play, sink, Outlet(screen, kept, notices, counters=status.count))
+            summary = replay_log(bench, play, sink, Outlet(screen, kept, notices, follower=status.follow))
     end_of_run(summary, screen, kept, as_json)

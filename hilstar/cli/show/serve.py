@@ -75,7 +75,7 @@ def serve(
         say_what_clips(bench)
         told = Source(f"{link.verb} {link.endpoint}", bench.renderer.gl_renderer, refresh_hz, min(limit.slots, limit.frames))
         status = RunStatus(told, kept)
-        outlet = Outlet(screen, kept, notices, tracker_pictures(link, bench), status.count)
+        outlet = Outlet(screen, kept, notices, tracker_pictures(link, bench), status.follow)
         with on_terminal(status):
             summary = serve_stream(bench, link, limit, status.see, outlet)
     end_of_run(summary, screen, kept, as_json)

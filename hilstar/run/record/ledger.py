@@ -136,7 +136,7 @@ class Ledger:
     def notice(self, notice: Notice) -> None:
         """Record an event of the run."""
         if self._sieve.keeps("event", notice.kind, notice.host_ns):
-            record = EventRecord(host_ns=notice.host_ns, kind=notice.kind, detail=notice.detail)
+            record = EventRecord(host_ns=notice.host_ns, kind=notice.kind, detail=notice.detail, who=notice.who)
             self._backlog.put(Entry("event", notice.host_ns, 0, record))
 
     # The writer's thread

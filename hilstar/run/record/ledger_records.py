@@ -75,11 +75,12 @@ class ProcessRecord(msgspec.Struct, kw_only=True):
 
 
 class EventRecord(msgspec.Struct, kw_only=True):
-    """An event of a run (see `hilstar.notices`): host time, ns, its kind, and its text."""
+    """An event of a run (see `hilstar.notices`): host time, ns, its kind, its text, and the person that it comes from."""
 
     host_ns: HostNs
     kind: str
     detail: str
+    who: str = ""
 
 
 class CountRecord(msgspec.Struct, kw_only=True):

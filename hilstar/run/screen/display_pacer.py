@@ -11,9 +11,10 @@ from typing import Any
 from hilstar.bench.frame import Drawn
 from hilstar.notices import Notices
 from hilstar.process.priority import steady_loop
+from hilstar.run.desk import Desk
 from hilstar.run.host_clock import HOST_CLOCK, HostClock
+from hilstar.run.overrides import Overrides
 from hilstar.run.pacer import Moment, Presented
-from hilstar.run.screen.overrides import Overrides
 from hilstar.run.screen.screen import Screen
 
 log = logging.getLogger(__name__)
@@ -24,10 +25,10 @@ class DisplayPacer:
 
     moves_stars = True
 
-    def __init__(self, screen: Screen, notices: Notices, clock: HostClock = HOST_CLOCK) -> None:
+    def __init__(self, screen: Screen, notices: Notices, clock: HostClock = HOST_CLOCK, desk: Desk | None = None) -> None:
         self.clock = clock
         self.stop = threading.Event()
-        self.operator = Overrides(screen, notices)
+        self.operator = Overrides(screen.aids, notices, lambda: screen.window.hidden, desk)
         self.scheduling = "normal"
         self._screen = screen
         self._notices = notices

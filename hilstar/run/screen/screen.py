@@ -8,13 +8,14 @@ import time
 from hilstar.bench.frame import Bench
 from hilstar.bench.orientation import orientation_of
 from hilstar.monitor.window.window import Window
-from hilstar.render.presenter import BLANK, CROSSHAIR, GRID, PATCH, Presenter, View
+from hilstar.render.presenter import Presenter, View
+from hilstar.run.aids import Aids
 from hilstar.run.screen.photodiode import marker_light
 from hilstar.run.screen.swap_clock import DrawBudget, SwapClock
 from hilstar.units import NS_PER_MS, NS_PER_S
 
 HELP = "keys: q quit, b blank, space pause, c crosshair, g grid, t next test patch, h this line"
-PATCHES = (0.0, 0.25, 0.5, 0.75, 1.0)  # of white
+KEYS = {"b": "blank", "c": "crosshair", "g": "grid", "t": "patch", "space": "pause"}
 log = logging.getLogger(__name__)
 
 
@@ -29,12 +30,10 @@ class Screen:
         monitor = bench.config.monitor
         self.window = window
         self.bench = bench
-        self.paused = False
+        self.aids = Aids()
         self.swap_to_light_ns = round((bench.scan.scanout_s / 2 * 1e3 + monitor.panel_delay_ms) * NS_PER_MS)
         self.keep_time(1000.0 / monitor.refresh_hz, False, time.monotonic_ns())
         self._quit = False
-        self._overlay = 0
-        self._patch = -1
         view = View(
             resolution_px=monitor.resolution_px,
             screen_px=window.size_px,
@@ -65,11 +64,9 @@ class Screen:
         """Draw the bench's last frame on the back buffer; the photodiode square's light in frame `number`, None without one."""
         monitor = self.bench.config.monitor
         white = 2**monitor.bits - 1
-        code = round(PATCHES[self._patch] * white) if self._patch >= 0 else 0
-        overlay = self._overlay | (PATCH if self._patch >= 0 else 0)
         side_px = monitor.photodiode_px
         marker = marker_light(number, monitor.photodiode) if side_px else None
-        self._presenter.present(overlay, code, (side_px, white * (marker or 0)))
+        self._presenter.present(self.aids.overlay, round(self.aids.patch_share * white), (side_px, white * (marker or 0)))
         return marker
 
     def swap(self) -> int:
@@ -81,33 +78,11 @@ class Screen:
             self._press(self.window.keys.popleft())
         return swap_ns
 
-    @property
-    def shows_sky(self) -> bool:
-        """False where an operator's key leaves no sky: under a blank or a test patch."""
-        return not self._overlay & BLANK and self._patch < 0
-
-    @property
-    def operator(self) -> str:
-        """What an operator's keys change of the sky, such as "grid, pause"; "" for nothing."""
-        names = {BLANK: "blank", GRID: "grid", CROSSHAIR: "crosshair"}
-        on = [name for bit, name in names.items() if self._overlay & bit]
-        if self._patch >= 0:
-            on.append(f"patch {PATCHES[self._patch]:.0%}")
-        return ", ".join([*on, "pause"] if self.paused else on)
-
     def _press(self, key: str) -> None:
         match key:
             case "q" | "escape":
                 self._quit = True
-            case "b":
-                self._overlay ^= BLANK
-            case "c":
-                self._overlay ^= CROSSHAIR
-            case "g":
-                self._overlay ^= GRID
-            case "t":
-                self._patch = self._patch + 1 if self._patch + 1 < len(PATCHES) else -1
-            case "space":
-                self.paused = not self.paused
             case "h" | "f1":
                 log.warning(HELP)
+            case _ if key in KEYS:
+                self.aids.toggle(KEYS[key])

@@ -10,6 +10,7 @@ import pytest
 from hilstar.attitude.clock.timeline import Attitude
 from hilstar.bench.config import parse_config
 from hilstar.notices import Notices
+from hilstar.run.aids import Aids
 from hilstar.run.loop import FrameLoop, Limit
 from hilstar.run.pacer import Moment
 from hilstar.run.screen.display_pacer import DisplayPacer
@@ -36,7 +37,7 @@ class FakeScreen:
         self.swap_to_light_ns = TO_LIGHT_NS
         self.timestamp_source = "a fake"
         self.window = SimpleNamespace(hidden="", gone=None)
-        self.operator, self.shows_sky, self.paused = "", True, False
+        self.aids = Aids()
         self.presented: list[int] = []
         self._host, self._by_screen, self._closes_at = clock, by_screen, closes_at
 

@@ -9,7 +9,9 @@ import pytest
 
 from hilstar.attitude.clock.timeline import Attitude
 from hilstar.notices import Notices
-from hilstar.run.screen.overrides import Overrides
+from hilstar.run.aids import Aids
+from hilstar.run.desk import Desk, Wish
+from hilstar.run.overrides import Overrides
 from hilstar.run.shown import OnScreen
 
 MS = 1_000_000
@@ -21,56 +23,79 @@ def attitude(angle: float, age_ns: int = 5 * MS) -> Attitude:
 
 
 @pytest.fixture
-def screen():
-    return SimpleNamespace(operator="", shows_sky=True, paused=False, window=SimpleNamespace(hidden=""))
+def aids():
+    return Aids()
 
 
-def test_without_keys_the_attitude_is_the_one_that_came(screen):
+def test_without_keys_the_attitude_is_the_one_that_came(aids):
     wanted = attitude(0.1)
-    assert Overrides(screen, Notices()).attitude(0, wanted) is wanted
+    assert Overrides(aids, Notices()).attitude(0, wanted) is wanted
 
 
-def test_a_pause_keeps_the_attitude_which_grows_old_and_does_not_move(screen):
-    overrides = Overrides(screen, Notices())
+def test_a_pause_keeps_the_attitude_which_grows_old_and_does_not_move(aids):
+    overrides = Overrides(aids, Notices())
     before = attitude(0.1)
     overrides.attitude(100 * MS, before)
-    screen.paused = True
+    aids.set("pause", True)
     held = overrides.attitude(350 * MS, attitude(0.2))
     assert held is not None and held.q_icrs_to_cam is before.q_icrs_to_cam
     assert held.age_ns == 255 * MS
     assert held.rate_cam_rad_s is None
-    screen.paused = False
+    aids.set("pause", False)
     assert overrides.attitude(400 * MS, before) is before
 
 
-def test_a_pause_before_any_attitude_shows_none(screen):
-    overrides = Overrides(screen, Notices())
-    screen.paused = True
+def test_a_pause_before_any_attitude_shows_none(aids):
+    overrides = Overrides(aids, Notices())
+    aids.set("pause", True)
     assert overrides.attitude(0, attitude(0.1)) is None
 
 
-def test_under_a_blank_or_a_patch_there_is_no_sky(screen):
-    overrides = Overrides(screen, Notices())
-    screen.shows_sky = False
-    assert overrides.attitude(0, attitude(0.1)) is None
+def test_under_a_blank_or_a_patch_there_is_no_sky(aids):
+    overrides = Overrides(aids, Notices())
+    for name in ("blank", "patch"):
+        aids.set(name, True)
+        assert overrides.attitude(0, attitude(0.1)) is None
+        aids.set(name, False)
+    wanted = attitude(0.1)
+    assert overrides.attitude(0, wanted) is wanted
 
 
-def test_each_change_of_keys_and_window_is_told_once(screen):
+def test_each_change_of_keys_and_window_is_told_once(aids):
     notices, told = Notices(), []
     notices.listen(lambda notice: told.append((notice.kind, notice.detail)))
-    overrides = Overrides(screen, notices)
+    window = SimpleNamespace(hidden="")
+    overrides = Overrides(aids, notices, lambda: window.hidden)
     for operator, hidden in (("", ""), ("grid", ""), ("grid", ""), ("", ""), ("", "minimised"), ("", "minimised"), ("", "")):
-        screen.operator, screen.window.hidden = operator, hidden
+        aids.set("grid", operator == "grid")
+        window.hidden = hidden
         assert overrides.look() == OnScreen(operator, hidden, True)
     assert [kind for kind, _ in told] == ["operator", "operator", "hidden", "visible"]
     assert "grid" in told[0][1] and "minimised" in told[2][1]
 
 
-def test_changed_and_hidden_frames_are_counted_with_their_time(screen):
-    overrides = Overrides(screen, Notices())
+def test_changed_and_hidden_frames_are_counted_with_their_time(aids):
+    overrides = Overrides(aids, Notices())
     for k, on_screen in enumerate([OnScreen(), OnScreen("grid"), OnScreen("grid", "covered"), OnScreen()]):
         overrides.count(on_screen, 20 * MS * k)
     assert overrides.summary() == {
         "operator": {"frames": 2, "s": pytest.approx(0.04)},
         "hidden": {"frames": 1, "s": pytest.approx(0.02)},
     }
+
+
+def test_a_wish_is_acted_on_by_the_next_look_and_told_with_who_wished_it(aids):
+    notices, told = Notices(), []
+    notices.listen(lambda notice: told.append((notice.kind, notice.detail, notice.who)))
+    desk = Desk()
+    overrides = Overrides(aids, notices, desk=desk)
+    wish, late = Wish("blank", True, "Ada"), Wish("grid", True, "Ada")
+    desk.ask(wish)
+    desk.ask(late)
+    late.called_off = True
+    assert not wish.done.is_set()
+    assert overrides.look() == OnScreen("blank", "", False)
+    assert wish.done.is_set() and not late.done.is_set()
+    assert told == [("operator", "blank on, by Ada: blank", "Ada")]
+    assert overrides.look() == OnScreen("blank", "", False)
+    assert len(told) == 1

@@ -1,0 +1,38 @@
+"""What can lie over the sky on a monitor, and what it makes of levels: `present.frag` in NumPy."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hilstar.monitor.response import Codes, Response
+
+CROSSHAIR, GRID, BLANK, PATCH = 1, 2, 4, 8
+GRID_PX = 100
+LINE_SHARE = 96 / 255  # of white: visible, but darker than a star's core
+
+
+def level_of_code(response: Response, code: int) -> int:
+    """The level whose codes are `code` in all three channels."""
+    if response.rgb is None:
+        return code
+    away = np.abs(response.rgb.astype(np.int64) - code).sum(axis=1)
+    return int(np.argmin(away))
+
+
+def lay_over(levels: Codes, overlay: int, patch_level: int, line_level: int, cross_px: tuple[int, int]) -> None:
+    """Change levels (height, width) in place as the monitor's last pass does; `cross_px` is the crosshair's pixel."""
+    blank = bool(overlay & BLANK)
+    on_patch = bool(overlay & PATCH) and not blank
+    if blank or on_patch:
+        levels[...] = patch_level if on_patch else 0
+    dark = on_patch and patch_level >= line_level  # on a patch as bright as a line
+    height, width = levels.shape
+    x, y = cross_px
+    columns = [k for k in range(width) if _on_line(k - x, overlay)]
+    rows = [k for k in range(height) if _on_line(k - y, overlay)]
+    for lines in (np.s_[:, columns], np.s_[rows, :]):
+        levels[lines] = 0 if dark else np.maximum(levels[lines], line_level)
+
+
+def _on_line(offset_px: int, overlay: int) -> bool:
+    return bool((overlay & GRID and offset_px % GRID_PX == 0) or (overlay & CROSSHAIR and offset_px == 0))

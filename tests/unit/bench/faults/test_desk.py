@@ -1,0 +1,126 @@
+"""The desk: which faults are on in which frame, by the file's times and by whoever asks."""
+
+from __future__ import annotations
+
+import pytest
+
+from hilstar.bench.faults.desk import MAX_ON, FaultDesk
+from hilstar.bench.faults.kinds import fault_of
+from hilstar.bench.faults.scenario import Scenario
+from hilstar.errors import InputError
+
+FRAME_NS = 10_000_000  # 100 Hz
+
+
+def blank(name, **keys):
+    return fault_of({"kind": "blank", "name": name, **keys})
+
+
+def star(name, **keys):
+    return fault_of({"kind": "false-star", "name": name, "tracker_px": [5, 5], "electrons": 100, **keys})
+
+
+def desk_of(*faults):
+    heard = []
+    scenario = Scenario("faults.toml", "", 0, faults)
+    return FaultDesk(scenario, FRAME_NS / 1e9, listen=heard.append), heard
+
+
+def frames(desk, count, first=0):
+    """What is on in frames in a row: names and shares."""
+    return [[(now.fault.name, now.share) for now in desk.at(k * FRAME_NS)] for k in range(first, first + count)]
+
+
+def test_a_fault_of_the_file_is_on_at_its_time_for_its_time():
+    desk, heard = desk_of(blank("cover", at_s=0.02, for_s=0.03))
+    assert [bool(on) for on in frames(desk, 7)] == [False, False, True, True, True, False, False]
+    assert [(c.what, c.number, c.t_ns, c.who) for c in heard] == [
+        ("start", 1, 2 * FRAME_NS, "file"),
+        ("end", 1, 5 * FRAME_NS, "file"),
+    ]
+
+
+def test_light_between_two_frames_is_divided_among_them_in_proportion():
+    desk, _ = desk_of(star("flash", at_s=0.014, for_s=0.02))
+    on = frames(desk, 5)
+    assert on == [[], [("flash", 0.6)], [("flash", 1.0)], [("flash", 0.4)], []]
+    assert sum(share for row in on for _, share in row) * FRAME_NS == 0.02e9
+
+
+def test_what_is_shorter_than_a_frame_is_on_for_one():
+    desk, _ = desk_of(blank("short", at_s=0.021, for_s=0.001))
+    assert [bool(on) for on in frames(desk, 5)] == [False, False, True, False, False]
+
+
+def test_the_first_frame_is_the_zero_unless_it_is_said():
+    desk, _ = desk_of(blank("cover", at_s=0.02))
+    assert not desk.at(7_000_000_000)
+    assert desk.at(7_020_000_000)
+    said, _ = desk_of(blank("cover", at_s=0.02))
+    said.begin(6_980_000_000)
+    assert said.at(7_000_000_000)
+
+
+def test_the_console_starts_and_stops_a_fault_of_the_scenario_by_name():
+    desk, heard = desk_of(blank("cover"), star("ghost"))
+    assert desk.names() == ["cover", "ghost"]
+    assert frames(desk, 2) == [[], []]
+    desk.start("ghost", "console")
+    assert desk.on() == ["ghost"]
+    assert frames(desk, 2, 2) == [[("ghost", 1.0)]] * 2
+    desk.stop("ghost", "console")
+    assert frames(desk, 1, 4) == [[]]
+    assert [(c.what, c.fault.name, c.who, c.t_ns) for c in heard] == [
+        ("start", "ghost", "console", 2 * FRAME_NS),
+        ("end", "ghost", "console", 4 * FRAME_NS),
+    ]
+    desk.start("ghost", "console")
+    assert frames(desk, 1, 5) == [[("ghost", 1.0)]]
+    assert heard[-1].number == 2  # the second start of the run
+
+
+def test_what_cannot_be_started_or_stopped_is_refused_in_a_line():
+    desk, _ = desk_of(blank("cover"))
+    with pytest.raises(InputError, match="no fault is called 'covre'; known are cover"):
+        desk.start("covre", "console")
+    with pytest.raises(InputError, match="'cover' is not on; none is"):
+        desk.stop("cover")
+    desk.start("cover", "console")
+    with pytest.raises(InputError, match="on already"):
+        desk.start("cover", "stream")
+
+
+def test_the_stream_asks_for_faults_of_its_own_now_or_later():
+    desk, _ = desk_of()
+    desk.at(0)
+    desk.ask(star("now", for_s=0.02), "stream")
+    desk.ask(blank("later", at_s=0.04, for_s=0.01), "stream")
+    desk.ask(blank("past", at_s=0.001, for_s=0.01), "stream")  # a time that has passed means now
+    assert frames(desk, 5, 1) == [
+        [("now", 1.0), ("past", 1.0)],
+        [("now", 1.0)],
+        [],
+        [("later", 1.0)],
+        [],
+    ]
+
+
+def test_memory_is_bounded_whoever_asks():
+    desk, _ = desk_of()
+    refused = 0
+    for number in range(5000):
+        try:
+            desk.ask(blank(f"fault {number}"), "stream")
+        except InputError:
+            refused += 1
+        if number % 50 == 0:
+            desk.at(number * FRAME_NS)
+    assert refused > 4000
+    assert len(desk.at(10**12)) <= MAX_ON
+
+
+def test_a_fault_between_two_frames_of_a_slow_run_is_reported_as_missed():
+    desk, heard = desk_of(blank("short", at_s=1.0, for_s=0.1))
+    desk.at(0)
+    assert desk.at(2_000_000_000) == ()
+    assert [change.what for change in heard] == ["missed"]

@@ -10,10 +10,13 @@ import numpy as np
 
 from hilstar.render.encoder import build_program
 from hilstar.scene.camera import Camera
-from hilstar.scene.extended import ExtendedLight, Glow, LightMap, Rectangle
+from hilstar.scene.extended import DiscLight, ExtendedLight, Glow, LightMap, Rectangle
 from hilstar.scene.rays import ray_shifts
+from hilstar.sky.bodies.disc import AIR_TOP, SOLAR_LIMB, Disc
 
 KEPT_TEXTURES = 4  # of maps and lenses: a bench has one lens, and few maps at a time
+LAWS = ("uniform", "lambert", "lunar-lambert", "limb-darkened")  # by their numbers in disc.frag
+NODES = 16  # as there
 
 
 class ExtendedLayer:
@@ -49,12 +52,17 @@ class ExtendedLayer:
     def _draw_one(self, light: ExtendedLight) -> None:
         if isinstance(light, LightMap):
             self._draw_map(light)
-        else:
+        elif isinstance(light, Glow):
             self._draw_glow(light)
+        else:
+            self._draw_disc(light)
 
     def _draw_map(self, light: LightMap) -> None:
-        program, triangle = self._program("light_map.frag")
+        program, triangle = self._program("light_map.frag", "", *(() if light.cover is None else ("COVER",)))
         self._texture(light.image, light.image, 1).use(0)
+        if light.cover is not None:
+            self._texture(light.cover, light.cover, 1).use(1)
+            program["cover"] = 1
         program["corner_px"] = light.corner_px
         program["times"] = light.times
         triangle.render(moderngl.TRIANGLES, vertices=3)
@@ -65,6 +73,15 @@ class ExtendedLayer:
         program["peak_e_per_s"] = light.peak_e_per_s
         program["scale_rad"] = light.scale_rad
         program["exponent"] = light.exponent
+        triangle.render(moderngl.TRIANGLES, vertices=3)
+
+    def _draw_disc(self, light: DiscLight) -> None:
+        program, triangle = self._with_rays("disc.frag", light.camera)
+        disc = light.disc
+        from_image = disc.to_sphere @ light.icrs_to_image.T
+        program["to_sphere"] = tuple(from_image.T.ravel().tolist())  # column by column
+        program["variance_px"] = light.variance_px
+        _set_face(program, disc)
         triangle.render(moderngl.TRIANGLES, vertices=3)
 
     def _with_rays(self, fragment: str, camera: Camera) -> tuple[moderngl.Program, moderngl.VertexArray]:
@@ -98,3 +115,19 @@ class ExtendedLayer:
             kept = owner, texture
         self._textures[id(owner)] = kept  # the last used is the last to go
         return kept[1]
+
+
+def _set_face(program: moderngl.Program, disc: Disc) -> None:
+    """What a body's face is like, in a program of disc.frag."""
+    place, weight = np.polynomial.legendre.leggauss(NODES)
+    program["node"] = ((place + 1) / 2).tolist()
+    program["weight"] = (weight / 2).tolist()
+    program["distance_radii"] = disc.distance_radii
+    program["sun"] = tuple(disc.sun_sphere.tolist())
+    program["normal_e_per_s_sr"] = disc.normal_e_per_s_sr
+    program["law"] = LAWS.index(disc.law)
+    program["lunar_share"] = disc.lunar_share
+    program["solar_limb"] = SOLAR_LIMB
+    program["air_radii"] = disc.air_radii
+    program["slant_depth"] = disc.slant_depth
+    program["air_top"] = AIR_TOP

@@ -12,7 +12,13 @@ import numpy as np
 
 from hilstar.arrays import Float32Array, FloatArray
 from hilstar.scene.camera import Camera
+from hilstar.sky.bodies.disc import AIR_TOP, Disc
 
+REACH_SIGMAS = 4.0  # as in disc.frag
+PIXEL_VARIANCE = 1 / 12  # of a square pixel, px squared
+LIMB_PLACES = 128
+BEHIND = 0.05  # of a unit direction's z: a limb that comes nearer to the camera's plane has no useful outline
+BOW = 1.01  # of an outline: what bows between its places
 Rectangle = tuple[int, int, int, int]  # left, top, width, height, pixels
 
 
@@ -20,12 +26,15 @@ Rectangle = tuple[int, int, int, int]  # left, top, width, height, pixels
 class LightMap:
     """An image of light, float32 (height, width), `times` a factor, its first pixel at `corner_px` (x, y) of the image.
 
+    `cover`, of the same shape, is the share of what was drawn before that each pixel hides; None hides nothing.
+
     Keep one array for as long as the light is the same, and do not write to it: it is uploaded once.
     """
 
     image: Float32Array
     corner_px: tuple[int, int] = (0, 0)
     times: float = 1.0
+    cover: Float32Array | None = None
 
     def region(self, resolution_px: tuple[int, int]) -> Rectangle | None:
         """The part of an image that it lights, None where that is nothing."""
@@ -52,7 +61,41 @@ class Glow:
         return (0, 0, *resolution_px)
 
 
-ExtendedLight = LightMap | Glow
+@dataclass(frozen=True, slots=True, eq=False)
+class DiscLight:
+    """A body's disc through a camera, spread by a Gaussian of `sigma_px`; `icrs_to_image` (3, 3) as for sprites.
+
+    It covers what is drawn before it. `scene.discs.disc_light` chooses between it and, for a small disc, a map.
+    """
+
+    disc: Disc
+    icrs_to_image: FloatArray
+    camera: Camera
+    sigma_px: tuple[float, float]
+
+    @property
+    def variance_px(self) -> tuple[float, float]:
+        """Of the Gaussian and of a square pixel, along x and y, px squared."""
+        return self.sigma_px[0] ** 2 + PIXEL_VARIANCE, self.sigma_px[1] ** 2 + PIXEL_VARIANCE
+
+    def region(self, resolution_px: tuple[int, int]) -> Rectangle | None:
+        """The pixels within the outline of its limb, its air and the Gaussian's reach; all where that is partly behind."""
+        air = 1 + AIR_TOP * self.disc.air_radii
+        seen = self.disc.limb(LIMB_PLACES, air) @ self.icrs_to_image.T
+        if (seen[:, 2] < BEHIND).any():
+            return (0, 0, *resolution_px)
+        x_px, y_px = self.camera.project_outward(seen)
+        if not (np.isfinite(x_px).all() and np.isfinite(y_px).all()):
+            return (0, 0, *resolution_px)
+        edges = []
+        for k, place in enumerate((x_px, y_px)):
+            low, high = float(place.min()), float(place.max())
+            half = (high - low) / 2 * BOW + REACH_SIGMAS * float(np.sqrt(self.variance_px[k])) + 1
+            edges.append(((low + high) / 2 - half, (low + high) / 2 + half))
+        return clipped((edges[0][0], edges[1][0], edges[0][1], edges[1][1]), resolution_px)
+
+
+ExtendedLight = LightMap | Glow | DiscLight
 
 
 def clipped(edges_px: tuple[float, float, float, float], resolution_px: tuple[int, int]) -> Rectangle | None:

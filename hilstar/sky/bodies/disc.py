@@ -95,6 +95,14 @@ class Disc:
         """The optical depth along a ray that touches the surface, 0 without air (Chapman's limit)."""
         return 0.0 if self.air is None else self.air.depth * float(np.sqrt(2 * np.pi / self.air_radii))
 
+    def limb(self, count: int, radii: float = 1.0) -> FloatArray:
+        """Unit directions (count, 3), ICRS, of rays that pass the centre at `radii` of it, all round."""
+        sine = min(1.0, radii / self.distance_radii)
+        turn = np.linspace(0.0, 2 * np.pi, count, endpoint=False)
+        ring = np.stack([sine * np.cos(turn), sine * np.sin(turn), np.full(count, np.sqrt(1 - sine**2))], axis=1)
+        seen = ring @ np.linalg.inv(self.to_sphere).T
+        return np.asarray(seen / np.linalg.norm(seen, axis=1, keepdims=True))
+
     def of_rate(self, electrons_per_s: float) -> Disc:
         """The same disc with this flux in all; black where nothing of it is lit."""
         whole_sr = self.law_integral_sr()
@@ -141,7 +149,14 @@ class Disc:
 
     def law_integral_sr(self) -> float:
         """The law's function over the seen disc, steradian."""
-        place, area = self._lit_face()
+        return float(self.points(QUADRATURE)[1].sum())
+
+    def points(self, nodes: int) -> tuple[FloatArray, FloatArray]:
+        """Directions (n, 3), ICRS axes, of places on the lit face, and the law's function times the steradian of each (n,).
+
+        `nodes` is their number along either axis of the face.
+        """
+        place, area = self._lit_face(nodes)
         # From the sphere's axes to space; the distance of each place along its ray.
         back = np.linalg.inv(self.to_sphere)
         seen = place + np.array([0.0, 0.0, self.distance_radii])
@@ -149,14 +164,14 @@ class Disc:
         distance = np.linalg.norm(true, axis=1)
         shaded = self._shaded(place, seen / distance[:, None])
         facing = -np.einsum("ij,ij->i", place, seen) * abs(np.linalg.det(back))
-        return float((shaded * facing * area / distance**3).sum())
+        return true / distance[:, None], shaded * facing * area / distance**3
 
-    def _lit_face(self) -> tuple[FloatArray, FloatArray]:
+    def _lit_face(self, nodes: int) -> tuple[FloatArray, FloatArray]:
         """Places (n, 3) of the sphere that are seen and lit, and the area that each stands for (n,).
 
         A place has a longitude from the observer's meridian towards the Sun, and a latitude from the plane of both.
         """
-        node, weight = np.polynomial.legendre.leggauss(QUADRATURE)
+        node, weight = np.polynomial.legendre.leggauss(nodes)
         top = np.arccos(1 / self.distance_radii)
         # The limb ends latitudes as a square root does: evenly in an angle it is smooth.
         latitude, stretch = top * np.sin(node * np.pi / 2), top * np.cos(node * np.pi / 2) * np.pi / 2

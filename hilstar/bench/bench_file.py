@@ -8,7 +8,7 @@ from pathlib import Path
 
 import msgspec
 
-from hilstar.bench.config import GEOCENTRE, BenchConfig, parse_config
+from hilstar.bench.config import GEOCENTRE, SOURCE, BenchConfig, parse_config
 from hilstar.bench.config.when import with_dates
 from hilstar.errors import InputError
 from hilstar.monitor.calibration import BUILT_IN
@@ -62,7 +62,7 @@ def _sha256(config: BenchConfig, folder: Path) -> str:
     curves = (tracker.quantum_efficiency, tracker.transmission)
     files = (config.monitor.calibration, config.collimator.geometry, tracker.distortion)
     true = (config.verify.true_calibration, config.verify.true_geometry)
-    orbit = None if config.spacecraft.orbit == GEOCENTRE else config.spacecraft.orbit
+    orbit = None if config.spacecraft.orbit in {GEOCENTRE, SOURCE} else config.spacecraft.orbit
     named: tuple[str | float | None, ...] = (*curves, *files, *true, orbit)
     for name in named:
         if isinstance(name, str) and name not in (*BUILT_IN_CURVES, *BUILT_IN, "hipparcos"):

@@ -150,14 +150,16 @@ class Bench:
         rate_cam_rad_s: Vector | FloatArray | None = None,
         velocity_km_s: FloatArray | None = None,
         t_ns: int | None = None,
+        place_km: FloatArray | None = None,
     ) -> Sprites | None:
         """The sprites of a frame (see `draw`), before anything is drawn; None for a blank one.
 
-        A velocity (3,), ICRS, is that of an observer against the one of `[sky] observer_velocity_km_s`.
+        A velocity (3,), ICRS, is that of an observer against the one of `[sky] observer_velocity_km_s`, a place (3,) its own
+        about the Earth's centre, ICRS axes.
         """
         if q_icrs_to_cam is None:
             return None
-        stars = self.seen(self.shown_stars, t_ns, velocity_km_s)
+        stars = self.seen(self.shown_stars, t_ns, velocity_km_s, place_km)
         turn = self._turn(q_icrs_to_cam, rate_cam_rad_s)
         return self.sprites(q_icrs_to_cam, stars) if turn is None else self._swept(stars, turn)
 
@@ -214,9 +216,17 @@ class Bench:
         order = np.argsort(truth["v_mag"], kind="stable")
         return Frame(q, linear, levels, self.code_values(levels), truth[order], sprites.star[order], t_ns)
 
-    def seen(self, stars: Stars, t_ns: int | None = None, velocity_km_s: FloatArray | None = None) -> Stars:
-        """`stars` or `shown_stars` as they are seen at `t_ns`, bodies among them, with a velocity as in `frame_sprites`."""
-        return stars.seen_at(velocity_km_s) if self.moving is None else self.moving.seen(stars, t_ns, velocity_km_s)
+    def seen(
+        self,
+        stars: Stars,
+        t_ns: int | None = None,
+        velocity_km_s: FloatArray | None = None,
+        place_km: FloatArray | None = None,
+    ) -> Stars:
+        """`stars` or `shown_stars` as they are seen at `t_ns`, bodies among them; velocity and place as in `frame_sprites`."""
+        if self.moving is None:
+            return stars.seen_at(velocity_km_s)
+        return self.moving.seen(stars, t_ns, velocity_km_s, place_km)
 
     def losses_mag(self, frame: Frame) -> dict[int | str, float]:
         """For each clipped star of a frame (by HIP number, or a body's name), how many magnitudes too faint it is.

@@ -5,10 +5,11 @@ from __future__ import annotations
 import logging
 from pathlib import Path
 
-from hilstar.bench.config import GEOCENTRE, BenchConfig
+from hilstar.bench.config import GEOCENTRE, SOURCE, BenchConfig
 from hilstar.bench.config.when import epoch_utc_ns, jyear
 from hilstar.reading import read_text
 from hilstar.scene.camera import Camera
+from hilstar.sky.bodies.earth import EARTH
 from hilstar.sky.bodies.kernel import Kernel
 from hilstar.sky.bodies.moving import PLANETS, YEAR_NS, BodyLight, MovingSky
 from hilstar.sky.bodies.oem import VERSION_KEY, OemOrbit
@@ -35,7 +36,7 @@ def moving_sky(config: BenchConfig, folder: Path, optics: Optics) -> MovingSky:
     # A source's own dates count from 1970, and its stars are those of its day.
     start_ns = round((config.sky.epoch_jyear - jyear(utc_ns)) * YEAR_NS)
     orbit = config.spacecraft.orbit or GEOCENTRE
-    observer = Geocentre() if orbit == GEOCENTRE else orbit_file(folder / orbit, utc_ns + start_ns)
+    observer = Geocentre() if orbit in {GEOCENTRE, SOURCE} else orbit_file(folder / orbit, utc_ns + start_ns)
     names = body_names(config)
     sky = config.sky
     rates = bodies_electrons_per_s(names, sky.brightness, optics, Photometry(sky.zero_point, sky.passband_weighting))
@@ -68,6 +69,7 @@ def body_names(config: BenchConfig) -> tuple[str, ...]:
     bodies = config.sky.bodies
     return (
         *(("Sun",) if bodies.sun else ()),
+        *((EARTH,) if bodies.earth else ()),
         *(("Moon",) if bodies.moon else ()),
         *(PLANETS if bodies.planets else ()),
     )

@@ -118,7 +118,7 @@ class FrameLoop:
         if attitude is None:
             return None
         rate = attitude.rate_cam_rad_s if self._moving else None
-        return self._bench.frame_sprites(attitude.q_icrs_to_cam, rate, attitude.velocity_km_s, t_ns)
+        return self._bench.frame_sprites(attitude.q_icrs_to_cam, rate, attitude.velocity_km_s, t_ns, attitude.place_km)
 
     def _gives_up(self, number: int, moment: Moment) -> bool:
         """Whether the frame's moment has passed so far that the next is begun instead.

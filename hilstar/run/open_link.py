@@ -12,13 +12,14 @@ from hilstar.attitude.wire.nasa42.tcp_link import Nasa42Link, Nasa42Lockstep
 from hilstar.attitude.wire.serial_link import SerialLink
 from hilstar.attitude.wire.source import Mounting
 from hilstar.attitude.wire.udp.udp_link import UdpLink
-from hilstar.attitude.wire.vizard.attitude import DifferenceRates, Follower
+from hilstar.attitude.wire.vizard.attitude import DifferenceRates, Follower, Taken
 from hilstar.attitude.wire.vizard.broadcast import VizardBroadcast
 from hilstar.attitude.wire.vizard.live import VizardLive
 from hilstar.attitude.wire.zmq_lockstep import ZmqLockstep
 from hilstar.attitude.wire.zmq_stream import ZmqReceiver
 from hilstar.bench.config import AttitudeSettings, BenchConfig
 from hilstar.bench.config.road import nasa42_road, udp_road
+from hilstar.bench.config.when import from_source
 from hilstar.notices import Notices
 from hilstar.units import NS_PER_MS
 
@@ -53,7 +54,8 @@ def _open_vizard(config: BenchConfig, notices: Notices | None) -> VizardBroadcas
     rates = DifferenceRates(round(settings.stale_after_ms * NS_PER_MS), math.radians(settings.max_rate_deg_s))
     name = None if settings.spacecraft is None else str(settings.spacecraft)
     mounting = Mounting(config.tracker.q_body_to_cam)
-    follower = Follower(name, mounting, rates, with_velocity=settings.use_velocity)
+    taken: Taken = "state" if from_source(config) else "velocity" if settings.use_velocity else "attitude"
+    follower = Follower(name, mounting, rates, taken)
     if settings.lockstep:
         return VizardLive(settings.address, follower, bind=settings.bind is not False, notices=notices)
     return VizardBroadcast(settings.address, follower, bind=settings.bind is True, notices=notices)

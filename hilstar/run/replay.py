@@ -127,7 +127,8 @@ class RunPlay:
         velocity = None if past.velocity_km_s is None else np.array(past.velocity_km_s)
         if past.q is None:
             return past.frame, past.t_ns, None
-        attitude = Attitude(np.array(past.q), 0, False, rate_cam_rad_s=rate, velocity_km_s=velocity)
+        place = None if past.place_km is None else np.array(past.place_km)
+        attitude = Attitude(np.array(past.q), 0, False, rate_cam_rad_s=rate, velocity_km_s=velocity, place_km=place)
         return past.frame, past.t_ns, attitude
 
 

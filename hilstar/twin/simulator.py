@@ -77,15 +77,22 @@ class Simulator:
         """An exposure of this tracker, by the attitude in its middle (unit quaternion) and a constant rate."""
         return Motion(q_icrs_to_cam, rate_cam_rad_s, self.config.tracker.exposure_s, t_ns)
 
-    def expose(self, motion: Motion, rng: np.random.Generator | None, velocity_km_s: FloatArray | None = None) -> Exposure:
+    def expose(
+        self,
+        motion: Motion,
+        rng: np.random.Generator | None,
+        velocity_km_s: FloatArray | None = None,
+        place_km: FloatArray | None = None,
+    ) -> Exposure:
         """One frame; without a generator, without noise. Raises InputError for what a detector cannot take.
 
-        A velocity (3,), ICRS, is that of an observer against the one of `[sky] observer_velocity_km_s`.
+        A velocity (3,), ICRS, is that of an observer against the one of `[sky] observer_velocity_km_s`, a place (3,) its own
+        about the Earth's centre.
         """
         tracker = self.config.tracker
         stars = self.stars.seen_at(velocity_km_s)
         if self.moving is not None:
-            stars = self.moving.seen(self.stars, motion.t_ns, velocity_km_s)
+            stars = self.moving.seen(self.stars, motion.t_ns, velocity_km_s, place_km)
         sprites = smeared_sprites(stars, motion, self.camera, self.renderer.footprint_px, tracker.psf_sigma_px)
         self.renderer.draw(sprites)
         mean_e = self.renderer.linear().astype(np.float64) * tracker.exposure_s + self.background_e

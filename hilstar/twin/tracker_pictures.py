@@ -30,7 +30,7 @@ class TrackerPictures:
         """The picture of the tracker at an attitude."""
         rate = np.zeros(3) if sample.rate_cam_rad_s is None else sample.rate_cam_rad_s
         motion = self._simulator.motion(sample.q_icrs_to_cam, rate, sample.t_ns)
-        exposure = self._simulator.expose(motion, self._noise.rng(self._count), sample.velocity_km_s)
+        exposure = self._simulator.expose(motion, self._noise.rng(self._count), sample.velocity_km_s, sample.place_km)
         self._count += 1
         return dn_png(exposure.dn, self._simulator.config.tracker.detector.bits)
 

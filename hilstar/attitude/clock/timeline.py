@@ -32,7 +32,8 @@ class Attitude:
     """An attitude at one time, with the age, sequence and arrival of the newest sample behind it, and whether it is too old.
 
     `prediction_ns` is how far the attitude was propagated past that sample, and `rate_cam_rad_s` the rate at that time, None
-    where the attitude is held. `velocity_km_s` is that of the sample before it.
+    where the attitude is held. `velocity_km_s` is that of the sample before it, and `place_km` where it has led from that
+    sample's place.
     """
 
     q_icrs_to_cam: FloatArray
@@ -43,6 +44,7 @@ class Attitude:
     prediction_ns: int = 0
     rate_cam_rad_s: FloatArray | None = None
     velocity_km_s: FloatArray | None = None
+    place_km: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +113,24 @@ class Timeline:
             received_ns = self._received_ns
         place = max(min(i, 1), 0)
         found = self._at(t_ns, near, place, received_ns) if i >= 0 else _held(near[0], 0, False)
-        return found if near[place].velocity_km_s is None else replace(found, velocity_km_s=near[place].velocity_km_s)
+        if near[place].velocity_km_s is None:
+            return found
+        return replace(found, velocity_km_s=near[place].velocity_km_s, place_km=self._place_km(near, place, t_ns))
+
+    def _place_km(self, near: list[AttitudeSample], place: int, t_ns: int) -> FloatArray | None:
+        """Where the observer is: on the cubic through two samples, else straight on for as long as attitudes are predicted."""
+        before = near[place]
+        if before.place_km is None or before.velocity_km_s is None:
+            return None
+        age_ns = max(t_ns - before.t_ns, 0)
+        after = near[place + 1] if place + 1 < len(near) else before
+        if after is before or after.place_km is None or after.velocity_km_s is None or self._jumped(before, after):
+            return before.place_km + before.velocity_km_s * (min(age_ns, self._policy.max_extrapolation_ns) / NS_PER_S)
+        gap_s = (after.t_ns - before.t_ns) / NS_PER_S
+        u = age_ns / (after.t_ns - before.t_ns)
+        straight = after.place_km - before.place_km
+        bend = (1 - u) * (before.velocity_km_s * gap_s - straight) - u * (after.velocity_km_s * gap_s - straight)
+        return before.place_km + u * straight + u * (1 - u) * bend
 
     def _at(self, t_ns: int, near: list[AttitudeSample], place: int, received_ns: int | None) -> Attitude:
         newest = near[place]

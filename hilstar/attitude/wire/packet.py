@@ -37,6 +37,7 @@ MESSAGE_REASONS: tuple[Reason, ...] = ("crc", "norm", "nan", "time", "format")
 STREAM_REASONS: tuple[Reason, ...] = ("rate", "source")
 REASONS = MESSAGE_REASONS + STREAM_REASONS
 MAX_SPEED_KM_S = 10_000.0  # of an observer: a thirtieth of that of light
+MIN_PLACE_KM, MAX_PLACE_KM = 6000.0, 1e7  # of one about the Earth: as an orbit's file is held to
 RATE_ROUNDING = 1e-6  # a packet's rate is float32
 
 
@@ -45,7 +46,8 @@ class AttitudeSample:
     """Where the camera points at `t_ns` of the sender's clock; `rate_cam_rad_s` (3,) or None when unknown.
 
     `acceleration_cam_rad_s2` (3,) is that of the rate, for sources without noise; `velocity_km_s` (3,), ICRS, the observer's
-    with respect to the origin of the sender's frame. Both are None where nobody says.
+    with respect to the origin of the sender's frame, and `place_km` (3,) its place, about the Earth's centre both where there
+    is one. Each is None where nobody says.
     """
 
     t_ns: int
@@ -55,6 +57,7 @@ class AttitudeSample:
     discontinuity: bool = False
     acceleration_cam_rad_s2: FloatArray | None = None
     velocity_km_s: FloatArray | None = None
+    place_km: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ from hilstar.bench.config.monitor import Monitor
 from hilstar.bench.config.read import parse_config, read_config
 from hilstar.bench.config.render import DEFAULT_BRIGHTEST_V_MAG, RenderSettings
 from hilstar.bench.config.sky import Bodies, SkySettings
-from hilstar.bench.config.spacecraft import GEOCENTRE
+from hilstar.bench.config.spacecraft import GEOCENTRE, SOURCE
 from hilstar.bench.config.tracker import Tracker
 from hilstar.bench.config.values import Vector
 from hilstar.bench.config.verify import Verify
@@ -19,6 +19,7 @@ from hilstar.bench.config.verify import Verify
 __all__ = [
     "DEFAULT_BRIGHTEST_V_MAG",
     "GEOCENTRE",
+    "SOURCE",
     "AttitudeSettings",
     "Background",
     "BenchConfig",

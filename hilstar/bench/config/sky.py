@@ -23,6 +23,13 @@ class Bodies(Table, frozen=True):
     ] = False
     moon: Annotated[bool, Meta(description="The Moon.")] = False
     sun: Annotated[bool, Meta(description="The Sun.")] = False
+    earth: Annotated[
+        bool,
+        Meta(
+            description='The Earth with its air, seen from an orbit: `[spacecraft] orbit` is then a file or `"source"`. Its'
+            " night side is dark."
+        ),
+    ] = False
 
 
 class SkySettings(Table, frozen=True):

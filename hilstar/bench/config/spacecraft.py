@@ -9,6 +9,7 @@ from msgspec import Meta
 from hilstar.toml_tables import Table
 
 GEOCENTRE = "geocentre"
+SOURCE = "source"
 
 
 class Spacecraft(Table, frozen=True):
@@ -22,7 +23,8 @@ class Spacecraft(Table, frozen=True):
         str | None,
         Meta(
             description='`"geocentre"`, or the path of a file: one two-line element set (TLE), propagated by SGP4, or a CCSDS'
-            " OEM (KVN; ICRF, GCRF or EME2000 about the Earth).",
+            ' OEM (KVN; ICRF, GCRF or EME2000 about the Earth); `"source"`: where the messages of'
+            ' `[attitude] source = "vizard"` (Basilisk) have the spacecraft.',
             extra={"default": 'none; `"geocentre"` with `[sky.bodies]`'},
         ),
     ] = None

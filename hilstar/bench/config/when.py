@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 
 from hilstar.bench.config.bench import BenchConfig
-from hilstar.bench.config.spacecraft import GEOCENTRE
+from hilstar.bench.config.spacecraft import GEOCENTRE, SOURCE
 from hilstar.errors import InputError
 from hilstar.units import NS_PER_S
 
@@ -38,7 +38,12 @@ def epoch_utc_ns(config: BenchConfig) -> int | None:
 def has_observer(config: BenchConfig) -> bool:
     """Whether the sky is seen from a known place: a spacecraft's, or for its bodies the Earth's centre."""
     bodies = config.sky.bodies
-    return bodies.planets or bodies.moon or bodies.sun or config.spacecraft.orbit is not None
+    return bodies.planets or bodies.moon or bodies.sun or bodies.earth or config.spacecraft.orbit is not None
+
+
+def from_source(config: BenchConfig) -> bool:
+    """Whether the source of the attitudes says where the spacecraft is."""
+    return config.spacecraft.orbit == SOURCE
 
 
 def with_epoch(config: BenchConfig, path: Path, tables: dict[str, Any]) -> BenchConfig:
@@ -55,8 +60,9 @@ def with_epoch(config: BenchConfig, path: Path, tables: dict[str, Any]) -> Bench
                 f"{path}: [sky] observer_velocity_km_s: with [sky.bodies] or [spacecraft] the velocity follows from the"
                 " ephemeris; leave it out"
             )
+    _check_orbit(config, path)
     attitude, orbit = config.attitude, config.spacecraft.orbit
-    if orbit not in {None, GEOCENTRE} and attitude.source == "vizard" and attitude.use_velocity:
+    if orbit not in {None, GEOCENTRE, SOURCE} and attitude.source == "vizard" and attitude.use_velocity:
         raise InputError(
             f"{path}: [attitude] use_velocity = true adds Basilisk's velocity to that of [spacecraft] orbit; write"
             ' use_velocity = false, or orbit = "geocentre"'
@@ -70,6 +76,28 @@ def with_epoch(config: BenchConfig, path: Path, tables: dict[str, Any]) -> Bench
     if utc_ns is None:
         return config
     return msgspec.structs.replace(config, sky=msgspec.structs.replace(config.sky, epoch_jyear=jyear(utc_ns)))
+
+
+def _check_orbit(config: BenchConfig, path: Path) -> None:
+    """Refuse (InputError) a place that nobody gives, and the Earth from its own centre."""
+    attitude, orbit = config.attitude, config.spacecraft.orbit
+    if config.sky.bodies.earth and orbit in {None, GEOCENTRE}:
+        raise InputError(
+            f"{path}: [sky.bodies] earth = true: from its centre no Earth is seen; write [spacecraft] orbit = the path of a TLE"
+            f' or an OEM, or "{SOURCE}"'
+        )
+    if not from_source(config):
+        return
+    if attitude.source != "vizard":
+        raise InputError(
+            f'{path}: [spacecraft] orbit = "{SOURCE}": of the sources of attitudes only "vizard" (Basilisk) sends the'
+            f' spacecraft\'s place, and [attitude] source = "{attitude.source}"; write the path of a TLE or an OEM'
+        )
+    if not attitude.use_velocity:
+        raise InputError(
+            f'{path}: [attitude] use_velocity = false, and [spacecraft] orbit = "{SOURCE}" takes the source\'s place and'
+            " velocity; leave use_velocity out"
+        )
 
 
 def with_dates(config: BenchConfig, scale: str | None, first_ns: int) -> BenchConfig:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import time
+from dataclasses import replace
 
 import msgspec
 
@@ -78,7 +79,11 @@ class Steps:
         return Refusal("format", f"a {type(event).__name__} packet; a request is an attitude, or a time request")
 
     def _show(self, sample: AttitudeSample, host_ns: int) -> Shown:
-        attitude = Attitude(sample.q_icrs_to_cam, 0, False, sample.sequence, host_ns, velocity_km_s=sample.velocity_km_s)
+        attitude = replace(
+            Attitude(sample.q_icrs_to_cam, 0, False, sample.sequence, host_ns),
+            velocity_km_s=sample.velocity_km_s,
+            place_km=sample.place_km,
+        )
         shown = self._loop.draw(self._loop.tally.frames, sample.t_ns, attitude)
         if shown is None:
             raise AssertionError("a frame in lockstep has no moment that can pass")

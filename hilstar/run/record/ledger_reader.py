@@ -12,7 +12,7 @@ import msgspec
 
 from hilstar.attitude.logs.mcap_log import ATTITUDE_TOPIC
 from hilstar.attitude.logs.mcap_reader import RUN_METADATA, read_messages, read_metadata, read_topics
-from hilstar.attitude.wire.packet import MAX_SPEED_KM_S, Refusal, checked_sample, rate_refusal
+from hilstar.attitude.wire.packet import MAX_PLACE_KM, MAX_SPEED_KM_S, MIN_PLACE_KM, Refusal, checked_sample, rate_refusal
 from hilstar.bench.config import BenchConfig
 from hilstar.errors import InputError, cannot_read
 from hilstar.reading import parse_toml
@@ -58,6 +58,10 @@ def drawable_frames(path: Path, max_rate_rad_s: float = math.inf) -> Iterator[Fr
                 raise InputError(f"{path}: message {number} of {FRAME_TOPIC}: {refusal.detail}")
         if math.hypot(*(record.velocity_km_s or ())) > MAX_SPEED_KM_S:
             raise InputError(f"{path}: message {number} of {FRAME_TOPIC}: a velocity over {MAX_SPEED_KM_S:g} km/s")
+        if record.place_km is not None and not MIN_PLACE_KM < math.hypot(*record.place_km) < MAX_PLACE_KM:
+            raise InputError(
+                f"{path}: message {number} of {FRAME_TOPIC}: a place beyond {MIN_PLACE_KM:g} to {MAX_PLACE_KM:g} km"
+            )
         yield record
 
 

@@ -20,7 +20,8 @@ class FrameRecord(msgspec.Struct, kw_only=True):
     """One frame; times ns: `t_ns` of the timeline, `light_ns` of the sender's clock, the others of this host's.
 
     `q` is the attitude at `light_ns`, when the middle row lights, and `rate` (rad/s, cam) the turn for which paths were
-    drawn, null where stars are points. `velocity_km_s` (ICRS) is that for which stars are aberrated besides the bench file's.
+    drawn, null where stars are points. `velocity_km_s` (ICRS) is that for which stars are aberrated besides the bench file's,
+    `place_km` where the source has the observer about the Earth, null where the bench file says it.
     `capped` counts the stars whose paths are coarser than they should be, `missed_before` the refresh periods before it without
     a frame, `missed` those of the run, and `marker` is the photodiode square. `operator`
     says how an operator's keys changed the sky ("blank, grid"; under a blank or a patch `q` is null), `hidden` why the window
@@ -37,6 +38,7 @@ class FrameRecord(msgspec.Struct, kw_only=True):
     q: tuple[float, float, float, float] | None = None
     rate: tuple[float, float, float] | None = None
     velocity_km_s: tuple[float, float, float] | None = None
+    place_km: tuple[float, float, float] | None = None
     attitude_sequence: int | None = None
     attitude_t_ns: AnyNs | None = None
     receive_ns: HostNs | None = None
@@ -138,6 +140,9 @@ def frame_record(shown: Shown, light_ns: int, missed: int, below_step: int) -> F
         if attitude.velocity_km_s is not None:
             x, y, z = attitude.velocity_km_s.tolist()
             record.velocity_km_s = (x, y, z)
+        if attitude.place_km is not None:
+            x, y, z = attitude.place_km.tolist()
+            record.place_km = (x, y, z)
         record.attitude_sequence = attitude.sequence
         record.attitude_t_ns = _within_64_bits(light_ns - attitude.age_ns)
         record.receive_ns = attitude.received_ns

@@ -24,6 +24,7 @@ INSTALL = "pip install 'hilstar[bodies]'"
 # planet's own: Jupiter's moons move Jupiter by 230 km, Saturn's Saturn by 300 km.
 EARTH = ((0, 3), (3, 399))
 CHAINS: dict[str, tuple[tuple[int, int], ...]] = {
+    "Earth": EARTH,  # from its own centre: no way at all
     "Sun": ((0, 10),),
     "Moon": ((0, 3), (3, 301)),
     "Mercury": ((0, 1),),

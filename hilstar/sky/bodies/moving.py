@@ -1,8 +1,8 @@
 """The part of a bench's sky that moves: bodies, and with the observer's velocity the aberration of all stars.
 
-What is costly is computed seldom: places by the ephemeris once in three hours, with cubics between them; apparent places at
-steps of the observer's orbit, with straight lines between them; magnitudes once a minute. All of it depends on the time alone,
-so a replay draws the same light.
+What is costly is computed seldom: places by the ephemeris once in three hours, with cubics between them; apparent places and
+magnitudes at steps of the observer's orbit, the places with straight lines between them. All of it depends on the time alone,
+so a replay draws the same light. For an observer whose place comes with each frame it is all computed with each frame.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from hilstar.errors import InputError
 from hilstar.sky.astrometry import aberrate
 from hilstar.sky.bodies.apparent import Viewpoint, apparent_bodies, apparent_stars
 from hilstar.sky.bodies.disc import Disc, Law, lunar_share
+from hilstar.sky.bodies.earth import DARK_V_MAG, EARTH, EQUATOR_KM, apparent_cone, at_centre, earth_disc, earth_light
 from hilstar.sky.bodies.kernel import DAY_S, Kernel, tdb_of_utc
 from hilstar.sky.bodies.magnitudes import body_v_mag, phase_angle_deg
 from hilstar.sky.bodies.orbit import Orbit
@@ -39,6 +40,7 @@ RADII_KM = {
     "Saturn": 60_268.0,
     "Uranus": 25_559.0,
     "Neptune": 24_764.0,
+    EARTH: EQUATOR_KM,
 }
 # Polar, and poles (right ascension and declination, degrees), of those that are flat enough to see: the same source
 POLAR_KM = {"Jupiter": 66_854.0, "Saturn": 54_364.0, "Uranus": 24_973.0, "Neptune": 24_341.0}
@@ -52,7 +54,7 @@ LAWS: dict[str, Law] = {"Sun": "limb-darkened", "Moon": "lunar-lambert"}  # plan
 NORTH = np.array([0.0, 0.0, 1.0])
 # The ephemeris takes 3 ms for all bodies at the ends of this time and twice between; cubics through them are within 0.1 mas.
 SPAN_S = 3 * 3600
-SPAN_NS, MINUTE_NS = SPAN_S * NS_PER_S, 60 * NS_PER_S
+SPAN_NS = SPAN_S * NS_PER_S
 YEAR_NS = 31_557_600 * NS_PER_S
 EDGE_DAYS = 1.0  # light time, and the cubics
 # A change of velocity that is left out, as aberrating all stars in view anew takes as long as their projection: 0.02 arcsec,
@@ -74,12 +76,28 @@ class Span:
 
 
 @dataclass(frozen=True, slots=True)
+class Moment:
+    """A time since the start, and the observer's state about the Earth, km and km/s, where it comes with the frame."""
+
+    since_ns: int
+    state: tuple[float, float, float, float, float, float] | None = None
+
+
+START = Moment(0)
+
+
+@dataclass(frozen=True, slots=True)
 class Sight:
-    """What an observer sees at a moment: vectors (n, 3) to the bodies in km, its viewpoint, and the bodies' unit vectors."""
+    """What an observer sees at a moment: vectors (n, 3) to the bodies in km, its viewpoint, and the bodies' unit vectors.
+
+    An Earth about the observer stands anywhere. `place_km` and `about_earth_km_s` (3,) are the observer's about its centre.
+    """
 
     seen_km: FloatArray
     view: Viewpoint
     directions: FloatArray
+    place_km: FloatArray
+    about_earth_km_s: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,19 +127,20 @@ class MovingSky:
         self._epoch = tdb_of_utc(self._utc_ns)
         self._tracked = ("Sun", *(name for name in names if name != "Sun"))
         self._drawn = [self._tracked.index(name) for name in names]
+        self._earth = names.index(EARTH) if EARTH in names else None
         self._radii_km = np.array([RADII_KM[name] for name in names])
         self._limits_ns = self._limits()
         self._step_ns = round(orbit.step_s * NS_PER_S)
         self._span: Callable[[int], Span] = lru_cache(maxsize=2)(self._compute_span)
-        self._node: Callable[[int], FloatArray] = lru_cache(maxsize=2)(self._compute_node)
-        self._faces: Callable[[int], dict[str, Disc]] = lru_cache(maxsize=1)(self._compute_faces)
-        self._light: Callable[[int], tuple[FloatArray, FloatArray]] = lru_cache(maxsize=1)(self._compute_light)
+        self._node: Callable[[Moment], FloatArray] = lru_cache(maxsize=2)(self._compute_node)
+        self._light: Callable[[Moment], tuple[FloatArray, FloatArray]] = lru_cache(maxsize=1)(self._compute_light)
+        self._face: Callable[[Moment, int], Disc] = lru_cache(maxsize=len(names) + 1)(self._compute_face)
         self._told = False
-        self._fixed_km_s = self._seen_from(0)[1].velocity_km_s
+        self._fixed_km_s = self._seen_from(START).view.velocity_km_s
 
     def stars_seen(self, directions: FloatArray, parallax_mas: FloatArray) -> FloatArray:
         """Unit vectors (n, 3) of stars in directions (n, 3) from the barycentre, as they are seen at the start."""
-        return apparent_stars(directions, parallax_mas, self._seen_from(0)[1])
+        return apparent_stars(directions, parallax_mas, self._seen_from(START).view)
 
     def among(self, stars: Stars) -> Stars:
         """The stars with the bodies among them at the start, in arrays of their own, which `seen` changes."""
@@ -129,19 +148,29 @@ class MovingSky:
         self.seen(both)
         return both
 
-    def seen(self, stars: Stars, t_ns: int | None = None, velocity_km_s: FloatArray | None = None) -> Stars:
+    def seen(
+        self,
+        stars: Stars,
+        t_ns: int | None = None,
+        velocity_km_s: FloatArray | None = None,
+        place_km: FloatArray | None = None,
+    ) -> Stars:
         """Stars made by `among` as they are seen at a moment (None: the start): bodies are moved there, in the arrays.
 
-        A velocity (3,), ICRS, adds to that of this sky's observer.
+        A velocity (3,), ICRS, adds to that of this sky's observer, and a place (3,), from the Earth's centre, to its place.
         """
-        since_ns = self._within(t_ns)
-        now = self._at(since_ns)
+        moment = self._moment(t_ns, velocity_km_s, place_km)
+        now = self._at(moment)
         count = len(self.names)
+        velocity = _against_start(now, velocity_km_s)
         if count:
-            stars.vectors[-count:] = now[:count, :3]
-            stars.grid.centre[-count:] = now[:count, :3]
-            stars.v_mag[-count:], stars.electrons_per_s[-count:] = self._light(since_ns // MINUTE_NS)
-        return stars.seen_at(_against_start(now, velocity_km_s))
+            vectors = now[:count, :3].copy()
+            if self._earth is not None and velocity is not None:
+                vectors[[self._earth]] = aberrate(vectors[[self._earth]], -velocity)  # its aberration is its own
+            stars.vectors[-count:] = vectors
+            stars.grid.centre[-count:] = vectors
+            stars.v_mag[-count:], stars.electrons_per_s[-count:] = self._light(self._step(moment))
+        return stars.seen_at(velocity)
 
     def discs(
         self,
@@ -150,61 +179,88 @@ class MovingSky:
         wider_than_rad: float = 0.0,
         t_ns: int | None = None,
         velocity_km_s: FloatArray | None = None,
+        place_km: FloatArray | None = None,
     ) -> list[Disc]:
         """The bodies wider than that, any part of which is within `reach_rad` of `axis` (3,), nearest first; else as `seen`.
 
-        Places and sizes are the moment's, light and the Sun's direction the minute's.
+        Places and sizes are the moment's, light and the Sun's direction those of the last step of the orbit.
         """
         if not self.names:
             return []
-        since_ns = self._within(t_ns)
-        now = self._at(since_ns)
+        moment = self._moment(t_ns, velocity_km_s, place_km)
+        now = self._at(moment)
         radius_rad = now[:-1, 4]
         near = now[:-1, :3] @ axis > np.cos(np.minimum(reach_rad + radius_rad, np.pi))
         near &= 2 * radius_rad > wider_than_rad
         if not near.any():
             return []
-        directions, velocity = now[:-1][near, :3], _against_start(now, velocity_km_s)
+        directions, velocity = now[:-1, :3].copy(), _against_start(now, velocity_km_s)
+        others = near if self._earth is None else near & (np.arange(len(near)) != self._earth)
         if velocity is not None:
-            directions = aberrate(directions, velocity)
+            directions[others] = aberrate(directions[others], velocity)
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        faces = self._faces(since_ns // MINUTE_NS)
-        found = [
-            _moved(faces[self.names[i]], direction, float(now[i, 3]))
-            for i, direction in zip(np.flatnonzero(near), directions, strict=True)
-        ]
+        step = self._step(moment)
+        found = [_moved(self._face(step, i), directions[i], float(now[i, 3])) for i in np.flatnonzero(near).tolist()]
         return sorted(found, key=lambda disc: disc.distance_km)
 
-    def _at(self, since_ns: int) -> FloatArray:
+    def _moment(self, t_ns: int | None, velocity_km_s: FloatArray | None, place_km: FloatArray | None) -> Moment:
+        """A time since the start, held within the ephemeris, with the observer's state about the Earth where it is given."""
+        since_ns = self._within(t_ns)
+        if place_km is None:
+            return Moment(since_ns)
+        x, y, z = place_km.tolist()
+        u, v, w = (0.0, 0.0, 0.0) if velocity_km_s is None else velocity_km_s.tolist()
+        return Moment(since_ns, (x, y, z, u, v, w))
+
+    def _step(self, moment: Moment) -> Moment:
+        """The last step of the orbit; where the observer's state comes with the frame, the moment itself."""
+        return Moment(moment.since_ns // self._step_ns * self._step_ns) if moment.state is None else moment
+
+    def _at(self, moment: Moment) -> FloatArray:
         """A node's rows (see `_compute_node`) at any moment."""
-        k, rest_ns = divmod(since_ns, self._step_ns)
-        node = self._node(k)
-        return node + (self._node(k + 1) - node) * (rest_ns / self._step_ns)
+        if moment.state is not None:
+            return self._node(moment)
+        first = self._step(moment)
+        node = self._node(first)
+        share = (moment.since_ns - first.since_ns) / self._step_ns
+        return node + (self._node(Moment(first.since_ns + self._step_ns)) - node) * share
 
     def sight(self, since_ns: int) -> Sight:
         """What is seen at a moment, the directions aberrated by the observer's velocity at the start; Sun first."""
-        seen_km, view = self._seen_from(since_ns)
-        return Sight(seen_km, view, apparent_bodies(seen_km, replace(view, velocity_km_s=self._fixed_km_s)))
+        return self._sight(Moment(since_ns))
 
-    def _seen_from(self, since_ns: int) -> tuple[FloatArray, Viewpoint]:
-        span, rest_ns = divmod(since_ns, SPAN_NS)
+    def _sight(self, moment: Moment) -> Sight:
+        seen = self._seen_from(moment)
+        return replace(seen, directions=apparent_bodies(seen.seen_km, replace(seen.view, velocity_km_s=self._fixed_km_s)))
+
+    def _seen_from(self, moment: Moment) -> Sight:
+        """What is seen at a moment, but for the directions."""
+        span, rest_ns = divmod(moment.since_ns, SPAN_NS)
         cubics = self._span(span)
         share = rest_ns / SPAN_NS
         powers, slopes = share**EXPONENTS, EXPONENTS * share ** np.maximum(EXPONENTS - 1, 0) / SPAN_S
-        place_km, velocity_km_s = self._orbit.state(self._utc_ns + since_ns)
+        place_km, about_km_s = self._orbit.state(self._utc_ns + moment.since_ns)
         from_earth_km, earth_km_s = np.tensordot(powers, cubics.seen_km, 1), powers @ cubics.earth_km_s
+        velocity_km_s = earth_km_s + about_km_s
+        if moment.state is not None:
+            place_km, about_km_s = np.array(moment.state[:3]), np.array(moment.state[3:])
         seen_km = from_earth_km - place_km
         # Light takes another time to the observer than to the Earth's centre: 22 ms at most in a low orbit, 700 m of the Moon
         later_s = (np.linalg.norm(seen_km, axis=1) - np.linalg.norm(from_earth_km, axis=1)) / LIGHT_KM_S
         seen_km -= (np.tensordot(slopes, cubics.seen_km, 1) + earth_km_s) * later_s[:, None]
-        return seen_km, Viewpoint(powers @ cubics.earth_km + place_km, earth_km_s + velocity_km_s, -seen_km[0])
+        if EARTH in self._tracked and at_centre(place_km):
+            seen_km[self._tracked.index(EARTH)] = NORTH
+        view = Viewpoint(powers @ cubics.earth_km + place_km, velocity_km_s, -seen_km[0])
+        return Sight(seen_km, view, np.empty((0, 3)), place_km, about_km_s)
 
     def diameters_arcsec(self, t_ns: int | None = None) -> dict[str, float]:
         """The apparent equatorial diameter of each body, arcsec."""
-        distance_km = np.linalg.norm(self.sight(self._within(t_ns)).seen_km[self._drawn], axis=1)
+        sight = self.sight(self._within(t_ns))
+        distance_km = np.linalg.norm(sight.seen_km[self._drawn], axis=1)
         return {
-            name: 2 * float(np.arcsin(RADII_KM[name] / d)) * ARCSEC_PER_RAD
+            name: 2 * float(np.arcsin(min(1.0, RADII_KM[name] / d))) * ARCSEC_PER_RAD
             for name, d in zip(self.names, distance_km, strict=True)
+            if name != EARTH or not at_centre(sight.place_km)
         }
 
     def _compute_span(self, span: int) -> Span:
@@ -214,42 +270,63 @@ class MovingSky:
         seen_km = [self._kernel.seen_km(name, date.whole, part, earth_km) for name in self._tracked]
         return Span(np.tensordot(CUBIC, np.stack(seen_km, axis=1), 1), CUBIC @ earth_km, CUBIC @ earth_km_s)
 
-    def _compute_node(self, k: int) -> FloatArray:
-        """Rows of the bodies' unit vectors, distances, km, and radii, rad; last the change of the observer's velocity."""
-        sight = self.sight(k * self._step_ns)
+    def _compute_node(self, moment: Moment) -> FloatArray:
+        """Rows of the bodies' unit vectors, distances, km, and radii, rad; last the change of the observer's velocity.
+
+        The Earth's is its disc's middle as it is seen, all aberration included.
+        """
+        sight = self._sight(moment)
         node = np.zeros((len(self.names) + 1, 5))
         node[:-1, :3] = sight.directions[self._drawn]
-        node[:-1, 3] = distance_km = np.linalg.norm(sight.seen_km[self._drawn], axis=1)
-        node[:-1, 4] = np.arcsin(np.minimum(1.0, self._radii_km / distance_km))
+        node[:-1, 3] = np.linalg.norm(sight.seen_km[self._drawn], axis=1)
+        if self._earth is not None and at_centre(sight.place_km):
+            node[self._earth] = np.nan  # nowhere in view
+        elif self._earth is not None:
+            node[self._earth, :3], node[self._earth, 3] = apparent_cone(-sight.place_km, sight.about_earth_km_s)
+        node[:-1, 4] = np.arcsin(np.minimum(1.0, self._radii_km / node[:-1, 3]))
         node[-1, :3] = sight.view.velocity_km_s - self._fixed_km_s
         return node
 
-    def _compute_faces(self, minute: int) -> dict[str, Disc]:
-        """Each body's disc at a minute, with its light."""
-        sight, rates = self.sight(minute * MINUTE_NS), self._light(minute)[1]
-        faces = {}
-        for i, name, rate in zip(self._drawn, self.names, rates, strict=True):
-            seen_km, sun_km = sight.seen_km[i], sight.seen_km[0] - sight.seen_km[i]
-            phase_deg = 0.0 if name == "Sun" else phase_angle_deg(-sun_km, seen_km)
-            disc = Disc(
-                name=name,
-                direction=sight.directions[i],
-                distance_km=float(np.linalg.norm(seen_km)),
-                equator_km=RADII_KM[name],
-                polar_km=POLAR_KM.get(name, RADII_KM[name]),
-                pole=_pole(name),
-                sun=NORTH if name == "Sun" else sun_km / np.linalg.norm(sun_km),
-                law=LAWS.get(name, "lambert"),
-                lunar_share=lunar_share(phase_deg) if name == "Moon" else 1.0,
-            )
-            faces[name] = disc.of_rate(float(rate))
-        return faces
+    def _compute_face(self, moment: Moment, i: int) -> Disc:
+        """The disc of a drawn body, with its light."""
+        sight, name, rate = self._sight(moment), self.names[i], float(self._light(moment)[1][i])
+        if name == EARTH:
+            return self._earth_disc(sight)
+        row = self._drawn[i]
+        seen_km, sun_km = sight.seen_km[row], sight.seen_km[0] - sight.seen_km[row]
+        phase_deg = 0.0 if name == "Sun" else phase_angle_deg(-sun_km, seen_km)
+        disc = Disc(
+            name=name,
+            direction=sight.directions[row],
+            distance_km=float(np.linalg.norm(seen_km)),
+            equator_km=RADII_KM[name],
+            polar_km=POLAR_KM.get(name, RADII_KM[name]),
+            pole=_pole(name),
+            sun=NORTH if name == "Sun" else sun_km / np.linalg.norm(sun_km),
+            law=LAWS.get(name, "lambert"),
+            lunar_share=lunar_share(phase_deg) if name == "Moon" else 1.0,
+        )
+        return disc.of_rate(rate)
 
-    def _compute_light(self, minute: int) -> tuple[FloatArray, FloatArray]:
-        sight, jyear = self.sight(minute * MINUTE_NS), self._jyear(minute * 60.0)
+    def _earth_disc(self, sight: Sight) -> Disc:
+        v0_e_per_s = float(self._bodies.v0_e_per_s[self.names.index(EARTH)])
+        from_sun_km = sight.view.from_sun_km - sight.place_km
+        return earth_disc(-sight.place_km, from_sun_km, sight.about_earth_km_s, v0_e_per_s)
+
+    def _compute_light(self, moment: Moment) -> tuple[FloatArray, FloatArray]:
+        sight, jyear = self._sight(moment), self._jyear(moment.since_ns / NS_PER_S)
         from_sun_km = sight.seen_km + sight.view.from_sun_km
-        v_mag = np.array([body_v_mag(self._tracked[i], from_sun_km[i], sight.seen_km[i], jyear) for i in self._drawn])
-        return v_mag, self._bodies.v0_e_per_s * flux_ratio(v_mag)
+        v_mag = np.array(
+            [
+                DARK_V_MAG if name == EARTH else body_v_mag(name, from_sun_km[row], sight.seen_km[row], jyear)
+                for row, name in zip(self._drawn, self.names, strict=True)
+            ]
+        )
+        rates = self._bodies.v0_e_per_s * flux_ratio(v_mag)
+        if self._earth is not None and not at_centre(sight.place_km):
+            disc = self._earth_disc(sight)
+            v_mag[self._earth], rates[self._earth] = earth_light(disc, float(self._bodies.v0_e_per_s[self._earth]))
+        return v_mag, rates
 
     def _jyear(self, seconds: float) -> float:
         date = self._epoch.after(seconds)

@@ -206,7 +206,13 @@ def test_an_aem_s_dates_and_an_oem_alongside_that_covers_minutes_of_its_day(bodi
             "follows from the ephemeris; leave it out",
         ),
         (DATED + '[spacecraft]\norbit = "none.tle"\n', "none.tle: cannot be read"),
-        (DATED + "[sky.bodies]\nearth = true\n", "unknown key earth"),
+        (DATED + "[sky.bodies]\nearth = true\n", "from its centre no Earth is seen; write [spacecraft] orbit ="),
+        (DATED + '[sky.bodies]\nearth = true\n[spacecraft]\norbit = "geocentre"\n', "from its centre no Earth is seen"),
+        (DATED + '[spacecraft]\norbit = "source"\n', 'only "vizard" (Basilisk) sends the spacecraft\'s place'),
+        (
+            DATED + '[spacecraft]\norbit = "source"\n[attitude]\nsource = "vizard"\nuse_velocity = false\n',
+            "takes the source's place and velocity; leave use_velocity out",
+        ),
         ('[sky]\nepoch_utc = "1850-01-01T00:00:00Z"\n[sky.bodies]\nmoon = true\n', "the ephemeris covers 1899-07-30 to"),
     ],
 )

@@ -104,10 +104,16 @@ def test_stars_of_every_frame_are_where_basilisk_s_truth_has_them(broadcast):
 
 
 def test_in_lockstep_every_step_is_one_frame(tmp_path):
-    """As fast as both go: two seconds of simulation in forty steps."""
+    """As fast as both go: two seconds of simulation in forty steps, each with the place from which the Earth is seen."""
     port = free_port()
     attitude = {"source": "vizard", "lockstep": True, "endpoint": f"tcp://127.0.0.1:{port}"}
-    (tmp_path / "bench.toml").write_text(bench_text(BENCH, {"attitude": attitude}))
+    seen = {
+        "attitude": attitude,
+        "sky": {"epoch_utc": "2026-11-21T00:00:00Z"},
+        "sky.bodies": {"earth": True, "moon": True},
+        "spacecraft": {"orbit": "source"},
+    }
+    (tmp_path / "bench.toml").write_text(bench_text(BENCH, seen))
     scenario = {"mode": "liveStream", "port": port, "shown_s": 0.05, "stops_s": [2.0]}
     with (
         basilisk(tmp_path, **scenario, spacecraft={"chaser": CHASER}) as simulation,
@@ -119,8 +125,11 @@ def test_in_lockstep_every_step_is_one_frame(tmp_path):
     assert [frame["t_ns"] for frame in frames] == [50_000_000 * k for k in range(1, 41)]
     assert summary["packets"]["received"] == summary["packets"]["accepted"] == 40
     for frame in frames:
-        true = rotation(MOUNTING) * truth.body_from_n[truth.row(frame["t_ns"])]
+        row = truth.row(frame["t_ns"])
+        true = rotation(MOUNTING) * truth.body_from_n[row]
         assert (rotation(frame["q"]) * true.inv()).magnitude() < SAMPLE_LIMIT_RAD
+        assert frame["place_km"] == pytest.approx(truth.r_bn_n[row] / 1000)
+        assert frame["velocity_km_s"] == pytest.approx(truth.v_bn_n[row] / 1000)
 
 
 def test_two_spacecraft_and_no_name_end_the_simulation_with_their_names(tmp_path):

@@ -45,12 +45,13 @@ def basilisk(folder: Path, **scenario: Any) -> Iterator[Basilisk]:
 
 
 class Truth:
-    """What Basilisk recorded: times (ns, since the beginning), attitudes, rates (rad/s, body), velocity (m/s, N)."""
+    """What Basilisk recorded: times (ns, since the beginning), attitudes, rates (rad/s, body), v and r (m/s and m, N)."""
 
     def __init__(self, folder: Path) -> None:
         with np.load(folder / "truth.npz") as table:
             self.t_ns, self.sigma_bn = table["t_ns"].astype(np.int64), table["sigma_bn"]
             self.omega_bn_b, self.v_bn_n = table["omega_bn_b"], table["v_bn_n"]
+            self.r_bn_n = table["r_bn_n"]
         # SciPy's MRPs turn the vector, Basilisk's the frame: [BN] is the inverse.
         self.body_from_n = Rotation.from_mrp(self.sigma_bn).inv()
 

@@ -77,6 +77,7 @@ def run(scenario: dict[str, Any]) -> None:
         if scenario.get("camera"):
             save_picture(viz, scenario["pictures"])
     columns = {"t_ns": truth.times(), "sigma_bn": truth.sigma_BN, "omega_bn_b": truth.omega_BN_B, "v_bn_n": truth.v_BN_N}
+    columns["r_bn_n"] = truth.r_BN_N
     np.savez(scenario["truth"], **columns)
 
 

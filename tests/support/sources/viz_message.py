@@ -24,8 +24,15 @@ FIELDS: dict[str, list[tuple[str, int, str, bool]]] = {
         ("cameraDir_B", 8, "double", True),
         ("renderRate", 9, "uint64", False),
     ],
+    "CelestialBody": [
+        ("bodyName", 1, "string", False),
+        ("position", 2, "double", True),
+        ("velocity", 3, "double", True),
+        ("rotation", 4, "double", True),
+    ],
     "VizMessage": [
         ("currentTime", 1, "TimeStamp", False),
+        ("celestialBodies", 2, "CelestialBody", True),
         ("spacecraft", 3, "Spacecraft", True),
         ("cameras", 4, "CameraConfig", True),
     ],
@@ -57,9 +64,10 @@ def viz_message(
     spacecraft: list[dict[str, Any]] | None = None,
     cameras: list[dict[str, Any]] | None = None,
     frame: int = 7,
+    bodies: list[dict[str, Any]] | None = None,
 ) -> bytes:
     """A VizMessage; without a time where `t_ns` is None."""
-    whole = _CLASSES["VizMessage"](spacecraft=spacecraft or [], cameras=cameras or [])
+    whole = _CLASSES["VizMessage"](spacecraft=spacecraft or [], cameras=cameras or [], celestialBodies=bodies or [])
     if t_ns is not None:
         whole.currentTime.frameNumber, whole.currentTime.simTimeElapsed = frame, t_ns
     return whole.SerializeToString()

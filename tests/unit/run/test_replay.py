@@ -38,7 +38,7 @@ def ledger(tmp_path, small_bench_file):
     return earlier_run(tmp_path / "run.mcap", small_bench_file)
 
 
-def earlier_run(path, small_bench_file, speed_km_s=0.0):
+def earlier_run(path, small_bench_file, speed_km_s=0.0, away_km=0.0):
     """Ten frames, one each 20 ms, the fourth of them blank, the last four aberrated, the last two on paths."""
     bench = SimpleNamespace(
         file=SimpleNamespace(path=small_bench_file, text=SMALL_BENCH, sha256="0" * 64),
@@ -53,6 +53,7 @@ def earlier_run(path, small_bench_file, speed_km_s=0.0):
             at_ns = 20_000_000 * k
             frame = FrameRecord(frame=2 * k, t_ns=500 + k, light_ns=0, draw_ns=at_ns, swap_ns=at_ns, q=q, rate=rate)
             frame.velocity_km_s = (0.0, 7.5, speed_km_s) if k >= 6 else None
+            frame.place_km = (7000.0 + away_km, 0.0, 1.0) if k >= 6 else None
             kept.frame(frame)
     return path
 
@@ -117,6 +118,15 @@ def test_a_part_of_an_earlier_run_is_chosen_by_when_its_frames_were_swapped(ledg
         plan_play(ledger, Wanted(start_s=0.041, stop_s=0.042), config)
     with pytest.raises(InputError, match="frame by frame"):
         plan_play(ledger, Wanted(2.0), config)
+
+
+def test_a_source_s_place_is_there_again_and_no_other_than_an_orbit_s(ledger, config, tmp_path, small_bench_file):
+    places = [frame[2].place_km for frame in map(plan_play(ledger, Wanted(speed=MAX), config).frame, (5, 6))]
+    assert places[0] is None
+    assert places[1].tolist() == [7000.0, 0.0, 1.0]
+    far = earlier_run(tmp_path / "far.mcap", small_bench_file, away_km=1e8)
+    with pytest.raises(InputError, match="message 7 of /frame: a place beyond 6000 to"):
+        plan_play(far, Wanted(speed=MAX), config)
 
 
 def test_stars_that_were_aberrated_are_so_again_and_no_faster_than_a_spacecraft(ledger, config, tmp_path, small_bench_file):

@@ -8,19 +8,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 
 from hilstar.arrays import FloatArray
-from hilstar.attitude.wire.packet import MAX_SPEED_KM_S, U32, AttitudeSample, Refusal, checked_sample
+from hilstar.attitude.wire.packet import U32, AttitudeSample, Refusal, checked_sample
 from hilstar.attitude.wire.source import Conventions, Mounting
 from hilstar.attitude.wire.vizard.message import SimUpdate, Spacecraft, decode_update
+from hilstar.attitude.wire.vizard.state import named, state_about_earth, velocity_km_s
 from hilstar.attitude.wire.vizard.wire_format import WireFormatError
 from hilstar.errors import printable, shortened
 from hilstar.rotation import rate_between_rad_s
 from hilstar.units import NS_PER_S
 
-M_PER_KM = 1000.0
 MAX_NAMES = 8  # of spacecraft, in a refusal
 
 
@@ -44,6 +45,9 @@ def _written(q: FloatArray) -> str:
 
 TURNS = "sigma_BN turns components of Basilisk's inertial frame N, taken as ICRS (J2000), into body components"
 VELOCITY = "the spacecraft's velocity, added to [sky] observer_velocity_km_s, aberrates the stars"
+PLACE = "its place and velocity about the Earth (at N's origin, where the message has none) are those of the observer"
+Taken = Literal["attitude", "velocity", "state"]  # of a message, besides the attitude
+TOLD: dict[Taken, tuple[str, ...]] = {"attitude": (), "velocity": (VELOCITY,), "state": (PLACE,)}
 
 CONVENTIONS = Conventions(
     "Basilisk's Vizard stream",
@@ -93,13 +97,14 @@ class DifferenceRates:
 class Follower:
     """The attitudes of one spacecraft from messages: that of the `name`, or the only one there is.
 
-    Each has the spacecraft's velocity with respect to the origin of Basilisk's frame, `with_velocity`.
+    Each has the spacecraft's velocity with respect to the origin of Basilisk's frame, of `taken` "velocity"; or its place and
+    velocity about the Earth, of "state".
     """
 
-    def __init__(self, name: str | None, mounting: Mounting, rates: DifferenceRates, *, with_velocity: bool = False) -> None:
+    def __init__(self, name: str | None, mounting: Mounting, rates: DifferenceRates, taken: Taken = "attitude") -> None:
         self._name, self._mounting, self._rates = name, mounting, rates
-        self._with_velocity = with_velocity
-        self.conventions = replace(CONVENTIONS, turns=f"{TURNS}; {VELOCITY}") if with_velocity else CONVENTIONS
+        self._taken = taken
+        self.conventions = replace(CONVENTIONS, turns="; ".join((TURNS, *TOLD[taken])))
 
     def take(self, message: bytes) -> tuple[AttitudeSample | Refusal, SimUpdate | None]:
         """The camera's attitude in a VizMessage, or why there is none; and the message itself where it is one."""
@@ -111,15 +116,23 @@ class Follower:
         if isinstance(chosen, Refusal):
             return chosen, update
         if len(chosen.sigma_bn) != 3:
-            what = f"spacecraft {_named(chosen)}: {len(chosen.sigma_bn)} components of its rotation (sigma_BN), not 3"
+            what = f"spacecraft {named(chosen)}: {len(chosen.sigma_bn)} components of its rotation (sigma_BN), not 3"
             return Refusal("format", what), update
         sample = checked_sample(update.t_ns, quaternion_of_mrp(chosen.sigma_bn), None, update.frame % U32)
-        velocity = _velocity_km_s(chosen) if self._with_velocity else None
-        if isinstance(velocity, Refusal):
-            return velocity, update
+        state = self._state(update, chosen)
+        if isinstance(state, Refusal):
+            return state, update
         if isinstance(sample, AttitudeSample):
-            sample = self._mounting.sample(self._rates.moving(replace(sample, velocity_km_s=velocity)))
+            sample = replace(sample, place_km=state[0], velocity_km_s=state[1])
+            sample = self._mounting.sample(self._rates.moving(sample))
         return sample, update
+
+    def _state(self, update: SimUpdate, craft: Spacecraft) -> tuple[FloatArray | None, FloatArray | None] | Refusal:
+        """Place and velocity, as far as they are taken."""
+        if self._taken == "state":
+            return state_about_earth(update, craft)
+        velocity = velocity_km_s(craft) if self._taken == "velocity" else None
+        return velocity if isinstance(velocity, Refusal) else (None, velocity)
 
     def _chosen(self, spacecraft: tuple[Spacecraft, ...]) -> Spacecraft | Refusal:
         """The spacecraft that is followed; parts of others (a parent is named) are taken only by their own name."""
@@ -129,21 +142,8 @@ class Follower:
             found = [craft for craft in spacecraft if craft.name == self._name]
         if len(found) == 1:
             return found[0]
-        names = ", ".join(map(_named, (found if self._name is None else spacecraft)[:MAX_NAMES])) or "none"
+        names = ", ".join(map(named, (found if self._name is None else spacecraft)[:MAX_NAMES])) or "none"
         if self._name is None:
             return Refusal("format", f'spacecraft: {names}; write the one that is meant, [attitude] spacecraft = "NAME"')
         wanted = shortened(printable(self._name))
         return Refusal("format", f"[attitude] spacecraft = {wanted}: {len(found)} have that name; there: {names}")
-
-
-def _velocity_km_s(craft: Spacecraft) -> FloatArray | Refusal:
-    speed_m_s = math.hypot(*craft.velocity_m_s)
-    if len(craft.velocity_m_s) == 3 and speed_m_s <= MAX_SPEED_KM_S * M_PER_KM:
-        return np.array(craft.velocity_m_s) / M_PER_KM
-    told = f"{speed_m_s:.3g} m/s" if craft.velocity_m_s else "nothing"
-    advice = f"it is {MAX_SPEED_KM_S:g} km/s at most; [attitude] use_velocity = false leaves it out"
-    return Refusal("format", f"spacecraft {_named(craft)}: its velocity is {told}, and {advice}")
-
-
-def _named(craft: Spacecraft) -> str:
-    return shortened(printable(craft.name)) or "one without a name"

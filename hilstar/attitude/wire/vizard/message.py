@@ -25,9 +25,9 @@ from hilstar.attitude.wire.vizard.wire_format import (
     as_text,
 )
 
-CURRENT_TIME, SPACECRAFT, CAMERAS = 1, 3, 4  # of a VizMessage
+CURRENT_TIME, CELESTIAL_BODIES, SPACECRAFT, CAMERAS = 1, 2, 3, 4  # of a VizMessage
 FRAME_NUMBER, SIM_TIME_ELAPSED = 1, 2  # of a TimeStamp
-NAME, POSITION, VELOCITY, ROTATION, PARENT_NAME = 1, 2, 3, 4, 19  # of a Spacecraft
+NAME, POSITION, VELOCITY, ROTATION, PARENT_NAME = 1, 2, 3, 4, 19  # of a Spacecraft; of a CelestialBody the first three
 CAMERA_ID, FIELD_OF_VIEW, RESOLUTION, CAMERA_DIR_B = 1, 3, 4, 8  # of a CameraConfig
 
 Components = tuple[float, ...]
@@ -49,6 +49,15 @@ class Spacecraft:
 
 
 @dataclass(frozen=True, slots=True)
+class CelestialBody:
+    """A planet of the simulation: position (m) and velocity (m/s) in N, with three components each or none."""
+
+    name: str = ""
+    position_m: Components = ()
+    velocity_m_s: Components = ()
+
+
+@dataclass(frozen=True, slots=True)
 class VizCamera:
     """A camera as Basilisk describes it to Vizard: degrees along its y axis, px, and `sigma` (MRP) from its body to Unity's."""
 
@@ -66,6 +75,7 @@ class SimUpdate:
     frame: int
     spacecraft: tuple[Spacecraft, ...]
     cameras: tuple[VizCamera, ...]
+    bodies: tuple[CelestialBody, ...] = ()
 
 
 def decode_update(message: bytes) -> SimUpdate:
@@ -73,12 +83,16 @@ def decode_update(message: bytes) -> SimUpdate:
     stamp: dict[int, float] | None = None
     spacecraft: list[Spacecraft] = []
     cameras: list[VizCamera] = []
+    bodies: list[CelestialBody] = []
     reader = Reader()
     for number, kind, value in reader.fields(memoryview(message)):
         if number == CURRENT_TIME:
             stamp = (stamp or {}) | _time_stamp(reader.fields(as_message(kind, value)))
         elif number == SPACECRAFT:
             spacecraft.append(_spacecraft(reader.fields(as_message(kind, value))))
+        elif number == CELESTIAL_BODIES:
+            body = _spacecraft(reader.fields(as_message(kind, value)), (POSITION, VELOCITY))
+            bodies.append(CelestialBody(body.name, body.position_m, body.velocity_m_s))
         elif number == CAMERAS:
             cameras.append(_camera(reader.fields(as_message(kind, value))))
     if stamp is None:
@@ -86,7 +100,7 @@ def decode_update(message: bytes) -> SimUpdate:
     time_ns = stamp.get(SIM_TIME_ELAPSED, 0.0)
     if not math.isfinite(time_ns) or round(time_ns) not in INT64:
         raise WireFormatError(f"simTimeElapsed {time_ns:g} ns")
-    return SimUpdate(round(time_ns), int(stamp.get(FRAME_NUMBER, 0)), tuple(spacecraft), tuple(cameras))
+    return SimUpdate(round(time_ns), int(stamp.get(FRAME_NUMBER, 0)), tuple(spacecraft), tuple(cameras), tuple(bodies))
 
 
 def _time_stamp(fields: Iterator[Field]) -> dict[int, float]:
@@ -94,13 +108,13 @@ def _time_stamp(fields: Iterator[Field]) -> dict[int, float]:
     return {number: readers[number](kind, value) for number, kind, value in fields if number in readers}
 
 
-def _spacecraft(fields: Iterator[Field]) -> Spacecraft:
+def _spacecraft(fields: Iterator[Field], wanted: tuple[int, ...] = (POSITION, VELOCITY, ROTATION)) -> Spacecraft:
     texts: dict[int, str] = {}
     vectors: dict[int, Components] = {}
     for number, kind, value in fields:
         if number in {NAME, PARENT_NAME}:
             texts[number] = as_text(kind, value)
-        elif number in {POSITION, VELOCITY, ROTATION}:
+        elif number in wanted:
             vectors[number] = _extended(vectors.get(number, ()), as_doubles(kind, value), 3)
     position, velocity, rotation = (vectors.get(number, ()) for number in (POSITION, VELOCITY, ROTATION))
     return Spacecraft(texts.get(NAME, ""), texts.get(PARENT_NAME, ""), position, velocity, rotation)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -264,3 +266,37 @@ def test_a_rate_over_the_limit_is_refused_by_name_with_its_unit():
         assert word in refusal.detail
     rounded = np.float32([0.0, 0.0, MAX_RATE_RAD_S]).astype(float)  # 60 deg/s itself, as a packet carries it
     assert limited().add(AttitudeSample(0, START, rounded)) is None
+
+
+def orbiting(t_ms: float, **more) -> AttitudeSample:
+    """A circle of 7000 km, 7.5 km/s."""
+    angle = 7.5 / 7000 * t_ms / 1e3
+    place, ahead = 7000 * np.array([np.cos(angle), np.sin(angle), 0]), 7.5 * np.array([-np.sin(angle), np.cos(angle), 0])
+    return replace(sample(t_ms, **more), place_km=place, velocity_km_s=ahead)
+
+
+@pytest.mark.parametrize(
+    ("t_ms", "limit_km"),
+    [
+        (-5.0, 0.04),  # the first sample's, 5 ms away
+        (0.0, 1e-12),
+        (4000.0, 1e-5),  # of a cubic: the jerk's derivative, 1e-8 km/s^4, times (10 s)^4 / 384, is 3e-7
+        (10_080.0, 3e-5),  # straight on: 8e-3 km/s^2 (80 ms)^2 / 2
+        (10_100.0, 5e-5),
+    ],
+)
+def test_an_observer_s_place_is_on_its_orbit_between_samples_and_straight_on_for_as_long_as_predicted(t_ms, limit_km):
+    timeline = filled(orbiting(0), orbiting(10_000), max_extrapolation_ms=100)
+    found = timeline.at(round(t_ms * 1e6))
+    assert found is not None
+    assert np.linalg.norm(found.place_km - orbiting(t_ms).place_km) < limit_km
+    held = timeline.at(60_000_000_000)
+    assert held is not None
+    assert np.linalg.norm(held.place_km - orbiting(10_100).place_km) < 5e-5
+
+
+def test_an_observer_s_place_does_not_go_across_a_jump():
+    timeline = filled(orbiting(0), orbiting(1_000_000, discontinuity=True), max_extrapolation_ms=100)
+    before = timeline.at(900_000_000_000)
+    assert before is not None
+    assert np.linalg.norm(before.place_km - orbiting(100).place_km) < 5e-5

@@ -198,7 +198,7 @@ def test_any_other_choice_is_refused_by_the_names_that_are_there(names, wanted, 
         (b"\x08\x05", "format", "wire type 0 where a message or a text is wanted"),
         (b"\x0a\x02\x10\x05", "format", "wire type 0 where a double is wanted"),
         (b"\x1a\x03\x22\x01\x00", "format", "1 bytes of doubles"),
-        (b"\x10\x01" * (MAX_FIELDS + 1), "format", f"over {MAX_FIELDS} fields"),
+        (b"\x28\x01" * (MAX_FIELDS + 1), "format", f"over {MAX_FIELDS} fields"),
         ((b"\x1a\x7e" + b"\x28\x01" * 63) * 30_000, "format", f"over {MAX_FIELDS} fields"),
         (b"\x1a\x80\x80\x80\x01" + b"\x22\xf8\xff\x7f" + bytes(2**21 - 4), "format", "bytes of numbers where a few are"),
     ],
@@ -288,7 +288,7 @@ def test_a_camera_that_is_not_the_bench_s_tracker_is_told_by_what_differs() -> N
 def test_a_velocity_goes_with_the_attitude_in_km_s_where_it_is_wanted() -> None:
     message = viz_message(spacecraft=[craft(velocity=[1000.0, -7500.0, 0.0])])
     rates = DifferenceRates(STEP_NS, 1.0)
-    with_it = taken(message, Follower(None, Mounting((0.0, 1.0, 0.0, 0.0)), rates, with_velocity=True))
+    with_it = taken(message, Follower(None, Mounting((0.0, 1.0, 0.0, 0.0)), rates, "velocity"))
     assert isinstance(with_it, AttitudeSample)
     assert with_it.velocity_km_s is not None
     assert with_it.velocity_km_s.tolist() == [1.0, -7.5, 0.0], "ICRS, which no mounting turns"
@@ -303,11 +303,51 @@ def test_a_velocity_goes_with_the_attitude_in_km_s_where_it_is_wanted() -> None:
     [([], "is nothing"), ([1.0, 2.0], "is 2.24 m/s"), ([3e8, 0, 0], "is 3e+08 m/s"), ([float("nan"), 0, 0], "is nan m/s")],
 )
 def test_a_velocity_that_is_none_is_refused_with_the_key_that_leaves_it_out(velocity, words) -> None:
-    by = Follower(None, Mounting(), DifferenceRates(STEP_NS, 1.0), with_velocity=True)
+    by = Follower(None, Mounting(), DifferenceRates(STEP_NS, 1.0), "velocity")
     refusal = taken(viz_message(spacecraft=[craft(velocity=velocity)]), by)
     assert isinstance(refusal, Refusal)
     assert words in refusal.detail
     assert "[attitude] use_velocity = false" in refusal.detail
+
+
+# Place
+
+
+RATES = DifferenceRates(STEP_NS, 1.0)
+SUN_CENTRED = {"bodyName": "earth", "position": [1.4e11, 2e10, 0.0], "velocity": [-4e3, 29e3, 0.0], "rotation": [1.0] * 9}
+
+
+@pytest.mark.parametrize("bodies", [[], [SUN_CENTRED], [{"bodyName": "sun", "position": [1.0, 2.0, 3.0]}, SUN_CENTRED]])
+def test_a_place_is_about_the_earth_wherever_the_message_has_it(bodies) -> None:
+    origin = SUN_CENTRED if bodies else {"position": [0.0] * 3, "velocity": [0.0] * 3}
+    here = craft(
+        position=[7e6 + origin["position"][0], origin["position"][1], -1e3],
+        velocity=[origin["velocity"][0], 7500.0 + origin["velocity"][1], 0.0],
+    )
+    by = Follower(None, Mounting((0.0, 1.0, 0.0, 0.0)), DifferenceRates(STEP_NS, 1.0), "state")
+    sample = taken(viz_message(spacecraft=[here], bodies=bodies), by)
+    assert isinstance(sample, AttitudeSample)
+    assert sample.place_km == pytest.approx([7000.0, 0.0, -1.0])
+    assert sample.velocity_km_s == pytest.approx([0.0, 7.5, 0.0])
+    assert "observer" in by.conventions.turns
+
+
+@pytest.mark.parametrize(
+    ("position", "words"),
+    [
+        ([], "is nowhere"),
+        ([7e6, 0.0], "is 7000 km from"),
+        ([7e3, 0, 0], "is 7 km from"),
+        ([1.5e11, 0, 0], "is 1.5e+08 km from"),
+        ([float("nan"), 0, 0], "is nan km"),
+        ([float("inf"), 0, 0], "is inf km"),
+    ],
+)
+def test_a_place_that_is_none_is_refused_with_what_is_taken(position, words) -> None:
+    refusal = taken(viz_message(spacecraft=[craft(position=position)]), Follower(None, Mounting(), RATES, "state"))
+    assert isinstance(refusal, Refusal)
+    assert words in refusal.detail
+    assert '[spacecraft] orbit = "source" takes 6000 to 1e+07 km' in refusal.detail
 
 
 # In Vizard's place

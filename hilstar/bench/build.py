@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
+from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile, read_bench_file
 from hilstar.bench.cameras import bench_camera
 from hilstar.bench.config import DEFAULT_BRIGHTEST_V_MAG, BenchConfig, RenderSettings, Tracker
@@ -155,13 +156,20 @@ def bench_stars(config: BenchConfig, folder: Path, moving: MovingSky | None = No
     elif any(sky.observer_velocity_km_s):
         vectors = aberrate(vectors, sky.observer_velocity_km_s)
     temperature_k = star_temperatures_k(catalog.bv_mag, sky.temperature)
-    optics = bench_optics(config.tracker, folder)
+    rates = star_rates_e_per_s(config, folder, catalog.v_mag, catalog.bv_mag, catalog.vi_mag)
+    return make_stars(catalog, vectors, temperature_k, rates)
+
+
+def star_rates_e_per_s(
+    config: BenchConfig, folder: Path, v_mag: FloatArray, bv_mag: FloatArray, vi_mag: FloatArray
+) -> FloatArray:
+    """The electron rates (n,) of stars of those magnitudes and colours on a bench's tracker; V-I may be NaN."""
+    sky, optics = config.sky, bench_optics(config.tracker, folder)
     photometry = Photometry(sky.zero_point, sky.passband_weighting)
     if sky.brightness == "dgs" and sky.spectrum == "pickles":
-        rates = tabulate_pickles(optics, photometry).electrons_per_s(catalog.v_mag, catalog.bv_mag, catalog.vi_mag)
-    else:
-        rates = tabulate(sky.brightness, optics, photometry).electrons_per_s(catalog.v_mag, temperature_k)
-    return make_stars(catalog, vectors, temperature_k, rates)
+        return tabulate_pickles(optics, photometry).electrons_per_s(v_mag, bv_mag, vi_mag)
+    temperature_k = star_temperatures_k(bv_mag, sky.temperature)
+    return tabulate(sky.brightness, optics, photometry).electrons_per_s(v_mag, temperature_k)
 
 
 def bench_calibration(config: BenchConfig, folder: Path) -> Calibration:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from types import TracebackType
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Protocol, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -17,7 +17,7 @@ from hilstar.attitude.wire.protocol import NORM_TOLERANCE
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.config import BenchConfig, Vector
 from hilstar.bench.effort import Effort
-from hilstar.bench.truth import truth_table
+from hilstar.bench.truth import designations, sprite_truth
 from hilstar.errors import InputError
 from hilstar.monitor.calibration import Calibration
 from hilstar.monitor.footprints import FootprintMap
@@ -46,7 +46,8 @@ class Frame:
     `linear` is float32 (height, width), electrons per second; `levels`, uint8 or uint16 of the same shape, are indices into
     the response's table; `codes` are the code values, the same array or with bit stealing (height, width, 3);
     `truth` is a structured array of TRUTH_DTYPE, a row for each star whose sprite touches the monitor, and `star` (n,) the
-    places of the same stars in the bench's. `t_ns` is the moment for which bodies were placed.
+    places of the same stars in the bench's, negative for light that a fault adds. `t_ns` is the moment for which bodies were
+    placed.
     """
 
     q_icrs_to_cam: FloatArray
@@ -56,6 +57,23 @@ class Frame:
     truth: npt.NDArray[np.void]
     star: IntArray
     t_ns: int | None = None
+
+
+class FrameFaults(Protocol):
+    """What is wrong in a frame on request (see `bench.faults`)."""
+
+    def turned(self, q_icrs_to_cam: FloatArray) -> FloatArray:
+        """The attitude that is shown in place of another."""
+
+    def over(
+        self,
+        sprites: Sprites,
+        stars: Stars,
+        q_icrs_to_cam: FloatArray,
+        draw: Callable[[Stars], Sprites],
+        scan: Scan | None = None,
+    ) -> Sprites:
+        """The frame's sprites with its faults."""
 
 
 class Drawn:
@@ -151,6 +169,7 @@ class Bench:
         velocity_km_s: FloatArray | None = None,
         t_ns: int | None = None,
         place_km: FloatArray | None = None,
+        faults: FrameFaults | None = None,
     ) -> Sprites | None:
         """The sprites of a frame (see `draw`), before anything is drawn; None for a blank one.
 
@@ -160,6 +179,18 @@ class Bench:
         if q_icrs_to_cam is None:
             return None
         stars = self.seen(self.shown_stars, t_ns, velocity_km_s, place_km)
+        sprites = self.star_sprites(stars, q_icrs_to_cam, rate_cam_rad_s)
+        if faults is None:
+            return sprites
+        scan = None if rate_cam_rad_s is None else self.scan
+        return faults.over(
+            sprites, stars, q_icrs_to_cam, lambda few: self.star_sprites(few, q_icrs_to_cam, rate_cam_rad_s), scan
+        )
+
+    def star_sprites(
+        self, stars: Stars, q_icrs_to_cam: FloatArray, rate_cam_rad_s: Vector | FloatArray | None = None
+    ) -> Sprites:
+        """The sprites of stars as they are seen, at an attitude and a rate (see `draw`)."""
         turn = self._turn(q_icrs_to_cam, rate_cam_rad_s)
         return self.sprites(q_icrs_to_cam, stars) if turn is None else self._swept(stars, turn)
 
@@ -169,7 +200,7 @@ class Bench:
         clipped = None if sprites is None else self._clipped(sprites)
         if sprites is None or clipped is None or not len(clipped):
             return Drawn(self.renderer, sprites)
-        return Drawn(self.renderer, sprites, tuple(self.shown_stars.designations(np.unique(sprites.star[clipped]))))
+        return Drawn(self.renderer, sprites, designations(self.shown_stars, sprites, clipped))
 
     def _turn(self, q_icrs_to_cam: FloatArray, rate_cam_rad_s: Vector | FloatArray | None) -> Turn | None:
         """The motion within a frame; None if no star moves far enough to be seen."""
@@ -196,7 +227,13 @@ class Bench:
         for q, rate in ((WARM_UP_ATTITUDE, WARM_UP_RATE_RAD_S), (WARM_UP_ATTITUDE, None), (None, None)):
             _ = self.draw(q, 0, rate).levels
 
-    def frame(self, q_icrs_to_cam: Sequence[float] | FloatArray, number: int = 0, t_ns: int | None = None) -> Frame:
+    def frame(
+        self,
+        q_icrs_to_cam: Sequence[float] | FloatArray,
+        number: int = 0,
+        t_ns: int | None = None,
+        faults: FrameFaults | None = None,
+    ) -> Frame:
         """Draw one frame and read all of it back; the arrays are copies.
 
         Stars too faint for the monitor are in the linear image and the truth, and not drawn. `number` counts frames, for
@@ -204,17 +241,23 @@ class Bench:
         within 1e-3.
         """
         q = checked_quaternion(q_icrs_to_cam)
-        sprites = self.sprites(q, self.seen(self.stars, t_ns))
-        self.renderer.draw(self.sprites(q, self.seen(self.shown_stars, t_ns)), number)
+        q = q if faults is None else faults.turned(q)
+        sprites = self._still(q, self.stars, t_ns, faults)
+        self.renderer.draw(self._still(q, self.shown_stars, t_ns, faults), number)
         levels = self.renderer.codes().copy()
         if len(self.faint_stars) or self.renderer.target.sides:
             self.renderer.draw(sprites, number, whole=True)
         linear = self.renderer.linear().copy()
-        truth = truth_table(self.stars, sprites.star, sprites.x_px, sprites.y_px)
+        truth, star = sprite_truth(self.stars, sprites, self._clipped(sprites))
         truth["drawn"] = truth["electrons_per_s"] >= self.faintest_shown_e_per_s
-        truth["clipped"][self._clipped(sprites)] = True
         order = np.argsort(truth["v_mag"], kind="stable")
-        return Frame(q, linear, levels, self.code_values(levels), truth[order], sprites.star[order], t_ns)
+        return Frame(q, linear, levels, self.code_values(levels), truth[order], star[order], t_ns)
+
+    def _still(self, q: FloatArray, stars: Stars, t_ns: int | None, faults: FrameFaults | None) -> Sprites:
+        """The sprites of `stars` or `shown_stars` as points, at an attitude and a moment."""
+        seen = self.seen(stars, t_ns)
+        sprites = self.sprites(q, seen)
+        return sprites if faults is None else faults.over(sprites, seen, q, lambda few: self.sprites(q, few))
 
     def seen(
         self,
@@ -233,7 +276,8 @@ class Bench:
 
         That is summed over its own pixels.
         """
-        clipped = set(self.stars.designations(frame.star[frame.truth["clipped"]]))
+        own = frame.star[frame.truth["clipped"]]
+        clipped = set(self.stars.designations(own[own >= 0]))
         if not clipped:
             return {}
         sprites = self.sprites(frame.q_icrs_to_cam, self.seen(self.shown_stars, frame.t_ns))

@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import FloatArray, IntArray
+from hilstar.scene.sprites import Sprites
 from hilstar.sky.stars import Stars
 
 TRUTH_DTYPE = np.dtype(
@@ -52,3 +53,45 @@ def truth_table(stars: Stars, star: IntArray, x_px: FloatArray, y_px: FloatArray
         # Back to the catalogue's decimals from float32.
         truth[name][listed] = np.round(getattr(catalog, name)[row].astype(np.float64), 3)
     return truth
+
+
+def designations(stars: Stars, sprites: Sprites, which: IntArray) -> tuple[int | str, ...]:
+    """What sprites at the positions `which` (n,) are of, each once: HIP numbers, and names of what has none."""
+    star = np.unique(sprites.star[which])
+    added = dict.fromkeys(sprites.added[-1 - k].name for k in star[star < 0])
+    return (*stars.designations(star[star >= 0]), *added)
+
+
+def sprite_truth(stars: Stars, sprites: Sprites, clipped: IntArray) -> tuple[npt.NDArray[np.void], IntArray]:
+    """Rows of TRUTH_DTYPE for what sprites are of, all drawn, and its indices (n,); `clipped` are positions of sprites.
+
+    Light of the frame's own has a row too, with its name, where its sprites have their middle.
+    """
+    over = np.zeros(len(sprites), dtype=bool)
+    over[clipped] = True
+    own = sprites.star >= 0
+    truth = truth_table(stars, sprites.star[own], sprites.x_px[own], sprites.y_px[own])
+    truth["clipped"] = over[own]
+    if not sprites.added:
+        return truth, sprites.star
+    added = _added_truth(sprites, over)
+    return np.concatenate([truth, added]), np.concatenate([sprites.star[own], np.unique(sprites.star[~own])])
+
+
+def _added_truth(sprites: Sprites, over: npt.NDArray[np.bool_]) -> npt.NDArray[np.void]:
+    """Rows for light of a frame's own, by the index of each."""
+    of_added = np.flatnonzero(sprites.star < 0)
+    star, line = np.unique(sprites.star[of_added], return_inverse=True)
+    light = sprites.data["electrons_per_s"][of_added].astype(np.float64)
+    rows = np.zeros(len(star), dtype=TRUTH_DTYPE)
+    total = np.bincount(line, light, minlength=len(star))
+    for name, places in (("x_px", sprites.x_px), ("y_px", sprites.y_px)):
+        rows[name] = np.bincount(line, light * places[of_added], minlength=len(star)) / total
+    for k, added in enumerate(sprites.added[-1 - index] for index in star.tolist()):
+        rows[k]["name"], rows[k]["v_mag"], rows[k]["bv"] = added.name, added.v_mag, added.bv_mag
+        rows[k]["electrons_per_s"] = added.electrons_per_s
+    for name in ("temperature_k", "range_mag", "period_d", "separation_arcsec"):
+        rows[name] = np.nan
+    rows["drawn"] = True
+    rows["clipped"] = np.bincount(line, over[of_added], minlength=len(star)) > 0
+    return rows

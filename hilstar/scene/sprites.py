@@ -24,13 +24,24 @@ MAX_COVERED_PX = 25_000_000
 
 
 @dataclass(frozen=True, slots=True)
+class AddedLight:
+    """Light of a frame's own, which is no star's: its name, magnitude, colour, and electrons per second."""
+
+    name: str
+    v_mag: float
+    bv_mag: float
+    electrons_per_s: float
+
+
+@dataclass(frozen=True, slots=True)
 class Sprites:
     """Stars on the image: `data` (n,) of SPRITE_DTYPE, their centres, and where each lies in `Stars`.
 
     A sprite covers `footprint_px` squared pixels, the first of them at `pixel - (footprint_px - 1) // 2`. A star's light is
     divided among up to `per_star` sprites. `capped` stars are drawn coarser than they should be, or not at all, because
     the work of a frame is bounded. `rate_cam_rad_s` (3,) is the turn along which stars are drawn as paths, None for points.
-    `extended` is the frame's light that is no star's, in the order in which it is drawn.
+    `extended` is the frame's light that is no star's, in the order in which it is drawn. Sprites of `added` light have -1, -2
+    and on for `star`.
     """
 
     data: npt.NDArray[np.void]
@@ -42,6 +53,7 @@ class Sprites:
     capped: int = 0
     rate_cam_rad_s: FloatArray | None = None
     extended: tuple[ExtendedLight, ...] = ()
+    added: tuple[AddedLight, ...] = ()
 
     def __len__(self) -> int:
         return len(self.data)

@@ -1,0 +1,119 @@
+"""Stray light over an image: a gradient and a measured map, as one camera sees them.
+
+Both are laid out once in the camera's own pixels, with the light that each collects of a tracker pixel's.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from hilstar.arrays import Float32Array, FloatArray
+from hilstar.bench.faults.kinds import Gradient, MeasuredMap
+from hilstar.bench.faults.lines import moved
+from hilstar.errors import InputError, cannot_read
+from hilstar.reading import read_bytes
+from hilstar.scene.camera import Camera
+
+GRID_PX = 8  # the places of a camera's pixels in another's are smooth: cubics between every eighth are within 1e-4 px
+MAX_FILE_BYTES = 200_000_000
+MAX_SIDE_PX = 16_384
+MAP_ADVICE = "give a FITS image, a greyscale PNG or an npy array of the whole detector"
+
+
+def gradient_image(fault: Gradient, camera: Camera, tracker: Camera) -> Float32Array:
+    """Electrons per second of each camera pixel (h, w) where the brightest corner of the detector has 1 in a tracker pixel."""
+    x_px, y_px, area = pixels_in(camera, tracker)
+    width, height = tracker.resolution_px
+    right, down = math.cos(math.radians(fault.towards_deg)), math.sin(math.radians(fault.towards_deg))
+    extent_px = abs(right) * width + abs(down) * height
+    rise = 0.5 + ((x_px - (width - 1) / 2) * right + (y_px - (height - 1) / 2) * down) / extent_px
+    return as_light(np.maximum(rise, 0.0) * area)
+
+
+def map_image(values: FloatArray, fault: MeasuredMap, camera: Camera, source: Camera) -> Float32Array:
+    """Electrons per second of each camera pixel (h, w) of a map over the whole image of `source`; nothing outside it."""
+    from scipy.ndimage import map_coordinates
+
+    x_px, y_px, area = pixels_in(camera, source)
+    width, height = source.resolution_px
+    rows, columns = values.shape
+    inside = (np.abs(x_px - (width - 1) / 2) <= width / 2) & (np.abs(y_px - (height - 1) / 2) <= height / 2)
+    place = np.stack([(y_px + 0.5) * rows / height - 0.5, (x_px + 0.5) * columns / width - 0.5])
+    found = map_coordinates(values, np.where(inside, place, 0.0), order=1, mode="nearest")
+    return as_light(np.where(inside, found * area, 0.0))
+
+
+def as_light(image: FloatArray) -> Float32Array:
+    """A map for the renderer: places without one are dark."""
+    return np.ascontiguousarray(np.nan_to_num(image, nan=0.0, posinf=0.0), dtype=np.float32)
+
+
+def pixels_in(camera: Camera, other: Camera) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Where each pixel of `camera` is in `other`'s pixels, and how many of them it covers: (h, w) each, NaN for nowhere."""
+    width, height = camera.resolution_px
+    if camera is other:
+        y, x = np.mgrid[0:height, 0:width].astype(np.float64)
+        return x, y, np.ones((height, width))
+    coarse = _grid_in(camera, other)
+    if coarse is None:
+        y, x = np.mgrid[0:height, 0:width].astype(np.float64)
+        seen_x, seen_y = (part.reshape(height, width) for part in moved(other, camera, x.ravel(), y.ravel()))
+        (x_down, x_right), (y_down, y_right) = np.gradient(seen_x), np.gradient(seen_y)
+        return seen_x, seen_y, np.abs(x_right * y_down - x_down * y_right)
+    (spline_x, spline_y), columns, rows = coarse, np.arange(width), np.arange(height)
+    x_right, y_right = spline_x(rows, columns, dy=1), spline_y(rows, columns, dy=1)
+    x_down, y_down = spline_x(rows, columns, dx=1), spline_y(rows, columns, dx=1)
+    return spline_x(rows, columns), spline_y(rows, columns), np.abs(x_right * y_down - x_down * y_right)
+
+
+def _grid_in(camera: Camera, other: Camera) -> tuple[Any, Any] | None:
+    """Cubics through the places of some of a camera's pixels in another's; None where some have no place."""
+    from scipy.interpolate import RectBivariateSpline
+
+    across, down = (np.linspace(0, size - 1, max(5, size // GRID_PX)) for size in camera.resolution_px)
+    x, y = np.meshgrid(across, down)
+    places = [part.reshape(x.shape) for part in moved(other, camera, x.ravel(), y.ravel())]
+    if not all(np.isfinite(place).all() for place in places):
+        return None
+    return RectBivariateSpline(down, across, places[0]), RectBivariateSpline(down, across, places[1])
+
+
+def read_map(path: Path) -> FloatArray:
+    """The image (h, w) in a file, its first row at the top. Raises InputError for one that is no map of light."""
+    raw = read_bytes(path, MAP_ADVICE, MAX_FILE_BYTES)
+    values = _decoded(path, raw)
+    if values.ndim != 2 or min(values.shape) < 2 or max(values.shape) > MAX_SIDE_PX:
+        raise InputError(f"{path}: an array of shape {values.shape}; {MAP_ADVICE}, 2 to {MAX_SIDE_PX} px on a side")
+    if values.dtype.kind not in "fiub":
+        raise InputError(f"{path}: values of type {values.dtype}; {MAP_ADVICE}")
+    image = values.astype(np.float64)
+    if not (np.isfinite(image).all() and image.min() >= 0):
+        raise InputError(f"{path}: a value is negative or not finite; give electrons per second, 0 or more")
+    if not image.max() > 0:
+        raise InputError(f"{path}: is dark everywhere; {MAP_ADVICE}")
+    return image
+
+
+def _decoded(path: Path, raw: bytes) -> npt.NDArray[Any]:
+    try:
+        if raw.startswith(b"\x93NUMPY"):
+            return np.asarray(np.load(io.BytesIO(raw), allow_pickle=False))
+        if raw.startswith(b"\x89PNG"):
+            from PIL import Image
+
+            with Image.open(io.BytesIO(raw)) as picture:
+                return np.asarray(picture)
+        if raw.startswith(b"SIMPLE  ="):
+            from astropy.io import fits
+
+            with fits.open(io.BytesIO(raw), memmap=False) as units:
+                return next(np.asarray(unit.data) for unit in units if getattr(unit, "data", None) is not None)
+    except Exception as error:  # each library raises its own for a damaged file
+        raise cannot_read(path, f"{type(error).__name__}: {error}", MAP_ADVICE) from error
+    raise cannot_read(path, "it is neither FITS, PNG nor npy", MAP_ADVICE)

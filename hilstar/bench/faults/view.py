@@ -1,0 +1,260 @@
+"""Faults as one camera sees them: what they add to a frame's sprites, and what they take away.
+
+The display and the virtual tracker have a view each; nothing else differs between them.
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from hilstar.arrays import Float32Array, FloatArray
+from hilstar.bench.faults.desk import Now
+from hilstar.bench.faults.kinds import (
+    CosmicRays,
+    FalseStar,
+    Fault,
+    Flash,
+    Glow,
+    Gradient,
+    MeasuredMap,
+    Place,
+    PointLight,
+    StarGone,
+)
+from hilstar.bench.faults.lines import Chain, Lines, moved, tracks
+from hilstar.bench.faults.surfaces import gradient_image, map_image, read_map
+from hilstar.bench.faults.targets import Targets
+from hilstar.errors import InputError
+from hilstar.rotation import to_matrix
+from hilstar.scene import extended
+from hilstar.scene.camera import Camera
+from hilstar.scene.frame_motion import Scan
+from hilstar.scene.sprites import AddedLight, Sprites, pack_sprites
+from hilstar.sky.stars import Stars
+from hilstar.units import NS_PER_S, flux_ratio, magnitude
+
+MAX_MAPS = 4  # gradients and measured maps at once: as many as the renderer keeps
+TRACK_SEED = 2  # beside the number of an exposure
+TRACK_BV_MAG = 0.0  # a track has no colour; its magnitude is that of a white star of as many electrons
+KEPT_MAPS, KEPT_BURSTS = 16, 64
+
+
+@dataclass(frozen=True, slots=True)
+class Sight:
+    """A camera and what a fault has to know to be drawn by it: the bench's two cameras, and its light.
+
+    `apparent` turns directions (n, 3) of ICRS into those that the bench's observer sees, and `v0_e_per_s` gives the electrons
+    per second of a star of V = 0 by its B-V.
+    """
+
+    camera: Camera
+    monitor: Camera
+    tracker: Camera
+    footprint_px: int
+    sigma_px: tuple[float, float]
+    exposure_s: float
+    apparent: Callable[[FloatArray], FloatArray]
+    v0_e_per_s: Callable[[float], float]
+    stars: Stars
+
+
+class FaultView:
+    """The faults of a scenario for one camera; `seed` is the scenario's, `folder` where the files are that it names."""
+
+    def __init__(self, sight: Sight, seed: int = 0, folder: Path | None = None) -> None:
+        self._sight, self._seed, self._folder = sight, seed, folder
+        self._targets = Targets()
+        self._maps: dict[Fault, extended.LightMap] = {}
+        self._tracks: dict[tuple[str, int], Chain] = {}
+
+    def prepare(self, fault: Fault) -> Fault:
+        """The fault as it is drawn, with everything ready that a frame has no time for. Raises InputError (see `FaultDesk`)."""
+        if isinstance(fault, CosmicRays) and fault.for_s is None:
+            fault = msgspec.structs.replace(fault, for_s=self._sight.exposure_s)
+        self._targets.check(self._sight.stars, fault)
+        if isinstance(fault, PointLight | CosmicRays):
+            self._sight.v0_e_per_s(getattr(fault, "bv_mag", TRACK_BV_MAG))
+        if isinstance(fault, Gradient | MeasuredMap):
+            self._map(fault)
+        if isinstance(fault, Place) and (fault.tracker_px is not None or fault.screen_px is not None):
+            self._check_place(fault)
+        return fault
+
+    def _check_place(self, fault: Place) -> None:
+        camera, place = self._source(fault)
+        if not np.isfinite(camera.rays(np.array([place[0]]), np.array([place[1]]))).all():
+            key = "tracker_px" if fault.tracker_px is not None else "screen_px"
+            raise InputError(f"{key} = {list(place)}: the lens has no direction there; write a place nearer to the image")
+
+    def light_e_per_s(self, fault: Fault) -> float:
+        """A fault's electrons per second: of a point, or in the tracker's brightest pixel; 1 where a map says it."""
+        per_s, in_exposure = getattr(fault, "electrons_per_s", None), getattr(fault, "electrons", None)
+        if per_s is not None:
+            return float(per_s)
+        if in_exposure is not None:
+            return float(in_exposure) / self._sight.exposure_s
+        if isinstance(fault, PointLight) and fault.v_mag is not None:
+            return float(flux_ratio(fault.v_mag)) * self._sight.v0_e_per_s(fault.bv_mag)
+        return 1.0
+
+    def rng(self, name: str, *numbers: int) -> np.random.Generator:
+        """The randomness of a fault: by the scenario's seed, the fault's name, and numbers."""
+        return np.random.default_rng((self._seed, zlib.crc32(name.encode()), *numbers))
+
+    def _map(self, fault: Gradient | MeasuredMap) -> extended.LightMap:
+        """A fault's light over the image where the brightest tracker pixel has its light."""
+        known = self._maps.pop(fault, None)
+        if known is None:
+            while len(self._maps) >= KEPT_MAPS:
+                self._maps.pop(next(iter(self._maps)))
+            image = self._laid_out(fault)
+            known = extended.LightMap(image, times=self.light_e_per_s(fault))
+        self._maps[fault] = known
+        return known
+
+    def _laid_out(self, fault: Gradient | MeasuredMap) -> Float32Array:
+        sight = self._sight
+        if isinstance(fault, Gradient):
+            return gradient_image(fault, sight.camera, sight.tracker)
+        if self._folder is None:
+            raise InputError(
+                f"file = {fault.file!r}: a message names no files; write the fault in the scenario, and start it by name"
+            )
+        values = read_map(self._folder / fault.file)
+        if fault.electrons_per_s is not None or fault.electrons is not None:
+            values = values / values.max()
+        return map_image(values, fault, sight.camera, sight.tracker if fault.frame == "tracker" else sight.monitor)
+
+    def _source(self, fault: Place) -> tuple[Camera, tuple[float, float]]:
+        """The camera in whose pixels a place is, and those."""
+        if fault.tracker_px is not None:
+            return self._sight.tracker, fault.tracker_px
+        return self._sight.monitor, fault.screen_px or (0.0, 0.0)
+
+    # What a frame asks for
+
+    def sky_points(self, now: Sequence[Now], stars: Stars) -> tuple[FloatArray, list[AddedLight]]:
+        """False stars and flashes that are fixed on the sky: their directions (n, 3), and what they are called."""
+        vectors, lights = [], []
+        for one in now:
+            fault = one.fault
+            if not isinstance(fault, FalseStar | Flash) or fault.tracker_px is not None or fault.screen_px is not None:
+                continue
+            direction = self._direction(fault, stars)
+            if direction is not None:
+                vectors.append(direction)
+                lights.append(self._added(fault, one.share))
+        return np.reshape(vectors, (-1, 3)), lights
+
+    def _direction(self, fault: FalseStar | Flash, stars: Stars) -> FloatArray | None:
+        if isinstance(fault, Flash) and (fault.hip is not None or fault.star is not None):
+            for known in (stars, self._sight.stars):  # a star that is too faint to show is among the bench's all the same
+                found = self._targets.find(known, fault)
+                if len(found):
+                    return np.asarray(known.vectors[found[0]])
+            return None
+        return np.asarray(self._sight.apparent(icrs_direction(fault)[None])[0])
+
+    def _added(self, fault: PointLight, share: float = 1.0) -> AddedLight:
+        rate = self.light_e_per_s(fault) * share
+        return AddedLight(fault.name, float(magnitude(rate / self._sight.v0_e_per_s(fault.bv_mag))), fault.bv_mag, rate)
+
+    def camera_points(self, now: Sequence[Now], scan: Scan | None) -> tuple[list[Chain], list[AddedLight]]:
+        """False stars and flashes that move with the camera, and tracks: chains, and what each line of them is called."""
+        chains, lights = [], []
+        for one in now:
+            fault = one.fault
+            if isinstance(fault, FalseStar | Flash) and (fault.tracker_px is not None or fault.screen_px is not None):
+                chains.append(self._moving(fault, one, scan))
+                lights.append(self._added(fault, one.share))
+            elif isinstance(fault, CosmicRays):
+                burst = self._burst(fault, max(0, one.since_ns))
+                chains.append(replace(burst, electrons_per_s=burst.electrons_per_s * one.share))
+                rate = fault.electrons / self._sight.exposure_s * one.share
+                v_mag = float(magnitude(rate / self._sight.v0_e_per_s(TRACK_BV_MAG)))
+                lights += [AddedLight(fault.name, v_mag, TRACK_BV_MAG, rate)] * fault.number
+        return chains, lights
+
+    def _moving(self, fault: FalseStar | Flash, one: Now, scan: Scan | None) -> Chain:
+        """A point's way over its pixels while they are lit."""
+        sight, (source, place) = self._sight, self._source(fault)
+        rate, since_s = np.array(fault.rate_px_s), one.since_ns / NS_PER_S
+        begin_s, hold_s = since_s, 0.0
+        if scan is not None and rate.any():
+            x_px, y_px = moved(sight.camera, source, *(np.array([place]) + rate * since_s).T)
+            late_s = scan.late_s(x_px, y_px, sight.camera.resolution_px)[0]
+            begin_s, hold_s = since_s + (float(late_s) if math.isfinite(late_s) else 0.0), scan.hold_s
+        ends = [(np.array(place) + rate * seconds)[None] for seconds in (begin_s, begin_s + hold_s)]
+        light = np.array([self.light_e_per_s(fault) * one.share])
+        return Lines(ends[0], ends[1], light).seen_by(sight.camera, source, sight.sigma_px)
+
+    def _burst(self, fault: CosmicRays, since_ns: int) -> Chain:
+        """The tracks of the exposure that a moment is in, counted from the burst's beginning."""
+        sight = self._sight
+        number = int(since_ns // round(sight.exposure_s * NS_PER_S))
+        key = (fault.name, number)
+        if key not in self._tracks:
+            if len(self._tracks) >= KEPT_BURSTS:
+                self._tracks.clear()
+            made = tracks(fault, sight.tracker.resolution_px, sight.exposure_s, self.rng(fault.name, TRACK_SEED, number))
+            self._tracks[key] = made.seen_by(sight.camera, sight.tracker, sight.sigma_px)
+        return self._tracks[key]
+
+    def gone(self, now: Sequence[Now], stars: Stars) -> list[tuple[int, float]]:
+        """Stars that are not there, and the share of their light that is left in this frame."""
+        taken = [one for one in now if isinstance(one.fault, StarGone)]
+        return [(int(star), 1 - one.share) for one in taken for star in self._targets.find(stars, one.fault)]
+
+    def surfaces(self, now: Sequence[Now], q_icrs_to_cam: FloatArray) -> list[extended.ExtendedLight]:
+        """Stray light; of maps the first MAX_MAPS."""
+        found: list[extended.ExtendedLight] = []
+        maps = 0
+        for one in now:
+            fault = one.fault
+            if isinstance(fault, Glow):
+                found.append(self._glow(fault, one.share, q_icrs_to_cam))
+            elif isinstance(fault, Gradient | MeasuredMap) and maps < MAX_MAPS:
+                light = self._map(fault)
+                found.append(light if one.share == 1 else replace(light, times=light.times * one.share))
+                maps += 1
+        return found
+
+    def _glow(self, fault: Glow, share: float, q_icrs_to_cam: FloatArray) -> extended.Glow:
+        sight = self._sight
+        if fault.tracker_px is not None or fault.screen_px is not None:
+            source, (x_px, y_px) = self._source(fault)
+            cam = source.rays(np.array([x_px]), np.array([y_px]))[0]
+        else:
+            cam = to_matrix(q_icrs_to_cam) @ sight.apparent(icrs_direction(fault)[None])[0]
+        direction = sight.camera.cam_to_image @ cam
+        # A monitor pixel collects as much of a tracker pixel's light as it covers of it.
+        covered = (sight.tracker.focal_length_px / sight.camera.focal_length_px) ** 2
+        peak = self.light_e_per_s(fault) * share * covered
+        unit = direction / np.linalg.norm(direction)
+        return extended.Glow(unit, peak, math.radians(fault.scale_deg), fault.exponent, sight.camera)
+
+    def footprints(self, chains: list[Chain]) -> list[Sprites]:
+        """The sprites of chains; the lines count on from one to the next, as stars from -1 down."""
+        made, first = [], 0
+        for chain in chains:
+            star = -1 - first - chain.line
+            size_px, footprint_px = self._sight.camera.resolution_px, self._sight.footprint_px
+            made.append(pack_sprites(chain.x_px, chain.y_px, chain.electrons_per_s, star, size_px, footprint_px))
+            first += chain.lines
+        return made
+
+
+def icrs_direction(fault: Place) -> FloatArray:
+    """The unit vector (3,), ICRS, of a place on the sky."""
+    if fault.icrs is not None:
+        vector = np.array(fault.icrs)
+        return np.asarray(vector / np.linalg.norm(vector))
+    ra, dec = np.radians(fault.radec_deg or (0.0, 0.0))
+    return np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])

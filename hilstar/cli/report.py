@@ -14,12 +14,12 @@ from hilstar.files import check_directory
 
 def report(
     ledger: RunFile,
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Directory for report.html and its charts.")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Directory for report.html and report.json.")],
     as_json: Json = False,
 ) -> None:
-    """Report a run on one page with charts: timing, attitude age, missed frames and memory."""
+    """Report a run on one page: pictures, timing, attitude age, missed frames, packets, events and memory."""
+    from hilstar.console.report.write import report as write_report
     from hilstar.files import make_directory
-    from hilstar.run.record.report import report as write_report
     from hilstar.run.record.report import table_rows
 
     check_directory("-o", output)

@@ -1,5 +1,6 @@
 // A chart along time: lines, or bands from minimum to maximum, and marks where something was lost. What it shows is written in words too.
 
+import { ChartRange } from "./chart_range.js";
 import { fixed, make, write } from "./format.js";
 
 const HEIGHT = 132;
@@ -41,8 +42,8 @@ export function envelope(t, low, high, from, to, columns) {
 
 // series: {name, unit, digits, ink, t, low, high}; marks: {name, ink, t, n}. Times in s, low and high in the chart's unit.
 export class Chart {
-  constructor(figure, { title, unit, ink, onPick = null }) {
-    Object.assign(this, { figure, unit, ink, onPick, series: [], marks: [], from: -60, to: 0, cursor: null, hover: null });
+  constructor(figure, { title, unit, ink, onPick = null, onRange = null }) {
+    Object.assign(this, { figure, unit, ink, onPick, series: [], marks: [], from: -60, to: 0, cursor: null, hover: null, chosen: null });
     const head = make("figcaption", "panel-head");
     this.heading = make("h2", "", title);
     this.now = make("span", "now figure");
@@ -55,7 +56,7 @@ export class Chart {
     this.context = this.canvas.getContext("2d");
     this.canvas.addEventListener("pointermove", (event) => this.point(event));
     this.canvas.addEventListener("pointerleave", () => this.point(null));
-    this.canvas.addEventListener("click", (event) => this.onPick?.(this.timeAt(event)));
+    if (onRange) this.range = new ChartRange(this, onRange);
   }
 
   set(series, marks, from, to) {
@@ -107,6 +108,7 @@ export class Chart {
     for (const mark of this.marks) this.drawMarks(mark);
     this.series.forEach((one, k) => this.drawBand(one, this.bands[k]));
     this.drawCursor();
+    this.drawChosen();
     this.tell();
   }
 
@@ -169,9 +171,14 @@ export class Chart {
   }
 
   // A line from top to bottom with a triangle: lost frames and refused packets are seen without their colour.
-  drawMarks({ ink: name, t, n }) {
+  drawMarks(mark) {
+    const { ink: name, t, n } = mark;
     const { context } = this;
     context.strokeStyle = context.fillStyle = this.ink[name];
+    if (mark.lasting) {
+      this.drawLasting(mark);
+      return;
+    }
     context.globalAlpha = 0.85;
     for (let k = 0; k < t.length; k += 1) {
       if (!n[k] || t[k] < this.from || t[k] > this.to) continue;
@@ -186,6 +193,27 @@ export class Chart {
     context.globalAlpha = 1;
   }
 
+  // What lasts is a shade over its time, with a triangle where it begins.
+  drawLasting({ t, n }) {
+    const { context } = this;
+    const y = TOP - 6;
+    let begun = null;
+    for (let k = 0; k <= t.length; k += 1) {
+      const on = k < t.length && n[k];
+      if (on && begun === null) begun = t[k];
+      if (on || begun === null) continue;
+      const [a, b] = [Math.max(begun, this.from), Math.min(k < t.length ? t[k] : this.to, this.to)];
+      const [left, right] = [this.x(a), Math.max(this.x(b), this.x(a) + 1)];
+      if (b >= a) {
+        context.globalAlpha = 0.22;
+        context.fillRect(left, TOP, right - left, HEIGHT - BOTTOM - TOP);
+        context.globalAlpha = 1;
+        context.fillRect(left, y, right - left, 3);
+      }
+      begun = null;
+    }
+  }
+
   drawCursor() {
     const { context, ink } = this;
     for (const [at, colour] of [[this.cursor, ink.accent], [this.hover, ink.muted]]) {
@@ -193,6 +221,16 @@ export class Chart {
       context.fillStyle = colour;
       context.fillRect(this.x(at) - 0.5, TOP, 1, HEIGHT - BOTTOM - TOP);
     }
+  }
+
+  // The part that is being chosen to be zoomed into.
+  drawChosen() {
+    if (!this.chosen) return;
+    const [a, b] = this.chosen.map((t) => this.x(t));
+    this.context.globalAlpha = 0.2;
+    this.context.fillStyle = this.ink.accent;
+    this.context.fillRect(Math.min(a, b), TOP, Math.abs(b - a), HEIGHT - BOTTOM - TOP);
+    this.context.globalAlpha = 1;
   }
 
   // The newest value, or that under the pointer, the cursor; minimum and maximum of what is seen.
@@ -220,8 +258,7 @@ export class Chart {
     if (this.legend.childElementCount === rows.length) return;
     this.legend.replaceChildren(
       ...rows.map(({ name, ink }) => {
-        const entry = make("span", `key ink-${ink}`, name);
-        return entry;
+        return make("span", `key ink-${ink}`, name);
       }),
     );
   }
@@ -237,7 +274,7 @@ function valueAt({ t, high }, at) {
   let gap = Infinity;
   for (let k = 0; k < t.length; k += 1) {
     const away = Math.abs(t[k] - at);
-    if (away < gap && high[k] !== null) [best, gap] = [high[k], away];
+    if (away < gap) [best, gap] = [high[k], away];
   }
   return best;
 }

@@ -85,7 +85,7 @@ export function writeRefusals(refused) {
   );
 }
 
-export function addEvent({ utc, kind, line }, onPick = null) {
+export function addEvent({ utc, kind, line }, onPick = null, most = MAX_EVENTS) {
   const list = byId("events");
   const row = make("li", "", "");
   const time = make("time", "figure", utc.length > 12 ? clock(utc) : utc);
@@ -99,6 +99,6 @@ export function addEvent({ utc, kind, line }, onPick = null) {
     row.addEventListener("keydown", (event) => event.key === "Enter" && onPick());
   }
   list.prepend(row);
-  while (list.childElementCount > MAX_EVENTS) list.lastElementChild.remove();
+  while (list.childElementCount > most) list.lastElementChild.remove();
   write(byId("events-count"), `${list.childElementCount}`);
 }

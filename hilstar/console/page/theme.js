@@ -6,7 +6,7 @@ const KEY = "hilstar.theme";
 const ORDER = ["auto", "light", "dark"];
 const WORDS = { auto: "Auto", light: "Light", dark: "Dark" };
 const INKS = {
-  muted: "--muted", accent: "--accent", bad: "--bad", warn: "--warn", ok: "--ok", gridLine: "--line", axis: "--edge", one: "--series-1", two: "--series-2",
+  muted: "--muted", accent: "--accent", bad: "--bad", warn: "--warn", ok: "--ok", gridLine: "--line", axis: "--edge", one: "--series-1", two: "--series-2", three: "--series-3",
   skyGround: "--sky-ground", skyLine: "--sky-line", skyText: "--sky-text", star: "--sky-star", galaxy: "--sky-galaxy", ecliptic: "--sky-ecliptic",
   field: "--sky-field", fieldFill: "--sky-fill", trail: "--sky-trail", moving: "--sky-moving",
 };

@@ -102,6 +102,7 @@ class PacketForm(msgspec.Struct):
 
     accepted: bool = True
     reason: str | None = None
+    receive_ns: AnyNs | None = None
 
 
 RunRecord = FrameRecord | ProcessRecord | PacketForm | CountRecord | EventRecord

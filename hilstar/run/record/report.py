@@ -1,28 +1,15 @@
-"""The report of a run from its ledger: timing, age, missed frames and the path of the attitude, on one page."""
+"""The figures of a run's report: timing, age, missed frames, packets and events, from its ledger."""
 
 from __future__ import annotations
 
-import base64
-import html
 from pathlib import Path
 
 import msgspec
 
 from hilstar.errors import InputError
-from hilstar.files import write_whole
 from hilstar.run.record.ledger_reader import NO_FRAMES, config_of, read_head, run_records
-from hilstar.run.record.report_charts import CHARTS
 from hilstar.run.record.report_figures import Figures
 from hilstar.running_statistics import Percentiles
-
-PAGE = """<!DOCTYPE html>
-<html lang="en"><head><meta charset="utf-8"><title>{title}</title><style>
-body {{ font: 15px/1.45 sans-serif; max-width: 1020px; margin: 2em auto; padding: 0 1em; color: #222 }}
-table {{ border-collapse: collapse; margin: 1em 0 }}
-td {{ padding: 3px 14px 3px 0; border-bottom: 1px solid #ddd; vertical-align: top }}
-img {{ max-width: 100% }}
-</style></head><body><h1>{title}</h1><table>{rows}</table>{figures}</body></html>
-"""
 
 
 def figures_of(path: Path) -> Figures:
@@ -103,24 +90,6 @@ def summarise(run: Figures) -> RunReport:
     )
 
 
-def report(path: Path, directory: Path) -> RunReport:
-    """Write `report.html`, its figures and `report.json` of a ledger into a directory; the figures.
-
-    Raises InputError for a file that is no ledger, and if it cannot write.
-    """
-    run = figures_of(path)
-    summary = summarise(run)
-    charts = [draw(run, directory) for draw in CHARTS]
-    page = PAGE.format(
-        title=html.escape(f"Run {path.name}"),
-        rows="".join(f"<tr><td>{html.escape(a)}</td><td>{html.escape(b)}</td></tr>" for a, b in table_rows(summary)),
-        figures="".join(f'<p><img alt="{f.stem}" src="data:image/png;base64,{_base64(f)}"></p>' for f in charts if f),
-    )
-    write_whole(directory / "report.html", page.encode(errors="replace"))
-    write_whole(directory / "report.json", msgspec.json.format(msgspec.json.encode(summary)))
-    return summary
-
-
 def table_rows(found: RunReport) -> list[tuple[str, str]]:
     """The figures as rows of text: name and value."""
     refused = sum(count for reason, count in found.packets.items() if reason != "accepted")
@@ -153,7 +122,3 @@ def table_rows(found: RunReport) -> list[tuple[str, str]]:
         ("calibration", f"{found.calibration}, SHA-256 {found.calibration_sha256}"),
         ("renderer", str(found.gl_renderer)),
     ]
-
-
-def _base64(path: Path) -> str:
-    return base64.b64encode(path.read_bytes()).decode()

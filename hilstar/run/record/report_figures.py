@@ -3,93 +3,62 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass, field
 
-import numpy as np
-
-from hilstar.arrays import FloatArray
+from hilstar.notices import MAX_DETAIL_CHARACTERS
 from hilstar.run.record.ledger_reader import MAX_REASON_CHARACTERS, MAX_REASONS, PacketTally
-from hilstar.run.record.ledger_records import EventRecord, FrameRecord, ProcessRecord, RunRecord
+from hilstar.run.record.ledger_records import CountRecord, EventRecord, FrameRecord, PacketForm, ProcessRecord, RunRecord
+from hilstar.run.record.series import SAMPLES, Bins, Sample, Spans
 from hilstar.running_statistics import RunningStatistics
 from hilstar.units import NS_PER_MS, NS_PER_S
 
 MEGABYTE = 1e6
 WARM_UP_S = 60.0  # after this the process has allocated all the memory that it needs
-SAMPLES = 1 << 16  # frames of which each figure is kept: all of a run of a quarter of an hour
-SPANS = 4096  # in which a run is drawn along its time
+KEYFRAMES = 16
+MAX_EVENTS = 1000  # of which the first and as many of the last are kept
 SMALL_RAD = 1e-8
 
 
-class Sample:
-    """Every n-th row of a stream, n doubling as the stream grows."""
+class Keyframes:
+    """Frames of a run that are worth a picture: evenly over it, and the first or worst of each kind."""
 
-    def __init__(self, columns: int, capacity: int = SAMPLES) -> None:
-        self._rows = np.zeros((capacity, columns))
-        self._kept = 0
-        self.stride = 1
-        self._seen = 0
+    def __init__(self, capacity: int = KEYFRAMES) -> None:
+        self._even: list[FrameRecord] = []
+        self._capacity, self._stride, self._seen = capacity, 1, 0
+        self._best: dict[str, tuple[float, FrameRecord]] = {}
 
-    def add(self, row: tuple[float, ...]) -> None:
-        """Add a row, or skip it."""
-        if self._seen % self.stride == 0:
-            if self._kept == len(self._rows):
-                half = len(self._rows) // 2
-                self._rows[:half] = self._rows[::2]
-                self._kept, self.stride = half, 2 * self.stride
-            if self._seen % self.stride == 0:
-                self._rows[self._kept] = row
-                self._kept += 1
+    def add(self, frame: FrameRecord) -> None:
+        """Look at a frame."""
+        if self._seen % self._stride == 0:
+            if len(self._even) == self._capacity:
+                self._even, self._stride = self._even[::2], 2 * self._stride
+            if self._seen % self._stride == 0:
+                self._even.append(frame)
         self._seen += 1
+        self._keep("first stale", frame, float(frame.stale and frame.q is not None))
+        self._keep("most clipped stars", frame, float(frame.clipped))
+        self._keep("most stars", frame, float(frame.stars_drawn))
 
-    @property
-    def rows(self) -> FloatArray:
-        """The rows that are kept, (n, columns)."""
-        return self._rows[: self._kept]
+    def _keep(self, why: str, frame: FrameRecord, worth: float) -> None:
+        if worth > self._best.get(why, (0.0,))[0]:
+            self._best[why] = (worth, frame)
 
-
-class Spans:
-    """The minimum, maximum and sum of each column over equal numbers of frames: at most `capacity` spans."""
-
-    def __init__(self, columns: int, capacity: int = SPANS) -> None:
-        shape = (capacity, columns)
-        self._low, self._high, self._sum = np.full(shape, np.inf), np.full(shape, -np.inf), np.zeros(shape)
-        self._begin = np.zeros(capacity)
-        self._used = self._in_last = 0
-        self._length = 1
-
-    def add(self, at: float, row: tuple[float, ...]) -> None:
-        """Add a frame; NaN is no value."""
-        if self._used == 0 or self._in_last == self._length:
-            if self._used == len(self._begin):
-                self._halve()
-            self._begin[self._used] = at
-            self._used, self._in_last = self._used + 1, 0
-        k = self._used - 1
-        for column, value in enumerate(row):
-            if not math.isnan(value):
-                self._low[k, column] = min(self._low[k, column], value)
-                self._high[k, column] = max(self._high[k, column], value)
-                self._sum[k, column] += value
-        self._in_last += 1
-
-    def _halve(self) -> None:
-        half = self._used // 2
-        self._low[:half] = np.minimum(self._low[::2], self._low[1::2])
-        self._high[:half] = np.maximum(self._high[::2], self._high[1::2])
-        self._sum[:half] = self._sum[::2] + self._sum[1::2]
-        self._begin[:half] = self._begin[::2]
-        self._low[half:], self._high[half:], self._sum[half:] = np.inf, -np.inf, 0.0
-        self._used, self._in_last, self._length = half, 2 * self._length, 2 * self._length
-
-    def column(self, number: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Begin, minimum, maximum and sum of each span that has any value in this column."""
-        low, high, total = (table[: self._used, number] for table in (self._low, self._high, self._sum))
-        some = np.isfinite(low)
-        return self._begin[: self._used][some], low[some], high[some], total[some]
+    def chosen(self, last: FrameRecord | None) -> list[tuple[FrameRecord, str]]:
+        """The frames in order, each with what is special of it, "" for nothing."""
+        found = {id(frame): (frame, "") for frame in self._even}
+        for why, (_, frame) in self._best.items():
+            before = found.get(id(frame), (frame, ""))[1]
+            found[id(frame)] = (frame, ", ".join(part for part in (before, why) if part))
+        if last is not None:
+            found.setdefault(id(last), (last, ""))
+        return sorted(found.values(), key=lambda each: each[0].swap_ns)
 
 
 METRICS = ("interval", "late", "draw", "age", "prediction", "packet")  # ms
-INTERVAL, AGE, MISSED, DRAWN, CLIPPED, BELOW_STEP = range(6)  # columns of the spans
+# The columns of the spans: METRICS, then these.
+COUNTS = ("missed", "stars", "clipped", "below_step", "stale", "blank")
+ACCEPTED, REFUSED = range(2)
 
 
 @dataclass(slots=True)
@@ -102,6 +71,7 @@ class Figures:
     frames: int = 0
     stale: int = 0
     blank: int = 0
+    late: int = 0  # stale, with an attitude
     capped: int = 0
     operator: int = 0
     hidden: int = 0
@@ -110,9 +80,14 @@ class Figures:
     first_swap_ns: int = 0
     spreads: dict[str, RunningStatistics] = field(default_factory=lambda: {name: RunningStatistics() for name in METRICS})
     samples: Sample = field(default_factory=lambda: Sample(len(METRICS)))
-    spans: Spans = field(default_factory=lambda: Spans(6))
-    path: Sample = field(default_factory=lambda: Sample(8, SAMPLES // 8))  # t_s, q, turned about x, y, z (rad)
-    process: Sample = field(default_factory=lambda: Sample(2, SAMPLES // 8))  # run_s, MB
+    spans: Spans = field(default_factory=lambda: Spans(len(METRICS) + len(COUNTS)))
+    # run_s, t_s, q, turned about x, y, z (rad)
+    path: Sample = field(default_factory=lambda: Sample(9, SAMPLES // 8))
+    process: Sample = field(default_factory=lambda: Sample(3, SAMPLES // 16))  # host time in s, MB, CPU time in s
+    keyframes: Keyframes = field(default_factory=Keyframes)
+    packet_times: Bins = field(default_factory=lambda: Bins(2))
+    first_events: list[EventRecord] = field(default_factory=list)
+    last_events: deque[EventRecord] = field(default_factory=lambda: deque(maxlen=MAX_EVENTS))
     first_process: ProcessRecord | None = None
     warm: ProcessRecord | None = None
     last_process: ProcessRecord | None = None
@@ -142,8 +117,18 @@ class Figures:
             kind = record.kind[:MAX_REASON_CHARACTERS]
             if kind in self.events or len(self.events) < MAX_REASONS:
                 self.events[kind] = self.events.get(kind, 0) + 1
+            record.detail = record.detail[:MAX_DETAIL_CHARACTERS]
+            (self.last_events if len(self.first_events) == MAX_EVENTS else self.first_events).append(record)
         else:
             self.packets.add(record)
+            self._add_packets(record)
+
+    def _add_packets(self, record: PacketForm | CountRecord) -> None:
+        if isinstance(record, PacketForm):
+            if record.receive_ns is not None:
+                self.packet_times.add(record.receive_ns, ACCEPTED if record.accepted else REFUSED)
+        elif record.kind == "packet":
+            self.packet_times.add(record.host_ns, ACCEPTED if record.reason == "accepted" else REFUSED, record.count)
 
     def _add_frame(self, frame: FrameRecord) -> None:
         before = self.last
@@ -153,6 +138,7 @@ class Figures:
         self.frames += 1
         self.stale += frame.stale
         self.blank += frame.q is None
+        self.late += frame.stale and frame.q is not None
         self.capped += frame.capped > 0
         self.operator += bool(frame.operator)
         self.hidden += bool(frame.hidden)
@@ -164,14 +150,15 @@ class Figures:
                 self.spreads[name].add(value)
         self.samples.add(values)
         run_s = (frame.swap_ns - self.first_swap_ns) / NS_PER_S
-        counts = (frame.missed_before, frame.stars_drawn, frame.clipped, frame.below_step)
-        self.spans.add(run_s, (values[0], values[3], *map(float, counts)))
+        counts = (frame.missed_before, frame.stars_drawn, frame.clipped, frame.below_step, frame.stale, frame.q is None)
+        self.spans.add(run_s, (*values, *map(float, counts)))
+        self.keyframes.add(frame)
         if frame.q is not None:
             if self._q is not None:
                 self._turned = [a + b for a, b in zip(self._turned, _turn_rad(self._q, frame.q), strict=True)]
             self._q = frame.q
             self._first_t_ns = frame.t_ns if self._first_t_ns is None else self._first_t_ns
-            self.path.add(((frame.t_ns - self._first_t_ns) / NS_PER_S, *frame.q, *self._turned))
+            self.path.add((run_s, (frame.t_ns - self._first_t_ns) / NS_PER_S, *frame.q, *self._turned))
 
     def _add_process(self, process: ProcessRecord) -> None:
         first = self.first_process = self.first_process or process
@@ -179,7 +166,7 @@ class Figures:
         if self.warm is None and run_s >= WARM_UP_S:
             self.warm = process
         self.last_process = process
-        self.process.add((run_s, process.resident_bytes / MEGABYTE))
+        self.process.add((process.host_ns / NS_PER_S, process.resident_bytes / MEGABYTE, process.cpu_s))
 
 
 def _times_ms(frame: FrameRecord, before: FrameRecord | None) -> tuple[float, ...]:

@@ -1,0 +1,173 @@
+"""What the page draws over a picture of a bench, from the bench's stars and its two cameras: no pixel of the picture itself."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from hilstar.arrays import FloatArray
+from hilstar.bench.cameras import tracker_camera
+from hilstar.bench.frame import Bench
+from hilstar.rotation import to_matrix, to_radec_roll_deg
+from hilstar.scene.camera import Camera
+from hilstar.sky.names import label_of
+from hilstar.sky.stars import Stars
+
+MAX_STARS = 400  # of a picture's truth, the brightest
+SKY_FAINTEST_MAG = 5.5
+SIDE_PLACES = 9  # of the tracker's outline, along each side: a lens bends it
+LINE_PLACES = 49  # of a line of the grid
+LINES_ACROSS = 3  # of the grid, at least, from the image's middle to its corner
+STEPS_DEG = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 15.0, 30.0)
+RA_STEPS_DEG = (*STEPS_DEG, 45.0, 90.0)
+BEYOND = 0.1  # of the image's size: how far lines go on outside of it
+PX_DIGITS, SKY_DIGITS = 2, 4
+
+
+@dataclass(frozen=True, slots=True)
+class Overlay:
+    """The monitor's camera and the tracker's, and the stars bright enough for the monitor."""
+
+    monitor: Camera
+    tracker: Camera
+    stars: Stars
+
+    def sky(self) -> dict[str, Any]:
+        """Stars and bodies of the whole sky as `[ra_deg, dec_deg, v_mag, label]`, the brightest first, and the screen.
+
+        The screen's corners are directions in cam; `[]` where a lens does not reach them.
+        """
+        bodies = len(self.stars.bodies)
+        order = np.argsort(self.stars.v_mag, kind="stable")
+        bright = order[self.stars.v_mag[order] < SKY_FAINTEST_MAG]
+        is_body = bright >= len(self.stars) - bodies
+        rays = self.monitor.rays(*_border(self.monitor.resolution_px, 2))
+        known = np.isfinite(rays).all()
+        corners = rays / np.linalg.norm(rays, axis=1, keepdims=True) if known else rays[:0]
+        return {
+            "stars": self._places(bright[~is_body]),
+            "moving": self._places(bright[is_body]),
+            "screen_cam": np.round(corners, 6).tolist(),
+        }
+
+    def _places(self, which: np.ndarray[Any, Any]) -> list[list[Any]]:
+        x, y, z = self.stars.directions(which).T
+        ra_deg, dec_deg = np.degrees(np.arctan2(y, x)) % 360.0, np.degrees(np.arctan2(z, np.hypot(x, y)))
+        columns = (
+            ra_deg.round(SKY_DIGITS).tolist(),
+            dec_deg.round(SKY_DIGITS).tolist(),
+            self.stars.v_mag[which].round(2).tolist(),
+        )
+        return [list(row) for row in zip(*columns, self._labels(which, ""), strict=True)]
+
+    def _labels(self, which: np.ndarray[Any, Any], none: str | None = None) -> list[str]:
+        """What stands beside a star: a body's name, else its designation; without one `none`, or its HIP number."""
+        found = zip(self.stars.names(which), self.stars.hip[which].tolist(), strict=True)
+        labels = [name or label_of(hip) for name, hip in found]
+        return labels if none is None else [none if label.startswith("HIP ") else label for label in labels]
+
+    def truth(self, q_icrs_to_cam: FloatArray, clipped: tuple[int | str, ...] = (), grid: bool = False) -> dict[str, Any]:
+        """What is where in a picture at an attitude: stars as `[x_px, y_px, v_mag, hip, label, clipped]`, the brightest first.
+
+        `boresight_px`, the tracker's outline `tracker_px`, and with `grid` the lines of RA and Dec as `{label, px}`; pixels of
+        the monitor. `clipped` are HIP numbers, and names of what has none.
+        """
+        turn = self.monitor.cam_to_image @ to_matrix(q_icrs_to_cam)
+        near = self.stars.near(turn[2], self.monitor.field_radius_rad(0.0))
+        x_px, y_px = self.monitor.project(self.stars.directions(near) @ turn.T)
+        inside = np.flatnonzero(self._on_screen(x_px, y_px, 0.0))
+        inside = inside[np.argsort(self.stars.v_mag[near[inside]], kind="stable")][:MAX_STARS]
+        which = near[inside]
+        marked = set(clipped)
+        hips, names = self.stars.hip[which].tolist(), self.stars.names(which)
+        columns = (
+            x_px[inside].round(PX_DIGITS).tolist(),
+            y_px[inside].round(PX_DIGITS).tolist(),
+            self.stars.v_mag[which].round(2).tolist(),
+            hips,
+            self._labels(which),
+            [int((name or hip) in marked) for name, hip in zip(names, hips, strict=True)],
+        )
+        told = {
+            "stars": [list(row) for row in zip(*columns, strict=True)],
+            "boresight_px": [round(at, PX_DIGITS) for at in self.monitor.boresight_px],
+            "tracker_px": self._tracker_px(),
+        }
+        return told | ({"grid": list(self._grid(q_icrs_to_cam, turn))} if grid else {})
+
+    def _on_screen(self, x_px: FloatArray, y_px: FloatArray, beyond: float) -> np.ndarray[Any, Any]:
+        width, height = self.monitor.resolution_px
+        with np.errstate(invalid="ignore"):  # NaN: behind the camera, or beyond the lens
+            inside = np.abs(x_px - (width - 1) / 2) <= width * (0.5 + beyond)
+            return np.asarray(inside & (np.abs(y_px - (height - 1) / 2) <= height * (0.5 + beyond)))
+
+    def _tracker_px(self) -> list[list[float]]:
+        """The tracker's outline on the monitor."""
+        rays = self.tracker.rays(*_border(self.tracker.resolution_px, SIDE_PLACES))
+        x_px, y_px = self.monitor.project_outward(rays @ self.monitor.cam_to_image.T)
+        known = np.isfinite(x_px) & np.isfinite(y_px)
+        return [[x, y] for x, y in np.column_stack((x_px, y_px))[known].round(PX_DIGITS).tolist()]
+
+    def _grid(self, q_icrs_to_cam: FloatArray, turn: FloatArray) -> Iterator[dict[str, Any]]:
+        """Lines of RA and of Dec that cross the image."""
+        ra_deg, dec_deg, _ = to_radec_roll_deg(q_icrs_to_cam)
+        radius_deg = math.degrees(self.monitor.field_radius_rad(0.0))
+        step_deg = _step(STEPS_DEG, radius_deg / LINES_ACROSS)
+        low_deg, high_deg = max(dec_deg - radius_deg, -90.0), min(dec_deg + radius_deg, 90.0)
+        wide_deg, ra_step_deg = 180.0, 30.0
+        if max(-low_deg, high_deg) < 90.0:  # the widest circle of right ascension that the field touches
+            share = math.sin(math.radians(min(radius_deg, 89.0))) / math.cos(math.radians(dec_deg))
+            wide_deg = math.degrees(math.asin(min(share, 1.0)))
+            ra_step_deg = _step(RA_STEPS_DEG, wide_deg / LINES_ACROSS)
+        reach = np.linspace(-wide_deg, wide_deg, LINE_PLACES * (4 if wide_deg > 90 else 1))
+        for dec in _multiples(low_deg, high_deg, step_deg):
+            yield from self._line(
+                f"Dec {dec:+.{_digits(step_deg)}f}\N{DEGREE SIGN}", ra_deg + reach, np.full_like(reach, dec), turn
+            )
+        up = np.linspace(low_deg, high_deg, LINE_PLACES)
+        for ra in _multiples(ra_deg - wide_deg, ra_deg + wide_deg - 1e-9, ra_step_deg):
+            yield from self._line(f"RA {ra % 360:.{_digits(ra_step_deg)}f}\N{DEGREE SIGN}", np.full_like(up, ra), up, turn)
+
+    def _line(self, label: str, ra_deg: FloatArray, dec_deg: FloatArray, turn: FloatArray) -> Iterator[dict[str, Any]]:
+        """A line over the sky, in pieces where it leaves the image."""
+        ra, dec = np.radians(ra_deg), np.radians(dec_deg)
+        vectors = np.column_stack((np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)))
+        x_px, y_px = self.monitor.project(vectors @ turn.T)
+        inside = self._on_screen(x_px, y_px, BEYOND)
+        # A piece has a place more on each side, so that it reaches over the image's edge; one alone is nothing.
+        near = np.isfinite(x_px) & (inside | np.append(inside[1:], False) | np.append(False, inside[:-1]))
+        bounds = np.flatnonzero(np.diff(np.concatenate(([False], near, [False])).astype(np.int8)))
+        for begin, end in zip(bounds[::2], bounds[1::2], strict=True):
+            if end - begin > 1:
+                places = np.column_stack((x_px[begin:end], y_px[begin:end]))
+                yield {"label": label.replace("-", "\N{MINUS SIGN}"), "px": places.round(1).tolist()}
+
+
+def overlay_of(bench: Bench) -> Overlay:
+    """The overlay of an assembled bench."""
+    return Overlay(bench.camera, tracker_camera(bench.config.tracker, bench.file.folder), bench.shown_stars)
+
+
+def _border(resolution_px: tuple[int, int], places: int) -> tuple[FloatArray, FloatArray]:
+    """Places on an image's edge, in order around it, so many along each side."""
+    width, height = resolution_px
+    along = np.linspace(0.0, 1.0, places)[:-1]
+    share_x = np.concatenate((along, np.ones_like(along), 1 - along, np.zeros_like(along)))
+    share_y = np.concatenate((np.zeros_like(along), along, np.ones_like(along), 1 - along))
+    return share_x * width - 0.5, share_y * height - 0.5
+
+
+def _step(steps: tuple[float, ...], most: float) -> float:
+    return max((step for step in steps if step <= most), default=steps[0])
+
+
+def _multiples(low: float, high: float, step: float) -> list[float]:
+    return [k * step for k in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)]
+
+
+def _digits(step_deg: float) -> int:
+    return 0 if step_deg >= 1 else 1 if step_deg >= 0.1 else 2

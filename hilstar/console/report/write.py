@@ -1,0 +1,26 @@
+"""Writing a run's report: the page, and its figures as JSON."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+
+from hilstar.console.report.bundle import report_page
+from hilstar.console.report.pictures import run_pictures
+from hilstar.console.report.run_data import run_data
+from hilstar.files import write_whole
+from hilstar.run.record.report import RunReport, figures_of, summarise
+
+
+def report(path: Path, directory: Path) -> RunReport:
+    """Write `report.html` and `report.json` of a ledger into a directory; the figures.
+
+    Raises InputError for a file that is no ledger, and if it cannot write.
+    """
+    run = figures_of(path)
+    summary = summarise(run)
+    page = report_page(run_data(path.name, run, summary) | run_pictures(run, path))
+    write_whole(directory / "report.html", page.encode(errors="replace"))
+    write_whole(directory / "report.json", msgspec.json.format(msgspec.json.encode(summary)))
+    return summary

@@ -1,0 +1,75 @@
+"""Debian's chromium without a window, through Selenium: its pages, what their consoles said, and pictures of them."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from selenium.webdriver import Chrome, ChromeOptions
+from selenium.webdriver.chrome.service import Service
+
+FLAGS = (
+    "--headless=new",
+    "--no-sandbox",  # chromium refuses its own as root, which a container's user is
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--disable-dev-shm-usage",
+    "--hide-scrollbars",
+)
+SIZES_PX = {"phone": (390, 844), "laptop": (1366, 768), "large": (1920, 1080)}
+
+
+class Browser(Chrome):
+    """A browser with what the tests of pages need."""
+
+    def size(self, width_px: int, height_px: int) -> None:
+        """The size of the page's window, in CSS pixels, however small."""
+        metrics = {"width": width_px, "height": height_px, "deviceScaleFactor": 1, "mobile": False}
+        self.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
+
+    def prefer(self, **features: str) -> None:
+        """What the user's system asks for: color_scheme="light", reduced_motion="reduce"."""
+        asked = [{"name": f"prefers-{name.replace('_', '-')}", "value": value} for name, value in features.items()]
+        self.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": asked})
+
+    def picture(self, path: Path, whole: bool = False) -> Path:
+        """A PNG of what the window shows, or of the whole page."""
+        if whole:
+            height = int(self.run("return document.documentElement.scrollHeight"))
+            width = int(self.run("return innerWidth"))
+            self.size(width, height)
+        self.save_screenshot(str(path))
+        return path
+
+    def run(self, script: str, *arguments: Any) -> Any:
+        """What a script says."""
+        return self.execute_script(script, *arguments)
+
+    def complaints(self) -> list[str]:
+        """What the console has said since it was last asked, violations of the page's policy among it."""
+        return [f"{entry['level']} {entry['message']}" for entry in self.get_log("browser")]
+
+
+@contextmanager
+def browser() -> Iterator[Browser]:
+    """A browser with an empty profile."""
+    profile = tempfile.mkdtemp(prefix="hilstar-chromium-")
+    options = ChromeOptions()
+    options.binary_location = shutil.which("chromium") or "/usr/bin/chromium"
+    for flag in (*FLAGS, f"--user-data-dir={profile}"):
+        options.add_argument(flag)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    found = Browser(options=options, service=Service(shutil.which("chromedriver") or "/usr/bin/chromedriver"))
+    try:
+        yield found
+    finally:
+        found.quit()
+        shutil.rmtree(profile, ignore_errors=True)

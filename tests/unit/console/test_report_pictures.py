@@ -1,0 +1,65 @@
+"""Pictures in a report are the codes that the run showed, or it says in a line why there are none."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hilstar.bench.frame import Bench
+from hilstar.console.report.write import report
+from hilstar.rotation import from_rotation_vector, multiply
+from hilstar.run.record.ledger import Ledger
+from hilstar.run.record.ledger_records import FrameRecord
+from tests.support.benches import ORION_Q
+from tests.support.run_page import levels_of, run_data_of
+
+pytestmark = pytest.mark.gpu
+RATE = (0.0, 0.02, 0.0)
+
+
+def attitude(k: int) -> tuple[float, ...]:
+    return tuple(multiply(from_rotation_vector(np.array([0.0, 1e-3 * k, 0.0])), np.array(ORION_Q)).tolist())
+
+
+@pytest.fixture
+def ledger(bench_with, tmp_path) -> tuple[Path, Bench]:
+    """40 frames of a turn, the first without an attitude."""
+    bench = bench_with()
+    with Ledger(tmp_path / "run.mcap", bench) as written:
+        for k in range(40):
+            q, rate = (None, None) if k == 0 else (attitude(k), RATE)
+            written.frame(FrameRecord(frame=k, t_ns=k, light_ns=k, draw_ns=k, swap_ns=10**9 + k, q=q, rate=rate))
+    return tmp_path / "run.mcap", bench
+
+
+def test_pictures_are_the_codes_of_the_run(ledger, tmp_path):
+    path, bench = ledger
+    report(path, tmp_path)
+    data = run_data_of((tmp_path / "report.html").read_text())
+    pictures = data["pictures"]
+    assert [picture["frame"] for picture in pictures] == sorted({picture["frame"] for picture in pictures})
+    assert pictures[0]["frame"] == 0 and pictures[-1]["frame"] == 39 and len(pictures) >= 8
+    assert pictures[0]["truth"] is None and not levels_of(pictures[0]).any()
+    for picture in pictures[1:]:
+        shown = bench.draw(np.array(attitude(picture["frame"])), picture["frame"], RATE).levels
+        assert np.array_equal(levels_of(picture), shown) and shown.any()
+        x, y, *_ = picture["truth"]["stars"][0]
+        about = shown[round(y) - 1 : round(y) + 2, round(x) - 1 : round(x) + 2]
+        assert about.max() > shown.max() / 2 > 50  # the brightest star is where the overlay says
+    assert data["sky"]["stars"]
+
+
+def test_a_file_of_the_bench_that_has_changed_since_gives_no_pictures_and_says_so(bench_with, tmp_path):
+    named = tmp_path / "truth.toml"
+    named.write_text("# the bench's hash covers every file that it names\n")
+    with Ledger(tmp_path / "run.mcap", bench_with('[verify]\ntrue_calibration = "truth.toml"\n')) as written:
+        written.frame(FrameRecord(frame=0, t_ns=0, light_ns=0, draw_ns=0, swap_ns=1, q=attitude(0)))
+    for text, count in ((None, 1), ("# another\n", 0)):
+        if text is not None:
+            named.write_text(text)
+        report(tmp_path / "run.mcap", tmp_path)
+        data = run_data_of((tmp_path / "report.html").read_text())
+        assert len(data["pictures"]) == count
+    assert "has changed since the run" in data["no_pictures"]

@@ -5,10 +5,11 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
-from hilstar.bench.config import GEOCENTRE, SOURCE, BenchConfig, parse_config
+from hilstar.bench.config import GEOCENTRE, SOURCE, BenchConfig, config_of, parse_config
 from hilstar.bench.config.when import with_dates
 from hilstar.errors import InputError
 from hilstar.monitor.calibration import BUILT_IN
@@ -46,6 +47,15 @@ def bench_file_of(path: Path, text: str) -> BenchFile:
     """The bench file that `path` would be with this text. Raises InputError as `read_bench_file` does."""
     config = parse_config(path, text)
     return BenchFile(path, text, config, _sha256(config, path.parent))
+
+
+def changed_file(file: BenchFile, tables: dict[str, Any]) -> BenchFile:
+    """The file as it would be with these tables, as TOML gives them. Raises InputError as `read_bench_file` does.
+
+    Its text stays that of `file`; its hash is that of a bench file with these tables.
+    """
+    config = config_of(file.path, tables)
+    return replace(file, config=config, sha256=_sha256(config, file.folder))
 
 
 def dated(file: BenchFile, scale: str | None, first_ns: int) -> BenchFile:

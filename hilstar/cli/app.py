@@ -19,6 +19,7 @@ from hilstar.cli.calibrate.plan import plan
 from hilstar.cli.calibrate.scale import scale
 from hilstar.cli.doctor import doctor
 from hilstar.cli.measure.budget import budget
+from hilstar.cli.measure.campaign import campaign
 from hilstar.cli.measure.compare import compare
 from hilstar.cli.measure.simulate import simulate
 from hilstar.cli.measure.verify import verify
@@ -37,6 +38,7 @@ COMMANDS: dict[str, tuple[Callable[..., None], ...]] = {
     "Show stars": (demo, frame, serve, replay),
     "Attitude streams": (send, attitude, convert, keys),
     "Check what is shown": (simulate, verify, compare, budget, report),
+    "Test the tracker": (campaign,),
     "Calibrate": (first_light, latency),
     "Study": (study, benchmark),
     "This machine": (doctor,),

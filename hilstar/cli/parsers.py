@@ -156,6 +156,14 @@ def parse_split(text: str | None) -> Split:
     return Split(bytes=value) if match[2].endswith("B") else Split(seconds=value)
 
 
+def parse_memory(text: str) -> int:
+    """The bytes of "4GB" or "500 MB". Raises InputError."""
+    match = re.fullmatch(r"(\d{1,9}(?:\.\d{1,9})?)\s*(MB|GB)", text.strip())
+    if match is None or float(match[1]) <= 0:
+        raise InputError(f"--memory {text}: write a size such as 4GB or 500MB")
+    return round(float(match[1]) * SPLIT_UNITS[match[2]])
+
+
 def parse_reading(text: str) -> Reading:
     """A reading from "HIP,DN". Raises InputError."""
     from hilstar.calibrate.scale import Reading

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hilstar.attitude.clock.timeline import Policy
+from hilstar.attitude.clock.timeline import Policy, Timeline
 from hilstar.attitude.logs.log_file import log_timeline
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.bench.bench_file import BenchFile
@@ -42,18 +42,20 @@ def log_motions(
         times_ns = [sample.t_ns for sample in samples]
     else:
         times_ns = [round(t) for t in np.linspace(first_ns, last_ns, frame_count)]
+    return [motion_at(timeline, (first_ns, last_ns), t_ns, exposure_s) for t_ns in times_ns]
+
+
+def motion_at(timeline: Timeline, span_ns: tuple[int, int], t_ns: int, exposure_s: float) -> Motion:
+    """The exposure around `t_ns` of a log that lasts over `span_ns` (see `log_motions`)."""
     half_ns = round(exposure_s * NS_PER_S / 2)
-    motions = []
-    for t_ns in times_ns:
-        ends_ns = max(first_ns, t_ns - half_ns), min(last_ns, t_ns + half_ns)
-        begin, middle, end = (timeline.at(t) for t in (ends_ns[0], t_ns, ends_ns[1]))
-        if begin is None or middle is None or end is None:
-            continue  # never: the log has a sample
-        rate = np.zeros(3)
-        if ends_ns[1] > ends_ns[0]:
-            rate = rate_between_rad_s(begin.q_icrs_to_cam, end.q_icrs_to_cam, (ends_ns[1] - ends_ns[0]) / NS_PER_S)
-        motions.append(Motion(middle.q_icrs_to_cam, rate, exposure_s, t_ns))
-    return motions
+    ends_ns = max(span_ns[0], t_ns - half_ns), min(span_ns[1], t_ns + half_ns)
+    begin, middle, end = (timeline.at(t) for t in (ends_ns[0], t_ns, ends_ns[1]))
+    if begin is None or middle is None or end is None:
+        raise AssertionError("a log has a sample")
+    rate = np.zeros(3)
+    if ends_ns[1] > ends_ns[0]:
+        rate = rate_between_rad_s(begin.q_icrs_to_cam, end.q_icrs_to_cam, (ends_ns[1] - ends_ns[0]) / NS_PER_S)
+    return Motion(middle.q_icrs_to_cam, rate, exposure_s, t_ns)
 
 
 def simulate_motions(

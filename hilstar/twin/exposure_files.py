@@ -3,17 +3,29 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
+from hilstar.bench.bench_file import BenchFile
+from hilstar.bench.config import BenchConfig
 from hilstar.bench.frame_files import sky_header
 from hilstar.files import written
+from hilstar.scene.camera import Camera
 from hilstar.twin.picture import exposure_picture
-from hilstar.twin.simulator import Exposure, FrameNoise, Simulator
+from hilstar.twin.simulator import Exposure, FrameNoise
 
 
-def write_exposure_fits(path: Path, simulator: Simulator, exposure: Exposure, noise: FrameNoise) -> None:
+class Imager(Protocol):
+    """What makes exposures: a bench file, and the tracker's camera."""
+
+    file: BenchFile
+    config: BenchConfig
+    camera: Camera
+
+
+def write_exposure_fits(path: Path, simulator: Imager, exposure: Exposure, noise: FrameNoise) -> None:
     """The virtual tracker's DN (uint16) and, as second HDU, the truth table; the header says how both were made."""
     from astropy.io import fits
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Literal, Self
+from typing import Literal, Protocol, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +18,7 @@ from hilstar.bench.config import BenchConfig
 from hilstar.bench.truth import truth_table
 from hilstar.errors import InputError
 from hilstar.render.renderer import Context, Renderer, Target
+from hilstar.scene.camera import Camera
 from hilstar.scene.exposure_motion import MIDDLE_S, Motion, smeared_sprites
 from hilstar.sky.electrons import Photometry, zodiacal_electrons_per_s_arcsec2
 from hilstar.sky.stars import Stars
@@ -65,13 +66,41 @@ class Simulator:
     def __init__(self, file: BenchFile, context: Context | None = None) -> None:
         self.file = file
         self.config = file.config
+        self._load_sky()
+        self._load_tracker()
+        self.renderer = Renderer(Target(self.config.tracker.resolution_px, self.config.tracker.psf_sigma_px), context)
+
+    def _load_sky(self) -> None:
+        self.moving = bench_moving(self.config, self.file.folder)
+        self.stars = moved(bench_stars(self.config, self.file.folder, self.moving), self.moving)
+
+    def _load_tracker(self) -> None:
         tracker = self.config.tracker
-        self.moving = bench_moving(self.config, file.folder)
-        self.stars = moved(bench_stars(self.config, file.folder, self.moving), self.moving)
-        self.camera = tracker_camera(tracker, file.folder)
-        self.background_e = background_e(self.config, file.folder)
+        self.camera = tracker_camera(tracker, self.file.folder)
+        self.background_e = background_e(self.config, self.file.folder)
         self.detector = Detector(tracker.detector, tracker.resolution_px, tracker.pixel_pitch_um)
-        self.renderer = Renderer(Target(tracker.resolution_px, tracker.psf_sigma_px), context)
+
+    def change(self, file: BenchFile) -> None:
+        """Be the tracker of another bench file of the same folder: only what the change touches is made anew.
+
+        For a simulator in a GL context of its own. Raises what the simulator itself does, and is then to be closed.
+        """
+        if file.config == self.config and file.sha256 == self.file.sha256:
+            return
+        before, self.file, self.config = self.config, file, file.config
+        if self.moving is not None or _sky_keys(before) != _sky_keys(self.config):
+            self._load_sky()
+        if (before.tracker, before.background, before.sky) != (self.config.tracker, self.config.background, self.config.sky):
+            self._load_tracker()
+        target = Target(self.config.tracker.resolution_px, self.config.tracker.psf_sigma_px)
+        if target != self.renderer.target:
+            self.renderer.close()
+            self.renderer = Renderer(target)
+
+    @property
+    def gl_renderer(self) -> str:
+        """The name of the GL renderer, as the driver gives it."""
+        return self.renderer.gl_renderer
 
     def motion(self, q_icrs_to_cam: FloatArray, rate_cam_rad_s: FloatArray, t_ns: int | None = None) -> Motion:
         """An exposure of this tracker, by the attitude in its middle (unit quaternion) and a constant rate."""
@@ -104,19 +133,8 @@ class Simulator:
             dn = self.detector.expose_noiseless(mean_e, tracker.exposure_s)
         else:
             dn = self.detector.expose(mean_e, tracker.exposure_s, rng)
-        return Exposure(motion, dn, mean_e, self._truth(motion, stars, np.unique(sprites.star), mean_e), sprites.capped)
-
-    def _truth(self, motion: Motion, stars: Stars, star: npt.NDArray[np.intp], mean_e: FloatArray) -> npt.NDArray[np.void]:
-        x_px, y_px = self.camera.project(stars.directions(star) @ motion.icrs_to_image(MIDDLE_S, self.camera)[0].T)
-        truth = truth_table(stars, star, x_px, y_px)
-        height, width = mean_e.shape
-        inside = np.isfinite(x_px) & (np.rint(x_px) >= 0) & (np.rint(x_px) < width)
-        inside &= (np.rint(y_px) >= 0) & (np.rint(y_px) < height)
-        place = np.rint(y_px[inside]).astype(np.intp), np.rint(x_px[inside]).astype(np.intp)
-        detector = self.config.tracker.detector
-        last_code_e = (2**detector.bits - 1 - detector.offset_dn) * detector.gain_e_per_dn
-        truth["clipped"][inside] = mean_e[place] > min(detector.full_well_e, last_code_e)
-        return truth[np.argsort(truth["v_mag"], kind="stable")]
+        truth = exposure_truth(self, motion, stars, np.unique(sprites.star), mean_e)
+        return Exposure(motion, dn, mean_e, truth, sprites.capped)
 
     def close(self) -> None:
         """Free the GL context."""
@@ -127,6 +145,35 @@ class Simulator:
 
     def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
         self.close()
+
+
+class Looking(Protocol):
+    """A tracker as a truth table needs it."""
+
+    config: BenchConfig
+    camera: Camera
+
+
+def exposure_truth(
+    tracker: Looking, motion: Motion, stars: Stars, star: npt.NDArray[np.intp], mean_e: FloatArray
+) -> npt.NDArray[np.void]:
+    """The truth of an exposure (see `Exposure`) with the stars at the indices `star` (n,) of `stars` in view."""
+    x_px, y_px = tracker.camera.project(stars.directions(star) @ motion.icrs_to_image(MIDDLE_S, tracker.camera)[0].T)
+    truth = truth_table(stars, star, x_px, y_px)
+    height, width = mean_e.shape
+    inside = np.isfinite(x_px) & (np.rint(x_px) >= 0) & (np.rint(x_px) < width)
+    inside &= (np.rint(y_px) >= 0) & (np.rint(y_px) < height)
+    place = np.rint(y_px[inside]).astype(np.intp), np.rint(x_px[inside]).astype(np.intp)
+    detector = tracker.config.tracker.detector
+    last_code_e = (2**detector.bits - 1 - detector.offset_dn) * detector.gain_e_per_dn
+    truth["clipped"][inside] = mean_e[place] > min(detector.full_well_e, last_code_e)
+    return truth[np.argsort(truth["v_mag"], kind="stable")]
+
+
+def _sky_keys(config: BenchConfig) -> tuple[object, ...]:
+    """All by which the rates and directions of stars are made, where no body moves among them."""
+    tracker = config.tracker
+    return config.sky, config.spacecraft, tracker.aperture_mm, tracker.quantum_efficiency, tracker.transmission
 
 
 def background_e(config: BenchConfig, folder: Path) -> FloatArray:

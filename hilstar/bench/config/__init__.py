@@ -8,7 +8,7 @@ from hilstar.bench.config.background import Background
 from hilstar.bench.config.bench import BenchConfig
 from hilstar.bench.config.collimator import Collimator
 from hilstar.bench.config.monitor import Monitor
-from hilstar.bench.config.read import parse_config, read_config
+from hilstar.bench.config.read import config_of, parse_config, read_config
 from hilstar.bench.config.render import DEFAULT_BRIGHTEST_V_MAG, RenderSettings
 from hilstar.bench.config.sky import Bodies, SkySettings
 from hilstar.bench.config.spacecraft import GEOCENTRE, SOURCE
@@ -31,6 +31,7 @@ __all__ = [
     "Tracker",
     "Vector",
     "Verify",
+    "config_of",
     "parse_config",
     "read_config",
 ]

@@ -29,7 +29,11 @@ def read_config(path: Path) -> BenchConfig:
 
 def parse_config(path: Path, text: str) -> BenchConfig:
     """Parse and check the text of the bench file `path`. Raises InputError: file, key, what is wrong and what to write."""
-    tables = parse_toml(path, text)
+    return config_of(path, parse_toml(path, text))
+
+
+def config_of(path: Path, tables: dict[str, Any]) -> BenchConfig:
+    """Check the tables of the bench file `path`, as TOML gives them. Raises InputError as `parse_config` does."""
     _check_finite(tables, path)
     try:
         config = msgspec.convert(tables, BenchConfig)

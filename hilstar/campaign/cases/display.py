@@ -1,0 +1,126 @@
+"""The display as the virtual tracker sees it: each frame that is shown during an exposure, through the twin, to DN."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+
+from hilstar.arrays import FloatArray
+from hilstar.bench.bench_file import BenchFile
+from hilstar.bench.build import open_bench
+from hilstar.bench.cameras import tracker_camera
+from hilstar.bench.config import BenchConfig
+from hilstar.monitor.quantise import shown_light
+from hilstar.rotation import propagate
+from hilstar.scene.exposure_motion import MIDDLE_S, Motion
+from hilstar.scene.psf import footprint_px
+from hilstar.scene.sprites import make_sprites
+from hilstar.tracker.detector import Detector
+from hilstar.twin.optics import TwinOptics
+from hilstar.twin.simulator import Exposure, background_e, exposure_truth
+from hilstar.twin.verify.light import true_panel
+from hilstar.twin.verify.twin import true_geometry
+
+
+class DisplayTracker:
+    """The bench's tracker before the bench's display as it truly is (`[verify] true_*`). Free it with `close`.
+
+    Frames follow one another at `[monitor] refresh_hz`, and each is held until the next: an exposure is the mean of those that
+    it lasts over, each at the attitude in the middle of its time. At rest they are one, unless they are dithered in time.
+    """
+
+    def __init__(self, file: BenchFile) -> None:
+        self.file, self.config = file, file.config
+        self._bench = open_bench(file)
+        self._load()
+        self._load_optics()
+
+    @property
+    def gl_renderer(self) -> str:
+        """The name of the GL renderer, as the driver gives it."""
+        return self._bench.renderer.gl_renderer
+
+    def change(self, file: BenchFile) -> None:
+        """Be the bench of another file of the same folder: only what the change touches is made anew."""
+        if file.config == self.config:
+            return
+        before, self.file, self.config = self.config, file, file.config
+        if _shown_keys(before) != _shown_keys(self.config) or self._bench.moving is not None:
+            self._bench.close()
+            self._bench = open_bench(file)
+        else:  # what the bench chose for its tolerance stays chosen
+            config = msgspec.structs.replace(file.config, render=self._bench.config.render)
+            self._bench = replace(self._bench, file=file, config=config)
+        self._load()
+        if _optics_keys(before) != _optics_keys(self.config):
+            self._optics.close()
+            self._load_optics()
+        else:
+            self._glow_e_per_s = self._optics.glow_e_per_s(self._panel)
+
+    def _load(self) -> None:
+        tracker = self.config.tracker
+        self.camera = tracker_camera(tracker, self.file.folder)
+        self._panel = true_panel(self._bench)
+        self._background_e = background_e(self.config, self.file.folder)
+        self._detector = Detector(tracker.detector, tracker.resolution_px, tracker.pixel_pitch_um)
+
+    def _load_optics(self) -> None:
+        self._optics = TwinOptics(true_geometry(self._bench, self.camera), self.config.tracker.psf_sigma_px)
+        self._glow_e_per_s = self._optics.glow_e_per_s(self._panel)
+
+    def expose(self, motion: Motion, rng: np.random.Generator | None) -> Exposure:
+        """One exposure of the display; without a generator, without noise. Raises InputError as the detector does."""
+        exposure_s = motion.exposure_s
+        light_e = self._optics.image_e_per_s(self._light_e_per_s(motion)) * exposure_s
+        mean_e = light_e + self._glow_e_per_s * exposure_s + self._background_e
+        if rng is None:
+            dn = self._detector.expose_noiseless(mean_e, exposure_s)
+        else:
+            dn = self._detector.expose(mean_e, exposure_s, rng)
+        stars = self._bench.seen(self._bench.stars, motion.t_ns)
+        icrs_to_image = motion.icrs_to_image(MIDDLE_S, self.camera)[0]
+        sprites = make_sprites(stars, icrs_to_image, self.camera, footprint_px(self.config.tracker.psf_sigma_px))
+        truth = exposure_truth(self, motion, stars, np.unique(sprites.star), mean_e)
+        truth["drawn"] = truth["electrons_per_s"] >= self._bench.faintest_shown_e_per_s
+        return Exposure(motion, dn, mean_e, truth)
+
+    def _light_e_per_s(self, motion: Motion) -> FloatArray:
+        """The mean light (H, W) of the display over the exposure."""
+        count = 1
+        if motion.rate_cam_rad_s.any() or self.config.render.quantisation == "temporal":
+            count = max(1, round(motion.exposure_s * self.config.monitor.refresh_hz))
+        total: FloatArray | None = None
+        for frame in range(count):
+            seconds = ((frame + 0.5) / count - 0.5) * motion.exposure_s
+            q = propagate(motion.q_icrs_to_cam, motion.rate_cam_rad_s, seconds)
+            light = shown_light(self._bench.draw(q, frame, t_ns=motion.t_ns).levels, self._panel)
+            total = light if total is None else total + light
+        return np.zeros((0, 0)) if total is None else total / count
+
+    def close(self) -> None:
+        """Free the GL contexts."""
+        self._bench.close()
+        self._optics.close()
+
+
+def _shown_keys(config: BenchConfig) -> tuple[object, ...]:
+    """All by which the bench chooses and draws its frames: of the tracker, what gathers light and how long."""
+    tracker = config.tracker
+    gathers = tracker.aperture_mm, tracker.quantum_efficiency, tracker.transmission, tracker.exposure_s
+    return config.sky, config.spacecraft, config.monitor, config.collimator, config.render, gathers
+
+
+def _optics_keys(config: BenchConfig) -> tuple[object, ...]:
+    """All by which the display's light falls onto the detector."""
+    tracker = config.tracker
+    lens = (
+        tracker.focal_length_mm,
+        tracker.pixel_pitch_um,
+        tracker.resolution_px,
+        tracker.principal_point_px,
+        tracker.distortion,
+    )
+    return config.monitor, config.collimator, config.verify, lens, tracker.psf_sigma_px

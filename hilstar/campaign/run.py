@@ -1,0 +1,133 @@
+"""A campaign from its plan to its table: what is done stays done, whatever ends the run before its end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import msgspec
+
+from hilstar.bench.bench_file import BenchFile, read_bench_file
+from hilstar.campaign.cases.case import CaseMaker
+from hilstar.campaign.cases.row import columns, failed, first_row
+from hilstar.campaign.plan.design import Design
+from hilstar.campaign.plan.parameters import grid_levels
+from hilstar.campaign.plan.tables import Plan, parse_plan
+from hilstar.campaign.store.directory import About, Directory
+from hilstar.campaign.store.journal import Journal
+from hilstar.campaign.store.table import file_sha256, require_parquet, schema_of, write_table
+from hilstar.campaign.workers.backlog import MAX_DEATHS, Backlog, Task
+from hilstar.campaign.workers.identity import Identity
+from hilstar.campaign.workers.session import Answered, Job, Session
+from hilstar.errors import InputError
+from hilstar.reading import MAX_TOML_BYTES, read_text
+
+MAX_LOG_BYTES = 10_000_000_000
+Say = Callable[[str], None]
+
+
+class Workers(Protocol):
+    """Whoever runs cases: the pool, or a cluster."""
+
+    def run(self, backlog: Backlog, done: Callable[[Task, Answered], None], lost: Callable[[Task, int | None], None]) -> None:
+        """Run all cases of a backlog."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """What a campaign is asked for beside its plan."""
+
+    solver: str
+    timeout_s: float
+    images: bool
+
+
+class Campaign:
+    """A campaign that is ready to run: everything checked, nothing written. Raises InputError or MachineError."""
+
+    def __init__(self, path: Path, directory: Path, asked: Asked) -> None:
+        require_parquet()
+        text = read_text(path, "give the path of a plan", MAX_TOML_BYTES)
+        self.path, self.directory, self.asked = path, directory, asked
+        self.plan: Plan = parse_plan(path, text)
+        self.file: BenchFile = read_bench_file(path.parent / self.plan.bench)
+        self.job = Job(
+            plan_path=str(path.resolve()),
+            plan_text=text,
+            bench_path=str(self.file.path.resolve()),
+            bench_text=self.file.text,
+            bench_sha256=self.file.sha256,
+            solver=asked.solver,
+            solver_folder=str(Path.cwd()),
+            timeout_s=asked.timeout_s,
+            directory=str(directory.resolve()),
+            images=asked.images,
+        )
+        try:
+            session = Session(self.job)  # what is wrong with the plan, the bench or the solver is said once, here
+        except InputError as error:
+            raise InputError(f"{path}: {error}" if "[[vary]]" in str(error) else str(error)) from error
+        try:
+            self.identity: Identity = session.identity()
+            self.maker: CaseMaker = session.maker
+        finally:
+            session.close()
+        self.columns = columns(self.maker.parameters, "stars" in session.columns)
+        levels = grid_levels(self.plan)
+        self.cases = self.plan.cases or _product(levels)
+        self.design = Design(self.plan.sampling, self.plan.seed, self.cases, self.maker.attitude_dimensions, levels)
+
+    def about(self) -> About:
+        """What the rows depend on."""
+        log = None if self.plan.attitudes.log is None else file_sha256(self.path.parent / self.plan.attitudes.log)
+        plan = msgspec.json.decode(msgspec.json.encode(self.plan, enc_hook=str))
+        identity = msgspec.to_builtins(self.identity)
+        return About(plan, self.file.sha256, log, self.asked.solver, self.asked.images, identity)
+
+    def run(self, directory: Directory, workers: Workers, on_done: Callable[[int], None]) -> None:
+        """Run what is missing, and write the table when nothing is. `on_done` gets the number of cases that are done.
+
+        Raises InputError where nothing can be written, and what the workers raise; the same again goes on from there.
+        """
+        journal = directory.journal(self.cases)
+        try:
+            done = journal.done
+            on_done(done)
+
+            def keep(rows: list[dict[str, Any]]) -> None:
+                nonlocal done
+                done += journal.append(rows)
+                on_done(done)
+
+            def lost(task: Task, at_fault: int | None) -> None:
+                if at_fault is not None:
+                    row = first_row(self.maker.case(at_fault, task.points[0]), self.columns)
+                    keep([failed(row, f"its worker died {MAX_DEATHS} times over it")])
+
+            if done < self.cases:
+                workers.run(Backlog(self.design, journal, 0.5), lambda task, answered: keep(answered.rows), lost)
+            write_table(directory.table, schema_of(self.columns, self._metadata()), self._blocks(journal))
+            journal.remove()
+        finally:
+            journal.close()
+
+    def _blocks(self, journal: Journal) -> Iterator[list[dict[str, Any]]]:
+        for block in range(journal.blocks):
+            yield journal.rows(block)
+
+    def _metadata(self) -> dict[str, str]:
+        return {f"hilstar.{name}": value for name, value in self._said()}
+
+    def _said(self) -> Iterator[tuple[str, str]]:
+        for name, value in msgspec.to_builtins(self.about()).items():
+            yield name, value if isinstance(value, str) else msgspec.json.encode(value).decode()
+
+
+def _product(levels: list[int]) -> int:
+    total = 1
+    for count in levels:
+        total *= count
+    return total

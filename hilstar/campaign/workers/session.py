@@ -1,0 +1,183 @@
+"""What a worker does: the campaign's cases, one after the other, with one tracker that changes with them."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import time
+from pathlib import Path
+from typing import Any, Protocol
+
+import msgspec
+import numpy as np
+
+from hilstar.arrays import FloatArray
+from hilstar.bench.bench_file import BenchFile, bench_file_of
+from hilstar.bench.config import BenchConfig
+from hilstar.campaign.cases.case import Case, CaseMaker
+from hilstar.campaign.cases.display import DisplayTracker
+from hilstar.campaign.cases.row import Kind, Row, Tally, columns, failed, first_row
+from hilstar.campaign.plan.tables import Plan, parse_plan
+from hilstar.campaign.solvers.answer import SolverFault
+from hilstar.campaign.solvers.choose import CENTROIDS, choose_solver
+from hilstar.campaign.workers.identity import Identity, own_identity
+from hilstar.errors import HilstarError, InputError, MachineError, one_line
+from hilstar.files import make_directory
+from hilstar.scene.camera import Camera
+from hilstar.scene.exposure_motion import Motion
+from hilstar.twin.exposure_files import write_exposure_fits
+from hilstar.twin.simulator import Exposure, FrameNoise, Simulator
+
+IMAGES = "images"
+IMAGES_A_FOLDER = 1000
+
+
+class Job(msgspec.Struct, frozen=True):
+    """All that a worker is sent once: the plan and the bench as they were read, the solver, and where images go."""
+
+    plan_path: str
+    plan_text: str
+    bench_path: str
+    bench_text: str
+    bench_sha256: str
+    solver: str
+    solver_folder: str
+    timeout_s: float
+    directory: str
+    images: bool
+
+
+class Answered(msgspec.Struct, frozen=True):
+    """The rows of some cases, the seconds that they took, and the most memory that the worker has had."""
+
+    rows: list[dict[str, Any]]
+    seconds: float
+    peak_bytes: int
+
+
+class Imaging(Protocol):
+    """A tracker that exposes, of the sky or of the display."""
+
+    file: BenchFile
+    config: BenchConfig
+    camera: Camera
+
+    @property
+    def gl_renderer(self) -> str:
+        """The name of the GL renderer."""
+        ...
+
+    def change(self, file: BenchFile) -> None:
+        """Be the tracker of another bench file."""
+        ...
+
+    def expose(self, motion: Motion, rng: np.random.Generator | None) -> Exposure:
+        """One exposure."""
+        ...
+
+    def close(self) -> None:
+        """Free the GL contexts."""
+        ...
+
+
+class Session:
+    """A worker's part of a campaign. Raises InputError where the plan or the bench cannot be used here, or differ."""
+
+    def __init__(self, job: Job) -> None:
+        os.environ.setdefault("LP_NUM_THREADS", "1")  # workers fill the cores
+        self.job = job
+        self.plan: Plan = parse_plan(Path(job.plan_path), job.plan_text)
+        self.file = bench_file_of(Path(job.bench_path), job.bench_text)
+        if self.file.sha256 != job.bench_sha256:
+            raise InputError(
+                f"its bench {self.file.sha256:.12} is not the campaign's {job.bench_sha256:.12}: a file that {job.bench_path}"
+                " names has another content there; copy it"
+            )
+        self.maker = CaseMaker(self.plan, self.file, Path(job.plan_path).parent)
+        self.columns: dict[str, Kind] = columns(self.maker.parameters, job.solver == CENTROIDS)
+        self._solver = choose_solver(job.solver, self.plan.centroids, Path(job.solver_folder), job.timeout_s)
+        self._tracker: Imaging | None = self._new_tracker(self.maker.file)
+
+    def identity(self) -> Identity:
+        """What this worker is."""
+        return own_identity(self._at(self.maker.file).gl_renderer)
+
+    def run(self, begin: int, points: FloatArray) -> Answered:
+        """The rows of the cases from `begin` on at their points (n, dimensions)."""
+        start_s = time.perf_counter()
+        rows = [self.row(begin + k, point) for k, point in enumerate(points)]
+        return Answered(rows, time.perf_counter() - start_s, peak_bytes())
+
+    def row(self, number: int, point: FloatArray) -> Row:
+        """The row of one case; one that fails says why."""
+        case = self.maker.case(number, point)
+        row = first_row(case, self.columns)
+        try:
+            file = self.maker.bench(case)
+            row["bench_sha256"] = file.sha256
+            return self._exposed(case, self._at(file), row)
+        except MachineError:
+            raise
+        except HilstarError as error:
+            return failed(row, one_line(str(error)))
+        except (ArithmeticError, ValueError, LookupError, MemoryError, np.linalg.LinAlgError) as error:
+            self._tracker = None
+            return failed(row, one_line(f"{type(error).__name__}: {error}"))
+
+    def _exposed(self, case: Case, tracker: Imaging, row: Row) -> Row:
+        tally = Tally("stars" in self.columns, self.plan.wrong_above_arcsec)
+        noise = FrameNoise(self.plan.noise, case.noise_seed)
+        for frame in range(self.plan.frames):
+            motion = self.maker.motion(case, frame, tracker.config.tracker.exposure_s)
+            # A case of one frame is what `hilstar simulate --seed` makes of the same bench and attitude.
+            rng = noise.rng() if self.plan.frames == 1 else noise.rng(frame)
+            exposure = tracker.expose(motion, rng)
+            if self.job.images:
+                name = image_name(case.number, frame, self.plan.frames)
+                row["image"] = image_name(case.number, 0, self.plan.frames)
+                path = Path(self.job.directory) / name
+                make_directory(path.parent)
+                write_exposure_fits(path, tracker, exposure, noise)
+            tally.see(exposure)
+            try:
+                tally.hear(exposure, self._solver.solve(exposure, tracker))
+            except SolverFault as error:
+                return failed(tally.into(row), one_line(str(error)))
+        return tally.into(row)
+
+    def _at(self, file: BenchFile) -> Imaging:
+        """The tracker of a bench file; one that cannot be made leaves none behind."""
+        tracker, self._tracker = self._tracker, None
+        if tracker is None:
+            tracker = self._new_tracker(file)
+        else:
+            try:
+                tracker.change(file)
+            except BaseException:
+                with contextlib.suppress(Exception):  # what it had may be closed already
+                    tracker.close()
+                raise
+        self._tracker = tracker
+        return tracker
+
+    def _new_tracker(self, file: BenchFile) -> Imaging:
+        return Simulator(file) if self.plan.through == "tracker" else DisplayTracker(file)
+
+    def close(self) -> None:
+        """Free the GL contexts."""
+        if self._tracker is not None:
+            self._tracker.close()
+
+
+def image_name(case: int, frame: int, frames: int) -> str:
+    """The path of an image below the campaign's directory."""
+    part = "" if frames == 1 else f"_{frame:05d}"
+    return f"{IMAGES}/{case // IMAGES_A_FOLDER:06d}/case_{case:09d}{part}.fits"
+
+
+def peak_bytes() -> int:
+    """The most memory that this process has had at once (Linux: VmHWM)."""
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith("VmHWM"):
+            return int(line.split()[1]) * 1024
+    return 0

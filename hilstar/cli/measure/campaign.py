@@ -1,0 +1,125 @@
+"""hilstar campaign: many cases of a bench, over every core and machine."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from hilstar.cli.options import Json
+from hilstar.cli.parsers import parse_memory
+from hilstar.console.terminal import print_json, progress, say
+
+if TYPE_CHECKING:
+    from hilstar.campaign.run import Campaign
+    from hilstar.campaign.store.directory import Directory
+
+LINE_S = 10.0  # between lines of progress where stderr is no terminal
+
+
+def campaign(
+    plan: Annotated[Path, typer.Argument(metavar="PLAN.toml", help="What varies, and how (docs: Campaigns).")],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="DIR", help="Directory of the campaign; it goes on where it was.")
+    ],
+    workers: Annotated[
+        int | None, typer.Option(help="Processes on this machine; by default one a core.", min=1, max=1024)
+    ] = None,
+    solver: Annotated[
+        str,
+        typer.Option(
+            metavar="SOLVER",
+            help='What is tested: "centroids", "python:MODULE:FUNCTION", or a command with {image} that prints a quaternion.',
+        ),
+    ] = "centroids",
+    solver_timeout: Annotated[float, typer.Option(metavar="S", help="Time limit of one image, s.", min=0.01, max=86400)] = 10.0,
+    images: Annotated[Literal["fits"] | None, typer.Option(help="Keep the images, with their truth.")] = None,
+    memory: Annotated[
+        str | None,
+        typer.Option(metavar="SIZE", help="For this process and its workers together, such as 4GB: as many run as fit."),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Run a plan's cases over every core into one Parquet table, a row a case."""
+    from hilstar.campaign.run import Asked, Campaign
+    from hilstar.campaign.store.directory import Directory
+    from hilstar.files import check_directory
+
+    check_directory("-o", output)
+    memory_bytes = None if memory is None else parse_memory(memory)
+    this = Campaign(plan, output, Asked(solver, solver_timeout, images is not None))
+    directory = Directory(output)
+    try:
+        directory.claim(this.about())
+        if not directory.table.exists():
+            run_cases(this, directory, workers or len(os.sched_getaffinity(0)), memory_bytes)
+        summary = summarised(this, directory)
+    finally:
+        directory.close()
+    if as_json:
+        print_json(summary)
+        return
+    why = "".join(f"; {count} failed: {line}" for line, count in summary["failed_because"].items())
+    typer.echo(f"{summary['cases']} cases in {summary['table']}, sha256 {summary['sha256']}{why}")
+
+
+def run_cases(this: Campaign, directory: Directory, workers: int, memory_bytes: int | None) -> None:
+    """Run the cases that are missing, on this machine's cores."""
+    from hilstar.campaign.workers.pool import Pool
+
+    count = 0
+    with telling(this.cases) as advance:
+
+        def on_done(done: int) -> None:
+            nonlocal count
+            count = done
+            advance(done)
+
+        try:
+            with Pool(this.job, this.identity, workers, memory_bytes) as pool:
+                this.run(directory, pool, on_done)
+        except KeyboardInterrupt:
+            say(f"hilstar: {count} of {this.cases} cases are done; the same command goes on from there")
+            raise
+
+
+@contextmanager
+def telling(cases: int) -> Iterator[Callable[[int], None]]:
+    """Progress with the time left: a bar on a terminal, elsewhere a line every ten seconds."""
+    if sys.stderr is not None and sys.stderr.isatty():
+        with progress("cases", cases) as advance:
+            yield advance
+        return
+    first: tuple[int, float] | None = None
+    last_s = time.monotonic()
+
+    def line(done: int) -> None:
+        nonlocal first, last_s
+        now_s = time.monotonic()
+        first = first or (done, now_s)
+        if now_s - last_s >= LINE_S and done > first[0]:
+            last_s = now_s
+            a_second = (done - first[0]) / (now_s - first[1])
+            say(f"hilstar: {done} of {cases} cases, {a_second:.3g} a second, {(cases - done) / a_second:.0f} s left")
+
+    yield line
+
+
+def summarised(this: Campaign, directory: Directory) -> dict[str, Any]:
+    """What came of a campaign, from its table."""
+    from hilstar.campaign.store.table import failures, file_sha256
+
+    because = failures(directory.table)
+    return {
+        "cases": this.cases,
+        "failed": sum(because.values()),
+        "failed_because": because,
+        "table": str(directory.table),
+        "sha256": file_sha256(directory.table),
+    }

@@ -1,0 +1,110 @@
+"""The pool: the same table whoever runs it, whatever is killed, and with cases that fail."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from hilstar.campaign.store.table import read_columns
+from tests.support.campaigns import write_campaign
+from tests.support.commands import HILSTAR, assert_refused, run_hilstar, run_hilstar_here
+from tests.support.waiting import wait_for
+
+# Slow enough to be killed in its middle; its answer, and the images that it fails over, are those of the pixels alone.
+SOLVER = """
+import time
+def solve(image, tracker):
+    time.sleep(0.05)
+    if int(image.sum()) % 5 == 0:
+        raise ValueError(f"not this one: {int(image.sum())}")
+    return None if int(image.sum()) % 7 == 0 else [1.0, 0.0, 0.0, 0.0]
+"""
+OPTIONS = ("--solver", "python:sleepy:solve", "--json")
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    write_campaign(tmp_path)
+    (tmp_path / "sleepy.py").write_text(SOLVER)
+    return tmp_path
+
+
+def start(folder: Path, workers: int) -> subprocess.Popen[str]:
+    command = [*HILSTAR, "campaign", "plan.toml", "-o", "out", "--workers", str(workers), *OPTIONS]
+    pipe = subprocess.PIPE
+    return subprocess.Popen(command, cwd=folder, stdout=pipe, stderr=pipe, text=True, start_new_session=True)
+
+
+def rows_so_far(folder: Path) -> int:
+    return sum(path.read_bytes().count(b"\n") for path in (folder / "out" / "journal").glob("*.jsonl"))
+
+
+def workers_of(process: subprocess.Popen[str]) -> Iterator[int]:
+    for child in Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split():
+        if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes():
+            yield int(child)
+
+
+def runs(pid: int) -> bool:
+    """Whether a process is there, and no zombie that waits for its new parent."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(") ")[2][0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def test_the_table_is_the_same_after_every_kind_of_end_and_with_cases_that_fail(folder: Path) -> None:
+    whole = run_hilstar_here("campaign", "plan.toml", "-o", "whole", "--workers", "3", *OPTIONS, cwd=folder)
+    assert whole.returncode == 0, whole.stderr
+    wanted = json.loads(whole.stdout)
+
+    stopped = start(folder, 2)  # Ctrl-C
+    wait_for(lambda: rows_so_far(folder) >= 3)
+    stopped.send_signal(signal.SIGINT)
+    _, err = stopped.communicate(timeout=10)
+    assert stopped.returncode == 130 and "the same command goes on" in err, err
+    after_stop = rows_so_far(folder)
+    assert 3 <= after_stop < 30
+
+    killed = start(folder, 2)  # a worker, then the driver itself
+    wait_for(lambda: rows_so_far(folder) > after_stop + 1)
+    second = run_hilstar_here("campaign", "plan.toml", "-o", "out", *OPTIONS[:2], cwd=folder)
+    assert_refused(second, 2, "another campaign is running")
+    victims = list(workers_of(killed))
+    os.kill(victims[0], signal.SIGKILL)
+    after_kill = rows_so_far(folder)
+    wait_for(lambda: rows_so_far(folder) > after_kill + 2)
+    left = list(workers_of(killed))
+    assert victims[0] not in left
+    os.kill(killed.pid, signal.SIGKILL)
+    killed.communicate()
+    wait_for(lambda: not any(runs(pid) for pid in left), "workers outlive their driver")
+    after_both = rows_so_far(folder)
+
+    last = run_hilstar("campaign", "plan.toml", "-o", "out", "--workers", "1", *OPTIONS, cwd=folder)
+    assert last.returncode == 0, last.stderr
+    summary = json.loads(last.stdout)
+    assert after_both < 30 and summary["sha256"] == wanted["sha256"]
+    assert (folder / "out" / "cases.parquet").read_bytes() == (folder / "whole" / "cases.parquet").read_bytes()
+
+    columns = read_columns(folder / "out" / "cases.parquet")
+    assert columns["case"] == list(range(30))
+    failed = [why for why, status in zip(columns["why"], columns["status"], strict=True) if status == "failed"]
+    assert failed and len(failed) == summary["failed"] and all("ValueError: not this one" in why for why in failed)
+    assert all(why == "the solver found no attitude" for why in columns["why"] if why and why not in failed)
+
+
+def test_another_plan_and_a_budget_that_is_too_small_are_refused(folder: Path) -> None:
+    short = run_hilstar_here("campaign", "plan.toml", "-o", "out", "--memory", "1MB", *OPTIONS[:2], cwd=folder)
+    assert_refused(short, 2, "--memory", "or more")
+    before = rows_so_far(folder)
+    write_campaign(folder, seed=8)
+    other = run_hilstar_here("campaign", "plan.toml", "-o", "out", *OPTIONS[:2], cwd=folder)
+    assert_refused(other, 2, "seed was 7 and is 8")
+    assert rows_so_far(folder) == before == 1

@@ -21,6 +21,11 @@ uniform float air_radii;          // the scale height; 0 without air
 uniform float slant_depth;
 uniform float air_top;            // scale heights
 uniform vec2 variance_px;         // of the Gaussian and of the square pixel
+uniform float times;
+uniform float covers;             // 0 or 1
+uniform vec3 turn_rad_s;          // of the camera, image axes, while pixels light up in turn
+uniform vec2 late_s_per_px;
+uniform vec2 middle_px;
 uniform float node[NODES];        // Gauss-Legendre on 0 to 1
 uniform float weight[NODES];
 
@@ -144,6 +149,7 @@ void main() {
     light = vec4(0.0);
     vec2 px = vec2(ivec2(gl_FragCoord.xy));
     vec3 seen = ray(px);
+    seen += dot(late_s_per_px, px - middle_px) * cross(turn_rad_s, seen);
     mat2 slopes = ray_slopes(px);
     vec3 s = to_sphere * seen;
     if (s.z <= 0.0) return;
@@ -172,5 +178,5 @@ void main() {
             found.x += 0.25 * shaded(there, 1.0 - there.impact);
         }
     }
-    light = vec4(normal_e_per_s_sr * sr * found.x, 0.0, 0.0, clamp(found.y, 0.0, 1.0));
+    light = vec4(times * normal_e_per_s_sr * sr * found.x, 0.0, 0.0, covers * clamp(found.y, 0.0, 1.0));
 }

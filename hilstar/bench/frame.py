@@ -16,13 +16,14 @@ from hilstar.arrays import Float32Array, FloatArray, IntArray
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.config import BenchConfig, Vector
+from hilstar.bench.discs import DiscPainter, When, disc_stars
 from hilstar.bench.effort import Effort
-from hilstar.bench.truth import designations, sprite_truth
+from hilstar.bench.truth import designations, sprite_truth, truth_table
 from hilstar.errors import InputError
 from hilstar.monitor.calibration import Calibration
 from hilstar.monitor.footprints import FootprintMap
 from hilstar.monitor.losses import star_losses_mag
-from hilstar.monitor.quantise import Panel
+from hilstar.monitor.quantise import Panel, shown_light
 from hilstar.monitor.response import Codes, code_dtype
 from hilstar.render.renderer import Renderer
 from hilstar.rotation import normalise, to_matrix
@@ -31,12 +32,15 @@ from hilstar.scene.clipping import clipped_sprites
 from hilstar.scene.frame_motion import Scan, Turn, swept_sprites
 from hilstar.scene.sprites import Sprites, make_sprites
 from hilstar.sky.stars import Stars, split_by_rate
+from hilstar.units import magnitude
 
 if TYPE_CHECKING:
+    from hilstar.sky.bodies.disc import Disc
     from hilstar.sky.bodies.moving import MovingSky
 
 WARM_UP_ATTITUDE = np.array([1.0, 0.0, 0.0, 0.0])
 WARM_UP_RATE_RAD_S = np.array([0.1, 0.0, 0.0])
+MOST = 0.5  # of a pixel's light: with less it is not the disc's
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,6 +184,9 @@ class Bench:
             return None
         stars = self.seen(self.shown_stars, t_ns, velocity_km_s, place_km)
         sprites = self.star_sprites(stars, q_icrs_to_cam, rate_cam_rad_s)
+        if self._painter is not None:
+            turn = self._turn(q_icrs_to_cam, rate_cam_rad_s)
+            sprites = self._painter.over(sprites, stars, q_icrs_to_cam, When(t_ns, velocity_km_s, place_km), turn)
         if faults is None:
             return sprites
         scan = None if rate_cam_rad_s is None else self.scan
@@ -194,13 +201,30 @@ class Bench:
         turn = self._turn(q_icrs_to_cam, rate_cam_rad_s)
         return self.sprites(q_icrs_to_cam, stars) if turn is None else self._swept(stars, turn)
 
+    @cached_property
+    def _painter(self) -> DiscPainter | None:
+        if self.moving is None or not self.moving.names:
+            return None
+        return DiscPainter(
+            self.moving,
+            self.camera,
+            self.renderer.footprint_px,
+            self._sigma_px,
+            white_e_per_s=self.flux_at_white_e_per_s * self.darkest,
+            scan=self.scan,
+        )
+
+    def discs(self, q_icrs_to_cam: FloatArray, when: When) -> list[Disc]:
+        """The bodies on the image at an attitude at rest that are drawn as discs, nearest first."""
+        return [] if self._painter is None else self._painter.on_image(q_icrs_to_cam, when)
+
     def draw_sprites(self, sprites: Sprites | None, frame: int = 0) -> Drawn:
         """Draw the levels of a frame's sprites."""
         self.renderer.draw(sprites, frame)
         clipped = None if sprites is None else self._clipped(sprites)
         if sprites is None or clipped is None or not len(clipped):
-            return Drawn(self.renderer, sprites)
-        return Drawn(self.renderer, sprites, designations(self.shown_stars, sprites, clipped))
+            return Drawn(self.renderer, sprites, () if sprites is None else sprites.over_white)
+        return Drawn(self.renderer, sprites, (*designations(self.shown_stars, sprites, clipped), *sprites.over_white))
 
     def _turn(self, q_icrs_to_cam: FloatArray, rate_cam_rad_s: Vector | FloatArray | None) -> Turn | None:
         """The motion within a frame; None if no star moves far enough to be seen."""
@@ -224,6 +248,8 @@ class Bench:
 
     def warm_up(self) -> None:
         """Draw once with paths, with stars and with none: a driver compiles its shaders at first use, 60 ms on llvmpipe."""
+        if self._painter is not None:
+            self.renderer.draw(replace(self.sprites(WARM_UP_ATTITUDE), extended=self._painter.any_lights()))
         for q, rate in ((WARM_UP_ATTITUDE, WARM_UP_RATE_RAD_S), (WARM_UP_ATTITUDE, None), (None, None)):
             _ = self.draw(q, 0, rate).levels
 
@@ -248,15 +274,29 @@ class Bench:
         if len(self.faint_stars) or self.renderer.target.sides:
             self.renderer.draw(sprites, number, whole=True)
         linear = self.renderer.linear().copy()
-        truth, star = sprite_truth(self.stars, sprites, self._clipped(sprites))
-        truth["drawn"] = truth["electrons_per_s"] >= self.faintest_shown_e_per_s
+        truth, star = self._truth(q, sprites, t_ns)
         order = np.argsort(truth["v_mag"], kind="stable")
         return Frame(q, linear, levels, self.code_values(levels), truth[order], star[order], t_ns)
 
+    def _truth(self, q: FloatArray, sprites: Sprites, t_ns: int | None) -> tuple[npt.NDArray[np.void], IntArray]:
+        """Rows of TRUTH_DTYPE for what sprites and discs are of, and its indices (n,)."""
+        truth, star = sprite_truth(self.stars, sprites, self._clipped(sprites))
+        if sprites.discs:
+            discs = [disc for disc in self.discs(q, When(t_ns)) if disc.name in sprites.discs]
+            found = disc_stars(self.stars, discs)
+            middles = np.array([disc.direction for disc in discs]) @ (self.camera.cam_to_image @ to_matrix(q)).T
+            rows = truth_table(self.stars, found, *self.camera.project(middles))
+            rows["clipped"] = np.isin(rows["name"], sprites.over_white)
+            truth, star = np.append(truth, rows), np.append(star, found)
+        truth["drawn"] = truth["electrons_per_s"] >= self.faintest_shown_e_per_s
+        return truth, star
+
     def _still(self, q: FloatArray, stars: Stars, t_ns: int | None, faults: FrameFaults | None) -> Sprites:
-        """The sprites of `stars` or `shown_stars` as points, at an attitude and a moment."""
+        """The sprites of `stars` or `shown_stars` as points, and discs, at an attitude and a moment."""
         seen = self.seen(stars, t_ns)
         sprites = self.sprites(q, seen)
+        if self._painter is not None:
+            sprites = self._painter.over(sprites, seen, q, When(t_ns))
         return sprites if faults is None else faults.over(sprites, seen, q, lambda few: self.sprites(q, few))
 
     def seen(
@@ -277,14 +317,31 @@ class Bench:
         That is summed over its own pixels.
         """
         own = frame.star[frame.truth["clipped"]]
-        clipped = set(self.stars.designations(own[own >= 0]))
+        clipped = self.stars.designations(own[own >= 0])
         if not clipped:
             return {}
-        sprites = self.sprites(frame.q_icrs_to_cam, self.seen(self.shown_stars, frame.t_ns))
+        sprites = self._still(frame.q_icrs_to_cam, self.shown_stars, frame.t_ns, None)
         footprints = FootprintMap(self.camera.resolution_px, self._sigma_px)
         loss_mag = star_losses_mag(sprites, self.panel, footprints, frame.levels)
         names = self.shown_stars.designations(sprites.star)
-        return {name: float(loss) for name, loss in zip(names, loss_mag, strict=True) if name in clipped}
+        losses = dict(zip(names, loss_mag.tolist(), strict=True)) | self._disc_losses_mag(frame, sprites)
+        return {name: losses[name] for name in clipped if name in losses}
+
+    def _disc_losses_mag(self, frame: Frame, sprites: Sprites) -> dict[int | str, float]:
+        """The same for each disc brighter than white, in the pixels of which it has most of the light."""
+        if not sprites.over_white or self._painter is None:
+            return {}
+        wanted = frame.linear
+        shown = shown_light(frame.levels, self.panel)
+        losses: dict[int | str, float] = {}
+        for disc in self.discs(frame.q_icrs_to_cam, When(frame.t_ns)):
+            if disc.name in sprites.over_white:
+                alone = self._painter.alone(disc, frame.q_icrs_to_cam)
+                self.renderer.draw(replace(sprites, data=sprites.data[:0], extended=alone))
+                own = self.renderer.linear() > MOST * wanted
+                if own.any():
+                    losses[disc.name] = float(magnitude(shown[own].sum() / wanted[own].sum(dtype=np.float64)))
+        return losses
 
     def code_values(self, levels: Codes) -> Codes:
         """The monitor's code values of levels (height, width): the same, or (height, width, 3) with bit stealing."""

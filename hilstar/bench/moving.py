@@ -7,6 +7,7 @@ from pathlib import Path
 
 from hilstar.bench.config import GEOCENTRE, SOURCE, BenchConfig
 from hilstar.bench.config.when import epoch_utc_ns, jyear
+from hilstar.bench.discs import POINT_PX
 from hilstar.reading import read_text
 from hilstar.scene.camera import Camera
 from hilstar.sky.bodies.earth import EARTH
@@ -22,7 +23,6 @@ log = logging.getLogger(__name__)
 
 MAX_ORBIT_BYTES = 20_000_000  # a year of minutes
 MAX_TLE_AGE_DAYS = 7.0
-POINT_PX = 0.2  # a wider disc moves light by more than a point's sprite does: 0.2 px across widens a sigma of 0.85 px by 0.2 %
 
 
 def moving_sky(config: BenchConfig, folder: Path, optics: Optics) -> MovingSky:
@@ -81,7 +81,7 @@ def wide_bodies(moving: MovingSky | None, camera: Camera, t_ns: int | None = Non
     px_per_arcsec = camera.scales_px_rad()[1] / ARCSEC_PER_RAD
     widths = sorted(((d * px_per_arcsec, name, d) for name, d in found.items()), reverse=True)
     return [
-        f"{name}: {arcsec:.1f} arcsec wide, {px:.2f} px of the screen; drawn as a point with all its light"
+        f"{name}: {arcsec:.1f} arcsec wide, {px:.2f} px of the screen; drawn as a disc"
         for px, name, arcsec in widths
         if px > POINT_PX
     ]

@@ -81,6 +81,12 @@ class ExtendedLayer:
         from_image = disc.to_sphere @ light.icrs_to_image.T
         program["to_sphere"] = tuple(from_image.T.ravel().tolist())  # column by column
         program["variance_px"] = light.variance_px
+        program["times"] = light.times
+        program["covers"] = float(light.covers)
+        shear = light.shear
+        program["turn_rad_s"] = (0.0, 0.0, 0.0) if shear is None else tuple(shear.rate_image_rad_s.tolist())
+        program["late_s_per_px"] = (0.0, 0.0) if shear is None else shear.s_per_px
+        program["middle_px"] = (0.0, 0.0) if shear is None else shear.middle_px
         _set_face(program, disc)
         triangle.render(moderngl.TRIANGLES, vertices=3)
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from hilstar.arrays import Float32Array, FloatArray
 from hilstar.scene.camera import Camera
-from hilstar.scene.extended import DiscLight, ExtendedLight, LightMap, clipped
+from hilstar.scene.extended import DiscLight, ExtendedLight, LightMap, Shear, clipped
 from hilstar.scene.psf import footprint_px
 from hilstar.sky.bodies.disc import Disc
 
@@ -18,37 +18,80 @@ NODES_A_SIGMA = 4.0  # along a radius: places in the face's middle are then 0.8 
 MIN_NODES = 10  # 1e-4 of the light
 
 
-def disc_light(disc: Disc, icrs_to_image: FloatArray, camera: Camera, sigma_px: tuple[float, float]) -> ExtendedLight | None:
-    """A body's disc spread by a Gaussian of `sigma_px`; None where it does not touch the image."""
-    light = DiscLight(disc, icrs_to_image, camera, sigma_px)
-    radius_px = np.tan(min(disc.radius_rad, 1.0)) * camera.focal_length_px
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """The camera at one moment of a frame: the map (3, 3) of ICRS to image axes, and the moment's share of the light."""
+
+    icrs_to_image: FloatArray
+    share: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """A camera whose image is spread by a Gaussian of `sigma_px`, at the poses of a frame, and how it turns meanwhile."""
+
+    camera: Camera
+    sigma_px: tuple[float, float]
+    poses: tuple[Pose, ...]
+    shear: Shear | None = None
+
+
+def disc_lights(disc: Disc, view: View, covers: bool) -> list[ExtendedLight]:
+    """A body's disc at all poses, none of it where it does not touch the image; where it `covers`, it hides what is behind."""
+    if len(view.poses) == 1:
+        pose = view.poses[0]
+        return _at_pose(DiscLight(disc, pose.icrs_to_image, view.camera, view.sigma_px, pose.share, covers, view.shear))
+    lights: list[ExtendedLight] = []
+    if covers:
+        # Poses hide together what one in the middle hides: each after the other would hide the light of those before.
+        middle = view.poses[len(view.poses) // 2].icrs_to_image
+        lights += _at_pose(DiscLight(disc, middle, view.camera, view.sigma_px, 0.0, True, view.shear))
+    for pose in view.poses:
+        lights += _at_pose(DiscLight(disc, pose.icrs_to_image, view.camera, view.sigma_px, pose.share, False, view.shear))
+    return lights
+
+
+def _at_pose(light: DiscLight) -> list[ExtendedLight]:
+    camera = light.camera
+    radius_px = np.tan(min(light.disc.radius_rad, 1.0)) * camera.focal_length_px
     sigmas = float(radius_px) / min(light.variance_px) ** 0.5
     if sigmas < SMALL_SIGMAS:
-        return _disc_map(light, max(MIN_NODES, int(np.ceil(NODES_A_SIGMA * sigmas))))
-    return None if light.region(camera.resolution_px) is None else light
+        drawn = _disc_map(light, max(MIN_NODES, int(np.ceil(NODES_A_SIGMA * sigmas))))
+        return [] if drawn is None else [drawn]
+    return [] if light.region(camera.resolution_px) is None else [light]
+
+
+def _seen(light: DiscLight, directions: FloatArray) -> FloatArray:
+    """Directions (n, 3), ICRS, in image axes while their own pixels are lit."""
+    seen = directions @ light.icrs_to_image.T
+    if light.shear is None:
+        return np.asarray(seen)
+    x_px, y_px = light.camera.project(seen)
+    late_s = np.nan_to_num(light.shear.late_s(x_px, y_px))
+    return np.asarray(seen - late_s[:, None] * np.cross(light.shear.rate_image_rad_s, seen))
 
 
 def _disc_map(light: DiscLight, nodes: int) -> LightMap | None:
     """The sum of the disc's places, each spread as a star is; its air, if any, is too thin to be seen."""
-    disc, reach_px = light.disc, footprint_px(light.sigma_px) / 2
-    face = replace(disc, law="uniform")
-    directions, whole_sr = face.points(nodes)
-    x_px, y_px = light.camera.project(directions @ light.icrs_to_image.T)
+    disc, camera, reach_px = light.disc, light.camera, footprint_px(light.sigma_px) / 2
+    directions, whole_sr = replace(disc, law="uniform").points(nodes)
+    x_px, y_px = camera.project(_seen(light, directions))
     known = np.isfinite(x_px)
     if not known.any():
         return None
     x_px, y_px, whole_sr = x_px[known], y_px[known], whole_sr[known]
     edges = (x_px.min() - reach_px, y_px.min() - reach_px, x_px.max() + reach_px + 1, y_px.max() + reach_px + 1)
-    region = clipped(edges, light.camera.resolution_px)
+    region = clipped(edges, camera.resolution_px)
     if region is None:
         return None
-    cover = _spread(x_px, y_px, whole_sr * _px_per_sr(light), region, light.sigma_px)
+    cover = None
+    if light.covers:
+        cover = np.minimum(_spread(x_px, y_px, whole_sr * _px_per_sr(light), region, light.sigma_px), np.float32(1))
     directions, law_sr = disc.points(nodes)
-    x_px, y_px = light.camera.project(directions @ light.icrs_to_image.T)
+    x_px, y_px = camera.project(_seen(light, directions))
     known = np.isfinite(x_px)
-    rates = disc.normal_e_per_s_sr * law_sr[known]
-    image = _spread(x_px[known], y_px[known], rates, region, light.sigma_px)
-    return LightMap(image, (region[0], region[1]), 1.0, np.minimum(cover, np.float32(1)))
+    rates = light.times * disc.normal_e_per_s_sr * law_sr[known]
+    return LightMap(_spread(x_px[known], y_px[known], rates, region, light.sigma_px), (region[0], region[1]), 1.0, cover)
 
 
 def _px_per_sr(light: DiscLight) -> float:

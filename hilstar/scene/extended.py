@@ -62,16 +62,37 @@ class Glow:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Shear:
+    """A camera that turns at `rate_image_rad_s` (3,), image axes, while pixels light up one after the other.
+
+    A pixel is lit `s_per_px` (x, y) times its distance from `middle_px` after the moment of the attitude.
+    """
+
+    rate_image_rad_s: FloatArray
+    s_per_px: tuple[float, float]
+    middle_px: tuple[float, float]
+
+    def late_s(self, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
+        """How long after the attitude's moment pixels (n,) are lit."""
+        (a, b), (x, y) = self.s_per_px, self.middle_px
+        return a * (x_px - x) + b * (y_px - y)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class DiscLight:
     """A body's disc through a camera, spread by a Gaussian of `sigma_px`; `icrs_to_image` (3, 3) as for sprites.
 
-    It covers what is drawn before it. `scene.discs.disc_light` chooses between it and, for a small disc, a map.
+    Its light is multiplied by `times`. Where it `covers`, it hides what was drawn before it. `scene.discs.disc_lights`
+    chooses between it and, for a small disc, a map.
     """
 
     disc: Disc
     icrs_to_image: FloatArray
     camera: Camera
     sigma_px: tuple[float, float]
+    times: float = 1.0
+    covers: bool = True
+    shear: Shear | None = None
 
     @property
     def variance_px(self) -> tuple[float, float]:
@@ -90,9 +111,18 @@ class DiscLight:
         edges = []
         for k, place in enumerate((x_px, y_px)):
             low, high = float(place.min()), float(place.max())
-            half = (high - low) / 2 * BOW + REACH_SIGMAS * float(np.sqrt(self.variance_px[k])) + 1
+            half = (high - low) / 2 * BOW + REACH_SIGMAS * float(np.sqrt(self.variance_px[k])) + 1 + self._sheared_px
             edges.append(((low + high) / 2 - half, (low + high) / 2 + half))
         return clipped((edges[0][0], edges[1][0], edges[0][1], edges[1][1]), resolution_px)
+
+    @property
+    def _sheared_px(self) -> float:
+        """How far the first and the last pixels' light is moved at most, about."""
+        if self.shear is None:
+            return 0.0
+        late_s = sum(abs(s) * size for s, size in zip(self.shear.s_per_px, self.camera.resolution_px, strict=True)) / 2
+        turn = float(np.linalg.norm(self.shear.rate_image_rad_s)) * late_s
+        return 2 * turn * float(np.hypot(self.camera.focal_length_px, max(self.camera.resolution_px)))
 
 
 ExtendedLight = LightMap | Glow | DiscLight

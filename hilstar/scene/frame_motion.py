@@ -83,7 +83,7 @@ def swept_sprites(
 
     `capped` counts the stars whose paths are coarser than NODES_PER_SIGMA, or shorter than the turn makes them.
     """
-    turn, slowed = _slowed(turn, scan, camera)
+    turn, is_slower = slowed(turn, scan, camera)
     middle = Turn(propagate(turn.q_icrs_to_cam, turn.rate_cam_rad_s, scan.hold_s / 2), turn.rate_cam_rad_s)
     axis = (camera.cam_to_image @ to_matrix(middle.q_icrs_to_cam))[2]
     margin_px = footprint_px / 2 + 1
@@ -102,7 +102,7 @@ def swept_sprites(
     star = near[nodes.path]
     light = nodes.share * length * stars.electrons_per_s[star]
     sprites = pack_sprites(x_px, y_px, light, star, camera.resolution_px, footprint_px)
-    capped = int(((wanted > 0) if slowed else (counts < wanted)).sum())
+    capped = int(((wanted > 0) if is_slower else (counts < wanted)).sum())
     return replace(sprites, per_star=int(counts.max(initial=1)), capped=capped)
 
 
@@ -135,7 +135,7 @@ def _of_the_brightest(wanted: IntArray, electrons_per_s: FloatArray, footprint_p
     return chosen
 
 
-def _slowed(turn: Turn, scan: Scan, camera: Camera) -> tuple[Turn, bool]:
+def slowed(turn: Turn, scan: Scan, camera: Camera) -> tuple[Turn, bool]:
     """The turn itself, or one about the same axis that takes no star farther than MAX_TURN_FIELD; and whether it is slower."""
     angle_rad, most_rad = turn.speed_rad_s * scan.whole_s, MAX_TURN_FIELD * camera.field_radius_rad(0.0)
     if angle_rad <= most_rad:

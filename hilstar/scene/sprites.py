@@ -40,8 +40,8 @@ class Sprites:
     A sprite covers `footprint_px` squared pixels, the first of them at `pixel - (footprint_px - 1) // 2`. A star's light is
     divided among up to `per_star` sprites. `capped` stars are drawn coarser than they should be, or not at all, because
     the work of a frame is bounded. `rate_cam_rad_s` (3,) is the turn along which stars are drawn as paths, None for points.
-    `extended` is the frame's light that is no star's, in the order in which it is drawn. Sprites of `added` light have -1, -2
-    and on for `star`.
+    `extended` is the frame's light that is no star's, in the order in which it is drawn; `discs` names the bodies among it, and
+    `over_white` those of them that are brighter than white. Sprites of `added` light have -1, -2 and on for `star`.
     """
 
     data: npt.NDArray[np.void]
@@ -54,6 +54,8 @@ class Sprites:
     rate_cam_rad_s: FloatArray | None = None
     extended: tuple[ExtendedLight, ...] = ()
     added: tuple[AddedLight, ...] = ()
+    discs: tuple[str, ...] = ()
+    over_white: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.data)

@@ -10,7 +10,7 @@ from scipy.ndimage import maximum_filter, minimum_filter
 
 from hilstar.render.renderer import Renderer, Target
 from hilstar.scene.camera import Camera
-from hilstar.scene.discs import disc_light
+from hilstar.scene.discs import Pose, View, disc_lights
 from hilstar.scene.extended import LightMap
 from hilstar.scene.lens import Lens
 from hilstar.sky.bodies.disc import Air, Disc
@@ -39,6 +39,10 @@ def drawn(gl, *lights) -> np.ndarray:
     none = sprites_at(np.empty((0, 2)), np.empty(0), gl.footprint_px)
     gl.draw(replace(none, extended=tuple(lights)))
     return gl.linear().astype(float)
+
+
+def lights(disc: Disc, cam: Camera, covers: bool = False):
+    return disc_lights(disc, View(cam, SIGMA, (Pose(np.eye(3)),)), covers)
 
 
 def camera(focal_px: float = FOCAL_PX, lens: Lens | None = None) -> Camera:
@@ -94,7 +98,7 @@ def centroid_px(picture: np.ndarray) -> np.ndarray:
 def test_the_moon_s_light_and_limb_at_six_phases_are_those_of_rays(gl, rng, radius_px, phase_deg):
     cam = camera()
     disc = moon(radius_px, phase_deg, cam)
-    got = drawn(gl, disc_light(disc, np.eye(3), cam, SIGMA))
+    got = drawn(gl, *lights(disc, cam))
     truth = spread_image(body_of(disc), cam.rays, SIZE, SIGMA, rng, finer=5)
     assert got.sum() == pytest.approx(truth.sum(), rel=FLUX_LIMIT)
     assert got.sum() == pytest.approx(disc.law_integral_sr() * 1e9, rel=SUM_LIMIT)
@@ -109,7 +113,7 @@ def test_the_moon_s_light_and_limb_at_six_phases_are_those_of_rays(gl, rng, radi
 def test_a_disc_through_a_lens_is_where_the_lens_has_it(gl, rng, polar):
     cam = camera(100.0, LENS)  # the corner is 0.4 of tangent off: the lens moves it by 1 px
     disc = moon(14.0, 50.0, cam, polar)
-    got = drawn(gl, disc_light(disc, np.eye(3), cam, SIGMA))
+    got = drawn(gl, *lights(disc, cam))
     truth = spread_image(body_of(disc), cam.rays, SIZE, SIGMA, rng)
     assert got.sum() == pytest.approx(truth.sum(), rel=FLUX_LIMIT)
     off_px = limb_off_px(disc, cam, got, truth)
@@ -132,7 +136,7 @@ def test_the_earth_and_its_air_are_those_of_rays(gl, rng, altitude_km, focal_px,
     sun = sun_from(direction, 30.0)
     pole = np.array([0.6, 0.0, 0.8])
     disc = Disc("Earth", direction, distance_km, EARTH_KM, 6356.752, pole, sun, "lambert", 1e6, 1.0, Air(*AIR))
-    light = disc_light(disc, np.eye(3), cam, SIGMA)
+    (light,) = lights(disc, cam, covers=True)
     got = drawn(gl, light)
     truth = spread_image(body_of(disc), cam.rays, SIZE, SIGMA, rng)
     assert got.sum() == pytest.approx(truth.sum(), rel=FLUX_LIMIT)

@@ -9,7 +9,7 @@ import pytest
 
 from hilstar.render.renderer import Renderer, Target
 from hilstar.scene.camera import Camera
-from hilstar.scene.discs import disc_light
+from hilstar.scene.discs import Pose, View, disc_lights
 from hilstar.sky.bodies.disc import Disc
 from hilstar.sky.bodies.earth import AIR, EQUATOR_KM, earth_disc
 from hilstar.sky.bodies.magnitudes import KM_PER_AU
@@ -32,7 +32,7 @@ def gl():
 
 def drawn(gl, disc: Disc, cam: Camera) -> np.ndarray:
     none = sprites_at(np.empty((0, 2)), np.empty(0), gl.footprint_px)
-    gl.draw(replace(none, extended=(disc_light(disc, np.eye(3), cam, SIGMA),)))
+    gl.draw(replace(none, extended=tuple(disc_lights(disc, View(cam, SIGMA, (Pose(np.eye(3)),)), True))))
     return gl.linear().astype(float)
 
 

@@ -12,10 +12,11 @@ from hilstar.toml_tables import Table
 
 
 class Bodies(Table, frozen=True):
-    """Bodies of the Solar System, as points of light: places by JPL's DE421, magnitudes by phase, sunlight times their albedo.
+    """Bodies of the Solar System: places by JPL's DE421, magnitudes by phase, sunlight times their albedo.
 
     They need `[sky] epoch_utc` and `pip install 'hilstar[bodies]'`. A body wider than 0.2 px of the screen, above all the Moon
-    and the Sun, is drawn as a point with all its light; `hilstar frame --explain` and `hilstar verify` say which.
+    and the Sun, is drawn as a disc with its phase, which hides what is behind it; `hilstar frame --explain` and `hilstar
+    verify` say which.
     """
 
     planets: Annotated[

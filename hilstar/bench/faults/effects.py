@@ -93,6 +93,8 @@ class Effects:
                 capped=sprites.capped,
                 rate_cam_rad_s=sprites.rate_cam_rad_s,
                 extended=sprites.extended,
+                discs=sprites.discs,
+                over_white=sprites.over_white,
                 added=(*lines, *named),
             )
         return replace(sprites, extended=(*sprites.extended, *surfaces)) if surfaces else sprites

@@ -203,6 +203,12 @@ class MovingSky:
         found = [_moved(self._face(step, i), directions[i], float(now[i, 3])) for i in np.flatnonzero(near).tolist()]
         return sorted(found, key=lambda disc: disc.distance_km)
 
+    def distances_km(
+        self, t_ns: int | None = None, velocity_km_s: FloatArray | None = None, place_km: FloatArray | None = None
+    ) -> FloatArray:
+        """How far the bodies (n,) are, in the order of `names`; else as `seen`."""
+        return self._at(self._moment(t_ns, velocity_km_s, place_km))[:-1, 3]
+
     def _moment(self, t_ns: int | None, velocity_km_s: FloatArray | None, place_km: FloatArray | None) -> Moment:
         """A time since the start, held within the ephemeris, with the observer's state about the Earth where it is given."""
         since_ns = self._within(t_ns)

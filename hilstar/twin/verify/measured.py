@@ -69,7 +69,7 @@ class Glow:
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """All fields, and what a verdict has to know of the bench; `wide_bodies` says which bodies are discs drawn as points.
+    """All fields, and what a verdict has to know of the bench; `wide_bodies` says which bodies are drawn as discs.
 
     `calibration` is the one that the bench assumes; `true_calibration` is the monitor's own, where it is another.
     """

@@ -97,7 +97,7 @@ class VerifySummary:
     by_magnitude: list[OneMagnitude]
     calibration: CalibrationName
     gl_renderer: str
-    drawn_as_points: list[str]
+    drawn_as_discs: list[str]
 
 
 def summarise(verdict: Verdict) -> VerifySummary:
@@ -135,7 +135,7 @@ def summarise(verdict: Verdict) -> VerifySummary:
         by_magnitude=_by_magnitude(errors),
         calibration=CalibrationName(measured.calibration.name, measured.calibration.sha256),
         gl_renderer=measured.gl_renderer,
-        drawn_as_points=measured.wide_bodies,
+        drawn_as_discs=measured.wide_bodies,
     )
 
 
@@ -175,7 +175,7 @@ def summary_lines(summary: VerifySummary) -> list[str]:
             f" {row.centroid_error_px.rms:.4f} px rms, {row.stars} stars"
             for row in summary.by_magnitude
         ),
-        *(f"{'':20}{line}" for line in summary.drawn_as_points),
+        *(f"{'':20}{line}" for line in summary.drawn_as_discs),
         *(f"{'':20}{reason}" for reason in summary.reasons),
         f"{'verdict':20}{'passed' if summary.passed else 'NOT passed'}",
     ]

@@ -67,9 +67,9 @@ def test_planets_in_the_truth_table_are_where_skyfield_has_them(bodies_file, at_
             assert np.hypot(*off_deg) * 3600 < PLACE_ARCSEC
 
 
-def test_wide_bodies_are_said_to_be_points(bodies_file):
+def test_wide_bodies_are_said_to_be_discs(bodies_file):
     done = run_hilstar_here("frame", bodies_file, "--radec", MOON, "--codes", bodies_file.parent / "c.png", "--explain")
-    assert "Moon: 1897" in done.stderr and "drawn as a point with all its light" in done.stderr
+    assert "Moon: 1897" in done.stderr and "drawn as a disc" in done.stderr
     assert "Neptune" not in done.stderr
     assert "clipped: Moon by" in done.stdout
 
@@ -94,8 +94,8 @@ def test_the_sun_in_view_overflows_nothing(bodies_file):
 
 def test_verify_knows_bodies_and_says_which_are_discs(bodies_file):
     done = run_hilstar_here("verify", bodies_file, "--fields", "2", "--json")
-    points = json.loads(done.stdout)["drawn_as_points"]
-    assert [line.split(":")[0] for line in points][:2] == ["Sun", "Moon"]
+    discs = json.loads(done.stdout)["drawn_as_discs"]
+    assert [line.split(":")[0] for line in discs][:2] == ["Sun", "Moon"]
 
 
 def test_a_frame_s_time_moves_bodies_and_comes_back_bit_for_bit(bodies_file):

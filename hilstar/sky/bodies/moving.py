@@ -181,19 +181,13 @@ class MovingSky:
             stars.v_mag[-count:], stars.electrons_per_s[-count:] = self._light(self._step(moment))
         return stars.seen_at(velocity)
 
-    def passing(
-        self,
-        cone: Cone,
-        t_ns: int | None = None,
-        velocity_km_s: FloatArray | None = None,
-        place_km: FloatArray | None = None,
-    ) -> Pass | None:
-        """The satellites that can be in a cone at a moment; None for none; velocity and place as in `seen`."""
+    def passing(self, cone: Cone, t_ns: int | None = None, *velocity_and_place: FloatArray | None) -> Pass | None:
+        """The satellites that can be in a cone at a moment; None for none; the observer's velocity and place as in `seen`."""
         if self.satellites is None:
             return None
         since_ns = self._within(t_ns)
         now = partial(self._circumstances, since_ns // MINUTE_NS)
-        return self.satellites.near(cone, Sky(self._utc_ns + since_ns, now, self._fixed_km_s, place_km, velocity_km_s))
+        return self.satellites.near(cone, Sky(self._utc_ns + since_ns, now, self._fixed_km_s, *velocity_and_place))
 
     def _compute_circumstances(self, minute: int) -> Circumstances:
         """The Sun and the Earth's velocity at a minute: 2.5 arcsec of the Sun, 0.4 m/s."""

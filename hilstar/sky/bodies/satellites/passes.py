@@ -56,8 +56,8 @@ class Sky:
     utc_ns: int
     now: Callable[[], Circumstances]
     fixed_km_s: FloatArray
-    place_km: FloatArray | None = None
     velocity_km_s: FloatArray | None = None
+    place_km: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -13,9 +13,11 @@ from hilstar.cli.options import Json
 from hilstar.console.terminal import print_json, progress
 from hilstar.files import check_directory
 
-Study = Literal["models", "outputs", "stability", "quantisation", "timing", "tradeoff", "economy", "prediction", "geometry"]
+Study = Literal[
+    "models", "outputs", "stability", "quantisation", "timing", "tradeoff", "economy", "prediction", "geometry", "bodies"
+]
 
-ROOMS = {"geometry", "models", "stability", "timing", "tradeoff"}  # the studies of more than one file
+ROOMS = {"bodies", "geometry", "models", "stability", "timing", "tradeoff"}  # the studies of more than one file
 
 
 def study(

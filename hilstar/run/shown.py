@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from hilstar.attitude.clock.timeline import Attitude
-from hilstar.bench.faults.desk import Now
 from hilstar.bench.frame import Drawn
 
 
@@ -48,7 +47,6 @@ class Shown:
     marker: int | None = None
     missing: bool = False
     on_screen: OnScreen = HEADLESS
-    faults: tuple[Now, ...] = ()
 
 
 FrameSink = Callable[[Shown], None]

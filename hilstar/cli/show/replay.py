@@ -19,7 +19,6 @@ from hilstar.cli.options import (
     Overwrite,
     PlaceText,
     ReferenceName,
-    ScenarioFile,
     TopicName,
     check_files,
 )
@@ -33,8 +32,6 @@ from hilstar.cli.show.running import (
     explain_bench,
     explain_source,
     optional_ledger,
-    optional_scenario,
-    run_with_faults,
     say_what_clips,
     shown_bench,
 )
@@ -64,7 +61,6 @@ def replay(
     ] = None,
     ledger: LedgerFile = None,
     ledger_split: LedgerSplit = None,
-    scenario: ScenarioFile = None,
     overwrite: Overwrite = False,
     windowed: Windowed = False,
     force: Force = False,
@@ -83,8 +79,7 @@ def replay(
     check_directory("-o", output)
     check_ending("--ledger", ledger, MCAP)
     file = read_bench_file(bench_file)
-    faults = optional_scenario(scenario)
-    check_files([log, scenario], [None if output is None else output / "frames.csv"], file, ledger, overwrite)
+    check_files([log], [None if output is None else output / "frames.csv"], file, ledger, overwrite)
     split = parse_split(ledger_split)
     notices = Notices()
     mounting = Mounting(file.config.tracker.q_body_to_cam)
@@ -95,7 +90,6 @@ def replay(
         shown_bench(file, headless, windowed, force) as (bench, screen),
         FrameImages(output, bench) as record,
         optional_ledger(ledger, bench, notices, overwrite, split) as kept,
-        run_with_faults(bench, faults, notices, kept, play.recording) as wrong,
     ):
         say_what_clips(bench)
         if explain:
@@ -109,7 +103,6 @@ def replay(
             record(shown)
             status.see(shown)
 
-        outlet = Outlet(screen, kept, notices, follower=status.follow, faults=wrong)
         with on_terminal(status):
-            summary = replay_log(bench, play, sink, outlet)
+            summary = replay_log(bench, play, sink, Outlet(screen, kept, notices, follower=status.follow))
     end_of_run(summary, screen, kept, as_json)

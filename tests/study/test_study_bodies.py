@@ -1,0 +1,53 @@
+"""What bodies cost and how exact they are: the study's tables hold what its findings say."""
+
+from __future__ import annotations
+
+import csv
+
+import pytest
+
+from hilstar.study.bodies.cost import SCENES
+from hilstar.study.bodies.run import run
+from hilstar.study.bodies.size import PHASES_DEG, QUICK_RADII_PX
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("bodies")
+    lines = run(folder, quick=True)
+    tables = {}
+    for name in ("bodies_cost", "bodies_size", "bodies_limits"):
+        assert (folder / f"{name}.png").stat().st_size > 20_000
+        with (folder / f"{name}.csv").open() as file:
+            tables[name] = list(csv.DictReader(file))
+    return lines, tables
+
+
+def test_each_scene_is_timed_against_the_same_frame_without_bodies(study):
+    rows = {row["scene"]: row for row in study[1]["bodies_cost"]}
+    assert list(rows) == [scene.name for scene in SCENES]
+    shown = {name: row["discs"].split() for name, row in rows.items() if row["discs"]}
+    assert shown["Moon in view, 55 px"] == ["Moon"]
+    assert shown["Earth fills the field"] == ["Earth"]
+    assert not any("not in view" in name or "none in view" in name for name in shown)
+    for row in rows.values():
+        assert float(row["cost_ms"]) == pytest.approx(float(row["frame_ms"]) - float(row["without_ms"]))
+
+
+def test_discs_are_within_a_percent_and_a_tenth_of_a_pixel_and_a_point_is_not(study):
+    rows = study[1]["bodies_size"]
+    assert len(rows) == len(PHASES_DEG) * len(QUICK_RADII_PX)
+    assert max(abs(float(row["flux_off"])) for row in rows) < 0.01
+    limbs = [float(row["limb_off_px"]) for row in rows if row["limb_off_px"] != "nan"]
+    assert limbs and max(limbs) < 0.1
+    large = [row for row in rows if float(row["radius_px"]) > 1]
+    assert all(float(row["point_pixel_off"]) > 10 * float(row["pixel_off"]) for row in large)
+
+
+def test_near_a_body_all_light_is_finite_and_what_is_over_white_is_white(study):
+    lines, tables = study
+    rows = tables["bodies_limits"]
+    assert {row["body"] for row in rows} == {"Moon", "Sun", "Earth"}
+    assert all(row["finite"] == row["white_is_white"] == "True" for row in rows)
+    assert max(float(row["over_white_mag"]) for row in rows if row["body"] == "Sun") > 15
+    assert len(lines) == 3 and "NOT" not in lines[2]

@@ -73,7 +73,8 @@ def _sha256(config: BenchConfig, folder: Path) -> str:
     files = (config.monitor.calibration, config.collimator.geometry, tracker.distortion)
     true = (config.verify.true_calibration, config.verify.true_geometry)
     orbit = None if config.spacecraft.orbit in {GEOCENTRE, SOURCE} else config.spacecraft.orbit
-    named: tuple[str | float | None, ...] = (*curves, *files, *true, orbit)
+    bodies = config.sky.bodies
+    named: tuple[str | float | None, ...] = (*curves, *files, *true, orbit, bodies.satellites, bodies.satellite_magnitudes)
     for name in named:
         if isinstance(name, str) and name not in (*BUILT_IN_CURVES, *BUILT_IN, "hipparcos"):
             digest.update(_named_bytes(folder / name))

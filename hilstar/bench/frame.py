@@ -18,6 +18,7 @@ from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.config import BenchConfig, Vector
 from hilstar.bench.discs import DiscPainter, When, disc_stars
 from hilstar.bench.effort import Effort
+from hilstar.bench.satellites import FRAME_SPRITES, Shot, with_satellites
 from hilstar.bench.truth import designations, sprite_truth, truth_table
 from hilstar.errors import InputError
 from hilstar.monitor.calibration import Calibration
@@ -29,8 +30,9 @@ from hilstar.render.renderer import Renderer
 from hilstar.rotation import normalise, to_matrix
 from hilstar.scene.camera import Camera
 from hilstar.scene.clipping import clipped_sprites
-from hilstar.scene.frame_motion import Scan, Turn, swept_sprites
+from hilstar.scene.frame_motion import Scan, Turn, slowed, swept_sprites
 from hilstar.scene.sprites import Sprites, make_sprites
+from hilstar.scene.trails import Brush
 from hilstar.sky.stars import Stars, split_by_rate
 from hilstar.units import magnitude
 
@@ -40,6 +42,7 @@ if TYPE_CHECKING:
 
 WARM_UP_ATTITUDE = np.array([1.0, 0.0, 0.0, 0.0])
 WARM_UP_RATE_RAD_S = np.array([0.1, 0.0, 0.0])
+STILL = np.zeros(3)
 MOST = 0.5  # of a pixel's light: with less it is not the disc's
 
 
@@ -184,9 +187,11 @@ class Bench:
             return None
         stars = self.seen(self.shown_stars, t_ns, velocity_km_s, place_km)
         sprites = self.star_sprites(stars, q_icrs_to_cam, rate_cam_rad_s)
+        turn = self._turn(q_icrs_to_cam, rate_cam_rad_s)
         if self._painter is not None:
-            turn = self._turn(q_icrs_to_cam, rate_cam_rad_s)
             sprites = self._painter.over(sprites, stars, q_icrs_to_cam, When(t_ns, velocity_km_s, place_km), turn)
+        shot = Shot(self.camera, self.scan, turn or Turn(q_icrs_to_cam, STILL), t_ns, velocity_km_s, place_km)
+        sprites = self._with_satellites(sprites, stars, shot, self.faintest_shown_e_per_s)
         if faults is None:
             return sprites
         scan = None if rate_cam_rad_s is None else self.scan
@@ -242,6 +247,13 @@ class Bench:
         sprites = swept_sprites(stars, turn, self.scan, self.camera, self.renderer.footprint_px, self._sigma_px)
         return replace(sprites, rate_cam_rad_s=turn.rate_cam_rad_s)
 
+    def _with_satellites(self, sprites: Sprites, stars: Stars, shot: Shot, faintest_e_per_s: float) -> Sprites:
+        if self.moving is None or self.moving.satellites is None:
+            return sprites
+        shot = replace(shot, turn=slowed(shot.turn, self.scan, self.camera)[0])
+        brush = Brush(self.renderer.footprint_px, self._sigma_px, FRAME_SPRITES)
+        return with_satellites(sprites, stars, self.moving, shot, brush, faintest_e_per_s)
+
     def count_faint(self, q_icrs_to_cam: FloatArray) -> int:
         """How many stars in view at an attitude are too faint for the monitor."""
         return len(self.sprites(q_icrs_to_cam, self.faint_stars)) if len(self.faint_stars) else 0
@@ -269,9 +281,10 @@ class Bench:
         q = checked_quaternion(q_icrs_to_cam)
         q = q if faults is None else faults.turned(q)
         sprites = self._still(q, self.stars, t_ns, faults)
-        self.renderer.draw(self._still(q, self.shown_stars, t_ns, faults), number)
+        shown = self._still(q, self.shown_stars, t_ns, faults)
+        self.renderer.draw(shown, number)
         levels = self.renderer.codes().copy()
-        if len(self.faint_stars) or self.renderer.target.sides:
+        if len(self.faint_stars) or self.renderer.target.sides or len(sprites) != len(shown):
             self.renderer.draw(sprites, number, whole=True)
         linear = self.renderer.linear().copy()
         truth, star = self._truth(q, sprites, t_ns)
@@ -292,11 +305,12 @@ class Bench:
         return truth, star
 
     def _still(self, q: FloatArray, stars: Stars, t_ns: int | None, faults: FrameFaults | None) -> Sprites:
-        """The sprites of `stars` or `shown_stars` as points, and discs, at an attitude and a moment."""
-        seen = self.seen(stars, t_ns)
+        """The sprites of `stars` or `shown_stars` as points, discs, and satellites' paths, at an attitude and a moment."""
+        seen, faintest_e_per_s = self.seen(stars, t_ns), 0.0 if stars is self.stars else self.faintest_shown_e_per_s
         sprites = self.sprites(q, seen)
         if self._painter is not None:
             sprites = self._painter.over(sprites, seen, q, When(t_ns))
+        sprites = self._with_satellites(sprites, seen, Shot(self.camera, self.scan, Turn(q, STILL), t_ns), faintest_e_per_s)
         return sprites if faults is None else faults.over(sprites, seen, q, lambda few: self.sprites(q, few))
 
     def seen(

@@ -8,6 +8,7 @@ from pathlib import Path
 from hilstar.bench.config import GEOCENTRE, SOURCE, BenchConfig
 from hilstar.bench.config.when import epoch_utc_ns, jyear
 from hilstar.bench.discs import POINT_PX
+from hilstar.bench.satellites import bench_satellites
 from hilstar.reading import read_text
 from hilstar.scene.camera import Camera
 from hilstar.sky.bodies.earth import EARTH
@@ -40,7 +41,9 @@ def moving_sky(config: BenchConfig, folder: Path, optics: Optics) -> MovingSky:
     names = body_names(config)
     sky = config.sky
     rates = bodies_electrons_per_s(names, sky.brightness, optics, Photometry(sky.zero_point, sky.passband_weighting))
-    return MovingSky(Kernel(), observer, utc_ns, BodyLight(names, bodies_bv_mag(names), rates), start_ns)
+    moving = MovingSky(Kernel(), observer, utc_ns, BodyLight(names, bodies_bv_mag(names), rates), start_ns)
+    moving.satellites = bench_satellites(config, folder, observer, (utc_ns, utc_ns + start_ns), optics)
+    return moving
 
 
 def orbit_file(path: Path, utc_ns: int) -> Orbit:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.arrays import FloatArray, IntArray
+from hilstar.arrays import BoolArray, FloatArray, IntArray
 from hilstar.scene.sprites import Sprites
 from hilstar.sky.stars import Stars
 
@@ -70,12 +70,25 @@ def sprite_truth(stars: Stars, sprites: Sprites, clipped: IntArray) -> tuple[npt
     over = np.zeros(len(sprites), dtype=bool)
     over[clipped] = True
     own = sprites.star >= 0
-    truth = truth_table(stars, sprites.star[own], sprites.x_px[own], sprites.y_px[own])
-    truth["clipped"] = over[own]
+    star, x_px, y_px = _one_a_star(sprites, own)
+    truth = truth_table(stars, star, x_px, y_px)
+    truth["clipped"] = over[own] if len(star) == own.sum() else np.isin(star, sprites.star[over])
     if not sprites.added:
-        return truth, sprites.star
+        return truth, star
     added = _added_truth(sprites, over)
-    return np.concatenate([truth, added]), np.concatenate([sprites.star[own], np.unique(sprites.star[~own])])
+    return np.concatenate([truth, added]), np.concatenate([star, np.unique(sprites.star[~own])])
+
+
+def _one_a_star(sprites: Sprites, own: BoolArray) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Each star of these sprites once, a satellite with the middle of its streak's light, px."""
+    star, x_px, y_px = sprites.star[own], sprites.x_px[own], sprites.y_px[own]
+    once, which = np.unique(star, return_inverse=True)
+    if len(once) == len(star):
+        return star, x_px, y_px
+    light = sprites.data["electrons_per_s"][own].astype(np.float64)
+    total = np.bincount(which, light)
+    x_px, y_px = (np.asarray(np.bincount(which, light * places) / total, dtype=np.float64) for places in (x_px, y_px))
+    return once, x_px, y_px
 
 
 def _added_truth(sprites: Sprites, over: npt.NDArray[np.bool_]) -> npt.NDArray[np.void]:

@@ -25,6 +25,9 @@ AtSeconds = Annotated[
     typer.Option("--at", metavar="S", help="Seconds after `[sky] epoch_utc`, at which bodies are placed; 0 by default."),
 ]
 RunFile = Annotated[Path, typer.Argument(metavar="RUN.mcap", help="The ledger of serve or replay.")]
+ScenarioFile = Annotated[
+    Path | None, typer.Option("--scenario", metavar="FILE.toml", help="Faults on request: what is wrong in the sky, and when.")
+]
 UNSAID = "What the log itself does not say"
 KernelFiles = Annotated[
     list[Path] | None,

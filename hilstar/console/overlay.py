@@ -14,7 +14,8 @@ from hilstar.bench.cameras import tracker_camera
 from hilstar.bench.frame import Bench
 from hilstar.rotation import to_matrix, to_radec_roll_deg
 from hilstar.scene.camera import Camera
-from hilstar.sky.names import label_of
+from hilstar.sky.catalog import load_catalog
+from hilstar.sky.names import label_of, star_names
 from hilstar.sky.stars import Stars
 
 MAX_STARS = 400  # of a picture's truth, the brightest
@@ -150,6 +151,16 @@ class Overlay:
 def overlay_of(bench: Bench) -> Overlay:
     """The overlay of an assembled bench."""
     return Overlay(bench.camera, tracker_camera(bench.config.tracker, bench.file.folder), bench.shown_stars)
+
+
+def catalogue_sky() -> dict[str, Any]:
+    """As `Overlay.sky` without a bench: Hipparcos' bright stars, where they were in 1991."""
+    catalog = load_catalog()
+    bright = np.argsort(catalog.v_mag, kind="stable")
+    bright = bright[catalog.v_mag[bright] < SKY_FAINTEST_MAG]
+    columns = (catalog.ra_deg[bright], catalog.dec_deg[bright], catalog.v_mag[bright])
+    rows = zip(*(column.round(SKY_DIGITS).tolist() for column in columns), catalog.hip[bright].tolist(), strict=True)
+    return {"stars": [[*numbers, star_names().get(hip, ("", ""))[0]] for *numbers, hip in rows], "moving": [], "screen_cam": []}
 
 
 def _border(resolution_px: tuple[int, int], places: int) -> tuple[FloatArray, FloatArray]:

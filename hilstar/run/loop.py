@@ -16,8 +16,10 @@ from msgspec import UNSET, UnsetType
 
 from hilstar.attitude.clock.timeline import Attitude, Policy, StaleGate
 from hilstar.bench.config import AttitudeSettings
+from hilstar.bench.faults.effects import Effects
 from hilstar.bench.frame import Bench
 from hilstar.notices import Notices
+from hilstar.run.faulty_frames import FaultyFrames
 from hilstar.run.pacer import AT_ONCE, ClockPacer, Moment, Pacer
 from hilstar.run.presence import AttitudeWatch
 from hilstar.run.shown import FrameSink, OnScreen, Shown, ignore
@@ -50,6 +52,7 @@ class FrameLoop:
         pacer: Pacer | None = None,
         moving: bool | None = None,
         notices: Notices | None = None,
+        faults: FaultyFrames | None = None,
     ) -> None:
         settings, motion = bench.config.attitude, bench.config.render.motion
         self._bench = bench
@@ -63,12 +66,13 @@ class FrameLoop:
         self.gate = StaleGate(policy_of(settings).stale_after_ns)
         self.notices = Notices() if notices is None else notices
         self._presence = AttitudeWatch(self.notices, self.pacer.clock)
+        self._faults = faults
         self.watch = FrameWatch(self._period_ns, self.notices, self.pacer.clock)
 
     def draw(self, number: int, t_ns: int, attitude: Attitude | None, moment: Moment = AT_ONCE) -> Shown | None:
         """Draw the frame for `t_ns` of the timeline's clock; without an attitude it is blank.
 
-        None for a frame that is given up because its moment passed while its sprites were computed.
+        None for a frame that is given up because its moment passed while its sprites were computed, or that a fault drops.
         """
         self.watch.begin(number)
         try:
@@ -82,11 +86,19 @@ class FrameLoop:
         self._presence.see(attitude, stale)
         on_screen = self.pacer.operator.look()
         attitude = self._shown_attitude(t_ns, attitude, stale)
-        sprites = self._sprites(attitude, t_ns)
+        effects, faults = None, self._faults
+        if faults is not None:
+            effects = faults.at(t_ns, attitude)
+            if faults.drops(effects, number):
+                return None
+            attitude = faults.attitude(effects, t_ns, attitude)
+        stays = None if faults is None else faults.frozen_frame(effects, self._bench)
+        sprites = None if stays is not None else self._sprites(attitude, t_ns, effects)
         if self._gives_up(number, moment):
             return None
         self.watch.enter("draw")
-        drawn = self._bench.draw_sprites(sprites, number)
+        drawn = self._bench.draw_sprites(sprites, number) if stays is None else stays
+        now = () if faults is None else faults.shown(effects, drawn, attitude, t_ns, stays is not None)
         presented = self.pacer.show(number, drawn, moment, begun_ns, self.watch.enter)
         shown = Shown(
             number=number,
@@ -102,6 +114,7 @@ class FrameLoop:
             marker=presented.marker,
             missing=missing,
             on_screen=on_screen,
+            faults=now,
         )
         self._count(shown, on_screen)
         self.watch.enter("output")
@@ -114,11 +127,12 @@ class FrameLoop:
         attitude = operator.attitude(t_ns, attitude)
         return None if stale and self._blank_when_stale and not operator.paused else attitude
 
-    def _sprites(self, attitude: Attitude | None, t_ns: int) -> Sprites | None:
+    def _sprites(self, attitude: Attitude | None, t_ns: int, effects: Effects | None) -> Sprites | None:
         if attitude is None:
             return None
         rate = attitude.rate_cam_rad_s if self._moving else None
-        return self._bench.frame_sprites(attitude.q_icrs_to_cam, rate, attitude.velocity_km_s, t_ns, attitude.place_km)
+        velocity, place = attitude.velocity_km_s, attitude.place_km
+        return self._bench.frame_sprites(attitude.q_icrs_to_cam, rate, velocity, t_ns, place, effects)
 
     def _gives_up(self, number: int, moment: Moment) -> bool:
         """Whether the frame's moment has passed so far that the next is begun instead.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol
 
@@ -19,6 +19,7 @@ from hilstar.attitude.wire.packet import AttitudeSample, rate_refusal
 from hilstar.attitude.wire.source import PACKETS, Conventions
 from hilstar.bench.config import BenchConfig
 from hilstar.errors import InputError
+from hilstar.run.faults.recorded import NO_RECORDING, Recording, read_recording
 from hilstar.run.loop import policy_of
 from hilstar.run.record.ledger_reader import drawable_frames
 from hilstar.run.record.ledger_records import FrameRecord
@@ -64,6 +65,17 @@ class Play(Protocol):
         """The time of the log's or the run's first frame."""
 
     @property
+    def zero_ns(self) -> int:
+        """The time from which a scenario counts its seconds: the log's first sample, or the run's first frame."""
+
+    @property
+    def recording(self) -> Recording:
+        """The faults of an earlier run."""
+
+    def past(self, slot: int) -> FrameRecord | None:
+        """The frame of an earlier run; None of a log."""
+
+    @property
     def told(self) -> list[tuple[str, str]]:
         """Events to report before it begins: kinds and lines."""
 
@@ -87,6 +99,8 @@ class LogPlay:
     moving: bool | None = None
     told: list[tuple[str, str]] = field(default_factory=list)
     conventions: Conventions = PACKETS
+    zero_ns: int = 0
+    recording: Recording = NO_RECORDING
 
     @property
     def packet_count(self) -> int:
@@ -97,6 +111,10 @@ class LogPlay:
         """Number, time and attitude of a frame."""
         t_ns = self.first_ns + round(slot * self.step_s * NS_PER_S)
         return slot, t_ns, self.timeline.at(t_ns)
+
+    def past(self, slot: int) -> FrameRecord | None:
+        """A log has no frames."""
+        return None
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,6 +127,8 @@ class RunPlay:
     moving: bool | None = True  # where the run's own were
     told: list[tuple[str, str]] = field(default_factory=list)
     conventions: Conventions = PACKETS
+    zero_ns: int = 0
+    recording: Recording = NO_RECORDING
 
     @property
     def first_ns(self) -> int:
@@ -130,6 +150,10 @@ class RunPlay:
         place = None if past.place_km is None else np.array(past.place_km)
         attitude = Attitude(np.array(past.q), 0, False, rate_cam_rad_s=rate, velocity_km_s=velocity, place_km=place)
         return past.frame, past.t_ns, attitude
+
+    def past(self, slot: int) -> FrameRecord | None:
+        """The frame as it was recorded."""
+        return self.frames[slot]
 
 
 def plan_play(log: Path, wanted: Wanted, config: BenchConfig, stated: Stated = NOTHING_STATED) -> Play:
@@ -159,7 +183,8 @@ def plan_play(log: Path, wanted: Wanted, config: BenchConfig, stated: Stated = N
     joins = log_joins(samples)
     timeline = log_timeline(samples, policy_of(config.attitude), joins)
     told = [*read.told, *joins.told]
-    return LogPlay(timeline, first_ns, step_s, int(count) + 1, not math.isinf(factor), None, told, read.conventions)
+    play = LogPlay(timeline, first_ns, step_s, int(count) + 1, not math.isinf(factor), None)
+    return replace(play, told=told, conventions=read.conventions, zero_ns=samples[0].t_ns)
 
 
 def _check_rates(log: Path, samples: list[AttitudeSample], max_rate_rad_s: float) -> None:
@@ -178,7 +203,8 @@ def _plan_run(log: Path, wanted: Wanted, factor: float, frames: list[FrameRecord
     kept = [frame for frame in frames if start_s <= (frame.swap_ns - first_ns) / NS_PER_S <= stop_s + 1e-9]
     if not kept:
         raise InputError(f"{log}: has no frame from --start {start_s:g} to --stop {stop_s:g}; write a longer span")
-    return RunPlay(kept, sum(1 for _ in read_attitudes(log)), not math.isinf(factor))
+    play = RunPlay(kept, sum(1 for _ in read_attitudes(log)), not math.isinf(factor))
+    return replace(play, zero_ns=frames[0].t_ns, recording=read_recording(log))
 
 
 def _span(log: Path, wanted: Wanted, length_s: float) -> tuple[float, float]:

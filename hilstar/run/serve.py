@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from msgspec import UNSET
 from msgspec.structs import replace as replaced
 
 from hilstar.attitude.back_channel import Traffic
@@ -24,6 +25,7 @@ from hilstar.bench.frame import Bench
 from hilstar.notices import Notices
 from hilstar.process.interrupts import stop_on_signal
 from hilstar.run.desk import Desk
+from hilstar.run.faults.run_faults import AnyFaults, replayed_faults
 from hilstar.run.frame_status import StatusMaker
 from hilstar.run.lockstep.nasa42 import serve_nasa42
 from hilstar.run.lockstep.packets import serve_lockstep
@@ -72,7 +74,7 @@ class Outlet:
     """Where frames go besides their sink: onto a screen and into a ledger; where events are reported, and who follows it.
 
     `pictures` are what a simulation gets that asks for those of its camera; `desk` has the wishes of operators who are not at
-    the display.
+    the display. `faults` are those on request; who wants to start one finds their own desk there.
     """
 
     screen: Screen | None = None
@@ -81,6 +83,7 @@ class Outlet:
     pictures: Pictures | None = None
     follower: Follower = nobody_follows
     desk: Desk | None = None
+    faults: AnyFaults | None = None
 
     def pacer(self, bench: Bench) -> Pacer:
         """The pacer of the screen, or without one that of the bench's own rate."""
@@ -93,7 +96,8 @@ class Outlet:
 def serve(bench: Bench, link: AnyLink, limit: Limit, sink: FrameSink = ignore, outlet: Outlet | None = None) -> RunSummary:
     """Show the live stream of `link` up to `limit`, or until a signal; returns the summary."""
     outlet = outlet or Outlet()
-    loop = FrameLoop(bench, sink, outlet.pacer(bench), notices=outlet.notices)
+    faults = outlet.faults
+    loop = FrameLoop(bench, sink, outlet.pacer(bench), None, outlet.notices, None if faults is None else faults.frames)
     if link.conventions.of_body:
         for kind, line in Mounting(bench.config.tracker.q_body_to_cam).told:
             outlet.notices.tell(kind, line)
@@ -103,6 +107,7 @@ def serve(bench: Bench, link: AnyLink, limit: Limit, sink: FrameSink = ignore, o
         else:
             summary = _serve_stream(bench, link, limit, loop, outlet)
     told: dict[str, str | int] = {"endpoint": link.endpoint}
+    summary = replaced(summary, faults=UNSET if faults is None else faults.summary())
     return replaced(
         summary, events=outlet.notices.counts(), link=told | link.link_counts.summary(), screen=loop.screen_summary()
     )
@@ -180,11 +185,18 @@ def replay(bench: Bench, play: Play, sink: FrameSink = ignore, outlet: Outlet | 
     Paced, late frames are missed, as on a monitor; otherwise every frame is drawn, as fast as it can be.
     """
     outlet = outlet or Outlet()
-    loop, ledger = FrameLoop(bench, sink, outlet.pacer(bench), play.moving, outlet.notices), outlet.ledger
+    ledger = outlet.ledger
+    faults = outlet.faults or replayed_faults(bench, play.recording, ledger)
+    if faults is not None:
+        faults.begin(play.zero_ns)
+    frames = None if faults is None else faults.frames
+    loop = FrameLoop(bench, sink, outlet.pacer(bench), play.moving, outlet.notices, frames)
     for kind, line in play.told:
         outlet.notices.tell(kind, line)
 
     def draw_slot(moment: Moment) -> Shown | None:
+        if faults is not None:
+            faults.recall(play.past(moment.slot))
         number, t_ns, attitude = play.frame(moment.slot)
         shown = loop.draw(number, t_ns, attitude, moment)
         if ledger is not None and shown is not None:
@@ -206,4 +218,5 @@ def replay(bench: Bench, play: Play, sink: FrameSink = ignore, outlet: Outlet | 
     duration_s = (time.monotonic_ns() - begin_ns) / NS_PER_S
     summary = loop.tally.summary(duration_s, counts, bench.renderer.gl_renderer)
     told = outlet.notices.counts()
+    summary = replaced(summary, faults=UNSET if faults is None else faults.summary())
     return replaced(summary, stale_events=loop.gate.events, events=told, screen=loop.screen_summary())

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from hilstar.attitude.clock.timeline import Attitude
+from hilstar.bench.faults.desk import Now
 from hilstar.bench.frame import Drawn
 
 
@@ -47,6 +48,7 @@ class Shown:
     marker: int | None = None
     missing: bool = False
     on_screen: OnScreen = HEADLESS
+    faults: tuple[Now, ...] = ()
 
 
 FrameSink = Callable[[Shown], None]

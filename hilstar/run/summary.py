@@ -66,6 +66,7 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     link: dict[str, str | int] | UnsetType = UNSET
     screen: dict[str, Any] | UnsetType = UNSET
     ledger: dict[str, str | int | None] | UnsetType = UNSET
+    faults: dict[str, Any] | UnsetType = UNSET
 
 
 class SwapTally:

@@ -25,7 +25,7 @@ class Stars:
     `row` is each star's place in `catalog`, which has what no frame needs; -1 for what is in no catalogue. With a
     `velocity_km_s` (3,), ICRS, they are seen by an observer who moves so against the one who sees `vectors`: `near` and
     `directions` then say what that observer sees. The last stars may be `bodies`, by name: whoever moves them rewrites their
-    part of the arrays.
+    part of the arrays. Those that `near` does not find (satellites) come first.
     """
 
     hip: npt.NDArray[np.int32]
@@ -120,9 +120,13 @@ def make_stars(catalog: Catalog, vectors: FloatArray, temperature_k: FloatArray,
     )
 
 
-def with_bodies(stars: Stars, bodies: tuple[str, ...], bv_mag: FloatArray) -> Stars:
-    """The stars, in arrays of their own, and after them bodies of colours `bv_mag` (k,), which have no place or light yet."""
+def with_bodies(stars: Stars, bodies: tuple[str, ...], bv_mag: FloatArray, found: bool = True) -> Stars:
+    """The stars, in arrays of their own, and after them bodies of colours `bv_mag` (k,), which have no place or light yet.
+
+    Bodies not to be `found` are in no cell: `near` passes over them, whoever moves them adds them to an image.
+    """
     count, order = len(bodies), len(stars) + np.arange(len(bodies))
+    cells = order[: count if found else 0]
     nowhere = np.full(count, np.nan)
     grid = stars.grid
     return Stars(
@@ -135,13 +139,13 @@ def with_bodies(stars: Stars, bodies: tuple[str, ...], bv_mag: FloatArray) -> St
         grid=replace(
             grid,
             order=np.concatenate([grid.order, order]),
-            start=np.concatenate([grid.start, order]),
-            count=np.concatenate([grid.count, np.ones(count, dtype=grid.count.dtype)]),
-            centre=np.concatenate([grid.centre, np.full((count, 3), np.nan)]),
-            cos_radius=np.concatenate([grid.cos_radius, np.full(count, np.cos(BODY_CELL_RAD))]),
-            sin_radius=np.concatenate([grid.sin_radius, np.full(count, np.sin(BODY_CELL_RAD))]),
+            start=np.concatenate([grid.start, cells]),
+            count=np.concatenate([grid.count, np.ones(len(cells), dtype=grid.count.dtype)]),
+            centre=np.concatenate([grid.centre, np.full((len(cells), 3), np.nan)]),
+            cos_radius=np.concatenate([grid.cos_radius, np.full(len(cells), np.cos(BODY_CELL_RAD))]),
+            sin_radius=np.concatenate([grid.sin_radius, np.full(len(cells), np.sin(BODY_CELL_RAD))]),
         ),
         catalog=stars.catalog,
         row=np.concatenate([stars.row, np.full(count, -1)]),
-        bodies=bodies,
+        bodies=(*stars.bodies, *bodies),
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Literal, Protocol, Self
@@ -15,11 +15,15 @@ from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import bench_moving, bench_optics, bench_stars, moved
 from hilstar.bench.cameras import tracker_camera
 from hilstar.bench.config import BenchConfig
+from hilstar.bench.satellites import EXPOSURE_SPRITES, Shot, with_satellites
 from hilstar.bench.truth import truth_table
 from hilstar.errors import InputError
 from hilstar.render.renderer import Context, Renderer, Target
 from hilstar.scene.camera import Camera
 from hilstar.scene.exposure_motion import MIDDLE_S, Motion, smeared_sprites
+from hilstar.scene.frame_motion import Scan, Turn
+from hilstar.scene.sprites import Sprites
+from hilstar.scene.trails import Brush
 from hilstar.sky.electrons import Photometry, zodiacal_electrons_per_s_arcsec2
 from hilstar.sky.stars import Stars
 from hilstar.tracker.detector import Detector
@@ -123,6 +127,7 @@ class Simulator:
         if self.moving is not None:
             stars = self.moving.seen(self.stars, motion.t_ns, velocity_km_s, place_km)
         sprites = smeared_sprites(stars, motion, self.camera, self.renderer.footprint_px, tracker.psf_sigma_px)
+        sprites = self._with_satellites(sprites, stars, motion, velocity_km_s, place_km)
         self.renderer.draw(sprites)
         mean_e = self.renderer.linear().astype(np.float64) * tracker.exposure_s + self.background_e
         if (
@@ -135,6 +140,20 @@ class Simulator:
             dn = self.detector.expose(mean_e, tracker.exposure_s, rng)
         truth = exposure_truth(self, motion, stars, np.unique(sprites.star), mean_e)
         return Exposure(motion, dn, mean_e, truth, sprites.capped)
+
+    def _with_satellites(
+        self,
+        sprites: Sprites,
+        stars: Stars,
+        motion: Motion,
+        velocity_km_s: FloatArray | None,
+        place_km: FloatArray | None,
+    ) -> Sprites:
+        scan, turn = Scan(hold_s=motion.exposure_s), Turn(motion.q_icrs_to_cam, motion.rate_cam_rad_s)
+        shot = Shot(self.camera, scan, turn, motion.t_ns, velocity_km_s, place_km)
+        shot = replace(shot, begin_s=-motion.exposure_s / 2)
+        brush = Brush(self.renderer.footprint_px, self.config.tracker.psf_sigma_px, EXPOSURE_SPRITES)
+        return with_satellites(sprites, stars, self.moving, shot, brush)
 
     def close(self) -> None:
         """Free the GL context."""

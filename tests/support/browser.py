@@ -11,6 +11,11 @@ from typing import Any
 
 from selenium.webdriver import Chrome, ChromeOptions
 from selenium.webdriver.chrome.service import Service
+from selenium.webdriver.common.by import By
+from selenium.webdriver.remote.webelement import WebElement
+from selenium.webdriver.support.ui import WebDriverWait
+
+from tests.support.waiting import PATIENCE_S
 
 FLAGS = (
     "--headless=new",
@@ -24,6 +29,15 @@ FLAGS = (
     "--disable-dev-shm-usage",
     "--hide-scrollbars",
 )
+# Beside what may be scrolled: the row of overlays, the bench file, tables of events.
+OVERFLOWING = """
+const may = (element) => element.closest("#overlays, pre, canvas, .skip, dialog");
+const wide = (element) => !element.childElementCount && element.clientWidth && element.scrollWidth > element.clientWidth + 1;
+return [...document.querySelectorAll("body *")]
+  .filter((element) => element.checkVisibility() && !may(element))
+  .filter((element) => element.getBoundingClientRect().right > innerWidth + 0.5 || wide(element))
+  .map((element) => `${element.tagName} ${element.id} ${element.className}: ${element.textContent.slice(0, 40)}`);
+"""
 SIZES_PX = {"phone": (390, 844), "laptop": (1366, 768), "large": (1920, 1080)}
 
 
@@ -52,6 +66,22 @@ class Browser(Chrome):
     def run(self, script: str, *arguments: Any) -> Any:
         """What a script says."""
         return self.execute_script(script, *arguments)
+
+    def find(self, selector: str) -> WebElement:
+        """The element of a CSS selector."""
+        return self.find_element(By.CSS_SELECTOR, selector)
+
+    def text(self, selector: str) -> str:
+        """What an element says, as it stands in the page, whatever its style makes of it."""
+        return " ".join(str(self.run("return document.querySelector(arguments[0]).textContent", selector)).split())
+
+    def until(self, condition: str, patience_s: float = PATIENCE_S) -> None:
+        """Wait until a condition in JavaScript holds."""
+        WebDriverWait(self, patience_s, poll_frequency=0.02).until(lambda _: self.run(f"return {condition}"), condition)
+
+    def overflowing(self) -> list[str]:
+        """What reaches out of the page's window to the right, and what text is wider than its box."""
+        return list(self.run(OVERFLOWING))
 
     def complaints(self) -> list[str]:
         """What the console has said since it was last asked, violations of the page's policy among it."""

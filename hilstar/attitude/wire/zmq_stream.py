@@ -48,6 +48,10 @@ class ZmqReceiver(ZmqSocket):
 
         Waits at most `timeout_ms` for the first, and for no other.
         """
+        return [self._arrival(host_ns, parts) for host_ns, parts in self.taken(timeout_ms)]
+
+    def taken(self, timeout_ms: int) -> list[tuple[int, list[bytes]]]:
+        """What `receive` makes its arrivals of: when each message came, host time in ns, and its parts."""
         if not self._waits(timeout_ms):
             return []
         waiting: list[tuple[int, list[bytes]]] = []
@@ -56,7 +60,7 @@ class ZmqReceiver(ZmqSocket):
             waiting.append((time.monotonic_ns(), parts))
             taken_bytes += sum(map(len, parts))
         admitted = self._gate.admit(len(waiting))
-        return [self._arrival(host_ns, parts) for host_ns, parts in waiting[len(waiting) - admitted :]]
+        return waiting[len(waiting) - admitted :]
 
     def _arrival(self, host_ns: int, parts: list[bytes]) -> Arrival[Event]:
         return Arrival(host_ns, decode(parts[-1]), parts[-1])

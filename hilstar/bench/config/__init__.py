@@ -7,6 +7,7 @@ from hilstar.bench.config.attitude import AttitudeSettings
 from hilstar.bench.config.background import Background
 from hilstar.bench.config.bench import BenchConfig
 from hilstar.bench.config.collimator import Collimator
+from hilstar.bench.config.faults import FaultSettings
 from hilstar.bench.config.monitor import Monitor
 from hilstar.bench.config.read import config_of, parse_config, read_config
 from hilstar.bench.config.render import DEFAULT_BRIGHTEST_V_MAG, RenderSettings
@@ -25,6 +26,7 @@ __all__ = [
     "BenchConfig",
     "Bodies",
     "Collimator",
+    "FaultSettings",
     "Monitor",
     "RenderSettings",
     "SkySettings",

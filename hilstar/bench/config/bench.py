@@ -7,6 +7,7 @@ import msgspec
 from hilstar.bench.config.attitude import AttitudeSettings
 from hilstar.bench.config.background import Background
 from hilstar.bench.config.collimator import Collimator
+from hilstar.bench.config.faults import FaultSettings
 from hilstar.bench.config.monitor import Monitor
 from hilstar.bench.config.render import RenderSettings
 from hilstar.bench.config.sky import SkySettings
@@ -30,3 +31,4 @@ class BenchConfig(Table, frozen=True):
     render: RenderSettings = msgspec.field(default_factory=RenderSettings)
     background: Background = msgspec.field(default_factory=Background)
     verify: Verify = msgspec.field(default_factory=Verify)
+    faults: FaultSettings = msgspec.field(default_factory=FaultSettings)

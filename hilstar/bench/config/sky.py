@@ -31,6 +31,28 @@ class Bodies(Table, frozen=True):
             " night side is dark."
         ),
     ] = False
+    satellites: Annotated[
+        str | None,
+        Meta(
+            description="The path of a list of two-line element sets (TLE), with name lines or without: satellites and debris "
+            "along their own paths, by SGP4, in and out of the Earth's shadow.",
+            extra={"default": "none"},
+        ),
+    ] = None
+    satellite_magnitudes: Annotated[
+        str | None,
+        Meta(
+            description="The path of a CSV with the columns `norad,standard_mag,period_s,amplitude_mag,flash_s,flash_at_s,"
+            "size_m`, of which only the first has to be there: what is known of each satellite's light.",
+            extra={"default": "none"},
+        ),
+    ] = None
+    satellite_standard_mag: Annotated[
+        Magnitude,
+        Meta(
+            description="V at 1000 km, 90 degrees of phase and in sunlight, of satellites without `standard_mag` in that table."
+        ),
+    ] = 6.0
 
 
 class SkySettings(Table, frozen=True):

@@ -38,7 +38,8 @@ def epoch_utc_ns(config: BenchConfig) -> int | None:
 def has_observer(config: BenchConfig) -> bool:
     """Whether the sky is seen from a known place: a spacecraft's, or for its bodies the Earth's centre."""
     bodies = config.sky.bodies
-    return bodies.planets or bodies.moon or bodies.sun or bodies.earth or config.spacecraft.orbit is not None
+    shown = bodies.planets or bodies.moon or bodies.sun or bodies.earth or bodies.satellites is not None
+    return shown or config.spacecraft.orbit is not None
 
 
 def from_source(config: BenchConfig) -> bool:

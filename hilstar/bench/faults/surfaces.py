@@ -5,6 +5,7 @@ Both are laid out once in the camera's own pixels, with the light that each coll
 
 from __future__ import annotations
 
+import hashlib
 import io
 import math
 from pathlib import Path
@@ -82,6 +83,11 @@ def _grid_in(camera: Camera, other: Camera) -> tuple[Any, Any] | None:
     if not all(np.isfinite(place).all() for place in places):
         return None
     return RectBivariateSpline(down, across, places[0]), RectBivariateSpline(down, across, places[1])
+
+
+def map_sha256(path: Path) -> str:
+    """The SHA-256 of a map's file. Raises InputError."""
+    return hashlib.sha256(read_bytes(path, MAP_ADVICE, MAX_FILE_BYTES)).hexdigest()
 
 
 def read_map(path: Path) -> FloatArray:

@@ -6,10 +6,10 @@ The display and the virtual tracker have a view each; nothing else differs betwe
 from __future__ import annotations
 
 import math
+import threading
 import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -29,6 +29,7 @@ from hilstar.bench.faults.kinds import (
     StarGone,
 )
 from hilstar.bench.faults.lines import Chain, Lines, moved, tracks
+from hilstar.bench.faults.scenario import NO_SCENARIO, Scenario
 from hilstar.bench.faults.surfaces import gradient_image, map_image, read_map
 from hilstar.bench.faults.targets import Targets
 from hilstar.errors import InputError
@@ -66,10 +67,13 @@ class Sight:
 
 
 class FaultView:
-    """The faults of a scenario for one camera; `seed` is the scenario's, `folder` where the files are that it names."""
+    """The faults of a scenario for one camera. A fault of the stream may be prepared while another thread draws."""
 
-    def __init__(self, sight: Sight, seed: int = 0, folder: Path | None = None) -> None:
-        self._sight, self._seed, self._folder = sight, seed, folder
+    def __init__(self, sight: Sight, scenario: Scenario = NO_SCENARIO) -> None:
+        self._sight, self._seed = sight, scenario.seed
+        self._folder = scenario.folder if scenario.faults else None
+        self._lasting = frozenset(scenario.faults)
+        self._lock = threading.Lock()
         self._targets = Targets()
         self._maps: dict[Fault, extended.LightMap] = {}
         self._tracks: dict[tuple[str, int], Chain] = {}
@@ -110,13 +114,16 @@ class FaultView:
 
     def _map(self, fault: Gradient | MeasuredMap) -> extended.LightMap:
         """A fault's light over the image where the brightest tracker pixel has its light."""
-        known = self._maps.pop(fault, None)
+        with self._lock:
+            known = self._maps.get(fault)
         if known is None:
-            while len(self._maps) >= KEPT_MAPS:
-                self._maps.pop(next(iter(self._maps)))
-            image = self._laid_out(fault)
-            known = extended.LightMap(image, times=self.light_e_per_s(fault))
-        self._maps[fault] = known
+            known = extended.LightMap(self._laid_out(fault), times=self.light_e_per_s(fault))
+        with self._lock:
+            self._maps.pop(fault, None)
+            self._maps[fault] = known  # the last used is the last to go
+            others = [kept for kept in self._maps if kept not in self._lasting]
+            if len(others) > KEPT_MAPS:
+                self._maps.pop(others[0])
         return known
 
     def _laid_out(self, fault: Gradient | MeasuredMap) -> Float32Array:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,7 +28,7 @@ def display_view(bench: Bench, scenario: Scenario = NO_SCENARIO) -> FaultView:
     tracker = tracker_camera(bench.config.tracker, bench.file.folder)
     sigma_px, footprint_px = bench.config.render.sprite_sigma_px, bench.renderer.footprint_px
     sight = _sight(bench.file, (bench.camera, bench.camera, tracker), (footprint_px, sigma_px), bench.stars, bench.moving)
-    return FaultView(sight, scenario.seed, _folder(scenario))
+    return FaultView(sight, scenario)
 
 
 def tracker_view(
@@ -43,11 +42,7 @@ def tracker_view(
     """The faults of a scenario as they fall on the virtual tracker's detector, whose `camera` it is."""
     monitor = bench_camera(file.config, file.folder)
     spread = footprint_px, file.config.tracker.psf_sigma_px
-    return FaultView(_sight(file, (camera, monitor, camera), spread, stars, moving), scenario.seed, _folder(scenario))
-
-
-def _folder(scenario: Scenario) -> Path | None:
-    return scenario.folder if scenario.faults else None
+    return FaultView(_sight(file, (camera, monitor, camera), spread, stars, moving), scenario)
 
 
 def _sight(

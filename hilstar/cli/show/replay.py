@@ -19,6 +19,7 @@ from hilstar.cli.options import (
     Overwrite,
     PlaceText,
     ReferenceName,
+    ScenarioFile,
     TopicName,
     check_files,
 )
@@ -32,6 +33,8 @@ from hilstar.cli.show.running import (
     explain_bench,
     explain_source,
     optional_ledger,
+    optional_scenario,
+    run_with_faults,
     say_what_clips,
     shown_bench,
 )
@@ -61,6 +64,7 @@ def replay(
     ] = None,
     ledger: LedgerFile = None,
     ledger_split: LedgerSplit = None,
+    scenario: ScenarioFile = None,
     overwrite: Overwrite = False,
     windowed: Windowed = False,
     force: Force = False,
@@ -79,7 +83,8 @@ def replay(
     check_directory("-o", output)
     check_ending("--ledger", ledger, MCAP)
     file = read_bench_file(bench_file)
-    check_files([log], [None if output is None else output / "frames.csv"], file, ledger, overwrite)
+    faults = optional_scenario(scenario)
+    check_files([log, scenario], [None if output is None else output / "frames.csv"], file, ledger, overwrite)
     split = parse_split(ledger_split)
     notices = Notices()
     mounting = Mounting(file.config.tracker.q_body_to_cam)
@@ -90,6 +95,7 @@ def replay(
         shown_bench(file, headless, windowed, force) as (bench, screen),
         FrameImages(output, bench) as record,
         optional_ledger(ledger, bench, notices, overwrite, split) as kept,
+        run_with_faults(bench, faults, notices, kept, play.recording) as wrong,
     ):
         say_what_clips(bench)
         if explain:
@@ -103,6 +109,7 @@ def replay(
             record(shown)
             status.see(shown)
 
+        outlet = Outlet(screen, kept, notices, follower=status.follow, faults=wrong)
         with on_terminal(status):
-            summary = replay_log(bench, play, sink, Outlet(screen, kept, notices, follower=status.follow))
+            summary = replay_log(bench, play, sink, outlet)
     end_of_run(summary, screen, kept, as_json)

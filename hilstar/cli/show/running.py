@@ -12,13 +12,16 @@ import msgspec
 import typer
 
 from hilstar.console.terminal import report, say
-from hilstar.errors import MachineError
+from hilstar.errors import InputError, MachineError
 from hilstar.notices import Notices
 from hilstar.process.interrupts import stop_on_signal
 
 if TYPE_CHECKING:
     from hilstar.attitude.wire.source import Conventions, Mounting
     from hilstar.bench.bench_file import BenchFile
+    from hilstar.bench.faults.scenario import Scenario
+    from hilstar.run.faults.recorded import Recording
+    from hilstar.run.faults.run_faults import AnyFaults
     from hilstar.run.summary import RunSummary
 
 Windowed = Annotated[bool, typer.Option("--windowed", help="A window on the desktop instead of the full display.")]
@@ -91,6 +94,38 @@ def optional_ledger(path: Path | None, bench: Any, notices: Notices, overwrite: 
     finally:
         with stop_on_signal(threading.Event()):  # a signal that comes now does not interrupt this
             ledger.close()
+
+
+def optional_scenario(path: Path | None) -> Scenario | None:
+    """The scenario of `--scenario`, None without one. Raises InputError."""
+    from hilstar.bench.faults.scenario import read_scenario
+
+    return None if path is None else read_scenario(path)
+
+
+@contextmanager
+def run_with_faults(
+    bench: Any, scenario: Scenario | None, notices: Notices, ledger: Any, recording: Recording | None = None
+) -> Iterator[AnyFaults | None]:
+    """The faults of a run: of its scenario and its stream, or of the run that is replayed; None where it has none."""
+    from hilstar.run.faults.run_faults import replayed_faults, run_faults
+
+    if recording is not None and recording.faults:
+        if scenario is not None:
+            raise InputError(f"--scenario {scenario.path}: the run that is replayed has faults of its own; leave it out")
+        yield replayed_faults(bench, recording, ledger)
+        return
+    faults = run_faults(bench, scenario, notices, ledger)
+    if faults is None:
+        yield None
+        return
+    with faults.listening(bench.config.faults, bench.file.folder) as endpoint:
+        if scenario is not None:
+            timed = sum(fault.at_s is not None for fault in scenario.faults)
+            say(f"{scenario.path}: {len(scenario.faults)} faults, {timed} of them at their time")
+        if endpoint:
+            say(f"faults: {endpoint}")
+        yield faults
 
 
 def end_of_run(summary: RunSummary, screen: Any, ledger: Any, as_json: bool) -> None:

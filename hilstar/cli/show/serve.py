@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hilstar.cli.options import BenchFile, Explain, Headless, Json, Overwrite, check_files
+from hilstar.cli.options import BenchFile, Explain, Headless, Json, Overwrite, ScenarioFile, check_files
 from hilstar.cli.parsers import parse_split
 from hilstar.cli.show.running import (
     Force,
@@ -18,6 +18,8 @@ from hilstar.cli.show.running import (
     explain_bench,
     explain_source,
     optional_ledger,
+    optional_scenario,
+    run_with_faults,
     say_what_clips,
     shown_bench,
 )
@@ -41,6 +43,7 @@ def serve(
     frames: Annotated[int | None, typer.Option(help="Number of frames to draw.", min=1)] = None,
     ledger: LedgerFile = None,
     ledger_split: LedgerSplit = None,
+    scenario: ScenarioFile = None,
     overwrite: Overwrite = False,
     windowed: Windowed = False,
     force: Force = False,
@@ -57,13 +60,15 @@ def serve(
 
     check_ending("--ledger", ledger, MCAP)
     file = read_bench_file(bench_file)
-    check_files([], [], file, ledger, overwrite)
+    faults = optional_scenario(scenario)
+    check_files([scenario], [], file, ledger, overwrite)
     split = parse_split(ledger_split)
     notices = Notices()
     with (
         open_link(file.config, file.folder, notices) as link,
         shown_bench(file, headless, windowed, force) as (bench, screen),
         optional_ledger(ledger, bench, notices, overwrite, split) as kept,
+        run_with_faults(bench, faults, notices, kept) as wrong,
     ):
         if explain:
             explain_source(link.conventions, Mounting(file.config.tracker.q_body_to_cam))
@@ -75,7 +80,7 @@ def serve(
         say_what_clips(bench)
         told = Source(f"{link.verb} {link.endpoint}", bench.renderer.gl_renderer, refresh_hz, min(limit.slots, limit.frames))
         status = RunStatus(told, kept)
-        outlet = Outlet(screen, kept, notices, tracker_pictures(link, bench), status.follow)
+        outlet = Outlet(screen, kept, notices, tracker_pictures(link, bench), status.follow, faults=wrong)
         with on_terminal(status):
             summary = serve_stream(bench, link, limit, status.see, outlet)
     end_of_run(summary, screen, kept, as_json)

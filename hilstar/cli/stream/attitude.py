@@ -133,6 +133,7 @@ def _pointing(sample: AttitudeSample, file: BenchFile) -> dict[str, Any]:
     from hilstar.bench.build import bench_moving, bench_stars, moved
     from hilstar.bench.cameras import tracker_camera
     from hilstar.bench.in_view import brightest_in_view
+    from hilstar.bench.satellites import satellites_now
     from hilstar.rotation import to_radec_roll_deg
 
     ra_deg, dec_deg, roll_deg = to_radec_roll_deg(sample.q_icrs_to_cam)
@@ -141,6 +142,7 @@ def _pointing(sample: AttitudeSample, file: BenchFile) -> dict[str, Any]:
     sky = moved(bench_stars(file.config, file.folder, moving), moving)
     if moving is not None:
         sky = moving.seen(sky, sample.t_ns)
+        satellites_now(sky, moving, sample.t_ns)
     stars = brightest_in_view(sky, camera, sample.q_icrs_to_cam, SHOWN_STARS)
     rate = sample.rate_cam_rad_s
     return {

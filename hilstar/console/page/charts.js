@@ -1,7 +1,7 @@
 // A chart along time: lines, or bands from minimum to maximum, and marks where something was lost. What it shows is written in words too.
 
 import { ChartRange } from "./chart_range.js";
-import { fixed, make, write } from "./format.js";
+import { fixed, make, withUnit, write } from "./format.js";
 
 const HEIGHT = 132;
 const LEFT = 44;
@@ -243,7 +243,7 @@ export class Chart {
       return { one, value, seen };
     });
     const named = parts.length > 1;
-    write(this.now, parts.length ? `${fixed(parts[0].value, parts[0].one.digits)}\u00a0${this.unit}` : "");
+    write(this.now, parts.length ? withUnit(parts[0].value, this.unit, parts[0].one.digits).trim() : "");
     const range = parts.map(({ one, seen }) => (Number.isFinite(seen[0]) ? `${named ? `${one.name} ` : ""}${fixed(seen[0], one.digits)} to ${fixed(seen[1], one.digits)}\u00a0${this.unit}` : `${named ? `${one.name} ` : ""}no value`));
     const lost = this.marks.map(({ name, t, n }) => `${t.reduce((sum, at, k) => sum + (at >= this.from && at <= this.to ? n[k] || 0 : 0), 0)} ${name}`);
     const where = at === null ? "" : `at ${timeText(at, 1)}${Math.abs(at) <= 90 ? "\u00a0s" : ""}; `;

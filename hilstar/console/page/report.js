@@ -86,7 +86,7 @@ function makeCharts() {
   const titles = [
     ...CHARTS,
     ["chart-motion", "Motion about the mean", motion?.about_mean.unit],
-    ["chart-steady", "Residual beside a steady turn", motion?.beside_steady.unit],
+    ["chart-steady", "Beside a steady turn", motion?.beside_steady.unit],
     ["chart-memory", "Memory of the process", "MB"],
     ["chart-cpu", "Processor time", "%"],
   ];
@@ -270,8 +270,9 @@ function startPicture() {
   byId("picture-foot").hidden = byId("overlays").hidden = byId("stage").hidden = !pictures.length;
   document.querySelector(".scrub").hidden = pictures.length < 2;
   const none = byId("no-picture");
-  none.hidden = pictures.length > 0;
-  write(none, `No pictures: ${run.no_pictures || "no frame could be drawn"}.`);
+  none.hidden = pictures.length > 0 && !run.caution;
+  none.dataset.state = pictures.length ? "warn" : "";
+  write(none, pictures.length ? `\u25b2 ${run.caution}` : `No pictures: ${run.no_pictures || "no frame could be drawn"}.`);
   if (!pictures.length) return;
   picture.setScreen(about.resolution_px, run.white_level);
   overlays.makeButtons(byId("overlays"));

@@ -13,7 +13,7 @@ from hilstar.attitude.clock.timeline import Attitude
 from hilstar.bench.bench_file import BenchFile, bench_file_of
 from hilstar.bench.build import open_bench
 from hilstar.bench.frame import Bench
-from hilstar.console.overlay import Overlay, overlay_of
+from hilstar.console.overlay import Overlay, catalogue_sky, overlay_of
 from hilstar.errors import InputError, MachineError
 from hilstar.run.record.ledger_records import FrameRecord
 from hilstar.run.record.report_figures import Figures
@@ -21,33 +21,41 @@ from hilstar.units import NS_PER_S
 
 MAX_BYTES = 3_000_000  # of all pictures together, packed
 NO_BENCH = "the ledger's head has no bench file"
-CHANGED = "the bench file, or a file that it names, is not there any more or has changed since the run"
+CAUTION = (
+    "Drawn by a bench that is not the run's own: a file that it names has changed since, or another version of hilstar wrote "
+    "the ledger. Codes may differ from those shown."
+)
 
 
 def run_pictures(run: Figures, ledger: Path) -> dict[str, Any]:
-    """`pictures` in the order of the run and the `sky` about them; or `no_pictures`, why there are none."""
+    """`pictures` in the order of the run, with a `caution` where the bench has changed, or `no_pictures`, why there are none.
+
+    And the whole `sky` about them.
+    """
     try:
-        with open_bench(_bench_file(run.head, ledger)) as bench:
+        file = _bench_file(run.head, ledger)
+        with open_bench(file) as bench:
             overlay = overlay_of(bench)
             return {
                 "pictures": _pictures(bench, overlay, run),
+                "caution": "" if file.sha256 == run.head.get("bench_sha256") else CAUTION,
                 "sky": overlay.sky(),
                 "white_level": len(bench.calibration.response.light) - 1,
             }
     except (InputError, MachineError) as error:
-        return {"pictures": [], "no_pictures": str(error)}
+        return {"pictures": [], "no_pictures": str(error), "sky": catalogue_sky()}
 
 
 def _bench_file(head: dict[str, str], ledger: Path) -> BenchFile:
-    """The bench of a run: the text in its head, with the files that it names where they are now. Raises InputError."""
+    """The bench of a run: the text in its head, with the files that it names where they are now, preferably unchanged.
+
+    Raises InputError where the head has none, or one that cannot be read.
+    """
     text, named = head.get("bench_text"), Path(head.get("bench_file", "bench.toml"))
     if not text:
         raise InputError(NO_BENCH)
-    for path in (named, ledger.parent / named.name):
-        file = bench_file_of(path, text)
-        if file.sha256 == head.get("bench_sha256"):
-            return file
-    raise InputError(CHANGED)
+    files = [bench_file_of(path, text) for path in (named, ledger.parent / named.name)]
+    return next((file for file in files if file.sha256 == head.get("bench_sha256")), files[0])
 
 
 def _pictures(bench: Bench, overlay: Overlay, run: Figures) -> list[dict[str, Any]]:

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from typing import Literal
 
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal
-from hilstar.run.record.ledger_records import EventRecord, FrameRecord
+from hilstar.run.record.ledger_records import EventRecord, FaultRecord, FrameRecord
 
-Kind = Literal["packet", "frame", "event"]
+Kind = Literal["packet", "frame", "event", "fault"]
 MAX_WAITING_BYTES = 32_000_000  # half a minute of a plain run, if the disk stalls
 FRAMES_SHARE = 0.5  # of it; the rest is for packets
 # A message of JSON and the objects that it is made of, roughly; the raw bytes of a packet come on top.
-ENTRY_BYTES = {"packet": 1500, "frame": 2500, "event": 1000}
+ENTRY_BYTES = {"packet": 1500, "frame": 2500, "event": 1000, "fault": 4000}
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +33,7 @@ class Entry:
     kind: Kind
     time_ns: int
     sequence: int
-    content: ReceivedPacket | FrameRecord | EventRecord
+    content: ReceivedPacket | FrameRecord | EventRecord | FaultRecord
 
     @property
     def size_bytes(self) -> int:

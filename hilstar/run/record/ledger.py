@@ -34,10 +34,12 @@ from hilstar.run.record.flood_sieve import Sieve
 from hilstar.run.record.ledger_records import (
     COUNT_TOPIC,
     EVENT_TOPIC,
+    FAULT_TOPIC,
     FRAME_TOPIC,
     PROCESS_TOPIC,
     CountRecord,
     EventRecord,
+    FaultRecord,
     FrameRecord,
     ProcessRecord,
     schema_of,
@@ -138,6 +140,10 @@ class Ledger:
         if self._sieve.keeps("event", notice.kind, notice.host_ns):
             record = EventRecord(host_ns=notice.host_ns, kind=notice.kind, detail=notice.detail, who=notice.who)
             self._backlog.put(Entry("event", notice.host_ns, 0, record))
+
+    def fault(self, record: FaultRecord) -> None:
+        """Record the beginning or the end of a fault; a replay needs each."""
+        self._backlog.put(Entry("fault", record.host_ns, record.number, record))
 
     # The writer's thread
 
@@ -290,6 +296,7 @@ TOPICS = {
     "event": _topic(EVENT_TOPIC, "hilstar.Event", EventRecord),
     "process": _topic(PROCESS_TOPIC, "hilstar.Process", ProcessRecord),
     "count": _topic(COUNT_TOPIC, "hilstar.Count", CountRecord),
+    "fault": _topic(FAULT_TOPIC, "hilstar.Fault", FaultRecord),
 }
 
 

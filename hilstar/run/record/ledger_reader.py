@@ -19,10 +19,12 @@ from hilstar.reading import parse_toml
 from hilstar.run.record.ledger_records import (
     COUNT_TOPIC,
     EVENT_TOPIC,
+    FAULT_TOPIC,
     FRAME_TOPIC,
     PROCESS_TOPIC,
     CountRecord,
     EventRecord,
+    FaultRecord,
     FrameRecord,
     PacketForm,
     ProcessRecord,
@@ -39,6 +41,13 @@ def frame_records(path: Path) -> Iterator[FrameRecord]:
     """The frames of a ledger as they were written, none if the file is no ledger. Raises InputError for damage."""
     for number, data in enumerate(read_messages(path, FRAME_TOPIC), start=1):
         yield _decoded(_frame_decoder, data, f"{path}: message {number} of {FRAME_TOPIC}")
+
+
+def fault_records(path: Path) -> Iterator[FaultRecord]:
+    """The beginnings and ends of faults in a ledger. Raises InputError for damage."""
+    decoder = msgspec.json.Decoder(FaultRecord)
+    for number, data in enumerate(read_messages(path, FAULT_TOPIC), start=1):
+        yield _decoded(decoder, data, f"{path}: message {number} of {FAULT_TOPIC}")
 
 
 def _decoded(decoder: msgspec.json.Decoder[Any], data: bytes, where: str) -> Any:

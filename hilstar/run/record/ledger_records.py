@@ -9,7 +9,7 @@ import msgspec
 from hilstar.bench.frame import Bench
 from hilstar.run.shown import Shown
 
-FRAME_TOPIC, PROCESS_TOPIC, EVENT_TOPIC, COUNT_TOPIC = "/frame", "/process", "/event", "/not_kept"
+FRAME_TOPIC, PROCESS_TOPIC, EVENT_TOPIC, COUNT_TOPIC, FAULT_TOPIC = "/frame", "/process", "/event", "/not_kept", "/fault"
 HostNs = Annotated[int, msgspec.Meta(ge=0, le=2**62)]  # of this host's clock, which began at its start
 AnyNs = Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)]  # of a sender's clock, or between it and the host's
 Marker = Annotated[int, msgspec.Meta(ge=0, le=1)]
@@ -54,6 +54,8 @@ class FrameRecord(msgspec.Struct, kw_only=True):
     marker: Marker | None = None
     operator: str = ""
     hidden: str = ""
+    faults: tuple[Count, ...] = ()
+    fault_since_ns: tuple[AnyNs, ...] = ()
 
 
 _KINDS: dict[Any, str] = {float: "number", str: "string", bool: "boolean"} | dict.fromkeys(
@@ -83,6 +85,26 @@ class EventRecord(msgspec.Struct, kw_only=True):
     kind: str
     detail: str
     who: str = ""
+
+
+class FaultRecord(msgspec.Struct, kw_only=True):
+    """A fault begins or ends ("start", "end"), or fell between two frames ("missed"): at host time, and `t_ns` of the run.
+
+    `number` counts the starts of a run, `who` is "file", "stream" or whoever asked. `table` is the fault as JSON, with the
+    keys of a scenario; `seed` that of its randomness, `folder` where its files are, and `file_sha256` that of its map.
+    """
+
+    host_ns: HostNs
+    event: str
+    number: Count
+    name: str
+    kind: str
+    who: str
+    t_ns: AnyNs
+    table: str
+    seed: int = 0
+    folder: str = ""
+    file_sha256: str = ""
 
 
 class CountRecord(msgspec.Struct, kw_only=True):
@@ -132,6 +154,9 @@ def frame_record(shown: Shown, light_ns: int, missed: int, below_step: int) -> F
         operator=shown.on_screen.operator,
         hidden=shown.on_screen.hidden,
     )
+    if shown.faults:
+        record.faults = tuple(one.number for one in shown.faults)
+        record.fault_since_ns = tuple(one.since_ns for one in shown.faults)
     if drawn.rate_cam_rad_s is not None:
         x, y, z = drawn.rate_cam_rad_s.tolist()
         record.rate = (x, y, z)

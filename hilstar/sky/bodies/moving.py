@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 
@@ -21,8 +21,9 @@ from hilstar.sky.bodies.apparent import Viewpoint, apparent_bodies, apparent_sta
 from hilstar.sky.bodies.disc import Disc, Law, lunar_share
 from hilstar.sky.bodies.earth import DARK_V_MAG, EARTH, EQUATOR_KM, apparent_cone, at_centre, earth_disc, earth_light
 from hilstar.sky.bodies.kernel import DAY_S, Kernel, tdb_of_utc
-from hilstar.sky.bodies.magnitudes import body_v_mag, phase_angle_deg
+from hilstar.sky.bodies.magnitudes import SUN_BV_MAG, body_v_mag, phase_angle_deg
 from hilstar.sky.bodies.orbit import Orbit
+from hilstar.sky.bodies.satellites.passes import Circumstances, Cone, Pass, Satellites, Sky
 from hilstar.sky.stars import Stars, with_bodies
 from hilstar.units import ARCSEC_PER_RAD, LIGHT_KM_S, NS_PER_S, flux_ratio
 
@@ -54,7 +55,7 @@ LAWS: dict[str, Law] = {"Sun": "limb-darkened", "Moon": "lunar-lambert"}  # plan
 NORTH = np.array([0.0, 0.0, 1.0])
 # The ephemeris takes 3 ms for all bodies at the ends of this time and twice between; cubics through them are within 0.1 mas.
 SPAN_S = 3 * 3600
-SPAN_NS = SPAN_S * NS_PER_S
+SPAN_NS, MINUTE_NS = SPAN_S * NS_PER_S, 60 * NS_PER_S
 YEAR_NS = 31_557_600 * NS_PER_S
 EDGE_DAYS = 1.0  # light time, and the cubics
 # A change of velocity that is left out, as aberrating all stars in view anew takes as long as their projection: 0.02 arcsec,
@@ -135,6 +136,8 @@ class MovingSky:
         self._node: Callable[[Moment], FloatArray] = lru_cache(maxsize=2)(self._compute_node)
         self._light: Callable[[Moment], tuple[FloatArray, FloatArray]] = lru_cache(maxsize=1)(self._compute_light)
         self._face: Callable[[Moment, int], Disc] = lru_cache(maxsize=len(names) + 1)(self._compute_face)
+        self._circumstances: Callable[[int], Circumstances] = lru_cache(maxsize=2)(self._compute_circumstances)
+        self.satellites: Satellites | None = None
         self._told = False
         self._fixed_km_s = self._seen_from(START).view.velocity_km_s
 
@@ -143,7 +146,13 @@ class MovingSky:
         return apparent_stars(directions, parallax_mas, self._seen_from(START).view)
 
     def among(self, stars: Stars) -> Stars:
-        """The stars with the bodies among them at the start, in arrays of their own, which `seen` changes."""
+        """The stars with the bodies among them at the start, in arrays of their own, which `seen` changes.
+
+        Satellites have places in the arrays, which whoever draws them fills (see `passing`).
+        """
+        if self.satellites is not None:
+            colour = np.full(len(self.satellites), SUN_BV_MAG)
+            stars = with_bodies(stars, self.satellites.names, colour, found=False)
         both = with_bodies(stars, self.names, self._bodies.bv_mag)
         self.seen(both)
         return both
@@ -171,6 +180,21 @@ class MovingSky:
             stars.grid.centre[-count:] = vectors
             stars.v_mag[-count:], stars.electrons_per_s[-count:] = self._light(self._step(moment))
         return stars.seen_at(velocity)
+
+    def passing(self, cone: Cone, t_ns: int | None = None, *velocity_and_place: FloatArray | None) -> Pass | None:
+        """The satellites that can be in a cone at a moment; None for none; the observer's velocity and place as in `seen`."""
+        if self.satellites is None:
+            return None
+        since_ns = self._within(t_ns)
+        now = partial(self._circumstances, since_ns // MINUTE_NS)
+        return self.satellites.near(cone, Sky(self._utc_ns + since_ns, now, self._fixed_km_s, *velocity_and_place))
+
+    def _compute_circumstances(self, minute: int) -> Circumstances:
+        """The Sun and the Earth's velocity at a minute: 2.5 arcsec of the Sun, 0.4 m/s."""
+        since_ns = minute * MINUTE_NS
+        cubics, share = self._span(since_ns // SPAN_NS), since_ns % SPAN_NS / SPAN_NS
+        powers = share**EXPONENTS
+        return Circumstances(np.tensordot(powers, cubics.seen_km, 1)[0], powers @ cubics.earth_km_s)
 
     def discs(
         self,

@@ -53,6 +53,7 @@ class TleOrbit:
 
         self._name, self._errors = name, SGP4_ERRORS
         self._satellite = Satrec.twoline2rv(*_checked(name, text))
+        self.number = int(self._satellite.satnum)
 
     def age_days(self, utc_ns: int) -> float:
         """How many days a UTC is after the elements' own date."""
@@ -65,7 +66,7 @@ class TleOrbit:
         if error:
             date = np.datetime64(utc_ns, "ns").astype("datetime64[s]")
             raise InputError(f"{self._name}: no orbit at {date}: {self._errors[error]}; give newer elements")
-        turn = _icrs_from_teme(utc_ns // TURN_NS)
+        turn = icrs_from_teme(utc_ns // TURN_NS)
         return turn @ place_km, turn @ velocity_km_s
 
 
@@ -81,8 +82,8 @@ def _checked(name: str, text: str) -> tuple[str, str]:
     return found[0], found[1]
 
 
-@lru_cache(maxsize=4)
-def _icrs_from_teme(hour: int) -> FloatArray:
+@lru_cache(maxsize=8)
+def icrs_from_teme(hour: int) -> FloatArray:
     """The rotation (3, 3) at an hour since 1970 (UTC): equation of the equinoxes, then nutation and precession (IAU 2006)."""
     date: Tdb = tdb_of_utc(hour * TURN_NS)
     cosine, sine = (f(erfa.ee06a(date.whole, date.part)) for f in (np.cos, np.sin))

@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 
 from hilstar.bench.frame import Bench
+from hilstar.console.report.pictures import run_pictures
 from hilstar.console.report.write import report
 from hilstar.rotation import from_rotation_vector, multiply
 from hilstar.run.record.ledger import Ledger
 from hilstar.run.record.ledger_records import FrameRecord
+from hilstar.run.record.report_figures import Figures
 from tests.support.benches import ORION_Q
 from tests.support.run_page import levels_of, run_data_of
 
@@ -48,18 +50,18 @@ def test_pictures_are_the_codes_of_the_run(ledger, tmp_path):
         x, y, *_ = picture["truth"]["stars"][0]
         about = shown[round(y) - 1 : round(y) + 2, round(x) - 1 : round(x) + 2]
         assert about.max() > shown.max() / 2 > 50  # the brightest star is where the overlay says
-    assert data["sky"]["stars"]
+    assert data["sky"]["stars"] and data["caution"] == ""
 
 
-def test_a_file_of_the_bench_that_has_changed_since_gives_no_pictures_and_says_so(bench_with, tmp_path):
-    named = tmp_path / "truth.toml"
-    named.write_text("# the bench's hash covers every file that it names\n")
-    with Ledger(tmp_path / "run.mcap", bench_with('[verify]\ntrue_calibration = "truth.toml"\n')) as written:
+def test_a_bench_that_has_changed_since_draws_with_a_caution_and_one_that_is_gone_says_why_not(bench_with, tmp_path):
+    bench = bench_with('[verify]\ntrue_calibration = "truth.toml"\n')
+    with Ledger(tmp_path / "run.mcap", bench) as written:
         written.frame(FrameRecord(frame=0, t_ns=0, light_ns=0, draw_ns=0, swap_ns=1, q=attitude(0)))
-    for text, count in ((None, 1), ("# another\n", 0)):
-        if text is not None:
-            named.write_text(text)
-        report(tmp_path / "run.mcap", tmp_path)
-        data = run_data_of((tmp_path / "report.html").read_text())
-        assert len(data["pictures"]) == count
-    assert "has changed since the run" in data["no_pictures"]
+    (tmp_path / "truth.toml").write_text("# the bench's hash covers every file that it names\n")
+    report(tmp_path / "run.mcap", tmp_path)
+    data = run_data_of((tmp_path / "report.html").read_text())
+    assert len(data["pictures"]) == 1 and "Codes may differ" in data["caution"]
+    figures = Figures({"bench_text": "[monitor]\n"})
+    none = run_pictures(figures, tmp_path / "run.mcap")
+    assert none["pictures"] == [] and "bench.toml" in none["no_pictures"]
+    assert none["sky"]["stars"][0][3] == "α CMa"

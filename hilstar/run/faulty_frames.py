@@ -1,0 +1,84 @@
+"""What faults do to the frames of a run, besides their light: frames that are never shown, that stay, or are blank.
+
+The loop asks once a frame. A replay asks a recording in place of a desk, and draws the same light from it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+from hilstar.attitude.clock.timeline import Attitude
+from hilstar.bench.faults.desk import Now
+from hilstar.bench.faults.effects import Effects
+from hilstar.bench.faults.kinds import Freeze
+from hilstar.bench.faults.view import FaultView
+from hilstar.bench.frame import Bench, Drawn
+
+
+class Source(Protocol):
+    """Says which faults are on."""
+
+    def at(self, t_ns: int) -> tuple[Now, ...]:
+        """Those of the frame whose light begins at `t_ns`."""
+
+
+@dataclass(frozen=True, slots=True)
+class Held:
+    """The last frame that was drawn: what stays when the next ones are frozen."""
+
+    drawn: Drawn
+    attitude: Attitude | None
+    t_ns: int
+    now: tuple[Now, ...]
+
+
+class FaultyFrames:
+    """The faults of a run, frame by frame."""
+
+    def __init__(self, source: Source, view: FaultView) -> None:
+        self.dropped = self.frozen = 0
+        self._source, self._view = source, view
+        self._held: Held | None = None
+
+    def at(self, t_ns: int, attitude: Attitude | None) -> Effects | None:
+        """What is wrong in a frame; None where nothing is, and before the run's first attitude, from which time counts."""
+        if attitude is None and self._held is None:
+            return None
+        now = self._source.at(t_ns)
+        return Effects(self._view, now) if now else None
+
+    def drops(self, effects: Effects | None, number: int) -> bool:
+        """Whether a frame is never shown; it is counted."""
+        if effects is None or self._held is None or not effects.drops(number):
+            return False
+        self.dropped += 1
+        return True
+
+    def attitude(self, effects: Effects | None, t_ns: int, attitude: Attitude | None) -> Attitude | None:
+        """The attitude that is shown in place of a frame's own."""
+        if effects is None or attitude is None:
+            return attitude
+        if effects.frozen and self._held is not None:
+            held = self._held.attitude
+            return None if held is None else replace(held, age_ns=max(0, held.age_ns + t_ns - self._held.t_ns))
+        if effects.blank:
+            return None
+        return replace(attitude, q_icrs_to_cam=effects.turned(attitude.q_icrs_to_cam))
+
+    def frozen_frame(self, effects: Effects | None, bench: Bench) -> Drawn | None:
+        """What is on the display already, for a frame that is frozen."""
+        if effects is None or not effects.frozen or self._held is None:
+            return None
+        self.frozen += 1
+        return Drawn(bench.renderer, self._held.drawn.sprites, self._held.drawn.clipped_hip)
+
+    def shown(
+        self, effects: Effects | None, drawn: Drawn, attitude: Attitude | None, t_ns: int, stays: bool
+    ) -> tuple[Now, ...]:
+        """Take note of a frame; its faults, which of one that `stays` are those of its light and what freezes it."""
+        now = () if effects is None else effects.now
+        if stays and self._held is not None:
+            return (*self._held.now, *(one for one in now if isinstance(one.fault, Freeze)))
+        self._held = Held(drawn, attitude, t_ns, tuple(one for one in now if not isinstance(one.fault, Freeze)))
+        return now

@@ -1,0 +1,311 @@
+"""Satellites that can be in view at a moment: their directions and their light at any time about it."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hilstar.arrays import BoolArray, FloatArray, IntArray
+from hilstar.sky.astrometry import aberrate
+from hilstar.sky.bodies.orbit import Orbit, TleOrbit
+from hilstar.sky.bodies.satellites.elements import Satellite
+from hilstar.sky.bodies.satellites.light import (
+    MAX_PHASE_FACTOR,
+    STANDARD_KM,
+    Brightness,
+    in_front,
+    reflected_share,
+    sunlit_share,
+)
+from hilstar.sky.bodies.satellites.swarm import Swarm
+from hilstar.sky.stars import Stars
+from hilstar.units import LIGHT_KM_S, NS_PER_S, magnitude
+
+log = logging.getLogger(__name__)
+
+EARTH_GM_KM3_S2 = 398_600.4418  # IERS Conventions 2010
+FASTEST_KM_S = 11.2  # of what stays about the Earth
+OWN_KM = 5.0  # what is nearer is taken for the observer itself; elements are off by 1 to 3 km a day
+OLD_DAYS = 14.0
+# Those that can come near the axis within this time, or before it turns by this angle, are looked for at once: 1 ms for 20 000.
+WATCH_S, WATCH_RAD = 3.0, np.radians(3.0)
+COS_WATCH = np.cos(WATCH_RAD)
+JUMP_KM = 10.0  # an observer that is elsewhere by more has jumped
+MOST_REFLECTED = 1.04 * MAX_PHASE_FACTOR  # the Earth is at most 1.7 % nearer the Sun than 1 au
+SHIFT_RAD = 4e-4  # aberration of what the Earth's motion shifts, and light time
+
+
+@dataclass(frozen=True, slots=True)
+class Circumstances:
+    """Vectors (3,), ICRS axes: from the Earth to the Sun, km, and the Earth's velocity about the barycentre, km/s."""
+
+    sun_km: FloatArray
+    earth_km_s: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Sky:
+    """What a sky knows of a moment: its UTC, the circumstances when they are asked for, what aberrates its bodies.
+
+    `place_km` and `velocity_km_s` (3,) are the observer's about the Earth where the orbit does not say it, else None.
+    """
+
+    utc_ns: int
+    now: Callable[[], Circumstances]
+    fixed_km_s: FloatArray
+    velocity_km_s: FloatArray | None = None
+    place_km: FloatArray | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cone:
+    """What is looked for: at least `faintest_e_per_s` within `radius_rad` of `axis` (3,), within `half_s` of a moment."""
+
+    axis: FloatArray
+    radius_rad: float
+    half_s: float
+    faintest_e_per_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pass:
+    """Satellites that can be in view: `index` (n,), their places in the list; seconds of its methods count from its moment.
+
+    Cubics in time, coefficients first (4, n, 3): `seen_km` from the observer to where each sent what arrives, `place_km` that
+    about the Earth, and `observer_km` (4, 3). `since_s` is the moment after `epoch_utc`, `fixed_km_s` (3,) the observer's
+    velocity at the start of the sky.
+    """
+
+    index: IntArray
+    brightness: Brightness
+    seen_km: FloatArray
+    place_km: FloatArray
+    observer_km: FloatArray
+    since_s: float
+    now: Circumstances
+    fixed_km_s: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    def only(self, which: IntArray) -> Pass:
+        """Those at places `which` (k,) alone."""
+        return replace(self, index=self.index[which], seen_km=self.seen_km[:, which], place_km=self.place_km[:, which])
+
+    def directions(self, which: IntArray | slice, seconds: FloatArray, velocity_km_s: FloatArray | None = None) -> FloatArray:
+        """Unit vectors (k, 3), ICRS, of satellites at places `which` (k,), aberrated as bodies are by `fixed_km_s`.
+
+        A velocity (3,) adds to that, within 1 mas.
+        """
+        velocity = self.fixed_km_s if velocity_km_s is None else self.fixed_km_s + velocity_km_s
+        seen = _at(self.seen_km[:, which], seconds[:, None])
+        return aberrate(seen / np.sqrt(np.einsum("ij,ij->i", seen, seen))[:, None], velocity)
+
+    def speeds_rad_s(self) -> FloatArray:
+        """How fast each is at its nearest in view (n,): its speed over its distance."""
+        squares = (np.einsum("ij,ij->i", part, part) for part in self.seen_km[:2])
+        distance, speed = (np.sqrt(square) for square in squares)
+        return np.asarray(speed / distance)
+
+    def rates_e_per_s(self, which: IntArray, begin_s: FloatArray, end_s: FloatArray) -> FloatArray:
+        """Mean electron rates (k,) between two times: by their middle's place, and in closed form what varies by itself."""
+        middle_s, listed = ((begin_s + end_s) / 2)[:, None], self.index[which]
+        place = _at(self.place_km[:, which], middle_s)
+        share = reflected_share(_at(self.seen_km[:, which], middle_s), place, self.now.sun_km)
+        share = share * in_front(_at(self.observer_km[:, None], middle_s), place)
+        varied = self.brightness.variation(listed, self.since_s + begin_s, self.since_s + end_s)
+        return np.asarray(self.brightness.standard_e_per_s[listed] * share * varied)
+
+
+def _at(cubic: FloatArray, s: FloatArray | np.float64) -> FloatArray:
+    return np.asarray(cubic[0] + s * (cubic[1] + s * (cubic[2] + s * cubic[3])))
+
+
+class Satellites:
+    """A list of satellites seen from an orbit; t_ns = 0 is the UTC `zero_ns`, sunlight of V = 0 gives `v0_e_per_s`.
+
+    The observer's own, by catalogue number where the orbit has one, is left out, and what is within OWN_KM of it at a moment.
+    """
+
+    def __init__(
+        self,
+        satellites: Sequence[Satellite],
+        brightness: Brightness,
+        v0_e_per_s: float,
+        orbit: Orbit,
+        zero_ns: int,
+    ) -> None:
+        own = orbit.number if isinstance(orbit, TleOrbit) else None
+        self._v0_e_per_s = v0_e_per_s
+        self.names = tuple(one.name for one in satellites)
+        self.brightness = brightness
+        self._satellites, self._orbit, self._zero_ns = satellites, orbit, zero_ns
+        self._swarm = Swarm([one.satrec for one in satellites])
+        self._numbers = np.array([one.number for one in satellites])
+        self._other = np.ones(len(satellites), dtype=np.bool_) if own is None else self._numbers != own
+        self._watch: _Watch | None = None
+        self._lost_told = self._own_told = False
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def near(self, cone: Cone, sky: Sky) -> Pass | None:
+        """Those in a cone at a moment, and some more; None for none."""
+        if self._swarm.move_to(sky.utc_ns):
+            self._tell_lost()
+        observer = self._observer(sky)
+        found = self._watched(cone, sky, observer)
+        if not len(found):
+            return None
+        seen = self._swarm.places_km(found, sky.utc_ns) - observer[0]
+        range_km = np.sqrt(np.einsum("ij,ij->i", seen, seen))
+        near = _within(seen @ cone.axis, range_km, cone.radius_rad + SHIFT_RAD, _reach_km(observer, cone.half_s))
+        which = found[near & (range_km > OWN_KM)]
+        if not len(which):
+            return None
+        now = sky.now()
+        place, seen = _light_cubics(self._swarm.motion_km(which, sky.utc_ns), observer, now.earth_km_s)
+        since_s = (sky.utc_ns - self._zero_ns) / NS_PER_S
+        return Pass(which, self.brightness, seen, place, observer, since_s, now, sky.fixed_km_s)
+
+    def _observer(self, sky: Sky) -> FloatArray:
+        """The cubic (4, 3) of the observer's places about the Earth, seconds after the moment."""
+        place_km, velocity_km_s = self._orbit.state(sky.utc_ns)
+        if sky.place_km is not None:
+            place_km = place_km + sky.place_km
+            velocity_km_s = velocity_km_s if sky.velocity_km_s is None else velocity_km_s + sky.velocity_km_s
+        return _falling(place_km, velocity_km_s)
+
+    def _watched(self, cone: Cone, sky: Sky, observer: FloatArray) -> IntArray:
+        """Those that can be in a cone, by the list that is kept for a while."""
+        watch = self._watch
+        if watch is None or not watch.covers(cone, sky.utc_ns, observer[0]):
+            self._watch = watch = _Watch(cone, sky.utc_ns, observer, self._search(cone, sky, observer))
+        return watch.found
+
+    def _search(self, cone: Cone, sky: Sky, observer: FloatArray) -> IntArray:
+        seen = self._swarm.places_km(slice(None), sky.utc_ns) - observer[0]
+        range_km = np.sqrt(np.einsum("ij,ij->i", seen, seen))
+        self._tell_own(range_km)
+        half_s = WATCH_S + cone.half_s
+        reach_km = _reach_km(observer, half_s) + JUMP_KM
+        near = _within(seen @ cone.axis, range_km, cone.radius_rad + WATCH_RAD + SHIFT_RAD, reach_km) & self._other
+        found = np.flatnonzero(near)
+        closest_km = np.maximum(range_km[found] - reach_km, OWN_KM)
+        most = self.brightness.standard_e_per_s[found] * self.brightness.most(found) * MOST_REFLECTED
+        found = found[most * (STANDARD_KM / closest_km) ** 2 >= cone.faintest_e_per_s]
+        # What is in the shadow at both ends of an arc that is nearly straight is so between them.
+        lit, sun_km = np.zeros(len(found)), sky.now().sun_km
+        for seconds in np.array([-half_s, half_s]):
+            lit += sunlit_share(self._swarm.places_km(found, sky.utc_ns, seconds), sun_km)
+        return np.asarray(found[lit > 0])
+
+    def write(self, stars: Stars, index: IntArray, vectors: FloatArray, electrons_per_s: FloatArray) -> None:
+        """Put satellites (k,) into the arrays of stars that were made with this list: unit vectors (k, 3) and rates (k,)."""
+        place = len(stars) - len(stars.bodies) + index
+        stars.vectors[place], stars.electrons_per_s[place] = vectors, electrons_per_s
+        stars.v_mag[place] = magnitude(electrons_per_s / self._v0_e_per_s)
+
+    def with_place(self, utc_ns: int) -> int:
+        """How many have a place by their elements at a UTC."""
+        self._swarm.move_to(utc_ns)
+        return int((self._swarm.error == 0).sum())
+
+    def warn_of_age(self, file: str, utc_ns: int) -> None:
+        """One line where elements are more than OLD_DAYS from a UTC."""
+        ages = np.array([abs(one.age_days(utc_ns)) for one in self._satellites])
+        old = int((ages > OLD_DAYS).sum())
+        if old:
+            log.warning(
+                "%s: the elements of %d of %d satellites are more than %.0f days from the date of t = 0 (%.0f at most); a low"
+                " orbit is off by 1 to 3 km a day",
+                file,
+                old,
+                len(ages),
+                OLD_DAYS,
+                ages.max(),
+            )
+
+    def _tell_lost(self) -> None:
+        if self._lost_told or not self._swarm.error.any():
+            return
+        from sgp4.api import SGP4_ERRORS
+
+        self._lost_told = True
+        lost = np.flatnonzero(self._swarm.error)
+        first = int(lost[0])
+        reason = SGP4_ERRORS.get(int(self._swarm.error[first]), "no number")
+        log.warning(
+            "%d of %d satellites have no place by their elements at this time and are left out, such as %s: %s",
+            len(lost),
+            len(self),
+            self.names[first],
+            reason,
+        )
+
+    def _tell_own(self, range_km: FloatArray) -> None:
+        if self._own_told:
+            return
+        own = np.flatnonzero(~self._other | (range_km < OWN_KM))
+        if len(own):
+            self._own_told = True
+            log.warning("%s is the observer itself, or within %g km of it, and is not drawn", self.names[int(own[0])], OWN_KM)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Watch:
+    """The satellites that can be in a cone, or in one near it, within WATCH_S of a moment; of the observer's path then."""
+
+    cone: Cone
+    utc_ns: int
+    observer_km: FloatArray
+    found: IntArray
+
+    def covers(self, cone: Cone, utc_ns: int, observer_km: FloatArray) -> bool:
+        """Whether they are all that can be in this cone."""
+        seconds = (utc_ns - self.utc_ns) / NS_PER_S
+        if abs(seconds) > WATCH_S or float(cone.axis @ self.cone.axis) < COS_WATCH:
+            return False
+        wider = cone.radius_rad > self.cone.radius_rad or cone.half_s > self.cone.half_s
+        if wider or cone.faintest_e_per_s < self.cone.faintest_e_per_s:
+            return False
+        jump = observer_km - _at(self.observer_km, np.float64(seconds))
+        return float(jump @ jump) < JUMP_KM**2
+
+
+def _reach_km(observer: FloatArray, half_s: float) -> float:
+    """How far a satellite can move against the observer, by its cubic (4, 3)."""
+    return half_s * (FASTEST_KM_S + float(np.linalg.norm(observer[1])))
+
+
+def _within(along_km: FloatArray, range_km: FloatArray, radius_rad: float, reach_km: float) -> BoolArray:
+    """Whether vectors (n,), by their parts along an axis and their lengths, can come within an angle of it by moving so far."""
+    moved = np.arcsin(np.minimum(1.0, reach_km / range_km))
+    limit = np.cos(np.minimum(np.pi, radius_rad + moved))
+    return np.asarray((along_km >= limit * range_km) | (range_km <= reach_km))
+
+
+def _falling(place_km: FloatArray, velocity_km_s: FloatArray) -> FloatArray:
+    """The cubic (4, 3) of an observer that falls about the Earth, by its state; at rest where it is the Earth's centre."""
+    distance = float(np.linalg.norm(place_km))
+    pull = -EARTH_GM_KM3_S2 / distance**3 if distance > 0 else 0.0
+    return np.stack([place_km, velocity_km_s, pull / 2 * place_km, pull / 6 * velocity_km_s])
+
+
+def _light_cubics(place_km: FloatArray, observer_km: FloatArray, earth_km_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Cubics (4, n, 3) of where satellites sent what arrives, about the Earth and from the observer, by their places."""
+    seen = place_km - observer_km[:, None]
+    distance = np.sqrt(np.einsum("ij,ij->i", seen[0], seen[0]))
+    late_s = (distance / LIGHT_KM_S)[:, None]
+    receding = (np.einsum("ij,ij->i", seen[0], seen[1]) / distance / LIGHT_KM_S)[:, None]
+    sent = place_km.copy()
+    sent[0] -= late_s * (place_km[1] - late_s * place_km[2])
+    sent[1] -= receding * place_km[1] + 2 * late_s * place_km[2]
+    seen = sent - observer_km[:, None]
+    # Meanwhile the Earth, and what is about it, has moved on: that undoes the aberration by its velocity.
+    seen[0] -= late_s * earth_km_s
+    seen[1] -= receding * earth_km_s
+    return sent, seen

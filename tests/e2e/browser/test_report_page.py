@@ -1,0 +1,136 @@
+"""A run's report in a browser, from a file: its pictures, its zoom, its moments, at every size, by mouse and by keys alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from selenium.webdriver.common.action_chains import ActionChains
+from selenium.webdriver.common.keys import Keys
+
+import hilstar
+from hilstar.notices import Notice
+from hilstar.rotation import from_rotation_vector, multiply
+from hilstar.run.record.ledger import Ledger
+from hilstar.run.record.ledger_records import FrameRecord
+from tests.support.benches import ORION_Q, SMALL_BENCH
+from tests.support.browser import SIZES_PX, Browser
+from tests.support.commands import run_hilstar_here
+from tests.support.run_page import levels_of, run_data_of
+
+pytestmark = [pytest.mark.e2e, pytest.mark.gpu]
+FRAMES, PERIOD_NS = 600, 16_666_667
+DARK, LIGHT = 40, 200  # grey values that no theme is between
+TURN_RAD = 2e-4  # a frame
+
+
+def record(k: int) -> FrameRecord:
+    at_ns = 10**12 + k * PERIOD_NS
+    q = tuple(multiply(from_rotation_vector(np.array([0.0, TURN_RAD * k, 0.0])), np.array(ORION_Q)).tolist())
+    age_ns = 400_000_000 if 300 <= k < 330 else 8_000_000 + 10_000 * (k % 50)
+    times = {"t_ns": at_ns, "light_ns": at_ns, "draw_ns": at_ns - 4_000_000, "swap_ns": at_ns, "age_ns": age_ns}
+    missed = {"missed_before": 2 if k == 450 else 0, "missed": 2 if k >= 450 else 0}
+    return FrameRecord(frame=k, q=q, stale=age_ns > 250_000_000, stars_drawn=200, **times, **missed)
+
+
+@pytest.fixture(scope="module")
+def report_file(tmp_path_factory) -> Path:
+    """The report of 10 s with a stale half second, two missed periods, refused packets and a mark."""
+    folder = tmp_path_factory.mktemp("run")
+    (folder / "bench.toml").write_text(SMALL_BENCH)
+    with hilstar.load(folder / "bench.toml") as bench, Ledger(folder / "run.mcap", bench) as ledger:
+        for k in range(FRAMES):
+            ledger.frame(record(k))
+        ledger.packet(10**12 + 10**9, b"?", None, None)
+        ledger.notice(Notice(10**12 + 5 * 10**9, "stale", "the attitude is stale"))
+        ledger.notice(Notice(10**12 + 7 * 10**9, "mark", "<img src=x onerror=alert(1)>"))
+    result = run_hilstar_here("report", folder / "run.mcap", "-o", folder / "report")
+    assert result.returncode == 0, result.stderr
+    return folder / "report" / "report.html"
+
+
+@pytest.fixture
+def report(page, report_file) -> Browser:
+    page.get(report_file.as_uri())
+    page.until("document.body.dataset.ready === 'true'")
+    return page
+
+
+def chart_aria(page: Browser, name: str) -> str:
+    return page.run(f"return document.querySelector('#chart-{name} canvas').getAttribute('aria-label')")
+
+
+def test_it_says_what_was_wrong_and_shows_the_whole_run(report):
+    text = {name: report.text(f"#{name}") for name in ("health-headline", "health-reasons", "summary", "events", "refusals")}
+    assert text["health-headline"] == "Sky was not right throughout"
+    assert "30 of 600 frames with a stale attitude" in text["health-reasons"] and "2 refresh periods" in text["health-reasons"]
+    assert "<img src=x onerror=alert(1)>" in text["events"]  # as text, never as a tag
+    assert "format" in text["refusals"]
+    age = chart_aria(report, "age")
+    assert "8.0 to 400.0" in age and "30 stale frames" in age
+    assert "2 missed" in chart_aria(report, "pacing")
+
+
+def test_a_drag_over_a_chart_looks_closer_and_every_chart_follows(report):
+    chart = report.find("#chart-age canvas")
+    width = chart.size["width"]
+    ActionChains(report).move_to_element_with_offset(chart, -round(width * 0.4), 0).click_and_hold().move_by_offset(
+        round(width * 0.2), 0
+    ).release().perform()
+    assert "of 10.0" in report.text("#range-text")
+    assert "8.0 to 8.5" in chart_aria(report, "age") and "0 stale" in chart_aria(report, "age")
+    assert "0 missed" in chart_aria(report, "pacing")
+    report.find("#range-whole").click()
+    assert "400.0" in chart_aria(report, "age")
+
+
+def test_by_keys_alone_a_chart_is_moved_over_the_run(report):
+    report.run("document.querySelector('#chart-age canvas').focus()")
+    for keys in ("+", "+", Keys.ARROW_RIGHT, "-", Keys.ARROW_LEFT):
+        before = report.text("#range-text")
+        ActionChains(report).send_keys(keys).perform()
+        assert report.text("#range-text") != before
+    ActionChains(report).send_keys("0").perform()
+    assert "the whole run" in report.text("#range-text")
+    outline = report.run("return getComputedStyle(document.activeElement).outlineStyle")
+    assert outline == "solid"
+
+
+def test_an_event_leads_to_its_moment_and_to_the_picture_nearest_to_it(report, report_file):
+    report.run("[...document.querySelectorAll('#events li')].find((row) => row.dataset.kind === 'stale').click()")
+    assert report.text("#attitude-state") == "at 5 s"
+    pictures = run_data_of(report_file.read_text())["pictures"]
+    nearest = min(pictures, key=lambda picture: abs(picture["t_s"] - 5.0))
+    report.until(f"document.getElementById('picture').dataset.frame === '{nearest['frame']}'")
+    assert report.text("#picture-badge") == "Stale attitude"
+
+
+def test_single_pixels_show_the_codes_that_were_shown(report, report_file):
+    report.find("#zoom-pixels").click()
+    picture = next(one for one in run_data_of(report_file.read_text())["pictures"] if one["truth"])
+    levels = levels_of(picture)
+    report.until("document.getElementById('picture-text').textContent.includes('4000')")
+    stage = report.find("#picture")
+    ActionChains(report).move_to_element(stage).perform()
+    y, x = np.unravel_index(np.argmax(levels), levels.shape)
+    assert report.text("#pixel") == f"({x}, {y}) px: code {levels.max()}"
+    ActionChains(report).move_by_offset(40, 0).perform()
+    assert report.text("#pixel") == f"({x + 1}, {y}) px: code {levels[y, x + 1]}"
+
+
+@pytest.mark.parametrize("size", SIZES_PX)
+def test_it_fits_every_size_in_light_and_dark(page, report_file, tmp_path, size):
+    page.size(*SIZES_PX[size])
+    seen = {}
+    for theme in ("dark", "light"):
+        page.prefer(color_scheme=theme)
+        page.get(report_file.as_uri())
+        page.until("document.body.dataset.ready === 'true'")
+        assert page.run("return document.documentElement.scrollWidth <= innerWidth")
+        assert page.overflowing() == []
+        seen[theme] = np.asarray(Image.open(page.picture(tmp_path / f"{theme}.png")).convert("L"), dtype=float)
+        assert seen[theme].shape[::-1] == SIZES_PX[size]
+    head = {theme: float(np.median(picture[:5])) for theme, picture in seen.items()}  # its own ground, above everything
+    assert head["dark"] < DARK and head["light"] > LIGHT

@@ -1,0 +1,103 @@
+"""Faults over ZeroMQ: what a message does, and that no message ends a run or fills its memory."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+
+import pytest
+import zmq
+
+from hilstar.bench.faults.desk import FaultDesk
+from hilstar.bench.faults.scenario import parse_scenario
+from hilstar.errors import InputError
+from hilstar.notices import Notices
+from hilstar.run.faults.stream import MAX_BURST, MAX_MESSAGE_BYTES, FaultStream, act
+
+PATIENCE_S = 5.0  # a message on loopback takes milliseconds; a loaded machine much longer
+STAR = {"kind": "false-star", "name": "ghost", "tracker_px": [10, 20], "electrons": 5e4}
+SCENARIO = parse_scenario(Path("f.toml"), '[[fault]]\nkind = "blank"\nname = "cover"')
+
+
+def test_a_message_asks_for_a_fault_and_starts_and_stops_by_name():
+    desk = FaultDesk(SCENARIO)
+    desk.at(0)
+    act(desk, json.dumps(STAR).encode())
+    act(desk, b'{"start": "cover"}')
+    assert [now.fault.name for now in desk.at(10)] == ["ghost", "cover"]
+    act(desk, b'{"stop": "ghost"}')
+    assert [now.fault.name for now in desk.at(20)] == ["cover"]
+
+
+@pytest.mark.parametrize(
+    ("raw", "said"),
+    [
+        (b"", "no JSON"),
+        (b"\xff\xfe\x00", "no JSON"),
+        (b"[1, 2]", "is list, no object"),
+        (b"[" * 10_000, "no JSON"),
+        (b'{"start": "ghost"}', "no fault is called 'ghost'; known are cover"),
+        (b'{"stop": "cover"}', "not on"),
+        (b'{"start": "cover", "for_s": 1}', "write a JSON object"),
+        (b'{"kind": "false-star"}', "the key name is missing"),
+        (b'{"kind": "false-star", "name": "x", "tracker_px": [1e999, 0], "electrons": 5}', ""),
+        (b'{"kind": "blank", "name": "x", "why": 1}', "unknown key why"),
+        (b'{"kind": ["blank"], "name": "x"}', "kind = ['blank']; write one of"),
+    ],
+)
+def test_a_bad_message_is_refused_in_a_line(raw, said):
+    desk = FaultDesk(SCENARIO)
+    with pytest.raises(InputError) as refused:
+        act(desk, raw)
+    assert said in str(refused.value)
+    assert desk.on() == []
+
+
+@pytest.fixture
+def stream():
+    desk, notices = FaultDesk(SCENARIO), Notices()
+    opened = FaultStream(desk, "tcp://127.0.0.1:*", bind=True, notices=notices)
+    context = zmq.Context()
+    sender = context.socket(zmq.PUB)
+    sender.setsockopt(zmq.SNDHWM, 0)
+    try:
+        wait_for(lambda: not opened._link.endpoint.endswith("*"))
+        sender.connect(opened._link.endpoint)
+        wait_for(lambda: opened._link.link_counts.connections)
+        time.sleep(0.1)  # the subscription takes its way back, which nothing here shows
+        yield desk, opened, sender
+    finally:
+        sender.close(linger=0)
+        context.term()
+        opened.close()
+
+
+def wait_for(true):
+    deadline_s = time.monotonic() + PATIENCE_S
+    while not true():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.005)
+
+
+def test_faults_come_in_over_a_socket_and_bad_messages_are_counted(stream):
+    desk, opened, sender = stream
+    for message in (b"nonsense", json.dumps(STAR).encode(), b'{"start": "cover"}'):
+        sender.send(message)
+    wait_for(lambda: len(desk.on()) == 2)
+    assert desk.on() == ["ghost", "cover"]
+    assert opened.summary()["messages"] == 3 and opened.summary()["refused"] == 1
+
+
+def test_a_flood_and_a_huge_message_leave_the_desk_bounded_and_listening(stream):
+    desk, opened, sender = stream
+    for number in range(3000):
+        sender.send(json.dumps(STAR | {"name": f"ghost {number}"}).encode())
+    wait_for(lambda: opened.messages >= 1000)
+    assert len(desk.on()) <= MAX_BURST + 50
+    sender.send(b"x" * (MAX_MESSAGE_BYTES + 1))  # drops the connection
+    wait_for(lambda: opened._link.link_counts.connections >= 2)
+    time.sleep(0.3)
+    before = opened.messages
+    sender.send(b'{"start": "cover"}')
+    wait_for(lambda: opened.messages > before)

@@ -31,7 +31,7 @@ class SlowBench:
     def begin(self, number: int) -> None:
         self._number = number
 
-    def frame_sprites(self, q_icrs_to_cam, rate_cam_rad_s, velocity_km_s, t_ns, place_km):
+    def frame_sprites(self, q_icrs_to_cam, rate_cam_rad_s, velocity_km_s, t_ns, place_km, faults=None):
         self.asked.append(rate_cam_rad_s)
         self._clock.work(self._cost(self._number))
         return q_icrs_to_cam

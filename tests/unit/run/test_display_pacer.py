@@ -74,7 +74,7 @@ class Run:
         self.loop = FrameLoop(bench, self.shown.append, self.pacer, notices=self.notices)
         self.loop.paced(limit, self._draw_slot)
 
-    def _sprites(self, q_icrs_to_cam, rate_cam_rad_s, velocity_km_s, t_ns, place_km):
+    def _sprites(self, q_icrs_to_cam, rate_cam_rad_s, velocity_km_s, t_ns, place_km, faults=None):
         self.rates.append(rate_cam_rad_s)
         self.host.work(self._cost(self.moments[-1].slot))
 

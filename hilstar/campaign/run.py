@@ -29,7 +29,9 @@ Say = Callable[[str], None]
 
 
 class Workers(Protocol):
-    """Whoever runs cases: the pool, or a cluster."""
+    """Whoever runs cases, in tasks of about `task_s`: the pool, or a cluster."""
+
+    task_s: float
 
     def run(self, backlog: Backlog, done: Callable[[Task, Answered], None], lost: Callable[[Task, int | None], None]) -> None:
         """Run all cases of a backlog."""
@@ -108,7 +110,7 @@ class Campaign:
                     keep([failed(row, f"its worker died {MAX_DEATHS} times over it")])
 
             if done < self.cases:
-                workers.run(Backlog(self.design, journal, 0.5), lambda task, answered: keep(answered.rows), lost)
+                workers.run(Backlog(self.design, journal, workers.task_s), lambda task, answered: keep(answered.rows), lost)
             write_table(directory.table, schema_of(self.columns, self._metadata()), self._blocks(journal))
             journal.remove()
         finally:

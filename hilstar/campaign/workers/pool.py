@@ -42,6 +42,8 @@ class _Worker:
 class Pool:
     """`count` processes for a job, at most as many as fit into `memory_bytes` with this one. Use it as a context manager."""
 
+    task_s = TASK_S
+
     def __init__(self, job: Job, identity: Identity, count: int, memory_bytes: int | None = None) -> None:
         self._job, self._identity = job, identity
         self._count, self._memory_bytes = count, memory_bytes

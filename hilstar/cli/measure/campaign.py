@@ -15,6 +15,7 @@ import typer
 from hilstar.cli.options import Json
 from hilstar.cli.parsers import parse_memory
 from hilstar.console.terminal import print_json, progress, say
+from hilstar.errors import InputError
 
 if TYPE_CHECKING:
     from hilstar.campaign.run import Campaign
@@ -31,6 +32,9 @@ def campaign(
     workers: Annotated[
         int | None, typer.Option(help="Processes on this machine; by default one a core.", min=1, max=1024)
     ] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="tcp://HOST:PORT", help="A Dask scheduler, whose workers run the cases.")
+    ] = None,
     solver: Annotated[
         str,
         typer.Option(
@@ -46,19 +50,21 @@ def campaign(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Run a plan's cases over every core into one Parquet table, a row a case."""
+    """Run a plan's cases over every core, or a cluster, into one Parquet table, a row a case."""
     from hilstar.campaign.run import Asked, Campaign
     from hilstar.campaign.store.directory import Directory
     from hilstar.files import check_directory
 
     check_directory("-o", output)
+    if scheduler is not None and (workers is not None or memory is not None):
+        raise InputError("campaign --scheduler: the cluster's workers are its own; leave out --workers and --memory")
     memory_bytes = None if memory is None else parse_memory(memory)
     this = Campaign(plan, output, Asked(solver, solver_timeout, images is not None))
     directory = Directory(output)
     try:
         directory.claim(this.about())
         if not directory.table.exists():
-            run_cases(this, directory, workers or len(os.sched_getaffinity(0)), memory_bytes)
+            run_cases(this, directory, scheduler, workers or len(os.sched_getaffinity(0)), memory_bytes)
         summary = summarised(this, directory)
     finally:
         directory.close()
@@ -69,8 +75,8 @@ def campaign(
     typer.echo(f"{summary['cases']} cases in {summary['table']}, sha256 {summary['sha256']}{why}")
 
 
-def run_cases(this: Campaign, directory: Directory, workers: int, memory_bytes: int | None) -> None:
-    """Run the cases that are missing, on this machine's cores."""
+def run_cases(this: Campaign, directory: Directory, scheduler: str | None, workers: int, memory_bytes: int | None) -> None:
+    """Run the cases that are missing, on a cluster or on this machine's cores."""
     from hilstar.campaign.workers.pool import Pool
 
     count = 0
@@ -82,8 +88,14 @@ def run_cases(this: Campaign, directory: Directory, workers: int, memory_bytes: 
             advance(done)
 
         try:
-            with Pool(this.job, this.identity, workers, memory_bytes) as pool:
-                this.run(directory, pool, on_done)
+            if scheduler is not None:
+                from hilstar.campaign.workers.cluster import Cluster
+
+                with Cluster(scheduler, this.job, this.identity, say) as cluster:
+                    this.run(directory, cluster, on_done)
+            else:
+                with Pool(this.job, this.identity, workers, memory_bytes) as pool:
+                    this.run(directory, pool, on_done)
         except KeyboardInterrupt:
             say(f"hilstar: {count} of {this.cases} cases are done; the same command goes on from there")
             raise

@@ -1,0 +1,190 @@
+"""The cluster: a Dask scheduler that somebody started, and its workers, as they come and go."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+from hilstar.campaign.workers.backlog import Backlog, Task
+from hilstar.campaign.workers.identity import Identity, difference
+from hilstar.campaign.workers.pool import Done, Lost
+from hilstar.campaign.workers.remote import examine, run_task
+from hilstar.campaign.workers.session import Answered, Job
+from hilstar.errors import InputError, MachineError, one_line
+
+INSTALL = "install it: pip install 'hilstar[dask]'"
+TASK_S = 1.0  # of work in a task; handing one out costs the scheduler about a millisecond (docs/campaign.md)
+SPARE_TASKS = 1  # that wait at a worker, beyond those that its threads are at
+POLL_S, LOOK_S = 0.25, 0.5
+CONNECT_S, ANSWER_S = 10.0, 30.0
+MAX_WITHOUT_WORKER_S = 60.0
+CLOSE_S = 0.3  # a Ctrl-C ends a command within a second
+
+
+@dataclass(slots=True)
+class _Worker:
+    """A worker by its address: how many threads it has, whether it may have tasks, and those that it has, oldest first."""
+
+    threads: int
+    checked: bool = False
+    refused: bool = False
+    tasks: deque[tuple[Any, Task]] = field(default_factory=deque)
+
+
+class Cluster:
+    """The workers of the scheduler at `address` ("tcp://HOST:PORT"). Use it as a context manager.
+
+    One of another version, bench or renderer is refused with a line through `say`, and gets no case. Raises InputError for
+    what is no address, and MachineError where no scheduler answers.
+    """
+
+    task_s = TASK_S
+
+    def __init__(self, address: str, job: Job, identity: Identity, say: Callable[[str], None]) -> None:
+        try:
+            import distributed
+        except ImportError as error:
+            raise MachineError(f"--scheduler needs Dask's distributed; {INSTALL}") from error
+        self._address, self._job, self._identity, self._say = address, job, identity, say
+        self._workers: dict[str, _Worker] = {}
+        self._examined: dict[Any, str] = {}
+        self._alone_since_s: float | None = None
+        self._looked_s = 0.0
+        self._something = threading.Event()  # a future is done
+        logging.getLogger("distributed").setLevel(logging.CRITICAL)  # it tells of each worker that goes
+        if not address.startswith(("tcp://", "tls://", "ucx://")):
+            raise InputError(f"--scheduler {address}: write tcp://HOST:PORT, as `dask scheduler` says it")
+        try:
+            client: Any = distributed.Client
+            self._client = client(address, timeout=CONNECT_S, set_as_default=False, name="hilstar-campaign")
+        except ValueError as error:
+            raise InputError(f"--scheduler {address}: {one_line(str(error))}; write tcp://HOST:PORT") from error
+        except (OSError, TimeoutError) as error:
+            raise MachineError(f"--scheduler {address}: nothing answers there; start one: dask scheduler") from error
+
+    def run(self, backlog: Backlog, done: Done, lost: Lost) -> None:
+        """Run all cases (see `Pool.run`). Raises MachineError where the scheduler, or every worker, is gone for long."""
+        while True:
+            self._look(backlog, lost)
+            self._hand_out(backlog)
+            if backlog.to_run <= 0:
+                return
+            self._check_alone()
+            self._something.wait(POLL_S)
+            self._something.clear()
+            self._hear_examined()
+            self._hear_tasks(backlog, done, lost)
+
+    def _look(self, backlog: Backlog, lost: Lost) -> None:
+        """See which workers have come, and which are gone, with what they had."""
+        if time.monotonic() - self._looked_s < LOOK_S:
+            return
+        self._looked_s = time.monotonic()
+        try:
+            present: dict[str, int] = self._client.sync(self._client.scheduler.ncores, workers=None, callback_timeout=ANSWER_S)
+        except (OSError, TimeoutError, asyncio.CancelledError, RuntimeError) as error:
+            raise MachineError(
+                f"--scheduler {self._address}: answers no more; start it again, and run the same command: it goes on"
+            ) from error
+        for address in [address for address in self._workers if address not in present]:
+            self._bury(address, backlog, lost)
+        for address, threads in present.items():
+            if address not in self._workers:
+                self._workers[address] = _Worker(threads)
+                future = self._submit(address, examine, self._job)
+                self._examined[future] = address
+
+    def _bury(self, address: str, backlog: Backlog, lost: Lost) -> None:
+        """A worker is gone: the task that it was at may be why, the others are handed out again."""
+        worker = self._workers.pop(address)
+        gone = [future for future, at in self._examined.items() if at == address]
+        for future in gone:
+            del self._examined[future]
+        self._client.cancel([*gone, *(future for future, _ in worker.tasks)])
+        for place, (_, task) in enumerate(worker.tasks):
+            if place < worker.threads:
+                lost(task, backlog.died(task))
+            else:
+                backlog.give_back(task)
+
+    def _submit(self, address: str, function: Callable[..., Any], *arguments: Any) -> Any:
+        where: Any = {"workers": [address], "allow_other_workers": False}
+        future = self._client.submit(function, *arguments, **where, pure=False, retries=0)
+        future.add_done_callback(lambda _: self._something.set())
+        return future
+
+    def _hand_out(self, backlog: Backlog) -> None:
+        good = {address: worker for address, worker in self._workers.items() if worker.checked and not worker.refused}
+        for depth in range(1, 1 + max((worker.threads for worker in good.values()), default=0) + SPARE_TASKS):
+            for address, worker in good.items():
+                if len(worker.tasks) < min(depth, worker.threads + SPARE_TASKS):
+                    task = backlog.take(sum(other.threads for other in good.values()))
+                    if task is None:
+                        return
+                    worker.tasks.append((self._submit(address, run_task, self._job, task.begin, task.points), task))
+
+    def _hear_examined(self) -> None:
+        for future in [future for future in self._examined if future.done()]:
+            address = self._examined.pop(future)
+            worker = self._workers.get(address)
+            if worker is None:
+                continue
+            worker.checked = True
+            try:
+                said = future.result()
+                why = difference(said, self._identity) if isinstance(said, Identity) else str(said)
+            except Exception as error:  # an older hilstar without campaigns, or none at all
+                why = f"cannot run campaigns of this hilstar ({type(error).__name__}: {error}); install the same version there"
+            if why is not None:
+                self._refuse(address, why)
+
+    def _refuse(self, address: str, why: str) -> None:
+        self._workers[address].refused = True
+        self._say(one_line(f"hilstar: worker {address} is refused: it {why}"))
+
+    def _hear_tasks(self, backlog: Backlog, done: Done, lost: Lost) -> None:
+        for address, worker in self._workers.items():
+            for entry in [entry for entry in worker.tasks if entry[0].done()]:
+                worker.tasks.remove(entry)
+                future, task = entry
+                if future.status == "finished":
+                    answered: Answered = future.result()
+                    backlog.done(task, answered.seconds)
+                    done(task, answered)
+                elif future.status == "error" and type(future.exception()).__name__ != "KilledWorker":
+                    backlog.give_back(task)
+                    if not worker.refused:
+                        self._refuse(address, f"failed: {future.exception()}")
+                else:
+                    lost(task, backlog.died(task))
+
+    def _check_alone(self) -> None:
+        """Refuse to wait for ever for workers."""
+        if any(not worker.refused for worker in self._workers.values()):
+            self._alone_since_s = None
+            return
+        now_s = time.monotonic()
+        refused = f"; {len(self._workers)} are refused" if self._workers else ""
+        advice = f"start some: dask worker {self._address} --nthreads 1 --nworkers 8"
+        if self._alone_since_s is None:
+            self._alone_since_s = now_s
+            self._say(f"hilstar: --scheduler {self._address} has no worker for this campaign{refused}; {advice}")
+        if now_s - self._alone_since_s > MAX_WITHOUT_WORKER_S:
+            raise MachineError(
+                f"--scheduler {self._address}: no worker for this campaign in {MAX_WITHOUT_WORKER_S:g} s{refused}; {advice}"
+            )
+
+    def __enter__(self) -> Cluster:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with contextlib.suppress(Exception):
+            self._client.cancel([future for worker in self._workers.values() for future, _ in worker.tasks])
+            self._client.close(timeout=CLOSE_S)

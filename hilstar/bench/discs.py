@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -13,6 +14,7 @@ from hilstar.arrays import FloatArray, IntArray
 from hilstar.rotation import propagate, to_matrix
 from hilstar.scene.camera import Camera
 from hilstar.scene.discs import Pose, View, disc_lights
+from hilstar.scene.exposure_motion import MIDDLE_S, Motion
 from hilstar.scene.extended import DiscLight, ExtendedLight, LightMap, Shear
 from hilstar.scene.frame_motion import NODES_PER_SIGMA, POINT_SIGMA, Scan, Turn, slowed
 from hilstar.scene.sprites import Sprites
@@ -27,6 +29,9 @@ POINT_PX = 0.2
 HIDDEN = 0.005  # of its light: a star or body of which less comes through is not drawn
 MAX_POSES = 7  # of a disc in a frame whose camera turns
 MAX_POSED_PX = 120  # of a radius: a larger disc is drawn once, in the middle of its time, so that the work is bounded
+# Of a disc in an exposure, to a sigma of the camera's way: its limb is then a chain of edges 1.6 sigma apart at most.
+EXPOSED_PER_SIGMA = 1.0
+MAX_EXPOSED = 63
 LATTICE = 9  # places along each side of a disc's rectangle that are asked whether they clip
 
 
@@ -68,8 +73,10 @@ class DiscPainter:
         discs = self._near(icrs_to_image, when, more_rad)
         if not discs:
             return sprites
-        view = self.still(icrs_to_image) if turn is None or self._scan is None else self.turning(turn, self._scan)
-        return self.painted(sprites, stars, discs, view, when)
+        if turn is None or self._scan is None:
+            return self.painted(sprites, stars, discs, self.still(icrs_to_image), when)
+        large = any(disc.radius_rad * self._px_per_rad > MAX_POSED_PX for disc in discs)
+        return self.painted(sprites, stars, discs, self.turning(turn, self._scan, 1 if large else MAX_POSES), when)
 
     def on_image(self, q_icrs_to_cam: FloatArray, when: When) -> list[Disc]:
         """Discs that touch the image of a camera at rest, nearest first."""
@@ -87,18 +94,33 @@ class DiscPainter:
         reach_rad, wide_rad = self._reach_rad + more_rad, POINT_PX / self._px_per_rad
         return self._moving.discs(icrs_to_image[2], reach_rad, wide_rad, when.t_ns, when.velocity_km_s, when.place_km)
 
+    def exposed(self, sprites: Sprites, stars: Stars, motion: Motion, when: When) -> Sprites:
+        """The sprites of an exposure's `stars` without what discs hide, and with the discs' mean light."""
+        camera = self.camera
+        turn_rad = float(np.linalg.norm(motion.rate_cam_rad_s)) * motion.exposure_s
+        icrs_to_image = motion.icrs_to_image(MIDDLE_S, camera)[0]
+        discs = self._near(icrs_to_image, when, turn_rad / 2)
+        if not discs:
+            return sprites
+        length_sigma = turn_rad * self._px_per_rad / min(self.sigma_px)
+        count = min(math.ceil(EXPOSED_PER_SIGMA * length_sigma) | 1, MAX_EXPOSED)
+        place, weight = np.polynomial.legendre.leggauss(count)
+        maps = motion.icrs_to_image(place / 2 * motion.exposure_s, camera)
+        poses = tuple(Pose(one, float(share / 2)) for one, share in zip(maps, weight, strict=True))
+        return self.painted(sprites, stars, discs, View(camera, self.sigma_px, poses), when)
+
     def still(self, icrs_to_image: FloatArray) -> View:
         """The view of a camera at rest."""
         return View(self.camera, self.sigma_px, (Pose(icrs_to_image),))
 
-    def turning(self, turn: Turn, scan: Scan) -> View:
+    def turning(self, turn: Turn, scan: Scan, max_poses: int) -> View:
         """The view of a camera that turns while a screen's rows light up in turn, each held for a time."""
         camera = self.camera
         turn, _ = slowed(turn, scan, camera)
         length_sigma = turn.speed_rad_s * scan.hold_s * self._px_per_rad / min(self.sigma_px)
         count = 1
         if length_sigma > POINT_SIGMA:
-            count = min(math.ceil(NODES_PER_SIGMA * length_sigma + 1) | 1, MAX_POSES)  # odd: one is in the middle
+            count = min(math.ceil(NODES_PER_SIGMA * length_sigma + 1) | 1, max_poses)  # odd: one is in the middle
         place, weight = np.polynomial.legendre.leggauss(count)
         times = zip(((place + 1) / 2 * scan.hold_s).tolist(), (weight / 2).tolist(), strict=True)
         attitudes = ((propagate(turn.q_icrs_to_cam, turn.rate_cam_rad_s, seconds), share) for seconds, share in times)
@@ -114,19 +136,14 @@ class DiscPainter:
         return replace(
             self.unhidden(sprites, stars, discs, when),
             extended=(*sprites.extended, *itertools.chain.from_iterable(lights)),
-            discs=tuple(disc.name for disc in discs),
+            discs=tuple(disc.name for disc, its in zip(reversed(discs), lights, strict=True) if its),
             over_white=tuple(disc.name for disc, its in zip(reversed(discs), lights, strict=True) if self._clips(its)),
         )
 
     def _lights(self, discs: list[Disc], view: View) -> list[list[ExtendedLight]]:
         """The light of each of some discs, nearest first, in the order in which they are drawn."""
         ordered = reversed([*enumerate(discs, 1)])
-        return [disc_lights(disc, self._of(disc, view), covers=k < len(discs)) for k, disc in ordered]
-
-    def _of(self, disc: Disc, view: View) -> View:
-        if disc.radius_rad * self._px_per_rad <= MAX_POSED_PX:
-            return view
-        return replace(view, poses=(replace(view.poses[len(view.poses) // 2], share=1.0),))
+        return [disc_lights(disc, view, covers=k < len(discs)) for k, disc in ordered]
 
     def any_lights(self) -> tuple[ExtendedLight, ...]:
         """Discs in the middle of the image, a small one and a large one: for a driver that compiles what draws them."""
@@ -137,8 +154,8 @@ class DiscPainter:
 
     def unhidden(self, sprites: Sprites, stars: Stars, discs: list[Disc], when: When) -> Sprites:
         """Sprites as seen through the air of `discs` and beside them, and none of the discs' own."""
-        first = len(stars) - len(stars.bodies)
-        through = np.where(np.isin(sprites.star, disc_stars(stars, discs)), 0.0, 1.0)
+        first = len(stars) - len(self._moving.names)
+        through = np.where(np.isin(sprites.star, disc_stars(stars, (disc.name for disc in discs))), 0.0, 1.0)
         directions = stars.directions(sprites.star)
         point = np.flatnonzero(sprites.star >= first)
         far_km = np.empty(0)
@@ -190,7 +207,7 @@ class DiscPainter:
         return float(light.disc.radiance(places[inside]).max(initial=0.0))
 
 
-def disc_stars(stars: Stars, discs: list[Disc]) -> IntArray:
-    """The places of discs among `stars`, which have the bodies last."""
-    first = len(stars) - len(stars.bodies)
-    return np.array([first + stars.bodies.index(disc.name) for disc in discs], dtype=np.intp)
+def disc_stars(stars: Stars, names: Iterable[str]) -> IntArray:
+    """The places of discs among `stars`, whose last are the bodies."""
+    last_first = stars.bodies[::-1]  # a satellite may have a body's name; satellites come before
+    return np.array([len(stars) - 1 - last_first.index(name) for name in names], dtype=np.intp)

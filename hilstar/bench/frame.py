@@ -296,7 +296,7 @@ class Bench:
         truth, star = sprite_truth(self.stars, sprites, self._clipped(sprites))
         if sprites.discs:
             discs = [disc for disc in self.discs(q, When(t_ns)) if disc.name in sprites.discs]
-            found = disc_stars(self.stars, discs)
+            found = disc_stars(self.stars, (disc.name for disc in discs))
             middles = np.array([disc.direction for disc in discs]) @ (self.camera.cam_to_image @ to_matrix(q)).T
             rows = truth_table(self.stars, found, *self.camera.project(middles))
             rows["clipped"] = np.isin(rows["name"], sprites.over_white)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
-from typing import Literal, Protocol, Self
+from typing import TYPE_CHECKING, Literal, Protocol, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +15,7 @@ from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import bench_moving, bench_optics, bench_stars, moved
 from hilstar.bench.cameras import tracker_camera
 from hilstar.bench.config import BenchConfig
+from hilstar.bench.discs import DiscPainter, When, disc_stars
 from hilstar.bench.satellites import EXPOSURE_SPRITES, Shot, with_satellites
 from hilstar.bench.truth import truth_table
 from hilstar.errors import InputError
@@ -22,13 +23,17 @@ from hilstar.render.renderer import Context, Renderer, Target
 from hilstar.scene.camera import Camera
 from hilstar.scene.exposure_motion import MIDDLE_S, Motion, smeared_sprites
 from hilstar.scene.frame_motion import Scan, Turn
+from hilstar.scene.psf import footprint_px
 from hilstar.scene.sprites import Sprites
 from hilstar.scene.trails import Brush
 from hilstar.sky.electrons import Photometry, zodiacal_electrons_per_s_arcsec2
 from hilstar.sky.stars import Stars
 from hilstar.tracker.detector import Detector
-from hilstar.tracker.settings import MAX_E
+from hilstar.tracker.settings import MAX_E, DetectorSettings
 from hilstar.units import ARCSEC_PER_RAD
+
+if TYPE_CHECKING:
+    from hilstar.sky.bodies.moving import MovingSky
 
 BODY_MAX_E = 0.5 * MAX_E  # room for dark current and cosmic rays
 Noise = Literal["full", "none"]
@@ -127,18 +132,17 @@ class Simulator:
         if self.moving is not None:
             stars = self.moving.seen(self.stars, motion.t_ns, velocity_km_s, place_km)
         sprites = smeared_sprites(stars, motion, self.camera, self.renderer.footprint_px, tracker.psf_sigma_px)
+        sprites = with_discs(self, self.moving, sprites, stars, motion, When(motion.t_ns, velocity_km_s, place_km))
         sprites = self._with_satellites(sprites, stars, motion, velocity_km_s, place_km)
         self.renderer.draw(sprites)
         mean_e = self.renderer.linear().astype(np.float64) * tracker.exposure_s + self.background_e
-        if (
-            self.moving is not None
-        ):  # the Sun as a point has more than a detector can be asked for; its wells are full long before
+        if self.moving is not None:  # the Sun has more than a detector can be asked for; its wells are full long before
             mean_e = np.minimum(mean_e, BODY_MAX_E)
         if rng is None:
             dn = self.detector.expose_noiseless(mean_e, tracker.exposure_s)
         else:
             dn = self.detector.expose(mean_e, tracker.exposure_s, rng)
-        truth = exposure_truth(self, motion, stars, np.unique(sprites.star), mean_e)
+        truth = exposure_truth(self, motion, stars, sprites, mean_e)
         return Exposure(motion, dn, mean_e, truth, sprites.capped)
 
     def _with_satellites(
@@ -174,19 +178,36 @@ class Looking(Protocol):
 
 
 def exposure_truth(
-    tracker: Looking, motion: Motion, stars: Stars, star: npt.NDArray[np.intp], mean_e: FloatArray
+    tracker: Looking, motion: Motion, stars: Stars, sprites: Sprites, mean_e: FloatArray
 ) -> npt.NDArray[np.void]:
-    """The truth of an exposure (see `Exposure`) with the stars at the indices `star` (n,) of `stars` in view."""
+    """The truth of an exposure (see `Exposure`) with those of `stars` that have sprites, and the discs."""
+    star = np.append(np.unique(sprites.star), disc_stars(stars, sprites.discs))
     x_px, y_px = tracker.camera.project(stars.directions(star) @ motion.icrs_to_image(MIDDLE_S, tracker.camera)[0].T)
     truth = truth_table(stars, star, x_px, y_px)
     height, width = mean_e.shape
     inside = np.isfinite(x_px) & (np.rint(x_px) >= 0) & (np.rint(x_px) < width)
     inside &= (np.rint(y_px) >= 0) & (np.rint(y_px) < height)
     place = np.rint(y_px[inside]).astype(np.intp), np.rint(x_px[inside]).astype(np.intp)
-    detector = tracker.config.tracker.detector
-    last_code_e = (2**detector.bits - 1 - detector.offset_dn) * detector.gain_e_per_dn
-    truth["clipped"][inside] = mean_e[place] > min(detector.full_well_e, last_code_e)
+    truth["clipped"][inside] = mean_e[place] > full_e(tracker.config.tracker.detector)
+    truth["clipped"] |= np.isin(truth["name"], sprites.over_white)
     return truth[np.argsort(truth["v_mag"], kind="stable")]
+
+
+def with_discs(
+    tracker: Looking, moving: MovingSky | None, sprites: Sprites, stars: Stars, motion: Motion, when: When
+) -> Sprites:
+    """The sprites of an exposure's `stars` without what discs of the moving sky hide, and with the discs' mean light."""
+    if moving is None or not moving.names:
+        return sprites
+    sigma_px, white_e_per_s = tracker.config.tracker.psf_sigma_px, full_e(tracker.config.tracker.detector) / motion.exposure_s
+    painter = DiscPainter(moving, tracker.camera, footprint_px(sigma_px), sigma_px, white_e_per_s=white_e_per_s)
+    return painter.exposed(sprites, stars, motion, when)
+
+
+def full_e(detector: DetectorSettings) -> float:
+    """The electrons of a pixel that is full, or at the ADC's last code."""
+    last_code_e = (2**detector.bits - 1 - detector.offset_dn) * detector.gain_e_per_dn
+    return float(min(detector.full_well_e, last_code_e))
 
 
 def _sky_keys(config: BenchConfig) -> tuple[object, ...]:

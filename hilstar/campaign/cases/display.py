@@ -12,6 +12,7 @@ from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import open_bench
 from hilstar.bench.cameras import tracker_camera
 from hilstar.bench.config import BenchConfig
+from hilstar.bench.discs import When
 from hilstar.monitor.quantise import shown_light
 from hilstar.rotation import propagate
 from hilstar.scene.exposure_motion import MIDDLE_S, Motion
@@ -19,7 +20,7 @@ from hilstar.scene.psf import footprint_px
 from hilstar.scene.sprites import make_sprites
 from hilstar.tracker.detector import Detector
 from hilstar.twin.optics import TwinOptics
-from hilstar.twin.simulator import Exposure, background_e, exposure_truth
+from hilstar.twin.simulator import Exposure, background_e, exposure_truth, with_discs
 from hilstar.twin.verify.light import true_panel
 from hilstar.twin.verify.twin import true_geometry
 
@@ -83,7 +84,8 @@ class DisplayTracker:
         stars = self._bench.seen(self._bench.stars, motion.t_ns)
         icrs_to_image = motion.icrs_to_image(MIDDLE_S, self.camera)[0]
         sprites = make_sprites(stars, icrs_to_image, self.camera, footprint_px(self.config.tracker.psf_sigma_px))
-        truth = exposure_truth(self, motion, stars, np.unique(sprites.star), mean_e)
+        sprites = with_discs(self, self._bench.moving, sprites, stars, motion, When(motion.t_ns))
+        truth = exposure_truth(self, motion, stars, sprites, mean_e)
         truth["drawn"] = truth["electrons_per_s"] >= self._bench.faintest_shown_e_per_s
         return Exposure(motion, dn, mean_e, truth)
 

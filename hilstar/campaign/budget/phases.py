@@ -1,0 +1,82 @@
+"""Where a star field stands within a pixel, and functions that repeat with it.
+
+A star of direction r is at f (R r)_x / (R r)_z on the detector, px from its middle. All stars near it move alike, so one
+direction gives the phase of the field, as far as the camera does not roll. Two families of functions are tried, and the one
+that explains more for what it costs is kept: harmonics of one direction's phase, the same over the whole run (the usual
+directions: where the boresight was at the start, in the middle, on average; and the turn from the start as angles), or
+harmonics of the phase of the place's own direction, with amplitudes that change from place to place, as they do where
+stars enter and leave the field.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import sparse
+from scipy.spatial import cKDTree
+
+from hilstar.arrays import FloatArray
+from hilstar.campaign.budget.places import REACH, axes_of, centres_of, places_of
+from hilstar.campaign.budget.scale import Scale
+from hilstar.campaign.budget.star_search import MIN_FORWARD
+from hilstar.rotation import conjugate, multiply, to_rotation_vector
+
+HARMONICS = ((1, 0), (0, 1), (1, 1), (1, -1), (2, 0), (0, 2))  # cycles per pixel along x and y
+LOCAL_HARMONICS = ((1, 0), (0, 1))
+
+
+@dataclass(frozen=True)
+class Phases:
+    """A star's place (n, 2), px, by which the field's place within a pixel is told; `name` says which star's."""
+
+    name: str
+    place_px: FloatArray
+
+    def columns(self, harmonics: tuple[tuple[int, int], ...] = HARMONICS) -> FloatArray:
+        """Cosines and sines (n, 2 k) of the harmonics."""
+        angle = 2 * np.pi * (self.place_px @ np.array(harmonics, dtype=float).T)
+        return np.concatenate([np.cos(angle), np.sin(angle)], axis=1)
+
+
+def phases_of(direction: FloatArray, axes: FloatArray, scale: Scale, name: str = "") -> Phases:
+    """The phases of a direction (3,), ICRS."""
+    seen = axes @ direction
+    return Phases(name, scale.focal_px * seen[:, :2] / seen[:, 2:])
+
+
+def global_phases(q_icrs_to_cam: FloatArray, axes: FloatArray, scale: Scale) -> Iterator[Phases]:
+    """The phases that hold over the whole run, of attitudes (n, 4) with axes (n, 3, 3)."""
+    mean = axes[:, 2].mean(axis=0)
+    directions = [("the mean boresight", mean / max(float(np.linalg.norm(mean)), 1e-9))]
+    directions += [("the first boresight", axes[0, 2]), ("the boresight in the middle of the run", axes[len(axes) // 2, 2])]
+    for name, direction in directions:
+        if (axes[:, 2] @ direction).min() > MIN_FORWARD:
+            yield phases_of(direction, axes, scale, name)
+    turn = to_rotation_vector(multiply(q_icrs_to_cam, conjugate(q_icrs_to_cam[0])))
+    yield Phases("the turn from the start", scale.focal_px * np.stack([-turn[:, 1], turn[:, 0]], axis=1))
+    yield Phases("the boresight's right ascension and declination", _on_the_sky(axes, scale))
+
+
+def _on_the_sky(axes: FloatArray, scale: Scale) -> FloatArray:
+    """Right ascension times the cosine of the mean declination, and declination, px (n, 2)."""
+    boresight = axes[:, 2]
+    ra = np.unwrap(np.arctan2(boresight[:, 1], boresight[:, 0]))
+    dec = np.arcsin(np.clip(boresight[:, 2], -1, 1))
+    return scale.focal_px * np.stack([(ra - ra[0]) * np.cos(dec.mean()), dec], axis=1)
+
+
+def local_columns(q_icrs_to_cam: FloatArray, scale: Scale, spacing_px: float) -> sparse.csr_matrix:
+    """Bumps times the harmonics of the phase of each bump's own direction: (n, 4 p)."""
+    axes = axes_of(q_icrs_to_cam)
+    place = places_of(axes, scale.focal_px, scale.roll_px)
+    centre = centres_of(place, spacing_px)
+    direction = centre[:, :3] / np.linalg.norm(centre[:, :3], axis=1, keepdims=True)
+    near = cKDTree(place).sparse_distance_matrix(cKDTree(centre), REACH * spacing_px, output_type="ndarray")
+    i, j, r = near["i"], near["j"], near["v"] / (REACH * spacing_px)
+    value = (1 - r) ** 4 * (4 * r + 1)
+    seen = np.einsum("nij,nj->ni", axes[i], direction[j])
+    phase = Phases("", scale.focal_px * seen[:, :2] / seen[:, 2:]).columns(LOCAL_HARMONICS)
+    parts = [sparse.csr_matrix((value * column, (i, j)), shape=(len(place), len(centre))) for column in phase.T]
+    return sparse.csr_matrix(sparse.hstack(parts))

@@ -1,0 +1,95 @@
+"""Where a star field stands in the field of view, and functions of that place.
+
+A place is six numbers in pixels: the boresight (ICRS) times the focal length, and the camera's x axis times the distance from
+the boresight at which stars usually stand. Two attitudes are as far apart as they move a star field on the detector, so
+that coming back to an attitude, from anywhere and whenever, is coming back to its place. A smooth function of the place is
+a sum of bumps (Wendland 1995), which stand a `spacing` apart wherever the run has been, and nowhere else.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy import linalg, sparse
+from scipy.spatial import cKDTree
+
+from hilstar.arrays import FloatArray
+
+REACH = 2.5  # of a bump, in spacings: a sine of four spacings or longer is then met to 1 %
+CLOSE = 0.7  # of a spacing: nearer bumps are one
+RIDGE = 1e-7  # of the mean diagonal: bumps that few samples tell apart
+
+
+def axes_of(q_icrs_to_cam: FloatArray) -> FloatArray:
+    """The rotation matrices (n, 3, 3) of attitudes (n, 4): their rows are the camera's axes in ICRS."""
+    w, x, y, z = np.moveaxis(q_icrs_to_cam, -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def places_of(axes: FloatArray, focal_px: float, roll_px: float) -> FloatArray:
+    """The places (n, 6), px, of attitudes by their axes (n, 3, 3)."""
+    return np.concatenate([focal_px * axes[:, 2], roll_px * axes[:, 0]], axis=1)
+
+
+@dataclass(frozen=True)
+class Bumps:
+    """The bumps (n, p) at n samples, and where they stand (p, 6)."""
+
+    value: sparse.csr_matrix
+    centre: FloatArray
+
+    @cached_property
+    def gram(self) -> FloatArray:
+        """The normal matrix (p, p)."""
+        return np.asarray((self.value.T @ self.value).todense())
+
+
+def centres_of(place: FloatArray, spacing_px: float) -> FloatArray:
+    """Places (p, 6) about a spacing apart that cover some (n, 6)."""
+    cell = np.floor(place / spacing_px).astype(np.int64)
+    _, inverse = np.unique(cell, axis=0, return_inverse=True)
+    inverse = inverse.ravel()
+    count = np.bincount(inverse)
+    mean = np.stack([np.bincount(inverse, column) for column in place.T], axis=1) / count[:, None]
+    kept = np.ones(len(mean), dtype=bool)
+    for a, b in sorted(cKDTree(mean).query_pairs(CLOSE * spacing_px)):
+        if kept[a] and kept[b]:
+            kept[b] = False
+    return np.asarray(mean[kept])
+
+
+def bumps_at(place: FloatArray, centre: FloatArray, spacing_px: float) -> Bumps:
+    """The bumps of some centres (p, 6) at places (n, 6)."""
+    near = cKDTree(place).sparse_distance_matrix(cKDTree(centre), REACH * spacing_px, output_type="ndarray")
+    r = near["v"] / (REACH * spacing_px)
+    value = (1 - r) ** 4 * (4 * r + 1)
+    return Bumps(sparse.csr_matrix((value, (near["i"], near["j"])), shape=(len(place), len(centre))), centre)
+
+
+class Projector:
+    """Least squares fits of the columns of a sparse matrix (n, p), with a ridge too small to matter.
+
+    `freedom` is how many degrees of freedom a fit takes.
+    """
+
+    def __init__(self, value: sparse.csr_matrix) -> None:
+        self.value = value
+        gram = np.asarray((value.T @ value).todense())
+        size = len(gram)
+        ridge = RIDGE * max(float(np.trace(gram)) / max(size, 1), 1e-30)
+        gram[np.diag_indices_from(gram)] += ridge
+        self._factor = linalg.cho_factor(gram, lower=True, overwrite_a=True, check_finite=False)
+        inverse, _ = linalg.lapack.dpotri(self._factor[0], lower=1)
+        self.freedom = size - ridge * float(np.trace(inverse))
+
+    def fit(self, wanted: FloatArray) -> FloatArray:
+        """What the columns explain (n, k) of values (n, k)."""
+        coefficient = linalg.cho_solve(self._factor, self.value.T @ wanted, check_finite=False)
+        return np.asarray(self.value @ coefficient)

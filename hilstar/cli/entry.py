@@ -20,18 +20,24 @@ from hilstar.process.stderr import finish_stderr, queue_stderr
 INTERRUPTED = 130
 LOG_FORMAT = "hilstar: %(message)s"
 READER_WAITS_S, STOPPED_READER_WAITS_S = 1.0, 0.1  # how long a slow reader of stderr is waited for, without and with a signal
+ADDRESS = re.compile(
+    r"(\[?[0-9A-Za-z.:-]*\]?:)?\d{1,6}|localhost|\d+(\.\d+){3}|\[[0-9A-Fa-f:.]+\]"
+)  # what --console may be followed by
 SHARE_OPTIONS = ("--lose", "--corrupt", "--reorder")  # may stand alone
 USUAL_SHARE = "5%"
+USUAL_ADDRESS = "127.0.0.1:8765"
 
 
-def with_shares(words: list[str]) -> list[str]:
-    """The command line with a share after each fault option that stands alone."""
+def with_values(words: list[str]) -> list[str]:
+    """The command line with a share after each fault option that stands alone, and an address after --console."""
     complete: list[str] = []
     for k, word in enumerate(words):
         following = "".join(words[k + 1 : k + 2])
         complete.append(word)
         if word in SHARE_OPTIONS and not re.match(r"[\d.]+%?$", following):
             complete.append(USUAL_SHARE)
+        if word == "--console" and not ADDRESS.fullmatch(following):
+            complete.append(USUAL_ADDRESS)
     return complete
 
 
@@ -52,7 +58,7 @@ def main() -> NoReturn:
 def run_command(words: list[str]) -> int:
     """Run a command line in this process; its exit code, a refusal's one line on stderr."""
     try:
-        return _run(with_shares(words))
+        return _run(with_values(words))
     except SystemExit as end:  # of `fail`
         return end.code if isinstance(end.code, int) else 1
 

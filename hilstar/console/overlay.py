@@ -5,18 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from hilstar.arrays import FloatArray
 from hilstar.bench.cameras import tracker_camera
-from hilstar.bench.frame import Bench
 from hilstar.rotation import to_matrix, to_radec_roll_deg
 from hilstar.scene.camera import Camera
 from hilstar.sky.catalog import load_catalog
 from hilstar.sky.names import label_of, star_names
 from hilstar.sky.stars import Stars
+
+if TYPE_CHECKING:
+    from hilstar.bench.frame import Bench
 
 MAX_STARS = 400  # of a picture's truth, the brightest
 SKY_FAINTEST_MAG = 5.5
@@ -30,12 +32,85 @@ PX_DIGITS, SKY_DIGITS = 2, 4
 
 
 @dataclass(frozen=True, slots=True)
-class Overlay:
-    """The monitor's camera and the tracker's, and the stars bright enough for the monitor."""
+class Marks:
+    """What needs no stars: the boresight, the tracker's outline and the lines of RA and Dec, by the two cameras of a bench."""
 
     monitor: Camera
     tracker: Camera
+
+    def told(self, q_icrs_to_cam: FloatArray | None, grid: bool = False) -> dict[str, Any]:
+        """`boresight_px`, the tracker's outline `tracker_px`, and with `grid` lines as `{label, px}`; pixels of the monitor.
+
+        Without an attitude there are no lines.
+        """
+        told: dict[str, Any] = {
+            "boresight_px": [round(at, PX_DIGITS) for at in self.monitor.boresight_px],
+            "tracker_px": self._tracker_px(),
+        }
+        if grid and q_icrs_to_cam is not None:
+            told["grid"] = list(self._grid(q_icrs_to_cam, self.monitor.cam_to_image @ to_matrix(q_icrs_to_cam)))
+        return told
+
+    def on_screen(self, x_px: FloatArray, y_px: FloatArray, beyond: float) -> np.ndarray[Any, Any]:
+        """Which places (n,) are on the monitor, or outside by at most that share of its size."""
+        width, height = self.monitor.resolution_px
+        with np.errstate(invalid="ignore"):  # NaN: behind the camera, or beyond the lens
+            inside = np.abs(x_px - (width - 1) / 2) <= width * (0.5 + beyond)
+            return np.asarray(inside & (np.abs(y_px - (height - 1) / 2) <= height * (0.5 + beyond)))
+
+    def _tracker_px(self) -> list[list[float]]:
+        """The tracker's outline on the monitor."""
+        rays = self.tracker.rays(*_border(self.tracker.resolution_px, SIDE_PLACES))
+        x_px, y_px = self.monitor.project_outward(rays @ self.monitor.cam_to_image.T)
+        known = np.isfinite(x_px) & np.isfinite(y_px)
+        return [[x, y] for x, y in np.column_stack((x_px, y_px))[known].round(PX_DIGITS).tolist()]
+
+    def _grid(self, q_icrs_to_cam: FloatArray, turn: FloatArray) -> Iterator[dict[str, Any]]:
+        """Lines of RA and of Dec that cross the image."""
+        ra_deg, dec_deg, _ = to_radec_roll_deg(q_icrs_to_cam)
+        radius_deg = math.degrees(self.monitor.field_radius_rad(0.0))
+        step_deg = _step(STEPS_DEG, radius_deg / LINES_ACROSS)
+        low_deg, high_deg = max(dec_deg - radius_deg, -90.0), min(dec_deg + radius_deg, 90.0)
+        wide_deg, ra_step_deg = 180.0, 30.0
+        if max(-low_deg, high_deg) < 90.0:  # the widest circle of right ascension that the field touches
+            share = math.sin(math.radians(min(radius_deg, 89.0))) / math.cos(math.radians(dec_deg))
+            wide_deg = math.degrees(math.asin(min(share, 1.0)))
+            ra_step_deg = _step(RA_STEPS_DEG, wide_deg / LINES_ACROSS)
+        reach = np.linspace(-wide_deg, wide_deg, LINE_PLACES * (4 if wide_deg > 90 else 1))
+        for dec in _multiples(low_deg, high_deg, step_deg):
+            yield from self._line(
+                f"Dec {dec:+.{_digits(step_deg)}f}\N{DEGREE SIGN}", ra_deg + reach, np.full_like(reach, dec), turn
+            )
+        up = np.linspace(low_deg, high_deg, LINE_PLACES)
+        for ra in _multiples(ra_deg - wide_deg, ra_deg + wide_deg - 1e-9, ra_step_deg):
+            yield from self._line(f"RA {ra % 360:.{_digits(ra_step_deg)}f}\N{DEGREE SIGN}", np.full_like(up, ra), up, turn)
+
+    def _line(self, label: str, ra_deg: FloatArray, dec_deg: FloatArray, turn: FloatArray) -> Iterator[dict[str, Any]]:
+        """A line over the sky, in pieces where it leaves the image."""
+        ra, dec = np.radians(ra_deg), np.radians(dec_deg)
+        vectors = np.column_stack((np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)))
+        x_px, y_px = self.monitor.project(vectors @ turn.T)
+        inside = self.on_screen(x_px, y_px, BEYOND)
+        # A piece has a place more on each side, so that it reaches over the image's edge; one alone is nothing.
+        near = np.isfinite(x_px) & (inside | np.append(inside[1:], False) | np.append(False, inside[:-1]))
+        bounds = np.flatnonzero(np.diff(np.concatenate(([False], near, [False])).astype(np.int8)))
+        for begin, end in zip(bounds[::2], bounds[1::2], strict=True):
+            if end - begin > 1:
+                places = np.column_stack((x_px[begin:end], y_px[begin:end]))
+                yield {"label": label.replace("-", "\N{MINUS SIGN}"), "px": places.round(1).tolist()}
+
+
+@dataclass(frozen=True, slots=True)
+class Overlay:
+    """The marks of a bench's two cameras, and the stars bright enough for the monitor."""
+
+    marks: Marks
     stars: Stars
+
+    @property
+    def monitor(self) -> Camera:
+        """The monitor's camera."""
+        return self.marks.monitor
 
     def sky(self) -> dict[str, Any]:
         """Stars and bodies of the whole sky as `[ra_deg, dec_deg, v_mag, label]`, the brightest first, and the screen.
@@ -74,13 +149,12 @@ class Overlay:
     def truth(self, q_icrs_to_cam: FloatArray, clipped: tuple[int | str, ...] = (), grid: bool = False) -> dict[str, Any]:
         """What is where in a picture at an attitude: stars as `[x_px, y_px, v_mag, hip, label, clipped]`, the brightest first.
 
-        `boresight_px`, the tracker's outline `tracker_px`, and with `grid` the lines of RA and Dec as `{label, px}`; pixels of
-        the monitor. `clipped` are HIP numbers, and names of what has none.
+        And the marks (see `Marks.told`). `clipped` are HIP numbers, and names of what has none.
         """
         turn = self.monitor.cam_to_image @ to_matrix(q_icrs_to_cam)
         near = self.stars.near(turn[2], self.monitor.field_radius_rad(0.0))
         x_px, y_px = self.monitor.project(self.stars.directions(near) @ turn.T)
-        inside = np.flatnonzero(self._on_screen(x_px, y_px, 0.0))
+        inside = np.flatnonzero(self.marks.on_screen(x_px, y_px, 0.0))
         inside = inside[np.argsort(self.stars.v_mag[near[inside]], kind="stable")][:MAX_STARS]
         which = near[inside]
         marked = set(clipped)
@@ -93,64 +167,12 @@ class Overlay:
             self._labels(which),
             [int((name or hip) in marked) for name, hip in zip(names, hips, strict=True)],
         )
-        told = {
-            "stars": [list(row) for row in zip(*columns, strict=True)],
-            "boresight_px": [round(at, PX_DIGITS) for at in self.monitor.boresight_px],
-            "tracker_px": self._tracker_px(),
-        }
-        return told | ({"grid": list(self._grid(q_icrs_to_cam, turn))} if grid else {})
-
-    def _on_screen(self, x_px: FloatArray, y_px: FloatArray, beyond: float) -> np.ndarray[Any, Any]:
-        width, height = self.monitor.resolution_px
-        with np.errstate(invalid="ignore"):  # NaN: behind the camera, or beyond the lens
-            inside = np.abs(x_px - (width - 1) / 2) <= width * (0.5 + beyond)
-            return np.asarray(inside & (np.abs(y_px - (height - 1) / 2) <= height * (0.5 + beyond)))
-
-    def _tracker_px(self) -> list[list[float]]:
-        """The tracker's outline on the monitor."""
-        rays = self.tracker.rays(*_border(self.tracker.resolution_px, SIDE_PLACES))
-        x_px, y_px = self.monitor.project_outward(rays @ self.monitor.cam_to_image.T)
-        known = np.isfinite(x_px) & np.isfinite(y_px)
-        return [[x, y] for x, y in np.column_stack((x_px, y_px))[known].round(PX_DIGITS).tolist()]
-
-    def _grid(self, q_icrs_to_cam: FloatArray, turn: FloatArray) -> Iterator[dict[str, Any]]:
-        """Lines of RA and of Dec that cross the image."""
-        ra_deg, dec_deg, _ = to_radec_roll_deg(q_icrs_to_cam)
-        radius_deg = math.degrees(self.monitor.field_radius_rad(0.0))
-        step_deg = _step(STEPS_DEG, radius_deg / LINES_ACROSS)
-        low_deg, high_deg = max(dec_deg - radius_deg, -90.0), min(dec_deg + radius_deg, 90.0)
-        wide_deg, ra_step_deg = 180.0, 30.0
-        if max(-low_deg, high_deg) < 90.0:  # the widest circle of right ascension that the field touches
-            share = math.sin(math.radians(min(radius_deg, 89.0))) / math.cos(math.radians(dec_deg))
-            wide_deg = math.degrees(math.asin(min(share, 1.0)))
-            ra_step_deg = _step(RA_STEPS_DEG, wide_deg / LINES_ACROSS)
-        reach = np.linspace(-wide_deg, wide_deg, LINE_PLACES * (4 if wide_deg > 90 else 1))
-        for dec in _multiples(low_deg, high_deg, step_deg):
-            yield from self._line(
-                f"Dec {dec:+.{_digits(step_deg)}f}\N{DEGREE SIGN}", ra_deg + reach, np.full_like(reach, dec), turn
-            )
-        up = np.linspace(low_deg, high_deg, LINE_PLACES)
-        for ra in _multiples(ra_deg - wide_deg, ra_deg + wide_deg - 1e-9, ra_step_deg):
-            yield from self._line(f"RA {ra % 360:.{_digits(ra_step_deg)}f}\N{DEGREE SIGN}", np.full_like(up, ra), up, turn)
-
-    def _line(self, label: str, ra_deg: FloatArray, dec_deg: FloatArray, turn: FloatArray) -> Iterator[dict[str, Any]]:
-        """A line over the sky, in pieces where it leaves the image."""
-        ra, dec = np.radians(ra_deg), np.radians(dec_deg)
-        vectors = np.column_stack((np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)))
-        x_px, y_px = self.monitor.project(vectors @ turn.T)
-        inside = self._on_screen(x_px, y_px, BEYOND)
-        # A piece has a place more on each side, so that it reaches over the image's edge; one alone is nothing.
-        near = np.isfinite(x_px) & (inside | np.append(inside[1:], False) | np.append(False, inside[:-1]))
-        bounds = np.flatnonzero(np.diff(np.concatenate(([False], near, [False])).astype(np.int8)))
-        for begin, end in zip(bounds[::2], bounds[1::2], strict=True):
-            if end - begin > 1:
-                places = np.column_stack((x_px[begin:end], y_px[begin:end]))
-                yield {"label": label.replace("-", "\N{MINUS SIGN}"), "px": places.round(1).tolist()}
+        return {"stars": [list(row) for row in zip(*columns, strict=True)]} | self.marks.told(q_icrs_to_cam, grid)
 
 
 def overlay_of(bench: Bench) -> Overlay:
     """The overlay of an assembled bench."""
-    return Overlay(bench.camera, tracker_camera(bench.config.tracker, bench.file.folder), bench.shown_stars)
+    return Overlay(Marks(bench.camera, tracker_camera(bench.config.tracker, bench.file.folder)), bench.shown_stars)
 
 
 def catalogue_sky() -> dict[str, Any]:

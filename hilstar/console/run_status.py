@@ -23,7 +23,7 @@ from hilstar.units import NS_PER_MS, NS_PER_S
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from hilstar.run.record.ledger import Ledger
+    from hilstar.run.record.ledger_switch import LedgerSwitch
     from hilstar.run.serve import Running
     from hilstar.run.shown import Shown
     from hilstar.run.summary import RunTally
@@ -54,7 +54,7 @@ class Line(NamedTuple):
 class RunStatus:
     """What a run is doing, from the newest frame that `see` was given."""
 
-    def __init__(self, source: Source, ledger: Ledger | None = None) -> None:
+    def __init__(self, source: Source, ledger: LedgerSwitch | None = None) -> None:
         self._source = source
         self._ledger = ledger
         self._begun_ns = time.monotonic_ns()
@@ -97,7 +97,7 @@ class RunStatus:
         return Line("frames", text, not tally.missed_frames)
 
     def _about(self) -> Iterator[Line]:
-        ledger = self._ledger
+        ledger = None if self._ledger is None else self._ledger.current
         if ledger is not None:
             failed = f"; failed: {ledger.failure}" if ledger.failure else ""
             yield Line("ledger", f"{ledger.path}, {ledger.size_bytes / 1e6:.1f} MB{failed}", ledger.failure is None)

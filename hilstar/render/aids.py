@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from hilstar.monitor.response import Codes, Response
@@ -36,3 +38,21 @@ def lay_over(levels: Codes, overlay: int, patch_level: int, line_level: int, cro
 
 def _on_line(offset_px: int, overlay: int) -> bool:
     return bool((overlay & GRID and offset_px % GRID_PX == 0) or (overlay & CROSSHAIR and offset_px == 0))
+
+
+@dataclass(frozen=True, slots=True)
+class AidLevels:
+    """What aids are in the levels of a monitor with codes of `bits` bits; the crosshair goes through pixel `cross_px`."""
+
+    response: Response
+    bits: int
+    cross_px: tuple[int, int]
+
+    def laid_over(self, levels: Codes, overlay: int, patch_share: float) -> Codes:
+        """Levels with what is on over them, a patch of so much of white: the same array where nothing is, else a copy."""
+        if not overlay:
+            return levels
+        levels, white = levels.copy(), 2**self.bits - 1
+        patch, line = (level_of_code(self.response, code) for code in (round(patch_share * white), int(LINE_SHARE * white)))
+        lay_over(levels, overlay, patch, line, self.cross_px)
+        return levels

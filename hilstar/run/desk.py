@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import threading
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from hilstar.run.aids import Aids
 
@@ -19,7 +18,7 @@ class Wish:
     who: str
     share: float = 1.0
     called_off: bool = False
-    done: threading.Event = field(default_factory=threading.Event)
+    done: bool = False
 
     @property
     def text(self) -> str:
@@ -45,4 +44,4 @@ class Desk:
                 continue
             aids.set(wish.name, wish.on, wish.share)
             acted(wish)
-            wish.done.set()
+            wish.done = True

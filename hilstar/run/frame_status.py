@@ -8,13 +8,14 @@ from hilstar.attitude.wire.packet import Status
 from hilstar.notices import Notices
 from hilstar.run.loop import FrameLoop
 from hilstar.run.record.ledger import Ledger
+from hilstar.run.record.ledger_switch import LedgerSwitch
 from hilstar.run.shown import Shown
 
 
 class StatusMaker:
     """Makes status packets; missed frames, refused packets and momentary events are reported once each."""
 
-    def __init__(self, ledger: Ledger | None = None) -> None:
+    def __init__(self, ledger: Ledger | LedgerSwitch | None = None) -> None:
         self._ledger = ledger
         self._missed = 0
         self._refused = 0

@@ -10,7 +10,7 @@ from hilstar.attitude.clock.timeline import Attitude
 from hilstar.bench.frame import Bench
 from hilstar.monitor.response import Codes
 from hilstar.notices import Notices
-from hilstar.render.aids import LINE_SHARE, lay_over, level_of_code
+from hilstar.render.aids import AidLevels
 from hilstar.run.aids import Aids
 from hilstar.run.desk import Desk, Wish
 from hilstar.run.pacer import Operator
@@ -93,24 +93,10 @@ class Overrides(Operator):
         return {name: {"frames": self._frames[name], "s": self._lasted_ns[name] / NS_PER_S} for name in self._frames}
 
 
-class AidLevels:
-    """What the aids are in a bench's levels: white, the light of a line, and where the crosshair goes."""
-
-    def __init__(self, bench: Bench) -> None:
-        self._response = bench.calibration.response
-        x_px, y_px = bench.camera.boresight_px
-        self._cross_px = (round(x_px), round(y_px))
-        self._white_code = 2**bench.config.monitor.bits - 1
-        self._line = level_of_code(self._response, int(LINE_SHARE * self._white_code))
-
-    def laid_over(self, levels: Codes, aids: Aids) -> Codes:
-        """Levels with the aids over them: the same array where there are none, else a copy."""
-        if not aids.overlay:
-            return levels
-        levels = levels.copy()
-        patch = level_of_code(self._response, round(aids.patch_share * self._white_code))
-        lay_over(levels, aids.overlay, patch, self._line, self._cross_px)
-        return levels
+def aid_levels_of(bench: Bench) -> AidLevels:
+    """What aids are in a bench's levels."""
+    x_px, y_px = bench.camera.boresight_px
+    return AidLevels(bench.calibration.response, bench.config.monitor.bits, (round(x_px), round(y_px)))
 
 
 class HeadlessOverrides(Overrides):
@@ -118,8 +104,8 @@ class HeadlessOverrides(Overrides):
 
     def __init__(self, bench: Bench, notices: Notices, desk: Desk | None = None) -> None:
         super().__init__(Aids(), notices, always_seen, desk)
-        self._levels = AidLevels(bench)
+        self._levels = aid_levels_of(bench)
 
     def laid_over(self, levels: Codes) -> Codes:
         """The levels with what the operator wants over them."""
-        return self._levels.laid_over(levels, self.aids)
+        return self._levels.laid_over(levels, self.aids.overlay, self.aids.patch_share)

@@ -13,7 +13,7 @@ from msgspec.structs import replace as replaced
 from hilstar.attitude.back_channel import Traffic
 from hilstar.attitude.clock.sender_clock import ClockSummary
 from hilstar.attitude.clock.timeline import Timeline
-from hilstar.attitude.receiver import PacketCounts, Receiver, nobody_watches
+from hilstar.attitude.receiver import PacketCounts, Receiver
 from hilstar.attitude.wire.links import StreamLink
 from hilstar.attitude.wire.nasa42.tcp_link import Nasa42Lockstep
 from hilstar.attitude.wire.source import Mounting
@@ -35,8 +35,8 @@ from hilstar.run.loop import FrameLoop, Limit, policy_of
 from hilstar.run.open_link import AnyLink
 from hilstar.run.overrides import HeadlessOverrides
 from hilstar.run.pacer import ClockPacer, Moment, Pacer
-from hilstar.run.record.ledger import Ledger
 from hilstar.run.record.ledger_records import below_step, frame_record
+from hilstar.run.record.ledger_switch import LedgerSwitch
 from hilstar.run.replay import Play
 from hilstar.run.screen.display_pacer import DisplayPacer
 from hilstar.run.screen.screen import Screen
@@ -78,7 +78,7 @@ class Outlet:
     """
 
     screen: Screen | None = None
-    ledger: Ledger | None = None
+    ledger: LedgerSwitch = field(default_factory=LedgerSwitch)
     notices: Notices = field(default_factory=Notices)
     pictures: Pictures | None = None
     follower: Follower = nobody_follows
@@ -147,7 +147,7 @@ def _serve_stream(bench: Bench, link: StreamLink, limit: Limit, loop: FrameLoop,
         if shown is None:
             return None
         light_ns = receiver.sender_ns(t_ns)
-        if ledger is not None:
+        if ledger.on:
             ledger.frame(frame_record(shown, light_ns, loop.tally.missed_frames, below_step(bench, shown)))
         if link.two_way:
             receiver.post(statuses.status(shown, light_ns, loop, receiver.counts, receiver.clock.synchronised))
@@ -173,10 +173,9 @@ def _serve_stream(bench: Bench, link: StreamLink, limit: Limit, loop: FrameLoop,
 
 
 def _receiver(settings: AttitudeSettings, link: StreamLink, timeline: Timeline, outlet: Outlet) -> Receiver:
-    watch = nobody_watches if outlet.ledger is None else outlet.ledger.packet
     shared = settings.clock == "shared"
     traffic = Traffic(settings.status_hz, settings.time_requests and not shared, shared)
-    return Receiver(link, timeline, traffic, watch, outlet.notices)
+    return Receiver(link, timeline, traffic, outlet.ledger.packet, outlet.notices)
 
 
 def replay(bench: Bench, play: Play, sink: FrameSink = ignore, outlet: Outlet | None = None) -> RunSummary:
@@ -199,7 +198,7 @@ def replay(bench: Bench, play: Play, sink: FrameSink = ignore, outlet: Outlet | 
             faults.recall(play.past(moment.slot))
         number, t_ns, attitude = play.frame(moment.slot)
         shown = loop.draw(number, t_ns, attitude, moment)
-        if ledger is not None and shown is not None:
+        if ledger.on and shown is not None:
             ledger.frame(frame_record(shown, t_ns, loop.tally.missed_frames, below_step(bench, shown)))
         return shown
 

@@ -18,7 +18,7 @@ import pytest
 
 from hilstar.bench.config import read_config
 from hilstar.cli.app import app
-from hilstar.cli.entry import with_shares
+from hilstar.cli.entry import with_values
 from tests.docs.pages import Block, blocks_of, differs
 from tests.support.benches import ROOT, SMALL_BENCH
 from tests.support.senders import free_port
@@ -114,7 +114,7 @@ def type_in(block: Block, port: str) -> None:
 def hilstar(words: list[str]) -> str:
     """What a hilstar command prints; it is run in this process, which saves a start of half a second."""
     with contextlib.redirect_stdout(io.StringIO()) as printed:
-        code = app(with_shares(words), standalone_mode=False)
+        code = app(with_values(words), standalone_mode=False)
     assert not code, f"exit code {code}: hilstar {' '.join(words)}"
     return printed.getvalue()
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -24,6 +24,7 @@ from hilstar.cli.options import (
     check_files,
 )
 from hilstar.cli.parsers import parse_place, parse_speed, parse_split
+from hilstar.cli.show.paging import Console, ConsoleName, Control, Token, fault_desk, followed, page_door
 from hilstar.cli.show.running import (
     Force,
     LedgerFile,
@@ -68,6 +69,10 @@ def replay(
     overwrite: Overwrite = False,
     windowed: Windowed = False,
     force: Force = False,
+    console: Console = None,
+    control: Control = False,
+    token: Token = None,
+    console_name: ConsoleName = None,
     explain: Explain = False,
     as_json: Json = False,
 ) -> None:
@@ -75,7 +80,9 @@ def replay(
     from hilstar.attitude.logs.entries import Stated
     from hilstar.attitude.wire.source import Mounting
     from hilstar.bench.bench_file import dated, read_bench_file
+    from hilstar.console.feed.opening import Parts, Told
     from hilstar.run.record.frame_images import FrameImages
+    from hilstar.run.record.ledger import Ledger
     from hilstar.run.replay import Wanted, plan_play
     from hilstar.run.serve import Outlet
     from hilstar.run.serve import replay as replay_log
@@ -92,6 +99,7 @@ def replay(
     play = plan_play(log, Wanted(parse_speed(speed), start, stop, step), file.config, stated)
     file = dated(file, play.conventions.scale, play.first_ns)
     with (
+        page_door(console, control, token, console_name) as door,
         shown_bench(file, headless, windowed, force) as (bench, screen),
         FrameImages(output, bench) as record,
         optional_ledger(ledger, bench, notices, overwrite, split) as kept,
@@ -105,11 +113,9 @@ def replay(
         renderer, refresh_hz = bench.renderer.gl_renderer, bench.config.monitor.refresh_hz
         status = RunStatus(Source(f"replaying {log}", renderer, refresh_hz, play.frame_count), kept)
 
-        def sink(shown: Any) -> None:
-            record(shown)
-            status.see(shown)
-
-        outlet = Outlet(screen, kept, notices, follower=status.follow, faults=wrong)
-        with on_terminal(status):
+        page = Told("replay", "log", str(log), timed=play.paced)
+        parts = Parts(bench, notices, kept, lambda path: Ledger(path, bench, notices, split=split), screen, fault_desk(wrong))
+        with on_terminal(status), followed(door, control, page, parts, status, record) as (sink, follower, desk):
+            outlet = Outlet(screen, kept, notices, follower=follower, desk=desk, faults=wrong)
             summary = replay_log(bench, play, sink, outlet)
     end_of_run(summary, screen, kept, as_json)

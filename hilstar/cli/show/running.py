@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,7 +13,6 @@ import typer
 from hilstar.console.terminal import report, say
 from hilstar.errors import InputError, MachineError
 from hilstar.notices import Notices
-from hilstar.process.interrupts import stop_on_signal
 
 if TYPE_CHECKING:
     from hilstar.attitude.wire.source import Conventions, Mounting
@@ -22,6 +20,7 @@ if TYPE_CHECKING:
     from hilstar.bench.faults.scenario import Scenario
     from hilstar.run.faults.recorded import Recording
     from hilstar.run.faults.run_faults import AnyFaults
+    from hilstar.run.record.ledger_switch import LedgerSwitch
     from hilstar.run.summary import RunSummary
 
 Windowed = Annotated[bool, typer.Option("--windowed", help="A window on the desktop instead of the full display.")]
@@ -80,20 +79,15 @@ def say_what_clips(bench: Any) -> None:
 
 
 @contextmanager
-def optional_ledger(path: Path | None, bench: Any, notices: Notices, overwrite: bool, split: Any) -> Iterator[Any]:
-    """The run's ledger, which keeps the run's events too, or nothing where none was asked for."""
+def optional_ledger(path: Path | None, bench: Any, notices: Notices, overwrite: bool, split: Any) -> Iterator[LedgerSwitch]:
+    """The run's ledger, which keeps the run's events too; none at the start where none was asked for."""
     from hilstar.run.record.ledger import Ledger
+    from hilstar.run.record.ledger_switch import LedgerSwitch
 
-    if path is None:
-        yield None
-        return
-    ledger = Ledger(path, bench, notices, overwrite, split)
+    ledger = LedgerSwitch(None if path is None else Ledger(path, bench, notices, overwrite, split))
     notices.listen(ledger.notice)
-    try:
+    with ledger:
         yield ledger
-    finally:
-        with stop_on_signal(threading.Event()):  # a signal that comes now does not interrupt this
-            ledger.close()
 
 
 def optional_scenario(path: Path | None) -> Scenario | None:
@@ -105,7 +99,7 @@ def optional_scenario(path: Path | None) -> Scenario | None:
 
 @contextmanager
 def run_with_faults(
-    bench: Any, scenario: Scenario | None, notices: Notices, ledger: Any, recording: Recording | None = None
+    bench: Any, scenario: Scenario | None, notices: Notices, ledger: LedgerSwitch, recording: Recording | None = None
 ) -> Iterator[AnyFaults | None]:
     """The faults of a run: of its scenario and its stream, or of the run that is replayed; None where it has none."""
     from hilstar.run.faults.run_faults import replayed_faults, run_faults
@@ -128,15 +122,15 @@ def run_with_faults(
         yield faults
 
 
-def end_of_run(summary: RunSummary, screen: Any, ledger: Any, as_json: bool) -> None:
+def end_of_run(summary: RunSummary, screen: Any, ledger: LedgerSwitch, as_json: bool) -> None:
     """The summary of a run whose ledger is closed; exit code 1 where that has failed.
 
     Raises MachineError where its window went away.
     """
-    if ledger is not None:
-        summary = msgspec.structs.replace(summary, ledger=ledger.summary())
+    if ledger.last is not None:
+        summary = msgspec.structs.replace(summary, ledger=ledger.last.summary())
     report(summary, as_json)
     if screen is not None and screen.window.gone is not None:
         raise MachineError(f"the run ended early: {screen.window.gone}")
-    if ledger is not None and ledger.failure is not None:
+    if ledger.failure is not None:
         raise typer.Exit(1)

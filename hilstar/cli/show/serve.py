@@ -9,6 +9,7 @@ import typer
 
 from hilstar.cli.options import BenchFile, Explain, Headless, Json, Overwrite, ScenarioFile, check_files
 from hilstar.cli.parsers import parse_split
+from hilstar.cli.show.paging import Console, ConsoleName, Control, Token, fault_desk, followed, page_door
 from hilstar.cli.show.running import (
     Force,
     LedgerFile,
@@ -47,14 +48,20 @@ def serve(
     overwrite: Overwrite = False,
     windowed: Windowed = False,
     force: Force = False,
+    console: Console = None,
+    control: Control = False,
+    token: Token = None,
+    console_name: ConsoleName = None,
     explain: Explain = False,
     as_json: Json = False,
 ) -> None:
     """Show the live attitude stream on the monitor."""
     from hilstar.attitude.wire.source import Mounting
     from hilstar.bench.bench_file import read_bench_file
+    from hilstar.console.feed.opening import Parts, Told
     from hilstar.run.loop import Limit
     from hilstar.run.open_link import open_link
+    from hilstar.run.record.ledger import Ledger
     from hilstar.run.serve import Outlet
     from hilstar.run.serve import serve as serve_stream
 
@@ -65,6 +72,7 @@ def serve(
     split = parse_split(ledger_split)
     notices = Notices()
     with (
+        page_door(console, control, token, console_name) as door,
         open_link(file.config, file.folder, notices) as link,
         shown_bench(file, headless, windowed, force) as (bench, screen),
         optional_ledger(ledger, bench, notices, overwrite, split) as kept,
@@ -80,9 +88,11 @@ def serve(
         say_what_clips(bench)
         told = Source(f"{link.verb} {link.endpoint}", bench.renderer.gl_renderer, refresh_hz, min(limit.slots, limit.frames))
         status = RunStatus(told, kept)
-        outlet = Outlet(screen, kept, notices, tracker_pictures(link, bench), status.follow, faults=wrong)
-        with on_terminal(status):
-            summary = serve_stream(bench, link, limit, status.see, outlet)
+        page = Told("serve", file.config.attitude.source, link.endpoint, timed=not file.config.attitude.lockstep)
+        parts = Parts(bench, notices, kept, lambda path: Ledger(path, bench, notices, split=split), screen, fault_desk(wrong))
+        with on_terminal(status), followed(door, control, page, parts, status) as (sink, follower, desk):
+            outlet = Outlet(screen, kept, notices, tracker_pictures(link, bench), follower, desk, wrong)
+            summary = serve_stream(bench, link, limit, sink, outlet)
     end_of_run(summary, screen, kept, as_json)
     if not summary.packets.accepted:
         say(f"no attitude came from {link.endpoint}; start the sender, and check its address")

@@ -24,8 +24,8 @@ from hilstar.notices import Notices
 from hilstar.run.faults.recorded import RecordedFaults, Recording
 from hilstar.run.faults.stream import FaultStream
 from hilstar.run.faulty_frames import FaultyFrames
-from hilstar.run.record.ledger import Ledger
 from hilstar.run.record.ledger_records import FaultRecord, FrameRecord
+from hilstar.run.record.ledger_switch import LedgerSwitch
 
 WORDS = {"start": "begins", "end": "ends", "missed": "fell between two frames"}
 MAX_NAMES = 100  # in the summary: a stream may make up names
@@ -37,7 +37,7 @@ class RunFaults:
     Raises InputError for a fault that this bench cannot draw.
     """
 
-    def __init__(self, bench: Bench, scenario: Scenario, notices: Notices, ledger: Ledger | None = None) -> None:
+    def __init__(self, bench: Bench, scenario: Scenario, notices: Notices, ledger: LedgerSwitch | None = None) -> None:
         self._scenario, self._notices, self._ledger = scenario, notices, ledger
         self._started: Counter[str] = Counter()
         self._missed: Counter[str] = Counter()
@@ -116,7 +116,9 @@ class RunFaults:
         return told if self._stream is None else told | {"stream": self._stream.summary()}
 
 
-def run_faults(bench: Bench, scenario: Scenario | None, notices: Notices, ledger: Ledger | None = None) -> RunFaults | None:
+def run_faults(
+    bench: Bench, scenario: Scenario | None, notices: Notices, ledger: LedgerSwitch | None = None
+) -> RunFaults | None:
     """The faults of a run that has a scenario, or whose bench file has a stream of them; None for one that has neither."""
     if scenario is None and bench.config.faults.endpoint is None:
         return None
@@ -129,7 +131,7 @@ class ReplayedFaults:
     Raises InputError for a fault that this bench cannot draw.
     """
 
-    def __init__(self, bench: Bench, recording: Recording, ledger: Ledger | None = None) -> None:
+    def __init__(self, bench: Bench, recording: Recording, ledger: LedgerSwitch | None = None) -> None:
         view = display_view(bench, recording.scenario)
         for fault in recording.faults.values():
             view.prepare(fault)
@@ -156,6 +158,6 @@ class ReplayedFaults:
 AnyFaults = RunFaults | ReplayedFaults
 
 
-def replayed_faults(bench: Bench, recording: Recording, ledger: Ledger | None = None) -> ReplayedFaults | None:
+def replayed_faults(bench: Bench, recording: Recording, ledger: LedgerSwitch | None = None) -> ReplayedFaults | None:
     """The faults of an earlier run; None where it had none."""
     return ReplayedFaults(bench, recording, ledger) if recording.faults else None

@@ -15,8 +15,8 @@ from hilstar.attitude.wire.packet import AttitudeSample, Event, Refusal, rate_re
 from hilstar.bench.frame import Bench
 from hilstar.notices import at_now
 from hilstar.run.loop import FrameLoop, Limit
-from hilstar.run.record.ledger import Ledger
 from hilstar.run.record.ledger_records import below_step, frame_record
+from hilstar.run.record.ledger_switch import LedgerSwitch
 from hilstar.run.shown import Shown
 from hilstar.run.summary import RunSummary
 from hilstar.running_statistics import RunningStatistics
@@ -29,7 +29,7 @@ log = logging.getLogger(__name__)
 class Steps:
     """The frames of a run up to its limit: each attitude is drawn at once, counted, and kept in the ledger."""
 
-    def __init__(self, bench: Bench, limit: Limit, loop: FrameLoop, ledger: Ledger | None) -> None:
+    def __init__(self, bench: Bench, limit: Limit, loop: FrameLoop, ledger: LedgerSwitch) -> None:
         self.counts = PacketCounts()
         self.last = Shown(0, 0, None, bench.draw(None), missing=True)
         self._bench, self._limit, self._loop, self._ledger = bench, limit, loop, ledger
@@ -55,7 +55,7 @@ class Steps:
                 log.warning("%s", at_now(line))
         shown = None if refusal is not None or sample is None else self._show(sample, host_ns)
         self.last = shown or self.last  # of a frame that a fault drops, the one before stays
-        if self._ledger is not None:
+        if self._ledger.on:
             self._ledger.packet(host_ns, raw, sample, refusal)
             if shown is not None:
                 self._ledger.frame(frame_record(self.last, self.last.t_ns, 0, below_step(self._bench, self.last)))

@@ -93,9 +93,9 @@ def test_a_wish_is_acted_on_by_the_next_look_and_told_with_who_wished_it(aids):
     desk.ask(wish)
     desk.ask(late)
     late.called_off = True
-    assert not wish.done.is_set()
+    assert not wish.done
     assert overrides.look() == OnScreen("blank", "", False)
-    assert wish.done.is_set() and not late.done.is_set()
+    assert wish.done and not late.done
     assert told == [("operator", "blank on, by Ada: blank", "Ada")]
     assert overrides.look() == OnScreen("blank", "", False)
     assert len(told) == 1

@@ -13,6 +13,7 @@ from hilstar.run.faults.recorded import read_recording
 from hilstar.run.faults.run_faults import RunFaults
 from hilstar.run.record.ledger import Ledger
 from hilstar.run.record.ledger_reader import fault_records, frame_records
+from hilstar.run.record.ledger_switch import LedgerSwitch
 from hilstar.run.replay import Wanted, plan_play
 from hilstar.run.serve import Outlet, replay
 from tests.support.benches import ATTITUDE, bench_text
@@ -92,7 +93,7 @@ def played(bench, log, ledger=None, scenario=None, notices=None):
     """The frames of a replay as fast as possible: codes by number, and the summary."""
     notices = notices or Notices()
     frames, codes = [], {}
-    kept = None if ledger is None else Ledger(ledger, bench, notices)
+    kept = LedgerSwitch(None if ledger is None else Ledger(ledger, bench, notices))
     faults = None if scenario is None else RunFaults(bench, scenario, notices, kept)
 
     def sink(shown):
@@ -101,8 +102,7 @@ def played(bench, log, ledger=None, scenario=None, notices=None):
 
     play = plan_play(log, Wanted(speed=float("inf")), bench.config)
     summary = replay(bench, play, sink, Outlet(ledger=kept, notices=notices, faults=faults))
-    if kept is not None:
-        kept.close()
+    kept.end()
     return frames, codes, summary
 
 

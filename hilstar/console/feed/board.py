@@ -1,0 +1,143 @@
+"""The memory that a run and its page share: numbered records in rings, written without a wait and read without a lock.
+
+A record's slot says which number is being written and which is whole (a seqlock), and has a CRC: a reader that was overtaken,
+or looked too early, sees that and tries again or leaves it. Each ring has one writer. The memory has no name (memfd): it is
+gone with the last process that has it open, however that ends.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import struct
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+_HEAD = struct.Struct("<Q")
+_SLOT = struct.Struct("<QQII")  # the number being written, the number that is whole, bytes, CRC-32
+_WANT = struct.Struct("<QQ")  # a picture each so many ns, until so many ns of host time
+_PAGE = 4096
+FRAMES, FRAME_BYTES = 512, 128  # 8 s at 60 Hz
+STATES, STATE_BYTES = 4, 60_000
+EVENTS, EVENT_BYTES = 512, 2_000
+PICTURES = 3
+MAX_SPRITES = 20_000
+SPRITE = np.dtype([("star", "<i4"), ("x_px", "<f4"), ("y_px", "<f4")])
+PICTURE_HEAD_BYTES = 128
+
+
+class Ring:
+    """Records numbered from 1 in a ring of `slots`, each of at most `slot_bytes`."""
+
+    def __init__(self, memory: memoryview, slots: int, slot_bytes: int) -> None:
+        self._memory = memory
+        self._slots, self._stride = slots, _SLOT.size + slot_bytes
+        self._slot_bytes = slot_bytes
+        self._next = self.newest + 1
+
+    @staticmethod
+    def size(slots: int, slot_bytes: int) -> int:
+        """The bytes of memory that it takes."""
+        return _HEAD.size + slots * (_SLOT.size + slot_bytes)
+
+    @property
+    def newest(self) -> int:
+        """The number of the newest record, 0 for none."""
+        return int(_HEAD.unpack_from(self._memory, 0)[0])
+
+    def put(self, data: bytes) -> None:
+        """Write a record; one that is too long is cut."""
+        data = data[: self._slot_bytes]
+        place = self.begin()
+        self._memory[place : place + len(data)] = data
+        self.end(len(data), zlib.crc32(data))
+
+    def begin(self) -> int:
+        """Open the next slot; where its bytes begin."""
+        place = self._place(self._next)
+        _SLOT.pack_into(self._memory, place, self._next, 0, 0, 0)
+        return place + _SLOT.size
+
+    def end(self, length: int, crc: int) -> None:
+        """Close the slot with so many bytes in it."""
+        _SLOT.pack_into(self._memory, self._place(self._next), self._next, self._next, length, crc)
+        _HEAD.pack_into(self._memory, 0, self._next)
+        self._next += 1
+
+    def room(self, length: int) -> memoryview:
+        """The first bytes of the slot that `begin` opened."""
+        place = self._place(self._next) + _SLOT.size
+        return self._memory[place : place + length]
+
+    def read(self, number: int) -> bytes | None:
+        """The record of that number; None where it is not whole, or has been overwritten."""
+        place = self._place(number)
+        begun, whole, length, crc = _SLOT.unpack_from(self._memory, place)
+        if not number or begun != number or whole != number or length > self._slot_bytes:
+            return None
+        data = bytes(self._memory[place + _SLOT.size : place + _SLOT.size + length])
+        if _SLOT.unpack_from(self._memory, place) != (begun, whole, length, crc):
+            return None
+        return data if not crc or zlib.crc32(data) == crc else None
+
+    def last(self) -> tuple[int, bytes] | None:
+        """The newest whole record with its number; None where there is none yet."""
+        newest = self.newest
+        for number in range(newest, max(newest - self._slots + 1, 0), -1):
+            data = self.read(number)
+            if data is not None:
+                return number, data
+        return None
+
+    def after(self, number: int) -> Iterator[tuple[int, bytes]]:
+        """The whole records after `number` that are still there, oldest first."""
+        newest = self.newest
+        for k in range(max(number + 1, newest - self._slots + 2, 1), newest + 1):
+            data = self.read(k)
+            if data is not None:
+                yield k, data
+
+    def _place(self, number: int) -> int:
+        return _HEAD.size + (number % self._slots) * self._stride
+
+
+@dataclass(frozen=True, slots=True)
+class Want:
+    """How often the page wants a picture, and until when (host time), ns; 0 for never."""
+
+    each_ns: int = 0
+    until_ns: int = 0
+
+
+class Board:
+    """The rings of a run: frames, states, events and pictures, and what the page wants; `fd` is the memory's own."""
+
+    def __init__(self, fd: int, picture_bytes: int) -> None:
+        self.fd = fd
+        slot_bytes = PICTURE_HEAD_BYTES + picture_bytes + MAX_SPRITES * SPRITE.itemsize
+        shapes = [(FRAMES, FRAME_BYTES), (STATES, STATE_BYTES), (EVENTS, EVENT_BYTES), (PICTURES, slot_bytes)]
+        starts = [_PAGE]
+        for shape in shapes:
+            starts.append(-(-(starts[-1] + Ring.size(*shape)) // _PAGE) * _PAGE)
+        if os.fstat(fd).st_size == 0:
+            os.ftruncate(fd, starts[-1])
+        self._memory = memoryview(mmap.mmap(fd, starts[-1]))
+        rings = [Ring(self._memory[start:], *shape) for start, shape in zip(starts, shapes, strict=False)]
+        self.frames, self.states, self.events, self.pictures = rings
+
+    @classmethod
+    def make(cls, picture_bytes: int) -> Board:
+        """A new board for pictures of so many bytes."""
+        return cls(os.memfd_create("hilstar-console"), picture_bytes)
+
+    @property
+    def want(self) -> Want:
+        """What the page wants now."""
+        return Want(*_WANT.unpack_from(self._memory, 0))
+
+    @want.setter
+    def want(self, want: Want) -> None:
+        _WANT.pack_into(self._memory, 0, want.each_ns, want.until_ns)

@@ -1,0 +1,149 @@
+"""Where the page is reached: its address, the socket that listens there, and the token that lets somebody in."""
+
+from __future__ import annotations
+
+import contextlib
+import ipaddress
+import re
+import secrets
+import socket
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Self
+
+from hilstar.errors import InputError, shortened
+
+HOST, PORT = "127.0.0.1", 8765
+FORM = "write HOST:PORT, such as 127.0.0.1:8765, or 0.0.0.0:8765 to be reached from elsewhere"
+BACKLOG = 512
+TOKEN_BYTES = 32
+TOKEN = re.compile(r"[A-Za-z0-9._~-]{16,200}")  # what a URL and a WebSocket's subprotocol carry as it is
+NAME = re.compile(r"(?=.{1,253}$)[A-Za-z0-9]([A-Za-z0-9-]*[A-Za-z0-9])?(\.[A-Za-z0-9]([A-Za-z0-9-]*[A-Za-z0-9])?)*(:\d{1,5})?")
+
+
+@dataclass(frozen=True, slots=True)
+class Address:
+    """A host and a port; port 0 is any free one."""
+
+    host: str
+    port: int
+
+    @property
+    def is_loopback(self) -> bool:
+        """Whether only this machine reaches it."""
+        if self.host == "localhost":
+            return True
+        with contextlib.suppress(ValueError):
+            return ipaddress.ip_address(self.host).is_loopback
+        return False
+
+
+def parse_address(text: str) -> Address:
+    """ "HOST:PORT", "HOST", ":PORT" or "PORT". Raises InputError."""
+    wrong = InputError(f"--console {shortened(text)}: {FORM}")
+    if text.isdecimal() and text.isascii():
+        host, port = HOST, text
+    elif text.startswith("["):
+        host, _, rest = text[1:].partition("]")
+        if rest and not rest.startswith(":"):
+            raise wrong
+        port = rest[1:]
+    elif text.count(":") > 1:
+        host, port = text, ""
+    else:
+        host, _, port = text.partition(":")
+    if port and not (port.isdecimal() and port.isascii() and len(port) <= 5 and int(port) < 2**16):
+        raise wrong
+    host = host or HOST
+    if not _is_host(host):
+        raise wrong
+    return Address(host, int(port) if port else PORT)
+
+
+def _is_host(text: str) -> bool:
+    with contextlib.suppress(ValueError):
+        ipaddress.ip_address(text)
+        return True
+    return NAME.fullmatch(text) is not None and ":" not in text and not re.fullmatch(r"[\d.]+", text)
+
+
+class Door:
+    """The listening socket, and what opens it. Raises InputError where the address cannot be had.
+
+    A token is made where the page can be reached from elsewhere and none is given; `made` says that it was. `names` are
+    further names of the page, those under which a proxy shows it.
+    """
+
+    def __init__(self, address: Address, token: str | None = None, names: tuple[str, ...] = ()) -> None:
+        if token is not None and TOKEN.fullmatch(token) is None:
+            raise InputError("--token: write 16 to 200 letters, digits or . _ ~ -, as `openssl rand -hex 32` makes them")
+        for name in names:
+            if NAME.fullmatch(name) is None:
+                raise InputError(f"--console-name {shortened(name)}: write a name as browsers have it, such as stars.lab:8443")
+        self.names = names
+        self.made = token is None and not address.is_loopback
+        self.token = secrets.token_urlsafe(TOKEN_BYTES) if self.made else token or ""
+        self.any_address = not address.is_loopback
+        self.host = address.host
+        self.socket = _listen(address)
+        self.port: int = self.socket.getsockname()[1]
+
+    @property
+    def hosts(self) -> list[str]:
+        """The names under which a browser may ask for the page, besides numeric addresses where `any_address`."""
+        own = ["localhost", "127.0.0.1", "[::1]", _bracketed(self.host)]
+        if self.any_address:
+            own += [socket.gethostname(), socket.getfqdn()]
+        return sorted({name.lower() for name in own})
+
+    @property
+    def url(self) -> str:
+        """What to open; with the token where that was made here, never one that was given."""
+        host = self.host
+        with contextlib.suppress(ValueError):
+            if ipaddress.ip_address(host).is_unspecified:
+                host = _own_address(self.socket.family)
+        return f"http://{_bracketed(host)}:{self.port}/" + (f"#token={self.token}" if self.made else "")
+
+    def close(self) -> None:
+        """Stop listening."""
+        self.socket.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+
+def _bracketed(host: str) -> str:
+    return f"[{host}]" if ":" in host else host
+
+
+def _listen(address: Address) -> socket.socket:
+    where = f"{_bracketed(address.host)}:{address.port}"
+    try:
+        found = socket.getaddrinfo(address.host, address.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+    except (OSError, UnicodeError) as error:
+        raise InputError(f"--console {where}: no such host ({getattr(error, 'strerror', error)}); {FORM}") from error
+    family, kind, protocol, _, place = found[0]
+    listener = socket.socket(family, kind, protocol)
+    try:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind(place)
+        listener.listen(BACKLOG)
+    except OSError as error:
+        listener.close()
+        reason = str(error.strerror or error)
+        raise InputError(f"--console {where}: cannot listen there ({reason}); choose another port, or 0 for any") from error
+    listener.setblocking(False)
+    return listener
+
+
+def _own_address(family: socket.AddressFamily) -> str:
+    """The address by which others most likely reach this machine: that of its route out; nothing is sent."""
+    beyond = "2001:db8::1" if family == socket.AF_INET6 else "192.0.2.1"  # for documentation: RFC 5737, RFC 3849
+    with contextlib.suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as probe:
+        probe.connect((beyond, 9))
+        return str(probe.getsockname()[0])
+    return "::1" if family == socket.AF_INET6 else HOST

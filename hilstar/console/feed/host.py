@@ -1,0 +1,186 @@
+"""Keeps the page's process alive beside a run: starts it, restarts it when it ends, tells it of the run, and takes its orders.
+
+All of this is done by one thread, ten times a second; the frame loop has no part in it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Self
+
+import msgspec
+
+from hilstar.console.feed.board import Board
+from hilstar.console.feed.messages import Answer, EventSeen, Order, RunSeen, Setup
+from hilstar.console.feed.orders import Orders
+from hilstar.console.feed.seen import Watched
+from hilstar.notices import Notice
+
+TICK_S = 0.1
+FIRST_WAIT_S, MAX_WAIT_S = 0.1, 5.0  # before the page's process is started again
+STEADY_S = 10.0  # alive for so long, it is as good as new
+END_WAITS_S = 1.0
+MAX_ORDERS = 8  # at once
+MAX_ORDER_BYTES = 8_000
+PAGE = (sys.executable, "-P", "-m", "hilstar.console.server")
+
+
+@dataclass(slots=True)
+class _Page:
+    """One process of the page, and the socket to it."""
+
+    process: subprocess.Popen[bytes]
+    wire: socket.socket
+    begun_s: float
+
+
+class Host:
+    """The page of a run, for as long as this is open."""
+
+    def __init__(self, setup: Setup, board: Board, listener: socket.socket, watched: Watched, orders: Orders) -> None:
+        self._board, self._listener, self._watched, self._orders = board, listener, watched, orders
+        self._setup_fd = _memory_of(msgspec.msgpack.encode(setup))
+        self._events: deque[Notice] = deque(maxlen=1000)
+        watched.notices.listen(self._events.append)
+        self._stop = threading.Event()
+        self._page: _Page | None = None
+        self._start_s, self._wait_s = 0.0, FIRST_WAIT_S
+        self._workers = ThreadPoolExecutor(MAX_ORDERS, thread_name_prefix="hilstar-order")
+        self._thread = threading.Thread(target=self._run, name="hilstar-console", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+        self._stop.set()
+        self._thread.join()
+        self._workers.shutdown(wait=False, cancel_futures=True)
+        os.close(self._setup_fd)
+
+    @property
+    def pid(self) -> int | None:
+        """The number of the page's process, None while there is none."""
+        return None if self._page is None else self._page.process.pid
+
+    def _run(self) -> None:
+        next_s = 0.0
+        while not self._stop.is_set():
+            now_s = time.monotonic()
+            if now_s >= next_s:
+                next_s = now_s + TICK_S
+                self._tick(now_s)
+            self._listen(max(next_s - time.monotonic(), 0.0))
+        self._end_page()
+
+    def _tick(self, now_s: float) -> None:
+        try:
+            self._board.states.put(msgspec.json.encode(self._watched.now()))
+        except RuntimeError as error:  # a container that changed while it was read: the next look is 0.1 s away
+            self._board.states.put(msgspec.json.encode(RunSeen(host_ns=time.monotonic_ns(), note=str(error))))
+        self._write_events()
+        page = self._page
+        if page is None:
+            if now_s >= self._start_s:
+                self._start_page(now_s)
+        elif page.process.poll() is not None:
+            self._lost(page, now_s)
+
+    def _write_events(self) -> None:
+        ahead_s = time.time() - time.monotonic_ns() * 1e-9
+        while self._events:
+            notice = self._events.popleft()
+            event = EventSeen(round(notice.host_ns * 1e-9 + ahead_s, 3), notice.kind, notice.detail)
+            self._board.events.put(msgspec.json.encode(event))
+
+    def _start_page(self, now_s: float) -> None:
+        wire, its_wire = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        given = (self._setup_fd, self._board.fd, its_wire.fileno(), self._listener.fileno())
+        try:
+            process = subprocess.Popen(
+                [*PAGE, *map(str, given)],
+                pass_fds=given,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                env=_environment(),
+            )
+        except OSError as error:
+            wire.close()
+            self._put_off(now_s, f"the operator's page cannot be started ({error.strerror})")
+            return
+        finally:
+            its_wire.close()
+        wire.setblocking(False)
+        self._page = _Page(process, wire, now_s)
+
+    def _lost(self, page: _Page, now_s: float) -> None:
+        page.wire.close()
+        self._page = None
+        if now_s - page.begun_s > STEADY_S:
+            self._wait_s = FIRST_WAIT_S
+        code = page.process.returncode
+        self._put_off(now_s, f"the operator's page ended ({f'signal {-code}' if code < 0 else f'exit code {code}'})")
+
+    def _put_off(self, now_s: float, what: str) -> None:
+        self._watched.notices.tell("console-lost", f"{what}; it is started again")
+        self._start_s, self._wait_s = now_s + self._wait_s, min(2 * self._wait_s, MAX_WAIT_S)
+
+    def _listen(self, seconds: float) -> None:
+        page = self._page
+        if page is None:
+            self._stop.wait(seconds)
+            return
+        ready, _, _ = select.select([page.wire], [], [], seconds)
+        if not ready:
+            return
+        with contextlib.suppress(OSError, msgspec.MsgspecError):
+            data = page.wire.recv(MAX_ORDER_BYTES)
+            if data:
+                self._take(msgspec.json.decode(data, type=Order))
+            else:  # its end is told by the next tick
+                self._stop.wait(seconds)
+
+    def _take(self, order: Order) -> None:
+        self._workers.submit(self._orders.do, order).add_done_callback(self._answer)
+
+    def _answer(self, done: Future[Answer]) -> None:
+        page = self._page
+        if page is None or done.cancelled() or done.exception() is not None:
+            return
+        with contextlib.suppress(OSError):  # it has gone meanwhile
+            page.wire.send(msgspec.json.encode(done.result()))
+
+    def _end_page(self) -> None:
+        page, self._page = self._page, None
+        if page is None:
+            return
+        page.wire.close()  # which tells it to end
+        try:
+            page.process.wait(END_WAITS_S)
+        except subprocess.TimeoutExpired:
+            page.process.kill()
+            page.process.wait()
+
+
+def _environment() -> dict[str, str]:
+    """This process's own, in which Python finds what it finds here, and nothing in the folder that the run was started in."""
+    return os.environ | {"PYTHONPATH": os.pathsep.join(place for place in sys.path if place)}
+
+
+def _memory_of(data: bytes) -> int:
+    """A descriptor of memory with these bytes, to be read by a process that is given it."""
+    fd = os.memfd_create("hilstar-console-setup")
+    with os.fdopen(os.dup(fd), "wb") as file:
+        file.write(data)
+    return fd

@@ -1,0 +1,178 @@
+"""What a run and its page say to each other: frames, states, events and pictures on the board, orders and their answers."""
+
+from __future__ import annotations
+
+import math
+import struct
+from typing import Any, NamedTuple, Self
+
+import msgspec
+
+FRAME = struct.Struct("<12qI")
+_PICTURE = struct.Struct("<3q4I4d")
+STALE, MISSING, BLANK, HAS_AGE = 1, 2, 4, 8
+
+
+class FrameNumbers(NamedTuple):
+    """One frame and the counts up to it; host times, ns. `flags` are of STALE, MISSING, BLANK and HAS_AGE."""
+
+    number: int
+    draw_ns: int
+    swap_ns: int
+    predicted_swap_ns: int
+    age_ns: int
+    missed_before: int
+    frames: int
+    missed: int
+    stale: int
+    given_up: int
+    received: int
+    refused: int
+    flags: int
+
+    def pack(self) -> bytes:
+        """Its bytes on the board."""
+        return FRAME.pack(*self)
+
+    @classmethod
+    def unpack(cls, data: bytes) -> Self:
+        """Those bytes read."""
+        return cls(*FRAME.unpack(data))
+
+
+class PictureHead(NamedTuple):
+    """A picture: its frame, when that was shown (host time, ns), and how much follows.
+
+    `q_w` to `q_z` are its attitude, NaN without one. First levels of
+    `item_bytes` each, `width` by `height`, then `sprites` of `board.SPRITE`.
+    """
+
+    frame: int
+    swap_ns: int
+    t_ns: int
+    width: int
+    height: int
+    item_bytes: int
+    sprites: int
+    q_w: float = math.nan
+    q_x: float = math.nan
+    q_y: float = math.nan
+    q_z: float = math.nan
+
+    def pack(self) -> bytes:
+        """Its bytes on the board."""
+        return _PICTURE.pack(*self)
+
+    @classmethod
+    def unpack(cls, data: bytes) -> Self:
+        """Those bytes read."""
+        return cls(*_PICTURE.unpack_from(data))
+
+
+class AttitudeSeen(msgspec.Struct, frozen=True):
+    """The attitude of the newest frame: cam from ICRS, scalar first; the rate in cam, rad/s."""
+
+    q: tuple[float, float, float, float]
+    rate_rad_s: tuple[float, float, float] | None
+    age_ns: int
+
+
+class ClockSeen(msgspec.Struct, frozen=True):
+    """The sender's clock."""
+
+    mode: str
+    offset_ms: float | None
+    drift_ppm: float | None
+    uncertainty_ms: float | None
+
+
+class LedgerSeen(msgspec.Struct, frozen=True):
+    """The ledger: `failing` says why it cannot be written now, "" where it can."""
+
+    path: str
+    bytes: int
+    failing: str = ""
+
+
+class RunSeen(msgspec.Struct, frozen=True, kw_only=True):
+    """The run at a moment of host time, ns; `alive_ns` is when the frame loop last moved, 0 before it began."""
+
+    host_ns: int
+    alive_ns: int = 0
+    frame: int = -1
+    stale: bool = False
+    missing: bool = True
+    blank: bool = True
+    stars: int = 0
+    clipped: list[int | str] = []
+    attitude: AttitudeSeen | None = None
+    clock: ClockSeen | None = None
+    frames: int = 0
+    missed: int = 0
+    stale_frames: int = 0
+    given_up: int = 0
+    received: int = 0
+    refused: dict[str, int] = {}
+    operator: dict[str, bool] = {}
+    operator_text: str = ""
+    overlay: int = 0
+    patch_share: float = 0.0
+    hidden: str = ""
+    display_lost: str = ""
+    ledger: LedgerSeen | None = None
+    note: str = ""
+    faults: list[str] = []
+    failed: list[str] = []
+
+
+class EventSeen(msgspec.Struct, frozen=True):
+    """An event of the run, at UTC, seconds."""
+
+    unix_s: float
+    kind: str
+    line: str
+
+
+SWITCHES = ("blank", "pause", "patch", "crosshair", "grid")  # as `run.aids` has them
+CONTROLS = (*SWITCHES, "ledger", "mark", "fault")
+PATCH_SHARE = 0.5  # of white, where an order does not say
+
+
+class Order(msgspec.Struct, kw_only=True):
+    """What a page asks for: a name of CONTROLS, what is to be, and by whom."""
+
+    id: int
+    name: str
+    who: str
+    on: bool = True
+    level: float = PATCH_SHARE
+    text: str = ""
+    fault: str = ""
+
+
+class Answer(msgspec.Struct, kw_only=True):
+    """What became of an order: an HTTP status, and a line."""
+
+    id: int
+    status: int
+    line: str
+
+
+class Setup(msgspec.Struct, kw_only=True):
+    """What the page's process knows from the start; `hello` is what it tells every page first.
+
+    `timed` says that frames are due whether an attitude comes or not. A page without a `token` is for anyone who reaches it.
+    """
+
+    hello: dict[str, Any]
+    source: dict[str, str]
+    hosts: list[str]
+    names: list[str]
+    any_address: bool
+    port: int
+    token: str
+    control: bool
+    picture_bytes: int
+    refresh_hz: float
+    timed: bool
+    scene: bytes = b""  # a pickled `overlay.Scene`

@@ -1,0 +1,98 @@
+"""Opens the page of a run: one call for the commands."""
+
+from __future__ import annotations
+
+import pickle
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from hilstar import __version__
+from hilstar.console.feed.board import Board
+from hilstar.console.feed.door import Door
+from hilstar.console.feed.feed import Feed
+from hilstar.console.feed.host import Host
+from hilstar.console.feed.messages import Setup
+from hilstar.console.feed.orders import Orders
+from hilstar.console.feed.seen import Watched
+from hilstar.console.feed.staging import scene_of
+from hilstar.errors import printable
+from hilstar.run.desk import Desk
+
+if TYPE_CHECKING:
+    from hilstar.bench.faults.desk import FaultDesk
+    from hilstar.bench.frame import Bench
+    from hilstar.notices import Notices
+    from hilstar.run.record.ledger import Ledger
+    from hilstar.run.record.ledger_switch import LedgerSwitch
+    from hilstar.run.screen.screen import Screen
+
+
+@dataclass(frozen=True, slots=True)
+class Told:
+    """What the page says of a run: the command, where attitudes come from, and whether frames are due by the clock."""
+
+    command: str
+    kind: str
+    endpoint: str
+    timed: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Parts:
+    """What a run is made of; `make_ledger` begins one at a path."""
+
+    bench: Bench
+    notices: Notices
+    ledger: LedgerSwitch
+    make_ledger: Callable[[Path], Ledger]
+    screen: Screen | None = None
+    faults: FaultDesk | None = None
+
+
+@contextmanager
+def opened_page(door: Door, control: bool, told: Told, parts: Parts) -> Iterator[tuple[Feed, Desk]]:
+    """The page of a run while this is open: what frames are given to, and where its wishes come from."""
+    width, height = parts.bench.config.monitor.resolution_px
+    picture_bytes = width * height * (1 if parts.bench.calibration.response.white < 2**8 else 2)
+    board = Board.make(picture_bytes)
+    feed, desk = Feed(board), Desk()
+    watched = Watched(feed, parts.notices, parts.ledger, parts.screen, parts.faults)
+    orders = Orders(desk, watched, parts.make_ledger)
+    with Host(setup_of(door, control, told, parts, picture_bytes), board, door.socket, watched, orders):
+        yield feed, desk
+
+
+def setup_of(door: Door, control: bool, told: Told, parts: Parts, picture_bytes: int) -> Setup:
+    """What the page's process is told at its start."""
+    bench, monitor = parts.bench, parts.bench.config.monitor
+    hello = {
+        "version": __version__,
+        "command": f"hilstar {told.command}",
+        "bench": printable(bench.file.path.name),
+        "renderer": bench.renderer.gl_renderer,
+        "started_utc": f"{datetime.fromtimestamp(time.time(), UTC):%Y-%m-%dT%H:%M:%SZ}",
+        "resolution_px": list(monitor.resolution_px),
+        "white_level": bench.calibration.response.white,
+        "bits": monitor.bits,
+        "refresh_hz": monitor.refresh_hz,
+        "faults": [] if parts.faults is None else parts.faults.names(),
+    }
+    return Setup(
+        hello=hello,
+        source={"kind": told.kind, "endpoint": printable(told.endpoint)},
+        hosts=door.hosts,
+        names=[name.lower() for name in door.names],
+        any_address=door.any_address,
+        port=door.port,
+        token=door.token,
+        control=control,
+        picture_bytes=picture_bytes,
+        refresh_hz=monitor.refresh_hz,
+        timed=told.timed,
+        scene=pickle.dumps(scene_of(bench, aids_in_levels=parts.screen is None)),
+    )

@@ -1,0 +1,181 @@
+"""The operator's page of a run: what it is told, what it may do, and that it comes back and goes with the run."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import time
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from hilstar.attitude.logs.mcap_log import read_messages
+from hilstar.run.record.ledger_reader import frame_records
+from hilstar.run.record.ledger_records import EventRecord
+from tests.support.pages import PageAddress, children, live, page_of, picture_of
+from tests.support.senders import LYRA, ORION, connected, talking
+from tests.support.servers import bound
+from tests.support.waiting import wait_for
+
+pytestmark = pytest.mark.e2e
+PAGE = "hilstar.console.server"
+# `stale_after_ms` is 250; then the next frame, a tick of the run's and one of the page's. What is left is for a busy machine.
+STALE_S, SEEN_S = 0.25, 0.5
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("page")
+    with bound(folder, "--console", "127.0.0.1:0", "--control", "--ledger", str(folder / "run.mcap")) as served:
+        yield served, page_of(served), folder
+
+
+@pytest.fixture
+def page(run) -> PageAddress:
+    return run[1]
+
+
+def events(ledger: Path) -> list[EventRecord]:
+    return [msgspec.json.decode(data, type=EventRecord) for data in read_messages(ledger, "/event")]
+
+
+def test_health_says_what_is_wrong_and_turns_within_half_a_second(run):
+    served, page, _ = run
+    assert page.json("/health")["reasons"] == ["no attitude has come yet"]
+    with connected(served.port) as sender:
+        with talking(sender):
+            wait_for(lambda: page.health_is(True))
+            with live(page) as link:
+                link.await_message(lambda said: said.get("state", {}).get("health", {}).get("ok"))
+        stopped_s = time.monotonic()
+        with live(page) as link:
+            said = link.await_message(lambda said: "state" in said and not said["state"]["health"]["ok"])
+        assert time.monotonic() - stopped_s < STALE_S + SEEN_S
+        assert said["state"]["health"]["reasons"][0].startswith("the attitude is stale")
+        assert page.health_is(False)
+
+
+def test_a_picture_has_the_stars_of_its_frame_where_the_truth_says(run):
+    served, page, _ = run
+    with connected(served.port) as sender, talking(sender, q=ORION), live(page) as link:
+        wait_for(lambda: page.health_is(True))
+        link.want(picture=True, hz=10, grid=True)
+        truth = link.await_message(lambda said: isinstance(said, dict) and said.get("truth", {}).get("stars"))["truth"]
+        head, levels = picture_of(link.await_message(lambda said: isinstance(said, bytes)))
+    assert (head["w"], head["h"]) == (320, 240) and levels.dtype == np.uint8
+    assert truth["frame"] == head["frame"]
+    shown = [star for star in truth["stars"] if 2 < star[0] < 317 and 2 < star[1] < 237][:5]
+    assert len(shown) == 5
+    for x, y, *_ in shown:
+        near = levels[round(y) - 2 : round(y) + 3, round(x) - 2 : round(x) + 3]
+        brightest = np.unravel_index(np.argmax(near), near.shape)
+        assert abs(brightest[0] - 2 + round(y) - y) <= 1 and abs(brightest[1] - 2 + round(x) - x) <= 1
+    assert {"\u03b6 Ori", "\u03b5 Ori"} & {star[4] for star in truth["stars"][:8]}
+    assert len(truth["grid"]) > 4 and all(len(line["px"]) > 1 for line in truth["grid"])
+
+
+def test_a_picture_is_the_run_s_own_and_moves_with_the_attitude(run):
+    served, page, _ = run
+    with connected(served.port) as sender, live(page) as link:
+        link.want(picture=True, hz=10)
+        seen = []
+        for q in (ORION, LYRA):
+            with talking(sender, q=q, first=10_000 * (1 + len(seen))):
+                wait_for(lambda: page.health_is(True))
+                head, levels = picture_of(link.await_message(lambda said: isinstance(said, bytes) and len(said) > 300))
+                for _ in range(5):  # those that were on their way
+                    head, levels = picture_of(link.await_message(lambda said: isinstance(said, bytes)))
+                seen.append((head["frame"], levels))
+    assert seen[1][0] > seen[0][0]
+    assert not np.array_equal(seen[0][1], seen[1][1]) and seen[0][1].max() > 0 and seen[1][1].max() > 0
+
+
+def test_each_control_acts_on_the_next_frames_and_is_in_the_ledger_with_who(run):
+    served, page, folder = run
+    with connected(served.port) as sender, talking(sender):
+        wait_for(lambda: page.health_is(True))
+        for name in ("blank", "pause", "patch", "crosshair", "grid"):
+            assert page.control(name, "Ada", on=True) == (200, {"line": f"{name} on"})
+            assert page.json("/state")["state"]["operator"][name]
+            assert page.control(name, "Ada", on=False) == (200, {"line": f"{name} off"})
+        assert page.control("mark", "J%C3%B6rg", text="lamp\x1b[2J on") == (200, {"line": "mark written"})
+        wait_for(lambda: page.health_is(True))
+    wait_for(lambda: any(event.kind == "mark" for event in events(folder / "run.mcap")))
+    told = [(event.detail, event.who) for event in events(folder / "run.mcap") if event.who]
+    assert told[:2] == [("blank on, by Ada: blank", "Ada"), ("blank off, by Ada: the sky of the attitude again", "Ada")]
+    assert told[-1] == ("mark, by J\u00f6rg: lamp\\x1b[2J on", "J\u00f6rg")
+    assert len(told) == 11
+    operators = {frame.operator for frame in frame_records(folder / "run.mcap")}
+    assert {"blank", "pause", "patch 50%", "crosshair", "grid"} <= operators
+
+
+def test_a_blank_or_a_patch_is_what_the_picture_shows(run):
+    served, page, _ = run
+    with connected(served.port) as sender, talking(sender), live(page) as link:
+        wait_for(lambda: page.health_is(True))
+        link.want(picture=True, hz=10)
+        for name, value in (("blank", 0), ("patch", 128)):
+            assert page.control(name, on=True)[0] == 200
+            for _ in range(200):
+                _, levels = picture_of(link.await_message(lambda said: isinstance(said, bytes)))
+                if (levels == value).all():
+                    break
+            assert (levels == value).all()
+            assert f"changed by the operator: {name}" in page.json("/health")["reasons"][0]
+            assert page.control(name, on=False)[0] == 200
+
+
+def test_a_ledger_is_ended_and_begun_while_the_run_goes_on(run):
+    _, page, folder = run
+    status, answer = page.control("ledger", on=False)
+    assert status == 200 and "is whole" in answer["line"]
+    assert page.json("/state")["state"]["ledger"] is None
+    before = len(list(frame_records(folder / "run.mcap")))
+    assert page.control("ledger", on=True)[0] == 200
+    path = Path(page.json("/state")["state"]["ledger"]["path"])
+    assert path.parent == folder and path.name != "run.mcap"
+    wait_for(lambda: path.stat().st_size and len(list(frame_records(path))) > 5)
+    assert len(list(frame_records(folder / "run.mcap"))) == before
+
+
+def test_a_page_killed_comes_back_by_itself_while_frames_go_on(run):
+    served, page, _ = run
+    (first,) = children(served.process.pid, PAGE)
+    frames = page.json("/state")["state"]["counts"]["frames"]
+    os.kill(first, signal.SIGKILL)
+    wait_for(lambda: [pid for pid in children(served.process.pid, PAGE) if pid != first])
+    assert page.json("/state")["state"]["counts"]["frames"] > frames  # the request waits at the door until there is a page
+    assert served.count("the operator's page ended (signal 9); it is started again") == 1
+
+
+def test_metrics_are_openmetrics_with_the_run_s_counts(page):
+    from prometheus_client.openmetrics.parser import text_string_to_metric_families
+
+    status, headers, data = page.ask("/metrics")
+    assert status == 200 and headers["content-type"].startswith("application/openmetrics-text")
+    samples = {
+        sample.name: sample.value for family in text_string_to_metric_families(data.decode()) for sample in family.samples
+    }
+    counts = page.json("/state")["state"]["counts"]
+    assert 0 < samples["hilstar_frames_total"] <= counts["frames"]
+    assert samples["hilstar_packets_received_total"] <= counts["received"]
+    assert samples["hilstar_healthy"] in {0.0, 1.0}
+
+
+@pytest.mark.parametrize("sign", [signal.SIGKILL, signal.SIGINT])
+def test_the_page_ends_with_its_run(tmp_path, sign):
+    with bound(tmp_path, "--console", "127.0.0.1:0") as served:
+        page_of(served)
+        (pid,) = children(served.process.pid, PAGE)
+        served.process.send_signal(sign)
+        wait_for(lambda: served.process.poll() is not None)
+        wait_for(lambda: _gone(pid))
+
+
+def _gone(pid: int) -> bool:
+    with contextlib.suppress(OSError, IndexError):
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    return True

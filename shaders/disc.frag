@@ -149,14 +149,16 @@ void main() {
     light = vec4(0.0);
     vec2 px = vec2(ivec2(gl_FragCoord.xy));
     vec3 seen = ray(px);
-    seen += dot(late_s_per_px, px - middle_px) * cross(turn_rad_s, seen);
+    vec3 turning = cross(turn_rad_s, seen);
+    seen += dot(late_s_per_px, px - middle_px) * turning;
     mat2 slopes = ray_slopes(px);
     vec3 s = to_sphere * seen;
     if (s.z <= 0.0) return;
     Sight here = sight(seen);
     // How the impact grows along x and y.
     float size = length(s), sine = length(s.xy) / size;
-    vec3 along_x = to_sphere * vec3(slopes[0], 0.0), along_y = to_sphere * vec3(slopes[1], 0.0);
+    vec3 along_x = to_sphere * (vec3(slopes[0], 0.0) + late_s_per_px.x * turning);
+    vec3 along_y = to_sphere * (vec3(slopes[1], 0.0) + late_s_per_px.y * turning);
     vec2 growth = distance_radii / size * (vec2(dot(here.side, along_x.xy), dot(here.side, along_y.xy))
         - sine / size * vec2(dot(s, along_x), dot(s, along_y)));
     float fall = length(growth);

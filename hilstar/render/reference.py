@@ -1,24 +1,30 @@
-"""The oracle: what the renderer should draw, in NumPy float64 with an exact erf."""
+"""The oracle: what the renderer should draw, in NumPy float64 with an exact erf, and discs by many rays a pixel."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from hilstar.arrays import FloatArray
+from hilstar.scene.extended import DiscLight, ExtendedLight, Glow, LightMap, Rectangle
 from hilstar.scene.psf import pixel_shares
 from hilstar.scene.sprites import Sprites
+
+RAYS_ACROSS = 5  # a pixel, along either axis: a limb is then within 0.02 px
+REACH_SIGMAS = 5  # of a disc's light from beyond its rectangle
 
 
 def linear_image(
     sprites: Sprites, resolution_px: tuple[int, int], sigma_px: tuple[float, float], footprint_px: int | None = None
 ) -> FloatArray:
-    """Electrons per second of each pixel, float64, shape (height, width).
+    """Electrons per second of each pixel, float64, shape (height, width): extended light, then sprites.
 
     `footprint_px` larger than the sprites' own shows what their footprints cut.
     """
     width, height = resolution_px
     size = sprites.footprint_px if footprint_px is None else footprint_px
     image = np.zeros((height, width))
+    for light in sprites.extended:
+        _lay(light, image)
     steps = np.arange(size) - (size - 1) // 2
     for sprite, x_px, y_px in zip(sprites.data, sprites.x_px, sprites.y_px, strict=True):
         columns, rows = sprite["pixel"][0] + steps, sprite["pixel"][1] + steps
@@ -26,3 +32,66 @@ def linear_image(
         share_x, share_y = pixel_shares(columns - x_px, sigma_px[0]), pixel_shares(rows - y_px, sigma_px[1])
         image[np.ix_(rows, columns)] += float(sprite["electrons_per_s"]) * np.outer(share_y, share_x)
     return image
+
+
+def _lay(light: ExtendedLight, image: FloatArray) -> None:
+    """Add light to an image, and hide what was there where it covers that."""
+    region = light.region((image.shape[1], image.shape[0]))
+    if region is None:
+        return
+    left, top, width, height = region
+    if isinstance(light, LightMap):
+        x, y = light.corner_px
+        part = slice(top - y, top - y + height), slice(left - x, left - x + width)
+        own = light.times * light.image[part].astype(np.float64)
+        cover = np.zeros(1) if light.cover is None else light.cover[part]
+    elif isinstance(light, Glow):
+        own, cover = _glow(light, region), np.zeros(1)
+    else:
+        own, cover = _disc(light, region)
+    where = slice(top, top + height), slice(left, left + width)
+    image[where] = image[where] * (1 - cover) + own
+
+
+def _glow(light: Glow, region: Rectangle) -> FloatArray:
+    left, top, width, height = region
+    y, x = np.mgrid[top : top + height, left : left + width].astype(np.float64)
+    u, v = light.camera.tangents(x.ravel(), y.ravel())
+    seen = np.stack([u, v, np.ones_like(u)], axis=1)
+    angle = np.arctan2(np.linalg.norm(np.cross(light.direction_image, seen), axis=1), seen @ light.direction_image)
+    profile = (1 + (angle / light.scale_rad) ** 2) ** (-light.exponent / 2)
+    return np.asarray(light.peak_e_per_s * profile.reshape(height, width))
+
+
+def _disc(light: DiscLight, region: Rectangle) -> tuple[FloatArray, FloatArray]:
+    """A disc's light and cover (height, width) in a region: sharp on a grid of rays, then spread by the Gaussian."""
+    from scipy.ndimage import gaussian_filter
+
+    left, top, width, height = region
+    margin = int(np.ceil(REACH_SIGMAS * max(light.sigma_px)))
+    columns, rows = (
+        (np.arange((size + 2 * margin) * RAYS_ACROSS) + 0.5) / RAYS_ACROSS - 0.5 - margin + first
+        for size, first in ((width, left), (height, top))
+    )
+    sharp = np.stack([_rays(light, columns, y) for y in rows], axis=1)
+    sigma = [RAYS_ACROSS * sigma_px for sigma_px in reversed(light.sigma_px)]
+    found = []
+    for part in sharp:
+        fine = gaussian_filter(part, sigma, mode="nearest", truncate=REACH_SIGMAS)
+        whole = fine.reshape(height + 2 * margin, RAYS_ACROSS, width + 2 * margin, RAYS_ACROSS).mean(axis=(1, 3))
+        found.append(whole[margin : margin + height, margin : margin + width])
+    return light.times * found[0], light.covers * found[1]
+
+
+def _rays(light: DiscLight, x_px: FloatArray, y_px: float) -> FloatArray:
+    """Light to a pixel, and cover (2, n), along the rays of a row of places (n,)."""
+    camera = light.camera
+    u, v = camera.tangents(x_px, np.full_like(x_px, y_px))
+    seen = np.nan_to_num(np.stack([u, v, np.ones_like(u)], axis=1))
+    if light.shear is not None:
+        late_s = light.shear.late_s(x_px, np.full_like(x_px, y_px))
+        seen = seen + late_s[:, None] * np.cross(light.shear.rate_image_rad_s, seen)
+    a, b, c, d = camera.slopes(seen[:, 0], seen[:, 1])
+    sr = np.nan_to_num(1 / (a * d - b * c)) / np.linalg.norm(seen, axis=1) ** 3
+    radiance, cover = light.disc.with_air(seen @ light.icrs_to_image)
+    return np.stack([radiance * sr, cover])

@@ -15,7 +15,16 @@ from hilstar.twin.verify.blends import with_blends_as_one
 from hilstar.twin.verify.displacement import Displaced
 from hilstar.twin.verify.light import true_calibration
 from hilstar.twin.verify.measured import Glow, Measured, Star, Tally
-from hilstar.twin.verify.star_finder import Matched, StarFinder, crowded, faintest_e_per_s, nearest, shared, star_finder
+from hilstar.twin.verify.star_finder import (
+    WING_SIGMAS,
+    Matched,
+    StarFinder,
+    crowded,
+    faintest_e_per_s,
+    nearest,
+    shared,
+    star_finder,
+)
 from hilstar.twin.verify.twin import Field, Twin
 from hilstar.units import magnitude
 
@@ -109,7 +118,8 @@ class Comparison:
 
     def _blended(self, seen: Field, sky: Matched) -> npt.NDArray[np.bool_]:
         flux, radius_px = seen.truth["electrons_per_s"], self.finder.settings.radius_px
-        return np.asarray(shared(sky.index) | crowded(seen.x_px, seen.y_px, flux, radius_px, self.finder.sigma_px))
+        by_disc = seen.near_disc(self.twin.camera, radius_px + WING_SIGMAS * max(self.finder.sigma_px))
+        return np.asarray(shared(sky.index) | crowded(seen.x_px, seen.y_px, flux, radius_px, self.finder.sigma_px) | by_disc)
 
     def _follow(self, seen: Field, shown: Centroids, wanted: npt.NDArray[np.bool_]) -> None:
         """Find each star where the true lens shows it, and note how far that is from where the sky has it."""

@@ -16,6 +16,7 @@ from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import open_bench
 from hilstar.bench.cameras import ideal_monitor, real_monitor, tracker_camera
 from hilstar.bench.config import Verify
+from hilstar.bench.discs import When
 from hilstar.bench.frame import Bench
 from hilstar.errors import InputError
 from hilstar.monitor.geometry import monitor_camera
@@ -33,7 +34,8 @@ class Field:
     """One attitude: mean electrons, (h, w) each, and its stars at their places (n,) in tracker pixels, as the sky has them.
 
     `shown_e` is what the monitor as it is makes, `assumed_e` what it would make if everything were as assumed (the same
-    array where nothing differs), and `sky_e` what the stars themselves make. `truth` has the rows of TRUTH_DTYPE.
+    array where nothing differs), and `sky_e` what the stars themselves make. `truth` has the rows of TRUTH_DTYPE of stars and
+    points, and `discs` those bodies' directions (3,), cam, and radii, rad, which are more than points.
     """
 
     shown_e: FloatArray
@@ -42,6 +44,16 @@ class Field:
     truth: npt.NDArray[np.void]
     x_px: FloatArray
     y_px: FloatArray
+    discs: tuple[tuple[FloatArray, float], ...] = ()
+
+    def near_disc(self, camera: Camera, margin_px: float) -> npt.NDArray[np.bool_]:
+        """True for stars (n,) within `margin_px` of a disc's limb, or before it."""
+        near = np.zeros(len(self.truth), dtype=bool)
+        rays = camera.rays(self.x_px, self.y_px)
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        for direction, radius_rad in self.discs:
+            near |= rays @ direction > math.cos(min(radius_rad + margin_px / camera.focal_length_px, math.pi))
+        return near
 
 
 class Twin:
@@ -75,8 +87,12 @@ class Twin:
         lights = exposure_lights(self.bench, frame, first_frame, panels)
         shown = self.true_optics.image_e_per_s(lights[0]) * exposure_s
         assumed = self.sky_optics.image_e_per_s(lights[1]) * exposure_s if self.differs else shown
-        x_px, y_px = self.camera.project(self.bench.stars.directions(frame.star) @ to_matrix(frame.q_icrs_to_cam).T)
-        return Field(shown, assumed, sky, frame.truth, x_px, y_px)
+        icrs_to_cam = to_matrix(frame.q_icrs_to_cam)
+        discs = self.bench.discs(frame.q_icrs_to_cam, When())
+        points = ~np.isin(frame.truth["name"], [disc.name for disc in discs])
+        x_px, y_px = self.camera.project(self.bench.stars.directions(frame.star[points]) @ icrs_to_cam.T)
+        found = tuple((icrs_to_cam @ disc.direction, disc.radius_rad) for disc in discs)
+        return Field(shown, assumed, sky, frame.truth[points], x_px, y_px, found)
 
     def detected_e(self, seen: Field, rng: np.random.Generator) -> FloatArray:
         """Electrons of one noisy exposure (h, w) as the DN give them, the mean of glow and background subtracted."""

@@ -1,0 +1,223 @@
+"""Discs in frames: stars and bodies behind them, white, the edge of the screen, a turn, and every quantisation."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from skyfield.api import Star
+
+from hilstar.bench.bench_file import read_bench_file
+from hilstar.bench.build import load
+from hilstar.bench.discs import DiscPainter, When
+from hilstar.bench.frame import Bench
+from hilstar.monitor.quantise import dither_levels, round_levels, temporal_levels
+from hilstar.monitor.response import srgb_response
+from hilstar.render.reference import linear_image
+from hilstar.render.renderer import Renderer, Target
+from hilstar.rotation import from_radec_roll_deg
+from hilstar.scene.camera import Camera
+from hilstar.scene.discs import Pose, View, disc_lights
+from hilstar.scene.extended import Shear
+from hilstar.scene.frame_motion import Scan, Turn
+from hilstar.scene.lens import Lens
+from hilstar.sky.bodies.disc import Disc
+from hilstar.twin.verify.measure import Comparison
+from hilstar.twin.verify.twin import Twin
+from tests.support.benches import TWIN, bench_text
+from tests.support.skies import skyfield
+from tests.support.stars import sprites_at
+
+# The Moon before the Beehive.
+NIGHT, BEEHIVE = "2026-11-29T00:00:00Z", (42485, 42516, 42523, 42549, 42578)
+SIZE, SIGMA, WHITE = (96, 80), (0.85, 0.85), 4e5
+CAMERA = Camera(SIZE, 900.0, (47.5, 39.5), np.eye(3))
+LENS = Lens(radial=(0.2, 0.05, 0.0), tangential=(1e-3, -2e-3))
+# The reference's own rays, five across a pixel, leave 0.3 % of a small crescent's light and 3 % of its brightest pixel.
+FLUX_LIMIT, PIXEL_LIMIT = 0.01, 0.05
+NOW = When()
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory) -> Iterator[Bench]:
+    file = tmp_path_factory.mktemp("discs") / "bench.toml"
+    bodies = {"moon": True, "sun": True, "planets": True}
+    tables = {"sky": {"epoch_utc": NIGHT, "faintest_v_mag": 7.0}, "sky.bodies": bodies, "render": {"quantisation": "round"}}
+    file.write_text(bench_text(tables))
+    with load(file) as opened:
+        yield opened
+
+
+def aim(bench: Bench, name: str, off_deg: float = 0.0) -> np.ndarray:
+    """The attitude with a body that far above the middle."""
+    vector = bench.seen(bench.stars).vectors[len(bench.stars) - len(bench.stars.bodies) + bench.stars.bodies.index(name)]
+    ra, dec = np.degrees(np.arctan2(vector[1], vector[0])), np.degrees(np.arcsin(vector[2]))
+    return from_radec_roll_deg(ra, dec - off_deg, 0.0)
+
+
+def disc(radius_px: float, phase_deg: float, at_px=(45.0, 41.0), name="Moon") -> Disc:
+    direction = CAMERA.rays(np.array([at_px[0]]), np.array([at_px[1]]))[0]
+    direction /= np.linalg.norm(direction)
+    side = np.cross(direction, [0.3, 1.0, 0.2])
+    side /= np.linalg.norm(side)
+    sun = -np.cos(np.radians(phase_deg)) * direction + np.sin(np.radians(phase_deg)) * side
+    distance = 1 / np.sin(radius_px / CAMERA.focal_length_px)
+    one = Disc(name, direction, distance, 1.0, 1.0, np.array([0.0, 0.0, 1.0]), sun, "lunar-lambert", 1.0, 0.6)
+    return one.of_rate(1e8)
+
+
+def test_stars_behind_the_moon_are_neither_drawn_nor_in_the_table(bench):
+    q = aim(bench, "Moon")
+    shot = bench.frame(q)
+    listed = set(shot.truth["hip"].tolist())
+    assert not listed & set(BEEHIVE)
+    with skyfield() as (scale, kernel):
+        now = kernel["earth"].at(scale.utc(2026, 11, 29))
+        moon = now.observe(kernel["moon"]).apparent()
+        radius_deg = np.degrees(np.arcsin(1737.4 / moon.distance().km))
+        catalog = bench.stars.catalog
+        near = np.flatnonzero((np.abs(catalog.dec_deg - 19.5) < 3) & (np.abs(catalog.ra_deg - 130) < 3) & (catalog.v_mag < 7))
+        stars = Star(ra_hours=catalog.ra_deg[near] / 15, dec_degrees=catalog.dec_deg[near])
+        off_deg = now.observe(stars).apparent().separation_from(moon).degrees
+    assert set(catalog.hip[near[off_deg < 0.99 * radius_deg]].tolist()) == set(BEEHIVE)
+    beside = set(catalog.hip[near[(off_deg > 1.01 * radius_deg) & (off_deg < 1.0)]].tolist())
+    assert len(beside) > 5 and beside <= listed
+    assert shot.truth["name"][0] == "Moon"
+    assert shot.linear.sum() == pytest.approx(shot.truth["electrons_per_s"].sum(), rel=FLUX_LIMIT)
+    assert bench.losses_mag(shot)["Moon"] > 3
+
+
+def test_the_moon_a_degree_beside_the_field_changes_nothing_and_half_of_it_is_half(bench):
+    half_deg = np.degrees(np.arctan(bench.camera.resolution_px[1] / 2 / bench.camera.focal_length_px))
+    beside = bench.frame_sprites(aim(bench, "Moon", half_deg + 1.0))
+    assert beside.extended == () and beside.over_white == ()
+    whole, half = (bench.frame(aim(bench, "Moon", off)) for off in (0.0, half_deg))
+    named = {row["name"]: row for row in half.truth}
+    assert named["Moon"]["clipped"] and named["Moon"]["y_px"] == pytest.approx(-0.5, abs=0.3)
+    assert 0.2 < half.linear.sum() / whole.linear.sum() < 0.8
+    assert bench.losses_mag(half)["Moon"] == pytest.approx(bench.losses_mag(whole)["Moon"], abs=0.5)
+
+
+def test_the_sun_in_the_field_is_white_finite_and_told_and_stars_keep_their_light(bench):
+    q = aim(bench, "Sun", 1.0)
+    shot = bench.frame(q)
+    assert np.isfinite(shot.linear).all() and shot.linear.max() > 1e15
+    assert (shot.levels == shot.levels.max()).sum() > 50
+    row = shot.truth[shot.truth["name"] == "Sun"][0]
+    assert row["clipped"] and bench.losses_mag(shot)["Sun"] > 15
+    assert "Sun" in bench.draw(q).clipped_hip
+    sprites = bench.frame_sprites(q)
+    points = bench.sprites(q, bench.seen(bench.shown_stars))
+    kept = np.isin(points.star, sprites.star)
+    assert len(sprites) > 10 and np.array_equal(sprites.data, points.data[kept])
+
+
+def test_a_nearer_disc_hides_a_farther_one_and_covers_all_of_it():
+    near, far = disc(9.0, 20.0, name="near"), disc(20.0, 30.0, (47.0, 40.0), "far")
+    view = View(CAMERA, SIGMA, (Pose(np.eye(3)),))
+    with Renderer(Target(SIZE, SIGMA)) as gl:
+        none = sprites_at(np.empty((0, 2)), np.empty(0), gl.footprint_px)
+        both = replace(none, extended=(*disc_lights(far, view, False), *disc_lights(near, view, True)))
+        gl.draw(both)
+        got, wanted = gl.linear().astype(float), linear_image(both, SIZE, SIGMA)
+        gl.draw(replace(none, extended=tuple(disc_lights(near, view, False))))
+        alone = gl.linear().astype(float)
+    assert np.abs(got - wanted).max() < PIXEL_LIMIT * wanted.max()
+    assert got[38:44, 42:48] == pytest.approx(alone[38:44, 42:48], rel=1e-5)  # seven pixels within the limb
+
+
+def test_a_point_behind_a_disc_is_gone_and_one_before_it_stays(bench):
+    q = aim(bench, "Moon")
+    painter = DiscPainter(bench.moving, bench.camera, bench.renderer.footprint_px, SIGMA)
+    stars = bench.seen(bench.shown_stars)
+    points = bench.sprites(q, stars)
+    first = len(stars) - len(bench.moving.names)
+    moon = int(np.flatnonzero(points.star == first + bench.moving.names.index("Moon"))[0])
+    (face,) = painter.on_image(q, NOW)
+    jupiter = first + bench.moving.names.index("Jupiter")
+    behind = replace(points, star=np.where(np.arange(len(points)) == moon, jupiter, points.star))
+    stars.vectors[jupiter] = face.direction
+    kept = painter.unhidden(behind, stars, [face], NOW).star
+    assert jupiter not in kept
+    nearer = replace(face, distance_km=1e12)
+    assert jupiter in painter.unhidden(behind, stars, [nearer], NOW).star
+
+
+@pytest.mark.parametrize("radius_px", [3.0, 25.0])
+@pytest.mark.parametrize("lens", [None, LENS], ids=["pinhole", "lens"])
+@pytest.mark.parametrize("late_s", [0.0, 1 / 60], ids=["at once", "row by row"])
+def test_the_reference_has_the_same_disc(radius_px, lens, late_s):
+    one = disc(radius_px, 60.0)
+    shear = Shear(np.array([0.02, 0.05, 0.01]), (0.0, late_s / SIZE[1]), (47.5, 39.5)) if late_s else None
+    view = View(replace(CAMERA, lens=lens), SIGMA, (Pose(np.eye(3)),), shear)
+    with Renderer(Target(SIZE, SIGMA)) as gl:
+        sprites = replace(
+            sprites_at(np.array([[60.2, 30.7]]), np.array([2e5]), gl.footprint_px),
+            extended=tuple(disc_lights(one, view, covers=True)),
+        )
+        gl.draw(sprites)
+        got = gl.linear()
+        assert gl.gl_error() == "GL_NO_ERROR"
+    wanted = linear_image(sprites, SIZE, SIGMA)
+    assert got.sum(dtype=float) == pytest.approx(wanted.sum(), rel=FLUX_LIMIT)
+    assert np.abs(got - wanted).max() < PIXEL_LIMIT * wanted.max()
+
+
+@pytest.mark.parametrize("radius_px", [3.0, 20.0])
+@pytest.mark.parametrize("method", ["round", "dither", "temporal", "exact"])
+def test_every_quantisation_encodes_discs_and_erases_them(method, radius_px):
+    target = Target(SIZE, SIGMA, srgb_response(10), WHITE, method)
+    panel = target.panel()
+    oracle = {"round": round_levels, "dither": dither_levels, "temporal": lambda a, p: temporal_levels(a, p, 3)}.get(method)
+    view = View(CAMERA, SIGMA, (Pose(np.eye(3)),))
+    with Renderer(target) as gl:
+        star = sprites_at(np.array([[20.2, 20.7]]), np.array([2e5]), gl.footprint_px)
+        gl.draw(star, 3)
+        plain = gl.codes().copy()
+        for _ in range(2):
+            gl.draw(replace(star, extended=tuple(disc_lights(disc(radius_px, 40.0), view, covers=True))), 3)
+            levels = gl.codes().copy()
+            wanted = (oracle or dither_levels)(gl.linear(), panel)
+            assert np.mean(levels[30:] != wanted[30:]) < 1e-3  # ties alone
+            assert (levels[30:] == 1023).any() == (radius_px == 3.0) and levels[30:].max() > 300
+            gl.draw(star, 3)
+            assert (gl.codes() == plain).all()
+
+
+def test_a_disc_under_a_turn_keeps_its_light_and_lies_along_the_way_of_its_star(bench):
+    """A turn of 3 degrees/s, 17 ms for a row: 0.9 px of this screen; a star at the Moon's middle is the truth for its place."""
+    q, rate = aim(bench, "Moon"), np.array([0.0, np.radians(3.0), 0.0])
+    scan = Scan(scanout_s=1 / 60, hold_s=1 / 60)
+    painter = DiscPainter(
+        bench.moving, bench.camera, bench.renderer.footprint_px, bench.config.render.sprite_sigma_px, scan=scan
+    )
+    stars = bench.seen(bench.shown_stars)
+    none = sprites_at(np.empty((0, 2)), np.empty(0), bench.renderer.footprint_px)
+    middles = []
+    for turn in (None, Turn(q, rate), Turn(q, 4 * rate)):
+        bench.renderer.draw(painter.over(none, stars, q, NOW, turn))
+        light = bench.renderer.linear().astype(float)
+        y, x = np.mgrid[: light.shape[0], : light.shape[1]]
+        middles.append((light.sum(), (light * x).sum() / light.sum(), (light * y).sum() / light.sum()))
+    still, *turned = middles
+    for times, (total, x, y) in zip((1, 4), turned, strict=True):
+        assert total == pytest.approx(still[0], rel=FLUX_LIMIT)
+        way_px = times * np.radians(3.0) / 120 * bench.camera.focal_length_px  # in half the time
+        assert abs(x - still[1]) == pytest.approx(way_px, abs=0.1)
+        assert y == pytest.approx(still[2], abs=0.1)
+
+
+def test_verify_takes_no_disc_and_no_star_beside_it_for_a_star(tmp_path):
+    bodies: dict = {"sky": {"epoch_utc": NIGHT, "faintest_v_mag": 6.0}, "sky.bodies": {"moon": True}}
+    (tmp_path / "bench.toml").write_text(bench_text(TWIN, bodies))
+    with Twin(read_bench_file(tmp_path / "bench.toml")) as twin:
+        comparison = Comparison(twin)
+        seen = twin.field(aim(twin.bench, "Moon"), 0)
+        comparison.add(seen, np.random.default_rng(1))
+        tally = comparison.tally
+        assert len(seen.discs) == 1 and seen.sky_e.sum() > 1e9
+        assert "Moon" not in seen.truth["name"]
+        assert len(tally.stars) > 5 and not tally.lost
+        assert max(abs(star.flux_mag) for star in tally.stars) < 0.1

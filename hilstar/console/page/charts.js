@@ -8,6 +8,7 @@ const LEFT = 44;
 const BOTTOM = 20;
 const TOP = 8;
 const RIGHT = 10;
+const CROWDED_PX = 16; // between marks, from which their lines would hide the curves
 const STEPS = [1, 2, 2.5, 5, 10];
 const TIME_STEPS_S = [0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 14400, 28800, 86400];
 
@@ -170,7 +171,7 @@ export class Chart {
     context.stroke();
   }
 
-  // A line from top to bottom with a triangle: lost frames and refused packets are seen without their colour.
+  // A triangle, and where they are few a line to the bottom: lost frames and refused packets are seen without their colour.
   drawMarks(mark) {
     const { ink: name, t, n } = mark;
     const { context } = this;
@@ -179,11 +180,12 @@ export class Chart {
       this.drawLasting(mark);
       return;
     }
-    context.globalAlpha = 0.85;
-    for (let k = 0; k < t.length; k += 1) {
-      if (!n[k] || t[k] < this.from || t[k] > this.to) continue;
-      const x = this.x(t[k]);
-      context.fillRect(x - 0.5, TOP, 1, HEIGHT - BOTTOM - TOP);
+    const seen = t.map((at, k) => (n[k] && at >= this.from && at <= this.to ? this.x(at) : null)).filter((x) => x !== null);
+    const crowded = seen.length > this.w / CROWDED_PX;
+    for (const x of seen) {
+      context.globalAlpha = 0.5;
+      if (!crowded) context.fillRect(x - 0.5, TOP, 1, HEIGHT - BOTTOM - TOP);
+      context.globalAlpha = 1;
       context.beginPath();
       context.moveTo(x - 4, TOP - 6);
       context.lineTo(x + 4, TOP - 6);

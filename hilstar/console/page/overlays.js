@@ -183,8 +183,12 @@ export class Overlays {
       const square = star[5] && this.on.clipped ? 4 * unit : 0;
       const gap = square + Math.max((6 + 0.9 * Math.max(FAINTEST_RING_MAG - star[2], 0)) * unit, view.scale * 2.5 + 3 * unit);
       const text = this.labelOf(star);
-      if (!text || !this.place(text, u + gap, v, 12)) continue;
-      this.write(text, u + gap, v, star[5] && this.on.clipped ? "#ff9a9a" : INK.name);
+      if (!text) continue;
+      this.context.font = `${12 * unit}px system-ui, sans-serif`;
+      const wide = this.context.measureText(text).width;
+      const left = u + gap + wide > this.canvas.width ? u - gap - wide : u + gap;
+      if (!this.place(text, left, v, 12)) continue;
+      this.write(text, left, v, star[5] && this.on.clipped ? "#ff9a9a" : INK.name);
       written += 1;
     }
   }

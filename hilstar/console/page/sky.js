@@ -6,6 +6,7 @@ const OBLIQUITY_DEG = 23.4393; // IAU 2006, J2000
 const GALACTIC_POLE = [192.8595, 27.1283]; // RA, Dec of the north galactic pole, ICRS (Hipparcos, ESA SP-1200, 1.5.3)
 const NODES = 8; // of the field's filling, from its middle to its edge
 const FAINTEST = 5.5;
+const LANDMARK_MAG = 3.2; // of a star that says to a person where the camera looks
 
 function circleAbout(pole, steps = 180) {
   const [x, y, z] = pole;
@@ -181,14 +182,16 @@ export class Sky {
     context.stroke();
   }
 
-  // The brightest named star within so many degrees of the boresight.
-  nearest(q, withinDeg = 15) {
+  // The nearest bright star with a name within so many degrees of the boresight.
+  nearest(q, withinDeg = 20) {
     const [, , boresight] = axesOf(q);
-    const limit = Math.cos(withinDeg * DEG);
-    for (const [ra, dec, , name] of this.stars) {
+    let best = Math.cos(withinDeg * DEG);
+    let found = "";
+    for (const [ra, dec, magnitude, name] of this.stars) {
       const v = vectorOf(ra, dec);
-      if (name && v[0] * boresight[0] + v[1] * boresight[1] + v[2] * boresight[2] > limit) return name;
+      const near = v[0] * boresight[0] + v[1] * boresight[1] + v[2] * boresight[2];
+      if (name && magnitude < LANDMARK_MAG && near > best) [best, found] = [near, name];
     }
-    return "";
+    return found;
   }
 }

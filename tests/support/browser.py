@@ -67,9 +67,19 @@ class Browser(Chrome):
         """What a script says."""
         return self.execute_script(script, *arguments)
 
+    def run_async(self, script: str) -> Any:
+        """What a script gives to its `done(...)`."""
+        return self.execute_async_script(f"const done = arguments[arguments.length - 1]; {script}")
+
     def find(self, selector: str) -> WebElement:
         """The element of a CSS selector."""
         return self.find_element(By.CSS_SELECTOR, selector)
+
+    def press(self, selector: str) -> None:
+        """Click on an element, in the middle of the window."""
+        element = self.find(selector)
+        self.run("arguments[0].scrollIntoView({ block: 'center' })", element)
+        element.click()
 
     def text(self, selector: str) -> str:
         """What an element says, as it stands in the page, whatever its style makes of it."""

@@ -96,8 +96,9 @@ const HEARD = {
   },
   event: (said) => addEvent(said),
   truth(said) {
+    if (held && said.frame !== picture.frame) return; // the truth of the picture that is held stays
     overlays.add(said);
-    if (!held) redraw("picture");
+    redraw("picture");
   },
 };
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -120,17 +121,14 @@ def test_single_pixels_show_the_codes_that_were_shown(report, report_file):
     assert report.text("#pixel") == f"({x + 1}, {y}) px: code {levels[y, x + 1]}"
 
 
-@pytest.mark.parametrize("size", SIZES_PX)
-def test_it_fits_every_size_in_light_and_dark(page, report_file, tmp_path, size):
-    page.size(*SIZES_PX[size])
-    seen = {}
-    for theme in ("dark", "light"):
-        page.prefer(color_scheme=theme)
-        page.get(report_file.as_uri())
-        page.until("document.body.dataset.ready === 'true'")
-        assert page.run("return document.documentElement.scrollWidth <= innerWidth")
-        assert page.overflowing() == []
-        seen[theme] = np.asarray(Image.open(page.picture(tmp_path / f"{theme}.png")).convert("L"), dtype=float)
-        assert seen[theme].shape[::-1] == SIZES_PX[size]
-    head = {theme: float(np.median(picture[:5])) for theme, picture in seen.items()}  # its own ground, above everything
-    assert head["dark"] < DARK and head["light"] > LIGHT
+def test_it_fits_every_size_in_light_and_dark(report, tmp_path):
+    for size, theme in itertools.product(SIZES_PX, ("dark", "light")):
+        report.size(*SIZES_PX[size])
+        report.prefer(color_scheme=theme)
+        report.until(f"document.documentElement.dataset.theme === '{theme}'")
+        assert report.run("return document.documentElement.scrollWidth <= innerWidth")
+        assert report.overflowing() == [], size
+        shot = np.asarray(Image.open(report.picture(tmp_path / f"{theme}.png")).convert("L"), dtype=float)
+        assert shot.shape[::-1] == SIZES_PX[size]
+        ground = float(np.median(shot[:5]))  # its own ground, above everything
+        assert ground < DARK if theme == "dark" else ground > LIGHT

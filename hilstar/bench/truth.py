@@ -75,7 +75,7 @@ def sprite_truth(stars: Stars, sprites: Sprites, clipped: IntArray) -> tuple[npt
     truth["clipped"] = over[own] if len(star) == own.sum() else np.isin(star, sprites.star[over])
     if not sprites.added:
         return truth, star
-    added = _added_truth(sprites, over)
+    added = added_truth(sprites, over)
     return np.concatenate([truth, added]), np.concatenate([star, np.unique(sprites.star[~own])])
 
 
@@ -91,8 +91,8 @@ def _one_a_star(sprites: Sprites, own: BoolArray) -> tuple[IntArray, FloatArray,
     return once, x_px, y_px
 
 
-def _added_truth(sprites: Sprites, over: npt.NDArray[np.bool_]) -> npt.NDArray[np.void]:
-    """Rows for light of a frame's own, by the index of each."""
+def added_truth(sprites: Sprites, over: npt.NDArray[np.bool_]) -> npt.NDArray[np.void]:
+    """Rows of TRUTH_DTYPE for light of a frame's own, by the index of each; `over` (n,) says which sprites clip."""
     of_added = np.flatnonzero(sprites.star < 0)
     star, line = np.unique(sprites.star[of_added], return_inverse=True)
     light = sprites.data["electrons_per_s"][of_added].astype(np.float64)

@@ -40,17 +40,21 @@ def parse_attitude(command: str, radec: str | None, quaternion: str | None) -> A
     return checked_quaternion(parse_numbers(quaternion or "", 4, "--quaternion", "W,X,Y,Z"))
 
 
-def parse_at(command: str, at_s: float | None, config: BenchConfig) -> int | None:
-    """The moment of one frame, ns after `epoch_utc`; None for that one. Raises InputError where nothing moves."""
+def parse_at(command: str, at_s: float | None, config: BenchConfig, timed: bool = False) -> int | None:
+    """The moment of one frame, ns after `epoch_utc`; None for that one.
+
+    Raises InputError where nothing moves and no scenario is `timed`.
+    """
     from hilstar.bench.config.when import has_observer
 
     if at_s is None:
         return None
     if not abs(at_s) <= MAX_AT_S:
         raise InputError(f"{command} --at {at_s:g}: write seconds, 1e10 at most")
-    if not has_observer(config):
+    if not timed and not has_observer(config):
         raise InputError(
-            f"{command} --at {at_s:g}: nothing moves in this sky; write [sky.bodies] or [spacecraft], or leave it out"
+            f"{command} --at {at_s:g}: nothing moves in this sky; write [sky.bodies] or [spacecraft], give a --scenario, or"
+            " leave it out"
         )
     return round(at_s * NS_PER_S)
 

@@ -64,7 +64,8 @@ class FaultyFrames:
             return None if held is None else replace(held, age_ns=max(0, held.age_ns + t_ns - self._held.t_ns))
         if effects.blank:
             return None
-        return replace(attitude, q_icrs_to_cam=effects.turned(attitude.q_icrs_to_cam))
+        rate = None if attitude.rate_cam_rad_s is None else effects.turned_rate(attitude.rate_cam_rad_s)
+        return replace(attitude, q_icrs_to_cam=effects.turned(attitude.q_icrs_to_cam), rate_cam_rad_s=rate)
 
     def frozen_frame(self, effects: Effects | None, bench: Bench) -> Drawn | None:
         """What is on the display already, for a frame that is frozen."""

@@ -9,23 +9,31 @@ import signal
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from hilstar.arrays import FloatArray
 from hilstar.attitude.clock.timeline import Policy, Timeline
 from hilstar.attitude.logs.log_file import log_timeline
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.bench.bench_file import BenchFile
+from hilstar.bench.faults.scenario import Scenario
+from hilstar.bench.faults.timetable import Timetable
+from hilstar.bench.faults.view import FaultView
+from hilstar.bench.faults.views import tracker_view
 from hilstar.files import make_directory
 from hilstar.process.interrupts import end_with_parent
 from hilstar.rotation import rate_between_rad_s
 from hilstar.scene.exposure_motion import Motion
 from hilstar.twin.exposure_files import write_exposure_fits
+from hilstar.twin.faulty_exposure import FaultyExposure, Piece, pieces_of
 from hilstar.twin.simulator import FrameNoise, Simulator
 from hilstar.units import NS_PER_S
 
 _simulator: Simulator | None = None
+_faults: FaultView | None = None
 
 
 def log_motions(
@@ -58,19 +66,62 @@ def motion_at(timeline: Timeline, span_ns: tuple[int, int], t_ns: int, exposure_
     return Motion(middle.q_icrs_to_cam, rate, exposure_s, t_ns)
 
 
+@dataclass(frozen=True, slots=True)
+class LogFaults:
+    """A scenario along a log, from whose first sample it counts."""
+
+    scenario: Scenario
+    samples: list[AttitudeSample]
+    max_rate_rad_s: float = math.inf
+
+    def pieces(self, simulator: Simulator, motions: list[Motion]) -> list[tuple[Piece, ...]]:
+        """Each exposure, cut where a fault begins or ends. Raises InputError for a fault that cannot be drawn."""
+        timetable = Timetable(self.scenario, _view(simulator, self.scenario), simulator.config.tracker.exposure_s)
+        timeline = log_timeline(self.samples, Policy(0, NS_PER_S, self.max_rate_rad_s))
+        zero_ns = self.samples[0].t_ns
+
+        def attitude_at(run_ns: int) -> FloatArray:
+            found = timeline.at(zero_ns + run_ns)
+            if found is None:
+                raise AssertionError("a log has a sample")
+            return found.q_icrs_to_cam
+
+        return [pieces_of(motion, (motion.t_ns or 0) - zero_ns, timetable, attitude_at) for motion in motions]
+
+
+def _view(simulator: Simulator, scenario: Scenario) -> FaultView:
+    footprint_px = simulator.renderer.footprint_px
+    return tracker_view(simulator.file, simulator.camera, footprint_px, simulator.stars, simulator.moving, scenario)
+
+
+def faulty_exposure(simulator: Simulator, motion: Motion, scenario: Scenario, run_ns: int) -> FaultyExposure:
+    """One exposure with a scenario's faults, its middle at `run_ns` of that. Raises InputError (see `FaultView.prepare`)."""
+    view = _view(simulator, scenario)
+    timetable = Timetable(scenario, view, simulator.config.tracker.exposure_s)
+    return FaultyExposure(view, pieces_of(motion, run_ns, timetable))
+
+
 def simulate_motions(
-    file: BenchFile, motions: list[Motion], noise: FrameNoise, directory: Path, on_done: Callable[[int], None]
+    file: BenchFile,
+    motions: list[Motion],
+    noise: FrameNoise,
+    directory: Path,
+    on_done: Callable[[int], None],
+    faults: LogFaults | None = None,
 ) -> None:
     """Write `exposure_000000.fits` and on into `directory`, each with its own noise: seeds (seed, number)."""
     make_directory(directory)
-    Simulator(file).close()  # an error in the bench file is reported once, here
+    with Simulator(file) as first:  # an error in the bench file is reported once, here
+        pieces = [()] * len(motions) if faults is None else faults.pieces(first, motions)
+    scenario = None if faults is None else faults.scenario
     workers = min(len(motions), len(os.sched_getaffinity(0)))
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, context, _start_worker, (file,)) as pool:
+    with ProcessPoolExecutor(workers, context, _start_worker, (file, scenario)) as pool:
         try:
             with _without_ctrl_c():
                 tasks = [
-                    pool.submit(_expose_to_file, motion, noise, number, directory) for number, motion in enumerate(motions)
+                    pool.submit(_expose_to_file, motion, noise, number, directory, pieces[number])
+                    for number, motion in enumerate(motions)
                 ]
             for done, task in enumerate(as_completed(tasks), start=1):
                 task.result()
@@ -92,15 +143,20 @@ def _without_ctrl_c() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _start_worker(file: BenchFile) -> None:
-    global _simulator  # noqa: PLW0603 - a process of the pool has one simulator, made at its start
+def _start_worker(file: BenchFile, scenario: Scenario | None) -> None:
+    global _simulator, _faults  # noqa: PLW0603 - a process of the pool has one simulator, made at its start
     end_with_parent()
     os.environ.setdefault("LP_NUM_THREADS", "1")  # the pool itself fills the cores
     _simulator = Simulator(file)
+    if scenario is not None:
+        _faults = _view(_simulator, scenario)
+        for fault in scenario.faults:
+            _faults.prepare(fault)
 
 
-def _expose_to_file(motion: Motion, noise: FrameNoise, number: int, directory: Path) -> None:
+def _expose_to_file(motion: Motion, noise: FrameNoise, number: int, directory: Path, pieces: tuple[Piece, ...] = ()) -> None:
     if _simulator is None:
         raise RuntimeError("the worker was not started with a bench")
-    exposure = _simulator.expose(motion, noise.rng(number))
+    faults = None if _faults is None else FaultyExposure(_faults, pieces)
+    exposure = _simulator.expose(motion, noise.rng(number), faults=faults)
     write_exposure_fits(directory / f"exposure_{number:06d}.fits", _simulator, exposure, noise)

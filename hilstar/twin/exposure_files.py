@@ -16,6 +16,8 @@ from hilstar.scene.camera import Camera
 from hilstar.twin.picture import exposure_picture
 from hilstar.twin.simulator import Exposure, FrameNoise
 
+MAX_CARD = 60  # characters of text on a card of FITS
+
 
 class Imager(Protocol):
     """What makes exposures: a bench file, and the tracker's camera."""
@@ -43,6 +45,8 @@ def write_exposure_fits(path: Path, simulator: Imager, exposure: Exposure, noise
     header["OFFSET"] = (tracker.detector.offset_dn, "[adu]")
     header["FULLWELL"] = (tracker.detector.full_well_e, "[electron]")
     header["BITS"] = (tracker.detector.bits, "of the ADC")
+    if exposure.faults:
+        header["FAULTS"] = ", ".join(exposure.faults)[:MAX_CARD]
     header["NSTARS"] = (len(exposure.truth), "stars in view")
     hdus = fits.HDUList([fits.PrimaryHDU(exposure.dn, header), fits.BinTableHDU(exposure.truth, name="TRUTH")])
     written(path, lambda part: hdus.writeto(part, overwrite=True))

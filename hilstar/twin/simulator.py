@@ -30,6 +30,7 @@ from hilstar.sky.electrons import Photometry, zodiacal_electrons_per_s_arcsec2
 from hilstar.sky.stars import Stars
 from hilstar.tracker.detector import Detector
 from hilstar.tracker.settings import MAX_E, DetectorSettings
+from hilstar.twin.faulty_exposure import FaultyExposure, Lens
 from hilstar.units import ARCSEC_PER_RAD
 
 if TYPE_CHECKING:
@@ -64,6 +65,7 @@ class Exposure:
     mean_e: FloatArray
     truth: npt.NDArray[np.void]
     capped: int = 0
+    faults: tuple[str, ...] = ()
 
 
 class Simulator:
@@ -121,6 +123,7 @@ class Simulator:
         rng: np.random.Generator | None,
         velocity_km_s: FloatArray | None = None,
         place_km: FloatArray | None = None,
+        faults: FaultyExposure | None = None,
     ) -> Exposure:
         """One frame; without a generator, without noise. Raises InputError for what a detector cannot take.
 
@@ -131,11 +134,20 @@ class Simulator:
         stars = self.stars.seen_at(velocity_km_s)
         if self.moving is not None:
             stars = self.moving.seen(self.stars, motion.t_ns, velocity_km_s, place_km)
-        sprites = smeared_sprites(stars, motion, self.camera, self.renderer.footprint_px, tracker.psf_sigma_px)
-        sprites = with_discs(self, self.moving, sprites, stars, motion, When(motion.t_ns, velocity_km_s, place_km))
-        sprites = self._with_satellites(sprites, stars, motion, velocity_km_s, place_km)
-        self.renderer.draw(sprites)
-        mean_e = self.renderer.linear().astype(np.float64) * tracker.exposure_s + self.background_e
+
+        def sprites_of(part: Motion) -> Sprites:
+            found = smeared_sprites(stars, part, self.camera, self.renderer.footprint_px, tracker.psf_sigma_px)
+            found = with_discs(self, self.moving, found, stars, part, When(part.t_ns, velocity_km_s, place_km))
+            return self._with_satellites(found, stars, part, velocity_km_s, place_km)
+
+        if faults is None:
+            sprites = sprites_of(motion)
+            mean_e = self._linear(sprites) * tracker.exposure_s + self.background_e
+        else:
+            lens = Lens(self.camera, self.renderer.footprint_px, tracker.psf_sigma_px)
+            mean_e, open_s = faults.light_e(stars, lens, sprites_of, self._linear)
+            mean_e += self.background_e * (open_s / tracker.exposure_s)
+            sprites = faults.sprites()
         if self.moving is not None:  # the Sun has more than a detector can be asked for; its wells are full long before
             mean_e = np.minimum(mean_e, BODY_MAX_E)
         if rng is None:
@@ -143,7 +155,15 @@ class Simulator:
         else:
             dn = self.detector.expose(mean_e, tracker.exposure_s, rng)
         truth = exposure_truth(self, motion, stars, sprites, mean_e)
-        return Exposure(motion, dn, mean_e, truth, sprites.capped)
+        if faults is None:
+            return Exposure(motion, dn, mean_e, truth, sprites.capped)
+        truth = np.concatenate([truth, faults.added_truth()])
+        return Exposure(motion, dn, mean_e, truth, sprites.capped, faults.names)
+
+    def _linear(self, sprites: Sprites) -> FloatArray:
+        """Electrons per second of each pixel (h, w) by sprites."""
+        self.renderer.draw(sprites)
+        return self.renderer.linear().astype(np.float64)
 
     def _with_satellites(
         self,

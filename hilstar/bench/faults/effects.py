@@ -11,12 +11,13 @@ from hilstar.arrays import FloatArray
 from hilstar.bench.faults.desk import Now
 from hilstar.bench.faults.kinds import AttitudeStep, Blank, Drop, Fault, Freeze
 from hilstar.bench.faults.view import FaultView
-from hilstar.rotation import propagate
+from hilstar.rotation import propagate, to_matrix
 from hilstar.scene.frame_motion import Scan
 from hilstar.scene.sprites import AddedLight, Sprites, join_sprites
 from hilstar.sky.cells import CellGrid
 from hilstar.sky.stars import BODY_CELL_RAD, Stars
 
+NO_TURN = np.array([1.0, 0.0, 0.0, 0.0])
 FRAME_SEED = 1  # beside the number of a frame
 
 
@@ -55,9 +56,9 @@ class Effects:
                 q_icrs_to_cam = propagate(q_icrs_to_cam, np.array(one.fault.turn_rad), 1.0)
         return q_icrs_to_cam
 
-    def of_light(self) -> Effects:
-        """Those that change the light of a frame."""
-        return Effects(self.view, tuple(one for one in self.now if one.fault.OF_LIGHT))
+    def turned_rate(self, rate_cam_rad_s: FloatArray) -> FloatArray:
+        """A rate in the axes of the camera as it is shown."""
+        return to_matrix(self.turned(NO_TURN)) @ rate_cam_rad_s if self._has(AttitudeStep) else rate_cam_rad_s
 
     def over(
         self,
@@ -88,13 +89,12 @@ class Effects:
             joined = join_sprites([sprites, *parts], sprites.footprint_px)
             per_star = max(sprites.per_star, *(_most_per_star(part) for part in parts))
             sprites = replace(
-                joined,
+                sprites,
+                data=joined.data,
+                star=joined.star,
+                x_px=joined.x_px,
+                y_px=joined.y_px,
                 per_star=per_star,
-                capped=sprites.capped,
-                rate_cam_rad_s=sprites.rate_cam_rad_s,
-                extended=sprites.extended,
-                discs=sprites.discs,
-                over_white=sprites.over_white,
                 added=(*lines, *named),
             )
         return replace(sprites, extended=(*sprites.extended, *surfaces)) if surfaces else sprites

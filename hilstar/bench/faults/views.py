@@ -12,6 +12,8 @@ from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import star_rates_e_per_s
 from hilstar.bench.cameras import bench_camera, tracker_camera
+from hilstar.bench.faults.desk import FaultDesk
+from hilstar.bench.faults.effects import Effects
 from hilstar.bench.faults.scenario import NO_SCENARIO, Scenario
 from hilstar.bench.faults.view import FaultView, Sight
 from hilstar.bench.frame import Bench
@@ -81,3 +83,11 @@ def _v0_e_per_s(file: BenchFile) -> Callable[[float], float]:
         return float(star_rates_e_per_s(file.config, file.folder, np.zeros(1), np.array([bv_mag]), unknown)[0])
 
     return rate
+
+
+def effects_at(bench: Bench, scenario: Scenario, t_ns: int) -> Effects:
+    """The faults of one frame of the display that is shown at a moment of a scenario. Raises InputError (see `FaultDesk`)."""
+    view = display_view(bench, scenario)
+    desk = FaultDesk(scenario, 1 / bench.config.monitor.refresh_hz, view.prepare)
+    desk.begin(0)
+    return Effects(view, desk.at(t_ns))

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from hilstar.cli.options import MAX_SEED, AtSeconds, BenchFile, Json, QuaternionText, RadecText, check_files
+from hilstar.cli.options import MAX_SEED, AtSeconds, BenchFile, Json, QuaternionText, RadecText, ScenarioFile, check_files
 from hilstar.cli.parsers import parse_at, parse_attitude, parse_rate
+from hilstar.cli.show.running import optional_scenario
 from hilstar.console.terminal import print_json, progress, say
 from hilstar.errors import InputError
 from hilstar.files import FITS, PNG, PNG_OR_TIFF, check_directory, check_ending
@@ -26,6 +27,7 @@ def simulate(
         str | None, typer.Option(metavar="X,Y,Z", help="Angular rate of the camera about its own axes, deg/s.")
     ] = None,
     at: AtSeconds = None,
+    scenario: ScenarioFile = None,
     log: Annotated[
         Path | None, typer.Option(metavar="LOG", help="Simulate frames along a log, into the directory given by -o.")
     ] = None,
@@ -45,13 +47,14 @@ def simulate(
     from hilstar.bench.bench_file import read_bench_file
     from hilstar.bench.truth import clipped_in
     from hilstar.twin import exposure_files as files
+    from hilstar.twin.batch import faulty_exposure
     from hilstar.twin.simulator import FrameNoise, Simulator
 
     if log is not None:
         if output is None or radec or quaternion or rate or png or dn_png or at is not None:
             raise InputError("simulate --log LOG: give -o DIR, and no --radec, --quaternion, --rate, --at, --png or --dn-png")
         check_directory("-o", output)
-        simulate_log(bench_file, log, frames, FrameNoise(noise, seed), output)
+        simulate_log(bench_file, log, frames, FrameNoise(noise, seed), output, scenario)
         return
     targets = [path for path in (output, png, dn_png) if path is not None]
     if not targets:
@@ -60,12 +63,15 @@ def simulate(
     check_ending("--png", png, PNG)
     check_ending("--dn-png", dn_png, PNG_OR_TIFF)
     file = read_bench_file(bench_file)
-    check_files([], targets, file)
-    q, t_ns = parse_attitude("simulate", radec, quaternion), parse_at("simulate", at, file.config)
+    wrong = optional_scenario(scenario)
+    check_files([scenario], targets, file)
+    q, t_ns = parse_attitude("simulate", radec, quaternion), parse_at("simulate", at, file.config, wrong is not None)
     rate_rad_s = parse_rate(rate) if rate else np.zeros(3)
     with Simulator(file) as simulator:
         frame_noise = FrameNoise(noise, seed)
-        exposure = simulator.expose(simulator.motion(q, rate_rad_s, t_ns), frame_noise.rng())
+        motion = simulator.motion(q, rate_rad_s, t_ns)
+        faults = None if wrong is None else faulty_exposure(simulator, motion, wrong, t_ns or 0)
+        exposure = simulator.expose(motion, frame_noise.rng(), faults=faults)
         if output is not None:
             files.write_exposure_fits(output, simulator, exposure, frame_noise)
         if png is not None:
@@ -77,6 +83,7 @@ def simulate(
             "clipped": clipped_in(exposure.truth),
             "capped": exposure.capped,
             "dn": {"min": int(exposure.dn.min()), "mean": float(exposure.dn.mean()), "max": int(exposure.dn.max())},
+            "faults": list(exposure.faults),
             "written": [str(path) for path in targets],
             "gl_renderer": simulator.renderer.gl_renderer,
         }
@@ -87,15 +94,18 @@ def simulate(
         typer.echo(f"{summary['stars']} stars, DN {dn['min']} to {dn['max']}; wrote {', '.join(summary['written'])}")
 
 
-def simulate_log(bench_file: Path, log: Path, frames: int | None, noise: FrameNoise, output: Path) -> None:
+def simulate_log(
+    bench_file: Path, log: Path, frames: int | None, noise: FrameNoise, output: Path, scenario: Path | None
+) -> None:
     """The virtual tracker along a log."""
     from hilstar.attitude.logs.entries import Stated
     from hilstar.attitude.logs.gaps import log_joins
     from hilstar.attitude.logs.log_file import open_log
     from hilstar.attitude.wire.source import Mounting
     from hilstar.bench.bench_file import dated, read_bench_file
-    from hilstar.twin.batch import log_motions, simulate_motions
+    from hilstar.twin.batch import LogFaults, log_motions, simulate_motions
 
+    wrong = optional_scenario(scenario)
     file = read_bench_file(bench_file)
     config = file.config
     read = open_log(log, Stated(Mounting(config.tracker.q_body_to_cam)))
@@ -103,7 +113,9 @@ def simulate_log(bench_file: Path, log: Path, frames: int | None, noise: FrameNo
     file = dated(file, read.conventions.scale, samples[0].t_ns)
     for _, line in [*read.told, *log_joins(samples).told]:
         say(line)
-    motions = log_motions(samples, frames, config.tracker.exposure_s, math.radians(config.attitude.max_rate_deg_s))
+    max_rate_rad_s = math.radians(config.attitude.max_rate_deg_s)
+    motions = log_motions(samples, frames, config.tracker.exposure_s, max_rate_rad_s)
+    faults = None if wrong is None else LogFaults(wrong, samples, max_rate_rad_s)
     with progress("exposing", len(motions)) as advance:
-        simulate_motions(file, motions, noise, output, advance)
+        simulate_motions(file, motions, noise, output, advance, faults)
     typer.echo(f"{len(motions)} exposures in {output}")

@@ -7,9 +7,9 @@ from typing import Annotated, Any
 
 import typer
 
-from hilstar.cli.options import AtSeconds, BenchFile, Explain, Json, QuaternionText, RadecText, check_files
+from hilstar.cli.options import AtSeconds, BenchFile, Explain, Json, QuaternionText, RadecText, ScenarioFile, check_files
 from hilstar.cli.parsers import parse_at, parse_attitude
-from hilstar.cli.show.running import explain_bench
+from hilstar.cli.show.running import explain_bench, optional_scenario
 from hilstar.console.terminal import print_json
 from hilstar.errors import InputError
 from hilstar.files import CSV, FITS, PNG, check_ending
@@ -28,6 +28,7 @@ def frame(
     codes: Annotated[Path | None, typer.Option(metavar="OUT.png", help="The code values.")] = None,
     preview: Annotated[Path | None, typer.Option(metavar="OUT.png", help="A picture stretched for the eye.")] = None,
     at: AtSeconds = None,
+    scenario: ScenarioFile = None,
     explain: Explain = False,
     as_json: Json = False,
 ) -> None:
@@ -37,6 +38,7 @@ def frame(
     from hilstar.bench import frame_files as files
     from hilstar.bench.bench_file import read_bench_file
     from hilstar.bench.build import open_bench
+    from hilstar.bench.faults.views import effects_at
     from hilstar.bench.truth import clipped_in
 
     q = parse_attitude("frame", radec, quaternion)
@@ -48,12 +50,13 @@ def frame(
     check_ending("--codes", codes, PNG)
     check_ending("--preview", preview, PNG)
     file = read_bench_file(bench_file)
-    t_ns = parse_at("frame", at, file.config)
-    check_files([], targets, file)
+    t_ns, wrong = parse_at("frame", at, file.config, scenario is not None), optional_scenario(scenario)
+    check_files([scenario], targets, file)
     with open_bench(file) as bench:
         if explain:
             explain_bench(bench, t_ns)
-        shot = bench.frame(q, t_ns=t_ns)
+        effects = None if wrong is None else effects_at(bench, wrong, t_ns or 0)
+        shot = bench.frame(q, t_ns=t_ns, faults=effects)
         if output is not None:
             files.write_frame_fits(output, bench, shot)
         if truth is not None:
@@ -71,6 +74,7 @@ def frame(
             "clipped_mag": bench.losses_mag(shot),
             "left_out": left_out(shot.truth),
             "calibration": {"name": bench.calibration.name, "sha256": bench.calibration.sha256},
+            "faults": [] if effects is None else [one.fault.name for one in effects.now],
             "written": [str(path) for path in targets],
             "gl_renderer": bench.renderer.gl_renderer,
         }

@@ -81,7 +81,7 @@ def page_of(served: Served) -> PageAddress:
 
 def _answers(page: PageAddress) -> bool:
     with contextlib.suppress(OSError, http.client.HTTPException):
-        return page.ask("/health")[0] in {200, 503}
+        return page.ask("/health")[0] in {200, 401, 503}
     return False
 
 

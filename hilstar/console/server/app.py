@@ -67,7 +67,7 @@ class Page:
             Route("/control/{name}", self._control, methods=["POST"]),
             WebSocketRoute("/live", self._live),
         ]
-        return Guarded(Starlette(routes=routes), self.guard)
+        return Guarded(Starlette(routes=routes, exception_handlers={Refused: _refused}), self.guard)
 
     async def _index(self, _: Request) -> Response:
         return Response(self._files["index.html"], media_type="text/html")
@@ -153,6 +153,10 @@ async def _body(request: Request) -> bytes:
     if seen > MAX_BODY_BYTES:
         raise Refused(413, f"a control has at most {MAX_BODY_BYTES} bytes")
     return data
+
+
+def _refused(_: Request, error: Exception) -> Response:
+    return _refusal(error.status, error.line) if isinstance(error, Refused) else _refusal(500, "")
 
 
 def _who(request: Request) -> str:

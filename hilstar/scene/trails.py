@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 # Sprites so far apart make no pixel of a streak wrong by more than 1e-3 of the satellite's light (spacing^2 / 24 of the slope
 # of its end; tests/unit/scene/test_trails.py holds it).
 SPACING_SIGMA = 0.3
+LIGHT_S = 0.25  # the longest time of one sprite: of the 8 s in which a low orbit enters the shadow, for one
 SAMPLES = 9  # of a path, from which its length and its part on the image are found
 REACH = 2.0  # times the speed at a moment, as a bound for some seconds about it
 BULGE = 2.0  # how much farther than its samples a path may be from the line between its ends
@@ -128,6 +129,7 @@ def _counts(seen: Pass, view: View, lit: Lit, brush: Brush) -> tuple[IntArray, t
     length = np.sqrt(step_x * step_x + step_y * step_y).sum(axis=0) * (end - begin)
     length = np.nan_to_num(length, nan=brush.most * SPACING_SIGMA)
     wanted = 1 + np.floor(np.minimum(length / SPACING_SIGMA, brush.most)).astype(np.intp)
+    wanted = np.maximum(wanted, np.ceil((end - begin) * lit.length_s / LIGHT_S).astype(np.intp))
     wanted[end <= begin] = 0
     return wanted, (begin, end)
 

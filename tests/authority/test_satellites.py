@@ -12,9 +12,10 @@ from skyfield.timelib import Time, Timescale
 
 from hilstar.sky.astrometry import aberrate
 from hilstar.sky.bodies.orbit import Geocentre, TleOrbit
+from hilstar.sky.bodies.satellites.light import sunlit_share
 from hilstar.sky.bodies.satellites.passes import Cone
-from tests.support.satellites import satellite_sky, some_orbits
-from tests.support.skies import STATION_TLE, STATION_UTC, skyfield, utc_ns
+from tests.support.satellites import element_set, satellite_sky, some_orbits
+from tests.support.skies import STATION_TLE, STATION_UTC, moving_sky, skyfield, utc_ns
 
 ARCSEC = np.pi / (180 * 3600)
 DAY_NS = 86_400 * 10**9
@@ -58,3 +59,29 @@ def test_places_of_a_week_agree_with_skyfield(observer, rng, theirs):
             apparent = now.observe(kernel["earth"] + satellites[place]).apparent().xyz.km
             off = np.linalg.norm(apparent / np.linalg.norm(apparent) - direction)
             assert off / ARCSEC < LIMIT_ARCSEC, (place, t_ns)
+
+
+# Skyfield's shadow is that of a sphere for the Sun's centre; half of the light is gone there within the bend of the limb.
+SHADOW_LIMIT_S = 0.3
+
+
+def test_the_shadow_of_a_sphere_begins_and_ends_when_skyfield_says(theirs, monkeypatch):
+    """Each change of a low orbit in five turns, at half of the sunlight. Rays say what the flattening does (unit tests)."""
+    monkeypatch.setattr("hilstar.sky.bodies.satellites.light.EARTH_FLATTENING", 0.0)
+    scale, kernel = theirs
+    text = element_set(7, (51.6416, 247.4627, 130.5360, 325.0288), 0.0006703, 15.5)
+    start, low = utc_ns(STATION_UTC), in_skyfield(f"LOW\n{text}", scale)[0]
+    seconds = np.arange(0.0, 28_000.0, 1.0)
+    sunlit = low.at(scale.tt_jd(date(scale, start).tt + seconds / 86_400)).is_sunlit(kernel)
+    changes = np.flatnonzero(np.diff(sunlit.astype(int)))
+    assert len(changes) >= 9
+    orbit, sky = TleOrbit(text, "low.tle"), moving_sky(start, ())
+    for k in changes.tolist():
+        sun_km = -sky.sight(round(seconds[k] * 1e9)).view.from_sun_km
+
+        def share(second: float, sun_km: np.ndarray = sun_km) -> float:
+            return float(sunlit_share(orbit.state(start + round(second * 1e9))[0][None], sun_km)[0])
+
+        before, after = share(seconds[k] - SHADOW_LIMIT_S), share(seconds[k + 1] + SHADOW_LIMIT_S)
+        assert (before > 0.5) == bool(sunlit[k])
+        assert (after > 0.5) == bool(sunlit[k + 1])

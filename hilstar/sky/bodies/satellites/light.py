@@ -89,9 +89,13 @@ def reflected_share(from_observer_km: FloatArray, place_km: FloatArray, sun_km: 
     distance_au = float(np.linalg.norm(sun_km)) / KM_PER_AU
     to_sun = sun_km / np.linalg.norm(sun_km)  # from any satellite of the Earth within 1 arcmin
     range_km = np.linalg.norm(from_observer_km, axis=1)
-    phase = np.arccos(np.clip(-(from_observer_km @ to_sun) / range_km, -1.0, 1.0))
-    diffuse = np.sin(phase) + (np.pi - phase) * np.cos(phase)
+    diffuse = phase_factor(np.clip(-(from_observer_km @ to_sun) / range_km, -1.0, 1.0))
     return np.asarray((STANDARD_KM / range_km) ** 2 / distance_au**2 * diffuse * sunlit_share(place_km, sun_km))
+
+
+def phase_factor(cos_phase: FloatArray) -> FloatArray:
+    """The light of a diffuse sphere over that at 90 degrees of phase (n,), by the cosines of its phase angles."""
+    return np.asarray(np.sqrt(1 - cos_phase**2) + (np.pi - np.arccos(cos_phase)) * cos_phase)
 
 
 def sunlit_share(place_km: FloatArray, sun_km: FloatArray) -> FloatArray:
@@ -121,14 +125,17 @@ def _overlap(a: FloatArray, b: FloatArray, apart: FloatArray) -> FloatArray:
     return np.asarray(a**2 * (in_a - np.sin(2 * in_a) / 2) + b**2 * (in_b - np.sin(2 * in_b) / 2))
 
 
-def in_front(observer_km: FloatArray, place_km: FloatArray) -> FloatArray:
-    """0 (n,) for places (n, 3) that the Earth hides from observers (n, 3), else 1; an observer inside it sees all."""
+def in_front(observer_km: FloatArray, place_km: FloatArray, depth_km: float = 0.0) -> FloatArray:
+    """0 (n,) for places (n, 3) that the Earth hides from observers (n, 3), else 1; an observer inside it sees all.
+
+    What is seen through less than `depth_km` of it counts as seen.
+    """
     observer, place = _stretched(observer_km), _stretched(place_km)
     way = place - observer
     share = np.clip(-np.einsum("ij,ij->i", observer, way) / np.einsum("ij,ij->i", way, way), 0.0, 1.0)
     closest = np.linalg.norm(observer + share[:, None] * way, axis=1)
     inside = np.linalg.norm(observer, axis=1) < EARTH_KM
-    return np.where((closest < EARTH_KM) & ~inside, 0.0, 1.0)
+    return np.where((closest < EARTH_KM - depth_km) & ~inside, 0.0, 1.0)
 
 
 def _stretched(vectors_km: FloatArray) -> FloatArray:

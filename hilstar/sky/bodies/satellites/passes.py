@@ -17,6 +17,7 @@ from hilstar.sky.bodies.satellites.light import (
     STANDARD_KM,
     Brightness,
     in_front,
+    phase_factor,
     reflected_share,
     sunlit_share,
 )
@@ -33,8 +34,10 @@ OLD_DAYS = 14.0
 # Those that can come near the axis within this time, or before it turns by this angle, are looked for at once: 1 ms for 20 000.
 WATCH_S, WATCH_RAD = 3.0, np.radians(3.0)
 COS_WATCH = np.cos(WATCH_RAD)
+HIDDEN_KM = 1.0  # in 3 s an arc is 40 m off a straight line
 JUMP_KM = 10.0  # an observer that is elsewhere by more has jumped
-MOST_REFLECTED = 1.04 * MAX_PHASE_FACTOR  # the Earth is at most 1.7 % nearer the Sun than 1 au
+MOST_SUN = 1.04  # sunlight over that at 1 au: the Earth is at most 1.7 % nearer
+STEEPEST_PHASE = 1.82  # of the phase factor, per radian
 SHIFT_RAD = 4e-4  # aberration of what the Earth's motion shifts, and light time
 
 
@@ -162,11 +165,12 @@ class Satellites:
             return None
         seen = self._swarm.places_km(found, sky.utc_ns) - observer[0]
         range_km = np.sqrt(np.einsum("ij,ij->i", seen, seen))
-        near = _within(seen @ cone.axis, range_km, cone.radius_rad + SHIFT_RAD, _reach_km(observer, cone.half_s))
-        which = found[near & (range_km > OWN_KM)]
+        reach_km, now = _reach_km(observer, cone.half_s), sky.now()
+        near = _within(seen @ cone.axis, range_km, cone.radius_rad + SHIFT_RAD, reach_km) & (range_km > OWN_KM)
+        near &= self._brightest(found, seen, range_km, reach_km, now) >= cone.faintest_e_per_s
+        which = found[near]
         if not len(which):
             return None
-        now = sky.now()
         place, seen = _light_cubics(self._swarm.motion_km(which, sky.utc_ns), observer, now.earth_km_s)
         since_s = (sky.utc_ns - self._zero_ns) / NS_PER_S
         return Pass(which, self.brightness, seen, place, observer, since_s, now, sky.fixed_km_s)
@@ -194,14 +198,25 @@ class Satellites:
         reach_km = _reach_km(observer, half_s) + JUMP_KM
         near = _within(seen @ cone.axis, range_km, cone.radius_rad + WATCH_RAD + SHIFT_RAD, reach_km) & self._other
         found = np.flatnonzero(near)
-        closest_km = np.maximum(range_km[found] - reach_km, OWN_KM)
-        most = self.brightness.standard_e_per_s[found] * self.brightness.most(found) * MOST_REFLECTED
-        found = found[most * (STANDARD_KM / closest_km) ** 2 >= cone.faintest_e_per_s]
-        # What is in the shadow at both ends of an arc that is nearly straight is so between them.
+        brightest = self._brightest(found, seen[found], range_km[found], reach_km, sky.now())
+        found = found[brightest >= cone.faintest_e_per_s]
+        # What is in the shadow, or well behind the Earth, at both ends of an arc that is nearly straight is so between them.
         lit, sun_km = np.zeros(len(found)), sky.now().sun_km
         for seconds in np.array([-half_s, half_s]):
-            lit += sunlit_share(self._swarm.places_km(found, sky.utc_ns, seconds), sun_km)
+            place = self._swarm.places_km(found, sky.utc_ns, seconds)
+            lit += sunlit_share(place, sun_km) * in_front(_at(observer, seconds)[None], place, HIDDEN_KM)
         return np.asarray(found[lit > 0])
+
+    def _brightest(
+        self, which: IntArray, seen_km: FloatArray, range_km: FloatArray, reach_km: float, now: Circumstances
+    ) -> FloatArray:
+        """The most that each of these (n,) can send while it moves by `reach_km`: outside the shadow, and in a flash."""
+        range_km = np.maximum(range_km, OWN_KM)
+        closest_km = np.maximum(range_km - reach_km, OWN_KM)
+        to_sun = now.sun_km / np.linalg.norm(now.sun_km)
+        diffuse = phase_factor(np.clip(-(seen_km @ to_sun) / range_km, -1.0, 1.0)) + STEEPEST_PHASE * reach_km / closest_km
+        share = MOST_SUN * np.minimum(diffuse, MAX_PHASE_FACTOR) * (STANDARD_KM / closest_km) ** 2
+        return np.asarray(self.brightness.standard_e_per_s[which] * self.brightness.most(which) * share)
 
     def write(self, stars: Stars, index: IntArray, vectors: FloatArray, electrons_per_s: FloatArray) -> None:
         """Put satellites (k,) into the arrays of stars that were made with this list: unit vectors (k, 3) and rates (k,)."""
@@ -283,7 +298,7 @@ def _reach_km(observer: FloatArray, half_s: float) -> float:
 
 def _within(along_km: FloatArray, range_km: FloatArray, radius_rad: float, reach_km: float) -> BoolArray:
     """Whether vectors (n,), by their parts along an axis and their lengths, can come within an angle of it by moving so far."""
-    moved = np.arcsin(np.minimum(1.0, reach_km / range_km))
+    moved = np.arcsin(np.minimum(1.0, reach_km / np.maximum(range_km, reach_km + OWN_KM)))
     limit = np.cos(np.minimum(np.pi, radius_rad + moved))
     return np.asarray((along_km >= limit * range_km) | (range_km <= reach_km))
 

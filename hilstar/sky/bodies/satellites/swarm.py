@@ -1,8 +1,9 @@
 """Places of many satellites at any time: SGP4 (Vallado et al. 2006, AIAA 2006-6753) seldom, cubics between.
 
 SGP4 takes 0.5 us a satellite, 11 ms for 20 000: most of a frame. It is therefore asked at the ends of STEP_S only, for a share
-of the list at a time, and between them places follow the cubic through both places and velocities. A low orbit is then within
-5 mm of SGP4: h^4 / 384 times n^4 r, n = 1.2e-3 rad/s; 0.01 arcsec at 100 km.
+of the list at a time, and between them places follow the cubic through both places and velocities. Low orbits are then within
+0.25 m of SGP4 (0.05 arcsec at 1000 km), others within 3.2 m, nowhere more than 0.07 arcsec from the Earth's centre: measured
+over three days. A cubic of exact velocities would be within 5 mm; SGP4's own are not quite the slopes of its places.
 """
 
 from __future__ import annotations

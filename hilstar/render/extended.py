@@ -8,10 +8,12 @@ from typing import Any
 import moderngl
 import numpy as np
 
+from hilstar.arrays import Float32Array
 from hilstar.render.encoder import build_program
 from hilstar.scene.camera import Camera
 from hilstar.scene.extended import DiscLight, ExtendedLight, Glow, LightMap, Rectangle
 from hilstar.scene.rays import ray_shifts
+from hilstar.scene.tiles import Tiles, disc_tiles
 from hilstar.sky.bodies.disc import AIR_TOP, SOLAR_LIMB, Disc
 
 KEPT_TEXTURES = 4  # of maps and lenses: a bench has one lens, and few maps at a time
@@ -42,8 +44,17 @@ class ExtendedLayer:
             region = light.region(self._resolution_px)
             if region is None:
                 continue
-            fbo.viewport = region
-            self._draw_one(light)
+            tiles = disc_tiles(light, region) if isinstance(light, DiscLight) else None
+            if isinstance(light, DiscLight) and tiles is not None:
+                region = tiles.region
+                if not region[2]:
+                    continue
+                fbo.viewport, fbo.scissor = (0, 0, *self._resolution_px), region
+                self._draw_tiles(light, tiles)
+                fbo.scissor = None  # type: ignore[assignment]  # as its documentation has it: no test
+            else:
+                fbo.viewport = region
+                self._draw_one(light)
             regions.append(region)
         ctx.blend_func = (moderngl.ONE, moderngl.ONE)
         ctx.disable(moderngl.BLEND)
@@ -75,8 +86,34 @@ class ExtendedLayer:
         program["exponent"] = light.exponent
         triangle.render(moderngl.TRIANGLES, vertices=3)
 
+    def _draw_tiles(self, light: DiscLight, tiles: Tiles) -> None:
+        program, _ = self._program("tile.frag", "", vertex="tile.vert")
+        program["covers"] = float(light.covers)
+        self._draw_corners(program, tiles.linear)
+        program, _ = self._with_rays("disc.frag", light.camera, "tile.vert")
+        self._set_disc(program, light)
+        self._draw_corners(program, tiles.edges)
+
+    def _draw_corners(self, program: moderngl.Program, corners: Float32Array) -> None:
+        if not len(corners):
+            return
+        program["size_px"] = self._resolution_px
+        buffer = self._ctx.buffer(corners)
+        layout = "2f 1f" if "rate" in program else "2f 4x"
+        names = ("place_px", "rate") if "rate" in program else ("place_px",)
+        triangles = self._ctx.vertex_array(program, [(buffer, layout, *names)])
+        triangles.render(moderngl.TRIANGLES)
+        triangles.release()
+        buffer.release()
+
     def _draw_disc(self, light: DiscLight) -> None:
         program, triangle = self._with_rays("disc.frag", light.camera)
+        self._set_disc(program, light)
+        triangle.render(moderngl.TRIANGLES, vertices=3)
+
+    @staticmethod
+    def _set_disc(program: moderngl.Program, light: DiscLight) -> None:
+        """The body, the turn and the Gaussian, in a program of disc.frag."""
         disc = light.disc
         from_image = disc.to_sphere @ light.icrs_to_image.T
         program["to_sphere"] = tuple(from_image.T.ravel().tolist())  # column by column
@@ -88,12 +125,13 @@ class ExtendedLayer:
         program["late_s_per_px"] = (0.0, 0.0) if shear is None else shear.s_per_px
         program["middle_px"] = (0.0, 0.0) if shear is None else shear.middle_px
         _set_face(program, disc)
-        triangle.render(moderngl.TRIANGLES, vertices=3)
 
-    def _with_rays(self, fragment: str, camera: Camera) -> tuple[moderngl.Program, moderngl.VertexArray]:
+    def _with_rays(
+        self, fragment: str, camera: Camera, vertex: str = "full.vert"
+    ) -> tuple[moderngl.Program, moderngl.VertexArray]:
         """A program whose pixels know their directions through `camera`, whose image this is."""
         defines = () if camera.lens is None else ("LENS",)
-        program, triangle = self._program(fragment, "rays.glsl", *defines)
+        program, triangle = self._program(fragment, "rays.glsl", *defines, vertex=vertex)
         program["principal_px"] = camera.principal_point_px
         program["focal_px"] = camera.focal_length_px
         if camera.lens is not None:
@@ -102,10 +140,13 @@ class ExtendedLayer:
             shifts.use(0)
         return program, triangle
 
-    def _program(self, fragment: str, include: str = "", *defines: str) -> tuple[moderngl.Program, moderngl.VertexArray]:
-        key = (fragment, include, *defines)
+    def _program(
+        self, fragment: str, include: str = "", *defines: str, vertex: str = "full.vert"
+    ) -> tuple[moderngl.Program, moderngl.VertexArray]:
+        """A program, and the triangle of `full.vert`; nothing is drawn by that with another vertex shader."""
+        key = (vertex, fragment, include, *defines)
         if key not in self._programs:
-            program = build_program(self._ctx, "full.vert", fragment, defines, include)
+            program = build_program(self._ctx, vertex, fragment, defines, include)
             self._programs[key] = program, self._ctx.vertex_array(program, [])
         return self._programs[key]
 

@@ -108,6 +108,10 @@ class Disc:
         whole_sr = self.law_integral_sr()
         return replace(self, normal_e_per_s_sr=electrons_per_s / whole_sr if whole_sr > 0 else 0.0)
 
+    def impact(self, directions: FloatArray) -> FloatArray:
+        """How close rays along ICRS directions (n, 3) pass the centre, radii (n,); infinite for those that lead away."""
+        return self._impact(directions @ self.to_sphere.T)
+
     def transmission(self, directions: FloatArray) -> FloatArray:
         """The share of light from behind the body in ICRS directions (n, 3): 0 on its disc, less than 1 through its air."""
         height = (self._impact(directions @ self.to_sphere.T) - 1) / (self.air_radii or 1.0)

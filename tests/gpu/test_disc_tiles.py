@@ -1,0 +1,94 @@
+"""A disc in tiles is the disc drawn whole, ray by ray: near the limb, the terminator, through a lens, and while it turns."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import hilstar.render.extended as layer
+from hilstar.render.renderer import Renderer, Target
+from hilstar.scene.camera import Camera
+from hilstar.scene.extended import DiscLight, Shear
+from hilstar.scene.lens import Lens
+from hilstar.scene.tiles import LEAST_PX, SMOOTH, disc_tiles
+from hilstar.sky.bodies.disc import Disc
+from hilstar.sky.bodies.earth import EQUATOR_KM, earth_disc
+from hilstar.sky.bodies.magnitudes import KM_PER_AU
+from tests.support.stars import sprites_at
+
+SIZE, SIGMA = (300, 260), (0.85, 0.85)
+MIDDLE_PX = (149.5, 129.5)
+LENS = Lens(radial=(0.2, 0.05, 0.0), tangential=(1e-3, -2e-3))
+# Straight lines in place of the face's light: SMOOTH at most by itself, and four times that across a terminator; and the
+# rounding of float32 where rays are taken in it (1e-4 near a limb).
+TILE_LIMIT = 4 * SMOOTH
+assert SIZE[0] * SIZE[1] > LEAST_PX
+
+
+@pytest.fixture(scope="module")
+def gl():
+    with Renderer(Target(SIZE, SIGMA)) as renderer:
+        yield renderer
+        assert renderer.gl_error() == "GL_NO_ERROR"
+
+
+def looking(distance_km: float, focal_px: float, from_limb_deg: float, phase_deg: float, lens: Lens | None = None) -> DiscLight:
+    aim = np.arcsin(EQUATOR_KM / distance_km) + np.radians(from_limb_deg)
+    towards = np.array([0.3 * np.sin(aim), np.sqrt(1 - 0.09) * np.sin(aim), np.cos(aim)])
+    side = np.array([0.5, -0.1, 1.0])
+    side -= (side @ towards) * towards
+    side /= np.linalg.norm(side)
+    sun = -np.cos(np.radians(phase_deg)) * towards + np.sin(np.radians(phase_deg)) * side
+    disc = earth_disc(distance_km * towards, -KM_PER_AU * sun, np.zeros(3), 1e5)
+    return DiscLight(disc, np.eye(3), Camera(SIZE, focal_px, MIDDLE_PX, np.eye(3), lens), SIGMA)
+
+
+def moon(light: DiscLight, radius_px: float) -> DiscLight:
+    """A Moon of that radius off the middle, three quarters of it lit."""
+    ahead, sun = np.array([0.02, -0.01, 1.0]), np.array([0.8, 0.3, -0.5])
+    far = 1 / np.sin(radius_px / light.camera.focal_length_px)
+    face = Disc("Moon", ahead / np.linalg.norm(ahead), far, 1.0, 1.0, np.array([0.0, 1.0, 0.0]), sun, "lunar-lambert", 1e6, 0.5)
+    return replace(light, disc=replace(face, sun=sun / np.linalg.norm(sun)))
+
+
+TURN = Shear(np.array([0.02, 0.05, 0.1]), (0.0, 1e-4), MIDDLE_PX)
+SCENES = {
+    "low orbit, limb": looking(EQUATOR_KM + 400, 1500.0, -1.0, 60.0),
+    "low orbit, full field": looking(EQUATOR_KM + 400, 1500.0, -30.0, 60.0),
+    "low orbit, terminator": looking(EQUATOR_KM + 400, 400.0, -20.0, 105.0),
+    "wide field": looking(EQUATOR_KM + 400, 150.0, -10.0, 60.0),
+    "geostationary": looking(42_164.0, 800.0, -8.0, 50.0),
+    "through a lens": looking(EQUATOR_KM + 400, 300.0, -5.0, 60.0, LENS),
+    "turning": replace(looking(EQUATOR_KM + 400, 1500.0, -1.0, 60.0), shear=TURN),
+    "a Moon of 110 px": moon(looking(42_164.0, 3000.0, -8.0, 50.0), 110.0),
+    "a Moon of 3000 px": moon(looking(42_164.0, 60_000.0, -8.0, 50.0), 3000.0),
+}
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_light_and_cover_are_those_of_the_disc_drawn_whole(gl, name, monkeypatch):
+    light = SCENES[name]
+    behind = replace(SCENES["low orbit, full field"], times=3.0)  # what is hidden
+    none = sprites_at(np.empty((0, 2)), np.empty(0), gl.footprint_px)
+    pictures = []
+    for tiles in (disc_tiles, lambda *_: None):
+        monkeypatch.setattr(layer, "disc_tiles", tiles)
+        for lights in ((light,), (behind, light)):
+            gl.draw(replace(none, extended=lights))
+            pictures.append(gl.linear().astype(float))
+    assert pictures[2].max() > 0
+    for mine, whole in ((pictures[0], pictures[2]), (pictures[1], pictures[3])):
+        assert np.abs(mine - whole).max() < TILE_LIMIT * whole.max()
+
+
+def test_most_of_a_full_field_is_linear_and_what_lies_beside_a_limb_is_not_drawn():
+    whole = (0, 0, *SIZE)
+    full = disc_tiles(SCENES["low orbit, full field"], whole)
+    assert full is not None
+    assert len(full.linear) > 10 * len(full.edges)
+    beside = disc_tiles(looking(EQUATOR_KM + 400, 1500.0, 30.0, 60.0), whole)
+    assert beside is not None
+    assert beside.region[2:] == (0, 0)
+    assert disc_tiles(SCENES["low orbit, full field"], (0, 0, 100, 100)) is None

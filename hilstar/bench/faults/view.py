@@ -169,6 +169,11 @@ class FaultView:
             return None
         return np.asarray(self._sight.apparent(icrs_direction(fault)[None])[0])
 
+    def star_direction(self, fault: Fault) -> FloatArray | None:
+        """Where the star of a fault is on the sky (3,); None of a fault that is about none."""
+        found = self._targets.find(self._sight.stars, fault)
+        return np.asarray(self._sight.stars.vectors[found[0]]) if len(found) else None
+
     def _added(self, fault: PointLight, share: float = 1.0) -> AddedLight:
         rate = self.light_e_per_s(fault) * share
         return AddedLight(fault.name, float(magnitude(rate / self._sight.v0_e_per_s(fault.bv_mag))), fault.bv_mag, rate)

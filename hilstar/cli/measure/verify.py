@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from hilstar.cli.options import MAX_SEED, BenchFile, Json
+from hilstar.cli.options import MAX_SEED, BenchFile, Json, ScenarioFile
+from hilstar.cli.show.running import optional_scenario
 from hilstar.console.terminal import print_json, progress
 from hilstar.files import check_directory
 
@@ -29,6 +30,7 @@ def verify(
         bool, typer.Option("--propose", help="Find the smallest change of the bench file with which a failing bench passes.")
     ] = False,
     write: Annotated[bool, typer.Option("--write", help="Find it, and make it in the bench file.")] = False,
+    scenario: ScenarioFile = None,
     as_json: Json = False,
 ) -> None:
     """Run the digital twin: what the tracker would measure of the stars shown, against the sky."""
@@ -47,8 +49,9 @@ def verify(
     file = read_bench_file(bench_file)
     if write:
         check_writable(file)
+    wrong = optional_scenario(scenario)
     with progress("verifying", fields) as advance:
-        verdict = run_twin(file, fields, np.random.default_rng(seed), advance)
+        verdict = run_twin(file, fields, np.random.default_rng(seed), advance, wrong)
     if output is not None:
         write_report(output, verdict)
     summary = summarise(verdict)

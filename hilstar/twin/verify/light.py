@@ -8,19 +8,22 @@ from pathlib import Path
 import numpy as np
 
 from hilstar.arrays import FloatArray
-from hilstar.bench.frame import Bench, Frame
+from hilstar.bench.frame import Bench, Frame, FrameFaults
 from hilstar.monitor.calibration import BUILT_IN, Calibration, load_calibration
 from hilstar.monitor.quantise import Panel, shown_light
 from hilstar.monitor.response import Response, table_response
 
 
-def exposure_lights(bench: Bench, frame: Frame, first_frame: int, panels: Sequence[Panel]) -> list[FloatArray]:
+def exposure_lights(
+    bench: Bench, frame: Frame, first_frame: int, panels: Sequence[Panel], faults: FrameFaults | None = None
+) -> list[FloatArray]:
     """The mean light (H, W), electrons per second, of each panel over an exposure that begins with frame `first_frame`."""
     lights = [shown_light(frame.levels, panel) for panel in panels]
     if bench.config.render.quantisation == "temporal":
         count = max(1, round(bench.config.tracker.exposure_s * bench.config.monitor.refresh_hz))
         for number in range(first_frame + 1, first_frame + count):
-            levels = bench.draw(frame.q_icrs_to_cam, number, t_ns=frame.t_ns).levels
+            sprites = bench.frame_sprites(frame.q_icrs_to_cam, t_ns=frame.t_ns, faults=faults)
+            levels = bench.draw_sprites(sprites, number).levels
             for light, panel in zip(lights, panels, strict=True):
                 light += shown_light(levels, panel)
         for light in lights:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from hilstar.error_spread import ErrorSpread, error_spread
 from hilstar.twin.verify.display_errors import DisplayErrors
+from hilstar.twin.verify.faulty_fields import FaultSeen, fault_lines
 from hilstar.twin.verify.verdict import Verdict
 from hilstar.units import ARCSEC_PER_RAD
 
@@ -98,6 +99,7 @@ class VerifySummary:
     calibration: CalibrationName
     gl_renderer: str
     drawn_as_discs: list[str]
+    faults: list[FaultSeen] = field(default_factory=list)
 
 
 def summarise(verdict: Verdict) -> VerifySummary:
@@ -136,6 +138,7 @@ def summarise(verdict: Verdict) -> VerifySummary:
         calibration=CalibrationName(measured.calibration.name, measured.calibration.sha256),
         gl_renderer=measured.gl_renderer,
         drawn_as_discs=measured.wide_bodies,
+        faults=verdict.faults,
     )
 
 
@@ -176,6 +179,7 @@ def summary_lines(summary: VerifySummary) -> list[str]:
             for row in summary.by_magnitude
         ),
         *(f"{'':20}{line}" for line in summary.drawn_as_discs),
+        *fault_lines(summary.faults),
         *(f"{'':20}{reason}" for reason in summary.reasons),
         f"{'verdict':20}{'passed' if summary.passed else 'NOT passed'}",
     ]

@@ -182,6 +182,10 @@ export class Chart {
     }
     const seen = t.map((at, k) => (n[k] && at >= this.from && at <= this.to ? this.x(at) : null)).filter((x) => x !== null);
     const crowded = seen.length > this.w / CROWDED_PX;
+    if (mark.flag) {
+      this.drawFlags(seen);
+      return;
+    }
     for (const x of seen) {
       context.globalAlpha = 0.5;
       if (!crowded) context.fillRect(x - 0.5, TOP, 1, HEIGHT - BOTTOM - TOP);
@@ -193,6 +197,17 @@ export class Chart {
       context.fill();
     }
     context.globalAlpha = 1;
+  }
+
+  // A diamond on the axis, for what somebody did.
+  drawFlags(places) {
+    const { context } = this;
+    const y = HEIGHT - BOTTOM;
+    for (const x of places) {
+      context.beginPath();
+      for (const [dx, dy] of [[0, -5], [5, 0], [0, 5], [-5, 0]]) context.lineTo(x + dx, y + dy);
+      context.fill();
+    }
   }
 
   // What lasts is a shade over its time, with a triangle where it begins.
@@ -247,7 +262,7 @@ export class Chart {
     const named = parts.length > 1;
     write(this.now, parts.length ? withUnit(parts[0].value, this.unit, parts[0].one.digits).trim() : "");
     const range = parts.map(({ one, seen }) => (Number.isFinite(seen[0]) ? `${named ? `${one.name} ` : ""}${fixed(seen[0], one.digits)} to ${fixed(seen[1], one.digits)}\u00a0${this.unit}` : `${named ? `${one.name} ` : ""}no value`));
-    const lost = this.marks.map(({ name, t, n }) => `${t.reduce((sum, at, k) => sum + (at >= this.from && at <= this.to ? n[k] || 0 : 0), 0)} ${name}`);
+    const lost = this.marks.filter((mark) => !mark.flag).map(({ name, t, n }) => `${t.reduce((sum, at, k) => sum + (at >= this.from && at <= this.to ? n[k] || 0 : 0), 0)} ${name}`);
     const where = at === null ? "" : `at ${timeText(at, 1)}${Math.abs(at) <= 90 ? "\u00a0s" : ""}; `;
     const words = where + [...range, ...lost].join(" \u00b7 ");
     write(this.text, words);

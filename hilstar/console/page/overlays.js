@@ -102,7 +102,10 @@ export class Overlays {
       this.path(px, false);
       context.stroke();
       const at = px.map(([x, y]) => this.view.toCanvas(x, y)).find((place) => this.inside(place, -14 * unit));
-      if (label && at && this.place(label, at[0] + 4 * unit, at[1], 11)) this.write(label, at[0] + 4 * unit, at[1], "#9dbcf5", 11);
+      if (!label || !at) continue;
+      context.font = `${11 * unit}px system-ui, sans-serif`;
+      const left = Math.min(at[0] + 4 * unit, this.canvas.width - context.measureText(label).width - 6 * unit);
+      if (this.place(label, left, at[1], 11)) this.write(label, left, at[1] - (left < at[0] ? 8 * unit : 0), "#9dbcf5", 11);
     }
   }
 

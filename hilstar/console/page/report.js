@@ -24,6 +24,7 @@ const CHARTS = [
   ["chart-latency", "Packet to swap", "ms", 1, [["packet", "packet to swap", "one"], ["prediction", "predicted", "two"]], []],
   ["chart-stars", "Stars on the screen", "", 0, [["stars", "drawn", "one"], ["clipped", "clipped", "two"], ["below_step", "too faint", "three"]], [["blank", "blank frames", "warn", true]]],
 ];
+const ACTS = /^(operator|mark|fault|scenario|ledger-(begun|ended|started|stopped))/;
 const SHADES = ["one", "two", "three"];
 
 let run = null;
@@ -104,9 +105,16 @@ function makeCharts() {
   write(byId("distributions-note"), run.stride > 1 ? `of each ${run.stride}th frame; logarithmic` : "of all frames; logarithmic");
 }
 
+// What somebody did to the run: operator's controls, marks and faults.
+function acts() {
+  const times = run.events.filter(({ kind }) => ACTS.test(kind)).map((one) => one.t_s);
+  return times.length ? [{ name: "operator\u2019s acts, marks and faults", ink: "accent", flag: true, t: times, n: times.map(() => 1) }] : [];
+}
+
 function drawCharts() {
+  const flags = acts();
   for (const one of Object.values(charts)) {
-    one.set(one.data.lines, one.data.marks, range[0], range[1]);
+    one.set(one.data.lines, [...one.data.marks, ...flags], range[0], range[1]);
     one.cursor = cursor;
     one.draw();
   }

@@ -9,14 +9,18 @@ from typing import Any
 
 import numpy as np
 
-from hilstar.attitude.clock.timeline import Attitude
 from hilstar.bench.bench_file import BenchFile, bench_file_of
 from hilstar.bench.build import open_bench
+from hilstar.bench.faults.kinds import Freeze
 from hilstar.bench.frame import Bench
 from hilstar.console.overlay import Overlay, catalogue_sky, overlay_of
 from hilstar.errors import InputError, MachineError
+from hilstar.run.faults.recorded import Recording, read_recording
 from hilstar.run.record.ledger_records import FrameRecord
 from hilstar.run.record.report_figures import Figures
+from hilstar.run.replay import RunPlay
+from hilstar.run.serve import replay
+from hilstar.run.shown import Shown
 from hilstar.units import NS_PER_S
 
 MAX_BYTES = 3_000_000  # of all pictures together, packed
@@ -37,7 +41,7 @@ def run_pictures(run: Figures, ledger: Path) -> dict[str, Any]:
         with open_bench(file) as bench:
             overlay = overlay_of(bench)
             return {
-                "pictures": _pictures(bench, overlay, run),
+                "pictures": _pictures(bench, overlay, run, ledger),
                 "caution": "" if file.sha256 == run.head.get("bench_sha256") else CAUTION,
                 "sky": overlay.sky(),
                 "white_level": len(bench.calibration.response.light) - 1,
@@ -58,37 +62,48 @@ def _bench_file(head: dict[str, str], ledger: Path) -> BenchFile:
     return next((file for file in files if file.sha256 == head.get("bench_sha256")), files[0])
 
 
-def _pictures(bench: Bench, overlay: Overlay, run: Figures) -> list[dict[str, Any]]:
+def _pictures(bench: Bench, overlay: Overlay, run: Figures, ledger: Path) -> list[dict[str, Any]]:
+    """The frames that are worth one, replayed with the faults that they had."""
+    recording = read_recording(ledger)
+    chosen = [(record, why) for record, why in run.keyframes.chosen(run.last) if not _stays(record, recording)]
     found: list[dict[str, Any]] = []
-    size = 0
-    for record, why in run.keyframes.chosen(run.last):
-        picture = _picture(bench, overlay, record)
-        size += len(picture["data"])
-        if size > MAX_BYTES:
-            break
+
+    def take(shown: Shown) -> None:
+        record, why = chosen[len(found)]
+        picture = _picture(overlay, shown)
         t_s = (record.swap_ns - run.first_swap_ns) / NS_PER_S
-        found.append(picture | {"t_s": round(t_s, 3), "why": why, "operator": record.operator, "stale": record.stale})
-    return found
+        told = {"why": why, "operator": record.operator, "stale": record.stale}
+        found.append(picture | told | {"t_s": round(t_s, 3)})
+
+    if chosen:
+        replay(bench, RunPlay([record for record, _ in chosen], 0, paced=False, recording=recording), take)
+    return _within(found, MAX_BYTES)
 
 
-def _picture(bench: Bench, overlay: Overlay, record: FrameRecord) -> dict[str, Any]:
+def _stays(record: FrameRecord, recording: Recording) -> bool:
+    """Whether a fault held the picture, so that it was that of a frame before."""
+    return any(isinstance(recording.faults.get(number), Freeze) for number in record.faults)
+
+
+def _within(pictures: list[dict[str, Any]], size: int) -> list[dict[str, Any]]:
+    """As many of them, evenly over the run, as are not larger together."""
+    while len(pictures) > 1 and sum(len(picture["data"]) for picture in pictures) > size:
+        pictures = pictures[::2]
+    return pictures
+
+
+def _picture(overlay: Overlay, shown: Shown) -> dict[str, Any]:
     """One frame: its levels, packed, and the truth about them."""
-    attitude = None if record.q is None else Attitude(np.array(record.q), 0, False)
-    if attitude is None:
-        levels, truth = bench.draw(None).levels, None
-    else:
-        velocity = None if record.velocity_km_s is None else np.array(record.velocity_km_s)
-        sprites = bench.frame_sprites(attitude.q_icrs_to_cam, record.rate, velocity, record.t_ns)
-        drawn = bench.draw_sprites(sprites, record.frame)
-        levels = drawn.levels
-        truth = overlay.truth(attitude.q_icrs_to_cam, drawn.clipped_hip, grid=True)
-    height, width = levels.shape
+    levels = shown.drawn.levels
+    truth = None
+    if shown.attitude is not None:
+        truth = overlay.truth(shown.attitude.q_icrs_to_cam, shown.drawn.clipped_hip, grid=True)
     wide = levels.dtype.itemsize == 2
     data = np.ascontiguousarray(levels, dtype="<u2" if wide else "u1").tobytes()
     return {
-        "frame": record.frame,
-        "w": width,
-        "h": height,
+        "frame": shown.number,
+        "w": levels.shape[1],
+        "h": levels.shape[0],
         "dtype": "u2" if wide else "u1",
         "data": base64.b64encode(zlib.compress(data, 9)).decode(),
         "truth": truth,

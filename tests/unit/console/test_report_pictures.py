@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from hilstar.bench.frame import Bench
 from hilstar.console.report.pictures import run_pictures
@@ -14,7 +15,8 @@ from hilstar.rotation import from_rotation_vector, multiply
 from hilstar.run.record.ledger import Ledger
 from hilstar.run.record.ledger_records import FrameRecord
 from hilstar.run.record.report_figures import Figures
-from tests.support.benches import ORION_Q
+from tests.support.benches import ORION_Q, SMALL_BENCH
+from tests.support.commands import run_hilstar_here
 from tests.support.run_page import levels_of, run_data_of
 
 pytestmark = pytest.mark.gpu
@@ -51,6 +53,28 @@ def test_pictures_are_the_codes_of_the_run(ledger, tmp_path):
         about = shown[round(y) - 1 : round(y) + 2, round(x) - 1 : round(x) + 2]
         assert about.max() > shown.max() / 2 > 50  # the brightest star is where the overlay says
     assert data["sky"]["stars"] and data["caution"] == ""
+
+
+def test_pictures_have_the_faults_that_the_run_had(tmp_path):
+    (tmp_path / "bench.toml").write_text(SMALL_BENCH)
+    (tmp_path / "faults.toml").write_text(
+        '[[fault]]\nname = "ghost"\nkind = "false-star"\nat_s = 0.0\nfor_s = 9.0\nradec_deg = [84.05, -1.2]\nv_mag = 2.0\n'
+    )
+    rows = "\n".join(f"{t_s},{','.join(map(repr, ORION_Q))}" for t_s in (0.0, 0.5))
+    (tmp_path / "log.csv").write_text(f"t_s,qw,qx,qy,qz\n{rows}\n")
+    speed = ("--headless", "--speed", "max", "-o", tmp_path / "frames")
+    files = [tmp_path / name for name in ("bench.toml", "log.csv")]
+    faulty = ("--scenario", tmp_path / "faults.toml", "--ledger", tmp_path / "run.mcap")
+    assert run_hilstar_here("replay", *files, *speed, *faulty).returncode == 0
+    report(tmp_path / "run.mcap", tmp_path)
+    pictures = run_data_of((tmp_path / "report.html").read_text())["pictures"]
+    assert len(pictures) >= 8
+    for picture in pictures:
+        shown = np.array(Image.open(tmp_path / "frames" / f"frame_{picture['frame']:06d}.png"))
+        assert np.array_equal(levels_of(picture), shown if shown.ndim == 2 else shown[..., 0])
+    run_hilstar_here("replay", *files, *speed)
+    sound = np.array(Image.open(tmp_path / "frames" / "frame_000000.png"))
+    assert (levels_of(pictures[0]) != (sound if sound.ndim == 2 else sound[..., 0])).any()
 
 
 def test_a_bench_that_has_changed_since_draws_with_a_caution_and_one_that_is_gone_says_why_not(bench_with, tmp_path):

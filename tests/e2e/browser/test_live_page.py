@@ -1,0 +1,283 @@
+"""The operator's page in a browser, before a real run: what it shows moves, turns red in time, and acts only where it may."""
+
+from __future__ import annotations
+
+import itertools
+import re
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from PIL import Image
+from selenium.webdriver.common.action_chains import ActionChains
+from selenium.webdriver.common.keys import Keys
+
+import hilstar
+from hilstar.attitude.logs.mcap_reader import read_messages
+from hilstar.run.record.ledger_records import EventRecord
+from tests.support.browser import SIZES_PX, Browser
+from tests.support.senders import ORION, connected, packet
+from tests.support.servers import Served, bound
+from tests.support.waiting import repeating, wait_for
+
+pytestmark = [pytest.mark.e2e, pytest.mark.gpu]
+ADDRESS = re.compile(r"page is at (http://\S+)")
+# "Red within 0.5 s of anything wrong"; and for a browser, a run and its page that share two cores with other tests:
+RED_MS, BUSY_MS = 500, 700
+MIN_PICTURES_HZ = 4  # of 8 that are asked for, on such a machine
+DARK, LIGHT = 40, 200  # grey values that no theme is between
+PACKET_S, TURN_RAD = 0.01, 1e-3  # between two packets
+COUNT_PICTURES = """
+const seen = new Set();
+const begun = performance.now();
+const look = () => {
+  seen.add(document.getElementById("picture").dataset.frame);
+  if (performance.now() - begun < 1000) setTimeout(look, 15);
+  else done(seen.size);
+};
+look();
+"""
+TRY_TO_BLANK = """
+const request = { method: "POST", headers: { "Content-Type": "application/json" }, body: '{"on": true}' };
+fetch("/control/blank", request).then((answer) => done(answer.status));
+"""
+ALL_DISABLED = "[...document.querySelectorAll('.controls-panel :is(button, input, select)')].every((field) => field.disabled)"
+
+
+@dataclass
+class Sky:
+    """A run with its page, and the sender before it, which may fall silent and may turn."""
+
+    served: Served
+    url: str
+    folder: Path
+    sending: threading.Event = field(default_factory=threading.Event)
+    turning: threading.Event = field(default_factory=threading.Event)
+    turned_rad: float = 0.0
+
+    def stand_still(self) -> None:
+        """Turn back to Orion, whose belt is in the middle, and no further."""
+        self.turning.clear()
+        time.sleep(5 * PACKET_S)  # for the packet that is being made
+        self.turned_rad = 0.0
+
+    def q(self) -> tuple[float, float, float, float]:
+        """The attitude that is sent: Orion, turned about y."""
+        (w, x, y, z), c, s = ORION, np.cos(self.turned_rad / 2), np.sin(self.turned_rad / 2)
+        return (w * c - y * s, x * c + z * s, y * c + w * s, z * c - x * s)
+
+
+@contextmanager
+def sky(folder: Path, *options: str) -> Iterator[Sky]:
+    with bound(folder, "--console", "127.0.0.1:0", *options) as served:
+        wait_for(lambda: any(ADDRESS.search(line) for line in list(served.lines)), served.lines)
+        url = next(found[1] for line in served.lines if (found := ADDRESS.search(line)))
+        shown, numbers = Sky(served, url, folder), itertools.count()
+        shown.sending.set()
+        shown.turning.set()
+
+        with connected(served.port) as sender:
+
+            def send() -> None:
+                if shown.sending.is_set():
+                    shown.turned_rad += TURN_RAD if shown.turning.is_set() else 0.0
+                    sender.send(packet(next(numbers), time.monotonic_ns(), shown.q()))
+
+            with repeating(send, PACKET_S):
+                yield shown
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Iterator[Sky]:
+    folder = tmp_path_factory.mktemp("page")
+    with sky(folder, "--control", "--ledger", str(folder / "run.mcap")) as shown:
+        yield shown
+
+
+@pytest.fixture
+def live(page, run) -> Browser:
+    """The page, green."""
+    run.sending.set()
+    run.turning.set()
+    page.get(run.url)
+    page.until("document.body.dataset.ok === 'true' && document.getElementById('picture').dataset.frame")
+    page.run("scrollTo(0, 0)")
+    return page
+
+
+def frame_of(page: Browser) -> int:
+    return int(page.run("return document.getElementById('picture').dataset.frame"))
+
+
+def pixels(page: Browser, canvas: str) -> str:
+    """What a canvas shows, as a PNG."""
+    return page.run("return document.getElementById(arguments[0]).toDataURL()", canvas)
+
+
+def pictures_in_a_second(page: Browser) -> int:
+    return page.run_async(COUNT_PICTURES)
+
+
+def events(run: Sky) -> list[EventRecord]:
+    return [msgspec.json.decode(data, type=EventRecord) for data in read_messages(run.folder / "run.mcap", "/event")]
+
+
+def test_pictures_move_and_the_numbers_are_those_that_are_sent(live, run):
+    first, shown = frame_of(live), pixels(live, "picture")
+    assert pictures_in_a_second(live) >= MIN_PICTURES_HZ
+    assert frame_of(live) > first and pixels(live, "picture") != shown
+    run.stand_still()
+    wanted = hilstar.rotation.to_radec_roll_deg(np.array(run.q()))
+    # Four decimals are shown.
+    live.until(f"Math.abs(parseFloat(document.getElementById('ra').textContent) - {wanted[0]}) < 1e-4")
+    live.until(f"Math.abs(parseFloat(document.getElementById('dec').textContent.replace('\u2212', '-')) - {wanted[1]}) < 1e-4")
+
+
+def test_single_pixels_have_the_codes_of_that_attitude(live, run):
+    run.stand_still()
+    with hilstar.load(run.folder / "serve.toml") as bench:
+        codes = bench.frame(np.array(run.q())).codes
+    y, x = np.unravel_index(np.argmax(codes), codes.shape)
+    time.sleep(1)  # until what was sent is shown, and pictures of it have come
+    ActionChains(live).send_keys("0", "h", "9").perform()
+    ActionChains(live).move_to_element(live.find("#picture")).perform()
+    live.until("document.getElementById('pixel').textContent.includes('code')")
+    assert live.text("#pixel") == f"({x}, {y}) px: code {codes[y, x]}"
+    ActionChains(live).move_by_offset(-40, 0).perform()  # a pixel of the monitor is 40 of the page
+    assert live.text("#pixel") == f"({x - 1}, {y}) px: code {codes[y, x - 1]}"
+    assert live.text("#picture-badge").startswith("Held on this page")
+
+
+def assert_overlay(page: Browser, before: str, same: bool) -> None:
+    """The page draws when the browser asks it to, soon after a key."""
+    wait_for(lambda: (pixels(page, "overlay") == before) == same, f"the overlay as before: {same}")
+
+
+def test_every_overlay_can_be_switched_by_its_key_and_by_its_button(live):
+    ActionChains(live).send_keys("h").perform()
+    time.sleep(0.3)  # the truth of the picture that is held comes beside it
+    for key, name in (("n", "names"), ("m", "magnitudes"), ("t", "truth"), ("x", "boresight"), ("f", "tracker")):
+        before, pressed = pixels(live, "overlay"), live.find(f"#overlay-{name}").get_attribute("aria-pressed")
+        ActionChains(live).send_keys(key).perform()
+        assert live.find(f"#overlay-{name}").get_attribute("aria-pressed") != pressed
+        assert_overlay(live, before, same=False)
+        live.press(f"#overlay-{name}")
+        assert_overlay(live, before, same=True)
+    ActionChains(live).send_keys("h", "g").perform()
+    before = pixels(live, "overlay")
+    live.until("document.getElementById('overlay-grid').getAttribute('aria-pressed') === 'true'")
+    assert_overlay(live, before, same=False)
+
+
+RED_AFTER = """
+new MutationObserver(() => {
+  if (document.body.dataset.ok === "false" && !window.redAt) window.redAt = Date.now();
+}).observe(document.body, { attributes: true });
+"""
+
+
+def test_stale_turns_red_within_half_a_second_and_says_why(live, run):
+    live.run(RED_AFTER)
+    run.sending.clear()
+    live.until("window.redAt")
+    since_ms = 1000 * next(record.host_ns for record in reversed(events_of(run, "stale"))) / 1e9
+    now_ms = time.time() * 1000 - time.monotonic() * 1000  # UTC of the host's clock, ms
+    assert live.run("return window.redAt") - (since_ms + now_ms) < RED_MS + BUSY_MS
+    assert live.text("#health-headline") == "Sky is not right" and "stale" in live.text("#health-reasons")
+    assert live.text("#health-icon") == "!"  # by shape and word, not by colour alone
+    assert live.text("#attitude-state") == "stale"
+    assert live.run("return document.title").startswith("✗")
+    run.sending.set()
+    live.until("document.body.dataset.ok === 'true'")
+
+
+def events_of(run: Sky, kind: str) -> list[EventRecord]:
+    wait_for(lambda: any(record.kind == kind for record in events(run)), kind)
+    return [record for record in events(run) if record.kind == kind]
+
+
+def test_controls_act_and_the_ledger_says_who(live, run):
+    name = live.find("#operator-name")
+    name.clear()
+    name.send_keys("Ada Løve", Keys.TAB)
+    for control in ("crosshair", "grid", "patch", "pause"):
+        live.press(f"#control-{control}")
+        live.until(f"document.getElementById('control-{control}').getAttribute('aria-pressed') === 'true'")
+        live.press(f"#control-{control}")
+        live.until(f"document.getElementById('control-{control}').getAttribute('aria-pressed') === 'false'")
+    live.press("#control-blank")
+    assert live.text("#control-blank") == "Press again: blank"
+    live.press("#control-blank")
+    live.until("document.getElementById('control-blank').getAttribute('aria-pressed') === 'true'")
+    assert "blank" in live.text("#picture-operator")
+    live.press("#control-blank")
+    live.find("#mark-text").send_keys("<b>shutter</b> open", Keys.ENTER)
+    live.until("document.getElementById('control-said').textContent === 'Mark written.'")
+    live.until("document.getElementById('events').textContent.includes('<b>shutter</b> open')")
+    wait_for(lambda: any("shutter" in record.detail for record in events(run)), "the mark in the ledger")
+    mark = next(record for record in events(run) if "shutter" in record.detail)
+    assert "Ada Løve" in mark.detail
+
+
+def test_by_the_keyboard_alone(live):
+    ActionChains(live).send_keys("?").perform()
+    assert live.run("return document.getElementById('shortcuts').open")
+    ActionChains(live).send_keys(Keys.ESCAPE).perform()
+    assert not live.run("return document.getElementById('shortcuts').open")
+    live.run("document.getElementById('picture').focus()")
+    ActionChains(live).send_keys("+", "+", "+", Keys.ARROW_RIGHT).perform()
+    assert "zoomed" in live.find("#picture").get_attribute("class")
+    reached = set()
+    for _ in range(60):
+        ActionChains(live).send_keys(Keys.TAB).perform()
+        element = live.switch_to.active_element
+        reached.add(element.get_attribute("id"))
+        if element.tag_name == "button":
+            assert live.run("return getComputedStyle(arguments[0]).outlineStyle", element) == "solid"
+    wanted = {"theme", "overlay-names", "zoom-fit", "hold", "stretch", "control-blank", "mark-text", "control-mark", "events"}
+    assert wanted <= reached
+
+
+def test_it_fits_every_size_in_light_and_dark(live, tmp_path):
+    for size, theme in itertools.product(SIZES_PX, ("dark", "light")):
+        live.size(*SIZES_PX[size])
+        live.prefer(color_scheme=theme)
+        live.until(f"document.documentElement.dataset.theme === '{theme}'")
+        assert live.run("return document.documentElement.scrollWidth <= innerWidth")
+        assert live.overflowing() == [], size
+        shot = np.asarray(Image.open(live.picture(tmp_path / f"{theme}.png")).convert("L"), dtype=float)
+        assert shot.shape[::-1] == SIZES_PX[size]
+        ground = float(np.median(shot[:5]))  # the page's own, above everything
+        assert ground < DARK if theme == "dark" else ground > LIGHT
+
+
+def test_who_asks_for_less_motion_gets_fewer_pictures_and_no_transitions(page, run):
+    page.prefer(color_scheme="dark", reduced_motion="reduce")
+    page.get(run.url)
+    page.until("document.getElementById('picture').dataset.frame")
+    assert 2 <= pictures_in_a_second(page) <= 4  # of 2 Hz
+    assert page.run("return getComputedStyle(document.getElementById('hold')).transitionDuration") == "0s"
+
+
+def test_without_control_the_page_only_shows_and_when_the_run_dies_it_is_red(page, tmp_path):
+    with sky(tmp_path) as shown:
+        page.get(shown.url)
+        page.until("document.body.dataset.ok === 'true'")
+        assert page.run(f"return {ALL_DISABLED}")
+        assert "--control" in page.text("#controls-note") and page.text("#control-state") == "read-only"
+        assert page.run_async(TRY_TO_BLANK) == 403
+        assert any("403" in line for line in page.complaints())  # the browser's own line about it
+        page.run(RED_AFTER)
+        died_ms = time.time() * 1000
+        shown.served.process.kill()
+        page.until("window.redAt")
+        assert page.run("return window.redAt") - died_ms < RED_MS + BUSY_MS
+        assert page.text("#health-headline") == "No word from hilstar"
+        page.get("about:blank")
+        page.complaints()  # that the connection was refused

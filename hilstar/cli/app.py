@@ -24,6 +24,7 @@ from hilstar.cli.measure.compare import compare
 from hilstar.cli.measure.simulate import simulate
 from hilstar.cli.measure.verify import verify
 from hilstar.cli.report import report
+from hilstar.cli.service.install import install
 from hilstar.cli.show.demo import demo
 from hilstar.cli.show.frame import frame
 from hilstar.cli.show.replay import replay
@@ -52,6 +53,7 @@ app = typer.Typer(
 calibrate = typer.Typer(
     help="Calibrate a bench: its geometry by dots or attitudes, its monitor by patches, its scale by stars."
 )
+service = typer.Typer()
 
 
 def print_version(wanted: bool) -> None:
@@ -70,9 +72,16 @@ def hilstar(
     """Show a star tracker on a bench the stars it would see: attitudes in, frames of code values out."""
 
 
+@service.callback()
+def of_this_machine() -> None:
+    """A run that this machine starts, watches, and starts again."""
+
+
 for panel, commands in COMMANDS.items():
     for command in commands:
         app.command(command.__name__.replace("_", "-"), rich_help_panel=panel)(command)
 for command in (dots, geometric, alignment, plan, photometric, scale):
     calibrate.command()(command)
 app.add_typer(calibrate, name="calibrate", rich_help_panel="Calibrate")
+service.command()(install)
+app.add_typer(service, name="service", rich_help_panel="This machine")

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 LIVE_EACH_S = 0.5
 PLAIN_EACH_S = 10.0
 STANDS_STILL_NS = NS_PER_S  # without a frame for so long
+ALIVE_NS, ALIVE_PERIODS = NS_PER_S, 3.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +70,24 @@ class RunStatus:
     def see(self, shown: Shown) -> None:
         """Take the newest frame; costs the frame loop one assignment."""
         self._shown = shown
+
+    def begun(self) -> bool:
+        """Whether a frame has been shown, or is waited for."""
+        return self._running is not None and self._running.loop.watch.alive_ns > 0
+
+    def alive(self) -> bool:
+        """Whether the frame loop moves: its last step is not longer ago than ALIVE_NS, or a few frames where those are slow."""
+        running = self._running
+        limit_ns = max(ALIVE_NS, ALIVE_PERIODS / self._source.refresh_hz * NS_PER_S)
+        return running is not None and time.monotonic_ns() - running.loop.watch.alive_ns < limit_ns
+
+    def line(self) -> str:
+        """The run in one line that is quickly read."""
+        shown, running = self._shown, self._running
+        if shown is None or running is None:
+            return "no frame yet"
+        attitude = _attitude_line(shown)
+        return f"attitude {attitude.text}; {running.tally.frames} frames, {running.tally.missed_frames} missed"
 
     def lines(self, now_ns: int) -> list[Line]:
         """The status at a host time; rates are since it was last asked for."""

@@ -185,3 +185,10 @@ def children(pid: int, words: str) -> list[int]:
             if parent == pid and words in line:
                 found.append(int(stat.parent.name))
     return found
+
+
+def gone(pid: int) -> bool:
+    """Whether a process has ended."""
+    with contextlib.suppress(OSError, IndexError):
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    return True

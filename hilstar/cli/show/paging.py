@@ -11,10 +11,12 @@ import typer
 from hilstar.console.run_status import RunStatus
 from hilstar.console.terminal import say
 from hilstar.errors import InputError
+from hilstar.process.notify import Service
 
 if TYPE_CHECKING:
     from hilstar.bench.faults.desk import FaultDesk
     from hilstar.console.feed.door import Door
+    from hilstar.console.feed.feed import Feed
     from hilstar.console.feed.opening import Parts, Told
     from hilstar.run.desk import Desk
     from hilstar.run.faults.run_faults import AnyFaults
@@ -71,11 +73,18 @@ def page_door(console: str | None, control: bool, token: str | None, names: list
 def followed(
     door: Door | None, control: bool, told: Told, parts: Parts, status: RunStatus, record: FrameSink | None = None
 ) -> Iterator[tuple[FrameSink, Follower, Desk | None]]:
-    """Who follows a run: the terminal, `record`, and the page where there is one: its sink, its follower, and its desk."""
+    """Who follows a run: the terminal, `record`, systemd, and the page where there is one: its sink, its follower, its desk."""
     sinks: list[FrameSink] = [status.see] if record is None else [record, status.see]
-    if door is None:
-        yield _all_of(sinks), status.follow, None
-        return
+    with Service(status.begun, status.alive, status.line):
+        if door is None:
+            yield _all_of(sinks), status.follow, None
+            return
+        with _page(door, control, told, parts, status) as (feed, follow, desk):
+            yield _all_of([*sinks, feed.see]), follow, desk
+
+
+@contextmanager
+def _page(door: Door, control: bool, told: Told, parts: Parts, status: RunStatus) -> Iterator[tuple[Feed, Follower, Desk]]:
     from hilstar.console.feed.opening import opened_page
 
     with opened_page(door, control, told, parts) as (feed, desk):
@@ -84,7 +93,7 @@ def followed(
             status.follow(running)
             feed.follow(running)
 
-        yield _all_of([*sinks, feed.see]), follow, desk
+        yield feed, follow, desk
 
 
 def _all_of(sinks: list[FrameSink]) -> FrameSink:

@@ -30,6 +30,7 @@ from hilstar.cli.show.running import (
     LedgerFile,
     LedgerSplit,
     Windowed,
+    dated_ledger,
     end_of_run,
     explain_bench,
     explain_source,
@@ -88,6 +89,7 @@ def replay(
     from hilstar.run.serve import replay as replay_log
 
     check_directory("-o", output)
+    ledger = dated_ledger(ledger)
     check_ending("--ledger", ledger, MCAP)
     file = read_bench_file(bench_file)
     faults = optional_scenario(scenario)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -23,12 +24,18 @@ if TYPE_CHECKING:
     from hilstar.run.record.ledger_switch import LedgerSwitch
     from hilstar.run.summary import RunSummary
 
+UTC_MARK = "{utc}"  # in a ledger's name
 Windowed = Annotated[bool, typer.Option("--windowed", help="A window on the desktop instead of the full display.")]
 Force = Annotated[
     bool, typer.Option("--force", help="Show on a display that the start-up checks refuse; the refusal is logged.")
 ]
 LedgerFile = Annotated[
-    Path | None, typer.Option("--ledger", metavar="RUN.mcap", help="Record every packet and every frame in this file.")
+    Path | None,
+    typer.Option(
+        "--ledger",
+        metavar="RUN.mcap",
+        help="Record every packet and every frame in this file; {utc} in it is the start's time.",
+    ),
 ]
 
 LedgerSplit = Annotated[
@@ -76,6 +83,13 @@ def say_what_clips(bench: Any) -> None:
     line = clipping_line(bench)
     if line is not None:
         say(line)
+
+
+def dated_ledger(path: Path | None) -> Path | None:
+    """A ledger's path with the time of this moment where its name asks for it."""
+    if path is None or UTC_MARK not in path.name:
+        return path
+    return path.with_name(path.name.replace(UTC_MARK, f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}"))
 
 
 @contextmanager

@@ -15,6 +15,7 @@ from hilstar.cli.show.running import (
     LedgerFile,
     LedgerSplit,
     Windowed,
+    dated_ledger,
     end_of_run,
     explain_bench,
     explain_source,
@@ -65,6 +66,7 @@ def serve(
     from hilstar.run.serve import Outlet
     from hilstar.run.serve import serve as serve_stream
 
+    ledger = dated_ledger(ledger)
     check_ending("--ledger", ledger, MCAP)
     file = read_bench_file(bench_file)
     faults = optional_scenario(scenario)

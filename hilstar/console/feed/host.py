@@ -33,6 +33,7 @@ STEADY_S = 10.0  # alive for so long, it is as good as new
 END_WAITS_S = 1.0
 MAX_ORDERS = 8  # at once
 MAX_ORDER_BYTES = 8_000
+OF_THE_RUN = {"NOTIFY_SOCKET", "WATCHDOG_PID", "WATCHDOG_USEC", "HILSTAR_TOKEN"}
 PAGE = (sys.executable, "-P", "-m", "hilstar.console.server")
 
 
@@ -174,8 +175,9 @@ class Host:
 
 
 def _environment() -> dict[str, str]:
-    """This process's own, in which Python finds what it finds here, and nothing in the folder that the run was started in."""
-    return os.environ | {"PYTHONPATH": os.pathsep.join(place for place in sys.path if place)}
+    """This process's own, in which Python finds what it finds here; without what is the run's alone."""
+    own = {name: value for name, value in os.environ.items() if name not in OF_THE_RUN}
+    return own | {"PYTHONPATH": os.pathsep.join(place for place in sys.path if place)}
 
 
 def _memory_of(data: bytes) -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import signal
 import time
@@ -15,7 +14,7 @@ import pytest
 from hilstar.attitude.logs.mcap_log import read_messages
 from hilstar.run.record.ledger_reader import frame_records
 from hilstar.run.record.ledger_records import EventRecord
-from tests.support.pages import PageAddress, children, live, page_of, picture_of
+from tests.support.pages import PageAddress, children, gone, live, page_of, picture_of
 from tests.support.senders import LYRA, ORION, connected, talking
 from tests.support.servers import bound
 from tests.support.waiting import wait_for
@@ -172,10 +171,4 @@ def test_the_page_ends_with_its_run(tmp_path, sign):
         (pid,) = children(served.process.pid, PAGE)
         served.process.send_signal(sign)
         wait_for(lambda: served.process.poll() is not None)
-        wait_for(lambda: _gone(pid))
-
-
-def _gone(pid: int) -> bool:
-    with contextlib.suppress(OSError, IndexError):
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
-    return True
+        wait_for(lambda: gone(pid))

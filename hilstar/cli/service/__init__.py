@@ -1,0 +1,1 @@
+"""hilstar as a service of this machine."""

@@ -1,0 +1,77 @@
+"""hilstar service install: a run that this machine starts, watches and starts again."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from hilstar.cli.options import BenchFile, Overwrite
+from hilstar.cli.show.running import UTC_MARK
+from hilstar.console.terminal import say
+from hilstar.errors import InputError, cannot_write
+
+if TYPE_CHECKING:
+    from hilstar.console.feed.door import Address
+
+
+def install(
+    bench_file: BenchFile,
+    options: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[-- OPTIONS]", help="Options of `hilstar serve`, such as `-- --console --control`."),
+    ] = None,
+    name: Annotated[str | None, typer.Option(metavar="NAME", help="The service's name; by default the bench file's.")] = None,
+    to_stdout: Annotated[bool, typer.Option("--print", help="Print the unit, and write nothing.")] = False,
+    overwrite: Overwrite = False,
+) -> None:
+    """Write a systemd unit of this user that serves a bench: watched, and back within seconds whenever it ends."""
+    from hilstar.bench.bench_file import read_bench_file
+    from hilstar.cli.service.unit import unit_name, unit_text, units_folder, write_token
+    from hilstar.files import refuse_existing, write_whole
+
+    read_bench_file(bench_file)
+    words, console = _checked(bench_file, options or [])
+    service = unit_name(name or bench_file.stem)
+    path = units_folder() / service
+    text = unit_text(path, bench_file.resolve(), words)
+    if to_stdout:
+        typer.echo(text, nl=False)
+        return
+    refuse_existing(path, overwrite)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(path, text)
+        tokens = path.with_suffix(".env")
+        if console is not None and not console.is_loopback and not tokens.exists():
+            write_token(tokens)
+            say(f"the token of the operator's page is in {tokens}")
+    except OSError as error:
+        raise cannot_write(path, error) from error
+    typer.echo(str(path))
+    say(f"start it now and whenever you log in: systemctl --user daemon-reload && systemctl --user enable --now {service}")
+    say("with nobody logged in as well: loginctl enable-linger")
+
+
+def _checked(bench_file: Path, options: list[str]) -> tuple[list[str], Address | None]:
+    """The options, if `hilstar serve` takes them, and where its page will be. Raises InputError."""
+    from hilstar.cli.app import app
+    from hilstar.cli.entry import with_values
+    from hilstar.console.feed.door import parse_address
+
+    words = with_values(options)
+    commands: Any = typer.main.get_command(app)
+    try:
+        given = commands.commands["serve"].make_context("serve", [str(bench_file), *words]).params
+    except Exception as error:  # typer's usage errors have no public base class in all its versions
+        message = getattr(error, "format_message", None)
+        if message is None:
+            raise
+        raise InputError(f"the options after --: {message()} (see hilstar serve --help)") from error
+    if given["token"] is not None and "HILSTAR_TOKEN" not in os.environ:
+        raise InputError("--token: a unit is no place for it; write HILSTAR_TOKEN=... into the .env file beside the unit")
+    if given["ledger"] is not None and UTC_MARK not in str(given["ledger"]):
+        raise InputError(f"--ledger {given['ledger']}: each start needs a ledger of its own; write run-{UTC_MARK}.mcap")
+    return words, None if given["console"] is None else parse_address(given["console"])

@@ -56,7 +56,9 @@ def bench_satellites(
     v0_e_per_s = float(bodies_electrons_per_s(("Sun",), sky.brightness, optics, photometry)[0])
     brightness = brightness_of(found, rows, bodies.satellite_standard_mag, v0_e_per_s)
     satellites = Satellites(found, brightness, v0_e_per_s, orbit, zero_ns)
+    satellites.listed = sum(one.number in rows for one in found)
     satellites.warn_of_age(str(path), start_ns)
+    satellites.place(start_ns)
     return satellites
 
 
@@ -118,6 +120,14 @@ def _lit(seen: Pass, view: View, shot: Shot) -> Lit:
         x_px, y_px = view.places_px(seen, EVERY, late_s)
         late_s = np.nan_to_num(shot.scan.late_s(x_px, y_px, shot.camera.resolution_px))
     return Lit(shot.begin_s + late_s, shot.scan.hold_s)
+
+
+def satellite_lines(sky: MovingSky | None, t_ns: int | None) -> list[str]:
+    """What there is to say of a bench's satellites at a moment, a line; none where it has none."""
+    if sky is None or sky.satellites is None:
+        return []
+    placed, known, every = sky.satellites_placed(t_ns), sky.satellites.listed, len(sky.satellites)
+    return [f"satellites: {placed} of {every} have a place by their elements; {known} are in [sky.bodies] satellite_magnitudes"]
 
 
 def satellites_now(stars: Stars, sky: MovingSky, t_ns: int | None) -> None:

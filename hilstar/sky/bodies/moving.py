@@ -18,41 +18,19 @@ from hilstar.arrays import FloatArray
 from hilstar.errors import InputError
 from hilstar.sky.astrometry import aberrate
 from hilstar.sky.bodies.apparent import Viewpoint, apparent_bodies, apparent_stars
-from hilstar.sky.bodies.disc import Disc, Law, lunar_share
-from hilstar.sky.bodies.earth import DARK_V_MAG, EARTH, EQUATOR_KM, apparent_cone, at_centre, earth_disc, earth_light
+from hilstar.sky.bodies.disc import Disc, lunar_share
+from hilstar.sky.bodies.earth import DARK_V_MAG, EARTH, apparent_cone, at_centre, earth_disc, earth_light
 from hilstar.sky.bodies.kernel import DAY_S, Kernel, tdb_of_utc
 from hilstar.sky.bodies.magnitudes import SUN_BV_MAG, body_v_mag, phase_angle_deg
 from hilstar.sky.bodies.orbit import Orbit
 from hilstar.sky.bodies.satellites.passes import Circumstances, Cone, Pass, Satellites, Sky
+from hilstar.sky.bodies.shapes import LAWS, NORTH, POLAR_KM, RADII_KM, pole
 from hilstar.sky.stars import Stars, with_bodies
 from hilstar.units import ARCSEC_PER_RAD, LIGHT_KM_S, NS_PER_S, flux_ratio
 
 log = logging.getLogger(__name__)
 
 PLANETS = ("Mercury", "Venus", "Mars", "Jupiter", "Saturn", "Uranus", "Neptune")
-# Equatorial, Archinal et al. 2018 and, the Sun's, IAU 2015 Resolution B3
-RADII_KM = {
-    "Sun": 695_700.0,
-    "Moon": 1737.4,
-    "Mercury": 2440.53,
-    "Venus": 6051.8,
-    "Mars": 3396.19,
-    "Jupiter": 71_492.0,
-    "Saturn": 60_268.0,
-    "Uranus": 25_559.0,
-    "Neptune": 24_764.0,
-    EARTH: EQUATOR_KM,
-}
-# Polar, and poles (right ascension and declination, degrees), of those that are flat enough to see: the same source
-POLAR_KM = {"Jupiter": 66_854.0, "Saturn": 54_364.0, "Uranus": 24_973.0, "Neptune": 24_341.0}
-POLES_DEG = {
-    "Jupiter": (268.057, 64.495),
-    "Saturn": (40.589, 83.537),
-    "Uranus": (257.311, -15.175),
-    "Neptune": (299.36, 43.46),
-}
-LAWS: dict[str, Law] = {"Sun": "limb-darkened", "Moon": "lunar-lambert"}  # planets: lambert
-NORTH = np.array([0.0, 0.0, 1.0])
 # The ephemeris takes 3 ms for all bodies at the ends of this time and twice between; cubics through them are within 0.1 mas.
 SPAN_S = 3 * 3600
 SPAN_NS, MINUTE_NS = SPAN_S * NS_PER_S, 60 * NS_PER_S
@@ -188,6 +166,10 @@ class MovingSky:
         since_ns = self._within(t_ns)
         now = partial(self._circumstances, since_ns // MINUTE_NS)
         return self.satellites.near(cone, Sky(self._utc_ns + since_ns, now, self._fixed_km_s, *velocity_and_place))
+
+    def satellites_placed(self, t_ns: int | None) -> int:
+        """How many of the satellites have a place by their elements at a moment."""
+        return 0 if self.satellites is None else self.satellites.place(self._utc_ns + self._within(t_ns))
 
     def _compute_circumstances(self, minute: int) -> Circumstances:
         """The Sun and the Earth's velocity at a minute: 2.5 arcsec of the Sun, 0.4 m/s."""
@@ -331,7 +313,7 @@ class MovingSky:
             distance_km=float(np.linalg.norm(seen_km)),
             equator_km=RADII_KM[name],
             polar_km=POLAR_KM.get(name, RADII_KM[name]),
-            pole=_pole(name),
+            pole=pole(name),
             sun=NORTH if name == "Sun" else sun_km / np.linalg.norm(sun_km),
             law=LAWS.get(name, "lambert"),
             lunar_share=lunar_share(phase_deg) if name == "Moon" else 1.0,
@@ -396,10 +378,3 @@ def _against_start(now: FloatArray, velocity_km_s: FloatArray | None) -> FloatAr
 def _moved(face: Disc, direction: FloatArray, distance_km: float) -> Disc:
     """A disc elsewhere: its radiance does not depend on its distance."""
     return replace(face, direction=direction, distance_km=distance_km)
-
-
-def _pole(name: str) -> FloatArray:
-    if name not in POLES_DEG:
-        return NORTH
-    ra, dec = np.radians(POLES_DEG[name])
-    return np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])

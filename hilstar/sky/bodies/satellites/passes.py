@@ -151,14 +151,15 @@ class Satellites:
         self._other = np.ones(len(satellites), dtype=np.bool_) if own is None else self._numbers != own
         self._watch: _Watch | None = None
         self._lost_told = self._own_told = False
+        self._lost = 0
+        self.listed = 0  # in the table of magnitudes
 
     def __len__(self) -> int:
         return len(self.names)
 
     def near(self, cone: Cone, sky: Sky) -> Pass | None:
         """Those in a cone at a moment, and some more; None for none."""
-        if self._swarm.move_to(sky.utc_ns):
-            self._tell_lost()
+        self.place(sky.utc_ns)
         observer = self._observer(sky)
         found = self._watched(cone, sky, observer)
         if not len(found):
@@ -224,10 +225,12 @@ class Satellites:
         stars.vectors[place], stars.electrons_per_s[place] = vectors, electrons_per_s
         stars.v_mag[place] = magnitude(electrons_per_s / self._v0_e_per_s)
 
-    def with_place(self, utc_ns: int) -> int:
-        """How many have a place by their elements at a UTC."""
-        self._swarm.move_to(utc_ns)
-        return int((self._swarm.error == 0).sum())
+    def place(self, utc_ns: int) -> int:
+        """Be ready for a UTC; how many have a place then. One line, once, about those that have none."""
+        if self._swarm.move_to(utc_ns):
+            self._lost = int(np.count_nonzero(self._swarm.error))
+            self._tell_lost()
+        return len(self) - self._lost
 
     def warn_of_age(self, file: str, utc_ns: int) -> None:
         """One line where elements are more than OLD_DAYS from a UTC."""
@@ -245,7 +248,7 @@ class Satellites:
             )
 
     def _tell_lost(self) -> None:
-        if self._lost_told or not self._swarm.error.any():
+        if self._lost_told or not self._lost:
             return
         from sgp4.api import SGP4_ERRORS
 

@@ -1,0 +1,41 @@
+"""Sizes, flattening, poles and laws of the light of Sun, Moon, Earth and planets."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hilstar.arrays import FloatArray
+from hilstar.sky.bodies.disc import Law
+from hilstar.sky.bodies.earth import EARTH, EQUATOR_KM
+
+# Equatorial, Archinal et al. 2018 and, the Sun's, IAU 2015 Resolution B3
+RADII_KM = {
+    "Sun": 695_700.0,
+    "Moon": 1737.4,
+    "Mercury": 2440.53,
+    "Venus": 6051.8,
+    "Mars": 3396.19,
+    "Jupiter": 71_492.0,
+    "Saturn": 60_268.0,
+    "Uranus": 25_559.0,
+    "Neptune": 24_764.0,
+    EARTH: EQUATOR_KM,
+}
+# Polar, and poles (right ascension and declination, degrees), of those that are flat enough to see: the same source
+POLAR_KM = {"Jupiter": 66_854.0, "Saturn": 54_364.0, "Uranus": 24_973.0, "Neptune": 24_341.0}
+POLES_DEG = {
+    "Jupiter": (268.057, 64.495),
+    "Saturn": (40.589, 83.537),
+    "Uranus": (257.311, -15.175),
+    "Neptune": (299.36, 43.46),
+}
+LAWS: dict[str, Law] = {"Sun": "limb-darkened", "Moon": "lunar-lambert"}  # planets: lambert
+NORTH = np.array([0.0, 0.0, 1.0])
+
+
+def pole(name: str) -> FloatArray:
+    """The unit vector (3,) of a body's north pole, ICRS axes; the ICRS's own of one that is round."""
+    if name not in POLES_DEG:
+        return NORTH
+    ra, dec = np.radians(POLES_DEG[name])
+    return np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])

@@ -18,6 +18,7 @@ from hilstar.cli.calibrate.photometric import photometric
 from hilstar.cli.calibrate.plan import plan
 from hilstar.cli.calibrate.scale import scale
 from hilstar.cli.doctor import doctor
+from hilstar.cli.measure.assess import assess
 from hilstar.cli.measure.budget import budget
 from hilstar.cli.measure.campaign import campaign
 from hilstar.cli.measure.compare import compare
@@ -39,7 +40,7 @@ COMMANDS: dict[str, tuple[Callable[..., None], ...]] = {
     "Show stars": (demo, frame, serve, replay),
     "Attitude streams": (send, attitude, convert, keys),
     "Check what is shown": (simulate, verify, compare, budget, report),
-    "Test the tracker": (campaign,),
+    "Test the tracker": (assess, campaign),
     "Calibrate": (first_light, latency),
     "Study": (study, benchmark),
     "This machine": (doctor,),

@@ -67,6 +67,11 @@ def coarse_offset(commanded: Commanded, t_s: FloatArray, reported: FloatArray) -
     return best
 
 
+def speed_offsets(commanded: Commanded, t_s: FloatArray, reported: FloatArray) -> FloatArray:
+    """The offsets (k,), best first, at which the angular speeds agree, and none at all: they hold in every convention."""
+    return np.append(_by_speed(commanded, t_s, reported)[0], 0.0)
+
+
 def _nearby(commanded: Commanded, t_s: FloatArray, reported: FloatArray, offset_s: float, reach_s: float) -> CoarseClock | None:
     """The best offset within `reach_s` of one."""
     first = _spread_at(commanded, t_s, reported, offset_s)
@@ -118,10 +123,13 @@ def _by_attitude(commanded: Commanded, t_s: FloatArray, reported: FloatArray) ->
     t, q = t_s[few], reported[few]
     reach = np.linspace(commanded.t_s[0] - t_s[-1], commanded.t_s[-1] - t_s[0], SCANNED)
     angle = np.full(len(reach), np.inf)
-    for k, offset in enumerate(reach):
-        moments = commanded.at(t + offset)
-        if moments.known.sum() >= max(3, MIN_OVERLAP * len(t)):
-            cosine = np.abs((q[moments.known] * moments.q[moments.known]).sum(axis=1))
+    shown = commanded.shown
+    frame_s, frame_q = commanded.t_s[shown], commanded.q[shown]
+    for k, offset in enumerate(reach):  # the frame after each moment is near enough for a scan
+        frame = np.searchsorted(frame_s, t + offset)
+        inside = (frame > 0) & (frame < len(frame_s))
+        if inside.sum() >= max(3, MIN_OVERLAP * len(t)):
+            cosine = np.abs((q[inside] * frame_q[frame[inside]]).sum(axis=1))
             angle[k] = float(np.median(1 - np.minimum(cosine, 1)))
     return _peaks(-angle, reach), float(reach[1] - reach[0])
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import numpy.typing as npt
 from scipy import linalg, sparse
 from scipy.spatial import cKDTree
 
@@ -54,8 +55,8 @@ class Bumps:
 def centres_of(place: FloatArray, spacing_px: float) -> FloatArray:
     """Places (p, 6) about a spacing apart that cover some (n, 6)."""
     cell = np.floor(place / spacing_px).astype(np.int64)
-    _, inverse = np.unique(cell, axis=0, return_inverse=True)
-    inverse = inverse.ravel()
+    _, first, inverse = np.unique(_numbers(cell), return_index=True, return_inverse=True)
+    inverse = np.argsort(np.argsort(first))[inverse]  # cells in the order in which they were first seen
     count = np.bincount(inverse)
     mean = np.stack([np.bincount(inverse, column) for column in place.T], axis=1) / count[:, None]
     kept = np.ones(len(mean), dtype=bool)
@@ -63,6 +64,15 @@ def centres_of(place: FloatArray, spacing_px: float) -> FloatArray:
         if kept[a] and kept[b]:
             kept[b] = False
     return np.asarray(mean[kept])
+
+
+def _numbers(cell: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """One number (n,) for each cell (n, 6): a hash by multiplication, which does not meet itself among thousands of cells."""
+    mixed = np.zeros(len(cell), dtype=np.uint64)
+    for column in (cell - cell.min(axis=0)).T.astype(np.uint64):
+        mixed = (mixed ^ column) * np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio (Knuth 1998, 6.4)
+        mixed ^= mixed >> np.uint64(29)
+    return mixed.astype(np.int64)
 
 
 def bumps_at(place: FloatArray, centre: FloatArray, spacing_px: float) -> Bumps:

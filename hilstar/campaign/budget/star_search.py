@@ -16,7 +16,7 @@ MIN_FORWARD = 0.3  # of a direction along the boresight, for its place on the de
 GRID = 40  # directions along each side
 PHASE_CYCLES = 0.25  # that a stretch may lose at the edge of a grid's cell
 MIN_STRETCH, MAX_STRETCH = 16, 256  # answers
-COARSE_ANSWERS = 3000
+COARSE_ANSWERS, FINE_ANSWERS = 3000, 8000  # that are looked at, spread over the run
 KEPT = 4  # directions, from one grid to the next
 LEVELS = 14
 FINEST_PX = 0.02
@@ -40,7 +40,7 @@ def best_direction(residual_arcsec: FloatArray, axes: FloatArray, scale: Scale) 
     search = _Search(value, axes, frame, scale)
     best = grid
     for level in range(LEVELS):
-        score = search.score(best, step, COARSE_ANSWERS if level == 0 else len(value))
+        score = search.score(best, step, COARSE_ANSWERS if level == 0 else FINE_ANSWERS)
         order = np.argsort(-score)
         best = best[order[: KEPT if level < LEVELS - 1 else 1]]
         if float(np.max(step)) * scale.focal_px < FINEST_PX:
@@ -83,10 +83,10 @@ class _Search:
         scores = np.zeros(len(tangent))
         for k, direction in enumerate(self.directions(tangent)):
             seen = axes @ direction
-            wave = np.exp((2j * np.pi * self.scale.focal_px) * (seen[:, :2] / seen[:, 2:]))
-            for axis in range(2):
-                sums = np.add.reduceat(value * wave[:, axis, None], start, axis=0)
-                scores[k] += float((np.abs(sums) ** 2).sum())
+            angle = (2 * np.pi * self.scale.focal_px) * (seen[:, :2] / seen[:, 2:])
+            for wave in (np.cos(angle), np.sin(angle)):
+                sums = np.add.reduceat((value[:, :, None] * wave[:, None]).reshape(-1, 6), start, axis=0)
+                scores[k] += float((sums**2).sum())
         return scores
 
     def _stretches(self, cell_px: float) -> IntArray:

@@ -1,0 +1,99 @@
+"""What the display itself costs: how far the attitude of the stars as shown is from that of the stars as they are.
+
+The twin lets a noiseless tracker look at the display and at the sky itself, at attitudes of the run. Star by star their
+places differ, by codes that are not fine enough for a place between pixels, and by a true lens that is not the assumed one.
+The small rotation e that turns the sky's directions v into the shown ones, v + e x v, weighted by light, is the attitude error
+that the display makes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilstar.arrays import FloatArray
+from hilstar.bench.bench_file import BenchFile
+from hilstar.twin.verify.star_finder import StarFinder, star_finder
+from hilstar.twin.verify.twin import Twin
+from hilstar.units import ARCSEC_PER_RAD
+
+MIN_STARS = 3
+SURE = 3.0
+
+
+def display_errors(file: BenchFile, q_icrs_to_cam: FloatArray) -> FloatArray:
+    """The display's attitude errors (n, 3), arcsec, cam axes, at attitudes (n, 4); NaN where it shows too few stars.
+
+    Raises InputError for a bench that cannot be built, and MachineError without OpenGL.
+    """
+    with Twin(file) as twin:
+        finder = star_finder(twin.bench, twin.monitor_px_per_px)
+        return np.array([_error(twin, finder, q, number) for number, q in enumerate(q_icrs_to_cam)]).reshape(-1, 3)
+
+
+def _error(twin: Twin, finder: StarFinder, q_icrs_to_cam: FloatArray, number: int) -> FloatArray:
+    field = twin.field(q_icrs_to_cam, number)
+    sky, shown = (finder.match(image, field.x_px, field.y_px) for image in (field.sky_e, field.shown_e))
+    both = (sky.index >= 0) & (shown.index >= 0)
+    if both.sum() < MIN_STARS:
+        return np.full(3, np.nan)
+    i, j = sky.index[both], shown.index[both]
+    true = _unit(twin.camera.rays(sky.found.x_px[i], sky.found.y_px[i]))
+    seen = _unit(twin.camera.rays(shown.found.x_px[j], shown.found.y_px[j]))
+    return ARCSEC_PER_RAD * turn_between(true, seen, sky.found.flux[i])
+
+
+def turn_between(true: FloatArray, seen: FloatArray, weight: FloatArray) -> FloatArray:
+    """The small rotation (3,), rad, that takes unit vectors (n, 3) nearest to others, by weights (n,)."""
+    cross = np.zeros((len(true), 3, 3))  # e x v = -[v] e
+    x, y, z = true.T
+    cross[:, 0, 1], cross[:, 0, 2], cross[:, 1, 2] = z, -y, x
+    cross -= np.swapaxes(cross, 1, 2)
+    root = np.sqrt(weight)[:, None]
+    found, *_ = np.linalg.lstsq((cross * root[:, :, None]).reshape(-1, 3), ((seen - true) * root).ravel(), rcond=None)
+    return np.asarray(found)
+
+
+def _unit(vectors: FloatArray) -> FloatArray:
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
+
+
+@dataclass(frozen=True, slots=True)
+class DisplayCost:
+    """The display's own error, one sigma across and about the boresight, arcsec, at `attitudes` of the run.
+
+    `seen` is the share of it that the tracker's answers show, with one sigma: 1 where the tracker looked at this display,
+    0 where its answers know nothing of it.
+    """
+
+    cross_arcsec: float
+    roll_arcsec: float
+    attitudes: int
+    seen: float
+    sigma_seen: float
+
+    @property
+    def subtracted(self) -> float:
+        """The share of the display's variance that is taken from the noise: what the answers show for sure, up to all of it."""
+        return min(self.seen, 1.0) ** 2 if self.seen > SURE * self.sigma_seen else 0.0
+
+
+def display_cost(error_arcsec: FloatArray, left_arcsec: FloatArray) -> DisplayCost | None:
+    """The cost from errors (n, 3) of the display, NaN for none, and what noise (n, 3) the tracker had at the same attitudes."""
+    known = np.isfinite(error_arcsec).all(axis=1)
+    if known.sum() < MIN_STARS:
+        return None
+    error = error_arcsec[known] - error_arcsec[known].mean(axis=0)
+    left = left_arcsec[known]
+    variance = np.maximum((left**2).mean(axis=0), 1e-12)
+    information = float((error**2 / variance).sum())
+    seen = float((error * left / variance).sum()) / max(information, 1e-30)
+    power = (error**2).sum(axis=0) / max(len(error) - 1, 1)
+    return DisplayCost(
+        cross_arcsec=float(np.sqrt(power[:2].mean())),
+        roll_arcsec=float(np.sqrt(power[2])),
+        attitudes=int(known.sum()),
+        seen=seen,
+        sigma_seen=1 / float(np.sqrt(max(information, 1e-30))),
+    )

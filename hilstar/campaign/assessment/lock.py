@@ -1,0 +1,121 @@
+"""Whether the tracker answered: availability, acquisition, and where it lost its lock."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+
+from hilstar.arrays import FloatArray
+from hilstar.campaign.budget.commanded import Commanded
+
+MISSED_CYCLES = 1.5  # between right answers: more is an outage
+LOST_CYCLES = 3.0  # of the tracker without a right answer: its lock is lost
+MAX_CYCLES = 20_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Outage:
+    """A time without right answers: run time, s, and its length; `lost` where it is longer than LOST_CYCLES."""
+
+    start_s: float
+    length_s: float
+    lost: bool
+    rows: int
+    wrong: int
+
+
+@dataclass(frozen=True, slots=True)
+class Acquisition:
+    """When a sky appeared, run time, s, and how long until the first right answer; None where none came before it went."""
+
+    start_s: float
+    wait_s: float | None
+
+
+@dataclass(frozen=True)
+class Lock:
+    """The answers that were due, and those that came: `availability` is right answers over those due."""
+
+    cycle_s: float
+    due: int
+    right: int
+    availability: float
+    outages: tuple[Outage, ...]
+    acquisitions: tuple[Acquisition, ...]
+
+    @property
+    def lost(self) -> tuple[Outage, ...]:
+        """The times when the lock was lost."""
+        return tuple(each for each in self.outages if each.lost)
+
+    @property
+    def acquisition_probability(self) -> float | None:
+        """The share of appearances and losses after which a right answer came."""
+        if not self.acquisitions:
+            return None
+        return sum(each.wait_s is not None for each in self.acquisitions) / len(self.acquisitions)
+
+    @property
+    def acquisition_s(self) -> float | None:
+        """The median time until the first right answer."""
+        waits = [each.wait_s for each in self.acquisitions if each.wait_s is not None]
+        return float(np.median(waits)) if waits else None
+
+
+def lock_of(commanded: Commanded, t_s: FloatArray, right: npt.NDArray[np.bool_], wrong: npt.NDArray[np.bool_]) -> Lock:
+    """What came of rows at run times (n,), rising, of which some are right answers, some wrong, and the others none."""
+    cycle_s = max(float(np.median(np.diff(t_s))), 1e-6)
+    cycle_s = max(cycle_s, float(t_s[-1] - t_s[0]) / MAX_CYCLES)
+    due = commanded.at(np.arange(t_s[0], t_s[-1] + cycle_s / 2, cycle_s)).known
+    outages = tuple(_outages(commanded, t_s, right, wrong, cycle_s))
+    count = int(right.sum())
+    return Lock(
+        cycle_s=cycle_s,
+        due=int(due.sum()),
+        right=count,
+        availability=min(count / max(int(due.sum()), 1), 1.0),
+        outages=outages,
+        acquisitions=tuple(_acquisitions(commanded, t_s, right, outages)),
+    )
+
+
+def _outages(
+    commanded: Commanded,
+    t_s: FloatArray,
+    right: npt.NDArray[np.bool_],
+    wrong: npt.NDArray[np.bool_],
+    cycle_s: float,
+) -> list[Outage]:
+    found = []
+    good = np.flatnonzero(right)
+    for before, after in pairwise(good.tolist()):
+        gap_s = float(t_s[after] - t_s[before])
+        if gap_s <= MISSED_CYCLES * cycle_s:
+            continue
+        inner = np.arange(t_s[before] + cycle_s, t_s[after] - cycle_s / 2, cycle_s)
+        if len(inner) and commanded.at(inner).known.mean() > 0.5:
+            between = slice(before + 1, after)
+            length_s = gap_s - cycle_s
+            lost = length_s > LOST_CYCLES * cycle_s
+            found.append(Outage(float(inner[0]), length_s, lost, int(after - before - 1), int(wrong[between].sum())))
+    return found
+
+
+def _acquisitions(
+    commanded: Commanded, t_s: FloatArray, right: npt.NDArray[np.bool_], outages: tuple[Outage, ...]
+) -> list[Acquisition]:
+    """After each appearance of the sky during the telemetry, and after each loss of the lock."""
+    shown = np.flatnonzero(np.diff(np.r_[False, commanded.joined].astype(int)) == 1)
+    ends = np.flatnonzero(np.diff(np.r_[commanded.joined, False].astype(int)) == -1) + 1
+    answers = t_s[right]
+    found = []
+    for first, last in zip(commanded.t_s[shown], commanded.t_s[ends], strict=True):
+        if last <= t_s[0] or first >= t_s[-1]:
+            continue
+        inside = answers[(answers >= first) & (answers <= last)]
+        found.append(Acquisition(float(first), float(inside[0] - first) if len(inside) else None))
+    found += [Acquisition(each.start_s, each.length_s) for each in outages if each.lost]
+    return sorted(found, key=lambda each: each.start_s)

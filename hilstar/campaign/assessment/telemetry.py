@@ -1,0 +1,165 @@
+"""A tracker's telemetry: CSV with every row that it has, valid or not, or a log of attitudes (AEM, MCAP, JSON lines)."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from decimal import Decimal, DecimalException
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from hilstar.arrays import FloatArray, IntArray
+from hilstar.attitude.wire.protocol import NORM_TOLERANCE
+from hilstar.errors import InputError, shortened
+from hilstar.reading import MCAP_MAGIC, open_lines, open_regular
+from hilstar.rotation import normalise
+from hilstar.units import NS_PER_S
+
+COLUMNS = ("t_s", "qw", "qx", "qy", "qz")
+VALID = "valid"
+ADVICE = f"write a CSV with the columns {','.join(COLUMNS)} and, where known, valid (1 or 0); or give an AEM or an MCAP file"
+MAX_BYTES = 500_000_000
+MAX_ROWS = 3_000_000
+MAX_T_NS = 9 * 10**18
+FLAGS = {"": True, "1": True, "0": False, "true": True, "false": False}
+
+
+@dataclass(frozen=True, slots=True)
+class Telemetry:
+    """Times (n,), ns of the tracker's clock, rising, with attitudes (n, 4), unit q_icrs_to_cam, NaN where not `valid` (n,).
+
+    `line` (n,) is each row's line in its file, or which attitude of it (from 1) where `of_lines` is False.
+    """
+
+    path: Path
+    t_ns: IntArray
+    q: FloatArray
+    valid: npt.NDArray[np.bool_]
+    line: IntArray
+    of_lines: bool = True
+
+    @property
+    def source(self) -> str:
+        """The file's name, as messages say it."""
+        return str(self.path)
+
+
+def read_telemetry(path: Path) -> Telemetry:
+    """Read telemetry. Raises InputError with the line of what is no attitude, and of times that do not increase."""
+    telemetry = _read_csv(path) if _is_csv(path) else _read_log(path)
+    if not telemetry.valid.any():
+        rows = f"{len(telemetry.t_ns)} rows, none of them valid" if len(telemetry.t_ns) else "no row"
+        raise InputError(f"{path}: has {rows}; {ADVICE}")
+    return telemetry
+
+
+def _is_csv(path: Path) -> bool:
+    """True unless the file's beginning is that of a log that says what it is."""
+    if path.is_dir():
+        return False
+    with open_regular(path, ADVICE) as file:
+        head = file.read(4096)
+    if head.startswith(MCAP_MAGIC) or b"\0" in head:
+        return False
+    lines = (line.strip() for line in head.splitlines())
+    first = next((line for line in lines if line and not line.startswith((b"#", b"COMMENT"))), b"")
+    return not first.startswith((b"<", b"{", b"CCSDS"))
+
+
+def _read_log(path: Path) -> Telemetry:
+    from hilstar.attitude.logs.log_file import read_log
+
+    samples = read_log(path)
+    count = len(samples)
+    return Telemetry(
+        path,
+        np.array([sample.t_ns for sample in samples], dtype=np.int64),
+        np.array([sample.q_icrs_to_cam for sample in samples]).reshape(count, 4),
+        np.ones(count, dtype=np.bool_),
+        np.arange(1, count + 1),
+        of_lines=False,
+    )
+
+
+def _read_csv(path: Path) -> Telemetry:
+    t_ns: list[int] = []
+    q: list[tuple[float, ...]] = []
+    valid: list[bool] = []
+    line: list[int] = []
+    for number, cells in _rows(path):
+        t_ns.append(_time(path, number, cells[0]))
+        if len(t_ns) > 1 and t_ns[-1] <= t_ns[-2]:
+            said = f"t_s = {shortened(cells[0])} after {t_ns[-2] / NS_PER_S:.9g}"
+            raise InputError(f"{path}:{number}: time does not increase ({said}); sort the rows, and give one recording")
+        valid.append(_flag(path, number, cells[5]))
+        q.append(_quaternion(path, number, cells[1:5]) if valid[-1] else (math.nan,) * 4)
+        line.append(number)
+        if len(t_ns) > MAX_ROWS:
+            raise InputError(f"{path}: more than {MAX_ROWS} rows; give a shorter recording")
+    attitudes = np.array(q).reshape(len(q), 4)
+    flags = np.array(valid, dtype=np.bool_)
+    attitudes[flags] = normalise(attitudes[flags])
+    return Telemetry(path, np.array(t_ns, dtype=np.int64), attitudes, flags, np.array(line, dtype=np.intp))
+
+
+def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
+    """Line numbers with the cells of COLUMNS and `valid`, "" where that is not there."""
+    with open_lines(path, ADVICE, MAX_BYTES) as text:
+        reader = csv.reader(text)
+        try:
+            rows = (row for row in reader if any(cell.strip() for cell in row) and not row[0].startswith("#"))
+            header = [name.strip() for name in next(rows, [])]
+            for name in COLUMNS:
+                if header.count(name) != 1:
+                    what = "there twice" if name in header else "missing"
+                    raise InputError(f"{path}:{max(reader.line_num, 1)}: column {name} is {what}; {ADVICE}")
+            places = [header.index(name) for name in COLUMNS]
+            flag = header.index(VALID) if VALID in header else None
+            for row in rows:
+                if len(row) < len(header):
+                    raise InputError(f"{path}:{reader.line_num}: {len(row)} cells and {len(header)} columns; {ADVICE}")
+                cells = [row[place].strip() for place in places]
+                yield reader.line_num, [*cells, "" if flag is None else row[flag].strip()]
+        except csv.Error as error:
+            raise InputError(f"{path}:{reader.line_num}: not CSV ({error}); {ADVICE}") from error
+
+
+def _time(path: Path, line: int, cell: str) -> int:
+    """Decimal seconds as nanoseconds: a float of today's Unix time would be off by 100 ns."""
+    try:
+        value = Decimal(cell)
+        t_ns = int(value.scaleb(9).to_integral_value()) if value.is_finite() and value.adjusted() < 12 else None
+    except DecimalException:
+        t_ns = None
+    if t_ns is None or abs(t_ns) > MAX_T_NS:
+        raise InputError(f"{path}:{line}: t_s = {shortened(cell)!r} is no time; write seconds, of any clock that runs evenly")
+    return t_ns
+
+
+def _flag(path: Path, line: int, cell: str) -> bool:
+    if cell.lower() not in FLAGS:
+        raise InputError(f"{path}:{line}: valid = {shortened(cell)!r}; write 1 or 0")
+    return FLAGS[cell.lower()]
+
+
+def _quaternion(path: Path, line: int, cells: list[str]) -> tuple[float, ...]:
+    numbers = []
+    for name, cell in zip(COLUMNS[1:], cells, strict=True):
+        try:
+            numbers.append(float(cell))
+        except ValueError:
+            numbers.append(math.nan)
+        if not math.isfinite(numbers[-1]):
+            raise InputError(
+                f"{path}:{line}: {name} = {shortened(cell)!r} is not a finite number; write valid = 0 where there is no answer"
+            )
+    norm = math.hypot(*numbers)
+    if abs(norm - 1) > NORM_TOLERANCE:
+        raise InputError(
+            f"{path}:{line}: the norm of qw,qx,qy,qz is {norm:.6g}; write unit quaternions, within {NORM_TOLERANCE:g}"
+        )
+    return tuple(numbers)

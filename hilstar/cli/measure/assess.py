@@ -1,0 +1,62 @@
+"""hilstar assess: a tracker's error budget, from a run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from hilstar.cli.options import Json, RunFile, check_files
+from hilstar.console.terminal import print_json, say
+from hilstar.errors import InputError
+
+MAX_LATENCY_MS = 1e7
+
+
+def assess(
+    ledger: RunFile,
+    telemetry: Annotated[
+        Path,
+        typer.Argument(
+            metavar="TELEMETRY",
+            help="Its answers on its own clock: CSV t_s,qw,qx,qy,qz[,valid] (q_icrs_to_cam, scalar first), AEM, MCAP.",
+        ),
+    ],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Directory for budget.html and its tables.")],
+    stamp: Annotated[
+        Literal["start", "middle", "end"], typer.Option(help="Where in an exposure of `[tracker] exposure_s` t_s stands.")
+    ] = "middle",
+    latency_ms: Annotated[
+        float, typer.Option("--latency-ms", metavar="MS", help="How much later than that t_s is, where it is known.")
+    ] = 0.0,
+    display_attitudes: Annotated[
+        int, typer.Option(metavar="N", min=0, max=1000, help="Attitudes at which the twin measures the display; 0 for none.")
+    ] = 12,
+    as_json: Json = False,
+) -> None:
+    """Find a tracker's error budget: bias, field-of-view error, pixel error, noise, clock, availability, wrong answers."""
+    from hilstar.campaign.assessment.assess import Wanted, assess_files
+    from hilstar.campaign.assessment.figures import budget_of, lines_of, write_tables
+    from hilstar.campaign.assessment.page import write_page
+    from hilstar.files import check_directory, make_directory
+
+    check_directory("-o", output)
+    if not abs(latency_ms) < MAX_LATENCY_MS:
+        raise InputError(f"--latency-ms {latency_ms:g}: write milliseconds, less than {MAX_LATENCY_MS:g} either way")
+    names = ("budget.html", "budget.csv", "slices.csv", "wrong.csv", "outages.csv")
+    check_files([ledger, telemetry], [output / name for name in names])
+    found = assess_files(ledger, telemetry, Wanted(stamp, latency_ms / 1e3, display_attitudes))
+    make_directory(output)
+    write_tables(output, found)
+    write_page(output / "budget.html", found)
+    if as_json:
+        print_json(budget_of(found))
+        for note in found.notes:
+            say(note)
+        return
+    for what, text in lines_of(found):
+        typer.echo(f"{what:24}{text}")
+    for note in found.notes:
+        typer.echo(f"{'note':24}{note}")
+    typer.echo(f"{'page':24}{output / 'budget.html'}")

@@ -1,0 +1,50 @@
+"""The ledger of a run that showed a planted tracker's attitudes, and that tracker's telemetry, as files."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import msgspec
+
+from hilstar.arrays import FloatArray
+from hilstar.attitude.logs.mcap_reader import RUN_METADATA
+from hilstar.attitude.logs.mcap_writer import McapWriter, Topic
+from hilstar.run.record.ledger_records import FRAME_TOPIC, FrameRecord, schema_of
+from tests.support.benches import SMALL_BENCH
+from tests.support.planted_tracker import Planted
+
+NS_PER_S = 1_000_000_000
+
+
+def write_ledger(path: Path, frames_s: FloatArray, frames_q: FloatArray | None, start_ns: int = 5 * NS_PER_S) -> Path:
+    """A ledger with a frame at each time (n,), s after `start_ns` of the sender's clock, of the attitudes (n, 4), or none."""
+    head = {"bench_text": SMALL_BENCH, "bench_file": str(path.parent / "bench.toml"), "bench_sha256": "of a test"}
+    with path.open("wb") as file:
+        topic = Topic(FRAME_TOPIC, "hilstar.Frame", schema_of(FrameRecord, "hilstar.Frame"))
+        writer = McapWriter(file.fileno(), {"frame": topic}, RUN_METADATA, head)
+        for number, t_s in enumerate(frames_s.tolist()):
+            t_ns = start_ns + round(t_s * NS_PER_S)
+            q = None if frames_q is None else tuple(frames_q[number].tolist())
+            record = FrameRecord(frame=number, t_ns=t_ns, light_ns=t_ns, draw_ns=t_ns, swap_ns=t_ns, q=q)
+            writer.add("frame", t_ns, msgspec.json.encode(record), number)
+        writer.flush()
+        writer.finish()
+        os.fsync(file.fileno())
+    return path
+
+
+def write_telemetry(path: Path, tau_s: FloatArray, reported: FloatArray, start_s: float = 5.0) -> Path:
+    """Telemetry as CSV; its line k + 2 is answer k."""
+    rows = [
+        f"{start_s + t:.9f},{w!r},{x!r},{y!r},{z!r},1"
+        for t, (w, x, y, z) in zip(tau_s.tolist(), reported.tolist(), strict=True)
+    ]
+    path.write_text("\n".join(["t_s,qw,qx,qy,qz,valid", *rows]) + "\n")
+    return path
+
+
+def write_run(folder: Path, planted: Planted) -> tuple[Path, Path]:
+    """The ledger and the telemetry of a planted run."""
+    ledger = write_ledger(folder / "run.mcap", planted.frames_s, planted.frames_q)
+    return ledger, write_telemetry(folder / "telemetry.csv", planted.tau_s, planted.reported)

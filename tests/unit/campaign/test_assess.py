@@ -1,0 +1,189 @@
+"""hilstar assess over files: what it finds of a planted tracker, and what it refuses."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from hilstar.arrays import FloatArray
+from hilstar.campaign.assessment.display_cost import display_cost, turn_between
+from hilstar.campaign.assessment.lock import lock_of
+from hilstar.campaign.assessment.slices import slices_of
+from hilstar.campaign.budget.commanded import Commanded
+from tests.support.commands import run_hilstar_here
+from tests.support.planted_run import write_ledger, write_run, write_telemetry
+from tests.support.planted_tracker import Planted, Sizes, plant, scalar_first, scan, still
+
+SIZES = Sizes(wild=5, offset_s=0.02)
+
+
+@pytest.fixture(scope="module")
+def planted() -> Planted:
+    return plant(scan, SIZES, np.random.default_rng(11), seconds=240.0)
+
+
+def test_a_run_gives_the_budget_on_one_page_and_names_each_wrong_answer(tmp_path: Path, planted: Planted) -> None:
+    ledger, telemetry = write_run(tmp_path, planted)
+    out = tmp_path / "out"
+    run = run_hilstar_here("assess", ledger, telemetry, "-o", out, "--json", "--display-attitudes", "0")
+    assert run.returncode == 0, run.stderr
+    found = json.loads(run.stdout)
+    keys = ["bias_arcsec", "fov_arcsec", "pixel_arcsec", "noise_arcsec", "clock", "availability", "wrong"]
+    assert list(found) == keys
+    assert list(found["clock"]) == ["offset_ms", "drift_ppm", "sigma_ms"]
+    assert found["noise_arcsec"]["cross"] == pytest.approx(1.0, rel=0.1)
+    assert found["pixel_arcsec"]["roll"] == pytest.approx(2.4, rel=0.15)
+    assert found["clock"]["offset_ms"] == pytest.approx(20.0, abs=10.0)
+    lines = (planted.wild + 2).tolist()
+    assert [each["row"] for each in found["wrong"]] == lines
+    with (out / "wrong.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [int(row["row"]) for row in rows] == lines
+    assert [float(row["t_s"]) for row in rows] == pytest.approx((planted.tau_s[planted.wild] + 5).tolist(), abs=1e-8)
+    # Gaps, and wild answers: what is left of one answer each 100 ms.
+    due = (planted.tau_s[-1] - planted.tau_s[0]) / 0.1 + 1
+    assert found["availability"] == pytest.approx((len(planted.tau_s) - 5) / due, abs=2e-3)
+    page = (out / "budget.html").read_text()
+    assert page.count("data:image/png;base64,") == 3
+    assert not re.search(r"(src|href)=.(https?:)?//", page)
+    with (out / "budget.csv").open() as file:
+        table = {(row["quantity"], row["axis"]): row for row in csv.DictReader(file)}
+    row = table["noise", "cross"]
+    assert float(row["low_95"]) < 1.0 < float(row["high_95"])
+    assert (out / "slices.csv").read_text().count("rate_deg_s") == 5
+
+
+@pytest.mark.parametrize(
+    ("rows", "said"),
+    [
+        ([], "has no row"),
+        (["1,nan,0,0,1,1"], "qw = 'nan' is not a finite number"),
+        (["1,2,0,0,1,1"], "norm of qw,qx,qy,qz is 2.23607"),
+        (["2,1,0,0,0,1", "1,1,0,0,0,1"], "time does not increase"),
+        (["1,1,0,0,0,0"], "none of them valid"),
+        (["1,1,0,0,0,2"], "valid = '2'"),
+        (["x,1,0,0,0,1"], "t_s = 'x' is no time"),
+        (["1,1,0,0,0,1"], "1 valid answers, and 30 are needed"),
+    ],
+)
+def test_telemetry_that_is_wrong_is_refused_in_one_line(tmp_path: Path, planted: Planted, rows: list[str], said: str) -> None:
+    ledger = write_ledger(tmp_path / "run.mcap", planted.frames_s[:50], planted.frames_q[:50])
+    telemetry = tmp_path / "telemetry.csv"
+    telemetry.write_text("\n".join(["t_s,qw,qx,qy,qz,valid", *rows]) + "\n")
+    check_refused(ledger, telemetry, said)
+
+
+def check_refused(ledger: Path, telemetry: Path, said: str) -> None:
+    run = run_hilstar_here("assess", ledger, telemetry, "-o", ledger.parent / "out", "--json")
+    assert run.returncode == 2, run.stderr
+    assert run.stdout == ""
+    assert said in run.stderr
+    assert run.stderr.count("\n") == 1
+    assert not (ledger.parent / "out").exists()
+
+
+def turned(planted: Planted, left: Rotation) -> FloatArray:
+    return scalar_first(left * Rotation.from_quat(np.roll(planted.reported, -1, axis=1)))
+
+
+@pytest.mark.parametrize(
+    ("convention", "said"),
+    [
+        ("inverse", "are the inverse (cam to ICRS)"),
+        ("scalar last", "have the scalar last"),
+        ("y up", "y = -y, z = -z of hilstar's"),
+        ("another run", "at no offset of its clock"),
+    ],
+)
+def test_other_conventions_and_other_runs_are_told_apart(tmp_path: Path, planted: Planted, convention: str, said: str) -> None:
+    ledger, _ = write_run(tmp_path, planted)
+    rng = np.random.default_rng(2)
+    reported = {
+        "inverse": lambda: planted.reported * [1, -1, -1, -1],
+        "scalar last": lambda: np.roll(planted.reported, -1, axis=1),
+        "y up": lambda: turned(planted, Rotation.from_rotvec([np.pi, 0, 0])),
+        "another run": lambda: scalar_first(Rotation.random(len(planted.tau_s), random_state=rng)),
+    }[convention]()
+    telemetry = write_telemetry(tmp_path / "other.csv", planted.tau_s, reported)
+    check_refused(ledger, telemetry, said)
+
+
+def test_a_ledger_without_attitudes_is_refused(tmp_path: Path, planted: Planted) -> None:
+    ledger = write_ledger(tmp_path / "run.mcap", planted.frames_s[:50], None)
+    telemetry = write_telemetry(tmp_path / "telemetry.csv", planted.tau_s, planted.reported)
+    check_refused(ledger, telemetry, "none of them has an attitude")
+
+
+def test_a_still_run_does_not_invent_a_clock(tmp_path: Path) -> None:
+    ledger, telemetry = write_run(
+        tmp_path, plant(still, Sizes(fov=0.0, pixel=0.0, wild=2), np.random.default_rng(12), seconds=200.0)
+    )
+    run = run_hilstar_here("assess", ledger, telemetry, "-o", tmp_path / "out", "--json", "--display-attitudes", "0")
+    found = json.loads(run.stdout)
+    assert found["clock"]["offset_ms"] is None
+    assert found["clock"]["drift_ppm"] is None
+    assert found["clock"]["sigma_ms"] > 1000
+    assert found["fov_arcsec"] == {"cross": None, "roll": None}
+    assert "no motion that tells the clock" in run.stderr
+    assert np.linalg.norm(found["bias_arcsec"][:2]) == pytest.approx(20.0, rel=0.05)
+
+
+def test_gaps_invalid_and_wrong_answers_are_outages_and_longer_ones_lose_the_lock() -> None:
+    t_s = np.arange(0.0, 100.0, 0.1)
+    commanded = Commanded(t_s, np.tile([1.0, 0.0, 0.0, 0.0], (len(t_s), 1)))
+    right, wrong = np.ones(len(t_s), dtype=bool), np.zeros(len(t_s), dtype=bool)
+    right[:20] = False  # two seconds to acquire
+    right[300:350] = False  # five seconds not valid
+    right[500], wrong[500] = False, True
+    kept = (t_s < 70) | (t_s > 80.05)  # ten seconds without a row
+    lock = lock_of(commanded, t_s[kept], right[kept], wrong[kept])
+    assert lock.due == pytest.approx(1000, abs=1)
+    assert lock.availability == pytest.approx((1000 - 20 - 50 - 1 - 100) / 1000, abs=2e-3)
+    assert [(round(o.start_s, 1), round(o.length_s, 1), o.wrong) for o in lock.outages] == [
+        (30.0, 5.0, 0),
+        (50.0, 0.1, 1),
+        (70.0, 10.1, 0),
+    ]
+    assert len(lock.lost) == 2
+    waits = [each.wait_s for each in lock.acquisitions]
+    assert waits == pytest.approx([2.0, 5.0, 10.1], abs=0.01)
+    assert lock.acquisition_probability == 1.0
+
+
+def test_the_displays_error_is_subtracted_only_where_the_answers_show_it() -> None:
+    rng = np.random.default_rng(13)
+    display = [0.5, 0.5, 4.0] * rng.normal(size=(60, 3))
+    noise = [0.8, 0.8, 3.0] * rng.normal(size=(60, 3))
+    seen, unseen = display_cost(display, noise + display), display_cost(display, noise)
+    assert seen is not None
+    assert unseen is not None
+    assert seen.seen == pytest.approx(1.0, abs=4 * seen.sigma_seen)
+    assert seen.subtracted > 0.5
+    assert unseen.subtracted == 0.0
+    assert display_cost(np.full((60, 3), np.nan), noise) is None
+
+
+def test_shifted_stars_are_the_turn_that_shifts_them() -> None:
+    rng = np.random.default_rng(14)
+    true = np.stack([*rng.uniform(-0.1, 0.1, (2, 20)), np.ones(20)], axis=1)
+    true /= np.linalg.norm(true, axis=1, keepdims=True)
+    turn = np.array([1e-5, -2e-5, 3e-4])
+    found = turn_between(true, Rotation.from_rotvec(turn).apply(true), np.ones(20))
+    np.testing.assert_allclose(found, turn, atol=1e-7)  # the square of the turn
+
+
+def test_slices_by_rate_show_where_the_noise_grows() -> None:
+    rng = np.random.default_rng(15)
+    rate = rng.uniform(0, 1, 5000)
+    left = (1 + rate)[:, None] * rng.normal(size=(5000, 3))
+    slices = slices_of(rate, left, left, 0.0)
+    assert len(slices) == 5
+    assert slices[0].noise_cross_arcsec == pytest.approx(1.1, rel=0.05)
+    assert slices[-1].noise_cross_arcsec == pytest.approx(1.9, rel=0.05)
+    assert sum(each.answers for each in slices) == 5000

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +16,7 @@ from hilstar.arrays import FloatArray
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.attitude.wire.zmq_stream import ZmqReceiver
 from hilstar.bench.build import load
+from hilstar.bench.frame import Bench
 from hilstar.bench.frame_files import write_codes_png, write_preview_png
 from hilstar.files import make_directory
 from hilstar.monitor.response import Codes
@@ -21,7 +24,7 @@ from hilstar.process.interrupts import caught
 from hilstar.resources import resource_path
 from hilstar.rotation import from_radec_roll_deg, propagate, rate_between_rad_s, slerp
 from hilstar.run.loop import Limit
-from hilstar.run.serve import serve
+from hilstar.run.serve import Outlet, serve
 from hilstar.run.shown import FrameSink, Shown
 from hilstar.run.summary import RunSummary
 from hilstar.units import ARCSEC_PER_RAD, NS_PER_S
@@ -83,15 +86,23 @@ def write_log(path: Path, samples: list[AttitudeSample]) -> None:
             file.write(msgspec.json.encode(line) + b"\n")
 
 
-def run_demo(directory: Path, duration_s: float, rng: np.random.Generator, watch: FrameSink) -> Demo:
+Watching = Callable[[Bench, str], AbstractContextManager[tuple[FrameSink, Outlet]]]
+
+
+def run_demo(directory: Path, duration_s: float, rng: np.random.Generator, watching: Watching) -> Demo:
     """Stream a slew from a process of its own through a loopback socket, serve it, and write a few frames.
 
-    `watch` sees every frame. Raises InputError or MachineError.
+    `watching` opens, for a bench and its endpoint, what sees every frame and who follows the run. Raises InputError or
+    MachineError.
     """
     make_directory(directory)
     log_path = directory / SLEW_LOG
     write_log(log_path, slew_samples(duration_s + 1.0, rng))
-    with load(resource_path("configs", "demo.toml")) as bench, ZmqReceiver(bench.config.attitude.address, bind=True) as link:
+    with (
+        load(resource_path("configs", "demo.toml")) as bench,
+        ZmqReceiver(bench.config.attitude.address, bind=True) as link,
+        watching(bench, link.endpoint) as (watch, outlet),
+    ):
         frame_count = round(duration_s * bench.config.monitor.refresh_hz)
         wanted = {int(frame_count * part) for part in (0.0625, 0.25, 0.5, 0.9375)}
         kept: dict[int, Codes] = {}
@@ -106,7 +117,7 @@ def run_demo(directory: Path, duration_s: float, rng: np.random.Generator, watch
         with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as sender:
             try:
                 link.wait_for_message(timeout_ms=20_000)
-                summary = serve(bench, link, Limit(slots=frame_count), sink)
+                summary = serve(bench, link, Limit(slots=frame_count), sink, outlet)
             finally:
                 sender.terminate()
         pictures = []

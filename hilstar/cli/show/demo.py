@@ -2,20 +2,38 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from hilstar.cli.options import MAX_SEED, Json
+from hilstar.cli.show.paging import Console, ConsoleName, Control, Token, followed, page_door
+from hilstar.cli.show.running import optional_ledger
+from hilstar.console.run_status import RunStatus, Source
 from hilstar.console.terminal import progress, report
 from hilstar.files import check_directory
+from hilstar.notices import Notices
+
+if TYPE_CHECKING:
+    from hilstar.bench.frame import Bench
+    from hilstar.console.feed.door import Door
+    from hilstar.run.serve import Outlet
+    from hilstar.run.shown import FrameSink
+
+HZ = 60  # of the demo's bench
 
 
 def demo(
     output: Annotated[Path, typer.Option("-o", "--output", help="Directory for the pictures.")] = Path("hilstar-demo"),
     duration: Annotated[float, typer.Option(help="Seconds to run.", min=0.5, max=600)] = 10.0,
     seed: Annotated[int, typer.Option(help="Seed of the slew's jitter.", min=0, max=MAX_SEED)] = 1,
+    console: Console = None,
+    control: Control = False,
+    token: Token = None,
+    console_name: ConsoleName = None,
     as_json: Json = False,
 ) -> None:
     """The main job in one command: real stars, an attitude streamed over a real ZeroMQ socket, frames out."""
@@ -24,8 +42,30 @@ def demo(
     from hilstar.run.demo import run_demo
 
     check_directory("-o", output)
-    with progress("serving", duration * 60) as advance:
-        result = run_demo(output, duration, np.random.default_rng(seed), lambda shown: advance(shown.number + 1))
+    with page_door(console, control, token, console_name) as door, progress("serving", duration * HZ) as advance:
+
+        def watching(bench: Bench, endpoint: str) -> AbstractContextManager[tuple[FrameSink, Outlet]]:
+            return _watching(bench, endpoint, door, control, lambda shown: advance(shown.number + 1))
+
+        result = run_demo(output, duration, np.random.default_rng(seed), watching)
     report(result.summary, as_json)
     if not as_json:
         typer.echo(f"{'pictures':20}{output}/frame_*_codes.png (what the monitor gets), _preview.png (stretched)")
+
+
+@contextmanager
+def _watching(
+    bench: Bench, endpoint: str, door: Door | None, control: bool, advance: FrameSink
+) -> Iterator[tuple[FrameSink, Outlet]]:
+    """The progress of the demo, and its page."""
+    from hilstar.console.feed.opening import Parts, Told
+    from hilstar.run.record.ledger import NO_SPLIT, Ledger
+    from hilstar.run.serve import Outlet
+
+    notices = Notices()
+    status = RunStatus(Source(f"bound to {endpoint}", bench.renderer.gl_renderer, bench.config.monitor.refresh_hz))
+    with optional_ledger(None, bench, notices, False, NO_SPLIT) as kept:
+        parts = Parts(bench, notices, kept, lambda path: Ledger(path, bench, notices))
+        page = Told("demo", bench.config.attitude.source, endpoint)
+        with followed(door, control, page, parts, status, advance) as (sink, follower, desk):
+            yield sink, Outlet(None, kept, notices, follower=follower, desk=desk)

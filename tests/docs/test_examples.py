@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 
 from hilstar.bench.config import read_config
+from hilstar.bench.faults.scenario import parse_scenario
 from hilstar.cli.app import app
 from hilstar.cli.entry import with_values
 from tests.docs.pages import Block, blocks_of, differs
@@ -86,6 +87,9 @@ def read_toml(text: str, folder: Path) -> None:
     """Read tables of a bench file; those that the page leaves out are the small bench's."""
     given = set(re.findall(r"(?m)^\[(\w+)\]$", text))
     if "calibration" in given:  # of a calibration file
+        return
+    if "[[fault]]" in text:
+        parse_scenario(folder / "scenario.toml", text)
         return
     missing = [part for part in re.split(r"\n(?=\[)", SMALL_BENCH) if part.strip("\n[").split("]")[0] not in given]
     path = folder / "tables.toml"

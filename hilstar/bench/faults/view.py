@@ -73,6 +73,7 @@ class FaultView:
         self._sight, self._seed = sight, scenario.seed
         self._folder = scenario.folder if scenario.faults else None
         self._lasting = frozenset(scenario.faults)
+        self._glow_kept: tuple[Fault, float, extended.Glow] | None = None
         self._lock = threading.Lock()
         self._targets = Targets()
         self._maps: dict[Fault, extended.LightMap] = {}
@@ -239,6 +240,16 @@ class FaultView:
         return found
 
     def _glow(self, fault: Glow, share: float, q_icrs_to_cam: FloatArray) -> extended.Glow:
+        fixed = fault.tracker_px is not None or fault.screen_px is not None
+        known = self._glow_kept
+        if fixed and known is not None and known[:2] == (fault, share):
+            return known[2]  # one object: the renderer knows the same light again by that
+        made = self._new_glow(fault, share, q_icrs_to_cam)
+        if fixed:
+            self._glow_kept = fault, share, made
+        return made
+
+    def _new_glow(self, fault: Glow, share: float, q_icrs_to_cam: FloatArray) -> extended.Glow:
         sight = self._sight
         if fault.tracker_px is not None or fault.screen_px is not None:
             source, (x_px, y_px) = self._source(fault)

@@ -7,8 +7,9 @@ from pathlib import Path
 import pytest
 
 from hilstar.bench.faults.kinds import KINDS, fault_of, table_of
-from hilstar.bench.faults.scenario import parse_scenario
+from hilstar.bench.faults.scenario import parse_scenario, read_scenario
 from hilstar.errors import InputError
+from tests.support.benches import ROOT
 
 FILE = Path("faults.toml")
 STAR = {"kind": "false-star", "name": "ghost", "radec_deg": [10, 20], "electrons": 5e4}
@@ -34,6 +35,11 @@ def test_a_fault_is_what_its_table_says_and_goes_back_into_it(table):
     fault = fault_of(table)
     assert (fault.KIND, fault.name) == (table["kind"], table["name"])
     assert fault_of(table_of(fault)) == fault
+
+
+def test_the_example_scenario_has_every_kind_but_a_map():
+    scenario = read_scenario(ROOT / "examples" / "faults.toml")
+    assert {fault.KIND for fault in scenario.faults} == set(KINDS) - {"light-map"}
 
 
 def test_the_examples_are_of_every_kind():

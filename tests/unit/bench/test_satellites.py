@@ -73,10 +73,20 @@ def test_a_frame_its_truth_and_a_run_s_frame_have_the_same_satellite(bench_file)
         assert bench.shown_stars.names(np.unique(sprites.star[sprites.star >= first])).count(name) == 1
 
 
+def fast_moment(bench: Bench) -> int:
+    """A time at which a lit satellite is faster than half a degree a second."""
+    for t_ns in range(0, 20_000 * S_NS, 40 * S_NS):
+        seen = bench.moving.passing(Cone(NORTH, np.pi, 0.0), t_ns)
+        name = brightest(bench, t_ns)[0]
+        if seen.speeds_rad_s()[[bench.moving.satellites.names[k] for k in seen.index].index(name)] > 0.009:
+            return t_ns
+    raise AssertionError("there is none")
+
+
 def test_a_camera_that_follows_a_satellite_has_it_as_a_point_and_stars_as_streaks(bench_file):
     """In the virtual tracker, over half a second; at rest it is the other way round, with the same light."""
     with load(bench_file) as bench, Simulator(read_bench_file(bench_file)) as tracker:
-        t_ns = AT_S * S_NS
+        t_ns = fast_moment(bench)
         name, place, _ = brightest(bench, t_ns)
         q = from_radec_roll_deg(*place, 0.0)
         before, after = (brightest(bench, t_ns + k)[1] for k in (-S_NS // 4, S_NS // 4))
@@ -89,7 +99,9 @@ def test_a_camera_that_follows_a_satellite_has_it_as_a_point_and_stars_as_streak
         peaks = [shot.mean_e[509:515, 509:515].sum() for shot in found]
         assert peaks[0] == pytest.approx(0.5 * rows[0]["electrons_per_s"], rel=0.02)
         assert peaks[1] < 0.8 * peaks[0]
-        assert (rows[0]["x_px"], rows[0]["y_px"]) == pytest.approx((511.5, 511.5), abs=0.1)
+        assert (rows[0]["x_px"], rows[0]["y_px"]) == pytest.approx(
+            (511.5, 511.5), abs=0.3
+        )  # 38 arcsec a px; 10 by the velocity since
 
 
 def test_frame_explains_them_and_attitude_and_verify_know_them(bench_file):

@@ -3,6 +3,8 @@
 //
 // Away from limb and air brightness is smooth: a ray, or four. About them what lies at each depth inside the limb is spread
 // across it. The nodes of the lit face do not depend on the pixel, so that all pixels together have all its light.
+// llvmpipe runs both sides of an `if`, but leaves a loop when no pixel needs it: so what is dear is in loops, whose ends depend
+// on the pixel.
 
 #define NODES 16
 #define UNIFORM 0
@@ -33,6 +35,7 @@ out vec4 light;
 
 const float REACH = 4.0;          // sigmas: 3e-5 of a spread edge is beyond
 const float SMOOTH_PX = 200.0;    // of a radius: from here one ray is within 4e-5 of the spread light
+const float SQRT3 = 1.73205081;
 const float STEEP_SIGMAS = 1.5;   // of the air's scale height: three nodes are within 1 % of its spread light
 const float EIGHTHS[8] = float[](-1.534, -0.887, -0.489, -0.157, 0.157, 0.489, 0.887, 1.534);  // of a Gaussian, their middles
 
@@ -44,9 +47,9 @@ struct Sight {
 };
 
 Sight sight(vec3 seen) {
-    vec3 s = to_sphere * normalize(seen);
-    float stretch = length(s), across = length(s.xy);
-    return Sight(distance_radii * across / stretch, across > 0.0 ? s.xy / across : vec2(1.0, 0.0), stretch);
+    vec3 s = to_sphere * seen;
+    float across = dot(s.xy, s.xy), size = inversesqrt(dot(s, s)), side = inversesqrt(max(across, 1e-30));
+    return Sight(distance_radii * across * side * size, s.xy * side, inversesqrt(dot(seen, seen)) / size);
 }
 
 // The law where a ray meets the face, `depth` radii inside the limb.
@@ -100,45 +103,26 @@ vec2 at_edge(Sight s, float depth_px, float fall, float sigma) {
     float most = min(2.0 * REACH * sigma * fall, 1.0);
     vec2 depths = lit(s, most), found = vec2(0.0);
     float span = depths.y - depths.x;
-    if (depth_px > -REACH * sigma && span > 0.0) {
-        for (int k = 0; k < NODES; k++) {
-            float depth = depths.x + span * node[k] * node[k];
-            float share = gauss((depth_px - depth / fall) / sigma) / (sigma * fall) * 2.0 * node[k] * span * weight[k];
-            // A ring's light is spread to a larger ring outside and a smaller one inside.
-            found.x += shaded(s, depth) * share * sqrt((1.0 - depth) / max(s.impact, 0.1));
-        }
+    int nodes = depth_px > -REACH * sigma && span > 0.0 ? NODES : 0;
+    for (int k = 0; k < nodes; k++) {
+        float depth = depths.x + span * node[k] * node[k];
+        float share = gauss((depth_px - depth / fall) / sigma) / (sigma * fall) * 2.0 * node[k] * span * weight[k];
+        // A ring's light is spread to a larger ring outside and a smaller one inside.
+        found.x += shaded(s, depth) * share * sqrt((1.0 - depth) / max(s.impact, 0.1));
     }
     found.y = 0.5 + 0.5 * erf_of(depth_px / (sigma * 1.41421356));
-    if (air_radii == 0.0) return found;
-    float top_px = air_top * air_radii / fall;
-    if (depth_px < -REACH * sigma && air_radii > STEEP_SIGMAS * sigma * fall) {
-        for (int k = -1; k <= 1; k++) {
-            found += air(s, (1.73205081 * sigma * float(k) - depth_px) * fall) * (k == 0 ? 0.666666667 : 0.166666667);
-        }
-        return found;
-    }
-    float low = max(-top_px, depth_px - REACH * sigma), high = min(0.0, depth_px + REACH * sigma);
-    if (high > low) {
-        for (int k = 0; k < NODES; k++) {
-            float depth = low + (high - low) * node[k];
-            found += air(s, -depth * fall) * gauss((depth_px - depth) / sigma) / sigma * (high - low) * weight[k];
-        }
+    bool steep = air_radii <= STEEP_SIGMAS * sigma * fall || depth_px >= -REACH * sigma;
+    float low = max(-air_top * air_radii / fall, depth_px - REACH * sigma), high = min(0.0, depth_px + REACH * sigma);
+    nodes = air_radii == 0.0 ? 0 : !steep ? 3 : high > low ? NODES : 0;
+    for (int k = 0; k < nodes; k++) {
+        float depth = steep ? low + (high - low) * node[k] : depth_px + SQRT3 * sigma * float(k - 1);
+        float share = gauss((depth_px - depth) / sigma) / sigma * (high - low) * weight[k];
+        found += air(s, -depth * fall) * (steep ? share : k == 1 ? 2.0 / 3.0 : 1.0 / 6.0);
     }
     return found;
 }
 
-// The same where the limb goes from light to dark along itself: the mean over what the Gaussian spreads along it.
-vec2 at_cusp(Sight s, float depth_px, float fall, float sigma) {
-    vec2 found = vec2(0.0);
-    for (int k = 0; k < 8; k++) {
-        float turn = EIGHTHS[k] * sigma * fall;
-        Sight beside = s;
-        beside.side = mat2(cos(turn), sin(turn), -sin(turn), cos(turn)) * s.side;
-        found += 0.125 * at_edge(beside, depth_px, fall, sigma);
-    }
-    return found;
-}
-
+// Whether the limb goes from light to dark along itself: what the Gaussian spreads along it then counts.
 bool near_cusp(Sight s, float fall, float sigma) {
     if (law == UNIFORM || law == LIMB_DARKENED) return false;
     float rim = 1.0 / sqrt(distance_radii * distance_radii - 1.0);  // the tangent of the limb's angle from the middle
@@ -165,20 +149,23 @@ void main() {
     vec2 outward = growth / fall;
     float sigma = sqrt(dot(outward * outward, variance_px));
     float depth_px = (1.0 - here.impact) / fall;
-    if (depth_px < -REACH * sigma - air_top * air_radii / fall) return;
     float sr = (slopes[0][0] * slopes[1][1] - slopes[0][1] * slopes[1][0]) / pow(dot(seen, seen), 1.5);
-    vec2 found;
-    if (depth_px <= REACH * sigma) {
-        found = near_cusp(here, fall, sigma) ? at_cusp(here, depth_px, fall, sigma) : at_edge(here, depth_px, fall, sigma);
-    } else if (fall * SMOOTH_PX < 1.0) {
-        found = vec2(shaded(here, 1.0 - here.impact), 1.0);
-    } else {
-        found = vec2(0.0, 1.0);
-        vec2 off = sqrt(variance_px);
-        for (int k = 0; k < 4; k++) {
-            Sight there = sight(seen + vec3(slopes * (off * vec2((k & 1) * 2 - 1, (k & 2) - 1)), 0.0));
-            found.x += 0.25 * shaded(there, 1.0 - there.impact);
-        }
+    vec2 found = vec2(0.0);
+    bool inside = depth_px > REACH * sigma;
+    if (depth_px < -REACH * sigma - air_top * air_radii / fall) return;
+    int parts = inside ? 0 : near_cusp(here, fall, sigma) ? 8 : 1;
+    for (int k = 0; k < parts; k++) {
+        float turn = parts == 1 ? 0.0 : EIGHTHS[k] * sigma * fall;
+        Sight beside = here;
+        beside.side = mat2(cos(turn), sin(turn), -sin(turn), cos(turn)) * here.side;
+        found += at_edge(beside, depth_px, fall, sigma) / float(parts);
+    }
+    found.y = inside ? 1.0 : found.y;
+    int rays = !inside ? 0 : fall * SMOOTH_PX < 1.0 ? 1 : 4;
+    vec2 off = rays == 4 ? sqrt(variance_px) : vec2(0.0);
+    for (int k = 0; k < rays; k++) {
+        Sight there = sight(seen + vec3(slopes * (off * vec2((k & 1) * 2 - 1, (k & 2) - 1)), 0.0));
+        found.x += shaded(there, 1.0 - there.impact) / float(rays);
     }
     light = vec4(times * normal_e_per_s_sr * sr * found.x, 0.0, 0.0, covers * clamp(found.y, 0.0, 1.0));
 }

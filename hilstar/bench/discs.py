@@ -146,9 +146,9 @@ class DiscPainter:
         return [disc_lights(disc, view, covers=k < len(discs)) for k, disc in ordered]
 
     def any_lights(self) -> tuple[ExtendedLight, ...]:
-        """Discs in the middle of the image, a small one and a large one: for a driver that compiles what draws them."""
+        """Discs of several sizes in the middle of the image: for a driver that compiles what draws each."""
         ahead = np.array([0.0, 0.0, 1.0])
-        radii_rad = np.array([2.0, 20.0]) * max(self.sigma_px) / self._px_per_rad
+        radii_rad = np.array([2.0, 20.0, 100.0, 400.0]) * max(self.sigma_px) / self._px_per_rad
         discs = [Disc("", ahead, 1 / math.sin(min(r, 1.0)), 1.0, 1.0, ahead, -ahead, "lambert") for r in radii_rad.tolist()]
         return tuple(itertools.chain.from_iterable(self._lights(discs, self.still(np.eye(3)))))
 

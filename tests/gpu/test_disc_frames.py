@@ -20,9 +20,10 @@ from hilstar.render.renderer import Renderer, Target
 from hilstar.rotation import from_radec_roll_deg
 from hilstar.scene.camera import Camera
 from hilstar.scene.discs import Pose, View, disc_lights
-from hilstar.scene.extended import Shear
+from hilstar.scene.extended import DiscLight, Shear
 from hilstar.scene.frame_motion import Scan, Turn
 from hilstar.scene.lens import Lens
+from hilstar.scene.tiles import disc_tiles
 from hilstar.sky.bodies.disc import Disc
 from hilstar.twin.verify.measure import Comparison
 from hilstar.twin.verify.twin import Twin
@@ -163,6 +164,30 @@ def test_the_reference_has_the_same_disc(radius_px, lens, late_s):
     wanted = linear_image(sprites, SIZE, SIGMA)
     assert got.sum(dtype=float) == pytest.approx(wanted.sum(), rel=FLUX_LIMIT)
     assert np.abs(got - wanted).max() < PIXEL_LIMIT * wanted.max()
+
+
+WHOLE, PART = (104.0, (47.0, 40.0)), (400.0, (310.0, 300.0))
+
+
+@pytest.mark.parametrize(
+    ("face", "law"),
+    [(WHOLE, "lunar-lambert"), (WHOLE, "limb-darkened"), (PART, "lambert"), (PART, "uniform")],
+    ids=["the Moon", "the Sun", "a near planet", "a part"],
+)
+def test_a_large_disc_in_tiles_is_that_of_the_reference(face, law):
+    size = (226, 222)
+    cam = Camera(size, 900.0, (112.5, 110.5), np.eye(3), LENS)
+    one = replace(disc(face[0], 50.0, face[1]), law=law, polar_km=0.93, pole=np.array([0.6, 0.8, 0.0]), lunar_share=0.4)
+    light = DiscLight(one, np.eye(3), cam, (0.85, 1.1))
+    tiles = disc_tiles(light, light.region(size))
+    assert tiles is not None and len(tiles.linear) + len(tiles.edges) > 2
+    with Renderer(Target(size, (0.85, 1.1))) as gl:
+        sprites = replace(sprites_at(np.empty((0, 2)), np.empty(0), gl.footprint_px), extended=(light,))
+        gl.draw(sprites)
+        got = gl.linear()
+    wanted = linear_image(sprites, size, (0.85, 1.1))
+    assert got.sum(dtype=float) == pytest.approx(wanted.sum(), rel=FLUX_LIMIT / 3)
+    assert np.abs(got - wanted).max() < PIXEL_LIMIT / 2 * wanted.max()
 
 
 @pytest.mark.parametrize("radius_px", [3.0, 20.0])

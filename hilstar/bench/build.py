@@ -18,6 +18,7 @@ from hilstar.bench.effort import Effort, Light, faintest_shown_e_per_s, plan_eff
 from hilstar.bench.frame import Bench
 from hilstar.bench.orientation import scan_of
 from hilstar.errors import InputError
+from hilstar.monitor.balance import Seen
 from hilstar.monitor.calibration import BUILT_IN, Calibration, load_calibration
 from hilstar.monitor.quantise import Panel, cycle_warning
 from hilstar.render.renderer import Context, Renderer, Target
@@ -74,11 +75,17 @@ def open_bench(file: BenchFile, context: Context | None = None) -> Bench:
         shown_stars=moved(shown, moving),
         faint_stars=faint,
         moving=moving,
-        renderer=Renderer(_target(config, panel, effort), context),
+        renderer=Renderer(_target(config, panel, effort, seen_by(config.tracker, camera)), context),
     )
 
 
-def _target(config: BenchConfig, panel: Panel, effort: Effort | None) -> Target:
+def seen_by(tracker: Tracker, camera: Camera) -> Seen:
+    """How the tracker sees the monitor at the boresight: its blur and its pixel in monitor pixels."""
+    pixel_px = camera.focal_length_px * tracker.pixel_pitch_um * 1e-3 / tracker.focal_length_mm
+    return Seen(blur_px=math.sqrt(math.prod(tracker.psf_sigma_px)) * pixel_px, pixel_px=pixel_px)
+
+
+def _target(config: BenchConfig, panel: Panel, effort: Effort | None, seen: Seen) -> Target:
     render = config.render
     if render.quantisation == "auto":
         raise AssertionError("the effort's plan has chosen")
@@ -91,6 +98,7 @@ def _target(config: BenchConfig, panel: Panel, effort: Effort | None) -> Target:
         uniformity=panel.uniformity,
         cycle_frames=render.cycle_frames,
         sides=() if effort is None else effort.sides,
+        seen=seen,
     )
 
 

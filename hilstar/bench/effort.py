@@ -28,9 +28,9 @@ MAG_PER_SHARE = 2.5 / math.log(10)
 # Light beyond a small sprite is under this share of what lights a pixel: only where the wings of stars meet is a code lower
 UNLIT = 0.25
 CUT_PHASES = 51
-# `exact`, stars at 1 deg/s, 1080p over 31 deg, two llvmpipe cores: a quarter of it at rest, twice as much at 5 deg/s. A field
+# `exact`, stars at 1 deg/s, 1080p over 31 deg, two llvmpipe cores: half of it at rest, three times as much at 15 deg/s. A field
 # of the Milky Way has twice the stars of an average one.
-EXACT_MS_A_STAR = 0.048
+EXACT_MS_A_STAR = 0.02
 EXACT_SHARE = 0.5
 
 
@@ -70,8 +70,6 @@ class ChosenSides:
 ENCODING = Choice(
     "encoding", "under the sprites, or all pixels where sprites cover more", "exact", "the cheaper one, frame by frame"
 )
-# `exact` makes its codes of the stars themselves.
-NO_SPRITES = ChosenSides((), 0.0, 0.0, Choice("sprites", "none", "exact", "no linear image is drawn"))
 PROJECTION = Choice("projection", "perspective", "exact", "a weak one would save nothing, and fails off the middle")
 
 
@@ -123,7 +121,7 @@ def plan_effort(render: RenderSettings, light: Light) -> Effort:
     if render.effort == "full":
         motion_px = render.motion_above_px
         return Effort(method, (), motion_px, errors.flux_max_mag, errors.centroid_max_px + motion_px, (codes.choice,))
-    sprites = NO_SPRITES if method == "exact" else choose_sides(render, light, method)
+    sprites = choose_sides(render, light, method)
     motion_px = max(render.motion_above_px, MOTION_SHARE * render.tolerance_px)
     paths = Choice(
         "paths",
@@ -205,7 +203,7 @@ def choose_sides(render: RenderSettings, light: Light, method: Quantisation) -> 
     sizes = range(full % 2 or 2, full, 2)
     largest = next((s for s in sizes if cut_mag(s, sigma_px) <= allowed_mag and cut_px(s, sigma_px) <= allowed_px), full)
     sides = [(math.inf, largest)]
-    if method == "round":
+    if method in ("round", "exact"):
         unlit = UNLIT * float(light.response.threshold[0]) * light.white_e_per_s
         # Falling rates: a star under the last of them that it is under gets the smallest sprite.
         sides += [(unlit / outside_share(size, sigma_px), size) for size in sizes[::-1] if size < largest]

@@ -1,70 +1,64 @@
-"""`exact`: the levels of one star's footprint chosen together, so that its light and its centroid are right in one frame.
+"""`exact`: the levels of one star's footprint chosen together, so that its light and its place are right in one frame.
 
 Every pixel shows one of the two levels around its light, so that no pixel is off by a whole level. The choice between the
-two minimises three sums over the star's pixels: the error of light, and its first moments about the star along x and y.
-First the errors are carried outwards from the star's middle, to where the steps of light are finer; then flips of one or
-two pixels are searched until none reduces the errors.
-In the straight foot of sRGB all steps are equal, so a star of N steps cannot be closer than half a step: 1 / 2N of its
-light, and about 1 / 2N px along each axis. That limit is the monitor's, and the method reaches it.
+two minimises the ten sums of `balance`. From the star's middle outwards each pixel is decided, with several choices of the
+pixels before it kept side by side: of the four that two of them lead to the better two are kept, and who is compared with whom
+changes from pixel to pixel. The last pixels, and the choice among what is left, weigh the light more.
+A star drawn as a path hands the errors of its light from sprite to sprite.
+In the straight foot of sRGB all steps are equal, so a star of N steps cannot have its light closer than half a step: 1 / 2N.
+This is the oracle of shaders/exact.comp, and what draws where that cannot run.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import Float32Array, FloatArray, IntArray
+from hilstar.monitor.balance import ALL_MOMENTS, AS_USUAL, LAST_LIGHT, SUMS, Balance, Seen
 from hilstar.monitor.footprints import FootprintMap, Footprints, PlaceArray
 from hilstar.monitor.level_table import ThresholdCounter
 from hilstar.monitor.quantise import Panel, level_dtype
 from hilstar.monitor.response import Codes
 from hilstar.scene.sprites import Sprites
 
-# The weight of a squared error of light against that of a squared moment of the same light times 1 px. One suits a star
-# whose steps differ. Where they are equal no moment may cost a whole step of light: four prevents it.
-LIGHT_WEIGHT = 1.0
-LIGHT_WEIGHT_ON_GRID = 4.0
-CHUNK = 512  # stars at a time: their arrays stay in a core's cache
-FLIPS = 24  # pixels of a star that are tested together, spread evenly from its middle to its reach
-SWEEPS = 4  # flips of one or two pixels; few stars take more
-GOOD_ENOUGH = 5e-4  # of the light, and px: a star with smaller errors is not flipped
+KEPT = 8  # choices side by side, a power of two: 4 leave the centroid a fifth more error, 16 a tenth less
+CHUNK = 256  # stars at a time: their arrays stay in a core's cache
+OFF = 0.6  # of a step, where steps are equal: then one more pixel is turned
 SAME_STEP = 1e-4  # steps that differ by less, relatively, are equal
+CARRIED = 32  # sprites of a path that hand on their errors; the next ones begin anew, beside them
+NONE = np.float32(1e30)  # the square of a choice that does not exist yet
 
 
 @dataclass(frozen=True, slots=True)
-class _Choice:
-    """The near pixels of n stars, (near, n), light relative to white; and what their errors add up to.
+class _Pixels:
+    """The near pixels of n stars, (near, n), light in steps from black: what the choice between two levels is about.
 
     `short` is what the lower level is off the wanted light (0 or less), `step` how much the next one adds (0 where there
-    is none to take), `up` whether it is taken. `arm` (3, near, n) weighs a pixel's error into the three of `error` (3, n):
-    light and two moments. `grid` (n,) is the step of a star whose steps are all equal, else 0.
+    is none to take). `arm` (SUMS, near, n) weighs a pixel's error into the sums of `error` (SUMS, n).
     """
 
-    short: FloatArray
-    step: FloatArray
-    up: npt.NDArray[np.bool_]
-    arm: FloatArray
-    error: FloatArray
-    grid: FloatArray
-
-    def unfinished(self, stars: IntArray, good: FloatArray) -> IntArray:
-        """Those of `stars` whose error is above `good` (n,) and whose steps, where equal, could bring it nearer."""
-        error = self.error[:, stars]
-        half_step = 0.5 * (1 + SAME_STEP) * self.grid[stars]
-        far = (np.square(error).sum(axis=0) > good[stars] ** 2) & (np.abs(error) > half_step).any(axis=0)
-        return np.asarray(stars[far])
+    short: Float32Array
+    step: Float32Array
+    arm: Float32Array
+    error: Float32Array
 
 
 class ExactQuantiser:
-    """Levels of sprites on a panel, one image after another; `sigma_px` is that of the sprites."""
+    """Levels of sprites on a panel, one image after another; `sigma_px` is that of the sprites, `seen` the tracker's."""
 
-    def __init__(self, panel: Panel, resolution_px: tuple[int, int], sigma_px: tuple[float, float]) -> None:
+    def __init__(
+        self, panel: Panel, resolution_px: tuple[int, int], sigma_px: tuple[float, float], seen: Seen = AS_USUAL
+    ) -> None:
         self._map = FootprintMap(resolution_px, sigma_px)
+        self._balance = Balance(sigma_px, seen)
         self._panel = panel
         response = panel.response
         self._light = np.append(response.light, response.light[-1])  # there is no step above white
+        self._step_e_per_s = float(response.light[1]) * panel.flux_at_white_e_per_s
         self._lower = ThresholdCounter(response.light[1:].astype(np.float32))
         self._nearest = ThresholdCounter(response.threshold.astype(np.float32))
         self._first_threshold = np.float32(response.threshold[0])
@@ -89,24 +83,24 @@ class ExactQuantiser:
         if sprites is not None and len(sprites):
             found = self._map.find(sprites)
             levels = np.empty(found.place.shape, dtype=self._flat.dtype)
-            for start in range(0, len(sprites), CHUNK):
-                some = slice(start, start + CHUNK)
-                levels[:, some] = self._choose(_part(found, some))
+            carried = np.zeros((3, len(sprites)))
+            for some in _turns(sprites):
+                levels[:, some], left = self._choose(_part(found, some), carried[:, some])
+                _hand_on(carried, left, some, sprites)
             self._lit = found.place.ravel()
             self._flat[self._lit] = levels.ravel()
             self._flat[-1] = 0
         return self._flat[:-1].reshape(height, width)
 
-    def _choose(self, found: Footprints) -> IntArray:
-        """The levels of a chunk of stars, (pixels, n)."""
+    def _choose(self, found: Footprints, carried: FloatArray) -> tuple[IntArray, FloatArray]:
+        """The levels of a chunk of stars, (pixels, n), and their errors of light and moments with those `carried`, (3, n)."""
         near = self._map.near
         output = None if self._output is None else self._output[found.place]
         asked = found.light / np.float32(self._panel.flux_at_white_e_per_s)
         if output is not None:
             asked /= output
-        floor = self._light[self._flat[found.place]].astype(np.float32) if self._on_floor else None
-        if floor is not None:
-            asked += floor
+        if self._on_floor:
+            asked += self._light[self._flat[found.place]].astype(np.float32)
         np.minimum(asked, np.float32(1), out=asked)  # light over white is lost; neighbours do not make up for it
         lower, upper = self._lower.count(asked[:near]), self._round(asked[near:])
         shown = self._light[np.concatenate([lower, upper])]
@@ -115,20 +109,22 @@ class ExactQuantiser:
         if output is not None:
             short *= output
             step *= output[:near]
-            asked *= output
         step[found.place[:near] == self._map.pixels] = 0.0
-        light = asked.sum(axis=0, dtype=np.float64)
-        if floor is not None:
-            light -= (floor if output is None else floor * output).sum(axis=0, dtype=np.float64)
-        grid = _equal_step(step)
-        weight = np.where(grid > 0, LIGHT_WEIGHT_ON_GRID**0.5, LIGHT_WEIGHT**0.5)
-        arm = np.stack([np.broadcast_to(weight, short.shape), found.dx_px, found.dy_px])
-        error = np.einsum("kpn,pn->kn", arm[:, near:], short[near:])
-        choice = _Choice(short[:near], step, np.zeros(step.shape, dtype=np.bool_), arm[:, :near], error, grid)
-        _aim_at_whole_steps(choice)
-        _carry_outwards(choice)
-        _flip(choice, GOOD_ENOUGH * light)
-        return np.concatenate([lower + choice.up, upper])
+        short /= self._light[1]
+        step /= self._light[1]
+        d = found.offset_px - found.fraction_px[:, None]
+        arm = self._balance.arms(
+            found.offset_px[:, :near], found.fraction_px, found.rate_e_per_s / np.float32(self._step_e_per_s)
+        )
+        far = short[near:]
+        error = np.zeros((SUMS, far.shape[1]), dtype=np.float32)
+        error[:3] = _plain_sums(far, d[:, near:]) + carried
+        grid = _aim_at_whole_steps(error[0], short[:near].sum(axis=0) + error[0], step)
+        error[0] *= arm[0, 0]
+        error[1:3] *= ALL_MOMENTS
+        up = _decide(_Pixels(short[:near].astype(np.float32), step.astype(np.float32), arm, error), grid)
+        short[:near] += step * up
+        return np.concatenate([lower + up, upper]), _plain_sums(short, d) + carried
 
     def _round(self, asked: Float32Array) -> IntArray:
         """The nearest levels; this far out they are 0 for all but the brightest stars."""
@@ -138,67 +134,123 @@ class ExactQuantiser:
         return levels
 
 
-def _part(found: Footprints, some: slice) -> Footprints:
-    return Footprints(found.light[:, some], found.place[:, some], found.dx_px[:, some], found.dy_px[:, some])
+def _part(found: Footprints, some: IntArray) -> Footprints:
+    return Footprints(
+        found.light[:, some],
+        found.place[:, some],
+        found.offset_px[..., some],
+        found.fraction_px[:, some],
+        found.rate_e_per_s[some],
+    )
 
 
-def _equal_step(step: FloatArray) -> FloatArray:
-    """The step of each star whose steps are all equal, else 0, (n,)."""
+def _turns(sprites: Sprites) -> Iterator[IntArray]:
+    """The sprites in chunks, each of a path after those before it; a long path is begun anew in places."""
+    place = np.arange(len(sprites))
+    if sprites.per_star > 1:
+        begins = np.flatnonzero(np.diff(sprites.star, prepend=-1))
+        place = (place - np.repeat(begins, np.diff(begins, append=len(sprites)))) % CARRIED
+        order = np.argsort(place, kind="stable")
+    else:
+        order, place = place, np.zeros_like(place)
+    for turn in np.split(order, np.flatnonzero(np.diff(place[order])) + 1):
+        for start in range(0, len(turn), CHUNK):
+            yield turn[start : start + CHUNK]
+
+
+def _hand_on(carried: FloatArray, left: FloatArray, some: IntArray, sprites: Sprites) -> None:
+    """Give the errors `left` (3, n) of sprites `some` to those that follow them in their paths, about their centres."""
+    if sprites.per_star == 1:
+        return
+    after = np.minimum(some + 1, len(sprites) - 1)
+    same = np.flatnonzero((sprites.star[after] == sprites.star[some]) & (after > some))
+    here, there = some[same], after[same]
+    carried[0, there] = left[0, same]
+    for row, place_px in ((1, sprites.x_px), (2, sprites.y_px)):
+        carried[row, there] = left[row, same] - left[0, same] * (place_px[there] - place_px[here])
+
+
+def _plain_sums(error: FloatArray | Float32Array, d: FloatArray | Float32Array) -> FloatArray:
+    """Light and first moments (3, n) of errors (pixels, n) at distances (2, pixels, n)."""
+    return np.stack([error.sum(axis=0), *np.einsum("kpn,pn->kn", d, error)])
+
+
+def _aim_at_whole_steps(light: FloatArray, lowest: FloatArray, step: FloatArray) -> FloatArray:
+    """Where all steps of a star are equal, take from `light` (n,) what no choice can show; `lowest` has all pixels down.
+
+    The step of those stars, 0 of others, (n,).
+    """
     largest = step.max(axis=0)
     smallest = np.min(step, axis=0, initial=np.inf, where=step > 0)
-    return np.where(largest <= smallest * (1 + SAME_STEP), largest, 0.0)
+    equal = np.flatnonzero((largest > 0) & (largest <= smallest * (1 + SAME_STEP)))
+    light[equal] -= lowest[equal] - np.rint(lowest[equal] / largest[equal]) * largest[equal]
+    grid = np.zeros_like(largest)
+    grid[equal] = largest[equal]
+    return np.asarray(grid)
 
 
-def _aim_at_whole_steps(choice: _Choice) -> None:
-    """Where all steps are equal, aim at the nearest light that can be shown: no moment is then worth a step of light."""
-    equal = np.flatnonzero(choice.grid)
-    root, step = LIGHT_WEIGHT_ON_GRID**0.5, choice.grid[equal]
-    short = choice.short[:, equal].sum(axis=0) + choice.error[0, equal] / root
-    choice.error[0, equal] -= root * (short - np.rint(short / step) * step)
+@dataclass(frozen=True, slots=True)
+class _Kept:
+    """The choices kept side by side: their sums (SUMS, KEPT, n), the pixels that are up (near, KEPT, n), and who is missing."""
+
+    error: Float32Array
+    up: npt.NDArray[np.bool_]
+    missing: Float32Array
+
+    def compare(self, pixel: int, down: Float32Array, rise: Float32Array) -> npt.NDArray[np.bool_]:
+        """Of the four choices that two of those kept lead to keep two, in their places; who takes the upper level, (KEPT, n).
+
+        `down` is what the lower level leads to, `rise` what the step to the upper one adds.
+        """
+        other = np.arange(KEPT) ^ (1 << (pixel % (KEPT.bit_length() - 1)))
+        rises = rise < 0
+        better, worse = down + np.minimum(rise, 0), down + np.maximum(rise, 0)
+        # Where both of one lead to less than either of the other, the other's place takes the second.
+        taken = worse[other] < better
+        place, star = np.nonzero(taken)
+        self.error[:, place, star] = self.error[:, other[place], star]
+        self.up[:pixel, place, star] = self.up[:pixel, other[place], star]
+        self.missing[place, star] = self.missing[other[place], star]
+        self.up[pixel] = np.where(taken, ~rises[other], rises)
+        return np.asarray(self.up[pixel])
+
+    def best(self) -> tuple[npt.NDArray[np.bool_], Float32Array]:
+        """The pixels that are up in the best choice, (near, n), and its sums (SUMS, n)."""
+        heavier = (LAST_LIGHT**2 - 1) * np.square(self.error[0])
+        best = (np.square(self.error).sum(axis=0) + heavier + self.missing).argmin(axis=0)[None, None]
+        up, error = (np.take_along_axis(part, best, axis=1)[:, 0] for part in (self.up, self.error))
+        return np.asarray(up), np.asarray(error)
 
 
-def _carry_outwards(choice: _Choice) -> None:
-    """Decide pixel by pixel from the middle outwards, each so that the errors carried so far become smallest."""
-    arm, error = choice.arm, choice.error
-    bound = -(choice.short + choice.step / 2) * np.square(arm).sum(axis=0)
-    bound[choice.step == 0] = -np.inf
-    for pixel in range(len(choice.step)):
-        choice.up[pixel] = (arm[:, pixel] * error).sum(axis=0) < bound[pixel]
-        left = choice.short[pixel] + choice.step[pixel] * choice.up[pixel]
-        error += arm[:, pixel] * left
+def _turn_one_more(pixels: _Pixels, up: npt.NDArray[np.bool_], error: Float32Array, grid: FloatArray) -> None:
+    """Where equal steps (`grid` > 0) left the light a step off, turn the pixel that does the other sums the least harm."""
+    stars = np.flatnonzero(np.abs(error[0]) > OFF * pixels.arm[0, 0] * np.where(grid > 0, grid, np.inf))
+    if not len(stars):
+        return
+    rise = error[0, stars] < 0
+    by = np.where(rise, pixels.step[:, stars], -pixels.step[:, stars])
+    arm = pixels.arm[:, :, stars]
+    more = by * (2 * (arm * error[:, None, stars]).sum(axis=0) + by * np.square(arm).sum(axis=0))
+    more[(by == 0) | (up[:, stars] == rise)] = np.inf
+    pixel = more.argmin(axis=0)
+    can = np.flatnonzero(np.isfinite(more.min(axis=0)))
+    up[pixel[can], stars[can]] ^= True
 
 
-def _flip(choice: _Choice, good: FloatArray) -> None:
-    """Flip the best one or two pixels of each star while its errors shrink and exceed `good` (n,)."""
-    error = choice.error
-    near = len(choice.step)
-    stride = -(-near // FLIPS)  # of a large star, another part of its pixels each time
-    stars = choice.unfinished(np.arange(error.shape[1]), good)
-    for sweep in range(SWEEPS + 2 * (stride - 1)):
-        if not len(stars):
-            return
-        pixels = np.arange(sweep % stride, near, stride)
-        some = np.ix_(pixels, stars)
-        change = np.where(choice.up[some], -choice.step[some], choice.step[some])
-        moves = choice.arm[:, pixels[:, None], stars] * change
-        first, second = _best_pair(moves, error[:, stars])
-        each, two = np.arange(len(stars)), first != second
-        flipped = error[:, stars] + moves[:, first, each] + two * moves[:, second, each]
-        better = np.square(flipped).sum(axis=0) < np.square(error[:, stars]).sum(axis=0) * (1 - 1e-9)
-        error[:, stars[better]] = flipped[:, better]
-        choice.up[pixels[first[better]], stars[better]] ^= True
-        choice.up[pixels[second[better & two]], stars[better & two]] ^= True
-        stars = choice.unfinished(stars[better] if stride == 1 else stars, good)
-
-
-def _best_pair(moves: FloatArray, error: FloatArray) -> tuple[IntArray, IntArray]:
-    """The two of p `moves` (3, p, n), or one twice, that added to `error` (3, n) make the smallest square."""
-    alone = np.square(moves).sum(axis=0) + 2 * (moves * error[:, None]).sum(axis=0)
-    ones = np.ones_like(alone)
-    # |e + a + b|^2 - |e|^2 = alone(a) + alone(b) + 2 a b, as one product of matrices.
-    left = np.stack([*(2 * moves), alone, ones]).transpose(2, 1, 0).astype(np.float32, order="C")
-    right = np.stack([*moves, ones, alone]).transpose(2, 0, 1).astype(np.float32, order="C")
-    square = left @ right
-    count = len(alone)
-    square[:, range(count), range(count)] = alone.T
-    return np.divmod(square.reshape(len(square), -1).argmin(axis=1), count)
+def _decide(pixels: _Pixels, grid: FloatArray) -> npt.NDArray[np.bool_]:
+    """Which pixels take the upper level, (near, n); `grid` (n,) is the step of stars whose steps are all equal, else 0."""
+    near, count = pixels.step.shape
+    missing = np.zeros((KEPT, count), dtype=np.float32)
+    missing[1:] = NONE
+    kept = _Kept(np.repeat(pixels.error[:, None], KEPT, axis=1), np.zeros((near, KEPT, count), dtype=np.bool_), missing)
+    error = kept.error
+    for pixel in range(near):
+        arm, step = pixels.arm[:, pixel, None], pixels.step[pixel]
+        error += arm * pixels.short[pixel]
+        down = np.square(error).sum(axis=0) + missing
+        rise = step * (2 * (arm * error).sum(axis=0) + step * np.square(arm).sum(axis=0))
+        rise[:, step == 0] = NONE
+        error += arm * step * kept.compare(pixel, down, rise)
+    up, left = kept.best()
+    _turn_one_more(pixels, up, left, grid)
+    return up

@@ -16,10 +16,12 @@ import numpy as np
 
 from hilstar.arrays import Float32Array
 from hilstar.errors import InputError, MachineError
+from hilstar.monitor.balance import AS_USUAL, Balance, Seen
 from hilstar.monitor.exact import ExactQuantiser
 from hilstar.monitor.quantise import CYCLE_FRAMES, Panel, Quantisation, frame_shift
 from hilstar.monitor.response import Codes, Response
 from hilstar.render.encoder import Encoder, Eraser, LevelTexture, SpriteSides, build_program, set_sides
+from hilstar.render.exact_pass import ExactPass
 from hilstar.render.extended import ExtendedLayer
 from hilstar.scene.extended import ExtendedLight, Rectangle
 from hilstar.scene.psf import SQRT2, footprint_px
@@ -37,7 +39,7 @@ class Target:
 
     `uniformity` float32 (height, width) is each pixel's light relative to the response (None: 1 everywhere), and
     `cycle_frames`, a power of two, is for `temporal` alone. `sides` are those of fainter stars' sprites, by falling
-    rates, of the same parity as the footprint.
+    rates, of the same parity as the footprint. `seen` is how the tracker sees the monitor, for `exact`.
     """
 
     resolution_px: tuple[int, int]
@@ -48,6 +50,7 @@ class Target:
     uniformity: Float32Array | None = None
     cycle_frames: int = CYCLE_FRAMES
     sides: SpriteSides = ()
+    seen: Seen = AS_USUAL
 
     def panel(self) -> Panel | None:
         """What turns light into levels, None without a response. Raises InputError for a map that does not fit."""
@@ -85,6 +88,7 @@ class Renderer:
         self.target = target
         self.footprint_px = footprint_px(target.sigma_px)
         self._undrawn: tuple[Sprites | None, bool] | None = None
+        self._by_numpy = False
         self._ctx = context or create_context()
         try:
             with self._ctx:
@@ -140,18 +144,22 @@ class Renderer:
         self._levels: LevelTexture | None = None
         self._encoder: Encoder | None = None
         self._exact: ExactQuantiser | None = None
+        self._exact_pass: ExactPass | None = None
         if panel is None:
             return
         frame_shift(0, target.cycle_frames)  # refuses a cycle that is no power of two
         self._levels = LevelTexture(self._ctx, target.resolution_px, panel)
         if target.quantisation == "exact":
-            self._exact = ExactQuantiser(panel, target.resolution_px, target.sigma_px)
+            self._exact = ExactQuantiser(panel, target.resolution_px, target.sigma_px, target.seen)
+            if ExactPass.runs_on(self._ctx, target.resolution_px, target.sigma_px):
+                balance = Balance(target.sigma_px, target.seen)
+                self._exact_pass = ExactPass(self._linear, self._levels, panel, balance)
             self._exact_levels = self._exact.levels(None)
             self._floor_encoder: Encoder | None = None
             self._floor_lights: tuple[ExtendedLight, ...] = ()
             self._floor_levels = self._exact_levels
-        else:
-            dithered = target.quantisation != "round"
+        if self._exact_pass is not None or self._exact is None:
+            dithered = target.quantisation in ("dither", "temporal")
             self._encoder = Encoder(self._ctx, self._linear, self._levels, panel, dithered)
             self._encoder.shrink(target.sides)
 
@@ -173,16 +181,21 @@ class Renderer:
         `frame` counts the frames shown, for `temporal` alone. With `whole` no sprite is smaller than the footprint.
         """
         with self._ctx:
-            if self._exact is not None and self._levels is not None:
+            extended = sprites is not None and bool(sprites.extended)
+            self._by_numpy = self._exact is not None and (self._exact_pass is None or extended)
+            if self._by_numpy and self._exact is not None and self._levels is not None:
                 # These levels come from the sprites themselves: the linear image is drawn only when it is read.
                 floor = None if sprites is None or not sprites.extended else self._floor(sprites.extended)
                 self._exact_levels = self._exact.levels(sprites, floor)
                 self._levels.write(self._exact_levels)
                 self._undrawn = (sprites, whole)
+                self._last_count = None
                 return
             self._draw_linear(sprites, whole)
             if self._encoder is not None:
                 self._encode(self._encoder, sprites, frame)
+            if self._exact_pass is not None and sprites is not None and len(sprites):
+                self._exact_pass.draw(self._buffer, sprites)
 
     def _encode(self, encoder: Encoder, sprites: Sprites | None, frame: int) -> None:
         temporal = self.target.quantisation == "temporal"
@@ -269,7 +282,7 @@ class Renderer:
 
         uint8 up to 256 levels, uint16 beyond. A target without a response has none: TypeError.
         """
-        if self._exact is not None:
+        if self._by_numpy:
             return self._exact_levels
         if self._levels is None:
             raise TypeError("this target has no monitor response, so no codes")

@@ -1,0 +1,138 @@
+"""`exact` on the GPU: after the nearest levels are drawn, a compute pass chooses each star's together (shaders/exact.comp)."""
+
+from __future__ import annotations
+
+import moderngl
+import numpy as np
+import numpy.typing as npt
+
+from hilstar.arrays import IntArray
+from hilstar.monitor.balance import (
+    ALL_LIGHT,
+    ALL_MOMENTS,
+    BOX_3,
+    BOX_5,
+    BOX_REACH,
+    FEW_STEPS,
+    LAST_LIGHT,
+    WINDOW_LIGHT,
+    WINDOW_MOMENTS,
+    Balance,
+)
+from hilstar.monitor.exact import CARRIED
+from hilstar.monitor.footprints import FootprintMap
+from hilstar.monitor.quantise import Panel
+from hilstar.render.encoder import LevelTexture
+from hilstar.resources import resource_path
+from hilstar.scene.psf import SQRT2
+from hilstar.scene.sprites import Sprites
+
+MIN_VERSION = 430  # of OpenGL, for compute shaders
+MAX_NEAR = 128  # pixels of a star that the shader has bits for: sprites up to a sigma of 1.8 px
+LOCAL_SIZE = 32  # as in exact.comp
+PLACE_DTYPE = np.dtype([("x_px", "<i4"), ("y_px", "<i4"), ("box_3", "<f4"), ("box_5", "<f4")])
+
+
+class ExactPass:
+    """Chooses the levels of sprites anew on a LevelTexture that has the nearest ones; it lives in its renderer's context."""
+
+    def __init__(self, linear: moderngl.Texture, levels: LevelTexture, panel: Panel, balance: Balance) -> None:
+        ctx = self._ctx = linear.ctx
+        self._linear, self._levels = linear, levels.texture
+        self._footprints = FootprintMap(linear.size, balance.sigma_px)
+        light = panel.light_e_per_s()
+        self._light = ctx.buffer(np.append(light, light[-1]).tobytes())
+        self._order = ctx.buffer(_places(self._footprints, balance).tobytes())
+        gain = panel.gain()
+        self._gain = None if gain is None else ctx.texture(linear.size, 1, np.ascontiguousarray(gain), dtype="f4")
+        self._stretches: moderngl.Buffer | None = None
+        self._programs = {paths: self._build(panel, balance, paths) for paths in (False, True)}
+
+    @staticmethod
+    def runs_on(ctx: moderngl.Context, resolution_px: tuple[int, int], sigma_px: tuple[float, float]) -> bool:
+        """Whether this GL has compute shaders, and the shader bits enough for the sprites' pixels."""
+        return ctx.version_code >= MIN_VERSION and FootprintMap(resolution_px, sigma_px).near <= MAX_NEAR
+
+    def _build(self, panel: Panel, balance: Balance, paths: bool) -> moderngl.ComputeShader:
+        near = self._footprints.near
+        defines = [f"NEAR {near}", f"BITS uvec{2 if near <= 64 else 4}", f"LEVELS r{8 * self._levels_bytes()}ui"]
+        defines += ["PATHS"] * paths + ["UNIFORMITY"] * (self._gain is not None)
+        version, body = resource_path("shaders", "exact.comp").read_text().split("\n", 1)
+        program = self._ctx.compute_shader("\n".join([version, *(f"#define {name}" for name in defines), body]))
+        window = balance.window_px
+        values = {
+            "footprint": self._footprints.size**2,
+            "white": panel.response.white,
+            "first_threshold_e_per_s": float(panel.response.threshold[0] * panel.flux_at_white_e_per_s),
+            "resolution_px": self._linear.size,
+            "odd": self._footprints.bias,
+            "inverse_sigma_sqrt2": tuple(1 / (sigma * SQRT2) for sigma in balance.sigma_px),
+            "half_inverse_window2": (0.5 / window[0] ** 2, 0.5 / window[1] ** 2),
+            "follows": (*balance.follows(3), *balance.follows(5)),
+            "weights": (ALL_LIGHT, ALL_MOMENTS, WINDOW_LIGHT, WINDOW_MOMENTS),
+            "few_steps": FEW_STEPS,
+            "last_light": LAST_LIGHT,
+            "linear_e_per_s": 0,
+        } | ({"gain": 1} if self._gain is not None else {})
+        for name, value in values.items():
+            if name in program:  # compilers drop what they do not need
+                program[name] = value
+        return program
+
+    def _levels_bytes(self) -> int:
+        return 1 if self._levels.dtype == "u1" else 2
+
+    def draw(self, buffer: moderngl.Buffer, sprites: Sprites) -> None:
+        """Choose the levels of `sprites`, which `buffer` holds and the linear image shows."""
+        paths = sprites.per_star > 1
+        program, count = self._programs[paths], len(sprites)
+        if paths:
+            stretches = stretches_of(sprites.star)
+            count = len(stretches)
+            self._upload(stretches)
+        buffer.bind_to_storage_buffer(0)
+        self._order.bind_to_storage_buffer(1)
+        self._light.bind_to_storage_buffer(2)
+        self._linear.use(0)
+        if self._gain is not None:
+            self._gain.use(1)
+        self._levels.bind_to_image(0, read=True, write=True)
+        program["count"] = count
+        program.run(-(-count // LOCAL_SIZE))
+        self._ctx.memory_barrier()
+
+    def _upload(self, stretches: IntArray) -> None:
+        data = stretches.astype(np.int32).tobytes()
+        if self._stretches is None or self._stretches.size < len(data):
+            if self._stretches is not None:
+                self._stretches.release()
+            self._stretches = self._ctx.buffer(reserve=2 * len(data), dynamic=True)
+        self._stretches.orphan()
+        self._stretches.write(data)
+        self._stretches.bind_to_storage_buffer(3)
+
+
+def _places(footprints: FootprintMap, balance: Balance) -> npt.NDArray[np.void]:
+    """The shader's places: a footprint's pixels by distance for each phase, with their weights in the boxes."""
+    x, y = footprints.places()
+    away_x, away_y = (
+        np.minimum(np.abs(at - np.rint(middle)[:, None]), BOX_REACH).astype(np.intp)
+        for at, middle in zip((x, y), footprints.phases, strict=True)
+    )
+    places = np.empty(x.shape, dtype=PLACE_DTYPE)
+    places["x_px"], places["y_px"] = x, y
+    for name, side, weight in (("box_3", 3, BOX_3), ("box_5", 5, BOX_5)):
+        table = balance.box(side)
+        places[name] = weight * table[away_x] * table[away_y]
+    return places
+
+
+def stretches_of(star: IntArray) -> IntArray:
+    """The parts of paths whose sprites hand on their errors, (n, 4): first and end of each, and of its path."""
+    begins = np.flatnonzero(np.diff(star, prepend=-1))
+    ends = np.append(begins[1:], len(star))
+    parts = -(-(ends - begins) // CARRIED)
+    path = np.repeat(np.arange(len(begins)), parts)
+    number = np.arange(len(path)) - np.repeat(np.cumsum(parts) - parts, parts)
+    first = begins[path] + number * CARRIED
+    return np.stack([first, np.minimum(first + CARRIED, ends[path]), begins[path], ends[path]], axis=1)

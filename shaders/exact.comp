@@ -1,0 +1,324 @@
+#version 430 core
+// `exact`: for each star, or stretch of a path, which of the two levels about its light each pixel takes. hilstar/monitor/exact.py
+// is the same in NumPy and says how; the ten sums are those of hilstar/monitor/balance.py.
+// It comes after the linear image and its nearest levels, and changes those levels. A pixel is the star's that gives more than half
+// of its light, so no pixel is written by two.
+// Defined before this text: LEVELS (r8ui or r16ui), NEAR, the pixels that are chosen, and BITS (uvec2 or uvec4), with a bit for each.
+
+layout(local_size_x = 32) in;
+
+struct Place {
+    int x_px, y_px;      // from the star's own pixel
+    float box_3, box_5;  // its weight in boxes of 3 and 5 tracker pixels about the star's nearest
+};
+layout(std430, binding = 0) readonly buffer Sprites { int sprite[]; };        // five words each, as SPRITE_DTYPE
+layout(std430, binding = 1) readonly buffer Order { Place order[]; };         // a footprint's pixels by distance, for each phase
+layout(std430, binding = 2) readonly buffer Light { float light_e_per_s[]; }; // of each level, white twice
+#ifdef PATHS
+layout(std430, binding = 3) readonly buffer Stretches { ivec4 stretch[]; };   // its sprites: first, end; its path's: first, end
+#endif
+layout(LEVELS, binding = 0) uniform uimage2D levels;
+uniform sampler2D linear_e_per_s;
+#ifdef UNIFORMITY
+uniform sampler2D gain;
+#endif
+
+uniform int count;
+uniform int footprint;  // pixels in all, of which NEAR are chosen
+uniform int white;
+uniform float first_threshold_e_per_s;
+uniform ivec2 resolution_px;
+uniform float odd;      // 0.5 for footprints with a middle
+uniform vec2 inverse_sigma_sqrt2;
+uniform vec2 half_inverse_window2;
+uniform vec4 follows;   // of the box of 3 tracker pixels along x and y, and of the one of 5
+uniform vec4 weights;   // light and moments, of all and under the window
+uniform float few_steps;
+uniform float last_light;
+
+const int PHASES = 8;
+const int KEPT = 8;
+const float NONE = 1e30;
+const float SAME_STEP = 1e-4;
+const float OFF = 0.6;  // of a step, where steps are equal: then one more pixel is turned
+const int REACH = 3;  // sprites of a path before and after that reach a sprite's pixels
+
+struct Choice {
+    vec4 a;  // light, moments, light under the window
+    vec4 b;  // moments under the window, moments in the smaller box
+    vec2 c;  // moments in the larger box
+    float square;
+    BITS up;
+};
+
+vec4 erf4(vec4 value) {  // as in splat.frag
+    vec4 x = clamp(value, -4.0, 4.0);
+    vec4 s = x * x;
+    vec4 p = s * -2.72614225801306e-10 + 2.77068142495902e-08;
+    p = p * s - 2.10102402082508e-06;
+    p = p * s - 5.69250639462346e-05;
+    p = p * s - 7.34990630326855e-04;
+    p = p * s - 2.95459980854025e-03;
+    p = p * s - 1.60960333262415e-02;
+    vec4 q = s * -1.45660718464996e-05 - 2.13374055278905e-04;
+    q = q * s - 1.68282697438203e-03;
+    q = q * s - 7.37332916720468e-03;
+    q = q * s - 1.42647390514189e-02;
+    return x * p / q;
+}
+
+void set_bit(inout BITS bits, int k) {
+    bits[k >> 5] |= 1u << (k & 31);
+}
+
+bool has_bit(BITS bits, int k) {
+    return (bits[k >> 5] & (1u << (k & 31))) != 0u;
+}
+
+ivec2 pixel_of(int i) {
+    return ivec2(sprite[5 * i], sprite[5 * i + 1]);
+}
+
+vec2 fraction_of(int i) {
+    return vec2(intBitsToFloat(sprite[5 * i + 2]), intBitsToFloat(sprite[5 * i + 3]));
+}
+
+float share_of(int i, ivec2 at) {
+    vec2 d = vec2(at - pixel_of(i)) - fraction_of(i);
+    vec4 e = erf4(vec4(d - 0.5, d + 0.5) * inverse_sigma_sqrt2.xyxy);
+    vec2 share = max(e.zw - e.xy, 0.0);
+    return intBitsToFloat(sprite[5 * i + 4]) * 0.25 * share.x * share.y;
+}
+
+ivec2 offset_of(int place) {
+    return ivec2(order[place].x_px, order[place].y_px);
+}
+
+// exp(-u) within 0.03: exp itself is a fifth of the whole pass on a CPU.
+float window_at(vec2 d) {
+    float near = 1.0 / (1.0 + dot(d * d, half_inverse_window2) / 8.0);
+    near *= near;
+    near *= near;
+    return near * near;
+}
+
+bool on_image(ivec2 at) {
+    return all(greaterThanEqual(at, ivec2(0))) && all(lessThan(at, resolution_px));
+}
+
+#ifdef PATHS
+// Whether a pixel is nearer to a sprite than to those before and after it in its path.
+bool nearest_in(ivec2 path, int i, ivec2 at) {
+    float own = share_of(i, at);
+    return (i == path.x || share_of(i - 1, at) < own) && (i + 1 == path.y || share_of(i + 1, at) <= own);
+}
+#endif
+
+// What a pixel's error is multiplied by in each sum; `d` is it from the star, `off` the star from its nearest pixel.
+void arms_of(int place, vec2 d, vec2 off, float light_weight, out vec4 a, out vec4 b, out vec2 c) {
+    float window = window_at(d);
+    a = vec4(light_weight, weights.y * d, weights.z * window);
+    b = vec4(weights.w * window * d, order[place].box_3 * (d + follows.xy * off));
+    c = order[place].box_5 * (d + follows.zw * off);
+}
+
+// The light that a pixel should show, e-/s, negative where it is not this star's; `own` is the sprite's part.
+float asked_of(int i, ivec2 path, ivec2 at, float own) {
+    float whole = own;
+#ifdef PATHS
+    for (int j = max(path.x, i - REACH); j < min(path.y, i + REACH + 1); j++)
+        if (j != i) whole += share_of(j, at);
+#endif
+    // A faint star's sprite may end before its near pixels do.
+    float asked = max(texelFetch(linear_e_per_s, at, 0).r, whole);
+    return 2.0 * whole > asked * 1.0001 ? asked : -1.0;
+}
+
+float output_of(ivec2 at) {
+#ifdef UNIFORMITY
+    return 1.0 / texelFetch(gain, at, 0).r;
+#else
+    return 1.0;
+#endif
+}
+
+Choice pick(bool first, Choice x, Choice y) {
+    return Choice(first ? x.a : y.a, first ? x.b : y.b, first ? x.c : y.c, first ? x.square : y.square, first ? x.up : y.up);
+}
+
+Choice moved(Choice e, vec4 a, vec4 b, vec2 c, float by, float square, BITS bit) {
+    return Choice(e.a + a * by, e.b + b * by, e.c + c * by, square, e.up | bit);
+}
+
+// Indices are written out: a compiler that does not unroll the loop keeps the choices in memory, at ten times the time.
+#define EIGHT(DO) DO(0) DO(1) DO(2) DO(3) DO(4) DO(5) DO(6) DO(7)
+#define SEVEN(DO) DO(1) DO(2) DO(3) DO(4) DO(5) DO(6) DO(7)
+#define NEXT_TO_EACH(DO) DO(0, 1) DO(2, 3) DO(4, 5) DO(6, 7)
+#define TWO_APART(DO) DO(0, 2) DO(1, 3) DO(4, 6) DO(5, 7)
+#define FOUR_APART(DO) DO(0, 4) DO(1, 5) DO(2, 6) DO(3, 7)
+
+// The square of the sums where the lower level is taken, and what the step to the upper one adds to it.
+#define LOWER(M) { \
+    float turn = dot(a, kept[M].a) + dot(b, kept[M].b) + dot(c, kept[M].c); \
+    lower[M] = kept[M].square + s * (2.0 * turn + s * aa); \
+    rise[M] = t > 0.0 ? t * (2.0 * (turn + s * aa) + t * aa) : NONE; }
+
+// Of the four choices that two of those kept lead to, keep two in their places: where both of one are better than either of the
+// other, the other's place takes the second.
+#define KEEP_THE_BETTER(M, N) { \
+    bool rise_m = rise[M] < 0.0, rise_n = rise[N] < 0.0; \
+    float better_m = lower[M] + min(rise[M], 0.0), worse_m = lower[M] + max(rise[M], 0.0); \
+    float better_n = lower[N] + min(rise[N], 0.0), worse_n = lower[N] + max(rise[N], 0.0); \
+    bool both_m = worse_m < better_n, both_n = worse_n < better_m; \
+    bool up_m = both_n ? !rise_n : rise_m, up_n = both_m ? !rise_m : rise_n; \
+    Choice in_m = pick(both_n, kept[N], kept[M]), in_n = pick(both_m, kept[M], kept[N]); \
+    kept[M] = moved(in_m, a, b, c, up_m ? s + t : s, both_n ? worse_n : better_m, up_m ? bit : BITS(0u)); \
+    kept[N] = moved(in_n, a, b, c, up_n ? s + t : s, both_m ? worse_m : better_n, up_n ? bit : BITS(0u)); }
+
+// Choose the levels of one sprite; `carried` is light and moments about it that it has to make up for, in steps from black, and
+// what is returned is what it leaves.
+vec3 choose(int i, ivec2 path, vec3 carried) {
+    ivec2 pixel = pixel_of(i);
+    vec2 fraction = fraction_of(i);
+    ivec2 cell = clamp(ivec2((fraction + odd) * float(PHASES)), 0, PHASES - 1);
+    int first = (cell.y * PHASES + cell.x) * footprint;
+    float unit = light_e_per_s[1];
+    float white_e_per_s = light_e_per_s[white];
+
+    int place[NEAR];
+    int mine = NEAR;
+#ifdef PATHS
+    mine = 0;
+    for (int k = 0; k < NEAR; k++)
+        if (nearest_in(path, i, pixel + offset_of(first + k))) place[mine++] = first + k;
+#else
+    for (int k = 0; k < NEAR; k++) place[k] = first + k;
+#endif
+    float short_of[NEAR];
+    float step_of[NEAR];
+    BITS rounded_up = BITS(0u);
+    vec3 seen = vec3(0.0);  // own light and moments, in this star's pixels and others'
+    float largest = 0.0, smallest = NONE, lowest = 0.0;
+    for (int k = 0; k < mine; k++) {
+        ivec2 offset = offset_of(place[k]);
+        ivec2 at = pixel + offset;
+        float own = share_of(i, at);
+        seen += own * vec3(1.0, vec2(offset) - fraction);
+        short_of[k] = 0.0;
+        step_of[k] = 0.0;
+        float asked = on_image(at) ? asked_of(i, path, at, own) : -1.0;
+        if (asked < 0.0) continue;
+        float factor = output_of(at);
+        asked = min(asked / factor, white_e_per_s);
+        int level = int(imageLoad(levels, at).r);
+        float shown = light_e_per_s[level];
+        bool above = shown > asked;
+        float low = above ? light_e_per_s[level - 1] : shown;
+        float next = above ? shown : light_e_per_s[level + 1];
+        if (above) set_bit(rounded_up, k);
+        factor /= unit;
+        short_of[k] = (low - asked) * factor;
+        step_of[k] = (next - low) * factor;
+        lowest += short_of[k];
+        if (step_of[k] > 0.0) {
+            largest = max(largest, step_of[k]);
+            smallest = min(smallest, step_of[k]);
+        }
+    }
+    vec3 error = carried;
+#ifndef PATHS
+    for (int k = NEAR; k < footprint; k++) {
+        ivec2 offset = offset_of(first + k);
+        ivec2 at = pixel + offset;
+        float own = share_of(i, at);
+        if (2.0 * own < first_threshold_e_per_s) break;
+        vec3 arm = vec3(1.0, vec2(offset) - fraction);
+        seen += own * arm;
+        float asked = on_image(at) ? asked_of(i, path, at, own) : -1.0;
+        if (asked < 0.0) continue;
+        float factor = output_of(at);
+        error += (light_e_per_s[imageLoad(levels, at).r] - min(asked / factor, white_e_per_s)) * factor / unit * arm;
+    }
+    // What lies further out stays dark. A sprite's moments about its centre are 0.
+    error -= (vec3(intBitsToFloat(sprite[5 * i + 4]), 0.0, 0.0) - seen) / unit;
+#endif
+    vec3 left = error;
+    bool equal = largest > 0.0 && largest <= smallest * (1.0 + SAME_STEP);
+    if (equal) {
+        float all_down = lowest + error.x;
+        error.x -= all_down - round(all_down / largest) * largest;
+    }
+
+    vec2 nearest = round(fraction);
+    vec2 off = fraction - nearest;
+    // As light_weight in balance.py.
+    float light_weight = weights.x * (1.0 + few_steps * unit / max(intBitsToFloat(sprite[5 * i + 4]), 1e-3 * unit));
+    vec3 begin = error * vec3(light_weight, weights.yy);
+    Choice kept[KEPT];
+#define BEGIN(M) kept[M] = Choice(vec4(begin, 0.0), vec4(0.0), vec2(0.0), M == 0 ? dot(begin, begin) : NONE, BITS(0u));
+    EIGHT(BEGIN)
+    for (int k = 0; k < mine; k++) {
+        float s = short_of[k], t = step_of[k];
+        if (s == 0.0 && t == 0.0) continue;
+        ivec2 offset = offset_of(place[k]);
+        vec2 d = vec2(offset) - fraction;
+        vec4 a, b;
+        vec2 c;
+        arms_of(place[k], d, off, light_weight, a, b, c);
+        float aa = dot(a, a) + dot(b, b) + dot(c, c);
+        BITS bit = BITS(0u);
+        set_bit(bit, k);
+        float lower[KEPT], rise[KEPT];
+        EIGHT(LOWER)
+        if (k % 3 == 0) { NEXT_TO_EACH(KEEP_THE_BETTER) } else if (k % 3 == 1) { TWO_APART(KEEP_THE_BETTER) } else { FOUR_APART(KEEP_THE_BETTER) }
+    }
+    Choice best = kept[0];
+    best.square += (last_light * last_light - 1.0) * best.a.x * best.a.x;
+#define BEST(M) \
+    kept[M].square += (last_light * last_light - 1.0) * kept[M].a.x * kept[M].a.x; \
+    best = pick(kept[M].square < best.square, kept[M], best);
+    SEVEN(BEST)
+    if (equal && abs(best.a.x) > OFF * light_weight * largest) {
+        bool rise = best.a.x < 0.0;
+        float least = NONE;
+        int turned = 0;
+        for (int k = 0; k < mine; k++) {
+            if (step_of[k] == 0.0 || has_bit(best.up, k) == rise) continue;
+            vec4 a, b;
+            vec2 c;
+            arms_of(place[k], vec2(offset_of(place[k])) - fraction, off, light_weight, a, b, c);
+            float by = rise ? step_of[k] : -step_of[k];
+            float more = by * (2.0 * (dot(a, best.a) + dot(b, best.b) + dot(c, best.c)) + by * (dot(a, a) + dot(b, b) + dot(c, c)));
+            turned = more < least ? k : turned;
+            least = min(more, least);
+        }
+        if (least < NONE) best.up[turned >> 5] ^= 1u << (turned & 31);
+    }
+    for (int k = 0; k < mine; k++) {
+        bool up = has_bit(best.up, k);
+        vec2 d = vec2(offset_of(place[k])) - fraction;
+        left += (short_of[k] + (up ? step_of[k] : 0.0)) * vec3(1.0, d);
+        if (step_of[k] == 0.0 || up == has_bit(rounded_up, k)) continue;
+        ivec2 at = pixel + offset_of(place[k]);
+        uint level = imageLoad(levels, at).r;
+        imageStore(levels, at, uvec4(up ? level + 1u : level - 1u));
+    }
+    return left;
+}
+
+void main() {
+    int i = int(gl_GlobalInvocationID.x);
+    if (i >= count) return;
+#ifdef PATHS
+    vec3 carried = vec3(0.0);
+    for (int node = stretch[i].x; node < stretch[i].y; node++) {
+        if (node > stretch[i].x) {
+            vec2 away = vec2(pixel_of(node) - pixel_of(node - 1)) + fraction_of(node) - fraction_of(node - 1);
+            carried.yz -= carried.x * away;
+        }
+        carried = choose(node, stretch[i].zw, carried);
+    }
+#else
+    choose(i, ivec2(0), vec3(0.0));
+#endif
+}

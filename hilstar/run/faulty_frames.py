@@ -38,6 +38,7 @@ class FaultyFrames:
 
     def __init__(self, source: Source, view: FaultView) -> None:
         self.dropped = self.frozen = 0
+        self.now: tuple[Now, ...] = ()  # of the last frame that was asked about
         self._source, self._view = source, view
         self._held: Held | None = None
 
@@ -45,7 +46,7 @@ class FaultyFrames:
         """What is wrong in a frame; None where nothing is, and before the run's first attitude, from which time counts."""
         if attitude is None and self._held is None:
             return None
-        now = self._source.at(t_ns)
+        now = self.now = self._source.at(t_ns)
         return Effects(self._view, now) if now else None
 
     def drops(self, effects: Effects | None, number: int) -> bool:

@@ -22,14 +22,13 @@ from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.faults.scenario import Scenario
 from hilstar.bench.faults.timetable import Timetable
 from hilstar.bench.faults.view import FaultView
-from hilstar.bench.faults.views import tracker_view
 from hilstar.files import make_directory
 from hilstar.process.interrupts import end_with_parent
 from hilstar.rotation import rate_between_rad_s
 from hilstar.scene.exposure_motion import Motion
 from hilstar.twin.exposure_files import write_exposure_fits
 from hilstar.twin.faulty_exposure import FaultyExposure, Piece, pieces_of
-from hilstar.twin.simulator import FrameNoise, Simulator
+from hilstar.twin.simulator import FrameNoise, Simulator, simulator_view
 from hilstar.units import NS_PER_S
 
 _simulator: Simulator | None = None
@@ -76,7 +75,7 @@ class LogFaults:
 
     def pieces(self, simulator: Simulator, motions: list[Motion]) -> list[tuple[Piece, ...]]:
         """Each exposure, cut where a fault begins or ends. Raises InputError for a fault that cannot be drawn."""
-        timetable = Timetable(self.scenario, _view(simulator, self.scenario), simulator.config.tracker.exposure_s)
+        timetable = Timetable(self.scenario, simulator_view(simulator, self.scenario), simulator.config.tracker.exposure_s)
         timeline = log_timeline(self.samples, Policy(0, NS_PER_S, self.max_rate_rad_s))
         zero_ns = self.samples[0].t_ns
 
@@ -89,14 +88,9 @@ class LogFaults:
         return [pieces_of(motion, (motion.t_ns or 0) - zero_ns, timetable, attitude_at) for motion in motions]
 
 
-def _view(simulator: Simulator, scenario: Scenario) -> FaultView:
-    footprint_px = simulator.renderer.footprint_px
-    return tracker_view(simulator.file, simulator.camera, footprint_px, simulator.stars, simulator.moving, scenario)
-
-
 def faulty_exposure(simulator: Simulator, motion: Motion, scenario: Scenario, run_ns: int) -> FaultyExposure:
     """One exposure with a scenario's faults, its middle at `run_ns` of that. Raises InputError (see `FaultView.prepare`)."""
-    view = _view(simulator, scenario)
+    view = simulator_view(simulator, scenario)
     timetable = Timetable(scenario, view, simulator.config.tracker.exposure_s)
     return FaultyExposure(view, pieces_of(motion, run_ns, timetable))
 
@@ -149,7 +143,7 @@ def _start_worker(file: BenchFile, scenario: Scenario | None) -> None:
     os.environ.setdefault("LP_NUM_THREADS", "1")  # the pool itself fills the cores
     _simulator = Simulator(file)
     if scenario is not None:
-        _faults = _view(_simulator, scenario)
+        _faults = simulator_view(_simulator, scenario)
         for fault in scenario.faults:
             _faults.prepare(fault)
 

@@ -16,6 +16,9 @@ from hilstar.bench.build import bench_moving, bench_optics, bench_stars, moved
 from hilstar.bench.cameras import tracker_camera
 from hilstar.bench.config import BenchConfig
 from hilstar.bench.discs import DiscPainter, When, disc_stars
+from hilstar.bench.faults.scenario import Scenario
+from hilstar.bench.faults.view import FaultView
+from hilstar.bench.faults.views import tracker_view
 from hilstar.bench.satellites import EXPOSURE_SPRITES, Shot, with_satellites
 from hilstar.bench.truth import truth_table
 from hilstar.errors import InputError
@@ -188,6 +191,12 @@ class Simulator:
 
     def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
         self.close()
+
+
+def simulator_view(simulator: Simulator, scenario: Scenario) -> FaultView:
+    """The faults of a scenario as a simulator's tracker sees them."""
+    footprint_px = simulator.renderer.footprint_px
+    return tracker_view(simulator.file, simulator.camera, footprint_px, simulator.stars, simulator.moving, scenario)
 
 
 class Looking(Protocol):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -93,7 +93,7 @@ def serve(
         page = Told("serve", file.config.attitude.source, link.endpoint, timed=not file.config.attitude.lockstep)
         parts = Parts(bench, notices, kept, lambda path: Ledger(path, bench, notices, split=split), screen, fault_desk(wrong))
         with on_terminal(status), followed(door, control, page, parts, status) as (sink, follower, desk):
-            outlet = Outlet(screen, kept, notices, tracker_pictures(link, bench), follower, desk, wrong)
+            outlet = Outlet(screen, kept, notices, tracker_pictures(link, bench, wrong), follower, desk, wrong)
             summary = serve_stream(bench, link, limit, sink, outlet)
     end_of_run(summary, screen, kept, as_json)
     if not summary.packets.accepted:
@@ -101,9 +101,13 @@ def serve(
         raise typer.Exit(NO_ATTITUDE)
 
 
-def tracker_pictures(link: AnyLink, bench: Bench) -> Pictures | None:
+def tracker_pictures(link: AnyLink, bench: Bench, faults: Any = None) -> Pictures | None:
     """The virtual tracker's pictures for a link whose other side asks for them."""
     from hilstar.attitude.wire.vizard.live import VizardLive
     from hilstar.twin.tracker_pictures import TrackerPictures
 
-    return TrackerPictures(bench) if isinstance(link, VizardLive) else None
+    if not isinstance(link, VizardLive):
+        return None
+    if faults is None:
+        return TrackerPictures(bench)
+    return TrackerPictures(bench, faults.desk.scenario, lambda: faults.frames.now)

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import io
+
 import numpy as np
 import pytest
+from PIL import Image
 
 import hilstar
+from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.bench.bench_file import bench_file_of
 from hilstar.bench.cameras import bench_camera, tracker_camera
+from hilstar.bench.faults.desk import Now
 from hilstar.bench.faults.scenario import parse_scenario
 from hilstar.bench.faults.views import effects_at
 from hilstar.rotation import angle_between_rad
 from hilstar.twin.batch import faulty_exposure
 from hilstar.twin.simulator import Simulator
+from hilstar.twin.tracker_pictures import TrackerPictures
 from hilstar.units import ARCSEC_PER_RAD, NS_PER_S
 from tests.support.benches import ORION_Q, SMALL_BENCH
 
@@ -142,3 +148,27 @@ def test_display_and_tracker_have_the_same_light_at_the_same_places(simulator, t
             assert off.min() < PLACE_PX and nearest["name"] == row["name"]
             assert nearest["electrons_per_s"] == pytest.approx(row["electrons_per_s"], rel=1e-5) or row["name"] == "rays"
     assert matched > 2
+
+
+def test_a_simulation_s_pictures_have_the_faults_of_the_display(tmp_path):
+    path = tmp_path / "bench.toml"
+    path.write_text(SMALL_BENCH)
+    scenario = parse_scenario(tmp_path / "faults.toml", GHOST + '[[fault]]\nkind = "freeze"\nname = "stuck"')
+    ghost, stuck = (Now(k, fault, 0) for k, fault in enumerate(scenario.faults, start=1))
+    on = []
+    with hilstar.load(path) as bench:
+        pictures = TrackerPictures(bench, scenario, lambda: tuple(on))
+        here = AttitudeSample(0, np.array(ORION_Q))
+        away = AttitudeSample(0, np.array([0.7071068, 0.7071068, 0.0, 0.0]))
+        plain = dn_of(pictures(here))
+        on.append(ghost)
+        seen = dn_of(pictures(here))
+        on[:] = [stuck]
+        stands = dn_of(pictures(away))
+    spot = slice(528, 533), slice(478, 483)
+    assert seen[spot].sum() > plain[spot].sum() + 0.5 * 4e4 / 24  # e-/DN of the default detector
+    assert np.abs(stands.astype(float) - plain).max() < 0.2 * plain.max()  # the same stars, with other noise
+
+
+def dn_of(png):
+    return np.asarray(Image.open(io.BytesIO(png)), dtype=np.uint16) >> 4

@@ -91,7 +91,9 @@ def _disc_map(light: DiscLight, nodes: int) -> LightMap | None:
     x_px, y_px = camera.project(_seen(light, directions))
     known = np.isfinite(x_px)
     rates = light.times * disc.normal_e_per_s_sr * law_sr[known]
-    return LightMap(_spread(x_px[known], y_px[known], rates, region, light.sigma_px), (region[0], region[1]), 1.0, cover)
+    return LightMap(
+        _spread(x_px[known], y_px[known], rates, region, light.sigma_px), (region[0], region[1]), 1.0, cover, disc.name
+    )
 
 
 def _px_per_sr(light: DiscLight) -> float:

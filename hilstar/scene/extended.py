@@ -26,7 +26,8 @@ Rectangle = tuple[int, int, int, int]  # left, top, width, height, pixels
 class LightMap:
     """An image of light, float32 (height, width), `times` a factor, its first pixel at `corner_px` (x, y) of the image.
 
-    `cover`, of the same shape, is the share of what was drawn before that each pixel hides; None hides nothing.
+    `cover`, of the same shape, is the share of what was drawn before that each pixel hides; None hides nothing. `name` is the
+    body's whose disc it is.
 
     Keep one array for as long as the light is the same, and do not write to it: it is uploaded once.
     """
@@ -35,6 +36,7 @@ class LightMap:
     corner_px: tuple[int, int] = (0, 0)
     times: float = 1.0
     cover: Float32Array | None = None
+    name: str = ""
 
     def region(self, resolution_px: tuple[int, int]) -> Rectangle | None:
         """The part of an image that it lights, None where that is nothing."""
@@ -93,6 +95,11 @@ class DiscLight:
     times: float = 1.0
     covers: bool = True
     shear: Shear | None = None
+
+    @property
+    def name(self) -> str:
+        """The body's name."""
+        return self.disc.name
 
     @property
     def variance_px(self) -> tuple[float, float]:

@@ -12,6 +12,7 @@ from hilstar.bench.faults.desk import Now
 from hilstar.bench.faults.kinds import AttitudeStep, Blank, Drop, Fault, Freeze
 from hilstar.bench.faults.view import FaultView
 from hilstar.rotation import propagate, to_matrix
+from hilstar.scene.extended import DiscLight, LightMap
 from hilstar.scene.frame_motion import Scan
 from hilstar.scene.sprites import AddedLight, Sprites, join_sprites
 from hilstar.sky.cells import CellGrid
@@ -77,7 +78,7 @@ class Effects:
             return replace(join_sprites([], sprites.footprint_px), rate_cam_rad_s=sprites.rate_cam_rad_s)
         gone = view.gone(now, stars)
         if gone:
-            sprites = _dimmed(sprites, gone)
+            sprites = _without_discs(_dimmed(sprites, gone), view.gone_bodies(now))
         directions, named = view.sky_points(now, stars)
         chains, lines = view.camera_points(now, scan)
         surfaces = view.surfaces(now, q_icrs_to_cam)
@@ -118,6 +119,20 @@ def _dimmed(sprites: Sprites, gone: list[tuple[int, float]]) -> Sprites:
     if kept.all():
         return whole
     return replace(whole, data=data[kept], star=sprites.star[kept], x_px=sprites.x_px[kept], y_px=sprites.y_px[kept])
+
+
+def _without_discs(sprites: Sprites, gone: dict[str, float]) -> Sprites:
+    """Sprites whose discs of some bodies are dark, or have a share of their light; what they hide stays hidden."""
+    if not any(name in gone for name in sprites.discs):
+        return sprites
+    lights = tuple(
+        replace(light, times=light.times * gone[light.name])
+        if isinstance(light, LightMap | DiscLight) and light.name in gone
+        else light
+        for light in sprites.extended
+    )
+    discs = tuple(name for name in sprites.discs if gone.get(name, 1.0) > 0)
+    return replace(sprites, extended=lights, discs=discs, over_white=tuple(n for n in sprites.over_white if n in discs))
 
 
 def few_stars(vectors: FloatArray, lights: Sequence[AddedLight], like: Stars) -> Stars:

@@ -225,6 +225,10 @@ class FaultView:
         taken = [one for one in now if isinstance(one.fault, StarGone)]
         return [(int(star), 1 - one.share) for one in taken for star in self._targets.find(stars, one.fault)]
 
+    def gone_bodies(self, now: Sequence[Now]) -> dict[str, float]:
+        """The same for what is gone by name."""
+        return {one.fault.star: 1 - one.share for one in now if isinstance(one.fault, StarGone) and one.fault.star is not None}
+
     def surfaces(self, now: Sequence[Now], q_icrs_to_cam: FloatArray) -> list[extended.ExtendedLight]:
         """Stray light; of maps the first MAX_MAPS."""
         found: list[extended.ExtendedLight] = []

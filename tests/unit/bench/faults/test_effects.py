@@ -12,9 +12,9 @@ from hilstar.bench.faults.kinds import fault_of
 from hilstar.bench.faults.scenario import Scenario
 from hilstar.bench.faults.views import display_view
 from hilstar.errors import InputError
-from hilstar.rotation import angle_between_rad
+from hilstar.rotation import angle_between_rad, from_radec_roll_deg
 from hilstar.units import ARCSEC_PER_RAD
-from tests.support.benches import ORION_Q, SMALL_BENCH
+from tests.support.benches import ORION_Q, SMALL_BENCH, bench_text
 
 # The linear image is float32 and a footprint cuts 1e-6 of a star (scene.psf.MAX_CUT).
 LIGHT_SHARE = 2e-6
@@ -195,3 +195,17 @@ def test_a_map_that_is_no_image_is_refused(bench, tmp_path, content, said):
     (tmp_path / "stray.fits").write_bytes(content)
     with pytest.raises(InputError, match=said):
         shown(bench, {"kind": "light-map", "file": "stray.fits"}, folder=tmp_path)
+
+
+def test_a_body_that_is_gone_has_neither_disc_nor_row(tmp_path):
+    path = tmp_path / "moon.toml"
+    path.write_text(bench_text({"sky": {"epoch_utc": "2026-11-21T00:00:00Z"}, "sky.bodies": {"moon": True}}))
+    with hilstar.load(path) as bench:
+        x, y, z = bench.seen(bench.stars, 0).vectors[-1]
+        q = from_radec_roll_deg(np.degrees(np.arctan2(y, x)), np.degrees(np.arcsin(z)), 0.0)
+        there = bench.frame(q, t_ns=0)
+        view = display_view(bench)
+        fault = view.prepare(fault_of({"kind": "star-gone", "name": "no Moon", "star": "Moon"}))
+        gone = bench.frame(q, t_ns=0, faults=Effects(view, (Now(1, fault, 0),)))
+    assert "Moon" in there.truth["name"] and "Moon" not in gone.truth["name"]
+    assert gone.linear.max() < 1e-3 * there.linear.max()

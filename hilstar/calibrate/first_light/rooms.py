@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -26,6 +26,10 @@ HOT_FILL = 0.5  # a pixel that is fuller in the dark is hot, and tells nothing
 LIGHT_STEP = 4.0  # by which the light is lowered while a pattern is too bright
 
 
+def nobody_watches(pattern: Pattern) -> None:
+    """For a session that nobody follows."""
+
+
 @dataclass(frozen=True, slots=True)
 class Looked:
     """An image of the tracker: its file, and its light above the dark frame (h, w), DN.
@@ -44,7 +48,8 @@ class Room:
     """Where a step works.
 
     `folder` takes its images, `session` its results. `kept` are the images of an attempt that was interrupted: they are not
-    taken again. `known` are figures of the steps before; `patches` is how many readings the response is worth.
+    taken again. `known` are figures of the steps before; `patches` is how many readings the response is worth. `watch` is
+    called with each pattern before it is shown.
     """
 
     file: BenchFile
@@ -54,6 +59,7 @@ class Room:
     known: dict[str, Figure]
     kept: Mapping[str, Path]
     patches: int
+    watch: Callable[[Pattern], object] = nobody_watches
 
     @property
     def resolution_px(self) -> tuple[int, int]:
@@ -93,12 +99,14 @@ class Room:
             return self.kept[pattern.name]
         make_directory(self.folder)
         stem = self.folder / pattern.name
+        self.watch(pattern)
         return self.eyes.look(self.file, pattern, stem, self.exposure_s if exposure_s is None else exposure_s)
 
     def take_or_key(self, pattern: Pattern, keys: Mapping[str, str]) -> Path | str:
         """The tracker's image of a pattern, or, by hand, the key that tells how it was seen: `keys` has what each means."""
         if isinstance(self.eyes, Hands) and pattern.name not in self.kept:
             stem = make_directory(self.folder) / pattern.name
+            self.watch(pattern)
             return self.eyes.look_or_key(self.file, pattern, stem, keys)
         return self.take(pattern)
 

@@ -20,6 +20,7 @@ import msgspec
 
 from hilstar import __version__
 from hilstar.bench.bench_file import BenchFile
+from hilstar.calibrate.first_light.patterns import Pattern
 from hilstar.calibrate.first_light.records import (
     KIND,
     Figure,
@@ -31,7 +32,7 @@ from hilstar.calibrate.first_light.records import (
     write_session,
 )
 from hilstar.calibrate.first_light.rewrite import rewrite
-from hilstar.calibrate.first_light.rooms import Room
+from hilstar.calibrate.first_light.rooms import Room, nobody_watches
 from hilstar.calibrate.first_light.sight.display import Stopped
 from hilstar.calibrate.first_light.sight.eyes import Eyes, NoImage, complete_images
 from hilstar.calibrate.first_light.steps import delay, lens, light, look, verify
@@ -117,12 +118,20 @@ NAMES = tuple(step.name for step in STEPS)
 
 
 class Session:
-    """A session in a directory, with so many readings (`patches`) for the response.
+    """A session in a directory, with so many readings (`patches`) for the response; `watch` sees each pattern.
 
     Raises InputError for a directory that is another bench's.
     """
 
-    def __init__(self, folder: Path, file: BenchFile, eyes: Eyes, patches: int) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        file: BenchFile,
+        eyes: Eyes,
+        patches: int,
+        watch: Callable[[Pattern], object] = nobody_watches,
+    ) -> None:
+        self._watch = watch
         self.folder, self.file, self.eyes, self.patches = folder, file, eyes, patches
         bench = str(file.path.resolve())
         found = read_session(folder)
@@ -226,7 +235,7 @@ class Session:
         known: dict[str, Figure] = {
             f"{name}.{key}": value for name, record in self.records.items() for key, value in record.figures.items()
         }
-        return Room(self.file, self.folder, folder, self.eyes, known, complete_images(folder), self.patches)
+        return Room(self.file, self.folder, folder, self.eyes, known, complete_images(folder), self.patches, self._watch)
 
     def _state(self, number: int, tables: tuple[str, ...] = ()) -> str:
         """The SHA-256 of what a step depends on: its tables but for what later steps write, the files they name, the eyes."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -10,13 +12,16 @@ import msgspec
 import typer
 
 from hilstar.cli.options import MAX_SEED, BenchFile, Json, check_files
+from hilstar.cli.show.paging import Console, ConsoleName, Control, Token, page_door
 from hilstar.console.terminal import print_json, say
 from hilstar.errors import InputError
 from hilstar.files import check_directory
 
 if TYPE_CHECKING:
     from hilstar.bench import bench_file as files
+    from hilstar.calibrate.first_light.patterns import Pattern
     from hilstar.calibrate.first_light.sight.eyes import Eyes
+    from hilstar.console.feed.door import Door
 
 PATCHES = 96
 
@@ -65,6 +70,10 @@ def first_light(
     ] = None,
     again: Annotated[list[str] | None, typer.Option(metavar="STEP", help="Do this step again; may be given often.")] = None,
     seed: Annotated[int, typer.Option(help="With --virtual: seed of the tracker's noise.", min=0, max=MAX_SEED)] = 0,
+    console: Console = None,
+    control: Control = False,
+    token: Token = None,
+    console_name: ConsoleName = None,
     as_json: Json = False,
 ) -> None:
     """Bring up a bench: mounting, focus, geometry, response, full scale, delay and verification, with a page at the end.
@@ -82,16 +91,17 @@ def first_light(
     check_directory("-o", output)
     file = read_bench_file(bench_file)
     check_files([virtual, dark], [], file)
-    eyes = _eyes(file, _Sources(grab, virtual, dark, diode, seed))
     by_hand = grab is None and virtual is None
     readings = (0 if by_hand else PATCHES) if patches is None else patches
-    try:
-        with alone_in(make_directory(output)):
-            session = Session(output, file, eyes, readings)
-            code = session.run(frozenset(again or []), say)
-            page = write_page(output, session.as_file(), output / BEFORE_FILE)
-    finally:
-        eyes.close()
+    with (
+        page_door(console, control, token, console_name) as door,
+        closing(_eyes(file, _Sources(grab, virtual, dark, diode, seed))) as eyes,
+        alone_in(make_directory(output)),
+        _shown(door, control, file) as (tell, watch),
+    ):
+        session = Session(output, file, eyes, readings, watch)
+        code = session.run(frozenset(again or []), tell)
+        page = write_page(output, session.as_file(), output / BEFORE_FILE)
     if as_json:
         print_json({**msgspec.to_builtins(session.as_file()), "page": str(page)})
     else:
@@ -100,6 +110,25 @@ def first_light(
         typer.echo(f"{'page':12} {page}")
     if code:
         raise typer.Exit(code)
+
+
+@contextmanager
+def _shown(
+    door: Door | None, control: bool, file: files.BenchFile
+) -> Iterator[tuple[Callable[[str], None], Callable[[Pattern], object]]]:
+    """Who is told of a session's lines and patterns: the terminal, and the page where there is one."""
+    if door is None:
+        yield say, lambda pattern: None
+        return
+    from hilstar.console.feed.session import session_page
+
+    with session_page(door, control, file) as feed:
+
+        def tell(line: str) -> None:
+            say(line)
+            feed.say(line)
+
+        yield tell, feed.show
 
 
 def _eyes(file: files.BenchFile, sources: _Sources) -> Eyes:

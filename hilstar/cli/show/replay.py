@@ -115,7 +115,7 @@ def replay(
         renderer, refresh_hz = bench.renderer.gl_renderer, bench.config.monitor.refresh_hz
         status = RunStatus(Source(f"replaying {log}", renderer, refresh_hz, play.frame_count), kept)
 
-        page = Told("replay", "log", str(log), timed=play.paced)
+        page = Told("replay", "log", str(log), "clock" if play.paced else "asked")
         parts = Parts(bench, notices, kept, lambda path: Ledger(path, bench, notices, split=split), screen, fault_desk(wrong))
         with on_terminal(status), followed(door, control, page, parts, status, record) as (sink, follower, desk):
             outlet = Outlet(screen, kept, notices, follower=follower, desk=desk, faults=wrong)

@@ -90,7 +90,7 @@ def serve(
         say_what_clips(bench)
         told = Source(f"{link.verb} {link.endpoint}", bench.renderer.gl_renderer, refresh_hz, min(limit.slots, limit.frames))
         status = RunStatus(told, kept)
-        page = Told("serve", file.config.attitude.source, link.endpoint, timed=not file.config.attitude.lockstep)
+        page = Told("serve", file.config.attitude.source, link.endpoint, "asked" if file.config.attitude.lockstep else "clock")
         parts = Parts(bench, notices, kept, lambda path: Ledger(path, bench, notices, split=split), screen, fault_desk(wrong))
         with on_terminal(status), followed(door, control, page, parts, status) as (sink, follower, desk):
             outlet = Outlet(screen, kept, notices, tracker_pictures(link, bench, wrong), follower, desk, wrong)

@@ -35,7 +35,7 @@ class Ring:
     def __init__(self, memory: memoryview, slots: int, slot_bytes: int) -> None:
         self._memory = memory
         self._slots, self._stride = slots, _SLOT.size + slot_bytes
-        self._slot_bytes = slot_bytes
+        self.slot_bytes = slot_bytes
         self._next = self.newest + 1
 
     @staticmethod
@@ -50,7 +50,7 @@ class Ring:
 
     def put(self, data: bytes) -> None:
         """Write a record; one that is too long is cut."""
-        data = data[: self._slot_bytes]
+        data = data[: self.slot_bytes]
         place = self.begin()
         self._memory[place : place + len(data)] = data
         self.end(len(data), zlib.crc32(data))
@@ -76,7 +76,7 @@ class Ring:
         """The record of that number; None where it is not whole, or has been overwritten."""
         place = self._place(number)
         begun, whole, length, crc = _SLOT.unpack_from(self._memory, place)
-        if not number or begun != number or whole != number or length > self._slot_bytes:
+        if not number or begun != number or whole != number or length > self.slot_bytes:
             return None
         data = bytes(self._memory[place + _SLOT.size : place + _SLOT.size + length])
         if _SLOT.unpack_from(self._memory, place) != (begun, whole, length, crc):

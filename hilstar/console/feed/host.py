@@ -14,18 +14,17 @@ import sys
 import threading
 import time
 from collections import deque
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Self
+from typing import Protocol, Self
 
 import msgspec
 
 from hilstar.console.feed.board import Board
 from hilstar.console.feed.messages import Answer, EventSeen, Order, RunSeen, Setup
-from hilstar.console.feed.orders import Orders
-from hilstar.console.feed.seen import Watched
-from hilstar.notices import Notice
+from hilstar.notices import Listener, Notice
 
 TICK_S = 0.1
 FIRST_WAIT_S, MAX_WAIT_S = 0.1, 5.0  # before the page's process is started again
@@ -35,6 +34,22 @@ MAX_ORDERS = 8  # at once
 MAX_ORDER_BYTES = 8_000
 OF_THE_RUN = {"NOTIFY_SOCKET", "WATCHDOG_PID", "WATCHDOG_USEC", "HILSTAR_TOKEN"}
 PAGE = (sys.executable, "-P", "-m", "hilstar.console.server")
+
+
+Do = Callable[[Order], Answer]  # on a thread of its own
+
+
+class Subject(Protocol):
+    """What the page is of: its state now, its events, and who is told of the page itself."""
+
+    def now(self) -> RunSeen:
+        """The state now."""
+
+    def listen(self, listener: Listener) -> None:
+        """Hand every further event to `listener`."""
+
+    def tell(self, kind: str, line: str) -> None:
+        """Tell of an event."""
 
 
 @dataclass(slots=True)
@@ -49,11 +64,11 @@ class _Page:
 class Host:
     """The page of a run, for as long as this is open."""
 
-    def __init__(self, setup: Setup, board: Board, listener: socket.socket, watched: Watched, orders: Orders) -> None:
-        self._board, self._listener, self._watched, self._orders = board, listener, watched, orders
+    def __init__(self, setup: Setup, board: Board, listener: socket.socket, watched: Subject, do: Do) -> None:
+        self._board, self._listener, self._watched, self._do = board, listener, watched, do
         self._setup_fd = _memory_of(msgspec.msgpack.encode(setup))
         self._events: deque[Notice] = deque(maxlen=1000)
-        watched.notices.listen(self._events.append)
+        watched.listen(self._events.append)
         self._stop = threading.Event()
         self._page: _Page | None = None
         self._start_s, self._wait_s = 0.0, FIRST_WAIT_S
@@ -134,7 +149,7 @@ class Host:
         self._put_off(now_s, f"the operator's page ended ({f'signal {-code}' if code < 0 else f'exit code {code}'})")
 
     def _put_off(self, now_s: float, what: str) -> None:
-        self._watched.notices.tell("console-lost", f"{what}; it is started again")
+        self._watched.tell("console-lost", f"{what}; it is started again")
         self._start_s, self._wait_s = now_s + self._wait_s, min(2 * self._wait_s, MAX_WAIT_S)
 
     def _listen(self, seconds: float) -> None:
@@ -153,7 +168,7 @@ class Host:
                 self._stop.wait(seconds)
 
     def _take(self, order: Order) -> None:
-        self._workers.submit(self._orders.do, order).add_done_callback(self._answer)
+        self._workers.submit(self._do, order).add_done_callback(self._answer)
 
     def _answer(self, done: Future[Answer]) -> None:
         page = self._page

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
-from typing import Any, NamedTuple, Self
+from typing import Any, Literal, NamedTuple, Self
 
 import msgspec
 
@@ -158,10 +158,14 @@ class Answer(msgspec.Struct, kw_only=True):
     line: str
 
 
+Pace = Literal["clock", "asked", "session"]
+
+
 class Setup(msgspec.Struct, kw_only=True):
     """What the page's process knows from the start; `hello` is what it tells every page first.
 
-    `timed` says that frames are due whether an attitude comes or not. A page without a `token` is for anyone who reaches it.
+    `pace` says how frames come: when they are due ("clock"), when a simulator asks ("asked"), as fast as they can ("asked"
+    too), or not at all, in a session of first light ("session"). A page without a `token` is for anyone who reaches it.
     """
 
     hello: dict[str, Any]
@@ -174,5 +178,5 @@ class Setup(msgspec.Struct, kw_only=True):
     control: bool
     picture_bytes: int
     refresh_hz: float
-    timed: bool
+    pace: Pace
     scene: bytes = b""  # a pickled `overlay.Scene`

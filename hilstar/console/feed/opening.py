@@ -16,7 +16,7 @@ from hilstar.console.feed.board import Board
 from hilstar.console.feed.door import Door
 from hilstar.console.feed.feed import Feed
 from hilstar.console.feed.host import Host
-from hilstar.console.feed.messages import Setup
+from hilstar.console.feed.messages import Pace, Setup
 from hilstar.console.feed.orders import Orders
 from hilstar.console.feed.seen import Watched
 from hilstar.console.feed.staging import scene_of
@@ -34,12 +34,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """What the page says of a run: the command, where attitudes come from, and whether frames are due by the clock."""
+    """What the page says of a run: the command, where attitudes come from, and how frames come."""
 
     command: str
     kind: str
     endpoint: str
-    timed: bool = True
+    pace: Pace = "clock"
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +63,7 @@ def opened_page(door: Door, control: bool, told: Told, parts: Parts) -> Iterator
     feed, desk = Feed(board), Desk()
     watched = Watched(feed, parts.notices, parts.ledger, parts.screen, parts.faults)
     orders = Orders(desk, watched, parts.make_ledger)
-    with Host(setup_of(door, control, told, parts, picture_bytes), board, door.socket, watched, orders):
+    with Host(setup_of(door, control, told, parts, picture_bytes), board, door.socket, watched, orders.do):
         yield feed, desk
 
 
@@ -93,6 +93,6 @@ def setup_of(door: Door, control: bool, told: Told, parts: Parts, picture_bytes:
         control=control,
         picture_bytes=picture_bytes,
         refresh_hz=monitor.refresh_hz,
-        timed=told.timed,
+        pace=told.pace,
         scene=pickle.dumps(scene_of(bench, aids_in_levels=parts.screen is None)),
     )

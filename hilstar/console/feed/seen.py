@@ -12,7 +12,7 @@ from hilstar.run.overrides import Overrides
 if TYPE_CHECKING:
     from hilstar.bench.faults.desk import FaultDesk
     from hilstar.console.feed.feed import Feed
-    from hilstar.notices import Notices
+    from hilstar.notices import Listener, Notices
     from hilstar.run.record.ledger_switch import LedgerSwitch
     from hilstar.run.screen.screen import Screen
     from hilstar.run.shown import Shown
@@ -34,6 +34,14 @@ class Watched:
     ledger: LedgerSwitch
     screen: Screen | None = None
     faults: FaultDesk | None = None
+
+    def listen(self, listener: Listener) -> None:
+        """Hand every further event of the run to `listener`."""
+        self.notices.listen(listener)
+
+    def tell(self, kind: str, line: str) -> None:
+        """Tell of an event of the run."""
+        self.notices.tell(kind, line)
 
     def now(self) -> RunSeen:
         """The run now."""

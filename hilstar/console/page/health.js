@@ -8,11 +8,12 @@ const SIGNS = { true: "\u2713", false: "!" };
 
 export class Health {
   constructor(link, onChange) {
-    Object.assign(this, { link, onChange, said: null, serverMs: NaN, saidAt: -Infinity, ok: null, lostUtc: null, bench: "" });
+    Object.assign(this, { link, onChange, said: null, serverMs: NaN, saidAt: -Infinity, ok: null, lostUtc: null, bench: "", session: false, missed: 0 });
     setInterval(() => this.check(), CHECK_MS);
   }
 
-  hear({ utc, health }) {
+  hear({ utc, health, counts }) {
+    this.missed = counts?.missed ?? 0;
     this.said = health;
     this.serverMs = Date.parse(utc);
     this.saidAt = performance.now();
@@ -33,7 +34,12 @@ export class Health {
       return { ok: false, headline: "No word from hilstar", reasons: `${why}. What is below is old.`, since: this.serverMs };
     }
     const { ok, since, reasons } = this.said;
-    return { ok, headline: ok ? "Sky is right" : "Sky is not right", reasons: reasons.join("; "), since: Date.parse(since) };
+    return { ok, headline: this.session ? (ok ? "First light goes on" : "A step has failed") : ok ? "Sky is right" : "Sky is not right", reasons: reasons.join("; "), since: Date.parse(since) };
+  }
+
+  get wellSaid() {
+    if (this.session) return "each step is told under Events";
+    return this.missed ? `attitude fresh; ${this.missed} frames missed since the start` : "attitude fresh, frames on time";
   }
 
   check() {
@@ -51,7 +57,7 @@ export class Health {
       this.onChange(ok);
     }
     write(byId("health-headline"), headline);
-    write(byId("health-reasons"), ok ? "attitude fresh, frames on time" : reasons);
+    write(byId("health-reasons"), ok ? this.wellSaid : reasons);
     write(byId("health-since"), Number.isFinite(since) && since !== null ? `since ${clock(since)} UTC` : "");
     write(byId("health-for"), Number.isFinite(since) && since !== null ? duration((this.nowMs - since) / 1000) : "");
     const title = `${ok ? "\u2713" : "\u2717 " + headline + ":"} ${this.bench || "hilstar"}`;

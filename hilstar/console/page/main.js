@@ -62,6 +62,7 @@ const HEARD = {
     picture.setScreen(said.resolution_px, said.white_level);
     controls.setUp(said);
     health.bench = said.bench;
+    health.session = Boolean(said.session);
     write(byId("bench"), said.bench);
     byId("bench").title = said.bench;
     write(byId("run-head"), `${said.command}  ${said.refresh_hz ? `${said.refresh_hz} Hz  ` : ""}${said.bits} bit`);
@@ -187,7 +188,7 @@ const FRAME_STATES = [
 ];
 
 function tellFrame({ frame, operator }) {
-  const [, words, shade] = FRAME_STATES.find(([key]) => frame[key]) || ["", "fresh", "ok"];
+  const [, words, shade] = FRAME_STATES.find(([key]) => frame[key]) || ["", hello?.session ? "first light" : "fresh", "ok"];
   const chip = byId("attitude-state");
   write(chip, words);
   chip.dataset.state = shade;

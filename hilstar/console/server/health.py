@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from hilstar.console.feed.messages import RunSeen
+from hilstar.console.feed.messages import Pace, RunSeen
 from hilstar.units import NS_PER_S
 
 SILENT_NS = 6 * NS_PER_S // 10  # the run is seen ten times a second
@@ -23,18 +23,16 @@ class Lately:
     missed_share: float = 0.0
 
 
-def reasons(seen: RunSeen | None, now_ns: int, lately: Lately, refresh_hz: float, timed: bool) -> list[str]:
-    """Why the sky is not right; [] where it is. `timed` frames are due whether an attitude comes or not."""
+def reasons(seen: RunSeen | None, now_ns: int, lately: Lately, refresh_hz: float, pace: Pace) -> list[str]:
+    """Why the sky is not right; [] where it is. See `Setup.pace`."""
     if seen is None:
         return ["the run has not begun"]
     if now_ns - seen.host_ns > SILENT_NS:
         return [f"the run's process has been silent for {_s(now_ns - seen.host_ns)}"]
-    return [
-        *seen.failed,
-        *_of_display(seen, now_ns, refresh_hz),
-        *_of_attitude(seen, now_ns, lately, timed),
-        *_of_rest(seen, lately),
-    ]
+    if pace == "session":
+        return seen.failed
+    of_display, of_attitude = _of_display(seen, now_ns, refresh_hz), _of_attitude(seen, now_ns, lately, pace)
+    return [*of_display, *of_attitude, *_of_rest(seen, lately)]
 
 
 def _of_display(seen: RunSeen, now_ns: int, refresh_hz: float) -> Iterator[str]:
@@ -47,7 +45,7 @@ def _of_display(seen: RunSeen, now_ns: int, refresh_hz: float) -> Iterator[str]:
         yield f"the frame loop has hung for {_s(now_ns - seen.alive_ns)}"
 
 
-def _of_attitude(seen: RunSeen, now_ns: int, lately: Lately, timed: bool) -> Iterator[str]:
+def _of_attitude(seen: RunSeen, now_ns: int, lately: Lately, pace: Pace) -> Iterator[str]:
     if not seen.alive_ns:
         return
     if seen.missing:
@@ -55,7 +53,7 @@ def _of_attitude(seen: RunSeen, now_ns: int, lately: Lately, timed: bool) -> Ite
     elif seen.stale:
         age = "" if seen.attitude is None else f": {_s(seen.attitude.age_ns)} old"
         yield f"the attitude is stale{age}"
-    elif not timed and lately.swap_ns and now_ns - lately.swap_ns > UNASKED_NS:
+    elif pace == "asked" and lately.swap_ns and now_ns - lately.swap_ns > UNASKED_NS:
         yield f"the simulator has asked for no frame for {_s(now_ns - lately.swap_ns)}"
 
 

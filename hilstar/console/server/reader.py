@@ -50,7 +50,7 @@ class Reader:
         if now_ns - self._pacing_ns > PACING_EACH_S * NS_PER_S:
             self._pacing_ns, self.pacing = now_ns, self._pacing_now(now_ns)
         lately = Lately(0 if self._last is None else self._last.swap_ns, self._missed_share())
-        self.health.update(reasons(self.seen, now_ns, lately, self._setup.refresh_hz, self._setup.timed), unix_s)
+        self.health.update(reasons(self.seen, now_ns, lately, self._setup.refresh_hz, self._setup.pace), unix_s)
         return self._new_events()
 
     def _new_events(self) -> list[dict[str, Any]]:

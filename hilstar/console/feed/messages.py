@@ -164,8 +164,8 @@ Pace = Literal["clock", "asked", "session"]
 class Setup(msgspec.Struct, kw_only=True):
     """What the page's process knows from the start; `hello` is what it tells every page first.
 
-    `pace` says how frames come: when they are due ("clock"), when a simulator asks ("asked"), as fast as they can ("asked"
-    too), or not at all, in a session of first light ("session"). A page without a `token` is for anyone who reaches it.
+    `pace` says how frames come: when they are due ("clock"), when a simulator asks or as fast as they can
+    ("asked"), or not at all, in a session of first light ("session"). A page without a `token` is for anyone who reaches it.
     """
 
     hello: dict[str, Any]

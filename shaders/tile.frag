@@ -1,12 +1,12 @@
 #version 330 core
-// Light that is linear over a tile, and covers what is behind it.
+// Light and cover that are linear over a tile.
 
 uniform float covers;
 
-in float rate_here;
+in vec2 here;
 
 out vec4 light;
 
 void main() {
-    light = vec4(rate_here, 0.0, 0.0, covers);
+    light = vec4(here.x, 0.0, 0.0, covers * here.y);
 }

@@ -1,14 +1,14 @@
 #version 330 core
-// A tile of the image, in pixels' edges; `rate` is the light at its corner, for tiles in which it is linear.
+// A tile of the image, in pixels' edges; `given` is light and cover at its corner, for tiles in which they are linear.
 
 uniform vec2 size_px;
 
 in vec2 place_px;
-in float rate;
+in vec2 given;
 
-out float rate_here;
+out vec2 here;
 
 void main() {
     gl_Position = vec4(2.0 * place_px / size_px - 1.0, 0.0, 1.0);
-    rate_here = rate;
+    here = given;
 }

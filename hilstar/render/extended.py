@@ -99,8 +99,8 @@ class ExtendedLayer:
             return
         program["size_px"] = self._resolution_px
         buffer = self._ctx.buffer(corners)
-        layout = "2f 1f" if "rate" in program else "2f 4x"
-        names = ("place_px", "rate") if "rate" in program else ("place_px",)
+        layout = "2f 2f" if "given" in program else "2f 8x"
+        names = ("place_px", "given") if "given" in program else ("place_px",)
         triangles = self._ctx.vertex_array(program, [(buffer, layout, *names)])
         triangles.render(moderngl.TRIANGLES)
         triangles.release()

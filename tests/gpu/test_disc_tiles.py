@@ -12,7 +12,7 @@ from hilstar.render.renderer import Renderer, Target
 from hilstar.scene.camera import Camera
 from hilstar.scene.extended import DiscLight, Shear
 from hilstar.scene.lens import Lens
-from hilstar.scene.tiles import LEAST_PX, SMOOTH, disc_tiles
+from hilstar.scene.tiles import AIR_SMOOTH, LEAST_PX, SMOOTH, disc_tiles
 from hilstar.sky.bodies.disc import Disc
 from hilstar.sky.bodies.earth import EQUATOR_KM, earth_disc
 from hilstar.sky.bodies.magnitudes import KM_PER_AU
@@ -21,9 +21,8 @@ from tests.support.stars import sprites_at
 SIZE, SIGMA = (300, 260), (0.85, 0.85)
 MIDDLE_PX = (149.5, 129.5)
 LENS = Lens(radial=(0.2, 0.05, 0.0), tangential=(1e-3, -2e-3))
-# Straight lines in place of the face's light: SMOOTH at most by itself, and four times that across a terminator; and the
-# rounding of float32 where rays are taken in it (1e-4 near a limb).
-TILE_LIMIT = 4 * SMOOTH
+# Straight lines in place of the air's light, and of the face's, which across a terminator are off by four times SMOOTH.
+TILE_LIMIT = max(AIR_SMOOTH, 4 * SMOOTH)
 assert SIZE[0] * SIZE[1] > LEAST_PX
 
 

@@ -26,7 +26,7 @@ SOLAR_LIMB = (0.30, 0.93, -0.23)
 # Of the Moon by phase, degrees: McEwen 1996, Lunar Planet. Sci. 27, 841; within 0 and 1 beyond where it was fitted.
 LUNAR_SHARE = (1.0, -0.019, 2.42e-4, -1.46e-6)
 QUADRATURE = 40  # Gauss-Legendre nodes along each axis of the lit face: 1e-5 of the flux, tests/unit/sky/bodies/test_disc.py
-AIR_TOP = 10.0  # scale heights over the limb: beyond, the Earth's air is 3e-4 deep along the ray
+AIR_TOP = 20.0  # scale heights over the limb: beyond, the Earth's air is 1e-8 deep along the ray, which no code shows
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,6 +153,20 @@ class Disc:
         mu0 = np.maximum(0.0, up @ self.sun_sphere / np.linalg.norm(up @ self.to_sphere, axis=1))
         light[beside] = self.normal_e_per_s_sr * mu0 * covered[beside] / -np.expm1(-self.slant_depth)
         return light, covered
+
+    def air_light(self, directions: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Electrons per second and steradian of the air beside the disc in ICRS directions (n, 3), and the share that it hides.
+
+        It is as bright as ground that a ray just touches on that side, by the share of light that it stops.
+        """
+        seen = directions @ self.to_sphere.T
+        side = seen[:, :2] / np.hypot(seen[:, 0], seen[:, 1])[:, None]
+        sine = 1 / self.distance_radii
+        up = np.column_stack((side * np.sqrt(1 - sine**2), np.full(len(side), -sine)))
+        mu0 = np.maximum(0.0, up @ self.sun_sphere / np.linalg.norm(up @ self.to_sphere, axis=1))
+        height = np.maximum(self._impact(seen) - 1, 0.0) / (self.air_radii or 1.0)
+        hidden = -np.expm1(-self.slant_depth * np.exp(-height))
+        return self.normal_e_per_s_sr * mu0 * hidden / -np.expm1(-self.slant_depth), hidden
 
     def _shaded(self, place: FloatArray, seen: FloatArray) -> FloatArray:
         """The law at places of the sphere (n, 3), along `seen` (n, 3): unit rays, but in the sphere's axes."""

@@ -136,5 +136,10 @@ def _edges(image: FloatArray, radius_px: float, phase_deg: float) -> FloatArray:
     x_px = half + MIDDLE_PX[0] + way * np.cos(angle)[:, None]
     y_px = half + MIDDLE_PX[1] + way * np.sin(angle)[:, None]
     profile = map_coordinates(image, [y_px, x_px], order=3, mode="nearest")
-    below = profile < profile[:, :1] / 2
-    return np.asarray(np.where(below.any(axis=1), steps[np.argmax(below, axis=1)], np.nan))
+    level = profile[:, :1] / 2
+    below = profile < level
+    first = np.maximum(np.argmax(below, axis=1), 1)
+    rows = np.arange(PLACES)
+    high, low = profile[rows, first - 1], profile[rows, first]
+    place = steps[first - 1] + (steps[1] - steps[0]) * (high - level[:, 0]) / (high - low)
+    return np.asarray(np.where(below.any(axis=1), place, np.nan))

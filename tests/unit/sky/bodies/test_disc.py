@@ -70,8 +70,12 @@ def test_air_dims_what_is_behind_it_as_traced_rays_say(rng):
     one = disc(60.0, 1.1, polar=6356.75 / 6378.14, air=earth)
     body = Body(1.1 * one.direction * 6378.0, 6378.0, 6378.0 * one.polar_km, one.pole, one.sun, lambert, 1.0, (8.0, 0.097))
     rays, _ = rays_about(one, rng, 20_000)
-    _, through = traced(body, rays)
+    light, through = traced(body, rays)
     found = one.transmission(rays)
+    beside = (through > 0) & (found > 0)
+    shining, hidden = one.air_light(rays[beside])
+    assert hidden == pytest.approx(1 - found[beside])
+    assert np.abs(shining - light[beside]).max() < AIR_LIMIT and shining.max() > 0.3
     assert np.abs(found - through)[(through > 0) & (found > 0)].max() < AIR_LIMIT
     assert np.count_nonzero((found > 0.05) & (found < 0.9)) > 20  # the shell is among the rays
 

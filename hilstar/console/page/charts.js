@@ -271,7 +271,7 @@ export class Chart {
   }
 
   tellLegend() {
-    const rows = [...(this.series.length > 1 ? this.series : []), ...this.marks];
+    const rows = [...(this.series.length > 1 ? this.series : []), ...this.marks.filter((mark) => !mark.flag)];
     if (this.legend.childElementCount === rows.length) return;
     this.legend.replaceChildren(
       ...rows.map(({ name, ink }) => {

@@ -16,6 +16,7 @@ const INK = { truth: "#63d2a1", name: "#c9d6ee", grid: "rgba(110, 150, 225, 0.6)
 const LABELS = 60; // the brightest in view; more would hide the stars
 const FAINTEST_RING_MAG = 8;
 const KEPT_TRUTHS = 12;
+const VALUES_FROM = 22; // CSS pixels per monitor pixel from which codes are written (picture.js)
 
 export class Overlays {
   constructor(canvas, view, onChange) {
@@ -189,9 +190,11 @@ export class Overlays {
       if (!text) continue;
       this.context.font = `${12 * unit}px system-ui, sans-serif`;
       const wide = this.context.measureText(text).width;
-      const left = u + gap + wide > this.canvas.width ? u - gap - wide : u + gap;
-      if (!this.place(text, left, v, 12)) continue;
-      this.write(text, left, v, star[5] && this.on.clipped ? "#ff9a9a" : INK.name);
+      const close = view.scale >= VALUES_FROM * unit; // beside the star it would hide codes
+      const beside = u + gap + wide > this.canvas.width ? u - gap - wide : u + gap;
+      const [left, top] = close ? [u - wide / 2, v - gap - 8 * unit] : [beside, v];
+      if (!this.place(text, left, top, 12)) continue;
+      this.write(text, left, top, star[5] && this.on.clipped ? "#ff9a9a" : INK.name);
       written += 1;
     }
   }

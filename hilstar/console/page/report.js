@@ -17,7 +17,7 @@ const FAR_S = 1; // from a moment to the nearest attitude
 
 // Id, title, unit, digits, its curves as [key of the run's spans, words, colour], and its marks, which may be lasting.
 const CHARTS = [
-  ["chart-age", "Age of the attitude at light", "ms", 1, [["age", "age", "one"]], [["stale", "stale frames", "warn", true]]],
+  ["chart-age", "Age at light", "ms", 1, [["age", "age", "one"]], [["stale", "stale frames", "warn", true]]],
   ["chart-pacing", "Pacing", "ms", 2, [["interval", "interval", "one"], ["draw", "drawing to swap", "two"]], [["missed", "missed", "bad"]]],
   ["chart-packets", "Packets", "Hz", 1, [], []],
   ["chart-late", "Swap later than predicted", "ms", 2, [["late", "late", "one"]], []],
@@ -88,7 +88,7 @@ function makeCharts() {
     ...CHARTS,
     ["chart-motion", "Motion about the mean", motion?.about_mean.unit],
     ["chart-steady", "Beside a steady turn", motion?.beside_steady.unit],
-    ["chart-memory", "Memory of the process", "MB"],
+    ["chart-memory", "Memory", "MB"],
     ["chart-cpu", "Processor time", "%"],
   ];
   const all = curves();
@@ -108,7 +108,7 @@ function makeCharts() {
 // What somebody did to the run: operator's controls, marks and faults.
 function acts() {
   const times = run.events.filter(({ kind }) => ACTS.test(kind)).map((one) => one.t_s);
-  return times.length ? [{ name: "operator\u2019s acts, marks and faults", ink: "accent", flag: true, t: times, n: times.map(() => 1) }] : [];
+  return times.length ? [{ name: "acts", ink: "accent", flag: true, t: times, n: times.map(() => 1) }] : [];
 }
 
 function drawCharts() {
@@ -268,6 +268,7 @@ function writeFacts() {
 
 function writeEvents() {
   for (const { t_s: at, utc, kind, line } of run.events) addEvent({ utc: utc || momentText(at), kind, line }, () => moveTo(at, true), run.events.length);
+  byId("range-acts").hidden = !acts().length;
   const left = run.events_total - run.events.length;
   write(byId("events-count"), left > 0 ? `${run.events_total}, the first and last ${run.events.length}` : `${run.events_total}`);
   if (!run.events.length) byId("events").append(make("li", "none", "none"));

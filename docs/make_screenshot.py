@@ -1,0 +1,84 @@
+"""The pictures of docs/console.md: the page of a run, single pixels of it, and the run's report, in Debian's chromium.
+
+`python docs/make_screenshot.py` writes docs/console.png, docs/pixels.png and docs/report.png. The run goes by the
+clock, so that no two are alike.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from PIL import Image
+
+DOCS = Path(__file__).resolve().parent
+sys.path.insert(0, str(DOCS.parent))
+
+from tests.support.browser import Browser, browser  # noqa: E402 - the checkout's own tests
+from tests.support.senders import free_port  # noqa: E402
+
+SIZE_PX = (1366, 900)
+COLOURS = 256  # of the palette
+CHART_S = 22.0  # until the charts have something to show
+HILSTAR = [sys.executable, "-m", "hilstar"]
+SIRIUS = "101.287,-16.716,25"
+
+
+def keep(data: bytes, name: str) -> None:
+    """A PNG as a small one of the documentation."""
+    Image.open(io.BytesIO(data)).convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE).save(DOCS / name, optimize=True)
+
+
+def watch(page: Browser, folder: Path) -> None:
+    """A run about Sirius, which clips, with a cable that spoils a packet in fifty."""
+    port = free_port()
+    text = (DOCS.parent / "configs" / "demo.toml").read_text().replace("tcp://127.0.0.1:*", f"tcp://127.0.0.1:{port}")
+    (folder / "bench.toml").write_text(text.replace('quantisation = "exact"', 'quantisation = "round"'))
+    serve = ["serve", "bench.toml", "--headless", "--console", "127.0.0.1:0", "--control", "--ledger", "run.mcap"]
+    send = ["send", "--spin", "0,0,1,0.3", "--radec", SIRIUS, "--to", f"tcp://127.0.0.1:{port}", "--connect"]
+    with (
+        subprocess.Popen([*HILSTAR, *serve], cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as run,
+        subprocess.Popen([*HILSTAR, *send, "--rate", "100", "--corrupt", "0.02"], stdout=subprocess.DEVNULL) as sender,
+    ):
+        assert run.stderr is not None
+        page.get(next(found[1] for line in run.stderr if (found := re.search(r"page is at (http://\S+)", line))))
+        page.until("document.getElementById('picture').dataset.frame")
+        time.sleep(CHART_S)
+        page.find("#mark-text").send_keys("baffle on")
+        page.press("#control-mark")
+        page.run("scrollTo(0, 0)")
+        page.until("document.body.dataset.ok === 'true'")
+        keep(page.get_screenshot_as_png(), "console.png")
+        page.find("#zoom-pixels").click()
+        page.run("scrollTo(0, 0)")
+        time.sleep(1.0)
+        keep(page.find("#stage").screenshot_as_png, "pixels.png")
+        sender.terminate()
+        page.until("document.body.dataset.ok === 'false'")
+        time.sleep(1.0)
+        run.terminate()
+
+
+def main() -> None:
+    """Watch a run, and look at its report."""
+    with tempfile.TemporaryDirectory() as scratch, browser() as page:
+        page.size(*SIZE_PX)
+        page.prefer(color_scheme="dark")
+        watch(page, Path(scratch))
+        subprocess.run([*HILSTAR, "report", "run.mcap", "-o", "report"], cwd=scratch, check=True, stdout=subprocess.DEVNULL)
+        page.size(1366, 1100)
+        page.prefer(color_scheme="light")
+        page.get((Path(scratch) / "report" / "report.html").as_uri())
+        page.until("document.body.dataset.ready === 'true'")
+        page.press("#chart-age canvas")
+        time.sleep(1.0)
+        keep(page.find("#charts").screenshot_as_png, "report.png")
+
+
+if __name__ == "__main__":
+    main()

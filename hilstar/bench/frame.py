@@ -18,7 +18,7 @@ from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.config import BenchConfig, Vector
 from hilstar.bench.discs import DiscPainter, When, disc_stars
 from hilstar.bench.effort import Effort
-from hilstar.bench.satellites import FRAME_SPRITES, Shot, with_satellites
+from hilstar.bench.satellites import FRAME_SPRITES, Shot, satellite_discs, with_satellites
 from hilstar.bench.truth import designations, sprite_truth, truth_table
 from hilstar.errors import InputError
 from hilstar.monitor.calibration import Calibration
@@ -221,7 +221,11 @@ class Bench:
 
     def discs(self, q_icrs_to_cam: FloatArray, when: When) -> list[Disc]:
         """The bodies on the image at an attitude at rest that are drawn as discs, nearest first."""
-        return [] if self._painter is None else self._painter.on_image(q_icrs_to_cam, when)
+        bodies = [] if self._painter is None else self._painter.on_image(q_icrs_to_cam, when)
+        if self.moving is None or self.moving.satellites is None or not self.moving.satellites.sized:
+            return bodies
+        stars = self.seen(self.stars, when.t_ns, when.velocity_km_s, when.place_km)
+        return [*satellite_discs(self.moving, stars, self.camera, q_icrs_to_cam, when), *bodies]
 
     def draw_sprites(self, sprites: Sprites | None, frame: int = 0) -> Drawn:
         """Draw the levels of a frame's sprites."""
@@ -250,7 +254,8 @@ class Bench:
     def _with_satellites(self, sprites: Sprites, stars: Stars, shot: Shot, faintest_e_per_s: float) -> Sprites:
         if self.moving is None or self.moving.satellites is None:
             return sprites
-        shot = replace(shot, turn=slowed(shot.turn, self.scan, self.camera)[0])
+        white_e_per_s = self.flux_at_white_e_per_s * self.darkest
+        shot = replace(shot, turn=slowed(shot.turn, self.scan, self.camera)[0], white_e_per_s=white_e_per_s)
         brush = Brush(self.renderer.footprint_px, self._sigma_px, FRAME_SPRITES)
         return with_satellites(sprites, stars, self.moving, shot, brush, faintest_e_per_s)
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,16 +11,19 @@ import numpy as np
 
 from hilstar.arrays import FloatArray
 from hilstar.bench.config import BenchConfig
+from hilstar.bench.discs import POINT_PX, When
 from hilstar.reading import read_text
 from hilstar.rotation import to_matrix
 from hilstar.scene.camera import Camera
 from hilstar.scene.frame_motion import Scan, Turn
 from hilstar.scene.sprites import Sprites
+from hilstar.scene.trail_discs import disc_of, disc_trail, hidden, places_of, wide
 from hilstar.scene.trails import EVERY, Brush, Lit, View, trails, with_trails
 from hilstar.sky.electrons import Optics, Photometry
 from hilstar.sky.stars import Stars
 
 if TYPE_CHECKING:
+    from hilstar.sky.bodies.disc import Disc
     from hilstar.sky.bodies.moving import MovingSky
     from hilstar.sky.bodies.orbit import Orbit
     from hilstar.sky.bodies.satellites.passes import Pass, Satellites
@@ -66,7 +70,8 @@ def bench_satellites(
 class Shot:
     """A camera's light: rows as `scan` has them, `begin_s` after the moment of `turn`.
 
-    The sky is that of `t_ns` for an observer with that velocity and place (see `MovingSky.seen`).
+    The sky is that of `t_ns` for an observer with that velocity and place (see `MovingSky.seen`). A pixel shows up to
+    `white_e_per_s`.
     """
 
     camera: Camera
@@ -76,6 +81,7 @@ class Shot:
     velocity_km_s: FloatArray | None = None
     place_km: FloatArray | None = None
     begin_s: float = 0.0
+    white_e_per_s: float = math.inf
 
     @property
     def longest_s(self) -> float:
@@ -106,11 +112,52 @@ def with_satellites(
     if not len(close):
         return sprites
     seen = seen.only(close)
+    if sky.satellites.sized:
+        broad = wide(seen, camera.scales_px_rad()[1], POINT_PX)
+        if broad.any():
+            sprites = _with_discs(sprites, stars, seen.only(np.flatnonzero(broad)), (view, shot, brush), sky.satellites)
+            seen = seen.only(np.flatnonzero(~broad))
     found = trails(seen, view, _lit(seen, view, shot), brush, faintest_e_per_s)
     if not len(found.index):
         return sprites
     sky.satellites.write(stars, found.index, found.middle, found.electrons_per_s)
     return with_trails(sprites, found, len(stars) - len(stars.bodies))
+
+
+def _with_discs(sprites: Sprites, stars: Stars, seen: Pass, how: tuple[View, Shot, Brush], satellites: Satellites) -> Sprites:
+    """The sprites of an image with satellites of a pass as discs, the farthest first, and without what they hide."""
+    view, shot, brush = how
+    lit, drawn = _lit(seen, view, shot), []
+    for k in np.argsort(-np.linalg.norm(seen.seen_km[0], axis=1)):
+        own = Lit(lit.begin_s[[k]], lit.length_s)
+        found = disc_trail(seen.only(np.array([k])), satellites.names[seen.index[k]], view, own, brush)
+        if found is not None:
+            drawn.append(found)
+            sprites = hidden(sprites, stars.directions(sprites.star), found)
+    satellites.write(stars, *places_of(drawn))
+    over = tuple(one.along[0].name for one in drawn if one.brightest_e_per_s > shot.white_e_per_s)
+    return replace(
+        sprites,
+        extended=(*sprites.extended, *(light for one in drawn for light in one.lights)),
+        discs=(*sprites.discs, *(one.along[0].name for one in drawn)),
+        over_white=(*sprites.over_white, *over),
+    )
+
+
+def satellite_discs(sky: MovingSky, stars: Stars, camera: Camera, q_icrs_to_cam: FloatArray, when: When) -> list[Disc]:
+    """The satellites on a camera's image at rest that are discs; `stars` are those of the sky as seen at that moment."""
+    if sky.satellites is None:
+        return []
+    from hilstar.sky.bodies.satellites.passes import Cone
+
+    icrs_to_image = camera.cam_to_image @ to_matrix(q_icrs_to_cam)
+    cone = Cone(icrs_to_image[2], camera.field_radius_rad(0.0), 0.0)
+    seen = sky.passing(cone, when.t_ns, when.velocity_km_s, when.place_km)
+    if seen is None:
+        return []
+    names = sky.satellites.names
+    broad = np.flatnonzero(wide(seen, camera.scales_px_rad()[1], POINT_PX))
+    return [disc_of(seen.only(np.array([k])), names[seen.index[k]], 0.0, stars.velocity_km_s) for k in broad.tolist()]
 
 
 def _lit(seen: Pass, view: View, shot: Shot) -> Lit:

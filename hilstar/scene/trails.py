@@ -89,7 +89,7 @@ class Trails:
 
 def trails(seen: Pass, view: View, lit: Lit, brush: Brush, faintest_e_per_s: float = 0.0) -> Trails:
     """The satellites of a pass along their paths; one whose mean rate is fainter than `faintest_e_per_s` is left out."""
-    wanted, (begin, end) = _counts(seen, view, lit, brush)
+    wanted, (begin, end) = sprite_counts(seen, view, lit, brush)
     counts = _within(wanted, brush.most)
     path = np.repeat(np.arange(len(seen)), counts)
     order = np.arange(len(path)) - np.repeat(np.cumsum(counts) - counts, counts)
@@ -115,7 +115,7 @@ def _within(wanted: IntArray, most: int) -> IntArray:
     return wanted if total <= most else np.minimum(wanted, np.maximum(1, (wanted * (most / total)).astype(np.intp)))
 
 
-def _counts(seen: Pass, view: View, lit: Lit, brush: Brush) -> tuple[IntArray, tuple[FloatArray, FloatArray]]:
+def sprite_counts(seen: Pass, view: View, lit: Lit, brush: Brush) -> tuple[IntArray, tuple[FloatArray, FloatArray]]:
     """How many sprites each path should have (0: it misses the image), and its part on the image."""
     at = np.linspace(0.0, 1.0, SAMPLES)[:, None]
     which = np.tile(np.arange(len(seen)), SAMPLES)

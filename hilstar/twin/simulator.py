@@ -178,7 +178,8 @@ class Simulator:
     ) -> Sprites:
         scan, turn = Scan(hold_s=motion.exposure_s), Turn(motion.q_icrs_to_cam, motion.rate_cam_rad_s)
         shot = Shot(self.camera, scan, turn, motion.t_ns, velocity_km_s, place_km)
-        shot = replace(shot, begin_s=-motion.exposure_s / 2)
+        white_e_per_s = full_e(self.config.tracker.detector) / (motion.exposure_s or 1.0)
+        shot = replace(shot, begin_s=-motion.exposure_s / 2, white_e_per_s=white_e_per_s)
         brush = Brush(self.renderer.footprint_px, self.config.tracker.psf_sigma_px, EXPOSURE_SPRITES)
         return with_satellites(sprites, stars, self.moving, shot, brush)
 

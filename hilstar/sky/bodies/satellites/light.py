@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import ndtr
 
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.units import flux_ratio
@@ -67,6 +66,8 @@ class Brightness:
         return np.asarray(1 + depth * np.cos(2 * np.pi * middle) * np.sinc((end_s - begin_s) * per_s))
 
     def _flashed(self, which: IntArray, begin_s: FloatArray, end_s: FloatArray) -> FloatArray:
+        from scipy.special import ndtr  # 0.1 s, which only flashes need
+
         period_s, sigma_s = self.period_s[which], self.flash_s[which] / FWHM_SIGMAS
         # The light of all flashes up to each end, in flashes: whole periods, and those near that have not ended
         until = []

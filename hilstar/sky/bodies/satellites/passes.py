@@ -107,6 +107,10 @@ class Pass:
         seen = _at(self.seen_km[:, which], seconds[:, None])
         return aberrate(seen / np.sqrt(np.einsum("ij,ij->i", seen, seen))[:, None], velocity)
 
+    def vectors_km(self, seconds: FloatArray) -> FloatArray:
+        """From the observer to where each (n, 3) sent what arrives then, each at its own of `seconds` (n,)."""
+        return _at(self.seen_km, seconds[:, None])
+
     def speeds_rad_s(self) -> FloatArray:
         """How fast each is at its nearest in view (n,): its speed over its distance."""
         squares = (np.einsum("ij,ij->i", part, part) for part in self.seen_km[:2])
@@ -153,6 +157,7 @@ class Satellites:
         self._lost_told = self._own_told = False
         self._lost = 0
         self.listed = 0  # in the table of magnitudes
+        self.sized = bool(brightness.size_m.any())
 
     def __len__(self) -> int:
         return len(self.names)

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 MAX_LIST_BYTES, MAX_TABLE_BYTES = 20_000_000, 5_000_000  # 120 000 sets: several times as many as there are in orbit
 # Of all satellites in a frame and in an exposure; a frame's cost as much as 60 stars' paths of 16 px
-FRAME_SPRITES, EXPOSURE_SPRITES = 1000, 200_000
+FRAME_SPRITES, EXPOSURE_SPRITES, EXPOSURE_POSES = 1000, 200_000, 500
 ROW_ROUNDS = 2  # as for stars: see `scene.frame_motion`
 
 

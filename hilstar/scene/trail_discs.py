@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -13,13 +14,13 @@ from hilstar.scene import discs
 from hilstar.scene.discs import Pose, disc_lights
 from hilstar.scene.extended import DiscLight, ExtendedLight, LightMap
 from hilstar.scene.sprites import Sprites
-from hilstar.scene.trails import Brush, Lit, View, sprite_counts
+from hilstar.scene.trails import SPACING_SIGMA, Brush, Lit, View, sprite_counts
 from hilstar.sky.bodies.disc import Disc
 
 if TYPE_CHECKING:
     from hilstar.sky.bodies.satellites.passes import Pass
 
-MAX_POSES = 33  # of one satellite in an image
+STEPS_A_RADIUS = 4.0  # of a disc's places along its path: an edge of it is then uneven by 1 % of the radius
 AT_REST = np.array([1.0, 0.0, 0.0, 0.0])
 NORTH = np.array([0.0, 0.0, 1.0])
 M_PER_KM = 1000.0
@@ -67,7 +68,9 @@ def disc_of(seen: Pass, name: str, second: float, velocity_km_s: FloatArray | No
 def disc_trail(seen: Pass, name: str, view: View, lit: Lit, brush: Brush) -> DiscTrail | None:
     """The only satellite of a pass along its path; None where it misses the image or has no light."""
     counts, (begin, end) = sprite_counts(seen, view, lit, brush)
-    count = min(int(counts[0]), MAX_POSES)
+    radius_sigma = disc_of(seen, name, 0.0, None).radius_rad * view.camera.focal_length_px / min(brush.sigma_px)
+    coarser = max(1.0, radius_sigma / (STEPS_A_RADIUS * SPACING_SIGMA))
+    count = min(math.ceil(int(counts[0]) / coarser), brush.poses)
     if not count:
         return None
     edges_s = lit.begin_s[0] + np.linspace(begin[0], end[0], count + 1) * lit.length_s

@@ -57,11 +57,15 @@ class View:
 
 @dataclass(frozen=True, slots=True)
 class Brush:
-    """What a sprite is: its side and sigma; and how many all satellites get at most, beyond which they are farther apart."""
+    """What a sprite is: its side and sigma; and how many all satellites get at most, beyond which they are farther apart.
+
+    One that is a disc is drawn at up to `poses` places.
+    """
 
     footprint_px: int
     sigma_px: tuple[float, float]
     most: int
+    poses: int = 33
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,7 +19,7 @@ from hilstar.bench.discs import DiscPainter, When, disc_stars
 from hilstar.bench.faults.scenario import Scenario
 from hilstar.bench.faults.view import FaultView
 from hilstar.bench.faults.views import tracker_view
-from hilstar.bench.satellites import EXPOSURE_SPRITES, Shot, with_satellites
+from hilstar.bench.satellites import EXPOSURE_POSES, EXPOSURE_SPRITES, Shot, with_satellites
 from hilstar.bench.truth import truth_table
 from hilstar.errors import InputError
 from hilstar.render.renderer import Context, Renderer, Target
@@ -180,7 +180,7 @@ class Simulator:
         shot = Shot(self.camera, scan, turn, motion.t_ns, velocity_km_s, place_km)
         white_e_per_s = full_e(self.config.tracker.detector) / (motion.exposure_s or 1.0)
         shot = replace(shot, begin_s=-motion.exposure_s / 2, white_e_per_s=white_e_per_s)
-        brush = Brush(self.renderer.footprint_px, self.config.tracker.psf_sigma_px, EXPOSURE_SPRITES)
+        brush = Brush(self.renderer.footprint_px, self.config.tracker.psf_sigma_px, EXPOSURE_SPRITES, EXPOSURE_POSES)
         return with_satellites(sprites, stars, self.moving, shot, brush)
 
     def close(self) -> None:

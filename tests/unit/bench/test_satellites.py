@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,14 +10,18 @@ import pytest
 
 from hilstar.bench.bench_file import read_bench_file
 from hilstar.bench.build import load
+from hilstar.bench.discs import When
 from hilstar.bench.frame import Bench
 from hilstar.rotation import from_radec_roll_deg, to_matrix
+from hilstar.scene.trail_discs import DiscTrail, hidden
+from hilstar.sky.bodies.disc import Disc
 from hilstar.sky.bodies.satellites.passes import Cone
 from hilstar.twin.simulator import Simulator
 from tests.support.benches import bench_text
 from tests.support.commands import run_hilstar_here
 from tests.support.satellites import element_set, some_orbits
 from tests.support.skies import STATION_TLE, STATION_UTC
+from tests.support.stars import sprites_at
 
 pytestmark = pytest.mark.gpu
 S_NS = 10**9
@@ -102,6 +107,53 @@ def test_a_camera_that_follows_a_satellite_has_it_as_a_point_and_stars_as_streak
         assert (rows[0]["x_px"], rows[0]["y_px"]) == pytest.approx(
             (511.5, 511.5), abs=0.3
         )  # 38 arcsec a px; 10 by the velocity since
+
+
+SIZE_M = 20_000
+
+
+def test_one_with_a_size_is_a_disc_with_its_light_which_hides_stars(bench_file):
+    """Against the same one as a point: the same light, half of it dark, its width that of its size and distance."""
+    with load(bench_file) as bench:
+        t_ns = fast_moment(bench)
+        name, place, _ = brightest(bench, t_ns)
+        number = bench.moving.satellites._satellites[bench.moving.satellites.names.index(name)].number
+    (bench_file.parent / "seen.csv").write_text(f"norad,standard_mag,size_m\n{number},3,{SIZE_M}\n")
+    bench_file.write_text(bench_file.read_text().replace("[sky]", "[sky]\nfaintest_v_mag = 2.5"))
+    q = from_radec_roll_deg(*place, 0.0)
+    with load(bench_file) as bench:
+        shot = bench.frame(q, t_ns=t_ns)
+        (disc,) = bench.discs(q, When(t_ns))
+        assert disc.name == name
+        (row,) = shot.truth[shot.truth["name"] == name]
+        lit = shot.linear.astype(np.float64)
+        bench.moving.satellites.sized = False  # as a point
+        point = bench.frame(q, t_ns=t_ns)
+        (as_point,) = point.truth[point.truth["name"] == name]
+        assert row["electrons_per_s"] == pytest.approx(as_point["electrons_per_s"], rel=1e-3)
+        assert lit.sum() - point.linear.sum(dtype=np.float64) == pytest.approx(0, abs=0.005 * row["electrons_per_s"])
+        width_px = 2 * disc.radius_rad * bench.camera.focal_length_px
+        assert width_px > 3
+        near = lit[80:160, 120:200]  # 320 x 240
+        seen = np.argwhere(near > 0.05 * near.max())
+        assert np.abs(np.ptp(seen, axis=0) - width_px).min() < 3  # of 24, along the terminator, blurred
+        assert (row["x_px"], row["y_px"]) == pytest.approx((as_point["x_px"], as_point["y_px"]), abs=1.5)
+    with Simulator(read_bench_file(bench_file)) as tracker:
+        found = tracker.expose(tracker.motion(q, np.zeros(3), t_ns), None)
+        (of_exposure,) = found.truth[found.truth["name"] == name]
+        whole_e = found.mean_e.sum()
+        assert whole_e > 0.45 * of_exposure["electrons_per_s"]
+
+
+def test_stars_behind_a_disc_lose_the_share_of_the_time_in_which_it_is_before_them():
+    disc = Disc("s", NORTH, 100.0, 1.0, 1.0, NORTH, -NORTH, "lambert")
+    aside = replace(disc, direction=np.array([0.0, np.sin(0.1), np.cos(0.1)]))
+    trail = DiscTrail(0, 1.0, NORTH, (disc, disc, aside, aside), np.full(4, 0.25), (), 0.0)
+    three = np.array([NORTH, aside.direction, [0.0, np.sin(0.05), np.cos(0.05)]])
+    left = hidden(sprites_at(np.zeros((3, 2)), np.array([8.0, 4.0, 2.0]), 5), three, trail)
+    assert left.data["electrons_per_s"].tolist() == [4.0, 2.0, 2.0]
+    gone = DiscTrail(0, 1.0, NORTH, (disc,), np.ones(1), (), 0.0)
+    assert hidden(left, three, gone).star.tolist() == [1, 2]
 
 
 def test_frame_explains_them_and_attitude_and_verify_know_them(bench_file):

@@ -14,7 +14,17 @@ from hilstar.console.terminal import print_json, progress
 from hilstar.files import check_directory
 
 Study = Literal[
-    "models", "outputs", "stability", "quantisation", "timing", "tradeoff", "economy", "prediction", "geometry", "bodies"
+    "models",
+    "outputs",
+    "stability",
+    "quantisation",
+    "timing",
+    "tradeoff",
+    "economy",
+    "prediction",
+    "geometry",
+    "bodies",
+    "faults",
 ]
 
 ROOMS = {"bodies", "geometry", "models", "stability", "timing", "tradeoff"}  # the studies of more than one file

@@ -19,7 +19,7 @@ from hilstar.toml_tables import Kind, Table, explained
 REFERENCE = "docs/faults.md"
 TYPE_WORDS = {"float": "number", "int": "whole number", "str": "text", "object": "table", "bool": "true or false"}
 MAX_TIME_S, MAX_LIGHT_E, MAX_PLACE_PX = 1e7, 1e12, 1e6
-MAX_TRACK_PX = 100_000  # of a burst's tracks together: a frame's work is bounded
+MAX_TRACK_PX = 20_000  # of a burst's tracks together: a frame's work is bounded
 MIN_RATE_PX_S = 1e-9
 UNIT_TOLERANCE = 1e-3
 
@@ -132,7 +132,7 @@ class CosmicRays(Fault, frozen=True, kw_only=True):
     KIND: ClassVar[str] = "cosmic-rays"
     OF_LIGHT: ClassVar[bool] = True
 
-    number: Annotated[int, Meta(ge=1, le=10_000)]
+    number: Annotated[int, Meta(ge=1, le=5_000)]
     electrons: Electrons
     length_px: Annotated[float, Meta(ge=0, le=10_000)] = 10.0
 

@@ -88,8 +88,8 @@ def test_a_wrong_fault_is_refused_with_its_key_and_what_to_write(change, said):
         ),
         ("[[fault]", "not TOML"),
         (
-            '[[fault]]\nkind = "cosmic-rays"\nname = "b"\nnumber = 10000\nelectrons = 1\nlength_px = 500',
-            "write at most 100000 px together",
+            '[[fault]]\nkind = "cosmic-rays"\nname = "b"\nnumber = 5000\nelectrons = 1\nlength_px = 500',
+            "write at most 20000 px together",
         ),
         ('[[fault]]\nkind = "flash"\nname = "f"\nhip = 1\nelectrons = 1', "write for_s = 0.1"),
         ('[[fault]]\nkind = "attitude-step"\nname = "s"\nturn_deg = [0, 200, 0]', "write a turn of 180 deg at most"),

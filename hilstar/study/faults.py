@@ -1,0 +1,221 @@
+"""What each fault on request costs in a frame, and what stray light leaves of the stars in the codes."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from hilstar.arrays import FloatArray
+from hilstar.bench.build import load
+from hilstar.bench.faults.desk import FaultDesk, Now
+from hilstar.bench.faults.effects import Effects
+from hilstar.bench.faults.kinds import Fault, Freeze, fault_of
+from hilstar.bench.faults.scenario import Scenario
+from hilstar.bench.faults.views import display_view
+from hilstar.bench.frame import Bench
+from hilstar.charts import chart, write_records
+from hilstar.monitor.quantise import shown_light
+from hilstar.rotation import from_radec_roll_deg, propagate
+from hilstar.scene.extended import Glow
+from hilstar.scene.sprites import Sprites, join_sprites
+from hilstar.study.shared.bench_text import Table as Keys
+from hilstar.study.shared.bench_text import bench_text
+from hilstar.study.shared.lone_stars import Isolation, lone_windows
+from hilstar.units import NS_PER_S, magnitude
+
+REFRESH_HZ = 60
+ROUNDS, QUICK_ROUNDS = 30, 3
+QUANTISATIONS = ("round", "exact")
+FIELD = from_radec_roll_deg(84.057, -1.2, 0.0)
+SLEW_RAD_S = np.array([0.0, 2e-4, 0.0])  # so that what is fixed on the sky is new in each frame
+ISOLATION = Isolation(margin_px=7, max_share=1e-3)
+SHARES = (0.0, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3, 0.6, 1.0)
+QUICK_SHARES = (0.0, 0.01, 1.0)
+LOST_MAG = 1.0  # a star this much too faint is not the star that was asked for
+
+Table = dict[str, Any]
+NOWHERE = "a scenario, nothing on"
+CASES: dict[str, list[Table]] = {
+    NOWHERE: [],
+    "false star, on the sky": [{"kind": "false-star", "radec_deg": [84.2, -1.0], "v_mag": 2.0}],
+    "false star, moving": [{"kind": "false-star", "tracker_px": [400, 500], "rate_px_s": [60, 10], "v_mag": 2.0}],
+    "64 false stars": [{"kind": "false-star", "radec_deg": [82 + k / 16, -3 + k / 16], "v_mag": 4.0} for k in range(64)],
+    "star gone": [{"kind": "star-gone", "hip": 26311}],
+    "flash at a star": [{"kind": "flash", "hip": 26727, "for_s": 10, "electrons": 1e5}],
+    "40 tracks of 12 px": [{"kind": "cosmic-rays", "number": 40, "electrons": 8000, "length_px": 12, "for_s": 10}],
+    "400 tracks of 25 px": [{"kind": "cosmic-rays", "number": 400, "electrons": 8000, "length_px": 25, "for_s": 10}],
+    "gradient": [{"kind": "gradient", "electrons_per_s": 400}],
+    "glow, on the detector": [{"kind": "glow", "tracker_px": [-600, 200], "electrons_per_s": 3000, "scale_deg": 2}],
+    "glow, on the sky": [{"kind": "glow", "radec_deg": [84, 12], "electrons_per_s": 3000, "scale_deg": 2}],
+    "measured map": [{"kind": "light-map", "file": "stray.npy"}],
+    "blank": [{"kind": "blank"}],
+    "frozen": [{"kind": "freeze"}],
+    "wrong attitude": [{"kind": "attitude-step", "turn_deg": [0, 0.5, 0]}],
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Cost:
+    """One case: median times of a frame, ms, with the fault and without any, in turn in the same run."""
+
+    quantisation: str
+    case: str
+    frame_ms: float
+    without_ms: float
+    cost_ms: float
+
+
+@dataclass(frozen=True, slots=True)
+class Stray:
+    """Stars over even stray light of a share of white: the error of their light in the codes, and the share that is lost."""
+
+    quantisation: str
+    share_of_white: float
+    stars: int
+    median_mag: float
+    p95_mag: float
+    lost: float
+
+
+def bench_of(folder: Path, quantisation: str) -> Bench:
+    """The bench of a study: an 8-bit monitor of 1920 x 1080 before a tracker of 11 degrees."""
+    tables: dict[str, Keys] = {
+        "tracker": {"resolution_px": (1024, 1024)},
+        "monitor": {"resolution_px": (1920, 1080), "pixel_pitch_um": 57.65, "refresh_hz": REFRESH_HZ},
+        "collimator": {"focal_length_mm": 350},
+        "render": {"quantisation": quantisation},
+    }
+    np.save(folder / "stray.npy", np.hypot(*np.indices((256, 256))) * 3.0)
+    path = folder / f"{quantisation}.toml"
+    path.write_text(bench_text(tables), encoding="utf-8")
+    return load(path)
+
+
+def cost_of(bench: Bench, folder: Path, case: str, rounds: int) -> Cost:
+    """The time of a frame with the faults of a case and without any, in turn."""
+    faults = tuple(fault_of({"name": f"fault {k}", **table}) for k, table in enumerate(CASES[case]))
+    scenario = Scenario(folder / "faults.toml", "", 1, faults, folder)
+    view = display_view(bench, scenario)
+    waiting = fault_of({"kind": "blank", "name": "later", "at_s": 1e6})
+    desk = FaultDesk(replace(scenario, faults=(waiting,)), 1 / REFRESH_HZ)
+    ready = [view.prepare(fault) for fault in faults]
+    times = []
+    for k in range(rounds + 1):
+        q = propagate(FIELD, SLEW_RAD_S, k / REFRESH_HZ)
+        now = tuple(Now(n, fault, round(k / REFRESH_HZ * NS_PER_S)) for n, fault in enumerate(ready, start=1))
+
+        def plain(q: FloatArray = q) -> object:
+            return bench.draw_sprites(bench.frame_sprites(q)).levels
+
+        def faulty(q: FloatArray = q, k: int = k, now: tuple[Now, ...] = now) -> object:
+            desk.at(round(k / REFRESH_HZ * NS_PER_S))
+            return _frame(bench, q, Effects(view, now), ready)
+
+        times.append((_ms(plain), _ms(faulty)))
+    without_ms, with_ms = np.median(np.array(times[1:]), axis=0).tolist()
+    return Cost(bench.config.render.quantisation, case, with_ms, without_ms, with_ms - without_ms)
+
+
+def _frame(bench: Bench, q: FloatArray, effects: Effects, faults: list[Fault]) -> object:
+    """What the frame loop does with a frame of such faults."""
+    if any(isinstance(fault, Freeze) for fault in faults):
+        return bench.renderer.codes()
+    if effects.blank:
+        return bench.draw_sprites(None).levels
+    q = effects.turned(q)
+    return bench.draw_sprites(bench.frame_sprites(q, faults=effects if effects.now else None)).levels
+
+
+def _ms(draw: Callable[[], object]) -> float:
+    begin = time.perf_counter()
+    draw()
+    return (time.perf_counter() - begin) * 1e3
+
+
+def stray_light(bench: Bench, share: float) -> Stray:
+    """What the codes leave of each star's light over even stray light: with the stars, less the same without them."""
+    white = bench.flux_at_white_e_per_s
+    sprites = bench.frame_sprites(FIELD)
+    if sprites is None:
+        raise AssertionError("a frame with an attitude has sprites")
+    glow = Glow(np.array([0.0, 0.0, 1.0]), share * white, 100.0, 1.0, bench.camera)  # 100 rad wide: even
+    lights = (glow,) if share else ()
+    both = _shown(bench, replace(sprites, extended=lights))
+    alone = _shown(bench, replace(join_sprites([], sprites.footprint_px), extended=lights))
+    off_mag = []
+    for star, window in lone_windows(sprites, sprites.x_px, sprites.y_px, bench.camera.resolution_px, ISOLATION):
+        wanted = float(sprites.data["electrons_per_s"][sprites.star == star].sum())
+        got = float((both[window] - alone[window]).sum())
+        off_mag.append(magnitude(got / wanted) if got > 0 else np.inf)
+    errors = np.abs(np.array(off_mag))
+    kept = np.where(np.isfinite(errors), errors, 99.0)
+    median, p95 = np.percentile(kept, (50, 95)).tolist()
+    return Stray(bench.config.render.quantisation, share, len(kept), median, p95, float((kept > LOST_MAG).mean()))
+
+
+def _shown(bench: Bench, sprites: Sprites) -> FloatArray:
+    return shown_light(bench.draw_sprites(sprites).levels, bench.panel).copy()
+
+
+def run(directory: Path, quick: bool = False) -> list[str]:
+    """Measure, and write `faults-cost.csv`, `faults-stray.csv`, `faults.png`; the findings, a line each. Raises InputError."""
+    costs: list[Cost] = []
+    strays: list[Stray] = []
+    rounds, shares = (QUICK_ROUNDS, QUICK_SHARES) if quick else (ROUNDS, SHARES)
+    with TemporaryDirectory() as name:
+        for quantisation in QUANTISATIONS:
+            with bench_of(Path(name), quantisation) as bench:
+                bench.warm_up()
+                costs += [cost_of(bench, Path(name), case, rounds) for case in CASES]
+                strays += [stray_light(bench, share) for share in shares]
+    write_records(directory / "faults-cost.csv", costs)
+    write_records(directory / "faults-stray.csv", strays)
+    findings = _findings(costs, strays)
+    _draw(directory / "faults.png", findings[0], costs, strays)
+    return findings
+
+
+def _findings(costs: list[Cost], strays: list[Stray]) -> list[str]:
+    found = []
+    for quantisation in QUANTISATIONS:
+        mine = {cost.case: cost for cost in costs if cost.quantisation == quantisation}
+        dearest = max(mine.values(), key=lambda cost: cost.cost_ms)
+        off = mine[NOWHERE]
+        found.append(
+            f"{quantisation}: of a frame of {off.without_ms:.1f} ms a scenario with nothing on takes {off.cost_ms:+.2f} ms, a"
+            f" false star {mine['false star, on the sky'].cost_ms:+.2f} ms; the dearest, {dearest.case},"
+            f" {dearest.cost_ms:+.1f} ms"
+        )
+    for quantisation in QUANTISATIONS:
+        worst = [stray for stray in strays if stray.quantisation == quantisation and stray.p95_mag > 0.1]
+        least = min((stray.share_of_white for stray in worst if stray.share_of_white), default=None)
+        limit = "no stray light here" if least is None else f"stray light of {least:g} of white"
+        found.append(f"{quantisation}: the stars' light is off by more than 0.1 mag (95 %) from {limit} on")
+    return found
+
+
+def _draw(path: Path, finding: str, costs: list[Cost], strays: list[Stray]) -> None:
+    with chart(path, finding, panels=2, share_x=False) as (cost, error):
+        height = 0.8 / len(QUANTISATIONS)
+        for k, quantisation in enumerate(QUANTISATIONS):
+            mine = [one for one in costs if one.quantisation == quantisation]
+            places = np.arange(len(mine)) + (k - 0.5) * height
+            cost.barh(places, [one.cost_ms for one in mine], height, label=quantisation)
+            light = [one for one in strays if one.quantisation == quantisation and one.share_of_white]
+            x = [one.share_of_white for one in light]
+            error.loglog(x, [max(one.p95_mag, 1e-4) for one in light], "o-", label=f"{quantisation}, 95 %")
+            error.loglog(x, [max(one.median_mag, 1e-4) for one in light], "o--", label=f"{quantisation}, median")
+        cost.set_yticks(np.arange(len(CASES)), list(CASES))
+        cost.invert_yaxis()
+        cost.set_xlabel("time of a frame, more than without it [ms]")
+        cost.legend(loc="lower right")
+        error.set_xlabel("even stray light [share of white in a monitor pixel]")
+        error.set_ylabel("error of the stars' light [mag]")
+        error.set_ylim(1e-4, 10)
+        error.legend(loc="upper left")

@@ -1,0 +1,50 @@
+"""hilstar study faults: a chart of what each kind costs, and where stray light takes the stars with it."""
+
+from __future__ import annotations
+
+import csv
+
+import pytest
+from PIL import Image
+
+from hilstar.bench.faults.kinds import KINDS
+from hilstar.study import faults
+from hilstar.study.faults import CASES, NOWHERE, QUANTISATIONS
+
+pytestmark = pytest.mark.study
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("faults")
+    return folder, faults.run(folder, quick=True)
+
+
+def rows(path):
+    with path.open() as file:
+        return list(csv.DictReader(file))
+
+
+def test_every_kind_but_a_dropped_frame_has_its_cost(study):
+    folder, findings = study
+    kinds = {table["kind"] for tables in CASES.values() for table in tables}
+    assert kinds == set(KINDS) - {"drop"}  # which draws nothing
+    costs = rows(folder / "faults-cost.csv")
+    assert [(row["quantisation"], row["case"]) for row in costs] == [(q, case) for q in QUANTISATIONS for case in CASES]
+    assert all(float(row["without_ms"]) > 0 for row in costs)
+    assert NOWHERE in CASES and len(findings) == 4
+
+
+def test_stray_light_of_white_leaves_no_star_and_none_leaves_all(study):
+    folder, _ = study
+    strays = rows(folder / "faults-stray.csv")
+    for quantisation in QUANTISATIONS:
+        mine = {float(row["share_of_white"]): row for row in strays if row["quantisation"] == quantisation}
+        assert float(mine[1.0]["lost"]) == 1.0
+        assert float(mine[0.0]["lost"]) < 0.05
+        assert int(mine[0.0]["stars"]) > 20
+
+
+def test_the_chart_is_a_picture(study):
+    with Image.open(study[0] / "faults.png") as picture:
+        assert picture.size[0] > 800

@@ -15,10 +15,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import sparse
-from scipy.spatial import cKDTree
 
 from hilstar.arrays import FloatArray
-from hilstar.campaign.budget.places import REACH, axes_of, centres_of, places_of
+from hilstar.campaign.budget.places import axes_of, centres_of, places_of, weights_at
 from hilstar.campaign.budget.scale import Scale
 from hilstar.campaign.budget.star_search import MIN_FORWARD
 from hilstar.rotation import conjugate, multiply, to_rotation_vector
@@ -73,9 +72,7 @@ def local_columns(q_icrs_to_cam: FloatArray, scale: Scale, spacing_px: float) ->
     place = places_of(axes, scale.focal_px, scale.roll_px)
     centre = centres_of(place, spacing_px)
     direction = centre[:, :3] / np.linalg.norm(centre[:, :3], axis=1, keepdims=True)
-    near = cKDTree(place).sparse_distance_matrix(cKDTree(centre), REACH * spacing_px, output_type="ndarray")
-    i, j, r = near["i"], near["j"], near["v"] / (REACH * spacing_px)
-    value = (1 - r) ** 4 * (4 * r + 1)
+    i, j, value = weights_at(place, centre, spacing_px)
     seen = np.einsum("nij,nj->ni", axes[i], direction[j])
     phase = Phases("", scale.focal_px * seen[:, :2] / seen[:, 2:]).columns(LOCAL_HARMONICS)
     parts = [sparse.csr_matrix((value * column, (i, j)), shape=(len(place), len(centre))) for column in phase.T]

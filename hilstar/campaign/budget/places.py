@@ -16,7 +16,7 @@ import numpy.typing as npt
 from scipy import linalg, sparse
 from scipy.spatial import cKDTree
 
-from hilstar.arrays import FloatArray
+from hilstar.arrays import FloatArray, IntArray
 
 REACH = 2.5  # of a bump, in spacings: a sine of four spacings or longer is then met to 1 %
 CLOSE = 0.7  # of a spacing: nearer bumps are one
@@ -77,10 +77,17 @@ def _numbers(cell: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
 
 def bumps_at(place: FloatArray, centre: FloatArray, spacing_px: float) -> Bumps:
     """The bumps of some centres (p, 6) at places (n, 6)."""
+    i, j, value = weights_at(place, centre, spacing_px)
+    return Bumps(sparse.csr_matrix((value, (i, j)), shape=(len(place), len(centre))), centre)
+
+
+def weights_at(place: FloatArray, centre: FloatArray, spacing_px: float) -> tuple[IntArray, IntArray, FloatArray]:
+    """Which sample and which centre, and the bump there; all bumps of a sample add to 1, so that a constant is met to the edge."""
     near = cKDTree(place).sparse_distance_matrix(cKDTree(centre), REACH * spacing_px, output_type="ndarray")
     r = near["v"] / (REACH * spacing_px)
     value = (1 - r) ** 4 * (4 * r + 1)
-    return Bumps(sparse.csr_matrix((value, (near["i"], near["j"])), shape=(len(place), len(centre))), centre)
+    total = np.bincount(near["i"], value, minlength=len(place))
+    return near["i"], near["j"], value / total[near["i"]]
 
 
 class Projector:

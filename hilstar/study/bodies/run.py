@@ -45,12 +45,11 @@ def run(directory: Path, quick: bool = False) -> list[str]:
 
 
 def _cost_line(costs: Sequence[Cost]) -> str:
-    dearest, step = max(costs, key=lambda cost: cost.cost_ms), costs[-1]
-    unseen = max((c for c in costs[:-1] if not c.discs), key=lambda cost: cost.cost_ms)
+    dearest, step = max(costs, key=lambda cost: cost.cpu_ms), costs[-1]
+    unseen = max((c for c in costs[:-1] if not c.discs), key=lambda cost: cost.cpu_ms)
     return (
-        f"bodies that are not in view, or points, cost at most {max(unseen.cost_ms, 0.0):.2f} ms a frame, and all of them"
-        f" {max(step.cost_ms, 0.0):.1f} ms once in 2 s; the dearest: {dearest.scene}, {dearest.cost_ms:.0f} ms on top of"
-        f" {dearest.without_ms:.1f}"
+        f"bodies that are not in view, or points, take at most {max(unseen.cpu_ms, 0.0):.1f} ms of processor time a frame, and"
+        f" all of them {max(step.cpu_ms, 0.0):.1f} ms once in 2 s; the dearest: {dearest.scene}, {dearest.cpu_ms:.0f} ms"
     )
 
 
@@ -64,12 +63,12 @@ def _size_line(sizes: Sequence[Exactness]) -> str:
 
 
 def _limits_line(nears: Sequence[Near]) -> str:
-    slowest = max(nears, key=lambda near: near.frame_ms - near.without_ms)
+    slowest = max(nears, key=lambda near: near.cpu_ms)
     sound = all(near.finite and near.white_is_white for near in nears)
     light = "finite, and what is over white is white" if sound else "NOT finite, or over white and not white"
     return (
-        f"from {max(n.off_deg for n in nears):g} degrees away to a full field every pixel's light is {light}; the largest cost"
-        f" is {slowest.frame_ms - slowest.without_ms:.1f} ms, {slowest.body} at {slowest.off_deg:g} degrees"
+        f"from {max(n.off_deg for n in nears):g} degrees away to a full field every pixel's light is {light}; a frame takes at"
+        f" most {slowest.cpu_ms:.0f} ms of processor time, {slowest.body} at {slowest.off_deg:g} degrees"
     )
 
 

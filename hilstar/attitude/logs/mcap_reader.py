@@ -30,6 +30,7 @@ RUN_METADATA = "hilstar"  # the name of a ledger's head
 ROS_ENCODINGS = frozenset({"cdr", "ros1"})
 OWN_TOPICS = frozenset({"/attitude", "/frame"})
 log = logging.getLogger(__name__)
+NO_END = "has no end: cut short, or its writer was killed or still writes; what is whole is read"
 ADVICE = "give an MCAP file, such as the ledger of a run"
 MAX_CHUNK_BYTES = 64_000_000  # unpacked; writers make them of about 1 MB
 MAX_RECORD_BYTES = 256_000_000
@@ -69,7 +70,6 @@ def read_topics(path: Path) -> Iterator[tuple[str, bytes]]:
     A file that ends so is said in one line of the log, once it is read. Raises InputError for damage, and for anything but a
     regular file.
     """
-    unfinished = []
     for part in parts_of(path):
         channels: dict[int, str] = {}
         for record in records_of(part):
@@ -77,10 +77,18 @@ def read_topics(path: Path) -> Iterator[tuple[str, bytes]]:
                 channels[record.id] = record.topic
             elif isinstance(record, Message) and record.channel_id in channels:
                 yield channels[record.channel_id], record.data
+    unfinished = unfinished_part(path)
+    if unfinished is not None:
+        log.warning("%s %s", unfinished, NO_END)
+
+
+def unfinished_part(path: Path) -> Path | None:
+    """The first of a run's files that lacks the end which its writer gives it; None where all are whole. Raises InputError."""
+    for part in parts_of(path):
         with open_regular(part, ADVICE) as file:
-            unfinished += [] if _is_finished(file) else [part]
-    if unfinished:
-        log.warning("%s has no end: cut short, or its writer was killed or still writes; what is whole is read", unfinished[0])
+            if not _is_finished(file):
+                return part
+    return None
 
 
 def read_messages(path: Path, topic: str) -> Iterator[bytes]:

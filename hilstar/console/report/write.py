@@ -6,6 +6,7 @@ from pathlib import Path
 
 import msgspec
 
+from hilstar.attitude.logs.mcap_reader import NO_END, unfinished_part
 from hilstar.console.report.bundle import report_page
 from hilstar.console.report.pictures import run_pictures
 from hilstar.console.report.run_data import run_data
@@ -20,7 +21,11 @@ def report(path: Path, directory: Path) -> RunReport:
     """
     run = figures_of(path)
     summary = summarise(run)
-    page = report_page(run_data(path.name, run, summary) | run_pictures(run, path))
+    data = run_data(path.name, run, summary) | run_pictures(run, path)
+    unfinished = unfinished_part(path)
+    if unfinished is not None:
+        data["facts"].insert(0, ("no end", f"{unfinished.name} {NO_END}"))
+    page = report_page(data)
     write_whole(directory / "report.html", page.encode(errors="replace"))
     write_whole(directory / "report.json", msgspec.json.format(msgspec.json.encode(summary)))
     return summary

@@ -47,6 +47,8 @@ TRY_TO_BLANK = """
 const request = { method: "POST", headers: { "Content-Type": "application/json" }, body: '{"on": true}' };
 fetch("/control/blank", request).then((answer) => done(answer.status));
 """
+# Not within the run, but on request.
+SCENARIO = '[[fault]]\nname = "ghost"\nkind = "false-star"\nat_s = 9e4\nfor_s = 1.0\nradec_deg = [84.0, -1.0]\nv_mag = 2.0\n'
 ALL_DISABLED = "[...document.querySelectorAll('.controls-panel :is(button, input, select)')].every((field) => field.disabled)"
 
 
@@ -96,7 +98,9 @@ def sky(folder: Path, *options: str) -> Iterator[Sky]:
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> Iterator[Sky]:
     folder = tmp_path_factory.mktemp("page")
-    with sky(folder, "--control", "--ledger", str(folder / "run.mcap")) as shown:
+    (folder / "faults.toml").write_text(SCENARIO)
+    options = ("--control", "--ledger", str(folder / "run.mcap"), "--scenario", str(folder / "faults.toml"))
+    with sky(folder, *options) as shown:
         yield shown
 
 
@@ -220,9 +224,12 @@ def test_controls_act_and_the_ledger_says_who(live, run):
     live.find("#mark-text").send_keys("<b>shutter</b> open", Keys.ENTER)
     live.until("document.getElementById('control-said').textContent === 'Mark written.'")
     live.until("document.getElementById('events').textContent.includes('<b>shutter</b> open')")
+    live.press("#control-fault")
+    live.until("document.getElementById('events').textContent.includes('fault ghost')")
     wait_for(lambda: any("shutter" in record.detail for record in events(run)), "the mark in the ledger")
     mark = next(record for record in events(run) if "shutter" in record.detail)
     assert "Ada Løve" in mark.detail
+    assert any("ghost" in record.detail and "Ada Løve" in record.detail for record in events_of(run, "fault"))
 
 
 def test_by_the_keyboard_alone(live):

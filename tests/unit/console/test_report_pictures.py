@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from hilstar.attitude.logs.mcap_reader import NO_END
 from hilstar.bench.frame import Bench
 from hilstar.console.report.pictures import run_pictures
 from hilstar.console.report.write import report
@@ -89,3 +90,11 @@ def test_a_bench_that_has_changed_since_draws_with_a_caution_and_one_that_is_gon
     none = run_pictures(figures, tmp_path / "run.mcap")
     assert none["pictures"] == [] and "bench.toml" in none["no_pictures"]
     assert none["sky"]["stars"][0][3] == "α CMa"
+
+
+def test_of_a_ledger_that_was_cut_off_what_is_whole_is_reported_and_the_page_says_so(ledger, tmp_path):
+    path, _ = ledger
+    (tmp_path / "cut.mcap").write_bytes(path.read_bytes()[:-400])
+    assert report(tmp_path / "cut.mcap", tmp_path).frames == 40
+    data = run_data_of((tmp_path / "report.html").read_text())
+    assert data["facts"][0] == ["no end", f"cut.mcap {NO_END}"]

@@ -152,22 +152,15 @@ class DiscPainter:
         discs = [Disc("", ahead, 1 / math.sin(min(r, 1.0)), 1.0, 1.0, ahead, -ahead, "lambert") for r in radii_rad.tolist()]
         return tuple(itertools.chain.from_iterable(self._lights(discs, self.still(np.eye(3)))))
 
+    def seen_through(self, stars: Stars, q_icrs_to_cam: FloatArray, when: When) -> FloatArray:
+        """The share of light (n,) of each of `stars` that comes past the discs near an attitude."""
+        discs = self._near(self.camera.cam_to_image @ to_matrix(q_icrs_to_cam), when, 0.0)
+        return self._through(stars, np.arange(len(stars)), discs, when)
+
     def unhidden(self, sprites: Sprites, stars: Stars, discs: list[Disc], when: When) -> Sprites:
         """Sprites as seen through the air of `discs` and beside them, and none of the discs' own."""
-        first = len(stars) - len(self._moving.names)
-        through = np.where(np.isin(sprites.star, disc_stars(stars, (disc.name for disc in discs))), 0.0, 1.0)
-        directions = stars.directions(sprites.star)
-        point = np.flatnonzero(sprites.star >= first)
-        far_km = np.empty(0)
-        if len(point):
-            far_km = self._moving.distances_km(when.t_ns, when.velocity_km_s, when.place_km)[sprites.star[point] - first]
-        for disc in discs:
-            reach_rad = disc.radius_rad * (1 + AIR_TOP * disc.air_radii) + 1e-7  # more than a cosine rounds
-            seen = through * (directions @ disc.direction > np.cos(min(reach_rad, np.pi))) > 0
-            seen[point[far_km < disc.distance_km]] = False
-            behind = np.flatnonzero(seen)
-            if len(behind):
-                through[behind] *= disc.transmission(directions[behind])
+        through = self._through(stars, sprites.star, discs, when)
+        through[np.isin(sprites.star, disc_stars(stars, (disc.name for disc in discs)))] = 0.0
         kept = through >= HIDDEN
         if kept.all() and (through == 1).all():
             return sprites
@@ -175,6 +168,28 @@ class DiscPainter:
         data["electrons_per_s"] *= through[kept].astype(np.float32)
         star, x_px, y_px = sprites.star[kept], sprites.x_px[kept], sprites.y_px[kept]
         return replace(sprites, data=data, star=star, x_px=x_px, y_px=y_px)
+
+    def _through(self, stars: Stars, which: IntArray, discs: list[Disc], when: When) -> FloatArray:
+        """The share of light (n,) of some of `stars` (n,) that comes past discs; bodies pass what is farther than they are.
+
+        Satellites are not asked: what hides them is their own matter.
+        """
+        first = len(stars) - len(self._moving.names)
+        through, directions = np.ones(len(which)), stars.directions(which)
+        satellite = np.flatnonzero((which >= len(stars) - len(stars.bodies)) & (which < first))
+        point = np.flatnonzero(which >= first)
+        far_km = np.empty(0)
+        if len(point):
+            far_km = self._moving.distances_km(when.t_ns, when.velocity_km_s, when.place_km)[which[point] - first]
+        for disc in discs:
+            reach_rad = disc.radius_rad * (1 + AIR_TOP * disc.air_radii) + 1e-7  # more than a cosine rounds
+            near = directions @ disc.direction > np.cos(min(reach_rad, np.pi))
+            near[point[far_km <= disc.distance_km]] = False  # itself among them
+            near[satellite] = False
+            behind = np.flatnonzero(near)
+            if len(behind):
+                through[behind] *= disc.transmission(directions[behind])
+        return through
 
     def _clips(self, lights: list[ExtendedLight]) -> bool:
         """Whether a disc's lights have more than white in a pixel: of a large disc, at some place of a lattice over it."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hilstar.arrays import FloatArray
+from hilstar.bench.discs import HIDDEN
 from hilstar.rotation import to_matrix
 from hilstar.scene.camera import Camera
 from hilstar.sky.stars import Stars
@@ -30,14 +31,21 @@ class StarInView:
     name: str
 
 
-def brightest_in_view(stars: Stars, camera: Camera, q_icrs_to_cam: FloatArray, count: int) -> list[StarInView]:
-    """The `count` brightest of `stars` that fall on the camera's pixels, the brightest first."""
+def brightest_in_view(
+    stars: Stars, camera: Camera, q_icrs_to_cam: FloatArray, count: int, through: FloatArray | None = None
+) -> list[StarInView]:
+    """The `count` brightest of `stars` that fall on the camera's pixels, the brightest first.
+
+    Those of which less than HIDDEN comes `through` (n,) what is before them are left out.
+    """
     vectors = stars.directions(np.arange(len(stars)))
     cam = vectors @ to_matrix(q_icrs_to_cam).T
     x_px, y_px = camera.project(cam @ camera.cam_to_image.T)
     width, height = camera.resolution_px
     with np.errstate(invalid="ignore"):  # NaN: behind the camera
         inside = (np.abs(x_px - (width - 1) / 2) <= width / 2) & (np.abs(y_px - (height - 1) / 2) <= height / 2)
+    if through is not None:
+        inside &= through >= HIDDEN
     found = np.flatnonzero(inside)
     found = found[np.argsort(stars.v_mag[found], kind="stable")][:count]
     off_rad = np.arctan2(np.hypot(cam[found, 0], cam[found, 1]), cam[found, 2])

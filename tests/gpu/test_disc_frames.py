@@ -13,6 +13,7 @@ from hilstar.bench.bench_file import read_bench_file
 from hilstar.bench.build import load
 from hilstar.bench.discs import DiscPainter, When
 from hilstar.bench.frame import Bench
+from hilstar.bench.in_view import brightest_in_view
 from hilstar.monitor.quantise import dither_levels, round_levels, temporal_levels
 from hilstar.monitor.response import srgb_response
 from hilstar.render.reference import linear_image
@@ -88,6 +89,11 @@ def test_stars_behind_the_moon_are_neither_drawn_nor_in_the_table(bench):
     assert shot.truth["name"][0] == "Moon"
     assert shot.linear.sum() == pytest.approx(shot.truth["electrons_per_s"].sum(), rel=FLUX_LIMIT)
     assert bench.losses_mag(shot)["Moon"] > 3
+    stars = bench.seen(bench.stars)
+    through = DiscPainter(bench.moving, bench.camera, 1, SIGMA).seen_through(stars, q, NOW)
+    found = brightest_in_view(stars, bench.camera, q, 500, through)
+    assert {star.hip for star in found} & set(BEEHIVE) == set()
+    assert {star.hip for star in brightest_in_view(stars, bench.camera, q, 500)} & set(BEEHIVE) == set(BEEHIVE)
 
 
 def test_the_moon_a_degree_beside_the_field_changes_nothing_and_half_of_it_is_half(bench):

@@ -132,6 +132,7 @@ def _pointing(sample: AttitudeSample, file: BenchFile) -> dict[str, Any]:
 
     from hilstar.bench.build import bench_moving, bench_stars, moved
     from hilstar.bench.cameras import tracker_camera
+    from hilstar.bench.discs import DiscPainter, When
     from hilstar.bench.in_view import brightest_in_view
     from hilstar.bench.satellites import satellites_now
     from hilstar.rotation import to_radec_roll_deg
@@ -140,10 +141,13 @@ def _pointing(sample: AttitudeSample, file: BenchFile) -> dict[str, Any]:
     camera = tracker_camera(file.config.tracker, file.folder)
     moving = bench_moving(file.config, file.folder)
     sky = moved(bench_stars(file.config, file.folder, moving), moving)
+    through = None
     if moving is not None:
         sky = moving.seen(sky, sample.t_ns)
         satellites_now(sky, moving, sample.t_ns)
-    stars = brightest_in_view(sky, camera, sample.q_icrs_to_cam, SHOWN_STARS)
+        painter = DiscPainter(moving, camera, 1, file.config.tracker.psf_sigma_px)
+        through = painter.seen_through(sky, sample.q_icrs_to_cam, When(sample.t_ns))
+    stars = brightest_in_view(sky, camera, sample.q_icrs_to_cam, SHOWN_STARS, through)
     rate = sample.rate_cam_rad_s
     return {
         "t_ns": sample.t_ns,

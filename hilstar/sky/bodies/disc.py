@@ -137,21 +137,13 @@ class Disc:
         return light
 
     def with_air(self, directions: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The radiance (n,) of disc and air in ICRS directions (n, 3), and the share (n,) of what is behind that they hide.
-
-        Air shines as ground does that a ray just touches, by the share that it hides.
-        """
+        """The radiance (n,) of disc and air in ICRS directions (n, 3), and the share (n,) of what is behind that they hide."""
         covered = 1 - self.transmission(directions)
         light = self.radiance(directions)
         if self.air is None:
             return light, covered
-        seen = (directions / np.linalg.norm(directions, axis=1, keepdims=True)) @ self.to_sphere.T
-        beside = np.flatnonzero((covered < 1) & (covered > 0))
-        side = seen[beside, :2] / np.linalg.norm(seen[beside, :2], axis=1, keepdims=True)
-        sine = 1 / self.distance_radii
-        up = np.column_stack((side * np.sqrt(1 - sine**2), np.full(len(beside), -sine)))
-        mu0 = np.maximum(0.0, up @ self.sun_sphere / np.linalg.norm(up @ self.to_sphere, axis=1))
-        light[beside] = self.normal_e_per_s_sr * mu0 * covered[beside] / -np.expm1(-self.slant_depth)
+        beside = np.flatnonzero(covered < 1)
+        light[beside], covered[beside] = self.air_light(directions[beside])
         return light, covered
 
     def air_light(self, directions: FloatArray) -> tuple[FloatArray, FloatArray]:

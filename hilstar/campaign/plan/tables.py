@@ -75,7 +75,7 @@ class Plan(Table, frozen=True):
     frames: Annotated[int, Meta(ge=1, le=MAX_FRAMES)] = 1
     step_s: Annotated[float, Meta(ge=1e-6, le=1e6)] = 0.2
     noise: Literal["full", "none"] = "full"
-    wrong_above_arcsec: Annotated[float, Meta(ge=0, le=648000)] = 60.0
+    wrong_above_arcsec: Annotated[float, Meta(ge=0, le=648000)] = 1800.0
     attitudes: Attitudes = msgspec.field(default_factory=Attitudes)
     centroids: Centroiding = msgspec.field(default_factory=Centroiding)
     vary: Annotated[list[Varied], Meta(max_length=64)] = msgspec.field(default_factory=list)

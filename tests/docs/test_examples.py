@@ -18,6 +18,7 @@ import pytest
 
 from hilstar.bench.config import read_config
 from hilstar.bench.faults.scenario import parse_scenario
+from hilstar.campaign.plan.tables import parse_plan
 from hilstar.cli.app import app
 from hilstar.cli.entry import with_values
 from tests.docs.pages import Block, blocks_of, differs
@@ -90,6 +91,9 @@ def read_toml(text: str, folder: Path) -> None:
         return
     if "[[fault]]" in text:
         parse_scenario(folder / "scenario.toml", text)
+        return
+    if text.startswith("bench = "):  # a campaign's plan
+        parse_plan(folder / "plan.toml", text)
         return
     missing = [part for part in re.split(r"\n(?=\[)", SMALL_BENCH) if part.strip("\n[").split("]")[0] not in given]
     path = folder / "tables.toml"

@@ -140,7 +140,7 @@ class Tally:
             self.why = self.why or answer.why
             return
         error = attitude_error_arcsec(exposure.motion.q_icrs_to_cam, answer.q_icrs_to_cam)
-        if self.first_q is None:
+        if self.frames == 1:
             self.first_q = answer.q_icrs_to_cam
         if np.linalg.norm(error) > self.wrong_above_arcsec:
             self.wrong += 1

@@ -122,12 +122,12 @@ def _run(words: list[str], folder: Path, timeout_s: float) -> tuple[int, str, st
         )
     except OSError as error:
         raise SolverFault(f"the solver cannot be started: {words[0]} ({error.strerror})") from error
-    try:
-        out, err = process.communicate(timeout=timeout_s)
-    except subprocess.TimeoutExpired as error:
-        raise SolverFault(f"the solver took longer than {timeout_s:g} s") from error
-    finally:
-        with contextlib.suppress(ProcessLookupError, PermissionError):
-            os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
+    with process:
+        try:
+            out, err = process.communicate(timeout=timeout_s)
+        except subprocess.TimeoutExpired as error:
+            raise SolverFault(f"the solver took longer than {timeout_s:g} s") from error
+        finally:
+            with contextlib.suppress(ProcessLookupError, PermissionError):
+                os.killpg(process.pid, signal.SIGKILL)
     return process.returncode, out, err

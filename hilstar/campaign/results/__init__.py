@@ -1,0 +1,1 @@
+"""What a campaign's table says: the error budget, and what each parameter costs."""

@@ -1,4 +1,4 @@
-"""The page's addresses. What each answers, and what a page and its server say to each other, is in `docs/console.md`."""
+"""The page's addresses. What each answers, and what a page and its server say to each other, is in `docs/console-server.md`."""
 
 from __future__ import annotations
 

@@ -1,0 +1,58 @@
+"""What the frame loop itself spends on the operator's page: python -m tests.benchmarks.bench_console_feed."""
+
+from __future__ import annotations
+
+import time
+from types import SimpleNamespace
+
+import numpy as np
+
+import hilstar
+from hilstar.attitude.clock.timeline import Attitude
+from hilstar.attitude.receiver import PacketCounts
+from hilstar.console.feed.board import Board, Want
+from hilstar.console.feed.feed import Feed
+from hilstar.resources import resource_path
+from hilstar.run.shown import Shown
+from hilstar.run.summary import RunTally
+from tests.support.benches import ORION_Q
+
+FRAMES, PICTURES = 20_000, 300
+PERIOD_NS = 16_666_667
+
+
+def main() -> None:
+    """Measure, and print."""
+    with hilstar.load(resource_path("configs", "demo.toml")) as bench:
+        drawn = bench.draw(np.array(ORION_Q))
+        levels = drawn.levels
+        feed = Feed(board := Board.make(levels.nbytes))
+        feed.follow(SimpleNamespace(loop=SimpleNamespace(tally=RunTally()), packets=PacketCounts(), tally=RunTally()))
+        attitude = Attitude(np.array(ORION_Q), 5_000_000, False)
+        base_ns = time.monotonic_ns()
+        shown = [Shown(k, 0, attitude, drawn, swap_ns=base_ns + k * PERIOD_NS) for k in range(FRAMES)]
+        took_us = []
+        for frame in shown:
+            begin_ns = time.perf_counter_ns()
+            feed.see(frame)
+            took_us.append((time.perf_counter_ns() - begin_ns) / 1e3)
+        print(f"numbers of a frame: {np.median(took_us):.1f} us median, {np.percentile(took_us, 99):.1f} us p99")
+        board.want = Want(1, 2**62)
+        took_us = []
+        for k in range(PICTURES):
+            later = Shown(k, 0, attitude, drawn, swap_ns=base_ns + (FRAMES + 10 * k) * PERIOD_NS)
+            begin_ns = time.perf_counter_ns()
+            feed.see(later)
+            took_us.append((time.perf_counter_ns() - begin_ns) / 1e3)
+        size = "x".join(map(str, levels.shape[::-1]))
+        print(f"with a picture of {size}: {np.median(took_us):.0f} us median, {np.percentile(took_us, 99):.0f} us p99")
+        took_us = []
+        for _ in range(50):
+            begin_ns = time.perf_counter_ns()
+            bench.renderer.codes()
+            took_us.append((time.perf_counter_ns() - begin_ns) / 1e3)
+        print(f"levels read back for it, as from a screen: {np.median(took_us):.0f} us median")
+
+
+if __name__ == "__main__":
+    main()

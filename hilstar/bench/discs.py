@@ -18,7 +18,7 @@ from hilstar.scene.exposure_motion import MIDDLE_S, Motion
 from hilstar.scene.extended import DiscLight, ExtendedLight, LightMap, Shear
 from hilstar.scene.frame_motion import NODES_PER_SIGMA, POINT_SIGMA, Scan, Turn, slowed
 from hilstar.scene.sprites import Sprites
-from hilstar.sky.bodies.disc import AIR_TOP, Disc
+from hilstar.sky.bodies.disc import AIR_TOP, Disc, gauss_legendre
 from hilstar.sky.stars import Stars
 
 if TYPE_CHECKING:
@@ -104,7 +104,7 @@ class DiscPainter:
             return sprites
         length_sigma = turn_rad * self._px_per_rad / min(self.sigma_px)
         count = min(math.ceil(EXPOSED_PER_SIGMA * length_sigma) | 1, MAX_EXPOSED)
-        place, weight = np.polynomial.legendre.leggauss(count)
+        place, weight = gauss_legendre(count)
         maps = motion.icrs_to_image(place / 2 * motion.exposure_s, camera)
         poses = tuple(Pose(one, float(share / 2)) for one, share in zip(maps, weight, strict=True))
         return self.painted(sprites, stars, discs, View(camera, self.sigma_px, poses), when)
@@ -121,7 +121,7 @@ class DiscPainter:
         count = 1
         if length_sigma > POINT_SIGMA:
             count = min(math.ceil(NODES_PER_SIGMA * length_sigma + 1) | 1, max_poses)  # odd: one is in the middle
-        place, weight = np.polynomial.legendre.leggauss(count)
+        place, weight = gauss_legendre(count)
         times = zip(((place + 1) / 2 * scan.hold_s).tolist(), (weight / 2).tolist(), strict=True)
         attitudes = ((propagate(turn.q_icrs_to_cam, turn.rate_cam_rad_s, seconds), share) for seconds, share in times)
         poses = tuple(Pose(camera.cam_to_image @ to_matrix(q), share) for q, share in attitudes)

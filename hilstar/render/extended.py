@@ -14,7 +14,7 @@ from hilstar.scene.camera import Camera
 from hilstar.scene.extended import DiscLight, ExtendedLight, Glow, LightMap, Rectangle
 from hilstar.scene.rays import ray_shifts
 from hilstar.scene.tiles import Tiles, disc_tiles
-from hilstar.sky.bodies.disc import AIR_TOP, SOLAR_LIMB, Disc
+from hilstar.sky.bodies.disc import AIR_TOP, SOLAR_LIMB, Disc, gauss_legendre
 
 KEPT_TEXTURES = 4  # of maps and lenses: a bench has one lens, and few maps at a time
 LAWS = ("uniform", "lambert", "lunar-lambert", "limb-darkened")  # by their numbers in disc.frag
@@ -166,7 +166,7 @@ class ExtendedLayer:
 
 def _set_face(program: moderngl.Program, disc: Disc) -> None:
     """What a body's face is like, in a program of disc.frag."""
-    place, weight = np.polynomial.legendre.leggauss(NODES)
+    place, weight = gauss_legendre(NODES)
     program["node"] = ((place + 1) / 2).tolist()
     program["weight"] = (weight / 2).tolist()
     program["distance_radii"] = disc.distance_radii

@@ -74,26 +74,28 @@ def _seen(light: DiscLight, directions: FloatArray) -> FloatArray:
 def _disc_map(light: DiscLight, nodes: int) -> LightMap | None:
     """The sum of the disc's places, each spread as a star is; its air, if any, is too thin to be seen."""
     disc, camera, reach_px = light.disc, light.camera, footprint_px(light.sigma_px) / 2
-    directions, whole_sr = replace(disc, law="uniform").points(nodes)
-    x_px, y_px = camera.project(_seen(light, directions))
-    known = np.isfinite(x_px)
-    if not known.any():
+    x_px, y_px, law_sr = _places(light, disc, nodes)
+    whole = _places(light, replace(disc, law="uniform"), nodes) if light.covers else (x_px, y_px, law_sr)
+    if not len(whole[0]):
         return None
-    x_px, y_px, whole_sr = x_px[known], y_px[known], whole_sr[known]
-    edges = (x_px.min() - reach_px, y_px.min() - reach_px, x_px.max() + reach_px + 1, y_px.max() + reach_px + 1)
+    (left, right), (top, bottom) = ((float(part.min()), float(part.max())) for part in whole[:2])
+    edges = (left - reach_px, top - reach_px, right + reach_px + 1, bottom + reach_px + 1)
     region = clipped(edges, camera.resolution_px)
     if region is None:
         return None
     cover = None
     if light.covers:
-        cover = np.minimum(_spread(x_px, y_px, whole_sr * _px_per_sr(light), region, light.sigma_px), np.float32(1))
+        cover = np.minimum(_spread(*whole[:2], whole[2] * _px_per_sr(light), region, light.sigma_px), np.float32(1))
+    image = _spread(x_px, y_px, light.times * disc.normal_e_per_s_sr * law_sr, region, light.sigma_px)
+    return LightMap(image, (region[0], region[1]), 1.0, cover)
+
+
+def _places(light: DiscLight, disc: Disc, nodes: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Places of the face that are on any pixel, (n,) each: x and y, and the law's function times their steradian."""
     directions, law_sr = disc.points(nodes)
-    x_px, y_px = camera.project(_seen(light, directions))
+    x_px, y_px = light.camera.project(_seen(light, directions))
     known = np.isfinite(x_px)
-    rates = light.times * disc.normal_e_per_s_sr * law_sr[known]
-    return LightMap(
-        _spread(x_px[known], y_px[known], rates, region, light.sigma_px), (region[0], region[1]), 1.0, cover, disc.name
-    )
+    return (x_px, y_px, law_sr) if known.all() else (x_px[known], y_px[known], law_sr[known])
 
 
 def _px_per_sr(light: DiscLight) -> float:

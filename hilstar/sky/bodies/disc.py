@@ -14,7 +14,7 @@ The law gives a disc its shape, the body's magnitude its sum: `of_rate` scales t
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Literal
 
 import numpy as np
@@ -199,7 +199,7 @@ class Disc:
 
         A place has a longitude from the observer's meridian towards the Sun, and a latitude from the plane of both.
         """
-        node, weight = np.polynomial.legendre.leggauss(nodes)
+        node, weight = gauss_legendre(nodes)
         top = np.arccos(1 / self.distance_radii)
         # The limb ends latitudes as a square root does: evenly in an angle it is smooth.
         latitude, stretch = top * np.sin(node * np.pi / 2), top * np.cos(node * np.pi / 2) * np.pi / 2
@@ -214,6 +214,13 @@ class Disc:
         cosine, sine = np.cos(latitude)[:, None], np.broadcast_to(np.sin(latitude)[:, None], longitude.shape)
         place = np.stack([cosine * np.sin(longitude), sine, -cosine * np.cos(longitude)], axis=-1)
         return place.reshape(-1, 3), area.ravel()
+
+
+@lru_cache(maxsize=64)
+def gauss_legendre(count: int) -> tuple[FloatArray, FloatArray]:
+    """Places from -1 to 1 and weights (count,), kept: a frame asks for the same again."""
+    place, weight = np.polynomial.legendre.leggauss(count)
+    return place, weight
 
 
 def lunar_share(phase_deg: float) -> float:

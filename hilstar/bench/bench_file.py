@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 
 from hilstar.bench.config import GEOCENTRE, SOURCE, BenchConfig, config_of, parse_config
-from hilstar.bench.config.when import with_dates
+from hilstar.bench.config.when import UNIX, today, with_dates
 from hilstar.errors import InputError
 from hilstar.monitor.calibration import BUILT_IN
 from hilstar.reading import MAX_TOML_BYTES, read_bytes, read_text
@@ -46,7 +46,7 @@ def read_bench_file(path: Path) -> BenchFile:
 def bench_file_of(path: Path, text: str) -> BenchFile:
     """The bench file that `path` would be with this text. Raises InputError as `read_bench_file` does."""
     config = parse_config(path, text)
-    return BenchFile(path, text, config, _sha256(config, path.parent))
+    return BenchFile(path, text, today(config), _sha256(config, path.parent))
 
 
 def changed_file(file: BenchFile, tables: dict[str, Any]) -> BenchFile:
@@ -64,6 +64,11 @@ def dated(file: BenchFile, scale: str | None, first_ns: int) -> BenchFile:
         return replace(file, config=with_dates(file.config, scale, first_ns))
     except InputError as error:
         raise InputError(f"{file.path}: {error}") from error
+
+
+def at_moment(file: BenchFile, t_ns: int | None) -> BenchFile:
+    """The file for a moment that a person names: its stars are those of that day where t_ns counts from 1970."""
+    return file if t_ns is None or file.config.sky.epoch_utc != UNIX else dated(file, None, t_ns)
 
 
 def _sha256(config: BenchConfig, folder: Path) -> str:

@@ -6,7 +6,7 @@ import logging
 from pathlib import Path
 
 from hilstar.bench.config import GEOCENTRE, SOURCE, BenchConfig
-from hilstar.bench.config.when import epoch_utc_ns, jyear
+from hilstar.bench.config.when import DAY_NS, UNIX, epoch_utc_ns, jyear
 from hilstar.bench.discs import POINT_PX
 from hilstar.bench.satellites import bench_satellites
 from hilstar.reading import read_text
@@ -36,12 +36,15 @@ def moving_sky(config: BenchConfig, folder: Path, optics: Optics) -> MovingSky:
         raise AssertionError("a file with an observer has a date")
     # A source's own dates count from 1970, and its stars are those of its day.
     start_ns = round((config.sky.epoch_jyear - jyear(utc_ns)) * YEAR_NS)
+    unix = config.sky.epoch_utc == UNIX
+    if unix:
+        start_ns = round(start_ns / DAY_NS) * DAY_NS  # a Julian year is good to milliseconds
     orbit = config.spacecraft.orbit or GEOCENTRE
     observer = Geocentre() if orbit in {GEOCENTRE, SOURCE} else orbit_file(folder / orbit, utc_ns + start_ns)
     names = body_names(config)
     sky = config.sky
     rates = bodies_electrons_per_s(names, sky.brightness, optics, Photometry(sky.zero_point, sky.passband_weighting))
-    moving = MovingSky(Kernel(), observer, utc_ns, BodyLight(names, bodies_bv_mag(names), rates), start_ns)
+    moving = MovingSky(Kernel(), observer, utc_ns, BodyLight(names, bodies_bv_mag(names), rates), start_ns, unix)
     moving.satellites = bench_satellites(config, folder, observer, (utc_ns, utc_ns + start_ns), optics)
     return moving
 

@@ -91,8 +91,9 @@ class SkySettings(Table, frozen=True):
         str | None,
         Meta(
             description='The UTC of t = 0 (`t_ns` = 0), such as `"2026-11-21T00:00:00Z"`. It takes the place of `epoch_jyear`, '
-            "and bodies are where they are at each frame's time. `\"source\"`: the log's own dates (AEM, SPICE, ROS), in "
-            "`replay`, `simulate --log` and `attitude`.",
+            'and bodies are where they are at each frame\'s time. `"unix"`: `t_ns` is Unix time, as `time.time_ns()` has it, '
+            'leap seconds and all; stars are those of the day of the run. `"source"`: the log\'s own dates (AEM, SPICE, ROS), '
+            "in `replay`, `simulate --log` and `attitude`.",
             extra={"default": "none"},
         ),
     ] = None

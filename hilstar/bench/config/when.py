@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 import warnings
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from hilstar.units import NS_PER_S
 
 UNIX_JD, DAY_NS = 2_440_587.5, 86_400 * NS_PER_S
 EPOCH_KEY = "[sky] epoch_utc ="
-FROM_SOURCE = "source"
+FROM_SOURCE, UNIX = "source", "unix"
 TT_FROM_TAI_NS, TAI_FROM_GPS_NS = 32_184_000_000, 19 * NS_PER_S  # TDB is TT within 2 ms
 SCALES = ("UTC", "TAI", "TT", "TDB", "GPS")
 
@@ -25,6 +26,8 @@ def epoch_utc_ns(config: BenchConfig) -> int | None:
     """The UTC of t = 0, ns since 1970 where every day has 86400 s; None where the file has none. Raises InputError."""
     if config.sky.epoch_utc is None:
         return None
+    if config.sky.epoch_utc == UNIX:
+        return 0
     if config.sky.epoch_utc == FROM_SOURCE:
         raise InputError(
             f'{EPOCH_KEY} "{FROM_SOURCE}" is for a log that has dates (replay, simulate --log, attitude LOG);'
@@ -68,7 +71,7 @@ def with_epoch(config: BenchConfig, path: Path, tables: dict[str, Any]) -> Bench
             f"{path}: [attitude] use_velocity = true adds Basilisk's velocity to that of [spacecraft] orbit; write"
             ' use_velocity = false, or orbit = "geocentre"'
         )
-    if config.sky.epoch_utc == FROM_SOURCE:
+    if config.sky.epoch_utc in {FROM_SOURCE, UNIX}:
         return config
     try:
         utc_ns = epoch_utc_ns(config)
@@ -105,8 +108,13 @@ def with_dates(config: BenchConfig, scale: str | None, first_ns: int) -> BenchCo
     """The same for a source that gives the dates: its first time, ns since 1970 on a time scale (see `Conventions`).
 
     `epoch_utc` is then the UTC of its t_ns = 0 by the leap seconds of that day, and `epoch_jyear` the beginning of the day: for
-    it stars are placed. Unchanged where the file has a date of its own. Raises InputError for a source without dates.
+    it stars are placed. Unchanged where the file has a date of its own. Raises InputError for a source without dates, and for
+    one whose times are none of Unix where the file says that they are.
     """
+    if config.sky.epoch_utc == UNIX:
+        if scale in SCALES and scale != "UTC":
+            raise InputError(f'{EPOCH_KEY} "{UNIX}": the times of this log are {scale}; write "{FROM_SOURCE}"')
+        return _on_day(config, UNIX, first_ns)
     if config.sky.epoch_utc != FROM_SOURCE:
         return config
     if scale not in SCALES:
@@ -114,10 +122,21 @@ def with_dates(config: BenchConfig, scale: str | None, first_ns: int) -> BenchCo
             f'{EPOCH_KEY} "{FROM_SOURCE}": the times of this log are no dates in {", ".join(SCALES[:-1])} or {SCALES[-1]};'
             " write the UTC of t_ns = 0"
         )
+    if scale == "UTC":
+        return _on_day(config, UNIX, first_ns)
     ahead_ns = _ahead_of_utc_ns(scale, first_ns)
-    day_ns = (first_ns - ahead_ns) // DAY_NS * DAY_NS
-    zero = str(np.datetime64(-ahead_ns, "ns"))
-    return msgspec.structs.replace(config, sky=msgspec.structs.replace(config.sky, epoch_utc=zero, epoch_jyear=jyear(day_ns)))
+    return _on_day(config, str(np.datetime64(-ahead_ns, "ns")), first_ns - ahead_ns)
+
+
+def today(config: BenchConfig) -> BenchConfig:
+    """The same with stars of the present day, by this machine's clock, where t_ns counts from 1970."""
+    return _on_day(config, UNIX, time.time_ns()) if config.sky.epoch_utc == UNIX else config
+
+
+def _on_day(config: BenchConfig, epoch_utc: str, utc_ns: int) -> BenchConfig:
+    """The same with this `epoch_utc`, and stars placed for the beginning of a UTC's day."""
+    day = jyear(utc_ns // DAY_NS * DAY_NS)
+    return msgspec.structs.replace(config, sky=msgspec.structs.replace(config.sky, epoch_utc=epoch_utc, epoch_jyear=day))
 
 
 def jyear(utc_ns: int) -> float:
@@ -129,8 +148,6 @@ def jyear(utc_ns: int) -> float:
 
 def _ahead_of_utc_ns(scale: str, t_ns: int) -> int:
     """How far a time scale is ahead of UTC at a time of it, ns since 1970."""
-    if scale == "UTC":
-        return 0
     import erfa
 
     tai_from_ns = {"TAI": 0, "GPS": -TAI_FROM_GPS_NS}.get(scale, TT_FROM_TAI_NS)

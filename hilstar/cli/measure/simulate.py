@@ -44,7 +44,7 @@ def simulate(
     """Simulate the virtual tracker's image of the sky, with noise."""
     import numpy as np
 
-    from hilstar.bench.bench_file import read_bench_file
+    from hilstar.bench.bench_file import at_moment, read_bench_file
     from hilstar.bench.truth import clipped_in
     from hilstar.twin import exposure_files as files
     from hilstar.twin.batch import faulty_exposure
@@ -66,7 +66,7 @@ def simulate(
     wrong = optional_scenario(scenario)
     check_files([scenario], targets, file)
     q, t_ns = parse_attitude("simulate", radec, quaternion), parse_at("simulate", at, file.config, wrong is not None)
-    rate_rad_s = parse_rate(rate) if rate else np.zeros(3)
+    file, rate_rad_s = at_moment(file, t_ns), parse_rate(rate) if rate else np.zeros(3)
     with Simulator(file) as simulator:
         frame_noise = FrameNoise(noise, seed)
         motion = simulator.motion(q, rate_rad_s, t_ns)

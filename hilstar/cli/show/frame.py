@@ -36,7 +36,7 @@ def frame(
     import numpy as np
 
     from hilstar.bench import frame_files as files
-    from hilstar.bench.bench_file import read_bench_file
+    from hilstar.bench.bench_file import at_moment, read_bench_file
     from hilstar.bench.build import open_bench
     from hilstar.bench.faults.views import effects_at
     from hilstar.bench.truth import clipped_in
@@ -51,6 +51,7 @@ def frame(
     check_ending("--preview", preview, PNG)
     file = read_bench_file(bench_file)
     t_ns, wrong = parse_at("frame", at, file.config, scenario is not None), optional_scenario(scenario)
+    file = at_moment(file, t_ns)
     check_files([scenario], targets, file)
     with open_bench(file) as bench:
         if explain:

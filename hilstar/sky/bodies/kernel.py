@@ -17,6 +17,7 @@ from hilstar.units import LIGHT_KM_S
 
 DAY_S = 86_400.0
 UNIX_JD = 2_440_587.5
+TT_FROM_TAI_S = 32.184
 NS_PER_DAY = 86_400 * 10**9
 INSTALL = "pip install 'hilstar[bodies]'"
 
@@ -51,13 +52,14 @@ class Tdb:
 
 
 def tdb_of_utc(utc_ns: int) -> Tdb:
-    """The moment of a UTC, ns since 1970 where every day has 86400 s, within 2 microseconds (ERFA's leap seconds, `dtdb`)."""
+    """The moment of a UTC, ns since 1970 where every day has 86400 s, within 2 microseconds (ERFA's `dat` and `dtdb`)."""
     days, rest_ns = divmod(utc_ns, NS_PER_DAY)
     whole, part = UNIX_JD + days, rest_ns / NS_PER_DAY
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", erfa.ErfaWarning)  # before 1960, and years after the last known leap second
-        tt = erfa.taitt(*erfa.utctai(whole, part))
-    return Tdb(whole, float(tt[0] - whole + tt[1] + erfa.dtdb(*tt, part, 0.0, 0.0, 0.0) / DAY_S))
+        # Not `utctai`, whose day that ends with a leap second is stretched over 86401 s.
+        tt_part = part + (float(erfa.dat(*erfa.jd2cal(whole, part))) + TT_FROM_TAI_S) / DAY_S
+    return Tdb(whole, tt_part + float(erfa.dtdb(whole, tt_part, part, 0.0, 0.0, 0.0)) / DAY_S)
 
 
 class Kernel:

@@ -94,15 +94,18 @@ NOTHING = BodyLight((), np.empty(0), np.empty(0))
 class MovingSky:
     """Bodies seen from an orbit; t_ns = 0 is the UTC `utc_ns`, and stars are placed for t_ns = `start_ns`.
 
-    Times that its methods call `since_ns` count from `start_ns`.
+    Times that its methods call `since_ns` count from `start_ns`. Where t_ns is `unix` time, every UTC day has 86400 s of it,
+    leap seconds or not, and `start_ns` is the beginning of one.
 
     Raises InputError where the ephemeris ends before that date, or the orbit does.
     """
 
-    def __init__(self, kernel: Kernel, orbit: Orbit, utc_ns: int, bodies: BodyLight = NOTHING, start_ns: int = 0) -> None:
+    def __init__(
+        self, kernel: Kernel, orbit: Orbit, utc_ns: int, bodies: BodyLight = NOTHING, start_ns: int = 0, unix: bool = False
+    ) -> None:
         self.names = names = bodies.names
         self._kernel, self._orbit, self._utc_ns, self._start_ns = kernel, orbit, utc_ns + start_ns, start_ns
-        self._bodies = bodies
+        self._bodies, self._unix = bodies, unix
         self._epoch = tdb_of_utc(self._utc_ns)
         self._tracked = ("Sun", *(name for name in names if name != "Sun"))
         self._drawn = [self._tracked.index(name) for name in names]
@@ -276,7 +279,7 @@ class MovingSky:
         }
 
     def _compute_span(self, span: int) -> Span:
-        date = self._epoch.after(span * SPAN_S)
+        date = tdb_of_utc(self._utc_ns + span * SPAN_NS) if self._unix else self._epoch.after(span * SPAN_S)
         part = date.part + CUBIC_AT * SPAN_S / DAY_S
         earth_km, earth_km_s = self._kernel.earth(date.whole, part)
         seen_km = [self._kernel.seen_km(name, date.whole, part, earth_km) for name in self._tracked]
@@ -359,8 +362,8 @@ class MovingSky:
         if abs(since_ns) > YEAR_NS and not self._told:
             self._told = True
             log.warning(
-                "t_ns = %d is %.1f years from [sky] epoch_utc, which is the UTC of t_ns = 0: proper motion and parallax are"
-                " those of epoch_utc",
+                "t_ns = %d is %.1f years from the date of the stars, whose proper motion and parallax stay: [sky] epoch_utc is"
+                ' the UTC of t_ns = 0, or "unix" where t_ns counts from 1970',
                 t_ns,
                 since_ns / YEAR_NS,
             )

@@ -144,8 +144,7 @@ def _start_worker(file: BenchFile, scenario: Scenario | None) -> None:
     _simulator = Simulator(file)
     if scenario is not None:
         _faults = simulator_view(_simulator, scenario)
-        for fault in scenario.faults:
-            _faults.prepare(fault)
+        _faults.prepared(scenario)
 
 
 def _expose_to_file(motion: Motion, noise: FrameNoise, number: int, directory: Path, pieces: tuple[Piece, ...] = ()) -> None:

@@ -86,6 +86,10 @@ def _check_meaning(config: BenchConfig, path: Path) -> None:
     ]
     if config.verify.true_geometry is not None and ideal:
         raise InputError(f"{path}: [verify] true_geometry takes the place of {ideal[0]}; leave one of them out")
+    if config.faults.endpoint is not None and config.faults.endpoint == config.attitude.address:
+        raise InputError(
+            f"{path}: [faults] endpoint = {config.faults.endpoint}: the attitude comes from there; write another port"
+        )
     try:
         check_road(config.attitude)
     except InputError as error:

@@ -12,13 +12,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
-from hilstar.bench.faults.kinds import Fault
+from hilstar.bench.faults.kinds import Fault, Glow, Gradient, MeasuredMap
 from hilstar.bench.faults.scenario import NO_SCENARIO, Scenario, lasts_ns
 from hilstar.errors import InputError
 from hilstar.units import NS_PER_S
 
 MAX_ON = 64
 MAX_ASKED = 256
+SURFACES = (Glow, Gradient, MeasuredMap)  # each is drawn over the whole image
+MAX_SURFACES_ON = 8
 FILE = "file"  # who starts what a scenario has a time for
 
 
@@ -147,6 +149,9 @@ class FaultDesk:
         with self._lock:
             if any(planned.fault.name == name for planned in (*self._on, *self._asked)) and name not in self._stops:
                 raise InputError(f"the fault {name!r} is on already; stop it first, or give another name")
+            there = sum(isinstance(planned.fault, SURFACES) for planned in (*self._on, *self._asked))
+            if isinstance(wanted.fault, SURFACES) and there >= MAX_SURFACES_ON:
+                raise InputError(f"{there} gradients, glows and maps are on or wait; stop one first")
             if len(self._on) >= MAX_ON or len(self._asked) >= MAX_ASKED:
                 raise InputError(f"{len(self._on)} faults are on and {len(self._asked)} wait; stop one first")
             self._asked.append(wanted)

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta
 
-from hilstar.bench.faults.kinds import KINDS, REFERENCE, TYPE_WORDS, Fault, fault_of
+from hilstar.bench.faults.kinds import KINDS, REFERENCE, TYPE_WORDS, Fault, Gradient, MeasuredMap, fault_of
 from hilstar.errors import InputError, shortened
 from hilstar.reading import MAX_TOML_BYTES, parse_toml, read_text
 from hilstar.toml_tables import Kind, Table, explained
@@ -17,6 +17,7 @@ from hilstar.units import NS_PER_S
 
 ADVICE = f"give the path of a scenario file (see {REFERENCE})"
 MAX_FAULTS = 256
+MAX_SURFACES = 16  # 8 MB each on a full HD monitor
 
 
 class Head(Table, frozen=True):
@@ -72,6 +73,9 @@ def parse_scenario(path: Path, text: str) -> Scenario:
                 f'{path}: {_place(number, table)} another fault has name = "{fault.name}"; write a name of its own'
             )
         faults.append(fault)
+    wide = sum(isinstance(fault, Gradient | MeasuredMap) for fault in faults)
+    if wide > MAX_SURFACES:
+        raise InputError(f"{path}: has {wide} gradients and maps, each an image of its own; write at most {MAX_SURFACES}")
     if not faults:
         raise InputError(f"{path}: has no fault; write [[fault]] tables, with kind = one of {', '.join(KINDS)}")
     return Scenario(path, text, head.seed, tuple(faults), path.parent)

@@ -32,7 +32,7 @@ class Timetable:
     def __init__(self, scenario: Scenario, view: FaultView, exposure_s: float) -> None:
         self._exposure_ns = round(exposure_s * NS_PER_S)
         self._entries = []
-        for number, fault in enumerate(map(view.prepare, scenario.faults), start=1):
+        for number, fault in enumerate(view.prepared(scenario), start=1):
             if fault.at_s is not None:
                 begin_ns, length_ns = round(fault.at_s * NS_PER_S), lasts_ns(fault)
                 self._entries.append(Entry(number, fault, begin_ns, None if length_ns is None else begin_ns + length_ns))

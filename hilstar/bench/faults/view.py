@@ -41,7 +41,6 @@ from hilstar.scene.sprites import AddedLight, Sprites, pack_sprites
 from hilstar.sky.stars import Stars
 from hilstar.units import NS_PER_S, flux_ratio, magnitude
 
-MAX_MAPS = 4  # gradients and measured maps at once: as many as the renderer keeps
 TRACK_SEED = 2  # beside the number of an exposure
 TRACK_BV_MAG = 0.0  # a track has no colour; its magnitude is that of a white star of as many electrons
 KEPT_MAPS, KEPT_BURSTS = 16, 64
@@ -91,6 +90,16 @@ class FaultView:
         if isinstance(fault, Place) and (fault.tracker_px is not None or fault.screen_px is not None):
             self._check_place(fault)
         return fault
+
+    def prepared(self, scenario: Scenario) -> list[Fault]:
+        """The faults of a scenario as they are drawn. Raises InputError with the file and the fault."""
+        found = []
+        for fault in scenario.faults:
+            try:
+                found.append(self.prepare(fault))
+            except InputError as error:
+                raise InputError(f"{scenario.path}: [[fault]] ({fault.name}): {error}") from error
+        return found
 
     def _check_place(self, fault: Place) -> None:
         camera, place = self._source(fault)
@@ -230,17 +239,15 @@ class FaultView:
         return {one.fault.star: 1 - one.share for one in now if isinstance(one.fault, StarGone) and one.fault.star is not None}
 
     def surfaces(self, now: Sequence[Now], q_icrs_to_cam: FloatArray) -> list[extended.ExtendedLight]:
-        """Stray light; of maps the first MAX_MAPS."""
+        """Stray light."""
         found: list[extended.ExtendedLight] = []
-        maps = 0
         for one in now:
             fault = one.fault
             if isinstance(fault, Glow):
                 found.append(self._glow(fault, one.share, q_icrs_to_cam))
-            elif isinstance(fault, Gradient | MeasuredMap) and maps < MAX_MAPS:
+            elif isinstance(fault, Gradient | MeasuredMap):
                 light = self._map(fault)
                 found.append(light if one.share == 1 else replace(light, times=light.times * one.share))
-                maps += 1
         return found
 
     def _glow(self, fault: Glow, share: float, q_icrs_to_cam: FloatArray) -> extended.Glow:

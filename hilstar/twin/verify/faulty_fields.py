@@ -63,7 +63,7 @@ class FaultyFields:
     def __init__(self, twin: Twin, scenario: Scenario, rng: np.random.Generator) -> None:
         self._twin, self._rng = twin, rng
         self._view: FaultView = display_view(twin.bench, scenario)
-        self._faults = [self._view.prepare(fault) for fault in scenario.faults]
+        self._faults = self._view.prepared(scenario)
         self._finder: StarFinder = star_finder(twin.bench, twin.monitor_px_per_px)
         self._view_rad = twin.camera.field_radius_rad(0.0)
 

@@ -119,6 +119,15 @@ def test_memory_is_bounded_whoever_asks():
     assert len(desk.at(10**12)) <= MAX_ON
 
 
+def test_only_some_stray_light_is_on_at_once_whoever_asks():
+    desk, _ = desk_of()
+    for number in range(8):
+        desk.ask(fault_of({"kind": "gradient", "name": f"{number}", "electrons": 5}), "stream")
+    with pytest.raises(InputError, match="8 gradients, glows and maps are on or wait"):
+        desk.ask(fault_of({"kind": "glow", "name": "sun", "tracker_px": [0, 0], "electrons": 5}), "stream")
+    desk.ask(blank("cover"), "stream")
+
+
 def test_a_fault_between_two_frames_of_a_slow_run_is_reported_as_missed():
     desk, heard = desk_of(blank("short", at_s=1.0, for_s=0.1))
     desk.at(0)

@@ -87,6 +87,7 @@ def test_a_wrong_fault_is_refused_with_its_key_and_what_to_write(change, said):
             '[[fault]] 2 (a): another fault has name = "a"',
         ),
         ("[[fault]", "not TOML"),
+        ("\n".join(f'[[fault]]\nkind = "gradient"\nname = "{k}"\nelectrons = 1' for k in range(17)), "17 gradients and maps"),
         (
             '[[fault]]\nkind = "cosmic-rays"\nname = "b"\nnumber = 5000\nelectrons = 1\nlength_px = 500',
             "write at most 20000 px together",

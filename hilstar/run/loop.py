@@ -86,13 +86,12 @@ class FrameLoop:
         self._presence.see(attitude, stale)
         on_screen = self.pacer.operator.look()
         attitude = self._shown_attitude(t_ns, attitude, stale)
-        effects, faults = None, self._faults
+        effects, faults, stays = None, self._faults, None
         if faults is not None:
             effects = faults.at(t_ns, attitude)
             if faults.drops(effects, number):
                 return None
-            attitude = faults.attitude(effects, t_ns, attitude)
-        stays = None if faults is None else faults.frozen_frame(effects, self._bench)
+            attitude, stays = faults.attitude(effects, t_ns, attitude), faults.frozen_frame(effects, self._bench)
         sprites = None if stays is not None else self._sprites(attitude, t_ns, effects)
         if self._gives_up(number, moment):
             return None

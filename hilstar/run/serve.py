@@ -207,15 +207,20 @@ def replay(bench: Bench, play: Play, sink: FrameSink = ignore, outlet: Outlet | 
     bench.warm_up()
     begin_ns = time.monotonic_ns()
     with stop_on_signal(loop.stop), loop.watch:
-        if play.paced:
-            loop.paced(Limit(slots=play.frame_count), draw_slot)
-        else:
-            for slot in range(play.frame_count):
-                if loop.stop.is_set():
-                    break
-                draw_slot(Moment(slot))
+        _draw_all(play, loop, draw_slot)
     duration_s = (time.monotonic_ns() - begin_ns) / NS_PER_S
     summary = loop.tally.summary(duration_s, counts, bench.renderer.gl_renderer)
     told = outlet.notices.counts()
     summary = replaced(summary, faults=UNSET if faults is None else faults.summary())
     return replaced(summary, stale_events=loop.gate.events, events=told, screen=loop.screen_summary())
+
+
+def _draw_all(play: Play, loop: FrameLoop, draw_slot: Callable[[Moment], Shown | None]) -> None:
+    """All frames of a replay, paced or as fast as possible, until a signal."""
+    if play.paced:
+        loop.paced(Limit(slots=play.frame_count), draw_slot)
+        return
+    for slot in range(play.frame_count):
+        if loop.stop.is_set():
+            return
+        draw_slot(Moment(slot))

@@ -153,15 +153,17 @@ class Simulator:
             sprites = faults.sprites()
         if self.moving is not None:  # the Sun has more than a detector can be asked for; its wells are full long before
             mean_e = np.minimum(mean_e, BODY_MAX_E)
-        if rng is None:
-            dn = self.detector.expose_noiseless(mean_e, tracker.exposure_s)
-        else:
-            dn = self.detector.expose(mean_e, tracker.exposure_s, rng)
-        truth = exposure_truth(self, motion, stars, sprites, mean_e)
+        dn, truth = self._digitised(mean_e, rng), exposure_truth(self, motion, stars, sprites, mean_e)
         if faults is None:
             return Exposure(motion, dn, mean_e, truth, sprites.capped)
         truth = np.concatenate([truth, faults.added_truth()])
         return Exposure(motion, dn, mean_e, truth, sprites.capped, faults.names)
+
+    def _digitised(self, mean_e: FloatArray, rng: np.random.Generator | None) -> npt.NDArray[np.uint16]:
+        exposure_s = self.config.tracker.exposure_s
+        if rng is None:
+            return self.detector.expose_noiseless(mean_e, exposure_s)
+        return self.detector.expose(mean_e, exposure_s, rng)
 
     def _linear(self, sprites: Sprites) -> FloatArray:
         """Electrons per second of each pixel (h, w) by sprites."""

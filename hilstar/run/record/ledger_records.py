@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 import msgspec
 
+from hilstar.attitude.clock.timeline import Attitude
 from hilstar.bench.frame import Bench
 from hilstar.run.shown import Shown
 
@@ -161,20 +162,24 @@ def frame_record(shown: Shown, light_ns: int, missed: int, below_step: int) -> F
         x, y, z = drawn.rate_cam_rad_s.tolist()
         record.rate = (x, y, z)
     if attitude is not None:
-        w, x, y, z = attitude.q_icrs_to_cam.tolist()
-        record.q = (w, x, y, z)
-        if attitude.velocity_km_s is not None:
-            x, y, z = attitude.velocity_km_s.tolist()
-            record.velocity_km_s = (x, y, z)
-        if attitude.place_km is not None:
-            x, y, z = attitude.place_km.tolist()
-            record.place_km = (x, y, z)
-        record.attitude_sequence = attitude.sequence
-        record.attitude_t_ns = _within_64_bits(light_ns - attitude.age_ns)
-        record.receive_ns = attitude.received_ns
-        record.age_ns = _within_64_bits(attitude.age_ns)
-        record.prediction_ns = attitude.prediction_ns
+        _note_attitude(record, attitude, light_ns)
     return record
+
+
+def _note_attitude(record: FrameRecord, attitude: Attitude, light_ns: int) -> None:
+    w, x, y, z = attitude.q_icrs_to_cam.tolist()
+    record.q = (w, x, y, z)
+    if attitude.velocity_km_s is not None:
+        x, y, z = attitude.velocity_km_s.tolist()
+        record.velocity_km_s = (x, y, z)
+    if attitude.place_km is not None:
+        x, y, z = attitude.place_km.tolist()
+        record.place_km = (x, y, z)
+    record.attitude_sequence = attitude.sequence
+    record.attitude_t_ns = _within_64_bits(light_ns - attitude.age_ns)
+    record.receive_ns = attitude.received_ns
+    record.age_ns = _within_64_bits(attitude.age_ns)
+    record.prediction_ns = attitude.prediction_ns
 
 
 def below_step(bench: Bench, shown: Shown) -> int:

@@ -6,7 +6,7 @@ import logging
 from pathlib import Path
 
 from hilstar.bench.config import GEOCENTRE, SOURCE, BenchConfig
-from hilstar.bench.config.when import DAY_NS, UNIX, epoch_utc_ns, jyear
+from hilstar.bench.config.when import DAY_NS, UNIX, epoch_utc_ns, from_source, jyear
 from hilstar.bench.discs import POINT_PX
 from hilstar.bench.satellites import bench_satellites
 from hilstar.reading import read_text
@@ -79,6 +79,14 @@ def body_names(config: BenchConfig) -> tuple[str, ...]:
         *(("Moon",) if bodies.moon else ()),
         *(PLANETS if bodies.planets else ()),
     )
+
+
+def observer_lines(config: BenchConfig) -> list[str]:
+    """A line where it is the source of the attitudes that says from where the sky is seen."""
+    if not from_source(config):
+        return []
+    where = "the sky is seen from the Earth's centre, without the Earth"
+    return [f'[spacecraft] orbit = "{SOURCE}": until a message has said where the spacecraft is, {where}']
 
 
 def wide_bodies(moving: MovingSky | None, camera: Camera, t_ns: int | None = None) -> list[str]:

@@ -7,7 +7,7 @@ import csv
 import pytest
 
 from hilstar.study.bodies.cost import SCENES
-from hilstar.study.bodies.run import run
+from hilstar.study.bodies.run import QUICK_BENCHES, run
 from hilstar.study.bodies.size import PHASES_DEG, QUICK_RADII_PX
 
 
@@ -25,7 +25,7 @@ def study(tmp_path_factory):
 
 def test_each_scene_is_timed_against_the_same_frame_without_bodies(study):
     rows = {row["scene"]: row for row in study[1]["bodies_cost"]}
-    assert list(rows) == [scene.name for scene in SCENES]
+    assert list(rows) == [scene.name for scene in SCENES if scene.bench in QUICK_BENCHES]
     shown = {name: row["discs"].split() for name, row in rows.items() if row["discs"]}
     assert shown["Moon in view, 55 px"] == ["Moon"]
     assert shown["Earth fills the field"] == ["Earth"]

@@ -47,7 +47,7 @@ LedgerSplit = Annotated[
 def explain_bench(bench: Any, t_ns: int | None = None) -> None:
     """Say where the stars come from, what was chosen within the tolerance, and which bodies are more than points at a time."""
     from hilstar.bench.effort import explain
-    from hilstar.bench.moving import wide_bodies
+    from hilstar.bench.moving import observer_lines, wide_bodies
     from hilstar.bench.satellites import satellite_lines
 
     for note in bench.stars.catalog.notes:
@@ -55,6 +55,7 @@ def explain_bench(bench: Any, t_ns: int | None = None) -> None:
     moving = bench.moving
     for line in [
         *explain(bench.effort, bench.config.render),
+        *observer_lines(bench.config),
         *wide_bodies(moving, bench.camera, t_ns),
         *satellite_lines(moving, t_ns),
     ]:

@@ -313,3 +313,19 @@ def test_a_log_without_dates_gives_none(bodies_file):
     done = run_hilstar_here("replay", bodies_file, bodies_file.parent / "log.csv", "--headless")
     assert done.returncode == 2
     assert "are no dates in UTC, TAI, TT, TDB or GPS" in done.stderr and done.stderr.count("\n") == 1
+
+
+def test_without_a_source_s_message_the_earth_is_not_there_and_explain_says_so(small_bench_file):
+    source = '[sky.bodies]\nearth = true\n[spacecraft]\norbit = "source"\n[attitude]\nsource = "vizard"\n'
+    small_bench_file.write_text(small_bench_file.read_text() + DATED + source)
+    folder = small_bench_file.parent
+    done = run_hilstar_here("frame", small_bench_file, "--radec", MOON, "--truth", folder / "t.csv", "--explain")
+    assert done.returncode == 0, done.stderr
+    assert "seen from the Earth's centre, without the Earth" in done.stderr
+    assert "Earth" not in {row["name"] for row in read_rows(folder / "t.csv")}
+    (folder / "station.tle").write_text(STATION_TLE)
+    text = small_bench_file.read_text().replace('orbit = "source"', 'orbit = "station.tle"').replace('source = "vizard"', "")
+    text = text.replace("2026-11-21T00:00:00Z", STATION_UTC)
+    small_bench_file.write_text(text)
+    from_orbit = run_hilstar_here("frame", small_bench_file, "--radec", MOON, "--truth", folder / "t.csv", "--explain")
+    assert "Earth: 5" in from_orbit.stderr and "drawn as a disc" in from_orbit.stderr, from_orbit.stderr

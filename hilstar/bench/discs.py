@@ -32,6 +32,7 @@ MAX_POSED_PX = 120  # of a radius: a larger disc is drawn once, in the middle of
 # Of a disc in an exposure, to a sigma of the camera's way: its limb is then a chain of edges 1.6 sigma apart at most.
 EXPOSED_PER_SIGMA = 1.0
 MAX_EXPOSED = 63
+LIMB_PLACES = 24  # of a disc that may be hidden: one beside another hides their outline as a whole
 LATTICE = 9  # places along each side of a disc's rectangle that are asked whether they clip
 
 
@@ -92,7 +93,8 @@ class DiscPainter:
     def _near(self, icrs_to_image: FloatArray, when: When, more_rad: float) -> list[Disc]:
         """Discs that may be on the image at an attitude (3, 3), or within `more_rad` of that, nearest first."""
         reach_rad, wide_rad = self._reach_rad + more_rad, POINT_PX / self._px_per_rad
-        return self._moving.discs(icrs_to_image[2], reach_rad, wide_rad, when.t_ns, when.velocity_km_s, when.place_km)
+        found = self._moving.discs(icrs_to_image[2], reach_rad, wide_rad, when.t_ns, when.velocity_km_s, when.place_km)
+        return [disc for k, disc in enumerate(found) if not k or not _hidden(disc, found[:k])]
 
     def exposed(self, sprites: Sprites, stars: Stars, motion: Motion, when: When) -> Sprites:
         """The sprites of an exposure's `stars` without what discs hide, and with the discs' mean light."""
@@ -220,6 +222,15 @@ class DiscPainter:
         with np.errstate(invalid="ignore"):  # NaN: behind the camera
             inside = (np.abs(x_px - (width - 1) / 2) <= width / 2) & (np.abs(y_px - (height - 1) / 2) <= height / 2)
         return float(light.disc.radiance(places[inside]).max(initial=0.0))
+
+
+def _hidden(disc: Disc, nearer: list[Disc]) -> bool:
+    """Whether others hide a disc: its middle and all of its limb."""
+    places = np.vstack([disc.direction, disc.limb(LIMB_PLACES)])
+    through = np.ones(len(places))
+    for one in nearer:
+        through *= one.transmission(places)
+    return bool(through.max() < HIDDEN)
 
 
 def disc_stars(stars: Stars, names: Iterable[str]) -> IntArray:

@@ -15,6 +15,7 @@ from hilstar.sky.bodies.disc import Disc
 # Of the Gaussian and a pixel together, in a radius: below, limb and middle are not apart and disc.frag is off by 1 % at 5.5.
 SMALL_SIGMAS = 8.0
 NODES_A_SIGMA = 4.0  # along a radius: places in the face's middle are then 0.8 sigma apart
+WHOLE = 0.999  # of a pixel: the rest is the sum's error, and the Sun behind it may be a billion times white
 MIN_NODES = 10  # 1e-4 of the light
 
 
@@ -85,7 +86,8 @@ def _disc_map(light: DiscLight, nodes: int) -> LightMap | None:
         return None
     cover = None
     if light.covers:
-        cover = np.minimum(_spread(*whole[:2], whole[2] * _px_per_sr(light), region, light.sigma_px), np.float32(1))
+        share = _spread(*whole[:2], whole[2] * _px_per_sr(light), region, light.sigma_px)
+        cover = np.where(share > WHOLE, np.float32(1), share)
     image = _spread(x_px, y_px, light.times * disc.normal_e_per_s_sr * law_sr, region, light.sigma_px)
     return LightMap(image, (region[0], region[1]), 1.0, cover, disc.name)
 

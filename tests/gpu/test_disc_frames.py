@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -133,6 +134,14 @@ def test_a_nearer_disc_hides_a_farther_one_and_covers_all_of_it():
         alone = gl.linear().astype(float)
     assert np.abs(got - wanted).max() < PIXEL_LIMIT * wanted.max()
     assert got[38:44, 42:48] == pytest.approx(alone[38:44, 42:48], rel=1e-5)  # seven pixels within the limb
+
+
+def test_a_disc_that_others_hide_as_a_whole_is_none():
+    """The Sun in a total eclipse is neither drawn nor listed, and comes back at its last contact."""
+    moon = disc(20.0, 170.0, (45.0, 41.0))
+    for sun, seen in ((disc(19.0, 0.0, (45.5, 41.0), "Sun"), 1), (disc(19.0, 0.0, (47.0, 41.0), "Sun"), 2)):
+        painter = DiscPainter(SimpleNamespace(discs=lambda *_, sun=sun: [moon, sun]), CAMERA, 10, SIGMA)
+        assert len(painter.on_image(np.array([1.0, 0.0, 0.0, 0.0]), NOW)) == seen
 
 
 def test_a_point_behind_a_disc_is_gone_and_one_before_it_stays(bench):

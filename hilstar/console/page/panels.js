@@ -23,11 +23,17 @@ export class Rows {
   }
 }
 
+// 0 to 360 degrees, and never 360.0000.
+function turn(degrees) {
+  const text = fixed(((degrees % 360) + 360) % 360, 4);
+  return text === "360.0000" ? "0.0000" : text;
+}
+
 export function writeAttitude(attitude, rows) {
   const known = attitude !== null;
-  write(byId("ra"), known ? `${fixed(attitude.ra_deg, 4)}\u00b0` : NONE);
+  write(byId("ra"), known ? `${turn(attitude.ra_deg)}\u00b0` : NONE);
   write(byId("dec"), known ? `${signed(attitude.dec_deg, 4)}\u00b0` : NONE);
-  write(byId("roll"), known ? `${fixed(((attitude.roll_deg % 360) + 360) % 360, 4)}\u00b0` : NONE);
+  write(byId("roll"), known ? `${turn(attitude.roll_deg)}\u00b0` : NONE);
   write(byId("ra-hms"), known ? hours(attitude.ra_deg) : "");
   write(byId("dec-dms"), known ? degreesMinutes(attitude.dec_deg) : "");
   const rate = known ? attitude.rate_deg_s : null;

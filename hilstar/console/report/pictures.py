@@ -15,11 +15,12 @@ from hilstar.bench.faults.kinds import Freeze
 from hilstar.bench.frame import Bench
 from hilstar.console.overlay import Overlay, catalogue_sky, overlay_of
 from hilstar.errors import InputError, MachineError
+from hilstar.notices import Notices
 from hilstar.run.faults.recorded import Recording, read_recording
 from hilstar.run.record.ledger_records import FrameRecord
 from hilstar.run.record.report_figures import Figures
 from hilstar.run.replay import RunPlay
-from hilstar.run.serve import replay
+from hilstar.run.serve import Outlet, replay
 from hilstar.run.shown import Shown
 from hilstar.units import NS_PER_S
 
@@ -29,6 +30,13 @@ CAUTION = (
     "Drawn by a bench that is not the run's own: a file that it names has changed since, or another version of hilstar wrote "
     "the ledger. Codes may differ from those shown."
 )
+
+
+class _Unsaid(Notices):
+    """Events of drawing again, which are not the run's."""
+
+    def tell(self, kind: str, detail: str, who: str = "") -> None:
+        """Say nothing."""
 
 
 def run_pictures(run: Figures, ledger: Path) -> dict[str, Any]:
@@ -76,7 +84,12 @@ def _pictures(bench: Bench, overlay: Overlay, run: Figures, ledger: Path) -> lis
         found.append(picture | told | {"t_s": round(t_s, 3)})
 
     if chosen:
-        replay(bench, RunPlay([record for record, _ in chosen], 0, paced=False, recording=recording), take)
+        replay(
+            bench,
+            RunPlay([record for record, _ in chosen], 0, paced=False, recording=recording),
+            take,
+            Outlet(notices=_Unsaid()),
+        )
     return _within(found, MAX_BYTES)
 
 

@@ -28,8 +28,9 @@ from tests.support.waiting import repeating, wait_for
 
 pytestmark = [pytest.mark.e2e, pytest.mark.gpu]
 ADDRESS = re.compile(r"page is at (http://\S+)")
-# "Red within 0.5 s of anything wrong"; and for a browser, a run and its page that share two cores with other tests:
-RED_MS, BUSY_MS = 500, 700
+# "Red within 0.5 s of anything wrong": 50 to 210 ms on two cores with ten processes that want them. A run that dies is missed
+# 0.4 s after its last word; a browser's timers may be late by BUSY_MS on such a machine.
+RED_MS, BUSY_MS = 500, 300
 MIN_PICTURES_HZ = 4  # of 8 that are asked for, on such a machine
 DARK, LIGHT = 40, 200  # grey values that no theme is between
 PACKET_S, TURN_RAD = 0.01, 1e-3  # between two packets
@@ -192,7 +193,8 @@ def test_stale_turns_red_within_half_a_second_and_says_why(live, run):
     live.until("window.redAt")
     since_ms = 1000 * next(record.host_ns for record in reversed(events_of(run, "stale"))) / 1e9
     now_ms = time.time() * 1000 - time.monotonic() * 1000  # UTC of the host's clock, ms
-    assert live.run("return window.redAt") - (since_ms + now_ms) < RED_MS + BUSY_MS
+    took_ms = live.run("return window.redAt") - (since_ms + now_ms)
+    assert took_ms < RED_MS
     assert live.text("#health-headline") == "Sky is not right" and "stale" in live.text("#health-reasons")
     assert live.text("#health-icon") == "!"  # by shape and word, not by colour alone
     assert live.text("#attitude-state") == "stale"

@@ -68,6 +68,13 @@ class Notices:
         for listener in self._listeners:
             listener(notice)
 
+    def mention(self, kind: str, detail: str) -> None:
+        """Say an event that is counted elsewhere, and hand it on."""
+        notice = Notice(time.monotonic_ns(), kind, detail[:MAX_DETAIL_CHARACTERS])
+        log.warning("%s", at_now(notice.detail))
+        for listener in self._listeners:
+            listener(notice)
+
     def begin(self, kind: str, detail: str) -> None:
         """Tell of an event that lasts: its kind is in `active` until `end`. Nothing where it has begun already."""
         with self._lock:

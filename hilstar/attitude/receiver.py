@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import threading
 import time
 from collections.abc import Callable
@@ -16,7 +15,7 @@ from hilstar.attitude.clock.shared_clock import SharedClockFilter
 from hilstar.attitude.clock.timeline import Timeline
 from hilstar.attitude.wire.links import Arrival, Link, SampleArrival
 from hilstar.attitude.wire.packet import REASONS, AttitudeSample, Event, Reason, Refusal, Status, TimeReply, TimeRequest
-from hilstar.notices import Notices, at_now
+from hilstar.notices import Notices
 from hilstar.running_statistics import RunningStatistics
 from hilstar.units import NS_PER_MS, NS_PER_S
 
@@ -26,7 +25,6 @@ QUEUED_NS = NS_PER_S // 10
 QUEUE_NEVER_EMPTY_NS = NS_PER_S
 MIN_BACK_OFF_NS = NS_PER_S // 20
 MAX_BACK_OFF_NS = NS_PER_S
-log = logging.getLogger(__name__)
 
 
 @dataclass(slots=True)
@@ -228,6 +226,6 @@ class Receiver:
         self.counts.refused_by[refusal.reason] += 1
         if self.counts.refused_by[refusal.reason] == 1:
             line = f"packet refused ({refusal.reason}): {refusal.detail}; further ones are only counted"
-            log.warning("%s", at_now(line))
+            self._notices.mention("refused", line)
         sample = arrival.event if isinstance(arrival.event, AttitudeSample) else None
         self._watch(arrival.host_ns, arrival.raw, sample, refusal)

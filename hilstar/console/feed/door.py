@@ -44,8 +44,8 @@ def parse_address(text: str) -> Address:
     if text.isdecimal() and text.isascii():
         host, port = HOST, text
     elif text.startswith("["):
-        host, _, rest = text[1:].partition("]")
-        if rest and not rest.startswith(":"):
+        host, bracket, rest = text[1:].partition("]")
+        if not bracket or (rest and not rest.startswith(":")):
             raise wrong
         port = rest[1:]
     elif text.count(":") > 1:

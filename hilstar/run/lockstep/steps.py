@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 import time
 from dataclasses import replace
@@ -13,7 +12,6 @@ from hilstar.attitude.clock.timeline import Attitude
 from hilstar.attitude.receiver import PacketCounts
 from hilstar.attitude.wire.packet import AttitudeSample, Event, Refusal, rate_refusal
 from hilstar.bench.frame import Bench
-from hilstar.notices import at_now
 from hilstar.run.loop import FrameLoop, Limit
 from hilstar.run.record.ledger_records import below_step, frame_record
 from hilstar.run.record.ledger_switch import LedgerSwitch
@@ -23,7 +21,6 @@ from hilstar.running_statistics import RunningStatistics
 from hilstar.units import NS_PER_MS, NS_PER_S
 
 POLL_MS = 50
-log = logging.getLogger(__name__)
 
 
 class Steps:
@@ -52,7 +49,7 @@ class Steps:
             self.counts.refused_by[refusal.reason] += 1
             if self.counts.refused_by[refusal.reason] == 1:
                 line = f"message refused ({refusal.reason}): {refusal.detail}; further ones are only counted"
-                log.warning("%s", at_now(line))
+                self._loop.notices.mention("refused", line)
         shown = None if refusal is not None or sample is None else self._show(sample, host_ns)
         self.last = shown or self.last  # of a frame that a fault drops, the one before stays
         if self._ledger.on:

@@ -1,0 +1,80 @@
+"""What is wrong with a run, for the page and for monitoring."""
+
+from __future__ import annotations
+
+import pytest
+from msgspec.structs import replace
+
+from hilstar.console.feed.messages import AttitudeSeen, LedgerSeen, RunSeen
+from hilstar.console.server.health import Health, Lately, reasons
+
+S = 1_000_000_000
+NOW = 1_000 * S
+ATTITUDE = AttitudeSeen((1.0, 0.0, 0.0, 0.0), None, 1_250_000_000)
+WELL = RunSeen(host_ns=NOW - S // 20, alive_ns=NOW - S // 10, missing=False, blank=False, attitude=ATTITUDE)
+LATELY = Lately(NOW - S // 50)
+
+
+def found(pace="clock", lately=LATELY, hz=60.0, **changes) -> list[str]:
+    return reasons(replace(WELL, **changes), NOW, lately, hz, pace)
+
+
+def test_a_run_that_goes_well_has_no_reason():
+    assert found() == []
+    assert found(pace="asked") == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"missing": True}, "no attitude has come yet"),
+        ({"stale": True}, "the attitude is stale: 1.2 s old"),
+        ({"stale": True, "attitude": None}, "the attitude is stale"),
+        ({"alive_ns": 0}, "being prepared"),
+        ({"alive_ns": NOW - S}, "the frame loop has hung for 1.0 s"),
+        ({"host_ns": NOW - S, "alive_ns": NOW - S}, "silent for 1.0 s"),
+        ({"display_lost": "the window went away"}, "the display is lost: the window went away"),
+        ({"hidden": "covered"}, "the window is covered"),
+        ({"ledger": LedgerSeen("run.mcap", 1, "cannot be written")}, "the ledger fails: cannot be written"),
+        ({"operator_text": "blank"}, "changed by the operator: blank"),
+        ({"faults": ["flash"]}, "a fault is on: flash"),
+    ],
+)
+def test_each_thing_that_is_wrong_is_a_reason(changes, words):
+    told = found(**changes)
+    assert len(told) == 1 and words in told[0]
+
+
+def test_a_ledger_that_is_written_and_a_few_missed_frames_are_well():
+    assert found(ledger=LedgerSeen("run.mcap", 1)) == []
+    assert found(lately=Lately(NOW, 0.5)) == []
+    assert "60%" in found(lately=Lately(NOW, 0.6))[0]
+
+
+def test_a_slow_display_is_not_a_loop_that_hangs():
+    """At 1 Hz a frame is due once a second."""
+    assert found(hz=1.0, alive_ns=NOW - 2 * S) == []
+    assert found(hz=1.0, alive_ns=NOW - 3 * S)
+
+
+def test_a_simulator_that_asks_for_nothing_is_a_reason_in_lockstep_alone():
+    late = Lately(NOW - 3 * S)
+    assert "no frame for 3.0 s" in found(pace="asked", lately=late)[0]
+    assert found(lately=late) == []
+
+
+def test_a_session_is_as_well_as_its_steps():
+    assert found(pace="session", missing=True, stale=True) == []
+    assert found(pace="session", failed=["focus failed: too dark"]) == ["focus failed: too dark"]
+
+
+def test_before_the_first_word_nothing_is_right_and_since_is_the_last_change():
+    health = Health(5.0)
+    health.update(reasons(None, NOW, LATELY, 60.0, "clock"), 6.0)
+    assert (health.ok, health.since_s, health.reasons) == (False, 5.0, ["the run has not begun"])
+    health.update([], 7.0)
+    health.update([], 8.0)
+    assert (health.ok, health.since_s) == (True, 7.0)
+    health.update(["stale"], 9.0)
+    health.update(["stale", "hung"], 10.0)
+    assert (health.ok, health.since_s) == (False, 9.0)

@@ -19,13 +19,13 @@ from hilstar.monitor.quantise import dither_levels, round_levels, temporal_level
 from hilstar.monitor.response import srgb_response
 from hilstar.render.reference import linear_image
 from hilstar.render.renderer import Renderer, Target
+from hilstar.render.tiles import disc_tiles
 from hilstar.rotation import from_radec_roll_deg
 from hilstar.scene.camera import Camera
 from hilstar.scene.discs import Pose, View, disc_lights
 from hilstar.scene.extended import DiscLight, Shear
 from hilstar.scene.frame_motion import Scan, Turn
 from hilstar.scene.lens import Lens
-from hilstar.scene.tiles import disc_tiles
 from hilstar.sky.bodies.disc import Disc
 from hilstar.twin.verify.measure import Comparison
 from hilstar.twin.verify.twin import Twin

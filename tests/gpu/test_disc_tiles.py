@@ -9,10 +9,10 @@ import pytest
 
 import hilstar.render.extended as layer
 from hilstar.render.renderer import Renderer, Target
+from hilstar.render.tiles import AIR_SMOOTH, LEAST_PX, SMOOTH, disc_tiles
 from hilstar.scene.camera import Camera
 from hilstar.scene.extended import DiscLight, Shear
 from hilstar.scene.lens import Lens
-from hilstar.scene.tiles import AIR_SMOOTH, LEAST_PX, SMOOTH, disc_tiles
 from hilstar.sky.bodies.disc import Disc
 from hilstar.sky.bodies.earth import EQUATOR_KM, earth_disc
 from hilstar.sky.bodies.magnitudes import KM_PER_AU

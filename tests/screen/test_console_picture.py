@@ -1,0 +1,42 @@
+"""The page's picture is what the display shows, with what an operator lays over it from the page."""
+
+from __future__ import annotations
+
+import subprocess
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from tests.support.benches import SCREEN_BENCH, still_log
+from tests.support.commands import HILSTAR
+from tests.support.pages import live, page_of, picture_of
+from tests.support.servers import Served
+from tests.support.waiting import wait_for
+
+pytestmark = pytest.mark.screen
+ROUND = '\n[render]\nquantisation = "round"\n'
+
+
+def test_the_page_s_picture_is_what_the_display_shows_under_every_aid(screen, tmp_path):
+    bench = tmp_path / "bench.toml"
+    bench.write_text(SCREEN_BENCH + ROUND)
+    command = [*HILSTAR, "replay", str(bench), str(still_log(tmp_path / "still.csv")), "--console", "127.0.0.1:0", "--control"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, env=screen.env) as process:
+        served = Served(process, 0)
+        try:
+            page = page_of(served)
+            wait_for(lambda: page.health_is(True))
+            seen = []
+            with live(page) as link:
+                link.want(picture=True, hz=10)
+                for switches in ((), ("crosshair",), ("grid",), ("patch",), ("blank",)):
+                    for name in switches:
+                        assert page.control(name, on=True, level=0.75)[0] == 200
+                    for _ in range(4):  # those that were on their way
+                        _, levels = picture_of(link.await_message(lambda said: isinstance(said, bytes)))
+                    wait_for(lambda levels=levels: np.array_equal(screen.pixels()[:, :, 0], levels))
+                    seen.append(levels)
+            assert all(not np.array_equal(before, after) for before, after in pairwise(seen))
+        finally:
+            process.kill()

@@ -37,12 +37,16 @@ def verify(
     import numpy as np
 
     from hilstar.bench.bench_file import read_bench_file
+    from hilstar.bench.heads_file import has_heads
     from hilstar.files import make_directory
     from hilstar.twin.verify.proposal_report import check_writable
     from hilstar.twin.verify.report import write_report
     from hilstar.twin.verify.run import verify as run_twin
     from hilstar.twin.verify.summary import summarise, summary_lines
 
+    if has_heads(bench_file):
+        _verify_heads(bench_file, fields, seed, as_json)
+        return
     check_directory("-o", output)
     if output is not None:
         make_directory(output)
@@ -63,6 +67,30 @@ def verify(
     mended = bool(proposed.get("written"))
     if strict and not verdict.passed and not mended:
         raise typer.Exit(1)
+
+
+def _verify_heads(path: Path, fields: int, seed: int, as_json: bool) -> None:
+    """The angles between the heads of a file with `heads`, solved from what their trackers would see."""
+    import numpy as np
+
+    from hilstar.bench.heads_file import read_heads
+    from hilstar.twin.heads import verify_heads
+
+    with progress("verifying", fields) as advance:
+        pairs = [pair.summary() for pair in verify_heads(read_heads(path), fields, np.random.default_rng(seed), advance)]
+    if as_json:
+        print_json({"angles": pairs})
+        return
+    for pair in pairs:
+        first, second = pair["heads"]
+        linear, codes = pair["linear_arcsec"], pair["codes_arcsec"]
+        told = "too few stars in both"
+        if linear is not None and codes is not None:
+            told = (
+                f"{linear['rms']:.4f} / {linear['max']:.4f} arcsec from linear light, {codes['rms']:.4f} / {codes['max']:.4f}"
+                f" from codes (rms / max, {pair['fields']} fields)"
+            )
+        typer.echo(f"{f'{first} to {second}':20}{told}")
 
 
 def _proposed(file: Bench, verdict: Verdict, seed: int, write: bool, as_json: bool) -> dict[str, Any]:

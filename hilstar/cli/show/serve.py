@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from hilstar.cli.options import BenchFile, Explain, Headless, Json, Overwrite, ScenarioFile, check_files
 from hilstar.cli.parsers import parse_split
+from hilstar.cli.show.heads import HeadsAsked, fed_link, serve_heads
 from hilstar.cli.show.paging import Console, ConsoleName, Control, Token, fault_desk, followed, page_door
 from hilstar.cli.show.running import (
     Force,
@@ -35,6 +37,8 @@ if TYPE_CHECKING:
     from hilstar.run.lockstep.vizard import Pictures
     from hilstar.run.open_link import AnyLink
 
+HeadOf = Annotated[Path | None, typer.Option("--head-of", hidden=True)]  # of a head's process: the file with `heads`,
+FedBy = Annotated[str | None, typer.Option("--fed-by", hidden=True)]  # and where the source's attitudes come from
 NO_ATTITUDE = 4  # the exit code of a run that never had one
 
 
@@ -55,8 +59,18 @@ def serve(
     console_name: ConsoleName = None,
     explain: Explain = False,
     as_json: Json = False,
+    head_of: HeadOf = None,
+    fed_by: FedBy = None,
 ) -> None:
-    """Show the live attitude stream on the monitor."""
+    """Show the live attitude stream on the monitor; of a file with `heads`, on the monitor of each."""
+    from hilstar.bench.heads_file import as_head, has_heads
+
+    if has_heads(bench_file):
+        switches = {"--headless": headless, "--windowed": windowed, "--force": force, "--control": control}
+        switches |= {"--overwrite": overwrite, "--explain": explain}
+        asked = HeadsAsked(duration, frames, dated_ledger(ledger), ledger_split, scenario, switches, console, token)
+        serve_heads(bench_file, asked, as_json)
+        return
     from hilstar.attitude.wire.source import Mounting
     from hilstar.bench.bench_file import read_bench_file
     from hilstar.console.feed.opening import Parts, Told
@@ -68,14 +82,14 @@ def serve(
 
     ledger = dated_ledger(ledger)
     check_ending("--ledger", ledger, MCAP)
-    file = read_bench_file(bench_file)
+    file = read_bench_file(bench_file) if head_of is None else as_head(bench_file, head_of)
     faults = optional_scenario(scenario)
     check_files([scenario], [], file, ledger, overwrite)
     split = parse_split(ledger_split)
     notices = Notices()
     with (
         page_door(console, control, token, console_name) as door,
-        open_link(file.config, file.folder, notices) as link,
+        open_link(file.config, file.folder, notices) if fed_by is None else fed_link(file, fed_by, notices) as link,
         shown_bench(file, headless, windowed, force) as (bench, screen),
         optional_ledger(ledger, bench, notices, overwrite, split) as kept,
         run_with_faults(bench, faults, notices, kept) as wrong,

@@ -1,0 +1,63 @@
+"""Three heads beside one source: real processes, one of them killed and one stopped."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+from pathlib import Path
+
+import numpy as np
+
+from hilstar.rotation import angle_between_rad, multiply
+from hilstar.run.record.ledger_reader import frame_records
+from tests.support.commands import HILSTAR
+from tests.support.heads import MOUNTINGS, heads_file
+from tests.support.senders import publisher, talking
+from tests.support.waiting import wait_for
+
+BODY = (0.7139, 0.1, -0.3, 0.6245)  # as a packet holds it; its norm is 1 within 1e-4
+SAME_RAD = 1e-9
+
+
+def children(parent: int) -> dict[str, int]:
+    """The processes of the heads, by name."""
+    found = {}
+    for entry in Path("/proc").iterdir():
+        try:
+            words = (entry / "cmdline").read_bytes().split(b"\0") if entry.name.isdecimal() else []
+            if b"--head-of" in words and int((entry / "stat").read_text().rsplit(")", 1)[1].split()[1]) == parent:
+                found[Path(next(word for word in words if word.endswith(b".toml")).decode()).stem] = int(entry.name)
+        except (OSError, IndexError):
+            continue  # it has just ended
+    return found
+
+
+def test_a_head_that_is_killed_or_hangs_stops_no_other_and_is_begun_again(tmp_path):
+    q, lines = np.array(BODY) / np.linalg.norm(BODY), tmp_path / "said.txt"
+    with publisher() as (sender, port), talking(sender, 50.0, tuple(q)), lines.open("w") as said:
+        path = heads_file(tmp_path, port)
+        command = [*HILSTAR, "serve", str(path), "--headless", "--json", "--ledger", str(tmp_path / "run.mcap")]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=said, text=True) as process:
+            try:
+                wait_for(lambda: lines.read_text().count("first attitude") == 3)
+                heads = children(process.pid)
+                os.kill(heads["b"], signal.SIGKILL)
+                os.kill(heads["c"], signal.SIGSTOP)
+                wait_for(lambda: lines.read_text().count("it is started again") == 2)
+                wait_for(lambda: lines.read_text().count("first attitude") == 5)
+                assert children(process.pid)["a"] == heads["a"]
+            finally:
+                process.send_signal(signal.SIGINT)
+            out, _ = process.communicate(timeout=60)
+    told = json.loads(out)["heads"]
+    assert [told[name]["restarts"] for name in "abc"] == [0, 1, 1], lines.read_text()
+    assert "b: its process ended (signal 9); it is started again" in lines.read_text()
+    for name, mounting in MOUNTINGS.items():
+        again = ".again1" if name != "a" else ""
+        ledger = tmp_path / f"run.{name}{again}.mcap"
+        shown = [np.array(record.q) for record in frame_records(ledger) if record.q is not None]
+        assert shown
+        assert max(angle_between_rad(one, multiply(np.array(mounting), q)) for one in shown) < SAME_RAD
+    assert not children(process.pid)

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 from scipy import linalg
+from scipy.spatial import cKDTree
 
 from hilstar.arrays import FloatArray
 from hilstar.campaign.budget.coarse_clock import CoarseClock
@@ -30,6 +31,7 @@ from hilstar.units import ARCSEC_PER_RAD, MAD_TO_SIGMA
 CUT_SIGMAS = 8.0
 AGREE_ARCSEC = 3600.0  # further from the others than a degree is no answer of this sky, however the errors are spread
 ROUNDS, REFINED = 40, 3
+PART_PX = 150.0  # of the field, over which an error that repeats with the place pulls a clock the same way
 # What is known of a clock before anything is measured: where the motion says less, the clock cannot be told.
 OFFSET_PRIOR_S = 10.0
 DRIFT_PRIOR = 2e-3
@@ -184,12 +186,30 @@ class ClockSolver:
         precision, pull = self._prior(state, begun_s)
         normal, right = np.diag(precision), pull
         smooth = most_likely(place, left)
+        pulls = np.zeros((len(left), 5))
         for axis in range(3):
             whitened = smooth.whiten(np.column_stack([design[axis], left[:, axis]]), axis)
             normal = normal + design[axis].T @ whitened[:, :5]
             right = right + design[axis].T @ whitened[:, 5]
+            pulls += whitened[:, :5] * left[:, axis : axis + 1]
         covariance = np.asarray(np.linalg.inv(normal), dtype=np.float64)
-        return self._moved(state, covariance @ right), covariance, used
+        step = covariance @ right
+        return self._moved(state, step), honest(covariance, pulls, place), used
+
+
+def honest(covariance: FloatArray, pulls: FloatArray, place: FloatArray) -> FloatArray:
+    """A covariance (5, 5), with sigmas no smaller than parts of the field differ by.
+
+    `pulls` (n, 5) are what each answer adds to the normal equations. An error that goes on for longer than the random function
+    is meant to pulls neighbours the same way (Liang and Zeger 1986).
+    """
+    centre = centres_of(place, PART_PX)
+    _, part = cKDTree(centre).query(place)
+    sums = np.stack([np.bincount(part, column, minlength=len(centre)) for column in pulls.T], axis=1)
+    sums = sums - sums.mean(axis=0)
+    spread = covariance @ (sums.T @ sums) @ covariance
+    growth = np.sqrt(np.maximum(np.diag(spread) / np.diag(covariance), 1.0))
+    return np.asarray(covariance * np.outer(growth, growth))
 
 
 def weights_of(residual_arcsec: FloatArray) -> tuple[FloatArray, FloatArray]:

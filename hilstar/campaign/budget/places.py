@@ -82,7 +82,7 @@ def bumps_at(place: FloatArray, centre: FloatArray, spacing_px: float) -> Bumps:
 
 
 def weights_at(place: FloatArray, centre: FloatArray, spacing_px: float) -> tuple[IntArray, IntArray, FloatArray]:
-    """Which sample and which centre, and the bump there; all bumps of a sample add to 1, so that a constant is met to the edge."""
+    """Which sample and which centre, and the bump there; all bumps of a sample add to 1, and a constant is met to the edge."""
     near = cKDTree(place).sparse_distance_matrix(cKDTree(centre), REACH * spacing_px, output_type="ndarray")
     r = near["v"] / (REACH * spacing_px)
     value = (1 - r) ** 4 * (4 * r + 1)

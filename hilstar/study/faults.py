@@ -30,7 +30,7 @@ from hilstar.study.shared.lone_stars import Isolation, lone_windows
 from hilstar.units import NS_PER_S, magnitude
 
 REFRESH_HZ = 60
-ROUNDS, QUICK_ROUNDS = 30, 3
+ROUNDS, QUICK_ROUNDS = 30, 1
 QUANTISATIONS = ("round", "exact")
 FIELD = from_radec_roll_deg(84.057, -1.2, 0.0)
 SLEW_RAD_S = np.array([0.0, 2e-4, 0.0])  # so that what is fixed on the sky is new in each frame

@@ -16,6 +16,7 @@ from hilstar.sky.bodies.disc import Disc
 SMALL_SIGMAS = 8.0
 NODES_A_SIGMA = 4.0  # along a radius: places in the face's middle are then 0.8 sigma apart
 WHOLE = 0.999  # of a pixel: the rest is the sum's error, and the Sun behind it may be a billion times white
+MAX_NODES = 64  # for a Gaussian ten times as wide along one axis as along the other
 MIN_NODES = 10  # 1e-4 of the light
 
 
@@ -54,10 +55,10 @@ def disc_lights(disc: Disc, view: View, covers: bool) -> list[ExtendedLight]:
 
 def _at_pose(light: DiscLight) -> list[ExtendedLight]:
     camera = light.camera
-    radius_px = np.tan(min(light.disc.radius_rad, 1.0)) * camera.focal_length_px
-    sigmas = float(radius_px) / min(light.variance_px) ** 0.5
-    if sigmas < SMALL_SIGMAS:
-        drawn = _disc_map(light, max(MIN_NODES, int(np.ceil(NODES_A_SIGMA * sigmas))))
+    radius_px = float(np.tan(min(light.disc.radius_rad, 1.0)) * camera.focal_length_px)
+    if radius_px < SMALL_SIGMAS * max(light.variance_px) ** 0.5:
+        nodes = int(np.ceil(NODES_A_SIGMA * radius_px / min(light.variance_px) ** 0.5))
+        drawn = _disc_map(light, min(max(MIN_NODES, nodes), MAX_NODES))
         return [] if drawn is None else [drawn]
     return [] if light.region(camera.resolution_px) is None else [light]
 

@@ -148,3 +148,15 @@ def test_the_earth_and_its_air_are_those_of_rays(gl, rng, altitude_km, focal_px,
     wanted = disc.transmission(cam.rays(x, y)).reshape(SIZE[::-1])
     smooth = maximum_filter(wanted, 9) - minimum_filter(wanted, 9) < FLUX_LIMIT
     assert np.abs(through - wanted)[smooth].max() < FLUX_LIMIT and smooth.mean() > 0.1
+
+
+@pytest.mark.parametrize("sigma_px", [(0.3, 3.5), (0.2, 0.2), (3.0, 3.0)])
+def test_any_gaussian_keeps_a_disc_s_light_and_its_place(sigma_px):
+    cam = camera()
+    disc = moon(4.8, 40.0, cam)
+    view = View(cam, sigma_px, (Pose(np.eye(3)),))
+    with Renderer(Target(SIZE, sigma_px)) as gl:
+        got = drawn(gl, *disc_lights(disc, view, covers=True))
+    truth = spread_image(body_of(disc), cam.rays, SIZE, (1.0, 1.0), np.random.default_rng(1), finer=5)  # of the same middle
+    assert got.sum() == pytest.approx(disc.law_integral_sr() * 1e9, rel=SUM_LIMIT)
+    assert np.abs(centroid_px(got) - centroid_px(truth)).max() < PLACE_LIMIT_PX

@@ -17,6 +17,7 @@ from hilstar.console.overlay import Overlay, catalogue_sky, overlay_of
 from hilstar.errors import InputError, MachineError
 from hilstar.notices import Notices
 from hilstar.run.faults.recorded import Recording, read_recording
+from hilstar.run.record.ledger_reader import wrong_in_frame
 from hilstar.run.record.ledger_records import FrameRecord
 from hilstar.run.record.report_figures import Figures
 from hilstar.run.replay import RunPlay
@@ -73,7 +74,8 @@ def _bench_file(head: dict[str, str], ledger: Path) -> BenchFile:
 def _pictures(bench: Bench, overlay: Overlay, run: Figures, ledger: Path) -> list[dict[str, Any]]:
     """The frames that are worth one, replayed with the faults that they had."""
     recording = read_recording(ledger)
-    chosen = [(record, why) for record, why in run.keyframes.chosen(run.last) if not _stays(record, recording)]
+    frames = run.keyframes.chosen(run.last)
+    chosen = [(record, why) for record, why in frames if not (_stays(record, recording) or wrong_in_frame(record))]
     found: list[dict[str, Any]] = []
 
     def take(shown: Shown) -> None:

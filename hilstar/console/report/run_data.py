@@ -19,7 +19,9 @@ from hilstar.units import NS_PER_S
 
 BINS = 60
 HISTOGRAM_SPREAD = 99.9  # percent of the frames that a histogram shows; the worst is in the table
+MIN_RANGE_MS, NARROWEST = 1e-3, 1e-9  # of a histogram, and of its values
 MS_DIGITS, S_DIGITS, Q_DIGITS, ANGLE_DIGITS = 3, 3, 8, 6
+MAX_WHO_CHARACTERS = 60
 IN_ARCSEC_DEG = 0.2  # a motion over less is drawn in arcsec
 POLE_DEG = 88.0  # beyond it right ascension and roll say nothing: turns about the camera's axes are drawn
 NAMES = ("RA \N{MULTIPLICATION SIGN} cos Dec", "Dec", "roll")
@@ -36,6 +38,11 @@ DISTRIBUTIONS = {
 
 def run_data(name: str, run: Figures, summary: RunReport) -> dict[str, Any]:
     """The figures of a run as the page reads them: lists of numbers, None for no value; times in s from the first swap."""
+    with np.errstate(all="ignore"):  # absurd figures of a foreign file become no value
+        return _run_data(name, run, summary)
+
+
+def _run_data(name: str, run: Figures, summary: RunReport) -> dict[str, Any]:
     config = config_of(run.head)
     rows = table_rows(summary)
     return {
@@ -96,7 +103,7 @@ def _utc(run: Figures, host_ns: int) -> str | None:
 
 
 def _numbers(values: FloatArray, digits: int) -> list[float | None]:
-    return [None if math.isnan(value) else value for value in np.round(values, digits).tolist()]
+    return [value if math.isfinite(value) else None for value in np.round(values, digits).tolist()]
 
 
 def _spans(run: Figures) -> dict[str, Any]:
@@ -121,8 +128,7 @@ def _process(run: Figures) -> dict[str, Any]:
     host_s, resident_mb, cpu_s = run.process.rows.T
     t_s = host_s - run.first_swap_ns / NS_PER_S
     step_s = np.diff(host_s, prepend=np.nan)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        share = np.where(step_s > 0, 100 * np.diff(cpu_s, prepend=np.nan) / step_s, np.nan)
+    share = np.where(step_s > 0, 100 * np.diff(cpu_s, prepend=np.nan) / step_s, np.nan)
     return {"t_s": _numbers(t_s, S_DIGITS), "resident_mb": _numbers(resident_mb, 2), "cpu_percent": _numbers(share, 1)}
 
 
@@ -134,7 +140,8 @@ def _histograms(run: Figures) -> list[dict[str, Any]]:
         if not len(values):
             continue
         low, high = np.percentile(values, [100 - HISTOGRAM_SPREAD, HISTOGRAM_SPREAD])
-        counts, edges = np.histogram(values, BINS, (low, max(high, low + 1e-3)))
+        narrowest = max(MIN_RANGE_MS, NARROWEST * max(abs(low), abs(high)))
+        counts, edges = np.histogram(values, BINS, (low, max(high, low + narrowest)))
         found.append(
             {"name": name, "title": title, "from_ms": float(edges[0]), "to_ms": float(edges[-1]), "counts": counts.tolist()}
         )
@@ -143,15 +150,19 @@ def _histograms(run: Figures) -> list[dict[str, Any]]:
 
 def _event(record: EventRecord, run: Figures) -> dict[str, Any]:
     t_s = (record.host_ns - run.first_swap_ns) / NS_PER_S
-    return {"t_s": round(t_s, S_DIGITS), "utc": _utc(run, record.host_ns), "kind": record.kind[:40], "line": record.detail}
+    who = f" ({record.who[:MAX_WHO_CHARACTERS]})" if record.who and record.who not in record.detail else ""
+    return {
+        "t_s": round(t_s, S_DIGITS),
+        "utc": _utc(run, record.host_ns),
+        "kind": record.kind[:40],
+        "line": record.detail + who,
+    }
 
 
 def _path(rows: FloatArray) -> dict[str, Any]:
     """The attitude along the run, and its rate in cam components, deg/s."""
     turned_deg = np.degrees(rows[:, 6:9])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        rate = np.diff(turned_deg, axis=0, append=np.nan) / np.diff(rows[:, 1], append=np.nan)[:, None]
-    rate[~np.isfinite(rate)] = np.nan
+    rate = np.diff(turned_deg, axis=0, append=np.nan) / np.diff(rows[:, 1], append=np.nan)[:, None]
     return {
         "t_s": _numbers(rows[:, 0], S_DIGITS),
         "q": np.round(rows[:, 2:6], Q_DIGITS).tolist(),

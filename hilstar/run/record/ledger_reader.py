@@ -13,6 +13,7 @@ import msgspec
 from hilstar.attitude.logs.mcap_log import ATTITUDE_TOPIC
 from hilstar.attitude.logs.mcap_reader import RUN_METADATA, read_messages, read_metadata, read_topics
 from hilstar.attitude.wire.packet import MAX_PLACE_KM, MAX_SPEED_KM_S, MIN_PLACE_KM, Refusal, checked_sample, rate_refusal
+from hilstar.attitude.wire.protocol import NORM_TOLERANCE
 from hilstar.bench.config import BenchConfig
 from hilstar.errors import InputError, cannot_read
 from hilstar.reading import parse_toml
@@ -60,18 +61,24 @@ def _decoded(decoder: msgspec.json.Decoder[Any], data: bytes, where: str) -> Any
 def drawable_frames(path: Path, max_rate_rad_s: float = math.inf) -> Iterator[FrameRecord]:
     """The frames of a ledger, to be drawn again. Raises InputError for damage, and for what the wire would refuse."""
     for number, record in enumerate(frame_records(path), start=1):
-        if record.q is not None:
-            sample = checked_sample(record.t_ns, record.q, record.rate)
-            refusal = sample if isinstance(sample, Refusal) else rate_refusal(sample, max_rate_rad_s)
-            if refusal is not None:
-                raise InputError(f"{path}: message {number} of {FRAME_TOPIC}: {refusal.detail}")
-        if math.hypot(*(record.velocity_km_s or ())) > MAX_SPEED_KM_S:
-            raise InputError(f"{path}: message {number} of {FRAME_TOPIC}: a velocity over {MAX_SPEED_KM_S:g} km/s")
-        if record.place_km is not None and not MIN_PLACE_KM < math.hypot(*record.place_km) < MAX_PLACE_KM:
-            raise InputError(
-                f"{path}: message {number} of {FRAME_TOPIC}: a place beyond {MIN_PLACE_KM:g} to {MAX_PLACE_KM:g} km"
-            )
+        wrong = wrong_in_frame(record, max_rate_rad_s)
+        if wrong:
+            raise InputError(f"{path}: message {number} of {FRAME_TOPIC}: {wrong}")
         yield record
+
+
+def wrong_in_frame(record: FrameRecord, max_rate_rad_s: float = math.inf) -> str:
+    """What the wire would refuse of a frame; "" where it can be drawn again."""
+    if record.q is not None:
+        sample = checked_sample(record.t_ns, record.q, record.rate)
+        refusal = sample if isinstance(sample, Refusal) else rate_refusal(sample, max_rate_rad_s)
+        if refusal is not None:
+            return refusal.detail
+    if math.hypot(*(record.velocity_km_s or ())) > MAX_SPEED_KM_S:
+        return f"a velocity over {MAX_SPEED_KM_S:g} km/s"
+    if record.place_km is not None and not MIN_PLACE_KM < math.hypot(*record.place_km) < MAX_PLACE_KM:
+        return f"a place beyond {MIN_PLACE_KM:g} to {MAX_PLACE_KM:g} km"
+    return ""
 
 
 def run_records(path: Path) -> Iterator[RunRecord]:
@@ -86,9 +93,17 @@ def run_records(path: Path) -> Iterator[RunRecord]:
     try:
         for number, (topic, data) in enumerate(read_topics(path), start=1):
             if topic in decoders:
-                yield _decoded(decoders[topic], data, f"{path}: message {number}, of {topic},")
+                record = _decoded(decoders[topic], data, f"{path}: message {number}, of {topic},")
+                if isinstance(record, FrameRecord) and record.q is not None and not _is_unit(record.q):
+                    raise InputError(f"{path}: message {number}, of {topic}: {wrong_in_frame(record)}")
+                yield record
     except OSError as error:
         raise cannot_read(path, error, "give the ledger of a run") from error
+
+
+def _is_unit(q: tuple[float, float, float, float]) -> bool:
+    """Whether a quaternion is one as `checked_sample` has it, which costs ten times as much."""
+    return abs(math.hypot(*q) - 1.0) <= NORM_TOLERANCE
 
 
 class PacketTally:

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import io
+import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from mcap.writer import Writer
 from PIL import Image
 
 from hilstar.attitude.logs.mcap_reader import NO_END
@@ -17,7 +21,7 @@ from hilstar.run.record.ledger import Ledger
 from hilstar.run.record.ledger_records import FrameRecord
 from hilstar.run.record.report_figures import Figures
 from tests.support.benches import ORION_Q, SMALL_BENCH
-from tests.support.commands import run_hilstar_here
+from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.run_page import levels_of, run_data_of
 
 pytestmark = pytest.mark.gpu
@@ -98,3 +102,48 @@ def test_of_a_ledger_that_was_cut_off_what_is_whole_is_reported_and_the_page_say
     assert report(tmp_path / "cut.mcap", tmp_path).frames == 40
     data = run_data_of((tmp_path / "report.html").read_text())
     assert data["facts"][0] == ["no end", f"cut.mcap {NO_END}"]
+
+
+ABSURD = {
+    "times beyond all clocks": {"age_ns": -(2**63), "prediction_ns": 2**63 - 1},
+    "a rate that nothing has": {"rate": [1e300, 0, 0]},
+    "a speed over light's": {"velocity_km_s": [1e9, 0, 0]},
+}
+
+
+@pytest.mark.parametrize("absurd", ABSURD)
+@pytest.mark.filterwarnings("error")
+def test_a_foreign_ledger_of_absurd_figures_is_reported_without_a_word_too_many(tmp_path, absurd):
+    form = {"light_ns": 1, "draw_ns": 1, "q": [1, 0, 0, 0]} | ABSURD[absurd]
+    records = [("/event", {"host_ns": 2**62, "kind": "<script>", "detail": "\0</script>", "who": "x" * 9999})]
+    records += [("/process", {"host_ns": k, "resident_bytes": 1, "cpu_s": 1e308 * (k - 1)}) for k in range(3)]
+    for k, swap_ns in enumerate((0, 10**18, 5, 2**62, 7)):
+        records.append(("/frame", form | {"frame": k, "t_ns": (-1) ** k * (2**63 - 1), "swap_ns": swap_ns}))
+    path = foreign_ledger(tmp_path, records)
+    result = run_hilstar_here("report", path, "-o", tmp_path)
+    assert (result.returncode, result.stderr) == (0, "")
+    data = run_data_of((tmp_path / "report.html").read_text())
+    assert len(data["path"]["t_s"]) == 5 and data["events"][0]["kind"] == "<script>"
+
+
+def test_a_frame_without_an_attitude_s_norm_is_refused_by_its_number(tmp_path):
+    path = foreign_ledger(
+        tmp_path, [("/frame", {"frame": 0, "t_ns": 0, "light_ns": 0, "draw_ns": 0, "swap_ns": 1, "q": [0, 0, 0, 0]})]
+    )
+    result = run_hilstar_here("report", path, "-o", tmp_path / "report")
+    assert_refused(result, 2, "message 1, of /frame: the quaternion's norm is 0")
+
+
+def foreign_ledger(folder: Path, records: list[tuple[str, dict[str, Any]]]) -> Path:
+    """A ledger of the small bench that hilstar has not written."""
+    file = io.BytesIO()
+    writer = Writer(file)
+    writer.start(library="test")
+    head = {"bench_text": SMALL_BENCH, "bench_file": "bench.toml", "unix_ns": "<b>", "monotonic_ns": "9" * 400}
+    writer.add_metadata("hilstar", head)
+    channels = {topic: writer.register_channel(topic, "json", 0) for topic, _ in records}
+    for topic, record in records:
+        writer.add_message(channels[topic], 1, json.dumps(record).encode(), 1)
+    writer.finish()
+    (folder / "foreign.mcap").write_bytes(file.getvalue())
+    return folder / "foreign.mcap"

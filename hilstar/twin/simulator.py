@@ -141,7 +141,7 @@ class Simulator:
         def sprites_of(part: Motion) -> Sprites:
             found = smeared_sprites(stars, part, self.camera, self.renderer.footprint_px, tracker.psf_sigma_px)
             found = with_discs(self, self.moving, found, stars, part, When(part.t_ns, velocity_km_s, place_km))
-            return self._with_satellites(found, stars, part, velocity_km_s, place_km)
+            return with_streaks(self, self.moving, found, stars, part, When(part.t_ns, velocity_km_s, place_km))
 
         if faults is None:
             sprites = sprites_of(motion)
@@ -169,21 +169,6 @@ class Simulator:
         """Electrons per second of each pixel (h, w) by sprites."""
         self.renderer.draw(sprites)
         return self.renderer.linear().astype(np.float64)
-
-    def _with_satellites(
-        self,
-        sprites: Sprites,
-        stars: Stars,
-        motion: Motion,
-        velocity_km_s: FloatArray | None,
-        place_km: FloatArray | None,
-    ) -> Sprites:
-        scan, turn = Scan(hold_s=motion.exposure_s), Turn(motion.q_icrs_to_cam, motion.rate_cam_rad_s)
-        shot = Shot(self.camera, scan, turn, motion.t_ns, velocity_km_s, place_km)
-        white_e_per_s = full_e(self.config.tracker.detector) / (motion.exposure_s or 1.0)
-        shot = replace(shot, begin_s=-motion.exposure_s / 2, white_e_per_s=white_e_per_s)
-        brush = Brush(self.renderer.footprint_px, self.config.tracker.psf_sigma_px, EXPOSURE_SPRITES, EXPOSURE_POSES)
-        return with_satellites(sprites, stars, self.moving, shot, brush)
 
     def close(self) -> None:
         """Free the GL context."""
@@ -234,6 +219,19 @@ def with_discs(
     sigma_px, white_e_per_s = tracker.config.tracker.psf_sigma_px, full_e(tracker.config.tracker.detector) / motion.exposure_s
     painter = DiscPainter(moving, tracker.camera, footprint_px(sigma_px), sigma_px, white_e_per_s=white_e_per_s)
     return painter.exposed(sprites, stars, motion, when)
+
+
+def with_streaks(
+    tracker: Looking, moving: MovingSky | None, sprites: Sprites, stars: Stars, motion: Motion, when: When
+) -> Sprites:
+    """The sprites of an exposure and those of satellites, each along its path over the exposure."""
+    settings = tracker.config.tracker
+    scan, turn = Scan(hold_s=motion.exposure_s), Turn(motion.q_icrs_to_cam, motion.rate_cam_rad_s)
+    shot = Shot(tracker.camera, scan, turn, when.t_ns, when.velocity_km_s, when.place_km)
+    white_e_per_s = full_e(settings.detector) / (motion.exposure_s or 1.0)
+    shot = replace(shot, begin_s=-motion.exposure_s / 2, white_e_per_s=white_e_per_s)
+    brush = Brush(footprint_px(settings.psf_sigma_px), settings.psf_sigma_px, EXPOSURE_SPRITES, EXPOSURE_POSES)
+    return with_satellites(sprites, stars, moving, shot, brush)
 
 
 def full_e(detector: DetectorSettings) -> float:

@@ -20,16 +20,18 @@ from hilstar.scene.psf import footprint_px
 from hilstar.scene.sprites import make_sprites
 from hilstar.tracker.detector import Detector
 from hilstar.twin.optics import TwinOptics
-from hilstar.twin.simulator import Exposure, background_e, exposure_truth, with_discs
+from hilstar.twin.simulator import Exposure, background_e, exposure_truth, with_discs, with_streaks
 from hilstar.twin.verify.light import true_panel
 from hilstar.twin.verify.twin import true_geometry
+from hilstar.units import NS_PER_S
 
 
 class DisplayTracker:
     """The bench's tracker before the bench's display as it truly is (`[verify] true_*`). Free it with `close`.
 
     Frames follow one another at `[monitor] refresh_hz`, and each is held until the next: an exposure is the mean of those that
-    it lasts over, each at the attitude in the middle of its time. At rest they are one, unless they are dithered in time.
+    it lasts over, each at the attitude in the middle of its time. At rest they are one, unless they are dithered in time or
+    have satellites.
     """
 
     def __init__(self, file: BenchFile) -> None:
@@ -85,20 +87,25 @@ class DisplayTracker:
         icrs_to_image = motion.icrs_to_image(MIDDLE_S, self.camera)[0]
         sprites = make_sprites(stars, icrs_to_image, self.camera, footprint_px(self.config.tracker.psf_sigma_px))
         sprites = with_discs(self, self._bench.moving, sprites, stars, motion, When(motion.t_ns))
+        sprites = with_streaks(self, self._bench.moving, sprites, stars, motion, When(motion.t_ns))
         truth = exposure_truth(self, motion, stars, sprites, mean_e)
         truth["drawn"] = truth["electrons_per_s"] >= self._bench.faintest_shown_e_per_s
         return Exposure(motion, dn, mean_e, truth)
 
     def _light_e_per_s(self, motion: Motion) -> FloatArray:
         """The mean light (H, W) of the display over the exposure."""
-        count = 1
-        if motion.rate_cam_rad_s.any() or self.config.render.quantisation == "temporal":
+        count, moving = 1, self._bench.moving
+        streaks = moving is not None and moving.satellites is not None
+        if streaks or motion.rate_cam_rad_s.any() or self.config.render.quantisation == "temporal":
             count = max(1, round(motion.exposure_s * self.config.monitor.refresh_hz))
         total: FloatArray | None = None
         for frame in range(count):
             seconds = ((frame + 0.5) / count - 0.5) * motion.exposure_s
             q = propagate(motion.q_icrs_to_cam, motion.rate_cam_rad_s, seconds)
-            light = shown_light(self._bench.draw(q, frame, t_ns=motion.t_ns).levels, self._panel)
+            t_ns = motion.t_ns
+            if streaks and t_ns is not None:  # satellites have the frame's whole time, stars its middle
+                t_ns += round((frame / count - 0.5) * motion.exposure_s * NS_PER_S)
+            light = shown_light(self._bench.draw(q, frame, t_ns=t_ns).levels, self._panel)
             total = light if total is None else total + light
         return np.zeros((0, 0)) if total is None else total / count
 

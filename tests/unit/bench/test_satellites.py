@@ -12,6 +12,7 @@ from hilstar.bench.bench_file import read_bench_file
 from hilstar.bench.build import load
 from hilstar.bench.discs import When
 from hilstar.bench.frame import Bench
+from hilstar.campaign.cases.display import DisplayTracker
 from hilstar.rotation import from_radec_roll_deg, to_matrix
 from hilstar.scene.trail_discs import DiscTrail, hidden
 from hilstar.sky.bodies.disc import Disc
@@ -203,3 +204,31 @@ def test_the_bench_s_hash_covers_both_files(bench_file):
         path.write_text(path.read_text() + "\n")
         hashes.add(read_bench_file(bench_file).sha256)
     assert len(hashes) == 3
+
+
+def test_a_tracker_before_the_display_sees_the_streak_that_one_before_the_sky_sees(bench_file):
+    """Frame by frame, each with the satellite's path while it is held; the small screen covers a part of the detector."""
+    with load(bench_file) as bench:
+        t_ns = fast_moment(bench)
+        name, place, _ = brightest(bench, t_ns)
+    text = bench_file.read_text().replace("[sky]", "[sky]\nfaintest_v_mag = 2.5")
+    bench_file.write_text(text.replace("transmission", "psf_sigma_px = [1.0, 1.0]\ntransmission", 1))
+    q, file = from_radec_roll_deg(*place, 0.0), read_bench_file(bench_file)
+    display = DisplayTracker(file)
+    with Simulator(file) as tracker:
+        of_sky, of_display = (one.expose(tracker.motion(q, np.zeros(3), t_ns), None) for one in (tracker, display))
+    display.close()
+    rows = [shot.truth[shot.truth["name"] == name][0] for shot in (of_sky, of_display)]
+    assert (rows[0]["x_px"], rows[0]["y_px"]) == pytest.approx((rows[1]["x_px"], rows[1]["y_px"]), abs=0.01)
+    middles, lengths = [], []
+    for shot in (of_sky, of_display):
+        light = shot.mean_e[480:544, 480:544] - np.median(shot.mean_e[480:544, 480:544])
+        light[light < 0.02 * light.max()] = 0.0
+        y, x = np.indices(light.shape)
+        at = np.array([(light * x).sum(), (light * y).sum()]) / light.sum()
+        minor, major = np.linalg.eigvalsh(np.cov(np.stack([x.ravel(), y.ravel()]), aweights=light.ravel()))
+        middles.append(at)
+        lengths.append(np.sqrt(major - minor))  # the screen's sprites are wider, in every direction
+    assert middles[1] == pytest.approx(middles[0], abs=0.3)
+    assert lengths[1] == pytest.approx(lengths[0], rel=0.1)
+    assert lengths[0] > 3

@@ -6,6 +6,7 @@ ten times a second, and only while somebody looks at one.
 
 from __future__ import annotations
 
+import contextlib
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -66,7 +67,8 @@ class Feed:
         want = self._board.want
         if want.each_ns and self._picture_due_ns <= shown.swap_ns < want.until_ns:
             self._picture_due_ns = shown.swap_ns + max(want.each_ns, MIN_PICTURE_NS)
-            self._copy(shown)
+            with contextlib.suppress(ValueError):  # levels of another size than the bench's: no picture, and the run goes on
+                self._copy(shown)
 
     def _copy(self, shown: Shown) -> None:
         """Copy the picture: its levels, its attitude, and where the stars in it are."""

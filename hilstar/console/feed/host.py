@@ -24,6 +24,7 @@ import msgspec
 
 from hilstar.console.feed.board import Board
 from hilstar.console.feed.messages import Answer, EventSeen, Order, RunSeen, Setup
+from hilstar.errors import one_line
 from hilstar.notices import Listener, Notice
 
 TICK_S = 0.1
@@ -103,8 +104,8 @@ class Host:
     def _tick(self, now_s: float) -> None:
         try:
             self._board.states.put(msgspec.json.encode(self._watched.now()))
-        except RuntimeError as error:  # a container that changed while it was read: the next look is 0.1 s away
-            self._board.states.put(msgspec.json.encode(RunSeen(host_ns=time.monotonic_ns(), note=str(error))))
+        except Exception as error:  # a container that changed while it was read, or whatever else: there is a next look
+            self._board.states.put(msgspec.json.encode(RunSeen(host_ns=time.monotonic_ns(), note=one_line(repr(error)))))
         self._write_events()
         page = self._page
         if page is None:

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from hilstar.run.screen.screen import Screen
     from hilstar.run.shown import Shown
 
+MAX_CLIPPED = 300  # by name; a picture has hundreds of stars
 # Events that last and keep a ledger from being written: as `run.record.ledger` tells them.
 LEDGER_TROUBLES = {
     "ledger-failed": "cannot be written",
@@ -59,7 +60,7 @@ class Watched:
             missing=shown is None or shown.missing,
             blank=shown is None or shown.attitude is None,
             stars=0 if shown is None else shown.drawn.star_count,
-            clipped=[] if shown is None else list(shown.drawn.clipped_hip),
+            clipped=[] if shown is None else list(shown.drawn.clipped_hip[:MAX_CLIPPED]),
             attitude=_attitude(shown),
             clock=None
             if clock is None or clock.mode == "none"

@@ -29,6 +29,7 @@ from hilstar.console.server.live import Crowd
 from hilstar.console.server.pictures import PictureRoom
 from hilstar.console.server.protocol import BoundedHttp
 from hilstar.console.server.reader import TICK_S, Reader
+from hilstar.errors import one_line
 from hilstar.units import NS_PER_S
 
 PR_SET_PDEATHSIG = 1
@@ -160,8 +161,13 @@ def main() -> None:
     setup = msgspec.msgpack.decode(os.pread(setup_fd, os.fstat(setup_fd).st_size, 0), type=Setup)
     board = Board(board_fd, setup.picture_bytes)
     listener = socket.socket(fileno=listener_fd)
-    asyncio.run(run(setup, board, Wire(socket.socket(fileno=wire_fd)), listener))
-    os._exit(0)  # without waiting for threads
+    code = 0
+    try:
+        asyncio.run(run(setup, board, Wire(socket.socket(fileno=wire_fd)), listener))
+    except Exception as error:  # whatever it is: the run starts the page again
+        print(one_line(f"hilstar: the operator's page failed ({type(error).__name__}: {error})"), file=sys.stderr, flush=True)
+        code = 1
+    os._exit(code)  # without waiting for threads
 
 
 if __name__ == "__main__":

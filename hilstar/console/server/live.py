@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
 import time
 from collections import deque
 from typing import Any
@@ -171,5 +172,20 @@ async def _close(client: Client, code: int | None = None) -> None:
 
 
 def told(message: dict[str, Any]) -> str:
-    """A message as JSON text."""
+    """A message as JSON text; a number that JSON does not know is null."""
+    try:
+        return _text(message)
+    except ValueError:
+        return _text(_known(message))
+
+
+def _text(message: Any) -> str:
     return json.dumps(message, ensure_ascii=False, separators=(",", ":"), allow_nan=False)
+
+
+def _known(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _known(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_known(part) for part in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -76,7 +76,7 @@ def _message(head: PictureHead, levels: Codes) -> bytes:
 
 
 def _told(truth: dict[str, Any]) -> bytes:
-    return json.dumps({"truth": truth}, ensure_ascii=False, separators=(",", ":")).encode()
+    return json.dumps({"truth": truth}, ensure_ascii=False, separators=(",", ":"), allow_nan=False).encode()
 
 
 def stars_of(scene: Scene, sprites: np.ndarray, seen: RunSeen | None) -> list[list[Any]]:

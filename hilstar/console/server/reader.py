@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections import deque
 from typing import Any
@@ -45,7 +46,8 @@ class Reader:
         now_ns, unix_s = time.monotonic_ns(), time.time()
         found = self._board.states.last()
         if found is not None:
-            self.seen = msgspec.json.decode(found[1], type=RunSeen)
+            with contextlib.suppress(msgspec.MsgspecError):  # cut, where it was too long: the one before stays
+                self.seen = msgspec.json.decode(found[1], type=RunSeen)
         self.points.append(self._point(now_ns))
         if now_ns - self._pacing_ns > PACING_EACH_S * NS_PER_S:
             self._pacing_ns, self.pacing = now_ns, self._pacing_now(now_ns)
@@ -57,8 +59,9 @@ class Reader:
         new = []
         for number, data in self._board.events.after(self._event_at):
             self._event_at = number
-            event = msgspec.json.decode(data, type=EventSeen)
-            new.append({"utc": utc_text(event.unix_s), "kind": event.kind, "line": event.line})
+            with contextlib.suppress(msgspec.MsgspecError):
+                event = msgspec.json.decode(data, type=EventSeen)
+                new.append({"utc": utc_text(event.unix_s), "kind": event.kind, "line": event.line})
         self.events.extend(new)
         return new
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -164,20 +165,22 @@ def bench_stars(config: BenchConfig, folder: Path, moving: MovingSky | None = No
     elif any(sky.observer_velocity_km_s):
         vectors = aberrate(vectors, sky.observer_velocity_km_s)
     temperature_k = star_temperatures_k(catalog.bv_mag, sky.temperature)
-    rates = star_rates_e_per_s(config, folder, catalog.v_mag, catalog.bv_mag, catalog.vi_mag)
+    rates = star_rates(config, folder)(catalog.v_mag, catalog.bv_mag, catalog.vi_mag)
     return make_stars(catalog, vectors, temperature_k, rates)
 
 
-def star_rates_e_per_s(
-    config: BenchConfig, folder: Path, v_mag: FloatArray, bv_mag: FloatArray, vi_mag: FloatArray
-) -> FloatArray:
-    """The electron rates (n,) of stars of those magnitudes and colours on a bench's tracker; V-I may be NaN."""
+# Electron rates (n,) of stars by their V, B-V and V-I, which may be NaN.
+StarRates = Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
+
+
+def star_rates(config: BenchConfig, folder: Path) -> StarRates:
+    """The electron rates of stars on a bench's tracker, by tables that are made here, once."""
     sky, optics = config.sky, bench_optics(config.tracker, folder)
     photometry = Photometry(sky.zero_point, sky.passband_weighting)
     if sky.brightness == "dgs" and sky.spectrum == "pickles":
-        return tabulate_pickles(optics, photometry).electrons_per_s(v_mag, bv_mag, vi_mag)
-    temperature_k = star_temperatures_k(bv_mag, sky.temperature)
-    return tabulate(sky.brightness, optics, photometry).electrons_per_s(v_mag, temperature_k)
+        return tabulate_pickles(optics, photometry).electrons_per_s
+    by_temperature = tabulate(sky.brightness, optics, photometry)
+    return lambda v_mag, bv_mag, _: by_temperature.electrons_per_s(v_mag, star_temperatures_k(bv_mag, sky.temperature))
 
 
 def bench_calibration(config: BenchConfig, folder: Path) -> Calibration:

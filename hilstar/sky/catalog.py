@@ -45,6 +45,7 @@ VARIABLE_TYPES = b"PUM"
 
 # A Tycho number TYC1-TYC2-TYC3 as one integer: TYC1 to 9537, TYC2 to 12121, TYC3 to 3.
 TYCHO, TYC_REGION = "TYC", 1_000_000
+MAX_DIGITS = 19  # of a 64-bit identifier
 
 Letters = npt.NDArray[np.bytes_]
 
@@ -103,6 +104,17 @@ class Catalog:
             region, number = divmod(identifier, TYC_REGION)
             return f"{TYCHO} {region}-{number // 10}-{number % 10}"
         return f"{self.designation} {identifier}"
+
+    def identifier_of(self, name: str) -> int | None:
+        """The identifier in a name that `name` gives to a star without a HIP number; None for any other text."""
+        if not self.designation or not name.startswith(f"{self.designation} "):
+            return None
+        numbers = name.removeprefix(f"{self.designation} ").split("-")
+        if not all(n.isascii() and n.isdigit() and len(n) <= MAX_DIGITS for n in numbers):
+            return None
+        if self.designation == TYCHO:
+            return int(numbers[0]) * TYC_REGION + int(numbers[1]) * 10 + int(numbers[2]) if len(numbers) == 3 else None
+        return int(numbers[0]) if len(numbers) == 1 else None
 
 
 def column_names() -> list[str]:

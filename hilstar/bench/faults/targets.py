@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 
 from hilstar.arrays import IntArray
@@ -9,6 +11,8 @@ from hilstar.bench.faults.kinds import Fault, Flash, StarGone
 from hilstar.errors import InputError
 from hilstar.sky.names import star_names
 from hilstar.sky.stars import Stars
+
+MAX_KEPT = 512  # a stream may ask for any star
 
 
 class Targets:
@@ -27,6 +31,8 @@ class Targets:
         key = (id(stars.hip), wanted)
         known = self._found.get(key)
         if known is None or known[0] is not stars.hip:  # the array is kept, so that no other one has its id
+            if len(self._found) >= MAX_KEPT:
+                self._found.clear()
             known = self._found[key] = (stars.hip, _places(stars, wanted))
         return known[1]
 
@@ -48,8 +54,14 @@ def _places(stars: Stars, wanted: int | str) -> IntArray:
     first = len(stars) - len(stars.bodies)
     if wanted in stars.bodies:
         return np.array([first + stars.bodies.index(wanted)])
+    number = re.fullmatch(r"HIP (\d{1,9})", wanted)
+    if number is not None:
+        return np.flatnonzero(stars.hip == int(number[1]))
     hip = next((hip for hip, names in star_names().items() if wanted in (names.name, names.designation)), None)
     if hip is not None:
         return np.flatnonzero(stars.hip == hip)
+    identifier = stars.catalog.identifier_of(wanted)
+    if identifier is None:
+        return np.empty(0, dtype=np.intp)
     nameless = np.flatnonzero(stars.hip[:first] == 0)
-    return nameless[[name == wanted for name in stars.names(nameless)]]
+    return np.asarray(nameless[stars.catalog.identifier[stars.row[nameless]] == identifier], dtype=np.intp)

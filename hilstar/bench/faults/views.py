@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
+from functools import cache, lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile
-from hilstar.bench.build import star_rates_e_per_s
+from hilstar.bench.build import star_rates
 from hilstar.bench.cameras import bench_camera, tracker_camera
 from hilstar.bench.faults.desk import FaultDesk
 from hilstar.bench.faults.effects import Effects
@@ -77,10 +77,11 @@ def _apparent(file: BenchFile, moving: MovingSky | None) -> Callable[[FloatArray
 
 
 def _v0_e_per_s(file: BenchFile) -> Callable[[float], float]:
-    @cache
+    tables = cache(lambda: star_rates(file.config, file.folder))  # 0.1 s, which only a fault needs
+
+    @lru_cache(maxsize=256)
     def rate(bv_mag: float) -> float:
-        unknown = np.array([np.nan])
-        return float(star_rates_e_per_s(file.config, file.folder, np.zeros(1), np.array([bv_mag]), unknown)[0])
+        return float(tables()(np.zeros(1), np.array([bv_mag]), np.array([np.nan]))[0])
 
     return rate
 

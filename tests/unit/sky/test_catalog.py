@@ -131,3 +131,14 @@ def test_a_star_is_called_by_its_catalogue():
     gaia = plain_catalog("Gaia DR3", 2, columns | {"identifier": np.array([4_295_806_720, 2**62]), "hip": np.array([0, 7])})
     assert [tycho.name(row) for row in range(2)] == ["TYC 9537-386-1", "TYC 1-13-3"]
     assert [gaia.name(row) for row in range(2)] == ["Gaia DR3 4295806720", "HIP 7"]
+
+
+@pytest.mark.parametrize(
+    ("designation", "name", "identifier"),
+    [("Gaia DR3", "Gaia DR3 4295806720", 4_295_806_720), ("TYC", "TYC 8-3041-2", 8_030_412), ("mine", "mine 12", 12)],
+)
+def test_a_name_of_a_catalogue_s_own_leads_back_to_its_star(designation, name, identifier):
+    columns = {"v_mag": np.zeros(1), "ra_deg": np.zeros(1), "dec_deg": np.zeros(1), "identifier": np.array([identifier])}
+    catalog = plain_catalog(designation, 1, columns)
+    assert catalog.name(0) == name and catalog.identifier_of(name) == identifier
+    assert [catalog.identifier_of(other) for other in ("HIP 3", f"{designation} x", designation, "")] == [None] * 4

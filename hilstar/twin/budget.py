@@ -97,11 +97,12 @@ def zero_point_mag(bench: Bench) -> float:
 
     Raises InputError where it has none.
     """
-    stars = bench.stars
+    rates_e_per_s = bench.stars.rates_e_per_s
+    bv_mag, v_mag = (column[: len(rates_e_per_s)] for column in (bench.stars.bv_mag, bench.stars.v_mag))
     # The stars of that colour, or else the nearest to it: where there are stars, none of these is far from it.
-    distance = np.abs(stars.bv_mag - SOLAR_BV)
+    distance = np.abs(bv_mag - SOLAR_BV)
     alike = distance <= max(LIKE_SOLAR_BV, float(distance.min()))
-    return float(np.median(stars.v_mag[alike] - magnitude(stars.electrons_per_s[alike])))
+    return float(np.median(v_mag[alike] - magnitude(rates_e_per_s[alike])))
 
 
 def corner_share(sigma_px: tuple[float, float]) -> float:

@@ -54,6 +54,8 @@ def with_epoch(config: BenchConfig, path: Path, tables: dict[str, Any]) -> Bench
     """The same with the Julian year of `epoch_utc`, which a bench's hash covers. Raises InputError for keys that disagree."""
     if config.sky.epoch_utc is not None and "epoch_jyear" in tables.get("sky", {}):
         raise InputError(f"{path}: [sky] has epoch_utc and epoch_jyear; write one of them")
+    if config.sky.bodies.satellite_magnitudes is not None and config.sky.bodies.satellites is None:
+        raise InputError(f'{path}: [sky.bodies] satellite_magnitudes is of no satellites; write satellites = "tles.txt" too')
     if has_observer(config):
         if config.sky.epoch_utc is None:
             raise InputError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -167,6 +168,9 @@ def test_frame_explains_them_and_attitude_and_verify_know_them(bench_file):
     assert done.stderr.count("OLD") == 1
     assert name in (bench_file.parent / "t.csv").read_text()
     assert run_hilstar_here("verify", bench_file, "--fields", "1", "--json").returncode == 0
+    budget = run_hilstar_here("budget", bench_file, "--json")
+    assert budget.returncode == 0, budget.stderr
+    assert json.loads(budget.stdout)["clips_v_mag"] < 3  # by stars: of satellites elsewhere no magnitude is known
 
 
 @pytest.mark.parametrize(
@@ -188,6 +192,13 @@ def test_a_wrong_file_is_one_line_and_exit_code_2(bench_file, named, text, said)
     assert done.returncode == 2
     assert said in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_a_table_without_a_list_is_refused(bench_file):
+    bench_file.write_text(bench_file.read_text().replace("satellites =", "# satellites ="))
+    done = run_hilstar_here("frame", bench_file, "--radec", "0,0,0", "--truth", bench_file.parent / "t.csv")
+    assert done.returncode == 2
+    assert 'satellite_magnitudes is of no satellites; write satellites = "tles.txt" too' in done.stderr
 
 
 def test_satellites_need_a_date(bench_file):

@@ -19,13 +19,14 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from hilstar.run.record.ledger_reader import frame_records
 from hilstar.run.record.ledger_records import FrameRecord
 from tests.support.benches import attitude_table, bench_text
-from tests.support.pages import PageAddress, live, page_of
+from tests.support.pages import PageAddress, children, live, page_of
 from tests.support.senders import connected, free_port, talking
 from tests.support.servers import Served
 from tests.support.waiting import real_time
@@ -89,27 +90,45 @@ def siege(page: PageAddress) -> Iterator[None]:
 KINDS = {"nobody": nobody, "two pages": two_pages, "200 connections": siege}
 
 
-def measure(screen: Screen, folder: Path, seconds: float) -> tuple[list[FrameRecord], list[tuple[str, int, int]]]:
-    """The frames of a run, and when (host time, ns) there was what."""
+class Turn(NamedTuple):
+    """What there was from when to when (host time, ns), and what the run and its page took of a core meanwhile, s."""
+
+    kind: str
+    begin_ns: int
+    end_ns: int
+    run_s: float
+    page_s: float
+
+
+def cpu_s(pid: int) -> float:
+    """What a process has had of a core so far."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def measure(screen: Screen, folder: Path, seconds: float) -> tuple[list[FrameRecord], list[Turn]]:
+    """The frames of a run, and its turns."""
     port = free_port()
     (folder / "bench.toml").write_text(BENCH + attitude_table(port, "bind = true"))
     command = [sys.executable, "-m", "hilstar", "serve", str(folder / "bench.toml"), "--windowed", "--force", "--json"]
     command += ["--ledger", str(folder / "run.mcap"), "--console", "127.0.0.1:0"]
-    turns: list[tuple[str, int, int]] = []
+    turns: list[Turn] = []
     with subprocess.Popen(
         command, env=screen.env | {"LP_NUM_THREADS": "0"}, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:
         served = Served(process, port)
         page = page_of(served)
+        pids = (process.pid, children(process.pid, "hilstar.console.server")[0])
         with connected(port) as sender, talking(sender, 100.0):
             time.sleep(3.0)
             while len(turns) < len(KINDS) * max(round(seconds / TURN_S), 1):
                 for name, kind in KINDS.items():
                     with kind(page):
                         time.sleep(1.0)
-                        begun_ns = time.monotonic_ns()
+                        begin_ns, before = time.monotonic_ns(), [cpu_s(pid) for pid in pids]
                         time.sleep(TURN_S)
-                        turns.append((name, begun_ns, time.monotonic_ns()))
+                        took = [cpu_s(pid) - then for pid, then in zip(pids, before, strict=True)]
+                        turns.append(Turn(name, begin_ns, time.monotonic_ns(), *took))
         served.summary()
     return list(frame_records(folder / "run.mcap")), turns
 
@@ -124,16 +143,18 @@ def main() -> None:
     swaps_ns = np.array([frame.swap_ns for frame in frames])
     missed = np.array([frame.missed_before for frame in frames])
     print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.2f} at the end; turns of {TURN_S:g} s")
-    print(f"{'':18}{'frames':>8}{'missed':>8}{'SD of the interval, ms':>26}")
+    print(f"{'':18}{'frames':>8}{'missed':>8}{'SD of the interval, ms':>26}{'run, % of a core':>20}{'page, % of a core':>20}")
     for kind in KINDS:
         intervals_ms, lost, count = [], 0, 0
-        for what, begin_ns, end_ns in turns:
-            if what == kind:
-                within = np.flatnonzero((swaps_ns >= begin_ns) & (swaps_ns < end_ns))
-                lost, count = lost + int(missed[within].sum()), count + len(within)
-                steps = np.diff(swaps_ns[within]) * MS
-                intervals_ms.append(steps[missed[within][1:] == 0])
-        print(f"{kind:18}{count:8}{lost:8}{np.concatenate(intervals_ms).std():26.3f}")
+        mine = [turn for turn in turns if turn.kind == kind]
+        for turn in mine:
+            within = np.flatnonzero((swaps_ns >= turn.begin_ns) & (swaps_ns < turn.end_ns))
+            lost, count = lost + int(missed[within].sum()), count + len(within)
+            steps = np.diff(swaps_ns[within]) * MS
+            intervals_ms.append(steps[missed[within][1:] == 0])
+        lasted_s = sum(turn.end_ns - turn.begin_ns for turn in mine) * 1e-9
+        shares = (100 * sum(took) / lasted_s for took in ([turn.run_s for turn in mine], [turn.page_s for turn in mine]))
+        print(f"{kind:18}{count:8}{lost:8}{np.concatenate(intervals_ms).std():26.3f}" + "".join(f"{s:20.1f}" for s in shares))
 
 
 if __name__ == "__main__":

@@ -24,6 +24,7 @@ log = logging.getLogger(__name__)
 
 MAX_ORBIT_BYTES = 20_000_000  # a year of minutes
 MAX_TLE_AGE_DAYS = 7.0
+MAX_ARCSEC, MANY_PX = 7200.0, 1000.0  # a wider body is told in degrees; across a field that wide no scale holds
 
 
 def moving_sky(config: BenchConfig, folder: Path, optics: Optics) -> MovingSky:
@@ -95,7 +96,15 @@ def wide_bodies(moving: MovingSky | None, camera: Camera, t_ns: int | None = Non
     px_per_arcsec = camera.scales_px_rad()[1] / ARCSEC_PER_RAD
     widths = sorted(((d * px_per_arcsec, name, d) for name, d in found.items()), reverse=True)
     return [
-        f"{name}: {arcsec:.1f} arcsec wide, {px:.2f} px of the screen; drawn as a disc"
+        f"{name}: {_angle(arcsec)} wide, {_pixels(px)} of the screen; drawn as a disc"
         for px, name, arcsec in widths
         if px > POINT_PX
     ]
+
+
+def _angle(arcsec: float) -> str:
+    return f"{arcsec:.1f} arcsec" if arcsec < MAX_ARCSEC else f"{arcsec / 3600:.1f} deg"
+
+
+def _pixels(px: float) -> str:
+    return f"{px:.2f} px" if px < MANY_PX else f"more than {MANY_PX:.0f} px"

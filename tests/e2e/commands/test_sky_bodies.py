@@ -328,4 +328,4 @@ def test_without_a_source_s_message_the_earth_is_not_there_and_explain_says_so(s
     text = text.replace("2026-11-21T00:00:00Z", STATION_UTC)
     small_bench_file.write_text(text)
     from_orbit = run_hilstar_here("frame", small_bench_file, "--radec", MOON, "--truth", folder / "t.csv", "--explain")
-    assert "Earth: 5" in from_orbit.stderr and "drawn as a disc" in from_orbit.stderr, from_orbit.stderr
+    assert "Earth: 143" in from_orbit.stderr and "drawn as a disc" in from_orbit.stderr, from_orbit.stderr

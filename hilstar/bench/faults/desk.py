@@ -126,6 +126,8 @@ class FaultDesk:
 
         Raises InputError where it cannot be drawn, its name is on, or too many are.
         """
+        with self._lock:
+            self._check_room(fault)  # before what takes time
         fault = self._prepare(fault)
         self._ask(_Planned(fault, who, None if fault.at_s is None else round(fault.at_s * NS_PER_S)))
 
@@ -145,16 +147,20 @@ class FaultDesk:
         return f"on are {', '.join(names)}" if names else "none is"
 
     def _ask(self, wanted: _Planned) -> None:
-        name = wanted.fault.name
         with self._lock:
-            if any(planned.fault.name == name for planned in (*self._on, *self._asked)) and name not in self._stops:
-                raise InputError(f"the fault {name!r} is on already; stop it first, or give another name")
-            there = sum(isinstance(planned.fault, SURFACES) for planned in (*self._on, *self._asked))
-            if isinstance(wanted.fault, SURFACES) and there >= MAX_SURFACES_ON:
-                raise InputError(f"{there} gradients, glows and maps are on or wait; stop one first")
-            if len(self._on) >= MAX_ON or len(self._asked) >= MAX_ASKED:
-                raise InputError(f"{len(self._on)} faults are on and {len(self._asked)} wait; stop one first")
+            self._check_room(wanted.fault)
             self._asked.append(wanted)
+
+    def _check_room(self, fault: Fault) -> None:
+        """Refuse (InputError) a fault whose name is on, and one too many; the caller has the lock."""
+        there = [planned.fault for planned in (*self._on, *self._asked)]
+        if any(other.name == fault.name for other in there) and fault.name not in self._stops:
+            raise InputError(f"the fault {fault.name!r} is on already; stop it first, or give another name")
+        surfaces = sum(isinstance(other, SURFACES) for other in there)
+        if isinstance(fault, SURFACES) and surfaces >= MAX_SURFACES_ON:
+            raise InputError(f"{surfaces} gradients, glows and maps are on or wait; stop one first")
+        if len(self._on) >= MAX_ON or len(self._asked) >= MAX_ASKED:
+            raise InputError(f"{len(self._on)} faults are on and {len(self._asked)} wait; stop one first")
 
     # Called by the frames' thread
 

@@ -67,14 +67,15 @@ def pixels_in(camera: Camera, other: Camera) -> tuple[FloatArray, FloatArray, Fl
         seen_x, seen_y = (part.reshape(height, width) for part in moved(other, camera, x.ravel(), y.ravel()))
         (x_down, x_right), (y_down, y_right) = np.gradient(seen_x), np.gradient(seen_y)
         return seen_x, seen_y, np.abs(x_right * y_down - x_down * y_right)
-    (spline_x, spline_y), columns, rows = coarse, np.arange(width), np.arange(height)
-    x_right, y_right = spline_x(rows, columns, dy=1), spline_y(rows, columns, dy=1)
-    x_down, y_down = spline_x(rows, columns, dx=1), spline_y(rows, columns, dx=1)
-    return spline_x(rows, columns), spline_y(rows, columns), np.abs(x_right * y_down - x_down * y_right)
+    x, y, area = (spline(np.arange(height), np.arange(width)) for spline in coarse)
+    return x, y, area
 
 
-def _grid_in(camera: Camera, other: Camera) -> tuple[Any, Any] | None:
-    """Cubics through the places of some of a camera's pixels in another's; None where some have no place."""
+def _grid_in(camera: Camera, other: Camera) -> tuple[Any, Any, Any] | None:
+    """Cubics through the places of some of a camera's pixels in another's, and through what they cover.
+
+    None where some have no place.
+    """
     from scipy.interpolate import RectBivariateSpline
 
     across, down = (np.linspace(0, size - 1, max(5, size // GRID_PX)) for size in camera.resolution_px)
@@ -82,7 +83,10 @@ def _grid_in(camera: Camera, other: Camera) -> tuple[Any, Any] | None:
     places = [part.reshape(x.shape) for part in moved(other, camera, x.ravel(), y.ravel())]
     if not all(np.isfinite(place).all() for place in places):
         return None
-    return RectBivariateSpline(down, across, places[0]), RectBivariateSpline(down, across, places[1])
+    along_x, along_y = (RectBivariateSpline(down, across, place) for place in places)
+    x_right, y_right = along_x(down, across, dy=1), along_y(down, across, dy=1)
+    x_down, y_down = along_x(down, across, dx=1), along_y(down, across, dx=1)
+    return along_x, along_y, RectBivariateSpline(down, across, np.abs(x_right * y_down - x_down * y_right))
 
 
 def map_sha256(path: Path) -> str:

@@ -17,10 +17,10 @@ from hilstar.campaign.plan.parameters import grid_levels
 from hilstar.campaign.plan.tables import Plan, parse_plan
 from hilstar.campaign.store.directory import About, Directory
 from hilstar.campaign.store.journal import Journal
-from hilstar.campaign.store.table import file_sha256, require_parquet, schema_of, write_table
+from hilstar.campaign.store.table import require_parquet, schema_of, write_table
 from hilstar.campaign.workers.backlog import MAX_DEATHS, Backlog, Task
 from hilstar.campaign.workers.identity import Identity
-from hilstar.campaign.workers.session import Answered, Job, Session
+from hilstar.campaign.workers.session import Answered, Job, Session, files_sha256
 from hilstar.errors import InputError
 from hilstar.reading import MAX_TOML_BYTES, read_text
 
@@ -62,6 +62,7 @@ class Campaign:
             bench_path=str(self.file.path.resolve()),
             bench_text=self.file.text,
             bench_sha256=self.file.sha256,
+            files_sha256=files_sha256(self.plan, path.parent),
             solver=asked.solver,
             solver_folder=str(Path.cwd()),
             timeout_s=asked.timeout_s,
@@ -84,10 +85,9 @@ class Campaign:
 
     def about(self) -> About:
         """What the rows depend on."""
-        log = None if self.plan.attitudes.log is None else file_sha256(self.path.parent / self.plan.attitudes.log)
         plan = msgspec.json.decode(msgspec.json.encode(self.plan, enc_hook=str))
         identity = msgspec.to_builtins(self.identity)
-        return About(plan, self.file.sha256, log, self.asked.solver, self.asked.images, identity)
+        return About(plan, self.file.sha256, self.job.files_sha256, self.asked.solver, self.asked.images, identity)
 
     def run(self, directory: Directory, workers: Workers, on_done: Callable[[int], None]) -> None:
         """Run what is missing, and write the table when nothing is. `on_done` gets the number of cases that are done.

@@ -17,13 +17,16 @@ from hilstar.attitude.logs.entries import Stated
 from hilstar.attitude.logs.log_file import log_timeline, open_log
 from hilstar.attitude.wire.source import Mounting
 from hilstar.bench.bench_file import BenchFile, dated
-from hilstar.campaign.plan.parameters import Parameter, changed_bench, parameters
+from hilstar.bench.faults.scenario import Scenario, read_scenario
+from hilstar.campaign.plan.parameters import SCENARIO, Parameter, changed_bench, parameters
 from hilstar.campaign.plan.tables import Attitudes, Plan
 from hilstar.errors import InputError
 from hilstar.reading import parse_toml
 from hilstar.rotation import from_radec_roll_deg, from_rotation_vector, multiply, normalise, propagate
 from hilstar.scene.exposure_motion import Motion
-from hilstar.twin.batch import motion_at
+from hilstar.twin.batch import faulty_exposure, motion_at
+from hilstar.twin.faulty_exposure import FaultyExposure
+from hilstar.twin.simulator import Simulator
 from hilstar.units import ARCSEC_PER_RAD, NS_PER_S
 
 ATTITUDE_DIMENSIONS = {"all-sky": 3, "field": 3, "log": 1}
@@ -58,6 +61,7 @@ class CaseMaker:
         if self._log is not None:
             self.file = dated(file, self._log.scale, self._log.span_ns[0])
         self.parameters: list[Parameter] = parameters(plan, file)
+        self._scenarios = _read_scenarios(self.parameters, folder)
         _check_through(plan, self.parameters, file)
 
     @property
@@ -94,6 +98,14 @@ class CaseMaker:
         q = propagate(first.q_icrs_to_cam, first.rate_cam_rad_s, step_ns / NS_PER_S) if step_ns else first.q_icrs_to_cam
         return Motion(q, first.rate_cam_rad_s, exposure_s, (first.t_ns or 0) + step_ns)
 
+    def faults(self, case: Case, motion: Motion, simulator: Simulator) -> FaultyExposure | None:
+        """What the case's scenario does to an exposure; its time is that of the case, or the log's since its beginning."""
+        scenario = self._scenarios.get(str(case.values.get(SCENARIO, "")))
+        if scenario is None:
+            return None
+        begin_ns = 0 if self._log is None else self._log.span_ns[0]
+        return faulty_exposure(simulator, motion, scenario, (motion.t_ns or 0) - begin_ns)
+
     def _first(self, number: int, look: FloatArray, values: dict[str, Any]) -> Motion:
         rate_rad_s = self._rate_rad_s(number, values)
         if self._log is not None:
@@ -128,6 +140,12 @@ def looking_q(attitudes: Attitudes, look: FloatArray) -> FloatArray:
     return from_radec_roll_deg(math.degrees(math.atan2(y, x)), math.degrees(math.atan2(z, math.hypot(x, y))), roll_deg)
 
 
+def _read_scenarios(varied: list[Parameter], folder: Path) -> dict[str, Scenario]:
+    """The scenarios that a plan names, by their names. Raises InputError."""
+    names = [str(name) for parameter in varied if parameter.key == SCENARIO for name in parameter.values if name]
+    return {name: read_scenario(folder / name) for name in names}
+
+
 def _has_rate(values: dict[str, Any]) -> bool:
     return any(key.startswith("rate_deg_s.") for key in values)
 
@@ -160,6 +178,10 @@ def _check_through(plan: Plan, varied: list[Parameter], file: BenchFile) -> None
             )
         if plan.attitudes.kind == "log" and parameter.key == "time_s":
             raise InputError('[[vary]] key = "time_s": with a log the times are the log\'s; leave it out')
+        if plan.through == "display" and parameter.key == SCENARIO:
+            raise InputError('[[vary]] key = "scenario": faults are of through = "tracker"; write that')
+        if parameter.key == SCENARIO and not parameter.values:
+            raise InputError('[[vary]] key = "scenario": is a file; write values = ["faults.toml", ""]')
         if table == "misalignment_arcsec" and (file.config.collimator.geometry or file.config.verify.true_geometry):
             raise InputError(
                 f'[[vary]] key = "{parameter.key}": the bench has a geometry file, whose own alignment counts; vary'

@@ -26,9 +26,11 @@ OWN_KEYS = (
     "misalignment_arcsec.z",
     "time_s",
     "noise_seed",
+    "scenario",
 )
 MAX_OWN = {"rate_deg_s": 360.0, "misalignment_arcsec": 36_000.0, "time_s": 9e9, "noise_seed": 2.0**63 - 1}
 WHOLE = ("noise_seed",)
+SCENARIO = "scenario"  # the path of a file of faults, or none where it is empty
 Value = float | int | bool | str
 
 
@@ -105,6 +107,10 @@ def _parameter(varied: Varied, file: BenchFile) -> Parameter:
 def _check(parameter: Parameter, value: Any, file: BenchFile, tables: dict[str, Any]) -> None:
     if not parameter.own:
         changed_bench(file, tables, {parameter.key: value})
+        return
+    if parameter.key == SCENARIO:
+        if not isinstance(value, str):
+            raise InputError(f'the value {shortened(value)}; write paths of scenario files, and "" for none')
         return
     largest = MAX_OWN[parameter.key.split(".")[0]]
     low = 0 if parameter.key in WHOLE else -largest

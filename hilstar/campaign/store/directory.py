@@ -24,7 +24,7 @@ class About(msgspec.Struct, frozen=True):
 
     plan: dict[str, Any]
     bench_sha256: str
-    log_sha256: str | None
+    files_sha256: str
     solver: str
     images: bool
     identity: dict[str, str]
@@ -94,7 +94,7 @@ def _changed(before: About, now: About) -> str:
             old, new = (part[table].get(key) for part in said)
             if old != new:
                 return f"{words}{key} was {shortened(_json(old))} and is {shortened(_json(new))}"
-    for key, words in (("bench_sha256", "its bench file"), ("log_sha256", "its log"), ("solver", "--solver")):
+    for key, words in (("bench_sha256", "its bench file"), ("files_sha256", "its log or scenario"), ("solver", "--solver")):
         if said[0][key] != said[1][key]:
             return f"{words} was {shortened(said[0][key])} and is {shortened(said[1][key])}"
     return "--images was another"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 import time
 from pathlib import Path
@@ -17,12 +18,14 @@ from hilstar.bench.config import BenchConfig
 from hilstar.campaign.cases.case import Case, CaseMaker
 from hilstar.campaign.cases.display import DisplayTracker
 from hilstar.campaign.cases.row import Kind, Row, Tally, columns, failed, first_row
+from hilstar.campaign.plan.parameters import SCENARIO
 from hilstar.campaign.plan.tables import Plan, parse_plan
 from hilstar.campaign.solvers.answer import SolverFault
 from hilstar.campaign.solvers.choose import CENTROIDS, choose_solver
 from hilstar.campaign.workers.identity import Identity, own_identity
 from hilstar.errors import HilstarError, InputError, MachineError, one_line
 from hilstar.files import make_directory
+from hilstar.reading import CHUNK_BYTES, open_regular
 from hilstar.scene.camera import Camera
 from hilstar.scene.exposure_motion import Motion
 from hilstar.twin.exposure_files import write_exposure_fits
@@ -40,6 +43,7 @@ class Job(msgspec.Struct, frozen=True):
     bench_path: str
     bench_text: str
     bench_sha256: str
+    files_sha256: str
     solver: str
     solver_folder: str
     timeout_s: float
@@ -93,6 +97,10 @@ class Session:
                 f"its bench {self.file.sha256:.12} is not the campaign's {job.bench_sha256:.12}: a file that {job.bench_path}"
                 " names has another content there; copy it"
             )
+        if files_sha256(self.plan, Path(job.plan_path).parent) != job.files_sha256:
+            raise InputError(
+                f"its log or scenario is not the campaign's: a file that {job.plan_path} names differs there; copy it"
+            )
         self.maker = CaseMaker(self.plan, self.file, Path(job.plan_path).parent)
         self.columns: dict[str, Kind] = columns(self.maker.parameters, job.solver == CENTROIDS)
         self._solver = choose_solver(job.solver, self.plan.centroids, Path(job.solver_folder), job.timeout_s)
@@ -131,7 +139,11 @@ class Session:
             motion = self.maker.motion(case, frame, tracker.config.tracker.exposure_s)
             # A case of one frame is what `hilstar simulate --seed` makes of the same bench and attitude.
             rng = noise.rng() if self.plan.frames == 1 else noise.rng(frame)
-            exposure = tracker.expose(motion, rng)
+            faults = self.maker.faults(case, motion, tracker) if isinstance(tracker, Simulator) else None
+            if isinstance(tracker, Simulator) and faults is not None:
+                exposure = tracker.expose(motion, rng, faults=faults)
+            else:
+                exposure = tracker.expose(motion, rng)
             if self.job.images:
                 name = image_name(case.number, frame, self.plan.frames)
                 row["image"] = image_name(case.number, 0, self.plan.frames)
@@ -167,6 +179,17 @@ class Session:
         """Free the GL contexts."""
         if self._tracker is not None:
             self._tracker.close()
+
+
+def files_sha256(plan: Plan, folder: Path) -> str:
+    """The digest of the files that a plan names beside its bench: its log, and its scenarios. Raises InputError."""
+    digest = hashlib.sha256()
+    varied = [str(name) for each in plan.vary if each.key == SCENARIO for name in each.values or () if name]
+    for name in [*([plan.attitudes.log] if plan.attitudes.log else []), *varied]:
+        with open_regular(folder / name, "give the path of a file") as file:
+            while chunk := file.read(CHUNK_BYTES):
+                digest.update(chunk)
+    return digest.hexdigest()
 
 
 def image_name(case: int, frame: int, frames: int) -> str:

@@ -11,7 +11,7 @@ from astropy.io import fits
 
 from hilstar.campaign.plan.design import Design
 from hilstar.campaign.plan.tables import parse_plan
-from hilstar.campaign.workers.session import Job, Session
+from hilstar.campaign.workers.session import Job, Session, files_sha256
 from hilstar.rotation import propagate
 from tests.support.campaigns import write_campaign
 from tests.support.commands import run_hilstar_here
@@ -30,6 +30,7 @@ def session(folder: Path, images: bool = False) -> Session:
             bench_path=str(bench),
             bench_text=bench.read_text(),
             bench_sha256=digest,
+            files_sha256=files_sha256(parse_plan(plan, plan.read_text()), folder),
             solver="centroids",
             solver_folder=str(folder),
             timeout_s=10.0,
@@ -103,3 +104,26 @@ def test_the_display_shows_what_the_tracker_would_see_and_its_misalignment(tmp_p
     assert np.abs(straight[:2]).max() < 3
     assert np.abs(turned - straight)[0] == pytest.approx(300, abs=3) and abs(turned - straight)[1] < 3
     assert rows[0]["matched"] >= 5
+
+
+SCENARIO = """
+[[fault]]
+kind = "blank"
+name = "dark"
+at_s = 1.0
+for_s = 2.0
+"""
+
+
+def test_a_scenario_is_varied_like_any_key_and_a_file_that_changes_is_another_campaign(tmp_path: Path) -> None:
+    scenario = {"key": "scenario", "values": ["", "dark.toml"]}
+    (tmp_path / "dark.toml").write_text(SCENARIO)
+    write_campaign(tmp_path, scenario, {"key": "time_s", "values": [0.0, 2.0]}, sampling="grid", cases=None)
+    this = session(tmp_path)
+    look = np.array([0.3, 0.6, 0.1])
+    found = [this.row(k, np.append(look, [(k // 2 + 0.5) / 2, (k % 2 + 0.5) / 2]))["matched"] for k in range(4)]
+    this.close()
+    assert found[0] == found[1] == found[2] > 0 == found[3]
+    before = files_sha256(this.plan, tmp_path)
+    (tmp_path / "dark.toml").write_text(SCENARIO + "# another\n")
+    assert files_sha256(this.plan, tmp_path) != before

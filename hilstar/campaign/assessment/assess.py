@@ -99,7 +99,7 @@ def _completed(
     valid = np.flatnonzero(answers.valid)
     right, wrong = np.zeros(len(t_s), dtype=np.bool_), np.zeros(len(t_s), dtype=np.bool_)
     right[valid[found.row]], wrong[valid[found.wrong]] = True, True
-    notes = [*found.notes, *_said_of_clock(found), *_said_of_bend(run, found)]
+    notes = [*found.notes, *_said_of_base(base_s), *_said_of_clock(found), *_said_of_bend(run, found)]
     display: DisplayCost | None = None
     by_magnitude: tuple[Slice, ...] = ()
     parts = found.components
@@ -114,6 +114,8 @@ def _completed(
             say("the display's own error")
             some = np.unique(np.linspace(0, len(found.row) - 1, wanted.display_attitudes).astype(int))
             display = display_cost(display_errors(file, found.commanded_q[some]), parts.left[some])
+            if display is None:
+                notes.append("the display shows too few stars at once for an attitude: its own error was not found")
     except HilstarError as refusal:
         notes.append(f"neither the field's magnitude nor the display's own error could be found from the ledger: {refusal}")
     noise, said = _without_display(found, display)
@@ -143,6 +145,15 @@ def _wrong(answers: Telemetry, found: Decomposed, t_s: FloatArray) -> tuple[Wron
         Wrong(int(answers.line[valid[k]]), int(answers.t_ns[valid[k]]) / 1e9, float(t_s[valid[k]]), float(off[k]))
         for k in found.wrong
     )
+
+
+def _said_of_base(base_s: float) -> list[str]:
+    """Times that do not overlap the run's as they are."""
+    if base_s == 0:
+        return []
+    return [
+        f"the telemetry's times, {abs(base_s):.9g} s from the run's, do not overlap it: its clock is taken as one of its own"
+    ]
 
 
 def _said_of_clock(found: Decomposed) -> list[str]:

@@ -50,7 +50,7 @@ def matched(run: RunLedger, telemetry: Telemetry, tau_s: FloatArray, q: FloatArr
         raise InputError(f"{telemetry.path}: {_turned(coarse.rotation)}: another frame or mounting; {cure}")
     raise InputError(
         f"{telemetry.path}: at no offset of its clock do the reported attitudes follow those of {run.path}, lit for"
-        f" {commanded.t_s[-1]:.6g} s; give the telemetry of this run, of more of it than gaps and wild answers"
+        f" {commanded.t_s[-1]:.6g} s; give the telemetry of this run, of which no more than half may be wild"
     )
 
 

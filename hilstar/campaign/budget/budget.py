@@ -19,6 +19,7 @@ from hilstar.rotation import conjugate, multiply, to_rotation_vector
 from hilstar.units import ARCSEC_PER_RAD, MAD_TO_SIGMA
 
 UNUSUAL_SIGMAS = 5.0
+MAX_SPREAD_ARCSEC = 600.0  # one sigma: more is no star tracker, but a motion that is somewhat alike
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +73,9 @@ def assess_run(
         raise InputError(
             f"half or more of the answers are wild: {int(clock.used.sum())} of {int(known.sum())} agree with one rotation"
         )
+    spread = MAD_TO_SIGMA * float(np.median(np.abs(clock.residual_arcsec[clock.used][:, :2])))
+    if spread > MAX_SPREAD_ARCSEC:
+        raise InputError(f"the answers scatter by {spread:.4g} arcsec about the commanded attitudes: they are of another run")
     total = clock.residual_arcsec + ARCSEC_PER_RAD * to_rotation_vector(clock.rotation)
     return _decomposed(total, clock.moments.q, clock.moments.rate_rad_s, (known, clock.used), (scale, rng, clock))
 

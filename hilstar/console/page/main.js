@@ -62,6 +62,8 @@ const HEARD = {
     picture.setScreen(said.resolution_px, said.white_level);
     controls.setUp(said);
     health.bench = said.bench;
+    document.body.dataset.session = String(Boolean(said.session));
+    document.body.dataset.control = String(said.control);
     health.session = Boolean(said.session);
     write(byId("bench"), said.bench);
     byId("bench").title = said.bench;
@@ -95,7 +97,11 @@ const HEARD = {
     while (points.length && points[0].t_s < from) points.shift();
     redraw("charts");
   },
-  event: (said) => addEvent(said),
+  event(said) {
+    const newest = byId("events").firstElementChild;
+    if (said.kind === "pattern" && newest?.dataset.kind === "pattern") newest.remove(); // a step is worth a line, not each of its patterns
+    addEvent(said);
+  },
   truth(said) {
     if (held && said.frame !== picture.frame) return; // the truth of the picture that is held stays
     overlays.add(said);
@@ -204,7 +210,7 @@ function tellAge() {
   const badge = byId("picture-badge");
   const age = performance.now() - pictureAt;
   const calm = matchMedia("(prefers-reduced-motion: reduce)").matches;
-  const old = picture.levels && age > OLD_PICTURE_MS * (calm ? 2 : 1);
+  const old = !hello?.session && picture.levels && age > OLD_PICTURE_MS * (calm ? 2 : 1);
   badge.hidden = !(held || old);
   badge.dataset.state = held ? "held" : "old";
   write(badge, held ? `Held on this page: frame ${picture.frame}` : old ? `This picture is ${(age / 1000).toFixed(1)}\u00a0s old` : "");

@@ -165,7 +165,8 @@ class Bench:
 
         `frame` counts the frames shown, for temporal dithering. With a rate that moves stars by more than
         `[render] motion_above_px`, each star is drawn along its path while its row is lit; the attitude is then that at the
-        middle row's first light. Bodies are where they are at `t_ns`, by default at the start.
+        middle row's first light. Bodies are where they are at `t_ns`, by default at the start; without a rate satellites'
+        paths have their middle there.
         """
         return self.draw_sprites(self.frame_sprites(q_icrs_to_cam, rate_cam_rad_s, t_ns=t_ns), frame)
 
@@ -191,6 +192,7 @@ class Bench:
         if self._painter is not None:
             sprites = self._painter.over(sprites, stars, q_icrs_to_cam, When(t_ns, velocity_km_s, place_km), turn)
         shot = Shot(self.camera, self.scan, turn or Turn(q_icrs_to_cam, STILL), t_ns, velocity_km_s, place_km)
+        shot = shot.at_rest() if rate_cam_rad_s is None else shot
         sprites = self._with_satellites(sprites, stars, shot, self.faintest_shown_e_per_s)
         if faults is None:
             return sprites
@@ -315,7 +317,8 @@ class Bench:
         sprites = self.sprites(q, seen)
         if self._painter is not None:
             sprites = self._painter.over(sprites, seen, q, When(t_ns))
-        sprites = self._with_satellites(sprites, seen, Shot(self.camera, self.scan, Turn(q, STILL), t_ns), faintest_e_per_s)
+        shot = Shot(self.camera, self.scan, Turn(q, STILL), t_ns).at_rest()
+        sprites = self._with_satellites(sprites, seen, shot, faintest_e_per_s)
         return sprites if faults is None else faults.over(sprites, seen, q, lambda few: self.sprites(q, few))
 
     def seen(

@@ -83,6 +83,10 @@ class Shot:
     begin_s: float = 0.0
     white_e_per_s: float = math.inf
 
+    def at_rest(self) -> Shot:
+        """The same light of a still picture: all rows at once, and its middle at the moment."""
+        return replace(self, scan=Scan(hold_s=self.scan.hold_s), begin_s=-self.scan.hold_s / 2)
+
     @property
     def longest_s(self) -> float:
         """The farthest from that moment that any light is."""

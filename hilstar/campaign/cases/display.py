@@ -103,8 +103,8 @@ class DisplayTracker:
             seconds = ((frame + 0.5) / count - 0.5) * motion.exposure_s
             q = propagate(motion.q_icrs_to_cam, motion.rate_cam_rad_s, seconds)
             t_ns = motion.t_ns
-            if streaks and t_ns is not None:  # satellites have the frame's whole time, stars its middle
-                t_ns += round((frame / count - 0.5) * motion.exposure_s * NS_PER_S)
+            if streaks and t_ns is not None:
+                t_ns += round(seconds * NS_PER_S)
             light = shown_light(self._bench.draw(q, frame, t_ns=t_ns).levels, self._panel)
             total = light if total is None else total + light
         return np.zeros((0, 0)) if total is None else total / count

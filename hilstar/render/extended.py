@@ -16,7 +16,7 @@ from hilstar.scene.extended import DiscLight, ExtendedLight, Glow, LightMap, Rec
 from hilstar.scene.rays import ray_shifts
 from hilstar.sky.bodies.disc import AIR_TOP, SOLAR_LIMB, Disc, gauss_legendre
 
-KEPT_TEXTURES = 4  # of maps and lenses: a bench has one lens, and few maps at a time
+KEPT_TEXTURES = 6  # of lasting maps and lenses: a bench has one lens, and few maps at a time
 LAWS = ("uniform", "lambert", "lunar-lambert", "limb-darkened")  # by their numbers in disc.frag
 NODES = 16  # as there
 
@@ -70,13 +70,19 @@ class ExtendedLayer:
 
     def _draw_map(self, light: LightMap) -> None:
         program, triangle = self._program("light_map.frag", "", *(() if light.cover is None else ("COVER",)))
-        self._texture(light.image, light.image, 1).use(0)
+        own = []
+        for unit, image in enumerate((light.image, light.cover)):
+            if image is not None:
+                texture = self._texture(image, image, 1) if light.lasting else self._upload(image, 1)
+                texture.use(unit)
+                own += [] if light.lasting else [texture]
         if light.cover is not None:
-            self._texture(light.cover, light.cover, 1).use(1)
             program["cover"] = 1
         program["corner_px"] = light.corner_px
         program["times"] = light.times
         triangle.render(moderngl.TRIANGLES, vertices=3)
+        for texture in own:
+            texture.release()
 
     def _draw_glow(self, light: Glow) -> None:
         program, triangle = self._with_rays("glow.frag", light.camera)
@@ -156,12 +162,15 @@ class ExtendedLayer:
         if kept is None:
             if len(self._textures) >= KEPT_TEXTURES:
                 self._textures.pop(next(iter(self._textures)))[1].release()
-            values = np.ascontiguousarray(ray_shifts(owner) if isinstance(owner, Camera) else image, dtype=np.float32)
-            texture = self._ctx.texture(values.shape[1::-1], components, values, dtype="f4")
-            texture.filter = (moderngl.NEAREST, moderngl.NEAREST)
-            kept = owner, texture
+            kept = owner, self._upload(ray_shifts(owner) if isinstance(owner, Camera) else image, components)
         self._textures[id(owner)] = kept  # the last used is the last to go
         return kept[1]
+
+    def _upload(self, image: Any, components: int) -> moderngl.Texture:
+        values = np.ascontiguousarray(image, dtype=np.float32)
+        texture = self._ctx.texture(values.shape[1::-1], components, values, dtype="f4")
+        texture.filter = (moderngl.NEAREST, moderngl.NEAREST)
+        return texture
 
 
 def _set_face(program: moderngl.Program, disc: Disc) -> None:

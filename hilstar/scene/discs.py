@@ -90,7 +90,7 @@ def _disc_map(light: DiscLight, nodes: int) -> LightMap | None:
         share = _spread(*whole[:2], whole[2] * _px_per_sr(light), region, light.sigma_px)
         cover = np.where(share > WHOLE, np.float32(1), share)
     image = _spread(x_px, y_px, light.times * disc.normal_e_per_s_sr * law_sr, region, light.sigma_px)
-    return LightMap(image, (region[0], region[1]), 1.0, cover, disc.name)
+    return LightMap(image, (region[0], region[1]), 1.0, cover, disc.name, lasting=False)
 
 
 def _places(light: DiscLight, disc: Disc, nodes: int) -> tuple[FloatArray, FloatArray, FloatArray]:

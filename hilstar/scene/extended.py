@@ -29,7 +29,8 @@ class LightMap:
     `cover`, of the same shape, is the share of what was drawn before that each pixel hides; None hides nothing. `name` is the
     body's whose disc it is.
 
-    Keep one array for as long as the light is the same, and do not write to it: it is uploaded once.
+    Keep one array for as long as the light is the same, and do not write to it: it is uploaded once. What a single frame has is
+    not `lasting`.
     """
 
     image: Float32Array
@@ -37,6 +38,7 @@ class LightMap:
     times: float = 1.0
     cover: Float32Array | None = None
     name: str = ""
+    lasting: bool = True
 
     def region(self, resolution_px: tuple[int, int]) -> Rectangle | None:
         """The part of an image that it lights, None where that is nothing."""

@@ -17,13 +17,14 @@ from hilstar.bench.frame import Bench
 from hilstar.bench.in_view import brightest_in_view
 from hilstar.monitor.quantise import dither_levels, round_levels, temporal_levels
 from hilstar.monitor.response import srgb_response
+from hilstar.render.extended import ExtendedLayer
 from hilstar.render.reference import linear_image
 from hilstar.render.renderer import Renderer, Target
 from hilstar.render.tiles import disc_tiles
 from hilstar.rotation import from_radec_roll_deg
 from hilstar.scene.camera import Camera
 from hilstar.scene.discs import Pose, View, disc_lights
-from hilstar.scene.extended import DiscLight, Shear
+from hilstar.scene.extended import DiscLight, LightMap, Shear
 from hilstar.scene.frame_motion import Scan, Turn
 from hilstar.scene.lens import Lens
 from hilstar.sky.bodies.disc import Disc
@@ -224,6 +225,24 @@ def test_every_quantisation_encodes_discs_and_erases_them(method, radius_px):
             assert (levels[30:] == 1023).any() == (radius_px == 3.0) and levels[30:].max() > 300
             gl.draw(star, 3)
             assert (gl.codes() == plain).all()
+
+
+def test_maps_of_discs_do_not_push_out_those_that_last(monkeypatch):
+    uploaded = []
+    upload = ExtendedLayer._upload
+    monkeypatch.setattr(ExtendedLayer, "_upload", lambda self, image, n: uploaded.append(image.shape) or upload(self, image, n))
+    view = View(CAMERA, SIGMA, (Pose(np.eye(3)),))
+    lasting = LightMap(np.ones(SIZE[::-1], dtype=np.float32))
+    with Renderer(Target(SIZE, SIGMA)) as gl:
+        none = sprites_at(np.empty((0, 2)), np.empty(0), gl.footprint_px)
+        for _ in range(3):
+            discs = [
+                light for x in range(5) for light in disc_lights(disc(2.0, 40.0, (10.0 + 15 * x, 40.0)), view, covers=True)
+            ]
+            gl.draw(replace(none, extended=(lasting, *discs)))
+            assert gl.linear().sum() > 4e8
+    assert uploaded.count(SIZE[::-1]) == 1
+    assert len(uploaded) == 1 + 3 * 2 * 5
 
 
 def test_a_disc_under_a_turn_keeps_its_light_and_lies_along_the_way_of_its_star(bench):

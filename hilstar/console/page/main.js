@@ -64,6 +64,7 @@ const HEARD = {
     health.bench = said.bench;
     document.body.dataset.session = String(Boolean(said.session));
     document.body.dataset.control = String(said.control);
+    picture.setRedClipped(overlays.on.clipped && !said.session); // a pattern's white is meant
     health.session = Boolean(said.session);
     write(byId("bench"), said.bench);
     byId("bench").title = said.bench;

@@ -87,7 +87,7 @@ class Orders:
 
     def _free_path(self) -> Path:
         """A new name, beside the newest ledger where there was one."""
-        folder = Path() if self._ledger.last is None else self._ledger.last.path.parent
+        folder = Path.cwd() if self._ledger.last is None else self._ledger.last.path.parent
         now = datetime.now(UTC)
         for k in range(100):
             path = folder / (f"hilstar-{now:%Y%m%dT%H%M%SZ}" + (f"-{k}" if k else "") + ".mcap")

@@ -24,6 +24,7 @@ class LedgerSwitch:
     def __init__(self, ledger: Ledger | None = None) -> None:
         self.current = ledger
         self.last = ledger  # the newest there was
+        self._ending = threading.Lock()  # the end of a run waits for one that an operator has begun
         self._scenario: list[FaultRecord] = []
         self._faults_on: dict[int, FaultRecord] = {}
 
@@ -79,9 +80,9 @@ class LedgerSwitch:
 
     def end(self) -> Ledger | None:
         """End the ledger, and wait until it is whole on the disk; the one that was ended."""
-        ledger, self.current = self.current, None
-        if ledger is not None:
-            with stop_on_signal(threading.Event()):  # a signal that comes now does not interrupt this
+        with self._ending, stop_on_signal(threading.Event()):  # a signal that comes now does not interrupt this
+            ledger, self.current = self.current, None
+            if ledger is not None:
                 ledger.close()
         return ledger
 

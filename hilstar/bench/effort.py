@@ -12,6 +12,7 @@ import numpy as np
 
 from hilstar.arrays import FloatArray
 from hilstar.bench.config import RenderSettings
+from hilstar.monitor.balance import Balance
 from hilstar.monitor.phases import WHITE, Errors, fainter, measure, phase_grid, shown_by
 from hilstar.monitor.quantise import Panel, Quantisation
 from hilstar.monitor.response import Response
@@ -190,7 +191,8 @@ def code_errors(method: Quantisation, render: RenderSettings, light: Light) -> E
     found = []
     for mag in np.linspace(0.0, deepest, MAGNITUDES).tolist():
         wanted = bright * flux_ratio(mag)
-        shown = shown_by(method, render.cycle_frames, panel, wanted.astype(np.float32), fainter(sprites, mag), sigma_px)
+        linear, balance = wanted.astype(np.float32), Balance(sigma_px)
+        shown = shown_by(method, render.cycle_frames, panel, linear, fainter(sprites, mag), balance)
         found.append(measure(wanted, shown, tile))
     return Errors(*(max(getattr(e, name) for e in found) for name in Errors.__slots__))
 

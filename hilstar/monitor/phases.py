@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hilstar.arrays import Float32Array, FloatArray
+from hilstar.monitor.balance import Balance
 from hilstar.monitor.exact import ExactQuantiser
 from hilstar.monitor.quantise import Panel, Quantisation, dither_levels, round_levels, shown_light, temporal_levels
 from hilstar.scene.psf import footprint_px, peak_share
@@ -54,6 +55,12 @@ def measure(wanted: FloatArray, shown: FloatArray, tile: int) -> Errors:
     return Errors(next(rms), float(flux.max()), next(rms), float(off.max()))
 
 
+def tiles_of(image: FloatArray, tile: int) -> FloatArray:
+    """The tiles of a square image, (tiles, tile, tile), row by row."""
+    count = len(image) // tile
+    return image.reshape(count, tile, count, tile).transpose(0, 2, 1, 3).reshape(-1, tile, tile)
+
+
 def _sums(image: FloatArray, tile: int) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Light and centroid (x, y), px, of each tile; the centroid is 0 where there is no light."""
     count = len(image) // tile
@@ -64,12 +71,15 @@ def _sums(image: FloatArray, tile: int) -> tuple[FloatArray, FloatArray, FloatAr
 
 
 def shown_by(
-    method: Quantisation, cycle_frames: int, panel: Panel, linear: Float32Array, sprites: Sprites, sigma_px: tuple[float, float]
+    method: Quantisation, cycle_frames: int, panel: Panel, linear: Float32Array, sprites: Sprites, balance: Balance
 ) -> FloatArray:
-    """The light (h, w) that a method shows for a linear image, averaged over an exposure of `cycle_frames`."""
+    """The light (h, w) that a method shows for a linear image, averaged over an exposure of `cycle_frames`.
+
+    `balance` is that of `exact`, with the sprites' sigma.
+    """
     if method == "exact":
         size = linear.shape[1], linear.shape[0]
-        return shown_light(ExactQuantiser(panel, size, sigma_px).levels(sprites), panel)
+        return shown_light(ExactQuantiser(panel, size, balance.sigma_px, balance.seen).levels(sprites), panel)
     if method == "temporal" and cycle_frames > 1:
         frames = [shown_light(temporal_levels(linear, panel, k, cycle_frames), panel) for k in range(cycle_frames)]
         return np.asarray(np.mean(frames, axis=0))

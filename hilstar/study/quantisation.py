@@ -10,6 +10,7 @@ import numpy as np
 
 from hilstar.arrays import FloatArray
 from hilstar.charts import STYLE, plain_ticks, save, title_lines, write_csv
+from hilstar.monitor.balance import Balance
 from hilstar.monitor.phases import SIGMA_PX, WHITE, Errors, fainter, measure, phase_grid, shown_by
 from hilstar.monitor.quantise import CYCLE_FRAMES, Panel
 from hilstar.monitor.response import srgb_response
@@ -55,7 +56,7 @@ def _against_magnitude(bits: int, way: Way, phases: int, mags: FloatArray) -> li
     for mag in mags:
         wanted = bright * flux_ratio(mag)
         linear, cycle = wanted.astype(np.float32), CYCLE_FRAMES if way.whole_cycle else 1
-        shown = shown_by(way.method, cycle, panel, linear, fainter(sprites, mag), SIGMA_PX)
+        shown = shown_by(way.method, cycle, panel, linear, fainter(sprites, mag), Balance(SIGMA_PX))
         errors.append(measure(wanted, shown, tile))
     return errors
 

@@ -7,15 +7,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import get_args
 
 import numpy as np
 
+from hilstar.arrays import FloatArray
 from hilstar.bench.frame import Bench
 from hilstar.bench.white import clipping_hip
-from hilstar.monitor.phases import WHITE, fainter, measure, phase_grid, shown_by
+from hilstar.monitor.balance import Balance
+from hilstar.monitor.phases import WHITE, fainter, phase_grid, shown_by, tiles_of
 from hilstar.monitor.quantise import Panel
 from hilstar.render.reference import linear_image
 from hilstar.scene.psf import peak_share
+from hilstar.tracker.centroiders import Centroider, brightest, star_places
 from hilstar.units import ARCSEC_PER_RAD, flux_ratio, magnitude
 
 PHASES = 16  # along a side of a pixel
@@ -24,6 +28,9 @@ MAX_BELOW_WHITE_MAG = 15.0
 SOLAR_BV, LIKE_SOLAR_BV = 0.65, 0.1
 FLUX_LIMITS_MAG = (0.02, 0.05)
 CENTROID_LIMIT_PX = 0.01
+USUAL: Centroider = "fit"  # what most trackers do
+COMPARED_MAG = 6.0
+BLUR_SIGMAS = 5.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +60,8 @@ class Budget:
 
     Magnitudes are those of a star of the Sun's colour: it clips in the middle of a pixel where the screen is darkest
     (`clips_v_mag`), on a corner of four pixels (`clips_v_mag_at_best`), and shows nothing from `nothing_v_mag` on. `within`
-    has the magnitudes below full scale over which the worst star stays within each limit.
+    has the magnitudes below full scale over which the worst star stays within each limit. Places in `rows` are as `centroider`
+    finds them; `centroid_rms_px` has the error along an axis that each kind finds COMPARED_MAG below full scale.
     """
 
     method: str
@@ -67,16 +75,21 @@ class Budget:
     left_out: NotDrawn
     black_e_per_s_px: float
     rows: list[MagnitudeRow]
+    centroider: Centroider
+    centroid_rms_px: dict[str, float | None]
 
 
-def budget(bench: Bench) -> Budget:
-    """The budget of a bench. Raises InputError for one without stars."""
+def budget(bench: Bench, centroider: Centroider = USUAL) -> Budget:
+    """The budget of a bench, places as `centroider` finds them after the tracker's blur.
+
+    Raises InputError for a bench without stars.
+    """
     render, white = bench.config.render, bench.flux_at_white_e_per_s
     # A star of rate r has V = zero_mag + magnitude(r).
     zero_mag = zero_point_mag(bench)
     clips = zero_mag + magnitude(white * bench.darkest / peak_share(render.sprite_sigma_px))
     nothing = zero_mag + magnitude(nothing_below_e_per_s(bench))
-    rows = _rows(bench, clips)
+    rows = [_row(bench, errors, clips) for errors in _errors(bench, centroider)]
     return Budget(
         method=render.quantisation + (" with bit stealing" if render.bit_stealing else ""),
         bits=bench.config.monitor.bits,
@@ -89,6 +102,8 @@ def budget(bench: Bench) -> Budget:
         left_out=not_drawn(bench),
         black_e_per_s_px=bench.calibration.response.black * white,
         rows=rows,
+        centroider=centroider,
+        centroid_rms_px=_by_each(bench),
     )
 
 
@@ -123,37 +138,92 @@ def not_drawn(bench: Bench) -> NotDrawn:
     return NotDrawn(len(missing), float(missing.sum() / rates.sum()))
 
 
-def _rows(bench: Bench, clips_v_mag: float) -> list[MagnitudeRow]:
-    render = bench.config.render
-    sigma_px, cycle = render.sprite_sigma_px, render.cycle_frames
-    panel = Panel(bench.calibration.response, WHITE)
-    sprites, tile = phase_grid(PHASES, sigma_px)
-    bright = linear_image(sprites, (PHASES * tile, PHASES * tile), sigma_px)
-    arcsec_per_px = ARCSEC_PER_RAD / bench.camera.scales_px_rad()[0]  # where a pixel is widest
-    rows = []
-    for mag in np.arange(0.0, MAX_BELOW_WHITE_MAG + STEP_MAG / 2, STEP_MAG):
-        wanted = bright * flux_ratio(mag)
-        linear = wanted.astype(np.float32)
-        shown = shown_by(bench.renderer.target.quantisation, cycle, panel, linear, fainter(sprites, float(mag)), sigma_px)
-        errors = measure(wanted, shown, tile)
-        rows.append(
-            MagnitudeRow(
-                v_mag=clips_v_mag + float(mag),
-                below_white_mag=float(mag),
-                flux_rms_mag=_finite(errors.flux_rms_mag),
-                flux_max_mag=_finite(errors.flux_max_mag),
-                centroid_rms_px=_finite(errors.centroid_rms_px),
-                centroid_max_px=_finite(errors.centroid_max_px),
-                centroid_max_arcsec=_finite(errors.centroid_max_px * arcsec_per_px),
-            )
-        )
-        if rows[-1].flux_rms_mag is None:
+@dataclass(frozen=True, slots=True)
+class _Errors:
+    """Flux errors, mag, and how far off each phase's star is along x and y, px, so many magnitudes below full scale."""
+
+    mag: float
+    flux_mag: FloatArray
+    off_px: FloatArray
+
+
+class _Phases:
+    """Stars at every sub-pixel phase, through the bench's method and the tracker's blur."""
+
+    def __init__(self, bench: Bench) -> None:
+        render = bench.config.render
+        self._bench, self._sigma_px = bench, render.sprite_sigma_px
+        self._seen = bench.renderer.target.seen
+        self._sprites, self._tile = phase_grid(PHASES, self._sigma_px)
+        size = PHASES * self._tile
+        self._bright = linear_image(self._sprites, (size, size), self._sigma_px)
+        self._panel = Panel(bench.calibration.response, WHITE)
+
+    def pair(self, mag: float) -> tuple[FloatArray, FloatArray]:
+        """The stars as the sky has them and as they are shown, `mag` below full scale: tiles (n, side, side), blurred."""
+        wanted, method = self._bright * flux_ratio(mag), self._bench.renderer.target.quantisation
+        balance, cycle = Balance(self._sigma_px, self._seen), self._bench.config.render.cycle_frames
+        shown = shown_by(method, cycle, self._panel, wanted.astype(np.float32), fainter(self._sprites, mag), balance)
+        return self._blurred(wanted), self._blurred(shown)
+
+    def _blurred(self, image: FloatArray) -> FloatArray:
+        from scipy.ndimage import gaussian_filter1d
+
+        blur_px = self._seen.blur_px
+        edge = math.ceil(BLUR_SIGMAS * blur_px)
+        side = self._tile + 2 * edge
+        tiles = np.pad(tiles_of(image, self._tile), ((0, 0), (edge, edge + 1 - side % 2), (edge, edge + 1 - side % 2)))
+        for axis in (1, 2):
+            tiles = gaussian_filter1d(tiles, blur_px, axis=axis, mode="constant", truncate=BLUR_SIGMAS)
+        return np.asarray(tiles)
+
+    def off_px(self, wanted: FloatArray, shown: FloatArray, kind: Centroider) -> FloatArray:
+        """How far off each star is found along x and y (2, n), px; infinite where nothing is shown."""
+        x, y = self._sigma_px
+        sigma_px = math.hypot(x, self._seen.blur_px), math.hypot(y, self._seen.blur_px)
+        pixels = brightest(wanted)
+        sky, seen = (np.stack(star_places(tiles, kind, sigma_px, pixels)) for tiles in (wanted, shown))
+        return np.where(shown.sum(axis=(1, 2)) > 0, seen - sky, np.inf)
+
+
+def _errors(bench: Bench, kind: Centroider) -> list[_Errors]:
+    """The errors at each magnitude, down to the first at which a star shows nothing."""
+    phases, found = _Phases(bench), []
+    for mag in np.arange(0.0, MAX_BELOW_WHITE_MAG + STEP_MAG / 2, STEP_MAG).tolist():
+        wanted, shown = phases.pair(mag)
+        flux = magnitude(shown.sum(axis=(1, 2)) / wanted.sum(axis=(1, 2)))
+        found.append(_Errors(mag, np.abs(flux), phases.off_px(wanted, shown, kind)))
+        if not np.isfinite(flux).all():
             break
-    return rows
+    return found
+
+
+def _by_each(bench: Bench) -> dict[str, float | None]:
+    phases = _Phases(bench)
+    wanted, shown = phases.pair(COMPARED_MAG)
+    return {kind: _finite(_rms(phases.off_px(wanted, shown, kind))) for kind in get_args(Centroider)}
+
+
+def _rms(errors: FloatArray) -> float:
+    return float(np.sqrt(np.mean(np.square(errors))))
 
 
 def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
+
+
+def _row(bench: Bench, errors: _Errors, clips_v_mag: float) -> MagnitudeRow:
+    arcsec_per_px = ARCSEC_PER_RAD / bench.camera.scales_px_rad()[0]  # where a pixel is widest
+    off_px = np.hypot(*errors.off_px)
+    return MagnitudeRow(
+        v_mag=clips_v_mag + errors.mag,
+        below_white_mag=errors.mag,
+        flux_rms_mag=_finite(_rms(errors.flux_mag)),
+        flux_max_mag=_finite(float(errors.flux_mag.max())),
+        centroid_rms_px=_finite(_rms(off_px)),
+        centroid_max_px=_finite(float(off_px.max())),
+        centroid_max_arcsec=_finite(float(off_px.max()) * arcsec_per_px),
+    )
 
 
 def _within(rows: list[MagnitudeRow]) -> dict[str, float | None]:

@@ -58,11 +58,13 @@ def budget_lines(found: Budget) -> list[str]:
         return "-" if value is None else f"{value:{form}}"
 
     within = ", ".join(f"{number(value, 'g')} mag within {limit.replace('_', ' ')}" for limit, value in found.within.items())
+    each = ", ".join(f"{kind} {number(value, '.4f')}" for kind, value in found.centroid_rms_px.items()) + " px rms"
     lines = [
         f"{'method':22}{found.method}, {found.bits} bits",
         f"{'clips at':22}V = {found.clips_v_mag:.2f} in the middle of a pixel, {found.clips_v_mag_at_best:.2f} on a corner",
         f"{'shows nothing':22}from V = {found.nothing_v_mag:.2f}, a range of {found.range_mag:.1f} mag",
         f"{'below full scale':22}{within}",
+        f"{'centroider':22}{found.centroider}, after the tracker's blur; 6 mag below full scale each is off by: {each}",
         f"{'clipped stars':22}{named(found.clipped_hip, MAX_NAMED)}",
         f"{'not drawn':22}{found.left_out.stars} stars, too faint: {found.left_out.flux_share:.2e} of all light",
         f"{'black':22}{found.black_e_per_s_px:.4g} e-/s in a monitor pixel",

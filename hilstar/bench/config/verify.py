@@ -61,6 +61,13 @@ class Verify(Table, frozen=True):
             'axes (`"swap"`).'
         ),
     ] = "none"
+    centroider: Annotated[
+        Literal["window", "moment", "fit", "box3", "box5"],
+        Meta(
+            description="What the tracker finds its stars by: a Gaussian window that follows the star, the plain first moment, "
+            "the least squares of a PSF, or the centre of mass of 3 x 3 or 5 x 5 pixels about the brightest."
+        ),
+    ] = "window"
     flux_mag: Annotated[
         Positive,
         Meta(

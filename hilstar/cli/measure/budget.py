@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, get_args
 
 import typer
 
 from hilstar.cli.options import BenchFile, Json
 from hilstar.console.terminal import print_json
+from hilstar.errors import InputError, shortened
 from hilstar.files import check_directory
 
 
@@ -18,17 +19,24 @@ def budget(
     output: Annotated[
         Path | None, typer.Option("-o", "--output", metavar="DIR", help="Directory for a chart and a table.")
     ] = None,
+    centroider: Annotated[
+        str, typer.Option(help="Who finds the stars: moment, window, fit (a PSF), box3 or box5 (centres of mass).")
+    ] = "fit",
     as_json: Json = False,
 ) -> None:
     """Find which magnitudes this monitor, sprite and quantisation can show, and how accurately."""
     from hilstar.bench.build import load
     from hilstar.files import make_directory
+    from hilstar.tracker.centroiders import Centroider
     from hilstar.twin.budget import budget as find_budget
     from hilstar.twin.budget_report import budget_lines, write_report
 
     check_directory("-o", output)
+    kind = next((known for known in get_args(Centroider) if known == centroider), None)
+    if kind is None:
+        raise InputError(f"--centroider {shortened(centroider)}: write one of {', '.join(get_args(Centroider))}")
     with load(bench_file) as bench:
-        found = find_budget(bench)
+        found = find_budget(bench, kind)
     if output is not None:
         write_report(make_directory(output), found)
     if as_json:

@@ -7,6 +7,7 @@ from contextlib import ExitStack
 import numpy as np
 
 from hilstar.bench.config import Monitor, RenderSettings
+from hilstar.monitor.balance import Balance
 from hilstar.monitor.phases import WHITE, fainter, measure, phase_grid, shown_by
 from hilstar.monitor.quantise import CYCLE_FRAMES, Panel
 from hilstar.render.reference import linear_image
@@ -43,7 +44,7 @@ def _quantised(stack: ExitStack, way: Way, bits: int) -> Trial:
     sprites, tile = phase_grid(PHASES, SIGMA_PX)
     wanted = linear_image(sprites, (PHASES * tile,) * 2, SIGMA_PX) * flux_ratio(mag)
     cycle, linear = CYCLE_FRAMES if way.whole_cycle else 1, wanted.astype(np.float32)
-    shown = shown_by(way.method, cycle, Panel(response, WHITE), linear, fainter(sprites, mag), SIGMA_PX)
+    shown = shown_by(way.method, cycle, Panel(response, WHITE), linear, fainter(sprites, mag), Balance(SIGMA_PX))
     found = measure(wanted, shown, tile)
     renderer = stack.enter_context(Renderer(Target(FRAME_PX, SIGMA_PX, response, WHITE, way.method)))
     field = star_field(FRAME_PX, renderer.footprint_px)

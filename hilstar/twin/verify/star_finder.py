@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -12,6 +12,7 @@ from hilstar.arrays import FloatArray, IntArray
 from hilstar.bench.config import BenchConfig
 from hilstar.bench.frame import Bench
 from hilstar.scene.psf import peak_share
+from hilstar.tracker.centroiders import Centroider, star_places
 from hilstar.tracker.centroids import Background, Centroids, CentroidSettings, find_stars
 from hilstar.units import magnitude
 
@@ -46,6 +47,7 @@ class StarFinder:
     settings: CentroidSettings
     sigma_px: tuple[float, float]
     background: Background
+    centroider: Centroider = "window"
 
     def match(self, image_e: FloatArray, x_px: FloatArray, y_px: FloatArray) -> Matched:
         """The stars of a noiseless image (h, w) at their places (n,).
@@ -53,7 +55,28 @@ class StarFinder:
         A tracker subtracts the screen's glow around each star: here it is not added in the first place.
         """
         found = find_stars(image_e, self.settings, self.background)
-        return Matched(found, nearest(found, x_px, y_px))
+        index = nearest(found, x_px, y_px)
+        return Matched(self._placed(image_e, found, index, (x_px, y_px)), index)
+
+    def _placed(
+        self, image_e: FloatArray, found: Centroids, index: IntArray, true_px: tuple[FloatArray, FloatArray]
+    ) -> Centroids:
+        """The stars that were matched, where the bench's own centroider finds them; the window's places are those found."""
+        stars = np.flatnonzero(index >= 0)
+        if self.centroider == "window" or not len(stars):
+            return found
+        reach = self.settings.radius_px
+        column, row = (np.rint(place[stars]).astype(np.intp) for place in true_px)
+        near = np.arange(2 * reach + 1)
+        # A star's true place may lie up to the largest distance of a match off the image.
+        far = reach + math.ceil(MATCH_PX) + 1
+        padded = np.pad(np.maximum(image_e, 0.0), far)
+        stamps = padded[(row[:, None] + near + far - reach)[:, :, None], (column[:, None] + near + far - reach)[:, None, :]]
+        middle = np.full(len(stars), reach)
+        dx_px, dy_px = star_places(stamps, self.centroider, self.sigma_px, (middle, middle))
+        x_px, y_px = found.x_px.copy(), found.y_px.copy()
+        x_px[index[stars]], y_px[index[stars]] = column + dx_px, row + dy_px
+        return replace(found, x_px=x_px, y_px=y_px)
 
 
 def star_finder(bench: Bench, monitor_px_per_px: float) -> StarFinder:
@@ -61,7 +84,8 @@ def star_finder(bench: Bench, monitor_px_per_px: float) -> StarFinder:
     sigma_px = seen_sigma_px(bench.config, monitor_px_per_px)
     settings = CentroidSettings(window_sigma_px=max(1.0, *sigma_px))
     peak_e = faintest_e_per_s(bench) * bench.config.tracker.exposure_s * peak_share(sigma_px)
-    return StarFinder(settings, sigma_px, Background(0.0, MIN_PEAK * peak_e / settings.threshold_sigma))
+    under = Background(0.0, MIN_PEAK * peak_e / settings.threshold_sigma)
+    return StarFinder(settings, sigma_px, under, bench.config.verify.centroider)
 
 
 def seen_sigma_px(config: BenchConfig, monitor_px_per_px: float) -> tuple[float, float]:

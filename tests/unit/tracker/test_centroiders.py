@@ -1,0 +1,48 @@
+"""Centroiders of every kind, against stars whose place is known."""
+
+from __future__ import annotations
+
+from typing import get_args
+
+import numpy as np
+import pytest
+from scipy.special import ndtr
+
+from hilstar.tracker.centroiders import Centroider, brightest, star_places
+
+SIGMA = (1.05, 0.95)
+# Of Gaussians integrated over pixels: sampling's own errors; a box of 5 x 5 cuts wings, one of 3 x 3 most of them.
+BIAS_PX = {"moment": 1e-6, "window": 2e-3, "fit": 1e-6, "box3": 0.3, "box5": 0.1}
+
+
+def stars(places, side=21):
+    at = np.arange(side) - side // 2
+    share = [
+        np.diff(ndtr((np.append(at - 0.5, at[-1] + 0.5) - place[:, None]) / sigma))
+        for place, sigma in zip(places, SIGMA, strict=True)
+    ]
+    return share[1][:, :, None] * share[0][:, None, :]
+
+
+@pytest.mark.parametrize("kind", get_args(Centroider))
+def test_each_finds_a_star_within_its_own_bias(kind, rng):
+    places = rng.uniform(-0.5, 0.5, (2, 50))
+    x, y = star_places(1e4 * stars(places), kind, SIGMA)
+    assert np.abs([x - places[0], y - places[1]]).max() < BIAS_PX[kind]
+
+
+@pytest.mark.parametrize("kind", get_args(Centroider))
+def test_each_follows_a_small_shift_and_finds_nothing_in_the_dark(kind):
+    places = np.array([[0.2, 0.21, 0.0], [-0.3, -0.3, 0.0]])
+    images = stars(places)
+    images[2] = 0
+    x, y = star_places(images, kind, SIGMA, brightest(stars(np.zeros((2, 3)))))
+    assert 0.003 < x[1] - x[0] < 0.011
+    assert abs(y[1] - y[0]) < 1e-3
+    assert x[2] == y[2] == 0
+
+
+def test_noise_alone_and_clipped_stars_keep_every_place_finite(rng):
+    for images in (rng.normal(0, 1, (40, 15, 15)) + 0.1, np.ones((3, 15, 15)), np.minimum(stars(np.zeros((2, 3))), 0.01)):
+        for kind in get_args(Centroider):
+            assert np.isfinite(star_places(np.maximum(images, 0), kind, SIGMA)).all()

@@ -61,7 +61,7 @@ def bench_satellites(
     brightness = brightness_of(found, rows, bodies.satellite_standard_mag, v0_e_per_s)
     satellites = Satellites(found, brightness, v0_e_per_s, orbit, zero_ns)
     satellites.listed = sum(one.number in rows for one in found)
-    satellites.warn_of_age(str(path), start_ns)
+    satellites.file = str(path)
     satellites.place(start_ns)
     return satellites
 

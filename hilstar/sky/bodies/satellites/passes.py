@@ -10,6 +10,7 @@ import numpy as np
 
 from hilstar.arrays import BoolArray, FloatArray, IntArray
 from hilstar.sky.astrometry import aberrate
+from hilstar.sky.bodies.kernel import NS_PER_DAY
 from hilstar.sky.bodies.orbit import Orbit, TleOrbit
 from hilstar.sky.bodies.satellites.elements import Satellite
 from hilstar.sky.bodies.satellites.light import (
@@ -154,7 +155,9 @@ class Satellites:
         self._numbers = np.array([one.number for one in satellites])
         self._other = np.ones(len(satellites), dtype=np.bool_) if own is None else self._numbers != own
         self._watch: _Watch | None = None
-        self._lost_told = self._own_told = False
+        self._lost_told = self._own_told = self._age_told = False
+        self._epoch_age_days = np.array([one.age_days(0) for one in satellites])
+        self.file = "satellites"  # what they are called in a line about their age
         self._lost = 0
         self.listed = 0  # in the table of magnitudes
         self.sized = bool(brightness.size_m.any())
@@ -233,19 +236,23 @@ class Satellites:
     def place(self, utc_ns: int) -> int:
         """Be ready for a UTC; how many have a place then. One line, once, about those that have none."""
         if self._swarm.move_to(utc_ns):
+            self.warn_of_age(utc_ns)
             self._lost = int(np.count_nonzero(self._swarm.error))
             self._tell_lost()
         return len(self) - self._lost
 
-    def warn_of_age(self, file: str, utc_ns: int) -> None:
-        """One line where elements are more than OLD_DAYS from a UTC."""
-        ages = np.array([abs(one.age_days(utc_ns)) for one in self._satellites])
+    def warn_of_age(self, utc_ns: int) -> None:
+        """One line, once, where elements are more than OLD_DAYS from a UTC."""
+        if self._age_told:
+            return
+        ages = np.abs(self._epoch_age_days + utc_ns / NS_PER_DAY)
         old = int((ages > OLD_DAYS).sum())
         if old:
+            self._age_told = True
             log.warning(
-                "%s: the elements of %d of %d satellites are more than %.0f days from the date of t = 0 (%.0f at most); a low"
+                "%s: the elements of %d of %d satellites are more than %.0f days from the sky's date (%.0f at most); a low"
                 " orbit is off by 1 to 3 km a day",
-                file,
+                self.file,
                 old,
                 len(ages),
                 OLD_DAYS,

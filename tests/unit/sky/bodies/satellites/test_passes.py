@@ -110,12 +110,13 @@ def test_decayed_satellites_are_left_out_with_one_line_and_the_others_stay(rng, 
 
 
 def test_elements_of_another_month_are_warned_of_once(caplog):
-    sky = satellite_sky(some_orbits(np.random.default_rng(1), 4))
-    sky.satellites.warn_of_age("tles.txt", START + 13 * 86_400 * S_NS)
-    assert not caplog.records
-    sky.satellites.warn_of_age("tles.txt", START + 40 * 86_400 * S_NS)
+    """At the moment at which they are used, not at that of the start."""
+    sky = satellite_sky(some_orbits(np.random.default_rng(1), 4), Geocentre())
+    for days in (0, 13, 40, 50, 0):
+        sky.passing(EVERYWHERE, days * 86_400 * S_NS)
+        assert len(caplog.records) == (days >= 40 or bool(caplog.records))
     assert len(caplog.records) == 1
-    assert "4 of 4 satellites are more than 14 days" in caplog.text
+    assert "4 of 4 satellites are more than 14 days from the sky's date (40 at most)" in caplog.text
 
 
 def test_twenty_thousand_are_read_and_looked_for(rng):

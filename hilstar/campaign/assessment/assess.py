@@ -24,6 +24,7 @@ from hilstar.units import ARCSEC_PER_RAD
 SEED = 0  # of the bootstrap: the same files give the same intervals
 SMALL = 0.3  # of the noise: a larger error of the display is said
 BENT_ARCSEC = 0.1
+TOGETHER, SLOW_SHARE = 20, 0.1  # answers, and a share of the noise's variance that is said
 Stamp = Literal["start", "middle", "end"]
 MIDDLE = {"start": 0.5, "middle": 0.0, "end": -0.5}  # of an exposure, from the stamp on
 
@@ -99,7 +100,7 @@ def _completed(
     valid = np.flatnonzero(answers.valid)
     right, wrong = np.zeros(len(t_s), dtype=np.bool_), np.zeros(len(t_s), dtype=np.bool_)
     right[valid[found.row]], wrong[valid[found.wrong]] = True, True
-    notes = [*found.notes, *_said_of_base(base_s), *_said_of_clock(found), *_said_of_bend(run, found)]
+    notes = [*found.notes, *_said_of_base(base_s), *_said_of_clock(found), *_said_of_bend(run, found), *_said_of_slow(found)]
     display: DisplayCost | None = None
     by_magnitude: tuple[Slice, ...] = ()
     parts = found.components
@@ -182,6 +183,24 @@ def _said_of_bend(run: RunLedger, found: Decomposed) -> list[str]:
     if bent < BENT_ARCSEC:
         return []
     return [f"in an exposure the attitude's mean differs from that in its middle by up to {bent:.2g} arcsec"]
+
+
+def _said_of_slow(found: Decomposed) -> list[str]:
+    """Noise that goes on from answer to answer: whatever changes slowly and does not repeat with the place."""
+    left = found.components.left
+    rows = len(left) // TOGETHER * TOGETHER
+    if rows < MIN_ROWS * TOGETHER:
+        return []
+    means = left[:rows].reshape(-1, TOGETHER, 3).mean(axis=1)
+    slow = (means**2).mean(axis=0) - found.components.noise_variance / TOGETHER
+    share = slow / np.maximum(found.components.noise_variance, 1e-12)
+    if share.max() < SLOW_SHARE:
+        return []
+    size = axes_of_variance(slow)
+    return [
+        f"the noise is not white: {size.cross:.2g} arcsec across the boresight and {size.roll:.2g} about it last for {TOGETHER}"
+        " answers and more, and do not repeat with the place: does the alignment drift, or the field-of-view error change?"
+    ]
 
 
 def _without_display(found: Decomposed, display: DisplayCost | None) -> tuple[Axes, list[str]]:

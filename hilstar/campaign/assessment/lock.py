@@ -115,6 +115,7 @@ def _acquisitions(
     for first, last in zip(commanded.t_s[shown], commanded.t_s[ends], strict=True):
         if last <= t_s[0] or first >= t_s[-1]:
             continue
+        first = max(first, t_s[0])  # before its first row nobody knows what the tracker did
         inside = answers[(answers >= first) & (answers <= last)]
         found.append(Acquisition(float(first), float(inside[0] - first) if len(inside) else None))
     found += [Acquisition(each.start_s, each.length_s) for each in outages if each.lost]

@@ -12,8 +12,9 @@ from hilstar.rotation import conjugate, from_rotation_vectors, multiply, normali
 
 MAX_GAP_S = 0.5  # between two frames: beyond it, and beyond three usual intervals, nothing says what was shown in between
 USUAL_INTERVALS = 3.0
-MAX_STEP_RAD = np.radians(2.0)  # between two frames, and MAX_STEP_RATIO times what it was before: more is a jump
-MAX_STEP_RATIO = 3.0
+MAX_STEP_RAD = np.radians(2.0)  # between two frames: more is a jump
+# And so is a step between two frames that both stand nearly still beside it.
+JUMP_RAD, JUMP_RATIO = np.radians(0.02), 4.0
 SAME_RAD = 1e-9
 UNEVEN = 1.6  # the ratio of neighbouring intervals up to which a cubic goes through four frames
 
@@ -42,6 +43,7 @@ class Commanded:
         near = gap_s <= max(MAX_GAP_S, USUAL_INTERVALS * self.interval_s)
         with np.errstate(invalid="ignore"):
             self.joined = np.isfinite(turned) & ((near & (turned <= MAX_STEP_RAD)) | (turned <= SAME_RAD))
+            self.joined &= ~_jumps(turned, gap_s)
         self._gap_s = gap_s
 
     @property
@@ -80,3 +82,10 @@ class Commanded:
             change = (self._step[near] / ratio[:, None] - self._step[before]) / (1 + ratio[:, None])
             bends.append(np.where(even[:, None], change, 0.0))
         return bends[0], bends[1]
+
+
+def _jumps(turned_rad: FloatArray, gap_s: FloatArray) -> npt.NDArray[np.bool_]:
+    """Which steps (n,) are much faster than the one before and the one after them."""
+    rate = np.nan_to_num(turned_rad) / gap_s
+    before, after = np.append(0.0, rate[:-1]), np.append(rate[1:], 0.0)
+    return np.asarray((np.nan_to_num(turned_rad) > JUMP_RAD) & (rate > JUMP_RATIO * np.maximum(before, after)))

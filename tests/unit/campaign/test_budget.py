@@ -129,6 +129,14 @@ def test_few_answers_and_wild_ones_are_refused() -> None:
         assess_cases(planted.frames_q[:100], wild / np.linalg.norm(wild, axis=1, keepdims=True), SCALE, rng)
 
 
+def test_a_jump_between_frames_is_not_taken_for_a_motion() -> None:
+    t_s = np.arange(0.0, 10.0, 0.1)
+    angle = np.where(t_s < 5.05, 0.0, np.radians(0.5)) / 2
+    commanded = Commanded(t_s, np.stack([np.cos(angle), np.sin(angle), 0 * t_s, 0 * t_s], axis=1))
+    assert np.flatnonzero(~commanded.joined).tolist() == [50]
+    assert commanded.at(np.array([4.95, 5.05, 5.15])).known.tolist() == [True, False, True]
+
+
 def test_between_frames_the_commanded_attitude_is_that_of_the_motion() -> None:
     """The scan's third derivative is 3 deg (2 pi / 271 s)^3 = 0.13 arcsec/s^3 at most: dt^3 / 15 of it is 1e-5 arcsec."""
     t_s = np.arange(0.0, 100.0, 0.1)

@@ -19,7 +19,7 @@ from hilstar.bench.config import BenchConfig, Vector
 from hilstar.bench.discs import DiscPainter, When, disc_stars
 from hilstar.bench.effort import Effort
 from hilstar.bench.satellites import FRAME_SPRITES, Shot, satellite_discs, with_satellites
-from hilstar.bench.truth import designations, sprite_truth, truth_table
+from hilstar.bench.truth import clipped_in, designations, sprite_names, sprite_truth, truth_table
 from hilstar.errors import InputError
 from hilstar.monitor.calibration import Calibration
 from hilstar.monitor.footprints import FootprintMap
@@ -333,19 +333,18 @@ class Bench:
             return stars.seen_at(velocity_km_s)
         return self.moving.seen(stars, t_ns, velocity_km_s, place_km)
 
-    def losses_mag(self, frame: Frame) -> dict[int | str, float]:
+    def losses_mag(self, frame: Frame, faults: FrameFaults | None = None) -> dict[int | str, float]:
         """For each clipped star of a frame (by HIP number, or a body's name), how many magnitudes too faint it is.
 
-        That is summed over its own pixels.
+        That is summed over its own pixels. `faults` are those of the frame.
         """
-        own = frame.star[frame.truth["clipped"]]
-        clipped = self.stars.designations(own[own >= 0])
+        clipped = clipped_in(frame.truth)
         if not clipped:
             return {}
-        sprites = self._still(frame.q_icrs_to_cam, self.shown_stars, frame.t_ns, None)
+        sprites = self._still(frame.q_icrs_to_cam, self.shown_stars, frame.t_ns, faults)
         footprints = FootprintMap(self.camera.resolution_px, self._sigma_px)
         loss_mag = star_losses_mag(sprites, self.panel, footprints, frame.levels)
-        names = self.shown_stars.designations(sprites.star)
+        names = sprite_names(self.shown_stars, sprites)
         losses = dict(zip(names, loss_mag.tolist(), strict=True)) | self._disc_losses_mag(frame, sprites)
         return {name: losses[name] for name in clipped if name in losses}
 

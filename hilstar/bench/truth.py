@@ -62,6 +62,12 @@ def designations(stars: Stars, sprites: Sprites, which: IntArray) -> tuple[int |
     return (*stars.designations(star[star >= 0]), *added)
 
 
+def sprite_names(stars: Stars, sprites: Sprites) -> list[int | str]:
+    """What each sprite is of: a HIP number, or the name of what has none."""
+    found = iter(stars.designations(sprites.star[sprites.star >= 0]))
+    return [sprites.added[-1 - k].name if k < 0 else next(found) for k in sprites.star.tolist()]
+
+
 def sprite_truth(stars: Stars, sprites: Sprites, clipped: IntArray) -> tuple[npt.NDArray[np.void], IntArray]:
     """Rows of TRUTH_DTYPE for what sprites are of, all drawn, and its indices (n,); `clipped` are positions of sprites.
 

@@ -91,7 +91,8 @@ def simulate(
         print_json(summary)
     else:
         dn = summary["dn"]
-        typer.echo(f"{summary['stars']} stars, DN {dn['min']} to {dn['max']}; wrote {', '.join(summary['written'])}")
+        named = f", faults: {', '.join(exposure.faults)}" if exposure.faults else ""
+        typer.echo(f"{summary['stars']} stars{named}, DN {dn['min']} to {dn['max']}; wrote {', '.join(summary['written'])}")
 
 
 def simulate_log(

@@ -72,7 +72,7 @@ def frame(
             "electrons_per_s": float(shot.linear.sum(dtype=np.float64)),
             "flux_at_white_e_per_s": bench.flux_at_white_e_per_s,
             "clipped": clipped,
-            "clipped_mag": bench.losses_mag(shot),
+            "clipped_mag": bench.losses_mag(shot, effects),
             "left_out": left_out(shot.truth),
             "calibration": {"name": bench.calibration.name, "sha256": bench.calibration.sha256},
             "faults": [] if effects is None else [one.fault.name for one in effects.now],
@@ -86,6 +86,8 @@ def frame(
         missing = summary["left_out"]
         if missing["stars"]:
             names += f", {missing['stars']} too faint to show ({missing['flux_share']:.2%} of all light)"
+        if summary["faults"]:
+            names += f", faults: {', '.join(summary['faults'])}"
         typer.echo(f"{len(shot.truth)} stars{names}; wrote {', '.join(summary['written'])}")
 
 

@@ -209,3 +209,14 @@ def test_a_body_that_is_gone_has_neither_disc_nor_row(tmp_path):
         gone = bench.frame(q, t_ns=0, faults=Effects(view, (Now(1, fault, 0),)))
     assert "Moon" in there.truth["name"] and "Moon" not in gone.truth["name"]
     assert gone.linear.max() < 1e-3 * there.linear.max()
+
+
+def test_a_false_star_over_white_is_named_with_its_loss(bench):
+    view = display_view(bench)
+    fault = view.prepare(fault_of({"kind": "false-star", "name": "nova", "screen_px": [40, 50], "electrons_per_s": 1e8}))
+    effects = Effects(view, (Now(1, fault, 0),))
+    frame = bench.frame(ORION_Q, faults=effects)
+    losses = bench.losses_mag(frame, effects)
+    # A hundred million electrons a second against white, in each pixel of its own.
+    assert frame.truth["clipped"][frame.truth["name"] == "nova"].all()
+    assert 0.5 < losses["nova"] < 10

@@ -303,3 +303,13 @@ def test_what_cannot_be_shown_is_named_with_its_loss():
     assert np.abs(shown_mag[[1, 3]]).max() < 0.01
     assert np.isinf(shown_mag[2])
     assert np.isinf(star_losses_mag(sprites, panel, footprints, np.zeros(FIELD[::-1], dtype=np.uint8))).all()
+
+
+def test_a_star_within_a_brighter_one_loses_what_that_one_does():
+    panel = Panel(srgb_response(8), WHITE)
+    # As alpha Centauri B within A: every pixel of its own is A's.
+    sprites = sprites_at([30.0, 30.02], [30.0, 30.01], np.array([flux_of(-2.0), flux_of(-0.6)]))
+    footprints = FootprintMap(FIELD, SIGMA)
+    shown_mag = star_losses_mag(sprites, panel, footprints, exact(sprites, panel))
+    assert shown_mag[0] > 0.1
+    assert shown_mag[1] == pytest.approx(shown_mag[0], abs=0.02)  # a fiftieth of a pixel apart

@@ -101,26 +101,8 @@ def _completed(
     right, wrong = np.zeros(len(t_s), dtype=np.bool_), np.zeros(len(t_s), dtype=np.bool_)
     right[valid[found.row]], wrong[valid[found.wrong]] = True, True
     notes = [*found.notes, *_said_of_base(base_s), *_said_of_clock(found), *_said_of_bend(run, found), *_said_of_slow(found)]
-    display: DisplayCost | None = None
-    by_magnitude: tuple[Slice, ...] = ()
-    parts = found.components
-    error = parts.fov.fitted + parts.pixel.fitted + parts.left
-    freedom = parts.fov.freedom + parts.pixel.freedom + 1
-    try:
-        file = run.bench_file()
-        say("the field's stars")
-        magnitudes = field_magnitudes(file, found.commanded_q)
-        by_magnitude = slices_of(magnitudes, parts.left, error, freedom)
-        if wanted.display_attitudes:
-            say("the display's own error")
-            some = np.unique(np.linspace(0, len(found.row) - 1, wanted.display_attitudes).astype(int))
-            display = display_cost(display_errors(file, found.commanded_q[some]), parts.left[some])
-            if display is None:
-                notes.append("the display shows too few stars at once for an attitude: its own error was not found")
-    except HilstarError as refusal:
-        notes.append(f"neither the field's magnitude nor the display's own error could be found from the ledger: {refusal}")
+    by_rate, by_magnitude, display, missing = _of_the_bench(run, found, wanted, say)
     noise, said = _without_display(found, display)
-    rate_deg_s = np.degrees(np.linalg.norm(found.rate_rad_s, axis=1))
     return Assessment(
         run=run,
         telemetry=answers,
@@ -130,11 +112,38 @@ def _completed(
         lock=lock_of(run.commanded, t_s, right, wrong),
         wrong=_wrong(answers, found, t_s),
         display=display,
-        by_rate=slices_of(rate_deg_s, parts.left, error, freedom),
+        by_rate=by_rate,
         by_magnitude=by_magnitude,
         t_s=t_s,
-        notes=(*notes, *said),
+        notes=(*notes, *missing, *said),
     )
+
+
+def _of_the_bench(
+    run: RunLedger, found: Decomposed, wanted: Wanted, say: Callable[[str], None]
+) -> tuple[tuple[Slice, ...], tuple[Slice, ...], DisplayCost | None, list[str]]:
+    """The error by rate and by magnitude, the display's own, and what of it could not be found."""
+    parts = found.components
+    error = parts.fov.fitted + parts.pixel.fitted + parts.left
+    freedom = parts.fov.freedom + parts.pixel.freedom + 1
+    rate_deg_s = np.degrees(np.linalg.norm(found.rate_rad_s, axis=1))
+    by_rate = slices_of(rate_deg_s, parts.left, error, freedom)
+    by_magnitude: tuple[Slice, ...] = ()
+    display: DisplayCost | None = None
+    notes: list[str] = []
+    try:
+        file = run.bench_file()
+        say("the field's stars")
+        by_magnitude = slices_of(field_magnitudes(file, found.commanded_q), parts.left, error, freedom)
+        if wanted.display_attitudes:
+            say("the display's own error")
+            some = np.unique(np.linspace(0, len(found.row) - 1, wanted.display_attitudes).astype(int))
+            display = display_cost(display_errors(file, found.commanded_q[some]), parts.left[some])
+            if display is None:
+                notes.append("the display shows too few stars at once for an attitude: its own error was not found")
+    except HilstarError as refusal:
+        notes.append(f"neither the field's magnitude nor the display's own error could be found from the ledger: {refusal}")
+    return by_rate, by_magnitude, display, notes
 
 
 def _wrong(answers: Telemetry, found: Decomposed, t_s: FloatArray) -> tuple[Wrong, ...]:

@@ -9,6 +9,7 @@ Laws:
 
 from __future__ import annotations
 
+import contextlib
 import os
 import zlib
 from pathlib import Path
@@ -92,7 +93,8 @@ class Journal:
         self.close()
         for path in self.folder.glob("*.jsonl"):
             path.unlink()
-        self.folder.rmdir()
+        with contextlib.suppress(OSError):  # somebody else's file is in it
+            self.folder.rmdir()
 
     def _block(self, block: int) -> range:
         return range(block * BLOCK_CASES, min(self.cases, (block + 1) * BLOCK_CASES))

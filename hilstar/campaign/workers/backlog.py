@@ -14,6 +14,7 @@ from hilstar.campaign.plan.design import Design
 from hilstar.campaign.store.journal import Journal
 
 FIRST_CASES, MAX_CASES = 1, 1000  # a task
+A_WORKER_S = 0.02  # of a task, so that one driver and one scheduler keep up: 50 tasks a second, whatever the workers' number
 MAX_DEATHS = 3  # of workers over one case alone, which is then taken for the cause
 SMOOTHING = 0.3
 
@@ -66,7 +67,8 @@ class Backlog:
         if self._case_s is None:
             return FIRST_CASES
         fair = math.ceil(self.to_run / (4 * max(1, workers)))
-        return max(1, min(MAX_CASES, fair, round(self._target_s / max(self._case_s, 1e-6))))
+        task_s = max(self._target_s, A_WORKER_S * workers)
+        return max(1, min(MAX_CASES, fair, round(task_s / max(self._case_s, 1e-6))))
 
     def done(self, task: Task, seconds: float) -> None:
         """A task has come back after so much work."""

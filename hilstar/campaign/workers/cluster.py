@@ -20,10 +20,10 @@ from hilstar.campaign.workers.session import Answered, Job
 from hilstar.errors import InputError, MachineError, one_line
 
 INSTALL = "install it: pip install 'hilstar[dask]'"
-TASK_S = 1.0  # of work in a task; handing one out costs the scheduler about a millisecond (docs/campaign.md)
+TASK_S = 1.0  # of work in a task; handing one out costs the scheduler milliseconds (docs/campaign.md)
 SPARE_TASKS = 1  # that wait at a worker, beyond those that its threads are at
 POLL_S, LOOK_S = 0.25, 0.5
-CONNECT_S, ANSWER_S = 10.0, 30.0
+CONNECT_S, ANSWER_S, MAX_SILENCE_S = 30.0, 30.0, 90.0
 MAX_WITHOUT_WORKER_S = 60.0
 CLOSE_S = 0.3  # a Ctrl-C ends a command within a second
 
@@ -56,7 +56,7 @@ class Cluster:
         self._workers: dict[str, _Worker] = {}
         self._examined: dict[Any, str] = {}
         self._alone_since_s: float | None = None
-        self._looked_s = 0.0
+        self._looked_s, self._answered_s = 0.0, time.monotonic()
         self._something = threading.Event()  # a future is done
         logging.getLogger("distributed").setLevel(logging.CRITICAL)  # it tells of each worker that goes
         if not address.startswith(("tcp://", "tls://", "ucx://")):
@@ -90,9 +90,12 @@ class Cluster:
         try:
             present: dict[str, int] = self._client.sync(self._client.scheduler.ncores, workers=None, callback_timeout=ANSWER_S)
         except (OSError, TimeoutError, asyncio.CancelledError, RuntimeError) as error:
+            if time.monotonic() - self._answered_s < MAX_SILENCE_S:
+                return  # a busy one answers later
             raise MachineError(
                 f"--scheduler {self._address}: answers no more; start it again, and run the same command: it goes on"
             ) from error
+        self._answered_s = time.monotonic()
         for address in [address for address in self._workers if address not in present]:
             self._bury(address, backlog, lost)
         for address, threads in present.items():

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hilstar.bench.bench_file import BenchFile, changed_file, read_bench_file
+from hilstar.bench.bench_file import BenchFile, bench_file_of, changed_file, read_bench_file
 from hilstar.bench.config import AttitudeSettings
 from hilstar.errors import InputError
 from hilstar.reading import MAX_TOML_BYTES, parse_toml, read_text
@@ -43,12 +43,11 @@ class HeadsFile:
         return self.path.parent
 
 
-def has_heads(path: Path) -> bool:
-    """Whether a file names heads; False where it cannot be read as TOML, which reading it as a bench file then says."""
-    try:
-        return KEY in _tables(path)
-    except InputError:
-        return False
+def read_bench_or_heads(path: Path) -> BenchFile | HeadsFile:
+    """A bench file, or a file with `heads`, opened once. Raises InputError as `read_bench_file` and `read_heads` do."""
+    text = read_text(path, "give the path of a bench file", MAX_TOML_BYTES)
+    tables = parse_toml(path, text)
+    return _heads_of(path, tables) if KEY in tables else bench_file_of(path, text)
 
 
 def _tables(path: Path) -> dict[str, Any]:
@@ -57,11 +56,14 @@ def _tables(path: Path) -> dict[str, Any]:
 
 def read_heads(path: Path) -> HeadsFile:
     """Read and check a file with `heads` and the bench files it names. Raises InputError: file, key, what to write instead."""
-    tables = _tables(path)
+    return _heads_of(path, _tables(path))
+
+
+def _heads_of(path: Path, tables: dict[str, Any]) -> HeadsFile:
     other = sorted(set(tables) - {KEY, "attitude"})
     if other:
         raise InputError(f"{path}: {other[0]}: beside heads stands only [attitude]; write it in the heads' own files")
-    listed = tables[KEY]
+    listed = tables.get(KEY)
     if not isinstance(listed, list) or not all(isinstance(name, str) and name for name in listed):
         raise InputError(f"{path}: heads = {listed!r}: no list of files; {EXAMPLE}")
     if not MIN_HEADS <= len(listed) <= MAX_HEADS:

@@ -15,6 +15,7 @@ from hilstar.files import check_directory
 
 if TYPE_CHECKING:
     from hilstar.bench.bench_file import BenchFile as Bench
+    from hilstar.bench.heads_file import HeadsFile
     from hilstar.twin.verify.verdict import Verdict
 
 
@@ -36,21 +37,20 @@ def verify(
     """Run the digital twin: what the tracker would measure of the stars shown, against the sky."""
     import numpy as np
 
-    from hilstar.bench.bench_file import read_bench_file
-    from hilstar.bench.heads_file import has_heads
+    from hilstar.bench.heads_file import HeadsFile, read_bench_or_heads
     from hilstar.files import make_directory
     from hilstar.twin.verify.proposal_report import check_writable
     from hilstar.twin.verify.report import write_report
     from hilstar.twin.verify.run import verify as run_twin
     from hilstar.twin.verify.summary import summarise, summary_lines
 
-    if has_heads(bench_file):
-        _verify_heads(bench_file, fields, seed, as_json)
-        return
     check_directory("-o", output)
     if output is not None:
         make_directory(output)
-    file = read_bench_file(bench_file)
+    file = read_bench_or_heads(bench_file)
+    if isinstance(file, HeadsFile):
+        _verify_heads(file, fields, seed, as_json)
+        return
     if write:
         check_writable(file)
     wrong = optional_scenario(scenario)
@@ -69,15 +69,14 @@ def verify(
         raise typer.Exit(1)
 
 
-def _verify_heads(path: Path, fields: int, seed: int, as_json: bool) -> None:
+def _verify_heads(heads: HeadsFile, fields: int, seed: int, as_json: bool) -> None:
     """The angles between the heads of a file with `heads`, solved from what their trackers would see."""
     import numpy as np
 
-    from hilstar.bench.heads_file import read_heads
     from hilstar.twin.heads import verify_heads
 
     with progress("verifying", fields) as advance:
-        pairs = [pair.summary() for pair in verify_heads(read_heads(path), fields, np.random.default_rng(seed), advance)]
+        pairs = [pair.summary() for pair in verify_heads(heads, fields, np.random.default_rng(seed), advance)]
     if as_json:
         print_json({"angles": pairs})
         return

@@ -41,15 +41,13 @@ class HeadsAsked:
         return (*given, *(name for name, on in self.switches.items() if on))
 
 
-def serve_heads(path: Path, asked: HeadsAsked, as_json: bool) -> None:
+def serve_heads(heads: HeadsFile, asked: HeadsAsked, as_json: bool) -> None:
     """Show every head's stars up to its end, and print what each said; exit code 4 where none ever had an attitude."""
     from hilstar.attitude.wire.vizard.live import VizardLive
     from hilstar.attitude.wire.zmq_lockstep import ZmqLockstep
-    from hilstar.bench.heads_file import read_heads
     from hilstar.run.heads.supervisor import HeadsRun, head_ledger, run_heads, source_config
     from hilstar.run.open_link import open_link
 
-    heads = read_heads(path)
     if asked.ledger is not None and not asked.switches.get("--overwrite"):
         taken = [file for name in heads.names if (file := head_ledger(asked.ledger, name)).exists()]
         if taken:

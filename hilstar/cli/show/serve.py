@@ -63,16 +63,16 @@ def serve(
     fed_by: FedBy = None,
 ) -> None:
     """Show the live attitude stream on the monitor; of a file with `heads`, on the monitor of each."""
-    from hilstar.bench.heads_file import as_head, has_heads
+    from hilstar.bench.heads_file import HeadsFile, as_head, read_bench_or_heads
 
-    if has_heads(bench_file):
+    file = read_bench_or_heads(bench_file) if head_of is None else as_head(bench_file, head_of)
+    if isinstance(file, HeadsFile):
         switches = {"--headless": headless, "--windowed": windowed, "--force": force, "--control": control}
         switches |= {"--overwrite": overwrite, "--explain": explain}
         asked = HeadsAsked(duration, frames, dated_ledger(ledger), ledger_split, scenario, switches, console, token)
-        serve_heads(bench_file, asked, as_json)
+        serve_heads(file, asked, as_json)
         return
     from hilstar.attitude.wire.source import Mounting
-    from hilstar.bench.bench_file import read_bench_file
     from hilstar.console.feed.opening import Parts, Told
     from hilstar.run.loop import Limit
     from hilstar.run.open_link import open_link
@@ -82,7 +82,6 @@ def serve(
 
     ledger = dated_ledger(ledger)
     check_ending("--ledger", ledger, MCAP)
-    file = read_bench_file(bench_file) if head_of is None else as_head(bench_file, head_of)
     faults = optional_scenario(scenario)
     check_files([scenario], [], file, ledger, overwrite)
     split = parse_split(ledger_split)

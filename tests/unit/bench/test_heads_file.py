@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from hilstar.bench.heads_file import as_head, has_heads, read_heads
+from hilstar.bench.heads_file import HeadsFile, as_head, read_bench_or_heads, read_heads
 from hilstar.errors import InputError
 from tests.support.benches import SMALL_BENCH
 from tests.support.heads import MOUNTINGS, heads_file
@@ -13,7 +13,7 @@ from tests.support.heads import MOUNTINGS, heads_file
 def test_each_head_has_its_own_bench_and_the_common_source(tmp_path):
     path = heads_file(tmp_path, 5599)
     heads = read_heads(path)
-    assert has_heads(path)
+    assert isinstance(read_bench_or_heads(path), HeadsFile)
     assert heads.names == ("a", "b", "c")
     assert [file.config.tracker.q_body_to_cam for file in heads.files] == [pytest.approx(q) for q in MOUNTINGS.values()]
     assert {file.config.attitude.endpoint for file in heads.files} == {"tcp://127.0.0.1:5599"}
@@ -44,8 +44,9 @@ def test_what_is_wrong_is_said_in_one_line(tmp_path, text, words):
     assert "\n" not in str(refused.value)
 
 
-def test_a_bench_file_and_what_is_no_toml_have_no_heads(tmp_path):
+def test_a_bench_file_is_read_as_one(tmp_path):
     (tmp_path / "bench.toml").write_text(SMALL_BENCH)
     (tmp_path / "broken.toml").write_text("heads = [")
-    assert not has_heads(tmp_path / "bench.toml")
-    assert not has_heads(tmp_path / "broken.toml")
+    assert not isinstance(read_bench_or_heads(tmp_path / "bench.toml"), HeadsFile)
+    with pytest.raises(InputError):
+        read_bench_or_heads(tmp_path / "broken.toml")

@@ -41,7 +41,7 @@ def moving_sky(config: BenchConfig, folder: Path, optics: Optics) -> MovingSky:
     if unix:
         start_ns = round(start_ns / DAY_NS) * DAY_NS  # a Julian year is good to milliseconds
     orbit = config.spacecraft.orbit or GEOCENTRE
-    observer = Geocentre() if orbit in {GEOCENTRE, SOURCE} else orbit_file(folder / orbit, utc_ns + start_ns)
+    observer = Geocentre() if orbit in {GEOCENTRE, SOURCE} else orbit_file(folder / orbit, utc_ns + start_ns, start_ns != 0)
     names = body_names(config)
     sky = config.sky
     rates = bodies_electrons_per_s(names, sky.brightness, optics, Photometry(sky.zero_point, sky.passband_weighting))
@@ -50,14 +50,16 @@ def moving_sky(config: BenchConfig, folder: Path, optics: Optics) -> MovingSky:
     return moving
 
 
-def orbit_file(path: Path, utc_ns: int) -> Orbit:
+def orbit_file(path: Path, utc_ns: int, day: bool) -> Orbit:
     """The orbit in a file, which is an OEM that covers that UTC, or elements: with a warning where they are of another week.
+
+    The UTC may be the beginning of the `day` of what is shown.
 
     Raises InputError, and MachineError without SGP4 for elements.
     """
     text = read_text(path, f"{TLE_ADVICE}, or a CCSDS OEM", MAX_ORBIT_BYTES)
     if text.lstrip().startswith(VERSION_KEY):
-        return OemOrbit(text, str(path), utc_ns)
+        return OemOrbit(text, str(path), utc_ns, day)
     orbit = TleOrbit(text, str(path))
     age_days = orbit.age_days(utc_ns)
     if abs(age_days) > MAX_TLE_AGE_DAYS:

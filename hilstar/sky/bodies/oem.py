@@ -50,14 +50,14 @@ class OemOrbit:
     """The orbit in the text of a file `name`.
 
     Raises InputError for a text that is none, or that has no epoch within a day of a UTC, ns since 1970, at which stars are
-    placed.
+    placed. Where that is only the beginning of the `day` of what is shown, the file need not cover it.
     """
 
     step_s = 2.0  # as for a `TleOrbit`
 
-    def __init__(self, text: str, name: str, utc_ns: int) -> None:
+    def __init__(self, text: str, name: str, utc_ns: int, day: bool = False) -> None:
         self._name, self._segments, self._told = name, list(_segments(text, name)), False
-        self._stars_ns = utc_ns
+        self._stars_ns, self._unseen_ns = utc_ns, UNSEEN_NS if day else -1
         if not self._segments:
             raise InputError(f"{name}: contains no segment of an orbit; {OEM_ADVICE}")
         if min(_away_ns(s, utc_ns) for s in self._segments) > DAY_NS:
@@ -71,8 +71,7 @@ class OemOrbit:
     def state(self, utc_ns: int) -> tuple[FloatArray, FloatArray]:
         """Place (3,), km, and velocity (3,), km/s; where the file has none, those of its nearest epoch, which is told once."""
         found = min(reversed(self._segments), key=lambda s: _away_ns(s, utc_ns))
-        # Stars are placed at the beginning of a day where the source gives the dates: nothing is shown there.
-        if not self._told and _away_ns(found, utc_ns) > 0 and abs(utc_ns - self._stars_ns) > UNSEEN_NS:
+        if not self._told and _away_ns(found, utc_ns) > 0 and abs(utc_ns - self._stars_ns) > self._unseen_ns:
             log.warning("%s: has no orbit at %s UTC; that of its nearest epoch is held", self._name, _date(utc_ns))
             self._told = True
         t_ns = int(np.clip(_time(found.scale, utc_ns), found.t_ns[0], found.t_ns[-1]))

@@ -69,10 +69,18 @@ def test_beyond_its_epochs_the_last_place_is_held_and_told_once(caplog):
     assert len(caplog.records) == 1 and "is held" in caplog.text
 
 
+@pytest.mark.parametrize("seconds", [-1, 11])
+def test_an_orbit_of_seconds_is_told_where_it_ends(caplog, seconds):
+    """Stars are placed for START_NS, where frames are shown from the start: no two minutes about it go untold."""
+    with caplog.at_level(logging.WARNING):
+        station(oem(segment([0, 5, 10]))).state(START_NS + seconds * NS)
+    assert len(caplog.records) == 1 and "is held" in caplog.text
+
+
 def test_the_moment_for_which_stars_are_placed_need_not_be_covered(caplog):
     """With the dates of a source that is the beginning of its day."""
     with caplog.at_level(logging.WARNING):
-        orbit = OemOrbit(oem(segment(MINUTES)), "a.oem", START_NS - 12 * 3600 * NS)
+        orbit = OemOrbit(oem(segment(MINUTES)), "a.oem", START_NS - 12 * 3600 * NS, day=True)
         assert orbit.state(START_NS - 12 * 3600 * NS)[0] == pytest.approx(STATION.state(START_NS)[0], abs=PLACE_KM)
         assert orbit.state(START_NS + 60 * NS)[0] == pytest.approx(STATION.state(START_NS + 60 * NS)[0], abs=PLACE_KM)
     assert not caplog.records

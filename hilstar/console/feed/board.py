@@ -19,6 +19,7 @@ import numpy as np
 _HEAD = struct.Struct("<Q")
 _SLOT = struct.Struct("<QQII")  # the number being written, the number that is whole, bytes, CRC-32
 _WANT = struct.Struct("<QQ")  # a picture each so many ns, until so many ns of host time
+_WRONG_SINCE = struct.Struct("<d")  # UTC, s
 _PAGE = 4096
 FRAMES, FRAME_BYTES = 512, 128  # 8 s at 60 Hz
 STATES, STATE_BYTES = 4, 60_000
@@ -141,3 +142,12 @@ class Board:
     @want.setter
     def want(self, want: Want) -> None:
         _WANT.pack_into(self._memory, 0, want.each_ns, want.until_ns)
+
+    @property
+    def wrong_since_s(self) -> float:
+        """Since when the page has found the run wrong (UTC, s), for a page that takes over; 0 where it found it right."""
+        return float(_WRONG_SINCE.unpack_from(self._memory, _WANT.size)[0])
+
+    @wrong_since_s.setter
+    def wrong_since_s(self, since_s: float) -> None:
+        _WRONG_SINCE.pack_into(self._memory, _WANT.size, since_s)

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 from hilstar.console.feed.messages import SWITCHES, Answer, Order
 from hilstar.console.feed.seen import Watched
 from hilstar.errors import HilstarError, one_line, printable
+from hilstar.run.aids import PATCHES
 from hilstar.run.desk import Desk, Wish
 
 if TYPE_CHECKING:
@@ -48,6 +49,8 @@ class Orders:
             return Answer(id=order.id, status=409, line=one_line(str(error)))
 
     def _switch(self, order: Order, who: str) -> Answer:
+        if order.name == "patch" and order.on and order.level not in PATCHES:
+            return Answer(id=order.id, status=400, line=f"no such patch; write a level of {', '.join(map(str, PATCHES))}")
         wish = Wish(order.name, order.on, who, order.level)
         self._desk.ask(wish)
         if self._waits_for(lambda: wish.done):

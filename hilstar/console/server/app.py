@@ -37,8 +37,8 @@ ORDERED_S = 30.0  # a ledger on a slow disk
 Give = Callable[[Order], Awaitable[Answer]]
 
 
-class OrderBody(msgspec.Struct):
-    """The body of `POST /control/NAME`."""
+class OrderBody(msgspec.Struct, forbid_unknown_fields=True):
+    """The body of `POST /control/NAME`; a key that is misspelt must not act as if it had not been there."""
 
     on: bool = True
     level: float = PATCH_SHARE

@@ -30,7 +30,7 @@ class Reader:
     def __init__(self, board: Board, setup: Setup) -> None:
         self._board, self._setup = board, setup
         self.seen: RunSeen | None = None
-        self.health = Health(time.time())
+        self.health = Health(board.wrong_since_s or time.time())  # an earlier page of this run may have died
         self.points: deque[dict[str, Any]] = deque(maxlen=round(HISTORY_S / TICK_S))
         self.events: deque[dict[str, Any]] = deque(maxlen=KEPT_EVENTS)
         self._frame_at = self._event_at = 0
@@ -53,6 +53,7 @@ class Reader:
             self._pacing_ns, self.pacing = now_ns, self._pacing_now(now_ns)
         lately = Lately(0 if self._last is None else self._last.swap_ns, self._missed_share())
         self.health.update(reasons(self.seen, now_ns, lately, self._setup.refresh_hz, self._setup.pace), unix_s)
+        self._board.wrong_since_s = 0.0 if self.health.ok else self.health.since_s
         return self._new_events()
 
     def _new_events(self) -> list[dict[str, Any]]:

@@ -13,7 +13,7 @@ import msgspec
 
 from hilstar.attitude.wire.keys import CurveKeys
 from hilstar.bench.config.faults import FaultSettings
-from hilstar.bench.faults.desk import Change, FaultDesk
+from hilstar.bench.faults.desk import FILE, Change, FaultDesk
 from hilstar.bench.faults.kinds import Fault, MeasuredMap, table_of
 from hilstar.bench.faults.scenario import NO_SCENARIO, Scenario
 from hilstar.bench.faults.surfaces import map_sha256
@@ -22,7 +22,7 @@ from hilstar.bench.frame import Bench
 from hilstar.errors import printable
 from hilstar.notices import Notices
 from hilstar.run.faults.recorded import RecordedFaults, Recording
-from hilstar.run.faults.stream import FaultStream
+from hilstar.run.faults.stream import STREAM, FaultStream
 from hilstar.run.faulty_frames import FaultyFrames
 from hilstar.run.record.ledger_records import FaultRecord, FrameRecord
 from hilstar.run.record.ledger_switch import LedgerSwitch
@@ -56,7 +56,8 @@ class RunFaults:
         tally = self._missed if change.what == "missed" else self._started
         if change.what != "end":
             tally[fault.name if len(tally) < MAX_NAMES or fault.name in tally else "others"] += 1
-        self._notices.tell("fault", f"fault {fault.name} ({fault.KIND}) {WORDS[change.what]}, by {change.who}")
+        person = "" if change.who in {FILE, STREAM} else change.who
+        self._notices.tell("fault", f"fault {fault.name} ({fault.KIND}) {WORDS[change.what]}, by {change.who}", person)
         if self._ledger is not None:
             table = msgspec.json.encode(table_of(fault)).decode()
             record = self._record(change.what, table, name=fault.name, kind=fault.KIND, who=change.who)

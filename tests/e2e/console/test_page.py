@@ -143,10 +143,13 @@ def test_a_ledger_is_ended_and_begun_while_the_run_goes_on(run):
 def test_a_page_killed_comes_back_by_itself_while_frames_go_on(run):
     served, page, _ = run
     (first,) = children(served.process.pid, PAGE)
+    wait_for(lambda: page.health_is(False))  # nobody sends
+    wrong_since = page.json("/health")["since"]
     frames = page.json("/state")["state"]["counts"]["frames"]
     os.kill(first, signal.SIGKILL)
     wait_for(lambda: [pid for pid in children(served.process.pid, PAGE) if pid != first])
     assert page.json("/state")["state"]["counts"]["frames"] > frames  # the request waits at the door until there is a page
+    assert page.json("/health")["since"] == wrong_since
     assert served.count("the operator's page ended (signal 9); it is started again") == 1
 
 

@@ -74,7 +74,8 @@ def test_a_board_is_seen_by_whoever_has_its_descriptor():
     board.events.put(b"event")
     other.want = Want(125_000_000, 7)
     assert other.frames.last() == (1, b"frame") and other.events.last() == (1, b"event")
-    assert board.want == Want(125_000_000, 7)
+    other.wrong_since_s = 12.5
+    assert board.want == Want(125_000_000, 7) and board.wrong_since_s == 12.5
     picture = np.arange(320 * 240, dtype=np.uint8)
     board.pictures.begin()
     np.copyto(np.frombuffer(board.pictures.room(picture.nbytes), dtype=np.uint8), picture)

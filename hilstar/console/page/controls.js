@@ -8,10 +8,11 @@ const NAME_KEY = "hilstar.operator";
 
 export class Controls {
   constructor(link) {
-    Object.assign(this, { link, on: {}, armed: null, allowed: false });
+    Object.assign(this, { link, on: {}, faultsOn: [], armed: null, allowed: false });
     for (const name of Object.keys(SWITCHES)) byId(`control-${name}`).addEventListener("click", () => this.press(name));
     byId("mark-form").addEventListener("submit", (event) => this.mark(event));
     byId("fault-form").addEventListener("submit", (event) => this.fault(event));
+    byId("fault-name").addEventListener("change", () => this.tellFault());
     byId("operator-form").addEventListener("submit", (event) => event.preventDefault());
     const name = byId("operator-name");
     name.value = localStorage.getItem(NAME_KEY) || "";
@@ -30,7 +31,18 @@ export class Controls {
     byId("fault-form").hidden = !(faults || []).length;
   }
 
-  hear({ operator, ledger }) {
+  // Nothing can be asked of a run that does not answer: `setUp` is called again once it does. What is written in a field stays.
+  lose() {
+    this.disarm();
+    this.allowed = false;
+    write(byId("control-state"), "no connection");
+    byId("control-state").dataset.state = "";
+    for (const button of document.querySelectorAll(".controls-panel button")) button.disabled = true;
+  }
+
+  hear({ operator, ledger, faults }) {
+    this.faultsOn = faults || [];
+    this.tellFault();
     this.on = { ...operator, ledger: ledger !== null };
     for (const [name, words] of Object.entries(SWITCHES)) {
       const button = byId(`control-${name}`);
@@ -83,10 +95,17 @@ export class Controls {
     this.send("mark", { text }, "Mark written").then((ok) => ok && (field.value = ""));
   }
 
+  // The button ends a fault that is on: one without an end of its own would stay for ever.
+  tellFault() {
+    const name = byId("fault-name").value;
+    write(byId("control-fault"), this.faultsOn.includes(name) ? "End" : "Inject");
+  }
+
   fault(event) {
     event.preventDefault();
     const name = byId("fault-name").value;
-    this.send("fault", { name }, `Fault ${name} injected`);
+    const on = !this.faultsOn.includes(name);
+    this.send("fault", { name, on }, `Fault ${name} ${on ? "injected" : "ended"}`);
   }
 
   async send(name, body, done) {

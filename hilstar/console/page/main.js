@@ -29,7 +29,7 @@ const dirty = { picture: false, sky: false, charts: false };
 const picture = new Picture(byId("picture"), () => redraw("picture"));
 const overlays = new Overlays(byId("overlay"), picture.view, onOverlay);
 const sky = new Sky(byId("sky"), ink);
-const link = new Link({ onMessage, onPicture, onChange: () => health.check() });
+const link = new Link({ onMessage, onPicture, onChange });
 const health = new Health(link, () => redraw("picture"));
 const controls = new Controls(link);
 const attitudeRows = new Rows(byId("attitude-rows"));
@@ -54,6 +54,11 @@ function drawAll() {
   if (dirty.sky) sky.draw();
   if (dirty.charts) drawCharts();
   for (const what of Object.keys(dirty)) dirty[what] = false;
+}
+
+function onChange() {
+  health.check();
+  if (!link.open) controls.lose();
 }
 
 const HEARD = {

@@ -48,8 +48,8 @@ TRY_TO_BLANK = """
 const request = { method: "POST", headers: { "Content-Type": "application/json" }, body: '{"on": true}' };
 fetch("/control/blank", request).then((answer) => done(answer.status));
 """
-# Not within the run, but on request.
-SCENARIO = '[[fault]]\nname = "ghost"\nkind = "false-star"\nat_s = 9e4\nfor_s = 1.0\nradec_deg = [84.0, -1.0]\nv_mag = 2.0\n'
+# On request alone, and until it is ended.
+SCENARIO = '[[fault]]\nname = "ghost"\nkind = "false-star"\nradec_deg = [84.0, -1.0]\nv_mag = 2.0\n'
 ALL_DISABLED = "[...document.querySelectorAll('.controls-panel :is(button, input, select)')].every((field) => field.disabled)"
 
 
@@ -228,10 +228,17 @@ def test_controls_act_and_the_ledger_says_who(live, run):
     live.until("document.getElementById('events').textContent.includes('<b>shutter</b> open')")
     live.press("#control-fault")
     live.until("document.getElementById('events').textContent.includes('fault ghost')")
+    live.until("document.getElementById('control-fault').textContent === 'End'")
+    live.press("#control-fault")
+    live.until("document.getElementById('control-fault').textContent === 'Inject'")
+    live.until("document.body.dataset.ok === 'true'")
     wait_for(lambda: any("shutter" in record.detail for record in events(run)), "the mark in the ledger")
     mark = next(record for record in events(run) if "shutter" in record.detail)
     assert "Ada Løve" in mark.detail
-    assert any("ghost" in record.detail and "Ada Løve" in record.detail for record in events_of(run, "fault"))
+    assert [(record.detail.split()[-4], record.who) for record in events_of(run, "fault")] == [
+        ("begins,", "Ada Løve"),
+        ("ends,", "Ada Løve"),
+    ]
 
 
 def test_by_the_keyboard_alone(live):
@@ -288,5 +295,6 @@ def test_without_control_the_page_only_shows_and_when_the_run_dies_it_is_red(pag
         page.until("window.redAt")
         assert page.run("return window.redAt") - died_ms < RED_MS + BUSY_MS
         assert page.text("#health-headline") == "No word from hilstar"
+        page.until("document.getElementById('control-state').textContent === 'no connection'")
         page.get("about:blank")
         page.complaints()  # that the connection was refused

@@ -150,6 +150,7 @@ export class Overlays {
   drawBoresight([x, y]) {
     const { context, unit } = this;
     const [u, v] = this.view.toCanvas(x, y);
+    this.taken.push([u - 24 * unit, v - unit, u + 24 * unit, v + unit]); // a name under its bar would look struck out
     context.strokeStyle = INK.boresight;
     context.lineWidth = 1.5 * unit;
     context.beginPath();
@@ -192,8 +193,10 @@ export class Overlays {
       const wide = this.context.measureText(text).width;
       const close = view.scale >= VALUES_FROM * unit; // beside the star it would hide codes
       const beside = u + gap + wide > this.canvas.width ? u - gap - wide : u + gap;
-      const [left, top] = close ? [u - wide / 2, v - gap - 8 * unit] : [beside, v];
-      if (!this.place(text, left, top, 12)) continue;
+      const above = [u - wide / 2, v - gap - 8 * unit];
+      const found = (close ? [above] : [[beside, v], above]).find(([left, top]) => this.place(text, left, top, 12));
+      if (!found) continue;
+      const [left, top] = found;
       this.write(text, left, top, star[5] && this.on.clipped ? "#ff9a9a" : INK.name);
       written += 1;
     }

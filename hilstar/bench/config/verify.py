@@ -64,8 +64,8 @@ class Verify(Table, frozen=True):
     centroider: Annotated[
         Literal["window", "moment", "fit", "box3", "box5"],
         Meta(
-            description="What the tracker finds its stars by: a Gaussian window that follows the star, the plain first moment, "
-            "the least squares of a PSF, or the centre of mass of 3 x 3 or 5 x 5 pixels about the brightest."
+            description='What the tracker finds its stars by: `"window"`, a Gaussian that follows the star; `"moment"`, the plain '
+            'first moment; `"fit"`, the least squares of a PSF; `"box3"` or `"box5"`, the centre of mass of so many pixels a side.'
         ),
     ] = "window"
     flux_mag: Annotated[

@@ -48,9 +48,11 @@ class Bodies(Table, frozen=True):
         ),
     ] = None
     satellite_standard_mag: Annotated[
-        Magnitude,
+        float,
         Meta(
-            description="V at 1000 km, 90 degrees of phase and in sunlight, of satellites without `standard_mag` in that table."
+            ge=-30,
+            le=50,
+            description="V at 1000 km, 90 degrees of phase, in sunlight, of satellites without `standard_mag` in that table.",
         ),
     ] = 6.0
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import io
 import math
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -122,7 +123,9 @@ def _decoded(path: Path, raw: bytes) -> npt.NDArray[Any]:
         if raw.startswith(b"SIMPLE  ="):
             from astropy.io import fits
 
-            with fits.open(io.BytesIO(raw), memmap=False) as units:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of astropy, about a cut file: one line says so
+                units = fits.open(io.BytesIO(raw), memmap=False)
                 return next(np.asarray(unit.data) for unit in units if getattr(unit, "data", None) is not None)
     except Exception as error:  # each library raises its own for a damaged file
         raise cannot_read(path, f"{type(error).__name__}: {error}", MAP_ADVICE) from error

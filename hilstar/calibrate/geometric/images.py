@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -86,7 +87,9 @@ def _fits(path: Path, data: bytes) -> npt.NDArray[Any]:
     from astropy.io import fits
 
     try:
-        with fits.open(BytesIO(data)) as hdus:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of astropy, about a cut file: one line says so
+            hdus = fits.open(BytesIO(data))
             planes = [hdu.data for hdu in hdus if isinstance(hdu, fits.PrimaryHDU | fits.ImageHDU) and hdu.data is not None]
     except (OSError, ValueError, TypeError, IndexError) as error:
         raise InputError(f"{path}: cannot be read as FITS ({error}); {ADVICE}") from error

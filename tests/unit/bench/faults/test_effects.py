@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import io
+import warnings
+
 import numpy as np
 import pytest
+from astropy.io import fits
 
 import hilstar
 from hilstar.bench.faults.desk import Now
@@ -183,18 +187,27 @@ def test_what_this_bench_cannot_draw_is_refused(bench, table, said):
         shown(bench, table)
 
 
+def cut_fits():
+    whole = io.BytesIO()
+    fits.PrimaryHDU(np.ones((40, 40), dtype=np.float32)).writeto(whole)
+    return whole.getvalue()[:4000]  # of 11 520 bytes
+
+
 @pytest.mark.parametrize(
     ("content", "said"),
     [
         (b"not an image", "neither FITS, PNG nor npy"),
         (b"\x89PNG\r\n\x1a\nbroken", "cannot be read"),
         (b"\x93NUMPY\x01", "cannot be read"),
+        (cut_fits(), "cannot be read"),
     ],
 )
 def test_a_map_that_is_no_image_is_refused(bench, tmp_path, content, said):
     (tmp_path / "stray.fits").write_bytes(content)
-    with pytest.raises(InputError, match=said):
+    with warnings.catch_warnings(record=True) as told, pytest.raises(InputError, match=said):
+        warnings.simplefilter("always")
         shown(bench, {"kind": "light-map", "file": "stray.fits"}, folder=tmp_path)
+    assert not told  # of a cut file one line is printed, not Astropy's besides
 
 
 def test_a_body_that_is_gone_has_neither_disc_nor_row(tmp_path):

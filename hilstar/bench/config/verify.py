@@ -65,8 +65,8 @@ class Verify(Table, frozen=True):
         Literal["window", "moment", "fit", "box3", "box5"],
         Meta(
             description='What the tracker finds its stars by: `"window"`, a Gaussian that follows the star; `"moment"`, the '
-            'plain first moment; `"fit"`, the least squares of a PSF; `"box3"` or `"box5"`, the centre of mass of so many pixels '
-            "a side."
+            'plain first moment; `"fit"`, the least squares of a PSF; `"box3"` or `"box5"`, the centre of mass of so many '
+            "pixels a side."
         ),
     ] = "window"
     flux_mag: Annotated[

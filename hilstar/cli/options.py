@@ -22,7 +22,7 @@ Explain = Annotated[
 ]
 AtSeconds = Annotated[
     float | None,
-    typer.Option("--at", metavar="S", help="Seconds after `[sky] epoch_utc`, or of a scenario; 0 by default."),
+    typer.Option("--at", metavar="S", help="Seconds after sky.epoch_utc, or of a scenario; 0 by default."),
 ]
 RunFile = Annotated[Path, typer.Argument(metavar="RUN.mcap", help="The ledger of serve or replay.")]
 ScenarioFile = Annotated[

@@ -19,7 +19,7 @@ import numpy as np
 from scipy import sparse
 
 from hilstar.arrays import FloatArray
-from hilstar.campaign.budget.phases import global_phases, local_columns, phases_of
+from hilstar.campaign.budget.phases import SHARP_HARMONICS, Phases, global_phases, local_columns, phases_of
 from hilstar.campaign.budget.places import Projector, axes_of, bumps_at, centres_of, places_of
 from hilstar.campaign.budget.scale import Scale
 from hilstar.campaign.budget.star_search import best_direction
@@ -34,6 +34,7 @@ MIN_EXTENT_OF_PIXEL_PX = 2.0
 LOCAL_SPACINGS_PX = (160.0, 80.0, 40.0, 20.0)
 MAX_LOCAL = 3000
 SOUGHT = "the phase of the direction that the error follows best"
+SHARP = ", to its fifth harmonic"
 SURE = 6.0  # standard deviations of what noise alone would explain
 SURE_OF_MANY = 12.0  # of thousands of directions the best
 APART = 0.5  # of the power of the waves that no bump explains, for pixel and field-of-view error to be told apart
@@ -128,12 +129,12 @@ def _waves(
     apart = 0.0 if bumps is not None else 1.0
     for name, columns in _families(about, *seen):
         waves = Projector(columns)
-        if bumps is not None and not name.startswith(LOCAL):
+        if bumps is not None and not name.startswith(LOCAL) and not name.endswith(SHARP):
             apart = max(apart, _apart(columns, bumps))
         if name.startswith(LOCAL) and columns.shape[1] > len(about) // ROWS_A_BUMP:
             break
         found = _component(waves, about, freedom)
-        power = _surely(found, about, freedom, SURE_OF_MANY if name == SOUGHT else SURE)
+        power = _surely(found, about, freedom, SURE_OF_MANY if name.startswith(SOUGHT) else SURE)
         if power > best[0]:
             best = (power, waves, replace(found, detail=name))
         elif name.startswith(LOCAL) and power < HOPELESS * best[0]:
@@ -160,15 +161,22 @@ def _families(
 ) -> Iterator[tuple[str, sparse.csr_matrix]]:
     """What may repeat with the place within a pixel, by name: the same over the run, then from place to place, ever finer."""
     for each in global_phases(q_icrs_to_cam, axes, scale):
-        yield f"the phase of {each.name}", sparse.csr_matrix(each.columns())
+        yield from _with_sharp(f"the phase of {each.name}", each)
     direction = best_direction(about, axes, scale)
     if direction is not None:
-        yield SOUGHT, sparse.csr_matrix(phases_of(direction, axes, scale).columns())
+        yield from _with_sharp(SOUGHT, phases_of(direction, axes, scale))
     for spacing in LOCAL_SPACINGS_PX:
         columns = local_columns(q_icrs_to_cam, scale, spacing)
         if columns.shape[1] > MAX_LOCAL:
             break
         yield f"{LOCAL}, {spacing:.0f} px apart", columns
+
+
+def _with_sharp(name: str, phases: Phases) -> Iterator[tuple[str, sparse.csr_matrix]]:
+    """Its smooth waves, and, of answers enough, those with the harmonics of an error that jumps from pixel to pixel."""
+    yield name, sparse.csr_matrix(phases.columns())
+    if len(phases.place_px) >= 2 * len(SHARP_HARMONICS) * ROWS_A_BUMP:
+        yield f"{name}{SHARP}", sparse.csr_matrix(phases.columns(SHARP_HARMONICS))
 
 
 def _apart(columns: sparse.csr_matrix, bumps: Projector) -> float:

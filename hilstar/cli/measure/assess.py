@@ -25,7 +25,7 @@ def assess(
     ],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Directory for budget.html and its tables.")],
     stamp: Annotated[
-        Literal["start", "middle", "end"], typer.Option(help="Where in an exposure of `[tracker] exposure_s` t_s stands.")
+        Literal["start", "middle", "end"], typer.Option(help="Where in an exposure of tracker.exposure_s t_s stands.")
     ] = "middle",
     latency_ms: Annotated[
         float, typer.Option("--latency-ms", metavar="MS", help="How much later than that t_s is, where it is known.")

@@ -64,10 +64,10 @@ def parts_of(path: Path) -> list[Path]:
     return parts
 
 
-def read_topics(path: Path) -> Iterator[tuple[str, bytes]]:
+def read_topics(path: Path, *, tell: bool = True) -> Iterator[tuple[str, bytes]]:
     """Topic and content of every message of a run's files, in their order, up to where its writer was killed.
 
-    A file that ends so is said in one line of the log, once it is read. Raises InputError for damage, and for anything but a
+    A file that ends so is said in one line of the log, once it is read, unless not `tell`. Raises InputError for damage, and for anything but a
     regular file.
     """
     for part in parts_of(path):
@@ -77,7 +77,7 @@ def read_topics(path: Path) -> Iterator[tuple[str, bytes]]:
                 channels[record.id] = record.topic
             elif isinstance(record, Message) and record.channel_id in channels:
                 yield channels[record.channel_id], record.data
-    unfinished = unfinished_part(path)
+    unfinished = unfinished_part(path) if tell else None
     if unfinished is not None:
         log.warning("%s %s", unfinished, NO_END)
 
@@ -91,9 +91,9 @@ def unfinished_part(path: Path) -> Path | None:
     return None
 
 
-def read_messages(path: Path, topic: str) -> Iterator[bytes]:
-    """What the messages of one topic hold. Raises InputError for damage."""
-    yield from (data for name, data in read_topics(path) if name == topic)
+def read_messages(path: Path, topic: str, *, tell: bool = True) -> Iterator[bytes]:
+    """What the messages of one topic hold; a file without its end is said unless not `tell`. Raises InputError for damage."""
+    yield from (data for name, data in read_topics(path, tell=tell) if name == topic)
 
 
 def topics_of(path: Path) -> list[str]:

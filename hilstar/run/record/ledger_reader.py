@@ -45,9 +45,12 @@ def frame_records(path: Path) -> Iterator[FrameRecord]:
 
 
 def fault_records(path: Path) -> Iterator[FaultRecord]:
-    """The beginnings and ends of faults in a ledger. Raises InputError for damage."""
+    """The beginnings and ends of faults in a ledger. Raises InputError for damage.
+
+    That its end is missing is said by whoever reads its frames.
+    """
     decoder = msgspec.json.Decoder(FaultRecord)
-    for number, data in enumerate(read_messages(path, FAULT_TOPIC), start=1):
+    for number, data in enumerate(read_messages(path, FAULT_TOPIC, tell=False), start=1):
         yield _decoded(decoder, data, f"{path}: message {number} of {FAULT_TOPIC}")
 
 

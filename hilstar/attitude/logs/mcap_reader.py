@@ -67,8 +67,8 @@ def parts_of(path: Path) -> list[Path]:
 def read_topics(path: Path, *, tell: bool = True) -> Iterator[tuple[str, bytes]]:
     """Topic and content of every message of a run's files, in their order, up to where its writer was killed.
 
-    A file that ends so is said in one line of the log, once it is read, unless not `tell`. Raises InputError for damage, and for anything but a
-    regular file.
+    A file that ends so is said in one line of the log, once it is read, unless not `tell`. Raises InputError for damage, and
+    for anything but a regular file.
     """
     for part in parts_of(path):
         channels: dict[int, str] = {}

@@ -94,7 +94,7 @@ class ExactQuantiser:
 
     def _choose(self, found: Footprints, carried: FloatArray) -> tuple[IntArray, FloatArray]:
         """The levels of a chunk of stars, (pixels, n), and their errors of light and moments with those `carried`, (3, n)."""
-        near = self._map.near
+        near = self._map.order.near
         output = None if self._output is None else self._output[found.place]
         asked = found.light / np.float32(self._panel.flux_at_white_e_per_s)
         if output is not None:

@@ -7,18 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.arrays import Float32Array, FloatArray, IntArray
+from hilstar.arrays import Float32Array, FloatArray
 from hilstar.errors import InputError
-from hilstar.monitor.balance import PIXEL_VARIANCE
-from hilstar.scene.psf import footprint_px
+from hilstar.monitor.pixel_order import PHASES, PixelOrder
 from hilstar.scene.sprites import Sprites
 
 PlaceArray = npt.NDArray[np.int32]  # half the memory of intp: these arrays are the method's largest
-
-PHASES = 8  # sub-pixel phases per axis for which the order of pixels by distance is tabulated
-# How far from a star a pixel may be lit that the star's own light leaves dark: 3 give a star of 267 steps twice the error.
-REACH_SIGMA = 3.4
-MIN_REACH_PX = 1.6  # narrower stars still get their eight neighbours, to choose among
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,53 +38,26 @@ class FootprintMap:
         self.resolution_px = resolution_px
         self.pixels = resolution_px[0] * resolution_px[1]
         self._sigma_px = sigma_px
-        self.size = footprint_px(sigma_px)
-        self._first = -((self.size - 1) // 2)
-        order, self.near = self._nearest_first()
-        self._row, self._column = (part.astype(np.int32) for part in np.divmod(order, self.size))
+        self.order = PixelOrder(sigma_px)
         self._last_entry = np.empty(self.pixels + 1, dtype=np.int32)
         self._contested = np.zeros(self.pixels + 1, dtype=np.bool_)
 
-    def _nearest_first(self) -> tuple[IntArray, int]:
-        """The footprint's pixels (size^2, PHASES^2) by distance in sigmas, and how many may lie within reach."""
-        phase = (np.arange(PHASES) + 0.5) / PHASES - self.bias
-        steps = np.arange(self.size) + self._first
-        spread = np.sqrt(np.square(self._sigma_px) + PIXEL_VARIANCE)
-        x, y = (((steps[:, None] - phase) / s) ** 2 for s in spread)
-        distance = np.sqrt(y[:, None, :, None] + x[None, :, None, :]).reshape(self.size**2, PHASES**2)
-        reach = max(REACH_SIGMA, MIN_REACH_PX / spread.min())
-        return np.argsort(distance, axis=0, kind="stable"), int((distance <= reach).sum(axis=0).max())
-
-    @property
-    def bias(self) -> float:
-        """What is added to a star's place in its pixel for its phase."""
-        return 0.5 if self.size % 2 else 0.0
-
-    def places(self) -> IntArray:
-        """The pixels of a footprint from the star's own, nearest first, by phase: x and y (2, PHASES^2, pixels)."""
-        return np.stack([self._column.T, self._row.T]).astype(np.intp) + self._first
-
-    @property
-    def phases(self) -> FloatArray:
-        """The middle of each phase, px from the star's own pixel: x and y (2, PHASES^2)."""
-        middle = (np.arange(PHASES) + 0.5) / PHASES - self.bias
-        return np.stack([np.tile(middle, PHASES), np.repeat(middle, PHASES)])
-
     def find(self, sprites: Sprites) -> Footprints:
         """The footprints of `sprites`. Raises InputError for sprites of another sigma's footprint."""
-        if sprites.footprint_px != self.size:
-            raise InputError(f"sprites of {sprites.footprint_px} px where the sigma needs {self.size} px")
+        order = self.order
+        if sprites.footprint_px != order.size:
+            raise InputError(f"sprites of {sprites.footprint_px} px where the sigma needs {order.size} px")
         data, count = sprites.data, len(sprites)
         fraction = data["fraction_px"].astype(np.float64).T
-        cell = np.clip((fraction + self.bias) * PHASES, 0, PHASES - 1).astype(np.intp)
-        row, column = (table.take(cell[1] * PHASES + cell[0], axis=1) for table in (self._row, self._column))
+        cell = np.clip((fraction + order.bias) * PHASES, 0, PHASES - 1).astype(np.intp)
+        row, column = (table.take(cell[1] * PHASES + cell[0], axis=1) for table in (order.row, order.column))
         share_x, share_y = (self._shares(f, s) for f, s in zip(fraction, self._sigma_px, strict=True))
         share_y *= data["electrons_per_s"]
         star = np.arange(count, dtype=np.int32)
         light = share_x.astype(np.float32).take(column * count + star)
         light *= share_y.astype(np.float32).take(row * count + star)
-        row += self._first
-        column += self._first
+        row += order.first
+        column += order.first
         place = self._places(data["pixel"], row, column)
         light[place == self.pixels] = 0.0
         if len(sprites):
@@ -102,7 +69,7 @@ class FootprintMap:
         """A star's share in each column (or row) of its footprint, (size, n)."""
         from scipy.special import ndtr
 
-        edges = np.arange(self.size + 1)[:, None] + (self._first - 0.5) - fraction_px
+        edges = np.arange(self.order.size + 1)[:, None] + (self.order.first - 0.5) - fraction_px
         return np.diff(ndtr(edges / sigma_px), axis=0)
 
     def _places(self, pixel: PlaceArray, row: PlaceArray, column: PlaceArray) -> PlaceArray:
@@ -110,7 +77,7 @@ class FootprintMap:
         x, y = pixel[:, 0].astype(np.int32), pixel[:, 1].astype(np.int32)
         place = row * width + column
         place += y * width + x
-        reach = self.size
+        reach = self.order.size
         cut = np.flatnonzero((x < reach) | (x >= width - reach) | (y < reach) | (y >= height - reach))
         if len(cut):
             at_x, at_y = x[cut] + column[:, cut], y[cut] + row[:, cut]

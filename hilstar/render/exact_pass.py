@@ -20,7 +20,7 @@ from hilstar.monitor.balance import (
     Balance,
 )
 from hilstar.monitor.exact import CARRIED
-from hilstar.monitor.footprints import FootprintMap
+from hilstar.monitor.pixel_order import PixelOrder
 from hilstar.monitor.quantise import Panel
 from hilstar.render.encoder import LevelTexture
 from hilstar.resources import resource_path
@@ -39,33 +39,33 @@ class ExactPass:
     def __init__(self, linear: moderngl.Texture, levels: LevelTexture, panel: Panel, balance: Balance) -> None:
         ctx = self._ctx = linear.ctx
         self._linear, self._levels = linear, levels.texture
-        self._footprints = FootprintMap(linear.size, balance.sigma_px)
+        self._pixels = PixelOrder(balance.sigma_px)
         light = panel.light_e_per_s()
         self._light = ctx.buffer(np.append(light, light[-1]).tobytes())
-        self._order = ctx.buffer(_places(self._footprints, balance).tobytes())
+        self._order = ctx.buffer(_places(self._pixels, balance).tobytes())
         gain = panel.gain()
         self._gain = None if gain is None else ctx.texture(linear.size, 1, np.ascontiguousarray(gain), dtype="f4")
         self._stretches: moderngl.Buffer | None = None
         self._programs = {paths: self._build(panel, balance, paths) for paths in (False, True)}
 
     @staticmethod
-    def runs_on(ctx: moderngl.Context, resolution_px: tuple[int, int], sigma_px: tuple[float, float]) -> bool:
+    def runs_on(ctx: moderngl.Context, sigma_px: tuple[float, float]) -> bool:
         """Whether this GL has compute shaders, and the shader bits enough for the sprites' pixels."""
-        return ctx.version_code >= MIN_VERSION and FootprintMap(resolution_px, sigma_px).near <= MAX_NEAR
+        return ctx.version_code >= MIN_VERSION and PixelOrder(sigma_px).near <= MAX_NEAR
 
     def _build(self, panel: Panel, balance: Balance, paths: bool) -> moderngl.ComputeShader:
-        near = self._footprints.near
+        near = self._pixels.near
         defines = [f"NEAR {near}", f"BITS uvec{2 if near <= 64 else 4}", f"LEVELS r{8 * self._levels_bytes()}ui"]
         defines += ["PATHS"] * paths + ["UNIFORMITY"] * (self._gain is not None)
         version, body = resource_path("shaders", "exact.comp").read_text().split("\n", 1)
         program = self._ctx.compute_shader("\n".join([version, *(f"#define {name}" for name in defines), body]))
         window = balance.window_px
         values = {
-            "footprint": self._footprints.size**2,
+            "footprint": self._pixels.size**2,
             "white": panel.response.white,
             "first_threshold_e_per_s": float(panel.response.threshold[0] * panel.flux_at_white_e_per_s),
             "resolution_px": self._linear.size,
-            "odd": self._footprints.bias,
+            "odd": self._pixels.bias,
             "inverse_sigma_sqrt2": tuple(1 / (sigma * SQRT2) for sigma in balance.sigma_px),
             "half_inverse_window2": (0.5 / window[0] ** 2, 0.5 / window[1] ** 2),
             "follows": (*balance.follows(3), *balance.follows(5)),
@@ -112,12 +112,12 @@ class ExactPass:
         self._stretches.bind_to_storage_buffer(3)
 
 
-def _places(footprints: FootprintMap, balance: Balance) -> npt.NDArray[np.void]:
+def _places(order: PixelOrder, balance: Balance) -> npt.NDArray[np.void]:
     """The shader's places: a footprint's pixels by distance for each phase, with their weights in the boxes."""
-    x, y = footprints.places()
+    x, y = order.places()
     away_x, away_y = (
         np.minimum(np.abs(at - np.rint(middle)[:, None]), BOX_REACH).astype(np.intp)
-        for at, middle in zip((x, y), footprints.phases, strict=True)
+        for at, middle in zip((x, y), order.phases, strict=True)
     )
     places = np.empty(x.shape, dtype=PLACE_DTYPE)
     places["x_px"], places["y_px"] = x, y

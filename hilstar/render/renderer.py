@@ -143,22 +143,19 @@ class Renderer:
         target, panel = self.target, self.target.panel()
         self._levels: LevelTexture | None = None
         self._encoder: Encoder | None = None
-        self._exact: ExactQuantiser | None = None
         self._exact_pass: ExactPass | None = None
+        # `exact` in NumPy is made by the first frame that needs it: its arrays are as large as the image.
+        self._exact: ExactQuantiser | None = None
+        self._floor_encoder: Encoder | None = None
+        self._floor_lights: tuple[ExtendedLight, ...] = ()
+        self._floor_levels: Codes | None = None
         if panel is None:
             return
         frame_shift(0, target.cycle_frames)  # refuses a cycle that is no power of two
         self._levels = LevelTexture(self._ctx, target.resolution_px, panel)
-        if target.quantisation == "exact":
-            self._exact = ExactQuantiser(panel, target.resolution_px, target.sigma_px, target.seen)
-            if ExactPass.runs_on(self._ctx, target.resolution_px, target.sigma_px):
-                balance = Balance(target.sigma_px, target.seen)
-                self._exact_pass = ExactPass(self._linear, self._levels, panel, balance)
-            self._exact_levels = self._exact.levels(None)
-            self._floor_encoder: Encoder | None = None
-            self._floor_lights: tuple[ExtendedLight, ...] = ()
-            self._floor_levels = self._exact_levels
-        if self._exact_pass is not None or self._exact is None:
+        if target.quantisation == "exact" and ExactPass.runs_on(self._ctx, target.sigma_px):
+            self._exact_pass = ExactPass(self._linear, self._levels, panel, Balance(target.sigma_px, target.seen))
+        if target.quantisation != "exact" or self._exact_pass is not None:
             dithered = target.quantisation in ("dither", "temporal")
             self._encoder = Encoder(self._ctx, self._linear, self._levels, panel, dithered)
             self._encoder.shrink(target.sides)
@@ -182,12 +179,10 @@ class Renderer:
         """
         with self._ctx:
             extended = sprites is not None and bool(sprites.extended)
-            self._by_numpy = self._exact is not None and (self._exact_pass is None or extended)
-            if self._by_numpy and self._exact is not None and self._levels is not None:
-                # These levels come from the sprites themselves: the linear image is drawn only when it is read.
-                floor = None if sprites is None or not sprites.extended else self._floor(sprites.extended)
-                self._exact_levels = self._exact.levels(sprites, floor)
-                self._levels.write(self._exact_levels)
+            exact = self._levels is not None and self.target.quantisation == "exact"
+            self._by_numpy = exact and (self._exact_pass is None or extended)
+            if self._by_numpy:
+                self._draw_by_numpy(sprites)
                 self._undrawn = (sprites, whole)
                 self._last_count = None
                 return
@@ -197,19 +192,29 @@ class Renderer:
             if self._exact_pass is not None and sprites is not None and len(sprites):
                 self._exact_pass.draw(self._buffer, sprites)
 
+    def _draw_by_numpy(self, sprites: Sprites | None) -> None:
+        """Levels by the sprites themselves: the linear image is drawn only when it is read."""
+        target, panel, levels = self.target, self.target.panel(), self._levels
+        if panel is None or levels is None:
+            return
+        if self._exact is None:
+            self._exact = ExactQuantiser(panel, target.resolution_px, target.sigma_px, target.seen)
+        floor = self._floor(sprites.extended, panel, levels) if sprites is not None and sprites.extended else None
+        self._exact_levels = self._exact.levels(sprites, floor)
+        levels.write(self._exact_levels)
+
     def _encode(self, encoder: Encoder, sprites: Sprites | None, frame: int) -> None:
         temporal = self.target.quantisation == "temporal"
         shift = frame_shift(frame, self.target.cycle_frames) if temporal else 0.0
         count, per_star = (0, 1) if sprites is None else (len(sprites), sprites.per_star)
         encoder.draw(count, per_star, self._covered_px(sprites), shift, self._regions)
 
-    def _floor(self, lights: tuple[ExtendedLight, ...]) -> Codes:
+    def _floor(self, lights: tuple[ExtendedLight, ...], panel: Panel, levels: LevelTexture) -> Codes:
         """The levels of extended light alone, dithered, for `exact`: its stars are added to them in light.
 
         The same lights again give the same levels, which are kept.
         """
-        panel, levels = self.target.panel(), self._levels
-        if lights == self._floor_lights or panel is None or levels is None:
+        if self._floor_levels is not None and lights == self._floor_lights:
             return self._floor_levels
         if self._floor_encoder is None:
             self._floor_encoder = Encoder(self._ctx, self._linear, levels, panel, dithered=True)
@@ -217,8 +222,9 @@ class Renderer:
         self._shine(lights)
         levels.fbo.clear()
         self._floor_encoder.draw(0, 1, 0, 0.0, self._regions)
-        self._floor_lights, self._floor_levels = lights, levels.read().copy()
-        return self._floor_levels
+        found = levels.read().copy()
+        self._floor_lights, self._floor_levels = lights, found
+        return found
 
     def _covered_px(self, sprites: Sprites | None) -> int:
         """Pixels of all sprites together."""

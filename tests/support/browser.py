@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -9,6 +10,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from PIL import Image
 from selenium.webdriver import Chrome, ChromeOptions
 from selenium.webdriver.chrome.service import Service
 from selenium.webdriver.common.by import By
@@ -39,6 +42,9 @@ return [...document.querySelectorAll("body *")]
   .map((element) => `${element.tagName} ${element.id} ${element.className}: ${element.textContent.slice(0, 40)}`);
 """
 SIZES_PX = {"phone": (390, 844), "laptop": (1366, 768), "large": (1920, 1080)}
+
+
+DARK, LIGHT = 40, 200  # grey values that no theme is between
 
 
 class Browser(Chrome):
@@ -113,3 +119,17 @@ def browser() -> Iterator[Browser]:
     finally:
         found.quit()
         shutil.rmtree(profile, ignore_errors=True)
+
+
+def assert_fits_every_size_in_light_and_dark(page: Browser, directory: Path) -> None:
+    """Nothing is wider than the window, and the ground above everything is the theme's; pictures go to the directory."""
+    for size, theme in itertools.product(SIZES_PX, ("dark", "light")):
+        page.size(*SIZES_PX[size])
+        page.prefer(color_scheme=theme)
+        page.until(f"document.documentElement.dataset.theme === '{theme}'")
+        assert page.run("return document.documentElement.scrollWidth <= innerWidth")
+        assert page.overflowing() == [], size
+        shot = np.asarray(Image.open(page.picture(directory / f"{theme}.png")).convert("L"), dtype=float)
+        assert shot.shape[::-1] == SIZES_PX[size]
+        ground = float(np.median(shot[:5]))
+        assert ground < DARK if theme == "dark" else ground > LIGHT

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from decimal import Decimal, DecimalException
 from pathlib import Path
@@ -14,18 +12,17 @@ import numpy.typing as npt
 
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE
+from hilstar.csv_tables import finite_numbers, is_valid, read_rows
 from hilstar.errors import InputError, shortened
-from hilstar.reading import MCAP_MAGIC, open_lines, open_regular
+from hilstar.reading import MCAP_MAGIC, open_regular
 from hilstar.rotation import normalise
 from hilstar.units import NS_PER_S
 
 COLUMNS = ("t_s", "qw", "qx", "qy", "qz")
-VALID = "valid"
 ADVICE = f"write a CSV with the columns {','.join(COLUMNS)} and, where known, valid (1 or 0); or give an AEM or an MCAP file"
 MAX_BYTES = 500_000_000
 MAX_ROWS = 3_000_000
 MAX_T_NS = 9 * 10**18
-FLAGS = {"": True, "1": True, "0": False, "true": True, "false": False}
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,12 +87,12 @@ def _read_csv(path: Path) -> Telemetry:
     q: list[tuple[float, ...]] = []
     valid: list[bool] = []
     line: list[int] = []
-    for number, cells in _rows(path):
+    for number, cells in read_rows(path, COLUMNS, ADVICE, MAX_BYTES):
         t_ns.append(_time(path, number, cells[0]))
         if len(t_ns) > 1 and t_ns[-1] <= t_ns[-2]:
             said = f"t_s = {shortened(cells[0])} after {t_ns[-2] / NS_PER_S:.9g}"
             raise InputError(f"{path}:{number}: time does not increase ({said}); sort the rows, and give one recording")
-        valid.append(_flag(path, number, cells[5]))
+        valid.append(is_valid(path, number, cells[5]))
         q.append(_quaternion(path, number, cells[1:5]) if valid[-1] else (math.nan,) * 4)
         line.append(number)
         if len(t_ns) > MAX_ROWS:
@@ -104,28 +101,6 @@ def _read_csv(path: Path) -> Telemetry:
     flags = np.array(valid, dtype=np.bool_)
     attitudes[flags] = normalise(attitudes[flags])
     return Telemetry(path, np.array(t_ns, dtype=np.int64), attitudes, flags, np.array(line, dtype=np.intp))
-
-
-def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Line numbers with the cells of COLUMNS and `valid`, "" where that is not there."""
-    with open_lines(path, ADVICE, MAX_BYTES) as text:
-        reader = csv.reader(text)
-        try:
-            rows = (row for row in reader if any(cell.strip() for cell in row) and not row[0].startswith("#"))
-            header = [name.strip() for name in next(rows, [])]
-            for name in COLUMNS:
-                if header.count(name) != 1:
-                    what = "there twice" if name in header else "missing"
-                    raise InputError(f"{path}:{max(reader.line_num, 1)}: column {name} is {what}; {ADVICE}")
-            places = [header.index(name) for name in COLUMNS]
-            flag = header.index(VALID) if VALID in header else None
-            for row in rows:
-                if len(row) < len(header):
-                    raise InputError(f"{path}:{reader.line_num}: {len(row)} cells and {len(header)} columns; {ADVICE}")
-                cells = [row[place].strip() for place in places]
-                yield reader.line_num, [*cells, "" if flag is None else row[flag].strip()]
-        except csv.Error as error:
-            raise InputError(f"{path}:{reader.line_num}: not CSV ({error}); {ADVICE}") from error
 
 
 def _time(path: Path, line: int, cell: str) -> int:
@@ -140,23 +115,8 @@ def _time(path: Path, line: int, cell: str) -> int:
     return t_ns
 
 
-def _flag(path: Path, line: int, cell: str) -> bool:
-    if cell.lower() not in FLAGS:
-        raise InputError(f"{path}:{line}: valid = {shortened(cell)!r}; write 1 or 0")
-    return FLAGS[cell.lower()]
-
-
 def _quaternion(path: Path, line: int, cells: list[str]) -> tuple[float, ...]:
-    numbers = []
-    for name, cell in zip(COLUMNS[1:], cells, strict=True):
-        try:
-            numbers.append(float(cell))
-        except ValueError:
-            numbers.append(math.nan)
-        if not math.isfinite(numbers[-1]):
-            raise InputError(
-                f"{path}:{line}: {name} = {shortened(cell)!r} is not a finite number; write valid = 0 where there is no answer"
-            )
+    numbers = finite_numbers(path, line, COLUMNS[1:], cells, "write valid = 0 where there is no answer")
     norm = math.hypot(*numbers)
     if abs(norm - 1) > NORM_TOLERANCE:
         raise InputError(

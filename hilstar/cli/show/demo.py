@@ -58,7 +58,8 @@ def _watching(
     bench: Bench, endpoint: str, door: Door | None, control: bool, advance: FrameSink
 ) -> Iterator[tuple[FrameSink, Outlet]]:
     """The progress of the demo, and its page."""
-    from hilstar.console.feed.opening import Parts, Told
+    from hilstar.console.feed.introduction import Told
+    from hilstar.console.feed.opening import Parts
     from hilstar.run.record.ledger import NO_SPLIT, Ledger
     from hilstar.run.serve import Outlet
 

@@ -17,7 +17,8 @@ if TYPE_CHECKING:
     from hilstar.bench.faults.desk import FaultDesk
     from hilstar.console.feed.door import Door
     from hilstar.console.feed.feed import Feed
-    from hilstar.console.feed.opening import Parts, Told
+    from hilstar.console.feed.introduction import Told
+    from hilstar.console.feed.opening import Parts
     from hilstar.run.desk import Desk
     from hilstar.run.faults.run_faults import AnyFaults
     from hilstar.run.serve import Follower, Running

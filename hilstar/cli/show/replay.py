@@ -81,7 +81,8 @@ def replay(
     from hilstar.attitude.logs.entries import Stated
     from hilstar.attitude.wire.source import Mounting
     from hilstar.bench.bench_file import dated, read_bench_file
-    from hilstar.console.feed.opening import Parts, Told
+    from hilstar.console.feed.introduction import Told
+    from hilstar.console.feed.opening import Parts
     from hilstar.run.record.frame_images import FrameImages
     from hilstar.run.record.ledger import Ledger
     from hilstar.run.replay import Wanted, plan_play

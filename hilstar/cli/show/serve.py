@@ -73,7 +73,8 @@ def serve(
         serve_heads(file, asked, as_json)
         return
     from hilstar.attitude.wire.source import Mounting
-    from hilstar.console.feed.opening import Parts, Told
+    from hilstar.console.feed.introduction import Told
+    from hilstar.console.feed.opening import Parts
     from hilstar.run.loop import Limit
     from hilstar.run.open_link import open_link
     from hilstar.run.record.ledger import Ledger

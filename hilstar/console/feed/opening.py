@@ -3,24 +3,21 @@
 from __future__ import annotations
 
 import pickle
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hilstar import __version__
 from hilstar.console.feed.board import Board
 from hilstar.console.feed.door import Door
 from hilstar.console.feed.feed import Feed
 from hilstar.console.feed.host import Host
-from hilstar.console.feed.messages import Pace, Setup
+from hilstar.console.feed.introduction import Told, introduced
+from hilstar.console.feed.messages import Setup
 from hilstar.console.feed.orders import Orders
 from hilstar.console.feed.seen import Watched
 from hilstar.console.feed.staging import scene_of
-from hilstar.errors import printable
 from hilstar.run.desk import Desk
 
 if TYPE_CHECKING:
@@ -30,16 +27,6 @@ if TYPE_CHECKING:
     from hilstar.run.record.ledger import Ledger
     from hilstar.run.record.ledger_switch import LedgerSwitch
     from hilstar.run.screen.screen import Screen
-
-
-@dataclass(frozen=True, slots=True)
-class Told:
-    """What the page says of a run: the command, where attitudes come from, and how frames come."""
-
-    command: str
-    kind: str
-    endpoint: str
-    pace: Pace = "clock"
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,30 +56,12 @@ def opened_page(door: Door, control: bool, told: Told, parts: Parts) -> Iterator
 
 def setup_of(door: Door, control: bool, told: Told, parts: Parts, picture_bytes: int) -> Setup:
     """What the page's process is told at its start."""
-    bench, monitor = parts.bench, parts.bench.config.monitor
-    hello = {
-        "version": __version__,
-        "command": f"hilstar {told.command}",
-        "bench": printable(bench.file.path.name),
+    bench = parts.bench
+    setup = introduced(door, control, told, bench.file, picture_bytes)
+    setup.hello |= {
         "renderer": bench.renderer.gl_renderer,
-        "started_utc": f"{datetime.fromtimestamp(time.time(), UTC):%Y-%m-%dT%H:%M:%SZ}",
-        "resolution_px": list(monitor.resolution_px),
         "white_level": bench.calibration.response.white,
-        "bits": monitor.bits,
-        "refresh_hz": monitor.refresh_hz,
         "faults": [] if parts.faults is None else parts.faults.names(),
     }
-    return Setup(
-        hello=hello,
-        source={"kind": told.kind, "endpoint": printable(told.endpoint)},
-        hosts=door.hosts,
-        names=[name.lower() for name in door.names],
-        any_address=door.any_address,
-        port=door.port,
-        token=door.token,
-        control=control,
-        picture_bytes=picture_bytes,
-        refresh_hz=monitor.refresh_hz,
-        pace=told.pace,
-        scene=pickle.dumps(scene_of(bench, aids_in_levels=parts.screen is None)),
-    )
+    setup.scene = pickle.dumps(scene_of(bench, aids_in_levels=parts.screen is None))
+    return setup

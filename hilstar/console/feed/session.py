@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hilstar import __version__
 from hilstar.console.feed.board import PICTURE_HEAD_BYTES, Board
 from hilstar.console.feed.host import Host
-from hilstar.console.feed.messages import Answer, Order, PictureHead, RunSeen, Setup
-from hilstar.errors import one_line, printable
+from hilstar.console.feed.introduction import Told, introduced
+from hilstar.console.feed.messages import Answer, Order, PictureHead, RunSeen
+from hilstar.errors import one_line
 from hilstar.notices import Listener, Notice
 
 if TYPE_CHECKING:
@@ -90,31 +90,7 @@ def session_page(door: Door, control: bool, file: BenchFile) -> Iterator[Session
     picture_bytes = width * height * CODE.itemsize
     board = Board.make(picture_bytes)
     feed = SessionFeed(board)
-    hello = {
-        "version": __version__,
-        "command": "hilstar first-light",
-        "bench": printable(file.path.name),
-        "renderer": "",
-        "started_utc": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-        "resolution_px": [width, height],
-        "white_level": 2**monitor.bits - 1,
-        "bits": monitor.bits,
-        "refresh_hz": monitor.refresh_hz,
-        "faults": [],
-        "session": True,
-    }
-    setup = Setup(
-        hello=hello,
-        source={"kind": "session", "endpoint": ""},
-        hosts=door.hosts,
-        names=[name.lower() for name in door.names],
-        any_address=door.any_address,
-        port=door.port,
-        token=door.token,
-        control=control,
-        picture_bytes=picture_bytes,
-        refresh_hz=monitor.refresh_hz,
-        pace="session",
-    )
+    setup = introduced(door, control, Told("first-light", "session", "", "session"), file, picture_bytes)
+    setup.hello["session"] = True
     with Host(setup, board, door.socket, feed, feed.do):
         yield feed

@@ -14,14 +14,13 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from PIL import Image
 from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.keys import Keys
 
 import hilstar
 from hilstar.attitude.logs.mcap_reader import read_messages
 from hilstar.run.record.ledger_records import EventRecord
-from tests.support.browser import SIZES_PX, Browser
+from tests.support.browser import Browser, assert_fits_every_size_in_light_and_dark
 from tests.support.senders import ORION, connected, packet
 from tests.support.servers import Served, bound
 from tests.support.waiting import repeating, wait_for
@@ -32,7 +31,6 @@ ADDRESS = re.compile(r"page is at (http://\S+)")
 # 0.4 s after its last word; a browser's timers may be late by BUSY_MS on such a machine.
 RED_MS, BUSY_MS = 500, 300
 MIN_PICTURES_HZ = 4  # of 8 that are asked for, on such a machine
-DARK, LIGHT = 40, 200  # grey values that no theme is between
 PACKET_S, TURN_RAD = 0.01, 1e-3  # between two packets
 COUNT_PICTURES = """
 const seen = new Set();
@@ -261,16 +259,7 @@ def test_by_the_keyboard_alone(live):
 
 
 def test_it_fits_every_size_in_light_and_dark(live, tmp_path):
-    for size, theme in itertools.product(SIZES_PX, ("dark", "light")):
-        live.size(*SIZES_PX[size])
-        live.prefer(color_scheme=theme)
-        live.until(f"document.documentElement.dataset.theme === '{theme}'")
-        assert live.run("return document.documentElement.scrollWidth <= innerWidth")
-        assert live.overflowing() == [], size
-        shot = np.asarray(Image.open(live.picture(tmp_path / f"{theme}.png")).convert("L"), dtype=float)
-        assert shot.shape[::-1] == SIZES_PX[size]
-        ground = float(np.median(shot[:5]))  # the page's own, above everything
-        assert ground < DARK if theme == "dark" else ground > LIGHT
+    assert_fits_every_size_in_light_and_dark(live, tmp_path)
 
 
 def test_who_asks_for_less_motion_gets_fewer_pictures_and_no_transitions(page, run):

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import itertools
 from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.keys import Keys
 
@@ -17,13 +15,12 @@ from hilstar.rotation import from_rotation_vector, multiply
 from hilstar.run.record.ledger import Ledger
 from hilstar.run.record.ledger_records import FrameRecord
 from tests.support.benches import ORION_Q, SMALL_BENCH
-from tests.support.browser import SIZES_PX, Browser
+from tests.support.browser import Browser, assert_fits_every_size_in_light_and_dark
 from tests.support.commands import run_hilstar_here
 from tests.support.run_page import levels_of, run_data_of
 
 pytestmark = [pytest.mark.e2e, pytest.mark.gpu]
 FRAMES, PERIOD_NS = 600, 16_666_667
-DARK, LIGHT = 40, 200  # grey values that no theme is between
 TURN_RAD = 2e-4  # a frame
 
 
@@ -122,13 +119,4 @@ def test_single_pixels_show_the_codes_that_were_shown(report, report_file):
 
 
 def test_it_fits_every_size_in_light_and_dark(report, tmp_path):
-    for size, theme in itertools.product(SIZES_PX, ("dark", "light")):
-        report.size(*SIZES_PX[size])
-        report.prefer(color_scheme=theme)
-        report.until(f"document.documentElement.dataset.theme === '{theme}'")
-        assert report.run("return document.documentElement.scrollWidth <= innerWidth")
-        assert report.overflowing() == [], size
-        shot = np.asarray(Image.open(report.picture(tmp_path / f"{theme}.png")).convert("L"), dtype=float)
-        assert shot.shape[::-1] == SIZES_PX[size]
-        ground = float(np.median(shot[:5]))  # its own ground, above everything
-        assert ground < DARK if theme == "dark" else ground > LIGHT
+    assert_fits_every_size_in_light_and_dark(report, tmp_path)

@@ -54,7 +54,16 @@ def open_bench(file: BenchFile, context: Context | None = None) -> Bench:
     finer = calibration.can_steal_bits and not file.config.render.bit_stealing
     camera = bench_camera(file.config, file.folder)
     sky_share, refresh_hz = _sky_share(camera), file.config.monitor.refresh_hz
-    light = Light(calibration.response, white_e_per_s * darkest, stars.electrons_per_s, finer, sky_share, refresh_hz)
+    light = Light(
+        response=calibration.response,
+        white_e_per_s=white_e_per_s * darkest,
+        rates_e_per_s=stars.electrons_per_s,
+        can_steal_bits=finer,
+        sky_share=sky_share,
+        refresh_hz=refresh_hz,
+        seen=seen_by(file.config.tracker, camera),
+        centroider=file.config.verify.centroider,
+    )
     effort = _effort(file.config.render, light)
     config = _chosen(file.config, effort)
     _warn_of_cycle(config, file.path)
@@ -76,7 +85,7 @@ def open_bench(file: BenchFile, context: Context | None = None) -> Bench:
         shown_stars=moved(shown, moving),
         faint_stars=faint,
         moving=moving,
-        renderer=Renderer(_target(config, panel, effort, seen_by(config.tracker, camera)), context),
+        renderer=Renderer(_target(config, panel, effort, light.seen), context),
     )
 
 

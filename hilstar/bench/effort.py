@@ -12,13 +12,14 @@ import numpy as np
 
 from hilstar.arrays import FloatArray
 from hilstar.bench.config import RenderSettings
-from hilstar.monitor.balance import Balance
-from hilstar.monitor.phases import WHITE, Errors, fainter, measure, phase_grid, shown_by
+from hilstar.monitor.balance import AS_USUAL, Balance, Seen
+from hilstar.monitor.phases import WHITE, fainter, phase_grid, phase_image, shown_by
 from hilstar.monitor.quantise import Panel, Quantisation
 from hilstar.monitor.response import Response
 from hilstar.render.encoder import MAX_SIDES, SpriteSide, SpriteSides
-from hilstar.render.reference import linear_image
 from hilstar.scene.psf import MAX_CUT, cut_share, footprint_px, peak_share, pixel_share
+from hilstar.tracker.centroiders import FAMILY, Centroider
+from hilstar.tracker.star_errors import Judge
 from hilstar.units import flux_ratio
 
 CODES_SHARE, EDGES_SHARE, MOTION_SHARE = 0.5, 0.25, 0.25
@@ -50,11 +51,24 @@ class Choice:
 
 
 @dataclass(frozen=True, slots=True)
+class CodeErrors:
+    """The maximum errors of a quantisation, and by whose measure of place; no place where its flux alone is too far off."""
+
+    flux_mag: float
+    place_px: float
+    centroider: Centroider | None
+
+    def within(self, limit_mag: float, limit_px: float) -> bool:
+        """Whether both are within their limits."""
+        return self.flux_mag <= limit_mag and self.place_px <= limit_px
+
+
+@dataclass(frozen=True, slots=True)
 class ChosenCodes:
     """A quantisation with its maximum errors."""
 
     method: Quantisation
-    errors: Errors
+    errors: CodeErrors
     choice: Choice
 
 
@@ -94,7 +108,8 @@ class Light:
     """What the stars are shown with: the panel's response, its minimum white (electrons per second), the stars' rates (n,).
 
     `can_steal_bits` says whether bit stealing would give finer codes, and is not used yet. `sky_share` is the share of the
-    whole sky that the screen covers.
+    whole sky that the screen covers. `seen` is how the tracker sees the monitor, `centroider` what it finds stars by: None
+    where the bench does not say, and then all of them judge.
     """
 
     response: Response
@@ -103,6 +118,13 @@ class Light:
     can_steal_bits: bool = False
     sky_share: float = 0.0
     refresh_hz: float = 60.0
+    seen: Seen = AS_USUAL
+    centroider: Centroider | None = None
+
+    @property
+    def judges(self) -> tuple[Centroider, ...]:
+        """Who measures where codes show a star."""
+        return FAMILY if self.centroider is None else (self.centroider,)
 
     def exact_ms(self) -> float:
         """The time that `exact` takes for an average field, turning at 1 deg/s, on two cores without a GPU."""
@@ -121,7 +143,7 @@ def plan_effort(render: RenderSettings, light: Light) -> Effort:
     method, errors = codes.method, codes.errors
     if render.effort == "full":
         motion_px = render.motion_above_px
-        return Effort(method, (), motion_px, errors.flux_max_mag, errors.centroid_max_px + motion_px, (codes.choice,))
+        return Effort(method, (), motion_px, errors.flux_mag, errors.place_px + motion_px, (codes.choice,))
     sprites = choose_sides(render, light, method)
     motion_px = max(render.motion_above_px, MOTION_SHARE * render.tolerance_px)
     paths = Choice(
@@ -134,8 +156,8 @@ def plan_effort(render: RenderSettings, light: Light) -> Effort:
         quantisation=method,
         sides=sprites.sides,
         motion_above_px=motion_px,
-        error_mag=errors.flux_max_mag + sprites.cut_mag,
-        error_px=errors.centroid_max_px + sprites.moved_px + motion_px,
+        error_mag=errors.flux_mag + sprites.cut_mag,
+        error_px=errors.place_px + sprites.moved_px + motion_px,
         choices=(_star_choice(render, light, method), codes.choice, sprites.choice, ENCODING, paths, PROJECTION),
     )
 
@@ -162,12 +184,13 @@ def choose_codes(render: RenderSettings, light: Light) -> ChosenCodes:
     in_time = exact_ms <= EXACT_SHARE * light.refresh_ms
     wanted = (BY_COST if in_time else BY_COST[:1]) if render.quantisation == "auto" else (render.quantisation,)
     limits = CODES_SHARE * render.tolerance_mag, CODES_SHARE * render.tolerance_px
+    stars = _CodeStars(render, light)
     for method in wanted:
-        errors = code_errors(method, render, light)
-        within = errors.flux_max_mag <= limits[0] and errors.centroid_max_px <= limits[1]
-        if within or method == wanted[-1]:
+        errors = stars.errors(method, math.inf if method == wanted[-1] else limits[0])
+        within = errors.within(*limits)
+        if within:
             break
-    error = f"{errors.flux_max_mag:.4f} mag and {errors.centroid_max_px:.4f} px maximum, from white to the faintest star"
+    error = f"{errors.flux_mag:.4f} mag and {errors.place_px:.4f} px maximum, {_by_whom(errors, light)}"
     if not within and render.quantisation == "auto" and not in_time:
         price = f"{exact_ms:.0f} ms of {light.refresh_ms:.0f} for an average field at 1 deg/s, without a GPU"
         error += f' (over {limits[0]:g} mag or {limits[1]:g} px: quantisation = "exact" is nearer and takes {price})'
@@ -180,21 +203,39 @@ def choose_codes(render: RenderSettings, light: Light) -> ChosenCodes:
     return ChosenCodes(method, errors, Choice("codes", method, error, saving))
 
 
-def code_errors(method: Quantisation, render: RenderSettings, light: Light) -> Errors:
-    """The maximum errors of a method over sub-pixel phases and over magnitudes from full scale to the faintest star."""
-    sigma_px = render.sprite_sigma_px
-    sprites, tile = phase_grid(PHASES, sigma_px)
-    bright = linear_image(sprites, (PHASES * tile, PHASES * tile), sigma_px)
-    panel = Panel(light.response, WHITE)
-    faintest = float(light.rates_e_per_s.min()) if len(light.rates_e_per_s) else light.white_e_per_s
-    deepest = max(0.0, 2.5 * math.log10(light.white_e_per_s / peak_share(sigma_px) / faintest))
-    found = []
-    for mag in np.linspace(0.0, deepest, MAGNITUDES).tolist():
-        wanted = bright * flux_ratio(mag)
-        linear, balance = wanted.astype(np.float32), Balance(sigma_px)
-        shown = shown_by(method, render.cycle_frames, panel, linear, fainter(sprites, mag), balance)
-        found.append(measure(wanted, shown, tile))
-    return Errors(*(max(getattr(e, name) for e in found) for name in Errors.__slots__))
+def _by_whom(errors: CodeErrors, light: Light) -> str:
+    worst = "" if len(light.judges) == 1 else f", the worst of {len(light.judges)} centroiders"
+    return f"as `{errors.centroider}` finds stars{worst}, from white to the faintest star"
+
+
+class _CodeStars:
+    """Stars at every sub-pixel phase, from full scale to the faintest of a bench, and the tracker that looks at them."""
+
+    def __init__(self, render: RenderSettings, light: Light) -> None:
+        sigma_px, seen = render.sprite_sigma_px, light.seen
+        self._cycle_frames, self._balance, self._kinds = render.cycle_frames, Balance(sigma_px, seen), light.judges
+        self._panel = Panel(light.response, WHITE)
+        self._sprites, tile = phase_grid(PHASES, sigma_px)
+        self._bright = phase_image(self._sprites, sigma_px)
+        self._judge = Judge(self._bright, tile, sigma_px, seen.blur_px, seen.pixel_px)
+        faintest = float(light.rates_e_per_s.min()) if len(light.rates_e_per_s) else light.white_e_per_s
+        deepest = max(0.0, 2.5 * math.log10(light.white_e_per_s / peak_share(sigma_px) / faintest))
+        self._mags = np.linspace(0.0, deepest, MAGNITUDES).tolist()
+
+    def errors(self, method: Quantisation, limit_mag: float) -> CodeErrors:
+        """The maximum errors of a method over phases and magnitudes; where its light is beyond a limit, of its light alone."""
+        flux_mag, shown = 0.0, []
+        for mag in reversed(self._mags):  # the faintest are off the furthest
+            linear = (self._bright * flux_ratio(mag)).astype(np.float32)
+            image = shown_by(method, self._cycle_frames, self._panel, linear, fainter(self._sprites, mag), self._balance)
+            flux_mag = max(flux_mag, self._judge.errors(image, flux_ratio(mag), ()).flux_max_mag)
+            if flux_mag > limit_mag:
+                return CodeErrors(flux_mag, math.inf, None)
+            shown.append(image.copy())
+        found = [self._judge.errors(image, flux_ratio(mag), self._kinds) for image in shown]
+        worst = max(found, key=lambda errors: errors.max_px(errors.worst()))
+        kind = worst.worst()
+        return CodeErrors(flux_mag, worst.max_px(kind), kind)
 
 
 def choose_sides(render: RenderSettings, light: Light, method: Quantisation) -> ChosenSides:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,12 +11,13 @@ from hilstar.arrays import Float32Array, FloatArray
 from hilstar.monitor.balance import Balance
 from hilstar.monitor.exact import ExactQuantiser
 from hilstar.monitor.quantise import Panel, Quantisation, dither_levels, round_levels, shown_light, temporal_levels
-from hilstar.scene.psf import footprint_px, peak_share
+from hilstar.scene.psf import footprint_px, peak_share, pixel_shares
 from hilstar.scene.sprites import Sprites, pack_sprites
 from hilstar.units import flux_ratio, magnitude
 
 SIGMA_PX = (0.85, 0.85)
 WHITE = 1.0
+MARGIN_PX = 2  # of dark between two stars
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,12 +32,25 @@ class Errors:
 
 def phase_grid(count: int, sigma_px: tuple[float, float] = SIGMA_PX) -> tuple[Sprites, int]:
     """count^2 stars, one in each tile at its own phase, as bright as white when centred on a pixel; and the tile's side, px."""
-    tile = footprint_px(sigma_px) + 2
+    tile = footprint_px(sigma_px) + MARGIN_PX
     place = (np.arange(count) + 0.5) * tile + (np.arange(count) + 0.5) / count - 0.5
     x_px, y_px = (axis.ravel() for axis in np.meshgrid(place, place))
     flux = np.full(count**2, WHITE / peak_share(sigma_px))
     size_px = count * tile, count * tile
     return pack_sprites(x_px, y_px, flux, np.arange(count**2), size_px, footprint_px(sigma_px)), tile
+
+
+def phase_image(sprites: Sprites, sigma_px: tuple[float, float]) -> FloatArray:
+    """The light (h, w) of the stars of a `phase_grid`: all are as bright, so their image is a column's times a row's."""
+    count = math.isqrt(len(sprites))
+    at = np.arange(sprites.footprint_px) - (sprites.footprint_px - 1) // 2
+    lines = []
+    for axis, places, sigma in ((0, sprites.x_px[:count], sigma_px[0]), (1, sprites.y_px[::count], sigma_px[1])):
+        pixels = sprites.data["pixel"][:, axis][:: count if axis else 1][:count, None] + at
+        line = np.zeros(count * (sprites.footprint_px + MARGIN_PX))
+        line[pixels] = pixel_shares(pixels - places[:, None], sigma)
+        lines.append(line)
+    return np.outer(float(sprites.data["electrons_per_s"][0]) * lines[1], lines[0])
 
 
 def fainter(sprites: Sprites, mag: float) -> Sprites:

@@ -1,36 +1,44 @@
 """Where centroiders of several kinds find a star: in squares of pixels around it, one star to a square.
 
-`moment`: the plain first moment. `window`: the mean under a Gaussian that follows the star (SExtractor's XWIN_IMAGE). `fit`:
-least squares of a Gaussian integrated over pixels. `box3`, `box5`: the centre of mass of 3 x 3 or 5 x 5 pixels, of those over a
-fiftieth of the brightest. What a display does to a star's light, each sees differently.
+`moment`: the plain first moment. `window`: the mean under a Gaussian that follows the star and is as wide (SExtractor's
+XWIN_IMAGE); `wide`: under one half as wide again. `fit`: least squares of a Gaussian integrated over pixels. `box3`, `box5`:
+the centre of mass of 3 x 3 or 5 x 5 pixels, of those over a fiftieth of the brightest. What a display does to a star's light,
+each sees differently.
 """
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Callable
+from functools import partial
+from typing import Literal, get_args
 
 import numpy as np
-from scipy.special import ndtr
 
 from hilstar.arrays import FloatArray, IntArray
 
-Centroider = Literal["moment", "window", "fit", "box3", "box5"]
-FIT_STEPS, WINDOW_STEPS = 6, 20
+Centroider = Literal["moment", "window", "wide", "fit", "box3", "box5"]
+FAMILY: tuple[Centroider, ...] = get_args(Centroider)
+WIDE = 1.5  # of the star's sigma
+FIT_STEPS, WINDOW_STEPS = 8, 20
+FIRST_STEPS = 3  # of a window, before a fit
+# A window as wide as the star moves the mean half of the way, one on a single pixel all of it: both come to rest by this.
+PACE = 1.5
+SETTLED_PX = 1e-6
 MAX_STEP_PX = 0.3  # of a fit: its model is nearly linear within that
 BOX_SHARE = 0.02
 MIN_LIGHT = 1e-30
 
 
 Pixels = tuple[IntArray, IntArray]  # rows and columns (n,)
+Sigma = tuple[float, float]
+Places = tuple[FloatArray, FloatArray]
 
 
-def star_places(
-    stamps: FloatArray, kind: Centroider, sigma_px: tuple[float, float], pixels: Pixels | None = None
-) -> tuple[FloatArray, FloatArray]:
+def star_places(stamps: FloatArray, kind: Centroider, sigma_px: Sigma, pixels: Pixels | None = None) -> Places:
     """Each star's x and y (n,), px from the middle of its square (n, side, side), side odd; 0 for a square without light.
 
     `sigma_px` (x, y) is the star's. A box is about one of `pixels`, at least two from the edge, by default the brightest: two
-    images of a star between two pixels are to be compared in one box.
+    images of a star between two pixels are to be compared in one box. The others begin there.
     """
     lit = np.flatnonzero(stamps.sum(axis=(1, 2)) > MIN_LIGHT)
     x, y = np.zeros(len(stamps)), np.zeros(len(stamps))
@@ -52,56 +60,73 @@ def _axis(stamps: FloatArray) -> FloatArray:
     return np.asarray(np.arange(side) - side // 2, dtype=np.float64)
 
 
-def _moment(stamps: FloatArray, sigma_px: tuple[float, float], pixels: Pixels) -> tuple[FloatArray, FloatArray]:
+def _moment(stamps: FloatArray, sigma_px: Sigma, pixels: Pixels) -> Places:
     at, light = _axis(stamps), stamps.sum(axis=(1, 2))
     return stamps.sum(axis=1) @ at / light, stamps.sum(axis=2) @ at / light
 
 
-def _window(stamps: FloatArray, sigma_px: tuple[float, float], pixels: Pixels) -> tuple[FloatArray, FloatArray]:
-    at = _axis(stamps)
-    x, y = _box(stamps, 2, pixels)
-    for _ in range(WINDOW_STEPS):
+def _window(stamps: FloatArray, sigma_px: Sigma, pixels: Pixels, wide: float = 1.0, steps: int = WINDOW_STEPS) -> Places:
+    at, (x, y) = _axis(stamps), _box(stamps, 2, pixels)
+    sigmas = sigma_px[0] * wide, sigma_px[1] * wide
+    for _ in range(steps):
         across, down = (
-            np.exp(-((at - place[:, None]) ** 2) / (2 * sigma**2)) for place, sigma in zip((x, y), sigma_px, strict=True)
+            np.exp(-np.square(at - place[:, None]) / (2 * sigma**2)) for place, sigma in zip((x, y), sigmas, strict=True)
         )
-        seen = stamps * down[:, :, None] * across[:, None, :]
-        light = np.maximum(seen.sum(axis=(1, 2)), MIN_LIGHT)
-        # A window as wide as the star moves the mean half of the way.
-        x, y = x + 2 * (seen.sum(axis=1) @ at / light - x), y + 2 * (seen.sum(axis=2) @ at / light - y)
-        x, y = (np.clip(place, at[0], at[-1]) for place in (x, y))
+        sums = _sums(stamps, np.stack([down, at * down], axis=1), np.stack([across, at * across], axis=2))
+        light = np.maximum(sums[:, 0, 0], MIN_LIGHT)
+        dx, dy = PACE * (sums[:, 0, 1] / light - x), PACE * (sums[:, 1, 0] / light - y)
+        x, y = (np.clip(place, at[0], at[-1]) for place in (x + dx, y + dy))
+        if max(np.abs(dx).max(), np.abs(dy).max()) < SETTLED_PX:
+            break
     return x, y
 
 
-def _fit(stamps: FloatArray, sigma_px: tuple[float, float], pixels: Pixels) -> tuple[FloatArray, FloatArray]:
-    at, (x, y) = _axis(stamps), _window(stamps, sigma_px, pixels)
+def _sums(stamps: FloatArray, rows: FloatArray, columns: FloatArray) -> FloatArray:
+    """Sums of each square under products of `rows` (n, j, side) and `columns` (n, side, k): (n, j, k)."""
+    return np.asarray(rows @ (stamps @ columns))
+
+
+def _fit(stamps: FloatArray, sigma_px: Sigma, pixels: Pixels) -> Places:
+    at, (x, y) = _axis(stamps), _window(stamps, sigma_px, pixels, steps=FIRST_STEPS)
     flux = stamps.sum(axis=(1, 2))
     for _ in range(FIT_STEPS):
-        (share_x, slope_x), (share_y, slope_y) = (
-            _profile(at, place, sigma) for place, sigma in zip((x, y), sigma_px, strict=True)
-        )
-        parts = [share_y[:, :, None] * share_x[:, None, :]]
-        parts += [
-            flux[:, None, None] * share_y[:, :, None] * slope_x[:, None, :],
-            flux[:, None, None] * slope_y[:, :, None] * share_x[:, None, :],
-        ]
-        slopes = np.stack(parts).reshape(3, len(stamps), -1)
-        left = stamps.reshape(len(stamps), -1) - flux[:, None] * slopes[0]
-        normal = np.einsum("knp,lnp->nkl", slopes, slopes)
-        normal += np.eye(3) * np.maximum(1e-12 * np.trace(normal, axis1=1, axis2=2), MIN_LIGHT)[:, None, None]
-        step = np.linalg.solve(normal, np.einsum("knp,np->nk", slopes, left)[..., None])[..., 0]
+        across, down = (np.stack(_profile(at, place, sigma), axis=1) for place, sigma in zip((x, y), sigma_px, strict=True))
+        step = _fit_step(_sums(stamps, down, across.transpose(0, 2, 1)), across, down, flux)
         flux = np.maximum(flux + step[:, 0], MIN_LIGHT)
-        x, y = (place + np.clip(step[:, k], -MAX_STEP_PX, MAX_STEP_PX) for k, place in ((1, x), (2, y)))
-        x, y = (np.clip(place, at[0], at[-1]) for place in (x, y))
+        dx, dy = (np.clip(step[:, k], -MAX_STEP_PX, MAX_STEP_PX) for k in (1, 2))
+        x, y = (np.clip(place, at[0], at[-1]) for place in (x + dx, y + dy))
+        if max(np.abs(dx).max(), np.abs(dy).max()) < SETTLED_PX:
+            break
     return x, y
 
 
-def _profile(at: FloatArray, place: FloatArray, sigma_px: float) -> tuple[FloatArray, FloatArray]:
+def _fit_step(seen: FloatArray, across: FloatArray, down: FloatArray, flux: FloatArray) -> FloatArray:
+    """What least squares adds to flux, x and y, (n, 3).
+
+    `across` and `down` (n, 2, side) are a star's shares and their slopes in columns and rows, `seen` (n, 2, 2) the square's
+    sums under their products.
+    """
+    (xx, xd, dd), (yy, yd, ee) = (
+        [np.einsum("ns,ns->n", part[:, i], part[:, j]) for i, j in ((0, 0), (0, 1), (1, 1))] for part in (across, down)
+    )
+    one = flux * yy * xd, flux * yd * xx  # of the star with its slopes
+    normal = np.stack(
+        [xx * yy, *one, one[0], flux**2 * yy * dd, flux**2 * yd * xd, one[1], flux**2 * yd * xd, flux**2 * ee * xx], axis=-1
+    ).reshape(-1, 3, 3)
+    left = np.stack([seen[:, 0, 0], flux * seen[:, 0, 1], flux * seen[:, 1, 0]], axis=-1) - flux[:, None] * normal[:, 0]
+    normal += np.eye(3) * np.maximum(1e-12 * np.trace(normal, axis1=1, axis2=2), MIN_LIGHT)[:, None, None]
+    return np.asarray(np.linalg.solve(normal, left[..., None])[..., 0])
+
+
+def _profile(at: FloatArray, place: FloatArray, sigma_px: float) -> Places:
     """A star's shares in a row of pixels, and how they change with its place, (n, side)."""
+    from scipy.special import ndtr  # 0.1 s of every command that needs none of it
+
     edges = (np.append(at - 0.5, at[-1] + 0.5) - place[:, None]) / sigma_px
     return np.diff(ndtr(edges)), -np.diff(np.exp(-(edges**2) / 2)) / (np.sqrt(2 * np.pi) * sigma_px)
 
 
-def _box(stamps: FloatArray, half: int, pixels: Pixels) -> tuple[FloatArray, FloatArray]:
+def _box(stamps: FloatArray, half: int, pixels: Pixels) -> Places:
     rows, columns = pixels
     side = stamps.shape[1]
     near = np.arange(-half, half + 1)
@@ -112,12 +137,15 @@ def _box(stamps: FloatArray, half: int, pixels: Pixels) -> tuple[FloatArray, Flo
     return (box * (x - side // 2)).sum(axis=(1, 2)) / light, (box * (y - side // 2)).sum(axis=(1, 2)) / light
 
 
-def _box_of_3(stamps: FloatArray, sigma_px: tuple[float, float], pixels: Pixels) -> tuple[FloatArray, FloatArray]:
-    return _box(stamps, 1, pixels)
+def _box_about(stamps: FloatArray, sigma_px: Sigma, pixels: Pixels, half: int) -> Places:
+    return _box(stamps, half, pixels)
 
 
-def _box_of_5(stamps: FloatArray, sigma_px: tuple[float, float], pixels: Pixels) -> tuple[FloatArray, FloatArray]:
-    return _box(stamps, 2, pixels)
-
-
-_KINDS = {"moment": _moment, "window": _window, "fit": _fit, "box3": _box_of_3, "box5": _box_of_5}
+_KINDS: dict[Centroider, Callable[[FloatArray, Sigma, Pixels], Places]] = {
+    "moment": _moment,
+    "window": _window,
+    "wide": partial(_window, wide=WIDE),
+    "fit": _fit,
+    "box3": partial(_box_about, half=1),
+    "box5": partial(_box_about, half=2),
+}

@@ -62,13 +62,15 @@ class Verify(Table, frozen=True):
         ),
     ] = "none"
     centroider: Annotated[
-        Literal["window", "moment", "fit", "box3", "box5"],
+        Literal["window", "wide", "moment", "fit", "box3", "box5"] | None,
         Meta(
-            description='What the tracker finds its stars by: `"window"`, a Gaussian that follows the star; `"moment"`, the '
-            'plain first moment; `"fit"`, the least squares of a PSF; `"box3"` or `"box5"`, the centre of mass of so many '
-            "pixels a side."
+            description='What the tracker finds its stars by: `"window"`, a Gaussian that follows the star and is as wide; '
+            '`"wide"`, one half as wide again; `"moment"`, the plain first moment; `"fit"`, the least squares of a PSF; '
+            '`"box3"` or `"box5"`, the centre of mass of so many pixels a side. '
+            '`quantisation = "auto"` judges codes by it, too.',
+            extra={"default": '`"window"`; to judge codes, all of them'},
         ),
-    ] = "window"
+    ] = None
     flux_mag: Annotated[
         Positive,
         Meta(

@@ -20,7 +20,10 @@ def budget(
         Path | None, typer.Option("-o", "--output", metavar="DIR", help="Directory for a chart and a table.")
     ] = None,
     centroider: Annotated[
-        str, typer.Option(help="Who finds the stars: moment, window, fit (a PSF), box3 or box5 (centres of mass).")
+        str,
+        typer.Option(
+            help="Who finds the stars: moment, window, wide (a wider window), fit (a PSF), box3 or box5 (centres of mass)."
+        ),
     ] = "fit",
     as_json: Json = False,
 ) -> None:

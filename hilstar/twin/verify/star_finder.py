@@ -16,6 +16,7 @@ from hilstar.tracker.centroiders import Centroider, star_places
 from hilstar.tracker.centroids import Background, Centroids, CentroidSettings, find_stars
 from hilstar.units import magnitude
 
+USUAL: Centroider = "window"
 MATCH_PX = 3.0
 # Of a star's light, how much others may bring into its window. Both images have it, so its effect is of second order: at
 # 0.02, a neighbour 0.1 mag off adds 0.002 mag.
@@ -47,7 +48,7 @@ class StarFinder:
     settings: CentroidSettings
     sigma_px: tuple[float, float]
     background: Background
-    centroider: Centroider = "window"
+    centroider: Centroider = USUAL
 
     def match(self, image_e: FloatArray, x_px: FloatArray, y_px: FloatArray) -> Matched:
         """The stars of a noiseless image (h, w) at their places (n,).
@@ -85,7 +86,7 @@ def star_finder(bench: Bench, monitor_px_per_px: float) -> StarFinder:
     settings = CentroidSettings(window_sigma_px=max(1.0, *sigma_px))
     peak_e = faintest_e_per_s(bench) * bench.config.tracker.exposure_s * peak_share(sigma_px)
     under = Background(0.0, MIN_PEAK * peak_e / settings.threshold_sigma)
-    return StarFinder(settings, sigma_px, under, bench.config.verify.centroider)
+    return StarFinder(settings, sigma_px, under, bench.config.verify.centroider or USUAL)
 
 
 def seen_sigma_px(config: BenchConfig, monitor_px_per_px: float) -> tuple[float, float]:

@@ -1,0 +1,146 @@
+"""What a tracker finds wrong with a display's stars: each centroider, in the tracker's own pixels after its own blur.
+
+A lit monitor pixel is a square of light. The tracker's optics blur it (a Gaussian), and its pixels, of any width, collect it.
+Stars stand in the tiles of a square image (`monitor.phases`); each row and column of tiles meets the tracker's pixels at a
+phase of its own.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilstar.arrays import FloatArray
+from hilstar.tracker.centroiders import FAMILY, Centroider, Pixels, Sigma, brightest, star_places
+from hilstar.units import magnitude
+
+SQUARES_VARIANCE = 1 / 6  # a pixel's width twice: a star is sampled by squares, and shown by squares
+REACH_SIGMAS = 5.0
+BOX_SIDE = 9  # of tracker pixels: a box of 5, two to either side for its middle
+# Pixels finer than this show windows and fits the same star: its sigma is 0.85 px and more.
+FINEST_PX = 0.5
+GOLDEN = 0.6180339887498949
+MIN_BLUR_PX = 1e-3
+
+
+@dataclass(frozen=True, slots=True)
+class StarErrors:
+    """Of n stars: flux errors, mag, positive too faint, and how far off each centroider finds them, px along x and y (2, n).
+
+    Infinite where a star shows nothing.
+    """
+
+    flux_mag: FloatArray
+    off_px: dict[Centroider, FloatArray]
+
+    @property
+    def flux_rms_mag(self) -> float:
+        """The rms of the flux errors."""
+        return float(np.sqrt(np.mean(np.square(self.flux_mag))))
+
+    @property
+    def flux_max_mag(self) -> float:
+        """The largest flux error."""
+        return float(np.abs(self.flux_mag).max())
+
+    def axis_rms_px(self, kind: Centroider) -> float:
+        """The rms along an axis."""
+        return float(np.sqrt(np.mean(np.square(self.off_px[kind]))))
+
+    def max_px(self, kind: Centroider) -> float:
+        """The largest distance."""
+        return float(np.hypot(*self.off_px[kind]).max())
+
+    def worst(self) -> Centroider:
+        """Who is furthest off."""
+        return max(self.off_px, key=self.max_px)
+
+
+class Judge:
+    """A tracker that looks at stars of a sigma (x, y) in the tiles of an image, and knows where they should be.
+
+    `wanted` (count * tile, count * tile) has a star in each tile, `(column + 1/2) / count` px to the right of its middle and
+    `(row + 1/2) / count` px down. `blur_px` and `pixel_px` are the tracker's, in monitor pixels.
+    """
+
+    def __init__(self, wanted: FloatArray, tile: int, sigma_px: Sigma, blur_px: float, pixel_px: float) -> None:
+        self._tile, self._count, self._pixel_px = tile, len(wanted) // tile, pixel_px
+        self._sampled_px = max(pixel_px, FINEST_PX)
+        x, y = (math.sqrt(sigma**2 + SQUARES_VARIANCE + blur_px**2) for sigma in sigma_px)
+        self._sigma_px = x / self._sampled_px, y / self._sampled_px
+        half = max(BOX_SIDE // 2, math.ceil(REACH_SIGMAS * max(self._sigma_px)))
+        blur_px = max(blur_px, MIN_BLUR_PX)
+        self._views = {self._sampled_px: self._view(self._sampled_px, blur_px, half)}
+        self._views.setdefault(pixel_px, self._view(pixel_px, blur_px, BOX_SIDE // 2))
+        self._light = self._light_of(wanted)
+        self._pixels = brightest(self._seen(wanted, pixel_px))
+        self._wanted = wanted
+        self._places: dict[Centroider, FloatArray] = {}
+
+    def errors(self, shown: FloatArray, share: float = 1.0, kinds: tuple[Centroider, ...] = FAMILY) -> StarErrors:
+        """The errors of an image of the same stars, whose light should be `share` of those wanted."""
+        light = self._light_of(shown)
+        off_px = {}
+        for kind in kinds:
+            if kind not in self._places:
+                self._places[kind] = self._found(self._wanted, kind)
+            off_px[kind] = np.where(light > 0, self._found(shown, kind) - self._places[kind], np.inf)
+        return StarErrors(np.asarray(magnitude(light / (share * self._light))), off_px)
+
+    def _found(self, image: FloatArray, kind: Centroider) -> FloatArray:
+        """The stars' places (2, n), px, from where the tracker's pixel in the middle is."""
+        if kind == "moment":  # no blur and no pixel changes it
+            tiles = self._tiles(image, self._tile)
+            at, light = np.arange(self._tile), np.maximum(tiles.sum(axis=(1, 2)), np.finfo(float).tiny)
+            return np.stack([tiles.sum(axis=1) @ at / light, tiles.sum(axis=2) @ at / light])
+        boxed = kind in ("box3", "box5")
+        pixel_px = self._pixel_px if boxed else self._sampled_px
+        stamps = self._seen(image, pixel_px)
+        places = star_places(stamps, kind, self._sigma_px, self._middles(stamps, boxed))
+        return np.stack(places) * pixel_px
+
+    def _middles(self, stamps: FloatArray, boxed: bool) -> Pixels:
+        if boxed:
+            return self._pixels
+        middle = np.full(len(stamps), stamps.shape[1] // 2)
+        return middle, middle
+
+    def _light_of(self, image: FloatArray) -> FloatArray:
+        return np.asarray(self._tiles(image, self._tile).sum(axis=(1, 2)))
+
+    def _tiles(self, image: FloatArray, side: int) -> FloatArray:
+        count = self._count
+        return image.reshape(count, side, count, side).transpose(0, 2, 1, 3).reshape(-1, side, side)
+
+    def _view(self, pixel_px: float, blur_px: float, half: int) -> FloatArray:
+        """What each of 2 half + 1 tracker pixels about a star collects of each monitor pixel, along one axis.
+
+        (count, 2 half + 1, tile), for stars at the phases of `count` columns.
+        """
+        column = np.arange(self._count)
+        star_px = (self._tile - 1) / 2 + (column + 0.5) / self._count
+        phase = (column * GOLDEN) % 1.0 - 0.5
+        middles = star_px[:, None] + pixel_px * (np.arange(-half, half + 1) + phase[:, None])
+        edges = np.arange(self._tile + 1) - 0.5
+        to_left, to_right = (middles[:, :, None] + side * pixel_px / 2 - edges for side in (-1, 1))
+        # Of a point's light blurred, the integral up to a place; and that integral's own over a monitor pixel.
+        within = [_ramp(to, blur_px) for to in (to_left, to_right)]
+        return -np.diff(within[1] - within[0], axis=-1)
+
+    def _seen(self, image: FloatArray, pixel_px: float) -> FloatArray:
+        """The tracker's pixels about each star, (n, side, side)."""
+        view, count, tile = self._views[pixel_px], self._count, self._tile
+        side = view.shape[1]
+        wide = image.reshape(count * tile, count, tile).transpose(1, 0, 2) @ view.transpose(0, 2, 1)  # (column, y, side)
+        rows = wide.reshape(count, count, tile, side).transpose(1, 2, 0, 3).reshape(count, tile, count * side)
+        return np.asarray((view @ rows).reshape(count, side, count, side).transpose(0, 2, 1, 3).reshape(-1, side, side))
+
+
+def _ramp(to_px: FloatArray, blur_px: float) -> FloatArray:
+    """The integral of a Gaussian's distribution up to each place."""
+    from scipy.special import ndtr  # 0.1 s of every command that needs none of it
+
+    sigmas = to_px / blur_px
+    return np.asarray(blur_px * (sigmas * ndtr(sigmas) + np.exp(-np.square(sigmas) / 2) / math.sqrt(2 * math.pi)))

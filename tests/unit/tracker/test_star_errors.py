@@ -1,0 +1,103 @@
+"""The tracker that judges codes, against one put together from fine samples and centroiders that share no code with it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter1d
+
+from hilstar.monitor.balance import Balance, Seen
+from hilstar.monitor.phases import MARGIN_PX, WHITE, fainter, phase_grid, phase_image, shown_by, tiles_of
+from hilstar.monitor.quantise import Panel
+from hilstar.monitor.response import srgb_response
+from hilstar.render.reference import linear_image
+from hilstar.scene.psf import footprint_px
+from hilstar.tracker.centroiders import FAMILY
+from hilstar.tracker.star_errors import GOLDEN, Judge
+from tests.support import centroiders as outside
+
+SIGMA = (0.85, 0.85)
+COUNT, FINE, FAR_PX = 5, 40, 8
+# Samples of 1/40 px: their light is within 1e-4 of the integral, and a place within 1e-4 px.
+SAMPLED_PX = 2e-4
+WINGS = 1e-6  # of a star's light are cut by its footprint
+# A shift along x moves nothing along y, but where it takes a pixel over a box's threshold, 2 % of the brightest.
+ACROSS_PX = {"moment": 1e-9, "window": 1e-4, "wide": 1e-4, "fit": 1e-4, "box3": 0.02, "box5": 0.02}
+FIT_PX = 0.02  # a tenth of a pixel aside widens a star, which a fit of fixed width sees askew
+
+
+def codes(method, mag, seen, sigma_px=SIGMA):
+    sprites, tile = phase_grid(COUNT, sigma_px)
+    wanted = phase_image(sprites, sigma_px) * 10 ** (-0.4 * mag)
+    panel = Panel(srgb_response(8), WHITE)
+    return wanted, shown_by(method, 1, panel, wanted.astype(np.float32), fainter(sprites, mag), Balance(sigma_px, seen)), tile
+
+
+def along(stars, axis, star_px, seen):
+    """What the tracker's pixels about each star collect along an axis of fine samples, (n, ...)."""
+    fine = np.repeat(np.pad(stars, [(0, 0)] + [(FAR_PX, FAR_PX) if k == axis else (0, 0) for k in (1, 2)]), FINE, axis) / FINE
+    fine = np.moveaxis(gaussian_filter1d(fine, seen.blur_px * FINE, axis=axis, truncate=6), axis, -1)
+    sums = np.concatenate([np.zeros((*fine.shape[:-1], 1)), np.cumsum(fine, axis=-1)], axis=-1)
+    half = int(np.ceil(6.5 / seen.pixel_px))
+    found = []
+    for k in range(len(stars)):
+        phase = (k % COUNT if axis == 2 else k // COUNT) * GOLDEN % 1 - 0.5
+        edges = star_px[k] + seen.pixel_px * (np.arange(-half, half + 2) - 0.5 + phase)
+        at = (edges + 0.5 + FAR_PX) * FINE
+        found.append(np.diff([np.interp(at, np.arange(sums.shape[-1]), line) for line in sums[k]], axis=-1))
+    return np.moveaxis(np.array(found), -1, axis)
+
+
+def looked_at(image, tile, seen):
+    index = np.arange(COUNT**2)
+    x_px, y_px = ((tile - 1) / 2 + (part + 0.5) / COUNT for part in (index % COUNT, index // COUNT))
+    return along(along(tiles_of(image, tile), 2, x_px, seen), 1, y_px, seen)
+
+
+@pytest.mark.parametrize("method", ["round", "exact"])
+@pytest.mark.parametrize("seen", [Seen(0.62, 1.0), Seen(0.4, 0.55), Seen(1.1, 2.3)])
+def test_errors_are_those_of_fine_samples_and_other_centroiders(method, seen):
+    wanted, shown, tile = codes(method, 5.0, seen)
+    found = Judge(wanted, tile, SIGMA, seen.blur_px, seen.pixel_px).errors(shown)
+    sky, lit = (looked_at(image, tile, seen) for image in (wanted, shown))
+    sigma = np.sqrt(SIGMA[0] ** 2 + 1 / 6 + seen.blur_px**2) / seen.pixel_px
+    ways = {
+        "window": lambda stars: outside.windowed(stars, sigma),
+        "wide": lambda stars: outside.windowed(stars, 1.5 * sigma),
+        "fit": lambda stars: outside.fitted(stars, sigma)[:2],
+        "box3": lambda stars: outside.box_mean(stars, 1, sky),
+        "box5": lambda stars: outside.box_mean(stars, 2, sky),
+    }
+    for kind, way in ways.items():
+        off_px = seen.pixel_px * np.subtract(way(lit), way(sky))
+        assert np.abs(found.off_px[kind] - off_px).max() < SAMPLED_PX, kind
+    plain = np.subtract(outside.moment(tiles_of(shown, tile)), outside.moment(tiles_of(wanted, tile)))
+    assert found.off_px["moment"] == pytest.approx(plain, abs=1e-12)
+    flux = -2.5 * np.log10(tiles_of(shown, tile).sum((1, 2)) / tiles_of(wanted, tile).sum((1, 2)))
+    assert found.flux_mag == pytest.approx(flux, abs=1e-12)
+
+
+@pytest.mark.parametrize("seen", [Seen(0.62, 1.0), Seen(0.3, 0.2), Seen(2.5, 5.0), Seen(0.0, 1.0)])
+def test_a_star_a_tenth_of_a_pixel_aside_is_found_there_and_a_dark_one_nowhere(seen):
+    """A tenth of each star's light is a pixel aside."""
+    sprites, tile = phase_grid(COUNT, SIGMA)
+    wanted = phase_image(sprites, SIGMA)
+    moved = wanted + 0.1 * (np.roll(wanted, 1, axis=1) - wanted)
+    judge = Judge(wanted, tile, SIGMA, seen.blur_px, seen.pixel_px)
+    found = judge.errors(0.5 * moved, 0.5)
+    assert found.flux_mag == pytest.approx(0, abs=WINGS)
+    for kind in FAMILY:
+        assert np.isfinite(found.off_px[kind]).all()
+        assert np.abs(found.off_px[kind][1]).max() < ACROSS_PX[kind] * max(1.0, seen.pixel_px), kind
+    assert found.off_px["moment"][0] == pytest.approx(0.1, abs=6 * WINGS)  # cut 6 px away
+    assert found.off_px["fit"][0] == pytest.approx(0.1, abs=FIT_PX)
+    dark = judge.errors(np.zeros_like(wanted))
+    assert np.isinf(dark.flux_mag).all() and np.isinf(dark.off_px["fit"]).all()
+
+
+def test_the_grid_s_image_is_the_oracle_s():
+    for sigma_px in (SIGMA, (0.4, 1.9)):
+        sprites, tile = phase_grid(COUNT, sigma_px)
+        assert tile == footprint_px(sigma_px) + MARGIN_PX
+        oracle = linear_image(sprites, (COUNT * tile, COUNT * tile), sigma_px)
+        assert phase_image(sprites, sigma_px) == pytest.approx(oracle, abs=1e-14)

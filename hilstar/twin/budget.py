@@ -7,19 +7,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import get_args
+from typing import Literal
 
 import numpy as np
 
-from hilstar.arrays import FloatArray
 from hilstar.bench.frame import Bench
 from hilstar.bench.white import clipping_hip
 from hilstar.monitor.balance import Balance
-from hilstar.monitor.phases import WHITE, fainter, phase_grid, shown_by, tiles_of
+from hilstar.monitor.phases import WHITE, fainter, phase_grid, phase_image, shown_by
 from hilstar.monitor.quantise import Panel
-from hilstar.render.reference import linear_image
 from hilstar.scene.psf import peak_share
-from hilstar.tracker.centroiders import Centroider, brightest, star_places
+from hilstar.tracker.centroiders import FAMILY, Centroider
+from hilstar.tracker.star_errors import Judge, StarErrors
 from hilstar.units import ARCSEC_PER_RAD, flux_ratio, magnitude
 
 PHASES = 16  # along a side of a pixel
@@ -30,12 +29,16 @@ FLUX_LIMITS_MAG = (0.02, 0.05)
 CENTROID_LIMIT_PX = 0.01
 USUAL: Centroider = "fit"  # what most trackers do
 COMPARED_MAG = 6.0
-BLUR_SIGMAS = 5.0
+By = Centroider | Literal["all"]
 
 
 @dataclass(frozen=True, slots=True)
 class MagnitudeRow:
-    """One magnitude: rms and maximum errors over phases, mag and monitor pixels; None where a star shows nothing."""
+    """One magnitude: rms and maximum errors over phases, mag and monitor pixels; None where a star shows nothing.
+
+    `centroid_rms_px` and `centroid_max_px` are distances as the budget's centroider finds them; `axis_rms_px` has each kind's
+    error along an axis.
+    """
 
     v_mag: float
     below_white_mag: float
@@ -44,6 +47,7 @@ class MagnitudeRow:
     centroid_rms_px: float | None
     centroid_max_px: float | None
     centroid_max_arcsec: float | None
+    axis_rms_px: dict[str, float | None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +65,8 @@ class Budget:
     Magnitudes are those of a star of the Sun's colour: it clips in the middle of a pixel where the screen is darkest
     (`clips_v_mag`), on a corner of four pixels (`clips_v_mag_at_best`), and shows nothing from `nothing_v_mag` on. `within`
     has the magnitudes below full scale over which the worst star stays within each limit. Places in `rows` are as `centroider`
-    finds them; `centroid_rms_px` has the error along an axis that each kind finds COMPARED_MAG below full scale.
+    finds them, those of the worst of its kind if that is `all`; `centroid_rms_px` has the error along an axis that each kind
+    finds COMPARED_MAG below full scale.
     """
 
     method: str
@@ -75,21 +80,23 @@ class Budget:
     left_out: NotDrawn
     black_e_per_s_px: float
     rows: list[MagnitudeRow]
-    centroider: Centroider
+    centroider: By
     centroid_rms_px: dict[str, float | None]
 
 
-def budget(bench: Bench, centroider: Centroider = USUAL) -> Budget:
-    """The budget of a bench, places as `centroider` finds them after the tracker's blur.
+def budget(bench: Bench, centroider: By | None = None) -> Budget:
+    """The budget of a bench, places as `centroider` finds them in the tracker's pixels after its blur.
 
-    Raises InputError for a bench without stars.
+    None takes the bench's own. Raises InputError for a bench without stars.
     """
+    by = centroider or bench.config.verify.centroider or USUAL
+    found = _errors(bench)
     render, white = bench.config.render, bench.flux_at_white_e_per_s
     # A star of rate r has V = zero_mag + magnitude(r).
     zero_mag = zero_point_mag(bench)
     clips = zero_mag + magnitude(white * bench.darkest / peak_share(render.sprite_sigma_px))
     nothing = zero_mag + magnitude(nothing_below_e_per_s(bench))
-    rows = [_row(bench, errors, clips) for errors in _errors(bench, centroider)]
+    rows = [_row(bench, mag, errors, by, clips) for mag, errors in found]
     return Budget(
         method=render.quantisation + (" with bit stealing" if render.bit_stealing else ""),
         bits=bench.config.monitor.bits,
@@ -102,8 +109,8 @@ def budget(bench: Bench, centroider: Centroider = USUAL) -> Budget:
         left_out=not_drawn(bench),
         black_e_per_s_px=bench.calibration.response.black * white,
         rows=rows,
-        centroider=centroider,
-        centroid_rms_px=_by_each(bench),
+        centroider=by,
+        centroid_rms_px=next((row.axis_rms_px for row in rows if row.below_white_mag == COMPARED_MAG), dict.fromkeys(FAMILY)),
     )
 
 
@@ -138,91 +145,40 @@ def not_drawn(bench: Bench) -> NotDrawn:
     return NotDrawn(len(missing), float(missing.sum() / rates.sum()))
 
 
-@dataclass(frozen=True, slots=True)
-class _Errors:
-    """Flux errors, mag, and how far off each phase's star is along x and y, px, so many magnitudes below full scale."""
-
-    mag: float
-    flux_mag: FloatArray
-    off_px: FloatArray
-
-
-class _Phases:
-    """Stars at every sub-pixel phase, through the bench's method and the tracker's blur."""
-
-    def __init__(self, bench: Bench) -> None:
-        render = bench.config.render
-        self._bench, self._sigma_px = bench, render.sprite_sigma_px
-        self._seen = bench.renderer.target.seen
-        self._sprites, self._tile = phase_grid(PHASES, self._sigma_px)
-        size = PHASES * self._tile
-        self._bright = linear_image(self._sprites, (size, size), self._sigma_px)
-        self._panel = Panel(bench.calibration.response, WHITE)
-
-    def pair(self, mag: float) -> tuple[FloatArray, FloatArray]:
-        """The stars as the sky has them and as they are shown, `mag` below full scale: tiles (n, side, side), blurred."""
-        wanted, method = self._bright * flux_ratio(mag), self._bench.renderer.target.quantisation
-        balance, cycle = Balance(self._sigma_px, self._seen), self._bench.config.render.cycle_frames
-        shown = shown_by(method, cycle, self._panel, wanted.astype(np.float32), fainter(self._sprites, mag), balance)
-        return self._blurred(wanted), self._blurred(shown)
-
-    def _blurred(self, image: FloatArray) -> FloatArray:
-        from scipy.ndimage import gaussian_filter1d
-
-        blur_px = self._seen.blur_px
-        edge = math.ceil(BLUR_SIGMAS * blur_px)
-        side = self._tile + 2 * edge
-        tiles = np.pad(tiles_of(image, self._tile), ((0, 0), (edge, edge + 1 - side % 2), (edge, edge + 1 - side % 2)))
-        for axis in (1, 2):
-            tiles = gaussian_filter1d(tiles, blur_px, axis=axis, mode="constant", truncate=BLUR_SIGMAS)
-        return np.asarray(tiles)
-
-    def off_px(self, wanted: FloatArray, shown: FloatArray, kind: Centroider) -> FloatArray:
-        """How far off each star is found along x and y (2, n), px; infinite where nothing is shown."""
-        x, y = self._sigma_px
-        sigma_px = math.hypot(x, self._seen.blur_px), math.hypot(y, self._seen.blur_px)
-        pixels = brightest(wanted)
-        sky, seen = (np.stack(star_places(tiles, kind, sigma_px, pixels)) for tiles in (wanted, shown))
-        return np.where(shown.sum(axis=(1, 2)) > 0, seen - sky, np.inf)
-
-
-def _errors(bench: Bench, kind: Centroider) -> list[_Errors]:
-    """The errors at each magnitude, down to the first at which a star shows nothing."""
-    phases, found = _Phases(bench), []
+def _errors(bench: Bench) -> list[tuple[float, StarErrors]]:
+    """The errors at each magnitude below full scale, down to the first at which a star shows nothing."""
+    render, target = bench.config.render, bench.renderer.target
+    sprites, tile = phase_grid(PHASES, render.sprite_sigma_px)
+    bright = phase_image(sprites, render.sprite_sigma_px)
+    judge = Judge(bright, tile, render.sprite_sigma_px, target.seen.blur_px, target.seen.pixel_px)
+    panel, balance = Panel(bench.calibration.response, WHITE), Balance(render.sprite_sigma_px, target.seen)
+    found = []
     for mag in np.arange(0.0, MAX_BELOW_WHITE_MAG + STEP_MAG / 2, STEP_MAG).tolist():
-        wanted, shown = phases.pair(mag)
-        flux = magnitude(shown.sum(axis=(1, 2)) / wanted.sum(axis=(1, 2)))
-        found.append(_Errors(mag, np.abs(flux), phases.off_px(wanted, shown, kind)))
-        if not np.isfinite(flux).all():
+        wanted, stars = (bright * flux_ratio(mag)).astype(np.float32), fainter(sprites, mag)
+        shown = shown_by(target.quantisation, render.cycle_frames, panel, wanted, stars, balance)
+        found.append((mag, judge.errors(shown, flux_ratio(mag))))
+        if not np.isfinite(found[-1][1].flux_mag).all():
             break
     return found
-
-
-def _by_each(bench: Bench) -> dict[str, float | None]:
-    phases = _Phases(bench)
-    wanted, shown = phases.pair(COMPARED_MAG)
-    return {kind: _finite(_rms(phases.off_px(wanted, shown, kind))) for kind in get_args(Centroider)}
-
-
-def _rms(errors: FloatArray) -> float:
-    return float(np.sqrt(np.mean(np.square(errors))))
 
 
 def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _row(bench: Bench, errors: _Errors, clips_v_mag: float) -> MagnitudeRow:
+def _row(bench: Bench, mag: float, errors: StarErrors, by: By, clips_v_mag: float) -> MagnitudeRow:
     arcsec_per_px = ARCSEC_PER_RAD / bench.camera.scales_px_rad()[0]  # where a pixel is widest
-    off_px = np.hypot(*errors.off_px)
+    kind = errors.worst() if by == "all" else by
+    max_px = errors.max_px(kind)
     return MagnitudeRow(
-        v_mag=clips_v_mag + errors.mag,
-        below_white_mag=errors.mag,
-        flux_rms_mag=_finite(_rms(errors.flux_mag)),
-        flux_max_mag=_finite(float(errors.flux_mag.max())),
-        centroid_rms_px=_finite(_rms(off_px)),
-        centroid_max_px=_finite(float(off_px.max())),
-        centroid_max_arcsec=_finite(float(off_px.max()) * arcsec_per_px),
+        v_mag=clips_v_mag + mag,
+        below_white_mag=mag,
+        flux_rms_mag=_finite(errors.flux_rms_mag),
+        flux_max_mag=_finite(errors.flux_max_mag),
+        centroid_rms_px=_finite(math.sqrt(2) * errors.axis_rms_px(kind)),
+        centroid_max_px=_finite(max_px),
+        centroid_max_arcsec=_finite(max_px * arcsec_per_px),
+        axis_rms_px={each: _finite(errors.axis_rms_px(each)) for each in FAMILY},
     )
 
 

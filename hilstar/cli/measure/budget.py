@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, get_args
+from typing import Annotated
 
 import typer
 
@@ -20,26 +20,29 @@ def budget(
         Path | None, typer.Option("-o", "--output", metavar="DIR", help="Directory for a chart and a table.")
     ] = None,
     centroider: Annotated[
-        str,
+        str | None,
         typer.Option(
-            help="Who finds the stars: moment, window, wide (a wider window), fit (a PSF), box3 or box5 (centres of mass)."
+            help="Who finds the stars: moment, window, wide (a wider window), fit (a PSF), box3 or box5 (centres of mass), or "
+            "all of them; what the bench has under verify, or fit, unless given."
         ),
-    ] = "fit",
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Find which magnitudes this monitor, sprite and quantisation can show, and how accurately."""
     from hilstar.bench.build import load
     from hilstar.files import make_directory
-    from hilstar.tracker.centroiders import Centroider
+    from hilstar.tracker.centroiders import FAMILY
+    from hilstar.twin.budget import By
     from hilstar.twin.budget import budget as find_budget
     from hilstar.twin.budget_report import budget_lines, write_report
 
     check_directory("-o", output)
-    kind = next((known for known in get_args(Centroider) if known == centroider), None)
-    if kind is None:
-        raise InputError(f"--centroider {shortened(centroider)}: write one of {', '.join(get_args(Centroider))}")
+    choices: tuple[By, ...] = (*FAMILY, "all")
+    by = next((choice for choice in choices if choice == centroider), None)
+    if centroider is not None and by is None:
+        raise InputError(f"--centroider {shortened(centroider)}: write one of {', '.join(choices)}")
     with load(bench_file) as bench:
-        found = find_budget(bench, kind)
+        found = find_budget(bench, by)
     if output is not None:
         write_report(make_directory(output), found)
     if as_json:

@@ -83,6 +83,27 @@ def test_budget_writes_its_chart_and_table(tmp_path, small_bench_file):
     assert "shows nothing" in spoken.stdout
 
 
+def test_budget_has_every_centroider_and_takes_the_bench_s_own(tmp_path, small_bench_file):
+    fit = of_json("budget", small_bench_file, "-o", tmp_path / "out")
+    assert fit["centroider"] == "fit"
+    row = fit["rows"][12]
+    assert set(row["axis_rms_px"]) == {"moment", "window", "wide", "fit", "box3", "box5"}
+    assert row["axis_rms_px"] == fit["centroid_rms_px"] and len(set(row["axis_rms_px"].values())) == 6
+    assert row["centroid_rms_px"] == pytest.approx(math.sqrt(2) * row["axis_rms_px"]["fit"])
+    with (tmp_path / "out" / "budget.csv").open() as file:
+        written = list(csv.DictReader(file))[12]
+    assert float(written["axis_rms_px_box5"]) == pytest.approx(row["axis_rms_px"]["box5"])
+    small_bench_file.write_text(small_bench_file.read_text() + '[verify]\ncentroider = "box5"\n')
+    own, every = of_json("budget", small_bench_file), of_json("budget", small_bench_file, "--centroider", "all")
+    assert own["centroider"] == "box5"
+    assert own["rows"][12]["centroid_rms_px"] == pytest.approx(math.sqrt(2) * own["rows"][12]["axis_rms_px"]["box5"])
+    pairs = zip(every["rows"][:-1], own["rows"][:-1], strict=True)
+    assert all(worst["centroid_max_px"] >= one["centroid_max_px"] for worst, one in pairs)
+    said = run_hilstar_here("budget", small_bench_file, "--centroider", "all").stdout
+    assert "   moment   window     wide      fit     box3     box5   max px" in said
+    assert_refused(run_hilstar_here("budget", small_bench_file, "--centroider", "psf"), 2, "box5, all")
+
+
 @pytest.mark.parametrize("method", ["dither", "temporal"])
 def test_every_method_has_a_budget(small_bench_file, method):
     small_bench_file.write_text(SMALL_BENCH + f'[render]\nquantisation = "{method}"\n')

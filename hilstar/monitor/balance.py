@@ -22,6 +22,8 @@ ALL_LIGHT, ALL_MOMENTS = 1.0, 0.75
 FEW_STEPS = 8.0  # a star of so many steps weighs its light twice: its flux is then as near as the panel's step allows
 WINDOW_LIGHT, WINDOW_MOMENTS = 0.8, 3.0
 BOX_3, BOX_5 = 2.2, 0.55
+# Over frames the light is made up for in time: a heavier weight would let the moments of faint stars drift.
+BOX_5_OVER_FRAMES = 0.8
 # The light's in the choice among what is left at the end: till then light can be made up for.
 LAST_LIGHT = 3.5
 # The Gaussian's variance beyond the sprite's, in variances of the blur: a fit has 0 before the blur and 2 after it.
@@ -42,10 +44,21 @@ AS_USUAL = Seen()
 
 @dataclass(frozen=True, slots=True)
 class Balance:
-    """The ten sums of stars of one sprite sigma (x, y), seen by one tracker."""
+    """The ten sums of stars of one sprite sigma (x, y), seen by one tracker, in one frame or over several (`temporal`)."""
 
     sigma_px: tuple[float, float]
     seen: Seen = AS_USUAL
+    over_frames: bool = False
+
+    @property
+    def few_steps(self) -> float:
+        """A star of so many steps weighs its light twice; over frames none does."""
+        return 0.0 if self.over_frames else FEW_STEPS
+
+    @property
+    def box_weights(self) -> tuple[float, float]:
+        """The weights of the boxes of 3 and 5 tracker pixels."""
+        return BOX_3, BOX_5_OVER_FRAMES if self.over_frames else BOX_5
 
     @property
     def window_px(self) -> tuple[float, float]:
@@ -83,17 +96,17 @@ class Balance:
         u = 0.5 * (np.square(d[0] / np.float32(self.window_px[0])) + np.square(d[1] / np.float32(self.window_px[1])))
         window = (1 + u / 8) ** -8
         arms = np.empty((SUMS, *window.shape), dtype=np.float32)
-        arms[0], arms[1:3] = light_weight(steps), ALL_MOMENTS * d
+        arms[0], arms[1:3] = light_weight(steps, self.few_steps), ALL_MOMENTS * d
         arms[3], arms[4:6] = WINDOW_LIGHT * window, WINDOW_MOMENTS * window * d
-        for first, side, weight in ((6, 3, BOX_3), (8, 5, BOX_5)):
+        for first, side, weight in zip((6, 8), (3, 5), self.box_weights, strict=True):
             table, follows = self.box(side), np.array(self.follows(side), dtype=np.float32)[:, None, None]
             arms[first : first + 2] = weight * table[away[0]] * table[away[1]] * (d + follows * off)
         return arms
 
 
-def light_weight(steps: Float32Array) -> Float32Array:
+def light_weight(steps: Float32Array, few_steps: float) -> Float32Array:
     """The weight of all light of stars of so many steps of light, (n,)."""
-    return np.asarray(ALL_LIGHT * (1 + FEW_STEPS / np.maximum(steps, 1e-3)), dtype=np.float32)
+    return np.asarray(ALL_LIGHT * (1 + few_steps / np.maximum(steps, 1e-3)), dtype=np.float32)
 
 
 def _follows(half_sigmas: float) -> float:

@@ -4,7 +4,7 @@ Every pixel shows one of the two levels around its light, so that no pixel is of
 two minimises the ten sums of `balance`. From the star's middle outwards each pixel is decided, with several choices of the
 pixels before it kept side by side: of the four that two of them lead to the better two are kept, and who is compared with whom
 changes from pixel to pixel. The last pixels, and the choice among what is left, weigh the light more.
-A star drawn as a path hands the errors of its light from sprite to sprite.
+A star drawn as a path hands its errors from sprite to sprite.
 In the straight foot of sRGB all steps are equal, so a star of N steps cannot have its light closer than half a step: 1 / 2N.
 This is the oracle of shaders/exact.comp, and what draws where that cannot run.
 """
@@ -13,11 +13,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.arrays import Float32Array, FloatArray, IntArray
+from hilstar.arrays import Float32Array, IntArray
 from hilstar.monitor.balance import ALL_MOMENTS, AS_USUAL, LAST_LIGHT, SUMS, Balance, Seen
 from hilstar.monitor.footprints import FootprintMap, Footprints, PlaceArray
 from hilstar.monitor.level_table import ThresholdCounter
@@ -47,14 +48,37 @@ class _Pixels:
     error: Float32Array
 
 
+@dataclass(frozen=True, slots=True)
+class Carried:
+    """What n sprites begin with: errors of the sums that they have to make up for (SUMS, n), in steps from black.
+
+    Those of light and moments are plain, the others weighed. Where all steps of a star are equal, `phase` (n,) is the part of
+    one that its light has in hand.
+    """
+
+    error: Float32Array
+    phase: Float32Array
+
+    def of(self, some: IntArray) -> Carried:
+        """That of some of the sprites."""
+        return Carried(self.error[:, some], self.phase[some])
+
+
+def nothing_carried(count: int) -> Carried:
+    """That of `count` sprites whose frame stands by itself."""
+    return Carried(np.zeros((SUMS, count), dtype=np.float32), np.zeros(count, dtype=np.float32))
+
+
 class ExactQuantiser:
     """Levels of sprites on a panel, one image after another; `sigma_px` is that of the sprites, `seen` the tracker's."""
+
+    over_frames: ClassVar[bool] = False
 
     def __init__(
         self, panel: Panel, resolution_px: tuple[int, int], sigma_px: tuple[float, float], seen: Seen = AS_USUAL
     ) -> None:
         self._map = FootprintMap(resolution_px, sigma_px)
-        self._balance = Balance(sigma_px, seen)
+        self._balance = Balance(sigma_px, seen, over_frames=self.over_frames)
         self._panel = panel
         response = panel.response
         self._light = np.append(response.light, response.light[-1])  # there is no step above white
@@ -83,17 +107,53 @@ class ExactQuantiser:
         if sprites is not None and len(sprites):
             found = self._map.find(sprites)
             levels = np.empty(found.place.shape, dtype=self._flat.dtype)
-            carried = np.zeros((3, len(sprites)))
+            carried = self._carried(sprites)
+            left = np.empty_like(carried.error)
             for some in _turns(sprites):
-                levels[:, some], left = self._choose(_part(found, some), carried[:, some])
-                _hand_on(carried, left, some, sprites)
+                levels[:, some], left[:, some] = self._choose(_part(found, some), carried.of(some))
+                _hand_on(carried.error, left, some, sprites)
+            self._keep(sprites, left)
             self._lit = found.place.ravel()
             self._flat[self._lit] = levels.ravel()
             self._flat[-1] = 0
         return self._flat[:-1].reshape(height, width)
 
-    def _choose(self, found: Footprints, carried: FloatArray) -> tuple[IntArray, FloatArray]:
-        """The levels of a chunk of stars, (pixels, n), and their errors of light and moments with those `carried`, (3, n)."""
+    def _carried(self, sprites: Sprites) -> Carried:
+        """What each sprite begins with: nothing, in a frame that is right by itself."""
+        return nothing_carried(len(sprites))
+
+    def _bounded(self, error: Float32Array, step: Float32Array) -> Float32Array:
+        """The errors (SUMS, n) that stars whose pixels have these steps (near, n) are given to make up for."""
+        return error
+
+    def _keep(self, sprites: Sprites, left: Float32Array) -> None:
+        """Take notice of the errors (SUMS, n) that a frame's sprites leave."""
+
+    def _choose(self, found: Footprints, carried: Carried) -> tuple[IntArray, Float32Array]:
+        """The levels of a chunk of stars, (pixels, n), and the errors that they and those `carried` leave, (SUMS, n)."""
+        near = self._map.order.near
+        lower, upper, short, step = self._levels_about(found)
+        d = found.offset_px - found.fraction_px[:, None]
+        arm = self._balance.arms(
+            found.offset_px[:, :near], found.fraction_px, found.rate_e_per_s / np.float32(self._step_e_per_s)
+        )
+        error = self._bounded(carried.error, step).copy()
+        error[:3] += _plain_sums(short[near:], d[:, near:])
+        grid = _equal_step(step)
+        error[0] += carried.phase * grid
+        hidden = _between_steps(short[:near].sum(axis=0) + error[0], grid)
+        error[0] -= hidden
+        weight = np.stack([arm[0, 0], *np.full((2, len(grid)), np.float32(ALL_MOMENTS))])
+        error[:3] *= weight
+        up, left = _decide(_Pixels(short[:near], step, arm, error), grid)
+        left[:3] /= weight
+        left[0] += hidden
+        return np.concatenate([lower + up, upper]), left
+
+    def _levels_about(self, found: Footprints) -> tuple[IntArray, IntArray, Float32Array, Float32Array]:
+        """The lower levels of the near pixels and the nearest ones of the others, what these are off the wanted light
+        (pixels, n), and what the next level adds to the near ones' (near, n), in steps from black.
+        """
         near = self._map.order.near
         output = None if self._output is None else self._output[found.place]
         asked = found.light / np.float32(self._panel.flux_at_white_e_per_s)
@@ -112,19 +172,7 @@ class ExactQuantiser:
         step[found.place[:near] == self._map.pixels] = 0.0
         short /= self._light[1]
         step /= self._light[1]
-        d = found.offset_px - found.fraction_px[:, None]
-        arm = self._balance.arms(
-            found.offset_px[:, :near], found.fraction_px, found.rate_e_per_s / np.float32(self._step_e_per_s)
-        )
-        far = short[near:]
-        error = np.zeros((SUMS, far.shape[1]), dtype=np.float32)
-        error[:3] = _plain_sums(far, d[:, near:]) + carried
-        grid = _aim_at_whole_steps(error[0], short[:near].sum(axis=0) + error[0], step)
-        error[0] *= arm[0, 0]
-        error[1:3] *= ALL_MOMENTS
-        up = _decide(_Pixels(short[:near].astype(np.float32), step.astype(np.float32), arm, error), grid)
-        short[:near] += step * up
-        return np.concatenate([lower + up, upper]), _plain_sums(short, d) + carried
+        return lower, upper, short.astype(np.float32), step.astype(np.float32)
 
     def _round(self, asked: Float32Array) -> IntArray:
         """The nearest levels; this far out they are 0 for all but the brightest stars."""
@@ -158,35 +206,34 @@ def _turns(sprites: Sprites) -> Iterator[IntArray]:
             yield turn[start : start + CHUNK]
 
 
-def _hand_on(carried: FloatArray, left: FloatArray, some: IntArray, sprites: Sprites) -> None:
-    """Give the errors `left` (3, n) of sprites `some` to those that follow them in their paths, about their centres."""
+def _hand_on(carried: Float32Array, left: Float32Array, some: IntArray, sprites: Sprites) -> None:
+    """Give the errors `left` (SUMS, n) of sprites `some` to those that follow them in their paths, about their centres."""
     if sprites.per_star == 1:
         return
     after = np.minimum(some + 1, len(sprites) - 1)
-    same = np.flatnonzero((sprites.star[after] == sprites.star[some]) & (after > some))
-    here, there = some[same], after[same]
-    carried[0, there] = left[0, same]
+    here = some[(sprites.star[after] == sprites.star[some]) & (after > some)]
+    there = here + 1
+    carried[:, there] = left[:, here]
     for row, place_px in ((1, sprites.x_px), (2, sprites.y_px)):
-        carried[row, there] = left[row, same] - left[0, same] * (place_px[there] - place_px[here])
+        carried[row, there] -= left[0, here] * (place_px[there] - place_px[here])
 
 
-def _plain_sums(error: FloatArray | Float32Array, d: FloatArray | Float32Array) -> FloatArray:
+def _plain_sums(error: Float32Array, d: Float32Array) -> Float32Array:
     """Light and first moments (3, n) of errors (pixels, n) at distances (2, pixels, n)."""
     return np.stack([error.sum(axis=0), *np.einsum("kpn,pn->kn", d, error)])
 
 
-def _aim_at_whole_steps(light: FloatArray, lowest: FloatArray, step: FloatArray) -> FloatArray:
-    """Where all steps of a star are equal, take from `light` (n,) what no choice can show; `lowest` has all pixels down.
-
-    The step of those stars, 0 of others, (n,).
-    """
+def _equal_step(step: Float32Array) -> Float32Array:
+    """The step of stars whose steps (near, n) are all equal, 0 of others, (n,)."""
     largest = step.max(axis=0)
     smallest = np.min(step, axis=0, initial=np.inf, where=step > 0)
-    equal = np.flatnonzero((largest > 0) & (largest <= smallest * (1 + SAME_STEP)))
-    light[equal] -= lowest[equal] - np.rint(lowest[equal] / largest[equal]) * largest[equal]
-    grid = np.zeros_like(largest)
-    grid[equal] = largest[equal]
-    return np.asarray(grid)
+    return np.where(largest <= smallest * (1 + SAME_STEP), largest, np.float32(0))
+
+
+def _between_steps(lowest: Float32Array, grid: Float32Array) -> Float32Array:
+    """What no choice can show of the light: `lowest` (n,) has all pixels down, `grid` as by `_equal_step`."""
+    step = np.where(grid > 0, grid, np.float32(1))
+    return np.where(grid > 0, lowest - np.rint(lowest / step) * step, np.float32(0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,7 +269,7 @@ class _Kept:
         return np.asarray(up), np.asarray(error)
 
 
-def _turn_one_more(pixels: _Pixels, up: npt.NDArray[np.bool_], error: Float32Array, grid: FloatArray) -> None:
+def _turn_one_more(pixels: _Pixels, up: npt.NDArray[np.bool_], error: Float32Array, grid: Float32Array) -> None:
     """Where equal steps (`grid` > 0) left the light a step off, turn the pixel that does the other sums the least harm."""
     stars = np.flatnonzero(np.abs(error[0]) > OFF * pixels.arm[0, 0] * np.where(grid > 0, grid, np.inf))
     if not len(stars):
@@ -235,10 +282,14 @@ def _turn_one_more(pixels: _Pixels, up: npt.NDArray[np.bool_], error: Float32Arr
     pixel = more.argmin(axis=0)
     can = np.flatnonzero(np.isfinite(more.min(axis=0)))
     up[pixel[can], stars[can]] ^= True
+    error[:, stars[can]] += arm[:, pixel[can], can] * by[pixel[can], can]
 
 
-def _decide(pixels: _Pixels, grid: FloatArray) -> npt.NDArray[np.bool_]:
-    """Which pixels take the upper level, (near, n); `grid` (n,) is the step of stars whose steps are all equal, else 0."""
+def _decide(pixels: _Pixels, grid: Float32Array) -> tuple[npt.NDArray[np.bool_], Float32Array]:
+    """Which pixels take the upper level, (near, n), and the sums that leaves, (SUMS, n).
+
+    `grid` (n,) is the step of stars whose steps are all equal, else 0.
+    """
     near, count = pixels.step.shape
     missing = np.zeros((KEPT, count), dtype=np.float32)
     missing[1:] = NONE
@@ -253,4 +304,4 @@ def _decide(pixels: _Pixels, grid: FloatArray) -> npt.NDArray[np.bool_]:
         error += arm * step * kept.compare(pixel, down, rise)
     up, left = kept.best()
     _turn_one_more(pixels, up, left, grid)
-    return up
+    return up, left

@@ -1,0 +1,95 @@
+"""`temporal`: `exact` from frame to frame, so that a star's light and place are right over any exposure of several frames.
+
+What a frame leaves of the ten sums of `balance` the same star has to make up for in the next one. The errors of any N frames
+in a row add up to the difference of two such remainders, each about as large as the error of one frame of `exact`: their mean
+falls as 1/N, whichever frame the exposure begins with, and with parts of a frame at its ends. A remainder is about the star's
+own centre and moves with it. A star too faint to light a pixel in every frame lights one in some: its light is then a rate of
+pulses (a sigma-delta modulation), and each star begins at a place of its own in that cycle, so that alike stars do not blink
+in step. A star keeps its remainder for as long as every frame has it, and begins anew when it comes back.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from hilstar.arrays import Float32Array, IntArray
+from hilstar.monitor.exact import Carried, ExactQuantiser, nothing_carried
+from hilstar.monitor.response import Codes
+from hilstar.scene.sprites import Sprites
+
+# What a star is given to make up for, in its largest steps: more than the 3 that occur, little enough for one that cannot (its
+# pixels are white) to be right again a few frames after it can.
+MAX_CARRIED_STEPS = 8.0
+GOLDEN = 2654435769  # 2^32 over the golden ratio: its multiples, modulo 2^32, are spread evenly, any number of them
+NONE_BEFORE = -1
+
+
+@dataclass(frozen=True, slots=True)
+class Left:
+    """What the stars of the last frame left: their numbers (n,) as in `Sprites.star`, and the errors (SUMS, n)."""
+
+    star: IntArray
+    error: Float32Array
+
+
+class TemporalQuantiser(ExactQuantiser):
+    """Levels of one frame after another; `left` is what the last one left, None at the beginning."""
+
+    over_frames: ClassVar[bool] = True
+    left: Left | None = None
+
+    def levels(self, sprites: Sprites | None, floor: Codes | None = None) -> Codes:
+        """The levels of the next frame, as `exact`'s."""
+        if sprites is None or not len(sprites):
+            self.left = None
+        return super().levels(sprites, floor)
+
+    def _carried(self, sprites: Sprites) -> Carried:
+        first, _ = ends_of_paths(sprites)
+        star = sprites.star[first]
+        before = places_before(None if self.left is None else self.left.star, star)
+        carried = nothing_carried(len(sprites))
+        known = before != NONE_BEFORE
+        if self.left is not None:
+            carried.error[:, first[known]] = self.left.error[:, before[known]]
+        carried.phase[first] = first_phases(star, before)
+        return carried
+
+    def _bounded(self, error: Float32Array, step: Float32Array) -> Float32Array:
+        limit = np.float32(MAX_CARRIED_STEPS) * step.max(axis=0)
+        return np.clip(error, -limit, limit)
+
+    def _keep(self, sprites: Sprites, left: Float32Array) -> None:
+        _, last = ends_of_paths(sprites)
+        self.left = Left(sprites.star[last].copy(), left[:, last])
+
+
+def ends_of_paths(sprites: Sprites) -> tuple[IntArray, IntArray]:
+    """The places of the first and of the last sprite of each star."""
+    if sprites.per_star == 1:
+        every = np.arange(len(sprites))
+        return every, every
+    first = np.flatnonzero(np.diff(sprites.star, prepend=sprites.star[0] - 1))
+    return first, np.append(first[1:], len(sprites)) - 1
+
+
+def places_before(before: IntArray | None, star: IntArray) -> IntArray:
+    """Where each of `star` (n,) was among those of the frame before, int32 (n,); NONE_BEFORE for new ones.
+
+    Of several of one number the last counts.
+    """
+    if before is None or not len(before) or not len(star):
+        return np.full(len(star), NONE_BEFORE, dtype=np.int32)
+    lowest = min(int(before.min()), int(star.min()))  # light of a fault has negative numbers
+    place = np.full(max(int(before.max()), int(star.max())) - lowest + 1, NONE_BEFORE, dtype=np.int32)
+    place[before - lowest] = np.arange(len(before), dtype=np.int32)
+    return np.asarray(place[star - lowest])
+
+
+def first_phases(star: IntArray, before: IntArray) -> Float32Array:
+    """The part of a step (n,), -0.5 to 0.5, that new stars have in hand; 0 for those that were there before."""
+    turned = (star.astype(np.uint64) * np.uint64(GOLDEN) & np.uint64(0xFFFFFFFF)).astype(np.float64) / 2**32 - 0.5
+    return np.where(before == NONE_BEFORE, turned, 0.0).astype(np.float32)

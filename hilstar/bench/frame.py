@@ -187,13 +187,14 @@ class Bench:
         if q_icrs_to_cam is None:
             return None
         stars = self.seen(self.shown_stars, t_ns, velocity_km_s, place_km)
-        sprites = self.star_sprites(stars, q_icrs_to_cam, rate_cam_rad_s)
         turn = self._turn(q_icrs_to_cam, rate_cam_rad_s)
+        sprites = self.sprites(q_icrs_to_cam, stars) if turn is None else self._swept(stars, turn)
         if self._painter is not None:
             sprites = self._painter.over(sprites, stars, q_icrs_to_cam, When(t_ns, velocity_km_s, place_km), turn)
-        shot = Shot(self.camera, self.scan, turn or Turn(q_icrs_to_cam, STILL), t_ns, velocity_km_s, place_km)
-        shot = shot.at_rest() if rate_cam_rad_s is None else shot
-        sprites = self._with_satellites(sprites, stars, shot, self.faintest_shown_e_per_s)
+        if self.moving is not None:
+            shot = Shot(self.camera, self.scan, turn or Turn(q_icrs_to_cam, STILL), t_ns, velocity_km_s, place_km)
+            shot = shot.at_rest() if rate_cam_rad_s is None else shot
+            sprites = self._with_satellites(sprites, stars, shot, self.faintest_shown_e_per_s)
         if faults is None:
             return sprites
         scan = None if rate_cam_rad_s is None else self.scan

@@ -41,11 +41,13 @@ class Camera:
         """Pixel x and y of directions (n, 3) in image axes; NaN for those not in front of the camera."""
         z = image_vectors[:, 2]
         if self.lens is None:
-            scale = np.divide(self.focal_length_px, z, out=np.full_like(z, np.nan), where=z > 0)
-            x = image_vectors[:, 0] * scale + self.principal_point_px[0]
-            y = image_vectors[:, 1] * scale + self.principal_point_px[1]
+            scale = _over(self.focal_length_px, z)
+            x = image_vectors[:, 0] * scale
+            y = image_vectors[:, 1] * scale
+            x += self.principal_point_px[0]
+            y += self.principal_point_px[1]
             return x, y
-        near = np.divide(1.0, z, out=np.full_like(z, np.nan), where=z > 0)
+        near = _over(1.0, z)
         return self.places_px(image_vectors[:, 0] * near, image_vectors[:, 1] * near)
 
     def project_outward(self, image_vectors: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -53,7 +55,7 @@ class Camera:
         if self.lens is None:
             return self.project(image_vectors)
         z = image_vectors[:, 2]
-        near = np.divide(1.0, z, out=np.full_like(z, np.nan), where=z > 0)
+        near = _over(1.0, z)
         u, v = image_vectors[:, 0] * near, image_vectors[:, 1] * near
         limit = self.lens.max_tangent * WITHIN
         beyond = np.flatnonzero(u * u + v * v > limit**2)
@@ -189,6 +191,15 @@ class Camera:
         )
         return x, y
 
+    def edges(self, margin_px: float) -> FloatArray:
+        """The planes of the image's sides, `margin_px` outside it: their inward unit normals (4, 3) in image axes.
+
+        With a lens they are those of the box around its directions.
+        """
+        (left, right), (top, bottom) = self._box(margin_px)
+        normals = np.array([[1.0, 0.0, -left], [-1.0, 0.0, right], [0.0, 1.0, -top], [0.0, -1.0, bottom]])
+        return np.asarray(normals / np.sqrt((normals * normals).sum(axis=1, keepdims=True)))
+
     def field_radius_rad(self, margin_px: float) -> float:
         """The angle from the image's normal to its farthest corner, `margin_px` outside it (with a lens, its own margin)."""
         if self.lens is not None:
@@ -198,6 +209,13 @@ class Camera:
         reach_x = max(cx, width - 1 - cx) + 0.5 + margin_px
         reach_y = max(cy, height - 1 - cy) + 0.5 + margin_px
         return float(np.arctan(np.hypot(reach_x, reach_y) / self.focal_length_px))
+
+
+def _over(size: float, z: FloatArray) -> FloatArray:
+    """`size` / z; NaN for what is not in front of the camera."""
+    if len(z) and z.min() > 0:  # a masked division is several times slower
+        return size / z
+    return np.divide(size, z, out=np.full_like(z, np.nan), where=z > 0)
 
 
 def bounded(camera: Camera, margin_px: float) -> Camera:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hilstar.arrays import Float32Array, FloatArray, IntArray
+from hilstar.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from hilstar.scene.psf import peak_share, pixel_shares
 from hilstar.scene.sprites import Sprites
 
@@ -47,13 +47,13 @@ def clipped_sprites(
     return np.asarray(bright[over], dtype=np.intp)
 
 
-def _star_rates(sprites: Sprites) -> FloatArray:
+def _star_rates(sprites: Sprites) -> Float32Array | FloatArray:
     """The rate of each sprite's whole star, electrons per second (n,)."""
-    rates = sprites.data["electrons_per_s"].astype(np.float64)
+    rates: Float32Array = sprites.data["electrons_per_s"]
     if sprites.per_star == 1:
         return rates
     _, star = np.unique(sprites.star, return_inverse=True)
-    return np.asarray(np.bincount(star, rates)[star])
+    return np.asarray(np.bincount(star, rates)[star], dtype=np.float64)
 
 
 def _share(offset_x: FloatArray, offset_y: FloatArray, sigma_px: tuple[float, float]) -> FloatArray:
@@ -62,10 +62,12 @@ def _share(offset_x: FloatArray, offset_y: FloatArray, sigma_px: tuple[float, fl
 
 def _light_at(sprites: Sprites, x: IntArray, y: IntArray, sigma_px: tuple[float, float]) -> FloatArray:
     """Light of all sprites together in the pixels at x, y (k,), electrons per second (k,)."""
-    order = np.argsort(sprites.x_px)
+    close = _close_to(sprites, x, y)
+    order = close[np.argsort(sprites.x_px[close])]
     reach = sprites.footprint_px / 2
-    first = np.searchsorted(sprites.x_px, x - reach, sorter=order)
-    count = np.searchsorted(sprites.x_px, x + reach, side="right", sorter=order) - first
+    rising_px = sprites.x_px[order]
+    first = np.searchsorted(rising_px, x - reach)
+    count = np.searchsorted(rising_px, x + reach, side="right") - first
     pixel = np.repeat(np.arange(len(x)), count)
     other = order[np.arange(len(pixel)) + np.repeat(first - (np.cumsum(count) - count), count)]
     offset_y = sprites.y_px[other] - y[pixel]
@@ -73,3 +75,17 @@ def _light_at(sprites: Sprites, x: IntArray, y: IntArray, sigma_px: tuple[float,
     pixel, other, offset_y = pixel[near], other[near], offset_y[near]
     share = _share(sprites.x_px[other] - x[pixel], offset_y, sigma_px)
     return np.asarray(np.bincount(pixel, sprites.data["electrons_per_s"][other] * share, minlength=len(x)), dtype=np.float64)
+
+
+def _close_to(sprites: Sprites, x: IntArray, y: IntArray) -> IntArray:
+    """Positions of the sprites whose footprints can reach one of the columns `x` and rows `y` (k,), and some more."""
+    pixel = sprites.data["pixel"]
+    return np.flatnonzero(_reach(pixel[:, 0], x, sprites.footprint_px) & _reach(pixel[:, 1], y, sprites.footprint_px))
+
+
+def _reach(pixel: IntArray, wanted: IntArray, size_px: int) -> BoolArray:
+    """Which pixels (n,) of an axis are within a footprint of one of the `wanted` (k,)."""
+    near = np.zeros(int(wanted.max(initial=0)) + 2 * size_px + 2, dtype=np.bool_)
+    for place in set(wanted.tolist()):
+        near[place : place + 2 * size_px + 1] = True
+    return near.take(pixel + size_px, mode="clip")

@@ -72,13 +72,14 @@ def make_sprites(stars: Stars, icrs_to_image: FloatArray, camera: Camera, footpr
     `icrs_to_image` (3, 3) turns ICRS components into image components.
     """
     margin_px = footprint_px / 2 + 1
-    near = stars.near(icrs_to_image[2], camera.field_radius_rad(margin_px))
-    seen = stars.directions(near) @ icrs_to_image.T
+    edges = camera.edges(margin_px) @ icrs_to_image
+    near = stars.near(icrs_to_image[2], camera.field_radius_rad(margin_px), edges)
+    seen = (icrs_to_image @ stars.directions(near).T).T  # component by component, as they are kept
     if camera.lens is not None:  # a pinhole's places cost less than the choice
         close = camera.in_view(seen, margin_px, 0.0)
         near, seen = near[close], seen[close]
     x_px, y_px = camera.project(seen)
-    sprites = pack_sprites(x_px, y_px, stars.electrons_per_s[near], near, camera.resolution_px, footprint_px)
+    sprites = pack_sprites(x_px, y_px, stars.electrons_per_s.take(near), near, camera.resolution_px, footprint_px)
     kept = brightest(sprites.data["electrons_per_s"], max_stars(footprint_px))
     if kept is None:
         return sprites
@@ -114,18 +115,24 @@ def pack_sprites(
     width, height = size_px
     # An odd footprint has the star in its middle pixel, an even one within half a pixel of its middle corner.
     bias = 0.5 if footprint_px % 2 else 0.0
-    pixel_x, pixel_y = np.floor(x_px + bias), np.floor(y_px + bias)
     before = (footprint_px - 1) // 2
     after = footprint_px - 1 - before
-    seen = (pixel_x >= -after) & (pixel_x < width + before) & (pixel_y >= -after) & (pixel_y < height + before)
-    x_px, y_px = x_px[seen], y_px[seen]
-    data = np.empty(len(x_px), dtype=SPRITE_DTYPE)
-    data["pixel"][:, 0] = pixel_x = pixel_x[seen]
-    data["pixel"][:, 1] = pixel_y = pixel_y[seen]
-    data["fraction_px"][:, 0] = x_px - pixel_x
-    data["fraction_px"][:, 1] = y_px - pixel_y
-    data["electrons_per_s"] = electrons_per_s[seen]
-    return Sprites(data, footprint_px, star[seen], x_px, y_px)
+    inside = _between(x_px, -after - bias, width + before - bias)
+    inside &= _between(y_px, -after - bias, height + before - bias)
+    seen = inside.nonzero()[0]
+    x_px, y_px = x_px.take(seen), y_px.take(seen)
+    data = np.empty(len(seen), dtype=SPRITE_DTYPE)
+    whole, part = (data.view(kind).reshape(-1, 5) for kind in (np.int32, np.float32))
+    for column, place_px in enumerate((x_px, y_px)):
+        pixel = np.floor(place_px + bias)
+        whole[:, column] = pixel
+        part[:, 2 + column] = place_px - pixel
+    part[:, 4] = electrons_per_s.take(seen)
+    return Sprites(data, footprint_px, star.take(seen), x_px, y_px)
+
+
+def _between(place_px: FloatArray, first: float, end: float) -> npt.NDArray[np.bool_]:
+    return np.asarray((place_px >= first) & (place_px < end))
 
 
 def join_sprites(parts: Sequence[Sprites], footprint_px: int) -> Sprites:

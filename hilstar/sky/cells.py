@@ -30,16 +30,34 @@ class CellGrid:
     cos_radius: FloatArray
     sin_radius: FloatArray
 
-    def near(self, axis: FloatArray, radius_rad: float) -> IntArray:
-        """Positions in `order` of every star within `radius_rad` of the unit vector `axis`, and some more."""
-        limit = np.cos(radius_rad) * self.cos_radius - np.sin(radius_rad) * self.sin_radius
-        hit = np.flatnonzero(self.centre @ axis >= limit)
-        count = self.count[hit]
-        if not len(hit):
+    def near(self, axis: FloatArray, radius_rad: float, edges: FloatArray | None = None, reach_rad: float = 0.0) -> IntArray:
+        """Positions in `order`, rising, of every star within `radius_rad` and `reach_rad` of the unit vector `axis`, and more.
+
+        With `edges` (k, 3), unit normals of planes through the centre, the stars within `reach_rad` of the inner side of each.
+        """
+        if not len(self.start):
             return np.empty(0, dtype=np.intp)
-        # Ranges [start, start + count) of the hit cells, laid end to end.
-        offset = self.start[hit] - (np.cumsum(count) - count)
-        return np.repeat(offset, count) + np.arange(count.sum())
+        widest = self.cos_radius.min()  # one bound for all cells, then each hit cell's own
+        farthest = min(radius_rad + reach_rad + float(np.arccos(widest)), np.pi)
+        hit = (self.centre @ axis >= np.cos(farthest)).nonzero()[0]
+        centre = self.centre.take(hit, axis=0).T
+        cos_radius, sin_radius = self.cos_radius.take(hit), self.sin_radius.take(hit)
+        within = axis @ centre >= np.cos(radius_rad + reach_rad) * cos_radius - np.sin(radius_rad + reach_rad) * sin_radius
+        if edges is not None and reach_rad < np.pi / 2:
+            deepest = np.cos(reach_rad) * sin_radius + np.sin(reach_rad) * cos_radius
+            deepest[np.cos(reach_rad) * cos_radius <= np.sin(reach_rad) * sin_radius] = 1.0  # a cell wider than a plane bounds
+            within &= (edges @ centre >= -deepest).all(axis=0)
+        return self._stars(hit[within])
+
+    def _stars(self, cells: IntArray) -> IntArray:
+        """Positions in `order` of the stars of rising `cells`."""
+        if not len(cells):
+            return np.empty(0, dtype=np.intp)
+        start = self.start.take(cells)
+        end = start + self.count.take(cells)
+        gaps = (start[1:] != end[:-1]).nonzero()[0]  # neighbours in a band follow each other: few ranges
+        firsts, lasts = [int(start[0]), *start[gaps + 1].tolist()], [*end[gaps].tolist(), int(end[-1])]
+        return np.concatenate([np.arange(first, last) for first, last in zip(firsts, lasts, strict=True)])
 
 
 def cell_grid(vectors: FloatArray, cell_deg: float = CELL_DEG) -> CellGrid:

@@ -89,11 +89,13 @@ class CellMeasurement:
     def _draw_stages(self) -> None:
         stars, camera, footprint_px = self.bench.shown_stars, self.bench.camera, self.staged.footprint_px
         begin = time.perf_counter()
-        near = stars.grid.near(self.icrs_to_image[2], camera.field_radius_rad(footprint_px / 2 + 1))
+        margin_px = footprint_px / 2 + 1
+        edges = camera.edges(margin_px) @ self.icrs_to_image
+        near = stars.near(self.icrs_to_image[2], camera.field_radius_rad(margin_px), edges)
         culled = time.perf_counter()
         # make_sprites in its two halves.
-        x_px, y_px = camera.project(stars.vectors[near] @ self.icrs_to_image.T)
-        sprites = pack_sprites(x_px, y_px, stars.electrons_per_s[near], near, camera.resolution_px, footprint_px)
+        x_px, y_px = camera.project((self.icrs_to_image @ stars.directions(near).T).T)
+        sprites = pack_sprites(x_px, y_px, stars.electrons_per_s.take(near), near, camera.resolution_px, footprint_px)
         projected = time.perf_counter()
         self.staged.draw(sprites)
         self.staged.codes()

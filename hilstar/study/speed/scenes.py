@@ -50,7 +50,7 @@ def _sorted(every: Stars, sources: IntArray, vectors: FloatArray) -> Stars:
     """Stars at `vectors` (n, 3) that are otherwise those of `every` at `sources` (n,), by cell."""
     grid = cell_grid(vectors)
     columns = {name: getattr(every, name)[sources[grid.order]] for name in STAR_COLUMNS}
-    return replace(every, vectors=np.ascontiguousarray(vectors[grid.order]), grid=grid, **columns)
+    return replace(every, vectors=np.asfortranarray(vectors[grid.order]), grid=grid, **columns)
 
 
 def _directions(bench: Bench, q: FloatArray, wanted: int, rng: np.random.Generator) -> FloatArray:

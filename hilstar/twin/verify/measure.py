@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from hilstar.arrays import FloatArray
 from hilstar.bench.moving import wide_bodies
+from hilstar.tracker.centroiders import FAMILY, Centroider
 from hilstar.tracker.centroids import Centroids, estimate_background, find_stars, noisiest_background
 from hilstar.twin.bench_geometry import BenchGeometry, Mirror
 from hilstar.twin.verify.blends import with_blends_as_one
@@ -48,7 +49,9 @@ class Comparison:
         tally, stars_listed = self.tally, len(seen.truth)
         seen = with_blends_as_one(seen, self.finder.sigma_px)
         tally.summed += stars_listed - len(seen.truth)
-        sky, shown = (self.finder.match(image_e, seen.x_px, seen.y_px) for image_e in (seen.sky_e, seen.shown_e))
+        windowed = [self.finder.find(image_e, seen.x_px, seen.y_px) for image_e in (seen.sky_e, seen.shown_e)]
+        each = {kind: self._placed(seen, windowed, kind) for kind in FAMILY}
+        sky, shown = each[self.finder.centroider]
         assumed = shown if seen.assumed_e is seen.shown_e else self.finder.match(seen.assumed_e, seen.x_px, seen.y_px)
         inside, drawn, clipped = self._inside(seen), seen.truth["drawn"], seen.truth["clipped"]
         tally.at_edge += int((self._on_detector(seen, 0.0) & ~inside).sum())
@@ -60,6 +63,8 @@ class Comparison:
         found = wanted & (sky.index >= 0) & (shown.index >= 0)
         for k in np.flatnonzero(wanted):
             (tally.stars if found[k] else tally.lost).append(self._star(seen, int(k), sky, shown, assumed))
+        for kind, (there, here) in each.items():
+            tally.off_px[kind] += [math.hypot(*here.against(there, int(k))[1:]) for k in np.flatnonzero(found)]
         tally.vanished += len(sky.found) - len(shown.found)
         self._follow(seen, shown.found, wanted)
         self._count_mirrored(seen, shown.found, wanted)
@@ -109,6 +114,12 @@ class Comparison:
             floor_px=math.hypot(*floor_px),
             name=str(row["name"]),
         )
+
+    def _placed(self, seen: Field, windowed: list[Matched], kind: Centroider) -> list[Matched]:
+        """The stars of the sky's image and of the display's where a centroider finds them."""
+        images_e = seen.sky_e, seen.shown_e
+        true_px = seen.x_px, seen.y_px
+        return [self.finder.placed(of, image_e, true_px, kind) for of, image_e in zip(windowed, images_e, strict=True)]
 
     def _catalogue(self, seen: Field) -> Matched:
         """The catalogue as if it had been found in an image."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from hilstar.bench.config import BenchConfig
 from hilstar.monitor.calibration import Calibration
 from hilstar.scene.camera import Camera
+from hilstar.tracker.centroiders import FAMILY, Centroider
 from hilstar.twin.bench_geometry import Mirror
 from hilstar.twin.verify.displacement import Displaced
 
@@ -42,6 +43,7 @@ class Tally:
     `summed` stars are part of a brighter one that the tracker cannot part from them. `displaced` are the stars that the display
     really shows, however far off. `vanished` counts how many fewer are found than the sky has, `mirrored` those found where a
     screen so mirrored would show them; `noisy_mag`, `noisy_px` are the errors with all of the detector's noise.
+    `off_px` has how far off each kind of centroider finds each of `stars`.
     """
 
     stars: list[Star] = field(default_factory=list)
@@ -56,6 +58,7 @@ class Tally:
     mirrored: Counter[Mirror] = field(default_factory=Counter)
     noisy_mag: list[float] = field(default_factory=list)
     noisy_px: list[float] = field(default_factory=list)
+    off_px: dict[Centroider, list[float]] = field(default_factory=lambda: {kind: [] for kind in FAMILY})
 
 
 @dataclass(frozen=True, slots=True)

@@ -51,33 +51,40 @@ class StarFinder:
     centroider: Centroider = USUAL
 
     def match(self, image_e: FloatArray, x_px: FloatArray, y_px: FloatArray) -> Matched:
-        """The stars of a noiseless image (h, w) at their places (n,).
+        """The stars of a noiseless image (h, w) at their places (n,), where the bench's own centroider finds them."""
+        return self.placed(self.find(image_e, x_px, y_px), image_e, (x_px, y_px), self.centroider)
+
+    def find(self, image_e: FloatArray, x_px: FloatArray, y_px: FloatArray) -> Matched:
+        """The stars of a noiseless image (h, w) at their places (n,), where a window finds them.
 
         A tracker subtracts the screen's glow around each star: here it is not added in the first place.
         """
         found = find_stars(image_e, self.settings, self.background)
-        index = nearest(found, x_px, y_px)
-        return Matched(self._placed(image_e, found, index, (x_px, y_px)), index)
+        return Matched(found, nearest(found, x_px, y_px))
 
-    def _placed(
-        self, image_e: FloatArray, found: Centroids, index: IntArray, true_px: tuple[FloatArray, FloatArray]
-    ) -> Centroids:
-        """The stars that were matched, where the bench's own centroider finds them; the window's places are those found."""
-        stars = np.flatnonzero(index >= 0)
-        if self.centroider == "window" or not len(stars):
-            return found
-        reach = self.settings.radius_px
-        column, row = (np.rint(place[stars]).astype(np.intp) for place in true_px)
+    def placed(
+        self, matched: Matched, image_e: FloatArray, true_px: tuple[FloatArray, FloatArray], kind: Centroider
+    ) -> Matched:
+        """The stars that a window has found where another centroider has them.
+
+        A box is about the pixel of the star's true place, or as many whole pixels aside as the star is.
+        """
+        found, stars = matched.found, np.flatnonzero(matched.index >= 0)
+        if kind == "window" or not len(stars):
+            return matched
+        index, reach = matched.index[stars], self.settings.radius_px
+        aside = (np.rint(seen[index] - true[stars]) for seen, true in zip((found.x_px, found.y_px), true_px, strict=True))
+        column, row = (np.rint(true[stars] + by).astype(np.intp) for true, by in zip(true_px, aside, strict=True))
         near = np.arange(2 * reach + 1)
         # A star's true place may lie up to the largest distance of a match off the image.
         far = reach + math.ceil(MATCH_PX) + 1
         padded = np.pad(np.maximum(image_e, 0.0), far)
         stamps = padded[(row[:, None] + near + far - reach)[:, :, None], (column[:, None] + near + far - reach)[:, None, :]]
         middle = np.full(len(stars), reach)
-        dx_px, dy_px = star_places(stamps, self.centroider, self.sigma_px, (middle, middle))
+        dx_px, dy_px = star_places(stamps, kind, self.sigma_px, (middle, middle))
         x_px, y_px = found.x_px.copy(), found.y_px.copy()
-        x_px[index[stars]], y_px[index[stars]] = column + dx_px, row + dy_px
-        return replace(found, x_px=x_px, y_px=y_px)
+        x_px[index], y_px[index] = column + dx_px, row + dy_px
+        return Matched(replace(found, x_px=x_px, y_px=y_px), matched.index)
 
 
 def star_finder(bench: Bench, monitor_px_per_px: float) -> StarFinder:

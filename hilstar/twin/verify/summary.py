@@ -8,8 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from hilstar.error_spread import ErrorSpread, error_spread
+from hilstar.tracker.centroiders import Centroider
 from hilstar.twin.verify.display_errors import DisplayErrors
 from hilstar.twin.verify.faulty_fields import FaultSeen, fault_lines
+from hilstar.twin.verify.star_finder import USUAL
 from hilstar.twin.verify.verdict import Verdict
 from hilstar.units import ARCSEC_PER_RAD
 
@@ -69,13 +71,18 @@ class CalibrationName:
 
 @dataclass(frozen=True, slots=True)
 class VerifySummary:
-    """The figures of a verdict; centroids in tracker pixels, and arcsec in the middle of its field."""
+    """The figures of a verdict; centroids in tracker pixels, and arcsec in the middle of its field.
+
+    They are as `centroider` finds the stars; `centroid_error_px_by` has those of each kind.
+    """
 
     fields: int
     stars: int
     flux_error_mag: ErrorSpread
     centroid_error_px: ErrorSpread
     centroid_error_arcsec: ErrorSpread
+    centroider: Centroider
+    centroid_error_px_by: dict[Centroider, ErrorSpread]
     lost: int
     passed: bool
     reasons: list[str]
@@ -113,6 +120,8 @@ def summarise(verdict: Verdict) -> VerifySummary:
         flux_error_mag=error_spread(np.abs(errors.flux_mag())),
         centroid_error_px=error_spread(centroid_px),
         centroid_error_arcsec=error_spread(centroid_px * ARCSEC_PER_RAD / measured.camera.focal_length_px),
+        centroider=measured.config.verify.centroider or USUAL,
+        centroid_error_px_by={kind: error_spread(np.array(off_px)) for kind, off_px in tally.off_px.items()},
         lost=len(errors.lost),
         passed=verdict.passed,
         reasons=verdict.reasons,
@@ -161,17 +170,19 @@ def summary_lines(summary: VerifySummary) -> list[str]:
     """The figures for a person."""
 
     def three(errors: ErrorSpread) -> str:
-        return " / ".join("-" if value is None else f"{value:.4f}" for value in (errors.rms, errors.p95, errors.max))
+        return " / ".join(_number(value) for value in (errors.rms, errors.p95, errors.max))
 
     noisy = summary.noisy
     rest = f"{summary.lost} lost, {summary.blended} blended, {summary.clipped} clipped"
     rest += f", {summary.not_shown} not shown, {summary.at_edge} at edge"
     rest += f", {summary.summed} part of a blend" if summary.summed else ""
-    centroid = f"{three(summary.centroid_error_px)} px, {three(summary.centroid_error_arcsec)} arcsec"
+    centroid = f"{three(summary.centroid_error_px)} px, {three(summary.centroid_error_arcsec)} arcsec, by {summary.centroider}"
+    each = ", ".join(f"{kind} {_number(errors.rms)}" for kind, errors in summary.centroid_error_px_by.items())
     return [
         f"{'stars':20}{summary.stars} in {summary.fields} fields; {rest}",
         f"{'flux error':20}{three(summary.flux_error_mag)} mag (rms / 95 % / max)",
         f"{'centroid error':20}{centroid}",
+        f"{'by each centroider':20}{each} px rms",
         f"{'with detector noise':20}{three(noisy.flux_mag)} mag, {three(noisy.centroid_px)} px",
         *(
             f"{f'V {row.v_from} to {row.v_to}':>17}   {row.flux_error_mag.rms:.4f} mag rms,"
@@ -183,3 +194,7 @@ def summary_lines(summary: VerifySummary) -> list[str]:
         *(f"{'':20}{reason}" for reason in summary.reasons),
         f"{'verdict':20}{'passed' if summary.passed else 'NOT passed'}",
     ]
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.4f}"

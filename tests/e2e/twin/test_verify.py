@@ -51,6 +51,10 @@ def test_a_right_bench_passes_within_the_aims(tmp_path):
     assert sum(row["stars"] for row in summary["by_magnitude"]) == summary["stars"]
     assert summary["codes_alone"]["flux_mag"] == summary["flux_error_mag"]
     assert summary["at_edge"] > 0
+    by_each = summary["centroid_error_px_by"]
+    assert list(by_each) == ["moment", "window", "wide", "fit", "box3", "box5"]
+    assert by_each[summary["centroider"]]["rms"] == pytest.approx(summary["centroid_error_px"]["rms"])
+    assert 0 < max(errors["p95"] for errors in by_each.values()) < 0.05
 
 
 def write_geometry_file(path: Path, lines: str) -> None:

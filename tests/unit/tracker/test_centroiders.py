@@ -46,3 +46,28 @@ def test_noise_alone_and_clipped_stars_keep_every_place_finite(rng):
     for images in (rng.normal(0, 1, (40, 15, 15)) + 0.1, np.ones((3, 15, 15)), np.minimum(stars(np.zeros((2, 3))), 0.01)):
         for kind in get_args(Centroider):
             assert np.isfinite(star_places(np.maximum(images, 0), kind, SIGMA)).all()
+
+
+HOSTILE = {
+    "one pixel": lambda rng: np.eye(15)[7][:, None] * np.eye(15)[7],
+    "two pixels, apart": lambda rng: np.eye(15)[7][:, None] * (np.eye(15)[2] + np.eye(15)[12]),
+    "a row": lambda rng: np.eye(15)[7][:, None] * np.ones(15),
+    "a corner": lambda rng: np.eye(15)[0][:, None] * np.eye(15)[0],
+    "half of a star, at an edge": lambda rng: stars(np.zeros((2, 1)), 15)[0] * (np.arange(15) < 7),
+    "two stars, one of them brighter": lambda rng: (
+        stars(np.array([[1.5], [0.0]]), 15)[0] + 9 * stars(np.array([[-1.5], [0.5]]), 15)[0]
+    ),
+    "clipped flat": lambda rng: np.minimum(1e6 * stars(np.zeros((2, 1)), 15)[0], 1.0),
+    "hardly any light": lambda rng: 1e-29 * stars(np.zeros((2, 1)), 15)[0],
+    "more than a sun": lambda rng: 1e30 * stars(np.zeros((2, 1)), 15)[0],
+    "noise": lambda rng: np.maximum(rng.normal(size=(15, 15)), 0),
+}
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("kind", get_args(Centroider))
+@pytest.mark.parametrize("sigma", [0.2, 1.0, 4.0])
+def test_a_star_that_is_none_has_a_place_on_its_square(kind, sigma, rng):
+    images = np.array([make(rng) for make in HOSTILE.values()])
+    for x in star_places(images, kind, (sigma, sigma)):
+        assert np.isfinite(x).all() and np.abs(x).max() <= 7

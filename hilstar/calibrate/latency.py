@@ -15,6 +15,8 @@ from hilstar.calibrate.edges import MIN_EDGES, Edges
 from hilstar.errors import InputError, shortened
 from hilstar.files import write_whole
 from hilstar.reading import MAX_TOML_BYTES, read_text
+from hilstar.run.sync.advice import exposures_of
+from hilstar.run.sync.beat import Beat, beat
 from hilstar.units import NS_PER_MS
 
 MAX_LATENCY_NS = 500 * NS_PER_MS
@@ -22,7 +24,6 @@ MAX_EARLY_NS = 5 * NS_PER_MS  # a clock that is read after the swap may give a t
 BIN_NS = NS_PER_MS
 LIKELY_SHARE = 0.9  # of the best peak: with a square that toggles, the latency repeats every two frames
 AGREEING_SHARE = 0.5  # of the edges that must find their frames
-NO_BEAT = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,15 +99,6 @@ class Percentiles:
 
 
 @dataclass(frozen=True, slots=True)
-class Beat:
-    """How refresh and exposure beat: refreshes in an exposure, the period of their phases, and what that costs in motion."""
-
-    refreshes_per_exposure: float
-    period_s: float | None
-    worst_arcsec_per_deg_s: float | None
-
-
-@dataclass(frozen=True, slots=True)
 class LatencySummary:
     """The figures of `hilstar latency`; its fields are the keys of the JSON object.
 
@@ -146,7 +138,7 @@ def summarise(paired: Paired, config: BenchConfig) -> LatencySummary:
         fall_ms=float(np.median(fall)) if len(fall) else None,
         swap_to_square_ms=to_square_ms,
         panel_delay_ms=p50 - to_square_ms,
-        beat=beat(monitor.refresh_hz, config.tracker.exposure_s),
+        beat=beat(exposures_of(config)),
     )
 
 
@@ -154,21 +146,6 @@ def swap_to_square_ms(monitor: Monitor) -> float:
     """From the first row's light to that of the square's middle, at the foot of the screen, by the scan-out."""
     rows = monitor.resolution_px[0 if monitor.rotate_deg % 180 else 1]
     return monitor.panel_scanout_ms * (1 - monitor.photodiode_px / 2 / rows)
-
-
-def beat(refresh_hz: float, exposure_s: float) -> Beat:
-    """The beat of refresh and exposure.
-
-    In an exposure of n + f refreshes (f under 1) a moving star is off by at most f (1 - f) / 2 of one refresh's path, divided
-    by n + f, whatever the display does: it cannot know when the tracker's exposure begins.
-    """
-    refreshes = refresh_hz * exposure_s
-    rest = refreshes - round(refreshes)
-    part = refreshes % 1.0
-    if refreshes <= 0:
-        return Beat(refreshes, None, None)
-    off_frames = part * (1 - part) / 2 / refreshes
-    return Beat(refreshes, exposure_s / abs(rest) if abs(rest) > NO_BEAT else None, off_frames / refresh_hz * 3600.0)
 
 
 def checked_delay_ms(panel_delay_ms: float) -> float:

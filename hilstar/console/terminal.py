@@ -75,6 +75,8 @@ def report(summary: RunSummary, as_json: bool) -> None:
         if lasted["frames"]:
             what = "changed by an operator's keys" if name == "operator" else "not fully visible"
             lines[name] = f"{lasted['frames']} frames, {lasted['s']:.1f} s, {what}"
+    if summary.sync:
+        lines["pulses"] = summary.sync.line()
     lines["renderer"] = summary.gl_renderer
     for name, line in lines.items():
         typer.echo(f"{name:20}{line}")

@@ -23,7 +23,7 @@ def steady_loop() -> Iterator[str]:
     interval_s = sys.getswitchinterval()
     policy = os.sched_getscheduler(0), os.sched_getparam(0)
     collecting = gc.isenabled()
-    scheduling = _raise_priority()
+    scheduling = raise_priority()
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     gc.collect()
     gc.freeze()
@@ -39,7 +39,8 @@ def steady_loop() -> Iterator[str]:
             os.sched_setscheduler(0, *policy)
 
 
-def _raise_priority() -> str:
+def raise_priority() -> str:
+    """Give this thread real-time priority where that is allowed; the scheduling that it got."""
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(FIFO_PRIORITY))
     except (OSError, AttributeError) as error:

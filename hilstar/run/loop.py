@@ -39,10 +39,16 @@ class Limit:
     frames: float = math.inf
 
 
+def nothing_on_frame(number: int, frame_ns: int) -> None:
+    """For a loop whose frames nobody waits for."""
+
+
 class FrameLoop:
     """Draws frames; a slow frame is missed, and never delays those after it.
 
     `moving` says whether stars are drawn along their paths; by default as the bench file has it, which is on a screen only.
+    `on_frame` is called with each frame's number and time stamp, host ns: once a screen has swapped it; without one when it is
+    due, or where nothing paces it, when it is out.
     """
 
     def __init__(
@@ -61,6 +67,7 @@ class FrameLoop:
         self._blank_when_stale = settings.on_stale == "blank"
         self.pacer = ClockPacer(self._period_ns) if pacer is None else pacer
         self._moving = (motion == "on" or (motion == "auto" and self.pacer.moves_stars)) if moving is None else moving
+        self.on_frame: Callable[[int, int], None] = nothing_on_frame
         self.stop = self.pacer.stop
         self.tally = RunTally()
         self.gate = StaleGate(policy_of(settings).stale_after_ns)
@@ -75,6 +82,8 @@ class FrameLoop:
         None for a frame that is given up because its moment passed while its sprites were computed, or that a fault drops.
         """
         self.watch.begin(number)
+        if moment.starts_ns is not None:
+            self.on_frame(number, moment.starts_ns)
         try:
             return self._draw(number, t_ns, attitude, moment)
         finally:
@@ -99,6 +108,8 @@ class FrameLoop:
         drawn = self._bench.draw_sprites(sprites, number) if stays is None else stays
         now = () if faults is None else faults.shown(effects, drawn, attitude, t_ns, stays is not None)
         presented = self.pacer.show(number, drawn, moment, begun_ns, self.watch.enter)
+        if moment.starts_ns is None:
+            self.on_frame(number, presented.swap_ns)
         shown = Shown(
             number=number,
             t_ns=t_ns,

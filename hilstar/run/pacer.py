@@ -40,6 +40,11 @@ class Moment:
         """When the light of the frame leaves if it is begun at `host_ns`."""
         return host_ns if self.light_ns is None else self.light_ns
 
+    @property
+    def starts_ns(self) -> int | None:
+        """When the frame starts where that is known before it is drawn: paced, and without a screen's swap to wait for."""
+        return self.due_ns if self.swap_ns is None else None
+
 
 AT_ONCE = Moment()
 

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from msgspec import UNSET
+from msgspec import UNSET, UnsetType
 from msgspec.structs import replace as replaced
 
 from hilstar.attitude.back_channel import Traffic
@@ -42,6 +42,8 @@ from hilstar.run.screen.display_pacer import DisplayPacer
 from hilstar.run.screen.screen import Screen
 from hilstar.run.shown import FrameSink, Shown, ignore
 from hilstar.run.summary import RunSummary, RunTally
+from hilstar.run.sync.frame_pulse import FramePulse
+from hilstar.run.sync.pulse_summary import SyncSummary
 from hilstar.units import NS_PER_S
 
 
@@ -74,7 +76,8 @@ class Outlet:
     """Where frames go besides their sink: onto a screen and into a ledger; where events are reported, and who follows it.
 
     `pictures` are what a simulation gets that asks for those of its camera; `desk` has the wishes of operators who are not at
-    the display. `faults` are those on request; who wants to start one finds their own desk there.
+    the display. `faults` are those on request; who wants to start one finds their own desk there. `pulse` is started at
+    each frame.
     """
 
     screen: Screen | None = None
@@ -84,6 +87,17 @@ class Outlet:
     follower: Follower = nobody_follows
     desk: Desk | None = None
     faults: AnyFaults | None = None
+    pulse: FramePulse | None = None
+
+    def on(self, loop: FrameLoop) -> FrameLoop:
+        """The loop, whose frames start the pulse."""
+        if self.pulse is not None:
+            loop.on_frame = self.pulse.frame
+        return loop
+
+    def pulses(self) -> SyncSummary | UnsetType:
+        """What the summary says of the pulses; unset without any."""
+        return UNSET if self.pulse is None else self.pulse.summary()
 
     def pacer(self, bench: Bench) -> Pacer:
         """The pacer of the screen, or without one that of the bench's own rate."""
@@ -97,7 +111,9 @@ def serve(bench: Bench, link: AnyLink, limit: Limit, sink: FrameSink = ignore, o
     """Show the live stream of `link` up to `limit`, or until a signal; returns the summary."""
     outlet = outlet or Outlet()
     faults = outlet.faults
-    loop = FrameLoop(bench, sink, outlet.pacer(bench), None, outlet.notices, None if faults is None else faults.frames)
+    loop = outlet.on(
+        FrameLoop(bench, sink, outlet.pacer(bench), None, outlet.notices, None if faults is None else faults.frames)
+    )
     if link.conventions.of_body:
         for kind, line in Mounting(bench.config.tracker.q_body_to_cam).told:
             outlet.notices.tell(kind, line)
@@ -107,7 +123,7 @@ def serve(bench: Bench, link: AnyLink, limit: Limit, sink: FrameSink = ignore, o
         else:
             summary = _serve_stream(bench, link, limit, loop, outlet)
     told: dict[str, str | int] = {"endpoint": link.endpoint}
-    summary = replaced(summary, faults=UNSET if faults is None else faults.summary())
+    summary = replaced(summary, faults=UNSET if faults is None else faults.summary(), sync=outlet.pulses())
     return replaced(
         summary, events=outlet.notices.counts(), link=told | link.link_counts.summary(), screen=loop.screen_summary()
     )
@@ -189,7 +205,7 @@ def replay(bench: Bench, play: Play, sink: FrameSink = ignore, outlet: Outlet | 
     if faults is not None:
         faults.begin(play.zero_ns)
     frames = None if faults is None else faults.frames
-    loop = FrameLoop(bench, sink, outlet.pacer(bench), play.moving, outlet.notices, frames)
+    loop = outlet.on(FrameLoop(bench, sink, outlet.pacer(bench), play.moving, outlet.notices, frames))
     for kind, line in play.told:
         outlet.notices.tell(kind, line)
 
@@ -210,8 +226,8 @@ def replay(bench: Bench, play: Play, sink: FrameSink = ignore, outlet: Outlet | 
         _draw_all(play, loop, draw_slot)
     duration_s = (time.monotonic_ns() - begin_ns) / NS_PER_S
     summary = loop.tally.summary(duration_s, counts, bench.renderer.gl_renderer)
+    summary = replaced(summary, faults=UNSET if faults is None else faults.summary(), sync=outlet.pulses())
     told = outlet.notices.counts()
-    summary = replaced(summary, faults=UNSET if faults is None else faults.summary())
     return replaced(summary, stale_events=loop.gate.events, events=told, screen=loop.screen_summary())
 
 

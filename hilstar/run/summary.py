@@ -10,6 +10,8 @@ from msgspec import UNSET, UnsetType
 from hilstar.attitude.clock.sender_clock import ClockSummary
 from hilstar.attitude.receiver import PacketCounts
 from hilstar.attitude.wire.packet import MESSAGE_REASONS, Reason
+from hilstar.run.sync.advice import BeatSummary
+from hilstar.run.sync.pulse_summary import SyncSummary
 from hilstar.running_statistics import Percentiles, RunningStatistics
 from hilstar.units import NS_PER_MS
 
@@ -67,6 +69,8 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     screen: dict[str, Any] | UnsetType = UNSET
     ledger: dict[str, str | int | None] | UnsetType = UNSET
     faults: dict[str, Any] | UnsetType = UNSET
+    beat: BeatSummary | UnsetType = UNSET
+    sync: SyncSummary | UnsetType = UNSET
 
 
 class SwapTally:

@@ -13,6 +13,7 @@ from hilstar.bench.config.read import config_of, parse_config, read_config
 from hilstar.bench.config.render import DEFAULT_BRIGHTEST_V_MAG, RenderSettings
 from hilstar.bench.config.sky import Bodies, SkySettings
 from hilstar.bench.config.spacecraft import GEOCENTRE, SOURCE
+from hilstar.bench.config.sync import SyncSettings
 from hilstar.bench.config.tracker import Tracker
 from hilstar.bench.config.values import Vector
 from hilstar.bench.config.verify import Verify
@@ -30,6 +31,7 @@ __all__ = [
     "Monitor",
     "RenderSettings",
     "SkySettings",
+    "SyncSettings",
     "Tracker",
     "Vector",
     "Verify",

@@ -12,6 +12,7 @@ from hilstar.bench.config.monitor import Monitor
 from hilstar.bench.config.render import RenderSettings
 from hilstar.bench.config.sky import SkySettings
 from hilstar.bench.config.spacecraft import Spacecraft
+from hilstar.bench.config.sync import SyncSettings
 from hilstar.bench.config.tracker import Tracker
 from hilstar.bench.config.verify import Verify
 from hilstar.toml_tables import Table
@@ -31,4 +32,5 @@ class BenchConfig(Table, frozen=True):
     render: RenderSettings = msgspec.field(default_factory=RenderSettings)
     background: Background = msgspec.field(default_factory=Background)
     verify: Verify = msgspec.field(default_factory=Verify)
+    sync: SyncSettings = msgspec.field(default_factory=SyncSettings)
     faults: FaultSettings = msgspec.field(default_factory=FaultSettings)

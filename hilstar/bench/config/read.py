@@ -13,6 +13,7 @@ from hilstar.attitude.wire.protocol import NORM_TOLERANCE
 from hilstar.bench.config.bench import TYPE_WORDS, BenchConfig
 from hilstar.bench.config.render import DEFAULT_BRIGHTEST_V_MAG
 from hilstar.bench.config.road import check_road
+from hilstar.bench.config.sync import check_sync
 from hilstar.bench.config.when import with_epoch
 from hilstar.errors import InputError, shortened
 from hilstar.reading import MAX_TOML_BYTES, parse_toml, read_text
@@ -90,6 +91,10 @@ def _check_meaning(config: BenchConfig, path: Path) -> None:
         raise InputError(
             f"{path}: [faults] endpoint = {config.faults.endpoint}: the attitude comes from there; write another port"
         )
+    try:
+        check_sync(config.sync, config.tracker, config.monitor, config.attitude)
+    except InputError as error:  # it names the tables itself
+        raise InputError(f"{path}: {error}") from error
     try:
         check_road(config.attitude)
     except InputError as error:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 import msgspec
 from msgspec import Meta
 
-from hilstar.bench.config.values import NotNegative, Point, Positive, Rotation, Sigma, Size
+from hilstar.bench.config.values import Frequency, NotNegative, Point, Positive, Rotation, Sigma, Size
 from hilstar.toml_tables import Table
 from hilstar.tracker.settings import DetectorSettings, PixelPitch
 
@@ -42,6 +42,21 @@ class Tracker(Table, frozen=True):
         ),
     ] = 1.0
     exposure_s: Annotated[NotNegative, Meta(description="Exposure time.")] = 0.1
+    frame_hz: Annotated[
+        Frequency | None,
+        Meta(
+            description="How many exposures the tracker takes in a second: with `refresh_hz` it makes the period of their beat "
+            "(see [sync](#sync)).",
+            extra={"default": "one exposure after the other"},
+        ),
+    ] = None
+    trigger: Annotated[
+        Literal["free", "external"],
+        Meta(
+            description='`"free"`: the tracker exposes by its own clock. `"external"`: each exposure begins with a frame of '
+            "the monitor (see [sync](#sync)): nothing beats."
+        ),
+    ] = "free"
     psf_sigma_px: Annotated[
         Sigma,
         Meta(

@@ -9,6 +9,7 @@ from msgspec import Meta
 # The limits keep every product of such numbers within float64; no bench comes near them.
 MIN_POSITIVE, MAX_NUMBER = 1e-6, 1e12
 Positive = Annotated[float, Meta(ge=MIN_POSITIVE, le=MAX_NUMBER)]
+Frequency = Annotated[float, Meta(ge=1e-6, le=1e6)]
 NotNegative = Annotated[float, Meta(ge=0, le=MAX_NUMBER)]
 Magnitude = Annotated[float, Meta(ge=-100, le=100)]
 EpochJyear = Annotated[float, Meta(ge=1800, le=2200)]

@@ -35,6 +35,7 @@ from hilstar.cli.show.running import (
     explain_bench,
     explain_source,
     optional_ledger,
+    optional_pulse,
     optional_scenario,
     run_with_faults,
     say_what_clips,
@@ -107,6 +108,7 @@ def replay(
         FrameImages(output, bench) as record,
         optional_ledger(ledger, bench, notices, overwrite, split) as kept,
         run_with_faults(bench, faults, notices, kept, play.recording) as wrong,
+        optional_pulse(file, notices) as pulse,
     ):
         say_what_clips(bench)
         if explain:
@@ -119,6 +121,6 @@ def replay(
         page = Told("replay", "log", str(log), "clock" if play.paced else "asked")
         parts = Parts(bench, notices, kept, lambda path: Ledger(path, bench, notices, split=split), screen, fault_desk(wrong))
         with on_terminal(status), followed(door, control, page, parts, status, record) as (sink, follower, desk):
-            outlet = Outlet(screen, kept, notices, follower=follower, desk=desk, faults=wrong)
+            outlet = Outlet(screen, kept, notices, follower=follower, desk=desk, faults=wrong, pulse=pulse)
             summary = replay_log(bench, play, sink, outlet)
     end_of_run(summary, screen, kept, as_json)

@@ -14,6 +14,7 @@ import typer
 from hilstar.console.terminal import report, say
 from hilstar.errors import InputError, MachineError
 from hilstar.notices import Notices
+from hilstar.units import NS_PER_S
 
 if TYPE_CHECKING:
     from hilstar.attitude.wire.source import Conventions, Mounting
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
     from hilstar.run.faults.run_faults import AnyFaults
     from hilstar.run.record.ledger_switch import LedgerSwitch
     from hilstar.run.summary import RunSummary
+    from hilstar.run.sync.advice import BeatSummary
+    from hilstar.run.sync.frame_pulse import FramePulse
 
 UTC_MARK = "{utc}"  # in a ledger's name
 Windowed = Annotated[bool, typer.Option("--windowed", help="A window on the desktop instead of the full display.")]
@@ -90,6 +93,31 @@ def say_what_clips(bench: Any) -> None:
     line = clipping_line(bench)
     if line is not None:
         say(line)
+
+
+def say_beat(bench: Any, screen: Any) -> BeatSummary:
+    """What the tracker's exposures make of the refresh of a bench's screen; a line where that matters, with what to write."""
+    from hilstar.run.sync.advice import beat_line, beat_of
+
+    measured_hz = NS_PER_S / screen.clock.period_ns if screen is not None and screen.clock.paced_by_screen else None
+    found = beat_of(bench.config, measured_hz, () if screen is None else screen.window.modes_hz)
+    line = beat_line(found)
+    if line is not None:
+        say(line)
+    return found
+
+
+@contextmanager
+def optional_pulse(file: BenchFile, notices: Notices) -> Iterator[FramePulse | None]:
+    """The pulse at each frame that a bench file asks for; None without one. Raises InputError where its port cannot be had."""
+    from hilstar.run.sync.frame_pulse import FramePulse
+
+    settings = file.config.sync
+    if not settings.port:
+        yield None
+        return
+    with FramePulse.of(settings, notices) as pulse:
+        yield pulse
 
 
 def dated_ledger(path: Path | None) -> Path | None:

@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from msgspec import UNSET
+from msgspec.structs import replace as replaced
 
 from hilstar.cli.options import BenchFile, Explain, Headless, Json, Overwrite, ScenarioFile, check_files
 from hilstar.cli.parsers import parse_split
@@ -22,8 +24,10 @@ from hilstar.cli.show.running import (
     explain_bench,
     explain_source,
     optional_ledger,
+    optional_pulse,
     optional_scenario,
     run_with_faults,
+    say_beat,
     say_what_clips,
     shown_bench,
 )
@@ -93,6 +97,7 @@ def serve(
         shown_bench(file, headless, windowed, force) as (bench, screen),
         optional_ledger(ledger, bench, notices, overwrite, split) as kept,
         run_with_faults(bench, faults, notices, kept) as wrong,
+        optional_pulse(file, notices) as pulse,
     ):
         if explain:
             explain_source(link.conventions, Mounting(file.config.tracker.q_body_to_cam))
@@ -102,14 +107,15 @@ def serve(
         limit = Limit(slots, math.inf if frames is None else frames)
         say(f"{link.verb} {link.endpoint}, {refresh_hz:g} Hz, {bench.renderer.gl_renderer}")
         say_what_clips(bench)
+        beat = UNSET if file.config.attitude.lockstep else say_beat(bench, screen)
         told = Source(f"{link.verb} {link.endpoint}", bench.renderer.gl_renderer, refresh_hz, min(limit.slots, limit.frames))
         status = RunStatus(told, kept)
         page = Told("serve", file.config.attitude.source, link.endpoint, "asked" if file.config.attitude.lockstep else "clock")
         parts = Parts(bench, notices, kept, lambda path: Ledger(path, bench, notices, split=split), screen, fault_desk(wrong))
         with on_terminal(status), followed(door, control, page, parts, status) as (sink, follower, desk):
-            outlet = Outlet(screen, kept, notices, tracker_pictures(link, bench, wrong), follower, desk, wrong)
+            outlet = Outlet(screen, kept, notices, tracker_pictures(link, bench, wrong), follower, desk, wrong, pulse)
             summary = serve_stream(bench, link, limit, sink, outlet)
-    end_of_run(summary, screen, kept, as_json)
+    end_of_run(replaced(summary, beat=beat), screen, kept, as_json)
     if not summary.packets.accepted:
         say(f"no attitude came from {link.endpoint}; start the sender, and check its address")
         raise typer.Exit(NO_ATTITUDE)

@@ -256,6 +256,16 @@ class Window:
         return next(same, None)
 
     @property
+    def modes_hz(self) -> tuple[int, ...]:
+        """The refresh rates that the display has at its size, whole Hz as the system gives them; none where it does not say."""
+        monitor = glfw.get_window_monitor(self._window)
+        if not monitor or self.display is None:
+            return ()
+        modes = glfw.get_video_modes(monitor)
+        same = {int(m.refresh_rate) for m in modes if (m.size.width, m.size.height) == self.display.resolution_px}
+        return tuple(sorted(same - {0}))
+
+    @property
     def timestamp_source(self) -> str:
         """Where the times of `swap` come from."""
         return "after-swap clock" if self._sync is None else "GLX_OML_sync_control"

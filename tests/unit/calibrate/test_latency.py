@@ -1,4 +1,4 @@
-"""A photodiode's edges with the frames that caused them, and how refresh and exposure beat."""
+"""A photodiode's edges with the frames that caused them."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hilstar.calibrate.edges import Edges
-from hilstar.calibrate.latency import beat, pair
+from hilstar.calibrate.latency import pair
 from hilstar.errors import InputError
 from hilstar.run.screen.photodiode import marker_light
 
@@ -36,17 +36,3 @@ def test_edges_of_another_run_are_refused(rng):
     seen = Edges(np.sort(rng.integers(0, swap_ns[-1], 200)), rng.integers(0, 2, 200))
     with pytest.raises(InputError, match="edges fit"):
         pair(seen, shown_edges, PERIOD_NS / 4)
-
-
-def test_the_beat_is_that_of_an_integral_over_frames():
-    """Brute force: the mean over an exposure of where a moving star's frames are, against where it is."""
-    refreshes = 6.3
-    worst = 0.0
-    for phase in np.linspace(0, 1, 101):
-        t = phase + (np.arange(20_000) + 0.5) / 20_000 * refreshes
-        worst = max(worst, abs(np.mean(np.floor(t) + 0.5 - t)))
-    found = beat(60.0, refreshes / 60)
-    assert found.worst_arcsec_per_deg_s == pytest.approx(worst * 60.0, rel=0.01)
-    assert found.period_s == pytest.approx(refreshes / 60 / 0.3)
-    assert beat(60.0, 0.1).period_s is None
-    assert beat(60.0, 0.0).worst_arcsec_per_deg_s is None

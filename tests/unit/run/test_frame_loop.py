@@ -163,3 +163,27 @@ def test_stars_move_within_a_frame_on_a_screen_only_unless_the_bench_file_says_o
         0, 0, Attitude(STILL.q_icrs_to_cam, 0, False, rate_cam_rad_s=rate)
     )
     assert (bench.asked[0] is rate) == paths
+
+
+def test_a_frame_starts_when_it_is_due_or_on_a_screen_when_that_has_swapped_it(tmp_path):
+    clock = FakeClock()
+    bench = SlowBench(tmp_path, clock, lambda number: 0)
+    loop, started = FrameLoop(bench, pacer=ClockPacer(PERIOD_NS, clock)), []
+    loop.on_frame = lambda number, frame_ns: started.append((number, frame_ns, clock.now_ns()))
+    due_ns = clock.now_ns()
+    loop.draw(0, 0, STILL, Moment(0, due_ns, due_ns))
+    assert started == [(0, due_ns, due_ns)]  # before it is drawn
+    due_ns = clock.now_ns() + PERIOD_NS
+    swapped = loop.draw(1, 0, STILL, Moment(1, clock.now_ns(), due_ns, swap_ns=due_ns))
+    at_once = loop.draw(2, 0, STILL)
+    assert started[1:] == [(frame.number, frame.swap_ns, frame.swap_ns) for frame in (swapped, at_once)]
+    assert swapped.swap_ns > swapped.draw_ns
+
+
+def test_a_frame_that_is_given_up_has_no_start_on_a_screen(tmp_path):
+    clock = FakeClock()
+    loop, started = FrameLoop(SlowBench(tmp_path, clock, lambda number: 1e8), pacer=ClockPacer(PERIOD_NS, clock)), []
+    loop.on_frame = lambda number, frame_ns: started.append(number)
+    due_ns = clock.now_ns()
+    assert loop.draw(0, 0, STILL, Moment(0, due_ns, due_ns, swap_ns=due_ns)) is None
+    assert started == []

@@ -1,0 +1,142 @@
+"""A pulse at each frame, for a tracker that takes a trigger: on a thread of its own, for a line may take its time."""
+
+from __future__ import annotations
+
+import threading
+import time
+from types import TracebackType
+from typing import Self
+
+from hilstar.attitude.wire.rts_line import LOST, RtsLine
+from hilstar.bench.config import SyncSettings
+from hilstar.errors import one_line
+from hilstar.notices import Notices
+from hilstar.process.priority import raise_priority
+from hilstar.run.sync.pulse_summary import SyncSummary
+from hilstar.running_statistics import RunningStatistics
+from hilstar.units import NS_PER_MS, NS_PER_S
+
+# How long a frame waits for the thread to take the pulse over, which else would wait for Python's lock: 0.5 ms or more.
+HANDOVER_S = 0.0005
+MIN_BACK_OFF_S, MAX_BACK_OFF_S = 0.1, 2.0
+END_S = 1.0
+
+
+class FramePulse:
+    """Raises a line at every `every_frames`th frame for `pulse_ms`, and never keeps a frame waiting. End it with `close`.
+
+    A frame that comes while the line is still busy, or lost, has no pulse; a lost line is opened again, with back-off.
+    """
+
+    def __init__(self, line: RtsLine, settings: SyncSettings, notices: Notices) -> None:
+        self._line = line
+        self._pulse_ns = round(settings.pulse_ms * NS_PER_MS)
+        self._every = settings.every_frames
+        self._notices = notices
+        self._wanted, self._taken, self._idle = threading.Event(), threading.Event(), threading.Event()
+        self._idle.set()
+        self._frame_ns = 0
+        self._ends = False
+        self._delay_ms, self._line_ms = RunningStatistics(), RunningStatistics()
+        self._skipped = self._lost = 0
+        self._retry_s, self._back_off_s = 0.0, MIN_BACK_OFF_S
+        self._thread = threading.Thread(target=self._run, name="hilstar-pulse", daemon=True)
+        self._thread.start()
+
+    @classmethod
+    def of(cls, settings: SyncSettings, notices: Notices) -> Self:
+        """The pulse that a bench file asks for. Raises InputError where its port cannot be had."""
+        return cls(RtsLine(settings.port, settings.active == "high"), settings, notices)
+
+    def frame(self, number: int, frame_ns: int) -> None:
+        """Start the pulse of frame `number`, whose time stamp (host, ns) is `frame_ns`; waits at most HANDOVER_S."""
+        if number % self._every:
+            return
+        if not self._idle.is_set():
+            self._skipped += 1
+            return
+        self._idle.clear()
+        self._taken.clear()
+        self._frame_ns = frame_ns
+        self._wanted.set()
+        self._taken.wait(HANDOVER_S)
+
+    def _run(self) -> None:
+        raise_priority()
+        while True:
+            self._wanted.wait()
+            self._wanted.clear()
+            if self._ends:
+                return
+            if self._line.is_open:
+                self._pulse()
+            else:
+                self._taken.set()
+                self._skipped += 1
+                self._reopen()
+            self._idle.set()
+
+    def _pulse(self) -> None:
+        try:
+            self._taken.set()
+            begin_ns = time.monotonic_ns()
+            self._line.set(True)
+            set_ns = time.monotonic_ns()
+            time.sleep(max(begin_ns + self._pulse_ns - time.monotonic_ns(), 0) / NS_PER_S)
+            self._line.set(False)
+        except LOST as error:
+            self._lose(error)
+            return
+        self._delay_ms.add((begin_ns - self._frame_ns) / NS_PER_MS)
+        self._line_ms.add((set_ns - begin_ns) / NS_PER_MS)
+
+    def _lose(self, error: BaseException) -> None:
+        self._lost += 1
+        self._skipped += 1
+        why = one_line(str(error))
+        self._notices.tell("sync-lost", f"[sync] port {self._line.port} is gone ({why}): frames go on without their pulse")
+        self._line.close()
+        self._back_off_s = MIN_BACK_OFF_S
+        self._retry_s = time.monotonic() + self._back_off_s
+
+    def _reopen(self) -> None:
+        if time.monotonic() < self._retry_s:
+            return
+        try:
+            self._line.open()
+        except LOST:
+            self._line.close()
+            self._back_off_s = min(2 * self._back_off_s, MAX_BACK_OFF_S)
+            self._retry_s = time.monotonic() + self._back_off_s
+            return
+        self._notices.tell("sync-back", f"[sync] port {self._line.port} is back")
+
+    def summary(self) -> SyncSummary:
+        """The pulses so far, with one that lasts."""
+        self._idle.wait(END_S)
+        delay, line = self._delay_ms, self._line_ms
+        return SyncSummary(
+            port=self._line.port,
+            pulses=delay.count,
+            skipped=self._skipped,
+            lost=self._lost,
+            delay_ms=delay.mean,
+            jitter_ms=delay.deviation,
+            max_delay_ms=delay.max if delay.count else None,
+            line_ms=line.mean,
+        )
+
+    def close(self) -> None:
+        """End the pulse that lasts, and close the port with the line at rest; one that hangs is left to the process's end."""
+        self._idle.wait(END_S)
+        self._ends = True
+        self._wanted.set()
+        self._thread.join(END_S)
+        if not self._thread.is_alive():
+            self._line.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()

@@ -1,0 +1,75 @@
+"""Pulses at a run's frames, over a real socket to a serial port of another thread (RFC 2217)."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from tests.support.benches import bench_text, still_log
+from tests.support.commands import assert_refused, run_hilstar_here
+from tests.support.rts_server import RtsServer
+
+# pyserial's client asks every 50 ms whether the server has set its line: a pulse is two of those, and 0.4 s apart.
+EVERY, REFRESH_HZ, SECONDS = 24, 60, 1.7
+APART_MS = 400.0
+
+
+def bench(tmp_path, port, **sync):
+    path = tmp_path / "bench.toml"
+    tables = {"render": {"quantisation": "round"}, "sync": {"port": port, "every_frames": EVERY, **sync}}
+    path.write_text(bench_text(tables))
+    return path
+
+
+@pytest.fixture
+def server():
+    with RtsServer() as server:
+        yield server
+
+
+def replayed(tmp_path, bench_file):
+    log = still_log(tmp_path / "still.csv")
+    done = run_hilstar_here("replay", bench_file, log, "--headless", "--stop", str(SECONDS), "--json")
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout), done.stderr
+
+
+def test_the_far_port_sees_as_many_pulses_as_are_told_each_so_many_frames(tmp_path, server):
+    summary, _ = replayed(tmp_path, bench(tmp_path, server.url, pulse_ms=20))
+    told, pulses = summary["sync"], server.pulses()
+    assert told["port"] == server.url
+    assert len(pulses) == told["pulses"] and told["pulses"] + told["skipped"] <= 1 + int(SECONDS * REFRESH_HZ) // EVERY
+    assert told["pulses"] >= 3 and told["lost"] == 0
+    assert min(down - up for up, down in pulses) >= 20e6
+    # Seen from the far port, against the grid of frames: what the summary calls jitter, and the socket's own.
+    rises_ms = np.array([up for up, _ in pulses]) / 1e6
+    off_ms = rises_ms - rises_ms[0] - np.round((rises_ms - rises_ms[0]) / APART_MS) * APART_MS
+    assert np.abs(off_ms).max() < APART_MS / 4
+    assert told["jitter_ms"] <= told["max_delay_ms"]
+    assert server.line.edges[-1][1] is False
+
+
+def test_a_port_that_is_cut_stops_no_frame(tmp_path, server):
+    def cut():
+        while not server.pulses():
+            time.sleep(0.01)
+        server.cut()
+
+    thread = threading.Thread(target=cut, daemon=True)
+    thread.start()
+    summary, said = replayed(tmp_path, bench(tmp_path, f"{server.url}?timeout=0.3"))
+    thread.join()
+    assert summary["sync"]["lost"] == 1 and summary["sync"]["pulses"] >= 1
+    assert summary["frames"] + summary["missed_frames"] >= int(SECONDS * REFRESH_HZ)
+    assert summary["events"]["sync-lost"] == 1
+    assert said.count("frames go on without their pulse") == 1
+
+
+def test_a_port_that_is_not_there_is_a_wrong_file(tmp_path):
+    path = bench(tmp_path, "/dev/nothing-there")
+    result = run_hilstar_here("serve", path, "--headless", "--frames", "1")
+    assert_refused(result, 2, "[sync] port = /dev/nothing-there", "write the serial port")

@@ -3,34 +3,47 @@
 // is the same in NumPy and says how; the ten sums are those of hilstar/monitor/balance.py.
 // It comes after the linear image and its nearest levels, and changes those levels. A pixel is the star's that gives more than half
 // of its light, so no pixel is written by two.
-// Defined before this text: LEVELS (r8ui or r16ui), NEAR, the pixels that are chosen, and BITS (uvec2 or uvec4), with a bit for each.
+// Defined before this text: LEVELS (r8ui or r16ui) and NEAR, the most pixels that are chosen.
+// On a CPU what is read costs most: a word for a pixel's place, once, and images rather than textures. And a branch costs both its
+// sides there, since eight stars go together: so nothing is decided by the number of a pixel, and loops end where a star's do.
 
 layout(local_size_x = 32) in;
 
-struct Place {
-    int x_px, y_px;      // from the star's own pixel
-    float box_3, box_5;  // its weight in boxes of 3 and 5 tracker pixels about the star's nearest
-};
+#if NEAR <= 32
+#define BITS uint
+#elif NEAR <= 64
+#define BITS uvec2
+#else
+#define BITS uvec4
+#endif
+
 layout(std430, binding = 0) readonly buffer Sprites { int sprite[]; };        // five words each, as SPRITE_DTYPE
-layout(std430, binding = 1) readonly buffer Order { Place order[]; };         // a footprint's pixels by distance, for each phase
+layout(std430, binding = 1) readonly buffer Order { uint order[]; };          // a footprint's pixels by distance, for each phase
 layout(std430, binding = 2) readonly buffer Light { float light_e_per_s[]; }; // of each level, white twice
 #ifdef PATHS
 layout(std430, binding = 3) readonly buffer Stretches { ivec4 stretch[]; };   // its sprites: first, end; its path's: first, end
 #endif
 layout(LEVELS, binding = 0) uniform uimage2D levels;
-uniform sampler2D linear_e_per_s;
+layout(r32f, binding = 1) readonly uniform image2D linear_e_per_s;
 #ifdef UNIFORMITY
 uniform sampler2D gain;
 #endif
 
 uniform int count;
-uniform int footprint;  // pixels in all, of which NEAR are chosen
+uniform int footprint;  // pixels in all
+uniform float reach_px2, reach_per_e; // how many of them are chosen: as PixelOrder.reach in pixel_order.py
+uniform int fewest;
 uniform int white;
 uniform float first_threshold_e_per_s;
 uniform ivec2 resolution_px;
 uniform float odd;      // 0.5 for footprints with a middle
 uniform vec2 inverse_sigma_sqrt2;
 uniform vec2 half_inverse_window2;
+#ifdef PATHS
+uniform vec2 half_inverse_spread2;  // of the Gaussian and a pixel together
+const float PI = 3.14159265;
+#endif
+uniform vec2 boxes;     // the weights of a box of 3 tracker pixels and of one of 5, of a 1023rd of a pixel in them
 uniform vec4 follows;   // of the box of 3 tracker pixels along x and y, and of the one of 5
 uniform vec4 weights;   // light and moments, of all and under the window
 uniform float few_steps;
@@ -41,7 +54,6 @@ const int KEPT = 8;
 const float NONE = 1e30;
 const float SAME_STEP = 1e-4;
 const float OFF = 0.6;  // of a step, where steps are equal: then one more pixel is turned
-const int REACH = 3;  // sprites of a path before and after that reach a sprite's pixels
 
 struct Choice {
     vec4 a;  // light, moments, light under the window
@@ -67,31 +79,49 @@ vec4 erf4(vec4 value) {  // as in splat.frag
     return x * p / q;
 }
 
-void set_bit(inout BITS bits, int k) {
-    bits[k >> 5] |= 1u << (k & 31);
+#if NEAR <= 32
+BITS bit_of(int k) {
+    return 1u << k;
+}
+
+bool has_bit(BITS bits, int k) {
+    return (bits & (1u << k)) != 0u;
+}
+#else
+BITS bit_of(int k) {
+    BITS bits = BITS(0u);
+    bits[k >> 5] = 1u << (k & 31);
+    return bits;
 }
 
 bool has_bit(BITS bits, int k) {
     return (bits[k >> 5] & (1u << (k & 31))) != 0u;
 }
+#endif
 
-ivec2 pixel_of(int i) {
-    return ivec2(sprite[5 * i], sprite[5 * i + 1]);
+// A sprite, or one that is not there: without light.
+struct Star {
+    ivec2 pixel;
+    vec2 fraction;
+    float e_per_s;
+};
+
+Star star_of(int i) {
+    return Star(
+        ivec2(sprite[5 * i], sprite[5 * i + 1]),
+        vec2(intBitsToFloat(sprite[5 * i + 2]), intBitsToFloat(sprite[5 * i + 3])),
+        intBitsToFloat(sprite[5 * i + 4]));
 }
 
-vec2 fraction_of(int i) {
-    return vec2(intBitsToFloat(sprite[5 * i + 2]), intBitsToFloat(sprite[5 * i + 3]));
-}
-
-float share_of(int i, ivec2 at) {
-    vec2 d = vec2(at - pixel_of(i)) - fraction_of(i);
+// A star's light in a pixel at `d` from it.
+float light_at(Star star, vec2 d) {
     vec4 e = erf4(vec4(d - 0.5, d + 0.5) * inverse_sigma_sqrt2.xyxy);
     vec2 share = max(e.zw - e.xy, 0.0);
-    return intBitsToFloat(sprite[5 * i + 4]) * 0.25 * share.x * share.y;
+    return star.e_per_s * 0.25 * share.x * share.y;
 }
 
-ivec2 offset_of(int place) {
-    return ivec2(order[place].x_px, order[place].y_px);
+ivec2 offset_of(uint place) {
+    return ivec2(place & 63u, place >> 6 & 63u) - 32;
 }
 
 // exp(-u) within 0.03: exp itself is a fifth of the whole pass on a CPU.
@@ -106,32 +136,13 @@ bool on_image(ivec2 at) {
     return all(greaterThanEqual(at, ivec2(0))) && all(lessThan(at, resolution_px));
 }
 
-#ifdef PATHS
-// Whether a pixel is nearer to a sprite than to those before and after it in its path.
-bool nearest_in(ivec2 path, int i, ivec2 at) {
-    float own = share_of(i, at);
-    return (i == path.x || share_of(i - 1, at) < own) && (i + 1 == path.y || share_of(i + 1, at) <= own);
-}
-#endif
-
 // What a pixel's error is multiplied by in each sum; `d` is it from the star, `off` the star from its nearest pixel.
-void arms_of(int place, vec2 d, vec2 off, float light_weight, out vec4 a, out vec4 b, out vec2 c) {
+void arms_of(uint place, vec2 d, vec2 off, float light_weight, out vec4 a, out vec4 b, out vec2 c) {
     float window = window_at(d);
+    vec2 box = vec2(place >> 12 & 1023u, place >> 22) * boxes;
     a = vec4(light_weight, weights.y * d, weights.z * window);
-    b = vec4(weights.w * window * d, order[place].box_3 * (d + follows.xy * off));
-    c = order[place].box_5 * (d + follows.zw * off);
-}
-
-// The light that a pixel should show, e-/s, negative where it is not this star's; `own` is the sprite's part.
-float asked_of(int i, ivec2 path, ivec2 at, float own) {
-    float whole = own;
-#ifdef PATHS
-    for (int j = max(path.x, i - REACH); j < min(path.y, i + REACH + 1); j++)
-        if (j != i) whole += share_of(j, at);
-#endif
-    // A faint star's sprite may end before its near pixels do.
-    float asked = max(texelFetch(linear_e_per_s, at, 0).r, whole);
-    return 2.0 * whole > asked * 1.0001 ? asked : -1.0;
+    b = vec4(weights.w * window * d, box.x * (d + follows.xy * off));
+    c = box.y * (d + follows.zw * off);
 }
 
 float output_of(ivec2 at) {
@@ -140,6 +151,49 @@ float output_of(ivec2 at) {
 #else
     return 1.0;
 #endif
+}
+
+#ifdef PATHS
+const int BESIDE = 2;  // sprites of a path before and after that reach a sprite's pixels
+
+// The sprites about sprite `i` of a path: place from its pixel, and the exponent of its light, far below any where there is none.
+vec3 beside[2 * BESIDE + 1];
+
+void look_beside(int i, ivec2 path) {
+    ivec2 pixel = star_of(i).pixel;
+    for (int j = 0; j < 2 * BESIDE + 1; j++) {
+        int other = i + j - BESIDE;
+        Star star = star_of(clamp(other, path.x, path.y - 1));
+        bool there = other >= path.x && other < path.y;
+        beside[j] = vec3(vec2(star.pixel - pixel) + star.fraction, there ? log(max(star.e_per_s, 1e-30)) : -NONE);
+    }
+}
+
+float exponent_of(int j, vec2 offset) {
+    vec2 d = offset - beside[j].xy;
+    return beside[j].z - dot(d * d, half_inverse_spread2);
+}
+
+// Whether a pixel is nearer to a sprite than to those before and after it in its path.
+bool nearest_in_path(vec2 offset) {
+    float own = exponent_of(BESIDE, offset);
+    return exponent_of(BESIDE - 1, offset) < own && exponent_of(BESIDE + 1, offset) <= own;
+}
+
+// The light of a path in a pixel, within some hundredths.
+float path_light_at(vec2 offset) {
+    float light = 0.0;
+    for (int j = 0; j < 2 * BESIDE + 1; j++) light += exp(exponent_of(j, offset));
+    return light * sqrt(half_inverse_spread2.x * half_inverse_spread2.y) / PI;
+}
+#endif
+
+// The light that a pixel should show, e-/s, negative where it is not this star's; `own` is what the star gives.
+float asked_of(ivec2 at, float own) {
+    if (!on_image(at)) return -1.0;
+    float drawn = imageLoad(linear_e_per_s, at).r;
+    // A faint star's sprite may end before its near pixels do.
+    return 2.0 * own > drawn * 1.0001 ? (drawn > 0.0 ? drawn : own) : -1.0;
 }
 
 Choice pick(bool first, Choice x, Choice y) {
@@ -175,72 +229,87 @@ Choice moved(Choice e, vec4 a, vec4 b, vec2 c, float by, float square, BITS bit)
     kept[M] = moved(in_m, a, b, c, up_m ? s + t : s, both_n ? worse_n : better_m, up_m ? bit : BITS(0u)); \
     kept[N] = moved(in_n, a, b, c, up_n ? s + t : s, both_m ? worse_m : better_n, up_n ? bit : BITS(0u)); }
 
+// One pixel decided in all choices.
+#define DECIDE(K, PAIRS) { \
+    float s = short_of[K], t = step_of[K]; \
+    vec4 a, b; \
+    vec2 c; \
+    arms_of(place[K], vec2(offset_of(place[K])) - fraction, off, light_weight, a, b, c); \
+    float aa = dot(a, a) + dot(b, b) + dot(c, c); \
+    BITS bit = bit_of(K); \
+    float lower[KEPT], rise[KEPT]; \
+    EIGHT(LOWER) \
+    PAIRS(KEEP_THE_BETTER) }
+
 // Choose the levels of one sprite; `carried` is light and moments about it that it has to make up for, in steps from black, and
-// what is returned is what it leaves.
-vec3 choose(int i, ivec2 path, vec3 carried) {
-    ivec2 pixel = pixel_of(i);
-    vec2 fraction = fraction_of(i);
+// what is returned is what it leaves. `of_light` is the light of the whole star.
+vec3 choose(Star star, float of_light, vec3 carried) {
+    ivec2 pixel = star.pixel;
+    vec2 fraction = star.fraction;
     ivec2 cell = clamp(ivec2((fraction + odd) * float(PHASES)), 0, PHASES - 1);
     int first = (cell.y * PHASES + cell.x) * footprint;
     float unit = light_e_per_s[1];
     float white_e_per_s = light_e_per_s[white];
+    int reach = clamp(int(reach_px2 * log(max(of_light * reach_per_e, 1.0))), fewest, NEAR);
 
-    int place[NEAR];
-    int mine = NEAR;
-#ifdef PATHS
-    mine = 0;
-    for (int k = 0; k < NEAR; k++)
-        if (nearest_in(path, i, pixel + offset_of(first + k))) place[mine++] = first + k;
-#else
-    for (int k = 0; k < NEAR; k++) place[k] = first + k;
-#endif
-    float short_of[NEAR];
-    float step_of[NEAR];
+    uint place[NEAR + 2];
+    float short_of[NEAR + 2];
+    float step_of[NEAR + 2];
     BITS rounded_up = BITS(0u);
     vec3 seen = vec3(0.0);  // own light and moments, in this star's pixels and others'
     float largest = 0.0, smallest = NONE, lowest = 0.0;
-    for (int k = 0; k < mine; k++) {
-        ivec2 offset = offset_of(place[k]);
+    int mine = 0;
+    for (int k = 0; k < reach; k++) {
+        uint here = order[first + k];
+        ivec2 offset = offset_of(here);
         ivec2 at = pixel + offset;
-        float own = share_of(i, at);
-        seen += own * vec3(1.0, vec2(offset) - fraction);
-        short_of[k] = 0.0;
-        step_of[k] = 0.0;
-        float asked = on_image(at) ? asked_of(i, path, at, own) : -1.0;
-        if (asked < 0.0) continue;
-        float factor = output_of(at);
-        asked = min(asked / factor, white_e_per_s);
-        int level = int(imageLoad(levels, at).r);
-        float shown = light_e_per_s[level];
-        bool above = shown > asked;
-        float low = above ? light_e_per_s[level - 1] : shown;
-        float next = above ? shown : light_e_per_s[level + 1];
-        if (above) set_bit(rounded_up, k);
-        factor /= unit;
-        short_of[k] = (low - asked) * factor;
-        step_of[k] = (next - low) * factor;
-        lowest += short_of[k];
-        if (step_of[k] > 0.0) {
-            largest = max(largest, step_of[k]);
-            smallest = min(smallest, step_of[k]);
+#ifdef PATHS
+        if (!nearest_in_path(vec2(offset))) continue;
+        float own = path_light_at(vec2(offset));
+#else
+        vec2 d = vec2(offset) - fraction;
+        float own = light_at(star, d);
+        seen += own * vec3(1.0, d);
+#endif
+        float s = 0.0, t = 0.0, asked = asked_of(at, own);
+        if (asked >= 0.0) {
+            float factor = output_of(at);
+            asked = min(asked / factor, white_e_per_s);
+            int level = int(imageLoad(levels, at).r);
+            float shown = light_e_per_s[level];
+            bool above = shown > asked;
+            float other = light_e_per_s[above ? level - 1 : level + 1];
+            float low = above ? other : shown;
+            factor /= unit;
+            s = (low - asked) * factor;
+            t = abs(other - shown) * factor;
+            lowest += s;
+            if (above) rounded_up |= bit_of(mine);
+            largest = max(largest, t);
+            smallest = t > 0.0 ? min(smallest, t) : smallest;
         }
+        place[mine] = here;
+        short_of[mine] = s;
+        step_of[mine] = t;
+        mine++;
     }
     vec3 error = carried;
 #ifndef PATHS
-    for (int k = NEAR; k < footprint; k++) {
-        ivec2 offset = offset_of(first + k);
+    for (int k = reach; k < footprint; k++) {
+        ivec2 offset = offset_of(order[first + k]);
         ivec2 at = pixel + offset;
-        float own = share_of(i, at);
+        vec2 d = vec2(offset) - fraction;
+        float own = light_at(star, d);
         if (2.0 * own < first_threshold_e_per_s) break;
-        vec3 arm = vec3(1.0, vec2(offset) - fraction);
+        vec3 arm = vec3(1.0, d);
         seen += own * arm;
-        float asked = on_image(at) ? asked_of(i, path, at, own) : -1.0;
+        float asked = asked_of(at, own);
         if (asked < 0.0) continue;
         float factor = output_of(at);
         error += (light_e_per_s[imageLoad(levels, at).r] - min(asked / factor, white_e_per_s)) * factor / unit * arm;
     }
     // What lies further out stays dark. A sprite's moments about its centre are 0.
-    error -= (vec3(intBitsToFloat(sprite[5 * i + 4]), 0.0, 0.0) - seen) / unit;
+    error -= (vec3(star.e_per_s, 0.0, 0.0) - seen) / unit;
 #endif
     vec3 left = error;
     bool equal = largest > 0.0 && largest <= smallest * (1.0 + SAME_STEP);
@@ -249,28 +318,23 @@ vec3 choose(int i, ivec2 path, vec3 carried) {
         error.x -= all_down - round(all_down / largest) * largest;
     }
 
-    vec2 nearest = round(fraction);
-    vec2 off = fraction - nearest;
+    vec2 off = fraction - round(fraction);
     // As light_weight in balance.py.
-    float light_weight = weights.x * (1.0 + few_steps * unit / max(intBitsToFloat(sprite[5 * i + 4]), 1e-3 * unit));
+    float light_weight = weights.x * (1.0 + few_steps * unit / max(star.e_per_s, 1e-3 * unit));
     vec3 begin = error * vec3(light_weight, weights.yy);
     Choice kept[KEPT];
 #define BEGIN(M) kept[M] = Choice(vec4(begin, 0.0), vec4(0.0), vec2(0.0), M == 0 ? dot(begin, begin) : NONE, BITS(0u));
     EIGHT(BEGIN)
-    for (int k = 0; k < mine; k++) {
-        float s = short_of[k], t = step_of[k];
-        if (s == 0.0 && t == 0.0) continue;
-        ivec2 offset = offset_of(place[k]);
-        vec2 d = vec2(offset) - fraction;
-        vec4 a, b;
-        vec2 c;
-        arms_of(place[k], d, off, light_weight, a, b, c);
-        float aa = dot(a, a) + dot(b, b) + dot(c, c);
-        BITS bit = BITS(0u);
-        set_bit(bit, k);
-        float lower[KEPT], rise[KEPT];
-        EIGHT(LOWER)
-        if (k % 3 == 0) { NEXT_TO_EACH(KEEP_THE_BETTER) } else if (k % 3 == 1) { TWO_APART(KEEP_THE_BETTER) } else { FOUR_APART(KEEP_THE_BETTER) }
+    // Three pixels at a time, the last of which may be none: those change nothing.
+    for (int k = mine; k < mine + 2; k++) {
+        place[k] = 0u;
+        short_of[k] = 0.0;
+        step_of[k] = 0.0;
+    }
+    for (int k = 0; k < mine; k += 3) {
+        DECIDE(k, NEXT_TO_EACH)
+        DECIDE(k + 1, TWO_APART)
+        DECIDE(k + 2, FOUR_APART)
     }
     Choice best = kept[0];
     best.square += (last_light * last_light - 1.0) * best.a.x * best.a.x;
@@ -292,16 +356,15 @@ vec3 choose(int i, ivec2 path, vec3 carried) {
             turned = more < least ? k : turned;
             least = min(more, least);
         }
-        if (least < NONE) best.up[turned >> 5] ^= 1u << (turned & 31);
+        if (least < NONE) best.up ^= bit_of(turned);
     }
     for (int k = 0; k < mine; k++) {
         bool up = has_bit(best.up, k);
-        vec2 d = vec2(offset_of(place[k])) - fraction;
-        left += (short_of[k] + (up ? step_of[k] : 0.0)) * vec3(1.0, d);
+        ivec2 offset = offset_of(place[k]);
+        left += (short_of[k] + (up ? step_of[k] : 0.0)) * vec3(1.0, vec2(offset) - fraction);
         if (step_of[k] == 0.0 || up == has_bit(rounded_up, k)) continue;
-        ivec2 at = pixel + offset_of(place[k]);
-        uint level = imageLoad(levels, at).r;
-        imageStore(levels, at, uvec4(up ? level + 1u : level - 1u));
+        uint level = imageLoad(levels, pixel + offset).r;
+        imageStore(levels, pixel + offset, uvec4(up ? level + 1u : level - 1u));
     }
     return left;
 }
@@ -312,13 +375,16 @@ void main() {
 #ifdef PATHS
     vec3 carried = vec3(0.0);
     for (int node = stretch[i].x; node < stretch[i].y; node++) {
+        look_beside(node, stretch[i].zw);
         if (node > stretch[i].x) {
-            vec2 away = vec2(pixel_of(node) - pixel_of(node - 1)) + fraction_of(node) - fraction_of(node - 1);
+            vec2 away = beside[BESIDE].xy - beside[BESIDE - 1].xy;
             carried.yz -= carried.x * away;
         }
-        carried = choose(node, stretch[i].zw, carried);
+        Star star = star_of(node);
+        carried = choose(star, star.e_per_s * float(stretch[i].w - stretch[i].z), carried);
     }
 #else
-    choose(i, ivec2(0), vec3(0.0));
+    Star star = star_of(i);
+    choose(star, star.e_per_s, vec3(0.0));
 #endif
 }

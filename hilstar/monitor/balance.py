@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilstar.arrays import Float32Array
+from hilstar.arrays import Float32Array, FloatArray, IntArray
 
 PIXEL_VARIANCE = 1 / 12  # a pixel's width adds to the sigma that it samples
 SUMS = 10
@@ -29,6 +29,7 @@ LAST_LIGHT = 3.5
 # The Gaussian's variance beyond the sprite's, in variances of the blur: a fit has 0 before the blur and 2 after it.
 WINDOW_BLURS = 0.6
 BOX_REACH = 15  # px from a star's nearest pixel; the boxes' weights are tabulated up to there
+IN_BOX = 1023  # what a pixel's part in a box is counted in: ten bits of the shader's
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,14 +67,20 @@ class Balance:
         x, y = (math.sqrt(s**2 + PIXEL_VARIANCE + WINDOW_BLURS * self.seen.blur_px**2) for s in self.sigma_px)
         return x, y
 
-    def box(self, side: int) -> Float32Array:
-        """The weight of pixels 0 to BOX_REACH from a star's nearest, along one axis, in a box of `side` tracker pixels."""
+    def in_box(self, side: int, away_x: FloatArray | Float32Array, away_y: FloatArray | Float32Array) -> IntArray:
+        """How much of a pixel so many pixels from a star's nearest is in a box of `side` tracker pixels, of IN_BOX."""
+        x, y = (np.minimum(np.abs(away), BOX_REACH).astype(np.intp) for away in (away_x, away_y))
+        table = self._box(side)
+        return np.asarray(np.rint(table[x] * table[y] * IN_BOX), dtype=np.intp)
+
+    def _box(self, side: int) -> FloatArray:
+        """The part of pixels 0 to BOX_REACH from a star's nearest, along one axis."""
         from scipy.special import ndtr
 
         half, away = side * self.seen.pixel_px / 2, np.arange(BOX_REACH + 1)
         # A box without blur keeps an edge of half a pixel: where the tracker's pixels lie on the monitor's is not known.
         blur = max(self.seen.blur_px, 0.25)
-        return np.asarray(ndtr((away + half) / blur) - ndtr((away - half) / blur), dtype=np.float32)
+        return np.asarray(ndtr((away + half) / blur) - ndtr((away - half) / blur))
 
     def follows(self, side: int) -> tuple[float, float]:
         """How far a star's centre of mass in a box follows the box: 0 where it holds all light, 1 in an even field."""
@@ -89,7 +96,7 @@ class Balance:
         """
         fraction = np.asarray(fraction_px, dtype=np.float32)[:, None]
         nearest = np.rint(fraction)
-        away = np.minimum(np.abs(offset_px - nearest), BOX_REACH).astype(np.intp)
+        away = offset_px - nearest
         d = (offset_px - fraction).astype(np.float32)
         off = fraction - nearest
         # Of eighth power for exp(-u), within 0.03: the shader's time is what it is for.
@@ -99,8 +106,9 @@ class Balance:
         arms[0], arms[1:3] = light_weight(steps, self.few_steps), ALL_MOMENTS * d
         arms[3], arms[4:6] = WINDOW_LIGHT * window, WINDOW_MOMENTS * window * d
         for first, side, weight in zip((6, 8), (3, 5), self.box_weights, strict=True):
-            table, follows = self.box(side), np.array(self.follows(side), dtype=np.float32)[:, None, None]
-            arms[first : first + 2] = weight * table[away[0]] * table[away[1]] * (d + follows * off)
+            follows = np.array(self.follows(side), dtype=np.float32)[:, None, None]
+            box = np.float32(weight / IN_BOX) * self.in_box(side, *away).astype(np.float32)
+            arms[first : first + 2] = box * (d + follows * off)
         return arms
 
 

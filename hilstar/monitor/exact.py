@@ -109,14 +109,22 @@ class ExactQuantiser:
             levels = np.empty(found.place.shape, dtype=self._flat.dtype)
             carried = self._carried(sprites)
             left = np.empty_like(carried.error)
+            reach = self._reach(found.rate_e_per_s * _in_path(sprites).astype(np.float32))
             for some in _turns(sprites):
-                levels[:, some], left[:, some] = self._choose(_part(found, some), carried.of(some))
+                levels[:, some], left[:, some] = self._choose(_part(found, some), carried.of(some), reach[some])
                 _hand_on(carried.error, left, some, sprites)
             self._keep(sprites, left)
             self._lit = found.place.ravel()
             self._flat[self._lit] = levels.ravel()
             self._flat[-1] = 0
         return self._flat[:-1].reshape(height, width)
+
+    def _reach(self, of_star_e_per_s: Float32Array) -> IntArray:
+        """How many pixels of stars of so much light (n,) are chosen, (n,); over frames all, for each has its turn."""
+        order = self._map.order
+        if self.over_frames:
+            return np.full(len(of_star_e_per_s), order.near)
+        return order.reach(of_star_e_per_s / np.float32(self._step_e_per_s))
 
     def _carried(self, sprites: Sprites) -> Carried:
         """What each sprite begins with: nothing, in a frame that is right by itself."""
@@ -129,23 +137,29 @@ class ExactQuantiser:
     def _keep(self, sprites: Sprites, left: Float32Array) -> None:
         """Take notice of the errors (SUMS, n) that a frame's sprites leave."""
 
-    def _choose(self, found: Footprints, carried: Carried) -> tuple[IntArray, Float32Array]:
-        """The levels of a chunk of stars, (pixels, n), and the errors that they and those `carried` leave, (SUMS, n)."""
+    def _choose(self, found: Footprints, carried: Carried, reach: IntArray) -> tuple[IntArray, Float32Array]:
+        """The levels of a chunk of stars, (pixels, n), and the errors that they and those `carried` leave, (SUMS, n).
+
+        Of each star the nearest `reach` (n,) pixels are chosen.
+        """
         near = self._map.order.near
         lower, upper, short, step = self._levels_about(found)
+        chosen = np.arange(near)[:, None] < reach
+        far, short, step = short.copy(), np.where(chosen, short[:near], np.float32(0)), np.where(chosen, step, np.float32(0))
+        far[:near][chosen] = 0.0
         d = found.offset_px - found.fraction_px[:, None]
         arm = self._balance.arms(
             found.offset_px[:, :near], found.fraction_px, found.rate_e_per_s / np.float32(self._step_e_per_s)
         )
         error = self._bounded(carried.error, step).copy()
-        error[:3] += _plain_sums(short[near:], d[:, near:])
+        error[:3] += _plain_sums(far, d)
         grid = _equal_step(step)
         error[0] += carried.phase * grid
-        hidden = _between_steps(short[:near].sum(axis=0) + error[0], grid)
+        hidden = _between_steps(short.sum(axis=0) + error[0], grid)
         error[0] -= hidden
         weight = np.stack([arm[0, 0], *np.full((2, len(grid)), np.float32(ALL_MOMENTS))])
         error[:3] *= weight
-        up, left = _decide(_Pixels(short[:near], step, arm, error), grid)
+        up, left = _decide(_Pixels(short, step, arm, error), grid)
         left[:3] /= weight
         left[0] += hidden
         return np.concatenate([lower + up, upper]), left
@@ -196,7 +210,7 @@ def _turns(sprites: Sprites) -> Iterator[IntArray]:
     """The sprites in chunks, each of a path after those before it; a long path is begun anew in places."""
     place = np.arange(len(sprites))
     if sprites.per_star > 1:
-        begins = np.flatnonzero(np.diff(sprites.star, prepend=-1))
+        begins = np.flatnonzero(np.diff(sprites.star, prepend=sprites.star[0] - 1))
         place = (place - np.repeat(begins, np.diff(begins, append=len(sprites)))) % CARRIED
         order = np.argsort(place, kind="stable")
     else:
@@ -204,6 +218,15 @@ def _turns(sprites: Sprites) -> Iterator[IntArray]:
     for turn in np.split(order, np.flatnonzero(np.diff(place[order])) + 1):
         for start in range(0, len(turn), CHUNK):
             yield turn[start : start + CHUNK]
+
+
+def _in_path(sprites: Sprites) -> IntArray:
+    """How many sprites the path of each has, (n,)."""
+    if sprites.per_star == 1:
+        return np.ones(len(sprites), dtype=np.intp)
+    begins = np.flatnonzero(np.diff(sprites.star, prepend=sprites.star[0] - 1))
+    lengths = np.diff(begins, append=len(sprites))
+    return np.asarray(np.repeat(lengths, lengths))
 
 
 def _hand_on(carried: Float32Array, left: Float32Array, some: IntArray, sprites: Sprites) -> None:

@@ -10,17 +10,15 @@ from hilstar.arrays import IntArray
 from hilstar.monitor.balance import (
     ALL_LIGHT,
     ALL_MOMENTS,
-    BOX_3,
-    BOX_5,
-    BOX_REACH,
-    FEW_STEPS,
+    IN_BOX,
     LAST_LIGHT,
+    PIXEL_VARIANCE,
     WINDOW_LIGHT,
     WINDOW_MOMENTS,
     Balance,
 )
 from hilstar.monitor.exact import CARRIED
-from hilstar.monitor.pixel_order import PixelOrder
+from hilstar.monitor.pixel_order import FEWEST, LEAST_LIGHT, PixelOrder
 from hilstar.monitor.quantise import Panel
 from hilstar.render.encoder import LevelTexture
 from hilstar.resources import resource_path
@@ -29,8 +27,8 @@ from hilstar.scene.sprites import Sprites
 
 MIN_VERSION = 430  # of OpenGL, for compute shaders
 MAX_NEAR = 128  # pixels of a star that the shader has bits for: sprites up to a sigma of 1.8 px
+MAX_SIZE = 63  # of a footprint whose places fit into their six bits
 LOCAL_SIZE = 32  # as in exact.comp
-PLACE_DTYPE = np.dtype([("x_px", "<i4"), ("y_px", "<i4"), ("box_3", "<f4"), ("box_5", "<f4")])
 
 
 class ExactPass:
@@ -51,29 +49,34 @@ class ExactPass:
     @staticmethod
     def runs_on(ctx: moderngl.Context, sigma_px: tuple[float, float]) -> bool:
         """Whether this GL has compute shaders, and the shader bits enough for the sprites' pixels."""
-        return ctx.version_code >= MIN_VERSION and PixelOrder(sigma_px).near <= MAX_NEAR
+        order = PixelOrder(sigma_px)
+        return ctx.version_code >= MIN_VERSION and order.near <= MAX_NEAR and order.size <= MAX_SIZE
 
     def _build(self, panel: Panel, balance: Balance, paths: bool) -> moderngl.ComputeShader:
-        near = self._pixels.near
-        defines = [f"NEAR {near}", f"BITS uvec{2 if near <= 64 else 4}", f"LEVELS r{8 * self._levels_bytes()}ui"]
+        order = self._pixels
+        defines = [f"NEAR {order.near}", f"LEVELS r{8 * self._levels_bytes()}ui"]
         defines += ["PATHS"] * paths + ["UNIFORMITY"] * (self._gain is not None)
         version, body = resource_path("shaders", "exact.comp").read_text().split("\n", 1)
         program = self._ctx.compute_shader("\n".join([version, *(f"#define {name}" for name in defines), body]))
         window = balance.window_px
         values = {
-            "footprint": self._pixels.size**2,
+            "footprint": order.size**2,
+            "reach_px2": order.area_px2,
+            "reach_per_e": 1 / (order.area_px2 * LEAST_LIGHT * float(panel.light_e_per_s()[1])),
+            "fewest": order.near if balance.over_frames else min(FEWEST, order.near),
             "white": panel.response.white,
             "first_threshold_e_per_s": float(panel.response.threshold[0] * panel.flux_at_white_e_per_s),
             "resolution_px": self._linear.size,
-            "odd": self._pixels.bias,
+            "odd": order.bias,
             "inverse_sigma_sqrt2": tuple(1 / (sigma * SQRT2) for sigma in balance.sigma_px),
             "half_inverse_window2": (0.5 / window[0] ** 2, 0.5 / window[1] ** 2),
+            "half_inverse_spread2": tuple(0.5 / (sigma**2 + PIXEL_VARIANCE) for sigma in balance.sigma_px),
+            "boxes": tuple(weight / IN_BOX for weight in balance.box_weights),
             "follows": (*balance.follows(3), *balance.follows(5)),
             "weights": (ALL_LIGHT, ALL_MOMENTS, WINDOW_LIGHT, WINDOW_MOMENTS),
-            "few_steps": FEW_STEPS,
+            "few_steps": balance.few_steps,
             "last_light": LAST_LIGHT,
-            "linear_e_per_s": 0,
-        } | ({"gain": 1} if self._gain is not None else {})
+        } | ({"gain": 0} if self._gain is not None else {})
         for name, value in values.items():
             if name in program:  # compilers drop what they do not need
                 program[name] = value
@@ -93,10 +96,10 @@ class ExactPass:
         buffer.bind_to_storage_buffer(0)
         self._order.bind_to_storage_buffer(1)
         self._light.bind_to_storage_buffer(2)
-        self._linear.use(0)
         if self._gain is not None:
-            self._gain.use(1)
+            self._gain.use(0)
         self._levels.bind_to_image(0, read=True, write=True)
+        self._linear.bind_to_image(1, read=True, write=False)
         program["count"] = count
         program.run(-(-count // LOCAL_SIZE))
         self._ctx.memory_barrier()
@@ -112,24 +115,17 @@ class ExactPass:
         self._stretches.bind_to_storage_buffer(3)
 
 
-def _places(order: PixelOrder, balance: Balance) -> npt.NDArray[np.void]:
-    """The shader's places: a footprint's pixels by distance for each phase, with their weights in the boxes."""
+def _places(order: PixelOrder, balance: Balance) -> npt.NDArray[np.uint32]:
+    """The shader's places: a footprint's pixels by distance for each phase; in a word x, y and their parts in the boxes."""
     x, y = order.places()
-    away_x, away_y = (
-        np.minimum(np.abs(at - np.rint(middle)[:, None]), BOX_REACH).astype(np.intp)
-        for at, middle in zip((x, y), order.phases, strict=True)
-    )
-    places = np.empty(x.shape, dtype=PLACE_DTYPE)
-    places["x_px"], places["y_px"] = x, y
-    for name, side, weight in (("box_3", 3, BOX_3), ("box_5", 5, BOX_5)):
-        table = balance.box(side)
-        places[name] = weight * table[away_x] * table[away_y]
-    return places
+    away = [at - np.rint(middle)[:, None] for at, middle in zip((x, y), order.phases, strict=True)]
+    words = x + 32 | (y + 32) << 6 | balance.in_box(3, *away) << 12 | balance.in_box(5, *away) << 22
+    return np.asarray(words, dtype=np.uint32)
 
 
 def stretches_of(star: IntArray) -> IntArray:
     """The parts of paths whose sprites hand on their errors, (n, 4): first and end of each, and of its path."""
-    begins = np.flatnonzero(np.diff(star, prepend=-1))
+    begins = np.flatnonzero(np.diff(star, prepend=star[0] - 1))
     ends = np.append(begins[1:], len(star))
     parts = -(-(ends - begins) // CARRIED)
     path = np.repeat(np.arange(len(begins)), parts)

@@ -12,6 +12,7 @@ from hilstar.calibrate.first_light.records import PAGE_FILE, Figure, Record, Ses
 from hilstar.errors import InputError
 from hilstar.files import write_whole
 from hilstar.reading import MAX_TOML_BYTES, read_bytes, read_text
+from hilstar.run.sync.advice import beat_line
 
 MAX_PICTURE_BYTES = 50_000_000
 MAX_FILES_LISTED = 12  # of a step; the others are counted, and stand in session.json
@@ -41,6 +42,7 @@ def write_page(folder: Path, session: SessionFile, before: Path) -> Path:
     body = [
         f'<p class="small">hilstar {_text(session.hilstar)}; images: {_text(session.seen_by)}</p>',
         _overview(session.steps),
+        *(f"<p>{_text(line)}</p>" for line in [None if session.beat is None else beat_line(session.beat)] if line),
         *(part for record in session.steps for part in _step(folder, record)),
         "<h2>The bench file</h2>",
         f"<p>{_text(bench)}, SHA-256 <code>{session.bench_sha256}</code></p>",

@@ -13,6 +13,7 @@ import msgspec
 from hilstar.errors import InputError, shortened
 from hilstar.files import write_whole
 from hilstar.reading import exists, read_bytes
+from hilstar.run.sync.advice import BeatSummary
 
 Verdict = Literal["done", "skipped", "failed"]
 Figure = float | int | str
@@ -75,7 +76,8 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
 class SessionFile(msgspec.Struct, frozen=True, kw_only=True):
     """session.json: the bench, where its patterns are seen, and the steps in their order.
 
-    `unfinished` has, by step, the state in which images were taken that a further attempt need not take again.
+    `unfinished` has, by step, the state in which images were taken that a further attempt need not take again. `beat` is
+    that of the tracker's exposures with the display's refresh, as measured where it was.
     """
 
     kind: str
@@ -86,6 +88,7 @@ class SessionFile(msgspec.Struct, frozen=True, kw_only=True):
     running: str | None
     steps: list[Record]
     unfinished: dict[str, str] = {}
+    beat: BeatSummary | None = None
 
     def step(self, name: str) -> Record | None:
         """The record of a step, None before it ran."""

@@ -37,6 +37,7 @@ from hilstar.calibrate.first_light.sight.display import Stopped
 from hilstar.calibrate.first_light.sight.eyes import Eyes, NoImage, complete_images
 from hilstar.calibrate.first_light.steps import delay, lens, light, look, verify
 from hilstar.errors import HilstarError, InputError, MachineError, one_line
+from hilstar.run.sync.advice import BeatSummary, beat_of
 
 BEFORE_FILE = "bench-before.toml"
 LOCK_FILE = ".lock"
@@ -264,7 +265,15 @@ class Session:
             running=running,
             steps=[self.records[name] for name in NAMES if name in self.records],
             unfinished=self.unfinished,
+            beat=self.beat(),
         )
+
+    def beat(self) -> BeatSummary:
+        """How the tracker's exposures beat with the display, by its own rate and modes where the session has seen them."""
+        display = self.records.get("display")
+        figures = {} if display is None else display.figures
+        refresh_hz, modes = figures.get("refresh_hz"), str(figures.get("modes_hz", "")).split()
+        return beat_of(self.file.config, None if refresh_hz is None else float(refresh_hz), [float(hz) for hz in modes])
 
 
 def _finite(value: Figure) -> Figure:

@@ -84,6 +84,7 @@ def first_light(
     from hilstar.calibrate.first_light.page import write_page
     from hilstar.calibrate.first_light.session import BEFORE_FILE, NAMES, Session, alone_in
     from hilstar.files import make_directory
+    from hilstar.run.sync.advice import beat_line
 
     wrong = [name for name in again or [] if name not in NAMES]
     if wrong:
@@ -101,6 +102,9 @@ def first_light(
     ):
         session = Session(output, file, eyes, readings, watch)
         code = session.run(frozenset(again or []), tell)
+        beats = beat_line(session.beat())
+        if beats is not None:
+            tell(beats)
         page = write_page(output, session.as_file(), output / BEFORE_FILE)
     if as_json:
         print_json({**msgspec.to_builtins(session.as_file()), "page": str(page)})

@@ -258,11 +258,12 @@ class Window:
     @property
     def modes_hz(self) -> tuple[int, ...]:
         """The refresh rates that the display has at its size, whole Hz as the system gives them; none where it does not say."""
-        monitor = glfw.get_window_monitor(self._window)
-        if not monitor or self.display is None:
+        display = self.display
+        monitor = None if self.gone is not None else glfw.get_window_monitor(self._window)
+        if not monitor or display is None:
             return ()
         modes = glfw.get_video_modes(monitor)
-        same = {int(m.refresh_rate) for m in modes if (m.size.width, m.size.height) == self.display.resolution_px}
+        same = {int(m.refresh_rate) for m in modes if (m.size.width, m.size.height) == display.resolution_px}
         return tuple(sorted(same - {0}))
 
     @property

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -29,12 +29,14 @@ class Timing:
     """What the gate measured: the median period, how many frames were dropped, and who keeps time.
 
     `paced_by_screen` is true where the screen itself keeps time, and `waits` false where it could, but swaps do not wait.
+    `modes_hz` are the refresh rates that the display has.
     """
 
     period_ms: float
     dropped: int
     paced_by_screen: bool
     waits: bool = True
+    modes_hz: tuple[int, ...] = ()
 
 
 def pass_gate(screen: Screen, force: bool) -> Timing:
@@ -46,6 +48,7 @@ def pass_gate(screen: Screen, force: bool) -> Timing:
     screen.bench.draw(None)
     swaps_ns = np.array([_swapped_ns(screen, number) for number in range(GATE_FRAMES + 1)])
     timing = timing_of(np.diff(swaps_ns) / NS_PER_MS, monitor, 0 if window.display is None else window.display.refresh_hz)
+    timing = replace(timing, modes_hz=window.modes_hz)
     screen.keep_time(timing.period_ms, timing.paced_by_screen, int(swaps_ns[-1]))
     if not timing.paced_by_screen:
         ms = timing.period_ms

@@ -73,3 +73,22 @@ def test_a_port_that_is_not_there_is_a_wrong_file(tmp_path):
     path = bench(tmp_path, "/dev/nothing-there")
     result = run_hilstar_here("serve", path, "--headless", "--frames", "1")
     assert_refused(result, 2, "[sync] port = /dev/nothing-there", "write the serial port")
+
+
+def served(tmp_path, *changes):
+    path = tmp_path / "beat.toml"
+    tables = {"render": {"quantisation": "round"}, "collimator": {"focal_length_mm": 350}, "sky": {"faintest_v_mag": 3.0}}
+    path.write_text(bench_text(tables, *changes))
+    done = run_hilstar_here("serve", path, "--headless", "--frames", "2", "--json")
+    assert done.returncode == 4, done.stderr  # nobody sends
+    return json.loads(done.stdout).get("beat"), [line for line in done.stderr.splitlines() if "refreshes" in line]
+
+
+def test_serve_says_a_beat_that_matters_and_nothing_of_one_that_does_not(tmp_path):
+    beat, lines = served(tmp_path, {"tracker": {"exposure_s": 0.105}})
+    assert len(lines) == 1 and "[tracker] exposure_s = 0.1" in lines[0] and "1 arcsec at 1 deg/s" in lines[0]
+    assert beat["matters"] and beat["proposal"] == {"refresh_hz": pytest.approx(400 / 7), "exposure_s": 0.1, "frame_hz": None}
+    assert beat["refreshes_per_exposure"] == pytest.approx(6.3)
+    assert beat["worst_arcsec"] == pytest.approx(1.0, rel=1e-6) and beat["period_s"] == pytest.approx(0.35)
+    beat, lines = served(tmp_path)
+    assert lines == [] and beat["worst_arcsec"] == 0.0 and not beat["matters"] and beat["proposal"] is None

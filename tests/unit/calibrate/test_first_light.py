@@ -6,6 +6,7 @@ import sys
 
 import numpy as np
 import pytest
+from msgspec import structs
 from scipy.special import ndtr
 
 from hilstar.bench.bench_file import read_bench_file
@@ -223,6 +224,21 @@ def test_steps_run_once_and_again_when_asked_or_when_what_they_depend_on_changes
     file.write_text(file.read_text().replace("[320, 240]", "[640, 480]"))
     counted.go(tmp_path)
     assert counted.runs == ["first", "second"]
+
+
+def test_a_session_knows_the_beat_by_what_it_has_seen_of_the_display(counted, tmp_path):
+    (tmp_path / "bench.toml").write_text(bench_text({"tracker": {"exposure_s": 0.04}, "collimator": {"focal_length_mm": 350}}))
+    session = counted.go(tmp_path)[1]
+    assert session.as_file().beat.refreshes_per_exposure == pytest.approx(2.4)
+    assert session.as_file().beat.proposal.refresh_hz == pytest.approx(50)
+    seen = Outcome("done", "a frame every 13.4 ms", {"refresh_hz": 74.6, "modes_hz": "50 60 75"})
+    session.records["display"] = structs.replace(session.records["first"], name="display", figures=dict(seen.figures))
+    assert session.beat().refreshes_per_exposure == pytest.approx(2.984)
+    assert not session.beat().matters
+    session.records["display"] = structs.replace(
+        session.records["display"], figures={"refresh_hz": 59.9, "modes_hz": "60 70 75"}
+    )
+    assert session.beat().proposal.refresh_hz == 75.0
 
 
 def test_what_failed_is_never_done_and_what_needs_it_is_skipped(counted, tmp_path):

@@ -23,7 +23,14 @@ def monitor(tmp_path):
 
 def window(**changes):
     """A window on a display that is as the small bench has it, but for `changes`."""
-    plain = {"size_px": (320, 240), "composited": False, "mirrored": None, "scaled": False, "depth_bits": 8}
+    plain = {
+        "size_px": (320, 240),
+        "composited": False,
+        "mirrored": None,
+        "scaled": False,
+        "depth_bits": 8,
+        "modes_hz": (50, 60),
+    }
     return SimpleNamespace(**plain | {"gone": None, "display": SimpleNamespace(refresh_hz=60.0)} | changes)
 
 

@@ -35,6 +35,7 @@ TRACKER_PX_A_DOT = 40.0  # between the dots of a frame: so many fit beside each 
 DOT_PX = 3  # side of a dot, monitor px
 BLURRED = 1.3  # times the bench file's sigma
 BLURRED_BY_PX = 0.1
+MS_PER_S = 1000.0
 
 
 def machine(room: Room) -> Outcome:
@@ -52,7 +53,11 @@ def display(room: Room) -> Outcome:
     timing = room.eyes.gate(room.file)
     if timing is None:
         return Outcome("skipped", f"no display of this program's own ({room.eyes.identity.partition(':')[0]})")
-    figures = {"period_ms": timing.period_ms, "dropped": timing.dropped}
+    figures: dict[str, Figure] = {"period_ms": timing.period_ms, "dropped": timing.dropped}
+    if timing.paced_by_screen:
+        figures["refresh_hz"] = MS_PER_S / timing.period_ms
+    if timing.modes_hz:
+        figures["modes_hz"] = " ".join(map(str, timing.modes_hz))
     paced = "" if timing.paced_by_screen else "; the display has no refresh of its own, frames are paced by software"
     return Outcome("done", f"a frame every {timing.period_ms:.3f} ms, {timing.dropped} dropped{paced}", figures)
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilstar.arrays import Float32Array, FloatArray, IntArray
+from hilstar.arrays import Float32Array, FloatArray
 
 PIXEL_VARIANCE = 1 / 12  # a pixel's width adds to the sigma that it samples
 SUMS = 10
@@ -29,7 +29,6 @@ LAST_LIGHT = 3.5
 # The Gaussian's variance beyond the sprite's, in variances of the blur: a fit has 0 before the blur and 2 after it.
 WINDOW_BLURS = 0.6
 BOX_REACH = 15  # px from a star's nearest pixel; the boxes' weights are tabulated up to there
-IN_BOX = 1023  # what a pixel's part in a box is counted in: ten bits of the shader's
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,11 +66,11 @@ class Balance:
         x, y = (math.sqrt(s**2 + PIXEL_VARIANCE + WINDOW_BLURS * self.seen.blur_px**2) for s in self.sigma_px)
         return x, y
 
-    def in_box(self, side: int, away_x: FloatArray | Float32Array, away_y: FloatArray | Float32Array) -> IntArray:
-        """How much of a pixel so many pixels from a star's nearest is in a box of `side` tracker pixels, of IN_BOX."""
+    def in_box(self, side: int, away_x: FloatArray | Float32Array, away_y: FloatArray | Float32Array) -> FloatArray:
+        """The part that is in a box of `side` tracker pixels of a pixel so many pixels from a star's nearest."""
         x, y = (np.minimum(np.abs(away), BOX_REACH).astype(np.intp) for away in (away_x, away_y))
         table = self._box(side)
-        return np.asarray(np.rint(table[x] * table[y] * IN_BOX), dtype=np.intp)
+        return np.asarray(table[x] * table[y])
 
     def _box(self, side: int) -> FloatArray:
         """The part of pixels 0 to BOX_REACH from a star's nearest, along one axis."""
@@ -107,7 +106,7 @@ class Balance:
         arms[3], arms[4:6] = WINDOW_LIGHT * window, WINDOW_MOMENTS * window * d
         for first, side, weight in zip((6, 8), (3, 5), self.box_weights, strict=True):
             follows = np.array(self.follows(side), dtype=np.float32)[:, None, None]
-            box = np.float32(weight / IN_BOX) * self.in_box(side, *away).astype(np.float32)
+            box = np.float32(weight) * self.in_box(side, *away).astype(np.float32)
             arms[first : first + 2] = box * (d + follows * off)
         return arms
 

@@ -10,7 +10,6 @@ from hilstar.arrays import IntArray
 from hilstar.monitor.balance import (
     ALL_LIGHT,
     ALL_MOMENTS,
-    IN_BOX,
     LAST_LIGHT,
     PIXEL_VARIANCE,
     WINDOW_LIGHT,
@@ -28,6 +27,7 @@ from hilstar.scene.sprites import Sprites
 MIN_VERSION = 430  # of OpenGL, for compute shaders
 MAX_NEAR = 128  # pixels of a star that the shader has bits for: sprites up to a sigma of 1.8 px
 MAX_SIZE = 63  # of a footprint whose places fit into their six bits
+IN_BOX = 1023  # what a pixel's part in a box is counted in: ten bits
 LOCAL_SIZE = 32  # as in exact.comp
 
 
@@ -119,7 +119,8 @@ def _places(order: PixelOrder, balance: Balance) -> npt.NDArray[np.uint32]:
     """The shader's places: a footprint's pixels by distance for each phase; in a word x, y and their parts in the boxes."""
     x, y = order.places()
     away = [at - np.rint(middle)[:, None] for at, middle in zip((x, y), order.phases, strict=True)]
-    words = x + 32 | (y + 32) << 6 | balance.in_box(3, *away) << 12 | balance.in_box(5, *away) << 22
+    box_3, box_5 = (np.rint(balance.in_box(side, *away) * IN_BOX).astype(np.intp) for side in (3, 5))
+    words = x + 32 | (y + 32) << 6 | box_3 << 12 | box_5 << 22
     return np.asarray(words, dtype=np.uint32)
 
 

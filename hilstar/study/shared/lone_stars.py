@@ -53,11 +53,12 @@ class StarError:
 def star_error(shown: FloatArray, true: FloatArray, window: Window) -> StarError:
     """The error of the star in a window of `shown`, against the same window of `true`."""
     light, true_light = float(shown[window].sum()), float(true[window].sum())
-    (x_px, y_px), (true_x_px, true_y_px) = _centroid_px(shown, window), _centroid_px(true, window)
+    (x_px, y_px), (true_x_px, true_y_px) = centroid_px(shown, window), centroid_px(true, window)
     return StarError(magnitude(light / true_light), math.hypot(x_px - true_x_px, y_px - true_y_px))
 
 
-def _centroid_px(image: FloatArray, window: Window) -> tuple[float, float]:
+def centroid_px(image: FloatArray, window: Window) -> tuple[float, float]:
+    """The centre of gravity (x, y) of a window of an image (h, w), px; NaN where it is dark."""
     part = image[window]
     y_px, x_px = np.mgrid[window]
     total = float(part.sum())

@@ -33,10 +33,10 @@ class Compensation:
     monitor_keys: Table
     motion: str
 
-    def bench_text(self) -> str:
+    def bench_text(self, exposure_s: float) -> str:
         """The bench file with this compensation."""
         tables: dict[str, Table] = {
-            "tracker": {"resolution_px": (800, 640), "exposure_s": 0.1, "transmission": "n-bk7-10mm"},
+            "tracker": {"resolution_px": (800, 640), "exposure_s": exposure_s, "transmission": "n-bk7-10mm"},
             "sky": {"faintest_v_mag": 6.0},
             "monitor": {"resolution_px": (1920, 1080), "pixel_pitch_um": 57.65, "bits": 10, **self.monitor_keys},
             "collimator": {"focal_length_mm": 350},
@@ -52,7 +52,9 @@ WAYS = {
     "+ smear": Compensation({}, "on"),
 }
 DRAW_TO_SWAP_S = 0.010
+EXPOSURE_S = 0.1
 START_S = 0.0037  # of the exposure, within a refresh period
+REFRESH_MS = 1e3 / 60  # the default of a bench file
 FRAME_BEFORE = 1  # the first rows of an exposure still show the frame before
 COST_ROUNDS = 9
 
@@ -69,15 +71,22 @@ def frame_weights(rows: FloatArray, swaps_s: Sequence[float], scan: Scan, span_s
 
 
 class ScanningPanel:
-    """A bench that shows on a panel that scans, with one compensation, and a tracker in front of it. Free it with `close`."""
+    """A bench that shows on a panel that scans, with one compensation, and a tracker in front of it. Free it with `close`.
 
-    def __init__(self, way: str, path: Path) -> None:
-        path.write_text(WAYS[way].bench_text())
+    Rows stay lit for `lit` of a refresh, which the bench knows where it compensates smear.
+    """
+
+    def __init__(self, way: str, path: Path, exposure_s: float = EXPOSURE_S, lit: float = 1.0) -> None:
+        compensation = WAYS[way]
+        if lit < 1:
+            compensation = replace(compensation, monitor_keys={**compensation.monitor_keys, "hold_ms": lit * REFRESH_MS})
+        path.write_text(compensation.bench_text(exposure_s))
         self.way = way
+        self.start_s = START_S
         self.bench = load(path)
         config = self.bench.config
         self.period_s = 1 / config.monitor.refresh_hz
-        self.panel_scan = replace(self.bench.scan, scanout_s=self.period_s, hold_s=self.period_s)
+        self.panel_scan = replace(self.bench.scan, scanout_s=self.period_s, hold_s=lit * self.period_s)
         tracker = config.tracker
         self.exposure_s = tracker.exposure_s
         self.camera = tracker_camera(tracker, self.bench.file.folder)
@@ -103,7 +112,7 @@ class ScanningPanel:
     def exposed_e_per_s(self, slew: Slew) -> FloatArray:
         """The tracker's image (h, w) of the screen, mean over an exposure."""
         height = self.bench.config.monitor.resolution_px[1]
-        span_s = (START_S, START_S + self.exposure_s)
+        span_s = (self.start_s, self.start_s + self.exposure_s)
         first = math.floor((span_s[0] - 2 * self.period_s) / self.period_s) - FRAME_BEFORE
         numbers = range(first, math.ceil(span_s[1] / self.period_s) + 1)
         swaps_s = [number * self.period_s for number in numbers]
@@ -142,7 +151,7 @@ class Sky:
 
     def paths(self, slew: Slew) -> Sprites:
         """Each star's path over the exposure, in monitor pixels."""
-        middle_s = START_S + self._shown.exposure_s / 2
+        middle_s = self._shown.start_s + self._shown.exposure_s / 2
         motion = Motion(slew.at(middle_s), slew.rate_cam_rad_s, self._shown.exposure_s)
         bench = self._shown.bench
         return smeared_sprites(bench.stars, motion, bench.camera, self._renderer.footprint_px, self._sigma_px)

@@ -17,6 +17,7 @@ import numpy as np
 from hilstar.charts import chart, plain_ticks, write_records
 from hilstar.scene.camera import Camera
 from hilstar.study.shared.lone_stars import Isolation, lone_windows, star_error
+from hilstar.study.timing.beat import beat_findings, measure_beat
 from hilstar.study.timing.panel import WAYS, ScanningPanel, Sky
 from hilstar.study.timing.slew import Slew
 from hilstar.units import ARCSEC_PER_RAD
@@ -74,7 +75,7 @@ def measure(quick: bool = False) -> list[Outcome]:
 
 
 def run(directory: Path, quick: bool = False) -> list[str]:
-    """Measure, and write `timing.csv` and `timing.png`; the findings, a line each. Raises InputError."""
+    """Measure, and write `timing` and `beat`, each as csv and png; the findings, a line each. Raises InputError."""
     outcomes = measure(quick)
     write_records(directory / "timing.csv", outcomes)
     at = {(o.way, o.rate_deg_s): o for o in outcomes}
@@ -84,7 +85,7 @@ def run(directory: Path, quick: bool = False) -> list[str]:
         f"with prediction alone, and by {best.rms_arcsec:.2g} with scan-out and smear compensated"
     )
     _draw(directory / "timing.png", finding, outcomes)
-    return [finding, *(_line(at[way, 2.0]) for way in WAYS)]
+    return [finding, *(_line(at[way, 2.0]) for way in WAYS), *beat_findings(measure_beat(quick), directory)]
 
 
 def _line(outcome: Outcome) -> str:

@@ -1,7 +1,7 @@
 """Tables of README and docs/ from the CSV files beside this script: `python results/tables.py` writes them between their marks.
 
-bench.csv is written by `hilstar benchmark -o`; tradeoff.csv, economy.csv and timing.csv by `hilstar study NAME -o`. machine.txt
-says on which machine.
+bench.csv is written by `hilstar benchmark -o`; tradeoff.csv, economy.csv and timing.csv by `hilstar study NAME -o`,
+quantisation_time.csv by `hilstar study quantisation -o`. machine.txt says on which machine.
 """
 
 from __future__ import annotations
@@ -88,7 +88,58 @@ def timing_table() -> str:
     return table(["at 2 deg/s", "arcsec rms", "worst", "time to draw"], body)
 
 
-TABLES = {"bench": bench_table, "tradeoff": tradeoff_table, "economy": economy_table, "timing": timing_table}
+CENTROIDERS = {
+    "moment": "plain first moment",
+    "window": "Gaussian window as wide as the star",
+    "wide": "Gaussian window half as wide again",
+    "fit": "PSF fit",
+    "box3": "centre of mass, 3 x 3",
+    "box5": "centre of mass, 5 x 5",
+}
+
+
+def quantisation_table() -> str:
+    """Each method's worst errors at the faint end of two panels' aims, and its time."""
+    rows = [row for row in rows_of("quantisation_time.csv") if row["bits"] in ("8", "10")]
+    at = {(row["bits"], row["method"]): row for row in rows}
+
+    def errors(row: dict[str, str]) -> str:
+        return f"{float(row['flux_max_mag']):.3f} mag, {float(row['max_px_fit']):.3f} px"
+
+    def times(method: str) -> float:
+        return float(at["8", method]["frame_ms"]) / float(at["8", "round"]["frame_ms"])
+
+    methods = dict.fromkeys(row["method"] for row in rows)
+    ends = [f"{bits} bits, {float(at[bits, 'round']['mag_under_white']):g} mag under white" for bits in ("8", "10")]
+    body = [[method, *(errors(at[bits, method]) for bits in ("8", "10")), f"{times(method):.1f} times"] for method in methods]
+    return table(["", *ends, "1000 stars, 1080p, 8 bits, to the time of `round`"], body)
+
+
+def centroider_table() -> str:
+    """What each centroider finds of `round` and `exact`, rms along an axis, and what is left."""
+    at = {(row["bits"], row["method"]): row for row in rows_of("quantisation_time.csv")}
+    head, body = ["centroider"], [[name] for name in CENTROIDERS.values()]
+    for bits in ("8", "10"):
+        rounded, exact = at[bits, "round"], at[bits, "exact"]
+        head += [f"{bits} bits, {float(exact['mag_under_white']):g} mag: `round`", "`exact`", "of it"]
+        for line, kind in zip(body, CENTROIDERS, strict=True):
+            both = [float(row[f"axis_rms_px_{kind}"]) for row in (rounded, exact)]
+            line += [f"{both[0]:.3f} px", f"{both[1]:.3f} px", f"{both[1] / both[0]:.2f}"]
+    flux = ["flux, rms"]
+    for bits in ("8", "10"):
+        both = [float(at[bits, method]["flux_rms_mag"]) for method in ("round", "exact")]
+        flux += [f"{both[0]:.3f} mag", f"{both[1]:.3f} mag", f"{both[1] / both[0]:.2f}"]
+    return table(head, [*body, flux])
+
+
+TABLES = {
+    "quantisation": quantisation_table,
+    "centroiders": centroider_table,
+    "bench": bench_table,
+    "tradeoff": tradeoff_table,
+    "economy": economy_table,
+    "timing": timing_table,
+}
 
 
 def with_tables(text: str) -> str:

@@ -4,17 +4,13 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 
-import numpy as np
-
 from hilstar.bench.config import Monitor, RenderSettings
-from hilstar.monitor.balance import Balance
-from hilstar.monitor.phases import WHITE, fainter, measure, phase_grid, shown_by
-from hilstar.monitor.quantise import CYCLE_FRAMES, Panel
-from hilstar.render.reference import linear_image
+from hilstar.monitor.phases import WHITE
 from hilstar.render.renderer import Renderer, Target
+from hilstar.study.shared.code_errors import JUDGE, code_errors
 from hilstar.study.shared.codes import AIMS, FRAME_PX, STARS, WAYS, Way, response_of, star_field
 from hilstar.study.tradeoff.table import Figure, Trial, Trials
-from hilstar.units import flux_ratio
+from hilstar.tracker.centroiders import FAMILY
 
 SIGMA_PX = RenderSettings().sprite_sigma_px
 PHASES = 32
@@ -33,19 +29,23 @@ def quantisation(stack: ExitStack, quick: bool) -> Trials:
         "quantisation",
         f"codes of {STARS} stars, {FRAME_PX[0]} x {FRAME_PX[1]}, light to memory",
         Figure(f"flux error of a star {mag:g} mag under white, {bits} bits, worst", "mag", ROUNDING_MAG),
-        Figure("centroid error, worst", "px"),
+        Figure("centroid error by a PSF fit, worst", "px"),
         "it needs no more than one frame and leaves no pattern that a tracker could take for a star",
         trials,
+        _each_remark(trials),
     )
+
+
+def _each_remark(trials: list[Trial]) -> str:
+    """What other centroiders than the PSF fit find with the method that is taken."""
+    taken = next(trial for trial in trials if trial.is_default)
+    each = ", ".join(f"{kind} {taken.more[f'max_px_{kind}']:.3f}" for kind in FAMILY)
+    return f"by each centroider '{taken.method}' is off by at most: {each} px"
 
 
 def _quantised(stack: ExitStack, way: Way, bits: int) -> Trial:
     response, mag = response_of(bits, way), AIMS[bits][1]
-    sprites, tile = phase_grid(PHASES, SIGMA_PX)
-    wanted = linear_image(sprites, (PHASES * tile,) * 2, SIGMA_PX) * flux_ratio(mag)
-    cycle, linear = CYCLE_FRAMES if way.whole_cycle else 1, wanted.astype(np.float32)
-    shown = shown_by(way.method, cycle, Panel(response, WHITE), linear, fainter(sprites, mag), Balance(SIGMA_PX))
-    found = measure(wanted, shown, tile)
+    found = code_errors(bits, way, PHASES, [mag])[0]
     renderer = stack.enter_context(Renderer(Target(FRAME_PX, SIGMA_PX, response, WHITE, way.method)))
     field = star_field(FRAME_PX, renderer.footprint_px)
 
@@ -54,4 +54,5 @@ def _quantised(stack: ExitStack, way: Way, bits: int) -> Trial:
         renderer.codes()
 
     is_default = (way.method, way.stealing) == (TAKEN, RenderSettings().bit_stealing)
-    return Trial(way.name, found.flux_max_mag, found.centroid_max_px, work, is_default)
+    each = {f"max_px_{kind}": found.max_px(kind) for kind in FAMILY}
+    return Trial(way.name, found.flux_max_mag, found.max_px(JUDGE), work, is_default, more=each)

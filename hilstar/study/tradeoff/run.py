@@ -24,6 +24,7 @@ from hilstar.study.tradeoff.quantisation import quantisation
 from hilstar.study.tradeoff.smear import smear
 from hilstar.study.tradeoff.spectrum import spectrum
 from hilstar.study.tradeoff.table import Figure, Row, Step, Trials, measured
+from hilstar.tracker.centroiders import FAMILY
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -61,6 +62,8 @@ COLUMNS = (
     "front",
     "beaten_by",
 )
+# Of the step `quantisation`: what centroiders of every kind find; empty in the others.
+MORE_COLUMNS = tuple(f"max_px_{kind}" for kind in FAMILY)
 
 
 def run(directory: Path, quick: bool = False) -> list[str]:
@@ -71,7 +74,7 @@ def run(directory: Path, quick: bool = False) -> list[str]:
         with ExitStack() as stack:
             steps.append(measured(plan(stack, quick), QUICK_BUDGET_S if quick else BUDGET_S))
         draw(directory / f"tradeoff_{steps[-1].name}.png", steps[-1], machine)
-    write_csv(directory / "tradeoff.csv", COLUMNS, [cells(step, row) for step in steps for row in step.rows])
+    write_csv(directory / "tradeoff.csv", (*COLUMNS, *MORE_COLUMNS), [cells(step, row) for step in steps for row in step.rows])
     head = f"medians on {machine}; * no method is both as accurate (by the first figure) and as fast; > hilstar's default"
     return [head, *(line for step in steps for line in table_lines(step))]
 
@@ -83,7 +86,7 @@ def this_machine() -> str:
 
 
 def cells(step: Step, row: Row) -> tuple[str | float | bool, ...]:
-    """A row of the CSV: COLUMNS."""
+    """A row of the CSV: COLUMNS and MORE_COLUMNS."""
     figures = (
         row.error,
         step.error.unit,
@@ -94,7 +97,8 @@ def cells(step: Step, row: Row) -> tuple[str | float | bool, ...]:
         row.time_ms,
         *row.quartiles_ms,
     )
-    return step.name, step.work, row.method, *figures, row.is_default, row.is_exact, row.on_front, row.beaten
+    more = (row.more.get(name, "") for name in MORE_COLUMNS)
+    return step.name, step.work, row.method, *figures, row.is_default, row.is_exact, row.on_front, row.beaten, *more
 
 
 def table_lines(step: Step) -> list[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -28,7 +28,7 @@ class Figure:
 class Trial:
     """A method to be timed: its error and a second figure, in the units of its `Trials`, and the work itself.
 
-    The exact one is what the others are measured against.
+    `more` are further figures by the names of their columns. The exact one is what the others are measured against.
     """
 
     method: str
@@ -37,6 +37,7 @@ class Trial:
     work: Callable[[], object]
     is_default: bool = False
     is_exact: bool = False
+    more: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +72,7 @@ class Row:
     is_exact: bool
     on_front: bool
     beaten: str = ""
+    more: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +98,7 @@ def measured(trials: Trials, budget_s: float) -> Step:
     low, middle, high = np.array([np.percentile(values, (25, 50, 75)) for values in times]).T
     front = pareto_front([max(trial.error, trials.error.floor) for trial in trials.trials], middle)
     rows = [
-        Row(t.method, t.error, t.second, float(ms), (float(q1), float(q3)), t.is_default, t.is_exact, bool(on))
+        Row(t.method, t.error, t.second, float(ms), (float(q1), float(q3)), t.is_default, t.is_exact, bool(on), more=t.more)
         for t, q1, ms, q3, on in zip(trials.trials, low, middle, high, front, strict=True)
     ]
     rows = [_with_reason(row, rows, trials) if row.is_default and not row.on_front else row for row in rows]

@@ -17,7 +17,7 @@ from hilstar.monitor.phases import WHITE, fainter, phase_grid, phase_image, show
 from hilstar.monitor.quantise import Panel, Quantisation
 from hilstar.monitor.response import Response
 from hilstar.render.encoder import MAX_SIDES, SpriteSide, SpriteSides
-from hilstar.scene.psf import MAX_CUT, cut_share, footprint_px, peak_share, pixel_share
+from hilstar.scene.psf import MAX_CUT, cut_share, footprint_px, outside_share, peak_share, pixel_share
 from hilstar.tracker.centroiders import FAMILY, Centroider
 from hilstar.tracker.star_errors import Judge
 from hilstar.units import flux_ratio
@@ -280,12 +280,6 @@ def _cut_px(size_px: int, sigma_px: float) -> float:
         shares = np.array([pixel_share(float(offset), sigma_px) for offset in offsets])
         worst = max(worst, abs(float((shares * offsets).sum() / shares.sum())))
     return worst
-
-
-def outside_share(size_px: int, sigma_px: tuple[float, float]) -> float:
-    """The largest share of a star's light in one pixel outside a square sprite, at the worst phase."""
-    (x, y), beyond = sigma_px, size_px / 2
-    return max(pixel_share(beyond, x) * pixel_share(0.0, y), pixel_share(beyond, y) * pixel_share(0.0, x))
 
 
 def faintest_shown_e_per_s(method: str, light: Light, sigma_px: tuple[float, float]) -> float:

@@ -20,7 +20,16 @@ from hilstar.monitor.balance import AS_USUAL, Balance, Seen
 from hilstar.monitor.exact import ExactQuantiser
 from hilstar.monitor.quantise import CYCLE_FRAMES, Panel, Quantisation, frame_shift
 from hilstar.monitor.response import Codes, Response
-from hilstar.render.encoder import Encoder, Eraser, LevelTexture, SpriteSides, build_program, set_sides
+from hilstar.render.encoder import (
+    SPRITE_PIXEL_COST,
+    Encoder,
+    Eraser,
+    LevelTexture,
+    SpriteSides,
+    build_program,
+    lit_sides,
+    set_sides,
+)
 from hilstar.render.exact_pass import ExactPass
 from hilstar.render.extended import ExtendedLayer
 from hilstar.scene.extended import ExtendedLight, Rectangle
@@ -158,7 +167,8 @@ class Renderer:
         if target.quantisation != "exact" or self._exact_pass is not None:
             dithered = target.quantisation in ("dither", "temporal")
             self._encoder = Encoder(self._ctx, self._linear, self._levels, panel, dithered)
-            self._encoder.shrink(target.sides)
+            self._lit_sides = () if dithered else target.sides or lit_sides(panel, target.sigma_px, self.footprint_px)
+            self._encoder.shrink(self._lit_sides)
 
     def _reserve(self, sprites: int) -> None:
         """Make room for `sprites` sprites on the GPU; it grows by doubling and never shrinks."""
@@ -227,12 +237,14 @@ class Renderer:
         return found
 
     def _covered_px(self, sprites: Sprites | None) -> int:
-        """Pixels of all sprites together."""
+        """Pixels that all sprites together may light; at most, where that is few."""
         if sprites is None:
             return 0
-        if not self.target.sides:
-            return len(sprites) * self.footprint_px**2
-        rates, widths = zip(*((side.below_e_per_s, side.side_px) for side in reversed(self.target.sides)), strict=True)
+        width, height = self.target.resolution_px
+        most = len(sprites) * self.footprint_px**2
+        if not self._lit_sides or most * SPRITE_PIXEL_COST < width * height:
+            return most
+        rates, widths = zip(*((side.below_e_per_s, side.side_px) for side in reversed(self._lit_sides)), strict=True)
         place = np.searchsorted(rates, sprites.data["electrons_per_s"] * np.float32(sprites.per_star), side="right")
         return int(np.square([*widths, self.footprint_px])[place].sum())
 

@@ -51,6 +51,12 @@ def cut_share(size_px: int, sigma_px: tuple[float, float]) -> float:
     return 1.0 - inside
 
 
+def outside_share(size_px: int, sigma_px: tuple[float, float]) -> float:
+    """The largest share of a star's light in one pixel outside a square sprite, at the worst phase."""
+    (x, y), beyond = sigma_px, size_px / 2
+    return max(pixel_share(beyond, x) * pixel_share(0.0, y), pixel_share(beyond, y) * pixel_share(0.0, x))
+
+
 def footprint_px(sigma_px: tuple[float, float], largest_cut: float = MAX_CUT) -> int:
     """The side of the smallest square footprint that cuts at most `largest_cut` of a star's flux."""
     size = 1

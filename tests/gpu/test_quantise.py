@@ -83,6 +83,19 @@ def test_levels_are_those_of_the_oracle_pixel_for_pixel(response, count, mapped,
     assert np.array_equal(seen[0], seen[1]) == (method != "temporal")
 
 
+def test_where_up_to_sixteen_wings_meet_no_lit_pixel_is_missed(rng):
+    """Only a star's own square is encoded; groups of faint stars and a bright one light pixels between their squares."""
+    size, groups, each = (640, 480), 40, 16
+    middles = rng.uniform([20, 20], [620, 460], size=(groups, 2))
+    pixels = (middles[:, None] + rng.uniform(-8, 8, (groups, each, 2))).reshape(-1, 2)
+    light = 10.0 ** rng.uniform(2, 4, groups * each)
+    light[:: 4 * each] *= 1e3
+    with Renderer(replace(target_of(GREY, "round"), resolution_px=size)) as gl:
+        gl.draw(sprites_at(pixels, light, gl.footprint_px))
+        assert np.array_equal(gl.codes(), round_levels(gl.linear(), gl.target.panel()))
+        assert np.count_nonzero(gl.codes()) > 1000
+
+
 # The shader sums in another order and knows erf to 4e-7: of two choices that are nearly as good it may take the other.
 OTHER_PIXELS = 0.03
 A_STAR = 32  # pixels: few stars may have one of them

@@ -10,11 +10,11 @@ import pytest
 
 from hilstar.bench.build import load
 from hilstar.bench.config import RenderSettings
-from hilstar.bench.effort import Light, choose_codes, choose_sides, cut_px, explain, outside_share, plan_effort
+from hilstar.bench.effort import Light, choose_codes, choose_sides, cut_px, explain, plan_effort
 from hilstar.monitor.response import srgb_response
 from hilstar.render.reference import linear_image
 from hilstar.rotation import from_radec_roll_deg
-from hilstar.scene.psf import footprint_px
+from hilstar.scene.psf import footprint_px, outside_share
 from tests.support.commands import run_hilstar_here
 
 SIGMA = (0.85, 0.85)

@@ -74,6 +74,26 @@ def test_the_renderer_s_table_counts_thresholds(bits, white, rng):
     assert np.array_equal(codes, np.searchsorted(thresholds, light, side="right"))
 
 
+@pytest.mark.parametrize("bits", [1, 2, 8, 10, 12])
+@pytest.mark.parametrize("white", [1e-3, 1.0, 4.1e7, 1e12])
+def test_one_word_a_bin_says_the_level(bits, white, rng):
+    """What encode.frag does with `steps`, in NumPy, against a plain search: at each threshold and next to it."""
+    thresholds = srgb_response(bits).thresholds_e_per_s(white)
+    table = code_table(thresholds)
+    steps = table.steps()
+    edges = np.concatenate([thresholds, np.nextafter(thresholds, 0), np.nextafter(thresholds, np.inf)])
+    light = np.concatenate([edges, np.float32(white) * rng.uniform(0, 1.1, 5000) ** 4, [0, 1e-38, 3e38]]).astype(np.float32)
+    lowest, shift = (table.first_bin - 1) << table.bin_shift, table.bin_shift
+    found = np.clip(light.view(np.int32).astype(np.int64), lowest, lowest + (len(steps) << shift) - 1)
+    word = steps[(found - lowest) >> shift].astype(np.int64)
+    level = (word >> (shift + 1)) + ((found & ((1 << shift) - 1)) >= (word & ((2 << shift) - 1)))
+    assert np.array_equal(level, np.searchsorted(thresholds, light, side="right"))
+
+
+def test_thresholds_too_close_for_a_bin_each_have_no_such_words():
+    assert code_table(np.array([1.0, 1.0000001, 2.0], dtype=np.float32)).steps() is None
+
+
 def test_gamma_is_a_power_law_with_thresholds_at_half_codes():
     response = gamma_response(8)
     assert response.light[128] == pytest.approx((128 / 255) ** 2.2)

@@ -21,7 +21,7 @@ from hilstar.bench.orientation import scan_of
 from hilstar.errors import InputError
 from hilstar.monitor.balance import Seen
 from hilstar.monitor.calibration import BUILT_IN, Calibration, load_calibration
-from hilstar.monitor.quantise import Panel, cycle_warning
+from hilstar.monitor.quantise import Panel
 from hilstar.render.renderer import Context, Renderer, Target
 from hilstar.scene.camera import Camera
 from hilstar.scene.psf import peak_share
@@ -63,10 +63,10 @@ def open_bench(file: BenchFile, context: Context | None = None) -> Bench:
         refresh_hz=refresh_hz,
         seen=seen_by(file.config.tracker, camera),
         centroider=file.config.verify.centroider,
+        exposure_frames=file.config.exposure_frames,
     )
     effort = _effort(file.config.render, light)
     config = _chosen(file.config, effort)
-    _warn_of_cycle(config, file.path)
     faintest = faintest_shown_e_per_s(config.render.quantisation, light, config.render.sprite_sigma_px)
     shown, faint = split_by_rate(stars, faintest)
     panel = Panel(calibration.response, white_e_per_s, uniformity)
@@ -106,7 +106,6 @@ def _target(config: BenchConfig, panel: Panel, effort: Effort | None, seen: Seen
         flux_at_white_e_per_s=panel.flux_at_white_e_per_s,
         quantisation=render.quantisation,
         uniformity=panel.uniformity,
-        cycle_frames=render.cycle_frames,
         sides=() if effort is None else effort.sides,
         seen=seen,
     )
@@ -128,14 +127,6 @@ def _chosen(config: BenchConfig, effort: Effort | None) -> BenchConfig:
         return config
     render = replace(config.render, quantisation=effort.quantisation, motion_above_px=effort.motion_above_px)
     return replace(config, render=render)
-
-
-def _warn_of_cycle(config: BenchConfig, path: Path) -> None:
-    render, refresh_hz = config.render, config.monitor.refresh_hz
-    if render.quantisation == "temporal":
-        warning = cycle_warning(config.tracker.exposure_s, refresh_hz, render.cycle_frames)
-        if warning is not None:
-            log.warning("%s: %s", path, warning)
 
 
 def bench_optics(tracker: Tracker, folder: Path) -> Optics:

@@ -14,7 +14,7 @@ from hilstar.arrays import FloatArray
 from hilstar.bench.config import RenderSettings
 from hilstar.monitor.balance import AS_USUAL, Balance, Seen
 from hilstar.monitor.phases import WHITE, fainter, phase_grid, phase_image, shown_by
-from hilstar.monitor.quantise import Panel, Quantisation
+from hilstar.monitor.quantise import EXPOSURE_FRAMES, Panel, Quantisation
 from hilstar.monitor.response import Response
 from hilstar.render.encoder import MAX_SIDES, SpriteSide, SpriteSides
 from hilstar.scene.psf import MAX_CUT, cut_share, footprint_px, outside_share, peak_share, pixel_share
@@ -109,7 +109,7 @@ class Light:
 
     `can_steal_bits` says whether bit stealing would give finer codes, and is not used yet. `sky_share` is the share of the
     whole sky that the screen covers. `seen` is how the tracker sees the monitor, `centroider` what it finds stars by: None
-    where the bench does not say, and then all of them judge.
+    where the bench does not say, and then all of them judge. Its exposure has `exposure_frames`.
     """
 
     response: Response
@@ -120,6 +120,7 @@ class Light:
     refresh_hz: float = 60.0
     seen: Seen = AS_USUAL
     centroider: Centroider | None = None
+    exposure_frames: int = EXPOSURE_FRAMES
 
     @property
     def judges(self) -> tuple[Centroider, ...]:
@@ -213,7 +214,7 @@ class _CodeStars:
 
     def __init__(self, render: RenderSettings, light: Light) -> None:
         sigma_px, seen = render.sprite_sigma_px, light.seen
-        self._cycle_frames, self._balance, self._kinds = render.cycle_frames, Balance(sigma_px, seen), light.judges
+        self._frames, self._balance, self._kinds = light.exposure_frames, Balance(sigma_px, seen), light.judges
         self._panel = Panel(light.response, WHITE)
         self._sprites, tile = phase_grid(PHASES, sigma_px)
         self._bright = phase_image(self._sprites, sigma_px)
@@ -227,7 +228,7 @@ class _CodeStars:
         flux_mag, shown = 0.0, []
         for mag in reversed(self._mags):  # the faintest are off the furthest
             linear = (self._bright * flux_ratio(mag)).astype(np.float32)
-            image = shown_by(method, self._cycle_frames, self._panel, linear, fainter(self._sprites, mag), self._balance)
+            image = shown_by(method, self._frames, self._panel, linear, fainter(self._sprites, mag), self._balance)
             flux_mag = max(flux_mag, self._judge.errors(image, flux_ratio(mag), ()).flux_max_mag)
             if flux_mag > limit_mag:
                 return CodeErrors(flux_mag, math.inf, None)
@@ -246,7 +247,7 @@ def choose_sides(render: RenderSettings, light: Light, method: Quantisation) -> 
     sizes = range(full % 2 or 2, full, 2)
     largest = next((s for s in sizes if cut_mag(s, sigma_px) <= allowed_mag and cut_px(s, sigma_px) <= allowed_px), full)
     sides = [(math.inf, largest)]
-    if method in ("round", "exact"):
+    if method in ("round", "exact", "temporal"):
         unlit = UNLIT * float(light.response.threshold[0]) * light.white_e_per_s
         # Falling rates: a star under the last of them that it is under gets the smallest sprite.
         sides += [(unlit / outside_share(size, sigma_px), size) for size in sizes[::-1] if size < largest]

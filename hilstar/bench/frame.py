@@ -163,10 +163,10 @@ class Bench:
     ) -> Drawn:
         """Draw the levels for an attitude; None gives a blank frame. The frame path: no copy, no table.
 
-        `frame` counts the frames shown, for temporal dithering. With a rate that moves stars by more than
-        `[render] motion_above_px`, each star is drawn along its path while its row is lit; the attitude is then that at the
-        middle row's first light. Bodies are where they are at `t_ns`, by default at the start; without a rate satellites'
-        paths have their middle there.
+        `frame` counts the frames shown, for `temporal`: a number not above the last one's begins anew. With a rate that moves
+        stars by more than `[render] motion_above_px`, each star is drawn along its path while its row is lit; the attitude is
+        then that at the middle row's first light. Bodies are where they are at `t_ns`, by default at the start; without a
+        rate satellites' paths have their middle there.
         """
         return self.draw_sprites(self.frame_sprites(q_icrs_to_cam, rate_cam_rad_s, t_ns=t_ns), frame)
 
@@ -272,6 +272,7 @@ class Bench:
             self.renderer.draw(replace(self.sprites(WARM_UP_ATTITUDE), extended=self._painter.any_lights()))
         for q, rate in ((WARM_UP_ATTITUDE, WARM_UP_RATE_RAD_S), (WARM_UP_ATTITUDE, None), (None, None)):
             _ = self.draw(q, 0, rate).levels
+        self.renderer.begin_anew()
 
     def frame(
         self,
@@ -282,18 +283,19 @@ class Bench:
     ) -> Frame:
         """Draw one frame and read all of it back; the arrays are copies.
 
-        Stars too faint for the monitor are in the linear image and the truth, and not drawn. `number` counts frames, for
-        temporal dithering; bodies are where they are at `t_ns`. Raises InputError for a quaternion that is not unit
-        within 1e-3.
+        Stars too faint for the monitor are in the linear image and the truth, and not drawn. `number` counts frames; with
+        `temporal` this is the first frame of a sequence. Bodies are where they are at `t_ns`. Raises InputError for a
+        quaternion that is not unit within 1e-3.
         """
         q = checked_quaternion(q_icrs_to_cam)
         q = q if faults is None else faults.turned(q)
         sprites = self._still(q, self.stars, t_ns, faults)
         shown = self._still(q, self.shown_stars, t_ns, faults)
+        self.renderer.begin_anew()
         self.renderer.draw(shown, number)
         levels = self.renderer.codes().copy()
         if len(self.faint_stars) or self.renderer.target.sides or len(sprites) != len(shown):
-            self.renderer.draw(sprites, number, whole=True)
+            self.renderer.draw_linear(sprites)
         linear = self.renderer.linear().copy()
         truth, star = self._truth(q, sprites, t_ns)
         order = np.argsort(truth["v_mag"], kind="stable")
@@ -359,7 +361,7 @@ class Bench:
         for disc in self.discs(frame.q_icrs_to_cam, When(frame.t_ns)):
             if disc.name in sprites.over_white:
                 alone = self._painter.alone(disc, frame.q_icrs_to_cam)
-                self.renderer.draw(replace(sprites, data=sprites.data[:0], extended=alone))
+                self.renderer.draw_linear(replace(sprites, data=sprites.data[:0], extended=alone))
                 own = self.renderer.linear() > MOST * wanted
                 if own.any():
                     losses[disc.name] = float(magnitude(shown[own].sum() / wanted[own].sum(dtype=np.float64)))

@@ -10,7 +10,8 @@ import numpy as np
 from hilstar.arrays import Float32Array, FloatArray
 from hilstar.monitor.balance import Balance
 from hilstar.monitor.exact import ExactQuantiser
-from hilstar.monitor.quantise import Panel, Quantisation, dither_levels, round_levels, shown_light, temporal_levels
+from hilstar.monitor.quantise import Panel, Quantisation, dither_levels, round_levels, shown_light
+from hilstar.monitor.temporal import TemporalQuantiser
 from hilstar.scene.psf import footprint_px, peak_share, pixel_shares
 from hilstar.scene.sprites import Sprites, pack_sprites
 from hilstar.units import flux_ratio, magnitude
@@ -18,6 +19,7 @@ from hilstar.units import flux_ratio, magnitude
 SIGMA_PX = (0.85, 0.85)
 WHITE = 1.0
 MARGIN_PX = 2  # of dark between two stars
+FRAMES_BEFORE = 2  # of `temporal` before an exposure: it is no better for being the first of a sequence
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,17 +88,20 @@ def _sums(image: FloatArray, tile: int) -> tuple[FloatArray, FloatArray, FloatAr
 
 
 def shown_by(
-    method: Quantisation, cycle_frames: int, panel: Panel, linear: Float32Array, sprites: Sprites, balance: Balance
+    method: Quantisation, exposure_frames: int, panel: Panel, linear: Float32Array, sprites: Sprites, balance: Balance
 ) -> FloatArray:
-    """The light (h, w) that a method shows for a linear image, averaged over an exposure of `cycle_frames`.
+    """The light (h, w) that a method shows for a linear image, with `temporal` the mean of `exposure_frames` frames.
 
     `balance` is that of `exact`, with the sprites' sigma.
     """
+    size = linear.shape[1], linear.shape[0]
     if method == "exact":
-        size = linear.shape[1], linear.shape[0]
         return shown_light(ExactQuantiser(panel, size, balance.sigma_px, balance.seen).levels(sprites), panel)
-    if method == "temporal" and cycle_frames > 1:
-        frames = [shown_light(temporal_levels(linear, panel, k, cycle_frames), panel) for k in range(cycle_frames)]
-        return np.asarray(np.mean(frames, axis=0))
+    if method == "temporal":
+        quantiser = TemporalQuantiser(panel, size, balance.sigma_px, balance.seen)
+        for _ in range(FRAMES_BEFORE):
+            quantiser.levels(sprites)
+        frames = (shown_light(quantiser.levels(sprites), panel) for _ in range(exposure_frames))
+        return np.asarray(sum(frames) / exposure_frames)
     levels = round_levels if method == "round" else dither_levels
     return shown_light(levels(linear, panel), panel)

@@ -1,6 +1,6 @@
-"""From a linear image to levels, pixel by pixel: `round`, `dither` and `temporal` (`exact` looks at stars: see `exact`).
+"""From a linear image to levels, pixel by pixel: `round` and `dither` (`exact` and `temporal` look at stars).
 
-A pixel's light lies between those of two levels, k and k + 1. `round` shows the nearer one. The others work in light, not
+A pixel's light lies between those of two levels, k and k + 1. `round` shows the nearer one. `dither` works in light, not
 in code: k + 1 has the probability (L - L_k) / (L_k+1 - L_k), so that the mean light is the light wanted.
 All compute in float32 like the renderer, which has to give every pixel the same level.
 """
@@ -19,10 +19,8 @@ from hilstar.monitor.response import Codes, Response, encode
 
 Quantisation = Literal["round", "dither", "temporal", "exact"]
 
-# Frames after which `temporal` repeats. Eight are 133 ms at 60 Hz, about one exposure of a tracker. A star of 42 steps of
-# light (8 magnitudes under white, 10 bits) then has rms errors of 0.007 mag and 0.017 px; sixteen frames halve them.
-CYCLE_FRAMES = 8
-MAX_CYCLE_FRAMES = 4096  # the mask has no more distinct thresholds
+EXPOSURE_FRAMES = 8  # over which `temporal` is judged unless a bench file says otherwise: 133 ms at 60 Hz
+MASK_TURNS = 4096  # the mask has no more distinct thresholds
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,39 +91,17 @@ def turned_mask(shift: float) -> Float32Array:
     return np.asarray(turned - np.floor(turned))
 
 
-def temporal_levels(linear_e_per_s: Float32Array, panel: Panel, frame: int, cycle_frames: int = CYCLE_FRAMES) -> Codes:
-    """`dither_levels` with a mask that turns from frame to frame.
+def mask_turn(frame: int) -> float:
+    """The mask's turn in a frame, for extended light in `temporal`: van der Corput's sequence in base 2.
 
-    Over 2^m frames from a multiple of 2^m on, up to the cycle, a still pixel's mean light is within a step / 2^m of the
-    light wanted. Raises InputError for a cycle that is not a power of two.
+    The turns of each aligned block of 2^m frames divide [0, 1) evenly; after MASK_TURNS frames it begins again.
     """
-    return dither_levels(linear_e_per_s, panel, frame_shift(frame, cycle_frames))
-
-
-def frame_shift(frame: int, cycle_frames: int) -> float:
-    """The mask's turn in a frame: van der Corput's sequence in base 2, which begins again after `cycle_frames`.
-
-    The turns of each aligned block of 2^m frames divide [0, 1) evenly. Raises InputError for a cycle that is no power of two.
-    """
-    if not 1 <= cycle_frames <= MAX_CYCLE_FRAMES or cycle_frames & (cycle_frames - 1):
-        raise InputError(f"a cycle of {cycle_frames} frames; write a power of two from 1 to {MAX_CYCLE_FRAMES}")
-    place, shift, weight = frame % cycle_frames, 0.0, 0.5
+    place, turn, weight = frame % MASK_TURNS, 0.0, 0.5
     while place:
-        shift += weight * (place & 1)
+        turn += weight * (place & 1)
         place >>= 1
         weight /= 2
-    return shift
-
-
-def cycle_warning(exposure_s: float, refresh_hz: float, cycle_frames: int = CYCLE_FRAMES) -> str | None:
-    """A warning for a tracker whose exposure is shorter than a cycle of `temporal`, else None."""
-    cycle_s = cycle_frames / refresh_hz
-    if exposure_s >= cycle_s:
-        return None
-    return (
-        f"temporal dithering needs {cycle_frames} frames, {cycle_s * 1e3:.0f} ms at {refresh_hz:g} Hz, and the tracker exposes"
-        f" {exposure_s * 1e3:.0f} ms, a part of the cycle; shorten the cycle or use exact"
-    )
+    return turn
 
 
 def shown_light(levels: Codes, panel: Panel) -> FloatArray:

@@ -18,8 +18,9 @@ from hilstar.arrays import Float32Array
 from hilstar.errors import InputError, MachineError
 from hilstar.monitor.balance import AS_USUAL, Balance, Seen
 from hilstar.monitor.exact import ExactQuantiser
-from hilstar.monitor.quantise import CYCLE_FRAMES, Panel, Quantisation, frame_shift
+from hilstar.monitor.quantise import Panel, Quantisation, mask_turn
 from hilstar.monitor.response import Codes, Response
+from hilstar.monitor.temporal import TemporalQuantiser
 from hilstar.render.encoder import (
     SPRITE_PIXEL_COST,
     Encoder,
@@ -39,6 +40,7 @@ from hilstar.scene.sprites import SPRITE_DTYPE, Sprites
 EGL_LIBRARY = "libEGL.so.1"
 INSTALL_EGL = "install it: apt-get install libegl1 libgl1-mesa-dri"
 FIRST_CAPACITY = 4096
+NO_FRAME = -1
 Context = moderngl.Context
 
 
@@ -46,9 +48,9 @@ Context = moderngl.Context
 class Target:
     """What the renderer draws for: an image's pixels, its sprites, and a monitor's response where codes are wanted.
 
-    `uniformity` float32 (height, width) is each pixel's light relative to the response (None: 1 everywhere), and
-    `cycle_frames`, a power of two, is for `temporal` alone. `sides` are those of fainter stars' sprites, by falling
-    rates, of the same parity as the footprint. `seen` is how the tracker sees the monitor, for `exact`.
+    `uniformity` float32 (height, width) is each pixel's light relative to the response (None: 1 everywhere). `sides` are those
+    of fainter stars' sprites, by falling rates, of the same parity as the footprint. `seen` is how the tracker sees the
+    monitor, for `exact` and `temporal`.
     """
 
     resolution_px: tuple[int, int]
@@ -57,7 +59,6 @@ class Target:
     flux_at_white_e_per_s: float = 1.0
     quantisation: Quantisation = "round"
     uniformity: Float32Array | None = None
-    cycle_frames: int = CYCLE_FRAMES
     sides: SpriteSides = ()
     seen: Seen = AS_USUAL
 
@@ -98,6 +99,8 @@ class Renderer:
         self.footprint_px = footprint_px(target.sigma_px)
         self._undrawn: tuple[Sprites | None, bool] | None = None
         self._by_numpy = False
+        self._star_by_star = target.response is not None and target.quantisation in ("exact", "temporal")
+        self._last_frame = NO_FRAME
         self._ctx = context or create_context()
         try:
             with self._ctx:
@@ -156,16 +159,15 @@ class Renderer:
         # `exact` in NumPy is made by the first frame that needs it: its arrays are as large as the image.
         self._exact: ExactQuantiser | None = None
         self._floor_encoder: Encoder | None = None
-        self._floor_lights: tuple[ExtendedLight, ...] = ()
+        self._floor_key: tuple[tuple[ExtendedLight, ...], float] = ((), 0.0)
         self._floor_levels: Codes | None = None
         if panel is None:
             return
-        frame_shift(0, target.cycle_frames)  # refuses a cycle that is no power of two
         self._levels = LevelTexture(self._ctx, target.resolution_px, panel)
         if target.quantisation == "exact" and ExactPass.runs_on(self._ctx, target.sigma_px):
             self._exact_pass = ExactPass(self._linear, self._levels, panel, Balance(target.sigma_px, target.seen))
-        if target.quantisation != "exact" or self._exact_pass is not None:
-            dithered = target.quantisation in ("dither", "temporal")
+        if not self._star_by_star or self._exact_pass is not None:
+            dithered = target.quantisation == "dither"
             self._encoder = Encoder(self._ctx, self._linear, self._levels, panel, dithered)
             self._lit_sides = () if dithered else target.sides or lit_sides(panel, target.sigma_px, self.footprint_px)
             self._encoder.shrink(self._lit_sides)
@@ -182,59 +184,75 @@ class Renderer:
         if self._encoder is not None:
             self._encoder.take_places_from(self._buffer, self.footprint_px)
 
-    def draw(self, sprites: Sprites | None, frame: int = 0, whole: bool = False) -> None:
+    def draw(self, sprites: Sprites | None, frame: int = 0) -> None:
         """Draw the linear image and the codes of `sprites` (None: blank); read them with `linear` and `codes`.
 
-        `frame` counts the frames shown, for `temporal` alone. With `whole` no sprite is smaller than the footprint.
+        `frame` counts the frames shown, for `temporal` alone: a frame whose number is not above the last one's begins anew.
         """
         with self._ctx:
+            if frame <= self._last_frame:
+                self.begin_anew()
+            self._last_frame = frame
             extended = sprites is not None and bool(sprites.extended)
-            exact = self._levels is not None and self.target.quantisation == "exact"
-            self._by_numpy = exact and (self._exact_pass is None or extended)
+            self._by_numpy = self._star_by_star and (self._exact_pass is None or extended)
             if self._by_numpy:
-                self._draw_by_numpy(sprites)
-                self._undrawn = (sprites, whole)
+                self._draw_by_numpy(sprites, frame)
+                self._undrawn = (sprites, False)
                 self._last_count = None
                 return
-            self._draw_linear(sprites, whole)
+            self._draw_linear(sprites, whole=False)
             if self._encoder is not None:
-                self._encode(self._encoder, sprites, frame)
+                self._encode(self._encoder, sprites)
             if self._exact_pass is not None and sprites is not None and len(sprites):
                 self._exact_pass.draw(self._buffer, sprites)
 
-    def _draw_by_numpy(self, sprites: Sprites | None) -> None:
+    def draw_linear(self, sprites: Sprites) -> None:
+        """Draw the linear image of `sprites` alone, no sprite smaller than the footprint; the next `codes` are undefined.
+
+        What `temporal` carries from frame to frame stays as it is.
+        """
+        with self._ctx:
+            self._draw_linear(sprites, whole=True)
+
+    def begin_anew(self) -> None:
+        """Forget what `temporal` carries from frame to frame: the next frame is the first of a sequence."""
+        self._last_frame = NO_FRAME
+        if isinstance(self._exact, TemporalQuantiser):
+            self._exact.left = None
+
+    def _draw_by_numpy(self, sprites: Sprites | None, frame: int) -> None:
         """Levels by the sprites themselves: the linear image is drawn only when it is read."""
         target, panel, levels = self.target, self.target.panel(), self._levels
         if panel is None or levels is None:
             return
+        temporal = target.quantisation == "temporal"
         if self._exact is None:
-            self._exact = ExactQuantiser(panel, target.resolution_px, target.sigma_px, target.seen)
-        floor = self._floor(sprites.extended, panel, levels) if sprites is not None and sprites.extended else None
+            quantiser = TemporalQuantiser if temporal else ExactQuantiser
+            self._exact = quantiser(panel, target.resolution_px, target.sigma_px, target.seen)
+        lights = () if sprites is None else sprites.extended
+        floor = self._floor(lights, mask_turn(frame) if temporal else 0.0, panel, levels) if lights else None
         self._exact_levels = self._exact.levels(sprites, floor)
         levels.write(self._exact_levels)
 
-    def _encode(self, encoder: Encoder, sprites: Sprites | None, frame: int) -> None:
-        temporal = self.target.quantisation == "temporal"
-        shift = frame_shift(frame, self.target.cycle_frames) if temporal else 0.0
+    def _encode(self, encoder: Encoder, sprites: Sprites | None) -> None:
         count, per_star = (0, 1) if sprites is None else (len(sprites), sprites.per_star)
-        encoder.draw(count, per_star, self._covered_px(sprites), shift, self._regions)
+        encoder.draw(count, per_star, self._covered_px(sprites), 0.0, self._regions)
 
-    def _floor(self, lights: tuple[ExtendedLight, ...], panel: Panel, levels: LevelTexture) -> Codes:
-        """The levels of extended light alone, dithered, for `exact`: its stars are added to them in light.
+    def _floor(self, lights: tuple[ExtendedLight, ...], turn: float, panel: Panel, levels: LevelTexture) -> Codes:
+        """The levels of extended light alone, dithered by a turned mask: stars are added to them in light.
 
-        The same lights again give the same levels, which are kept.
+        The same lights and turn again give the same levels, which are kept.
         """
-        if self._floor_levels is not None and lights == self._floor_lights:
+        if (lights, turn) == self._floor_key and self._floor_levels is not None:
             return self._floor_levels
         if self._floor_encoder is None:
             self._floor_encoder = Encoder(self._ctx, self._linear, levels, panel, dithered=True)
         self._erase()
         self._shine(lights)
         levels.fbo.clear()
-        self._floor_encoder.draw(0, 1, 0, 0.0, self._regions)
-        found = levels.read().copy()
-        self._floor_lights, self._floor_levels = lights, found
-        return found
+        self._floor_encoder.draw(0, 1, 0, turn, self._regions)
+        self._floor_key, self._floor_levels = (lights, turn), levels.read().copy()
+        return self._floor_levels
 
     def _covered_px(self, sprites: Sprites | None) -> int:
         """Pixels that all sprites together may light; at most, where that is few."""

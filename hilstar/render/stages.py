@@ -44,9 +44,9 @@ class StagedRenderer(Renderer):
         with self._timed("splat"):
             super()._splat_stars(sprites, whole)
 
-    def _encode(self, encoder: Encoder, sprites: Sprites | None, frame: int) -> None:
+    def _encode(self, encoder: Encoder, sprites: Sprites | None) -> None:
         with self._timed("encode"):
-            super()._encode(encoder, sprites, frame)
+            super()._encode(encoder, sprites)
 
     @contextmanager
     def _timed(self, stage: str) -> Iterator[None]:

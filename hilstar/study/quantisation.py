@@ -11,7 +11,7 @@ import numpy as np
 from hilstar.arrays import FloatArray
 from hilstar.charts import STYLE, plain_ticks, save, title_lines, write_csv
 from hilstar.monitor.phases import SIGMA_PX, WHITE
-from hilstar.monitor.quantise import CYCLE_FRAMES
+from hilstar.monitor.quantise import EXPOSURE_FRAMES
 from hilstar.monitor.response import srgb_response
 from hilstar.render.renderer import Renderer, Target
 from hilstar.scene.psf import footprint_px, peak_share
@@ -79,7 +79,7 @@ def _summary(bits: int, found: Found, mags: FloatArray) -> str:
     half_step_px = srgb_response(bits).half_step * peak_share(SIGMA_PX) / flux_ratio(limit)
     return (
         f"{bits} bits, sRGB, {limit:g} magnitudes (aim {aim_mag:g} mag, {AIM_PX:g} px): largest errors, places by a PSF fit, of"
-        f" exact {worst(WAYS[3])}, with bit stealing {worst(WAYS[5])}; {one_frame} (over {CYCLE_FRAMES} frames)."
+        f" exact {worst(WAYS[3])}, with bit stealing {worst(WAYS[5])}; {one_frame} (over {EXPOSURE_FRAMES} frames)."
         f" Half the smallest step of light moves a centroid by {half_step_px:.3f} px along each axis"
     )
 

@@ -147,7 +147,7 @@ def not_drawn(bench: Bench) -> NotDrawn:
 
 def _errors(bench: Bench) -> list[tuple[float, StarErrors]]:
     """The errors at each magnitude below full scale, down to the first at which a star shows nothing."""
-    render, target = bench.config.render, bench.renderer.target
+    render, target, frames = bench.config.render, bench.renderer.target, bench.config.exposure_frames
     sprites, tile = phase_grid(PHASES, render.sprite_sigma_px)
     bright = phase_image(sprites, render.sprite_sigma_px)
     judge = Judge(bright, tile, render.sprite_sigma_px, target.seen.blur_px, target.seen.pixel_px)
@@ -155,7 +155,7 @@ def _errors(bench: Bench) -> list[tuple[float, StarErrors]]:
     found = []
     for mag in np.arange(0.0, MAX_BELOW_WHITE_MAG + STEP_MAG / 2, STEP_MAG).tolist():
         wanted, stars = (bright * flux_ratio(mag)).astype(np.float32), fainter(sprites, mag)
-        shown = shown_by(target.quantisation, render.cycle_frames, panel, wanted, stars, balance)
+        shown = shown_by(target.quantisation, frames, panel, wanted, stars, balance)
         found.append((mag, judge.errors(shown, flux_ratio(mag))))
         if not np.isfinite(found[-1][1].flux_mag).all():
             break

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from hilstar.arrays import FloatArray
 from hilstar.attitude.wire.source import Mounting
 from hilstar.bench.heads_file import HeadsFile
-from hilstar.monitor.quantise import MAX_CYCLE_FRAMES
+from hilstar.monitor.quantise import MASK_TURNS
 from hilstar.rotation import conjugate, from_matrix, multiply, to_rotation_vector
 from hilstar.twin.verify.star_finder import Matched, crowded, shared, star_finder
 from hilstar.twin.verify.twin import Field, Twin
@@ -125,7 +125,7 @@ def verify_heads(
         seen_by = [_Head(stack.enter_context(Twin(file))) for file in heads.files]
         for number in range(fields):
             q = rng.normal(size=4)
-            q_icrs_to_body, first_frame = q / np.linalg.norm(q), int(rng.integers(0, MAX_CYCLE_FRAMES))
+            q_icrs_to_body, first_frame = q / np.linalg.norm(q), int(rng.integers(0, MASK_TURNS))
             solved = [head.solved(q_icrs_to_body, first_frame) for head in seen_by]
             for pair, (one, other) in zip(pairs, combinations(solved, 2), strict=True):
                 if one is not None and other is not None:

@@ -9,7 +9,7 @@ from hilstar.bench.config.background import Background
 from hilstar.bench.config.collimator import Collimator
 from hilstar.bench.config.faults import FaultSettings
 from hilstar.bench.config.monitor import Monitor
-from hilstar.bench.config.render import RenderSettings
+from hilstar.bench.config.render import MAX_JUDGED_FRAMES, RenderSettings
 from hilstar.bench.config.sky import SkySettings
 from hilstar.bench.config.spacecraft import Spacecraft
 from hilstar.bench.config.sync import SyncSettings
@@ -34,3 +34,10 @@ class BenchConfig(Table, frozen=True):
     verify: Verify = msgspec.field(default_factory=Verify)
     sync: SyncSettings = msgspec.field(default_factory=SyncSettings)
     faults: FaultSettings = msgspec.field(default_factory=FaultSettings)
+
+    @property
+    def exposure_frames(self) -> int:
+        """The frames of the tracker's exposure by which `temporal` is judged."""
+        if self.render.cycle_frames is not None:
+            return self.render.cycle_frames
+        return min(max(1, round(self.tracker.exposure_s * self.monitor.refresh_hz)), MAX_JUDGED_FRAMES)

@@ -12,6 +12,7 @@ from hilstar.toml_tables import Table
 # White, where the file gives none. demo.toml, 200 random fields: the brightest code of 8 bits is 100 in the median (38 with
 # Sirius for white), `verify` sees flux 0.065 mag off at 95 % (0.41), and 13 stars clip, one of them in 8 % of fields.
 DEFAULT_BRIGHTEST_V_MAG = 1.5
+MAX_JUDGED_FRAMES = 16  # of an exposure that the file does not count: longer ones are better still
 
 
 class RenderSettings(Table, frozen=True):
@@ -37,8 +38,9 @@ class RenderSettings(Table, frozen=True):
         Literal["round", "dither", "temporal", "exact", "auto"],
         Meta(
             description='How light becomes codes. `"round"`: the nearest code. `"dither"`: blue noise, exact in the mean over '
-            'pixels. `"temporal"`: dithered over `cycle_frames` frames. `"exact"`: all codes of a star are chosen together, so '
-            'that its flux and centroid are right in a single frame. `"auto"`: `round` where that stays within the tolerance, '
+            'pixels. `"exact"`: all codes of a star are chosen together, so that its flux and centroid are right in a single '
+            'frame. `"temporal"`: and so that each frame makes up for what the one before left, by which the mean of any N '
+            'frames is about N times as right. `"auto"`: `round` where that stays within the tolerance, '
             "else `exact`, unless an average field, turning at 1 deg/s, would take it more than half a refresh on two cores "
             "without a GPU; "
             "`--explain` of `frame`, `serve` and `replay` says which."
@@ -52,9 +54,13 @@ class RenderSettings(Table, frozen=True):
         ),
     ] = False
     cycle_frames: Annotated[
-        Literal[1, 2, 4, 8, 16, 32, 64, 128, 256],
-        Meta(description="Length of the `temporal` cycle. A warning is given when the tracker's exposure is shorter."),
-    ] = 8
+        Annotated[int, Meta(ge=1, le=256)] | None,
+        Meta(
+            description="Frames of the tracker's exposure, by which `budget`, `--explain` and `first-light` judge `temporal`. "
+            "The codes do not depend on it.",
+            extra={"default": f"as many as `exposure_s` has, at most {MAX_JUDGED_FRAMES}"},
+        ),
+    ] = None
     sprite_sigma_px: Annotated[Sigma, Meta(description="Gaussian sigma of a star on the monitor, in monitor pixels.")] = (
         0.85,
         0.85,

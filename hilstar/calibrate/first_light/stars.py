@@ -82,10 +82,11 @@ def see_stars(room: Room) -> StarsSeen:
 
 
 def _frames(bench: Bench, frame: Frame) -> tuple[CodeImage, ...]:
-    """The codes of an attitude: one frame, or with `temporal` a whole turn of them."""
-    numbers = range(1, bench.config.render.cycle_frames if bench.config.render.quantisation == "temporal" else 1)
-    later = [bench.code_values(bench.draw(frame.q_icrs_to_cam, number).levels.copy()) for number in numbers]
-    return tuple(codes.astype(np.uint16) for codes in (frame.codes, *later))
+    """The codes of an attitude: one frame, or with `temporal` those of an exposure."""
+    if bench.config.render.quantisation != "temporal":
+        return (frame.codes.astype(np.uint16),)
+    numbers = range(bench.config.exposure_frames)
+    return tuple(bench.code_values(bench.draw(frame.q_icrs_to_cam, k).levels).astype(np.uint16) for k in numbers)
 
 
 def _together(fields: list[StarsSeen], dark: Path) -> StarsSeen:

@@ -8,7 +8,7 @@ import numpy as np
 
 from hilstar.monitor.balance import AS_USUAL, Balance
 from hilstar.monitor.phases import SIGMA_PX, WHITE, fainter, phase_grid, phase_image, shown_by
-from hilstar.monitor.quantise import CYCLE_FRAMES, Panel
+from hilstar.monitor.quantise import Panel
 from hilstar.study.shared.codes import Way, response_of
 from hilstar.tracker.centroiders import FAMILY, Centroider
 from hilstar.tracker.star_errors import Judge, StarErrors
@@ -31,10 +31,12 @@ def code_errors(bits: int, way: Way, phases: int, mags: Iterable[float]) -> list
     sprites, tile = phase_grid(phases, SIGMA_PX)
     bright = phase_image(sprites, SIGMA_PX)
     judge = Judge(bright, tile, SIGMA_PX, AS_USUAL.blur_px, AS_USUAL.pixel_px)
-    cycle, errors = CYCLE_FRAMES if way.whole_cycle else 1, []
+    errors = []
     for mag in mags:
         wanted = (bright * flux_ratio(mag)).astype(np.float32)
-        errors.append(judge.errors(shown_by(way.method, cycle, panel, wanted, fainter(sprites, mag), balance), flux_ratio(mag)))
+        errors.append(
+            judge.errors(shown_by(way.method, way.frames, panel, wanted, fainter(sprites, mag), balance), flux_ratio(mag))
+        )
     return errors
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hilstar.monitor.phases import SIGMA_PX, WHITE
-from hilstar.monitor.quantise import CYCLE_FRAMES, Quantisation
+from hilstar.monitor.quantise import EXPOSURE_FRAMES, Quantisation
 from hilstar.monitor.response import Response, Weights, bit_stealing_response, srgb_response
 from hilstar.scene.psf import peak_share
 from hilstar.scene.sprites import Sprites, pack_sprites
@@ -27,19 +27,19 @@ STEALING = ", bit stealing"
 
 @dataclass(frozen=True, slots=True)
 class Way:
-    """One way from light to levels: its name, the renderer's method, and the style of its line."""
+    """One way from light to levels: its name, the renderer's method, its line's style, and in how many frames it is seen."""
 
     name: str
     method: Quantisation
     style: str
     stealing: bool = False
-    whole_cycle: bool = False
+    frames: int = 1
 
 
 WAYS = (
     Way("round", "round", "C7-"),
-    Way("dither; temporal in one frame", "dither", "C1-"),
-    Way(f"temporal, mean of {CYCLE_FRAMES} frames", "temporal", "C2-", whole_cycle=True),
+    Way("dither", "dither", "C1-"),
+    Way(f"temporal, mean of {EXPOSURE_FRAMES} frames", "temporal", "C2-", frames=EXPOSURE_FRAMES),
     Way("exact", "exact", "C0-"),
     Way("round" + STEALING, "round", "C7:", stealing=True),
     Way("exact" + STEALING, "exact", "C0:", stealing=True),

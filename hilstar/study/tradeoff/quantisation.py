@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
+from itertools import count
 
 from hilstar.bench.config import Monitor, RenderSettings
 from hilstar.monitor.phases import WHITE
@@ -49,8 +50,10 @@ def _quantised(stack: ExitStack, way: Way, bits: int) -> Trial:
     renderer = stack.enter_context(Renderer(Target(FRAME_PX, SIGMA_PX, response, WHITE, way.method)))
     field = star_field(FRAME_PX, renderer.footprint_px)
 
+    numbers = count()
+
     def work() -> None:
-        renderer.draw(field)
+        renderer.draw(field, next(numbers))
         renderer.codes()
 
     is_default = (way.method, way.stealing) == (TAKEN, RenderSettings().bit_stealing)

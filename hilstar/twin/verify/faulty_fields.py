@@ -19,7 +19,7 @@ from hilstar.bench.faults.scenario import Scenario, lasts_ns
 from hilstar.bench.faults.view import FaultView, icrs_direction
 from hilstar.bench.faults.views import display_view
 from hilstar.bench.frame import Frame
-from hilstar.monitor.quantise import MAX_CYCLE_FRAMES
+from hilstar.monitor.quantise import MASK_TURNS
 from hilstar.rotation import from_radec_roll_deg, propagate
 from hilstar.twin.verify.light import exposure_lights
 from hilstar.twin.verify.star_finder import StarFinder, star_finder
@@ -74,7 +74,7 @@ class FaultyFields:
     def _one(self, fault: Fault) -> FaultSeen:
         if isinstance(fault, Freeze | Drop):
             return FaultSeen(fault.name, fault.KIND, note="of the run's frames: a field that stands still has none")
-        q, first_frame = self._attitude(fault), int(self._rng.integers(0, MAX_CYCLE_FRAMES))
+        q, first_frame = self._attitude(fault), int(self._rng.integers(0, MASK_TURNS))
         since_ns = (lasts_ns(fault) or 0) // 2
         effects = Effects(self._view, (Now(1, fault, since_ns),))
         plain, faulty = self._shot(q, first_frame, None), self._shot(q, first_frame, effects)

@@ -13,21 +13,30 @@ from hilstar.monitor.calibration import BUILT_IN, Calibration, load_calibration
 from hilstar.monitor.quantise import Panel, shown_light
 from hilstar.monitor.response import Response, table_response
 
+PHASES = 4  # frames of a sequence with which an exposure may begin
+
 
 def exposure_lights(
     bench: Bench, frame: Frame, first_frame: int, panels: Sequence[Panel], faults: FrameFaults | None = None
 ) -> list[FloatArray]:
-    """The mean light (H, W), electrons per second, of each panel over an exposure that begins with frame `first_frame`."""
-    lights = [shown_light(frame.levels, panel) for panel in panels]
-    if bench.config.render.quantisation == "temporal":
-        count = max(1, round(bench.config.tracker.exposure_s * bench.config.monitor.refresh_hz))
-        for number in range(first_frame + 1, first_frame + count):
+    """The mean light (H, W), electrons per second, of each panel over an exposure that begins with frame `first_frame`.
+
+    With `temporal` that is one of the first PHASES frames of a sequence, which `frame` is the first of.
+    """
+    if bench.config.render.quantisation != "temporal":
+        return [shown_light(frame.levels, panel) for panel in panels]
+    before, count = first_frame % PHASES, max(1, round(bench.config.tracker.exposure_s * bench.config.monitor.refresh_hz))
+    lights = [np.zeros(frame.levels.shape) for _ in panels]
+    for number in range(before + count):
+        levels = frame.levels
+        if number:
             sprites = bench.frame_sprites(frame.q_icrs_to_cam, t_ns=frame.t_ns, faults=faults)
-            levels = bench.draw_sprites(sprites, number).levels
+            levels = bench.draw_sprites(sprites, first_frame + number).levels
+        if number >= before:
             for light, panel in zip(lights, panels, strict=True):
                 light += shown_light(levels, panel)
-        for light in lights:
-            light /= count
+    for light in lights:
+        light /= count
     return lights
 
 

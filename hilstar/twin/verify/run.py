@@ -9,7 +9,7 @@ import numpy as np
 
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.faults.scenario import Scenario
-from hilstar.monitor.quantise import MAX_CYCLE_FRAMES
+from hilstar.monitor.quantise import MASK_TURNS
 from hilstar.twin.verify.faulty_fields import FaultyFields
 from hilstar.twin.verify.measure import Comparison
 from hilstar.twin.verify.twin import Twin
@@ -34,7 +34,7 @@ def verify(
         faulty = None if scenario is None else FaultyFields(twin, scenario, of_faults)
         for number in range(fields):
             q = attitudes.normal(size=4)
-            first_frame = int(attitudes.integers(0, MAX_CYCLE_FRAMES))
+            first_frame = int(attitudes.integers(0, MASK_TURNS))
             comparison.add(twin.field(q / np.linalg.norm(q), first_frame), noise)
             on_field(number + 1)
         verdict = judge(comparison.measured())

@@ -10,13 +10,12 @@ from hilstar.monitor.blue_noise import blue_noise
 from hilstar.monitor.data.make_blue_noise import SEED, void_and_cluster
 from hilstar.monitor.level_table import ThresholdCounter
 from hilstar.monitor.quantise import (
+    MASK_TURNS,
     Panel,
-    cycle_warning,
     dither_levels,
-    frame_shift,
+    mask_turn,
     round_levels,
     shown_light,
-    temporal_levels,
 )
 from hilstar.monitor.response import encode, gamma_response, srgb_response
 
@@ -89,36 +88,23 @@ def test_a_level_s_own_light_is_never_dithered():
 
 @pytest.mark.parametrize("frames", [1, 2, 4, 8, 16, 32, 64])
 @pytest.mark.parametrize("start", [0, 3])
-def test_the_error_of_temporal_after_aligned_frames_is_under_a_step_over_their_number(frames, start, rng):
+def test_over_aligned_turns_of_the_mask_the_error_is_under_a_step_over_their_number(frames, start, rng):
     response = srgb_response(8)
     panel = Panel(response, WHITE)
     light = rng.uniform(0, 0.9, (40, 50)) ** 2
     image = (WHITE * light).astype(np.float32)
-    shown = [
-        shown_light(temporal_levels(image, panel, frame, 64), panel) for frame in range(frames * start, frames * (start + 1))
-    ]
+    turns = [mask_turn(frame) for frame in range(frames * start, frames * (start + 1))]
+    shown = [shown_light(dither_levels(image, panel, turn), panel) for turn in turns]
     error = np.abs(np.mean(shown, axis=0) / WHITE - light) / steps_of(light, response)
     assert error.max() < 1 / frames + ROUNDING_OF_A_STEP
     assert error.max() > 0.5 / frames  # and no method of so few equal frames does better for every light
 
 
-def test_temporal_begins_again_after_its_cycle():
-    turns = [frame_shift(frame, 8) for frame in range(24)]
-    assert turns[:8] == turns[8:16] == turns[16:]
-    assert sorted(turns[:8]) == [k / 8 for k in range(8)]
-    assert [frame_shift(frame, 1) for frame in range(3)] == [0, 0, 0]
-
-
-@pytest.mark.parametrize("cycle", [0, 3, 6, -8, 8192])
-def test_a_cycle_that_is_no_power_of_two_is_refused(cycle):
-    with pytest.raises(InputError, match="power of two"):
-        frame_shift(0, cycle)
-
-
-def test_an_exposure_shorter_than_the_cycle_is_warned_of():
-    warning = cycle_warning(0.1, 60.0, 8)
-    assert warning is not None and "133 ms" in warning and "100 ms" in warning
-    assert cycle_warning(8 / 60, 60.0, 8) is None
+def test_the_mask_s_turns_begin_again():
+    turns = [mask_turn(frame) for frame in range(MASK_TURNS)]
+    assert sorted(turns) == [k / MASK_TURNS for k in range(MASK_TURNS)]
+    assert sorted(turns[24:32]) == pytest.approx([k / 8 + min(turns[24:32]) for k in range(8)])
+    assert mask_turn(MASK_TURNS + 5) == turns[5]
 
 
 def test_the_uniformity_map_is_taken_out_of_the_light(rng):

@@ -46,7 +46,14 @@ def load(path: str | Path) -> Bench:
 def open_bench(file: BenchFile, context: Context | None = None) -> Bench:
     """Assemble the bench of a file, in a window's `context` if one is given. Raises InputError or MachineError (no OpenGL)."""
     moving = bench_moving(file.config, file.folder)
-    stars, calibration = bench_stars(file.config, file.folder, moving), bench_calibration(file.config, file.folder)
+    bench = assembled(file, bench_stars(file.config, file.folder, moving), context, moving)
+    _warn_of_cycle(bench.config, file.path)
+    return bench
+
+
+def assembled(file: BenchFile, stars: Stars, context: Context | None = None, moving: MovingSky | None = None) -> Bench:
+    """The bench of a file whose stars are made already, as `bench_stars` makes them. Raises InputError or MachineError."""
+    calibration = bench_calibration(file.config, file.folder)
     white_e_per_s = _white_e_per_s(file.config.render, stars)
     uniformity = calibration.uniformity_map(file.config.monitor.resolution_px)
     darkest = 1.0 if uniformity is None else float(uniformity.min())

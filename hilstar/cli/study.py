@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 
-from hilstar.cli.options import Json
+from hilstar.cli.options import Json, check_files
 from hilstar.console.terminal import print_json, progress
 from hilstar.files import check_directory
 
@@ -25,14 +26,19 @@ Study = Literal[
     "geometry",
     "bodies",
     "faults",
+    "chain",
 ]
 
-ROOMS = {"bodies", "geometry", "models", "stability", "timing", "tradeoff"}  # the studies of more than one file
+ROOMS = {"bodies", "chain", "geometry", "models", "stability", "timing", "tradeoff"}  # the studies of more than one file
+CHAIN_SCENES = 5
 
 
 def study(
     what: Annotated[Study, typer.Argument(help="The study.")],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Directory for charts and tables.")],
+    bench: Annotated[
+        Path | None, typer.Argument(metavar="[BENCH.toml]", help="The bench file of `chain`.", show_default=False)
+    ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Fewer rounds, where a full study takes minutes.")] = False,
     as_json: Json = False,
 ) -> None:
@@ -40,13 +46,34 @@ def study(
     from hilstar.files import make_directory
 
     check_directory("-o", output)
+    check_bench(what, bench)
     make_directory(output)
-    with progress(f"study {what}", math.inf):
-        lines, right = study_lines(what, output, quick)
+    with progress(f"study {what}", math.inf if bench is None else CHAIN_SCENES) as advance:
+        lines, right = study_lines(what, output, quick) if bench is None else chain_lines(bench, output, quick, advance)
     if as_json:
         print_json({"study": what, "right": right, "findings": lines, "directory": str(output)})
     else:
         typer.echo("\n".join([*lines, f"figures and tables in {output}"]))
+
+
+def check_bench(what: str, bench: Path | None) -> None:
+    """Refuse (InputError) a bench file for a study that has its own, and `chain` without one."""
+    from hilstar.errors import InputError
+
+    if what == "chain" and bench is None:
+        raise InputError("study chain: is of a bench; write hilstar study chain BENCH.toml -o DIR")
+    if what != "chain" and bench is not None:
+        raise InputError(f"study {what}: has benches of its own; leave out {bench}")
+
+
+def chain_lines(bench: Path, output: Path, quick: bool, advance: Callable[[int], object]) -> tuple[list[str], bool]:
+    """Run the study of a bench's whole chain; what it found, and whether `auto` is on every front."""
+    from hilstar.bench.bench_file import read_bench_file
+    from hilstar.study.chain.run import OUTPUTS, run
+
+    file = read_bench_file(bench)
+    check_files([bench], [output / name for name in OUTPUTS], file)
+    return run(file, output, quick, advance)
 
 
 def study_lines(what: str, output: Path, quick: bool = False) -> tuple[list[str], bool]:

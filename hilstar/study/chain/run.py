@@ -1,0 +1,59 @@
+"""The whole frame's error against its time: each combination of a bench's choices, in five scenes of its own sky."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+from hilstar.bench.bench_file import BenchFile
+from hilstar.errors import InputError
+from hilstar.study.chain.bench_parts import Parts
+from hilstar.study.chain.budget import error_budget, time_budget
+from hilstar.study.chain.chart import draw
+from hilstar.study.chain.measuring import QUICK, Plan, SceneMeasurement
+from hilstar.study.chain.scenes import five_scenes
+from hilstar.study.chain.table import BudgetRow, Row, StageRow, budget_rows, rows_of, stage_rows, write_tables
+from hilstar.study.chain.tracker import Tracker
+from hilstar.study.chain.verdict import is_right, scene_line
+
+OUTPUTS = ("chain.png", "chain.csv", "chain_budget.csv", "chain_time.csv")
+
+
+def run(
+    file: BenchFile, directory: Path, quick: bool = False, advance: Callable[[int], object] | None = None
+) -> tuple[list[str], bool]:
+    """Measure a bench file's scenes; write `chain.png`, `chain.csv`, `chain_budget.csv` and `chain_time.csv` into `directory`.
+
+    A line for each scene, and whether `auto` is on the front of all, or within the noise of it; `advance` hears how many scenes
+    are done. Raises InputError, MachineError.
+    """
+    rows: list[Row] = []
+    budget: list[BudgetRow] = []
+    stages: list[StageRow] = []
+    lines, right = [], True
+    with Parts(file) as parts:
+        tracker = Tracker(parts.own)
+        try:
+            for number, scene in enumerate(five_scenes(parts.own)):
+                measurement = SceneMeasurement(parts, tracker, scene, QUICK if quick else Plan())
+                if not measurement.star_count:
+                    lines.append(f"{scene.name}: not measured: no star stands alone and stays in view over the exposure")
+                    continue
+                own = rows_of(measurement, measurement.outcomes())
+                auto = measurement.marks.auto
+                parts_of_error = budget_rows(scene.name, error_budget(measurement, auto))
+                parts_of_time = stage_rows(scene.name, time_budget(measurement, auto))
+                lines.append(scene_line(own, parts_of_error, parts_of_time))
+                right = right and is_right(own)
+                rows, budget, stages = rows + own, budget + parts_of_error, stages + parts_of_time
+                if advance is not None:
+                    advance(number + 1)
+            machine = f"{parts.own.renderer.gl_renderer}, {os.cpu_count()} cores"
+        finally:
+            tracker.close()
+    if not rows:
+        raise InputError(f"{file.path}: no star stands alone in view in any scene; write a larger [sky] faintest_v_mag")
+    write_tables(directory, rows, budget, stages)
+    draw(directory / "chain.png", rows, budget, stages, machine)
+    return [*lines, f"times on {machine}"], right

@@ -1,0 +1,238 @@
+"""What the bench's virtual tracker measures of its stars: of the sky itself, and of what the display makes of it.
+
+At rest the stars are found by the bench's own centroider (`[verify] centroider`). Where they leave paths, each is the centre of
+mass of the pixels about its path, which is long enough for an attitude that is late. Light is without noise: that of the
+detector is not the display's.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilstar.arrays import BoolArray, FloatArray, IntArray
+from hilstar.bench.cameras import tracker_camera
+from hilstar.bench.frame import Bench
+from hilstar.rotation import to_matrix
+from hilstar.scene.camera import Camera
+from hilstar.scene.psf import peak_share
+from hilstar.study.chain.motion import PACKET_HZ, Movement, lead_ns
+from hilstar.study.chain.panel import Exposure
+from hilstar.study.chain.true_light import instants, points, sky_light
+from hilstar.twin.bench_geometry import BenchGeometry
+from hilstar.twin.optics import TwinOptics
+from hilstar.twin.verify.star_finder import (
+    CROWDED_SHARE,
+    MATCH_PX,
+    Matched,
+    StarFinder,
+    crowded,
+    seen_sigma_px,
+    shared,
+    star_finder,
+)
+from hilstar.units import ARCSEC_PER_RAD, MAG_PER_RELATIVE, NS_PER_S, magnitude
+
+REACH_SIGMAS = 4.0
+LOST_SHARE = 0.1  # of a star's light: with less of it in its pixels it is lost
+LOST_MAG = MAG_PER_RELATIVE  # a lost star's flux is off by all of it
+PATH_STEP_PX = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """The judged stars (n,) of one exposure: unit directions (n, 3) in cam, NaN where lost, and light, electrons."""
+
+    directions: FloatArray
+    light_e: FloatArray
+
+    @property
+    def lost(self) -> BoolArray:
+        """The stars that are not found."""
+        return np.isnan(self.directions[:, 0])
+
+
+@dataclass(frozen=True, slots=True)
+class Off:
+    """How far stars (n,) of one measurement are from another's, arcsec and mag; and whether they are lost."""
+
+    arcsec: FloatArray
+    mag: FloatArray
+    lost: BoolArray
+
+
+class Tracker:
+    """A bench's virtual tracker. Free it with `close`."""
+
+    def __init__(self, bench: Bench) -> None:
+        self.bench = bench
+        tracker = bench.config.tracker
+        self.camera: Camera = tracker_camera(tracker, bench.file.folder)
+        self.geometry = BenchGeometry(bench.camera, self.camera)
+        self.optics = TwinOptics(self.geometry, tracker.psf_sigma_px)
+        scale = bench.camera.focal_length_px / self.camera.focal_length_px
+        self.finder: StarFinder = star_finder(bench, scale)
+        self.sigma_px = seen_sigma_px(bench.config, scale)
+        self.monitor_px_per_px = scale
+        self.arcsec_per_px = ARCSEC_PER_RAD / self.camera.scales_px_rad()[1]
+
+    def image_e(self, light_e_per_s: FloatArray, seen: Exposure) -> FloatArray:
+        """Electrons (h, w) of an exposure to the mean light of a monitor (H, W)."""
+        return self.optics.image_e_per_s(light_e_per_s) * seen.length_s
+
+    def close(self) -> None:
+        """Free the GL context."""
+        self.optics.close()
+
+
+class Judge:
+    """One exposure of a scene: its stars that stand alone, and what the tracker measures of them in the sky itself."""
+
+    def __init__(self, tracker: Tracker, movement: Movement, seen: Exposure) -> None:
+        self.tracker, self.movement, self.seen = tracker, movement, seen
+        bench = tracker.bench
+        q = movement.at(seen.middle_ns())
+        sprites = points(bench, q)
+        self._star = sprites.star
+        self._e = bench.stars.electrons_per_s[self._star] * seen.length_s
+        self._wanted = self._whole(sprites.star)
+        self.true = bench.stars.directions(self._star) @ to_matrix(q).T
+        self._x_px, self._y_px = tracker.camera.project(self.true @ tracker.camera.cam_to_image.T)
+        self.judged = np.zeros(0, dtype=np.intp)
+        self.sky = Measured(np.zeros((0, 3)), np.zeros(0))
+        places_px = self._paths() if movement.turns else (self._x_px, self._y_px)
+        inside = self._inside(*places_px, self._margin_px()).reshape(-1, len(self._star)).all(axis=0)
+        if not (self._wanted & inside).any():
+            return
+        self._wanted &= inside
+        sky_e = tracker.image_e(sky_light(bench, movement, instants(bench, movement, seen)), seen)
+        if movement.turns:
+            self._choose_paths(sky_e, *places_px)
+        else:
+            self._choose_points(sky_e)
+        self.sky = self.measure(sky_e)
+
+    def __len__(self) -> int:
+        return len(self.judged)
+
+    def measure(self, image_e: FloatArray) -> Measured:
+        """The judged stars in an image of the tracker (h, w), electrons."""
+        if self.movement.turns:
+            return self._measure_paths(image_e)
+        match = self.tracker.finder.match(image_e, self._x_px, self._y_px)
+        return self._measured(match, self.judged)
+
+    def _whole(self, star: IntArray) -> BoolArray:
+        """Stars that the panel's `exact` shows and that clip nowhere."""
+        bench = self.tracker.bench
+        rates = bench.stars.electrons_per_s[star]
+        white = bench.flux_at_white_e_per_s * bench.darkest
+        clips = rates * peak_share(bench.config.render.sprite_sigma_px) > white
+        return np.asarray((rates >= bench.calibration.response.half_step * white) & ~clips)
+
+    def _choose_points(self, sky_e: FloatArray) -> None:
+        tracker, radius_px = self.tracker, self.tracker.finder.settings.radius_px
+        match = tracker.finder.match(sky_e, self._x_px, self._y_px)
+        wanted = self._wanted & (match.index >= 0) & ~shared(match.index)
+        wanted &= ~crowded(self._x_px, self._y_px, self._e, radius_px, tracker.sigma_px)
+        self.judged = np.flatnonzero(wanted)
+
+    def _measured(self, match: Matched, which: IntArray) -> Measured:
+        index = match.index[which]
+        found = index >= 0
+        index = np.where(found, index, 0)
+        if not found.any():
+            return Measured(np.full((len(which), 3), np.nan), np.zeros(len(which)))
+        places = match.found.x_px[index], match.found.y_px[index]
+        light_e = np.where(found, match.found.flux[index], 0.0)
+        return Measured(np.where(found[:, None], self._directions(*places), np.nan), light_e)
+
+    def _margin_px(self) -> float:
+        """How far from the edge of the detector a star is whole."""
+        return self._reach_px + 1 if self.movement.turns else self.tracker.finder.settings.radius_px + MATCH_PX
+
+    @property
+    def _reach_px(self) -> int:
+        """How far from a path its star's light is summed."""
+        return math.ceil(REACH_SIGMAS * max(self.tracker.sigma_px)) + 1
+
+    def _choose_paths(self, sky_e: FloatArray, x_px: FloatArray, y_px: FloatArray) -> None:
+        """The stars about whose path (k, n), longer by all that an attitude can be late, hardly any light is another's."""
+        reach_px = self._reach_px
+        y, x = np.mgrid[-reach_px : reach_px + 1, -reach_px : reach_px + 1]
+        disc = (x * x + y * y <= reach_px**2).nonzero()
+        near_x, near_y = disc[1] - reach_px, disc[0] - reach_px
+        width, flat = sky_e.shape[1], sky_e.ravel()
+        judged, pixels = [], []
+        for k in np.flatnonzero(self._wanted):
+            column, row = np.rint(x_px[:, k]).astype(np.intp), np.rint(y_px[:, k]).astype(np.intp)
+            own = np.unique((row[:, None] + near_y) * width + column[:, None] + near_x)
+            if flat[own].sum() <= (1 + CROWDED_SHARE) * self._e[k]:
+                judged.append(k)
+                pixels.append(own)
+        self.judged = np.array(judged, dtype=np.intp)
+        self._pixels = np.concatenate(pixels) if pixels else np.zeros(0, dtype=np.intp)
+        self._begins = np.cumsum([0, *(len(own) for own in pixels)])[:-1]
+
+    def _paths(self) -> tuple[FloatArray, FloatArray]:
+        """Places (k, n) of the stars on the tracker along their whole paths, px."""
+        tracker, seen = self.tracker, self.seen
+        late_s = lead_ns(tracker.bench.config) / NS_PER_S + 1 / PACKET_HZ
+        span_s = seen.length_s + 2 * late_s
+        path_px = math.radians(abs(self.movement.rate_deg_s)) * span_s * tracker.camera.scales_px_rad()[1]
+        at_s = np.linspace(-late_s, seen.length_s + late_s, max(5, math.ceil(path_px / PATH_STEP_PX))) + seen.begin_s
+        turns = [tracker.camera.cam_to_image @ to_matrix(self.movement.at(round(t * NS_PER_S))) for t in at_s]
+        vectors = tracker.bench.stars.directions(self._star)
+        places = [tracker.camera.project(vectors @ turn.T) for turn in turns]
+        return np.stack([x for x, _ in places]), np.stack([y for _, y in places])
+
+    def _measure_paths(self, image_e: FloatArray) -> Measured:
+        if not len(self.judged):
+            return Measured(np.zeros((0, 3)), np.zeros(0))
+        width, light = image_e.shape[1], image_e.ravel()[self._pixels]
+        row, column = np.divmod(self._pixels, width)
+        total, by_x, by_y = (np.add.reduceat(part, self._begins) for part in (light, light * column, light * row))
+        found = total > LOST_SHARE * self._e[self.judged]
+        divisor = np.where(found, total, 1.0)
+        directions = self._directions(by_x / divisor, by_y / divisor)
+        return Measured(np.where(found[:, None], directions, np.nan), np.where(found, total, 0.0))
+
+    def _directions(self, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
+        rays = self.tracker.camera.rays(x_px, y_px)
+        return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+
+    def _inside(self, x_px: FloatArray, y_px: FloatArray, margin_px: float) -> BoolArray:
+        """Places on the tracker whose neighbourhood is whole on the detector and on the monitor."""
+        tracker = self.tracker
+        width, height = tracker.camera.resolution_px
+        inside = (x_px >= margin_px) & (x_px < width - 1 - margin_px) & (y_px >= margin_px) & (y_px < height - 1 - margin_px)
+        seen_x, seen_y = (part.reshape(x_px.shape) for part in tracker.geometry.to_monitor(x_px.ravel(), y_px.ravel()))
+        reach = tracker.bench.renderer.footprint_px / 2 + margin_px * tracker.monitor_px_per_px
+        width, height = tracker.bench.camera.resolution_px
+        inside &= (seen_x >= reach) & (seen_x < width - 1 - reach)
+        return np.asarray(inside & (seen_y >= reach) & (seen_y < height - 1 - reach))
+
+
+def off(tracker: Tracker, shown: Measured, wanted: Measured) -> Off:
+    """How far the stars of a measurement are from where and what they should be: a lost one by MATCH_PX, and all its light."""
+    lost = shown.lost | wanted.lost
+    chord = np.linalg.norm(shown.directions - wanted.directions, axis=1)
+    arcsec = np.where(lost, MATCH_PX * tracker.arcsec_per_px, 2 * np.arcsin(np.minimum(chord, 2.0) / 2) * ARCSEC_PER_RAD)
+    mag = magnitude(np.where(lost, 1.0, shown.light_e) / np.where(lost, 1.0, wanted.light_e))
+    return Off(arcsec, np.where(lost, LOST_MAG, mag), lost)
+
+
+def attitude_off_arcsec(shown: Measured, wanted: Measured) -> tuple[float, float]:
+    """By how much the camera is turned across the boresight and about it, by least squares of the stars found; NaN for few."""
+    found = ~(shown.lost | wanted.lost)
+    true, seen = wanted.directions[found], shown.directions[found]
+    if len(true) < 2:
+        return math.nan, math.nan
+    # seen - true = turn x true for a small turn: a row of the cross product's matrix for each component.
+    x, y, z = true.T
+    none = np.zeros_like(x)
+    rows = [np.stack(row, axis=1) for row in ((none, z, -y), (-z, none, x), (y, -x, none))]
+    turn = np.linalg.lstsq(np.concatenate(rows), (seen - true).T.ravel(), rcond=None)[0] * ARCSEC_PER_RAD
+    return math.hypot(turn[0], turn[1]), abs(float(turn[2]))

@@ -1,0 +1,88 @@
+"""What a scene's table says in one line: where `auto` stands, and if it is not on the front, why."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from hilstar.study.chain.budget import RSS, WHOLE
+from hilstar.study.chain.table import AUTO, BudgetRow, Row, StageRow, auto_of, beating
+
+MAX_REASONS = 2
+
+
+def scene_line(rows: Sequence[Row], budget: Sequence[BudgetRow], stages: Sequence[StageRow]) -> str:
+    """What `auto` takes in a scene and is off by, whether it is on the front, and what its error and time are made of."""
+    own = rows[auto_of(rows)]
+    steps = [part for part in budget if part.step not in (RSS, WHOLE)]
+    largest, longest = max(steps, key=lambda part: part.error_arcsec), max(stages, key=lambda one: one.time_ms)
+    share = longest.time_ms / max(sum(one.time_ms for one in stages), 1e-9)
+    return (
+        f"{own.scene}: {AUTO} ({words(own)}) is {own.error_arcsec:.3g} arcsec and {own.error_mag:.2g} mag off over"
+        f" {own.stars} stars{f', {own.lost} of them lost' if own.lost else ''}, in {own.time_ms:.3g} ms; {standing(rows)};"
+        f" error: {largest.step} {largest.error_arcsec:.2g} arcsec; time: {longest.stage} {share:.0%}"
+    )
+
+
+def is_right(rows: Sequence[Row]) -> bool:
+    """Whether `auto` is on the front of what effort may choose, or within the noise of it."""
+    return not beating(rows, as_filed=True)[0]
+
+
+def standing(rows: Sequence[Row]) -> str:
+    """Whether `auto` is on the front of all, or within the noise of it; else what beats it, why, and how it is without that."""
+    beyond, within = beating(rows)
+    if not beyond:
+        return "on the front, within the noise" if within else "on the front"
+    own, best = rows[auto_of(rows)], _nearest(beyond)
+    said = f"not on the front: {_compared(own, best)}: {why_not(own, best)}"
+    if best in (own_beyond := beating(rows, as_filed=True)[0]):
+        return said
+    if own_beyond:
+        nearest = _nearest(own_beyond)
+        return f"{said}; nor of what effort may choose: {_compared(own, nearest)}: {why_not(own, nearest)}"
+    return f"{said}; on the front of what effort may choose{', within the noise' if beating(rows, as_filed=True)[1] else ''}"
+
+
+def words(row: Row) -> str:
+    """A row's combination in a few words."""
+    stealing = " with bit stealing" if row.bit_stealing == "true" else ""
+    moving = f", {row.smear}s, {row.prediction}" if row.rate_deg_s else ""
+    return f"{row.quantisation}{stealing}, {row.sprite} sprites{moving}"
+
+
+def why_not(own: Row, other: Row) -> str:
+    """Why `effort = "auto"` does not take what beats it."""
+    reasons = []
+    if other.bit_stealing != own.bit_stealing:
+        reasons.append(
+            "bit stealing is the bench file's choice, for a panel whose primaries are known as the tracker sees them"
+        )
+    if other.prediction != own.prediction:
+        reasons.append(f"prediction by {other.prediction} is the sender's choice (whether its packets have rates)")
+    if other.faintest_v_mag != own.faintest_v_mag:
+        reasons.append("the catalogue's depth is the bench file's choice")
+    if other.quantisation == "temporal":
+        reasons.append("temporal is only right over a whole exposure, and effort asks for each frame")
+    elif other.quantisation != own.quantisation:
+        reasons.append(
+            f"effort compares {own.quantisation} and {other.quantisation} by their worst star at any sub-pixel phase, not by a"
+            " field's rms"
+        )
+    if other.sprite != own.sprite:
+        reasons.append(
+            "coarse sprites are beyond the tolerance" if other.sprite == "coarse" else "cut sprites save nothing here"
+        )
+    if other.smear != own.smear:
+        reasons.append(f"{other.smear}s instead of {own.smear}s")
+    return "; ".join(reasons)
+
+
+def _nearest(rows: Sequence[Row]) -> Row:
+    """Of what beats `auto`, that with the smallest error, and of these the fastest."""
+    return min(rows, key=lambda row: (row.error_arcsec, row.time_ms))
+
+
+def _compared(own: Row, other: Row) -> str:
+    faster = own.time_ms - other.time_ms
+    noise = (own.noise_ms**2 + other.noise_ms**2) ** 0.5
+    return f"{words(other)} is {other.error_arcsec:.3g} arcsec off and {faster:.2g} ms faster (noise {noise:.2g} ms)"

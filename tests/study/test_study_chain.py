@@ -1,0 +1,198 @@
+"""The whole chain: its table's fronts, its errors against what they must be, its budgets, and what the command refuses."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hilstar.bench.bench_file import bench_file_of
+from hilstar.errors import InputError
+from hilstar.render.reference import linear_image
+from hilstar.study.chain import motion, run, scenes
+from hilstar.study.chain.bench_parts import Parts
+from hilstar.study.chain.combinations import Combination
+from hilstar.study.chain.front import Point, beaters, front
+from hilstar.study.chain.measuring import Plan, SceneMeasurement
+from hilstar.study.chain.motion import lead_ns
+from hilstar.study.chain.scenes import Scene, five_scenes
+from hilstar.study.chain.tracker import Tracker
+from hilstar.study.chain.true_light import add_light, points
+from hilstar.units import ARCSEC_PER_RAD, NS_PER_S
+from tests.support.commands import assert_refused, run_hilstar_here
+from tests.support.pictures import assert_drawn, table
+
+SMALL = """
+[tracker]
+aperture_mm = 30
+focal_length_mm = 70
+pixel_pitch_um = 13
+quantum_efficiency = "ccd47-20"
+resolution_px = [320, 320]
+[sky]
+faintest_v_mag = 9
+[monitor]
+resolution_px = [400, 360]
+pixel_pitch_um = 57.65
+[collimator]
+focal_length_mm = 350
+[render]
+brightest_v_mag = 4
+"""
+PLAN = Plan(exposures=1, time_s=0.05)
+# The centroider's own error for stars of sigma 1.05 px is 0.0012 px in the median (0.05 arcsec); a display's is ten times that.
+FLOOR_PX = 0.005
+# A long path's middle is its mean to the second order of the field: 1 deg/s over 0.1 s in a field of 3 degrees.
+PATH_FLOOR_PX = 0.01
+# Of an error by a late attitude, whatever the codes do: they add 1 arcsec rms to 140.
+LATE_SHARE = 0.02
+# Root sum square and whole differ by what the steps have in common.
+RSS_SHARE = 0.25
+ROUNDED = 1e-3  # four digits in the table
+
+
+def small_file(folder: Path, text: str = SMALL):
+    """The small bench's file."""
+    return bench_file_of(folder / "bench.toml", text)
+
+
+@pytest.fixture(scope="module")
+def parts(tmp_path_factory):
+    with Parts(small_file(tmp_path_factory.mktemp("parts"))) as found:
+        tracker = Tracker(found.own)
+        yield found, tracker
+        tracker.close()
+
+
+def scene_of(parts, number: int) -> SceneMeasurement:
+    """One of the small bench's scenes."""
+    benches, tracker = parts
+    return SceneMeasurement(benches, tracker, five_scenes(benches.own)[number], PLAN)
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory):
+    """The command on the small bench, with a scene at rest and one that turns."""
+    folder = tmp_path_factory.mktemp("chain")
+    (folder / "bench.toml").write_text(SMALL)
+
+    def two(bench):
+        found = five_scenes(bench)
+        return found[1], found[3]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(run, "QUICK", PLAN)
+        patch.setattr(run, "five_scenes", two)
+        result = run_hilstar_here("study", "chain", folder / "bench.toml", "-o", folder / "out", "--quick", "--json")
+    assert result.returncode == 0, result.stderr
+    return json.loads(result.stdout), folder / "out"
+
+
+def test_the_front_is_what_anyone_finds_in_the_table(study):
+    rows = table(study[1] / "chain.csv")
+    for scene in {row["scene"] for row in rows}:
+        own = [row for row in rows if row["scene"] == scene]
+        for error, column in (("error_arcsec", "on_front"), ("error_mag", "on_front_mag")):
+            spots = [(float(row["time_ms"]), float(row[error])) for row in own]
+            for spot, row in zip(spots, own, strict=True):
+                beaten = any(other != spot and other[0] <= spot[0] and other[1] <= spot[1] for other in spots)
+                assert row[column] == ("false" if beaten else "true")
+        assert 1 <= sum(row["on_front"] == "true" for row in own) < len(own)
+
+
+def test_auto_and_default_are_each_one_point_of_each_scene(study):
+    told, out = study
+    rows = table(out / "chain.csv")
+    names = list(dict.fromkeys(row["scene"] for row in rows))
+    assert names == ["dense field", "1 deg/s"]
+    for name in names:
+        for mark in ("auto", "default"):
+            (row,) = [row for row in rows if row["scene"] == name and row["chosen"] == mark]
+            assert row["sprite"] == ("cut" if mark == "auto" else "full")
+            assert float(row["noise_ms"]) >= 0 and float(row["time_ms"]) > 0
+        assert any(line.startswith(f"{name}: auto") and "on the front" in line for line in told["findings"])
+    assert {row["quantisation"] for row in rows} == {"round", "dither", "temporal", "exact"}
+    assert {row["prediction"] for row in rows if row["scene"] == "1 deg/s"} == {"rate", "two samples", "held"}
+    assert {row["bit_stealing"] for row in rows} == {"true", "false"}
+    assert_drawn(out / "chain.png")
+
+
+def test_the_budget_adds_up_to_the_whole_error_of_auto(study):
+    rows, parts = table(study[1] / "chain.csv"), table(study[1] / "chain_budget.csv")
+    for scene in {part["scene"] for part in parts}:
+        (auto,) = [row for row in rows if row["scene"] == scene and row["chosen"] == "auto"]
+        for error in ("error_arcsec", "error_mag"):
+            by_step = {part["step"]: float(part[error]) for part in parts if part["scene"] == scene}
+            whole, rss = by_step.pop("whole"), by_step.pop("rss")
+            assert whole == pytest.approx(float(auto[error]), rel=ROUNDED)
+            assert rss == pytest.approx(math.sqrt(sum(value**2 for value in by_step.values())), rel=ROUNDED)
+            assert rss == pytest.approx(whole, rel=RSS_SHARE)
+        assert by_step["codes"] > 0
+    turning = {part["step"]: float(part["error_arcsec"]) for part in parts if part["scene"] == "1 deg/s"}
+    assert turning["prediction"] > 0 and turning["refresh"] > 0
+    stages = table(study[1] / "chain_time.csv")
+    assert {stage["stage"] for stage in stages} == {"prediction", "sprites", "drawing and codes", "read-back"}
+
+
+def test_the_sky_itself_is_measured_where_the_stars_are(parts, monkeypatch):
+    monkeypatch.setattr(motion, "JITTER", ())
+    for number, limit_px in ((1, FLOOR_PX), (3, PATH_FLOOR_PX)):
+        (judge,) = scene_of(parts, number).judges
+        true = judge.true[judge.judged]
+        off_px = np.linalg.norm(judge.sky.directions - true, axis=1) * ARCSEC_PER_RAD / parts[1].arcsec_per_px
+        assert len(judge) > 10
+        assert np.median(off_px) < limit_px
+
+
+def test_light_of_all_sprites_at_once_is_the_oracle_s(parts):
+    bench = parts[0].own
+    sprites, sigma_px = points(bench, scenes.five_scenes(bench)[1].q_icrs_to_cam), bench.config.render.sprite_sigma_px
+    image = np.zeros(bench.camera.resolution_px[::-1])
+    add_light(image, sprites, sigma_px)
+    expected = linear_image(sprites, bench.camera.resolution_px, sigma_px)
+    assert np.allclose(image, expected, rtol=0, atol=1e-12 * expected.max())
+
+
+def test_a_held_attitude_is_late_by_its_age_its_row_and_half_a_frame(parts, monkeypatch):
+    monkeypatch.setattr(motion, "JITTER", ())
+    scene, bench = scene_of(parts, 3), parts[0].own
+    (judge,) = scene.judges
+    sample_ns, lead = NS_PER_S // motion.PACKET_HZ, lead_ns(bench.config)
+    ages_ns = [light - (light - lead) // sample_ns * sample_ns for light in judge.seen.light_ns]
+    age_s = np.average(ages_ns, weights=judge.seen.weights.mean(axis=(1, 2))) / NS_PER_S
+    true = judge.true[judge.judged]
+    row_s = bench.scan.late_s(*bench.camera.project(true @ bench.camera.cam_to_image.T), bench.camera.resolution_px)
+    late_s = age_s + row_s + bench.scan.hold_s / 2
+    expected = np.sqrt(np.mean((3600 * late_s * np.linalg.norm(np.cross(true, motion.AXIS), axis=1)) ** 2))
+    held = Combination("exact", False, parts[0].faintest_v_mag, "full", "point", "held")
+    assert scene.error(held).arcsec == pytest.approx(expected, rel=LATE_SHARE)
+
+
+def test_a_point_is_beaten_by_one_that_is_no_worse_and_no_slower():
+    spots = [Point(1.0, 3.0), Point(2.0, 2.0), Point(2.0, 2.0), Point(2.0, 2.5), Point(3.0, 1.0), Point(3.5, 1.0)]
+    assert front(spots) == [True, True, True, False, True, False]
+    near = [Point(1.00, 1.0, 0.01), Point(1.02, 1.0, 0.01), Point(1.5, 1.0, 0.01)]
+    assert beaters(near, 1) == ([], [0])
+    assert beaters(near, 2) == ([0, 1], [])
+
+
+def test_what_cannot_be_studied_is_refused_in_one_line(tmp_path):
+    (tmp_path / "dark.toml").write_text(SMALL.replace("aperture_mm", "exposure_s = 0\naperture_mm"))
+    (tmp_path / "bare.toml").write_text("[tracker]\naperture_mm = 30\n")
+    out = tmp_path / "out"
+    assert_refused(run_hilstar_here("study", "chain", tmp_path / "dark.toml", "-o", out), 2, "exposure_s = 0")
+    assert_refused(run_hilstar_here("study", "chain", tmp_path / "bare.toml", "-o", out), 2, "bare.toml")
+    assert_refused(run_hilstar_here("study", "chain", "-o", out), 2, "BENCH.toml")
+    assert_refused(run_hilstar_here("study", "models", tmp_path / "dark.toml", "-o", out), 2, "dark.toml")
+    (tmp_path / "chain.csv").write_text(SMALL)
+    assert_refused(run_hilstar_here("study", "chain", tmp_path / "chain.csv", "-o", tmp_path), 2, "chain.csv")
+
+
+def test_a_bench_of_which_no_star_stays_in_view_is_refused(parts, monkeypatch, tmp_path):
+    fast = Scene("300 deg/s", "no star stays", five_scenes(parts[0].own)[0].q_icrs_to_cam, 300.0)
+    monkeypatch.setattr(run, "five_scenes", lambda bench: (fast,))
+    with pytest.raises(InputError, match="no star stands alone in view"):
+        run.run(small_file(tmp_path), tmp_path, quick=True)

@@ -46,9 +46,7 @@ def load(path: str | Path) -> Bench:
 def open_bench(file: BenchFile, context: Context | None = None) -> Bench:
     """Assemble the bench of a file, in a window's `context` if one is given. Raises InputError or MachineError (no OpenGL)."""
     moving = bench_moving(file.config, file.folder)
-    bench = assembled(file, bench_stars(file.config, file.folder, moving), context, moving)
-    _warn_of_cycle(bench.config, file.path)
-    return bench
+    return assembled(file, bench_stars(file.config, file.folder, moving), context, moving)
 
 
 def assembled(file: BenchFile, stars: Stars, context: Context | None = None, moving: MovingSky | None = None) -> Bench:

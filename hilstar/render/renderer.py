@@ -27,14 +27,14 @@ from hilstar.render.encoder import (
     Eraser,
     LevelTexture,
     SpriteSides,
-    build_program,
     lit_sides,
     set_sides,
 )
 from hilstar.render.exact_pass import ExactPass
 from hilstar.render.extended import ExtendedLayer
+from hilstar.render.splat import splat_program
 from hilstar.scene.extended import ExtendedLight, Rectangle
-from hilstar.scene.psf import SQRT2, footprint_px
+from hilstar.scene.psf import footprint_px
 from hilstar.scene.sprites import SPRITE_DTYPE, Sprites
 
 EGL_LIBRARY = "libEGL.so.1"
@@ -137,10 +137,7 @@ class Renderer:
         self._linear = ctx.texture(target.resolution_px, 1, dtype="f4")
         self._linear.filter = (moderngl.NEAREST, moderngl.NEAREST)
         self._linear_fbo = ctx.framebuffer([self._linear])
-        self._splat = build_program(ctx, "star.vert", "splat.frag")
-        self._splat["inverse_sigma_sqrt2"] = tuple(1 / (sigma * SQRT2) for sigma in target.sigma_px)
-        self._splat["resolution_px"] = target.resolution_px
-        self._splat["footprint_px"] = self.footprint_px
+        self._splat = splat_program(ctx, target.resolution_px, target.sigma_px, self.footprint_px)
         set_sides(self._splat, target.sides)
         self._eraser = Eraser(ctx, target.resolution_px, of_levels=False)
         self._level_eraser = Eraser(ctx, target.resolution_px, of_levels=True)

@@ -10,10 +10,11 @@ import numpy as np
 
 from hilstar.render.encoder import build_program
 from hilstar.render.renderer import FIRST_CAPACITY, Renderer, Target
+from hilstar.render.splat import splat_program
 from hilstar.scene.psf import pixel_shares
 from hilstar.scene.sprites import Sprites
 
-Profile = Literal["renderer", "exp erf", "table", "centre"]
+Profile = Literal["renderer", "erf", "exp erf", "table", "centre"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +48,10 @@ class VariantRenderer(Renderer):
         if variant.half_float:
             self._linear = self._ctx.texture(self.target.resolution_px, 1, dtype="f2")
             self._linear_fbo = self._ctx.framebuffer([self._linear])
-        if variant.profile != "renderer":
+        if variant.profile in ("renderer", "erf"):
+            target, by_erf = self.target, variant.profile == "erf"
+            self._splat = splat_program(self._ctx, target.resolution_px, target.sigma_px, self.footprint_px, by_erf)
+        else:
             define = variant.profile.upper().replace(" ", "_")
             self._splat = build_program(self._ctx, "star.vert", "study/splat.frag", (define,))
             self._splat["resolution_px"] = self.target.resolution_px
@@ -55,7 +59,7 @@ class VariantRenderer(Renderer):
                 self._load_table(variant.table_size)
             else:
                 self._splat["sigma_px"] = self.target.sigma_px
-        self._splat["footprint_px"] = self.footprint_px
+            self._splat["footprint_px"] = self.footprint_px
         self._reserve(FIRST_CAPACITY)
 
     def _load_table(self, size: int) -> None:

@@ -108,8 +108,8 @@ def test_less_is_worse(study):
         errors = [error_of(steps[step], method) for method in methods]
         assert all(worse > better for worse, better in itertools.pairwise(errors)), (methods, errors)
 
-    falls("psf", "GL erf, R32F, 6 px", "GL erf, R32F, 8 px", "GL erf, R32F, 10 px")
-    falls("psf", "GL erf, R16F, 10 px", "GL table of 512, 10 px", "GL erf, R32F, 10 px")
+    falls("psf", "GL polynomial, R32F, 6 px", "GL polynomial, R32F, 8 px", "GL polynomial, R32F, 10 px")
+    falls("psf", "GL polynomial, R16F, 10 px", "GL table of 512, 10 px", "GL polynomial, R32F, 10 px")
     falls("brightness", "AGS", "trapezoid, 10 nm", "trapezoid, 5 nm", "trapezoid, 1 nm", "Gauss-Legendre, 3 per knot")
     falls("brightness", *(f"table over 1/T, degree {n}" for n in (5, 10, 20, 40)))
     falls("spectrum", "AGS, one average", "black body, ballesteros2012", "real spectra by V-I")

@@ -67,9 +67,10 @@ def _centre_remark() -> str:
 def splat_variants() -> dict[str, SplatVariant]:
     """The GPU's ways, by name; the renderer's own is the `SplatVariant()` that changes nothing."""
     own = footprint_px(SIGMA_PX)
-    variants = {f"GL erf, R32F, {own} px": SplatVariant()}
-    variants |= {f"GL erf, R32F, {size} px": SplatVariant(footprint_px=size) for size in SIZES_PX if size != own}
-    variants |= {f"GL erf, R16F, {own} px": SplatVariant(half_float=True)}
+    variants = {f"GL polynomial, R32F, {own} px": SplatVariant()}
+    variants |= {f"GL polynomial, R32F, {size} px": SplatVariant(footprint_px=size) for size in SIZES_PX if size != own}
+    variants |= {f"GL polynomial, R16F, {own} px": SplatVariant(half_float=True)}
+    variants |= {f"GL erf, {own} px": SplatVariant("erf")}
     variants |= {f"GL erf by exp, {own} px": SplatVariant("exp erf")}
     variants |= {f"GL table of {size}, {own} px": SplatVariant("table", table_size=size) for size in TABLE_SIZES}
     variants |= {f"GL pixel centre, {own} px": SplatVariant("centre")}

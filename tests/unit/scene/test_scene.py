@@ -11,7 +11,16 @@ from hilstar.errors import InputError
 from hilstar.monitor.geometry import monitor_camera
 from hilstar.rotation import from_radec_roll_deg, to_matrix
 from hilstar.scene.clipping import clipped_sprites
-from hilstar.scene.psf import MAX_CUT, cut_share, footprint_px, peak_share, pixel_share
+from hilstar.scene.psf import (
+    MAX_CUT,
+    MAX_SHARE_ERROR,
+    cut_share,
+    footprint_px,
+    peak_share,
+    pixel_share,
+    pixel_shares,
+    share_polynomial,
+)
 from hilstar.scene.sprites import make_sprites
 from hilstar.sky.stars import Stars
 from tests.support.stars import stars_at
@@ -125,3 +134,19 @@ def test_a_star_is_clipped_when_its_peak_is_over_white():
     clipped = stars.hip[sprites.star[clipped_sprites(sprites, SIGMA, white, (64, 48))]]
     # 0 is white itself; 1 is over it; 2 and 3 are over it together.
     assert sorted(clipped.tolist()) == [1, 2, 3]
+
+
+@pytest.mark.parametrize("sigma", [0.5, 0.55, 0.7, 0.85, 1.3, 3.0, 20.0])
+def test_a_share_s_polynomial_is_that_close_everywhere(sigma):
+    """At places between those of the fit, in the float32 of a shader."""
+    reach = footprint_px((sigma, sigma)) / 2 + 0.5
+    offset = np.linspace(0, reach, 3001)
+    power = np.zeros(len(offset), dtype=np.float32)
+    for term in share_polynomial(sigma, reach)[::-1]:
+        power = power * np.float32(offset**2) + np.float32(term)
+    # Float32 rounds the exponent, of a few units where the share is large, by 1e-7 of it.
+    assert np.abs(np.exp2(power) - pixel_shares(offset, sigma)).max() < 2 * MAX_SHARE_ERROR
+
+
+def test_a_narrow_star_has_no_polynomial():
+    assert share_polynomial(0.3, 3.0) is None

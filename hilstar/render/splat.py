@@ -1,0 +1,36 @@
+"""The program that draws a star's light: by a polynomial for each axis where one is exact enough, else by error functions."""
+
+from __future__ import annotations
+
+from functools import reduce
+from itertools import zip_longest
+
+import moderngl
+
+from hilstar.render.encoder import build_program
+from hilstar.scene.psf import SQRT2, share_polynomial
+
+
+def splat_program(
+    ctx: moderngl.Context,
+    resolution_px: tuple[int, int],
+    sigma_px: tuple[float, float],
+    footprint_px: int,
+    by_erf: bool = False,
+) -> moderngl.Program:
+    """The program of star.vert and splat.frag for sprites of one sigma, up to `footprint_px` a side.
+
+    `by_erf` has error functions where polynomials would do, for the study of trade-offs.
+    """
+    axes = [share_polynomial(sigma, footprint_px / 2 + 0.5) for sigma in sigma_px]
+    if by_erf or axes[0] is None or axes[1] is None:
+        program = build_program(ctx, "star.vert", "splat.frag")
+        program["inverse_sigma_sqrt2"] = tuple(1 / (sigma * SQRT2) for sigma in sigma_px)
+    else:
+        terms = [f"vec2({x:.9e}, {y:.9e})" for x, y in zip_longest(axes[0], axes[1], fillvalue=0.0)]
+        # Written out: from an array of uniforms llvmpipe takes twice as long.
+        polynomial = reduce(lambda sum, term: f"({sum} * square + {term})", reversed(terms))
+        program = build_program(ctx, "star.vert", "splat.frag", (f"LOG2_SHARE(square) {polynomial}",))
+    program["resolution_px"] = resolution_px
+    program["footprint_px"] = footprint_px
+    return program

@@ -39,6 +39,7 @@ class _Ending:
         self.signal: int | None = None
         self.stops: list[threading.Event] = []
         self.guard: int | None = None
+        self.holds = 0
 
 
 _ending = _Ending()
@@ -79,6 +80,8 @@ def _handle(number: int, frame: FrameType | None) -> None:
     if _ending.signal is not None:
         return  # the end is under way; a second signal is the watchers' matter
     _ending.signal = number
+    if _ending.holds:
+        return
     if not _ending.stops:
         if _ending.guard and frame is not None and frame.f_code.co_filename.startswith("<frozen importlib"):
             # Python's import calls itself back where an exception is lost, and so far nothing is there to be put in order.
@@ -119,6 +122,24 @@ def stop_on_signal(stop: threading.Event) -> Iterator[None]:
         _ending.stops.remove(stop)
         for number, handler in previous.items():
             signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def held() -> Iterator[None]:
+    """A signal's KeyboardInterrupt comes when this is left (main thread; where hilstar's handlers are installed).
+
+    It is for extensions in C that call Python back and do not look whether an exception came of it.
+    """
+    if threading.current_thread() is not threading.main_thread() or _ending.stops or _ending.signal is not None:
+        yield
+        return
+    _ending.holds += 1
+    try:
+        yield
+    finally:
+        _ending.holds -= 1
+    if caught() is not None and not _ending.holds:
+        raise KeyboardInterrupt
 
 
 def leave(code: int) -> NoReturn:

@@ -15,6 +15,7 @@ from hilstar.monitor.blue_noise import blue_noise
 from hilstar.monitor.level_table import CodeTable, code_table
 from hilstar.monitor.quantise import Panel, level_dtype
 from hilstar.monitor.response import Codes
+from hilstar.process.interrupts import held
 from hilstar.resources import resource_path
 from hilstar.scene.extended import Rectangle
 from hilstar.scene.psf import outside_share
@@ -29,10 +30,11 @@ def build_program(
     version, body = resource_path("shaders", fragment).read_text().split("\n", 1)
     before = [resource_path("shaders", include).read_text()] if include else []
     lines = [version, *(f"#define {name}" for name in defines), *before, body]
-    return ctx.program(
-        vertex_shader=resource_path("shaders", vertex).read_text(),
-        fragment_shader="\n".join(lines),
-    )
+    with held():  # moderngl makes a program's members by Python, and an exception there ends the process
+        return ctx.program(
+            vertex_shader=resource_path("shaders", vertex).read_text(),
+            fragment_shader="\n".join(lines),
+        )
 
 
 MAX_SIDES = 8  # as in star.vert

@@ -19,6 +19,7 @@ from hilstar.monitor.balance import (
 from hilstar.monitor.exact import CARRIED
 from hilstar.monitor.pixel_order import FEWEST, LEAST_LIGHT, PixelOrder
 from hilstar.monitor.quantise import Panel
+from hilstar.process.interrupts import held
 from hilstar.render.encoder import LevelTexture
 from hilstar.resources import resource_path
 from hilstar.scene.psf import SQRT2
@@ -57,7 +58,8 @@ class ExactPass:
         defines = [f"NEAR {order.near}", f"LEVELS r{8 * self._levels_bytes()}ui"]
         defines += ["PATHS"] * paths + ["UNIFORMITY"] * (self._gain is not None)
         version, body = resource_path("shaders", "exact.comp").read_text().split("\n", 1)
-        program = self._ctx.compute_shader("\n".join([version, *(f"#define {name}" for name in defines), body]))
+        with held():  # as for any program
+            program = self._ctx.compute_shader("\n".join([version, *(f"#define {name}" for name in defines), body]))
         window = balance.window_px
         values = {
             "footprint": order.size**2,

@@ -116,6 +116,21 @@ def test_a_draw_without_end_is_ended(tmp_path, small_bench_file, number, before)
         assert code in {128 + number, -signal.SIGKILL}
 
 
+def test_a_signal_while_a_shader_is_built_ends_it_in_order(tmp_path, small_bench_file):
+    """There the GL library is called by Python and calls Python, and an exception of that is a crash."""
+    before = (
+        "import os, signal, _moderngl\nmake = _moderngl.make_uniform\n"
+        "def told(*arguments):\n    os.kill(os.getpid(), signal.SIGINT)\n    return make(*arguments)\n"
+        "_moderngl.make_uniform = told"
+    )
+    with running(
+        program("frame", small_bench_file, "--radec", "84,-1,0", "--codes", tmp_path / "c.png", before=before)
+    ) as process:
+        _, err = process.communicate(timeout=20)
+    assert process.returncode == 128 + signal.SIGINT, err
+    assert err.decode().splitlines()[-1] == "hilstar: stopped"
+
+
 def test_a_second_signal_ends_it_at_once(tmp_path, small_bench_file):
     log = tmp_path / "log.csv"
     log.write_text("t_s,qw,qx,qy,qz\n0,1,0,0,0\n60,1,0,0,0\n")

@@ -13,7 +13,7 @@ import numpy as np
 from hilstar.arrays import FloatArray
 from hilstar.bench.config import RenderSettings
 from hilstar.monitor.balance import AS_USUAL, Balance, Seen
-from hilstar.monitor.phases import WHITE, fainter, phase_grid, phase_image, shown_by
+from hilstar.monitor.phases import UNLIKE, WHITE, fainter, line_places, phase_grid, phase_image, shown_by
 from hilstar.monitor.quantise import EXPOSURE_FRAMES, Panel, Quantisation
 from hilstar.monitor.response import Response
 from hilstar.render.encoder import MAX_SIDES, SpriteSide, SpriteSides
@@ -216,9 +216,9 @@ class _CodeStars:
         sigma_px, seen = render.sprite_sigma_px, light.seen
         self._frames, self._balance, self._kinds = light.exposure_frames, Balance(sigma_px, seen), light.judges
         self._panel = Panel(light.response, WHITE)
-        self._sprites, tile = phase_grid(PHASES, sigma_px)
+        self._sprites, _ = phase_grid(PHASES, sigma_px, UNLIKE)
         self._bright = phase_image(self._sprites, sigma_px)
-        self._judge = Judge(self._bright, tile, sigma_px, seen.blur_px, seen.pixel_px)
+        self._judge = Judge(self._bright, line_places(self._sprites), sigma_px, seen.blur_px, seen.pixel_px)
         faintest = float(light.rates_e_per_s.min()) if len(light.rates_e_per_s) else light.white_e_per_s
         deepest = max(0.0, 2.5 * math.log10(light.white_e_per_s / peak_share(sigma_px) / faintest))
         self._mags = np.linspace(0.0, deepest, MAGNITUDES).tolist()

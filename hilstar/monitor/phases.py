@@ -20,6 +20,8 @@ SIGMA_PX = (0.85, 0.85)
 WHITE = 1.0
 MARGIN_PX = 2  # of dark between two stars
 FRAMES_BEFORE = 2  # of `temporal` before an exposure: it is no better for being the first of a sequence
+MIDDLES = (0.5, 0.5)
+UNLIKE = (0.25, 0.375)  # no star is another's mirror image: with MIDDLES only one of eight is like no other
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,14 +34,25 @@ class Errors:
     centroid_max_px: float
 
 
-def phase_grid(count: int, sigma_px: tuple[float, float] = SIGMA_PX) -> tuple[Sprites, int]:
-    """count^2 stars, one in each tile at its own phase, as bright as white when centred on a pixel; and the tile's side, px."""
-    tile = footprint_px(sigma_px) + MARGIN_PX
-    place = (np.arange(count) + 0.5) * tile + (np.arange(count) + 0.5) / count - 0.5
-    x_px, y_px = (axis.ravel() for axis in np.meshgrid(place, place))
+def phase_grid(
+    count: int, sigma_px: tuple[float, float] = SIGMA_PX, first: tuple[float, float] = MIDDLES
+) -> tuple[Sprites, int]:
+    """count^2 stars, one in each tile at its own phase, as bright as white when centred on a pixel; and the tile's side, px.
+
+    The first phase along x and y is `first`, in steps of 1 / count px.
+    """
+    tile, steps = footprint_px(sigma_px) + MARGIN_PX, np.arange(count)
+    places = ((steps + 0.5) * tile + (steps + start) / count - 0.5 for start in first)
+    x_px, y_px = (axis.ravel() for axis in np.meshgrid(*places))
     flux = np.full(count**2, WHITE / peak_share(sigma_px))
     size_px = count * tile, count * tile
     return pack_sprites(x_px, y_px, flux, np.arange(count**2), size_px, footprint_px(sigma_px)), tile
+
+
+def line_places(sprites: Sprites) -> tuple[FloatArray, FloatArray]:
+    """Where a `phase_grid` has the stars of each column of tiles, x (count,) in px, and of each row, y."""
+    count = math.isqrt(len(sprites))
+    return sprites.x_px[:count], sprites.y_px[::count]
 
 
 def phase_image(sprites: Sprites, sigma_px: tuple[float, float]) -> FloatArray:
@@ -47,7 +60,7 @@ def phase_image(sprites: Sprites, sigma_px: tuple[float, float]) -> FloatArray:
     count = math.isqrt(len(sprites))
     at = np.arange(sprites.footprint_px) - (sprites.footprint_px - 1) // 2
     lines = []
-    for axis, places, sigma in ((0, sprites.x_px[:count], sigma_px[0]), (1, sprites.y_px[::count], sigma_px[1])):
+    for axis, (places, sigma) in enumerate(zip(line_places(sprites), sigma_px, strict=True)):
         pixels = sprites.data["pixel"][:, axis][:: count if axis else 1][:count, None] + at
         line = np.zeros(count * (sprites.footprint_px + MARGIN_PX))
         line[pixels] = pixel_shares(pixels - places[:, None], sigma)

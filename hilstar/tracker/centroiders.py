@@ -1,9 +1,9 @@
 """Where centroiders of several kinds find a star: in squares of pixels around it, one star to a square.
 
-`moment`: the plain first moment. `window`: the mean under a Gaussian that follows the star and is as wide (SExtractor's
-XWIN_IMAGE); `wide`: under one half as wide again. `fit`: least squares of a Gaussian integrated over pixels. `box3`, `box5`:
-the centre of mass of 3 x 3 or 5 x 5 pixels, of those over a fiftieth of the brightest. What a display does to a star's light,
-each sees differently.
+`moment`: the plain first moment. `window`: the mean under a Gaussian that follows the star and is as wide, a pixel at least
+(SExtractor's XWIN_IMAGE); `wide`: under one half as wide again. `fit`: least squares of a Gaussian integrated over pixels.
+`box3`, `box5`: the centre of mass of 3 x 3 or 5 x 5 pixels, of those over a fiftieth of the brightest. What a display does to a
+star's light, each sees differently.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from hilstar.arrays import FloatArray, IntArray
 Centroider = Literal["moment", "window", "wide", "fit", "box3", "box5"]
 FAMILY: tuple[Centroider, ...] = get_args(Centroider)
 WIDE = 1.5  # of the star's sigma
+MIN_WINDOW_PX = 1.0  # a narrower one sees the one pixel that it stands on
 FIT_STEPS, WINDOW_STEPS = 8, 20
 FIRST_STEPS = 3  # of a window, before a fit
 # A window as wide as the star moves the mean half of the way, one on a single pixel all of it: both come to rest by this.
@@ -67,7 +68,7 @@ def _moment(stamps: FloatArray, sigma_px: Sigma, pixels: Pixels) -> Places:
 
 def _window(stamps: FloatArray, sigma_px: Sigma, pixels: Pixels, wide: float = 1.0, steps: int = WINDOW_STEPS) -> Places:
     at, (x, y) = _axis(stamps), _box(stamps, 2, pixels)
-    sigmas = sigma_px[0] * wide, sigma_px[1] * wide
+    sigmas = [wide * max(sigma, MIN_WINDOW_PX) for sigma in sigma_px]
     for _ in range(steps):
         across, down = (
             np.exp(-np.square(at - place[:, None]) / (2 * sigma**2)) for place, sigma in zip((x, y), sigmas, strict=True)

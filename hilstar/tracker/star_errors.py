@@ -61,19 +61,23 @@ class StarErrors:
 class Judge:
     """A tracker that looks at stars of a sigma (x, y) in the tiles of an image, and knows where they should be.
 
-    `wanted` (count * tile, count * tile) has a star in each tile, `(column + 1/2) / count` px to the right of its middle and
-    `(row + 1/2) / count` px down. `blur_px` and `pixel_px` are the tracker's, in monitor pixels.
+    `wanted` (count * tile, count * tile) has a star in each tile, near its middle: those of a column of tiles at an
+    x of `places_px`, those of a row at a y (count,). `blur_px` and `pixel_px` are the tracker's, in monitor pixels.
     """
 
-    def __init__(self, wanted: FloatArray, tile: int, sigma_px: Sigma, blur_px: float, pixel_px: float) -> None:
-        self._tile, self._count, self._pixel_px = tile, len(wanted) // tile, pixel_px
+    def __init__(
+        self, wanted: FloatArray, places_px: tuple[FloatArray, FloatArray], sigma_px: Sigma, blur_px: float, pixel_px: float
+    ) -> None:
+        self._count = len(places_px[0])
+        self._tile, self._pixel_px = len(wanted) // self._count, pixel_px
+        self._in_tile_px = [place - self._tile * np.arange(self._count) for place in places_px]
         self._sampled_px = max(pixel_px, FINEST_PX)
         x, y = (math.sqrt(sigma**2 + SQUARES_VARIANCE + blur_px**2) for sigma in sigma_px)
         self._sigma_px = x / self._sampled_px, y / self._sampled_px
         half = max(BOX_SIDE // 2, math.ceil(REACH_SIGMAS * max(self._sigma_px)))
         blur_px = max(blur_px, MIN_BLUR_PX)
-        self._views = {self._sampled_px: self._view(self._sampled_px, blur_px, half)}
-        self._views.setdefault(pixel_px, self._view(pixel_px, blur_px, BOX_SIDE // 2))
+        self._views = {self._sampled_px: self._views_of(self._sampled_px, blur_px, half)}
+        self._views.setdefault(pixel_px, self._views_of(pixel_px, blur_px, BOX_SIDE // 2))
         self._light = self._light_of(wanted)
         self._pixels = brightest(self._seen(wanted, pixel_px))
         self._wanted = wanted
@@ -114,14 +118,15 @@ class Judge:
         count = self._count
         return image.reshape(count, side, count, side).transpose(0, 2, 1, 3).reshape(-1, side, side)
 
-    def _view(self, pixel_px: float, blur_px: float, half: int) -> FloatArray:
+    def _views_of(self, pixel_px: float, blur_px: float, half: int) -> list[FloatArray]:
+        return [self._view(place_px, pixel_px, blur_px, half) for place_px in self._in_tile_px]
+
+    def _view(self, star_px: FloatArray, pixel_px: float, blur_px: float, half: int) -> FloatArray:
         """What each of 2 half + 1 tracker pixels about a star collects of each monitor pixel, along one axis.
 
-        (count, 2 half + 1, tile), for stars at the phases of `count` columns.
+        (count, 2 half + 1, tile), for stars at places (count,) in their tiles.
         """
-        column = np.arange(self._count)
-        star_px = (self._tile - 1) / 2 + (column + 0.5) / self._count
-        phase = (column * GOLDEN) % 1.0 - 0.5
+        phase = (np.arange(self._count) * GOLDEN) % 1.0 - 0.5
         middles = star_px[:, None] + pixel_px * (np.arange(-half, half + 1) + phase[:, None])
         edges = np.arange(self._tile + 1) - 0.5
         to_left, to_right = (middles[:, :, None] + side * pixel_px / 2 - edges for side in (-1, 1))
@@ -131,11 +136,11 @@ class Judge:
 
     def _seen(self, image: FloatArray, pixel_px: float) -> FloatArray:
         """The tracker's pixels about each star, (n, side, side)."""
-        view, count, tile = self._views[pixel_px], self._count, self._tile
-        side = view.shape[1]
-        wide = image.reshape(count * tile, count, tile).transpose(1, 0, 2) @ view.transpose(0, 2, 1)  # (column, y, side)
-        rows = wide.reshape(count, count, tile, side).transpose(1, 2, 0, 3).reshape(count, tile, count * side)
-        return np.asarray((view @ rows).reshape(count, side, count, side).transpose(0, 2, 1, 3).reshape(-1, side, side))
+        (columns, rows), count, tile = self._views[pixel_px], self._count, self._tile
+        side = rows.shape[1]
+        wide = image.reshape(count * tile, count, tile).transpose(1, 0, 2) @ columns.transpose(0, 2, 1)  # (column, y, side)
+        lines = wide.reshape(count, count, tile, side).transpose(1, 2, 0, 3).reshape(count, tile, count * side)
+        return np.asarray((rows @ lines).reshape(count, side, count, side).transpose(0, 2, 1, 3).reshape(-1, side, side))
 
 
 def _ramp(to_px: FloatArray, blur_px: float) -> FloatArray:

@@ -14,7 +14,7 @@ import numpy as np
 from hilstar.bench.frame import Bench
 from hilstar.bench.white import clipping_hip
 from hilstar.monitor.balance import Balance
-from hilstar.monitor.phases import WHITE, fainter, phase_grid, phase_image, shown_by
+from hilstar.monitor.phases import WHITE, fainter, line_places, phase_grid, phase_image, shown_by
 from hilstar.monitor.quantise import Panel
 from hilstar.scene.psf import peak_share
 from hilstar.tracker.centroiders import FAMILY, Centroider
@@ -148,9 +148,9 @@ def not_drawn(bench: Bench) -> NotDrawn:
 def _errors(bench: Bench) -> list[tuple[float, StarErrors]]:
     """The errors at each magnitude below full scale, down to the first at which a star shows nothing."""
     render, target, frames = bench.config.render, bench.renderer.target, bench.config.exposure_frames
-    sprites, tile = phase_grid(PHASES, render.sprite_sigma_px)
+    sprites, _ = phase_grid(PHASES, render.sprite_sigma_px)
     bright = phase_image(sprites, render.sprite_sigma_px)
-    judge = Judge(bright, tile, render.sprite_sigma_px, target.seen.blur_px, target.seen.pixel_px)
+    judge = Judge(bright, line_places(sprites), render.sprite_sigma_px, target.seen.blur_px, target.seen.pixel_px)
     panel, balance = Panel(bench.calibration.response, WHITE), Balance(render.sprite_sigma_px, target.seen)
     found = []
     for mag in np.arange(0.0, MAX_BELOW_WHITE_MAG + STEP_MAG / 2, STEP_MAG).tolist():

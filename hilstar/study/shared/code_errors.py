@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from hilstar.monitor.balance import AS_USUAL, Balance
-from hilstar.monitor.phases import SIGMA_PX, WHITE, fainter, phase_grid, phase_image, shown_by
+from hilstar.monitor.phases import SIGMA_PX, WHITE, fainter, line_places, phase_grid, phase_image, shown_by
 from hilstar.monitor.quantise import Panel
 from hilstar.study.shared.codes import Way, response_of
 from hilstar.tracker.centroiders import FAMILY, Centroider
@@ -28,9 +28,9 @@ ERROR_COLUMNS = (
 def code_errors(bits: int, way: Way, phases: int, mags: Iterable[float]) -> list[StarErrors]:
     """The errors of phases^2 stars, so many magnitudes under white, on an sRGB panel; the tracker is as usual."""
     panel, balance = Panel(response_of(bits, way), WHITE), Balance(SIGMA_PX, AS_USUAL)
-    sprites, tile = phase_grid(phases, SIGMA_PX)
+    sprites, _ = phase_grid(phases, SIGMA_PX)
     bright = phase_image(sprites, SIGMA_PX)
-    judge = Judge(bright, tile, SIGMA_PX, AS_USUAL.blur_px, AS_USUAL.pixel_px)
+    judge = Judge(bright, line_places(sprites), SIGMA_PX, AS_USUAL.blur_px, AS_USUAL.pixel_px)
     errors = []
     for mag in mags:
         wanted = (bright * flux_ratio(mag)).astype(np.float32)

@@ -11,10 +11,12 @@ import pytest
 from hilstar.bench.build import load
 from hilstar.bench.config import RenderSettings
 from hilstar.bench.effort import Light, choose_codes, choose_sides, cut_px, explain, plan_effort
+from hilstar.monitor.balance import Seen
 from hilstar.monitor.response import srgb_response
 from hilstar.render.reference import linear_image
 from hilstar.rotation import from_radec_roll_deg
 from hilstar.scene.psf import footprint_px, outside_share
+from hilstar.tracker.centroiders import FAMILY
 from tests.support.commands import run_hilstar_here
 
 SIGMA = (0.85, 0.85)
@@ -38,6 +40,27 @@ def test_round_is_chosen_where_it_does_and_exact_where_it_does_not():
     assert choose_codes(settings(tolerance_mag=0.02, tolerance_px=0.04), light(8, 6.0)).method == "exact"
     codes = choose_codes(settings(tolerance_mag=1e-4), light(8, 6.0))
     assert codes.method == "exact" and "over 5e-05 mag" in codes.choice.error and codes.errors.flux_mag > 1e-4
+
+
+def test_the_tracker_s_own_centroider_and_pixels_judge_codes():
+    """12 bits, 6.5 magnitudes, 0.02 px: a fit is served by `round`, a plain moment is not."""
+    asked, sky = settings(tolerance_mag=0.05, tolerance_px=0.02), light(12, 6.5)
+    of_fit, of_all = choose_codes(asked, replace(sky, centroider="fit")), choose_codes(asked, sky)
+    assert (of_fit.method, of_all.method) == ("round", "exact")
+    assert of_fit.errors.centroider == "fit" and "as `fit` finds stars, from white" in of_fit.choice.error
+    assert f"as `{of_all.errors.centroider}` finds stars, the worst of 6 centroiders" in of_all.choice.error
+    rounded = {
+        (kind, pixel_px): choose_codes(
+            settings(quantisation="round"), replace(sky, centroider=kind, seen=Seen(0.55 * pixel_px, pixel_px))
+        ).errors
+        for kind in FAMILY
+        for pixel_px in (0.5, 1.0, 2.0)
+    }
+    assert len({errors.flux_mag for errors in rounded.values()}) == 1
+    narrow, even, wide = (rounded["box3", pixel_px].place_px for pixel_px in (0.5, 1.0, 2.0))
+    assert narrow < even / 2 < wide / 4
+    assert len({round(rounded["moment", pixel_px].place_px, 12) for pixel_px in (0.5, 1.0, 2.0)}) == 1
+    assert len({round(rounded[kind, 1.0].place_px, 12) for kind in FAMILY}) == 6
 
 
 def test_what_the_file_asks_for_is_not_overruled():
@@ -102,6 +125,12 @@ def test_the_plan_adds_up_and_says_when_it_cannot():
     tight = settings(tolerance_mag=1e-4, tolerance_px=1e-4)
     assert "OVER" in explain(plan_effort(tight, light(8, 6.0)), tight)[-1]
     assert "full" in explain(None, RenderSettings())[0]
+
+
+def test_a_bench_s_centroider_stands_in_what_it_explains(small_bench_file):
+    small_bench_file.write_text(small_bench_file.read_text() + '[verify]\ncentroider = "box5"\n')
+    with load(small_bench_file) as bench:
+        assert "as `box5` finds stars, from white" in explain(bench.effort, bench.config.render)[0]
 
 
 def test_explain_is_said_beside_the_json(tmp_path, small_bench_file):

@@ -7,7 +7,7 @@ import pytest
 from scipy.ndimage import gaussian_filter1d
 
 from hilstar.monitor.balance import Balance, Seen
-from hilstar.monitor.phases import MARGIN_PX, WHITE, fainter, phase_grid, phase_image, shown_by, tiles_of
+from hilstar.monitor.phases import MARGIN_PX, WHITE, fainter, line_places, phase_grid, phase_image, shown_by, tiles_of
 from hilstar.monitor.quantise import Panel
 from hilstar.monitor.response import srgb_response
 from hilstar.render.reference import linear_image
@@ -58,12 +58,12 @@ def looked_at(image, tile, seen):
 @pytest.mark.parametrize("seen", [Seen(0.62, 1.0), Seen(0.4, 0.55), Seen(1.1, 2.3)])
 def test_errors_are_those_of_fine_samples_and_other_centroiders(method, seen):
     wanted, shown, tile = codes(method, 5.0, seen)
-    found = Judge(wanted, tile, SIGMA, seen.blur_px, seen.pixel_px).errors(shown)
+    found = Judge(wanted, line_places(phase_grid(COUNT, SIGMA)[0]), SIGMA, seen.blur_px, seen.pixel_px).errors(shown)
     sky, lit = (looked_at(image, tile, seen) for image in (wanted, shown))
     sigma = np.sqrt(SIGMA[0] ** 2 + 1 / 6 + seen.blur_px**2) / seen.pixel_px
     ways = {
-        "window": lambda stars: outside.windowed(stars, sigma),
-        "wide": lambda stars: outside.windowed(stars, 1.5 * sigma),
+        "window": lambda stars: outside.windowed(stars, max(1, sigma)),
+        "wide": lambda stars: outside.windowed(stars, 1.5 * max(1, sigma)),
         "fit": lambda stars: outside.fitted(stars, sigma)[:2],
         "box3": lambda stars: outside.box_mean(stars, 1, sky),
         "box5": lambda stars: outside.box_mean(stars, 2, sky),
@@ -80,10 +80,10 @@ def test_errors_are_those_of_fine_samples_and_other_centroiders(method, seen):
 @pytest.mark.parametrize("seen", [Seen(0.62, 1.0), Seen(0.3, 0.2), Seen(2.5, 5.0), Seen(0.0, 1.0)])
 def test_a_star_a_tenth_of_a_pixel_aside_is_found_there_and_a_dark_one_nowhere(seen):
     """A tenth of each star's light is a pixel aside."""
-    sprites, tile = phase_grid(COUNT, SIGMA)
+    sprites, _ = phase_grid(COUNT, SIGMA)
     wanted = phase_image(sprites, SIGMA)
     moved = wanted + 0.1 * (np.roll(wanted, 1, axis=1) - wanted)
-    judge = Judge(wanted, tile, SIGMA, seen.blur_px, seen.pixel_px)
+    judge = Judge(wanted, line_places(sprites), SIGMA, seen.blur_px, seen.pixel_px)
     found = judge.errors(0.5 * moved, 0.5)
     assert found.flux_mag == pytest.approx(0, abs=WINGS)
     for kind in FAMILY:

@@ -106,7 +106,7 @@ class Renderer:
             with self._ctx:
                 self._check_limits()
                 self._build()
-        except Exception:  # not a signal's end: the process goes with its contexts, and one half built may not be taken apart
+        except BaseException:
             self._ctx.release()
             raise
 

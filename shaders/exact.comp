@@ -3,7 +3,8 @@
 // is the same in NumPy and says how; the ten sums are those of hilstar/monitor/balance.py.
 // It comes after the linear image and its nearest levels, and changes those levels. A pixel is the star's that gives more than half
 // of its light, so no pixel is written by two.
-// Defined before this text: LEVELS (r8ui or r16ui) and NEAR, the most pixels that are chosen.
+// Defined before this text: LEVELS (r8ui or r16ui), NEAR, the most pixels that are chosen, SIZE and FIRST, a footprint's pixels along
+// an axis and the first of them from the star's.
 // On a CPU what is read costs most: a word for a pixel's place, once, and images rather than textures. And a branch costs both its
 // sides there, since eight stars go together: so nothing is decided by the number of a pixel, and loops end where a star's do.
 
@@ -136,6 +137,27 @@ bool on_image(ivec2 at) {
     return all(greaterThanEqual(at, ivec2(0))) && all(lessThan(at, resolution_px));
 }
 
+#ifndef PATHS
+// A star's light and its moments about the star in all pixels of its footprint that are on the image: its whole light and none, but
+// where the image's edge cuts it, or where it is so narrow that its pixels' middles are not where their light is (NARROW).
+vec3 whole_of(Star star) {
+#ifndef NARROW
+    if (on_image(star.pixel + FIRST) && on_image(star.pixel + FIRST + SIZE - 1)) return vec3(star.e_per_s, 0.0, 0.0);
+#endif
+    vec2 light = vec2(0.0), moment = vec2(0.0);
+    for (int k = FIRST; k < FIRST + SIZE; k++) {
+        vec2 d = float(k) - star.fraction;
+        vec4 e = erf4(vec4(d - 0.5, d + 0.5) * inverse_sigma_sqrt2.xyxy);
+        ivec2 at = star.pixel + k;
+        vec2 there = vec2(at.x >= 0 && at.x < resolution_px.x, at.y >= 0 && at.y < resolution_px.y);
+        vec2 share = 0.5 * max(e.zw - e.xy, 0.0) * there;
+        light += share;
+        moment += share * d;
+    }
+    return star.e_per_s * vec3(light.x * light.y, moment.x * light.y, light.x * moment.y);
+}
+#endif
+
 // What a pixel's error is multiplied by in each sum; `d` is it from the star, `off` the star from its nearest pixel.
 void arms_of(uint place, vec2 d, vec2 off, float light_weight, out vec4 a, out vec4 b, out vec2 c) {
     float window = window_at(d);
@@ -256,7 +278,7 @@ vec3 choose(Star star, float of_light, vec3 carried) {
     float short_of[NEAR + 2];
     float step_of[NEAR + 2];
     BITS rounded_up = BITS(0u);
-    vec3 seen = vec3(0.0);  // own light and moments, in this star's pixels and others'
+    vec3 seen = vec3(0.0);  // own light and moments on the image, in this star's pixels and others'
     float largest = 0.0, smallest = NONE, lowest = 0.0;
     int mine = 0;
     for (int k = 0; k < reach; k++) {
@@ -269,7 +291,7 @@ vec3 choose(Star star, float of_light, vec3 carried) {
 #else
         vec2 d = vec2(offset) - fraction;
         float own = light_at(star, d);
-        seen += own * vec3(1.0, d);
+        if (on_image(at)) seen += own * vec3(1.0, d);
 #endif
         float s = 0.0, t = 0.0, asked = asked_of(at, own);
         if (asked >= 0.0) {
@@ -302,14 +324,15 @@ vec3 choose(Star star, float of_light, vec3 carried) {
         float own = light_at(star, d);
         if (2.0 * own < first_threshold_e_per_s) break;
         vec3 arm = vec3(1.0, d);
+        if (!on_image(at)) continue;
         seen += own * arm;
         float asked = asked_of(at, own);
         if (asked < 0.0) continue;
         float factor = output_of(at);
         error += (light_e_per_s[imageLoad(levels, at).r] - min(asked / factor, white_e_per_s)) * factor / unit * arm;
     }
-    // What lies further out stays dark. A sprite's moments about its centre are 0.
-    error -= (vec3(star.e_per_s, 0.0, 0.0) - seen) / unit;
+    // What lies further out stays dark.
+    error -= (whole_of(star) - seen) / unit;
 #endif
     vec3 left = error;
     bool equal = largest > 0.0 && largest <= smallest * (1.0 + SAME_STEP);

@@ -29,6 +29,8 @@ MIN_VERSION = 430  # of OpenGL, for compute shaders
 MAX_NEAR = 128  # pixels of a star that the shader has bits for: sprites up to a sigma of 1.8 px
 MAX_SIZE = 63  # of a footprint whose places fit into their six bits
 IN_BOX = 1023  # what a pixel's part in a box is counted in: ten bits
+# Narrower sprites have moments of their pixels: exp(-2 pi^2 sigma^2) / pi px, here 5e-6, of thousands of steps of light.
+NARROW_PX = 0.75
 LOCAL_SIZE = 32  # as in exact.comp
 
 
@@ -56,6 +58,7 @@ class ExactPass:
     def _build(self, panel: Panel, balance: Balance, paths: bool) -> moderngl.ComputeShader:
         order = self._pixels
         defines = [f"NEAR {order.near}", f"LEVELS r{8 * self._levels_bytes()}ui"]
+        defines += [f"SIZE {order.size}", f"FIRST ({order.first})"] + ["NARROW"] * (min(balance.sigma_px) < NARROW_PX)
         defines += ["PATHS"] * paths + ["UNIFORMITY"] * (self._gain is not None)
         version, body = resource_path("shaders", "exact.comp").read_text().split("\n", 1)
         with held():  # as for any program

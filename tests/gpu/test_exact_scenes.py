@@ -1,0 +1,44 @@
+"""`exact` by the compute pass where it might fail: within the same limits as its NumPy oracle, and nearly its codes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hilstar.monitor.exact import ExactQuantiser
+from hilstar.monitor.response import srgb_response
+from hilstar.render.renderer import Renderer, Target
+from tests.support.exact_scenes import SCENES, SIDE, USUAL, WHITE, assert_no_worse, single, uneven
+
+# Pixels that differ from the oracle's: of two choices that are as good it may take the other, and on 2 bits many are. Where
+# stars lie over each other a pixel that is nobody's by half stays rounded, which in NumPy the brighter one chooses.
+OTHER, OTHER_AMONG_NEIGHBOURS = 0.08, 0.35
+
+
+def target_of(scene):
+    return Target((SIDE, SIDE), scene.sigma_px, scene.response, WHITE, "exact", scene.uniformity)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_no_scene_is_worse_than_rounded_nor_other_than_the_oracle_s(name):
+    scene = SCENES[name]()
+    with Renderer(target_of(scene)) as gl:
+        gl.draw(scene.sprites)
+        levels = gl.codes().copy()
+        assert gl.gl_error() == "GL_NO_ERROR"
+    assert levels.max() <= scene.response.white
+    assert_no_worse(levels, name, scene)
+    oracle = ExactQuantiser(scene.panel, (SIDE, SIDE), scene.sigma_px).levels(scene.sprites)
+    beside = "neighbour" in name or "apart" in name
+    assert (levels != oracle).sum() <= (OTHER_AMONG_NEIGHBOURS if beside else OTHER) * (oracle > 0).sum()
+    assert np.abs(levels.astype(int) - oracle).max() <= 1
+
+
+@pytest.mark.parametrize("uniformity", [None, uneven()], ids=["even", "uneven"])
+def test_no_stars_are_black_also_after_some(uniformity):
+    scene = single(3, srgb_response(8), USUAL, uniformity)
+    with Renderer(target_of(scene)) as gl:
+        for sprites, lit in ((None, False), (scene.sprites, True), (None, False)):
+            gl.draw(sprites)
+            assert (gl.codes().max() > 0) == lit
+        assert gl.gl_error() == "GL_NO_ERROR"

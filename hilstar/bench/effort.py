@@ -17,6 +17,7 @@ from hilstar.monitor.phases import UNLIKE, WHITE, fainter, line_places, phase_gr
 from hilstar.monitor.quantise import EXPOSURE_FRAMES, Panel, Quantisation
 from hilstar.monitor.response import Response
 from hilstar.render.encoder import MAX_SIDES, SpriteSide, SpriteSides
+from hilstar.render.exact_pass import ExactPass
 from hilstar.scene.psf import MAX_CUT, cut_share, footprint_px, outside_share, peak_share, pixel_share
 from hilstar.tracker.centroiders import FAMILY, Centroider
 from hilstar.tracker.star_errors import Judge
@@ -30,9 +31,11 @@ MAG_PER_SHARE = 2.5 / math.log(10)
 # Light beyond a small sprite is under this share of what lights a pixel: only where the wings of stars meet is a code lower
 UNLIT = 0.25
 CUT_PHASES = 51
-# `exact`, stars at 1 deg/s, 1080p over 31 deg, two llvmpipe cores: half of it at rest, three times as much at 15 deg/s. A field
-# of the Milky Way has twice the stars of an average one.
-EXACT_MS_A_STAR = 0.02
+# A whole frame with `exact`, for each of 800 to 1400 stars, 1080p over 31 deg at 0 to 15 deg/s, two llvmpipe cores; `round` takes
+# 1.2 to 1.5 times less. Sprites that are too wide for the compute pass take NumPy's time. A field of the Milky Way has twice the
+# stars of an average one.
+EXACT_MS_A_STAR = 0.01
+WIDE_EXACT_MS_A_STAR = 0.23
 EXACT_SHARE = 0.5
 
 
@@ -127,10 +130,11 @@ class Light:
         """Who measures where codes show a star."""
         return FAMILY if self.centroider is None else (self.centroider,)
 
-    def exact_ms(self) -> float:
+    def exact_ms(self, sigma_px: tuple[float, float]) -> float:
         """The time that `exact` takes for an average field, turning at 1 deg/s, on two cores without a GPU."""
         lit = self.rates_e_per_s >= self.response.half_step * self.white_e_per_s
-        return EXACT_MS_A_STAR * self.sky_share * float(np.count_nonzero(lit))
+        a_star_ms = EXACT_MS_A_STAR if ExactPass.takes(sigma_px) else WIDE_EXACT_MS_A_STAR
+        return a_star_ms * self.sky_share * float(np.count_nonzero(lit))
 
     @property
     def refresh_ms(self) -> float:
@@ -181,7 +185,7 @@ def choose_codes(render: RenderSettings, light: Light) -> ChosenCodes:
 
     `auto` does not take `exact` where that would be late in fields of many stars.
     """
-    exact_ms = light.exact_ms()
+    exact_ms = light.exact_ms(render.sprite_sigma_px)
     in_time = exact_ms <= EXACT_SHARE * light.refresh_ms
     wanted = (BY_COST if in_time else BY_COST[:1]) if render.quantisation == "auto" else (render.quantisation,)
     limits = CODES_SHARE * render.tolerance_mag, CODES_SHARE * render.tolerance_px
@@ -198,7 +202,7 @@ def choose_codes(render: RenderSettings, light: Light) -> ChosenCodes:
     elif not within:
         ways = "more bits, bit_stealing or brighter stars" if light.can_steal_bits else "more bits or brighter stars"
         error += f" (over {limits[0]:g} mag or {limits[1]:g} px: {ways} would do)"
-    saving = "several times cheaper than exact" if method == "round" else "nothing saved"
+    saving = "exact takes 1.2 to 1.5 times as long" if method == "round" else "nothing saved"
     if method == "exact":
         saving = f"an average field at 1 deg/s takes {exact_ms:.2g} ms of {light.refresh_ms:.3g} on two cores without a GPU"
     return ChosenCodes(method, errors, Choice("codes", method, error, saving))

@@ -52,8 +52,13 @@ class ExactPass:
     @staticmethod
     def runs_on(ctx: moderngl.Context, sigma_px: tuple[float, float]) -> bool:
         """Whether this GL has compute shaders, and the shader bits enough for the sprites' pixels."""
+        return ctx.version_code >= MIN_VERSION and ExactPass.takes(sigma_px)
+
+    @staticmethod
+    def takes(sigma_px: tuple[float, float]) -> bool:
+        """Whether the shader has bits enough for the pixels of such sprites."""
         order = PixelOrder(sigma_px)
-        return ctx.version_code >= MIN_VERSION and order.near <= MAX_NEAR and order.size <= MAX_SIZE
+        return order.near <= MAX_NEAR and order.size <= MAX_SIZE
 
     def _build(self, panel: Panel, balance: Balance, paths: bool) -> moderngl.ComputeShader:
         order = self._pixels

@@ -31,9 +31,9 @@ MAG_PER_SHARE = 2.5 / math.log(10)
 # Light beyond a small sprite is under this share of what lights a pixel: only where the wings of stars meet is a code lower
 UNLIT = 0.25
 CUT_PHASES = 51
-# A whole frame with `exact`, for each of 800 to 1400 stars, 1080p over 31 deg at 0 to 15 deg/s, two llvmpipe cores; `round` takes
-# 1.2 to 1.5 times less. Sprites that are too wide for the compute pass take NumPy's time. A field of the Milky Way has twice the
-# stars of an average one.
+# A whole frame with `exact`, for each of 800 to 1400 stars, 1080p over 31 deg at 0 to 15 deg/s, two llvmpipe cores; `round`
+# takes 1.2 to 1.5 times less. Sprites that are too wide for the compute pass take NumPy's time. A field of the Milky Way has
+# twice the stars of an average one.
 EXACT_MS_A_STAR = 0.01
 WIDE_EXACT_MS_A_STAR = 0.23
 EXACT_SHARE = 0.5

@@ -22,6 +22,7 @@ from hilstar.monitor.quantise import Panel, Quantisation, mask_turn
 from hilstar.monitor.response import Codes, Response
 from hilstar.monitor.temporal import TemporalQuantiser
 from hilstar.render.encoder import (
+    CUT_WINGS,
     SPRITE_PIXEL_COST,
     Encoder,
     Eraser,
@@ -138,12 +139,13 @@ class Renderer:
         self._linear.filter = (moderngl.NEAREST, moderngl.NEAREST)
         self._linear_fbo = ctx.framebuffer([self._linear])
         self._splat = splat_program(ctx, target.resolution_px, target.sigma_px, self.footprint_px)
-        set_sides(self._splat, target.sides)
         self._eraser = Eraser(ctx, target.resolution_px, of_levels=False)
         self._level_eraser = Eraser(ctx, target.resolution_px, of_levels=True)
         self._extended = ExtendedLayer(ctx, target.resolution_px)
         self._regions: tuple[Rectangle, ...] = ()  # of extended light that is on the images
+        self._cut_sides = target.sides
         self._build_levels()
+        set_sides(self._splat, self._cut_sides)
         self._reserve(FIRST_CAPACITY)
         width, height = target.resolution_px
         self._linear_image = np.empty((height, width), dtype=np.float32)
@@ -168,6 +170,8 @@ class Renderer:
             self._encoder = Encoder(self._ctx, self._linear, self._levels, panel, dithered)
             self._lit_sides = () if dithered else target.sides or lit_sides(panel, target.sigma_px, self.footprint_px)
             self._encoder.shrink(self._lit_sides)
+            if target.quantisation == "round" and not target.sides:
+                self._cut_sides = lit_sides(panel, target.sigma_px, self.footprint_px, CUT_WINGS)
 
     def _reserve(self, sprites: int) -> None:
         """Make room for `sprites` sprites on the GPU; it grows by doubling and never shrinks."""
@@ -197,9 +201,13 @@ class Renderer:
                 self._undrawn = (sprites, False)
                 self._last_count = None
                 return
-            self._draw_linear(sprites, whole=False)
+            covered_px, (width, height) = self._covered_px(sprites), self.target.resolution_px
+            cut = bool(self._cut_sides) and sprites is not None and covered_px * SPRITE_PIXEL_COST < width * height
+            self._draw_linear(sprites, whole=not (self.target.sides or cut))
             if self._encoder is not None:
-                self._encode(self._encoder, sprites)
+                self._encode(self._encoder, sprites, covered_px)
+            if cut and not self.target.sides:
+                self._undrawn = (sprites, True)  # without what `round` left out, when somebody asks
             if self._exact_pass is not None and sprites is not None and len(sprites):
                 self._exact_pass.draw(self._buffer, sprites)
 
@@ -231,9 +239,9 @@ class Renderer:
         self._exact_levels = self._exact.levels(sprites, floor)
         levels.write(self._exact_levels)
 
-    def _encode(self, encoder: Encoder, sprites: Sprites | None) -> None:
+    def _encode(self, encoder: Encoder, sprites: Sprites | None, covered_px: int) -> None:
         count, per_star = (0, 1) if sprites is None else (len(sprites), sprites.per_star)
-        encoder.draw(count, per_star, self._covered_px(sprites), 0.0, self._regions)
+        encoder.draw(count, per_star, covered_px, 0.0, self._regions)
 
     def _floor(self, lights: tuple[ExtendedLight, ...], turn: float, panel: Panel, levels: LevelTexture) -> Codes:
         """The levels of extended light alone, dithered by a turned mask: stars are added to them in light.
@@ -257,11 +265,14 @@ class Renderer:
             return 0
         width, height = self.target.resolution_px
         most = len(sprites) * self.footprint_px**2
-        if not self._lit_sides or most * SPRITE_PIXEL_COST < width * height:
+        if self._encoder is None or not self._lit_sides or most * SPRITE_PIXEL_COST < width * height:
             return most
-        rates, widths = zip(*((side.below_e_per_s, side.side_px) for side in reversed(self._lit_sides)), strict=True)
-        place = np.searchsorted(rates, sprites.data["electrons_per_s"] * np.float32(sprites.per_star), side="right")
-        return int(np.square([*widths, self.footprint_px])[place].sum())
+        rates, larger_px = np.ascontiguousarray(sprites.data["electrons_per_s"]), self.footprint_px
+        for side in self._lit_sides:
+            smaller = int(np.count_nonzero(rates < side.below_e_per_s / sprites.per_star))
+            most -= smaller * (larger_px**2 - side.side_px**2)
+            larger_px = side.side_px
+        return most
 
     def _upload(self, sprites: Sprites) -> None:
         if len(sprites) > self._capacity:
@@ -271,9 +282,10 @@ class Renderer:
         self._buffer.orphan()
         self._buffer.write(sprites.data)
 
-    def _draw_linear(self, sprites: Sprites | None, whole: bool) -> None:
+    def _draw_linear(self, sprites: Sprites | None, whole: bool, levels: bool = True) -> None:
+        """Draw the linear image; `levels` says whether the last frame's are erased."""
         self._undrawn = None
-        self._erase()
+        self._erase(levels)
         if sprites is not None and sprites.extended:
             self._shine(sprites.extended)
         if sprites is not None and len(sprites):
@@ -281,15 +293,16 @@ class Renderer:
             self._last_count = len(sprites)
             self._splat_stars(sprites, whole)
 
-    def _erase(self) -> None:
+    def _erase(self, levels: bool = True) -> None:
         """Make black what the last frame drew."""
+        level_fbo = self._levels.fbo if levels and self._encoder is not None and self._levels is not None else None
         self._eraser.erase(self._linear_fbo, self._last_count)
-        if self._encoder is not None and self._levels is not None:
-            self._level_eraser.erase(self._levels.fbo, self._last_count)
+        if level_fbo is not None:
+            self._level_eraser.erase(level_fbo, self._last_count)
         for region in self._regions:
             self._linear_fbo.clear(viewport=region)
-            if self._encoder is not None and self._levels is not None:
-                self._levels.fbo.clear(viewport=region)
+            if level_fbo is not None:
+                level_fbo.clear(viewport=region)
         self._regions = ()
         self._last_count = 0
 
@@ -299,7 +312,7 @@ class Renderer:
 
     def _splat_stars(self, sprites: Sprites, whole: bool) -> None:
         """Add the light of the sprites that are in the buffer to the linear image."""
-        self._splat["sides"] = 0 if whole else len(self.target.sides)
+        self._splat["sides"] = 0 if whole else len(self._cut_sides)
         self._splat["sprites_per_star"] = float(sprites.per_star)
         width, height = self.target.resolution_px
         margin = self.footprint_px
@@ -336,7 +349,7 @@ class Renderer:
         """The linear image of the last draw, electrons per second, float32 (height, width); overwritten as `codes`."""
         with self._ctx:
             if self._undrawn is not None:
-                self._draw_linear(*self._undrawn)
+                self._draw_linear(*self._undrawn, levels=self._by_numpy)
             self._linear_fbo.read_into(self._linear_image, components=1, dtype="f4", alignment=1)
         return self._linear_image
 

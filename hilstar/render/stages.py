@@ -32,9 +32,9 @@ class StagedRenderer(Renderer):
         self.stage_ms["read_back"] = (time.perf_counter() - begin) * 1e3
         return codes
 
-    def _erase(self) -> None:
+    def _erase(self, levels: bool = True) -> None:
         with self._timed("erase"):
-            super()._erase()
+            super()._erase(levels)
 
     def _upload(self, sprites: Sprites) -> None:
         with self._timed("upload"):
@@ -44,9 +44,9 @@ class StagedRenderer(Renderer):
         with self._timed("splat"):
             super()._splat_stars(sprites, whole)
 
-    def _encode(self, encoder: Encoder, sprites: Sprites | None) -> None:
+    def _encode(self, encoder: Encoder, sprites: Sprites | None, covered_px: int) -> None:
         with self._timed("encode"):
-            super()._encode(encoder, sprites)
+            super()._encode(encoder, sprites, covered_px)
 
     @contextmanager
     def _timed(self, stage: str) -> Iterator[None]:

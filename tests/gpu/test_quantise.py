@@ -11,6 +11,7 @@ from hilstar.errors import InputError
 from hilstar.monitor.exact import ExactQuantiser
 from hilstar.monitor.quantise import Panel, dither_levels, round_levels, shown_light, turned_mask
 from hilstar.monitor.response import bit_stealing_response, gamma_response, srgb_response
+from hilstar.render.encoder import CUT_WINGS
 from hilstar.render.renderer import Renderer, Target
 from hilstar.scene.psf import footprint_px
 from tests.support.stars import sprites_at
@@ -18,6 +19,8 @@ from tests.support.stars import sprites_at
 SIZE = (256, 192)
 SIGMA = (0.85, 0.85)
 WHITE = 1e6
+# Of pixels that groups of stars light: light is within a few 64ths of a step under a threshold in as many of them.
+FLIPPED = 0.02
 GREY = srgb_response(8)
 RESPONSES = {
     "srgb8": GREY,
@@ -78,8 +81,8 @@ def test_levels_are_those_of_the_oracle_pixel_for_pixel(response, count, mapped,
     assert levels.max() == response.white
 
 
-def test_where_up_to_sixteen_wings_meet_no_lit_pixel_is_missed(rng):
-    """Only a star's own square is encoded; groups of faint stars and a bright one light pixels between their squares."""
+def test_where_wings_meet_round_leaves_out_no_more_than_it_says(rng):
+    """Groups of faint stars and bright ones: a star's light beyond its square is under a 32nd of what lights a pixel."""
     size, groups, each = (640, 480), 40, 16
     middles = rng.uniform([20, 20], [620, 460], size=(groups, 2))
     pixels = (middles[:, None] + rng.uniform(-8, 8, (groups, each, 2))).reshape(-1, 2)
@@ -87,8 +90,27 @@ def test_where_up_to_sixteen_wings_meet_no_lit_pixel_is_missed(rng):
     light[:: 4 * each] *= 1e3
     with Renderer(replace(target_of(GREY, "round"), resolution_px=size)) as gl:
         gl.draw(sprites_at(pixels, light, gl.footprint_px))
-        assert np.array_equal(gl.codes(), round_levels(gl.linear(), gl.target.panel()))
-        assert np.count_nonzero(gl.codes()) > 1000
+        panel, found, whole = gl.target.panel(), gl.codes().copy(), gl.linear().copy()
+        assert np.array_equal(found, gl.codes())  # to read the whole light leaves the levels
+    expected = round_levels(whole, panel)
+    left_out = each / CUT_WINGS * GREY.threshold[0] * WHITE
+    assert (found <= expected).all()
+    assert (found >= round_levels(np.maximum(whole - left_out, 0).astype(np.float32), panel)).all()
+    assert np.count_nonzero(found != expected) < FLIPPED * np.count_nonzero(expected)
+    assert np.count_nonzero(expected) > 1000
+
+
+@pytest.mark.parametrize("sigma", [(0.55, 0.55), (0.85, 0.85), (1.3, 0.7)])
+def test_a_star_alone_has_the_levels_of_its_whole_light(sigma):
+    """At 144 phases, from one that lights no pixel to one that clips."""
+    step = footprint_px(sigma) + 3
+    rows, columns = np.mgrid[1:13, 1:13].reshape(2, -1)
+    pixels = np.column_stack([columns * step + columns / 12, rows * step + rows / 12])
+    with Renderer(Target((60 * step, 15 * step), sigma, GREY, WHITE)) as gl:
+        gl.draw(sprites_at(pixels, 10.0 ** np.linspace(1.5, 7.5, 144), gl.footprint_px))
+        found = gl.codes().copy()
+        assert np.array_equal(found, round_levels(gl.linear(), gl.target.panel()))
+        assert len(np.unique(found)) > 100
 
 
 # The shader sums in another order and knows erf to 4e-7: of two choices that are nearly as good it may take the other.

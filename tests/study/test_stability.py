@@ -16,6 +16,7 @@ from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.scene.camera import Camera
 from hilstar.sky.electrons import tabulate
 from hilstar.study.stability import attitude as stability_attitude
+from hilstar.study.stability import codes as stability_codes
 from hilstar.study.stability import field as stability_field
 from hilstar.study.stability import image as stability_image
 from hilstar.study.stability import popping as stability_popping
@@ -108,6 +109,20 @@ def rounded(_quantisation):
     return code_fluxes("round")
 
 
+def rounded_codes(scene):
+    return stability_codes.codes_of(scene, "round")
+
+
+JUDGED_CODES = (
+    stability_codes.stars_half_off,
+    stability_codes.stars_a_pixel_apart,
+    stability_codes.narrow_codes,
+    stability_codes.uneven_panel,
+    stability_codes.two_bits,
+    stability_codes.sixteen_bits,
+)
+
+
 def taken_as_it_is(_message):
     return AttitudeSample(1, stability_attitude.START)
 
@@ -128,6 +143,7 @@ WRONG_ROADS = (
     (stability_image.star_on_pixel_edge, "by_renderer", rendered_by(stability_image.nearest_pixel)),
     (stability_image.star_on_image_edge, "by_renderer", rendered_by(stability_image.nearest_pixel)),
     (stability_popping.popping_codes, "moving_code_fluxes", rounded),
+    *((visit, "exact_codes", rounded_codes) for visit in JUDGED_CODES),
     (stability_sky.temperature_range, "tabulate", averaged),
     (stability_tracker.nan_pixel, "find_stars", len),
 )

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from hilstar.charts import write_csv
-from hilstar.study.stability import attitude, field, image, popping, sky, tracker
+from hilstar.study.stability import attitude, codes, field, image, popping, sky, tracker
 from hilstar.study.stability.charts import draw_charts
 from hilstar.study.stability.failure_case import FailureCase
 
@@ -35,6 +35,15 @@ CASES: tuple[Callable[[], FailureCase], ...] = (
     image.flux_range,
     popping.popping,
     popping.popping_codes,
+    codes.stars_half_off,
+    codes.stars_a_pixel_apart,
+    codes.narrow_codes,
+    codes.uneven_panel,
+    codes.two_bits,
+    codes.sixteen_bits,
+    codes.clipped_neighbours,
+    codes.all_clipped,
+    codes.no_stars,
     tracker.billion_electrons,
     tracker.full_well,
     tracker.empty_field,

@@ -203,7 +203,8 @@ def diffused_light(linear: FloatArray, response: Response) -> FloatArray:
 
 def no_stars() -> FailureCase:
     """Nothing in view."""
-    none = Scene(sprites_of(*np.zeros((3, 0)), SIGMA_PX), SIGMA_PX, Panel(srgb_response(8), WHITE))
+    nothing = np.zeros(0)
+    none = Scene(sprites_of(nothing, nothing, nothing, SIGMA_PX), SIGMA_PX, Panel(srgb_response(8), WHITE))
     with np.errstate(invalid="ignore"):
         scaled = none.wanted() / none.wanted().max()
     error = float((exact_codes(none) != 0).mean())

@@ -149,8 +149,9 @@ class Receiver:
         arrivals = self._link.receive(POLL_MS)
         for k, arrival in enumerate(arrivals):
             # The newest of those that arrived while this thread slept woke it; the others had to wait.
-            timely = arrival.stamped or (not waits and k == len(arrivals) - 1)
-            self._take(arrival, 0 if timely else arrival.host_ns - self._empty_ns)
+            timely = not waits and k == len(arrivals) - 1
+            waited_ns = 0 if timely else arrival.host_ns - self._empty_ns
+            self._take(arrival, arrival.waited_ns if arrival.stamped else waited_ns)
         now_ns = time.monotonic_ns()
         self._settle(self.jumps.expire(now_ns))
         if self._link.two_way:

@@ -1,16 +1,30 @@
-"""A frame loop that its own process does not interrupt: scheduling, Python's lock, and the garbage collector."""
+"""When the kernel runs what must not wait: a frame loop that its own process does not interrupt, and a process that stamps."""
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import gc
 import os
+import platform
+import struct
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 FIFO_PRIORITY = 10
 # How long another thread may keep Python's lock from the frame loop; 5 ms by default, a third of a frame.
 SWITCH_INTERVAL_S = 0.0005
+PROMPT_PRIORITY = FIFO_PRIORITY + 1
+HEAVY = 0.3
+LOOK_S = 0.25
+SHORT_SLICE_NS = 100_000  # the shortest that the kernel gives
+SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}  # Linux's numbers of a call that the C library does not have
+SCHED_ATTRIBUTES = struct.Struct(
+    "=IIQiIQQQ"
+)  # sched_setattr(2): size, policy, flags, nice, priority, runtime, deadline, period
 
 
 @contextmanager
@@ -46,3 +60,51 @@ def raise_priority() -> str:
     except (OSError, AttributeError) as error:
         return f"normal: SCHED_FIFO is not allowed ({getattr(error, 'strerror', error)}); give this user rtprio in limits.conf"
     return f"SCHED_FIFO {FIFO_PRIORITY}"
+
+
+class PromptWhileLight:
+    """A process that only wakes, stamps and sleeps again is woken before all others; one that works for long is not.
+
+    Real-time priority above the frame loop's where that is allowed; else the shortest slice of the normal scheduler, which
+    Linux 6.12 and later gives anybody (a task that asks for less runs sooner). While the process takes more than HEAVY of a
+    core, as in a flood, its priority is the normal one, so that it takes no frame's time.
+    """
+
+    def __init__(self) -> None:
+        _ask_for_short_slices()
+        self._prompt = _set_all_threads(os.SCHED_FIFO, PROMPT_PRIORITY)
+        self._allowed = self._prompt
+        self._looked_s, self._used_s = time.monotonic(), time.process_time()
+
+    def tend(self) -> None:
+        """Look how much the process has done; quick, so that it may be called often."""
+        now_s = time.monotonic()
+        if not self._allowed or now_s - self._looked_s < LOOK_S:
+            return
+        used_s = time.process_time()
+        heavy = used_s - self._used_s > HEAVY * (now_s - self._looked_s)
+        self._looked_s, self._used_s = now_s, used_s
+        if heavy and self._prompt:
+            self._prompt = not _set_all_threads(os.SCHED_OTHER, 0)
+        elif not heavy and not self._prompt:
+            self._prompt = _set_all_threads(os.SCHED_FIFO, PROMPT_PRIORITY)
+
+
+def _set_all_threads(policy: int, priority: int) -> bool:
+    """Whether every thread of this process has this scheduling now; those to come inherit it."""
+    try:
+        for thread in Path("/proc/self/task").iterdir():
+            with contextlib.suppress(ProcessLookupError):
+                os.sched_setscheduler(int(thread.name), policy, os.sched_param(priority))
+    except (OSError, AttributeError):
+        return False
+    return True
+
+
+def _ask_for_short_slices() -> None:
+    number = SCHED_SETATTR.get(platform.machine())
+    if number is None:
+        return
+    asked = SCHED_ATTRIBUTES.pack(SCHED_ATTRIBUTES.size, os.SCHED_OTHER, 0, os.nice(0), 0, SHORT_SLICE_NS, 0, 0)
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).syscall(number, 0, ctypes.create_string_buffer(asked, len(asked)), 0)  # an older kernel refuses

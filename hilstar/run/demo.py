@@ -13,6 +13,7 @@ import msgspec
 import numpy as np
 
 from hilstar.arrays import FloatArray
+from hilstar.attitude.wire.apart.zmq_apart import ZmqApart
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.attitude.wire.zmq_stream import ZmqReceiver
 from hilstar.bench.build import load
@@ -100,7 +101,7 @@ def run_demo(directory: Path, duration_s: float, rng: np.random.Generator, watch
     write_log(log_path, slew_samples(duration_s + 1.0, rng))
     with (
         load(resource_path("configs", "demo.toml")) as bench,
-        ZmqReceiver(bench.config.attitude.address, bind=True) as link,
+        ZmqApart(ZmqReceiver(bench.config.attitude.address, bind=True)) as link,
         watching(bench, link.endpoint) as (watch, outlet),
     ):
         frame_count = round(duration_s * bench.config.monitor.refresh_hz)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+from hilstar.attitude.wire.apart.serial_apart import SerialApart
+from hilstar.attitude.wire.apart.zmq_apart import ZmqApart
 from hilstar.attitude.wire.keys import CurveKeys
 from hilstar.attitude.wire.links import StreamLink
 from hilstar.attitude.wire.nasa42.messages import MessageReader
@@ -32,24 +34,35 @@ def link_keys(settings: AttitudeSettings, folder: Path) -> CurveKeys:
     return CurveKeys(*(None if name is None else folder / name for name in names))
 
 
-def open_link(config: BenchConfig, folder: Path, notices: Notices | None = None) -> AnyLink:
-    """The link that the bench file in `folder` names. Raises InputError if it cannot be opened."""
+def open_link(config: BenchConfig, folder: Path, notices: Notices | None = None, *, apart: bool = False) -> AnyLink:
+    """The link that the bench file in `folder` names. Raises InputError if it cannot be opened.
+
+    With `apart`, what the kernel does not stamp is read and stamped by a process of its own: OpenGL's calls hold Python's
+    lock, and a thread of a process that draws reads a packet some milliseconds late.
+    """
     settings = config.attitude
     if settings.source == "serial":
-        return SerialLink(str(settings.port), settings.baud, notices)
+        return (SerialApart if apart else SerialLink)(str(settings.port), settings.baud, notices)
     if settings.source == "udp":
         return UdpLink(*udp_road(settings), notices)
     if settings.source == "vizard":
-        return _open_vizard(config, notices)
+        return _open_vizard(config, notices, apart=apart)
     if settings.source == "42":
         return _open_42(config, notices)
     keys = link_keys(settings, folder)
     if settings.lockstep:
         return ZmqLockstep(settings.address, bind=settings.bind is not False, keys=keys, notices=notices)
-    return ZmqReceiver(settings.address, bind=settings.bind is True, keys=keys, notices=notices)
+    receiver = ZmqReceiver(settings.address, bind=settings.bind is True, keys=keys, notices=notices)
+    return ZmqApart(receiver, notices) if apart else receiver
 
 
-def _open_vizard(config: BenchConfig, notices: Notices | None) -> VizardBroadcast | VizardLive:
+def await_reader(link: AnyLink) -> None:
+    """Wait until the process that reads a link, if there is one, can begin at once: from then on a sender is heard."""
+    if isinstance(link, ZmqApart | SerialApart):
+        link.await_ready()
+
+
+def _open_vizard(config: BenchConfig, notices: Notices | None, *, apart: bool) -> AnyLink:
     settings = config.attitude
     rates = DifferenceRates(round(settings.stale_after_ms * NS_PER_MS), math.radians(settings.max_rate_deg_s))
     name = None if settings.spacecraft is None else str(settings.spacecraft)
@@ -58,7 +71,8 @@ def _open_vizard(config: BenchConfig, notices: Notices | None) -> VizardBroadcas
     follower = Follower(name, mounting, rates, taken)
     if settings.lockstep:
         return VizardLive(settings.address, follower, bind=settings.bind is not False, notices=notices)
-    return VizardBroadcast(settings.address, follower, bind=settings.bind is True, notices=notices)
+    broadcast = VizardBroadcast(settings.address, follower, bind=settings.bind is True, notices=notices)
+    return ZmqApart(broadcast, notices) if apart else broadcast
 
 
 def _open_42(config: BenchConfig, notices: Notices | None) -> Nasa42Link:

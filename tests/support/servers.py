@@ -84,12 +84,21 @@ class Served:
         wait_for(lambda: self.count(words), (words, self.lines))
 
     def used_mb(self) -> float:
-        """Its resident memory."""
-        return int(Path(f"/proc/{self.process.pid}/statm").read_text().split()[1]) * resource.getpagesize() / 1e6
+        """Its resident memory, and that of its reader."""
+        pages = [int((folder / "statm").read_text().split()[1]) for folder in self._folders()]
+        return sum(pages) * resource.getpagesize() / 1e6
 
     def files(self) -> int:
-        """How many files and sockets it has open."""
-        return len(list(Path(f"/proc/{self.process.pid}/fd").iterdir()))
+        """How many files and sockets it and its reader have open."""
+        return sum(len(list((folder / "fd").iterdir())) for folder in self._folders())
+
+    def _folders(self) -> list[Path]:
+        """The process and the one that reads the link for it, as Linux shows them."""
+        own = Path(f"/proc/{self.process.pid}")
+        children = [
+            Path(f"/proc/{each}") for task in (own / "task").iterdir() for each in (task / "children").read_text().split()
+        ]
+        return [own, *(each for each in children if b"attitude.wire.apart" in (each / "cmdline").read_bytes())]
 
     def summary(self) -> dict:
         """What it prints at its end, after Ctrl-C."""

@@ -19,7 +19,8 @@ class Arrival(Generic[E_co]):
     """One message: host time of its arrival, what it says, its bytes as received, and how long it may have waited unread.
 
     `refusal` says why a packet that is an attitude is not used. `back` sends to whoever sent this, where a link has several
-    senders. A `stamped` arrival's time is the kernel's, however long it waited.
+    senders. A `stamped` arrival's time and its wait are the kernel's, or of a process that does nothing else, however late it
+    is read here.
     """
 
     host_ns: int

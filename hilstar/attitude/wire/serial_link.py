@@ -9,7 +9,7 @@ import select
 import termios
 import time
 from types import TracebackType
-from typing import Self
+from typing import NamedTuple, Self
 
 import serial
 from serial.tools import list_ports
@@ -45,6 +45,18 @@ def serial_target(text: str) -> tuple[str, int] | None:
 def serial_ports() -> list[str]:
     """The serial ports of this machine, each with its description."""
     return [f"{port.device} ({port.description})" for port in sorted(list_ports.comports())]
+
+
+class Chunk(NamedTuple):
+    """Bytes that were read at once: when, and if a process that only reads did it, how long they may have waited unread.
+
+    `empty_ns` is when nothing waited last.
+    """
+
+    host_ns: int
+    data: bytes
+    waited_ns: int | None = None
+    empty_ns: int = 0
 
 
 class SerialLink:
@@ -87,18 +99,32 @@ class SerialLink:
             self._reopen(timeout_ms)
             return []
         try:
-            if device.timeout != timeout_ms / 1000:  # setting it costs a tcsetattr
-                device.timeout = timeout_ms / 1000
-            chunk = device.read(1)
-            chunk += device.read(min(device.in_waiting, MAX_READ_BYTES)) if chunk else b""
+            chunks = self._read(device, timeout_ms)
         except (OSError, TypeError) as error:  # pyserial raises TypeError for a port closed meanwhile
             self._lose(str(error))
             return []
-        host_ns = time.monotonic_ns()
-        frames = chunk.count(DELIMITER)
+        return [arrival for chunk in chunks for arrival in self._arrivals(chunk)]
+
+    def _read(self, device: serial.Serial, timeout_ms: int) -> list[Chunk]:
+        """What has come, read now."""
+        if device.timeout != timeout_ms / 1000:  # setting it costs a tcsetattr
+            device.timeout = timeout_ms / 1000
+        data = device.read(1)
+        data += device.read(min(device.in_waiting, MAX_READ_BYTES)) if data else b""
+        return [Chunk(time.monotonic_ns(), data)] if data else []
+
+    def _arrivals(self, chunk: Chunk) -> list[Arrival[Event]]:
+        """The frames that a chunk completes; those before the last were there earlier, and waited for it."""
+        frames = chunk.data.count(DELIMITER)
         admitted = self._gate.admit(frames)
-        events = self._decoder.feed(chunk) if admitted == frames else self._decoder.feed_newest(chunk, admitted)
-        return [Arrival(host_ns, event, raw) for event, raw in events]
+        events = self._decoder.feed(chunk.data) if admitted == frames else self._decoder.feed_newest(chunk.data, admitted)
+        if chunk.waited_ns is None:
+            return [Arrival(chunk.host_ns, event, raw) for event, raw in events]
+        arrivals: list[Arrival[Event]] = []
+        for k, (event, raw) in enumerate(events):
+            waited_ns = chunk.waited_ns if k == len(events) - 1 else chunk.host_ns - chunk.empty_ns
+            arrivals.append(Arrival(chunk.host_ns, event, raw, waited_ns=waited_ns, stamped=True))
+        return arrivals
 
     def wait_for_message(self, timeout_ms: int) -> bool:
         """True once unread bytes wait."""

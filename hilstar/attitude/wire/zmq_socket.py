@@ -60,6 +60,7 @@ class ZmqSocket:
         self.link_counts = LinkCounts()
         self._notices = Notices() if notices is None else notices
         self._kind, self._bind, self._address = kind, bind, self._place.address
+        self._keys = keys
         self._pair = None if keys.secret_key is None else load_secret(keys.secret_key)
         self._server_key = None if bind or keys.server_key is None else load_public(keys.server_key)
         allowed = AllowList(keys.allowed_clients) if bind and keys.allowed_clients is not None else None
@@ -79,6 +80,10 @@ class ZmqSocket:
         except InputError:
             self.close()
             raise
+
+    def opened_as(self) -> tuple[str, bool, CurveKeys]:
+        """Endpoint, whether it is bound, and keys: what another process needs to open the same."""
+        return self.endpoint, self._bind, self._keys
 
     def _authenticate(self, allowed: AllowList) -> None:
         from zmq.auth.thread import ThreadAuthenticator  # brings asyncio

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import time
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import NamedTuple
 
 import zmq
 
@@ -20,6 +23,14 @@ SEND_QUEUE_MESSAGES = 10_000
 MAX_SUBSCRIPTION_BYTES = 1024
 RECONNECT_S = 0.25
 TEND_S = 0.05
+
+
+class Taken(NamedTuple):
+    """A message: when it came, host time in ns, its parts, and how long it may have waited unread, where that is known."""
+
+    host_ns: int
+    parts: list[bytes]
+    waited_ns: int | None = None
 
 
 class ZmqReceiver(ZmqSocket):
@@ -48,19 +59,29 @@ class ZmqReceiver(ZmqSocket):
 
         Waits at most `timeout_ms` for the first, and for no other.
         """
-        return [self._arrival(host_ns, parts) for host_ns, parts in self.taken(timeout_ms)]
+        return self.arrivals(self.taken(timeout_ms))
 
-    def taken(self, timeout_ms: int) -> list[tuple[int, list[bytes]]]:
-        """What `receive` makes its arrivals of: when each message came, host time in ns, and its parts."""
+    def taken(self, timeout_ms: int) -> list[Taken]:
+        """What `receive` makes its arrivals of."""
         if not self._waits(timeout_ms):
             return []
-        waiting: list[tuple[int, list[bytes]]] = []
+        waiting: list[Taken] = []
         taken_bytes = 0
         while len(waiting) < QUEUE_MESSAGES and taken_bytes < MAX_TAKEN_BYTES and (parts := self._take_parts()) is not None:
-            waiting.append((time.monotonic_ns(), parts))
+            waiting.append(Taken(time.monotonic_ns(), parts))
             taken_bytes += sum(map(len, parts))
         admitted = self._gate.admit(len(waiting))
         return waiting[len(waiting) - admitted :]
+
+    def arrivals(self, taken: Iterable[Taken]) -> list[Arrival[Event]]:
+        """What messages say."""
+        out = []
+        for each in taken:
+            arrival = self._arrival(each.host_ns, each.parts)
+            if each.waited_ns is not None:
+                arrival = replace(arrival, waited_ns=each.waited_ns, stamped=True)
+            out.append(arrival)
+        return out
 
     def _arrival(self, host_ns: int, parts: list[bytes]) -> Arrival[Event]:
         return Arrival(host_ns, decode(parts[-1]), parts[-1])

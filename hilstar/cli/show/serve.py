@@ -37,6 +37,7 @@ from hilstar.files import MCAP, check_ending
 from hilstar.notices import Notices
 
 if TYPE_CHECKING:
+    from hilstar.bench.bench_file import BenchFile as ReadFile
     from hilstar.bench.frame import Bench
     from hilstar.run.lockstep.vizard import Pictures
     from hilstar.run.open_link import AnyLink
@@ -80,7 +81,7 @@ def serve(
     from hilstar.console.feed.introduction import Told
     from hilstar.console.feed.opening import Parts
     from hilstar.run.loop import Limit
-    from hilstar.run.open_link import open_link
+    from hilstar.run.open_link import await_reader
     from hilstar.run.record.ledger import Ledger
     from hilstar.run.serve import Outlet
     from hilstar.run.serve import serve as serve_stream
@@ -93,7 +94,7 @@ def serve(
     notices = Notices()
     with (
         page_door(console, control, token, console_name) as door,
-        open_link(file.config, file.folder, notices) if fed_by is None else fed_link(file, fed_by, notices) as link,
+        _source(file, fed_by, notices) as link,
         shown_bench(file, headless, windowed, force) as (bench, screen),
         optional_ledger(ledger, bench, notices, overwrite, split) as kept,
         run_with_faults(bench, faults, notices, kept) as wrong,
@@ -105,6 +106,7 @@ def serve(
         refresh_hz = bench.config.monitor.refresh_hz
         slots = math.inf if duration is None else round(duration * refresh_hz)
         limit = Limit(slots, math.inf if frames is None else frames)
+        await_reader(link)
         say(f"{link.verb} {link.endpoint}, {refresh_hz:g} Hz, {bench.renderer.gl_renderer}")
         say_what_clips(bench)
         beat = UNSET if file.config.attitude.lockstep else say_beat(bench, screen)
@@ -119,6 +121,15 @@ def serve(
     if not summary.packets.accepted:
         say(f"no attitude came from {link.endpoint}; start the sender, and check its address")
         raise typer.Exit(NO_ATTITUDE)
+
+
+def _source(file: ReadFile, fed_by: str | None, notices: Notices) -> AnyLink:
+    """Where the attitudes come from: the bench's own source, or of a head the process that has it."""
+    from hilstar.run.open_link import open_link
+
+    if fed_by is not None:
+        return fed_link(file, fed_by, notices)
+    return open_link(file.config, file.folder, notices, apart=True)
 
 
 def tracker_pictures(link: AnyLink, bench: Bench, faults: Any = None) -> Pictures | None:

@@ -76,8 +76,8 @@ class FaultStream:
     def _run(self) -> None:
         while not self._stop.is_set():
             try:
-                for host_ns, parts in self._link.taken(POLL_MS):
-                    self._take(host_ns, parts[-1])
+                for each in self._link.taken(POLL_MS):
+                    self._take(each.host_ns, each.parts[-1])
             except Exception as error:  # whatever it is: the run goes on, and so does this
                 self._notices.tell("fault-stream", f"the stream of faults failed ({type(error).__name__}: {error}); going on")
                 self._stop.wait(RETRY_S)

@@ -14,6 +14,7 @@ from typing import Self
 
 from hilstar.attitude.wire.endpoint import Endpoint, check_use, parse_endpoint
 from hilstar.attitude.wire.flood_limits import FloodGate, LinkCounts
+from hilstar.attitude.wire.kernel_stamps import ANCILLARY_BYTES, KernelStamps
 from hilstar.attitude.wire.links import Arrival
 from hilstar.attitude.wire.nasa42.messages import CONVENTIONS, MessageReader, MessageSplitter
 from hilstar.attitude.wire.packet import Event, Packet
@@ -82,28 +83,32 @@ class Nasa42Link:
             self._connect(timeout_ms)
         if not self.wait_for_message(timeout_ms):
             return []
-        chunk = self._read()
-        host_ns = time.monotonic_ns()
+        chunk, host_ns = self._read()
         if not chunk:  # the connection says no more for now, or ever
             self._accept()
             return []
         messages = self._splitter.feed(chunk)
         self._read_messages(len(messages))
         admitted = self._gate.admit(len(messages))
-        return [Arrival(host_ns, self._reader.decode(each), each) for each in messages[len(messages) - admitted :]]
+        arrivals: list[Arrival[Event]] = []
+        for k, message in enumerate(messages[len(messages) - admitted :], 1):
+            waited_ns = 0 if k == admitted else host_ns - self._stamps.empty_ns  # the kernel's stamp is that of the last
+            arrivals.append(Arrival(host_ns, self._reader.decode(message), message, waited_ns=waited_ns, stamped=True))
+        return arrivals
 
-    def _read(self) -> bytes:
+    def _read(self) -> tuple[bytes, int]:
+        """What has come, and when the last of it did."""
         if self._connection is None:
-            return b""
+            return b"", 0
         with contextlib.suppress(OSError):
             try:
-                chunk = self._connection.recv(MAX_READ_BYTES)
+                chunk, ancillary, _, _ = self._connection.recvmsg(MAX_READ_BYTES, ANCILLARY_BYTES)
             except BlockingIOError:
-                return b""
+                return b"", 0
             if chunk:
-                return chunk
+                return chunk, self._stamps.arrived_ns(ancillary, time.monotonic_ns())
         self._lose()
-        return b""
+        return b"", 0
 
     def _read_messages(self, count: int) -> None:
         """So many messages were read: 42 may compute on."""
@@ -151,7 +156,7 @@ class Nasa42Link:
         for option, value in KEEPALIVE.items():
             made.setsockopt(socket.IPPROTO_TCP, option, value)
         self._splitter = MessageSplitter()
-        self._connection = made
+        self._connection, self._stamps = made, KernelStamps(made)
         if self.link_counts.connections > 1:
             self._notices.tell("back", "42 is connected again")
 
@@ -168,7 +173,11 @@ class Nasa42Link:
         poll = select.poll()
         for each in waited:
             poll.register(each, select.POLLIN)
-        return bool(poll.poll(timeout_ms))
+        asked_ns = time.monotonic_ns()
+        waits = bool(poll.poll(timeout_ms))
+        if not waits and self._connection is not None:
+            self._stamps.empty_ns = asked_ns
+        return waits
 
     def send(self, packet: Packet) -> None:
         """42 hears acknowledgements and nothing else."""

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable
 
 from hilstar.attitude.wire.links import Arrival
 from hilstar.attitude.wire.packet import AttitudeSample, Event, Refusal
 from hilstar.attitude.wire.vizard.attitude import Follower
 from hilstar.attitude.wire.vizard.parts import MAX_UPDATE_BYTES, SIM_UPDATE, check_loopback, update_of
-from hilstar.attitude.wire.zmq_stream import ZmqReceiver
+from hilstar.attitude.wire.zmq_stream import Taken, ZmqReceiver
 from hilstar.notices import Notices
 from hilstar.units import NS_PER_S
 
@@ -59,9 +60,9 @@ class VizardBroadcast(ZmqReceiver):
         self._follower, self.conventions = follower, follower.conventions
         self._opening = Opening()
 
-    def receive(self, timeout_ms: int) -> list[Arrival[Event]]:
-        """The waiting messages, oldest first, and only the newest of a flood."""
-        return self._opening.passed(super().receive(timeout_ms), time.monotonic_ns())
+    def arrivals(self, taken: Iterable[Taken]) -> list[Arrival[Event]]:
+        """What messages say; the very first ones are held back for a moment."""
+        return self._opening.passed(super().arrivals(taken), time.monotonic_ns())
 
     def _arrival(self, host_ns: int, parts: list[bytes]) -> Arrival[Event]:
         message = update_of(parts)

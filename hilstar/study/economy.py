@@ -17,7 +17,9 @@ from hilstar.render.reference import linear_image
 from hilstar.rotation import from_radec_roll_deg
 from hilstar.scene.frame_motion import Scan, Turn, swept_sprites
 from hilstar.study.shared.bench_text import Table, bench_text
-from hilstar.study.shared.lone_stars import Isolation, lone_windows, star_error
+from hilstar.study.shared.lone_stars import Isolation, lone_windows, squares, star_error
+from hilstar.tracker.centroiders import FAMILY
+from hilstar.tracker.star_errors import stamp_errors
 
 # Full effort: `exact` codes and whole sprites reach every tolerance that can be reached.
 EFFORTS: dict[str, Table] = {
@@ -52,7 +54,11 @@ SCENES = (
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """A scene at one effort: the time of a frame, the largest errors of stars that stand alone, and the tolerance."""
+    """A scene at one effort: the time of a frame, the largest errors of stars that stand alone, and the tolerance.
+
+    `centroid_max_px` is by the plain moment of the light on the monitor, `max_px_...` as each centroider finds them on the
+    tracker.
+    """
 
     scene: str
     effort: str
@@ -63,11 +69,22 @@ class Outcome:
     centroid_max_px: float
     measured_stars: int
     tolerance: float
+    max_px_moment: float
+    max_px_window: float
+    max_px_wide: float
+    max_px_fit: float
+    max_px_box3: float
+    max_px_box5: float
+
+    @property
+    def worst_px(self) -> float:
+        """The largest error of a place by any centroider."""
+        return max(float(getattr(self, f"max_px_{kind}")) for kind in FAMILY)
 
     @property
     def within(self) -> bool:
-        """Both errors are under the scene's tolerance."""
-        return self.flux_max_mag <= self.tolerance and self.centroid_max_px <= self.tolerance
+        """Light and place, by each centroider, are under the scene's tolerance."""
+        return max(self.flux_max_mag, self.worst_px) <= self.tolerance
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,12 +157,16 @@ def _outcome(scene: Scene, name: str, bench: Bench, frame_ms: float) -> Outcome:
     scan = Scan(bench.scan.down, bench.scan.scanout_s, bench.scan.hold_s)
     sprites = swept_sprites(bench.stars, turn, scan, bench.camera, footprint, sigma_px)
     true = linear_image(sprites, size, sigma_px)
-    errors = []
+    errors, windows = [], []
     rates = sprites.data["electrons_per_s"]
     for star, window in lone_windows(sprites, sprites.x_px, sprites.y_px, size, ISOLATION):
         if rates[sprites.star == star].sum() > 2 * bench.flux_at_white_e_per_s:
             continue  # clips at some sub-pixel phases
         errors.append(star_error(shown, true, window))
+        windows.append(window)
+    seen = bench.renderer.target.seen
+    lit, wanted = (squares(image, windows) for image in (shown, true))
+    off_px = stamp_errors(lit, wanted, sigma_px, seen.blur_px, seen.pixel_px)
     return Outcome(
         scene=scene.name,
         effort=name,
@@ -156,12 +177,14 @@ def _outcome(scene: Scene, name: str, bench: Bench, frame_ms: float) -> Outcome:
         centroid_max_px=max(error.centroid_px for error in errors),
         measured_stars=len(errors),
         tolerance=scene.tolerance,
+        **{f"max_px_{kind}": float(np.hypot(*off_px[kind]).max()) for kind in FAMILY},
     )
 
 
 def _line(comparison: Comparison) -> str:
     full, auto = comparison.full, comparison.auto
-    errors = f"largest errors of {auto.measured_stars} stars {auto.flux_max_mag:.4f} mag and {auto.centroid_max_px:.4f} px"
+    errors = f"largest errors of {auto.measured_stars} stars {auto.flux_max_mag:.4f} mag and {auto.worst_px:.4f} px"
+    errors += f" by the worst of six centroiders ({auto.max_px_fit:.4f} by a PSF fit)"
     verdict = "within" if auto.within else "OVER"
     return (
         f"{auto.scene}: {auto.frame_ms:.2f} ms ({auto.quantisation}) instead of {full.frame_ms:.2f} ms, "
@@ -197,11 +220,11 @@ def _draw(path: Path, comparisons: list[Comparison]) -> None:
             error.bar(at + shift, [o.flux_max_mag for o in mine], 0.18, color=colour, label=f"{mine[0].effort}, mag")
             error.bar(
                 at + shift + 0.19,
-                [o.centroid_max_px for o in mine],
+                [o.worst_px for o in mine],
                 0.18,
                 color=colour,
                 alpha=0.5,
-                label=f"{mine[0].effort}, px",
+                label=f"{mine[0].effort}, px, worst of six centroiders",
             )
         for place, outcome in zip(at, auto, strict=True):
             label = "tolerance" if not place else None

@@ -21,6 +21,7 @@ REACH_SIGMAS = 5.0
 BOX_SIDE = 9  # of tracker pixels: a box of 5, two to either side for its middle
 # Pixels finer than this show windows and fits the same star: its sigma is 0.85 px and more.
 FINEST_PX = 0.5
+BOXES = ("box3", "box5")
 GOLDEN = 0.6180339887498949
 MIN_BLUR_PX = 1e-3
 
@@ -99,7 +100,7 @@ class Judge:
             tiles = self._tiles(image, self._tile)
             at, light = np.arange(self._tile), np.maximum(tiles.sum(axis=(1, 2)), np.finfo(float).tiny)
             return np.stack([tiles.sum(axis=1) @ at / light, tiles.sum(axis=2) @ at / light])
-        boxed = kind in ("box3", "box5")
+        boxed = kind in BOXES
         pixel_px = self._pixel_px if boxed else self._sampled_px
         stamps = self._seen(image, pixel_px)
         places = star_places(stamps, kind, self._sigma_px, self._middles(stamps, boxed))
@@ -119,20 +120,7 @@ class Judge:
         return image.reshape(count, side, count, side).transpose(0, 2, 1, 3).reshape(-1, side, side)
 
     def _views_of(self, pixel_px: float, blur_px: float, half: int) -> list[FloatArray]:
-        return [self._view(place_px, pixel_px, blur_px, half) for place_px in self._in_tile_px]
-
-    def _view(self, star_px: FloatArray, pixel_px: float, blur_px: float, half: int) -> FloatArray:
-        """What each of 2 half + 1 tracker pixels about a star collects of each monitor pixel, along one axis.
-
-        (count, 2 half + 1, tile), for stars at places (count,) in their tiles.
-        """
-        phase = (np.arange(self._count) * GOLDEN) % 1.0 - 0.5
-        middles = star_px[:, None] + pixel_px * (np.arange(-half, half + 1) + phase[:, None])
-        edges = np.arange(self._tile + 1) - 0.5
-        to_left, to_right = (middles[:, :, None] + side * pixel_px / 2 - edges for side in (-1, 1))
-        # Of a point's light blurred, the integral up to a place; and that integral's own over a monitor pixel.
-        within = [_ramp(to, blur_px) for to in (to_left, to_right)]
-        return -np.diff(within[1] - within[0], axis=-1)
+        return [_collected(place_px, self._tile, pixel_px, blur_px, half) for place_px in self._in_tile_px]
 
     def _seen(self, image: FloatArray, pixel_px: float) -> FloatArray:
         """The tracker's pixels about each star, (n, side, side)."""
@@ -141,6 +129,52 @@ class Judge:
         wide = image.reshape(count * tile, count, tile).transpose(1, 0, 2) @ columns.transpose(0, 2, 1)  # (column, y, side)
         lines = wide.reshape(count, count, tile, side).transpose(1, 2, 0, 3).reshape(count, tile, count * side)
         return np.asarray((rows @ lines).reshape(count, side, count, side).transpose(0, 2, 1, 3).reshape(-1, side, side))
+
+
+def stamp_errors(
+    shown: FloatArray, wanted: FloatArray, sigma_px: Sigma, blur_px: float, pixel_px: float
+) -> dict[Centroider, FloatArray]:
+    """How far off each centroider finds the stars of squares `shown` from those `wanted`, both (n, side, side): px (2, n).
+
+    Stars may be paths; sigmas, blur and pixels as for a `Judge`. Infinite where nothing is shown.
+    """
+    count, side = wanted.shape[:2]
+    at, light = np.arange(side), wanted.sum(axis=(1, 2))
+    middles = wanted.sum(axis=1) @ at / light, wanted.sum(axis=2) @ at / light
+    sampled_px, blur_px = max(pixel_px, FINEST_PX), max(blur_px, MIN_BLUR_PX)
+    x, y = (math.sqrt(sigma**2 + SQUARES_VARIANCE + blur_px**2) / sampled_px for sigma in sigma_px)
+
+    def seen(images: FloatArray, width_px: float, half: int) -> FloatArray:
+        columns, rows = (_collected(middle, side, width_px, blur_px, half) for middle in middles)
+        return rows @ images @ columns.transpose(0, 2, 1)
+
+    half = max(BOX_SIDE // 2, math.ceil(side / 2 / sampled_px))
+    whole, boxed = (
+        [seen(images, *how) for images in (wanted, shown)] for how in ((sampled_px, half), (pixel_px, BOX_SIDE // 2))
+    )
+    middle, off_px = np.full(count, half), {}
+    for kind in FAMILY:
+        views, width_px, pixels = (
+            (boxed, pixel_px, brightest(boxed[0])) if kind in BOXES else (whole, sampled_px, (middle, middle))
+        )
+        there, here = (np.stack(star_places(view, kind, (x, y), pixels)) * width_px for view in views)
+        off_px[kind] = np.where(shown.sum(axis=(1, 2)) > 0, here - there, np.inf)
+    return off_px
+
+
+def _collected(star_px: FloatArray, side: int, pixel_px: float, blur_px: float, half: int) -> FloatArray:
+    """What each of 2 half + 1 tracker pixels about a star collects of each of `side` monitor pixels, along one axis.
+
+    (n, 2 half + 1, side), for stars at places (n,) from the first monitor pixel; each meets the tracker's pixels at a phase of
+    its own.
+    """
+    phase = (np.arange(len(star_px)) * GOLDEN) % 1.0 - 0.5
+    middles = star_px[:, None] + pixel_px * (np.arange(-half, half + 1) + phase[:, None])
+    edges = np.arange(side + 1) - 0.5
+    to_left, to_right = (middles[:, :, None] + way * pixel_px / 2 - edges for way in (-1, 1))
+    # Of a point's light blurred, the integral up to a place; and that integral's own over a monitor pixel.
+    within = [_ramp(to, blur_px) for to in (to_left, to_right)]
+    return -np.diff(within[1] - within[0], axis=-1)
 
 
 def _ramp(to_px: FloatArray, blur_px: float) -> FloatArray:

@@ -7,6 +7,7 @@ import csv
 import pytest
 
 from hilstar.study.economy import SCENES, run
+from hilstar.tracker.centroiders import FAMILY
 
 
 @pytest.fixture(scope="module")
@@ -22,7 +23,9 @@ def test_a_scene_that_needs_less_gets_it_and_stays_within_its_tolerance(study):
     assert (full["effort"], auto["effort"]) == ("full", "auto")
     assert auto["quantisation"] == "round" and full["quantisation"] == "exact"
     for row in (full, auto):
-        assert max(float(row["flux_max_mag"]), float(row["centroid_max_px"])) <= float(row["tolerance"])
+        places_px = [float(row[f"max_px_{kind}"]) for kind in FAMILY]
+        assert max(float(row["flux_max_mag"]), float(row["centroid_max_px"]), *places_px) <= float(row["tolerance"])
+        assert len(set(places_px)) == 6 and float(row["max_px_fit"]) < float(row["max_px_moment"])
     assert int(auto["measured_stars"]) == int(full["measured_stars"]) > 100
     assert float(full["flux_max_mag"]) < float(auto["flux_max_mag"])
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,6 +40,17 @@ def lone_windows(
         near = (x_px > left - margin) & (x_px < right + margin) & (y_px > top - margin) & (y_px < bottom + margin) & ~own
         if light[near].sum() <= isolation.max_share * light[own].sum():
             yield int(star), (slice(int(top), int(bottom) + 1), slice(int(left), int(right) + 1))
+
+
+def squares(image: FloatArray, windows: Sequence[Window]) -> FloatArray:
+    """The windows of an image, each alone in the middle of a square as wide as the widest: (n, side, side), side odd."""
+    side = max(part.stop - part.start for window in windows for part in window) | 1
+    found = np.zeros((len(windows), side, side))
+    for square, window in zip(found, windows, strict=True):
+        height, width = image[window].shape
+        top, left = (side - height) // 2, (side - width) // 2
+        square[top : top + height, left : left + width] = image[window]
+    return found
 
 
 @dataclass(frozen=True, slots=True)

@@ -41,7 +41,7 @@ def psf(stack: ExitStack, quick: bool) -> Trials:
         "psf",
         f"linear image of {STARS} stars, {FRAME_PX[0]} x {FRAME_PX[1]}",
         Figure("flux error, worst", "mag", ROUNDING_MAG),
-        Figure("centroid error, worst", "px"),
+        Figure("centre of gravity, worst", "px"),
         "methods this close change order from run to run; the default has the smallest footprint that cuts at most"
         f" {MAX_CUT:g} of a star's light at any phase, and needs no table",
         trials,

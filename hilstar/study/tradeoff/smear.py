@@ -57,7 +57,7 @@ def smear(stack: ExitStack, quick: bool) -> Trials:
         "smear",
         f"linear image of {len(many)} stars, paths of {paths.min():.0f} to {paths.max():.0f} px, {SIZE_PX} px squared",
         Figure("largest pixel error, share of its star", "1", ROUNDING_SHARE),
-        Figure("centroid error, worst", "px"),
+        Figure("centre of gravity, worst", "px"),
         "its error does not grow with the path, as that of a fixed number does",
         trials,
     )

@@ -172,7 +172,13 @@ class Errors:
 
 
 def errors_of(levels, scene):
-    shown, wanted, found = shown_light(levels, scene.panel), scene.wanted, []
+    """Of one frame's levels."""
+    return errors_of_light(shown_light(levels, scene.panel), scene)
+
+
+def errors_of_light(shown, scene):
+    """Of the light (h, w) that a tracker sees, of a frame or the mean over several."""
+    wanted, found = scene.wanted, []
     for window in scene.windows:
         rows, columns = np.mgrid[window]
         sums = [[float((image[window] * arm).sum()) for arm in (1, columns, rows)] for image in (shown, wanted)]

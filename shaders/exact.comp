@@ -3,6 +3,7 @@
 // is the same in NumPy and says how; the ten sums are those of hilstar/monitor/balance.py.
 // It comes after the linear image and its nearest levels, and changes those levels. A pixel is the star's that gives more than half
 // of its light, so no pixel is written by two.
+// With TEMPORAL a star begins with what it left in the frame before (hilstar/monitor/temporal.py).
 // Defined before this text: LEVELS (r8ui or r16ui), NEAR, the most pixels that are chosen, SIZE and FIRST, a footprint's pixels along
 // an axis and the first of them from the star's.
 // On a CPU what is read costs most: a word for a pixel's place, once, and images rather than textures. And a branch costs both its
@@ -23,6 +24,15 @@ layout(std430, binding = 1) readonly buffer Order { uint order[]; };          //
 layout(std430, binding = 2) readonly buffer Light { float light_e_per_s[]; }; // of each level, white twice
 #ifdef PATHS
 layout(std430, binding = 3) readonly buffer Stretches { ivec4 stretch[]; };   // its sprites: first, end; its path's: first, end
+#endif
+#ifdef TEMPORAL
+struct Begin {
+    int before;   // the star's place in the frame before, negative where it has none
+    float phase;  // of a step, where all are equal: what a new star has in hand
+};
+layout(std430, binding = 4) readonly buffer Begins { Begin begins[]; };
+layout(std430, binding = 5) readonly buffer Before { float before[]; };       // ten sums for each star, or stretch
+layout(std430, binding = 6) writeonly buffer Left { float left_sums[]; };
 #endif
 layout(LEVELS, binding = 0) uniform uimage2D levels;
 layout(r32f, binding = 1) readonly uniform image2D linear_e_per_s;
@@ -55,6 +65,15 @@ const int KEPT = 8;
 const float NONE = 1e30;
 const float SAME_STEP = 1e-4;
 const float OFF = 0.6;  // of a step, where steps are equal: then one more pixel is turned
+
+const float MAX_CARRIED_STEPS = 8.0;
+
+// Errors of the ten sums in steps from black: those of all light and its moments plain, the others weighed.
+struct Sums {
+    vec4 a;  // as in a Choice
+    vec4 b;
+    vec2 c;
+};
 
 struct Choice {
     vec4 a;  // light, moments, light under the window
@@ -263,9 +282,9 @@ Choice moved(Choice e, vec4 a, vec4 b, vec2 c, float by, float square, BITS bit)
     EIGHT(LOWER) \
     PAIRS(KEEP_THE_BETTER) }
 
-// Choose the levels of one sprite; `carried` is light and moments about it that it has to make up for, in steps from black, and
-// what is returned is what it leaves. `of_light` is the light of the whole star.
-vec3 choose(Star star, float of_light, vec3 carried) {
+// Choose the levels of one sprite; `carried` is what it has to make up for, and what is returned is what it leaves. Where all
+// steps are equal it has `phase` of one in hand. `of_light` is the light of the whole star.
+Sums choose(Star star, float of_light, Sums carried, float phase) {
     ivec2 pixel = star.pixel;
     vec2 fraction = star.fraction;
     ivec2 cell = clamp(ivec2((fraction + odd) * float(PHASES)), 0, PHASES - 1);
@@ -315,7 +334,11 @@ vec3 choose(Star star, float of_light, vec3 carried) {
         step_of[mine] = t;
         mine++;
     }
-    vec3 error = carried;
+#ifdef TEMPORAL
+    float limit = MAX_CARRIED_STEPS * largest;  // a star that cannot make up for it saves nothing up
+    carried = Sums(clamp(carried.a, -limit, limit), clamp(carried.b, -limit, limit), clamp(carried.c, -limit, limit));
+#endif
+    vec3 error = carried.a.xyz;
 #ifndef PATHS
     for (int k = reach; k < footprint; k++) {
         ivec2 offset = offset_of(order[first + k]);
@@ -334,19 +357,22 @@ vec3 choose(Star star, float of_light, vec3 carried) {
     // What lies further out stays dark.
     error -= (whole_of(star) - seen) / unit;
 #endif
-    vec3 left = error;
     bool equal = largest > 0.0 && largest <= smallest * (1.0 + SAME_STEP);
+    float hidden = 0.0;  // of the light, what no choice can show
     if (equal) {
+        error.x += phase * largest;
         float all_down = lowest + error.x;
-        error.x -= all_down - round(all_down / largest) * largest;
+        hidden = all_down - round(all_down / largest) * largest;
+        error.x -= hidden;
     }
 
     vec2 off = fraction - round(fraction);
     // As light_weight in balance.py.
     float light_weight = weights.x * (1.0 + few_steps * unit / max(star.e_per_s, 1e-3 * unit));
     vec3 begin = error * vec3(light_weight, weights.yy);
+    float begin_square = dot(begin, begin) + carried.a.w * carried.a.w + dot(carried.b, carried.b) + dot(carried.c, carried.c);
     Choice kept[KEPT];
-#define BEGIN(M) kept[M] = Choice(vec4(begin, 0.0), vec4(0.0), vec2(0.0), M == 0 ? dot(begin, begin) : NONE, BITS(0u));
+#define BEGIN(M) kept[M] = Choice(vec4(begin, carried.a.w), carried.b, carried.c, M == 0 ? begin_square : NONE, BITS(0u));
     EIGHT(BEGIN)
     // Three pixels at a time, the last of which may be none: those change nothing.
     for (int k = mine; k < mine + 2; k++) {
@@ -379,35 +405,66 @@ vec3 choose(Star star, float of_light, vec3 carried) {
             turned = more < least ? k : turned;
             least = min(more, least);
         }
-        if (least < NONE) best.up ^= bit_of(turned);
+        if (least < NONE) {
+            vec4 a, b;
+            vec2 c;
+            arms_of(place[turned], vec2(offset_of(place[turned])) - fraction, off, light_weight, a, b, c);
+            best = moved(best, a, b, c, rise ? step_of[turned] : -step_of[turned], best.square, BITS(0u));
+            best.up ^= bit_of(turned);
+        }
     }
     for (int k = 0; k < mine; k++) {
         bool up = has_bit(best.up, k);
-        ivec2 offset = offset_of(place[k]);
-        left += (short_of[k] + (up ? step_of[k] : 0.0)) * vec3(1.0, vec2(offset) - fraction);
         if (step_of[k] == 0.0 || up == has_bit(rounded_up, k)) continue;
-        uint level = imageLoad(levels, pixel + offset).r;
-        imageStore(levels, pixel + offset, uvec4(up ? level + 1u : level - 1u));
+        ivec2 at = pixel + offset_of(place[k]);
+        uint level = imageLoad(levels, at).r;
+        imageStore(levels, at, uvec4(up ? level + 1u : level - 1u));
     }
-    return left;
+    vec4 plain = best.a / vec4(light_weight, weights.yy, 1.0);
+    return Sums(plain + vec4(hidden, vec3(0.0)), best.b, best.c);
 }
+
+#ifdef TEMPORAL
+Sums sums_before(int i) {
+    if (i < 0) return Sums(vec4(0.0), vec4(0.0), vec2(0.0));
+    i *= 10;
+    return Sums(
+        vec4(before[i], before[i + 1], before[i + 2], before[i + 3]),
+        vec4(before[i + 4], before[i + 5], before[i + 6], before[i + 7]),
+        vec2(before[i + 8], before[i + 9]));
+}
+
+void leave(int i, Sums sums) {
+    for (int k = 0; k < 4; k++) {
+        left_sums[10 * i + k] = sums.a[k];
+        left_sums[10 * i + 4 + k] = sums.b[k];
+    }
+    for (int k = 0; k < 2; k++) left_sums[10 * i + 8 + k] = sums.c[k];
+}
+#endif
 
 void main() {
     int i = int(gl_GlobalInvocationID.x);
     if (i >= count) return;
+#ifdef TEMPORAL
+    Sums sums = sums_before(begins[i].before);
+    float phase = begins[i].phase;
+#else
+    Sums sums = Sums(vec4(0.0), vec4(0.0), vec2(0.0));
+    float phase = 0.0;
+#endif
 #ifdef PATHS
-    vec3 carried = vec3(0.0);
     for (int node = stretch[i].x; node < stretch[i].y; node++) {
         look_beside(node, stretch[i].zw);
-        if (node > stretch[i].x) {
-            vec2 away = beside[BESIDE].xy - beside[BESIDE - 1].xy;
-            carried.yz -= carried.x * away;
-        }
+        if (node > stretch[i].x) sums.a.yz -= sums.a.x * (beside[BESIDE].xy - beside[BESIDE - 1].xy);
         Star star = star_of(node);
-        carried = choose(star, star.e_per_s * float(stretch[i].w - stretch[i].z), carried);
+        sums = choose(star, star.e_per_s * float(stretch[i].w - stretch[i].z), sums, node > stretch[i].x ? 0.0 : phase);
     }
 #else
     Star star = star_of(i);
-    choose(star, star.e_per_s, vec3(0.0));
+    sums = choose(star, star.e_per_s, sums, phase);
+#endif
+#ifdef TEMPORAL
+    leave(i, sums);
 #endif
 }

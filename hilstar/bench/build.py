@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -34,8 +33,6 @@ from hilstar.sky.tables.star_table import Choice, choose_catalog
 
 if TYPE_CHECKING:
     from hilstar.sky.bodies.moving import MovingSky
-
-log = logging.getLogger(__name__)
 
 
 def load(path: str | Path) -> Bench:

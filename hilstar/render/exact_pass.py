@@ -1,4 +1,7 @@
-"""`exact` on the GPU: after the nearest levels are drawn, a compute pass chooses each star's together (shaders/exact.comp)."""
+"""`exact` on the GPU: after the nearest levels are drawn, a compute pass chooses each star's together (shaders/exact.comp).
+
+`temporal` is the same pass, with what each star leaves kept on the GPU from frame to frame.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +15,7 @@ from hilstar.monitor.balance import (
     ALL_MOMENTS,
     LAST_LIGHT,
     PIXEL_VARIANCE,
+    SUMS,
     WINDOW_LIGHT,
     WINDOW_MOMENTS,
     Balance,
@@ -19,6 +23,7 @@ from hilstar.monitor.balance import (
 from hilstar.monitor.exact import CARRIED
 from hilstar.monitor.pixel_order import FEWEST, LEAST_LIGHT, PixelOrder
 from hilstar.monitor.quantise import Panel
+from hilstar.monitor.temporal import NONE_BEFORE, Left, first_phases, places_before
 from hilstar.process.interrupts import held
 from hilstar.render.encoder import LevelTexture
 from hilstar.resources import resource_path
@@ -32,6 +37,9 @@ IN_BOX = 1023  # what a pixel's part in a box is counted in: ten bits
 # Narrower sprites have moments of their pixels: exp(-2 pi^2 sigma^2) / pi px, here 5e-6, of thousands of steps of light.
 NARROW_PX = 0.75
 LOCAL_SIZE = 32  # as in exact.comp
+FIRST_BINDING = 4  # of a Memory's buffers
+BEGIN_DTYPE = np.dtype([("before", "<i4"), ("phase", "<f4")])
+SUMS_BYTES = 4 * SUMS
 
 
 class ExactPass:
@@ -47,6 +55,7 @@ class ExactPass:
         gain = panel.gain()
         self._gain = None if gain is None else ctx.texture(linear.size, 1, np.ascontiguousarray(gain), dtype="f4")
         self._stretches: moderngl.Buffer | None = None
+        self._memory = Memory(ctx) if balance.over_frames else None
         self._programs = {paths: self._build(panel, balance, paths) for paths in (False, True)}
 
     @staticmethod
@@ -65,6 +74,7 @@ class ExactPass:
         defines = [f"NEAR {order.near}", f"LEVELS r{8 * self._levels_bytes()}ui"]
         defines += [f"SIZE {order.size}", f"FIRST ({order.first})"] + ["NARROW"] * (min(balance.sigma_px) < NARROW_PX)
         defines += ["PATHS"] * paths + ["UNIFORMITY"] * (self._gain is not None)
+        defines += ["TEMPORAL"] * balance.over_frames
         version, body = resource_path("shaders", "exact.comp").read_text().split("\n", 1)
         with held():  # as for any program
             program = self._ctx.compute_shader("\n".join([version, *(f"#define {name}" for name in defines), body]))
@@ -92,17 +102,30 @@ class ExactPass:
                 program[name] = value
         return program
 
+    @property
+    def left(self) -> Left | None:
+        """What the last frame of `temporal` left; None at the beginning of a sequence. It may come from NumPy's quantiser."""
+        return None if self._memory is None else self._memory.left
+
+    @left.setter
+    def left(self, left: Left | None) -> None:
+        if self._memory is not None:
+            self._memory.left = left
+
     def _levels_bytes(self) -> int:
         return 1 if self._levels.dtype == "u1" else 2
 
     def draw(self, buffer: moderngl.Buffer, sprites: Sprites) -> None:
         """Choose the levels of `sprites`, which `buffer` holds and the linear image shows."""
         paths = sprites.per_star > 1
-        program, count = self._programs[paths], len(sprites)
+        program, count, first = self._programs[paths], len(sprites), None
         if paths:
             stretches = stretches_of(sprites.star)
-            count = len(stretches)
+            count, first = len(stretches), stretches[:, 0]
             self._upload(stretches)
+        if self._memory is not None:
+            goes_on = np.zeros(count, dtype=np.bool_) if first is None else first != stretches[:, 2]
+            self._memory.bind(sprites.star if first is None else sprites.star[first], goes_on)
         buffer.bind_to_storage_buffer(0)
         self._order.bind_to_storage_buffer(1)
         self._light.bind_to_storage_buffer(2)
@@ -123,6 +146,59 @@ class ExactPass:
         self._stretches.orphan()
         self._stretches.write(data)
         self._stretches.bind_to_storage_buffer(3)
+
+
+class Memory:
+    """What the stars of one frame leave to the next, on the GPU; it lives in its renderer's context."""
+
+    def __init__(self, ctx: moderngl.Context) -> None:
+        self._ctx = ctx
+        self._star: IntArray | None = None  # of the last frame
+        self._room = 0
+        self._begins, self._before, self._left = (self._reserved(size) for size in (BEGIN_DTYPE.itemsize, *2 * (SUMS_BYTES,)))
+
+    def _reserved(self, size: int) -> moderngl.Buffer:
+        return self._ctx.buffer(reserve=max(self._room, 1) * size, dynamic=True)
+
+    def bind(self, star: IntArray, goes_on: npt.NDArray[np.bool_]) -> None:
+        """Bind it for a pass over stars, or stretches of their paths, of these numbers (n,).
+
+        One that goes on with a path is no star's first, and begins with nothing.
+        """
+        places = places_before(self._star, star)
+        begins = np.empty(len(star), dtype=BEGIN_DTYPE)
+        begins["before"] = np.where(goes_on, NONE_BEFORE, places)
+        begins["phase"] = np.where(goes_on, 0, first_phases(star, places))
+        self._before, self._left = self._left, self._before
+        if len(star) > self._room:
+            self._room = 2 * len(star)
+            self._begins.release()
+            self._begins = self._reserved(BEGIN_DTYPE.itemsize)
+        if self._left.size < len(star) * SUMS_BYTES:
+            self._left.release()
+            self._left = self._reserved(SUMS_BYTES)
+        self._begins.write(begins)
+        for place, buffer in enumerate((self._begins, self._before, self._left), start=FIRST_BINDING):
+            buffer.bind_to_storage_buffer(place)
+        self._star = star.copy()
+
+    @property
+    def left(self) -> Left | None:
+        """What the last frame left, read back; None at the beginning of a sequence."""
+        if self._star is None:
+            return None
+        sums = np.frombuffer(self._left.read(len(self._star) * SUMS_BYTES), dtype="<f4").reshape(-1, SUMS)
+        return Left(self._star, np.ascontiguousarray(sums.T))
+
+    @left.setter
+    def left(self, left: Left | None) -> None:
+        self._star = None if left is None else left.star
+        if left is None:
+            return
+        self._room = max(self._room, len(left.star))
+        self._left.release()
+        self._left = self._reserved(SUMS_BYTES)
+        self._left.write(np.ascontiguousarray(left.error.T, dtype="<f4"))
 
 
 def _places(order: PixelOrder, balance: Balance) -> npt.NDArray[np.uint32]:

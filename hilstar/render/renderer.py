@@ -163,8 +163,9 @@ class Renderer:
         if panel is None:
             return
         self._levels = LevelTexture(self._ctx, target.resolution_px, panel)
-        if target.quantisation == "exact" and ExactPass.runs_on(self._ctx, target.sigma_px):
-            self._exact_pass = ExactPass(self._linear, self._levels, panel, Balance(target.sigma_px, target.seen))
+        if self._star_by_star and ExactPass.runs_on(self._ctx, target.sigma_px):
+            balance = Balance(target.sigma_px, target.seen, over_frames=target.quantisation == "temporal")
+            self._exact_pass = ExactPass(self._linear, self._levels, panel, balance)
         if not self._star_by_star or self._exact_pass is not None:
             dithered = target.quantisation == "dither"
             self._encoder = Encoder(self._ctx, self._linear, self._levels, panel, dithered)
@@ -208,8 +209,8 @@ class Renderer:
                 self._encode(self._encoder, sprites, covered_px)
             if cut and not self.target.sides:
                 self._undrawn = (sprites, True)  # without what `round` left out, when somebody asks
-            if self._exact_pass is not None and sprites is not None and len(sprites):
-                self._exact_pass.draw(self._buffer, sprites)
+            if self._exact_pass is not None:
+                self._choose(self._exact_pass, sprites)
 
     def draw_linear(self, sprites: Sprites) -> None:
         """Draw the linear image of `sprites` alone, no sprite smaller than the footprint; the next `codes` are undefined.
@@ -224,6 +225,17 @@ class Renderer:
         self._last_frame = NO_FRAME
         if isinstance(self._exact, TemporalQuantiser):
             self._exact.left = None
+        if self._exact_pass is not None:
+            self._exact_pass.left = None
+
+    def _choose(self, exact_pass: ExactPass, sprites: Sprites | None) -> None:
+        """Choose the levels of the sprites that are drawn, star by star, with what NumPy's last frame left."""
+        if isinstance(self._exact, TemporalQuantiser) and self._exact.left is not None:
+            exact_pass.left, self._exact.left = self._exact.left, None
+        if sprites is None or not len(sprites):
+            exact_pass.left = None
+        else:
+            exact_pass.draw(self._buffer, sprites)
 
     def _draw_by_numpy(self, sprites: Sprites | None, frame: int) -> None:
         """Levels by the sprites themselves: the linear image is drawn only when it is read."""
@@ -234,6 +246,9 @@ class Renderer:
         if self._exact is None:
             quantiser = TemporalQuantiser if temporal else ExactQuantiser
             self._exact = quantiser(panel, target.resolution_px, target.sigma_px, target.seen)
+        left = None if self._exact_pass is None else self._exact_pass.left
+        if isinstance(self._exact, TemporalQuantiser) and self._exact_pass is not None and left is not None:
+            self._exact.left, self._exact_pass.left = left, None
         lights = () if sprites is None else sprites.extended
         floor = self._floor(lights, mask_turn(frame) if temporal else 0.0, panel, levels) if lights else None
         self._exact_levels = self._exact.levels(sprites, floor)

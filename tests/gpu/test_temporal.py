@@ -1,0 +1,132 @@
+"""`temporal` on the GPU: its aims there, the same as the oracle frame by frame, and frames that NumPy draws in between."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hilstar.monitor.quantise import Panel, shown_light
+from hilstar.monitor.response import gamma_response, srgb_response, table_response
+from hilstar.monitor.temporal import TemporalQuantiser
+from hilstar.render.reference import linear_image
+from hilstar.render.renderer import Renderer, Target
+from hilstar.scene.extended import LightMap
+from hilstar.scene.psf import footprint_px, peak_share
+from hilstar.scene.sprites import pack_sprites
+from tests.support.centroiders import family_errors_px
+
+WHITE = 1e6
+SIGMA = (0.85, 0.85)
+TILE, SIDE = 22, 12
+SIZE = (TILE * SIDE, TILE * SIDE)
+SIX_MAG = WHITE * 10 ** (-0.4 * 6.0) / peak_share(SIGMA)
+FRAMES = 6
+AIM_MAG, AIM_PX, OF_FEW = 0.003, 0.004, 1.15  # as in tests/unit/monitor/test_temporal.py
+# The shader sums in another order and knows erf to 4e-7: of two choices that are nearly as good it may take the other.
+OTHER_PIXELS = 0.03
+LEFT = 0.02
+UNEVEN = np.random.default_rng(5).uniform(0.8, 1.2, SIZE[::-1]).astype(np.float32)
+
+
+def stars(x, y, flux, numbers=None):
+    numbers = np.arange(len(x)) if numbers is None else numbers
+    return pack_sprites(x, y, np.broadcast_to(np.asarray(flux, float), x.shape), numbers, SIZE, footprint_px(SIGMA))
+
+
+def places():
+    middle = (np.arange(SIDE) + 0.5) * TILE - 0.5 + (np.arange(SIDE) + 0.5) / SIDE - 0.5
+    return tuple(axis.ravel() for axis in np.meshgrid(middle, middle))
+
+
+def tiles(image):
+    return np.asarray(image.reshape(SIDE, TILE, SIDE, TILE).transpose(0, 2, 1, 3).reshape(-1, TILE, TILE)[:, :-1, :-1], float)
+
+
+def flux_mag(shown, wanted):
+    return float(np.sqrt(np.mean(np.square(2.5 * np.log10(shown.sum((1, 2)) / wanted.sum((1, 2)))))))
+
+
+@pytest.mark.parametrize("make", [srgb_response, gamma_response])
+def test_over_any_six_frames_every_centroider_finds_the_light_and_the_place(make):
+    target = Target(SIZE, SIGMA, make(8), WHITE, "temporal")
+    sprites = stars(*places(), SIX_MAG)
+    sky = tiles(linear_image(sprites, SIZE, SIGMA))
+    with Renderer(target) as gl:
+        frames = []
+        for frame in range(12):
+            gl.draw(sprites, frame)
+            frames.append(tiles(shown_light(gl.codes(), target.panel())))
+        assert gl.gl_error() == "GL_NO_ERROR"
+    for first in (0, 2, 5):
+        for part in (0.0, 0.4):
+            weights = np.ones(FRAMES + 1)
+            weights[0], weights[-1] = 1 - part, part
+            mean = np.tensordot(weights, np.stack(frames[first : first + FRAMES + 1]), 1) / FRAMES
+            assert flux_mag(mean, sky) < AIM_MAG
+            assert max(family_errors_px(mean, sky, SIGMA[0]).values()) < OF_FEW * AIM_PX
+
+
+@pytest.mark.parametrize("uniformity", [None, UNEVEN], ids=["even", "uneven"])
+@pytest.mark.parametrize("bits", [1, 8])
+def test_a_frame_is_the_oracle_s_after_the_same_frame_before(bits, uniformity):
+    """Each frame begins with what the GPU's last one left; some stars go and come, and are half off the image."""
+    target = Target(SIZE, SIGMA, table_response(bits, np.linspace(0, 1, 2**bits)), WHITE, "temporal", uniformity)
+    panel, rng = target.panel(), np.random.default_rng(3)
+    x, y = places()
+    every = stars(x, y - 11, 10 ** rng.uniform(4, 6.5, len(x)))
+    oracle = TemporalQuantiser(panel, SIZE, SIGMA)
+    with Renderer(target) as gl:
+        for frame in range(6):
+            keep = rng.random(len(every)) < 0.8
+            some = replace(every, data=every.data[keep], star=every.star[keep], x_px=every.x_px[keep], y_px=every.y_px[keep])
+            gl.draw(some, frame)
+            found, wanted = gl.codes().copy(), oracle.levels(some)
+            assert (found != wanted).sum() <= OTHER_PIXELS * (wanted > 0).sum() + 4
+            with gl.context:
+                left = gl._exact_pass.left
+            same = tiles(np.roll(found == wanted, 11, axis=0)).all(axis=(1, 2))[some.star] & (some.star >= SIDE)  # and whole
+            assert same.mean() > 0.5
+            assert np.abs(left.error - oracle.left.error)[:, same].max() < LEFT
+            oracle.left = left
+
+
+def test_paths_keep_their_light_over_the_frames():
+    """6 px a frame in five sprites, one way after another: within the aim, by GL as by NumPy."""
+    panel = Panel(srgb_response(8), WHITE)
+    x, y = places()
+    way = np.repeat(np.arange(len(x)) * 2.4, 5)
+    numbers = np.repeat(np.arange(len(x)), 5)
+    oracle, errors = TemporalQuantiser(panel, SIZE, SIGMA), []
+    with Renderer(Target(SIZE, SIGMA, panel.response, WHITE, "temporal")) as gl:
+        shown, sky = np.zeros((2, *SIZE)), np.zeros(SIZE)
+        for frame in range(FRAMES):
+            at = np.tile(np.arange(5) * 1.2 - 2.4, len(x)) + 1.0 * (frame - 2.5)
+            sprites = stars(np.repeat(x, 5) + at * np.cos(way), np.repeat(y, 5) + at * np.sin(way), SIX_MAG / 5, numbers)
+            sprites = replace(sprites, per_star=5)
+            gl.draw(sprites, frame)
+            shown[0] += shown_light(gl.codes(), panel)
+            shown[1] += shown_light(oracle.levels(sprites), panel)
+            sky += linear_image(sprites, SIZE, SIGMA)
+        errors = [flux_mag(tiles(image), tiles(sky)) for image in shown]
+        assert gl.gl_error() == "GL_NO_ERROR"
+    assert max(errors) < AIM_MAG
+
+
+def test_frames_with_extended_light_go_on_where_others_stopped():
+    """A map lights the image in every second frame, which NumPy draws: the light over all frames is right within a step."""
+    panel = Panel(table_response(2, np.linspace(0, 1, 4)), WHITE)
+    sprites = stars(*places(), 1.3 * WHITE / 3)
+    none = replace(sprites, data=sprites.data[:0], star=sprites.star[:0], x_px=sprites.x_px[:0], y_px=sprites.y_px[:0])
+    light = LightMap(np.full(SIZE[::-1], 0.02 * WHITE, dtype=np.float32))
+    with Renderer(Target(SIZE, SIGMA, panel.response, WHITE, "temporal")) as gl, Renderer(gl.target) as floor:
+        total = np.zeros(len(sprites))
+        for frame in range(9):
+            lights = (light,) if frame % 2 else ()
+            gl.draw(replace(sprites, extended=lights), frame)
+            floor.draw(replace(none, extended=lights), frame)
+            added = shown_light(gl.codes(), panel) - shown_light(floor.codes(), panel)
+            total += tiles(added).sum((1, 2)) / (WHITE / 3) - 1.3
+            assert np.abs(total).max() < 1.0 + 1e-3
+        assert gl.gl_error() == "GL_NO_ERROR"

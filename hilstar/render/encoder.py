@@ -41,13 +41,13 @@ MAX_SIDES = 8  # as in star.vert
 PLACES = "2i 8x 1f"  # of SPRITE_DTYPE: places and rates
 SPRITE_PIXEL_COST = 4  # of a pixel encoded under a sprite, in pixels of a pass over the whole image (llvmpipe, sprites of 6 px)
 # Of the image: beyond it a clear is faster than erasing sprites, of levels sooner than of light (llvmpipe, 1080p and 4K).
-MAX_ERASED_LEVELS, MAX_ERASED_LIGHT = 0.02, 0.06
+MAX_ERASED_LEVELS, MAX_ERASED_LIGHT = 0.02, 0.03
 IMAGES_VERSION = 420  # of OpenGL, for images in shaders
 # A level is missed only where the wings of more stars than this meet outside all of their own squares (see `lit_sides`).
 MEETING_WINGS = 16
 # Where stars are apart, `round` leaves out the light of each beyond a square: in no pixel more than this part of what lights
-# one, a 64th of the first step. A star alone has the same levels; with 10 000 on 1080p 4 to 14 of 82 000 lit pixels are a level
-# off, where wings meet and their light was that near a threshold.
+# one, a 64th of the first step. A star alone has the same levels; of 10 000 on 1080p three in a thousand have a pixel (in all
+# twelve of 82 000 lit ones) that is a level lower, where wings meet, and all have 0.002 mag rms.
 CUT_WINGS = 32
 
 
@@ -90,7 +90,7 @@ def lit_sides(panel: Panel, sigma_px: tuple[float, float], footprint_px: int, wi
 class Eraser:
     """Makes an image black again where the last frame's sprites were, or all of it where that is faster.
 
-    On llvmpipe a clear of 1920 x 1080 takes 0.7 ms of two cores, as long as 2000 stars. It lives in its renderer's context.
+    On llvmpipe a clear of 1920 x 1080 takes 0.7 ms of two cores, as long as 1000 stars. It lives in its renderer's context.
     """
 
     def __init__(self, ctx: moderngl.Context, size_px: tuple[int, int], of_levels: bool) -> None:
@@ -109,11 +109,15 @@ class Eraser:
         self._vao = self._ctx.vertex_array(self._program, [(buffer, PLACES, "pixel", "electrons_per_s")])
         self._program["footprint_px"] = self._footprint_px = footprint_px
 
+    def clears(self, count: int | None) -> bool:
+        """Whether a clear of all is faster than erasing `count` sprites (None: it is not known where they are)."""
+        return count is None or count * self._footprint_px**2 > self._most_px
+
     def erase(self, fbo: moderngl.Framebuffer, count: int | None) -> None:
         """Make `fbo` black where the first `count` sprites of the buffer are; all of it where that is not known."""
         width, height = self._size_px
         fbo.use()
-        if count is None or count * self._footprint_px**2 > self._most_px:
+        if self.clears(count):
             fbo.clear()
         elif count and self._vao is not None:
             margin = self._footprint_px
@@ -216,17 +220,27 @@ class Encoder:
         """Encode fainter stars' smaller sprites only."""
         set_sides(self._sprites, sides)
 
-    def draw(self, count: int, per_star: int, covered_px: int, shift: float = 0.0, regions: Sequence[Rectangle] = ()) -> None:
-        """Encode the linear image under the first `count` sprites of the buffer and in `regions`; the rest is, and was, black.
+    def draw(
+        self,
+        count: int,
+        per_star: int,
+        covered_px: int,
+        shift: float = 0.0,
+        regions: Sequence[Rectangle] = (),
+        is_black: bool = True,
+    ) -> None:
+        """Encode the linear image under the first `count` sprites of the buffer and in `regions`; the rest is black.
 
         `shift` turns the mask of a dithering encoder. Each star has `per_star` sprites; together they cover `covered_px`, and
-        where that is most of the image the pass covers all of it.
+        where that is most of the image the pass covers all of it. `is_black` says that the levels were erased before.
         """
         width, height = self._size_px
         whole = (0, 0, width, height)
         if covered_px * SPRITE_PIXEL_COST >= width * height or whole in regions:
             regions, count = (whole,), 0
         self._fbo.use()
+        if not is_black and whole not in regions:
+            self._fbo.clear()
         for unit, texture in enumerate(self._textures.values()):
             texture.use(unit)
         if self._linear_image is not None:

@@ -153,6 +153,7 @@ class Renderer:
     def _build_levels(self) -> None:
         target, panel = self.target, self.target.panel()
         self._levels: LevelTexture | None = None
+        self._levels_black = True  # but for the last frame
         self._encoder: Encoder | None = None
         self._exact_pass: ExactPass | None = None
         # `exact` in NumPy is made by the first frame that needs it: its arrays are as large as the image.
@@ -256,7 +257,8 @@ class Renderer:
 
     def _encode(self, encoder: Encoder, sprites: Sprites | None, covered_px: int) -> None:
         count, per_star = (0, 1) if sprites is None else (len(sprites), sprites.per_star)
-        encoder.draw(count, per_star, covered_px, 0.0, self._regions)
+        encoder.draw(count, per_star, covered_px, 0.0, self._regions, self._levels_black)
+        self._levels_black = True  # but for what this frame has
 
     def _floor(self, lights: tuple[ExtendedLight, ...], turn: float, panel: Panel, levels: LevelTexture) -> Codes:
         """The levels of extended light alone, dithered by a turned mask: stars are added to them in light.
@@ -310,14 +312,16 @@ class Renderer:
 
     def _erase(self, levels: bool = True) -> None:
         """Make black what the last frame drew."""
-        level_fbo = self._levels.fbo if levels and self._encoder is not None and self._levels is not None else None
+        if levels and self._encoder is not None and self._levels is not None:
+            # A clear waits for the encoder: the fewer changes from image to image, the faster.
+            self._levels_black = self._levels_black and not self._level_eraser.clears(self._last_count)
+            if self._levels_black:
+                self._level_eraser.erase(self._levels.fbo, self._last_count)
+                for region in self._regions:
+                    self._levels.fbo.clear(viewport=region)
         self._eraser.erase(self._linear_fbo, self._last_count)
-        if level_fbo is not None:
-            self._level_eraser.erase(level_fbo, self._last_count)
         for region in self._regions:
             self._linear_fbo.clear(viewport=region)
-            if level_fbo is not None:
-                level_fbo.clear(viewport=region)
         self._regions = ()
         self._last_count = 0
 

@@ -161,6 +161,24 @@ def test_nothing_remains_of_the_frame_before(rng):
         assert gl.gl_error() == "GL_NO_ERROR"
 
 
+@pytest.mark.parametrize("read", [False, True], ids=["unread", "light is read between"])
+def test_frames_of_any_number_of_stars_follow_each_other(read, rng):
+    """Few are erased one by one, more by a clear, and those that cover the image by the pass itself."""
+    size = (640, 480)
+    with Renderer(target_of(size)) as gl, Renderer(target_of(size)) as fresh:
+        for count in (3, 40, 2, 9000, 1, 300, 9000, 0, 40, 300, 2, 0, 3):
+            sprites = sprites_at(rng.uniform([0, 0], size, size=(count, 2)), np.full(count, 1e6), gl.footprint_px)
+            gl.draw(sprites)
+            if read:
+                gl.linear()
+            fresh.draw(None)
+            fresh._last_count = None  # all of its images is cleared
+            fresh.draw(sprites)
+            assert np.array_equal(gl.codes(), fresh.codes())
+            if read:
+                assert np.array_equal(gl.linear(), fresh.linear())
+
+
 def test_two_renderers_live_side_by_side():
     pixels = np.array([[30.3, 40.4]])
     with Renderer(target_of()) as a, Renderer(target_of((64, 64), bits=12)) as b:

@@ -13,6 +13,7 @@ from hilstar.bench.config.values import Positive
 from hilstar.errors import InputError
 from hilstar.toml_tables import Table
 
+NETWORK_PORT = "rfc2217://"
 ROUNDING = 1e-6  # relative: 0.1 s at 10 Hz is one exposure after the other
 
 
@@ -60,6 +61,8 @@ def check_sync(sync: SyncSettings, tracker: Tracker, monitor: Monitor, attitude:
         raise InputError(
             f"[tracker] frame_hz = {tracker.frame_hz:g}: exposures of {tracker.exposure_s:g} s overlap; write {most}"
         )
+    if not sync.port.isprintable() or ("://" in sync.port and not sync.port.startswith(NETWORK_PORT)):
+        raise InputError(f'[sync] port = {sync.port!r}: write "/dev/ttyUSB0" or the like, or "{NETWORK_PORT}HOST:PORT"')
     between_ms = sync.every_frames * monitor.period_ms
     if sync.port and sync.pulse_ms >= between_ms:
         what = f"[sync] pulse_ms = {sync.pulse_ms:g}: the next pulse is due after {between_ms:.4g} ms"

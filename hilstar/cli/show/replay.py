@@ -104,11 +104,11 @@ def replay(
     file = dated(file, play.conventions.scale, play.first_ns)
     with (
         page_door(console, control, token, console_name) as door,
+        optional_pulse(file, notices) as pulse,
         shown_bench(file, headless, windowed, force) as (bench, screen),
         FrameImages(output, bench) as record,
         optional_ledger(ledger, bench, notices, overwrite, split) as kept,
         run_with_faults(bench, faults, notices, kept, play.recording) as wrong,
-        optional_pulse(file, notices) as pulse,
     ):
         say_what_clips(bench)
         if explain:

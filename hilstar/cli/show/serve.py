@@ -95,10 +95,10 @@ def serve(
     with (
         page_door(console, control, token, console_name) as door,
         _source(file, fed_by, notices) as link,
+        optional_pulse(file, notices) as pulse,
         shown_bench(file, headless, windowed, force) as (bench, screen),
         optional_ledger(ledger, bench, notices, overwrite, split) as kept,
         run_with_faults(bench, faults, notices, kept) as wrong,
-        optional_pulse(file, notices) as pulse,
     ):
         if explain:
             explain_source(link.conventions, Mounting(file.config.tracker.q_body_to_cam))

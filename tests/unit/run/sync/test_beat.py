@@ -182,6 +182,8 @@ def test_a_panel_that_flashes_wants_a_trigger(tmp_path):
             {"sync": {"port": "/dev/x"}, "attitude": {"source": "serial", "port": "/dev/x"}},
             r"\[sync\] port = /dev/x: the attitude comes over it",
         ),
+        ({"sync": {"port": "socket://bench:1"}}, r"\[sync\] port = 'socket://bench:1': write .* \"rfc2217://HOST:PORT\""),
+        ({"sync": {"port": "/dev/tty\x07"}}, r"\[sync\] port = '/dev/tty\\x07': write"),
         ({"tracker": {"trigger": "yes"}}, "trigger"),
         ({"sync": {"every_frames": 0}}, "every_frames"),
         ({"sync": {"turn_deg_s": 0}}, "turn_deg_s"),

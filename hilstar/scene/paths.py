@@ -104,6 +104,11 @@ class Chords:
     x_px: FloatArray
     y_px: FloatArray
 
+    def to(self, longer: FloatArray) -> Chords:
+        """The same ways from their begins, so many times (n,) as long."""
+        x_px, y_px = (np.stack([ends[0], ends[0] + (ends[1] - ends[0]) * longer]) for ends in (self.x_px, self.y_px))
+        return Chords(x_px, y_px)
+
     def length_sigma(self, sigma_px: tuple[float, float]) -> FloatArray:
         """How long each is in sigmas; NaN where an end is behind the camera."""
         return np.asarray(

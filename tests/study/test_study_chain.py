@@ -14,6 +14,7 @@ from hilstar.errors import InputError
 from hilstar.render.reference import linear_image
 from hilstar.study.chain import motion, run, scenes
 from hilstar.study.chain.bench_parts import Parts
+from hilstar.study.chain.budget import error_budget
 from hilstar.study.chain.combinations import Combination
 from hilstar.study.chain.front import Point, beaters, front
 from hilstar.study.chain.measuring import Plan, SceneMeasurement
@@ -21,7 +22,7 @@ from hilstar.study.chain.motion import lead_ns
 from hilstar.study.chain.scenes import Scene, five_scenes
 from hilstar.study.chain.tracker import Tracker
 from hilstar.study.chain.true_light import add_light, points
-from hilstar.units import ARCSEC_PER_RAD, NS_PER_S
+from hilstar.units import ARCSEC_PER_RAD, MAG_PER_RELATIVE, NS_PER_S
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.pictures import assert_drawn, table
 
@@ -169,6 +170,18 @@ def test_a_held_attitude_is_late_by_its_age_its_row_and_half_a_frame(parts, monk
     expected = np.sqrt(np.mean((3600 * late_s * np.linalg.norm(np.cross(true, motion.AXIS), axis=1)) ** 2))
     held = Combination("exact", False, parts[0].faintest_v_mag, "full", "point", "held")
     assert scene.error(held).arcsec == pytest.approx(expected, rel=LATE_SHARE)
+
+
+def test_a_star_that_runs_with_the_scan_loses_no_light(parts, monkeypatch):
+    monkeypatch.setattr(motion, "JITTER", ())
+    scene, bench = scene_of(parts, 4), parts[0].own
+    (judge,) = scene.judges
+    moved_px = math.radians(10.0) * motion.AXIS[0] * bench.camera.focal_length_px
+    share = moved_px * bench.scan.scanout_s / bench.camera.resolution_px[1]
+    # A star of equal light in each frame would be too faint by that share; what is left is its part of the ends' frames.
+    ends = share * bench.scan.hold_s / judge.seen.length_s
+    assert len(judge) > 2 and ends < share / 5
+    assert error_budget(scene, scene.marks.auto)[0].mag < MAG_PER_RELATIVE * ends
 
 
 def test_a_point_is_beaten_by_one_that_is_no_worse_and_no_slower():

@@ -24,7 +24,6 @@ from hilstar.study.chain.true_light import instants, points, sky_light
 from hilstar.twin.bench_geometry import BenchGeometry
 from hilstar.twin.optics import TwinOptics
 from hilstar.twin.verify.star_finder import (
-    CROWDED_SHARE,
     MATCH_PX,
     Matched,
     StarFinder,
@@ -39,6 +38,7 @@ REACH_SIGMAS = 4.0
 LOST_SHARE = 0.1  # of a star's light: with less of it in its pixels it is lost
 LOST_MAG = MAG_PER_RELATIVE  # a lost star's flux is off by all of it
 PATH_STEP_PX = 0.5
+OTHERS_SHARE = 1e-3  # of a star's light, that others bring to its path: 50 px from its middle it moves that by 0.05 px
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,7 +169,7 @@ class Judge:
         for k in np.flatnonzero(self._wanted):
             column, row = np.rint(x_px[:, k]).astype(np.intp), np.rint(y_px[:, k]).astype(np.intp)
             own = np.unique((row[:, None] + near_y) * width + column[:, None] + near_x)
-            if flat[own].sum() <= (1 + CROWDED_SHARE) * self._e[k]:
+            if flat[own].sum() <= (1 + OTHERS_SHARE) * self._e[k]:
                 judged.append(k)
                 pixels.append(own)
         self.judged = np.array(judged, dtype=np.intp)

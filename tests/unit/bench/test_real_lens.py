@@ -18,6 +18,8 @@ SIGMA_SUMS = 2e-5  # of the brightest pixel: float32 sums and the sprites' cut
 PATH_STEPS = 400
 # The time of a row is found to a 500th of the scan-out, and the star's speed times that is the limit.
 PATH_LIMIT = {(0.3, -0.5, 0.2): 0.2, (1.0, 0.8, -1.9): 1.0}
+# Two moments, each within half a step of 1.2 scan-outs in 600, in one of hold; and at 130 deg/s how a path bends in that time.
+SHARE_LIMIT = {(0.3, -0.5, 0.2): 3e-3, (1.0, 0.8, -1.9): 1e-2}
 
 
 @pytest.fixture(scope="module")
@@ -113,17 +115,25 @@ def test_paths_are_those_of_the_bent_stars_while_their_rows_are_lit(bench, folde
         turned = to_matrix(propagate(q, rate, seconds))
         return true_places_px(folder, stars @ turned.T)
 
-    late, times = np.zeros(len(near)), np.linspace(-0.6, 0.6, 601) * scan.scanout_s
-    rows = np.array([at(t)[1] for t in times])  # the row of each star at each time; its own time is where the two agree
-    with np.errstate(invalid="ignore"):
-        differ = np.abs(np.clip((rows - 539.5) / SIZE[1], -0.5, 0.5) * scan.scanout_s - times[:, None])
-    seen_ever = np.isfinite(differ).any(axis=0)
-    late[seen_ever] = times[np.nanargmin(differ[:, seen_ever], axis=0)]
+    times = np.linspace(-0.6, 0.6, 601) * scan.scanout_s
+
+    def met(after_s):
+        """When the panel, `after_s` after it lit the middle row, writes each star's row, from that moment on."""
+        # The row of each star at each time; the panel is there where the two agree.
+        found_s, rows = np.zeros(len(near)), np.array([at(t + after_s)[1] for t in times])
+        with np.errstate(invalid="ignore"):
+            differ = np.abs(np.clip((rows - 539.5) / SIZE[1], -0.5, 0.5) * scan.scanout_s - times[:, None])
+        seen_ever = np.isfinite(differ).any(axis=0)
+        found_s[seen_ever] = times[np.nanargmin(differ[:, seen_ever], axis=0)]
+        return found_s
+
+    late = met(0.0)
+    span = scan.hold_s + met(scan.hold_s) - late
     axis = rate / np.linalg.norm(rate)
     cam = stars @ to_matrix(q).T
     total = np.zeros((len(cam), 3))
     for step in (np.arange(PATH_STEPS) + 0.5) / PATH_STEPS:
-        angle = (-np.linalg.norm(rate) * (late + step * scan.hold_s))[:, None]
+        angle = (-np.linalg.norm(rate) * (late + step * span))[:, None]
         turned = cam * np.cos(angle) + np.cross(axis, cam) * np.sin(angle) + (cam @ axis)[:, None] * axis * (1 - np.cos(angle))
         x, y = true_places_px(folder, turned)
         on = (x > -0.5) & (x < SIZE[0] - 0.5) & (y > -0.5) & (y < SIZE[1] - 0.5)
@@ -135,11 +145,12 @@ def test_paths_are_those_of_the_bent_stars_while_their_rows_are_lit(bench, folde
     assert (share[total[:, 0] > 0.02] > 0).all()
     whole = total[:, 0] > 1 - 0.5 / PATH_STEPS
     assert whole.sum() > 50
-    assert np.abs(share[whole] - 1).max(initial=0) < 1e-6
+    # A star that runs with the scan meets fewer frames, and has more light in each.
+    assert np.abs(share - span / scan.hold_s)[whole].max(initial=0) < SHARE_LIMIT[tuple(rate)]
     for place, column in ((found.x_px, 1), (found.y_px, 2)):
         mean = np.zeros(len(cam))
         np.add.at(mean, place_of, place * found.data["electrons_per_s"])
-        off = mean[whole] / rates_e[whole] - total[whole, column]
+        off = mean[whole] / (rates_e * share)[whole] - total[whole, column]
         assert np.abs(off).max(initial=0) < PATH_LIMIT[tuple(rate)]
 
 

@@ -6,17 +6,28 @@ import numpy as np
 import pytest
 
 from hilstar.monitor.exact import ExactQuantiser
+from hilstar.monitor.quantise import shown_light
 from hilstar.monitor.response import srgb_response
 from hilstar.render.renderer import Renderer, Target
-from tests.support.exact_scenes import SCENES, SIDE, USUAL, WHITE, assert_no_worse, single, uneven
+from tests.support.exact_scenes import (
+    FRAMES,
+    SCENES,
+    SIDE,
+    USUAL,
+    WHITE,
+    assert_no_worse,
+    assert_right_over_frames,
+    single,
+    uneven,
+)
 
 # Pixels that differ from the oracle's: of two choices that are as good it may take the other, and on 2 bits many are. Where
 # stars lie over each other a pixel that is nobody's by half stays rounded, which in NumPy the brighter one chooses.
 OTHER, OTHER_AMONG_NEIGHBOURS = 0.08, 0.35
 
 
-def target_of(scene):
-    return Target((SIDE, SIDE), scene.sigma_px, scene.response, WHITE, "exact", scene.uniformity)
+def target_of(scene, quantisation="exact"):
+    return Target((SIDE, SIDE), scene.sigma_px, scene.response, WHITE, quantisation, scene.uniformity)
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -32,6 +43,27 @@ def test_no_scene_is_worse_than_rounded_nor_other_than_the_oracle_s(name):
     beside = "neighbour" in name or "apart" in name
     assert (levels != oracle).sum() <= (OTHER_AMONG_NEIGHBOURS if beside else OTHER) * (oracle > 0).sum()
     assert np.abs(levels.astype(int) - oracle).max() <= 1
+
+
+HARDEST = (
+    "half off, faint",
+    "1 px apart",
+    "sigma 0.3 px, half off",
+    "uneven, half off",
+    "clipped neighbour, near",
+    "2 bits, linear",
+)
+
+
+@pytest.mark.parametrize("name", HARDEST)
+def test_over_frames_no_scene_is_near_rounded_and_a_part_of_a_refresh_costs_nothing(name):
+    scene, frames = SCENES[name](), []
+    with Renderer(target_of(scene, "temporal")) as gl:
+        for number in range(FRAMES):
+            gl.draw(scene.sprites, number)
+            frames.append(shown_light(gl.codes(), scene.panel))
+        assert gl.gl_error() == "GL_NO_ERROR"
+    assert_right_over_frames(frames, scene)
 
 
 @pytest.mark.parametrize("uniformity", [None, uneven()], ids=["even", "uneven"])

@@ -31,12 +31,11 @@ MAG_PER_SHARE = 2.5 / math.log(10)
 # Light beyond a small sprite is under this share of what lights a pixel: only where the wings of stars meet is a code lower
 UNLIT = 0.25
 CUT_PHASES = 51
-# A whole frame with `exact`, for each of 800 to 1400 stars, 1080p over 31 deg at 0 to 15 deg/s, two llvmpipe cores; `round`
-# takes 1.2 to 1.5 times less. Sprites that are too wide for the compute pass take NumPy's time. A field of the Milky Way has
-# twice the stars of an average one.
-EXACT_MS_A_STAR = 0.01
-WIDE_EXACT_MS_A_STAR = 0.23
-EXACT_SHARE = 0.5
+# A whole frame, for each of 800 to 1400 stars, 1080p over 31 deg at 0 to 15 deg/s, two llvmpipe cores. Sprites that are too
+# wide for the compute pass take NumPy's time. A field of the Milky Way has twice the stars of an average one.
+ROUND_MS_A_STAR = 0.008
+EXACT_MS_A_STAR, WIDE_EXACT_MS_A_STAR = 0.01, 0.23
+IN_TIME_SHARE = 0.5  # of a refresh
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,10 +129,11 @@ class Light:
         """Who measures where codes show a star."""
         return FAMILY if self.centroider is None else (self.centroider,)
 
-    def exact_ms(self, sigma_px: tuple[float, float]) -> float:
-        """The time that `exact` takes for an average field, turning at 1 deg/s, on two cores without a GPU."""
+    def field_ms(self, method: Quantisation, sigma_px: tuple[float, float]) -> float:
+        """The time that `round` or `exact` takes for an average field, turning at 1 deg/s, on two cores without a GPU."""
         lit = self.rates_e_per_s >= self.response.half_step * self.white_e_per_s
-        a_star_ms = EXACT_MS_A_STAR if ExactPass.takes(sigma_px) else WIDE_EXACT_MS_A_STAR
+        exact_ms = EXACT_MS_A_STAR if ExactPass.takes(sigma_px) else WIDE_EXACT_MS_A_STAR
+        a_star_ms = exact_ms if method == "exact" else ROUND_MS_A_STAR
         return a_star_ms * self.sky_share * float(np.count_nonzero(lit))
 
     @property
@@ -183,10 +183,10 @@ def explain(effort: Effort | None, render: RenderSettings) -> list[str]:
 def choose_codes(render: RenderSettings, light: Light) -> ChosenCodes:
     """The cheapest quantisation whose errors are within the codes' part of the tolerance; the most accurate one if none is.
 
-    `auto` does not take `exact` where that would be late in fields of many stars.
+    `auto` does not take `exact` where that would be late in fields of many stars and `round` would not.
     """
-    exact_ms = light.exact_ms(render.sprite_sigma_px)
-    in_time = exact_ms <= EXACT_SHARE * light.refresh_ms
+    round_ms, exact_ms = (light.field_ms(method, render.sprite_sigma_px) for method in BY_COST)
+    in_time = exact_ms <= IN_TIME_SHARE * light.refresh_ms or round_ms > IN_TIME_SHARE * light.refresh_ms
     wanted = (BY_COST if in_time else BY_COST[:1]) if render.quantisation == "auto" else (render.quantisation,)
     limits = CODES_SHARE * render.tolerance_mag, CODES_SHARE * render.tolerance_px
     stars = _CodeStars(render, light)
@@ -197,12 +197,15 @@ def choose_codes(render: RenderSettings, light: Light) -> ChosenCodes:
             break
     error = f"{errors.flux_mag:.4f} mag and {errors.place_px:.4f} px maximum, {_by_whom(errors, light)}"
     if not within and render.quantisation == "auto" and not in_time:
-        price = f"{exact_ms:.0f} ms of {light.refresh_ms:.0f} for an average field at 1 deg/s, without a GPU"
+        price = (
+            f"{exact_ms:.0f} ms of {light.refresh_ms:.0f} (round {round_ms:.0f}) for an average field at 1 deg/s without a GPU"
+        )
         error += f' (over {limits[0]:g} mag or {limits[1]:g} px: quantisation = "exact" is nearer and takes {price})'
     elif not within:
         ways = "more bits, bit_stealing or brighter stars" if light.can_steal_bits else "more bits or brighter stars"
         error += f" (over {limits[0]:g} mag or {limits[1]:g} px: {ways} would do)"
-    saving = "exact takes 1.2 to 1.5 times as long" if method == "round" else "nothing saved"
+    longer = exact_ms / round_ms if round_ms else 1.0
+    saving = f"exact takes {longer:.2g} times as long" if method == "round" else "nothing saved"
     if method == "exact":
         saving = f"an average field at 1 deg/s takes {exact_ms:.2g} ms of {light.refresh_ms:.3g} on two cores without a GPU"
     return ChosenCodes(method, errors, Choice("codes", method, error, saving))

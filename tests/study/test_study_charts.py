@@ -9,6 +9,7 @@ from hilstar import charts
 from hilstar.study.economy import Comparison, Outcome, economy_finding
 from hilstar.study.speed import report as benchmark_report
 from hilstar.study.speed.result import Machine, Result, Spread, Timing
+from hilstar.tracker.centroiders import FAMILY
 from hilstar.twin.budget import budget
 from hilstar.twin.budget_report import write_report
 
@@ -28,7 +29,7 @@ def figures(monkeypatch) -> list[Figure]:
 
 
 def outcome(frame_ms: float, worst_mag: float = 0.01) -> Outcome:
-    return Outcome("a scene", "auto", "round", 10, frame_ms, worst_mag, 0.01, 5, 0.1)
+    return Outcome("a scene", "auto", "round", 10, frame_ms, worst_mag, 0.01, 5, 0.1, *[0.01] * len(FAMILY))
 
 
 @pytest.mark.parametrize(

@@ -42,8 +42,7 @@ class RenderSettings(Table, frozen=True):
             'frame. `"temporal"`: and so that each frame makes up for what the one before left, by which the mean of any N '
             'frames is about N times as right. `"auto"`: `round` where that stays within the tolerance, '
             "else `exact`, unless an average field, turning at 1 deg/s, would take it more than half a refresh on two cores "
-            "without a GPU; "
-            "`--explain` of `frame`, `serve` and `replay` says which."
+            "without a GPU and would not take `round` as long; `--explain` of `frame`, `serve` and `replay` says which."
         ),
     ] = "auto"
     bit_stealing: Annotated[

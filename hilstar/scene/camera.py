@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -200,6 +201,10 @@ class Camera:
         normals = np.array([[1.0, 0.0, -left], [-1.0, 0.0, right], [0.0, 1.0, -top], [0.0, -1.0, bottom]])
         return np.asarray(normals / np.sqrt((normals * normals).sum(axis=1, keepdims=True)))
 
+    def field(self, margin_px: float) -> tuple[float, FloatArray]:
+        """`field_radius_rad` and `edges`, which are the same for every frame, of the last few margins."""
+        return _field(self, margin_px)
+
     def field_radius_rad(self, margin_px: float) -> float:
         """The angle from the image's normal to its farthest corner, `margin_px` outside it (with a lens, its own margin)."""
         if self.lens is not None:
@@ -209,6 +214,13 @@ class Camera:
         reach_x = max(cx, width - 1 - cx) + 0.5 + margin_px
         reach_y = max(cy, height - 1 - cy) + 0.5 + margin_px
         return float(np.arctan(np.hypot(reach_x, reach_y) / self.focal_length_px))
+
+
+@lru_cache(maxsize=16)
+def _field(camera: Camera, margin_px: float) -> tuple[float, FloatArray]:
+    edges = camera.edges(margin_px)
+    edges.flags.writeable = False
+    return camera.field_radius_rad(margin_px), edges
 
 
 def _over(size: float, z: FloatArray) -> FloatArray:

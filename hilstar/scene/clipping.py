@@ -12,6 +12,7 @@ from hilstar.scene.sprites import Sprites
 CLIP_TOLERANCE = 1e-6
 # Of the sprites that may clip with the light of others, only this many are tested, the brightest: the work is bounded.
 MAX_DOUBTFUL = 512
+FEW_PAIRS = 4096  # of pixels and sprites near them: so many are asked all together, sooner than they are sorted
 
 
 def clipped_sprites(
@@ -31,7 +32,7 @@ def clipped_sprites(
     bright_e_per_s = 0.5 * flux_at_white_e_per_s * darkest / peak_share(sigma_px)
     if sprites.per_star * sprites.data["electrons_per_s"].max(initial=0.0) <= bright_e_per_s:
         return np.empty(0, dtype=np.intp)  # most frames: no star is that bright, however its light is divided
-    bright = np.flatnonzero(_star_rates(sprites) > bright_e_per_s)
+    bright = (_star_rates(sprites) > bright_e_per_s).nonzero()[0]
     x, y = np.rint(sprites.x_px[bright]).astype(int), np.rint(sprites.y_px[bright]).astype(int)
     inside = (x >= 0) & (x < resolution_px[0]) & (y >= 0) & (y < resolution_px[1])
     bright, x, y = bright[inside], x[inside], y[inside]
@@ -40,7 +41,7 @@ def clipped_sprites(
         limit *= uniformity[y, x]
     own = sprites.data["electrons_per_s"][bright] * _share(x - sprites.x_px[bright], y - sprites.y_px[bright], sigma_px)
     over = own > limit
-    doubtful = np.flatnonzero(~over)
+    doubtful = (~over).nonzero()[0]
     if len(doubtful) > MAX_DOUBTFUL:
         doubtful = doubtful[np.argpartition(-own[doubtful], MAX_DOUBTFUL)[:MAX_DOUBTFUL]]
     over[doubtful] = _light_at(sprites, x[doubtful], y[doubtful], sigma_px) > limit[doubtful]
@@ -57,14 +58,22 @@ def _star_rates(sprites: Sprites) -> Float32Array | FloatArray:
 
 
 def _share(offset_x: FloatArray, offset_y: FloatArray, sigma_px: tuple[float, float]) -> FloatArray:
+    if sigma_px[0] == sigma_px[1]:
+        both = pixel_shares(np.stack([offset_x, offset_y]), sigma_px[0])
+        return np.asarray(both[0] * both[1])
     return pixel_shares(offset_x, sigma_px[0]) * pixel_shares(offset_y, sigma_px[1])
 
 
 def _light_at(sprites: Sprites, x: IntArray, y: IntArray, sigma_px: tuple[float, float]) -> FloatArray:
     """Light of all sprites together in the pixels at x, y (k,), electrons per second (k,)."""
     close = _close_to(sprites, x, y)
-    order = close[np.argsort(sprites.x_px[close])]
     reach = sprites.footprint_px / 2
+    if len(x) * len(close) <= FEW_PAIRS:
+        offset_x, offset_y = (places[close] - wanted[:, None] for places, wanted in ((sprites.x_px, x), (sprites.y_px, y)))
+        share = _share(offset_x, offset_y, sigma_px)
+        share[np.maximum(np.abs(offset_x), np.abs(offset_y)) > reach] = 0.0
+        return np.asarray(share @ sprites.data["electrons_per_s"][close].astype(np.float64))
+    order = close[np.argsort(sprites.x_px[close])]
     rising_px = sprites.x_px[order]
     first = np.searchsorted(rising_px, x - reach)
     count = np.searchsorted(rising_px, x + reach, side="right") - first

@@ -88,8 +88,9 @@ def swept_sprites(
     middle = Turn(propagate(turn.q_icrs_to_cam, turn.rate_cam_rad_s, scan.hold_s / 2), turn.rate_cam_rad_s)
     icrs_to_middle = camera.cam_to_image @ to_matrix(middle.q_icrs_to_cam)
     margin_px = footprint_px / 2 + 1
-    edges, reach_rad = camera.edges(margin_px) @ icrs_to_middle, turn.speed_rad_s * scan.whole_s / 2
-    near = stars.near(icrs_to_middle[2], camera.field_radius_rad(margin_px), edges, reach_rad)
+    radius_rad, edges = camera.field(margin_px)
+    reach_rad = turn.speed_rad_s * scan.whole_s / 2
+    near = stars.near(icrs_to_middle[2], radius_rad, edges @ icrs_to_middle, reach_rad)
     seen = (camera.cam_to_image @ to_matrix(turn.q_icrs_to_cam) @ stars.directions(near).T).T
     close = camera.in_view(seen, margin_px, turn.speed_rad_s * scan.longest_s)
     near = near[close]

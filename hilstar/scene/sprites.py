@@ -72,8 +72,8 @@ def make_sprites(stars: Stars, icrs_to_image: FloatArray, camera: Camera, footpr
     `icrs_to_image` (3, 3) turns ICRS components into image components.
     """
     margin_px = footprint_px / 2 + 1
-    edges = camera.edges(margin_px) @ icrs_to_image
-    near = stars.near(icrs_to_image[2], camera.field_radius_rad(margin_px), edges)
+    radius_rad, edges = camera.field(margin_px)
+    near = stars.near(icrs_to_image[2], radius_rad, edges @ icrs_to_image)
     seen = (icrs_to_image @ stars.directions(near).T).T  # component by component, as they are kept
     if camera.lens is not None:  # a pinhole's places cost less than the choice
         close = camera.in_view(seen, margin_px, 0.0)

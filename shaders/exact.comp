@@ -418,7 +418,8 @@ Sums choose(Star star, float of_light, Sums carried, float phase) {
         if (step_of[k] == 0.0 || up == has_bit(rounded_up, k)) continue;
         ivec2 at = pixel + offset_of(place[k]);
         uint level = imageLoad(levels, at).r;
-        imageStore(levels, at, uvec4(up ? level + 1u : level - 1u));
+        // Of two paths that cross, each may take itself for the brighter, and both move a pixel: never beyond black and white.
+        imageStore(levels, at, uvec4(up ? min(level + 1u, uint(white)) : max(level, 1u) - 1u));
     }
     vec4 plain = best.a / vec4(light_weight, weights.yy, 1.0);
     return Sums(plain + vec4(hidden, vec3(0.0)), best.b, best.c);

@@ -24,6 +24,8 @@ layout(std430, binding = 1) readonly buffer Order { uint order[]; };          //
 layout(std430, binding = 2) readonly buffer Light { float light_e_per_s[]; }; // of each level, white twice
 #ifdef PATHS
 layout(std430, binding = 3) readonly buffer Stretches { ivec4 stretch[]; };   // its sprites: first, end; its path's: first, end
+#else
+layout(std430, binding = 3) readonly buffer Turns { int turn[]; };            // sprites, those of alike light side by side
 #endif
 #ifdef TEMPORAL
 struct Begin {
@@ -83,7 +85,18 @@ struct Choice {
     BITS up;
 };
 
-vec4 erf4(vec4 value) {  // as in splat.frag
+// A star's shares of light along x and y in a pixel at `d` from it, and in the whole pixel: as in splat.frag.
+#ifdef LOG2_SHARE
+vec2 shares_at(vec2 d) {
+    return exp2(LOG2_SHARE((d * d)));
+}
+
+float share_at(vec2 d) {
+    vec2 power = LOG2_SHARE((d * d));
+    return exp2(power.x + power.y);
+}
+#else
+vec4 erf4(vec4 value) {
     vec4 x = clamp(value, -4.0, 4.0);
     vec4 s = x * x;
     vec4 p = s * -2.72614225801306e-10 + 2.77068142495902e-08;
@@ -98,6 +111,17 @@ vec4 erf4(vec4 value) {  // as in splat.frag
     q = q * s - 1.42647390514189e-02;
     return x * p / q;
 }
+
+vec2 shares_at(vec2 d) {
+    vec4 e = erf4(vec4(d - 0.5, d + 0.5) * inverse_sigma_sqrt2.xyxy);
+    return 0.5 * max(e.zw - e.xy, 0.0);
+}
+
+float share_at(vec2 d) {
+    vec2 share = shares_at(d);
+    return share.x * share.y;
+}
+#endif
 
 #if NEAR <= 32
 BITS bit_of(int k) {
@@ -133,13 +157,6 @@ Star star_of(int i) {
         intBitsToFloat(sprite[5 * i + 4]));
 }
 
-// A star's light in a pixel at `d` from it.
-float light_at(Star star, vec2 d) {
-    vec4 e = erf4(vec4(d - 0.5, d + 0.5) * inverse_sigma_sqrt2.xyxy);
-    vec2 share = max(e.zw - e.xy, 0.0);
-    return star.e_per_s * 0.25 * share.x * share.y;
-}
-
 ivec2 offset_of(uint place) {
     return ivec2(place & 63u, place >> 6 & 63u) - 32;
 }
@@ -166,10 +183,9 @@ vec3 whole_of(Star star) {
     vec2 light = vec2(0.0), moment = vec2(0.0);
     for (int k = FIRST; k < FIRST + SIZE; k++) {
         vec2 d = float(k) - star.fraction;
-        vec4 e = erf4(vec4(d - 0.5, d + 0.5) * inverse_sigma_sqrt2.xyxy);
         ivec2 at = star.pixel + k;
         vec2 there = vec2(at.x >= 0 && at.x < resolution_px.x, at.y >= 0 && at.y < resolution_px.y);
-        vec2 share = 0.5 * max(e.zw - e.xy, 0.0) * there;
+        vec2 share = shares_at(d) * there;
         light += share;
         moment += share * d;
     }
@@ -309,14 +325,15 @@ Sums choose(Star star, float of_light, Sums carried, float phase) {
         float own = path_light_at(vec2(offset));
 #else
         vec2 d = vec2(offset) - fraction;
-        float own = light_at(star, d);
+        float own = star.e_per_s * share_at(d);
         if (on_image(at)) seen += own * vec3(1.0, d);
 #endif
+        int level = 0;
         float s = 0.0, t = 0.0, asked = asked_of(at, own);
         if (asked >= 0.0) {
             float factor = output_of(at);
             asked = min(asked / factor, white_e_per_s);
-            int level = int(imageLoad(levels, at).r);
+            level = int(imageLoad(levels, at).r);
             float shown = light_e_per_s[level];
             bool above = shown > asked;
             float other = light_e_per_s[above ? level - 1 : level + 1];
@@ -344,7 +361,7 @@ Sums choose(Star star, float of_light, Sums carried, float phase) {
         ivec2 offset = offset_of(order[first + k]);
         ivec2 at = pixel + offset;
         vec2 d = vec2(offset) - fraction;
-        float own = light_at(star, d);
+        float own = star.e_per_s * share_at(d);
         if (2.0 * own < first_threshold_e_per_s) break;
         vec3 arm = vec3(1.0, d);
         if (!on_image(at)) continue;
@@ -447,6 +464,9 @@ void leave(int i, Sums sums) {
 void main() {
     int i = int(gl_GlobalInvocationID.x);
     if (i >= count) return;
+#ifndef PATHS
+    i = turn[i];
+#endif
 #ifdef TEMPORAL
     Sums sums = sums_before(begins[i].before);
     float phase = begins[i].phase;

@@ -22,15 +22,21 @@ def splat_program(
 
     `by_erf` has error functions where polynomials would do, for the study of trade-offs.
     """
-    axes = [share_polynomial(sigma, footprint_px / 2 + 0.5) for sigma in sigma_px]
-    if by_erf or axes[0] is None or axes[1] is None:
-        program = build_program(ctx, "star.vert", "splat.frag")
+    define = () if by_erf else share_define(sigma_px, footprint_px)
+    program = build_program(ctx, "star.vert", "splat.frag", define)
+    if not define:
         program["inverse_sigma_sqrt2"] = tuple(1 / (sigma * SQRT2) for sigma in sigma_px)
-    else:
-        terms = [f"vec2({x:.9e}, {y:.9e})" for x, y in zip_longest(axes[0], axes[1], fillvalue=0.0)]
-        # Written out: from an array of uniforms llvmpipe takes twice as long.
-        polynomial = reduce(lambda sum, term: f"({sum} * square + {term})", reversed(terms))
-        program = build_program(ctx, "star.vert", "splat.frag", (f"LOG2_SHARE(square) {polynomial}",))
     program["resolution_px"] = resolution_px
     program["footprint_px"] = footprint_px
     return program
+
+
+def share_define(sigma_px: tuple[float, float], footprint_px: int) -> tuple[str, ...]:
+    """LOG2_SHARE for a shader, in a footprint; nothing where only error functions are exact enough."""
+    axes = [share_polynomial(sigma, footprint_px / 2 + 0.5) for sigma in sigma_px]
+    if axes[0] is None or axes[1] is None:
+        return ()
+    terms = [f"vec2({x:.9e}, {y:.9e})" for x, y in zip_longest(axes[0], axes[1], fillvalue=0.0)]
+    # Written out: from an array of uniforms llvmpipe takes twice as long.
+    polynomial = reduce(lambda sum, term: f"({sum} * square + {term})", reversed(terms))
+    return (f"LOG2_SHARE(square) {polynomial}",)

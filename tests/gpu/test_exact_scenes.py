@@ -13,10 +13,12 @@ from tests.support.exact_scenes import (
     FRAMES,
     SCENES,
     SIDE,
+    STREAKS,
     USUAL,
     WHITE,
     assert_no_worse,
     assert_right_over_frames,
+    assert_streaks_are_right,
     single,
     uneven,
 )
@@ -43,6 +45,17 @@ def test_no_scene_is_worse_than_rounded_nor_other_than_the_oracle_s(name):
     beside = "neighbour" in name or "apart" in name
     assert (levels != oracle).sum() <= (OTHER_AMONG_NEIGHBOURS if beside else OTHER) * (oracle > 0).sum()
     assert np.abs(levels.astype(int) - oracle).max() <= 1
+
+
+@pytest.mark.parametrize("name", STREAKS)
+def test_streaks_are_as_right_where_they_might_fail(name):
+    scene = STREAKS[name]()
+    with Renderer(target_of(scene)) as gl:
+        gl.draw(scene.sprites)
+        levels = gl.codes().copy()
+        assert gl.gl_error() == "GL_NO_ERROR"
+    assert_streaks_are_right(levels, scene)
+    assert_streaks_are_right(ExactQuantiser(scene.panel, (SIDE, SIDE), scene.sigma_px).levels(scene.sprites), scene)
 
 
 HARDEST = (

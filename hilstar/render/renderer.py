@@ -172,7 +172,7 @@ class Renderer:
             self._encoder = Encoder(self._ctx, self._linear, self._levels, panel, dithered)
             self._lit_sides = () if dithered else target.sides or lit_sides(panel, target.sigma_px, self.footprint_px)
             self._encoder.shrink(self._lit_sides)
-            if target.quantisation == "round" and not target.sides:
+            if not dithered and not target.sides:
                 self._cut_sides = lit_sides(panel, target.sigma_px, self.footprint_px, CUT_WINGS)
 
     def _reserve(self, sprites: int) -> None:
@@ -209,7 +209,7 @@ class Renderer:
             if self._encoder is not None:
                 self._encode(self._encoder, sprites, covered_px)
             if cut and not self.target.sides:
-                self._undrawn = (sprites, True)  # without what `round` left out, when somebody asks
+                self._undrawn = (sprites, True)  # without what is left out, when somebody asks
             if self._exact_pass is not None:
                 self._choose(self._exact_pass, sprites)
 

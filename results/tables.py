@@ -1,12 +1,13 @@
 """Tables of README and docs/ from the CSV files beside this script: `python results/tables.py` writes them between their marks.
 
 bench.csv is written by `hilstar benchmark -o`; tradeoff.csv, economy.csv and timing.csv by `hilstar study NAME -o`,
-quantisation_time.csv by `hilstar study quantisation -o`. machine.txt says on which machine.
+quantisation_time.csv and over_frames.csv by `hilstar study quantisation -o`. machine.txt says on which machine.
 """
 
 from __future__ import annotations
 
 import csv
+import math
 import re
 from pathlib import Path
 
@@ -136,7 +137,27 @@ def centroider_table() -> str:
     return table(head, [*body, flux])
 
 
+def over_frames_table() -> str:
+    """What `temporal` leaves on each panel after so many frames."""
+    rows = [row for row in rows_of("over_frames.csv") if row["method"] == "temporal"]
+    at = {(row["panel"], row["frames"]): row for row in rows}
+    frames = ("1", "2", "6", "16", "64")
+
+    def cell(row: dict[str, str]) -> str:
+        flux_mag, off_px = float(row["flux_rms_mag"]), float(row["axis_rms_px_fit"])
+        return f"{flux_mag:.2g} mag, {off_px:.2g} px" if math.isfinite(flux_mag) else "may be dark"
+
+    def name(panel: str) -> str:
+        row = at[panel, "1"]
+        return f"{panel}, {float(row['mag_under_white']):g} mag under white: {figure(float(row['steps']))} steps of light"
+
+    panels = dict.fromkeys(row["panel"] for row in rows)
+    head = ["", *(f"{count} frames" if count != "1" else "1 frame" for count in frames)]
+    return table(head, [[name(panel), *(cell(at[panel, count]) for count in frames)] for panel in panels])
+
+
 TABLES = {
+    "over_frames": over_frames_table,
     "quantisation": quantisation_table,
     "centroiders": centroider_table,
     "bench": bench_table,

@@ -19,7 +19,7 @@ from hilstar.monitor.response import Codes, Response, encode
 
 Quantisation = Literal["round", "dither", "temporal", "exact"]
 
-EXPOSURE_FRAMES = 8  # over which `temporal` is judged unless a bench file says otherwise: 133 ms at 60 Hz
+EXPOSURE_FRAMES = 6  # over which `temporal` is judged unless a bench says otherwise: 100 ms at 60 Hz
 MASK_TURNS = 4096  # the mask has no more distinct thresholds
 
 

@@ -17,6 +17,7 @@ from hilstar.render.renderer import Renderer, Target
 from hilstar.scene.psf import footprint_px, peak_share
 from hilstar.study.shared.code_errors import ERROR_COLUMNS, JUDGE, code_errors, error_cells
 from hilstar.study.shared.codes import AIM_PX, AIMS, BITS, FRAME_PX, STARS, WAYS, Way, response_of, star_field
+from hilstar.study.shared.over_frames import study_frames
 from hilstar.tracker.centroiders import FAMILY
 from hilstar.tracker.star_errors import StarErrors
 from hilstar.units import flux_ratio
@@ -51,7 +52,7 @@ def run(directory: Path, quick: bool = False) -> list[str]:
         ("bits", "method", "frame_ms", "mag_under_white", *ERROR_COLUMNS),
         [(*key, times[key], AIMS[key[0]][1], *error_cells(e)) for key, e in faintest.items()],
     )
-    return findings
+    return [*findings, study_frames(directory, quick)]
 
 
 def _frame_ms(bits: int, way: Way, repeats: int) -> float:
@@ -75,11 +76,11 @@ def _summary(bits: int, found: Found, mags: FloatArray) -> str:
         within = [e for e, mag in zip(found[bits, way.name], mags, strict=True) if mag <= limit]
         return f"{max(e.flux_max_mag for e in within):.3f} mag and {max(e.max_px(JUDGE) for e in within):.3f} px"
 
-    one_frame = ", ".join(f"{way.method} {worst(way)}" for way in WAYS[:3])
+    others = ", ".join(f"{way.method} {worst(way)}" for way in WAYS[:3])
     half_step_px = srgb_response(bits).half_step * peak_share(SIGMA_PX) / flux_ratio(limit)
     return (
         f"{bits} bits, sRGB, {limit:g} magnitudes (aim {aim_mag:g} mag, {AIM_PX:g} px): largest errors, places by a PSF fit, of"
-        f" exact {worst(WAYS[3])}, with bit stealing {worst(WAYS[5])}; {one_frame} (over {EXPOSURE_FRAMES} frames)."
+        f" exact {worst(WAYS[3])}, with bit stealing {worst(WAYS[5])}; {others} (over {EXPOSURE_FRAMES} frames)."
         f" Half the smallest step of light moves a centroid by {half_step_px:.3f} px along each axis"
     )
 

@@ -36,8 +36,8 @@ def test_fainter_stars_have_less_light():
 
 def test_the_study_writes_charts_tables_and_findings(tmp_path):
     findings = run(tmp_path, quick=True)
-    assert len(findings) == len(BITS) + 2
-    for name in ("quantisation.png", "quantisation_centroiders.png", "quantisation_time.png"):
+    assert len(findings) == len(BITS) + 3
+    for name in ("quantisation.png", "quantisation_centroiders.png", "quantisation_time.png", "over_frames.png"):
         pixels = np.array(Image.open(tmp_path / name).convert("L"))
         assert pixels.shape[0] > 500 and (pixels < 200).mean() > 0.005
     with (tmp_path / "quantisation.csv").open() as file:
@@ -54,3 +54,11 @@ def test_the_study_writes_charts_tables_and_findings(tmp_path):
     assert float(faint["exact"]["centroid_rms_px"]) == pytest.approx(np.sqrt(2) * float(faint["exact"]["axis_rms_px_moment"]))
     with (tmp_path / "quantisation_time.csv").open() as file:
         assert all(float(row["frame_ms"]) > 0 for row in csv.DictReader(file))
+    with (tmp_path / "over_frames.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    left = {(r["panel"], r["method"], r["frames"]): float(r["flux_rms_mag"]) for r in rows}
+    for panel in dict.fromkeys(r["panel"] for r in rows):
+        assert left[panel, "temporal", "6"] < left[panel, "temporal", "2"]
+        # Exposures that are no whole turn of the mask have what it leaves; steps of one light are within 1 / 6 for both.
+        assert left[panel, "temporal", "6"] < 0.8 * left[panel, "dither", "6"]
+    assert left["sRGB, 8 bits", "temporal", "6"] < 0.003

@@ -1,0 +1,136 @@
+"""What `temporal` leaves over an exposure of N frames, on panels of many levels and of few, and what `dither` would."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hilstar.arrays import FloatArray
+from hilstar.charts import chart, write_records
+from hilstar.monitor.balance import AS_USUAL
+from hilstar.monitor.phases import SIGMA_PX, WHITE, fainter, line_places, phase_grid, phase_image
+from hilstar.monitor.quantise import Panel, dither_levels, mask_turn, shown_light
+from hilstar.monitor.response import Response, gamma_response, srgb_response, table_response
+from hilstar.monitor.temporal import TemporalQuantiser
+from hilstar.tracker.star_errors import Judge, StarErrors
+from hilstar.units import flux_ratio
+
+FRAMES = (1, 2, 4, 6, 8, 16, 32, 64)
+BEGINS = (2.0, 3.4, 5.7, 7.1)  # refreshes: exposures begin within frames too
+AIM_FRAMES = 6
+
+
+@dataclass(frozen=True, slots=True)
+class Shown:
+    """A panel, and a star so many magnitudes under white on it."""
+
+    name: str
+    response: Response
+    mag: float
+
+
+@dataclass(frozen=True, slots=True)
+class Left:
+    """A row of over_frames.csv: rms errors over phases and beginnings of exposures of so many frames, places along an axis.
+
+    `steps` is the star's light in steps from black; errors are infinite where a star may show nothing.
+    """
+
+    panel: str
+    mag_under_white: float
+    steps: float
+    method: str
+    frames: int
+    flux_rms_mag: float
+    axis_rms_px_moment: float
+    axis_rms_px_window: float
+    axis_rms_px_fit: float
+
+
+def panels() -> list[Shown]:
+    """The panels: monitors of 8 bits, and microdisplays whose levels are equal."""
+    equal = {bits: table_response(bits, np.linspace(0, 1, 2**bits)) for bits in (8, 2, 1)}
+    return [
+        Shown("sRGB, 8 bits", srgb_response(8), 6.0),
+        Shown("gamma 2.2, 8 bits", gamma_response(8), 6.0),
+        Shown("linear, 8 bits", equal[8], 6.0),
+        Shown("linear, 2 bits", equal[2], 2.0),
+        Shown("1 bit", equal[1], 2.0),
+    ]
+
+
+def study_frames(directory: Path, quick: bool) -> str:
+    """Write over_frames.csv and over_frames.png into `directory`; the finding."""
+    phases, counts = (6, FRAMES[:4]) if quick else (16, FRAMES)
+    left = [row for shown in panels() for row in _left_by(shown, phases, counts)]
+    write_records(directory / "over_frames.csv", left)
+    finding = _finding(left)
+    _draw(directory / "over_frames.png", left, finding)
+    return finding
+
+
+def _left_by(shown: Shown, phases: int, counts: tuple[int, ...]) -> list[Left]:
+    panel, share = Panel(shown.response, WHITE), flux_ratio(shown.mag)
+    sprites, tile = phase_grid(phases)
+    bright = phase_image(sprites, SIGMA_PX)
+    judge = Judge(bright, line_places(sprites), SIGMA_PX, AS_USUAL.blur_px, AS_USUAL.pixel_px)
+    stars, linear = fainter(sprites, shown.mag), (share * bright).astype(np.float32)
+    quantiser = TemporalQuantiser(panel, (phases * tile, phases * tile), SIGMA_PX)
+    steps = float(stars.data["electrons_per_s"][0]) / (float(shown.response.light[1]) * WHITE)
+    rows = []
+    for method in ("temporal", "dither"):
+        # Light up to the end of each frame: an exposure's is the difference of two, its ends within frames.
+        whole = np.zeros((int(max(BEGINS)) + max(counts) + 2, *linear.shape))
+        for frame in range(len(whole) - 1):
+            levels = quantiser.levels(stars) if method == "temporal" else dither_levels(linear, panel, mask_turn(frame))
+            whole[frame + 1] = whole[frame] + shown_light(levels, panel)
+        for count in counts:
+            means = ((_up_to(whole, begin + count) - _up_to(whole, begin)) / count for begin in BEGINS)
+            errors = [judge.errors(mean, share, ("moment", "window", "fit")) for mean in means]
+            rows.append(Left(shown.name, shown.mag, steps, method, count, *_rms(errors)))
+    return rows
+
+
+def _up_to(whole: FloatArray, refreshes: float) -> FloatArray:
+    """The light of so many refreshes from the beginning."""
+    frame, part = int(refreshes), refreshes % 1
+    return np.asarray(whole[frame] + part * (whole[frame + 1] - whole[frame]))
+
+
+def _rms(errors: list[StarErrors]) -> tuple[float, ...]:
+    each = [(e.flux_rms_mag, *(e.axis_rms_px(kind) for kind in ("moment", "window", "fit"))) for e in errors]
+    return tuple(np.sqrt(np.mean(np.square(each), axis=0)).tolist())
+
+
+def _finding(left: list[Left]) -> str:
+    at = {(row.panel, row.method): row for row in left if row.frames == AIM_FRAMES}
+    each = (
+        f"{name} {at[name, 'temporal'].flux_rms_mag:.2g} mag, {at[name, 'temporal'].axis_rms_px_fit:.2g} px"
+        for name in dict.fromkeys(row.panel for row in left)
+    )
+    return f"temporal over any {AIM_FRAMES} frames, rms, places by a PSF fit: {'; '.join(each)}"
+
+
+def _draw(path: Path, left: list[Left], finding: str) -> None:
+    with chart(path, finding, panels=2) as (flux, place):
+        for colour, name in enumerate(dict.fromkeys(row.panel for row in left)):
+            for method, style in (("temporal", "-o"), ("dither", ":")):
+                rows = [row for row in left if (row.panel, row.method) == (name, method)]
+                label = (
+                    f"{name}, {rows[0].steps:.{1 if rows[0].steps < 100 else 0}f} steps of light"
+                    if method == "temporal"
+                    else None
+                )
+                frames, look = [row.frames for row in rows], f"C{colour}{style}"
+                flux.plot(frames, [_finite(row.flux_rms_mag) for row in rows], look, label=label, ms=4)
+                place.plot(frames, [_finite(row.axis_rms_px_fit) for row in rows], look, ms=4)
+        flux.set(xscale="log", yscale="log", ylim=(1e-6, 1), ylabel="flux error, rms [mag]")
+        place.set(xscale="log", yscale="log", ylabel="place by a PSF fit, rms [px]", xlabel="frames of an exposure")
+        place.set_xticks(FRAMES, [str(count) for count in FRAMES])
+        flux.legend(title="solid: temporal, dotted: dither with a mask that turns", fontsize=9, loc="lower left")
+
+
+def _finite(value: float) -> float:
+    return value if np.isfinite(value) else np.nan

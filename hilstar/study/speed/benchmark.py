@@ -23,9 +23,11 @@ SIZES: tuple[Size, ...] = ((1024, 1024), REFERENCE_PX, (2560, 2048), (3840, 2160
 COUNTS = (100, 1000, 10_000, 50_000)
 MAX_STARS = 200_000  # NumPy's method takes 2.9 kB of memory for each
 RADEC_ROLL_DEG = (84.057, -1.2, 10.0)
-# What the project set itself for REFERENCE_PX on two cores; by stars, ms.
-AIMS_MS = {1000: 7.0, 10_000: 25.0}
-PYTHON_AIM_MS = 0.6  # at 1000 stars
+# What the project set itself on two cores, ms: whole frames by image and stars, Python at REFERENCE_PX by stars; how many times
+# a still frame one may take that turns by 10 deg/s.
+AIMS_MS = {(REFERENCE_PX, 1000): 3.5, (REFERENCE_PX, 10_000): 10.0, ((3840, 2160), 50_000): 40.0}
+PYTHON_AIMS_MS = {1000: 0.2, 10_000: 1.0}
+TURNING_TIMES = 2.0
 START_AIM_MS = 1500.0
 
 
@@ -55,7 +57,7 @@ def run(plan: Plan, rng: np.random.Generator, advance: Callable[[int], object]) 
     q_icrs_to_cam = from_radec_roll_deg(*RADEC_ROLL_DEG)
     with TemporaryDirectory() as folder:
         for place, size in enumerate(plan.sizes):
-            file = plan.file or own_bench_file(Path(folder) / "bench.toml", size)
+            file = plan.file or own_bench_file(Path(folder) / "bench.toml", size, motion="on")
             with open_bench(file) as bench:
                 result.gl_renderer = bench.renderer.gl_renderer
                 every = bench.shown_stars
@@ -97,13 +99,20 @@ def _summarise_starts(result: Result, sizes: tuple[Size, ...]) -> None:
 
 def _aims(result: Result) -> list[Aim]:
     """The aims that this run can judge."""
+    at = {(row.size, row.stars, row.method, row.kind): row.ms.median for row in result.rows}
     aims = []
-    for row in result.rows:
-        if row.kind == "whole_frame" and row.size == REFERENCE_PX and row.stars in AIMS_MS:
-            aims.append((f"whole frame to codes, {row.stars} stars", AIMS_MS[row.stars], row.ms.median))
+    for (size, stars, method, kind), ms in at.items():
+        where = f"{stars} stars, {size[0]} x {size[1]}"
+        still, numba = (at.get((size, stars, *key)) for key in (("hilstar", "whole_frame"), ("numba", "linear_only")))
+        if kind == "whole_frame" and (size, stars) in AIMS_MS:
+            aims.append((f"whole frame to codes, {where}", AIMS_MS[size, stars], ms))
+        elif kind == "turning" and still is not None:
+            aims.append((f"turning by 10 deg/s, {where}, {TURNING_TIMES:g} still frames", TURNING_TIMES * still, ms))
+        elif kind == "linear_only" and method == "hilstar" and numba is not None:
+            aims.append((f"linear image, {where}, numba's time", numba, ms))
     for python in result.python_ms:
-        if python.stars == 1000 and python.size == REFERENCE_PX:
-            aims.append(("Python outside GL, 1000 stars", PYTHON_AIM_MS, python.ms.median))
+        if python.size == REFERENCE_PX and python.stars in PYTHON_AIMS_MS:
+            aims.append((f"Python outside GL, {python.stars} stars", PYTHON_AIMS_MS[python.stars], python.ms.median))
     starts = [start.import_ms + start.first_frame_ms for start in result.startup if start.size == REFERENCE_PX]
     if starts:
         aims.append(("import and first frame", START_AIM_MS, float(np.median(starts))))

@@ -20,6 +20,8 @@ from hilstar.study.speed.result import Agreement, Cell, PythonTime, Result, Skip
 
 STAGES = ("cull", "project", "erase", "upload", "splat", "encode", "read_back")
 GPU_STAGES = ("gpu_splat", "gpu_encode")
+# 10 deg/s about an axis across and along the boresight: each star is drawn along its path while its row is lit.
+TURN_RAD_S = np.radians(10.0) * np.array([0.64, -0.74, 0.21])
 
 
 class CellMeasurement:
@@ -40,6 +42,7 @@ class CellMeasurement:
         """Time every method in turn, so that what else the machine does is in the times of all."""
         works: dict[str, Callable[[], object]] = {
             "whole_frame": lambda: self.bench.draw(self.q).levels,
+            "turning": lambda: self.bench.draw(self.q, 0, TURN_RAD_S).levels,
             "linear_only": self._draw_linear,
             "stages": self._draw_stages,
             "python": self._python,
@@ -59,7 +62,7 @@ class CellMeasurement:
     def _keep(self, times_ms: dict[str, list[float]]) -> None:
         self.result.python_ms.append(PythonTime(*self.cell_key, _spread(times_ms.pop("python"))))
         del times_ms["stages"]  # with its waits; its parts are kept
-        rows = [("hilstar", kind, times_ms.pop(kind)) for kind in ("whole_frame", "linear_only")]
+        rows = [("hilstar", kind, times_ms.pop(kind)) for kind in ("whole_frame", "turning", "linear_only")]
         for kind in (*STAGES, *GPU_STAGES):
             if stage_ms := self.stage_ms.get(kind):
                 rows.append(("hilstar", kind, stage_ms[1:] or stage_ms))  # without the first turn, as in `interleaved`

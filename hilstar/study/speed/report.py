@@ -13,7 +13,12 @@ from hilstar.study.speed.result import Cell, Result, Size, Timing
 COLORS = {"hilstar": "C3", "numpy": "C0", "numba": "C1", "galsim": "C2", "photutils": "C4"}
 COLUMN = 12
 NAME = 26
-OF_AN_IMAGE = ("whole_frame", "linear_only")
+OF_AN_IMAGE = ("whole_frame", "turning", "linear_only")
+LABELS = {
+    "whole_frame": ("whole frame to codes", "o-"),
+    "turning": ("the same turning by 10 deg/s", "o:"),
+    "linear_only": ("linear image only", "o--"),
+}
 
 
 def lines(result: Result) -> Iterator[str]:
@@ -35,7 +40,8 @@ def lines(result: Result) -> Iterator[str]:
 
 
 def _notes(result: Result) -> Iterator[str]:
-    yield "whole frame: from attitude to codes in memory. linear only: the image alone, from given places and light"
+    yield "whole frame: from attitude to codes in memory. turning: the same at 10 deg/s, with stars drawn along their paths"
+    yield "linear only: the image alone, from given places and light"
     yield "stages are waited for, one after the other; gpu: the same by the driver's own timers"
     for name, does in result.does.items():
         worst = [row.worst_of_peak for row in result.agreement if row.method == name]
@@ -52,7 +58,7 @@ def _notes(result: Result) -> Iterator[str]:
     )
     for aim in result.aims:
         word = "reached" if aim.reached else "NOT reached"
-        yield f"aim {word}: {aim.what} {aim.measured_ms:.2f} ms (at most {aim.aim_ms:g})"
+        yield f"aim {word}: {aim.what} {aim.measured_ms:.2f} ms (at most {aim.aim_ms:.4g})"
 
 
 def write(result: Result, folder: Path) -> None:
@@ -79,9 +85,8 @@ def _draw(path: Path, result: Result) -> None:
             rows = [row for row in result.rows if row.size == size and row.kind in OF_AN_IMAGE]
             for method, kind in dict.fromkeys((row.method, row.kind) for row in rows):
                 points = [(row.stars, row.ms.median) for row in rows if (row.method, row.kind) == (method, kind)]
-                style = "o-" if kind == "whole_frame" else "o--"
-                label = f"{method}, {'whole frame to codes' if kind == 'whole_frame' else 'linear image only'}"
-                axis.plot(*zip(*points, strict=True), style, color=COLORS[method], ms=4, label=label)
+                label, style = LABELS[kind]
+                axis.plot(*zip(*points, strict=True), style, color=COLORS[method], ms=4, label=f"{method}, {label}")
             axis.set(title=_words(size), xscale="log", yscale="log", xlabel="stars in view", ylabel="ms a frame (median)")
             plain_ticks(axis.xaxis, _counts(rows))
         handles = {label: line for axis in grid for line, label in zip(*axis.get_legend_handles_labels(), strict=True)}

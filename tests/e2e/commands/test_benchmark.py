@@ -44,12 +44,24 @@ def test_rows_are_those_of_the_contract(measured):
         assert 0 < row["ms"]["min"] <= row["ms"]["median"] <= row["ms"]["max"]
     for count in (100, 1000):
         kinds = [row["kind"] for row in result["rows"] if row["stars"] == count and row["method"] == "hilstar"]
-        assert kinds.count("whole_frame") == 1
+        assert kinds.count("whole_frame") == kinds.count("turning") == 1
         assert set(STAGES) < set(kinds)
         assert [row["kind"] for row in result["rows"] if row["stars"] == count and row["method"] == "numpy"] == ["linear_only"]
     assert min(result[name] for name in ("import_ms", "first_frame_ms", "memory_mb")) > 0
     assert {row["method"] for row in result["agreement"]} >= {"numpy"}
     assert all(row["worst_of_peak"] < FLOAT32_OF_PEAK for row in result["agreement"] if row["method"] == "numpy")
+
+
+def test_each_count_is_judged_turning_against_still_and_beside_numba(measured):
+    result, _ = measured
+    at = {(row["stars"], row["method"], row["kind"]): row["ms"]["median"] for row in result["rows"]}
+    aims = {aim["what"]: aim for aim in result["aims"]}
+    for count in (100, 1000):
+        turning = aims[f"turning by 10 deg/s, {count} stars, 640 x 480, 2 still frames"]
+        assert turning["aim_ms"] == 2 * at[count, "hilstar", "whole_frame"]
+        assert turning["reached"] == (at[count, "hilstar", "turning"] <= turning["aim_ms"])
+        beside = aims.get(f"linear image, {count} stars, 640 x 480, numba's time")
+        assert (beside and beside["aim_ms"]) == at.get((count, "numba", "linear_only"))
 
 
 def test_stages_make_up_the_whole_frame(measured):

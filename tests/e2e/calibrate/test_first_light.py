@@ -242,7 +242,7 @@ def test_images_come_from_a_command(tmp_path):
 
 
 def test_a_command_that_fails_is_a_failed_step_and_what_needs_it_is_not_done(tmp_path):
-    (tmp_path / "bench.toml").write_text(bench_text(TWIN))
+    (tmp_path / "bench.toml").write_text(bench_text(TWIN, {"tracker": {"exposure_s": 0.045}}))
     fails = f"{sys.executable} -c \"import sys; sys.exit('camera 3 is not there')\" {{pattern}} {{output}}"
     result = go(tmp_path, "--grab", fails, "--json")
     assert result.returncode == 1
@@ -250,7 +250,13 @@ def test_a_command_that_fails_is_a_failed_step_and_what_needs_it_is_not_done(tmp
     assert steps["orientation"]["verdict"] == "failed"
     assert "camera 3 is not there" in steps["orientation"]["line"]
     assert {steps[name]["verdict"] for name in ("focus", "geometry", "verify")} == {"skipped"}
-    assert "failed" in (tmp_path / "s" / "first-light.html").read_text()
+    page = (tmp_path / "s" / "first-light.html").read_text()
+    assert "failed" in page
+    # Whatever fails: 2.7 refreshes beat with the screen.
+    (beats,) = (line for line in result.stderr.splitlines() if "refreshes" in line)
+    assert beats.startswith("exposures of 0.045 s are 2.7 refreshes of 60 Hz") and "[tracker] exposure_s = 0.05" in beats
+    assert beats in page
+    assert json.loads(result.stdout)["beat"]["proposal"]["exposure_s"] == pytest.approx(0.05)
 
 
 @pytest.mark.parametrize(

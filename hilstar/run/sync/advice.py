@@ -161,4 +161,4 @@ def _cure(proposal: Proposal) -> str:
     if ways:
         return f"without a beat: {' or '.join(ways)}"
     stands = "" if proposal.frame_hz is None else f"; at [tracker] frame_hz = {proposal.frame_hz:.6g} its phase stands still"
-    return f"no rate is without it: trigger the tracker ([sync] port){stands}"
+    return f"no rate is without it: trigger the tracker ([sync] port, [tracker] trigger){stands}"

@@ -20,6 +20,7 @@ from hilstar.units import NS_PER_MS, NS_PER_S
 HANDOVER_S = 0.0005
 MIN_BACK_OFF_S, MAX_BACK_OFF_S = 0.1, 2.0
 END_S = 1.0
+LAST_S = 0.25  # for the last pulse of a run: what follows has a second, after a signal
 
 
 class FramePulse:
@@ -113,7 +114,7 @@ class FramePulse:
 
     def summary(self) -> SyncSummary:
         """The pulses so far, with one that lasts."""
-        self._idle.wait(END_S)
+        self._idle.wait(LAST_S)
         delay, line = self._delay_ms, self._line_ms
         return SyncSummary(
             port=self._line.port,

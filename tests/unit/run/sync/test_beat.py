@@ -170,7 +170,10 @@ def test_a_panel_that_flashes_wants_a_trigger(tmp_path):
     found = beat_of(bench(tmp_path, {"exposure_s": 0.1, "frame_hz": 7.7}, monitor={"hold_ms": 1}))
     assert found.matters and found.proposal.exposure_s is found.proposal.refresh_hz is None
     assert found.proposal.frame_hz == pytest.approx(7.5)
-    assert "trigger the tracker ([sync] port); at [tracker] frame_hz = 7.5 its phase stands still" in beat_line(found)
+    assert (
+        "trigger the tracker ([sync] port, [tracker] trigger); at [tracker] frame_hz = 7.5 its phase stands still"
+        in beat_line(found)
+    )
 
 
 @pytest.mark.parametrize(

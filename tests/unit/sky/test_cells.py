@@ -7,7 +7,7 @@ import pytest
 
 from hilstar.sky.astrometry import unit_vectors_icrs
 from hilstar.sky.catalog import load_catalog
-from hilstar.sky.cells import CELL_DEG, cell_grid
+from hilstar.sky.cells import CELL_DEG, PARTS, cell_grid
 
 
 @pytest.fixture(scope="module")
@@ -37,6 +37,16 @@ def test_few_others_are_found(vectors):
     farthest = np.arccos(np.clip((vectors[found] @ axis).min(), -1, 1))
     assert farthest < radius + 2 * np.radians(CELL_DEG) * np.sqrt(2)
     assert len(found) < len(vectors) / 20
+
+
+def test_stars_of_a_cell_follow_each_other_by_its_parts(vectors):
+    """Neighbours in order are neighbours in the sky: within a part's diagonal, not a cell's."""
+    grid = cell_grid(vectors)
+    inside = np.setdiff1d(np.arange(1, len(vectors)), grid.start)  # not across two cells
+    ordered = vectors[grid.order]
+    step = np.arccos(np.clip(np.einsum("ij,ij->i", ordered[inside], ordered[inside - 1]), -1, 1))
+    assert np.median(step) < np.radians(CELL_DEG / PARTS * np.sqrt(2))
+    assert np.array_equal(np.sort(grid.order), np.arange(len(vectors)))
 
 
 def test_no_stars_and_one_star():

@@ -150,9 +150,13 @@ struct Star {
     float e_per_s;
 };
 
+ivec2 pixel_of(int i) {
+    return ivec2(sprite[5 * i], sprite[5 * i + 1]);
+}
+
 Star star_of(int i) {
     return Star(
-        ivec2(sprite[5 * i], sprite[5 * i + 1]),
+        pixel_of(i),
         vec2(intBitsToFloat(sprite[5 * i + 2]), intBitsToFloat(sprite[5 * i + 3])),
         intBitsToFloat(sprite[5 * i + 4]));
 }
@@ -211,19 +215,28 @@ float output_of(ivec2 at) {
 }
 
 #ifdef PATHS
-const int BESIDE = 2;  // sprites of a path before and after that reach a sprite's pixels
+const int BESIDE = 1;  // sprites of a path before and after that give most of the light in the pixels nearest to a sprite
 
 // The sprites about sprite `i` of a path: place from its pixel, and the exponent of its light, far below any where there is none.
 vec3 beside[2 * BESIDE + 1];
 
+vec3 beside_at(int i, ivec2 path, ivec2 pixel) {
+    Star star = star_of(clamp(i, path.x, path.y - 1));
+    bool there = i >= path.x && i < path.y;
+    return vec3(vec2(star.pixel - pixel) + star.fraction, there ? log(max(star.e_per_s, 1e-30)) : -NONE);
+}
+
 void look_beside(int i, ivec2 path) {
-    ivec2 pixel = star_of(i).pixel;
-    for (int j = 0; j < 2 * BESIDE + 1; j++) {
-        int other = i + j - BESIDE;
-        Star star = star_of(clamp(other, path.x, path.y - 1));
-        bool there = other >= path.x && other < path.y;
-        beside[j] = vec3(vec2(star.pixel - pixel) + star.fraction, there ? log(max(star.e_per_s, 1e-30)) : -NONE);
-    }
+    ivec2 pixel = pixel_of(i);
+    for (int j = 0; j < 2 * BESIDE + 1; j++) beside[j] = beside_at(i + j - BESIDE, path, pixel);
+}
+
+// From the sprite before to sprite `i`.
+void look_on(int i, ivec2 path) {
+    ivec2 pixel = pixel_of(i);
+    vec3 back = vec3(vec2(pixel_of(i - 1) - pixel), 0.0);
+    for (int j = 0; j < 2 * BESIDE; j++) beside[j] = beside[j + 1] + back;
+    beside[2 * BESIDE] = beside_at(i + BESIDE, path, pixel);
 }
 
 float exponent_of(int j, vec2 offset) {
@@ -237,7 +250,7 @@ bool nearest_in_path(vec2 offset) {
     return exponent_of(BESIDE - 1, offset) < own && exponent_of(BESIDE + 1, offset) <= own;
 }
 
-// The light of a path in a pixel, within some hundredths.
+// The light of a path in a pixel nearest to its sprite; a tenth or so is of sprites farther along.
 float path_light_at(vec2 offset) {
     float light = 0.0;
     for (int j = 0; j < 2 * BESIDE + 1; j++) light += exp(exponent_of(j, offset));
@@ -315,13 +328,20 @@ Sums choose(Star star, float of_light, Sums carried, float phase) {
     BITS rounded_up = BITS(0u);
     vec3 seen = vec3(0.0);  // own light and moments on the image, in this star's pixels and others'
     float largest = 0.0, smallest = NONE, lowest = 0.0;
+#ifdef PATHS
     int mine = 0;
     for (int k = 0; k < reach; k++) {
         uint here = order[first + k];
-        ivec2 offset = offset_of(here);
+        if (nearest_in_path(vec2(offset_of(here)))) place[mine++] = here;
+    }
+#else
+    int mine = reach;
+    for (int k = 0; k < mine; k++) place[k] = order[first + k];
+#endif
+    for (int k = 0; k < mine; k++) {
+        ivec2 offset = offset_of(place[k]);
         ivec2 at = pixel + offset;
 #ifdef PATHS
-        if (!nearest_in_path(vec2(offset))) continue;
         float own = path_light_at(vec2(offset));
 #else
         vec2 d = vec2(offset) - fraction;
@@ -342,14 +362,12 @@ Sums choose(Star star, float of_light, Sums carried, float phase) {
             s = (low - asked) * factor;
             t = abs(other - shown) * factor;
             lowest += s;
-            if (above) rounded_up |= bit_of(mine);
+            if (above) rounded_up |= bit_of(k);
             largest = max(largest, t);
             smallest = t > 0.0 ? min(smallest, t) : smallest;
         }
-        place[mine] = here;
-        short_of[mine] = s;
-        step_of[mine] = t;
-        mine++;
+        short_of[k] = s;
+        step_of[k] = t;
     }
 #ifdef TEMPORAL
     float limit = MAX_CARRIED_STEPS * largest;  // a star that cannot make up for it saves nothing up
@@ -475,11 +493,15 @@ void main() {
     float phase = 0.0;
 #endif
 #ifdef PATHS
-    for (int node = stretch[i].x; node < stretch[i].y; node++) {
-        look_beside(node, stretch[i].zw);
-        if (node > stretch[i].x) sums.a.yz -= sums.a.x * (beside[BESIDE].xy - beside[BESIDE - 1].xy);
+    ivec4 of = stretch[i];
+    look_beside(of.x, of.zw);
+    for (int node = of.x; node < of.y; node++) {
+        if (node > of.x) {
+            look_on(node, of.zw);
+            sums.a.yz -= sums.a.x * (beside[BESIDE].xy - beside[BESIDE - 1].xy);
+        }
         Star star = star_of(node);
-        sums = choose(star, star.e_per_s * float(stretch[i].w - stretch[i].z), sums, node > stretch[i].x ? 0.0 : phase);
+        sums = choose(star, star.e_per_s * float(of.w - of.z), sums, node > of.x ? 0.0 : phase);
     }
 #else
     Star star = star_of(i);

@@ -63,7 +63,10 @@ def _axis(stamps: FloatArray) -> FloatArray:
 
 def _moment(stamps: FloatArray, sigma_px: Sigma, pixels: Pixels) -> Places:
     at, light = _axis(stamps), stamps.sum(axis=(1, 2))
-    return stamps.sum(axis=1) @ at / light, stamps.sum(axis=2) @ at / light
+    x, y = (
+        np.clip(stamps.sum(axis=axis) @ at / light, at[0], at[-1]) for axis in (1, 2)
+    )  # noise below 0 may leave little light
+    return x, y
 
 
 def _window(stamps: FloatArray, sigma_px: Sigma, pixels: Pixels, wide: float = 1.0, steps: int = WINDOW_STEPS) -> Places:

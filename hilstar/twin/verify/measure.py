@@ -154,8 +154,10 @@ class Comparison:
         under = estimate_background(detected_e, step_e)
         if under.noise <= step_e / math.sqrt(12):  # rounding's: most of the image may be clipped at 0 DN, beside a glow
             under = noisiest_background(detected_e, step_e)
-        found = find_stars(detected_e, self.finder.settings, under)
-        match = nearest(found, seen.x_px, seen.y_px)
+        windowed = find_stars(detected_e, self.finder.settings, under)
+        match, true_px = nearest(windowed, seen.x_px, seen.y_px), (seen.x_px, seen.y_px)
+        matched = Matched(windowed, match)
+        found = self.finder.placed(matched, detected_e - under.level, true_px, self.finder.centroider).found
         expected_e = seen.truth["electrons_per_s"] * self.twin.config.tracker.exposure_s
         for k in np.flatnonzero(wanted & (match >= 0)):
             flux_e = float(found.flux[match[k]])

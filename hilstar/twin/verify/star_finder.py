@@ -78,7 +78,7 @@ class StarFinder:
         near = np.arange(2 * reach + 1)
         # A star's true place may lie up to the largest distance of a match off the image.
         far = reach + math.ceil(MATCH_PX) + 1
-        padded = np.pad(np.maximum(image_e, 0.0), far)
+        padded = np.pad(image_e, far)
         stamps = padded[(row[:, None] + near + far - reach)[:, :, None], (column[:, None] + near + far - reach)[:, None, :]]
         middle = np.full(len(stars), reach)
         dx_px, dy_px = star_places(stamps, kind, self.sigma_px, (middle, middle))

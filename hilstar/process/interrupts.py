@@ -93,6 +93,11 @@ def _handle(number: int, frame: FrameType | None) -> None:
         stop.set()
 
 
+def is_command() -> bool:
+    """Whether this process is one of hilstar's commands, and not a program that uses its parts."""
+    return _ending.guard is not None
+
+
 def caught() -> str | None:
     """The name of the signal that ends this process; None while none has come."""
     return None if _ending.signal is None else signal.Signals(_ending.signal).name

@@ -46,7 +46,7 @@ def serve_heads(heads: HeadsFile, asked: HeadsAsked, as_json: bool) -> None:
     from hilstar.attitude.wire.vizard.live import VizardLive
     from hilstar.attitude.wire.zmq_lockstep import ZmqLockstep
     from hilstar.run.heads.supervisor import HeadsRun, head_ledger, run_heads, source_config
-    from hilstar.run.open_link import open_link
+    from hilstar.run.open_link import await_reader, open_link
 
     if asked.ledger is not None and not asked.switches.get("--overwrite"):
         taken = [file for name in heads.names if (file := head_ledger(asked.ledger, name)).exists()]
@@ -54,7 +54,8 @@ def serve_heads(heads: HeadsFile, asked: HeadsAsked, as_json: bool) -> None:
             raise InputError(f"--ledger {asked.ledger}: {taken[0]} exists; give another name, or --overwrite")
     notices = Notices()
     consoles = _consoles(asked.console, heads)
-    with open_link(source_config(heads), heads.folder, notices) as link:
+    with open_link(source_config(heads), heads.folder, notices, apart=True) as link:
+        await_reader(link)
         say(f"{link.verb} {link.endpoint}, {len(heads.names)} heads: {', '.join(heads.names)}")
         assert not isinstance(link, ZmqLockstep | VizardLive)  # read_heads refuses lockstep
         run = HeadsRun(heads, asked.options(), asked.duration_s, asked.ledger, consoles, asked.token)

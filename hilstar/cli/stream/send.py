@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import threading
 import time
+from collections.abc import Callable
 from itertools import islice, takewhile
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,7 +16,8 @@ from hilstar.cli.options import LOG_HELP, MAX_SEED, Json, MountingText, RadecTex
 from hilstar.cli.parsers import parse_mounting, parse_radec, parse_share, parse_spin
 from hilstar.console.terminal import print_json, progress, say
 from hilstar.errors import InputError
-from hilstar.process.interrupts import stop_on_signal
+from hilstar.process.interrupts import is_command, stop_on_signal
+from hilstar.process.priority import PromptWhileLight
 from hilstar.units import NS_PER_S
 
 LISTEN_SLICE_S = 0.1  # between looks at whether a signal has come
@@ -78,8 +80,21 @@ def send(
         if not heard(link, wait, stop):
             say("no listener yet; sending anyway")
         with progress("sending", min(total, count or math.inf)) as advance:
-            send_samples(cable, islice(samples, count), stop, advance)
+            send_samples(cable, islice(samples, count), stop, in_time(advance))
     tell(cable.tally, link, as_json)
+
+
+def in_time(advance: Callable[[int], None]) -> Callable[[int], None]:
+    """`advance`, in a process that is woken in time: it stands for another machine, and does not wait for a display."""
+    if not is_command():
+        return advance
+    priority = PromptWhileLight()
+
+    def advance_in_time(count: int) -> None:
+        advance(count)
+        priority.tend()
+
+    return advance_in_time
 
 
 def wanted_samples(

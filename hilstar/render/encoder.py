@@ -38,6 +38,7 @@ def build_program(
 
 
 MAX_SIDES = 8  # as in star.vert
+MAX_RATE = 3e38  # in float32
 PLACES = "2i 8x 1f"  # of SPRITE_DTYPE: places and rates
 SPRITE_PIXEL_COST = 4  # of a pixel encoded under a sprite, in pixels of a pass over the whole image (llvmpipe, sprites of 6 px)
 # Of the image: beyond it a clear is faster than erasing sprites, of levels sooner than of light (llvmpipe, 1080p and 4K).
@@ -84,7 +85,8 @@ def lit_sides(panel: Panel, sigma_px: tuple[float, float], footprint_px: int, wi
     light = panel.response.threshold[0] * panel.flux_at_white_e_per_s / (1.0 if gain is None else float(gain.max()))
     sizes = range(footprint_px - 2, 0, -2)
     every = -(-len(sizes) // MAX_SIDES) or 1
-    return tuple(SpriteSide(float(light) / wings / outside_share(size, sigma_px), size) for size in sizes[::every])
+    rates = {size: float(light) / wings / outside_share(size, sigma_px) for size in sizes[::every]}
+    return tuple(SpriteSide(min(rate, MAX_RATE), size) for size, rate in rates.items())
 
 
 class Eraser:

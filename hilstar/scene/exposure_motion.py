@@ -127,7 +127,8 @@ class _Smear:
         camera, stars = self.camera, self.stars
         angle_rad = float(np.linalg.norm(motion.rate_cam_rad_s)) * (end_s - begin_s)
         middle = motion.icrs_to_image(np.array([(begin_s + end_s) / 2]), camera)[0]
-        near = stars.near(middle[2], camera.field_radius_rad(self.footprint_px / 2 + 1) + angle_rad)
+        radius_rad, edges = camera.field(self.footprint_px / 2 + 1)
+        near = stars.near(middle[2], radius_rad, edges @ middle, angle_rad)
         paths = Paths(stars.directions(near) @ middle.T, camera.cam_to_image @ motion.rate_cam_rad_s, camera)
         half_s = (end_s - begin_s) / 2
         counts, begin, end = self._nodes(paths, half_s)

@@ -61,7 +61,8 @@ class Stars:
 
     def directions(self, which: IntArray) -> FloatArray:
         """Where stars are seen: ICRS unit vectors (n, 3)."""
-        vectors = self.vectors.T.take(which, axis=1).T
+        vectors = self.vectors
+        vectors = vectors.T.take(which, axis=1).T if vectors.flags.f_contiguous else vectors[which]
         return vectors if self.velocity_km_s is None else aberrate(vectors, self.velocity_km_s)
 
     def seen_at(self, velocity_km_s: FloatArray | None) -> Stars:

@@ -120,9 +120,11 @@ class ExactQuantiser:
         return self._flat[:-1].reshape(height, width)
 
     def _reach(self, of_star_e_per_s: Float32Array) -> IntArray:
-        """How many pixels of stars of so much light (n,) are chosen, (n,); over frames all, for each has its turn."""
+        """How many pixels of stars of so much light (n,) are chosen, (n,)."""
         order = self._map.order
-        if self.over_frames:
+        if (
+            self.over_frames
+        ):  # pixels that stay dark would be off the same way in each frame, which the others cannot make up for
             return np.full(len(of_star_e_per_s), order.near)
         return order.reach(of_star_e_per_s / np.float32(self._step_e_per_s))
 

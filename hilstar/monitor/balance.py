@@ -16,18 +16,35 @@ from hilstar.arrays import Float32Array, FloatArray
 
 PIXEL_VARIANCE = 1 / 12  # a pixel's width adds to the sigma that it samples
 SUMS = 10
-# Weights of a squared error, in light or light times 1 px: found by search, on 24 x 24 phases of stars of 47 and 66 steps of
-# light, for the centroider that gains least over rounding.
-ALL_LIGHT, ALL_MOMENTS = 1.0, 0.75
-FEW_STEPS = 8.0  # a star of so many steps weighs its light twice: its flux is then as near as the panel's step allows
-WINDOW_LIGHT, WINDOW_MOMENTS = 0.8, 3.0
-BOX_3, BOX_5 = 2.2, 0.55
-BOX_5_OVER_FRAMES = 1.2  # 0.0034 px in place of 0.0038 over six frames of a star of 66 steps; the others stay under 0.0031
-# The light's in the choice among what is left at the end: till then light can be made up for.
-LAST_LIGHT = 3.5
-# The Gaussian's variance beyond the sprite's, in variances of the blur: a fit has 0 before the blur and 2 after it.
-WINDOW_BLURS = 0.6
 BOX_REACH = 15  # px from a star's nearest pixel; the boxes' weights are tabulated up to there
+
+
+@dataclass(frozen=True, slots=True)
+class Weights:
+    """Of the sums in a squared error, in light or light times 1 px.
+
+    `few_steps`: a star of so many steps weighs its light twice; its flux is then as near as the panel's step allows.
+    `last_light` is that of the light in the choice among what is left at the end: till then light can be made up for.
+    `window_blurs` is the Gaussian's variance beyond the sprite's, in variances of the blur: a fit has 0 before the blur and 2
+    after it.
+    """
+
+    light: float
+    moments: float
+    window_light: float
+    window_moments: float
+    box_3: float
+    box_5: float
+    few_steps: float
+    last_light: float
+    window_blurs: float
+
+
+# Found by search, for the centroider that gains least over rounding: stars of 46 to 95 steps, most of all 66 at 32 x 32 phases.
+IN_A_FRAME = Weights(1.0, 0.75, 0.8, 3.0, 2.2, 0.55, 8.0, 3.5, 0.6)
+# Over frames no star weighs its light more, or faint stars' moments would drift; the larger box leaves 0.0034 px in place of
+# 0.0038 over six frames of a star of 66 steps, and the others stay under 0.0031.
+OVER_FRAMES = Weights(1.0, 0.75, 0.8, 3.0, 2.2, 1.2, 0.0, 3.5, 0.6)
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,19 +67,14 @@ class Balance:
     over_frames: bool = False
 
     @property
-    def few_steps(self) -> float:
-        """A star of so many steps weighs its light twice; over frames none does, or faint stars' moments would drift."""
-        return 0.0 if self.over_frames else FEW_STEPS
-
-    @property
-    def box_weights(self) -> tuple[float, float]:
-        """The weights of the boxes of 3 and 5 tracker pixels."""
-        return BOX_3, BOX_5_OVER_FRAMES if self.over_frames else BOX_5
+    def weights(self) -> Weights:
+        """The weights of its sums."""
+        return OVER_FRAMES if self.over_frames else IN_A_FRAME
 
     @property
     def window_px(self) -> tuple[float, float]:
         """The Gaussian's sigma along x and y."""
-        x, y = (math.sqrt(s**2 + PIXEL_VARIANCE + WINDOW_BLURS * self.seen.blur_px**2) for s in self.sigma_px)
+        x, y = (math.sqrt(s**2 + PIXEL_VARIANCE + self.weights.window_blurs * self.seen.blur_px**2) for s in self.sigma_px)
         return x, y
 
     def in_box(self, side: int, away_x: FloatArray | Float32Array, away_y: FloatArray | Float32Array) -> FloatArray:
@@ -101,18 +113,19 @@ class Balance:
         u = 0.5 * (np.square(d[0] / np.float32(self.window_px[0])) + np.square(d[1] / np.float32(self.window_px[1])))
         window = (1 + u / 8) ** -8
         arms = np.empty((SUMS, *window.shape), dtype=np.float32)
-        arms[0], arms[1:3] = light_weight(steps, self.few_steps), ALL_MOMENTS * d
-        arms[3], arms[4:6] = WINDOW_LIGHT * window, WINDOW_MOMENTS * window * d
-        for first, side, weight in zip((6, 8), (3, 5), self.box_weights, strict=True):
+        weights = self.weights
+        arms[0], arms[1:3] = _light_weight(steps, weights), weights.moments * d
+        arms[3], arms[4:6] = weights.window_light * window, weights.window_moments * window * d
+        for first, side, weight in ((6, 3, weights.box_3), (8, 5, weights.box_5)):
             follows = np.array(self.follows(side), dtype=np.float32)[:, None, None]
             box = np.float32(weight) * self.in_box(side, *away).astype(np.float32)
             arms[first : first + 2] = box * (d + follows * off)
         return arms
 
 
-def light_weight(steps: Float32Array, few_steps: float) -> Float32Array:
+def _light_weight(steps: Float32Array, weights: Weights) -> Float32Array:
     """The weight of all light of stars of so many steps of light, (n,)."""
-    return np.asarray(ALL_LIGHT * (1 + few_steps / np.maximum(steps, 1e-3)), dtype=np.float32)
+    return np.asarray(weights.light * (1 + weights.few_steps / np.maximum(steps, 1e-3)), dtype=np.float32)
 
 
 def _follows(half_sigmas: float) -> float:

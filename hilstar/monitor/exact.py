@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import Float32Array, IntArray
-from hilstar.monitor.balance import ALL_MOMENTS, AS_USUAL, LAST_LIGHT, SUMS, Balance, Seen
+from hilstar.monitor.balance import AS_USUAL, SUMS, Balance, Seen
 from hilstar.monitor.footprints import FootprintMap, Footprints, PlaceArray
 from hilstar.monitor.level_table import ThresholdCounter
 from hilstar.monitor.quantise import Panel, level_dtype
@@ -39,13 +39,15 @@ class _Pixels:
     """The near pixels of n stars, (near, n), light in steps from black: what the choice between two levels is about.
 
     `short` is what the lower level is off the wanted light (0 or less), `step` how much the next one adds (0 where there
-    is none to take). `arm` (SUMS, near, n) weighs a pixel's error into the sums of `error` (SUMS, n).
+    is none to take). `arm` (SUMS, near, n) weighs a pixel's error into the sums of `error` (SUMS, n), of which that of light
+    counts `last_light` times at the end.
     """
 
     short: Float32Array
     step: Float32Array
     arm: Float32Array
     error: Float32Array
+    last_light: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,9 +161,9 @@ class ExactQuantiser:
         error[0] += carried.phase * grid
         hidden = _between_steps(short.sum(axis=0) + error[0], grid)
         error[0] -= hidden
-        weight = np.stack([arm[0, 0], *np.full((2, len(grid)), np.float32(ALL_MOMENTS))])
+        weight = np.stack([arm[0, 0], *np.full((2, len(grid)), np.float32(self._balance.weights.moments))])
         error[:3] *= weight
-        up, left = _decide(_Pixels(short, step, arm, error), grid)
+        up, left = _decide(_Pixels(short, step, arm, error, self._balance.weights.last_light), grid)
         left[:3] /= weight
         left[0] += hidden
         return np.concatenate([lower + up, upper]), left
@@ -286,9 +288,9 @@ class _Kept:
         self.up[pixel] = np.where(taken, ~rises[other], rises)
         return np.asarray(self.up[pixel])
 
-    def best(self) -> tuple[npt.NDArray[np.bool_], Float32Array]:
-        """The pixels that are up in the best choice, (near, n), and its sums (SUMS, n)."""
-        heavier = (LAST_LIGHT**2 - 1) * np.square(self.error[0])
+    def best(self, last_light: float) -> tuple[npt.NDArray[np.bool_], Float32Array]:
+        """The pixels that are up in the best choice, (near, n), and its sums (SUMS, n); light counts `last_light` times."""
+        heavier = (last_light**2 - 1) * np.square(self.error[0])
         best = (np.square(self.error).sum(axis=0) + heavier + self.missing).argmin(axis=0)[None, None]
         up, error = (np.take_along_axis(part, best, axis=1)[:, 0] for part in (self.up, self.error))
         return np.asarray(up), np.asarray(error)
@@ -327,6 +329,6 @@ def _decide(pixels: _Pixels, grid: Float32Array) -> tuple[npt.NDArray[np.bool_],
         rise = step * (2 * (arm * error).sum(axis=0) + step * np.square(arm).sum(axis=0))
         rise[:, step == 0] = NONE
         error += arm * step * kept.compare(pixel, down, rise)
-    up, left = kept.best()
+    up, left = kept.best(pixels.last_light)
     _turn_one_more(pixels, up, left, grid)
     return up, left

@@ -11,13 +11,8 @@ import numpy.typing as npt
 
 from hilstar.arrays import Float32Array, IntArray
 from hilstar.monitor.balance import (
-    ALL_LIGHT,
-    ALL_MOMENTS,
-    LAST_LIGHT,
     PIXEL_VARIANCE,
     SUMS,
-    WINDOW_LIGHT,
-    WINDOW_MOMENTS,
     Balance,
 )
 from hilstar.monitor.exact import CARRIED
@@ -82,7 +77,7 @@ class ExactPass:
         version, body = resource_path("shaders", "exact.comp").read_text().split("\n", 1)
         with held():  # as for any program
             program = self._ctx.compute_shader("\n".join([version, *(f"#define {name}" for name in defines), body]))
-        window = balance.window_px
+        window, weights = balance.window_px, balance.weights
         values = {
             "footprint": order.size**2,
             "reach_px2": order.area_px2,
@@ -95,11 +90,11 @@ class ExactPass:
             "inverse_sigma_sqrt2": tuple(1 / (sigma * SQRT2) for sigma in balance.sigma_px),
             "half_inverse_window2": (0.5 / window[0] ** 2, 0.5 / window[1] ** 2),
             "half_inverse_spread2": tuple(0.5 / (sigma**2 + PIXEL_VARIANCE) for sigma in balance.sigma_px),
-            "boxes": tuple(weight / IN_BOX for weight in balance.box_weights),
+            "boxes": (weights.box_3 / IN_BOX, weights.box_5 / IN_BOX),
             "follows": (*balance.follows(3), *balance.follows(5)),
-            "weights": (ALL_LIGHT, ALL_MOMENTS, WINDOW_LIGHT, WINDOW_MOMENTS),
-            "few_steps": balance.few_steps,
-            "last_light": LAST_LIGHT,
+            "weights": (weights.light, weights.moments, weights.window_light, weights.window_moments),
+            "few_steps": weights.few_steps,
+            "last_light": weights.last_light,
         } | ({"gain": 0} if self._gain is not None else {})
         for name, value in values.items():
             if name in program:  # compilers drop what they do not need

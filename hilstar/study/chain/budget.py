@@ -1,4 +1,4 @@
-"""Where a combination's error comes from, and where its time goes.
+"""Where a combination's error comes from.
 
 The steps are added one by one to a display that does everything exactly, in the order of the chain, and each is charged with
 what it changes in the stars that the tracker measures: all of them together are the whole error, star by star. Cut sprites come
@@ -19,7 +19,6 @@ from hilstar.scene.frame_motion import Turn, swept_sprites
 from hilstar.scene.sprites import Sprites, make_sprites
 from hilstar.sky.stars import Stars
 from hilstar.study.chain.combinations import Combination
-from hilstar.study.chain.drawing import STAGES, Stopwatch
 from hilstar.study.chain.measuring import SceneMeasurement, pooled
 from hilstar.study.chain.panel import Lit
 from hilstar.study.chain.tracker import Measured, off
@@ -27,7 +26,6 @@ from hilstar.study.chain.true_light import linear_light
 
 STEPS = ("refresh", "prediction", "smear", "depth", "codes", "sprites")
 RSS, WHOLE = "rss", "whole"
-WARM_UP, TIMED_FRAMES = 2, 15
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,14 +37,6 @@ class Part:
     mag: float
 
 
-@dataclass(frozen=True, slots=True)
-class StageTime:
-    """What a stage of a frame takes, ms."""
-
-    stage: str
-    ms: float
-
-
 def error_budget(scene: SceneMeasurement, combination: Combination) -> list[Part]:
     """The parts of a combination's error by STEPS, then RSS and WHOLE."""
     found = [[judge.sky, *_measured(scene, combination, number)] for number, judge in enumerate(scene.judges)]
@@ -56,13 +46,6 @@ def error_budget(scene: SceneMeasurement, combination: Combination) -> list[Part
     rss = [float(np.sqrt(sum(getattr(part, name) ** 2 for part in parts))) for name in ("arcsec", "mag")]
     whole = pooled([off(scene.tracker, one[-1], one[0]) for one in found])
     return [*parts, Part(RSS, *rss), Part(WHOLE, *whole)]
-
-
-def time_budget(scene: SceneMeasurement, combination: Combination) -> list[StageTime]:
-    """The median time of each of STAGES."""
-    watch = Stopwatch(scene.chain(combination))
-    times = [watch.stages_ms() for _ in range(WARM_UP + TIMED_FRAMES)][WARM_UP:]
-    return [StageTime(stage, float(ms)) for stage, ms in zip(STAGES, np.median(times, axis=0), strict=True)]
 
 
 def _measured(scene: SceneMeasurement, combination: Combination, number: int) -> Iterator[Measured]:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hilstar.charts import STYLE, plain_ticks, save
+from hilstar.charts import STYLE, plain_ticks, save, title_lines
 from hilstar.study.chain.budget import RSS, WHOLE
 from hilstar.study.chain.combinations import QUANTISATIONS
 from hilstar.study.chain.table import AUTO, DEFAULT, BudgetRow, Row, StageRow
@@ -31,8 +31,10 @@ WORDS = {RSS: "root sum square", "refresh": "refresh of the panel", "codes": "qu
 CHOSEN = {DEFAULT: ("D", "black"), AUTO: ("*", "C3")}
 
 
-def draw(path: Path, rows: Sequence[Row], budget: Sequence[BudgetRow], stages: Sequence[StageRow], machine: str) -> None:
-    """Write the picture. Raises InputError where it cannot be written."""
+def draw(
+    path: Path, rows: Sequence[Row], budget: Sequence[BudgetRow], stages: Sequence[StageRow], head: tuple[str, str]
+) -> None:
+    """Write the picture, with its finding and the machine of its times. Raises InputError where it cannot be written."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
@@ -61,7 +63,8 @@ def draw(path: Path, rows: Sequence[Row], budget: Sequence[BudgetRow], stages: S
         ):
             grid[row][0].set_ylabel(label)
         figure.legend(handles=_legend(rows), loc="outside lower center", ncols=5, fontsize=10)
-        figure.suptitle(f"The whole frame's error, as the tracker measures it, against its time: {machine}", fontsize=14)
+        finding, machine = head
+        figure.suptitle(f"{title_lines(finding)}\n{machine}", fontsize=14)
         save(figure, path)
 
 
@@ -132,7 +135,7 @@ def _times(axes: Axes, stages: Sequence[StageRow]) -> None:
 
 def _round_ticks(axis: Axis, low: float, high: float) -> None:
     first, last = math.floor(math.log10(low)), math.ceil(math.log10(high))
-    steps = (1, 2, 5) if last - first <= 3 else (1,)
+    steps = (1, 1.5, 2, 3, 5, 7) if high < 8 * low else (1, 2, 5) if high < 200 * low else (1,)
     ticks = [step * 10.0**power for power in range(first, last + 1) for step in steps]
     plain_ticks(axis, [tick for tick in ticks if low <= tick <= high])
 

@@ -12,7 +12,7 @@ import numpy as np
 from hilstar.rotation import propagate
 from hilstar.study.chain.bench_parts import Marks, Parts
 from hilstar.study.chain.combinations import Combination, combinations
-from hilstar.study.chain.drawing import Chain, Stopwatch
+from hilstar.study.chain.drawing import STAGES, Chain, Stopwatch
 from hilstar.study.chain.motion import Movement
 from hilstar.study.chain.panel import exposure
 from hilstar.study.chain.scenes import Scene
@@ -62,6 +62,14 @@ class Times:
 
 
 @dataclass(frozen=True, slots=True)
+class StageTime:
+    """The median time of a stage of a frame, ms."""
+
+    stage: str
+    ms: float
+
+
+@dataclass(frozen=True, slots=True)
 class Outcome:
     """A combination as measured."""
 
@@ -102,14 +110,15 @@ class SceneMeasurement:
         step_rad = np.array([*PHASE_STEP_PX, 0.0]) / self.tracker.camera.focal_length_px
         return replace(self.movement, q_icrs_to_cam=propagate(self.movement.q_icrs_to_cam, step_rad, number))
 
-    def outcomes(self) -> list[Outcome]:
-        """Every combination's error and time."""
+    def outcomes(self) -> tuple[list[Outcome], list[StageTime]]:
+        """Every combination's error and time, and what the stages of `auto` take."""
         chains = [self.chain(combination) for combination in self.combinations]
-        times = timed(chains, self.plan.time_s)
-        return [
+        times, stages = timed(chains, self.plan.time_s, self.combinations.index(self.marks.auto))
+        found = [
             Outcome(chain.combination, sprite_px(chain), self.error(chain.combination), spent)
             for chain, spent in zip(chains, times, strict=True)
         ]
+        return found, stages
 
     def error(self, combination: Combination) -> Error:
         """A combination's error over all exposures."""
@@ -143,15 +152,17 @@ def sprite_px(chain: Chain) -> str:
     return f"{low}" if low == high else f"{low} to {high}"
 
 
-def timed(chains: Sequence[Chain], time_s: float) -> list[Times]:
-    """The times of all chains, in rounds of which each has an order of its own, so that other load on the machine affects all.
+def timed(chains: Sequence[Chain], time_s: float, staged: int) -> tuple[list[Times], list[StageTime]]:
+    """The times of all chains, and those of the stages of one of them.
 
-    A visit's first frame is not counted: it fills what the chain before has emptied.
+    In rounds, each with an order of its own, so that other load on the machine affects all. A visit's first frame is not
+    counted: it fills what the chain before has emptied.
     """
     watches = [Stopwatch(chain) for chain in chains]
     for watch in watches:
         watch.frame_ms()
     spent: list[list[tuple[float, float]]] = [[] for _ in watches]
+    stages: list[tuple[float, ...]] = []
     rng, begin = np.random.default_rng(SEED), time.perf_counter()
     for number in range(MAX_ROUNDS):
         if number >= MIN_ROUNDS and time.perf_counter() - begin > time_s:
@@ -159,7 +170,10 @@ def timed(chains: Sequence[Chain], time_s: float) -> list[Times]:
         for k in rng.permutation(len(watches)):
             watches[k].frame_ms()
             spent[k] += [watches[k].frame_ms() for _ in range(FRAMES_A_VISIT)]
-    return [_times(np.array(one)) for one in spent]
+            if k == staged:
+                stages += [watches[k].stages_ms() for _ in range(FRAMES_A_VISIT)]
+    middle = np.median(stages, axis=0).tolist()
+    return [_times(np.array(one)) for one in spent], [StageTime(*pair) for pair in zip(STAGES, middle, strict=True)]
 
 
 def _times(spent: np.ndarray) -> Times:

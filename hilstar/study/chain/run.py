@@ -9,13 +9,13 @@ from pathlib import Path
 from hilstar.bench.bench_file import BenchFile
 from hilstar.errors import InputError
 from hilstar.study.chain.bench_parts import Parts
-from hilstar.study.chain.budget import error_budget, time_budget
+from hilstar.study.chain.budget import error_budget
 from hilstar.study.chain.chart import draw
 from hilstar.study.chain.measuring import QUICK, Plan, SceneMeasurement
 from hilstar.study.chain.scenes import five_scenes
 from hilstar.study.chain.table import BudgetRow, Row, StageRow, budget_rows, rows_of, stage_rows, write_tables
 from hilstar.study.chain.tracker import Tracker
-from hilstar.study.chain.verdict import is_right, scene_line
+from hilstar.study.chain.verdict import headline, is_right, scene_line
 
 OUTPUTS = ("chain.png", "chain.csv", "chain_budget.csv", "chain_time.csv")
 
@@ -40,10 +40,11 @@ def run(
                 if not measurement.star_count:
                     lines.append(f"{scene.name}: not measured: no star stands alone and stays in view over the exposure")
                     continue
-                own = rows_of(measurement, measurement.outcomes())
+                outcomes, stage_times = measurement.outcomes()
+                own = rows_of(measurement, outcomes)
                 auto = measurement.marks.auto
                 parts_of_error = budget_rows(scene.name, error_budget(measurement, auto))
-                parts_of_time = stage_rows(scene.name, time_budget(measurement, auto))
+                parts_of_time = stage_rows(scene.name, stage_times)
                 lines.append(scene_line(own, parts_of_error, parts_of_time))
                 right = right and is_right(own)
                 rows, budget, stages = rows + own, budget + parts_of_error, stages + parts_of_time
@@ -55,5 +56,5 @@ def run(
     if not rows:
         raise InputError(f"{file.path}: no star stands alone in view in any scene; write a larger [sky] faintest_v_mag")
     write_tables(directory, rows, budget, stages)
-    draw(directory / "chain.png", rows, budget, stages, machine)
+    draw(directory / "chain.png", rows, budget, stages, (headline(rows), machine))
     return [*lines, f"times on {machine}"], right

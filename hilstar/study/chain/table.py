@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from hilstar.charts import write_records
-from hilstar.study.chain.budget import Part, StageTime
+from hilstar.study.chain.budget import Part
 from hilstar.study.chain.front import Point, beaters, front
-from hilstar.study.chain.measuring import Outcome, SceneMeasurement
+from hilstar.study.chain.measuring import Outcome, SceneMeasurement, StageTime
 
 DIGITS, MS_PLACES = 4, 4
 AUTO, DEFAULT = "auto", "default"

@@ -103,7 +103,7 @@ class Judge:
         self.judged = np.zeros(0, dtype=np.intp)
         self.sky = Measured(np.zeros((0, 3)), np.zeros(0))
         places_px = self._paths() if movement.turns else (self._x_px, self._y_px)
-        inside = self._inside(*places_px, self._margin_px()).reshape(-1, len(self._star)).all(axis=0)
+        inside = np.atleast_2d(self._inside(*places_px, self._margin_px())).all(axis=0)
         if not (self._wanted & inside).any():
             return
         self._wanted &= inside

@@ -23,6 +23,15 @@ def scene_line(rows: Sequence[Row], budget: Sequence[BudgetRow], stages: Sequenc
     )
 
 
+def headline(rows: Sequence[Row]) -> str:
+    """What the whole table says of `auto`."""
+    scenes = [[row for row in rows if row.scene == name] for name in dict.fromkeys(row.scene for row in rows)]
+    on, others = [own for own in scenes if not beating(own)[0]], [own for own in scenes if beating(own)[0]]
+    beaten = "".join(f"; {own[0].scene}: {words(_nearest(beating(own)[0]))} beats it" for own in others)
+    where = f"in {len(on)} of {len(scenes)} scenes"
+    return f'effort = "auto" is on the front of error against time, or within its noise, {where}{beaten}'
+
+
 def is_right(rows: Sequence[Row]) -> bool:
     """Whether `auto` is on the front of what effort may choose, or within the noise of it."""
     return not beating(rows, as_filed=True)[0]
@@ -57,12 +66,14 @@ def why_not(own: Row, other: Row) -> str:
         reasons.append(
             "bit stealing is the bench file's choice, for a panel whose primaries are known as the tracker sees them"
         )
-    if other.prediction != own.prediction:
+    if other.prediction != own.prediction and own.prediction == "held":
+        reasons.append("[attitude] max_extrapolation_ms = 0 is the bench file's choice")
+    elif other.prediction != own.prediction:
         reasons.append(f"prediction by {other.prediction} is the sender's choice (whether its packets have rates)")
     if other.faintest_v_mag != own.faintest_v_mag:
         reasons.append("the catalogue's depth is the bench file's choice")
     if other.quantisation == "temporal":
-        reasons.append("temporal is only right over a whole exposure, and effort asks for each frame")
+        reasons.append("temporal is right over an exposure, and effort asks for light that is right in each frame")
     elif other.quantisation != own.quantisation:
         reasons.append(
             f"effort compares {own.quantisation} and {other.quantisation} by their worst star at any sub-pixel phase, not by a"

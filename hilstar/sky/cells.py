@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,16 +41,19 @@ class CellGrid:
         """
         if not len(self.start):
             return np.empty(0, dtype=np.intp)
-        widest = self.cos_radius.min()  # one bound for all cells, then each hit cell's own
-        farthest = min(radius_rad + reach_rad + float(np.arccos(widest)), np.pi)
-        hit = (self.centre @ axis >= np.cos(farthest)).nonzero()[0]
+        widest_rad = math.acos(self.cos_radius.min())  # one bound for all cells, then each hit cell's own
+        farthest_rad = min(radius_rad + reach_rad + widest_rad, math.pi)
+        hit = (self.centre @ axis >= math.cos(farthest_rad)).nonzero()[0]
         centre = self.centre.take(hit, axis=0).T
         cos_radius, sin_radius = self.cos_radius.take(hit), self.sin_radius.take(hit)
-        within = axis @ centre >= np.cos(radius_rad + reach_rad) * cos_radius - np.sin(radius_rad + reach_rad) * sin_radius
-        if edges is not None and reach_rad < np.pi / 2:
-            deepest = np.cos(reach_rad) * sin_radius + np.sin(reach_rad) * cos_radius
-            deepest[np.cos(reach_rad) * cos_radius <= np.sin(reach_rad) * sin_radius] = 1.0  # a cell wider than a plane bounds
-            within &= (edges @ centre >= -deepest).all(axis=0)
+        cosine, sine = math.cos(radius_rad + reach_rad), math.sin(radius_rad + reach_rad)
+        within = axis @ centre >= cosine * cos_radius - sine * sin_radius
+        if edges is not None and reach_rad < math.pi / 2:
+            cosine, sine = math.cos(reach_rad), math.sin(reach_rad)
+            deepest = cosine * sin_radius + sine * cos_radius
+            if widest_rad + reach_rad >= math.pi / 2:
+                deepest[cosine * cos_radius <= sine * sin_radius] = 1.0  # a cell wider than a plane bounds
+            within &= (edges @ centre + deepest).min(axis=0) >= 0
         return self._stars(hit[within])
 
     def _stars(self, cells: IntArray) -> IntArray:

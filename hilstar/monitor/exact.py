@@ -124,9 +124,8 @@ class ExactQuantiser:
     def _reach(self, of_star_e_per_s: Float32Array) -> IntArray:
         """How many pixels of stars of so much light (n,) are chosen, (n,)."""
         order = self._map.order
-        if (
-            self.over_frames
-        ):  # pixels that stay dark would be off the same way in each frame, which the others cannot make up for
+        # Over frames all: pixels that stay dark are off the same way in each, and the others cannot make up for it.
+        if self.over_frames:
             return np.full(len(of_star_e_per_s), order.near)
         return order.reach(of_star_e_per_s / np.float32(self._step_e_per_s))
 

@@ -92,6 +92,16 @@ def test_a_frame_is_the_oracle_s_after_the_same_frame_before(bits, uniformity):
             oracle.left = left
 
 
+def test_without_compute_shaders_it_is_numpy_s(monkeypatch):
+    monkeypatch.setattr("hilstar.render.exact_pass.MIN_VERSION", 999)
+    target = Target(SIZE, SIGMA, srgb_response(8), WHITE, "temporal")
+    oracle, sprites = TemporalQuantiser(target.panel(), SIZE, SIGMA), stars(*places(), SIX_MAG)
+    with Renderer(target) as gl:
+        for frame in range(3):
+            gl.draw(sprites, frame)
+            assert np.array_equal(gl.codes(), oracle.levels(sprites))
+
+
 def test_paths_keep_their_light_over_the_frames():
     """6 px a frame in five sprites, one way after another: within the aim, by GL as by NumPy."""
     panel = Panel(srgb_response(8), WHITE)

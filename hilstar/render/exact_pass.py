@@ -33,6 +33,7 @@ IN_BOX = 1023  # what a pixel's part in a box is counted in: ten bits
 # Narrower sprites have moments of their pixels: exp(-2 pi^2 sigma^2) / pi px, here 5e-6, of thousands of steps of light.
 NARROW_PX = 0.75
 RUN, MAX_RUNS, HALF_OCTAVES = 256, 2048, 32  # of stars that are sorted by light; runs times half octaves fill 16 bits
+PARTS = ("inputs", "stars", "choices")  # of the shader, before exact.comp
 LOCAL_SIZE = 32  # as in exact.comp
 FIRST_BINDING = 4  # of a Memory's buffers
 BEGIN_DTYPE = np.dtype([("before", "<i4"), ("phase", "<f4")])
@@ -75,8 +76,9 @@ class ExactPass:
         defines += ["PATHS"] * paths + ["UNIFORMITY"] * (self._gain is not None)
         defines += ["TEMPORAL"] * balance.over_frames
         version, body = resource_path("shaders", "exact.comp").read_text().split("\n", 1)
+        before = [resource_path("shaders", f"exact/{part}.glsl").read_text() for part in PARTS]
         with held():  # as for any program
-            program = self._ctx.compute_shader("\n".join([version, *(f"#define {name}" for name in defines), body]))
+            program = self._ctx.compute_shader("\n".join([version, *(f"#define {name}" for name in defines), *before, body]))
         window, weights = balance.window_px, balance.weights
         values = {
             "footprint": order.size**2,

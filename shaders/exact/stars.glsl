@@ -1,0 +1,145 @@
+// What a star gives a pixel, and which pixels are a star's own. Part of exact.comp.
+
+// A star's shares of light along x and y in a pixel at `d` from it, and in the whole pixel: as in splat.frag.
+#ifdef LOG2_SHARE
+vec2 shares_at(vec2 d) {
+    return exp2(LOG2_SHARE((d * d)));
+}
+
+float share_at(vec2 d) {
+    vec2 power = LOG2_SHARE((d * d));
+    return exp2(power.x + power.y);
+}
+#else
+vec4 erf4(vec4 value) {
+    vec4 x = clamp(value, -4.0, 4.0);
+    vec4 s = x * x;
+    vec4 p = s * -2.72614225801306e-10 + 2.77068142495902e-08;
+    p = p * s - 2.10102402082508e-06;
+    p = p * s - 5.69250639462346e-05;
+    p = p * s - 7.34990630326855e-04;
+    p = p * s - 2.95459980854025e-03;
+    p = p * s - 1.60960333262415e-02;
+    vec4 q = s * -1.45660718464996e-05 - 2.13374055278905e-04;
+    q = q * s - 1.68282697438203e-03;
+    q = q * s - 7.37332916720468e-03;
+    q = q * s - 1.42647390514189e-02;
+    return x * p / q;
+}
+
+vec2 shares_at(vec2 d) {
+    vec4 e = erf4(vec4(d - 0.5, d + 0.5) * inverse_sigma_sqrt2.xyxy);
+    return 0.5 * max(e.zw - e.xy, 0.0);
+}
+
+float share_at(vec2 d) {
+    vec2 share = shares_at(d);
+    return share.x * share.y;
+}
+#endif
+
+// A sprite, or one that is not there: without light.
+struct Star {
+    ivec2 pixel;
+    vec2 fraction;
+    float e_per_s;
+};
+
+ivec2 pixel_of(int i) {
+    return ivec2(sprite[5 * i], sprite[5 * i + 1]);
+}
+
+Star star_of(int i) {
+    return Star(
+        pixel_of(i),
+        vec2(intBitsToFloat(sprite[5 * i + 2]), intBitsToFloat(sprite[5 * i + 3])),
+        intBitsToFloat(sprite[5 * i + 4]));
+}
+
+ivec2 offset_of(uint place) {
+    return ivec2(place & 63u, place >> 6 & 63u) - 32;
+}
+
+bool on_image(ivec2 at) {
+    return all(greaterThanEqual(at, ivec2(0))) && all(lessThan(at, resolution_px));
+}
+
+#ifndef PATHS
+// A star's light and its moments about the star in all pixels of its footprint that are on the image: its whole light and none, but
+// where the image's edge cuts it, or where it is so narrow that its pixels' middles are not where their light is (NARROW).
+vec3 whole_of(Star star) {
+#ifndef NARROW
+    if (on_image(star.pixel + FIRST) && on_image(star.pixel + FIRST + SIZE - 1)) return vec3(star.e_per_s, 0.0, 0.0);
+#endif
+    vec2 light = vec2(0.0), moment = vec2(0.0);
+    for (int k = FIRST; k < FIRST + SIZE; k++) {
+        vec2 d = float(k) - star.fraction;
+        ivec2 at = star.pixel + k;
+        vec2 there = vec2(at.x >= 0 && at.x < resolution_px.x, at.y >= 0 && at.y < resolution_px.y);
+        vec2 share = shares_at(d) * there;
+        light += share;
+        moment += share * d;
+    }
+    return star.e_per_s * vec3(light.x * light.y, moment.x * light.y, light.x * moment.y);
+}
+#endif
+
+float output_of(ivec2 at) {
+#ifdef UNIFORMITY
+    return 1.0 / texelFetch(gain, at, 0).r;
+#else
+    return 1.0;
+#endif
+}
+
+#ifdef PATHS
+const int BESIDE = 1;  // sprites of a path before and after that give most of the light in the pixels nearest to a sprite
+
+// The sprites about sprite `i` of a path: place from its pixel, and the exponent of its light, far below any where there is none.
+vec3 beside[2 * BESIDE + 1];
+
+vec3 beside_at(int i, ivec2 path, ivec2 pixel) {
+    Star star = star_of(clamp(i, path.x, path.y - 1));
+    bool there = i >= path.x && i < path.y;
+    return vec3(vec2(star.pixel - pixel) + star.fraction, there ? log(max(star.e_per_s, 1e-30)) : -NONE);
+}
+
+void look_beside(int i, ivec2 path) {
+    ivec2 pixel = pixel_of(i);
+    for (int j = 0; j < 2 * BESIDE + 1; j++) beside[j] = beside_at(i + j - BESIDE, path, pixel);
+}
+
+// From the sprite before to sprite `i`.
+void look_on(int i, ivec2 path) {
+    ivec2 pixel = pixel_of(i);
+    vec3 back = vec3(vec2(pixel_of(i - 1) - pixel), 0.0);
+    for (int j = 0; j < 2 * BESIDE; j++) beside[j] = beside[j + 1] + back;
+    beside[2 * BESIDE] = beside_at(i + BESIDE, path, pixel);
+}
+
+float exponent_of(int j, vec2 offset) {
+    vec2 d = offset - beside[j].xy;
+    return beside[j].z - dot(d * d, half_inverse_spread2);
+}
+
+// Whether a pixel is nearer to a sprite than to those before and after it in its path.
+bool nearest_in_path(vec2 offset) {
+    float own = exponent_of(BESIDE, offset);
+    return exponent_of(BESIDE - 1, offset) < own && exponent_of(BESIDE + 1, offset) <= own;
+}
+
+// The light of a path in a pixel nearest to its sprite; a tenth or so is of sprites farther along.
+float path_light_at(vec2 offset) {
+    float light = 0.0;
+    for (int j = 0; j < 2 * BESIDE + 1; j++) light += exp(exponent_of(j, offset));
+    return light * sqrt(half_inverse_spread2.x * half_inverse_spread2.y) / PI;
+}
+#endif
+
+// The light that a pixel should show, e-/s, negative where it is not this star's; `own` is what the star gives.
+float asked_of(ivec2 at, float own) {
+    if (!on_image(at)) return -1.0;
+    float drawn = imageLoad(linear_e_per_s, at).r;
+    // A faint star's sprite may end before its near pixels do.
+    return 2.0 * own > drawn * 1.0001 ? (drawn > 0.0 ? drawn : own) : -1.0;
+}

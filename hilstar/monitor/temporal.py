@@ -25,6 +25,8 @@ from hilstar.scene.sprites import Sprites
 MAX_CARRIED_STEPS = 8.0
 GOLDEN = 2654435769  # 2^32 over the golden ratio: its multiples, modulo 2^32, are spread evenly, any number of them
 NONE_BEFORE = -1
+    1 << 20
+)  # of stars for a table of them, which is made in each frame: 0.2 ms; of more stars those in view are sorted
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,10 +85,9 @@ def places_before(before: IntArray | None, star: IntArray) -> IntArray:
     """
     if before is None or not len(before) or not len(star):
         return np.full(len(star), NONE_BEFORE, dtype=np.int32)
-    lowest = min(int(before.min()), int(star.min()))  # light of a fault has negative numbers
-    place = np.full(max(int(before.max()), int(star.max())) - lowest + 1, NONE_BEFORE, dtype=np.int32)
-    place[before - lowest] = np.arange(len(before), dtype=np.int32)
-    return np.asarray(place[star - lowest])
+    order = np.argsort(before, kind="stable")
+    found = np.maximum(np.searchsorted(before[order], star, side="right") - 1, 0)
+    return np.where(before[order[found]] == star, order[found], NONE_BEFORE).astype(np.int32)
 
 
 def first_phases(star: IntArray, before: IntArray) -> Float32Array:

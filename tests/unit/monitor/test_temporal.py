@@ -193,6 +193,14 @@ def test_a_star_is_known_by_its_number_in_whatever_order_they_come(rng):
     assert places_before(np.array([7, -2, 7]), np.array([-2, 3, 7, 900])).tolist() == [1, NONE_BEFORE, 2, NONE_BEFORE]
 
 
+def test_each_star_has_its_last_place_of_the_frame_before(rng):
+    for count in (1, 5, 200):
+        before, star = rng.integers(-20, 300, count), rng.integers(-25, 310, 150)
+        places = {number: place for place, number in enumerate(before.tolist())}
+        assert places_before(before, star).tolist() == [places.get(number, NONE_BEFORE) for number in star.tolist()]
+    assert places_before(before[:0], star).max() == places_before(None, star).max() == NONE_BEFORE
+
+
 def test_stars_over_each_other_are_right_together(rng):
     """600 stars, several to a tile: light that is right in each tile of 22 px but for its edges."""
     panel = Panel(srgb_response(8), WHITE)

@@ -25,8 +25,6 @@ from hilstar.scene.sprites import Sprites
 MAX_CARRIED_STEPS = 8.0
 GOLDEN = 2654435769  # 2^32 over the golden ratio: its multiples, modulo 2^32, are spread evenly, any number of them
 NONE_BEFORE = -1
-    1 << 20
-)  # of stars for a table of them, which is made in each frame: 0.2 ms; of more stars those in view are sorted
 
 
 @dataclass(frozen=True, slots=True)

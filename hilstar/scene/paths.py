@@ -65,12 +65,13 @@ class Paths:
         self.speed_rad_s = float(np.linalg.norm(rate_image_rad_s))
         x, y, z = rate_image_rad_s / (self.speed_rad_s or 1.0)
         axis = np.array([x, y, z])
-        self._seen = seen
-        self._cross = seen @ np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])
-        self._along = (seen @ axis)[:, None] * axis
+        # Component by component (3, n): several times faster than direction by direction.
+        self._seen = np.ascontiguousarray(seen.T)
+        self._cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ self._seen
+        self._along = axis[:, None] * (axis @ self._seen)
 
     def __len__(self) -> int:
-        return len(self._seen)
+        return int(self._seen.shape[1])
 
     def through(self, camera: Camera) -> Paths:
         """The same paths seen by another camera that turns with this one."""
@@ -80,21 +81,23 @@ class Paths:
 
     def places_px(self, star: IntArray | slice, seconds: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Pixel x and y of the stars at places `star` (k,), each at its own of `seconds` (k,); NaN behind the camera."""
-        return self._places_px(self._seen[star], self._cross[star], self._along[star], seconds)
+        return self._places_px(self._seen[:, star], self._cross[:, star], self._along[:, star], seconds)
 
     def all_places_px(self, seconds: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Pixel x and y (m, n) of all stars at `seconds` (m, 1), or (m, n) of their own; NaN behind the camera."""
         shape = len(seconds), len(self)
-        x_px, y_px = self._places_px(self._seen, self._cross, self._along, seconds)
+        x_px, y_px = self._places_px(self._seen[:, None], self._cross[:, None], self._along[:, None], seconds)
         return x_px.reshape(shape), y_px.reshape(shape)
 
     def _places_px(
         self, seen: FloatArray, cross: FloatArray, along: FloatArray, seconds: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        angle = (self.speed_rad_s * seconds)[..., None]
+        angle = self.speed_rad_s * seconds
         cosine = np.cos(angle)
-        turned = seen * cosine - cross * np.sin(angle) + along * (1 - cosine)
-        return self.camera.project_outward(turned.reshape(-1, 3))
+        turned = seen * cosine
+        turned -= cross * np.sin(angle)
+        turned += along * (1 - cosine)
+        return self.camera.project_outward(turned.reshape(3, -1).T)
 
 
 @dataclass(frozen=True, slots=True)

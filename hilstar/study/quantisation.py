@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -35,7 +36,7 @@ def run(directory: Path, quick: bool = False) -> list[str]:
     """Write the charts (PNG) and their tables (CSV) into `directory`; a line for each finding."""
     phases, mags = (8, np.linspace(0, 8, 5)) if quick else (32, np.linspace(0, 10, 41))
     found: Found = {(bits, way.name): code_errors(bits, way, phases, mags) for bits in BITS for way in WAYS}
-    times = {(bits, way.name): _frame_ms(bits, way, 3 if quick else 21) for bits in BITS for way in WAYS}
+    times = {(bits, name): ms for bits in BITS for name, ms in _frames_ms(bits, 3 if quick else 31).items()}
     rows = [
         (bits, name, float(mag), *error_cells(e))
         for (bits, name), errors in found.items()
@@ -55,18 +56,19 @@ def run(directory: Path, quick: bool = False) -> list[str]:
     return [*findings, study_frames(directory, quick)]
 
 
-def _frame_ms(bits: int, way: Way, repeats: int) -> float:
-    """The median time of drawing STARS stars and reading their codes back."""
-    sprites = star_field(FRAME_PX, footprint_px(SIGMA_PX))
-    target = Target(FRAME_PX, SIGMA_PX, response_of(bits, way), WHITE, way.method)
-    times = []
-    with Renderer(target) as renderer:
-        for frame in range(repeats + 1):
-            begin = time.perf_counter()
-            renderer.draw(sprites, frame)
-            renderer.codes()
-            times.append((time.perf_counter() - begin) * 1e3)
-    return float(np.median(times[1:]))
+def _frames_ms(bits: int, rounds: int) -> dict[str, float]:
+    """The median times of drawing STARS stars and reading their codes back, by way, in turn, so that all bear the same load."""
+    sprites, times = star_field(FRAME_PX, footprint_px(SIGMA_PX)), {way.name: list[float]() for way in WAYS}
+    with ExitStack() as stack:
+        targets = {way.name: Target(FRAME_PX, SIGMA_PX, response_of(bits, way), WHITE, way.method) for way in WAYS}
+        renderers = {name: stack.enter_context(Renderer(target)) for name, target in targets.items()}
+        for frame in range(rounds + 1):
+            for name, renderer in renderers.items():
+                begin = time.perf_counter()
+                renderer.draw(sprites, frame)
+                renderer.codes()
+                times[name].append((time.perf_counter() - begin) * 1e3)
+    return {name: float(np.median(each[1:])) for name, each in times.items()}
 
 
 def _summary(bits: int, found: Found, mags: FloatArray) -> str:

@@ -55,7 +55,7 @@ def _explain(message: str, tables: dict[str, Any], kind: Kind) -> str:
     if missing:
         name = f"key {missing[1]}" if names else f"table [{missing[1]}]"
         return f"{_place(names)}the {name} is missing; add it (see {kind.reference})"
-    wanted = fault.removeprefix("Expected ").replace("`", "").split(", got ")[0]
+    wanted = fault.removeprefix("Expected ").replace("`", "").split(", got ")[0].removesuffix(" | null")
     for type_name, word in kind.type_words.items():
         wanted = re.sub(rf"\b{type_name}\b", word, wanted)
     table, key = [n for n in names if not n.isdigit()][:-1], [n for n in names if not n.isdigit()][-1]
@@ -76,7 +76,9 @@ def _toml(value: Any) -> str:
 
 def _choices(fields: tuple[msgspec.structs.FieldInfo, ...], key: str) -> tuple[str, ...]:
     kinds = {field.name: field.type for field in fields}
-    return get_args(plain(kinds[key]))
+    kind = plain(kinds[key])
+    # Of `X | None`, those of X: no file has a None.
+    return tuple(choice for part in (get_args(kind) if type(None) in get_args(kind) else (kind,)) for choice in get_args(part))
 
 
 def _place(names: list[str]) -> str:

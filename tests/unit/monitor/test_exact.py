@@ -24,8 +24,9 @@ FIELD = (160, 120)
 AIMS = [(10, 0.02, 8.0, 0.05), (8, 0.05, 6.0, 0.03)]
 # Light in float32 (6e-8 of it, summed over 100 pixels) and steps called equal within SAME_STEP.
 EXCESS = 1 + 1e-3
-# Of the error of `round`, by each centroider; measured 0.18 to 0.40 on 16 x 16 phases.
-OF_ROUND = 0.42
+# Of the error of `round`, by each centroider; measured 0.19 to 0.33 at 32 x 32 phases on sRGB, 0.11 to 0.28 on a power law. The
+# choice among many is chaotic: another order of float32 sums moves it by some hundredths.
+OF_ROUND = 0.35
 FLUX_MAG = 0.01
 
 
@@ -104,7 +105,7 @@ def cut(image, tile):
 def test_whatever_centroider_a_tracker_has_finds_the_star_a_third_as_far_off_as_rounded(response):
     """Six magnitudes under white: 66 steps of light on sRGB."""
     panel = Panel(response, WHITE)
-    tile, count = 21, 16
+    tile, count = 21, 32
     place = (np.arange(count) + 0.5) * tile - 0.5 + (np.arange(count) + 0.5) / count - 0.5
     x, y = (axis.ravel() for axis in np.meshgrid(place, place))
     size = (count * tile, count * tile)

@@ -8,6 +8,7 @@ import select
 import signal
 import socket
 import sys
+import time
 from collections.abc import Callable
 from typing import NoReturn
 
@@ -15,6 +16,7 @@ from hilstar.attitude.wire.apart.records import Kind, pack
 from hilstar.process.parent import end_with_parent
 
 WANTED_BUFFER_BYTES = 1 << 20  # the kernel gives what it allows: some hundred messages, while nobody reads them
+LIFE_S = 1.0
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
@@ -23,7 +25,15 @@ class Wire:
 
     def __init__(self, made: socket.socket) -> None:
         self.socket = made
+        self._signed_s = -LIFE_S
         made.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, WANTED_BUFFER_BYTES)
+
+    def sign(self) -> None:
+        """Say that this process is ready, and from time to time that it still is."""
+        now_s = time.monotonic()
+        if now_s - self._signed_s >= LIFE_S:
+            self._signed_s = now_s
+            self.put(pack(Kind.READY, b""))
 
     def put(self, record: bytes) -> None:
         """Hand a record over; waits while the other side does not read, so that nothing grows here."""

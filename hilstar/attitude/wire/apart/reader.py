@@ -18,6 +18,8 @@ MAX_READ_BYTES = 1 << 20  # in one go
 MIN_BACK_OFF_S = 0.05
 MAX_BACK_OFF_S = 1.0
 STEADY_S = 10 * MAX_BACK_OFF_S
+STALLED_S = 3.0  # it says each second that it lives
+STARTS_S = 30.0  # and on a machine whose cores are all busy it begins within this
 READY_WITHIN_S = 5.0
 ENDS_WITHIN_S = 0.3  # in order; a signal leaves a command a second for all its ends
 
@@ -36,14 +38,14 @@ class Reader:
         self._wire: socket.socket | None = None
         self._stream = RecordStream()
         self._why, self._ready = "", False
-        self._begun_s = self._again_s = 0.0
+        self._begun_s = self._again_s = self._silent_s = 0.0
         self._back_off_s = MIN_BACK_OFF_S
         self._begin()
 
     def _begin(self) -> None:
         self.generation += 1
         self._begun_s, self._why, self._stream = time.monotonic(), "", RecordStream()
-        self._ready = False
+        self._ready, self._silent_s = False, 0.0
         wire, its_wire = socket.socketpair()
         wire.setblocking(False)
         self._wire = wire
@@ -82,7 +84,14 @@ class Reader:
             return False
         poll = select.poll()
         poll.register(self._wire, select.POLLIN)
-        return bool(poll.poll(timeout_ms))
+        begun_s = time.monotonic()
+        said = bool(poll.poll(timeout_ms))
+        # Only what was waited here counts: this process may have been stopped itself.
+        self._silent_s = 0.0 if said else self._silent_s + min(time.monotonic() - begun_s, timeout_ms / 1000)
+        limit_s = STALLED_S if self._ready else STARTS_S
+        if self._silent_s > limit_s:
+            self._ended(f"no sign of life for {limit_s:g} s")
+        return said
 
     def await_ready(self) -> None:
         """Wait until the process has imported what it needs; not for long, and not for one that failed."""

@@ -65,10 +65,10 @@ class _Device:
 
 def read_device(wire: Wire) -> None:
     """Read what is given, until the other side is gone (EOFError)."""
-    wire.put(pack(Kind.READY, b""))
     priority = PromptWhileLight()
     device = _Device(wire)
     while True:
+        wire.sign()
         file = device.file
         watched: list[int | socket.socket] = [wire.socket] if file is None else [wire.socket, file]
         asked_ns = time.monotonic_ns()

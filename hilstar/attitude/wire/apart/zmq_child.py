@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from hilstar.attitude.wire.apart.child import Wire, run_child
-from hilstar.attitude.wire.apart.records import Kind, pack, pack_message, pack_object
+from hilstar.attitude.wire.apart.records import Kind, pack_message, pack_object
 from hilstar.attitude.wire.flood_limits import LinkCounts
 from hilstar.attitude.wire.keys import CurveKeys
 from hilstar.attitude.wire.zmq_stream import ZmqReceiver
@@ -80,7 +80,7 @@ def _open(told: Any, notices: Notices) -> ZmqReceiver:
 
 def read_socket(wire: Wire) -> None:
     """Stamp and hand on what comes, until the other side is gone (EOFError). Raises InputError where it cannot be opened."""
-    wire.put(pack(Kind.READY, b""))
+    wire.sign()
     told = _ordered(wire)
     priority = PromptWhileLight()
     notices = ForwardedNotices(wire)
@@ -102,6 +102,7 @@ def read_socket(wire: Wire) -> None:
                 counted = link.link_counts.summary()
                 wire.put(pack_object(Kind.COUNTS, counted))
             priority.tend()
+            wire.sign()
 
 
 if __name__ == "__main__":

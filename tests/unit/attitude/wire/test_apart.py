@@ -94,14 +94,19 @@ def nasa42_road() -> Iterator[tuple]:
             yield link, lambda k: sender.sendall(message(0.1 * next(steps), Rotation.identity()).encode())
 
 
-def seen_late_ns(link, put) -> int:
-    """How late a message is stamped that leaves just before the lock is held; one that was read has come before it."""
+def await_packet(link, put, number: int) -> None:
+    """Send until one is heard: the road is open."""
 
     def heard() -> bool:
-        put(0)
+        put(number)
         return bool(link.receive(20))
 
     wait_for(heard, "the road is open", poll_s=0.02)
+
+
+def seen_late_ns(link, put) -> int:
+    """How late a message is stamped that leaves just before the lock is held; one that was read has come before it."""
+    await_packet(link, put, 0)
     while link.receive(100):
         pass
     left_ns = time.monotonic_ns()
@@ -123,7 +128,7 @@ def test_a_packet_is_stamped_while_the_process_that_draws_holds_pythons_lock(roa
 def test_a_thread_of_that_process_would_stamp_it_after():
     """So the test above can fail."""
     with zmq_road(ZmqReceiver) as (link, put):
-        wait_for(lambda: put(0) or link.receive(20), poll_s=0.02)
+        await_packet(link, put, 0)
         left_ns = time.monotonic_ns()
         put(1)
         hold_the_lock()
@@ -136,14 +141,24 @@ def child_of(link) -> int:
     return link._reader._process.pid
 
 
+def test_a_reader_that_hangs_is_begun_again(caplog, monkeypatch):
+    monkeypatch.setattr("hilstar.attitude.wire.apart.reader.STALLED_S", 1.5)  # over the second between its signs of life
+    with serial_road() as (link, put):
+        await_packet(link, put, 0)
+        os.kill(child_of(link), signal.SIGSTOP)
+        wait_for(lambda: not link.receive(100) and link._reader.generation == 2, poll_s=0.0)
+        await_packet(link, put, 2)
+    assert "the attitude receiver stopped (no sign of life for 1.5 s); restarting it" in caplog.text
+
+
 @pytest.mark.parametrize("road", [zmq_road, serial_road])
 def test_a_reader_that_dies_is_begun_again_and_the_link_goes_on(road, caplog):
     with road() as (link, put):
-        wait_for(lambda: put(0) or link.receive(20), poll_s=0.02)
+        await_packet(link, put, 0)
         first = child_of(link)
         os.kill(first, signal.SIGKILL)
         wait_for(lambda: not link.receive(20) and link._reader.generation == 2)
-        wait_for(lambda: put(1) or link.receive(20), poll_s=0.02)
+        await_packet(link, put, 1)
         second = child_of(link)
     assert link._notices.counts()["receiver-failed"] == 1
     assert "the attitude receiver stopped (signal 9); restarting it" in caplog.text

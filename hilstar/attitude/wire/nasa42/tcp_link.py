@@ -14,11 +14,11 @@ from typing import Self
 
 from hilstar.attitude.wire.endpoint import Endpoint, check_use, parse_endpoint
 from hilstar.attitude.wire.flood_limits import FloodGate, LinkCounts
-from hilstar.attitude.wire.kernel_stamps import ANCILLARY_BYTES, KernelStamps
 from hilstar.attitude.wire.links import Arrival
 from hilstar.attitude.wire.nasa42.messages import CONVENTIONS, MessageReader, MessageSplitter
 from hilstar.attitude.wire.packet import Event, Packet
 from hilstar.attitude.wire.udp.addresses import AllowedSenders
+from hilstar.attitude.wire.udp.kernel_stamps import ANCILLARY_BYTES, KernelStamps
 from hilstar.errors import InputError
 from hilstar.notices import Notices
 

@@ -12,10 +12,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from hilstar.attitude.wire.kernel_stamps import ANCILLARY_BYTES, KernelStamps, monotonic_minus_realtime_ns
 from hilstar.attitude.wire.packet import MAX_JSON_BYTES
 from hilstar.attitude.wire.udp.addresses import Network, Place
 from hilstar.attitude.wire.udp.kernel_filter import keep_only
+from hilstar.attitude.wire.udp.kernel_stamps import ANCILLARY_BYTES, KernelStamps, monotonic_minus_realtime_ns
 from hilstar.errors import InputError
 
 MAX_DATAGRAM_BYTES = MAX_JSON_BYTES + 1  # the rest of a longer one is cut off, and `packet.decode` refuses what is left

@@ -167,11 +167,13 @@ def timed(chains: Sequence[Chain], time_s: float, staged: int) -> tuple[list[Tim
     for number in range(MAX_ROUNDS):
         if number >= MIN_ROUNDS and time.perf_counter() - begin > time_s:
             break
-        for k in rng.permutation(len(watches)):
+        for k in rng.permutation(len(watches) + 1):
+            if k == len(watches):
+                watches[staged].frame_ms()
+                stages += [watches[staged].stages_ms() for _ in range(FRAMES_A_VISIT)]
+                continue
             watches[k].frame_ms()
             spent[k] += [watches[k].frame_ms() for _ in range(FRAMES_A_VISIT)]
-            if k == staged:
-                stages += [watches[k].stages_ms() for _ in range(FRAMES_A_VISIT)]
     middle = np.median(stages, axis=0).tolist()
     return [_times(np.array(one)) for one in spent], [StageTime(*pair) for pair in zip(STAGES, middle, strict=True)]
 

@@ -190,6 +190,8 @@ def test_a_point_is_beaten_by_one_that_is_no_worse_and_no_slower():
     near = [Point(1.00, 1.0, 0.01), Point(1.02, 1.0, 0.01), Point(1.5, 1.0, 0.01)]
     assert beaters(near, 1) == ([], [0])
     assert beaters(near, 2) == ([0, 1], [])
+    assert beaters([Point(1.02, 1.0, 0.01), Point(1.0, 0.1, 0.01)], 0) == ([], [1])
+    assert beaters([Point(1.02, 1.0), Point(1.02, 0.1)], 0) == ([1], [])
 
 
 def test_what_cannot_be_studied_is_refused_in_one_line(tmp_path):

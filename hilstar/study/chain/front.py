@@ -16,12 +16,11 @@ from hilstar.arrays import BoolArray, FloatArray
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """A combination's time and error, and the noise of each: one sigma of a median, and of an rms of so many stars."""
+    """A combination's time and error, and one sigma of its median time."""
 
     time_ms: float
     error: float
     time_noise_ms: float = 0.0
-    error_noise: float = 0.0
 
 
 def beaten_by(points: Sequence[Point]) -> BoolArray:
@@ -39,10 +38,12 @@ def front(points: Sequence[Point]) -> list[bool]:
 
 
 def beyond_noise(point: Point, other: Point) -> bool:
-    """Whether `other`, which beats `point`, does so by more than three sigmas of the difference, in time or in error."""
-    time_noise = 3 * float(np.hypot(point.time_noise_ms, other.time_noise_ms))
-    error_noise = 3 * float(np.hypot(point.error_noise, other.error_noise))
-    return point.time_ms - other.time_ms > time_noise or point.error - other.error > error_noise
+    """Whether `other`, which beats `point`, is faster by more than three sigmas of the difference of their medians.
+
+    Else their times cannot be told apart, and which of them is on the front is chance, as far as this run knows.
+    """
+    noise_ms = 3 * float(np.hypot(point.time_noise_ms, other.time_noise_ms))
+    return point.time_ms - other.time_ms > noise_ms or not noise_ms
 
 
 def beaters(points: Sequence[Point], which: int) -> tuple[list[int], list[int]]:

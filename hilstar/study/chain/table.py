@@ -97,11 +97,8 @@ def rows_of(scene: SceneMeasurement, outcomes: Sequence[Outcome]) -> list[Row]:
 
 
 def points(rows: Sequence[Row], error: str) -> list[Point]:
-    """The rows as points, by `error_arcsec` or `error_mag`, with the noise of an rms over so many stars."""
-    return [
-        Point(row.time_ms, getattr(row, error), row.noise_ms, getattr(row, error) / math.sqrt(2 * max(row.stars, 1)))
-        for row in rows
-    ]
+    """The rows as points, by `error_arcsec` or `error_mag`."""
+    return [Point(row.time_ms, getattr(row, error), row.noise_ms) for row in rows]
 
 
 def auto_of(rows: Sequence[Row]) -> int:

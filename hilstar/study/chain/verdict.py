@@ -40,9 +40,10 @@ def is_right(rows: Sequence[Row]) -> bool:
 def standing(rows: Sequence[Row]) -> str:
     """Whether `auto` is on the front of all, or within the noise of it; else what beats it, why, and how it is without that."""
     beyond, within = beating(rows)
+    own = rows[auto_of(rows)]
     if not beyond:
-        return "on the front, within the noise" if within else "on the front"
-    own, best = rows[auto_of(rows)], _nearest(beyond)
+        return f"on the front within the noise: {_compared(own, _nearest(within))}" if within else "on the front"
+    best = _nearest(beyond)
     said = f"not on the front: {_compared(own, best)}: {why_not(own, best)}"
     if best in (own_beyond := beating(rows, as_filed=True)[0]):
         return said

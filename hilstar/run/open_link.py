@@ -20,7 +20,7 @@ from hilstar.attitude.wire.vizard.live import VizardLive
 from hilstar.attitude.wire.zmq_lockstep import ZmqLockstep
 from hilstar.attitude.wire.zmq_stream import ZmqReceiver
 from hilstar.bench.config import AttitudeSettings, BenchConfig
-from hilstar.bench.config.road import nasa42_road, udp_road
+from hilstar.bench.config.stream.road import nasa42_road, udp_road
 from hilstar.bench.config.when import from_source
 from hilstar.notices import Notices
 from hilstar.units import NS_PER_MS

@@ -3,7 +3,6 @@
 Each key's type, limits, default and meaning stand once, in the class of its table; docs/bench-file.md is made from them.
 """
 
-from hilstar.bench.config.attitude import AttitudeSettings
 from hilstar.bench.config.background import Background
 from hilstar.bench.config.bench import BenchConfig
 from hilstar.bench.config.collimator import Collimator
@@ -13,6 +12,7 @@ from hilstar.bench.config.read import config_of, parse_config, read_config
 from hilstar.bench.config.render import DEFAULT_BRIGHTEST_V_MAG, RenderSettings
 from hilstar.bench.config.sky import Bodies, SkySettings
 from hilstar.bench.config.spacecraft import GEOCENTRE, SOURCE
+from hilstar.bench.config.stream.attitude import AttitudeSettings
 from hilstar.bench.config.sync import SyncSettings
 from hilstar.bench.config.tracker import Tracker
 from hilstar.bench.config.values import Vector

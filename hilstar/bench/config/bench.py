@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import msgspec
 
-from hilstar.bench.config.attitude import AttitudeSettings
 from hilstar.bench.config.background import Background
 from hilstar.bench.config.collimator import Collimator
 from hilstar.bench.config.faults import FaultSettings
@@ -12,6 +11,7 @@ from hilstar.bench.config.monitor import Monitor
 from hilstar.bench.config.render import MAX_JUDGED_FRAMES, RenderSettings
 from hilstar.bench.config.sky import SkySettings
 from hilstar.bench.config.spacecraft import Spacecraft
+from hilstar.bench.config.stream.attitude import AttitudeSettings
 from hilstar.bench.config.sync import SyncSettings
 from hilstar.bench.config.tracker import Tracker
 from hilstar.bench.config.verify import Verify

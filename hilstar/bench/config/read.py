@@ -12,7 +12,7 @@ from hilstar.attitude.wire.packet import MAX_SPEED_KM_S
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE
 from hilstar.bench.config.bench import TYPE_WORDS, BenchConfig
 from hilstar.bench.config.render import DEFAULT_BRIGHTEST_V_MAG
-from hilstar.bench.config.road import check_road
+from hilstar.bench.config.stream.road import check_road
 from hilstar.bench.config.sync import check_sync
 from hilstar.bench.config.when import with_epoch
 from hilstar.errors import InputError, shortened

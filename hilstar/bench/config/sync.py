@@ -6,8 +6,8 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from hilstar.bench.config.attitude import AttitudeSettings
 from hilstar.bench.config.monitor import Monitor
+from hilstar.bench.config.stream.attitude import AttitudeSettings
 from hilstar.bench.config.tracker import Tracker
 from hilstar.bench.config.values import Positive
 from hilstar.errors import InputError

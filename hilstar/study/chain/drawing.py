@@ -97,4 +97,8 @@ class Stopwatch:
         light_ns = NS_PER_S + self._number * self._period_ns
         own = propagate(chain.movement.q_icrs_to_cam, NUDGE_RAD, self._number)
         samples = replace(chain.movement, q_icrs_to_cam=own).samples(light_ns - self._lead_ns)
-        return filled_timeline(samples, chain.combination.prediction, chain.bench.config.attitude), light_ns, self._number
+        return (
+            filled_timeline(samples, chain.combination.prediction, chain.bench.config.attitude),
+            light_ns,
+            self._number,
+        )

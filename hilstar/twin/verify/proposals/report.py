@@ -11,7 +11,7 @@ from hilstar.bench.bench_file import BenchFile
 from hilstar.errors import InputError, cannot_write
 from hilstar.files import write_whole
 from hilstar.reading import MAX_TOML_BYTES, read_text
-from hilstar.twin.verify.proposal import Change, Proposal, Verified, changed_text
+from hilstar.twin.verify.proposals.proposal import Change, Proposal, Verified, changed_text
 
 
 def proposal_lines(file: BenchFile, proposal: Proposal) -> list[str]:

@@ -1,0 +1,1 @@
+"""`[attitude]`: where attitudes come from, and by which road."""

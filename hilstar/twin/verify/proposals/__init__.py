@@ -1,0 +1,1 @@
+"""What `verify --propose` would change in a bench file, and what it says of it."""

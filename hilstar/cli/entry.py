@@ -46,8 +46,6 @@ def main() -> NoReturn:
     interrupts.install()
     queue_stderr()
     logging.basicConfig(format=LOG_FORMAT, stream=sys.stderr)
-    if sys.stdout is None:  # closed by the parent process
-        sys.stdout = open(os.devnull, "w")  # noqa: SIM115, PTH123 - for as long as the process lives
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="surrogateescape")  # a file's name goes out as the bytes that came in
     code = run_command(sys.argv[1:])

@@ -68,12 +68,18 @@ def install() -> None:
 
 
 def _fill_closed() -> None:
-    """Open the standard streams that the parent process closed, so that no socket takes their numbers."""
-    for descriptor in range(3):
+    """Open the standard streams that the parent process closed, so that no socket takes their numbers.
+
+    Python has None for one that was closed, and prints what is for None on stdout.
+    """
+    for descriptor, name in enumerate(("stdin", "stdout", "stderr")):
         try:
             os.fstat(descriptor)
         except OSError:
-            os.open(os.devnull, os.O_RDWR)  # the lowest number that is free
+            # The lowest number that is free; what a program of this one's writes has to go somewhere, too.
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(descriptor, "w" if descriptor else "r", closefd=False))  # noqa: SIM115
 
 
 def _handle(number: int, frame: FrameType | None) -> None:

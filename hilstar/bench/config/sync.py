@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Annotated, Literal
 
 from msgspec import Meta
@@ -61,7 +62,9 @@ def check_sync(sync: SyncSettings, tracker: Tracker, monitor: Monitor, attitude:
         raise InputError(
             f"[tracker] frame_hz = {tracker.frame_hz:g}: exposures of {tracker.exposure_s:g} s overlap; write {most}"
         )
-    if not sync.port.isprintable() or ("://" in sync.port and not sync.port.startswith(NETWORK_PORT)):
+    if not sync.port.isprintable() or (
+        "://" in sync.port and not re.fullmatch(NETWORK_PORT + r"[^/]+:\d{1,5}(/.*)?", sync.port)
+    ):
         raise InputError(f'[sync] port = {sync.port!r}: write "/dev/ttyUSB0" or the like, or "{NETWORK_PORT}HOST:PORT"')
     between_ms = sync.every_frames * monitor.period_ms
     if sync.port and sync.pulse_ms >= between_ms:

@@ -15,6 +15,7 @@ from hilstar.units import ARCSEC_PER_RAD, NS_PER_MS, NS_PER_S
 MIN_REFRESH_HZ, MAX_REFRESH_HZ = 0.01, 1000.0  # as [monitor] refresh_hz
 MAX_CHANGE = 2.0  # a refresh rate farther off than this factor is no proposal
 MM_PER_UM = 1e-3
+FEW_ARCSEC = 99.5  # from there on, two digits would be written with an exponent
 
 
 class Proposal(msgspec.Struct, frozen=True, kw_only=True):
@@ -140,7 +141,10 @@ def beat_line(found: BeatSummary) -> str | None:
     """The beat for a person, with what to write instead; None where it does not matter."""
     if not found.matters:
         return None
-    costs = [] if found.worst_arcsec is None else [f"{found.worst_arcsec:.2g} arcsec at {found.turn_deg_s:g} deg/s"]
+    costs = []
+    if found.worst_arcsec is not None:
+        arcsec = f"{found.worst_arcsec:.2g}" if found.worst_arcsec < FEW_ARCSEC else f"{found.worst_arcsec:.0f}"
+        costs.append(f"{arcsec} arcsec at {found.turn_deg_s:g} deg/s")
     if found.worst_mag is None:
         costs.append("all of its light")
     elif found.worst_mag > found.tolerance_mag:

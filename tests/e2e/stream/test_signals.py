@@ -314,3 +314,18 @@ def test_closed_standard_streams_are_nobody_else_s(tmp_path, small_bench_file):
     result = subprocess.run(["bash", "-c", 'exec "$@" 0<&- 1>&- 2>&-', "bash", *command], timeout=60, check=False)
     assert result.returncode == 0
     assert out.read_bytes().startswith(b"SIMPLE")
+
+
+def test_with_stderr_closed_stdout_holds_no_line_of_it(tmp_path):
+    command = program("attitude", tmp_path / "no.csv", "--json")
+    result = subprocess.run(
+        ["bash", "-c", 'exec "$@" 2>&-', "bash", *command], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert (result.returncode, result.stdout) == (2, "")
+
+
+def test_a_run_with_all_standard_streams_closed_shows_its_frames(tmp_path, small_bench_file):
+    command = program("serve", small_bench_file, "--headless", "--frames", "2", "--ledger", tmp_path / "run.mcap")
+    result = subprocess.run(["bash", "-c", 'exec "$@" 0<&- 1>&- 2>&-', "bash", *command], timeout=60, check=False)
+    assert result.returncode == NO_ATTITUDE
+    assert (tmp_path / "run.mcap").stat().st_size > 0

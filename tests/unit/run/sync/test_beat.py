@@ -176,6 +176,11 @@ def test_a_panel_that_flashes_wants_a_trigger(tmp_path):
     )
 
 
+def test_an_amount_of_hundreds_is_written_without_an_exponent(tmp_path):
+    found = beat_of(bench(tmp_path, {"exposure_s": 0.105}, sync={"turn_deg_s": 200}))
+    assert "up to 200 arcsec at 200 deg/s" in beat_line(found)
+
+
 @pytest.mark.parametrize(
     ("tables", "said"),
     [
@@ -186,6 +191,7 @@ def test_a_panel_that_flashes_wants_a_trigger(tmp_path):
             r"\[sync\] port = /dev/x: the attitude comes over it",
         ),
         ({"sync": {"port": "socket://bench:1"}}, r"\[sync\] port = 'socket://bench:1': write .* \"rfc2217://HOST:PORT\""),
+        ({"sync": {"port": "rfc2217://bench"}}, r"'rfc2217://bench': write .* \"rfc2217://HOST:PORT\""),
         ({"sync": {"port": "/dev/tty\x07"}}, r"\[sync\] port = '/dev/tty\\x07': write"),
         ({"tracker": {"trigger": "yes"}}, "trigger"),
         ({"sync": {"every_frames": 0}}, "every_frames"),

@@ -6,6 +6,7 @@ A run's ledger is never overwritten unless the user asks for it.
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import os
 import stat
@@ -240,6 +241,13 @@ def check_ending(option: str, path: Path | None, endings: tuple[str, ...]) -> No
         # A valid name on this file system, so that it can be copied from the line.
         better = path.with_suffix("").name or "OUT"
         raise InputError(f"{option} {path}: {_article(endings)} is written there; write {better}{endings[0]}")
+
+
+def writable_directory(path: Path) -> Path:
+    """`make_directory`, refused (InputError) where no file can be created in it: before long work, not after it."""
+    if not os.access(make_directory(path), os.W_OK | os.X_OK):
+        raise cannot_write(path, os.strerror(errno.EACCES))
+    return path
 
 
 def check_directory(option: str, path: Path | None) -> None:

@@ -43,11 +43,11 @@ def study(
     as_json: Json = False,
 ) -> None:
     """Draw charts and tables of what each choice costs in accuracy and in time, and of where methods fail."""
-    from hilstar.files import make_directory
+    from hilstar.files import writable_directory
 
     check_directory("-o", output)
     check_bench(what, bench)
-    make_directory(output)
+    writable_directory(output)
     with progress(f"study {what}", math.inf if bench is None else CHAIN_SCENES) as advance:
         lines, right = study_lines(what, output, quick) if bench is None else chain_lines(bench, output, quick, advance)
     if as_json:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from pathlib import Path
 
 import numpy as np
@@ -204,6 +205,14 @@ def test_what_cannot_be_studied_is_refused_in_one_line(tmp_path):
     assert_refused(run_hilstar_here("study", "models", tmp_path / "dark.toml", "-o", out), 2, "dark.toml")
     (tmp_path / "chain.csv").write_text(SMALL)
     assert_refused(run_hilstar_here("study", "chain", tmp_path / "chain.csv", "-o", tmp_path), 2, "chain.csv")
+
+
+def test_a_directory_without_the_right_to_write_is_refused_before_the_study(tmp_path, monkeypatch):
+    (tmp_path / "bench.toml").write_text(SMALL)
+    monkeypatch.setattr(os, "access", lambda path, mode: mode != os.W_OK | os.X_OK)  # root may write anywhere
+    monkeypatch.setattr(run, "run", lambda *given: pytest.fail("the study has begun"))
+    refused = run_hilstar_here("study", "chain", tmp_path / "bench.toml", "-o", tmp_path / "out")
+    assert_refused(refused, 2, "out: cannot be written (Permission denied)")
 
 
 def test_a_bench_of_which_no_star_stays_in_view_is_refused(parts, monkeypatch, tmp_path):

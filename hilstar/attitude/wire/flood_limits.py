@@ -70,7 +70,9 @@ class FloodGate:
         self._counts.flooded += count
         if now_s - self._dropped_s > OVER_S:
             self._notices.tell(
-                "flood", f"over {MAX_PACKETS_PER_S} packets per second: taking the newest, dropping the others unread"
+                "flood",
+                f"over {MAX_PACKETS_PER_S} packets per second, or {MAX_BURST} at once: taking the newest,"
+                " dropping the others unread",
             )
         self._dropped_s = now_s
         time.sleep(PAUSE_S)

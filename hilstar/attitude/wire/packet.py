@@ -208,7 +208,7 @@ def rate_refusal(sample: AttitudeSample, max_rate_rad_s: float) -> Refusal | Non
 
 def _decode_json(message: bytes) -> AttitudeSample | Refusal:
     if len(message) > MAX_JSON_BYTES:
-        return Refusal("format", f"{len(message)} bytes of JSON; the maximum is {MAX_JSON_BYTES}")
+        return Refusal("format", f"more than {MAX_JSON_BYTES} bytes of JSON; send an attitude alone")
     try:
         form = _json_decoder.decode(message)
     except (msgspec.MsgspecError, RecursionError, UnicodeDecodeError) as error:

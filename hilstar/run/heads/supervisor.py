@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
 import tempfile
@@ -15,6 +16,7 @@ import msgspec
 from msgspec.structs import replace
 
 from hilstar.attitude.back_channel import BackChannel, Traffic
+from hilstar.attitude.wire.endpoint import is_served
 from hilstar.attitude.wire.heads.feed import Feed
 from hilstar.attitude.wire.links import StreamLink
 from hilstar.attitude.wire.packet import TimeRequest
@@ -28,6 +30,7 @@ POLL_MS = 10
 TEND_NS = NS_PER_S // 20
 MIN_DURATION_S = 0.05  # of a head that is begun again at the end
 ENDS_S = 5.0  # what a head may take to end in order
+FOLDER, SOCKET = "hilstar-heads-", "body"
 BODY = (1.0, 0.0, 0.0, 0.0)
 
 
@@ -61,8 +64,9 @@ def head_ledger(ledger: Path, name: str, number: int = 0) -> Path:
 def run_heads(asked: HeadsRun, link: StreamLink, say: Say) -> dict[str, Any]:
     """Show each head until its end, or until a signal; what each one said of itself (--json), by its name."""
     stop = threading.Event()
-    with tempfile.TemporaryDirectory(prefix="hilstar-heads-") as folder, stop_on_signal(stop):
-        endpoint = f"ipc://{folder}/body"
+    clear_left()
+    with tempfile.TemporaryDirectory(prefix=FOLDER) as folder, stop_on_signal(stop):
+        endpoint = f"ipc://{folder}/{SOCKET}"
         with Feed(endpoint) as feed:
             processes = [_head(asked, k, endpoint, say) for k in range(len(asked.heads.names))]
             try:
@@ -73,6 +77,16 @@ def run_heads(asked: HeadsRun, link: StreamLink, say: Say) -> dict[str, Any]:
                 for process in processes:
                     process.close(ENDS_S)
     return {process.name: _told(process) for process in processes}
+
+
+def clear_left() -> None:
+    """Remove what killed runs of this user left: temporary folders whose socket nobody serves any more."""
+    for folder in Path(tempfile.gettempdir()).glob(f"{FOLDER}*"):
+        with contextlib.suppress(OSError):
+            path = folder / SOCKET
+            if path.lstat().st_uid == folder.lstat().st_uid == os.geteuid() and not is_served(path):
+                path.unlink()
+                folder.rmdir()
 
 
 def _head(asked: HeadsRun, k: int, endpoint: str, say: Say) -> HeadProcess:

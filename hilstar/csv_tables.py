@@ -24,10 +24,10 @@ def read_rows(path: Path, columns: tuple[str, ...], advice: str, limit_bytes: in
         try:
             rows = (row for row in reader if any(cell.strip() for cell in row) and not row[0].startswith("#"))
             header = [name.strip() for name in next(rows, [])]
-            for name in columns:
-                if header.count(name) != 1:
-                    what = "there twice" if name in header else "missing"
-                    raise InputError(f"{path}:{max(reader.line_num, 1)}: column {name} is {what}; {advice}")
+            wrong = [f"{name} is missing" for name in columns if name not in header]
+            wrong += [f"{name} is there twice" for name in columns if header.count(name) > 1]
+            if wrong:
+                raise InputError(f"{path}:{max(reader.line_num, 1)}: column {wrong[0]}; {advice}")
             places = [header.index(name) for name in columns]
             flag = header.index(VALID) if VALID in header else None
             for row in rows:

@@ -25,6 +25,8 @@ FAINT_MAG = 6.0  # under the star whose peak is white
 NARROW_PX = 0.3
 # A star of equal steps can have its light within half of one and no nearer; where steps differ it comes nearer than that.
 STEPS_A_STAR = 0.5
+# A star of so few pixels, lit by codes whose steps are several of the smallest.
+NARROW_STEPS = 0.6
 ROUNDING = 'quantisation = "round"'
 TOGETHER = "exact chooses the codes of a star's own pixels together, for what of its light is to be seen there"
 
@@ -111,7 +113,7 @@ def half_off() -> Scene:
     return Scene(sprites, SIGMA_PX, Panel(srgb_response(8), WHITE))
 
 
-def _judged(case: str, scene: Scene, why: str = TOGETHER) -> FailureCase:
+def _judged(case: str, scene: Scene, why: str = TOGETHER, steps_a_star: float = STEPS_A_STAR) -> FailureCase:
     """Rounding against `exact`, by the light of each group of stars."""
     fault, error = error_steps(codes_of(scene, "round"), scene), error_steps(exact_codes(scene), scene)
     return FailureCase(
@@ -120,7 +122,7 @@ def _judged(case: str, scene: Scene, why: str = TOGETHER) -> FailureCase:
         f"a star's light off by {fault:.2g} of the panel's smallest steps rms",
         f"by {error:.2g} steps",
         why,
-        Figures(error, fault, STEPS_A_STAR * scene.stars),
+        Figures(error, fault, steps_a_star * scene.stars),
     )
 
 
@@ -138,7 +140,8 @@ def stars_a_pixel_apart() -> FailureCase:
 def narrow_codes() -> FailureCase:
     """Stars of less than a pixel."""
     scene = lone_stars(FAINT_MAG / 2, srgb_response(8), NARROW_PX)
-    return _judged(f"codes of stars of sigma {NARROW_PX:g} px, {FAINT_MAG / 2:g} mag under white", scene)
+    case = f"codes of stars of sigma {NARROW_PX:g} px, {FAINT_MAG / 2:g} mag under white"
+    return _judged(case, scene, steps_a_star=NARROW_STEPS)
 
 
 def uneven_panel() -> FailureCase:

@@ -206,7 +206,7 @@ def row(text, number, value, column):
         (lambda text: row(text, 4, "3", 0), ("pairs.csv:5", "norm", "qw,qx,qy,qz")),
         (lambda text: text.replace(HEADER, "qw,qx,qy,qz,tx,ty,tz,tw"), ("scalar", "first")),
         (lambda text: text + "1,0,0\n", ("pairs.csv:302", "3 cells")),
-        (lambda text: text.replace("\n", ",perhaps\n").replace("tz,perhaps", "tz,valid"), ("valid = perhaps", "1 or 0")),
+        (lambda text: text.replace("\n", ",perhaps\n").replace("tz,perhaps", "tz,valid"), ("valid = 'perhaps'", "1 or 0")),
     ],
 )
 def test_pairs_that_are_none_get_one_line(measured, tmp_path, change, words):

@@ -32,6 +32,7 @@ SUMMARY_KEYS |= {
     "reconnects",
     "events",
     "link",
+    "beat",
 }
 
 

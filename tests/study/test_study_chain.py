@@ -21,7 +21,7 @@ from hilstar.study.chain.front import Point, beaters, front
 from hilstar.study.chain.measuring import Plan, SceneMeasurement
 from hilstar.study.chain.motion import lead_ns
 from hilstar.study.chain.scenes import Scene, five_scenes
-from hilstar.study.chain.tracker import Tracker
+from hilstar.study.chain.tracker import MATCH_PX, Tracker, off
 from hilstar.study.chain.true_light import add_light, points
 from hilstar.units import ARCSEC_PER_RAD, MAG_PER_RELATIVE, NS_PER_S
 from tests.support.commands import assert_refused, run_hilstar_here
@@ -183,6 +183,17 @@ def test_a_star_that_runs_with_the_scan_loses_no_light(parts, monkeypatch):
     ends = share * bench.scan.hold_s / judge.seen.length_s
     assert len(judge) > 2 and ends < share / 5
     assert error_budget(scene, scene.marks.auto)[0].mag < MAG_PER_RELATIVE * ends
+
+
+def test_a_star_that_is_lost_is_no_nearer_than_one_that_is_found_late(parts):
+    scene, bench = scene_of(parts, 4), parts[0]
+    (judge,) = scene.judges
+    held = Combination("exact", False, bench.faintest_v_mag, "full", "point", "held")
+    image_e = scene.tracker.image_e(scene.chain(held).exposed(judge.seen), judge.seen)
+    late = off(judge, judge.measure(image_e), judge.sky)
+    dark = off(judge, judge.measure(np.zeros_like(image_e)), judge.sky)
+    assert dark.lost.all() and not late.lost.all()
+    assert dark.arcsec.min() > late.arcsec[~late.lost].max() > MATCH_PX * scene.tracker.arcsec_per_px
 
 
 def test_a_point_is_beaten_by_one_that_is_no_worse_and_no_slower():

@@ -42,9 +42,10 @@ def error_budget(scene: SceneMeasurement, combination: Combination) -> list[Part
     found = [[judge.sky, *_measured(scene, combination, number)] for number, judge in enumerate(scene.judges)]
     parts = []
     for k, step in enumerate(STEPS):
-        parts.append(Part(step, *pooled([off(scene.tracker, one[k + 1], one[k]) for one in found])))
+        off_by = [off(judge, one[k + 1], one[k]) for judge, one in zip(scene.judges, found, strict=True)]
+        parts.append(Part(step, *pooled(off_by)))
     rss = [float(np.sqrt(sum(getattr(part, name) ** 2 for part in parts))) for name in ("arcsec", "mag")]
-    whole = pooled([off(scene.tracker, one[-1], one[0]) for one in found])
+    whole = pooled([off(judge, one[-1], one[0]) for judge, one in zip(scene.judges, found, strict=True)])
     return [*parts, Part(RSS, *rss), Part(WHOLE, *whole)]
 
 

@@ -126,7 +126,7 @@ class SceneMeasurement:
         for number, judge in enumerate(self.judges):
             light = self.chain(combination, number).exposed(judge.seen)
             shown = judge.measure(self.tracker.image_e(light, judge.seen))
-            found.append(off(self.tracker, shown, judge.sky))
+            found.append(off(judge, shown, judge.sky))
             turns.append(attitude_off_arcsec(shown, judge.sky))
         arcsec, mag = pooled(found)
         cross, roll = (rms_of_known(column) for column in zip(*turns, strict=True))

@@ -102,6 +102,7 @@ class Judge:
         self._x_px, self._y_px = tracker.camera.project(self.true @ tracker.camera.cam_to_image.T)
         self.judged = np.zeros(0, dtype=np.intp)
         self.sky = Measured(np.zeros((0, 3)), np.zeros(0))
+        self.lost_arcsec = max(MATCH_PX, self._path_px) * tracker.arcsec_per_px
         places_px = self._paths() if movement.turns else (self._x_px, self._y_px)
         inside = np.atleast_2d(self._inside(*places_px, self._margin_px())).all(axis=0)
         if not (self._wanted & inside).any():
@@ -176,13 +177,22 @@ class Judge:
         self._pixels = np.concatenate(pixels) if pixels else np.zeros(0, dtype=np.intp)
         self._begins = np.cumsum([0, *(len(own) for own in pixels)])[:-1]
 
+    @property
+    def _late_s(self) -> float:
+        """By how much an attitude can be late."""
+        return lead_ns(self.tracker.bench.config) / NS_PER_S + 1 / PACKET_HZ
+
+    @property
+    def _path_px(self) -> float:
+        """How far a star goes in the exposure, and while an attitude can be late before and after it."""
+        span_s = self.seen.length_s + 2 * self._late_s
+        return math.radians(abs(self.movement.rate_deg_s)) * span_s * self.tracker.camera.scales_px_rad()[1]
+
     def _paths(self) -> tuple[FloatArray, FloatArray]:
         """Places (k, n) of the stars on the tracker along their whole paths, px."""
         tracker, seen = self.tracker, self.seen
-        late_s = lead_ns(tracker.bench.config) / NS_PER_S + 1 / PACKET_HZ
-        span_s = seen.length_s + 2 * late_s
-        path_px = math.radians(abs(self.movement.rate_deg_s)) * span_s * tracker.camera.scales_px_rad()[1]
-        at_s = np.linspace(-late_s, seen.length_s + late_s, max(5, math.ceil(path_px / PATH_STEP_PX))) + seen.begin_s
+        count = max(5, math.ceil(self._path_px / PATH_STEP_PX))
+        at_s = np.linspace(-self._late_s, seen.length_s + self._late_s, count) + seen.begin_s
         turns = [tracker.camera.cam_to_image @ to_matrix(self.movement.at(round(t * NS_PER_S))) for t in at_s]
         vectors = tracker.bench.stars.directions(self._star)
         places = [tracker.camera.project(vectors @ turn.T) for turn in turns]
@@ -215,11 +225,15 @@ class Judge:
         return np.asarray(inside & (seen_y >= reach) & (seen_y < height - 1 - reach))
 
 
-def off(tracker: Tracker, shown: Measured, wanted: Measured) -> Off:
-    """How far the stars of a measurement are from where and what they should be: a lost one by MATCH_PX, and all its light."""
+def off(judge: Judge, shown: Measured, wanted: Measured) -> Off:
+    """How far the stars of a measurement are from where and what they should be.
+
+    A lost one is off by all its light, and by 3 px or its path, whichever is longer: to lose a star is no better than to
+    find it late.
+    """
     lost = shown.lost | wanted.lost
     chord = np.linalg.norm(shown.directions - wanted.directions, axis=1)
-    arcsec = np.where(lost, MATCH_PX * tracker.arcsec_per_px, 2 * np.arcsin(np.minimum(chord, 2.0) / 2) * ARCSEC_PER_RAD)
+    arcsec = np.where(lost, judge.lost_arcsec, 2 * np.arcsin(np.minimum(chord, 2.0) / 2) * ARCSEC_PER_RAD)
     mag = magnitude(np.where(lost, 1.0, shown.light_e) / np.where(lost, 1.0, wanted.light_e))
     return Off(arcsec, np.where(lost, LOST_MAG, mag), lost)
 

@@ -63,7 +63,7 @@ def check_sync(sync: SyncSettings, tracker: Tracker, monitor: Monitor, attitude:
             f"[tracker] frame_hz = {tracker.frame_hz:g}: exposures of {tracker.exposure_s:g} s overlap; write {most}"
         )
     if not sync.port.isprintable() or (
-        "://" in sync.port and not re.fullmatch(NETWORK_PORT + r"[^/]+:\d{1,5}(/.*)?", sync.port)
+        "://" in sync.port and not re.fullmatch(NETWORK_PORT + r"[^/?]+:\d{1,5}([/?].*)?", sync.port)
     ):
         raise InputError(f'[sync] port = {sync.port!r}: write "/dev/ttyUSB0" or the like, or "{NETWORK_PORT}HOST:PORT"')
     between_ms = sync.every_frames * monitor.period_ms

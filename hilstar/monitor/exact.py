@@ -71,10 +71,22 @@ def nothing_carried(count: int) -> Carried:
     return Carried(np.zeros((SUMS, count), dtype=np.float32), np.zeros(count, dtype=np.float32))
 
 
+@dataclass(frozen=True, slots=True)
+class Left:
+    """What the stars of a frame left to the next one: their numbers (n,) as in `Sprites.star`, and the errors (SUMS, n)."""
+
+    star: IntArray
+    error: Float32Array
+
+
 class ExactQuantiser:
-    """Levels of sprites on a panel, one image after another; `sigma_px` is that of the sprites, `seen` the tracker's."""
+    """Levels of sprites on a panel, one image after another; `sigma_px` is that of the sprites, `seen` the tracker's.
+
+    `left` is what the last frame left: always None where each stands by itself, and at the beginning of a sequence.
+    """
 
     over_frames: ClassVar[bool] = False
+    left: Left | None = None
 
     def __init__(
         self, panel: Panel, resolution_px: tuple[int, int], sigma_px: tuple[float, float], seen: Seen = AS_USUAL

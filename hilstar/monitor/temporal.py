@@ -10,13 +10,12 @@ in step. A star keeps its remainder for as long as every frame has it, and begin
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
 from hilstar.arrays import Float32Array, IntArray
-from hilstar.monitor.exact import Carried, ExactQuantiser, nothing_carried
+from hilstar.monitor.exact import Carried, ExactQuantiser, Left, nothing_carried
 from hilstar.monitor.response import Codes
 from hilstar.scene.sprites import Sprites
 
@@ -27,19 +26,10 @@ GOLDEN = 2654435769  # 2^32 over the golden ratio: its multiples, modulo 2^32, a
 NONE_BEFORE = -1
 
 
-@dataclass(frozen=True, slots=True)
-class Left:
-    """What the stars of the last frame left: their numbers (n,) as in `Sprites.star`, and the errors (SUMS, n)."""
-
-    star: IntArray
-    error: Float32Array
-
-
 class TemporalQuantiser(ExactQuantiser):
-    """Levels of one frame after another; `left` is what the last one left, None at the beginning."""
+    """Levels of one frame after another, each of which makes up for what the last one left."""
 
     over_frames: ClassVar[bool] = True
-    left: Left | None = None
 
     def levels(self, sprites: Sprites | None, floor: Codes | None = None) -> Codes:
         """The levels of the next frame, as `exact`'s."""

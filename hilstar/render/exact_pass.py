@@ -15,10 +15,10 @@ from hilstar.monitor.balance import (
     SUMS,
     Balance,
 )
-from hilstar.monitor.exact import CARRIED
+from hilstar.monitor.exact import CARRIED, Left
 from hilstar.monitor.pixel_order import FEWEST, LEAST_LIGHT, PixelOrder
 from hilstar.monitor.quantise import Panel
-from hilstar.monitor.temporal import NONE_BEFORE, Left, first_phases, places_before
+from hilstar.monitor.temporal import NONE_BEFORE, first_phases, places_before
 from hilstar.process.interrupts import held
 from hilstar.render.encoder import LevelTexture
 from hilstar.render.splat import share_define
@@ -118,17 +118,15 @@ class ExactPass:
 
     def draw(self, buffer: moderngl.Buffer, sprites: Sprites) -> None:
         """Choose the levels of `sprites`, which `buffer` holds and the linear image shows."""
-        paths = sprites.per_star > 1
-        program, star = self._programs[paths], sprites.star
-        if paths:
-            turns = stretches_of(star)
-            star, goes_on = star[turns[:, 0]], turns[:, 0] != turns[:, 2]
-        else:
-            turns, goes_on = turns_of(sprites.data["electrons_per_s"], self._step_e_per_s), np.zeros(len(star), dtype=np.bool_)
+        paths, star = sprites.per_star > 1, sprites.star
+        program = self._programs[paths]
+        turns = stretches_of(star) if paths else turns_of(sprites.data["electrons_per_s"], self._step_e_per_s)
         count = len(turns)
         self._upload(turns)
-        if self._memory is not None:
-            self._memory.bind(star, goes_on)
+        if self._memory is not None and paths:
+            self._memory.bind(star[turns[:, 0]], turns[:, 0] != turns[:, 2])
+        elif self._memory is not None:
+            self._memory.bind(star, np.zeros(count, dtype=np.bool_))
         buffer.bind_to_storage_buffer(0)
         self._order.bind_to_storage_buffer(1)
         self._light.bind_to_storage_buffer(2)

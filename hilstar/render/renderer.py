@@ -224,14 +224,13 @@ class Renderer:
     def begin_anew(self) -> None:
         """Forget what `temporal` carries from frame to frame: the next frame is the first of a sequence."""
         self._last_frame = NO_FRAME
-        if isinstance(self._exact, TemporalQuantiser):
-            self._exact.left = None
-        if self._exact_pass is not None:
-            self._exact_pass.left = None
+        for chooser in (self._exact, self._exact_pass):
+            if chooser is not None:
+                chooser.left = None
 
     def _choose(self, exact_pass: ExactPass, sprites: Sprites | None) -> None:
         """Choose the levels of the sprites that are drawn, star by star, with what NumPy's last frame left."""
-        if isinstance(self._exact, TemporalQuantiser) and self._exact.left is not None:
+        if self._exact is not None and self._exact.left is not None:
             exact_pass.left, self._exact.left = self._exact.left, None
         if sprites is None or not len(sprites):
             exact_pass.left = None
@@ -247,8 +246,7 @@ class Renderer:
         if self._exact is None:
             quantiser = TemporalQuantiser if temporal else ExactQuantiser
             self._exact = quantiser(panel, target.resolution_px, target.sigma_px, target.seen)
-        left = None if self._exact_pass is None else self._exact_pass.left
-        if isinstance(self._exact, TemporalQuantiser) and self._exact_pass is not None and left is not None:
+        if self._exact_pass is not None and (left := self._exact_pass.left) is not None:
             self._exact.left, self._exact_pass.left = left, None
         lights = () if sprites is None else sprites.extended
         floor = self._floor(lights, mask_turn(frame) if temporal else 0.0, panel, levels) if lights else None

@@ -243,19 +243,22 @@ def check_ending(option: str, path: Path | None, endings: tuple[str, ...]) -> No
         raise InputError(f"{option} {path}: {_article(endings)} is written there; write {better}{endings[0]}")
 
 
-def writable_directory(path: Path) -> Path:
-    """`make_directory`, refused (InputError) where no file can be created in it: before long work, not after it."""
-    if not os.access(make_directory(path), os.W_OK | os.X_OK):
-        raise cannot_write(path, os.strerror(errno.EACCES))
-    return path
-
-
 def check_directory(option: str, path: Path | None) -> None:
-    """Refuse (InputError) the name of a file where a directory is created."""
-    if path is not None and path.suffix.lower() in KNOWN and not path.is_dir():
+    """Refuse (InputError) the name of a file where a directory is created, and a place where nothing can be.
+
+    For the start of a command: before its work, and before anything is created.
+    """
+    if path is None:
+        return
+    if path.suffix.lower() in KNOWN and not path.is_dir():
         raise InputError(
             f"{option} {path}: several files are written, into a directory; write the name of one, such as {path.stem}"
         )
+    there = next((place for place in (path, *path.parents) if exists(place)), None)
+    if there is not None and not there.is_dir():
+        raise cannot_write(path, os.strerror(errno.ENOTDIR))
+    if there is not None and not os.access(there, os.W_OK | os.X_OK):
+        raise cannot_write(path, os.strerror(errno.EACCES))
 
 
 def _article(endings: tuple[str, ...]) -> str:

@@ -16,11 +16,11 @@ from typing import Any
 
 from hilstar.bench.bench_file import BenchFile, bench_file_of, changed_file, read_bench_file
 from hilstar.bench.config import AttitudeSettings
+from hilstar.bench.config.read import HEADS
 from hilstar.errors import InputError
 from hilstar.reading import MAX_TOML_BYTES, parse_toml, read_text
 
 MIN_HEADS, MAX_HEADS = 2, 8
-KEY = "heads"
 EXAMPLE = 'write heads = ["a.toml", "b.toml"], a bench file for each'
 
 
@@ -47,7 +47,7 @@ def read_bench_or_heads(path: Path) -> BenchFile | HeadsFile:
     """A bench file, or a file with `heads`, opened once. Raises InputError as `read_bench_file` and `read_heads` do."""
     text = read_text(path, "give the path of a bench file", MAX_TOML_BYTES)
     tables = parse_toml(path, text)
-    return _heads_of(path, tables) if KEY in tables else bench_file_of(path, text)
+    return _heads_of(path, tables) if HEADS in tables else bench_file_of(path, text)
 
 
 def _tables(path: Path) -> dict[str, Any]:
@@ -60,10 +60,10 @@ def read_heads(path: Path) -> HeadsFile:
 
 
 def _heads_of(path: Path, tables: dict[str, Any]) -> HeadsFile:
-    other = sorted(set(tables) - {KEY, "attitude"})
+    other = sorted(set(tables) - {HEADS, "attitude"})
     if other:
         raise InputError(f"{path}: {other[0]}: beside heads stands only [attitude]; write it in the heads' own files")
-    listed = tables.get(KEY)
+    listed = tables.get(HEADS)
     if not isinstance(listed, list) or not all(isinstance(name, str) and name for name in listed):
         raise InputError(f"{path}: heads = {listed!r}: no list of files; {EXAMPLE}")
     if not MIN_HEADS <= len(listed) <= MAX_HEADS:
@@ -73,20 +73,17 @@ def _heads_of(path: Path, tables: dict[str, Any]) -> HeadsFile:
     twice = next((name for k, name in enumerate(names) if name in names[:k]), None)
     if twice is not None:
         raise InputError(f"{path}: heads: two are called {twice}; give each a file of its own name")
-    files = tuple(_head(path, head, tables.get("attitude", {})) for head in paths)
+    files = tuple(_head(head, tables.get("attitude", {})) for head in paths)
     if files[0].config.attitude.lockstep:
         raise InputError(f"{path}: [attitude] lockstep = true: several heads follow a stream that runs freely; take it out")
     return HeadsFile(path, names, files)
 
 
-def _head(path: Path, head: Path, attitude: dict[str, Any]) -> BenchFile:
+def _head(head: Path, attitude: dict[str, Any]) -> BenchFile:
     file = read_bench_file(head)
-    tables = parse_toml(head, file.text)
-    if KEY in tables:
-        raise InputError(f"{head}: names heads itself; give {path.name} bench files of one head each")
-    return changed_file(file, tables | {"attitude": attitude})
+    return changed_file(file, parse_toml(head, file.text) | {"attitude": attitude})
 
 
 def as_head(head: Path, heads: Path) -> BenchFile:
     """A head's bench file with the common source of the file `heads`. Raises InputError as `read_heads` does."""
-    return _head(heads, head, _tables(heads).get("attitude", {}))
+    return _head(head, _tables(heads).get("attitude", {}))

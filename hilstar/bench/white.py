@@ -1,4 +1,4 @@
-"""Which stars of a bench are brighter than full scale."""
+"""What is said of a bench's light before a run: stars brighter than full scale, and what its white is assumed to be made of."""
 
 from __future__ import annotations
 
@@ -40,3 +40,15 @@ def clipping_line(bench: Bench) -> str | None:
     stars = f"1 {one} of the sky is" if len(found) == 1 else f"{len(found)} {many} of the sky are"
     key = "flux_at_white_e_per_s" if render.brightest_v_mag is None else f"brightest_v_mag = {render.brightest_v_mag:g}"
     return f"{stars} brighter than white and clip in view: {named(found, NAMED_STARS)} ([render] {key})"
+
+
+def shares_line(bench: Bench) -> str | None:
+    """One line where bit stealing weighs the primaries by a formula's shares of white, which are no tracker's; else None."""
+    calibration = bench.calibration
+    if not bench.config.render.bit_stealing or not calibration.is_formula or calibration.weights is None:
+        return None
+    shares = ", ".join(f"{share:g}" for share in calibration.weights)
+    return (
+        f'[render] bit_stealing with calibration = "{calibration.name}" assumes that the tracker sees white as {shares} of red,'
+        " green and blue, as a photometer does; measure it (hilstar first-light), or write a calibration file with [weights]"
+    )

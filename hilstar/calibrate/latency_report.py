@@ -10,6 +10,7 @@ from hilstar.calibrate.edges import Edges, square_edges
 from hilstar.calibrate.latency import LatencySummary, Paired, pair, summarise
 from hilstar.charts import chart
 from hilstar.errors import InputError
+from hilstar.files import make_directory
 from hilstar.run.record.ledger_reader import config_of, read_head, run_records
 from hilstar.units import NS_PER_MS, NS_PER_S
 
@@ -31,7 +32,7 @@ def measure_latency(ledger: Path, edges: Edges, directory: Path | None) -> Laten
     paired = pair(edges, shown, NS_PER_S / config.monitor.refresh_hz)
     summary = summarise(paired, config)
     if directory is not None:
-        draw_latency(directory / "latency.png", paired, summary)
+        draw_latency(make_directory(directory) / "latency.png", paired, summary)
     return summary
 
 

@@ -48,12 +48,10 @@ def benchmark(
     elif sizes is not None:
         plan = replace(plan, sizes=parse_sizes(sizes))
     check_directory("-o", output)
-    if output is not None:
-        make_directory(output)
     with progress("measuring", len(plan.sizes) * len(plan.counts)) as advance:
         result = speed.run(plan, np.random.default_rng(seed), advance)
     if output is not None:
-        speed_report.write(result, output)
+        speed_report.write(result, make_directory(output))
     if as_json:
         print_json(msgspec.to_builtins(result))
     else:

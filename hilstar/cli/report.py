@@ -19,11 +19,9 @@ def report(
 ) -> None:
     """Report a run on one page: pictures, timing, attitude age, missed frames, packets, events and memory."""
     from hilstar.console.report.write import report as write_report
-    from hilstar.files import make_directory
     from hilstar.run.record.report import table_rows
 
     check_directory("-o", output)
-    make_directory(output)
     found = write_report(ledger, output)
     if as_json:
         print_json(found)

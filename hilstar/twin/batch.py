@@ -104,9 +104,9 @@ def simulate_motions(
     faults: LogFaults | None = None,
 ) -> None:
     """Write `exposure_000000.fits` and on into `directory`, each with its own noise: seeds (seed, number)."""
-    make_directory(directory)
     with Simulator(file) as first:  # an error in the bench file is reported once, here
         pieces = [()] * len(motions) if faults is None else faults.pieces(first, motions)
+    make_directory(directory)
     scenario = None if faults is None else faults.scenario
     workers = min(len(motions), len(os.sched_getaffinity(0)))
     context = multiprocessing.get_context("spawn")

@@ -20,6 +20,7 @@ from hilstar.reading import MAX_TOML_BYTES, parse_toml, read_text
 from hilstar.toml_tables import Kind, explained
 from hilstar.units import LIGHT_KM_S
 
+HEADS = "heads"  # the key of a file that names bench files (see `bench.heads_file`)
 KIND = Kind(BenchConfig, "configs/README.md", TYPE_WORDS)
 
 
@@ -35,6 +36,8 @@ def parse_config(path: Path, text: str) -> BenchConfig:
 
 def config_of(path: Path, tables: dict[str, Any]) -> BenchConfig:
     """Check the tables of the bench file `path`, as TOML gives them. Raises InputError as `parse_config` does."""
+    if HEADS in tables:
+        raise InputError(f"{path}: names several heads, and one bench file is wanted here; give one of its heads' files")
     _check_finite(tables, path)
     try:
         config = msgspec.convert(tables, BenchConfig)

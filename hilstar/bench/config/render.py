@@ -49,7 +49,8 @@ class RenderSettings(Table, frozen=True):
         bool,
         Meta(
             description="Lets the codes of r, g and b differ by one: seven times as many levels, weighted as the tracker sees "
-            "the primaries."
+            "the primaries: by `[weights]` of the calibration file. Formulas, such as sRGB, assume Rec. 709's, a photometer's, "
+            "and `serve`, `replay` and `budget` say so."
         ),
     ] = False
     cycle_frames: Annotated[

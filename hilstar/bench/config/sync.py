@@ -34,13 +34,13 @@ class SyncSettings(Table, frozen=True):
     """
 
     port: Annotated[
-        str,
+        str | None,
         Meta(
             description='The serial port whose RTS is pulsed, such as `"/dev/ttyUSB0"`, or `"rfc2217://HOST:PORT"`. Not the '
             "attitude's.",
             extra={"default": "none"},
         ),
-    ] = ""
+    ] = None
     pulse_ms: Annotated[Positive, Meta(description="Width of the pulse.")] = 1.0
     active: Annotated[
         Literal["high", "low"],
@@ -62,13 +62,16 @@ def check_sync(sync: SyncSettings, tracker: Tracker, monitor: Monitor, attitude:
         raise InputError(
             f"[tracker] frame_hz = {tracker.frame_hz:g}: exposures of {tracker.exposure_s:g} s overlap; write {most}"
         )
-    if not sync.port.isprintable() or (
+    if sync.port is None:
+        return
+    if not (sync.port.strip() and sync.port.isprintable()) or (
         "://" in sync.port and not re.fullmatch(NETWORK_PORT + r"[^/?]+:\d{1,5}([/?].*)?", sync.port)
     ):
-        raise InputError(f'[sync] port = {sync.port!r}: write "/dev/ttyUSB0" or the like, or "{NETWORK_PORT}HOST:PORT"')
+        advice = f'write "/dev/ttyUSB0" or the like, or "{NETWORK_PORT}HOST:PORT"; leave it out for no pulse'
+        raise InputError(f"[sync] port = {sync.port!r}: {advice}")
     between_ms = sync.every_frames * monitor.period_ms
-    if sync.port and sync.pulse_ms >= between_ms:
+    if sync.pulse_ms >= between_ms:
         what = f"[sync] pulse_ms = {sync.pulse_ms:g}: the next pulse is due after {between_ms:.4g} ms"
         raise InputError(f"{what}; write a shorter pulse, or a larger every_frames")
-    if sync.port and attitude.source == "serial" and sync.port == attitude.port:
+    if attitude.source == "serial" and sync.port == attitude.port:
         raise InputError(f"[sync] port = {sync.port}: the attitude comes over it; write another port")

@@ -35,7 +35,6 @@ def latency(
     from hilstar.calibrate.edges import capture_edges, read_edges, save_edges
     from hilstar.calibrate.latency import write_panel_delay
     from hilstar.calibrate.latency_report import latency_lines, measure_latency
-    from hilstar.files import make_directory
 
     check_directory("-o", output)
     check_ending("--save", save, CSV)
@@ -52,7 +51,7 @@ def latency(
         time.sleep(LEDGER_BEHIND_S)
     if save is not None:
         save_edges(save, found)
-    summary = measure_latency(ledger, found, None if output is None else make_directory(output))
+    summary = measure_latency(ledger, found, output)
     if as_json:
         print_json(asdict(summary))
     else:

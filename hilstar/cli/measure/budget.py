@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from hilstar.cli.options import BenchFile, Json
-from hilstar.console.terminal import print_json
+from hilstar.console.terminal import print_json, say
 from hilstar.errors import InputError, shortened
 from hilstar.files import check_directory
 
@@ -30,6 +30,7 @@ def budget(
 ) -> None:
     """Find which magnitudes this monitor, sprite and quantisation can show, and how accurately."""
     from hilstar.bench.build import load
+    from hilstar.bench.white import shares_line
     from hilstar.files import make_directory
     from hilstar.tracker.centroiders import FAMILY
     from hilstar.twin.budget import By
@@ -42,10 +43,12 @@ def budget(
     if centroider is not None and by is None:
         raise InputError(f"--centroider {shortened(centroider)}: write one of {', '.join(choices)}")
     with load(bench_file) as bench:
-        found = find_budget(bench, by)
+        found, assumed = find_budget(bench, by), shares_line(bench)
     if output is not None:
         write_report(make_directory(output), found)
     if as_json:
         print_json(asdict(found))
     else:
         typer.echo("\n".join(budget_lines(found)))
+    if assumed is not None:
+        say(assumed)

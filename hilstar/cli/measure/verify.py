@@ -11,6 +11,7 @@ import typer
 from hilstar.cli.options import MAX_SEED, BenchFile, Json, ScenarioFile
 from hilstar.cli.show.running import optional_scenario
 from hilstar.console.terminal import print_json, progress
+from hilstar.errors import InputError
 from hilstar.files import check_directory
 
 if TYPE_CHECKING:
@@ -45,10 +46,11 @@ def verify(
     from hilstar.twin.verify.summary import summarise, summary_lines
 
     check_directory("-o", output)
-    if output is not None:
-        make_directory(output)
     file = read_bench_or_heads(bench_file)
     if isinstance(file, HeadsFile):
+        given = {"-o": output, "--strict": strict, "--propose": propose, "--write": write, "--scenario": scenario}
+        for option in [name for name, value in given.items() if value]:
+            raise InputError(f"verify {option}: is of one bench; leave it out, or give one of the heads' files of {bench_file}")
         _verify_heads(file, fields, seed, as_json)
         return
     if write:
@@ -57,7 +59,7 @@ def verify(
     with progress("verifying", fields) as advance:
         verdict = run_twin(file, fields, np.random.default_rng(seed), advance, wrong)
     if output is not None:
-        write_report(output, verdict)
+        write_report(make_directory(output), verdict)
     summary = summarise(verdict)
     if not as_json:
         typer.echo("\n".join(summary_lines(summary)))

@@ -38,7 +38,7 @@ from hilstar.cli.show.running import (
     optional_pulse,
     optional_scenario,
     run_with_faults,
-    say_what_clips,
+    say_of_light,
     shown_bench,
 )
 from hilstar.console.run_status import RunStatus, Source, on_terminal
@@ -110,7 +110,7 @@ def replay(
         optional_ledger(ledger, bench, notices, overwrite, split) as kept,
         run_with_faults(bench, faults, notices, kept, play.recording) as wrong,
     ):
-        say_what_clips(bench)
+        say_of_light(bench)
         if explain:
             explain_source(play.conventions, mounting)
             explain_bench(bench)

@@ -86,13 +86,13 @@ def shown_bench(file: BenchFile, headless: bool, windowed: bool, force: bool) ->
         yield screen.bench, screen
 
 
-def say_what_clips(bench: Any) -> None:
-    """Name the stars that this bench cannot show as bright as they are."""
-    from hilstar.bench.white import clipping_line
+def say_of_light(bench: Any) -> None:
+    """Name the stars that this bench cannot show as bright as they are, and what is assumed of its primaries."""
+    from hilstar.bench.white import clipping_line, shares_line
 
-    line = clipping_line(bench)
-    if line is not None:
-        say(line)
+    for line in (clipping_line(bench), shares_line(bench)):
+        if line is not None:
+            say(line)
 
 
 def say_beat(bench: Any, screen: Any) -> BeatSummary:
@@ -113,7 +113,7 @@ def optional_pulse(file: BenchFile, notices: Notices) -> Iterator[FramePulse | N
     from hilstar.run.sync.frame_pulse import FramePulse
 
     settings = file.config.sync
-    if not settings.port:
+    if settings.port is None:
         yield None
         return
     with FramePulse.of(settings, notices) as pulse:

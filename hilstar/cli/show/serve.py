@@ -28,7 +28,7 @@ from hilstar.cli.show.running import (
     optional_scenario,
     run_with_faults,
     say_beat,
-    say_what_clips,
+    say_of_light,
     shown_bench,
 )
 from hilstar.console.run_status import RunStatus, Source, on_terminal
@@ -108,7 +108,7 @@ def serve(
         limit = Limit(slots, math.inf if frames is None else frames)
         await_reader(link)
         say(f"{link.verb} {link.endpoint}, {refresh_hz:g} Hz, {bench.renderer.gl_renderer}")
-        say_what_clips(bench)
+        say_of_light(bench)
         beat = UNSET if file.config.attitude.lockstep else say_beat(bench, screen)
         told = Source(f"{link.verb} {link.endpoint}", bench.renderer.gl_renderer, refresh_hz, min(limit.slots, limit.frames))
         status = RunStatus(told, kept)

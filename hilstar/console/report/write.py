@@ -10,7 +10,7 @@ from hilstar.attitude.logs.mcap_reader import NO_END, unfinished_part
 from hilstar.console.report.bundle import report_page
 from hilstar.console.report.pictures import run_pictures
 from hilstar.console.report.run_data import run_data
-from hilstar.files import write_whole
+from hilstar.files import make_directory, write_whole
 from hilstar.run.record.report import RunReport, figures_of, summarise
 
 
@@ -26,6 +26,7 @@ def report(path: Path, directory: Path) -> RunReport:
     if unfinished is not None:
         data["facts"].insert(0, ("no end", f"{unfinished.name} {NO_END}"))
     page = report_page(data)
+    make_directory(directory)
     write_whole(directory / "report.html", page.encode(errors="replace"))
     write_whole(directory / "report.json", msgspec.json.format(msgspec.json.encode(summary)))
     return summary

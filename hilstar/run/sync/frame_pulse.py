@@ -47,7 +47,7 @@ class FramePulse:
     @classmethod
     def of(cls, settings: SyncSettings, notices: Notices) -> Self:
         """The pulse that a bench file asks for. Raises InputError where its port cannot be had."""
-        return cls(RtsLine(settings.port, settings.active == "high"), settings, notices)
+        return cls(RtsLine(str(settings.port), settings.active == "high"), settings, notices)
 
     def frame(self, number: int, frame_ns: int) -> None:
         """Start the pulse of frame `number`, whose time stamp (host, ns) is `frame_ns`; waits at most HANDOVER_S."""

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from hilstar.bench.bench_file import BenchFile
 from hilstar.errors import InputError
+from hilstar.files import make_directory
 from hilstar.study.chain.bench_parts import Parts
 from hilstar.study.chain.budget import error_budget
 from hilstar.study.chain.chart import draw
@@ -55,6 +56,7 @@ def run(
             tracker.close()
     if not rows:
         raise InputError(f"{file.path}: no star stands alone in view in any scene; write a larger [sky] faintest_v_mag")
+    make_directory(directory)
     write_tables(directory, rows, budget, stages)
     draw(directory / "chain.png", rows, budget, stages, (headline(rows), machine))
     return [*lines, f"times on {machine}"], right

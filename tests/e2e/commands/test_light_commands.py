@@ -18,7 +18,7 @@ from hilstar.bench.white import clipping_hip
 from hilstar.monitor.calibration import load_calibration
 from hilstar.scene.psf import peak_share, pixel_share
 from hilstar.twin.budget import budget, zero_point_mag
-from tests.support.benches import ROOT, SMALL_BENCH
+from tests.support.benches import ROOT, SMALL_BENCH, bench_text
 from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
 
 EXACT = '[render]\nquantisation = "exact"\n'
@@ -81,6 +81,16 @@ def test_budget_writes_its_chart_and_table(tmp_path, small_bench_file):
         assert min(picture.size) > 500
     spoken = run_hilstar("budget", small_bench_file)
     assert "shows nothing" in spoken.stdout
+
+
+def test_a_formula_s_shares_of_white_are_said_to_be_assumed(tmp_path):
+    path = tmp_path / "bench.toml"
+    for calibration, assumed in (("srgb", True), ("lcd-example", False)):
+        path.write_text(bench_text({"monitor": {"calibration": calibration}, "render": {"bit_stealing": True}}))
+        told = run_hilstar_here("budget", path)
+        assert told.returncode == 0, told.stderr
+        assert ("as 0.2126, 0.7152, 0.0722 of red, green and blue" in told.stderr) is assumed
+        assert len(told.stderr.splitlines()) == assumed
 
 
 def test_budget_has_every_centroider_and_takes_the_bench_s_own(tmp_path, small_bench_file):

@@ -29,7 +29,7 @@ def test_each_head_has_its_own_bench_and_the_common_source(tmp_path):
         ('heads = ["a.toml", "sub/../a.toml"]', "two are called a"),
         ('heads = ["a.toml", "nowhere.toml"]', "nowhere.toml"),
         ('heads = ["a.toml", "b.toml"]\n[monitor]\nbits = 8', "monitor: beside heads stands only"),
-        ('heads = ["a.toml", "heads.toml"]', "unknown key heads"),
+        ('heads = ["a.toml", "heads.toml"]', "give one of its heads' files"),
         ('heads = ["a.toml", "b.toml"]\n[attitude]\nlockstep = true', "lockstep"),
         ('heads = ["a.toml", "b.toml"]\n[attitude]\nsource = "pigeon"', "source"),
     ],

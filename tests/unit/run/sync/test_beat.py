@@ -191,6 +191,7 @@ def test_an_amount_of_hundreds_is_written_without_an_exponent(tmp_path):
             r"\[sync\] port = /dev/x: the attitude comes over it",
         ),
         ({"sync": {"port": "socket://bench:1"}}, r"\[sync\] port = 'socket://bench:1': write .* \"rfc2217://HOST:PORT\""),
+        ({"sync": {"port": ""}}, r"\[sync\] port = '': write .*; leave it out for no pulse"),
         ({"sync": {"port": "rfc2217://bench"}}, r"'rfc2217://bench': write .* \"rfc2217://HOST:PORT\""),
         ({"sync": {"port": "/dev/tty\x07"}}, r"\[sync\] port = '/dev/tty\\x07': write"),
         ({"tracker": {"trigger": "yes"}}, "trigger"),

@@ -90,9 +90,10 @@ class Outlet:
     pulse: FramePulse | None = None
 
     def on(self, loop: FrameLoop) -> FrameLoop:
-        """The loop, whose frames start the pulse."""
+        """The loop, whose frames start the pulse; the ledger counts them."""
         if self.pulse is not None:
             loop.on_frame = self.pulse.frame
+            self.pulse.counted = self.ledger.pulse
         return loop
 
     def pulses(self) -> SyncSummary | UnsetType:

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import threading
 from collections import Counter
+from typing import Literal
 
 from hilstar.run.record.backlog import Kind
 from hilstar.units import NS_PER_S
+
+Counted = Kind | Literal["pulse"]  # pulses are only counted
 
 
 class Allowance:
@@ -36,7 +39,7 @@ class Sieve:
 
     def __init__(self) -> None:
         self._allowances: dict[tuple[Kind, str], Allowance] = {}
-        self._counts: Counter[tuple[Kind, str]] = Counter()
+        self._counts: Counter[tuple[Counted, str]] = Counter()
         self._lock = threading.Lock()
 
     def keeps(self, kind: Kind, reason: str, now_ns: int) -> bool:
@@ -51,12 +54,12 @@ class Sieve:
                 self._counts[kind, reason] += 1
         return kept
 
-    def count(self, kind: Kind, reason: str, number: int = 1) -> None:
+    def count(self, kind: Counted, reason: str, number: int = 1) -> None:
         """Count messages that are not recorded for another reason."""
         with self._lock:
             self._counts[kind, reason] += number
 
-    def counted(self) -> list[tuple[Kind, str, int]]:
+    def counted(self) -> list[tuple[Counted, str, int]]:
         """The counts since the last call."""
         with self._lock:
             counts, self._counts = self._counts, Counter()

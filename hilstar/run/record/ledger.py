@@ -145,6 +145,10 @@ class Ledger:
         """Record the beginning or the end of a fault; a replay needs each."""
         self._backlog.put(Entry("fault", record.host_ns, record.number, record))
 
+    def pulse(self, what: str) -> None:
+        """Count what became of a pulse: "sent", "skipped" or "lost"."""
+        self._sieve.count("pulse", what)
+
     # The writer's thread
 
     def _run(self) -> None:
@@ -193,7 +197,7 @@ class Ledger:
         for kind, number in dropped.items():
             self._lose(kind, number)
         for kind, reason, number in self._sieve.counted():
-            self._counted += 0 if reason == NO_ROOM else number
+            self._counted += 0 if reason == NO_ROOM or kind == "pulse" else number
             record = CountRecord(host_ns=now_ns, kind=kind, reason=reason, count=number)
             self._add("count", now_ns, msgspec.json.encode(record))
         process = self._probe.record()

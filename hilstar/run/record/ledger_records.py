@@ -11,6 +11,8 @@ from hilstar.bench.frame import Bench
 from hilstar.run.shown import Shown
 
 FRAME_TOPIC, PROCESS_TOPIC, EVENT_TOPIC, COUNT_TOPIC, FAULT_TOPIC = "/frame", "/process", "/event", "/not_kept", "/fault"
+# What becomes of the pulse of a frame: a pulse that the line was lost in is "lost", and its frame "skipped" too.
+PULSES = ("sent", "skipped", "lost")
 HostNs = Annotated[int, msgspec.Meta(ge=0, le=2**62)]  # of this host's clock, which began at its start
 AnyNs = Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)]  # of a sender's clock, or between it and the host's
 Marker = Annotated[int, msgspec.Meta(ge=0, le=1)]
@@ -109,9 +111,10 @@ class FaultRecord(msgspec.Struct, kw_only=True):
 
 
 class CountRecord(msgspec.Struct, kw_only=True):
-    """What was only counted, second by second (host time, ns): refused packets by reason, or a flood.
+    """What was only counted, second by second (host time, ns): refused packets by reason, a flood, or pulses.
 
-    `kind` is "packet", "frame" or "event"; `reason` that of a refusal, "accepted" of other packets, the kind of an event.
+    `kind` is "packet", "frame", "event" or "pulse"; `reason` that of a refusal, "accepted" of other packets, the kind of an
+    event, and of a pulse one of PULSES.
     """
 
     host_ns: HostNs

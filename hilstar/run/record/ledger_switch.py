@@ -56,6 +56,12 @@ class LedgerSwitch:
         if ledger is not None:
             ledger.notice(notice)
 
+    def pulse(self, what: str) -> None:
+        """Count what became of a pulse: "sent", "skipped" or "lost"."""
+        ledger = self.current
+        if ledger is not None:
+            ledger.pulse(what)
+
     def fault(self, record: FaultRecord) -> None:
         """Record what becomes of a fault; a ledger that begins later has the scenario too, and what is on then."""
         if record.event == "scenario":

@@ -45,6 +45,7 @@ class RunReport(msgspec.Struct, frozen=True, kw_only=True):
     packet_to_swap_ms: Percentiles
     packets: dict[str, int]
     events: dict[str, int]
+    pulses: dict[str, int]
     clipped: int
     below_step: int
     stars_drawn: int
@@ -81,6 +82,7 @@ def summarise(run: Figures) -> RunReport:
         packet_to_swap_ms=spreads["packet"].percentiles(),
         packets=run.packets.counts,
         events=run.events,
+        pulses=run.pulses,
         **run.most,
         memory_growth_mb=run.memory_growth_mb,
         bench_sha256=run.head.get("bench_sha256"),
@@ -88,6 +90,14 @@ def summarise(run: Figures) -> RunReport:
         calibration_sha256=run.head.get("calibration_sha256"),
         gl_renderer=run.head.get("gl_renderer"),
     )
+
+
+def pulses_line(pulses: dict[str, int]) -> str:
+    """The pulses of a run for a person."""
+    if not pulses:
+        return "none"
+    lost = f", the line lost {pulses['lost']} times" if pulses["lost"] else ""
+    return f"{pulses['sent']} at their frames, {pulses['skipped']} skipped{lost}"
 
 
 def table_rows(found: RunReport) -> list[tuple[str, str]]:
@@ -116,6 +126,7 @@ def table_rows(found: RunReport) -> list[tuple[str, str]]:
         ("packet to swap", three(found.packet_to_swap_ms)),
         ("packets", f"{found.packets.get('accepted', 0)} accepted, {refused} refused"),
         ("events", ", ".join(f"{kind} {count}" for kind, count in found.events.items()) or "none"),
+        ("pulses", pulses_line(found.pulses)),
         ("stars", f"at most {found.stars_drawn} drawn, {found.clipped} clipped, {found.below_step} too faint"),
         ("memory after the first minute", number(found.memory_growth_mb, "MB more at the end")),
         ("bench file", f"SHA-256 {found.bench_sha256}"),

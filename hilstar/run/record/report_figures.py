@@ -8,7 +8,15 @@ from dataclasses import dataclass, field
 
 from hilstar.notices import MAX_DETAIL_CHARACTERS
 from hilstar.run.record.ledger_reader import MAX_REASON_CHARACTERS, MAX_REASONS, PacketTally
-from hilstar.run.record.ledger_records import CountRecord, EventRecord, FrameRecord, PacketForm, ProcessRecord, RunRecord
+from hilstar.run.record.ledger_records import (
+    PULSES,
+    CountRecord,
+    EventRecord,
+    FrameRecord,
+    PacketForm,
+    ProcessRecord,
+    RunRecord,
+)
 from hilstar.run.record.series import SAMPLES, Bins, Sample, Spans
 from hilstar.running_statistics import RunningStatistics
 from hilstar.units import NS_PER_MS, NS_PER_S
@@ -68,6 +76,7 @@ class Figures:
     head: dict[str, str]
     packets: PacketTally = field(default_factory=PacketTally)
     events: dict[str, int] = field(default_factory=dict)
+    pulses: dict[str, int] = field(default_factory=dict)  # by PULSES; {} where none was due
     frames: int = 0
     stale: int = 0
     blank: int = 0
@@ -127,6 +136,9 @@ class Figures:
         if isinstance(record, PacketForm):
             if record.receive_ns is not None:
                 self.packet_times.add(record.receive_ns, ACCEPTED if record.accepted else REFUSED)
+        elif record.kind == "pulse" and record.reason in PULSES:
+            self.pulses = dict.fromkeys(PULSES, 0) | self.pulses
+            self.pulses[record.reason] += record.count
         elif record.kind == "packet":
             self.packet_times.add(record.host_ns, ACCEPTED if record.reason == "accepted" else REFUSED, record.count)
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import Counter
+from collections.abc import Callable
 from types import TracebackType
 from typing import Self
 
@@ -23,10 +25,15 @@ END_S = 1.0
 LAST_S = 0.25  # for the last pulse of a run: what follows has a second, after a signal
 
 
+def _nobody_counts(what: str) -> None:
+    """Whoever counts the pulses of a run that has no ledger."""
+
+
 class FramePulse:
     """Raises a line at every `every_frames`th frame for `pulse_ms`, and never keeps a frame waiting. End it with `close`.
 
     A frame that comes while the line is still busy, or lost, has no pulse; a lost line is opened again, with back-off.
+    `counted` hears what becomes of each, from any thread: "sent", "skipped" or "lost".
     """
 
     def __init__(self, line: RtsLine, settings: SyncSettings, notices: Notices) -> None:
@@ -39,7 +46,8 @@ class FramePulse:
         self._frame_ns = 0
         self._ends = False
         self._delay_ms, self._line_ms = RunningStatistics(), RunningStatistics()
-        self._skipped = self._lost = 0
+        self._counts: Counter[str] = Counter()
+        self.counted: Callable[[str], None] = _nobody_counts
         self._retry_s, self._back_off_s = 0.0, MIN_BACK_OFF_S
         self._thread = threading.Thread(target=self._run, name="hilstar-pulse", daemon=True)
         self._thread.start()
@@ -54,7 +62,7 @@ class FramePulse:
         if number % self._every:
             return
         if not self._idle.is_set():
-            self._skipped += 1
+            self._count("skipped")
             return
         self._idle.clear()
         self._taken.clear()
@@ -73,7 +81,7 @@ class FramePulse:
                 self._pulse()
             else:
                 self._taken.set()
-                self._skipped += 1
+                self._count("skipped")
                 self._reopen()
             self._idle.set()
 
@@ -88,12 +96,17 @@ class FramePulse:
         except LOST as error:
             self._lose(error)
             return
+        self._count("sent")
         self._delay_ms.add((begin_ns - self._frame_ns) / NS_PER_MS)
         self._line_ms.add((set_ns - begin_ns) / NS_PER_MS)
 
+    def _count(self, what: str) -> None:
+        self._counts[what] += 1
+        self.counted(what)
+
     def _lose(self, error: BaseException) -> None:
-        self._lost += 1
-        self._skipped += 1
+        self._count("lost")
+        self._count("skipped")
         why = one_line(str(error))
         self._notices.tell("sync-lost", f"[sync] port {self._line.port} is gone ({why}): frames go on without their pulse")
         self._line.close()
@@ -119,8 +132,8 @@ class FramePulse:
         return SyncSummary(
             port=self._line.port,
             pulses=delay.count,
-            skipped=self._skipped,
-            lost=self._lost,
+            skipped=self._counts["skipped"],
+            lost=self._counts["lost"],
             delay_ms=delay.mean,
             jitter_ms=delay.deviation,
             max_delay_ms=delay.max if delay.count else None,

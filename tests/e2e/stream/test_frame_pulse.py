@@ -33,7 +33,8 @@ def server():
 
 def replayed(tmp_path, bench_file):
     log = still_log(tmp_path / "still.csv")
-    done = run_hilstar_here("replay", bench_file, log, "--headless", "--stop", str(SECONDS), "--json")
+    kept = ("--ledger", tmp_path / "run.mcap")
+    done = run_hilstar_here("replay", bench_file, log, "--headless", "--stop", str(SECONDS), "--json", *kept)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout), done.stderr
 
@@ -67,6 +68,13 @@ def test_a_port_that_is_cut_stops_no_frame(tmp_path, server):
     assert summary["frames"] + summary["missed_frames"] >= int(SECONDS * REFRESH_HZ)
     assert summary["events"]["sync-lost"] == 1
     assert said.count("frames go on without their pulse") == 1
+    # What the run says of its pulses is in its ledger, and in the report of that.
+    counts = {name: summary["sync"][key] for name, key in (("sent", "pulses"), ("skipped", "skipped"), ("lost", "lost"))}
+    reported = run_hilstar_here("report", tmp_path / "run.mcap", "-o", tmp_path / "report", "--json")
+    assert json.loads(reported.stdout)["pulses"] == counts
+    told = run_hilstar_here("report", tmp_path / "run.mcap", "-o", tmp_path / "report").stdout
+    assert f"{counts['sent']} at their frames, {counts['skipped']} skipped, the line lost 1 times" in told
+    assert "only_counted" not in summary["ledger"]
 
 
 def test_a_port_that_is_not_there_is_a_wrong_file(tmp_path):

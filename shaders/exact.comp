@@ -18,28 +18,31 @@ Sums choose(Star star, float of_light, Sums carried, float phase) {
     vec2 fraction = star.fraction;
     ivec2 cell = clamp(ivec2((fraction + odd) * float(PHASES)), 0, PHASES - 1);
     int first = (cell.y * PHASES + cell.x) * footprint;
-    float unit = light_e_per_s[1];
-    float white_e_per_s = light_e_per_s[white];
+    float unit = light_of(1);
+    float white_e_per_s = light_of(white);
     int reach = clamp(int(reach_px2 * log(max(of_light * reach_per_e, 1.0))), fewest, NEAR);
 
+#ifdef PATHS
     uint place[NEAR + 2];
-    float short_of[NEAR + 2];
-    float step_of[NEAR + 2];
+#define PLACE(k) place[k]
+#else
+#define PLACE(k) ORDER_AT(first + (k))
+#endif
+    uint step_of[NEAR + 2];  // the lower level, and in 16 bits how much of the step to the next the light is above it
     BITS rounded_up = BITS(0u);
     vec3 seen = vec3(0.0);  // own light and moments on the image, in this star's pixels and others'
     float largest = 0.0, smallest = NONE, lowest = 0.0;
 #ifdef PATHS
     int mine = 0;
     for (int k = 0; k < reach; k++) {
-        uint here = order[first + k];
+        uint here = ORDER_AT(first + k);
         if (nearest_in_path(vec2(offset_of(here)))) place[mine++] = here;
     }
 #else
     int mine = reach;
-    for (int k = 0; k < mine; k++) place[k] = order[first + k];
 #endif
     for (int k = 0; k < mine; k++) {
-        ivec2 offset = offset_of(place[k]);
+        ivec2 offset = offset_of(PLACE(k));
         ivec2 at = pixel + offset;
 #ifdef PATHS
         float own = path_light_at(vec2(offset));
@@ -48,26 +51,24 @@ Sums choose(Star star, float of_light, Sums carried, float phase) {
         float own = star.e_per_s * share_at(d);
         if (on_image(at)) seen += own * vec3(1.0, d);
 #endif
-        int level = 0;
-        float s = 0.0, t = 0.0, asked = asked_of(at, own);
+        uint word = NO_STEP;
+        float asked = asked_of(at, own);
         if (asked >= 0.0) {
-            float factor = output_of(at);
-            asked = min(asked / factor, white_e_per_s);
-            level = int(imageLoad(levels, at).r);
-            float shown = light_e_per_s[level];
-            bool above = shown > asked;
-            float other = light_e_per_s[above ? level - 1 : level + 1];
-            float low = above ? other : shown;
-            factor /= unit;
-            s = (low - asked) * factor;
-            t = abs(other - shown) * factor;
-            lowest += s;
+            float factor = output_of(at) / unit;
+            asked = min(asked / output_of(at), white_e_per_s);
+            int level = int(imageLoad(levels, at).r);
+            bool above = light_of(level) > asked;
             if (above) rounded_up |= bit_of(k);
-            largest = max(largest, t);
-            smallest = t > 0.0 ? min(smallest, t) : smallest;
+            level -= int(above);
+            float low = light_of(level), step = light_of(level + 1) - low;
+            if (step > 0.0) {
+                word = uint(level) << 16 | uint(clamp((asked - low) / step, 0.0, 1.0) * 65535.0 + 0.5);
+                lowest += (low - asked) * factor;
+                smallest = min(smallest, step * factor);
+                largest = max(largest, step * factor);
+            }
         }
-        short_of[k] = s;
-        step_of[k] = t;
+        step_of[k] = word;
     }
 #ifdef TEMPORAL
     float limit = MAX_CARRIED_STEPS * largest;  // a star that cannot make up for it saves nothing up
@@ -76,7 +77,7 @@ Sums choose(Star star, float of_light, Sums carried, float phase) {
     vec3 error = carried.a.xyz;
 #ifndef PATHS
     for (int k = reach; k < footprint; k++) {
-        ivec2 offset = offset_of(order[first + k]);
+        ivec2 offset = offset_of(ORDER_AT(first + k));
         ivec2 at = pixel + offset;
         vec2 d = vec2(offset) - fraction;
         float own = star.e_per_s * share_at(d);
@@ -87,7 +88,7 @@ Sums choose(Star star, float of_light, Sums carried, float phase) {
         float asked = asked_of(at, own);
         if (asked < 0.0) continue;
         float factor = output_of(at);
-        error += (light_e_per_s[imageLoad(levels, at).r] - min(asked / factor, white_e_per_s)) * factor / unit * arm;
+        error += (light_of(int(imageLoad(levels, at).r)) - min(asked / factor, white_e_per_s)) * factor / unit * arm;
     }
     // What lies further out stays dark.
     error -= (whole_of(star) - seen) / unit;
@@ -111,9 +112,10 @@ Sums choose(Star star, float of_light, Sums carried, float phase) {
     EIGHT(BEGIN)
     // Three pixels at a time, the last of which may be none: those change nothing.
     for (int k = mine; k < mine + 2; k++) {
+#ifdef PATHS
         place[k] = 0u;
-        short_of[k] = 0.0;
-        step_of[k] = 0.0;
+#endif
+        step_of[k] = NO_STEP;
     }
     for (int k = 0; k < mine; k += 3) {
         DECIDE(k, NEXT_TO_EACH)
@@ -131,11 +133,12 @@ Sums choose(Star star, float of_light, Sums carried, float phase) {
         float least = NONE;
         int turned = 0;
         for (int k = 0; k < mine; k++) {
-            if (step_of[k] == 0.0 || has_bit(best.up, k) == rise) continue;
+            if (step_of[k] == NO_STEP || has_bit(best.up, k) == rise) continue;
             vec4 a, b;
             vec2 c;
-            arms_of(place[k], vec2(offset_of(place[k])) - fraction, off, light_weight, a, b, c);
-            float by = rise ? step_of[k] : -step_of[k];
+            arms_of(PLACE(k), vec2(offset_of(PLACE(k))) - fraction, off, light_weight, a, b, c);
+            float t = step_at(step_of[k], pixel + offset_of(PLACE(k))).y;
+            float by = rise ? t : -t;
             float more = by * (2.0 * (dot(a, best.a) + dot(b, best.b) + dot(c, best.c)) + by * (dot(a, a) + dot(b, b) + dot(c, c)));
             turned = more < least ? k : turned;
             least = min(more, least);
@@ -143,19 +146,27 @@ Sums choose(Star star, float of_light, Sums carried, float phase) {
         if (least < NONE) {
             vec4 a, b;
             vec2 c;
-            arms_of(place[turned], vec2(offset_of(place[turned])) - fraction, off, light_weight, a, b, c);
-            best = moved(best, a, b, c, rise ? step_of[turned] : -step_of[turned], best.square, BITS(0u));
+            arms_of(PLACE(turned), vec2(offset_of(PLACE(turned))) - fraction, off, light_weight, a, b, c);
+            float t = step_at(step_of[turned], pixel + offset_of(PLACE(turned))).y;
+            best = moved(best, a, b, c, rise ? t : -t, best.square, BITS(0u));
             best.up ^= bit_of(turned);
         }
     }
-    for (int k = 0; k < mine; k++) {
-        bool up = has_bit(best.up, k);
-        if (step_of[k] == 0.0 || up == has_bit(rounded_up, k)) continue;
-        ivec2 at = pixel + offset_of(place[k]);
-        uint level = imageLoad(levels, at).r;
-        // Of two paths that cross, each may take itself for the brighter, and both move a pixel: never beyond black and white.
-        imageStore(levels, at, uvec4(up ? min(level + 1u, uint(white)) : max(level, 1u) - 1u));
-    }
+    // Only the pixels that are not as they were rounded.
+#define STORE(BITS_OF, FROM) \
+    for (uint turned = best.up BITS_OF ^ rounded_up BITS_OF; turned != 0u; turned &= turned - 1u) { \
+        int k = findLSB(turned) + FROM; \
+        imageStore(levels, pixel + offset_of(PLACE(k)), uvec4((step_of[k] >> 16) + uint(has_bit(best.up, k)))); }
+#if NEAR <= 32
+    STORE(, 0)
+#else
+    STORE([0], 0)
+    STORE([1], 32)
+#if NEAR > 64
+    STORE([2], 64)
+    STORE([3], 96)
+#endif
+#endif
     vec4 plain = best.a / vec4(light_weight, weights.yy, 1.0);
     return Sums(plain + vec4(hidden, vec3(0.0)), best.b, best.c);
 }

@@ -37,6 +37,16 @@ def build_program(
         )
 
 
+def build_compute(
+    ctx: moderngl.Context, main: str, defines: Sequence[str], parts: Sequence[str] = ()
+) -> moderngl.ComputeShader:
+    """A compute program from a file of shaders/, after `defines` and the parts of it that are in files of their own."""
+    version, body = resource_path("shaders", main).read_text().split("\n", 1)
+    before = [resource_path("shaders", f"{part}.glsl").read_text() for part in parts]
+    with held():  # as for any program
+        return ctx.compute_shader("\n".join([version, *(f"#define {name}" for name in defines), *before, body]))
+
+
 MAX_SIDES = 8  # as in star.vert
 MAX_RATE = 3e38  # in float32
 PLACES = "2i 8x 1f"  # of SPRITE_DTYPE: places and rates
@@ -151,6 +161,23 @@ class LevelTexture:
         return self._image
 
 
+class Table:
+    """Values (n,) of four bytes that a shader looks up: in a uniform block where there is room, else in a storage buffer."""
+
+    def __init__(self, ctx: moderngl.Context, name: str, binding: int, values: npt.NDArray[Any]) -> None:
+        rows = table_rows(values, ctx)
+        self.define = [] if rows is None else [f"{name} {len(rows)}"]
+        self._binding, self._in_block = binding, rows is not None
+        self._buffer = ctx.buffer((values if rows is None else rows).tobytes())
+
+    def bind(self) -> None:
+        """Bind it for the next pass."""
+        if self._in_block:
+            self._buffer.bind_to_uniform_block(self._binding)
+        else:
+            self._buffer.bind_to_storage_buffer(self._binding)
+
+
 class Encoder:
     """Draws the levels of a linear image: only the sprites' footprints where that is less work than the whole image.
 
@@ -169,7 +196,8 @@ class Encoder:
         defines = (("DITHER",) if dithered else ()) + (("UNIFORMITY",) if gain is not None else ())
         rising = panel.light_e_per_s()[1:] if dithered else panel.response.thresholds_e_per_s(panel.flux_at_white_e_per_s)
         table = code_table(rising)
-        steps = None if dithered else _block(table.steps(), ctx)
+        found = None if dithered else table.steps()
+        steps = None if found is None else table_rows(found, ctx)
         defines += () if steps is None else (f"STEPS {len(steps)}",)
         self._linear_image = linear if ctx.version_code >= IMAGES_VERSION else None
         defines += (f"BIN_SHIFT {table.bin_shift}", *(("IMAGES",) if self._linear_image is not None else ()))
@@ -268,11 +296,11 @@ def _rows(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
     return padded
 
 
-def _block(steps: npt.NDArray[np.uint32] | None, ctx: moderngl.Context) -> npt.NDArray[np.uint32] | None:
-    """`steps` in rows of four (n, 4), for a uniform block; None where there are none, or more than this GL has room for.
+def table_rows(values: npt.NDArray[Any], ctx: moderngl.Context) -> npt.NDArray[Any] | None:
+    """`values` (n,) of four bytes in rows of four, for a uniform block; None where this GL has no room for so many.
 
-    On llvmpipe a block is read in two thirds of the time of a texture.
+    On llvmpipe a block is read in two thirds of the time of a texture, and in half of that of a storage buffer.
     """
-    if steps is None or 4 * len(steps) + 16 > ctx.info["GL_MAX_UNIFORM_BLOCK_SIZE"]:
+    if 4 * len(values) + 16 > ctx.info["GL_MAX_UNIFORM_BLOCK_SIZE"]:
         return None
-    return np.resize(steps, (-(-len(steps) // 4), 4))
+    return np.resize(values, (-(-len(values) // 4), 4))

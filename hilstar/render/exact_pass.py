@@ -19,11 +19,9 @@ from hilstar.monitor.exact import CARRIED, Left
 from hilstar.monitor.pixel_order import FEWEST, LEAST_LIGHT, PixelOrder
 from hilstar.monitor.quantise import Panel
 from hilstar.monitor.temporal import NONE_BEFORE, first_phases, places_before
-from hilstar.process.interrupts import held
-from hilstar.render.encoder import LevelTexture
-from hilstar.render.splat import share_define
-from hilstar.resources import resource_path
-from hilstar.scene.psf import SQRT2
+from hilstar.render.encoder import LevelTexture, Table, build_compute
+from hilstar.render.splat import set_sigma, share_define
+from hilstar.render.star_passes import StarPasses
 from hilstar.scene.sprites import Sprites
 
 MIN_VERSION = 430  # of OpenGL, for compute shaders
@@ -33,7 +31,7 @@ IN_BOX = 1023  # what a pixel's part in a box is counted in: ten bits
 # Narrower sprites have moments of their pixels: exp(-2 pi^2 sigma^2) / pi px, here 5e-6, of thousands of steps of light.
 NARROW_PX = 0.75
 RUN, MAX_RUNS, HALF_OCTAVES = 256, 2048, 32  # of stars that are sorted by light; runs times half octaves fill 16 bits
-PARTS = ("inputs", "stars", "choices")  # of the shader, before exact.comp
+PARTS = ("sums", "exact/inputs", "shares", "exact/stars", "exact/choices")  # of the shader, before exact.comp
 LOCAL_SIZE = 32  # as in exact.comp
 FIRST_BINDING = 4  # of a Memory's buffers
 BEGIN_DTYPE = np.dtype([("before", "<i4"), ("phase", "<f4")])
@@ -48,14 +46,15 @@ class ExactPass:
         self._linear, self._levels = linear, levels.texture
         self._pixels = PixelOrder(balance.sigma_px)
         light = panel.light_e_per_s()
-        self._light = ctx.buffer(np.append(light, light[-1]).tobytes())
-        self._order = ctx.buffer(_places(self._pixels, balance).tobytes())
+        self._order = Table(ctx, "ORDER_ROWS", 1, _places(self._pixels, balance).ravel())
+        self._light = Table(ctx, "LIGHT_ROWS", 2, np.append(light, light[-1]))
         gain = panel.gain()
         self._gain = None if gain is None else ctx.texture(linear.size, 1, np.ascontiguousarray(gain), dtype="f4")
         self._memory = Memory(ctx) if balance.over_frames else None
         self._step_e_per_s = float(light[1])
         self._turns: moderngl.Buffer | None = None
-        self._programs = {paths: self._build(panel, balance, paths) for paths in (False, True)}
+        self._panel, self._balance = panel, balance
+        self._programs: dict[tuple[bool, bool], moderngl.ComputeShader] = {}
 
     @staticmethod
     def runs_on(ctx: moderngl.Context, sigma_px: tuple[float, float]) -> bool:
@@ -68,17 +67,21 @@ class ExactPass:
         order = PixelOrder(sigma_px)
         return order.near <= MAX_NEAR and order.size <= MAX_SIZE
 
-    def _build(self, panel: Panel, balance: Balance, paths: bool) -> moderngl.ComputeShader:
-        order = self._pixels
+    def _program(self, paths: bool, summed: bool) -> moderngl.ComputeShader:
+        """The program for stars or paths, whose light is summed or in the linear image; made when it is first asked for."""
+        if (paths, summed) not in self._programs:
+            self._programs[paths, summed] = self._build(paths, summed)
+        return self._programs[paths, summed]
+
+    def _build(self, paths: bool, summed: bool) -> moderngl.ComputeShader:
+        order, panel, balance = self._pixels, self._panel, self._balance
         defines = [f"NEAR {order.near}", f"LEVELS r{8 * self._levels_bytes()}ui"]
         defines += [f"SIZE {order.size}", f"FIRST ({order.first})"] + ["NARROW"] * (min(balance.sigma_px) < NARROW_PX)
         defines += share_define(balance.sigma_px, order.size)
         defines += ["PATHS"] * paths + ["UNIFORMITY"] * (self._gain is not None)
-        defines += ["TEMPORAL"] * balance.over_frames
-        version, body = resource_path("shaders", "exact.comp").read_text().split("\n", 1)
-        before = [resource_path("shaders", f"exact/{part}.glsl").read_text() for part in PARTS]
-        with held():  # as for any program
-            program = self._ctx.compute_shader("\n".join([version, *(f"#define {name}" for name in defines), *before, body]))
+        defines += ["TEMPORAL"] * balance.over_frames + ["SUMS"] * summed + [*self._order.define, *self._light.define]
+        program = build_compute(self._ctx, "exact.comp", defines, PARTS if summed else PARTS[1:])
+        set_sigma(program, balance.sigma_px)
         window, weights = balance.window_px, balance.weights
         values = {
             "footprint": order.size**2,
@@ -89,7 +92,6 @@ class ExactPass:
             "first_threshold_e_per_s": float(panel.response.threshold[0] * panel.flux_at_white_e_per_s),
             "resolution_px": self._linear.size,
             "odd": order.bias,
-            "inverse_sigma_sqrt2": tuple(1 / (sigma * SQRT2) for sigma in balance.sigma_px),
             "half_inverse_window2": (0.5 / window[0] ** 2, 0.5 / window[1] ** 2),
             "half_inverse_spread2": tuple(0.5 / (sigma**2 + PIXEL_VARIANCE) for sigma in balance.sigma_px),
             "boxes": (weights.box_3 / IN_BOX, weights.box_5 / IN_BOX),
@@ -116,10 +118,10 @@ class ExactPass:
     def _levels_bytes(self) -> int:
         return 1 if self._levels.dtype == "u1" else 2
 
-    def draw(self, buffer: moderngl.Buffer, sprites: Sprites) -> None:
-        """Choose the levels of `sprites`, which `buffer` holds and the linear image shows."""
+    def draw(self, buffer: moderngl.Buffer, sprites: Sprites, passes: StarPasses | None = None) -> None:
+        """Choose the levels of `sprites`, which `buffer` holds and the sums of `passes` show, or else the linear image."""
         paths, star = sprites.per_star > 1, sprites.star
-        program = self._programs[paths]
+        program = self._program(paths, passes is not None)
         turns = stretches_of(star) if paths else turns_of(sprites.data["electrons_per_s"], self._step_e_per_s)
         count = len(turns)
         self._upload(turns)
@@ -128,12 +130,15 @@ class ExactPass:
         elif self._memory is not None:
             self._memory.bind(star, np.zeros(count, dtype=np.bool_))
         buffer.bind_to_storage_buffer(0)
-        self._order.bind_to_storage_buffer(1)
-        self._light.bind_to_storage_buffer(2)
+        self._order.bind()
+        self._light.bind()
         if self._gain is not None:
             self._gain.use(0)
         self._levels.bind_to_image(0, read=True, write=True)
-        self._linear.bind_to_image(1, read=True, write=False)
+        if passes is None:
+            self._linear.bind_to_image(1, read=True, write=False)
+        else:
+            passes.bind_sums(program)
         program["count"] = count
         program.run(-(-count // LOCAL_SIZE))
         self._ctx.memory_barrier()

@@ -5,22 +5,22 @@ This room is the only user of moderngl.
 
 from __future__ import annotations
 
-import contextlib
-import ctypes
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
 import moderngl
 import numpy as np
 
 from hilstar.arrays import Float32Array
-from hilstar.errors import InputError, MachineError
+from hilstar.errors import InputError
 from hilstar.monitor.balance import AS_USUAL, Balance, Seen
 from hilstar.monitor.exact import ExactQuantiser
 from hilstar.monitor.quantise import Panel, Quantisation, mask_turn
 from hilstar.monitor.response import Codes, Response
 from hilstar.monitor.temporal import TemporalQuantiser
+from hilstar.render.context import create_context
 from hilstar.render.encoder import (
     CUT_WINGS,
     SPRITE_PIXEL_COST,
@@ -34,14 +34,14 @@ from hilstar.render.encoder import (
 from hilstar.render.exact_pass import ExactPass
 from hilstar.render.extended import ExtendedLayer
 from hilstar.render.splat import splat_program
+from hilstar.render.star_passes import StarPasses
 from hilstar.scene.extended import ExtendedLight, Rectangle
 from hilstar.scene.psf import footprint_px
 from hilstar.scene.sprites import SPRITE_DTYPE, Sprites
 
-EGL_LIBRARY = "libEGL.so.1"
-INSTALL_EGL = "install it: apt-get install libegl1 libgl1-mesa-dri"
 FIRST_CAPACITY = 4096
 NO_FRAME = -1
+UNTIMED = nullcontext()
 Context = moderngl.Context
 
 
@@ -72,24 +72,6 @@ class Target:
             found = " x ".join(map(str, self.uniformity.shape[::-1]))
             raise InputError(f"the uniformity map is {found} px and the monitor {width} x {height}; give one value per pixel")
         return Panel(self.response, self.flux_at_white_e_per_s, self.uniformity)
-
-
-def create_context() -> moderngl.Context:
-    """A headless OpenGL 3.3 core context. Raises MachineError with what to install.
-
-    Every GL function comes through libEGL's own loader: a bare machine has no libGL.so.
-    """
-    try:
-        settings: Any = {"backend": "egl", "libgl": EGL_LIBRARY, "libegl": EGL_LIBRARY}
-        return moderngl.create_context(require=330, standalone=True, **settings)
-    except Exception as error:  # moderngl and glcontext raise plain Exceptions here
-        raise MachineError(f"OpenGL 3.3 through EGL is missing ({error}); {INSTALL_EGL}") from error
-
-
-def leave_contexts() -> None:
-    """Let this thread's headless context go: it stays current after its release, and a window's GLX then ends the process."""
-    with contextlib.suppress(OSError, AttributeError):  # a machine without EGL has no such context
-        ctypes.CDLL(EGL_LIBRARY).eglReleaseThread()
 
 
 class Renderer:
@@ -156,6 +138,7 @@ class Renderer:
         self._levels_black = True  # but for the last frame
         self._encoder: Encoder | None = None
         self._exact_pass: ExactPass | None = None
+        self._passes: StarPasses | None = None
         # `exact` in NumPy is made by the first frame that needs it: its arrays are as large as the image.
         self._exact: ExactQuantiser | None = None
         self._floor_encoder: Encoder | None = None
@@ -174,6 +157,8 @@ class Renderer:
             self._encoder.shrink(self._lit_sides)
             if not dithered and not target.sides:
                 self._cut_sides = lit_sides(panel, target.sigma_px, self.footprint_px, CUT_WINGS)
+            if not dithered and StarPasses.runs_on(self._ctx, panel):
+                self._passes = StarPasses(self._levels, panel, target.sigma_px, self._star_by_star)
 
     def _reserve(self, sprites: int) -> None:
         """Make room for `sprites` sprites on the GPU; it grows by doubling and never shrinks."""
@@ -198,20 +183,18 @@ class Renderer:
             self._last_frame = frame
             extended = sprites is not None and bool(sprites.extended)
             self._by_numpy = self._star_by_star and (self._exact_pass is None or extended)
+            passes = None if self._by_numpy or extended else self._passes
+            if passes is not None and (unit := passes.unit_for(sprites)) is not None:
+                self._draw_by_passes(passes, sprites, unit)
+                return
+            if self._passes is not None:
+                self._passes.forget()
             if self._by_numpy:
                 self._draw_by_numpy(sprites, frame)
                 self._undrawn = (sprites, False)
                 self._last_count = None
-                return
-            covered_px, (width, height) = self._covered_px(sprites), self.target.resolution_px
-            cut = bool(self._cut_sides) and sprites is not None and covered_px * SPRITE_PIXEL_COST < width * height
-            self._draw_linear(sprites, whole=not (self.target.sides or cut))
-            if self._encoder is not None:
-                self._encode(self._encoder, sprites, covered_px)
-            if cut and not self.target.sides:
-                self._undrawn = (sprites, True)  # without what is left out, when somebody asks
-            if self._exact_pass is not None:
-                self._choose(self._exact_pass, sprites)
+            else:
+                self._draw_by_points(sprites)
 
     def draw_linear(self, sprites: Sprites) -> None:
         """Draw the linear image of `sprites` alone, no sprite smaller than the footprint; the next `codes` are undefined.
@@ -228,14 +211,47 @@ class Renderer:
             if chooser is not None:
                 chooser.left = None
 
-    def _choose(self, exact_pass: ExactPass, sprites: Sprites | None) -> None:
+    def _draw_by_points(self, sprites: Sprites | None) -> None:
+        """The linear image and its levels by rasterised sprites."""
+        covered_px, (width, height) = self._covered_px(sprites), self.target.resolution_px
+        cut = bool(self._cut_sides) and sprites is not None and covered_px * SPRITE_PIXEL_COST < width * height
+        self._draw_linear(sprites, whole=not (self.target.sides or cut))
+        if self._encoder is not None:
+            with self._stage("encode"):
+                self._encode(self._encoder, sprites, covered_px)
+        if cut and not self.target.sides:
+            self._undrawn = (sprites, True)  # without what is left out, when somebody asks
+        self._choose(sprites, None)
+
+    def _draw_by_passes(self, passes: StarPasses, sprites: Sprites | None, unit_e_per_s: float) -> None:
+        """Levels star by star; the linear image is drawn only when it is read."""
+        self._undrawn, self._levels_black = (sprites, True), False
+        with self._stage("erase"):
+            passes.erase()
+        if sprites is not None and len(sprites):
+            with self._stage("upload"):
+                passes.upload(sprites)
+            with self._stage("splat"):
+                passes.add_light(unit_e_per_s)
+            with self._stage("encode"):
+                passes.encode()
+        self._choose(sprites, passes)
+
+    def _stage(self, name: str) -> AbstractContextManager[object]:
+        """What a stage of a frame runs in; see StagedRenderer."""
+        return UNTIMED
+
+    def _choose(self, sprites: Sprites | None, passes: StarPasses | None) -> None:
         """Choose the levels of the sprites that are drawn, star by star, with what NumPy's last frame left."""
+        if self._exact_pass is None:
+            return
         if self._exact is not None and self._exact.left is not None:
-            exact_pass.left, self._exact.left = self._exact.left, None
+            self._exact_pass.left, self._exact.left = self._exact.left, None
         if sprites is None or not len(sprites):
-            exact_pass.left = None
-        else:
-            exact_pass.draw(self._buffer, sprites)
+            self._exact_pass.left = None
+            return
+        with self._stage("choose"):
+            self._exact_pass.draw(self._buffer if passes is None else passes.sprites, sprites, passes)
 
     def _draw_by_numpy(self, sprites: Sprites | None, frame: int) -> None:
         """Levels by the sprites themselves: the linear image is drawn only when it is read."""
@@ -300,13 +316,16 @@ class Renderer:
     def _draw_linear(self, sprites: Sprites | None, whole: bool, levels: bool = True) -> None:
         """Draw the linear image; `levels` says whether the last frame's are erased."""
         self._undrawn = None
-        self._erase(levels)
+        with self._stage("erase"):
+            self._erase(levels)
         if sprites is not None and sprites.extended:
             self._shine(sprites.extended)
         if sprites is not None and len(sprites):
-            self._upload(sprites)
+            with self._stage("upload"):
+                self._upload(sprites)
             self._last_count = len(sprites)
-            self._splat_stars(sprites, whole)
+            with self._stage("splat"):
+                self._splat_stars(sprites, whole)
 
     def _erase(self, levels: bool = True) -> None:
         """Make black what the last frame drew."""

@@ -23,12 +23,17 @@ def splat_program(
     `by_erf` has error functions where polynomials would do, for the study of trade-offs.
     """
     define = () if by_erf else share_define(sigma_px, footprint_px)
-    program = build_program(ctx, "star.vert", "splat.frag", define)
-    if not define:
-        program["inverse_sigma_sqrt2"] = tuple(1 / (sigma * SQRT2) for sigma in sigma_px)
+    program = build_program(ctx, "star.vert", "splat.frag", define, "shares.glsl")
+    set_sigma(program, sigma_px)
     program["resolution_px"] = resolution_px
     program["footprint_px"] = footprint_px
     return program
+
+
+def set_sigma(program: moderngl.Program | moderngl.ComputeShader, sigma_px: tuple[float, float]) -> None:
+    """Set the sigma of a program of shares.glsl, where its shares are by error functions."""
+    if "inverse_sigma_sqrt2" in program:
+        program["inverse_sigma_sqrt2"] = tuple(1 / (sigma * SQRT2) for sigma in sigma_px)
 
 
 def share_define(sigma_px: tuple[float, float], footprint_px: int) -> tuple[str, ...]:

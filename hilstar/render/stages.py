@@ -7,14 +7,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from hilstar.monitor.response import Codes
-from hilstar.render.encoder import Encoder
 from hilstar.render.renderer import Renderer, Target
-from hilstar.scene.sprites import Sprites
 from hilstar.units import NS_PER_MS
 
 
 class StagedRenderer(Renderer):
-    """A Renderer whose `stage_ms` holds the last frame's stages: erase, upload, splat, encode and read_back in ms of wall time.
+    """A Renderer whose `stage_ms` holds the last frame's stages in ms of wall time: erase, upload, splat,
+    encode, choose and read_back.
 
     `gpu_splat` and `gpu_encode` are the same by the driver's own timers, where it has them.
     """
@@ -32,25 +31,9 @@ class StagedRenderer(Renderer):
         self.stage_ms["read_back"] = (time.perf_counter() - begin) * 1e3
         return codes
 
-    def _erase(self, levels: bool = True) -> None:
-        with self._timed("erase"):
-            super()._erase(levels)
-
-    def _upload(self, sprites: Sprites) -> None:
-        with self._timed("upload"):
-            super()._upload(sprites)
-
-    def _splat_stars(self, sprites: Sprites, whole: bool) -> None:
-        with self._timed("splat"):
-            super()._splat_stars(sprites, whole)
-
-    def _encode(self, encoder: Encoder, sprites: Sprites | None, covered_px: int) -> None:
-        with self._timed("encode"):
-            super()._encode(encoder, sprites, covered_px)
-
     @contextmanager
-    def _timed(self, stage: str) -> Iterator[None]:
-        query = self._queries.get(stage)
+    def _stage(self, name: str) -> Iterator[None]:
+        query = self._queries.get(name)
         begin = time.perf_counter()
         if query is None:
             yield
@@ -58,6 +41,6 @@ class StagedRenderer(Renderer):
             with query:
                 yield
         self._ctx.finish()
-        self.stage_ms[stage] = (time.perf_counter() - begin) * 1e3
+        self.stage_ms[name] = (time.perf_counter() - begin) * 1e3
         if query is not None and query.elapsed:
-            self.stage_ms[f"gpu_{stage}"] = query.elapsed / NS_PER_MS
+            self.stage_ms[f"gpu_{name}"] = query.elapsed / NS_PER_MS

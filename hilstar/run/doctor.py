@@ -13,7 +13,7 @@ from hilstar.attitude.wire.zmq_socket import zmq_version
 from hilstar.attitude.wire.zmq_stream import ZmqReceiver, ZmqSender
 from hilstar.errors import HilstarError, MachineError
 from hilstar.monitor.window.window import displays
-from hilstar.render.renderer import create_context
+from hilstar.render.context import create_context
 from hilstar.resources import resource_path
 from hilstar.sky.catalog import load_catalog
 

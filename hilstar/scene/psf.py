@@ -23,6 +23,7 @@ SQRT2 = math.sqrt(2.0)
 MAX_SHARE_ERROR = 1e-7
 MIN_DEGREE, MAX_DEGREE = 3, 8  # beyond it a polynomial costs as much as erf
 FIT_PLACES, FIT_ROUNDS = 120, 15
+BOUND_PLACES = 200
 
 
 def pixel_share(offset_px: float, sigma_px: float) -> float:
@@ -70,6 +71,20 @@ def footprint_px(sigma_px: tuple[float, float], largest_cut: float = MAX_CUT) ->
         if size > 100_000:
             raise InputError(f"sprite sigma {sigma_px} px: too large for any footprint; write a few pixels")
     return size
+
+
+@lru_cache(maxsize=8)
+def share_bound(sigma_px: tuple[float, float], size_px: int) -> tuple[tuple[float, float], float]:
+    """How far a share of light may lie, (x, y) in px^2, and a factor: an ellipse of a pixel's distance from its star.
+
+    Of the pixels of a footprint of `size_px` those with more than a share s of the light have x^2 / scale_x + y^2 / scale_y
+    under log(factor / s). That is a Gaussian's ellipse with the factor that the integral over pixels needs.
+    """
+    scale = [2 * (sigma**2 + 1 / 12) for sigma in sigma_px]
+    places = np.linspace(0.0, size_px / 2 + 0.5, BOUND_PLACES)
+    shares = [np.maximum(pixel_shares(places, sigma), 1e-300) for sigma in sigma_px]
+    more = [float((np.log(share) + places**2 / along).max()) for share, along in zip(shares, scale, strict=True)]
+    return (scale[0], scale[1]), math.exp(sum(more))
 
 
 @lru_cache(maxsize=8)

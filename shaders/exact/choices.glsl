@@ -87,10 +87,12 @@ Choice moved(Choice e, vec4 a, vec4 b, vec2 c, float by, float square, BITS bit)
 
 // One pixel decided in all choices.
 #define DECIDE(K, PAIRS) { \
-    float s = short_of[K], t = step_of[K]; \
+    uint here = PLACE(K); \
+    vec2 step = step_at(step_of[K], pixel + offset_of(here)); \
+    float s = step.x, t = step.y; \
     vec4 a, b; \
     vec2 c; \
-    arms_of(place[K], vec2(offset_of(place[K])) - fraction, off, light_weight, a, b, c); \
+    arms_of(here, vec2(offset_of(here)) - fraction, off, light_weight, a, b, c); \
     float aa = dot(a, a) + dot(b, b) + dot(c, c); \
     BITS bit = bit_of(K); \
     float lower[KEPT], rise[KEPT]; \

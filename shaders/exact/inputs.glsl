@@ -9,8 +9,20 @@
 #endif
 
 layout(std430, binding = 0) readonly buffer Sprites { int sprite[]; };        // five words each, as SPRITE_DTYPE
-layout(std430, binding = 1) readonly buffer Order { uint order[]; };          // a footprint's pixels by distance, for each phase
-layout(std430, binding = 2) readonly buffer Light { float light_e_per_s[]; }; // of each level, white twice
+// A footprint's pixels by distance, for each phase, and the light of each level, white twice: in blocks where there is room for them,
+// which a CPU reads in half the time.
+#ifdef ORDER_ROWS
+layout(std140, binding = 1) uniform Order { uvec4 order_rows[ORDER_ROWS]; };
+#define ORDER_AT(k) order_rows[(k) >> 2][(k) & 3]
+#else
+layout(std430, binding = 1) readonly buffer Order { uint order[]; };
+#define ORDER_AT(k) order[k]
+#endif
+#ifdef LIGHT_ROWS
+layout(std140, binding = 2) uniform Light { vec4 light_rows[LIGHT_ROWS]; };
+#else
+layout(std430, binding = 2) readonly buffer Light { float light_e_per_s[]; };
+#endif
 #ifdef PATHS
 layout(std430, binding = 3) readonly buffer Stretches { ivec4 stretch[]; };   // its sprites: first, end; its path's: first, end
 #else
@@ -26,7 +38,9 @@ layout(std430, binding = 5) readonly buffer Before { float before[]; };       //
 layout(std430, binding = 6) writeonly buffer Left { float left_sums[]; };
 #endif
 layout(LEVELS, binding = 0) uniform uimage2D levels;
+#ifndef SUMS
 layout(r32f, binding = 1) readonly uniform image2D linear_e_per_s;
+#endif
 #ifdef UNIFORMITY
 uniform sampler2D gain;
 #endif
@@ -39,7 +53,6 @@ uniform int white;
 uniform float first_threshold_e_per_s;
 uniform ivec2 resolution_px;
 uniform float odd;      // 0.5 for footprints with a middle
-uniform vec2 inverse_sigma_sqrt2;
 uniform vec2 half_inverse_window2;
 #ifdef PATHS
 uniform vec2 half_inverse_spread2;  // of the Gaussian and a pixel together
@@ -58,3 +71,11 @@ const float SAME_STEP = 1e-4;
 const float OFF = 0.6;  // of a step, where steps are equal: then one more pixel is turned
 
 const float MAX_CARRIED_STEPS = 8.0;
+
+float light_of(int level) {
+#ifdef LIGHT_ROWS
+    return light_rows[level >> 2][level & 3];
+#else
+    return light_e_per_s[level];
+#endif
+}

@@ -1,43 +1,5 @@
 // What a star gives a pixel, and which pixels are a star's own. Part of exact.comp.
 
-// A star's shares of light along x and y in a pixel at `d` from it, and in the whole pixel: as in splat.frag.
-#ifdef LOG2_SHARE
-vec2 shares_at(vec2 d) {
-    return exp2(LOG2_SHARE((d * d)));
-}
-
-float share_at(vec2 d) {
-    vec2 power = LOG2_SHARE((d * d));
-    return exp2(power.x + power.y);
-}
-#else
-vec4 erf4(vec4 value) {
-    vec4 x = clamp(value, -4.0, 4.0);
-    vec4 s = x * x;
-    vec4 p = s * -2.72614225801306e-10 + 2.77068142495902e-08;
-    p = p * s - 2.10102402082508e-06;
-    p = p * s - 5.69250639462346e-05;
-    p = p * s - 7.34990630326855e-04;
-    p = p * s - 2.95459980854025e-03;
-    p = p * s - 1.60960333262415e-02;
-    vec4 q = s * -1.45660718464996e-05 - 2.13374055278905e-04;
-    q = q * s - 1.68282697438203e-03;
-    q = q * s - 7.37332916720468e-03;
-    q = q * s - 1.42647390514189e-02;
-    return x * p / q;
-}
-
-vec2 shares_at(vec2 d) {
-    vec4 e = erf4(vec4(d - 0.5, d + 0.5) * inverse_sigma_sqrt2.xyxy);
-    return 0.5 * max(e.zw - e.xy, 0.0);
-}
-
-float share_at(vec2 d) {
-    vec2 share = shares_at(d);
-    return share.x * share.y;
-}
-#endif
-
 // A sprite, or one that is not there: without light.
 struct Star {
     ivec2 pixel;
@@ -84,12 +46,21 @@ vec3 whole_of(Star star) {
 }
 #endif
 
+const uint NO_STEP = 0xffffffffu;
+
 float output_of(ivec2 at) {
 #ifdef UNIFORMITY
     return 1.0 / texelFetch(gain, at, 0).r;
 #else
     return 1.0;
 #endif
+}
+
+// A pixel's light where its lower level is taken, from what it should show, and the step to the next level, in steps from black.
+vec2 step_at(uint word, ivec2 at) {
+    int level = int(word >> 16);
+    float step = (light_of(level + 1) - light_of(level)) * output_of(at) / light_of(1);
+    return word == NO_STEP ? vec2(0.0) : vec2(float(word & 0xffffu) * (-1.0 / 65535.0), 1.0) * step;
 }
 
 #ifdef PATHS
@@ -139,7 +110,11 @@ float path_light_at(vec2 offset) {
 // The light that a pixel should show, e-/s, negative where it is not this star's; `own` is what the star gives.
 float asked_of(ivec2 at, float own) {
     if (!on_image(at)) return -1.0;
+#ifdef SUMS
+    float drawn = float(sums[at.y * resolution_px.x + at.x]) * unit_e_per_s;
+#else
     float drawn = imageLoad(linear_e_per_s, at).r;
+#endif
     // A faint star's sprite may end before its near pixels do.
     return 2.0 * own > drawn * 1.0001 ? (drawn > 0.0 ? drawn : own) : -1.0;
 }

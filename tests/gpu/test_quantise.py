@@ -22,6 +22,7 @@ WHITE = 1e6
 # Of pixels that groups of stars light: light is within a few 64ths of a step under a threshold in as many of them.
 FLIPPED = 0.02
 GREY = srgb_response(8)
+UNIT = 2e-4  # of the faintest light that is shown: what light is rounded by where it is drawn star by star
 RESPONSES = {
     "srgb8": GREY,
     "srgb10": srgb_response(10),
@@ -64,6 +65,7 @@ def assert_same_but_for_ties(found, expected, linear, panel):
 @pytest.mark.parametrize("count", [150, 8000])
 @pytest.mark.parametrize("mapped", [False, True], ids=["even", "uneven"])
 @pytest.mark.parametrize("method", ["round", "dither"])
+@pytest.mark.usefixtures("by_points")
 def test_levels_are_those_of_the_oracle_pixel_for_pixel(response, count, mapped, method, rng):
     """150 stars take the footprint pass, 8000 the full-screen pass: the levels of one linear image are one thing."""
     target = target_of(response, method, uneven(rng) if mapped else None)
@@ -81,6 +83,7 @@ def test_levels_are_those_of_the_oracle_pixel_for_pixel(response, count, mapped,
     assert levels.max() == response.white
 
 
+@pytest.mark.usefixtures("each_way")
 def test_where_wings_meet_round_leaves_out_no_more_than_it_says(rng):
     """Groups of faint stars and bright ones: a star's light beyond its square is under a 32nd of what lights a pixel."""
     size, groups, each = (640, 480), 40, 16
@@ -101,6 +104,7 @@ def test_where_wings_meet_round_leaves_out_no_more_than_it_says(rng):
 
 
 @pytest.mark.parametrize("sigma", [(0.55, 0.55), (0.85, 0.85), (1.3, 0.7)])
+@pytest.mark.usefixtures("each_way")
 def test_a_star_alone_has_the_levels_of_its_whole_light(sigma):
     """At 144 phases, from one that lights no pixel to one that clips."""
     step = footprint_px(sigma) + 3
@@ -109,7 +113,10 @@ def test_a_star_alone_has_the_levels_of_its_whole_light(sigma):
     with Renderer(Target((60 * step, 15 * step), sigma, GREY, WHITE)) as gl:
         gl.draw(sprites_at(pixels, 10.0 ** np.linspace(1.5, 7.5, 144), gl.footprint_px))
         found = gl.codes().copy()
-        assert np.array_equal(found, round_levels(gl.linear(), gl.target.panel()))
+        light, panel = gl.linear(), gl.target.panel()
+        assert (found >= round_levels(light * np.float32(1 - UNIT), panel)).all()
+        assert (found <= round_levels(light * np.float32(1 + UNIT), panel)).all()
+        assert np.count_nonzero(found != round_levels(light, panel)) <= 1
         assert len(np.unique(found)) > 100
 
 
@@ -129,6 +136,7 @@ def apart(count, rng, footprint):
 
 @pytest.mark.parametrize("response", RESPONSES.values(), ids=RESPONSES)
 @pytest.mark.parametrize("mapped", [False, True], ids=["even", "uneven"])
+@pytest.mark.usefixtures("each_way")
 def test_exact_levels_are_those_of_its_quantiser(response, mapped, rng):
     target = target_of(response, "exact", uneven(rng) if mapped else None)
     panel = target.panel()
@@ -148,6 +156,7 @@ def test_exact_levels_are_those_of_its_quantiser(response, mapped, rng):
         assert gl.gl_error() == "GL_NO_ERROR"
 
 
+@pytest.mark.usefixtures("each_way")
 def test_exact_paths_are_those_of_its_quantiser(rng):
     """Streaks of up to 70 sprites, some over the edge: the same flux within a step of each, and as good."""
     target = target_of(RESPONSES["srgb8"], "exact")
@@ -169,6 +178,7 @@ def test_exact_paths_are_those_of_its_quantiser(rng):
         assert gl.gl_error() == "GL_NO_ERROR"
 
 
+@pytest.mark.usefixtures("each_way")
 def test_overlapping_stars_are_exact_together(rng):
     """2000 stars over each other: light as right as that of the oracle, rounding is off by much more."""
     target = target_of(RESPONSES["srgb8"], "exact")
@@ -188,6 +198,7 @@ def test_overlapping_stars_are_exact_together(rng):
     assert rms[0] < 0.7 * rms[2]
 
 
+@pytest.mark.usefixtures("each_way")
 def test_temporal_goes_on_while_the_frames_numbers_rise(rng):
     """A number not above the last one's, `begin_anew` and a blank frame begin a sequence; other drawings do not."""
     with Renderer(target_of(GREY, "temporal")) as gl:

@@ -10,7 +10,7 @@ import pytest
 
 from hilstar.errors import InputError, MachineError
 from hilstar.monitor.response import encode, srgb_response
-from hilstar.render import renderer as renderer_module
+from hilstar.render import context as context_module
 from hilstar.render.reference import linear_image
 from hilstar.render.renderer import Renderer, Target
 from hilstar.scene.psf import MAX_CUT, footprint_px
@@ -107,6 +107,7 @@ def test_the_footprint_cuts_no_more_than_it_says():
 
 @pytest.mark.parametrize("bits", [6, 8, 10, 12, 16])
 @pytest.mark.parametrize("count", [150, 8000])
+@pytest.mark.usefixtures("by_points")
 def test_codes_are_those_of_the_oracle_pixel_for_pixel(bits, count, rng):
     """150 stars take the footprint pass, 8000 the full-screen pass: the codes of one linear image are one thing."""
     pixels = rng.uniform([-5, -5], [260, 197], size=(count, 2))
@@ -162,6 +163,7 @@ def test_nothing_remains_of_the_frame_before(rng):
 
 
 @pytest.mark.parametrize("read", [False, True], ids=["unread", "light is read between"])
+@pytest.mark.usefixtures("each_way")
 def test_frames_of_any_number_of_stars_follow_each_other(read, rng):
     """Few are erased one by one, more by a clear, and those that cover the image by the pass itself."""
     size = (640, 480)
@@ -173,6 +175,8 @@ def test_frames_of_any_number_of_stars_follow_each_other(read, rng):
                 gl.linear()
             fresh.draw(None)
             fresh._last_count = None  # all of its images is cleared
+            if fresh._passes is not None:
+                fresh._passes.forget()
             fresh.draw(sprites)
             assert np.array_equal(gl.codes(), fresh.codes())
             if read:
@@ -202,6 +206,6 @@ def test_a_monitor_larger_than_the_driver_s_textures_is_refused():
 
 
 def test_a_machine_without_egl_is_told_what_to_install(monkeypatch):
-    monkeypatch.setattr(renderer_module, "EGL_LIBRARY", "libEGL.so.none")
+    monkeypatch.setattr(context_module, "EGL_LIBRARY", "libEGL.so.none")
     with pytest.raises(MachineError, match="apt-get install libegl1 libgl1-mesa-dri"):
         Renderer(target_of())

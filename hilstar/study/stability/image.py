@@ -12,8 +12,9 @@ from scipy.special import erf, ndtr
 
 from hilstar.arrays import Float32Array, FloatArray
 from hilstar.errors import InputError
+from hilstar.render.context import create_context
 from hilstar.render.reference import linear_image
-from hilstar.render.renderer import Renderer, Target, create_context
+from hilstar.render.renderer import Renderer, Target
 from hilstar.scene.psf import MAX_CUT, SQRT2, cut_share, footprint_px, pixel_shares
 from hilstar.scene.sprites import Sprites, join_sprites, pack_sprites
 from hilstar.study.stability.failure_case import FailureCase, Figures

@@ -15,8 +15,8 @@ from hilstar.bench.orientation import orientation_of
 from hilstar.calibrate.edges import Edges, edges_of
 from hilstar.calibrate.first_light.patterns import CodeImage, Pattern
 from hilstar.errors import HilstarError, MachineError
+from hilstar.render.context import leave_contexts
 from hilstar.render.presenter import Presenter, View, level_texture, window_context
-from hilstar.render.renderer import leave_contexts
 from hilstar.run.screen.gate import Timing, pass_gate
 from hilstar.run.screen.screen import Screen
 

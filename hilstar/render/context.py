@@ -1,0 +1,32 @@
+"""Headless OpenGL contexts through EGL."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+from typing import Any
+
+import moderngl
+
+from hilstar.errors import MachineError
+
+EGL_LIBRARY = "libEGL.so.1"
+INSTALL_EGL = "install it: apt-get install libegl1 libgl1-mesa-dri"
+
+
+def create_context() -> moderngl.Context:
+    """A headless OpenGL 3.3 core context. Raises MachineError with what to install.
+
+    Every GL function comes through libEGL's own loader: a bare machine has no libGL.so.
+    """
+    try:
+        settings: Any = {"backend": "egl", "libgl": EGL_LIBRARY, "libegl": EGL_LIBRARY}
+        return moderngl.create_context(require=330, standalone=True, **settings)
+    except Exception as error:  # moderngl and glcontext raise plain Exceptions here
+        raise MachineError(f"OpenGL 3.3 through EGL is missing ({error}); {INSTALL_EGL}") from error
+
+
+def leave_contexts() -> None:
+    """Let this thread's headless context go: it stays current after its release, and a window's GLX then ends the process."""
+    with contextlib.suppress(OSError, AttributeError):  # a machine without EGL has no such context
+        ctypes.CDLL(EGL_LIBRARY).eglReleaseThread()

@@ -1,0 +1,158 @@
+"""Frames drawn star by star in compute passes: on a software OpenGL in a quarter of the time of sprites that are rasterised.
+
+Each pixel's light is a sum of whole units, which is the same in whatever order several threads add to it.
+"""
+
+from __future__ import annotations
+
+import math
+
+import moderngl
+import numpy as np
+
+from hilstar.monitor.level_table import CodeTable, code_table
+from hilstar.monitor.quantise import Panel
+from hilstar.render.encoder import LevelTexture, Table, build_compute
+from hilstar.render.splat import set_sigma, share_define
+from hilstar.scene.psf import footprint_px, peak_share, share_bound
+from hilstar.scene.sprites import SPRITE_DTYPE, Sprites
+
+MIN_VERSION = 430  # of OpenGL, for compute shaders
+SOFTWARE = ("llvmpipe", "softpipe")  # a graphics card rasterises points in its stride, and a star a lane leaves it idle
+LOCAL_SIZE = 32  # as in light.comp
+STEPS_BINDING, SUMS_BINDING = 1, 7
+MAX_SUM = 2**31 - 2**24  # what an int holds, less what a float32 that large is rounded by
+# Of the light that lights a pixel. Where stars are so many and so bright that a unit would be more, their light is blended.
+MAX_UNIT = 1 / 64
+# A star's light ends where a pixel has one part in WINGS of what lights one, and where footprints cover the whole image one in
+# WINGS * DENSER_WINGS. A star alone has the same levels; of 10 000 on 1080p eleven of 82 000 lit pixels are one level lower,
+# where wings meet, and of 50 000 one in seven thousand.
+WINGS, DENSER_WINGS = 128, 8
+# Of the image: where footprints cover more, a clear of levels and sums is faster (llvmpipe, 1080p and 4K).
+MAX_ERASED = 0.1
+MAX_ERASED_KEPT = 0.03  # all of the footprints and the sums too: `exact` may light pixels beyond a star's reach
+ANY_REACH = 1e6, 1e30  # axes and rates that are so many times larger reach over every footprint
+
+
+class StarPasses:
+    """Draws sprites into pixels' sums and a LevelTexture; it lives in its renderer's context, which is current in every call.
+
+    With `keep` the sums stay for `exact` to look at.
+    """
+
+    def __init__(self, levels: LevelTexture, panel: Panel, sigma_px: tuple[float, float], keep: bool) -> None:
+        ctx = self._ctx = levels.texture.ctx
+        self._levels, self._keep = levels, keep
+        self._size_px = levels.texture.size
+        self._footprint_px = footprint_px(sigma_px)
+        gain = panel.gain()
+        self._gain = None if gain is None else ctx.texture(self._size_px, 1, np.ascontiguousarray(gain), dtype="f4")
+        low, high = (1.0, 1.0) if gain is None else (float(gain.min()), float(gain.max()))
+        thresholds = panel.response.thresholds_e_per_s(panel.flux_at_white_e_per_s)
+        self._lit_e_per_s, self._white_e_per_s = float(thresholds[0]) / high, panel.flux_at_white_e_per_s / low
+        self._peak_share = peak_share(sigma_px)
+        self._axes_px2, self._share_bound = share_bound(sigma_px, self._footprint_px)
+        self._sums = ctx.buffer(np.zeros(self._size_px[0] * self._size_px[1], dtype=np.int32))
+        self._unit_e_per_s = 0.0  # of the sums
+        self.sprites = ctx.buffer(reserve=SPRITE_DTYPE.itemsize, dynamic=True)
+        self._drawn: int | None = None  # sprites that are in the buffer and on the images; None: it is not known
+        self._build(code_table(thresholds), sigma_px)
+
+    @staticmethod
+    def runs_on(ctx: moderngl.Context, panel: Panel) -> bool:
+        """Whether this GL is a processor's, with compute shaders, and no bin of the panel's table has several thresholds."""
+        if ctx.version_code < MIN_VERSION or not str(ctx.info["GL_RENDERER"]).startswith(SOFTWARE):
+            return False
+        return code_table(panel.response.thresholds_e_per_s(panel.flux_at_white_e_per_s)).steps() is not None
+
+    def _build(self, table: CodeTable, sigma_px: tuple[float, float]) -> None:
+        steps = table.steps()
+        if steps is None:
+            raise ValueError("several thresholds in a bin; ask `runs_on` first")
+        self._steps = Table(self._ctx, "STEPS", STEPS_BINDING, steps)
+        texel = {"u1": "r8ui", "u2": "r16ui"}[self._levels.texture.dtype]
+        defines = [f"LEVELS_FORMAT {texel}", f"FOOTPRINT {self._footprint_px}", f"BIN_SHIFT {table.bin_shift}"]
+        defines += [*share_define(sigma_px, self._footprint_px), *["KEEP"] * self._keep]
+        defines += ["UNIFORMITY"] * (self._gain is not None) + self._steps.define
+        self._light, self._encode, self._black = (
+            build_compute(self._ctx, "light.comp", [*part, *defines], ("shares", "sums"))
+            for part in (["LIGHT"], ["LEVELS"], [])
+        )
+        for program in (self._light, self._encode, self._black):
+            program["resolution_px"], program["reach_px2"] = self._size_px, self._axes_px2
+        if self._keep:
+            self._black["reach_px2"] = [along * ANY_REACH[0] for along in self._axes_px2]
+            self._black["reach_per_e"] = ANY_REACH[1]
+        set_sigma(self._light, sigma_px)
+        self._light["most_e_per_s"] = self._white_e_per_s
+        self._encode["lowest"] = (table.first_bin - 1) << table.bin_shift
+        self._encode["highest"] = ((table.first_bin + len(table.first_code)) << table.bin_shift) - 1
+
+    def unit_for(self, sprites: Sprites | None) -> float | None:
+        """The unit (e-/s) in which no pixel's sum of these sprites can be too large; None where it is too coarse for the panel.
+
+        A power of two, from the sum of all stars' brightest pixels, of white at most each.
+        """
+        if sprites is None or not len(sprites):
+            return self._white_e_per_s
+        rates = np.minimum(sprites.data["electrons_per_s"], np.float32(self._white_e_per_s / self._peak_share))
+        most_e_per_s = max(float(rates.sum(dtype=np.float64)) * self._peak_share * 1.000001, self._white_e_per_s)
+        unit = 2.0 ** math.ceil(math.log2(most_e_per_s / (MAX_SUM - len(sprites))))
+        return unit if unit <= self._lit_e_per_s * MAX_UNIT else None
+
+    def forget(self) -> None:
+        """Something else has drawn on the levels: the next `erase` makes all of them black."""
+        self._drawn = None
+
+    def erase(self) -> None:
+        """Make black what the last frame drew."""
+        most_px = (MAX_ERASED_KEPT if self._keep else MAX_ERASED) * self._size_px[0] * self._size_px[1]
+        if self._drawn is None or self._drawn * self._footprint_px**2 > most_px:
+            if self._keep:
+                self._sums.clear()
+            self._levels.fbo.use()
+            self._levels.fbo.clear()
+        else:
+            self._run(self._black)
+        self._drawn = 0
+
+    def upload(self, sprites: Sprites) -> None:
+        """Take the sprites that `add_light` and `encode` are about."""
+        size = len(sprites) * SPRITE_DTYPE.itemsize
+        if self.sprites.size < size:
+            self.sprites.release()
+            self.sprites = self._ctx.buffer(reserve=2 * size, dynamic=True)
+        self.sprites.orphan()
+        self.sprites.write(sprites.data)
+        self._drawn = len(sprites)
+        width, height = self._size_px
+        wings = WINGS * (DENSER_WINGS if len(sprites) * self._footprint_px**2 > width * height else 1)
+        for program in (self._light, self._encode, *[self._black][self._keep :]):
+            program["reach_per_e"] = self._share_bound * sprites.per_star * wings / self._lit_e_per_s
+
+    def add_light(self, unit_e_per_s: float) -> None:
+        """Add the light of the sprites to their pixels' sums, which are of that unit."""
+        self._unit_e_per_s = self._light["unit_e_per_s"] = self._encode["unit_e_per_s"] = unit_e_per_s
+        self._run(self._light)
+
+    def encode(self) -> None:
+        """Make levels of the sums under the sprites, the nearest."""
+        if self._gain is not None:
+            self._gain.use(0)
+        self._steps.bind()
+        self._run(self._encode)
+
+    def bind_sums(self, program: moderngl.ComputeShader) -> None:
+        """Let another program look at the sums (see shaders/sums.glsl)."""
+        program["unit_e_per_s"] = self._unit_e_per_s
+        self._sums.bind_to_storage_buffer(SUMS_BINDING)
+
+    def _run(self, program: moderngl.ComputeShader) -> None:
+        if not self._drawn:
+            return
+        program["count"] = self._drawn
+        self.sprites.bind_to_storage_buffer(0)
+        self._sums.bind_to_storage_buffer(SUMS_BINDING)
+        self._levels.texture.bind_to_image(0, read=False, write=True)
+        program.run(-(-self._drawn // LOCAL_SIZE))
+        self._ctx.memory_barrier()

@@ -1,0 +1,85 @@
+#version 430 core
+// A frame's stars to light and levels, a star a lane, within the reach of each. With LIGHT each adds to the sums of its pixels;
+// with LEVELS those become levels, the nearest; with neither levels become black again.
+// On llvmpipe this takes a quarter of the time of points that are rasterised and blended (hilstar/render/star_passes.py).
+// Defined before this text: LEVELS_FORMAT (r8ui or r16ui), FOOTPRINT; with KEEP sums stay as they are for exact.comp, else they are
+// nothing again when they have become levels. It comes after shares.glsl and sums.glsl.
+
+layout(local_size_x = 32) in;
+
+layout(std430, binding = 0) readonly buffer Sprites { int sprite[]; };  // five words each, as SPRITE_DTYPE
+layout(LEVELS_FORMAT, binding = 0) writeonly uniform uimage2D levels;
+#ifdef LEVELS
+// As in encode.frag.
+#ifdef STEPS
+layout(std140, binding = 1) uniform Steps { uvec4 steps[STEPS]; };
+#define STEP(bin) steps[(bin) >> 2][(bin) & 3]
+#else
+layout(std430, binding = 1) readonly buffer Steps { uint steps[]; };
+#define STEP(bin) steps[bin]
+#endif
+uniform int lowest;
+uniform int highest;
+#ifdef UNIFORMITY
+uniform sampler2D gain;
+#endif
+#endif
+
+uniform int count;
+uniform ivec2 resolution_px;
+uniform float most_e_per_s;  // of one star in one pixel: more is white in any case
+uniform float reach_per_e;   // a star lights an ellipse: the logarithm of this times its rate, times these squares of its axes
+uniform vec2 reach_px2;
+
+const int FIRST = -((FOOTPRINT - 1) / 2);
+
+#ifdef LEVELS
+uint level_of(float light) {
+    int bits = clamp(floatBitsToInt(light), lowest, highest);
+    uint found = STEP((bits - lowest) >> BIN_SHIFT);
+    uint lower = uint(bits) & ((1u << BIN_SHIFT) - 1u);
+    return (found >> (BIN_SHIFT + 1)) + uint(lower >= (found & ((2u << BIN_SHIFT) - 1u)));
+}
+#endif
+
+void main() {
+    int i = int(gl_GlobalInvocationID.x);
+    if (i >= count) return;
+    ivec2 pixel = ivec2(sprite[5 * i], sprite[5 * i + 1]);
+    vec2 fraction = vec2(intBitsToFloat(sprite[5 * i + 2]), intBitsToFloat(sprite[5 * i + 3]));
+    float e_per_s = intBitsToFloat(sprite[5 * i + 4]);
+    vec2 reach_px = sqrt(log(max(reach_per_e * e_per_s, 1.0)) * reach_px2);
+    int first_x = max(FIRST, -pixel.x), end_x = min(FIRST + FOOTPRINT, resolution_px.x - pixel.x);
+    int y = max(max(FIRST, -pixel.y), int(ceil(fraction.y - reach_px.y)));
+    int end_y = min(min(FIRST + FOOTPRINT, resolution_px.y - pixel.y), int(floor(fraction.y + reach_px.y)) + 1);
+    for (; y < end_y; y++) {
+        float up = (float(y) - fraction.y) / reach_px.y;
+        float wide = reach_px.x * sqrt(max(1.0 - up * up, 0.0));
+        int end = min(end_x, int(floor(fraction.x + wide)) + 1);
+        for (int x = max(first_x, int(ceil(fraction.x - wide))); x < end; x++) {
+            ivec2 at = pixel + ivec2(x, y);
+            int here = at.y * resolution_px.x + at.x;
+#if defined(LIGHT)
+            float light = min(e_per_s * share_at(vec2(x, y) - fraction), most_e_per_s);
+            atomicAdd(sums[here], int(light / unit_e_per_s + 0.5));
+#elif defined(LEVELS)
+#ifdef KEEP
+            int sum = sums[here];
+#else
+            int sum = atomicExchange(sums[here], 0);
+            if (sum == 0) continue;  // another star's too, and done
+#endif
+            float light = float(sum) * unit_e_per_s;
+#ifdef UNIFORMITY
+            light *= texelFetch(gain, at, 0).r;
+#endif
+            imageStore(levels, at, uvec4(level_of(light)));
+#else
+#ifdef KEEP
+            sums[here] = 0;
+#endif
+            imageStore(levels, at, uvec4(0u));
+#endif
+        }
+    }
+}

@@ -1,0 +1,124 @@
+"""Frames drawn star by star: the levels of the light within the stars' reach, in whatever order and after whatever frame."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hilstar.monitor.quantise import round_levels
+from hilstar.monitor.response import gamma_response, srgb_response
+from hilstar.render.renderer import Renderer, Target
+from hilstar.render.star_passes import MAX_UNIT, WINGS
+from hilstar.scene.extended import LightMap
+from hilstar.scene.psf import footprint_px, pixel_shares, share_bound
+from tests.support.stars import sprites_at
+
+SIZE, SIGMA, WHITE = (256, 192), (0.85, 0.85), 1e6
+PANELS = {"srgb6": srgb_response(6), "srgb8": srgb_response(8), "srgb10": srgb_response(10), "gamma8": gamma_response(8)}
+# Light is summed in float32 by blending, in whole units here: both round by that of what they sum, at most.
+FLOAT32 = 1e-6
+
+
+def stars(count, rng, size=SIZE, decades=(1, 6)):
+    pixels = rng.uniform([-5, -5], [size[0] + 5, size[1] + 5], size=(count, 2))
+    return sprites_at(pixels, 10.0 ** rng.uniform(*decades, count), footprint_px(SIGMA))
+
+
+def covering(sprites, size):
+    """How many stars' footprints hold each pixel (height, width)."""
+    count, side = np.zeros(size[::-1]), sprites.footprint_px
+    for x, y in sprites.data["pixel"] - (side - 1) // 2:
+        count[max(y, 0) : max(y + side, 0), max(x, 0) : max(x + side, 0)] += 1
+    return count
+
+
+@pytest.mark.parametrize("name", PANELS)
+@pytest.mark.parametrize("uneven", [False, True], ids=["even", "uneven"])
+@pytest.mark.parametrize("count", [0, 1, 150, 4000])
+def test_levels_are_those_of_the_light_but_for_what_lies_beyond_reach(name, uneven, count, rng):
+    response = PANELS[name]
+    map_ = rng.uniform(0.8, 1.2, SIZE[::-1]).astype(np.float32) if uneven else None
+    with Renderer(Target(SIZE, SIGMA, response, WHITE, uniformity=map_)) as gl:
+        sprites = stars(count, rng)
+        gl.draw(sprites)
+        found, whole, panel = gl.codes().copy(), gl.linear().astype(np.float64), gl.target.panel()
+        assert gl.gl_error() == "GL_NO_ERROR"
+    lit = response.threshold[0] * WHITE
+    over = covering(sprites, SIZE)
+    rounding = over * lit * MAX_UNIT + FLOAT32 * whole
+    least = whole - over * lit / WINGS - rounding
+    assert (found <= round_levels((whole + rounding).astype(np.float32), panel)).all()
+    assert (found >= round_levels(np.maximum(least, 0).astype(np.float32), panel)).all()
+    # Few pixels are near a threshold: the bounds above are wide, and most levels are the very same.
+    assert np.count_nonzero(found != round_levels(whole.astype(np.float32), panel)) <= 0.01 * np.count_nonzero(found)
+
+
+def test_the_order_of_stars_changes_nothing(rng):
+    with Renderer(Target(SIZE, SIGMA, PANELS["srgb10"], WHITE)) as gl:
+        sprites = stars(3000, rng)
+        gl.draw(sprites)
+        first = gl.codes().copy()
+        for _ in range(3):
+            order = rng.permutation(len(sprites))
+            gl.draw(replace(sprites, data=sprites.data[order], star=sprites.star[order]))
+            assert np.array_equal(gl.codes(), first)
+
+
+@pytest.mark.parametrize("count", [1, 100, 20_000])
+def test_no_sum_is_too_large_for_its_pixel(count):
+    """Any number of stars far brighter than white, on one pixel."""
+    with Renderer(Target(SIZE, SIGMA, PANELS["srgb8"], WHITE)) as gl:
+        gl.draw(sprites_at(np.full((count, 2), 100.0), np.full(count, 1e12), gl.footprint_px))
+        found = gl.codes()
+        assert (found[97:104, 97:104] == 255).all()
+        assert np.count_nonzero(found) <= gl.footprint_px**2
+
+
+def test_where_units_are_too_coarse_sprites_are_blended(rng, monkeypatch):
+    """A panel of 16 bits, and on 8 bits so many stars of white that a unit would be much of a step: the same as by points."""
+    bright = stars(20_000, rng, decades=(6, 7))
+    for response, sprites in ((srgb_response(16), stars(300, rng)), (gamma_response(8, 3.0), bright)):
+        target = Target(SIZE, SIGMA, response, WHITE)
+        with Renderer(target) as gl:
+            assert gl._passes is None or gl._passes.unit_for(sprites) is None
+            gl.draw(sprites)
+            assert np.array_equal(gl.codes(), round_levels(gl.linear(), target.panel()))
+
+
+@pytest.mark.parametrize("quantisation", ["round", "exact", "temporal"])
+def test_frames_of_all_kinds_follow_each_other(quantisation, rng):
+    """Stars, none, few and many, too many for units, and extended light: each frame is as if it were the first."""
+    target = Target(SIZE, SIGMA, gamma_response(8), WHITE, quantisation)
+    glow = LightMap(np.full((40, 50), 3e4, dtype=np.float32), (30, 20))
+    few, many, bright = stars(9, rng), stars(600, rng), stars(20_000, rng, decades=(6, 7))
+    lit = replace(few, extended=(glow,))
+    frames = [few, many, few, bright, few, None, bright, many, lit, few, lit, bright, lit, None, few]
+    with Renderer(target) as gl:
+        assert gl._passes is not None
+        assert gl._passes.unit_for(bright) is None
+        assert gl._passes.unit_for(many) is not None
+        for place, sprites in enumerate(frames):
+            gl.draw(sprites)
+            found = gl.codes().copy()
+            if place % 2:
+                gl.linear()
+            with Renderer(target) as fresh:
+                fresh.draw(sprites)
+                assert np.array_equal(found, fresh.codes()), place
+        assert gl.gl_error() == "GL_NO_ERROR"
+
+
+@pytest.mark.parametrize("sigma", [(0.3, 0.3), (0.4, 0.4), (0.85, 0.85), (1.3, 0.7), (3.0, 1.0)])
+def test_no_pixel_outside_the_ellipse_has_more_than_its_share(sigma):
+    size = footprint_px(sigma)
+    axes, factor = share_bound(sigma, size)
+    places = np.linspace(-size / 2, size / 2, 301)
+    share = np.outer(pixel_shares(places, sigma[1]), pixel_shares(places, sigma[0]))
+    reach = places[None, :] ** 2 / axes[0] + places[:, None] ** 2 / axes[1]
+    for least in (1e-2, 1e-4, 1e-6):
+        outside = reach > np.log(factor / least)
+        assert share[outside].max() <= least
+        # Nor is it much too large: what lies just inside has a good part of it.
+        assert share[~outside].min() > 0.02 * least

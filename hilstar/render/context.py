@@ -1,4 +1,4 @@
-"""Headless OpenGL contexts through EGL."""
+"""Headless OpenGL contexts through EGL, and what they can draw."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 import moderngl
 
-from hilstar.errors import MachineError
+from hilstar.errors import InputError, MachineError
 
 EGL_LIBRARY = "libEGL.so.1"
 INSTALL_EGL = "install it: apt-get install libegl1 libgl1-mesa-dri"
@@ -24,6 +24,16 @@ def create_context() -> moderngl.Context:
         return moderngl.create_context(require=330, standalone=True, **settings)
     except Exception as error:  # moderngl and glcontext raise plain Exceptions here
         raise MachineError(f"OpenGL 3.3 through EGL is missing ({error}); {INSTALL_EGL}") from error
+
+
+def check_limits(ctx: moderngl.Context, resolution_px: tuple[int, int], footprint_px: int, sigma: str) -> None:
+    """Raise InputError where this GL cannot draw such an image, or points as large as its sprites; those are by `sigma`."""
+    largest = int(min(ctx.info["GL_MAX_TEXTURE_SIZE"], *ctx.info["GL_MAX_VIEWPORT_DIMS"])) - 2 * footprint_px
+    if max(resolution_px) > largest:
+        raise InputError(f"resolution_px = {list(resolution_px)}: this GL draws at most {largest} px")
+    points = ctx.info["GL_POINT_SIZE_RANGE"][1]
+    if footprint_px > points:
+        raise InputError(f"{sigma}: needs sprites of {footprint_px} px; this GL draws at most {points:g} px")
 
 
 def leave_contexts() -> None:

@@ -19,6 +19,7 @@ from hilstar.process.interrupts import held
 from hilstar.resources import resource_path
 from hilstar.scene.extended import Rectangle
 from hilstar.scene.psf import outside_share
+from hilstar.scene.sprites import Sprites
 
 TABLE_WIDTH = 1024  # that of encode.frag
 
@@ -97,6 +98,19 @@ def lit_sides(panel: Panel, sigma_px: tuple[float, float], footprint_px: int, wi
     every = -(-len(sizes) // MAX_SIDES) or 1
     rates = {size: float(light) / wings / outside_share(size, sigma_px) for size in sizes[::every]}
     return tuple(SpriteSide(min(rate, MAX_RATE), size) for size, rate in rates.items())
+
+
+def most_covered_px(sprites: Sprites, footprint_px: int, sides: SpriteSides, few_px: int) -> int:
+    """Pixels that all sprites together may light, fainter stars within these sides; at most, where that is under `few_px`."""
+    most = len(sprites) * footprint_px**2
+    if not sides or most < few_px:
+        return most
+    rates, larger_px = np.ascontiguousarray(sprites.data["electrons_per_s"]), footprint_px
+    for side in sides:
+        smaller = int(np.count_nonzero(rates < side.below_e_per_s / sprites.per_star))
+        most -= smaller * (larger_px**2 - side.side_px**2)
+        larger_px = side.side_px
+    return most
 
 
 class Eraser:

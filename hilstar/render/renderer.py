@@ -20,7 +20,7 @@ from hilstar.monitor.exact import ExactQuantiser
 from hilstar.monitor.quantise import Panel, Quantisation, mask_turn
 from hilstar.monitor.response import Codes, Response
 from hilstar.monitor.temporal import TemporalQuantiser
-from hilstar.render.context import create_context
+from hilstar.render.context import check_limits, create_context
 from hilstar.render.encoder import (
     CUT_WINGS,
     SPRITE_PIXEL_COST,
@@ -29,10 +29,12 @@ from hilstar.render.encoder import (
     LevelTexture,
     SpriteSides,
     lit_sides,
+    most_covered_px,
     set_sides,
 )
 from hilstar.render.exact_pass import ExactPass
 from hilstar.render.extended import ExtendedLayer
+from hilstar.render.host_image import HostImage
 from hilstar.render.splat import splat_program
 from hilstar.render.star_passes import StarPasses
 from hilstar.scene.extended import ExtendedLight, Rectangle
@@ -77,6 +79,8 @@ class Target:
 class Renderer:
     """Draws sprites of one Target, in a context of its own or in a window's. Free it with `close`."""
 
+    ON_HOST = True  # whether a linear image alone may be drawn in the process's memory, where this GL can
+
     def __init__(self, target: Target, context: Context | None = None) -> None:
         self.target = target
         self.footprint_px = footprint_px(target.sigma_px)
@@ -87,7 +91,8 @@ class Renderer:
         self._ctx = context or create_context()
         try:
             with self._ctx:
-                self._check_limits()
+                key = "sprite_sigma_px" if target.response else "psf_sigma_px"
+                check_limits(self._ctx, target.resolution_px, self.footprint_px, f"{key} = {list(target.sigma_px)}")
                 self._build()
         except BaseException:
             self._ctx.release()
@@ -102,16 +107,6 @@ class Renderer:
     def context(self) -> Context:
         """The GL context, for another renderer beside this one; it ends with this one."""
         return self._ctx
-
-    def _check_limits(self) -> None:
-        info, sigma = self._ctx.info, list(self.target.sigma_px)
-        largest = int(min(info["GL_MAX_TEXTURE_SIZE"], *info["GL_MAX_VIEWPORT_DIMS"])) - 2 * self.footprint_px
-        if max(self.target.resolution_px) > largest:
-            raise InputError(f"resolution_px = {list(self.target.resolution_px)}: this GL draws at most {largest} px")
-        points = info["GL_POINT_SIZE_RANGE"][1]
-        if self.footprint_px > points:
-            key = "sprite_sigma_px" if self.target.response else "psf_sigma_px"
-            raise InputError(f"{key} = {sigma}: needs sprites of {self.footprint_px} px; this GL draws at most {points:g} px")
 
     def _build(self) -> None:
         ctx, target = self._ctx, self.target
@@ -131,6 +126,9 @@ class Renderer:
         self._reserve(FIRST_CAPACITY)
         width, height = target.resolution_px
         self._linear_image = np.empty((height, width), dtype=np.float32)
+        on_host = self.ON_HOST and target.response is None and HostImage.runs_on(ctx, target.resolution_px)
+        self._host = HostImage(ctx, target.resolution_px, target.sigma_px, self.footprint_px) if on_host else None
+        self._on_host = False  # where the last draw is
 
     def _build_levels(self) -> None:
         target, panel = self.target, self.target.panel()
@@ -213,8 +211,10 @@ class Renderer:
 
     def _draw_by_points(self, sprites: Sprites | None) -> None:
         """The linear image and its levels by rasterised sprites."""
-        covered_px, (width, height) = self._covered_px(sprites), self.target.resolution_px
-        cut = bool(self._cut_sides) and sprites is not None and covered_px * SPRITE_PIXEL_COST < width * height
+        few_px = self.target.resolution_px[0] * self.target.resolution_px[1] // SPRITE_PIXEL_COST
+        sides = self._lit_sides if self._encoder is not None else ()
+        covered_px = 0 if sprites is None else most_covered_px(sprites, self.footprint_px, sides, few_px)
+        cut = bool(self._cut_sides) and sprites is not None and covered_px < few_px
         self._draw_linear(sprites, whole=not (self.target.sides or cut))
         if self._encoder is not None:
             with self._stage("encode"):
@@ -290,21 +290,6 @@ class Renderer:
         self._floor_key, self._floor_levels = (lights, turn), levels.read().copy()
         return self._floor_levels
 
-    def _covered_px(self, sprites: Sprites | None) -> int:
-        """Pixels that all sprites together may light; at most, where that is few."""
-        if sprites is None:
-            return 0
-        width, height = self.target.resolution_px
-        most = len(sprites) * self.footprint_px**2
-        if self._encoder is None or not self._lit_sides or most * SPRITE_PIXEL_COST < width * height:
-            return most
-        rates, larger_px = np.ascontiguousarray(sprites.data["electrons_per_s"]), self.footprint_px
-        for side in self._lit_sides:
-            smaller = int(np.count_nonzero(rates < side.below_e_per_s / sprites.per_star))
-            most -= smaller * (larger_px**2 - side.side_px**2)
-            larger_px = side.side_px
-        return most
-
     def _upload(self, sprites: Sprites) -> None:
         if len(sprites) > self._capacity:
             self._splat_vao.release()
@@ -316,6 +301,10 @@ class Renderer:
     def _draw_linear(self, sprites: Sprites | None, whole: bool, levels: bool = True) -> None:
         """Draw the linear image; `levels` says whether the last frame's are erased."""
         self._undrawn = None
+        self._on_host = self._host is not None and whole and not (sprites is not None and sprites.extended)
+        if self._host is not None and self._on_host:
+            self._host.draw(sprites)
+            return
         with self._stage("erase"):
             self._erase(levels)
         if sprites is not None and sprites.extended:
@@ -382,7 +371,9 @@ class Renderer:
         return self._levels.texture
 
     def linear(self) -> Float32Array:
-        """The linear image of the last draw, electrons per second, float32 (height, width); overwritten as `codes`."""
+        """The linear image of the last draw, electrons per second, float32 (height, width), to read; overwritten as `codes`."""
+        if self._host is not None and self._on_host:
+            return self._host.image
         with self._ctx:
             if self._undrawn is not None:
                 self._draw_linear(*self._undrawn, levels=self._by_numpy)

@@ -33,6 +33,8 @@ class SplatVariant:
 class VariantRenderer(Renderer):
     """A renderer of linear images whose splat is a variant's. Free it with `close`."""
 
+    ON_HOST = False  # it is the splat that is compared
+
     def __init__(self, target: Target, variant: SplatVariant) -> None:
         super().__init__(target)
         self.footprint_px = variant.footprint_px or self.footprint_px

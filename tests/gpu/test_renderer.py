@@ -28,22 +28,27 @@ PIXEL_LIMIT = 2 * 4.4e-7
 BLEND_LIMIT = 1e-6
 
 
-def draw(target: Target, pixels: np.ndarray, electrons_per_s: np.ndarray) -> tuple[np.ndarray, np.ndarray, Sprites]:
+# A linear image beside codes is rasterised; alone, it is added up in the process's memory where this GL can (host_image.py).
+BOTH_WAYS = pytest.mark.parametrize("bits", [8, None], ids=["beside codes", "alone"])
+
+
+def draw(target: Target, pixels: np.ndarray, electrons_per_s: np.ndarray) -> tuple[np.ndarray, np.ndarray | None, Sprites]:
     with Renderer(target) as gl:
         assert gl.gl_error() == "GL_NO_ERROR"
         sprites = sprites_at(pixels, electrons_per_s, gl.footprint_px)
         gl.draw(sprites)
-        linear, codes = gl.linear().copy(), gl.codes().copy()
+        linear, codes = gl.linear().copy(), None if target.response is None else gl.codes().copy()
         assert gl.gl_error() == "GL_NO_ERROR"
     return linear, codes, sprites
 
 
 def target_of(resolution=(256, 192), sigma=(0.85, 0.85), bits=8, white=1e6) -> Target:
-    return Target(resolution, sigma, srgb_response(bits), white)
+    return Target(resolution, sigma, None if bits is None else srgb_response(bits), white)
 
 
+@BOTH_WAYS
 @pytest.mark.parametrize("sigma", [(0.4, 0.4), (0.55, 0.55), (0.85, 0.85), (1.3, 0.7), (0.5, 2.5), (3.0, 3.0)])
-def test_an_isolated_star_has_its_flux_and_its_centroid_at_every_phase(sigma):
+def test_an_isolated_star_has_its_flux_and_its_centroid_at_every_phase(sigma, bits):
     """A grid of 12 x 12 phases of a pixel, each star in a field of its own."""
     step = footprint_px(sigma) + 3
     phases = np.linspace(-0.5, 0.5, 12)
@@ -52,7 +57,7 @@ def test_an_isolated_star_has_its_flux_and_its_centroid_at_every_phase(sigma):
     pixels[:, 1] += phases[rows.ravel()]
     flux = 10.0 ** np.linspace(1, 9, 144)
     side = 14 * step
-    linear, _, _ = draw(target_of((side, side), sigma), pixels, flux)
+    linear, _, _ = draw(target_of((side, side), sigma, bits), pixels, flux)
     for (x, y), f in zip(pixels, flux, strict=True):
         left, top = round(x) - step // 2, round(y) - step // 2
         patch = linear[top : top + step, left : left + step].astype(np.float64)
@@ -71,11 +76,12 @@ def exact_centroid(x: float, sigma: float) -> float:
     return sum(p * (cdf(p + 0.5) - cdf(p - 0.5)) for p in pixels)
 
 
+@BOTH_WAYS
 @pytest.mark.parametrize("sigma", [(0.3, 0.3), (0.85, 0.85), (1.7, 0.6), (10.0, 10.0)])
-def test_every_pixel_is_that_of_the_oracle(sigma, rng):
+def test_every_pixel_is_that_of_the_oracle(sigma, bits, rng):
     pixels = rng.uniform([-5, -5], [260, 197], size=(60, 2))
     flux = 10.0 ** rng.uniform(2, 6, 60)
-    linear, _, sprites = draw(target_of(sigma=sigma), pixels, flux)
+    linear, _, sprites = draw(target_of(sigma=sigma, bits=bits), pixels, flux)
     oracle = linear_image(sprites, (256, 192), sigma)
     # Where stars overlap, each brings its own error.
     scale = linear_image(replace(sprites, data=sprites.data), (256, 192), (sigma[0] * 1.5, sigma[1] * 1.5)) + flux.max()
@@ -83,10 +89,11 @@ def test_every_pixel_is_that_of_the_oracle(sigma, rng):
     assert linear.min() >= 0
 
 
-def test_stars_partly_off_the_edge_are_drawn_partly():
+@BOTH_WAYS
+def test_stars_partly_off_the_edge_are_drawn_partly(bits):
     pixels = np.array([[-0.5, 50.0], [-3.0, 90.0], [100.0, -0.5], [255.5, 60.0], [258.0, 20.0], [130.0, 193.5], [-0.5, -0.5]])
     flux = np.full(len(pixels), 1e6)
-    linear, _, sprites = draw(target_of(), pixels, flux)
+    linear, _, sprites = draw(target_of(bits=bits), pixels, flux)
     oracle = linear_image(sprites, (256, 192), (0.85, 0.85))
     assert np.abs(linear - oracle).max() < PIXEL_LIMIT * 1e6
     # A star on the very edge gives half its light, one on the corner a quarter.
@@ -119,25 +126,28 @@ def test_codes_are_those_of_the_oracle_pixel_for_pixel(bits, count, rng):
     assert codes.max() == 2**bits - 1
 
 
-def test_overlapping_stars_add_up(rng):
+@BOTH_WAYS
+def test_overlapping_stars_add_up(bits, rng):
     pixels = np.full((1000, 2), 100.25) + rng.normal(scale=0.01, size=(1000, 2))
-    linear, _, sprites = draw(target_of(), pixels, np.ones(1000))
+    linear, _, sprites = draw(target_of(bits=bits), pixels, np.ones(1000))
     oracle = linear_image(sprites, (256, 192), (0.85, 0.85))
     # 1000 additions round by up to half a step of the running sum each: 1000 x 6e-8 at the very worst.
     assert np.abs(linear - oracle).max() / oracle.max() < 6e-5
     assert linear.sum(dtype=np.float64) == pytest.approx(1000, rel=6e-5)
 
 
-def test_a_hundred_thousand_stars_are_drawn(rng):
+@BOTH_WAYS
+def test_a_hundred_thousand_stars_are_drawn(bits, rng):
     count = 100_000
     pixels = rng.uniform([20, 20], [1004, 748], size=(count, 2))
-    linear, _, _ = draw(target_of((1024, 768)), pixels, np.ones(count))
+    linear, _, _ = draw(target_of((1024, 768), bits=bits), pixels, np.ones(count))
     assert linear.sum(dtype=np.float64) == pytest.approx(count, rel=BLEND_LIMIT + MAX_CUT)
 
 
-def test_twelve_decades_of_flux_stand_side_by_side():
+@BOTH_WAYS
+def test_twelve_decades_of_flux_stand_side_by_side(bits):
     pixels = np.array([[50.0, 50.0], [150.0, 100.0]])
-    linear, _, _ = draw(target_of(), pixels, np.array([1e12, 1.0]))
+    linear, _, _ = draw(target_of(bits=bits), pixels, np.array([1e12, 1.0]))
     assert linear[30:70, 30:70].sum(dtype=np.float64) == pytest.approx(1e12, rel=FLUX_LIMIT)
     assert linear[80:120, 130:170].sum(dtype=np.float64) == pytest.approx(1.0, rel=FLUX_LIMIT)
 

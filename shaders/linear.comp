@@ -1,0 +1,49 @@
+#version 430 core
+// The linear image, added up in a buffer (hilstar/render/host_image.py): the pixels of stars that were there become black, then
+// those that are there add their light. A work group has a band of rows, and each of its lanes every second column and fourth
+// row: no two lanes write the same pixel, and each takes stars in their order, so that the same stars give the same bits
+// whatever runs side by side.
+// Defined before this text: FOOTPRINT, BANDS; and shares.glsl.
+
+layout(local_size_x = 8) in;
+
+layout(std430, binding = 0) readonly buffer Sprites { int sprite[]; };  // five words each, as SPRITE_DTYPE
+layout(std430, binding = 1) buffer Light { float linear_e_per_s[]; };
+
+uniform ivec4 stars[BANDS];  // of each band: the first star that was there, the end of them, the same of those that are there
+uniform int bands;
+uniform int done;            // stars of each band that earlier passes have taken
+uniform int at_once;
+uniform ivec2 resolution_px;
+
+const int FIRST = -((FOOTPRINT - 1) / 2);
+const ivec2 STEP = ivec2(2, 4);  // powers of two
+
+void main() {
+    int band = int(gl_WorkGroupID.x);
+    ivec4 range = stars[band];
+    int top = band * resolution_px.y / bands, bottom = (band + 1) * resolution_px.y / bands;
+    int lane = int(gl_LocalInvocationIndex);
+    ivec2 own = ivec2(lane % STEP.x, lane / STEP.x);
+    int were = range.y - range.x;
+    int end_star = min(were + range.w - range.z, done + at_once);
+    for (int k = done; k < end_star; k++) {
+        int i = k < were ? range.x + k : range.z + k - were;
+        ivec2 pixel = ivec2(sprite[5 * i], sprite[5 * i + 1]);
+        vec2 fraction = vec2(intBitsToFloat(sprite[5 * i + 2]), intBitsToFloat(sprite[5 * i + 3]));
+        float e_per_s = intBitsToFloat(sprite[5 * i + 4]);
+        ivec2 begin = max(pixel + FIRST, ivec2(0, top));
+        ivec2 end = min(pixel + FIRST + FOOTPRINT, ivec2(resolution_px.x, bottom));
+        begin += (own - begin) & (STEP - 1);  // the first column and row of this lane's
+        for (int y = begin.y; y < end.y; y += STEP.y) {
+            for (int x = begin.x; x < end.x; x += STEP.x) {
+                int here = y * resolution_px.x + x;
+                if (k < were) {
+                    linear_e_per_s[here] = 0.0;
+                } else {
+                    linear_e_per_s[here] += e_per_s * share_at(vec2(ivec2(x, y) - pixel) - fraction);
+                }
+            }
+        }
+    }
+}

@@ -189,8 +189,8 @@ def test_a_log_with_nan_is_refused_with_its_line(tmp_path, small_bench_file):
 def test_a_machine_without_egl_gets_one_line_and_exit_code_3(small_bench_file):
     """The loader looks for a libEGL that is not there, in a process of its own."""
     script = (
-        "import sys; from hilstar import cli; from hilstar.render import renderer;"
-        "renderer.EGL_LIBRARY = 'libEGL.so.none';"
+        "import sys; from hilstar import cli; from hilstar.render import context;"
+        "context.EGL_LIBRARY = 'libEGL.so.none';"
         f"sys.argv = ['hilstar', 'frame', {str(small_bench_file)!r}, '--radec', '1,2,3', '-o', 'x.fits']; cli.main()"
     )
     result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=False)

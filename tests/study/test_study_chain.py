@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ import pytest
 from hilstar.bench.bench_file import bench_file_of
 from hilstar.errors import InputError
 from hilstar.render.reference import linear_image
-from hilstar.study.chain import motion, run, scenes
+from hilstar.study.chain import chart, motion, panel, run, scenes
 from hilstar.study.chain.bench_parts import Parts
 from hilstar.study.chain.budget import error_budget
 from hilstar.study.chain.combinations import Combination
@@ -21,6 +22,7 @@ from hilstar.study.chain.front import Point, beaters, front
 from hilstar.study.chain.measuring import Plan, SceneMeasurement
 from hilstar.study.chain.motion import lead_ns
 from hilstar.study.chain.scenes import Scene, five_scenes
+from hilstar.study.chain.table import Row
 from hilstar.study.chain.tracker import MATCH_PX, Tracker, off
 from hilstar.study.chain.true_light import add_light, points
 from hilstar.units import ARCSEC_PER_RAD, MAG_PER_RELATIVE, NS_PER_S
@@ -194,6 +196,43 @@ def test_a_star_that_is_lost_is_no_nearer_than_one_that_is_found_late(parts):
     dark = off(judge, judge.measure(np.zeros_like(image_e)), judge.sky)
     assert dark.lost.all() and not late.lost.all()
     assert dark.arcsec.min() > late.arcsec[~late.lost].max() > MATCH_PX * scene.tracker.arcsec_per_px
+
+
+def test_a_long_exposure_is_said_to_be_measured_in_part(study, tmp_path):
+    with Parts(small_file(tmp_path, SMALL.replace("aperture_mm", "exposure_s = 3.5\naperture_mm"))) as long:
+        said = panel.shortened_line(long.own)
+        seen = panel.exposure(long.own, 20)
+    assert said == "exposures of 16 refreshes, 0.267 s, in the place of [tracker] exposure_s = 3.5"
+    assert seen.length_s == pytest.approx(16 / 60)
+    told, out = study
+    assert not any("in the place of" in line for line in told["findings"])
+    assert {row["exposure_s"] for row in table(out / "chain.csv")} == {"0.1"}
+
+
+@pytest.mark.parametrize("place", [(0, 0), (-1, 0), (0, -1), (-1, -1)])
+def test_the_names_in_the_chart_stay_within_their_axes(monkeypatch, tmp_path, place):
+    """The slowest or fastest point, the worst or best of them, is the default, and the one beside it auto."""
+    corner = {"time_ms": sorted((1.0, 9.0))[place[0]], "error_arcsec": sorted((0.1, 900.0))[place[1]]}
+    known = {field.name: 1.0 for field in fields(Row)} | {
+        "scene": "s",
+        "smear": "path",
+        "prediction": "rate",
+        "error_mag": 0.01,
+    }
+    known |= {"quantisation": "exact", "sprite": "cut", "on_front": "true", "on_front_mag": "true", "noise_ms": 0.01}
+    others = [{"time_ms": t, "error_arcsec": e, "chosen": ""} for t in (1.0, 3.0, 9.0) for e in (0.1, 10.0, 900.0)]
+    marked = [corner | {"chosen": "default"}, corner | {"time_ms": corner["time_ms"] * 1.01, "chosen": "auto"}]
+    kept = []
+    monkeypatch.setattr(chart, "save", lambda figure, path: kept.append(figure))
+    chart.draw(tmp_path / "c.png", [Row(**(known | one)) for one in (*others, *marked)], [], [], ("finding", "machine"))
+    (figure,) = kept
+    figure.canvas.draw()
+    for axes in figure.axes[:1]:
+        names = [text for text in axes.texts if text.get_text() in ("default", "auto")]
+        assert len(names) == 2
+        for name in names:
+            box, room = name.get_window_extent(), axes.get_window_extent()
+            assert room.x0 <= box.x0 and box.x1 <= room.x1 and room.y0 <= box.y0 and box.y1 <= room.y1, name.get_text()
 
 
 def test_a_point_is_beaten_by_one_that_is_no_worse_and_no_slower():

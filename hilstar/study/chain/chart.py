@@ -28,6 +28,7 @@ COLUMN_INCH, HEIGHT_INCH = 4.4, 17.0
 ROWS = (3.0, 3.0, 1.7, 1.7, 1.1)
 FLOOR_SHARE = 1e-3  # of the whole error: bars below it are of no account
 WORDS = {RSS: "root sum square", "refresh": "refresh of the panel", "codes": "quantisation", "sprites": "cut sprites"}
+NAME_ROOM = 0.7  # of the axes: right of here a name has no room to the right of its point
 CHOSEN = {DEFAULT: ("D", "black"), AUTO: ("*", "C3")}
 
 
@@ -75,12 +76,12 @@ def _scatter(axes: Axes, rows: Sequence[Row], error: str) -> None:
     axes.step(*zip(*line, strict=True), where="post", color="black", lw=1.3, zorder=1)
     for row in rows:
         _dot(axes, row, max(getattr(row, error), floor), getattr(row, front) == "true")
+    axes.set(xscale="log", yscale="log")
+    axes.margins(0.1, 0.12)
     for row in rows:
         for name, (marker, colour) in CHOSEN.items():
             if row.chosen == name:
                 _label(axes, name, (row.time_ms, max(getattr(row, error), floor)), (marker, colour))
-    axes.set(xscale="log", yscale="log")
-    axes.margins(0.1, 0.12)
     for axis, (low, high) in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
         _round_ticks(axis, low, high)
 
@@ -96,14 +97,16 @@ def _dot(axes: Axes, row: Row, error: float, on_front: bool) -> None:
 
 
 def _label(axes: Axes, name: str, place: tuple[float, float], look: tuple[str, str]) -> None:
+    """A ring around a point, and its name: beside it where the axes have room, `default` below and others above."""
     marker, colour = look
-    below = name == DEFAULT
     axes.plot(*place, marker=marker, ms=17, mfc="none", mec=colour, mew=1.8, ls="none", zorder=4)
+    at_end = axes.transAxes.inverted().transform(axes.transData.transform(place))[0] > NAME_ROOM
     axes.annotate(
         name,
         place,
-        xytext=(12, -16 if below else 12),
+        xytext=(-12 if at_end else 12, -16 if name == DEFAULT else 12),
         textcoords="offset points",
+        ha="right" if at_end else "left",
         color=colour,
         fontsize=11,
         fontweight="bold",

@@ -57,6 +57,14 @@ def exposure_s(bench: Bench) -> float:
     return min(bench.config.tracker.exposure_s, MAX_FRAMES / bench.config.monitor.refresh_hz)
 
 
+def shortened_line(bench: Bench) -> str | None:
+    """What is said where an exposure is longer than what is measured of it; None where it is not."""
+    whole_s, measured_s = bench.config.tracker.exposure_s, exposure_s(bench)
+    if measured_s == whole_s:
+        return None
+    return f"exposures of {MAX_FRAMES} refreshes, {measured_s:.3g} s, in the place of [tracker] exposure_s = {whole_s:g}"
+
+
 def exposure(bench: Bench, first_frame: int) -> Exposure:
     """An exposure that begins START_S after the first light of a frame's middle row."""
     period_s, length_s, scan = 1 / bench.config.monitor.refresh_hz, exposure_s(bench), bench.scan

@@ -13,6 +13,7 @@ from hilstar.study.chain.bench_parts import Parts
 from hilstar.study.chain.budget import error_budget
 from hilstar.study.chain.chart import draw
 from hilstar.study.chain.measuring import QUICK, Plan, SceneMeasurement
+from hilstar.study.chain.panel import shortened_line
 from hilstar.study.chain.scenes import five_scenes
 from hilstar.study.chain.table import BudgetRow, Row, StageRow, budget_rows, rows_of, stage_rows, write_tables
 from hilstar.study.chain.tracker import Tracker
@@ -52,11 +53,13 @@ def run(
                 if advance is not None:
                     advance(number + 1)
             machine = f"{parts.own.renderer.gl_renderer}, {os.cpu_count()} cores"
+            shortened = shortened_line(parts.own)
         finally:
             tracker.close()
     if not rows:
         raise InputError(f"{file.path}: no star stands alone in view in any scene; write a larger [sky] faintest_v_mag")
     make_directory(directory)
     write_tables(directory, rows, budget, stages)
-    draw(directory / "chain.png", rows, budget, stages, (headline(rows), machine))
-    return [*lines, f"times on {machine}"], right
+    notes = [f"times on {machine}", *([] if shortened is None else [shortened])]
+    draw(directory / "chain.png", rows, budget, stages, (headline(rows), "; ".join(notes)))
+    return [*lines, *notes], right

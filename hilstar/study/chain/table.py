@@ -20,13 +20,15 @@ AUTO, DEFAULT = "auto", "default"
 class Row:
     """A combination in a scene; its fields are the columns of `chain.csv`.
 
-    `error_arcsec`, `error_mag`: rms over the `stars` of all exposures, `lost` of them not found. The fronts are those of
-    `time_ms` against `error_arcsec` and `error_mag`; `on_front_as_filed` that of what effort may choose, against
-    `error_arcsec`: the rows whose `bit_stealing`, `faintest_v_mag` and `prediction` are those of the bench file.
+    `exposure_s` is what is measured of the tracker's exposure. `error_arcsec`, `error_mag`: rms over the `stars` of all
+    exposures, `lost` of them not found. The fronts are those of `time_ms` against `error_arcsec` and `error_mag`;
+    `on_front_as_filed` that of what effort may choose, against `error_arcsec`: the rows whose `bit_stealing`,
+    `faintest_v_mag` and `prediction` are those of the bench file.
     """
 
     scene: str
     rate_deg_s: float
+    exposure_s: float
     bits: int
     bit_stealing: str
     faintest_v_mag: float
@@ -142,6 +144,7 @@ def _row(scene: SceneMeasurement, one: Outcome) -> Row:
     return Row(
         scene=scene.scene.name,
         rate_deg_s=scene.scene.rate_deg_s,
+        exposure_s=rounded(scene.judges[0].seen.length_s),
         bits=scene.parts.own.config.monitor.bits,
         bit_stealing=said(own.bit_stealing),
         faintest_v_mag=own.faintest_v_mag,

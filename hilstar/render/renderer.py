@@ -156,7 +156,7 @@ class Renderer:
             if not dithered and not target.sides:
                 self._cut_sides = lit_sides(panel, target.sigma_px, self.footprint_px, CUT_WINGS)
             if not dithered and StarPasses.runs_on(self._ctx, panel):
-                self._passes = StarPasses(self._levels, panel, target.sigma_px, self._star_by_star)
+                self._passes = StarPasses(self._levels, panel, target.sigma_px, self._star_by_star, target.sides)
 
     def _reserve(self, sprites: int) -> None:
         """Make room for `sprites` sprites on the GPU; it grows by doubling and never shrinks."""

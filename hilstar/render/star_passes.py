@@ -12,9 +12,9 @@ import numpy as np
 
 from hilstar.monitor.level_table import CodeTable, code_table
 from hilstar.monitor.quantise import Panel
-from hilstar.render.encoder import LevelTexture, Table, build_compute
+from hilstar.render.encoder import LevelTexture, SpriteSides, Table, build_compute
 from hilstar.render.splat import set_sigma, share_define
-from hilstar.scene.psf import footprint_px, peak_share, share_bound
+from hilstar.scene.psf import footprint_px, outside_share, peak_share, share_bound
 from hilstar.scene.sprites import SPRITE_DTYPE, Sprites
 
 MIN_VERSION = 430  # of OpenGL, for compute shaders
@@ -28,19 +28,25 @@ MAX_UNIT = 1 / 64
 # WINGS * DENSER_WINGS. A star alone has the same levels; of 10 000 on 1080p eleven of 82 000 lit pixels are one level lower,
 # where wings meet, and of 50 000 one in seven thousand.
 WINGS, DENSER_WINGS = 128, 8
+# A square that is large enough at its worst phase has so many times the reach of an ellipse, in light.
+SQUARE_WINGS = 4
 # Of the image: where footprints cover more, a clear of levels and sums is faster (llvmpipe, 1080p and 4K).
 MAX_ERASED = 0.1
 MAX_ERASED_KEPT = 0.03  # all of the footprints and the sums too: `exact` may light pixels beyond a star's reach
+ANY_RATE = 1e-6  # the largest side of all, for stars of any rate, has fewer wings
 ANY_REACH = 1e6, 1e30  # axes and rates that are so many times larger reach over every footprint
 
 
 class StarPasses:
     """Draws sprites into pixels' sums and a LevelTexture; it lives in its renderer's context, which is current in every call.
 
-    With `keep` the sums stay for `exact` to look at.
+    With `keep` the sums stay for `exact` to look at. `sides` (see `Target.sides`) say how large sprites are at most, and what
+    light of a star alone they may leave out.
     """
 
-    def __init__(self, levels: LevelTexture, panel: Panel, sigma_px: tuple[float, float], keep: bool) -> None:
+    def __init__(
+        self, levels: LevelTexture, panel: Panel, sigma_px: tuple[float, float], keep: bool, sides: SpriteSides = ()
+    ) -> None:
         ctx = self._ctx = levels.texture.ctx
         self._levels, self._keep = levels, keep
         self._size_px = levels.texture.size
@@ -52,6 +58,8 @@ class StarPasses:
         self._lit_e_per_s, self._white_e_per_s = float(thresholds[0]) / high, panel.flux_at_white_e_per_s / low
         self._peak_share = peak_share(sigma_px)
         self._axes_px2, self._share_bound = share_bound(sigma_px, self._footprint_px)
+        self._wings = WINGS if not sides else _wings_of(sides, self._lit_e_per_s, sigma_px)
+        self._side_px = max((side.side_px for side in sides), default=self._footprint_px)
         self._sums = ctx.buffer(np.zeros(self._size_px[0] * self._size_px[1], dtype=np.int32))
         self._unit_e_per_s = 0.0  # of the sums
         self.sprites = ctx.buffer(reserve=SPRITE_DTYPE.itemsize, dynamic=True)
@@ -71,12 +79,13 @@ class StarPasses:
             raise ValueError("several thresholds in a bin; ask `runs_on` first")
         self._steps = Table(self._ctx, "STEPS", STEPS_BINDING, steps)
         texel = {"u1": "r8ui", "u2": "r16ui"}[self._levels.texture.dtype]
-        defines = [f"LEVELS_FORMAT {texel}", f"FOOTPRINT {self._footprint_px}", f"BIN_SHIFT {table.bin_shift}"]
+        defines = [f"LEVELS_FORMAT {texel}", f"BIN_SHIFT {table.bin_shift}"]
         defines += [*share_define(sigma_px, self._footprint_px), *["KEEP"] * self._keep]
         defines += ["UNIFORMITY"] * (self._gain is not None) + self._steps.define
+        side, all_px = f"FOOTPRINT {self._side_px}", f"FOOTPRINT {self._footprint_px}"
         self._light, self._encode, self._black = (
             build_compute(self._ctx, "light.comp", [*part, *defines], ("shares", "sums"))
-            for part in (["LIGHT"], ["LEVELS"], [])
+            for part in (["LIGHT", side], ["LEVELS", side], [all_px])
         )
         for program in (self._light, self._encode, self._black):
             program["resolution_px"], program["reach_px2"] = self._size_px, self._axes_px2
@@ -126,7 +135,7 @@ class StarPasses:
         self.sprites.write(sprites.data)
         self._drawn = len(sprites)
         width, height = self._size_px
-        wings = WINGS * (DENSER_WINGS if len(sprites) * self._footprint_px**2 > width * height else 1)
+        wings = self._wings * (DENSER_WINGS if len(sprites) * self._footprint_px**2 > width * height else 1)
         for program in (self._light, self._encode, *[self._black][self._keep :]):
             program["reach_per_e"] = self._share_bound * sprites.per_star * wings / self._lit_e_per_s
 
@@ -156,3 +165,9 @@ class StarPasses:
         self._levels.texture.bind_to_image(0, read=False, write=True)
         program.run(-(-self._drawn // LOCAL_SIZE))
         self._ctx.memory_barrier()
+
+
+def _wings_of(sides: SpriteSides, lit_e_per_s: float, sigma_px: tuple[float, float]) -> float:
+    """What part of the light that lights a pixel the squares of `sides` leave out beside them at most: one in so many."""
+    found = [lit_e_per_s / (side.below_e_per_s * outside_share(side.side_px, sigma_px)) for side in sides]
+    return SQUARE_WINGS * max(1.0, min([wings for wings in found if wings > ANY_RATE], default=WINGS / SQUARE_WINGS))

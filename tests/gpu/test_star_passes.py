@@ -9,16 +9,18 @@ import pytest
 
 from hilstar.monitor.quantise import round_levels
 from hilstar.monitor.response import gamma_response, srgb_response
+from hilstar.render.encoder import SpriteSide
 from hilstar.render.renderer import Renderer, Target
 from hilstar.render.star_passes import MAX_UNIT, WINGS
 from hilstar.scene.extended import LightMap
-from hilstar.scene.psf import footprint_px, pixel_shares, share_bound
+from hilstar.scene.psf import footprint_px, outside_share, pixel_shares, share_bound
 from tests.support.stars import sprites_at
 
 SIZE, SIGMA, WHITE = (256, 192), (0.85, 0.85), 1e6
 PANELS = {"srgb6": srgb_response(6), "srgb8": srgb_response(8), "srgb10": srgb_response(10), "gamma8": gamma_response(8)}
 # Light is summed in float32 by blending, in whole units here: both round by that of what they sum, at most.
 FLOAT32 = 1e-6
+CUT = 1e-4  # of a star: what lies past a sprite two pixels smaller
 
 
 def stars(count, rng, size=SIZE, decades=(1, 6)):
@@ -122,3 +124,25 @@ def test_no_pixel_outside_the_ellipse_has_more_than_its_share(sigma):
         assert share[outside].max() <= least
         # Nor is it much too large: what lies just inside has a good part of it.
         assert share[~outside].min() > 0.02 * least
+
+
+def test_smaller_sprites_leave_out_no_more_than_they_say(rng):
+    """Sides as `effort = "auto"` chooses them: a quarter of what lights a pixel, and nothing past the largest side."""
+    response = PANELS["srgb8"]
+    lit, size = response.threshold[0] * WHITE, footprint_px(SIGMA)
+    sides = (SpriteSide(3e38, size - 2), *(SpriteSide(0.25 * lit / outside_share(k, SIGMA), k) for k in range(size - 4, 1, -2)))
+    with (
+        Renderer(Target(SIZE, SIGMA, response, WHITE, sides=sides)) as gl,
+        Renderer(Target(SIZE, SIGMA, response, WHITE)) as all_,
+    ):
+        sprites = stars(400, rng)
+        gl.draw(sprites)
+        all_.draw(sprites)
+        found, whole, panel = gl.codes().copy(), all_.linear().astype(np.float64), gl.target.panel()
+        assert np.count_nonzero(found) < np.count_nonzero(all_.codes())
+        alone = sprites_at(np.array([[100.0, 90.0]]), np.array([1e12]), size)
+        gl.draw(alone)
+        assert np.count_nonzero(gl.codes()) == (size - 2) ** 2
+    wings = covering(sprites, SIZE) * 0.25 * lit + CUT * whole
+    assert (found <= round_levels((whole * (1 + FLOAT32)).astype(np.float32), panel)).all()
+    assert (found >= round_levels(np.maximum(whole * (1 - FLOAT32) - wings, 0).astype(np.float32), panel)).all()

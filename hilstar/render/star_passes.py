@@ -32,7 +32,7 @@ WINGS, DENSER_WINGS = 128, 8
 SQUARE_WINGS = 4
 # Of the image: where footprints cover more, a clear of levels and sums is faster (llvmpipe, 1080p and 4K).
 MAX_ERASED = 0.1
-MAX_ERASED_KEPT = 0.03  # all of the footprints and the sums too: `exact` may light pixels beyond a star's reach
+MAX_ERASED_KEPT = 0.07  # all of the footprints and the sums too: `exact` may light pixels beyond a star's reach
 ANY_RATE = 1e-6  # the largest side of all, for stars of any rate, has fewer wings
 ANY_REACH = 1e6, 1e30  # axes and rates that are so many times larger reach over every footprint
 

@@ -11,7 +11,7 @@ layout(std430, binding = 0) readonly buffer Sprites { int sprite[]; };  // five 
 layout(std430, binding = 1) buffer Light { float linear_e_per_s[]; };
 
 uniform ivec4 stars[BANDS];  // of each band: the first star that was there, the end of them, the same of those that are there
-uniform int bands;
+uniform int bands;           // one, or an even number
 uniform int done;            // stars of each band that earlier passes have taken
 uniform int at_once;
 uniform ivec2 resolution_px;
@@ -40,7 +40,9 @@ void take(int i, bool black) {
 }
 
 void main() {
-    int band = int(gl_WorkGroupID.x), lane = int(gl_LocalInvocationIndex);
+    // llvmpipe gives each thread groups in a row: every second band first, so that stars close together are shared by two.
+    int group = 2 * int(gl_WorkGroupID.x), lane = int(gl_LocalInvocationIndex);
+    int band = group % bands + group / bands;
     ivec4 range = stars[band];
     top = band * resolution_px.y / bands;
     bottom = (band + 1) * resolution_px.y / bands;

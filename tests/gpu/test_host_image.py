@@ -77,7 +77,7 @@ def test_the_same_stars_give_the_same_bits_in_any_number_of_bands(gl, rng, monke
         assert np.array_equal(gl.linear(), once)
     gl.draw(replace(sprites, data=sprites.data[::-1]))
     assert not np.array_equal(gl.linear(), once)  # or the test could not fail
-    monkeypatch.setattr(host_image, "BANDS", 3)
+    monkeypatch.setattr(host_image, "BANDS", 4)
     with Renderer(Target(SIZE, SIGMA)) as other:
         other.draw(sprites)
         assert np.array_equal(other.linear(), once)

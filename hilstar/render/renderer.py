@@ -155,7 +155,7 @@ class Renderer:
             self._encoder.shrink(self._lit_sides)
             if not dithered and not target.sides:
                 self._cut_sides = lit_sides(panel, target.sigma_px, self.footprint_px, CUT_WINGS)
-            if not dithered and StarPasses.runs_on(self._ctx, panel):
+            if not dithered and StarPasses.runs_on(self._ctx, panel, target.resolution_px, self.footprint_px):
                 self._passes = StarPasses(self._levels, panel, target.sigma_px, self._star_by_star, target.sides)
 
     def _reserve(self, sprites: int) -> None:

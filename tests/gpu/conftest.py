@@ -10,7 +10,7 @@ from hilstar.render.star_passes import StarPasses
 @pytest.fixture
 def by_points(monkeypatch: pytest.MonkeyPatch) -> None:
     """Sprites are rasterised and blended."""
-    monkeypatch.setattr(StarPasses, "runs_on", staticmethod(lambda ctx, panel: False))
+    monkeypatch.setattr(StarPasses, "runs_on", staticmethod(lambda *target: False))
 
 
 @pytest.fixture(params=["star by star", "by points"])

@@ -146,3 +146,15 @@ def test_smaller_sprites_leave_out_no_more_than_they_say(rng):
     wings = covering(sprites, SIZE) * 0.25 * lit + CUT * whole
     assert (found <= round_levels((whole * (1 + FLOAT32)).astype(np.float32), panel)).all()
     assert (found >= round_levels(np.maximum(whole * (1 - FLOAT32) - wings, 0).astype(np.float32), panel)).all()
+
+
+@pytest.mark.parametrize("sigma", [(24.0, 24.0), (25.0, 25.0)])
+def test_the_largest_sprites_are_whole(sigma):
+    """A shader's loops may end early without a word: the largest sprites drawn star by star, and the smallest that are not."""
+    target = Target((400, 300), sigma, PANELS["srgb8"], WHITE)
+    with Renderer(target) as gl:
+        assert (gl._passes is not None) == (sigma[0] < 24.5)
+        gl.draw(sprites_at(np.array([[200.2, 150.3]]), np.array([1e9]), gl.footprint_px))
+        found, light, panel = gl.codes().copy(), gl.linear(), gl.target.panel()
+    assert np.count_nonzero(found != round_levels(light, panel)) <= 3
+    assert np.count_nonzero(found) > 1000

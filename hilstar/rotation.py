@@ -7,6 +7,7 @@ Arrays may carry leading axes: a quaternion is the last axis.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from hilstar.arrays import FloatArray
 
@@ -87,6 +88,12 @@ def from_matrix(matrix: FloatArray) -> FloatArray:
         q[k] = 1 - trace + 2 * matrix[i, i]
     q = normalise(q)
     return q if q[0] >= 0 else -q
+
+
+def direction_of(ra_deg: ArrayLike, dec_deg: ArrayLike) -> FloatArray:
+    """The unit vectors (..., 3) of right ascensions and declinations, degrees, in the axes that these are of."""
+    ra, dec = np.radians(ra_deg), np.radians(dec_deg)
+    return np.stack((np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)), axis=-1)
 
 
 def from_radec_roll_deg(ra_deg: float, dec_deg: float, roll_deg: float) -> FloatArray:

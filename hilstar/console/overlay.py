@@ -11,7 +11,7 @@ import numpy as np
 
 from hilstar.arrays import FloatArray
 from hilstar.bench.cameras import tracker_camera
-from hilstar.rotation import to_matrix, to_radec_roll_deg
+from hilstar.rotation import direction_of, to_matrix, to_radec_roll_deg
 from hilstar.scene.camera import Camera
 from hilstar.sky.catalog import load_catalog
 from hilstar.sky.names import label_of, star_names
@@ -87,9 +87,7 @@ class Marks:
 
     def _line(self, label: str, ra_deg: FloatArray, dec_deg: FloatArray, turn: FloatArray) -> Iterator[dict[str, Any]]:
         """A line over the sky, in pieces where it leaves the image."""
-        ra, dec = np.radians(ra_deg), np.radians(dec_deg)
-        vectors = np.column_stack((np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)))
-        x_px, y_px = self.monitor.project(vectors @ turn.T)
+        x_px, y_px = self.monitor.project(direction_of(ra_deg, dec_deg) @ turn.T)
         inside = self.on_screen(x_px, y_px, BEYOND)
         # A piece has a place more on each side, so that it reaches over the image's edge; one alone is nothing.
         near = np.isfinite(x_px) & (inside | np.append(inside[1:], False) | np.append(False, inside[:-1]))

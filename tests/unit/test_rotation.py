@@ -8,6 +8,7 @@ import pytest
 from hilstar.rotation import (
     angle_between_rad,
     conjugate,
+    direction_of,
     from_radec_roll_deg,
     multiply,
     normalise,
@@ -37,6 +38,14 @@ ROUNDING_DEG = 1e-11
 def test_the_design_s_check_values_come_out(radec_roll, expected):
     q = from_radec_roll_deg(*radec_roll)
     assert np.abs(q - expected).max() < PRINTED
+
+
+def test_a_direction_is_where_the_boresight_points():
+    ra_deg, dec_deg = np.array([0.0, 40.0, 283.0, 10.0]), np.array([0.0, 20.0, -89.0, 90.0])
+    found = direction_of(ra_deg, dec_deg)
+    for ra, dec, vector in zip(ra_deg, dec_deg, found, strict=True):
+        assert np.allclose(to_matrix(from_radec_roll_deg(ra, dec, 7.0)) @ vector, [0, 0, 1], rtol=0, atol=ROUNDING)
+        assert direction_of(ra, dec) == pytest.approx(vector, abs=ROUNDING)
 
 
 def test_at_roll_zero_north_is_up_and_east_is_left():

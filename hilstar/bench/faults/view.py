@@ -33,7 +33,7 @@ from hilstar.bench.faults.scenario import NO_SCENARIO, Scenario
 from hilstar.bench.faults.surfaces import gradient_image, map_image, read_map
 from hilstar.bench.faults.targets import Targets
 from hilstar.errors import InputError
-from hilstar.rotation import to_matrix
+from hilstar.rotation import direction_of, to_matrix
 from hilstar.scene import extended
 from hilstar.scene.camera import Camera
 from hilstar.scene.frame_motion import Scan
@@ -290,5 +290,4 @@ def icrs_direction(fault: Place) -> FloatArray:
     if fault.icrs is not None:
         vector = np.array(fault.icrs)
         return np.asarray(vector / np.linalg.norm(vector))
-    ra, dec = np.radians(fault.radec_deg or (0.0, 0.0))
-    return np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
+    return direction_of(*(fault.radec_deg or (0.0, 0.0)))

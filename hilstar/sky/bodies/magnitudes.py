@@ -17,6 +17,7 @@ import numpy as np
 from numpy.polynomial.polynomial import polyval
 
 from hilstar.arrays import FloatArray
+from hilstar.rotation import direction_of
 
 KM_PER_AU = 149_597_870.7
 SUN_V_MAG = -26.76  # at 1 au: Willmer 2018, ApJS 236, 47
@@ -93,9 +94,4 @@ def _saturn_mag(phase_deg: float, sun_latitude_deg: float, observer_latitude_deg
     return -8.914 - 1.825 * sine + 0.026 * phase_deg - 0.378 * sine * float(np.exp(-2.25 * phase_deg))
 
 
-def _pole(ra_deg: float, dec_deg: float) -> FloatArray:
-    ra, dec = np.radians(ra_deg), np.radians(dec_deg)
-    return np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
-
-
-_POLES = {"Saturn": _pole(*SATURN_POLE_DEG), "Uranus": _pole(*URANUS_POLE_DEG)}
+_POLES = {"Saturn": direction_of(*SATURN_POLE_DEG), "Uranus": direction_of(*URANUS_POLE_DEG)}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hilstar.arrays import FloatArray
+from hilstar.rotation import direction_of
 from hilstar.sky.bodies.disc import Law
 from hilstar.sky.bodies.earth import EARTH, EQUATOR_KM
 
@@ -37,5 +38,4 @@ def pole(name: str) -> FloatArray:
     """The unit vector (3,) of a body's north pole, ICRS axes; the ICRS's own of one that is round."""
     if name not in POLES_DEG:
         return NORTH
-    ra, dec = np.radians(POLES_DEG[name])
-    return np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
+    return direction_of(*POLES_DEG[name])

@@ -8,7 +8,7 @@ import numpy as np
 
 from hilstar.arrays import FloatArray
 from hilstar.monitor.geometry import monitor_camera
-from hilstar.rotation import from_radec_roll_deg, to_matrix, to_radec_roll_deg
+from hilstar.rotation import direction_of, from_radec_roll_deg, to_matrix, to_radec_roll_deg
 from hilstar.scene.camera import Camera
 from hilstar.scene.sprites import pack_sprites
 from hilstar.sky.astrometry import RAD_PER_MAS, unit_vectors_icrs
@@ -44,7 +44,7 @@ def motion_at_pole() -> FailureCase:
     moved = unit_vectors_icrs(at_pole, HIPPARCOS_EPOCH_JYEAR + years)[0]
     turn_deg = 100.0 * years * RAD_PER_MAS / np.radians(1.0)
     dec_deg = 89.999 + turn_deg / 2
-    wrong = [_vector(359.9999 + turn_deg / cosine, dec_deg) for cosine in (1.0, np.cos(np.radians(89.999)))]
+    wrong = [direction_of(359.9999 + turn_deg / cosine, dec_deg) for cosine in (1.0, np.cos(np.radians(89.999)))]
     exact = _great_circle(359.9999, 89.999, np.array([100.0, 50.0]) * years * RAD_PER_MAS)
     error, *faults = (_apart_rad(v, exact) / RAD_PER_MAS for v in (moved, *wrong))
     return FailureCase(
@@ -57,11 +57,6 @@ def motion_at_pole() -> FailureCase:
     )
 
 
-def _vector(ra_deg: float, dec_deg: float) -> FloatArray:
-    ra, dec = np.radians(ra_deg), np.radians(dec_deg)
-    return np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
-
-
 def _great_circle(ra_deg: float, dec_deg: float, path_rad: FloatArray) -> FloatArray:
     """Where a straight path in space ends, seen at `path_rad` (east, north), by angles along a great circle."""
     ra, dec = np.radians(ra_deg), np.radians(dec_deg)
@@ -70,7 +65,7 @@ def _great_circle(ra_deg: float, dec_deg: float, path_rad: FloatArray) -> FloatA
     length = float(np.hypot(*path_rad))
     along = (path_rad[0] * east + path_rad[1] * north) / length
     angle = np.arctan(length)
-    return np.asarray(np.cos(angle) * _vector(ra_deg, dec_deg) + np.sin(angle) * along)
+    return np.asarray(np.cos(angle) * direction_of(ra_deg, dec_deg) + np.sin(angle) * along)
 
 
 def _apart_rad(a: FloatArray, b: FloatArray) -> float:
@@ -84,7 +79,7 @@ def fields_over_wrap_and_pole() -> FailureCase:
     grid, radius = cell_grid(vectors), 10.0
     lost, box_lost, seen = 0, 0, 0
     for ra_deg, dec_deg in ((0.01, 0.0), (359.99, -45.0), (200.0, 89.0), (20.0, -90.0)):
-        axis = _vector(ra_deg, dec_deg)
+        axis = direction_of(ra_deg, dec_deg)
         inside = np.flatnonzero(vectors @ axis >= np.cos(np.radians(radius)))
         box = (np.abs(catalog.ra_deg - ra_deg) <= radius) & (np.abs(catalog.dec_deg - dec_deg) <= radius)
         lost += len(np.setdiff1d(inside, grid.order[grid.near(axis, np.radians(radius))]))

@@ -15,7 +15,7 @@ import numpy as np
 from hilstar.arrays import FloatArray
 from hilstar.attitude.logs.aem.blocks import EULER_DERIVATIVE, SPIN, SPIN_NUTATION, SPIN_NUTATION_MOM
 from hilstar.attitude.logs.aem.keywords import AemFaultError
-from hilstar.rotation import conjugate, from_rotation_vectors, multiply
+from hilstar.rotation import conjugate, direction_of, from_rotation_vectors, multiply
 
 AXES = {"1": 0, "2": 1, "3": 2, "X": 0, "Y": 1, "Z": 2}
 
@@ -68,8 +68,7 @@ def spin(values: FloatArray, kind: str) -> tuple[FloatArray, FloatArray]:
         momentum = np.stack((np.sin(nutation) * np.cos(phase), -np.sin(nutation) * np.sin(phase), np.cos(nutation)), axis=1)
         rate += (2 * np.pi / values[:, 5])[:, None] * momentum
     elif kind == SPIN_NUTATION_MOM:
-        ra, dec = np.radians(values[:, 4]), np.radians(values[:, 5])
-        momentum = np.stack((np.cos(ra) * np.cos(dec), np.sin(ra) * np.cos(dec), np.sin(dec)), axis=1)
+        momentum = direction_of(values[:, 4], values[:, 5])
         rate += np.radians(values[:, 6])[:, None] * rotated(q, momentum)
     elif kind != SPIN:
         raise AssertionError(kind)

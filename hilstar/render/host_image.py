@@ -26,7 +26,8 @@ PINNED_MEMORY = "GL_AMD_pinned_memory"
 EXTERNAL_VIRTUAL_MEMORY_BUFFER, DYNAMIC_COPY = 0x9160, 0x88EA  # of that extension, and of OpenGL
 MAX_IMAGE_BYTES = 2**27  # of a buffer that llvmpipe's shaders write
 BANDS = 16  # of rows, each of one thread at a time; an even number
-FEW = 128  # sprites that one thread draws while more would begin
+FEW_PX = 12_800  # of sprites, which one thread draws while more would begin
+FIRST_CAPACITY = 1024  # sprites
 STEP_X, STEP_Y = 2, 4  # as in linear.comp
 MAX_ROUNDS = 60_000  # of all of a shader's loops together: llvmpipe leaves them after 65 535, without a word
 # Of the image: beyond it a clear is faster than making sprites black (llvmpipe, 1080p and 4K).
@@ -48,10 +49,11 @@ class HostImage:
         self._ctx, self._size_px, self._footprint_px = ctx, resolution_px, footprint_px
         width, height = resolution_px
         # Whole pages, which the array keeps for as long as somebody holds it.
-        self.image = np.frombuffer(mmap.mmap(-1, 4 * width * height), dtype=np.float32).reshape(height, width)
+        pages = mmap.mmap(-1, 4 * width * height, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+        self.image = np.frombuffer(pages, dtype=np.float32).reshape(height, width)
         self._light = _pinned(ctx, self.image.ctypes.data, self.image.nbytes)
         self.image.flags.writeable = False
-        self._capacity, self._half = FEW, 0  # sprites that fit into half of the buffer, and which half is the last frame's
+        self._capacity, self._half = FIRST_CAPACITY, 0  # sprites that fit into half of the buffer, and which half is the last frame's
         self._sprites = self._reserved()
         self._rows: RowArray = np.empty(0, dtype=ROW_DTYPE)  # of the last frame's sprites, as they are in the buffer
         edges_px = np.arange(BANDS + 1) * resolution_px[1] // BANDS
@@ -90,7 +92,7 @@ class HostImage:
             self._sprites.release()
             self._capacity = 2 * count
             self._sprites = self._reserved()
-        bands = 1 if count <= FEW else BANDS
+        bands = 1 if self._is_few(count) else BANDS
         ranges = np.zeros((BANDS, 4), dtype=np.int32)
         ranges[:, :2] = self._half * self._capacity + self._in_bands(bands)
         self._half = 1 - self._half
@@ -98,13 +100,16 @@ class HostImage:
         ranges[:, 2:] = self._half * self._capacity + self._in_bands(bands)
         self._run(ranges, bands)
 
+    def _is_few(self, sprites: int) -> bool:
+        return sprites * self._footprint_px**2 <= FEW_PX
+
     def _upload(self, sprites: Sprites) -> RowArray:
         """Put the sprites into the buffer, by rows where they are many; their rows."""
         height, data = self._size_px[1], sprites.data
         before = (self._footprint_px - 1) // 2
         last = data["pixel"][:, 1] + (self._footprint_px - 1 - before)
         rows: RowArray = np.clip(last, 0, height + 2 * self._footprint_px).astype(ROW_DTYPE)
-        if len(data) > FEW:
+        if not self._is_few(len(data)):
             order = np.argsort(rows, kind="stable")
             data, rows = np.take(data, order), rows[order]
         self._sprites.write(data, offset=self._half * self._capacity * SPRITE_DTYPE.itemsize)
@@ -112,7 +117,7 @@ class HostImage:
 
     def _in_bands(self, bands: int) -> IntArray:
         """The first of the sprites in the buffer that touches each band and the end of them (BANDS, 2)."""
-        if bands == 1 or len(self._rows) <= FEW:  # all, in any order
+        if bands == 1 or self._is_few(len(self._rows)):  # all, in any order
             return np.array([[0, len(self._rows)]])
         return np.stack([np.searchsorted(self._rows, self._first_row), np.searchsorted(self._rows, self._end_row)], axis=1)
 

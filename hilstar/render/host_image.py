@@ -53,7 +53,8 @@ class HostImage:
         self.image = np.frombuffer(pages, dtype=np.float32).reshape(height, width)
         self._light = _pinned(ctx, self.image.ctypes.data, self.image.nbytes)
         self.image.flags.writeable = False
-        self._capacity, self._half = FIRST_CAPACITY, 0  # sprites that fit into half of the buffer, and which half is the last frame's
+        self._capacity = FIRST_CAPACITY  # sprites that fit into half of the buffer
+        self._half = 0  # the half with the last frame's
         self._sprites = self._reserved()
         self._rows: RowArray = np.empty(0, dtype=ROW_DTYPE)  # of the last frame's sprites, as they are in the buffer
         edges_px = np.arange(BANDS + 1) * resolution_px[1] // BANDS

@@ -1,8 +1,8 @@
 #version 430 core
 // The linear image, added up in a buffer (hilstar/render/host_image.py): the pixels of stars that were there become black, then
-// those that are there add their light. A work group has a band of rows, and each of its lanes every second column and fourth
-// row: no two lanes write the same pixel, and each takes stars in their order, so that the same stars give the same bits
-// whatever runs side by side.
+// those that are there add their light. A work group has a band of rows, and each of its lanes every eighth row: no two
+// lanes write the same pixel, and each takes stars in their order, so that the same stars give the same bits whatever runs side by
+// side. Lanes in rows of their own wait for memory at once: two columns and four rows take a seventh more time.
 // Defined before this text: FOOTPRINT, BANDS; and shares.glsl.
 
 layout(local_size_x = 8) in;
@@ -17,10 +17,10 @@ uniform int at_once;
 uniform ivec2 resolution_px;
 
 const int FIRST = -((FOOTPRINT - 1) / 2);
-const ivec2 STEP = ivec2(2, 4);  // powers of two
+const int STEP = 8;  // rows from one of a lane's to the next: a power of two
 
 int top, bottom;  // of the band's rows
-ivec2 own;        // the first column and row of this lane's
+int own;          // the first row of this lane's
 
 // Make a star's pixels black, or add its light. It is written out for either: a choice in each pixel takes a sixth more time.
 void take(int i, bool black) {
@@ -29,9 +29,9 @@ void take(int i, bool black) {
     float e_per_s = intBitsToFloat(sprite[5 * i + 4]);
     ivec2 begin = max(pixel + FIRST, ivec2(0, top));
     ivec2 end = min(pixel + FIRST + FOOTPRINT, ivec2(resolution_px.x, bottom));
-    begin += (own - begin) & (STEP - 1);
-    for (int y = begin.y; y < end.y; y += STEP.y) {
-        for (int x = begin.x; x < end.x; x += STEP.x) {
+    begin.y += (own - begin.y) & (STEP - 1);
+    for (int y = begin.y; y < end.y; y += STEP) {
+        for (int x = begin.x; x < end.x; x++) {
             int here = y * resolution_px.x + x;
             if (black) linear_e_per_s[here] = 0.0;
             else linear_e_per_s[here] += e_per_s * share_at(vec2(ivec2(x, y) - pixel) - fraction);
@@ -41,12 +41,12 @@ void take(int i, bool black) {
 
 void main() {
     // llvmpipe gives each thread groups in a row: every second band first, so that stars close together are shared by two.
-    int group = 2 * int(gl_WorkGroupID.x), lane = int(gl_LocalInvocationIndex);
+    int group = 2 * int(gl_WorkGroupID.x);
     int band = group % bands + group / bands;
     ivec4 range = stars[band];
     top = band * resolution_px.y / bands;
     bottom = (band + 1) * resolution_px.y / bands;
-    own = ivec2(lane % STEP.x, lane / STEP.x);
+    own = int(gl_LocalInvocationIndex);
     int were = range.y - range.x, end_star = min(were + range.w - range.z, done + at_once);
     for (int k = done; k < min(were, end_star); k++) take(range.x + k, true);
     for (int k = max(done, were); k < end_star; k++) take(range.z + k - were, false);

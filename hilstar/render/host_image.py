@@ -28,7 +28,7 @@ MAX_IMAGE_BYTES = 2**27  # of a buffer that llvmpipe's shaders write
 BANDS = 16  # of rows, each of one thread at a time; an even number
 FEW_PX = 12_800  # of sprites, which one thread draws while more would begin
 FIRST_CAPACITY = 1024  # sprites
-STEP_X, STEP_Y = 2, 4  # as in linear.comp
+STEP = 8  # as in linear.comp
 MAX_ROUNDS = 60_000  # of all of a shader's loops together: llvmpipe leaves them after 65 535, without a word
 # Of the image: beyond it a clear is faster than making sprites black (llvmpipe, 1080p and 4K).
 MAX_ERASED = 0.02
@@ -132,9 +132,9 @@ class HostImage:
         program["bands"] = bands
         self._sprites.bind_to_storage_buffer(0)
         self._light.bind_to_storage_buffer(1)
-        rows = -(-min(self._footprint_px, -(-height // bands)) // STEP_Y)
-        columns = -(-self._footprint_px // STEP_X)
-        at_once = max(MAX_ROUNDS // (2 + (rows + 1) + rows * (columns + 1)), 1)  # the end of a loop is a round too
+        rows = -(-min(self._footprint_px, -(-height // bands)) // STEP)
+        rounds = 2 + (rows + 1) + rows * (self._footprint_px + 1)  # of a star: the end of a loop is one too
+        at_once = max(MAX_ROUNDS // rounds, 1)
         program["at_once"] = at_once
         for done in range(0, longest, at_once):
             program["done"] = done

@@ -31,7 +31,7 @@ FIRST_CAPACITY = 1024  # sprites
 STEP = 8  # as in linear.comp
 MAX_ROUNDS = 60_000  # of all of a shader's loops together: llvmpipe leaves them after 65 535, without a word
 # Of the image: beyond it a clear is faster than making sprites black (llvmpipe, 1080p and 4K).
-MAX_ERASED = 0.02
+MAX_ERASED = 0.06
 ROW_DTYPE = np.uint16  # sorted by digits: in a tenth of the time of larger numbers
 RowArray = npt.NDArray[np.uint16]
 

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from types import TracebackType
 from typing import TYPE_CHECKING, Protocol, Self
 
 import numpy as np
@@ -29,6 +28,7 @@ from hilstar.monitor.response import Codes, code_dtype
 from hilstar.render.renderer import Renderer
 from hilstar.rotation import normalise, to_matrix
 from hilstar.scene.camera import Camera
+from hilstar.scene.candidates import Candidates
 from hilstar.scene.clipping import clipped_sprites
 from hilstar.scene.frame_motion import Scan, Turn, slowed, swept_sprites
 from hilstar.scene.sprites import Sprites, make_sprites
@@ -133,6 +133,7 @@ class Bench:
     faint_stars: Stars
     renderer: Renderer
     moving: MovingSky | None = None
+    candidates: Candidates = field(default_factory=Candidates, repr=False)
 
     def with_stars(self, stars: Stars) -> Bench:
         """The same bench, and renderer, with other stars, all of which are shown."""
@@ -150,9 +151,10 @@ class Bench:
 
     def sprites(self, q_icrs_to_cam: FloatArray, stars: Stars | None = None) -> Sprites:
         """The sprites of `stars` (by default those bright enough to show) at an attitude (unit quaternion, scalar first)."""
-        stars = self.shown_stars if stars is None else stars
         icrs_to_image = self.camera.cam_to_image @ to_matrix(q_icrs_to_cam)
-        return make_sprites(stars, icrs_to_image, self.camera, self.renderer.footprint_px)
+        stars = self.shown_stars if stars is None else stars
+        candidates = self.candidates if stars is self.shown_stars else None
+        return make_sprites(stars, icrs_to_image, self.camera, self.renderer.footprint_px, candidates)
 
     def draw(
         self,
@@ -197,10 +199,8 @@ class Bench:
             sprites = self._with_satellites(sprites, stars, shot, self.faintest_shown_e_per_s)
         if faults is None:
             return sprites
-        scan = None if rate_cam_rad_s is None else self.scan
-        return faults.over(
-            sprites, stars, q_icrs_to_cam, lambda few: self.star_sprites(few, q_icrs_to_cam, rate_cam_rad_s), scan
-        )
+        scan, draw = None if rate_cam_rad_s is None else self.scan, self.star_sprites
+        return faults.over(sprites, stars, q_icrs_to_cam, lambda few: draw(few, q_icrs_to_cam, rate_cam_rad_s), scan)
 
     def star_sprites(
         self, stars: Stars, q_icrs_to_cam: FloatArray, rate_cam_rad_s: Vector | FloatArray | None = None
@@ -355,8 +355,7 @@ class Bench:
         """The same for each disc brighter than white, in the pixels of which it has most of the light."""
         if not sprites.over_white or self._painter is None:
             return {}
-        wanted = frame.linear
-        shown = shown_light(frame.levels, self.panel)
+        wanted, shown = frame.linear, shown_light(frame.levels, self.panel)
         losses: dict[int | str, float] = {}
         for disc in self.discs(frame.q_icrs_to_cam, When(frame.t_ns)):
             if disc.name in sprites.over_white:
@@ -385,7 +384,7 @@ class Bench:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(self, *exception: object) -> None:
         self.close()
 
 

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.scene.camera import Camera
+from hilstar.scene.candidates import Candidates, stars_about
 from hilstar.scene.extended import ExtendedLight
 from hilstar.sky.stars import Stars
 
@@ -66,20 +67,26 @@ class Sprites:
         return len(self) if self.per_star == 1 else len(np.unique(self.star))
 
 
-def make_sprites(stars: Stars, icrs_to_image: FloatArray, camera: Camera, footprint_px: int) -> Sprites:
+def make_sprites(
+    stars: Stars, icrs_to_image: FloatArray, camera: Camera, footprint_px: int, candidates: Candidates | None = None
+) -> Sprites:
     """The sprites of every star whose footprint touches the image, centres off the edge included.
 
-    `icrs_to_image` (3, 3) turns ICRS components into image components.
+    `icrs_to_image` (3, 3) turns ICRS components into image components. With `candidates` of the last frame stars need not be
+    looked for anew; the sprites are the same.
     """
     margin_px = footprint_px / 2 + 1
-    radius_rad, edges = camera.field(margin_px)
-    near = stars.near(icrs_to_image[2], radius_rad, edges @ icrs_to_image)
-    seen = (icrs_to_image @ stars.directions(near).T).T  # component by component, as they are kept
+    if candidates is None:
+        near = stars_about(stars, icrs_to_image, camera, margin_px)
+        directions, electrons_per_s = stars.directions(near).T, stars.electrons_per_s.take(near)
+    else:
+        near, directions, electrons_per_s = candidates.near(stars, icrs_to_image, camera, margin_px)
+    seen = (icrs_to_image @ directions).T  # component by component, as they are kept
     if camera.lens is not None:  # a pinhole's places cost less than the choice
         close = camera.in_view(seen, margin_px, 0.0)
-        near, seen = near[close], seen[close]
+        near, seen, electrons_per_s = near[close], seen[close], electrons_per_s[close]
     x_px, y_px = camera.project(seen)
-    sprites = pack_sprites(x_px, y_px, stars.electrons_per_s.take(near), near, camera.resolution_px, footprint_px)
+    sprites = pack_sprites(x_px, y_px, electrons_per_s, near, camera.resolution_px, footprint_px)
     kept = brightest(sprites.data["electrons_per_s"], max_stars(footprint_px))
     if kept is None:
         return sprites

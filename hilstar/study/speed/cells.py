@@ -93,12 +93,11 @@ class CellMeasurement:
         stars, camera, footprint_px = self.bench.shown_stars, self.bench.camera, self.staged.footprint_px
         begin = time.perf_counter()
         margin_px = footprint_px / 2 + 1
-        edges = camera.edges(margin_px) @ self.icrs_to_image
-        near = stars.near(self.icrs_to_image[2], camera.field_radius_rad(margin_px), edges)
+        near, directions, rates_e_per_s = self.bench.candidates.near(stars, self.icrs_to_image, camera, margin_px)
         culled = time.perf_counter()
         # make_sprites in its two halves.
-        x_px, y_px = camera.project((self.icrs_to_image @ stars.directions(near).T).T)
-        sprites = pack_sprites(x_px, y_px, stars.electrons_per_s.take(near), near, camera.resolution_px, footprint_px)
+        x_px, y_px = camera.project((self.icrs_to_image @ directions).T)
+        sprites = pack_sprites(x_px, y_px, rates_e_per_s, near, camera.resolution_px, footprint_px)
         projected = time.perf_counter()
         self.staged.draw(sprites)
         self.staged.codes()

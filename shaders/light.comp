@@ -30,6 +30,7 @@ uniform ivec2 resolution_px;
 uniform float most_e_per_s;  // of one star in one pixel: more is white in any case
 uniform float reach_per_e;   // a star lights an ellipse: the logarithm of this times its rate, times these squares of its axes
 uniform vec2 reach_px2;
+uniform float least_reach;   // of that logarithm
 
 const int FIRST = -((FOOTPRINT - 1) / 2);
 
@@ -48,7 +49,7 @@ void main() {
     ivec2 pixel = ivec2(sprite[5 * i], sprite[5 * i + 1]);
     vec2 fraction = vec2(intBitsToFloat(sprite[5 * i + 2]), intBitsToFloat(sprite[5 * i + 3]));
     float e_per_s = intBitsToFloat(sprite[5 * i + 4]);
-    vec2 reach_px = sqrt(log(max(reach_per_e * e_per_s, 1.0)) * reach_px2);
+    vec2 reach_px = sqrt(max(log(reach_per_e * e_per_s), least_reach) * reach_px2);
     int first_x = max(FIRST, -pixel.x), end_x = min(FIRST + FOOTPRINT, resolution_px.x - pixel.x);
     int y = max(max(FIRST, -pixel.y), int(ceil(fraction.y - reach_px.y)));
     int end_y = min(min(FIRST + FOOTPRINT, resolution_px.y - pixel.y), int(floor(fraction.y + reach_px.y)) + 1);

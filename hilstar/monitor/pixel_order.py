@@ -30,8 +30,8 @@ class PixelOrder:
         self.first = -((self.size - 1) // 2)
         self.bias = 0.5 if self.size % 2 else 0.0
         distance = self._distances(sigma_px)
-        reach = max(REACH_SIGMA, MIN_REACH_PX / _spread_px(sigma_px).min())
-        self.near = int((distance <= reach).sum(axis=0).max())
+        self._least_spread_px = float(_spread_px(sigma_px).min())
+        self.near = int((distance <= self.reach_sigmas()).sum(axis=0).max())
         order = np.argsort(distance, axis=0, kind="stable")
         self.area_px2 = 2 * np.pi * float(_spread_px(sigma_px).prod())
         self.row, self.column = (part.astype(np.int32) for part in np.divmod(order, self.size))
@@ -42,6 +42,10 @@ class PixelOrder:
         steps = np.arange(self.size) + self.first
         x, y = (((steps[:, None] - phase) / s) ** 2 for s in _spread_px(sigma_px))
         return np.asarray(np.sqrt(y[:, None, :, None] + x[None, :, None, :]).reshape(self.size**2, PHASES**2))
+
+    def reach_sigmas(self, more_px: float = 0.0) -> float:
+        """How far the pixels lie that are within reach, in sigmas with a pixel's width among them, and `more_px` farther."""
+        return max(REACH_SIGMA, MIN_REACH_PX / self._least_spread_px) + more_px / self._least_spread_px
 
     def reach(self, steps: Float32Array) -> IntArray:
         """How many of its nearest pixels stars of so many steps of light (n,) have enough light in to choose, (n,)."""

@@ -11,6 +11,7 @@ import moderngl
 import numpy as np
 
 from hilstar.monitor.level_table import CodeTable, code_table
+from hilstar.monitor.pixel_order import PixelOrder
 from hilstar.monitor.quantise import Panel
 from hilstar.render.encoder import LevelTexture, SpriteSides, Table, build_compute
 from hilstar.render.splat import set_sigma, share_define
@@ -34,9 +35,9 @@ WINGS, DENSER_WINGS = 128, 8
 SQUARE_WINGS = 4
 # Of the image: where footprints cover more, a clear of levels and sums is faster (llvmpipe, 1080p and 4K).
 MAX_ERASED = 0.1
-MAX_ERASED_KEPT = 0.07  # all of the footprints and the sums too: `exact` may light pixels beyond a star's reach
+MAX_ERASED_KEPT = 0.1  # with the sums, and all pixels among which `exact` chooses
 ANY_RATE = 1e-6  # the largest side of all, for stars of any rate, has fewer wings
-ANY_REACH = 1e6, 1e30  # axes and rates that are so many times larger reach over every footprint
+PHASE_PX = 0.1  # a star is at most so far from the middle of its phase
 
 
 class StarPasses:
@@ -97,8 +98,7 @@ class StarPasses:
         for program in (self._light, self._encode, self._black):
             program["resolution_px"], program["reach_px2"] = self._size_px, self._axes_px2
         if self._keep:
-            self._black["reach_px2"] = [along * ANY_REACH[0] for along in self._axes_px2]
-            self._black["reach_per_e"] = ANY_REACH[1]
+            self._black["least_reach"] = 0.5 * PixelOrder(sigma_px).reach_sigmas(PHASE_PX) ** 2
         set_sigma(self._light, sigma_px)
         self._light["most_e_per_s"] = self._white_e_per_s
         self._encode["lowest"] = (table.first_bin - 1) << table.bin_shift
@@ -143,7 +143,7 @@ class StarPasses:
         self._drawn = len(sprites)
         width, height = self._size_px
         wings = self._wings * (DENSER_WINGS if len(sprites) * self._footprint_px**2 > width * height else 1)
-        for program in (self._light, self._encode, *[self._black][self._keep :]):
+        for program in (self._light, self._encode, self._black):
             program["reach_per_e"] = self._share_bound * sprites.per_star * wings / self._lit_e_per_s
 
     def add_light(self, unit_e_per_s: float) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import moderngl
 
 from hilstar.errors import InputError, MachineError
+from hilstar.process.cores import drawing_threads_apart
 
 EGL_LIBRARY = "libEGL.so.1"
 INSTALL_EGL = "install it: apt-get install libegl1 libgl1-mesa-dri"
@@ -21,7 +22,8 @@ def create_context() -> moderngl.Context:
     """
     try:
         settings: Any = {"backend": "egl", "libgl": EGL_LIBRARY, "libegl": EGL_LIBRARY}
-        return moderngl.create_context(require=330, standalone=True, **settings)
+        with drawing_threads_apart():
+            return moderngl.create_context(require=330, standalone=True, **settings)
     except Exception as error:  # moderngl and glcontext raise plain Exceptions here
         raise MachineError(f"OpenGL 3.3 through EGL is missing ({error}); {INSTALL_EGL}") from error
 

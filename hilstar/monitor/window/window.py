@@ -17,6 +17,7 @@ import glfw
 from hilstar.errors import InputError, MachineError
 from hilstar.monitor.window.visibility import ScreenArea, Visibility
 from hilstar.monitor.window.x11 import Survival, is_composited, sync_control
+from hilstar.process.cores import drawing_threads_apart
 
 TITLE = "hilstar"
 NO_DISPLAY = "no display to open a window on; set DISPLAY, or run with --headless"
@@ -135,7 +136,8 @@ class Window:
         ):
             glfw.window_hint(hint, value)
         width, height = settings.resolution_px if self.display is None else self.display.resolution_px
-        self._window = glfw.create_window(width, height, TITLE, monitor, None)
+        with drawing_threads_apart():
+            self._window = glfw.create_window(width, height, TITLE, monitor, None)
         if not self._window:
             raise MachineError("no window with OpenGL 3.3 can be opened; install it: apt-get install libgl1 libgl1-mesa-dri")
         glfw.make_context_current(self._window)

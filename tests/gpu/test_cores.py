@@ -1,0 +1,49 @@
+"""Which cores the threads of a software OpenGL are kept on; a process's first context begins them."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+LOOK = """
+import json, os
+from pathlib import Path
+{before}
+from hilstar.render.context import create_context
+create_context()
+tasks = [task for task in Path("/proc/self/task").iterdir() if int(task.name) != os.getpid()]
+print(json.dumps([[(task / "comm").read_text().strip(), sorted(os.sched_getaffinity(int(task.name)))] for task in tasks]))
+"""
+ALL = sorted(os.sched_getaffinity(0))
+
+
+def threads(before: str = "", **environment: str) -> list[tuple[str, list[int]]]:
+    """Names of a new process's threads and the cores that they may run on."""
+    run = [sys.executable, "-c", LOOK.format(before=before)]
+    env = os.environ | {"OPENBLAS_NUM_THREADS": "1"} | environment
+    return json.loads(subprocess.run(run, capture_output=True, check=True, env=env, text=True).stdout)
+
+
+def test_each_has_one_and_each_core_has_one_that_rasterises_and_one_that_computes():
+    """Where there are as many threads as cores: one core has nothing to part, and llvmpipe begins so many at most."""
+    found = [(name, cores) for name, cores in threads() if ":" not in name]
+    rasterisers = [cores for name, cores in found if name.startswith("llvmpipe-")]
+    others = [cores for name, cores in found if not name.startswith("llvmpipe-")]
+    apart = [[core] for core in ALL] if 2 <= len(ALL) <= 16 else [ALL] * len(rasterisers)
+    assert sorted(rasterisers) == sorted(others) == apart
+
+
+@pytest.mark.parametrize(
+    ("before", "environment"),
+    [("", {"LP_NUM_THREADS": "1"}), (f"os.sched_setaffinity(0, {{{ALL[0]}}})", {})],
+    ids=["one thread", "one core"],
+)
+def test_where_threads_and_cores_are_not_as_many_they_stay_where_they_may(before, environment):
+    """Several processes of one thread each would all be kept on the first core."""
+    allowed = [ALL[0]] if before else ALL
+    found = threads(before, **environment)
+    assert all(cores == allowed for name, cores in found if ":" not in name)  # the driver's own for its files is elsewhere

@@ -31,10 +31,10 @@ MAG_PER_SHARE = 2.5 / math.log(10)
 # Light beyond a small sprite is under this share of what lights a pixel: only where the wings of stars meet is a code lower
 UNLIT = 0.25
 CUT_PHASES = 51
-# A whole frame, for each of 800 to 1400 stars, 1080p over 31 deg at 0 to 15 deg/s, two llvmpipe cores. Sprites that are too
+# A whole frame, for each of 2500 to 5000 stars, 1080p over 31 deg at 1 to 15 deg/s, two llvmpipe cores. Sprites that are too
 # wide for the compute pass take NumPy's time. A field of the Milky Way has twice the stars of an average one.
-ROUND_MS_A_STAR = 0.008
-EXACT_MS_A_STAR, WIDE_EXACT_MS_A_STAR = 0.01, 0.23
+ROUND_MS_A_STAR = 0.002
+EXACT_MS_A_STAR, WIDE_EXACT_MS_A_STAR = 0.003, 0.23
 IN_TIME_SHARE = 0.5  # of a refresh
 
 

@@ -44,7 +44,8 @@ def clipped_sprites(
     doubtful = (~over).nonzero()[0]
     if len(doubtful) > MAX_DOUBTFUL:
         doubtful = doubtful[np.argpartition(-own[doubtful], MAX_DOUBTFUL)[:MAX_DOUBTFUL]]
-    over[doubtful] = _light_at(sprites, x[doubtful], y[doubtful], sigma_px) > limit[doubtful]
+    if len(doubtful):
+        over[doubtful] = _light_at(sprites, x[doubtful], y[doubtful], sigma_px) > limit[doubtful]
     return np.asarray(bright[over], dtype=np.intp)
 
 

@@ -31,8 +31,9 @@ MAX_UNIT = 1 / 64
 # WINGS * DENSER_WINGS. A star alone has the same levels; of 10 000 on 1080p eleven of 82 000 lit pixels are one level lower,
 # where wings meet, and of 50 000 one in seven thousand.
 WINGS, DENSER_WINGS = 128, 8
-# A square that is large enough at its worst phase has so many times the reach of an ellipse, in light.
-SQUARE_WINGS = 4
+# A square that is large enough at its worst phase, and in its corners, leaves out as little as an ellipse with so many times
+# the wings: with 4, streaks at 10 deg/s were off by 1.4 arcsec rms and 0.004 mag, by squares 0.6 and 0.001.
+SQUARE_WINGS = 16
 # Of the image: where footprints cover more, a clear of levels and sums is faster (llvmpipe, 1080p and 4K).
 MAX_ERASED = 0.1
 MAX_ERASED_KEPT = 0.1  # with the sums, and all pixels among which `exact` chooses

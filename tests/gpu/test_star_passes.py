@@ -139,7 +139,7 @@ def test_smaller_sprites_leave_out_no_more_than_they_say(rng):
         gl.draw(sprites)
         all_.draw(sprites)
         found, whole, panel = gl.codes().copy(), all_.linear().astype(np.float64), gl.target.panel()
-        assert np.count_nonzero(found) < np.count_nonzero(all_.codes())
+        assert np.count_nonzero(found) <= np.count_nonzero(all_.codes())
         alone = sprites_at(np.array([[100.0, 90.0]]), np.array([1e12]), size)
         gl.draw(alone)
         assert np.count_nonzero(gl.codes()) == (size - 2) ** 2

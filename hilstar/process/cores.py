@@ -9,12 +9,15 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator
+import time
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 TASKS = Path("/proc/self/task")
 RASTERISERS = "llvmpipe-"
+NAMING_S = 1e-3  # a thread names itself, a little after it has begun
+NAMING_TRIES = 20
 
 
 @contextmanager
@@ -22,13 +25,22 @@ def drawing_threads_apart() -> Iterator[None]:
     """Keep each thread that llvmpipe begins in this context on a core of its own, where it begins one for each core."""
     before = _threads()
     yield
-    begun = {thread: name for thread, name in sorted(_threads().items()) if thread not in before}
-    rasterisers = [thread for thread, name in begun.items() if name.startswith(RASTERISERS)]
-    # Those that compute have the process's own name; others of the driver's have one with a colon.
-    computing = [thread for thread, name in begun.items() if thread not in rasterisers and ":" not in name]
+    for _ in range(NAMING_TRIES):
+        rasterisers, computing = _drawing_threads(before)
+        if len(rasterisers) == len(computing):
+            break
+        time.sleep(NAMING_S)
     for group in (rasterisers, computing):
         if len(group) == len(rasterisers):
             _spread(group)
+
+
+def _drawing_threads(before: Collection[int]) -> tuple[list[int], list[int]]:
+    """The threads begun since that rasterise, and those that compute."""
+    begun = {thread: name for thread, name in sorted(_threads().items()) if thread not in before}
+    rasterisers = [thread for thread, name in begun.items() if name.startswith(RASTERISERS)]
+    # Those that compute have the process's own name; others of the driver's have one with a colon.
+    return rasterisers, [thread for thread, name in begun.items() if thread not in rasterisers and ":" not in name]
 
 
 def _threads() -> dict[int, str]:

@@ -10,11 +10,12 @@ import sys
 import pytest
 
 LOOK = """
-import json, os
+import json, os, time
 from pathlib import Path
 {before}
 from hilstar.render.context import create_context
 create_context()
+time.sleep(0.2)  # the driver's threads have named themselves
 tasks = [task for task in Path("/proc/self/task").iterdir() if int(task.name) != os.getpid()]
 print(json.dumps([[(task / "comm").read_text().strip(), sorted(os.sched_getaffinity(int(task.name)))] for task in tasks]))
 """

@@ -99,7 +99,7 @@ def test_the_report_says_it_on_one_page(run, tmp_path):
     assert result.returncode == 0, result.stderr
     found = json.loads(result.stdout)
     assert found["frames"] == summary["frames"] and found["missed_frames"] <= summary["missed_frames"]
-    assert found["pacing_jitter_ms"] == pytest.approx(summary["screen"]["pacing_jitter_ms"], rel=1e-6)
+    assert found["pacing_jitter_ms"] == pytest.approx(summary["screen"]["pacing_jitter_ms"])  # None without a row
     for key in ("attitude_age_ms", "packet_to_swap_ms", "swap_late_ms"):
         assert found[key]["p50"] is not None
     assert found["packets"]["accepted"] == summary["packets"]["accepted"]

@@ -13,6 +13,7 @@ import pytest
 from scipy.special import erf
 
 from hilstar.attitude.wire.packet import AttitudeSample
+from hilstar.rotation import direction_of
 from hilstar.scene.camera import Camera
 from hilstar.sky.electrons import tabulate
 from hilstar.study.stability import attitude as stability_attitude
@@ -95,7 +96,7 @@ def by_right_ascension(catalog, epoch_jyear):
     years = epoch_jyear - stability_field.HIPPARCOS_EPOCH_JYEAR
     ra_deg = catalog.ra_deg + catalog.pm_ra_cosdec_mas_yr * years / 3.6e6
     dec_deg = catalog.dec_deg + catalog.pm_dec_mas_yr * years / 3.6e6
-    return np.array([stability_field._vector(*place) for place in zip(ra_deg, dec_deg, strict=True)])
+    return direction_of(ra_deg, dec_deg)
 
 
 def averaged(_model, optics, photometry):

@@ -25,7 +25,8 @@ ALL = sorted(os.sched_getaffinity(0))
 def threads(before: str = "", **environment: str) -> list[tuple[str, list[int]]]:
     """Names of a new process's threads and the cores that they may run on."""
     run = [sys.executable, "-c", LOOK.format(before=before)]
-    env = os.environ | {"OPENBLAS_NUM_THREADS": "1"} | environment
+    own = {name: value for name, value in os.environ.items() if name != "LP_NUM_THREADS"}  # a campaign here has set it
+    env = own | {"OPENBLAS_NUM_THREADS": "1"} | environment
     return json.loads(subprocess.run(run, capture_output=True, check=True, env=env, text=True).stdout)
 
 

@@ -9,6 +9,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from concurrent.futures import CancelledError
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -24,6 +25,7 @@ TASK_S = 1.0  # of work in a task; handing one out costs the scheduler milliseco
 SPARE_TASKS = 1  # that wait at a worker, beyond those that its threads are at
 POLL_S, LOOK_S = 0.25, 0.5
 CONNECT_S, ANSWER_S, MAX_SILENCE_S = 30.0, 30.0, 90.0
+FETCH_S = 5.0  # a task's rows come at once, or their worker is gone
 MAX_WITHOUT_WORKER_S = 60.0
 CLOSE_S = 0.3  # a Ctrl-C ends a command within a second
 
@@ -72,6 +74,8 @@ class Cluster:
     def run(self, backlog: Backlog, done: Done, lost: Lost) -> None:
         """Run all cases (see `Pool.run`). Raises MachineError where the scheduler, or every worker, is gone for long."""
         while True:
+            if self._client.status == "closed":
+                raise self._gone()
             self._look(backlog, lost)
             self._hand_out(backlog)
             if backlog.to_run <= 0:
@@ -84,7 +88,7 @@ class Cluster:
 
     def _look(self, backlog: Backlog, lost: Lost) -> None:
         """See which workers have come, and which are gone, with what they had."""
-        if time.monotonic() - self._looked_s < LOOK_S:
+        if time.monotonic() - self._looked_s < LOOK_S or self._client.status != "running":  # it looks for a lost scheduler
             return
         self._looked_s = time.monotonic()
         try:
@@ -92,9 +96,7 @@ class Cluster:
         except (OSError, TimeoutError, asyncio.CancelledError, RuntimeError) as error:
             if time.monotonic() - self._answered_s < MAX_SILENCE_S:
                 return  # a busy one answers later
-            raise MachineError(
-                f"--scheduler {self._address}: answers no more; start it again, and run the same command: it goes on"
-            ) from error
+            raise self._gone() from error
         self._answered_s = time.monotonic()
         for address in [address for address in self._workers if address not in present]:
             self._bury(address, backlog, lost)
@@ -103,6 +105,11 @@ class Cluster:
                 self._workers[address] = _Worker(threads)
                 future = self._submit(address, examine, self._job)
                 self._examined[future] = address
+
+    def _gone(self) -> MachineError:
+        return MachineError(
+            f"--scheduler {self._address}: answers no more; start it again, and run the same command: it goes on"
+        )
 
     def _bury(self, address: str, backlog: Backlog, lost: Lost) -> None:
         """A worker is gone: the task that it was at may be why, the others are handed out again."""
@@ -124,6 +131,8 @@ class Cluster:
         return future
 
     def _hand_out(self, backlog: Backlog) -> None:
+        if self._client.status != "running":
+            return
         good = {address: worker for address, worker in self._workers.items() if worker.checked and not worker.refused}
         for depth in range(1, 1 + max((worker.threads for worker in good.values()), default=0) + SPARE_TASKS):
             for address, worker in good.items():
@@ -141,9 +150,12 @@ class Cluster:
                 continue
             worker.checked = True
             try:
-                said = future.result()
+                said = future.result(timeout=FETCH_S)
                 why = difference(said, self._identity) if isinstance(said, Identity) else str(said)
             except Exception as error:  # an older hilstar without campaigns, or none at all
+                if future.status != "error":  # it is gone, or the scheduler; if it is still there it is asked again
+                    del self._workers[address]
+                    continue
                 why = f"cannot run campaigns of this hilstar ({type(error).__name__}: {error}); install the same version there"
             if why is not None:
                 self._refuse(address, why)
@@ -155,12 +167,16 @@ class Cluster:
     def _hear_tasks(self, backlog: Backlog, done: Done, lost: Lost) -> None:
         for address, worker in self._workers.items():
             for entry in [entry for entry in worker.tasks if entry[0].done()]:
-                worker.tasks.remove(entry)
                 future, task = entry
-                if future.status == "finished":
-                    answered: Answered = future.result()
+                answered = _fetched(future)
+                if answered is None and future.status in ("finished", "pending"):
+                    continue
+                worker.tasks.remove(entry)
+                if answered is not None:
                     backlog.done(task, answered.seconds)
                     done(task, answered)
+                elif future.status == "cancelled":  # with the scheduler's connection
+                    backlog.give_back(task)
                 elif future.status == "error" and type(future.exception()).__name__ != "KilledWorker":
                     backlog.give_back(task)
                     if not worker.refused:
@@ -191,3 +207,13 @@ class Cluster:
         with contextlib.suppress(Exception):
             self._client.cancel([future for worker in self._workers.values() for future, _ in worker.tasks])
             self._client.close(timeout=CLOSE_S)
+
+
+def _fetched(future: Any) -> Answered | None:
+    """What a task answered; None where it failed, or where its worker has died before it gave the answer away."""
+    if future.status != "finished":
+        return None
+    with contextlib.suppress(OSError, CancelledError):
+        answered: Answered = future.result(timeout=FETCH_S)
+        return answered
+    return None

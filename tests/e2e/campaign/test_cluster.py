@@ -18,8 +18,8 @@ import hilstar
 from hilstar.campaign.store.table import read_columns
 from tests.support.benches import ROOT
 from tests.support.campaigns import write_campaign
-from tests.support.commands import HILSTAR, assert_refused, run_hilstar_here
-from tests.support.waiting import wait_for
+from tests.support.commands import HILSTAR, assert_refused, run_hilstar, run_hilstar_here
+from tests.support.waiting import PATIENCE_S, wait_for
 
 DASK = [sys.executable, "-m", "dask"]
 SOLVER = """
@@ -31,6 +31,19 @@ def solve(image, tracker):
         raise ValueError(f"not this one: {int(image.sum())}")
     return [1.0, 0.0, 0.0, 0.0]
 """
+FETCH = """
+import os, signal, sys
+import distributed
+from hilstar.campaign.workers import cluster
+cluster.FETCH_S = 1.0
+with distributed.Client(sys.argv[1]) as client:
+    client.wait_for_workers(1)
+    future = client.submit(sum, (1, 2), workers=list(client.scheduler_info()["workers"]))
+    distributed.wait(future)
+    os.kill(int(sys.argv[2]), signal.SIGKILL)
+    print(future.status, cluster._fetched(future))
+"""
+WORKER = ("--nthreads", "1", "--no-nanny", "--no-dashboard", "--death-timeout", "60")
 OPTIONS = ("--solver", "python:sleepy:solve", "--json")
 
 
@@ -76,22 +89,33 @@ def rows_so_far(folder: Path) -> int:
     return sum(path.read_bytes().count(b"\n") for path in (folder / "out" / "journal").glob("*.jsonl"))
 
 
-def test_a_cluster_gives_the_pools_table_though_a_worker_and_the_driver_are_killed(folder: Path) -> None:
-    worker = ("--nthreads", "1", "--no-nanny", "--no-dashboard", "--death-timeout", "60")
-    with contextlib.ExitStack() as stack:
-        start = ("scheduler", "--port", "0", "--host", "127.0.0.1", "--no-dashboard", "--scheduler-file", "scheduler.json")
-        stack.enter_context(running(folder, "scheduler.log", *start))
-        wait_for(lambda: (folder / "scheduler.json").exists() and (folder / "scheduler.json").stat().st_size, "no scheduler")
-        address = json.loads((folder / "scheduler.json").read_text())["address"]
-        victim = stack.enter_context(running(folder, "a.log", "worker", address, *worker))
-        stack.enter_context(running(folder, "b.log", "worker", address, *worker))
-        other = str(other_version(folder))
-        stack.enter_context(running(folder, "c.log", "worker", address, *worker, "--name", "other", PYTHONPATH=other))
+@contextlib.contextmanager
+def scheduler(folder: Path, port: str = "0") -> Iterator[tuple[subprocess.Popen[bytes], str]]:
+    """A scheduler and its address, once it listens there."""
+    file = folder / "scheduler.json"
+    file.unlink(missing_ok=True)
+    start = ("scheduler", "--port", port, "--host", "127.0.0.1", "--no-dashboard", "--scheduler-file", file.name)
+    with running(folder, "scheduler.log", *start) as process:
+        wait_for(lambda: file.exists() and file.stat().st_size, "no scheduler")
+        yield process, json.loads(file.read_text())["address"]
 
-        command = [*HILSTAR, "campaign", "plan.toml", "-o", "out", "--scheduler", address, *OPTIONS]
-        with (folder / "driver.log").open("wb") as log:
-            driver = subprocess.Popen(command, cwd=folder, stdout=log, stderr=log)
+
+def driver_of(folder: Path, address: str) -> subprocess.Popen[bytes]:
+    command = [*HILSTAR, "campaign", "plan.toml", "-o", "out", "--scheduler", address, *OPTIONS]
+    with (folder / "driver.log").open("wb") as log:
+        return subprocess.Popen(command, cwd=folder, stdout=log, stderr=log)
+
+
+def test_a_cluster_gives_the_pools_table_though_a_worker_and_the_driver_are_killed(folder: Path) -> None:
+    with contextlib.ExitStack() as stack:
+        _, address = stack.enter_context(scheduler(folder))
+        other = str(other_version(folder))
+        stack.enter_context(running(folder, "c.log", "worker", address, *WORKER, "--name", "other", PYTHONPATH=other))
+        driver = driver_of(folder, address)
         wait_for(lambda: "is refused" in (folder / "driver.log").read_text(), "the other version is not refused")
+
+        victim = stack.enter_context(running(folder, "a.log", "worker", address, *WORKER))
+        stack.enter_context(running(folder, "b.log", "worker", address, *WORKER))
         wait_for(lambda: rows_so_far(folder) >= 3, "nothing comes")
         os.kill(victim.pid, signal.SIGKILL)
         after_kill = rows_so_far(folder)
@@ -101,7 +125,7 @@ def test_a_cluster_gives_the_pools_table_though_a_worker_and_the_driver_are_kill
         (folder / "slow").unlink()
         assert rows_so_far(folder) < 24
 
-        last = run_hilstar_here("campaign", "plan.toml", "-o", "out", "--scheduler", address, *OPTIONS, cwd=folder)
+        last = run_hilstar("campaign", "plan.toml", "-o", "out", "--scheduler", address, *OPTIONS, cwd=folder)
     assert last.returncode == 0, last.stderr
     for said in ((folder / "driver.log").read_text(), last.stderr):
         assert re.search(
@@ -111,6 +135,31 @@ def test_a_cluster_gives_the_pools_table_though_a_worker_and_the_driver_are_kill
     assert (folder / "out/cases.parquet").read_bytes() == (folder / "pool/cases.parquet").read_bytes(), pool.stderr
     columns = read_columns(folder / "out/cases.parquet")
     assert columns["case"] == list(range(24)) and {"done", "failed"} == set(columns["status"])
+
+
+def test_a_campaign_goes_on_when_its_scheduler_was_killed_and_is_started_again(folder: Path) -> None:
+    with contextlib.ExitStack() as stack:
+        process, address = stack.enter_context(scheduler(folder))
+        stack.enter_context(running(folder, "a.log", "worker", address, *WORKER))
+        driver = driver_of(folder, address)
+        wait_for(lambda: rows_so_far(folder) >= 3, "nothing comes")
+        process.kill()
+        process.wait()
+        (folder / "slow").unlink()
+        stack.enter_context(scheduler(folder, address.rpartition(":")[2]))
+        stack.enter_context(running(folder, "b.log", "worker", address, *WORKER))
+        assert driver.wait(PATIENCE_S) == 0, (folder / "driver.log").read_text()
+    assert read_columns(folder / "out/cases.parquet")["case"] == list(range(24))
+
+
+def test_an_answer_that_died_with_its_worker_is_not_waited_for(folder: Path) -> None:
+    """The scheduler would hand the task to that worker again, as soon as it is back."""
+    with contextlib.ExitStack() as stack:
+        _, address = stack.enter_context(scheduler(folder))
+        worker = stack.enter_context(running(folder, "a.log", "worker", address, *WORKER))
+        command = [sys.executable, "-c", FETCH, address, str(worker.pid)]
+        fetched = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+    assert fetched.stdout == "finished None\n", fetched.stderr
 
 
 def test_no_scheduler_and_no_address_are_one_line(folder: Path) -> None:

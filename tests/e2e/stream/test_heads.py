@@ -6,6 +6,7 @@ import json
 import os
 import signal
 import subprocess
+import time
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from tests.support.waiting import wait_for
 
 BODY = (0.7139, 0.1, -0.3, 0.6245)  # as a packet holds it; its norm is 1 within 1e-4
 SAME_RAD = 1e-9
+BEGUN_S = 1.0  # by then a head that draws has said so; one that has not may take a minute to begin
 
 
 def children(parent: int) -> dict[str, int]:
@@ -42,6 +44,7 @@ def test_a_head_that_is_killed_or_hangs_stops_no_other_and_is_begun_again(tmp_pa
         with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=said, text=True) as process:
             try:
                 wait_for(lambda: lines.read_text().count("first attitude") == 3)
+                time.sleep(BEGUN_S)
                 heads = children(process.pid)
                 os.kill(heads["b"], signal.SIGKILL)
                 os.kill(heads["c"], signal.SIGSTOP)

@@ -37,6 +37,7 @@ RATE_RAD_S = np.radians([0.0, 0.0, 20.0])
 # A packet's float32 rate of 20 deg/s (0.35 rad/s) predicts over 100 ms; and rounding.
 PREDICTED_RAD = 0.35 * 0.1 * 2**-24 * 2 + 1e-9
 ANSWERED_S = 0.3
+A_BUSY_MACHINE_S = ("frame-late", "frame-given-up")  # and no fault of a sender's
 
 
 def bench_of(folder: Path, *lines: str) -> Path:
@@ -124,7 +125,7 @@ def test_nothing_wrong_is_drawn_over_a_bad_network(tmp_path, form: Callable[[byt
     assert len(shown) > 70
     assert doubled[0] > 30
     assert summary["packets"]["refused"] >= doubled[0] + cable.tally.corrupted - 3  # the last may be on their way
-    assert set(summary["events"]) <= {"first-attitude"}
+    assert set(summary["events"]) <= {"first-attitude", *A_BUSY_MACHINE_S}
     first_ns, first = shown[0]
     for t_ns, q in shown:
         assert angle_between_rad(q, propagate(first, RATE_RAD_S, (t_ns - first_ns) / 1e9)) < PREDICTED_RAD

@@ -41,7 +41,7 @@ class SyncSettings(Table, frozen=True):
             extra={"default": "none"},
         ),
     ] = None
-    pulse_ms: Annotated[Positive, Meta(description="Width of the pulse.")] = 1.0
+    pulse_ms: Annotated[Positive, Meta(description="Width of the pulse, at least.")] = 1.0
     active: Annotated[
         Literal["high", "low"],
         Meta(

@@ -91,7 +91,8 @@ class FramePulse:
             begin_ns = time.monotonic_ns()
             self._line.set(True)
             set_ns = time.monotonic_ns()
-            time.sleep(max(begin_ns + self._pulse_ns - time.monotonic_ns(), 0) / NS_PER_S)
+            # From when the line is known to be raised: a trigger may be wider than asked for, but not narrower.
+            time.sleep(max(set_ns + self._pulse_ns - time.monotonic_ns(), 0) / NS_PER_S)
             self._line.set(False)
         except LOST as error:
             self._lose(error)

@@ -13,6 +13,10 @@ from hilstar.process.cores import drawing_threads_apart
 
 EGL_LIBRARY = "libEGL.so.1"
 INSTALL_EGL = "install it: apt-get install libegl1 libgl1-mesa-dri"
+MIN_COMPUTE_VERSION = 430  # of OpenGL, for compute shaders
+SOFTWARE = ("llvmpipe", "softpipe")
+# Of llvmpipe: what its shaders write of a buffer, and rounds of all loops of a shader (65 535 end them without a word).
+MAX_WRITTEN_BYTES, MAX_ROUNDS = 2**27, 60_000
 
 
 def create_context() -> moderngl.Context:
@@ -36,6 +40,11 @@ def check_limits(ctx: moderngl.Context, resolution_px: tuple[int, int], footprin
     points = ctx.info["GL_POINT_SIZE_RANGE"][1]
     if footprint_px > points:
         raise InputError(f"{sigma}: needs sprites of {footprint_px} px; this GL draws at most {points:g} px")
+
+
+def computes_in_software(ctx: moderngl.Context) -> bool:
+    """Whether this GL is a processor's and has compute shaders; a graphics card rasterises points in its stride."""
+    return ctx.version_code >= MIN_COMPUTE_VERSION and str(ctx.info["GL_RENDERER"]).startswith(SOFTWARE)
 
 
 def leave_contexts() -> None:

@@ -14,22 +14,17 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import IntArray
-from hilstar.process.interrupts import held
-from hilstar.render.context import EGL_LIBRARY
+from hilstar.render.context import EGL_LIBRARY, MAX_ROUNDS, MAX_WRITTEN_BYTES, computes_in_software
+from hilstar.render.encoder import build_compute
 from hilstar.render.splat import set_sigma, share_define
-from hilstar.resources import resource_path
 from hilstar.scene.sprites import SPRITE_DTYPE, Sprites
 
-MIN_VERSION = 430  # of OpenGL, for compute shaders
-SOFTWARE = "llvmpipe"  # a graphics card has its own memory, and rasterises points in its stride
 PINNED_MEMORY = "GL_AMD_pinned_memory"
 EXTERNAL_VIRTUAL_MEMORY_BUFFER, DYNAMIC_COPY = 0x9160, 0x88EA  # of that extension, and of OpenGL
-MAX_IMAGE_BYTES = 2**27  # of a buffer that llvmpipe's shaders write
 BANDS = 16  # of rows, each of one thread at a time; an even number
 FEW_PX = 12_800  # of sprites, which one thread draws while more would begin
 FIRST_CAPACITY = 1024  # sprites
 STEP = 8  # as in linear.comp
-MAX_ROUNDS = 60_000  # of all of a shader's loops together: llvmpipe leaves them after 65 535, without a word
 # Of the image: beyond it a clear is faster than making sprites black (llvmpipe, 1080p and 4K).
 MAX_ERASED = 0.06
 ROW_DTYPE = np.uint16  # sorted by digits: in a tenth of the time of larger numbers
@@ -66,15 +61,12 @@ class HostImage:
     def runs_on(ctx: moderngl.Context, resolution_px: tuple[int, int]) -> bool:
         """Whether this GL is a processor's, has what this needs, and takes an image so large."""
         width, height = resolution_px
-        has = ctx.version_code >= MIN_VERSION and PINNED_MEMORY in ctx.extensions
-        return has and SOFTWARE in ctx.info["GL_RENDERER"] and 4 * width * height <= MAX_IMAGE_BYTES
+        has = computes_in_software(ctx) and PINNED_MEMORY in ctx.extensions
+        return has and 4 * width * height <= MAX_WRITTEN_BYTES
 
     def _build(self, sigma_px: tuple[float, float]) -> moderngl.ComputeShader:
         named = [*share_define(sigma_px, self._footprint_px), f"FOOTPRINT {self._footprint_px}", f"BANDS {BANDS}"]
-        version, body = resource_path("shaders", "linear.comp").read_text().split("\n", 1)
-        shares = resource_path("shaders", "shares.glsl").read_text()
-        with held():  # as for any program
-            program = self._ctx.compute_shader("\n".join([version, *(f"#define {name}" for name in named), shares, body]))
+        program = build_compute(self._ctx, "linear.comp", named, ["shares"])
         set_sigma(program, sigma_px)
         program["resolution_px"] = self._size_px
         return program

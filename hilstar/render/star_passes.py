@@ -13,16 +13,13 @@ import numpy as np
 from hilstar.monitor.level_table import CodeTable, code_table
 from hilstar.monitor.pixel_order import PixelOrder
 from hilstar.monitor.quantise import Panel
+from hilstar.render.context import MAX_ROUNDS, MAX_WRITTEN_BYTES, computes_in_software
 from hilstar.render.encoder import LevelTexture, SpriteSides, Table, build_compute
 from hilstar.render.splat import set_sigma, share_define
 from hilstar.scene.psf import footprint_px, outside_share, peak_share, share_bound
 from hilstar.scene.sprites import SPRITE_DTYPE, Sprites
 
-MIN_VERSION = 430  # of OpenGL, for compute shaders
-SOFTWARE = ("llvmpipe", "softpipe")  # a graphics card rasterises points in its stride, and a star a lane leaves it idle
 LOCAL_SIZE = 32  # as in light.comp
-MAX_SUMS_BYTES = 2**27  # of a buffer that llvmpipe's shaders write
-MAX_ROUNDS = 60_000  # of a shader's loops: llvmpipe leaves them after 65 535, without a word
 STEPS_BINDING, SUMS_BINDING = 1, 7
 MAX_SUM = 2**31 - 2**24  # what an int holds, less what a float32 that large is rounded by
 # Of the light that lights a pixel. Where stars are so many and so bright that a unit would be more, their light is blended.
@@ -76,9 +73,9 @@ class StarPasses:
 
         The panel's table may have no bin with several thresholds.
         """
-        if ctx.version_code < MIN_VERSION or not str(ctx.info["GL_RENDERER"]).startswith(SOFTWARE):
+        if not computes_in_software(ctx):  # a graphics card is left idle by a star a lane
             return False
-        if 4 * size_px[0] * size_px[1] > MAX_SUMS_BYTES or footprint_px * (footprint_px + 2) > MAX_ROUNDS:
+        if 4 * size_px[0] * size_px[1] > MAX_WRITTEN_BYTES or footprint_px * (footprint_px + 2) > MAX_ROUNDS:
             return False
         return code_table(panel.response.thresholds_e_per_s(panel.flux_at_white_e_per_s)).steps() is not None
 

@@ -31,7 +31,7 @@ class _Kept:
         """Whether every star near that field is among these."""
         kept = self.stars
         same = stars.vectors is kept.vectors and stars.electrons_per_s is kept.electrons_per_s and stars.grid is kept.grid
-        if not same or stars.velocity_km_s is not None or camera is not self.camera or margin_px != self.margin_px:
+        if not same or camera is not self.camera or margin_px != self.margin_px:
             return False
         difference = (icrs_to_image - self.icrs_to_image).ravel()
         # |R - S| by its elements is sqrt(8) sin(angle / 2), whatever the axis of the turn from R to S: roll counts as well.
@@ -56,10 +56,9 @@ class Candidates:
 
         That is directions (3, n), ICRS, and electrons per second (n,). None of it is the caller's to change.
         """
-        kept = self._kept
-        if kept is not None and kept.holds(stars, icrs_to_image, camera, margin_px):
+        kept, keeps = self._kept, not stars.bodies and stars.velocity_km_s is None
+        if keeps and kept is not None and kept.holds(stars, icrs_to_image, camera, margin_px):
             return kept.near, kept.directions, kept.electrons_per_s
-        keeps = not stars.bodies and stars.velocity_km_s is None
         near = stars_about(stars, icrs_to_image, camera, margin_px, KEPT_TURN_RAD if keeps else 0.0)
         directions, electrons_per_s = stars.directions(near).T, stars.electrons_per_s.take(near)
         if keeps:

@@ -76,8 +76,9 @@ class Cluster:
         while True:
             if self._client.status == "closed":
                 raise self._gone()
-            self._look(backlog, lost)
-            self._hand_out(backlog)
+            if self._client.status == "running":  # it may be looking for a scheduler that it has lost
+                self._look(backlog, lost)
+                self._hand_out(backlog)
             if backlog.to_run <= 0:
                 return
             self._check_alone()
@@ -88,7 +89,7 @@ class Cluster:
 
     def _look(self, backlog: Backlog, lost: Lost) -> None:
         """See which workers have come, and which are gone, with what they had."""
-        if time.monotonic() - self._looked_s < LOOK_S or self._client.status != "running":  # it looks for a lost scheduler
+        if time.monotonic() - self._looked_s < LOOK_S:
             return
         self._looked_s = time.monotonic()
         try:
@@ -131,8 +132,6 @@ class Cluster:
         return future
 
     def _hand_out(self, backlog: Backlog) -> None:
-        if self._client.status != "running":
-            return
         good = {address: worker for address, worker in self._workers.items() if worker.checked and not worker.refused}
         for depth in range(1, 1 + max((worker.threads for worker in good.values()), default=0) + SPARE_TASKS):
             for address, worker in good.items():

@@ -8,6 +8,7 @@ do) and no thread can.
 
 from __future__ import annotations
 
+import _thread
 import contextlib
 import os
 import select
@@ -95,7 +96,13 @@ def _handle(number: int, frame: FrameType | None) -> None:
             _let_guard_go()
             os._exit(SIGNALLED + number)
         raise KeyboardInterrupt
-    for stop in _ending.stops:
+    # The main thread may be in the middle of a wait for it and hold the event's lock, which a handler in it cannot take.
+    with contextlib.suppress(RuntimeError):  # no thread to be had: the watchers end it
+        _thread.start_new_thread(_stop, (*_ending.stops,))
+
+
+def _stop(*stops: threading.Event) -> None:
+    for stop in stops:
         stop.set()
 
 

@@ -131,6 +131,22 @@ def test_a_signal_while_a_shader_is_built_ends_it_in_order(tmp_path, small_bench
     assert err.decode().splitlines()[-1] == "hilstar: stopped"
 
 
+def test_a_signal_in_the_middle_of_a_wait_ends_a_run_in_order(tmp_path):
+    """Python runs a handler between any two steps of the main thread, and there it may hold the lock of what it waits for."""
+    before = (
+        "import os, signal\nfrom hilstar.run.host_clock import HostClock\nwait = HostClock.wait_until\n"
+        "def told(clock, due_ns, stop):\n    with stop._cond:\n        os.kill(os.getpid(), signal.SIGINT)\n"
+        "    return wait(clock, due_ns, stop)\n"
+        "HostClock.wait_until = told"
+    )
+    with running(
+        program("serve", serve_file(tmp_path, free_port()), "--headless", "--json", before=before), text=True
+    ) as process:
+        out, err = process.communicate(timeout=20)
+    assert process.returncode == NO_ATTITUDE, err
+    assert json.loads(out)["frames"] < 10
+
+
 def test_a_second_signal_ends_it_at_once(tmp_path, small_bench_file):
     log = tmp_path / "log.csv"
     log.write_text("t_s,qw,qx,qy,qz\n0,1,0,0,0\n60,1,0,0,0\n")

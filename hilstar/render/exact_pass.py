@@ -31,7 +31,7 @@ IN_BOX = 1023  # what a pixel's part in a box is counted in: ten bits
 # Narrower sprites have moments of their pixels: exp(-2 pi^2 sigma^2) / pi px, here 5e-6, of thousands of steps of light.
 NARROW_PX = 0.75
 RUN, MAX_RUNS, HALF_OCTAVES = 256, 2048, 32  # of stars that are sorted by light; runs times half octaves fill 16 bits
-PARTS = ("sums", "exact/inputs", "shares", "exact/stars", "exact/choices")  # of the shader, before exact.comp
+PARTS = ("sums", "exact/inputs", "shares", "exact/stars", "exact/pixels", "exact/choices")  # of the shader, before exact.comp
 LOCAL_SIZE = 32  # as in exact.comp
 FIRST_BINDING = 4  # of a Memory's buffers
 BEGIN_DTYPE = np.dtype([("before", "<i4"), ("phase", "<f4")])

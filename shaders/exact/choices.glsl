@@ -15,26 +15,6 @@ struct Choice {
     BITS up;
 };
 
-#if NEAR <= 32
-BITS bit_of(int k) {
-    return 1u << k;
-}
-
-bool has_bit(BITS bits, int k) {
-    return (bits & (1u << k)) != 0u;
-}
-#else
-BITS bit_of(int k) {
-    BITS bits = BITS(0u);
-    bits[k >> 5] = 1u << (k & 31);
-    return bits;
-}
-
-bool has_bit(BITS bits, int k) {
-    return (bits[k >> 5] & (1u << (k & 31))) != 0u;
-}
-#endif
-
 // exp(-u) within 0.03: exp itself is a fifth of the whole pass on a CPU.
 float window_at(vec2 d) {
     float near = 1.0 / (1.0 + dot(d * d, half_inverse_window2) / 8.0);
@@ -50,6 +30,10 @@ void arms_of(uint place, vec2 d, vec2 off, float light_weight, out vec4 a, out v
     a = vec4(light_weight, weights.y * d, weights.z * window);
     b = vec4(weights.w * window * d, box.x * (d + follows.xy * off));
     c = box.y * (d + follows.zw * off);
+}
+
+void arms_at(Near near, int k, out vec4 a, out vec4 b, out vec2 c) {
+    arms_of(PLACE(k), vec2(offset_of(PLACE(k))) - near.star.fraction, near.off, near.light_weight, a, b, c);
 }
 
 Choice pick(bool first, Choice x, Choice y) {
@@ -88,11 +72,11 @@ Choice moved(Choice e, vec4 a, vec4 b, vec2 c, float by, float square, BITS bit)
 // One pixel decided in all choices.
 #define DECIDE(K, PAIRS) { \
     uint here = PLACE(K); \
-    vec2 step = step_at(step_of[K], pixel + offset_of(here)); \
+    vec2 step = step_at(step_of[K], near.star.pixel + offset_of(here)); \
     float s = step.x, t = step.y; \
     vec4 a, b; \
     vec2 c; \
-    arms_of(here, vec2(offset_of(here)) - fraction, off, light_weight, a, b, c); \
+    arms_of(here, vec2(offset_of(here)) - near.star.fraction, near.off, near.light_weight, a, b, c); \
     float aa = dot(a, a) + dot(b, b) + dot(c, c); \
     BITS bit = bit_of(K); \
     float lower[KEPT], rise[KEPT]; \

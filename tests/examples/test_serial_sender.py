@@ -20,6 +20,7 @@ from tests.support.servers import interrupted, listening
 from tests.support.wire.ptys import Cable
 
 EXAMPLES = ROOT / "examples"
+READ_S = 0.5  # until a busy machine has read what was sent
 STRICT = ["-Wall", "-Wextra", "-Werror", "-pedantic"]
 BAUD = 921_600
 CLOCK_OFFSET_S = 1000
@@ -54,6 +55,7 @@ def test_the_sender_streams_into_hilstar_and_both_sides_know_each_other_s_clock(
     with listening(bench_file, "reading serial:") as process:
         result = subprocess.run(command, capture_output=True, text=True, timeout=30, check=False)
         assert result.returncode == 0, result.stderr
+        time.sleep(READ_S)
         summary = interrupted(process)
     counted = told(result.stdout)
     packets = summary["packets"]

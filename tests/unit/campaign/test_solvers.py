@@ -20,6 +20,7 @@ from hilstar.twin.simulator import Exposure, Simulator
 from hilstar.units import ARCSEC_PER_RAD
 from tests.support.benches import ROOT
 from tests.support.campaigns import write_campaign
+from tests.support.waiting import PATIENCE_S
 
 EXAMPLES = ROOT / "examples"
 # A dozen stars with centroids to 0.03 px of 134 arcsec: 4 / sqrt 12 arcsec an axis; five sigma, and the field's lever for roll.
@@ -89,7 +90,7 @@ FAULTS = {
 def test_a_command_that_fails_says_how(seen: tuple[Simulator, Exposure], text: str) -> None:
     simulator, exposure = seen
     try:
-        said = solver(text, timeout_s=0.3).solve(exposure, simulator).why
+        said = solver(text, timeout_s=0.3 if "sleep" in text else PATIENCE_S).solve(exposure, simulator).why
     except SolverFault as fault:
         said = str(fault)
     assert FAULTS[text] in said and "hilstar-solver" not in said

@@ -86,8 +86,9 @@ class RunStatus:
         shown, running = self._shown, self._running
         if shown is None or running is None:
             return "no frame yet"
-        attitude = _attitude_line(shown)
-        return f"attitude {attitude.text}; {running.tally.frames} frames, {running.tally.missed_frames} missed"
+        attitude, tally, packets = _attitude_line(shown), running.tally, running.packets
+        told = f"{tally.frames} frames, {tally.missed_frames} missed; {packets.received} packets, {packets.refused} refused"
+        return f"attitude {attitude.text}; {told}"
 
     def lines(self, now_ns: int) -> list[Line]:
         """The status at a host time; rates are since it was last asked for."""

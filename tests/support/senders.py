@@ -8,13 +8,14 @@ import socket
 import struct
 import time
 import zlib
+from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 import zmq
 
 from hilstar.rotation import from_radec_roll_deg
-from tests.support.waiting import repeating
+from tests.support.waiting import PATIENCE_S, repeating
 
 ORION = tuple(from_radec_roll_deg(84.0, -1.0, 0.0))
 LYRA = tuple(from_radec_roll_deg(283.0, 35.0, 30.0))
@@ -26,43 +27,78 @@ def packet(sequence: int, t_ns: int, q=(0.5, 0.5, -0.5, 0.5), rate=(0.0, 0.0, 0.
     return body + struct.pack("<I", zlib.crc32(body))
 
 
-# Ports under those that the system gives to whoever asks for any; each process of tests begins elsewhere, so that workers, and
-# another session on this machine, do not ask for the same one at the same time.
+# Ports under those that the system gives to whoever asks for any; each process of tests begins elsewhere.
 PORTS = range(20_000, 32_000)
+MAX_HELD = 128  # of the newest ports: no test has so many, and a process may open 1024 files
 _next = itertools.count(os.getpid() * 211)
+_held: deque[socket.socket] = deque(maxlen=MAX_HELD)
 
 
 def free_port() -> int:
-    """A port of this machine that nobody has, and that no other test is given."""
+    """A port of this machine that nobody has, over TCP or UDP, and that no other test is given, of whatever process.
+
+    Between this and the moment it is bound, a name of its own in the kernel (it goes with this process) keeps it from others.
+    """
     for number in _next:
         port = PORTS[number % len(PORTS)]
-        with socket.socket() as probe:
-            try:
-                probe.bind(("127.0.0.1", port))
-            except OSError:
-                continue
-            return port
+        name = socket.socket(socket.AF_UNIX)
+        try:
+            name.bind(f"\0hilstar-test-port-{port}")
+            for kind in (socket.SOCK_STREAM, socket.SOCK_DGRAM):
+                with socket.socket(socket.AF_INET, kind) as probe:
+                    probe.bind(("127.0.0.1", port))
+        except OSError:
+            name.close()
+            continue
+        _held.append(name)
+        return port
     raise AssertionError("unreachable: the ports go round")
+
+
+_publishers: dict[int, zmq.Socket] = {}
 
 
 @contextmanager
 def publisher() -> Iterator[tuple[zmq.Socket, int]]:
-    """A plain PUB socket, bound; and its port."""
+    """A plain publishing socket, bound, which is told of its subscribers (an XPUB is a PUB that says so); and its port."""
     context = zmq.Context()
-    sender = context.socket(zmq.PUB)
+    sender = publishing(context)
     sender.setsockopt(zmq.LINGER, 1000)
-    sender.setsockopt(zmq.SNDHWM, 100_000)
     port = free_port()
     sender.bind(f"tcp://127.0.0.1:{port}")
+    _publishers[port] = sender
     try:
         yield sender, port
     finally:
+        del _publishers[port]
         sender.close()
         context.term()
 
 
+def publishing(context: zmq.Context) -> zmq.Socket:
+    """An XPUB socket that drops nothing for want of room, and says each subscription."""
+    sender = context.socket(zmq.XPUB)
+    sender.setsockopt(zmq.XPUB_VERBOSE, 1)
+    sender.setsockopt(zmq.SNDHWM, 100_000)
+    return sender
+
+
+def await_subscriber(sender: zmq.Socket) -> None:
+    """Wait for the next subscription at a publishing socket: from then on no packet is lost."""
+    while True:
+        assert sender.poll(PATIENCE_S * 1000), "nobody subscribes"
+        if sender.recv()[:1] == b"\1":  # and not one that ends
+            return
+
+
+def await_subscriber_of(port: int) -> None:
+    """Wait for a subscription at the publisher that is bound to a port; nothing is waited for where there is none."""
+    if port in _publishers:
+        await_subscriber(_publishers[port])
+
+
 @contextmanager
-def connected(port: int, kind: int = zmq.PUB, patience_s: float = 5.0) -> Iterator[zmq.Socket]:
+def connected(port: int, kind: int = zmq.PUB, patience_s: float = PATIENCE_S) -> Iterator[zmq.Socket]:
     """A plain socket of that kind, connected."""
     context = zmq.Context()
     end = context.socket(kind)

@@ -5,30 +5,80 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import resource
 import signal
 import socket
 import subprocess
 import threading
-import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from tests.support.benches import LIVE_BENCH, SMALL_BENCH, attitude_table
 from tests.support.commands import HILSTAR
-from tests.support.senders import free_port
+from tests.support.senders import await_subscriber_of, free_port
 from tests.support.waiting import PATIENCE_S, wait_for
 
-# ZeroMQ's subscription crosses the socket: nothing tells a sender of ours that it has come, and no packet may be lost.
-SUBSCRIBED_S = 0.3
+STATUS_EACH_S = 0.05
+STATUS = re.compile(r"(\d+) frames, \d+ missed; (\d+) packets, (\d+) refused")
+
+
+class Run(subprocess.Popen[str]):
+    """A command that shows frames, and what it says of itself to whoever runs it as a service (sd_notify)."""
+
+    def __init__(self, command: list[str]) -> None:
+        self._told = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._told.bind("")  # a name that the kernel chooses
+        self._told.setblocking(False)
+        address = "@" + self._told.getsockname()[1:].decode()
+        own = {"NOTIFY_SOCKET": address, "WATCHDOG_USEC": str(round(2 * STATUS_EACH_S * 1e6))}
+        self._counts = (0, 0, 0)
+        super().__init__(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ | own)
+
+    def counts(self) -> tuple[int, int, int]:
+        """How many frames it has shown so far, how many packets it has received, and how many of those it refused."""
+        with contextlib.suppress(BlockingIOError):
+            while told := self._told.recv(4096):
+                if found := STATUS.search(told.decode()):
+                    self._counts = (int(found[1]), int(found[2]), int(found[3]))
+        return self._counts
+
+    def _await(self, holds: Callable[[], object], what: str) -> None:
+        wait_for(lambda: holds() or self.poll() is not None, what)
+        assert holds(), (what, self.counts(), "it has ended")
+
+    def shows(self, frames: int = 1) -> None:
+        """Wait until so many frames have been shown."""
+        self._await(lambda: self.counts()[0] >= frames, f"{frames} frames")
+
+    def has_received(self, packets: int) -> None:
+        """Wait until it has counted so many packets: at its end those that it has not read yet are lost."""
+        self._await(lambda: self.counts()[1] >= packets, f"{packets} packets")
+
+    def has_refused(self, packets: int) -> None:
+        """Wait until it has refused so many packets."""
+        self._await(lambda: self.counts()[2] >= packets, f"{packets} packets refused")
+
+    def accepted(self) -> int:
+        """How many packets it has taken for attitudes so far."""
+        _, received, refused = self.counts()
+        return received - refused
+
+    def has_accepted(self, packets: int) -> None:
+        """Wait until it has taken so many packets for attitudes."""
+        self._await(lambda: self.accepted() >= packets, f"{packets} packets accepted")
+
+    def __exit__(self, *raised: Any) -> None:
+        super().__exit__(*raised)
+        self._told.close()
 
 
 @contextmanager
-def listening(bench: Path, first_words: str, *options: str) -> Iterator[subprocess.Popen[str]]:
+def listening(bench: Path, first_words: str, *options: str) -> Iterator[Run]:
     """`hilstar serve --headless --json` of a bench file, once its first line says these words."""
-    command = [*HILSTAR, "serve", str(bench), "--headless", "--json", *options]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ) as process:
+    with Run([*HILSTAR, "serve", str(bench), "--headless", "--json", *options]) as process:
         try:
             assert process.stderr is not None
             first = process.stderr.readline()
@@ -39,13 +89,13 @@ def listening(bench: Path, first_words: str, *options: str) -> Iterator[subproce
 
 
 @contextmanager
-def serving(tmp_path: Path, port: int, *options: str, attitude: str = "", monitor: str = "") -> Iterator[subprocess.Popen[str]]:
-    """`hilstar serve` of the small bench on a port, once it hears."""
+def serving(tmp_path: Path, port: int, *options: str, attitude: str = "", monitor: str = "") -> Iterator[Run]:
+    """`hilstar serve` of the small bench on a port, once it has subscribed to the publisher there, if there is one."""
     bench = tmp_path / "serve.toml"
     text = SMALL_BENCH if "[render]" in attitude else LIVE_BENCH
     bench.write_text(text.replace("[collimator]", f"{monitor}\n[collimator]") + attitude_table(port, attitude))
     with listening(bench, f"127.0.0.1:{port}", *options) as process:
-        time.sleep(SUBSCRIBED_S)
+        await_subscriber_of(port)
         yield process
 
 
@@ -62,10 +112,17 @@ def interrupted(process: subprocess.Popen[str]) -> dict:
     return summary_of(process)
 
 
+def until_said(process: subprocess.Popen[str], words: str) -> None:
+    """Read its stderr until a line says these words."""
+    assert process.stderr is not None
+    while words not in (line := process.stderr.readline()):
+        assert line, f"it ended without {words!r}"
+
+
 class Served:
     """`hilstar serve`, bound to a port, its stderr read as it comes."""
 
-    def __init__(self, process: subprocess.Popen[str], port: int) -> None:
+    def __init__(self, process: Run, port: int) -> None:
         self.process, self.port = process, port
         self.lines: list[str] = []
         self._reader = threading.Thread(target=self._read, daemon=True)
@@ -118,7 +175,7 @@ def bound(tmp_path: Path, *options: str, attitude: str = "bind = true", files: i
     command = [*HILSTAR, "serve", str(bench), "--headless", "--json", *options]
     if files is not None:
         command = ["sh", "-c", f'ulimit -n {files}; exec "$@"', "sh", *command]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    with Run(command) as process:
         served = Served(process, port)
         try:
             served.await_line("bound to")

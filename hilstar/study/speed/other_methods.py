@@ -15,6 +15,7 @@ import numpy as np
 from scipy.special import erf
 
 from hilstar.arrays import Float32Array, FloatArray, IntArray
+from hilstar.process.interrupts import held
 from hilstar.scene.psf import SQRT2
 from hilstar.scene.sprites import Sprites, pack_sprites
 
@@ -44,7 +45,8 @@ def other_methods() -> tuple[list[OtherMethod], dict[str, str]]:
         except ImportError as error:
             missing[name] = f"not installed ({error}): {INSTALL}"
             continue
-        other.draw(FIRST, (0.85, 0.85), (8, 8))  # numba compiles
+        with held():  # numba compiles, and LLVM calls Python back meanwhile: an exception there is printed, and lost
+            other.draw(FIRST, (0.85, 0.85), (8, 8))
         found.append(other)
     return found, missing
 

@@ -6,7 +6,6 @@ import json
 import os
 import signal
 import subprocess
-import time
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +16,11 @@ from tests.support.commands import HILSTAR
 from tests.support.heads import MOUNTINGS, heads_file
 from tests.support.senders import publisher, talking
 from tests.support.waiting import wait_for
+from tests.support.x11.screens import recorded
 
 BODY = (0.7139, 0.1, -0.3, 0.6245)  # as a packet holds it; its norm is 1 within 1e-4
 SAME_RAD = 1e-9
-BEGUN_S = 1.0  # by then a head that draws has said so; one that has not may take a minute to begin
+BEGUN_FRAMES = 60  # by then a head has told that it draws, in its own time; one that has not may take a minute to begin
 
 
 def children(parent: int) -> dict[str, int]:
@@ -44,7 +44,8 @@ def test_a_head_that_is_killed_or_hangs_stops_no_other_and_is_begun_again(tmp_pa
         with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=said, text=True) as process:
             try:
                 wait_for(lambda: lines.read_text().count("first attitude") == 3)
-                time.sleep(BEGUN_S)
+                ledgers = [tmp_path / f"run.{name}.mcap" for name in MOUNTINGS]
+                wait_for(lambda: all(len(recorded(ledger)) > BEGUN_FRAMES for ledger in ledgers))
                 heads = children(process.pid)
                 os.kill(heads["b"], signal.SIGKILL)
                 os.kill(heads["c"], signal.SIGSTOP)

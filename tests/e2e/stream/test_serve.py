@@ -16,9 +16,11 @@ import zmq
 from hilstar.rotation import from_radec_roll_deg
 from tests.support.benches import SMALL_BENCH
 from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
-from tests.support.senders import connected, free_port, packet, publisher
+from tests.support.senders import await_subscriber, connected, free_port, packet, publisher, publishing
 from tests.support.servers import serving, summary_of
+from tests.support.waiting import wait_for
 
+SOME_FRAMES = 50  # of 300: a machine whose cores are all busy draws a third of them
 SUMMARY_KEYS = {"frames", "duration_s", "fps", "frame_ms", "attitude_age_ms", "packets", "stars_drawn", "clipped"}
 SUMMARY_KEYS |= {
     "capped",
@@ -39,6 +41,7 @@ SUMMARY_KEYS |= {
 def test_a_thousand_packets_at_200_hz_all_arrive_with_garbage_between_them(tmp_path):
     """1000 good ones; after every tenth, one each of: wrong CRC, NaN, norm, old time, and bytes of no form."""
     with publisher() as (sender, port), serving(tmp_path, port) as process:
+        process.shows()
         start = time.monotonic_ns()
         for k in range(1000):
             t_ns = start + k * 5_000_000
@@ -52,7 +55,7 @@ def test_a_thousand_packets_at_200_hz_all_arrive_with_garbage_between_them(tmp_p
                 sender.send(packet(k, t_ns + 1, q=(1.1, 0, 0, 0)))
                 sender.send(packet(k, t_ns - 1))
                 sender.send(np.random.default_rng(k).bytes(50))
-        time.sleep(0.2)
+        process.has_received(1500)
         process.send_signal(signal.SIGINT)
         summary = summary_of(process)
     packets = summary["packets"]
@@ -60,17 +63,20 @@ def test_a_thousand_packets_at_200_hz_all_arrive_with_garbage_between_them(tmp_p
     assert packets["received"] == 1500
     assert packets["refused_by"] == {"crc": 100, "norm": 100, "nan": 100, "time": 100, "format": 100}
     assert packets["refused"] == 500
-    assert summary["frames"] > 200
+    # A frame or a missed one for each sixtieth of the five seconds, whatever else the machine had to do.
+    assert summary["frames"] + summary["missed_frames"] >= 299 and summary["frames"] > SOME_FRAMES
     assert summary["stars_drawn"]["max"] > 0
     assert set(summary) == SUMMARY_KEYS
 
 
 def test_a_clean_stream_is_refused_nothing(tmp_path):
     with publisher() as (sender, port), serving(tmp_path, port) as process:
+        process.shows()
         for k in range(400):
             sender.send(packet(k, time.monotonic_ns()))
             time.sleep(0.0025)
-        time.sleep(0.2)
+        process.has_received(400)
+        process.shows(process.counts()[0] + 2)
         process.send_signal(signal.SIGTERM)
         summary = summary_of(process)
     assert (summary["packets"]["received"], summary["packets"]["refused"]) == (400, 0)
@@ -84,7 +90,7 @@ def test_json_and_multipart_messages_are_taken(tmp_path):
         sender.send_multipart([b"attitude", json.dumps({"t_ns": 2_000_000, "q": [1, 0, 0, 0]}).encode()])
         sender.send_multipart([b"topic", b"more", packet(3, 3_000_000)])
         sender.send(b'{"t_ns": 4000000, "q": [NaN, 0, 0, 0]}')
-        time.sleep(0.3)
+        process.has_received(4)
         process.send_signal(signal.SIGINT)
         packets = summary_of(process)["packets"]
     assert (packets["accepted"], packets["refused_by"]["nan"]) == (3, 1)
@@ -95,13 +101,13 @@ def test_an_oversized_message_costs_a_connection_and_no_more(tmp_path):
     with publisher() as (sender, port), serving(tmp_path, port) as process:
         for k in range(20):
             sender.send(packet(k, 1_000_000 * k))
-        time.sleep(0.2)
+        process.has_received(20)
         sender.send(bytes(2 << 20))
-        time.sleep(1.0)
+        await_subscriber(sender)
         for k in range(20, 120):
             sender.send(packet(k, 1_000_000 * k))
             time.sleep(0.005)
-        time.sleep(0.2)
+        process.has_received(120)
         process.send_signal(signal.SIGINT)
         packets = summary_of(process)["packets"]
     assert packets["accepted"] == 120
@@ -112,20 +118,28 @@ def test_a_sender_that_closes_and_comes_back_is_heard_again(tmp_path):
     context = zmq.Context()
     with publisher() as (sender, port), serving(tmp_path, port) as process:
         sender.send(packet(0, 1_000_000))
-        time.sleep(0.2)
+        process.has_received(1)
         sender.unbind(f"tcp://127.0.0.1:{port}")
         sender.close(linger=0)
-        time.sleep(0.3)
-        again = context.socket(zmq.PUB)
-        again.bind(f"tcp://127.0.0.1:{port}")
-        time.sleep(1.0)
+        time.sleep(0.3)  # it is away for a while
+        again = publishing(context)
+        wait_for(lambda: binds(again, port), "the port, which libzmq gives back from a thread of its own")
+        await_subscriber(again)
         again.send(packet(1, 2_000_000))
-        time.sleep(0.2)
+        process.has_received(2)
         process.send_signal(signal.SIGINT)
         packets = summary_of(process)["packets"]
         again.close(linger=0)
     context.term()
     assert packets["accepted"] == 2
+
+
+def binds(sender: zmq.Socket, port: int) -> bool:
+    try:
+        sender.bind(f"tcp://127.0.0.1:{port}")
+    except zmq.ZMQError:
+        return False
+    return True
 
 
 def test_a_silent_sender_shows_blank_frames_and_ends_in_order(tmp_path):
@@ -143,9 +157,11 @@ def test_what_is_shown_after_the_stream_stops_is_the_policy_s(tmp_path, on_stale
     """One packet, then a second of silence: the frames after 100 ms are stale, and blank only where that was asked."""
     attitude = f'stale_after_ms = 100\nmax_extrapolation_ms = 50\non_stale = "{on_stale}"'
     with publisher() as (sender, port), serving(tmp_path, port, "--duration", "1.5", attitude=attitude) as process:
+        process.shows()
         sender.send(packet(0, 0, q=tuple(from_radec_roll_deg(84, -1, 0))))
         summary = summary_of(process)
-    assert summary["stale_frames"] > 50
+    # Six or seven frames fall into 100 ms; all the others are stale, with those before the packet.
+    assert 0 < summary["frames"] - summary["stale_frames"] <= 8
     mean, most = summary["stars_drawn"]["mean"], summary["stars_drawn"]["max"]
     assert (mean > 0.4 * most) is stars_at_end
     assert summary["frames"] + summary["missed_frames"] == 90
@@ -159,7 +175,7 @@ def test_hilstar_send_is_heard_by_serve_that_binds(tmp_path):
         )
         assert sent.returncode == 0, sent.stderr
         assert "300 packets sent" in sent.stderr
-        time.sleep(0.2)
+        process.has_received(300)
         process.send_signal(signal.SIGINT)
         packets = summary_of(process)["packets"]
     assert (packets["received"], packets["refused"]) == (300, 0)
@@ -171,7 +187,7 @@ def test_a_log_sent_at_a_rate_is_resampled(tmp_path):
     with serving(tmp_path, port) as process:
         sent = run_hilstar("send", tmp_path / "log.csv", "--rate", "100", "--to", f"tcp://127.0.0.1:{port}")
         assert "101 packets sent" in sent.stderr
-        time.sleep(0.2)
+        process.has_received(101)
         process.send_signal(signal.SIGINT)
         assert summary_of(process)["packets"]["accepted"] == 101
 
@@ -186,7 +202,8 @@ def test_a_sender_that_restarts_is_taken_up_again(tmp_path):
             # What arrives before the first frame teaches the clock nothing; a loaded machine takes seconds to draw that.
             while start_ns and "the first attitude has come" not in (line := process.stderr.readline()):
                 assert line, "serve ended before its first frame"
-            time.sleep(0.5)
+            time.sleep(0.5)  # between the two runs
+        process.has_received(100)
         process.send_signal(signal.SIGINT)
         packets = summary_of(process)["packets"]
     assert packets["refused"] == 0
@@ -232,7 +249,7 @@ def test_lockstep_shows_one_frame_a_request_and_says_when(tmp_path):
 
 
 def test_lockstep_without_a_request_never_had_an_attitude(tmp_path):
-    with serving(tmp_path, free_port(), "--duration", "2.5", attitude="lockstep = true") as process:
+    with serving(tmp_path, free_port(), "--duration", "4", attitude="lockstep = true") as process:
         summary = summary_of(process, code=4)
     assert (summary["packets"]["accepted"], summary["events"]["no-attitude"]) == (0, 1)
 
@@ -264,6 +281,7 @@ def test_with_keys_a_known_client_is_heard_and_a_stranger_is_not(tmp_path):
             assert run_hilstar("send", *to, *options).returncode == 0
         plain = run_hilstar("send", *to, "--wait", "1")
         assert "no listener" in plain.stderr
+        process.has_received(40)
         process.send_signal(signal.SIGINT)
         packets = summary_of(process)["packets"]
     assert (packets["received"], packets["accepted"]) == (40, 40)
@@ -285,7 +303,8 @@ def test_key_files_that_are_none_get_one_line(tmp_path, small_bench_file):
 
 def test_a_flood_is_bounded_and_the_display_goes_on(tmp_path):
     """50 000 messages of 200 kB as fast as they go: what hilstar keeps of them is bounded, and frames go on."""
-    with publisher() as (sender, port), serving(tmp_path, port, "--duration", "4") as process:
+    with publisher() as (sender, port), serving(tmp_path, port) as process:
+        process.shows()
         message = bytes(200_000)
         end = time.monotonic() + 2.5
         most_kb = 0
@@ -294,8 +313,9 @@ def test_a_flood_is_bounded_and_the_display_goes_on(tmp_path):
             with Path(f"/proc/{process.pid}/status").open() as status:
                 most_kb = max(most_kb, *(int(line.split()[1]) for line in status if line.startswith("VmRSS")))
         sender.close(linger=0)
+        process.send_signal(signal.SIGINT)
         summary = summary_of(process, code=4)  # none of them is an attitude
     assert summary["packets"]["refused_by"]["format"] > 100
-    assert summary["frames"] + summary["missed_frames"] == 240
-    assert summary["frames"] > 60
+    assert summary["frames"] + summary["missed_frames"] >= 149
+    assert summary["frames"] > summary["missed_frames"] / 3
     assert most_kb < 1_000_000

@@ -16,6 +16,7 @@ from hilstar.console import run_status
 from tests.support.benches import LIVE_BENCH, attitude_table, still_log
 from tests.support.commands import HILSTAR, run_hilstar_here
 from tests.support.senders import free_port, publisher, talking
+from tests.support.waiting import PATIENCE_S
 
 pytestmark = pytest.mark.e2e
 ESCAPES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
@@ -31,15 +32,16 @@ def bench_for(tmp_path: Path, port: int) -> Path:
 def test_a_terminal_shows_the_attitude_and_turns_to_stale(tmp_path):
     """As a person sees it: through a pseudo-terminal."""
     ours, theirs = pty.openpty()
-    seen = ""
+    raw, seen = b"", ""
 
-    def read_until(words: str, patience_s: float = 20.0) -> None:
-        nonlocal seen
-        deadline_s = time.monotonic() + patience_s
+    def read_until(words: str) -> None:
+        nonlocal raw, seen
+        deadline_s = time.monotonic() + PATIENCE_S
         while words not in seen:
             assert time.monotonic() < deadline_s, f"no {words!r} in {seen[-2000:]}"
             if select.select([ours], [], [], 0.1)[0]:
-                seen += ESCAPES.sub("", os.read(ours, 65536).decode())
+                raw += os.read(ours, 65536)  # which may end within a letter, or within an escape sequence
+                seen = ESCAPES.sub("", raw.decode(errors="ignore"))
 
     with publisher() as (sender, port):
         command = [*HILSTAR, "serve", str(bench_for(tmp_path, port)), "--headless", "--ledger", str(tmp_path / "run.mcap")]
@@ -66,13 +68,14 @@ def test_a_terminal_shows_the_attitude_and_turns_to_stale(tmp_path):
 
 def test_elsewhere_a_plain_line_comes_now_and_then(tmp_path, monkeypatch):
     monkeypatch.setattr(run_status, "PLAIN_EACH_S", 0.4)
+    begun_s = time.monotonic()
     with publisher() as (sender, port), talking(sender):
-        result = run_hilstar_here("serve", bench_for(tmp_path, port), "--headless", "--duration", "1.5")
+        result = run_hilstar_here("serve", bench_for(tmp_path, port), "--headless", "--duration", "2.5")
     assert result.returncode == 0, result.stderr
     told = [line for line in result.stderr.splitlines() if "; packets " in line]
-    assert 2 <= len(told) <= 4, result.stderr
+    assert 2 <= len(told) <= (time.monotonic() - begun_s) / 0.4, result.stderr
     assert re.search(
-        r"attitude RA 84\.0000, Dec -1\.0000, roll 0\.0000 deg, .* ms old; frames \d+ of 90 \([\d.]+/s\)", told[-1]
+        r"attitude RA 84\.0000, Dec -1\.0000, roll 0\.0000 deg, .* ms old; frames \d+ of 150 \([\d.]+/s\)", told[-1]
     )
     received = int(re.search(r"packets (\d+) received", told[-1])[1])
     assert received > 50, "200 a second are sent"

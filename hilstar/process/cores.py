@@ -16,8 +16,9 @@ from pathlib import Path
 
 TASKS = Path("/proc/self/task")
 RASTERISERS = "llvmpipe-"
-NAMING_S = 1e-3  # a thread names itself, a little after it has begun
-NAMING_TRIES = 20
+LOOK_S = 1e-3
+# A thread names itself, a little after it has begun: on a busy machine, when it is first given a core.
+NAMING_S, BUSY_NAMING_S = 0.02, 0.5
 
 
 @contextmanager
@@ -25,11 +26,15 @@ def drawing_threads_apart() -> Iterator[None]:
     """Keep each thread that llvmpipe begins in this context on a core of its own, where it begins one for each core."""
     before = _threads()
     yield
-    for _ in range(NAMING_TRIES):
+    begun_s = time.monotonic()
+    while True:
         rasterisers, computing = _drawing_threads(before)
         if len(rasterisers) == len(computing):
             break
-        time.sleep(NAMING_S)
+        may_be_llvmpipe = len(rasterisers) + len(computing) >= 2 * len(_cores())
+        if time.monotonic() - begun_s > (BUSY_NAMING_S if may_be_llvmpipe else NAMING_S):
+            break
+        time.sleep(LOOK_S)
     for group in (rasterisers, computing):
         if len(group) == len(rasterisers):
             _spread(group)
@@ -53,9 +58,14 @@ def _threads() -> dict[int, str]:
     return names
 
 
+def _cores() -> list[int]:
+    """Those that this process may run on; none where the system does not say."""
+    return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+
+
 def _spread(threads: list[int]) -> None:
     """A core for each thread, if there are as many cores as threads."""
-    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+    cores = _cores()
     if len(threads) < 2 or len(threads) != len(cores):
         return
     for thread, core in zip(threads, cores, strict=True):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import subprocess
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -30,13 +29,19 @@ def test_the_page_s_picture_is_what_the_display_shows_under_every_aid(screen, tm
             seen = []
             with live(page) as link:
                 link.want(picture=True, hz=10)
+
+                def shown_anew() -> bool:
+                    """Whether the page's next picture is what the screen shows, and not what it showed before the switch."""
+                    _, levels = picture_of(link.await_message(lambda said: isinstance(said, bytes)))
+                    if (seen and np.array_equal(seen[-1], levels)) or not np.array_equal(screen.pixels()[:, :, 0], levels):
+                        return False
+                    seen.append(levels)
+                    return True
+
                 for switches in ((), ("crosshair",), ("grid",), ("patch",), ("blank",)):
                     for name in switches:
                         assert page.control(name, on=True, level=0.75)[0] == 200
-                    for _ in range(4):  # those that were on their way
-                        _, levels = picture_of(link.await_message(lambda said: isinstance(said, bytes)))
-                    wait_for(lambda levels=levels: np.array_equal(screen.pixels()[:, :, 0], levels))
-                    seen.append(levels)
-            assert all(not np.array_equal(before, after) for before, after in pairwise(seen))
+                    wait_for(shown_anew, switches, poll_s=0.0)
+            assert len(seen) == 5
         finally:
             process.kill()

@@ -94,8 +94,13 @@ class Run:
     """A whole script through a receiver; `ages_ms` and `shown` are of the attitude shown just after each message."""
 
     def __init__(self, make: Callable[[int], list[Arrival]], traffic: Traffic | None = None, **script) -> None:
-        self.host0_ns = time.monotonic_ns() + NS_PER_S  # after what was queued
-        arrivals = sorted(make(self.host0_ns), key=lambda arrival: (arrival.host_ns, arrival.event.t_ns))
+        lead_ns = NS_PER_S // 2
+        while True:  # until the script was written before its time: what comes just after the beginning may have queued
+            lead_ns *= 2
+            self.host0_ns = time.monotonic_ns() + lead_ns
+            arrivals = sorted(make(self.host0_ns), key=lambda arrival: (arrival.host_ns, arrival.event.t_ns))
+            if time.monotonic_ns() < self.host0_ns - lead_ns // 2:
+                break
         self.notices = Notices()
         self.timeline = Timeline(Policy(STALE_AFTER_NS, STALE_AFTER_NS))
         self.ages_ms: list[float] = []

@@ -27,6 +27,7 @@ from hilstar.run.record.ledger import Ledger, Split
 from hilstar.run.record.ledger_reader import drawable_frames
 from hilstar.run.record.ledger_records import FrameRecord
 from hilstar.run.record.report import figures_of, summarise
+from tests.support.waiting import wait_for
 
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 
@@ -51,9 +52,7 @@ def test_a_ledger_goes_on_in_other_files_and_is_read_as_one(tmp_path, bench):
     path = tmp_path / "run.mcap"
     with Ledger(path, bench, split=Split(bytes=1)) as ledger:
         keep(ledger, 0, 50)
-        end_s = time.monotonic() + 20
-        while not (tmp_path / "run.0001.mcap").exists() and time.monotonic() < end_s:
-            time.sleep(0.02)
+        wait_for((tmp_path / "run.0001.mcap").exists, "the next file")
         keep(ledger, 50, 100)
     assert len(parts_of(path)) >= 2
     assert [sample.sequence for sample in read_log(path)] == list(range(100))
@@ -74,7 +73,7 @@ def test_a_disk_without_room_loses_frames_first_and_says_so_and_is_tried_again(t
     ledger = Ledger(tmp_path / "run.mcap", bench, notices)
     try:
         keep(ledger, 0, 10)
-        time.sleep(0.5)
+        wait_for(lambda: len(list(drawable_frames(ledger.path))) == 10, "the first frames on the disk")
         resource.setrlimit(resource.RLIMIT_FSIZE, ((tmp_path / "run.mcap").stat().st_size, limits[1]))
         keep(ledger, 10, 20)
         wait_for(lambda: "ledger-failed" in notices.active)
@@ -87,13 +86,6 @@ def test_a_disk_without_room_loses_frames_first_and_says_so_and_is_tried_again(t
     assert ledger.summary()["unrecorded"] == 10
     assert [sample.sequence for sample in read_log(tmp_path / "run.mcap")] == list(range(20))
     assert [frame.frame for frame in drawable_frames(tmp_path / "run.mcap")] == list(range(10))
-
-
-def wait_for(true) -> None:
-    end_s = time.monotonic() + 20
-    while not true():
-        assert time.monotonic() < end_s
-        time.sleep(0.02)
 
 
 def test_what_waits_is_bounded_by_bytes_and_frames_go_first():

@@ -204,12 +204,12 @@ def test_any_other_choice_is_refused_by_the_names_that_are_there(names, wanted, 
     ],
 )
 def test_what_is_no_message_is_refused_with_what_is_wrong(message: bytes, reason: str, words: str) -> None:
-    begun_s = time.monotonic()
+    begun_s = time.thread_time()
     refusal = taken(message)
     assert isinstance(refusal, Refusal)
     assert refusal.reason == reason
     assert words in refusal.detail
-    assert time.monotonic() - begun_s < QUICK_S
+    assert time.thread_time() - begun_s < QUICK_S
 
 
 def test_a_message_that_is_cut_short_anywhere_gives_no_other_attitude() -> None:

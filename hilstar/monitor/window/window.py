@@ -12,9 +12,8 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Self
 
-import glfw
-
 from hilstar.errors import InputError, MachineError
+from hilstar.monitor.window.library import glfw
 from hilstar.monitor.window.visibility import ScreenArea, Visibility
 from hilstar.monitor.window.x11 import Survival, is_composited, sync_control
 from hilstar.process.cores import drawing_threads_apart

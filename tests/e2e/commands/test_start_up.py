@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 
@@ -25,3 +26,14 @@ def test_nothing_heavy_is_imported_before_it_is_used(module):
 
 def test_a_run_imports_before_its_first_frame_what_some_frames_need():
     assert "scipy.special" in imported_by("hilstar.run.loop")
+
+
+def test_a_run_begins_no_other_process_by_what_it_imports():
+    """As the own search of glfw would, whose process says a traceback where a signal ends the start-up meanwhile."""
+    program = "import sys; sys.addaudithook(lambda name, _: print(name) if name == 'subprocess.Popen' else None)\n"
+    program += "import hilstar.cli.show.serve, hilstar.run.screen.open_screen; print('glfw' in sys.modules)"
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("PYGLFW")}
+    result = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60, env=environment
+    )
+    assert result.stdout == "True\n"

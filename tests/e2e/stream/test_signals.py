@@ -133,17 +133,20 @@ def test_a_signal_while_a_shader_is_built_ends_it_in_order(tmp_path, small_bench
     assert err.decode().splitlines()[-1] == "hilstar: stopped"
 
 
-def test_a_signal_while_numba_compiles_ends_it_without_a_word_of_python_s(tmp_path):
-    """LLVM calls Python back too, and ctypes prints an exception that comes of that, and goes on."""
+def test_a_signal_while_a_peer_s_library_calls_python_ends_it_without_a_word_of_python_s(tmp_path):
+    """numba's LLVM does: ctypes prints an exception that comes of a callback, and goes on. Here qsort does, with no numba."""
     before = (
-        "import os, signal\nfrom llvmlite.binding.executionengine import ExecutionEngine as Engine\n"
-        "find = Engine._find_module_ptr\n"
-        "def told(*arguments):\n    os.kill(os.getpid(), signal.SIGINT)\n    return find(*arguments)\n"
-        "Engine._find_module_ptr = told"
+        "import ctypes, os, signal\nfrom hilstar.study.speed import other_methods\n"
+        "kind = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p)\n"
+        "def told(*pair):\n    os.kill(os.getpid(), signal.SIGINT)\n    return 0\n"
+        "def draw(*arguments):\n    ctypes.CDLL(None).qsort((ctypes.c_int * 2)(2, 1), 2, 4, kind(told))\n"
+        "    print('drawn', flush=True)\n"
+        "other_methods.METHODS = (('callback', 'calls Python', lambda: draw),)"
     )
     with running(program("benchmark", "-o", tmp_path / "times", before=before), text=True) as process:
-        _, err = process.communicate(timeout=2 * PATIENCE_S)
+        out, err = process.communicate(timeout=2 * PATIENCE_S)
     assert process.returncode == 128 + signal.SIGINT, err
+    assert (out, err.splitlines()[-1]) == ("drawn\n", "hilstar: stopped")
     assert "Traceback" not in err
 
 

@@ -1,0 +1,31 @@
+"""glfw, with the library that its own package brings.
+
+Its own search begins a Python process that loads each library and says its version: 30 ms of every start-up, and where a
+signal ends the start-up meanwhile, that process prints its traceback.
+"""
+
+from __future__ import annotations
+
+import os
+from importlib.util import find_spec
+from pathlib import Path
+
+__all__ = ["glfw"]
+
+
+def _own_library() -> Path | None:
+    """The library of glfw's own package for this session's kind of display; None where the package has none."""
+    spec = find_spec("glfw")
+    kind = os.environ.get("PYGLFW_LIBRARY_VARIANT", "").lower() or os.environ.get("XDG_SESSION_TYPE", "")
+    if spec is None or spec.origin is None:
+        return None
+    library = Path(spec.origin).parent / ("wayland" if kind == "wayland" else "x11") / "libglfw.so"
+    return library if library.is_file() else None
+
+
+if not os.environ.get("PYGLFW_LIBRARY"):
+    _library = _own_library()
+    if _library is not None:
+        os.environ["PYGLFW_LIBRARY"] = str(_library)
+
+import glfw  # noqa: E402 - it looks at the environment when it is imported

@@ -23,14 +23,13 @@ from hilstar.run.record.ledger_records import EventRecord
 from tests.support.browser import Browser, assert_fits_every_size_in_light_and_dark
 from tests.support.senders import ORION, connected, packet
 from tests.support.servers import Served, bound
-from tests.support.waiting import repeating, wait_for
+from tests.support.waiting import CHANCES, best_of_three, in_time, repeating, wait_for
 
 pytestmark = [pytest.mark.e2e, pytest.mark.gpu]
 ADDRESS = re.compile(r"page is at (http://\S+)")
 # "Red within 0.5 s of anything wrong": 50 to 210 ms on two cores with ten processes that want them. A run that dies is missed
 # 0.4 s after its last word; a browser's timers may be late by BUSY_MS on such a machine.
 RED_MS, BUSY_MS = 500, 300
-TRIES = 3  # of what takes its time: a machine that stands still once is not the program
 MIN_PICTURES_HZ = 4  # of 8 that are asked for, on such a machine
 PACKET_S, TURN_RAD = 0.01, 1e-3  # between two packets
 COUNT_PICTURES = """
@@ -134,7 +133,7 @@ def events(run: Sky) -> list[EventRecord]:
 
 def test_pictures_move_and_the_numbers_are_those_that_are_sent(live, run):
     first, shown = frame_of(live), pixels(live, "picture")
-    assert any(pictures_in_a_second(live) >= MIN_PICTURES_HZ for _ in range(TRIES))
+    assert any(pictures_in_a_second(live) >= MIN_PICTURES_HZ for _ in range(CHANCES))
     assert frame_of(live) > first and pixels(live, "picture") != shown
     run.stand_still()
     wanted = hilstar.rotation.to_radec_roll_deg(np.array(run.q()))
@@ -205,7 +204,7 @@ def red_after_stale_ms(page: Browser, run: Sky) -> float:
 
 
 def test_stale_turns_red_within_half_a_second_and_says_why(live, run):
-    for _ in range(TRIES - 1):
+    for _ in range(CHANCES - 1):
         if red_after_stale_ms(live, run) < RED_MS:
             break
         run.sending.set()
@@ -286,7 +285,7 @@ def test_who_asks_for_less_motion_gets_fewer_pictures_and_no_transitions(page, r
     page.prefer(color_scheme="dark", reduced_motion="reduce")
     page.get(run.url)
     page.until("document.getElementById('picture').dataset.frame")
-    assert any(2 <= pictures_in_a_second(page) <= 4 for _ in range(TRIES))  # of 2 Hz
+    assert any(2 <= pictures_in_a_second(page) <= 4 for _ in range(CHANCES))  # of 2 Hz
     assert page.run("return getComputedStyle(document.getElementById('hold')).transitionDuration") == "0s"
 
 
@@ -312,14 +311,12 @@ def red_after_death_ms(page: Browser, shown: Sky) -> float:
     return page.run("return window.redAt") - died_ms
 
 
+@best_of_three
 def test_when_the_run_dies_the_page_is_red(page, tmp_path):
-    for _ in range(TRIES):
-        with sky(tmp_path) as shown:
-            took_ms = red_after_death_ms(page, shown)
-        if took_ms < RED_MS + BUSY_MS:
-            break
-    assert took_ms < RED_MS + BUSY_MS
+    with sky(tmp_path) as shown:
+        took_ms = red_after_death_ms(page, shown)
     assert page.text("#health-headline") == "No word from hilstar"
     page.until("document.getElementById('control-state').textContent === 'no connection'")
     page.get("about:blank")
     page.complaints()  # that the connection was refused
+    in_time(took_ms < RED_MS + BUSY_MS, took_ms)

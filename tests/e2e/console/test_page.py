@@ -17,13 +17,12 @@ from hilstar.run.record.ledger_records import EventRecord
 from tests.support.pages import PageAddress, children, gone, live, page_of, picture_of
 from tests.support.senders import LYRA, ORION, connected, talking
 from tests.support.servers import bound
-from tests.support.waiting import wait_for
+from tests.support.waiting import CHANCES, wait_for
 
 pytestmark = pytest.mark.e2e
 PAGE = "hilstar.console.server"
 # `stale_after_ms` is 250; then the next frame, a tick of the run's and one of the page's. What is left is for a busy machine.
 STALE_S, SEEN_S = 0.25, 0.5
-TRIES = 3  # a machine that stands still once is not the program
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +45,7 @@ def test_health_says_what_is_wrong_and_turns_within_half_a_second(run):
     served, page, _ = run
     assert page.json("/health")["reasons"] == ["no attitude has come yet"]
     with connected(served.port) as sender:
-        for attempt in range(TRIES):
+        for attempt in range(CHANCES):
             with talking(sender, first=1 + 10_000 * attempt):
                 wait_for(lambda: page.health_is(True))
                 with live(page) as link:

@@ -60,6 +60,7 @@ def served(tmp_path, *options: str) -> tuple[Path, dict]:
         return ledger, summary_of(process)
 
 
+@best_of_three
 def test_every_packet_and_every_frame_is_there(tmp_path):
     ledger, summary = served(tmp_path)
     assert summary["ledger"] == {"path": str(ledger), "failure": None, "unrecorded": 0}
@@ -76,7 +77,7 @@ def test_every_packet_and_every_frame_is_there(tmp_path):
     assert len(frames) == summary["frames"]
     drawn = [frame for frame in frames if frame["q"] is not None]
     assert drawn == frames[-len(drawn) :]  # from the first packet on
-    assert len(drawn) > 10
+    in_time(len(drawn) > 40, len(drawn))
     for frame in drawn:
         assert frame["draw_ns"] < frame["swap_ns"]
         assert frame["receive_ns"] < frame["draw_ns"]
@@ -132,7 +133,7 @@ def test_after_a_kill_all_but_the_last_half_second_can_be_read(tmp_path):
         process.kill()
         process.wait()
     found, frames = read_log(ledger), list(drawable_frames(ledger))
-    in_time(len(found) >= 90 and len(frames) > 20, (len(found), len(frames)))
+    in_time(len(found) >= 100 and len(frames) > 50, (len(found), len(frames)))
     # The bench's clock began 50 s before its stream, which ended at the kill: frames and packets reach to half a second of it.
     within_ns = 50_000_000_000 + 1_500_000_000 - 600_000_000
     in_time(found[-1].t_ns > within_ns and frames[-1].t_ns > within_ns, (found[-1].t_ns, frames[-1].t_ns))

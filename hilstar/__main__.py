@@ -5,14 +5,29 @@ from __future__ import annotations
 import sys
 from typing import NoReturn
 
-from hilstar.process import interrupts
-from hilstar.process.stderr import finish_stderr
-
 READER_WAITS_S = 0.1  # for a reader of stderr that sleeps
+WRONG_FILE = 2
 
 
 def main() -> NoReturn:
-    """Import the commands and run them."""
+    """Import the commands and run them; one line where a module that they need is damaged."""
+    try:
+        import_and_run()
+    except Exception as error:
+        path = damaged_module(error)
+        if path is None:
+            raise
+        print(
+            f"hilstar: {path}: this compiled module is damaged ({error}), as by a full disk; delete the file", file=sys.stderr
+        )
+        sys.exit(WRONG_FILE)
+
+
+def import_and_run() -> NoReturn:
+    """Import the commands and run them; Ctrl-C may come at any step."""
+    from hilstar.process import interrupts
+    from hilstar.process.stderr import finish_stderr
+
     try:
         interrupts.install()
         from hilstar.cli import main as run
@@ -22,6 +37,21 @@ def main() -> NoReturn:
         print("hilstar: stopped", file=sys.stderr)
         finish_stderr(READER_WAITS_S)
         interrupts.leave(interrupts.exit_code())
+
+
+def damaged_module(error: BaseException) -> str | None:
+    """The path of the compiled module (.pyc) that Python could not read; None where the error is any other.
+
+    Python writes such a file on its own, cut short where the disk is full, and then fails at each start:
+    marshal raises EOFError, ValueError or TypeError.
+    """
+    trace = error.__traceback__
+    while trace is not None:
+        frame = trace.tb_frame
+        if frame.f_code.co_name == "_compile_bytecode" and "bytecode_path" in frame.f_locals:
+            return str(frame.f_locals["bytecode_path"])
+        trace = trace.tb_next
+    return None
 
 
 if __name__ == "__main__":

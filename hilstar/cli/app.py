@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from hilstar import __version__
 from hilstar.cli.benchmark import benchmark
@@ -46,7 +47,35 @@ COMMANDS: dict[str, tuple[Callable[..., None], ...]] = {
     "This machine": (doctor,),
 }
 
+
+class EarlyEnd(Exception):
+    """An EOFError on its way through typer, which takes one for Ctrl-D, prints an empty line and drops it."""
+
+    def __init__(self, error: EOFError) -> None:
+        super().__init__(str(error))
+        self.error = error
+
+
+class Commands(TyperGroup):
+    """The commands, whose EOFErrors stay what they are."""
+
+    def make_context(self, *arguments: Any, **named: Any) -> Any:
+        """Parse the command line. Raises EarlyEnd."""
+        try:
+            return super().make_context(*arguments, **named)
+        except EOFError as error:
+            raise EarlyEnd(error) from error
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command. Raises EarlyEnd."""
+        try:
+            return super().invoke(ctx)
+        except EOFError as error:
+            raise EarlyEnd(error) from error
+
+
 app = typer.Typer(
+    cls=Commands,
     add_completion=False,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},

@@ -11,7 +11,7 @@ from typing import NoReturn
 
 import typer
 
-from hilstar.cli.app import app
+from hilstar.cli.app import EarlyEnd, app
 from hilstar.console.terminal import fail
 from hilstar.errors import HilstarError, InputError, MachineError
 from hilstar.process import interrupts
@@ -73,6 +73,8 @@ def _run(words: list[str]) -> int:
         fail(str(error), error.exit_code)
     except (KeyboardInterrupt, typer.Abort):
         fail("stopped", interrupts.exit_code())
+    except EarlyEnd as end:
+        raise end.error from None
     except BrokenPipeError:
         # Whoever read our output has gone: nothing is left to say.
         _let_go_of_stdout()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import resource
 from pathlib import Path
 
 import pytest
@@ -23,6 +22,7 @@ from hilstar.files import (
     whole_file,
     write_whole,
 )
+from tests.support.full_disk import files_of_at_most
 
 
 @pytest.mark.parametrize("kind", ["same", "hard", "soft", "dotted"])
@@ -75,13 +75,8 @@ def test_an_error_leaves_the_older_file_whole_and_nothing_beside(tmp_path):
 def test_a_full_disk_leaves_the_older_file_whole(tmp_path):
     path = tmp_path / "a.bin"
     path.write_bytes(b"old")
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))
-    try:
-        with pytest.raises(InputError, match="cannot be written"):
-            write_whole(path, bytes(5000))
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    with files_of_at_most(1000), pytest.raises(InputError, match="cannot be written"):
+        write_whole(path, bytes(5000))
     assert path.read_bytes() == b"old"
 
 

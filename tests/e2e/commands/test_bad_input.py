@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import py_compile
 import resource
 import signal
 import subprocess
@@ -16,10 +17,11 @@ import pytest
 from hilstar.attitude.logs.log_file import READABLE
 from hilstar.cli import app
 from hilstar.errors import HilstarError, one_line
-from tests.support.benches import SMALL_BENCH
+from tests.support.benches import ROOT, SMALL_BENCH
 from tests.support.commands import assert_refused, bounded_by, run_hilstar_here
+from tests.support.full_disk import WITHOUT_BYTECODE, limited_environment
+from tests.support.waiting import PATIENCE_S
 
-LONGEST_S = 60  # of a test: all that it refuses
 MEMORY_BYTES = 4 << 30
 BENCH = SMALL_BENCH.replace("[1024, 1024]", "[64, 64]").replace("[320, 240]", "[64, 48]")
 FRAME = ("frame", "bench.toml", "--radec", "84,-1,0", "--codes", "codes.png")
@@ -31,7 +33,7 @@ MONITOR = '[calibration]\nkind="photometric"\nwho=""\nwhen=""\ninstrument=""\nun
 def bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """In a directory of its own, with an alarm: whatever waits for ever fails, and does not stop the suite."""
     monkeypatch.chdir(tmp_path)
-    with bounded_by(LONGEST_S):
+    with bounded_by(PATIENCE_S):
         yield
 
 
@@ -212,7 +214,7 @@ def test_a_full_stdout_is_one_line(words):
     Path("log.csv").write_text("t_s,qw,qx,qy,qz\n0,1,0,0,0\n")
     with Path("/dev/full").open("w") as full:
         command = [sys.executable, "-m", "hilstar", *words]
-        result = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, timeout=120, check=False)
+        result = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, timeout=PATIENCE_S, check=False)
     assert result.returncode in {1, 2}
     assert len(result.stderr.splitlines()) == 1, result.stderr
     assert "stdout" in result.stderr
@@ -240,8 +242,24 @@ def test_a_full_disk_is_one_line(words):
     Path("log.csv").write_text("t_s,qw,qx,qy,qz\n0,1,0,0,0\n1,1,0,0,0\n")
     Path("long.csv").write_text("t_s,qw,qx,qy,qz\n" + "".join(f"{k},1,0,0,0\n" for k in range(500)))
     command = [sys.executable, "-m", "hilstar", *words]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False, preexec_fn=limited)
+    result = subprocess.run(
+        command, capture_output=True, text=True, timeout=PATIENCE_S, check=False, preexec_fn=limited, env=limited_environment()
+    )
     assert_refused(result, 2, "cannot be written")
+
+
+@pytest.mark.parametrize("module", ["study/models/spectra.py", "cli/app.py", "errors.py"])
+@pytest.mark.parametrize("kept", [200, 16])
+def test_a_compiled_module_that_a_full_disk_cut_short_is_named(tmp_path, module, kept):
+    """Marshal reads past its end: an EOFError, which click takes for Ctrl-C."""
+    source = ROOT / "hilstar" / module
+    compiled = tmp_path / "cache" / source.with_suffix(f".{sys.implementation.cache_tag}.pyc").relative_to("/")
+    py_compile.compile(str(source), cfile=str(compiled), doraise=True)
+    os.truncate(compiled, kept)
+    environment = os.environ | {"PYTHONPYCACHEPREFIX": str(tmp_path / "cache")} | WITHOUT_BYTECODE
+    command = [sys.executable, "-m", "hilstar", "study", "models", "-o", "study", "--quick"]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False, env=environment)
+    assert_refused(result, 2, str(compiled), "damaged", "delete")
 
 
 def test_names_that_are_not_utf_8_are_as_good_as_others():

@@ -20,9 +20,10 @@ from hilstar.rotation import from_radec_roll_deg, propagate
 from hilstar.run.record.ledger_reader import drawable_frames
 from tests.support.benches import LIVE_BENCH, SMALL_BENCH
 from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
+from tests.support.full_disk import limited_environment
 from tests.support.senders import await_subscriber, packet, publisher
 from tests.support.servers import serving, summary_of
-from tests.support.waiting import best_of_three, in_time
+from tests.support.waiting import PATIENCE_S, best_of_three, in_time
 
 START = from_radec_roll_deg(84, -1, 0)
 RATE = (0.0, 0.0, 0.1)
@@ -149,13 +150,17 @@ def test_a_full_disk_ends_the_ledger_and_not_the_display(tmp_path):
         limited = f"import resource; resource.setrlimit(resource.RLIMIT_FSIZE, ({LIMIT_BYTES}, {LIMIT_BYTES}))"
         program = f"{limited}; from hilstar.cli import main; main()"
         with subprocess.Popen(
-            [sys.executable, "-c", program, *command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+            [sys.executable, "-c", program, *command],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=limited_environment(),
         ) as process:
             assert process.stderr is not None
             process.stderr.readline()
             await_subscriber(sender)
             stream(sender, 200)
-            out, err = process.communicate(timeout=30)
+            out, err = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 1, err
     summary = json.loads(out)
     assert "the display goes on" in err

@@ -27,6 +27,7 @@ from hilstar.run.record.ledger import Ledger, Split
 from hilstar.run.record.ledger_reader import drawable_frames
 from hilstar.run.record.ledger_records import FrameRecord
 from hilstar.run.record.report import figures_of, summarise
+from tests.support.full_disk import files_of_at_most
 from tests.support.waiting import wait_for
 
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
@@ -69,19 +70,13 @@ def test_a_split_is_a_size_or_a_time():
 
 def test_a_disk_without_room_loses_frames_first_and_says_so_and_is_tried_again(tmp_path, bench):
     notices = Notices()
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    ledger = Ledger(tmp_path / "run.mcap", bench, notices)
-    try:
+    with Ledger(tmp_path / "run.mcap", bench, notices) as ledger:
         keep(ledger, 0, 10)
         wait_for(lambda: len(list(drawable_frames(ledger.path))) == 10, "the first frames on the disk")
-        resource.setrlimit(resource.RLIMIT_FSIZE, ((tmp_path / "run.mcap").stat().st_size, limits[1]))
-        keep(ledger, 10, 20)
-        wait_for(lambda: "ledger-failed" in notices.active)
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        with files_of_at_most((tmp_path / "run.mcap").stat().st_size):
+            keep(ledger, 10, 20)
+            wait_for(lambda: "ledger-failed" in notices.active)
         wait_for(lambda: "ledger-failed" not in notices.active)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-        ledger.close()
     assert ledger.failure == "File too large"
     assert ledger.summary()["unrecorded"] == 10
     assert [sample.sequence for sample in read_log(tmp_path / "run.mcap")] == list(range(20))

@@ -14,7 +14,7 @@ FENCE = re.compile(
     r"(?:^<!-- (?P<note>[^\n]*) -->\n)?^```(?P<language>\w*)(?: title=\"(?P<title>[^\"]+)\")?[^\n]*\n(?P<text>.*?)^```$",
     re.MULTILINE | re.DOTALL,
 )
-NUMBER = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
+NUMBER = re.compile(r"(?<![\w.])(?:\d+(?:\.\d+){2,}|-?\d+(?:\.\d+)?(?:e[-+]?\d+)?)")  # the first is a version, as 3.11.2
 RELATIVE_ERROR = 0.01  # of a figure with a decimal point: drivers and processors round differently
 
 
@@ -75,8 +75,8 @@ def steps_of(text: str) -> list[Step]:
 def differs(shown: str, printed: str, figures_vary: bool) -> str | None:
     """Why `printed` is not what a page shows, or None where it is.
 
-    A line `...` stands for any lines, `...` within a line for any text. Whole numbers must be the same, others within
-    RELATIVE_ERROR; with `figures_vary` any number will do.
+    A line `...` stands for any lines, `...` within a line for any text. Whole numbers and versions must be the same, others
+    within RELATIVE_ERROR; with `figures_vary` any number will do.
     """
     pattern = "".join(r"(?:.*\n)*?" if line == "..." else line_pattern(line) + "\n" for line in shown.splitlines())
     match = re.fullmatch(pattern, printed)
@@ -85,7 +85,7 @@ def differs(shown: str, printed: str, figures_vary: bool) -> str | None:
     if figures_vary:
         return None
     for wanted, got in zip(NUMBER.findall(shown), match.groups(), strict=True):
-        exact = "." not in wanted
+        exact = wanted.count(".") != 1
         if (wanted != got) if exact else abs(float(wanted) - float(got)) > RELATIVE_ERROR * abs(float(wanted)):
             return f"{got} where the page has {wanted}"
     return None

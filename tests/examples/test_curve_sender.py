@@ -16,6 +16,7 @@ from tests.examples.support import commands, copied
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.senders import free_port
 from tests.support.servers import listening
+from tests.support.waiting import PATIENCE_S
 
 EVERYWHERE = "tcp://*:5560"
 
@@ -36,10 +37,10 @@ def test_with_its_key_it_is_heard_and_with_another_it_is_told(tmp_path, monkeypa
     assert serve[1:4] == ["serve", bench.name, "--headless"]
     with listening(bench, f"bound to {endpoint}", *serve[4:]) as process:
         command = [sys.executable, send[1], endpoint, send[3], "0.5"]
-        sent = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
+        sent = subprocess.run(command, capture_output=True, text=True, check=True, timeout=PATIENCE_S)
         refused = stranger(monkeypatch, endpoint)
         process.send_signal(signal.SIGINT)
-        out, err = process.communicate(timeout=30)
+        out, err = process.communicate(timeout=PATIENCE_S)
     assert sent.stdout == "50 attitudes sent\n"
     assert refused == 1
     assert "allowed_clients" in capsys.readouterr().err

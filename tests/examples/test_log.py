@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.examples.support import EXAMPLES, commands, copied, section
 from tests.support.commands import run_hilstar_here
+from tests.support.waiting import PATIENCE_S
 
 STEP_S = 0.1
 # The trapezoidal rule's error in one step, h^3 / 12 times the largest second derivative of the rate, A/T (2 pi/T)^2.
@@ -29,7 +30,9 @@ def rows() -> np.ndarray:
 
 
 def test_the_log_is_what_its_script_makes():
-    made = subprocess.run([sys.executable, EXAMPLES / "make_slew.py"], capture_output=True, text=True, check=True, timeout=30)
+    made = subprocess.run(
+        [sys.executable, EXAMPLES / "make_slew.py"], capture_output=True, text=True, check=True, timeout=PATIENCE_S
+    )
     assert made.stdout == (EXAMPLES / "slew.csv").read_text()
 
 

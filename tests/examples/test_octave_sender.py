@@ -13,6 +13,7 @@ from tests.examples.support import section
 from tests.support.benches import ROOT, SMALL_BENCH
 from tests.support.senders import free_port
 from tests.support.servers import interrupted, listening
+from tests.support.waiting import PATIENCE_S
 
 OCTAVE = shutil.which("octave-cli")
 pytestmark = pytest.mark.skipif(OCTAVE is None, reason="octave-cli is not installed")
@@ -21,7 +22,7 @@ HAS_UDP = "exit(double(isempty(pkg('list', 'instrument-control'))))"
 
 def octave(program: str) -> subprocess.CompletedProcess[str]:
     command = [OCTAVE, "--norc", "--quiet", "--path", str(ROOT / "examples"), "--eval", program]
-    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
 
 
 def random_samples(rng: np.random.Generator) -> list[AttitudeSample]:

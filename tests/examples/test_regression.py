@@ -12,6 +12,7 @@ import pytest
 
 from tests.examples.support import commands, copied, section
 from tests.support.commands import run_hilstar_here
+from tests.support.waiting import PATIENCE_S
 
 
 def test_it_passes_on_the_same_sky_and_fails_on_another(tmp_path, monkeypatch):
@@ -31,7 +32,7 @@ def test_it_passes_on_the_same_sky_and_fails_on_another(tmp_path, monkeypatch):
 
     options = ["--import-mode=importlib", "-p", "no:cacheprovider", "-rA"]
     command = [sys.executable, *test[1:], "wrong/test_sky.py", *options]
-    result = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    result = subprocess.run(command, capture_output=True, text=True, check=False, timeout=PATIENCE_S)
     assert result.returncode == pytest.ExitCode.TESTS_FAILED, result.stdout
     outcomes = {name: outcome for outcome, name in re.findall(r"(?m)^(PASSED|FAILED) (\S+)::", result.stdout)}
     assert outcomes == {"test_sky.py": "PASSED", "wrong/test_sky.py": "FAILED"}

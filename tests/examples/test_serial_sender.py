@@ -17,6 +17,7 @@ from hilstar.attitude.wire.serial_link import SerialLink
 from hilstar.rotation import propagate
 from tests.support.benches import ROOT, SMALL_BENCH
 from tests.support.servers import interrupted, listening
+from tests.support.waiting import PATIENCE_S
 from tests.support.wire.ptys import Cable
 
 EXAMPLES = ROOT / "examples"
@@ -37,7 +38,7 @@ def sender(tmp_path_factory) -> Path:
     target = tmp_path_factory.mktemp("serial") / "serial_sender"
     command = ["gcc", "-std=c99", "-D_POSIX_C_SOURCE=200809L", "-O2", *STRICT, "-I", ROOT / "firmware_protocol"]
     command += [EXAMPLES / "serial_sender.c", "-lm", "-o", target]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    result = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
     assert (result.returncode, result.stderr) == (0, "")
     return target
 
@@ -53,7 +54,7 @@ def test_the_sender_streams_into_hilstar_and_both_sides_know_each_other_s_clock(
     bench_file.write_text(f'{SMALL_BENCH}\n[attitude]\nsource = "serial"\nport = "{cable.host}"\nbaud = {BAUD}\n')
     command = [str(sender), str(cable.sender), str(BAUD), "100", "1.5", "5", str(CLOCK_OFFSET_S)]
     with listening(bench_file, "reading serial:") as process:
-        result = subprocess.run(command, capture_output=True, text=True, timeout=30, check=False)
+        result = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
         assert result.returncode == 0, result.stderr
         time.sleep(READ_S)
         summary = interrupted(process)
@@ -115,6 +116,6 @@ def test_the_sender_says_in_one_line_what_is_wrong(sender):
         (["/dev/null", "7", "1", "1", "1"], 2),
         (["/dev/null", "115200", "1", "1", "1"], 1),
     ):
-        result = subprocess.run([str(sender), *arguments], capture_output=True, text=True, timeout=10, check=False)
+        result = subprocess.run([str(sender), *arguments], capture_output=True, text=True, timeout=PATIENCE_S, check=False)
         assert result.returncode == code
         assert len(result.stderr.splitlines()) == 1

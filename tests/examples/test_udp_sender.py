@@ -17,6 +17,7 @@ from tests.examples.support import commands
 from tests.support.benches import ROOT, SMALL_BENCH
 from tests.support.senders import free_port
 from tests.support.servers import interrupted, listening
+from tests.support.waiting import PATIENCE_S
 
 # As strict as compilers are, besides what the README gives.
 READ_S = 0.5  # until a busy machine has read what was sent
@@ -28,7 +29,7 @@ def sender(tmp_path_factory) -> Path:
     target = tmp_path_factory.mktemp("udp") / "udp_sender"
     compiler, *rest = commands("A C++ sender over UDP")[0]
     command = [compiler, *STRICT, *rest[:-1], target]
-    result = subprocess.run(command, cwd=ROOT / "examples", capture_output=True, text=True, timeout=120, check=False)
+    result = subprocess.run(command, cwd=ROOT / "examples", capture_output=True, text=True, timeout=PATIENCE_S, check=False)
     assert (result.returncode, result.stderr) == (0, "")
     return target
 
@@ -39,7 +40,7 @@ def test_the_sender_streams_into_hilstar_and_both_sides_talk(tmp_path, sender):
     bench.write_text(f'{SMALL_BENCH}\n[attitude]\nsource = "udp"\nbind = "{address}"\nport = {port}\n')
     with listening(bench, "bound to") as process:
         command = [sender, address, str(port), "100", "1", "5"]
-        result = subprocess.run(command, capture_output=True, text=True, timeout=30, check=True)
+        result = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=True)
         time.sleep(READ_S)
         summary = interrupted(process)
     match = re.fullmatch(r"sent 100, requests (\d+), statuses (\d+)\n", result.stdout)
@@ -56,9 +57,9 @@ def test_the_sender_streams_into_hilstar_and_both_sides_talk(tmp_path, sender):
 def test_the_sender_turns_as_its_rate_says(sender):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as end:
         end.bind(("127.0.0.1", 0))
-        end.settimeout(10.0)
+        end.settimeout(PATIENCE_S)
         command = [sender, "127.0.0.1", str(end.getsockname()[1]), "500", "0.1", "20"]
-        subprocess.run(command, capture_output=True, timeout=30, check=True)
+        subprocess.run(command, capture_output=True, timeout=PATIENCE_S, check=True)
         samples = [decode(end.recv(100)) for _ in range(50)]
     rate = np.radians([0.0, 0.0, 20.0])
     first = samples[0]
@@ -72,6 +73,6 @@ def test_the_sender_turns_as_its_rate_says(sender):
 
 def test_the_sender_says_in_one_line_what_is_wrong(sender):
     for arguments, code in (([], 2), (["127.0.0.1", "9", "1", "1", "x"], 2), (["127.0.0.1", "no port", "1", "1", "1"], 1)):
-        result = subprocess.run([sender, *arguments], capture_output=True, text=True, timeout=10, check=False)
+        result = subprocess.run([sender, *arguments], capture_output=True, text=True, timeout=PATIENCE_S, check=False)
         assert result.returncode == code
         assert len(result.stderr.splitlines()) == 1

@@ -16,7 +16,7 @@ from hilstar.calibrate.first_light.sight.display import Display
 from tests.support import plain_camera
 from tests.support.benches import TWIN, bench_text
 from tests.support.commands import HILSTAR, run_hilstar
-from tests.support.waiting import best_of_three, in_time, wait_for
+from tests.support.waiting import PATIENCE_S, best_of_three, in_time, wait_for
 from tests.support.wire.ptys import Cable
 from tests.support.x11.diode import Diode
 from tests.support.x11.events import client
@@ -30,7 +30,7 @@ def test_the_display_shows_each_pattern_while_the_command_runs(screen, tmp_path)
     with plain_camera.on_duty() as camera:
         grab = f"{camera} {screen.file} {{output}} --reversed"
         words = ["first-light", tmp_path / "bench.toml", "-o", tmp_path / "s", "--grab", grab, "--patches", "0", "--json"]
-        result = run_hilstar(*words, env=screen.env, timeout=180)
+        result = run_hilstar(*words, env=screen.env, timeout=PATIENCE_S)
     assert result.returncode == 0, result.stderr
     steps = {step["name"]: step for step in json.loads(result.stdout)["steps"]}
     assert steps["display"]["verdict"] == "done"
@@ -84,7 +84,7 @@ def test_a_person_tells_the_mounting_by_a_key_and_saves_the_images(screen, tmp_p
             while "geometry-1/frame_000" not in (line := told_by(process, "now save")):
                 save(line, screen)
             user.press("q")
-            assert process.wait(30) == 1
+            assert process.wait(PATIENCE_S) == 1
         finally:
             process.kill()
     session = json.loads((tmp_path / "s" / "session.json").read_text())
@@ -103,7 +103,7 @@ def test_the_delay_of_a_real_display_is_found_by_a_photodiode(screen, tmp_path):
     with Cable(tmp_path) as cable, Diode(screen, cable.sender, ADDED_MS):
         diode = f"serial:{cable.host}@921600"
         words = ["first-light", bench, "-o", tmp_path / "s", "--grab", "false {output}", "--diode", diode, "--json"]
-        result = run_hilstar(*words, env=screen.env, timeout=120)
+        result = run_hilstar(*words, env=screen.env, timeout=PATIENCE_S)
     assert result.returncode == 1, result.stderr
     steps = {step["name"]: step for step in json.loads(result.stdout)["steps"]}
     assert steps["orientation"]["verdict"] == "failed"

@@ -17,7 +17,7 @@ from hilstar.run.record.ledger_reader import read_run
 from hilstar.run.screen.photodiode import CODE, CODE_BITS, marker_light
 from tests.support.benches import ATTITUDE, SCREEN_BENCH, still_log
 from tests.support.commands import HILSTAR, assert_refused, run_hilstar, run_hilstar_here
-from tests.support.waiting import best_of_three, in_time, real_time, wait_for
+from tests.support.waiting import PATIENCE_S, best_of_three, in_time, real_time, wait_for
 from tests.support.wire.ptys import Cable
 from tests.support.x11.diode import Diode
 from tests.support.x11.screens import Screen, xvfb
@@ -58,7 +58,7 @@ def shown(screen: Screen, folder: Path, kind: str):
             assert process.poll() is None
             yield bench
             process.terminate()
-            process.communicate(timeout=20)
+            process.communicate(timeout=PATIENCE_S)
         finally:
             process.kill()
 

@@ -155,5 +155,5 @@ with load(resource_path("configs", "demo.toml")) as bench:
         loop.draw(number, 0, turning)
     print(gc.collect())
 """
-    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True)
+    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=PATIENCE_S, check=True)
     assert int(result.stdout) == 0

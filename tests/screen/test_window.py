@@ -172,7 +172,7 @@ def test_the_patches_of_a_plan_come_up_on_the_screen(screen, tmp_path):
             pixels = screen.pixels()
             seen.add((int(pixels[240, 320].max()), int(pixels[20, 20].max())))
             time.sleep(0.02)
-        said = process.communicate(timeout=10)[1]
+        said = process.communicate(timeout=PATIENCE_S)[1]
     in_time({(0, 0), (127, 0), (255, 0)} <= seen, seen)
     assert "code 255, channel w" in said
 
@@ -194,7 +194,7 @@ def test_the_dots_of_a_plan_come_up_turned_as_the_stars_are(screen, bench_file, 
                 pixels = screen.pixels()[..., 0]
                 seen |= any((pixels == image).all() for image in wanted)
             time.sleep(0.02)
-        said = process.communicate(timeout=10)[1]
+        said = process.communicate(timeout=PATIENCE_S)[1]
     assert seen
     assert "frame 8 of 8" in said
     assert "8 of 8 frames shown" in said

@@ -23,6 +23,7 @@ from hilstar.study.models.temperatures import torres2010_k
 from hilstar.study.models.zero_points import zero_points
 from hilstar.study.shared.brightness import held_out_errors, study_optics
 from tests.support.commands import run_hilstar_here
+from tests.support.waiting import PATIENCE_S
 
 STEMS = ("rapp_ccd47-20", "rapp_kai-4021", "temperature_scales", "zero_points", "choices", "spectra")
 
@@ -310,4 +311,4 @@ def test_matplotlib_is_imported_by_a_drawing_and_pyplot_by_none():
         "assert 'matplotlib' not in sys.modules;"
         "run.zero_points(Path(tempfile.mkdtemp())); assert 'matplotlib.pyplot' not in sys.modules"
     )
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=PATIENCE_S)

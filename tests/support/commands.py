@@ -15,12 +15,13 @@ from typing import TextIO
 
 from hilstar.cli import run_command
 from hilstar.cli.entry import LOG_FORMAT
+from tests.support.waiting import PATIENCE_S
 
 HILSTAR = [sys.executable, "-m", "hilstar"]
 
 
 def run_hilstar(
-    *arguments: str | Path, cwd: Path | None = None, timeout: float = 120, env: dict[str, str] | None = None
+    *arguments: str | Path, cwd: Path | None = None, timeout: float = PATIENCE_S, env: dict[str, str] | None = None
 ) -> subprocess.CompletedProcess[str]:
     """The command as a user runs it, in a process of its own: half a second of CPU before it begins."""
     command = [*HILSTAR, *map(str, arguments)]
@@ -37,7 +38,9 @@ def run_hilstar(
     return subprocess.CompletedProcess(command, process.returncode, out, err)
 
 
-def run_hilstar_here(*arguments: str | Path, cwd: Path | None = None, timeout: int = 120) -> subprocess.CompletedProcess[str]:
+def run_hilstar_here(
+    *arguments: str | Path, cwd: Path | None = None, timeout: int = PATIENCE_S
+) -> subprocess.CompletedProcess[str]:
     """The command line in this process: the same words, refusals and exit code, and milliseconds instead of a new process.
 
     For what is said, written and returned. The process itself (streams, signals, the workers it starts) is `run_hilstar`'s.

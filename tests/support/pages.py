@@ -85,7 +85,7 @@ def _answers(page: PageAddress) -> bool:
     return False
 
 
-def raw(port: int, data: bytes, seconds: float = 10.0) -> bytes:
+def raw(port: int, data: bytes, seconds: float = PATIENCE_S) -> bytes:
     """What comes back for bytes until the other side closes, or is silent for so long."""
     with socket.create_connection(("127.0.0.1", port), timeout=seconds) as connection:
         connection.sendall(data)

@@ -14,6 +14,8 @@ import serial
 import serial.rfc2217
 from serial.urlhandler.protocol_loop import Serial as LoopSerial
 
+from tests.support.waiting import PATIENCE_S
+
 
 class KeptLine(LoopSerial):
     """A port whose RTS is looped to its CTS; `edges` has the host time (ns) and level of each change."""
@@ -90,4 +92,4 @@ class RtsServer:
     def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
         self._ends = True
         self.cut()
-        self._thread.join(5)
+        self._thread.join(PATIENCE_S)

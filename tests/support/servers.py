@@ -99,7 +99,7 @@ def serving(tmp_path: Path, port: int, *options: str, attitude: str = "", monito
         yield process
 
 
-def summary_of(process: subprocess.Popen[str], timeout: float = 30, code: int = 0) -> dict:
+def summary_of(process: subprocess.Popen[str], timeout: float = PATIENCE_S, code: int = 0) -> dict:
     """What it prints at its end, with that exit code."""
     out, err = process.communicate(timeout=timeout)
     assert process.returncode == code, err

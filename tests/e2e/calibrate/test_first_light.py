@@ -28,6 +28,7 @@ from hilstar.units import ARCSEC_PER_RAD
 from tests.support import plain_camera
 from tests.support.benches import TWIN, bench_text
 from tests.support.commands import HILSTAR, assert_refused, run_hilstar_here
+from tests.support.waiting import PATIENCE_S
 
 GAMMA_22 = {"monitor": {"calibration": "gamma2.2", "photodiode_px": 40}}
 NOTES = Notes({}, ErrorTable(), MadeTable(by="planted", when="2026-11-21", poses=1))
@@ -181,13 +182,13 @@ def started(folder, *more):
 
 def ended_at(process, folder, image, ending):
     """Let a session run until an image is there, end it so, and give back the images of that step and when they were taken."""
-    end_s = time.monotonic() + 100
+    end_s = time.monotonic() + PATIENCE_S
     while not list((folder / "s").glob(f"images/{image}*")):
         assert time.monotonic() < end_s
         assert process.poll() is None
         time.sleep(0.01)
     process.send_signal(ending)
-    process.wait(60)
+    process.wait(PATIENCE_S)
     return {path: path.stat().st_mtime_ns for path in sorted((folder / "s").glob(f"images/{image.split('/')[0]}/*.png"))}
 
 

@@ -14,7 +14,7 @@ import pytest
 from hilstar.campaign.store.table import read_columns
 from tests.support.campaigns import write_campaign
 from tests.support.commands import HILSTAR, assert_refused, run_hilstar, run_hilstar_here
-from tests.support.waiting import wait_for
+from tests.support.waiting import PATIENCE_S, wait_for
 
 # Slow enough to be killed in its middle; its answer, and the images that it fails over, are those of the pixels alone.
 SOLVER = """
@@ -69,7 +69,7 @@ def test_the_table_is_the_same_after_every_kind_of_end_and_with_cases_that_fail(
     stopped = start(folder, 2)  # Ctrl-C
     wait_for(lambda: rows_so_far(folder) >= 3)
     stopped.send_signal(signal.SIGINT)
-    _, err = stopped.communicate(timeout=10)
+    _, err = stopped.communicate(timeout=PATIENCE_S)
     assert stopped.returncode == 130 and "the same command goes on" in err, err
     after_stop = rows_so_far(folder)
     assert 3 <= after_stop < 30

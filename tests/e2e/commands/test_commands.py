@@ -193,7 +193,7 @@ def test_a_machine_without_egl_gets_one_line_and_exit_code_3(small_bench_file):
         "context.EGL_LIBRARY = 'libEGL.so.none';"
         f"sys.argv = ['hilstar', 'frame', {str(small_bench_file)!r}, '--radec', '1,2,3', '-o', 'x.fits']; cli.main()"
     )
-    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=False)
+    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=PATIENCE_S, check=False)
     assert_refused(result, 3, "apt-get install libegl1 libgl1-mesa-dri")
 
 

@@ -12,6 +12,7 @@ import pytest
 
 from tests.support.benches import ROOT
 from tests.support.readme import blocks
+from tests.support.waiting import INSTALLED_WITHIN_S, PATIENCE_S
 
 FILES = ("pyproject.toml", "README.md", "LICENSE", "hilstar", "shaders", "configs")
 # For pip: packages are not compiled ahead, which takes longer than all that the demo then imports ("no" turns it off).
@@ -40,7 +41,7 @@ def checkout(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
         else:
             shutil.copy(source, folder / name)
     result = subprocess.run(
-        ["sh", "-c", blocks("sh")[0]], cwd=folder, capture_output=True, text=True, timeout=600, check=False,
+        ["sh", "-c", blocks("sh")[0]], cwd=folder, capture_output=True, text=True, timeout=INSTALLED_WITHIN_S, check=False,
         env=clean_environment(), stdin=subprocess.DEVNULL,
     )  # fmt: skip
     assert result.returncode == 0, result.stderr
@@ -63,7 +64,7 @@ def test_the_installed_wheel_runs_the_demo_without_the_checkout(checkout, tmp_pa
 
     def printed(*command: str | Path) -> str:
         done = subprocess.run(
-            command, cwd=elsewhere, capture_output=True, text=True, timeout=120, check=False, env=clean_environment()
+            command, cwd=elsewhere, capture_output=True, text=True, timeout=PATIENCE_S, check=False, env=clean_environment()
         )
         assert done.returncode == 0, done.stderr
         return done.stdout

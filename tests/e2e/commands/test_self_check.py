@@ -26,7 +26,7 @@ from tests.support.sources.aem_messages import kvn, rows_of
 from tests.support.sources.ros_bags import START_NS, Make, write_bag1, write_bag2, write_mcap
 from tests.support.sources.ulog_files import ULogWriter
 from tests.support.sources.viz_message import craft, viz_message
-from tests.support.waiting import repeating
+from tests.support.waiting import PATIENCE_S, repeating
 
 MOUNTING = [0.6, 0.48, -0.64, 0.0]
 ALNILAM = 26311
@@ -204,7 +204,7 @@ def nasa42(numbers: Numbers) -> Iterator[dict[str, object]]:
             connection.recv(4)
 
     with socket.create_server(("127.0.0.1", 0)) as listener:
-        listener.settimeout(20)
+        listener.settimeout(PATIENCE_S)
         thread = threading.Thread(target=serve, args=(listener,))
         thread.start()
         yield {"source": "42", "endpoint": f"tcp://127.0.0.1:{listener.getsockname()[1]}"}

@@ -8,6 +8,8 @@ import sys
 
 import pytest
 
+from tests.support.waiting import PATIENCE_S
+
 # What single commands, files and plots need, and no bench: each costs 15 to 250 ms.
 HEAVY = {"asyncio", "astropy", "ccsds_ndm", "matplotlib", "mcap", "rich", "scipy.special", "unittest"}
 
@@ -15,7 +17,7 @@ HEAVY = {"asyncio", "astropy", "ccsds_ndm", "matplotlib", "mcap", "rich", "scipy
 def imported_by(module: str) -> set[str]:
     """The modules that a new process has after it imported one."""
     program = f"import sys, {module}; print(*sys.modules)"
-    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60)
+    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=PATIENCE_S)
     return set(result.stdout.split())
 
 
@@ -34,6 +36,6 @@ def test_a_run_begins_no_other_process_by_what_it_imports():
     program += "import hilstar.cli.show.serve, hilstar.run.screen.open_screen; print('glfw' in sys.modules)"
     environment = {name: value for name, value in os.environ.items() if not name.startswith("PYGLFW")}
     result = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60, env=environment
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=PATIENCE_S, env=environment
     )
     assert result.stdout == "True\n"

@@ -18,7 +18,7 @@ from tests.support.senders import free_port, publisher
 from tests.support.servers import interrupted, listening, serving
 from tests.support.sources.basilisk import Truth, basilisk, rotation
 from tests.support.sources.viz_message import craft, viz_message
-from tests.support.waiting import is_connected_to, wait_for
+from tests.support.waiting import PATIENCE_S, is_connected_to, wait_for
 
 # Two degrees a second, from just under |sigma| = 1: the switch to the shadow set comes within half a second. The other
 # spacecraft is elsewhere, so that a choice of the wrong one is seen.
@@ -147,7 +147,7 @@ def test_two_spacecraft_and_no_name_end_the_simulation_with_their_names(tmp_path
     ):
         told = simulation.run(code=1)
         served.send_signal(signal.SIGINT)
-        out, err = served.communicate(timeout=30)
+        out, err = served.communicate(timeout=PATIENCE_S)
     assert "Error processing SIM_UPDATE" in told
     assert served.returncode == 4
     assert 'spacecraft: chaser, target; write the one that is meant, [attitude] spacecraft = "NAME"' in err

@@ -13,7 +13,7 @@ import pytest
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.senders import packet, publisher
 from tests.support.servers import serving, summary_of
-from tests.support.waiting import best_of_three, in_time
+from tests.support.waiting import PATIENCE_S, best_of_three, in_time
 
 RATES_RAD_S = (1.0, 10.0, 57.0, 200.0, 900.0)
 # A frame of the small bench takes 1 ms; one of 10 rad/s took 1500 ms and more. The margin is for busy machines.
@@ -62,7 +62,7 @@ def test_a_rate_in_deg_s_is_refused_by_name_once_said_and_the_stream_goes_on(tmp
         stream(sender, [(still, (0.0, 0.0, 57.0 if k % 2 else 1.0)) for k in range(100)], 100)
         process.has_received(100)
         process.send_signal(signal.SIGINT)
-        out, err = process.communicate(timeout=30)
+        out, err = process.communicate(timeout=PATIENCE_S)
     packets = json.loads(out)["packets"]
     assert (packets["accepted"], packets["refused_by"]["rate"]) == (50, 50)
     lines = [line for line in err.splitlines() if "max_rate_deg_s" in line]
@@ -105,13 +105,13 @@ def test_a_run_with_such_turns_is_replayed_from_its_ledger_in_bounded_time(tmp_p
         process.shows(60)
         process.send_signal(signal.SIGINT)
         served = summary_of(process)
-    began_s = time.monotonic()
-    result = run_hilstar_here("replay", tmp_path / "serve.toml", ledger, "--headless", "--speed", "max", "--json", timeout=60)
+    result = run_hilstar_here(
+        "replay", tmp_path / "serve.toml", ledger, "--headless", "--speed", "max", "--json", timeout=PATIENCE_S
+    )
     assert result.returncode == 0, result.stderr
     summary = json.loads(result.stdout)
     assert (summary["frames"], summary["capped"]) == (served["frames"], served["capped"])
     assert summary["capped"] > 0
-    assert time.monotonic() - began_s < 30
 
 
 def test_a_frame_that_hangs_is_told_with_its_stage():
@@ -125,7 +125,7 @@ def test_a_frame_that_hangs_is_told_with_its_stage():
     with FrameWatch(1e9 / 60, notices) as watch:
         watch.begin(7)
         watch.enter("swap")
-        assert told.wait(30)
+        assert told.wait(PATIENCE_S)
         watch.end(timed=True)
     assert "frame 7 hangs in its stage swap" in lines[0]
     assert "frame 7 took" in lines[-1]

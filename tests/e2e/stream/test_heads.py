@@ -15,7 +15,7 @@ from hilstar.run.record.ledger_reader import frame_records
 from tests.support.commands import HILSTAR
 from tests.support.heads import MOUNTINGS, heads_file
 from tests.support.senders import publisher, talking
-from tests.support.waiting import wait_for
+from tests.support.waiting import PATIENCE_S, wait_for
 from tests.support.x11.screens import recorded
 
 BODY = (0.7139, 0.1, -0.3, 0.6245)  # as a packet holds it; its norm is 1 within 1e-4
@@ -54,7 +54,7 @@ def test_a_head_that_is_killed_or_hangs_stops_no_other_and_is_begun_again(tmp_pa
                 assert children(process.pid)["a"] == heads["a"]
             finally:
                 process.send_signal(signal.SIGINT)
-            out, _ = process.communicate(timeout=60)
+            out, _ = process.communicate(timeout=PATIENCE_S)
     told = json.loads(out)["heads"]
     assert [told[name]["restarts"] for name in "abc"] == [0, 1, 1], lines.read_text()
     assert "b: its process ended (signal 9); it is started again" in lines.read_text()

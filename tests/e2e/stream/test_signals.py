@@ -26,6 +26,7 @@ WITHIN_S = 1.0
 # A loaded machine wakes and reaps late.
 LATE_S = 0.5
 NO_ATTITUDE = 4
+HEARS_HANG_UPS = ["env", "--default-signal=HUP"]  # the suite may itself run under nohup, which hands on that it is ignored
 STUCK = """
 import sys, time
 from hilstar.run.loop import FrameLoop
@@ -45,6 +46,7 @@ def program(*words: str | Path, before: str = "") -> list[str]:
 
 @contextmanager
 def running(command: list[str], **more) -> Iterator[subprocess.Popen]:
+    command = [*HEARS_HANG_UPS, *command]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True, **more) as process:
         try:
             yield process
@@ -53,11 +55,27 @@ def running(command: list[str], **more) -> Iterator[subprocess.Popen]:
                 os.killpg(process.pid, signal.SIGKILL)
 
 
+def test_a_hang_up_ends_nothing_under_nohup(tmp_path):
+    """SIGHUP stays ignored where it was on entry."""
+    with publisher() as (sender, port):
+        command = program("serve", serve_file(tmp_path, port), "--headless", "--json")
+        with running(["bash", "-c", 'trap "" HUP; exec "$@"', "bash", *command]) as process:
+            assert process.stderr is not None and process.stderr.readline()
+            process.send_signal(signal.SIGHUP)
+            for _ in range(20):
+                sender.send(packet(0, time.monotonic_ns()))
+                time.sleep(0.01)
+            assert process.poll() is None
+            code, out, err = ends(process, signal.SIGTERM)
+    assert code in {0, 4}, err
+    assert json.loads(out)["frames"] > 0
+
+
 def ends(process: subprocess.Popen, number: int) -> tuple[int, str, str]:
     """Exit code and what was said, after a signal; within a second, and nothing of its session is left."""
     begin_s = time.monotonic()
     process.send_signal(number)
-    out, err = process.communicate(timeout=10)
+    out, err = process.communicate(timeout=PATIENCE_S)
     took_s = time.monotonic() - begin_s
     in_time(took_s < WITHIN_S + LATE_S, (took_s, err))
     wait_for(lambda: not of_session(process.pid))
@@ -84,7 +102,7 @@ def serve_file(folder: Path, port: int, more: str = "") -> Path:
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 @best_of_three
 def test_a_signal_ends_a_run_in_order(tmp_path, number):
-    """Also where SIGINT is ignored on entry, as a shell does it for what it runs with `&`."""
+    """Also where SIGINT is ignored on entry, as a shell does it for what it runs with `&`; not where SIGHUP is (nohup)."""
     ledger = tmp_path / "run.mcap"
     with publisher() as (sender, port):
         command = program("serve", serve_file(tmp_path, port), "--headless", "--json", "--ledger", ledger)
@@ -229,7 +247,7 @@ def test_a_log_that_nobody_reads_holds_up_neither_the_frames_nor_the_end(tmp_pat
                     )
                 begin_s = time.monotonic()
                 process.send_signal(signal.SIGTERM)
-                out, _ = process.communicate(timeout=10)
+                out, _ = process.communicate(timeout=PATIENCE_S)
                 in_time(time.monotonic() - begin_s < WITHIN_S + LATE_S, "the end")
             finally:
                 process.kill()
@@ -246,7 +264,7 @@ def test_a_summary_that_nobody_reads_does_not_hold_up_the_end(tmp_path):
                 assert process.stderr is not None and process.stderr.readline()
                 begin_s = time.monotonic()
                 process.send_signal(signal.SIGTERM)
-                process.wait(timeout=10)
+                process.wait(timeout=PATIENCE_S)
                 in_time(time.monotonic() - begin_s < WITHIN_S + LATE_S, "the end")
             finally:
                 process.kill()
@@ -355,7 +373,7 @@ def test_closed_standard_streams_are_nobody_else_s(tmp_path, small_bench_file):
     """Else the first socket or file would be the standard error, and take its lines."""
     out = tmp_path / "frame.fits"
     command = program("frame", small_bench_file, "--radec", "84,-1,0", "-o", out)
-    result = subprocess.run(["bash", "-c", 'exec "$@" 0<&- 1>&- 2>&-', "bash", *command], timeout=60, check=False)
+    result = subprocess.run(["bash", "-c", 'exec "$@" 0<&- 1>&- 2>&-', "bash", *command], timeout=PATIENCE_S, check=False)
     assert result.returncode == 0
     assert out.read_bytes().startswith(b"SIMPLE")
 
@@ -363,13 +381,13 @@ def test_closed_standard_streams_are_nobody_else_s(tmp_path, small_bench_file):
 def test_with_stderr_closed_stdout_holds_no_line_of_it(tmp_path):
     command = program("attitude", tmp_path / "no.csv", "--json")
     result = subprocess.run(
-        ["bash", "-c", 'exec "$@" 2>&-', "bash", *command], capture_output=True, text=True, timeout=60, check=False
+        ["bash", "-c", 'exec "$@" 2>&-', "bash", *command], capture_output=True, text=True, timeout=PATIENCE_S, check=False
     )
     assert (result.returncode, result.stdout) == (2, "")
 
 
 def test_a_run_with_all_standard_streams_closed_shows_its_frames(tmp_path, small_bench_file):
     command = program("serve", small_bench_file, "--headless", "--frames", "2", "--ledger", tmp_path / "run.mcap")
-    result = subprocess.run(["bash", "-c", 'exec "$@" 0<&- 1>&- 2>&-', "bash", *command], timeout=60, check=False)
+    result = subprocess.run(["bash", "-c", 'exec "$@" 0<&- 1>&- 2>&-', "bash", *command], timeout=PATIENCE_S, check=False)
     assert result.returncode == NO_ATTITUDE
     assert (tmp_path / "run.mcap").stat().st_size > 0

@@ -230,7 +230,7 @@ def test_a_flood_costs_little_and_its_newest_attitude_is_shown(tmp_path):
     flood = "import socket, sys, time\ns = socket.socket(2, 2)\ns.connect(('127.0.0.1', int(sys.argv[1])))\n"
     flood += "end = time.time() + 1\nwhile time.time() < end: s.send(b'?' * 64)"
     with listening(bench_of(tmp_path, f"port = {port}"), "bound to") as process:
-        subprocess.run([sys.executable, "-c", flood, str(port)], check=True, timeout=30)
+        subprocess.run([sys.executable, "-c", flood, str(port)], check=True, timeout=PATIENCE_S)
         wait_for(lambda: unread_bytes(port) == 0, "the flood is read")
         assert sent(f"udp://127.0.0.1:{port}", "--spin", "z,1", "--rate", "100", "--count", "20")["sent"] == 20
         process.has_accepted(20)

@@ -24,6 +24,7 @@ from tests.support.commands import run_hilstar_here
 from tests.support.senders import free_port
 from tests.support.servers import interrupted, listening
 from tests.support.sources.basilisk import Truth, basilisk, rotation
+from tests.support.waiting import INSTALLED_WITHIN_S, PATIENCE_S
 
 # The limits; measured here: 0.0003 to 0.024 arcsec and 0.03 to 0.7 arcsec.
 LINEAR_LIMIT_ARCSEC = 0.1
@@ -60,7 +61,7 @@ def solver_python(tmp_path_factory) -> Path:
     python = folder / "bin" / "python"
     install = [sys.executable, "-m", "pip", "--python", python, "install", "-q", "--no-compile"]
     for arguments in (["numpy<2", "scipy", "pillow"], ["--no-deps", "cedar-solve==0.5.1"]):
-        subprocess.run([*install, *arguments], check=True, timeout=600)
+        subprocess.run([*install, *arguments], check=True, timeout=INSTALLED_WITHIN_S)
     return python
 
 
@@ -108,7 +109,7 @@ def solved_fields(solver_python: Path, fields: list[np.ndarray]) -> list[dict[st
     lines = [json.dumps({"yx": (yx + 0.5).tolist(), "size": [1024, 1024], "fov_deg": 20.0}) for yx in fields]
     script = Path(__file__).with_name("plate_solve.py")
     solved = subprocess.run(
-        [solver_python, script], input="\n".join(lines), capture_output=True, text=True, timeout=120, check=True
+        [solver_python, script], input="\n".join(lines), capture_output=True, text=True, timeout=PATIENCE_S, check=True
     )
     return [json.loads(line) for line in solved.stdout.splitlines()]
 

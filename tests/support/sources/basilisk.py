@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from tests.support.waiting import PATIENCE_S
+
 SCRIPT = Path(__file__).with_name("basilisk_run.py")
 
 
@@ -24,7 +26,7 @@ class Basilisk:
 
     def run(self, code: int = 0) -> str:
         """Let it go, wait for its end with that exit code; what it said."""
-        self._process.communicate("go\n", timeout=60)
+        self._process.communicate("go\n", timeout=PATIENCE_S)
         assert self._process.returncode == code, self._said.read_text()
         return self._said.read_text()
 

@@ -6,6 +6,9 @@ import contextlib
 import socket
 import struct
 
+from tests.support.waiting import PATIENCE_S
+
+SILENT_S = 5.0  # the other side may say nothing
 GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"NULL".ljust(20, b"\0") + bytes(32)
 
 
@@ -15,11 +18,11 @@ def greeted(port: int, kind: bytes = b"PUB") -> socket.socket:
     ready = b"\x05READY" + b"\x0bSocket-Type" + struct.pack(">I", len(kind)) + kind
     connection.sendall(GREETING + b"\x04" + bytes([len(ready)]) + ready)
     with contextlib.suppress(TimeoutError):  # a message before the other's READY is against the protocol
-        connection.settimeout(5.0)
+        connection.settimeout(SILENT_S)
         said = b""
         while len(said) < 66 or len(said) < 66 + said[65]:
             said += connection.recv(1024) or b"closed" * 100
-    connection.settimeout(30.0)
+    connection.settimeout(PATIENCE_S)
     return connection
 
 

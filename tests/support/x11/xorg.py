@@ -11,6 +11,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from tests.support.waiting import PATIENCE_S
+
 SERVER_CONFIG = """
 Section "ServerFlags"
   Option "AutoAddDevices" "false"
@@ -57,7 +59,9 @@ class Xorg:
 
     def xrandr(self, *words: str) -> str:
         """What xrandr says to these words."""
-        result = subprocess.run(["xrandr", *words], env=self.env, capture_output=True, text=True, timeout=20, check=False)
+        result = subprocess.run(
+            ["xrandr", *words], env=self.env, capture_output=True, text=True, timeout=PATIENCE_S, check=False
+        )
         assert result.returncode == 0, result.stderr
         if "--output" in words:
             self.xrandr()  # a query makes the driver look at its plugs
@@ -92,4 +96,4 @@ def xorg(folder: Path) -> Iterator[Xorg]:
         yield server
     finally:
         process.terminate()
-        process.wait(timeout=20)
+        process.wait(timeout=PATIENCE_S)

@@ -16,9 +16,9 @@ from hilstar.attitude.wire.links import Arrival
 from hilstar.attitude.wire.packet import AttitudeSample, Event, Packet, Status, TimeReply, TimeRequest, encode
 from hilstar.attitude.wire.protocol import HEALTH_MISSED, HEALTH_REFUSED, HEALTH_STALE
 from hilstar.units import NS_PER_MS, NS_PER_S
+from tests.support.waiting import PATIENCE_S
 
 NOW_NS = 10**12
-PATIENCE_S = 20.0
 SENDER_AHEAD_NS = 7 * NS_PER_S
 
 

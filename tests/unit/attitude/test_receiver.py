@@ -19,12 +19,12 @@ from hilstar.attitude.wire.packet import AttitudeSample, Packet, encode
 from hilstar.notices import Notices
 from hilstar.rotation import from_radec_roll_deg, propagate
 from hilstar.units import NS_PER_MS, NS_PER_S
+from tests.support.waiting import PATIENCE_S
 
 PERIOD_NS = 5 * NS_PER_MS
 ORION = from_radec_roll_deg(84.0, -1.0, 0.0)
 LYRA = from_radec_roll_deg(283.0, 35.0, 30.0)
 STALE_AFTER_NS = 250 * NS_PER_MS
-PATIENCE_S = 20.0
 Q = np.array([1.0, 0.0, 0.0, 0.0])
 
 

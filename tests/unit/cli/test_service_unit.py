@@ -11,6 +11,7 @@ import pytest
 
 from tests.support.benches import SMALL_BENCH
 from tests.support.commands import assert_refused, run_hilstar_here
+from tests.support.waiting import PATIENCE_S
 
 
 @pytest.fixture
@@ -74,5 +75,7 @@ def test_systemd_takes_the_unit(bench, tmp_path, monkeypatch):
         return
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     path = tmp_path / "config" / "systemd" / "user" / "hilstar-room7.service"
-    verified = subprocess.run([analyze, "--user", "verify", str(path)], capture_output=True, text=True, timeout=30, check=False)
+    verified = subprocess.run(
+        [analyze, "--user", "verify", str(path)], capture_output=True, text=True, timeout=PATIENCE_S, check=False
+    )
     assert "hilstar-room7" not in verified.stderr, verified.stderr

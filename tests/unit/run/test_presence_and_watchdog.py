@@ -12,6 +12,7 @@ from hilstar.notices import Notices
 from hilstar.run.presence import AttitudeWatch
 from hilstar.run.watchdog import FrameWatch
 from tests.support.fake_clock import FakeClock
+from tests.support.waiting import PATIENCE_S
 
 PERIOD_NS = 16_666_667
 FRESH = Attitude(np.array([1.0, 0.0, 0.0, 0.0]), 5_000_000, False)
@@ -90,5 +91,5 @@ def test_a_frame_that_hangs_is_told_once_with_its_stage_while_it_hangs():
         watch.begin(7)
         watch.enter("swap")
         clock.work(2e9)
-        assert told.wait(30)
+        assert told.wait(PATIENCE_S)
     assert lines == ["frame 7 hangs in its stage swap since 2.0 s"]

@@ -12,6 +12,7 @@ import pytest
 from hilstar.attitude.wire.cobs import framed
 from hilstar.attitude.wire.packet import AttitudeSample, TimeReply, decode, encode
 from tests.support.benches import ROOT
+from tests.support.waiting import PATIENCE_S
 
 FOLDER = ROOT / "firmware_protocol"
 VECTORS = json.loads((FOLDER / "vectors.json").read_text())
@@ -27,7 +28,7 @@ def driver(tmp_path_factory) -> Path:
     target = tmp_path_factory.mktemp("cpp") / "driver"
     source = Path(__file__).parent / "cpp_driver.cpp"
     command = [*COMPILER, *SANITIZERS, "-I", FOLDER, source, "-o", target]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    result = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
     assert (result.returncode, result.stderr) == (0, "")
     return target
 

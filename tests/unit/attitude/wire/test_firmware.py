@@ -18,6 +18,7 @@ from cobs import cobs
 from hilstar.attitude.wire.cobs import DELIMITER, MAX_FRAME_BYTES, frame
 from hilstar.attitude.wire.packet import TimeRequest
 from tests.support.benches import ROOT
+from tests.support.waiting import PATIENCE_S
 
 FOLDER = ROOT / "firmware_protocol"
 VECTORS = json.loads((FOLDER / "vectors.json").read_text())
@@ -55,7 +56,7 @@ int l(hilstar_decoder *decoder, uint8_t byte) { return hilstar_push(decoder, byt
 
 def compiled(command: list[str], source: Path, target: Path, *more: str) -> Path:
     line = [*command, "-I", str(FOLDER), str(source), "-o", str(target), *more]
-    result = subprocess.run(line, capture_output=True, text=True, timeout=120, check=False)
+    result = subprocess.run(line, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
     assert result.returncode == 0, result.stderr
     assert result.stderr == ""
     return target
@@ -64,7 +65,7 @@ def compiled(command: list[str], source: Path, target: Path, *more: str) -> Path
 def driven(driver: Path, lines: list[str]) -> list[str]:
     """The driver's answers, one a line."""
     text = "".join(line + "\n" for line in lines)
-    result = subprocess.run([str(driver)], input=text, capture_output=True, text=True, timeout=300, check=False)
+    result = subprocess.run([str(driver)], input=text, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
     assert result.returncode == 0, result.stderr[-2000:]
     answers = result.stdout.splitlines()
     assert len(answers) == len(lines)
@@ -263,7 +264,7 @@ def code_bytes(tmp_path: Path, compiler: list[str], size: str) -> int:
     source = tmp_path / "every.c"
     source.write_text(EVERY_FUNCTION)
     target = compiled([*compiler, "-std=c99", *STRICT, "-Os", "-c"], source, tmp_path / "every.o")
-    table = subprocess.run([size, str(target)], capture_output=True, text=True, timeout=30, check=True).stdout
+    table = subprocess.run([size, str(target)], capture_output=True, text=True, timeout=PATIENCE_S, check=True).stdout
     text, data, bss, *_ = (int(word) for word in table.splitlines()[1].split()[:3])
     assert data == bss == 0
     return text

@@ -21,6 +21,7 @@ from hilstar.attitude.wire.cobs import DELIMITER, StreamDecoder, frame
 from hilstar.attitude.wire.packet import MESSAGE_REASONS, AttitudeSample, Refusal, decode, encode
 from hilstar.rotation import from_radec_roll_deg
 from tests.support.benches import ROOT
+from tests.support.waiting import PATIENCE_S
 
 FOLDER = ROOT / "firmware_protocol"
 VECTORS = json.loads((FOLDER / "vectors.json").read_text())
@@ -73,7 +74,7 @@ def events(stream: bytes) -> list:
 
 def regenerated(folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, str(folder / "firmware_protocol" / "generate.py"), *options]
-    return subprocess.run(command, capture_output=True, text=True, timeout=30, check=False)
+    return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
 
 
 @pytest.fixture

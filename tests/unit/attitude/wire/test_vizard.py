@@ -29,6 +29,7 @@ from hilstar.notices import Notices
 from hilstar.rotation import to_radec_roll_deg
 from hilstar.units import NS_PER_S
 from tests.support.sources.viz_message import craft, viz_message
+from tests.support.waiting import PATIENCE_S
 
 ROUNDING_RAD = 1e-14  # some products of float64 rotations
 DIGITS_DEG = np.degrees(4e-7)  # seven digits of each MRP, and the angle is four times its change
@@ -375,12 +376,12 @@ def test_each_request_has_one_answer_whatever_it_asks() -> None:
             ([b""], [b"ERROR"]),
         ):
             basilisk.send_multipart(request)
-            asked = link.receive(5000)
+            asked = link.receive(PATIENCE_S * 1000)
             if isinstance(asked, Step):
                 link.answer_step(isinstance(asked.event, AttitudeSample))
             elif isinstance(asked, ImageRequest):
                 assert asked.camera == 7
                 link.answer_image(b"png")
-            assert basilisk.poll(5000), request
+            assert basilisk.poll(PATIENCE_S * 1000), request
             assert basilisk.recv_multipart() == answer
     assert notices.counts()["unknown-request"] == 3

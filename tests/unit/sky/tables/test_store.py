@@ -12,6 +12,7 @@ import pytest
 from hilstar.sky.catalog import column_names
 from hilstar.sky.tables.star_table import Choice, choose_catalog
 from hilstar.sky.tables.store import KEPT_FILES
+from tests.support.waiting import PATIENCE_S
 
 TEXT = "ra,dec,vmag,b-v\n1,2,3,0.1\n4,5,6,\n7,8,9,0.5\n"
 
@@ -116,7 +117,7 @@ def test_two_processes_at_once_both_have_the_catalogue(table):
         "print(len(choose_catalog(Choice(Path(sys.argv[1])))))"
     )
     runs = [subprocess.Popen([sys.executable, "-c", program, table], stdout=subprocess.PIPE) for _ in range(2)]
-    counts = [run.communicate(timeout=60)[0].strip() for run in runs]
+    counts = [run.communicate(timeout=PATIENCE_S)[0].strip() for run in runs]
     assert counts == [b"2"] * 2
     (path,) = stored(table)
     rewritten(path, v_mag=np.array([1.0, 2.0]))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 from matplotlib.figure import Figure
 
@@ -12,6 +14,8 @@ from hilstar.study.speed.result import Machine, Result, Spread, Timing
 from hilstar.tracker.centroiders import FAMILY
 from hilstar.twin.budget import budget
 from hilstar.twin.budget_report import write_report
+from tests.support.figures import assert_legible
+from tests.support.pictures import assert_drawn
 
 
 @pytest.fixture
@@ -26,6 +30,83 @@ def figures(monkeypatch) -> list[Figure]:
     monkeypatch.setattr(charts, "save", keep)
     monkeypatch.setattr(benchmark_report, "save", keep)
     return kept
+
+
+@pytest.fixture
+def two_lines(tmp_path):
+    """A chart that is as it should be, after what a test does to it."""
+
+    def draw(spoil=lambda axes: None) -> Figure:
+        with charts.chart(tmp_path / "lines", "One line is twice the other", note="Of nothing.") as (axes,):
+            for name, k in (("once", 1), ("twice", 2)):
+                axes.plot([1, 10, 100], [k, 10 * k, 100 * k], label=name)
+            axes.set(xscale="log", yscale="log", xlabel="time [s]", ylabel="place [m]")
+            charts.label_ends(axes)
+            spoil(axes)
+        return axes.figure
+
+    return draw
+
+
+def test_a_chart_is_written_for_light_and_dark_pages(two_lines, tmp_path):
+    two_lines()
+    text = (tmp_path / "lines.svg").read_text()
+    light, dark = text.split("prefers-color-scheme: dark", 1)[0], text
+    used = set(re.findall(r"(?:fill|stroke): (#[0-9a-f]{6})", text.split("</style>", 1)[1]))
+    assert {charts.BLUE, charts.ORANGE, charts.INK, charts.PAPER} <= used <= set(charts.DARK)
+    for colour in used:
+        assert f'[style*="fill: {colour}"]{{fill:{charts.DARK[colour]}!important}}' in dark
+        assert charts.DARK[colour] not in light
+    assert "<dc:date>" not in text
+    two_lines()
+    assert (tmp_path / "lines.svg").read_text() == text
+    assert_drawn(tmp_path / "lines.png")
+
+
+@pytest.mark.parametrize("paper", [charts.PAPER, charts.DARK[charts.PAPER]])
+def test_colours_stand_out_on_both_pages(paper):
+    """WCAG's contrast: 4.5 of text, which every colour may be."""
+
+    def light(colour: str) -> float:
+        parts = [int(colour[k : k + 2], 16) / 255 for k in (1, 3, 5)]
+        return sum(
+            w * (c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4)
+            for w, c in zip((0.2126, 0.7152, 0.0722), parts, strict=True)
+        )
+
+    for each, dark in charts.DARK.items():
+        if each not in (charts.GRID, charts.PAPER):
+            pair = sorted((light(each if paper == charts.PAPER else dark), light(paper)))
+            assert (pair[1] + 0.05) / (pair[0] + 0.05) >= 4.5, (each, paper)
+
+
+def test_the_looks_of_a_chart_are_looked_at(two_lines):
+    assert_legible(two_lines())
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda axes: axes.annotate("here", (0.01, 0.5), xycoords="figure fraction", color=charts.INK), "lies over"),
+        (lambda axes: axes.annotate("far", (0.99, 0.4), xycoords="figure fraction"), "leaves the canvas"),
+        (lambda axes: axes.text(2, 100, "small", fontsize=7), "px high"),
+        (lambda axes: axes.plot([1, 2], [3, 4], color=charts.RED), "nothing names"),
+        (lambda axes: axes.plot([1, 2], [3, 4], color="C0", label="red") and axes.legend(loc="lower left"), "under the legend"),
+        (lambda axes: axes.set_ylim(1, 100), "leaves its axes"),
+        (lambda axes: axes.plot([1, 2], [3, 4], color="tab:red", label="a red") and axes.legend(), "has no dark one"),
+        (lambda axes: axes.figure.suptitle("a\nb\nc"), "a\nb"),
+    ],
+)
+def test_what_is_wrong_with_a_chart_is_seen(two_lines, spoil, said):
+    with pytest.raises(AssertionError, match=said):
+        assert_legible(two_lines(spoil))
+
+
+def test_figures_of_an_axis_are_a_persons():
+    assert [charts.plain(v) for v in (3000, 0.5, 0.0001, 1e-5, 3e-6, 2e6, 0)] == [
+        *("3000", "0.5", "0.0001", "10⁻⁵", "3·10⁻⁶", "2·10⁶", "0")
+    ]
+    assert [charts.capital(text) for text in ("rate [Hz]", "x [px]", "V [mag]")] == ["Rate [Hz]", "x [px]", "V [mag]"]
 
 
 def outcome(frame_ms: float, worst_mag: float = 0.01) -> Outcome:

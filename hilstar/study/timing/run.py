@@ -14,7 +14,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from hilstar.charts import chart, plain_ticks, write_records
+from hilstar.charts import chart, label_ends, plain_ticks, write_records
 from hilstar.scene.camera import Camera
 from hilstar.study.shared.lone_stars import Isolation, lone_windows, star_error
 from hilstar.study.timing.beat import beat_findings, measure_beat
@@ -79,12 +79,7 @@ def run(directory: Path, quick: bool = False) -> list[str]:
     outcomes = measure(quick)
     write_records(directory / "timing.csv", outcomes)
     at = {(o.way, o.rate_deg_s): o for o in outcomes}
-    plain, best = (at[way, 2.0] for way in ("prediction", "+ smear"))
-    finding = (
-        f"At 2 deg/s on a 60 Hz panel, with an exposure of 0.1 s, star positions are off by {plain.rms_arcsec:.0f} arcsec rms "
-        f"with prediction alone, and by {best.rms_arcsec:.2g} with scan-out and smear compensated"
-    )
-    _draw(directory / "timing.png", finding, outcomes)
+    finding = draw(directory / "timing", outcomes)
     return [finding, *(_line(at[way, 2.0]) for way in WAYS), *beat_findings(measure_beat(quick), directory)]
 
 
@@ -93,16 +88,26 @@ def _line(outcome: Outcome) -> str:
     return f"{outcome.way}: {errors}, {outcome.draw_ms:.1f} ms a frame ({outcome.stars} stars)"
 
 
-def _draw(path: Path, finding: str, outcomes: list[Outcome]) -> None:
-    with chart(path, finding, panels=2) as (error, cost):
+def draw(path: Path, outcomes: list[Outcome]) -> str:
+    """The chart of the outcomes; its finding."""
+    at = {(o.way, o.rate_deg_s): o for o in outcomes}
+    plain, best = (at[way, QUICK_RATES_DEG_S[0]] for way in ("prediction", "+ smear"))
+    finding = (
+        f"At 2 deg/s star positions are off by {plain.rms_arcsec:.0f} arcsec rms with prediction alone,"
+        f" and by {best.rms_arcsec:.2g} with scan-out and smear compensated"
+    )
+    note = "60 Hz panel that lights row by row and holds; exposure 0.1 s; 10 bits, exact; each way adds to the one above it."
+    with chart(path, finding, panels=2, note=note, heights=(1.5, 1)) as (error, cost):
         for way, marker in zip(WAYS, "osd^", strict=True):
             mine = [o for o in outcomes if o.way == way]
             rates = [o.rate_deg_s for o in mine]
             error.loglog(rates, [o.rms_arcsec for o in mine], marker=marker, label=way)
             cost.semilogx(rates, [o.draw_ms for o in mine], marker=marker, label=way)
-        error.set_ylabel("error of star positions [arcsec rms]")
-        error.legend(loc="upper left")
-        cost.set_ylabel("time to draw a frame [ms]")
+        error.set_ylabel("error of star positions, rms [arcsec]")
+        cost.set_ylabel("time of a frame [ms]")
         cost.set_ylim(bottom=0)
         cost.set_xlabel("slew rate [deg/s]")
         plain_ticks(cost.xaxis, sorted({o.rate_deg_s for o in outcomes}))
+        for axes in (error, cost):
+            label_ends(axes)
+    return finding

@@ -1,0 +1,129 @@
+"""What every chart has to be, whatever its data: read at the width of its page, with nothing over anything else."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Iterator
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+from matplotlib.transforms import Bbox
+
+from hilstar import charts
+
+PAGE_PX = 700  # the narrowest column of the documentation that a figure is read in
+MIN_TEXT_PX = 11.0  # at that width
+MAX_TITLE_LINES = 2
+TOUCH_PX = 1.5  # boxes are whole pixels of a hinted font: this much is no overlap
+PLAIN = {charts.INK, charts.MUTED, charts.GRID, charts.PAPER}  # of axes and of what a text beside it names
+
+
+def assert_legible(figure: Figure) -> None:
+    """No text overlaps another, leaves the canvas or is small; no curve leaves its axes or lies under a legend."""
+    figure.draw_without_rendering()
+    assert figure.get_suptitle(), "a chart has no finding"
+    assert len(figure.get_suptitle().splitlines()) <= MAX_TITLE_LINES, figure.get_suptitle()
+    texts = [(text, box(text)) for text in seen(figure)]
+    for text, extent in texts:
+        words, inside = text.get_text(), Bbox.from_bounds(*figure.bbox.bounds).padded(TOUCH_PX)
+        assert inside.containsx(extent.x0) and inside.containsx(extent.x1), f"{words!r} leaves the canvas"
+        assert inside.containsy(extent.y0) and inside.containsy(extent.y1), f"{words!r} leaves the canvas"
+        size_px = text.get_fontsize() / 72 * PAGE_PX / figure.get_figwidth()
+        assert size_px >= MIN_TEXT_PX, f"{words!r} is {size_px:.1f} px high"
+        assert not re.search(r"\de[+-]\d\d", words), f"{words!r} is a computer's figure"
+    for (one, a), (other, b) in itertools.combinations(texts, 2):
+        assert not touch(a, b), f"{one.get_text()!r} lies over {other.get_text()!r}"
+    for axes in figure.axes:
+        assert_capital(axes)
+        assert_lines(axes, named_colours(figure))
+
+
+def seen(figure: Figure) -> Iterator[Text]:
+    """Every text that is drawn."""
+    for text in figure.findobj(Text):
+        if (
+            text.get_visible()
+            and text.get_text().strip()
+            and (text.axes is None or text.axes.get_visible())
+            and ticks_shown(text)
+        ):
+            yield text  # type: ignore[misc]
+
+
+def ticks_shown(text: Text) -> bool:
+    """Whether a text is no label of a tick beyond its axis's limits, which has a place and is not drawn."""
+    axes = text.axes
+    for axis in () if axes is None else (axes.xaxis, axes.yaxis):
+        low, high = sorted(axis.get_view_interval())
+        for tick in (*axis.get_major_ticks(), *axis.get_minor_ticks()):
+            if text in (tick.label1, tick.label2):
+                slack = 1e-9 * (high - low)
+                return bool(tick.get_visible() and low - slack <= tick.get_loc() <= high + slack)
+    return True
+
+
+def box(text: Text) -> Bbox:
+    """The box of a text alone, without its arrow."""
+    return Text.get_window_extent(text)
+
+
+def touch(a: Bbox, b: Bbox) -> bool:
+    """Whether two boxes lie over each other."""
+    return min(a.x1, b.x1) - max(a.x0, b.x0) > TOUCH_PX and min(a.y1, b.y1) - max(a.y0, b.y0) > TOUCH_PX
+
+
+def assert_capital(axes: Axes) -> None:
+    """Titles and labels begin alike."""
+    for words in (axes.get_xlabel(), axes.get_ylabel(), axes.get_title(loc="left"), axes.get_title()):
+        assert words == charts.capital(words), words
+
+
+def named_colours(figure: Figure) -> set[str]:
+    """Colours that a text has, or a legend names."""
+    found = {to_hex(text.get_color()) for text in seen(figure)}
+    for legend in legends(figure):
+        found |= {to_hex(colour) for handle in legend.legend_handles for colour in handle_colours(handle)}
+    return found
+
+
+def legends(figure: Figure) -> list:
+    """Every legend, of the figure and of its axes."""
+    return [*figure.legends, *(axes.get_legend() for axes in figure.axes if axes.get_legend() is not None)]
+
+
+def handle_colours(handle) -> Iterator:
+    """The colours of one entry of a legend."""
+    for name in ("get_color", "get_facecolor", "get_edgecolor", "get_markeredgecolor"):
+        if hasattr(handle, name):
+            colour = getattr(handle, name)()
+            yield from colour if isinstance(colour, np.ndarray) and colour.ndim == 2 else [colour]
+
+
+def assert_lines(axes: Axes, named: set[str]) -> None:
+    """Each line in view, and of a colour that something names; no legend over one."""
+    legend = axes.get_legend()
+    over = None if legend is None else legend.get_window_extent()
+    for line in axes.get_lines():
+        x_is_data, y_is_data = line.get_transform().contains_branch_seperately(axes.transData)
+        drawn = line.get_transform().transform(np.asarray(line.get_xydata(), dtype=float))
+        drawn = drawn[np.isfinite(drawn).all(axis=1)]
+        if not len(drawn) or not line.get_visible():
+            continue
+        colour = to_hex(line.get_color())
+        assert colour in PLAIN or colour in named, f"nothing names the line {line.get_label()!r} in {colour}"
+        assert line.get_label() == "" or colour in charts.DARK, (
+            f"{line.get_label()!r} has the colour {colour}, which has no dark one"
+        )
+        if x_is_data and y_is_data and line.get_gid() != "cut":
+            low, high = axes.bbox.y0 - TOUCH_PX, axes.bbox.y1 + TOUCH_PX
+            assert (drawn[:, 1] >= low).all() and (drawn[:, 1] <= high).all(), f"{line.get_label()!r} leaves its axes"
+        if over is not None:
+            steps = np.linspace(0, 1, 50)[:, None]
+            if line.get_linestyle() not in ("None", "none", "") and len(drawn) < 500:
+                drawn = np.concatenate([a + steps * (b - a) for a, b in itertools.pairwise(drawn)] or [drawn])
+            inside = (drawn > [over.x0, over.y0]).all(axis=1) & (drawn < [over.x1, over.y1]).all(axis=1)
+            assert not inside.any(), f"{line.get_label()!r} lies under the legend"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar import __version__
-from hilstar.arrays import FloatArray
+from hilstar.arrays import Float32Array, FloatArray
 from hilstar.bench.frame import Bench, Frame
 from hilstar.bench.world_coordinates import world_coordinates
 from hilstar.files import written
@@ -104,14 +105,26 @@ def write_preview_png(path: Path, codes: Codes) -> None:
     It is stretched to the brightest pixel of the frame.
     """
     from PIL import Image
-    from scipy.ndimage import gaussian_filter, maximum_filter
+    from scipy.ndimage import gaussian_filter
 
-    signal = codes.astype(np.float32) / max(int(codes.max()), 1)
-    picture = np.zeros_like(signal)
-    reach = np.arange(-PREVIEW_RADIUS_PX, PREVIEW_RADIUS_PX + 1)
-    for radius in range(1, PREVIEW_RADIUS_PX + 1):
-        bright = np.where(signal >= ((radius - 1) / PREVIEW_RADIUS_PX) ** 2, signal, 0)
-        disc = np.hypot(*np.meshgrid(reach, reach)) <= radius
-        picture = np.maximum(picture, maximum_filter(bright, footprint=disc))
-    smooth = gaussian_filter(picture**PREVIEW_POWER, PREVIEW_BLUR_PX)
+    signal = codes.astype(np.float32) / np.float32(max(int(codes.max()), 1))
+    smooth = gaussian_filter(_discs(signal) ** PREVIEW_POWER, PREVIEW_BLUR_PX)
     written(path, lambda part: Image.fromarray((255 * np.clip(smooth, 0, 1)).astype(np.uint8)).save(part, "PNG"))
+
+
+def _discs(signal: Float32Array) -> Float32Array:
+    """Each pixel of (height, width), 0 to 1, as a disc of its value; the brightest of those that overlap.
+
+    Only lit pixels are looked at, of which a frame of stars has few.
+    """
+    edge, reach = PREVIEW_RADIUS_PX, range(-PREVIEW_RADIUS_PX, PREVIEW_RADIUS_PX + 1)
+    picture = np.zeros_like(signal, shape=(signal.shape[0] + 2 * edge, signal.shape[1] + 2 * edge))
+    row, column = np.nonzero(signal)
+    value = signal[row, column]
+    for down in reach:
+        for right in reach:
+            radius = max(1, math.ceil(math.hypot(down, right)))
+            if radius <= PREVIEW_RADIUS_PX:
+                seen = value >= ((radius - 1) / PREVIEW_RADIUS_PX) ** 2
+                np.maximum.at(picture, (row[seen] + edge + down, column[seen] + edge + right), value[seen])
+    return picture[edge:-edge, edge:-edge]

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import shlex
 import subprocess
 import sys
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Self
 
 import msgspec
 import numpy as np
@@ -19,9 +21,9 @@ from hilstar.attitude.wire.zmq_stream import ZmqReceiver
 from hilstar.bench.build import load
 from hilstar.bench.frame import Bench
 from hilstar.bench.frame_files import write_codes_png, write_preview_png
+from hilstar.errors import MachineError
 from hilstar.files import make_directory
 from hilstar.monitor.response import Codes
-from hilstar.process.interrupts import caught
 from hilstar.resources import resource_path
 from hilstar.rotation import from_radec_roll_deg, propagate, rate_between_rad_s, slerp
 from hilstar.run.loop import Limit
@@ -37,23 +39,30 @@ WAYPOINTS_DEG = ((84.057, -1.2, 0.0), (101.287, -16.716, 25.0), (114.825, 5.225,
 SETTLE_FRACTION = 0.15  # of each leg, at rest at its end
 JITTER_ARCSEC = (1.5, 1.5, 6.0)  # 1 sigma about cam x, y, z: a good wheel-controlled satellite
 JITTER_SECONDS = 0.4  # its correlation time
+REST_S = 5.0  # at the slew's end: a busy machine's loop may end later than its sender's slew
+PICTURES_AT = (0.0625, 0.25, 0.5, 0.9375)  # of the run
+LISTENER_WITHIN_S = 120.0
 
 
 @dataclass(frozen=True, slots=True)
 class Demo:
-    """The result of the demo: its summary and the pictures that it wrote."""
+    """The result of the demo: its summary, and the codes of a few frames by their numbers, of so many bits."""
 
     summary: RunSummary
-    pictures: list[Path]
+    kept: dict[int, Codes]
+    bits: int
 
 
 def slew_samples(duration_s: float, rng: np.random.Generator) -> list[AttitudeSample]:
-    """A rest-to-rest slew through WAYPOINTS_DEG at SEND_HZ, quintic in angle, with correlated pointing jitter."""
-    count = round(duration_s * SEND_HZ) + 1
+    """A rest-to-rest slew through WAYPOINTS_DEG at SEND_HZ, then REST_S at rest.
+
+    It is quintic in angle, with correlated pointing jitter.
+    """
+    count = round((duration_s + REST_S) * SEND_HZ) + 1
     times_s = np.arange(count) / SEND_HZ
     jitter = _jitter_rad(count, rng)
     points = [from_radec_roll_deg(*waypoint) for waypoint in WAYPOINTS_DEG]
-    attitudes = [propagate(_on_path(points, t / duration_s), jitter[k], -1.0) for k, t in enumerate(times_s)]
+    attitudes = [propagate(_on_path(points, min(t / duration_s, 1.0)), jitter[k], -1.0) for k, t in enumerate(times_s)]
     samples = []
     for k, q in enumerate(attitudes):
         before, after = attitudes[max(k - 1, 0)], attitudes[min(k + 1, count - 1)]
@@ -91,10 +100,10 @@ Watching = Callable[[Bench, str], AbstractContextManager[tuple[FrameSink, Outlet
 
 
 def run_demo(directory: Path, duration_s: float, rng: np.random.Generator, watching: Watching) -> Demo:
-    """Stream a slew from a process of its own through a loopback socket, serve it, and write a few frames.
+    """Stream a slew from a process of its own through a loopback socket, and serve it.
 
-    `watching` opens, for a bench and its endpoint, what sees every frame and who follows the run. Raises InputError or
-    MachineError.
+    The sender begins once the loop has drawn its first frame, and the run once an attitude has come. `watching` opens, for a
+    bench and its endpoint, what sees every frame and who follows the run. Raises InputError or MachineError.
     """
     make_directory(directory)
     log_path = directory / SLEW_LOG
@@ -102,29 +111,55 @@ def run_demo(directory: Path, duration_s: float, rng: np.random.Generator, watch
     with (
         load(resource_path("configs", "demo.toml")) as bench,
         ZmqApart(ZmqReceiver(bench.config.attitude.address, bind=True)) as link,
+        _Sender(["send", str(log_path), "--to", link.endpoint, "--connect", "--wait", f"{LISTENER_WITHIN_S:g}"]) as sender,
         watching(bench, link.endpoint) as (watch, outlet),
     ):
         frame_count = round(duration_s * bench.config.monitor.refresh_hz)
-        wanted = {int(frame_count * part) for part in (0.0625, 0.25, 0.5, 0.9375)}
+        wanted = {int(frame_count * part) for part in PICTURES_AT}
         kept: dict[int, Codes] = {}
 
         def sink(shown: Shown) -> None:
-            if wanted and shown.number >= min(wanted):
+            if shown.missing:
+                sender.tend()
+            elif wanted and shown.number >= min(wanted):
                 wanted.remove(min(wanted))
                 kept[shown.number] = shown.drawn.levels.copy()
             watch(shown)
 
-        command = [sys.executable, "-m", "hilstar", "send", str(log_path), "--to", link.endpoint, "--connect"]
-        with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as sender:
-            try:
-                link.wait_for_message(timeout_ms=20_000)
-                summary = serve(bench, link, Limit(slots=frame_count), sink, outlet)
-            finally:
-                sender.terminate()
-        pictures = []
-        for number, codes in kept.items() if caught() is None else ():  # after Ctrl-C no pictures are wanted
-            exact, preview = (directory / f"frame_{number:04d}_{kind}.png" for kind in ("codes", "preview"))
-            write_codes_png(exact, codes, bench.config.monitor.bits)
-            write_preview_png(preview, codes)
-            pictures += [exact, preview]
-    return Demo(summary, pictures)
+        link.await_ready()
+        summary = serve(bench, link, Limit(slots=frame_count, from_first_attitude=True), sink, outlet)
+    return Demo(summary, kept, bench.config.monitor.bits)
+
+
+class _Sender:
+    """A process of hilstar's that begins when it is first tended, and ends with this."""
+
+    def __init__(self, arguments: list[str]) -> None:
+        self._command = [sys.executable, "-m", "hilstar", *arguments]
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def tend(self) -> None:
+        """Begin it. Raises MachineError where it has ended."""
+        if self._process is None:
+            self._process = subprocess.Popen(self._command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        elif self._process.poll() is not None:
+            command = shlex.join(["hilstar", *self._command[3:]])
+            raise MachineError(f"the demo's sender ended before an attitude came; to see why, run: {command}")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        if self._process is not None:
+            self._process.terminate()
+            self._process.wait()
+
+
+def write_pictures(directory: Path, demo: Demo, advance: Callable[[int], None]) -> None:
+    """Two pictures of each frame that was kept: its codes, and a preview; `advance` is told how many are written."""
+    for written, (number, codes) in enumerate(demo.kept.items()):
+        exact, preview = (directory / f"frame_{number:04d}_{kind}.png" for kind in ("codes", "preview"))
+        write_codes_png(exact, codes, demo.bits)
+        advance(2 * written + 1)
+        write_preview_png(preview, codes)
+        advance(2 * written + 2)

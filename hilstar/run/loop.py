@@ -33,10 +33,14 @@ GIVEN_UP_PERIODS = 2.0
 
 @dataclass(frozen=True, slots=True)
 class Limit:
-    """When a paced run ends: after a number of refresh periods, or of frames drawn."""
+    """When a paced run ends: after a number of refresh periods, or of frames drawn.
+
+    With `from_first_attitude` a live run draws blank frames until an attitude has come, and counts from then on.
+    """
 
     slots: float = math.inf
     frames: float = math.inf
+    from_first_attitude: bool = False
 
 
 def nothing_on_frame(number: int, frame_ns: int) -> None:
@@ -205,6 +209,15 @@ class FrameLoop:
                     return
                 gave_up = draw_slot(moment) is None
                 last = moment
+
+    def lead_in(self, draw_blank: Callable[[Moment], object], over: Callable[[], bool]) -> None:
+        """Call `draw_blank` at each of the pacer's moments until `over` is true; none of these frames is counted."""
+        with self.pacer.steady():
+            for moment in self.pacer.moments():
+                if over() or self.pacer.clock.wait_until(moment.begin_ns, self.stop):
+                    break
+                draw_blank(moment)
+        self.tally = RunTally()
 
     def _goes_on(self, slot: int, limit: Limit) -> bool:
         return slot < limit.slots and self.tally.frames < limit.frames and not self.stop.is_set()

@@ -157,6 +157,10 @@ def _serve_stream(bench: Bench, link: StreamLink, limit: Limit, loop: FrameLoop,
     outlet.follower(Running(loop, receiver.counts, receiver.clock_summary))
     statuses = StatusMaker(ledger)
 
+    def draw_blank(moment: Moment) -> None:
+        receiver.tend()
+        loop.draw(moment.slot, receiver.clock.to_sender_ns(time.monotonic_ns()), None, moment)
+
     def draw_slot(moment: Moment) -> Shown | None:
         receiver.tend()
         t_ns = receiver.clock.to_sender_ns(moment.light_if_begun_at(time.monotonic_ns()))
@@ -174,6 +178,8 @@ def _serve_stream(bench: Bench, link: StreamLink, limit: Limit, loop: FrameLoop,
     try:
         bench.warm_up()
         receiver.learn()
+        if limit.from_first_attitude:
+            loop.lead_in(draw_blank, lambda: len(timeline) > 0)
         begin_ns = time.monotonic_ns()
         loop.paced(limit, draw_slot)
     finally:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
@@ -13,7 +13,7 @@ from hilstar.cli.options import MAX_SEED, Json
 from hilstar.cli.show.paging import Console, ConsoleName, Control, Token, followed, page_door
 from hilstar.cli.show.running import optional_ledger
 from hilstar.console.run_status import RunStatus, Source
-from hilstar.console.terminal import progress, report
+from hilstar.console.terminal import progress, report, say
 from hilstar.files import check_directory
 from hilstar.notices import Notices
 
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from hilstar.console.feed.door import Door
     from hilstar.run.serve import Outlet
     from hilstar.run.shown import FrameSink
+    from hilstar.run.summary import RunSummary
 
 HZ = 60  # of the demo's bench
 
@@ -36,10 +37,14 @@ def demo(
     console_name: ConsoleName = None,
     as_json: Json = False,
 ) -> None:
-    """The main job in one command: real stars, an attitude streamed over a real ZeroMQ socket, frames out."""
+    """The main job in one command: real stars, an attitude streamed over a real ZeroMQ socket, frames out.
+
+    Where frames show an old sky, because attitudes came too late, the last line says so and the exit code is 1.
+    """
     import numpy as np
 
-    from hilstar.run.demo import run_demo
+    from hilstar.process.interrupts import caught
+    from hilstar.run.demo import run_demo, write_pictures
 
     check_directory("-o", output)
     with page_door(console, control, token, console_name) as door, progress("serving", duration * HZ) as advance:
@@ -48,9 +53,29 @@ def demo(
             return _watching(bench, endpoint, door, control, lambda shown: advance(shown.number + 1))
 
         result = run_demo(output, duration, np.random.default_rng(seed), watching)
+    if result.kept and caught() is None:  # after Ctrl-C no pictures are wanted
+        if not as_json:
+            say(f"writing {len(result.kept)} pictures and their previews to {output}")
+        with progress("writing pictures", 2 * len(result.kept)) as advance:
+            write_pictures(output, result, advance)
     report(result.summary, as_json)
     if not as_json:
         typer.echo(f"{'pictures':20}{output}/frame_*_codes.png (what the monitor gets), _preview.png (stretched)")
+    if result.summary.stale_frames and caught() is None:
+        _refuse_stale(result.summary, as_json)
+
+
+def _refuse_stale(summary: RunSummary, as_json: bool) -> NoReturn:
+    """The last line of a demo whose sky stood still, and exit code 1."""
+    line = (
+        f"{summary.stale_frames} of {summary.frames} frames show an old sky: no attitude came in time; "
+        "the machine is busy, so close other programs and run it again"
+    )
+    if as_json:
+        say(f"hilstar: {line}")
+    else:
+        typer.echo(f"{'stale sky':20}{line}")
+    raise typer.Exit(1)
 
 
 @contextmanager

@@ -134,6 +134,25 @@ def test_a_stopped_run_draws_no_other_frame(tmp_path):
     assert drawn == [0, 1, 2, 3]
 
 
+def test_frames_of_a_lead_in_are_not_counted(tmp_path):
+    clock = FakeClock()
+    shown = []
+    loop = FrameLoop(SlowBench(tmp_path, clock, lambda number: 0), shown.append, ClockPacer(PERIOD_NS, clock))
+    loop.lead_in(lambda moment: loop.draw(moment.slot, 0, None, moment), lambda: len(shown) == 5)
+    assert [frame.missing for frame in shown] == [True] * 5
+    loop.paced(Limit(slots=7), lambda moment: loop.draw(moment.slot, 0, STILL, moment))
+    assert (loop.tally.frames, loop.tally.stale_frames, loop.tally.missed_frames) == (7, 0, 0)
+    assert [frame.number for frame in shown[5:]] == list(range(7))
+
+
+def test_a_stopped_lead_in_ends(tmp_path):
+    clock = FakeClock()
+    loop = FrameLoop(SlowBench(tmp_path, clock, lambda number: 0), pacer=ClockPacer(PERIOD_NS, clock))
+    loop.stop.set()
+    loop.lead_in(lambda moment: pytest.fail("it was stopped"), lambda: False)
+    assert loop.tally.frames == 0
+
+
 @pytest.mark.parametrize(("on_stale", "blank"), [("hold", False), ("blank", True)])
 def test_a_stale_attitude_is_held_or_blank_as_the_bench_file_says(tmp_path, on_stale, blank):
     run = Run(tmp_path, Limit(slots=3), more=f'[attitude]\non_stale = "{on_stale}"\n', attitude=OLD)

@@ -1,0 +1,100 @@
+"""The demo: its sender begins when the loop draws, a sky that stood still is no success, and it has the operator's page too."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+
+import pytest
+
+from hilstar.bench.frame import Bench
+from hilstar.run import demo
+from tests.support.commands import HILSTAR, assert_refused, run_hilstar_here
+from tests.support.pages import live, page_of, picture_of
+from tests.support.servers import Served
+
+pytestmark = pytest.mark.e2e
+
+SECONDS = 1.5
+SLOW_START_S = 2 * SECONDS  # longer than the slew of a demo of SECONDS, which a sender that began before would have ended
+
+
+def run_demo(folder, *options):
+    return run_hilstar_here("demo", "-o", folder / "demo", "--duration", str(SECONDS), *options)
+
+
+def test_the_sender_begins_once_a_frame_is_drawn_however_long_that_takes(tmp_path, monkeypatch):
+    order = []
+    warm_up, draw, popen = Bench.warm_up, Bench.draw_sprites, subprocess.Popen
+
+    def slow(bench: Bench) -> None:
+        time.sleep(SLOW_START_S)
+        warm_up(bench)
+        order.append("warm")
+
+    def noted(bench: Bench, *arguments: object):
+        if "warm" in order:
+            order.append("drawn")
+        return draw(bench, *arguments)
+
+    def begin(command, **options):
+        if "send" in command:
+            order.append("sender")
+        return popen(command, **options)
+
+    monkeypatch.setattr(Bench, "warm_up", slow)
+    monkeypatch.setattr(Bench, "draw_sprites", noted)
+    monkeypatch.setattr(demo.subprocess, "Popen", begin)
+    result = run_demo(tmp_path, "--json")
+    assert order[:3] == ["warm", "drawn", "sender"]
+    summary = json.loads(result.stdout)
+    assert (result.returncode, summary["stale_frames"]) == (0, 0), result.stderr
+    assert summary["frames"] + summary["missed_frames"] == round(SECONDS * 60)
+    assert summary["stars_drawn"]["mean"] > 50  # no blank frame of the lead-in is among them
+    assert len({path.read_bytes() for path in (tmp_path / "demo").glob("*_codes.png")}) == 4
+
+
+def test_a_sky_that_stood_still_is_said_last_and_is_no_success(tmp_path, monkeypatch):
+    """The sender ends after a third of a second."""
+    write = demo.write_log
+    monkeypatch.setattr(demo, "write_log", lambda path, samples: write(path, samples[: round(SECONDS / 5 * demo.SEND_HZ)]))
+    result = run_demo(tmp_path)
+    assert result.returncode == 1
+    last = result.stdout.splitlines()[-1]
+    assert last.startswith("stale sky") and "frames show an old sky" in last and "busy" in last
+    assert "writing 4 pictures" in result.stderr
+    told = run_demo(tmp_path, "--json")
+    assert told.returncode == 1
+    summary = json.loads(told.stdout)
+    said = told.stderr.splitlines()
+    assert f"{summary['stale_frames']} of {summary['frames']} frames show an old sky" in said[-1]
+    assert not any("writing" in line for line in said)
+
+
+def test_a_sender_that_ends_before_an_attitude_came_is_named(tmp_path, monkeypatch):
+    popen = subprocess.Popen
+
+    def fails(command, **options):
+        return popen([sys.executable, "-c", "raise SystemExit(7)"] if "send" in command else command, **options)
+
+    monkeypatch.setattr(demo.subprocess, "Popen", fails)
+    assert_refused(run_demo(tmp_path), 3, "the demo's sender ended before an attitude came", "hilstar send")
+
+
+def test_the_demo_can_be_watched_and_acted_on(tmp_path):
+    command = [*HILSTAR, "demo", "-o", str(tmp_path / "demo"), "--duration", "60", "--console", "127.0.0.1:0", "--control"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            page = page_of(Served(process, 0))
+            with live(page) as link:
+                hello = link.await_message(lambda said: isinstance(said, dict) and "hello" in said)["hello"]
+                link.want(picture=True, hz=8)
+                head, levels = picture_of(link.await_message(lambda said: isinstance(said, bytes)))
+            assert hello["command"] == "hilstar demo" and hello["control"]
+            assert levels.shape == (head["h"], head["w"]) == tuple(reversed(hello["resolution_px"]))
+            assert page.control("mark", "Ada", text="the demo runs")[0] == 200
+        finally:
+            process.terminate()
+            process.communicate()

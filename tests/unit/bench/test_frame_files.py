@@ -1,0 +1,36 @@
+"""Frames as files."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.ndimage import gaussian_filter, maximum_filter
+
+from hilstar.bench.frame_files import PREVIEW_BLUR_PX, PREVIEW_POWER, PREVIEW_RADIUS_PX, write_preview_png
+
+
+def preview_by_filters(codes):
+    """For each radius, a maximum over a disc of all pixels bright enough for it: nine filters of the whole frame."""
+    signal = codes.astype(np.float32) / np.float32(codes.max())
+    picture = np.zeros_like(signal)
+    reach = np.arange(-PREVIEW_RADIUS_PX, PREVIEW_RADIUS_PX + 1)
+    for radius in range(1, PREVIEW_RADIUS_PX + 1):
+        bright = np.where(signal >= ((radius - 1) / PREVIEW_RADIUS_PX) ** 2, signal, 0)
+        disc = np.hypot(*np.meshgrid(reach, reach)) <= radius
+        picture = np.maximum(picture, maximum_filter(bright, footprint=disc))
+    return (255 * np.clip(gaussian_filter(picture**PREVIEW_POWER, PREVIEW_BLUR_PX), 0, 1)).astype(np.uint8)
+
+
+@pytest.mark.parametrize("lit", [0.002, 0.3])
+def test_a_preview_has_a_disc_for_each_lit_pixel_to_the_edges(tmp_path, lit):
+    rng = np.random.default_rng(4)
+    codes = np.where(rng.random((90, 120)) < lit, rng.integers(1, 256, (90, 120)), 0).astype(np.uint8)
+    codes[0, 0] = codes[89, 60] = 255
+    write_preview_png(tmp_path / "preview.png", codes)
+    assert np.array_equal(np.asarray(Image.open(tmp_path / "preview.png")), preview_by_filters(codes))
+
+
+def test_a_preview_of_a_dark_frame_is_dark(tmp_path):
+    write_preview_png(tmp_path / "preview.png", np.zeros((20, 30), np.uint8))
+    assert not np.asarray(Image.open(tmp_path / "preview.png")).any()

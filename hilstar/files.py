@@ -1,6 +1,7 @@
 """Files that are written: complete or not at all, never over an input or another output, and under a name that fits.
 
-A run's ledger is never overwritten unless the user asks for it.
+A run's ledger is never overwritten unless the user asks for it. Temporary names are random and made anew (O_EXCL), and what
+is written goes through the open file, never again by its name: nobody who can write to the folder can turn it elsewhere.
 """
 
 from __future__ import annotations
@@ -8,12 +9,16 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
+import io
 import os
+import secrets
+import shutil
 import stat
+import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from hilstar.errors import InputError, cannot_write
 from hilstar.reading import MAX_TOML_BYTES, MCAP_MAGIC, exists, open_regular, parse_toml, read_text
@@ -22,6 +27,9 @@ LEDGER_MARK = b"bench_sha256"  # in the head of each ledger
 HEAD_BYTES = 16_384
 MAX_DEPTH = 3  # a bench file names a calibration, which names a table
 OVERWRITE = "write another name, or add --overwrite"
+PART_BYTES = 100  # of a file's name in that of its temporary file, which may have 255
+OWNER = ".owner"  # in a temporary folder: the file that its process has locked
+FOLDERS = "hilstar-"  # what temporary folders are called
 
 # The endings of each kind of file; the first is the one that messages suggest.
 FITS = (".fits", ".fit", ".fts")
@@ -60,8 +68,14 @@ def check_outputs(inputs: Iterable[Path | None], outputs: Iterable[Path | None])
         if path is not None and place is not None:
             taken.setdefault(place, path)
     for path in outputs:
-        place = None if path is None else place_of(path)
-        if path is None or place is None:
+        if path is None:
+            continue
+        try:
+            _status(path)
+        except (OSError, ValueError) as error:
+            raise cannot_write(path, error) from error
+        place = place_of(path)
+        if place is None:
             continue
         if place in taken:
             other = "" if taken[place] == path else f", the same file as {taken[place]}"
@@ -96,42 +110,73 @@ def _texts(value: Any) -> Iterator[str]:
 
 
 @contextmanager
-def whole_file(path: Path) -> Iterator[Path]:
-    """A temporary path beside `path` to write to; at the end it replaces `path`, and an error leaves that unchanged.
+def whole_file(path: Path) -> Iterator[IO[bytes]]:
+    """A temporary file beside `path`, open for writing; at the end it replaces `path`, and an error leaves that unchanged.
 
     Devices and pipes are written themselves. Raises InputError where nothing can be written, and for a run's ledger.
     """
     try:
-        with _beside(path) as part:
-            yield part
+        status = _status(path)
+        if status is not None and not stat.S_ISREG(status.st_mode):
+            with path.open("wb") as file:
+                yield file
+            return
+        refuse_ledger(path)
+        with _part_of(Path(os.path.realpath(path)), None if status is None else stat.S_IMODE(status.st_mode)) as file:
+            yield file
     except OSError as error:
         raise cannot_write(path, error) from error
 
 
-@contextmanager
-def _beside(path: Path) -> Iterator[Path]:
-    target = Path(os.path.realpath(path))
-    status = target.stat() if target.exists() else None
-    if status is not None and not stat.S_ISREG(status.st_mode):
-        yield path
-        return
-    refuse_ledger(path)
-    # The ending stays: some libraries choose the format by it.
-    part = target.with_name(f".{target.stem[:100]}.{os.getpid()}.part{target.suffix}")
+def _status(path: Path) -> os.stat_result | None:
+    """That of the file a path leads to, None where there is none yet. Raises OSError for links in a circle."""
     try:
-        yield part
-        if status is not None:
-            part.chmod(stat.S_IMODE(status.st_mode))
-        part.replace(target)
-    finally:
-        with contextlib.suppress(OSError):
-            part.unlink(missing_ok=True)
+        return path.stat()
+    except FileNotFoundError:
+        return None
+
+
+@contextmanager
+def _part_of(target: Path, mode: int | None) -> Iterator[IO[bytes]]:
+    part = _part_path(target)
+    with open(part, "wb", opener=_create) as file:
+        try:
+            yield file
+            file.flush()
+            if mode is not None:
+                os.fchmod(file.fileno(), mode)
+            if not os.path.samestat(os.fstat(file.fileno()), part.lstat()):
+                raise OSError(errno.ESTALE, "its temporary file was replaced while it was written")
+            part.replace(target)
+        except BaseException:
+            with contextlib.suppress(OSError):
+                part.unlink(missing_ok=True)
+            raise
+
+
+def _part_path(target: Path) -> Path:
+    """A temporary name beside a file that nobody can foresee; after a kill it is known by its ending."""
+    name = os.fsdecode(os.fsencode(target.stem)[:PART_BYTES])
+    return target.with_name(f".{name}.{secrets.token_hex(8)}.part{target.suffix}")
+
+
+def _create(path: str | Path, flags: int = os.O_WRONLY | os.O_CREAT) -> int:
+    """A new file, never one that is there, nor one that a link there leads to. Raises OSError."""
+    return os.open(path, flags | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
 
 
 def write_whole(path: Path, data: bytes | str) -> None:
     """Write a file, complete or not at all. Raises InputError."""
-    with whole_file(path) as part:
-        part.write_bytes(data.encode() if isinstance(data, str) else data)
+    with whole_file(path) as file:
+        file.write(data.encode() if isinstance(data, str) else data)
+
+
+@contextmanager
+def as_text(file: IO[bytes]) -> Iterator[IO[str]]:
+    """A file's text (UTF-8), whose lines end as they are written; the file stays open."""
+    text = io.TextIOWrapper(file, encoding="utf-8", newline="")
+    yield text
+    text.detach()
 
 
 def refuse_existing(path: Path | None, overwrite: bool) -> None:
@@ -167,10 +212,9 @@ class NewFile:
             raise cannot_write(path, "it is no file", "choose another place for the ledger")
         made = path
         if exists(path):
-            target = Path(os.path.realpath(path))
-            made = self._part = target.with_name(f".{target.name[:100]}.{os.getpid()}.part")
+            made = self._part = _part_path(Path(os.path.realpath(path)))
         try:
-            self.fd = os.open(made, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
+            self.fd = _create(made)
         except FileExistsError as error:
             raise InputError(f"{path}: is there already; {OVERWRITE}") from error
         except (OSError, ValueError) as error:
@@ -221,10 +265,70 @@ def make_directory(path: Path) -> Path:
     return path
 
 
-def written(path: Path, write: Callable[[Path], object]) -> None:
+def written(path: Path, write: Callable[[IO[bytes]], object]) -> None:
     """Write a file by `write`, complete or not at all; an older file stays until the new one is complete."""
-    with whole_file(path) as part:
-        write(part)
+    with whole_file(path) as file:
+        write(file)
+
+
+def open_lock(path: Path) -> int:
+    """The descriptor of a lock file, made where there is none, and never that of a file which a link there leads to.
+
+    Raises InputError.
+    """
+    try:
+        return os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
+    except (OSError, ValueError) as error:
+        raise cannot_write(path, error) from error
+
+
+@contextmanager
+def temporary_folder(kind: str) -> Iterator[Path]:
+    """A folder of this process's alone, such as /tmp/hilstar-KIND-x1y2z3ab, deleted at the end.
+
+    Where a kill left some, the next process of the same user deletes them.
+    """
+    clear_left()
+    folder, owner = _owned_folder(f"{FOLDERS}{kind}-")
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+        os.close(owner)
+
+
+def _owned_folder(prefix: str) -> tuple[Path, int]:
+    """A new folder, and the descriptor by which its owner holds it: the kernel lets it go however the owner ends."""
+    while True:
+        folder = Path(tempfile.mkdtemp(prefix=prefix))
+        owner = _create(folder / OWNER)
+        fcntl.flock(owner, fcntl.LOCK_EX)
+        if exists(folder / OWNER):
+            return folder, owner
+        os.close(owner)  # somebody cleared it before it was held
+
+
+def clear_left() -> None:
+    """Delete the temporary folders of this user whose owner has ended; no link is followed, and no folder but ours."""
+    for folder in Path(tempfile.gettempdir()).glob(f"{FOLDERS}*"):
+        with contextlib.suppress(OSError):  # it is gone, or no folder, or has no owner's file, or its owner lives
+            _clear(folder)
+
+
+def _clear(folder: Path) -> None:
+    """Delete a folder that nobody holds. Raises OSError for any other."""
+    opened = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+    try:
+        if os.fstat(opened).st_uid != os.geteuid():
+            return
+        owner = os.open(OWNER, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=opened)
+        try:
+            fcntl.flock(owner, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            shutil.rmtree(folder)
+        finally:
+            os.close(owner)
+    finally:
+        os.close(opened)
 
 
 def check_ending(option: str, path: Path | None, endings: tuple[str, ...]) -> None:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import csv
+import gzip
+import io
 import math
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -14,7 +16,7 @@ from hilstar import __version__
 from hilstar.arrays import Float32Array, FloatArray
 from hilstar.bench.frame import Bench, Frame
 from hilstar.bench.world_coordinates import world_coordinates
-from hilstar.files import written
+from hilstar.files import as_text, whole_file, written
 from hilstar.monitor.response import Codes
 from hilstar.rotation import to_radec_roll_deg
 from hilstar.scene.camera import Camera
@@ -37,7 +39,18 @@ def write_frame_fits(path: Path, bench: Bench, frame: Frame) -> None:
     header["NSTARS"] = (len(frame.truth), "stars in view")
     header["CALNAME"] = (bench.calibration.name, "monitor calibration")
     header["CALSHA"] = bench.calibration.sha256
-    written(path, lambda part: fits.PrimaryHDU(frame.linear, header).writeto(part, overwrite=True))
+    write_fits(path, fits.PrimaryHDU(frame.linear, header))
+
+
+def write_fits(path: Path, hdus: Any) -> None:
+    """A FITS file of Astropy's HDU or list of them, packed where the name ends in .gz."""
+    with whole_file(path) as file:
+        if path.suffix != ".gz":
+            hdus.writeto(file)
+            return
+        data = io.BytesIO()
+        hdus.writeto(data)
+        file.write(gzip.compress(data.getbuffer()))
 
 
 def sky_header(bench_hash: str, epoch_jyear: float, q_icrs_to_cam: FloatArray, camera: Camera) -> Any:
@@ -63,15 +76,11 @@ def sky_header(bench_hash: str, epoch_jyear: float, q_icrs_to_cam: FloatArray, c
 
 def write_truth_csv(path: Path, frame: Frame) -> None:
     """One row per star: the columns of TRUTH_DTYPE, brightest first; drawn and clipped are 1 or 0, an unknown figure is nan."""
-
-    def write(part: Path) -> None:
-        with part.open("w", encoding="ascii", newline="") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(frame.truth.dtype.names or ())
-            for row in frame.truth.tolist():
-                writer.writerow([int(v) if isinstance(v, bool) else v for v in row])
-
-    written(path, write)
+    with whole_file(path) as whole, as_text(whole) as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(frame.truth.dtype.names or ())
+        for row in frame.truth.tolist():
+            writer.writerow([int(v) if isinstance(v, bool) else v for v in row])
 
 
 def write_codes_png(path: Path, codes: Codes, bits: int) -> None:
@@ -82,21 +91,20 @@ def write_codes_png(path: Path, codes: Codes, bits: int) -> None:
     image = (
         np.asarray(codes, dtype=np.uint8) if bits <= 8 else np.asarray(codes.astype(np.uint16) << (16 - bits), dtype=np.uint16)
     )
-    written(path, lambda part: _save_png(part, image))
+    written(path, lambda file: _save_png(file, image))
 
 
-def _save_png(path: Path, image: npt.NDArray[Any]) -> None:
+def _save_png(file: IO[bytes], image: npt.NDArray[Any]) -> None:
     if image.ndim == 2 or image.dtype == np.uint8:
         from PIL import Image
 
-        Image.fromarray(image).save(path, "PNG", compress_level=1)
+        Image.fromarray(image).save(file, "PNG", compress_level=1)
         return
     # Pillow has no RGB of 16 bits.
     import png
 
     height, width, _ = image.shape
-    with path.open("wb") as file:
-        png.Writer(width, height, bitdepth=16, greyscale=False, compression=1).write(file, image.reshape(height, -1))
+    png.Writer(width, height, bitdepth=16, greyscale=False, compression=1).write(file, image.reshape(height, -1))
 
 
 def write_preview_png(path: Path, codes: Codes) -> None:
@@ -109,7 +117,7 @@ def write_preview_png(path: Path, codes: Codes) -> None:
 
     signal = codes.astype(np.float32) / np.float32(max(int(codes.max()), 1))
     smooth = gaussian_filter(_discs(signal) ** PREVIEW_POWER, PREVIEW_BLUR_PX)
-    written(path, lambda part: Image.fromarray((255 * np.clip(smooth, 0, 1)).astype(np.uint8)).save(part, "PNG"))
+    written(path, lambda file: Image.fromarray((255 * np.clip(smooth, 0, 1)).astype(np.uint8)).save(file, "PNG"))
 
 
 def _discs(signal: Float32Array) -> Float32Array:

@@ -18,6 +18,7 @@ from hilstar.bench.bench_file import BenchFile, bench_file_of, changed_file, rea
 from hilstar.bench.config import AttitudeSettings
 from hilstar.bench.config.read import HEADS
 from hilstar.errors import InputError
+from hilstar.files import place_of
 from hilstar.reading import MAX_TOML_BYTES, parse_toml, read_text
 
 MIN_HEADS, MAX_HEADS = 2, 8
@@ -74,9 +75,19 @@ def _heads_of(path: Path, tables: dict[str, Any]) -> HeadsFile:
     if twice is not None:
         raise InputError(f"{path}: heads: two are called {twice}; give each a file of its own name")
     files = tuple(_head(head, tables.get("attitude", {})) for head in paths)
+    _refuse_one_twice(path, paths)
     if files[0].config.attitude.lockstep:
         raise InputError(f"{path}: [attitude] lockstep = true: several heads follow a stream that runs freely; take it out")
     return HeadsFile(path, names, files)
+
+
+def _refuse_one_twice(path: Path, heads: list[Path]) -> None:
+    """Two names of one file, by a link, would show one bench twice and write over each other's ledger."""
+    places = [place_of(head) for head in heads]
+    for k, place in enumerate(places):
+        if place in places[:k]:
+            first = heads[places.index(place)]
+            raise InputError(f"{path}: heads: {heads[k].name} is the same file as {first.name}; give each a file of its own")
 
 
 def _head(head: Path, attitude: dict[str, Any]) -> BenchFile:

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.config import BenchConfig
-from hilstar.bench.frame_files import sky_header
+from hilstar.bench.frame_files import sky_header, write_fits
 from hilstar.files import written
 from hilstar.scene.camera import Camera
 from hilstar.twin.picture import exposure_picture
@@ -49,14 +49,14 @@ def write_exposure_fits(path: Path, simulator: Imager, exposure: Exposure, noise
         header["FAULTS"] = ", ".join(exposure.faults)[:MAX_CARD]
     header["NSTARS"] = (len(exposure.truth), "stars in view")
     hdus = fits.HDUList([fits.PrimaryHDU(exposure.dn, header), fits.BinTableHDU(exposure.truth, name="TRUTH")])
-    written(path, lambda part: hdus.writeto(part, overwrite=True))
+    write_fits(path, hdus)
 
 
 def write_exposure_png(path: Path, dn: npt.NDArray[np.uint16]) -> None:
     """A picture of a tracker's frame for a person (see `twin.picture`)."""
     from PIL import Image
 
-    written(path, lambda part: Image.fromarray(exposure_picture(dn)).save(part, "PNG"))
+    written(path, lambda file: Image.fromarray(exposure_picture(dn)).save(file, "PNG"))
 
 
 def write_dn_picture(path: Path, dn: npt.NDArray[np.uint16]) -> None:
@@ -64,4 +64,4 @@ def write_dn_picture(path: Path, dn: npt.NDArray[np.uint16]) -> None:
     from PIL import Image
 
     form = "TIFF" if path.suffix.lower() in {".tif", ".tiff"} else "PNG"
-    written(path, lambda part: Image.fromarray(dn).save(part, form))
+    written(path, lambda file: Image.fromarray(dn).save(file, form))

@@ -18,6 +18,7 @@ from hilstar.files import (
     check_ending,
     check_outputs,
     files_named_in,
+    open_lock,
     refuse_existing,
     whole_file,
     write_whole,
@@ -64,7 +65,7 @@ def test_an_error_leaves_the_older_file_whole_and_nothing_beside(tmp_path):
     path.write_text("old")
     path.chmod(0o640)
     with pytest.raises(InputError, match="cannot be written"), whole_file(path) as part:
-        part.write_text("half")
+        part.write(b"half")
         raise OSError(28, "No space left on device")
     assert path.read_text() == "old"
     assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
@@ -78,6 +79,70 @@ def test_a_full_disk_leaves_the_older_file_whole(tmp_path):
     with files_of_at_most(1000), pytest.raises(InputError, match="cannot be written"):
         write_whole(path, bytes(5000))
     assert path.read_bytes() == b"old"
+
+
+def test_a_temporary_name_cannot_be_foreseen_and_no_planted_link_is_followed(tmp_path, monkeypatch):
+    victim = tmp_path / "victim"
+    victim.write_text("theirs")
+    (tmp_path / f".a.{os.getpid()}.part.txt").symlink_to(victim)
+    write_whole(tmp_path / "a.txt", "mine")
+    assert victim.read_text() == "theirs"
+    monkeypatch.setattr("secrets.token_hex", lambda _: "foreseen")
+    (tmp_path / ".a.foreseen.part.txt").symlink_to(victim)
+    (tmp_path / ".run.foreseen.part.mcap").symlink_to(victim)
+    (tmp_path / "run.mcap").write_text("old")
+    with pytest.raises(InputError, match="cannot be written"):
+        write_whole(tmp_path / "a.txt", "mine again")
+    with pytest.raises(InputError, match="is there already"):
+        NewFile(tmp_path / "run.mcap", overwrite=True)
+    assert victim.read_text() == "theirs"
+    assert (tmp_path / "a.txt").read_text() == "mine"
+
+
+def test_what_takes_the_temporary_name_s_place_gets_nothing_written(tmp_path):
+    victim = tmp_path / "victim"
+    victim.write_text("theirs")
+    with pytest.raises(InputError, match="cannot be written"), whole_file(tmp_path / "a.txt") as file:
+        [part] = tmp_path.glob(".a.*.part.txt")
+        part.unlink()
+        part.symlink_to(victim)
+        file.write(b"mine")
+    assert victim.read_text() == "theirs"
+
+
+def test_links_in_a_circle_are_refused_and_stay(tmp_path):
+    one, other = tmp_path / "one.fits", tmp_path / "other.fits"
+    one.symlink_to(other)
+    other.symlink_to(one)
+    with pytest.raises(InputError, match=r"one.fits: cannot be written \(Too many levels of symbolic links\)"):
+        write_whole(one, "x")
+    with pytest.raises(InputError, match="Too many levels"):
+        check_outputs([], [one])
+    assert one.is_symlink() and other.is_symlink()
+
+
+def test_a_lock_file_is_no_way_to_another_file(tmp_path):
+    victim = tmp_path / "victim"
+    victim.write_text("theirs")
+    (tmp_path / ".lock").symlink_to(victim)
+    with pytest.raises(InputError, match="cannot be written"):
+        open_lock(tmp_path / ".lock")
+    assert victim.read_text() == "theirs"
+
+
+def test_a_long_name_in_any_script_has_room_for_its_temporary_one(tmp_path):
+    path = tmp_path / ("\N{CJK UNIFIED IDEOGRAPH-661F}" * 80 + ".csv")
+    write_whole(path, "x")
+    assert [file.name for file in tmp_path.iterdir()] == [path.name]
+
+
+def test_a_pipe_is_written_itself(tmp_path):
+    pipe = tmp_path / "pipe.csv"
+    os.mkfifo(pipe)
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    write_whole(pipe, "x")
+    assert os.read(reader, 10) == b"x"
+    os.close(reader)
 
 
 def test_a_link_stays_a_link(tmp_path):

@@ -98,7 +98,7 @@ def write_log(path: Path, samples: Sequence[AttitudeSample], scale: str | None =
         raise InputError(f"{path}: not a log's name; end it in one of {', '.join([*_WRITERS, *_AEM_IN_XML])}")
     if not samples:
         raise InputError(f"{path}: no attitude to write")
-    with whole_file(path) as part, part.open("wb") as file:
+    with whole_file(path) as file:
         if ending in _AEM_IN_XML:
             _write_aem(file, samples, _AEM_IN_XML[ending], scale)
         else:

@@ -8,7 +8,6 @@ import hashlib
 import math
 import os
 import platform
-import shutil
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -37,6 +36,7 @@ from hilstar.calibrate.first_light.sight.display import Stopped
 from hilstar.calibrate.first_light.sight.eyes import Eyes, NoImage, complete_images
 from hilstar.calibrate.first_light.steps import delay, lens, light, look, verify
 from hilstar.errors import HilstarError, InputError, MachineError, one_line
+from hilstar.files import open_lock, write_whole
 from hilstar.run.sync.advice import BeatSummary, beat_of
 
 BEFORE_FILE = "bench-before.toml"
@@ -148,7 +148,7 @@ class Session:
         """
         before = self.folder / BEFORE_FILE
         if not before.exists():
-            shutil.copyfile(self.file.path, before)
+            write_whole(before, self.file.path.read_bytes())
         for number, step in enumerate(STEPS):
             if step.name not in again and self._is_done(number):
                 say(f"{step.name:12} {self.records[step.name].verdict} before: {self.records[step.name].line}")
@@ -305,9 +305,12 @@ def _is_same(path: Path, digest: str) -> bool:
 @contextmanager
 def alone_in(folder: Path) -> Iterator[None]:
     """Keep a second session out of a directory (InputError) while this one works there; a kill lets it go."""
-    with (folder / LOCK_FILE).open("w") as file:
+    lock = open_lock(folder / LOCK_FILE)
+    try:
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             raise InputError(f"{folder}: another first-light session works there; wait for its end") from error
         yield
+    finally:
+        os.close(lock)

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.errors import InputError
-from hilstar.files import written
+from hilstar.files import as_text, whole_file
 from hilstar.reading import open_lines
 
 BoolArray = npt.NDArray[np.bool_]
@@ -110,16 +110,12 @@ def dot_image(plan: DotPlan, frame: int, resolution_px: tuple[int, int], white: 
 
 def write_plan(path: Path, plan: DotPlan) -> None:
     """A row for each lit dot of each frame."""
-
-    def write(part: Path) -> None:
-        with part.open("w", encoding="ascii", newline="") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(PLAN_COLUMNS)
-            for frame in range(plan.frames):
-                for dot in np.flatnonzero(plan.lit[:, frame]):
-                    writer.writerow((frame, int(dot), int(plan.x_px[dot]), int(plan.y_px[dot])))
-
-    written(path, write)
+    with whole_file(path) as whole, as_text(whole) as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(PLAN_COLUMNS)
+        for frame in range(plan.frames):
+            for dot in np.flatnonzero(plan.lit[:, frame]):
+                writer.writerow((frame, int(dot), int(plan.x_px[dot]), int(plan.y_px[dot])))
 
 
 def read_plan(path: Path) -> DotPlan:

@@ -9,7 +9,6 @@ import re
 import shlex
 import signal
 import subprocess
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ import numpy.typing as npt
 from hilstar.campaign.solvers.answer import Answer, SolverFault, Tracker, checked_attitude
 from hilstar.campaign.solvers.function import tracker_facts
 from hilstar.errors import InputError, one_line
+from hilstar.files import temporary_folder
 from hilstar.twin.exposure_files import write_dn_picture
 from hilstar.twin.simulator import Exposure
 
@@ -49,8 +49,8 @@ class CommandSolver:
 
     def solve(self, exposure: Exposure, tracker: Tracker) -> Answer:
         """The command's answer. Raises SolverFault where it fails, takes too long or prints what is no attitude."""
-        with tempfile.TemporaryDirectory(prefix="hilstar-solver-") as folder:
-            image, picture = Path(folder) / "image.fits", Path(folder) / "image.png"
+        with temporary_folder("solver") as folder:
+            image, picture = folder / "image.fits", folder / "image.png"
             if any(IMAGE in word for word in self._words):
                 write_plain_fits(image, exposure.dn)
             if any(PICTURE in word for word in self._words):
@@ -60,7 +60,7 @@ class CommandSolver:
             code, out, err = _run(words, self._folder, self._timeout_s)
         if code:
             said = err.strip().splitlines()[-1:] or ["it said nothing on stderr"]
-            line = said[0].replace(str(image), IMAGE).replace(str(picture), PICTURE).replace(folder, "")
+            line = said[0].replace(str(image), IMAGE).replace(str(picture), PICTURE).replace(str(folder), "")
             raise SolverFault(one_line(f"the solver ended with code {code}: {line}"))
         q = printed_attitude(out)
         return Answer(None, "the solver found no attitude") if q is None else Answer(checked_attitude(q, "the solver"))

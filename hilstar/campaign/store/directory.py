@@ -11,7 +11,7 @@ import msgspec
 
 from hilstar.campaign.store.journal import Journal
 from hilstar.errors import InputError, cannot_read, shortened
-from hilstar.files import make_directory, write_whole
+from hilstar.files import make_directory, open_lock, write_whole
 from hilstar.reading import read_bytes
 
 ABOUT, LOCK, JOURNAL, TABLE = "campaign.json", "campaign.lock", "journal", "cases.parquet"
@@ -71,10 +71,7 @@ class Directory:
 
 
 def _locked(path: Path) -> int:
-    try:
-        fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
-    except OSError as error:
-        raise InputError(f"{path.parent}: cannot be written ({error.strerror}); choose another place") from error
+    fd = open_lock(path)
     try:
         fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:

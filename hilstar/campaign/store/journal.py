@@ -106,7 +106,7 @@ class Journal:
         path = self._path(block, OPEN)
         try:
             if block not in self._files:
-                self._files[block] = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o666)
+                self._files[block] = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
             while line:  # a full disk may take a part; what it left is a cut line, dropped at the next start
                 line = line[os.write(self._files[block], line) :]
         except OSError as error:
@@ -126,7 +126,7 @@ class Journal:
         if not whole:
             write_whole(path, b"".join(_line(row) for row in found.values()))
         if len(found) == len(self._block(block)):  # killed between the last row and the new name
-            self._files[block] = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CLOEXEC)
+            self._files[block] = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_NOFOLLOW | os.O_CLOEXEC)
             self._done[block] = set(found)
             self._close_block(block)
             return []

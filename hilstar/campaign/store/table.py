@@ -39,9 +39,9 @@ def write_table(path: Path, schema: pa.Schema, blocks: Iterator[list[dict[str, A
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    with whole_file(path) as part:
+    with whole_file(path) as file:
         settings: Any = {"compression": COMPRESSION, "compression_level": COMPRESSION_LEVEL, "version": "2.6"}
-        with pq.ParquetWriter(part, schema, **settings) as writer:
+        with pq.ParquetWriter(file, schema, **settings) as writer:
             for rows in blocks:
                 arrays = [pa.array([_exact(row[field.name], field.type) for row in rows], field.type) for field in schema]
                 writer.write_table(pa.Table.from_arrays(arrays, schema=schema), row_group_size=max(1, len(rows)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -53,7 +54,7 @@ def serve_heads(heads: HeadsFile, asked: HeadsAsked, as_json: bool) -> None:
         if taken:
             raise InputError(f"--ledger {asked.ledger}: {taken[0]} exists; give another name, or --overwrite")
     notices = Notices()
-    consoles = _consoles(asked.console, heads)
+    consoles = _consoles(asked, heads)
     with open_link(source_config(heads), heads.folder, notices, apart=True) as link:
         await_reader(link)
         say(f"{link.verb} {link.endpoint}, {len(heads.names)} heads: {', '.join(heads.names)}")
@@ -69,14 +70,21 @@ def serve_heads(heads: HeadsFile, asked: HeadsAsked, as_json: bool) -> None:
         raise typer.Exit(failed[0] if 0 < failed[0] <= NO_ATTITUDE else 1)
 
 
-def _consoles(console: str | None, heads: HeadsFile) -> tuple[str, ...]:
-    from hilstar.console.feed.door import parse_address
+def _consoles(asked: HeadsAsked, heads: HeadsFile) -> tuple[str, ...]:
+    """The address of each head's page. Raises InputError where one cannot be had, before a head is begun."""
+    from hilstar.console.feed.door import MAX_PORT, Address, Door, parse_address
 
-    if console is None:
+    if asked.console is None:
         return ()
-    first = parse_address(console)
+    first, count = parse_address(asked.console), len(heads.names)
+    if first.port and first.port + count - 1 > MAX_PORT:
+        raise InputError(f"--console {asked.console}: {count} pages need as many ports from there; choose a lower one")
+    addresses = [Address(first.host, first.port + k if first.port else 0) for k in range(count)]
+    with ExitStack() as doors:
+        for address in addresses:
+            doors.enter_context(Door(address, asked.token))
     host = f"[{first.host}]" if ":" in first.host else first.host
-    return tuple(f"{host}:{first.port + k if first.port else 0}" for k in range(len(heads.names)))
+    return tuple(f"{host}:{address.port}" for address in addresses)
 
 
 def _report(told: dict[str, dict[str, object]], as_json: bool) -> None:

@@ -14,6 +14,7 @@ from typing import Self
 from hilstar.errors import InputError, shortened
 
 HOST, PORT = "127.0.0.1", 8765
+MAX_PORT = 2**16 - 1
 FORM = "write HOST:PORT, such as 127.0.0.1:8765, or 0.0.0.0:8765 to be reached from elsewhere"
 BACKLOG = 512
 TOKEN_BYTES = 32
@@ -52,7 +53,7 @@ def parse_address(text: str) -> Address:
         host, port = text, ""
     else:
         host, _, port = text.partition(":")
-    if port and not (port.isdecimal() and port.isascii() and len(port) <= 5 and int(port) < 2**16):
+    if port and not (port.isdecimal() and port.isascii() and len(port) <= 5 and int(port) <= MAX_PORT):
         raise wrong
     host = host or HOST
     if not _is_host(host):

@@ -7,7 +7,6 @@ import os
 import signal
 import socket
 import subprocess
-import tempfile
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -29,17 +28,17 @@ class HeadProcess:
 
     `command(number, drawn_s)` is that of its begin `number`, `drawn_s` after it drew first, 0 where it never did.
 
-    It tells its life as a service does (sd_notify): ready once it draws, and a sign each second while frames go on.
+    It tells its life as a service does (sd_notify), to the socket `life`: ready once it draws, and a sign each second while
+    frames go on.
     """
 
-    def __init__(self, name: str, command: Command, say: Say, secrets: Mapping[str, str] = NOTHING) -> None:
+    def __init__(self, name: str, command: Command, say: Say, life: Path, secrets: Mapping[str, str] = NOTHING) -> None:
         self.name = name
         self.restarts = 0
         self.code: int | None = None  # of its end, None before that
         self.output = b""  # what it wrote to stdout, the last time
         self._command, self._say, self._secrets = command, say, secrets  # not on a command line, which all users see
-        self._folder = tempfile.TemporaryDirectory(prefix="hilstar-head-")
-        self._address = str(Path(self._folder.name) / "life")
+        self._address = str(life)
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
         self._socket.bind(self._address)
         self._socket.setblocking(False)
@@ -155,7 +154,6 @@ class HeadProcess:
             for reader in self._readers:
                 reader.join(1.0)
         self._socket.close()
-        self._folder.cleanup()
 
 
 def _how(code: int) -> str:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import sys
-import tempfile
 import threading
 import time
 from dataclasses import dataclass
@@ -16,12 +14,12 @@ import msgspec
 from msgspec.structs import replace
 
 from hilstar.attitude.back_channel import BackChannel, Traffic
-from hilstar.attitude.wire.endpoint import is_served
 from hilstar.attitude.wire.heads.feed import Feed
 from hilstar.attitude.wire.links import StreamLink
 from hilstar.attitude.wire.packet import TimeRequest
 from hilstar.bench.config import BenchConfig
 from hilstar.bench.heads_file import HeadsFile
+from hilstar.files import temporary_folder
 from hilstar.process.interrupts import stop_on_signal
 from hilstar.run.heads.head_process import HeadProcess, Say
 from hilstar.units import NS_PER_S
@@ -30,7 +28,7 @@ POLL_MS = 10
 TEND_NS = NS_PER_S // 20
 MIN_DURATION_S = 0.05  # of a head that is begun again at the end
 ENDS_S = 5.0  # what a head may take to end in order
-FOLDER, SOCKET = "hilstar-heads-", "body"
+SOCKET = "body"
 BODY = (1.0, 0.0, 0.0, 0.0)
 
 
@@ -64,11 +62,10 @@ def head_ledger(ledger: Path, name: str, number: int = 0) -> Path:
 def run_heads(asked: HeadsRun, link: StreamLink, say: Say) -> dict[str, Any]:
     """Show each head until its end, or until a signal; what each one said of itself (--json), by its name."""
     stop = threading.Event()
-    clear_left()
-    with tempfile.TemporaryDirectory(prefix=FOLDER) as folder, stop_on_signal(stop):
+    with temporary_folder("heads") as folder, stop_on_signal(stop):
         endpoint = f"ipc://{folder}/{SOCKET}"
         with Feed(endpoint) as feed:
-            processes = [_head(asked, k, endpoint, say) for k in range(len(asked.heads.names))]
+            processes = [_head(asked, k, endpoint, folder, say) for k in range(len(asked.heads.names))]
             try:
                 _hand_on(link, feed, processes, stop)
                 for process in processes:
@@ -79,17 +76,7 @@ def run_heads(asked: HeadsRun, link: StreamLink, say: Say) -> dict[str, Any]:
     return {process.name: _told(process) for process in processes}
 
 
-def clear_left() -> None:
-    """Remove what killed runs of this user left: temporary folders whose socket nobody serves any more."""
-    for folder in Path(tempfile.gettempdir()).glob(f"{FOLDER}*"):
-        with contextlib.suppress(OSError):
-            path = folder / SOCKET
-            if path.lstat().st_uid == folder.lstat().st_uid == os.geteuid() and not is_served(path):
-                path.unlink()
-                folder.rmdir()
-
-
-def _head(asked: HeadsRun, k: int, endpoint: str, say: Say) -> HeadProcess:
+def _head(asked: HeadsRun, k: int, endpoint: str, folder: Path, say: Say) -> HeadProcess:
     name, file = asked.heads.names[k], asked.heads.files[k]
 
     def command(number: int, drawn_s: float) -> list[str]:
@@ -103,7 +90,8 @@ def _head(asked: HeadsRun, k: int, endpoint: str, say: Say) -> HeadProcess:
             made += ["--console", asked.consoles[k]]
         return made
 
-    return HeadProcess(name, command, say, {} if asked.token is None else {"HILSTAR_TOKEN": asked.token})
+    secrets = {} if asked.token is None else {"HILSTAR_TOKEN": asked.token}
+    return HeadProcess(name, command, say, folder / f"life-{k}", secrets)
 
 
 def _hand_on(link: StreamLink, feed: Feed, processes: list[HeadProcess], stop: threading.Event) -> None:

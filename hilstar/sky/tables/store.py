@@ -115,8 +115,8 @@ def keep(path: Path, made: Kept) -> None:
     columns = {name: getattr(made.catalog, name) for name in column_names()}
     with contextlib.suppress(OSError, HilstarError):
         make_directory(path.parent)
-        with whole_file(path) as part:
-            np.savez(part, allow_pickle=False, about=np.array(json.dumps(about)), **columns)
+        with whole_file(path) as file:
+            np.savez(file, allow_pickle=False, about=np.array(json.dumps(about)), **columns)
         by_age = sorted(path.parent.glob("catalogue-*.npz"), key=lambda file: file.stat().st_mtime_ns, reverse=True)
         for old in by_age[KEPT_FILES:]:
             old.unlink(missing_ok=True)

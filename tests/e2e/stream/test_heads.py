@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import socket
 import subprocess
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import numpy as np
 
 from hilstar.rotation import angle_between_rad, multiply
 from hilstar.run.record.ledger_reader import frame_records
-from tests.support.commands import HILSTAR
+from tests.support.commands import HILSTAR, assert_refused, run_hilstar
 from tests.support.heads import MOUNTINGS, heads_file
 from tests.support.senders import publisher, talking
 from tests.support.waiting import PATIENCE_S, wait_for
@@ -65,3 +66,27 @@ def test_a_head_that_is_killed_or_hangs_stops_no_other_and_is_begun_again(tmp_pa
         assert shown
         assert max(angle_between_rad(one, multiply(np.array(mounting), q)) for one in shown) < SAME_RAD
     assert not children(process.pid)
+
+
+def test_a_page_s_port_that_is_taken_is_found_before_a_head_begins(tmp_path):
+    with socket.create_server(("127.0.0.1", 0)) as taken, publisher() as (_, port):
+        path, page = heads_file(tmp_path, port), taken.getsockname()[1] - 1  # the second head's
+        options = ["--headless", "--console", f"127.0.0.1:{page}", "--duration", "5"]
+        assert_refused(run_hilstar("serve", path, *options), 2, f"--console 127.0.0.1:{page + 1}: cannot listen there")
+
+
+def test_a_killed_run_leaves_no_folder_after_the_next_one(tmp_path):
+    place = tmp_path / "tmp"
+    place.mkdir()
+    environment, lines = {**os.environ, "TMPDIR": str(place)}, tmp_path / "said.txt"
+    with publisher() as (sender, port), talking(sender, 50.0, BODY), lines.open("w") as said:
+        command = [*HILSTAR, "serve", str(heads_file(tmp_path, port)), "--headless"]
+        with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=said, env=environment) as process:
+            try:
+                wait_for(lambda: lines.read_text().count("first attitude") == 3)
+            finally:
+                process.kill()
+        assert list(place.glob("hilstar-head*"))
+        ended = run_hilstar(*command[3:], "--duration", "0.5", env=environment)
+        assert ended.returncode in {0, 4}, ended.stderr
+    assert not list(place.glob("hilstar-*"))

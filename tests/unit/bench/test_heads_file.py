@@ -50,3 +50,16 @@ def test_a_bench_file_is_read_as_one(tmp_path):
     assert not isinstance(read_bench_or_heads(tmp_path / "bench.toml"), HeadsFile)
     with pytest.raises(InputError):
         read_bench_or_heads(tmp_path / "broken.toml")
+
+
+@pytest.mark.parametrize("link", ["soft", "hard"])
+def test_two_names_of_one_file_are_no_two_heads(tmp_path, link):
+    (tmp_path / "a.toml").write_text(SMALL_BENCH)
+    if link == "soft":
+        (tmp_path / "b.toml").symlink_to("a.toml")
+    else:
+        (tmp_path / "b.toml").hardlink_to(tmp_path / "a.toml")
+    path = tmp_path / "heads.toml"
+    path.write_text('heads = ["a.toml", "b.toml"]\n')
+    with pytest.raises(InputError, match=r"heads: b.toml is the same file as a.toml; give each a file of its own"):
+        read_heads(path)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import re
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from hilstar.attitude.logs.ros.db3 import Db3File
 from hilstar.attitude.logs.ros.mcap_bag import McapBag
 from hilstar.attitude.logs.ros.storage import ADVICE, ZSTD_MAGIC, Message, Storage, Topic, unpack_file
 from hilstar.errors import InputError, shortened
+from hilstar.files import temporary_folder
 from hilstar.reading import HEAD_BYTES, MCAP_MAGIC, ROSBAG_MAGIC, SQLITE_MAGIC, open_regular, read_text, refuse_kind
 
 METADATA = "metadata.yaml"
@@ -59,8 +59,8 @@ def open_bag(path: Path) -> Iterator[Bag]:
     """A .bag, .db3 or .mcap file, or a directory of the latter two. Raises InputError."""
     told: list[tuple[str, str]] = []
     paths = _files_of(path, told) if is_bag_directory(path) else [path]
-    with tempfile.TemporaryDirectory(prefix="hilstar-bag-") as place:
-        yield Bag(path, [_storage(file, Path(place)) for file in paths], told)
+    with temporary_folder("bag") as place:
+        yield Bag(path, [_storage(file, place) for file in paths], told)
 
 
 def _files_of(path: Path, told: list[tuple[str, str]]) -> list[Path]:

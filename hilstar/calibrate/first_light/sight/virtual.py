@@ -93,7 +93,7 @@ class VirtualBench:
         rng = np.random.default_rng((self._seed, zlib.crc32(str(Path(stem.parent.name) / stem.name).encode())))
         image = Image.fromarray(self._detector.expose(mean_e, exposure_s, rng))
         path = stem.with_name(stem.name + ".png")
-        written(path, lambda part: image.save(part, "PNG", compress_level=1))
+        written(path, lambda file: image.save(file, "PNG", compress_level=1))
         return path
 
     def _image_e_per_s(self, frames: list[CodeImage]) -> FloatArray:

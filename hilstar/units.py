@@ -39,3 +39,7 @@ def magnitude(ratio: float | FloatArray) -> float | FloatArray:
         with np.errstate(divide="ignore"):
             return np.asarray(-2.5 * np.log10(ratio))
     return -2.5 * math.log10(ratio) if ratio > 0 else math.inf
+
+
+# Of OpenGL, as asked for, newest first: NVIDIA's driver gives the version that is asked for, and no newer one.
+GL_VERSIONS = ((4, 6), (4, 5), (4, 3), (3, 3))

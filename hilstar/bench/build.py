@@ -21,7 +21,8 @@ from hilstar.errors import InputError
 from hilstar.monitor.balance import Seen
 from hilstar.monitor.calibration import BUILT_IN, Calibration, load_calibration
 from hilstar.monitor.quantise import Panel
-from hilstar.render.renderer import Context, Renderer, Target
+from hilstar.render.context import Context, create_context, has_compute
+from hilstar.render.renderer import Renderer, Target
 from hilstar.scene.camera import Camera
 from hilstar.scene.psf import peak_share
 from hilstar.sky.astrometry import aberrate, unit_vectors_icrs
@@ -48,6 +49,15 @@ def open_bench(file: BenchFile, context: Context | None = None) -> Bench:
 
 def assembled(file: BenchFile, stars: Stars, context: Context | None = None, moving: MovingSky | None = None) -> Bench:
     """The bench of a file whose stars are made already, as `bench_stars` makes them. Raises InputError or MachineError."""
+    context = context or create_context()
+    try:
+        return _assembled(file, stars, context, moving)
+    except BaseException:
+        context.release()
+        raise
+
+
+def _assembled(file: BenchFile, stars: Stars, context: Context, moving: MovingSky | None) -> Bench:
     calibration = bench_calibration(file.config, file.folder)
     white_e_per_s = _white_e_per_s(file.config.render, stars)
     uniformity = calibration.uniformity_map(file.config.monitor.resolution_px)
@@ -66,6 +76,7 @@ def assembled(file: BenchFile, stars: Stars, context: Context | None = None, mov
         seen=seen_by(file.config.tracker, camera),
         centroider=file.config.verify.centroider,
         exposure_frames=file.config.exposure_frames,
+        has_compute=has_compute(context),
     )
     effort = _effort(file.config.render, light)
     config = _chosen(file.config, effort)

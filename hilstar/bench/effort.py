@@ -31,10 +31,11 @@ MAG_PER_SHARE = 2.5 / math.log(10)
 # Light beyond a small sprite is under this share of what lights a pixel: only where the wings of stars meet is a code lower
 UNLIT = 0.25
 CUT_PHASES = 51
-# A whole frame, for each of 2500 to 5000 stars, 1080p over 31 deg at 1 to 15 deg/s, two llvmpipe cores. Sprites that are too
-# wide for the compute pass take NumPy's time. A field of the Milky Way has twice the stars of an average one.
+# A whole frame, for each of 2500 to 5000 stars, 1080p over 31 deg at 1 to 15 deg/s, two llvmpipe cores. Without compute
+# shaders (before OpenGL 4.3) `exact` takes NumPy's time (0.03 to 0.06 of 150 to 1800 stars), and so do sprites that are too
+# wide for the shader. A field of the Milky Way has twice the stars of an average one.
 ROUND_MS_A_STAR = 0.002
-EXACT_MS_A_STAR, WIDE_EXACT_MS_A_STAR = 0.003, 0.23
+EXACT_MS_A_STAR, NUMPY_EXACT_MS_A_STAR, WIDE_EXACT_MS_A_STAR = 0.003, 0.05, 0.23
 IN_TIME_SHARE = 0.5  # of a refresh
 
 
@@ -111,7 +112,8 @@ class Light:
 
     `can_steal_bits` says whether bit stealing would give finer codes, and is not used yet. `sky_share` is the share of the
     whole sky that the screen covers. `seen` is how the tracker sees the monitor, `centroider` what it finds stars by: None
-    where the bench does not say, and then all of them judge. Its exposure has `exposure_frames`.
+    where the bench does not say, and then all of them judge. Its exposure has `exposure_frames`. `has_compute` is whether
+    this OpenGL has the compute shaders that choose codes for `exact`.
     """
 
     response: Response
@@ -123,6 +125,7 @@ class Light:
     seen: Seen = AS_USUAL
     centroider: Centroider | None = None
     exposure_frames: int = EXPOSURE_FRAMES
+    has_compute: bool = True
 
     @property
     def judges(self) -> tuple[Centroider, ...]:
@@ -132,7 +135,9 @@ class Light:
     def field_ms(self, method: Quantisation, sigma_px: tuple[float, float]) -> float:
         """The time that `round` or `exact` takes for an average field, turning at 1 deg/s, on two cores without a GPU."""
         lit = self.rates_e_per_s >= self.response.half_step * self.white_e_per_s
-        exact_ms = EXACT_MS_A_STAR if ExactPass.takes(sigma_px) else WIDE_EXACT_MS_A_STAR
+        exact_ms = EXACT_MS_A_STAR if self.has_compute else NUMPY_EXACT_MS_A_STAR
+        if not ExactPass.takes(sigma_px):
+            exact_ms = WIDE_EXACT_MS_A_STAR
         a_star_ms = exact_ms if method == "exact" else ROUND_MS_A_STAR
         return a_star_ms * self.sky_share * float(np.count_nonzero(lit))
 
@@ -200,6 +205,7 @@ def choose_codes(render: RenderSettings, light: Light) -> ChosenCodes:
         price = (
             f"{exact_ms:.0f} ms of {light.refresh_ms:.0f} (round {round_ms:.0f}) for an average field at 1 deg/s without a GPU"
         )
+        price += "" if light.has_compute else ", in NumPy: its compute shaders need OpenGL 4.3"
         error += f' (over {limits[0]:g} mag or {limits[1]:g} px: quantisation = "exact" is nearer and takes {price})'
     elif not within:
         ways = "more bits, bit_stealing or brighter stars" if light.can_steal_bits else "more bits or brighter stars"

@@ -10,26 +10,31 @@ import moderngl
 
 from hilstar.errors import InputError, MachineError
 from hilstar.process.cores import drawing_threads_apart
+from hilstar.units import GL_VERSIONS
 
 EGL_LIBRARY = "libEGL.so.1"
 INSTALL_EGL = "install it: apt-get install libegl1 libgl1-mesa-dri"
 MIN_COMPUTE_VERSION = 430  # of OpenGL, for compute shaders
+Context = moderngl.Context
 SOFTWARE = ("llvmpipe", "softpipe")
 # Of llvmpipe: what its shaders write of a buffer, and rounds of all loops of a shader (65 535 end them without a word).
 MAX_WRITTEN_BYTES, MAX_ROUNDS = 2**27, 60_000
 
 
 def create_context() -> moderngl.Context:
-    """A headless OpenGL 3.3 core context. Raises MachineError with what to install.
+    """A headless core context of the newest OpenGL, 3.3 at least. Raises MachineError with what to install.
 
     Every GL function comes through libEGL's own loader: a bare machine has no libGL.so.
     """
-    try:
-        settings: Any = {"backend": "egl", "libgl": EGL_LIBRARY, "libegl": EGL_LIBRARY}
-        with drawing_threads_apart():
-            return moderngl.create_context(require=330, standalone=True, **settings)
-    except Exception as error:  # moderngl and glcontext raise plain Exceptions here
-        raise MachineError(f"OpenGL 3.3 through EGL is missing ({error}); {INSTALL_EGL}") from error
+    settings: Any = {"backend": "egl", "libgl": EGL_LIBRARY, "libegl": EGL_LIBRARY}
+    refusal = ""
+    with drawing_threads_apart():
+        for major, minor in GL_VERSIONS:
+            try:
+                return moderngl.create_context(require=100 * major + 10 * minor, standalone=True, **settings)
+            except Exception as error:  # moderngl and glcontext raise plain Exceptions here
+                refusal = str(error)
+    raise MachineError(f"OpenGL 3.3 through EGL is missing ({refusal}); {INSTALL_EGL}")
 
 
 def check_limits(ctx: moderngl.Context, resolution_px: tuple[int, int], footprint_px: int, sigma: str) -> None:
@@ -42,9 +47,14 @@ def check_limits(ctx: moderngl.Context, resolution_px: tuple[int, int], footprin
         raise InputError(f"{sigma}: needs sprites of {footprint_px} px; this GL draws at most {points:g} px")
 
 
+def has_compute(ctx: Context) -> bool:
+    """Whether this GL has compute shaders (OpenGL 4.3); without them `exact` and `temporal` choose their levels in NumPy."""
+    return bool(ctx.version_code >= MIN_COMPUTE_VERSION)
+
+
 def computes_in_software(ctx: moderngl.Context) -> bool:
     """Whether this GL is a processor's and has compute shaders; a graphics card rasterises points in its stride."""
-    return ctx.version_code >= MIN_COMPUTE_VERSION and str(ctx.info["GL_RENDERER"]).startswith(SOFTWARE)
+    return has_compute(ctx) and str(ctx.info["GL_RENDERER"]).startswith(SOFTWARE)
 
 
 def leave_contexts() -> None:

@@ -19,7 +19,7 @@ from hilstar.monitor.exact import CARRIED, Left
 from hilstar.monitor.pixel_order import FEWEST, LEAST_LIGHT, PixelOrder
 from hilstar.monitor.quantise import Panel
 from hilstar.monitor.temporal import NONE_BEFORE, first_phases, places_before
-from hilstar.render.context import MIN_COMPUTE_VERSION
+from hilstar.render.context import has_compute
 from hilstar.render.encoder import LevelTexture, Table, build_compute
 from hilstar.render.splat import set_sigma, share_define
 from hilstar.render.star_passes import StarPasses
@@ -59,7 +59,7 @@ class ExactPass:
     @staticmethod
     def runs_on(ctx: moderngl.Context, sigma_px: tuple[float, float]) -> bool:
         """Whether this GL has compute shaders, and the shader bits enough for the sprites' pixels."""
-        return ctx.version_code >= MIN_COMPUTE_VERSION and ExactPass.takes(sigma_px)
+        return has_compute(ctx) and ExactPass.takes(sigma_px)
 
     @staticmethod
     def takes(sigma_px: tuple[float, float]) -> bool:

@@ -1,4 +1,4 @@
-"""The renderer: sprites to a linear image and code values, in OpenGL 3.3 core through EGL.
+"""The renderer: sprites to a linear image and code values, in OpenGL (3.3 core or newer).
 
 This room is the only user of moderngl.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Self
+from typing import Literal, Self
 
 import moderngl
 import numpy as np
@@ -20,7 +20,7 @@ from hilstar.monitor.exact import ExactQuantiser
 from hilstar.monitor.quantise import Panel, Quantisation, mask_turn
 from hilstar.monitor.response import Codes, Response
 from hilstar.monitor.temporal import TemporalQuantiser
-from hilstar.render.context import check_limits, create_context
+from hilstar.render.context import Context, check_limits, create_context
 from hilstar.render.encoder import (
     CUT_WINGS,
     SPRITE_PIXEL_COST,
@@ -44,7 +44,7 @@ from hilstar.scene.sprites import SPRITE_DTYPE, Sprites
 FIRST_CAPACITY = 4096
 NO_FRAME = -1
 UNTIMED = nullcontext()
-Context = moderngl.Context
+Path = Literal["compute shaders", "points", "points, then compute shaders", "NumPy"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,6 +102,20 @@ class Renderer:
     def gl_renderer(self) -> str:
         """The name of the GL renderer, as the driver gives it."""
         return str(self._ctx.info["GL_RENDERER"])
+
+    @property
+    def gl_version(self) -> str:
+        """The version of OpenGL, as the driver gives it."""
+        return str(self._ctx.info["GL_VERSION"])
+
+    @property
+    def path(self) -> Path:
+        """By what levels are drawn here; those of frames with extended light (discs, stray light) by points or NumPy."""
+        if self._star_by_star and self._exact_pass is None:
+            return "NumPy"
+        if self._passes is not None:
+            return "compute shaders"
+        return "points, then compute shaders" if self._exact_pass is not None else "points"
 
     @property
     def context(self) -> Context:

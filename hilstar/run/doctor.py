@@ -13,7 +13,7 @@ from hilstar.attitude.wire.zmq_socket import zmq_version
 from hilstar.attitude.wire.zmq_stream import ZmqReceiver, ZmqSender
 from hilstar.errors import HilstarError, MachineError
 from hilstar.monitor.window.window import displays
-from hilstar.render.context import create_context
+from hilstar.render.context import computes_in_software, create_context, has_compute
 from hilstar.resources import resource_path
 from hilstar.sky.catalog import load_catalog
 
@@ -58,7 +58,9 @@ def _gl() -> str:
     ctx = create_context()
     try:
         info = ctx.info
-        return f"{info['GL_RENDERER']}, OpenGL {info['GL_VERSION']}, points up to {info['GL_POINT_SIZE_RANGE'][1]:g} px"
+        what = f"{info['GL_RENDERER']}, OpenGL {info['GL_VERSION']}, points up to {info['GL_POINT_SIZE_RANGE'][1]:g} px"
+        exact = "compute shaders" if has_compute(ctx) else "NumPy (slow: their shaders need OpenGL 4.3)"
+        return f"{what}; round by {'compute shaders' if computes_in_software(ctx) else 'points'}, exact and temporal by {exact}"
     finally:
         ctx.release()
 

@@ -185,7 +185,7 @@ def _serve_stream(bench: Bench, link: StreamLink, limit: Limit, loop: FrameLoop,
     finally:
         receiver.close()
     duration_s = (time.monotonic_ns() - begin_ns) / NS_PER_S
-    summary = loop.tally.summary(duration_s, receiver.counts, bench.renderer.gl_renderer)
+    summary = loop.tally.summary(duration_s, receiver.counts, bench.renderer)
     return replaced(
         summary,
         stale_events=loop.gate.events,
@@ -232,7 +232,7 @@ def replay(bench: Bench, play: Play, sink: FrameSink = ignore, outlet: Outlet | 
     with stop_on_signal(loop.stop), loop.watch:
         _draw_all(play, loop, draw_slot)
     duration_s = (time.monotonic_ns() - begin_ns) / NS_PER_S
-    summary = loop.tally.summary(duration_s, counts, bench.renderer.gl_renderer)
+    summary = loop.tally.summary(duration_s, counts, bench.renderer)
     summary = replaced(summary, faults=UNSET if faults is None else faults.summary(), sync=outlet.pulses())
     told = outlet.notices.counts()
     return replaced(summary, stale_events=loop.gate.events, events=told, screen=loop.screen_summary())

@@ -10,6 +10,7 @@ from msgspec import UNSET, UnsetType
 from hilstar.attitude.clock.sender_clock import ClockSummary
 from hilstar.attitude.receiver import PacketCounts
 from hilstar.attitude.wire.packet import MESSAGE_REASONS, Reason
+from hilstar.render.renderer import Renderer
 from hilstar.run.sync.advice import BeatSummary
 from hilstar.run.sync.pulse_summary import SyncSummary
 from hilstar.running_statistics import Percentiles, RunningStatistics
@@ -59,6 +60,8 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     capped: int
     given_up: int
     gl_renderer: str
+    gl_version: str
+    render_path: str
     turn_ms: Percentiles | UnsetType = UNSET
     stale_events: int = 0
     receive_latency_ms: Percentiles | UnsetType = UNSET
@@ -136,7 +139,7 @@ class RunTally:
         stars = sorted(star for star in self.clipped_hip if isinstance(star, int))
         return ClippedSummary(self._clipped_max, stars, sorted(body for body in self.clipped_hip if isinstance(body, str)))
 
-    def summary(self, duration_s: float, counts: PacketCounts, gl_renderer: str) -> RunSummary:
+    def summary(self, duration_s: float, counts: PacketCounts, renderer: Renderer) -> RunSummary:
         """What all kinds of run say; figures without a sample are None."""
         refused_by = {name: n for name, n in counts.refused_by.items() if n or name in MESSAGE_REASONS}
         return RunSummary(
@@ -152,5 +155,7 @@ class RunTally:
             stale_frames=self.stale_frames,
             capped=self.capped_frames,
             given_up=self.given_up_frames,
-            gl_renderer=gl_renderer,
+            gl_renderer=renderer.gl_renderer,
+            gl_version=renderer.gl_version,
+            render_path=renderer.path,
         )

@@ -22,7 +22,8 @@ from hilstar.bench.faults.views import tracker_view
 from hilstar.bench.satellites import EXPOSURE_POSES, EXPOSURE_SPRITES, Shot, with_satellites
 from hilstar.bench.truth import truth_table
 from hilstar.errors import InputError
-from hilstar.render.renderer import Context, Renderer, Target
+from hilstar.render.context import Context
+from hilstar.render.renderer import Renderer, Target
 from hilstar.scene.camera import Camera
 from hilstar.scene.exposure_motion import MIDDLE_S, Motion, smeared_sprites
 from hilstar.scene.frame_motion import Scan, Turn

@@ -17,6 +17,7 @@ from hilstar.monitor.window.library import glfw
 from hilstar.monitor.window.visibility import ScreenArea, Visibility
 from hilstar.monitor.window.x11 import Survival, is_composited, sync_control
 from hilstar.process.cores import drawing_threads_apart
+from hilstar.units import GL_VERSIONS
 
 TITLE = "hilstar"
 NO_DISPLAY = "no display to open a window on; set DISPLAY, or run with --headless"
@@ -122,8 +123,6 @@ class Window:
         if settings.display is not None:
             self.display, monitor = _find(settings.display)
         for hint, value in (
-            (glfw.CONTEXT_VERSION_MAJOR, 3),
-            (glfw.CONTEXT_VERSION_MINOR, 3),
             (glfw.OPENGL_PROFILE, glfw.OPENGL_CORE_PROFILE),
             (glfw.RESIZABLE, False),
             (glfw.AUTO_ICONIFY, False),
@@ -136,7 +135,7 @@ class Window:
             glfw.window_hint(hint, value)
         width, height = settings.resolution_px if self.display is None else self.display.resolution_px
         with drawing_threads_apart():
-            self._window = glfw.create_window(width, height, TITLE, monitor, None)
+            self._window = _newest_window(width, height, monitor)
         if not self._window:
             raise MachineError("no window with OpenGL 3.3 can be opened; install it: apt-get install libgl1 libgl1-mesa-dri")
         glfw.make_context_current(self._window)
@@ -315,6 +314,16 @@ class Window:
 
     def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
         self.close()
+
+
+def _newest_window(width: int, height: int, monitor: Any) -> Any:
+    """A window with the newest OpenGL that its driver gives; None where it gives none of 3.3 or newer."""
+    for major, minor in GL_VERSIONS:
+        glfw.window_hint(glfw.CONTEXT_VERSION_MAJOR, major)
+        glfw.window_hint(glfw.CONTEXT_VERSION_MINOR, minor)
+        if window := glfw.create_window(width, height, TITLE, monitor, None):
+            return window
+    return None
 
 
 def _area_of(monitor: Any) -> ScreenArea:

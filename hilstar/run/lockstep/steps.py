@@ -65,7 +65,7 @@ class Steps:
     def summary(self) -> RunSummary:
         """The summary of the run so far."""
         duration_s = (time.monotonic_ns() - self._begin_ns) / NS_PER_S
-        summary = self._loop.tally.summary(duration_s, self.counts, self._bench.renderer.gl_renderer)
+        summary = self._loop.tally.summary(duration_s, self.counts, self._bench.renderer)
         return msgspec.structs.replace(summary, turn_ms=self._turn_ms.percentiles())
 
     def _refusal(self, event: Event) -> Refusal | None:

@@ -312,6 +312,8 @@ def _head_of(bench: Bench) -> dict[str, str]:
         "calibration": bench.calibration.name,
         "calibration_sha256": bench.calibration.sha256,
         "gl_renderer": bench.renderer.gl_renderer,
+        "gl_version": bench.renderer.gl_version,
+        "render_path": bench.renderer.path,
         "monotonic_ns": str(time.monotonic_ns()),
         "unix_ns": str(time.time_ns()),
     }

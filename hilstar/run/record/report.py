@@ -54,6 +54,8 @@ class RunReport(msgspec.Struct, frozen=True, kw_only=True):
     calibration: str | None
     calibration_sha256: str | None
     gl_renderer: str | None
+    gl_version: str | None
+    render_path: str | None
 
 
 def summarise(run: Figures) -> RunReport:
@@ -89,6 +91,8 @@ def summarise(run: Figures) -> RunReport:
         calibration=run.head.get("calibration"),
         calibration_sha256=run.head.get("calibration_sha256"),
         gl_renderer=run.head.get("gl_renderer"),
+        gl_version=run.head.get("gl_version"),
+        render_path=run.head.get("render_path"),
     )
 
 
@@ -131,5 +135,5 @@ def table_rows(found: RunReport) -> list[tuple[str, str]]:
         ("memory after the first minute", number(found.memory_growth_mb, "MB more at the end")),
         ("bench file", f"SHA-256 {found.bench_sha256}"),
         ("calibration", f"{found.calibration}, SHA-256 {found.calibration_sha256}"),
-        ("renderer", str(found.gl_renderer)),
+        ("renderer", f"{found.gl_renderer}, OpenGL {found.gl_version or '-'}; levels by {found.render_path or '-'}"),
     ]

@@ -27,6 +27,8 @@ SUMMARY_KEYS |= {
     "missed_frames",
     "stale_frames",
     "gl_renderer",
+    "gl_version",
+    "render_path",
     "stale_events",
     "receive_latency_ms",
     "clock",

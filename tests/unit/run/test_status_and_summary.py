@@ -38,6 +38,9 @@ def loop():
     )
 
 
+RENDERER = SimpleNamespace(gl_renderer="llvmpipe", gl_version="4.5", path="points")
+
+
 def shown(attitude: Attitude | None = FRESH, number: int = 9, clipped: tuple[int, ...] = (), **more) -> Shown:
     return Shown(number, 0, attitude, SimpleNamespace(clipped_hip=clipped), **more)
 
@@ -101,7 +104,7 @@ def test_a_second_sender_is_told_while_it_lasts_and_once_if_it_has_gone_since(lo
 
 
 def test_a_run_without_a_frame_has_nulls_where_there_is_no_figure():
-    summary = msgspec.to_builtins(RunTally().summary(0.0, PacketCounts(), "none"))
+    summary = msgspec.to_builtins(RunTally().summary(0.0, PacketCounts(), RENDERER))
     assert summary["frames"] == 0 and summary["fps"] is None
     assert summary["frame_ms"] == {"p50": None, "p99": None, "max": None}
     assert summary["stars_drawn"] == {"mean": None, "max": None}
@@ -115,7 +118,7 @@ def test_a_summary_has_the_figures_of_its_frames():
         tally.add((2 + k % 2) * MS, None if k == 0 else 7 * MS, 50 + k, (5, 3) if k == 8 else ())
     counts = PacketCounts(received=30)
     counts.refused_by["crc"] = 10
-    summary = msgspec.to_builtins(tally.summary(2.0, counts, "llvmpipe"))
+    summary = msgspec.to_builtins(tally.summary(2.0, counts, RENDERER))
     assert (summary["frames"], summary["fps"]) == (100, 50)
     assert summary["frame_ms"]["max"] == 3.0
     assert summary["frame_ms"]["p50"] == pytest.approx(2.0, rel=2e-3)

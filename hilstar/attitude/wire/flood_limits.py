@@ -9,6 +9,7 @@ import resource
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from typing import TypeVar
 
 from hilstar.notices import Notices
 
@@ -20,7 +21,9 @@ PAUSE_S = 0.005  # of a flooded receiver: the frame loop needs the interpreter l
 OVER_S = 1.0  # a flood is over once no packet was dropped for this long
 FREED_WITHIN_S = 2.0
 PAGE_BYTES = resource.getpagesize()
+MAX_LOOKED_AT = 1000  # of what is passed over: a discontinuity is declared once, and not in each packet that is damaged
 WANTED_FILES = 65_536
+T = TypeVar("T")
 
 
 @dataclass(slots=True)
@@ -45,7 +48,7 @@ class LinkCounts:
 
 
 class FloodGate:
-    """Admits MAX_PACKETS_PER_S, and MAX_BURST at once. The others are counted and reported."""
+    """Admits MAX_PACKETS_PER_S, and MAX_BURST at once, the newest. The others are passed over: counted and reported."""
 
     def __init__(self, counts: LinkCounts, notices: Notices, now_s: Callable[[], float] = time.monotonic) -> None:
         self._counts = counts
@@ -55,8 +58,20 @@ class FloodGate:
         self._seen_s = now_s()
         self._dropped_s = -OVER_S
 
-    def admit(self, waiting: int) -> int:
-        """How many of the waiting packets may be decoded; the caller drops the others. Pauses where there are others."""
+    def newest(self, waiting: list[T], declares_discontinuity: Callable[[T], bool]) -> list[T]:
+        """Of all that waits, oldest first, what may be decoded: the newest. Pauses where others are passed over.
+
+        Of those the newest that declares a discontinuity is taken too: no attitude is interpolated across it.
+        """
+        passed_over = len(waiting) - self._admit(len(waiting))
+        for k in range(passed_over - 1, max(passed_over - MAX_LOOKED_AT, 0) - 1, -1):
+            if declares_discontinuity(waiting[k]):
+                self._counts.flooded -= 1
+                return [waiting[k], *waiting[passed_over:]]
+        return waiting[passed_over:]
+
+    def _admit(self, waiting: int) -> int:
+        """How many of the waiting packets may be decoded."""
         now_s = self._now_s()
         self._left = min(self._left + (now_s - self._seen_s) * MAX_PACKETS_PER_S, MAX_BURST)
         self._seen_s = now_s
@@ -72,7 +87,7 @@ class FloodGate:
             self._notices.tell(
                 "flood",
                 f"over {MAX_PACKETS_PER_S} packets per second, or {MAX_BURST} at once: taking the newest,"
-                " dropping the others unread",
+                " passing over the others unread",
             )
         self._dropped_s = now_s
         time.sleep(PAUSE_S)

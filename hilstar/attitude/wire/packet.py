@@ -25,6 +25,7 @@ from hilstar.attitude.wire import protocol
 from hilstar.attitude.wire.protocol import FASTEST_RAD_S, NORM_TOLERANCE, VERSION
 
 CRC = struct.Struct("<I")
+ATTITUDE_HEAD = bytes([VERSION, protocol.KIND_ATTITUDE])
 MAX_JSON_BYTES = 4096
 INT64 = range(-(2**63), 2**63)
 U32 = 2**32
@@ -155,6 +156,17 @@ def decode(message: bytes) -> Event:
     if len(message) != size:
         return Refusal("format", f"version {head[0]}, kind {head[1]}; send version {VERSION}, kind 1")
     return _decode_body(head[1], message)
+
+
+def declares_discontinuity(message: bytes) -> bool:
+    """Whether a message is an attitude that must not be interpolated to; quick where it is not."""
+    if message[:2] == ATTITUDE_HEAD:
+        if len(message) != protocol.ATTITUDE_BYTES or not message[len(ATTITUDE_HEAD)] & protocol.FLAG_DISCONTINUITY:
+            return False
+    elif b"discontinuity" not in message[:MAX_JSON_BYTES]:
+        return False
+    event = decode(message)
+    return isinstance(event, AttitudeSample) and event.discontinuity
 
 
 def _decode_body(kind: int, message: bytes) -> Event:

@@ -14,7 +14,7 @@ from typing import NamedTuple, Self
 import serial
 from serial.tools import list_ports
 
-from hilstar.attitude.wire.cobs import DELIMITER, StreamDecoder, frame
+from hilstar.attitude.wire.cobs import DELIMITER, StreamDecoder, decode_frame, frame, frame_declares_discontinuity
 from hilstar.attitude.wire.flood_limits import FloodGate, LinkCounts
 from hilstar.attitude.wire.links import Arrival
 from hilstar.attitude.wire.packet import Event, Packet, encode
@@ -59,6 +59,26 @@ class Chunk(NamedTuple):
     empty_ns: int = 0
 
 
+class Framed(NamedTuple):
+    """A frame that a chunk completed, and whether it was the chunk's last."""
+
+    body: bytes
+    chunk: Chunk
+    last: bool
+
+    def declares_discontinuity(self) -> bool:
+        """Whether it is an attitude that must not be interpolated to."""
+        return frame_declares_discontinuity(self.body)
+
+    def arrival(self) -> Arrival[Event]:
+        """What it says; frames before the chunk's last were there earlier, and waited for it."""
+        chunk, event = self.chunk, decode_frame(self.body)
+        if chunk.waited_ns is None:
+            return Arrival(chunk.host_ns, event, self.body)
+        waited_ns = chunk.waited_ns if self.last else chunk.host_ns - chunk.empty_ns
+        return Arrival(chunk.host_ns, event, self.body, waited_ns=waited_ns, stamped=True)
+
+
 class SerialLink:
     """A serial port that is reopened, with back-off, whenever it disappears.
 
@@ -93,7 +113,7 @@ class SerialLink:
         return device
 
     def receive(self, timeout_ms: int) -> list[Arrival[Event]]:
-        """The frames that have arrived; waits at most `timeout_ms` for the first byte."""
+        """The frames that have arrived, and only the newest of a flood; waits at most `timeout_ms` for the first byte."""
         device = self._device
         if device is None:
             self._reopen(timeout_ms)
@@ -103,7 +123,8 @@ class SerialLink:
         except (OSError, TypeError) as error:  # pyserial raises TypeError for a port closed meanwhile
             self._lose(str(error))
             return []
-        return [arrival for chunk in chunks for arrival in self._arrivals(chunk)]
+        waiting = [framed for chunk in chunks for framed in self._framed(chunk)]
+        return [framed.arrival() for framed in self._gate.newest(waiting, Framed.declares_discontinuity)]
 
     def _read(self, device: serial.Serial, timeout_ms: int) -> list[Chunk]:
         """What has come, read now."""
@@ -113,18 +134,9 @@ class SerialLink:
         data += device.read(min(device.in_waiting, MAX_READ_BYTES)) if data else b""
         return [Chunk(time.monotonic_ns(), data)] if data else []
 
-    def _arrivals(self, chunk: Chunk) -> list[Arrival[Event]]:
-        """The frames that a chunk completes; those before the last were there earlier, and waited for it."""
-        frames = chunk.data.count(DELIMITER)
-        admitted = self._gate.admit(frames)
-        events = self._decoder.feed(chunk.data) if admitted == frames else self._decoder.feed_newest(chunk.data, admitted)
-        if chunk.waited_ns is None:
-            return [Arrival(chunk.host_ns, event, raw) for event, raw in events]
-        arrivals: list[Arrival[Event]] = []
-        for k, (event, raw) in enumerate(events):
-            waited_ns = chunk.waited_ns if k == len(events) - 1 else chunk.host_ns - chunk.empty_ns
-            arrivals.append(Arrival(chunk.host_ns, event, raw, waited_ns=waited_ns, stamped=True))
-        return arrivals
+    def _framed(self, chunk: Chunk) -> list[Framed]:
+        bodies = self._decoder.frames(chunk.data)
+        return [Framed(body, chunk, k == len(bodies)) for k, body in enumerate(bodies, 1)]
 
     def wait_for_message(self, timeout_ms: int) -> bool:
         """True once unread bytes wait."""

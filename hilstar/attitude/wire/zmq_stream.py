@@ -13,7 +13,7 @@ import zmq
 from hilstar.attitude.wire.flood_limits import FloodGate
 from hilstar.attitude.wire.keys import NO_KEYS, CurveKeys
 from hilstar.attitude.wire.links import Arrival
-from hilstar.attitude.wire.packet import Event, Packet, decode
+from hilstar.attitude.wire.packet import Event, Packet, declares_discontinuity, decode
 from hilstar.attitude.wire.zmq_socket import QUEUE_MESSAGES, ZmqSocket
 from hilstar.notices import Notices
 from hilstar.process.interrupts import caught
@@ -31,6 +31,10 @@ class Taken(NamedTuple):
     host_ns: int
     parts: list[bytes]
     waited_ns: int | None = None
+
+    def declares_discontinuity(self) -> bool:
+        """Whether it is a packet or JSON object whose attitude must not be interpolated to."""
+        return declares_discontinuity(self.parts[-1])
 
 
 class ZmqReceiver(ZmqSocket):
@@ -70,8 +74,7 @@ class ZmqReceiver(ZmqSocket):
         while len(waiting) < QUEUE_MESSAGES and taken_bytes < MAX_TAKEN_BYTES and (parts := self._take_parts()) is not None:
             waiting.append(Taken(time.monotonic_ns(), parts))
             taken_bytes += sum(map(len, parts))
-        admitted = self._gate.admit(len(waiting))
-        return waiting[len(waiting) - admitted :]
+        return self._gate.newest(waiting, Taken.declares_discontinuity)
 
     def arrivals(self, taken: Iterable[Taken]) -> list[Arrival[Event]]:
         """What messages say."""

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import json
+import os
+import signal
 import threading
 import time
+import tty
 from collections.abc import Iterator
 
 import msgspec
 import numpy as np
 import pytest
+from cobs import cobs
 
+from hilstar.attitude.wire.flood_limits import MAX_PACKETS_PER_S
 from hilstar.attitude.wire.serial_link import SerialLink
 from hilstar.bench.build import load
 from hilstar.rotation import angle_between_rad, from_radec_roll_deg, propagate
@@ -22,14 +29,16 @@ from hilstar.run.serve import serve
 from tests.support.benches import LIVE_BENCH
 from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
 from tests.support.live_runs import attitudes, median_age_ns, serve_until
-from tests.support.servers import interrupted, listening, until_said
-from tests.support.waiting import best_of_three, in_time
+from tests.support.senders import packet
+from tests.support.servers import interrupted, listening, summary_of, until_said
+from tests.support.waiting import best_of_three, in_time, repeating
 from tests.support.wire.ptys import Cable
 
 BAUD = 921_600
 START_DEG = (84.057, -1.2, 0.0)
 # A packet's float32 rate (0.35 rad/s) predicts over 100 ms; and rounding.
 PREDICTED_RAD = 1e-7 * 0.35 + 1e-9
+FLOOD_HZ, FLOOD_EACH_S = 6000, 0.001
 LATE_S = 0.5  # a loaded machine wakes late
 
 
@@ -180,3 +189,33 @@ def test_a_port_that_is_not_there_or_no_port_gets_one_line(tmp_path):
     assert_refused(run_hilstar_here("serve", bench, "--headless", "--duration", "1"), 2, "port")
     assert_refused(run_hilstar_here("send", "--spin", "z,1", "--to", "serial:/dev/ttyNowhere@115200"), 2, "ttyNowhere")
     assert_refused(run_hilstar_here("send", "--spin", "z,1", "--to", "serial:@115200"), 2, "serial:/dev/ttyX@BAUD")
+
+
+@best_of_three
+def test_more_packets_than_a_run_looks_at_are_passed_over_and_the_run_ends_in_order(tmp_path):
+    """Every packet in a write of its own, as a USB-CDC device sends them, whatever its baud rate, to the end."""
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    os.set_blocking(master, False)
+    bench, ledger = tmp_path / "flood.toml", tmp_path / "run.mcap"
+    bench.write_text(f'{LIVE_BENCH}\n[attitude]\nsource = "serial"\nport = "{os.ttyname(slave)}"\n')
+    sequences = itertools.count()
+
+    def put() -> None:
+        for _ in range(round(FLOOD_HZ * FLOOD_EACH_S)):
+            with contextlib.suppress(BlockingIOError):
+                os.write(master, cobs.encode(packet(next(sequences), time.monotonic_ns())) + b"\0")
+
+    with listening(bench, "reading serial:", "--ledger", str(ledger)) as process:
+        process.shows()
+        with repeating(put, FLOOD_EACH_S):
+            process.has_received(4 * MAX_PACKETS_PER_S)
+            process.send_signal(signal.SIGTERM)
+            summary = summary_of(process)
+    os.close(master)
+    os.close(slave)
+    assert summary["packets"]["refused"] == 0
+    assert summary["ledger"]["failure"] is None
+    in_time(summary["link"]["flooded"] > 0, summary["link"])  # a busy machine sends less
+    in_time(summary["attitude_age_ms"]["p50"] < 100, summary["attitude_age_ms"])
+    in_time("stale" not in summary["events"], summary["events"])

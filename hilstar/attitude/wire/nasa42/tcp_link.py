@@ -89,10 +89,11 @@ class Nasa42Link:
             return []
         messages = self._splitter.feed(chunk)
         self._read_messages(len(messages))
-        admitted = self._gate.admit(len(messages))
+        admitted = self._gate.newest(messages, lambda message: False)  # 42 declares none
         arrivals: list[Arrival[Event]] = []
-        for k, message in enumerate(messages[len(messages) - admitted :], 1):
-            waited_ns = 0 if k == admitted else host_ns - self._stamps.empty_ns  # the kernel's stamp is that of the last
+        for k, message in enumerate(admitted, 1):
+            # The kernel's stamp is that of the last.
+            waited_ns = 0 if k == len(admitted) else host_ns - self._stamps.empty_ns
             arrivals.append(Arrival(host_ns, self._reader.decode(message), message, waited_ns=waited_ns, stamped=True))
         return arrivals
 

@@ -16,7 +16,7 @@ from typing import Self
 
 from hilstar.attitude.wire.flood_limits import PAUSE_S, FloodGate, LinkCounts
 from hilstar.attitude.wire.links import Arrival
-from hilstar.attitude.wire.packet import Event, Packet, Status, decode, encode
+from hilstar.attitude.wire.packet import Event, Packet, Status, declares_discontinuity, decode, encode
 from hilstar.attitude.wire.source import PACKETS
 from hilstar.attitude.wire.udp.addresses import AllowedSenders, Place
 from hilstar.attitude.wire.udp.datagrams import Datagram, Datagrams, SocketAddress
@@ -80,10 +80,10 @@ class UdpLink:
         taken = self._datagrams.take(MAX_TAKEN)
         waiting = [datagram for datagram in taken if self._admits(datagram)]
         self._look(len(taken) - len(waiting))
-        admitted = self._gate.admit(len(waiting))
+        admitted = self._gate.newest(waiting, lambda datagram: declares_discontinuity(datagram.data))
         if len(taken) == MAX_TAKEN:
             time.sleep(PAUSE_S)
-        return [self._arrival(datagram) for datagram in waiting[len(waiting) - admitted :]]
+        return [self._arrival(datagram) for datagram in admitted]
 
     def _admits(self, datagram: Datagram) -> bool:
         host = datagram.sender[0]

@@ -6,13 +6,14 @@ import contextlib
 import os
 import time
 import tty
+from dataclasses import replace
 
 import pytest
 
 from hilstar.attitude.wire.cobs import StreamDecoder, framed
 from hilstar.attitude.wire.flood_limits import MAX_BURST, MAX_PACKETS_PER_S, OVER_S, FloodGate, LinkCounts
-from hilstar.attitude.wire.packet import AttitudeSample, encode
-from hilstar.attitude.wire.serial_link import SerialLink
+from hilstar.attitude.wire.packet import AttitudeSample, declares_discontinuity, decode, encode
+from hilstar.attitude.wire.serial_link import Chunk, SerialLink
 from hilstar.errors import InputError
 from hilstar.notices import Notices
 from hilstar.run.send.ends import SerialSender
@@ -22,32 +23,90 @@ from tests.support.wire.samples import sample
 FRAME = framed(encode(sample(7)))
 
 
+def plain(_: object) -> bool:
+    return False
+
+
 def test_a_burst_passes_and_a_flood_does_not():
     now_s = 100.0
     counts, notices = LinkCounts(), Notices()
     gate = FloodGate(counts, notices, lambda: now_s)
-    assert gate.admit(MAX_BURST) == MAX_BURST
+    burst = list(range(MAX_BURST))
+    assert gate.newest(burst, plain) == burst
     admitted = 0
     for _ in range(20):
         now_s += 0.002
-        admitted += gate.admit(MAX_BURST)
+        taken = gate.newest(burst, plain)
+        assert taken == burst[MAX_BURST - len(taken) :]
+        admitted += len(taken)
     assert admitted == pytest.approx(20 * 0.002 * MAX_PACKETS_PER_S, abs=1)
     assert counts.flooded == 20 * MAX_BURST - admitted
     assert notices.counts() == {"flood": 1}
     now_s += OVER_S
-    assert gate.admit(MAX_BURST) == MAX_BURST
+    assert gate.newest(burst, plain) == burst
 
 
-def test_of_a_chunk_the_newest_frames_are_taken_whatever_was_kept_before():
+def flooded_messages(jumped: set[int]) -> list[AttitudeSample]:
+    return [replace(sample(7), sequence=k, discontinuity=k in jumped) for k in range(3 * MAX_BURST)]
+
+
+class Line(SerialLink):
+    """A line on which every frame was read by itself, all of them before anybody looked."""
+
+    def __init__(self, samples: list[AttitudeSample], damaged: set[int] = frozenset()) -> None:
+        self._master, self._slave = os.openpty()
+        frames = [framed(encode(each)) for each in samples]
+        for k in damaged:
+            frames[k] = frames[k][:20] + bytes([frames[k][20] % 255 + 1]) + frames[k][21:]
+        self._chunks = [Chunk(k, data, 0, k) for k, data in enumerate([b"\0", *frames])]
+        super().__init__(os.ttyname(self._slave), 921_600)
+
+    def _read(self, device, timeout_ms: int) -> list[Chunk]:
+        chunks, self._chunks = self._chunks, []
+        return chunks
+
+    def close(self) -> None:
+        super().close()
+        os.close(self._master)
+        os.close(self._slave)
+
+
+def test_of_a_line_that_brings_more_the_newest_are_taken_in_one_go(monkeypatch):
+    """Frame by frame each one that was too many cost a pause of 5 ms, and the oldest were taken: ages of seconds, no end."""
+    pauses: list[float] = []
+    monkeypatch.setattr("hilstar.attitude.wire.flood_limits.time.sleep", pauses.append)
+    with Line(flooded_messages(set())) as line:
+        taken = [arrival.event.sequence for arrival in line.receive(0)]
+        assert taken == list(range(2 * MAX_BURST, 3 * MAX_BURST))
+        assert line.link_counts.flooded == 2 * MAX_BURST
+        assert len(pauses) == 1
+
+
+def test_a_jump_that_is_passed_over_still_separates_what_is_before_it_from_what_is_after(monkeypatch):
+    """Of two that declare one and were passed over the newest whole one is taken, on every road."""
+    jumped = {500, 1500, 1800}
+    samples = flooded_messages(jumped)
+    with Line(samples, damaged={1800}) as line:
+        on_line = [arrival.event for arrival in line.receive(0)]
+    messages = [encode(each) for each in samples]
+    messages[1800] = messages[1800][:20] + b"?" + messages[1800][21:]
+    as_json = [b'{"t_ns":%d,"q":[1,0,0,0],"sequence":%d,"discontinuity":true}' % (k, k) if k in jumped else message
+               for k, message in enumerate(messages)]  # fmt: skip
+    as_json[1800] = b'{"discontinuity":true}'
+    for form in (messages, as_json):
+        taken = FloodGate(LinkCounts(), Notices()).newest(form, declares_discontinuity)
+        events = [decode(message) for message in taken]
+        for found in (events, on_line):
+            assert [event.sequence for event in found] == [1500, *range(2 * MAX_BURST, 3 * MAX_BURST)]
+            assert [event.discontinuity for event in found[:2]] == [True, False]
+
+
+def test_a_frame_of_which_the_end_comes_after_a_flood_is_taken():
     decoder = StreamDecoder()
-    decoder.feed(b"\0" + FRAME[:30])
-    chunk = b"".join(framed(encode(sample(k))) for k in range(10))
-    newest = decoder.feed_newest(chunk + FRAME[:20], 3)
-    assert [event.sequence for event, _ in newest if isinstance(event, AttitudeSample)] == [7, 8, 9]
+    assert decoder.frames(b"\0" + FRAME[:30]) == []
+    chunk = FRAME[30:] + FRAME * 3 + FRAME[:20]
+    assert decoder.frames(chunk) == [FRAME[:-1]] * 4
     assert [type(event) for event, _ in decoder.feed(FRAME[20:])] == [AttitudeSample]
-    assert decoder.feed_newest(chunk, 0) == []
-    assert len(decoder.feed_newest(chunk, 10)) == 10
-    assert len(decoder.feed_newest(chunk, 99)) == 10
 
 
 def test_a_line_of_short_junk_is_read_at_a_bounded_rate_and_a_good_frame_after_it_is_taken():

@@ -15,13 +15,15 @@ import secrets
 import shutil
 import stat
 import tempfile
+import time
+import zlib
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
 from hilstar.errors import InputError, cannot_write
-from hilstar.reading import MAX_TOML_BYTES, MCAP_MAGIC, exists, open_regular, parse_toml, read_text
+from hilstar.reading import CHUNK_BYTES, MAX_TOML_BYTES, MCAP_MAGIC, exists, open_regular, parse_toml, read_text
 
 LEDGER_MARK = b"bench_sha256"  # in the head of each ledger
 HEAD_BYTES = 16_384
@@ -29,6 +31,7 @@ MAX_DEPTH = 3  # a bench file names a calibration, which names a table
 OVERWRITE = "write another name, or add --overwrite"
 PART_BYTES = 100  # of a file's name in that of its temporary file, which may have 255
 OWNER = ".owner"  # in a temporary folder: the file that its process has locked
+MIN_REST_S, MAX_REST_S = 1.0, 3600.0  # before a file that was found whole is read through again
 FOLDERS = "hilstar-"  # what temporary folders are called
 
 # The endings of each kind of file; the first is the one that messages suggest.
@@ -200,7 +203,8 @@ def refuse_ledger(path: Path) -> None:
 class NewFile:
     """A new file that grows while it is written, locked so that it has one writer.
 
-    `fd` is its descriptor. With `overwrite` an older file stays until `commit`. Raises InputError.
+    `fd` is its descriptor, which writes at the file's end. With `overwrite` an older file stays until `commit`. Raises
+    InputError.
     """
 
     def __init__(self, path: Path, overwrite: bool = False) -> None:
@@ -213,8 +217,10 @@ class NewFile:
         made = path
         if exists(path):
             made = self._part = _part_path(Path(os.path.realpath(path)))
+        self._mtime_ns, self._look_s, self._rest_s = 0, 0.0, MIN_REST_S
         try:
-            self.fd = _create(made)
+            # Written by append: what somebody cuts off is missing for good, and the size says so. Read to be compared.
+            self.fd = _create(made, os.O_RDWR | os.O_CREAT | os.O_APPEND)
         except FileExistsError as error:
             raise InputError(f"{path}: is there already; {OVERWRITE}") from error
         except (OSError, ValueError) as error:
@@ -229,6 +235,28 @@ class NewFile:
             self._part.replace(os.path.realpath(self.path))
             self._part = None
 
+    def note(self) -> None:
+        """Remember the file as this process has written it, before it looks for the next `harm`."""
+        self._mtime_ns = os.fstat(self.fd).st_mtime_ns
+
+    def harm(self, size_bytes: int, crc: int) -> str | None:
+        """What somebody has done to the file, of which this process wrote so many bytes of this CRC-32; None for nothing.
+
+        Raises OSError.
+        """
+        status = os.fstat(self.fd)
+        if not status.st_nlink:
+            return "deleted"
+        if status.st_size != size_bytes:
+            return "truncated" if status.st_size < size_bytes else "overwritten"
+        if status.st_mtime_ns == self._mtime_ns or time.monotonic() < self._look_s:
+            return None
+        if _crc_of(self.fd, size_bytes) != crc:
+            return "overwritten"
+        # It was only touched, or its file system keeps other times than it says: it is not read over and over.
+        self._look_s, self._rest_s = time.monotonic() + self._rest_s, min(2 * self._rest_s, MAX_REST_S)
+        return None
+
     def discard(self) -> None:
         """Close and delete the file."""
         self.close()
@@ -238,6 +266,13 @@ class NewFile:
     def close(self) -> None:
         """Close the descriptor. Raises OSError."""
         os.close(self.fd)
+
+
+def _crc_of(fd: int, size_bytes: int) -> int:
+    crc = place = 0
+    while place < size_bytes and (data := os.pread(fd, min(CHUNK_BYTES, size_bytes - place), place)):
+        crc, place = zlib.crc32(data, crc), place + len(data)
+    return crc
 
 
 def refuse_writer(path: Path) -> None:

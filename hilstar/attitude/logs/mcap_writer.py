@@ -17,7 +17,7 @@ import zlib
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import zstandard
 from mcap.data_stream import RecordBuilder
@@ -74,7 +74,7 @@ class McapWriter:
         self._channels = [Channel(i, topic.name, "json", {}, i) for i, topic in enumerate(topics.values(), 1)]
         self._pending: list[_Pending] = []
         self.pending_bytes = 0
-        self._crc = 0
+        self.crc = 0  # CRC-32 of all that is written
         self._index = bytearray()
         self._indexed = True
         self._counts: Counter[int] = Counter()
@@ -93,6 +93,16 @@ class McapWriter:
         record = _message_head.pack(Opcode.MESSAGE, 22 + len(data), self._ids[key], sequence % 2**32, time_ns, time_ns) + data
         self._pending.append(_Pending(self._ids[key], time_ns, record))
         self.pending_bytes += len(record)
+
+    @property
+    def written(self) -> int:
+        """How many messages are in the file."""
+        return self._counts.total()
+
+    def take_over(self, other: Self) -> None:
+        """Take the messages that another writer of the same topics has not written yet."""
+        self._pending, self.pending_bytes = other._pending, other.pending_bytes
+        other._pending, other.pending_bytes = [], 0
 
     def drop(self, key: str | None = None) -> int:
         """Forget the messages of a topic (None: of all) that are not written yet; returns their number."""
@@ -119,7 +129,7 @@ class McapWriter:
     def finish(self) -> None:
         """Write what was added, the index and the end. Raises OSError; the file is then as if its writer had been killed."""
         self.flush()
-        end = _bytes_of(DataEnd(self._crc))
+        end = _bytes_of(DataEnd(self.crc))
         summary, offset_start = self._summary(self.size_bytes + len(end))
         start = self.size_bytes + len(end)
         crc = zlib.crc32(_footer_head.pack(Opcode.FOOTER, 20, start, offset_start), zlib.crc32(summary))
@@ -181,7 +191,7 @@ class McapWriter:
                 os.lseek(self._fd, self.size_bytes, os.SEEK_SET)
             raise
         self.size_bytes += len(data)
-        self._crc = zlib.crc32(data, self._crc)
+        self.crc = zlib.crc32(data, self.crc)
 
 
 def _bytes_of(*records: McapRecord) -> bytes:

@@ -21,6 +21,7 @@ MAX_CLIPPED = 300  # by name; a picture has hundreds of stars
 # Events that last and keep a ledger from being written: as `run.record.ledger` tells them.
 LEDGER_TROUBLES = {
     "ledger-failed": "cannot be written",
+    "ledger-lost": "a file was deleted, truncated or overwritten",
     "ledger-stalled": "the disk accepts nothing",
     "ledger-thin": "the disk is full: frames are not recorded",
 }

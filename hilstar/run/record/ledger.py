@@ -2,17 +2,20 @@
 
 A thread of its own writes a chunk five times a second, whole and with its CRC, so that no disk stops a frame. In a flood
 the first are kept whole and the others counted second by second. When a disk fills up, frames are dropped first and packets
-last; a disk that fails is tried again, and never ends the display.
+last; a disk that fails is tried again, and never ends the display. Where somebody deletes, truncates or overwrites the file,
+that is said and the run goes on in another, for nobody could read the rest of the first.
 """
 
 from __future__ import annotations
 
 import contextlib
+import itertools
 import math
 import os
 import threading
 import time
 import uuid
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -53,6 +56,7 @@ MAX_CHUNK_BYTES = 1_000_000
 MAX_RAW_BYTES = 1024  # of a message; every packet is shorter, a simulator's own messages may be cut
 MAX_DETAIL_CHARACTERS = 200
 DISK_WAITS_S, STOPPED_DISK_WAITS_S = 20.0, 0.4  # for a disk that stalls at the end, without and with a signal
+MAX_REST_S = 60.0  # between two files begun because one was deleted, truncated or overwritten
 STALLED_S = 5.0  # since the writer's last pass
 LOW_SHARE, WELL_SHARE = 0.10, 0.12  # of the disk
 FRAMES_RESERVE_BYTES, FRAMES_RESERVE_SHARE = 64_000_000, 0.02  # reserved for packets, the smaller of the two
@@ -80,7 +84,7 @@ class Ledger:
         overwrite: bool = False,
         split: Split = NO_SPLIT,
     ) -> None:
-        self.path = path
+        self.path = self._asked = path
         self.failure: str | None = None
         self._notices = Notices() if notices is None else notices
         self._overwrite, self._split = overwrite, split
@@ -89,7 +93,11 @@ class Ledger:
         self._lost = self._counted = 0
         self._thin = False
         self._part = 0
-        self._file, self._writer = self._begin(path)
+        self._renewed_s, self._rest_s = -math.inf, EACH_S
+        self._moved = False
+        self.standing: Callable[[], list[FaultRecord]] = list  # what a file has to know that begins in the middle of a run
+        self._file, self._writer = self._begin(path, overwrite)
+        self._notices.end("ledger-lost", "ledger-new", f"{path}: a new ledger is begun")
         self._begun_s = self._alive_s = time.monotonic()
         self._each_s = 0.0
         self._probe = ProcessProbe()
@@ -97,12 +105,13 @@ class Ledger:
         self._thread = threading.Thread(target=self._run, name="hilstar-ledger", daemon=True)
         self._thread.start()
 
-    def _begin(self, path: Path) -> tuple[NewFile, McapWriter]:
+    def _begin(self, path: Path, overwrite: bool) -> tuple[NewFile, McapWriter]:
         """Create a file and write its head. Raises InputError."""
-        file = NewFile(path, self._overwrite)
+        file = NewFile(path, overwrite)
         try:
             writer = McapWriter(file.fd, TOPICS, RUN_METADATA, self._head | {"part": str(self._part)})
             file.commit()
+            file.note()
         except OSError as error:
             file.discard()
             raise cannot_write(path, error, "choose another place for the ledger") from error
@@ -160,6 +169,7 @@ class Ledger:
 
     def _turn(self, last: bool) -> None:
         try:
+            self._look_at_file(last)
             for entry in self._backlog.take():
                 self._take(entry)
             now_s = time.monotonic()
@@ -167,6 +177,7 @@ class Ledger:
                 self._each_s = now_s
                 self._each_second()
             self._flush()
+            self._file.note()
             if last:
                 self._writer.finish()
             elif self._writer.size_bytes >= self._split.bytes or now_s - self._begun_s >= self._split.seconds:
@@ -204,6 +215,57 @@ class Ledger:
         if process is not None:
             self._add("process", now_ns, msgspec.json.encode(process))
         self._look_at_disk()
+
+    def _look_at_file(self, last: bool) -> None:
+        """Go on in another file where this one was deleted, truncated or overwritten."""
+        harm = self._file.harm(self._writer.size_bytes, self._writer.crc)
+        if harm is None:
+            self._look_at_place()
+        elif last or time.monotonic() - self._renewed_s > self._rest_s:
+            self._renew(harm, last)
+
+    def _renew(self, harm: str, last: bool) -> None:
+        if self._renewed_s > 0:  # whoever does this again and again does not fill the disk with files
+            self._rest_s = min(2 * self._rest_s, MAX_REST_S)
+        self._renewed_s = time.monotonic()
+        before, lost, part = part_path(self.path, self._part), self._writer.written, self._part
+        self.failure = f"{before} was {harm} while it was written"
+        self._part = 0
+        try:
+            path = _free_path(self._asked)
+            file, writer = self._begin(path, overwrite=False)
+        except InputError as error:
+            self._part = part
+            self._lost += lost if last else 0
+            self._say_lost(f"{self.failure}, and no other can be begun: {error}; the display goes on")
+            return
+        self._say_lost(f"{self.failure}: {lost} messages in it may be lost; the ledger goes on in {path}")
+        self._lost += lost
+        writer.take_over(self._writer)
+        old, self._file, self._writer, self.path = self._file, file, writer, path
+        self._begun_s, self._moved = time.monotonic(), False
+        for record in self.standing():
+            self._add("fault", record.host_ns, msgspec.json.encode(record), record.number)
+        old.close()
+
+    def _say_lost(self, line: str) -> None:
+        """Say it each time; it lasts until another ledger is begun."""
+        if "ledger-lost" in self._notices.active:
+            self._notices.tell("ledger-lost", line)
+        else:
+            self._notices.begin("ledger-lost", line)
+
+    def _look_at_place(self) -> None:
+        """Say once that the file has another name now: all of it is there."""
+        if self._moved:
+            return
+        place = part_path(self.path, self._part)
+        try:
+            self._moved = not os.path.samestat(place.stat(), os.fstat(self._file.fd))
+        except FileNotFoundError:
+            self._moved = True
+        if self._moved:
+            self._notices.tell("ledger-moved", f"{place}: was moved while it is written; the ledger goes on where it is now")
 
     def _lose(self, kind: Kind | str, number: int) -> None:
         """Count messages that were lost for lack of room."""
@@ -249,7 +311,7 @@ class Ledger:
         """Open the next file, then finish this one."""
         self._part += 1
         try:
-            file, writer = self._begin(part_path(self.path, self._part))
+            file, writer = self._begin(part_path(self.path, self._part), self._overwrite)
         except InputError as error:
             self._part -= 1
             self._begun_s = time.monotonic()  # so that it is not tried at each pass
@@ -288,6 +350,12 @@ class Ledger:
 
     def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
         self.close()
+
+
+def _free_path(path: Path) -> Path:
+    """RUN.next1.mcap, or the first such name that nothing has."""
+    names = (path.with_name(f"{path.stem}.next{k}{path.suffix}") for k in itertools.count(1))
+    return next(name for name in names if not os.path.lexists(name))
 
 
 def _topic(name: str, schema_name: str, record: type[msgspec.Struct]) -> Topic:

@@ -27,6 +27,8 @@ class LedgerSwitch:
         self._ending = threading.Lock()  # the end of a run waits for one that an operator has begun
         self._scenario: list[FaultRecord] = []
         self._faults_on: dict[int, FaultRecord] = {}
+        if ledger is not None:
+            ledger.standing = self._standing
 
     @property
     def on(self) -> bool:
@@ -79,10 +81,14 @@ class LedgerSwitch:
         ledger = self.current
         if ledger is None:
             ledger = make()
-            for record in [*self._scenario, *self._faults_on.values()]:
+            ledger.standing = self._standing
+            for record in self._standing():
                 ledger.fault(record)
             self.last = self.current = ledger
         return ledger
+
+    def _standing(self) -> list[FaultRecord]:
+        return [*self._scenario, *list(self._faults_on.values())]
 
     def end(self) -> Ledger | None:
         """End the ledger, and wait until it is whole on the disk; the one that was ended."""

@@ -21,9 +21,10 @@ from hilstar.run.record.ledger_reader import drawable_frames
 from tests.support.benches import LIVE_BENCH, SMALL_BENCH
 from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
 from tests.support.full_disk import limited_environment
-from tests.support.senders import await_subscriber, packet, publisher
-from tests.support.servers import serving, summary_of
-from tests.support.waiting import PATIENCE_S, best_of_three, in_time
+from tests.support.pages import page_of
+from tests.support.senders import await_subscriber, connected, packet, publisher, talking
+from tests.support.servers import bound, serving, summary_of
+from tests.support.waiting import PATIENCE_S, best_of_three, in_time, wait_for
 
 START = from_radec_roll_deg(84, -1, 0)
 RATE = (0.0, 0.0, 0.1)
@@ -168,6 +169,27 @@ def test_a_full_disk_ends_the_ledger_and_not_the_display(tmp_path):
     assert summary["ledger"]["unrecorded"] > 0
     assert summary["frames"] + summary["missed_frames"] == 180
     assert len(read_log(ledger)) > 20
+
+
+def test_a_ledger_that_is_deleted_is_said_everywhere_and_ends_the_run_with_1(tmp_path):
+    ledger = tmp_path / "run.mcap"
+    with bound(tmp_path, "--ledger", str(ledger), "--console", "127.0.0.1:0") as served:
+        page = page_of(served)
+        with connected(served.port) as sender, talking(sender):
+            wait_for(lambda: page.health_is(True))
+            ledger.unlink()
+            served.await_line(f"{ledger} was deleted while it was written")
+            following = tmp_path / "run.next1.mcap"
+            reason = "the ledger fails: a file was deleted, truncated or overwritten"
+            wait_for(lambda: page.json("/health")["reasons"] == [reason])
+            wait_for(lambda: len(list(drawable_frames(following))) > 10, "frames in the next file")
+        served.process.send_signal(signal.SIGINT)
+        assert served.process.wait(PATIENCE_S) == 1, served.lines
+        told = json.loads(served.process.stdout.read())["ledger"]
+    assert (told["path"], told["failure"]) == (str(following), f"{ledger} was deleted while it was written")
+    assert told["unrecorded"] > 10
+    assert any(each["kind"] == "ledger-lost" for each in messages(following)["/event"])
+    assert not ledger.exists()
 
 
 def test_a_ledger_that_cannot_be_begun_gets_one_line(tmp_path, small_bench_file):

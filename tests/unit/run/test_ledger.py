@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import resource
+import shutil
 import time
 import zlib
 from types import SimpleNamespace
@@ -25,7 +27,8 @@ from hilstar.notices import Notices
 from hilstar.run.record.backlog import MAX_WAITING_BYTES, Backlog, Entry, ReceivedPacket
 from hilstar.run.record.ledger import Ledger, Split
 from hilstar.run.record.ledger_reader import drawable_frames
-from hilstar.run.record.ledger_records import FrameRecord
+from hilstar.run.record.ledger_records import FAULT_TOPIC, FaultRecord, FrameRecord
+from hilstar.run.record.ledger_switch import LedgerSwitch
 from hilstar.run.record.report import figures_of, summarise
 from tests.support.full_disk import files_of_at_most
 from tests.support.waiting import wait_for
@@ -81,6 +84,107 @@ def test_a_disk_without_room_loses_frames_first_and_says_so_and_is_tried_again(t
     assert ledger.summary()["unrecorded"] == 10
     assert [sample.sequence for sample in read_log(tmp_path / "run.mcap")] == list(range(20))
     assert [frame.frame for frame in drawable_frames(tmp_path / "run.mcap")] == list(range(10))
+
+
+def delete(path, _):
+    path.unlink()
+
+
+def replace_by_another(path, folder):
+    (folder / "other").write_bytes(b"another file")
+    (folder / "other").replace(path)
+
+
+def cut(path, _):
+    os.truncate(path, 300)
+
+
+def write_anew(path, _):
+    path.write_bytes(b"x" * 10)
+
+
+def write_longer(path, _):
+    path.write_bytes(b"x" * 1_000_000)
+
+
+def write_over(path, _):
+    time.sleep(0.05)  # a later tick of the clock by which a file system dates changes
+    with path.open("r+b") as file:
+        file.seek(100)
+        file.write(b"over what was there")
+
+
+@pytest.mark.parametrize("split", [Split(), Split(bytes=1)])
+@pytest.mark.parametrize("harm", [delete, replace_by_another, cut, write_anew, write_longer, write_over])
+def test_a_ledger_that_is_harmed_is_said_and_goes_on_in_another_file(tmp_path, bench, harm, split):
+    notices, path = Notices(), tmp_path / "run.mcap"
+    with Ledger(path, bench, notices, split=split) as ledger:
+        keep(ledger, 0, 10)
+        wait_for(lambda: len(list(drawable_frames(path))) == 10, "the first frames on the disk")
+        if split.bytes == 1:
+            wait_for((tmp_path / "run.0001.mcap").exists, "the next file")
+        harmed = parts_of(path)[-1]
+        harm(harmed, tmp_path)
+        left = harmed.read_bytes() if harmed.exists() else None
+        wait_for(lambda: "ledger-lost" in notices.active)
+        keep(ledger, 10, 20)
+    assert ledger.path == tmp_path / "run.next1.mcap"
+    assert [frame.frame for frame in drawable_frames(ledger.path)] == list(range(10, 20))
+    assert (harmed.read_bytes() if harmed.exists() else None) == left
+    assert ledger.failure.startswith(f"{harmed} was ")
+    assert ledger.failure.split(" was ")[1].split()[0] in {"deleted", "truncated", "overwritten"}
+    assert ledger.summary()["failure"] == ledger.failure
+    assert notices.counts()["ledger-lost"] == 1
+
+
+def test_a_ledger_that_is_harmed_at_the_very_end_is_said_too(tmp_path, bench):
+    with Ledger(tmp_path / "run.mcap", bench) as ledger:
+        keep(ledger, 0, 10)
+        wait_for(lambda: len(list(drawable_frames(ledger.path))) == 10, "the first frames on the disk")
+        (tmp_path / "run.mcap").unlink()
+    assert ledger.failure.endswith("run.mcap was deleted while it was written")
+    assert ledger.summary()["unrecorded"] >= 20
+
+
+def test_a_ledger_whose_folder_is_gone_is_said_and_the_run_goes_on(tmp_path, bench):
+    notices, folder = Notices(), tmp_path / "runs"
+    folder.mkdir()
+    with Ledger(folder / "run.mcap", bench, notices) as ledger:
+        keep(ledger, 0, 10)
+        wait_for(lambda: len(list(drawable_frames(ledger.path))) == 10, "the first frames on the disk")
+        shutil.rmtree(folder)
+        wait_for(lambda: "ledger-lost" in notices.active)
+        folder.mkdir()
+        wait_for((folder / "run.next1.mcap").exists, "another file, once there is a place for it")
+        keep(ledger, 10, 20)
+    assert [frame.frame for frame in drawable_frames(folder / "run.next1.mcap")][-1] == 19
+    assert ledger.failure.endswith("run.mcap was deleted while it was written")
+
+
+def test_a_ledger_that_is_moved_touched_or_linked_is_whole(tmp_path, bench):
+    notices = Notices()
+    with Ledger(tmp_path / "run.mcap", bench, notices) as ledger:
+        keep(ledger, 0, 10)
+        (tmp_path / "link.mcap").hardlink_to(tmp_path / "run.mcap")
+        (tmp_path / "run.mcap").touch()
+        (tmp_path / "run.mcap").rename(tmp_path / "moved.mcap")
+        wait_for(lambda: notices.counts().get("ledger-moved"))
+        keep(ledger, 10, 20)
+    assert ledger.failure is None
+    assert [frame.frame for frame in drawable_frames(tmp_path / "moved.mcap")] == list(range(20))
+
+
+def test_a_ledger_begun_in_the_place_of_another_knows_the_faults_that_are_on(tmp_path, bench):
+    notices, path = Notices(), tmp_path / "run.mcap"
+    with LedgerSwitch(Ledger(path, bench, notices)) as switch:
+        for number, event in ((9, "scenario"), (0, "start"), (1, "start"), (0, "end")):
+            record = {"name": f"f{number}", "kind": "blank", "who": "file", "t_ns": 0, "table": "{}"}
+            switch.fault(FaultRecord(host_ns=1, event=event, number=number, **record))
+        wait_for(lambda: sum(topic == FAULT_TOPIC for topic, _ in read_topics(path)) == 4, "the faults on the disk")
+        path.unlink()
+        wait_for(lambda: "ledger-lost" in notices.active)
+    found = [json.loads(data) for topic, data in read_topics(switch.last.path) if topic == FAULT_TOPIC]
+    assert [(each["event"], each["number"]) for each in found] == [("scenario", 9), ("start", 1)]
 
 
 def test_what_waits_is_bounded_by_bytes_and_frames_go_first():

@@ -14,7 +14,7 @@ import pytest
 
 from hilstar.monitor.window.x11 import sync_control
 from tests.support.benches import SCREEN_BENCH, still_log
-from tests.support.commands import HILSTAR, run_hilstar
+from tests.support.commands import HILSTAR, assert_refused, run_hilstar
 from tests.support.waiting import PATIENCE_S, wait_for
 from tests.support.x11.screens import recorded
 from tests.support.x11.xorg import Xorg, xorg
@@ -98,6 +98,30 @@ def test_the_monitor_that_is_named_is_the_one_that_is_filled(server, tmp_path):
         assert "800 x 600" in result.stderr
     finally:
         server.xrandr("--output", "DUMMY1", "--off")
+
+
+@pytest.mark.parametrize(("wanted_hz", "shown_hz"), [(60, 59.94), (120, 119.88), (75, 59.94)])
+def test_a_display_keeps_its_refresh_or_takes_the_bench_s_where_it_has_it(server, tmp_path, wanted_hz, shown_hz):
+    """Left to itself GLFW opens a window at the highest refresh that a display has."""
+    assert server.refresh_hz("DUMMY0") == 59.94
+    path = bench(tmp_path)
+    path.write_text(path.read_text().replace("refresh_hz = 60", f"refresh_hz = {wanted_hz}"))
+    with showing(server, path):
+        assert server.refresh_hz("DUMMY0") == shown_hz
+    assert server.refresh_hz("DUMMY0") == 59.94
+
+
+def test_a_session_of_wayland_alone_is_refused_in_a_plain_line(server, tmp_path):
+    env = {name: value for name, value in server.env.items() if name != "DISPLAY"}
+    env |= {"WAYLAND_DISPLAY": "wayland-0", "XDG_SESSION_TYPE": "wayland"}
+    result = run_hilstar("replay", bench(tmp_path), tmp_path / "still.csv", env=env)
+    assert_refused(result, 3, "Wayland", "Xorg session", "--headless")
+
+
+def test_x11_is_used_where_the_session_says_wayland(server, tmp_path):
+    env = server.env | {"XDG_SESSION_TYPE": "wayland", "WAYLAND_DISPLAY": "wayland-0"}
+    result = run_hilstar("replay", bench(tmp_path), tmp_path / "still.csv", "--force", "--stop", "0.3", env=env)
+    assert result.returncode == 0, result.stderr
 
 
 def test_a_display_that_another_one_mirrors_is_refused(server, tmp_path):

@@ -14,12 +14,11 @@ __all__ = ["glfw"]
 
 
 def _own_library() -> Path | None:
-    """The library of glfw's own package for this session's kind of display; None where the package has none."""
+    """The library for X11 of glfw's own package, whatever the session; None where the package has none."""
     spec = find_spec("glfw")
-    kind = os.environ.get("PYGLFW_LIBRARY_VARIANT", "").lower() or os.environ.get("XDG_SESSION_TYPE", "")
     if spec is None or spec.origin is None:
         return None
-    library = Path(spec.origin).parent / ("wayland" if kind == "wayland" else "x11") / "libglfw.so"
+    library = Path(spec.origin).parent / "x11" / "libglfw.so"
     return library if library.is_file() else None
 
 

@@ -15,12 +15,17 @@ from typing import Any, Self
 from hilstar.errors import InputError, MachineError
 from hilstar.monitor.window.library import glfw
 from hilstar.monitor.window.visibility import ScreenArea, Visibility
-from hilstar.monitor.window.x11 import Survival, is_composited, sync_control
+from hilstar.monitor.window.x11 import Survival, has_extension, is_composited, sync_control
 from hilstar.process.cores import drawing_threads_apart
 from hilstar.units import GL_VERSIONS
 
 TITLE = "hilstar"
+RAMP_TOLERANCE = 1 / 512  # half a code of 8 bits
 NO_DISPLAY = "no display to open a window on; set DISPLAY, or run with --headless"
+WAYLAND = (
+    "no X11 display: this session is Wayland's, where a program can neither time its frames nor set the gamma ramp; "
+    "use an Xorg session, or run with --headless"
+)
 log = logging.getLogger(__name__)
 
 
@@ -45,11 +50,15 @@ class Display:
 
 @dataclass(frozen=True, slots=True)
 class WindowSettings:
-    """`display` is an index or a part of a name, None for an ordinary window; `bits` are requested per colour."""
+    """`display` is an index or a part of a name, None for an ordinary window; `bits` are requested per colour.
+
+    `refresh_hz` is asked for where the display has it; by default the display keeps its own.
+    """
 
     resolution_px: tuple[int, int]
     bits: int
     display: int | str | None = None
+    refresh_hz: float | None = None
 
 
 def displays() -> list[Display]:
@@ -69,8 +78,9 @@ def _glfw() -> Any:
 
 def _start() -> None:
     glfw.ERROR_REPORTING = "ignore"
-    if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")) or not glfw.init():
-        raise MachineError(NO_DISPLAY)
+    glfw.init_hint(glfw.PLATFORM, glfw.PLATFORM_X11)
+    if not os.environ.get("DISPLAY") or not glfw.init():
+        raise MachineError(WAYLAND if os.environ.get("WAYLAND_DISPLAY") else NO_DISPLAY)
 
 
 def _describe(index: int, monitor: Any) -> Display:
@@ -105,6 +115,7 @@ class Window:
         self.keys: deque[str] = deque(maxlen=64)
         self._ramp: tuple[Any, Any] | None = None
         self._changed = False  # a monitor came or went
+        self.ramp_refused = False  # the display keeps a gamma ramp that is not straight
         self.lost = False
         self.gone: str | None = None
         self._survival: Survival | None = None
@@ -122,6 +133,8 @@ class Window:
         monitor = None
         if settings.display is not None:
             self.display, monitor = _find(settings.display)
+            # Left to itself, GLFW switches a display to its highest refresh.
+            glfw.window_hint(glfw.REFRESH_RATE, _refresh_to_ask(self.display, monitor, settings.refresh_hz))
         for hint, value in (
             (glfw.OPENGL_PROFILE, glfw.OPENGL_CORE_PROFILE),
             (glfw.RESIZABLE, False),
@@ -138,6 +151,8 @@ class Window:
             self._window = _newest_window(width, height, monitor)
         if not self._window:
             raise MachineError("no window with OpenGL 3.3 can be opened; install it: apt-get install libgl1 libgl1-mesa-dri")
+        if self.display is not None:  # as it is now
+            self.display = _describe(self.display.index, monitor)
         glfw.make_context_current(self._window)
         glfw.swap_interval(1)
         glfw.set_input_mode(self._window, glfw.CURSOR, glfw.CURSOR_HIDDEN if monitor else glfw.CURSOR_NORMAL)
@@ -165,6 +180,7 @@ class Window:
         straight = [value / (size - 1) for value in range(size)]
         identity: Any = (straight, straight, straight)
         glfw.set_gamma_ramp(monitor, identity)
+        self.ramp_refused = not _is_straight(glfw.get_gamma_ramp(monitor))
 
     def _on_iconify(self, window: Any, minimised: int) -> None:
         self._minimised = bool(minimised)
@@ -247,6 +263,12 @@ class Window:
         return is_composited(self._x_display)
 
     @property
+    def by_wayland(self) -> bool:
+        """True where the X server is XWayland: a Wayland compositor draws the display."""
+        names = (_describe(index, monitor).name for index, monitor in enumerate(glfw.get_monitors()))
+        return has_extension(self._x_display, b"XWAYLAND") or any(name.startswith("XWAYLAND") for name in names)
+
+    @property
     def mirrored(self) -> str | None:
         """The name of another display that shows the same part of the desktop, where there is one."""
         if self.display is None:
@@ -260,11 +282,7 @@ class Window:
         """The refresh rates that the display has at its size, whole Hz as the system gives them; none where it does not say."""
         display = self.display
         monitor = None if self.gone is not None else glfw.get_window_monitor(self._window)
-        if not monitor or display is None:
-            return ()
-        modes = glfw.get_video_modes(monitor)
-        same = {int(m.refresh_rate) for m in modes if (m.size.width, m.size.height) == display.resolution_px}
-        return tuple(sorted(same - {0}))
+        return () if not monitor or display is None else _modes_hz(display, monitor)
 
     @property
     def timestamp_source(self) -> str:
@@ -314,6 +332,25 @@ class Window:
 
     def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
         self.close()
+
+
+def _modes_hz(display: Display, monitor: Any) -> tuple[int, ...]:
+    modes = glfw.get_video_modes(monitor)
+    same = {int(m.refresh_rate) for m in modes if (m.size.width, m.size.height) == display.resolution_px}
+    return tuple(sorted(same - {0}))
+
+
+def _refresh_to_ask(display: Display, monitor: Any, wanted_hz: float | None) -> int:
+    """The refresh that a display is opened with: the one wanted if it has it, else the one at which it runs."""
+    if wanted_hz is not None and round(wanted_hz) in _modes_hz(display, monitor):
+        return round(wanted_hz)
+    return display.refresh_hz or int(glfw.DONT_CARE)
+
+
+def _is_straight(ramp: Any) -> bool:
+    """Whether a gamma ramp as read back is the identity, within the 16 bits of the server and the steps of a small table."""
+    size = len(ramp.red)
+    return all(abs(value - k / (size - 1)) < RAMP_TOLERANCE for part in ramp for k, value in enumerate(part))
 
 
 def _newest_window(width: int, height: int, monitor: Any) -> Any:

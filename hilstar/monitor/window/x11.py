@@ -105,6 +105,16 @@ def sync_control(x_display: int | None, drawable: int | None) -> SyncControl | N
         return None
 
 
+def has_extension(x_display: int | None, name: bytes) -> bool:
+    """Whether an X server has an extension."""
+    if not x_display:
+        return False
+    library: Any = ctypes.CDLL(X11_LIBRARY)
+    library.XQueryExtension.argtypes = [ctypes.c_void_p, ctypes.c_char_p, *[ctypes.c_void_p] * 3]
+    parts = (ctypes.byref(ctypes.c_int()) for _ in range(3))
+    return bool(library.XQueryExtension(x_display, name, *parts))
+
+
 def is_composited(x_display: int | None) -> bool:
     """True where a compositing manager owns the screen (ICCCM selection _NET_WM_CM_S0); it may delay frames."""
     if not x_display:

@@ -84,6 +84,10 @@ def faults(window: Window, monitor: Monitor, timing: Timing) -> Iterator[str]:
         (width, height), (wide, high) = window.size_px, wanted_px
         sizes = f"{width} x {height} px and the bench file says {wide} x {high}"
         yield f"the display is {sizes}; set [monitor] resolution_px, or the display's mode"
+    if window.by_wayland:
+        yield "a Wayland compositor draws this display (XWayland), and holds frames back; use an Xorg session"
+    if window.ramp_refused:
+        yield "the display keeps a gamma ramp that is not straight; stop what sets it (night light, colour management)"
     if window.composited:
         yield "a compositing manager draws this display and may hold frames back; stop it, or use a plain X session"
     if window.mirrored is not None:

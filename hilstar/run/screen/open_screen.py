@@ -19,7 +19,8 @@ def open_screen(file: BenchFile, *, windowed: bool, force: bool) -> Iterator[Scr
     """The bench of a file on its display, past the gate. Raises InputError or MachineError."""
     monitor = file.config.monitor
     display = None if windowed else monitor.display
-    settings = WindowSettings(orientation_of(monitor).screen_px(monitor.resolution_px), monitor.bits, display)
+    size_px = orientation_of(monitor).screen_px(monitor.resolution_px)
+    settings = WindowSettings(size_px, monitor.bits, display, monitor.refresh_hz)
     with Window(settings) as window, open_bench(file, window_context()) as bench:
         screen = Screen(window, bench)
         bench.warm_up()

@@ -28,6 +28,7 @@ Section "Monitor"
   HorizSync 5-1000
   VertRefresh 5-200
   Modeline "640x480" 25.175 640 656 752 800 480 490 492 525
+  Modeline "640x480_120" 50.35 640 656 752 800 480 490 492 525
   Modeline "800x600" 40.0 800 840 968 1056 600 601 605 628
 EndSection
 Section "Screen"
@@ -37,7 +38,7 @@ Section "Screen"
   DefaultDepth 24
   SubSection "Display"
     Depth 24
-    Modes "640x480" "800x600"
+    Modes "640x480" "800x600" "640x480_120"
     Virtual 1440 600
   EndSubSection
 EndSection
@@ -67,6 +68,13 @@ class Xorg:
             self.xrandr()  # a query makes the driver look at its plugs
         return result.stdout
 
+    def refresh_hz(self, output: str) -> float:
+        """The rate at which an output runs, as xrandr marks it."""
+        part = self.xrandr().split(f"{output} connected")[1].split("connected")[0]
+        match = re.search(r"([\d.]+)\*", part)
+        assert match is not None, part
+        return float(match[1])
+
     def gamma(self, output: str) -> tuple[float, ...]:
         """The exponents of an output's ramp, as xrandr reads them back from the server."""
         part = self.xrandr("--verbose").split(f"{output} connected")[1]
@@ -77,7 +85,7 @@ class Xorg:
 
 @contextmanager
 def xorg(folder: Path) -> Iterator[Xorg]:
-    """An X server with one monitor DUMMY0 of 640 x 480 at 59.94 Hz, and a second one DUMMY1 to be switched on."""
+    """An X server with one monitor DUMMY0 of 640 x 480 at 59.94 Hz, also 119.88, and a second, DUMMY1, to be switched on."""
     config, log = folder / "xorg.conf", folder / "xorg.log"
     config.write_text(SERVER_CONFIG)
     read, write = os.pipe()

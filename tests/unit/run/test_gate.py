@@ -25,6 +25,8 @@ def window(**changes):
     """A window on a display that is as the small bench has it, but for `changes`."""
     plain = {
         "size_px": (320, 240),
+        "by_wayland": False,
+        "ramp_refused": False,
         "composited": False,
         "mirrored": None,
         "scaled": False,
@@ -69,6 +71,8 @@ def test_a_display_as_the_bench_file_has_it_has_no_fault(monitor):
         ({"composited": True}, GOOD, "compositing manager"),
         ({"mirrored": "HDMI-2"}, GOOD, "HDMI-2 mirrors this one"),
         ({"scaled": True}, GOOD, "set its scale to 100 %"),
+        ({"by_wayland": True}, GOOD, "use an Xorg session"),
+        ({"ramp_refused": True}, GOOD, "gamma ramp that is not straight"),
         ({"depth_bits": 6}, GOOD, "6 bits per colour and the bench file says 8"),
         ({}, Timing(PERIOD_MS * 1.02, 0, True), "58.82 Hz and the bench file says 60"),
         ({}, Timing(0.4, 0, False, waits=False), "switch vertical sync on"),

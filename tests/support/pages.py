@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 from wsproto import ConnectionType, WSConnection
-from wsproto.events import AcceptConnection, BytesMessage, CloseConnection, RejectConnection, Request, TextMessage
+from wsproto.events import AcceptConnection, BytesMessage, CloseConnection, Ping, RejectConnection, Request, TextMessage
 
 from tests.support.servers import Served
 from tests.support.waiting import PATIENCE_S, wait_for
@@ -111,6 +111,11 @@ class Live:
         """Send a text."""
         self._connection.sendall(self._protocol.send(TextMessage(text)))
 
+    def flood(self, frame: bytes, count: int) -> None:
+        """Send the bytes of a frame so many times, and read nothing."""
+        for _ in range(count // 100):
+            self._connection.sendall(frame * 100)
+
     def messages(self) -> Iterator[dict[str, Any] | bytes]:
         """Texts as JSON, and pictures as bytes, until it is closed."""
         text, parts = "", b""
@@ -129,6 +134,8 @@ class Live:
                         if event.message_finished:
                             yield parts
                             parts = b""
+                    case Ping():
+                        self._connection.sendall(self._protocol.send(event.response()))
                     case CloseConnection():
                         return
             if not data:

@@ -2,6 +2,8 @@
 
 const RETRY_MS = [200, 400, 800, 1500];
 const SILENT_MS = 3000; // without any message: the socket is given up and opened anew
+const GAVE_WAY = 4013; // the server's code: as many pages are open as it has places for, and another one came
+const GAVE_WAY_MS = 10000;
 const TOKEN_KEY = "hilstar.token";
 
 // The token comes in the address once, and is taken out of it: it would stay in the history and in what is copied.
@@ -37,7 +39,7 @@ export class Link {
       this.onChange();
     });
     socket.addEventListener("message", (event) => this.hear(event.data));
-    socket.addEventListener("close", () => this.again(socket));
+    socket.addEventListener("close", ({ code }) => this.again(socket, code === GAVE_WAY));
   }
 
   hear(data) {
@@ -46,11 +48,12 @@ export class Link {
     else this.onMessage(JSON.parse(data));
   }
 
-  again(socket) {
+  again(socket, gaveWay = false) {
     if (socket !== this.socket) return;
     this.socket = null;
+    if (gaveWay) this.refusedWhy = `too many pages are open, and this one gave way to a newer one; it comes back in ${GAVE_WAY_MS / 1000}\u00a0s`;
     this.onChange();
-    const wait = RETRY_MS[Math.min(this.tries, RETRY_MS.length - 1)];
+    const wait = gaveWay ? GAVE_WAY_MS : RETRY_MS[Math.min(this.tries, RETRY_MS.length - 1)];
     this.tries += 1;
     if (this.tries === 2) this.askWhy();
     setTimeout(() => this.connect(), wait);

@@ -27,7 +27,7 @@ from hilstar.console.feed.scene import Scene
 from hilstar.console.server.app import ORDERED_S, Page
 from hilstar.console.server.live import Crowd
 from hilstar.console.server.pictures import PictureRoom
-from hilstar.console.server.protocol import BoundedHttp
+from hilstar.console.server.protocol import PING_S, PONG_S, BoundedHttp, ReadingWebSocket
 from hilstar.console.server.reader import TICK_S, Reader
 from hilstar.errors import one_line
 from hilstar.units import NS_PER_S
@@ -125,7 +125,9 @@ async def run(setup: Setup, board: Board, wire: Wire, listener: socket.socket) -
     config = uvicorn.Config(
         page.app(),
         http=BoundedHttp,
-        ws="wsproto",
+        ws=ReadingWebSocket,
+        ws_ping_interval=PING_S,
+        ws_ping_timeout=PONG_S,
         lifespan="off",
         loop="asyncio",
         access_log=False,

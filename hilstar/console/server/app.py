@@ -122,9 +122,7 @@ class Page:
                     await asyncio.sleep(0.02)
 
     async def _live(self, socket: WebSocket) -> None:
-        if not self.crowd.has_room():
-            await socket.send_denial_response(_refusal(503, "too many pages are open"))
-            return
+        self.crowd.make_room()
         await socket.accept("hilstar" if "hilstar" in socket.scope["subprotocols"] else None)
         client = Client(socket)
         client.tell(told({"hello": self.reader.hello(), "state": self.reader.state(), "history": list(self.reader.points)}))

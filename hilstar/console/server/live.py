@@ -1,4 +1,8 @@
-"""Who follows the run: pages on WebSockets, each told at its own speed; a slow one loses pictures, then its connection."""
+"""Who follows the run: pages on WebSockets, each told at its own speed; a slow one loses pictures, then its connection.
+
+A page that comes always has a place. Where all are taken one gives way: one that does not read, before one that has
+asked for nothing, before one that is no browser's, before one of those with the most pages from one address, the oldest.
+"""
 
 from __future__ import annotations
 
@@ -6,29 +10,37 @@ import asyncio
 import json
 import math
 import time
-from collections import deque
-from typing import Any
+from collections import Counter, deque
+from typing import Annotated, Any
 
 import msgspec
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from hilstar.console.server.pictures import Packed
+from hilstar.console.server.protocol import LINE, ReadingWebSocket
 
 MAX_CLIENTS = 32
 MAX_WAITING_TEXTS = 100  # ten seconds
 SEND_S = 10.0
+CLOSING_S = 5.0  # for a close to be read
 MAX_WISHES = 40  # in WISHES_S
 WISHES_S = 2.0
-MAX_HZ = 10.0
+MIN_HZ, MAX_HZ = 0.1, 10.0
 TRY_AGAIN, POLICY = 1013, 1008  # close codes of RFC 6455 and its registry
+GIVES_WAY = 4013  # of our own: the page does not come back at once, or it would take the place of the next
 
 
 class Want(msgspec.Struct):
     """What a page wants besides the state."""
 
     picture: bool = False
-    hz: float = 8.0
+    hz: Annotated[float, msgspec.Meta(gt=0)] = 8.0
     grid: bool = False
+
+    @property
+    def picture_hz(self) -> float:
+        """How often it wants pictures, within bounds; 0 for never."""
+        return min(max(self.hz, MIN_HZ), MAX_HZ) if self.picture else 0.0
 
 
 class Wish(msgspec.Struct):
@@ -37,11 +49,21 @@ class Wish(msgspec.Struct):
     want: Want
 
 
+def wish_of(text: str) -> Want | None:
+    """What a page's message wants; None for nonsense."""
+    try:
+        return msgspec.json.decode(text, type=Wish).want
+    except (msgspec.MsgspecError, ValueError, RecursionError):  # not its JSON, no UTF-8, deeper than any
+        return None
+
+
 class Client:
     """One page."""
 
     def __init__(self, socket: WebSocket) -> None:
         self.socket = socket
+        self._line: ReadingWebSocket = socket.scope["extensions"][LINE]
+        self.address = "" if socket.client is None else socket.client.host
         self.want = Want()
         self.asked = False  # has said what it wants, as the page does at once
         self.is_page = "origin" in socket.headers
@@ -63,7 +85,8 @@ class Client:
     def show(self, packed: Packed) -> None:
         """Offer a picture: sent if the page wants it now, instead of one that waits."""
         now_s = time.monotonic()
-        if self.want.picture and now_s - self._picture_s > 0.8 / min(max(self.want.hz, 0.1), MAX_HZ):
+        hz = self.want.picture_hz
+        if hz and now_s - self._picture_s > 0.8 / hz:
             self._picture_s, self._packed = now_s, packed
             self._wake.set()
 
@@ -71,6 +94,17 @@ class Client:
         """Have the connection closed."""
         self.closing = code
         self._wake.set()
+        if code != POLICY and not self.is_read:  # it would not take the code either
+            self.drop()
+
+    def drop(self) -> None:
+        """End the connection now, whatever waits to be sent."""
+        self._line.drop()
+
+    @property
+    def is_read(self) -> bool:
+        """Whether it has lately shown that it reads what it is sent."""
+        return self._line.is_read
 
     async def send_all(self) -> None:
         """Send what is queued until it is to be closed; WebSocketDisconnect, TimeoutError where it cannot."""
@@ -99,12 +133,11 @@ class Client:
                 self.close(POLICY)
                 return
             self._wishes_s.append(now_s)
-            try:
-                self.want = msgspec.json.decode(message.get("text") or b"", type=Wish).want
-            except msgspec.MsgspecError:
+            want = wish_of(message.get("text") or "")
+            if want is None:
                 self.close(POLICY)
                 return
-            self.asked = True
+            self.want, self.asked = want, True
 
 
 class Crowd:
@@ -119,7 +152,7 @@ class Crowd:
     @property
     def picture_hz(self) -> float:
         """How often the one that wants pictures most often wants them; 0 where nobody does."""
-        return max((min(client.want.hz, MAX_HZ) for client in self._clients if client.want.picture), default=0.0)
+        return max((client.want.picture_hz for client in self._clients), default=0.0)
 
     def tell(self, message: dict[str, Any]) -> None:
         """Tell all of them; the text is made once."""
@@ -133,16 +166,15 @@ class Crowd:
         for client in self._clients:
             client.show(packed)
 
-    def has_room(self) -> bool:
-        """Whether one more may come; the oldest that has asked for nothing makes room, then the oldest that is no browser."""
+    def make_room(self) -> None:
+        """Have one give way where all places are taken."""
         if len(self._clients) < MAX_CLIENTS:
-            return True
-        idle = [client for client in self._clients if not client.asked] or [c for c in self._clients if not c.is_page]
-        if not idle:
-            return False
-        self._clients.pop(idle[0])
-        idle[0].close(TRY_AGAIN)
-        return True
+            return
+        pages = Counter(client.address for client in self._clients)
+        worth = {c: (c.is_read, c.asked, c.is_page, -pages[c.address]) for c in self._clients}
+        least = min(worth, key=worth.__getitem__)  # of equals the first, which is the oldest
+        self._clients.pop(least)
+        least.close(GIVES_WAY)
 
     async def follow(self, client: Client) -> None:
         """Serve a page until it goes, or has to."""
@@ -155,6 +187,7 @@ class Crowd:
             for task in tasks:
                 task.cancel()
             results = await asyncio.gather(*tasks, return_exceptions=True)
+            asyncio.get_running_loop().call_later(CLOSING_S, client.drop)
             if client.closing is not None and not any(isinstance(r, WebSocketDisconnect | TimeoutError) for r in results):
                 await _close(client)
 

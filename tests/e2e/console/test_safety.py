@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import json
+import resource
 import socket
 import time
+from pathlib import Path
 
 import pytest
 
+from hilstar.console.server.protocol import PONG_S
 from tests.support.commands import assert_refused, run_hilstar_here
-from tests.support.pages import PageAddress, live, page_of, raw
+from tests.support.pages import PageAddress, children, live, page_of, raw
 from tests.support.senders import free_port
 from tests.support.servers import bound
 from tests.support.waiting import PATIENCE_S, wait_for
@@ -182,6 +185,14 @@ def missed_and_frames(page: PageAddress) -> tuple[int, int]:
     return counts["missed"], counts["frames"]
 
 
+def clients(page: PageAddress) -> float:
+    return float(page.ask("/metrics")[2].decode().split("\nhilstar_console_clients ")[1].split()[0])
+
+
+def resident_mb(pid: int) -> float:
+    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * resource.getpagesize() / 1e6
+
+
 def test_two_hundred_idle_and_hostile_connections_leave_room_for_the_operator(local):
     """And frames go on; what they cost is measured by tests/benchmarks/bench_console.py."""
     _, page = local
@@ -209,14 +220,83 @@ def test_forty_pages_that_ask_for_nothing_make_room_for_one_that_does(local):
             link.await_message(lambda said: isinstance(said, bytes))
 
 
-@pytest.mark.parametrize("text", ["nonsense", "{}", '{"want": {"hz": "fast"}}', "x" * 10_000])
-def test_a_page_that_says_nonsense_is_closed(local, text):
-    _, page = local
+def hz(text: str) -> str:
+    return f'{{"want": {{"picture": true, "hz": {text}}}}}'
+
+
+HZ = ('"fast"', "-1", "0", "-0.0", "-5e-324", "1e999", "NaN", "Infinity", "null", "true", "[8]", "9" * 3000)
+NONSENSE = [
+    "nonsense",
+    "{}",
+    "",
+    "null",
+    '{"want": null}',
+    '{"want": []}',
+    '{"want": {"picture": 1}}',
+    '{"want": {"grid": ""}}',
+]
+DEEP = ["[" * 3900, '{"want": {"x": ' + "[" * 3900, '{"want": {"picture": "' + "x" * 3000 + '"}}', "x" * 10_000]
+
+
+@pytest.mark.parametrize("text", [*NONSENSE, *map(hz, HZ), *DEEP], ids=lambda text: text[:45])
+def test_a_page_that_says_nonsense_is_closed_and_the_page_s_process_stays(local, text):
+    served, page = local
+    before = children(served.process.pid, "hilstar.console.server")
     with live(page) as link:
         link.say(text)
         with contextlib.suppress(OSError):
             for _ in link.messages():
                 pass  # until it is closed
+    assert page.ask("/health")[0] in {200, 503}
+    assert children(served.process.pid, "hilstar.console.server") == before
+
+
+@pytest.mark.parametrize("text", ["5e-324", "1e-300", "0.001", "1e308", "123456789012345678901234567890"])
+def test_a_wish_beyond_bounds_is_one_within_them(local, text):
+    served, page = local
+    before = children(served.process.pid, "hilstar.console.server")
+    with live(page) as link:
+        link.say(hz(text))
+        for _ in range(5):
+            link.await_message(lambda said: "state" in said if isinstance(said, dict) else False)
+    assert children(served.process.pid, "hilstar.console.server") == before
+
+
+def test_pages_that_do_not_read_never_lock_the_operator_out_and_are_closed(local):
+    """More of them than there are places, as browsers' pages with wishes: each that comes later has a place all the same."""
+    served, page = local
+    own = {"Origin": f"http://127.0.0.1:{page.port}"}
+    before = children(served.process.pid, "hilstar.console.server")
+    with contextlib.ExitStack() as stack:
+        deaf = [stack.enter_context(live(page, own)) for _ in range(40)]
+        for each in deaf[-32:]:
+            each.want(picture=True, hz=10)
+        with live(page, own) as link:
+            link.want(picture=True, hz=10)
+            link.await_message(lambda said: isinstance(said, bytes))
+            for each in [stack.enter_context(live(page, own)) for _ in range(40)]:
+                each.want(picture=True, hz=10)
+            link.await_message(lambda _: clients(page) == 1, 10 * PONG_S)
+    assert children(served.process.pid, "hilstar.console.server") == before
+
+
+def test_a_page_that_reads_gives_way_before_the_operator_is_refused(local):
+    _, page = local
+    with contextlib.ExitStack() as stack:
+        for _ in range(33):
+            link = stack.enter_context(live(page, {"Origin": f"http://127.0.0.1:{page.port}"}))
+            link.want(picture=False)
+            link.await_message(lambda said: "state" in said)
+        link.await_message(lambda said: "history" not in said)
+
+
+def test_pings_whose_answers_are_not_read_take_little_memory(local):
+    served, page = local
+    (pid,) = children(served.process.pid, "hilstar.console.server")
+    before_mb = resident_mb(pid)
+    with live(page) as link, contextlib.suppress(OSError):
+        link.flood(b"\x89\xfd\0\0\0\0" + b"x" * 125, 200_000)
+    assert resident_mb(pid) < before_mb + 20
 
 
 def test_a_given_token_is_never_printed(tmp_path, monkeypatch):

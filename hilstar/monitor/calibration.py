@@ -12,7 +12,17 @@ import numpy as np
 
 from hilstar.arrays import Float32Array, FloatArray
 from hilstar.errors import InputError, shortened
-from hilstar.monitor.calibration_file import beside, read_grid, read_response, read_toml
+from hilstar.monitor.calibration_file import (
+    Head,
+    NotesTable,
+    WeightsTable,
+    add_uniformity,
+    beside,
+    read_grid,
+    read_response,
+    read_toml,
+    write_calibration,
+)
 from hilstar.monitor.response import (
     MAX_LEVELS,
     TRIPLES,
@@ -73,16 +83,16 @@ class Calibration:
         if self.uniformity is None:
             return None
         width, height = resolution_px
-        rows = _weights_of_grid(height, self.uniformity.shape[0])
-        columns = _weights_of_grid(width, self.uniformity.shape[1])
+        rows = weights_of_grid(height, self.uniformity.shape[0])
+        columns = weights_of_grid(width, self.uniformity.shape[1])
         light = rows @ self.uniformity @ columns.T
         smallest = float(self.uniformity.min()) / 2  # an extrapolated slope must not go below zero
         light = np.maximum(light, smallest)
         return np.asarray(light / light.max(), dtype=np.float32)
 
 
-def _weights_of_grid(pixels: int, fields: int) -> FloatArray:
-    """The weight of each field in each pixel, (pixels, fields)."""
+def weights_of_grid(pixels: int, fields: int) -> FloatArray:
+    """The weight of each of a grid's fields in each pixel along one axis, (pixels, fields)."""
     if fields == 1:
         return np.ones((pixels, 1))
     place = (np.arange(pixels) + 0.5) * fields / pixels - 0.5
@@ -134,6 +144,26 @@ def primary_lights(source: str | Path, bits: int) -> FloatArray:
     names = ("r", "g", "b") if "r" in above else ("w", "w", "w")
     light = np.stack([above[name] / above[name][-1] for name in names])
     return np.asarray(light * (shares / shares.sum())[:, None])
+
+
+def with_uniformity(source: str | Path, bits: int, path: Path, grid: FloatArray | None) -> tuple[Path, ...]:
+    """Write a calibration's light with another grid of relative light (rows, columns), or with none; the files, TOML first.
+
+    `source` is a built-in name or a file, as for `load_calibration`. Raises InputError.
+    """
+    response, weights, noise, notes = f"{path.stem}.csv", None, 0.0, NotesTable()
+    if str(source) in FORMULAS:
+        light = srgb_response(bits) if str(source) == "srgb" else gamma_response(bits)
+        head = Head("photometric", "", "", f"none: the formula {source}", "relative", bits, response)
+        columns, weights = {"w": light.light}, WeightsTable(*REC709_WEIGHTS)
+    else:
+        origin, digest = EXAMPLE if str(source) == "lcd-example" else Path(source), hashlib.sha256()
+        file = read_toml(origin, digest)
+        columns = read_response(beside(origin, file.calibration.response, "[calibration] response"), bits, digest)
+        head = msgspec.structs.replace(file.calibration, response=response)
+        weights, noise, notes = file.weights, file.noise.relative if file.noise else 0.0, file.notes
+    table = write_calibration(path, head, columns, noise, notes, weights)
+    return (path, table) if grid is None else (path, table, add_uniformity(path, grid))
 
 
 def _load_file(path: Path, name: str, bits: int, bit_stealing: bool) -> Calibration:

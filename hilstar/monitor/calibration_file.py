@@ -195,7 +195,14 @@ def read_grid(path: Path, digest: Digest) -> FloatArray:
     return grid
 
 
-def write_calibration(path: Path, head: Head, columns: dict[str, FloatArray], noise: float, notes: NotesTable) -> Path:
+def write_calibration(
+    path: Path,
+    head: Head,
+    columns: dict[str, FloatArray],
+    noise: float,
+    notes: NotesTable,
+    weights: WeightsTable | None = None,
+) -> Path:
     """Write the TOML and, beside it, the response it names; the CSV's path. Raises InputError where they cannot be written."""
     table = path.parent / head.response
     codes = np.arange(len(next(iter(columns.values()))))
@@ -204,6 +211,8 @@ def write_calibration(path: Path, head: Head, columns: dict[str, FloatArray], no
         "ascii", "replace"
     ).decode()
     lines = ["[calibration]", *_keys(msgspec.structs.asdict(head)), ""]
+    if weights is not None:
+        lines += ["[weights]", *(f"{name} = {share!r}" for name, share in msgspec.structs.asdict(weights).items()), ""]
     lines += ["[noise]", f"relative = {noise:.6g}", "", "[notes]", *_keys(msgspec.structs.asdict(notes))]
     write_whole(table, comment + ",".join(["code", *columns]) + "\n" + rows)
     write_whole(path, "\n".join(lines) + "\n")

@@ -37,14 +37,40 @@ def draw_focus(path: Path, found: Sharpness, finding: str) -> None:
         axes.invert_yaxis()
 
 
-def draw_light(path: Path, e_per_s: FloatArray, off_mag: FloatArray, noise_mag: FloatArray, finding: str) -> None:
-    """How much too faint stars were seen (n,), magnitudes, over the light that was asked for (n,), electrons per second."""
-    with chart(path, finding) as (axes,):
-        axes.errorbar(e_per_s, off_mag, noise_mag, fmt="o", markersize=4)
-        axes.axhline(float(np.median(off_mag)), color="0.5", linewidth=0.8)
-        axes.set_xscale("log")
-        axes.invert_yaxis()
-        axes.set(xlabel="light asked for [e-/s]", ylabel="seen - asked for [mag]")
+def draw_light(
+    path: Path,
+    e_per_s: FloatArray,
+    off_mag: FloatArray,
+    noise_mag: FloatArray,
+    finding: str,
+    from_middle: FloatArray | None = None,
+) -> None:
+    """How much too faint stars were seen (n,), magnitudes, over the light that was asked for (n,), electrons per second.
+
+    With `from_middle` (n,), in half sides of the screen, over that as well.
+    """
+    panels = [("light asked for [e-/s]", e_per_s)]
+    panels += [] if from_middle is None else [("from the middle of the screen [half sides]", from_middle)]
+    with chart(path, finding, panels=len(panels), share_x=False) as drawn:
+        for axes, (name, along) in zip(drawn, panels, strict=True):
+            axes.errorbar(along, off_mag, noise_mag, fmt="o", markersize=4)
+            axes.axhline(float(np.median(off_mag)), color="0.5", linewidth=0.8)
+            axes.invert_yaxis()
+            axes.set(xlabel=name, ylabel="seen - asked for [mag]")
+        drawn[0].set_xscale("log")
+
+
+def draw_uniformity(path: Path, place: FloatArray, mag: tuple[FloatArray, FloatArray], finding: str) -> None:
+    """Dots at places (n, 2) of the screen: how much fainter each is than the brightest place, and than the map has it (n,)."""
+    names = "fainter than the brightest place [mag]", "fainter than the map has it [mag]"
+    with chart(path, finding, panels=2) as both:
+        for axes, off_mag, name in zip(both, mag, names, strict=True):
+            low, high = (float(value) for value in np.percentile(off_mag, (1, 99)))
+            dots = axes.scatter(place[:, 0], place[:, 1], c=off_mag, s=8, cmap="viridis_r", vmin=low, vmax=max(high, low + 1e-4))
+            axes.figure.colorbar(dots, ax=axes, label=name)
+            axes.set(aspect="equal", ylabel="monitor y [px]")
+            axes.invert_yaxis()
+        both[-1].set_xlabel("monitor x [px]")
 
 
 def draw_response_error(path: Path, response: Response, off_mag: FloatArray, finding: str) -> None:

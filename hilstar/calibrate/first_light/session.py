@@ -34,7 +34,7 @@ from hilstar.calibrate.first_light.rewrite import rewrite
 from hilstar.calibrate.first_light.rooms import Room, nobody_watches
 from hilstar.calibrate.first_light.sight.display import Stopped
 from hilstar.calibrate.first_light.sight.eyes import Eyes, NoImage, complete_images
-from hilstar.calibrate.first_light.steps import delay, lens, light, look, verify
+from hilstar.calibrate.first_light.steps import delay, lens, light, look, uniformity, verify
 from hilstar.errors import HilstarError, InputError, MachineError, one_line
 from hilstar.files import open_lock, write_whole
 from hilstar.run.sync.advice import BeatSummary, beat_of
@@ -78,6 +78,15 @@ STEPS = (
         lens.geometry,
         needs=("orientation",),
         writes=("collimator.geometry",),
+    ),
+    Step(
+        "uniformity",
+        "dots on four lattices over the whole screen",
+        "an image of each",
+        uniformity.uniformity,
+        needs=("geometry",),
+        tables=("monitor", "collimator", "tracker"),
+        writes=("monitor.calibration",),
     ),
     Step(
         "photometry",

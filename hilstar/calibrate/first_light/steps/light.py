@@ -12,7 +12,7 @@ from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import open_bench
 from hilstar.calibrate.first_light.photometer import Assumed, Photometer, Readings
 from hilstar.calibrate.first_light.pictures import draw_light, draw_response_error
-from hilstar.calibrate.first_light.records import Change, Figure, Outcome
+from hilstar.calibrate.first_light.records import Change, Figure, Outcome, Verdict
 from hilstar.calibrate.first_light.rooms import Room
 from hilstar.calibrate.first_light.stars import MIN_STARS, see_stars
 from hilstar.calibrate.measurements import PRIMARIES
@@ -69,7 +69,7 @@ def _assumed(room: Room, calibration: Calibration, channels: str) -> Assumed:
     """What the bench file says of each channel."""
     if channels == "w":
         return Assumed({"w": calibration.response.light}, calibration.response.black)
-    lights = primary_lights(_source(room.file), room.file.config.monitor.bits)
+    lights = primary_lights(calibration_source(room.file), room.file.config.monitor.bits)
     return Assumed(dict(zip(channels, lights, strict=True)), calibration.response.black)
 
 
@@ -88,10 +88,11 @@ def plan_for(bits: int, patches: int, channels: str = "w") -> list[Patch]:
 
 def calibration_of(room: Room) -> Calibration:
     """The monitor's light as the bench file has it, code by code."""
-    return load_calibration(_source(room.file), room.file.config.monitor.bits)
+    return load_calibration(calibration_source(room.file), room.file.config.monitor.bits)
 
 
-def _source(file: BenchFile) -> str | Path:
+def calibration_source(file: BenchFile) -> str | Path:
+    """What [monitor] calibration names: a built-in name, or a path."""
     name = file.config.monitor.calibration
     return name if name in BUILT_IN else file.folder / name
 
@@ -122,7 +123,7 @@ def _response_figures(
         **{f"error_at_{decade}_percent": value for decade, value in first.error_percent.items()},
     }
     if room.truth is not None:
-        true = load_calibration(_source(room.truth), room.truth.config.monitor.bits).response
+        true = load_calibration(calibration_source(room.truth), room.truth.config.monitor.bits).response
         figures["truth_max_mag"] = float(np.abs(response_error_mag(now, true)).max())
         figures["truth_black_level"] = true.black
     return figures
@@ -169,7 +170,8 @@ def scale(room: Room) -> Outcome:
     wanted, noise_mag = seen.e_per_s[used], seen.noise_mag[used]
     ratios = seen.dn[used] * room.file.config.tracker.detector.gain_e_per_dn / (wanted * room.exposure_s)
     found = Scale(white * float(np.median(ratios)), white, ratios)
-    figures = _scale_figures(room, found, wanted)
+    scatter = seen.scatter(np.asarray(magnitude(ratios)), used)
+    figures = _scale_figures(room, found, wanted) | {"scatter_error_mag": scatter.error_mag}
     by_mag, error_mag = float(figures["off_mag"]), float(figures["error_mag"])
     brighter = f"{abs(by_mag):.3f} +- {error_mag:.3f} mag {'fainter' if by_mag > 0 else 'brighter'} than the bench file has it"
     line = f"white is worth {found.flux_at_white_e_per_s:.4g} e-/s, {brighter}, by {len(ratios)} stars"
@@ -179,11 +181,13 @@ def scale(room: Room) -> Outcome:
     if wrong:
         why = "the response is not as the bench file has it (photometry), or the background is not dark; nothing was changed"
         return Outcome("failed", f"{line}, but {wrong}: {why}", figures, files, (picture,))
+    verdict: Verdict = "failed" if scatter.finding else "done"
+    line += f", but {scatter.finding}" if scatter.finding else ""
     if abs(by_mag) < AGREE_SIGMAS * error_mag:
-        return Outcome("done", line, figures, files, (picture,))
+        return Outcome(verdict, line, figures, files, (picture,))
     key, value = "flux_at_white_e_per_s", float(f"{found.flux_at_white_e_per_s:.6g}")
     change = Change(table="render", key=key, before=room.file.config.render.flux_at_white_e_per_s, after=value)
-    return Outcome("done", line, figures, files, (picture,), (change,))
+    return Outcome(verdict, line, figures, files, (picture,), (change,))
 
 
 def _white_e_per_s(file: BenchFile) -> float:

@@ -38,9 +38,11 @@ def verify(room: Room) -> Outcome:
     line = f"{len(seen.place_px)} stars on the screen are {rms} from where the sky has them"
     pictures = [picture]
     if seen.sure.sum() >= MIN_STARS:
-        figures |= _light_figures(room, seen, light)
+        found, finding = _light_figures(room, seen, light)
+        figures |= found
         pictures.append(light)
         line += f", and {figures['flux_p95_mag']:.3f} mag from its light (95 % of {figures['flux_stars']})"
+        reasons += [finding] if finding else []
     else:
         line += f"; the light of {int(seen.sure.sum())} can be read, too few to judge it"
     reasons += _star_reasons(room, figures)
@@ -100,22 +102,31 @@ def _twin_figures(twin: VerifySummary) -> dict[str, Figure]:
     }
 
 
-def _light_figures(room: Room, seen: StarsSeen, picture: Path) -> dict[str, Figure]:
-    """How far the light of stars is from the sky's, by the tracker's gain and exposure, their common zero point aside."""
+def _light_figures(room: Room, seen: StarsSeen, picture: Path) -> tuple[dict[str, Figure], str]:
+    """How far the light of stars is from the sky's, by the tracker's gain and exposure, their common zero point aside.
+
+    And what is wrong where they scatter far beyond their errors.
+    """
     gain, exposure_s = room.file.config.tracker.detector.gain_e_per_dn, room.exposure_s
     off = np.asarray(magnitude(seen.dn * gain / (seen.e_per_s * exposure_s)))[seen.sure]
     zero_point = float(np.median(off))
     spread = np.abs(off - zero_point)
     p95 = float(np.percentile(spread, 95))
     finding = f"the light of {len(off)} stars is {p95:.3f} mag from the sky's at 95 %, {zero_point:+.3f} mag in common"
-    draw_light(picture, seen.e_per_s[seen.sure], off, seen.noise_mag[seen.sure], finding)
-    return {
+    from_middle = np.hypot(*seen.screen[seen.sure].T)
+    draw_light(picture, seen.e_per_s[seen.sure], off, seen.noise_mag[seen.sure], finding, from_middle)
+    scatter = seen.scatter(off, seen.sure)
+    figures: dict[str, Figure] = {
         "flux_stars": len(off),
         "flux_rms_mag": float(np.sqrt((spread**2).mean())),
         "flux_p95_mag": p95,
         "flux_max_mag": float(spread.max()),
         "flux_zero_point_mag": zero_point,
+        "flux_scatter_mag": scatter.rms_mag,
+        "flux_error_mag": scatter.error_mag,
+        "flux_by_place": scatter.by_place,
     }
+    return figures, scatter.finding
 
 
 def _star_reasons(room: Room, figures: dict[str, Figure]) -> list[str]:

@@ -1,0 +1,264 @@
+"""The step of uniformity: how much of a dot's light comes from each place of the screen, and the map that evens it out."""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from hilstar.arrays import FloatArray, IntArray
+from hilstar.calibrate.first_light.patterns import CodeImage, Pattern, black
+from hilstar.calibrate.first_light.pictures import draw_uniformity
+from hilstar.calibrate.first_light.records import Change, Figure, Outcome
+from hilstar.calibrate.first_light.rooms import HOT_FILL, Room
+from hilstar.calibrate.first_light.steps.light import calibration_of, calibration_source
+from hilstar.calibrate.first_light.steps.look import DOT_PX, sharp_dots
+from hilstar.errors import InputError
+from hilstar.monitor.calibration import load_calibration, weights_of_grid, with_uniformity
+from hilstar.tracker.centroids import noisiest_background
+from hilstar.units import MAD_TO_SIGMA, MAG_PER_RELATIVE, magnitude
+
+APART_TRACKER_PX = 10.0  # from dot to dot: each has the light of a cell of its own, whatever its blur
+APART_SIGMAS = 14.0
+MAX_DOTS = 64  # of a lattice, along the screen's longer side
+SHIFTS = ((0, 0), (1, 0), (0, 1), (1, 1))  # of the four lattices, halves of a period: each dot meets other pixels
+MIN_DOTS = 40
+ROWS = (2, 3, 5, 7, 9, 13, 18)  # of the grids that are tried; as many columns as make their fields square
+DOTS_A_FIELD = 10
+FOLDS, SEED = 5, 0
+SURE = 2.0  # standard errors by which a finer grid has to be better at the dots that were held out
+WILD_SIGMAS = 5.0  # a dot on a dead pixel, or behind dust
+JOINED = 1e-3  # of a dot's weight: what holds fields together that have few
+WORTH_MAG = 0.002  # rms over the field: less is within what a star's light is known to
+FAR_SIGMAS, FAR_MAG = 3.0, 0.01  # beyond both, dots differ for another reason than their noise
+FILE = "light.toml"
+
+Flags = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class Dots:
+    """Dots seen whole: middles (n,), monitor px, and their light (n,), DN; `noise_mag` is what one is uncertain by."""
+
+    x: IntArray
+    y: IntArray
+    light: FloatArray
+    noise_mag: float
+
+
+@dataclass(frozen=True, slots=True)
+class Map:
+    """Light against place: a grid (rows, columns), one field where it is even, and its value at each dot (n,).
+
+    `left_mag` is what dots that were held out differ from it by, rms; `used` the dots that are not wild.
+    """
+
+    grid: FloatArray
+    at_dots: FloatArray
+    left_mag: float
+    used: Flags
+
+    @property
+    def is_even(self) -> bool:
+        """Whether a star is as bright everywhere, as well as stars can tell."""
+        return self.grid.size == 1 or self.rms_mag < WORTH_MAG
+
+    @property
+    def rms_mag(self) -> float:
+        """How much the light changes over the dots."""
+        return float(np.std(magnitude(self.at_dots[self.used])))
+
+
+def uniformity(room: Room) -> Outcome:
+    """Measure light against place, and give the bench's calibration the map where it lacks it. Raises InputError."""
+    dots, images = see_dots(room)
+    size_px, assumed = room.resolution_px, calibration_of(room)
+    known = assumed.uniformity_map(size_px)
+    as_known = np.ones(len(dots.light)) if known is None else known[dots.y, dots.x].astype(np.float64)
+    against = map_of(dots, dots.light / as_known, size_px)
+    found = map_of(dots, dots.light, size_px)
+    figures = _figures(room, dots, found, against)
+    picture = room.session / "uniformity.png"
+    line = f"{_said(found, known is not None)}; {len(dots.light)} dots differ from that by {found.left_mag:.4f} mag"
+    line += f" (noise {dots.noise_mag:.4f})"
+    draw_uniformity(picture, np.stack([dots.x, dots.y], axis=1)[found.used].astype(np.float64), _mag(found, dots), line)
+    files: list[Path] = [picture, *images]
+    changes: tuple[Change, ...] = ()
+    if against.is_even:
+        line += "; the bench file has it so" if known is not None else "; nothing was written"
+    else:
+        source, path = calibration_source(room.file), room.session / FILE
+        files += with_uniformity(source, room.file.config.monitor.bits, path, None if found.is_even else found.grid)
+        changes = _named(room, path)
+        line += "; what the tracker's own lens darkens is part of it"
+    if found.left_mag > max(FAR_SIGMAS * dots.noise_mag, FAR_MAG):
+        why = "dust, a panel uneven from pixel to pixel, or light that is not steady; look at the images"
+        return Outcome("failed", f"{line}: that is far above their noise: {why}", figures, tuple(files), (picture,), changes)
+    return Outcome("done", line, figures, tuple(files), (picture,), changes)
+
+
+def _said(found: Map, assumed: bool) -> str:
+    if found.is_even:
+        return "the light is even over the screen" + (", where the bench file has it uneven" if assumed else "")
+    seen = found.at_dots[found.used]
+    rows, columns = found.grid.shape
+    return f"the darkest place has {seen.min() / seen.max():.1%} of the brightest's light, in a map of {rows} x {columns}"
+
+
+def _mag(found: Map, dots: Dots) -> tuple[FloatArray, FloatArray]:
+    """Of the dots that count: how much fainter each is than the brightest place, and than the map has it, magnitudes."""
+    used = found.used
+    fainter = np.asarray(magnitude(dots.light[used] / found.at_dots[used].max()))
+    return fainter, np.asarray(magnitude(dots.light[used] / found.at_dots[used]))
+
+
+def _named(room: Room, path: Path) -> tuple[Change, ...]:
+    name, before = os.path.relpath(path, room.file.folder), room.file.config.monitor.calibration
+    return () if before == name else (Change(table="monitor", key="calibration", before=before, after=name),)
+
+
+def _figures(room: Room, dots: Dots, found: Map, against: Map) -> dict[str, Figure]:
+    seen = found.at_dots[found.used]
+    figures: dict[str, Figure] = {
+        "dots": len(dots.light),
+        "wild_dots": int((~found.used).sum()),
+        "grid": " x ".join(map(str, found.grid.shape)),
+        "darkest_of_brightest": float(seen.min() / seen.max()),
+        "change_rms_mag": found.rms_mag,
+        "off_bench_file_rms_mag": against.rms_mag,
+        "left_rms_mag": found.left_mag,
+        "dot_noise_mag": dots.noise_mag,
+    }
+    if room.truth is not None:
+        monitor = room.truth.config.monitor
+        true = load_calibration(calibration_source(room.truth), monitor.bits).uniformity_map(monitor.resolution_px)
+        if room.truth.config.monitor.resolution_px == room.resolution_px:
+            its = np.ones(len(dots.light)) if true is None else true[dots.y, dots.x].astype(np.float64)
+            figures["truth_rms_mag"] = float(np.std(magnitude(found.at_dots / its)))
+    return figures
+
+
+def see_dots(room: Room) -> tuple[Dots, tuple[Path, ...]]:
+    """The light of dots on lattices over the whole screen, and the images. Raises InputError where too few are seen whole."""
+    geometry, code = room.real_geometry(), int(room.known.get("focus.dot_code", 0)) or sharp_dots(room)[0]
+    ratio = geometry.tracker.focal_length_px / geometry.monitor.focal_length_px
+    sigma_px = math.hypot(float(np.mean(room.file.config.tracker.psf_sigma_px)), DOT_PX * ratio / math.sqrt(12))
+    apart_px = max(APART_TRACKER_PX, APART_SIGMAS * sigma_px) / ratio
+    period = max(math.ceil(apart_px / 2) * 2, math.ceil(max(room.resolution_px) / MAX_DOTS / 2) * 2)
+    width, height = geometry.tracker.resolution_px
+    y, x = np.mgrid[0:height, 0:width]
+    seen = np.stack(geometry.to_monitor(x.ravel().astype(np.float64), y.ravel().astype(np.float64)))
+    dark_path = room.dark()
+    dark = room.read(dark_path)
+    bad = dark > HOT_FILL * room.full_dn
+    bad[[0, -1]], bad[:, [0, -1]] = True, True  # a cell that reaches the detector's edge has lost pixels
+    parts, paths, noise_dn = [], [dark_path], 0.0
+    for number, shift in enumerate(SHIFTS):
+        firsts = [period // 2 + period // 2 * half for half in shift]
+        looked = room.look(Pattern(f"lattice_{number:03}", _lattice(room.resolution_px, firsts, period, code)), dark)
+        paths.append(looked.path)
+        if room.is_too_bright(looked):
+            raise InputError(f"dots of code {code} saturate the tracker; run the focus again (--again focus), then this step")
+        noise_dn = noisiest_background(looked.image).noise
+        parts.append(_cells(room.resolution_px, firsts, period, seen, looked.image, bad))
+    columns, rows, light = (np.concatenate(part) for part in zip(*parts, strict=True))
+    lit = light > 0
+    if lit.sum() < MIN_DOTS:
+        raise InputError(f"{int(lit.sum())} dots are seen whole and {MIN_DOTS} are needed; look at the geometry and the focus")
+    detector = room.file.config.tracker.detector
+    dn = float(np.median(light[lit]))
+    pixels = (period * ratio) ** 2
+    # A dark frame has the noise of an image; PRNU counts by how many pixels share a dot.
+    shared = detector.prnu**2 / (4 * math.pi * sigma_px**2)
+    noise = math.sqrt((dn / detector.gain_e_per_dn + 2 * pixels * noise_dn**2) / dn**2 + shared)
+    return Dots(columns[lit], rows[lit], light[lit], MAG_PER_RELATIVE * noise), tuple(paths)
+
+
+def _lattice(resolution_px: tuple[int, int], firsts: list[int], period: int, code: int) -> CodeImage:
+    """Squares of DOT_PX about every `period`-th pixel from `firsts` (x, y) on."""
+    codes, half = black(resolution_px), DOT_PX // 2
+    for down in range(-half, half + 1):
+        for right in range(-half, half + 1):
+            codes[firsts[1] + down :: period, firsts[0] + right :: period] = code
+    return codes
+
+
+def _cells(
+    resolution_px: tuple[int, int], firsts: list[int], period: int, seen: FloatArray, image: FloatArray, bad: Flags
+) -> tuple[IntArray, IntArray, FloatArray]:
+    """Column and row (n,) of each dot whose cell of the tracker's image has no bad pixel, and the sum of the image in it.
+
+    `seen` (2, h * w) is where each pixel of the tracker looks, monitor px.
+    """
+    counts = [(size - first - DOT_PX // 2 - 1) // period + 1 for size, first in zip(resolution_px, firsts, strict=True)]
+    cell = [np.floor((part - first) / period + 0.5) for part, first in zip(np.nan_to_num(seen, nan=-1e9), firsts, strict=True)]
+    inside = (cell[0] >= 0) & (cell[0] < counts[0]) & (cell[1] >= 0) & (cell[1] < counts[1])
+    index = (cell[1][inside] * counts[0] + cell[0][inside]).astype(np.intp)
+    total = counts[0] * counts[1]
+    light = np.asarray(np.bincount(index, image.ravel()[inside], minlength=total), dtype=np.float64)
+    whole = np.bincount(index, minlength=total) > 0
+    whole &= np.bincount(index, bad.ravel()[inside], minlength=total) == 0
+    which = np.flatnonzero(whole)
+    return firsts[0] + which % counts[0] * period, firsts[1] + which // counts[0] * period, light[which]
+
+
+def map_of(dots: Dots, light: FloatArray, resolution_px: tuple[int, int]) -> Map:
+    """The simplest map that light (n,) at the dots needs: one field, or the grid after which no finer one is surely better."""
+    width, height = resolution_px
+    shapes = [(1, 1), *((rows, max(round(rows * width / height), 1)) for rows in ROWS)]
+    shapes = [shape for shape in shapes if math.prod(shape) * DOTS_A_FIELD <= len(light)] or shapes[:1]
+    designs = [_design(dots, shape, resolution_px) for shape in shapes]
+    relative = light / np.median(light)
+    used = _tame(relative, designs[-1], shapes[-1])
+    fold = np.random.default_rng(SEED).integers(0, FOLDS, len(light))
+    squares = [_held_out(relative, design, shape, used, fold) for design, shape in zip(designs, shapes, strict=True)]
+    best = min(squares, key=lambda each: float(each[used].mean()))
+    worse = [(each - best)[used] for each in squares]
+    place = next(k for k, each in enumerate(worse) if each.mean() <= SURE * each.std() / math.sqrt(len(each)))
+    grid = _fitted(relative[used], designs[place][used], shapes[place])
+    left = MAG_PER_RELATIVE * math.sqrt(float(squares[place][used].mean()))
+    return Map(grid.reshape(shapes[place]), designs[place] @ grid, left, used)
+
+
+def _design(dots: Dots, shape: tuple[int, int], resolution_px: tuple[int, int]) -> Any:
+    """The weight of each field at each dot (n, fields), sparse: as a calibration's map has it."""
+    from scipy.sparse import csr_array
+
+    rows = weights_of_grid(resolution_px[1], shape[0])[dots.y]
+    columns = weights_of_grid(resolution_px[0], shape[1])[dots.x]
+    return csr_array((rows[:, :, None] * columns[:, None, :]).reshape(len(dots.x), -1))
+
+
+def _fitted(light: FloatArray, design: Any, shape: tuple[int, int]) -> FloatArray:
+    """The fields (rows * columns,) by least squares; those without dots continue their neighbours."""
+    number = np.arange(math.prod(shape)).reshape(shape)
+    joined = [(number[1:], number[:-1]), (number[:, 1:], number[:, :-1])]
+    normal = (design.T @ design).toarray()
+    for a, b in ((one.ravel(), other.ravel()) for one, other in joined):
+        np.add.at(normal, (np.concatenate([a, b]), np.concatenate([a, b])), JOINED)
+        np.add.at(normal, (np.concatenate([a, b]), np.concatenate([b, a])), -JOINED)
+    found = np.linalg.solve(normal, design.T @ light)
+    return np.asarray(np.maximum(found, light.min() / 2))  # a field that no dot reaches has light, too
+
+
+def _tame(light: FloatArray, design: Any, shape: tuple[int, int]) -> Flags:
+    """The dots (n,) that are no further from the finest map than others are."""
+    used = np.ones(len(light), dtype=np.bool_)
+    for _ in range(3):
+        off = light / (design @ _fitted(light[used], design[used], shape)) - 1
+        used = np.abs(off) < WILD_SIGMAS * max(MAD_TO_SIGMA * float(np.median(np.abs(off[used]))), 1e-6)
+    return used
+
+
+def _held_out(light: FloatArray, design: Any, shape: tuple[int, int], used: Flags, fold: IntArray) -> FloatArray:
+    """How far each dot is from a map made without it, relative and squared (n,)."""
+    squares = np.zeros(len(light))
+    for each in range(FOLDS):
+        out, kept = fold == each, used & (fold != each)
+        squares[out] = (light[out] / (design[out] @ _fitted(light[kept], design[kept], shape)) - 1) ** 2
+    return squares

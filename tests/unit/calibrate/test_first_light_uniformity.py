@@ -1,0 +1,134 @@
+"""Light against place: vignetting and an uneven panel are measured and evened out, and stars then scatter as their errors do."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hilstar.bench.bench_file import read_bench_file
+from hilstar.calibrate.first_light.rewrite import rewrite
+from hilstar.calibrate.first_light.rooms import Room
+from hilstar.calibrate.first_light.sight.virtual import VirtualBench
+from hilstar.calibrate.first_light.steps.light import photometry, scale
+from hilstar.calibrate.first_light.steps.uniformity import Dots, map_of, uniformity
+from hilstar.calibrate.first_light.steps.verify import verify
+from hilstar.monitor.calibration import load_calibration, with_uniformity
+from tests.support.benches import TWIN, bench_text
+
+SIZE_PX = (640, 480)
+Y, X = np.mgrid[-1:1:11j, -1:1:15j]
+VIGNETTING = (1 + 0.2 * (X**2 + Y**2)) ** -2.0  # half of the light in the corners of the screen
+PANEL = 1 + np.random.default_rng(4).normal(0, 0.05, (5, 7))
+# A dot is read to 0.004 mag, and a field of the map has ten dots or more; between the fields it is bilinear.
+MAP_MAG = 0.005
+NOISE = "[tracker.detector]\nread_noise_e = 12.0\nprnu = 0.005\ngain_e_per_dn = 4.0\nbits = 14\n"
+
+
+def planted(folder, grid, name="srgb", bench=None):
+    """A bench file that knows nothing of its truth's light against place."""
+    bits = 10 if name == "srgb" else 8
+    with_uniformity(name, bits, folder / "true.toml", grid)
+    changes = {"monitor": {"bits": bits, "calibration": name}}
+    text = bench_text(TWIN, changes) + (bench or "")
+    (folder / "bench.toml").write_text(text)
+    (folder / "truth.toml").write_text(text.replace(f'"{name}"', '"true.toml"'))
+    return folder
+
+
+def did(folder, step, patches=0):
+    """What a step comes to, with the bench file rewritten as a session does it."""
+    file, true = (read_bench_file(folder / name) for name in ("bench.toml", "truth.toml"))
+    eyes = VirtualBench(file, true, 0)
+    try:
+        outcome = step(Room(file, folder, folder / step.__name__, eyes, {}, {}, patches))
+    finally:
+        eyes.close()
+    rewrite(file, outcome.changes)
+    return outcome
+
+
+@pytest.mark.parametrize(("grid", "seen"), [(VIGNETTING, 0.1), (PANEL, 0.03)], ids=["vignetting", "panel"])
+def test_an_uneven_screen_is_a_finding_until_it_is_measured_and_then_is_gone(tmp_path, grid, seen):
+    folder = planted(tmp_path, grid)
+    before = did(folder, verify)
+    assert before.verdict == "failed"
+    assert "scatters" in before.line
+    assert before.figures["flux_scatter_mag"] > 3 * before.figures["flux_error_mag"]
+    found = did(folder, uniformity)
+    assert found.verdict == "done", found.line
+    assert found.figures["truth_rms_mag"] < MAP_MAG
+    assert found.figures["change_rms_mag"] == pytest.approx(seen, rel=0.5)
+    assert (folder / "uniformity.png") in found.pictures
+    assert load_calibration(folder / "light.toml", 10).uniformity is not None
+    assert did(folder, scale).verdict == "done"
+    after = did(folder, verify)
+    assert after.verdict == "done", after.line
+    assert after.figures["flux_scatter_mag"] < 1.5 * after.figures["flux_error_mag"]
+    assert before.figures["flux_scatter_mag"] > 3 * after.figures["flux_scatter_mag"]
+
+
+def test_an_even_screen_has_nothing_written(tmp_path):
+    folder = planted(tmp_path, None)
+    found = did(folder, uniformity)
+    assert (found.verdict, found.changes) == ("done", ())
+    assert "even" in found.line
+    assert not (folder / "light.toml").exists()
+    assert did(folder, verify).verdict == "done"
+
+
+def test_a_map_that_holds_stays_and_one_that_does_not_goes(tmp_path):
+    folder = planted(tmp_path, VIGNETTING)
+    did(folder, uniformity)
+    again = did(folder, uniformity)
+    assert (again.verdict, again.changes) == ("done", ())
+    assert "has it so" in again.line
+    truth = (folder / "truth.toml").read_text()
+    (folder / "truth.toml").write_text(truth.replace('"true.toml"', '"srgb"'))
+    mended = did(folder, uniformity)
+    assert (mended.verdict, mended.figures["grid"]) == ("done", "1 x 1")
+    assert load_calibration(folder / "light.toml", 10).uniformity is None
+
+
+def test_the_example_monitor_keeps_its_shares_and_its_response(tmp_path):
+    """By 8 bits, with the response measured after the map: both are in the file that the bench names."""
+    folder = planted(tmp_path, VIGNETTING, "lcd-example")
+    found = did(folder, uniformity)
+    assert found.verdict == "done", found.line
+    mine, its = (load_calibration(path, 8, bit_stealing=True) for path in (folder / "light.toml", "lcd-example"))
+    assert mine.weights == pytest.approx(its.weights)
+    assert np.array_equal(mine.response.light, its.response.light)
+    assert did(folder, photometry, 96).verdict == "done"
+    measured = load_calibration(folder / read_bench_file(folder / "bench.toml").config.monitor.calibration, 8)
+    assert np.allclose(measured.uniformity, load_calibration(folder / "light.toml", 8).uniformity)
+
+
+def test_noise_of_the_tracker_is_in_the_errors_of_its_stars(tmp_path):
+    folder = planted(tmp_path, None, bench=NOISE)
+    found = did(folder, uniformity)
+    assert (found.verdict, found.changes) == ("done", ()), found.line
+    assert found.figures["left_rms_mag"] == pytest.approx(found.figures["dot_noise_mag"], rel=0.3)
+    assert did(folder, verify).verdict == "done"
+
+
+def dots(light, rng, noise=0.004):
+    x, y = (part.ravel() for part in np.meshgrid(np.arange(8, 632, 12), np.arange(8, 472, 12)))
+    return Dots(x, y, light(x / 320 - 1, y / 240 - 1) * rng.normal(1, noise, x.shape), 1.0857 * noise)
+
+
+def test_wild_dots_do_not_bend_the_map():
+    rng = np.random.default_rng(1)
+    seen = dots(lambda x, y: 1 - 0.1 * x, rng)
+    seen.light[rng.choice(len(seen.light), 40, replace=False)] *= 0.3
+    found = map_of(seen, seen.light, SIZE_PX)
+    assert (~found.used).sum() == 40
+    assert found.left_mag == pytest.approx(seen.noise_mag, rel=0.1)
+    true = 1 - 0.1 * (seen.x / 320 - 1)
+    assert np.std(found.at_dots / true) < 0.002
+
+
+def test_dots_that_differ_from_one_to_the_next_are_a_finding(tmp_path):
+    """A panel of 80 x 60 fields with 8 % between neighbours: no map of at most 18 x 24 has them."""
+    folder = planted(tmp_path, 1 + np.random.default_rng(2).normal(0, 0.08, (60, 80)))
+    found = did(folder, uniformity)
+    assert found.verdict == "failed"
+    assert "far above" in found.line

@@ -11,6 +11,7 @@ import errno
 import fcntl
 import io
 import os
+import re
 import secrets
 import shutil
 import stat
@@ -30,6 +31,7 @@ HEAD_BYTES = 16_384
 MAX_DEPTH = 3  # a bench file names a calibration, which names a table
 OVERWRITE = "write another name, or add --overwrite"
 PART_BYTES = 100  # of a file's name in that of its temporary file, which may have 255
+PART_NAME = re.compile(r"\..+\.([0-9a-f]{16}|[0-9]+)\.part(\.\w+)?", re.DOTALL)  # a process id in those of 0.1.0
 OWNER = ".owner"  # in a temporary folder: the file that its process has locked
 MIN_REST_S, MAX_REST_S = 1.0, 3600.0  # before a file that was found whole is read through again
 FOLDERS = "hilstar-"  # what temporary folders are called
@@ -161,6 +163,14 @@ def _part_path(target: Path) -> Path:
     """A temporary name beside a file that nobody can foresee; after a kill it is known by its ending."""
     name = os.fsdecode(os.fsencode(target.stem)[:PART_BYTES])
     return target.with_name(f".{name}.{secrets.token_hex(8)}.part{target.suffix}")
+
+
+def clear_parts(folder: Path) -> None:
+    """Delete what killed writers left in a directory and below it; for one that has a single writer, who is asking."""
+    for path in folder.rglob(".*"):
+        if PART_NAME.fullmatch(path.name) and path.is_file() and not path.is_symlink():
+            with contextlib.suppress(OSError):
+                path.unlink()
 
 
 def _create(path: str | Path, flags: int = os.O_WRONLY | os.O_CREAT) -> int:

@@ -65,8 +65,10 @@ def draw_uniformity(path: Path, place: FloatArray, mag: tuple[FloatArray, FloatA
     names = "fainter than the brightest place [mag]", "fainter than the map has it [mag]"
     with chart(path, finding, panels=2) as both:
         for axes, off_mag, name in zip(both, mag, names, strict=True):
-            low, high = (float(value) for value in np.percentile(off_mag, (1, 99)))
-            dots = axes.scatter(place[:, 0], place[:, 1], c=off_mag, s=8, cmap="viridis_r", vmin=low, vmax=max(high, low + 1e-4))
+            low, high = (float(value) for value in np.percentile(off_mag, (0.5, 99.5)))
+            dots = axes.scatter(
+                place[:, 0], place[:, 1], c=off_mag, s=8, cmap="viridis_r", vmin=low, vmax=max(high, low + 1e-4)
+            )
             axes.figure.colorbar(dots, ax=axes, label=name)
             axes.set(aspect="equal", ylabel="monitor y [px]")
             axes.invert_yaxis()

@@ -36,7 +36,7 @@ from hilstar.calibrate.first_light.sight.display import Stopped
 from hilstar.calibrate.first_light.sight.eyes import Eyes, NoImage, complete_images
 from hilstar.calibrate.first_light.steps import delay, lens, light, look, uniformity, verify
 from hilstar.errors import HilstarError, InputError, MachineError, one_line
-from hilstar.files import open_lock, write_whole
+from hilstar.files import clear_parts, open_lock, write_whole
 from hilstar.run.sync.advice import BeatSummary, beat_of
 
 BEFORE_FILE = "bench-before.toml"
@@ -155,6 +155,7 @@ class Session:
 
         Raises Stopped where the display is closed.
         """
+        clear_parts(self.folder)
         before = self.folder / BEFORE_FILE
         if not before.exists():
             write_whole(before, self.file.path.read_bytes())

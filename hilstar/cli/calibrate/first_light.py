@@ -16,6 +16,8 @@ from hilstar.cli.show.paging import Console, ConsoleName, Control, Token, page_d
 from hilstar.console.terminal import print_json, say
 from hilstar.errors import InputError
 from hilstar.files import check_directory
+from hilstar.reading import exists
+from hilstar.resources import resource_path
 
 if TYPE_CHECKING:
     from hilstar.bench import bench_file as files
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
     from hilstar.console.feed.door import Door
 
 PATCHES = 96
+EXAMPLE_TRUTH = "truth-example.toml"  # in configs, wherever hilstar is installed
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +55,11 @@ def first_light(
     ] = None,
     virtual: Annotated[
         Path | None,
-        typer.Option(metavar="TRUTH.toml", help="Without hardware: a bench file that says how the bench really is."),
+        typer.Option(
+            metavar="TRUTH.toml",
+            help="Without hardware: a bench file that says how the bench really is. truth-example.toml comes with hilstar"
+            " (in configs), for the bench of configs/demo.toml.",
+        ),
     ] = None,
     dark: Annotated[
         Path | None,
@@ -91,6 +98,8 @@ def first_light(
         raise InputError(f"--again {wrong[0]}: write one of {', '.join(NAMES)}")
     check_directory("-o", output)
     file = read_bench_file(bench_file)
+    if virtual is not None and virtual.name == EXAMPLE_TRUTH and not exists(virtual):
+        virtual = resource_path("configs", EXAMPLE_TRUTH)
     check_files([virtual, dark], [], file)
     by_hand = grab is None and virtual is None
     readings = (0 if by_hand else PATCHES) if patches is None else patches

@@ -21,6 +21,7 @@ from hilstar.monitor.calibration import load_calibration
 from hilstar.monitor.calibration_file import Head, NotesTable, write_calibration
 from hilstar.monitor.geometry_file import ErrorTable, MadeTable, Notes, write_geometry
 from hilstar.monitor.response import gamma_response, srgb_response
+from hilstar.resources import resource_path
 from hilstar.rotation import from_rotation_vector, to_matrix
 from hilstar.scene.camera import Camera
 from hilstar.scene.lens import Lens
@@ -32,7 +33,7 @@ from tests.support.waiting import PATIENCE_S
 
 GAMMA_22 = {"monitor": {"calibration": "gamma2.2", "photodiode_px": 40}}
 NOTES = Notes({}, ErrorTable(), MadeTable(by="planted", when="2026-11-21", poses=1))
-STEPS = ["machine", "display", "orientation", "focus", "geometry", "photometry", "scale", "latency", "verify"]
+STEPS = ["machine", "display", "orientation", "focus", "geometry", "uniformity", "photometry", "scale", "latency", "verify"]
 FEW = ["--patches", 30]  # 12 levels
 NONE = ["--patches", 0]
 GAMMA, BLACK, WHITE_E_PER_S = 2.35, 1 / 800, 2.5e6
@@ -141,6 +142,7 @@ def test_a_whole_virtual_session_finds_mirror_and_lens(whole):
         "orientation",
         "focus",
         "geometry",
+        "uniformity",
         "photometry",
         "scale",
         "latency",
@@ -158,7 +160,7 @@ def test_the_page_needs_nothing_beside_it(whole):
     folder, found, _ = whole
     page = (folder / "s" / "first-light.html").read_text()
     assert not re.search(r"(src|href)=['\"](?!data:|#)", page)
-    assert page.count("data:image/png;base64,") == 9
+    assert page.count("data:image/png;base64,") == 10
     for step in found["steps"]:
         assert f'id="{step["name"]}"' in page
     assert found["bench_sha256"] in page
@@ -210,12 +212,30 @@ def test_a_session_killed_half_way_goes_on_where_it_was(tmp_path):
     resumed = virtually(folder, *FEW)
     assert resumed.returncode == 0, resumed.stderr
     assert untouched(readings) == len(readings) - 1 > 10
-    names = [f"{name}-1" for name in ("focus", "geometry", "orientation", "photometry", "scale", "verify")]
+    names = [f"{name}-1" for name in ("focus", "geometry", "orientation", "photometry", "scale", "uniformity", "verify")]
     assert sorted(path.name for path in (folder / "s" / "images").iterdir()) == names
+    assert not list((folder / "s").rglob("*.part*"))
     light = steps_of(resumed)["photometry"]["figures"]
     assert light["truth_max_mag"] < RESPONSE_MAG
     assert read_bench_file(folder / "bench.toml").config.monitor.rotate_deg == 90
     assert places_off_arcsec(folder) < PLACES_ARCSEC
+
+
+def test_the_truth_that_comes_with_hilstar_is_found(tmp_path):
+    """By its name alone, in a folder that has no such file: mirror, focal length, light, its fall to the edges, full scale."""
+    shutil.copy(resource_path("configs", "demo.toml"), tmp_path / "bench.toml")
+    result = run_hilstar_here(
+        "first-light", "bench.toml", "-o", "s", "--virtual", "truth-example.toml", *FEW[:1], 60, "--json", cwd=tmp_path
+    )
+    assert result.returncode == 0, result.stderr
+    steps = steps_of(result)
+    assert steps["orientation"]["figures"]["seen"] == "mirrored left to right"
+    assert steps["uniformity"]["figures"]["darkest_of_brightest"] < 0.95
+    assert steps["uniformity"]["figures"]["truth_rms_mag"] < 0.005
+    assert steps["photometry"]["figures"]["truth_max_mag"] < RESPONSE_MAG
+    assert steps["scale"]["figures"]["flux_at_white_e_per_s"] == pytest.approx(2.4e6, rel=SCALE_MAG)
+    light = steps["verify"]["figures"]
+    assert light["flux_scatter_mag"] < 1.5 * light["flux_error_mag"]
 
 
 def test_images_come_from_a_command(tmp_path):

@@ -288,6 +288,17 @@ def test_a_camera_that_fails_once_does_not_cost_the_images_before_it(tmp_path, m
     assert not go("frames")[2].items() & after.items()
 
 
+def test_what_a_killed_session_was_writing_is_cleared_when_it_goes_on(counted, tmp_path):
+    images = tmp_path / "s" / "images" / "geometry-1"
+    images.mkdir(parents=True)
+    litter = [".frame_005.10368.part.png", ".frame_005.0123456789abcdef.part.png", ".session.fedcba9876543210.part.json"]
+    own = [".notes.part.png", "frame_004.png", "part.10.part.png"]
+    for name in (*litter, *own):
+        (images / name).touch()
+    assert counted.go(tmp_path)[0] == 0
+    assert sorted(path.name for path in images.iterdir()) == sorted(own)
+
+
 def test_a_directory_of_another_bench_is_refused(counted, tmp_path):
     counted.go(tmp_path)
     (tmp_path / "other.toml").write_text(bench_text())

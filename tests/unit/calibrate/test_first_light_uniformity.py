@@ -1,4 +1,4 @@
-"""Light against place: vignetting and an uneven panel are measured and evened out, and stars then scatter as their errors do."""
+"""Light against place: an uneven screen is measured and evened out, and stars then scatter as their errors do."""
 
 from __future__ import annotations
 

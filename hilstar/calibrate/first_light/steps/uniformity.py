@@ -28,8 +28,8 @@ APART_SIGMAS = 14.0
 MAX_DOTS = 64  # of a lattice, along the screen's longer side
 SHIFTS = ((0, 0), (1, 0), (0, 1), (1, 1))  # of the four lattices, halves of a period: each dot meets other pixels
 MIN_DOTS = 40
-ROWS = (2, 3, 5, 7, 9, 13, 18)  # of the grids that are tried; as many columns as make their fields square
-DOTS_A_FIELD = 10
+ROWS = (2, 3, 5, 7, 9, 13, 18, 26)  # of the grids that are tried; as many columns as make their fields square
+DOTS_A_FIELD = 6
 FOLDS, SEED = 5, 0
 SURE = 2.0  # standard errors by which a finer grid has to be better at the dots that were held out
 WILD_SIGMAS = 5.0  # a dot on a dead pixel, or behind dust
@@ -53,7 +53,7 @@ class Dots:
 
 @dataclass(frozen=True, slots=True)
 class Map:
-    """Light against place: a grid (rows, columns), one field where it is even, and its value at each dot (n,).
+    """Light against place: a grid (rows, columns), one field where it is even, and its value at each dot (n,), median 1.
 
     `left_mag` is what dots that were held out differ from it by, rms; `used` the dots that are not wild.
     """
@@ -112,9 +112,8 @@ def _said(found: Map, assumed: bool) -> str:
 
 def _mag(found: Map, dots: Dots) -> tuple[FloatArray, FloatArray]:
     """Of the dots that count: how much fainter each is than the brightest place, and than the map has it, magnitudes."""
-    used = found.used
-    fainter = np.asarray(magnitude(dots.light[used] / found.at_dots[used].max()))
-    return fainter, np.asarray(magnitude(dots.light[used] / found.at_dots[used]))
+    light, mapped = (dots.light / np.median(dots.light))[found.used], found.at_dots[found.used]
+    return np.asarray(magnitude(light / mapped.max())), np.asarray(magnitude(light / mapped))
 
 
 def _named(room: Room, path: Path) -> tuple[Change, ...]:
@@ -229,9 +228,19 @@ def _design(dots: Dots, shape: tuple[int, int], resolution_px: tuple[int, int]) 
     """The weight of each field at each dot (n, fields), sparse: as a calibration's map has it."""
     from scipy.sparse import csr_array
 
-    rows = weights_of_grid(resolution_px[1], shape[0])[dots.y]
-    columns = weights_of_grid(resolution_px[0], shape[1])[dots.x]
-    return csr_array((rows[:, :, None] * columns[:, None, :]).reshape(len(dots.x), -1))
+    across = _two(weights_of_grid(resolution_px[0], shape[1])[dots.x])
+    down = _two(weights_of_grid(resolution_px[1], shape[0])[dots.y])
+    dot, sides = np.arange(len(dots.x)), [(y, x) for y in down for x in across]
+    fields = np.concatenate([y[0] * shape[1] + x[0] for y, x in sides])
+    weights = np.concatenate([y[1] * x[1] for y, x in sides])
+    return csr_array((weights, (np.tile(dot, len(sides)), fields)), shape=(len(dot), math.prod(shape)))
+
+
+def _two(weights: FloatArray) -> list[tuple[IntArray, FloatArray]]:
+    """The one or two fields of each row of weights (n, fields) that are not 0: their numbers and weights (n,) each."""
+    row, last = np.arange(len(weights)), weights.shape[1] - 1
+    left = np.minimum((weights != 0).argmax(axis=1), max(last - 1, 0))
+    return [(field, weights[row, field]) for field in (left, left + 1)[: last + 1]]
 
 
 def _fitted(light: FloatArray, design: Any, shape: tuple[int, int]) -> FloatArray:

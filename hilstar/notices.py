@@ -42,7 +42,7 @@ class Notices:
 
     def __init__(self) -> None:
         self._counts: Counter[str] = Counter()
-        self._active: set[str] = set()
+        self._active: dict[str, str] = {}
         self._said_ns: dict[str, deque[int]] = {}
         self._listeners: list[Listener] = []
         self._lock = threading.Lock()
@@ -80,7 +80,7 @@ class Notices:
         with self._lock:
             if kind in self._active:
                 return
-            self._active.add(kind)
+            self._active[kind] = detail
         self.tell(kind, detail)
 
     def end(self, kind: str, told_as: str, detail: str) -> None:
@@ -88,7 +88,7 @@ class Notices:
         with self._lock:
             if kind not in self._active:
                 return
-            self._active.remove(kind)
+            del self._active[kind]
         self.tell(told_as, detail)
 
     @property
@@ -96,6 +96,12 @@ class Notices:
         """The kinds that have begun and not ended."""
         with self._lock:
             return frozenset(self._active)
+
+    @property
+    def lasting(self) -> dict[str, str]:
+        """The kinds that have begun and not ended, with what was told of each."""
+        with self._lock:
+            return dict(self._active)
 
     def counts(self) -> dict[str, int]:
         """How often each kind came."""

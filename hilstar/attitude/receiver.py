@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 
 from hilstar.attitude.back_channel import QUIET, BackChannel, Traffic
 from hilstar.attitude.clock.jumps import MIN_LIMIT_NS, WAITED_UNKNOWN_NS, JumpFilter
+from hilstar.attitude.clock.rate_check import RateCheck, WrongRates
 from hilstar.attitude.clock.sender_clock import ClockSummary, SenderClock
 from hilstar.attitude.clock.senders import Repeats, Senders
 from hilstar.attitude.clock.shared_clock import SharedClockFilter
@@ -61,6 +62,7 @@ class Receiver:
         traffic: Traffic = QUIET,
         watch: Watch = nobody_watches,
         notices: Notices | None = None,
+        wrong_rates: WrongRates = "use-quaternions",
     ) -> None:
         self.counts = PacketCounts()
         self._notices = Notices() if notices is None else notices
@@ -72,6 +74,7 @@ class Receiver:
         self._back = BackChannel(link, traffic)
         self._watch = watch
         self._repeats = Repeats(self._notices)
+        self._rates = RateCheck(wrong_rates, self._notices)
         self._senders = Senders(timeline.stale_after_ns, self._notices)
         self._begun_ns: int | None = None
         self._learn_from_ns: int | None = None
@@ -188,6 +191,7 @@ class Receiver:
         if refusal is not None:
             self._refuse(arrival, refusal)
             return
+        self._rates.see(sample)
         if self._repeats.resumed():
             self.jumps.forgive()
         if self._learn_from_ns is None or host_ns < self._learn_from_ns:
@@ -209,7 +213,7 @@ class Receiver:
     def _settle(self, decided: list[SampleArrival]) -> None:
         for arrival in decided:
             sample, host_ns = arrival.event, arrival.host_ns
-            refusal = arrival.refusal or self._timeline.add(sample, host_ns)
+            refusal = arrival.refusal or self._timeline.add(self._rates.believed(sample), host_ns)
             if refusal is not None:
                 self._refuse(arrival, refusal)
                 continue

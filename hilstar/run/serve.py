@@ -198,7 +198,7 @@ def _serve_stream(bench: Bench, link: StreamLink, limit: Limit, loop: FrameLoop,
 def _receiver(settings: AttitudeSettings, link: StreamLink, timeline: Timeline, outlet: Outlet) -> Receiver:
     shared = settings.clock == "shared"
     traffic = Traffic(settings.status_hz, settings.time_requests and not shared, shared)
-    return Receiver(link, timeline, traffic, outlet.ledger.packet, outlet.notices)
+    return Receiver(link, timeline, traffic, outlet.ledger.packet, outlet.notices, settings.check_rates)
 
 
 def replay(bench: Bench, play: Play, sink: FrameSink = ignore, outlet: Outlet | None = None) -> RunSummary:

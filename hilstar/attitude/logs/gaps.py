@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import FloatArray
+from hilstar.attitude.clock.rate_check import cause_in
 from hilstar.attitude.clock.timeline import Join
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.rotation import conjugate, multiply
@@ -26,6 +27,7 @@ GAP_INTERVALS = 5  # usual (median) intervals; four packets lost in a row are no
 FIT_SHARE, GAP_FIT_SHARE = 0.2, 0.02
 FIT_RAD, GAP_FIT_RAD = 0.5, np.radians(1.0)  # and at most this: after many turns a share of them means nothing
 ALIKE_RAD = np.radians(1 / 3600)  # this close, all ways of joining agree
+LOOKED_AT = 2000  # samples, for the cause of rates that do not fit
 NO_GAPS: frozenset[int] = frozenset()
 
 
@@ -38,6 +40,7 @@ class LogJoins:
     usual_s: float = 0.0
     longest_s: float = 0.0
     misfits: int = 0
+    cause: str = ""
 
     def __call__(self, before: AttitudeSample, after: AttitudeSample) -> Join:
         """For a timeline."""
@@ -55,7 +58,8 @@ class LogJoins:
             lines.append(("log-gap", f"the log has {gaps}, {sizes}; the attitude is held there"))
         if self.misfits:
             misfits = f"in {self.misfits} intervals the log's rates do not fit its attitudes"
-            lines.append(("log-rates", f"{misfits}, and are ignored there"))
+            why = f"; probably {self.cause}" if self.cause else ""
+            lines.append(("log-rates", f"{misfits}, and are ignored there{why}"))
         return lines
 
 
@@ -70,13 +74,21 @@ def log_joins(samples: Sequence[AttitudeSample]) -> LogJoins:
     known, fits = _fits(samples, seconds, gap)
     broken = np.array([sample.discontinuity for sample in samples[1:]])
     held = gap & ~fits & ~broken
+    misfit = known & ~fits & ~broken & ~gap
     return LogJoins(
         frozenset(t_ns[:-1][fits & ~broken].tolist()),
         frozenset(t_ns[:-1][held].tolist()),
         usual_s,
         float(seconds[held].max(initial=0.0)),
-        int((known & ~fits & ~broken & ~gap).sum()),
+        int(misfit.sum()),
+        _cause(samples, int(misfit.argmax())) if misfit.any() else "",
     )
+
+
+def _cause(samples: Sequence[AttitudeSample], first: int) -> str:
+    """What is probably wrong with the rates from the first one on that does not fit; "" where they do not say."""
+    found = cause_in([sample for sample in samples[first : first + LOOKED_AT] if sample.rate_cam_rad_s is not None])
+    return "" if found is None else found.text
 
 
 def _fits(

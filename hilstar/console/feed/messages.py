@@ -122,6 +122,7 @@ class RunSeen(msgspec.Struct, frozen=True, kw_only=True):
     ledger: LedgerSeen | None = None
     note: str = ""
     faults: list[str] = []
+    rates: str = ""
     failed: list[str] = []
 
 

@@ -6,6 +6,7 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from hilstar.attitude.clock.rate_check import WRONG
 from hilstar.console.feed.messages import AttitudeSeen, ClockSeen, LedgerSeen, RunSeen
 from hilstar.run.overrides import Overrides
 
@@ -80,6 +81,7 @@ class Watched:
             display_lost="" if self.screen is None else self.screen.window.gone or "",
             ledger=self._ledger(),
             faults=[] if self.faults is None else self.faults.on(),
+            rates=self.notices.lasting.get(WRONG, ""),
         )
 
     def _ledger(self) -> LedgerSeen | None:

@@ -64,6 +64,8 @@ def _of_rest(seen: RunSeen, lately: Lately) -> Iterator[str]:
         yield f"the window is {seen.hidden}"
     if seen.operator_text:
         yield f"changed by the operator: {seen.operator_text}"
+    if seen.rates:
+        yield seen.rates
     if seen.faults:
         yield f"a fault is on: {', '.join(seen.faults)}"
     if lately.missed_share > MANY_MISSED_SHARE:

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import msgspec
 
+from hilstar.attitude.clock.rate_check import RateCheck
 from hilstar.attitude.clock.timeline import Attitude
 from hilstar.attitude.receiver import PacketCounts
 from hilstar.attitude.wire.packet import AttitudeSample, Event, Refusal, rate_refusal
@@ -31,6 +32,7 @@ class Steps:
         self.last = Shown(0, 0, None, bench.draw(None), missing=True)
         self._bench, self._limit, self._loop, self._ledger = bench, limit, loop, ledger
         self._max_rate_rad_s = math.radians(bench.config.attitude.max_rate_deg_s)
+        self._rates = RateCheck(bench.config.attitude.check_rates, loop.notices, used=False)
         self._turn_ms = RunningStatistics()
         self._begin_ns = time.monotonic_ns()
         self._end_ns = self._begin_ns + limit.slots / bench.config.monitor.refresh_hz * NS_PER_S
@@ -72,7 +74,8 @@ class Steps:
         if isinstance(event, Refusal):
             return event
         if isinstance(event, AttitudeSample):
-            return rate_refusal(event, self._max_rate_rad_s)
+            self._rates.see(event)
+            return rate_refusal(self._rates.believed(event), self._max_rate_rad_s)
         return Refusal("format", f"a {type(event).__name__} packet; a request is an attitude, or a time request")
 
     def _show(self, sample: AttitudeSample, host_ns: int) -> Shown | None:

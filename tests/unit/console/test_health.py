@@ -38,6 +38,7 @@ def test_a_run_that_goes_well_has_no_reason():
         ({"ledger": LedgerSeen("run.mcap", 1, "cannot be written")}, "the ledger fails: cannot be written"),
         ({"operator_text": "blank"}, "changed by the operator: blank"),
         ({"faults": ["flash"]}, "a fault is on: flash"),
+        ({"rates": "the packets' rates are wrong"}, "the packets' rates are wrong"),
     ],
 )
 def test_each_thing_that_is_wrong_is_a_reason(changes, words):

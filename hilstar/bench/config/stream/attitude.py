@@ -153,6 +153,15 @@ class AttitudeSettings(Table, frozen=True):
             "and two samples that would need a faster turn between them are a jump, never a turn.",
         ),
     ] = 60.0
+    check_rates: Annotated[
+        Literal["use-quaternions", "warn", "off"],
+        Meta(
+            description="Rates that are not those of the packets' own quaternions (in deg/s, of the wrong sign, axes or frame, "
+            'or zero) are reported (`rates-wrong`). `"use-quaternions"`: and the sky is drawn by the quaternions\' own turn '
+            'until the rates are right. `"warn"`: they are used all the same. `"off"`: nothing is compared. At rest nothing '
+            "can be told. A log's rates are used only where they fit its attitudes."
+        ),
+    ] = "use-quaternions"
 
     @property
     def address(self) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -133,3 +135,9 @@ def test_times_beyond_64_bits_of_difference_do_no_harm():
     samples = [AttitudeSample(t, START) for t in (-(2**63), 0, 2**63 - 1)]
     assert log_joins(samples).told == []
     assert log_joins(samples[:1]).told == []
+
+
+def test_a_log_s_rates_in_deg_s_are_named():
+    samples = [replace(each, rate_cam_rad_s=np.degrees(each.rate_cam_rad_s)) for each in log(np.arange(0, 60, 0.5))]
+    told = dict(log_joins(samples).told)["log-rates"]
+    assert told.startswith("in 119 intervals") and told.endswith("probably they are in deg/s; send rad/s")

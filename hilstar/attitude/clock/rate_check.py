@@ -1,0 +1,345 @@
+"""Whether the rates that packets carry are those of their own attitudes, and what is probably wrong where they are not; no I/O.
+
+Laws:
+1. Stretches of packets are compared: the turn of their quaternions with the mean of their rates, each with its own noise.
+2. A stretch whose attitude turns by less than its noise says nothing; nor does one that jumps, or stands and steps.
+3. Rates are wrong where all of MIN_STRETCHES in a row (or all but one of MORE_STRETCHES) are off by far more than the noise and
+   either one cause explains them all, or the error is gross. They are right again where all of MIN_STRETCHES fit.
+4. Stretches of several lengths are compared: a short one finds a fast turn in half a second, a long one a slow turn in noise.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from hilstar.arrays import FloatArray
+from hilstar.attitude.wire.packet import AttitudeSample
+from hilstar.notices import Notices
+from hilstar.rotation import conjugate, multiply, to_rotation_vector
+from hilstar.units import NS_PER_S
+
+WrongRates = Literal["use-quaternions", "warn", "off"]
+WRONG, RIGHT = "rates-wrong", "rates-right"
+
+STRETCHES_S = (0.1, 0.2, 0.5)
+MIN_INTERVALS = 5
+MIN_STRETCHES, MORE_STRETCHES = 4, 6
+MANY_WITHOUT = 20
+MAX_GAP_NS = NS_PER_S // 2
+RESTART_NS = NS_PER_S  # t_ns goes back by as much where a sender starts anew; by less where packets overtake each other
+MAX_STEP_RAD = 1.5  # from packet to packet: half a turn has no direction
+MIN_TURN_RAD_S = math.radians(0.01)
+MIN_OFF_RAD_S, MIN_GROSS_RAD_S = math.radians(0.05), math.radians(1.0)
+OFF_SHARE, FIT_SHARE, AXES_SHARE, GROSS_SHARE = 0.2, 0.1, 0.03, 0.5  # of the faster of both turns
+MAX_HELD_SHARE = 0.2  # of packets that repeat an attitude: between its steps such a turn is not the camera's
+OFF_SIGMA, FIT_SIGMA, TURN_SIGMA = 6.0, 4.0, 3.0
+MIN_BETTER = 3.0  # a cause leaves at most a third of the error
+WALK = 1.1  # white noise of rates, summed up: the slope of its sum is off by sqrt(6/5) of its mean's error
+
+
+class Stretch(NamedTuple):
+    """Some packets in a row: (3,) rates, rad/s, cam, and their standard errors, rad/s.
+
+    `turn` is that of the quaternions, `rate` the mean of the rates, and `rate_as_icrs` the same if they had ICRS components.
+    """
+
+    turn: FloatArray
+    rate: FloatArray
+    rate_as_icrs: FloatArray
+    turn_sigma: float
+    rate_sigma: float
+
+    @property
+    def turns(self) -> bool:
+        """Whether the attitude turns by more than its noise."""
+        return float(np.linalg.norm(self.turn)) > max(MIN_TURN_RAD_S, TURN_SIGMA * self.turn_sigma)
+
+
+@dataclass(frozen=True, slots=True)
+class Cause:
+    """What may be wrong with rates: `mended` are those of a stretch without it, `scale` what their noise is multiplied by."""
+
+    text: str
+    mended: Callable[[Stretch], FloatArray]
+    scale: float = 1.0
+
+
+# What a rate of 1 rad/s is in units that senders confuse with it.
+UNITS = {
+    "deg/s": math.degrees(1.0),
+    "arcsec/s": math.degrees(3600.0),
+    "mrad/s": 1e3,
+    "rad/ms": 1e-3,
+    "rpm": 60 / math.tau,
+    "revolutions/s": 1 / math.tau,
+    "rad/s times pi/180": math.radians(1.0),
+}
+OTHER_FRAME = "they are of another frame than the camera's, such as the body's"
+OTHER_AXES = f"their axes are in another order or have the wrong sign, or {OTHER_FRAME}"
+GROSS = "no unit, sign or order of axes explains them"
+
+
+def _scaled(by: float) -> Callable[[Stretch], FloatArray]:
+    return lambda stretch: stretch.rate / by
+
+
+def _turned(matrix: FloatArray) -> Callable[[Stretch], FloatArray]:
+    return lambda stretch: matrix @ stretch.rate
+
+
+def _in_icrs(by: float) -> Callable[[Stretch], FloatArray]:
+    return lambda stretch: stretch.rate_as_icrs / by
+
+
+def _causes() -> Iterator[Cause]:
+    """Those without a choice of axes, the simplest first."""
+    for unit, size in UNITS.items():
+        yield Cause(f"they are in {unit}; send rad/s", _scaled(size), 1 / size)
+    for unit, size in (("", 1.0), (" and in deg/s", UNITS["deg/s"])):
+        yield Cause(f"they have the wrong sign{unit}; send the turn of the camera in the sky, rad/s", _scaled(-size), 1 / size)
+    for unit, size in (("", 1.0), (", in deg/s", UNITS["deg/s"])):
+        yield Cause(f"they have ICRS components{unit}; send the camera's, rad/s", _in_icrs(size), 1 / size)
+
+
+def _permutations() -> Iterator[Cause]:
+    """Every order and sign of the axes but the right one and its opposite."""
+    for order in itertools.permutations(range(3)):
+        for signs in itertools.product((1, -1), repeat=3):
+            if order == (0, 1, 2) and abs(sum(signs)) == 3:
+                continue
+            matrix = np.zeros((3, 3))
+            matrix[range(3), order] = signs
+            sent = ", ".join(("" if signs[order.index(k)] > 0 else "-") + "xyz"[order.index(k)] for k in range(3))
+            what = "some of their axes have the wrong sign" if order == (0, 1, 2) else "their axes are in another order"
+            for unit, size in (("", 1.0), (" and in deg/s", UNITS["deg/s"])):
+                text = f"{what}{unit}: the camera's ({sent}) is sent as (x, y, z)"
+                yield Cause(text, _turned(matrix / size), 1 / size)
+
+
+CAUSES, PERMUTATIONS = tuple(_causes()), tuple(_permutations())
+
+
+def stretch_of(samples: Sequence[AttitudeSample]) -> Stretch | None:
+    """What packets in a row say, in the order of their times; None where most are broken off from those before them."""
+    t_s = np.array([sample.t_ns - samples[0].t_ns for sample in samples]) / NS_PER_S
+    q = np.array([sample.q_icrs_to_cam for sample in samples])
+    rate = np.array([sample.rate_cam_rad_s for sample in samples])
+    step_s = np.diff(t_s)[:, None]
+    turn_rad = -to_rotation_vector(multiply(q[1:], conjugate(q[:-1])))
+    mean = (rate[1:] + rate[:-1]) / 2
+    held = (q[1:] == q[:-1]).all(axis=1)
+    if MAX_HELD_SHARE < held.mean() < 1.0:
+        return None
+    whole = np.array([not sample.discontinuity for sample in samples[1:]])
+    for vectors_rad in (turn_rad, mean * step_s):
+        whole &= np.linalg.norm(vectors_rad, axis=1) < MAX_STEP_RAD
+    count = int(whole.sum())
+    if count < max(MIN_INTERVALS, (len(samples) - 1) / 2):
+        return None
+    at_s, turned, summed, as_icrs = (
+        np.vstack((np.zeros(part.shape[1]), np.cumsum(part[whole], axis=0)))
+        for part in (step_s, turn_rad, mean * step_s, _turned_by(q[1:], mean) * step_s)
+    )
+    weight = at_s[:, 0] - at_s.mean()
+    spread_s2 = float(weight @ weight)
+    turn = weight @ turned / spread_s2
+    scatter = turned - turned.mean(axis=0) - weight[:, None] * turn
+    turn_sigma = math.sqrt(float((scatter**2).sum()) / (3 * (count - 1)) / spread_s2)
+    rate_sigma = WALK * math.sqrt(float((np.diff(rate, axis=0)[whole] ** 2).sum()) / (6 * count) / count)
+    return Stretch(turn, weight @ summed / spread_s2, weight @ as_icrs / spread_s2, turn_sigma, rate_sigma)
+
+
+def _turned_by(q: FloatArray, vectors: FloatArray) -> FloatArray:
+    """Vectors (n, 3) turned by quaternions (n, 4)."""
+    pure = np.concatenate([np.zeros((len(vectors), 1)), vectors], axis=1)
+    return np.asarray(multiply(multiply(q, pure), conjugate(q))[:, 1:])
+
+
+def cause_of(stretches: Sequence[Stretch]) -> Cause | None:
+    """What is wrong with the rates of these stretches, all but one in MORE_STRETCHES of them; None where they may be right."""
+    allowed = len(stretches) // MORE_STRETCHES
+    if sum(not (stretch.turns and _is_off(stretch)) for stretch in stretches) > allowed:
+        return None
+    if not any(stretch.rate.any() for stretch in stretches):
+        coherent = np.linalg.norm(sum(s.turn for s in stretches)) > GROSS_SHARE * sum(np.linalg.norm(s.turn) for s in stretches)
+        return Cause("they are zero; leave them out", _scaled(1.0)) if coherent else None
+    off = float(np.median([_error(stretch, stretch.rate) for stretch in stretches]))
+
+    def explains(cause: Cause, share: float = FIT_SHARE) -> bool:
+        errors = [_error(stretch, cause.mended(stretch)) for stretch in stretches]
+        fits = [error <= _limit(s, share, FIT_SIGMA, cause.scale) for s, error in zip(stretches, errors, strict=True)]
+        return fits.count(False) <= allowed and off >= MIN_BETTER * float(np.median(errors))
+
+    for cause in CAUSES:
+        if explains(cause):
+            return cause
+    found = [cause for cause in PERMUTATIONS if explains(cause, AXES_SHARE)]
+    sharp = all(FIT_SIGMA * math.hypot(s.turn_sigma, s.rate_sigma) < FIT_SHARE * _faster(s) for s in stretches)
+    if found:
+        return found[0] if sharp and len(found) == 1 else replace(found[0], text=OTHER_AXES)
+    rotation = _best_rotation(stretches)
+    for unit, size in (("", 1.0), (", and in deg/s", UNITS["deg/s"])):
+        turned = Cause(OTHER_FRAME + unit, _turned(rotation / size), 1 / size)
+        if explains(turned):
+            return turned
+    gross = [_error(s, s.rate) > max(MIN_GROSS_RAD_S, GROSS_SHARE * _faster(s)) for s in stretches]
+    return Cause(GROSS, _scaled(1.0)) if all(gross) and len(stretches) >= MORE_STRETCHES else None
+
+
+def cause_in(samples: Sequence[AttitudeSample]) -> Cause | None:
+    """The first cause that a log's samples show, all of which have rates; None where they show none."""
+    length = _Length(0.0)
+    for sample in samples:
+        if length.add(sample) and (newest := length.newest(MIN_STRETCHES)) and (cause := cause_of(newest)):
+            return cause
+    return None
+
+
+def fits(stretch: Stretch) -> bool:
+    """Whether a turn shows that its rates are right."""
+    return stretch.turns and _error(stretch, stretch.rate) <= _limit(stretch, FIT_SHARE, FIT_SIGMA)
+
+
+def _is_off(stretch: Stretch) -> bool:
+    return _error(stretch, stretch.rate) > max(MIN_OFF_RAD_S, _limit(stretch, OFF_SHARE, OFF_SIGMA))
+
+
+def _error(stretch: Stretch, rate: FloatArray) -> float:
+    return float(np.linalg.norm(stretch.turn - rate))
+
+
+def _faster(stretch: Stretch) -> float:
+    return float(max(np.linalg.norm(stretch.turn), np.linalg.norm(stretch.rate)))
+
+
+def _limit(stretch: Stretch, share: float, sigma: float, scale: float = 1.0) -> float:
+    """How far turn and rate may be apart: a share of the turn, and the noise of both."""
+    size = _faster(stretch) if scale == 1.0 else float(np.linalg.norm(stretch.turn))
+    return max(share * size, sigma * math.hypot(stretch.turn_sigma, scale * stretch.rate_sigma))
+
+
+def _best_rotation(stretches: Sequence[Stretch]) -> FloatArray:
+    """The rotation (3, 3) that turns rates best into turns (Kabsch 1976)."""
+    u, _, vt = np.linalg.svd(sum(np.outer(stretch.turn, stretch.rate) for stretch in stretches))
+    return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt)
+
+
+class _Length:
+    """The newest stretches of one length."""
+
+    def __init__(self, length_s: float) -> None:
+        self._length_ns = round(length_s * NS_PER_S)
+        self._samples: list[AttitudeSample] = []
+        self.stretches: deque[Stretch] = deque(maxlen=MORE_STRETCHES)
+
+    def add(self, sample: AttitudeSample) -> bool:
+        """Take the next packet; True where it completes a stretch."""
+        samples = self._samples
+        samples.append(sample)
+        if len(samples) <= MIN_INTERVALS or sample.t_ns - samples[0].t_ns < self._length_ns:
+            return False
+        stretch = stretch_of(samples)
+        self._samples = [sample]
+        if stretch is None:
+            return False
+        self.stretches.append(stretch)
+        return True
+
+    def restart(self) -> None:
+        """Forget everything."""
+        self._samples.clear()
+        self.stretches.clear()
+
+    def newest(self, count: int) -> list[Stretch]:
+        """So many of the newest stretches; [] while there are fewer."""
+        return list(self.stretches)[-count:] if len(self.stretches) >= count else []
+
+
+class RateCheck:
+    """Follows one sender: tells of wrong rates once, and of right ones after that.
+
+    `wrong` says what is done with rates that are: "off" looks at nothing. `used` is False for a run that draws without rates.
+    """
+
+    def __init__(self, wrong: WrongRates, notices: Notices, *, used: bool = True) -> None:
+        self._use = wrong
+        self._used = used
+        self._notices = notices
+        self._lengths = [_Length(length_s) for length_s in STRETCHES_S]
+        self._last_ns: int | None = None
+        self._without = 0  # packets in a row without a rate
+        self.cause: Cause | None = None
+
+    @property
+    def distrusts(self) -> bool:
+        """Whether rates are left out now."""
+        return self.cause is not None and self._use == "use-quaternions"
+
+    def see(self, sample: AttitudeSample) -> None:
+        """Take the next packet as it was sent, on the sender's own clock."""
+        if self._use == "off" or not self._follows(sample):
+            return
+        self._without = self._without + 1 if sample.rate_cam_rad_s is None else 0
+        if self._without:
+            if self._without == MANY_WITHOUT:
+                self._end("the packets carry no rates any more")
+            return
+        for length in self._lengths:
+            if length.add(sample):
+                self._judge(length)
+
+    def believed(self, sample: AttitudeSample) -> AttitudeSample:
+        """The sample as it is to be drawn: without its rate where rates are wrong."""
+        if not self.distrusts or sample.rate_cam_rad_s is None:
+            return sample
+        return replace(sample, rate_cam_rad_s=None, acceleration_cam_rad_s2=None)
+
+    def _follows(self, sample: AttitudeSample) -> bool:
+        """False for a packet that others overtook; a gap and a sender that starts anew begin anew."""
+        last_ns = self._last_ns
+        if last_ns is not None and last_ns - RESTART_NS < sample.t_ns <= last_ns:
+            return False
+        if last_ns is not None and not 0 < sample.t_ns - last_ns <= MAX_GAP_NS:
+            self._restart()
+        self._last_ns = sample.t_ns
+        return True
+
+    def _judge(self, length: _Length) -> None:
+        newest = length.newest(MIN_STRETCHES)
+        if not newest:
+            return
+        if self.cause is not None:
+            if all(fits(stretch) for stretch in newest):
+                self._end("the packets' rates are those of their quaternions again")
+            return
+        more = length.newest(MORE_STRETCHES)
+        self.cause = cause_of(newest) or (cause_of(more) if more else None)
+        if self.cause is not None:
+            self._notices.begin(WRONG, self._line(self.cause, newest[-1]))
+
+    def _line(self, cause: Cause, stretch: Stretch) -> str:
+        turn_deg_s, rate_rad_s = np.degrees(np.linalg.norm(stretch.turn)), np.linalg.norm(stretch.rate)
+        done = "the sky is drawn by the quaternions' own turn" if self.distrusts else "they are used all the same"
+        if not self._used:
+            done = "nothing is drawn by them"
+        return (
+            f"the packets' rates are wrong, probably because {cause.text}: the quaternions turn at {turn_deg_s:.3g} deg/s, the"
+            f" rates say {rate_rad_s:.3g} rad/s ({math.degrees(rate_rad_s):.3g} deg/s); {done} ([attitude] check_rates)"
+        )
+
+    def _end(self, why: str) -> None:
+        self._restart()
+        if self.cause is not None:
+            self.cause = None
+            self._notices.end(WRONG, RIGHT, why)
+
+    def _restart(self) -> None:
+        for length in self._lengths:
+            length.restart()

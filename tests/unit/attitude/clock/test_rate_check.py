@@ -1,0 +1,206 @@
+"""Whether packets' rates are those of their attitudes: what is wrong is named, and what is right is never called wrong."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from hilstar.arrays import FloatArray
+from hilstar.attitude.clock.rate_check import OTHER_AXES, RIGHT, WRONG, RateCheck
+from hilstar.attitude.wire.packet import AttitudeSample
+from hilstar.notices import Notices
+from hilstar.rotation import conjugate, from_radec_roll_deg, from_rotation_vectors, multiply
+from hilstar.units import NS_PER_S
+
+ARCSEC = math.radians(1 / 3600)
+FINE_S = 1e-3  # steps of the true motion: 0.1 arcsec off in a second of the fastest of these turns
+START = from_radec_roll_deg(84.057, -1.2, 10.0)
+# Noise as a coarse star tracker and a coarse gyroscope have it.
+Q_NOISE_RAD, RATE_NOISE_RAD_S = 30 * ARCSEC, math.radians(0.1)
+TOLD_WITHIN_S = 1.0  # at 20 Hz and more, as the bench file's page says; some tens of packets below
+HONEST_STREAMS = 60
+TURN = np.radians([0.2, -0.35, 0.5])
+OTHER_FRAME = np.array([[0.6, 0.0, -0.8], [0.0, 1.0, 0.0], [0.8, 0.0, 0.6]])
+
+
+def moved(rates: FloatArray, step_s: float) -> FloatArray:
+    """The attitudes (n, 4) from START at rates (n, 3), cam, that change linearly from one to the next."""
+    steps = from_rotation_vectors(-(rates[1:] + rates[:-1]) / 2 * step_s)
+    q = [START]
+    for step in steps:
+        q.append(multiply(step, q[-1]))
+    return np.array(q)
+
+
+def samples(t_ns, q, rates, broken=()) -> list[AttitudeSample]:
+    sent = rates.astype(np.float32).astype(np.float64)
+    return [AttitudeSample(int(t), q[k], sent[k], k, k in broken) for k, t in enumerate(t_ns)]
+
+
+def steady(hz: float = 100.0, seconds: float = 3.0, turn: FloatArray = TURN, rng: np.random.Generator | None = None):
+    """Times, attitudes and true rates of a constant turn, noisy where a generator is given."""
+    count = round(seconds * hz)
+    rates = np.tile(turn, (count, 1))
+    q = moved(rates, 1 / hz)
+    if rng is not None:
+        q = multiply(from_rotation_vectors(rng.normal(0, Q_NOISE_RAD, (count, 3))), q)
+        rates = rates + rng.normal(0, RATE_NOISE_RAD_S, (count, 3))
+    return np.round(np.arange(count) * NS_PER_S / hz).astype(int), q, rates
+
+
+def in_icrs(q: FloatArray, rates: FloatArray) -> FloatArray:
+    pure = np.concatenate([np.zeros((len(q), 1)), rates], axis=1)
+    return multiply(multiply(conjugate(q), pure), q)[:, 1:]
+
+
+WRONGS: dict[str, tuple[Callable[[FloatArray, FloatArray], FloatArray], str]] = {
+    "deg/s": (lambda q, rates: np.degrees(rates), "in deg/s; send rad/s"),
+    "the sign": (lambda q, rates: -rates, "wrong sign"),
+    "both": (lambda q, rates: -np.degrees(rates), "wrong sign and in deg/s"),
+    "rad/ms": (lambda q, rates: rates / 1e3, "in rad/ms"),
+    "rad twice": (lambda q, rates: np.radians(rates), "times pi/180"),
+    "axes": (lambda q, rates: rates[:, [1, 2, 0]], "the camera's (y, z, x) is sent as (x, y, z)"),
+    "axes and signs": (lambda q, rates: rates[:, [1, 0, 2]] * [1, -1, 1], "the camera's (y, -x, z) is sent as (x, y, z)"),
+    "signs": (lambda q, rates: rates * [1, -1, -1], "wrong sign: the camera's (x, -y, -z) is sent"),
+    "another frame": (lambda q, rates: rates @ OTHER_FRAME.T, "another frame than the camera's, such as the body's"),
+    "another frame, deg/s": (lambda q, rates: np.degrees(rates @ OTHER_FRAME.T), "such as the body's, and in deg/s"),
+    "ICRS": (in_icrs, "ICRS components"),
+    "zeros": (lambda q, rates: np.zeros_like(rates), "zero; leave them out"),
+}
+
+AXES = {"axes", "axes and signs", "signs", "another frame", "another frame, deg/s"}  # in noise these are one
+
+
+def watched(stream: list[AttitudeSample], mode="use-quaternions") -> tuple[RateCheck, list[tuple[str, str]], float | None]:
+    """The check after a stream, what it told, and after how long first."""
+    notices, told = Notices(), []
+    notices.listen(lambda notice: told.append((notice.kind, notice.detail)))
+    check, first_s = RateCheck(mode, notices), None
+    for sample in stream:
+        check.see(sample)
+        if told and first_s is None:
+            first_s = (sample.t_ns - stream[0].t_ns) / NS_PER_S
+    return check, told, first_s
+
+
+@pytest.mark.parametrize("wrong", WRONGS)
+@pytest.mark.parametrize("noisy", [False, True])
+def test_what_is_wrong_is_named_once_within_a_second(wrong, noisy):
+    if wrong == "zeros" and noisy:
+        return  # nobody adds noise to zeros
+    change, words = WRONGS[wrong]
+    t_ns, q, rates = steady(rng=np.random.default_rng(1) if noisy else None)
+    _, told, first_s = watched(samples(t_ns, q, change(q, rates)))
+    assert [kind for kind, _ in told] == [WRONG]
+    assert words in told[0][1] or (noisy and OTHER_AXES in told[0][1] and wrong in AXES)
+    assert first_s < TOLD_WITHIN_S
+
+
+@pytest.mark.parametrize(("hz", "within_s"), [(10, 2.1), (20, 1.1), (50, 1.0), (200, 1.0), (1000, 1.0)])
+def test_deg_s_about_one_axis_is_named_at_any_rate_of_packets(hz, within_s):
+    """The issue's own stream: 0.5 deg/s, and "rate": [0, 0, 0.5]."""
+    t_ns, q, rates = steady(hz, turn=np.radians([0, 0, 0.5]), rng=np.random.default_rng(2))
+    _, told, first_s = watched(samples(t_ns, q, np.degrees(rates)))
+    assert [kind for kind, _ in told] == [WRONG]
+    assert "they are in deg/s" in told[0][1]
+    assert first_s < within_s
+
+
+def test_arcsec_s_is_named_where_a_step_of_them_is_no_full_turn():
+    t_ns, q, rates = steady(turn=np.radians([0, 0.02, 0]))
+    _, told, _ = watched(samples(t_ns, q, np.degrees(rates) * 3600))
+    assert [kind for kind, _ in told] == [WRONG] and "they are in arcsec/s" in told[0][1]
+
+
+def test_a_slow_turn_in_noise_is_told_from_longer_stretches():
+    """0.1 deg/s: in a tenth of a second 36 arcsec, of quaternions with 30 arcsec of noise each."""
+    t_ns, q, rates = steady(100, 4.0, np.radians([0, 0, 0.1]), np.random.default_rng(3))
+    _, told, _ = watched(samples(t_ns, q, np.degrees(rates)))
+    assert [kind for kind, _ in told] == [WRONG] and "deg/s" in told[0][1]
+
+
+@pytest.mark.parametrize("claim", [0.0, 0.001, 0.5])
+def test_at_rest_nothing_is_said(claim):
+    t_ns, q, rates = steady(turn=np.zeros(3), rng=np.random.default_rng(4))
+    assert watched(samples(t_ns, q, rates + claim))[1] == []
+
+
+def test_attitudes_that_stand_between_steps_accuse_no_rate():
+    """Sent at 100 Hz, computed at 5: a stretch has one step or none."""
+    t_ns, q, rates = steady(seconds=6.0)
+    assert watched(samples(t_ns, q[np.arange(len(q)) // 20 * 20], rates))[1] == []
+
+
+def test_a_stuck_rate_is_told_though_nothing_explains_it():
+    t_ns, q, _ = steady(turn=np.radians([0, 0, 3.0]))
+    _, told, _ = watched(samples(t_ns, q, np.tile([0.05, 0.02, 0.01], (len(q), 1))))
+    assert [kind for kind, _ in told] == [WRONG]
+
+
+def honest(rng: np.random.Generator) -> list[AttitudeSample]:
+    """A stream whose rates are the truth, with everything that may happen to one."""
+    hz = rng.choice([10, 20, 50, 100, 200, 1000])
+    t_s = np.arange(0, 2 if hz == 1000 else 5, 1 / hz)
+    if rng.random() < 0.3:  # irregular packets
+        t_s = np.sort(t_s + rng.uniform(0, 0.4, len(t_s)) / hz)
+    fine_s = np.arange(0, t_s[-1] + 2 * FINE_S, FINE_S)
+    size = math.radians(10 ** rng.uniform(-2.5, 1.5))
+    rates = size * rng.normal(size=3) * np.ones((len(fine_s), 1))
+    if rng.random() < 0.5:  # it accelerates
+        rates *= np.sin(2 * np.pi * fine_s / rng.uniform(2, 20) + rng.uniform(0, 6))[:, None]
+    if rng.random() < 0.3:  # it starts and stops at once
+        rates *= (fine_s // rng.uniform(0.3, 2) % 2)[:, None]
+    if rng.random() < 0.3:  # it is shaken
+        hz_shaken, arcsec = 10 ** rng.uniform(-0.5, 1.7), rng.uniform(0.1, 5)
+        rates = rates + 2 * np.pi * hz_shaken * arcsec * ARCSEC * np.cos(2 * np.pi * hz_shaken * fine_s)[:, None]
+    at = np.round(t_s / FINE_S).astype(int)
+    q, rates, t_ns = moved(rates, FINE_S)[at], rates[at], at * round(FINE_S * NS_PER_S)
+    q = multiply(from_rotation_vectors(rng.normal(0, rng.choice([0, Q_NOISE_RAD]), (len(at), 3))), q)
+    rates = rates + rng.normal(0, rng.choice([0, RATE_NOISE_RAD_S]), rates.shape)
+    k = int(rng.integers(1, len(at)))
+    broken: set[int] = set()
+    if rng.random() < 0.2:  # a new target, told or not
+        q[k:] = multiply(q[k:], from_rotation_vectors(rng.normal(0, 1, (1, 3))))
+        broken = {k} if rng.random() < 0.5 else set()
+    if rng.random() < 0.2:  # a clock that is set, or a sender that starts anew
+        t_ns[k:] += round(rng.choice([-1, 1]) * 10 ** rng.uniform(6, 13))
+    if rng.random() < 0.3:  # a clock that is read late
+        t_ns = t_ns + np.round(rng.exponential(0.2 / hz, len(at)) * NS_PER_S).astype(int)
+    stream = samples(t_ns, q, rates, broken)
+    lost = rng.choice([0, 0, 0.1, 0.5])
+    return [sample for sample in stream if rng.random() >= lost]
+
+
+def test_right_rates_are_never_called_wrong():
+    for seed in range(HONEST_STREAMS):
+        assert watched(honest(np.random.default_rng(seed)))[1] == [], seed
+
+
+def test_rates_that_become_right_are_believed_again():
+    t_ns, q, rates = steady(seconds=4.0, rng=np.random.default_rng(5))
+    wrong = np.where(np.arange(len(rates))[:, None] < 200, np.degrees(rates), rates)
+    stream = samples(t_ns, q, wrong)
+    check, told, _ = watched(stream[:200])
+    assert check.distrusts and check.believed(stream[199]).rate_cam_rad_s is None
+    check, told, _ = watched(stream)
+    assert [kind for kind, _ in told] == [WRONG, RIGHT]
+    assert not check.distrusts and check.believed(stream[-1]) is stream[-1]
+
+
+def test_packets_that_leave_rates_out_end_it_too():
+    t_ns, q, rates = steady()
+    stream = samples(t_ns, q, -rates)
+    stream += [AttitudeSample(int(t_ns[-1] + (k + 1) * NS_PER_S // 100), q[-1], None, k) for k in range(30)]
+    assert [kind for kind, _ in watched(stream)[1]] == [WRONG, RIGHT]
+
+
+def test_warn_believes_the_rate_and_off_does_not_look():
+    t_ns, q, rates = steady()
+    stream = samples(t_ns, q, -rates)
+    check, told, _ = watched(stream, "warn")
+    assert [kind for kind, _ in told] == [WRONG] and "used all the same" in told[0][1]
+    assert check.believed(stream[-1]) is stream[-1]
+    assert watched(stream, "off")[1] == []

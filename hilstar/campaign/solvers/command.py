@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import re
 import shlex
-import signal
-import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +16,7 @@ from hilstar.campaign.solvers.answer import Answer, SolverFault, Tracker, checke
 from hilstar.campaign.solvers.function import tracker_facts
 from hilstar.errors import InputError, one_line
 from hilstar.files import temporary_folder
+from hilstar.process.child import MAX_OUTPUT_BYTES, Child
 from hilstar.twin.exposure_files import write_dn_picture
 from hilstar.twin.simulator import Exposure
 
@@ -110,24 +108,14 @@ def _filled(word: str, places: dict[str, str]) -> str:
 def _run(words: list[str], folder: Path, timeout_s: float) -> tuple[int, str, str]:
     """Run a command in a group of its own, which ends with it. Raises SolverFault."""
     try:
-        process = subprocess.Popen(
-            words,
-            cwd=folder,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            errors="replace",
-            start_new_session=True,
-        )
+        child = Child(words, folder)
     except OSError as error:
         raise SolverFault(f"the solver cannot be started: {words[0]} ({error.strerror})") from error
-    with process:
-        try:
-            out, err = process.communicate(timeout=timeout_s)
-        except subprocess.TimeoutExpired as error:
-            raise SolverFault(f"the solver took longer than {timeout_s:g} s") from error
-        finally:
-            with contextlib.suppress(ProcessLookupError, PermissionError):
-                os.killpg(process.pid, signal.SIGKILL)
-    return process.returncode, out, err
+    with child:
+        code = child.wait(timeout_s)
+        if child.too_much:
+            most = f"{MAX_OUTPUT_BYTES // 1_000_000} MB"
+            raise SolverFault(f"the solver printed more than {most} and was ended; let it print the quaternion alone")
+        if code is None:
+            raise SolverFault(f"the solver took longer than {timeout_s:g} s")
+    return code, child.out, child.err

@@ -18,6 +18,7 @@ STARTS_S = 60.0  # a head that has not begun by then is started again
 MIN_BACK_OFF_S, MAX_BACK_OFF_S = 0.2, 5.0
 US_PER_S = 1_000_000
 MAX_LINE = 2000
+MAX_OUTPUT = 10_000_000  # bytes of a head's own summary
 NOTHING: Mapping[str, str] = {}
 Command = Callable[[int, float], Sequence[str]]
 Say = Callable[[str], None]
@@ -74,7 +75,9 @@ class HeadProcess:
             self._say(f"{self.name}: {line.decode(errors='replace').rstrip()}")
 
     def _keep(self, stream: IO[bytes]) -> None:
-        self.output = stream.read()
+        self.output = stream.read(MAX_OUTPUT)
+        while stream.read(MAX_LINE):  # what is more is let go, so that the head does not stand still for it
+            pass
 
     def _drain(self) -> bool:
         """Take the signs of life that wait; whether there were any."""

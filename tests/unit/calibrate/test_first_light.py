@@ -154,6 +154,7 @@ def test_a_command_is_told_the_exposure_and_must_write_a_new_image(tmp_path):
     [
         (f"{sys.executable} -c \"import sys; sys.exit('no camera on bus 3')\" {{pattern}} {{output}}", "no camera on bus 3"),
         ("true {pattern} {output}", "wrote no image"),
+        ("sh -c 'yes {pattern} {output} >&2'", "printed more than 4 MB"),
         ("no-such-command-here {pattern} {output}", "cannot be run"),
         ("cp {pattern} here.png", "has no {output}"),
         ("cp '{pattern} {output}", "quotes in pairs"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 import sys
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from hilstar.twin.simulator import Exposure, Simulator
 from hilstar.units import ARCSEC_PER_RAD
 from tests.support.benches import ROOT
 from tests.support.campaigns import write_campaign
-from tests.support.waiting import PATIENCE_S
+from tests.support.waiting import PATIENCE_S, wait_for
 
 EXAMPLES = ROOT / "examples"
 # A dozen stars with centroids to 0.03 px of 134 arcsec: 4 / sqrt 12 arcsec an axis; five sigma, and the field's lever for roll.
@@ -110,3 +111,18 @@ NO_SOLVERS = ["solve me", "python:nothing", "python:no_such_module:f", "python:m
 def test_what_is_no_solver_is_refused_before_the_first_case(text: str) -> None:
     with pytest.raises(InputError, match="--solver"):
         solver(text)
+
+
+@pytest.mark.parametrize("stream", ["1", "2"])
+def test_a_solver_that_keeps_printing_is_ended_at_the_bound_with_its_children(
+    seen: tuple[Simulator, Exposure], tmp_path: Path, stream: str
+) -> None:
+    simulator, exposure = seen
+    before_kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    text = f"sh -c 'sleep 1000 & echo $! > {tmp_path}/child; exec yes {{image}} >&{stream}'"
+    with pytest.raises(SolverFault, match="printed more than 4 MB"):
+        solver(text, timeout_s=PATIENCE_S).solve(exposure, simulator)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before_kib < 50_000
+    child = Path(f"/proc/{(tmp_path / 'child').read_text().strip()}/stat")
+    # Without an init of its own a container keeps what has ended as a zombie.
+    wait_for(lambda: not child.exists() or child.read_text().rpartition(")")[2].split()[0] == "Z", "the solver's child to end")

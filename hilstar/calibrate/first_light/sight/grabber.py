@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import shlex
-import subprocess
-import tempfile
 import time
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from pathlib import Path
-from typing import IO
 
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.frame_files import write_codes_png
@@ -18,6 +16,7 @@ from hilstar.calibrate.first_light.sight.diode import SerialDiode, Watched
 from hilstar.calibrate.first_light.sight.display import Display
 from hilstar.calibrate.first_light.sight.eyes import PATTERN_FILE, NoImage
 from hilstar.errors import InputError, shortened
+from hilstar.process.child import MAX_OUTPUT_BYTES, Child
 from hilstar.run.screen.gate import Timing
 
 GRAB_TIMEOUT_S = 120.0
@@ -84,42 +83,39 @@ def _filled(word: str, values: Mapping[str, str]) -> str:
 
 
 def _run(words: list[str], output: Path, meanwhile: Callable[[Callable[[], bool]], None]) -> None:
-    started: list[subprocess.Popen[bytes]] = []
+    started: list[Child] = []
     end_s = time.monotonic() + GRAB_TIMEOUT_S
 
     def done() -> bool:
         # Begun when it is first asked: by then the panel shows the pattern.
         if not started:
-            started.append(_start(words, said))
+            started.append(ended.enter_context(_start(words)))
         return started[0].poll() is not None or time.monotonic() > end_s
 
-    with tempfile.TemporaryFile() as said:
-        try:
-            meanwhile(done)
-            said.seek(0)
-            _check(words, output, started[0].poll(), said.read().decode(errors="replace"))
-        finally:
-            for process in started:
-                process.kill()
-                process.wait()
+    with ExitStack() as ended:
+        meanwhile(done)
+        child, code = started[0], started[0].poll()
+    _check(words, output, child, code)
 
 
-def _check(words: list[str], output: Path, code: int | None, said: str) -> None:
+def _check(words: list[str], output: Path, child: Child, code: int | None) -> None:
     """Refuse (NoImage) a command that did not end, failed, or wrote no image."""
     command = shortened(shlex.join(words))
+    if child.too_much:
+        raise NoImage(f"--grab: {command} printed more than {MAX_OUTPUT_BYTES // 1_000_000} MB on stderr; let it say less")
     if code is None:
         raise NoImage(f"--grab: {command} took over {GRAB_TIMEOUT_S:.0f} s; run it by hand to see why")
     if code:
-        lines = said.strip().splitlines()
+        lines = child.err.strip().splitlines()
         why = f": {shortened(lines[-1])}" if lines else ""
         raise NoImage(f"--grab: {command} ended with code {code}{why}")
     if not output.is_file() or not output.stat().st_size:
         raise NoImage(f"--grab: {command} wrote no image; it has to write {{output}}, as PNG or FITS")
 
 
-def _start(words: list[str], said: IO[bytes]) -> subprocess.Popen[bytes]:
+def _start(words: list[str]) -> Child:
     try:
-        return subprocess.Popen(words, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=said)
+        return Child(words, keeps_stdout=False)
     except OSError as error:
         raise NoImage(f"--grab: {words[0]} cannot be run ({error.strerror}); write a command that can") from error
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import csv
 import io
+import itertools
 import math
 import re
 import textwrap
@@ -96,9 +97,9 @@ def write_records(path: Path, records: Sequence[Any]) -> None:
 
 
 def read_records(path: Path, record: type[Record]) -> list[Record]:
-    """The rows of a table that `write_records` wrote, as dataclasses of texts and numbers."""
+    """The rows of a table that `write_records` wrote, as dataclasses of texts, numbers and flags."""
     kinds = {field.name: field.type for field in fields(record)}  # type: ignore[arg-type]
-    convert = {"int": int, "float": float, "str": str}
+    convert: dict[str, Any] = {"int": int, "float": float, "str": str, "bool": "True".__eq__}
     with path.open(encoding="utf-8", newline="") as file:
         return [record(**{name: convert[str(kinds[name])](text) for name, text in row.items()}) for row in csv.DictReader(file)]
 
@@ -135,6 +136,7 @@ def panels_of(
     with rc_context({**STYLE, "axes.prop_cycle": cycler(color=SERIES)}):
         high = MARGIN_INCH + PANEL_INCH * rows if height_inch is None else height_inch
         figure = Figure(figsize=(WIDTH_INCH, high), layout="constrained")
+        figure.get_layout_engine().set(h_pad=0.07)  # type: ignore[call-arg,union-attr]
         grid = figure.subplots(rows, columns, sharex=share_x, sharey=share_y, squeeze=False, height_ratios=heights)
         figure.suptitle(title_lines(capital(finding)), x=0.01, ha="left", fontsize=TITLE_PT)
         if note:
@@ -151,7 +153,7 @@ def finish(figure: Figure) -> None:
     for axes in figure.axes:
         for axis, length_px, apart_px in ((axes.xaxis, axes.bbox.width, 45), (axes.yaxis, axes.bbox.height, 25)):
             if isinstance(axis.get_major_locator(), LogLocator):
-                log_ticks(axis, max(int(length_px / apart_px), 3))
+                log_ticks(axis, length_px / apart_px)
             axis.set_label_text(capital(axis.get_label_text()))
         axes.set_title(capital(axes.get_title(loc="left")))
 
@@ -183,13 +185,19 @@ def plain(value: float) -> str:
     """A round figure as a person writes it; below 0.0001 and from a million on as a power of ten."""
     if value == 0 or 1e-4 <= abs(value) < 1e6:
         return f"{value:g}"
-    mantissa, power = f"{value:.0e}".split("e")
+    mantissa, power = f"{value:.1e}".split("e")
+    mantissa = mantissa.removesuffix(".0")
     raised = str(int(power)).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
     return f"{'' if mantissa == '1' else mantissa + '·'}10{raised}"
 
 
-def log_ticks(axis: Axis, most: int) -> None:
-    """Round ticks of a logarithmic axis within its limits, about so many: several in each power of ten, or some powers."""
+def two_digits(value: float) -> str:
+    """A measured figure as a chart says it."""
+    return plain(float(f"{value:.2g}")) if math.isfinite(value) else "-"
+
+
+def log_ticks(axis: Axis, room: float) -> None:
+    """Round ticks of a logarithmic axis within its limits, as many as stand apart where there is room for `room`."""
     low, high = sorted(axis.get_view_interval())
     first, last = math.floor(math.log10(low)), math.ceil(math.log10(high))
     choices: list[tuple[tuple[float, ...], int]] = [
@@ -202,7 +210,7 @@ def log_ticks(axis: Axis, most: int) -> None:
     for steps, every in choices:
         ticks = [step * 10.0**power for power in range(first, last + 1) if power % every == 0 for step in steps]
         ticks = [tick for tick in ticks if low * 0.999 <= tick <= high * 1.001]
-        if len(ticks) <= most:
+        if min((b / a for a, b in itertools.pairwise(ticks)), default=high) > (high / low) ** (1 / room):
             break
     plain_ticks(axis, ticks)
 
@@ -216,7 +224,8 @@ def label_ends(axes: Axes) -> None:
         xy = np.asarray(line.get_xydata(), dtype=float)
         ends = xy[np.isfinite(xy[:, 1]) & ((low <= xy[:, 0]) & (xy[:, 0] <= high) | (not x_is_data))]
         if len(ends) and not str(line.get_label()).startswith("_"):
-            place = float(ends[-1, 0]) if x_is_data else high, float(ends[-1, 1])
+            x, y = (float(value) for value in ends[ends[:, 0].argmax()])
+            place = (x if x_is_data else high), y
             named.append((str(line.get_label()), place, str(line.get_color())))
     name_at_side(axes, named)
 
@@ -257,14 +266,17 @@ def spread(heights: Sequence[float], gap: float) -> list[float]:
     return placed
 
 
-def value_bars(axes: Axes, names: Sequence[str], values: Sequence[float], colours: Sequence[str] | str, form: str) -> None:
-    """Horizontal bars, the first on top, each with its figure at its end."""
+def value_bars(axes: Axes, names: Sequence[str], values: Sequence[float], colours: Sequence[str] | str) -> None:
+    """Horizontal bars, the first on top, each with its figure at its end in the place of an axis."""
     bars = axes.barh(range(len(names)), values, color=colours)
     axes.set_yticks(range(len(names)), names)
     axes.invert_yaxis()
-    axes.bar_label(bars, fmt=form, padding=3, fontsize=SMALL_PT)
-    axes.margins(x=0.16)
-    axes.grid(visible=False, axis="y")
+    axes.bar_label(bars, [two_digits(value) for value in values], padding=3, fontsize=SMALL_PT)
+    axes.margins(x=0.3)
+    axes.grid(visible=False)
+    axes.tick_params(length=0)
+    axes.set_xticks([])
+    axes.spines["bottom"].set_visible(False)
 
 
 def save(figure: Figure, path: Path) -> None:

@@ -5,14 +5,43 @@ Measuring needs an idle machine, drawing does not. The other charts of docs/ are
 
 from __future__ import annotations
 
+import csv
 from pathlib import Path
 
 from hilstar.charts import read_records
+from hilstar.study.shared import over_frames
 from hilstar.study.timing import run as timing
+from hilstar.study.tradeoff import run as tradeoff
+from hilstar.study.tradeoff.psf import ROUNDING_MAG
+from hilstar.study.tradeoff.table import Figure, Row, Step
 
 HERE = Path(__file__).parent
 DOCS = HERE.parent / "docs"
+MACHINE = "llvmpipe (LLVM 15.0.6, 256 bits), 2 cores"  # as machine.txt has it
+TRADEOFF_STEP = "psf"
+TRUE = "True"
+
+
+def tradeoff_step(name: str) -> Step:
+    """A step of tradeoff.csv as the study measured it, whose errors below ROUNDING_MAG are none."""
+    with (HERE / "tradeoff.csv").open(encoding="utf-8", newline="") as file:
+        table = [row for row in csv.DictReader(file) if row["step"] == name]
+    error, second = (Figure(table[0][f"{key}_is"], table[0][f"{key}_unit"], ROUNDING_MAG) for key in ("error", "second"))
+    rows = [
+        Row(
+            row["method"],
+            float(row["error"]),
+            float(row["second"]),
+            float(row["time_ms"]),
+            (float(row["quartile_1_ms"]), float(row["quartile_3_ms"])),
+            *(row[flag] == TRUE for flag in ("default", "exact", "front")),
+        )
+        for row in table
+    ]
+    return Step(name, table[0]["work"], error, second, tuple(rows))
 
 
 if __name__ == "__main__":
     timing.draw(DOCS / "timing.svg", read_records(HERE / "timing.csv", timing.Outcome))
+    over_frames.draw(DOCS / "over_frames.svg", read_records(HERE / "over_frames.csv", over_frames.Left))
+    tradeoff.draw(DOCS / "tradeoff.svg", tradeoff_step(TRADEOFF_STEP), MACHINE)

@@ -11,7 +11,7 @@ import numpy as np
 
 from hilstar.bench.build import load
 from hilstar.bench.frame import Bench
-from hilstar.charts import chart, write_records
+from hilstar.charts import BLUE, MUTED, ORANGE, RED, SMALL_PT, chart, write_records
 from hilstar.monitor.quantise import shown_light
 from hilstar.render.reference import linear_image
 from hilstar.rotation import from_radec_roll_deg
@@ -101,10 +101,10 @@ class Comparison:
 
 
 def run(directory: Path, quick: bool = False) -> list[str]:
-    """Measure every scene, and write `economy.csv` and `economy.png`; a line for each scene. Raises InputError."""
+    """Measure every scene, and write `economy.csv` and its chart; a line for each scene. Raises InputError."""
     comparisons = [compare(scene, QUICK_ROUNDS if quick else ROUNDS) for scene in SCENES]
     write_records(directory / "economy.csv", [outcome for c in comparisons for outcome in (c.full, c.auto)])
-    _draw(directory / "economy.png", comparisons)
+    draw(directory / "economy", comparisons)
     return [_line(comparison) for comparison in comparisons]
 
 
@@ -210,27 +210,30 @@ def _compared(comparison: Comparison) -> str:
     return f"{ratio:.1f} times as fast" if ratio >= 1 else f"{1 / ratio:.1f} times as SLOW"
 
 
-def _draw(path: Path, comparisons: list[Comparison]) -> None:
-    finding = economy_finding(comparisons)
-    with chart(path, finding, panels=2) as (cost, error):
+def draw(path: Path, comparisons: list[Comparison]) -> None:
+    """The time of each scene at both efforts, and the errors at the effort that it needs, as shares of the tolerance."""
+    note = "Errors of stars that stand alone; places by the worst of six centroiders."
+    with chart(path, economy_finding(comparisons), panels=2, note=note, heights=(1, 1)) as (cost, error):
         at = np.arange(len(comparisons))
-        full, auto = [c.full for c in comparisons], [c.auto for c in comparisons]
-        for shift, mine, colour in ((-0.2, full, "C7"), (0.2, auto, "C0")):
-            cost.bar(at + shift, [o.frame_ms for o in mine], 0.38, color=colour, label=mine[0].effort)
-            error.bar(at + shift, [o.flux_max_mag for o in mine], 0.18, color=colour, label=f"{mine[0].effort}, mag")
-            error.bar(
-                at + shift + 0.19,
-                [o.worst_px for o in mine],
-                0.18,
-                color=colour,
-                alpha=0.5,
-                label=f"{mine[0].effort}, px, worst of six centroiders",
-            )
-        for place, outcome in zip(at, auto, strict=True):
-            label = "tolerance" if not place else None
-            error.plot([place - 0.45, place + 0.45], [outcome.tolerance] * 2, color="#c33", label=label)
+        autos = [c.auto for c in comparisons]
+        for shift, mine, colour, name in (
+            (-0.2, [c.full for c in comparisons], MUTED, "full effort"),
+            (0.2, autos, BLUE, 'effort = "auto"'),
+        ):
+            bars = cost.bar(at + shift, [o.frame_ms for o in mine], 0.38, color=colour, label=name)
+            cost.bar_label(bars, fmt="%.2g", padding=2, fontsize=SMALL_PT)
+        for shift, values, colour, name in (
+            (-0.2, [o.flux_max_mag for o in autos], ORANGE, "light [mag]"),
+            (0.2, [o.worst_px for o in autos], BLUE, "place [monitor px]"),
+        ):
+            bars = error.bar(at + shift, values, 0.38, color=colour, label=name)
+            error.bar_label(bars, fmt="%.2g", padding=2, fontsize=SMALL_PT)
+        for place, outcome in zip(at, autos, strict=True):
+            error.plot([place - 0.45, place + 0.45], [outcome.tolerance] * 2, color=RED, label="_" if place else "tolerance")
         cost.set_ylabel("time of a frame [ms]")
-        error.set_ylabel("largest error of a star")
-        error.set_xticks(at, [outcome.scene.replace(", ", ",\n") for outcome in full])
-        cost.legend()
-        error.legend(ncols=3, fontsize=9)
+        error.set_ylabel('largest error at "auto"')
+        error.set_xticks(at, [outcome.scene.replace(", ", ",\n") for outcome in autos])
+        for axes, high in ((cost, max(c.full.frame_ms for c in comparisons)), (error, max(o.tolerance for o in autos))):
+            axes.grid(visible=False, axis="x")
+            axes.set_ylim(0, 1.45 * max(high, *(bar.get_height() for bar in axes.patches)))  # type: ignore[attr-defined]
+            axes.legend(loc="upper left", ncols=3)

@@ -19,7 +19,7 @@ from hilstar.bench.faults.kinds import Fault, Freeze, fault_of
 from hilstar.bench.faults.scenario import Scenario
 from hilstar.bench.faults.views import display_view
 from hilstar.bench.frame import Bench
-from hilstar.charts import chart, write_records
+from hilstar.charts import BLUE, GREEN, INK, MUTED, chart, label_ends, write_records
 from hilstar.monitor.quantise import shown_light
 from hilstar.rotation import from_radec_roll_deg, propagate
 from hilstar.scene.extended import Glow
@@ -32,11 +32,13 @@ from hilstar.units import NS_PER_S, magnitude
 REFRESH_HZ = 60
 ROUNDS, QUICK_ROUNDS = 30, 1
 QUANTISATIONS = ("round", "exact")
+COLOURS = dict(zip(QUANTISATIONS, (GREEN, BLUE), strict=True))
 FIELD = from_radec_roll_deg(84.057, -1.2, 0.0)
 SLEW_RAD_S = np.array([0.0, 2e-4, 0.0])  # so that what is fixed on the sky is new in each frame
 ISOLATION = Isolation(margin_px=7, max_share=1e-3)
 SHARES = (0.0, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3, 0.6, 1.0)
 QUICK_SHARES = (0.0, 0.01, 1.0)
+SPOILT_MAG, DARK_MAG = 0.1, 90.0
 LOST_MAG = 1.0  # a star this much too faint is not the star that was asked for
 
 Table = dict[str, Any]
@@ -164,7 +166,7 @@ def _shown(bench: Bench, sprites: Sprites) -> FloatArray:
 
 
 def run(directory: Path, quick: bool = False) -> list[str]:
-    """Measure, and write `faults-cost.csv`, `faults-stray.csv`, `faults.png`; the findings, a line each. Raises InputError."""
+    """Measure; write `faults-cost.csv`, `faults-stray.csv` and their charts; the findings, a line each. Raises InputError."""
     costs: list[Cost] = []
     strays: list[Stray] = []
     rounds, shares = (QUICK_ROUNDS, QUICK_SHARES) if quick else (ROUNDS, SHARES)
@@ -177,7 +179,8 @@ def run(directory: Path, quick: bool = False) -> list[str]:
     write_records(directory / "faults-cost.csv", costs)
     write_records(directory / "faults-stray.csv", strays)
     findings = _findings(costs, strays)
-    _draw(directory / "faults.png", findings[0], costs, strays)
+    draw_stray(directory / "faults", strays)
+    draw_costs(directory / "faults_cost", costs)
     return findings
 
 
@@ -193,29 +196,56 @@ def _findings(costs: list[Cost], strays: list[Stray]) -> list[str]:
             f" {dearest.cost_ms:+.1f} ms"
         )
     for quantisation in QUANTISATIONS:
-        worst = [stray for stray in strays if stray.quantisation == quantisation and stray.p95_mag > 0.1]
-        least = min((stray.share_of_white for stray in worst if stray.share_of_white), default=None)
+        least = spoilt_from(strays, quantisation)
         limit = "no stray light here" if least is None else f"stray light of {least:g} of white"
-        found.append(f"{quantisation}: the stars' light is off by more than 0.1 mag (95 %) from {limit} on")
+        found.append(f"{quantisation}: the stars' light is off by more than {SPOILT_MAG:g} mag (95 %) from {limit} on")
     return found
 
 
-def _draw(path: Path, finding: str, costs: list[Cost], strays: list[Stray]) -> None:
-    with chart(path, finding, panels=2, share_x=False) as (cost, error):
-        height = 0.8 / len(QUANTISATIONS)
-        for k, quantisation in enumerate(QUANTISATIONS):
-            mine = [one for one in costs if one.quantisation == quantisation]
-            places = np.arange(len(mine)) + (k - 0.5) * height
-            cost.barh(places, [one.cost_ms for one in mine], height, label=quantisation)
-            light = [one for one in strays if one.quantisation == quantisation and one.share_of_white]
-            x = [one.share_of_white for one in light]
-            error.loglog(x, [max(one.p95_mag, 1e-4) for one in light], "o-", label=f"{quantisation}, 95 %")
-            error.loglog(x, [max(one.median_mag, 1e-4) for one in light], "o--", label=f"{quantisation}, median")
-        cost.set_yticks(np.arange(len(CASES)), list(CASES))
-        cost.invert_yaxis()
-        cost.set_xlabel("time of a frame, more than without it [ms]")
-        cost.legend(loc="lower right")
-        error.set_xlabel("even stray light [share of white in a monitor pixel]")
-        error.set_ylabel("error of the stars' light [mag]")
-        error.set_ylim(1e-4, 10)
-        error.legend(loc="upper left")
+def spoilt_from(strays: list[Stray], quantisation: str) -> float | None:
+    """The least stray light, share of white, from which on stars are off by more than SPOILT_MAG; None where it is none."""
+    worst = [stray for stray in strays if stray.quantisation == quantisation and stray.p95_mag > SPOILT_MAG]
+    return min((stray.share_of_white for stray in worst if stray.share_of_white), default=None)
+
+
+def draw_stray(path: Path, strays: list[Stray]) -> None:
+    """What even stray light leaves of the stars."""
+    least = {name: spoilt_from(strays, name) for name in QUANTISATIONS}
+    said = [f"from {value:g} of white on with {name}" for name, value in least.items() if value is not None]
+    finding = (
+        f"Stray light spoils stars by more than {SPOILT_MAG:g} mag {', and '.join(said)}"
+        if said
+        else "No stray light spoils stars"
+    )
+    note = "Solid: 95 % of the stars are within it. Dotted: half of them. A line ends where such a star shows nothing."
+    with chart(path, finding, note=note) as (axes,):
+        for name, colour in COLOURS.items():
+            light = [one for one in strays if one.quantisation == name and one.share_of_white]
+            for error, style, label in (("p95_mag", "o-", f"{name}, 95 %"), ("median_mag", "o:", f"{name}, half")):
+                values = [getattr(one, error) if getattr(one, error) < DARK_MAG else np.nan for one in light]
+                axes.loglog([one.share_of_white for one in light], values, style, color=colour, label=label)
+        axes.axhline(SPOILT_MAG, color=INK, ls="--", lw=1.2, label=f"{SPOILT_MAG:g} mag")
+        axes.set(xlabel="even stray light [share of white in a monitor pixel]", ylabel="error of stars' light [mag]")
+        label_ends(axes)
+
+
+def draw_costs(path: Path, costs: list[Cost]) -> None:
+    """The time of a frame with each fault and without it."""
+    dearest = max(costs, key=lambda cost: cost.frame_ms)
+    star = max((cost for cost in costs if "false star" in cost.case), key=lambda cost: cost.frame_ms)
+    points = f"With false stars a frame takes at most {star.frame_ms:.1f} ms"
+    finding = f"{points}, with the dearest fault, {dearest.case}, {dearest.frame_ms:.0f} ms"
+    note = "Filled: a frame with the fault. Open: the same frame without it, in turn in the same run. Medians; 1920 x 1080."
+    with chart(path, finding, 1, len(QUANTISATIONS), note=note, share_y=True, height_inch=5.2) as panels:
+        for (name, colour), axes in zip(COLOURS.items(), panels, strict=True):
+            mine = [cost for cost in costs if cost.quantisation == name]
+            for place, cost in enumerate(mine):
+                axes.plot([cost.without_ms, cost.frame_ms], [place, place], color=MUTED, lw=1)
+            places = range(len(mine))
+            axes.plot([cost.without_ms for cost in mine], places, "o", color=colour, mfc="none", label="without")
+            axes.plot([cost.frame_ms for cost in mine], places, "o", color=colour, label="with the fault")
+            axes.set(xscale="log", xlabel="time of a frame [ms]")
+            axes.set_title(name, color=colour)
+            axes.grid(visible=False, axis="y")
+        panels[0].set_yticks(range(len(CASES)), list(CASES))
+        panels[0].invert_yaxis()

@@ -10,30 +10,30 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hilstar.arrays import FloatArray
-from hilstar.charts import STYLE, plain_ticks, save, title_lines, write_csv
+from hilstar.charts import BLUE, INK, MUTED, ORANGE, SMALL_PT, chart, label_ends, name_at_side, write_csv
 from hilstar.monitor.phases import SIGMA_PX, WHITE
 from hilstar.monitor.quantise import EXPOSURE_FRAMES
 from hilstar.monitor.response import srgb_response
 from hilstar.render.renderer import Renderer, Target
 from hilstar.scene.psf import footprint_px, peak_share
 from hilstar.study.shared.code_errors import ERROR_COLUMNS, JUDGE, code_errors, error_cells
-from hilstar.study.shared.codes import AIM_PX, AIMS, BITS, FRAME_PX, STARS, WAYS, Way, response_of, star_field
+from hilstar.study.shared.codes import AIM_PX, AIMS, BITS, FRAME_PX, STARS, WAYS, response_of, star_field
 from hilstar.study.shared.over_frames import study_frames
 from hilstar.tracker.centroiders import FAMILY
 from hilstar.tracker.star_errors import StarErrors
 from hilstar.units import flux_ratio
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+    pass
 
 
 Found = dict[tuple[int, str], list[StarErrors]]
-COLOURS = ("C0", "C1", "C2", "C3", "C4", "C5")  # of centroiders
-THIRD = 1 / 3  # of the error of `round`, at most, is what `exact` is meant to leave
+MIN_ERROR = 1e-5  # as drawn
+MARKERS = dict(zip(BITS, "os^", strict=True))
 
 
 def run(directory: Path, quick: bool = False) -> list[str]:
-    """Write the charts (PNG) and their tables (CSV) into `directory`; a line for each finding."""
+    """Write the charts and their tables (CSV) into `directory`; a line for each finding."""
     phases, mags = (8, np.linspace(0, 8, 5)) if quick else (32, np.linspace(0, 10, 41))
     found: Found = {(bits, way.name): code_errors(bits, way, phases, mags) for bits in BITS for way in WAYS}
     times = {(bits, name): ms for bits in BITS for name, ms in _frames_ms(bits, 3 if quick else 31).items()}
@@ -45,9 +45,9 @@ def run(directory: Path, quick: bool = False) -> list[str]:
     write_csv(directory / "quantisation.csv", ("bits", "method", "mag_under_white", *ERROR_COLUMNS), rows)
     faintest = {key: errors[int(np.searchsorted(mags, AIMS[key[0]][1]))] for key, errors in found.items()}
     findings = [*(_summary(bits, found, mags) for bits in BITS), _each_summary(faintest), _time_summary(times)]
-    _draw_magnitudes(directory / "quantisation.png", found, mags, findings[1])
-    _draw_each(directory / "quantisation_centroiders.png", found, mags, findings[-2])
-    _draw_times(directory / "quantisation_time.png", faintest, times, findings[-1])
+    _draw_magnitudes(directory / "quantisation", found, mags)
+    _draw_each(directory / "quantisation_centroiders", faintest)
+    _draw_times(directory / "quantisation_time", faintest, times)
     write_csv(
         directory / "quantisation_time.csv",
         ("bits", "method", "frame_ms", "mag_under_white", *ERROR_COLUMNS),
@@ -73,18 +73,19 @@ def _frames_ms(bits: int, rounds: int) -> dict[str, float]:
 
 def _summary(bits: int, found: Found, mags: FloatArray) -> str:
     aim_mag, limit = AIMS[bits]
-
-    def worst(way: Way) -> str:
-        within = [e for e, mag in zip(found[bits, way.name], mags, strict=True) if mag <= limit]
-        return f"{max(e.flux_max_mag for e in within):.3f} mag and {max(e.max_px(JUDGE) for e in within):.3f} px"
-
-    others = ", ".join(f"{way.method} {worst(way)}" for way in WAYS[:3])
+    worst = {way: _worst(found[bits, way.name], mags, limit) for way in WAYS}
+    others = ", ".join(f"{way.method} {worst[way]}" for way in WAYS[:3])
     half_step_px = srgb_response(bits).half_step * peak_share(SIGMA_PX) / flux_ratio(limit)
     return (
         f"{bits} bits, sRGB, {limit:g} magnitudes (aim {aim_mag:g} mag, {AIM_PX:g} px): largest errors, places by a PSF fit, of"
-        f" exact {worst(WAYS[3])}, with bit stealing {worst(WAYS[5])}; {others} (over {EXPOSURE_FRAMES} frames)."
+        f" exact {worst[WAYS[3]]}, with bit stealing {worst[WAYS[5]]}; {others} (over {EXPOSURE_FRAMES} frames)."
         f" Half the smallest step of light moves a centroid by {half_step_px:.3f} px along each axis"
     )
+
+
+def _worst(errors: list[StarErrors], mags: FloatArray, limit_mag: float) -> str:
+    within = [e for e, mag in zip(errors, mags, strict=True) if mag <= limit_mag]
+    return f"{max(e.flux_max_mag for e in within):.3f} mag and {max(e.max_px(JUDGE) for e in within):.3f} px"
 
 
 def _each_summary(faintest: dict[tuple[int, str], StarErrors]) -> str:
@@ -107,99 +108,91 @@ def _time_summary(times: dict[tuple[int, str], float]) -> str:
     )
 
 
-def _draw_magnitudes(path: Path, found: Found, mags: FloatArray, finding: str) -> None:
-    from matplotlib import rc_context
-    from matplotlib.figure import Figure
-
-    with rc_context(STYLE):
-        figure = Figure(figsize=(15.0, 9.6), layout="constrained")
-        grid = figure.subplots(2, len(BITS), sharex=True, sharey="row")
-        for column, bits in enumerate(BITS):
+def _draw_magnitudes(path: Path, found: Found, mags: FloatArray) -> None:
+    bits, limit = BITS[1], AIMS[BITS[1]][1]
+    exact, rounded = (_worst(found[bits, name], mags, limit) for name in ("exact", "round"))
+    finding = (
+        f"On {bits} bits every star to {limit:g} magnitudes under white is within {exact} with exact, {rounded} with round"
+    )
+    note = "Largest errors over sub-pixel phases, sRGB; places by a PSF fit. Dotted: with bit stealing."
+    with chart(path, finding, len(BITS), 2, note=note, share_y="col") as grid:
+        for bits, flux, place in zip(BITS, grid[::2], grid[1::2], strict=True):
             aim_mag, limit = AIMS[bits]
             for way in WAYS:
                 errors = found[bits, way.name]
-                flux, off = grid[0, column], grid[1, column]
-                _lines(flux, mags, [(e.flux_rms_mag, e.flux_max_mag) for e in errors], way)
-                _lines(off, mags, [(np.sqrt(2) * e.axis_rms_px(JUDGE), e.max_px(JUDGE)) for e in errors], way)
-            for axis, aim in ((grid[0, column], aim_mag), (grid[1, column], AIM_PX)):
-                axis.plot([0, limit], [aim, aim], "k--", lw=1.2, label="aim, and its range")
-                axis.plot([limit, limit], [1e-6, aim], "k--", lw=1.2)
-            grid[0, column].set(title=f"{bits} bits", yscale="log", ylim=(1e-5, 1))
-            grid[1, column].set(yscale="log", ylim=(1e-5, 1), xlabel="magnitudes under a star whose peak is white")
-        grid[0, 0].set(ylabel="flux error [mag]\nthick: rms over phases, thin: largest")
-        grid[1, 0].set(ylabel="centroid error by a PSF fit [monitor px]\nthick: rms over phases, thin: largest")
-        figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
-        figure.suptitle(title_lines(finding), fontsize=12)
-        save(figure, path)
+                for axes, values in ((flux, [e.flux_max_mag for e in errors]), (place, [e.max_px(JUDGE) for e in errors])):
+                    shown = np.where(np.isfinite(values), np.maximum(values, MIN_ERROR), np.nan)
+                    axes.semilogy(
+                        mags,
+                        shown,
+                        ":" if way.stealing else "-",
+                        color=way.colour,
+                        lw=1.5,
+                        label=way.name.replace("mean of ", ""),
+                    )
+            for axes, aim in ((flux, aim_mag), (place, AIM_PX)):
+                axes.plot([0, limit, limit], [aim, aim, MIN_ERROR], "--", color=INK, lw=1.1, label="_aim")
+                axes.annotate("aim", (0, aim), (2, 3), textcoords="offset points", fontsize=SMALL_PT)
+            flux.set(title=f"{bits} bits", ylabel="flux error [mag]")
+            place.set_ylabel("place error [monitor px]")
+            label_ends(place)
+        for axes in grid[-2:]:
+            axes.set_xlabel("magnitudes under a white peak")
 
 
-def _draw_each(path: Path, found: Found, mags: FloatArray, finding: str) -> None:
-    """Each centroider's error with `round` and with `exact`, and what is left of the one by the other."""
-    from matplotlib import rc_context
-    from matplotlib.figure import Figure
-
-    with rc_context(STYLE):
-        figure = Figure(figsize=(15.0, 12.0), layout="constrained")
-        grid = figure.subplots(3, len(BITS), sharex=True, sharey="row")
-        for column, bits in enumerate(BITS):
-            limit = AIMS[bits][1]
-            for kind, colour in zip(FAMILY, COLOURS, strict=True):
-                rounded, exact = (np.array([e.axis_rms_px(kind) for e in found[bits, name]]) for name in ("round", "exact"))
-                style = "--" if kind == "fit" else "-"  # a window as wide as the star finds the same
-                rounded, exact = (np.where(np.isfinite(values), values, np.nan) for values in (rounded, exact))
-                for axis, values in zip(grid[:, column], (rounded, exact, exact / rounded), strict=True):
-                    axis.plot(mags, values, style, color=colour, label=kind)
-            for axis in grid[:2, column]:
-                axis.set(yscale="log", ylim=(1e-5, 1))
-            grid[2, column].axhline(THIRD, color="k", ls="--", lw=1.2, label="a third of the error of round")
-            grid[2, column].set(ylim=(0, 1), xlabel="magnitudes under a star whose peak is white")
-            for axis in grid[:, column]:
-                axis.axvline(limit, color="0.5", ls=":", lw=1.2, label="faint end of the aim")
-            grid[0, column].set_title(f"{bits} bits")
-        for axis, what in zip(grid[:, 0], ("round", "exact", "exact / round"), strict=True):
-            axis.set_ylabel(f"{what}\nrms along an axis" + ("" if "/" in what else " [monitor px]"))
-        figure.legend(*grid[2, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
-        figure.suptitle(title_lines(finding), fontsize=12)
-        save(figure, path)
-
-
-def _lines(axis: Axes, mags: FloatArray, rms_and_max: list[tuple[float, float]], way: Way) -> None:
-    """The rms as a thick line, the largest as a thin one; a line ends where a star shows nothing."""
-    rms, largest = np.array(rms_and_max).T
-    axis.plot(mags, np.where(np.isfinite(rms), rms, np.nan), way.style, label=way.name)
-    axis.plot(mags, np.where(np.isfinite(largest), largest, np.nan), way.style, lw=0.7, alpha=0.7)
+def _draw_each(path: Path, faintest: dict[tuple[int, str], StarErrors]) -> None:
+    """Each centroider's error with `round` and with `exact`, at the faint end of each panel's aim."""
+    left = {
+        (bits, kind): faintest[bits, "exact"].axis_rms_px(kind) / faintest[bits, "round"].axis_rms_px(kind)
+        for bits in BITS
+        for kind in FAMILY
+    }
+    finding = (
+        f"Whichever centroider the tracker has, exact leaves {min(left.values()):.2f} to {max(left.values()):.2f}"
+        " of the error that round makes at the faint end"
+    )
+    note = "Errors are rms along an axis, over sub-pixel phases. At the right: what exact leaves of the error of round."
+    with chart(path, finding, 1, len(BITS), note=note, share_x=True, share_y=True, height_inch=3.6) as grid:
+        for bits, axes in zip(BITS, grid, strict=True):
+            for place, kind in enumerate(FAMILY):
+                rounded, exact = (faintest[bits, name].axis_rms_px(kind) for name in ("round", "exact"))
+                axes.plot([exact, rounded], [place, place], color=MUTED, lw=1)
+                axes.plot(rounded, place, "o", color=ORANGE, label="_" if place else "round")
+                axes.plot(exact, place, "o", color=BLUE, label="_" if place else "exact")
+                axes.annotate(
+                    f"{left[bits, kind]:.2f}",
+                    (rounded, place),
+                    (6, 0),
+                    textcoords="offset points",
+                    va="center",
+                    fontsize=SMALL_PT,
+                )
+            axes.set(xscale="log", title=f"{bits} bits, {AIMS[bits][1]:g} mag under white", xlabel="error [monitor px]")
+            axes.margins(x=0.2, y=0.12)
+            axes.grid(visible=False, axis="y")
+        grid[0].set_yticks(range(len(FAMILY)), FAMILY)
+        grid[0].invert_yaxis()
+        grid[0].figure.legend(*grid[0].get_legend_handles_labels(), loc="outside upper right", ncols=2)
 
 
-def _draw_times(
-    path: Path, faintest: dict[tuple[int, str], StarErrors], times: dict[tuple[int, str], float], finding: str
-) -> None:
-    from matplotlib import rc_context
-    from matplotlib.figure import Figure
-
-    markers = dict(zip(BITS, "os^", strict=True))
-    with rc_context(STYLE):
-        figure = Figure(figsize=(13.0, 6.8), layout="constrained")
-        axes = figure.subplots(1, 2, sharex=True)
+def _draw_times(path: Path, faintest: dict[tuple[int, str], StarErrors], times: dict[tuple[int, str], float]) -> None:
+    note = f"{STARS} stars, {FRAME_PX[0]} x {FRAME_PX[1]}. Circles, squares, triangles: 8, 10 and 12 bits, at the faint end."
+    ms = {way.name: times[BITS[1], way.name] for way in WAYS}
+    finding = (
+        f"From light to codes in memory exact takes {ms['exact']:.1f} ms and round {ms['round']:.1f} ms, on {BITS[1]} bits"
+    )
+    with chart(path, finding, 2, note=note) as panels:
         for way in WAYS:
-            for bits in BITS:
-                key = bits, way.name
-                label = way.name if bits == BITS[0] else None
-                face = "none" if way.stealing else way.style[:2]
-                for axis, error in zip(axes, _rms(faintest[key]), strict=True):
-                    axis.plot(times[key], error, markers[bits], color=way.style[:2], mfc=face, ms=9, label=label)
-        for bits, marker in markers.items():
-            label = f"{bits} bits, {AIMS[bits][1]:g} mag under white"
-            axes[0].plot([], [], "k" + marker, ms=9, label=label)
-        names = ("flux error [mag]", "centroid error by a PSF fit [monitor px]")
-        for axis, aim, what in zip(axes, (AIMS[10][0], AIM_PX), names, strict=True):
-            axis.axhline(aim, color="k", ls="--", lw=1.2, label="aim (8 bits: 0.05 mag)")
-            axis.set(yscale="log", xscale="log", ylabel=f"{what}, rms over phases")
-            axis.set(xlabel=f"time of a frame with {STARS} stars [ms]")
-            plain_ticks(axis.xaxis, (1, 1.5, 2, 3, 4, 5, 7, 10, 15))
-            axis.set_xlim(min(times.values()) / 1.2, max(times.values()) * 1.2)
-        figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
-        figure.suptitle(title_lines(finding), fontsize=12)
-        save(figure, path)
+            for bits, marker in MARKERS.items():
+                for axes, error in zip(panels, _rms(faintest[bits, way.name]), strict=True):
+                    face = "none" if way.stealing else way.colour
+                    axes.loglog(times[bits, way.name], error, marker, color=way.colour, mfc=face, ms=8)
+        for axes, number, what in zip(panels, (0, 1), ("flux error, rms [mag]", "place error, rms [monitor px]"), strict=True):
+            axes.set_ylabel(what)
+            axes.margins(0.1)
+            places = {way: (times[BITS[0], way.name], _rms(faintest[BITS[0], way.name])[number]) for way in WAYS}
+            name_at_side(axes, [(way.name, place, way.colour) for way, place in places.items()])
+        panels[-1].set_xlabel("time of a frame [ms]")
 
 
 def _rms(errors: StarErrors) -> tuple[float, float]:

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hilstar import charts
 from hilstar.bench.bench_file import bench_file_of
 from hilstar.errors import InputError
 from hilstar.render.reference import linear_image
@@ -27,6 +28,7 @@ from hilstar.study.chain.tracker import MATCH_PX, Tracker, off
 from hilstar.study.chain.true_light import add_light, points
 from hilstar.units import ARCSEC_PER_RAD, MAG_PER_RELATIVE, NS_PER_S
 from tests.support.commands import assert_refused, run_hilstar_here
+from tests.support.figures import assert_legible
 from tests.support.pictures import assert_drawn, table
 
 SMALL = """
@@ -121,7 +123,8 @@ def test_auto_and_default_are_each_one_point_of_each_scene(study):
     assert {row["quantisation"] for row in rows} == {"round", "dither", "temporal", "exact"}
     assert {row["prediction"] for row in rows if row["scene"] == "1 deg/s"} == {"rate", "two samples", "held"}
     assert {row["bit_stealing"] for row in rows} == {"true", "false"}
-    assert_drawn(out / "chain.png")
+    for name in ("chain", "chain_budget"):
+        assert_drawn(out / f"{name}.png")
 
 
 def test_the_budget_adds_up_to_the_whole_error_of_auto(study):
@@ -209,30 +212,41 @@ def test_a_long_exposure_is_said_to_be_measured_in_part(study, tmp_path):
     assert {row["exposure_s"] for row in table(out / "chain.csv")} == {"0.1"}
 
 
-@pytest.mark.parametrize("place", [(0, 0), (-1, 0), (0, -1), (-1, -1)])
-def test_the_names_in_the_chart_stay_within_their_axes(monkeypatch, tmp_path, place):
-    """The slowest or fastest point, the worst or best of them, is the default, and the one beside it auto."""
-    corner = {"time_ms": sorted((1.0, 9.0))[place[0]], "error_arcsec": sorted((0.1, 900.0))[place[1]]}
-    known = {field.name: 1.0 for field in fields(Row)} | {
+def planted(**figures) -> Row:
+    known = {field.name: 1.0 for field in fields(Row)}
+    words = {
         "scene": "s",
         "smear": "path",
         "prediction": "rate",
-        "error_mag": 0.01,
+        "quantisation": "exact",
+        "sprite": "cut",
+        "chosen": "",
+        "rate_deg_s": 0.0,
     }
-    known |= {"quantisation": "exact", "sprite": "cut", "on_front": "true", "on_front_mag": "true", "noise_ms": 0.01}
-    others = [{"time_ms": t, "error_arcsec": e, "chosen": ""} for t in (1.0, 3.0, 9.0) for e in (0.1, 10.0, 900.0)]
-    marked = [corner | {"chosen": "default"}, corner | {"time_ms": corner["time_ms"] * 1.01, "chosen": "auto"}]
+    return Row(**(known | words | {"on_front": "true", "on_front_mag": "true", "noise_ms": 0.01} | figures))
+
+
+@pytest.mark.parametrize("place", [(0, 0), (-1, 0), (0, -1), (-1, -1)])
+def test_the_chart_names_its_front_and_what_is_chosen(monkeypatch, tmp_path, place):
+    """The slowest or fastest point, the worst or best of them, is the default, and the one beside it auto."""
+    time_ms, error = sorted((1.0, 9.0))[place[0]], sorted((0.1, 900.0))[place[1]]
+    rows = [planted(time_ms=t, error_arcsec=e) for t in (1.0, 3.0, 9.0) for e in (0.1, 10.0, 900.0)]
+    rows += [planted(time_ms=time_ms * k, error_arcsec=error, chosen=name) for name, k in (("default", 1), ("auto", 1.01))]
     kept = []
-    monkeypatch.setattr(chart, "save", lambda figure, path: kept.append(figure))
-    chart.draw(tmp_path / "c.png", [Row(**(known | one)) for one in (*others, *marked)], [], [], ("finding", "machine"))
+    monkeypatch.setattr(charts, "save", lambda figure, path: kept.append(figure))
+    chart.draw(tmp_path / "c", rows, "A finding", "a machine")
     (figure,) = kept
-    figure.canvas.draw()
-    for axes in figure.axes[:1]:
-        names = [text for text in axes.texts if text.get_text() in ("default", "auto")]
-        assert len(names) == 2
-        for name in names:
-            box, room = name.get_window_extent(), axes.get_window_extent()
-            assert room.x0 <= box.x0 and box.x1 <= room.x1 and room.y0 <= box.y0 and box.y1 <= room.y1, name.get_text()
+    assert_legible(figure)
+    names = [text.get_text() for text in figure.axes[0].texts]
+    for name, k in (("default", 1), ("auto", 1.01)):
+        assert f"{name}: {charts.two_digits(error)} arcsec, {charts.two_digits(time_ms * k)} ms" in names
+    assert sum(name == "exact" for name in names) >= 2
+
+
+def test_scenes_that_are_alike_are_drawn_once():
+    rates = {"average field": (0.0, 0.23), "dense field": (0.0, 0.24), "faint field": (0.0, 0.9), "1 deg/s": (1.0, 0.25)}
+    rows = [planted(scene=name, rate_deg_s=rate, error_arcsec=error, chosen="auto") for name, (rate, error) in rates.items()]
+    assert chart.differing(rows) == {"average field": ["dense field"], "faint field": [], "1 deg/s": []}
 
 
 def test_a_point_is_beaten_by_one_that_is_no_worse_and_no_slower():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 
 import pytest
@@ -28,7 +29,6 @@ def figures(monkeypatch) -> list[Figure]:
         kept.append(figure)
 
     monkeypatch.setattr(charts, "save", keep)
-    monkeypatch.setattr(benchmark_report, "save", keep)
     return kept
 
 
@@ -100,6 +100,26 @@ def test_the_looks_of_a_chart_are_looked_at(two_lines):
 def test_what_is_wrong_with_a_chart_is_seen(two_lines, spoil, said):
     with pytest.raises(AssertionError, match=said):
         assert_legible(two_lines(spoil))
+
+
+@pytest.mark.parametrize(
+    ("limits", "ticks"),
+    [
+        ((0.3, 21), [0.5, 1, 2, 5, 10, 20]),
+        ((0.03, 2000), [0.1, 1, 10, 100, 1000]),
+        ((0.0009, 0.7), [0.001, 0.003, 0.01, 0.03, 0.1, 0.3]),
+        ((0.026, 0.14), [0.03, 0.04, 0.05, 0.07, 0.1]),
+        ((1e-13, 10), [1e-12, 1e-10, 1e-8, 1e-6, 1e-4, 1e-2, 1]),
+    ],
+)
+def test_ticks_are_round_and_names_at_the_side_keep_apart(limits, ticks):
+    axes = Figure().subplots()
+    axes.set(xscale="log", xlim=limits)
+    charts.log_ticks(axes.xaxis, 9)
+    assert axes.get_xticks() == pytest.approx(ticks)
+    heights = charts.spread([0.9, 0.9, 0.89, 0.02, 0.01, 0.0], 0.05)
+    assert min(a - b for a, b in itertools.pairwise(heights)) == pytest.approx(0.05)
+    assert heights[-1] >= 0 and heights[0] <= 1
 
 
 def test_figures_of_an_axis_are_a_persons():

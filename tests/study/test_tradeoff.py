@@ -23,7 +23,7 @@ from hilstar.study.tradeoff import table as tradeoff_table
 from hilstar.study.tradeoff.brightness import trapezoid
 from hilstar.study.tradeoff.demo import SIGMA_PX
 from hilstar.study.tradeoff.depth import LIMITS_V_MAG
-from hilstar.study.tradeoff.run import STEPS, draw, round_ticks, spread, table_lines
+from hilstar.study.tradeoff.run import STEPS, draw, table_lines
 from hilstar.study.tradeoff.table import MIN_ROUNDS, Figure, Trial, Trials, interleaved, measured, pareto_front
 
 NAMES = ["brightness", "spectrum", "depth", "culling", "projection", "prediction", "smear", "psf", "quantisation"]
@@ -198,16 +198,6 @@ def test_a_trapezoid_integrates_a_straight_line(rng):
     nodes, weight = trapezoid(7.0, line)
     assert np.diff(nodes).max() <= 7.0
     assert line(nodes) @ weight == pytest.approx(line.value.mean() * 100e-9, rel=1e-12)
-
-
-def test_names_at_the_side_keep_apart_and_ticks_are_round():
-    heights = spread(np.array([0.9, 0.9, 0.89, 0.02, 0.01, 0.0]), 0.05)
-    assert min(a - b for a, b in itertools.pairwise(heights)) == pytest.approx(0.05)
-    assert heights[-1] >= 0 and heights[0] <= 1
-    assert round_ticks(0.3, 21) == pytest.approx([0.5, 1, 2, 5, 10, 20])
-    assert round_ticks(0.03, 2000) == pytest.approx([0.1, 1, 10, 100, 1000])
-    assert round_ticks(0.026, 0.14) == pytest.approx([0.03, 0.04, 0.05, 0.07, 0.1])
-    assert len(round_ticks(1e-13, 10)) <= 8
 
 
 def test_every_step_is_known_and_a_chart_that_cannot_be_written_is_refused(tmp_path, clock):

@@ -1,159 +1,144 @@
-"""The picture: a column a scene; error against time in arcsec and in mag, and where error and time come from."""
+"""Two pictures: error against time in each scene that differs, with the front; and where error and time come from."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from hilstar.charts import STYLE, plain_ticks, save, title_lines
+from hilstar.charts import BLUE, GREEN, INK, ORANGE, PURPLE, RED, capital, chart, name_at_side, two_digits, value_bars
 from hilstar.study.chain.budget import RSS, WHOLE
 from hilstar.study.chain.combinations import QUANTISATIONS
-from hilstar.study.chain.table import AUTO, DEFAULT, BudgetRow, Row, StageRow
+from hilstar.study.chain.table import AUTO, DEFAULT, BudgetRow, Row, StageRow, auto_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.axis import Axis
 
-COLOURS: dict[str, str] = dict(zip(QUANTISATIONS, ("C7", "C1", "C2", "C0"), strict=True))
-MARKERS = {("path", "rate"): "o", ("path", "two samples"): "v", ("point", "rate"): "s", ("point", "held"): "^"}
-MARKER_WORDS = {
-    ("path", "rate"): "paths, predicted by the rate",
-    ("path", "two samples"): "paths, by two samples",
-    ("point", "rate"): "points, by the rate",
-    ("point", "held"): "points, held",
-}
-COLUMN_INCH, HEIGHT_INCH = 4.4, 17.0
-ROWS = (3.0, 3.0, 1.7, 1.7, 1.1)
-FLOOR_SHARE = 1e-3  # of the whole error: bars below it are of no account
-WORDS = {RSS: "root sum square", "refresh": "refresh of the panel", "codes": "quantisation", "sprites": "cut sprites"}
-NAME_ROOM = 0.7  # of the axes: right of here a name has no room to the right of its point
-CHOSEN = {DEFAULT: ("D", "black"), AUTO: ("*", "C3")}
+COLOURS: dict[str, str] = dict(zip(QUANTISATIONS, (PURPLE, ORANGE, GREEN, BLUE), strict=True))
+PANEL_INCH, BARS_INCH, TITLE_INCH = 2.7, 1.5, 1.2
+FLOOR_SHARE = 1e-3  # of the smallest error: what is 0 has a place on a logarithmic axis
+LESS = 0.9  # of the error of the one that was named last: what is worth a name on the front
+ALIKE = 1.5  # scenes of one rate are drawn once where auto's error differs by less than this factor
+WORDS = {"refresh": "panel's refresh", "codes": "quantisation", "sprites": "cut sprites", WHOLE: "all of it"}
+CHOSEN = {DEFAULT: INK, AUTO: RED}
 
 
-def draw(
-    path: Path, rows: Sequence[Row], budget: Sequence[BudgetRow], stages: Sequence[StageRow], head: tuple[str, str]
-) -> None:
-    """Write the picture, with its finding and the machine of its times. Raises InputError where it cannot be written."""
-    from matplotlib import rc_context
-    from matplotlib.figure import Figure
-
-    scenes = list(dict.fromkeys(row.scene for row in rows))
-    with rc_context(STYLE):
-        figure = Figure(figsize=(COLUMN_INCH * max(len(scenes), 2), HEIGHT_INCH), layout="constrained")
-        grid = figure.subplots(5, len(scenes), squeeze=False, height_ratios=ROWS)
-        for column, name in enumerate(scenes):
-            own = [row for row in rows if row.scene == name]
-            _scatter(grid[0][column], own, "error_arcsec")
-            _scatter(grid[1][column], own, "error_mag")
-            parts = [part for part in budget if part.scene == name]
-            _bars(grid[2][column], parts, "error_arcsec")
-            _bars(grid[3][column], parts, "error_mag")
-            _times(grid[4][column], [one for one in stages if one.scene == name])
-            grid[0][column].set_title(f"{name}, {own[0].stars} stars")
-            grid[1][column].set_xlabel("median time of a frame [ms]")
-            grid[2][column].set_xlabel("arcsec, rms, at auto")
-            grid[3][column].set_xlabel("mag, rms, at auto")
-            grid[4][column].set_xlabel("ms a frame, at auto")
-        for column in range(1, len(scenes)):
-            for row in (2, 3, 4):
-                grid[row][column].set_yticklabels([])
-        for row, label in enumerate(
-            ("star's place, rms [arcsec]", "star's light, rms [mag]", "error from", "error from", "time")
-        ):
-            grid[row][0].set_ylabel(label)
-        figure.legend(handles=_legend(rows), loc="outside lower center", ncols=5, fontsize=10)
-        finding, machine = head
-        figure.suptitle(f"{title_lines(finding)}\n{machine}", fontsize=14)
-        save(figure, path)
+def differing(rows: Sequence[Row]) -> dict[str, list[str]]:
+    """The scenes to be drawn, each with those of its rate in which `auto` is as far off."""
+    kept: dict[str, list[str]] = {}
+    autos: dict[str, Row] = {}
+    for scene in dict.fromkeys(row.scene for row in rows):
+        mine = [row for row in rows if row.scene == scene]
+        own = mine[auto_of(mine)]
+        like = [s for s, o in autos.items() if o.rate_deg_s == own.rate_deg_s and _alike(o.error_arcsec, own.error_arcsec)]
+        if like:
+            kept[like[0]].append(scene)
+        else:
+            kept[scene], autos[scene] = [], own
+    return kept
 
 
-def _scatter(axes: Axes, rows: Sequence[Row], error: str) -> None:
-    front = "on_front" if error == "error_arcsec" else "on_front_mag"
-    floor = FLOOR_SHARE * min((getattr(row, error) for row in rows if getattr(row, error) > 0), default=1.0)
-    line = [(row.time_ms, max(getattr(row, error), floor)) for row in rows if getattr(row, front) == "true"]
-    axes.step(*zip(*line, strict=True), where="post", color="black", lw=1.3, zorder=1)
-    for row in rows:
-        _dot(axes, row, max(getattr(row, error), floor), getattr(row, front) == "true")
-    axes.set(xscale="log", yscale="log")
-    axes.margins(0.1, 0.12)
-    for row in rows:
-        for name, (marker, colour) in CHOSEN.items():
-            if row.chosen == name:
-                _label(axes, name, (row.time_ms, max(getattr(row, error), floor)), (marker, colour))
-    for axis, (low, high) in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
-        _round_ticks(axis, low, high)
+def _alike(a: float, b: float) -> bool:
+    return max(a, b) <= ALIKE * min(a, b)
 
 
-def _dot(axes: Axes, row: Row, error: float, on_front: bool) -> None:
-    colour, stealing = COLOURS[row.quantisation], row.bit_stealing == "true"
-    size = {"full": 8.0, "cut": 6.0, "coarse": 4.0}[row.sprite]
-    style: dict[str, Any] = {"marker": MARKERS[row.smear, row.prediction], "ms": size, "mec": colour, "mew": 1.4}
-    half = row.noise_ms
-    axes.plot([max(row.time_ms - half, row.time_ms / 2), row.time_ms + half], [error] * 2, color=colour, lw=1.0, alpha=0.5)
-    style |= {"mfc": "white" if stealing else colour, "alpha": 1.0 if on_front else 0.65}
-    axes.plot(row.time_ms, error, ls="none", zorder=3 if on_front else 2, **style)
+def draw(path: Path, rows: Sequence[Row], finding: str, machine: str) -> None:
+    """Error against time, a panel for each scene that differs. Raises InputError where it cannot be written."""
+    scenes = differing(rows)
+    note = f"The line is the front: nothing else is as right and as fast. Pale: all other choices. {capital(machine)}."
+    with chart(path, finding, len(scenes), note=note, share_x=False, height_inch=TITLE_INCH + PANEL_INCH * len(scenes)) as grid:
+        for axes, (scene, alike) in zip(grid, scenes.items(), strict=True):
+            own = [row for row in rows if row.scene == scene]
+            axes.set_title(f"{scene}, {own[0].stars} stars" + (f" (the same in: {', '.join(alike)})" if alike else ""))
+            axes.set(xscale="log", yscale="log", ylabel="star's place, rms [arcsec]")
+            _scatter(axes, own)
+        grid[-1].set_xlabel("median time of a frame [ms]")
 
 
-def _label(axes: Axes, name: str, place: tuple[float, float], look: tuple[str, str]) -> None:
-    """A ring around a point, and its name: beside it where the axes have room, `default` below and others above."""
-    marker, colour = look
-    axes.plot(*place, marker=marker, ms=17, mfc="none", mec=colour, mew=1.8, ls="none", zorder=4)
-    at_end = axes.transAxes.inverted().transform(axes.transData.transform(place))[0] > NAME_ROOM
-    axes.annotate(
-        name,
-        place,
-        xytext=(-12 if at_end else 12, -16 if name == DEFAULT else 12),
-        textcoords="offset points",
-        ha="right" if at_end else "left",
-        color=colour,
-        fontsize=11,
-        fontweight="bold",
-        zorder=5,
+def _scatter(axes: Axes, rows: Sequence[Row]) -> None:
+    floor = FLOOR_SHARE * min((row.error_arcsec for row in rows if row.error_arcsec > 0), default=1.0)
+    at = [(row.time_ms, max(row.error_arcsec, floor)) for row in rows]
+    front = [(row, place) for row, place in zip(rows, at, strict=True) if row.on_front == "true"]
+    axes.step(*zip(*(place for _, place in front), strict=True), where="post", color=INK, lw=1.2, zorder=2)
+    for row, place in zip(rows, at, strict=True):
+        colour, on_front = COLOURS[row.quantisation], row.on_front == "true"
+        early, late = max(place[0] - row.noise_ms, place[0] / 2), place[0] + row.noise_ms
+        axes.plot([early, late], [place[1]] * 2, color=colour, lw=1.0, alpha=0.4)
+        axes.plot(*place, "o", color=colour, ms=6 if on_front else 4, alpha=1 if on_front else 0.35, zorder=3)
+    axes.margins(0.06, 0.12)
+    for row, place in zip(rows, at, strict=True):
+        for name in row.chosen.split():
+            axes.plot(*place, "o", color=CHOSEN[name], ms=13 if name == AUTO else 17, mfc="none", mew=1.6, zorder=4)
+    named, last, own = [], math.inf, rows[auto_of(rows)]
+    for row, place in front:
+        if place[1] < LESS * last and not row.chosen:
+            named.append((short_words(row, own), place, COLOURS[row.quantisation]))
+            last = place[1]
+    for row, place in zip(rows, at, strict=True):
+        if row.chosen:
+            figures = f"{two_digits(row.error_arcsec)} arcsec, {two_digits(row.time_ms)} ms"
+            named.append(
+                (f"{row.chosen.replace(' ', ', ')}: {figures}", place, CHOSEN[AUTO if AUTO in row.chosen else DEFAULT])
+            )
+    for name, colour in COLOURS.items():
+        if not any(colour == other for *_, other in named):  # the best of what has no place on the front
+            best = min(
+                (each for each in zip(rows, at, strict=True) if each[0].quantisation == name),
+                key=lambda each: each[1][1],
+                default=None,
+            )
+            named += [(short_words(best[0], own), best[1], colour)] if best else []
+    name_at_side(axes, named)
+
+
+def short_words(row: Row, own: Row) -> str:
+    """A row's combination where its sprites go without saying, and its depth where it is that of `own`."""
+    shallow = ", fewer stars" if row.faintest_v_mag < own.faintest_v_mag else ""
+    moving = f", {row.smear}s by {row.prediction}".replace("by held", "held") if row.rate_deg_s else ""
+    return f"{row.quantisation}{' + bit stealing' if row.bit_stealing == 'true' else ''}{moving}{shallow}"
+
+
+def draw_budget(path: Path, rows: Sequence[Row], budget: Sequence[BudgetRow], stages: Sequence[StageRow]) -> None:
+    """Where `auto`'s error and time come from, a row of panels for each scene that differs. Raises InputError."""
+    scenes = differing(rows)
+    last = list(scenes)[-1]
+    steps = [part.step for part in budget if part.scene == next(iter(scenes)) and part.step != RSS]
+    shown = [step for step in steps if any(p.error_arcsec or p.error_mag for p in budget if p.step == step)]
+    none = [WORDS.get(step, step) for step in steps if step not in shown]
+    note = "Each step is charged with what it changes when it is added to an exact display" + (
+        f"; {' and '.join(none)} change nothing here." if none else "."
     )
+    height = TITLE_INCH + BARS_INCH * len(scenes)
+    with chart(
+        path, _budget_finding(scenes, budget, stages), len(scenes), 3, note=note, share_x=False, height_inch=height
+    ) as grid:
+        for k, scene in enumerate(scenes):
+            parts = {part.step: part for part in budget if part.scene == scene}
+            place, light, times = grid[3 * k : 3 * k + 3]
+            place.set_title(scene)
+            for axes, error, unit in ((place, "error_arcsec", "arcsec"), (light, "error_mag", "mag")):
+                values = [getattr(parts[step], error) for step in shown]
+                colours = [RED if step == WHOLE else BLUE for step in shown]
+                value_bars(axes, [WORDS.get(step, step) for step in shown], values, colours)
+                axes.set_xlabel(f"error, rms [{unit}]" if scene == last else "")
+            light.set_yticklabels([])
+            mine = [one for one in stages if one.scene == scene]
+            value_bars(times, [one.stage for one in mine], [one.time_ms for one in mine], PURPLE)
+            times.set_xlabel("time of a frame [ms]" if scene == last else "")
 
 
-def _bars(axes: Axes, parts: Sequence[BudgetRow], error: str) -> None:
-    values = [getattr(part, error) for part in parts][::-1]
-    names = [WORDS.get(part.step, part.step) for part in parts][::-1]
-    colours = ["C3" if part.step == WHOLE else "0.5" if part.step == RSS else "C0" for part in parts][::-1]
-    largest = max([value for value in values if math.isfinite(value)], default=1.0) or 1.0
-    axes.barh(names, values, color=colours)
-    for place, value in enumerate(values):
-        text = "0" if value == 0 else f"{value:.2g}"
-        axes.annotate(f" {text}", (value, place), va="center", fontsize=9)
-    axes.set_xlim(0, 1.25 * largest)
-    axes.grid(visible=False, axis="y")
-
-
-def _times(axes: Axes, stages: Sequence[StageRow]) -> None:
-    values, names = [one.time_ms for one in stages][::-1], [one.stage for one in stages][::-1]
-    axes.barh(names, values, color="C4")
-    for place, value in enumerate(values):
-        axes.annotate(f" {value:.2g}", (value, place), va="center", fontsize=9)
-    axes.set_xlim(0, 1.25 * max(values, default=1.0))
-    axes.grid(visible=False, axis="y")
-
-
-def _round_ticks(axis: Axis, low: float, high: float) -> None:
-    first, last = math.floor(math.log10(low)), math.ceil(math.log10(high))
-    steps = (1, 1.5, 2, 3, 5, 7) if high < 8 * low else (1, 2, 5) if high < 200 * low else (1,)
-    ticks = [step * 10.0**power for power in range(first, last + 1) for step in steps]
-    plain_ticks(axis, [tick for tick in ticks if low <= tick <= high])
-
-
-def _legend(rows: Sequence[Row]) -> list[Any]:
-    from matplotlib.lines import Line2D
-
-    plain: dict[str, Any] = {"ls": "none", "color": "0.3"}
-    handles = [Line2D([], [], color="black", lw=1.3, label="front: nothing is as right and as fast")]
-    for name, (marker, colour) in CHOSEN.items():
-        word = "hilstar's defaults" if name == DEFAULT else 'effort = "auto"'
-        handles.append(Line2D([], [], marker=marker, ms=13, mfc="none", mec=colour, mew=1.8, ls="none", label=word))
-    handles += [Line2D([], [], marker="o", color=colour, ls="none", label=name) for name, colour in COLOURS.items()]
-    handles.append(Line2D([], [], marker="o", mfc="white", mec="0.3", ls="none", label="open: bit stealing"))
-    seen = {(row.smear, row.prediction) for row in rows}
-    handles += [Line2D([], [], marker=m, label=MARKER_WORDS[key], **plain) for key, m in MARKERS.items() if key in seen]
-    handles.append(Line2D([], [], marker="o", ms=4, label="large, medium, small: sprites full, cut, coarse", **plain))
-    return handles
+def _budget_finding(
+    scenes: Sequence[str] | dict[str, list[str]], budget: Sequence[BudgetRow], stages: Sequence[StageRow]
+) -> str:
+    said = []
+    for scene in scenes:
+        parts = [part for part in budget if part.scene == scene and part.step not in (RSS, WHOLE)]
+        largest = max(parts, key=lambda part: part.error_arcsec if math.isfinite(part.error_arcsec) else math.inf)
+        said.append(
+            f"{WORDS.get(largest.step, largest.step)} in the {scene}"
+            if "field" in scene
+            else f"{WORDS.get(largest.step, largest.step)} at {scene}"
+        )
+    longest = max(stages, key=lambda one: one.time_ms)
+    return f"Of auto's error most is {', '.join(said)}; of its time most is {longest.stage}"

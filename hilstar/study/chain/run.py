@@ -11,7 +11,7 @@ from hilstar.errors import InputError
 from hilstar.files import make_directory
 from hilstar.study.chain.bench_parts import Parts
 from hilstar.study.chain.budget import error_budget
-from hilstar.study.chain.chart import draw
+from hilstar.study.chain.chart import draw, draw_budget
 from hilstar.study.chain.measuring import QUICK, Plan, SceneMeasurement
 from hilstar.study.chain.panel import shortened_line
 from hilstar.study.chain.scenes import five_scenes
@@ -19,13 +19,18 @@ from hilstar.study.chain.table import BudgetRow, Row, StageRow, budget_rows, row
 from hilstar.study.chain.tracker import Tracker
 from hilstar.study.chain.verdict import headline, is_right, scene_line
 
-OUTPUTS = ("chain.png", "chain.csv", "chain_budget.csv", "chain_time.csv")
+OUTPUTS = (
+    *(f"{name}{ending}" for name in ("chain", "chain_budget") for ending in (".png", ".svg")),
+    "chain.csv",
+    "chain_budget.csv",
+    "chain_time.csv",
+)
 
 
 def run(
     file: BenchFile, directory: Path, quick: bool = False, advance: Callable[[int], object] | None = None
 ) -> tuple[list[str], bool]:
-    """Measure a bench file's scenes; write `chain.png`, `chain.csv`, `chain_budget.csv` and `chain_time.csv` into `directory`.
+    """Measure a bench file's scenes; write OUTPUTS into `directory`.
 
     A line for each scene, and whether `auto` is on the front of all, or within the noise of it; `advance` hears how many scenes
     are done. Raises InputError, MachineError.
@@ -61,5 +66,6 @@ def run(
     make_directory(directory)
     write_tables(directory, rows, budget, stages)
     notes = [f"times on {machine}", *([] if shortened is None else [shortened])]
-    draw(directory / "chain.png", rows, budget, stages, (headline(rows), "; ".join(notes)))
+    draw(directory / "chain", rows, headline(rows), "; ".join(notes))
+    draw_budget(directory / "chain_budget", rows, budget, stages)
     return [*lines, *notes], right

@@ -26,10 +26,10 @@ def scene_line(rows: Sequence[Row], budget: Sequence[BudgetRow], stages: Sequenc
 def headline(rows: Sequence[Row]) -> str:
     """What the whole table says of `auto`."""
     scenes = [[row for row in rows if row.scene == name] for name in dict.fromkeys(row.scene for row in rows)]
-    on, others = [own for own in scenes if not beating(own)[0]], [own for own in scenes if beating(own)[0]]
-    beaten = "".join(f"; {own[0].scene}: {words(_nearest(beating(own)[0]))} beats it" for own in others)
-    where = f"in {len(on)} of {len(scenes)} scenes"
-    return f'effort = "auto" is on the front of error against time, or within its noise, {where}{beaten}'
+    beaten = [own[0].scene for own in scenes if beating(own)[0]]
+    where = f"in {len(scenes) - len(beaten)} of {len(scenes)} scenes"
+    said = f", not in {', '.join(beaten)}" if beaten else ""
+    return f'The choice of effort = "auto" is on the front of error against time, or within its noise, {where}{said}'
 
 
 def is_right(rows: Sequence[Row]) -> bool:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hilstar.charts import BLUE, GREEN, ORANGE, PURPLE
 from hilstar.monitor.phases import SIGMA_PX, WHITE
 from hilstar.monitor.quantise import EXPOSURE_FRAMES, Quantisation
 from hilstar.monitor.response import Response, Weights, bit_stealing_response, srgb_response
@@ -27,22 +28,22 @@ STEALING = ", bit stealing"
 
 @dataclass(frozen=True, slots=True)
 class Way:
-    """One way from light to levels: its name, the renderer's method, its line's style, and in how many frames it is seen."""
+    """One way from light to levels: its name, the renderer's method, its colour, and in how many frames it is seen."""
 
     name: str
     method: Quantisation
-    style: str
+    colour: str
     stealing: bool = False
     frames: int = 1
 
 
 WAYS = (
-    Way("round", "round", "C7-"),
-    Way("dither", "dither", "C1-"),
-    Way(f"temporal, mean of {EXPOSURE_FRAMES} frames", "temporal", "C2-", frames=EXPOSURE_FRAMES),
-    Way("exact", "exact", "C0-"),
-    Way("round" + STEALING, "round", "C7:", stealing=True),
-    Way("exact" + STEALING, "exact", "C0:", stealing=True),
+    Way("round", "round", PURPLE),
+    Way("dither", "dither", ORANGE),
+    Way(f"temporal, mean of {EXPOSURE_FRAMES} frames", "temporal", GREEN, frames=EXPOSURE_FRAMES),
+    Way("exact", "exact", BLUE),
+    Way("round" + STEALING, "round", PURPLE, stealing=True),
+    Way("exact" + STEALING, "exact", BLUE, stealing=True),
 )
 
 

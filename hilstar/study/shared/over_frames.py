@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from hilstar.arrays import FloatArray
-from hilstar.charts import chart, write_records
+from hilstar.charts import BLUE, GREEN, ORANGE, PURPLE, TEAL, chart, label_ends, plain_ticks, write_records
 from hilstar.monitor.balance import AS_USUAL
 from hilstar.monitor.phases import SIGMA_PX, WHITE, fainter, line_places, phase_grid, phase_image
 from hilstar.monitor.quantise import Panel, dither_levels, mask_turn, shown_light
@@ -62,13 +62,12 @@ def panels() -> list[Shown]:
 
 
 def study_frames(directory: Path, quick: bool) -> str:
-    """Write over_frames.csv and over_frames.png into `directory`; the finding."""
+    """Write over_frames.csv and its chart into `directory`; the finding."""
     phases, counts = (6, FRAMES[:4]) if quick else (16, FRAMES)
     left = [row for shown in panels() for row in _left_by(shown, phases, counts)]
     write_records(directory / "over_frames.csv", left)
-    finding = _finding(left)
-    _draw(directory / "over_frames.png", left, finding)
-    return finding
+    draw(directory / "over_frames", left)
+    return _finding(left)
 
 
 def _left_by(shown: Shown, phases: int, counts: tuple[int, ...]) -> list[Left]:
@@ -113,23 +112,32 @@ def _finding(left: list[Left]) -> str:
     return f"temporal over any {AIM_FRAMES} frames, rms, places by a PSF fit: {'; '.join(each)}"
 
 
-def _draw(path: Path, left: list[Left], finding: str) -> None:
-    with chart(path, finding, panels=2) as (flux, place):
-        for colour, name in enumerate(dict.fromkeys(row.panel for row in left)):
+def draw(path: Path, left: list[Left]) -> None:
+    """What is left over the frames of an exposure, each panel in its colour."""
+    names = list(dict.fromkeys(row.panel for row in left))
+    at = {row.panel: row.axis_rms_px_fit for row in left if row.frames == AIM_FRAMES and row.method == "temporal"}
+    finding = (
+        f"Over any {AIM_FRAMES} frames temporal places stars within {at[names[0]]:.2g} px rms on {names[0]},"
+        f" and within {at[names[-1]]:.2g} px on {names[-1]}"
+    )
+    note = "Solid: temporal. Dotted: dither with a mask that turns. Steps: a star's light in steps of the panel from black."
+    with chart(path, finding, panels=2, note=note) as (flux, place):
+        for name, colour in zip(names, (BLUE, ORANGE, GREEN, PURPLE, TEAL), strict=True):
             for method, style in (("temporal", "-o"), ("dither", ":")):
                 rows = [row for row in left if (row.panel, row.method) == (name, method)]
-                label = (
-                    f"{name}, {rows[0].steps:.{1 if rows[0].steps < 100 else 0}f} steps of light"
-                    if method == "temporal"
-                    else None
-                )
-                frames, look = [row.frames for row in rows], f"C{colour}{style}"
-                flux.plot(frames, [_finite(row.flux_rms_mag) for row in rows], look, label=label, ms=4)
-                place.plot(frames, [_finite(row.axis_rms_px_fit) for row in rows], look, ms=4)
-        flux.set(xscale="log", yscale="log", ylim=(1e-6, 1), ylabel="flux error, rms [mag]")
-        place.set(xscale="log", yscale="log", ylabel="place by a PSF fit, rms [px]", xlabel="frames of an exposure")
-        place.set_xticks(FRAMES, [str(count) for count in FRAMES])
-        flux.legend(title="solid: temporal, dotted: dither with a mask that turns", fontsize=9, loc="lower left")
+                frames = [row.frames for row in rows]
+                steps = f"{rows[0].steps:.{1 if rows[0].steps < 100 else 0}f}"
+                for axes, error, label in (
+                    (flux, "flux_rms_mag", f"{name}: {steps} steps"),
+                    (place, "axis_rms_px_fit", name),
+                ):
+                    values = [_finite(getattr(row, error)) for row in rows]
+                    axes.loglog(frames, values, style, color=colour, ms=4, label=label if method == "temporal" else "_")
+        flux.set_ylabel("flux error, rms [mag]")
+        place.set(ylabel="place by a PSF fit, rms [px]", xlabel="frames of an exposure")
+        plain_ticks(place.xaxis, sorted({row.frames for row in left}))
+        for axes in (flux, place):
+            label_ends(axes)
 
 
 def _finite(value: float) -> float:

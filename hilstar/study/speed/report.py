@@ -7,10 +7,10 @@ from pathlib import Path
 
 from msgspec import UNSET
 
-from hilstar.charts import STYLE, plain_ticks, save, title_lines, write_csv
+from hilstar.charts import BLUE, GREEN, ORANGE, PURPLE, RED, chart, plain_ticks, write_csv
 from hilstar.study.speed.result import Cell, Result, Size, Timing
 
-COLORS = {"hilstar": "C3", "numpy": "C0", "numba": "C1", "galsim": "C2", "photutils": "C4"}
+COLOURS = {"hilstar": RED, "numpy": BLUE, "numba": ORANGE, "galsim": GREEN, "photutils": PURPLE}
 COLUMN = 12
 NAME = 26
 OF_AN_IMAGE = ("whole_frame", "turning", "linear_only")
@@ -62,44 +62,43 @@ def _notes(result: Result) -> Iterator[str]:
 
 
 def write(result: Result, folder: Path) -> None:
-    """Write bench.csv and bench.png into `folder`. Raises InputError where they cannot be written."""
+    """Write bench.csv and its chart into `folder`. Raises InputError where they cannot be written."""
     columns = ("width", "height", "stars", "method", "kind", "median_ms", "min_ms", "max_ms")
     table = [(r.width, r.height, r.stars, r.method, r.kind, r.ms.median, r.ms.min, r.ms.max) for r in result.rows]
     write_csv(folder / "bench.csv", columns, table)
-    _draw(folder / "bench.png", result)
+    _draw(folder / "bench", result)
 
 
 def _draw(path: Path, result: Result) -> None:
-    from matplotlib import rc_context
-    from matplotlib.figure import Figure
-
     sizes = _sizes(result.rows)
     across = min(2, len(sizes))
     down = -(-len(sizes) // across)
-    with rc_context(STYLE):
-        figure = Figure(figsize=(2.0 + 5.5 * across, 2.2 + 4.0 * down), layout="constrained")
-        grid = figure.subplots(down, across, sharex=True, sharey=True, squeeze=False).ravel()
-        for axis in grid[len(sizes) :]:
-            axis.set_axis_off()
-        for axis, size in zip(grid, sizes, strict=False):
+    note = f"Medians on {result.gl_renderer}, {result.machine.cores} cores."
+    height = 2.1 + 2.5 * down
+    with chart(path, _finding(result), down, across, note=note, share_x=True, share_y=True, height_inch=height) as grid:
+        for axes in grid[len(sizes) :]:
+            axes.set_axis_off()
+        for axes, size in zip(grid, sizes, strict=False):
             rows = [row for row in result.rows if row.size == size and row.kind in OF_AN_IMAGE]
             for method, kind in dict.fromkeys((row.method, row.kind) for row in rows):
                 points = [(row.stars, row.ms.median) for row in rows if (row.method, row.kind) == (method, kind)]
                 label, style = LABELS[kind]
-                axis.plot(*zip(*points, strict=True), style, color=COLORS[method], ms=4, label=f"{method}, {label}")
-            axis.set(title=_words(size), xscale="log", yscale="log", xlabel="stars in view", ylabel="ms a frame (median)")
-            plain_ticks(axis.xaxis, _counts(rows))
-        handles = {label: line for axis in grid for line, label in zip(*axis.get_legend_handles_labels(), strict=True)}
-        figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=min(2 * across, len(handles)))
-        figure.suptitle(title_lines(_finding(result)), fontsize=12)
-        save(figure, path)
+                axes.plot(*zip(*points, strict=True), style, color=COLOURS[method], ms=4, label=f"{method}, {label}")
+            axes.set(title=_words(size), xscale="log", yscale="log")
+            plain_ticks(axes.xaxis, _counts(rows))
+        for axes in grid[-across:]:
+            axes.set_xlabel("stars in view")
+        for axes in grid[::across]:
+            axes.set_ylabel("time of a frame [ms]")
+        handles = {label: line for axes in grid for line, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+        grid[0].figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=2)
 
 
 def _finding(result: Result) -> str:
     whole = [row for row in result.rows if row.kind == "whole_frame"]
     first, last = (pick(whole, key=lambda row: row.ms.median) for pick in (min, max))
     parts = [f"{row.ms.median:.1f} ms with {row.stars} stars on {_words(row.size)}" for row in (first, last)]
-    return f"A whole frame takes {parts[0]} and {parts[1]} ({result.gl_renderer}, {result.machine.cores} cores)"
+    return f"A whole frame takes {parts[0]} and {parts[1]}"
 
 
 def _named(rows: Sequence[Timing]) -> dict[str, dict[int, float]]:

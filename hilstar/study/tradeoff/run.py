@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hilstar.charts import STYLE, plain_ticks, save, title_lines, write_csv
+from hilstar.charts import BLUE, MUTED, RED, capital, chart, name_at_side, two_digits, write_csv
 from hilstar.render.renderer import Renderer, Target
 from hilstar.study.tradeoff.brightness import brightness
 from hilstar.study.tradeoff.culling import culling
@@ -27,9 +26,8 @@ from hilstar.study.tradeoff.table import Figure, Row, Step, Trials, measured
 from hilstar.tracker.centroiders import FAMILY
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+    pass
 
-MAX_POWERS = 8
 # In the order of the chain.
 STEPS: tuple[Callable[[ExitStack, bool], Trials], ...] = (
     brightness,
@@ -67,13 +65,13 @@ MORE_COLUMNS = tuple(f"max_px_{kind}" for kind in FAMILY)
 
 
 def run(directory: Path, quick: bool = False) -> list[str]:
-    """Write a chart for each step (PNG) and one table (CSV) into `directory`; the table as lines for a person."""
+    """Write a chart for each step and one table (CSV) into `directory`; the table as lines for a person."""
     machine = this_machine()
     steps = []
     for plan in STEPS:
         with ExitStack() as stack:
             steps.append(measured(plan(stack, quick), QUICK_BUDGET_S if quick else BUDGET_S))
-        draw(directory / f"tradeoff_{steps[-1].name}.png", steps[-1], machine)
+        draw(directory / f"tradeoff_{steps[-1].name}", steps[-1], machine)
     write_csv(directory / "tradeoff.csv", (*COLUMNS, *MORE_COLUMNS), [cells(step, row) for step in steps for row in step.rows])
     head = f"medians on {machine}; * no method is both as accurate (by the first figure) and as fast; > hilstar's default"
     return [head, *(line for step in steps for line in table_lines(step))]
@@ -117,88 +115,45 @@ def table_lines(step: Step) -> list[str]:
 def finding(step: Step) -> str:
     """What a chart says in its title."""
     own, exact = step.default, next((row for row in step.rows if row.is_exact), None)
-    right = own.error <= step.error.floor
-    text = (
-        f"{step.name}, {step.work}: '{own.method}' has {'no error' if right else 'an error of ' + said(own.error, step.error)}"
-    )
+    off = "has no error" if own.error <= step.error.floor else f"is off by {said(own.error, step.error)}"
+    text = f"{'PSF' if step.name == 'psf' else step.name}: '{own.method}' {off}"
     compared = "" if exact is None else f"; '{exact.method}' takes {exact.time_ms:.3g} ms"
-    return f"{text} and takes {own.time_ms:.3g} ms{compared}"
+    return f"{text} in {own.time_ms:.3g} ms{compared}"
 
 
 def said(value: float, figure: Figure) -> str:
     """A figure with its unit; a share has none."""
-    return f"{value:.2g}" + ("" if figure.unit == "1" else f" {figure.unit}")
+    return two_digits(value) + ("" if figure.unit == "1" else f" {figure.unit}")
 
 
 def draw(path: Path, step: Step, machine: str) -> None:
     """Draw error against time on logarithmic axes: the front as a line, the default ringed, every method named at the side."""
-    from matplotlib import rc_context
-    from matplotlib.figure import Figure as Canvas
-
-    floor = step.error.floor
-    with rc_context(STYLE):
-        canvas = Canvas(figsize=(11.0, 6.4), layout="constrained")
-        axis = canvas.subplots()
-        shown = {row.method: (row.time_ms, max(row.error, floor)) for row in step.rows}
+    floor, own = step.error.floor, step.default
+    shown = {row.method: (row.time_ms, max(row.error, floor)) for row in step.rows}
+    note = f"{capital(step.work)}. Blue: the front, which nothing else is as right and as fast as. Ring: hilstar's default."
+    note += (
+        f" Bars: quartiles. Dotted: {said(floor, step.error)}, no error below it. {machine}."
+        if floor
+        else f" Bars: quartiles. {machine}."
+    )
+    height = max(4.2, 1.9 + 0.17 * len(step.rows))
+    with chart(path, finding(step), note=note, height_inch=height) as (axes,):
         front = [shown[row.method] for row in step.rows if row.on_front]
-        axis.step(
-            *np.array(front).T, where="post", color="C0", lw=1.4, label="front: no other method is as accurate and as fast"
-        )
+        axes.step(*np.array(front).T, where="post", color=BLUE, lw=1.4)
         for row in step.rows:
-            colour = "C0" if row.on_front else "C7"
-            axis.plot(row.quartiles_ms, [shown[row.method][1]] * 2, color=colour, lw=3.5, alpha=0.4, solid_capstyle="butt")
-            axis.plot(*shown[row.method], "o", color=colour, ms=6, zorder=3)
-        own = step.default
-        axis.plot(*shown[own.method], "o", ms=15, mfc="none", mec="C3", mew=2.0, zorder=4, label="hilstar's default")
+            colour = BLUE if row.on_front else MUTED
+            axes.plot(row.quartiles_ms, [shown[row.method][1]] * 2, color=colour, lw=3.5, alpha=0.4, solid_capstyle="butt")
+            axes.plot(*shown[row.method], "o", color=colour, ms=6, zorder=3)
+        axes.plot(*shown[own.method], "o", color=RED, ms=14, mfc="none", mew=2.0, zorder=4)
+        axes.set(xscale="log", yscale="log", xlabel="median time [ms]", ylabel=f"{step.error.name} [{unit_of(step.error)}]")
+        axes.margins(0.06, 0.08)
         if any(row.error < floor for row in step.rows):
-            axis.axhline(floor, color="0.5", ls=":", lw=1.2, label=f"counts as no error: below {said(floor, step.error)}")
-        axis.set(xscale="log", yscale="log", xlabel=f"median time [ms], bar: quartiles; {machine}")
-        axis.set(ylabel=f"{step.error.name} [{step.error.unit}]")
-        axis.margins(0.06, 0.08)
-        plain_ticks(axis.xaxis, round_ticks(*axis.get_xlim()))
-        plain_ticks(axis.yaxis, round_ticks(*axis.get_ylim()))
-        name_methods(axis, step.rows, shown)
-        canvas.legend(loc="outside lower center", ncols=3)
-        canvas.suptitle(title_lines(finding(step)), fontsize=12)
-        save(canvas, path)
+            axes.axhline(floor, color=MUTED, ls=":", lw=1.2)
+        falling = sorted(step.rows, key=lambda row: (-shown[row.method][1], row.time_ms))
+        colours = [RED if row is own else BLUE if row.on_front else MUTED for row in falling]
+        name_at_side(axes, [(row.method, shown[row.method], colour) for row, colour in zip(falling, colours, strict=True)])
 
 
-def round_ticks(low: float, high: float) -> list[float]:
-    """Round ticks of a logarithmic axis: several in each power of ten, or for a long axis only some of the powers."""
-    first, last = math.floor(math.log10(low)), math.ceil(math.log10(high))
-    steps = (1, 2, 3, 4, 5, 7) if high < 10 * low else (1, 2, 5) if last - first <= 3 else (1,)
-    every = -(-(last - first) // MAX_POWERS)
-    ticks = (step * 10.0**power for power in range(first, last) if power % every == 0 for step in steps)
-    return [tick for tick in ticks if low <= tick <= high]
-
-
-def name_methods(axis: Axes, rows: Sequence[Row], shown: dict[str, tuple[float, float]]) -> None:
-    """Every method's name in a column right of the chart, at its error's height as far as the others leave room."""
-    falling = sorted(rows, key=lambda row: (-shown[row.method][1], row.time_ms))
-    points = axis.transScale.transform([shown[row.method] for row in falling])
-    low, high = axis.transScale.transform([[1.0, limit] for limit in axis.get_ylim()])[:, 1]
-    heights = spread((points[:, 1] - low) / (high - low), 0.98 / max(len(rows), 24))
-    for row, height in zip(falling, heights, strict=True):
-        colour = "C3" if row.is_default else "C0" if row.on_front else "0.35"
-        axis.annotate(
-            row.method,
-            shown[row.method],
-            (1.03, height),
-            textcoords="axes fraction",
-            va="center",
-            fontsize=9,
-            color=colour,
-            arrowprops={"arrowstyle": "-", "color": colour, "alpha": 0.35, "lw": 0.7, "shrinkB": 4, "relpos": (0, 0.5)},
-        )
-
-
-def spread(heights: np.ndarray, gap: float) -> list[float]:
-    """Falling heights moved apart by at least `gap`, within 0 and 1 where there is room."""
-    placed: list[float] = []
-    for height in heights:
-        placed.append(min(float(height), 1.0 if not placed else placed[-1] - gap))
-    lowest = 0.0
-    for k in reversed(range(len(placed))):
-        placed[k] = max(placed[k], lowest)
-        lowest = placed[k] + gap
-    return placed
+def unit_of(figure: Figure) -> str:
+    """A figure's unit as an axis has it."""
+    return "share" if figure.unit == "1" else figure.unit

@@ -19,8 +19,8 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import FloatArray
+from hilstar.attitude.logs.aem.blocks import AemFaultError
 from hilstar.attitude.logs.aem.epochs import epoch_ns
-from hilstar.attitude.logs.aem.keywords import AemFaultError
 from hilstar.errors import InputError
 from hilstar.rotation import multiply
 from hilstar.units import NS_PER_S

@@ -195,7 +195,7 @@ def _mcap(path: Path) -> LogReading:
 
 
 def _aem(path: Path, text: str) -> LogReading:
-    from hilstar.attitude.logs.aem.keywords import AemFaultError
+    from hilstar.attitude.logs.aem.blocks import AemFaultError
     from hilstar.attitude.logs.aem.reader import read_aem
     from hilstar.attitude.logs.of_date import q_icrs_to_date
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from hilstar.arrays import FloatArray
 from hilstar.attitude.logs import earth
-from hilstar.attitude.logs.aem.keywords import AemFaultError
+from hilstar.attitude.logs.aem.blocks import AemFaultError
 from hilstar.rotation import from_matrix, normalise
 from hilstar.units import NS_PER_S
 

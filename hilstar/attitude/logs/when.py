@@ -6,8 +6,8 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
+from hilstar.attitude.logs.aem.blocks import AemFaultError
 from hilstar.attitude.logs.aem.epochs import epoch_ns, epoch_text
-from hilstar.attitude.logs.aem.keywords import AemFaultError
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.errors import InputError
 from hilstar.units import NS_PER_S

@@ -6,11 +6,13 @@ import os
 import re
 import shutil
 import subprocess
+from importlib import metadata
 from pathlib import Path
 
 import pytest
 
 from tests.support.benches import ROOT
+from tests.support.licences import UNKNOWN, is_copyleft, licence_of
 from tests.support.readme import blocks
 from tests.support.waiting import INSTALLED_WITHIN_S, PATIENCE_S
 
@@ -52,6 +54,14 @@ def test_the_first_command_does_the_main_job_in_a_fresh_checkout(checkout):
     folder, out = checkout
     assert shape(out[out.index("frames  ") :]) == shape(blocks("text")[0])
     assert len(list((folder / "hilstar-demo").glob("frame_*_codes.png"))) == 4
+
+
+def test_nothing_that_pip_pulled_is_under_the_gpl(checkout):
+    folder, _ = checkout
+    [packages] = (folder / ".venv" / "lib").glob("python*/site-packages")
+    licences = {each.metadata["Name"]: licence_of(each) for each in metadata.distributions(path=[str(packages)])}
+    assert "hilstar" in licences
+    assert {name: licence for name, licence in licences.items() if licence == UNKNOWN or is_copyleft(licence)} == {}
 
 
 def test_the_installed_wheel_runs_the_demo_without_the_checkout(checkout, tmp_path):

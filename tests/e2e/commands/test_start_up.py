@@ -11,7 +11,7 @@ import pytest
 from tests.support.waiting import PATIENCE_S
 
 # What single commands, files and plots need, and no bench: each costs 15 to 250 ms.
-HEAVY = {"asyncio", "astropy", "ccsds_ndm", "matplotlib", "mcap", "rich", "scipy.special", "unittest"}
+HEAVY = {"asyncio", "astropy", "matplotlib", "mcap", "rich", "scipy.special", "unittest"}
 
 
 def imported_by(module: str) -> set[str]:

@@ -13,8 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from hilstar.arrays import FloatArray
-from hilstar.attitude.logs.aem.blocks import EULER_DERIVATIVE, SPIN, SPIN_NUTATION, SPIN_NUTATION_MOM
-from hilstar.attitude.logs.aem.keywords import AemFaultError
+from hilstar.attitude.logs.aem.blocks import EULER_DERIVATIVE, SPIN, SPIN_NUTATION, SPIN_NUTATION_MOM, AemFaultError
 from hilstar.rotation import conjugate, direction_of, from_rotation_vectors, multiply
 
 AXES = {"1": 0, "2": 1, "3": 2, "X": 0, "Y": 1, "Z": 2}

@@ -6,7 +6,7 @@ import re
 from datetime import date, timedelta
 from functools import lru_cache
 
-from hilstar.attitude.logs.aem.keywords import AemFaultError
+from hilstar.attitude.logs.aem.blocks import AemFaultError
 from hilstar.units import NS_PER_S
 
 DAY_NS = 86_400 * NS_PER_S

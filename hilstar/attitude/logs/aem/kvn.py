@@ -1,7 +1,4 @@
-"""AEM in KVN, read line by line.
-
-The library `ccsds-ndm` (3.1) reads no AEM 2.0 in KVN, and silently drops unknown lines and a block that is cut off.
-"""
+"""AEM in KVN, read line by line: an unknown line is refused, and so is a block that is cut off."""
 
 from __future__ import annotations
 
@@ -9,8 +6,17 @@ import io
 
 import numpy as np
 
-from hilstar.attitude.logs.aem.blocks import COMPONENTS, DERIVATIVE, QUATERNIONS, Block, check_metadata, plain
-from hilstar.attitude.logs.aem.keywords import VERSION_KEY, AemFaultError, fault_of
+from hilstar.attitude.logs.aem.blocks import (
+    COMPONENTS,
+    DERIVATIVE,
+    QUATERNIONS,
+    VERSION_KEY,
+    AemFaultError,
+    Block,
+    check_metadata,
+    fault_of,
+    plain,
+)
 
 MARKERS = {  # the section that a marker ends, and the one that it begins
     "META_START": ("header", "metadata"),
@@ -44,7 +50,7 @@ def kvn_blocks(text: str) -> list[Block]:
         elif section == "data":
             rows.append((where, line.split()))
         else:
-            key, value = _keyword(line, section, where)
+            key, value = _keyword(line, section, header.get(VERSION_KEY, ""), where)
             keywords = header if section == "header" else meta
             if key in keywords:
                 raise AemFaultError(where, f"{key} appears twice in the {section}; delete one")
@@ -56,11 +62,11 @@ def kvn_blocks(text: str) -> list[Block]:
     return blocks
 
 
-def _keyword(line: str, section: str, where: str) -> tuple[str, str]:
+def _keyword(line: str, section: str, version: str, where: str) -> tuple[str, str]:
     key, equals, value = line.partition("=")
     if not equals or section not in {"header", "metadata"}:
         raise AemFaultError(where, f"{line[:40]!r} in the {section}; write KEYWORD = value, or a marker such as META_START")
-    fault = fault_of(key.strip(), section)
+    fault = fault_of(key.strip(), section, version)
     if fault is not None:
         raise AemFaultError(where, fault)
     return key.strip(), plain(value)

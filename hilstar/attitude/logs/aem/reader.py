@@ -31,10 +31,11 @@ from hilstar.attitude.logs.aem.blocks import (
     RATE,
     SPIN,
     SPINS,
+    VERSION_KEY,
+    AemFaultError,
     Block,
 )
 from hilstar.attitude.logs.aem.epochs import epoch_ns
-from hilstar.attitude.logs.aem.keywords import VERSION_KEY, AemFaultError
 from hilstar.attitude.logs.aem.kvn import kvn_blocks
 from hilstar.attitude.logs.aem.xml import xml_blocks
 from hilstar.attitude.logs.entries import Entry, LogReading

@@ -246,7 +246,7 @@ def test_xml_whose_angles_are_not_those_of_the_sequence_is_refused(tmp_path):
     text = kvn(rows_of(ANGLES), **keywords("1.0", "ICRF", "A2B", "321", ATTITUDE_TYPE="EULER_ANGLE"))
     angles = f"<rotationAngles>{turns('angle', 'XYZ')}</rotationAngles>"
     state = f"<eulerAngle><EPOCH>{EPOCHS[0]}</EPOCH>{angles}</eulerAngle>"
-    assert "must be Z_ANGLE, Y_ANGLE, X_ANGLE, as EULER_ROT_SEQ has them" in refusal(tmp_path, xml_of("1.0", text, state))
+    assert "rotation1 is the X_ANGLE, and EULER_ROT_SEQ has Z_ANGLE there" in refusal(tmp_path, xml_of("1.0", text, state))
 
 
 @pytest.mark.parametrize("names", [None, "7051995", "ZZX", "12", "ABC", "3211"])

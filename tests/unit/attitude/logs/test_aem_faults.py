@@ -235,6 +235,85 @@ def xml(tmp_path):
     return (tmp_path / "a.xml").read_text()
 
 
+HEAD = '<aem id="CCSDS_AEM_VERS" version="1.0">'
+
+
+def _n(text, count):
+    """So many lines of a text."""
+    return f"{text}\n" * count
+
+
+@pytest.mark.parametrize(
+    ("text", "word"),
+    [
+        (f"{HEAD}<body>{'<segment>' * 30}", "nested too deep"),
+        (f"{HEAD}<header>{_n('<COMMENT/>', 100_001)}", "too many"),
+        (f"<ndm><oem>{_n('<a/>', 100_001)}", "too many"),
+        (f"{HEAD}<header {_n('a=_', 300_000)}/></aem>", "a million characters"),
+        (f"{HEAD}<header><COMMENT>{_n('x', 500_001)}</COMMENT></header></aem>", "a million characters"),
+        ('<!DOCTYPE aem SYSTEM "file:///etc/passwd"><aem/>', "has a DOCTYPE"),
+        ('<?xml version="1.0"?><!DOCTYPE a [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;">]><aem>&b;</aem>', "has a DOCTYPE"),
+        (f"{HEAD}&b;</aem>", "not well-formed XML (undefined entity)"),
+    ],
+    ids=["deep", "wide", "a wide neighbour", "attributes", "text", "external", "entities", "no entity"],
+)
+def test_xml_made_to_fill_the_memory_or_to_read_other_files_is_refused(tmp_path, text, word):
+    assert word in refusal(tmp_path, text)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "word"),
+    [
+        ("<metadata>", "<metadata>QUATERNION_TYPE", "'QUATERNION_TYPE' stands in <metadata>"),
+        ("<data>", "<data>1 0 0 0", "'1 0 0 0' stands in <data>"),
+        ("<quaternion>", "<quaternion>1", "'1' stands in <quaternion>"),
+        ("<Q1>", '<Q1 units="deg">', "<Q1> in 'deg'; write no units"),
+        ("<Q1>", '<Q1 scale="2">', "<Q1> has no scale"),
+        ("<QUATERNION_TYPE>LAST", "<QUATERNION_TYPE>LEAST", "QUATERNION_TYPE is LEAST; write FIRST or LAST"),
+        ("<TIME_SYSTEM>", "<TIME_SYSTEM>TAI</TIME_SYSTEM><TIME_SYSTEM>", "TIME_SYSTEM appears twice in the metadata"),
+        ("<quaternion>", "<quaternion/><quaternion>", "has no place in a <quaternionState>"),
+        ("<EPOCH>", "<EPOCH>1970-01-01T00:00:00</EPOCH><EPOCH>", "has one EPOCH"),
+        ("<attitudeState>", "<state/><attitudeState>", "<state> where <COMMENT> belongs"),
+        ("</segment>", "<data/></segment>", "one <metadata>, then one <data>"),
+        ("</body>", "</body><body/>", "one <header>, then one <body>"),
+        ('id="CCSDS_AEM_VERS"', 'id="CCSDS_OEM_VERS"', 'no id="CCSDS_AEM_VERS"'),
+        ('version="1.0">', 'version="3.0">', "CCSDS_AEM_VERS is 3.0; write 1.0 or 2.0"),
+        ("<aem", "<oem", "<oem> where <aem> or <ndm> belongs"),
+    ],
+)
+def test_what_xml_would_hide_is_refused(tmp_path, xml, old, new, word):
+    text = xml.replace(old, new, 1)
+    assert word in refusal(tmp_path, text.replace("</aem>", "</oem>") if old == "<aem" else text)
+
+
+def test_names_with_a_namespace_and_another_message_beside_the_aem_are_read(tmp_path, xml):
+    body = xml[xml.index("<aem") :]
+    named = re.sub(r"<(/?)(\w)", r"<\1ndm:\2", body).replace("<ndm:aem", '<ndm:aem xmlns:ndm="urn:ccsds:schema:ndmxml"', 1)
+    assert [sample.t_ns for sample in read(tmp_path, named)] == [0, 1, 2]
+    assert [sample.t_ns for sample in read(tmp_path, f"<ndm><oem><body>9</body></oem>{body}</ndm>")] == [0, 1, 2]
+
+
+@pytest.mark.parametrize(
+    ("version", "key", "value", "other"),
+    [
+        ("2.0", "ATTITUDE_DIR", "B2A", "2.0 always turns from REF_FRAME_A to REF_FRAME_B"),
+        ("2.0", "QUATERNION_TYPE", "FIRST", "2.0 always has the scalar last"),
+        ("2.0", "RATE_FRAME", "SC_BODY_1", "2.0 has ANGVEL_FRAME"),
+        ("1.0", "ANGVEL_FRAME", "SC_BODY_1", "1.0 has RATE_FRAME"),
+    ],
+)
+def test_a_keyword_of_the_other_version_is_refused_with_both_named(tmp_path, version, key, value, other):
+    """504.0-B-2 annex J."""
+    own = {"1.0": "2.0", "2.0": "1.0"}[version]
+    words = f"{key} is of AEM {own}, and CCSDS_AEM_VERS is {version}; {other}"
+    text = kvn(rows_of([0, 0, 0, 1]), version, **{key: value})
+    line = text[: text.index(key)].count("\n") + 1
+    assert f"log:{line}: {words}" in refusal(tmp_path, text)
+    meta = "".join(f"<{k}>{v}</{k}>" for k, v in re.findall(r"(\w+) = (.*)", text[text.index("META_START") :]))
+    document = f'<aem id="CCSDS_AEM_VERS" version="{version}"><body><segment><metadata>{meta}</metadata></segment></body></aem>'
+    assert words in refusal(tmp_path, document)
+
+
 def test_an_element_that_would_be_passed_over_is_refused_with_its_line(tmp_path, xml):
     lines = xml.splitlines()
     number = next(k for k, line in enumerate(lines, start=1) if "<QUATERNION_TYPE>" in line)

@@ -12,6 +12,9 @@ from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from typing import Self
+
+from hilstar.errors import printable
 
 MAX_SAID = 3
 SAID_WINDOW_S = 10.0
@@ -27,6 +30,11 @@ class Notice:
     kind: str
     detail: str
     who: str = ""
+
+    @classmethod
+    def now(cls, kind: str, detail: str, who: str = "") -> Self:
+        """An event of this moment, in text that JSON and a terminal hold, whatever a file in it is called."""
+        return cls(time.monotonic_ns(), kind, printable(detail)[:MAX_DETAIL_CHARACTERS], printable(who))
 
 
 def at_now(line: str) -> str:
@@ -53,7 +61,7 @@ class Notices:
 
     def tell(self, kind: str, detail: str, who: str = "") -> None:
         """Count an event, say it unless its kind floods, and hand it on; `who` is the person that it comes from, if one."""
-        notice = Notice(time.monotonic_ns(), kind, detail[:MAX_DETAIL_CHARACTERS], who)
+        notice = Notice.now(kind, detail, who)
         with self._lock:
             self._counts[kind] += 1
             said_ns = self._said_ns.setdefault(kind, deque(maxlen=MAX_SAID))
@@ -70,7 +78,7 @@ class Notices:
 
     def mention(self, kind: str, detail: str) -> None:
         """Say an event that is counted elsewhere, and hand it on."""
-        notice = Notice(time.monotonic_ns(), kind, detail[:MAX_DETAIL_CHARACTERS])
+        notice = Notice.now(kind, detail)
         log.warning("%s", at_now(notice.detail))
         for listener in self._listeners:
             listener(notice)

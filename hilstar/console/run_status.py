@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from hilstar.errors import printable
 from hilstar.rotation import to_radec_roll_deg
 from hilstar.units import NS_PER_MS, NS_PER_S
 
@@ -120,7 +121,8 @@ class RunStatus:
         ledger = None if self._ledger is None else self._ledger.current
         if ledger is not None:
             failed = f"; failed: {ledger.failure}" if ledger.failure else ""
-            yield Line("ledger", f"{ledger.path}, {ledger.size_bytes / 1e6:.1f} MB{failed}", ledger.failure is None)
+            text = printable(f"{ledger.path}, {ledger.size_bytes / 1e6:.1f} MB{failed}")
+            yield Line("ledger", text, ledger.failure is None)
         yield Line("source", self._source.attitudes)
         yield Line("display", f"{self._source.refresh_hz:g} Hz, {self._source.renderer}")
 

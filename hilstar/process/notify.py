@@ -43,7 +43,7 @@ class Service:
     def _send(self, text: str) -> None:
         address = "\0" + self._address[1:] if self._address.startswith("@") else self._address
         with contextlib.suppress(OSError):  # nobody listens, or its queue is full
-            self._socket.sendto(text.encode(), address)
+            self._socket.sendto(text.encode(errors="replace"), address)
 
     def _run(self) -> None:
         while not self._ready():

@@ -104,9 +104,9 @@ class Host:
     def _tick(self, now_s: float) -> None:
         try:
             self._board.states.put(msgspec.json.encode(self._watched.now()))
+            self._write_events()
         except Exception as error:  # a container that changed while it was read, or whatever else: there is a next look
             self._board.states.put(msgspec.json.encode(RunSeen(host_ns=time.monotonic_ns(), note=one_line(repr(error)))))
-        self._write_events()
         page = self._page
         if page is None:
             if now_s >= self._start_s:
@@ -161,7 +161,7 @@ class Host:
         ready, _, _ = select.select([page.wire], [], [], seconds)
         if not ready:
             return
-        with contextlib.suppress(OSError, msgspec.MsgspecError):
+        with contextlib.suppress(OSError, msgspec.MsgspecError, UnicodeDecodeError):
             data = page.wire.recv(MAX_ORDER_BYTES)
             if data:
                 self._take(msgspec.json.decode(data, type=Order))

@@ -40,13 +40,18 @@ class Orders:
         """Do it; what went wrong is in the answer."""
         who = one_line(order.who)[:MAX_WHO_CHARACTERS]
         try:
-            if order.name in SWITCHES:
-                return self._switch(order, who)
-            if order.name == "ledger":
-                return self._switch_ledger(order, who)
-            return self._mark(order, who) if order.name == "mark" else self._fault(order, who)
+            answer = self._done(order, who)
         except HilstarError as error:
             return Answer(id=order.id, status=409, line=one_line(str(error)))
+        answer.line = printable(answer.line)  # a ledger may be called anything
+        return answer
+
+    def _done(self, order: Order, who: str) -> Answer:
+        if order.name in SWITCHES:
+            return self._switch(order, who)
+        if order.name == "ledger":
+            return self._switch_ledger(order, who)
+        return self._mark(order, who) if order.name == "mark" else self._fault(order, who)
 
     def _switch(self, order: Order, who: str) -> Answer:
         if order.name == "patch" and order.on and order.level not in PATCHES:

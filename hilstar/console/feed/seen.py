@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from hilstar.attitude.clock.rate_check import WRONG
 from hilstar.console.feed.messages import AttitudeSeen, ClockSeen, LedgerSeen, RunSeen
+from hilstar.errors import printable
 from hilstar.run.overrides import Overrides
 
 if TYPE_CHECKING:
@@ -89,7 +90,7 @@ class Watched:
         if ledger is None:
             return None
         troubles = [words for kind, words in LEDGER_TROUBLES.items() if kind in self.notices.active]
-        return LedgerSeen(str(ledger.path), ledger.size_bytes, "; ".join(troubles))
+        return LedgerSeen(printable(str(ledger.path)), ledger.size_bytes, "; ".join(troubles))
 
 
 def _attitude(shown: Shown | None) -> AttitudeSeen | None:

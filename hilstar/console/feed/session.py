@@ -66,7 +66,7 @@ class SessionFeed:
     def tell(self, kind: str, line: str) -> None:
         """Tell the page of an event."""
         for listener in self._listeners:
-            listener(Notice(time.monotonic_ns(), kind, " ".join(line.split())))
+            listener(Notice.now(kind, " ".join(line.split())))
 
     def now(self) -> RunSeen:
         """The state now."""

@@ -10,6 +10,7 @@ from hilstar.attitude.logs.mcap_reader import NO_END, unfinished_part
 from hilstar.console.report.bundle import report_page
 from hilstar.console.report.pictures import run_pictures
 from hilstar.console.report.run_data import run_data
+from hilstar.errors import printable
 from hilstar.files import make_directory, write_whole
 from hilstar.run.record.report import RunReport, figures_of, summarise
 
@@ -21,10 +22,10 @@ def report(path: Path, directory: Path) -> RunReport:
     """
     run = figures_of(path)
     summary = summarise(run)
-    data = run_data(path.name, run, summary) | run_pictures(run, path)
+    data = run_data(printable(path.name), run, summary) | run_pictures(run, path)
     unfinished = unfinished_part(path)
     if unfinished is not None:
-        data["facts"].insert(0, ("no end", f"{unfinished.name} {NO_END}"))
+        data["facts"].insert(0, ("no end", f"{printable(unfinished.name)} {NO_END}"))
     page = report_page(data)
     make_directory(directory)
     write_whole(directory / "report.html", page.encode(errors="replace"))

@@ -105,7 +105,7 @@ class Page:
             return _refusal(403, "read-only: start hilstar with --control to act from here")
         try:
             body = msgspec.json.decode(data or b"{}", type=OrderBody)
-        except msgspec.MsgspecError as error:
+        except (msgspec.MsgspecError, UnicodeDecodeError) as error:
             return _refusal(400, f"not the JSON of a control: {error}")
         answer = await self.give(
             Order(id=0, name=name, who=_who(request), on=body.on, level=body.level, text=body.text, fault=body.name)

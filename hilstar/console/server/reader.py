@@ -46,7 +46,9 @@ class Reader:
         now_ns, unix_s = time.monotonic_ns(), time.time()
         found = self._board.states.last()
         if found is not None:
-            with contextlib.suppress(msgspec.MsgspecError):  # cut, where it was too long: the one before stays
+            with contextlib.suppress(
+                msgspec.MsgspecError, UnicodeDecodeError
+            ):  # cut, where it was too long: the one before stays
                 self.seen = msgspec.json.decode(found[1], type=RunSeen)
         self.points.append(self._point(now_ns))
         if now_ns - self._pacing_ns > PACING_EACH_S * NS_PER_S:
@@ -60,7 +62,7 @@ class Reader:
         new = []
         for number, data in self._board.events.after(self._event_at):
             self._event_at = number
-            with contextlib.suppress(msgspec.MsgspecError):
+            with contextlib.suppress(msgspec.MsgspecError, UnicodeDecodeError):
                 event = msgspec.json.decode(data, type=EventSeen)
                 new.append({"utc": utc_text(event.unix_s), "kind": event.kind, "line": event.line})
         self.events.extend(new)

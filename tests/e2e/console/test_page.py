@@ -14,7 +14,9 @@ import pytest
 from hilstar.attitude.logs.mcap_log import read_messages
 from hilstar.run.record.ledger_reader import frame_records
 from hilstar.run.record.ledger_records import EventRecord
+from tests.support.commands import run_hilstar_here
 from tests.support.pages import PageAddress, children, gone, live, page_of, picture_of
+from tests.support.run_page import run_data_of
 from tests.support.senders import LYRA, ORION, connected, talking
 from tests.support.servers import bound
 from tests.support.waiting import CHANCES, wait_for
@@ -141,6 +143,28 @@ def test_a_ledger_is_ended_and_begun_while_the_run_goes_on(run):
     assert path.parent == folder and path.name != "run.mcap"
     wait_for(lambda: path.stat().st_size and len(list(frame_records(path))) > 5)
     assert len(list(frame_records(folder / "run.mcap"))) == before
+
+
+def test_a_ledger_may_be_called_anything(tmp_path):
+    folder = tmp_path / os.fsdecode(b"r\xffun")
+    folder.mkdir()
+    ledger = folder / os.fsdecode(b"l\xfe.mcap")
+    with bound(tmp_path, "--console", "127.0.0.1:0", "--control", "--ledger", str(ledger)) as served:
+        page = page_of(served)
+        with connected(served.port) as sender, talking(sender):
+            wait_for(lambda: page.health_is(True))
+            assert page.json("/state")["state"]["ledger"]["path"].endswith("/r\\xffun/l\\xfe.mcap")
+            status, said = page.control("ledger", on=False)
+            assert (status, said["line"].endswith("/r\\xffun/l\\xfe.mcap is whole")) == (200, True)
+            status, said = page.control("ledger", on=True)
+            assert (status, "/r\\xffun/hilstar-" in said["line"]) == (200, True)
+            assert page.control("mark", text="still here")[0] == 200
+            assert page.health_is(True)
+        told = served.summary()["ledger"]
+    assert told["failure"] is None
+    found = run_hilstar_here("report", ledger, "-o", tmp_path / "report")
+    assert found.returncode == 0, found.stderr
+    assert run_data_of((tmp_path / "report" / "report.html").read_text())["about"]["run"] == "l\\xfe.mcap"
 
 
 def test_a_page_killed_comes_back_by_itself_while_frames_go_on(run):

@@ -99,7 +99,16 @@ def test_a_control_is_a_post_of_a_little_json(open_run):
     assert ask("/health", "POST", "{}", JSON)[0] == 405
     assert ask("/control/blank", "POST", "on=1", {"Content-Type": "application/x-www-form-urlencoded"})[0] == 415
     assert ask("/control/blank", "POST", "on=1", {"Content-Type": "text/plain"})[0] == 415
-    for body in ("{", "[]", '{"on": "yes"}', "\xff".encode("latin-1"), '{"on": 1e999}', '{"onn": false}'):
+    for body in (
+        "{",
+        "[]",
+        '{"on": "yes"}',
+        "\xff".encode("latin-1"),
+        b'{"text": "\xff"}',
+        b'{"\xff": 1}',
+        '{"on": 1e999}',
+        '{"onn": false}',
+    ):
         assert ask("/control/blank", "POST", body, JSON)[0] == 400, body
     assert ask("/control/mark", "POST", '{"text": "  "}', JSON)[0] == 400
     assert ask("/control/patch", "POST", '{"level": 0.33}', JSON)[0] == 400  # never the nearest in silence

@@ -11,8 +11,10 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import CancelledError
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
+from hilstar.attitude.wire.endpoint import Endpoint, check_use, parse_endpoint
 from hilstar.campaign.workers.backlog import Backlog, Task
 from hilstar.campaign.workers.identity import Identity, difference
 from hilstar.campaign.workers.pool import Done, Lost
@@ -21,6 +23,8 @@ from hilstar.campaign.workers.session import Answered, Job
 from hilstar.errors import InputError, MachineError, one_line
 
 INSTALL = "install it: pip install 'hilstar[dask]'"
+PROTOCOLS = ("tcp", "tls", "ucx")
+GIVE_TLS = "give tls://HOST:PORT with --tls-ca-file, --tls-cert and --tls-key, as Dask's scheduler and workers have them"
 TASK_S = 1.0  # of work in a task; handing one out costs the scheduler milliseconds (docs/campaign.md)
 SPARE_TASKS = 1  # that wait at a worker, beyond those that its threads are at
 POLL_S, LOOK_S = 0.25, 0.5
@@ -28,6 +32,75 @@ CONNECT_S, ANSWER_S, MAX_SILENCE_S = 30.0, 30.0, 90.0
 FETCH_S = 5.0  # a task's rows come at once, or their worker is gone
 MAX_WITHOUT_WORKER_S = 60.0
 CLOSE_S = 0.3  # a Ctrl-C ends a command within a second
+
+
+@dataclass(frozen=True, slots=True)
+class Scheduler:
+    """Where a scheduler is ("tcp://HOST:PORT", "tls://HOST:PORT"), and the files of Dask's TLS, whose names these are.
+
+    `tls_key` may be left out where the certificate's file has the key, and all three where Dask's own configuration has them.
+    """
+
+    address: str
+    tls_ca_file: Path | None = None
+    tls_cert: Path | None = None
+    tls_key: Path | None = None
+
+    @property
+    def given(self) -> bool:
+        """Whether a file of TLS is named."""
+        return any((self.tls_ca_file, self.tls_cert, self.tls_key))
+
+    def check(self) -> None:
+        """Refuse (InputError) what is no address, one off loopback without TLS, and TLS that is not whole.
+
+        A scheduler runs whatever it is sent: who reaches it without a certificate runs code on every worker.
+        """
+        named, protocol = f"--scheduler {self.address}", self.address.partition("://")[0]
+        if protocol not in PROTOCOLS:
+            raise InputError(f"{named}: write tcp://HOST:PORT, as `dask scheduler` says it")
+        endpoint = self._endpoint()
+        if protocol == "tls":
+            missing = [name for name in ("tls_ca_file", "tls_cert") if getattr(self, name) is None]
+            if self.given and missing:
+                raise InputError(f"{named}: --{missing[0].replace('_', '-')} is missing; {GIVE_TLS}")
+        elif self.given:
+            raise InputError(f"{named}: {protocol} is not encrypted, and --tls-* would do nothing; write tls://HOST:PORT")
+        elif not endpoint.loopback:
+            raise InputError(f"{named}: non-loopback endpoints require TLS; {GIVE_TLS}, or use tcp://127.0.0.1:PORT")
+
+    def _endpoint(self) -> Endpoint:
+        host = self.address.partition("://")[2]
+        try:
+            endpoint = parse_endpoint(f"tcp://{host}")
+            check_use(endpoint, f"tcp://{host}", bind=False)
+        except InputError as error:
+            raise InputError(f"--scheduler {self.address}: {str(error).partition(': ')[2]}") from error
+        return endpoint
+
+    @property
+    def checked_address(self) -> str:
+        """The address with `localhost` as a number: a name could be resolved to anything."""
+        protocol = self.address.partition("://")[0]
+        return f"{protocol}://{self._endpoint().address.removeprefix('tcp://')}"
+
+    def security(self) -> Any:
+        """Dask's. Raises InputError for files that are no certificates, and tls:// without any."""
+        from distributed.security import Security
+
+        if not self.address.startswith("tls://"):
+            return None
+        names = {"tls_ca_file": self.tls_ca_file, "tls_client_cert": self.tls_cert, "tls_client_key": self.tls_key}
+        made: Any = Security
+        try:
+            security = made(require_encryption=True, **{name: str(path) for name, path in names.items() if path is not None})
+            context = security.get_connection_args("client").get("ssl_context")
+        except (OSError, ValueError) as error:  # of ssl, too
+            files = ", ".join(str(path) for path in names.values() if path is not None) or "Dask's configuration"
+            raise InputError(f"--scheduler {self.address}: {files}: {one_line(str(error))}; {GIVE_TLS}") from error
+        if context is None:
+            raise InputError(f"--scheduler {self.address}: no certificate is named; {GIVE_TLS}")
+        return security
 
 
 @dataclass(slots=True)
@@ -41,19 +114,21 @@ class _Worker:
 
 
 class Cluster:
-    """The workers of the scheduler at `address` ("tcp://HOST:PORT"). Use it as a context manager.
+    """The workers of a scheduler. Use it as a context manager.
 
     One of another version, bench or renderer is refused with a line through `say`, and gets no case. Raises InputError for
-    what is no address, and MachineError where no scheduler answers.
+    what `Scheduler.check` refuses, and MachineError where no scheduler answers.
     """
 
     task_s = TASK_S
 
-    def __init__(self, address: str, job: Job, identity: Identity, say: Callable[[str], None]) -> None:
+    def __init__(self, scheduler: Scheduler, job: Job, identity: Identity, say: Callable[[str], None]) -> None:
         try:
             import distributed
         except ImportError as error:
             raise MachineError(f"--scheduler needs Dask's distributed; {INSTALL}") from error
+        scheduler.check()
+        address = scheduler.checked_address
         self._address, self._job, self._identity, self._say = address, job, identity, say
         self._workers: dict[str, _Worker] = {}
         self._examined: dict[Any, str] = {}
@@ -61,15 +136,38 @@ class Cluster:
         self._looked_s, self._answered_s = 0.0, time.monotonic()
         self._something = threading.Event()  # a future is done
         logging.getLogger("distributed").setLevel(logging.CRITICAL)  # it tells of each worker that goes
-        if not address.startswith(("tcp://", "tls://", "ucx://")):
-            raise InputError(f"--scheduler {address}: write tcp://HOST:PORT, as `dask scheduler` says it")
+        security = scheduler.security()
         try:
             client: Any = distributed.Client
-            self._client = client(address, timeout=CONNECT_S, set_as_default=False, name="hilstar-campaign")
+            named = {"set_as_default": False, "name": "hilstar-campaign", "security": security}
+            self._client = client(address, timeout=CONNECT_S, **named)
         except ValueError as error:
             raise InputError(f"--scheduler {address}: {one_line(str(error))}; write tcp://HOST:PORT") from error
         except (OSError, TimeoutError) as error:
-            raise MachineError(f"--scheduler {address}: nothing answers there; start one: dask scheduler") from error
+            if "certificate" in str(error):
+                why = "the scheduler and this side do not have certificates of one CA; look at --tls-ca-file and --tls-cert"
+            else:
+                why = f"nothing answers there; start one: dask scheduler {self._dask_words()}"
+            raise MachineError(f"--scheduler {address}: {why}") from error
+        self._say_where_it_listens()
+
+    def _dask_words(self) -> str:
+        """What a scheduler or a worker that goes with the address is started with."""
+        if self._address.startswith("tls://"):
+            return "--tls-ca-file CA.pem --tls-cert CERT.pem --tls-key KEY.pem"
+        return "--host 127.0.0.1"
+
+    def _say_where_it_listens(self) -> None:
+        """Say it where a scheduler without TLS, reached over loopback, listens to the network as well."""
+        address: str = self._client.scheduler_info()["address"]
+        if address.startswith("tls://"):
+            return
+        with contextlib.suppress(InputError):
+            if not parse_endpoint(f"tcp://{address.partition('://')[2]}").loopback:
+                self._say(
+                    f"hilstar: the scheduler listens at {address} without TLS: who reaches that runs code on its workers;"
+                    f" start it with {self._dask_words()}"
+                )
 
     def run(self, backlog: Backlog, done: Done, lost: Lost) -> None:
         """Run all cases (see `Pool.run`). Raises MachineError where the scheduler, or every worker, is gone for long."""
@@ -190,7 +288,7 @@ class Cluster:
             return
         now_s = time.monotonic()
         refused = f"; {len(self._workers)} are refused" if self._workers else ""
-        advice = f"start some: dask worker {self._address} --nthreads 1 --nworkers 8"
+        advice = f"start some: dask worker {self._address} --nthreads 1 --nworkers 8 {self._dask_words()}"
         if self._alone_since_s is None:
             self._alone_since_s = now_s
             self._say(f"hilstar: --scheduler {self._address} has no worker for this campaign{refused}; {advice}")

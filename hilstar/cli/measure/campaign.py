@@ -20,6 +20,7 @@ from hilstar.errors import InputError
 if TYPE_CHECKING:
     from hilstar.campaign.run import Campaign
     from hilstar.campaign.store.directory import Directory
+    from hilstar.campaign.workers.cluster import Scheduler
 
 MAX_REASONS = 5
 LINE_S = 10.0  # between lines of progress where stderr is no terminal
@@ -34,7 +35,16 @@ def campaign(
         int | None, typer.Option(help="Processes on this machine; by default one a core.", min=1, max=1024)
     ] = None,
     scheduler: Annotated[
-        str | None, typer.Option(metavar="tcp://HOST:PORT", help="A Dask scheduler, whose workers run the cases.")
+        str | None,
+        typer.Option(metavar="tcp://HOST:PORT", help="A Dask scheduler, whose workers run the cases; off loopback with TLS."),
+    ] = None,
+    tls_ca_file: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="With --scheduler tls://HOST:PORT: the CA's certificates, PEM, as Dask's."),
+    ] = None,
+    tls_cert: Annotated[Path | None, typer.Option(metavar="FILE", help="This side's certificate, PEM.")] = None,
+    tls_key: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Its key, where the certificate's file has none.")
     ] = None,
     solver: Annotated[
         str,
@@ -59,13 +69,14 @@ def campaign(
     check_directory("-o", output)
     if scheduler is not None and (workers is not None or memory is not None):
         raise InputError("campaign --scheduler: the cluster's workers are its own; leave out --workers and --memory")
+    cluster = _scheduler(scheduler, tls_ca_file, tls_cert, tls_key)
     memory_bytes = None if memory is None else parse_memory(memory)
     this = Campaign(plan, output, Asked(solver, solver_timeout, images is not None))
     directory = Directory(output)
     try:
         directory.claim(this.about())
         if not directory.table.exists():
-            run_cases(this, directory, scheduler, workers or len(os.sched_getaffinity(0)), memory_bytes)
+            run_cases(this, directory, cluster, workers or len(os.sched_getaffinity(0)), memory_bytes)
         summary = summarised(this, directory)
     finally:
         directory.close()
@@ -75,7 +86,22 @@ def campaign(
     typer.echo("\n".join(lines_of(summary)))
 
 
-def run_cases(this: Campaign, directory: Directory, scheduler: str | None, workers: int, memory_bytes: int | None) -> None:
+def _scheduler(address: str | None, *tls: Path | None) -> Scheduler | None:
+    """The scheduler that is asked for, checked. Raises InputError."""
+    from hilstar.campaign.workers.cluster import Scheduler
+
+    if address is None:
+        if any(tls):
+            raise InputError("campaign --tls-*: is for a cluster; write --scheduler tls://HOST:PORT beside it")
+        return None
+    found = Scheduler(address, *tls)
+    found.check()
+    return found
+
+
+def run_cases(
+    this: Campaign, directory: Directory, scheduler: Scheduler | None, workers: int, memory_bytes: int | None
+) -> None:
     """Run the cases that are missing, on a cluster or on this machine's cores."""
     from hilstar.campaign.workers.pool import Pool
 

@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -16,6 +17,7 @@ import pytest
 
 import hilstar
 from hilstar.campaign.store.table import read_columns
+from hilstar.campaign.workers import cluster
 from tests.support.benches import ROOT
 from tests.support.campaigns import write_campaign
 from tests.support.commands import HILSTAR, assert_refused, run_hilstar, run_hilstar_here
@@ -90,11 +92,12 @@ def rows_so_far(folder: Path) -> int:
 
 
 @contextlib.contextmanager
-def scheduler(folder: Path, port: str = "0") -> Iterator[tuple[subprocess.Popen[bytes], str]]:
+def scheduler(folder: Path, port: str = "0", *more: str) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
     """A scheduler and its address, once it listens there."""
     file = folder / "scheduler.json"
     file.unlink(missing_ok=True)
-    start = ("scheduler", "--port", port, "--host", "127.0.0.1", "--no-dashboard", "--scheduler-file", file.name)
+    where = more or ("--host", "127.0.0.1")
+    start = ("scheduler", "--port", port, "--no-dashboard", "--scheduler-file", file.name, *where)
     with running(folder, "scheduler.log", *start) as process:
         wait_for(lambda: file.exists() and file.stat().st_size, "no scheduler")
         yield process, json.loads(file.read_text())["address"]
@@ -160,6 +163,82 @@ def test_an_answer_that_died_with_its_worker_is_not_waited_for(folder: Path) -> 
         command = [sys.executable, "-c", FETCH, address, str(worker.pid)]
         fetched = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
     assert fetched.stdout == "finished None\n", fetched.stderr
+
+
+def certificates(folder: Path, name: str) -> tuple[str, ...]:
+    """A CA and a certificate of it, as options of Dask's and of the campaign's."""
+    ca, key, cert, asked = (folder / f"{name}-{part}.pem" for part in ("ca", "key", "cert", "asked"))
+    new = ["openssl", "req", "-newkey", "rsa:2048", "-nodes", "-subj", f"/CN={name}"]
+    by_ca = ["-CA", str(ca), "-CAkey", f"{ca}.key", "-CAcreateserial", "-days", "2"]
+    for command in (
+        [*new, "-x509", "-days", "2", "-keyout", f"{ca}.key", "-out", str(ca), "-subj", f"/CN={name} CA"],
+        [*new, "-keyout", str(key), "-out", str(asked)],
+        ["openssl", "x509", "-req", "-in", str(asked), "-out", str(cert), *by_ca],
+    ):
+        subprocess.run(command, check=True, capture_output=True)
+    return "--tls-ca-file", str(ca), "--tls-cert", str(cert), "--tls-key", str(key)
+
+
+@pytest.mark.skipif(shutil.which("openssl") is None, reason="the system has no openssl")
+def test_a_cluster_with_dasks_tls_runs_a_campaign_and_takes_nobody_elses_certificate(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (folder / "slow").unlink()
+    ours, theirs = certificates(folder, "ours"), certificates(folder, "theirs")
+    with contextlib.ExitStack() as stack:
+        _, address = stack.enter_context(scheduler(folder, "0", "--host", "127.0.0.1", "--protocol", "tls", *ours))
+        assert address.startswith("tls://127.0.0.1:")
+        stack.enter_context(running(folder, "a.log", "worker", address, *WORKER, "--host", "127.0.0.1", *ours))
+        words = ("campaign", "plan.toml", "-o", "out", "--scheduler", address, *OPTIONS)
+        monkeypatch.setattr(cluster, "CONNECT_S", 5.0)
+        refused = run_hilstar_here(*words, *theirs, cwd=folder)
+        assert_refused(refused, 3, "certificate")
+        assert_refused(run_hilstar_here(*words, cwd=folder), 2, "no certificate is named", "--tls-ca-file")
+        monkeypatch.undo()
+        result = run_hilstar("campaign", *words[1:], *ours, cwd=folder)
+    assert result.returncode == 0, result.stderr
+    assert json.loads(result.stdout)["cases"] == 24
+    pool = run_hilstar_here("campaign", "plan.toml", "-o", "pool", "--workers", "1", *OPTIONS, cwd=folder)
+    assert (folder / "out/cases.parquet").read_bytes() == (folder / "pool/cases.parquet").read_bytes(), pool.stderr
+
+
+TLS = ("--tls-ca-file", "plan.toml", "--tls-cert", "plan.toml")
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (
+            ["--scheduler", "tcp://192.0.2.1:8786"],
+            ["non-loopback endpoints require TLS", "--tls-ca-file", "tcp://127.0.0.1:PORT"],
+        ),
+        (["--scheduler", "tcp://bench-pc:8786"], ["non-loopback endpoints require TLS"]),
+        (["--scheduler", "ucx://[2001:db8::1]:8786"], ["non-loopback endpoints require TLS"]),
+        (["--scheduler", "tcp://0.0.0.0:8786"], ["0.0.0.0"]),
+        (["--scheduler", "tcp://192.0.2.1:8786", *TLS], ["not encrypted", "tls://HOST:PORT"]),
+        (["--scheduler", "tls://192.0.2.1:8786", *TLS[:2]], ["--tls-cert is missing"]),
+        (["--scheduler", "tls://192.0.2.1:8786", *TLS], ["plan.toml", "--tls-key"]),
+        (["--scheduler", "tls://192.0.2.1:8786", "--tls-ca-file", "none.pem", "--tls-cert", "none.pem"], ["none.pem"]),
+        (["--scheduler", "tls://:1"], ["tls://:1"]),
+        (["--scheduler", "tcp://127.0.0.1:99999"], ["99999"]),
+        ([*TLS], ["--scheduler tls://HOST:PORT"]),
+    ],
+)
+def test_code_runs_over_no_network_without_tls(folder: Path, words: list[str], said: list[str]) -> None:
+    assert_refused(run_hilstar_here("campaign", "plan.toml", "-o", "o", *words, cwd=folder), 2, *said)
+
+
+def test_a_scheduler_on_loopback_that_listens_to_the_network_too_is_said(folder: Path) -> None:
+    (folder / "slow").unlink()
+    with contextlib.ExitStack() as stack:
+        _, address = stack.enter_context(scheduler(folder, "0", "--protocol", "tcp"))
+        if address.startswith("tcp://127."):
+            pytest.skip("this machine has no other address than loopback's")
+        here = f"tcp://127.0.0.1:{address.rpartition(':')[2]}"
+        stack.enter_context(running(folder, "a.log", "worker", here, *WORKER, "--host", "127.0.0.1"))
+        result = run_hilstar("campaign", "plan.toml", "-o", "out", "--scheduler", here, *OPTIONS, cwd=folder)
+    assert result.returncode == 0, result.stderr
+    assert f"the scheduler listens at {address} without TLS" in result.stderr
 
 
 def test_no_scheduler_and_no_address_are_one_line(folder: Path) -> None:

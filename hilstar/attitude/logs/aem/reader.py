@@ -8,7 +8,7 @@ Rules:
    hilstar's. ATTITUDE_DIR says which frame is first (2.0: always A), QUATERNION_TYPE where the scalar is (2.0: last).
 3. A rate is the angular velocity of the second frame with respect to the first. Euler angles and spins: `angles`.
 4. `t_ns` is nanoseconds from 1970-01-01T00:00:00 of the file's own time system; leap seconds are not counted.
-5. A second block of data begins with a discontinuity. Interpolation hints and usable spans are ignored.
+5. A second block of data begins with a discontinuity; blocks that overlap: `overlaps`. Interpolation hints are ignored.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ from hilstar.attitude.logs.aem.blocks import (
 )
 from hilstar.attitude.logs.aem.epochs import epoch_ns
 from hilstar.attitude.logs.aem.kvn import kvn_blocks
+from hilstar.attitude.logs.aem.overlaps import Segment, resolved
 from hilstar.attitude.logs.aem.xml import xml_blocks
 from hilstar.attitude.logs.entries import Entry, LogReading
 from hilstar.attitude.wire.packet import INT64, AttitudeSample, checked_sample
@@ -58,7 +59,7 @@ AMBIGUOUS = (
     f"{EULER_RATE} of AEM 1.0 does not say whether its rates are those of the angles or an angular velocity; they are not used"
 )
 QUARTER_TURN_DEG = 90.0
-ADVICE = "sort its lines, and let no blocks overlap; leap seconds are not counted, so write TAI across one"
+ADVICE = "sort its lines; leap seconds are not counted, so write TAI across one"
 
 
 def read_aem(text: str, of_date: OfDate) -> LogReading:
@@ -79,8 +80,10 @@ def read_aem(text: str, of_date: OfDate) -> LogReading:
     timed.sort(key=lambda pair: pair[0][0])
     entries: list[Entry] = []
     told: dict[str, str] = {}
-    for times, block in timed:
-        following = list(_entries(block, times, of_date, told))
+    runs, overlap = resolved([Segment(block, times, list(_entries(block, times, of_date, told))) for times, block in timed])
+    if overlap is not None:
+        told["aem-overlap"] = overlap
+    for following in runs:
         if entries:
             _part(entries, following)
         entries += following

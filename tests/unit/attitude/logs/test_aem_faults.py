@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import re
+from itertools import pairwise
 
 import numpy as np
 import pytest
 
-from hilstar.attitude.logs.aem import epochs
-from hilstar.attitude.logs.log_file import write_log
+from hilstar.attitude.clock.timeline import Policy
+from hilstar.attitude.logs.aem import epochs, overlaps
+from hilstar.attitude.logs.log_file import log_timeline, open_log, write_log
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.errors import InputError
 from hilstar.units import NS_PER_S
@@ -86,9 +88,110 @@ def test_blocks_may_share_an_epoch_and_the_earlier_then_ends_a_nanosecond_before
     assert [s.discontinuity for s in samples] == [False, False, True, False]
 
 
-def test_blocks_that_overlap_are_refused(tmp_path):
-    text = two_blocks(["2024-01-01T00:00:00", "2024-01-01T00:00:05"], ["2024-01-01T00:00:03"])
-    assert "time does not increase" in refusal(tmp_path, text)
+TURN_DEG_S = 3.0
+
+
+def turned(number, second):
+    """Of segment `number`, about z at a constant rate; each segment has an offset of its own, so that it can be told."""
+    angle = np.radians(TURN_DEG_S * second + 40.0 * number) / 2
+    return f"2024-01-01T00:00:{second:02d} 0 0 {float(np.sin(angle))!r} {float(np.cos(angle))!r}"
+
+
+def overlapping(*segments):
+    """Segments, each its seconds and its keywords, as one message."""
+    text = ""
+    for number, (seconds, keywords) in enumerate(segments):
+        own = kvn([turned(number, second) for second in seconds], REF_FRAME_B="CAM", **keywords)
+        text += own if not number else own[own.index("META_START") :]
+    return text
+
+
+def which_at(samples, second):
+    """Of which segment the sky is at a time, from the attitude there."""
+    timeline = log_timeline(samples, Policy(0, NS_PER_S))
+    q = timeline.at(samples[0].t_ns + round(second * NS_PER_S)).q_icrs_to_cam
+    angle = np.degrees(2 * np.arctan2(-q[3], q[0]))  # the conjugate of what the file has
+    return ((angle - TURN_DEG_S * second) / 40.0 + 0.5) % 9 - 0.5
+
+
+def useable(start, stop):
+    return {f"USEABLE_{key}_TIME": f"2024-01-01T00:00:{second:02d}" for key, second in (("START", start), ("STOP", stop))}
+
+
+@pytest.mark.parametrize(
+    ("segments", "wanted"),
+    [
+        # Without USEABLE times: the later segment from its beginning; and where it has ended, the earlier one again.
+        ([([0, 20, 40], {}), ([25, 45], {})], {24: 0, 25: 1, 26: 1, 44: 1}),
+        ([([0, 20, 40], {}), ([25, 30], {})], {24: 0, 26: 1, 29: 1, 30.5: 0, 39: 0}),
+        # By USEABLE times, between attitudes too: the earlier one goes on to its end there.
+        ([([0, 20, 40], useable(0, 33)), ([30, 50], useable(33, 50))], {29: 0, 32: 0, 32.9: 0, 33.1: 1, 49: 1}),
+        # Where only one segment has a time, it is taken whether it is useable there or not.
+        ([([0, 20, 40], useable(5, 28)), ([30, 50], useable(35, 45))], {1: 0, 29: 0, 31: 1, 49: 1}),
+        # In the file's order they need not be; of two that begin together the later in the file is taken.
+        ([([30, 50], {}), ([0, 20, 40], {})], {29: 1, 31: 0, 49: 0}),
+        ([([0, 20], {}), ([0, 20], {})], {1: 1, 19: 1}),
+        # One attitude alone has no duration, and is left out within another segment.
+        ([([0, 20], {}), ([10], {})], {9: 0, 11: 0}),
+    ],
+)
+@pytest.mark.parametrize("form", ["kvn", "xml"])
+def test_segments_that_overlap_are_read_by_their_useable_times_then_the_later_one(tmp_path, segments, wanted, form):
+    text = overlapping(*segments)
+    (tmp_path / "log").write_text(text if form == "kvn" else in_xml(text))
+    log = open_log(tmp_path / "log")
+    times = [sample.t_ns for sample in log.samples]
+    assert all(before < after for before, after in pairwise(times))
+    for second, number in wanted.items():
+        assert which_at(log.samples, second) == pytest.approx(number, abs=1e-9), (second, number)
+    [notice] = [line for kind, line in log.told if kind == "aem-overlap"]
+    assert "2 segments overlap" in notice and "USEABLE" in notice
+    changes = sum(before != after for before, after in pairwise(wanted.values()))
+    assert sum(sample.discontinuity for sample in log.samples) == changes
+
+
+def in_xml(text):
+    """A message of quaternions, scalar last, in XML."""
+    body = ""
+    for block in text.split("META_START")[1:]:
+        meta, data = block.split("META_STOP")
+        keywords = "".join(f"<{key}>{value}</{key}>" for key, value in re.findall(r"(\w+) = (.*)", meta))
+        states = ""
+        for row in data.replace("DATA_START", "").replace("DATA_STOP", "").strip().splitlines():
+            epoch, *q = row.split()
+            values = "".join(f"<{key}>{value}</{key}>" for key, value in zip(("Q1", "Q2", "Q3", "QC"), q, strict=True))
+            state = f"<EPOCH>{epoch}</EPOCH><quaternion>{values}</quaternion>"
+            states += f"<attitudeState><quaternionState>{state}</quaternionState></attitudeState>"
+        body += f"<segment><metadata>{keywords}</metadata><data>{states}</data></segment>"
+    return f'<aem id="CCSDS_AEM_VERS" version="1.0"><body>{body}</body></aem>'
+
+
+def test_useable_times_of_segments_that_do_not_overlap_change_nothing(tmp_path):
+    (tmp_path / "log").write_text(overlapping(([0, 10, 20], useable(5, 15)), ([30, 40], useable(35, 36))))
+    log = open_log(tmp_path / "log")
+    assert len(log.samples) == 5
+    assert "aem-overlap" not in dict(log.told)
+
+
+def test_rows_that_go_back_in_time_are_refused_as_ever(tmp_path):
+    assert "time does not increase" in refusal(tmp_path, overlapping(([0, 20, 10], {}), ([15, 30], {})))
+
+
+@pytest.mark.parametrize(
+    ("keywords", "words"),
+    [
+        (useable(20, 5), "USEABLE_STOP_TIME is before USEABLE_START_TIME"),
+        ({"USEABLE_START_TIME": "soon"}, "the epoch is 'SOON'"),
+    ],
+)
+def test_useable_times_that_cannot_be_are_refused_where_they_are_needed(tmp_path, keywords, words):
+    assert words in refusal(tmp_path, overlapping(([0, 20], keywords), ([15, 30], {})))
+
+
+def test_thousands_of_segments_that_overlap_are_refused(tmp_path):
+    one = overlapping(([0, 20], {}))
+    text = one + one[one.index("META_START") :] * overlaps.MAX_OVERLAPPING
+    assert "1001 segments overlap, and 1000 may" in refusal(tmp_path, text)
 
 
 def test_blocks_of_two_time_systems_are_refused(tmp_path):

@@ -26,7 +26,7 @@ from hilstar.cli.measure.compare import compare
 from hilstar.cli.measure.simulate import simulate
 from hilstar.cli.measure.verify import verify
 from hilstar.cli.report import report
-from hilstar.cli.service.install import install
+from hilstar.cli.service.install import install, uninstall
 from hilstar.cli.show.demo import demo
 from hilstar.cli.show.frame import frame
 from hilstar.cli.show.replay import replay
@@ -114,4 +114,5 @@ for command in (dots, geometric, alignment, plan, photometric, scale):
     calibrate.command()(command)
 app.add_typer(calibrate, name="calibrate", rich_help_panel="Calibrate")
 service.command()(install)
+service.command()(uninstall)
 app.add_typer(service, name="service", rich_help_panel="This machine")

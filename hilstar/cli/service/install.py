@@ -1,8 +1,10 @@
-"""hilstar service install: a run that this machine starts, watches and starts again."""
+"""hilstar service: a run that this machine starts, watches and starts again."""
 
 from __future__ import annotations
 
+import getpass
 import os
+import subprocess
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,6 +17,8 @@ from hilstar.errors import InputError, cannot_write
 
 if TYPE_CHECKING:
     from hilstar.console.feed.door import Address
+
+SYSTEMD_S = 30.0  # a run ends within TimeoutStopSec
 
 
 def install(
@@ -29,14 +33,17 @@ def install(
 ) -> None:
     """Write a systemd unit of this user that serves a bench: watched, and back within seconds whenever it ends."""
     from hilstar.bench.bench_file import read_bench_file
-    from hilstar.cli.service.unit import unit_name, unit_text, units_folder, write_token
+    from hilstar.cli.service.unit import can_confine, unit_name, unit_text, units_folder, write_token
     from hilstar.files import refuse_existing, write_whole
 
     read_bench_file(bench_file)
     words, console = _checked(bench_file, options or [])
     service = unit_name(name or bench_file.stem)
     path = units_folder() / service
-    text = unit_text(path, bench_file.resolve(), words)
+    confined = can_confine()
+    text = unit_text(path, bench_file.resolve(), words, confined)
+    if not confined:
+        say("this system gives users no namespace of their own: the unit keeps the capabilities that systemd gives it")
     if to_stdout:
         typer.echo(text, nl=False)
         return
@@ -52,7 +59,43 @@ def install(
         raise cannot_write(path, error) from error
     typer.echo(str(path))
     say(f"start it now and whenever you log in: systemctl --user daemon-reload && systemctl --user enable --now {service}")
-    say("with nobody logged in as well: loginctl enable-linger")
+    say(f"at boot as well, with nobody logged in: loginctl enable-linger {getpass.getuser()}")
+    say(f"to be rid of it: hilstar service uninstall {service.removeprefix('hilstar-').removesuffix('.service')}")
+
+
+def uninstall(
+    name: Annotated[
+        str, typer.Argument(metavar="NAME", help="The service's name, as install printed it; by default the bench file's.")
+    ],
+) -> None:
+    """Stop a service, and delete its unit and its token."""
+    from hilstar.cli.service.unit import unit_name, units_folder
+
+    bare = name.removesuffix(".toml").removesuffix(".service").removeprefix("hilstar-")
+    path = units_folder() / unit_name(bare)
+    if not os.path.lexists(path):
+        found = sorted(each.stem.removeprefix("hilstar-") for each in path.parent.glob("hilstar-*.service"))
+        there = f"there is {', '.join(found)}" if found else "there is none"
+        raise InputError(f"{path}: no such service; {there}")
+    stopped = _systemctl("disable", "--now", path.name)
+    try:
+        for file in (path, path.with_suffix(".env")):
+            file.unlink(missing_ok=True)
+    except OSError as error:
+        raise cannot_write(path, error) from error
+    _systemctl("daemon-reload")
+    typer.echo(str(path))
+    if not stopped:
+        say(f"no systemd of this user was reached: if it still runs, systemctl --user stop {path.name}")
+
+
+def _systemctl(*words: str) -> bool:
+    """Whether systemd has done something; False where there is none."""
+    try:
+        done = subprocess.run(["systemctl", "--user", *words], capture_output=True, timeout=SYSTEMD_S, check=False)
+    except (OSError, subprocess.TimeoutExpired):
+        return False
+    return done.returncode == 0
 
 
 def _checked(bench_file: Path, options: list[str]) -> tuple[list[str], Address | None]:

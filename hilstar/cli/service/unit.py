@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import re
 import secrets
@@ -38,10 +39,40 @@ TimeoutStartSec=120
 WatchdogSec=3
 KillMode=mixed
 TimeoutStopSec=10
+# What a run does not need is taken from it. Left are the network (attitudes, page), real-time priority, devices (GPU, serial
+# ports), /tmp (the X server's socket), memory that a compiler writes and runs (OpenGL), and files of yours.
+{confined}NoNewPrivileges=yes
+SystemCallFilter={calls}
+SystemCallErrorNumber=EPERM
+SystemCallArchitectures=native
+RestrictAddressFamilies=AF_UNIX AF_INET AF_INET6 AF_NETLINK
+RestrictNamespaces=yes
+RestrictSUIDSGID=yes
+LockPersonality=yes
+UMask=0027
 
 [Install]
 WantedBy=default.target
 """
+
+
+CONFINED = """\
+PrivateUsers=yes
+CapabilityBoundingSet=
+"""
+# @resources stays: real-time priority, and the cores that threads are kept on.
+DENIED_CALLS = "~@clock @cpu-emulation @debug @module @mount @obsolete @privileged @raw-io @reboot @swap"
+CLONE_NEWUSER, PR_CAPBSET_DROP = 0x10000000, 24
+
+
+def can_confine() -> bool:
+    """Whether this user may give capabilities up: in a user namespace, which some systems allow to root alone."""
+    libc = ctypes.CDLL(None)
+    child = os.fork()
+    if child == 0:
+        may = (os.geteuid() == 0 or libc.unshare(CLONE_NEWUSER) == 0) and libc.prctl(PR_CAPBSET_DROP, 0, 0, 0, 0) == 0
+        os._exit(0 if may else 1)
+    return os.waitpid(child, 0)[1] == 0
 
 
 def unit_name(name: str) -> str:
@@ -57,8 +88,13 @@ def units_folder(environment: Mapping[str, str] = os.environ) -> Path:
     return (Path(named) if named.startswith("/") else Path.home() / ".config") / "systemd" / "user"
 
 
-def unit_text(path: Path, bench: Path, options: list[str], environment: Mapping[str, str] = os.environ) -> str:
-    """The unit at `path` that serves a bench file with these options of `hilstar serve`, from this folder."""
+def unit_text(
+    path: Path, bench: Path, options: list[str], confined: bool = True, environment: Mapping[str, str] = os.environ
+) -> str:
+    """The unit at `path` that serves a bench file with these options of `hilstar serve`, from this folder.
+
+    It gives up its capabilities where it is `confined`, as `can_confine` says whether it may.
+    """
     command = [*_hilstar(), "serve", str(bench), *options]
     folder = Path.cwd()
     found = {name: environment[name] for name in DISPLAY_VARIABLES if environment.get(name)}
@@ -69,6 +105,8 @@ def unit_text(path: Path, bench: Path, options: list[str], environment: Mapping[
         folder=_literal(str(folder)),
         display="".join(f"Environment={_quoted(f'{name}={value}')}\n" for name, value in found.items()),
         tokens=_literal(str(path.with_suffix(".env"))),
+        confined=CONFINED if confined else "",
+        calls=DENIED_CALLS,
     )
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import getpass
+import re
 import shlex
 import shutil
 import stat
@@ -79,3 +81,63 @@ def test_systemd_takes_the_unit(bench, tmp_path, monkeypatch):
         [analyze, "--user", "verify", str(path)], capture_output=True, text=True, timeout=PATIENCE_S, check=False
     )
     assert "hilstar-room7" not in verified.stderr, verified.stderr
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="no systemd here")
+def test_the_unit_exposes_less_than_4_of_10(bench):
+    assert install(bench, "--", "--console").returncode == 0
+    path = bench.parent / "config" / "systemd" / "user" / "hilstar-room7.service"
+    told = subprocess.run(
+        ["systemd-analyze", "security", "--offline=true", "--no-pager", str(path)],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
+    )
+    found = re.search(r"Overall exposure level for \S+: ([\d.]+)", told.stdout)
+    assert found is not None, told.stdout + told.stderr
+    assert float(found[1]) < 4.0
+
+
+def test_the_unit_takes_nothing_that_a_run_needs(bench):
+    keys = keys_of(install(bench, "--print").stdout)
+    # Devices (GPU, serial ports), /tmp (the X server's socket), real-time priority, OpenGL's compiler, ledgers anywhere.
+    for key in ("PrivateDevices", "DevicePolicy", "PrivateTmp", "RestrictRealtime", "MemoryDenyWriteExecute", "ProtectHome"):
+        assert key not in keys
+    assert "@resources" not in keys["SystemCallFilter"]
+    assert keys["NoNewPrivileges"] == "yes" and keys["CapabilityBoundingSet"] == ""
+
+
+def test_where_users_have_no_namespace_the_unit_asks_for_none(bench, monkeypatch):
+    monkeypatch.setattr("hilstar.cli.service.unit.can_confine", lambda: False)
+    result = install(bench, "--print")
+    assert "the unit keeps the capabilities" in result.stderr
+    keys = keys_of(result.stdout)
+    assert "PrivateUsers" not in keys and "CapabilityBoundingSet" not in keys
+    assert keys["NoNewPrivileges"] == "yes"
+
+
+@pytest.mark.parametrize("name", ["room7", "hilstar-room7.service", "room7.toml"])
+def test_what_was_installed_can_be_uninstalled(bench, name, monkeypatch):
+    units = bench.parent / "config" / "systemd" / "user"
+    done = install(bench, "--", "--console", "0.0.0.0:8765")
+    assert f"loginctl enable-linger {getpass.getuser()}" in done.stderr
+    (units / "mine.service").write_text("kept")
+    asked = bench.parent / "asked.txt"
+    (bench.parent / "systemctl").write_text(f"#!/bin/sh\necho $* >> '{asked}'\n")
+    (bench.parent / "systemctl").chmod(0o755)
+    monkeypatch.setenv("PATH", str(bench.parent), prepend=":")
+    assert_refused(run_hilstar_here("service", "uninstall", "other"), 2, "hilstar-other.service", "there is room7")
+    result = run_hilstar_here("service", "uninstall", name)
+    assert (result.returncode, result.stdout) == (0, f"{units / 'hilstar-room7.service'}\n"), result.stderr
+    assert [path.name for path in units.iterdir()] == ["mine.service"]
+    assert asked.read_text() == "--user disable --now hilstar-room7.service\n--user daemon-reload\n"
+    assert_refused(run_hilstar_here("service", "uninstall", name), 2, "there is none")
+
+
+def test_without_systemd_uninstall_says_what_is_left_to_do(bench, monkeypatch):
+    assert install(bench).returncode == 0
+    monkeypatch.setenv("PATH", str(bench.parent))
+    result = run_hilstar_here("service", "uninstall", "room7")
+    assert result.returncode == 0
+    assert "systemctl --user stop hilstar-room7.service" in result.stderr

@@ -1,6 +1,8 @@
-"""The two kinds of refusal, each with its exit code, and how a refusal quotes what it refuses."""
+"""The two kinds of refusal, each with its exit code, how it quotes what it refuses, and what it takes a wrong word for."""
 
 from __future__ import annotations
+
+from collections.abc import Iterable
 
 MAX_QUOTED_CHARACTERS = 120
 MAX_LINE_CHARACTERS = 1000
@@ -8,9 +10,12 @@ CUT = "[...]"
 
 
 class HilstarError(Exception):
-    """One line for a person: what is wrong, where, and what to write instead."""
+    """One line for a person: what is wrong, where, and what to write instead; of bounded length, whatever it quotes."""
 
     exit_code = 1
+
+    def __init__(self, line: str) -> None:
+        super().__init__(one_line(line))
 
 
 class InputError(HilstarError):
@@ -67,3 +72,12 @@ def one_line(text: str) -> str:
     """A message as one line of bounded length, whatever it quotes of the input."""
     words = (shortened(printable(word)) for word in text.split())
     return shortened(" ".join(words), MAX_LINE_CHARACTERS)
+
+
+def did_you_mean(word: object, known: Iterable[str]) -> str:
+    """ "did you mean frame? " where `word` is nearly one of the words that are known; else nothing."""
+    import difflib  # 5 ms, which a command without a mistake does not need
+
+    by_small_letters = {one.casefold(): one for one in known}
+    near = difflib.get_close_matches(shortened(word).casefold(), by_small_letters, n=1)
+    return f"did you mean {by_small_letters[near[0]]}? " if near else ""

@@ -5,14 +5,15 @@ The line says table, key, value, and what is wanted, in the place of msgspec's o
 
 from __future__ import annotations
 
-import difflib
 import re
 from dataclasses import dataclass
-from typing import Annotated, Any, get_args, get_origin
+from typing import Annotated, Any, Literal, get_args, get_origin
 
 import msgspec
 
-from hilstar.errors import shortened
+from hilstar.errors import did_you_mean, shortened
+
+EXAMPLES: dict[int, tuple[float, ...]] = {2: (1024, 1024), 3: (0.0, 0.0, 0.0), 4: (1.0, 0.0, 0.0, 0.0)}  # by length
 
 
 class Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -48,23 +49,42 @@ def _explain(message: str, tables: dict[str, Any], kind: Kind) -> str:
     unknown = re.search(r"unknown field `(.*)`", fault)
     if unknown:
         known = [field.name for field in _fields(kind.root, names)]
-        close = difflib.get_close_matches(unknown[1], known, n=1)
-        advice = f"did you mean {close[0]}?" if close else f"known are {', '.join(known)}"
+        advice = did_you_mean(unknown[1], known).strip() or f"known are {', '.join(known)}"
         return f"{_place(names)}unknown key {shortened(unknown[1])}; {advice}"
     missing = re.search(r"missing required field `(.*)`", fault)
     if missing:
         name = f"key {missing[1]}" if names else f"table [{missing[1]}]"
         return f"{_place(names)}the {name} is missing; add it (see {kind.reference})"
-    wanted = fault.removeprefix("Expected ").replace("`", "").split(", got ")[0].removesuffix(" | null")
-    for type_name, word in kind.type_words.items():
-        wanted = re.sub(rf"\b{type_name}\b", word, wanted)
-    table, key = [n for n in names if not n.isdigit()][:-1], [n for n in names if not n.isdigit()][-1]
-    if fault.startswith("Invalid enum"):
-        wanted = " or ".join(f'"{choice}"' for choice in _choices(_fields(kind.root, table), key))
+    *table, key = [name for name in names if not name.isdigit()]
     value: Any = tables
     for name in (*table, key):
         value = value[name]
-    return f"{_place(table)}{key} = {_toml(value)}; {wanted} is wanted"
+    field = next(field for field in _fields(kind.root, table) if field.name == key)
+    choices = _choices(plain(field.type))
+    if choices and not isinstance(value, list):
+        wanted = " or ".join(map(_toml, choices))
+        return f"{_place(table)}{key} = {_toml(value)}; {did_you_mean(value, map(str, choices))}{wanted} is wanted"
+    wanted = fault.removeprefix("Expected ").replace("`", "").split(", got ")[0].removesuffix(" | null").replace(" | ", " or ")
+    for type_name, word in kind.type_words.items():
+        wanted = re.sub(rf"\b{type_name}\b", word, wanted)
+    return f"{_place(table)}{key} = {_toml(value)}; {wanted} is wanted{_such_as(field, value)}"
+
+
+def _such_as(field: msgspec.structs.FieldInfo, value: Any) -> str:
+    """An example of what the key takes, from what stands there: ", such as bits = 8"; "" where there is none."""
+    if isinstance(value, str) and re.fullmatch(r"[+-]?\d+(\.\d+)?", value):
+        return f", such as {field.name} = {shortened(value)}"
+    kind = plain(field.type)
+    parts = next((part for part in (kind, *map(plain, get_args(kind))) if get_origin(part) is tuple), None)  # X of `X | None`
+    if parts is None:
+        return ""
+    kinds = [plain(kind) for kind in get_args(parts)]
+    if Ellipsis in kinds:
+        return f", such as {field.name} = [{_toml(value)}]" if isinstance(value, kinds[0]) else ""
+    if isinstance(value, int | float) and not isinstance(value, bool) and len(kinds) == 2:
+        return f", such as {field.name} = [{_toml(value)}, {_toml(value)}]"
+    example = field.default if isinstance(field.default, tuple) else EXAMPLES[len(kinds)]
+    return f", such as {field.name} = {_toml(list(example)).replace(',', ', ')}"
 
 
 def _toml(value: Any) -> str:
@@ -74,11 +94,11 @@ def _toml(value: Any) -> str:
         return shortened(value)
 
 
-def _choices(fields: tuple[msgspec.structs.FieldInfo, ...], key: str) -> tuple[str, ...]:
-    kinds = {field.name: field.type for field in fields}
-    kind = plain(kinds[key])
-    # Of `X | None`, those of X: no file has a None.
-    return tuple(choice for part in (get_args(kind) if type(None) in get_args(kind) else (kind,)) for choice in get_args(part))
+def _choices(kind: Any) -> tuple[Any, ...]:
+    """The values of a key that has choices, those of X where it is `X | None`; none of another key."""
+    parts = get_args(kind) if type(None) in get_args(kind) else (kind,)
+    literal = [plain(part) for part in parts if get_origin(plain(part)) is Literal]
+    return tuple(choice for part in literal for choice in get_args(part))
 
 
 def _place(names: list[str]) -> str:

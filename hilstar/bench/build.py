@@ -13,6 +13,7 @@ from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile, read_bench_file
 from hilstar.bench.cameras import bench_camera
 from hilstar.bench.config import DEFAULT_BRIGHTEST_V_MAG, BenchConfig, RenderSettings, Tracker
+from hilstar.bench.config.values import MAX_NUMBER, MIN_POSITIVE
 from hilstar.bench.config.when import epoch_utc_ns, has_observer
 from hilstar.bench.effort import Effort, Light, faintest_shown_e_per_s, plan_effort
 from hilstar.bench.frame import Bench
@@ -223,4 +224,10 @@ def brightest_peak_e_per_s(
     if not len(wanted):
         key, better = ("[render] brightest_v_mag", "smaller") if len(stars) else ("[sky] faintest_v_mag", "larger")
         raise InputError(f"{key} leaves no star; write a {better} magnitude, or [render] flux_at_white_e_per_s")
-    return float(wanted.max()) * peak_share(sigma_px)
+    peak_e_per_s = float(wanted.max()) * peak_share(sigma_px)
+    if not MIN_POSITIVE <= peak_e_per_s <= MAX_NUMBER:
+        raise InputError(
+            f"[tracker] aperture_mm, quantum_efficiency and transmission: the brightest star to show gives {peak_e_per_s:.3g}"
+            f" electrons per second; write those of a lens that gives it {MIN_POSITIVE:g} to {MAX_NUMBER:g}"
+        )
+    return peak_e_per_s

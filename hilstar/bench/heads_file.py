@@ -17,7 +17,7 @@ from typing import Any
 from hilstar.bench.bench_file import BenchFile, bench_file_of, changed_file, read_bench_file
 from hilstar.bench.config import AttitudeSettings
 from hilstar.bench.config.read import HEADS
-from hilstar.errors import InputError
+from hilstar.errors import InputError, did_you_mean, shortened
 from hilstar.files import place_of
 from hilstar.reading import MAX_TOML_BYTES, parse_toml, read_text
 
@@ -63,10 +63,13 @@ def read_heads(path: Path) -> HeadsFile:
 def _heads_of(path: Path, tables: dict[str, Any]) -> HeadsFile:
     other = sorted(set(tables) - {HEADS, "attitude"})
     if other:
-        raise InputError(f"{path}: {other[0]}: beside heads stands only [attitude]; write it in the heads' own files")
+        meant = did_you_mean(other[0], ["attitude"])
+        raise InputError(
+            f"{path}: {shortened(other[0])}: {meant}beside heads stands only [attitude]; write it in the heads' own files"
+        )
     listed = tables.get(HEADS)
     if not isinstance(listed, list) or not all(isinstance(name, str) and name for name in listed):
-        raise InputError(f"{path}: heads = {listed!r}: no list of files; {EXAMPLE}")
+        raise InputError(f"{path}: heads = {shortened(repr(listed))}: no list of files; {EXAMPLE}")
     if not MIN_HEADS <= len(listed) <= MAX_HEADS:
         raise InputError(f"{path}: heads names {len(listed)} files; {EXAMPLE}, from {MIN_HEADS} to {MAX_HEADS}")
     paths = [path.parent / name for name in listed]

@@ -1,25 +1,39 @@
-"""hilstar doctor: what this machine has, and what it lacks."""
+"""hilstar doctor: what this machine has, and what it lacks; and whether a bench file can be right."""
 
 from __future__ import annotations
 
 from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
 
 import typer
 
 from hilstar.cli.options import Json
+from hilstar.cli.show.running import say_units
 from hilstar.console.terminal import print_json
 
+OwnBench = Annotated[
+    Path | None,
+    typer.Argument(metavar="[BENCH.toml]", help="A bench file, or one with heads, to be checked too.", show_default=False),
+]
 
-def doctor(as_json: Json = False) -> None:
-    """Check this machine's OpenGL, displays, links and files, and say what is missing."""
-    from hilstar.run.doctor import examine
 
+def doctor(bench_file: OwnBench = None, as_json: Json = False) -> None:
+    """Check this machine's OpenGL, displays, links and files, and say what is missing; of a bench file, what it means."""
+    from hilstar.run.doctor import examine, examine_bench
+
+    benches = {} if bench_file is None else examine_bench(bench_file)
     result = examine()
+    for fields in benches.values():
+        say_units(fields)
     if as_json:
-        print_json(asdict(result))
+        named = {"benches": {name: fields.keys() for name, fields in benches.items()}} if benches else {}
+        print_json(asdict(result) | named)
     else:
         for check in result.checks:
             mark = "ok" if check.ok else "MISSING" if check.required else "none"
             typer.echo(f"{mark:8}{check.name:12}{check.detail}")
+        for name, fields in benches.items():
+            typer.echo(f"{'ok' if fields.warning is None else 'check':8}{name:12}{fields.line()}")
     if not result.ok:
         raise typer.Exit(3)

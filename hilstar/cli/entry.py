@@ -7,13 +7,14 @@ import logging
 import os
 import re
 import sys
-from typing import NoReturn
+from itertools import takewhile
+from typing import Any, NoReturn
 
 import typer
 
 from hilstar.cli.app import EarlyEnd, app
 from hilstar.console.terminal import fail
-from hilstar.errors import HilstarError, InputError, MachineError
+from hilstar.errors import HilstarError, InputError, MachineError, did_you_mean, shortened
 from hilstar.process import interrupts
 from hilstar.process.stderr import finish_stderr, queue_stderr
 
@@ -24,6 +25,10 @@ ADDRESS = re.compile(
     r"(\[?[0-9A-Za-z.:-]*\]?:)?\d{1,6}|localhost|\d+(\.\d+){3}|\[[0-9A-Fa-f:.]+\]"
 )  # what --console may be followed by
 SHARE_OPTIONS = ("--lose", "--corrupt", "--reorder")  # may stand alone
+NUMBER_OPTIONS = ("--radec", "--quaternion", "--rate", "--place", "--mounting", "--reading")  # several, with commas
+NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+NUMBERS = re.compile(rf",|,?{NUMBER}(?:,{NUMBER})*,?")  # a word of them, as a shell hands on what has spaces
+ELSEWHERE = dict.fromkeys(("display", "displays", "monitors", "screens"), "`hilstar doctor` lists the displays")
 USUAL_SHARE = "5%"
 USUAL_ADDRESS = "127.0.0.1:8765"
 
@@ -81,11 +86,43 @@ def _run(words: list[str]) -> int:
         return 1
     except Exception as error:
         # typer's usage errors have no public base class in all its versions; they can format themselves.
-        message = getattr(error, "format_message", None)
-        if message is not None:
-            fail(f"{message()} (see hilstar --help)", InputError.exit_code)
+        if hasattr(error, "format_message"):
+            fail(usage_line(error, words), InputError.exit_code)
         _fail_for_the_machine(error)
         raise
+
+
+def usage_line(error: Any, words: list[str]) -> str:
+    """What is wrong with a command line, by typer's `error`, and what to write."""
+    said = str(error.format_message()).replace("Value error, ", "").rstrip(".")
+    at = getattr(error, "ctx", None)
+    see = f"(see {'hilstar' if at is None else at.command_path} --help)"
+    if (spaced := _spaced_numbers(words)) is not None:
+        return spaced
+    if (other := re.match(r"No such command '(.*?)'", said)) and at is not None:
+        known = list(getattr(at.command, "commands", {}))
+        advice = ELSEWHERE.get(other[1]) or did_you_mean(other[1], known).strip() or f"the commands are {', '.join(known)}"
+        return f"No such command '{shortened(other[1])}'; {advice} {see}"
+    if said.startswith("No such option") and at is not None:
+        known = [name for one in at.command.params for name in (*one.opts, *one.secondary_opts) if name.startswith("-")]
+        advice = did_you_mean(error.option_name, known).strip() or f"its options are {', '.join(known)}"
+        return f"No such option: {shortened(error.option_name)}; {advice} {see}"
+    if choice := re.search(r"'([^']*)' is not one of (.*)", said):
+        meant = did_you_mean(choice[1], re.findall(r"'(.*?)'", choice[2])).strip()
+        return f"{said}{meant and '; '}{meant} {see}"
+    return f"{said} {see}"
+
+
+def _spaced_numbers(words: list[str]) -> str | None:
+    """What to write where the numbers of one option stand apart, such as --radec 84.057 -1.2 0; None where none do."""
+    for k, word in enumerate(words):
+        option, is_joined, first = word.partition("=")
+        rest = ([first] if is_joined else []) + words[k + 1 :]
+        parts = list(takewhile(NUMBERS.fullmatch, rest)) if option in NUMBER_OPTIONS else []
+        if len(parts) > 1:
+            numbers = ",".join(",".join(parts).replace(",", " ").split())
+            return f"{option} {' '.join(parts)}: write {option} {numbers}, with commas and without spaces"
+    return None
 
 
 def _fail_for_the_machine(error: Exception) -> None:

@@ -6,7 +6,7 @@ import math
 import re
 from typing import TYPE_CHECKING, Any
 
-from hilstar.errors import InputError
+from hilstar.errors import InputError, did_you_mean
 from hilstar.units import NS_PER_S
 
 if TYPE_CHECKING:
@@ -64,6 +64,9 @@ def parse_numbers(text: str, count: int, option: str, form: str) -> list[float]:
     try:
         numbers = [float(part) for part in text.split(",")]
     except ValueError as error:
+        apart = text.replace(",", " ").split()
+        if len(apart) == count:
+            form = f"{form}, with commas and without spaces"
         raise InputError(f"{option} {text}: write {form}") from error
     if len(numbers) != count or not all(map(math.isfinite, numbers)):
         raise InputError(f"{option} {text}: write {count} finite numbers, {form}")
@@ -141,7 +144,7 @@ def parse_speed(text: str) -> float:
     try:
         factor = float(text)
     except ValueError as error:
-        raise InputError(f"--speed {text}: {SPEED_FORM}") from error
+        raise InputError(f"--speed {text}: {did_you_mean(text, named)}{SPEED_FORM}") from error
     if not 1e-3 <= factor <= 1e3:
         raise InputError(f"--speed {text}: {SPEED_FORM}, from 0.001 to 1000")
     return factor

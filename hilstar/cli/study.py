@@ -63,8 +63,8 @@ def check_bench(what: str, bench: Path | None) -> None:
         raise InputError(f"study {what}: has benches of its own; leave out {bench}")
 
 
-def chain_lines(bench: Path, output: Path, quick: bool, advance: Callable[[int], object]) -> tuple[list[str], bool]:
-    """Run the study of a bench's whole chain; what it found, and whether `auto` is on every front."""
+def chain_lines(bench: Path, output: Path, quick: bool, advance: Callable[[int], object]) -> tuple[list[str], bool | None]:
+    """Run the study of a bench's whole chain; what it found, and whether `auto` is on every front (None: not judged)."""
     from hilstar.bench.bench_file import read_bench_file
     from hilstar.study.chain.run import OUTPUTS, run
 
@@ -73,7 +73,7 @@ def chain_lines(bench: Path, output: Path, quick: bool, advance: Callable[[int],
     return run(file, output, quick, advance)
 
 
-def study_lines(what: str, output: Path, quick: bool = False) -> tuple[list[str], bool]:
+def study_lines(what: str, output: Path, quick: bool = False) -> tuple[list[str], bool | None]:
     """Run a study; what it found, and whether everything was right."""
     make_directory(output)
     study_of = import_module(f"hilstar.study.{what}{'.run' if what in ROOMS else ''}")

@@ -15,10 +15,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
-import numpy as np
-
 from hilstar.errors import printable
-from hilstar.rotation import to_radec_roll_deg
 from hilstar.units import NS_PER_MS, NS_PER_S
 
 if TYPE_CHECKING:
@@ -131,11 +128,13 @@ def _attitude_line(shown: Shown) -> Line:
     attitude = shown.attitude
     if attitude is None:
         return Line("attitude", "none yet: the frames are blank" if shown.missing else "hidden: the frames are blank", False)
+    from hilstar.rotation import to_radec_roll_deg  # with NumPy 0.1 s, which Tab and --help do not need
+
     ra_deg, dec_deg, roll_deg = to_radec_roll_deg(attitude.q_icrs_to_cam)
     text = f"RA {ra_deg:.4f}, Dec {dec_deg:.4f}, roll {roll_deg:.4f} deg"
     rate = attitude.rate_cam_rad_s
     if rate is not None:
-        text += f", {np.degrees(np.linalg.norm(rate)):.4g} deg/s"
+        text += f", {math.degrees(math.hypot(*rate)):.4g} deg/s"
     text += f", {attitude.age_ns / NS_PER_MS:.0f} ms old"
     return Line("attitude", text + (": STALE" if shown.stale else ""), not shown.stale)
 

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from hilstar.arrays import Float32Array, FloatArray
-from hilstar.errors import InputError, shortened
+from hilstar.errors import InputError, did_you_mean, shortened
 from hilstar.monitor.calibration_file import (
     Head,
     NotesTable,
@@ -116,9 +116,11 @@ def load_calibration(source: str | Path, bits: int, *, bit_stealing: bool = Fals
         digest = hashlib.sha256(f"hilstar built-in {name}, {bits} bits".encode()).hexdigest()
         return Calibration(name, response, digest, weights=REC709_WEIGHTS, instrument="none: a formula")
     path = EXAMPLE if name == "lcd-example" else Path(source)
-    if not path.suffix and not exists(path):
+    meant = did_you_mean(name, BUILT_IN)
+    if not exists(path) and (meant or not path.suffix):
         raise InputError(
-            f"calibration = {shortened(json.dumps(name))}: no such built-in or file; write {', '.join(BUILT_IN)} or FILE.toml"
+            f"calibration = {shortened(json.dumps(name))}: no such built-in or file; {meant}write "
+            f"{', '.join(BUILT_IN)} or FILE.toml"
         )
     return _load_file(path, name if name == "lcd-example" else path.name, bits, bit_stealing)
 

@@ -7,10 +7,15 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 from hilstar.attitude.wire.serial_link import serial_ports
 from hilstar.attitude.wire.zmq_socket import zmq_version
 from hilstar.attitude.wire.zmq_stream import ZmqReceiver, ZmqSender
+from hilstar.bench.bench_file import BenchFile
+from hilstar.bench.build import bench_calibration, bench_optics
+from hilstar.bench.fields_of_view import FieldsOfView, fields_of_view
+from hilstar.bench.heads_file import read_bench_or_heads
 from hilstar.errors import HilstarError, MachineError
 from hilstar.monitor.window.window import displays
 from hilstar.render.context import computes_in_software, create_context, has_compute
@@ -41,6 +46,19 @@ def examine() -> Examination:
     checks = [_check(name, look) for name, look in LOOKS.items()]
     checks += [_displays(), _serial()]
     return Examination(all(check.ok for check in checks if check.required), checks)
+
+
+def examine_bench(path: Path) -> dict[str, FieldsOfView]:
+    """What the screen and the tracker of a bench file see, or of each of its heads, by the file's name.
+
+    Raises InputError where the file, or one that it names, is wrong.
+    """
+    file = read_bench_or_heads(path)
+    files = (file,) if isinstance(file, BenchFile) else file.files
+    for one in files:
+        bench_calibration(one.config, one.folder)
+        bench_optics(one.config.tracker, one.folder)
+    return {one.path.name: fields_of_view(one.config, one.folder) for one in files}
 
 
 def _check(name: str, look: Callable[[], str]) -> Check:

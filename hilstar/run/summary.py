@@ -74,6 +74,7 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     faults: dict[str, Any] | UnsetType = UNSET
     beat: BeatSummary | UnsetType = UNSET
     sync: SyncSummary | UnsetType = UNSET
+    fields_of_view: dict[str, Any] | UnsetType = UNSET
 
 
 class SwapTally:

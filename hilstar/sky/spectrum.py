@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from hilstar.arrays import FloatArray
-from hilstar.errors import InputError, cannot_read, shortened
+from hilstar.errors import InputError, cannot_read, did_you_mean, shortened
 from hilstar.reading import exists, read_text
 from hilstar.units import LIGHT_M_S
 
@@ -21,6 +21,7 @@ STEFAN_BOLTZMANN_W_M2_K4 = 5.670374419e-8
 
 DATA_DIR = Path(__file__).resolve().parent / "data"
 MAX_CURVE_BYTES = 1_000_000
+MIN_CONSTANT = 1e-6  # of a curve that is one number: no sensor or lens is below, and products stay within float64
 MAX_CURVE_ROWS = 10_000
 RANGE_NM = (1.0, 100_000.0)  # beyond any sensor; each MAX_INTERVAL_NM costs nodes
 BUILT_IN_CURVES = ("ccd47-20", "kai-4021", "n-bk7-10mm", "johnson-v")
@@ -60,8 +61,8 @@ def load_curve(source: str | float, what: str, folder: Path = DATA_DIR) -> Curve
     `what` names the curve in the InputError that bad input raises.
     """
     if isinstance(source, int | float):
-        if not 0.0 <= source <= 1.0:
-            raise InputError(f"{what} = {source}: write a number from 0 to 1")
+        if not MIN_CONSTANT <= source <= 1.0:
+            raise InputError(f"{what} = {shortened(source)}: write a number from {MIN_CONSTANT:g} to 1")
         return constant_curve(float(source))
     if source in BUILT_IN_CURVES:
         return read_curve_csv(DATA_DIR / f"{source}.csv")
@@ -69,7 +70,10 @@ def load_curve(source: str | float, what: str, folder: Path = DATA_DIR) -> Curve
     if not exists(path):
         names = ", ".join(f'"{name}"' for name in BUILT_IN_CURVES[:3])
         shown = shortened(source)
-        raise InputError(f"{what} = {shown!r}: no such built-in or file {path}; write {names}, a CSV path or a number")
+        raise InputError(
+            f"{what} = {shown!r}: no such built-in or file {path}; "
+            f"{did_you_mean(source, BUILT_IN_CURVES)}write {names}, a CSV path or a number"
+        )
     return read_curve_csv(path)
 
 

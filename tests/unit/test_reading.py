@@ -19,7 +19,7 @@ def refusal(path: Path, limit_bytes: int = LIMIT_BYTES) -> str:
     with pytest.raises(InputError) as error:
         read_text(path, ADVICE, limit_bytes)
     line = str(error.value)
-    assert line.startswith(f"{path}: ")
+    assert line.startswith(one_line(f"{path}:"))
     assert line.endswith(ADVICE)
     return line.removeprefix(f"{path}: ")
 

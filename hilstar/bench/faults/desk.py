@@ -14,7 +14,7 @@ from typing import Literal
 
 from hilstar.bench.faults.kinds import Fault, Glow, Gradient, MeasuredMap
 from hilstar.bench.faults.scenario import NO_SCENARIO, Scenario, lasts_ns
-from hilstar.errors import InputError
+from hilstar.errors import InputError, did_you_mean
 from hilstar.units import NS_PER_S
 
 MAX_ON = 64
@@ -118,7 +118,8 @@ class FaultDesk:
         fault = self._listed.get(name)
         if fault is None:
             known = ", ".join(self.names())
-            raise InputError(f"no fault is called {name!r}; " + (f"known are {known}" if known else "the run has no scenario"))
+            advice = f"{did_you_mean(name, self.names())}known are {known}" if known else "the run has no scenario"
+            raise InputError(f"no fault is called {name!r}; {advice}")
         self._ask(_Planned(fault, who, None))
 
     def ask(self, fault: Fault, who: str) -> None:

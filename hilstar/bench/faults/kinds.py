@@ -13,7 +13,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import msgspec
 from msgspec import Meta
 
-from hilstar.errors import InputError, shortened
+from hilstar.errors import InputError, did_you_mean, shortened
 from hilstar.toml_tables import Kind, Table, explained
 
 REFERENCE = "docs/faults.md"
@@ -277,7 +277,7 @@ def fault_of(table: Any) -> Fault:
     kind = table.get("kind")
     if not isinstance(kind, str) or kind not in KINDS:
         said = "the key kind is missing" if kind is None else f"kind = {shortened(repr(kind))}"
-        raise InputError(f"{said}; write one of {', '.join(KINDS)}")
+        raise InputError(f"{said}; {did_you_mean(kind, KINDS)}write one of {', '.join(KINDS)}")
     made = KINDS[kind]
     _check_finite(keys)
     try:

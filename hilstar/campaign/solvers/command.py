@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from hilstar.campaign.solvers.answer import Answer, SolverFault, Tracker, checked_attitude
 from hilstar.campaign.solvers.function import tracker_facts
-from hilstar.errors import InputError, one_line
+from hilstar.errors import InputError, did_you_mean, one_line
 from hilstar.files import temporary_folder
 from hilstar.process.child import MAX_OUTPUT_BYTES, Child
 from hilstar.twin.exposure_files import write_dn_picture
@@ -40,7 +40,8 @@ class CommandSolver:
             raise InputError(f"--solver {template}: {error}; write a command with {IMAGE}, or {PICTURE}, in it") from error
         if not any(IMAGE in word or PICTURE in word for word in self._words):
             raise InputError(
-                f"--solver {template}: names no image; write centroids, python:MODULE:FUNCTION, or a command with {IMAGE}"
+                f"--solver {template}: names no image; {did_you_mean(template, ['centroids'])}write centroids, "
+                f"python:MODULE:FUNCTION, or a command with {IMAGE}"
                 f' in it, such as "solve {IMAGE}"'
             )
         self._folder, self._timeout_s = folder, timeout_s

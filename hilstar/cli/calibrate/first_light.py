@@ -14,7 +14,7 @@ import typer
 from hilstar.cli.options import MAX_SEED, BenchFile, Json, check_files
 from hilstar.cli.show.paging import Console, ConsoleName, Control, Token, page_door
 from hilstar.console.terminal import print_json, say
-from hilstar.errors import InputError
+from hilstar.errors import InputError, did_you_mean
 from hilstar.files import check_directory
 from hilstar.reading import exists
 from hilstar.resources import resource_path
@@ -95,7 +95,7 @@ def first_light(
 
     wrong = [name for name in again or [] if name not in NAMES]
     if wrong:
-        raise InputError(f"--again {wrong[0]}: write one of {', '.join(NAMES)}")
+        raise InputError(f"--again {wrong[0]}: {did_you_mean(wrong[0], NAMES)}write one of {', '.join(NAMES)}")
     check_directory("-o", output)
     file = read_bench_file(bench_file)
     if virtual is not None and virtual.name == EXAMPLE_TRUTH and not exists(virtual):

@@ -10,7 +10,7 @@ import typer
 
 from hilstar.cli.options import BenchFile, Json
 from hilstar.console.terminal import print_json, say
-from hilstar.errors import InputError, shortened
+from hilstar.errors import InputError, did_you_mean, shortened
 from hilstar.files import check_directory
 
 
@@ -41,7 +41,8 @@ def budget(
     choices: tuple[By, ...] = (*FAMILY, "all")
     by = next((choice for choice in choices if choice == centroider), None)
     if centroider is not None and by is None:
-        raise InputError(f"--centroider {shortened(centroider)}: write one of {', '.join(choices)}")
+        meant = did_you_mean(centroider, choices)
+        raise InputError(f"--centroider {shortened(centroider)}: {meant}write one of {', '.join(choices)}")
     with load(bench_file) as bench:
         found, assumed = find_budget(bench, by), shares_line(bench)
     if output is not None:

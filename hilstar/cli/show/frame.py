@@ -9,7 +9,7 @@ import typer
 
 from hilstar.cli.options import AtSeconds, BenchFile, Explain, Json, QuaternionText, RadecText, ScenarioFile, check_files
 from hilstar.cli.parsers import parse_at, parse_attitude
-from hilstar.cli.show.running import explain_bench, optional_scenario
+from hilstar.cli.show.running import explain_bench, optional_scenario, say_units
 from hilstar.console.terminal import print_json
 from hilstar.errors import InputError
 from hilstar.files import CSV, FITS, PNG, check_ending
@@ -39,6 +39,7 @@ def frame(
     from hilstar.bench.bench_file import at_moment, read_bench_file
     from hilstar.bench.build import open_bench
     from hilstar.bench.faults.views import effects_at
+    from hilstar.bench.fields_of_view import fields_of_view
     from hilstar.bench.truth import clipped_in
 
     q = parse_attitude("frame", radec, quaternion)
@@ -53,6 +54,7 @@ def frame(
     t_ns, wrong = parse_at("frame", at, file.config, scenario is not None), optional_scenario(scenario)
     file = at_moment(file, t_ns)
     check_files([scenario], targets, file)
+    fields = fields_of_view(file.config, file.folder)
     with open_bench(file) as bench:
         if explain:
             explain_bench(bench, t_ns)
@@ -77,6 +79,7 @@ def frame(
             "calibration": {"name": bench.calibration.name, "sha256": bench.calibration.sha256},
             "faults": [] if effects is None else [one.fault.name for one in effects.now],
             "written": [str(path) for path in targets],
+            "fields_of_view": fields.keys(),
             "gl_renderer": bench.renderer.gl_renderer,
         }
     if as_json:
@@ -89,6 +92,8 @@ def frame(
         if summary["faults"]:
             names += f", faults: {', '.join(summary['faults'])}"
         typer.echo(f"{len(shot.truth)} stars{names}; wrote {', '.join(summary['written'])}")
+        typer.echo(fields.line())
+    say_units(fields)  # after the refusals: a command that fails says one line
 
 
 def clipped_text(loss_mag: dict[int | str, float]) -> str:

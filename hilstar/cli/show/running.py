@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from hilstar.attitude.wire.source import Conventions, Mounting
     from hilstar.bench.bench_file import BenchFile
     from hilstar.bench.faults.scenario import Scenario
+    from hilstar.bench.fields_of_view import FieldsOfView
     from hilstar.run.faults.recorded import Recording
     from hilstar.run.faults.run_faults import AnyFaults
     from hilstar.run.record.ledger_switch import LedgerSwitch
@@ -93,6 +94,12 @@ def say_of_light(bench: Any) -> None:
     for line in (clipping_line(bench), shares_line(bench)):
         if line is not None:
             say(line)
+
+
+def say_units(fields: FieldsOfView) -> None:
+    """Warn where a length of the bench file cannot be in the unit of its key."""
+    if fields.warning is not None:
+        say(f"check the units: {fields.warning}")
 
 
 def say_beat(bench: Any, screen: Any) -> BeatSummary:

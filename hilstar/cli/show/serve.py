@@ -29,6 +29,7 @@ from hilstar.cli.show.running import (
     run_with_faults,
     say_beat,
     say_of_light,
+    say_units,
     shown_bench,
 )
 from hilstar.console.run_status import RunStatus, Source, on_terminal
@@ -78,6 +79,7 @@ def serve(
         serve_heads(file, asked, as_json)
         return
     from hilstar.attitude.wire.source import Mounting
+    from hilstar.bench.fields_of_view import fields_of_view
     from hilstar.console.feed.introduction import Told
     from hilstar.console.feed.opening import Parts
     from hilstar.run.loop import Limit
@@ -89,6 +91,7 @@ def serve(
     ledger = dated_ledger(ledger)
     check_ending("--ledger", ledger, MCAP)
     faults = optional_scenario(scenario)
+    fields = fields_of_view(file.config, file.folder)
     check_files([scenario], [], file, ledger, overwrite)
     split = parse_split(ledger_split)
     notices = Notices()
@@ -108,6 +111,8 @@ def serve(
         limit = Limit(slots, math.inf if frames is None else frames)
         await_reader(link)
         say(f"{link.verb} {link.endpoint}, {refresh_hz:g} Hz, {bench.renderer.gl_renderer}")
+        say(fields.line())
+        say_units(fields)
         say_of_light(bench)
         beat = UNSET if file.config.attitude.lockstep else say_beat(bench, screen)
         told = Source(f"{link.verb} {link.endpoint}", bench.renderer.gl_renderer, refresh_hz, min(limit.slots, limit.frames))
@@ -117,7 +122,7 @@ def serve(
         with on_terminal(status), followed(door, control, page, parts, status) as (sink, follower, desk):
             outlet = Outlet(screen, kept, notices, tracker_pictures(link, bench, wrong), follower, desk, wrong, pulse)
             summary = serve_stream(bench, link, limit, sink, outlet)
-    end_of_run(replaced(summary, beat=beat), screen, kept, as_json)
+    end_of_run(replaced(summary, beat=beat, fields_of_view=fields.keys()), screen, kept, as_json)
     if not summary.packets.accepted:
         say(f"no attitude came from {link.endpoint}; start the sender, and check its address")
         raise typer.Exit(NO_ATTITUDE)

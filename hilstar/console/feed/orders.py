@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from hilstar.console.feed.messages import SWITCHES, Answer, Order
 from hilstar.console.feed.seen import Watched
-from hilstar.errors import HilstarError, one_line, printable
+from hilstar.errors import HilstarError, did_you_mean, one_line, printable
 from hilstar.run.aids import PATCHES
 from hilstar.run.desk import Desk, Wish
 
@@ -117,7 +117,8 @@ class Orders:
         if faults is None or not faults.names():
             return Answer(id=order.id, status=409, line="this run has no faults to start: give it some with --scenario")
         if order.fault not in faults.names():
-            return Answer(id=order.id, status=404, line=f"no fault of that name; write one of {', '.join(faults.names())}")
+            meant, known = did_you_mean(order.fault, faults.names()), ", ".join(faults.names())
+            return Answer(id=order.id, status=404, line=f"no fault of that name; {meant}write one of {known}")
         before = self._feed.count
         act = faults.start if order.on else faults.stop
         act(order.fault, who)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Self
 
-from hilstar.errors import InputError, MachineError
+from hilstar.errors import InputError, MachineError, did_you_mean
 from hilstar.monitor.window.library import glfw
 from hilstar.monitor.window.visibility import ScreenArea, Visibility
 from hilstar.monitor.window.x11 import Survival, has_extension, is_composited, sync_control
@@ -375,4 +375,5 @@ def _find(wanted: int | str) -> tuple[Display, Any]:
         if wanted == display.index or (isinstance(wanted, str) and wanted.lower() in display.name.lower()):
             return display, monitor
     known = "; ".join(display.line() for display in described)
-    raise InputError(f"[monitor] display = {wanted!r}: no such display; write the index or name of one of {known}")
+    meant = did_you_mean(wanted, (display.name for display in described))
+    raise InputError(f"[monitor] display = {wanted!r}: no such display; {meant}write the index or name of one of {known}")

@@ -18,6 +18,7 @@ from hilstar.study.chain.scenes import five_scenes
 from hilstar.study.chain.table import BudgetRow, Row, StageRow, budget_rows, rows_of, stage_rows, write_tables
 from hilstar.study.chain.tracker import Tracker
 from hilstar.study.chain.verdict import headline, is_right, scene_line
+from hilstar.study.shared.other_work import OtherWork, busy_line, is_busy
 
 OUTPUTS = (
     *(f"{name}{ending}" for name in ("chain", "chain_budget") for ending in (".png", ".svg")),
@@ -29,16 +30,16 @@ OUTPUTS = (
 
 def run(
     file: BenchFile, directory: Path, quick: bool = False, advance: Callable[[int], object] | None = None
-) -> tuple[list[str], bool]:
+) -> tuple[list[str], bool | None]:
     """Measure a bench file's scenes; write OUTPUTS into `directory`.
 
-    A line for each scene, and whether `auto` is on the front of all, or within the noise of it; `advance` hears how many scenes
-    are done. Raises InputError, MachineError.
+    A line for each scene, and whether `auto` is on the front of all, or within the noise of it: None on a busy machine.
+    `advance` hears how many scenes are done. Raises InputError, MachineError.
     """
     rows: list[Row] = []
     budget: list[BudgetRow] = []
     stages: list[StageRow] = []
-    lines, right = [], True
+    lines, judged, others = [], [], OtherWork()
     with Parts(file) as parts:
         tracker = Tracker(parts.own)
         try:
@@ -52,8 +53,7 @@ def run(
                 auto = measurement.marks.auto
                 parts_of_error = budget_rows(scene.name, error_budget(measurement, auto))
                 parts_of_time = stage_rows(scene.name, stage_times)
-                lines.append(scene_line(own, parts_of_error, parts_of_time))
-                right = right and is_right(own)
+                judged.append((own, parts_of_error, parts_of_time))
                 rows, budget, stages = rows + own, budget + parts_of_error, stages + parts_of_time
                 if advance is not None:
                     advance(number + 1)
@@ -63,9 +63,12 @@ def run(
             tracker.close()
     if not rows:
         raise InputError(f"{file.path}: no star stands alone in view in any scene; write a larger [sky] faintest_v_mag")
+    others_cores = others.cores()
+    busy = is_busy(others_cores)
+    lines = [*(scene_line(*scene, busy) for scene in judged), *lines]
     make_directory(directory)
     write_tables(directory, rows, budget, stages)
-    notes = [f"times on {machine}", *([] if shortened is None else [shortened])]
-    draw(directory / "chain", rows, headline(rows), "; ".join(notes))
+    notes = [f"times on {machine}", *([] if shortened is None else [shortened]), *([busy_line(others_cores)] if busy else [])]
+    draw(directory / "chain", rows, headline(rows, busy), "; ".join(notes))
     draw_budget(directory / "chain_budget", rows, budget, stages)
-    return [*lines, *notes], right
+    return [*lines, *notes], None if busy else all(is_right(own) for own, _, _ in judged)

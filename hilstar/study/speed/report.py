@@ -8,6 +8,7 @@ from pathlib import Path
 from msgspec import UNSET
 
 from hilstar.charts import BLUE, GREEN, ORANGE, PURPLE, RED, chart, plain_ticks, write_csv
+from hilstar.study.shared.other_work import busy_line, is_busy
 from hilstar.study.speed.result import Cell, Result, Size, Timing
 
 COLOURS = {"hilstar": RED, "numpy": BLUE, "numba": ORANGE, "galsim": GREEN, "photutils": PURPLE}
@@ -37,6 +38,8 @@ def lines(result: Result) -> Iterator[str]:
         yield f"{'  Python outside GL':{NAME}}" + "".join(f"{_ms(python.get(count)):>{COLUMN}}" for count in counts)
     yield ""
     yield from _notes(result)
+    if is_busy(result.others_cores):
+        yield busy_line(result.others_cores)
 
 
 def _notes(result: Result) -> Iterator[str]:
@@ -57,7 +60,7 @@ def _notes(result: Result) -> Iterator[str]:
         f"peak memory {result.memory_mb:.0f} MB, in a fresh process"
     )
     for aim in result.aims:
-        word = "reached" if aim.reached else "NOT reached"
+        word = "not judged" if aim.reached is None else "reached" if aim.reached else "NOT reached"
         yield f"aim {word}: {aim.what} {aim.measured_ms:.2f} ms (at most {aim.aim_ms:.4g})"
 
 
@@ -98,7 +101,8 @@ def _finding(result: Result) -> str:
     whole = [row for row in result.rows if row.kind == "whole_frame"]
     first, last = (pick(whole, key=lambda row: row.ms.median) for pick in (min, max))
     parts = [f"{row.ms.median:.1f} ms with {row.stars} stars on {_words(row.size)}" for row in (first, last)]
-    return f"A whole frame takes {parts[0]} and {parts[1]}"
+    busy = ", beside other work: no winner is named" if is_busy(result.others_cores) else ""
+    return f"A whole frame takes {parts[0]} and {parts[1]}{busy}"
 
 
 def _named(rows: Sequence[Timing]) -> dict[str, dict[int, float]]:

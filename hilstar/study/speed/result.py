@@ -94,12 +94,12 @@ class Start:
 
 @dataclass(frozen=True, slots=True)
 class Aim:
-    """A time that the project set itself, and whether this run reached it."""
+    """A time that the project set itself, and whether this run reached it; None on a busy machine."""
 
     what: str
     aim_ms: float
     measured_ms: float
-    reached: bool
+    reached: bool | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,3 +130,4 @@ class Result:
     first_frame_ms: float = 0.0
     memory_mb: float = 0.0
     aims: list[Aim] = field(default_factory=list)
+    others_cores: float = 0.0  # that other processes took while it ran

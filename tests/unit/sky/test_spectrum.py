@@ -75,7 +75,7 @@ def test_a_curve_file_that_is_wrong_is_refused(tmp_path, text, words):
 def test_a_curve_that_is_neither_name_nor_file_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"\[tracker\] quantum_efficiency = 'ccd48'.*\"ccd47-20\""):
         load_curve("ccd48", "[tracker] quantum_efficiency", tmp_path)
-    with pytest.raises(InputError, match="from 0 to 1"):
+    with pytest.raises(InputError, match="from 1e-06 to 1"):
         load_curve(1.5, "[tracker] transmission", tmp_path)
 
 

@@ -1,0 +1,75 @@
+"""A wrong word, or numbers with spaces between them: the line says what to type."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.support.benches import ROOT
+from tests.support.commands import assert_refused, run_hilstar_here
+
+BENCH = str(ROOT / "examples" / "bench.toml")
+MEANT = "84.057,-1.2,0, with commas and without spaces"
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["displays"], "`hilstar doctor` lists the displays"),
+        (["fram"], "did you mean frame?"),
+        (["nonsense"], "the commands are demo, frame"),
+        (["calibrate", "dot"], "did you mean dots?"),
+        (["service", "instal"], "did you mean install?"),
+        (["frame", BENCH, "--radecc", "1,2,3"], "did you mean --radec?"),
+        (["frame", BENCH, "--nonsense"], "its options are --radec"),
+        (["study", "chian", "-o", "d"], "did you mean chain?"),
+        (["simulate", BENCH, "--noise", "ful"], "did you mean full?"),
+        (["budget", BENCH, "--centroider", "windw"], "did you mean window?"),
+        (["replay", BENCH, "log.csv", "--speed", "realtme"], "did you mean realtime?"),
+        (["first-light", BENCH, "-o", "s", "--again", "verfy"], "did you mean verify?"),
+        (["frame", BENCH, "--radec", "84.057", "-1.2", "0", "-o", "o.fits"], f"write --radec {MEANT}"),
+        (["frame", BENCH, "--radec", "84.057,", "-1.2,", "0", "-o", "o.fits"], f"write --radec {MEANT}"),
+        (["frame", BENCH, "--radec=84.057", "-1.2", "0", "-o", "o.fits"], f"write --radec {MEANT}"),
+        (["frame", BENCH, "--radec", "84.057 -1.2 0", "-o", "o.fits"], "with commas and without spaces"),
+        (["simulate", BENCH, "--radec", "1,2,3", "--rate", "0", "1", "0", "-o", "o.fits"], "write --rate 0,1,0"),
+    ],
+    ids=lambda value: " ".join(value)[-40:] if isinstance(value, list) else None,
+)
+def test_a_wrong_word_is_answered_with_the_right_one(words, said, tmp_path):
+    assert_refused(run_hilstar_here(*words, cwd=tmp_path), 2, said)
+
+
+def test_numbers_after_commas_are_no_reason_to_complain_of_spaces(tmp_path):
+    refused = run_hilstar_here("frame", BENCH, "--radec", "84.057,-1.2,0", "--nonsense", cwd=tmp_path)
+    assert_refused(refused, 2, "No such option: --nonsense")
+
+
+@pytest.mark.parametrize(
+    ("table", "line", "said"),
+    [
+        ("tracker", "resolution_px = 1024", "such as resolution_px = [1024, 1024]"),
+        ("tracker", "psf_sigma_px = 0.6", "such as psf_sigma_px = [0.6, 0.6]"),
+        ("collimator", "q_cam_to_mon = [1, 0]", "such as q_cam_to_mon = [1.0, 0.0, 0.0, 0.0]"),
+        ("attitude", 'allow = "10.0.0.1"', 'such as allow = ["10.0.0.1"]'),
+        ("monitor", 'bits = "8"', "such as bits = 8"),
+        ("render", 'quantisation = "exakt"', "did you mean exact?"),
+        ("monitor", "rotate_deg = 45", "0 or 90 or 180 or 270 is wanted"),
+        ("attitude", 'source = "zqm"', "did you mean zmq?"),
+        ("tracker", 'quantum_efficiency = "ccd47-2"', "did you mean ccd47-20?"),
+        ("monitor", 'calibration = "sRGB"', "did you mean srgb?"),
+        ("monitor", 'calibration = "gama2.2"', "did you mean gamma2.2?"),
+        ("tracker", "aperture = 30", "did you mean aperture_mm?"),
+    ],
+)
+def test_a_wrong_value_is_answered_with_an_example(table, line, said, tmp_path):
+    tables = {
+        "tracker": ["aperture_mm = 30", "focal_length_mm = 70", "pixel_pitch_um = 13", "resolution_px = [64, 64]"],
+        "monitor": ["resolution_px = [64, 48]", "pixel_pitch_um = 57.65"],
+        "collimator": ["focal_length_mm = 350"],
+    }
+    tables["tracker"].append('quantum_efficiency = "ccd47-20"')
+    key = line.partition(" =")[0]
+    rest = [other for other in tables.get(table, []) if not other.startswith(f"{key} =")]
+    tables[table] = [*rest, line]
+    text = "\n".join(f"[{name}]\n" + "\n".join(lines) for name, lines in tables.items())
+    (tmp_path / "bench.toml").write_text(text + "\n")
+    assert_refused(run_hilstar_here("doctor", "bench.toml", cwd=tmp_path), 2, said)

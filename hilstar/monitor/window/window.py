@@ -15,11 +15,12 @@ from typing import Any, Self
 from hilstar.errors import InputError, MachineError, did_you_mean
 from hilstar.monitor.window.library import glfw
 from hilstar.monitor.window.visibility import ScreenArea, Visibility
-from hilstar.monitor.window.x11 import Survival, has_extension, is_composited, sync_control
+from hilstar.monitor.window.x11 import Survival, SwapStamps, has_extension, is_composited, sync_control
 from hilstar.process.cores import drawing_threads_apart
-from hilstar.units import GL_VERSIONS
+from hilstar.units import GL_VERSIONS, NS_PER_S
 
 TITLE = "hilstar"
+USUAL_REFRESH_HZ = 60
 RAMP_TOLERANCE = 1 / 512  # half a code of 8 bits
 NO_DISPLAY = "no display to open a window on; set DISPLAY, or run with --headless"
 WAYLAND = (
@@ -166,7 +167,9 @@ class Window:
             self._survival.cover(self._x_display)
             window = glfw.get_x11_window(self._window)
             self._visibility = Visibility.of(window, None if monitor is None else _area_of(monitor), self._survival)
-        self._sync = sync_control(self._x_display, glfw.get_glx_window(self._window) if self._x_display else None)
+        sync = sync_control(self._x_display, glfw.get_glx_window(self._window) if self._x_display else None)
+        refresh_hz = self.display.refresh_hz if self.display is not None else 0
+        self._stamps = SwapStamps(sync, NS_PER_S / (refresh_hz or settings.refresh_hz or USUAL_REFRESH_HZ))
         if monitor is not None:
             self._set_identity_ramp(monitor)
 
@@ -287,25 +290,17 @@ class Window:
     @property
     def timestamp_source(self) -> str:
         """Where the times of `swap` come from."""
-        return "after-swap clock" if self._sync is None else "GLX_OML_sync_control"
+        return self._stamps.source
 
     def swap(self, wait: Callable[[], None] = lambda: None) -> int:
-        """Show what was drawn; the host time, ns, of the swap: the driver's, else that just after the call.
+        """Show what was drawn; the host time, ns, of the swap: the driver's, else that once it is done.
 
-        `wait` returns once the swap is done, where `glfwSwapBuffers` itself may return earlier.
+        `wait` returns once the swap is done, where `glfwSwapBuffers` itself may return earlier and the driver has no times.
         """
-        if self.gone is None:
-            glfw.swap_buffers(self._window)
-            wait()
-        now_ns = time.monotonic_ns()
-        if self._sync is not None and self.gone is None:
-            swap_ns = self._sync.swap_ns()
-            if swap_ns is None:
-                log.warning("GLX_OML_sync_control gives no time; the host's clock just after the swap is used instead")
-                self._sync = None
-            else:
-                now_ns = swap_ns
-        return now_ns
+        if self.gone is not None:
+            return time.monotonic_ns()
+        glfw.swap_buffers(self._window)
+        return self._stamps.after_swap(wait)
 
     def look_at_events(self) -> None:
         """Handle keys, and monitors that come and go."""

@@ -7,6 +7,7 @@ Each answer is None or False where the system has no such thing: Wayland, or a d
 from __future__ import annotations
 
 import ctypes
+import logging
 import time
 from collections.abc import Callable
 from typing import Any
@@ -14,12 +15,17 @@ from typing import Any
 from hilstar.units import NS_PER_US
 
 GL_LIBRARY, X11_LIBRARY = "libGL.so.1", "libX11.so.6"
+CLOCK = "after-swap clock"
 SYNC_EXTENSION = b"GLX_OML_sync_control"
 # A UST further back is of another clock than this host's monotonic one, or of another swap.
 MAX_UST_AGE_NS = 1_000_000_000
+MAX_GAPS = 30  # swaps in a row without a time stamp that can be right
 BAD_WINDOW, BAD_DRAWABLE, FIRST_EXTENSION_ERROR = 3, 9, 128  # X.h; those of extensions are GLX's here
 SERVER_GONE = "the X server is gone, or has closed the window's connection"
 WINDOW_GONE = "the window is gone: another program has closed it"
+
+
+log = logging.getLogger(__name__)
 
 
 class _ErrorEvent(ctypes.Structure):
@@ -83,12 +89,39 @@ class SyncControl:
         self._window = (x_display, drawable)
 
     def swap_ns(self) -> int | None:
-        """Wait for the last swap; host time (monotonic) at which it was done, None where the driver does not say."""
+        """Wait for the last swap; the driver's time of it (host's monotonic clock), None where it does not say."""
         ust, msc, sbc = (ctypes.c_int64() for _ in range(3))
         if not self._wait_for_swap(*self._window, 0, ctypes.byref(ust), ctypes.byref(msc), ctypes.byref(sbc)):
             return None
-        swap_ns = ust.value * NS_PER_US
-        return swap_ns if 0 <= time.monotonic_ns() - swap_ns < MAX_UST_AGE_NS else None
+        return ust.value * NS_PER_US
+
+
+class SwapStamps:
+    """When each swap reached the screen: by the driver where it says, else by the host's clock once the swap is done.
+
+    Linux stamps the *end* of a vertical blank, when the first row is lit, and tells of it at its beginning: up to a
+    millisecond ahead of now. So a stamp may be a refresh period ahead; a single one that cannot be right is passed over.
+    """
+
+    def __init__(self, sync: SyncControl | None, period_ns: float, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
+        self._sync, self._period_ns, self._now_ns = sync, period_ns, now_ns
+        self._gaps = 0
+        self.source = CLOCK if sync is None else SYNC_EXTENSION.decode()
+
+    def after_swap(self, wait: Callable[[], None]) -> int:
+        """Time of the swap just asked for, host ns; `wait` returns once it is done, where the driver does not say."""
+        if self._sync is not None:
+            swap_ns = self._sync.swap_ns()
+            if swap_ns is not None and -self._period_ns <= self._now_ns() - swap_ns < MAX_UST_AGE_NS:
+                self._gaps, self.source = 0, SYNC_EXTENSION.decode()
+                return swap_ns
+            self._gaps += 1
+            if self._gaps == MAX_GAPS:
+                log.warning("%s gives no time of swaps; the host's clock after them is used instead", SYNC_EXTENSION.decode())
+                self._sync = None
+        wait()
+        self.source = CLOCK
+        return self._now_ns()
 
 
 def sync_control(x_display: int | None, drawable: int | None) -> SyncControl | None:

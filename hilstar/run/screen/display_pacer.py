@@ -16,6 +16,7 @@ from hilstar.run.host_clock import HOST_CLOCK, HostClock
 from hilstar.run.overrides import Overrides
 from hilstar.run.pacer import Moment, Presented
 from hilstar.run.screen.screen import Screen
+from hilstar.units import NS_PER_MS
 
 log = logging.getLogger(__name__)
 
@@ -56,11 +57,16 @@ class DisplayPacer:
         """Put the frame on the screen at its moment."""
         enter("present")
         marker = self._screen.present(number)
-        self._screen.budget.add(self.clock.now_ns() - begun_ns)
+        ready_ns, budget = self.clock.now_ns(), self._screen.budget
+        budget.add(ready_ns - begun_ns)
         if moment.swap_ns is not None and not self._screen.clock.paced_by_screen:
             self.clock.wait_until(moment.swap_ns, self.stop)
         enter("swap")
         swap_ns = self._screen.swap()
+        due_ns = moment.swap_ns
+        if self._screen.clock.paced_by_screen and due_ns is not None and budget.add_flip(due_ns - ready_ns, swap_ns - due_ns):
+            guard_ms = budget.guard_ns / NS_PER_MS
+            self._notices.tell("guard-raised", f"the display's driver flips late: frames are ready {guard_ms:.2f} ms before")
         self._end_with_window()
         return Presented(swap_ns, self._screen.timestamp_source, marker)
 
@@ -79,5 +85,6 @@ class DisplayPacer:
 
     def summary(self, swaps: dict[str, Any]) -> dict[str, Any]:
         """Where the times of swaps come from, the loop's scheduling, the swaps, and how long the sky was changed or hidden."""
-        named = {"timestamp_source": self._screen.timestamp_source, "scheduling": self.scheduling}
+        named: dict[str, Any] = {"timestamp_source": self._screen.timestamp_source, "scheduling": self.scheduling}
+        named |= {"guard_ms": self._screen.budget.guard_ns / NS_PER_MS, "queued_frames": self._screen.queued}
         return named | swaps | self.operator.summary()

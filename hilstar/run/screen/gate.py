@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
@@ -13,13 +14,21 @@ from hilstar.bench.config import Monitor
 from hilstar.bench.orientation import orientation_of
 from hilstar.errors import MachineError
 from hilstar.monitor.window.window import Window
+from hilstar.run.host_clock import HOST_CLOCK, HostClock
 from hilstar.run.screen.screen import Screen
+from hilstar.run.screen.swap_clock import DrawBudget
 from hilstar.units import NS_PER_MS
 
 GATE_FRAMES = 120
 REFRESH_TOLERANCE = 0.01
 DROPPED = 1.5  # periods
 MAX_DROPPED = 2  # of GATE_FRAMES: a desktop that is still busy with the new window
+BURSTS, BURST = 3, 8  # of swaps, to find how many are queued
+BURST_AT = 0.25  # of a period after a swap: far from the next one
+DRAINED = 6  # periods after which no queue has a frame
+# The first is today's and serves most drivers; a 4K display or a slow X server needs more.
+GUARDS_MS = (1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0)
+GUARD_TRIALS = 4
 UNPACED = 0.1  # of the period that the system knows of: swaps faster by more do not wait for it
 log = logging.getLogger(__name__)
 
@@ -29,7 +38,8 @@ class Timing:
     """What the gate measured: the median period, how many frames were dropped, and who keeps time.
 
     `paced_by_screen` is true where the screen itself keeps time, and `waits` false where it could, but swaps do not wait.
-    `modes_hz` are the refresh rates that the display has.
+    `modes_hz` are the refresh rates that the display has. The driver holds `queued` finished frames back, a refresh each, and
+    takes a frame for a swap up to `guard_ms` before it.
     """
 
     period_ms: float
@@ -37,9 +47,11 @@ class Timing:
     paced_by_screen: bool
     waits: bool = True
     modes_hz: tuple[int, ...] = ()
+    queued: int = 0
+    guard_ms: float = DrawBudget.GUARD_NS / NS_PER_MS
 
 
-def pass_gate(screen: Screen, force: bool) -> Timing:
+def pass_gate(screen: Screen, force: bool, clock: HostClock = HOST_CLOCK) -> Timing:
     """Time GATE_FRAMES swaps and refuse (MachineError) a display that is not as the bench file has it; its timing.
 
     With `force` a fault is only logged.
@@ -50,6 +62,10 @@ def pass_gate(screen: Screen, force: bool) -> Timing:
     timing = timing_of(np.diff(swaps_ns) / NS_PER_MS, monitor, 0 if window.display is None else window.display.refresh_hz)
     timing = replace(timing, modes_hz=window.modes_hz)
     screen.keep_time(timing.period_ms, timing.paced_by_screen, int(swaps_ns[-1]))
+    if timing.paced_by_screen and window.gone is None:
+        queued = queued_frames(screen, clock)
+        timing = replace(timing, queued=queued, guard_ms=timing.guard_ms if queued else needed_guard_ms(screen, clock))
+        screen.keep_ahead(timing.guard_ms, timing.queued)
     if not timing.paced_by_screen:
         ms = timing.period_ms
         log.warning("the display has no refresh of its own (swaps take %.2f ms): frames are paced by software", ms)
@@ -65,6 +81,44 @@ def pass_gate(screen: Screen, force: bool) -> Timing:
 def _swapped_ns(screen: Screen, number: int) -> int:
     screen.present(number)
     return screen.swap()
+
+
+def queued_frames(screen: Screen, clock: HostClock) -> int:
+    """How many finished frames the driver holds back: swaps in a row that return before their frame is on the screen.
+
+    The burst begins when the queue is empty, a quarter of a period after a swap: its last one returns when the frame before
+    it by as many as are queued is shown.
+    """
+    found = []
+    for _ in range(BURSTS):
+        period_ns = screen.clock.period_ns
+        begin_ns = round(screen.clock.next_after(clock.now_ns() + DRAINED * period_ns) + BURST_AT * period_ns)
+        clock.wait_until(begin_ns, threading.Event())
+        for number in range(BURST):
+            screen.present(number)
+            screen.swap(timed=False)
+        took = (clock.now_ns() - begin_ns) / period_ns
+        found.append(BURST - round(took + BURST_AT))
+    return max(0, sorted(found)[BURSTS // 2])
+
+
+def needed_guard_ms(screen: Screen, clock: HostClock) -> float:
+    """The shortest of GUARDS_MS before a swap at which a finished frame is still taken for it."""
+    for guard_ms in GUARDS_MS:
+        if guard_ms * NS_PER_MS > screen.clock.period_ns / 2:
+            break
+        late = [_flips_late(screen, clock, guard_ms * NS_PER_MS) for _ in range(GUARD_TRIALS)]
+        if not any(late):
+            return guard_ms
+    return screen.clock.period_ns / 2 / NS_PER_MS
+
+
+def _flips_late(screen: Screen, clock: HostClock, guard_ns: float) -> bool:
+    period_ns = screen.clock.period_ns
+    due_ns = screen.clock.next_after(clock.now_ns() + period_ns)
+    screen.present(0)
+    clock.wait_until(round(due_ns - guard_ns), threading.Event())
+    return screen.swap() - due_ns > period_ns / 2
 
 
 def timing_of(periods_ms: FloatArray, monitor: Monitor, known_hz: float) -> Timing:
@@ -84,6 +138,18 @@ def faults(window: Window, monitor: Monitor, timing: Timing) -> Iterator[str]:
         (width, height), (wide, high) = window.size_px, wanted_px
         sizes = f"{width} x {height} px and the bench file says {wide} x {high}"
         yield f"the display is {sizes}; set [monitor] resolution_px, or the display's mode"
+    yield from _desktop_faults(window)
+    if timing.paced_by_screen:
+        yield from _timing_faults(monitor, timing)
+    if not timing.waits:
+        yield "swaps do not wait for the display's refresh; switch vertical sync on in its driver"
+    if window.depth_bits < monitor.bits:
+        depths = f"{window.depth_bits} bits per colour and the bench file says {monitor.bits}"
+        yield f"the window has {depths}; set [monitor] bits, or a deeper mode"
+
+
+def _desktop_faults(window: Window) -> Iterator[str]:
+    """What other programs do to the display."""
     if window.by_wayland:
         yield "a Wayland compositor draws this display (XWayland), and holds frames back; use an Xorg session"
     if window.ramp_refused:
@@ -95,13 +161,6 @@ def faults(window: Window, monitor: Monitor, timing: Timing) -> Iterator[str]:
         yield f"the display {window.mirrored} mirrors this one; {advice}"
     if window.scaled:
         yield "the display is scaled by its desktop; set its scale to 100 %"
-    if timing.paced_by_screen:
-        yield from _timing_faults(monitor, timing)
-    if not timing.waits:
-        yield "swaps do not wait for the display's refresh; switch vertical sync on in its driver"
-    if window.depth_bits < monitor.bits:
-        depths = f"{window.depth_bits} bits per colour and the bench file says {monitor.bits}"
-        yield f"the window has {depths}; set [monitor] bits, or a deeper mode"
 
 
 def _timing_faults(monitor: Monitor, timing: Timing) -> Iterator[str]:
@@ -110,3 +169,8 @@ def _timing_faults(monitor: Monitor, timing: Timing) -> Iterator[str]:
         yield f"the display refreshes at {hz}; set [monitor] refresh_hz, or the display's mode"
     if timing.dropped > MAX_DROPPED:
         yield f"the display dropped {timing.dropped} of {GATE_FRAMES} frames; close other programs that draw on it"
+    if timing.queued:
+        held = f"{timing.queued} finished frame{'s' * (timing.queued > 1)}"
+        late = f"light comes {timing.queued * timing.period_ms:.1f} ms after the swap"
+        ways = "use one with GLX_OML_sync_control, or __GL_MaxFramesAllowed=1 (NVIDIA)"
+        yield f"the driver holds {held} back, and {late}; {ways}"

@@ -23,7 +23,7 @@ class Screen:
     """A window with a bench's frames on it.
 
     `clock` predicts its swaps, `budget` how early a frame has to be begun, and `swap_to_light_ns` is the time from a swap to
-    the middle row's first light: half of the scan-out, and the panel's own delay.
+    the middle row's first light: half of the scan-out, the panel's own delay, and the frames `queued` in the driver.
     """
 
     def __init__(self, window: Window, bench: Bench) -> None:
@@ -49,6 +49,13 @@ class Screen:
         period_ns = period_ms * NS_PER_MS if by_screen else NS_PER_S / self.bench.config.monitor.refresh_hz
         self.clock = SwapClock(swap_ns, period_ns, by_screen)
         self.budget = DrawBudget(period_ns)
+        self.queued = 0
+
+    def keep_ahead(self, guard_ms: float, queued: int) -> None:
+        """Have frames ready `guard_ms` before their swap; the driver holds `queued` of them back for a refresh each."""
+        self.budget = DrawBudget(self.clock.period_ns, guard_ms * NS_PER_MS)
+        self.swap_to_light_ns += round((queued - self.queued) * self.clock.period_ns)
+        self.queued = queued
 
     @property
     def closing(self) -> bool:
@@ -69,10 +76,14 @@ class Screen:
         self._presenter.present(self.aids.overlay, round(self.aids.patch_share * white), (side_px, white * (marker or 0)))
         return marker
 
-    def swap(self) -> int:
-        """Swap what was presented onto the screen, and take in keys; host time of the swap, ns."""
+    def swap(self, timed: bool = True) -> int:
+        """Swap what was presented onto the screen, and take in keys; host time of the swap, ns.
+
+        One that is not `timed` does not move the clock.
+        """
         swap_ns = self.window.swap(self._presenter.wait)
-        self.clock.update(swap_ns)
+        if timed:
+            self.clock.update(swap_ns)
         self.window.look_at_events()
         while self.window.keys:
             self._press(self.window.keys.popleft())

@@ -47,14 +47,37 @@ class DrawBudget:
     FRAMES = 120
     SLOW = 3  # the third slowest counts: two outliers in two seconds are late rather than all others early
     GUARD_NS = 1.0 * NS_PER_MS
+    MORE = 1.25  # of the time that a driver was seen to need
 
-    def __init__(self, period_ns: float) -> None:
+    def __init__(self, period_ns: float, guard_ns: float = GUARD_NS) -> None:
         self._period_ns = period_ns
         self._costs_ns: deque[int] = deque(maxlen=self.FRAMES)
+        self._late_leads_ns: deque[float] = deque(maxlen=self.SLOW)
+        self._frames = 0
+        self.guard_ns = guard_ns
 
     def add(self, cost_ns: int) -> None:
         """Add how long a frame took until it could be swapped."""
         self._costs_ns.append(cost_ns)
+
+    def add_flip(self, lead_ns: float, late_ns: float) -> bool:
+        """Add a flip that was `late_ns` after its moment, of a frame that was ready `lead_ns` before it.
+
+        True where the guard is raised: the third in FRAMES frames that was ready in time and a refresh late.
+        """
+        self._frames += 1
+        if self._frames >= self.FRAMES:
+            self._frames = 0
+            self._late_leads_ns.clear()
+        if late_ns < self._period_ns / 2 or not 0 < lead_ns < self._period_ns / 2:
+            return False
+        self._late_leads_ns.append(lead_ns)
+        if len(self._late_leads_ns) < self.SLOW:
+            return False
+        before_ns = self.guard_ns
+        self.guard_ns = min(max(before_ns, self.MORE * sorted(self._late_leads_ns)[1]), self._period_ns / 2)
+        self._late_leads_ns.clear()
+        return self.guard_ns > before_ns
 
     @property
     def min_ns(self) -> float:
@@ -66,4 +89,4 @@ class DrawBudget:
         """The time that all but two of the last frames took, and a guard; at most a period, and a whole period at first."""
         if len(self._costs_ns) < self.FRAMES // 4:
             return self._period_ns
-        return min(sorted(self._costs_ns)[-self.SLOW] + self.GUARD_NS, self._period_ns)
+        return min(sorted(self._costs_ns)[-self.SLOW] + self.guard_ns, self._period_ns)

@@ -34,6 +34,7 @@ class FakeScreen:
     def __init__(self, clock: FakeClock, by_screen: bool = True, closes_at: int | None = None) -> None:
         self.clock = SwapClock(FIRST_SWAP_NS, PERIOD_NS, by_screen)
         self.budget = DrawBudget(PERIOD_NS)
+        self.queued = 0
         self.swap_to_light_ns = TO_LIGHT_NS
         self.timestamp_source = "a fake"
         self.window = SimpleNamespace(hidden="", gone=None)

@@ -11,6 +11,7 @@ from hilstar.bench.config import parse_config
 from hilstar.errors import MachineError
 from hilstar.run.screen.gate import GATE_FRAMES, Timing, faults, pass_gate, timing_of
 from tests.support.benches import SMALL_BENCH
+from tests.support.model_display import model_screen
 
 PERIOD_MS = 1000 / 60
 GOOD = Timing(PERIOD_MS, 0, True)
@@ -83,41 +84,23 @@ def test_each_fault_of_a_display_is_said_with_what_to_do(monitor, changes, timin
     assert words in fault
 
 
-class Screen:
-    """A screen whose swaps come each period, of a window with `changes`."""
-
-    def __init__(self, tmp_path, **changes) -> None:
-        self.window = window(**changes)
-        self.bench = SimpleNamespace(config=parse_config(tmp_path / "bench.toml", SMALL_BENCH), draw=lambda q: None)
-        self.kept: tuple[float, bool, int] | None = None
-        self._swaps = 0
-
-    def present(self, number: int) -> None:
-        pass
-
-    def swap(self) -> int:
-        self._swaps += 1
-        return round(self._swaps * PERIOD_MS * 1e6)
-
-    def keep_time(self, period_ms: float, by_screen: bool, swap_ns: int) -> None:
-        self.kept = period_ms, by_screen, swap_ns
+def test_a_good_display_passes_and_its_swaps_are_predicted_from_the_last_one(tmp_path, monkeypatch):
+    screen, display = model_screen(tmp_path, monkeypatch)
+    timing = pass_gate(screen, force=False, clock=display.clock)
+    assert timing.period_ms == pytest.approx(PERIOD_MS, rel=1e-6) and timing.paced_by_screen
+    periods = (screen.clock.next_after(display.clock.ns) - display.flips_ns[-1]) / display.period_ns
+    assert periods == pytest.approx(round(periods), abs=1e-4)
 
 
-def test_a_good_display_passes_and_its_swaps_are_predicted_from_the_last_one(tmp_path):
-    screen = Screen(tmp_path)
-    pass_gate(screen, force=False)
-    period_ms, by_screen, swap_ns = screen.kept
-    assert period_ms == pytest.approx(PERIOD_MS, rel=1e-6) and by_screen
-    assert swap_ns == round((GATE_FRAMES + 1) * PERIOD_MS * 1e6)
-
-
-def test_a_fault_is_refused_and_only_logged_with_force(tmp_path, caplog):
+def test_a_fault_is_refused_and_only_logged_with_force(tmp_path, monkeypatch, caplog):
+    screen, display = model_screen(tmp_path, monkeypatch, composited=True)
     with pytest.raises(MachineError, match=r"compositing.*or add --force"):
-        pass_gate(Screen(tmp_path, composited=True), force=False)
-    pass_gate(Screen(tmp_path, composited=True), force=True)
+        pass_gate(screen, force=False, clock=display.clock)
+    pass_gate(screen, force=True, clock=display.clock)
     assert "shown anyway (--force)" in caplog.text
 
 
-def test_a_window_that_is_gone_is_refused_even_with_force(tmp_path):
+def test_a_window_that_is_gone_is_refused_even_with_force(tmp_path, monkeypatch):
+    screen, display = model_screen(tmp_path, monkeypatch, gone="its display was unplugged")
     with pytest.raises(MachineError, match="unplugged"):
-        pass_gate(Screen(tmp_path, gone="its display was unplugged"), force=True)
+        pass_gate(screen, force=True, clock=display.clock)

@@ -16,8 +16,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
+import msgspec
+
 from hilstar.errors import InputError, cannot_read, shortened
 
+# What msgspec raises for bytes that are no JSON of the wanted form: for some that are no UTF-8 it is Python's own error.
+NOT_JSON = (msgspec.MsgspecError, UnicodeDecodeError, RecursionError)
 HEAD_BYTES = 16
 MAX_LINE_CHARACTERS = 1_000_000
 CHUNK_BYTES = 1 << 20

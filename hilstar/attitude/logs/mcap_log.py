@@ -13,6 +13,7 @@ from hilstar.attitude.logs.mcap_reader import read_messages
 from hilstar.attitude.logs.mcap_writer import Topic
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal, checked_sample
 from hilstar.errors import InputError
+from hilstar.reading import NOT_JSON
 
 ATTITUDE_TOPIC = "/attitude"
 ATTITUDE_SCHEMA_NAME = "hilstar.Attitude"
@@ -110,7 +111,7 @@ def read_attitudes(path: Path) -> Iterator[AttitudeSample]:
 def _sample(data: bytes) -> AttitudeSample | Refusal | None:
     try:
         form = _decoder.decode(data)
-    except (msgspec.MsgspecError, RecursionError, UnicodeDecodeError) as error:
+    except NOT_JSON as error:
         return Refusal("format", f"is not a hilstar attitude ({error})")
     if not form.accepted:
         return None

@@ -12,7 +12,7 @@ import msgspec
 
 from hilstar.errors import InputError, shortened
 from hilstar.files import write_whole
-from hilstar.reading import exists, read_bytes
+from hilstar.reading import NOT_JSON, exists, read_bytes
 from hilstar.run.sync.advice import BeatSummary
 
 Verdict = Literal["done", "skipped", "failed"]
@@ -102,7 +102,7 @@ def read_session(folder: Path) -> SessionFile | None:
         return None
     try:
         found = msgspec.json.decode(read_bytes(path, ADVICE, MAX_SESSION_BYTES), type=SessionFile)
-    except msgspec.DecodeError as error:
+    except NOT_JSON as error:
         raise InputError(f"{path}: is no session ({shortened(error)}); {ADVICE}") from error
     if found.kind != KIND:
         raise InputError(f"{path}: kind = {shortened(repr(found.kind))} and {KIND!r} is wanted; {ADVICE}")

@@ -7,7 +7,6 @@ import json
 import re
 import shlex
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -65,15 +64,15 @@ class CommandSolver:
         return Answer(None, "the solver found no attitude") if q is None else Answer(checked_attitude(q, "the solver"))
 
 
-def printed_attitude(text: str) -> list[float] | None:
-    """The quaternion in a program's output: its last line with four numbers, or a JSON object with "q"; None without one."""
+def printed_attitude(text: str) -> object | None:
+    """The quaternion in a program's output: its last line with four numbers, or what its JSON object has as "q"; or None."""
     for line in reversed(text[-MAX_OUTPUT_CHARACTERS:].splitlines()):
         if line.lstrip().startswith("{"):
-            with contextlib.suppress(ValueError):
+            with contextlib.suppress(ValueError, RecursionError):
                 said = json.loads(line)
                 if "q" in said:
-                    q: Any = said["q"]
-                    return None if q is None else list(q)
+                    q: object = said["q"]
+                    return q
                 continue
         if re.fullmatch(r"[\s,;\[\]()\d.eE+-]+", line):
             numbers = NUMBER.findall(line)

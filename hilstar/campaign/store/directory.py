@@ -12,7 +12,7 @@ import msgspec
 from hilstar.campaign.store.journal import Journal
 from hilstar.errors import InputError, cannot_read, shortened
 from hilstar.files import make_directory, open_lock, write_whole
-from hilstar.reading import read_bytes
+from hilstar.reading import NOT_JSON, read_bytes
 
 ABOUT, LOCK, JOURNAL, TABLE = "campaign.json", "campaign.lock", "journal", "cases.parquet"
 MAX_ABOUT_BYTES = 50_000_000
@@ -53,7 +53,7 @@ class Directory:
             return
         try:
             before = msgspec.json.decode(read_bytes(place, ANOTHER, MAX_ABOUT_BYTES), type=About)
-        except msgspec.DecodeError as error:
+        except NOT_JSON as error:
             raise cannot_read(place, "it is no campaign's", ANOTHER) from error
         now = msgspec.json.decode(msgspec.json.encode(about), type=About)
         if self.table.exists():  # whose rows are not run again, whatever this machine is

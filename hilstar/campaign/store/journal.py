@@ -19,6 +19,7 @@ import msgspec
 
 from hilstar.errors import InputError, cannot_write
 from hilstar.files import make_directory, write_whole
+from hilstar.reading import NOT_JSON
 
 BLOCK_CASES = 16_384
 OPEN, FULL = ".jsonl", ".full.jsonl"
@@ -159,5 +160,8 @@ def _row(line: bytes) -> Row | None:
     text = line[CHECKSUM_CHARACTERS + 1 :]
     if line[: CHECKSUM_CHARACTERS + 1] != b"%08x " % zlib.crc32(text):
         return None
-    row: Row = msgspec.json.decode(text)
-    return row
+    try:
+        row = msgspec.json.decode(text, type=Row)
+    except NOT_JSON:  # with the right checksum: somebody else's line
+        return None
+    return row if isinstance(row.get("case"), int) else None

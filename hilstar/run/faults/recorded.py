@@ -12,6 +12,7 @@ from hilstar.bench.faults.kinds import Fault, Freeze, MeasuredMap, fault_of
 from hilstar.bench.faults.scenario import Scenario
 from hilstar.bench.faults.surfaces import map_sha256
 from hilstar.errors import InputError
+from hilstar.reading import NOT_JSON
 from hilstar.run.record.ledger_reader import fault_records
 from hilstar.run.record.ledger_records import FaultRecord, FrameRecord
 from hilstar.units import NS_PER_S
@@ -46,7 +47,7 @@ def read_recording(path: Path) -> Recording:
         seed, folder = record.seed, Path(record.folder)
         try:
             faults[record.number] = fault = fault_of(msgspec.json.decode(record.table))
-        except (msgspec.MsgspecError, InputError, RecursionError, UnicodeDecodeError) as error:
+        except (*NOT_JSON, InputError) as error:
             raise InputError(f"{path}: the fault {record.name!r} is not one of hilstar's ({error})") from error
         if isinstance(fault, MeasuredMap) and map_sha256(folder / fault.file) != record.file_sha256:
             raise InputError(f"{path}: {folder / fault.file} is not the map that the run had; put that one there")

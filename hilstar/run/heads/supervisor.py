@@ -21,6 +21,7 @@ from hilstar.bench.config import BenchConfig
 from hilstar.bench.heads_file import HeadsFile
 from hilstar.files import temporary_folder
 from hilstar.process.interrupts import stop_on_signal
+from hilstar.reading import NOT_JSON
 from hilstar.run.heads.head_process import HeadProcess, Say
 from hilstar.units import NS_PER_S
 
@@ -115,6 +116,6 @@ def _hand_on(link: StreamLink, feed: Feed, processes: list[HeadProcess], stop: t
 def _told(process: HeadProcess) -> dict[str, Any]:
     try:
         summary = msgspec.json.decode(process.output) if process.output.strip() else None
-    except msgspec.DecodeError:
+    except NOT_JSON:
         summary = None
     return {"exit_code": process.code, "restarts": process.restarts, "summary": summary}

@@ -16,7 +16,7 @@ from hilstar.attitude.wire.packet import MAX_PLACE_KM, MAX_SPEED_KM_S, MIN_PLACE
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE
 from hilstar.bench.config import BenchConfig
 from hilstar.errors import InputError, cannot_read
-from hilstar.reading import parse_toml
+from hilstar.reading import NOT_JSON, parse_toml
 from hilstar.run.record.ledger_records import (
     COUNT_TOPIC,
     EVENT_TOPIC,
@@ -57,7 +57,7 @@ def fault_records(path: Path) -> Iterator[FaultRecord]:
 def _decoded(decoder: msgspec.json.Decoder[Any], data: bytes, where: str) -> Any:
     try:
         return decoder.decode(data)
-    except (msgspec.MsgspecError, RecursionError, UnicodeDecodeError) as error:
+    except NOT_JSON as error:
         raise InputError(f"{where} is not one of hilstar's ({error})") from error
 
 

@@ -24,6 +24,7 @@ from hilstar.monitor.geometry import monitor_camera
 from hilstar.render.presenter import Orientation
 from hilstar.twin.bench_geometry import BenchGeometry
 from tests.support.benches import bench_text
+from tests.support.damage import NO_JSON
 
 NO_TURN = np.array([1.0, 0.0, 0.0, 0.0])
 MOUNTINGS = [Mounting(x, y, turn) for x in (False, True) for y in (False, True) for turn in (0, 90, 180, 270)]
@@ -307,8 +308,9 @@ def test_a_directory_of_another_bench_is_refused(counted, tmp_path):
         Session(tmp_path / "s", read_bench_file(tmp_path / "other.toml"), Blind(), 0)
 
 
-def test_a_session_file_that_is_none_is_refused(counted, tmp_path):
-    (tmp_path / "s" / "session.json").write_text("{}")
+@pytest.mark.parametrize("data", [b"{}", *NO_JSON, b'{"kind": "\xff"}'])
+def test_a_session_file_that_is_none_is_refused(counted, tmp_path, data):
+    (tmp_path / "s" / "session.json").write_bytes(data)
     with pytest.raises(InputError, match="is no session"):
         counted.go(tmp_path)
 

@@ -104,6 +104,17 @@ def test_what_a_program_prints_is_read_from_its_last_line_with_an_attitude() -> 
     assert printed_attitude("1 2 3\n") is None and printed_attitude("") is None and printed_attitude('{"q": null}') is None
 
 
+@pytest.mark.parametrize("line", ['{"q": 5}', '{"q": {"w": 1}}', '{"q": [1, 0, 0]}', '{"q": "north"}'])
+def test_an_answer_that_is_no_quaternion_is_a_fault_of_the_solver(seen: tuple[Simulator, Exposure], line: str) -> None:
+    simulator, exposure = seen
+    with pytest.raises(SolverFault, match="four numbers"):
+        solver(f"sh -c 'cat $0 >/dev/null; echo \"$1\"' {{image}} '{line}'", timeout_s=PATIENCE_S).solve(exposure, simulator)
+
+
+def test_what_is_nested_too_deep_is_no_answer() -> None:
+    assert printed_attitude('{"q":' * 20_000) is None
+
+
 NO_SOLVERS = ["solve me", "python:nothing", "python:no_such_module:f", "python:math:nothing", "a 'b {image}"]
 
 

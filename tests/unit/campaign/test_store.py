@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import random
+import zlib
 from pathlib import Path
 
 import pytest
 
 from hilstar.campaign.store import journal as journals
+from hilstar.campaign.store.directory import About, Directory
 from hilstar.campaign.store.journal import Journal
 from hilstar.campaign.store.table import file_sha256, read_columns, schema_of, write_table
 from hilstar.errors import InputError
+from tests.support.damage import NO_JSON
 
 
 def row(case: int) -> dict[str, object]:
@@ -85,3 +89,20 @@ def test_a_full_block_that_lost_rows_is_refused(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-5])
     with pytest.raises(InputError, match="missing"):
         Journal(tmp_path / "j", 3).rows(0)
+
+
+@pytest.mark.parametrize("text", [*NO_JSON, b"[]", b'{"case":"1"}', b"{}"])
+def test_a_line_that_is_no_row_is_dropped_though_its_checksum_is_right(tmp_path: Path, text: bytes) -> None:
+    journal = Journal(tmp_path / "j", 6)
+    journal.append([row(case) for case in range(3)])
+    journal.close()
+    with (tmp_path / "j" / "000000.jsonl").open("ab") as file:
+        file.write(b"%08x %s\n" % (zlib.crc32(text), text))
+    assert Journal(tmp_path / "j", 6).missing(0) == [3, 4, 5]
+
+
+@pytest.mark.parametrize("text", NO_JSON)
+def test_a_campaign_file_that_is_none_is_refused(tmp_path: Path, text: bytes) -> None:
+    (tmp_path / "campaign.json").write_bytes(text)
+    with contextlib.closing(Directory(tmp_path)) as directory, pytest.raises(InputError, match=r"campaign\.json"):
+        directory.claim(About({}, "", {}, "centroids", False, {}))

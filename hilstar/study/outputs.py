@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.bench.bench_file import read_bench_file
-from hilstar.charts import STYLE, save, write_csv
+from hilstar.charts import INK, MUTED, chart, write_csv
 from hilstar.resources import resource_path
 from hilstar.rotation import from_radec_roll_deg
 from hilstar.twin.exposure_files import write_exposure_fits
@@ -41,7 +41,7 @@ SCENES = (
 
 
 def run(directory: Path) -> list[str]:
-    """Write each scene's figure (PNG), noisy image (FITS) and truth (CSV); a line for each."""
+    """Write each scene's figure, noisy image (FITS) and truth (CSV); a line for each."""
     return [_draw_scene(directory, scene) for scene in SCENES]
 
 
@@ -54,7 +54,7 @@ def _draw_scene(directory: Path, scene: Scene) -> str:
         write_exposure_fits(directory / f"{scene.name}.fits", simulator, noisy, noise)
     truth = noisy.truth
     write_csv(directory / f"{scene.name}.csv", truth.dtype.names or (), truth.tolist())
-    _figure(directory / f"{scene.name}.png", scene, clean, noisy)
+    _figure(directory / scene.name, scene, clean, noisy)
     background = float(np.median(noisy.dn))
     v_mag, saturated = truth["v_mag"], int(truth["clipped"].sum())
     return (
@@ -64,32 +64,30 @@ def _draw_scene(directory: Path, scene: Scene) -> str:
 
 
 def _figure(path: Path, scene: Scene, clean: Exposure, noisy: Exposure) -> None:
-    from matplotlib import rc_context
-    from matplotlib.figure import Figure
-
-    with rc_context(STYLE):
-        figure = Figure(figsize=(17, 11), layout="constrained")
-        grid = figure.subplots(2, 3)
-        _star_plots(list(grid[0]), noisy.truth, noisy.dn.shape)
-        _images(list(grid[1]), scene, clean, noisy)
-        figure.suptitle(scene.title, fontsize=14)
-        save(figure, path)
+    truth, saturated = noisy.truth, int(noisy.truth["clipped"].sum())
+    finding = f"{scene.title}: {len(truth)} stars to V = {truth['v_mag'].max():.1f}, {saturated or 'none'} saturated"
+    note = "Stars are counted with the brightest first; lines: means. All three images have one stretch."
+    with chart(path, finding, 2, 3, note=note, share_x=False, height_inch=6.4) as axes:
+        _star_plots(axes[:3], truth, noisy.dn.shape)
+        _images(axes[3:], scene, clean, noisy)
 
 
 def _star_plots(axes: list[Axes], truth: npt.NDArray[np.void], shape: tuple[int, ...]) -> None:
     centroids, magnitudes, temperatures = axes
     height, width = shape
-    centroids.plot(truth["x_px"], truth["y_px"], ".", ms=4)
+    centroids.plot(truth["x_px"], truth["y_px"], ".", color=INK, ms=3)
     centroids.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal")
-    centroids.set(xlabel="x [px]", ylabel="y [px]", title=f"centroids of {len(truth)} stars")
+    centroids.set(xlabel="x [px]", ylabel="y [px]", title="Centroids")
     number = np.arange(1, len(truth) + 1)
-    for axis, column, label in ((magnitudes, "v_mag", "V [mag]"), (temperatures, "temperature_k", "temperature [K]")):
-        axis.plot(number, truth[column], ".", ms=4)
-        axis.axhline(truth[column].mean(), color="k", lw=1, label=f"mean {truth[column].mean():.4g}")
-        axis.set(xlabel="star, brightest first", ylabel=label)
-        axis.legend()
-    magnitudes.set(title="apparent magnitudes")
-    temperatures.set(title="black-body temperatures", yscale="log")
+    for axis, column, label, unit in (
+        (magnitudes, "v_mag", "V", "mag"),
+        (temperatures, "temperature_k", "Black-body temperature", "K"),
+    ):
+        mean = float(truth[column].mean())
+        axis.plot(number, truth[column], ".", color=INK, ms=3)
+        axis.axhline(mean, color=MUTED, lw=1)
+        axis.set(xlabel="star", title=f"{label}, mean {mean:.4g} {unit}", ylabel=f"{label} [{unit}]")
+    temperatures.set(yscale="log", title=f"T, mean {truth['temperature_k'].mean():.0f} K")
 
 
 def _images(axes: list[Axes], scene: Scene, clean: Exposure, noisy: Exposure) -> None:
@@ -98,10 +96,11 @@ def _images(axes: list[Axes], scene: Scene, clean: Exposure, noisy: Exposure) ->
     x, y = (float(star["x_px"][0]), float(star["y_px"][0])) if len(star) else (width / 2, height / 2)
     low, high = np.percentile(noisy.dn, (1, 99.8))
     stretch: dict[str, Any] = {"cmap": "gray", "vmin": low, "vmax": high, "interpolation": "nearest"}
-    titles = ("without noise", "with noise", f"with noise, around HIP {scene.zoom_hip}")
+    titles = ("Without noise", "With noise", f"The same, HIP {scene.zoom_hip}")
     for axis, exposure, title in zip(axes, (clean, noisy, noisy), titles, strict=True):
         image = axis.imshow(exposure.dn, **stretch)
         axis.grid(False)
-        axis.set(xlabel="x [px]", ylabel="y [px]", title=title)
+        axis.set(xlabel="x [px]", title=title)
+    axes[0].set_ylabel("y [px]")
     axes[2].set(xlim=(x - ZOOM_PX / 2, x + ZOOM_PX / 2), ylim=(y + ZOOM_PX / 2, y - ZOOM_PX / 2))
-    axes[2].figure.colorbar(image, ax=axes, label="DN", shrink=0.8)
+    axes[2].figure.colorbar(image, ax=axes, label="Signal [DN]", orientation="horizontal", shrink=0.6, aspect=40)

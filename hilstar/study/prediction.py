@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from hilstar.attitude.wire.packet import AttitudeSample
-from hilstar.charts import chart, plain_ticks, write_records
+from hilstar.charts import SERIES, chart, label_ends, plain_ticks, write_records
 from hilstar.rotation import angle_between_rad
 from hilstar.study.shared.predictors import JITTER, NEAR, SLEW_DEG, SLEW_S, Predictor, predictors, slew_attitude, slew_sample
 from hilstar.units import ARCSEC_PER_RAD, NS_PER_MS, NS_PER_S
@@ -42,19 +42,17 @@ class Outcome:
 
 
 def run(directory: Path, quick: bool = False) -> list[str]:
-    """Measure, and write `prediction.csv` and `prediction.png`; a line for each method. Raises InputError."""
+    """Measure, and write `prediction.csv` and its chart; a line for each method. Raises InputError."""
     outcomes = measure(QUICK_SPAN_S if quick else SPAN_S)
     write_records(directory / "prediction.csv", outcomes)
     usual = [o for o in outcomes if (o.rate_hz, o.latency_ms) == (USUAL_HZ, USUAL_MS)]
     default = next(o for o in usual if o.method == next(g.name for g in predictors() if g.is_default))
     hold = next(o for o in usual if o.method == "hold")
-    shaken = ", ".join(f"{size:g} arcsec at {hz:g} Hz" for size, hz in JITTER)
     finding = (
         f"At {USUAL_HZ} Hz and {USUAL_MS} ms of latency, prediction by the newest sample's rate is off by "
         f"{default.rms_arcsec:.2g} arcsec rms, holding the sample by {hold.rms_arcsec:.3g}"
-        f" (a swing of {SLEW_DEG:g} degrees in {SLEW_S:g} s, shaken by {shaken})"
     )
-    _draw(directory / "prediction.png", finding, outcomes)
+    _draw(directory / "prediction", finding, outcomes)
     return [finding, *(_line(outcome) for outcome in usual)]
 
 
@@ -99,18 +97,20 @@ def _line(outcome: Outcome) -> str:
 
 
 def _draw(path: Path, finding: str, outcomes: list[Outcome]) -> None:
-    with chart(path, finding, panels=2, share_x=False) as (latency, rate):
-        for name, marker in zip(dict.fromkeys(o.method for o in outcomes), MARKERS, strict=False):
+    shaken = ", ".join(f"{size:g} arcsec at {hz:g} Hz" for size, hz in JITTER)
+    note = f"A swing of {SLEW_DEG:g} degrees in {SLEW_S:g} s, shaken by {shaken}. In brackets: the time of one attitude."
+    with chart(path, finding, panels=2, share_x=False, note=note) as (latency, rate):
+        for name, marker, colour in zip(dict.fromkeys(o.method for o in outcomes), MARKERS, SERIES, strict=False):
             mine = [o for o in outcomes if o.method == name]
             took_us = np.median([o.attitude_us for o in mine])
             by_latency = sorted((o.latency_ms, o.rms_arcsec) for o in mine if o.rate_hz == USUAL_HZ)
             by_rate = sorted((o.rate_hz, o.rms_arcsec) for o in mine if o.latency_ms == USUAL_MS)
-            latency.loglog(*zip(*by_latency, strict=True), marker=marker, label=f"{name}: {took_us:.0f} us")
-            rate.loglog(*zip(*by_rate, strict=True), marker=marker)
+            latency.loglog(*zip(*by_latency, strict=True), marker=marker, color=colour, label=f"{name} ({took_us:.0f} us)")
+            rate.loglog(*zip(*by_rate, strict=True), marker=marker, color=colour, label=name)
         latency.set_xlabel(f"latency [ms], packets at {USUAL_HZ} Hz")
         rate.set_xlabel(f"rate of packets [Hz], latency {USUAL_MS} ms")
         plain_ticks(latency.xaxis, LATENCIES_MS)
         plain_ticks(rate.xaxis, RATES_HZ)
         for axes in (latency, rate):
-            axes.set_ylabel("pointing error [arcsec rms]")
-        latency.legend(loc="upper left", fontsize=9)
+            axes.set_ylabel("pointing error, rms [arcsec]")
+            label_ends(axes)

@@ -17,7 +17,7 @@ from hilstar.calibrate.geometric.dots import plan_dots
 from hilstar.calibrate.geometric.fit import Matched, Problem, fit
 from hilstar.calibrate.geometric.match import first_look
 from hilstar.calibrate.geometric.model import BROWN_CONRADY, PINHOLE, RADIAL, Geometry, Model, Nominal
-from hilstar.charts import chart, plain_ticks, write_records
+from hilstar.charts import INK, SERIES, chart, label_ends, plain_ticks, write_records
 from hilstar.monitor.geometry import monitor_camera
 from hilstar.scene.camera import Camera
 from hilstar.study.geometry.doublet import TracedBench
@@ -59,6 +59,7 @@ STARS = 4000
 FAIL_ARCSEC = 1.0
 SEED = 7
 MARKERS = "osd^"
+SHORT = {"the same with a field of degree 4": "with a field, degree 4", "Brown-Conrady with tilt": "Brown-Conrady, tilt"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +77,7 @@ class Outcome:
 
 
 def run(directory: Path, quick: bool = False) -> list[str]:
-    """Measure, and write `geometry.csv` and `geometry.png`; a line for each model. Raises InputError."""
+    """Measure, and write `geometry.csv` and its chart; a line for each model. Raises InputError."""
     sizes = SIZES[1:4:2] if quick else SIZES
     noises = (USUAL_NOISE_PX, NOISES_PX[-1]) if quick else NOISES_PX
     shown = {Frames(*size, USUAL_NOISE_PX) for size in sizes} | {Frames(*USUAL_SIZE, noise) for noise in noises}
@@ -85,11 +86,10 @@ def run(directory: Path, quick: bool = False) -> list[str]:
     usual = [o for o in outcomes if (o.frames, o.dots_per_frame) == USUAL_SIZE and o.noise_px == USUAL_NOISE_PX]
     best = min(usual, key=lambda o: o.held_out_arcsec)
     finding = (
-        f"{USUAL_SIZE[0]} frames of {USUAL_SIZE[1]} dots with {USUAL_NOISE_PX:g} px of noise: uncalibrated, stars are off by"
-        f" {ideal_arcsec():.0f} arcsec rms; by {usual[0].model} fitted to the dots, {usual[0].stars_rms_arcsec:.0f};"
-        f" by the model that held-out dots choose ({best.model}), {best.stars_rms_arcsec:.2g}"
+        f"Uncalibrated stars are off by {ideal_arcsec():.0f} arcsec rms, by {usual[0].model} {usual[0].stars_rms_arcsec:.0f},"
+        f" by the model that held-out dots choose ({best.model}) {best.stars_rms_arcsec:.2g}"
     )
-    _draw(directory / "geometry.png", finding, outcomes)
+    _draw(directory / "geometry", finding, outcomes)
     return [finding, *(_line(outcome) for outcome in usual)]
 
 
@@ -149,8 +149,10 @@ def _line(outcome: Outcome) -> str:
 
 
 def _draw(path: Path, finding: str, outcomes: list[Outcome]) -> None:
-    with chart(path, finding, panels=2, share_x=False) as (dots, noise):
-        for model, marker in zip(MODELS, MARKERS, strict=True):
+    note = f"Solid: stars all over the screen. Dotted: dots that were held out. {USUAL_SIZE[0]} frames of {USUAL_SIZE[1]} dots"
+    note += f" with {USUAL_NOISE_PX:g} px of noise, one of the two varied."
+    with chart(path, finding, panels=2, share_x=False, note=note) as (dots, noise):
+        for model, marker, colour in zip(MODELS, MARKERS, SERIES, strict=False):
             mine = [o for o in outcomes if o.model == model.name]
             by_dots = sorted((o.centroids, o.stars_rms_arcsec, o.held_out_arcsec) for o in mine if o.noise_px == USUAL_NOISE_PX)
             by_noise = sorted(
@@ -158,13 +160,12 @@ def _draw(path: Path, finding: str, outcomes: list[Outcome]) -> None:
             )
             for axes, rows in ((dots, by_dots), (noise, by_noise)):
                 places, stars, held = zip(*rows, strict=True)
-                (line,) = axes.loglog(places, stars, marker=marker, label=f"{model.name}: stars")
-                axes.loglog(places, held, "--", color=line.get_color(), linewidth=1.0, label=f"{model.name}: held-out dots")
+                axes.loglog(places, stars, marker=marker, color=colour, label=SHORT.get(model.name, model.name))
+                axes.loglog(places, held, ":", color=colour, lw=1.2, label="_held out")
         for axes in (dots, noise):
-            axes.axhline(FAIL_ARCSEC, color="0.4", linewidth=0.8)
-            axes.annotate("fails above", (0.01, FAIL_ARCSEC), xycoords=("axes fraction", "data"), fontsize=8, va="bottom")
-            axes.set_ylabel("error [arcsec rms]")
-        dots.set_xlabel(f"centroids, each with {USUAL_NOISE_PX:g} px of noise")
-        noise.set_xlabel(f"noise of a centroid [px], {USUAL_SIZE[0]} frames of {USUAL_SIZE[1]} dots")
+            axes.axhline(FAIL_ARCSEC, color=INK, ls="--", lw=1.2, label="fails above")
+            axes.set_ylabel("error, rms [arcsec]")
+            label_ends(axes)
+        dots.set_xlabel("centroids [number]")
+        noise.set_xlabel("noise of a centroid [px]")
         plain_ticks(noise.xaxis, sorted({o.noise_px for o in outcomes}))
-        dots.legend(fontsize=8, ncols=2)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from hilstar.arrays import FloatArray
-from hilstar.charts import chart, write_csv
+from hilstar.charts import INK, MUTED, SERIES, chart, label_ends, write_csv
 from hilstar.sky.catalog import Catalog, load_catalog
 from hilstar.sky.electrons import Optics, Photometry, ags_electrons_per_s, dgs_electrons_per_s, star_temperatures_k
 from hilstar.sky.pickles import tabulate_pickles
@@ -33,7 +33,12 @@ def choices(directory: Path) -> Finding:
     text = "What each choice costs half of Hipparcos to V = 7.5 (95 %), CCD47-20, mag: " + ", ".join(
         f"{name.split()[-1]} {half:.2f} ({most:.2f})" for name, (half, most) in paid.items()
     )
-    _draw(directory / "choices.png", text, cost, percentiles, len(stars))
+    dearest = max(paid, key=lambda name: paid[name][1])
+    finding = (
+        f"Of the choices of brightness {dearest.split()[-1]} changes most: half of Hipparcos to V = {BRIGHT_V_MAG:g} by"
+        f" {paid[dearest][0]:.2f} mag and more, a twentieth by {paid[dearest][1]:.2f} mag"
+    )
+    _draw(directory / "choices", finding, cost, percentiles, len(stars))
     columns = ("bv_mag", *(f"{n.replace(' ', '_')}_mag" for n in cost))
     columns += ("pickles_p5_mag", "pickles_median_mag", "pickles_p95_mag", "stars_in_window")
     write_csv(directory / "choices.csv", columns, np.column_stack((BV_MAG, *cost.values(), *percentiles)).tolist())
@@ -76,21 +81,18 @@ def running_percentiles(bv_mag: FloatArray, value: FloatArray, at_bv_mag: FloatA
     return rows
 
 
-def _draw(path: Path, text: str, cost: dict[str, FloatArray], percentiles: FloatArray, star_count: int) -> None:
+def _draw(path: Path, finding: str, cost: dict[str, FloatArray], percentiles: FloatArray, star_count: int) -> None:
     low, middle, high, _ = percentiles
-    with chart(path, text, panels=2) as (upper, lower):
-        for name, mag in cost.items():
-            upper.plot(BV_MAG, mag, label=name)
-        for axis in (upper, lower):
-            axis.plot(BV_MAG, middle, "k", label="spectrum pickles, median of real stars")
-            axis.axhline(0, color="0.5", lw=1)
-            axis.set(ylabel="cost against the black body [mag],\n+ is fainter")
-        label = f"5 to 95 % of {star_count} Hipparcos stars to V = {BRIGHT_V_MAG:g}"
-        lower.fill_between(BV_MAG, low, high, color="0.7", alpha=0.6, label=label)
-        reddest = (
-            f"M giants share the B-V of K giants: up to {-np.nanmin(low):.1f} mag brighter than the black body (5 % of stars)"
-        )
+    note = f"Band: 5 to 95 % of {star_count} Hipparcos stars. M giants share the B-V of K giants, and are up to"
+    note += f" {-np.nanmin(low):.1f} mag brighter than the black body. + is fainter; CCD47-20."
+    with chart(path, finding, panels=2, note=note) as (upper, lower):
+        for (name, mag), colour in zip(cost.items(), SERIES, strict=False):
+            upper.plot(BV_MAG, mag, color=colour, label=name.split()[-1])
+        for axes in (upper, lower):
+            axes.plot(BV_MAG, middle, color=INK, label="pickles, median")
+            axes.axhline(0, color=MUTED, lw=1)
+            axes.set(ylabel="cost against a black body [mag]")
+        lower.fill_between(BV_MAG, low, high, color=MUTED, alpha=0.35, lw=0)
         lower.set(xlabel="B-V [mag]")
-        lower.set_title(reddest, fontsize=11)
-        upper.legend(fontsize=10, loc="lower left")
-        lower.legend(fontsize=10, loc="lower left")
+        for axes in (upper, lower):
+            label_ends(axes)

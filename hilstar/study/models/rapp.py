@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from hilstar.arrays import FloatArray
-from hilstar.charts import chart, plain_ticks, write_csv
+from hilstar.charts import MUTED, SERIES, chart, label_ends, plain_ticks, write_csv
 from hilstar.sky.electrons import (
     REFERENCE_TEMPERATURE_K,
     Optics,
@@ -42,7 +42,11 @@ def rapp(directory: Path, sensor: str) -> Finding:
         + THESIS_HOT_STARS.get(sensor, "")
     )
     finding = Finding(f"rapp_{sensor}", text)
-    _draw(directory, finding, kelvin, ratios, optics.range_nm)
+    title = (
+        f"{SENSORS[sensor]}: a black body of 3000 K gives {coolest:.2f} times the electrons of the average model,"
+        f" one of 5000 K {cool:.2f} times"
+    )
+    _draw(directory / finding.figure, title, kelvin, ratios, optics.range_nm)
     columns = ("temperature_k", *(f"rapp{k}_{weighting}" for weighting in WEIGHTINGS for k in (1, 2, 3)))
     table = np.column_stack((kelvin, *(ratios[weighting][k] for weighting in WEIGHTINGS for k in range(3))))
     write_csv(directory / f"{finding.figure}.csv", columns, table.tolist())
@@ -70,15 +74,14 @@ def rapp_ratios(temperature_k: FloatArray, optics: Optics, weighting: Weighting)
     return np.stack((irradiance, photons, electrons))
 
 
-def _draw(directory: Path, finding: Finding, kelvin: FloatArray, ratios: Ratios, range_nm: tuple[float, float]) -> None:
+def _draw(path: Path, title: str, kelvin: FloatArray, ratios: Ratios, range_nm: tuple[float, float]) -> None:
     low_nm, high_nm = range_nm
-    with chart(directory / f"{finding.figure}.png", finding.text) as (axis,):
-        for k, name in enumerate(("RAPP1 irradiance", "RAPP2 photons", "RAPP3 electrons")):
-            (line,) = axis.plot(kelvin, ratios["energy"][k], label=f"{name}, energy weighting")
-            axis.plot(kelvin, ratios["photon"][k], "--", color=line.get_color(), label=f"{name}, photon weighting (source)")
-        axis.axhline(1, color="0.5", lw=1)
-        axis.set(xscale="log", yscale="log", ylabel=f"DGS / AGS at the same V, {low_nm:.0f} to {high_nm:.0f} nm [1]")
-        axis.set(xlabel="black-body temperature [K]")
-        plain_ticks(axis.xaxis, (3000, 4000, 5000, 7000, 9000, 15_000, 20_000, 30_000, 50_000))
-        plain_ticks(axis.yaxis, (0.8, 0.9, 1, 1.2, 1.4, 1.6, 2, 2.5))
-        axis.legend(loc="upper right" if finding.figure.endswith("kai-4021") else "upper center", fontsize=10)
+    note = f"DGS over AGS at one V, {low_nm:.0f} to {high_nm:.0f} nm. Solid: energy weighting; dotted: photon (source)."
+    with chart(path, title, note=note) as (axes,):
+        for k, (name, colour) in enumerate(zip(("irradiance", "photons", "electrons"), SERIES, strict=False)):
+            axes.loglog(kelvin, ratios["energy"][k], color=colour, label=name)
+            axes.loglog(kelvin, ratios["photon"][k], ":", color=colour, label="_photon weighting")
+        axes.axhline(1, color=MUTED, lw=1)
+        axes.set(xlabel="black-body temperature [K]", ylabel="ratio of the models [1]")
+        plain_ticks(axes.xaxis, (3000, 5000, 9000, 15_000, 30_000, 50_000))
+        label_ends(axes)

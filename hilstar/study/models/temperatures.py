@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from hilstar.arrays import FloatArray
-from hilstar.charts import chart, plain_ticks, write_csv
+from hilstar.charts import BLUE, INK, MUTED, ORANGE, chart, label_ends, write_csv
 from hilstar.sky.catalog import load_catalog
 from hilstar.sky.electrons import Photometry, dgs_electrons_per_s
 from hilstar.sky.spectrum import TEMPERATURE_SCALES
@@ -66,7 +66,10 @@ def temperature_scales(directory: Path) -> Finding:
         + ", ".join(f"{half:.3f} ({most:.2f}) mag by {name}" for name, (half, most) in within.items())
         + " of Torres 2010"
     )
-    _draw(directory / "temperature_scales.png", text, scales)
+    finding = f"The scale wang2021 steps down by {step_k:.0f} K at B-V = 0; half of Hipparcos is within " + ", ".join(
+        f"{half:.3f} mag by {name}" for name, (half, _) in within.items()
+    )
+    _draw(directory / "temperature_scales", f"{finding} of Torres 2010", scales)
     groups = (("k", scales.kelvin), ("percent", scales.percent), ("mag", scales.mag))
     columns = ("bv_mag", "torres2010_k", *(f"{name}_{unit}" for unit, values in groups for name in values))
     table = np.column_stack((bv, scales.torres_k, *(value for _, values in groups for value in values.values())))
@@ -93,17 +96,19 @@ def torres2010_k(bv_mag: FloatArray, supergiant: bool = False) -> FloatArray:
     return np.asarray(10 ** np.polynomial.polynomial.polyval(bv_mag, coefficients))
 
 
-def _draw(path: Path, text: str, scales: Scales) -> None:
-    with chart(path, text, panels=3) as axes:
-        axes[0].plot(scales.bv_mag, scales.torres_k, "k", label="Torres 2010 (Flower), dwarfs to giants: the reference below")
-        for axis, values in zip(axes, (scales.kelvin, scales.percent, scales.mag), strict=True):
-            for (name, value), style in zip(values.items(), ("k:", "C0", "C1"), strict=True):
-                axis.plot(scales.bv_mag, value, style, label=name.replace("torres2010_supergiant", "Torres 2010, supergiants"))
-        for axis in axes[1:]:
-            axis.axhline(0, color="k", lw=1)
-        axes[0].set(yscale="log", ylabel="temperature [K]")
-        plain_ticks(axes[0].yaxis, (3000, 4000, 6000, 10_000, 20_000, 40_000))
-        axes[1].set(ylabel="temperature against Torres 2010 [%]", ylim=(-75, 45))
-        axes[2].set(xlabel="B-V [mag]", ylabel="CCD47-20 electrons against\nTorres 2010 [mag], + is fainter")
-        for axis in axes:
-            axis.legend(fontsize=10)
+def _draw(path: Path, finding: str, scales: Scales) -> None:
+    note = "Torres 2010 (Flower 1996) for dwarfs and giants is the reference. Electrons: CCD47-20, + is fainter."
+    with chart(path, finding, panels=3, note=note) as panels:
+        kelvin, percent, mag = panels
+        kelvin.plot(scales.bv_mag, scales.torres_k, color=INK, label="Torres 2010")
+        for axes, values in zip(panels, (scales.kelvin, scales.percent, scales.mag), strict=True):
+            for (name, value), style, colour in zip(values.items(), (":", "-", "-"), (MUTED, BLUE, ORANGE), strict=True):
+                words = name.replace("torres2010_supergiant", "Torres, supergiants")
+                axes.plot(scales.bv_mag, value, style, color=colour, label=words)
+        for axes in (percent, mag):
+            axes.axhline(0, color=INK, lw=1)
+        kelvin.set(yscale="log", ylabel="temperature [K]")
+        percent.set(ylabel="difference [%]")
+        mag.set(xlabel="B-V [mag]", ylabel="difference in electrons [mag]")
+        for axes in panels:
+            label_ends(axes)

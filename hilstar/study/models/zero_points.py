@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from hilstar.arrays import FloatArray
-from hilstar.charts import chart, write_csv
+from hilstar.charts import BLUE, ORANGE, SMALL_PT, chart, write_csv
 from hilstar.sky.electrons import REFERENCE_TEMPERATURE_K, Photometry, dgs_electrons_per_s
 from hilstar.study.models.finding import Finding
 from hilstar.study.models.settings import SENSORS, WEIGHTINGS
@@ -29,7 +29,7 @@ def zero_points(directory: Path) -> Finding:
         f"A V = 0 star of 9602 K gives {base[0] / 1e6:.1f} million electrons/s by Vega's flux (CCD47-20, 30 mm),"
         f" {100 * (1 - base[2] / base[0]):.0f} % ({cost[2]:.2f} mag) fewer by the IAU's bolometric zero point"
     )
-    _draw(directory / "zero_points.png", text, rates, mag)
+    _draw(directory / "zero_points", text, rates, mag)
     rows = [
         (sensor, p.zero_point, p.weighting, float(rate), float(m))
         for sensor in SENSORS
@@ -43,14 +43,13 @@ def zero_points(directory: Path) -> Finding:
 def _draw(path: Path, text: str, rates: dict[str, FloatArray], mag: dict[str, FloatArray]) -> None:
     with chart(path, text, panels=2) as (upper, lower):
         place = np.arange(len(SETTINGS))
-        for k, (sensor, name) in enumerate(SENSORS.items()):
-            for axis, height, figure in ((upper, rates[sensor] / 1e6, "%.2f"), (lower, mag[sensor], "%+.3f")):
-                bars = axis.bar(place + 0.4 * k - 0.2, height, 0.38, label=name)
-                axis.bar_label(bars, fmt=figure, padding=2)
-        upper.set(ylabel="electrons per second [millions]", ylim=(0, 1.15 * rates["ccd47-20"].max() / 1e6))
+        for k, ((sensor, name), colour) in enumerate(zip(SENSORS.items(), (BLUE, ORANGE), strict=True)):
+            for axes, height, figure in ((upper, rates[sensor] / 1e6, "%.2f"), (lower, mag[sensor], "%+.3f")):
+                bars = axes.bar(place + 0.4 * k - 0.2, height, 0.38, color=colour, label=name)
+                axes.bar_label(bars, fmt=figure, padding=2, fontsize=SMALL_PT)
+        upper.set(ylabel="electrons a second [millions]", ylim=(0, 1.3 * rates["ccd47-20"].max() / 1e6))
         lower.set_xticks(place, [f"{p.zero_point},\n{p.weighting} weighting" for p in SETTINGS])
-        lower.set(
-            ylabel="against vega, energy [mag],\n+ is fainter", xlabel="zero point, passband weighting", ylim=(-0.05, 0.38)
-        )
-        upper.legend()
-        lower.legend(loc="upper left")
+        lower.set(ylabel="fainter than vega, energy [mag]", xlabel="zero point, weighting of the passband", ylim=(-0.06, 0.42))
+        for axes in (upper, lower):
+            axes.grid(visible=False, axis="x")
+            axes.legend(loc="upper left", ncols=2)

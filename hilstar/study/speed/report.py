@@ -76,9 +76,8 @@ def _draw(path: Path, result: Result) -> None:
     sizes = _sizes(result.rows)
     across = min(2, len(sizes))
     down = -(-len(sizes) // across)
-    note = f"Medians on {result.gl_renderer}, {result.machine.cores} cores."
     height = 2.1 + 2.5 * down
-    with chart(path, _finding(result), down, across, note=note, share_x=True, share_y=True, height_inch=height) as grid:
+    with chart(path, _finding(result), down, across, share_x=True, share_y=True, height_inch=height) as grid:
         for axes in grid[len(sizes) :]:
             axes.set_axis_off()
         for axes, size in zip(grid, sizes, strict=False):
@@ -102,7 +101,8 @@ def _finding(result: Result) -> str:
     first, last = (pick(whole, key=lambda row: row.ms.median) for pick in (min, max))
     parts = [f"{row.ms.median:.1f} ms with {row.stars} stars on {_words(row.size)}" for row in (first, last)]
     busy = ", beside other work: no winner is named" if is_busy(result.others_cores) else ""
-    return f"A whole frame takes {parts[0]} and {parts[1]}{busy}"
+    where = f"{result.gl_renderer}, {result.machine.cores} cores"
+    return f"A whole frame takes {parts[0]} and {parts[1]} ({where}{busy})"
 
 
 def _named(rows: Sequence[Timing]) -> dict[str, dict[int, float]]:

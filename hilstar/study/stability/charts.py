@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hilstar.charts import chart, plain_ticks, write_csv
+from hilstar.charts import BLUE, GREEN, INK, MUTED, ORANGE, PURPLE, chart, label_ends, plain_ticks, two_digits, write_csv
 from hilstar.study.stability.attitude import sampled_error_arcsec, straight_line, way_error_arcsec
 from hilstar.study.stability.field import weak_perspective_error
 from hilstar.study.stability.image import SIGMA_PX, by_renderer, narrow_errors, point_sampled, target
@@ -24,7 +24,7 @@ from hilstar.units import magnitude
 
 
 def draw_charts(directory: Path) -> None:
-    """Write each chart (PNG) and its table (CSV) into `directory`."""
+    """Write each chart and its table (CSV) into `directory`."""
     for draw in (narrow_sigmas, weak_perspectives, ripples, turns):
         draw(directory)
 
@@ -38,22 +38,21 @@ def narrow_sigmas(directory: Path) -> None:
     columns = ("sigma_px", "flux_error", "centroid_error_px", "sampled_flux_error", "sampled_centroid_error_px")
     write_csv(directory / "narrow_stars.csv", columns, rows)
     sigma, flux, off_px, sampled_flux, sampled_px = np.array(rows).T
-    at, wide = int(np.abs(sigmas_px - 0.5).argmin()), sigmas_px > 0.85
-    either = float(np.maximum(flux, sampled_flux)[wide].max())
+    at = int(np.abs(sigmas_px - 0.5).argmin())
     finding = (
-        f"At sigma {sigma[at]:.2f} px point sampling is off by {100 * sampled_flux[at]:.1f} % in flux and"
-        f" {sampled_px[at]:.3f} px in centroid, integration over pixels by {100 * flux[at]:.5f} % and {off_px[at]:.4f} px."
-        f" Above 0.85 px both are within {either:.0e} in flux"
+        f"At sigma {sigma[at]:.2f} px a star sampled at pixel middles is off by {100 * sampled_flux[at]:.1f} % and"
+        f" {sampled_px[at]:.3f} px, integrated over pixels by {100 * flux[at]:.5f} % and {off_px[at]:.4f} px"
     )
-    with chart(directory / "narrow_stars.png", finding, panels=2) as (above, below):
-        for axis, theirs, ours in ((above, sampled_flux, flux), (below, sampled_px, off_px)):
-            axis.plot(sigma, theirs, "C3", label="the Gaussian's value at the middle of each pixel")
-            axis.plot(sigma, ours, "C0", label="integrated over pixels (hilstar)")
-            axis.set(xscale="log", yscale="log")
-        above.set(ylabel="flux error, relative\nlargest over phases")
-        below.set(ylabel="centre of gravity [px]\nlargest error over phases", xlabel="sigma of the star [px]")
-        plain_ticks(below.xaxis, (0.1, 0.2, 0.3, 0.5, 0.85, 1, 2))
-        above.legend()
+    note = "Largest errors over sub-pixel phases; the place by the centre of gravity."
+    with chart(directory / "narrow_stars", finding, panels=2, note=note) as (above, below):
+        for axes, theirs, ours in ((above, sampled_flux, flux), (below, sampled_px, off_px)):
+            axes.loglog(sigma, theirs, color=ORANGE, label="sampled")
+            axes.loglog(sigma, ours, color=BLUE, label="integrated (hilstar)")
+        above.set(ylabel="flux error [share]")
+        below.set(ylabel="place error [px]", xlabel="sigma of the star [px]")
+        plain_ticks(below.xaxis, (0.1, 0.2, 0.3, 0.5, 0.85, 1.2, 2))
+        for axes in (above, below):
+            label_ends(axes)
 
 
 def weak_perspectives(directory: Path) -> None:
@@ -64,12 +63,13 @@ def weak_perspectives(directory: Path) -> None:
     write_csv(directory / "weak_perspective.csv", ("field_angle_deg", "error_px", "error_arcsec"), rows)
     at_px, at_arcsec = (float(off[0]) for off in weak_perspective_error(np.array([10.0])))
     finding = (
-        f"With the demo's lens and monitor, weak perspective (one depth for every star) is off by {abs(at_px):.0f} px or"
-        f" {abs(at_arcsec):.0f} arcsec at a field angle of ten degrees, and by an eighth of that at five"
+        f"Weak perspective (one depth for every star) is off by {abs(at_px):.0f} px or {abs(at_arcsec):.0f} arcsec ten degrees"
+        " from the axis, and by an eighth of that at five"
     )
-    with chart(directory / "weak_perspective.png", finding, panels=2) as (above, below):
-        above.plot(angle_deg, np.abs(off_px), "C3")
-        below.plot(angle_deg, np.abs(off_arcsec), "C3")
+    note = "With the demo's lens and monitor. Perspective proper, as hilstar has it, has no such error."
+    with chart(directory / "weak_perspective", finding, panels=2, note=note) as (above, below):
+        above.plot(angle_deg, np.abs(off_px), color=INK)
+        below.plot(angle_deg, np.abs(off_arcsec), color=INK)
         above.set(xscale="log", yscale="log", ylabel="error [monitor px]")
         below.set(yscale="log", ylabel="error [arcsec]", xlabel="field angle [deg]")
         plain_ticks(below.xaxis, (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 60))
@@ -92,21 +92,19 @@ def ripples(directory: Path) -> None:
     write_csv(directory / "popping.csv", columns, np.column_stack([step_px, *off_mag.values()]).tolist())
     spread = {name: float(np.ptp(mag)) for name, mag in off_mag.items()}
     finding = (
-        f"A star {CODES_MAG_UNDER_WHITE:g} mag under white, {CODES_BITS} bits, sigma {SIGMA_PX:g} px, moves in {STEPS}"
-        f" sub-pixel steps: its light varies by {spread['linear image']:.1e} mag in the linear image,"
-        f" by {spread['codes, exact']:.3f} with exact codes and by {spread['codes, round']:.3f} with rounded ones"
+        f"Moved in sub-pixel steps a star's light varies by {spread['codes, exact']:.3f} mag with exact codes and by"
+        f" {spread['codes, round']:.3f} mag with rounded ones"
     )
-    with chart(directory / "popping.png", finding, panels=2) as (above, below):
-        for (name, mag), colour in zip(off_mag.items(), ("C1", "C3", "C0", "k"), strict=True):
-            above.plot(step_px, mag, colour, label=name, lw=1.0)
-        below.plot(step_px, 1e6 * off_mag["linear image"], "k", lw=1.0)
+    note = f"A star {CODES_MAG_UNDER_WHITE:g} mag under white, {CODES_BITS} bits, sigma {SIGMA_PX:g} px, {STEPS} steps;"
+    note += f" it moves in y by {PATH_PX[1] / PATH_PX[0]:.2f} of its way in x."
+    with chart(directory / "popping", finding, panels=2, note=note) as (above, below):
+        for (name, mag), colour in zip(off_mag.items(), (GREEN, ORANGE, BLUE, INK), strict=True):
+            above.plot(step_px, mag, color=colour, label=name, lw=1.0)
+        below.plot(step_px, 1e6 * off_mag["linear image"], color=INK, lw=1.0, label="linear image")
         above.set(ylabel="light lost [mag]")
-        below.set(
-            ylabel="linear image alone,\nlight lost [1e-6 mag]",
-            xlabel=f"displacement in x [px]; that in y is {PATH_PX[1] / PATH_PX[0]:.2f} of it",
-        )
-        above.margins(y=0.2)
-        above.legend(ncols=4, loc="upper center")
+        below.set(ylabel="light lost [millionths of a mag]", xlabel="displacement in x [px]")
+        for axes in (above, below):
+            label_ends(axes)
 
 
 def turns(directory: Path) -> None:
@@ -122,12 +120,17 @@ def turns(directory: Path) -> None:
     largest = max(curves["samples with rates"])
     finding = (
         "Beyond half a turn between samples SLERP takes the wrong way round; with rates a steady turn is followed"
-        f" within {largest:.0e} arcsec up to {turn_deg[-1]:.0f} degrees"
+        f" within {two_digits(largest)} arcsec"
     )
-    with chart(directory / "turns.png", finding) as (axis,):
-        for (name, errors), style in zip(curves.items(), ("C1", "C3", "C0"), strict=True):
-            axis.plot(turn_deg, np.maximum(errors, 1e-12), style, label=name)
+    with chart(directory / "turns", finding) as (axis,):
+        for (name, errors), colour in zip(curves.items(), (PURPLE, ORANGE, BLUE), strict=True):
+            axis.plot(
+                turn_deg,
+                np.maximum(errors, 1e-12),
+                color=colour,
+                label=name.replace("samples ", "").replace(", normalised", ""),
+            )
         axis.set(yscale="log", xlabel="turn between samples [deg]", ylabel="largest error between samples [arcsec]")
         plain_ticks(axis.xaxis, (0, 60, 120, 180, 240, 300, 360))
-        axis.axvline(180, color="k", ls="--", lw=1.0)
-        axis.legend(loc="center right")
+        axis.axvline(180, color=MUTED, ls="--", lw=1.0)
+        label_ends(axis)

@@ -14,7 +14,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from hilstar.arrays import FloatArray
-from hilstar.charts import chart, write_records
+from hilstar.charts import SERIES, chart, label_ends, plain_ticks, write_records
 from hilstar.run.sync.beat import ARCSEC_PER_DEG, Exposures, beat, seen_at
 from hilstar.scene.exposure_motion import Motion
 from hilstar.study.shared.lone_stars import Isolation, centroid_px, lone_windows
@@ -23,6 +23,7 @@ from hilstar.study.timing.slew import Slew
 from hilstar.units import magnitude
 
 RATE_DEG_S = 1.0
+PLACE_TICKS = (-100, -30, -10, -3, -1, 0, 1, 3, 10, 30, 100)
 STARTS = 3  # of exposures within a refresh, for phases between the rows of stars
 STEP_S = 0.5e-3  # to either side, for a star's speed on the detector
 ISOLATION = Isolation(margin_px=8.0, max_share=1e-3)
@@ -113,16 +114,16 @@ def _rows_and_speeds(panel: ScanningPanel, slew: Slew, stars: np.ndarray) -> tup
 
 
 def beat_findings(points: list[BeatPoint], directory: Path) -> list[str]:
-    """Write `beat.csv` and `beat.png`; a line for each case. Raises InputError."""
+    """Write `beat.csv` and its chart; a line for each case. Raises InputError."""
     write_records(directory / "beat.csv", points)
     cases = list(dict.fromkeys(Case(p.refreshes, p.lit) for p in points))
     lines = [_line(case, [p for p in points if Case(p.refreshes, p.lit) == case]) for case in cases]
     off = np.array([p.off_arcsec - p.foretold_arcsec for p in points])
     finding = (
-        f"What a tracker sees of a screen that refreshes, at {RATE_DEG_S:g} deg/s, is what the phase between them foretells,"
-        f" within {np.sqrt(np.mean(off**2)):.2g} arcsec rms: whole refreshes of rows that stay lit have no beat"
+        f"The beat of exposure and refresh moves a star at {RATE_DEG_S:g} deg/s as foretold from their phase,"
+        f" within {np.sqrt(np.mean(off**2)):.2g} arcsec rms"
     )
-    _draw(directory / "beat.png", finding, cases, points)
+    _draw(directory / "beat", finding, cases, points)
     return [finding, *lines]
 
 
@@ -140,18 +141,19 @@ def _line(case: Case, points: list[BeatPoint]) -> str:
 
 def _draw(path: Path, finding: str, cases: list[Case], points: list[BeatPoint]) -> None:
     phases = np.linspace(0, 1, 801)
-    with chart(path, finding, panels=2) as (place, light):
-        for case in cases:
+    note = "Lines: foretold. Dots: stars of the virtual tracker. Whole refreshes of rows that stay lit have no beat."
+    with chart(path, finding, panels=2, note=note) as (place, light):
+        for case, colour in zip(cases, SERIES, strict=False):
             mine = [p for p in points if Case(p.refreshes, p.lit) == case]
             foretold = seen_at(Exposures(60.0, case.refreshes / 60.0, lit_s=case.lit / 60.0), phases)
-            (line,) = place.plot(phases, foretold.off_s * RATE_DEG_S * ARCSEC_PER_DEG)
-            place.plot([p.phase for p in mine], [p.off_arcsec for p in mine], "o", markersize=3.5, color=line.get_color())
-            light.plot(phases, [magnitude(float(part)) for part in foretold.light], color=line.get_color(), label=case.words)
-            light.plot([p.phase for p in mine], [p.light_mag for p in mine], "o", markersize=3.5, color=line.get_color())
-        place.set_ylabel(f"place at {RATE_DEG_S:g} deg/s [arcsec]")
+            place.plot(phases, foretold.off_s * RATE_DEG_S * ARCSEC_PER_DEG, color=colour, label=case.words)
+            light.plot(phases, [magnitude(float(part)) for part in foretold.light], color=colour, label=case.words)
+            for axes, seen in ((place, "off_arcsec"), (light, "light_mag")):
+                axes.plot([p.phase for p in mine], [getattr(p, seen) for p in mine], "o", ms=3.5, color=colour, label="_seen")
+        place.set_ylabel("shift of its place [arcsec]")
         place.set_yscale("symlog", linthresh=1.0)
-        light.set_ylabel("light [mag]")
-        light.legend(loc="lower center", fontsize=9)
-        light.set_xlabel(
-            "the exposure begins after a row lights [refreshes]; lines: foretold, dots: stars of the virtual tracker"
-        )
+        plain_ticks(place.yaxis, [tick for tick in PLACE_TICKS if abs(tick) <= max(map(abs, place.get_ylim()))])
+        light.set_ylabel("change of its light [mag]")
+        light.set_xlabel("start of the exposure after a row lights [refreshes]")
+        for axes in (place, light):
+            label_ends(axes)

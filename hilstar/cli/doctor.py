@@ -16,12 +16,26 @@ OwnBench = Annotated[
     Path | None,
     typer.Argument(metavar="[BENCH.toml]", help="A bench file, or one with heads, to be checked too.", show_default=False),
 ]
+Report = Annotated[
+    bool,
+    typer.Option(
+        "--report", help="Print this machine as a row of the table of docs/where-it-fails.md, without names or serial numbers."
+    ),
+]
 
 
-def doctor(bench_file: OwnBench = None, as_json: Json = False) -> None:
+def doctor(bench_file: OwnBench = None, as_json: Json = False, report: Report = False) -> None:
     """Check this machine's OpenGL, displays, links and files, and say what is missing; of a bench file, what it means."""
     from hilstar.run.doctor import examine, examine_bench
+    from hilstar.run.machine_row import row, table
 
+    if report:
+        cells = row()
+        if as_json:
+            print_json(cells)
+        else:
+            typer.echo(table(cells))
+        return
     benches = {} if bench_file is None else examine_bench(bench_file)
     result = examine()
     for fields in benches.values():

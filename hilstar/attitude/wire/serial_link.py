@@ -47,6 +47,13 @@ def serial_ports() -> list[str]:
     return [f"{port.device} ({port.description})" for port in sorted(list_ports.comports())]
 
 
+def adapters() -> list[str]:
+    """What the serial ports are, without their names and serial numbers: "FT232R USB UART (0403:6001)"."""
+    ports = sorted(list_ports.comports())
+    words = [f"{port.product or 'USB'} ({port.vid:04x}:{port.pid:04x})" if port.vid is not None else "UART" for port in ports]
+    return [f"{words.count(word)} x {word}" if words.count(word) > 1 else word for word in dict.fromkeys(words)]
+
+
 class Chunk(NamedTuple):
     """Bytes that were read at once: when, and if a process that only reads did it, how long they may have waited unread.
 

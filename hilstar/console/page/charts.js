@@ -1,13 +1,15 @@
 // A chart along time: lines, or bands from minimum to maximum, and marks where something was lost. What it shows is written in words too.
 
 import { ChartRange } from "./chart_range.js";
-import { fixed, make, withUnit, write } from "./format.js";
+import { duration, fixed, make, quantity, write } from "./format.js";
 
-const HEIGHT = 132;
+const HEIGHT = 144;
 const LEFT = 44;
 const BOTTOM = 20;
-const TOP = 8;
+const TOP = 22;
 const RIGHT = 10;
+const RECENT_S = 2; // a value that is older is none
+const IN_SECONDS_MS = 2000; // an axis of more is in s
 const CROWDED_PX = 16; // between marks, from which their lines would hide the curves
 const STEPS = [1, 2, 2.5, 5, 10];
 const TIME_STEPS_S = [0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 14400, 28800, 86400];
@@ -43,7 +45,7 @@ export function envelope(t, low, high, from, to, columns) {
 
 // series: {name, unit, digits, ink, t, low, high}; marks: {name, ink, t, n}. Times in s, low and high in the chart's unit.
 export class Chart {
-  constructor(figure, { title, unit, ink, onPick = null, onRange = null }) {
+  constructor(figure, { title, unit, ink, note = "", onPick = null, onRange = null }) {
     Object.assign(this, { figure, unit, ink, onPick, series: [], marks: [], from: -60, to: 0, cursor: null, hover: null, chosen: null });
     const head = make("figcaption", "panel-head");
     this.heading = make("h2", "", title);
@@ -53,7 +55,7 @@ export class Chart {
     this.canvas.setAttribute("role", "img");
     this.text = make("p", "second figure chart-text");
     this.legend = make("p", "legend");
-    figure.append(head, this.canvas, this.text, this.legend);
+    figure.append(head, ...(note ? [make("p", "second", note)] : []), this.canvas, this.text, this.legend);
     this.context = this.canvas.getContext("2d");
     this.canvas.addEventListener("pointermove", (event) => this.point(event));
     this.canvas.addEventListener("pointerleave", () => this.point(null));
@@ -119,7 +121,11 @@ export class Chart {
     context.textBaseline = "middle";
     context.textAlign = "right";
     context.lineWidth = 1;
-    const digits = Math.max(0, -Math.floor(Math.log10(this.step) + 1e-9) + (this.step / 10 ** Math.floor(Math.log10(this.step)) === 2.5 ? 1 : 0));
+    const [scale, unit] = this.unit === "ms" && Math.max(this.top, -this.bottom) >= IN_SECONDS_MS ? [1000, "s"] : [1, this.unit];
+    const step = this.step / scale;
+    const digits = Math.max(0, -Math.floor(Math.log10(step) + 1e-9) + (step / 10 ** Math.floor(Math.log10(step)) === 2.5 ? 1 : 0));
+    context.fillStyle = ink.muted;
+    context.fillText(unit, LEFT - 6, 6);
     for (let value = this.bottom; value <= this.top + this.step * 0.01; value += this.step) {
       const y = Math.round(this.y(value)) + 0.5;
       context.strokeStyle = Math.abs(value) < this.step / 100 ? ink.axis : ink.gridLine;
@@ -128,7 +134,7 @@ export class Chart {
       context.lineTo(this.w - RIGHT, y);
       context.stroke();
       context.fillStyle = ink.muted;
-      context.fillText(fixed(value, digits), LEFT - 6, y);
+      context.fillText(fixed(value / scale, digits), LEFT - 6, y);
     }
     this.drawTimes();
   }
@@ -256,12 +262,12 @@ export class Chart {
     const parts = this.series.map((one, k) => {
       const [lows, highs] = this.bands[k];
       const seen = [Math.min(...lows), Math.max(...highs)];
-      const value = at === null ? lastOf(one) : valueAt(one, at);
+      const value = at === null ? lastOf(one, this.to) : valueAt(one, at);
       return { one, value, seen };
     });
     const named = parts.length > 1;
-    write(this.now, parts.length ? withUnit(parts[0].value, this.unit, parts[0].one.digits).trim() : "");
-    const range = parts.map(({ one, seen }) => (Number.isFinite(seen[0]) ? `${named ? `${one.name} ` : ""}${fixed(seen[0], one.digits)} to ${fixed(seen[1], one.digits)}\u00a0${this.unit}` : `${named ? `${one.name} ` : ""}no value`));
+    write(this.now, parts.length ? quantity(parts[0].value, this.unit, parts[0].one.digits) : "");
+    const range = parts.map(({ one, seen }) => (Number.isFinite(seen[0]) ? `${named ? `${one.name} ` : ""}${rangeText(seen, this.unit, one.digits)}` : `${named ? `${one.name} ` : ""}no value`));
     const lost = this.marks.filter((mark) => !mark.flag).map(({ name, t, n }) => `${t.reduce((sum, at, k) => sum + (at >= this.from && at <= this.to ? n[k] || 0 : 0), 0)} ${name}`);
     const where = at === null ? "" : `at ${timeText(at, 1)}${Math.abs(at) <= 90 ? "\u00a0s" : ""}; `;
     const words = where + [...range, ...lost].join(" \u00b7 ");
@@ -281,9 +287,15 @@ export class Chart {
   }
 }
 
-function lastOf({ high }) {
-  for (let k = high.length - 1; k >= 0; k -= 1) if (high[k] !== null && high[k] !== undefined) return k === high.length - 1 ? high[k] : null;
+// The newest value, if it is recent: a slow run has points without a frame.
+function lastOf({ t, high }, to) {
+  for (let k = high.length - 1; k >= 0 && t[k] >= to - RECENT_S; k -= 1) if (high[k] !== null && high[k] !== undefined) return high[k];
   return null;
+}
+
+function rangeText([low, high], unit, digits) {
+  if (unit === "ms" && high >= 1000) return `${duration(low / 1000, digits)} to ${duration(high / 1000, digits)}`;
+  return `${fixed(low, digits)} to ${quantity(high, unit, digits)}`;
 }
 
 function valueAt({ t, high }, at) {

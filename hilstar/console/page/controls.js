@@ -21,7 +21,8 @@ export class Controls {
 
   setUp({ control, faults }) {
     this.allowed = control;
-    write(byId("control-state"), control ? "may act" : "read-only");
+    write(byId("control-state"), control ? "control on" : "read-only");
+    byId("control-state").title = control ? "hilstar was started with --control: these buttons change what the monitor shows, and the ledger" : "start hilstar with --control to act from here";
     byId("control-state").dataset.state = control ? "ok" : "";
     for (const field of document.querySelectorAll(".controls-panel :is(button, input, select)")) field.disabled = !control;
     const note = byId("controls-note");
@@ -47,8 +48,16 @@ export class Controls {
     for (const [name, words] of Object.entries(SWITCHES)) {
       const button = byId(`control-${name}`);
       button.setAttribute("aria-pressed", String(Boolean(this.on[name])));
-      if (this.armed?.name !== name) write(button, words);
+      if (this.armed?.name !== name) write(button, this.wordsOf(name, words));
     }
+    const said = byId("ledger-said");
+    write(said, ledger === null ? "off: nothing of this run is kept" : ledger.failing ? "cannot be written" : "records this run");
+    said.dataset.state = ledger === null ? "warn" : ledger.failing ? "bad" : "ok";
+  }
+
+  // A switch has its name on it, the ledger's button what it does.
+  wordsOf(name, words = SWITCHES[name]) {
+    return name === "ledger" ? (this.on.ledger ? "Stop" : "Start") : words;
   }
 
   // Blanking, and ending a ledger, take a second press within three seconds.
@@ -79,7 +88,7 @@ export class Controls {
     const { name } = this.armed;
     this.armed = null;
     byId(`control-${name}`).classList.remove("armed");
-    write(byId(`control-${name}`), SWITCHES[name]);
+    write(byId(`control-${name}`), this.wordsOf(name));
     this.say("", true);
   }
 

@@ -44,13 +44,22 @@ export function bytes(value) {
   return `${size.toFixed(k === 0 ? 0 : 1)}\u00a0${units[k]}`;
 }
 
-export function duration(seconds) {
-  if (seconds === null || !Number.isFinite(seconds)) return "";
-  const s = Math.max(seconds, 0);
-  if (s < 60) return `${s.toFixed(1)}\u00a0s`;
+// Every duration of the page: ms below 1 s (with so many digits), then s, min, h.
+export function duration(seconds, digits = 0) {
+  if (seconds === null || seconds === undefined || !Number.isFinite(seconds)) return "";
+  const sign = seconds < 0 ? MINUS : "";
+  const s = Math.abs(seconds);
+  if (s < 0.9995) return `${fixed(seconds * 1000, digits)}\u00a0ms`;
+  if (s < 59.95) return `${sign}${s.toFixed(s < 9.995 ? Math.max(digits, 1) : 1)}\u00a0s`;
   const minutes = Math.floor(s / 60);
-  if (minutes < 60) return `${minutes}\u00a0min ${String(Math.floor(s % 60)).padStart(2, "0")}\u00a0s`;
-  return `${Math.floor(minutes / 60)}\u00a0h ${String(minutes % 60).padStart(2, "0")}\u00a0min`;
+  if (minutes < 60) return `${sign}${minutes}\u00a0min ${String(Math.floor(s % 60)).padStart(2, "0")}\u00a0s`;
+  return `${sign}${Math.floor(minutes / 60)}\u00a0h ${String(minutes % 60).padStart(2, "0")}\u00a0min`;
+}
+
+// A value with its unit; one in ms is a duration.
+export function quantity(value, unit, digits = 0) {
+  if (unit === "ms" && Number.isFinite(value)) return duration(value / 1000, digits);
+  return withUnit(value, unit, digits).trim();
 }
 
 export function clock(utc, digits = 0) {

@@ -8,7 +8,7 @@ const SIGNS = { true: "\u2713", false: "!" };
 
 export class Health {
   constructor(link, onChange) {
-    Object.assign(this, { link, onChange, said: null, serverMs: NaN, saidAt: -Infinity, ok: null, lostUtc: null, bench: "", session: false, missed: 0 });
+    Object.assign(this, { link, onChange, said: null, serverMs: NaN, saidAt: -Infinity, ok: null, lostUtc: null, bench: "", session: false, missed: 0, lately: 0 });
     setInterval(() => this.check(), CHECK_MS);
   }
 
@@ -39,7 +39,9 @@ export class Health {
 
   get wellSaid() {
     if (this.session) return "each step is told under Events";
-    return this.missed ? `attitude fresh; ${this.missed} frames missed since the start` : "attitude fresh, frames on time";
+    const many = (n) => `${n} ${n === 1 ? "frame" : "frames"} missed`;
+    if (this.lately) return `attitude fresh; ${many(this.lately)} in the last minute`;
+    return this.missed ? `attitude fresh, frames on time for a minute; ${many(this.missed)} since the start` : "attitude fresh, frames on time";
   }
 
   check() {

@@ -2,10 +2,10 @@
 
 import { count, fixed, make, write } from "./format.js";
 
-const HEIGHT = 120;
+const HEIGHT = 132;
 const LEFT = 40;
 const RIGHT = 10;
-const TOP = 8;
+const TOP = 22;
 const BOTTOM = 20;
 
 export class Histogram {
@@ -46,13 +46,16 @@ export class Histogram {
       context.fillStyle = ink.muted;
       context.fillText(power < 3 ? String(10 ** power) : `10${["", "", "", "\u00b3", "\u2074", "\u2075", "\u2076", "\u2077"][power] || "^"}`, LEFT - 6, y(10 ** power));
     }
+    context.textAlign = "left";
+    context.fillText("frames", 2, 6);
     const width = (w - LEFT - RIGHT) / Math.max(counts.length, 1);
     context.fillStyle = ink.one;
     counts.forEach((n, k) => n && context.fillRect(LEFT + k * width, y(n), Math.max(width - 0.5, 0.5), HEIGHT - BOTTOM - y(n)));
     context.fillStyle = ink.muted;
     for (const [share, align] of [[0, "left"], [0.5, "center"], [1, "right"]]) {
       context.textAlign = align;
-      context.fillText(fixed(this.from + share * (this.to - this.from), this.digits), LEFT + share * (w - LEFT - RIGHT), HEIGHT - BOTTOM / 2 + 2);
+      const unit = share === 1 ? `\u00a0${this.unit}` : "";
+      context.fillText(fixed(this.from + share * (this.to - this.from), this.digits) + unit, LEFT + share * (w - LEFT - RIGHT), HEIGHT - BOTTOM / 2 + 2);
     }
     this.tell(null);
   }

@@ -2,10 +2,10 @@
 
 import { Chart } from "./charts.js";
 import { Controls, listKeys } from "./controls.js";
-import { byId, clock, make, write } from "./format.js";
+import { byId, clock, duration, write } from "./format.js";
 import { Health } from "./health.js";
 import { Link } from "./link.js";
-import { OVERLAYS, Overlays } from "./overlays.js";
+import { OVERLAYS, Overlays, pictureText, seenStars } from "./overlays.js";
 import { Rows, addEvent, writeAttitude, writeRefusals, writeRun, writeSource } from "./panels.js";
 import { Picture } from "./picture.js";
 import { Sky } from "./sky.js";
@@ -24,7 +24,7 @@ let trail = [];
 let held = false;
 let pictureAt = -Infinity;
 let decoding = false;
-const dirty = { picture: false, sky: false, charts: false };
+const dirty = { picture: false, overlay: false, sky: false, charts: false };
 
 const picture = new Picture(byId("picture"), () => redraw("picture"));
 const overlays = new Overlays(byId("overlay"), picture.view, onOverlay);
@@ -48,9 +48,9 @@ function redraw(what) {
 function drawAll() {
   if (dirty.picture) {
     picture.draw();
-    overlays.draw(picture.frame);
     tellPicture();
   }
+  if (dirty.picture || dirty.overlay) overlays.draw(picture);
   if (dirty.sky) sky.draw();
   if (dirty.charts) drawCharts();
   for (const what of Object.keys(dirty)) dirty[what] = false;
@@ -187,6 +187,7 @@ function times() {
 function drawCharts() {
   const span = -(hello?.history_s || 60);
   const t = times();
+  health.lately = column("missed").reduce((sum, n) => sum + (n || 0), 0);
   charts.age.set([series("age", "age_ms", "one", 1)], [], span, 0);
   charts.pacing.set([series("interval", "interval_ms", "one", 2), series("drawing", "frame_ms", "two", 2)], [{ name: "missed", ink: "bad", t, n: column("missed") }], span, 0);
   charts.packets.set([series("packets", "packets_hz", "one", 1)], [{ name: "refused", ink: "bad", t, n: column("refused") }], span, 0);
@@ -219,14 +220,14 @@ function tellAge() {
   const old = !hello?.session && picture.levels && age > OLD_PICTURE_MS * (calm ? 2 : 1);
   badge.hidden = !(held || old);
   badge.dataset.state = held ? "held" : "old";
-  write(badge, held ? `Held on this page: frame ${picture.frame}` : old ? `This picture is ${(age / 1000).toFixed(1)}\u00a0s old` : "");
+  write(badge, held ? `Held on this page: frame ${picture.frame}` : old ? `This picture is ${duration(age / 1000)} old` : "");
 }
 
 function tellPicture() {
   const zoom = Math.round((100 * picture.view.scale) / picture.view.ratio);
-  write(byId("picture-text"), picture.frame === null ? "" : `frame ${picture.frame}  ${zoom}\u00a0%`);
   const truth = overlays.of(picture.frame);
-  const named = (truth?.stars || []).slice(0, 3).map((star) => star[4] || `HIP ${star[3]}`);
+  write(byId("picture-text"), picture.frame === null ? "" : pictureText(truth, picture, zoom));
+  const named = seenStars(truth, picture).slice(0, 3);
   const words = picture.frame === null ? "no picture yet" : `frame ${picture.frame}, ${state?.frame.stars ?? "?"} stars${named.length ? `, brightest ${named.join(", ")}` : ""}`;
   byId("picture").setAttribute("aria-label", `What the monitor shows: ${words}`);
 }
@@ -281,6 +282,7 @@ function start() {
     picture.setStretch(event.target.value);
     redraw("picture");
   });
+  for (const kind of ["pointermove", "pointerdown", "pointerleave"]) byId("picture").addEventListener(kind, () => redraw("overlay"));
   document.addEventListener("keydown", onKey);
   document.addEventListener("visibilitychange", askForPictures);
   new ResizeObserver(() => picture.fitStage() && redraw("picture")).observe(byId("stage"));

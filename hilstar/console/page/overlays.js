@@ -13,10 +13,12 @@ export const OVERLAYS = [
   ["clipped", "Clipped", true, "c"],
 ];
 const INK = { truth: "#63d2a1", name: "#c9d6ee", grid: "rgba(110, 150, 225, 0.6)", tracker: "#ffcf70", boresight: "#7db4ff", clipped: "#ff6b6b" };
-const LABELS = 60; // the brightest in view; more would hide the stars
+const LABELS = 40; // the brightest in view; more would hide the stars
 const FAINTEST_RING_MAG = 8;
 const KEPT_TRUTHS = 12;
-const VALUES_FROM = 22; // CSS pixels per monitor pixel from which codes are written (picture.js)
+const UNDER_CODES = 0.6; // opacity of lines over pixels whose codes are written
+const LABEL_AREA_PX = 24000; // of the picture, in CSS pixels squared, for each label
+const POINTED_PX = 12; // from the pointer to the star that it names
 
 export class Overlays {
   constructor(canvas, view, onChange) {
@@ -57,20 +59,34 @@ export class Overlays {
     return this.truths.get(frame) || this.newest;
   }
 
-  draw(frame) {
+  draw(picture) {
     const { canvas, context, view } = this;
     canvas.width = view.canvas.width;
     canvas.height = view.canvas.height;
-    const truth = this.of(frame);
-    if (!truth) return;
+    const truth = this.of(picture.frame);
+    this.labels = 0;
+    if (picture.hasValues) context.globalAlpha = UNDER_CODES;
+    if (truth) this.drawTruth(truth, picture);
+    context.globalAlpha = 1;
+    if (picture.hasValues) picture.drawValues(context);
+    canvas.dataset.labels = String(this.labels);
+  }
+
+  drawTruth(truth, picture) {
+    const { context, view } = this;
+    this.picture = picture;
+    const stars = truth.stars || [];
     context.lineJoin = "round";
     this.unit = view.ratio;
     this.taken = [];
+    this.outline = this.on.tracker && (truth.tracker_px || []).length > 2 ? truth.tracker_px.map(([x, y]) => view.toCanvas(x, y)) : [];
     if (this.on.grid) this.drawGrid(truth.grid || []);
-    if (this.on.tracker) this.drawTracker(truth.tracker_px || []);
-    if (this.on.truth || this.on.clipped) this.drawRings(truth.stars || []);
+    if (this.on.tracker) this.drawTracker();
+    if (this.on.truth || this.on.clipped) this.drawRings(stars);
     if (this.on.boresight && truth.boresight_px) this.drawBoresight(truth.boresight_px);
-    if (this.on.names || this.on.magnitudes) this.drawLabels(truth.stars || []);
+    if (picture.hasValues) return; // names would hide the codes: they stand below the picture
+    if (this.on.names || this.on.magnitudes) this.drawLabels(stars);
+    this.drawPointed(stars, picture.pointer);
   }
 
   path(points, close) {
@@ -103,23 +119,26 @@ export class Overlays {
       this.path(px, false);
       context.stroke();
       const at = px.map(([x, y]) => this.view.toCanvas(x, y)).find((place) => this.inside(place, -14 * unit));
-      if (!label || !at) continue;
+      if (!label || !at || this.picture.hasValues) continue;
       context.font = `${11 * unit}px system-ui, sans-serif`;
       const left = Math.min(at[0] + 4 * unit, this.canvas.width - context.measureText(label).width - 6 * unit);
       if (this.place(label, left, at[1], 11)) this.write(label, left, at[1] - (left < at[0] ? 8 * unit : 0), "#9dbcf5", 11);
     }
   }
 
-  drawTracker(outline) {
-    const { context, unit } = this;
-    if (outline.length < 3) return;
+  drawTracker() {
+    const { context, unit, outline } = this;
+    if (!outline.length) return;
     context.strokeStyle = INK.tracker;
     context.lineWidth = 1.5 * unit;
     context.setLineDash([8 * unit, 5 * unit]);
-    this.path(outline, true);
+    context.beginPath();
+    outline.forEach((at, k) => context[k ? "lineTo" : "moveTo"](...at));
+    context.closePath();
     context.stroke();
     context.setLineDash([]);
-    const inside = outline.map(([x, y]) => this.view.toCanvas(x, y)).filter((place) => this.inside(place, -6 * unit));
+    if (this.picture.hasValues) return;
+    const inside = outline.filter((place) => this.inside(place, -6 * unit));
     const top = inside.reduce((best, place) => (best && best[0] + best[1] <= place[0] + place[1] ? best : place), null);
     const label = "tracker\u2019s field";
     if (top && this.place(label, top[0] + 6 * unit, top[1] + 12 * unit, 11)) this.write(label, top[0] + 6 * unit, top[1] + 12 * unit, INK.tracker, 11);
@@ -161,44 +180,118 @@ export class Overlays {
     context.stroke();
   }
 
-  // True, and the place is taken, where no other label stands.
+  boxOf(text, u, v, size) {
+    const { unit, context } = this;
+    context.font = `${size * unit}px system-ui, sans-serif`;
+    return [u - 2 * unit, v - size * 0.65 * unit, u + context.measureText(text).width + 2 * unit, v + size * 0.65 * unit];
+  }
+
+  // True, and the place is taken, where the whole label is inside, and on no other one, no star and not on the field's line.
   place(text, u, v, size) {
-    const { unit } = this;
-    const box = [u - 2 * unit, v - size * 0.65 * unit, u + text.length * size * 0.6 * unit, v + size * 0.65 * unit];
+    const box = this.boxOf(text, u, v, size);
+    const { width, height } = this.canvas;
+    if (box[0] < 0 || box[1] < 0 || box[2] > width || box[3] > height) return false;
     if (this.taken.some((other) => box[0] < other[2] && other[0] < box[2] && box[1] < other[3] && other[1] < box[3])) return false;
+    if (this.outline.some((from, k) => crosses(from, this.outline[(k + 1) % this.outline.length], box))) return false;
     this.taken.push(box);
+    this.labels += 1;
     return true;
   }
 
   labelOf([, , magnitude, hip, label, clipped]) {
     const parts = [];
-    if (this.on.names) parts.push(label || (hip ? `HIP ${hip}` : ""));
+    if (this.on.names) parts.push(nameOf([0, 0, 0, hip, label]));
     if (this.on.magnitudes && magnitude !== null) parts.push(magnitude.toFixed(2).replace("-", "\u2212"));
     if (clipped && this.on.clipped) parts.push("clipped");
     return parts.filter(Boolean).join("  ");
   }
 
+  gapOf([, , magnitude, , , clipped]) {
+    const square = clipped && this.on.clipped ? 4 * this.unit : 0;
+    return square + Math.max((6 + 0.9 * Math.max(FAINTEST_RING_MAG - magnitude, 0)) * this.unit, this.view.scale * 2.5 + 3 * this.unit);
+  }
+
+  // The brightest, as many as the picture has room for; the rest are named under the pointer.
   drawLabels(stars) {
-    const { unit, view } = this;
+    const { unit, view, context } = this;
+    const places = stars.map(([x, y]) => view.toCanvas(x, y));
+    const room = (this.canvas.width * this.canvas.height) / (unit * unit) / LABEL_AREA_PX;
+    const most = Math.max(6, Math.min(LABELS, Math.round(room)));
+    for (const [u, v] of places) if (this.inside([u, v])) this.taken.push([u - 2 * unit, v - 2 * unit, u + 2 * unit, v + 2 * unit]);
     let written = 0;
-    const most = Math.max(8, Math.min(LABELS, Math.round((this.canvas.width * this.canvas.height) / (unit * unit) / 9000)));
-    for (const star of stars) {
-      const [u, v] = view.toCanvas(star[0], star[1]);
-      if (written >= most || !this.inside([u, v])) continue;
-      const square = star[5] && this.on.clipped ? 4 * unit : 0;
-      const gap = square + Math.max((6 + 0.9 * Math.max(FAINTEST_RING_MAG - star[2], 0)) * unit, view.scale * 2.5 + 3 * unit);
+    for (const [k, star] of stars.entries()) {
+      const [u, v] = places[k];
       const text = this.labelOf(star);
-      if (!text) continue;
-      this.context.font = `${12 * unit}px system-ui, sans-serif`;
-      const wide = this.context.measureText(text).width;
-      const close = view.scale >= VALUES_FROM * unit; // beside the star it would hide codes
-      const beside = u + gap + wide > this.canvas.width ? u - gap - wide : u + gap;
-      const above = [u - wide / 2, v - gap - 8 * unit];
-      const found = (close ? [above] : [[beside, v], above]).find(([left, top]) => this.place(text, left, top, 12));
+      if (written >= most || !text || !this.inside([u, v])) continue;
+      const gap = this.gapOf(star);
+      context.font = `${12 * unit}px system-ui, sans-serif`;
+      const wide = context.measureText(text).width;
+      const tries = [[u + gap, v], [u - gap - wide, v], [u - wide / 2, v - gap - 8 * unit], [u - wide / 2, v + gap + 8 * unit]];
+      const found = tries.find(([left, top]) => this.place(text, left, top, 12));
       if (!found) continue;
-      const [left, top] = found;
-      this.write(text, left, top, star[5] && this.on.clipped ? "#ff9a9a" : INK.name);
+      this.write(text, ...found, star[5] && this.on.clipped ? "#ff9a9a" : INK.name);
       written += 1;
     }
   }
+
+  // The star under the pointer, whatever else is written: its name, V, and whether it clips.
+  drawPointed(stars, pointer) {
+    if (!pointer) return;
+    const { unit, view, context } = this;
+    const [u, v] = view.toCanvas(...pointer);
+    const away = ([x, y]) => Math.hypot(...view.toCanvas(x, y).map((at, k) => at - [u, v][k]));
+    const near = stars.reduce((best, star) => (away(star) < (best ? away(best) : POINTED_PX * unit) ? star : best), null);
+    if (!near) return;
+    const text = labelAll(near);
+    const [x, y] = view.toCanvas(near[0], near[1]);
+    const gap = this.gapOf(near);
+    context.font = `${13 * unit}px system-ui, sans-serif`;
+    const wide = context.measureText(text).width + 12 * unit;
+    const left = x + gap + wide > this.canvas.width ? x - gap - wide : x + gap;
+    const top = Math.min(Math.max(y - 11 * unit, 0), this.canvas.height - 22 * unit);
+    context.fillStyle = "rgba(10, 16, 28, 0.92)";
+    context.fillRect(left, top, wide, 22 * unit);
+    context.strokeStyle = INK.name;
+    context.lineWidth = unit;
+    context.strokeRect(left, top, wide, 22 * unit);
+    this.write(text, left + 6 * unit, top + 11 * unit, "#ffffff", 13);
+  }
+}
+
+function nameOf([, , , hip, label]) {
+  return label || (hip ? `HIP ${hip}` : "");
+}
+
+function labelAll(star) {
+  const magnitude = star[2] === null ? "" : `V ${star[2].toFixed(2).replace("-", "\u2212")}`;
+  return [nameOf(star), magnitude, star[5] ? "clipped" : ""].filter(Boolean).join("  ");
+}
+
+// The names of the stars in the part of the picture that is seen, the brightest first.
+export function seenStars(truth, picture) {
+  const { canvas, view } = picture;
+  const seen = ([x, y]) => view.toCanvas(x, y).every((at, k) => at >= 0 && at <= [canvas.width, canvas.height][k]);
+  return (truth?.stars || []).filter(seen).map(nameOf);
+}
+
+// Where every pixel has its code in it, names stand below the picture.
+export function pictureText(truth, picture, zoom) {
+  const named = picture.hasValues ? seenStars(truth, picture).slice(0, 3).join(", ") : "";
+  return `frame ${picture.frame}  ${zoom}\u00a0%${named ? `  ${named}` : ""}`;
+}
+
+// Whether a line from a to b goes through a box (Liang and Barsky 1984).
+function crosses(a, b, box) {
+  let [from, to] = [0, 1];
+  for (const k of [0, 1]) {
+    const step = b[k] - a[k];
+    if (step === 0) {
+      if (a[k] < box[k] || a[k] > box[k + 2]) return false;
+      continue;
+    }
+    const ends = [(box[k] - a[k]) / step, (box[k + 2] - a[k]) / step];
+    from = Math.max(from, Math.min(...ends));
+    to = Math.min(to, Math.max(...ends));
+  }
+  return from <= to;
 }

@@ -1,6 +1,6 @@
 // The numbers beside the picture: attitude, clock, counts, refusals, ledger and events. Names from outside are only ever text.
 
-import { NONE, byId, bytes, clock, count, degreesMinutes, fixed, hours, make, signed, withUnit, write } from "./format.js";
+import { NONE, byId, bytes, clock, count, degreesMinutes, fixed, hours, make, quantity, signed, withUnit, write } from "./format.js";
 
 const MAX_EVENTS = 200;
 
@@ -44,9 +44,9 @@ export function writeAttitude(attitude, rows) {
 
 export function writeSource(state, rows) {
   const { attitude, source, clock: sender } = state;
-  rows.set("Age at light", attitude ? withUnit(attitude.age_ms, "ms", 1) : NONE);
+  rows.set("Age at light", attitude ? quantity(attitude.age_ms, "ms", 1) : NONE);
   rows.set("Source", source ? [source.kind, source.endpoint].filter(Boolean).join("  ") : NONE);
-  rows.set("Clock offset", sender ? `${withUnit(sender.offset_ms, "ms", 3)} \u00b1 ${fixed(sender.sigma_ms, 3)}` : NONE);
+  rows.set("Clock offset", sender ? `${quantity(sender.offset_ms, "ms", 3)} \u00b1 ${quantity(sender.sigma_ms, "ms", 3)}` : NONE);
   rows.set("Clock drift", sender ? withUnit(sender.drift_ppm, "ppm", 2) : NONE);
   rows.set("Clock from", sender ? (sender.synchronised ? "time exchange" : "arrivals (excludes the minimum delay)") : NONE);
 }
@@ -58,8 +58,8 @@ export function writeRun({ frame, counts, pacing, ledger }, rows) {
   rows.set("Stale", count(counts.stale), seen(counts.stale));
   rows.set("Given up", count(counts.given_up), seen(counts.given_up));
   rows.set("Packets", `${count(counts.accepted)} of ${count(counts.received)} accepted`);
-  rows.set("Interval p50, p99", pacing ? `${fixed(pacing.p50_ms, 2)}, ${withUnit(pacing.p99_ms, "ms", 2)}` : NONE);
-  rows.set("Jitter (sd)", pacing ? withUnit(pacing.sd_ms, "ms", 3) : NONE);
+  rows.set("Interval p50, p99", pacing ? `${quantity(pacing.p50_ms, "ms", 2)}, ${quantity(pacing.p99_ms, "ms", 2)}` : NONE);
+  rows.set("Jitter (sd)", pacing ? quantity(pacing.sd_ms, "ms", 3) : NONE);
   rows.set("Stars drawn", count(frame.stars));
   const clipped = frame.clipped || [];
   rows.set("Clipped", clipped.length ? `${clipped.length}: ${clipped.slice(0, 4).join(", ")}${clipped.length > 4 ? ", \u2026" : ""}` : "none", clipped.length ? "warn" : "");

@@ -191,7 +191,11 @@ export class Picture {
     context.imageSmoothingEnabled = false;
     context.drawImage(this.close, u, v, columns * view.scale, rows * view.scale);
     if (view.scale >= GRID_FROM * view.ratio) this.drawEdges(left, top, columns, rows);
-    if (view.scale >= VALUES_FROM * view.ratio) this.drawValues(left, top, columns, rows);
+  }
+
+  // Near enough that each pixel has its code written in it.
+  get hasValues() {
+    return Boolean(this.levels) && this.view.scale >= VALUES_FROM * this.view.ratio;
   }
 
   drawEdges(left, top, columns, rows) {
@@ -212,8 +216,10 @@ export class Picture {
     context.stroke();
   }
 
-  drawValues(left, top, columns, rows) {
-    const { context, view } = this;
+  // The codes, onto a canvas over this one, so that no overlay hides them.
+  drawValues(context) {
+    const { view } = this;
+    const [left, top, columns, rows] = this.seen();
     const digits = String(this.white).length;
     context.font = `${Math.min(Math.floor((view.scale * 1.35) / Math.max(digits, 3)), 18 * view.ratio)}px ui-monospace, Menlo, monospace`;
     context.textAlign = "center";

@@ -3,7 +3,7 @@
 import { Chart, timeText } from "./charts.js";
 import { byId, clock, duration, make, write } from "./format.js";
 import { Histogram } from "./histogram.js";
-import { OVERLAYS, Overlays } from "./overlays.js";
+import { OVERLAYS, Overlays, pictureText, seenStars } from "./overlays.js";
 import { Rows, addEvent, writeAttitude, writeRefusals } from "./panels.js";
 import { Picture } from "./picture.js";
 import { Sky } from "./sky.js";
@@ -22,7 +22,7 @@ const CHARTS = [
   ["chart-packets", "Packets", "Hz", 1, [], []],
   ["chart-late", "Swap later than predicted", "ms", 2, [["late", "late", "one"]], []],
   ["chart-latency", "Packet to swap", "ms", 1, [["packet", "packet to swap", "one"], ["prediction", "predicted", "two"]], []],
-  ["chart-stars", "Stars on the screen", "", 0, [["stars", "drawn", "one"], ["clipped", "clipped", "two"], ["below_step", "too faint", "three"]], [["blank", "blank frames", "warn", true]]],
+  ["chart-stars", "Stars on the screen", "stars", 0, [["stars", "drawn", "one"], ["clipped", "clipped", "two"], ["below_step", "too faint", "three"]], [["blank", "blank frames", "warn", true]]],
 ];
 const ACTS = /^(operator|mark|fault|scenario|ledger-(begun|ended|started|stopped))/;
 const SHADES = ["one", "two", "three"];
@@ -46,14 +46,14 @@ async function unpacked(base64) {
 
 // Charts.
 
-function chart(id, title, unit) {
+function chart(id, title, unit, note) {
   let figure = byId(id);
   if (!figure) {
     figure = make("figure", "panel chart");
     figure.id = id;
     byId("charts").append(figure);
   }
-  charts[id] = new Chart(figure, { title, unit, ink, onRange });
+  charts[id] = new Chart(figure, { title, unit, ink, note, onRange });
   return charts[id];
 }
 
@@ -86,14 +86,14 @@ function makeCharts() {
   const { motion } = run;
   const titles = [
     ...CHARTS,
-    ["chart-motion", "Motion about the mean", motion?.about_mean.unit],
-    ["chart-steady", "Beside a steady turn", motion?.beside_steady.unit],
+    ["chart-motion", "Motion about the mean", motion?.about_mean.unit, "the camera\u2019s angles less their means over the run"],
+    ["chart-steady", "Beside a steady turn", motion?.beside_steady.unit, "how far the camera was from where a constant rate, fitted to the whole run, would have turned it"],
     ["chart-memory", "Memory", "MB"],
     ["chart-cpu", "Processor time", "%"],
   ];
   const all = curves();
-  for (const [id, title, unit] of titles) {
-    if (all[id]?.lines.some(({ high }) => high.some((value) => value !== null))) chart(id, title, unit).data = all[id];
+  for (const [id, title, unit, note] of titles) {
+    if (all[id]?.lines.some(({ high }) => high.some((value) => value !== null))) chart(id, title, unit, typeof note === "string" ? note : "").data = all[id];
     else byId(id)?.remove();
   }
   for (const one of run.histograms) {
@@ -210,10 +210,11 @@ async function show(k, andMove = true) {
 function drawPicture() {
   if (!picture.levels) return;
   picture.draw();
-  overlays.draw(picture.frame);
+  overlays.draw(picture);
   const zoom = Math.round((100 * picture.view.scale) / picture.view.ratio);
-  write(byId("picture-text"), `frame ${picture.frame}  ${zoom}\u00a0%`);
-  const named = (overlays.of(picture.frame)?.stars || []).slice(0, 3).map((star) => star[4]);
+  const truth = overlays.of(picture.frame);
+  write(byId("picture-text"), pictureText(truth, picture, zoom));
+  const named = seenStars(truth, picture).slice(0, 3);
   byId("picture").setAttribute("aria-label", `Frame ${picture.frame} of the run${named.length ? `, brightest ${named.join(", ")}` : ""}`);
 }
 
@@ -241,12 +242,12 @@ function capital(text) {
   return text.charAt(0).toUpperCase() + text.slice(1);
 }
 
-function writeHealth({ ok, headline, reasons }) {
+function writeHealth({ ok, headline, share, reasons }) {
   const box = byId("health");
   box.dataset.ok = document.body.dataset.ok = String(ok);
   write(byId("health-icon"), ok ? "\u2713" : "!");
   write(byId("health-headline"), headline);
-  write(byId("health-reasons"), ok ? "every frame on time, with a fresh attitude" : reasons.join("; "));
+  write(byId("health-reasons"), ok ? "every frame on time, with a fresh attitude" : `${share} of its time was: ${reasons.join("; ")}`);
   write(byId("health-since"), run.about.started_utc ? `${run.about.started_utc.slice(0, 19).replace("T", " ")} UTC` : "");
   write(byId("health-for"), duration(run.duration_s));
 }
@@ -320,6 +321,7 @@ function listen() {
   });
   byId("scrub").addEventListener("input", (event) => show(Number(event.target.value)));
   byId("play").addEventListener("click", play);
+  for (const kind of ["pointermove", "pointerdown", "pointerleave"]) byId("picture").addEventListener(kind, () => overlays.draw(picture));
   document.addEventListener("keydown", onKey);
   new ResizeObserver(() => picture.fitStage() && drawPicture()).observe(byId("stage"));
   new ResizeObserver(drawAll).observe(byId("main"));

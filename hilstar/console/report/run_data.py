@@ -79,7 +79,7 @@ def _about(name: str, run: Figures, config: BenchConfig | None) -> dict[str, Any
 
 
 def verdict(found: RunReport, late: int) -> dict[str, Any]:
-    """Whether the sky was right all along, in one word, and why not."""
+    """Whether the sky was right all along, in how many of the refresh periods it was, and why not in the others."""
     counted = (
         (found.blank_frames, "without an attitude"),
         (late, "with a stale attitude"),
@@ -90,7 +90,15 @@ def verdict(found: RunReport, late: int) -> dict[str, Any]:
     if found.missed_frames:
         reasons.append(f"{found.missed_frames} refresh periods without a frame of their own")
     headline = "Sky was right throughout" if not reasons else "Sky was not right throughout"
-    return {"ok": not reasons, "headline": headline, "reasons": reasons}
+    share = _share(found.right_frames, found.frames + found.missed_frames)  # of the refresh periods in which a frame was due
+    return {"ok": not reasons, "headline": headline, "share": share, "reasons": reasons}
+
+
+def _share(part: int, whole: int) -> str:
+    """A share of a run, rounded down: 100 % is said of all of it alone."""
+    percent = 100 * part / max(whole, 1)
+    digits = 3 if percent > 99.9 else 2 if percent > 99 else 1
+    return f"{math.floor(percent * 10**digits) / 10**digits:.{digits}f} %"
 
 
 def _utc(run: Figures, host_ns: int) -> str | None:

@@ -73,7 +73,11 @@ def _of_rest(seen: RunSeen, lately: Lately) -> Iterator[str]:
 
 
 def _s(time_ns: int) -> str:
-    return f"{time_ns / NS_PER_S:.1f} s"
+    """A duration as the page writes it."""
+    s = time_ns / NS_PER_S
+    if s < 60:
+        return f"{s:.1f} s"
+    return f"{int(s // 60)} min {int(s % 60):02d} s" if s < 3600 else f"{int(s // 3600)} h {int(s % 3600 // 60):02d} min"
 
 
 class Health:

@@ -28,6 +28,22 @@ WINDOW_GONE = "the window is gone: another program has closed it"
 log = logging.getLogger(__name__)
 
 
+def server_of() -> str:
+    """The X server of `DISPLAY`: its maker and release; "" without one. Raises OSError without libX11."""
+    library: Any = ctypes.CDLL(X11_LIBRARY)
+    library.XOpenDisplay.restype, library.XOpenDisplay.argtypes = ctypes.c_void_p, [ctypes.c_char_p]
+    library.XServerVendor.restype, library.XServerVendor.argtypes = ctypes.c_char_p, [ctypes.c_void_p]
+    library.XVendorRelease.argtypes = library.XCloseDisplay.argtypes = [ctypes.c_void_p]
+    display = library.XOpenDisplay(None)
+    if not display:
+        return ""
+    release = library.XVendorRelease(display)
+    major, minor, patch = release // 10_000_000, release // 100_000 % 100, release // 1000 % 100
+    vendor = library.XServerVendor(display).decode(errors="replace")
+    library.XCloseDisplay(display)
+    return f"{vendor} {major}.{minor}.{patch}"
+
+
 class _ErrorEvent(ctypes.Structure):
     """XErrorEvent of Xlib."""
 

@@ -46,6 +46,7 @@ class RunReport(msgspec.Struct, frozen=True, kw_only=True):
     packets: dict[str, int]
     events: dict[str, int]
     pulses: dict[str, int]
+    right_frames: int = 0  # on the screen, with a fresh attitude, not changed by the operator
     clipped: int
     below_step: int
     stars_drawn: int
@@ -68,6 +69,7 @@ def summarise(run: Figures) -> RunReport:
         duration_s=run.duration_s,
         missed_frames=0 if last is None else last.missed,
         stale_frames=run.stale,
+        right_frames=run.right,
         blank_frames=run.blank,
         operator_frames=run.operator,
         hidden_frames=run.hidden,

@@ -84,6 +84,7 @@ class Figures:
     capped: int = 0
     operator: int = 0
     hidden: int = 0
+    right: int = 0  # frames that nothing of these was wrong with
     most: dict[str, int] = field(default_factory=lambda: dict.fromkeys(("clipped", "below_step", "stars_drawn"), 0))
     last: FrameRecord | None = None
     first_swap_ns: int = 0
@@ -154,6 +155,7 @@ class Figures:
         self.capped += frame.capped > 0
         self.operator += bool(frame.operator)
         self.hidden += bool(frame.hidden)
+        self.right += not (frame.stale or frame.q is None or frame.operator or frame.hidden)
         for name in self.most:
             self.most[name] = max(self.most[name], getattr(frame, name))
         values = _times_ms(frame, before)

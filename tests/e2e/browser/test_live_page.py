@@ -183,6 +183,54 @@ def test_every_overlay_can_be_switched_by_its_key_and_by_its_button(live):
     assert_overlay(live, before, same=False)
 
 
+def test_labels_are_few_and_none_stands_over_the_codes(live):
+    """A label for each 24 000 px of the picture at most, and the field's besides; codes lie over everything."""
+    area_px = live.run("const c = document.getElementById('overlay'); return c.clientWidth * c.clientHeight")
+    live.until("Number(document.getElementById('overlay').dataset.labels) > 3")
+    assert float(live.run("return document.getElementById('overlay').dataset.labels")) <= area_px / 24_000 + 2
+    ActionChains(live).send_keys("h", "9").perform()
+    live.until("document.getElementById('overlay').dataset.labels === '0'")
+    assert live.text("#picture-text").split()[-1] != "%"  # the star is named below the picture
+
+
+DURATIONS = """
+const values = [36489.6, 725000, 7.38e6, 12.5, 999.96, -250, -3000];
+import("/static/format.js").then(({ quantity }) => done(values.map((ms) => quantity(ms, "ms", 1))));
+"""
+LATE_POINT = """
+import("/static/charts.js").then(({ Chart }) => {
+  const figure = document.createElement("figure");
+  document.body.append(figure);
+  const chart = new Chart(figure, { title: "Age", unit: "ms", ink: {} });
+  const say = (t) => {
+    const values = t.map((at, k) => (k ? null : 12));
+    chart.set([{ name: "age", ink: "one", digits: 1, t, low: values, high: values }], [], -60, 0);
+    chart.draw();
+    return figure.querySelector(".now").textContent;
+  };
+  done([say([-0.3, -0.2, -0.1, 0]), say([-30, -0.1, 0])]);
+  figure.remove();
+});
+"""
+
+
+def test_durations_are_in_the_unit_that_a_person_reads(live):
+    told = [text.replace("\u00a0", " ") for text in live.run_async(DURATIONS)]
+    assert told == ["36.5 s", "12 min 05 s", "2 h 03 min", "12.5 ms", "1.0 s", "\u2212250.0 ms", "\u22123.0 s"]
+
+
+def test_a_chart_s_headline_is_its_newest_value_though_the_last_moments_have_none(live):
+    """A run slower than the page's ten points a second: every other point is without a frame."""
+    assert [text.replace("\u00a0", " ") for text in live.run_async(LATE_POINT)] == ["12.0 ms", "\u2013"]
+
+
+def test_what_a_page_may_do_and_the_ledger_say_it_in_words(live):
+    live.until("document.getElementById('ledger-said').textContent === 'records this run'")
+    assert live.text("#control-ledger") == "Stop" and live.text("#control-state") == "control on"
+    live.press("#control-ledger")
+    assert live.text("#control-ledger") == "Press again: stop"
+
+
 RED_AFTER = """
 window.redAt = 0;
 new MutationObserver(() => {

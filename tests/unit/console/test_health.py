@@ -29,6 +29,8 @@ def test_a_run_that_goes_well_has_no_reason():
     [
         ({"missing": True}, "no attitude has come yet"),
         ({"stale": True}, "the attitude is stale: 1.2 s old"),
+        ({"stale": True, "attitude": replace(ATTITUDE, age_ns=3_725 * S)}, "the attitude is stale: 1 h 02 min old"),
+        ({"stale": True, "attitude": replace(ATTITUDE, age_ns=725 * S)}, "the attitude is stale: 12 min 05 s old"),
         ({"stale": True, "attitude": None}, "the attitude is stale"),
         ({"alive_ns": 0}, "being prepared"),
         ({"alive_ns": NOW - S}, "the frame loop has hung for 1.0 s"),

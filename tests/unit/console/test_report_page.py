@@ -97,6 +97,9 @@ def test_the_verdict_names_everything_that_was_wrong():
         "1 of 5 frames not seen on the screen",
         "2 refresh periods without a frame of their own",
     ]
+    assert (
+        told["headline"] == "Sky was not right throughout" and told["share"] == "28.5 %"
+    )  # 2 of 5 frames and 2 periods without one
     well = Figures({})
     well.add(frame(0))
     assert verdict(summarise(well), 0)["ok"]

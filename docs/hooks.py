@@ -1,21 +1,41 @@
-"""What mkdocs does besides: links out of docs/ name the file, for the built pages stand alone.
+"""What mkdocs does besides: the changelog and the examples become pages, and links out of docs/ name the file.
 
-On a checkout such a link is followed; tests/docs checks that it leads somewhere.
+The built pages stand alone; on a checkout such a link is followed, and tests/docs checks that it leads somewhere.
 """
 
 from __future__ import annotations
 
+import posixpath
 import re
+from pathlib import Path
 from typing import Any
 
-OUTSIDE = re.compile(r"\[([^\]\[]+)\]\(\.\./([^)\s#]+)(?:#[^)\s]*)?\)")
+from mkdocs.structure.files import File, Files
+
+ROOT = Path(__file__).resolve().parents[1]
+ADDED = {"changes.md": "CHANGELOG.md", "examples.md": "examples/README.md"}  # pages of the site, and the files that they are
+LINK = re.compile(r"(?<!!)\[([^\]\[]+)\]\(([^)\s#:]+)(#[^)\s]*)?\)")
 
 
-def _named(link: re.Match[str]) -> str:
-    text, path = link[1], link[2]
-    return f"`{path}`" if path.endswith(text.strip("`")) else f"{text} (`{path}`)"
+def on_files(files: Files, config: Any) -> Files:
+    """Add the pages that lie elsewhere in the checkout."""
+    for page, path in ADDED.items():
+        files.append(File.generated(config, page, content=(ROOT / path).read_text(encoding="utf-8")))
+    return files
 
 
-def on_page_markdown(markdown: str, **_: Any) -> str:
-    """A page's text with `[words](../PATH)` as "words (`PATH`)"."""
-    return OUTSIDE.sub(_named, markdown)
+def on_page_markdown(markdown: str, page: Any = None, **_: Any) -> str:
+    """A page's text with each link as the site has it: to a page, or as "words (`PATH`)" to any other file."""
+    source = "docs/x.md" if page is None else ADDED.get(page.file.src_uri, f"docs/{page.file.src_uri}")
+
+    def linked(link: re.Match[str]) -> str:
+        text, heading = link[1], link[3] or ""
+        path = posixpath.normpath(posixpath.join(posixpath.dirname(source), link[2]))
+        if path.startswith("docs/"):
+            return f"[{text}]({path.removeprefix('docs/')}{heading})"
+        site = next((name for name, file in ADDED.items() if path in {file, posixpath.dirname(file)}), None)
+        if site is not None:
+            return f"[{text}]({site}{heading})"
+        return f"`{path}`" if path.endswith(text.strip("`")) else f"{text} (`{path}`)"
+
+    return LINK.sub(linked, markdown)

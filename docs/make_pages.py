@@ -1,16 +1,23 @@
-"""The generated pages: `python docs/make_pages.py` writes them; tests/docs fails where one is not what this makes."""
+"""The generated pages and drawings: `python docs/make_pages.py` writes them; tests/docs fails where one is old."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
 
+import api_page
 import command_page
+import drawings
 
 from hilstar.bench.config import reference
 
 HERE = Path(__file__).parent
-PAGES: dict[str, Callable[[], str]] = {"bench-file.md": reference.page, "commands.md": command_page.page}
+PAGES: dict[str, Callable[[], str]] = {
+    "bench-file.md": reference.page,
+    "commands.md": command_page.page,
+    "python-api.md": api_page.page,
+    **drawings.DRAWINGS,
+}
 
 
 if __name__ == "__main__":

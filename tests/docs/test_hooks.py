@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+import re
+from types import SimpleNamespace
 
 import pytest
 
@@ -15,8 +17,39 @@ from tests.support.benches import ROOT
         ("see [the wire](../firmware_protocol/README.md#keys) first", "see the wire (`firmware_protocol/README.md`) first"),
         ("see [CALIBRATION.md](../configs/CALIBRATION.md)", "see `configs/CALIBRATION.md`"),
         ("see [the light](the-light.md)", "see [the light](the-light.md)"),
+        ("see [changes](../CHANGELOG.md), [examples](../examples)", "see [changes](changes.md), [examples](examples.md)"),
     ],
 )
 def test_a_link_out_of_the_documentation_names_the_file(monkeypatch, page, built):
     monkeypatch.syspath_prepend(ROOT / "docs")
     assert importlib.import_module("hooks").on_page_markdown(page) == built
+
+
+def test_a_page_from_elsewhere_links_into_the_documentation(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "docs")
+    page = SimpleNamespace(file=SimpleNamespace(src_uri="examples.md"))
+    text = "see [campaigns](../docs/campaign.md#cases) and [a header](../firmware_protocol/hilstar_protocol.h)"
+    built = importlib.import_module("hooks").on_page_markdown(text, page=page)
+    assert built == "see [campaigns](campaign.md#cases) and a header (`firmware_protocol/hilstar_protocol.h`)"
+
+
+def test_every_page_stands_in_one_group_of_the_site():
+    """As the contents of a book: no page without a group, none twice, and no group of one."""
+    lines = (ROOT / "mkdocs.yml").read_text().partition("\nnav:\n")[2].partition("\n\n")[0].splitlines()
+    groups = [line.strip(" -:") for line in lines if line.endswith(":")]
+    assert groups == ["Start", "Bench", "Sky", "Run", "Prove", "Reference"]
+    named = [line.rpartition(" ")[2] for line in lines if line.endswith(".md")]
+    pages = {page.name for page in (ROOT / "docs").glob("*.md")} | {"changes.md", "examples.md"}
+    assert len(named) == len(set(named)) and set(named) == pages
+
+
+@pytest.mark.parametrize("page", ["index", "first-day", "attitude-in", "heads", "error-budget"])
+def test_a_drawing_is_light_and_dark(page):
+    (name,) = re.findall(r"\((drawing-\w+\.svg)\)", (ROOT / "docs" / f"{page}.md").read_text())
+    drawing = (ROOT / "docs" / name).read_text()
+    assert "prefers-color-scheme:dark" in drawing and "<title>" in drawing
+
+
+def test_a_plain_view_of_the_repository_shows_the_python_api_too():
+    text = (ROOT / "docs" / "python-api.md").read_text()
+    assert "\n:::" not in text and "### hilstar.load" in text and "Raises InputError" in text

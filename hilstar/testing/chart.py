@@ -28,7 +28,7 @@ def draw(path: Path, comparison: SkyComparison) -> None:
     with chart(path, finding(comparison), 2) as axes:
         names: list[list[Annotation]] = []
         for axis, what, unit in ((axes[0], "flux error", "mag"), (axes[1], "centroid error", "px")):
-            panel = _Panel(comparison, unit)
+            panel = Panel(comparison, unit)
             panel.draw(axis)
             names.append(panel.name_stars(axis))
             less = " beyond what is common" if panel.common else ""
@@ -38,12 +38,12 @@ def draw(path: Path, comparison: SkyComparison) -> None:
         _make_room(axes[0], names)
 
 
-class _Panel:
+class Panel:
     """Errors and limits of one kind; stars that only one image has are in rows above."""
 
     def __init__(self, comparison: SkyComparison, unit: str) -> None:
         common = comparison.common
-        self.unit = unit
+        self.unit, self.comparison = unit, comparison
         self.stars = comparison.stars if common is None else common.beyond + common.alone
         self.worst = comparison.differing
         self.brightest = max(star.flux_e_per_s for star in comparison.stars)
@@ -55,6 +55,7 @@ class _Panel:
         self.rows = {"missing": self.row, "extra": 8 * self.row}
 
     def of(self, *kinds: str) -> list[StarDifference]:
+        """The stars of these kinds that are drawn."""
         return [star for star in self.stars if star.kind in kinds]
 
     def point(self, star: StarDifference) -> tuple[float, float, float]:
@@ -64,11 +65,18 @@ class _Panel:
             return mag, max(abs(star.flux_error_mag), MIN_ERROR), star.limits.flux_mag
         return mag, max(star.centroid_error_px, MIN_ERROR), star.limits.centroid_px
 
+    def label(self, kind: str, drawn: int) -> str:
+        """How many stars are of a kind: of those that one image alone has all, as the terminal and the table count them."""
+        count = len(self.comparison.of(kind)) if kind in self.rows else drawn
+        common = count - drawn
+        return f"{kind}: {count}" + (f"\n({common} by what is common)" if common else "")
+
     def draw(self, axis: Axes) -> None:
+        """Draw the stars, the limits and the legend."""
         for kind, style in STYLES:
             mags, errors = [[self.point(star)[k] for star in self.of(kind)] for k in (0, 1)]
             heights = [self.rows[kind]] * len(mags) if kind in self.rows else errors
-            axis.plot(mags, heights, style, ms=5 if kind == "same" else 7, label=f"{kind}: {len(mags)}")
+            axis.plot(mags, heights, style, ms=5 if kind == "same" else 7, label=self.label(kind, len(mags)))
         axis.axhline(self.limit, color="k", ls="--", lw=1.2, label=f"limit: {self.limit:g} {self.unit}")
         if self.common:
             axis.axhline(self.common, color="C2", lw=1.2, label=f"in common: {self.common:.3g} {self.unit}")

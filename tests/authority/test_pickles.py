@@ -62,6 +62,11 @@ CALSPEC = {
 # colours' own 0.01 mag makes 0.5 %. Measured: 1.9 % at worst (Vega, ccd47-20).
 CALSPEC_LIMIT = 0.025
 
+SHOWN_V_MAG = 7.5  # what a bench shows by default
+# The rate by V-I against the rate by B-V alone, 95 % of the stars with V-I under REDDEST_VI_MAG: what docs/the-light.md says.
+TWO_COLOURS = {"ccd47-20": 0.0817, "kai-4021": 0.0444, "flat": 0.1043}
+TWO_COLOURS_TOLERANCE = 0.0005  # as they are stated
+
 # Stars whose two colours disagree (reddened, double, mistyped) may leave the library's range of rates. Measured: 9.2 %.
 OUTSIDE_LIMIT = 0.10
 
@@ -162,6 +167,37 @@ def test_a_cool_star_gives_more_electrons_the_redder_it_is(name):
     steps = np.diff(rates)
     assert (steps[vi_mag[1:] < load_library().vi_mag.max()] > 0).all()
     assert (steps[vi_mag[:-1] > load_library().vi_mag.max()] == 0).all()
+
+
+def test_six_stars_that_are_shown_are_redder_than_every_spectrum():
+    catalog = load_catalog()
+    beyond = (catalog.v_mag <= SHOWN_V_MAG) & (catalog.vi_mag > load_library().vi_mag.max())
+    assert catalog.hip[beyond].tolist() == [10826, 21479, 64569, 65835, 67419, 110478]
+
+
+@pytest.mark.parametrize(("name", "p95"), TWO_COLOURS.items())
+def test_the_catalogue_s_two_colours_give_two_rates(name, p95):
+    catalog = load_catalog()
+    kept = (catalog.v_mag <= SHOWN_V_MAG) & (catalog.vi_mag < REDDEST_VI_MAG)
+    v_mag, bv_mag, vi_mag = (column[kept] for column in (catalog.v_mag, catalog.bv_mag, catalog.vi_mag))
+    table = tabulate_pickles(SENSORS[name], Photometry())
+    by_vi, by_bv = (table.electrons_per_s(v_mag, bv_mag, colour) for colour in (vi_mag, np.full_like(vi_mag, np.nan)))
+    assert np.percentile(np.abs(by_vi / by_bv - 1), 95) == pytest.approx(p95, abs=TWO_COLOURS_TOLERANCE)
+    if name == "ccd47-20":
+        assert np.percentile(np.abs(table.electrons_per_s(v_mag, bv_mag, vi_mag + 0.05) / by_vi - 1), 95) == pytest.approx(
+            0.030, abs=TWO_COLOURS_TOLERANCE
+        )
+
+
+def test_most_of_hipparcos_s_vi_is_the_usual_one_of_its_bv():
+    catalog = load_catalog()
+    kept = (catalog.v_mag <= SHOWN_V_MAG) & np.isfinite(catalog.bv_mag)
+    bv_mag, vi_mag = catalog.bv_mag[kept], catalog.vi_mag[kept]
+    alike = np.array_split(np.argsort(bv_mag), 200)
+    usual = np.interp(bv_mag, [np.median(bv_mag[k]) for k in alike], [np.median(vi_mag[k]) for k in alike])
+    off_mag = np.abs(vi_mag - usual)[vi_mag < REDDEST_VI_MAG]
+    assert np.percentile(off_mag, 67) < 0.006
+    assert (off_mag > 0.2).sum() == 887
 
 
 def test_five_magnitudes_are_a_hundredfold():

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from hilstar.bench.config.values import Magnitude, NotNegative
+from hilstar.bench.config.values import Magnitude, NotNegative, Signed
 from hilstar.toml_tables import Table
 
 
@@ -28,7 +28,7 @@ class Background(Table, frozen=True):
         ),
     ] = None
     gradient_electrons_across: Annotated[
-        tuple[float, float],
+        tuple[Signed, Signed],
         Meta(
             description="By how many electrons per exposure the background grows from one edge of the detector to the other.",
             extra={"form": "[right, down]"},

@@ -20,6 +20,7 @@ from hilstar.reading import MAX_TOML_BYTES, parse_toml, read_text
 from hilstar.toml_tables import Kind, explained
 from hilstar.units import LIGHT_KM_S
 
+MAX_AREA_PX = 2**26  # twice an 8K monitor: half a gigabyte for each float64 image of it
 HEADS = "heads"  # the key of a file that names bench files (see `bench.heads_file`)
 KIND = Kind(BenchConfig, "configs/README.md", TYPE_WORDS)
 
@@ -76,6 +77,7 @@ def _check_meaning(config: BenchConfig, path: Path) -> None:
     _check_unit(path, "[collimator] q_cam_to_mon", config.collimator.q_cam_to_mon)
     if config.tracker.q_body_to_cam is not None:
         _check_unit(path, "[tracker] q_body_to_cam", config.tracker.q_body_to_cam)
+    _check_areas(path, config)
     room_km_s = MAX_SPEED_KM_S if config.attitude.source == "vizard" else 0.0
     if math.hypot(*config.sky.observer_velocity_km_s) + room_km_s >= LIGHT_KM_S:
         raise InputError(f"{path}: [sky] observer_velocity_km_s is not slower than light; write km/s, ICRS x, y, z")
@@ -102,6 +104,15 @@ def _check_meaning(config: BenchConfig, path: Path) -> None:
         check_road(config.attitude)
     except InputError as error:
         raise InputError(f"{path}: [attitude] {error}") from error
+
+
+def _check_areas(path: Path, config: BenchConfig) -> None:
+    for table, (width, height) in (("tracker", config.tracker.resolution_px), ("monitor", config.monitor.resolution_px)):
+        if width * height > MAX_AREA_PX:
+            raise InputError(
+                f"{path}: [{table}] resolution_px = [{width}, {height}]: {width * height / 1e6:.0f} million pixels; write"
+                f" {MAX_AREA_PX / 1e6:.0f} million at most, such as [8192, 8192]"
+            )
 
 
 def _check_unit(path: Path, where: str, q: tuple[float, ...]) -> None:

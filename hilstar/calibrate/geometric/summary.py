@@ -19,6 +19,7 @@ from hilstar.scene.lens import Lens
 from hilstar.units import ARCSEC_PER_RAD
 
 ONE_POSE = "one pose: the tracker's own distortion and the collimator's cannot be told apart; this file holds both"
+COLLIMATOR_ALONE = "one pose, with the tracker's lens as its flight model says: this file holds the collimator alone"
 ROUND = "poses turned about the boresight do not tell apart distortions that are round about it; they are in the stated error"
 ARROW_SHARE = 0.03  # of the screen's width: the median residual's arrow
 
@@ -115,7 +116,10 @@ def summary_of(found: Calibrated, written: tuple[str, ...]) -> GeometricSummary:
 
 
 def _notes(found: Calibrated) -> tuple[str, ...]:
-    notes = (ONE_POSE,) if len(found.problem.q_poses) == 1 else () if found.tracker_known else (ROUND,)
+    if len(found.problem.q_poses) == 1:
+        notes: tuple[str, ...] = (ONE_POSE if found.problem.nominal.tracker.lens is None else COLLIMATOR_ALONE,)
+    else:
+        notes = () if found.tracker_known else (ROUND,)
     lens = found.fit.geometry.monitor.lens
     if lens is None or not math.isfinite(lens.max_tangent):
         return notes

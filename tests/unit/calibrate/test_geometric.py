@@ -13,6 +13,7 @@ from hilstar.calibrate.geometric.decode import decode
 from hilstar.calibrate.geometric.dots import DotPlan, plan_dots, read_plan, write_plan
 from hilstar.calibrate.geometric.model import Nominal
 from hilstar.calibrate.geometric.observed import Observed
+from hilstar.calibrate.geometric.summary import lines_of, summary_of
 from hilstar.errors import InputError
 from hilstar.monitor.geometry import monitor_camera
 from hilstar.scene.camera import Camera, bounded
@@ -124,6 +125,16 @@ def test_what_poses_do_not_tell_apart_does_not_run_away(rng):
     found = calibrate_geometry(plan, nominal_of(BENCH), two_poses(bench, plan, real, rng, 0.0, 0.0), rng, tracker_known=False)
     assert np.sqrt((errors_arcsec(found, bench) ** 2).mean()) < 3.0
     assert found.uncertainty.rms_arcsec > 10  # a tracker's own round distortion is still in what the file states
+
+
+@pytest.mark.parametrize("lens", [None, Lens(radial=(-0.02, 0.0, 0.0))], ids=["ideal", "flight model"])
+def test_of_one_pose_the_file_holds_both_lenses_only_where_the_tracker_s_is_not_known(lens, rng):
+    plan, tracker = plan_of(*FEW[:2]), replace(TRACKER, lens=lens)
+    nominal = replace(nominal_of(BENCH), tracker=tracker)
+    found = calibrate_geometry(plan, nominal, observed_dots(BENCH, plan, tracker, rng), rng, tracker_known=True)
+    (note,) = (line for line in lines_of(summary_of(found, ())) if line.startswith("one pose"))
+    assert ("this file holds both" in note) == (lens is None)
+    assert ("holds the collimator alone" in note) == (lens is not None)
 
 
 def test_the_codes_alone_name_every_dot(rng):

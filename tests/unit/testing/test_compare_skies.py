@@ -16,6 +16,7 @@ from hilstar.rotation import from_radec_roll_deg
 from hilstar.scene.psf import footprint_px
 from hilstar.scene.sprites import pack_sprites
 from hilstar.testing import MAX_LINES, assert_same_sky, compare
+from hilstar.testing.chart import Panel
 from hilstar.testing.star_difference import CENTROID_PX, FLUX_MAG
 from hilstar.testing.star_fit import star_sigma_px
 from tests.support.benches import SMALL_BENCH
@@ -188,6 +189,19 @@ def test_a_turn_a_scale_and_a_dimming_of_all_are_told_apart(field):
     assert common.scale_error == pytest.approx(5e-4, abs=2e-6)
     assert common.flux_mag == pytest.approx(0.1, abs=MEASURED_MAG)
     assert "turned by +0.0500 deg" in common.line() and "dimmer by 0.10 mag" in common.line()
+
+
+def test_the_legend_counts_what_the_terminal_counts(field):
+    # Shifted as a whole, stars leave the image and come into it: they are common, and missing or extra all the same.
+    field.x_px += 3.0
+    found = compare(field.frame(), field.golden)
+    assert found.common is not None
+    assert found.summary()["missing"] > 0
+    panel = Panel(found, "mag")
+    for kind in ("missing", "extra"):
+        drawn = len(panel.of(kind))
+        assert panel.label(kind, drawn).startswith(f"{kind}: {found.summary()[kind]}")
+    assert len(panel.of("missing")) < found.summary()["missing"]
 
 
 def test_what_a_few_stars_do_is_not_common(field):

@@ -237,4 +237,5 @@ def policy_of(settings: AttitudeSettings) -> Policy:
         max_extrapolation_ns=round(settings.max_extrapolation_ms * NS_PER_MS),
         stale_after_ns=round(settings.stale_after_ms * NS_PER_MS),
         max_rate_rad_s=math.radians(settings.max_rate_deg_s),
+        prediction=settings.prediction,
     )

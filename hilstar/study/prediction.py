@@ -2,6 +2,9 @@
 
 The slew is a swing of degrees, shaken on each axis (see `shared.predictors`). A frame at time t has the samples that were taken
 before t minus the latency, which covers link, drawing and scan-out.
+
+Then what prediction makes of a vibration, against its frequency, beside a steady turn: by the rate, with `prediction = "auto"`,
+and for the newest attitude alone.
 """
 
 from __future__ import annotations
@@ -10,14 +13,27 @@ import math
 import time
 from bisect import bisect_right
 from dataclasses import dataclass
+from itertools import pairwise, product
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
+from hilstar.attitude.clock.timeline import Policy, Prediction, Timeline
 from hilstar.attitude.wire.packet import AttitudeSample
-from hilstar.charts import SERIES, chart, label_ends, plain_ticks, write_records
-from hilstar.rotation import angle_between_rad
-from hilstar.study.shared.predictors import JITTER, NEAR, SLEW_DEG, SLEW_S, Predictor, predictors, slew_attitude, slew_sample
+from hilstar.charts import BLUE, GREEN, MUTED, ORANGE, SERIES, chart, label_ends, plain_ticks, write_records
+from hilstar.rotation import angle_between_rad, conjugate, multiply, propagate, to_rotation_vector
+from hilstar.study.shared.predictors import (
+    JITTER,
+    NEAR,
+    ORION,
+    SLEW_DEG,
+    SLEW_S,
+    Predictor,
+    predictors,
+    slew_attitude,
+    slew_sample,
+)
 from hilstar.units import ARCSEC_PER_RAD, NS_PER_MS, NS_PER_S
 
 RATES_HZ = (5, 10, 20, 50, 100, 200)
@@ -27,6 +43,18 @@ FRAME_HZ = 60
 SPAN_S, QUICK_SPAN_S = 40.0, 4.0
 TIMED = 200
 MARKERS = "osd^vx"
+
+Way = Literal["rate", "auto", "newest"]
+WAYS: dict[Way, str] = {"rate": ORANGE, "auto": BLUE, "newest": GREEN}
+SHAKEN_HZ = (1, 2, 3, 5, 7, 10, 14, 20, 27, 35, 45)
+QUICK_SHAKEN_HZ = (2, 5, 10, 14, 20, 45)
+# Of packets, Hz, and the mean age of the newest one at light, ms: half a period of the packets at least.
+SHAKEN_CELLS = ((20, 40), (50, 20), (100, 5), (100, 10), (100, 20), (100, 40), (200, 10), (200, 20))
+QUICK_SHAKEN_CELLS = ((100, 20),)
+SHAKEN_ARCSEC, SHAKEN_TURN_RAD_S = 2.0, math.radians(0.5)
+SETTLED_S, SHAKEN_S = 1.5, 3.0
+SHAKEN_FRAME_HZ = 59.94  # no multiple of the packets' rate or of a vibration: every phase comes
+Z = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +81,11 @@ def run(directory: Path, quick: bool = False) -> list[str]:
         f"{default.rms_arcsec:.2g} arcsec rms, holding the sample by {hold.rms_arcsec:.3g}"
     )
     _draw(directory / "prediction", finding, outcomes)
-    return [finding, *(_line(outcome) for outcome in usual)]
+    shaken_by = measure_shaken(quick)
+    write_records(directory / "prediction_jitter.csv", shaken_by)
+    told = shaken_finding(shaken_by, USUAL_HZ, USUAL_MS)
+    _draw_shaken(directory / "prediction_jitter", told, shaken_by)
+    return [finding, *(_line(outcome) for outcome in usual), told]
 
 
 def measure(span_s: float) -> list[Outcome]:
@@ -64,6 +96,84 @@ def measure(span_s: float) -> list[Outcome]:
         samples = [slew_sample(round(k * NS_PER_S / hz)) for k in range(math.ceil(span_s * hz) + 1)]
         outcomes += [_outcome(predictor, samples, hz, ms) for predictor in predictors() if not predictor.waits]
     return outcomes
+
+
+@dataclass(frozen=True, slots=True)
+class Shaken:
+    """What a way of prediction makes of a vibration: the amplitude it shows and its error (rms), as shares of the true ones."""
+
+    way: str
+    packets: str
+    packet_hz: int
+    age_ms: int
+    jitter_hz: float
+    gain: float
+    residual: float
+
+
+def measure_shaken(quick: bool) -> list[Shaken]:
+    """Every way at every frequency, packets with rates and without."""
+    cells, frequencies = (QUICK_SHAKEN_CELLS, QUICK_SHAKEN_HZ) if quick else (SHAKEN_CELLS, SHAKEN_HZ)
+    found = []
+    for rates, (packet_hz, age_ms), way, jitter_hz in product((True, False), cells, WAYS, frequencies):
+        if jitter_hz < packet_hz / 2:  # a faster one looks like a slow one
+            residual, gain = shaken_error(way, jitter_hz, packet_hz, age_ms, rates)
+            packets = "with rates" if rates else "without rates"
+            found.append(Shaken(way, packets, packet_hz, age_ms, jitter_hz, gain, residual))
+    return found
+
+
+def shaken_error(way: Way, jitter_hz: float, packet_hz: int, age_ms: float, rates: bool) -> tuple[float, float]:
+    """Error (rms) and amplitude of what is shown of a vibration about z beside a steady turn, as shares of the vibration's own.
+
+    "newest" stands still between packets; the steady turn is known to it.
+    """
+    turn = 0.0 if way == "newest" else SHAKEN_TURN_RAD_S
+    prediction: Prediction = "auto" if way == "auto" else "rate"
+    timeline = Timeline(Policy(0 if way == "newest" else NS_PER_S, NS_PER_S, prediction=prediction))
+    latency_s = max(age_ms / 1e3 - 0.5 / packet_hz, 0.0)
+    amplitude, turning = SHAKEN_ARCSEC / ARCSEC_PER_RAD, math.tau * jitter_hz
+
+    def angle(t_s: float) -> float:
+        return turn * t_s + amplitude * math.sin(turning * t_s + 0.3)
+
+    taken, errors, times_s = 0, [], np.arange(0, SETTLED_S + SHAKEN_S, 1 / SHAKEN_FRAME_HZ) + latency_s
+    for t_s in times_s:
+        while taken / packet_hz <= t_s - latency_s:
+            at_s = taken / packet_hz
+            rate = Z * (turn + amplitude * turning * math.cos(turning * at_s + 0.3)) if rates else None
+            timeline.add(AttitudeSample(round(at_s * NS_PER_S), propagate(ORION, Z, angle(at_s)), rate))
+            taken += 1
+        shown = timeline.at(round(t_s * NS_PER_S))
+        if shown is None:
+            raise AssertionError("a timeline with samples has an attitude")
+        errors.append(-to_rotation_vector(multiply(shown.q_icrs_to_cam, conjugate(propagate(ORION, Z, angle(t_s)))))[2])
+    late = times_s >= SETTLED_S
+    phase, error = turning * times_s[late] + 0.3, np.array(errors)[late]
+    waves = np.column_stack((np.sin(phase), np.cos(phase), np.ones(len(phase))))
+    fitted = np.linalg.lstsq(waves, error + amplitude * np.sin(phase), rcond=None)[0]
+    return float(np.sqrt(2 * np.mean(error**2)) / amplitude), float(np.hypot(fitted[0], fitted[1]) / amplitude)
+
+
+def crossing_hz(found: list[Shaken], packets: str, packet_hz: int, age_ms: int) -> float:
+    """From which frequency on the newest attitude is nearer than one predicted by its rate; infinite where it is not."""
+    mine = [s for s in found if (s.packets, s.packet_hz, s.age_ms) == (packets, packet_hz, age_ms)]
+    by = {way: [s.residual for s in mine if s.way == way] for way in WAYS}
+    worse_by = np.array(by["rate"]) - np.array(by["newest"])
+    hz = [s.jitter_hz for s in mine if s.way == "rate"]
+    for (low, under), (high, over) in pairwise(zip(hz, worse_by, strict=True)):
+        if under <= 0 < over:
+            return float(low * (high / low) ** (under / (under - over)))
+    return math.inf
+
+
+def shaken_finding(found: list[Shaken], packet_hz: int, age_ms: int) -> str:
+    """The answer of the chart: above which frequency it is better not to predict a vibration."""
+    given, derived = (crossing_hz(found, packets, packet_hz, age_ms) for packets in ("with rates", "without rates"))
+    return (
+        f"Of a vibration above {given:.0f} Hz ({derived:.0f} without rates) the newest attitude is nearer than one predicted by"
+        f' {age_ms} ms; "auto" is near the better of both'
+    )
 
 
 def _outcome(predictor: Predictor, samples: list[AttitudeSample], rate_hz: int, latency_ms: int) -> Outcome:
@@ -114,3 +224,28 @@ def _draw(path: Path, finding: str, outcomes: list[Outcome]) -> None:
         for axes in (latency, rate):
             axes.set_ylabel("pointing error, rms [arcsec]")
             label_ends(axes)
+
+
+def _draw_shaken(path: Path, finding: str, found: list[Shaken]) -> None:
+    note = (
+        f"Packets at {USUAL_HZ} Hz, the newest {USUAL_MS} ms old at light on the mean; a vibration of {SHAKEN_ARCSEC:g} arcsec"
+        f" beside a turn of {math.degrees(SHAKEN_TURN_RAD_S):g} deg/s. Error and amplitude as shares of the vibration's own."
+    )
+    with chart(path, finding, panels=2, columns=2, note=note, share_y="row") as axes:
+        for column, packets in enumerate(("with rates", "without rates")):
+            error, gain = axes[column], axes[2 + column]
+            for way, colour in WAYS.items():
+                mine = [s for s in found if (s.way, s.packets, s.packet_hz, s.age_ms) == (way, packets, USUAL_HZ, USUAL_MS)]
+                hz = [s.jitter_hz for s in mine]
+                error.semilogx(hz, [s.residual for s in mine], marker="o", markersize=3.5, color=colour, label=way)
+                gain.semilogx(hz, [s.gain for s in mine], marker="o", markersize=3.5, color=colour, label=way)
+            error.set_title(f"packets {packets}")
+            gain.axhline(1.0, color=MUTED, linewidth=0.8)
+            gain.set_xlabel("frequency of the vibration [Hz]")
+            for panel in (error, gain):
+                panel.set_ylim(bottom=0)
+                plain_ticks(panel.xaxis, (1, 2, 5, 10, 20, 45))
+        axes[0].set_ylabel("error, rms / vibration's rms")
+        axes[2].set_ylabel("amplitude shown / true")
+        for panel in (axes[1], axes[3]):
+            label_ends(panel)

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hilstar.study.prediction import LATENCIES_MS, RATES_HZ, USUAL_HZ, USUAL_MS, Outcome, run
+from hilstar.charts import read_records
+from hilstar.study.prediction import LATENCIES_MS, RATES_HZ, USUAL_HZ, USUAL_MS, Outcome, Shaken, crossing_hz, run
 from hilstar.study.shared.predictors import SLEW_DEG, SLEW_S
 
 
@@ -46,9 +47,33 @@ def test_a_rate_predicts_better_than_holding_and_worse_the_longer_it_has_to(outc
         assert outcomes[own, USUAL_HZ, ms].rms_arcsec < outcomes["hold", USUAL_HZ, ms].rms_arcsec / 3
 
 
+@pytest.fixture(scope="module")
+def shaken(study):
+    return {(s.way, s.packets, s.jitter_hz): s for s in read_records(study[0] / "prediction_jitter.csv", Shaken)}
+
+
+def test_a_rate_amplifies_a_vibration_by_its_phase_over_the_age(shaken):
+    """What is shown, 1 + i x of a wave, and what is true, exp(i x), for x = 2 pi f age; ages within 5 ms of their mean."""
+    for hz in (2.0, 5.0, 10.0, 14.0):
+        x = math.tau * hz * USUAL_MS / 1e3
+        assert shaken["rate", "with rates", hz].gain == pytest.approx(math.hypot(1, x), rel=0.05)
+        assert shaken["newest", "with rates", hz].residual == pytest.approx(2 * math.sin(x / 2), rel=0.1)
+
+
+def test_auto_is_the_rate_where_vibrations_are_slow_and_damps_where_they_are_fast(study, shaken):
+    for packets in ("with rates", "without rates"):
+        for hz in (2.0, 5.0):
+            assert shaken["auto", packets, hz].residual == pytest.approx(shaken["rate", packets, hz].residual, rel=0.05)
+        for hz in (20.0, 45.0):
+            assert shaken["auto", packets, hz].residual < 0.7 * shaken["rate", packets, hz].residual
+            assert shaken["auto", packets, hz].residual < 2.0 * shaken["newest", packets, hz].residual
+        assert 8 < crossing_hz(list(shaken.values()), packets, USUAL_HZ, USUAL_MS) < 16  # sin x = x / 2: 15 Hz with rates
+    assert study[1][-1].startswith("Of a vibration above 1")
+
+
 def test_the_study_writes_what_it_found(study, outcomes):
     folder, lines = study
-    assert len(lines) == 1 + 5
+    assert len(lines) == 1 + 5 + 1
     assert len(outcomes) == 5 * (len(RATES_HZ) + len(LATENCIES_MS) - 1)
     assert {ms for _, hz, ms in outcomes if hz == USUAL_HZ} == set(LATENCIES_MS)
     assert {hz for _, hz, ms in outcomes if ms == USUAL_MS} == set(RATES_HZ)

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from hilstar.arrays import FloatArray
+from hilstar.attitude.clock.damping import UNDAMPED, Damped, Damping
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal, rate_refusal
 from hilstar.rotation import angle_between_rad, propagate, rate_between_rad_s, slerp
 from hilstar.units import NS_PER_S
@@ -24,6 +25,8 @@ FRESH_AGAIN = 0.5
 
 # Between two samples: the first one is held, SLERP takes the shorter way, or both are blended (C2) with their rates.
 Join = Literal["hold", "slerp", "blend"]
+# Past the newest: by its rate, or by what of that rate's jitter the last second's samples show to go on.
+Prediction = Literal["rate", "auto"]
 Joins = Callable[[AttitudeSample, AttitudeSample], Join]
 
 
@@ -51,12 +54,15 @@ class Attitude:
 class Policy:
     """How far to predict past the newest sample, how long it counts as fresh, and the maximum rate.
 
+    `prediction` "auto" carries a rate's jitter on as far as the samples show that it goes on (`damping`).
+
     A sample whose rate exceeds `max_rate_rad_s` is refused; two samples farther apart than that are a jump.
     """
 
     max_extrapolation_ns: int
     stale_after_ns: int
     max_rate_rad_s: float = math.inf
+    prediction: Prediction = "rate"
 
 
 class Timeline:
@@ -72,6 +78,8 @@ class Timeline:
         self._t_ns: list[int] = []
         self._samples: list[AttitudeSample] = []
         self._received_ns: int | None = None  # of the newest
+        self._damping = Damping() if policy.prediction == "auto" else None
+        self._damped = UNDAMPED  # of the newest
         self._lock = threading.Lock()
 
     def __len__(self) -> int:
@@ -87,12 +95,13 @@ class Timeline:
         too_fast = rate_refusal(sample, self._policy.max_rate_rad_s)
         if too_fast is not None:
             return too_fast
+        damped = self._damp(sample)
         with self._lock:
             if self._t_ns and sample.t_ns <= self._t_ns[-1]:
                 return Refusal("time", f"t_ns {sample.t_ns} is not after {self._t_ns[-1]} of an earlier packet")
             self._t_ns.append(sample.t_ns)
             self._samples.append(sample)
-            self._received_ns = received_ns
+            self._received_ns, self._damped = received_ns, damped
             if len(self._samples) > 2 * self._capacity:
                 del self._t_ns[: self._capacity], self._samples[: self._capacity]
             return None
@@ -102,17 +111,17 @@ class Timeline:
 
         Before the first sample it is the first. Between two it is the C2 blend of both where both have rates, else SLERP;
         before a discontinuity, in a log's gap, and for a turn faster than `max_rate_rad_s` the earlier one is held. Past the
-        newest it is predicted with the sample's rate (else that of the last two samples), and its acceleration where it has
-        one, for at most `max_extrapolation_ns`, and then held.
+        newest it is predicted with the sample's rate (else that of the last two samples; where the policy says "auto", less
+        what `damping` takes from it), and its acceleration where it has one, for at most `max_extrapolation_ns`, and then held.
         """
         with self._lock:
             if not self._samples:
                 return None
             i = bisect_right(self._t_ns, t_ns) - 1
             near = self._samples[max(i - 1, 0) : i + 3]
-            received_ns = self._received_ns
+            received_ns, damped = self._received_ns, self._damped
         place = max(min(i, 1), 0)
-        found = self._at(t_ns, near, place, received_ns) if i >= 0 else _held(near[0], 0, False)
+        found = self._at(t_ns, near, place, received_ns, damped) if i >= 0 else _held(near[0], 0, False)
         if near[place].velocity_km_s is None:
             return found
         return replace(found, velocity_km_s=near[place].velocity_km_s, place_km=self._place_km(near, place, t_ns))
@@ -132,7 +141,7 @@ class Timeline:
         bend = (1 - u) * (before.velocity_km_s * gap_s - straight) - u * (after.velocity_km_s * gap_s - straight)
         return before.place_km + u * straight + u * (1 - u) * bend
 
-    def _at(self, t_ns: int, near: list[AttitudeSample], place: int, received_ns: int | None) -> Attitude:
+    def _at(self, t_ns: int, near: list[AttitudeSample], place: int, received_ns: int | None, damped: Damped) -> Attitude:
         newest = near[place]
         age_ns = t_ns - newest.t_ns
         if place + 1 < len(near):
@@ -142,7 +151,8 @@ class Timeline:
                 return _held(newest, age_ns, gap)
             q, rate = self._between(near, place, age_ns, join)
             return Attitude(q, age_ns, False, newest.sequence, rate_cam_rad_s=rate)
-        return replace(self._predict(near[place - 1] if place else None, newest, age_ns), received_ns=received_ns)
+        own = self._rate_of(near[place - 1] if place else None, newest)
+        return replace(self._predict(newest, own, age_ns, damped), received_ns=received_ns)
 
     def _between(self, near: list[AttitudeSample], place: int, age_ns: int, join: Join) -> tuple[FloatArray, FloatArray]:
         """Attitude and rate between two samples; in a blend the rates are blended too."""
@@ -184,18 +194,40 @@ class Timeline:
         seconds = (after.t_ns - before.t_ns) / NS_PER_S
         return angle_between_rad(before.q_icrs_to_cam, after.q_icrs_to_cam) > self._policy.max_rate_rad_s * seconds
 
-    def _predict(self, previous: AttitudeSample | None, newest: AttitudeSample, age_ns: int) -> Attitude:
+    def _rate_of(self, previous: AttitudeSample | None, newest: AttitudeSample) -> FloatArray | None:
+        """The rate by which a sample is carried on: its own, else that of the turn to it; None where nobody knows."""
+        if newest.rate_cam_rad_s is not None or previous is None or self._jumped(previous, newest):
+            return newest.rate_cam_rad_s
+        gap_ns = newest.t_ns - previous.t_ns
+        if gap_ns > self._policy.stale_after_ns:
+            return None
+        return rate_between_rad_s(previous.q_icrs_to_cam, newest.q_icrs_to_cam, gap_ns / NS_PER_S)
+
+    def _damp(self, sample: AttitudeSample) -> Damped:
+        """What a prediction takes from the rate of the next sample; nothing from one whose acceleration is known."""
+        damping, previous = self._damping, self._samples[-1] if self._samples else None
+        if damping is None or (previous is not None and sample.t_ns <= previous.t_ns):
+            return UNDAMPED
+        rate = self._rate_of(previous, sample)
+        if rate is None or sample.acceleration_cam_rad_s2 is not None:
+            damping.restart()
+            return UNDAMPED
+        if previous is None or sample.t_ns - previous.t_ns > self._policy.stale_after_ns or self._jumped(previous, sample):
+            return damping.add(sample.t_ns, tuple(rate.tolist()), None)
+        turn = rate_between_rad_s(previous.q_icrs_to_cam, sample.q_icrs_to_cam, 1.0)
+        return damping.add(sample.t_ns, tuple(rate.tolist()), tuple(turn.tolist()))
+
+    def _predict(self, newest: AttitudeSample, rate: FloatArray | None, age_ns: int, damped: Damped) -> Attitude:
         stale = age_ns > self._policy.stale_after_ns
-        rate = newest.rate_cam_rad_s
-        if rate is None and previous is not None and not self._jumped(previous, newest):
-            gap_ns = newest.t_ns - previous.t_ns
-            if gap_ns <= self._policy.stale_after_ns:
-                rate = rate_between_rad_s(previous.q_icrs_to_cam, newest.q_icrs_to_cam, gap_ns / NS_PER_S)
         if rate is None:
             return _held(newest, age_ns, stale)
         # results/tradeoff.csv, prediction: 5.5 arcsec by the rate of the sample; a cubic spline 17, holding 144.
         prediction_ns = min(age_ns, self._policy.max_extrapolation_ns)
         seconds, bend = prediction_ns / NS_PER_S, newest.acceleration_cam_rad_s2
+        if self._damping is not None:
+            self._damping.asked(seconds)
+            if damped is not UNDAMPED:
+                rate = rate - damped.by(seconds)
         mean, last = (rate, rate) if bend is None else (rate + 0.5 * seconds * bend, rate + seconds * bend)
         q = propagate(newest.q_icrs_to_cam, mean, seconds)
         turning = last if prediction_ns == age_ns else None  # held past that

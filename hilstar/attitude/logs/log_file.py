@@ -107,6 +107,7 @@ def write_log(path: Path, samples: Sequence[AttitudeSample], scale: str | None =
 
 def log_timeline(samples: list[AttitudeSample], policy: Policy, joins: LogJoins | None = None) -> Timeline:
     """A timeline of every sample of a log, joined as the log's own samples require (see `gaps`)."""
+    policy = replace(policy, prediction="rate")  # nothing is predicted of a log
     timeline = Timeline(policy, capacity=len(samples), joins=log_joins(samples) if joins is None else joins)
     for sample in samples:
         timeline.add(sample)

@@ -153,6 +153,15 @@ class AttitudeSettings(Table, frozen=True):
             "and two samples that would need a faster turn between them are a jump, never a turn.",
         ),
     ] = 60.0
+    prediction: Annotated[
+        Literal["rate", "auto"],
+        Meta(
+            description='How the newest attitude is carried on to the moment of light. `"rate"`: by its rate, which is exact '
+            'for a steady turn and amplifies jitter from about 0.3 / age on (15 Hz at 20 ms). `"auto"`: a steady turn as '
+            "before, and of the jitter as much as the last second's samples show to go on "
+            "([On time](on-time.md#prediction-and-jitter))."
+        ),
+    ] = "rate"
     check_rates: Annotated[
         Literal["use-quaternions", "warn", "off"],
         Meta(

@@ -13,6 +13,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from hilstar.errors import InputError, MachineError, did_you_mean
+from hilstar.monitor.window.awake import Awake
 from hilstar.monitor.window.library import glfw
 from hilstar.monitor.window.visibility import ScreenArea, Visibility
 from hilstar.monitor.window.x11 import Survival, SwapStamps, has_extension, is_composited, sync_control
@@ -122,10 +123,12 @@ class Window:
         self._survival: Survival | None = None
         self._visibility: Visibility | None = None
         self._minimised = False
+        self._awake = Awake()
         try:
             self._open()
         except BaseException:
             glfw.terminate()
+            self._awake.close()
             raise
 
     def _open(self) -> None:
@@ -310,8 +313,9 @@ class Window:
             self._follow_display()
 
     def close(self) -> None:
-        """Restore the monitor's gamma ramp, and close."""
-        if self.gone is not None:  # there is no server left to tell
+        """Restore the monitor's gamma ramp and its blanking, and close."""
+        if self.gone is not None:  # there is no server left to tell, or no window
+            self._awake.close()
             return
         if self._visibility is not None:
             self._visibility.close()
@@ -321,6 +325,7 @@ class Window:
             with contextlib.suppress(glfw.GLFWError):
                 glfw.set_gamma_ramp(monitor, ramp)
         glfw.terminate()
+        self._awake.close()  # after GLFW, which restores what it had found: no blanking
 
     def __enter__(self) -> Self:
         return self

@@ -1,0 +1,169 @@
+"""No screen goes dark during a run, and what the X server was set to comes back, however the run ends."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import re
+import signal
+import subprocess
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from hilstar.monitor.window.awake import _Server
+from tests.support.benches import SCREEN_BENCH, still_log
+from tests.support.commands import HILSTAR
+from tests.support.waiting import PATIENCE_S, wait_for
+from tests.support.x11.screens import xvfb
+from tests.support.x11.xorg import Xorg, xorg
+
+pytestmark = pytest.mark.screen
+BEFORE, AWAKE = ("600", "300", "yes"), ("0", "no")
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory) -> Iterator[Xorg]:
+    """A real X server."""
+    with xorg(tmp_path_factory.mktemp("xorg")) as running:
+        yield running
+
+
+@pytest.fixture(autouse=True)
+def blanking(server):
+    for words in (("s", "600", "300"), ("s", "blank")):
+        xset(server, *words)
+    assert seen(server) == BEFORE
+
+
+def xset(server: Xorg, *words: str) -> str:
+    done = subprocess.run(["xset", *words], env=server.env, capture_output=True, text=True, timeout=PATIENCE_S, check=True)
+    return done.stdout
+
+
+def seen(server: Xorg) -> tuple[str, ...]:
+    """Timeout, cycle, and whether blanking is preferred, as xset tells them."""
+    text = xset(server, "q")
+    patterns = (r"timeout:\s+(\d+)", r"cycle:\s+(\d+)", r"blanking:\s+(\w+)")
+    found = [re.search(pattern, text) for pattern in patterns]
+    return tuple("" if match is None else match[1] for match in found)
+
+
+def awake(server: Xorg) -> bool:
+    timeout, _, prefers = seen(server)
+    return (timeout, prefers) == AWAKE
+
+
+@contextmanager
+def shown(server: Xorg, folder: Path, name: str = "bench", *options: str) -> Iterator[subprocess.Popen[bytes]]:
+    folder.mkdir(exist_ok=True)
+    (folder / f"{name}.toml").write_text(SCREEN_BENCH)
+    still_log(folder / "still.csv")
+    command = [*HILSTAR, "replay", str(folder / f"{name}.toml"), str(folder / "still.csv"), "--force", *options]
+    with (
+        (folder / f"{name}.txt").open("wb") as said,
+        subprocess.Popen(command, env=server.env, stdout=said, stderr=said, start_new_session=True) as process,
+    ):
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+@pytest.mark.parametrize("sign", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize("options", [(), ("--windowed",)])
+def test_nothing_blanks_during_a_run_and_all_is_as_before_after_it(server, tmp_path, sign, options):
+    with shown(server, tmp_path, "bench", *options) as process:
+        wait_for(lambda: awake(server) or process.poll() is not None)
+        assert process.poll() is None, (tmp_path / "bench.txt").read_text()
+        process.send_signal(sign)
+        process.wait(PATIENCE_S)
+        if sign != signal.SIGKILL:
+            assert seen(server) == BEFORE  # before the command has ended
+    wait_for(lambda: seen(server) == BEFORE, "after a kill, within moments")
+
+
+def test_a_kill_of_all_its_processes_restores_too(server, tmp_path):
+    with shown(server, tmp_path) as process:
+        wait_for(lambda: awake(server) or process.poll() is not None)
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait(PATIENCE_S)
+    wait_for(lambda: seen(server) == BEFORE)
+
+
+def test_two_runs_on_one_server_keep_it_awake_until_the_last_ends(server, tmp_path):
+    with shown(server, tmp_path / "one", "one", "--windowed") as one:
+        wait_for(lambda: awake(server))
+        with shown(server, tmp_path / "two", "two", "--windowed") as two:
+            wait_for(lambda: "Hz" in (tmp_path / "two" / "two.txt").read_text())
+            one.send_signal(signal.SIGINT)
+            one.wait(PATIENCE_S)
+            wait_for(lambda: awake(server))
+            two.send_signal(signal.SIGKILL)
+    wait_for(lambda: seen(server) == BEFORE)
+
+
+def test_what_somebody_sets_meanwhile_is_prevented_and_comes_after(server, tmp_path):
+    with shown(server, tmp_path) as process:
+        wait_for(lambda: awake(server) or process.poll() is not None)
+        xset(server, "s", "120", "300")
+        wait_for(lambda: awake(server) or process.poll() is not None)
+        process.send_signal(signal.SIGINT)
+        process.wait(PATIENCE_S)
+    assert seen(server)[0] == "120"
+
+
+class StandIn:
+    """Stands for libX11 and libXext before a server with DPMS: no server that runs without a monitor has it."""
+
+    def __init__(self) -> None:
+        self.saver, self.level, self.on, self.calls = [600, 300, 1, 1], 3, 1, []
+        self.XOpenDisplay = lambda _: 1  # takes an attribute, as a function of ctypes does
+
+    def DPMSQueryExtension(self, *_: object) -> int:
+        return 1
+
+    def DPMSCapable(self, _: object) -> int:
+        return 1
+
+    def DPMSInfo(self, _: object, level: ctypes.c_ushort, on: ctypes.c_ubyte) -> None:
+        level._obj.value, on._obj.value = self.level, self.on
+
+    def XGetScreenSaver(self, _: object, *parts: ctypes.c_int) -> None:
+        for part, value in zip(parts, self.saver, strict=True):
+            part._obj.value = value
+
+    def XSetScreenSaver(self, _: object, *parts: int) -> None:
+        self.saver = list(parts)
+
+    def __getattr__(self, name: str) -> Callable[..., None]:
+        return lambda _, *words: self.calls.append((name, *words))
+
+
+def test_standby_is_ended_prevented_and_restored(monkeypatch):
+    library = StandIn()
+    monkeypatch.setattr(ctypes, "CDLL", lambda _: library)
+    server = _Server()
+    before = server.blanking()
+    assert before == (600, 300, 1, 1, True) and before.happens
+    server.prevent(before)
+    assert [name for name, *_ in library.calls] == ["DPMSForceLevel", "DPMSDisable", "XForceScreenSaver", "XSync"]
+    library.on = 0  # as the server has it after that
+    assert not server.blanking().happens
+    server.restore(before)
+    assert library.calls[-2][0] == "DPMSEnable" and library.saver == [600, 300, 1, 1]
+    library.calls.clear()
+    server.restore(before._replace(dpms=False))
+    assert [name for name, *_ in library.calls] == ["XSync"]
+
+
+def test_a_virtual_server_is_kept_awake_too(tmp_path):
+    with xvfb(tmp_path, "640x480x24") as screen:
+        xset(screen, "s", "600", "300")
+        with shown(screen, tmp_path) as process:
+            wait_for(lambda: seen(screen)[0] == "0")
+            process.send_signal(signal.SIGINT)
+            process.wait(PATIENCE_S)
+        assert seen(screen)[0] == "600"

@@ -139,6 +139,7 @@ class Receiver:
         try:
             while not self._stop.is_set():
                 self._listen()
+            self._take_decided(self._senders.release())
             self._settle(self.jumps.release())
         except BaseException as error:  # whatever it is: the display continues, and `tend` restarts this
             self._failure = f"{type(error).__name__}: {error}"
@@ -156,6 +157,8 @@ class Receiver:
             waited_ns = 0 if timely else arrival.host_ns - self._empty_ns
             self._take(arrival, arrival.waited_ns if arrival.stamped else waited_ns)
         now_ns = time.monotonic_ns()
+        if not arrivals:  # else the sender shown may have spoken, and is not read yet
+            self._take_decided(self._senders.expire(now_ns))
         self._settle(self.jumps.expire(now_ns))
         if self._link.two_way:
             self._back.talk(now_ns, ask=self._learn_from_ns is not None)
@@ -187,13 +190,25 @@ class Receiver:
 
     def _take_sample(self, arrival: SampleArrival) -> None:
         sample, host_ns = arrival.event, arrival.host_ns
-        refusal = self._repeats.judge(sample, host_ns, arrival.raw) or self._senders.judge(sample, host_ns, arrival.waited_ns)
+        refusal = self._repeats.judge(sample, host_ns, arrival.raw)
         if refusal is not None:
             self._refuse(arrival, refusal)
             return
         self._rates.see(sample)
         if self._repeats.resumed():
             self.jumps.forgive()
+        self._take_decided(self._senders.take(arrival))
+
+    def _take_decided(self, arrivals: list[SampleArrival]) -> None:
+        """What is known by now to be from the sender shown, or from another."""
+        for arrival in arrivals:
+            if arrival.refusal is not None:
+                self._refuse(arrival, arrival.refusal)
+            else:
+                self._take_own(arrival)
+
+    def _take_own(self, arrival: SampleArrival) -> None:
+        host_ns = arrival.host_ns
         if self._learn_from_ns is None or host_ns < self._learn_from_ns:
             arrival = replace(arrival, waited_ns=WAITED_UNKNOWN_NS)
         elif self.clock.unheard:

@@ -1,31 +1,50 @@
 """Who sends: a sender that hangs or whose clock has stopped, and a second sender on the same link; no I/O.
 
-A link does not say who sent a packet, so the packets themselves must. Two senders have two counters: where their packets
-alternate, `sequence` goes back while `t_ns` advances, again and again, and each counter by itself is regular; a single sender
-does that once, when it restarts. Without a sequence the attitudes must tell: alternately near one of two, and each time far
-from the other. A declared jump (discontinuity), a reordered packet and a new target are not a second sender.
+A link does not say who sent a message, so the messages themselves must. A sender is known by its clock (`t_ns` advances as the
+host's does, or by its usual step for each count), its count (`sequence` advances), and its sky (the attitude goes on as it
+turned).
+
+Laws:
+1. A message that agrees with the sender shown in two of the three is its own: it may restart its count, set its clock, or turn
+   to a new target without saying so, and it may mix packets that count with messages that do not.
+2. Any other message is a stranger's. It waits until the sender shown speaks again, and is then refused: there are two. Where
+   that one stays silent for longer than it usually is, it was the same sender, begun anew, and goes on from there.
+3. A sender that comes back on the course that it had before a stranger took its place was not that stranger.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from typing import NamedTuple
 
+from hilstar.attitude.wire.links import SampleArrival
 from hilstar.attitude.wire.packet import U32, AttitudeSample, Refusal
 from hilstar.notices import Notices
-from hilstar.rotation import angle_between_rad, propagate
-from hilstar.units import NS_PER_S
+from hilstar.units import NS_PER_MS, NS_PER_S
 
 SECOND, FROZEN = "second-sender", "source-frozen"
 MIN_REPEATS = 10  # and
 MIN_REPEATED_NS = NS_PER_S // 4
-MIN_TURNS = 3  # from the other sender back to the first, within
-TURNS_WITHIN_NS = 5 * NS_PER_S
-MIN_TURNS_BY_MOTION = 8  # attitudes alone are weaker evidence than two counters
-FAR_RATIO = 4.0  # of the distance from one sender to that from the other
+MIN_ANOTHERS_RAD = 0.1  # at one time of a clock that stands, an attitude that far away is another sender's
+MIN_STRANGE = 3  # messages of one stranger, before and after the first sender spoke again: they are a second one's
+ANOTHER_COURSE_WITHIN_NS = 5 * NS_PER_S
+MAX_STRANGERS = 4
+EARLY_NS = 50 * NS_PER_MS  # from message to message t_ns may run ahead of the host's clock, or go back, by this and be one's
 MIN_FAR_RAD = 5e-5  # 10 arcsec
+FAR_RATIO = 3.0  # of what the attitudes lately came off their course
+PLAUSIBLE_RAD_S = math.radians(60.0)
+STEADY = (0.7, 1.4)  # times the usual step of t_ns
 MAX_FIRST_LOSSES = 16  # packets missing, while their period is not known yet
 MAX_STEP_NS = 10 * NS_PER_S
-MAX_REORDERED = 64
+MIN_KNOWN, MIN_KNOWN_NS = 8, NS_PER_S  # before a sender's usual silences are known
+USUAL_SILENCES, SLACK_NS = 3, 20 * NS_PER_MS
+FORGETS, LEARNS = 0.98, 1 / 32  # of a silence or an error, with each message
+MIN_COURSES = 8  # attitudes alone are weaker evidence than clocks and counters
+
+Turn = tuple[float, float, float]
 
 
 class Repeats:
@@ -34,15 +53,16 @@ class Repeats:
     def __init__(self, notices: Notices) -> None:
         self._notices = notices
         self._last: bytes | None = None
-        self._last_t_ns: int | None = None
+        self._last_sample: AttitudeSample | None = None
         self._since_ns = 0
         self._count = 0
         self._frozen = False
 
     def judge(self, sample: AttitudeSample, host_ns: int, raw: bytes) -> Refusal | None:
-        """Why this one is refused; None where its time differs from that of the previous one."""
-        if sample.t_ns != self._last_t_ns:
-            self._last, self._last_t_ns, self._since_ns, self._count = raw, sample.t_ns, host_ns, 0
+        """Why this one is refused; None where its time differs from that of the previous one, or it is another sender's."""
+        last = self._last_sample
+        if last is None or sample.t_ns != last.t_ns or (raw != self._last and _is_another_s(last, sample)):
+            self._last, self._last_sample, self._since_ns, self._count = raw, sample, host_ns, 0
             return None
         self._count += 1
         if self._count >= MIN_REPEATS and host_ns - self._since_ns >= MIN_REPEATED_NS:
@@ -53,6 +73,7 @@ class Repeats:
             )
             self._frozen = True
             self._notices.begin(FROZEN, f"{what}: refused (time), and the attitude shown is getting old")
+        self._last_sample = sample
         return Refusal("time", f"t_ns {sample.t_ns} repeats that of the previous packet")
 
     def resumed(self) -> bool:
@@ -64,42 +85,165 @@ class Repeats:
         return True
 
 
+def _is_another_s(last: AttitudeSample, sample: AttitudeSample) -> bool:
+    return math.hypot(*_turn_rad(last.q_icrs_to_cam.tolist(), sample.q_icrs_to_cam.tolist())) > MIN_ANOTHERS_RAD
+
+
+def _steps(before: int, sequence: int) -> int:
+    """By how much `sequence` advances, modulo 2^32, taken the shorter way."""
+    return (sequence - before + U32 // 2) % U32 - U32 // 2
+
+
+def _turn_rad(a: Sequence[float], b: Sequence[float]) -> Turn:
+    """The turn from attitude `a` to `b` as a rate times a second; plain floats, for every packet passes here."""
+    w = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]
+    x = a[0] * b[1] - a[1] * b[0] - a[3] * b[2] + a[2] * b[3]
+    y = a[0] * b[2] - a[2] * b[0] - a[1] * b[3] + a[3] * b[1]
+    z = a[0] * b[3] - a[3] * b[0] - a[2] * b[1] + a[1] * b[2]
+    sine = math.sqrt(x * x + y * y + z * z)
+    scale = -2.0 if sine < 1e-9 else -2.0 * math.atan2(sine, abs(w)) / sine
+    if w < 0:
+        scale = -scale
+    return x * scale, y * scale, z * scale
+
+
+@dataclass(frozen=True, slots=True)
+class _Agreement:
+    """In what a message agrees with a sender; `far_rad` is how far its attitude lies from the course."""
+
+    clock: bool
+    count: bool
+    sky: bool
+    plausible: bool  # a turn that a spacecraft could have made meanwhile
+    steady: bool  # it comes by the usual step of t_ns
+    far_rad: float
+
+    @property
+    def score(self) -> int:
+        """Of the three."""
+        return self.clock + self.count + self.sky
+
+
 @dataclass(slots=True)
-class _Track:
-    """What is known of one sender: its newest sample, when that arrived, and how its packets advance."""
+class _Sender:
+    """What is known of one: its newest message, when that arrived, and how its messages advance."""
 
     sample: AttitudeSample
     host_ns: int
-    period_ns: float | None = None
+    waited_ns: int = 0
+    heard: int = 1
+    since_ns: int = 0
+    count: int = 0  # its newest `sequence`, and the time of that
+    count_t_ns: int = 0
+    period_ns: float | None = None  # of t_ns for each count, or for each message
     still: bool = True  # it does not count: its sequence never changes
+    turning_rad_s: Turn | None = None
+    far_rad: float = 0.0  # how far its attitudes lately came off their course
+    silence_ns: float = 0.0  # how long it was lately silent from message to message
+    q: list[float] = field(default_factory=list)
 
-    def step(self, sample: AttitudeSample) -> int:
-        """By how much `sequence` advances from here, modulo 2^32, taken the shorter way."""
-        return (sample.sequence - self.sample.sequence + U32 // 2) % U32 - U32 // 2
+    @classmethod
+    def of(cls, arrival: SampleArrival) -> _Sender:
+        sample = arrival.event
+        made = cls(sample, arrival.host_ns, arrival.waited_ns, since_ns=arrival.host_ns, count=sample.sequence)
+        made.count_t_ns, made.q, made.turning_rad_s = sample.t_ns, sample.q_icrs_to_cam.tolist(), _rate_of(sample)
+        return made
 
-    def may_reach(self, sample: AttitudeSample, host_ns: int) -> bool:
-        """True where this counter may have reached that sequence by now."""
-        step, later_ns = self.step(sample), sample.t_ns - self.sample.t_ns
-        if self.still and step == 0:
-            return later_ns > 0
-        gap_ns = max(later_ns if 0 < later_ns < MAX_STEP_NS else 0, host_ns - self.host_ns)
-        max_step = MAX_FIRST_LOSSES if self.period_ns is None else 2 + 2 * gap_ns / self.period_ns
+    def agrees(self, arrival: SampleArrival) -> _Agreement:
+        """In what a message agrees with this sender."""
+        sample = arrival.event
+        later_ns, gap_ns = sample.t_ns - self.sample.t_ns, arrival.host_ns - self.host_ns
+        step = _steps(self.count, sample.sequence)
+        on_line = self._on_line(step, sample.t_ns - self.count_t_ns)
+        usual_ns = max(gap_ns + EARLY_NS + min(self.waited_ns, NS_PER_S), 3 * (self.period_ns or 0.0))
+        clock = on_line or -EARLY_NS <= later_ns <= usual_ns
+        meanwhile_ns = later_ns if abs(later_ns) < MAX_STEP_NS else max(gap_ns, 0)
+        turned = _turn_rad(self.q, sample.q_icrs_to_cam.tolist())
+        far_rad = self._far_rad(turned, meanwhile_ns)
+        if not clock:
+            far_rad = min(far_rad, self._far_rad(turned, max(gap_ns, 0)))
+        seconds = max(abs(later_ns) if clock else gap_ns, 0) / NS_PER_S
+        return _Agreement(
+            clock,
+            self._counts_on(step, later_ns, gap_ns),
+            far_rad <= MIN_FAR_RAD + FAR_RATIO * self.far_rad,
+            far_rad <= MIN_FAR_RAD + PLAUSIBLE_RAD_S * seconds,
+            self._is_steady(step, later_ns),
+            far_rad,
+        )
+
+    def _on_line(self, step: int, later_ns: int) -> bool:
+        """Whether time and count advanced together, however late the message is."""
+        if self.still or self.period_ns is None or not step:
+            return False
+        usual_ns = step * self.period_ns
+        return abs(later_ns - usual_ns) <= 0.5 * self.period_ns + 0.05 * abs(usual_ns)
+
+    def _counts_on(self, step: int, later_ns: int, gap_ns: int) -> bool:
+        """Whether this counter may have reached that sequence by now."""
+        later_ns = max(later_ns if 0 < later_ns < MAX_STEP_NS else 0, gap_ns)
+        max_step = MAX_FIRST_LOSSES if self.period_ns is None else 2 + 2 * later_ns / self.period_ns
         return 1 <= step <= max_step
 
-    def far_rad(self, sample: AttitudeSample) -> float:
-        """The angle from that attitude to this sender's last one, propagated to its time."""
-        at = self.sample
-        later_s = min(max(sample.t_ns - at.t_ns, 0), NS_PER_S) / NS_PER_S
-        q = at.q_icrs_to_cam if at.rate_cam_rad_s is None else propagate(at.q_icrs_to_cam, at.rate_cam_rad_s, later_s)
-        return angle_between_rad(q, sample.q_icrs_to_cam)
+    def _is_steady(self, step: int, later_ns: int) -> bool:
+        if self.period_ns is None:
+            return False
+        return STEADY[0] < later_ns / (self.period_ns * max(step, 1)) < STEADY[1]
 
-    def move(self, sample: AttitudeSample, host_ns: int) -> None:
-        """Take the next sample of this sender."""
-        step, later_ns = self.step(sample), sample.t_ns - self.sample.t_ns
-        if 0 < later_ns < MAX_STEP_NS:
-            period_ns = later_ns / max(step, 1)
-            self.period_ns = period_ns if self.period_ns is None else self.period_ns + (period_ns - self.period_ns) / 8
-        self.sample, self.host_ns, self.still = sample, host_ns, self.still and step == 0
+    def _far_rad(self, turned: Turn, meanwhile_ns: float) -> float:
+        """From the course that it had, or from where it was."""
+        stood_rad = math.hypot(*turned)
+        if self.turning_rad_s is None:
+            return stood_rad
+        seconds = max(-NS_PER_S, min(meanwhile_ns, NS_PER_S)) / NS_PER_S
+        return min(stood_rad, math.dist(turned, [seconds * rate for rate in self.turning_rad_s]))
+
+    def move(self, arrival: SampleArrival, agreed: _Agreement) -> None:
+        """Take the next message of this sender."""
+        sample = arrival.event
+        later_ns, step = sample.t_ns - self.sample.t_ns, _steps(self.count, sample.sequence)
+        if agreed.clock and later_ns <= 0:  # out of order
+            return
+        if self.still or sample.sequence:  # 0: it mixes in a message that does not count
+            counted_ns = sample.t_ns - self.count_t_ns
+            if 0 < counted_ns < MAX_STEP_NS and (agreed.count or self.still):
+                period_ns = counted_ns / max(step, 1)
+                self.period_ns = period_ns if self.period_ns is None else self.period_ns + (period_ns - self.period_ns) / 8
+            self.still = self.still and step == 0
+            self.count, self.count_t_ns = sample.sequence, sample.t_ns
+        if agreed.sky or (agreed.plausible and not self.still):
+            self.far_rad = max(agreed.far_rad, FORGETS * self.far_rad)
+        elif agreed.plausible and not sample.discontinuity:
+            self.far_rad += (agreed.far_rad - self.far_rad) * LEARNS
+        q = sample.q_icrs_to_cam.tolist()
+        known = _rate_of(sample)
+        if known is None and NS_PER_MS <= later_ns < NS_PER_S // 4 and agreed.plausible:
+            known = tuple(turn * NS_PER_S / later_ns for turn in _turn_rad(self.q, q))  # type: ignore[assignment]
+        if known is not None or not agreed.plausible:
+            self.turning_rad_s = known
+        self.silence_ns = max(arrival.host_ns - self.host_ns, FORGETS * self.silence_ns)
+        self.heard += 1
+        self.sample, self.q, self.host_ns, self.waited_ns = sample, q, arrival.host_ns, arrival.waited_ns
+
+    def patience_ns(self, silent_after_ns: int) -> float:
+        """How long it may be silent before a stranger is taken for it."""
+        if self.heard < MIN_KNOWN or self.host_ns - self.since_ns < MIN_KNOWN_NS:
+            return silent_after_ns
+        return min(silent_after_ns, USUAL_SILENCES * self.silence_ns + SLACK_NS)
+
+
+def _rate_of(sample: AttitudeSample) -> Turn | None:
+    if sample.rate_cam_rad_s is None:
+        return None
+    x, y, z = sample.rate_cam_rad_s.tolist()
+    return x, y, z
+
+
+class _Waiting(NamedTuple):
+    """A stranger's message that nothing has decided yet."""
+
+    arrival: SampleArrival
+    sender: _Sender
 
 
 class Senders:
@@ -108,106 +252,167 @@ class Senders:
     def __init__(self, silent_after_ns: int, notices: Notices) -> None:
         self._silent_after_ns = silent_after_ns
         self._notices = notices
-        self._main: _Track | None = None
-        self._other: _Track | None = None
-        self._turn_ns = 0
-        self._turns = 0
-        self._other_spoke = False
-        self._at_odds = False
-        self._previous: _Track | None = None
+        self._main: _Sender | None = None
+        self._left: _Sender | None = None  # the sender shown as it was before it went elsewhere, or another took its place
+        self._strangers: list[_Sender] = []
+        self._waiting: list[_Waiting] = []
+        self._courses = 0  # between which the sender shown went to and fro
         self._two = False
 
-    def judge(self, sample: AttitudeSample, host_ns: int, waited_ns: int = 0) -> Refusal | None:
-        """Why a sample read at `host_ns`, which may have waited, is refused: it is from another sender than the one shown."""
-        main = self._main
-        self._compare(sample, host_ns)
+    def take(self, arrival: SampleArrival) -> list[SampleArrival]:
+        """The messages that this one decides, in order, those of another sender than the one shown with a refusal."""
+        main, host_ns = self._main, arrival.host_ns
         if main is None:
-            self._main = _Track(sample, host_ns)
-            return None
-        if self._two and (self._other is None or host_ns - self._other.host_ns > TURNS_WITHIN_NS):
+            self._main = _Sender.of(arrival)
+            return [arrival]
+        self._strangers = [each for each in self._strangers if host_ns - each.host_ns < ANOTHER_COURSE_WITHIN_NS]
+        if self._two and not self._strangers:
             self._part("the second sender is silent")
-        if not self._is_silent(main, host_ns - waited_ns):  # a sender that was not read for a while was not silent
-            return self._assign(main, sample, host_ns)
-        other = self._two and self._is_other(main, sample, host_ns)
-        if other:
-            self._part("the first sender is silent; showing the other one")
-        if main.may_reach(sample, host_ns) and not other:
-            main.move(sample, host_ns)
+        agreed = main.agrees(arrival)
+        rival = self._rival(arrival, agreed)
+        own = rival is None and self._is_its_own(main, arrival.event, agreed)
+        comes_back = not agreed.sky and not arrival.event.discontinuity and self._comes_back(arrival, agreed)
+        if own and not (comes_back and self._is_too_often(main, arrival.event)):
+            self._courses = self._courses + comes_back if comes_back or agreed.sky else 0
+            return self._speaks(main, arrival, agreed)
+        if comes_back:
+            return self._return(main, arrival)
+        return self._take_strange(main, arrival, rival)
+
+    def expire(self, host_ns: int) -> list[SampleArrival]:
+        """Strangers' messages, where the sender shown has been silent for longer than it usually is."""
+        main = self._main
+        if main is None or not self._waiting or host_ns - main.host_ns <= main.patience_ns(self._silent_after_ns):
+            return []
+        return self._give_way(main, self._waiting[-1].sender)
+
+    def release(self) -> list[SampleArrival]:
+        """What waits still, as it is."""
+        waiting, self._waiting = self._waiting, []
+        return [each.arrival for each in waiting]
+
+    def _rival(self, arrival: SampleArrival, agreed: _Agreement) -> _Sender | None:
+        """The stranger that a message is rather from, if there is one."""
+        best: _Sender | None = None
+        score, far_rad = agreed.score, agreed.far_rad if agreed.sky else FAR_RATIO * agreed.far_rad
+        for each in self._strangers:
+            its = each.agrees(arrival)
+            if (its.clock or its.count) and (its.score > score or (its.score == score and FAR_RATIO * its.far_rad < far_rad)):
+                best, score, far_rad = each, its.score, its.far_rad
+        return best
+
+    def _is_its_own(self, main: _Sender, sample: AttitudeSample, agreed: _Agreement) -> bool:
+        """Two of three agree; a turn to a new target is said, or could have been made, or comes by the usual step."""
+        if agreed.sky:
+            return agreed.clock or agreed.count
+        if agreed.count and not agreed.clock:
+            return agreed.plausible
+        turned = sample.discontinuity or agreed.plausible or agreed.steady
+        counts = agreed.count or (main.still and sample.sequence == main.count)
+        return agreed.clock and (counts and turned)
+
+    def _speaks(self, main: _Sender, arrival: SampleArrival, agreed: _Agreement) -> list[SampleArrival]:
+        if not agreed.sky or not agreed.clock:
+            self._left = replace(main)
+        elif self._left is not None and arrival.host_ns - self._left.host_ns > self._left.patience_ns(self._silent_after_ns):
+            self._left = None
+        decided = self._decide(main, arrival)
+        main.move(arrival, agreed)
+        return [*decided, arrival]
+
+    def _decide(self, main: _Sender, arrival: SampleArrival) -> list[SampleArrival]:
+        """The sender shown has spoken: what strangers said meanwhile is refused, unless it continues in one count."""
+        waiting, self._waiting = self._waiting, []
+        if not waiting:
+            return []
+        counts = [main.count, *(each.arrival.event.sequence for each in waiting), arrival.event.sequence]
+        if all(1 <= _steps(before, after) <= 2 for before, after in pairwise(counts)):
+            return [each.arrival for each in waiting]
+        if any(each.sender.heard >= MIN_STRANGE for each in waiting):
+            self._tell_two()
+        return [_refused(each.arrival) for each in waiting]
+
+    def _tell_two(self) -> None:
+        self._two = True
+        self._notices.begin(SECOND, "two senders on one link: showing the first, refusing the other (source)")
+
+    def _is_too_often(self, main: _Sender, sample: AttitudeSample) -> bool:
+        """Whether one sender would not go to and fro like that: it has hardly begun to count, or it never counts."""
+        if sample.sequence:
+            return main.heard <= 2
+        return main.still and self._courses >= MIN_COURSES and self._courses % 2 == 0
+
+    def _comes_back(self, arrival: SampleArrival, agreed: _Agreement) -> bool:
+        """Whether the sender that was left is there again, and goes on as if nothing had been between."""
+        left = self._left
+        if left is None or arrival.host_ns - left.host_ns > max(left.patience_ns(self._silent_after_ns), self._silent_after_ns):
+            return False
+        its = left.agrees(arrival)
+        return its.sky and its.score > agreed.score and (its.clock or its.count)
+
+    def _return(self, main: _Sender, arrival: SampleArrival) -> list[SampleArrival]:
+        """Show the first sender again; who took its place is a stranger."""
+        left = self._left
+        if left is None:
+            raise AssertionError("only a sender that was left comes back")
+        self._main, self._left, self._courses = left, None, 0
+        self._add_stranger(main)
+        if main.heard - left.heard >= MIN_STRANGE:
+            self._tell_two()
+        return self._speaks(left, arrival, left.agrees(arrival))
+
+    def _take_strange(self, main: _Sender, arrival: SampleArrival, rival: _Sender | None) -> list[SampleArrival]:
+        sender = rival or self._known(arrival)
+        if sender is None:
+            sender = _Sender.of(arrival)
+            self._add_stranger(sender)
+        elif arrival.event.t_ns == sender.sample.t_ns:
+            refusal = Refusal("time", f"t_ns {arrival.event.t_ns} repeats that of an earlier packet")
+            return [replace(arrival, refusal=refusal)]
         else:
-            self._main, self._other, self._turns = _Track(sample, host_ns), None, 0
+            sender.move(arrival, sender.agrees(arrival))
+        self._waiting.append(_Waiting(arrival, sender))
+        silent_ns = arrival.host_ns - arrival.waited_ns - main.host_ns  # one that was not read for a while was not silent
+        patience_ns = main.patience_ns(self._silent_after_ns)
+        if silent_ns > max(self._silent_after_ns, 3 * (main.period_ns or 0.0)):
+            self._left = None
+            return self._give_way(main, sender, for_good=True)
+        if not self._two and silent_ns > patience_ns:
+            return self._give_way(main, sender)
+        if self._two:
+            return [_refused(each.arrival) for each in self._emptied()]
+        return []
+
+    def _known(self, arrival: SampleArrival) -> _Sender | None:
+        """The stranger that this message continues in two of three, or that repeats itself in it."""
+        for each in self._strangers:
+            its = each.agrees(arrival)
+            if its.score >= 2 or (its.clock and its.plausible) or arrival.event.t_ns == each.sample.t_ns:
+                return each
         return None
 
-    def _compare(self, sample: AttitudeSample, host_ns: int) -> None:
-        """Against the previous message: a single sender's count and time advance together, and its time as the host's."""
-        if self._previous is not None:
-            before = self._previous
-            later_ns, step = sample.t_ns - before.sample.t_ns, before.step(sample)
-            backwards = step <= 0 < later_ns or later_ns < 0 < step
-            self._at_odds |= backwards or abs(later_ns - (host_ns - before.host_ns)) > NS_PER_S
-        self._previous = _Track(sample, host_ns)
+    def _give_way(self, main: _Sender, sender: _Sender, *, for_good: bool = False) -> list[SampleArrival]:
+        """The sender shown is silent: another one is shown, or the same one begun anew."""
+        if self._two:
+            self._part("the first sender is silent; showing the other one")
+        self._main, self._left = sender, None if for_good else main
+        self._strangers = [each for each in self._strangers if each is not sender]
+        if for_good:
+            self._add_stranger(main)
+        return [each.arrival if each.sender is sender else _refused(each.arrival) for each in self._emptied()]
 
-    def _is_other(self, main: _Track, sample: AttitudeSample, host_ns: int) -> bool:
-        if not main.may_reach(sample, host_ns):
-            return True
-        other = self._other
-        return other is not None and other.may_reach(sample, host_ns) and other.far_rad(sample) < main.far_rad(sample)
+    def _emptied(self) -> list[_Waiting]:
+        waiting, self._waiting = self._waiting, []
+        return waiting
 
-    def _is_silent(self, main: _Track, host_ns: int) -> bool:
-        return host_ns - main.host_ns > max(self._silent_after_ns, 3 * (main.period_ns or 0.0))
-
-    def _assign(self, main: _Track, sample: AttitudeSample, host_ns: int) -> Refusal | None:
-        other = self._other
-        if main.still and main.step(sample) == 0:
-            is_main = self._nearer_main(main, other, sample)
-        elif self._out_of_order(main, sample):
-            return None
-        else:
-            is_main = main.may_reach(sample, host_ns)
-            if is_main and other is not None and other.may_reach(sample, host_ns):
-                is_main = main.far_rad(sample) <= other.far_rad(sample)
-        if is_main:
-            main.move(sample, host_ns)
-            self._count_turn(host_ns)
-            return None
-        if other is None or not other.may_reach(sample, host_ns):
-            self._turns = self._turns if other is None else 0  # a sender that counts like that is not a second one
-            self._other = _Track(sample, host_ns)
-        else:
-            other.move(sample, host_ns)
-            self._other_spoke = True
-        if not self._two:
-            return None
-        return Refusal("source", "from a second sender on the same link; the one that was there first is shown")
-
-    def _out_of_order(self, main: _Track, sample: AttitudeSample) -> bool:
-        return -MAX_REORDERED <= main.step(sample) <= 0 and sample.t_ns <= main.sample.t_ns
-
-    def _nearer_main(self, main: _Track, other: _Track | None, sample: AttitudeSample) -> bool:
-        """By motion alone, where no sender counts; a sample near both or neither decides nothing, and is the first sender's."""
-        far_rad = main.far_rad(sample)
-        if other is None or self._two:
-            if other is not None:
-                return far_rad <= other.far_rad(sample)
-            return sample.discontinuity or far_rad < MIN_FAR_RAD
-        other_rad = other.far_rad(sample)
-        clear = max(far_rad, other_rad) > max(FAR_RATIO * min(far_rad, other_rad), MIN_FAR_RAD)
-        if not clear or sample.discontinuity:
-            self._other, self._turns = None, 0
-            return True
-        return far_rad < other_rad
-
-    def _count_turn(self, host_ns: int) -> None:
-        """The first sender has sent; the other one may have since the first last did."""
-        if not self._other_spoke or not self._at_odds:
-            return
-        self._other_spoke = self._at_odds = False
-        self._turns = self._turns + 1 if host_ns - self._turn_ns < TURNS_WITHIN_NS else 1
-        self._turn_ns = host_ns
-        counted = self._main is not None and not self._main.still
-        if self._turns >= (MIN_TURNS if counted else MIN_TURNS_BY_MOTION) and not self._two:
-            self._two = True
-            self._notices.begin(SECOND, "two senders on one link: showing the first, refusing the other (source)")
+    def _add_stranger(self, sender: _Sender) -> None:
+        self._strangers = [*self._strangers[-MAX_STRANGERS + 1 :], sender]
 
     def _part(self, why: str) -> None:
-        self._two, self._turns = False, 0
+        self._two = False
         self._notices.end(SECOND, "second-sender-gone", why)
+
+
+def _refused(arrival: SampleArrival) -> SampleArrival:
+    detail = "from a second sender on the same link; the one that was there first is shown"
+    return replace(arrival, refusal=Refusal("source", detail))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import takewhile
 
 import numpy as np
@@ -16,7 +16,7 @@ from hilstar.attitude.clock.timeline import Policy, Timeline
 from hilstar.attitude.receiver import QUEUED_NS, Receiver
 from hilstar.attitude.wire.links import Arrival
 from hilstar.attitude.wire.packet import AttitudeSample, Packet, encode
-from hilstar.notices import Notices
+from hilstar.notices import Notice, Notices
 from hilstar.rotation import from_radec_roll_deg, propagate
 from hilstar.units import NS_PER_MS, NS_PER_S
 from tests.support.waiting import PATIENCE_S
@@ -102,6 +102,9 @@ class Run:
             if time.monotonic_ns() < self.host0_ns - lead_ns // 2:
                 break
         self.notices = Notices()
+        self.told: list[Notice] = []
+        self.received_when_told = 0
+        self.notices.listen(self._hear)
         self.timeline = Timeline(Policy(STALE_AFTER_NS, STALE_AFTER_NS))
         self.ages_ms: list[float] = []
         self.shown: list[np.ndarray] = []
@@ -114,6 +117,10 @@ class Run:
             self.receiver.tend()
         self.receiver.close()
         self.counts, self.events = self.receiver.counts, self.notices.counts()
+
+    def _hear(self, notice: Notice) -> None:
+        self.told.append(notice)
+        self.received_when_told = self.receiver.counts.received
 
     def _look(self, arrival: Arrival) -> None:
         attitude = self.timeline.at(self.receiver.clock.to_sender_ns(arrival.host_ns))
@@ -225,6 +232,96 @@ def test_a_second_sender_with_a_clock_of_its_own_and_four_times_the_rate_is_kept
     assert run.counts.refused_by["source"] > 500
     assert abs(run.shown[-1] @ ORION) > 0.999
     assert max(run.ages_ms[-300:]) < 40
+
+
+def in_bursts(found: list[Arrival], burst: int) -> list[Arrival]:
+    """The same messages, so many of them sent together when the last of them is due."""
+    last = [found[min(k // burst * burst + burst, len(found)) - 1].host_ns for k in range(len(found))]
+    return [replace(each, host_ns=last[k] + k % burst * 30_000) for k, each in enumerate(found)]
+
+
+def beside(first: Sender, second: Sender, burst: int) -> Callable[[int], list[Arrival]]:
+    """Two that were started together, a third of a burst apart, and send for three seconds."""
+
+    def make(t0: int) -> list[Arrival]:
+        apart_ns = burst * PERIOD_NS // 3
+        one, other = (each.packets(t0 + k * apart_ns, seconds(0, 3)) for k, each in enumerate((first, second)))
+        return in_bursts(one, burst) + in_bursts(other, burst)
+
+    return make
+
+
+A_DAY_NS = 86_400 * NS_PER_S
+
+
+@pytest.mark.parametrize("burst", [1, 2, 3, 10])
+@pytest.mark.parametrize("offset_ns", [0, 1, 7 * NS_PER_MS, 300 * NS_PER_MS, 3 * A_DAY_NS, -NS_PER_S, -3 * A_DAY_NS])
+def test_two_senders_of_one_design_are_told_apart_however_they_alternate(burst, offset_ns):
+    """Equal counters, two skies, clocks that are nanoseconds or days apart: the second one is never shown."""
+    run = Run(beside(Sender(), Sender(LYRA, offset_ns=offset_ns), burst))
+    assert run.events == {"second-sender": 1}
+    assert (run.accepted, run.counts.refused_by["source"] + run.counts.refused_by["time"]) == (600, 600)
+    assert max(abs(q @ LYRA) for q in run.shown) < 0.99
+    told = next(notice for notice in run.told if notice.kind == "second-sender")
+    assert run.received_when_told < 2 * NS_PER_S // PERIOD_NS, told  # a second of both
+
+
+@pytest.mark.parametrize("burst", [1, 4])
+@pytest.mark.parametrize("offset_ns", [3600 * NS_PER_S, -3 * A_DAY_NS])
+def test_two_senders_of_one_sky_and_two_clocks_are_two(burst, offset_ns):
+    run = Run(beside(Sender(), Sender(offset_ns=offset_ns), burst))
+    assert run.events == {"second-sender": 1}
+    assert (run.accepted, run.counts.refused_by["source"], run.receiver.jumps.jumps) == (600, 600, 0)
+
+
+@pytest.mark.parametrize("counts", [True, False])
+@pytest.mark.parametrize("burst", [1, 3])
+def test_one_sender_that_mixes_packets_and_json_is_one(burst, counts):
+    """Turning at 3 deg/s; the JSON says neither a rate nor, in one case, a count."""
+    rate = np.radians([0.0, 0.0, 3.0])
+
+    def make(t0: int) -> list[Arrival]:
+        found = []
+        for k, after_ns in enumerate(seconds(0, 4)):
+            q = propagate(ORION, rate, after_ns / NS_PER_S)
+            as_json = k // burst % 2
+            sample = AttitudeSample(t0 + after_ns, q, None if as_json else rate, (k if counts else 0) if as_json else k)
+            found.append(Arrival(t0 + after_ns + 50_000, sample, encode(sample)))
+        return found
+
+    run = Run(make)
+    assert (run.accepted, run.events) == (800, {})
+
+
+@pytest.mark.parametrize("pause_s", [0.0, 0.1, 1.0])
+@pytest.mark.parametrize("offset_s", [0, 5, -3600])
+@pytest.mark.parametrize("q", [ORION, LYRA], ids=["same sky", "another sky"])
+def test_a_sender_that_restarts_takes_over(pause_s, offset_s, q):
+    """Its count begins anew, and its clock and sky may be others."""
+    run = Run(
+        lambda t0: (
+            Sender(first=5000).packets(t0, seconds(0, 3))
+            + Sender(q, offset_ns=offset_s * NS_PER_S).packets(t0, seconds(3 + pause_s, 6))
+        )
+    )
+    assert run.counts.refused == 0
+    assert set(run.events) <= {"jump"}
+    assert abs(run.shown[-1] @ q) > 0.999
+    assert max(run.ages_ms[-300:]) < 10
+
+
+@pytest.mark.parametrize("offset_ns", [3 * NS_PER_MS, 3600 * NS_PER_S])
+def test_the_first_sender_that_pauses_gives_way_and_is_the_second_when_it_resumes(offset_ns):
+    def make(t0: int) -> list[Arrival]:
+        first = Sender().packets(t0, seconds(0, 2)) + Sender(first=800).packets(t0, seconds(4, 6))
+        return in_bursts(first, 3) + in_bursts(Sender(LYRA, offset_ns=offset_ns).packets(t0 + 8_000_000, seconds(0, 6)), 3)
+
+    run = Run(make)
+    assert run.events["second-sender"] == 2
+    assert run.events["second-sender-gone"] == 1
+    assert abs(run.shown[-1] @ LYRA) > 0.999
+    flips = np.abs(np.diff([q @ ORION for q in run.shown])) > 0.1
+    assert flips.sum() == 1
 
 
 def test_the_other_sender_is_taken_up_when_the_first_falls_silent():

@@ -195,7 +195,7 @@ def _said_of_bend(run: RunLedger, found: Decomposed) -> list[str]:
 
 
 def _said_of_slow(found: Decomposed) -> list[str]:
-    """Noise that goes on from answer to answer: whatever changes slowly and does not repeat with the place."""
+    """Noise that goes on from answer to answer: what changes slowly with time, or with the place more sharply than bumps do."""
     left = found.components.left
     rows = len(left) // TOGETHER * TOGETHER
     if rows < MIN_ROWS * TOGETHER:
@@ -208,7 +208,8 @@ def _said_of_slow(found: Decomposed) -> list[str]:
     size = axes_of_variance(slow)
     return [
         f"the noise is not white: {size.cross:.2g} arcsec across the boresight and {size.roll:.2g} about it last for {TOGETHER}"
-        " answers and more, and do not repeat with the place: does the alignment drift, or the field-of-view error change?"
+        f" answers and more, besides {found.components.fov.detail or 'the bias'}: does the alignment drift with time, or"
+        " does the field-of-view error jump somewhere?"
     ]
 
 

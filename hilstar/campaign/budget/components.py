@@ -19,7 +19,7 @@ import numpy as np
 from scipy import sparse
 
 from hilstar.arrays import FloatArray
-from hilstar.campaign.budget.phases import SHARP_HARMONICS, Phases, global_phases, local_columns, phases_of
+from hilstar.campaign.budget.phases import SHARP_HARMONICS, Phases, edges_of, global_phases, local_columns, phases_of
 from hilstar.campaign.budget.places import Projector, axes_of, bumps_at, centres_of, places_of
 from hilstar.campaign.budget.scale import Scale
 from hilstar.campaign.budget.star_search import best_direction
@@ -35,6 +35,7 @@ LOCAL_SPACINGS_PX = (160.0, 80.0, 40.0, 20.0)
 MAX_LOCAL = 3000
 SOUGHT = "the phase of the direction that the error follows best"
 SHARP = ", to its fifth harmonic"
+EDGES = "jumps within a pixel"
 SURE = 6.0  # standard deviations of what noise alone would explain
 SURE_OF_MANY = 12.0  # of thousands of directions the best
 APART = 0.5  # of the power of the waves that no bump explains, for pixel and field-of-view error to be told apart
@@ -125,9 +126,9 @@ def _waves(
         reason = f"the star field moved by {extent_px:.3g} px only: pixel error cannot be told from bias"
         return None, replace(none, reason=reason)
     freedom = 0.0 if bumps is None else bumps.freedom
-    best: tuple[float, Projector | None, Component] = (0.0, None, none)
+    best: tuple[float, Projector | None, Component, Phases | None] = (0.0, None, none, None)
     apart = 0.0 if bumps is not None else 1.0
-    for name, columns in _families(about, *seen):
+    for name, columns, phases in _families(about, *seen):
         waves = Projector(columns)
         if bumps is not None and not name.startswith(LOCAL) and not name.endswith(SHARP):
             apart = max(apart, _apart(columns, bumps))
@@ -136,13 +137,28 @@ def _waves(
         found = _component(waves, about, freedom)
         power = _surely(found, about, freedom, SURE_OF_MANY if name.startswith(SOUGHT) else SURE)
         if power > best[0]:
-            best = (power, waves, replace(found, detail=name))
+            best = (power, waves, replace(found, detail=name), phases)
         elif name.startswith(LOCAL) and power < HOPELESS * best[0]:
             break
     if apart < APART:
         reason = "each place within a pixel was seen at one place in the field only: pixel error cannot be told from it"
         return None, replace(none, reason=reason)
-    return best[1], replace(best[2], detail=best[2].detail or "nothing repeats with the place within a pixel")
+    _, chosen, found, phases = best
+    if chosen is not None and phases is not None:
+        return _with_edges(chosen, found, phases, about, freedom)
+    return chosen, replace(found, detail=found.detail or "nothing repeats with the place within a pixel")
+
+
+def _with_edges(
+    waves: Projector, found: Component, phases: Phases, about: FloatArray, freedom: float
+) -> tuple[Projector, Component]:
+    """Waves, and the jumps that they leave, where there are any."""
+    base = np.asarray(waves.value.todense())
+    edges = edges_of(phases, base, about)
+    if not edges.shape[1]:
+        return waves, found
+    both = Projector(sparse.csr_matrix(np.concatenate([base, edges], axis=1)))
+    return both, replace(_component(both, about, freedom), detail=f"{found.detail}, with {edges.shape[1]} {EDGES}")
 
 
 def _surely(found: Component, about: FloatArray, other_freedom: float, sure: float) -> float:
@@ -158,7 +174,7 @@ def _surely(found: Component, about: FloatArray, other_freedom: float, sure: flo
 
 def _families(
     about: FloatArray, q_icrs_to_cam: FloatArray, axes: FloatArray, scale: Scale
-) -> Iterator[tuple[str, sparse.csr_matrix]]:
+) -> Iterator[tuple[str, sparse.csr_matrix, Phases | None]]:
     """What may repeat with the place within a pixel, by name: the same over the run, then from place to place, ever finer."""
     for each in global_phases(q_icrs_to_cam, axes, scale):
         yield from _with_sharp(f"the phase of {each.name}", each)
@@ -169,14 +185,14 @@ def _families(
         columns = local_columns(q_icrs_to_cam, scale, spacing)
         if columns.shape[1] > MAX_LOCAL:
             break
-        yield f"{LOCAL}, {spacing:.0f} px apart", columns
+        yield f"{LOCAL}, {spacing:.0f} px apart", columns, None
 
 
-def _with_sharp(name: str, phases: Phases) -> Iterator[tuple[str, sparse.csr_matrix]]:
+def _with_sharp(name: str, phases: Phases) -> Iterator[tuple[str, sparse.csr_matrix, Phases]]:
     """Its smooth waves, and, of answers enough, those with the harmonics of an error that jumps from pixel to pixel."""
-    yield name, sparse.csr_matrix(phases.columns())
+    yield name, sparse.csr_matrix(phases.columns()), phases
     if len(phases.place_px) >= 2 * len(SHARP_HARMONICS) * ROWS_A_BUMP:
-        yield f"{name}{SHARP}", sparse.csr_matrix(phases.columns(SHARP_HARMONICS))
+        yield f"{name}{SHARP}", sparse.csr_matrix(phases.columns(SHARP_HARMONICS)), phases
 
 
 def _apart(columns: sparse.csr_matrix, bumps: Projector) -> float:

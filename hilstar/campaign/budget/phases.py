@@ -25,6 +25,10 @@ from hilstar.rotation import conjugate, multiply, to_rotation_vector
 HARMONICS = ((1, 0), (0, 1), (1, 1), (1, -1), (2, 0), (0, 2))  # cycles per pixel along x and y
 SHARP_HARMONICS = (*HARMONICS, (3, 0), (0, 3), (4, 0), (0, 4), (5, 0), (0, 5))  # of a saw's power, 89 %; two have 76 %
 LOCAL_HARMONICS = ((1, 0), (0, 1))
+MAX_EDGES = 12
+EDGE_STEPS = 1024  # of a pixel, at which an edge is sought
+# What an edge has to explain, in units of the noise's variance: in 300 runs of noise alone the best of all places explained 33.
+SURE_OF_EDGE = 50.0
 
 
 @dataclass(frozen=True)
@@ -38,6 +42,37 @@ class Phases:
         """Cosines and sines (n, 2 k) of the harmonics."""
         angle = 2 * np.pi * (self.place_px @ np.array(harmonics, dtype=float).T)
         return np.concatenate([np.cos(angle), np.sin(angle)], axis=1)
+
+
+def edges_of(phases: Phases, base: FloatArray, about: FloatArray) -> FloatArray:
+    """Saws (n, m) of the place within a pixel that explain most of residuals (n, 3) beyond a base (n, k) of harmonics.
+
+    One after another (orthogonal matching pursuit: Pati et al. 1993), as long as each is sure. A jump anywhere is a saw and
+    something smooth, so a few saws and harmonics make every function that is smooth but for a few jumps.
+    """
+    columns = base
+    n = len(about)
+    spectrum = np.fft.rfft((np.arange(EDGE_STEPS) + 0.5) / EDGE_STEPS - 0.5)
+    highest = max(SHARP_HARMONICS if base.shape[1] == 2 * len(SHARP_HARMONICS) else HARMONICS)[0]
+    spectrum[: highest + 1] = 0.0  # the base has these
+    power = float((np.fft.irfft(spectrum, EDGE_STEPS) ** 2).mean())
+    bin_of = [np.minimum((EDGE_STEPS * (u % 1)).astype(np.int64), EDGE_STEPS - 1) for u in phases.place_px.T]
+    for _ in range(MAX_EDGES):
+        fitted = columns @ np.linalg.lstsq(columns, about, rcond=None)[0]
+        left = (about - fitted) / np.maximum((about - fitted).std(axis=0), 1e-12)
+        best = (SURE_OF_EDGE, 0, 0)
+        for axis, bins in enumerate(bin_of):
+            sums = np.stack([np.bincount(bins, value, minlength=EDGE_STEPS) for value in left.T])
+            met = np.fft.irfft(np.fft.rfft(sums) * np.conj(spectrum), EDGE_STEPS)
+            gain = (met**2).sum(axis=0) / (n * power)
+            place = int(np.argmax(gain))
+            best = max(best, (float(gain[place]), axis, place))
+        gain_there, axis, place = best
+        if gain_there <= SURE_OF_EDGE:
+            break
+        edge = (phases.place_px[:, axis] - place / EDGE_STEPS) % 1 - 0.5
+        columns = np.concatenate([columns, edge[:, None]], axis=1)
+    return columns[:, base.shape[1] :]
 
 
 def phases_of(direction: FloatArray, axes: FloatArray, scale: Scale, name: str = "") -> Phases:

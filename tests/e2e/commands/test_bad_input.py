@@ -14,9 +14,10 @@ from pathlib import Path
 
 import pytest
 
+import hilstar
 from hilstar.attitude.logs.log_file import READABLE
 from hilstar.cli import app
-from hilstar.errors import HilstarError, one_line
+from hilstar.errors import HilstarError, InputError, one_line
 from tests.support.benches import ROOT, SMALL_BENCH
 from tests.support.commands import assert_refused, bounded_by, run_hilstar_here
 from tests.support.full_disk import WITHOUT_BYTECODE, limited_environment
@@ -206,6 +207,60 @@ def test_a_key_of_thousands_of_parts_takes_no_minutes():
 def test_a_refusal_repeats_little_of_a_bench_file(text):
     Path("bench.toml").write_text(text if text.startswith(("k", "[tracker]")) else BENCH + text)
     assert len(refusal(*FRAME)) < 700
+
+
+SIMULATE = ("simulate", "bench.toml", "--radec", "84,-1,0", "-o", "o.fits")
+
+
+@pytest.mark.parametrize("value", ["5e-324", "1e-310", "1e-200"])
+@pytest.mark.parametrize("key", ["quantum_efficiency", "transmission"])
+@pytest.mark.parametrize("words", [FRAME, SIMULATE, ("budget", "bench.toml"), ("doctor", "bench.toml")], ids=lambda w: w[0])
+def test_a_curve_of_next_to_nothing_is_refused(words, key, value):
+    lines = [line for line in BENCH.splitlines() if not line.startswith(f"{key} =")]
+    Path("bench.toml").write_text("\n".join(lines).replace("[tracker]", f"[tracker]\n{key} = {value}"))
+    assert f"[tracker] {key} = {value}: write a number from 1e-06 to 1" in refusal(*words)
+
+
+def test_a_curve_of_next_to_nothing_in_a_file_is_refused():
+    Path("qe.csv").write_text("wavelength_nm,value\n400,5e-324\n900,5e-324\n")
+    Path("bench.toml").write_text(BENCH.replace('"ccd47-20"', '"qe.csv"'))
+    refused = refusal(*FRAME)
+    assert "quantum_efficiency" in refused or "no electron" in refused
+
+
+@pytest.mark.parametrize(
+    ("table", "line"),
+    [
+        ("tracker", "psf_sigma_px = [32768, 32768]"),
+        ("tracker", "psf_sigma_px = [1e308, 1e308]"),
+        ("render", "sprite_sigma_px = [32768, 1]"),
+        ("tracker", "principal_point_px = [1e308, 1e308]"),
+        ("collimator", "principal_point_px = [-1e308, 1]"),
+        ("background", "gradient_electrons_across = [1e308, 0]"),
+    ],
+)
+def test_a_number_that_no_bench_has_is_refused_before_it_takes_memory(table, line):
+    key = line.partition(" =")[0]
+    lines = [other for other in BENCH.splitlines() if not other.startswith(f"{key} =")]
+    lines += [] if f"[{table}]" in lines else [f"[{table}]"]
+    lines.insert(lines.index(f"[{table}]") + 1, line)
+    Path("bench.toml").write_text("\n".join(lines) + "\n")
+    for words in (FRAME, SIMULATE):
+        assert f"[{table}] {key} = " in refusal(*words)
+
+
+@pytest.mark.parametrize(("table", "size"), [("tracker", "[64, 64]"), ("monitor", "[64, 48]")])
+def test_an_image_of_a_thousand_million_pixels_is_refused(table, size):
+    assert BENCH.count(f"resolution_px = {size}") == 1
+    Path("bench.toml").write_text(BENCH.replace(size, "[32768, 32768]"))
+    assert f"[{table}] resolution_px = [32768, 32768]: 1074 million pixels; write 67 million at most" in refusal(*FRAME)
+
+
+def test_whoever_calls_from_python_gets_a_bounded_line_too():
+    Path("bench.toml").write_text(BENCH.replace('"ccd47-20"', '"' + "x" * 100_000 + '"'))
+    with pytest.raises(InputError) as refused:
+        hilstar.load("bench.toml")
+    assert len(str(refused.value)) < 700
 
 
 @pytest.mark.parametrize("words", [["--help"], ["frame", "--help"], ["convert", "log.csv", "out.csv"], [*FRAME, "--json"]])

@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 
 from hilstar.rotation import from_radec_roll_deg
+from hilstar.study.shared.other_work import is_busy
 from hilstar.study.speed import cells
 from hilstar.study.speed.benchmark import RADEC_ROLL_DEG
 from hilstar.study.speed.cells import STAGES
@@ -59,7 +60,8 @@ def test_each_count_is_judged_turning_against_still_and_beside_numba(measured):
     for count in (100, 1000):
         turning = aims[f"turning by 10 deg/s, {count} stars, 640 x 480, 2 still frames"]
         assert turning["aim_ms"] == 2 * at[count, "hilstar", "whole_frame"]
-        assert turning["reached"] == (at[count, "hilstar", "turning"] <= turning["aim_ms"])
+        reached = at[count, "hilstar", "turning"] <= turning["aim_ms"]
+        assert turning["reached"] == (None if is_busy(result["others_cores"]) else reached)
         beside = aims.get(f"linear image, {count} stars, 640 x 480, numba's time")
         assert (beside and beside["aim_ms"]) == at.get((count, "numba", "linear_only"))
 

@@ -75,8 +75,9 @@ def test_a_curve_file_that_is_wrong_is_refused(tmp_path, text, words):
 def test_a_curve_that_is_neither_name_nor_file_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"\[tracker\] quantum_efficiency = 'ccd48'.*\"ccd47-20\""):
         load_curve("ccd48", "[tracker] quantum_efficiency", tmp_path)
-    with pytest.raises(InputError, match="from 1e-06 to 1"):
-        load_curve(1.5, "[tracker] transmission", tmp_path)
+    for value in (1.5, 5e-324, 1e-200, 0.0, -1.0, float("nan"), 10**400):
+        with pytest.raises(InputError, match="from 1e-06 to 1"):
+            load_curve(value, "[tracker] transmission", tmp_path)
 
 
 def test_a_tracker_that_sees_nothing_is_refused():

@@ -1,0 +1,47 @@
+"""On a busy machine times name no winner: what the others take is measured, and said."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+from hilstar.study.chain.verdict import headline
+from hilstar.study.shared.other_work import BUSY_SHARE, OtherWork, busy_line, is_busy
+from hilstar.study.speed.report import lines
+from hilstar.study.speed.result import Aim, Machine, Result
+from tests.support.waiting import wait_for
+
+CORES = os.cpu_count() or 1
+MACHINE = Machine("a processor", CORES, 0.0, "3", "2")
+
+
+def test_processes_that_are_not_this_one_s_are_counted_while_they_run():
+    work = OtherWork()
+    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(CORES)]
+    try:
+        wait_for(lambda: is_busy(work.cores()), "nothing else ran")  # a child counts as its own only once it has ended
+    finally:
+        for process in busy:
+            process.kill()
+            process.wait()
+
+
+def test_what_this_process_does_itself_is_not_other_work():
+    work, before = OtherWork(), os.times()
+    while os.times().user - before.user < 1.0:
+        pass
+    spent_s, passed_s = os.times().user - before.user, os.times().elapsed - before.elapsed
+    # All of the machine less what this process had is the most that there can be of others.
+    assert work.cores() <= CORES - spent_s / passed_s + 0.1
+
+
+def test_a_busy_machine_is_said_and_no_aim_is_judged():
+    others = CORES * BUSY_SHARE * 2
+    told = list(lines(Result(MACHINE, aims=[Aim("frame", 1.0, 2.0, None)], others_cores=others)))
+    assert busy_line(others) in told
+    assert any(line.startswith("aim not judged") for line in told)
+    idle = list(lines(Result(MACHINE, aims=[Aim("frame", 1.0, 2.0, False)])))
+    assert not any("busy" in line for line in idle)
+    assert any(line.startswith("aim NOT reached") for line in idle)
+    assert "no combination is named" in headline([], busy=True)

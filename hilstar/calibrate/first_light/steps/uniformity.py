@@ -23,8 +23,10 @@ from hilstar.monitor.calibration import load_calibration, weights_of_grid, with_
 from hilstar.tracker.centroids import noisiest_background
 from hilstar.units import MAD_TO_SIGMA, MAG_PER_RELATIVE, magnitude
 
-APART_TRACKER_PX = 10.0  # from dot to dot: each has the light of a cell of its own, whatever its blur
-APART_SIGMAS = 14.0
+APART_TRACKER_PX, APART_SIGMAS = 10.0, 16.0  # from dot to dot
+# Of the circle about a dot whose light is summed; at most a quarter of a period, so that no two of the four lattices share a
+# pixel: the dark frame's noise, which all of them have, would else be a pattern from dot to dot, and be taken for the screen's.
+REACH_SIGMAS, REACH = 4.5, 0.25
 MAX_DOTS = 64  # of a lattice, along the screen's longer side
 SHIFTS = ((0, 0), (1, 0), (0, 1), (1, 1))  # of the four lattices, halves of a period: each dot meets other pixels
 MIN_DOTS = 40
@@ -146,39 +148,41 @@ def see_dots(room: Room) -> tuple[Dots, tuple[Path, ...]]:
     """The light of dots on lattices over the whole screen, and the images. Raises InputError where too few are seen whole."""
     geometry, code = room.real_geometry(), int(room.known.get("focus.dot_code", 0)) or sharp_dots(room)[0]
     ratio = geometry.tracker.focal_length_px / geometry.monitor.focal_length_px
-    sigma_px = math.hypot(float(np.mean(room.file.config.tracker.psf_sigma_px)), DOT_PX * ratio / math.sqrt(12))
+    psf_px = float(room.known.get("focus.psf_sigma_px", np.mean(room.file.config.tracker.psf_sigma_px)))
+    sigma_px = math.hypot(psf_px, DOT_PX * ratio / math.sqrt(12))
     apart_px = max(APART_TRACKER_PX, APART_SIGMAS * sigma_px) / ratio
     period = max(math.ceil(apart_px / 2) * 2, math.ceil(max(room.resolution_px) / MAX_DOTS / 2) * 2)
+    reach = min(REACH * period, REACH_SIGMAS * sigma_px / ratio)
     width, height = geometry.tracker.resolution_px
     y, x = np.mgrid[0:height, 0:width]
     seen = np.stack(geometry.to_monitor(x.ravel().astype(np.float64), y.ravel().astype(np.float64)))
     dark_path = room.dark()
     dark = room.read(dark_path)
     bad = dark > HOT_FILL * room.full_dn
-    bad[[0, -1]], bad[:, [0, -1]] = True, True  # a cell that reaches the detector's edge has lost pixels
+    bad[[0, -1]], bad[:, [0, -1]] = True, True  # a dot that reaches the detector's edge has lost light
     parts, paths, noise_dn = [], [dark_path], 0.0
     for number, shift in enumerate(SHIFTS):
         firsts = [period // 2 + period // 2 * half for half in shift]
-        looked = room.look(Pattern(f"lattice_{number:03}", _lattice(room.resolution_px, firsts, period, code)), dark)
+        looked = room.look(Pattern(f"lattice_{number:03}", _shown(firsts, period, code, room.resolution_px)), dark)
         paths.append(looked.path)
         if room.is_too_bright(looked):
             raise InputError(f"dots of code {code} saturate the tracker; run the focus again (--again focus), then this step")
         noise_dn = noisiest_background(looked.image).noise
-        parts.append(_cells(room.resolution_px, firsts, period, seen, looked.image, bad))
+        parts.append(_sums(_Lattice(firsts, period, reach), room.resolution_px, seen, looked.image, bad))
     columns, rows, light = (np.concatenate(part) for part in zip(*parts, strict=True))
     lit = light > 0
     if lit.sum() < MIN_DOTS:
         raise InputError(f"{int(lit.sum())} dots are seen whole and {MIN_DOTS} are needed; look at the geometry and the focus")
     detector = room.file.config.tracker.detector
     dn = float(np.median(light[lit]))
-    pixels = (period * ratio) ** 2
+    pixels = math.pi * (reach * ratio) ** 2
     # A dark frame has the noise of an image; PRNU counts by how many pixels share a dot.
     shared = detector.prnu**2 / (4 * math.pi * sigma_px**2)
     noise = math.sqrt((dn / detector.gain_e_per_dn + 2 * pixels * noise_dn**2) / dn**2 + shared)
     return Dots(columns[lit], rows[lit], light[lit], MAG_PER_RELATIVE * noise), tuple(paths)
 
 
-def _lattice(resolution_px: tuple[int, int], firsts: list[int], period: int, code: int) -> CodeImage:
+def _shown(firsts: list[int], period: int, code: int, resolution_px: tuple[int, int]) -> CodeImage:
     """Squares of DOT_PX about every `period`-th pixel from `firsts` (x, y) on."""
     codes, half = black(resolution_px), DOT_PX // 2
     for down in range(-half, half + 1):
@@ -187,17 +191,29 @@ def _lattice(resolution_px: tuple[int, int], firsts: list[int], period: int, cod
     return codes
 
 
-def _cells(
-    resolution_px: tuple[int, int], firsts: list[int], period: int, seen: FloatArray, image: FloatArray, bad: Flags
+@dataclass(frozen=True, slots=True)
+class _Lattice:
+    """The first dot (x, y), how far apart they are, and how far the light of one is summed: monitor px."""
+
+    firsts: list[int]
+    period: int
+    reach: float
+
+
+def _sums(
+    lattice: _Lattice, resolution_px: tuple[int, int], seen: FloatArray, image: FloatArray, bad: Flags
 ) -> tuple[IntArray, IntArray, FloatArray]:
-    """Column and row (n,) of each dot whose cell of the tracker's image has no bad pixel, and the sum of the image in it.
+    """Column and row (n,) of each dot without a bad pixel in reach, and the sum of the image in reach of it (n,).
 
     `seen` (2, h * w) is where each pixel of the tracker looks, monitor px.
     """
+    firsts, period = np.array(lattice.firsts), lattice.period
     counts = [(size - first - DOT_PX // 2 - 1) // period + 1 for size, first in zip(resolution_px, firsts, strict=True)]
-    cell = [np.floor((part - first) / period + 0.5) for part, first in zip(np.nan_to_num(seen, nan=-1e9), firsts, strict=True)]
-    inside = (cell[0] >= 0) & (cell[0] < counts[0]) & (cell[1] >= 0) & (cell[1] < counts[1])
-    index = (cell[1][inside] * counts[0] + cell[0][inside]).astype(np.intp)
+    place = (np.nan_to_num(seen, nan=-1e9) - firsts[:, None]) / period
+    nearest = np.rint(place)
+    inside = (nearest >= 0).all(axis=0) & (nearest[0] < counts[0]) & (nearest[1] < counts[1])
+    inside &= np.hypot(*(place - nearest)) * period <= lattice.reach
+    index = (nearest[1][inside] * counts[0] + nearest[0][inside]).astype(np.intp)
     total = counts[0] * counts[1]
     light = np.asarray(np.bincount(index, image.ravel()[inside], minlength=total), dtype=np.float64)
     whole = np.bincount(index, minlength=total) > 0

@@ -165,6 +165,7 @@ def capital(text: str) -> str:
 
 def title_lines(finding: str, columns: int = TITLE_COLUMNS) -> str:
     """A finding in the fewest lines of about equal length, with no line break between a figure and its unit."""
+    finding = re.sub(r"\d(\.\d+)?e[+-]\d+", lambda found: two_digits(float(found[0])), finding)
     bound = re.sub(r"(?<=\d) (?=%|(K|mag|mm|px|ms|s|deg/s|arcsec)\b)", "\N{NO-BREAK SPACE}", finding)
 
     def wrapped(width: int) -> list[str]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from hilstar.calibrate.edges import Edges, square_edges
 from hilstar.calibrate.latency import LatencySummary, Paired, pair, summarise
-from hilstar.charts import chart
+from hilstar.charts import BLUE, ORANGE, chart
 from hilstar.errors import InputError
 from hilstar.files import make_directory
 from hilstar.run.record.ledger_reader import config_of, read_head, run_records
@@ -19,7 +19,7 @@ LEVEL_NAMES = {1: "dark to light", 0: "light to dark"}
 
 
 def measure_latency(ledger: Path, edges: Edges, directory: Path | None) -> LatencySummary:
-    """The figures of `hilstar latency`, and `latency.png` in a directory where one is given.
+    """The figures of `hilstar latency`, and the chart `latency` in a directory where one is given.
 
     Raises InputError for a ledger or edges that do not fit each other.
     """
@@ -32,7 +32,7 @@ def measure_latency(ledger: Path, edges: Edges, directory: Path | None) -> Laten
     paired = pair(edges, shown, NS_PER_S / config.monitor.refresh_hz)
     summary = summarise(paired, config)
     if directory is not None:
-        draw_latency(make_directory(directory) / "latency.png", paired, summary)
+        draw_latency(make_directory(directory) / "latency", paired, summary)
     return summary
 
 
@@ -62,8 +62,9 @@ def draw_latency(path: Path, paired: Paired, summary: LatencySummary) -> None:
     with chart(path, f"From swap to light: {middle:.2f} ms, jitter {jitter:.3f} ms") as (axes,):
         ms = paired.latency_ns / NS_PER_MS
         bins = np.linspace(ms.min(), max(ms.max(), ms.min() + 1e-3), BINS).tolist()
-        for level, name in LEVEL_NAMES.items():
-            axes.hist(ms[paired.level == level], bins=bins, alpha=0.6, label=name)
+        for (level, name), colour in zip(LEVEL_NAMES.items(), (BLUE, ORANGE), strict=True):
+            axes.hist(ms[paired.level == level], bins=bins, color=colour, alpha=0.6, label=name)
         axes.set_xlabel("swap to the photodiode's edge [ms]")
-        axes.set_ylabel("edges")
-        axes.legend()
+        axes.set_ylabel("edges [number]")
+        axes.margins(y=0.25)
+        axes.legend(loc="upper right", ncols=2)

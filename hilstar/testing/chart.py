@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hilstar.charts import chart
+from hilstar.charts import GREEN, INK, MUTED, ORANGE, PURPLE, RED, SMALL_PT, chart, title_lines
 from hilstar.testing.sky_comparison import SkyComparison, finding
 from hilstar.testing.star_difference import StarDifference
 from hilstar.units import magnitude
@@ -20,21 +20,24 @@ MAX_NAMES = 6  # of stars, in each panel; the table has all
 MAX_TRIED = 60  # names that are tried for room
 ROOM_PX = 3.0  # between two names
 MIN_ERROR = 1e-8  # as drawn: a tenth of float32's rounding
-STYLES = (("same", "C0."), ("changed", "C3o"), ("missing", "C3v"), ("extra", "C1^"))
+STYLES = (("same", ".", MUTED), ("changed", "o", RED), ("missing", "v", PURPLE), ("extra", "^", ORANGE))
 
 
 def draw(path: Path, comparison: SkyComparison) -> None:
     """Write the chart. Raises InputError where it cannot be."""
-    with chart(path, finding(comparison), 2) as axes:
+    said = finding(comparison)
+    while title_lines(said).count("\n") > 1 and ";" in said:
+        said = said.rpartition(";")[0]
+    with chart(path, said, 2, height_inch=7.4) as axes:
         names: list[list[Annotation]] = []
-        for axis, what, unit in ((axes[0], "flux error", "mag"), (axes[1], "centroid error", "px")):
+        for axis, what, unit in ((axes[0], "flux error", "mag"), (axes[1], "place error", "px")):
             panel = Panel(comparison, unit)
             panel.draw(axis)
             names.append(panel.name_stars(axis))
             less = " beyond what is common" if panel.common else ""
-            axis.set(yscale="log", ylabel=f"{what}{less} [{unit}],\nsmaller ones drawn at {MIN_ERROR:g}")
-            axis.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), fontsize=9)
-        axes[1].set_xlabel("magnitudes below the brightest star")
+            axis.set(yscale="log", ylabel=f"{what}{less} [{unit}]")
+            axis.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
+        axes[1].set_xlabel("magnitudes below the brightest star [mag]")
         _make_room(axes[0], names)
 
 
@@ -73,16 +76,18 @@ class Panel:
 
     def draw(self, axis: Axes) -> None:
         """Draw the stars, the limits and the legend."""
-        for kind, style in STYLES:
+        for kind, marker, colour in STYLES:
             mags, errors = [[self.point(star)[k] for star in self.of(kind)] for k in (0, 1)]
             heights = [self.rows[kind]] * len(mags) if kind in self.rows else errors
-            axis.plot(mags, heights, style, ms=5 if kind == "same" else 7, label=self.label(kind, len(mags)))
-        axis.axhline(self.limit, color="k", ls="--", lw=1.2, label=f"limit: {self.limit:g} {self.unit}")
+            axis.plot(mags, heights, marker, color=colour, ms=5 if kind == "same" else 7, label=self.label(kind, len(mags)))
+        axis.axhline(self.limit, color=INK, ls="--", lw=1.2, label=f"limit: {self.limit:g} {self.unit}")
         if self.common:
-            axis.axhline(self.common, color="C2", lw=1.2, label=f"in common: {self.common:.3g} {self.unit}")
+            axis.axhline(self.common, color=GREEN, lw=1.2, label=f"in common: {self.common:.3g} {self.unit}")
         wider = [point for star in self.of("same", "changed") if (point := self.point(star))[2] > self.limit]
         if wider:
-            axis.plot([p[0] for p in wider], [p[2] for p in wider], "k_", ms=8, label=f"a star's own limit: {len(wider)}")
+            axis.plot(
+                [p[0] for p in wider], [p[2] for p in wider], "_", color=INK, ms=8, label=f"a star's own limit: {len(wider)}"
+            )
         axis.set_ylim(MIN_ERROR / 2, 300 * self.row)
         axis.set_xlim(right=axis.get_xlim()[1] + 0.5)
 
@@ -94,7 +99,7 @@ class Panel:
             if self.unit == "mag" if star.kind in self.rows else error > own:
                 name = star.name if star.hip else f"({star.x_px:.0f}, {star.y_px:.0f})"
                 place = mag, self.rows.get(star.kind, error)
-                names.append(axis.annotate(name, place, xytext=(6, 5), textcoords="offset points", fontsize=8))
+                names.append(axis.annotate(name, place, xytext=(6, 5), textcoords="offset points", fontsize=SMALL_PT))
         return names[:MAX_TRIED]
 
 

@@ -26,14 +26,14 @@ COLUMNS = (
 
 
 def write_report(directory: Path, comparison: SkyComparison) -> None:
-    """compare.csv, a row for each star, and compare.png, errors against magnitude.
+    """compare.csv, a row for each star, and the chart compare, errors against magnitude, as PNG and SVG.
 
     Raises InputError where one cannot be written.
     """
     odd = {(star.hip, star.x_px, star.y_px) for star in comparison.differing}
     rows = ((*_row(star), int((star.hip, star.x_px, star.y_px) in odd)) for star in comparison.stars)
     write_csv(directory / "compare.csv", COLUMNS, rows)
-    draw(directory / "compare.png", comparison)
+    draw(directory / "compare", comparison)
 
 
 def _row(star: StarDifference) -> tuple[object, ...]:

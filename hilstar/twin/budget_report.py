@@ -5,24 +5,20 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hilstar.bench.white import named
-from hilstar.charts import chart, write_csv
+from hilstar.charts import BLUE, MUTED, ORANGE, RED, SERIES, chart, label_ends, write_csv
 from hilstar.tracker.centroiders import FAMILY
 from hilstar.twin.budget import CENTROID_LIMIT_PX, COMPARED_MAG, FLUX_LIMITS_MAG, Budget, MagnitudeRow
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 MAX_NAMED = 20
 MIN_ERROR = 1e-6  # as drawn
 
 
 def write_report(directory: Path, found: Budget) -> None:
-    """budget.csv and budget.png. Raises InputError where one cannot be written."""
+    """budget.csv, and its chart as budget.png and budget.svg. Raises InputError where one cannot be written."""
     rows = [_flat(row) for row in found.rows]
     write_csv(directory / "budget.csv", list(rows[0]), [["" if v is None else v for v in row.values()] for row in rows])
     reach = found.within[f"{FLUX_LIMITS_MAG[1]:g}_mag"]
@@ -30,38 +26,36 @@ def write_report(directory: Path, found: Budget) -> None:
     finding += f"{FLUX_LIMITS_MAG[1]:g} mag over {'no' if reach is None else f'{reach:g}'} magnitudes"
     shown = [row for row in found.rows if row.flux_max_mag is not None]
     v_mag = np.array([row.v_mag for row in shown])
-    with chart(directory / "budget.png", finding, 3) as axes:
+    note = f"Left of the first grey line stars clip (V = {found.clips_v_mag:.2f}), right of the second they show nothing (V ="
+    note += f" {found.nothing_v_mag:.2f}). Over sub-pixel phases; places by {found.centroider} but in the last panel."
+    with chart(directory / "budget", finding, 3, note=note) as axes:
         for axis, kind, limits, label in (
             (axes[0], "flux", FLUX_LIMITS_MAG, "flux error [mag]"),
-            (axes[1], "centroid", (CENTROID_LIMIT_PX,), f"centroid error by {found.centroider}\n[monitor px]"),
+            (axes[1], "centroid", (CENTROID_LIMIT_PX,), "place error [monitor px]"),
         ):
             unit = "mag" if kind == "flux" else "px"
-            for name, style in (("max", "C0-"), ("rms", "C0--")):
+            for name, word, colour in (("max", "largest to V", ORANGE), ("rms", "rms", BLUE)):
                 values = np.array([getattr(row, f"{kind}_{name}_{unit}") for row in shown])
-                axis.semilogy(v_mag, np.maximum(values, MIN_ERROR), style, label=f"{name} over sub-pixel phases")
-            _draw_limits(axis, found, limits, unit)
+                values = np.maximum.accumulate(values.astype(float)) if name == "max" else values
+                axis.semilogy(v_mag, np.maximum(values, MIN_ERROR), color=colour, label=word)
+            for limit in limits:
+                axis.axhline(limit, color=RED, linestyle=":", linewidth=1.4, label=f"limit {limit:g} {unit}")
             axis.set_ylabel(label)
-            axis.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), fontsize=9)
-        for kind in FAMILY:
+        for kind, colour in zip(FAMILY, SERIES, strict=True):
             values = np.array([row.axis_rms_px[kind] for row in shown])
-            axes[2].semilogy(v_mag, np.maximum(values, MIN_ERROR), "--" if kind == "fit" else "-", label=kind)
-        axes[2].set_ylabel("centroid error by each, rms\nalong an axis [monitor px]")
-        axes[2].legend(loc="center left", bbox_to_anchor=(1.01, 0.5), fontsize=9, title="centroider")
+            axes[2].semilogy(v_mag, np.maximum(values, MIN_ERROR), "--" if kind == "fit" else "-", color=colour, label=kind)
+        axes[2].set_ylabel("rms along an axis [monitor px]")
         axes[2].set_xlabel("V of a star of the Sun's colour [mag]")
+        for axis in axes:
+            for edge in (found.clips_v_mag, found.nothing_v_mag):
+                axis.axvline(edge, color=MUTED, linewidth=1)
+            label_ends(axis)
 
 
 def _flat(row: MagnitudeRow) -> dict[str, float | None]:
     """A row's columns: each kind of centroider has its own."""
     values = asdict(row)
     return values | {f"axis_rms_px_{kind}": value for kind, value in values.pop("axis_rms_px").items()}
-
-
-def _draw_limits(axis: Axes, found: Budget, limits: tuple[float, ...], unit: str) -> None:
-    for limit, style in zip(limits, (":", "-."), strict=False):
-        axis.axhline(limit, color="tab:red", linestyle=style, linewidth=1, label=f"limit: {limit:g} {unit}")
-    axis.axvline(found.clips_v_mag, color="0.4", linewidth=1, label=f"clips: brighter than V = {found.clips_v_mag:.2f}")
-    dark = f"shows nothing: fainter than V = {found.nothing_v_mag:.2f}"
-    axis.axvline(found.nothing_v_mag, color="0.4", linestyle="--", linewidth=1, label=dark)
 
 
 def budget_lines(found: Budget) -> list[str]:

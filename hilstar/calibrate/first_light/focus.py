@@ -24,11 +24,15 @@ MODEL_POINTS = 9  # of a dot, along each axis
 
 @dataclass(frozen=True, slots=True)
 class Sharpness:
-    """Dots as the tracker saw them: places (n,), the sigma of each (n,), px, and the median with the dot's own width out."""
+    """Dots as the tracker saw them: places (n,), the sigma of each (n,), px, that of the PSF (n,) with the dot's own width out.
+
+    `psf_sigma_px` is the median of the last.
+    """
 
     x_px: FloatArray
     y_px: FloatArray
     sigma_px: FloatArray
+    each_psf_sigma_px: FloatArray
     psf_sigma_px: float
 
 
@@ -46,8 +50,8 @@ def sharpness(image: FloatArray, dot_side_px: float) -> Sharpness:
     level = float(np.median(image))
     sigma_px = _sigmas(np.pad(image - level, RADIUS_PX), x_px, y_px)
     expected = [_model_sigma(float(psf), dot_side_px) for psf in MODEL_SIGMAS_PX]
-    psf_sigma_px = float(np.interp(np.median(sigma_px), np.maximum.accumulate(expected), MODEL_SIGMAS_PX))
-    return Sharpness(x_px, y_px, sigma_px, psf_sigma_px)
+    each = np.interp(sigma_px, np.maximum.accumulate(expected), MODEL_SIGMAS_PX)
+    return Sharpness(x_px, y_px, sigma_px, each, float(np.median(each)))
 
 
 def _model_sigma(psf_sigma_px: float, dot_side_px: float) -> float:

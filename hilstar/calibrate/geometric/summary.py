@@ -13,7 +13,7 @@ import hilstar
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.calibrate.geometric.calibration import Calibrated
 from hilstar.calibrate.geometric.fit import residuals_px
-from hilstar.charts import chart
+from hilstar.charts import BLUE, SMALL_PT, chart
 from hilstar.monitor.geometry_file import ErrorTable, MadeTable, Notes, write_geometry
 from hilstar.scene.lens import Lens
 from hilstar.units import ARCSEC_PER_RAD
@@ -21,6 +21,7 @@ from hilstar.units import ARCSEC_PER_RAD
 ONE_POSE = "one pose: the tracker's own distortion and the collimator's cannot be told apart; this file holds both"
 COLLIMATOR_ALONE = "one pose, with the tracker's lens as its flight model says: this file holds the collimator alone"
 ROUND = "poses turned about the boresight do not tell apart distortions that are round about it; they are in the stated error"
+WIDE_INCH = 5.6  # of a panel
 ARROW_SHARE = 0.03  # of the screen's width: the median residual's arrow
 
 
@@ -205,24 +206,26 @@ def draw_geometry(path: Path, found: Calibrated) -> None:
     error, width = found.uncertainty.map_arcsec, found.problem.nominal.monitor.resolution_px[0]
     height = found.problem.nominal.monitor.resolution_px[1]
     finding = (
-        f"{found.chosen.name}: a star's place is known to {found.uncertainty.rms_arcsec:.2g} arcsec rms,"
-        f" {found.uncertainty.max_arcsec:.2g} at the maximum; held-out dots {found.chosen.rms_arcsec:.2g} rms"
+        f"By {found.chosen.name} a star's place is known to {found.uncertainty.rms_arcsec:.2g} arcsec rms,"
+        f" {found.uncertainty.max_arcsec:.2g} at most; held-out dots {found.chosen.rms_arcsec:.2g} rms"
     )
     dot, right, down = _mean_residuals(found)
     to_arcsec = ARCSEC_PER_RAD / found.problem.nominal.tracker.focal_length_px
-    median = float(np.median(np.hypot(right, down)))
-    with chart(path, finding, panels=2, share_x=False) as (places, residuals):
+    median = max(float(np.median(np.hypot(right, down))), 1e-9)
+    with chart(path, finding, panels=2, height_inch=1.4 + 2 * WIDE_INCH * height / width) as (places, residuals):
         image = places.imshow(error, extent=(-0.5, width - 0.5, height - 0.5, -0.5), aspect="equal", cmap="viridis")
-        places.figure.colorbar(image, ax=places, label="1 sigma [arcsec]", shrink=0.8)
-        places.set_title("error of a star's place", fontsize=11)
-        scale = ARROW_SHARE * width / max(median, 1e-9)
+        places.figure.colorbar(image, ax=[places, residuals], label="1 sigma of a star's place [arcsec]", shrink=0.5)
+        places.set_title("Error of a star's place")
         x, y = found.plan.x_px[dot], found.plan.y_px[dot]
-        residuals.quiver(x, y, right * scale, down * scale, angles="xy", scale_units="xy", scale=1, width=0.0015)
-        residuals.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal")
-        residuals.set_title(f"mean residual of each dot, median {median * to_arcsec:.2g} arcsec", fontsize=11)
+        look = {"angles": "xy", "scale_units": "xy", "width": 0.002, "color": BLUE}
+        arrows = residuals.quiver(x, y, right, down, scale=median / (ARROW_SHARE * width), **look)
+        key = {"labelpos": "E", "coordinates": "axes", "fontproperties": {"size": SMALL_PT}}
+        residuals.quiverkey(arrows, 0.75, 1.05, median, f"{median * to_arcsec:.2g} arcsec", **key)
+        residuals.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal", xlabel="monitor x [px]")
+        residuals.set_title("Mean residual of each dot; key: their median")
         for axes in (places, residuals):
-            axes.set_xlabel("monitor x [px]")
             axes.set_ylabel("monitor y [px]")
+            axes.grid(visible=False)
 
 
 def _mean_residuals(found: Calibrated) -> tuple[IntArray, FloatArray, FloatArray]:

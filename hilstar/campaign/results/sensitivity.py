@@ -20,7 +20,7 @@ from scipy.stats import rankdata
 
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.campaign.results.columns import VARY, Columns
-from hilstar.charts import chart, write_csv
+from hilstar.charts import INK, MUTED, chart, write_csv
 
 MAX_BINS, MIN_IN_BIN = 8, 8
 SURE = 4.0  # standard errors between the worst and the best bin; of 8 bins of noise, 1 in 100 are so far apart
@@ -214,8 +214,8 @@ def draw_costs(path: Path, found: list[Cost]) -> None:
                 where = [float(place) for place in cost.places]
             else:
                 axis.set_xticks(where, [str(place) for place in cost.places])
-            axis.errorbar(where, cost.level, yerr=cost.error, fmt="o-", capsize=3)
-            axis.axhline(cost.overall, linewidth=0.8, linestyle="--", color="grey")
+            axis.errorbar(where, cost.level, yerr=cost.error, fmt="o-", capsize=3, color=INK, ecolor=MUTED)
+            axis.axhline(cost.overall, linewidth=0.8, linestyle="--", color=MUTED)
             axis.set_ylim(0, top)
             if len(where) > 2 and min(where) > 0 and max(where) / min(where) > 30:
                 axis.set_xscale("log")

@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from hilstar.errors import HilstarError, InputError, MachineError
     from hilstar.run.send.python_sender import Sender
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 __all__ = ["Bench", "Drawn", "Frame", "HilstarError", "InputError", "MachineError", "Sender", "load"]
 
 

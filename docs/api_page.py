@@ -67,10 +67,9 @@ def signature(name: str, found: Any) -> str:
     if isinstance(found, property):
         returned = inspect.get_annotations(found.fget)["return"] if found.fget else ""
         return f"{short}: {returned}"
-    try:
-        shown = inspect.signature(found)
-    except ValueError:  # an exception's
+    if inspect.isclass(found) and issubclass(found, Exception):
         return ""
+    shown = inspect.signature(found)
     returns = "" if inspect.isclass(found) else f" -> {shown.return_annotation}"
     parameters = [_parameter(each) for each in shown.parameters.values() if each.name != "self"]
     first = next((k for k, each in enumerate(shown.parameters.values()) if each.kind is each.KEYWORD_ONLY), None)

@@ -1,12 +1,13 @@
 """The pictures of docs/console.md: the page of a run, single pixels of it, and the run's report, in Debian's chromium.
 
 `python docs/make_screenshot.py` writes docs/console.png, docs/pixels.png and docs/report.png, and each again as
-NAME-light.png. The run goes by the clock, so that no two are alike; the page is taken once it has been on time for a minute,
-which takes a machine that is.
+NAME-light.png. The run goes by the clock, so that no two are alike. The page is taken once it has been on time for a minute; on
+a machine that is too busy for that, the picture shows and says what was missed.
 """
 
 from __future__ import annotations
 
+import contextlib
 import io
 import re
 import subprocess
@@ -16,6 +17,7 @@ import time
 from pathlib import Path
 
 from PIL import Image
+from selenium.common.exceptions import TimeoutException
 
 DOCS = Path(__file__).resolve().parent
 sys.path.insert(0, str(DOCS.parent))
@@ -25,7 +27,7 @@ from tests.support.senders import free_port  # noqa: E402
 
 SIZE_PX = (1366, 1400)
 COLOURS = 256  # of the palette
-CALM_S = 600.0  # within which a minute without a missed frame has to come
+CALM_S = 60.0  # within which a minute without a missed frame may come
 ON_TIME = "/fresh, frames on time/.test(document.getElementById('health-reasons').textContent)"
 HILSTAR = [sys.executable, "-m", "hilstar"]
 SIRIUS = "101.287,-16.716,25"
@@ -60,7 +62,8 @@ def watch(page: Browser, folder: Path) -> None:
         page.get(next(found[1] for line in run.stderr if (found := re.search(r"page is at (http://\S+)", line))))
         page.until("document.getElementById('picture').dataset.frame")
         time.sleep(60.0)  # the charts' minute
-        page.until(ON_TIME, CALM_S)
+        with contextlib.suppress(TimeoutException):
+            page.until(ON_TIME, CALM_S)
         page.find("#mark-text").send_keys("baffle on")
         page.press("#control-mark")
         page.run("scrollTo(0, 0)")
@@ -82,7 +85,7 @@ def main() -> None:
         page.prefer(color_scheme="dark")
         watch(page, Path(scratch))
         subprocess.run([*HILSTAR, "report", "run.mcap", "-o", "report"], cwd=scratch, check=True, stdout=subprocess.DEVNULL)
-        page.size(1366, 1100)
+        page.size(1366, 1700)
         page.get((Path(scratch) / "report" / "report.html").as_uri())
         page.until("document.body.dataset.ready === 'true'")
         page.press("#chart-age canvas")

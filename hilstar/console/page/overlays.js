@@ -169,7 +169,8 @@ export class Overlays {
   drawBoresight([x, y]) {
     const { context, unit } = this;
     const [u, v] = this.view.toCanvas(x, y);
-    this.taken.push([u - 24 * unit, v - unit, u + 24 * unit, v + unit]); // a name under its bar would look struck out
+    // A name under one of its bars would look struck out.
+    this.taken.push([u - 24 * unit, v - unit, u + 24 * unit, v + unit], [u - unit, v - 24 * unit, u + unit, v + 24 * unit]);
     context.strokeStyle = INK.boresight;
     context.lineWidth = 1.5 * unit;
     context.beginPath();
@@ -227,6 +228,7 @@ export class Overlays {
       context.font = `${12 * unit}px system-ui, sans-serif`;
       const wide = context.measureText(text).width;
       const tries = [[u + gap, v], [u - gap - wide, v], [u - wide / 2, v - gap - 8 * unit], [u - wide / 2, v + gap + 8 * unit]];
+      for (const dy of [-14, 14]) tries.push([u + gap, v + dy * unit], [u - gap - wide, v + dy * unit]); // beside the boresight's cross
       const found = tries.find(([left, top]) => this.place(text, left, top, 12));
       if (!found) continue;
       this.write(text, ...found, star[5] && this.on.clipped ? "#ff9a9a" : INK.name);

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from hilstar.console.server.protocol import PONG_S
+from hilstar.console.server.protocol import MAX_CONNECTIONS, PONG_S
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.pages import PageAddress, children, live, page_of, raw
 from tests.support.senders import free_port
@@ -217,6 +217,19 @@ def test_two_hundred_idle_and_hostile_connections_leave_room_for_the_operator(lo
             link.want(picture=True, hz=10)
             link.await_message(lambda said: isinstance(said, bytes))
         wait_for(lambda: missed_and_frames(page)[1] > frames + 30)
+
+
+def test_connections_that_stay_after_their_answer_are_bounded(local):
+    """They give way before one that waits for its own: descriptors do not run out."""
+    served, page = local
+    (pid,) = children(served.process.pid, "hilstar.console.server")
+    with contextlib.ExitStack() as stack:
+        for _ in range(300):
+            connection = stack.enter_context(socket.create_connection(("127.0.0.1", page.port), timeout=10))
+            connection.sendall(f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{page.port}\r\n\r\n".encode())
+            assert connection.recv(12) == b"HTTP/1.1 200"
+        assert len(list(Path(f"/proc/{pid}/fd").iterdir())) < 2 * MAX_CONNECTIONS
+        assert status_of(page) == 200
 
 
 def test_forty_pages_that_ask_for_nothing_make_room_for_one_that_does(local):

@@ -8,7 +8,7 @@ import pytest
 from hilstar.campaign.budget.components import EDGES, components_of
 from tests.support.planted_tracker import SCALE, attitude, scalar_first, scan, star_px, waves
 
-# Of 4000 answers the noise is known to 0.7 %, and of a pixel error of 0.6 of it to 1.5 %. A star whose direction
+# From 4000 answers the noise is known to 0.7 %, and a pixel error of 0.6 of it to 1.5 %. A star whose direction
 # is found to 0.01 px blurs a saw's jump by as much: 1 % of its power, which is 2 % of the noise for a saw of 1.5 of it.
 PIXEL_WITHIN, NOISE_WITHIN = 0.04, 0.05
 

@@ -1,6 +1,8 @@
 """Events of a run, told as they happen: a line on stderr, a count in the summary, an event in the ledger.
 
-A kind that comes more than MAX_SAID times within SAID_WINDOW_S is counted and recorded, and said again once it is rare.
+A kind that comes more than MAX_SAID times within SAID_WINDOW_S is only counted for a while, twice as long each time up to
+MAX_QUIET_S, and then said with how many there were meanwhile; so is its end, by `sum_up`. Where it comes on, what is only
+counted is not recorded either, but for what a person did.
 """
 
 from __future__ import annotations
@@ -18,6 +20,9 @@ from hilstar.errors import printable
 
 MAX_SAID = 3
 SAID_WINDOW_S = 10.0
+MAX_QUIET_S = 640.0
+MAX_RECORDED = 20  # of a kind, before what is only counted is not recorded either
+ALWAYS_RECORDED = frozenset({"fault"})
 MAX_DETAIL_CHARACTERS = 400
 log = logging.getLogger(__name__)
 
@@ -45,13 +50,44 @@ def at_now(line: str) -> str:
 Listener = Callable[[Notice], None]
 
 
+@dataclass(slots=True)
+class _Kind:
+    """How often a kind was said lately, and until when it is only counted."""
+
+    said_ns: deque[int]
+    quiet_s: float = 0.0
+    until_ns: int = 0
+    last_ns: int = 0
+    unsaid: int = 0
+    recorded: int = 0
+
+    def words(self, notice: Notice) -> str | None:
+        """What to say of one more; None where it is only counted."""
+        now_ns = notice.host_ns
+        if now_ns < self.until_ns:
+            self.last_ns, self.unsaid = now_ns, self.unsaid + 1
+            return None
+        rare = now_ns - self.last_ns > SAID_WINDOW_S * 1e9
+        self.last_ns, meanwhile, self.unsaid = now_ns, self.unsaid, 0
+        if rare:
+            self.quiet_s = 0.0
+        self.said_ns.append(now_ns)
+        often = len(self.said_ns) == MAX_SAID and now_ns - self.said_ns[0] < SAID_WINDOW_S * 1e9
+        said = notice.detail + (f" ({meanwhile} more meanwhile)" if meanwhile else "")
+        if not often and not (self.quiet_s and not rare):
+            return said
+        self.quiet_s = min(max(2 * self.quiet_s, SAID_WINDOW_S), MAX_QUIET_S)
+        self.until_ns = now_ns + round(self.quiet_s * 1e9)
+        return f"{said}; further ones are only counted for {self.quiet_s:.0f} s"
+
+
 class Notices:
     """Takes events from any thread; never waits, never raises for what a listener does."""
 
     def __init__(self) -> None:
         self._counts: Counter[str] = Counter()
         self._active: dict[str, str] = {}
-        self._said_ns: dict[str, deque[int]] = {}
+        self._kinds: dict[str, _Kind] = {}
         self._listeners: list[Listener] = []
         self._lock = threading.Lock()
 
@@ -64,15 +100,26 @@ class Notices:
         notice = Notice.now(kind, detail, who)
         with self._lock:
             self._counts[kind] += 1
-            said_ns = self._said_ns.setdefault(kind, deque(maxlen=MAX_SAID))
-            floods = len(said_ns) == MAX_SAID and notice.host_ns - said_ns[0] < SAID_WINDOW_S * 1e9
-            if not floods:
-                said_ns.append(notice.host_ns)
-            last_before_silence = not floods and len(said_ns) == MAX_SAID
-            last_before_silence &= notice.host_ns - said_ns[0] < SAID_WINDOW_S * 1e9
-        if not floods:
-            further = "; further ones are only counted for a while" if last_before_silence else ""
-            log.warning("%s", at_now(notice.detail + further))
+            known = self._kinds.setdefault(kind, _Kind(deque(maxlen=MAX_SAID)))
+            words = known.words(notice)
+            recorded = words is not None or known.recorded < MAX_RECORDED or bool(who) or kind in ALWAYS_RECORDED
+            known.recorded += recorded
+        if words is not None:
+            log.warning("%s", at_now(words))
+        if recorded:
+            self._hand_on(notice)
+
+    def sum_up(self) -> None:
+        """Say, at a run's end, how many there were of each kind that was only counted."""
+        with self._lock:
+            unsaid = {kind: known.unsaid for kind, known in self._kinds.items() if known.unsaid}
+            for known in self._kinds.values():
+                known.unsaid = 0
+        if unsaid:
+            told = ", ".join(f"{kind} {self._counts[kind]} ({count} of them not said)" for kind, count in unsaid.items())
+            log.warning("%s", at_now(f"events in all: {told}"))
+
+    def _hand_on(self, notice: Notice) -> None:
         for listener in self._listeners:
             listener(notice)
 
@@ -80,8 +127,7 @@ class Notices:
         """Say an event that is counted elsewhere, and hand it on."""
         notice = Notice.now(kind, detail)
         log.warning("%s", at_now(notice.detail))
-        for listener in self._listeners:
-            listener(notice)
+        self._hand_on(notice)
 
     def begin(self, kind: str, detail: str) -> None:
         """Tell of an event that lasts: its kind is in `active` until `end`. Nothing where it has begun already."""

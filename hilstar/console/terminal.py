@@ -16,9 +16,19 @@ from hilstar.errors import one_line
 
 if TYPE_CHECKING:
     from hilstar.attitude.clock.sender_clock import ClockSummary
-    from hilstar.run.summary import RunSummary
+    from hilstar.attitude.wire.packet import Reason
+    from hilstar.run.summary import PacketSummary, RunSummary
     from hilstar.running_statistics import Percentiles
 
+INSTEAD: dict[Reason, str] = {
+    "format": "send packets of 64 bytes, version 1, little-endian, or JSON with t_ns and q",
+    "crc": "end each packet with the CRC-32 of zlib over the 60 bytes before it, and look at the cable",
+    "nan": "send finite numbers",
+    "norm": "send unit quaternions, scalar first, not angles",
+    "rate": "send rates in rad/s, or write a larger [attitude] max_rate_deg_s",
+    "time": "let t_ns rise from packet to packet",
+    "source": "stop one of the two senders",
+}
 CLOCK_WORDS = {"one-way": "from arrivals", "exchange": "from time exchanges"}
 
 
@@ -83,6 +93,15 @@ def report(summary: RunSummary, as_json: bool) -> None:
     lines["renderer"] = summary.gl_renderer
     for name, line in lines.items():
         typer.echo(f"{name:20}{line}")
+
+
+def without_attitude(endpoint: str, packets: PacketSummary) -> str:
+    """Why a run had no attitude, and what to change."""
+    if not packets.received:
+        return f"no attitude came from {endpoint}; start the sender, and check its address"
+    reasons = [(count, reason) for reason, count in packets.refused_by.items() if count]
+    told = "; ".join(f"{count} for {reason}: {INSTEAD[reason]}" for count, reason in sorted(reasons, reverse=True))
+    return f"all {packets.refused} packets from {endpoint} were refused, {told}"
 
 
 def clock_line(clock: ClockSummary) -> str:

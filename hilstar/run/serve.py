@@ -123,6 +123,7 @@ def serve(bench: Bench, link: AnyLink, limit: Limit, sink: FrameSink = ignore, o
             summary = _serve_lockstep(bench, link, limit, loop, outlet)
         else:
             summary = _serve_stream(bench, link, limit, loop, outlet)
+    outlet.notices.sum_up()
     told: dict[str, str | int] = {"endpoint": link.endpoint}
     summary = replaced(summary, faults=UNSET if faults is None else faults.summary(), sync=outlet.pulses())
     return replaced(

@@ -85,6 +85,8 @@ class Doorkeeper:
         self._counts.connections += 1
         if self._counts.connections > 1:
             self._notices.tell("back", "reconnected to the sender")
+        else:
+            self._notices.mention("connected", "connected to the sender")
 
     def _leave(self, file: int) -> None:
         self.lost = True

@@ -45,6 +45,8 @@ class ZmqReceiver(ZmqSocket):
 
     def __init__(self, endpoint: str, *, bind: bool = False, keys: CurveKeys = NO_KEYS, notices: Notices | None = None) -> None:
         super().__init__(zmq.SUB, endpoint, bind=bind, keys=keys, notices=notices)
+        if not bind:  # who connects is told of nothing until a sender binds there
+            self.verb = "waiting for a sender at"
         self._shut()
         self._gate = FloodGate(self.link_counts, self._notices)
         self._reconnect_s = 0.0

@@ -33,7 +33,7 @@ from hilstar.cli.show.running import (
     shown_bench,
 )
 from hilstar.console.run_status import RunStatus, Source, on_terminal
-from hilstar.console.terminal import say
+from hilstar.console.terminal import say, without_attitude
 from hilstar.files import MCAP, check_ending
 from hilstar.notices import Notices
 
@@ -115,7 +115,7 @@ def serve(
         say_units(fields)
         say_of_light(bench)
         beat = UNSET if file.config.attitude.lockstep else say_beat(bench, screen)
-        told = Source(f"{link.verb} {link.endpoint}", bench.renderer.gl_renderer, refresh_hz, min(limit.slots, limit.frames))
+        told = Source(link.endpoint, bench.renderer.gl_renderer, refresh_hz, min(limit.slots, limit.frames))
         status = RunStatus(told, kept)
         page = Told("serve", file.config.attitude.source, link.endpoint, "asked" if file.config.attitude.lockstep else "clock")
         parts = Parts(bench, notices, kept, lambda path: Ledger(path, bench, notices, split=split), screen, fault_desk(wrong))
@@ -124,7 +124,7 @@ def serve(
             summary = serve_stream(bench, link, limit, sink, outlet)
     end_of_run(replaced(summary, beat=beat, fields_of_view=fields.keys()), screen, kept, as_json)
     if not summary.packets.accepted:
-        say(f"no attitude came from {link.endpoint}; start the sender, and check its address")
+        say(without_attitude(link.endpoint, summary.packets))
         raise typer.Exit(NO_ATTITUDE)
 
 

@@ -61,7 +61,7 @@ def broadcast(tmp_path_factory) -> tuple[Truth, dict[str, list[dict]], dict]:
     (folder / "bench.toml").write_text(bench_text(BENCH, {"attitude": attitude}))
     scenario = {"mode": "broadcastStream", "port": port, "shown_s": 0.02, "stops_s": [1.2]}
     crafts = {"chaser": CHASER, "target": TARGET}
-    words = f"connected to tcp://127.0.0.1:{port}"
+    words = f"waiting for a sender at tcp://127.0.0.1:{port}"
     with (
         basilisk(folder, **scenario, spacecraft=crafts) as simulation,
         listening(folder / "bench.toml", words, "--ledger", str(folder / "run.mcap")) as served,

@@ -84,7 +84,7 @@ def test_with_keys_it_is_let_in_on_either_side_of_the_connection(tmp_path, conne
     bench = tmp_path / "bench.toml"
     bench.write_text("\n".join([SMALL_BENCH, "[attitude]", *lines, ""]))
     with (
-        listening(bench, "bound to" if connect else "connected to") as process,
+        listening(bench, "bound to" if connect else "waiting for a sender at") as process,
         hilstar.Sender(endpoint, connect=connect, secret_key=keys / f"{mine}.key_secret", **ours) as sender,
     ):
         assert sender.wait()

@@ -6,6 +6,7 @@ import os
 import pty
 import re
 import select
+import signal
 import subprocess
 import time
 from pathlib import Path
@@ -15,8 +16,9 @@ import pytest
 from hilstar.console import run_status
 from tests.support.benches import LIVE_BENCH, attitude_table, still_log
 from tests.support.commands import HILSTAR, run_hilstar_here
-from tests.support.senders import free_port, publisher, talking
-from tests.support.waiting import PATIENCE_S
+from tests.support.senders import free_port, packet, publisher, talking
+from tests.support.servers import serving
+from tests.support.waiting import PATIENCE_S, repeating
 
 pytestmark = pytest.mark.e2e
 ESCAPES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
@@ -88,7 +90,22 @@ def test_a_replay_tells_its_frames_too(tmp_path, small_bench_file, monkeypatch):
     assert re.search(r"attitude RA 84\.0570.*frames \d+ of 61 .*source replaying .*log\.csv", result.stderr)
 
 
+def test_a_run_whose_packets_were_all_refused_says_why_and_what_to_change(tmp_path):
+    """Its last line was that no attitude came, and to start the sender."""
+    with publisher() as (sender, port), serving(tmp_path, port) as process:
+        with repeating(lambda: sender.send(packet(0, time.monotonic_ns(), q=(84.0, -1.2, 0.0, 0.0))), 0.01):
+            process.has_refused(20)
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 4
+    last = err.splitlines()[-1]
+    assert re.fullmatch(r"all \d+ packets from tcp://127.0.0.1:\d+ were refused, \d+ for norm: send unit quaternions, .*", last)
+    assert "connected to the sender" in err
+
+
 def test_a_run_that_never_had_an_attitude_says_so_at_its_end(tmp_path):
     result = run_hilstar_here("serve", bench_for(tmp_path, free_port()), "--headless", "--duration", "0.3")
     assert result.returncode == 4
     assert "no attitude came from tcp://127.0.0.1" in result.stderr.splitlines()[-1]
+    assert result.stderr.startswith("waiting for a sender at tcp://127.0.0.1:")
+    assert "connected to" not in result.stderr

@@ -16,7 +16,7 @@ from hilstar.attitude.wire.apart.records import Kind, pack
 from hilstar.process.parent import end_with_parent
 
 WANTED_BUFFER_BYTES = 1 << 20  # the kernel gives what it allows: some hundred messages, while nobody reads them
-LIFE_S = 1.0
+LIFE_S = 0.1
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from pathlib import Path
 
 from hilstar.attitude.wire.apart.records import Kind, Record, RecordStream
 from hilstar.notices import Notices
@@ -18,7 +19,8 @@ MAX_READ_BYTES = 1 << 20  # in one go
 MIN_BACK_OFF_S = 0.05
 MAX_BACK_OFF_S = 1.0
 STEADY_S = 10 * MAX_BACK_OFF_S
-STALLED_S = 3.0  # it says each second that it lives
+HUNG_S = 0.4  # it says each 0.1 s that it lives; asleep for so long without a word, it hangs
+STALLED_S = 3.0  # one that would run waits for a core for so long
 STARTS_S = 30.0  # and on a machine whose cores are all busy it begins within this
 READY_WITHIN_S = 5.0
 ENDS_WITHIN_S = 0.3  # in order; a signal leaves a command a second for all its ends
@@ -88,10 +90,18 @@ class Reader:
         said = bool(poll.poll(timeout_ms))
         # Only what was waited here counts: this process may have been stopped itself.
         self._silent_s = 0.0 if said else self._silent_s + min(time.monotonic() - begun_s, timeout_ms / 1000)
-        limit_s = STALLED_S if self._ready else STARTS_S
+        limit_s = (STALLED_S if self._would_run() else HUNG_S) if self._ready and self._silent_s > HUNG_S else STARTS_S
         if self._silent_s > limit_s:
             self._ended(f"no sign of life for {limit_s:g} s")
         return said
+
+    def _would_run(self) -> bool:
+        """Whether the process runs, or waits for a core; one that is stopped or asleep does not."""
+        with contextlib.suppress(OSError, IndexError):
+            if self._process is not None:
+                status = Path(f"/proc/{self._process.pid}/stat").read_text()
+                return status.rpartition(")")[2].split()[0] == "R"
+        return True
 
     def await_ready(self) -> None:
         """Wait until the process has imported what it needs; not for long, and not for one that failed."""

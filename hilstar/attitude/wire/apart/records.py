@@ -27,9 +27,7 @@ class Kind(IntEnum):
     COUNTS = 3  # JSON: LinkCounts by name
     GONE = 4  # text: the device does not answer, and why
     ENDS = 5  # text: the process ends, and why
-    READY = (
-        6  # what it needs is imported, and it does at once what it is asked for; each second from then on, as a sign of life
-    )
+    READY = 6  # what it needs is imported, and it does at once what it is asked for; again and again, as a sign of life
 
 
 class Stamped(NamedTuple):

@@ -19,7 +19,7 @@ from hilstar.process.priority import PromptWhileLight
 READ, CLOSE = b"R", b"C"
 COMMAND_BYTES = 2
 MAX_READ_BYTES = 65_536
-TEND_S = 0.5
+TEND_S = 0.1  # it says each 0.1 s that it lives
 
 
 class _Device:

@@ -62,20 +62,24 @@ class MessageSplitter:
     """Bytes in, whole messages out, each with the line that ends it; TOO_LONG in the place of one that is."""
 
     def __init__(self) -> None:
-        self._kept = b""
+        self._kept = bytearray()
+        self._line = 0  # where its last line begins: what is before it was looked at
         self._overlong = False
 
     def feed(self, chunk: bytes) -> list[bytes]:
         """The messages that `chunk` completes, in order."""
         messages: list[bytes] = []
         self._kept += chunk
-        while (end := END.search(self._kept)) is not None:
-            overlong = self._overlong or end.end() > MAX_MESSAGE_BYTES
-            messages.append(TOO_LONG if overlong else self._kept[: end.end()])
-            self._kept, self._overlong = self._kept[end.end() :], False
+        if b"\n" in chunk:
+            while (end := END.search(self._kept, self._line)) is not None:
+                overlong = self._overlong or end.end() > MAX_MESSAGE_BYTES
+                messages.append(TOO_LONG if overlong else bytes(self._kept[: end.end()]))
+                del self._kept[: end.end()]
+                self._line, self._overlong = 0, False
+            self._line = self._kept.rfind(b"\n") + 1
         if len(self._kept) > MAX_MESSAGE_BYTES:
             # The last line may be the beginning of the end.
-            self._overlong, self._kept = True, self._kept[self._kept.rfind(b"\n") + 1 :][:MAX_MESSAGE_BYTES]
+            self._overlong, self._kept, self._line = True, self._kept[self._line :][:MAX_MESSAGE_BYTES], 0
         return messages
 
 

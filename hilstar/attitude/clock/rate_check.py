@@ -170,27 +170,40 @@ def cause_of(stretches: Sequence[Stretch]) -> Cause | None:
     if not any(stretch.rate.any() for stretch in stretches):
         coherent = np.linalg.norm(sum(s.turn for s in stretches)) > GROSS_SHARE * sum(np.linalg.norm(s.turn) for s in stretches)
         return Cause("they are zero; leave them out", _scaled(1.0)) if coherent else None
+    return _definite(stretches) or _indefinite(stretches)
+
+
+def _explains(stretches: Sequence[Stretch], cause: Cause, share: float) -> bool:
+    """Whether without this cause the rates fit, all but one in MORE_STRETCHES of them, and far better than with it."""
     off = float(np.median([_error(stretch, stretch.rate) for stretch in stretches]))
+    errors = [_error(stretch, cause.mended(stretch)) for stretch in stretches]
+    fits = [error <= _limit(s, share, FIT_SIGMA, cause.scale) for s, error in zip(stretches, errors, strict=True)]
+    return fits.count(False) <= len(stretches) // MORE_STRETCHES and off >= MIN_BETTER * float(np.median(errors))
 
-    def explains(cause: Cause, share: float = FIT_SHARE) -> bool:
-        errors = [_error(stretch, cause.mended(stretch)) for stretch in stretches]
-        fits = [error <= _limit(s, share, FIT_SIGMA, cause.scale) for s, error in zip(stretches, errors, strict=True)]
-        return fits.count(False) <= allowed and off >= MIN_BETTER * float(np.median(errors))
 
+def _definite(stretches: Sequence[Stretch]) -> Cause | None:
+    """The simplest of the causes without a free choice that explains the rates."""
     for cause in CAUSES:
-        if explains(cause):
+        if _explains(stretches, cause, FIT_SHARE):
             return cause
-    found = [cause for cause in PERMUTATIONS if explains(cause, AXES_SHARE)]
+    found = [cause for cause in PERMUTATIONS if _explains(stretches, cause, AXES_SHARE)]
     sharp = all(FIT_SIGMA * math.hypot(s.turn_sigma, s.rate_sigma) < FIT_SHARE * _faster(s) for s in stretches)
-    if found:
-        return found[0] if sharp and len(found) == 1 else replace(found[0], text=OTHER_AXES)
+    if not found:
+        return None
+    return found[0] if sharp and len(found) == 1 else replace(found[0], text=OTHER_AXES)
+
+
+def _indefinite(stretches: Sequence[Stretch]) -> Cause | None:
+    """A rotation that explains the rates, or that nothing does though they are far off: of MORE_STRETCHES alone."""
+    if len(stretches) < MORE_STRETCHES:
+        return None
     rotation = _best_rotation(stretches)
     for unit, size in (("", 1.0), (", and in deg/s", UNITS["deg/s"])):
         turned = Cause(OTHER_FRAME + unit, _turned(rotation / size), 1 / size)
-        if explains(turned):
+        if _explains(stretches, turned, AXES_SHARE):
             return turned
     gross = [_error(s, s.rate) > max(MIN_GROSS_RAD_S, GROSS_SHARE * _faster(s)) for s in stretches]
-    return Cause(GROSS, _scaled(1.0)) if all(gross) and len(stretches) >= MORE_STRETCHES else None
+    return Cause(GROSS, _scaled(1.0)) if all(gross) else None
 
 
 def cause_in(samples: Sequence[AttitudeSample]) -> Cause | None:

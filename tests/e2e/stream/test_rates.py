@@ -24,8 +24,8 @@ from hilstar.run.shown import Shown
 from hilstar.units import ARCSEC_PER_RAD
 from tests.support.live_runs import serve_until
 from tests.support.pages import page_of
-from tests.support.senders import ORION, connected, packet, publisher
-from tests.support.servers import bound
+from tests.support.senders import ORION, connected, free_port, packet, publisher
+from tests.support.servers import bound, serving, until_said
 from tests.support.waiting import repeating, wait_for
 
 pytestmark = pytest.mark.e2e
@@ -140,3 +140,16 @@ def test_a_rate_over_the_limit_is_taken_once_the_packets_show_its_unit(tmp_path)
             accepted = served.process.accepted()
             wait_for(lambda: served.process.accepted() > accepted + 50)
     assert math.degrees(2.0) > 60
+
+
+def test_in_lockstep_it_is_told_though_no_rate_is_drawn_by(tmp_path):
+    port = free_port()
+    with serving(tmp_path, port, attitude="lockstep = true") as process, connected(port, zmq.REQ) as asker:
+        for k in range(100):
+            t_ns = k * 10_000_000
+            asker.send(packet(k, t_ns, attitude(t_ns, 0), AS_DEG_S))
+            asker.recv()
+        until_said(
+            process, "send rad/s: the quaternions turn at 0.5 deg/s, the rates say 0.5 rad/s (28.6 deg/s); nothing is drawn"
+        )
+        process.kill()

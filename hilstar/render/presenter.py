@@ -13,6 +13,10 @@ from hilstar.errors import MachineError
 from hilstar.monitor.window.x11 import GL_LIBRARY, X11_LIBRARY
 from hilstar.render.encoder import TABLE_WIDTH, build_program
 
+GL_DITHER = 0x0BD0
+MAX_LEVELS = 2**16
+PRIMARIES = {"grey": (1, 1, 1), "red": (1, 0, 0), "green": (0, 1, 0), "blue": (0, 0, 1)}
+
 
 @dataclass(frozen=True, slots=True)
 class Orientation:
@@ -66,6 +70,30 @@ class View:
     triples: npt.NDArray[np.uint16] | None = None
 
 
+def changed_codes(context: moderngl.Context, screen_px: tuple[int, int], bits: int) -> str:
+    """Which codes the back buffer has otherwise than they were drawn; "" where every code of grey and each primary is there.
+
+    All are drawn side by side and read back. It overwrites the back buffer, and swaps nothing.
+    """
+    codes = np.arange(2**bits, dtype=np.uint16)
+    triples = np.concatenate([np.outer(codes, primaries).astype(np.uint16) for primaries in PRIMARIES.values()])
+    width, height = screen_px
+    wrong: list[str] = []
+    for part in np.array_split(triples, -(-len(triples) // min(MAX_LEVELS, width * height))):
+        levels = (np.arange(width * height, dtype=np.uint32) % len(part)).astype(np.uint16).reshape(height, width)
+        with context:
+            texture = level_texture(context, levels)
+            Presenter(texture, View(screen_px, screen_px, bits, triples=part)).present()
+            read = context.screen.read(viewport=(0, 0, width, height), components=3, dtype="f4")
+            texture.release()
+        drawn = np.rint(np.frombuffer(read, dtype=np.float32).reshape(height, width, 3)[::-1] * codes[-1])
+        differ = (drawn != part[levels]).any(axis=-1)
+        for level in np.unique(levels[differ]):
+            became = drawn[(levels == level) & differ][0].astype(int)
+            wrong.append(f"{tuple(map(int, part[level]))} as {tuple(map(int, became))}")
+    return f"{len(wrong)} of {len(triples)} codes are not drawn as they are, {wrong[0]}" if wrong else ""
+
+
 class Presenter:
     """Draws a texture of levels on the screen of its context."""
 
@@ -74,6 +102,7 @@ class Presenter:
         self._ctx = levels.ctx
         self._view = view
         with self._ctx:
+            self._ctx.disable_direct(GL_DITHER)  # which GL begins with
             self._plain, self._aided = (self._build(aids) for aids in (False, True))
         self.set_triples(view.triples)
 

@@ -13,11 +13,11 @@ from PIL import Image
 
 from hilstar.rotation import propagate
 from hilstar.run.record.ledger_reader import frame_records
-from tests.support.benches import ATTITUDE, SCREEN_BENCH
+from tests.support.benches import ATTITUDE, SCREEN_BENCH, still_log
 from tests.support.commands import run_hilstar
 from tests.support.waiting import PATIENCE_S, best_of_three, in_time
 from tests.support.x11.events import client
-from tests.support.x11.screens import Screen, Shown, codes_of, lines_over
+from tests.support.x11.screens import Screen, Shown, codes_of, lines_over, xvfb
 
 
 def test_the_screen_shows_the_codes_bit_for_bit(screen, bench_file):
@@ -198,3 +198,25 @@ def test_the_dots_of_a_plan_come_up_turned_as_the_stars_are(screen, bench_file, 
     assert seen
     assert "frame 8 of 8" in said
     assert "8 of 8 frames shown" in said
+
+
+@pytest.mark.parametrize(
+    ("depth", "bits", "words"),
+    [
+        (24, 10, ("8 bits per colour and the bench file says 10", "codes are not drawn as they are, (1, 1, 1) as (0, 0, 0)")),
+        (16, 8, ("the X screen has 5 bits per colour and the window 8, so that X converts",)),
+        (30, 8, ("the X screen has 10 bits per colour and the window 8, so that X converts",)),
+        (30, 10, ("gamma ramp has 256 steps, too few for 10 bits",)),
+    ],
+)
+def test_the_gate_reads_the_depth_and_every_code_of_what_is_drawn_on(tmp_path, depth, bits, words):
+    bench_file = tmp_path / "bench.toml"
+    bench_file.write_text(SCREEN_BENCH.replace("[collimator]", f"bits = {bits}\n[collimator]"))
+    still_log(tmp_path / "still.csv")
+    with xvfb(tmp_path, f"640x480x{depth}") as screen:
+        code, said = refused(screen, bench_file, "--stop", "0.2")
+        assert code == 3, said
+        _, forced = refused(screen, bench_file, "--force", "--stop", "0.2")
+    for word in words:
+        assert word in forced
+    assert ("codes are not drawn" in forced) == ((depth, bits) == (24, 10)), forced

@@ -10,7 +10,7 @@ import pytest
 
 from hilstar.bench.config import parse_config
 from hilstar.bench.orientation import scan_of
-from hilstar.monitor.window.x11 import SwapStamps
+from hilstar.monitor.window.x11 import BackBuffer, SwapStamps
 from hilstar.run.screen import screen as screen_room
 from hilstar.run.screen.screen import Screen
 from tests.support.benches import SMALL_BENCH
@@ -28,13 +28,14 @@ def model_screen(
     model = ModelDisplay(clock, round(1e9 / hz), **display)
     presenter = SimpleNamespace(present=lambda *values: None, wait=model.wait)
     monkeypatch.setattr(screen_room, "Presenter", lambda texture, view: presenter)
+    monkeypatch.setattr(screen_room, "changed_codes", lambda context, screen_px, bits: "")
     config = parse_config(folder / "bench.toml", SMALL_BENCH.replace("[collimator]", f"refresh_hz = {hz}\n[collimator]"))
     bench = SimpleNamespace(
         config=config,
         scan=scan_of(config.monitor),
         camera=SimpleNamespace(boresight_px=(0.0, 0.0)),
         calibration=SimpleNamespace(response=SimpleNamespace(rgb=None)),
-        renderer=SimpleNamespace(codes_texture=None),
+        renderer=SimpleNamespace(codes_texture=None, context=None),
         draw=lambda q: None,
         frame_sprites=lambda *values, **named: clock.work(DRAW_NS),
         draw_sprites=lambda sprites, number: SimpleNamespace(levels=None, star_count=0, clipped_hip=(), capped=0),
@@ -73,7 +74,9 @@ class ModelDisplay:
             "composited": False,
             "mirrored": None,
             "scaled": False,
-            "depth_bits": 8,
+            "back_buffer": BackBuffer(8, 0),
+            "screen_bits": 8,
+            "ramp_size": 256,
             "modes_hz": (60,),
             "gone": None,
             "hidden": "",

@@ -16,7 +16,7 @@ from hilstar.errors import InputError, MachineError, did_you_mean
 from hilstar.monitor.window.awake import Awake
 from hilstar.monitor.window.library import glfw
 from hilstar.monitor.window.visibility import ScreenArea, Visibility
-from hilstar.monitor.window.x11 import Survival, SwapStamps, has_extension, is_composited, sync_control
+from hilstar.monitor.window.x11 import BackBuffer, Survival, SwapStamps, back_buffer, has_extension, is_composited, sync_control
 from hilstar.process.cores import drawing_threads_apart
 from hilstar.units import GL_VERSIONS, NS_PER_S
 
@@ -247,7 +247,17 @@ class Window:
         return int(width), int(height)
 
     @property
-    def depth_bits(self) -> int:
+    def back_buffer(self) -> BackBuffer:
+        """What is drawn on."""
+        return back_buffer(glfw.get_proc_address)
+
+    @property
+    def ramp_size(self) -> int:
+        """Steps of the display's gamma ramp; 0 where it has none, or is not known."""
+        return 0 if self._ramp is None else len(self._ramp[1][0])
+
+    @property
+    def screen_bits(self) -> int:
         """Bits per colour of the screen's mode: the minimum of the three."""
         monitor = glfw.get_window_monitor(self._window) or glfw.get_primary_monitor()
         bits = glfw.get_video_mode(monitor).bits

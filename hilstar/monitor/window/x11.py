@@ -10,11 +10,14 @@ import ctypes
 import logging
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 from hilstar.units import NS_PER_US
 
 GL_LIBRARY, X11_LIBRARY = "libGL.so.1", "libX11.so.6"
+GL_DRAW_FRAMEBUFFER, GL_BACK_LEFT, GL_SAMPLES = 0x8CA9, 0x0402, 0x80A9
+GL_COLOUR_SIZES = (0x8212, 0x8213, 0x8214)  # GL_FRAMEBUFFER_ATTACHMENT_RED_SIZE, _GREEN_SIZE, _BLUE_SIZE
 CLOCK = "after-swap clock"
 SYNC_EXTENSION = b"GLX_OML_sync_control"
 # A UST further back is of another clock than this host's monotonic one, or of another swap.
@@ -152,6 +155,29 @@ def sync_control(x_display: int | None, drawable: int | None) -> SyncControl | N
         return SyncControl(library, x_display, drawable) if SYNC_EXTENSION in extensions.split() else None
     except (OSError, AttributeError):
         return None
+
+
+@dataclass(frozen=True, slots=True)
+class BackBuffer:
+    """What is drawn on: bits of each colour (the fewest of the three), and samples of a pixel (0 or 1: one)."""
+
+    bits: int
+    samples: int
+
+
+def back_buffer(address_of: Callable[[str], Any]) -> BackBuffer:
+    """The back buffer of the context that is current, by GL functions of those addresses."""
+
+    def integer(name: str, *arguments: int) -> int:
+        value = ctypes.c_int()
+        function = ctypes.CFUNCTYPE(None, *[ctypes.c_uint] * len(arguments), ctypes.POINTER(ctypes.c_int))(address_of(name))
+        function(*arguments, ctypes.byref(value))
+        return value.value
+
+    bits = (
+        integer("glGetFramebufferAttachmentParameteriv", GL_DRAW_FRAMEBUFFER, GL_BACK_LEFT, size) for size in GL_COLOUR_SIZES
+    )
+    return BackBuffer(min(bits), integer("glGetIntegerv", GL_SAMPLES))
 
 
 def has_extension(x_display: int | None, name: bytes) -> bool:

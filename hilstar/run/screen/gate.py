@@ -29,6 +29,7 @@ DRAINED = 6  # periods after which no queue has a frame
 # The first is today's and serves most drivers; a 4K display or a slow X server needs more.
 GUARDS_MS = (1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0)
 GUARD_TRIALS = 4
+PLAIN_BITS = 8
 UNPACED = 0.1  # of the period that the system knows of: swaps faster by more do not wait for it
 log = logging.getLogger(__name__)
 
@@ -71,7 +72,10 @@ def pass_gate(screen: Screen, force: bool, clock: HostClock = HOST_CLOCK) -> Tim
         log.warning("the display has no refresh of its own (swaps take %.2f ms): frames are paced by software", ms)
     if window.gone is not None:
         raise MachineError(window.gone)
-    for fault in faults(window, monitor, timing):
+    changed = screen.changed_codes()
+    if changed:
+        changed += "; switch dithering, colour transforms and antialiasing off in the display's driver"
+    for fault in (*faults(window, monitor, timing), *[changed] * bool(changed)):
         if not force:
             raise MachineError(f"{fault}; or add --force")
         log.warning("%s: shown anyway (--force)", fault)
@@ -143,9 +147,7 @@ def faults(window: Window, monitor: Monitor, timing: Timing) -> Iterator[str]:
         yield from _timing_faults(monitor, timing)
     if not timing.waits:
         yield "swaps do not wait for the display's refresh; switch vertical sync on in its driver"
-    if window.depth_bits < monitor.bits:
-        depths = f"{window.depth_bits} bits per colour and the bench file says {monitor.bits}"
-        yield f"the window has {depths}; set [monitor] bits, or a deeper mode"
+    yield from _depth_faults(window, monitor)
 
 
 def _desktop_faults(window: Window) -> Iterator[str]:
@@ -161,6 +163,21 @@ def _desktop_faults(window: Window) -> Iterator[str]:
         yield f"the display {window.mirrored} mirrors this one; {advice}"
     if window.scaled:
         yield "the display is scaled by its desktop; set its scale to 100 %"
+
+
+def _depth_faults(window: Window, monitor: Monitor) -> Iterator[str]:
+    """What would change codes between the frame and the panel's cable."""
+    buffer, wanted = window.back_buffer, monitor.bits
+    if buffer.bits != wanted:
+        depths = f"{buffer.bits} bits per colour and the bench file says {wanted}"
+        yield f"the window has {depths}; set [monitor] bits, or the depth of the X screen"
+    elif window.screen_bits != buffer.bits:
+        depths = f"{window.screen_bits} bits per colour and the window {buffer.bits}"
+        yield f"the X screen has {depths}, so that X converts codes; set [monitor] bits, or DefaultDepth of the X screen"
+    if buffer.samples > 1:
+        yield f"the driver draws {buffer.samples} samples a pixel; switch forced antialiasing off in its settings"
+    if wanted > PLAIN_BITS and 0 < window.ramp_size < 2**wanted:
+        yield f"the display's gamma ramp has {window.ramp_size} steps, too few for {wanted} bits; set [monitor] bits = 8"
 
 
 def _timing_faults(monitor: Monitor, timing: Timing) -> Iterator[str]:

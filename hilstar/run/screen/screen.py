@@ -8,7 +8,7 @@ import time
 from hilstar.bench.frame import Bench
 from hilstar.bench.orientation import orientation_of
 from hilstar.monitor.window.window import Window
-from hilstar.render.presenter import Presenter, View
+from hilstar.render.presenter import Presenter, View, changed_codes
 from hilstar.run.aids import Aids
 from hilstar.run.screen.photodiode import marker_light
 from hilstar.run.screen.swap_clock import DrawBudget, SwapClock
@@ -66,6 +66,10 @@ class Screen:
     def timestamp_source(self) -> str:
         """Where the times of swaps come from, and who paces them."""
         return self.window.timestamp_source + ("" if self.clock.paced_by_screen else ", software pacing")
+
+    def changed_codes(self) -> str:
+        """Which codes the driver draws otherwise than they are; "" for none."""
+        return changed_codes(self.bench.renderer.context, self.window.size_px, self.bench.config.monitor.bits)
 
     def present(self, number: int) -> int | None:
         """Draw the bench's last frame on the back buffer; the photodiode square's light in frame `number`, None without one."""

@@ -9,6 +9,7 @@ import pytest
 
 from hilstar.bench.config import parse_config
 from hilstar.errors import MachineError
+from hilstar.monitor.window.x11 import BackBuffer
 from hilstar.run.screen.gate import GATE_FRAMES, Timing, faults, pass_gate, timing_of
 from tests.support.benches import SMALL_BENCH
 from tests.support.model_display import model_screen
@@ -31,7 +32,9 @@ def window(**changes):
         "composited": False,
         "mirrored": None,
         "scaled": False,
-        "depth_bits": 8,
+        "back_buffer": BackBuffer(8, 0),
+        "screen_bits": 8,
+        "ramp_size": 256,
         "modes_hz": (50, 60),
     }
     return SimpleNamespace(**plain | {"gone": None, "display": SimpleNamespace(refresh_hz=60.0)} | changes)
@@ -74,7 +77,10 @@ def test_a_display_as_the_bench_file_has_it_has_no_fault(monitor):
         ({"scaled": True}, GOOD, "set its scale to 100 %"),
         ({"by_wayland": True}, GOOD, "use an Xorg session"),
         ({"ramp_refused": True}, GOOD, "gamma ramp that is not straight"),
-        ({"depth_bits": 6}, GOOD, "6 bits per colour and the bench file says 8"),
+        ({"back_buffer": BackBuffer(6, 0)}, GOOD, "6 bits per colour and the bench file says 8"),
+        ({"back_buffer": BackBuffer(10, 0)}, GOOD, "10 bits per colour and the bench file says 8"),
+        ({"screen_bits": 10}, GOOD, "the X screen has 10 bits per colour and the window 8, so that X converts codes"),
+        ({"back_buffer": BackBuffer(8, 4)}, GOOD, "4 samples a pixel"),
         ({}, Timing(PERIOD_MS * 1.02, 0, True), "58.82 Hz and the bench file says 60"),
         ({}, Timing(0.4, 0, False, waits=False), "switch vertical sync on"),
     ],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -80,6 +81,7 @@ def test_the_installed_wheel_runs_the_demo_without_the_checkout(checkout, tmp_pa
         return done.stdout
 
     programs = folder / ".venv" / "bin"
-    assert '"frames":1' in printed(programs / "hilstar", "demo", "--duration", "2", "--json")
+    shown = json.loads(printed(programs / "hilstar", "demo", "--duration", "2", "--json"))
+    assert shown["frames"] > 0 and shown["stars_drawn"]["mean"] > 50
     assert len(list((elsewhere / "hilstar-demo").glob("*_codes.png"))) == 4
     assert str(folder / ".venv") in printed(programs / "python", "-c", "import hilstar; print(hilstar.__file__)")

@@ -14,6 +14,7 @@ from hilstar.campaign.assessment.slices import Slice
 from hilstar.campaign.budget.budget import Axes
 from hilstar.charts import write_csv
 
+COUNT = "1"  # the unit of counts and shares in the tables
 COLUMNS = ("quantity", "axis", "value", "unit", "low_95", "high_95")
 MAX_NAMED = 10
 
@@ -93,17 +94,17 @@ def rows_of(found: Assessment) -> Iterator[Row]:
         ):
             yield name, "", value if told else None, unit, value - 1.96 * sigma, value + 1.96 * sigma
     lock = found.lock
-    yield "availability", "", lock.availability, "1", None, None
-    yield "answers due", "", lock.due, "1", None, None
-    yield "right answers", "", lock.right, "1", None, None
-    yield "wrong answers", "", len(found.wrong), "1", None, None
-    yield "lock lost", "", len(lock.lost), "1", None, None
-    yield "acquisition probability", "", lock.acquisition_probability, "1", None, None
+    yield "availability", "", lock.availability, COUNT, None, None
+    yield "answers due", "", lock.due, COUNT, None, None
+    yield "right answers", "", lock.right, COUNT, None, None
+    yield "wrong answers", "", len(found.wrong), COUNT, None, None
+    yield "lock lost", "", len(lock.lost), COUNT, None, None
+    yield "acquisition probability", "", lock.acquisition_probability, COUNT, None, None
     yield "acquisition time, median", "", lock.acquisition_s, "s", None, None
     if found.display is not None:
         yield "display's own error", "cross", found.display.cross_arcsec, "arcsec", None, None
         yield "display's own error", "roll", found.display.roll_arcsec, "arcsec", None, None
-        yield "display's own error, share seen", "", found.display.seen, "1", None, None
+        yield "display's own error, share seen", "", found.display.seen, COUNT, None, None
 
 
 def _of_axes(name: str, axes: Axes, interval: FloatArray) -> Iterator[Row]:

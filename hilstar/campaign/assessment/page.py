@@ -4,46 +4,54 @@ from __future__ import annotations
 
 import base64
 import html
-import io
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from hilstar.campaign.assessment.assess import Assessment
-from hilstar.campaign.assessment.figures import lines_of, rows_of
+from hilstar.campaign.assessment.figures import COUNT, lines_of, rows_of
 from hilstar.campaign.assessment.slices import Slice
 from hilstar.campaign.budget.places import axes_of
-from hilstar.charts import STYLE
+from hilstar.charts import BLUE, DARK, GRID, INK, MUTED, PAPER, label_ends, panels_of, svg
 from hilstar.files import write_whole
 
 MAX_POINTS = 4000
 MAX_ROWS = 200
+DIGITS = 4
 PAGE = """<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8"><title>{title}</title><style>
-body {{ font: 15px/1.45 sans-serif; max-width: 1020px; margin: 2em auto; padding: 0 1em; color: #222 }}
+:root {{ color-scheme: light dark; --ink: {ink}; --paper: {paper}; --rule: {rule}; --note: #fff6df }}
+@media (prefers-color-scheme: dark) {{ :root {{
+  --ink: {dark_ink}; --paper: {dark_paper}; --rule: {dark_rule}; --note: #3d3520 }} }}
+body {{ font: 15px/1.45 sans-serif; max-width: 1020px; margin: 2em auto; padding: 0 1em;
+  color: var(--ink); background: var(--paper) }}
 table {{ border-collapse: collapse; margin: 1em 0 }}
-td, th {{ padding: 3px 14px 3px 0; border-bottom: 1px solid #ddd; vertical-align: top; text-align: left }}
+td, th {{ padding: 3px 14px 3px 0; border-bottom: 1px solid var(--rule); vertical-align: top; text-align: left }}
 td.n {{ text-align: right; font-variant-numeric: tabular-nums }}
 img {{ max-width: 100% }}
-.note {{ background: #fff6df; padding: .4em .8em; margin: .4em 0 }}
+.note {{ background: var(--note); padding: .4em .8em; margin: .4em 0 }}
 </style></head><body><h1>{title}</h1>{notes}{body}</body></html>
 """
+COLOURS = {"ink": INK, "paper": PAPER, "rule": GRID}
+COLOURS |= {f"dark_{name}": DARK[colour] for name, colour in COLOURS.items()}
+AXES = ("x", "y", "about the boresight")
 
 
 def write_page(path: Path, found: Assessment) -> None:
     """Write the page of an assessment; it needs no other file. Raises InputError."""
     title = f"Error budget: {found.telemetry.path.name} against {found.run.path.name}"
     notes = "".join(f'<p class="note">{html.escape(note)}</p>' for note in found.notes)
-    write_whole(
-        path, PAGE.format(title=html.escape(title), notes=notes, body="".join(_sections(found))).encode(errors="replace")
-    )
+    text = PAGE.format(title=html.escape(title), notes=notes, body="".join(_sections(found)), **COLOURS)
+    write_whole(path, text.encode(errors="replace"))
 
 
 def _sections(found: Assessment) -> Iterator[str]:
     yield _table(("", ""), lines_of(found))
     yield "<h2>Budget</h2><p>One sigma an axis, with 95 % intervals by the block bootstrap.</p>"
-    yield _table(("quantity", "axis", "value", "unit", "low", "high"), list(rows_of(found)))
+    rows: list[tuple[object, ...]] = [(*row[:3], "" if row[3] == COUNT else row[3], *row[4:]) for row in rows_of(found)]
+    yield _table(("quantity", "axis", "value", "unit", "low", "high"), rows)
     yield "<h2>Errors over the run</h2>" + _over_time(found)
     yield "<h2>What repeats with the place in the field</h2>" + _field_map(found)
     detail = found.found.components.pixel.detail or found.found.components.pixel.reason
@@ -70,7 +78,7 @@ def _cell(value: object) -> str:
     if value is None:
         return "<td>-</td>"
     if isinstance(value, float):
-        return f'<td class="n">{value:.6g}</td>'
+        return f'<td class="n">{value:.{DIGITS}g}</td>'
     return f'<td class="n">{value}</td>' if isinstance(value, int) else f"<td>{html.escape(str(value))}</td>"
 
 
@@ -83,42 +91,37 @@ def _slices(unit: str, slices: Sequence[Slice]) -> str:
     return _table(header, rows) + "<p>Arcsec; the error's rms is about the bias.</p>"
 
 
-def _image(figure: object, alt: str) -> str:
-    data = io.BytesIO()
-    figure.savefig(data, format="png", dpi=100)  # type: ignore[attr-defined]
-    return f'<p><img alt="{html.escape(alt)}" src="data:image/png;base64,{base64.b64encode(data.getvalue()).decode()}"></p>'
+def _image(figure: Any, alt: str) -> str:
+    data = base64.b64encode(svg(figure).encode()).decode()
+    return f'<p><img alt="{html.escape(alt)}" src="data:image/svg+xml;base64,{data}"></p>'
 
 
 def _over_time(found: Assessment) -> str:
-    from matplotlib import rc_context
-    from matplotlib.figure import Figure
-
     parts = found.found.components
     valid = np.flatnonzero(found.telemetry.valid)
     t_s = found.t_s[valid[found.found.row]]
     some = np.unique(np.linspace(0, len(t_s) - 1, MAX_POINTS).astype(int))
     repeating = parts.fov.fitted + parts.pixel.fitted
-    with rc_context(STYLE):
-        figure = Figure(figsize=(9.5, 7), layout="constrained")
-        for axis, name, k in zip(figure.subplots(3, 1, sharex=True), ("x", "y", "about the boresight"), range(3), strict=True):
-            axis.plot(t_s[some], (repeating + parts.left)[some, k], ".", ms=2, color="#9bb8d3", label="error about the bias")
-            axis.plot(
-                t_s[some], parts.fov.fitted[some, k], ".", ms=2, color="#c0392b", label="repeats with the place in the field"
-            )
+    rms = np.sqrt(np.mean((repeating + parts.left) ** 2, axis=0))
+    finding = f"The error about the bias is {rms[0]:.2g} arcsec rms in x, {rms[1]:.2g} in y, {rms[2]:.2g} about the boresight"
+    note = (
+        "Grey: the error. Blue: what of it repeats with the place in the field. Bands: lock lost. Dotted lines: wrong answers."
+    )
+    with panels_of(finding, 3, note=note, height_inch=7.0) as panels:
+        for axes, name, k in zip(panels, AXES, range(3), strict=True):
+            axes.plot(t_s[some], (repeating + parts.left)[some, k], ".", ms=3.5, color=MUTED, rasterized=True)
+            axes.plot(t_s[some], parts.fov.fitted[some, k], ".", ms=2.5, color=BLUE, rasterized=True, label="repeats")
             for each in found.lock.lost:
-                axis.axvspan(each.start_s, each.start_s + each.length_s, color="#dddddd")
+                axes.axvspan(each.start_s, each.start_s + each.length_s, color=MUTED, alpha=0.3, lw=0)
             for wrong in found.wrong:
-                axis.axvline(wrong.run_s, color="#e6a100", lw=0.6)
-            axis.set_ylabel(f"{name}, arcsec")
-        axis.set_xlabel("run time, s (grey: lock lost; yellow: wrong answers)")
-        figure.axes[0].legend(markerscale=6, loc="upper right", ncols=2)
-        return _image(figure, "errors over the run")
+                axes.axvline(wrong.run_s, color=INK, lw=1, ls=":")
+            axes.set_ylabel(f"{name} [arcsec]")
+            label_ends(axes)
+        panels[-1].set_xlabel("run time [s]")
+    return _image(panels[0].figure, "errors over the run")
 
 
 def _field_map(found: Assessment) -> str:
-    from matplotlib import rc_context
-    from matplotlib.figure import Figure
-
     parts, scale = found.found.components, found.run.scale
     axes = axes_of(found.found.commanded_q)
     some = np.unique(np.linspace(0, len(axes) - 1, MAX_POINTS).astype(int))
@@ -129,32 +132,34 @@ def _field_map(found: Assessment) -> str:
         reason = parts.fov.reason or "the run goes over too much of the sky for one map: see the chart over time"
         return f"<p>{html.escape(reason)}.</p>"
     place = scale.focal_px * seen[:, :2] / seen[:, 2:]
-    with rc_context(STYLE):
-        figure = Figure(figsize=(9.5, 3.6), layout="constrained")
-        for k, (axis, name) in enumerate(zip(figure.subplots(1, 3), ("x", "y", "about the boresight"), strict=True)):
-            value = parts.fov.fitted[some, k]
-            limit = max(float(np.abs(value).max()), 1e-6)
-            drawn = axis.scatter(*place.T, c=value, s=4, cmap="RdBu_r", vmin=-limit, vmax=limit)
-            figure.colorbar(drawn, ax=axis, orientation="horizontal", label=f"{name}, arcsec")
-            axis.set_aspect("equal", adjustable="datalim")
-            axis.invert_yaxis()
-            axis.set_xlabel("place of the star field, px")
-        return _image(figure, "field-of-view error over the field")
+    largest = np.abs(parts.fov.fitted).max(axis=0)
+    finding = f"It is up to {largest[0]:.2g} arcsec in x, {largest[1]:.2g} in y and {largest[2]:.2g} about the boresight"
+    with panels_of(finding, 1, 3, share_x=False, height_inch=3.9) as panels:
+        for k, (panel, name) in enumerate(zip(panels, AXES, strict=True)):
+            value, limit = parts.fov.fitted[some, k], max(float(largest[k]), 1e-6)
+            look: dict[str, Any] = {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit, "rasterized": True}
+            drawn = panel.scatter(place[:, 0], place[:, 1], c=value, s=6, edgecolors="none", **look)
+            panel.figure.colorbar(drawn, ax=panel, orientation="horizontal", label=f"{name} [arcsec]")
+            panel.set_aspect("equal", adjustable="datalim")
+            panel.set_xlabel("star field x [px]")
+            panel.invert_yaxis()
+        panels[0].set_ylabel("star field y [px]")
+    return _image(panels[0].figure, "field-of-view error over the field")
 
 
 def _histogram(found: Assessment) -> str:
-    from matplotlib import rc_context
-    from matplotlib.figure import Figure
-
     left, variance = found.found.components.left, found.found.components.noise_variance
-    with rc_context(STYLE):
-        figure = Figure(figsize=(9.5, 3.2), layout="constrained")
-        for k, (axis, name) in enumerate(zip(figure.subplots(1, 3), ("x", "y", "about the boresight"), strict=True)):
-            sigma = max(float(np.sqrt(variance[k])), 1e-9)
+    sigmas = np.sqrt(variance)
+    finding = f"Noise is {sigmas[0]:.2g} arcsec in x, {sigmas[1]:.2g} in y and {sigmas[2]:.2g} about the boresight, one sigma"
+    note = "Bars: what is left when all that repeats is taken away. Line: the normal distribution of that sigma."
+    with panels_of(finding, 1, 3, share_x=False, note=note, height_inch=3.6) as panels:
+        for k, (axes, name) in enumerate(zip(panels, AXES, strict=True)):
+            sigma = max(float(sigmas[k]), 1e-9)
             edges = np.linspace(-5, 5, 61) * sigma
-            axis.hist(left[:, k], edges, density=True, color="#9bb8d3")
-            axis.plot(edges, np.exp(-0.5 * (edges / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi)), color="#333")
-            axis.set_yscale("log")
-            axis.set_ylim(1e-4 / sigma, 1 / sigma)
-            axis.set_xlabel(f"{name}, arcsec")
-        return _image(figure, "noise, and the normal distribution")
+            axes.hist(left[:, k], edges.tolist(), density=True, color=BLUE, alpha=0.5)
+            axes.plot(edges, np.exp(-0.5 * (edges / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi)), color=INK, lw=1.2)
+            axes.set_yscale("log")
+            axes.set_ylim(1e-6 / sigma, 1 / sigma)
+            axes.set_xlabel(f"{name} [arcsec]")
+        panels[0].set_ylabel("share [1/arcsec]")
+    return _image(panels[0].figure, "noise, and the normal distribution")

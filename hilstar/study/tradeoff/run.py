@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hilstar.charts import BLUE, MUTED, RED, capital, chart, name_at_side, two_digits, write_csv
+from hilstar.charts import BLUE, MUTED, RED, capital, chart, name_at_side, title_lines, two_digits, write_csv
 from hilstar.render.renderer import Renderer, Target
 from hilstar.study.tradeoff.brightness import brightness
 from hilstar.study.tradeoff.culling import culling
@@ -28,6 +28,7 @@ from hilstar.tracker.centroiders import FAMILY
 if TYPE_CHECKING:
     pass
 
+LABEL_COLUMNS = 40  # of an axis as high as a panel
 # In the order of the chain.
 STEPS: tuple[Callable[[ExitStack, bool], Trials], ...] = (
     brightness,
@@ -145,7 +146,12 @@ def draw(path: Path, step: Step, machine: str) -> None:
             axes.plot(row.quartiles_ms, [shown[row.method][1]] * 2, color=colour, lw=3.5, alpha=0.4, solid_capstyle="butt")
             axes.plot(*shown[row.method], "o", color=colour, ms=6, zorder=3)
         axes.plot(*shown[own.method], "o", color=RED, ms=14, mfc="none", mew=2.0, zorder=4)
-        axes.set(xscale="log", yscale="log", xlabel="median time [ms]", ylabel=f"{step.error.name} [{unit_of(step.error)}]")
+        axes.set(
+            xscale="log",
+            yscale="log",
+            xlabel="median time [ms]",
+            ylabel=title_lines(f"{step.error.name} [{unit_of(step.error)}]", LABEL_COLUMNS),
+        )
         axes.margins(0.06, 0.08)
         if any(row.error < floor for row in step.rows):
             axes.axhline(floor, color=MUTED, ls=":", lw=1.2)

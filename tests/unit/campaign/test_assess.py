@@ -9,14 +9,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
+from hilstar import charts
 from hilstar.arrays import FloatArray
+from hilstar.campaign.assessment import page
 from hilstar.campaign.assessment.display_cost import display_cost, turn_between
 from hilstar.campaign.assessment.lock import lock_of
 from hilstar.campaign.assessment.slices import slices_of
 from hilstar.campaign.budget.commanded import Commanded
 from tests.support.commands import run_hilstar_here
+from tests.support.figures import assert_legible
 from tests.support.planted_run import write_ledger, write_run, write_telemetry
 from tests.support.planted_tracker import Planted, Sizes, plant, scalar_first, scan, still
 
@@ -28,7 +32,9 @@ def planted() -> Planted:
     return plant(scan, SIZES, np.random.default_rng(11), seconds=240.0)
 
 
-def test_a_run_gives_the_budget_on_one_page_and_names_each_wrong_answer(tmp_path: Path, planted: Planted) -> None:
+def test_a_run_gives_the_budget_on_one_page_and_names_each_wrong_answer(tmp_path: Path, planted: Planted, monkeypatch) -> None:
+    drawn: list[Figure] = []
+    monkeypatch.setattr(page, "svg", lambda figure: drawn.append(figure) or charts.svg(figure))
     ledger, telemetry = write_run(tmp_path, planted)
     out = tmp_path / "out"
     run = run_hilstar_here("assess", ledger, telemetry, "-o", out, "--json", "--display-attitudes", "0")
@@ -50,9 +56,11 @@ def test_a_run_gives_the_budget_on_one_page_and_names_each_wrong_answer(tmp_path
     # Gaps, and wild answers: what is left of one answer each 100 ms.
     due = (planted.tau_s[-1] - planted.tau_s[0]) / 0.1 + 1
     assert found["availability"] == pytest.approx((len(planted.tau_s) - 5) / due, abs=2e-3)
-    page = (out / "budget.html").read_text()
-    assert page.count("data:image/png;base64,") == 3
-    assert not re.search(r"(src|href)=.(https?:)?//", page)
+    text = (out / "budget.html").read_text()
+    assert text.count("data:image/svg+xml;base64,") == len(drawn) == 3 and "prefers-color-scheme: dark" in text
+    assert not re.search(r"(src|href)=.(https?:)?//|<td>1</td>", text)
+    for figure in drawn:
+        assert_legible(figure)
     with (out / "budget.csv").open() as file:
         table = {(row["quantity"], row["axis"]): row for row in csv.DictReader(file)}
     row = table["noise", "cross"]

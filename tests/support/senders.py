@@ -22,8 +22,8 @@ LYRA = tuple(from_radec_roll_deg(283.0, 35.0, 30.0))
 
 
 def packet(sequence: int, t_ns: int, q=(0.5, 0.5, -0.5, 0.5), rate=(0.0, 0.0, 0.0)) -> bytes:
-    """An attitude as docs and firmware_protocol/protocol.toml lay it out."""
-    body = struct.pack("<BBHIq4d3f", 1, 1, 1, sequence, t_ns, *q, *rate)
+    """An attitude as docs and firmware_protocol/protocol.toml lay it out; a rate of None is none."""
+    body = struct.pack("<BBHIq4d3f", 1, 1, rate is not None, sequence, t_ns, *q, *(rate or (0.0, 0.0, 0.0)))
     return body + struct.pack("<I", zlib.crc32(body))
 
 

@@ -88,7 +88,7 @@ def sky(folder: Path, *options: str) -> Iterator[Sky]:
             def send() -> None:
                 if shown.sending.is_set():
                     shown.turned_rad += TURN_RAD if shown.turning.is_set() else 0.0
-                    sender.send(packet(next(numbers), time.monotonic_ns(), shown.q()))
+                    sender.send(packet(next(numbers), time.monotonic_ns(), shown.q(), rate=None))
 
             with repeating(send, PACKET_S):
                 yield shown

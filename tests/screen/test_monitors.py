@@ -92,6 +92,8 @@ def test_the_monitor_that_is_named_is_the_one_that_is_filled(server, tmp_path):
         with showing(server, path):
             pass
         assert frames(path) > 10
+        warned = run_hilstar("replay", path, tmp_path / "still.csv", "--force", "--stop", "0.2", env=server.env)
+        assert "other displays, DUMMY0" in warned.stderr and "X screen of its own" in warned.stderr
         wrong = bench(tmp_path, 'display = "DUMMY1"')
         result = run_hilstar("replay", wrong, tmp_path / "still.csv", env=server.env)
         assert result.returncode == 3

@@ -73,6 +73,7 @@ class ModelDisplay:
             "ramp_refused": False,
             "composited": False,
             "mirrored": None,
+            "others": (),
             "scaled": False,
             "back_buffer": BackBuffer(8, 0),
             "screen_bits": 8,

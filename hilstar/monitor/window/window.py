@@ -285,6 +285,14 @@ class Window:
         return has_extension(self._x_display, b"XWAYLAND") or any(name.startswith("XWAYLAND") for name in names)
 
     @property
+    def others(self) -> tuple[str, ...]:
+        """The names of the other displays of the same X screen, where this window fills one."""
+        if self.display is None or self.gone is not None:
+            return ()
+        names = (_describe(index, monitor).name for index, monitor in enumerate(glfw.get_monitors()))
+        return tuple(name for name in names if name != self.display.name)
+
+    @property
     def mirrored(self) -> str | None:
         """The name of another display that shows the same part of the desktop, where there is one."""
         if self.display is None:

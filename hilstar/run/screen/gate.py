@@ -72,6 +72,12 @@ def pass_gate(screen: Screen, force: bool, clock: HostClock = HOST_CLOCK) -> Tim
         log.warning("the display has no refresh of its own (swaps take %.2f ms): frames are paced by software", ms)
     if window.gone is not None:
         raise MachineError(window.gone)
+    if window.others:
+        log.warning(
+            "the X screen has other displays, %s: frames may be copied instead of flipped, or follow another's refresh; "
+            "switch them off, or give this one an X screen of its own",
+            ", ".join(window.others),
+        )
     changed = screen.changed_codes()
     if changed:
         changed += "; switch dithering, colour transforms and antialiasing off in the display's driver"
@@ -159,7 +165,7 @@ def _desktop_faults(window: Window) -> Iterator[str]:
     if window.composited:
         yield "a compositing manager draws this display and may hold frames back; stop it, or use a plain X session"
     if window.mirrored is not None:
-        advice = "switch it off, or place it beside this one (xrandr --right-of)"
+        advice = "switch it off, or give this one an X screen of its own (docs/bench-pc.md)"
         yield f"the display {window.mirrored} mirrors this one; {advice}"
     if window.scaled:
         yield "the display is scaled by its desktop; set its scale to 100 %"

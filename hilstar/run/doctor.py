@@ -18,6 +18,7 @@ from hilstar.bench.fields_of_view import FieldsOfView, fields_of_view
 from hilstar.bench.heads_file import read_bench_or_heads
 from hilstar.errors import HilstarError, MachineError
 from hilstar.monitor.window.window import displays
+from hilstar.notices import Notices
 from hilstar.render.context import computes_in_software, create_context, has_compute
 from hilstar.resources import resource_path
 from hilstar.sky.catalog import load_catalog
@@ -83,9 +84,16 @@ def _gl() -> str:
         ctx.release()
 
 
+class _Unsaid(Notices):
+    """Events of a connection that nobody asked after."""
+
+    def mention(self, kind: str, detail: str) -> None:
+        """Say nothing."""
+
+
 def _zeromq() -> str:
     """One message through a real loopback socket."""
-    with ZmqSender("tcp://127.0.0.1:*") as sender, ZmqReceiver(sender.endpoint) as receiver:
+    with ZmqSender("tcp://127.0.0.1:*") as sender, ZmqReceiver(sender.endpoint, notices=_Unsaid()) as receiver:
         receiver.receive(0)  # a receiver connects when it is first read
         if not sender.wait_for_listener(2.0):
             raise MachineError("a loopback connection does not come up; allow TCP on 127.0.0.1")

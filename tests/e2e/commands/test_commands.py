@@ -201,7 +201,7 @@ def test_doctor_says_what_is_there():
     result = run_hilstar("doctor", "--json")
     assert result.returncode == 0, result.stdout
     report = json.loads(result.stdout)
-    assert report["ok"] is True
+    assert report["ok"] is True and result.stderr == ""
     checks = {check["name"]: check for check in report["checks"]}
     assert {"opengl", "zeromq", "display", "files", "catalogue", "python"} <= set(checks)
     assert "OpenGL" in checks["opengl"]["detail"]

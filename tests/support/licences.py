@@ -18,10 +18,10 @@ MAX_NAME_CHARACTERS = 100  # the field `License` holds a name, or the whole text
 def licence_of(package: metadata.Distribution) -> str:
     """What a distribution states: its SPDX expression, else its classifiers, else the beginning of its field `License`."""
     said = package.metadata
-    if said["License-Expression"]:
-        return str(said["License-Expression"])
+    if expression := said.get("License-Expression"):
+        return str(expression)
     classifiers = [each for each in said.get_all("Classifier", []) if each.startswith("License :: OSI Approved ::")]
-    return "; ".join(classifiers) or (said["License"] or "")[:MAX_NAME_CHARACTERS].strip() or UNKNOWN
+    return "; ".join(classifiers) or (said.get("License") or "")[:MAX_NAME_CHARACTERS].strip() or UNKNOWN
 
 
 def is_copyleft(licence: str) -> bool:

@@ -22,11 +22,12 @@ if TYPE_CHECKING:
     from zmq.auth.thread import ThreadAuthenticator
 
 # At most QUEUE_MESSAGES of a flood wait here; the rest wait at the sender or are lost there. A part over MAX_PART_BYTES drops
-# its connection, which is then made anew; a message of more than MAX_PARTS drops every connection. A message that never ends
-# is limited only by the memory of the process (flood_limits.MemoryWatch).
+# its connection, which is then made anew. Of a message of more than MAX_PARTS the rest is passed over, for other senders' wait
+# behind it; one of more than MAX_PASSED_OVER drops every connection. A message that never ends is limited only by the memory
+# of the process (flood_limits.MemoryWatch).
 QUEUE_MESSAGES = 1000
 MAX_PART_BYTES = 1 << 18
-MAX_PARTS = 64
+MAX_PARTS, MAX_PASSED_OVER = 64, 10_000
 # A peer whose cable was pulled says nothing: it is asked, and its connection made anew.
 HEARTBEAT_MS = 1000
 HEARTBEAT_TIMEOUT_MS = 3000
@@ -192,9 +193,17 @@ class ZmqSocket:
                 if not taken.getsockopt(zmq.RCVMORE):
                     return parts
                 parts.append(taken.recv(zmq.NOBLOCK))
+            passed_over = 0 if self._kind == zmq.REP else MAX_PASSED_OVER  # a REP socket that was asked has to answer
+            for _ in range(passed_over):
+                if not taken.getsockopt(zmq.RCVMORE):
+                    self._notices.tell(
+                        "long-message", f"{self.endpoint}: a message of more than {MAX_PARTS} parts is passed over"
+                    )
+                    return None
+                taken.recv(zmq.NOBLOCK, copy=False)
         except zmq.Again:
             return None
-        self._reset(f"a message of more than {MAX_PARTS} parts")
+        self._reset(f"a message of more than {passed_over or MAX_PARTS} parts")
         return None
 
     def _reset(self, why: str) -> None:

@@ -48,8 +48,10 @@ def _draw(path: Path, text: str, rates: dict[str, FloatArray], mag: dict[str, Fl
                 bars = axes.bar(place + 0.4 * k - 0.2, height, 0.38, color=colour, label=name)
                 axes.bar_label(bars, fmt=figure, padding=2, fontsize=SMALL_PT)
         upper.set(ylabel="electrons a second [millions]", ylim=(0, 1.3 * rates["ccd47-20"].max() / 1e6))
+        low, high = min(0.0, *(m.min() for m in mag.values())), max(m.max() for m in mag.values())
+        limits = (low - 0.15 * (high - low), high + 0.4 * (high - low))  # with room for figures and names
         lower.set_xticks(place, [f"{p.zero_point},\n{p.weighting} weighting" for p in SETTINGS])
-        lower.set(ylabel="fainter than vega, energy [mag]", xlabel="zero point, weighting of the passband", ylim=(-0.06, 0.42))
+        lower.set(ylabel="fainter than vega, energy [mag]", xlabel="zero point, weighting of the passband", ylim=limits)
         for axes in (upper, lower):
             axes.grid(visible=False, axis="x")
             axes.legend(loc="upper left", ncols=2)

@@ -22,7 +22,7 @@ from hilstar.sky.spectrum import (
     PLANCK_J_S,
     TEMPERATURE_SCALES,
     blackbody_exitance_w_m2_m,
-    load_curve,
+    constant_curve,
 )
 from hilstar.study.shared.brightness import held_out_errors, study_optics
 from hilstar.study.stability.failure_case import FailureCase, Figures
@@ -158,7 +158,7 @@ def cool_stars() -> FailureCase:
 
 def blind_tracker() -> FailureCase:
     """A tracker that detects no light at all."""
-    blind = replace(OPTICS, quantum_efficiency=load_curve(0.0, "qe"))
+    blind = replace(OPTICS, quantum_efficiency=constant_curve(0.0))
     rate = dgs_electrons_per_s(np.array([5000.0]), blind, Photometry())
     with np.errstate(divide="ignore"):
         logarithm = np.log(rate)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import resource
 import socket
@@ -85,7 +86,7 @@ def test_a_message_of_a_million_parts_is_dropped_before_it_is_a_list(tmp_path):
         before_mb = served.used_mb()
         with greeted(served.port) as attacker, contextlib.suppress(OSError):
             attacker.sendall(part(bytes(1), more=True) * 1_000_000 + part(b"end", more=False))
-            served.await_line("more than 64 parts")
+            served.await_line("more than 10000 parts")
         wait_for(lambda: served.used_mb() < before_mb + 128, "the memory is given back")
         summary = served.summary()
     assert summary["link"]["resets"] == 1
@@ -140,6 +141,28 @@ while time.monotonic() < end:
     assert 0 < summary["packets"]["received"] < MAX_BURST + MAX_PACKETS_PER_S * summary["duration_s"]
     in_time(summary["frames"] > 5 * summary["missed_frames"], summary)
     assert ledger.stat().st_size < 20e6
+
+
+def test_a_sender_of_long_messages_costs_another_s_packets_nothing(tmp_path):
+    """20 MB in 100 parts, again and again: dropping every connection for each lost many of the packets beside it."""
+    sequence = itertools.count()
+    with bound(tmp_path) as served, connected(served.port) as good, connected(served.port) as long:
+
+        def send() -> None:
+            good.send(packet(next(sequence), time.monotonic_ns()))
+            time.sleep(0.005)
+
+        wait_for(lambda: send() or any("the first attitude" in line for line in list(served.lines)), poll_s=0.0)
+        before = next(sequence)
+        for number in range(200):
+            if number % 10 == 0:
+                long.send_multipart([bytes(200_000)] * 100)
+            send()
+        wait_for(lambda: send() or any("more than 64 parts is passed over" in line for line in list(served.lines)), poll_s=0.0)
+        sent = next(sequence) - before
+        summary = served.summary()
+    assert summary["link"]["resets"] == 0
+    assert summary["packets"]["accepted"] >= 0.9 * sent
 
 
 def test_lockstep_survives_no_delimiter_dead_askers_and_endless_parts(tmp_path):

@@ -28,6 +28,7 @@ SUMMARY_KEYS |= {
     "stale_frames",
     "gl_renderer",
     "gl_version",
+    "fields_of_view",
     "render_path",
     "stale_events",
     "receive_latency_ms",

@@ -81,7 +81,7 @@ def test_the_console_starts_and_stops_a_fault_of_the_scenario_by_name():
 
 def test_what_cannot_be_started_or_stopped_is_refused_in_a_line():
     desk, _ = desk_of(blank("cover"))
-    with pytest.raises(InputError, match="no fault is called 'covre'; known are cover"):
+    with pytest.raises(InputError, match=r"no fault is called 'covre'; did you mean cover\? known are cover"):
         desk.start("covre", "console")
     with pytest.raises(InputError, match="'cover' is not on; none is"):
         desk.stop("cover")

@@ -44,7 +44,7 @@ def test_a_message_asks_for_a_fault_and_starts_and_stops_by_name():
         (b'{"kind": "false-star"}', "the key name is missing"),
         (b'{"kind": "false-star", "name": "x", "tracker_px": [1e999, 0], "electrons": 5}', ""),
         (b'{"kind": "blank", "name": "x", "why": 1}', "unknown key why"),
-        (b'{"kind": ["blank"], "name": "x"}', "kind = ['blank']; write one of"),
+        (b'{"kind": ["blank"], "name": "x"}', "kind = ['blank']; did you mean blank? write one of"),
     ],
 )
 def test_a_bad_message_is_refused_in_a_line(raw, said):

@@ -160,7 +160,7 @@ def finish(figure: Figure) -> None:
 
 def capital(text: str) -> str:
     """A text with a capital first, unless it begins with a symbol of one letter (x, y)."""
-    return text[:1].upper() + text[1:] if len(re.match(r"\w*", text)[0]) > 1 else text  # type: ignore[index]
+    return text[:1].upper() + text[1:] if re.match(r"\w\w|a ", text) else text
 
 
 def title_lines(finding: str, columns: int = TITLE_COLUMNS) -> str:

@@ -8,9 +8,10 @@ from __future__ import annotations
 import posixpath
 import re
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from mkdocs.structure.files import File, Files
+if TYPE_CHECKING:
+    from mkdocs.structure.files import Files
 
 ROOT = Path(__file__).resolve().parents[1]
 ADDED = {"changes.md": "CHANGELOG.md", "examples.md": "examples/README.md"}  # pages of the site, and the files that they are
@@ -19,6 +20,8 @@ LINK = re.compile(r"(?<!!)\[([^\]\[]+)\]\(([^)\s#:]+)(#[^)\s]*)?\)")
 
 def on_files(files: Files, config: Any) -> Files:
     """Add the pages that lie elsewhere in the checkout."""
+    from mkdocs.structure.files import File  # which the tests of the rest do without
+
     for page, path in ADDED.items():
         files.append(File.generated(config, page, content=(ROOT / path).read_text(encoding="utf-8")))
     return files

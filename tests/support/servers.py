@@ -82,6 +82,8 @@ def listening(bench: Path, first_words: str, *options: str) -> Iterator[Run]:
         try:
             assert process.stderr is not None
             first = process.stderr.readline()
+            while first and first_words not in first:  # a sender that is there already may be met before
+                first = process.stderr.readline()
             assert first_words in first, first
             yield process
         finally:

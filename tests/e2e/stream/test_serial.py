@@ -199,12 +199,14 @@ def test_more_packets_than_a_run_looks_at_are_passed_over_and_the_run_ends_in_or
     os.set_blocking(master, False)
     bench, ledger = tmp_path / "flood.toml", tmp_path / "run.mcap"
     bench.write_text(f'{LIVE_BENCH}\n[attitude]\nsource = "serial"\nport = "{os.ttyname(slave)}"\n')
-    sequences = itertools.count()
+    sequences, cut = itertools.count(), []
 
     def put() -> None:
         for _ in range(round(FLOOD_HZ * FLOOD_EACH_S)):
+            frame = cobs.encode(packet(next(sequences), time.monotonic_ns())) + b"\0"
             with contextlib.suppress(BlockingIOError):
-                os.write(master, cobs.encode(packet(next(sequences), time.monotonic_ns())) + b"\0")
+                if os.write(master, frame) < len(frame):  # the pty is nearly full
+                    cut.append(frame)
 
     with listening(bench, "reading serial:", "--ledger", str(ledger)) as process:
         process.shows()
@@ -214,7 +216,7 @@ def test_more_packets_than_a_run_looks_at_are_passed_over_and_the_run_ends_in_or
             summary = summary_of(process)
     os.close(master)
     os.close(slave)
-    assert summary["packets"]["refused"] == 0
+    assert summary["packets"]["refused"] <= len(cut)
     assert summary["ledger"]["failure"] is None
     in_time(summary["link"]["flooded"] > 0, summary["link"])  # a busy machine sends less
     in_time(summary["attitude_age_ms"]["p50"] < 100, summary["attitude_age_ms"])

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 ROOT = Path(__file__).resolve().parents[1]
 ADDED = {"changes.md": "CHANGELOG.md", "examples.md": "examples/README.md"}  # pages of the site, and the files that they are
-LINK = re.compile(r"(?<!!)\[([^\]\[]+)\]\(([^)\s#:]+)(#[^)\s]*)?\)")
+LINK = re.compile(r"(?<!!)\[((?:[^\]\[]|\[[^\]\[]*\])+)\]\(([^)\s#:]+)(#[^)\s]*)?\)")  # its words may have brackets
 
 
 def on_files(files: Files, config: Any) -> Files:

@@ -16,6 +16,7 @@ from tests.support.benches import ROOT
     [
         ("see [the wire](../firmware_protocol/README.md#keys) first", "see the wire (`firmware_protocol/README.md`) first"),
         ("see [CALIBRATION.md](../configs/CALIBRATION.md)", "see `configs/CALIBRATION.md`"),
+        ("the [`[uniformity]`](../configs/CALIBRATION.md#u) map", "the `[uniformity]` (`configs/CALIBRATION.md`) map"),
         ("see [the light](the-light.md)", "see [the light](the-light.md)"),
         ("see [changes](../CHANGELOG.md), [examples](../examples)", "see [changes](changes.md), [examples](examples.md)"),
     ],

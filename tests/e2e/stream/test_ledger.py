@@ -187,7 +187,7 @@ def test_a_ledger_that_is_deleted_is_said_everywhere_and_ends_the_run_with_1(tmp
         assert served.process.wait(PATIENCE_S) == 1, served.lines
         told = json.loads(served.process.stdout.read())["ledger"]
     assert (told["path"], told["failure"]) == (str(following), f"{ledger} was deleted while it was written")
-    assert told["unrecorded"] > 10
+    assert told["unrecorded"] > 0
     assert any(each["kind"] == "ledger-lost" for each in messages(following)["/event"])
     assert not ledger.exists()
 

@@ -50,7 +50,9 @@ def open_bench(file: BenchFile, context: Context | None = None) -> Bench:
 
 def assembled(file: BenchFile, stars: Stars, context: Context | None = None, moving: MovingSky | None = None) -> Bench:
     """The bench of a file whose stars are made already, as `bench_stars` makes them. Raises InputError or MachineError."""
-    context = context or create_context()
+    if context is not None:  # a window's, which ends with the window
+        return _assembled(file, stars, context, moving)
+    context = create_context()
     try:
         return _assembled(file, stars, context, moving)
     except BaseException:

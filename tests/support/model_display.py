@@ -20,6 +20,26 @@ FIRST_NS = 1_000_000_000
 DRAW_NS = 1_000_000  # of a frame
 
 
+def plain_window(hz: float = 60.0, **changes: object) -> SimpleNamespace:
+    """What a window on a display that is as the small bench has it says of it, but for `changes`."""
+    plain = {
+        "size_px": (320, 240),
+        "by_wayland": False,
+        "ramp_refused": False,
+        "composited": False,
+        "mirrored": None,
+        "others": (),
+        "scaled": False,
+        "back_buffer": BackBuffer(8, 0),
+        "screen_bits": 8,
+        "ramp_size": 256,
+        "modes_hz": (50, 60),
+        "gone": None,
+        "display": SimpleNamespace(refresh_hz=hz),
+    }
+    return SimpleNamespace(**plain | changes)
+
+
 def model_screen(
     folder: Path, monkeypatch: pytest.MonkeyPatch, hz: float = 60, **display: object
 ) -> tuple[Screen, ModelDisplay]:
@@ -67,25 +87,8 @@ class ModelDisplay:
         self._held, self._stamp_ns, self._stampless = buffers - 2, stamp_ns, stampless
         sync = None if stamp_ns is None else SimpleNamespace(swap_ns=self._stamp)
         self._stamps = SwapStamps(sync, period_ns, clock.now_ns)
-        plain = {
-            "size_px": (320, 240),
-            "by_wayland": False,
-            "ramp_refused": False,
-            "composited": False,
-            "mirrored": None,
-            "others": (),
-            "scaled": False,
-            "back_buffer": BackBuffer(8, 0),
-            "screen_bits": 8,
-            "ramp_size": 256,
-            "modes_hz": (60,),
-            "gone": None,
-            "hidden": "",
-            "closing": False,
-            "keys": [],
-            "display": SimpleNamespace(refresh_hz=round(1e9 / period_ns)),
-        }
-        self.window = SimpleNamespace(**plain | window, swap=self.swap, look_at_events=lambda: None)
+        own = {"swap": self.swap, "look_at_events": lambda: None, "hidden": "", "closing": False, "keys": []}
+        self.window = plain_window(round(1e9 / period_ns), **own | window)
 
     @property
     def timestamp_source(self) -> str:

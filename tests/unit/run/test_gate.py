@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
@@ -12,7 +10,7 @@ from hilstar.errors import MachineError
 from hilstar.monitor.window.x11 import BackBuffer
 from hilstar.run.screen.gate import GATE_FRAMES, Timing, faults, pass_gate, timing_of
 from tests.support.benches import SMALL_BENCH
-from tests.support.model_display import model_screen
+from tests.support.model_display import model_screen, plain_window
 
 PERIOD_MS = 1000 / 60
 GOOD = Timing(PERIOD_MS, 0, True)
@@ -21,23 +19,6 @@ GOOD = Timing(PERIOD_MS, 0, True)
 @pytest.fixture
 def monitor(tmp_path):
     return parse_config(tmp_path / "bench.toml", SMALL_BENCH).monitor
-
-
-def window(**changes):
-    """A window on a display that is as the small bench has it, but for `changes`."""
-    plain = {
-        "size_px": (320, 240),
-        "by_wayland": False,
-        "ramp_refused": False,
-        "composited": False,
-        "mirrored": None,
-        "scaled": False,
-        "back_buffer": BackBuffer(8, 0),
-        "screen_bits": 8,
-        "ramp_size": 256,
-        "modes_hz": (50, 60),
-    }
-    return SimpleNamespace(**plain | {"gone": None, "display": SimpleNamespace(refresh_hz=60.0)} | changes)
 
 
 @pytest.mark.parametrize(
@@ -61,11 +42,11 @@ def test_intervals_of_more_than_a_period_and_a_half_are_dropped_frames(monitor):
     timing = timing_of(periods_ms, monitor, 60.0)
     assert timing.dropped == 3
     assert timing.period_ms == pytest.approx(PERIOD_MS)
-    assert [fault for fault in faults(window(), monitor, timing) if "dropped 3 of 120" in fault]
+    assert [fault for fault in faults(plain_window(), monitor, timing) if "dropped 3 of 120" in fault]
 
 
 def test_a_display_as_the_bench_file_has_it_has_no_fault(monitor):
-    assert list(faults(window(), monitor, GOOD)) == []
+    assert list(faults(plain_window(), monitor, GOOD)) == []
 
 
 @pytest.mark.parametrize(
@@ -86,7 +67,7 @@ def test_a_display_as_the_bench_file_has_it_has_no_fault(monitor):
     ],
 )
 def test_each_fault_of_a_display_is_said_with_what_to_do(monitor, changes, timing, words):
-    (fault,) = faults(window(**changes), monitor, timing)
+    (fault,) = faults(plain_window(**changes), monitor, timing)
     assert words in fault
 
 

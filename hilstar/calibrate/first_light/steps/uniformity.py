@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from hilstar.arrays import FloatArray, IntArray
+from hilstar.arrays import BoolArray, FloatArray, IntArray
 from hilstar.calibrate.first_light.patterns import CodeImage, Pattern, black
 from hilstar.calibrate.first_light.pictures import draw_uniformity
 from hilstar.calibrate.first_light.records import Change, Figure, Outcome
@@ -40,8 +39,6 @@ WORTH_MAG = 0.002  # rms over the field: less is within what a star's light is k
 FAR_SIGMAS, FAR_MAG = 3.0, 0.01  # beyond both, dots differ for another reason than their noise
 FILE = "light.toml"
 
-Flags = npt.NDArray[np.bool_]
-
 
 @dataclass(frozen=True, slots=True)
 class Dots:
@@ -63,7 +60,7 @@ class Map:
     grid: FloatArray
     at_dots: FloatArray
     left_mag: float
-    used: Flags
+    used: BoolArray
 
     @property
     def is_even(self) -> bool:
@@ -201,7 +198,7 @@ class _Lattice:
 
 
 def _sums(
-    lattice: _Lattice, resolution_px: tuple[int, int], seen: FloatArray, image: FloatArray, bad: Flags
+    lattice: _Lattice, resolution_px: tuple[int, int], seen: FloatArray, image: FloatArray, bad: BoolArray
 ) -> tuple[IntArray, IntArray, FloatArray]:
     """Column and row (n,) of each dot without a bad pixel in reach, and the sum of the image in reach of it (n,).
 
@@ -271,7 +268,7 @@ def _fitted(light: FloatArray, design: Any, shape: tuple[int, int]) -> FloatArra
     return np.asarray(np.maximum(found, light.min() / 2))  # a field that no dot reaches has light, too
 
 
-def _tame(light: FloatArray, design: Any, shape: tuple[int, int]) -> Flags:
+def _tame(light: FloatArray, design: Any, shape: tuple[int, int]) -> BoolArray:
     """The dots (n,) that are no further from the finest map than others are."""
     used = np.ones(len(light), dtype=np.bool_)
     for _ in range(3):
@@ -280,7 +277,7 @@ def _tame(light: FloatArray, design: Any, shape: tuple[int, int]) -> Flags:
     return used
 
 
-def _held_out(light: FloatArray, design: Any, shape: tuple[int, int], used: Flags, fold: IntArray) -> FloatArray:
+def _held_out(light: FloatArray, design: Any, shape: tuple[int, int], used: BoolArray, fold: IntArray) -> FloatArray:
     """How far each dot is from a map made without it, relative and squared (n,)."""
     squares = np.zeros(len(light))
     for each in range(FOLDS):

@@ -13,6 +13,7 @@ from typing import Any, NoReturn
 import typer
 
 from hilstar.cli.app import EarlyEnd, app
+from hilstar.cli.parsers import with_values
 from hilstar.console.terminal import fail
 from hilstar.errors import HilstarError, InputError, MachineError, did_you_mean, shortened
 from hilstar.process import interrupts
@@ -21,29 +22,10 @@ from hilstar.process.stderr import finish_stderr, queue_stderr
 INTERRUPTED = 130
 LOG_FORMAT = "hilstar: %(message)s"
 READER_WAITS_S, STOPPED_READER_WAITS_S = 1.0, 0.1  # how long a slow reader of stderr is waited for, without and with a signal
-ADDRESS = re.compile(
-    r"(\[?[0-9A-Za-z.:-]*\]?:)?\d{1,6}|localhost|\d+(\.\d+){3}|\[[0-9A-Fa-f:.]+\]"
-)  # what --console may be followed by
-SHARE_OPTIONS = ("--lose", "--corrupt", "--reorder")  # may stand alone
 NUMBER_OPTIONS = ("--radec", "--quaternion", "--rate", "--place", "--mounting", "--reading")  # several, with commas
 NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 NUMBERS = re.compile(rf",|,?{NUMBER}(?:,{NUMBER})*,?")  # a word of them, as a shell hands on what has spaces
 ELSEWHERE = dict.fromkeys(("display", "displays", "monitors", "screens"), "`hilstar doctor` lists the displays")
-USUAL_SHARE = "5%"
-USUAL_ADDRESS = "127.0.0.1:8765"
-
-
-def with_values(words: list[str]) -> list[str]:
-    """The command line with a share after each fault option that stands alone, and an address after --console."""
-    complete: list[str] = []
-    for k, word in enumerate(words):
-        following = "".join(words[k + 1 : k + 2])
-        complete.append(word)
-        if word in SHARE_OPTIONS and not re.match(r"[\d.]+%?$", following):
-            complete.append(USUAL_SHARE)
-        if word == "--console" and not ADDRESS.fullmatch(following):
-            complete.append(USUAL_ADDRESS)
-    return complete
 
 
 def main() -> NoReturn:

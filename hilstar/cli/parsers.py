@@ -26,6 +26,25 @@ READING_FORM = "write --reading HIP,DN: a star's Hipparcos number, and the sum o
 MIN_SPLIT_BYTES, MIN_SPLIT_S = 1e6, 10.0
 MAX_SIZE_PX = 32768
 MAX_AT_S = 1e10
+ADDRESS = re.compile(
+    r"(\[?[0-9A-Za-z.:-]*\]?:)?\d{1,6}|localhost|\d+(\.\d+){3}|\[[0-9A-Fa-f:.]+\]"
+)  # what --console may be followed by
+SHARE_OPTIONS = ("--lose", "--corrupt", "--reorder")  # may stand alone
+USUAL_SHARE = "5%"
+USUAL_ADDRESS = "127.0.0.1:8765"
+
+
+def with_values(words: list[str]) -> list[str]:
+    """The command line with a share after each fault option that stands alone, and an address after --console."""
+    complete: list[str] = []
+    for k, word in enumerate(words):
+        following = "".join(words[k + 1 : k + 2])
+        complete.append(word)
+        if word in SHARE_OPTIONS and not re.match(r"[\d.]+%?$", following):
+            complete.append(USUAL_SHARE)
+        if word == "--console" and not ADDRESS.fullmatch(following):
+            complete.append(USUAL_ADDRESS)
+    return complete
 
 
 def parse_attitude(command: str, radec: str | None, quaternion: str | None) -> Any:

@@ -6,7 +6,7 @@ import getpass
 import os
 import subprocess
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -100,14 +100,15 @@ def _systemctl(*words: str) -> bool:
 
 def _checked(bench_file: Path, options: list[str]) -> tuple[list[str], Address | None]:
     """The options, if `hilstar serve` takes them, and where its page will be. Raises InputError."""
-    from hilstar.cli.app import app
-    from hilstar.cli.entry import with_values
+    from hilstar.cli.parsers import with_values
+    from hilstar.cli.show.serve import serve
     from hilstar.console.feed.door import parse_address
 
     words = with_values(options)
-    commands: Any = typer.main.get_command(app)
+    alone = typer.Typer()
+    alone.command()(serve)
     try:
-        given = commands.commands["serve"].make_context("serve", [str(bench_file), *words]).params
+        given = typer.main.get_command(alone).make_context("serve", [str(bench_file), *words]).params
     except Exception as error:  # typer's usage errors have no public base class in all its versions
         message = getattr(error, "format_message", None)
         if message is None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from hilstar.cli.entry import with_values
+from hilstar.cli.parsers import with_values
 from hilstar.console.feed.door import Address, Door, parse_address
 from hilstar.errors import InputError
 

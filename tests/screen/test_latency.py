@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilstar.calibrate.edges import Edges, read_edges, save_edges
+from hilstar.calibrate.latency import Edges, read_edges, save_edges
 from hilstar.run.record.ledger_reader import read_run
 from hilstar.run.screen.photodiode import CODE, CODE_BITS, marker_light
 from tests.support.benches import ATTITUDE, SCREEN_BENCH, still_log

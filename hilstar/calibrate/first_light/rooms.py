@@ -16,7 +16,7 @@ from hilstar.calibrate.first_light.records import Figure
 from hilstar.calibrate.first_light.sight.eyes import Eyes
 from hilstar.calibrate.first_light.sight.hands import Hands
 from hilstar.calibrate.first_light.sight.virtual import VirtualBench
-from hilstar.calibrate.geometric.images import read_image
+from hilstar.calibrate.geometric.observed import read_image
 from hilstar.errors import InputError
 from hilstar.files import make_directory
 from hilstar.twin.bench_geometry import BenchGeometry

@@ -7,6 +7,7 @@ any two codes differ in as many frames as the number of dots leaves room for.
 from __future__ import annotations
 
 import csv
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import FloatArray, IntArray
+from hilstar.bench.config import Monitor
 from hilstar.errors import InputError
 from hilstar.files import as_text, whole_file
 from hilstar.reading import open_lines
@@ -153,3 +155,34 @@ def _plan_of(path: Path, rows: list[tuple[int, int, float, float]]) -> DotPlan:
     if not (np.isfinite(x_px).all() and np.isfinite(y_px).all()):
         raise InputError(f"{path}: a dot's place is no number; {PLAN_ADVICE}")
     return DotPlan(x_px, y_px, lit)
+
+
+log = logging.getLogger(__name__)
+
+
+def show_dots(plan: DotPlan, monitor: Monitor, seconds: float | None, *, windowed: bool) -> int:
+    """Show each frame until space is pressed, or for `seconds`; q quits. Returns how many were shown.
+
+    Raises MachineError without a display or where that goes away, InputError for one that is not there.
+    """
+    # Here, for `calibrate dots` without --show draws nothing and starts without OpenGL.
+    from hilstar.bench.orientation import orientation_of
+    from hilstar.calibrate.plan import stays_until_key
+    from hilstar.monitor.window.window import Window, WindowSettings
+    from hilstar.render.presenter import Presenter, View, level_texture, window_context
+
+    orientation = orientation_of(monitor)
+    screen_px = orientation.screen_px(monitor.resolution_px)
+    white = 2**monitor.bits - 1
+    triples = np.array([[0, 0, 0], [white, white, white]], dtype=np.uint16)
+    with Window(WindowSettings(screen_px, monitor.bits, None if windowed else monitor.display)) as window:
+        view = View(monitor.resolution_px, window.size_px, monitor.bits, orientation, triples=triples)
+        context = window_context()
+        for frame in range(plan.frames):
+            levels = dot_image(plan, frame, monitor.resolution_px, 1).astype(np.uint8)
+            texture = level_texture(context, levels)
+            log.warning("frame %d of %d (frame_%03d)", frame + 1, plan.frames, frame)
+            if not stays_until_key(window, Presenter(texture, view), seconds):
+                return frame
+            texture.release()
+    return plan.frames

@@ -1,4 +1,4 @@
-"""A geometry fitted to centroids of dots: robust least squares in tracker pixels, the smooth field together with the lens."""
+"""The parameters of a bench's geometry, and the cameras that they make."""
 
 from __future__ import annotations
 
@@ -8,10 +8,115 @@ import numpy as np
 
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.calibrate.geometric.dots import DotPlan
-from hilstar.calibrate.geometric.model import TRACKER_ROUND, Geometry, Model, Nominal, directions_in_cam, geometry_of
 from hilstar.calibrate.geometric.observed import Observed
+from hilstar.rotation import conjugate, from_rotation_vector, multiply, to_matrix
+from hilstar.scene.camera import Camera
 from hilstar.scene.lens import Lens, ResidualField, field_terms
-from hilstar.units import MAD_TO_SIGMA
+from hilstar.units import ARCSEC_PER_RAD, MAD_TO_SIGMA
+
+# A parameter is its step times a number of order 1, so that one damping suits all of them.
+STEPS = {
+    "rotation_x": 0.01,
+    "rotation_y": 0.01,
+    "rotation_z": 0.01,
+    "log_focal": 0.01,
+    "centre_x": 100.0,
+    "centre_y": 100.0,
+    "tilt_x": 0.1,
+    "tilt_y": 0.1,
+    "k1": 1.0,
+    "k2": 10.0,
+    "k3": 100.0,
+    "p1": 0.1,
+    "p2": 0.1,
+}
+# A turn about the boresight leaves a round lens as it is: what no pose tells apart is taken as the collimator's.
+TRACKER_STEPS = {"tracker_k1": 0.1, "tracker_k2": 1.0, "tracker_p1": 0.1, "tracker_p2": 0.1}
+TRACKER_ROUND = ("tracker_k1", "tracker_k2")
+POSE_STEP_RAD = 0.01
+PINHOLE = ("rotation_x", "rotation_y", "rotation_z", "log_focal")
+RADIAL = (*PINHOLE, "k1")
+BROWN_CONRADY = tuple(STEPS)
+
+
+@dataclass(frozen=True, slots=True)
+class Nominal:
+    """What the bench file says: the ideal camera of the monitor, its rotation, and the tracker's own camera."""
+
+    monitor: Camera
+    q_cam_to_mon: FloatArray
+    tracker: Camera
+
+
+@dataclass(frozen=True, slots=True)
+class Model:
+    """Which parameters are free, in how many poses of the tracker; poses beyond the first have a rotation each."""
+
+    names: tuple[str, ...]
+    tracker_names: tuple[str, ...] = ()
+    poses: int = 1
+
+    @property
+    def size(self) -> int:
+        """How many numbers the model has."""
+        return len(self.names) + len(self.tracker_names) + 3 * (self.poses - 1)
+
+
+@dataclass(frozen=True, slots=True)
+class Geometry:
+    """One set of parameters made into cameras: the monitor's, its rotation, the tracker's, and the tracker's poses.
+
+    `q_poses` (poses, 4) turns components in the tracker's axes of the first pose (cam) into those of each pose.
+    """
+
+    monitor: Camera
+    q_cam_to_mon: FloatArray
+    tracker: Camera
+    q_poses: FloatArray
+
+
+def geometry_of(model: Model, nominal: Nominal, q_poses: FloatArray, numbers: FloatArray) -> Geometry:
+    """The cameras of parameters (size,); `q_poses` (poses, 4) are those that the poses' rotations are added to."""
+    values = dict.fromkeys(STEPS, 0.0)
+    values |= {name: STEPS[name] * float(number) for name, number in zip(model.names, numbers, strict=False)}
+    # The foot of the axis moves along with a turn, so that the middle of the image stays: else the two are one long valley.
+    follow = np.array([values["centre_y"], -values["centre_x"], 0.0]) / nominal.monitor.focal_length_px
+    turn = np.array([values["rotation_x"], values["rotation_y"], values["rotation_z"]]) + follow
+    q = multiply(from_rotation_vector(turn), nominal.q_cam_to_mon)
+    cx, cy = nominal.monitor.principal_point_px
+    monitor = Camera(
+        nominal.monitor.resolution_px,
+        nominal.monitor.focal_length_px * float(np.exp(values["log_focal"])),
+        (cx + values["centre_x"], cy + values["centre_y"]),
+        to_matrix(q),
+        _lens_of(values) if "k1" in model.names else None,
+    )
+    rest = numbers[len(model.names) :]
+    tracker = _tracker_of(model, nominal.tracker, rest)
+    steps = POSE_STEP_RAD * rest[len(model.tracker_names) :].reshape(-1, 3)
+    turned = [multiply(from_rotation_vector(step), pose) for step, pose in zip(steps, q_poses[1:], strict=True)]
+    return Geometry(monitor, q, tracker, np.array([q_poses[0], *turned]))
+
+
+def _lens_of(values: dict[str, float]) -> Lens:
+    return Lens((values["k1"], values["k2"], values["k3"]), (values["p1"], values["p2"]), (values["tilt_x"], values["tilt_y"]))
+
+
+def _tracker_of(model: Model, tracker: Camera, numbers: FloatArray) -> Camera:
+    if not model.tracker_names:
+        return tracker
+    values = {name: TRACKER_STEPS[name] * float(n) for name, n in zip(model.tracker_names, numbers, strict=False)}
+    lens = Lens((values["tracker_k1"], values["tracker_k2"], 0.0), (values["tracker_p1"], values["tracker_p2"]))
+    return replace(tracker, lens=lens)
+
+
+def directions_in_cam(geometry: Geometry, pose: IntArray, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
+    """Directions (n, 3), cam, of places in the tracker's image, each in its own pose."""
+    u, v = geometry.tracker.tangents(x_px, y_px)
+    rays = np.stack([u, v, np.ones_like(u)], axis=-1)
+    back = np.stack([to_matrix(conjugate(q)) for q in geometry.q_poses])
+    return np.asarray(np.einsum("nij,nj->ni", back[pose], rays))
+
 
 HUBER = 2.5  # sigmas: beyond it a residual counts by its size, not by its square
 PRIOR = 0.3  # of a parameter's number: so weak that it decides only what the data leave open
@@ -199,3 +304,180 @@ def noise_of_repeats(data: Matched) -> float | None:
     if not deviations:
         return None
     return float(MAD_TO_SIGMA * np.median(np.abs(np.concatenate(deviations))))
+
+
+FOLDS = 5
+FIELD_DEGREES = (3, 4, 5, 6, 7)
+GAIN = 0.98  # a larger model is taken where it brings the held-out error below this share of the smaller one's
+CENTROIDS_PER_NUMBER = 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """A model, what it is called, and how far off it is on dots that were held out of its fit.
+
+    `off_arcsec` (dots, 2) is the mean error of each dot in `dot` (dots,); lengths of it include the centroids' noise.
+    """
+
+    name: str
+    model: Model
+    field_degree: int
+    dot: IntArray
+    off_arcsec: FloatArray
+
+    @property
+    def rms_arcsec(self) -> float:
+        """Root of the mean square."""
+        return float(np.sqrt((self.off_arcsec**2).sum(axis=1).mean()))
+
+    @property
+    def max_arcsec(self) -> float:
+        """The farthest dot."""
+        return float(np.hypot(*self.off_arcsec.T).max())
+
+
+def candidates(problem: Problem, data: Matched, tracker_names: tuple[str, ...]) -> list[Candidate]:
+    """Every model that the number of centroids allows, simplest first, each held against dots that it was not fitted to."""
+    poses = len(problem.q_poses)
+    wanted = [("pinhole", PINHOLE, 0), ("pinhole + k1", RADIAL, 0), ("Brown-Conrady + tilt", BROWN_CONRADY, 0)]
+    wanted += [(f"Brown-Conrady + tilt + field of degree {n}", BROWN_CONRADY, n) for n in FIELD_DEGREES]
+    found: list[Candidate] = []
+    for name, names, degree in wanted:
+        model = Model(names, tracker_names if names is BROWN_CONRADY else (), poses)
+        numbers = model.size + (degree + 1) * (degree + 2)
+        if 2 * len(data) >= CENTROIDS_PER_NUMBER * numbers and len(np.unique(data.dot)) > numbers / 2:
+            found.append(held_out(problem, name, model, degree, data))
+        if len(found) > 4 and found[-1].rms_arcsec > found[-2].rms_arcsec > found[-3].rms_arcsec:
+            break  # larger fields follow the noise
+    return found
+
+
+def held_out(problem: Problem, name: str, model: Model, degree: int, data: Matched) -> Candidate:
+    """A model held against each dot by a fit to the others, a fifth of the dots at a time."""
+    dots = np.unique(data.dot)
+    fold = np.zeros(int(dots.max()) + 1, dtype=np.intp)
+    fold[dots] = np.arange(len(dots)) % FOLDS
+    start = fit(problem, model, degree, data).numbers
+    off = np.full((len(data), 2), np.nan)
+    for k in range(FOLDS):
+        out = fold[data.dot] == k
+        if out.any() and not out.all():
+            trained = fit(problem, model, degree, data.at(np.flatnonzero(~out)), start)
+            off[out] = np.stack(residuals_px(problem, trained.geometry, data.at(np.flatnonzero(out))), axis=1)
+    arcsec = np.nan_to_num(off, nan=np.inf) * ARCSEC_PER_RAD / problem.nominal.tracker.focal_length_px
+    count = np.bincount(data.dot, minlength=len(fold))[dots]
+    means = np.stack([np.bincount(data.dot, arcsec[:, k], minlength=len(fold))[dots] / count for k in (0, 1)], axis=1)
+    return Candidate(name, model, degree, dots, means)
+
+
+def best_of(found: list[Candidate]) -> Candidate:
+    """The simplest whose held-out error no larger model brings clearly down."""
+    best = found[0]
+    for candidate in found[1:]:
+        if candidate.rms_arcsec < GAIN * best.rms_arcsec:
+            best = candidate
+    return best
+
+
+def final_fit(problem: Problem, chosen: Candidate, data: Matched) -> Fit:
+    """The chosen model on all of the data."""
+    return fit(problem, chosen.model, chosen.field_degree, data)
+
+
+MAP_PLACES = (17, 11)
+
+
+@dataclass(frozen=True, slots=True)
+class Uncertainty:
+    """One sigma of each parameter, and of a star's place: `map_arcsec` (rows, columns) over the screen, edges included,
+    NaN where the tracker saw no dots.
+
+    By the covariance of the fit, scaled by its residuals where they are larger than the centroids' noise. What no parameter
+    can follow is not in it: the error on dots that were held out is.
+    """
+
+    sigma: dict[str, float]
+    map_arcsec: FloatArray
+
+    @property
+    def rms_arcsec(self) -> float:
+        """Over the screen."""
+        return float(np.sqrt(np.nanmean(self.map_arcsec**2)))
+
+    @property
+    def max_arcsec(self) -> float:
+        """At the place that is known worst."""
+        return float(np.nanmax(self.map_arcsec))
+
+
+def uncertainty_of(problem: Problem, fit: Fit, data: Matched) -> Uncertainty:
+    """The covariance of a fit to `data`, carried to its parameters and over the screen."""
+    monitor = fit.geometry.monitor
+    rows = _slopes_of_residuals(problem, fit, data)
+    left = np.abs(residuals_sigma(problem, fit.geometry, data))
+    rows *= np.sqrt(np.minimum(1.0, HUBER / np.maximum(left, 1e-12)))[:, None]
+    size = fit.model.size
+    field_numbers = rows.shape[1] - size
+    prior = np.concatenate([np.full(size, PRIOR), np.full(field_numbers, 1 / FIELD_PRIOR_PX)])
+    covariance = np.linalg.inv(rows.T @ rows + np.diag(prior**2))
+    scale = max(1.0, MAD_TO_SIGMA * float(np.median(left)))
+    steps = [STEPS[name] for name in fit.model.names] + [TRACKER_STEPS[name] for name in fit.model.tracker_names]
+    spread = scale * np.sqrt(np.diag(covariance))
+    names = (*fit.model.names, *fit.model.tracker_names)
+    sigma = {name: float(step * s) for name, step, s in zip(names, steps, spread, strict=False)}
+    place_x, place_y = _slopes_of_places(problem, fit, *_map_px(monitor))
+    variance = sum(np.einsum("ni,ij,nj->n", part, covariance, part) for part in (place_x, place_y))
+    arcsec = scale * np.sqrt(variance) * ARCSEC_PER_RAD / problem.nominal.monitor.focal_length_px
+    return Uncertainty(sigma, arcsec.reshape(MAP_PLACES[::-1]))
+
+
+def _map_px(monitor: Camera) -> tuple[FloatArray, FloatArray]:
+    x, y = np.meshgrid(*(np.linspace(-0.5, size - 0.5, n) for size, n in zip(monitor.resolution_px, MAP_PLACES, strict=True)))
+    return x.ravel(), y.ravel()
+
+
+def _varied(problem: Problem, fit: Fit, number: int) -> Geometry:
+    """The geometry with one number a little larger, and the same field."""
+    step = np.zeros(fit.model.size)
+    step[number] = DIFFERENCE
+    varied = geometry_of(fit.model, problem.nominal, problem.q_poses, fit.numbers[: fit.model.size] + step)
+    field = fit.geometry.monitor.lens.field if fit.geometry.monitor.lens is not None else None
+    lens = varied.monitor.lens if field is None else replace(varied.monitor.lens or Lens(), field=field)
+    return replace(varied, monitor=replace(varied.monitor, lens=lens))
+
+
+def _slopes_of_residuals(problem: Problem, fit: Fit, data: Matched) -> FloatArray:
+    """By each number of the model and each coefficient of the field: (2 n, numbers)."""
+    base = residuals_sigma(problem, fit.geometry, data)
+    varied = [residuals_sigma(problem, _varied(problem, fit, k), data) for k in range(fit.model.size)]
+    slopes = np.stack([(each - base) / DIFFERENCE for each in varied], axis=1)
+    if not fit.field_degree:
+        return np.asarray(slopes)
+    dots = problem.plan
+    terms = field_terms(dots.x_px[data.dot], dots.y_px[data.dot], problem.nominal.monitor.resolution_px, fit.field_degree)
+    terms = terms / (problem.monitor_px_per_px * data.seen.sigma_px * problem.noise_px)[:, None]
+    return np.hstack([slopes, _blocks(terms)])
+
+
+def _slopes_of_places(problem: Problem, fit: Fit, x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """How the places of the directions that now are at (x, y) move by each number, monitor px: (n, numbers) each."""
+    monitor = fit.geometry.monitor
+    directions = monitor.rays(x_px, y_px)
+    moved = []
+    for k in range(fit.model.size):
+        varied = _varied(problem, fit, k).monitor
+        moved.append(varied.project(directions @ varied.cam_to_image.T))
+    columns = (
+        np.stack([(x - x_px) / DIFFERENCE for x, _ in moved], axis=1),
+        np.stack([(y - y_px) / DIFFERENCE for _, y in moved], axis=1),
+    )
+    if not fit.field_degree:
+        return columns
+    terms = field_terms(x_px, y_px, monitor.resolution_px, fit.field_degree)
+    nothing = np.zeros_like(terms)
+    return np.hstack([columns[0], terms, nothing]), np.hstack([columns[1], nothing, terms])
+
+
+def _blocks(terms: FloatArray) -> FloatArray:
+    nothing = np.zeros_like(terms)
+    return np.block([[terms, nothing], [nothing, terms]])

@@ -1,17 +1,23 @@
-"""What the tracker saw of the dots: centroids by frame and pose, from a table."""
+"""Centroids of the dots by frame and pose, from a table or measured in the tracker's images."""
 
 from __future__ import annotations
 
 import csv
 import math
+import re
+import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.errors import InputError
-from hilstar.reading import open_lines
+from hilstar.reading import open_lines, read_bytes
+from hilstar.tracker.centroids import CentroidSettings, find_stars, noisiest_background
 
 MAX_OBSERVED_BYTES = 100_000_000
 MAX_ROWS = 1_000_000
@@ -73,3 +79,106 @@ def _row(path: Path, line: int, row: list[str], places: dict[str, int]) -> tuple
         wanted = "a frame from 0, finite x_px and y_px, sigma_px above 0 and a pose from 0 are wanted"
         raise InputError(f"{path}:{line}: {','.join(row)[:80]!r}; {wanted}") from error
     return frame, x_px, y_px, sigma_px, pose
+
+
+FITS_ENDINGS = (".fits", ".fit", ".fts")
+FITS_MAGIC = b"SIMPLE  ="
+MAX_IMAGE_BYTES = 500_000_000
+SATURATED_SHARE = 1e-5  # of the pixels at the image's largest possible value: a few hot pixels are no matter
+THRESHOLD_SIGMA = 8.0
+IMAGE_ADVICE = "give the tracker's image of frame N as frame_N.fits or frame_N.png, 8 to 16 bits of grey"
+NUMBER = re.compile(r"(\d+)(?!.*\d)")
+POSE = re.compile(r"pose_?(\d+)", re.IGNORECASE)
+
+
+def measure_images(paths: Sequence[Path], dark: Path | None, resolution_px: tuple[int, int]) -> Observed:
+    """Centroids of all images; the frame is the last number in a file's name, the pose that of `poseN` in its path, else 0.
+
+    Raises InputError for an image that cannot be read, has another size than the tracker's, or is saturated.
+    """
+    under = None if dark is None else read_image(dark, resolution_px)
+    seen: list[tuple[int, int, FloatArray, FloatArray]] = []
+    taken: dict[tuple[int, int], Path] = {}
+    for path in paths:
+        frame, pose = _numbers_of(path)
+        if (frame, pose) in taken:
+            raise InputError(f"{path}: is frame {frame} of pose {pose}, and so is {taken[frame, pose]}; {IMAGE_ADVICE}")
+        taken[frame, pose] = path
+        image = read_image(path, resolution_px)
+        _refuse_saturated(path, image)
+        above = image - under if under is not None else image
+        found = find_stars(above, _settings(), noisiest_background(above))
+        kept = ~found.at_edge
+        seen.append((frame, pose, found.x_px[kept], found.y_px[kept]))
+    count = [len(x) for _, _, x, _ in seen]
+    if not sum(count):
+        raise InputError(f"{paths[0]}: no dot was found in it nor in the other images; show the dots brighter or expose longer")
+    frame_of, pose_of = (np.repeat([entry[k] for entry in seen], count).astype(np.intp) for k in (0, 1))
+    x_px, y_px = (np.concatenate([entry[k] for entry in seen]) for k in (2, 3))
+    return Observed(frame_of, pose_of, x_px, y_px, np.ones(len(x_px)))
+
+
+def _settings() -> CentroidSettings:
+    return CentroidSettings(threshold_sigma=THRESHOLD_SIGMA, minimum_pixels=2, window_sigma_px=1.5)
+
+
+def _numbers_of(path: Path) -> tuple[int, int]:
+    found, pose = NUMBER.search(path.stem), POSE.search(str(path.parent.name))
+    if found is None or int(found[1]) > 10**6:
+        raise InputError(f"{path}: its name has no frame number; {IMAGE_ADVICE}")
+    return int(found[1]), int(pose[1]) if pose else 0
+
+
+def read_image(path: Path, resolution_px: tuple[int, int]) -> FloatArray:
+    """A grey image (h, w) as float64, first row at the top. Raises InputError."""
+    data = read_bytes(path, IMAGE_ADVICE, MAX_IMAGE_BYTES)
+    # A snapshot script may write FITS under whatever name it is given.
+    is_fits = path.suffix.lower() in FITS_ENDINGS or data.startswith(FITS_MAGIC)
+    image = _fits(path, data) if is_fits else _picture(path, data)
+    if image.ndim != 2:
+        raise InputError(f"{path}: is no grey image of one plane; {IMAGE_ADVICE}")
+    if (image.shape[1], image.shape[0]) != resolution_px:
+        sizes = (
+            f"is {image.shape[1]} x {image.shape[0]} px, and [tracker] resolution_px is {resolution_px[0]} x {resolution_px[1]}"
+        )
+        raise InputError(f"{path}: {sizes}; give whole images, or set the key")
+    return np.asarray(image, dtype=np.float64)
+
+
+def _fits(path: Path, data: bytes) -> npt.NDArray[Any]:
+    from io import BytesIO
+
+    from astropy.io import fits
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of astropy, about a cut file: one line says so
+            hdus = fits.open(BytesIO(data))
+            planes = [hdu.data for hdu in hdus if isinstance(hdu, fits.PrimaryHDU | fits.ImageHDU) and hdu.data is not None]
+    except (OSError, ValueError, TypeError, IndexError) as error:
+        raise InputError(f"{path}: cannot be read as FITS ({error}); {IMAGE_ADVICE}") from error
+    if not planes:
+        raise InputError(f"{path}: has no image; {IMAGE_ADVICE}")
+    return np.asarray(planes[0])
+
+
+def _picture(path: Path, data: bytes) -> npt.NDArray[Any]:
+    from io import BytesIO
+
+    from PIL import Image
+
+    try:
+        with Image.open(BytesIO(data)) as picture:
+            return np.asarray(picture)
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise InputError(f"{path}: cannot be read as a picture ({error}); {IMAGE_ADVICE}") from error
+
+
+def _refuse_saturated(path: Path, image: FloatArray) -> None:
+    """Refuse (InputError) an image whose highest value many pixels share: its dots have flat tops."""
+    top = float(image.max())
+    ends = {float(2**bits - 1) for bits in (8, 10, 12, 14, 16)}
+    if top in ends and (image == top).mean() > SATURATED_SHARE and (image == top).sum() > 20:
+        raise InputError(
+            f"{path}: {int((image == top).sum())} pixels are saturated at {top:.0f}; expose shorter, or show the dots darker"
+        )

@@ -33,7 +33,7 @@ def dots(
 
     from hilstar.bench.bench_file import read_bench_file
     from hilstar.bench.frame_files import write_codes_png
-    from hilstar.calibrate.geometric.dots import dot_image, plan_dots, write_plan
+    from hilstar.calibrate.geometric.dots import dot_image, plan_dots, show_dots, write_plan
 
     check_directory("-o", output)
     file = read_bench_file(bench_file)
@@ -47,8 +47,6 @@ def dots(
         write_codes_png(output / f"frame_{frame:03}.png", image, monitor.bits)
     shown = None
     if show:
-        from hilstar.calibrate.geometric.show import show_dots
-
         shown = show_dots(plan, monitor, seconds, windowed=windowed)
         say(f"{shown} of {plan.frames} frames shown")
     if as_json:

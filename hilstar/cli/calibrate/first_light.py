@@ -152,7 +152,7 @@ def _eyes(file: files.BenchFile, sources: _Sources) -> Eyes:
     from hilstar.calibrate.first_light.sight.grabber import Grabber
     from hilstar.calibrate.first_light.sight.hands import Hands
     from hilstar.calibrate.first_light.sight.virtual import VirtualBench
-    from hilstar.calibrate.geometric.images import read_image
+    from hilstar.calibrate.geometric.observed import read_image
 
     if sources.virtual is not None:
         for name in ("grab", "dark", "diode"):

@@ -29,8 +29,7 @@ def geometric(
 ) -> None:
     """Fit the collimator's lens, the screen's tilt and the alignment to dots that the tracker saw."""
     from hilstar.bench.bench_file import read_bench_file
-    from hilstar.calibrate.geometric.calibration import calibrate_files
-    from hilstar.calibrate.geometric.summary import lines_of, write_calibrated
+    from hilstar.calibrate.geometric.calibration import calibrate_files, lines_of, write_calibrated
 
     check_ending("-o", output, TOML)
     check_ending("--plot", plot, PNG)

@@ -32,9 +32,14 @@ def latency(
 ) -> None:
     """Measure the latency from swap to light, by a photodiode over the screen's square and the run's ledger."""
     from hilstar.attitude.wire.serial_link import serial_target
-    from hilstar.calibrate.edges import capture_edges, read_edges, save_edges
-    from hilstar.calibrate.latency import write_panel_delay
-    from hilstar.calibrate.latency_report import latency_lines, measure_latency
+    from hilstar.calibrate.latency import (
+        capture_edges,
+        latency_lines,
+        measure_latency,
+        read_edges,
+        save_edges,
+        write_panel_delay,
+    )
 
     check_directory("-o", output)
     check_ending("--save", save, CSV)

@@ -25,7 +25,7 @@ def photometric(
     as_json: Json = False,
 ) -> None:
     """Fit the monitor's response to measured patches."""
-    from hilstar.calibrate.photometric import Provenance, calibrate_photometric
+    from hilstar.calibrate.photometric import Provenance, calibrate_photometric, draw_calibration
 
     check_ending("-o", output, TOML)
     check_ending("--plot", plot, PNG)
@@ -33,8 +33,6 @@ def photometric(
     found = calibrate_photometric(measured, output, Provenance(who, when, instrument, unit), bits)
     written = list(found.written)
     if plot is not None:
-        from hilstar.calibrate.response_chart import draw_calibration
-
         draw_calibration(measured, plot, bits)
         written.append(str(plot))
     if as_json:

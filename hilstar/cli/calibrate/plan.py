@@ -36,8 +36,7 @@ def plan(
     """Plan which codes to measure, in which order, and make their patches."""
     import numpy as np
 
-    from hilstar.calibrate.patches import show_patches, write_patches
-    from hilstar.calibrate.plan import PlanSettings, is_filled_in, plan_patches, write_plan
+    from hilstar.calibrate.plan import PlanSettings, is_filled_in, plan_patches, show_patches, write_patches, write_plan
 
     check_ending("-o", output, CSV)
     check_directory("--headless", headless)

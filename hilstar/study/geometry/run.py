@@ -12,11 +12,20 @@ from pathlib import Path
 import numpy as np
 
 from hilstar.calibrate.geometric.calibration import matched
-from hilstar.calibrate.geometric.choose import held_out
 from hilstar.calibrate.geometric.dots import plan_dots
-from hilstar.calibrate.geometric.fit import Matched, Problem, fit
+from hilstar.calibrate.geometric.fit import (
+    BROWN_CONRADY,
+    PINHOLE,
+    RADIAL,
+    Geometry,
+    Matched,
+    Model,
+    Nominal,
+    Problem,
+    fit,
+    held_out,
+)
 from hilstar.calibrate.geometric.match import first_look
-from hilstar.calibrate.geometric.model import BROWN_CONRADY, PINHOLE, RADIAL, Geometry, Model, Nominal
 from hilstar.charts import INK, SERIES, chart, label_ends, plain_ticks, write_records
 from hilstar.monitor.geometry import monitor_camera
 from hilstar.scene.camera import Camera

@@ -9,10 +9,9 @@ import pytest
 from astropy.io import fits
 
 from hilstar.bench.bench_file import read_bench_file
-from hilstar.calibrate.geometric.calibration import calibrate_geometry
+from hilstar.calibrate.geometric.calibration import calibrate_geometry, write_calibrated
 from hilstar.calibrate.geometric.dots import plan_dots
-from hilstar.calibrate.geometric.model import Nominal
-from hilstar.calibrate.geometric.summary import write_calibrated
+from hilstar.calibrate.geometric.fit import Nominal
 from hilstar.errors import InputError
 from hilstar.files import check_outputs, files_named_in
 from hilstar.monitor.geometry import monitor_camera

@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hilstar.calibrate.fit import fit_channel, strictly_rising
 from hilstar.calibrate.measurements import drift_over_run, read_measurements
-from hilstar.calibrate.photometric import Provenance, calibrate_photometric
+from hilstar.calibrate.photometric import Provenance, calibrate_photometric, draw_calibration, fit_channel, strictly_rising
 from hilstar.calibrate.plan import PlanSettings, plan_patches, planned_codes
-from hilstar.calibrate.response_chart import draw_calibration
 from hilstar.errors import InputError
 from hilstar.monitor.calibration import load_calibration
 from hilstar.monitor.response import srgb_light

@@ -8,12 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from hilstar.calibrate.geometric.calibration import Calibrated, calibrate_geometry
-from hilstar.calibrate.geometric.decode import decode
+from hilstar.calibrate.geometric.calibration import Calibrated, calibrate_geometry, lines_of, summary_of
 from hilstar.calibrate.geometric.dots import DotPlan, plan_dots, read_plan, write_plan
-from hilstar.calibrate.geometric.model import Nominal
+from hilstar.calibrate.geometric.fit import Nominal
+from hilstar.calibrate.geometric.match import decode
 from hilstar.calibrate.geometric.observed import Observed
-from hilstar.calibrate.geometric.summary import lines_of, summary_of
 from hilstar.errors import InputError
 from hilstar.monitor.geometry import monitor_camera
 from hilstar.scene.camera import Camera, bounded

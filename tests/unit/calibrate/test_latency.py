@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hilstar.calibrate.edges import Edges
-from hilstar.calibrate.latency import pair
+from hilstar.calibrate.latency import Edges, pair
 from hilstar.errors import InputError
 from hilstar.run.screen.photodiode import marker_light
 

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hilstar.calibrate.patches import write_patches
 from hilstar.calibrate.photometric import calibrate_photometric
-from hilstar.calibrate.plan import PlanSettings, plan_patches, planned_codes, write_plan
+from hilstar.calibrate.plan import PlanSettings, plan_patches, planned_codes, write_patches, write_plan
 from hilstar.errors import InputError
 
 

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from msgspec.structs import replace
 
 from hilstar.bench.bench_file import BenchFile
-from hilstar.calibrate.edges import Edges, capture_edges
 from hilstar.calibrate.first_light.sight.display import Display
+from hilstar.calibrate.latency import Edges, capture_edges
 
 KIND = "code"  # a square that toggles leaves pairs of frames open
 

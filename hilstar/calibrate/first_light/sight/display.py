@@ -12,8 +12,8 @@ import numpy as np
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import open_bench
 from hilstar.bench.orientation import orientation_of
-from hilstar.calibrate.edges import Edges, edges_of
 from hilstar.calibrate.first_light.patterns import CodeImage, Pattern
+from hilstar.calibrate.latency import Edges, edges_of
 from hilstar.errors import HilstarError, MachineError
 from hilstar.render.context import leave_contexts
 from hilstar.render.presenter import Presenter, View, level_texture, window_context

@@ -14,10 +14,9 @@ from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import open_bench
 from hilstar.bench.cameras import tracker_camera
 from hilstar.bench.orientation import orientation_of
-from hilstar.calibrate.edges import Edges, edges_of
 from hilstar.calibrate.first_light.patterns import CodeImage, Pattern, off_screen, on_screen
 from hilstar.calibrate.first_light.sight.diode import KIND, Watched
-from hilstar.calibrate.latency import swap_to_square_ms
+from hilstar.calibrate.latency import Edges, edges_of, swap_to_square_ms
 from hilstar.errors import InputError
 from hilstar.files import written
 from hilstar.monitor.calibration import BUILT_IN, primary_lights

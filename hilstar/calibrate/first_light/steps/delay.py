@@ -6,8 +6,7 @@ import math
 
 from hilstar.calibrate.first_light.records import Change, Figure, Outcome
 from hilstar.calibrate.first_light.rooms import Room
-from hilstar.calibrate.latency import LatencySummary, checked_delay_ms, pair, summarise
-from hilstar.calibrate.latency_report import draw_latency
+from hilstar.calibrate.latency import LatencySummary, checked_delay_ms, draw_latency, pair, summarise
 from hilstar.units import ERROR_OF_MEDIAN, NS_PER_S
 
 WATCHED_S = 5.0  # some 150 edges at 60 Hz

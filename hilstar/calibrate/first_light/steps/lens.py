@@ -8,9 +8,8 @@ from hilstar.calibrate.first_light.patterns import Pattern
 from hilstar.calibrate.first_light.records import Change, Figure, Outcome
 from hilstar.calibrate.first_light.rooms import Room
 from hilstar.calibrate.first_light.steps.look import plan_for, sharp_dots
-from hilstar.calibrate.geometric.calibration import calibrate_files
+from hilstar.calibrate.geometric.calibration import GeometricSummary, calibrate_files, write_calibrated
 from hilstar.calibrate.geometric.dots import dot_image, write_plan
-from hilstar.calibrate.geometric.summary import GeometricSummary, write_calibrated
 from hilstar.files import make_directory
 
 

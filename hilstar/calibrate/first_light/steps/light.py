@@ -16,9 +16,8 @@ from hilstar.calibrate.first_light.records import Change, Figure, Outcome, Verdi
 from hilstar.calibrate.first_light.rooms import Room
 from hilstar.calibrate.first_light.stars import MIN_STARS, see_stars
 from hilstar.calibrate.measurements import PRIMARIES
-from hilstar.calibrate.photometric import PhotometricSummary, Provenance, calibrate_photometric
+from hilstar.calibrate.photometric import PhotometricSummary, Provenance, calibrate_photometric, draw_calibration
 from hilstar.calibrate.plan import Patch, PlanSettings, plan_patches
-from hilstar.calibrate.response_chart import draw_calibration
 from hilstar.calibrate.scale import UNSURE_MAG, Scale
 from hilstar.errors import InputError
 from hilstar.monitor.calibration import BUILT_IN, Calibration, load_calibration, primary_lights

@@ -21,10 +21,9 @@ from hilstar.bench.frame import Bench
 from hilstar.notices import Notices
 from hilstar.run.faulty_frames import FaultyFrames
 from hilstar.run.pacer import AT_ONCE, ClockPacer, Moment, Pacer
-from hilstar.run.presence import AttitudeWatch
 from hilstar.run.shown import FrameSink, OnScreen, Shown, ignore
 from hilstar.run.summary import RunTally
-from hilstar.run.watchdog import FrameWatch
+from hilstar.run.watchdog import AttitudeWatch, FrameWatch
 from hilstar.scene.sprites import Sprites
 from hilstar.units import NS_PER_MS, NS_PER_S
 

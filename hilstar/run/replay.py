@@ -1,13 +1,17 @@
-"""What part of a log is replayed, and how fast."""
+"""The replay of a log or of a ledger: which part of it, how fast, and the run itself."""
 
 from __future__ import annotations
 
 import math
+import time
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
+from msgspec import UNSET
+from msgspec.structs import replace as replaced
 
 from hilstar.attitude.clock.timeline import Attitude, Timeline
 from hilstar.attitude.logs.entries import Stated
@@ -15,14 +19,21 @@ from hilstar.attitude.logs.gaps import log_joins
 from hilstar.attitude.logs.log_file import NOTHING_STATED, log_timeline, open_log
 from hilstar.attitude.logs.mcap_log import read_attitudes
 from hilstar.attitude.logs.mcap_reader import holds_ros, is_mcap
+from hilstar.attitude.receiver import PacketCounts
 from hilstar.attitude.wire.packet import AttitudeSample, rate_refusal
 from hilstar.attitude.wire.source import PACKETS, Conventions
 from hilstar.bench.config import BenchConfig
+from hilstar.bench.frame import Bench
 from hilstar.errors import InputError
-from hilstar.run.faults.recorded import NO_RECORDING, Recording, read_recording
-from hilstar.run.loop import policy_of
+from hilstar.process.interrupts import stop_on_signal
+from hilstar.run.faults import NO_RECORDING, Recording, read_recording, replayed_faults
+from hilstar.run.loop import FrameLoop, Limit, policy_of
+from hilstar.run.pacer import Moment
 from hilstar.run.record.ledger_reader import drawable_frames
-from hilstar.run.record.ledger_records import FrameRecord
+from hilstar.run.record.ledger_records import FrameRecord, below_step, frame_record
+from hilstar.run.serve import Outlet, Running
+from hilstar.run.shown import FrameSink, Shown, ignore
+from hilstar.run.summary import RunSummary
 from hilstar.units import NS_PER_S
 
 MAX_FRAMES = 100_000_000
@@ -213,3 +224,51 @@ def _span(log: Path, wanted: Wanted, length_s: float) -> tuple[float, float]:
     if not 0 <= start_s <= stop_s <= length_s + 1e-9:
         raise InputError(f"{log}: --start {start_s:g} --stop {stop_s:g}; write seconds between 0 and its length, {length_s:g}")
     return start_s, stop_s
+
+
+def replay(bench: Bench, play: Play, sink: FrameSink = ignore, outlet: Outlet | None = None) -> RunSummary:
+    """Replay recorded frames; returns the summary.
+
+    Paced, late frames are missed, as on a monitor; otherwise every frame is drawn, as fast as it can be.
+    """
+    outlet = outlet or Outlet()
+    ledger = outlet.ledger
+    faults = outlet.faults or replayed_faults(bench, play.recording, ledger)
+    if faults is not None:
+        faults.begin(play.zero_ns)
+    frames = None if faults is None else faults.frames
+    loop = outlet.on(FrameLoop(bench, sink, outlet.pacer(bench), play.moving, outlet.notices, frames))
+    for kind, line in play.told:
+        outlet.notices.tell(kind, line)
+
+    def draw_slot(moment: Moment) -> Shown | None:
+        if faults is not None:
+            faults.recall(play.past(moment.slot))
+        number, t_ns, attitude = play.frame(moment.slot)
+        shown = loop.draw(number, t_ns, attitude, moment)
+        if ledger.on and shown is not None:
+            ledger.frame(frame_record(shown, t_ns, loop.tally.missed_frames, below_step(bench, shown)))
+        return shown
+
+    counts = PacketCounts(received=play.packet_count)
+    outlet.follower(Running(loop, counts))
+    bench.warm_up()
+    begin_ns = time.monotonic_ns()
+    with stop_on_signal(loop.stop), loop.watch:
+        _draw_all(play, loop, draw_slot)
+    duration_s = (time.monotonic_ns() - begin_ns) / NS_PER_S
+    summary = loop.tally.summary(duration_s, counts, bench.renderer)
+    summary = replaced(summary, faults=UNSET if faults is None else faults.summary(), sync=outlet.pulses())
+    told = outlet.notices.counts()
+    return replaced(summary, stale_events=loop.gate.events, events=told, screen=loop.screen_summary())
+
+
+def _draw_all(play: Play, loop: FrameLoop, draw_slot: Callable[[Moment], Shown | None]) -> None:
+    """All frames of a replay, paced or as fast as possible, until a signal."""
+    if play.paced:
+        loop.paced(Limit(slots=play.frame_count), draw_slot)
+        return
+    for slot in range(play.frame_count):
+        if loop.stop.is_set():
+            return
+        draw_slot(Moment(slot))

@@ -1,4 +1,4 @@
-"""A live run over a link, and the replay of a log."""
+"""A live run over a link: the stream, or a sender in lockstep."""
 
 from __future__ import annotations
 
@@ -24,8 +24,7 @@ from hilstar.bench.config import AttitudeSettings
 from hilstar.bench.frame import Bench
 from hilstar.notices import Notices
 from hilstar.process.interrupts import stop_on_signal
-from hilstar.run.desk import Desk
-from hilstar.run.faults.run_faults import AnyFaults, replayed_faults
+from hilstar.run.faults import AnyFaults
 from hilstar.run.frame_status import StatusMaker
 from hilstar.run.lockstep.nasa42 import serve_nasa42
 from hilstar.run.lockstep.packets import serve_lockstep
@@ -33,11 +32,10 @@ from hilstar.run.lockstep.steps import Steps
 from hilstar.run.lockstep.vizard import Cameras, Pictures, serve_vizard
 from hilstar.run.loop import FrameLoop, Limit, policy_of
 from hilstar.run.open_link import AnyLink
-from hilstar.run.overrides import HeadlessOverrides
+from hilstar.run.operator import HeadlessOverrides, SwitchRequests
 from hilstar.run.pacer import ClockPacer, Moment, Pacer
 from hilstar.run.record.ledger_records import below_step, frame_record
 from hilstar.run.record.ledger_switch import LedgerSwitch
-from hilstar.run.replay import Play
 from hilstar.run.screen.display_pacer import DisplayPacer
 from hilstar.run.screen.screen import Screen
 from hilstar.run.shown import FrameSink, Shown, ignore
@@ -49,9 +47,9 @@ from hilstar.units import NS_PER_S
 
 @dataclass(frozen=True, slots=True)
 class Running:
-    """What a run counts in and is known by while it runs: who follows it may read all of it at any time, from any thread.
+    """Counters and identity of a run in progress. Readable from any thread.
 
-    `clock` says how the sender's clock stands; None where a run has no sender.
+    `clock` gives the state of the sender's clock; None in a run without a sender.
     """
 
     loop: FrameLoop
@@ -73,11 +71,10 @@ def nobody_follows(running: Running) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Outlet:
-    """Where frames go besides their sink: onto a screen and into a ledger; where events are reported, and who follows it.
+    """Where frames go besides their sink (a screen, a ledger), where events are reported, and who follows the run.
 
-    `pictures` are what a simulation gets that asks for those of its camera; `desk` has the wishes of operators who are not at
-    the display. `faults` are those on request; who wants to start one finds their own desk there. `pulse` is started at
-    each frame.
+    `pictures` are sent to a simulation that asks for its camera's pictures. `requests` are those of the operator's page.
+    `faults` are the scenario's and the stream's. `pulse` is started at each frame.
     """
 
     screen: Screen | None = None
@@ -85,7 +82,7 @@ class Outlet:
     notices: Notices = field(default_factory=Notices)
     pictures: Pictures | None = None
     follower: Follower = nobody_follows
-    desk: Desk | None = None
+    requests: SwitchRequests | None = None
     faults: AnyFaults | None = None
     pulse: FramePulse | None = None
 
@@ -103,8 +100,8 @@ class Outlet:
     def pacer(self, bench: Bench) -> Pacer:
         """The pacer of the screen, or without one that of the bench's own rate."""
         if self.screen is not None:
-            return DisplayPacer(self.screen, self.notices, desk=self.desk)
-        operator = None if self.desk is None else HeadlessOverrides(bench, self.notices, self.desk)
+            return DisplayPacer(self.screen, self.notices, requests=self.requests)
+        operator = None if self.requests is None else HeadlessOverrides(bench, self.notices, self.requests)
         return ClockPacer(NS_PER_S / bench.config.monitor.refresh_hz, operator=operator)
 
 
@@ -200,51 +197,3 @@ def _receiver(settings: AttitudeSettings, link: StreamLink, timeline: Timeline, 
     shared = settings.clock == "shared"
     traffic = Traffic(settings.status_hz, settings.time_requests and not shared, shared)
     return Receiver(link, timeline, traffic, outlet.ledger.packet, outlet.notices, settings.check_rates)
-
-
-def replay(bench: Bench, play: Play, sink: FrameSink = ignore, outlet: Outlet | None = None) -> RunSummary:
-    """Replay recorded frames; returns the summary.
-
-    Paced, late frames are missed, as on a monitor; otherwise every frame is drawn, as fast as it can be.
-    """
-    outlet = outlet or Outlet()
-    ledger = outlet.ledger
-    faults = outlet.faults or replayed_faults(bench, play.recording, ledger)
-    if faults is not None:
-        faults.begin(play.zero_ns)
-    frames = None if faults is None else faults.frames
-    loop = outlet.on(FrameLoop(bench, sink, outlet.pacer(bench), play.moving, outlet.notices, frames))
-    for kind, line in play.told:
-        outlet.notices.tell(kind, line)
-
-    def draw_slot(moment: Moment) -> Shown | None:
-        if faults is not None:
-            faults.recall(play.past(moment.slot))
-        number, t_ns, attitude = play.frame(moment.slot)
-        shown = loop.draw(number, t_ns, attitude, moment)
-        if ledger.on and shown is not None:
-            ledger.frame(frame_record(shown, t_ns, loop.tally.missed_frames, below_step(bench, shown)))
-        return shown
-
-    counts = PacketCounts(received=play.packet_count)
-    outlet.follower(Running(loop, counts))
-    bench.warm_up()
-    begin_ns = time.monotonic_ns()
-    with stop_on_signal(loop.stop), loop.watch:
-        _draw_all(play, loop, draw_slot)
-    duration_s = (time.monotonic_ns() - begin_ns) / NS_PER_S
-    summary = loop.tally.summary(duration_s, counts, bench.renderer)
-    summary = replaced(summary, faults=UNSET if faults is None else faults.summary(), sync=outlet.pulses())
-    told = outlet.notices.counts()
-    return replaced(summary, stale_events=loop.gate.events, events=told, screen=loop.screen_summary())
-
-
-def _draw_all(play: Play, loop: FrameLoop, draw_slot: Callable[[Moment], Shown | None]) -> None:
-    """All frames of a replay, paced or as fast as possible, until a signal."""
-    if play.paced:
-        loop.paced(Limit(slots=play.frame_count), draw_slot)
-        return
-    for slot in range(play.frame_count):
-        if loop.stop.is_set():
-            return
-        draw_slot(Moment(slot))

@@ -93,5 +93,5 @@ def _watching(
     with optional_ledger(None, bench, notices, False, NO_SPLIT) as kept:
         parts = Parts(bench, notices, kept, lambda path: Ledger(path, bench, notices))
         page = Told("demo", bench.config.attitude.source, endpoint)
-        with followed(door, control, page, parts, status, advance) as (sink, follower, desk):
-            yield sink, Outlet(None, kept, notices, follower=follower, desk=desk)
+        with followed(door, control, page, parts, status, advance) as (sink, follower, requests):
+            yield sink, Outlet(None, kept, notices, follower=follower, requests=requests)

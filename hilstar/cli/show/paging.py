@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from hilstar.console.feed.feed import Feed
     from hilstar.console.feed.introduction import Told
     from hilstar.console.feed.opening import Parts
-    from hilstar.run.desk import Desk
-    from hilstar.run.faults.run_faults import AnyFaults
+    from hilstar.run.faults import AnyFaults
+    from hilstar.run.operator import SwitchRequests
     from hilstar.run.serve import Follower, Running
     from hilstar.run.shown import FrameSink, Shown
 
@@ -73,28 +73,30 @@ def page_door(console: str | None, control: bool, token: str | None, names: list
 @contextmanager
 def followed(
     door: Door | None, control: bool, told: Told, parts: Parts, status: RunStatus, record: FrameSink | None = None
-) -> Iterator[tuple[FrameSink, Follower, Desk | None]]:
-    """Who follows a run: the terminal, `record`, systemd, and the page where there is one: its sink, its follower, its desk."""
+) -> Iterator[tuple[FrameSink, Follower, SwitchRequests | None]]:
+    """Connect a run to the terminal, `record`, systemd and the page: its sink, its follower, and the page's requests."""
     sinks: list[FrameSink] = [status.see] if record is None else [record, status.see]
     with Service(status.begun, status.alive, status.line):
         if door is None:
             yield _all_of(sinks), status.follow, None
             return
-        with _page(door, control, told, parts, status) as (feed, follow, desk):
-            yield _all_of([*sinks, feed.see]), follow, desk
+        with _page(door, control, told, parts, status) as (feed, follow, requests):
+            yield _all_of([*sinks, feed.see]), follow, requests
 
 
 @contextmanager
-def _page(door: Door, control: bool, told: Told, parts: Parts, status: RunStatus) -> Iterator[tuple[Feed, Follower, Desk]]:
+def _page(
+    door: Door, control: bool, told: Told, parts: Parts, status: RunStatus
+) -> Iterator[tuple[Feed, Follower, SwitchRequests]]:
     from hilstar.console.feed.opening import opened_page
 
-    with opened_page(door, control, told, parts) as (feed, desk):
+    with opened_page(door, control, told, parts) as (feed, requests):
 
         def follow(running: Running) -> None:
             status.follow(running)
             feed.follow(running)
 
-        yield feed, follow, desk
+        yield feed, follow, requests
 
 
 def _all_of(sinks: list[FrameSink]) -> FrameSink:

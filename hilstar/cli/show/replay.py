@@ -87,8 +87,8 @@ def replay(
     from hilstar.run.record.frame_images import FrameImages
     from hilstar.run.record.ledger import Ledger
     from hilstar.run.replay import Wanted, plan_play
+    from hilstar.run.replay import replay as replay_log
     from hilstar.run.serve import Outlet
-    from hilstar.run.serve import replay as replay_log
 
     check_directory("-o", output)
     ledger = dated_ledger(ledger)
@@ -120,7 +120,7 @@ def replay(
 
         page = Told("replay", "log", str(log), "clock" if play.paced else "asked")
         parts = Parts(bench, notices, kept, lambda path: Ledger(path, bench, notices, split=split), screen, fault_desk(wrong))
-        with on_terminal(status), followed(door, control, page, parts, status, record) as (sink, follower, desk):
-            outlet = Outlet(screen, kept, notices, follower=follower, desk=desk, faults=wrong, pulse=pulse)
+        with on_terminal(status), followed(door, control, page, parts, status, record) as (sink, follower, requests):
+            outlet = Outlet(screen, kept, notices, follower=follower, requests=requests, faults=wrong, pulse=pulse)
             summary = replay_log(bench, play, sink, outlet)
     end_of_run(summary, screen, kept, as_json)

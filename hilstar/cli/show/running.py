@@ -21,8 +21,7 @@ if TYPE_CHECKING:
     from hilstar.bench.bench_file import BenchFile
     from hilstar.bench.faults.scenario import Scenario
     from hilstar.bench.fields_of_view import FieldsOfView
-    from hilstar.run.faults.recorded import Recording
-    from hilstar.run.faults.run_faults import AnyFaults
+    from hilstar.run.faults import AnyFaults, Recording
     from hilstar.run.record.ledger_switch import LedgerSwitch
     from hilstar.run.summary import RunSummary
     from hilstar.run.sync.advice import BeatSummary
@@ -158,7 +157,7 @@ def run_with_faults(
     bench: Any, scenario: Scenario | None, notices: Notices, ledger: LedgerSwitch, recording: Recording | None = None
 ) -> Iterator[AnyFaults | None]:
     """The faults of a run: of its scenario and its stream, or of the run that is replayed; None where it has none."""
-    from hilstar.run.faults.run_faults import replayed_faults, run_faults
+    from hilstar.run.faults import replayed_faults, run_faults
 
     if recording is not None and recording.faults:
         if scenario is not None:

@@ -119,8 +119,8 @@ def serve(
         status = RunStatus(told, kept)
         page = Told("serve", file.config.attitude.source, link.endpoint, "asked" if file.config.attitude.lockstep else "clock")
         parts = Parts(bench, notices, kept, lambda path: Ledger(path, bench, notices, split=split), screen, fault_desk(wrong))
-        with on_terminal(status), followed(door, control, page, parts, status) as (sink, follower, desk):
-            outlet = Outlet(screen, kept, notices, tracker_pictures(link, bench, wrong), follower, desk, wrong, pulse)
+        with on_terminal(status), followed(door, control, page, parts, status) as (sink, follower, requests):
+            outlet = Outlet(screen, kept, notices, tracker_pictures(link, bench, wrong), follower, requests, wrong, pulse)
             summary = serve_stream(bench, link, limit, sink, outlet)
     end_of_run(replaced(summary, beat=beat, fields_of_view=fields.keys()), screen, kept, as_json)
     if not summary.packets.accepted:

@@ -18,7 +18,7 @@ from hilstar.console.feed.messages import Setup
 from hilstar.console.feed.orders import Orders
 from hilstar.console.feed.seen import Watched
 from hilstar.console.feed.staging import scene_of
-from hilstar.run.desk import Desk
+from hilstar.run.operator import SwitchRequests
 
 if TYPE_CHECKING:
     from hilstar.bench.faults.desk import FaultDesk
@@ -42,16 +42,16 @@ class Parts:
 
 
 @contextmanager
-def opened_page(door: Door, control: bool, told: Told, parts: Parts) -> Iterator[tuple[Feed, Desk]]:
+def opened_page(door: Door, control: bool, told: Told, parts: Parts) -> Iterator[tuple[Feed, SwitchRequests]]:
     """The page of a run while this is open: what frames are given to, and where its wishes come from."""
     width, height = parts.bench.config.monitor.resolution_px
     picture_bytes = width * height * (1 if parts.bench.calibration.response.white < 2**8 else 2)
     board = Board.make(picture_bytes)
-    feed, desk = Feed(board), Desk()
+    feed, requests = Feed(board), SwitchRequests()
     watched = Watched(feed, parts.notices, parts.ledger, parts.screen, parts.faults)
-    orders = Orders(desk, watched, parts.make_ledger)
+    orders = Orders(requests, watched, parts.make_ledger)
     with Host(setup_of(door, control, told, parts, picture_bytes), board, door.socket, watched, orders.do):
-        yield feed, desk
+        yield feed, requests
 
 
 def setup_of(door: Door, control: bool, told: Told, parts: Parts, picture_bytes: int) -> Setup:

@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING
 from hilstar.console.feed.messages import SWITCHES, Answer, Order
 from hilstar.console.feed.seen import Watched
 from hilstar.errors import HilstarError, did_you_mean, one_line, printable
-from hilstar.run.aids import PATCHES
-from hilstar.run.desk import Desk, Wish
+from hilstar.run.operator import PATCHES, SwitchRequest, SwitchRequests
 
 if TYPE_CHECKING:
     from hilstar.run.record.ledger import Ledger
@@ -30,8 +29,8 @@ MAX_WHO_CHARACTERS = 60
 class Orders:
     """Does what is ordered; each call is on a thread of its own, and waits."""
 
-    def __init__(self, desk: Desk, watched: Watched, make_ledger: Callable[[Path], Ledger]) -> None:
-        self._desk, self._feed, self._faults = desk, watched.feed, watched.faults
+    def __init__(self, requests: SwitchRequests, watched: Watched, make_ledger: Callable[[Path], Ledger]) -> None:
+        self._requests, self._feed, self._faults = requests, watched.feed, watched.faults
         self._ledger, self._notices = watched.ledger, watched.notices
         self._make_ledger = make_ledger
         self._ledger_lock = threading.Lock()
@@ -56,11 +55,11 @@ class Orders:
     def _switch(self, order: Order, who: str) -> Answer:
         if order.name == "patch" and order.on and order.level not in PATCHES:
             return Answer(id=order.id, status=400, line=f"no such patch; write a level of {', '.join(map(str, PATCHES))}")
-        wish = Wish(order.name, order.on, who, order.level)
-        self._desk.ask(wish)
-        if self._waits_for(lambda: wish.done):
-            return Answer(id=order.id, status=200, line=wish.text)
-        wish.called_off = True
+        request = SwitchRequest(order.name, order.on, who, order.level)
+        self._requests.ask(request)
+        if self._waits_for(lambda: request.done):
+            return Answer(id=order.id, status=200, line=request.text)
+        request.called_off = True
         return Answer(
             id=order.id, status=504, line=f"the frame loop did not take it within {LOOP_WAITS_S:g} s; nothing changed"
         )

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from hilstar.attitude.clock.rate_check import WRONG
 from hilstar.console.feed.messages import AttitudeSeen, ClockSeen, LedgerSeen, RunSeen
 from hilstar.errors import printable
-from hilstar.run.overrides import Overrides
+from hilstar.run.operator import Overrides
 
 if TYPE_CHECKING:
     from hilstar.bench.faults.desk import FaultDesk

@@ -7,7 +7,7 @@ import numpy as np
 from hilstar.bench.frame import Bench
 from hilstar.console.feed.scene import Scene
 from hilstar.console.overlay import overlay_of
-from hilstar.run.overrides import aid_levels_of
+from hilstar.run.operator import aid_levels_of
 
 MAX_NAMES = 5000  # of stars without a HIP number, the brightest
 

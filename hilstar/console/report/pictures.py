@@ -16,12 +16,12 @@ from hilstar.bench.frame import Bench
 from hilstar.console.overlay import Overlay, catalogue_sky, overlay_of
 from hilstar.errors import InputError, MachineError
 from hilstar.notices import Notices
-from hilstar.run.faults.recorded import Recording, read_recording
+from hilstar.run.faults import Recording, read_recording
 from hilstar.run.record.ledger_reader import wrong_in_frame
 from hilstar.run.record.ledger_records import FrameRecord
 from hilstar.run.record.report_figures import Figures
-from hilstar.run.replay import RunPlay
-from hilstar.run.serve import Outlet, replay
+from hilstar.run.replay import RunPlay, replay
+from hilstar.run.serve import Outlet
 from hilstar.run.shown import Shown
 from hilstar.units import NS_PER_S
 

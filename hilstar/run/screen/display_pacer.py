@@ -11,9 +11,8 @@ from typing import Any
 from hilstar.bench.frame import Drawn
 from hilstar.notices import Notices
 from hilstar.process.priority import steady_loop
-from hilstar.run.desk import Desk
 from hilstar.run.host_clock import HOST_CLOCK, HostClock
-from hilstar.run.overrides import Overrides
+from hilstar.run.operator import Overrides, SwitchRequests
 from hilstar.run.pacer import Moment, Presented
 from hilstar.run.screen.screen import Screen
 from hilstar.units import NS_PER_MS
@@ -26,10 +25,12 @@ class DisplayPacer:
 
     moves_stars = True
 
-    def __init__(self, screen: Screen, notices: Notices, clock: HostClock = HOST_CLOCK, desk: Desk | None = None) -> None:
+    def __init__(
+        self, screen: Screen, notices: Notices, clock: HostClock = HOST_CLOCK, requests: SwitchRequests | None = None
+    ) -> None:
         self.clock = clock
         self.stop = threading.Event()
-        self.operator = Overrides(screen.aids, notices, lambda: screen.window.hidden, desk)
+        self.operator = Overrides(screen.aids, notices, lambda: screen.window.hidden, requests)
         self.scheduling = "normal"
         self._screen = screen
         self._notices = notices

@@ -9,7 +9,7 @@ from hilstar.bench.frame import Bench
 from hilstar.bench.orientation import orientation_of
 from hilstar.monitor.window.window import Window
 from hilstar.render.presenter import Presenter, View, changed_codes
-from hilstar.run.aids import Aids
+from hilstar.run.operator import Aids
 from hilstar.run.screen.photodiode import marker_light
 from hilstar.run.screen.swap_clock import DrawBudget, SwapClock
 from hilstar.units import NS_PER_MS, NS_PER_S

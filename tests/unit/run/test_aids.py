@@ -7,7 +7,7 @@ import pytest
 
 from hilstar.monitor.response import Response
 from hilstar.render.aids import lay_over, level_of_code
-from hilstar.run.aids import SWITCHES, Aids
+from hilstar.run.operator import SWITCHES, Aids
 from tests.support.x11.screens import lines_over
 
 LINE = 96

@@ -10,8 +10,8 @@ import pytest
 from hilstar.attitude.clock.timeline import Attitude
 from hilstar.bench.config import parse_config
 from hilstar.notices import Notices
-from hilstar.run.aids import Aids
 from hilstar.run.loop import FrameLoop, Limit
+from hilstar.run.operator import Aids
 from hilstar.run.pacer import Moment
 from hilstar.run.screen.display_pacer import DisplayPacer
 from hilstar.run.screen.swap_clock import DrawBudget, SwapClock

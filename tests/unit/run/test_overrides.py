@@ -9,9 +9,7 @@ import pytest
 
 from hilstar.attitude.clock.timeline import Attitude
 from hilstar.notices import Notices
-from hilstar.run.aids import Aids
-from hilstar.run.desk import Desk, Wish
-from hilstar.run.overrides import Overrides
+from hilstar.run.operator import Aids, Overrides, SwitchRequest, SwitchRequests
 from hilstar.run.shown import OnScreen
 
 MS = 1_000_000
@@ -87,11 +85,11 @@ def test_changed_and_hidden_frames_are_counted_with_their_time(aids):
 def test_a_wish_is_acted_on_by_the_next_look_and_told_with_who_wished_it(aids):
     notices, told = Notices(), []
     notices.listen(lambda notice: told.append((notice.kind, notice.detail, notice.who)))
-    desk = Desk()
-    overrides = Overrides(aids, notices, desk=desk)
-    wish, late = Wish("blank", True, "Ada"), Wish("grid", True, "Ada")
-    desk.ask(wish)
-    desk.ask(late)
+    requests = SwitchRequests()
+    overrides = Overrides(aids, notices, requests=requests)
+    wish, late = SwitchRequest("blank", True, "Ada"), SwitchRequest("grid", True, "Ada")
+    requests.ask(wish)
+    requests.ask(late)
     late.called_off = True
     assert not wish.done
     assert overrides.look() == OnScreen("blank", "", False)

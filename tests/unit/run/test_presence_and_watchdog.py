@@ -9,8 +9,7 @@ import pytest
 
 from hilstar.attitude.clock.timeline import Attitude
 from hilstar.notices import Notices
-from hilstar.run.presence import AttitudeWatch
-from hilstar.run.watchdog import FrameWatch
+from hilstar.run.watchdog import AttitudeWatch, FrameWatch
 from tests.support.fake_clock import FakeClock
 from tests.support.waiting import PATIENCE_S
 

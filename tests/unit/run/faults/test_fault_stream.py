@@ -13,7 +13,7 @@ from hilstar.bench.faults.desk import FaultDesk
 from hilstar.bench.faults.scenario import parse_scenario
 from hilstar.errors import InputError
 from hilstar.notices import Notices
-from hilstar.run.faults.stream import MAX_BURST, MAX_MESSAGE_BYTES, MAX_PER_S, FaultStream, act
+from hilstar.run.faults import MAX_BURST, MAX_MESSAGE_BYTES, MAX_PER_S, FaultStream, act
 from tests.support.senders import await_subscriber, publishing
 from tests.support.waiting import wait_for
 

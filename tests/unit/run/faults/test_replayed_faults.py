@@ -9,13 +9,12 @@ import hilstar
 from hilstar.bench.faults.scenario import parse_scenario
 from hilstar.errors import InputError
 from hilstar.notices import Notices
-from hilstar.run.faults.recorded import read_recording
-from hilstar.run.faults.run_faults import RunFaults
+from hilstar.run.faults import RunFaults, read_recording
 from hilstar.run.record.ledger import Ledger
 from hilstar.run.record.ledger_reader import fault_records, frame_records
 from hilstar.run.record.ledger_switch import LedgerSwitch
-from hilstar.run.replay import Wanted, plan_play
-from hilstar.run.serve import Outlet, replay
+from hilstar.run.replay import Wanted, plan_play, replay
+from hilstar.run.serve import Outlet
 from tests.support.benches import ATTITUDE, bench_text
 
 SCENARIO = """

@@ -1,0 +1,325 @@
+"""Faults over ZeroMQ: a message is a JSON object with the keys of a scenario's `[[fault]]`, or starts or stops one by name.
+
+`{"start": "NAME"}` begins a fault of the scenario, `{"stop": "NAME"}` ends any. A message that is wrong, or one too many, is
+refused and counted; nothing of it is kept.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from hilstar.attitude.wire.keys import NO_KEYS, CurveKeys
+from hilstar.attitude.wire.zmq_stream import ZmqReceiver
+from hilstar.bench.config.faults import FaultSettings
+from hilstar.bench.faults.desk import FILE, Change, FaultDesk, Now, share_on
+from hilstar.bench.faults.kinds import Fault, Freeze, MeasuredMap, fault_of, table_of
+from hilstar.bench.faults.scenario import NO_SCENARIO, Scenario
+from hilstar.bench.faults.surfaces import map_sha256
+from hilstar.bench.faults.views import display_view
+from hilstar.bench.frame import Bench
+from hilstar.errors import InputError, printable, shortened
+from hilstar.notices import Notices
+from hilstar.reading import NOT_JSON
+from hilstar.run.faulty_frames import FaultyFrames
+from hilstar.run.record.flood_sieve import Allowance
+from hilstar.run.record.ledger_reader import fault_records
+from hilstar.run.record.ledger_records import FaultRecord, FrameRecord
+from hilstar.run.record.ledger_switch import LedgerSwitch
+from hilstar.units import NS_PER_S
+
+STREAM = "stream"
+POLL_MS = 50
+RETRY_S = 0.5
+MAX_MESSAGE_BYTES = 16_384
+# A fault costs time to prepare and room in the ledger: that many at once, and that many each second after.
+MAX_BURST, MAX_PER_S = 50, 10
+FORM = 'write a JSON object with kind and name, {"start": "NAME"} or {"stop": "NAME"}'
+
+
+class FaultLink(ZmqReceiver):
+    """The socket that messages come in through."""
+
+    max_part_bytes = MAX_MESSAGE_BYTES
+
+
+def act(desk: FaultDesk, raw: bytes) -> None:
+    """Do what a message asks for. Raises InputError for one that is wrong, or that cannot be done."""
+    try:
+        message: Any = msgspec.json.decode(raw)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError, ValueError) as error:
+        raise InputError(f"a message is no JSON ({shortened(error)}); {FORM}") from error
+    if not isinstance(message, dict):
+        raise InputError(f"a message is {type(message).__name__}, no object; {FORM}")
+    for verb in ("start", "stop"):
+        if verb in message:
+            name = message[verb]
+            if len(message) > 1 or not isinstance(name, str):
+                raise InputError(f"{shortened(message)}: {FORM}")
+            desk.start(name, STREAM) if verb == "start" else desk.stop(name, STREAM)
+            return
+    desk.ask(fault_of(message), STREAM)
+
+
+class FaultStream:
+    """Listens on a thread of its own while it is open. Raises InputError where the endpoint cannot be used."""
+
+    def __init__(
+        self, desk: FaultDesk, endpoint: str, *, bind: bool = False, keys: CurveKeys = NO_KEYS, notices: Notices | None = None
+    ) -> None:
+        self.messages = 0
+        self.refused: Counter[str] = Counter()
+        self._desk, self._notices = desk, Notices() if notices is None else notices
+        self._link = FaultLink(endpoint, bind=bind, keys=keys, notices=self._notices)
+        self._allowance = Allowance(MAX_BURST, MAX_PER_S)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="hilstar-faults", daemon=True)
+        self._thread.start()
+
+    @property
+    def endpoint(self) -> str:
+        """Where it listens."""
+        return f"{self._link.verb} {self._link.endpoint}"
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            try:
+                for each in self._link.taken(POLL_MS):
+                    self._take(each.host_ns, each.parts[-1])
+            except Exception as error:  # whatever it is: the run goes on, and so does this
+                self._notices.tell("fault-stream", f"the stream of faults failed ({type(error).__name__}: {error}); going on")
+                self._stop.wait(RETRY_S)
+
+    def _take(self, host_ns: int, raw: bytes) -> None:
+        self.messages += 1
+        if not self._allowance.take(host_ns):
+            self._refuse("too-many", f"more than {MAX_PER_S} messages a second; send fewer")
+            return
+        try:
+            act(self._desk, raw)
+        except InputError as error:
+            self._refuse("refused", str(error))
+
+    def _refuse(self, reason: str, detail: str) -> None:
+        self.refused[reason] += 1
+        self._notices.tell("fault-refused", f"fault refused: {shortened(detail, 300)}")
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._stop.set()
+        self._thread.join()
+        self._link.close()
+
+    def summary(self) -> dict[str, int]:
+        """How many messages came, and how many were refused."""
+        return {
+            "messages": self.messages,
+            "refused": sum(self.refused.values()),
+            "dropped_unread": self._link.link_counts.flooded,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """The faults of a ledger by the number of their start; empty where the run had none."""
+
+    faults: dict[int, Fault]
+    seed: int
+    folder: Path
+    records: tuple[FaultRecord, ...] = ()
+
+    @property
+    def scenario(self) -> Scenario:
+        """What a view of them has to know."""
+        return Scenario(self.folder, "", self.seed, tuple(dict.fromkeys(self.faults.values())), self.folder)
+
+
+NO_RECORDING = Recording({}, 0, Path())
+
+
+def read_recording(path: Path) -> Recording:
+    """The faults of a run. Raises InputError for damage, and for a measured map that is not the run's any more."""
+    faults: dict[int, Fault] = {}
+    seed, folder = 0, Path()
+    records = tuple(fault_records(path))
+    for record in records:
+        if record.event != "start":
+            continue
+        seed, folder = record.seed, Path(record.folder)
+        try:
+            faults[record.number] = fault = fault_of(msgspec.json.decode(record.table))
+        except (*NOT_JSON, InputError) as error:
+            raise InputError(f"{path}: the fault {record.name!r} is not one of hilstar's ({error})") from error
+        if isinstance(fault, MeasuredMap) and map_sha256(folder / fault.file) != record.file_sha256:
+            raise InputError(f"{path}: {folder / fault.file} is not the map that the run had; put that one there")
+    return Recording(faults, seed, folder, records)
+
+
+class RecordedFaults:
+    """A source of faults (see `run.faulty_frames.Source`) that is told each frame: its faults of light, and whether it stays.
+
+    A recorded attitude is the one that was shown, so a wrong one is not made wrong again; a dropped frame was never recorded.
+    """
+
+    def __init__(self, recording: Recording, refresh_hz: float) -> None:
+        self._faults = recording.faults
+        self._frame_ns = round(NS_PER_S / refresh_hz)
+        self._now: tuple[Now, ...] = ()
+
+    def recall(self, record: FrameRecord) -> None:
+        """Take the faults of the frame that is drawn next."""
+        found = []
+        for number, since_ns in zip(record.faults, record.fault_since_ns, strict=False):
+            fault = self._faults.get(number)
+            if fault is not None and (fault.OF_LIGHT or isinstance(fault, Freeze)):
+                found.append(Now(number, fault, since_ns, share_on(fault, since_ns, self._frame_ns)))
+        self._now = tuple(found)
+
+    def at(self, t_ns: int) -> tuple[Now, ...]:
+        """The faults of that frame."""
+        return self._now
+
+
+WORDS = {"start": "begins", "end": "ends", "missed": "fell between two frames"}
+MAX_NAMES = 100  # in the summary: a stream may make up names
+
+
+class RunFaults:
+    """The faults of one run: `desk` for who wants to start one, `frames` for the loop.
+
+    Raises InputError for a fault that this bench cannot draw.
+    """
+
+    def __init__(self, bench: Bench, scenario: Scenario, notices: Notices, ledger: LedgerSwitch | None = None) -> None:
+        self._scenario, self._notices, self._ledger = scenario, notices, ledger
+        self._started: Counter[str] = Counter()
+        self._missed: Counter[str] = Counter()
+        self._stream: FaultStream | None = None
+        view = display_view(bench, scenario)
+        self._sha256: dict[Fault, str] = {
+            fault: map_sha256(scenario.folder / fault.file) for fault in scenario.faults if isinstance(fault, MeasuredMap)
+        }
+        self.desk = FaultDesk(scenario, 1 / bench.config.monitor.refresh_hz, view.prepare, self._hear)
+        self.frames = FaultyFrames(self.desk, view)
+        if ledger is not None and scenario.faults:
+            ledger.fault(self._record("scenario", scenario.text, name=printable(str(scenario.path))))
+
+    def _hear(self, change: Change) -> None:
+        fault = change.fault
+        tally = self._missed if change.what == "missed" else self._started
+        if change.what != "end":
+            tally[fault.name if len(tally) < MAX_NAMES or fault.name in tally else "others"] += 1
+        person = "" if change.who in {FILE, STREAM} else change.who
+        self._notices.tell("fault", f"fault {fault.name} ({fault.KIND}) {WORDS[change.what]}, by {change.who}", person)
+        if self._ledger is not None:
+            table = msgspec.json.encode(table_of(fault)).decode()
+            record = self._record(change.what, table, name=fault.name, kind=fault.KIND, who=change.who)
+            record.number, record.t_ns = change.number, change.t_ns
+            record.file_sha256 = self._sha256.get(fault, "")
+            self._ledger.fault(record)
+
+    def _record(self, event: str, table: str, name: str, kind: str = "", who: str = "") -> FaultRecord:
+        folder = str(self._scenario.folder.resolve()) if self._scenario.faults else ""
+        return FaultRecord(
+            host_ns=time.monotonic_ns(),
+            event=event,
+            number=0,
+            name=name,
+            kind=kind,
+            who=who,
+            t_ns=0,
+            table=table,
+            seed=self._scenario.seed,
+            folder=folder,
+        )
+
+    def begin(self, zero_ns: int) -> None:
+        """Say from which time of the timeline a scenario's seconds count; by default from the first frame with an attitude."""
+        self.desk.begin(zero_ns)
+
+    def recall(self, record: FrameRecord | None) -> None:
+        """These faults come from the desk, whatever an earlier run had."""
+
+    @contextmanager
+    def listening(self, settings: FaultSettings, folder: Path) -> Iterator[str]:
+        """Take faults from the stream that a bench file names; says where it listens, "" where it names none.
+
+        Raises InputError where the endpoint cannot be used.
+        """
+        if settings.endpoint is None:
+            yield ""
+            return
+        names = (settings.curve_secret_key, settings.curve_server_key, settings.allowed_clients)
+        keys = CurveKeys(*(None if name is None else folder / name for name in names))
+        self._stream = FaultStream(self.desk, settings.endpoint, bind=settings.bind, keys=keys, notices=self._notices)
+        try:
+            yield self._stream.endpoint
+        finally:
+            self._stream.close()
+
+    def summary(self) -> dict[str, Any]:
+        """What was on in the run: names and how often each began, frames dropped and frozen, and the stream's messages."""
+        told: dict[str, Any] = {
+            "scenario": str(self._scenario.path) if self._scenario.faults else None,
+            "started": dict(self._started),
+            "missed": dict(self._missed),
+            "on": self.desk.on(),
+            "dropped_frames": self.frames.dropped,
+            "frozen_frames": self.frames.frozen,
+        }
+        return told if self._stream is None else told | {"stream": self._stream.summary()}
+
+
+def run_faults(
+    bench: Bench, scenario: Scenario | None, notices: Notices, ledger: LedgerSwitch | None = None
+) -> RunFaults | None:
+    """The faults of a run that has a scenario, or whose bench file has a stream of them; None for one that has neither."""
+    if scenario is None and bench.config.faults.endpoint is None:
+        return None
+    return RunFaults(bench, scenario or NO_SCENARIO, notices, ledger)
+
+
+class ReplayedFaults:
+    """The faults of an earlier run for the loop that draws it again, and for the ledger of that.
+
+    Raises InputError for a fault that this bench cannot draw.
+    """
+
+    def __init__(self, bench: Bench, recording: Recording, ledger: LedgerSwitch | None = None) -> None:
+        view = display_view(bench, recording.scenario)
+        for fault in recording.faults.values():
+            view.prepare(fault)
+        self._source = RecordedFaults(recording, bench.config.monitor.refresh_hz)
+        self._started = Counter(record.name for record in recording.records if record.event == "start")
+        self.frames = FaultyFrames(self._source, view)
+        if ledger is not None:
+            for record in recording.records:
+                ledger.fault(record)
+
+    def begin(self, zero_ns: int) -> None:
+        """The recording says what is on in each frame."""
+
+    def recall(self, record: FrameRecord | None) -> None:
+        """Take the faults of the frame that is drawn next."""
+        if record is not None:
+            self._source.recall(record)
+
+    def summary(self) -> dict[str, Any]:
+        """What was on in the earlier run, by how often it began, and how many frames stayed."""
+        return {"recorded": dict(self._started), "frozen_frames": self.frames.frozen}
+
+
+AnyFaults = RunFaults | ReplayedFaults
+
+
+def replayed_faults(bench: Bench, recording: Recording, ledger: LedgerSwitch | None = None) -> ReplayedFaults | None:
+    """The faults of an earlier run; None where it had none."""
+    return ReplayedFaults(bench, recording, ledger) if recording.faults else None

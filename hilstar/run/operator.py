@@ -1,0 +1,216 @@
+"""The operator of a run: switches over the sky (keys at the display, the page), who asks for them, and what they change.
+
+The frame loop turns switches and counts the frames that they change. Other threads ask through `SwitchRequests`.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+from hilstar.attitude.clock.timeline import Attitude
+from hilstar.bench.frame import Bench
+from hilstar.monitor.response import Codes
+from hilstar.notices import Notices
+from hilstar.render.aids import BLANK, CROSSHAIR, GRID, PATCH, AidLevels
+from hilstar.run.pacer import Operator
+from hilstar.run.shown import HEADLESS, OnScreen
+from hilstar.units import NS_PER_S
+
+PATCHES = (0.0, 0.25, 0.5, 0.75, 1.0)  # of white
+_BITS = {"blank": BLANK, "grid": GRID, "crosshair": CROSSHAIR}
+SWITCHES = ("blank", "pause", "patch", "crosshair", "grid")
+
+
+class Aids:
+    """Switches that cover or stop the sky. Written by the frame loop's thread alone."""
+
+    def __init__(self) -> None:
+        self.paused = False
+        self._overlay = 0
+        self._patch = -1
+
+    @property
+    def overlay(self) -> int:
+        """Bits of `render.aids` that are on."""
+        return self._overlay | (PATCH if self._patch >= 0 else 0)
+
+    @property
+    def patch_share(self) -> float:
+        """The patch's part of white; 0 without one."""
+        return PATCHES[self._patch] if self._patch >= 0 else 0.0
+
+    @property
+    def shows_sky(self) -> bool:
+        """False under a blank or a test patch."""
+        return not self._overlay & BLANK and self._patch < 0
+
+    @property
+    def text(self) -> str:
+        """Switches that are on, such as "grid, pause"; "" for none."""
+        on = [name for name, bit in _BITS.items() if self._overlay & bit]
+        if self._patch >= 0:
+            on.append(f"patch {PATCHES[self._patch]:.0%}")
+        return ", ".join([*on, "pause"] if self.paused else on)
+
+    def states(self) -> dict[str, bool]:
+        """Which switches are on, by their names."""
+        return {name: self.is_on(name) for name in SWITCHES}
+
+    def is_on(self, name: str) -> bool:
+        """Whether a switch is on."""
+        if name == "pause":
+            return self.paused
+        return self._patch >= 0 if name == "patch" else bool(self._overlay & _BITS[name])
+
+    def set(self, name: str, on: bool, share: float = 1.0) -> None:
+        """Turn a switch; a patch shows the nearest to `share` of white."""
+        if name == "pause":
+            self.paused = on
+        elif name == "patch":
+            self._patch = min(range(len(PATCHES)), key=lambda k: abs(PATCHES[k] - share)) if on else -1
+        else:
+            self._overlay = self._overlay | _BITS[name] if on else self._overlay & ~_BITS[name]
+
+    def toggle(self, name: str) -> None:
+        """Toggle a switch. The patch steps through PATCHES, then turns off."""
+        if name == "patch":
+            self._patch = self._patch + 1 if self._patch + 1 < len(PATCHES) else -1
+        else:
+            self.set(name, not self.is_on(name))
+
+
+@dataclass(eq=False, slots=True)
+class SwitchRequest:
+    """A request to turn one switch of `Aids`, and who asks. The frame loop sets `done`; `called_off` withdraws it."""
+
+    name: str
+    on: bool
+    who: str
+    share: float = 1.0
+    called_off: bool = False
+    done: bool = False
+
+    @property
+    def text(self) -> str:
+        """The request in words, such as "blank on"."""
+        return f"{self.name} {'on' if self.on else 'off'}"
+
+
+class SwitchRequests:
+    """Queue of requests from any thread. The frame loop empties it once a frame and never waits."""
+
+    def __init__(self) -> None:
+        self.waiting: deque[SwitchRequest] = deque()
+
+    def ask(self, request: SwitchRequest) -> None:
+        """Add a request."""
+        self.waiting.append(request)
+
+    def act(self, aids: Aids, acted: Callable[[SwitchRequest], None]) -> None:
+        """Turn the requested switches and report each by `acted`. Called by the frame loop."""
+        while self.waiting:
+            request = self.waiting.popleft()
+            if request.called_off:
+                continue
+            aids.set(request.name, request.on, request.share)
+            acted(request)
+            request.done = True
+
+
+SKY_AGAIN = "the sky of the attitude again"
+
+
+def always_seen() -> str:
+    """Reason for a hidden window, in a run without one: always none."""
+    return ""
+
+
+class Overrides(Operator):
+    """What covers the sky, and why the window is hidden ("" where it is visible). `requests` come from other threads."""
+
+    def __init__(
+        self, aids: Aids, notices: Notices, hidden: Callable[[], str] = always_seen, requests: SwitchRequests | None = None
+    ) -> None:
+        self.aids = aids
+        self._notices = notices
+        self._hidden = hidden
+        self._requests = SwitchRequests() if requests is None else requests
+        self._told = HEADLESS
+        self._held: tuple[Attitude, int] | None = None  # what a paused screen shows, and the time that it was for
+        self._last_swap_ns: int | None = None
+        self._frames = {"operator": 0, "hidden": 0}
+        self._lasted_ns = {"operator": 0, "hidden": 0}
+
+    @property
+    def paused(self) -> bool:
+        """Whether the operator has paused the sky."""
+        return self.aids.paused
+
+    def look(self) -> OnScreen:
+        """State of the switches and the window now. Reports what has changed."""
+        if self._requests.waiting:
+            self._requests.act(self.aids, self._acted)
+        now = OnScreen(self.aids.text, self._hidden(), self.aids.shows_sky)
+        if now != self._told:
+            before, self._told = self._told, now
+            if now.operator != before.operator:
+                self._notices.tell("operator", f"operator's keys: {now.operator or SKY_AGAIN}")
+            if now.hidden != before.hidden:
+                self._tell_hidden(now.hidden)
+        return now
+
+    def _acted(self, request: SwitchRequest) -> None:
+        shown = self.aids.text
+        self._told = replace(self._told, operator=shown)
+        self._notices.tell("operator", f"{request.text}, by {request.who}: {shown or SKY_AGAIN}", request.who)
+
+    def _tell_hidden(self, hidden: str) -> None:
+        if hidden:
+            self._notices.tell("hidden", f"the window is {hidden}: its frames are not fully visible")
+        else:
+            self._notices.tell("visible", "the window is visible again")
+
+    def attitude(self, t_ns: int, attitude: Attitude | None) -> Attitude | None:
+        """Attitude to show: during a pause the one of its start, with a growing age; None where no sky is shown."""
+        if not self.aids.paused:
+            self._held = None if attitude is None else (attitude, t_ns)
+        elif self._held is None:
+            attitude = None
+        else:
+            held, held_t_ns = self._held
+            attitude = replace(held, rate_cam_rad_s=None, age_ns=max(0, held.age_ns + t_ns - held_t_ns))
+        return attitude if self.aids.shows_sky else None
+
+    def count(self, shown: OnScreen, swap_ns: int) -> None:
+        """Count a frame by how it was shown."""
+        since_ns = 0 if self._last_swap_ns is None else swap_ns - self._last_swap_ns
+        self._last_swap_ns = swap_ns
+        for name, lasts in (("operator", shown.operator), ("hidden", shown.hidden)):
+            if lasts:
+                self._frames[name] += 1
+                self._lasted_ns[name] += since_ns
+
+    def summary(self) -> dict[str, Any]:
+        """Frames changed by the operator and frames hidden by the window: count, and duration in s."""
+        return {name: {"frames": self._frames[name], "s": self._lasted_ns[name] / NS_PER_S} for name in self._frames}
+
+
+def aid_levels_of(bench: Bench) -> AidLevels:
+    """The aids' levels on a bench."""
+    x_px, y_px = bench.camera.boresight_px
+    return AidLevels(bench.calibration.response, bench.config.monitor.bits, (round(x_px), round(y_px)))
+
+
+class HeadlessOverrides(Overrides):
+    """Operator of a run without a screen: the aids are drawn into the levels."""
+
+    def __init__(self, bench: Bench, notices: Notices, requests: SwitchRequests | None = None) -> None:
+        super().__init__(Aids(), notices, always_seen, requests)
+        self._levels = aid_levels_of(bench)
+
+    def laid_over(self, levels: Codes) -> Codes:
+        """Levels with the operator's aids over them."""
+        return self._levels.laid_over(levels, self.aids.overlay, self.aids.patch_share)

@@ -8,8 +8,7 @@ import numpy as np
 
 from hilstar.bench.config import BenchConfig, Tracker
 from hilstar.errors import InputError
-from hilstar.monitor.geometry import monitor_camera
-from hilstar.monitor.geometry_file import load_distortion, load_geometry
+from hilstar.monitor.geometry import load_distortion, load_geometry, monitor_camera
 from hilstar.scene.camera import Camera, bounded
 from hilstar.scene.psf import footprint_px
 

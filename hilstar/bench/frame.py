@@ -21,8 +21,7 @@ from hilstar.bench.satellites import FRAME_SPRITES, Shot, satellite_discs, with_
 from hilstar.bench.truth import clipped_in, designations, sprite_names, sprite_truth, truth_table
 from hilstar.errors import InputError
 from hilstar.monitor.calibration import Calibration
-from hilstar.monitor.footprints import FootprintMap
-from hilstar.monitor.losses import star_losses_mag
+from hilstar.monitor.footprints import FootprintMap, star_losses_mag
 from hilstar.monitor.quantise import Panel, shown_light
 from hilstar.monitor.response import Codes, code_dtype
 from hilstar.render.renderer import Renderer

@@ -38,8 +38,7 @@ from hilstar.calibrate.measurements import (
 )
 from hilstar.charts import BLUE, GREEN, INK, MUTED, RED, chart, label_ends
 from hilstar.errors import InputError
-from hilstar.monitor.calibration import load_calibration
-from hilstar.monitor.calibration_file import Head, NotesTable, write_calibration
+from hilstar.monitor.calibration import Head, NotesTable, load_calibration, write_calibration
 from hilstar.monitor.response import srgb_light
 from hilstar.units import MAG_PER_RELATIVE
 

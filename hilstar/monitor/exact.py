@@ -21,8 +21,7 @@ import numpy.typing as npt
 from hilstar.arrays import Float32Array, IntArray
 from hilstar.monitor.balance import AS_USUAL, SUMS, Balance, Seen
 from hilstar.monitor.footprints import FootprintMap, Footprints, PlaceArray
-from hilstar.monitor.level_table import ThresholdCounter
-from hilstar.monitor.quantise import Panel, level_dtype
+from hilstar.monitor.quantise import Panel, ThresholdCounter, level_dtype
 from hilstar.monitor.response import Codes
 from hilstar.scene.sprites import Sprites
 

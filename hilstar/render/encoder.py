@@ -11,9 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.errors import InputError
-from hilstar.monitor.blue_noise import blue_noise
-from hilstar.monitor.level_table import CodeTable, code_table
-from hilstar.monitor.quantise import Panel, level_dtype
+from hilstar.monitor.quantise import CodeTable, Panel, blue_noise, code_table, level_dtype
 from hilstar.monitor.response import Codes
 from hilstar.process.interrupts import held
 from hilstar.resources import resource_path

@@ -16,7 +16,7 @@ from hilstar.monitor.balance import (
     Balance,
 )
 from hilstar.monitor.exact import CARRIED, Left
-from hilstar.monitor.pixel_order import FEWEST, LEAST_LIGHT, PixelOrder
+from hilstar.monitor.footprints import FEWEST, LEAST_LIGHT, PixelOrder
 from hilstar.monitor.quantise import Panel
 from hilstar.monitor.temporal import NONE_BEFORE, first_phases, places_before
 from hilstar.render.context import has_compute

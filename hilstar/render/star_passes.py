@@ -10,9 +10,8 @@ import math
 import moderngl
 import numpy as np
 
-from hilstar.monitor.level_table import CodeTable, code_table
-from hilstar.monitor.pixel_order import PixelOrder
-from hilstar.monitor.quantise import Panel
+from hilstar.monitor.footprints import PixelOrder
+from hilstar.monitor.quantise import CodeTable, Panel, code_table
 from hilstar.render.context import MAX_ROUNDS, MAX_WRITTEN_BYTES, computes_in_software
 from hilstar.render.encoder import LevelTexture, SpriteSides, Table, build_compute
 from hilstar.render.splat import set_sigma, share_define

@@ -12,7 +12,7 @@ import hilstar
 from hilstar.bench.bench_file import BenchFile
 from hilstar.calibrate.alignment.calibration import Aligned
 from hilstar.calibrate.alignment.residual import AxesArcsec
-from hilstar.monitor.geometry_file import ErrorTable, MadeTable, Notes, load_geometry, load_notes, write_geometry
+from hilstar.monitor.geometry import ErrorTable, MadeTable, Notes, load_geometry, load_notes, write_geometry
 
 MAX_NAMED = 10  # wild rows
 ONE_ATTITUDE = (

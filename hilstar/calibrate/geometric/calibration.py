@@ -40,7 +40,7 @@ from hilstar.calibrate.geometric.match import FirstLook, first_look, match_by_ge
 from hilstar.calibrate.geometric.observed import Observed, measure_images, read_observed
 from hilstar.charts import BLUE, SMALL_PT, chart
 from hilstar.errors import InputError
-from hilstar.monitor.geometry_file import ErrorTable, MadeTable, Notes, write_geometry
+from hilstar.monitor.geometry import ErrorTable, MadeTable, Notes, write_geometry
 from hilstar.rotation import to_matrix
 from hilstar.scene.lens import Lens
 from hilstar.units import ARCSEC_PER_RAD

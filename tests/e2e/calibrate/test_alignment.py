@@ -11,8 +11,7 @@ import pytest
 import hilstar
 from hilstar.bench.bench_file import read_bench_file
 from hilstar.bench.cameras import NO_MISALIGNMENT, tracker_camera
-from hilstar.monitor.geometry import monitor_camera
-from hilstar.monitor.geometry_file import ErrorTable, MadeTable, Notes, load_geometry, load_notes, write_geometry
+from hilstar.monitor.geometry import ErrorTable, MadeTable, Notes, load_geometry, load_notes, monitor_camera, write_geometry
 from hilstar.rotation import (
     angle_between_rad,
     from_radec_roll_deg,

@@ -15,8 +15,7 @@ from hilstar.calibrate.first_light.sight.virtual import VirtualBench
 from hilstar.calibrate.first_light.steps.light import exponent, photometry, plan_for, response_error_mag, scale, trend
 from hilstar.calibrate.plan import Patch
 from hilstar.errors import InputError
-from hilstar.monitor.calibration import load_calibration, primary_lights
-from hilstar.monitor.calibration_file import Head, NotesTable, write_calibration
+from hilstar.monitor.calibration import Head, NotesTable, load_calibration, primary_lights, write_calibration
 from hilstar.monitor.geometry import monitor_camera
 from hilstar.monitor.response import gamma_response, srgb_response
 from hilstar.twin.bench_geometry import BenchGeometry

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from hilstar.monitor.exact import ExactQuantiser
-from hilstar.monitor.footprints import FootprintMap
-from hilstar.monitor.losses import star_losses_mag
+from hilstar.monitor.footprints import FootprintMap, star_losses_mag
 from hilstar.monitor.quantise import Panel, round_levels, shown_light
 from hilstar.monitor.response import gamma_response, srgb_response
 from hilstar.render.reference import linear_image

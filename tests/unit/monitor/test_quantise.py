@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from hilstar.errors import InputError
-from hilstar.monitor.blue_noise import blue_noise
 from hilstar.monitor.data.make_blue_noise import SEED, void_and_cluster
-from hilstar.monitor.level_table import ThresholdCounter
 from hilstar.monitor.quantise import (
     MASK_TURNS,
     Panel,
+    ThresholdCounter,
+    blue_noise,
     dither_levels,
     mask_turn,
     round_levels,

@@ -20,8 +20,7 @@ from hilstar.calibrate.photometric import PhotometricSummary, Provenance, calibr
 from hilstar.calibrate.plan import Patch, PlanSettings, plan_patches
 from hilstar.calibrate.scale import UNSURE_MAG, Scale
 from hilstar.errors import InputError
-from hilstar.monitor.calibration import BUILT_IN, Calibration, load_calibration, primary_lights
-from hilstar.monitor.calibration_file import add_uniformity
+from hilstar.monitor.calibration import BUILT_IN, Calibration, add_uniformity, load_calibration, primary_lights
 from hilstar.monitor.response import Response
 from hilstar.scene.psf import peak_share
 from hilstar.units import ERROR_OF_MEDIAN, MAG_PER_RELATIVE, magnitude

@@ -54,7 +54,12 @@ def has_compute(ctx: Context) -> bool:
 
 def computes_in_software(ctx: moderngl.Context) -> bool:
     """Whether this GL is a processor's and has compute shaders; a graphics card rasterises points in its stride."""
-    return has_compute(ctx) and str(ctx.info["GL_RENDERER"]).startswith(SOFTWARE)
+    return has_compute(ctx) and is_software(ctx)
+
+
+def is_software(ctx: moderngl.Context) -> bool:
+    """Whether a processor draws, and no graphics card."""
+    return str(ctx.info["GL_RENDERER"]).startswith(SOFTWARE)
 
 
 def leave_contexts() -> None:

@@ -11,6 +11,8 @@ import numpy.typing as npt
 
 from hilstar.errors import MachineError
 from hilstar.monitor.window.x11 import GL_LIBRARY, X11_LIBRARY
+from hilstar.render.context import is_software
+from hilstar.render.driver import Driver
 from hilstar.render.encoder import TABLE_WIDTH, build_program
 
 GL_DITHER = 0x0BD0
@@ -102,6 +104,8 @@ class Presenter:
         self._ctx = levels.ctx
         self._view = view
         with self._ctx:
+            self._driver = Driver(self._ctx)
+            self._draws_wait = is_software(self._ctx)
             self._ctx.disable_direct(GL_DITHER)  # which GL begins with
             self._plain, self._aided = (self._build(aids) for aids in (False, True))
         self.set_triples(view.triples)
@@ -146,14 +150,18 @@ class Presenter:
         (As Psychtoolbox does after a flip.)
         """
         with self._ctx:
-            self._ctx.screen.clear(viewport=(0, 0, 1, 1))
-            self._ctx.finish()
+            self._ctx.screen.use()
+            self._driver.take_back_buffer()
+            self._driver.wait()
 
     def present(self, overlay: int = 0, patch_code: int = 0, marker: tuple[int, int] = (0, 0)) -> None:
         """Draw the last levels on the back buffer; `marker` is the photodiode square's side, px, and code."""
         with self._ctx:
             screen = self._ctx.screen
             screen.use()
+            if self._draws_wait:  # for the passes that write the levels, with the lock held
+                self._driver.wait()
+            self._driver.take_back_buffer()
             self._ctx.viewport = (0, 0, *self._view.screen_px)
             self._texture.use(0)
             self._triples.use(1)
@@ -165,4 +173,4 @@ class Presenter:
             if side_px:
                 light = code / (2**self._view.bits - 1)
                 screen.clear(light, light, light, 1.0, viewport=(0, 0, side_px, side_px))
-            self._ctx.finish()
+            self._driver.wait()

@@ -21,6 +21,7 @@ from hilstar.monitor.quantise import Panel, Quantisation, mask_turn
 from hilstar.monitor.response import Codes, Response
 from hilstar.monitor.temporal import TemporalQuantiser
 from hilstar.render.context import Context, check_limits, create_context
+from hilstar.render.driver import Driver
 from hilstar.render.encoder import (
     CUT_WINGS,
     SPRITE_PIXEL_COST,
@@ -91,6 +92,7 @@ class Renderer:
         self._ctx = context or create_context()
         try:
             with self._ctx:
+                self._driver = Driver(self._ctx)
                 key = "sprite_sigma_px" if target.response else "psf_sigma_px"
                 check_limits(self._ctx, target.resolution_px, self.footprint_px, f"{key} = {list(target.sigma_px)}")
                 self._build()
@@ -372,6 +374,7 @@ class Renderer:
         if self._levels is None:
             raise TypeError("this target has no monitor response, so no codes")
         with self._ctx:
+            self._driver.wait()
             return self._levels.read()
 
     @property
@@ -391,8 +394,14 @@ class Renderer:
         with self._ctx:
             if self._undrawn is not None:
                 self._draw_linear(*self._undrawn, levels=self._by_numpy)
+            self._driver.wait()
             self._linear_fbo.read_into(self._linear_image, components=1, dtype="f4", alignment=1)
         return self._linear_image
+
+    def fault(self) -> str:
+        """What has become of the GPU since the last call: a reset or a GL error; "" where all is well. Some microseconds."""
+        with self._ctx:
+            return self._driver.fault()
 
     def gl_error(self) -> str:
         """The GL error since the last call, "GL_NO_ERROR" when there is none."""

@@ -372,12 +372,17 @@ def _is_straight(ramp: Any) -> bool:
 
 
 def _newest_window(width: int, height: int, monitor: Any) -> Any:
-    """A window with the newest OpenGL that its driver gives; None where it gives none of 3.3 or newer."""
-    for major, minor in GL_VERSIONS:
-        glfw.window_hint(glfw.CONTEXT_VERSION_MAJOR, major)
-        glfw.window_hint(glfw.CONTEXT_VERSION_MINOR, minor)
-        if window := glfw.create_window(width, height, TITLE, monitor, None):
-            return window
+    """A window with the newest OpenGL that its driver gives; None where it gives none of 3.3 or newer.
+
+    A context without robustness never tells that its GPU was reset; some drivers have none with it.
+    """
+    for robustness in (glfw.LOSE_CONTEXT_ON_RESET, glfw.NO_ROBUSTNESS):
+        glfw.window_hint(glfw.CONTEXT_ROBUSTNESS, robustness)
+        for major, minor in GL_VERSIONS:
+            glfw.window_hint(glfw.CONTEXT_VERSION_MAJOR, major)
+            glfw.window_hint(glfw.CONTEXT_VERSION_MINOR, minor)
+            if window := glfw.create_window(width, height, TITLE, monitor, None):
+                return window
     return None
 
 

@@ -9,6 +9,7 @@ from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import open_bench
 from hilstar.bench.orientation import orientation_of
 from hilstar.monitor.window.window import Window, WindowSettings
+from hilstar.render.driver import sleep_in_waits
 from hilstar.render.presenter import window_context
 from hilstar.run.screen.gate import pass_gate
 from hilstar.run.screen.screen import Screen
@@ -20,6 +21,7 @@ def open_screen(file: BenchFile, *, windowed: bool, force: bool) -> Iterator[Scr
     monitor = file.config.monitor
     display = None if windowed else monitor.display
     size_px = orientation_of(monitor).screen_px(monitor.resolution_px)
+    sleep_in_waits()
     settings = WindowSettings(size_px, monitor.bits, display, monitor.refresh_hz)
     with Window(settings) as window, open_bench(file, window_context()) as bench:
         screen = Screen(window, bench)

@@ -195,7 +195,7 @@ def _likely_latency_ns(seen: Edges, shown: Edges) -> tuple[float, bool]:
 
 
 @dataclass(frozen=True, slots=True)
-class Percentiles:
+class LatencyPercentiles:
     """Latencies, ms."""
 
     p1: float
@@ -214,7 +214,7 @@ class LatencySummary:
     edges: int
     unmatched: int
     ambiguous: bool
-    latency_ms: Percentiles
+    latency_ms: LatencyPercentiles
     jitter_ms: float
     rise_ms: float | None
     fall_ms: float | None
@@ -238,7 +238,7 @@ def summarise(paired: Paired, config: BenchConfig) -> LatencySummary:
         edges=len(ms),
         unmatched=paired.unmatched,
         ambiguous=paired.ambiguous,
-        latency_ms=Percentiles(p1, p50, p99, float(ms.max())),
+        latency_ms=LatencyPercentiles(p1, p50, p99, float(ms.max())),
         jitter_ms=float(ms.std()),
         rise_ms=float(np.median(rise)) if len(rise) else None,
         fall_ms=float(np.median(fall)) if len(fall) else None,

@@ -60,7 +60,7 @@ class Measurements:
 
 
 @dataclass(frozen=True, slots=True)
-class Levels:
+class MeasuredLevels:
     """Repeats combined: for each distinct code (n,), rising, the mean light, the count, and the mean's standard error.
 
     `relative_noise` is one patch's; nan where nothing was repeated.
@@ -184,7 +184,7 @@ def _clipped(code: IntArray, reading: FloatArray) -> list[int]:
     return [int(c) for c in codes] if len(codes) > 1 and at_limit.sum() >= CLIPPED_VALUES else []
 
 
-def group_levels(measured: Measurements, channel: str) -> Levels:
+def group_levels(measured: Measurements, channel: str) -> MeasuredLevels:
     """The levels of one channel; code 0 is the same black in every channel, so all its readings count."""
     chosen = (measured.channel == channel) | (measured.code == 0)
     value = measured.value[chosen]
@@ -192,7 +192,9 @@ def group_levels(measured: Measurements, channel: str) -> Levels:
     mean = np.asarray(np.bincount(place, value) / count, dtype=np.float64)
     squares = np.asarray(np.bincount(place, (value - mean[place]) ** 2), dtype=np.float64)
     relative = _pooled(squares, mean, count, mean > np.median(mean), BRIGHT_DOF)
-    return Levels(code.astype(np.intp), mean, count.astype(np.intp), relative, _additive(squares, mean, count, relative))
+    return MeasuredLevels(
+        code.astype(np.intp), mean, count.astype(np.intp), relative, _additive(squares, mean, count, relative)
+    )
 
 
 def _pooled(squares: FloatArray, mean: FloatArray, count: IntArray, bright: npt.NDArray[np.bool_], fewest: int) -> float:
@@ -218,7 +220,7 @@ def _additive(squares: FloatArray, mean: FloatArray, count: IntArray, relative: 
     return math.sqrt((float(squares[faint].sum()) - expected) / dof)
 
 
-def check_levels(measured: Measurements, channel: str, levels: Levels) -> None:
+def check_levels(measured: Measurements, channel: str, levels: MeasuredLevels) -> None:
     """Refuse what no response can be fitted to. Raises InputError with the reason and what to do."""
     place = f"{measured.source}: channel {channel}"
     if levels.code[0] != 0:
@@ -248,7 +250,7 @@ def check_levels(measured: Measurements, channel: str, levels: Levels) -> None:
         )
 
 
-def _check_saturation(measured: Measurements, channel: str, levels: Levels, error: FloatArray) -> None:
+def _check_saturation(measured: Measurements, channel: str, levels: MeasuredLevels, error: FloatArray) -> None:
     """An S-curve is flat at white too: what counts is flatter than sin^2, which falls by 3 (1 - code / white)^2."""
     clipped = measured.clipped.get(channel, [])
     white = levels.mean[-1]

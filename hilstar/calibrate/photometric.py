@@ -29,7 +29,7 @@ from hilstar.calibrate.measurements import (
     CHANNELS,
     NOISE_FLOOR,
     PRIMARIES,
-    Levels,
+    MeasuredLevels,
     Measurements,
     check_drift,
     check_levels,
@@ -100,7 +100,7 @@ class ChannelFit:
     white: float
     black: float
     error: FloatArray
-    levels: Levels
+    levels: MeasuredLevels
     residual: FloatArray
     noise_relative: float
     shape: str
@@ -151,7 +151,7 @@ def fit_channel(measured: Measurements, channel: str) -> ChannelFit:
         raise InputError(f"{measured.source}: channel {channel}: no smooth response fits these values; check them") from error
 
 
-def fit_levels(levels: Levels, white: int) -> ChannelFit:
+def fit_levels(levels: MeasuredLevels, white: int) -> ChannelFit:
     """The response to levels that have passed `check_levels`, for codes 0 to `white`."""
     noise = levels.relative_noise
     if math.isnan(noise):
@@ -189,11 +189,11 @@ def strictly_rising(light: FloatArray) -> FloatArray:
     return np.asarray(rising / rising[-1])
 
 
-def _best_solution(levels: Levels, white: int, noise: float) -> _Solution:
+def _best_solution(levels: MeasuredLevels, white: int, noise: float) -> _Solution:
     return min((_solve(shape, _problem(shape, levels, white, noise)) for shape in SHAPES), key=lambda s: s.minus_log_evidence)
 
 
-def _problem(shape: Shape, levels: Levels, white: int, noise: float) -> _Problem:
+def _problem(shape: Shape, levels: MeasuredLevels, white: int, noise: float) -> _Problem:
     codes = np.arange(1, white + 1) / white
     at = levels.code[1:] / white
     low, high = shape.coordinate(codes[[0, -1]])
@@ -299,7 +299,7 @@ class Provenance:
 
 
 @dataclass(frozen=True, slots=True)
-class Repeats:
+class RepeatCounts:
     """How often the levels were measured."""
 
     min: int
@@ -307,7 +307,7 @@ class Repeats:
 
 
 @dataclass(frozen=True, slots=True)
-class BlackLevel:
+class FittedBlack:
     """The light of code 0, relative to white and in the unit of measurement."""
 
     relative: float
@@ -315,7 +315,7 @@ class BlackLevel:
 
 
 @dataclass(frozen=True, slots=True)
-class HeldOut:
+class HeldOutLevels:
     """The errors of levels held out of the fit, of light above black, from white to three decades below it."""
 
     rms_percent: float
@@ -330,13 +330,13 @@ class ChannelSummary:
     """One channel's figures; `error_percent` is the standard error of its response at each decade below white."""
 
     codes: int
-    repeats: Repeats
-    black_level: BlackLevel
+    repeats: RepeatCounts
+    black_level: FittedBlack
     noise_relative: float
     shape: str
     parameters: float
     error_percent: dict[str, float]
-    holdout: HeldOut
+    holdout: HeldOutLevels
 
 
 @dataclass(frozen=True, slots=True)
@@ -432,8 +432,8 @@ def _channel_summary(fit: ChannelFit) -> ChannelSummary:
     places = {decade: int(np.argmin(np.abs(log_light + decade * math.log(10)))) for decade in DECADES}
     return ChannelSummary(
         codes=len(count),
-        repeats=Repeats(int(count.min()), int(count.max())),
-        black_level=BlackLevel(fit.black / fit.white, fit.black),
+        repeats=RepeatCounts(int(count.min()), int(count.max())),
+        black_level=FittedBlack(fit.black / fit.white, fit.black),
         noise_relative=fit.noise_relative,
         shape=fit.shape,
         parameters=fit.parameters,
@@ -442,12 +442,12 @@ def _channel_summary(fit: ChannelFit) -> ChannelSummary:
     )
 
 
-def held_out(fit: ChannelFit) -> HeldOut:
+def held_out(fit: ChannelFit) -> HeldOutLevels:
     """The errors of the levels of a fit, each held out of it."""
     shown = fit.light[fit.levels.code[1:]] >= 10.0 ** -DECADES[-1]
     residual = np.abs(fit.residual[shown])
     rms, p95, largest = float(np.sqrt((residual**2).mean())), float(np.percentile(residual, 95)), float(residual.max())
-    return HeldOut(100 * rms, 100 * p95, 100 * largest, MAG_PER_RELATIVE * rms, MAG_PER_RELATIVE * largest)
+    return HeldOutLevels(100 * rms, 100 * p95, 100 * largest, MAG_PER_RELATIVE * rms, MAG_PER_RELATIVE * largest)
 
 
 MIN_DRAWN_LIGHT = 1e-5  # of white, as drawn

@@ -29,7 +29,7 @@ class Reading:
 
 
 @dataclass(frozen=True, slots=True)
-class Scale:
+class MeasuredScale:
     """What white is worth by the tracker, and how well readings agree."""
 
     flux_at_white_e_per_s: float
@@ -42,7 +42,7 @@ class Scale:
         return float(np.std(magnitude(self.ratios), ddof=1)) if len(self.ratios) > 1 else 0.0
 
 
-def scale_by_tracker(bench: Bench, readings: list[Reading], exposure_s: float) -> Scale:
+def scale_by_tracker(bench: Bench, readings: list[Reading], exposure_s: float) -> MeasuredScale:
     """White by the median of the readings: where the tracker saw r times the light asked for, white is worth r times more.
 
     Raises InputError for a star that the bench does not have or cannot show whole, and for one over the tracker's full well.
@@ -55,7 +55,7 @@ def scale_by_tracker(bench: Bench, readings: list[Reading], exposure_s: float) -
         rate = _rate_of(bench, reading.hip)
         ratios.append(reading.dn * detector.gain_e_per_dn / (rate * exposure_s))
     median = float(np.median(ratios))
-    return Scale(bench.flux_at_white_e_per_s * median, bench.flux_at_white_e_per_s, np.array(ratios))
+    return MeasuredScale(bench.flux_at_white_e_per_s * median, bench.flux_at_white_e_per_s, np.array(ratios))
 
 
 def _rate_of(bench: Bench, hip: int) -> float:

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from hilstar.bench.bench_file import read_bench_file
-from hilstar.calibrate.first_light.patterns import Pattern
-from hilstar.calibrate.first_light.sight.display import Display
+from hilstar.calibrate.first_light.image_sources import Pattern, PatternDisplay
 from tests.support import plain_camera
 from tests.support.benches import TWIN, bench_text
 from tests.support.commands import HILSTAR, run_hilstar
@@ -121,7 +120,7 @@ def test_colours_are_shown_and_frames_of_a_turn_one_after_the_other(screen, tmp_
     table = rng.integers(0, 256, (1000, 3)).astype(np.uint16)
     colours, other = table[rng.integers(0, 1000, (2, 480, 640))]
     looks = []
-    with Display() as display:
+    with PatternDisplay() as display:
         display.show_until(file, Pattern("colours", colours), lambda: looks.append(screen.pixels()) or True)
         assert (looks[-1] == colours).all()
         seen = set()

@@ -1,19 +1,24 @@
-"""What a session has done so far, as session.json keeps it: a record of each step, with its figures, files and hashes."""
+"""What a session keeps: session.json, the keys it sets in the bench file, and the page first-light.html."""
 
 from __future__ import annotations
 
+import base64
+import difflib
 import hashlib
-from collections.abc import Mapping
+import html
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
 import msgspec
 
+from hilstar.bench.bench_file import BenchFile, read_bench_file
+from hilstar.bench.bench_file_edit import with_key
 from hilstar.errors import InputError, shortened
 from hilstar.files import write_whole
-from hilstar.reading import NOT_JSON, exists, read_bytes
-from hilstar.run.sync.advice import BeatSummary
+from hilstar.reading import MAX_TOML_BYTES, NOT_JSON, exists, read_bytes, read_text
+from hilstar.run.sync.advice import BeatSummary, beat_line
 
 Verdict = Literal["done", "skipped", "failed"]
 Figure = float | int | str
@@ -27,7 +32,7 @@ PAGE_FILE = "first-light.html"
 ADVICE = "give the directory of a first-light session, or a new one"
 
 
-class Change(msgspec.Struct, frozen=True, kw_only=True):
+class KeyChange(msgspec.Struct, frozen=True, kw_only=True):
     """A key of the bench file that a step has set; `before` is None where it had not been written."""
 
     table: str
@@ -43,7 +48,7 @@ class Change(msgspec.Struct, frozen=True, kw_only=True):
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class StepOutcome:
     """What a step came to: one line, its figures, the files that it made, pictures for the page, and keys to set."""
 
     verdict: Verdict
@@ -51,10 +56,10 @@ class Outcome:
     figures: Mapping[str, Figure] = field(default_factory=dict)
     files: tuple[Path, ...] = ()
     pictures: tuple[Path, ...] = ()
-    changes: tuple[Change, ...] = ()
+    changes: tuple[KeyChange, ...] = ()
 
 
-class Record(msgspec.Struct, frozen=True, kw_only=True):
+class StepRecord(msgspec.Struct, frozen=True, kw_only=True):
     """A step in session.json.
 
     `state_sha256` covers what the step depends on; `files` has the SHA-256 of each by its path relative to the session.
@@ -68,7 +73,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     figures: dict[str, Figure]
     files: dict[str, str]
     pictures: list[str]
-    changes: list[Change]
+    changes: list[KeyChange]
     ended: str
     seconds: float
 
@@ -86,11 +91,11 @@ class SessionFile(msgspec.Struct, frozen=True, kw_only=True):
     bench_sha256: str
     seen_by: str
     running: str | None
-    steps: list[Record]
+    steps: list[StepRecord]
     unfinished: dict[str, str] = {}
     beat: BeatSummary | None = None
 
-    def step(self, name: str) -> Record | None:
+    def step(self, name: str) -> StepRecord | None:
         """The record of a step, None before it ran."""
         return next((record for record in self.steps if record.name == name), None)
 
@@ -117,3 +122,131 @@ def write_session(folder: Path, session: SessionFile) -> None:
 def sha256_of(path: Path) -> str:
     """The SHA-256 of a file's bytes. Raises InputError where it cannot be read."""
     return hashlib.sha256(read_bytes(path, ADVICE, MAX_FILE_BYTES)).hexdigest()
+
+
+INSTEAD_OF = {"flux_at_white_e_per_s": ("brightest_v_mag",)}
+
+
+def with_changes(file: BenchFile, changes: Iterable[KeyChange]) -> BenchFile:
+    """The bench file as it would be with the changes, written nowhere.
+
+    Raises InputError where a key cannot be set in this file.
+    """
+    text = file.text
+    for change in changes:
+        text = with_key(text, change.table, change.key, change.after, INSTEAD_OF.get(change.key, ()))
+    return _checked(file, text, changes)
+
+
+def _checked(file: BenchFile, text: str, changes: Iterable[KeyChange]) -> BenchFile:
+    """The bench of `text`. Raises InputError where it does not say what was to be set."""
+    from hilstar.bench.config import parse_config
+
+    config = parse_config(file.path, text)
+    for change in changes:
+        now = getattr(getattr(config, change.table), change.key)
+        if (list(now) if isinstance(now, tuple) else now) != change.after:
+            raise InputError(f"{file.path}: {change.key} could not be set; write it under [{change.table}] yourself")
+    return BenchFile(file.path, text, config, file.sha256)
+
+
+def rewrite(file: BenchFile, changes: Iterable[KeyChange]) -> BenchFile:
+    """Write the changed bench file in the old one's place. Raises InputError."""
+    changes = tuple(changes)
+    if not changes:
+        return file
+    write_whole(file.path, with_changes(file, changes).text)
+    return read_bench_file(file.path)
+
+
+MAX_PICTURE_BYTES = 50_000_000
+MAX_FILES_LISTED = 12  # of a step; the others are counted, and stand in session.json
+COLOURS = {"done": "#2e7d32", "skipped": "#8a6d00", "failed": "#c62828"}
+PAGE = """<!DOCTYPE html>
+<html lang="en"><head><meta charset="utf-8"><title>{title}</title>
+<style>
+body {{ font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem; color: #222; }}
+h1 {{ margin-bottom: 0; }} h2 {{ margin-top: 2.5rem; }}
+table {{ border-collapse: collapse; margin: 1rem 0; }}
+td, th {{ padding: .2rem 1rem .2rem 0; text-align: left; vertical-align: top; border-bottom: 1px solid #e4e4e4; }}
+code, pre {{ font: 13px/1.45 ui-monospace, monospace; overflow-wrap: anywhere; }}
+pre {{ background: #f6f6f6; padding: .8rem; white-space: pre-wrap; }}
+img {{ max-width: 100%; }}
+.verdict {{ color: #fff; border-radius: .3rem; padding: .1rem .5rem; font-size: .85em; }}
+.small {{ color: #666; font-size: .9em; }}
+</style></head><body>
+<h1>{title}</h1>
+{body}
+</body></html>
+"""
+
+
+def write_page(folder: Path, session: SessionFile, before: Path) -> Path:
+    """Write the page of a session, with its bench file as it was and as it is. Raises InputError where it cannot be written."""
+    bench = Path(session.bench)
+    body = [
+        f'<p class="small">hilstar {_text(session.hilstar)}; images: {_text(session.seen_by)}</p>',
+        _overview(session.steps),
+        *(f"<p>{_text(line)}</p>" for line in [None if session.beat is None else beat_line(session.beat)] if line),
+        *(part for record in session.steps for part in _step(folder, record)),
+        "<h2>The bench file</h2>",
+        f"<p>{_text(bench)}, SHA-256 <code>{session.bench_sha256}</code></p>",
+        f"<pre>{_text(_difference(before, bench))}</pre>",
+    ]
+    path = folder / PAGE_FILE
+    write_whole(path, PAGE.format(title=f"First light of {_text(bench.name)}", body="\n".join(body)).encode(errors="replace"))
+    return path
+
+
+def _overview(steps: Iterable[StepRecord]) -> str:
+    rows = [
+        f"<tr><td><a href='#{record.name}'>{record.name}</a></td><td>{_badge(record)}</td><td>{_text(record.line)}</td></tr>"
+        for record in steps
+    ]
+    return f"<table>{''.join(rows)}</table>"
+
+
+def _badge(record: StepRecord) -> str:
+    return f'<span class="verdict" style="background:{COLOURS[record.verdict]}">{record.verdict}</span>'
+
+
+def _step(folder: Path, record: StepRecord) -> Iterator[str]:
+    yield f'<h2 id="{record.name}">{record.name} {_badge(record)}</h2>'
+    yield f'<p>{_text(record.line)}</p><p class="small">{_text(record.ended)}, {record.seconds:.1f} s</p>'
+    if record.changes:
+        yield f"<p>In the bench file: {'; '.join(f'<code>{_text(change.line)}</code>' for change in record.changes)}</p>"
+    yield from (_picture(folder / name) for name in record.pictures)
+    if record.figures:
+        yield _table((name, _figure(value)) for name, value in record.figures.items())
+    if record.files:
+        listed = list(record.files.items())[:MAX_FILES_LISTED]
+        more = len(record.files) - len(listed)
+        yield _table((name, f"<code>{digest}</code>") for name, digest in listed)
+        yield f'<p class="small">and {more} files more, in session.json</p>' if more else ""
+
+
+def _table(rows: Iterable[tuple[str, str]]) -> str:
+    return f"<table>{''.join(f'<tr><td>{_text(name)}</td><td>{value}</td></tr>' for name, value in rows)}</table>"
+
+
+def _figure(value: Figure) -> str:
+    return _text(f"{value:.6g}" if isinstance(value, float) else value)
+
+
+def _picture(path: Path) -> str:
+    try:
+        data = base64.b64encode(read_bytes(path, "", MAX_PICTURE_BYTES)).decode()
+    except InputError as error:
+        return f"<p>{_text(error)}</p>"
+    return f'<p><img alt="{_text(path.stem)}" src="data:image/png;base64,{data}"></p>'
+
+
+def _difference(before: Path, after: Path) -> str:
+    """The bench file's lines that changed, with their neighbours."""
+    old, new = (read_text(path, "", MAX_TOML_BYTES).splitlines() for path in (before, after))
+    lines = list(difflib.unified_diff(old, new, "before", "now", lineterm=""))
+    return "\n".join(lines) or "nothing was changed"
+
+
+def _text(value: object) -> str:
+    return html.escape(str(value))

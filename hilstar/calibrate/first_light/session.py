@@ -1,4 +1,4 @@
-"""The session: its steps in order, each done once, and done again when what it depends on has changed."""
+"""The session: its steps in order, each done once, and again when what it depends on has changed."""
 
 from __future__ import annotations
 
@@ -19,32 +19,112 @@ import msgspec
 
 from hilstar import __version__
 from hilstar.bench.bench_file import BenchFile
-from hilstar.calibrate.first_light.patterns import Pattern
+from hilstar.calibrate.first_light.context import StepContext, nobody_watches
+from hilstar.calibrate.first_light.geometry import focus, geometry, orientation
+from hilstar.calibrate.first_light.image_sources import ImageSource, NoImage, Pattern, Stopped, complete_images
+from hilstar.calibrate.first_light.photometry import photometry
 from hilstar.calibrate.first_light.records import (
     KIND,
     Figure,
-    Outcome,
-    Record,
+    KeyChange,
     SessionFile,
+    StepOutcome,
+    StepRecord,
     read_session,
+    rewrite,
     sha256_of,
     write_session,
 )
-from hilstar.calibrate.first_light.rewrite import rewrite
-from hilstar.calibrate.first_light.rooms import Room, nobody_watches
-from hilstar.calibrate.first_light.sight.display import Stopped
-from hilstar.calibrate.first_light.sight.eyes import Eyes, NoImage, complete_images
-from hilstar.calibrate.first_light.steps import delay, lens, light, look, uniformity, verify
+from hilstar.calibrate.first_light.stars import scale, verify
+from hilstar.calibrate.first_light.uniformity import uniformity
+from hilstar.calibrate.latency import LatencySummary, checked_delay_ms, draw_latency, pair, summarise
 from hilstar.errors import HilstarError, InputError, MachineError, one_line
 from hilstar.files import clear_parts, open_lock, write_whole
+from hilstar.run.doctor import examine
 from hilstar.run.sync.advice import BeatSummary, beat_of
+from hilstar.units import ERROR_OF_MEDIAN, NS_PER_S
+
+WATCHED_S = 5.0  # some 150 edges at 60 Hz
+AGREE_MS = 0.05  # less is no reason to change the bench file, nor to doubt a scan-out
+
+
+def latency(context: StepContext) -> StepOutcome:
+    """Measure the panel's delay and set it in the bench file. Raises InputError, MachineError."""
+    monitor = context.file.config.monitor
+    if not monitor.photodiode_px:
+        return StepOutcome("skipped", "not measured: [monitor] photodiode_px is 0, so no square is shown for a photodiode")
+    watched = context.source.diode(context.file, WATCHED_S)
+    if watched is None:
+        how = "--diode serial:/dev/ttyX@BAUD, with the display on this machine; or `hilstar latency` with the ledger of a run"
+        return StepOutcome("skipped", f"not measured, the bench file's {monitor.panel_delay_ms:g} ms stays: give {how}")
+    paired = pair(watched.seen, watched.shown, NS_PER_S / monitor.refresh_hz)
+    found = summarise(paired, context.file.config)
+    picture = context.session / "latency.png"
+    draw_latency(picture, paired, found)
+    delay_ms = checked_delay_ms(0.0 if -AGREE_MS < found.panel_delay_ms < 0 else found.panel_delay_ms)
+    error_ms = ERROR_OF_MEDIAN * found.jitter_ms / math.sqrt(found.edges)
+    figures = _figures(context, found, delay_ms, error_ms)
+    line = (
+        f"panel_delay_ms {delay_ms:g} +- {error_ms:.3f}, the bench file has {monitor.panel_delay_ms:g}; a swap is light at the"
+        f" square after {found.latency_ms.p50:.2f} ms, jitter {found.jitter_ms:.3f}, {found.edges} edges"
+    )
+    if abs(delay_ms - monitor.panel_delay_ms) < max(AGREE_MS, 3 * error_ms):
+        return StepOutcome("done", line, figures, (picture,), (picture,))
+    change = KeyChange(table="monitor", key="panel_delay_ms", before=monitor.panel_delay_ms, after=delay_ms)
+    return StepOutcome("done", line, figures, (picture,), (picture,), (change,))
+
+
+def _figures(context: StepContext, found: LatencySummary, delay_ms: float, error_ms: float) -> dict[str, Figure]:
+    figures: dict[str, Figure] = {
+        "panel_delay_ms": delay_ms,
+        "error_ms": error_ms,
+        "in_bench_file_ms": context.file.config.monitor.panel_delay_ms,
+        "swap_to_light_p50_ms": found.latency_ms.p50,
+        "swap_to_light_p99_ms": found.latency_ms.p99,
+        "swap_to_square_ms": found.swap_to_square_ms,
+        "jitter_ms": found.jitter_ms,
+        "edges": found.edges,
+        "edges_without_a_frame": found.unmatched,
+    }
+    figures |= {name: value for name, value in (("rise_ms", found.rise_ms), ("fall_ms", found.fall_ms)) if value is not None}
+    if context.truth is not None:
+        figures["truth_panel_delay_ms"] = context.truth.config.monitor.panel_delay_ms
+    return figures
+
+
+MS_PER_S = 1000.0
+
+
+def machine(context: StepContext) -> StepOutcome:
+    """Ask the machine what it has. Raises MachineError for what it lacks."""
+    found = examine()
+    missing = [check for check in found.checks if check.required and not check.ok]
+    if missing:
+        raise MachineError("; ".join(f"{check.name}: {check.detail}" for check in missing))
+    figures = {check.name: check.detail for check in found.checks}
+    return StepOutcome("done", figures["opengl"], figures)
+
+
+def display(context: StepContext) -> StepOutcome:
+    """Measure the display. Raises MachineError for one that is not as the bench file has it."""
+    timing = context.source.gate(context.file)
+    if timing is None:
+        return StepOutcome("skipped", f"no display of this program's own ({context.source.identity.partition(':')[0]})")
+    figures: dict[str, Figure] = {"period_ms": timing.period_ms, "dropped": timing.dropped}
+    if timing.paced_by_screen:
+        figures["refresh_hz"] = MS_PER_S / timing.period_ms
+    if timing.modes_hz:
+        figures["modes_hz"] = " ".join(map(str, timing.modes_hz))
+    paced = "" if timing.paced_by_screen else "; the display has no refresh of its own, frames are paced by software"
+    return StepOutcome("done", f"a frame every {timing.period_ms:.3f} ms, {timing.dropped} dropped{paced}", figures)
+
 
 BEFORE_FILE = "bench-before.toml"
 LOCK_FILE = ".lock"
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class SessionStep:
     """One step: what it shows, what it wants back, the steps that have to be done before it, and the tables it depends on.
 
     `writes` are the keys of the bench file that it may set.
@@ -53,73 +133,73 @@ class Step:
     name: str
     shows: str
     wants: str
-    run: Callable[[Room], Outcome]
+    run: Callable[[StepContext], StepOutcome]
     needs: tuple[str, ...] = ()
     tables: tuple[str, ...] = ("monitor", "collimator", "tracker")
     writes: tuple[str, ...] = ()
 
 
 STEPS = (
-    Step("machine", "", "OpenGL, links and files that work", look.machine, tables=()),
-    Step("display", "120 black frames", "a display with the bench file's size and rate", look.display, tables=("monitor",)),
-    Step(
+    SessionStep("machine", "", "OpenGL, links and files that work", machine, tables=()),
+    SessionStep("display", "120 black frames", "a display with the bench file's size and rate", display, tables=("monitor",)),
+    SessionStep(
         "orientation",
         "three squares: the largest at a corner, the next to its right, the smallest below it",
         "one image of the tracker",
-        look.orientation,
+        orientation,
         needs=("machine", "display"),
         writes=("monitor.flip_x", "monitor.flip_y", "monitor.rotate_deg", "monitor.resolution_px"),
     ),
-    Step("focus", "dots", "one image, and fainter ones while they saturate", look.focus, needs=("orientation",)),
-    Step(
+    SessionStep("focus", "dots", "one image, and fainter ones while they saturate", focus, needs=("orientation",)),
+    SessionStep(
         "geometry",
         "frames of dots, each of which blinks its own code",
         "an image of each frame",
-        lens.geometry,
+        geometry,
         needs=("orientation",),
         writes=("collimator.geometry",),
     ),
-    Step(
+    SessionStep(
         "uniformity",
         "dots on four lattices over the whole screen",
         "an image of each",
-        uniformity.uniformity,
+        uniformity,
         needs=("geometry",),
         tables=("monitor", "collimator", "tracker"),
         writes=("monitor.calibration",),
     ),
-    Step(
+    SessionStep(
         "photometry",
         "dots on lattices, in one code after the other",
         "an image of each",
-        light.photometry,
+        photometry,
         needs=("geometry",),
         tables=("monitor", "tracker"),
         writes=("monitor.calibration",),
     ),
-    Step(
+    SessionStep(
         "scale",
         "fields of stars",
         "an image of each",
-        light.scale,
+        scale,
         needs=("geometry",),
         tables=("monitor", "collimator", "tracker", "sky", "render"),
         writes=("render.flux_at_white_e_per_s", "render.brightest_v_mag"),
     ),
-    Step(
+    SessionStep(
         "latency",
         "the photodiode's square",
         "its edges",
-        delay.latency,
+        latency,
         needs=("display",),
         tables=("monitor",),
         writes=("monitor.panel_delay_ms",),
     ),
-    Step(
+    SessionStep(
         "verify",
         "fields of stars",
         "an image of each, and a twin that passes",
-        verify.verify,
+        verify,
         needs=("geometry",),
         tables=("monitor", "collimator", "tracker", "sky", "render", "background", "verify"),
     ),
@@ -127,7 +207,7 @@ STEPS = (
 NAMES = tuple(step.name for step in STEPS)
 
 
-class Session:
+class FirstLightSession:
     """A session in a directory, with so many readings (`patches`) for the response; `watch` sees each pattern.
 
     Raises InputError for a directory that is another bench's.
@@ -137,12 +217,12 @@ class Session:
         self,
         folder: Path,
         file: BenchFile,
-        eyes: Eyes,
+        source: ImageSource,
         patches: int,
         watch: Callable[[Pattern], object] = nobody_watches,
     ) -> None:
         self._watch = watch
-        self.folder, self.file, self.eyes, self.patches = folder, file, eyes, patches
+        self.folder, self.file, self.source, self.patches = folder, file, source, patches
         bench = str(file.path.resolve())
         found = read_session(folder)
         if found is not None and found.bench != bench:
@@ -181,7 +261,7 @@ class Session:
             return False
         return all(_is_same(self.folder / name, digest) for name, digest in record.files.items())
 
-    def _unmet(self, step: Step) -> str | None:
+    def _unmet(self, step: SessionStep) -> str | None:
         """The first step that this one needs and that is not there."""
         for name in step.needs:
             record = self.records.get(name)
@@ -189,19 +269,19 @@ class Session:
                 return name
         return None
 
-    def _run(self, number: int, afresh: bool, say: Callable[[str], None]) -> Record:
+    def _run(self, number: int, afresh: bool, say: Callable[[str], None]) -> StepRecord:
         step, start_s, exit_code = STEPS[number], time.monotonic(), 0
         unmet = self._unmet(step)
         if unmet is not None:
-            outcome = Outcome("skipped", f"needs {unmet}, which is not done")
+            outcome = StepOutcome("skipped", f"needs {unmet}, which is not done")
         else:
             if step.shows or step.wants:
                 say(f"{step.name:12} shows {step.shows or 'nothing'}; wants {step.wants}")
-            room = self._room(step, self._begun(number) and not afresh)
+            context = self._context(step, self._begun(number) and not afresh)
             self.unfinished[step.name] = self._attempt(number)
             self._write(step.name)
-            outcome, exit_code = self._tried(step, room)
-        return Record(
+            outcome, exit_code = self._tried(step, context)
+        return StepRecord(
             name=step.name,
             verdict=outcome.verdict,
             line=outcome.line,
@@ -215,10 +295,10 @@ class Session:
             seconds=round(time.monotonic() - start_s, 3),
         )
 
-    def _tried(self, step: Step, room: Room) -> tuple[Outcome, int]:
+    def _tried(self, step: SessionStep, context: StepContext) -> tuple[StepOutcome, int]:
         """What a step came to, with the bench file written; a refusal is a failed step."""
         try:
-            outcome = step.run(room)
+            outcome = step.run(context)
             self.file = rewrite(self.file, outcome.changes)
         except Stopped:
             raise
@@ -227,7 +307,7 @@ class Session:
             code = 1 if isinstance(error, InputError) else error.exit_code
             if not isinstance(error, NoImage | MachineError):
                 del self.unfinished[step.name]
-            return Outcome("failed", one_line(str(error))), code
+            return StepOutcome("failed", one_line(str(error))), code
         del self.unfinished[step.name]
         return outcome, 1 if outcome.verdict == "failed" else 0
 
@@ -239,17 +319,19 @@ class Session:
         # What is shown depends on where the screen stands, whatever a step's result does.
         return f"{self._state(number, (*STEPS[number].tables, 'collimator'))} {self.patches}"
 
-    def _room(self, step: Step, goes_on: bool) -> Room:
+    def _context(self, step: SessionStep, goes_on: bool) -> StepContext:
         attempts = self.folder / "images"
         number = sum(1 for path in attempts.glob(f"{step.name}-*") if path.is_dir())
         folder = attempts / f"{step.name}-{number if goes_on and number else number + 1}"
         known: dict[str, Figure] = {
             f"{name}.{key}": value for name, record in self.records.items() for key, value in record.figures.items()
         }
-        return Room(self.file, self.folder, folder, self.eyes, known, complete_images(folder), self.patches, self._watch)
+        return StepContext(
+            self.file, self.folder, folder, self.source, known, complete_images(folder), self.patches, self._watch
+        )
 
     def _state(self, number: int, tables: tuple[str, ...] = ()) -> str:
-        """The SHA-256 of what a step depends on: its tables but for what later steps write, the files they name, the eyes."""
+        """The SHA-256 of what a step depends on: its tables but for what later steps write, the files they name, the source."""
         step = STEPS[number]
         later = {key for other in STEPS[number + 1 :] for key in other.writes}
         config = msgspec.to_builtins(self.file.config)
@@ -258,7 +340,7 @@ class Session:
             for table in tables or step.tables
         }
         named = {text: sha256_of(self.file.folder / text) for text in _texts(kept) if _is_file(self.file.folder / text)}
-        seen_by = self.eyes.identity if step.tables else platform.python_version()
+        seen_by = self.source.identity if step.tables else platform.python_version()
         return hashlib.sha256(msgspec.json.encode([__version__, seen_by, kept, named], order="sorted")).hexdigest()
 
     def _write(self, running: str | None) -> None:
@@ -271,7 +353,7 @@ class Session:
             hilstar=__version__,
             bench=str(self.file.path.resolve()),
             bench_sha256=self.file.sha256,
-            seen_by=self.eyes.identity,
+            seen_by=self.source.identity,
             running=running,
             steps=[self.records[name] for name in NAMES if name in self.records],
             unfinished=self.unfinished,
@@ -280,8 +362,8 @@ class Session:
 
     def beat(self) -> BeatSummary:
         """How the tracker's exposures beat with the display, by its own rate and modes where the session has seen them."""
-        display = self.records.get("display")
-        figures = {} if display is None else display.figures
+        record = self.records.get("display")
+        figures = {} if record is None else record.figures
         refresh_hz, modes = figures.get("refresh_hz"), str(figures.get("modes_hz", "")).split()
         return beat_of(self.file.config, None if refresh_hz is None else float(refresh_hz), [float(hz) for hz in modes])
 

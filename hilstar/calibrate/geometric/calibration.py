@@ -22,7 +22,7 @@ from hilstar.calibrate.geometric.fit import (
     TRACKER_STEPS,
     Candidate,
     Fit,
-    Matched,
+    MatchedDots,
     Model,
     Nominal,
     Problem,
@@ -65,7 +65,7 @@ class Calibrated:
 
     plan: DotPlan
     problem: Problem
-    data: Matched
+    data: MatchedDots
     fit: Fit
     models: list[Candidate]
     chosen: Candidate
@@ -170,7 +170,7 @@ def bounded_to_field(problem: Problem, fit: Fit) -> Fit:
 
 def matched(
     plan: DotPlan, nominal: Nominal, seen: Observed, look: FirstLook, tracker_names: tuple[str, ...] = ()
-) -> tuple[Problem, Matched]:
+) -> tuple[Problem, MatchedDots]:
     """The centroids with their dots, by the codes' map first and by a fitted lens then; and what is to be fitted to them.
 
     Raises InputError where the image moved between frames.
@@ -250,7 +250,7 @@ ARROW_SHARE = 0.03  # of the screen's width: the median residual's arrow
 
 
 @dataclass(frozen=True, slots=True)
-class Dots:
+class DotCounts:
     """How many dots the plan has, and how many were recognised."""
 
     planned: int
@@ -268,7 +268,7 @@ class CentroidCounts:
 
 
 @dataclass(frozen=True, slots=True)
-class HeldOut:
+class HeldOutDots:
     """The error of dots held out of the fit, arcsec, and the rms that the noise of their centroids alone makes."""
 
     rms_arcsec: float
@@ -277,7 +277,7 @@ class HeldOut:
 
 
 @dataclass(frozen=True, slots=True)
-class StarError:
+class PlaceError:
     """One sigma of a star's place over the screen."""
 
     rms_arcsec: float
@@ -294,7 +294,7 @@ class ModelError:
 
 
 @dataclass(frozen=True, slots=True)
-class Parameter:
+class FittedParameter:
     """A parameter's value and one sigma, in the unit of its name."""
 
     value: float
@@ -307,14 +307,14 @@ class GeometricSummary:
 
     model: str
     poses: int
-    dots: Dots
+    dots: DotCounts
     centroids: CentroidCounts
     noise_px: float
     noise_arcsec: float
-    held_out: HeldOut
-    error: StarError
+    held_out: HeldOutDots
+    error: PlaceError
     models: tuple[ModelError, ...]
-    parameters: dict[str, Parameter]
+    parameters: dict[str, FittedParameter]
     tracker: str
     notes: tuple[str, ...]
     written: tuple[str, ...]
@@ -326,12 +326,12 @@ def summary_of(found: Calibrated, written: tuple[str, ...]) -> GeometricSummary:
     return GeometricSummary(
         model=chosen.name,
         poses=len(found.problem.q_poses),
-        dots=Dots(len(found.plan), len(np.unique(found.data.dot))),
+        dots=DotCounts(len(found.plan), len(np.unique(found.data.dot))),
         centroids=CentroidCounts(found.centroids, len(found.data), found.lost, found.false),
         noise_px=found.problem.noise_px,
         noise_arcsec=found.noise_arcsec,
-        held_out=HeldOut(chosen.rms_arcsec, chosen.max_arcsec, found.held_out_noise_arcsec),
-        error=StarError(found.uncertainty.rms_arcsec, found.uncertainty.max_arcsec),
+        held_out=HeldOutDots(chosen.rms_arcsec, chosen.max_arcsec, found.held_out_noise_arcsec),
+        error=PlaceError(found.uncertainty.rms_arcsec, found.uncertainty.max_arcsec),
         models=tuple(ModelError(model.name, model.rms_arcsec, model.max_arcsec) for model in found.models),
         parameters=parameters_of(found),
         tracker="held" if found.tracker_known else "fitted",
@@ -352,7 +352,7 @@ def _notes(found: Calibrated) -> tuple[str, ...]:
     return (*notes, f"the tracker sees {known_deg:.2f} deg from the axis: no star is shown farther out")
 
 
-def parameters_of(found: Calibrated) -> dict[str, Parameter]:
+def parameters_of(found: Calibrated) -> dict[str, FittedParameter]:
     """Each parameter's value and one sigma, in its own unit."""
     monitor, sigma = found.fit.geometry.monitor, found.uncertainty.sigma
     lens = monitor.lens or Lens()
@@ -371,7 +371,7 @@ def parameters_of(found: Calibrated) -> dict[str, Parameter]:
         values[name] = (value, sigma.get(name, 0.0))
     for name in found.fit.model.tracker_names:
         values[name] = (_tracker_value(found, name), sigma[name])
-    return {name: Parameter(float(value), float(s)) for name, (value, s) in values.items()}
+    return {name: FittedParameter(float(value), float(s)) for name, (value, s) in values.items()}
 
 
 def _tracker_value(found: Calibrated, name: str) -> float:

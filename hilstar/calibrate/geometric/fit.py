@@ -132,7 +132,7 @@ DIFFERENCE = 1e-5  # of a parameter's number
 
 
 @dataclass(frozen=True, slots=True)
-class Matched:
+class MatchedDots:
     """Centroids (n,) and the dot that each is."""
 
     seen: Observed
@@ -141,9 +141,9 @@ class Matched:
     def __len__(self) -> int:
         return len(self.dot)
 
-    def at(self, chosen: IntArray) -> Matched:
+    def at(self, chosen: IntArray) -> MatchedDots:
         """Those at places `chosen`, or where a mask is true."""
-        return Matched(self.seen.at(chosen), self.dot[chosen])
+        return MatchedDots(self.seen.at(chosen), self.dot[chosen])
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,7 +182,7 @@ class _Loss:
     problem: Problem
     model: Model
     field_degree: int
-    data: Matched
+    data: MatchedDots
 
     def geometry(self, numbers: FloatArray) -> Geometry:
         lens, field = numbers[: self.model.size], numbers[self.model.size :]
@@ -228,7 +228,7 @@ class _Loss:
         return float(each.sum() + 0.5 * self.prior(len(numbers)) @ numbers**2)
 
 
-def fit(problem: Problem, model: Model, field_degree: int, data: Matched, start: FloatArray | None = None) -> Fit:
+def fit(problem: Problem, model: Model, field_degree: int, data: MatchedDots, start: FloatArray | None = None) -> Fit:
     """The model with its residual field of a total degree (0 for none) that suits `data` best, searched from `start`."""
     loss = _Loss(problem, model, field_degree, data)
     if start is None and field_degree:
@@ -264,20 +264,20 @@ def _smallest(loss: _Loss, numbers: FloatArray) -> FloatArray:
     return numbers
 
 
-def residuals_px(problem: Problem, geometry: Geometry, data: Matched) -> tuple[FloatArray, FloatArray]:
+def residuals_px(problem: Problem, geometry: Geometry, data: MatchedDots) -> tuple[FloatArray, FloatArray]:
     """How far each centroid is from its dot, x and y (n,), on the monitor but in tracker px."""
     plan, scale = problem.plan, problem.monitor_px_per_px
     x_px, y_px = _places_px(geometry, data)
     return (x_px - plan.x_px[data.dot]) / scale, (y_px - plan.y_px[data.dot]) / scale
 
 
-def residuals_sigma(problem: Problem, geometry: Geometry, data: Matched) -> FloatArray:
+def residuals_sigma(problem: Problem, geometry: Geometry, data: MatchedDots) -> FloatArray:
     """The residuals (2 n,), x then y, each in its own sigma."""
     sigma = data.seen.sigma_px * problem.noise_px
     return np.concatenate([part / sigma for part in residuals_px(problem, geometry, data)])
 
 
-def _places_px(geometry: Geometry, data: Matched) -> tuple[FloatArray, FloatArray]:
+def _places_px(geometry: Geometry, data: MatchedDots) -> tuple[FloatArray, FloatArray]:
     """Where on the monitor, px, the centroids (n,) are by a geometry."""
     directions = directions_in_cam(geometry, data.seen.pose, data.seen.x_px, data.seen.y_px)
     return geometry.monitor.project(directions @ geometry.monitor.cam_to_image.T)
@@ -288,7 +288,7 @@ def _with_field(geometry: Geometry, field: ResidualField) -> Geometry:
     return replace(geometry, monitor=replace(camera, lens=replace(camera.lens or Lens(), field=field)))
 
 
-def noise_of_repeats(data: Matched) -> float | None:
+def noise_of_repeats(data: MatchedDots) -> float | None:
     """The error of one centroid, px, one axis, by how dots repeat in several frames; None where none repeats.
 
     It knows nothing of the model. By the median of the absolute deviations: a false match or two do not count.
@@ -336,7 +336,7 @@ class Candidate:
         return float(np.hypot(*self.off_arcsec.T).max())
 
 
-def candidates(problem: Problem, data: Matched, tracker_names: tuple[str, ...]) -> list[Candidate]:
+def candidates(problem: Problem, data: MatchedDots, tracker_names: tuple[str, ...]) -> list[Candidate]:
     """Every model that the number of centroids allows, simplest first, each held against dots that it was not fitted to."""
     poses = len(problem.q_poses)
     wanted = [("pinhole", PINHOLE, 0), ("pinhole + k1", RADIAL, 0), ("Brown-Conrady + tilt", BROWN_CONRADY, 0)]
@@ -352,7 +352,7 @@ def candidates(problem: Problem, data: Matched, tracker_names: tuple[str, ...]) 
     return found
 
 
-def held_out(problem: Problem, name: str, model: Model, degree: int, data: Matched) -> Candidate:
+def held_out(problem: Problem, name: str, model: Model, degree: int, data: MatchedDots) -> Candidate:
     """A model held against each dot by a fit to the others, a fifth of the dots at a time."""
     dots = np.unique(data.dot)
     fold = np.zeros(int(dots.max()) + 1, dtype=np.intp)
@@ -379,7 +379,7 @@ def best_of(found: list[Candidate]) -> Candidate:
     return best
 
 
-def final_fit(problem: Problem, chosen: Candidate, data: Matched) -> Fit:
+def final_fit(problem: Problem, chosen: Candidate, data: MatchedDots) -> Fit:
     """The chosen model on all of the data."""
     return fit(problem, chosen.model, chosen.field_degree, data)
 
@@ -410,7 +410,7 @@ class Uncertainty:
         return float(np.nanmax(self.map_arcsec))
 
 
-def uncertainty_of(problem: Problem, fit: Fit, data: Matched) -> Uncertainty:
+def uncertainty_of(problem: Problem, fit: Fit, data: MatchedDots) -> Uncertainty:
     """The covariance of a fit to `data`, carried to its parameters and over the screen."""
     monitor = fit.geometry.monitor
     rows = _slopes_of_residuals(problem, fit, data)
@@ -446,7 +446,7 @@ def _varied(problem: Problem, fit: Fit, number: int) -> Geometry:
     return replace(varied, monitor=replace(varied.monitor, lens=lens))
 
 
-def _slopes_of_residuals(problem: Problem, fit: Fit, data: Matched) -> FloatArray:
+def _slopes_of_residuals(problem: Problem, fit: Fit, data: MatchedDots) -> FloatArray:
     """By each number of the model and each coefficient of the field: (2 n, numbers)."""
     base = residuals_sigma(problem, fit.geometry, data)
     varied = [residuals_sigma(problem, _varied(problem, fit, k), data) for k in range(fit.model.size)]

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.calibrate.geometric.dots import DotPlan
-from hilstar.calibrate.geometric.fit import Geometry, Matched, Nominal, directions_in_cam
+from hilstar.calibrate.geometric.fit import Geometry, MatchedDots, Nominal, directions_in_cam
 from hilstar.calibrate.geometric.observed import Observed
 from hilstar.errors import InputError
 from hilstar.rotation import from_matrix
@@ -248,7 +248,7 @@ def _refuse_orientation(nominal: Nominal, matrix: FloatArray) -> None:
         raise InputError(f"the tracker sees the monitor {words}, show the dots again, and take new frames")
 
 
-def match_by_maps(plan: DotPlan, nominal: Nominal, seen: Observed, look: FirstLook) -> Matched:
+def match_by_maps(plan: DotPlan, nominal: Nominal, seen: Observed, look: FirstLook) -> MatchedDots:
     """Each centroid with the lit dot that the first maps put it nearest to, within what a lens may do."""
     x_px, y_px = np.full(len(seen), np.nan), np.full(len(seen), np.nan)
     u, v = nominal.tracker.tangents(seen.x_px, seen.y_px)
@@ -258,14 +258,14 @@ def match_by_maps(plan: DotPlan, nominal: Nominal, seen: Observed, look: FirstLo
     return _nearest(plan, seen, x_px, y_px, FIRST_REACH * nominal.monitor.resolution_px[0])
 
 
-def match_by_geometry(plan: DotPlan, seen: Observed, geometry: Geometry, reach_px: float) -> Matched:
+def match_by_geometry(plan: DotPlan, seen: Observed, geometry: Geometry, reach_px: float) -> MatchedDots:
     """Each centroid with the lit dot that a fitted geometry puts it nearest to, within `reach_px` of the monitor."""
     directions = directions_in_cam(geometry, seen.pose, seen.x_px, seen.y_px)
     x_px, y_px = geometry.monitor.project(directions @ geometry.monitor.cam_to_image.T)
     return _nearest(plan, seen, x_px, y_px, reach_px)
 
 
-def _nearest(plan: DotPlan, seen: Observed, x_px: FloatArray, y_px: FloatArray, reach_px: float) -> Matched:
+def _nearest(plan: DotPlan, seen: Observed, x_px: FloatArray, y_px: FloatArray, reach_px: float) -> MatchedDots:
     dot: IntArray = np.full(len(seen), -1, dtype=np.intp)
     for pose in range(int(seen.pose.max()) + 1):
         for frame in range(plan.frames):
@@ -281,10 +281,10 @@ def _nearest(plan: DotPlan, seen: Observed, x_px: FloatArray, y_px: FloatArray, 
             near = mutual & (far[np.arange(len(here)), best] < reach_px)
             dot[here[near]] = lit[best[near]]
     kept = np.flatnonzero(dot >= 0)
-    return Matched(seen.at(kept), dot[kept])
+    return MatchedDots(seen.at(kept), dot[kept])
 
 
-def refuse_motion(data: Matched) -> None:
+def refuse_motion(data: MatchedDots) -> None:
     """Refuse (InputError) frames between which the whole image moved."""
     for pose in np.unique(data.seen.pose):
         here = data.at(np.flatnonzero(data.seen.pose == pose))
@@ -299,7 +299,7 @@ def refuse_motion(data: Matched) -> None:
                 )
 
 
-def frame_shifts(data: Matched, places: FloatArray) -> tuple[IntArray, FloatArray, float]:
+def frame_shifts(data: MatchedDots, places: FloatArray) -> tuple[IntArray, FloatArray, float]:
     """The frames, how far the image of each stands from the others', and the noise of what is left (Tukey's median polish)."""
     frames, frame = np.unique(data.seen.frame, return_inverse=True)
     dots, dot = np.unique(data.dot, return_inverse=True)

@@ -21,8 +21,7 @@ from hilstar.resources import resource_path
 
 if TYPE_CHECKING:
     from hilstar.bench import bench_file as files
-    from hilstar.calibrate.first_light.patterns import Pattern
-    from hilstar.calibrate.first_light.sight.eyes import Eyes
+    from hilstar.calibrate.first_light.image_sources import ImageSource, Pattern
     from hilstar.console.feed.door import Door
 
 PATCHES = 96
@@ -88,8 +87,8 @@ def first_light(
     Sets the bench file's keys; SESSION keeps the file as it was, the calibration files, session.json and first-light.html.
     """
     from hilstar.bench.bench_file import read_bench_file
-    from hilstar.calibrate.first_light.page import write_page
-    from hilstar.calibrate.first_light.session import BEFORE_FILE, NAMES, Session, alone_in
+    from hilstar.calibrate.first_light.records import write_page
+    from hilstar.calibrate.first_light.session import BEFORE_FILE, NAMES, FirstLightSession, alone_in
     from hilstar.files import make_directory
     from hilstar.run.sync.advice import beat_line
 
@@ -105,11 +104,11 @@ def first_light(
     readings = (0 if by_hand else PATCHES) if patches is None else patches
     with (
         page_door(console, control, token, console_name) as door,
-        closing(_eyes(file, _Sources(grab, virtual, dark, diode, seed))) as eyes,
+        closing(_image_source(file, _Sources(grab, virtual, dark, diode, seed))) as source,
         alone_in(make_directory(output)),
         _shown(door, control, file) as (tell, watch),
     ):
-        session = Session(output, file, eyes, readings, watch)
+        session = FirstLightSession(output, file, source, readings, watch)
         code = session.run(frozenset(again or []), tell)
         beats = beat_line(session.beat())
         if beats is not None:
@@ -144,14 +143,12 @@ def _shown(
         yield tell, feed.show
 
 
-def _eyes(file: files.BenchFile, sources: _Sources) -> Eyes:
+def _image_source(file: files.BenchFile, sources: _Sources) -> ImageSource:
     """Where the images come from. Raises InputError for sources that do not go together."""
     from hilstar.attitude.wire.serial_link import serial_target
     from hilstar.bench.bench_file import read_bench_file
-    from hilstar.calibrate.first_light.sight.diode import SerialDiode
-    from hilstar.calibrate.first_light.sight.grabber import Grabber
-    from hilstar.calibrate.first_light.sight.hands import Hands
-    from hilstar.calibrate.first_light.sight.virtual import VirtualBench
+    from hilstar.calibrate.first_light.image_sources import ByHand, GrabCommand, SerialDiode
+    from hilstar.calibrate.first_light.virtual import VirtualBench
     from hilstar.calibrate.geometric.observed import read_image
 
     if sources.virtual is not None:
@@ -165,4 +162,4 @@ def _eyes(file: files.BenchFile, sources: _Sources) -> Eyes:
     if sources.diode is not None and port is None:
         raise InputError(f"--diode {sources.diode}: write serial:/dev/ttyX@BAUD, such as serial:/dev/ttyACM0@115200")
     diode = None if port is None else SerialDiode(*port)
-    return Hands(sources.dark, diode) if sources.grab is None else Grabber(sources.grab, sources.dark, diode)
+    return ByHand(sources.dark, diode) if sources.grab is None else GrabCommand(sources.grab, sources.dark, diode)

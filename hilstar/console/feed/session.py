@@ -18,7 +18,7 @@ from hilstar.notices import Listener, Notice
 
 if TYPE_CHECKING:
     from hilstar.bench.bench_file import BenchFile
-    from hilstar.calibrate.first_light.patterns import Pattern
+    from hilstar.calibrate.first_light.image_sources import Pattern
     from hilstar.console.feed.door import Door
 
 CODE = np.dtype("<u2")

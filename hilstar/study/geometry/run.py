@@ -18,7 +18,7 @@ from hilstar.calibrate.geometric.fit import (
     PINHOLE,
     RADIAL,
     Geometry,
-    Matched,
+    MatchedDots,
     Model,
     Nominal,
     Problem,
@@ -124,7 +124,7 @@ def _outcomes(frames: Frames) -> list[Outcome]:
     return [_outcome(problem, data, frames, model) for model in MODELS]
 
 
-def _outcome(problem: Problem, data: Matched, frames: Frames, model: LensModel) -> Outcome:
+def _outcome(problem: Problem, data: MatchedDots, frames: Frames, model: LensModel) -> Outcome:
     free = Model(model.parameters)
     candidate = held_out(problem, model.name, free, model.field_degree, data)
     errors = _star_errors(fit(problem, free, model.field_degree, data).geometry)

@@ -16,7 +16,7 @@ import pytest
 
 from hilstar.bench.bench_file import read_bench_file
 from hilstar.bench.cameras import bench_camera
-from hilstar.calibrate.first_light.steps.light import response_error_mag
+from hilstar.calibrate.first_light.photometry import response_error_mag
 from hilstar.monitor.calibration import Head, NotesTable, load_calibration, write_calibration
 from hilstar.monitor.geometry import ErrorTable, MadeTable, Notes, write_geometry
 from hilstar.monitor.response import gamma_response, srgb_response

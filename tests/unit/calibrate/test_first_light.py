@@ -11,14 +11,20 @@ from scipy.special import ndtr
 
 from hilstar.bench.bench_file import read_bench_file
 from hilstar.calibrate.first_light import session as sessions
-from hilstar.calibrate.first_light.focus import sharpness
-from hilstar.calibrate.first_light.orientation import UPRIGHT, WAYS, Mounting, corrected, keys_of_ways, look_of, see_figure
-from hilstar.calibrate.first_light.patterns import Pattern, black, figure_for, off_screen, on_screen
-from hilstar.calibrate.first_light.records import Change, Outcome
-from hilstar.calibrate.first_light.rewrite import rewrite
-from hilstar.calibrate.first_light.session import Session, Step
-from hilstar.calibrate.first_light.sight.eyes import NoImage
-from hilstar.calibrate.first_light.sight.grabber import Grabber
+from hilstar.calibrate.first_light.geometry import (
+    UPRIGHT,
+    WAYS,
+    ScreenMounting,
+    corrected,
+    figure_for,
+    keys_of_ways,
+    look_of,
+    see_figure,
+    sharpness,
+)
+from hilstar.calibrate.first_light.image_sources import GrabCommand, NoImage, Pattern, black, off_screen, on_screen
+from hilstar.calibrate.first_light.records import KeyChange, StepOutcome, rewrite
+from hilstar.calibrate.first_light.session import FirstLightSession, SessionStep
 from hilstar.errors import InputError
 from hilstar.monitor.geometry import monitor_camera
 from hilstar.render.presenter import Orientation
@@ -27,7 +33,7 @@ from tests.support.benches import bench_text
 from tests.support.damage import NO_JSON
 
 NO_TURN = np.array([1.0, 0.0, 0.0, 0.0])
-MOUNTINGS = [Mounting(x, y, turn) for x in (False, True) for y in (False, True) for turn in (0, 90, 180, 270)]
+MOUNTINGS = [ScreenMounting(x, y, turn) for x in (False, True) for y in (False, True) for turn in (0, 90, 180, 270)]
 GEOMETRY = BenchGeometry(monitor_camera((640, 480), 57.65, 120, NO_TURN), monitor_camera((400, 400), 13, 25, NO_TURN))
 # The model of a dot and the image here are the same mathematics in two forms; the noise of 40 dots is what is left.
 SIGMA_PX = 0.02
@@ -133,7 +139,7 @@ def test_sharpness_is_the_sigma_of_the_psf(sigma_px):
 def grabbed(tmp_path, command):
     (tmp_path / "bench.toml").write_text(bench_text())
     pattern = Pattern("figure_000", black((320, 240)))
-    return Grabber(command).look(read_bench_file(tmp_path / "bench.toml"), pattern, tmp_path / "figure_000", 0.025)
+    return GrabCommand(command).look(read_bench_file(tmp_path / "bench.toml"), pattern, tmp_path / "figure_000", 0.025)
 
 
 def test_a_command_gets_the_pattern_and_writes_the_image(tmp_path):
@@ -178,29 +184,29 @@ class Counted:
     def __init__(self, monkeypatch):
         self.runs, self.failing = [], set()
         steps = (
-            Step("first", "", "", self.step("first"), tables=("monitor",), writes=("monitor.flip_x",)),
-            Step("second", "", "", self.step("second"), needs=("first",), tables=("monitor",)),
-            Step("third", "", "", self.step("third"), tables=("collimator",)),
+            SessionStep("first", "", "", self.step("first"), tables=("monitor",), writes=("monitor.flip_x",)),
+            SessionStep("second", "", "", self.step("second"), needs=("first",), tables=("monitor",)),
+            SessionStep("third", "", "", self.step("third"), tables=("collimator",)),
         )
         monkeypatch.setattr(sessions, "STEPS", steps)
         monkeypatch.setattr(sessions, "NAMES", tuple(step.name for step in steps))
 
     def step(self, name):
-        def run(room):
+        def run(context):
             self.runs.append(name)
             if name in self.failing:
                 raise InputError("it is not there")
-            path = room.session / f"{name}.txt"
+            path = context.session / f"{name}.txt"
             path.write_text(name)
-            now = room.file.config.monitor.flip_x
-            changes = (Change(table="monitor", key="flip_x", before=now, after=True),) if name == "first" and not now else ()
-            return Outcome("done", "found", files=(path,), changes=changes)
+            now = context.file.config.monitor.flip_x
+            changes = (KeyChange(table="monitor", key="flip_x", before=now, after=True),) if name == "first" and not now else ()
+            return StepOutcome("done", "found", files=(path,), changes=changes)
 
         return run
 
     def go(self, folder, again=()):
         self.runs.clear()
-        session = Session(folder / "s", read_bench_file(folder / "bench.toml"), Blind(), 0)
+        session = FirstLightSession(folder / "s", read_bench_file(folder / "bench.toml"), Blind(), 0)
         return session.run(frozenset(again), lambda line: None), session
 
 
@@ -233,7 +239,7 @@ def test_a_session_knows_the_beat_by_what_it_has_seen_of_the_display(counted, tm
     session = counted.go(tmp_path)[1]
     assert session.as_file().beat.refreshes_per_exposure == pytest.approx(2.4)
     assert session.as_file().beat.proposal.refresh_hz == pytest.approx(50)
-    seen = Outcome("done", "a frame every 13.4 ms", {"refresh_hz": 74.6, "modes_hz": "50 60 75"})
+    seen = StepOutcome("done", "a frame every 13.4 ms", {"refresh_hz": 74.6, "modes_hz": "50 60 75"})
     session.records["display"] = structs.replace(session.records["first"], name="display", figures=dict(seen.figures))
     assert session.beat().refreshes_per_exposure == pytest.approx(2.984)
     assert not session.beat().matters
@@ -264,19 +270,19 @@ def test_a_camera_that_fails_once_does_not_cost_the_images_before_it(tmp_path, m
     (tmp_path / "s").mkdir()
     taken = []
 
-    def frames(room):
+    def frames(context):
         for number in range(4):
-            path = room.take(Pattern(f"frame_{number}", black(room.resolution_px)))
+            path = context.take(Pattern(f"frame_{number}", black(context.resolution_px)))
             taken.append((path.name, path.stat().st_mtime_ns))
-        return Outcome("done", "found")
+        return StepOutcome("done", "found")
 
-    monkeypatch.setattr(sessions, "STEPS", (Step("frames", "", "", frames, tables=("monitor",)),))
+    monkeypatch.setattr(sessions, "STEPS", (SessionStep("frames", "", "", frames, tables=("monitor",)),))
     monkeypatch.setattr(sessions, "NAMES", ("frames",))
     grab = f"sh -c 'cp {{pattern}} {{output}}; case {{output}} in *frame_2*) test -e {tmp_path / 'mended'};; esac'"
 
     def go(*again):
         taken.clear()
-        session = Session(tmp_path / "s", read_bench_file(tmp_path / "bench.toml"), Grabber(grab), 0)
+        session = FirstLightSession(tmp_path / "s", read_bench_file(tmp_path / "bench.toml"), GrabCommand(grab), 0)
         code = session.run(frozenset(again), lambda line: None)
         return code, session.records["frames"].verdict, dict(taken)
 
@@ -305,7 +311,7 @@ def test_a_directory_of_another_bench_is_refused(counted, tmp_path):
     counted.go(tmp_path)
     (tmp_path / "other.toml").write_text(bench_text())
     with pytest.raises(InputError, match="write another directory"):
-        Session(tmp_path / "s", read_bench_file(tmp_path / "other.toml"), Blind(), 0)
+        FirstLightSession(tmp_path / "s", read_bench_file(tmp_path / "other.toml"), Blind(), 0)
 
 
 @pytest.mark.parametrize("data", [b"{}", *NO_JSON, b'{"kind": "\xff"}'])
@@ -319,7 +325,7 @@ def test_a_key_that_cannot_be_set_leaves_the_file_alone(tmp_path):
     path = tmp_path / "bench.toml"
     path.write_text(bench_text({"monitor": {"flip_x": None}}).replace("[monitor]", "[ monitor ]"))
     before = path.read_text()
-    change = Change(table="monitor", key="flip_x", before=False, after=True)
+    change = KeyChange(table="monitor", key="flip_x", before=False, after=True)
     with pytest.raises(InputError, match=r"bench\.toml"):
         rewrite(read_bench_file(path), [change])
     assert path.read_text() == before

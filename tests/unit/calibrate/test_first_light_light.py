@@ -8,11 +8,19 @@ from PIL import Image
 from scipy.special import ndtr
 
 from hilstar.bench.bench_file import read_bench_file
-from hilstar.calibrate.first_light.lattice import field_for, peak_shares
-from hilstar.calibrate.first_light.photometer import Assumed, Photometer
-from hilstar.calibrate.first_light.rooms import Room
-from hilstar.calibrate.first_light.sight.virtual import VirtualBench
-from hilstar.calibrate.first_light.steps.light import exponent, photometry, plan_for, response_error_mag, scale, trend
+from hilstar.calibrate.first_light.context import StepContext
+from hilstar.calibrate.first_light.photometry import (
+    Assumed,
+    Photometer,
+    exponent,
+    field_for,
+    peak_shares,
+    photometry,
+    plan_for,
+    response_error_mag,
+)
+from hilstar.calibrate.first_light.stars import scale, trend
+from hilstar.calibrate.first_light.virtual import VirtualBench
 from hilstar.calibrate.plan import Patch
 from hilstar.errors import InputError
 from hilstar.monitor.calibration import Head, NotesTable, load_calibration, primary_lights, write_calibration
@@ -85,8 +93,8 @@ class Camera:
 
 def read(tmp_path, camera, codes=(0, 100, 300, 511, 700, 900, 1023, 0)):
     (tmp_path / "bench.toml").write_text(bench_text(TWIN))
-    room = Room(read_bench_file(tmp_path / "bench.toml"), tmp_path, tmp_path / "i", camera, {}, {}, 96)
-    photometer = Photometer(room, SIGMA_PX, Assumed({"w": srgb_response(10).light}, 0.0))
+    context = StepContext(read_bench_file(tmp_path / "bench.toml"), tmp_path, tmp_path / "i", camera, {}, {}, 96)
+    photometer = Photometer(context, SIGMA_PX, Assumed({"w": srgb_response(10).light}, 0.0))
     return photometer.read([Patch(code, "w") for code in codes])
 
 
@@ -130,7 +138,7 @@ def test_a_pixel_that_is_brighter_among_lit_ones_is_seen_by_the_links(tmp_path):
 def test_a_screen_whose_pixels_depend_on_their_neighbours_is_no_calibration(tmp_path):
     (tmp_path / "bench.toml").write_text(bench_text(TWIN))
     camera = Camera(srgb_response(10).light, 20_000, neighbours=0.08)
-    outcome = photometry(Room(read_bench_file(tmp_path / "bench.toml"), tmp_path, tmp_path / "i", camera, {}, {}, 24))
+    outcome = photometry(StepContext(read_bench_file(tmp_path / "bench.toml"), tmp_path, tmp_path / "i", camera, {}, {}, 24))
     assert (outcome.verdict, outcome.changes) == ("failed", ())
     assert outcome.figures["links_max_mag"] == pytest.approx(2.5 * np.log10(1.08), abs=0.005)
     assert "local dimming" in outcome.line
@@ -173,11 +181,11 @@ def on_the_twin(tmp_path, step, bench, truth, patches=72):
     (tmp_path / "bench.toml").write_text(bench_text(TWIN, bench))
     (tmp_path / "truth.toml").write_text(bench_text(TWIN, truth))
     file, true = (read_bench_file(tmp_path / name) for name in ("bench.toml", "truth.toml"))
-    eyes = VirtualBench(file, true, 0)
+    source = VirtualBench(file, true, 0)
     try:
-        return step(Room(file, tmp_path, tmp_path / "images", eyes, {}, {}, patches))
+        return step(StepContext(file, tmp_path, tmp_path / "images", source, {}, {}, patches))
     finally:
-        eyes.close()
+        source.close()
 
 
 def test_bit_stealing_needs_the_primaries_and_finds_their_shares(tmp_path):

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from hilstar.bench.bench_file import read_bench_file
-from hilstar.calibrate.first_light.rewrite import rewrite
-from hilstar.calibrate.first_light.rooms import Room
-from hilstar.calibrate.first_light.sight.virtual import VirtualBench
-from hilstar.calibrate.first_light.steps.light import photometry, scale
-from hilstar.calibrate.first_light.steps.uniformity import Dots, map_of, uniformity
-from hilstar.calibrate.first_light.steps.verify import verify
+from hilstar.calibrate.first_light.context import StepContext
+from hilstar.calibrate.first_light.photometry import photometry
+from hilstar.calibrate.first_light.records import rewrite
+from hilstar.calibrate.first_light.stars import scale, verify
+from hilstar.calibrate.first_light.uniformity import DotLight, map_of, uniformity
+from hilstar.calibrate.first_light.virtual import VirtualBench
 from hilstar.monitor.calibration import load_calibration, with_uniformity
 from tests.support.benches import TWIN, bench_text
 
@@ -38,11 +38,11 @@ def planted(folder, grid, name="srgb", bench=None):
 def did(folder, step, patches=0):
     """What a step comes to, with the bench file rewritten as a session does it."""
     file, true = (read_bench_file(folder / name) for name in ("bench.toml", "truth.toml"))
-    eyes = VirtualBench(file, true, 0)
+    source = VirtualBench(file, true, 0)
     try:
-        outcome = step(Room(file, folder, folder / step.__name__, eyes, {}, {}, patches))
+        outcome = step(StepContext(file, folder, folder / step.__name__, source, {}, {}, patches))
     finally:
-        eyes.close()
+        source.close()
     rewrite(file, outcome.changes)
     return outcome
 
@@ -112,7 +112,7 @@ def test_noise_of_the_tracker_is_in_the_errors_of_its_stars(tmp_path):
 
 def dots(light, rng, noise=0.004):
     x, y = (part.ravel() for part in np.meshgrid(np.arange(8, 632, 12), np.arange(8, 472, 12)))
-    return Dots(x, y, light(x / 320 - 1, y / 240 - 1) * rng.normal(1, noise, x.shape), 1.0857 * noise)
+    return DotLight(x, y, light(x / 320 - 1, y / 240 - 1) * rng.normal(1, noise, x.shape), 1.0857 * noise)
 
 
 def test_wild_dots_do_not_bend_the_map():

@@ -14,8 +14,7 @@ from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import open_bench
 from hilstar.bench.cameras import tracker_camera
 from hilstar.bench.orientation import orientation_of
-from hilstar.calibrate.first_light.patterns import CodeImage, Pattern, off_screen, on_screen
-from hilstar.calibrate.first_light.sight.diode import KIND, Watched
+from hilstar.calibrate.first_light.image_sources import KIND, CodeImage, DiodeRecording, Pattern, off_screen, on_screen
 from hilstar.calibrate.latency import Edges, edges_of, swap_to_square_ms
 from hilstar.errors import InputError
 from hilstar.files import written
@@ -73,7 +72,7 @@ class VirtualBench:
         """The tracker's image of a monitor that is switched off."""
         return self._exposed(np.zeros_like(self._glow_e_per_s), self.truth.config.tracker.exposure_s, stem)
 
-    def diode(self, file: BenchFile, seconds: float) -> Watched | None:
+    def diode(self, file: BenchFile, seconds: float) -> DiodeRecording | None:
         """A photodiode of the twin's: the delay of the truth's panel and its scan-out, and a little jitter."""
         rng = np.random.default_rng((self._seed, zlib.crc32(b"diode")))
         frames = int(seconds * file.config.monitor.refresh_hz)
@@ -83,7 +82,7 @@ class VirtualBench:
         monitor = replace(self.truth.config.monitor, photodiode_px=file.config.monitor.photodiode_px)
         delay_ns = (monitor.panel_delay_ms + swap_to_square_ms(monitor)) * NS_PER_MS
         late_ns = delay_ns + rng.normal(0, DIODE_JITTER_NS, len(shown.host_ns))
-        return Watched(shown, Edges(shown.host_ns + np.rint(late_ns).astype(np.int64), shown.level))
+        return DiodeRecording(shown, Edges(shown.host_ns + np.rint(late_ns).astype(np.int64), shown.level))
 
     def _exposed(self, light_e_per_s: FloatArray, exposure_s: float, stem: Path) -> Path:
         from PIL import Image

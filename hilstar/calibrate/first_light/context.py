@@ -11,11 +11,9 @@ import numpy as np
 from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.cameras import bench_camera, ideal_monitor, tracker_camera
-from hilstar.calibrate.first_light.patterns import Pattern, black
+from hilstar.calibrate.first_light.image_sources import ByHand, ImageSource, Pattern, black
 from hilstar.calibrate.first_light.records import Figure
-from hilstar.calibrate.first_light.sight.eyes import Eyes
-from hilstar.calibrate.first_light.sight.hands import Hands
-from hilstar.calibrate.first_light.sight.virtual import VirtualBench
+from hilstar.calibrate.first_light.virtual import VirtualBench
 from hilstar.calibrate.geometric.observed import read_image
 from hilstar.errors import InputError
 from hilstar.files import make_directory
@@ -31,7 +29,7 @@ def nobody_watches(pattern: Pattern) -> None:
 
 
 @dataclass(frozen=True, slots=True)
-class Looked:
+class DarkSubtracted:
     """An image of the tracker: its file, and its light above the dark frame (h, w), DN.
 
     `raw_peak` is with the dark frame, hot pixels left out, and `floor_dn` the median of that.
@@ -44,7 +42,7 @@ class Looked:
 
 
 @dataclass(frozen=True, slots=True)
-class Room:
+class StepContext:
     """Where a step works.
 
     `folder` takes its images, `session` its results. `kept` are the images of an attempt that was interrupted: they are not
@@ -55,7 +53,7 @@ class Room:
     file: BenchFile
     session: Path
     folder: Path
-    eyes: Eyes
+    source: ImageSource
     known: dict[str, Figure]
     kept: Mapping[str, Path]
     patches: int
@@ -74,7 +72,7 @@ class Room:
     @property
     def truth(self) -> BenchFile | None:
         """The bench as it really is, in a virtual session."""
-        return self.eyes.truth if isinstance(self.eyes, VirtualBench) else None
+        return self.source.truth if isinstance(self.source, VirtualBench) else None
 
     def geometry(self) -> BenchGeometry:
         """Monitor and tracker as the bench file has them, with an ideal collimator."""
@@ -84,7 +82,7 @@ class Room:
         """The same with the lens that was measured."""
         return BenchGeometry(bench_camera(self.file.config, self.file.folder), self.geometry().tracker)
 
-    def with_file(self, file: BenchFile) -> Room:
+    def with_file(self, file: BenchFile) -> StepContext:
         """The same with another bench file."""
         return replace(self, file=file)
 
@@ -100,34 +98,34 @@ class Room:
         make_directory(self.folder)
         stem = self.folder / pattern.name
         self.watch(pattern)
-        return self.eyes.look(self.file, pattern, stem, self.exposure_s if exposure_s is None else exposure_s)
+        return self.source.look(self.file, pattern, stem, self.exposure_s if exposure_s is None else exposure_s)
 
     def take_or_key(self, pattern: Pattern, keys: Mapping[str, str]) -> Path | str:
         """The tracker's image of a pattern, or, by hand, the key that tells how it was seen: `keys` has what each means."""
-        if isinstance(self.eyes, Hands) and pattern.name not in self.kept:
+        if isinstance(self.source, ByHand) and pattern.name not in self.kept:
             stem = make_directory(self.folder) / pattern.name
             self.watch(pattern)
-            return self.eyes.look_or_key(self.file, pattern, stem, keys)
+            return self.source.look_or_key(self.file, pattern, stem, keys)
         return self.take(pattern)
 
     def unlit(self) -> Path | None:
         """The tracker's image with the monitor switched off, None where there is none."""
         name = "unlit_000"
-        return self.kept[name] if name in self.kept else self.eyes.unlit(make_directory(self.folder) / name)
+        return self.kept[name] if name in self.kept else self.source.unlit(make_directory(self.folder) / name)
 
     def dark(self) -> Path:
         """The tracker's image of a black screen."""
         return self.take(Pattern("dark_000", black(self.resolution_px)))
 
-    def look(self, pattern: Pattern, dark: FloatArray) -> Looked:
+    def look(self, pattern: Pattern, dark: FloatArray) -> DarkSubtracted:
         """The tracker's image of a pattern, above its dark frame. Raises InputError for one that cannot be read."""
         return self.looked(self.take(pattern), dark)
 
-    def looked(self, path: Path, dark: FloatArray) -> Looked:
+    def looked(self, path: Path, dark: FloatArray) -> DarkSubtracted:
         """An image of the tracker above its dark frame. Raises InputError for one that cannot be read."""
         raw = self.read(path)
         cold = dark < HOT_FILL * self.full_dn
-        return Looked(path, raw - dark, float(raw[cold].max(initial=0.0)), float(np.median(dark)))
+        return DarkSubtracted(path, raw - dark, float(raw[cold].max(initial=0.0)), float(np.median(dark)))
 
     def read(self, path: Path) -> FloatArray:
         """An image of the tracker (h, w), DN."""
@@ -139,7 +137,7 @@ class Room:
         detector = self.file.config.tracker.detector
         return min(2.0**detector.bits - 1, detector.offset_dn + detector.full_well_e / detector.gain_e_per_dn)
 
-    def is_too_bright(self, looked: Looked) -> bool:
+    def is_too_bright(self, looked: DarkSubtracted) -> bool:
         """Whether pixels are near the end of the tracker's range."""
         return looked.raw_peak > MAX_FILL * self.full_dn
 

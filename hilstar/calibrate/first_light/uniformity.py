@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 
 from hilstar.arrays import BoolArray, FloatArray, IntArray
-from hilstar.calibrate.first_light.patterns import CodeImage, Pattern, black
-from hilstar.calibrate.first_light.pictures import draw_uniformity
-from hilstar.calibrate.first_light.records import Change, Figure, Outcome
-from hilstar.calibrate.first_light.rooms import HOT_FILL, Room
-from hilstar.calibrate.first_light.steps.light import calibration_of, calibration_source
-from hilstar.calibrate.first_light.steps.look import DOT_PX, sharp_dots
+from hilstar.calibrate.first_light.context import HOT_FILL, StepContext
+from hilstar.calibrate.first_light.geometry import DOT_PX, sharp_dots
+from hilstar.calibrate.first_light.image_sources import CodeImage, Pattern, black
+from hilstar.calibrate.first_light.photometry import calibration_of, calibration_source
+from hilstar.calibrate.first_light.records import Figure, KeyChange, StepOutcome
+from hilstar.charts import chart
 from hilstar.errors import InputError
 from hilstar.monitor.calibration import load_calibration, weights_of_grid, with_uniformity
 from hilstar.tracker.centroids import noisiest_background
@@ -41,7 +41,7 @@ FILE = "light.toml"
 
 
 @dataclass(frozen=True, slots=True)
-class Dots:
+class DotLight:
     """Dots seen whole: middles (n,), monitor px, and their light (n,), DN; `noise_mag` is what one is uncertain by."""
 
     x: IntArray
@@ -51,7 +51,7 @@ class Dots:
 
 
 @dataclass(frozen=True, slots=True)
-class Map:
+class UniformityMap:
     """Light against place: a grid (rows, columns), one field where it is even, and its value at each dot (n,), median 1.
 
     `left_mag` is what dots that were held out differ from it by, rms; `used` the dots that are not wild.
@@ -73,35 +73,37 @@ class Map:
         return float(np.std(magnitude(self.at_dots[self.used])))
 
 
-def uniformity(room: Room) -> Outcome:
+def uniformity(context: StepContext) -> StepOutcome:
     """Measure light against place, and give the bench's calibration the map where it lacks it. Raises InputError."""
-    dots, images = see_dots(room)
-    size_px, assumed = room.resolution_px, calibration_of(room)
+    dots, images = see_dots(context)
+    size_px, assumed = context.resolution_px, calibration_of(context)
     known = assumed.uniformity_map(size_px)
     as_known = np.ones(len(dots.light)) if known is None else known[dots.y, dots.x].astype(np.float64)
     against = map_of(dots, dots.light / as_known, size_px)
     found = map_of(dots, dots.light, size_px)
-    figures = _figures(room, dots, found, against)
-    picture = room.session / "uniformity.png"
+    figures = _figures(context, dots, found, against)
+    picture = context.session / "uniformity.png"
     line = f"{_said(found, known is not None)}; {len(dots.light)} dots differ from that by {found.left_mag:.4f} mag"
     line += f" (noise {dots.noise_mag:.4f})"
     draw_uniformity(picture, np.stack([dots.x, dots.y], axis=1)[found.used].astype(np.float64), _mag(found, dots), line)
     files: list[Path] = [picture, *images]
-    changes: tuple[Change, ...] = ()
+    changes: tuple[KeyChange, ...] = ()
     if against.is_even:
         line += "; the bench file has it so" if known is not None else "; nothing was written"
     else:
-        source, path = calibration_source(room.file), room.session / FILE
-        files += with_uniformity(source, room.file.config.monitor.bits, path, None if found.is_even else found.grid)
-        changes = _named(room, path)
+        source, path = calibration_source(context.file), context.session / FILE
+        files += with_uniformity(source, context.file.config.monitor.bits, path, None if found.is_even else found.grid)
+        changes = _named(context, path)
         line += "; what the tracker's own lens darkens is part of it"
     if found.left_mag > max(FAR_SIGMAS * dots.noise_mag, FAR_MAG):
         why = "dust, a panel uneven from pixel to pixel, or light that is not steady; look at the images"
-        return Outcome("failed", f"{line}: that is far above their noise: {why}", figures, tuple(files), (picture,), changes)
-    return Outcome("done", line, figures, tuple(files), (picture,), changes)
+        return StepOutcome(
+            "failed", f"{line}: that is far above their noise: {why}", figures, tuple(files), (picture,), changes
+        )
+    return StepOutcome("done", line, figures, tuple(files), (picture,), changes)
 
 
-def _said(found: Map, assumed: bool) -> str:
+def _said(found: UniformityMap, assumed: bool) -> str:
     if found.is_even:
         return "the light is even over the screen" + (", where the bench file has it uneven" if assumed else "")
     seen = found.at_dots[found.used]
@@ -109,18 +111,18 @@ def _said(found: Map, assumed: bool) -> str:
     return f"the darkest place has {seen.min() / seen.max():.1%} of the brightest's light, in a map of {rows} x {columns}"
 
 
-def _mag(found: Map, dots: Dots) -> tuple[FloatArray, FloatArray]:
+def _mag(found: UniformityMap, dots: DotLight) -> tuple[FloatArray, FloatArray]:
     """Of the dots that count: how much fainter each is than the brightest place, and than the map has it, magnitudes."""
     light, mapped = (dots.light / np.median(dots.light))[found.used], found.at_dots[found.used]
     return np.asarray(magnitude(light / mapped.max())), np.asarray(magnitude(light / mapped))
 
 
-def _named(room: Room, path: Path) -> tuple[Change, ...]:
-    name, before = os.path.relpath(path, room.file.folder), room.file.config.monitor.calibration
-    return () if before == name else (Change(table="monitor", key="calibration", before=before, after=name),)
+def _named(context: StepContext, path: Path) -> tuple[KeyChange, ...]:
+    name, before = os.path.relpath(path, context.file.folder), context.file.config.monitor.calibration
+    return () if before == name else (KeyChange(table="monitor", key="calibration", before=before, after=name),)
 
 
-def _figures(room: Room, dots: Dots, found: Map, against: Map) -> dict[str, Figure]:
+def _figures(context: StepContext, dots: DotLight, found: UniformityMap, against: UniformityMap) -> dict[str, Figure]:
     seen = found.at_dots[found.used]
     figures: dict[str, Figure] = {
         "dots": len(dots.light),
@@ -132,51 +134,51 @@ def _figures(room: Room, dots: Dots, found: Map, against: Map) -> dict[str, Figu
         "left_rms_mag": found.left_mag,
         "dot_noise_mag": dots.noise_mag,
     }
-    if room.truth is not None:
-        monitor = room.truth.config.monitor
-        true = load_calibration(calibration_source(room.truth), monitor.bits).uniformity_map(monitor.resolution_px)
-        if room.truth.config.monitor.resolution_px == room.resolution_px:
+    if context.truth is not None:
+        monitor = context.truth.config.monitor
+        true = load_calibration(calibration_source(context.truth), monitor.bits).uniformity_map(monitor.resolution_px)
+        if context.truth.config.monitor.resolution_px == context.resolution_px:
             its = np.ones(len(dots.light)) if true is None else true[dots.y, dots.x].astype(np.float64)
             figures["truth_rms_mag"] = float(np.std(magnitude(found.at_dots / its)))
     return figures
 
 
-def see_dots(room: Room) -> tuple[Dots, tuple[Path, ...]]:
+def see_dots(context: StepContext) -> tuple[DotLight, tuple[Path, ...]]:
     """The light of dots on lattices over the whole screen, and the images. Raises InputError where too few are seen whole."""
-    geometry, code = room.real_geometry(), int(room.known.get("focus.dot_code", 0)) or sharp_dots(room)[0]
+    geometry, code = context.real_geometry(), int(context.known.get("focus.dot_code", 0)) or sharp_dots(context)[0]
     ratio = geometry.tracker.focal_length_px / geometry.monitor.focal_length_px
-    psf_px = float(room.known.get("focus.psf_sigma_px", np.mean(room.file.config.tracker.psf_sigma_px)))
+    psf_px = float(context.known.get("focus.psf_sigma_px", np.mean(context.file.config.tracker.psf_sigma_px)))
     sigma_px = math.hypot(psf_px, DOT_PX * ratio / math.sqrt(12))
     apart_px = max(APART_TRACKER_PX, APART_SIGMAS * sigma_px) / ratio
-    period = max(math.ceil(apart_px / 2) * 2, math.ceil(max(room.resolution_px) / MAX_DOTS / 2) * 2)
+    period = max(math.ceil(apart_px / 2) * 2, math.ceil(max(context.resolution_px) / MAX_DOTS / 2) * 2)
     reach = min(REACH * period, REACH_SIGMAS * sigma_px / ratio)
     width, height = geometry.tracker.resolution_px
     y, x = np.mgrid[0:height, 0:width]
     seen = np.stack(geometry.to_monitor(x.ravel().astype(np.float64), y.ravel().astype(np.float64)))
-    dark_path = room.dark()
-    dark = room.read(dark_path)
-    bad = dark > HOT_FILL * room.full_dn
+    dark_path = context.dark()
+    dark = context.read(dark_path)
+    bad = dark > HOT_FILL * context.full_dn
     bad[[0, -1]], bad[:, [0, -1]] = True, True  # a dot that reaches the detector's edge has lost light
     parts, paths, noise_dn = [], [dark_path], 0.0
     for number, shift in enumerate(SHIFTS):
         firsts = [period // 2 + period // 2 * half for half in shift]
-        looked = room.look(Pattern(f"lattice_{number:03}", _shown(firsts, period, code, room.resolution_px)), dark)
+        looked = context.look(Pattern(f"lattice_{number:03}", _shown(firsts, period, code, context.resolution_px)), dark)
         paths.append(looked.path)
-        if room.is_too_bright(looked):
+        if context.is_too_bright(looked):
             raise InputError(f"dots of code {code} saturate the tracker; run the focus again (--again focus), then this step")
         noise_dn = noisiest_background(looked.image).noise
-        parts.append(_sums(_Lattice(firsts, period, reach), room.resolution_px, seen, looked.image, bad))
+        parts.append(_sums(_Lattice(firsts, period, reach), context.resolution_px, seen, looked.image, bad))
     columns, rows, light = (np.concatenate(part) for part in zip(*parts, strict=True))
     lit = light > 0
     if lit.sum() < MIN_DOTS:
         raise InputError(f"{int(lit.sum())} dots are seen whole and {MIN_DOTS} are needed; look at the geometry and the focus")
-    detector = room.file.config.tracker.detector
+    detector = context.file.config.tracker.detector
     dn = float(np.median(light[lit]))
     pixels = math.pi * (reach * ratio) ** 2
     # A dark frame has the noise of an image; PRNU counts by how many pixels share a dot.
     shared = detector.prnu**2 / (4 * math.pi * sigma_px**2)
     noise = math.sqrt((dn / detector.gain_e_per_dn + 2 * pixels * noise_dn**2) / dn**2 + shared)
-    return Dots(columns[lit], rows[lit], light[lit], MAG_PER_RELATIVE * noise), tuple(paths)
+    return DotLight(columns[lit], rows[lit], light[lit], MAG_PER_RELATIVE * noise), tuple(paths)
 
 
 def _shown(firsts: list[int], period: int, code: int, resolution_px: tuple[int, int]) -> CodeImage:
@@ -219,7 +221,7 @@ def _sums(
     return firsts[0] + which % counts[0] * period, firsts[1] + which // counts[0] * period, light[which]
 
 
-def map_of(dots: Dots, light: FloatArray, resolution_px: tuple[int, int]) -> Map:
+def map_of(dots: DotLight, light: FloatArray, resolution_px: tuple[int, int]) -> UniformityMap:
     """The simplest map that light (n,) at the dots needs: one field, or the grid after which no finer one is surely better."""
     width, height = resolution_px
     shapes = [(1, 1), *((rows, max(round(rows * width / height), 1)) for rows in ROWS)]
@@ -234,10 +236,10 @@ def map_of(dots: Dots, light: FloatArray, resolution_px: tuple[int, int]) -> Map
     place = next(k for k, each in enumerate(worse) if each.mean() <= SURE * each.std() / math.sqrt(len(each)))
     grid = _fitted(relative[used], designs[place][used], shapes[place])
     left = MAG_PER_RELATIVE * math.sqrt(float(squares[place][used].mean()))
-    return Map(grid.reshape(shapes[place]), designs[place] @ grid, left, used)
+    return UniformityMap(grid.reshape(shapes[place]), designs[place] @ grid, left, used)
 
 
-def _design(dots: Dots, shape: tuple[int, int], resolution_px: tuple[int, int]) -> Any:
+def _design(dots: DotLight, shape: tuple[int, int], resolution_px: tuple[int, int]) -> Any:
     """The weight of each field at each dot (n, fields), sparse: as a calibration's map has it."""
     from scipy.sparse import csr_array
 
@@ -284,3 +286,18 @@ def _held_out(light: FloatArray, design: Any, shape: tuple[int, int], used: Bool
         out, kept = fold == each, used & (fold != each)
         squares[out] = (light[out] / (design[out] @ _fitted(light[kept], design[kept], shape)) - 1) ** 2
     return squares
+
+
+def draw_uniformity(path: Path, place: FloatArray, mag: tuple[FloatArray, FloatArray], finding: str) -> None:
+    """Dots at places (n, 2) of the screen: how much fainter each is than the brightest place, and than the map has it (n,)."""
+    names = "fainter than the brightest place [mag]", "fainter than the map has it [mag]"
+    with chart(path, finding, panels=2) as both:
+        for axes, off_mag, name in zip(both, mag, names, strict=True):
+            low, high = (float(value) for value in np.percentile(off_mag, (0.5, 99.5)))
+            dots = axes.scatter(
+                place[:, 0], place[:, 1], c=off_mag, s=8, cmap="viridis_r", vmin=low, vmax=max(high, low + 1e-4)
+            )
+            axes.figure.colorbar(dots, ax=axes, label=name)
+            axes.set(aspect="equal", ylabel="monitor y [px]")
+            axes.invert_yaxis()
+        both[-1].set_xlabel("monitor x [px]")

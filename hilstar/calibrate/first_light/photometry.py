@@ -1,0 +1,448 @@
+"""The step of photometry: the tracker as a photometer, by dots on lattices that do not saturate it."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.special import ndtr
+
+from hilstar.arrays import FloatArray
+from hilstar.bench.bench_file import BenchFile
+from hilstar.calibrate.first_light.context import HOT_FILL, MAX_FILL, StepContext
+from hilstar.calibrate.first_light.image_sources import CodeImage, Pattern, black, in_channel
+from hilstar.calibrate.first_light.records import Figure, KeyChange, StepOutcome
+from hilstar.calibrate.measurements import PRIMARIES
+from hilstar.calibrate.photometric import PhotometricSummary, Provenance, calibrate_photometric, draw_calibration
+from hilstar.calibrate.plan import Patch, PlanSettings, plan_patches
+from hilstar.charts import INK, MUTED, chart
+from hilstar.errors import InputError
+from hilstar.files import write_whole
+from hilstar.monitor.calibration import BUILT_IN, Calibration, add_uniformity, load_calibration, primary_lights
+from hilstar.monitor.response import Response
+from hilstar.twin.bench_geometry import BenchGeometry
+from hilstar.units import MAG_PER_RELATIVE, magnitude
+
+SHARE = 0.5  # of the smaller side of what both screen and tracker have
+MAX_SIDE_TRACKER_PX = 200.0
+APART_TRACKER_PX = 8.0  # of the sparsest lattice's dots: their wings do not add up
+MIN_DOTS = 4  # along a side of the sparsest lattice
+MARGIN_SIGMAS, MARGIN_PX = 6.0, 3.0
+PHASES = 24
+
+
+@dataclass(frozen=True, slots=True)
+class DotField:
+    """A square of the monitor (left, top, side; px) and the part of the tracker's image that has its light (slices).
+
+    `monitor_px` is how many of the monitor's pixels stand in that part.
+    """
+
+    left: int
+    top: int
+    side: int
+    rows: slice
+    columns: slice
+    monitor_px: float
+
+    def lattice(self, resolution_px: tuple[int, int], period: int, patch: Patch) -> CodeImage:
+        """Each `period`-th pixel of the square, across and down, in a patch's code and channel; from its cell's middle on."""
+        codes = black(resolution_px)
+        first = period // 2
+        inside = codes[self.top : self.top + self.side, self.left : self.left + self.side]
+        inside[first::period, first::period] = patch.code
+        return in_channel(codes, patch.channel)
+
+    def lit(self, period: int) -> int:
+        """How many pixels such a lattice has."""
+        return (self.side // period) ** 2
+
+
+def field_for(geometry: BenchGeometry, sigma_px: float) -> tuple[DotField, tuple[int, ...]]:
+    """Where lattices are shown, and their periods, dense to sparse; `sigma_px` is the tracker's PSF.
+
+    Raises InputError where too little of the monitor is seen.
+    """
+    ratio = geometry.tracker.focal_length_px / geometry.monitor.focal_length_px
+    sides = *(ratio * size for size in geometry.monitor.resolution_px), *geometry.tracker.resolution_px
+    side = min(SHARE * min(sides), MAX_SIDE_TRACKER_PX) / ratio
+    sparsest = 2 ** math.ceil(math.log2(max(APART_TRACKER_PX / ratio, 1.0)))
+    cells = int(side // sparsest)
+    if cells < MIN_DOTS:
+        raise InputError("the tracker sees too little of the monitor for the response; look at focal lengths and pixel pitches")
+    (x,), (y,) = geometry.to_monitor(*(np.array([(size - 1) / 2]) for size in geometry.tracker.resolution_px))
+    places = zip((x, y), geometry.monitor.resolution_px, strict=True)
+    left, top = (_within(middle, cells * sparsest, size) for middle, size in places)
+    margin = MARGIN_PX + MARGIN_SIGMAS * math.hypot(sigma_px, ratio / math.sqrt(12))
+    rows, columns = _seen(geometry, (left, top), cells * sparsest, margin)
+    area = (rows.stop - rows.start) * (columns.stop - columns.start)
+    periods = tuple(2**power for power in range(int(math.log2(sparsest)) + 1))
+    return DotField(left, top, cells * sparsest, rows, columns, area / ratio**2), periods
+
+
+def _within(middle: float, side: int, size: int) -> int:
+    """The first pixel of a side about the middle of what is seen, within the screen."""
+    wanted = middle if math.isfinite(middle) else (size - 1) / 2
+    return int(np.clip(round(wanted - (side - 1) / 2), 0, size - side))
+
+
+def _seen(geometry: BenchGeometry, corner: tuple[int, int], side: int, margin: float) -> tuple[slice, slice]:
+    """The rows and columns of the tracker's image that the square's border and its wings fall on."""
+    along = np.linspace(0, side - 1, 33)
+    low, high = np.zeros_like(along), np.full_like(along, side - 1)
+    x = corner[0] + np.concatenate([along, along, low, high])
+    y = corner[1] + np.concatenate([low, high, along, along])
+    seen = geometry.to_tracker(x, y)
+    if not all(np.isfinite(part).all() for part in seen):
+        raise InputError("the middle of the tracker's field sees no screen; run the geometry again")
+    ends = []
+    for part, size in zip(seen, geometry.tracker.resolution_px, strict=True):
+        first, last = math.floor(part.min() - margin), math.ceil(part.max() + margin) + 1
+        if first < 0 or last > size:
+            raise InputError("the dots are not whole in the tracker's field; look at [collimator] and run the geometry again")
+        ends.append(slice(first, last))
+    return ends[1], ends[0]
+
+
+def peak_shares(periods: tuple[int, ...], ratio: float, sigma_px: float) -> FloatArray:
+    """Of one lit pixel's light, what the brightest tracker pixel has under each lattice; `ratio` tracker px a monitor px."""
+    sigma = math.hypot(sigma_px, ratio / math.sqrt(12))
+    shares = []
+    for period in periods:
+        step = period * ratio
+        reach = np.arange(-math.ceil(MARGIN_SIGMAS * sigma / step) - 1, math.ceil(MARGIN_SIGMAS * sigma / step) + 2) * step
+        phase = np.linspace(-0.5, 0.5, PHASES)[:, None] * step + reach
+        along = (ndtr((phase + 0.5) / sigma) - ndtr((phase - 0.5) / sigma)).sum(axis=1)
+        shares.append(float(along.max()) ** 2)
+    return np.array(shares)
+
+
+FILL = 0.5  # of the tracker's range: what a lattice is chosen for
+LESS = 4.0  # by which the exposure is shortened while white saturates
+MAX_PROBES = 10
+BLACK = Patch(0, "w")
+
+
+@dataclass(frozen=True, slots=True)
+class LatticeRatio:
+    """How much brighter a lit pixel is by its dense lattice than by its sparse one, both of one code: 1 where light adds up."""
+
+    patch: Patch
+    dense: int
+    sparse: int
+    ratio: float
+
+
+@dataclass(frozen=True, slots=True)
+class Readings:
+    """Light (n,) of a lit pixel of each patch with the black level, DN/s, the exposure, and how lattices agree.
+
+    `black_known` says that the black level was measured; else it is the bench file's share of white.
+    """
+
+    patches: list[Patch]
+    light: FloatArray
+    exposure_s: float
+    links: list[LatticeRatio]
+    black_known: bool
+    images: tuple[Path, ...]
+
+    def write(self, path: Path) -> None:
+        """MEASURED.csv, as `calibrate photometric` reads it. Raises InputError."""
+        head = [f"# light of one monitor pixel in the tracker, DN/s, by dots on lattices; exposed for {self.exposure_s:.6g} s"]
+        head += [
+            f"# code {link.patch.code} of {link.patch.channel}: a pixel of every {link.dense} is {link.ratio:.5f} times"
+            f" one of every {link.sparse}"
+            for link in self.links
+        ]
+        rows = [
+            f"{order},{patch.code},{patch.channel},{value!r}"
+            for order, (patch, value) in enumerate(zip(self.patches, self.light.tolist(), strict=True), start=1)
+        ]
+        write_whole(path, "\n".join([*head, "order,code,channel,value", *rows]) + "\n")
+
+
+@dataclass(frozen=True, slots=True)
+class Assumed:
+    """Light above black by channel and code (2^bits,), relative to white, and the black level: as the bench file has them."""
+
+    light: dict[str, FloatArray]
+    black: float
+
+
+class Photometer:
+    """Lattices before the tracker. Raises InputError where they cannot be seen whole."""
+
+    def __init__(self, context: StepContext, sigma_px: float, assumed: Assumed) -> None:
+        geometry = context.real_geometry()
+        self.context, self.assumed = context, assumed
+        self.field, self.periods = field_for(geometry, sigma_px)
+        self.shares = peak_shares(self.periods, geometry.tracker.focal_length_px / geometry.monitor.focal_length_px, sigma_px)
+        self.exposure_s = context.exposure_s
+        self._dark_screen = context.take(Pattern("black_screen", black(context.resolution_px)))
+        self.images = [self._dark_screen]
+        self._cold = self._part(self._dark_screen) < HOT_FILL * context.full_dn
+
+    def read(self, planned: list[Patch]) -> Readings:
+        """Show the planned patches and read them. Raises InputError where the tracker cannot take white."""
+        white_dn = self._expose()
+        chosen = {patch: self._period(patch, white_dn) for patch in planned if patch.code}
+        sums: list[float] = []
+        for order, patch in enumerate(planned):
+            while True:
+                period = chosen.get(patch, 1)
+                total, fill = self._look(f"patch_{order:03}_{period}", period, patch)
+                if fill <= MAX_FILL or period == self.periods[-1]:
+                    break
+                chosen[patch] = 2 * period  # brighter than the bench file has it
+            sums.append(total)
+        links = [link for channel in self.assumed.light for link in self._links(channel, chosen)]
+        light, black_known = self._light(planned, np.array(sums), chosen, links)
+        return Readings(planned, light, self.exposure_s, links, black_known, tuple(self.images))
+
+    def _expose(self) -> float:
+        """Choose the exposure: the bench file's, or one in which white does not saturate; the peak of a white dot, DN."""
+        white = self._brightest()
+        for probe in range(MAX_PROBES):
+            fill = self._look(f"white_{probe:02}", self.periods[-1], white)[1]
+            if fill <= MAX_FILL:
+                break
+            if not self.context.source.sets_exposure:
+                raise InputError(
+                    f"one pixel at white saturates the tracker in {self.exposure_s:g} s: let --grab set the exposure"
+                    " ({exposure_s}), turn the monitor's brightness down, or use a photometer (hilstar calibrate plan)"
+                )
+            self.exposure_s /= LESS
+        else:
+            raise InputError(f"one pixel at white saturates the tracker even in {self.exposure_s:.2g} s; look at stray light")
+        if probe:
+            self.exposure_s *= FILL / fill
+        dark = self._part(self._take("black", 1, BLACK))
+        bright = self._part(self._take("white", self.periods[-1], white))
+        share = float(self.assumed.light[white.channel][white.code])
+        return float((bright - dark)[self._cold].max(initial=1.0)) / share
+
+    def _brightest(self) -> Patch:
+        """White of the brightest channel."""
+        return Patch(self.context.white, max(self.assumed.light, key=lambda name: float(self.assumed.light[name][-1])))
+
+    def _period(self, patch: Patch, white_dn: float) -> int:
+        """The densest lattice that a patch may have, by the response that the bench file assumes."""
+        peaks = white_dn * self.assumed.light[patch.channel][patch.code] * self.shares / self.shares[-1]
+        fits = np.flatnonzero(peaks <= FILL * self.context.full_dn)
+        return self.periods[int(fits[0])] if len(fits) else self.periods[-1]
+
+    def _links(self, channel: str, chosen: dict[Patch, int]) -> Iterator[LatticeRatio]:
+        """A code's dot by two lattices, for each two that follow each other in a channel."""
+        periods = {patch: period for patch, period in chosen.items() if patch.channel == channel}
+        dark = self._look(f"black_link_{channel}", 1, BLACK)[0]
+        for dense, sparse in itertools.pairwise(sorted({*periods.values(), self.periods[-1]})):
+            patch = max(patch for patch, period in periods.items() if period == dense)
+            dots = [
+                (self._look(f"link_{channel}_{sparse}_{period}", period, patch)[0] - dark) / self.field.lit(period)
+                for period in (dense, sparse)
+            ]
+            if dots[1] <= 0:
+                raise InputError(f"dots of code {patch.code} have no light in the tracker; look at what the screen shows")
+            yield LatticeRatio(patch, dense, sparse, dots[0] / dots[1])
+
+    def _light(
+        self, planned: list[Patch], sums: FloatArray, chosen: dict[Patch, int], links: list[LatticeRatio]
+    ) -> tuple[FloatArray, bool]:
+        """Light (n,) of a pixel of each patch, black level included, DN/s, by the sparsest lattice; if black was measured."""
+        order, dark = np.arange(len(planned)), np.array([patch.code == 0 for patch in planned])
+        under = np.interp(order, order[dark], sums[dark])
+        factor = {(channel, self.periods[-1]): 1.0 for channel in self.assumed.light}
+        for link in reversed(links):
+            channel = link.patch.channel
+            factor[channel, link.dense] = factor[channel, link.sparse] * link.ratio
+        periods = [chosen.get(patch, self.periods[-1]) for patch in planned]
+        lit = [self.field.lit(p) * factor[patch.channel, p] for patch, p in zip(planned, periods, strict=True)]
+        light = (sums - under) / (np.array(lit) * self.exposure_s)
+        # Of a black screen each pixel has its light; its repeats tell how well it is known.
+        light[dark] = (sums[dark] - sums[dark].mean()) / (self.field.monitor_px * self.exposure_s)
+        glow = self._glow()
+        if glow is not None:
+            return np.maximum(light + glow, 0.0), True
+        whites = [light[[patch == Patch(self.context.white, name) for patch in planned]].mean() for name in self.assumed.light]
+        return np.maximum(light + self.assumed.black * float(np.sum(whites)), 0.0), False
+
+    def _glow(self) -> float | None:
+        """The light of a black pixel, DN/s: a black screen against one that is switched off, at the bench file's exposure."""
+        unlit = self.context.unlit()
+        if unlit is None:
+            return None
+        self.images.append(unlit)
+        more = float((self._part(self._dark_screen) - self._part(unlit)).sum())
+        return max(more / (self.field.monitor_px * self.context.exposure_s), 0.0)
+
+    def _look(self, name: str, period: int, patch: Patch) -> tuple[float, float]:
+        """The sum over the field of a lattice, DN, and how full its brightest pixel is."""
+        part = self._part(self._take(name, period, patch))
+        return float(part.sum()), float(part[self._cold].max(initial=0.0)) / self.context.full_dn
+
+    def _take(self, name: str, period: int, patch: Patch) -> Path:
+        pattern = Pattern(name, self.field.lattice(self.context.resolution_px, period, patch))
+        self.images.append(self.context.take(pattern, self.exposure_s))
+        return self.images[-1]
+
+    def _part(self, path: Path) -> FloatArray:
+        return self.context.read(path)[self.field.rows, self.field.columns]
+
+
+SEED = 0
+PHOTOMETRY_FILES = ("measured.csv", "response.toml", "response.png", "response-before.png")
+MIN_LEVELS = 10  # as `calibrate photometric` needs
+DIM_LIGHT = 1e-3  # of white: how far down responses are compared
+
+
+def photometry(context: StepContext) -> StepOutcome:
+    """Measure the response and name its file in the bench file. Raises InputError."""
+    monitor = context.file.config.monitor
+    if not context.patches:
+        how = "give --patches N, or use a photometer (`hilstar calibrate plan --show`, then `hilstar calibrate photometric`)"
+        return StepOutcome("skipped", f"not measured, the bench file's {monitor.calibration} stays: {how}")
+    assumed = calibration_of(context)
+    sigma_px = float(context.known.get("focus.psf_sigma_px", np.mean(context.file.config.tracker.psf_sigma_px)))
+    channels = "".join(PRIMARIES) if context.file.config.render.bit_stealing else "w"
+    planned = plan_for(monitor.bits, context.patches, channels)
+    readings = Photometer(context, sigma_px, _assumed(context, assumed, channels)).read(planned)
+    measured, output, picture, before = (context.session / name for name in PHOTOMETRY_FILES)
+    readings.write(measured)
+    instrument = f"the tracker, exposed for {readings.exposure_s:.4g} s, hilstar first-light"
+    found = calibrate_photometric(measured, output, Provenance("", "", instrument, "DN/s"), monitor.bits)
+    files = [output, output.with_suffix(".csv"), measured, picture, before, *readings.images]
+    if assumed.uniformity is not None:
+        files.append(add_uniformity(output, assumed.uniformity))
+    draw_calibration(measured, picture, monitor.bits)
+    written = load_calibration(output, monitor.bits)
+    now = written.response
+    figures = _response_figures(context, readings, found, assumed.response, now)
+    if written.weights is not None:
+        figures["shares_of_white"] = ", ".join(f"{n} {share:.4f}" for n, share in zip(channels, written.weights, strict=True))
+    off = f"{figures['bench_file_off_rms_mag']:.3f} mag rms, {figures['bench_file_off_max_mag']:.3f} max"
+    draw_response_error(before, now, response_error_mag(assumed.response, now), f"The bench file's response is off by {off}")
+    return _judged(context, figures, tuple(dict.fromkeys(files)), (picture, before))
+
+
+def _assumed(context: StepContext, calibration: Calibration, channels: str) -> Assumed:
+    """What the bench file says of each channel."""
+    if channels == "w":
+        return Assumed({"w": calibration.response.light}, calibration.response.black)
+    lights = primary_lights(calibration_source(context.file), context.file.config.monitor.bits)
+    return Assumed(dict(zip(channels, lights, strict=True)), calibration.response.black)
+
+
+def plan_for(bits: int, patches: int, channels: str = "w") -> list[Patch]:
+    """The plan of the most levels that has no more than so many patches. Raises InputError where they are too few."""
+    best: list[Patch] = []
+    for levels in range(MIN_LEVELS, min(patches, 2**bits) + 1):
+        planned = plan_patches(PlanSettings(bits, levels, 1, channels), np.random.default_rng(SEED))
+        if len(planned) <= patches:
+            best = planned
+    if not best:
+        fewest = len(plan_patches(PlanSettings(bits, MIN_LEVELS, 1, channels), np.random.default_rng(SEED)))
+        raise InputError(f"--patches {patches}: a response needs {fewest} or more; write that, or 0 for none")
+    return best
+
+
+def calibration_of(context: StepContext) -> Calibration:
+    """The monitor's light as the bench file has it, code by code."""
+    return load_calibration(calibration_source(context.file), context.file.config.monitor.bits)
+
+
+def calibration_source(file: BenchFile) -> str | Path:
+    """What [monitor] calibration names: a built-in name, or a path."""
+    name = file.config.monitor.calibration
+    return name if name in BUILT_IN else file.folder / name
+
+
+def _response_figures(
+    context: StepContext, readings: Readings, found: PhotometricSummary, before: Response, now: Response
+) -> dict[str, Figure]:
+    off = response_error_mag(before, now)
+    first = found.first
+    figures: dict[str, Figure] = {
+        "gamma": exponent(now),
+        "gamma_in_bench_file": exponent(before),
+        "bench_file_off_rms_mag": float(np.sqrt((off**2).mean())),
+        "bench_file_off_max_mag": float(np.abs(off).max()),
+        "black_level": now.black,
+        "black_level_in_bench_file": before.black,
+        "black_level_measured": "yes" if readings.black_known else "no: give --dark, an image with the monitor switched off",
+        "held_out_rms_mag": max(each.holdout.rms_mag for each in found.channels.values()),
+        "held_out_p95_mag": max(MAG_PER_RELATIVE * each.holdout.p95_percent / 100 for each in found.channels.values()),
+        "held_out_max_mag": max(each.holdout.max_mag for each in found.channels.values()),
+        "noise_percent": 100 * found.noise_relative,
+        "drift_percent": float("nan") if found.drift_percent is None else found.drift_percent,
+        "patches": len(readings.patches),
+        "codes": first.codes,
+        "exposure_s": readings.exposure_s,
+        "links": ", ".join(f"{link.ratio:.4f}" for link in readings.links) or "none",
+        "links_max_mag": max((abs(float(magnitude(link.ratio))) for link in readings.links), default=0.0),
+        **{f"error_at_{decade}_percent": value for decade, value in first.error_percent.items()},
+    }
+    if context.truth is not None:
+        true = load_calibration(calibration_source(context.truth), context.truth.config.monitor.bits).response
+        figures["truth_max_mag"] = float(np.abs(response_error_mag(now, true)).max())
+        figures["truth_black_level"] = true.black
+    return figures
+
+
+def _judged(
+    context: StepContext, figures: dict[str, Figure], files: tuple[Path, ...], pictures: tuple[Path, ...]
+) -> StepOutcome:
+    """Done, with the response named in the bench file, unless it is not known as well as [verify] needs it."""
+    limit_mag = context.file.config.verify.flux_mag
+    monitor = context.file.config.monitor
+    line = (
+        f"the bench file's {monitor.calibration} is off by {figures['bench_file_off_rms_mag']:.3f} mag rms,"
+        f" {figures['bench_file_off_max_mag']:.3f} max (gamma {figures['gamma']:.3f}, not"
+        f" {figures['gamma_in_bench_file']:.3f});"
+        f" measured: held-out levels {figures['held_out_rms_mag']:.4f} mag rms, {figures['held_out_max_mag']:.4f} max;"
+        f" black {figures['black_level']:.2e} of white"
+        f"{'' if figures['black_level_measured'] == 'yes' else ' as the bench file has it, not measured (--dark)'}"
+    )
+    if float(figures["links_max_mag"]) > limit_mag:
+        why = "switch off dynamic contrast and local dimming, or is the tracker not linear?"
+        line = f"dense and sparse dots of one code differ by {figures['links_max_mag']:.3f} mag: {why}"
+        return StepOutcome("failed", line, figures, files, pictures)
+    if float(figures["held_out_p95_mag"]) > limit_mag:
+        why = "take more readings (--patches), look at stray light, and at whether the monitor was warm"
+        return StepOutcome("failed", f"{line}: the levels do not make one smooth response; {why}", figures, files, pictures)
+    name = os.path.relpath(context.session / "response.toml", context.file.folder)
+    changes = (
+        ()
+        if monitor.calibration == name
+        else (KeyChange(table="monitor", key="calibration", before=monitor.calibration, after=name),)
+    )
+    return StepOutcome("done", line, figures, files, pictures, changes)
+
+
+def response_error_mag(assumed: Response, true: Response) -> FloatArray:
+    """How much fainter the codes really are (n,), magnitudes, from three decades below white up to it; both code by code."""
+    seen = true.light[1:] >= DIM_LIGHT
+    return np.asarray(magnitude(true.light[1:][seen] / assumed.light[1:][seen]))
+
+
+def exponent(response: Response) -> float:
+    """The power of the signal that the light follows, fitted to its logarithm over three decades."""
+    light = response.light[1:]
+    used = light >= DIM_LIGHT
+    signal = np.arange(1, len(response.light))[used] / response.white
+    return float(np.polyfit(np.log(signal), np.log(light[used]), 1)[0])
+
+
+def draw_response_error(path: Path, response: Response, off_mag: FloatArray, finding: str) -> None:
+    """How much fainter the brightest codes are than assumed (n,), magnitudes, over their measured light."""
+    with chart(path, finding) as (axes,):
+        axes.plot(response.light[-len(off_mag) :], off_mag, color=INK)
+        axes.axhline(0, color=MUTED, linewidth=0.8)
+        axes.set_xscale("log")
+        axes.set(xlabel="measured light over white [share]", ylabel="fainter than in the bench file [mag]")
+        axes.invert_yaxis()

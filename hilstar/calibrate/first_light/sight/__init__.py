@@ -1,1 +1,0 @@
-"""Where a session's images come from: a command, a person, or the twin; and the display that shows its patterns."""

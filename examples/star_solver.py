@@ -16,8 +16,8 @@ import numpy.typing as npt
 from scipy.spatial import KDTree
 
 from hilstar.rotation import from_matrix
-from hilstar.sky.astrometry import unit_vectors_icrs
 from hilstar.sky.catalog import load_catalog
+from hilstar.sky.stars import unit_vectors_icrs
 from hilstar.tracker.centroids import find_stars
 
 Array = npt.NDArray[np.float64]

@@ -15,7 +15,7 @@ from hilstar.errors import InputError
 from hilstar.monitor.calibration import BUILT_IN
 from hilstar.reading import MAX_TOML_BYTES, read_bytes, read_text
 from hilstar.sky.spectrum import BUILT_IN_CURVES
-from hilstar.sky.tables.store import file_sha256
+from hilstar.sky.star_table import file_sha256
 
 MAX_NAMED_BYTES = 100_000_000
 

@@ -26,12 +26,10 @@ from hilstar.render.context import Context, create_context, has_compute
 from hilstar.render.renderer import Renderer, Target
 from hilstar.scene.camera import Camera
 from hilstar.scene.psf import peak_share
-from hilstar.sky.astrometry import aberrate, unit_vectors_icrs
-from hilstar.sky.electrons import Optics, Photometry, star_temperatures_k, tabulate
-from hilstar.sky.pickles import tabulate_pickles
+from hilstar.sky.electrons import Optics, Photometry, star_temperatures_k, tabulate, tabulate_pickles
 from hilstar.sky.spectrum import load_curve
-from hilstar.sky.stars import Stars, make_stars, split_by_rate
-from hilstar.sky.tables.star_table import Choice, choose_catalog
+from hilstar.sky.star_table import Choice, choose_catalog
+from hilstar.sky.stars import Stars, aberrate, make_stars, split_by_rate, unit_vectors_icrs
 
 if TYPE_CHECKING:
     from hilstar.sky.bodies.moving import MovingSky

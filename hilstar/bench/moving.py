@@ -11,12 +11,11 @@ from hilstar.bench.discs import POINT_PX
 from hilstar.bench.satellites import bench_satellites
 from hilstar.reading import read_text
 from hilstar.scene.camera import Camera
-from hilstar.sky.bodies.earth import EARTH
+from hilstar.sky.bodies.disc import EARTH
 from hilstar.sky.bodies.kernel import Kernel
+from hilstar.sky.bodies.light import bodies_bv_mag, bodies_electrons_per_s
 from hilstar.sky.bodies.moving import PLANETS, YEAR_NS, BodyLight, MovingSky
-from hilstar.sky.bodies.oem import VERSION_KEY, OemOrbit
-from hilstar.sky.bodies.orbit import TLE_ADVICE, Geocentre, Orbit, TleOrbit
-from hilstar.sky.bodies.spectra import bodies_bv_mag, bodies_electrons_per_s
+from hilstar.sky.bodies.orbit import TLE_ADVICE, VERSION_KEY, Geocentre, OemOrbit, Orbit, TleOrbit
 from hilstar.sky.electrons import Optics, Photometry
 from hilstar.units import ARCSEC_PER_RAD
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from hilstar.sky.bodies.disc import Disc
     from hilstar.sky.bodies.moving import MovingSky
     from hilstar.sky.bodies.orbit import Orbit
-    from hilstar.sky.bodies.satellites.passes import Pass, Satellites
+    from hilstar.sky.bodies.passes import Pass, Satellites
 
 MAX_LIST_BYTES, MAX_TABLE_BYTES = 20_000_000, 5_000_000  # 120 000 sets: several times as many as there are in orbit
 # Of all satellites in a frame and in an exposure; a frame's cost as much as 60 stars' paths of 16 px
@@ -41,21 +41,19 @@ def bench_satellites(
 
     Raises InputError for a list or a table that is wrong, MachineError without SGP4.
     """
-    from hilstar.sky.bodies.satellites.elements import ADVICE, read_satellites
-    from hilstar.sky.bodies.satellites.passes import Satellites
-    from hilstar.sky.bodies.satellites.table import ADVICE as TABLE_ADVICE
-    from hilstar.sky.bodies.satellites.table import brightness_of, read_table
-    from hilstar.sky.bodies.spectra import bodies_electrons_per_s
+    from hilstar.sky.bodies.light import bodies_electrons_per_s
+    from hilstar.sky.bodies.passes import Satellites
+    from hilstar.sky.bodies.satellites import LIST_FORM, TABLE_FORM, brightness_of, read_satellites, read_table
 
     sky, bodies, (zero_ns, start_ns) = config.sky, config.sky.bodies, zero_and_start_ns
     if bodies.satellites is None:
         return None
     path = folder / bodies.satellites
-    found = read_satellites(read_text(path, ADVICE, MAX_LIST_BYTES), str(path), start_ns)
+    found = read_satellites(read_text(path, LIST_FORM, MAX_LIST_BYTES), str(path), start_ns)
     rows = {}
     if bodies.satellite_magnitudes is not None:
         table = folder / bodies.satellite_magnitudes
-        rows = read_table(read_text(table, TABLE_ADVICE, MAX_TABLE_BYTES), str(table))
+        rows = read_table(read_text(table, TABLE_FORM, MAX_TABLE_BYTES), str(table))
     photometry = Photometry(sky.zero_point, sky.passband_weighting)
     v0_e_per_s = float(bodies_electrons_per_s(("Sun",), sky.brightness, optics, photometry)[0])
     brightness = brightness_of(found, rows, bodies.satellite_standard_mag, v0_e_per_s)
@@ -102,7 +100,7 @@ def with_satellites(
     """
     if sky is None or sky.satellites is None:
         return sprites
-    from hilstar.sky.bodies.satellites.passes import Cone
+    from hilstar.sky.bodies.passes import Cone
 
     camera, turn = shot.camera, shot.turn
     icrs_to_image = camera.cam_to_image @ to_matrix(turn.q_icrs_to_cam)
@@ -152,7 +150,7 @@ def satellite_discs(sky: MovingSky, stars: Stars, camera: Camera, q_icrs_to_cam:
     """The satellites on a camera's image at rest that are discs; `stars` are those of the sky as seen at that moment."""
     if sky.satellites is None:
         return []
-    from hilstar.sky.bodies.satellites.passes import Cone
+    from hilstar.sky.bodies.passes import Cone
 
     icrs_to_image = camera.cam_to_image @ to_matrix(q_icrs_to_cam)
     cone = Cone(icrs_to_image[2], camera.field_radius_rad(0.0), 0.0)
@@ -183,7 +181,7 @@ def satellite_lines(sky: MovingSky | None, t_ns: int | None) -> list[str]:
 
 def satellites_now(stars: Stars, sky: MovingSky, t_ns: int | None) -> None:
     """Put every satellite that has light at a moment into the arrays of `stars`, wherever it is in the sky."""
-    from hilstar.sky.bodies.satellites.passes import Cone
+    from hilstar.sky.bodies.passes import Cone
 
     seen = sky.passing(Cone(np.array([0.0, 0.0, 1.0]), np.pi, 0.0), t_ns)
     if seen is None or sky.satellites is None:

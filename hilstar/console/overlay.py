@@ -13,8 +13,7 @@ from hilstar.arrays import FloatArray
 from hilstar.bench.cameras import tracker_camera
 from hilstar.rotation import direction_of, to_matrix, to_radec_roll_deg
 from hilstar.scene.camera import Camera
-from hilstar.sky.catalog import load_catalog
-from hilstar.sky.names import label_of, star_names
+from hilstar.sky.catalog import label_of, load_catalog, star_names
 from hilstar.sky.stars import Stars
 
 if TYPE_CHECKING:

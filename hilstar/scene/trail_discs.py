@@ -18,7 +18,7 @@ from hilstar.scene.trails import SPACING_SIGMA, Brush, Lit, View, sprite_counts
 from hilstar.sky.bodies.disc import Disc
 
 if TYPE_CHECKING:
-    from hilstar.sky.bodies.satellites.passes import Pass
+    from hilstar.sky.bodies.passes import Pass
 
 STEPS_A_RADIUS = 4.0  # of a disc's places along its path: an edge of it is then uneven by 1 % of the radius
 AT_REST = np.array([1.0, 0.0, 0.0, 0.0])

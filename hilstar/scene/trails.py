@@ -17,7 +17,7 @@ from hilstar.scene.paths import Chords, Paths
 from hilstar.scene.sprites import Sprites, join_sprites, pack_sprites
 
 if TYPE_CHECKING:
-    from hilstar.sky.bodies.satellites.passes import Pass
+    from hilstar.sky.bodies.passes import Pass
 
 # Sprites so far apart make no pixel of a streak wrong by more than 1e-3 of the satellite's light (spacing^2 / 24 of the slope
 # of its end; tests/unit/scene/test_trails.py holds it).

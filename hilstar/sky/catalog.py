@@ -1,11 +1,16 @@
-"""The Hipparcos main catalogue (ESA SP-1200, CDS I/239): packaged, or read from a `hip_main.dat`."""
+"""The Hipparcos main catalogue (ESA SP-1200, CDS I/239): packaged, or read from a `hip_main.dat`.
+
+What people call bright stars: Bayer's letters, Flamsteed's numbers and proper names, by HIP number.
+"""
 
 from __future__ import annotations
 
 import csv
 import math
 from dataclasses import dataclass, fields, replace
+from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -48,6 +53,7 @@ TYCHO, TYC_REGION = "TYC", 1_000_000
 MAX_DIGITS = 19  # of a 64-bit identifier
 
 Letters = npt.NDArray[np.bytes_]
+STAR_NAMES = Path(__file__).resolve().parent / "data" / "star_names.csv"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -259,3 +265,24 @@ def unpack(columns: dict[str, npt.NDArray[np.int64]], rows_read: int) -> Catalog
             "separation_arcsec": values["separation_arcsec"].astype(np.float32),
         },
     )
+
+
+class StarName(NamedTuple):
+    """A star's designation ("α Ori", "51 Peg") and its proper name ("Betelgeuse"), each "" where it has none."""
+
+    designation: str
+    name: str
+
+
+@cache
+def star_names() -> dict[int, StarName]:
+    """The designations and names of 3300 stars by HIP number (see `data/make_star_names.py`)."""
+    with STAR_NAMES.open(encoding="utf-8", newline="") as file:
+        rows = csv.DictReader(line for line in file if not line.startswith("#"))
+        return {int(row["hip"]): StarName(row["designation"], row["name"]) for row in rows}
+
+
+def label_of(hip: int) -> str:
+    """What a chart writes beside a star: its designation, else its name, else its HIP number; "" without one."""
+    designation, name = star_names().get(hip, ("", ""))
+    return designation or name or (f"HIP {hip}" if hip else "")

@@ -12,8 +12,8 @@ from astropy.wcs import WCS
 
 from hilstar.bench.world_coordinates import world_coordinates
 from hilstar.rotation import from_radec_roll_deg, to_matrix
-from hilstar.sky.astrometry import aberrate, unit_vectors_icrs
 from hilstar.sky.catalog import Catalog, load_catalog, plain_catalog
+from hilstar.sky.stars import aberrate, unit_vectors_icrs
 from hilstar.units import LIGHT_KM_S
 
 MAS = np.pi / (180 * 3600 * 1000)

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from skyfield import magnitudelib
 
-from hilstar.sky.bodies import spectra
-from hilstar.sky.bodies.magnitudes import KM_PER_AU, body_v_mag, moon_v_mag, phase_angle_deg
+from hilstar.sky.bodies import light
+from hilstar.sky.bodies.light import KM_PER_AU, bodies_bv_mag, bodies_electrons_per_s, body_v_mag, moon_v_mag, phase_angle_deg
 from hilstar.sky.bodies.moving import PLANETS
-from hilstar.sky.bodies.spectra import bodies_bv_mag, bodies_electrons_per_s
 from hilstar.sky.electrons import Optics, Photometry
 from hilstar.sky.spectrum import BUILT_IN_CURVES, load_curve
 from tests.support.skies import ALL_BODIES, moving_sky, random_utcs_ns
@@ -130,7 +129,7 @@ def test_rates_by_the_paper_s_other_photometric_system_are_the_same(sensor, monk
     assert sensor in BUILT_IN_CURVES
     optics = Optics(30.0, load_curve(sensor, "qe"), load_curve(1.0, "transmission"))
     ours = bodies_electrons_per_s(PLANETS, "dgs", optics, Photometry())
-    monkeypatch.setattr(spectra, "BANDS_NM", SLOAN_NM)
-    monkeypatch.setattr(spectra, "ALBEDOS", SLOAN_ALBEDOS)
+    monkeypatch.setattr(light, "BANDS_NM", SLOAN_NM)
+    monkeypatch.setattr(light, "ALBEDOS", SLOAN_ALBEDOS)
     theirs = bodies_electrons_per_s(PLANETS, "dgs", optics, Photometry())
     assert np.abs(2.5 * np.log10(ours / theirs)).max() < SYSTEMS_MAG

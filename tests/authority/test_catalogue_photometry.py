@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilstar.sky.pickles import load_library
-from hilstar.sky.tables.photometry import bv_from_vi, from_gaia, from_tycho
+from hilstar.sky.electrons import load_library
+from hilstar.sky.table_reader import bv_from_vi, from_gaia, from_tycho
 
 HERE = Path(__file__).parent
 # Mamajek et al. 2002 state 0.006 mag in V and 0.009 in B-V; ground and Tycho scatter by 0.015 and 0.02

@@ -5,11 +5,13 @@ import pytest
 
 from hilstar.errors import InputError
 from hilstar.sky.catalog import load_catalog
-from hilstar.sky.electrons import Optics, Photometry, dgs_electrons_per_s
-from hilstar.sky.pickles import (
+from hilstar.sky.electrons import (
     MAX_BV_FIT_VI_MAG,
     PACKAGED_LIBRARY,
+    Optics,
+    Photometry,
     band_mean,
+    dgs_electrons_per_s,
     fit_table,
     library_electrons_per_s,
     load_library,

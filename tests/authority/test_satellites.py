@@ -10,10 +10,10 @@ from skyfield.api import EarthSatellite
 from skyfield.jpllib import SpiceKernel
 from skyfield.timelib import Time, Timescale
 
-from hilstar.sky.astrometry import aberrate
 from hilstar.sky.bodies.orbit import Geocentre, TleOrbit
-from hilstar.sky.bodies.satellites.light import sunlit_share
-from hilstar.sky.bodies.satellites.passes import Cone
+from hilstar.sky.bodies.passes import Cone
+from hilstar.sky.bodies.satellites import sunlit_share
+from hilstar.sky.stars import aberrate
 from tests.support.satellites import element_set, satellite_sky, some_orbits
 from tests.support.skies import STATION_TLE, STATION_UTC, moving_sky, skyfield, utc_ns
 
@@ -67,7 +67,7 @@ SHADOW_LIMIT_S = 0.3
 
 def test_the_shadow_of_a_sphere_begins_and_ends_when_skyfield_says(theirs, monkeypatch):
     """Each change of a low orbit in five turns, at half of the sunlight. Rays say what the flattening does (unit tests)."""
-    monkeypatch.setattr("hilstar.sky.bodies.satellites.light.EARTH_FLATTENING", 0.0)
+    monkeypatch.setattr("hilstar.sky.bodies.satellites.EARTH_FLATTENING", 0.0)
     scale, kernel = theirs
     text = element_set(7, (51.6416, 247.4627, 130.5360, 325.0288), 0.0006703, 15.5)
     start, low = utc_ns(STATION_UTC), in_skyfield(f"LOW\n{text}", scale)[0]

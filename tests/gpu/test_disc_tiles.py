@@ -13,9 +13,8 @@ from hilstar.render.tiles import AIR_SMOOTH, LEAST_PX, SMOOTH, disc_tiles
 from hilstar.scene.camera import Camera
 from hilstar.scene.extended import DiscLight, Shear
 from hilstar.scene.lens import Lens
-from hilstar.sky.bodies.disc import Disc
-from hilstar.sky.bodies.earth import EQUATOR_KM, earth_disc
-from hilstar.sky.bodies.magnitudes import KM_PER_AU
+from hilstar.sky.bodies.disc import EQUATOR_KM, Disc, earth_disc
+from hilstar.sky.bodies.light import KM_PER_AU
 from tests.support.stars import sprites_at
 
 SIZE, SIGMA = (300, 260), (0.85, 0.85)

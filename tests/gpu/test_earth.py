@@ -10,9 +10,8 @@ import pytest
 from hilstar.render.renderer import Renderer, Target
 from hilstar.scene.camera import Camera
 from hilstar.scene.discs import Pose, View, disc_lights
-from hilstar.sky.bodies.disc import Disc
-from hilstar.sky.bodies.earth import AIR, EQUATOR_KM, earth_disc
-from hilstar.sky.bodies.magnitudes import KM_PER_AU
+from hilstar.sky.bodies.disc import AIR, EQUATOR_KM, Disc, earth_disc
+from hilstar.sky.bodies.light import KM_PER_AU
 from tests.support.ray_traced.bodies import Body, lambert, limb
 from tests.support.ray_traced.image import edge_px, spread_image
 from tests.support.stars import sprites_at

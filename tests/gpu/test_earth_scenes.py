@@ -11,7 +11,7 @@ from hilstar.bench.build import load
 from hilstar.bench.discs import When
 from hilstar.bench.frame import Bench
 from hilstar.rotation import from_radec_roll_deg
-from hilstar.sky.bodies.earth import AIR, EQUATOR_KM, POLAR_KM
+from hilstar.sky.bodies.disc import AIR, EQUATOR_KM, POLAR_KM
 from tests.support.benches import bench_text
 from tests.support.ray_traced.bodies import Body, lambert, traced
 

@@ -14,8 +14,7 @@ from scipy.integrate import quad
 from hilstar.charts import TITLE_COLUMNS, title_lines
 from hilstar.sky import electrons
 from hilstar.sky.catalog import load_catalog
-from hilstar.sky.electrons import Photometry, tabulate
-from hilstar.sky.pickles import load_library, tabulate_pickles
+from hilstar.sky.electrons import Photometry, load_library, tabulate, tabulate_pickles
 from hilstar.sky.spectrum import DATA_DIR
 from hilstar.study.models.choices import running_percentiles
 from hilstar.study.models.rapp import rapp_ratios

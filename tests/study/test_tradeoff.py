@@ -14,9 +14,9 @@ from hilstar.render.reference import linear_image
 from hilstar.render.renderer import Target
 from hilstar.render.variants import SplatVariant, VariantRenderer
 from hilstar.scene.psf import MAX_CUT
-from hilstar.sky.cells import CELL_DEG
 from hilstar.sky.electrons import TABLE_DEGREE
 from hilstar.sky.spectrum import Curve
+from hilstar.sky.stars import CELL_DEG
 from hilstar.study.shared.codes import star_field
 from hilstar.study.tradeoff import run as tradeoff
 from hilstar.study.tradeoff import table as tradeoff_table

@@ -6,9 +6,8 @@ import numpy as np
 
 from hilstar.sky.bodies.moving import MovingSky
 from hilstar.sky.bodies.orbit import Orbit, TleOrbit
-from hilstar.sky.bodies.satellites.elements import read_satellites
-from hilstar.sky.bodies.satellites.passes import Satellites
-from hilstar.sky.bodies.satellites.table import brightness_of, read_table
+from hilstar.sky.bodies.passes import Satellites
+from hilstar.sky.bodies.satellites import brightness_of, read_satellites, read_table
 from tests.support.skies import STATION_TLE, STATION_UTC, moving_sky, utc_ns
 
 EPOCH = "08264.51782528"  # the station's

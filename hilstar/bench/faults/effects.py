@@ -15,8 +15,7 @@ from hilstar.rotation import propagate, to_matrix
 from hilstar.scene.extended import DiscLight, LightMap
 from hilstar.scene.frame_motion import Scan
 from hilstar.scene.sprites import AddedLight, Sprites, join_sprites
-from hilstar.sky.cells import CellGrid
-from hilstar.sky.stars import BODY_CELL_RAD, Stars
+from hilstar.sky.stars import BODY_CELL_RAD, CellGrid, Stars
 
 NO_TURN = np.array([1.0, 0.0, 0.0, 0.0])
 FRAME_SEED = 1  # beside the number of a frame

@@ -9,7 +9,7 @@ import numpy as np
 from hilstar.arrays import IntArray
 from hilstar.bench.faults.kinds import Fault, Flash, StarGone
 from hilstar.errors import InputError
-from hilstar.sky.names import star_names
+from hilstar.sky.catalog import star_names
 from hilstar.sky.stars import Stars
 
 MAX_KEPT = 512  # a stream may ask for any star

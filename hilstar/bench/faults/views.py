@@ -18,8 +18,7 @@ from hilstar.bench.faults.scenario import NO_SCENARIO, Scenario
 from hilstar.bench.faults.view import FaultView, Sight
 from hilstar.bench.frame import Bench
 from hilstar.scene.camera import Camera
-from hilstar.sky.astrometry import aberrate
-from hilstar.sky.stars import Stars
+from hilstar.sky.stars import Stars, aberrate
 
 if TYPE_CHECKING:
     from hilstar.sky.bodies.moving import MovingSky

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from hilstar.console.overlay import Marks
 from hilstar.render.aids import AidLevels
-from hilstar.sky.names import label_of
+from hilstar.sky.catalog import label_of
 
 
 @dataclass(frozen=True, eq=False)

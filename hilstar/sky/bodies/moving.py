@@ -16,16 +16,26 @@ import numpy as np
 
 from hilstar.arrays import FloatArray
 from hilstar.errors import InputError
-from hilstar.sky.astrometry import aberrate
-from hilstar.sky.bodies.apparent import Viewpoint, apparent_bodies, apparent_stars
-from hilstar.sky.bodies.disc import Disc, lunar_share
-from hilstar.sky.bodies.earth import DARK_V_MAG, EARTH, apparent_cone, at_centre, earth_disc, earth_light
-from hilstar.sky.bodies.kernel import DAY_S, Kernel, tdb_of_utc
-from hilstar.sky.bodies.magnitudes import SUN_BV_MAG, body_v_mag, phase_angle_deg
+from hilstar.sky.bodies.disc import (
+    DARK_V_MAG,
+    EARTH,
+    LAWS,
+    NORTH,
+    POLAR_RADII_KM,
+    RADII_KM,
+    Disc,
+    apparent_cone,
+    at_centre,
+    earth_disc,
+    earth_light,
+    lunar_share,
+    pole,
+)
+from hilstar.sky.bodies.kernel import DAY_S, Kernel, Viewpoint, apparent_bodies, apparent_stars, tdb_of_utc
+from hilstar.sky.bodies.light import SUN_BV_MAG, body_v_mag, phase_angle_deg
 from hilstar.sky.bodies.orbit import Orbit
-from hilstar.sky.bodies.satellites.passes import Circumstances, Cone, Pass, Satellites, Sky
-from hilstar.sky.bodies.shapes import LAWS, NORTH, POLAR_KM, RADII_KM, pole
-from hilstar.sky.stars import Stars, with_bodies
+from hilstar.sky.bodies.passes import Circumstances, Cone, Pass, Satellites, Sky
+from hilstar.sky.stars import Stars, aberrate, with_bodies
 from hilstar.units import ARCSEC_PER_RAD, LIGHT_KM_S, NS_PER_S, flux_ratio
 
 log = logging.getLogger(__name__)
@@ -315,7 +325,7 @@ class MovingSky:
             direction=sight.directions[row],
             distance_km=float(np.linalg.norm(seen_km)),
             equator_km=RADII_KM[name],
-            polar_km=POLAR_KM.get(name, RADII_KM[name]),
+            polar_km=POLAR_RADII_KM.get(name, RADII_KM[name]),
             pole=pole(name),
             sun=NORTH if name == "Sun" else sun_km / np.linalg.norm(sun_km),
             law=LAWS.get(name, "lambert"),

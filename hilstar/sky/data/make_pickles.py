@@ -25,8 +25,7 @@ import numpy as np
 
 from hilstar.arrays import FloatArray
 from hilstar.errors import InputError
-from hilstar.sky.electrons import Optics, Photometry
-from hilstar.sky.pickles import PACKAGED_LIBRARY, Library, band_mean, library_electrons_per_s
+from hilstar.sky.electrons import PACKAGED_LIBRARY, Library, Optics, Photometry, band_mean, library_electrons_per_s
 from hilstar.sky.spectrum import Curve, constant_curve, load_curve
 
 MEMBER = re.compile(r"EXOSIMS/TargetList/dat_uvk/pickles_uk_(\d+)\.fits")

@@ -9,8 +9,14 @@ import numpy as np
 from hilstar.arrays import FloatArray
 from hilstar.charts import INK, MUTED, SERIES, chart, label_ends, write_csv
 from hilstar.sky.catalog import Catalog, load_catalog
-from hilstar.sky.electrons import Optics, Photometry, ags_electrons_per_s, dgs_electrons_per_s, star_temperatures_k
-from hilstar.sky.pickles import tabulate_pickles
+from hilstar.sky.electrons import (
+    Optics,
+    Photometry,
+    ags_electrons_per_s,
+    dgs_electrons_per_s,
+    star_temperatures_k,
+    tabulate_pickles,
+)
 from hilstar.study.models.finding import Finding
 from hilstar.study.models.settings import BRIGHT_V_MAG
 from hilstar.study.shared.brightness import study_optics

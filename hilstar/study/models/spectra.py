@@ -8,8 +8,14 @@ import numpy as np
 
 from hilstar.arrays import FloatArray
 from hilstar.charts import BLUE, GREEN, INK, MUTED, ORANGE, chart, plain_ticks, write_csv
-from hilstar.sky.electrons import Photometry, dgs_electrons_per_s, star_temperatures_k
-from hilstar.sky.pickles import Library, library_electrons_per_s, load_library
+from hilstar.sky.electrons import (
+    Library,
+    Photometry,
+    dgs_electrons_per_s,
+    library_electrons_per_s,
+    load_library,
+    star_temperatures_k,
+)
 from hilstar.sky.spectrum import TEMPERATURE_SCALES
 from hilstar.study.models.finding import Finding
 from hilstar.study.models.settings import SENSORS

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hilstar.arrays import FloatArray
-from hilstar.sky.electrons import Optics
-from hilstar.sky.pickles import fit_table, load_library
+from hilstar.sky.electrons import Optics, fit_table, load_library
 from hilstar.sky.spectrum import load_curve
 
 APERTURE_MM = 30.0

@@ -11,8 +11,7 @@ from hilstar.bench.frame import Bench
 from hilstar.errors import InputError
 from hilstar.rotation import to_matrix
 from hilstar.scene.sprites import pack_sprites
-from hilstar.sky.cells import cell_grid
-from hilstar.sky.stars import Stars
+from hilstar.sky.stars import Stars, cell_grid
 
 # A cap this much wider than the monitor's own: culling must have something to throw away.
 SKY_BEYOND = 1.5

@@ -11,9 +11,8 @@ from hilstar.monitor.geometry import monitor_camera
 from hilstar.rotation import direction_of, from_radec_roll_deg, to_matrix, to_radec_roll_deg
 from hilstar.scene.camera import Camera
 from hilstar.scene.sprites import pack_sprites
-from hilstar.sky.astrometry import RAD_PER_MAS, unit_vectors_icrs
 from hilstar.sky.catalog import HIPPARCOS_EPOCH_JYEAR, load_catalog
-from hilstar.sky.cells import cell_grid
+from hilstar.sky.stars import RAD_PER_MAS, cell_grid, unit_vectors_icrs
 from hilstar.study.stability.failure_case import FailureCase, Figures
 from hilstar.units import ARCSEC_PER_RAD
 

@@ -15,9 +15,8 @@ from hilstar.render.renderer import Renderer, Target
 from hilstar.rotation import from_radec_roll_deg, propagate, to_matrix
 from hilstar.scene.psf import footprint_px, peak_share
 from hilstar.scene.sprites import Sprites, make_sprites
-from hilstar.sky.astrometry import unit_vectors_icrs
 from hilstar.sky.catalog import HIPPARCOS_EPOCH_JYEAR, load_catalog
-from hilstar.sky.stars import make_stars
+from hilstar.sky.stars import make_stars, unit_vectors_icrs
 from hilstar.study.shared.codes import AIMS
 from hilstar.study.stability.failure_case import FailureCase, Figures
 from hilstar.study.stability.field import ALIGNED, FOCAL_LENGTH_MM, PITCH_UM

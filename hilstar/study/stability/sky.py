@@ -13,10 +13,12 @@ from hilstar.sky.electrons import (
     Photometry,
     ags_electrons_per_s,
     dgs_electrons_per_s,
+    library_electrons_per_s,
+    load_library,
     star_temperatures_k,
     tabulate,
+    tabulate_pickles,
 )
-from hilstar.sky.pickles import library_electrons_per_s, load_library, tabulate_pickles
 from hilstar.sky.spectrum import (
     BOLTZMANN_J_K,
     PLANCK_J_S,

@@ -14,8 +14,7 @@ from hilstar.bench.cameras import ideal_monitor
 from hilstar.scene.camera import Camera
 from hilstar.scene.psf import footprint_px
 from hilstar.scene.sprites import pack_sprites
-from hilstar.sky.cells import CELL_DEG, cell_grid
-from hilstar.sky.stars import Stars
+from hilstar.sky.stars import CELL_DEG, Stars, cell_grid
 from hilstar.study.tradeoff.demo import (
     ATTITUDES,
     NO_LIMIT_V_MAG,

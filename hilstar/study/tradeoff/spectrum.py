@@ -13,10 +13,12 @@ from hilstar.bench.config import SkySettings
 from hilstar.sky.electrons import (
     Photometry,
     RateTable,
+    library_electrons_per_s,
+    load_library,
     star_temperatures_k,
     tabulate,
+    tabulate_pickles,
 )
-from hilstar.sky.pickles import library_electrons_per_s, load_library, tabulate_pickles
 from hilstar.sky.spectrum import (
     TEMPERATURE_SCALES,
 )

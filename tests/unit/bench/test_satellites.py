@@ -17,7 +17,7 @@ from hilstar.campaign.cases.display import DisplayTracker
 from hilstar.rotation import from_radec_roll_deg, to_matrix
 from hilstar.scene.trail_discs import DiscTrail, hidden
 from hilstar.sky.bodies.disc import Disc
-from hilstar.sky.bodies.satellites.passes import Cone
+from hilstar.sky.bodies.passes import Cone
 from hilstar.twin.simulator import Simulator
 from tests.support.benches import bench_text
 from tests.support.commands import run_hilstar_here

@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from hilstar.bench.truth import truth_table
-from hilstar.sky.astrometry import unit_vectors_icrs
 from hilstar.sky.catalog import load_catalog
-from hilstar.sky.stars import make_stars
+from hilstar.sky.stars import make_stars, unit_vectors_icrs
 
 
 def test_each_star_has_its_own_variability_and_companion():

@@ -13,7 +13,7 @@ from hilstar.scene.camera import Camera
 from hilstar.scene.clipping import CLIP_TOLERANCE, clipped_sprites
 from hilstar.scene.psf import footprint_px, peak_share, pixel_shares
 from hilstar.scene.sprites import make_sprites, pack_sprites
-from hilstar.sky.cells import cell_grid
+from hilstar.sky.stars import cell_grid
 from tests.support.stars import stars_at
 
 IDENTITY = np.array([1.0, 0, 0, 0])

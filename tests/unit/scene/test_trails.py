@@ -10,7 +10,7 @@ from hilstar.scene.camera import Camera
 from hilstar.scene.psf import footprint_px, pixel_shares
 from hilstar.scene.sprites import Sprites
 from hilstar.scene.trails import Brush, Lit, Trails, View, trails, with_trails
-from hilstar.sky.bodies.satellites.passes import Cone
+from hilstar.sky.bodies.passes import Cone
 from tests.support.satellites import element_set, satellite_sky
 from tests.support.stars import sprites_at
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hilstar.sky.astrometry import unit_vectors_icrs
 from hilstar.sky.catalog import load_catalog
-from hilstar.sky.cells import CELL_DEG, PARTS, cell_grid
+from hilstar.sky.stars import CELL_DEG, PARTS, cell_grid, unit_vectors_icrs
 
 
 @pytest.fixture(scope="module")

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from skyfield.named_stars import named_star_dict
 
-from hilstar.sky.catalog import load_catalog
-from hilstar.sky.names import label_of, star_names
+from hilstar.sky.catalog import label_of, load_catalog, star_names
 
 MIN_SHARED = 80  # of Skyfield's 119 names; the others are spelt otherwise, or not the ones that the IAU approved
 # Names that the IAU (WGSN, 2016 to 2018) gave to another star than Skyfield's older list: γ Crv, α Cen B, γ Peg and α Peg.

@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hilstar.sky.astrometry import aberrate
-from hilstar.sky.bodies.disc import Disc
-from hilstar.sky.bodies.earth import DARK_V_MAG, earth_disc, earth_light
-from hilstar.sky.bodies.magnitudes import KM_PER_AU, body_v_mag
+from hilstar.sky.bodies.disc import DARK_V_MAG, Disc, earth_disc, earth_light
+from hilstar.sky.bodies.light import KM_PER_AU, body_v_mag
 from hilstar.sky.bodies.orbit import TleOrbit
+from hilstar.sky.stars import aberrate
 from hilstar.units import LIGHT_KM_S
 from tests.support.ray_traced.bodies import Body, lambert, limb
 from tests.support.skies import ALL_BODIES, STATION_TLE, STATION_UTC, moving_sky, utc_ns

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hilstar.errors import InputError
-from hilstar.sky.bodies.oem import OemOrbit, hermite
+from hilstar.sky.bodies.orbit import OemOrbit, hermite
 from tests.support.sources.oem_messages import START_NS, STATION, oem, segment
 
 MINUTES = range(0, 1260, 60)

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilstar.sky.astrometry import unit_vectors_icrs
 from hilstar.sky.catalog import Catalog, load_catalog, plain_catalog
-from hilstar.sky.tables.join import join
+from hilstar.sky.star_table import join
+from hilstar.sky.stars import unit_vectors_icrs
 
 ARCSEC = np.pi / (180 * 3600)
 BARNARD, MIZAR, SIRIUS = 87937, 65378, 32349

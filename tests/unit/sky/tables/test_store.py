@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from hilstar.sky.catalog import column_names
-from hilstar.sky.tables.star_table import Choice, choose_catalog
-from hilstar.sky.tables.store import KEPT_FILES
+from hilstar.sky.star_table import KEPT_FILES, Choice, choose_catalog
 from tests.support.waiting import PATIENCE_S
 
 TEXT = "ra,dec,vmag,b-v\n1,2,3,0.1\n4,5,6,\n7,8,9,0.5\n"
@@ -113,7 +112,7 @@ def test_only_the_newest_files_are_kept(table):
 @pytest.mark.e2e
 def test_two_processes_at_once_both_have_the_catalogue(table):
     program = (
-        "import sys; from pathlib import Path; from hilstar.sky.tables.star_table import *;"
+        "import sys; from pathlib import Path; from hilstar.sky.star_table import *;"
         "print(len(choose_catalog(Choice(Path(sys.argv[1])))))"
     )
     runs = [subprocess.Popen([sys.executable, "-c", program, table], stdout=subprocess.PIPE) for _ in range(2)]

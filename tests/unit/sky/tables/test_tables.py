@@ -12,8 +12,8 @@ from astropy.table import MaskedColumn, Table
 
 from hilstar.errors import InputError
 from hilstar.sky.catalog import load_catalog
-from hilstar.sky.tables.photometry import from_gaia
-from hilstar.sky.tables.star_table import Choice, choose_catalog
+from hilstar.sky.star_table import Choice, choose_catalog
+from hilstar.sky.table_reader import from_gaia
 
 # CSV, ECSV and VOTable have float64 in 17 digits.
 SAME = 1e-12

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from hilstar.errors import InputError
-from hilstar.sky.bodies.satellites.elements import read_satellites
+from hilstar.sky.bodies.satellites import read_satellites
 from tests.support.satellites import element_set, with_checksum
 from tests.support.skies import STATION_TLE, STATION_UTC, utc_ns
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hilstar.sky.bodies.satellites.light import (
+from hilstar.sky.bodies.satellites import (
     EARTH_FLATTENING,
     EARTH_KM,
     KM_PER_AU,

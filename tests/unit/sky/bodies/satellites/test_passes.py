@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from hilstar.sky.bodies.orbit import Geocentre, TleOrbit
-from hilstar.sky.bodies.satellites.elements import read_satellites
-from hilstar.sky.bodies.satellites.passes import OWN_KM, Cone
-from hilstar.sky.bodies.satellites.swarm import Swarm
+from hilstar.sky.bodies.passes import OWN_KM, Cone
+from hilstar.sky.bodies.satellites import Swarm, read_satellites
 from tests.support.satellites import element_set, satellite_sky, some_orbits, with_checksum
 from tests.support.skies import STATION_TLE, STATION_UTC, utc_ns
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from hilstar.errors import InputError
-from hilstar.sky.bodies.satellites.elements import read_satellites
-from hilstar.sky.bodies.satellites.table import brightness_of, read_table
+from hilstar.sky.bodies.satellites import brightness_of, read_satellites, read_table
 from tests.support.satellites import element_set
 from tests.support.skies import STATION_TLE
 

@@ -9,21 +9,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hilstar.arrays import BoolArray, FloatArray, IntArray
-from hilstar.sky.astrometry import aberrate
 from hilstar.sky.bodies.kernel import NS_PER_DAY
 from hilstar.sky.bodies.orbit import Orbit, TleOrbit
-from hilstar.sky.bodies.satellites.elements import Satellite
-from hilstar.sky.bodies.satellites.light import (
+from hilstar.sky.bodies.satellites import (
     MAX_PHASE_FACTOR,
     STANDARD_KM,
     Brightness,
+    Satellite,
+    Swarm,
     in_front,
     phase_factor,
     reflected_share,
     sunlit_share,
 )
-from hilstar.sky.bodies.satellites.swarm import Swarm
-from hilstar.sky.stars import Stars
+from hilstar.sky.stars import Stars, aberrate
 from hilstar.units import LIGHT_KM_S, NS_PER_S, magnitude
 
 log = logging.getLogger(__name__)

@@ -9,6 +9,14 @@ opposition surge is left out. Beyond 150 degrees as the cube of the angle left t
 earthshine; Allen's table is within 0.1 mag of both up to 150 degrees, and 0.25 fainter at 160.
 
 Earth: Mallama and Hilton's curve, which was made for the whole globe from afar and is held to 170 degrees.
+
+Electron rates of bodies: sunlight times their albedo, through the tracker's curves as a star's spectrum is.
+
+Planets: geometric albedos of Mallama, Krobusek and Pavlov 2017 (Icarus 282, 19; table 7): Johnson-Cousins U, B, V, Rc, Ic and
+Sloan z'. The paper's Sloan albedos u' to z' alone, measured apart, give rates within 0.05 mag; a star of the same B-V would be
+0.2 mag off for Jupiter and 0.5 for Uranus, whose methane takes the red. The Moon: the ROLO model's reflectance at 45 degrees of
+phase (Kieffer and Stone 2005, AJ 129, 2887, table 4); at 10 and 90 degrees its rate at equal V is within 4 %. Straight lines
+between the bands, constant beyond them. Sunlight: G2V of the library.
 """
 
 from __future__ import annotations
@@ -18,6 +26,18 @@ from numpy.polynomial.polynomial import polyval
 
 from hilstar.arrays import FloatArray
 from hilstar.rotation import direction_of
+from hilstar.sky.electrons import (
+    BrightnessModel,
+    Library,
+    Optics,
+    Photometry,
+    ags_electrons_per_s,
+    band_mean,
+    library_electrons_per_s,
+    load_library,
+)
+from hilstar.sky.spectrum import load_curve
+from hilstar.units import magnitude
 
 KM_PER_AU = 149_597_870.7
 SUN_V_MAG = -26.76  # at 1 au: Willmer 2018, ApJS 236, 47
@@ -33,11 +53,26 @@ URANUS_MAG, URANUS_PER_DEG = -7.110, -8.4e-04  # eq. 14
 # Poles of the IAU's working group (Archinal et al. 2018): right ascension and declination, degrees
 SATURN_POLE_DEG, URANUS_POLE_DEG = (40.589, 83.537), (257.311, -15.175)
 
-EARTH = (-3.99, -1.060e-3, 2.054e-4)  # eq. 5
+EARTH_TERMS = (-3.99, -1.060e-3, 2.054e-4)  # eq. 5
 EARTH_CURVE_DEG = 170.0
 FULL_MOON_V_MAG, MOON_PER_DEG, MOON_PER_DEG4 = -12.73, 0.026, 4e-9
 MOON_DISTANCE_KM = 384_400.0
 MOON_CRESCENT_DEG, THINNEST_DEG = 150.0, 0.3  # a thinner one, as wide as the Sun, is as bright as that
+SUNLIGHT = "G2V"
+BANDS_NM = (366.0, 438.0, 545.0, 641.0, 798.0, 913.0)  # U B V Rc Ic (Bessell 1998, table A2) and z' (Fukugita et al. 1996)
+ALBEDOS: dict[str, tuple[float, ...]] = {
+    "Mercury": (0.087, 0.105, 0.142, 0.158, 0.180, 0.237),
+    "Venus": (0.348, 0.658, 0.689, 0.658, 0.640, 0.630),
+    "Earth": (0.60, 0.512, 0.434, 0.392, 0.396, 0.40),  # as recalled; U and z' are no more than likely
+    "Mars": (0.060, 0.088, 0.170, 0.250, 0.285, 0.325),
+    "Jupiter": (0.358, 0.443, 0.538, 0.513, 0.389, 0.348),
+    "Saturn": (0.203, 0.339, 0.499, 0.646, 0.543, 0.450),
+    "Uranus": (0.502, 0.561, 0.488, 0.264, 0.089, 0.056),
+    "Neptune": (0.578, 0.562, 0.442, 0.226, 0.072, 0.048),
+}
+MOON_NM = (350.0, 405.0, 441.6, 486.9, 549.1, 665.1, 745.3, 774.8, 865.3, 928.4, 1059.5)
+MOON_ALBEDO = (0.0205, 0.0283, 0.0290, 0.0325, 0.0380, 0.0480, 0.0499, 0.0531, 0.0563, 0.0560, 0.0634)
+B_NM, V_NM = 438.0, 545.0
 
 
 def body_v_mag(name: str, sun_to_body_km: FloatArray, observer_to_body_km: FloatArray, jyear: float) -> float:
@@ -81,7 +116,7 @@ def _at_unit_distance(name: str, phase_deg: float, latitudes_deg: list[float], j
     if name == "Neptune":  # eq. 16: it brightened from 1980 to 2000
         return float(np.clip(-6.89 - 0.0054 * (jyear - 1980.0), -7.00, -6.89))
     if name == "Earth":
-        return float(polyval(min(phase_deg, EARTH_CURVE_DEG), EARTH))
+        return float(polyval(min(phase_deg, EARTH_CURVE_DEG), EARTH_TERMS))
     curves = {"Mercury": MERCURY, "Venus": VENUS, "Mars": MARS, "Jupiter": JUPITER}
     curve = VENUS_CRESCENT if name == "Venus" and phase_deg >= VENUS_CRESCENT_DEG else curves[name]
     return float(polyval(phase_deg, curve))
@@ -95,3 +130,39 @@ def _saturn_mag(phase_deg: float, sun_latitude_deg: float, observer_latitude_deg
 
 
 _POLES = {"Saturn": direction_of(*SATURN_POLE_DEG), "Uranus": direction_of(*URANUS_POLE_DEG)}
+
+
+def bodies_electrons_per_s(
+    names: tuple[str, ...], model: BrightnessModel, optics: Optics, photometry: Photometry
+) -> FloatArray:
+    """Electron rates of bodies of V = 0, shape (n,). Raises InputError as `tabulate_pickles` does."""
+    if model == "ags":
+        return np.full(len(names), ags_electrons_per_s(optics, photometry))
+    return library_electrons_per_s(reflected(names), optics, photometry)
+
+
+def reflected(names: tuple[str, ...]) -> Library:
+    """The spectra of bodies, as a library of their own."""
+    stars = load_library()
+    sunlight = stars.flux[stars.spectral_type.index(SUNLIGHT)]
+    lit = [sunlight * albedo(name, stars.wavelength_nm) for name in names]
+    flux = np.array(lit).reshape(len(names), len(stars.wavelength_nm))  # of no bodies too
+    colour = bodies_bv_mag(names)
+    unscaled = Library(stars.wavelength_nm, flux, names, colour, np.full(len(names), np.nan))
+    mean = band_mean(unscaled, load_curve("johnson-v", "johnson-v"))
+    return Library(stars.wavelength_nm, flux / mean[:, None], names, colour, unscaled.vi_mag)
+
+
+def bodies_bv_mag(names: tuple[str, ...]) -> FloatArray:
+    """B-V of bodies (n,), by the Sun's and their albedos."""
+    blue, visual = (np.array([albedo(name, np.array([nm]))[0] for name in names]) for nm in (B_NM, V_NM))
+    return np.asarray(SUN_BV_MAG + magnitude(blue / visual))
+
+
+def albedo(name: str, wavelength_nm: FloatArray) -> FloatArray:
+    """A body's albedo at wavelengths (n,), the Moon's at 45 degrees of phase; 1 for the Sun."""
+    if name == "Sun":
+        return np.ones_like(wavelength_nm)
+    if name == "Moon":
+        return np.interp(wavelength_nm, MOON_NM, MOON_ALBEDO)
+    return np.interp(wavelength_nm, BANDS_NM, ALBEDOS[name])

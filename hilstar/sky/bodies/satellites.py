@@ -1,0 +1,441 @@
+"""Lists of two-line element sets, with or without name lines, as CelesTrak and Space-Track give them.
+
+How bright a satellite is: a diffuse sphere in sunlight, in and out of the Earth's shadow, and its flashes.
+
+A standard magnitude is V at 1000 km and 90 degrees of phase, in full sunlight at 1 au (McCants, Heavens-Above). A diffuse
+sphere's light goes with sin p + (pi - p) cos p of the phase angle p (Lambert; Hejduk 2011, AMOS Conference, eq. 2), which is 1
+there, and with the square of the distance.
+
+A table of what users know of satellites: their brightness, flashes and sizes, by catalogue number.
+
+Places of many satellites at any time: SGP4 (Vallado et al. 2006, AIAA 2006-6753) seldom, cubics between.
+
+SGP4 takes 0.5 us a satellite, 11 ms for 20 000: most of a frame. It is therefore asked at the ends of STEP_S only, for a share
+of the list at a time, and between them places follow the cubic through both places and velocities. Low orbits are then within
+0.25 m of SGP4 (0.05 arcsec at 1000 km), others within 3.2 m, nowhere more than 0.07 arcsec from the Earth's centre: measured
+over three days. A cubic of exact velocities would be within 5 mm; SGP4's own are not quite the slopes of its places.
+"""
+
+from __future__ import annotations
+
+import csv
+import importlib.util
+import math
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hilstar.arrays import FloatArray, IntArray
+from hilstar.errors import InputError, MachineError, printable, shortened
+from hilstar.sky.bodies.kernel import INSTALL, NS_PER_DAY, UNIX_JD
+from hilstar.sky.bodies.orbit import TURN_NS, icrs_from_teme
+from hilstar.units import NS_PER_S, flux_ratio
+
+if TYPE_CHECKING:
+    from sgp4.api import Satrec
+
+LINE_LENGTH = 69  # with its checksum
+MAX_NAME = 24  # characters, as CelesTrak has them
+LIST_FORM = "give a list of two-line element sets, with name lines or without"
+# Of each line the columns (from 0) that are numbers, and what they are.
+NUMBERS = {
+    "1": {"epoch's year": (18, 20), "epoch's day": (20, 32), "first derivative of the mean motion": (33, 43)},
+    "2": {
+        "inclination": (8, 16),
+        "right ascension of the node": (17, 25),
+        "eccentricity": (26, 33),
+        "argument of perigee": (34, 42),
+        "mean anomaly": (43, 51),
+        "mean motion": (52, 63),
+    },
+}
+DIGIT_SUM = {ord(c): int(c) if c.isdigit() else int(c == "-") for c in map(chr, range(128))}
+STANDARD_KM = 1000.0
+SUN_KM, KM_PER_AU = 695_700.0, 149_597_870.7
+EARTH_KM, EARTH_FLATTENING = 6378.137, 1 / 298.257  # IERS Conventions 2010
+MAX_PHASE_FACTOR = np.pi  # at full phase
+FWHM_SIGMAS = 2 * float(np.sqrt(2 * np.log(2)))
+NEIGHBOURS = np.arange(-3, 4)  # a flash lasts at most half a period: 3 periods are 14 sigmas
+SHORTEST_S = 1e-6  # a mean over less is the light of a moment
+KEY = "norad"
+# Each column that a row may leave empty, with its limits.
+COLUMNS = {
+    "standard_mag": (-30.0, 50.0),
+    "period_s": (1e-3, 1e7),
+    "amplitude_mag": (0.0, 20.0),
+    "flash_s": (1e-4, 5e6),
+    "flash_at_s": (-1e10, 1e10),
+    "size_m": (0.0, 1e5),
+}
+TABLE_FORM = f"write a CSV with the columns {KEY},{','.join(COLUMNS)}, of which only the first has to be there"
+Row = dict[str, float]
+STEP_S = 20
+STEP_NS = STEP_S * NS_PER_S
+# So many at a time take 0.3 ms; the moments of a step at which a share's turn comes are spread over it.
+SHARE = 512
+# Coefficients of 1, s, s^2, s^3 of the cubic through place and velocity (times the step) at both ends
+HERMITE = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [-3.0, -2.0, 3.0, -1.0], [2.0, 1.0, -2.0, 1.0]])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Satellite:
+    """One satellite: its name (that of no other in its list), its catalogue number, and its elements."""
+
+    name: str
+    number: int
+    satrec: Satrec
+
+    def age_days(self, utc_ns: int) -> float:
+        """How many days a UTC is after the elements' own date."""
+        return float(utc_ns / NS_PER_DAY + UNIX_JD - self.satrec.jdsatepoch - self.satrec.jdsatepochF)
+
+
+def read_satellites(text: str, file: str, utc_ns: int) -> list[Satellite]:
+    """The satellites in the text of a list, in its order; of several sets of one, that of the date nearest to a UTC.
+
+    A name that several have is followed by the catalogue number; one without a name is called by that.
+
+    Raises InputError with the line that is wrong, and MachineError without SGP4.
+    """
+    if importlib.util.find_spec("sgp4") is None:
+        raise MachineError(f"[sky.bodies] satellites need SGP4; {INSTALL}")
+    from sgp4.api import Satrec
+
+    found: dict[int, Satellite] = {}
+    for name, first, second in _sets(text, file):
+        satrec = Satrec.twoline2rv(first, second)
+        number = satrec.satnum
+        one = Satellite(name, number, satrec)
+        other = found.get(number)
+        if other is None or abs(one.age_days(utc_ns)) < abs(other.age_days(utc_ns)):
+            found[number] = one
+    if not found:
+        raise InputError(f"{file}: no element set in it; {LIST_FORM}")
+    shared = Counter(one.name for one in found.values())
+    return [Satellite(_called(one, shared[one.name]), one.number, one.satrec) for one in found.values()]
+
+
+def _called(one: Satellite, bearers: int) -> str:
+    if not one.name:
+        return f"NORAD {one.number}"
+    return one.name if bearers == 1 else f"{one.name} {one.number}"
+
+
+def _sets(text: str, file: str) -> Iterator[tuple[str, str, str]]:
+    """The name (empty where there is none), the first and the second line of each set."""
+    name, first, first_at = "", "", 0
+    for at, line in enumerate(text.splitlines(), start=1):
+        line = line.rstrip()
+        where = f"{file}:{at}"
+        if not line or line.startswith("#"):
+            continue
+        if first:
+            if not line.startswith("2 "):
+                raise InputError(f"{where}: element line 2 is missing after line {first_at}; {LIST_FORM}")
+            _check(line, where)
+            if line[2:7] != first[2:7]:
+                other = first[2:7].strip()
+                raise InputError(f"{where}: it is of satellite {line[2:7].strip()}, line {first_at} of {other}; {LIST_FORM}")
+            yield name, first, line
+            name, first = "", ""
+        elif line.startswith("1 "):
+            _check(line, where)
+            first, first_at = line, at
+        elif line.startswith("2 "):
+            raise InputError(f"{where}: element line 1 is missing before it; {LIST_FORM}")
+        elif name:
+            raise InputError(f"{where}: two lines in a row that are no elements; {LIST_FORM}")
+        else:
+            name = _name(line)
+    if first or name:
+        raise InputError(f"{file}: it ends within an element set; {LIST_FORM}")
+
+
+def _name(line: str) -> str:
+    """A name line's name in ASCII, as tables have it; Space-Track writes "0 " before it."""
+    text = line[2:] if line.startswith("0 ") else line
+    return printable(text.strip()).encode("ascii", "replace").decode()[:MAX_NAME].strip()
+
+
+def _check(line: str, where: str) -> None:
+    """Refuse (InputError) a line of the wrong length, with a wrong checksum, or without its numbers."""
+    if len(line) != LINE_LENGTH or not line.isascii():
+        raise InputError(f"{where}: {len(line)} characters, where an element line has {LINE_LENGTH}; {LIST_FORM}")
+    total = sum(map(DIGIT_SUM.__getitem__, line[:-1].encode())) % 10
+    if str(total) != line[-1]:
+        raise InputError(f"{where}: its digits add up to {total}, not {line[-1]}: a damaged line; take the list anew")
+    for what, (begin, end) in NUMBERS[line[0]].items():
+        part = line[begin:end].strip()
+        if not part.lstrip("+-").replace(".", "", 1).isdigit():
+            raise InputError(f"{where}: columns {begin + 1} to {end}, its {what}, read {part!r}; write a number")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Brightness:
+    """What is known of n satellites, (n,) each: see `table`. `standard_e_per_s` are electron rates at the standard magnitude.
+
+    Without `period_s` (NaN) a satellite's light is steady; with `flash_s` (else NaN) it flashes, otherwise it goes up and down.
+    """
+
+    standard_e_per_s: FloatArray
+    period_s: FloatArray
+    amplitude_mag: FloatArray
+    flash_s: FloatArray
+    flash_at_s: FloatArray
+    size_m: FloatArray
+
+    def most(self, which: IntArray) -> FloatArray:
+        """The largest factor by which each of these is ever brighter than its mean (in a flash: than without)."""
+        ratio = flux_ratio(-self.amplitude_mag[which])
+        varied = np.where(np.isnan(self.flash_s[which]), 2 * ratio / (ratio + 1), ratio)
+        return np.where(np.isnan(self.period_s[which]), 1.0, varied)
+
+    def variation(self, which: IntArray, begin_s: FloatArray, end_s: FloatArray) -> FloatArray:
+        """The mean factor of each of these (n,) between two times, seconds after `epoch_utc`, in closed form.
+
+        Up and down: a cosine of the flux whose extremes are `amplitude_mag` apart, with a mean of 1. Flashes: Gaussian ones of
+        `flash_s` at half height, `amplitude_mag` brighter at their top. A maximum is at `flash_at_s`.
+        """
+        factor = np.ones(len(which))
+        steady = np.isnan(self.period_s[which])
+        if steady.all():
+            return factor
+        end_s = np.maximum(end_s, begin_s + SHORTEST_S)
+        flashing = ~np.isnan(self.flash_s[which]) & ~steady
+        for chosen, mean in ((~flashing & ~steady, self._waved), (flashing, self._flashed)):
+            factor[chosen] = mean(which[chosen], begin_s[chosen], end_s[chosen])
+        return factor
+
+    def _waved(self, which: IntArray, begin_s: FloatArray, end_s: FloatArray) -> FloatArray:
+        ratio, per_s = flux_ratio(-self.amplitude_mag[which]), 1 / self.period_s[which]
+        middle = ((begin_s + end_s) / 2 - self.flash_at_s[which]) * per_s
+        depth = (ratio - 1) / (ratio + 1)
+        return np.asarray(1 + depth * np.cos(2 * np.pi * middle) * np.sinc((end_s - begin_s) * per_s))
+
+    def _flashed(self, which: IntArray, begin_s: FloatArray, end_s: FloatArray) -> FloatArray:
+        from scipy.special import ndtr  # 0.1 s, which only flashes need
+
+        period_s, sigma_s = self.period_s[which], self.flash_s[which] / FWHM_SIGMAS
+        # The light of all flashes up to each end, in flashes: whole periods, and those near that have not ended
+        until = []
+        for seconds in (begin_s, end_s):
+            turn = np.floor((seconds - self.flash_at_s[which]) / period_s)
+            rest_s = seconds - self.flash_at_s[which] - turn * period_s
+            near = ndtr((rest_s[:, None] - NEIGHBOURS * period_s[:, None]) / sigma_s[:, None]).sum(axis=1)
+            until.append((turn, near))
+        (turn, near), (last_turn, last_near) = until
+        flashes = (last_turn - turn) + (last_near - near)
+        extra = flux_ratio(-self.amplitude_mag[which]) - 1
+        return np.asarray(1 + extra * flashes * sigma_s * np.sqrt(2 * np.pi) / (end_s - begin_s))
+
+
+def reflected_share(from_observer_km: FloatArray, place_km: FloatArray, sun_km: FloatArray) -> FloatArray:
+    """Flux over that of the standard magnitude (n,), of satellites at vectors from the observer and from the Earth (n, 3).
+
+    The Sun stands at a vector (3,) from the Earth; the Earth's shadow is in it.
+    """
+    distance_au = float(np.linalg.norm(sun_km)) / KM_PER_AU
+    to_sun = sun_km / np.linalg.norm(sun_km)  # from any satellite of the Earth within 1 arcmin
+    range_km = np.linalg.norm(from_observer_km, axis=1)
+    diffuse = phase_factor(np.clip(-(from_observer_km @ to_sun) / range_km, -1.0, 1.0))
+    return np.asarray((STANDARD_KM / range_km) ** 2 / distance_au**2 * diffuse * sunlit_share(place_km, sun_km))
+
+
+def phase_factor(cos_phase: FloatArray) -> FloatArray:
+    """The light of a diffuse sphere over that at 90 degrees of phase (n,), by the cosines of its phase angles."""
+    return np.asarray(np.sqrt(1 - cos_phase**2) + (np.pi - np.arccos(cos_phase)) * cos_phase)
+
+
+def sunlit_share(place_km: FloatArray, sun_km: FloatArray) -> FloatArray:
+    """The share (n,) of the Sun's disc that the Earth leaves free, seen from places (n, 3) about the Earth; without its air.
+
+    The area of two overlapping circles, in space stretched along the Earth's axis so that it is a sphere.
+    """
+    place, sun = _stretched(place_km), _stretched(sun_km)
+    distance = np.linalg.norm(place, axis=1)
+    to_sun = sun - place
+    far = np.linalg.norm(to_sun, axis=1)
+    earth = np.arcsin(np.minimum(1.0, EARTH_KM / distance))
+    disc = np.arcsin(SUN_KM / far)
+    apart = np.arccos(np.clip(-np.einsum("ij,ij->i", place, to_sun) / (distance * far), -1.0, 1.0))
+    within = np.abs(earth - disc)
+    share = np.where(apart <= within, np.maximum(0.0, 1 - (earth / disc) ** 2), 1.0)
+    partly = np.flatnonzero((apart > within) & (apart < earth + disc))
+    if len(partly):
+        share[partly] = 1 - _overlap(earth[partly], disc[partly], apart[partly]) / (np.pi * disc[partly] ** 2)
+    return share
+
+
+def _overlap(a: FloatArray, b: FloatArray, apart: FloatArray) -> FloatArray:
+    """The area that circles of radii a and b share, on a plane."""
+    from_a = (apart**2 + a**2 - b**2) / (2 * apart)
+    in_a, in_b = (np.arccos(np.clip(x / r, -1.0, 1.0)) for x, r in ((from_a, a), (apart - from_a, b)))
+    return np.asarray(a**2 * (in_a - np.sin(2 * in_a) / 2) + b**2 * (in_b - np.sin(2 * in_b) / 2))
+
+
+def in_front(observer_km: FloatArray, place_km: FloatArray, depth_km: float = 0.0) -> FloatArray:
+    """0 (n,) for places (n, 3) that the Earth hides from observers (n, 3), else 1; an observer inside it sees all.
+
+    What is seen through less than `depth_km` of it counts as seen.
+    """
+    observer, place = _stretched(observer_km), _stretched(place_km)
+    way = place - observer
+    share = np.clip(-np.einsum("ij,ij->i", observer, way) / np.einsum("ij,ij->i", way, way), 0.0, 1.0)
+    closest = np.linalg.norm(observer + share[:, None] * way, axis=1)
+    inside = np.linalg.norm(observer, axis=1) < EARTH_KM
+    return np.where((closest < EARTH_KM - depth_km) & ~inside, 0.0, 1.0)
+
+
+def _stretched(vectors_km: FloatArray) -> FloatArray:
+    """Vectors in axes in which the Earth is a sphere of its equatorial radius; its axis is ICRS z within 0.2 degrees."""
+    return np.asarray(vectors_km * np.array([1.0, 1.0, 1 / (1 - EARTH_FLATTENING)]))
+
+
+def read_table(text: str, file: str) -> dict[int, Row]:
+    """The rows of a table by catalogue number, each with the columns that are filled. Raises InputError with the line."""
+    lines = _lines(text, file)
+    at, header = next(lines, (1, []))
+    names = [name.lower() for name in header]
+    unknown = [name for name in names if name != KEY and name not in COLUMNS]
+    if KEY not in names or unknown or len(set(names)) < len(names):
+        wrong = f"no column {shortened(unknown[0])!r} is known" if unknown else f"no header with {KEY} and each column once"
+        raise InputError(f"{file}:{at}: {wrong}; {TABLE_FORM}")
+    rows: dict[int, Row] = {}
+    for at, cells in lines:
+        where = f"{file}:{at}"
+        if len(cells) > len(names):
+            raise InputError(f"{where}: {len(cells)} values for {len(names)} columns; {TABLE_FORM}")
+        row = dict(zip(names, cells, strict=False))
+        number = _number(row.pop(KEY, ""), where)
+        if number in rows:
+            raise InputError(f"{where}: satellite {number} is there twice; leave one row")
+        rows[number] = _values(row, where)
+    return rows
+
+
+def _lines(text: str, file: str) -> Iterator[tuple[int, list[str]]]:
+    """Each line's number and cells, without empty ones and comments."""
+    for at, line in enumerate(text.splitlines(), start=1):
+        if line.strip() and not line.lstrip().startswith("#"):
+            try:
+                yield at, [cell.strip() for cell in next(csv.reader([line], strict=True))]
+            except csv.Error as error:
+                raise InputError(f"{file}:{at}: {error}; {TABLE_FORM}") from error
+
+
+def _number(text: str, where: str) -> int:
+    from sgp4.alpha5 import from_alpha5
+
+    try:
+        return int(from_alpha5(text) if len(text) <= 5 else text)
+    except (ValueError, IndexError, KeyError) as error:
+        raise InputError(f"{where}: {KEY} = {shortened(text)!r}; write a catalogue number, such as 25544") from error
+
+
+def _values(row: dict[str, str], where: str) -> Row:
+    values: Row = {}
+    for name, text in row.items():
+        if not text:
+            continue
+        low, high = COLUMNS[name]
+        try:
+            values[name] = float(text)
+        except ValueError:
+            values[name] = math.nan
+        if not low <= values[name] <= high:
+            raise InputError(f"{where}: {name} = {shortened(text)!r}; write {low:g} to {high:g}, or leave it empty")
+    if "amplitude_mag" in values or "flash_s" in values or "period_s" in values:
+        if "period_s" not in values or "amplitude_mag" not in values:
+            raise InputError(f"{where}: light that varies has a period_s and an amplitude_mag; write both")
+        if values.get("flash_s", 0.0) > values["period_s"] / 2:
+            raise InputError(f"{where}: flash_s is over half of period_s; leave it out: the light then goes up and down")
+    return values
+
+
+def brightness_of(satellites: Sequence[Satellite], rows: dict[int, Row], default_mag: float, v0_e_per_s: float) -> Brightness:
+    """The brightness of satellites by a table's rows and a standard magnitude for those that have none.
+
+    `v0_e_per_s` is the electron rate of sunlight of V = 0.
+    """
+
+    def column(name: str, default: float) -> np.ndarray:
+        return np.array([rows.get(one.number, {}).get(name, default) for one in satellites], dtype=np.float64)
+
+    return Brightness(
+        standard_e_per_s=v0_e_per_s * flux_ratio(column("standard_mag", default_mag)),
+        period_s=column("period_s", math.nan),
+        amplitude_mag=column("amplitude_mag", 0.0),
+        flash_s=column("flash_s", math.nan),
+        flash_at_s=column("flash_at_s", 0.0),
+        size_m=column("size_m", 0.0),
+    )
+
+
+class Swarm:
+    """Satellites by their elements; a moment's places depend on that moment alone."""
+
+    def __init__(self, satrecs: Sequence[Satrec]) -> None:
+        from sgp4.api import SatrecArray
+
+        shares = [satrecs[k : k + SHARE] for k in range(0, len(satrecs), SHARE)]
+        self._shares = [SatrecArray(list(share)) for share in shares]
+        self._late_ns = np.arange(len(shares)) * (STEP_NS // len(shares))
+        self._step = np.full(len(shares), np.iinfo(np.int64).min)
+        self._terms = np.zeros((len(satrecs), 4, 3))
+        self._begin_ns = np.zeros(len(satrecs), dtype=np.int64)
+        self._ends: list[FloatArray | None] = [None] * len(shares)
+        # SGP4's code for what is wrong with a satellite in its present step, 0 for nothing.
+        self.error = np.zeros(len(satrecs), dtype=np.uint8)
+
+    def __len__(self) -> int:
+        return len(self.error)
+
+    def move_to(self, utc_ns: int) -> bool:
+        """Be ready for moments about a UTC, ns since 1970; whether any satellite is now in another step."""
+        step = (utc_ns - self._late_ns) // STEP_NS
+        due = np.flatnonzero(step != self._step)
+        if not len(due):
+            return False
+        for k in due.tolist():
+            part = slice(k * SHARE, min(len(self), (k + 1) * SHARE))
+            begin_ns = int(step[k]) * STEP_NS + int(self._late_ns[k])
+            self._load(k, part, begin_ns, follows=step[k] == self._step[k] + 1)
+            self._begin_ns[part] = begin_ns
+        self._step = step
+        return True
+
+    def _load(self, k: int, part: slice, begin_ns: int, follows: bool) -> None:
+        last, error = self._ends[k], np.zeros(part.stop - part.start, dtype=np.uint8)
+        if last is None or not follows:
+            last, error = self._states(k, begin_ns)
+        else:
+            error = np.where(np.isnan(last[:, 0, 0]), self.error[part], 0).astype(np.uint8)
+        end, end_error = self._states(k, begin_ns + STEP_NS)
+        self._terms[part] = HERMITE @ np.concatenate([last, end], axis=1)
+        self.error[part] = np.where(error, error, end_error)
+        self._ends[k] = end
+
+    def _states(self, k: int, utc_ns: int) -> tuple[FloatArray, FloatArray]:
+        """Place, km, and velocity times the step, (n, 2, 3), ICRS axes, and errors (n,); NaN where there is one."""
+        days, rest_ns = divmod(utc_ns, NS_PER_DAY)
+        error, place_km, velocity_km_s = self._shares[k].sgp4(np.array([UNIX_JD + days]), np.array([rest_ns / NS_PER_DAY]))
+        states = np.stack([place_km[:, 0], velocity_km_s[:, 0] * STEP_S], axis=1) @ icrs_from_teme(utc_ns // TURN_NS).T
+        error = np.where(np.isfinite(states).all(axis=(1, 2)), error[:, 0], np.maximum(error[:, 0], 1))
+        states[error != 0] = np.nan
+        return states, error
+
+    def places_km(self, which: IntArray | slice, utc_ns: int, seconds: FloatArray | float = 0.0) -> FloatArray:
+        """Places (n, 3), km from the Earth's centre, ICRS axes, `seconds` (n,) after the UTC it was moved to; NaN for none."""
+        s = ((utc_ns - self._begin_ns[which]) / NS_PER_S + seconds)[:, None] / STEP_S
+        terms = self._terms[which]
+        return np.asarray(terms[:, 0] + s * (terms[:, 1] + s * (terms[:, 2] + s * terms[:, 3])))
+
+    def motion_km(self, which: IntArray, utc_ns: int) -> FloatArray:
+        """Coefficients (4, n, 3) of 1, s, s^2 and s^3 of the same places, s in seconds after that UTC."""
+        s = ((utc_ns - self._begin_ns[which]) / NS_PER_S)[:, None] / STEP_S
+        a, b, c, d = np.moveaxis(self._terms[which], 1, 0)
+        cubic = a + s * (b + s * (c + s * d)), b + s * (2 * c + s * 3 * d), c + s * 3 * d, d
+        return np.stack([term / STEP_S**power for power, term in enumerate(cubic)])

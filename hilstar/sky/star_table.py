@@ -1,0 +1,503 @@
+"""From a table's columns to a catalogue: one unit for each figure, V and colours, and which rows are no star.
+
+A table's stars added to Hipparcos: in their overlap Hipparcos' star stands, and no other in its place.
+
+Catalogues made of tables, kept in the user's cache directory: whole or not at all, and made anew where they are damaged.
+
+A file is found by what it was made of. Nothing depends on it: without a cache directory, on a full disk or beside another
+process that writes the same file, a table is read again.
+
+The catalogue of a bench: the packaged one, a `hip_main.dat`, or a user's table, alone or added to Hipparcos.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import logging
+import os
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from hilstar.arrays import FloatArray, IntArray
+from hilstar.errors import HilstarError, InputError
+from hilstar.files import make_directory, whole_file
+from hilstar.reading import open_regular
+from hilstar.sky.catalog import PACKAGED_CATALOG, RANGES, TYC_REGION, TYCHO, Catalog, column_names, load_catalog, plain_catalog
+from hilstar.sky.stars import cell_grid, unit_vectors_icrs
+from hilstar.sky.table_reader import COLUMNS_WANTED, FILE_WANTED, MAX_TABLE_BYTES, ROUTES, RawTable, factor_to, read_table
+
+# Epochs of the places, Julian years, where a table has its catalogue's own names and no epoch.
+EPOCH_OF_PLACES = {"ramdeg": 2000.0, "raicrs": 1991.25, "raj2000": 2000.0, "_raj2000": 2000.0}
+GAIA_DR2_JYEAR, GAIA_DR3_JYEAR = 2015.5, 2016.0
+EPOCHS_JYEAR = (1800.0, 2200.0)
+# Right ascensions within 24 and declinations that span more than this, of so many stars, are hours: no field is so narrow.
+HOURS_SPAN_DEG, HOURS_STARS = 60.0, 100
+# Of a thousand stars the fastest moves by some 100 mas a year; no star of the sky moves by 12 arcsec a year.
+SLOWEST_MAS_YR, MOTION_STARS = 12.0, 1000
+MAX_STEM = 16  # characters of a file's name in the name of its stars, which has 32 in a truth table
+ADVICE = "give the column its unit in a FITS, ECSV or VOTable, or convert it"
+# Of one star at a common epoch, two catalogues' places differ by far less, but for orbits. Hipparcos' photometry has the light
+# of both components of a pair that it did not part.
+SAME_ARCSEC = 2.0
+# A star that is left alone there is looked for this far, where the magnitude has to agree as well.
+FAR_ARCSEC, FAR_MAG = 10.0, 0.5
+# A pair's orbit may have taken it so far past the separation that Hipparcos gives; no component is brighter than the sum by
+# more than this.
+PAIR_ARCSEC, PAIR_MAG = 2.0, 1.0
+ODD_MAG = 1.0
+OVERLAP_LIMIT_MAG = 0.03  # of the median
+FEW_MATCHES, BRIGHT_STARS, BRIGHT_V_MAG = 0.5, 20, 7.0
+RAD_PER_ARCSEC = np.pi / (180 * 3600)
+VERSION = 1  # of what a table is made into: count up with each change of its result
+KEPT_FILES = 6  # the newest; 250 MB each for 2.5 million stars
+HASH_BYTES = 1 << 22
+MAX_STORED_BYTES = 3_000_000_000
+DTYPES = {"hip": "i4", "identifier": "i8", "variable": "S1", "multiple": "S1"} | dict.fromkeys(
+    ("range_mag", "period_d", "separation_arcsec"), "f4"
+)
+ALWAYS_KNOWN = ("ra_deg", "dec_deg", "v_mag", "bv_mag", "pm_ra_cosdec_mas_yr", "pm_dec_mas_yr")
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Assembled:
+    """A table's stars, and one line about what became of its rows."""
+
+    catalog: Catalog
+    line: str
+    dropped: int
+
+
+def assemble(path: Path, table: RawTable, stated_epoch_jyear: float | None, compared: bool = False) -> Assembled:
+    """The stars of a table, whose epoch matters where they move or are to be `compared` with stars that do.
+
+    Raises InputError where no row is a star, and where a unit or the epoch has to be stated.
+    """
+    columns = _Columns(path, table)
+    ra_deg, dec_deg = columns.places()
+    v_mag, bv_mag, vi_mag, words = columns.magnitudes()
+    pm = {role: columns.role(role, 0.0) for role in ("pm_ra_cosdec_mas_yr", "pm_dec_mas_yr")}
+    if not any(columns.has_unit(table.layout.role[role]) for role in pm if role in table.layout.role):
+        _check_motions(path, *pm.values())
+    figures: dict[str, npt.NDArray[Any]] = {
+        "ra_deg": ra_deg,
+        "dec_deg": dec_deg,
+        "v_mag": v_mag,
+        "bv_mag": bv_mag,
+        "vi_mag": vi_mag,
+        **pm,
+        "parallax_mas": columns.role("parallax_mas", np.nan),
+    }
+    designation, identifier = columns.identifiers()
+    _check_hours(path, ra_deg, dec_deg, columns.has_unit(columns.pair[0]))
+    reason = _dropped(figures)
+    kept = reason == 0
+    if not kept.any():
+        raise InputError(f"{path}: none of its {len(reason)} rows is a star ({_reasons(reason)}); {COLUMNS_WANTED}")
+    dated = compared or any((motion[kept] != 0).any() for motion in pm.values())
+    epoch, epoch_words = columns.epoch(stated_epoch_jyear, dated, designation)
+    figures |= {"epoch_jyear": epoch, "identifier": identifier, "hip": _once(columns.hip(), kept, v_mag)}
+    catalog = plain_catalog(designation, len(kept), {name: values[kept] for name, values in figures.items()})
+    rest = "" if kept.all() else f"; not used: {_reasons(reason)}"
+    line = f"{path.name}: {len(catalog)} stars of {len(kept)} rows, {words}; {epoch_words}{rest}"
+    return Assembled(catalog, line, int((~kept).sum()))
+
+
+class _Columns:
+    """A table's columns by role, in the units of a catalogue."""
+
+    def __init__(self, path: Path, table: RawTable) -> None:
+        self.path, self.table, self.layout = path, table, table.layout
+        self.pair = self.layout.places[0]
+
+    def has_unit(self, column: str) -> bool:
+        return bool((self.table.unit.get(column) or "").strip())
+
+    def _in_unit(self, role: str, column: str) -> FloatArray:
+        factor = factor_to(role, column, self.table.unit.get(column), self.path)
+        values = np.asarray(self.table.columns[column], dtype=np.float64)
+        return values if factor == 1.0 else values * factor
+
+    def role(self, role: str, blank: float) -> FloatArray:
+        """The figures of a role, `blank` where the table has none."""
+        if role not in self.layout.role:
+            return np.full(self.table.row_count, blank)
+        values = self._in_unit(role, self.layout.role[role])
+        return np.where(np.isfinite(values), values, blank)
+
+    def places(self) -> tuple[FloatArray, FloatArray]:
+        """Right ascension, 0 to 360, and declination, degrees; NaN where no pair of columns has both."""
+        ra_deg, dec_deg = (np.full(self.table.row_count, np.nan) for _ in range(2))
+        for ra, dec in self.layout.places:
+            blank = ~(np.isfinite(ra_deg) & np.isfinite(dec_deg))
+            if not blank.any():
+                break
+            ra_deg = np.where(blank, self._in_unit("ra_deg", ra), ra_deg)
+            dec_deg = np.where(blank, self._in_unit("dec_deg", dec), dec_deg)
+        west = (ra_deg < 0) & (ra_deg >= -180)
+        return np.where(west, ra_deg + 360, ra_deg), dec_deg
+
+    def magnitudes(self) -> tuple[FloatArray, FloatArray, FloatArray, str]:
+        """V, B-V and V-I by the first road that a row's columns allow, and the roads in words."""
+        v, bv, vi = (np.full(self.table.row_count, np.nan) for _ in range(3))
+        words: list[str] = []
+        for route in (route for route in ROUTES if route.roles in self.layout.magnitudes):
+            blank = ~(np.isfinite(v) & np.isfinite(bv))
+            if not blank.any():
+                break
+            new_v, new_bv, new_vi = route.convert(*(self.role(role, np.nan)[blank] for role in route.roles))
+            if np.isfinite(new_v).any() and route.words not in words:
+                words.append(route.words)
+            v[blank], bv[blank], vi[blank] = new_v, new_bv, new_vi
+        if "vi_mag" in self.layout.role:
+            given = self.role("vi_mag", np.nan)
+            vi = np.where(np.isfinite(given), given, vi)
+        return v, bv, vi, ", ".join(words)
+
+    def identifiers(self) -> tuple[str, npt.NDArray[np.int64]]:
+        """What the stars are called, and the number of each: Gaia's, Tycho's, or that of the row, from 1."""
+        role, columns = self.layout.role, self.table.columns
+        if "gaia" in role:
+            epoch = self.role("epoch_jyear", GAIA_DR3_JYEAR)
+            return "Gaia DR2" if (epoch == GAIA_DR2_JYEAR).all() else "Gaia DR3", np.asarray(
+                columns[role["gaia"]], dtype=np.int64
+            )
+        if all(name in role for name in ("tyc1", "tyc2", "tyc3")):
+            region, number, part = (np.asarray(columns[role[name]], dtype=np.int64) for name in ("tyc1", "tyc2", "tyc3"))
+            return TYCHO, region * TYC_REGION + number * 10 + part
+        return f"{self.path.stem[:MAX_STEM]} row", np.arange(1, self.table.row_count + 1, dtype=np.int64)
+
+    def hip(self) -> npt.NDArray[np.int64]:
+        """HIP numbers, 0 where the table has none."""
+        if "hip" not in self.layout.role:
+            return np.zeros(self.table.row_count, dtype=np.int64)
+        return np.asarray(self.table.columns[self.layout.role["hip"]], dtype=np.int64)
+
+    def epoch(self, stated_jyear: float | None, dated: bool, designation: str) -> tuple[FloatArray, str]:
+        """The epoch of each place, Julian years, and where it comes from. Raises InputError where it has to be stated."""
+        known = EPOCH_OF_PLACES.get(self.pair[0].lower())
+        if known is None and designation == "Gaia DR3":
+            known = GAIA_DR3_JYEAR
+        if stated_jyear is not None:
+            return np.full(self.table.row_count, stated_jyear), f"places of J{stated_jyear:g} as stated"
+        if "epoch_jyear" in self.layout.role:
+            values = self.role("epoch_jyear", np.nan)
+            if not ((values > EPOCHS_JYEAR[0]) & (values < EPOCHS_JYEAR[1])).all():
+                raise InputError(f"{self.path}: column {self.layout.role['epoch_jyear']} is no Julian year; {_STATE_EPOCH}")
+            return values, f"places of J{float(np.median(values)):g} by its column"
+        if known is not None:
+            return np.full(self.table.row_count, known), f"places of J{known:g} by its columns' names"
+        if dated:
+            raise InputError(f"{self.path}: has no epoch of its places, and stars move; {_STATE_EPOCH}")
+        return np.full(self.table.row_count, GAIA_DR3_JYEAR), "places without motion"
+
+
+MAY_BE_UNKNOWN = ("vi_mag", "parallax_mas")
+_STATE_EPOCH = "write [sky] catalogue_epoch_jyear, such as 2000.0"
+_REASONS = ("", "without a place", "without a magnitude and a colour", "beyond what a star has", "repeated")
+
+
+def _dropped(figures: dict[str, npt.NDArray[Any]]) -> npt.NDArray[np.int8]:
+    """For each row why it is no star, an index into _REASONS; 0 for a star."""
+    reason = np.zeros(len(figures["v_mag"]), dtype=np.int8)
+    for name, (low, high) in RANGES.items():
+        if name not in figures:
+            continue
+        beyond = (figures[name] < low) | (figures[name] > high)
+        if name in MAY_BE_UNKNOWN:
+            figures[name][beyond] = np.nan
+        else:
+            reason[beyond] = 3
+    reason[~(np.isfinite(figures["v_mag"]) & np.isfinite(figures["bv_mag"]))] = 2
+    reason[~(np.isfinite(figures["ra_deg"]) & np.isfinite(figures["dec_deg"]))] = 1
+    stars = np.flatnonzero(reason == 0)
+    reason[stars[_repeated({name: figures[name][stars] for name in ("ra_deg", "dec_deg", "v_mag")})]] = 4
+    return reason
+
+
+def _repeated(figures: dict[str, FloatArray]) -> npt.NDArray[np.bool_]:
+    """Rows that stand in the table before, with the same place and magnitude."""
+    order = np.lexsort((figures["v_mag"], figures["dec_deg"], figures["ra_deg"]))
+    repeated = np.zeros(len(order), dtype=np.bool_)
+    repeated[order[1:]] = np.all([np.diff(values[order]) == 0 for values in figures.values()], axis=0)
+    return repeated
+
+
+def _reasons(reason: npt.NDArray[np.int8]) -> str:
+    counts = np.bincount(reason, minlength=len(_REASONS))
+    return ", ".join(f"{counts[k]} {_REASONS[k]}" for k in range(1, len(_REASONS)) if counts[k])
+
+
+def _once(hip: npt.NDArray[np.int64], kept: npt.NDArray[np.bool_], v_mag: FloatArray) -> npt.NDArray[np.int32]:
+    """HIP numbers of which each stands once, at the brightest star that has it."""
+    usable = np.where(kept & (hip > 0) & (hip < 2**31), hip, 0)
+    rows = np.flatnonzero(usable)
+    rows = rows[np.argsort(v_mag[rows], kind="stable")]
+    _, first = np.unique(usable[rows], return_index=True)
+    result = np.zeros(len(hip), dtype=np.int32)
+    result[rows[first]] = usable[rows[first]]
+    return result
+
+
+def _check_hours(path: Path, ra_deg: FloatArray, dec_deg: FloatArray, has_unit: bool) -> None:
+    placed = np.isfinite(ra_deg) & np.isfinite(dec_deg)
+    if has_unit or placed.sum() < HOURS_STARS:
+        return
+    if ra_deg[placed].max() < 24 and ra_deg[placed].min() >= 0 and np.ptp(dec_deg[placed]) > HOURS_SPAN_DEG:
+        raise InputError(
+            f"{path}: right ascension runs from 0 to 24 over the whole sky, so it is in hours; {ADVICE} to degrees"
+        )
+
+
+def _check_motions(path: Path, *motions: FloatArray) -> None:
+    largest = max(float(np.abs(motion).max(initial=0.0)) for motion in motions)
+    if 0 < largest < SLOWEST_MAS_YR and len(motions[0]) >= MOTION_STARS:
+        raise InputError(
+            f"{path}: no proper motion exceeds {largest:.3g}, so they are in arcsec a year; {ADVICE} to mas a year"
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Joined:
+    """Hipparcos with a table's further stars, one line about the overlap, and what is suspect about it (None: nothing)."""
+
+    catalog: Catalog
+    line: str
+    doubt: str | None
+
+
+def join(hipparcos: Catalog, table: Catalog) -> Joined:
+    """Add the table's stars that Hipparcos does not have.
+
+    Stars are compared at the median epoch of the table's places. Hipparcos' own row stays for each star of both, with
+    its place, magnitude and number; so do pairs that it has as one star of the sum.
+    """
+    epoch_jyear = float(np.median(table.epoch_jyear))
+    owner, arcsec = _nearest_owner(hipparcos, table, epoch_jyear)
+    held = _held(hipparcos, table, owner, arcsec)
+    difference = _differences(hipparcos, table, owner, held)
+    added = table.taken(~held)
+    joined: dict[str, Any] = {name: np.concatenate([getattr(hipparcos, name), getattr(added, name)]) for name in column_names()}
+    catalog = replace(hipparcos, **joined, designation=table.designation, rows_read=hipparcos.rows_read + table.rows_read)
+    line = f"{difference.words}; {len(added)} stars added to Hipparcos' {len(hipparcos)}"
+    return Joined(catalog, line, _doubt(table, held, difference))
+
+
+def _nearest_owner(hipparcos: Catalog, table: Catalog, epoch_jyear: float) -> tuple[IntArray, FloatArray]:
+    """For each star of the table (n,) Hipparcos' nearest star and its distance, arcsec; infinite beyond any pair's reach."""
+    from scipy.spatial import cKDTree
+
+    reach = max(FAR_ARCSEC, float(np.nanmax(hipparcos.separation_arcsec, initial=0.0)) + PAIR_ARCSEC)
+    tree = cKDTree(unit_vectors_icrs(hipparcos, epoch_jyear))
+    chord, owner = tree.query(unit_vectors_icrs(table, epoch_jyear), distance_upper_bound=reach * RAD_PER_ARCSEC)
+    return np.minimum(np.asarray(owner, dtype=np.intp), len(hipparcos) - 1), np.asarray(chord) / RAD_PER_ARCSEC
+
+
+def _held(hipparcos: Catalog, table: Catalog, owner: IntArray, arcsec: FloatArray) -> npt.NDArray[np.bool_]:
+    """The stars of the table (n,) whose light is in their owner's magnitude."""
+    fainter_mag = table.v_mag - hipparcos.v_mag[owner]
+    separation = np.nan_to_num(hipparcos.separation_arcsec[owner].astype(np.float64), nan=-np.inf)
+    held = (arcsec <= SAME_ARCSEC) | ((arcsec <= separation + PAIR_ARCSEC) & (fainter_mag > -PAIR_MAG))
+    alone = np.ones(len(hipparcos), dtype=np.bool_)
+    alone[owner[held]] = False
+    return np.asarray(held | (alone[owner] & (arcsec <= FAR_ARCSEC) & (np.abs(fainter_mag) <= FAR_MAG)))
+
+
+@dataclass(frozen=True, slots=True)
+class _Differences:
+    count: int
+    median_mag: float
+    words: str
+
+
+def _differences(hipparcos: Catalog, table: Catalog, owner: IntArray, held: npt.NDArray[np.bool_]) -> _Differences:
+    """Of stars that both have alone, and that do not vary: how the table's V and B-V differ."""
+    shares = np.bincount(owner[held], minlength=len(hipparcos))
+    plain = (shares == 1) & (hipparcos.variable == b"") & (hipparcos.multiple == b"")
+    star = np.flatnonzero(held)[plain[owner[held]]]
+    of_both = int((shares > 0).sum())
+    if not len(star):
+        return _Differences(0, 0.0, f"{of_both} stars of Hipparcos are among them")
+    v_mag = table.v_mag[star] - hipparcos.v_mag[owner[star]]
+    bv_mag = table.bv_mag[star] - hipparcos.bv_mag[owner[star]]
+    median_mag, wide_mag = float(np.median(v_mag)), float(np.quantile(np.abs(v_mag), 0.95))
+    odd = int((np.abs(v_mag) > ODD_MAG).sum())
+    words = (
+        f"{of_both} stars of Hipparcos are among them, of {len(star)} single constant ones V differs by {median_mag:+.3f} mag"
+        f" in the median ({wide_mag:.3f} at 95 %, {odd} by more than {ODD_MAG:g}) and B-V by {float(np.median(bv_mag)):+.3f}"
+    )
+    return _Differences(len(star), median_mag, words)
+
+
+def _doubt(table: Catalog, held: npt.NDArray[np.bool_], difference: _Differences) -> str | None:
+    bright = table.v_mag < BRIGHT_V_MAG
+    if bright.sum() >= BRIGHT_STARS and held[bright].mean() < FEW_MATCHES:
+        return (
+            f"of its {int(bright.sum())} stars to V = {BRIGHT_V_MAG:g} Hipparcos has {held[bright].mean():.0%} at their place;"
+            " are its places ICRS degrees, and of the epoch that it gives?"
+        )
+    if difference.count and abs(difference.median_mag) > OVERLAP_LIMIT_MAG:
+        return f"its V differs by {difference.median_mag:+.3f} mag from Hipparcos' in the median; are these magnitudes V?"
+    return None
+
+
+@dataclass(frozen=True, slots=True)
+class Kept:
+    """A catalogue, and what is to be said of it each time."""
+
+    catalog: Catalog
+    doubts: tuple[str, ...] = ()
+
+
+def file_sha256(path: Path, advice: str) -> str:
+    """The SHA-256 of a file of at most MAX_TABLE_BYTES, computed once for each state of it. Raises InputError."""
+    with open_regular(path, advice, MAX_TABLE_BYTES) as file:
+        status = os.fstat(file.fileno())
+    return _sha256(path, (status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns), advice)
+
+
+@cache
+def _sha256(path: Path, state: tuple[int, ...], advice: str) -> str:
+    del state
+    digest = hashlib.sha256()
+    with open_regular(path, advice) as file:
+        while block := file.read(HASH_BYTES):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def store_path(made_of: Sequence[str]) -> Path | None:
+    """The cache's file for what was made of these words (a file's hash, settings); None where there is no cache directory."""
+    named = os.environ.get("XDG_CACHE_HOME", "")
+    try:
+        root = Path(named) if named.startswith("/") else Path.home() / ".cache"
+    except RuntimeError:  # no home
+        return None
+    key = hashlib.sha256(json.dumps([VERSION, *made_of]).encode()).hexdigest()
+    return root / "hilstar" / f"catalogue-{key[:40]}.npz"
+
+
+def kept(path: Path) -> Kept | None:
+    """What the cache holds at `path`; None where it holds nothing that can be trusted."""
+    try:
+        with open_regular(path, "", MAX_STORED_BYTES) as file:
+            status = os.fstat(file.fileno())
+            if status.st_uid != os.getuid() or not _is_plain(zipfile.ZipFile(file)):
+                return None
+            file.seek(0)
+            with np.load(file, allow_pickle=False) as packed:
+                columns = {name: packed[name] for name in column_names()}
+                about = json.loads(str(packed["about"]))
+        notes = tuple(map(str, about["notes"]))
+        catalog = Catalog(**columns, designation=str(about["designation"]), rows_read=int(about["rows_read"]), notes=notes)
+        found = Kept(catalog, tuple(map(str, about["doubts"])))
+    except Exception:  # whatever a damaged file raises in the layers of zipfile, NumPy and json
+        return None
+    return found if _is_sound(catalog) else None
+
+
+def _is_plain(archive: zipfile.ZipFile) -> bool:
+    """Whether nothing in an archive is packed, so that it cannot unfold into more than the file is long."""
+    return all(entry.compress_type == zipfile.ZIP_STORED for entry in archive.infolist())
+
+
+def _is_sound(catalog: Catalog) -> bool:
+    """Whether each column has its type, one length, and figures that a star can have."""
+    for name in column_names():
+        values = getattr(catalog, name)
+        if values.shape != catalog.v_mag.shape or values.ndim != 1 or values.dtype != np.dtype(DTYPES.get(name, "f8")):
+            return False
+        if name in RANGES:
+            low, high = RANGES[name]
+            bounds = (values.min(initial=high), values.max(initial=low)) if name in ALWAYS_KNOWN else (low, high)
+            if not (low <= bounds[0] and bounds[1] <= high):  # NaN too
+                return False
+    return bool(np.isfinite(catalog.epoch_jyear).all())
+
+
+def keep(path: Path, made: Kept) -> None:
+    """Put a catalogue into the cache, and drop the oldest others; nothing happens where that cannot be."""
+    about = {"designation": made.catalog.designation, "rows_read": made.catalog.rows_read}
+    about |= {"notes": made.catalog.notes, "doubts": made.doubts}
+    columns = {name: getattr(made.catalog, name) for name in column_names()}
+    with contextlib.suppress(OSError, HilstarError):
+        make_directory(path.parent)
+        with whole_file(path) as file:
+            np.savez(file, allow_pickle=False, about=np.array(json.dumps(about)), **columns)
+        by_age = sorted(path.parent.glob("catalogue-*.npz"), key=lambda file: file.stat().st_mtime_ns, reverse=True)
+        for old in by_age[KEPT_FILES:]:
+            old.unlink(missing_ok=True)
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """A bench's catalogue as its file names it; `epoch_jyear` is that of a table's places, where the file states it."""
+
+    source: str | Path = "hipparcos"
+    with_hipparcos: bool = False
+    epoch_jyear: float | None = None
+
+
+def choose_catalog(choice: Choice) -> Catalog:
+    """The stars of a choice, with notes on what became of a table's rows.
+
+    A table is read once; then what was made of it comes from the user's cache directory. Rows that are no star, and an overlap
+    that does not fit, are said in the log each time. Raises InputError.
+    """
+    packaged = str(choice.source) == "hipparcos"
+    if packaged or _is_hip_main(Path(choice.source)):
+        if choice.with_hipparcos:
+            raise InputError("[sky] with_hipparcos adds a table's stars to Hipparcos; name a table as [sky] catalogue")
+        if choice.epoch_jyear is not None:
+            raise InputError("[sky] catalogue_epoch_jyear is for a table; Hipparcos has its own, J1991.25")
+        return load_catalog(choice.source)
+    path = Path(choice.source)
+    made_of = (
+        path.name,
+        file_sha256(path, FILE_WANTED),
+        repr(choice.epoch_jyear),
+        _packaged_sha256() if choice.with_hipparcos else "",
+    )
+    place = store_path(made_of)
+    made = kept(place) if place is not None else None
+    if made is None:
+        made = _made(path, choice)
+        if place is not None:
+            keep(place, made)
+    for line in made.doubts:
+        log.warning("%s", line)
+    return made.catalog
+
+
+def _made(path: Path, choice: Choice) -> Kept:
+    found = assemble(path, read_table(path), choice.epoch_jyear, choice.with_hipparcos)
+    doubts = [found.line] if found.dropped else []
+    if not choice.with_hipparcos:
+        return Kept(_by_cell(found.catalog, found.line), tuple(doubts))
+    joined = join(load_catalog(), found.catalog)
+    if joined.doubt is not None:
+        doubts.append(f"{path.name}: {joined.doubt}")
+    return Kept(_by_cell(joined.catalog, found.line, joined.line), tuple(doubts))
+
+
+def _by_cell(catalog: Catalog, *notes: str) -> Catalog:
+    """The same stars, neighbours together: a bench that sorts them by cell then reads each array from its start to its end."""
+    return replace(catalog.taken(cell_grid(unit_vectors_icrs(catalog, GAIA_DR3_JYEAR)).order), notes=notes)
+
+
+def _is_hip_main(path: Path) -> bool:
+    with open_regular(path, FILE_WANTED, MAX_TABLE_BYTES) as file:
+        return file.read(2) == b"H|"
+
+
+def _packaged_sha256() -> str:
+    return hashlib.sha256(PACKAGED_CATALOG.read_bytes()).hexdigest()

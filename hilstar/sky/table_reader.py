@@ -1,0 +1,384 @@
+"""From a catalogue's own passbands to Johnson V, B-V and Cousins V-I, by published relations.
+
+Which column of a table is which: the names of Gaia, Tycho-2, Hipparcos and this project, and what their units say.
+
+Tables of stars as files: FITS, VOTable, ECSV and CSV through Astropy, only the columns that are used.
+"""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from numpy.polynomial.polynomial import polyval
+
+from hilstar.arrays import FloatArray
+from hilstar.errors import InputError, cannot_read, shortened
+from hilstar.reading import HEAD_BYTES, kind_of, open_regular, size_text
+from hilstar.sky.catalog import load_catalog
+
+# BT - VT to V - VT, and to (B - V) - (BT - VT) in the blue and in the red: Mamajek, Meyer and Liebert 2002, AJ 124, 1670,
+# appendix C, with the sign of the erratum (2006, AJ 131, 2360). For -0.25 < BT - VT < 2; beyond, the offsets of the ends.
+TYCHO_RANGE_MAG, TYCHO_RED_MAG = (-0.25, 2.0), 0.5
+V_FROM_VT = (9.7e-4, -0.1334, 0.05486, -0.01998)
+BV_BLUE, BV_RED = (-0.006, -0.1069, 0.1459), (0.0, -0.007813, -0.1489, 0.03384)
+
+# BP - RP to G - V and to G - I: Riello et al. 2021, A&A 649, A3, table C.2 (Gaia DR3 documentation, table 5.9), scatter 0.030
+# and 0.038 mag, for -0.5 < BP - RP < 4.5; beyond, the values of the ends.
+GAIA_RANGE_MAG = (-0.5, 4.5)
+G_LESS_V = (-0.02704, 0.01424, -0.2156, 0.01426)
+G_LESS_I = (0.01753, 0.76, -0.0991)
+
+# V - I to B - V: the median of Hipparcos' stars in bins of this width and at least so many.
+BIN_MAG, MIN_STARS = 0.05, 20
+# Names in lower case, the first that a table has is taken. A later pair of places fills the rows of an earlier one that are
+# blank: Tycho-2 has no mean place for one star in 20.
+PLACES = (
+    ("ra", "dec"),
+    ("ramdeg", "demdeg"),
+    ("ra_icrs", "de_icrs"),
+    ("raicrs", "deicrs"),
+    ("ra_deg", "dec_deg"),
+    ("radeg", "dedeg"),
+    ("raj2000", "dej2000"),
+    ("ra(icrs)", "de(icrs)"),
+    ("rarad", "derad"),
+    ("ra_icrs_", "de_icrs_"),
+    ("_raj2000", "_dej2000"),
+)
+NAMES: dict[str, tuple[str, ...]] = {
+    "pm_ra_cosdec_mas_yr": ("pmra", "pm_ra_cosdec_mas_yr", "pm_ra_cosdec", "pm_ra"),
+    "pm_dec_mas_yr": ("pmdec", "pmde", "pm_dec_mas_yr", "pm_dec"),
+    "parallax_mas": ("parallax", "plx", "parallax_mas"),
+    "epoch_jyear": ("ref_epoch", "epoch_jyear"),
+    "v_mag": ("v_mag", "vmag", "v"),
+    "b_mag": ("b_mag", "bmag", "b"),
+    "bv_mag": ("bv_mag", "b-v", "b_v", "bv"),
+    "vi_mag": ("vi_mag", "v-i", "v_i", "vi"),
+    "bt_mag": ("btmag", "bt_mag", "bt"),
+    "vt_mag": ("vtmag", "vt_mag", "vt"),
+    "g_mag": ("phot_g_mean_mag", "gmag", "g"),
+    "bp_mag": ("phot_bp_mean_mag", "bpmag"),
+    "rp_mag": ("phot_rp_mean_mag", "rpmag"),
+    "bp_rp_mag": ("bp_rp", "bp-rp"),
+    "gaia": ("source_id", "source"),
+    "tyc1": ("tyc1",),
+    "tyc2": ("tyc2",),
+    "tyc3": ("tyc3",),
+    "hip": ("hip",),
+}
+COLUMNS_WANTED = (
+    "name V with B-V or V-I (vmag, b-v, v-i), Tycho's vtmag and btmag, or Gaia's phot_g_mean_mag with bp_rp or with "
+    "phot_bp_mean_mag and phot_rp_mean_mag"
+)
+MAX_NAMED = 12
+HOURS = ("h", "hr", "hour", "hourangle")
+UNITS = {"deg": ("ra_deg", "dec_deg"), "mas / yr": ("pm_ra_cosdec_mas_yr", "pm_dec_mas_yr"), "mas": ("parallax_mas",)}
+UNIT_OF = {role: unit for unit, roles in UNITS.items() for role in roles}
+FILE_WANTED = "give a table of stars as FITS, ECSV, CSV or VOTable, or the CDS I/239 hip_main.dat"
+MAX_TABLE_BYTES = 4_000_000_000
+MAX_XML_BYTES = 500_000_000  # a VOTable is parsed as a whole
+MAX_HEAD_BYTES = 1_000_000  # of the lines before a text's rows
+MAX_COLUMNS, MAX_LINE = 1000, 50_000
+MAX_ROWS = 10_000_000
+CHUNK_BYTES = 64_000_000  # of a text that is parsed at once
+BLANKS = ("", "null", "NULL", "nan", "NaN", "--", "---")
+DELIMITERS = (",", "\t", "|", ";")
+ELSEWHERE = re.compile(rb"<STREAM\b[^>]*\bhref\s*=", re.IGNORECASE)
+
+
+def from_tycho(bt_mag: FloatArray, vt_mag: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Johnson V and B-V, shape (n,), of Tycho's BT and VT."""
+    colour = bt_mag - vt_mag
+    held = np.clip(colour, *TYCHO_RANGE_MAG)
+    offset = np.where(held < TYCHO_RED_MAG, polyval(held, BV_BLUE), polyval(held, BV_RED))
+    return vt_mag + polyval(held, V_FROM_VT), colour + offset
+
+
+def from_gaia(g_mag: FloatArray, bp_rp_mag: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Johnson V and Cousins V-I, shape (n,), of Gaia's G and BP-RP (DR3)."""
+    held = np.clip(bp_rp_mag, *GAIA_RANGE_MAG)
+    g_less_v = polyval(held, G_LESS_V)
+    return g_mag - g_less_v, polyval(held, G_LESS_I) - g_less_v
+
+
+def bv_from_vi(vi_mag: FloatArray) -> FloatArray:
+    """The B-V, shape (n,), that Hipparcos' stars of that V-I have in the median; the colours of its ends beyond them."""
+    return np.asarray(np.interp(vi_mag, *_bv_along_vi()))
+
+
+@cache
+def _bv_along_vi() -> tuple[FloatArray, FloatArray]:
+    stars = load_catalog()
+    known = np.isfinite(stars.vi_mag)
+    bv_mag, vi_mag = stars.bv_mag[known], stars.vi_mag[known]
+    order = np.argsort(vi_mag, kind="stable")
+    bins, start = np.unique(np.round(vi_mag[order] / BIN_MAG), return_index=True)
+    parts = zip(bins * BIN_MAG, np.split(bv_mag[order], start[1:]), strict=True)
+    full = [(vi, float(np.median(part))) for vi, part in parts if len(part) >= MIN_STARS]
+    return np.array([vi for vi, _ in full]), np.array([bv for _, bv in full])
+
+
+Converted = tuple[FloatArray, FloatArray, FloatArray]
+
+
+@dataclass(frozen=True, slots=True)
+class Route:
+    """One way from a table's magnitudes to V, B-V and V-I, (n,) each, V-I NaN where it is not known."""
+
+    roles: tuple[str, ...]
+    words: str
+    convert: Callable[..., Converted]
+
+
+def _given(v: FloatArray, bv: FloatArray) -> Converted:
+    return v, bv, np.full(len(v), np.nan)
+
+
+def _by_vi(v: FloatArray, vi: FloatArray) -> Converted:
+    return v, bv_from_vi(vi), vi
+
+
+def _by_tycho(vt: FloatArray, bt: FloatArray) -> Converted:
+    v, bv = from_tycho(bt, vt)
+    return v, bv, np.full(len(v), np.nan)
+
+
+def _by_gaia(g: FloatArray, bp_rp: FloatArray) -> Converted:
+    return _by_vi(*from_gaia(g, bp_rp))
+
+
+# The best first.
+ROUTES = (
+    Route(("v_mag", "bv_mag"), "V and B-V as given", _given),
+    Route(("v_mag", "vi_mag"), "V and V-I as given, B-V of Hipparcos' stars of that V-I", _by_vi),
+    Route(("v_mag", "b_mag"), "B and V as given", lambda v, b: _given(v, b - v)),
+    Route(("vt_mag", "bt_mag"), "V and B-V from Tycho's BT and VT (Mamajek et al. 2002)", _by_tycho),
+    Route(("g_mag", "bp_rp_mag"), "V and V-I from Gaia's G, BP and RP (Riello et al. 2021)", _by_gaia),
+    Route(
+        ("g_mag", "bp_mag", "rp_mag"),
+        "V and V-I from Gaia's G, BP and RP (Riello et al. 2021)",
+        lambda g, bp, rp: _by_gaia(g, bp - rp),
+    ),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """The table's column for each role, the pairs that give places, and the sets of roles that give V and a colour."""
+
+    role: Mapping[str, str]
+    places: tuple[tuple[str, str], ...]
+    magnitudes: tuple[tuple[str, ...], ...]
+
+    def needed(self) -> list[str]:
+        """The columns to read."""
+        return sorted({*self.role.values(), *(name for pair in self.places for name in pair)})
+
+
+def layout_of(path: Path, names: Sequence[str]) -> Layout:
+    """Which of a table's columns are used. Raises InputError where there is no place or no magnitude with a colour."""
+    known = {name.strip().lower(): name for name in reversed(names)}
+    places = tuple((known[ra], known[dec]) for ra, dec in PLACES if ra in known and dec in known)
+    role = {role: known[found] for role, words in NAMES.items() if (found := next((w for w in words if w in known), None))}
+    magnitudes = tuple(route.roles for route in ROUTES if all(name in role for name in route.roles))
+    found = ", ".join(shortened(name, 40) for name in names[:MAX_NAMED]) + (", ..." if len(names) > MAX_NAMED else "")
+    if not places:
+        pairs = ", ".join(f"{ra} and {dec}" for ra, dec in PLACES[:4])
+        raise InputError(f"{path}: has no right ascension and declination among its columns ({found}); name them {pairs}")
+    if not magnitudes:
+        raise InputError(f"{path}: has no magnitude with a colour among its columns ({found}); {COLUMNS_WANTED}")
+    return Layout(role, places, magnitudes)
+
+
+def factor_to(role: str, column: str, unit: str | None, path: Path) -> float:
+    """By what a column's figures are multiplied to have the role's unit; 1 where the table says none. Raises InputError."""
+    from astropy import units as u
+
+    wanted = UNIT_OF.get(role)
+    if unit is None or not unit.strip() or wanted is None:
+        return 1.0
+    if role == "ra_deg" and unit.strip().lower() in HOURS:
+        return 15.0
+    try:
+        return float(u.Unit(unit, parse_strict="raise").to(u.Unit(wanted), equivalencies=u.dimensionless_angles()))
+    except (ValueError, TypeError, u.UnitConversionError) as error:
+        raise InputError(f"{path}: column {column} is in {shortened(unit)!r}; give it in {wanted.replace(' ', '')}") from error
+
+
+@dataclass(frozen=True, slots=True)
+class RawTable:
+    """The columns of a table by its own names: figures as float64 with NaN where blank, identifiers as int64 with 0."""
+
+    layout: Layout
+    columns: Mapping[str, FloatArray | npt.NDArray[np.int64]]
+    unit: Mapping[str, str | None]
+    row_count: int
+
+
+Whole = ("gaia", "tyc1", "tyc2", "tyc3", "hip")
+
+
+def read_table(path: Path) -> RawTable:
+    """Read a table of stars. Raises InputError for another file, and for one that is too large."""
+    with open_regular(path, FILE_WANTED, MAX_TABLE_BYTES) as file:
+        head = file.read(4096)
+    kind = kind_of(head[:HEAD_BYTES])
+    if kind is not None and kind != "a FITS file":
+        raise cannot_read(path, f"it is {kind}", "unpack it first" if kind.endswith("zip file") else FILE_WANTED)
+    text = head.lstrip(b"\xef\xbb\xbf \r\n\t")
+    if kind == "a FITS file":
+        return _read_fits(path)
+    if text[:5] == b"<?xml" or text[:8].upper() == b"<VOTABLE":
+        return _read_votable(path)
+    if not text:
+        raise InputError(f"{path}: is empty; {FILE_WANTED}")
+    return _read_text(path)
+
+
+@contextmanager
+def _quiet(path: Path) -> Iterator[None]:
+    """Astropy's warnings silenced, and whatever its layers raise over a broken file as one line."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    except InputError:
+        raise
+    except MemoryError as error:
+        raise cannot_read(path, "it needs more memory than there is", "cut it to the stars that are used") from error
+    except Exception as error:
+        raise cannot_read(path, f"{type(error).__name__}: {error}".rstrip(": "), FILE_WANTED) from error
+
+
+def _read_fits(path: Path) -> RawTable:
+    from astropy.io import fits
+
+    with _quiet(path), fits.open(path, memmap=True) as hdus:
+        table = next((hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU | fits.TableHDU)), None)
+        if table is None:
+            raise InputError(f"{path}: holds no table; {FILE_WANTED}")
+        layout = layout_of(path, table.columns.names)
+        _check_rows(path, int(table.header["NAXIS2"]))
+        by_name = {column.name: column for column in table.columns}
+        columns, unit = {}, {}
+        for name in layout.needed():
+            null = by_name[name].null
+            values = np.asarray(table.data[name])
+            mask = values == null if null is not None and values.dtype.kind in "iu" else None
+            columns[name], unit[name] = _numbers(path, layout, name, values, mask), by_name[name].unit
+        return RawTable(layout, columns, unit, len(table.data))
+
+
+def _read_votable(path: Path) -> RawTable:
+    from astropy.io import votable
+
+    if path.stat().st_size > MAX_XML_BYTES:
+        size = size_text(path.stat().st_size)
+        raise cannot_read(path, f"a VOTable of {size}, {size_text(MAX_XML_BYTES)} at most", "give it as FITS")
+    if ELSEWHERE.search(path.read_bytes()):
+        raise cannot_read(path, "its data are in another file or at another place", "give a VOTable that holds them")
+    with _quiet(path):
+        table = votable.parse_single_table(path, verify="ignore")
+        fields = {field.name: field for field in table.fields}
+        layout = layout_of(path, list(fields))
+        _check_rows(path, len(table.array))
+        columns, unit = {}, {}
+        for name in layout.needed():
+            column = table.array[fields[name].ID if fields[name].ID in (table.array.dtype.names or ()) else name]
+            columns[name] = _numbers(path, layout, name, np.asarray(column.data), np.ma.getmaskarray(column))
+            unit[name] = None if fields[name].unit is None else str(fields[name].unit)
+        return RawTable(layout, columns, unit, len(table.array))
+
+
+def _read_text(path: Path) -> RawTable:
+    names, unit, delimiter = _text_head(path)
+    layout = layout_of(path, names)
+    needed = layout.needed()
+    parts: dict[str, list[Any]] = {name: [] for name in needed}
+    count = 0
+    with _quiet(path):
+        for chunk in _chunks(path, needed, delimiter):
+            count += len(chunk)
+            _check_rows(path, count)
+            for name in needed:
+                column = chunk[name]
+                parts[name].append(_numbers(path, layout, name, np.asarray(column), np.ma.getmaskarray(column)))
+    if not count:
+        raise InputError(f"{path}: has no rows; {FILE_WANTED}")
+    return RawTable(layout, {name: np.concatenate(values) for name, values in parts.items()}, unit, count)
+
+
+def _chunks(path: Path, needed: list[str], delimiter: str) -> Iterator[Any]:
+    """Pieces of a text's rows as Astropy tables of the columns `needed`."""
+    from astropy.io import ascii as text
+
+    yield from text.read(
+        path,
+        format="tab" if delimiter == "\t" else "csv",
+        **({} if delimiter == "\t" else {"delimiter": delimiter}),
+        comment="#",
+        guess=False,
+        include_names=needed,
+        fill_values=[(blank, "0") for blank in BLANKS],
+        fast_reader={"enable": "force", "chunk_size": CHUNK_BYTES, "chunk_generator": True},
+    )
+
+
+def _text_head(path: Path) -> tuple[list[str], dict[str, str | None], str]:
+    """The columns' names and units, and what stands between them, by the comments and the first line of a text."""
+    with open_regular(path, FILE_WANTED) as file:
+        head = file.read(MAX_HEAD_BYTES).decode("utf-8-sig", errors="replace")
+    lines = head.splitlines()
+    comments = [line[1:].strip() for line in lines if line.startswith("#")]
+    first = next((line for line in lines if line.strip() and not line.startswith("#")), "")
+    unit: dict[str, str | None] = {}
+    delimiter = max(DELIMITERS, key=first.count)
+    if comments and comments[0].startswith("%ECSV"):
+        from astropy.table import meta
+
+        with _quiet(path):
+            header = meta.get_header_from_yaml([line for line in comments if not line.startswith("%ECSV")])
+        unit = {column["name"]: column.get("unit") for column in header["datatype"]}
+        delimiter = str(header.get("delimiter", " "))
+    elif not first.count(delimiter):
+        raise cannot_read(path, "its first line names no columns", FILE_WANTED)
+    names = [name.strip().strip('"') for name in first[:MAX_LINE].split(None if delimiter == " " else delimiter)]
+    if len(first) > MAX_LINE or len(names) > MAX_COLUMNS:
+        raise cannot_read(
+            path, f"its first line names more than {MAX_COLUMNS} columns or is longer than {MAX_LINE}", FILE_WANTED
+        )
+    return names, unit, delimiter
+
+
+def _numbers(path: Path, layout: Layout, name: str, values: npt.NDArray[Any], mask: Any) -> Any:
+    """A column as float64, or as int64 where it identifies the star. Raises InputError where it is text."""
+    whole = name in {layout.role.get(role) for role in Whole}
+    if values.dtype.kind not in "iufb":
+        raise InputError(
+            f"{path}: column {name} is no column of numbers (its first is {str(values.flat[0])[:40]!r}); write decimal figures,"
+            " places in degrees"
+            if values.size
+            else f"{path}: has no rows; {FILE_WANTED}"
+        )
+    if whole:
+        numbers = np.nan_to_num(values, nan=0.0) if values.dtype.kind == "f" else values
+        plain = numbers.astype(np.int64)
+        return plain if mask is None else np.where(mask, 0, plain)
+    figures = values.astype(np.float64)
+    if mask is not None:
+        figures[mask] = np.nan
+    return figures
+
+
+def _check_rows(path: Path, count: int) -> None:
+    if count > MAX_ROWS:
+        raise InputError(f"{path}: has more than {MAX_ROWS} rows; cut it to the magnitudes that the tracker sees")

@@ -10,17 +10,11 @@ from typing import Any, Protocol
 import msgspec
 
 from hilstar.bench.bench_file import BenchFile, read_bench_file
-from hilstar.campaign.cases.case import CaseMaker
-from hilstar.campaign.cases.row import columns, failed, first_row
-from hilstar.campaign.plan.design import Design
-from hilstar.campaign.plan.parameters import grid_levels
-from hilstar.campaign.plan.tables import Plan, parse_plan
-from hilstar.campaign.store.directory import About, Directory
-from hilstar.campaign.store.journal import Journal
-from hilstar.campaign.store.table import require_parquet, schema_of, write_table
-from hilstar.campaign.workers.backlog import MAX_DEATHS, Backlog, Task
-from hilstar.campaign.workers.identity import Identity
-from hilstar.campaign.workers.session import Answered, Job, Session, files_sha256
+from hilstar.campaign.cases import CaseMaker, columns, failed, first_row
+from hilstar.campaign.plan import Design, Plan, grid_levels, parse_plan
+from hilstar.campaign.pool import MAX_DEATHS, Backlog, Task
+from hilstar.campaign.session import Answered, Identity, Job, Session, files_sha256
+from hilstar.campaign.store import About, Directory, Journal, require_parquet, schema_of, write_table
 from hilstar.errors import InputError
 from hilstar.reading import MAX_TOML_BYTES, read_text
 

@@ -18,7 +18,7 @@ import pytest
 
 from hilstar.bench.config import read_config
 from hilstar.bench.faults.scenario import parse_scenario
-from hilstar.campaign.plan.tables import parse_plan
+from hilstar.campaign.plan import parse_plan
 from hilstar.cli.app import app
 from hilstar.cli.parsers import with_values
 from tests.docs.pages import Block, blocks_of, differs

@@ -18,9 +18,9 @@ from hilstar.console.terminal import print_json, progress, say
 from hilstar.errors import InputError
 
 if TYPE_CHECKING:
+    from hilstar.campaign.cluster import Scheduler
     from hilstar.campaign.run import Campaign
-    from hilstar.campaign.store.directory import Directory
-    from hilstar.campaign.workers.cluster import Scheduler
+    from hilstar.campaign.store import Directory
 
 MAX_REASONS = 5
 LINE_S = 10.0  # between lines of progress where stderr is no terminal
@@ -63,7 +63,7 @@ def campaign(
 ) -> None:
     """Run a plan's cases over every core, or a cluster, into one Parquet table, a row a case."""
     from hilstar.campaign.run import Asked, Campaign
-    from hilstar.campaign.store.directory import Directory
+    from hilstar.campaign.store import Directory
     from hilstar.files import check_directory
 
     check_directory("-o", output)
@@ -88,7 +88,7 @@ def campaign(
 
 def _scheduler(address: str | None, *tls: Path | None) -> Scheduler | None:
     """The scheduler that is asked for, checked. Raises InputError."""
-    from hilstar.campaign.workers.cluster import Scheduler
+    from hilstar.campaign.cluster import Scheduler
 
     if address is None:
         if any(tls):
@@ -103,7 +103,7 @@ def run_cases(
     this: Campaign, directory: Directory, scheduler: Scheduler | None, workers: int, memory_bytes: int | None
 ) -> None:
     """Run the cases that are missing, on a cluster or on this machine's cores."""
-    from hilstar.campaign.workers.pool import Pool
+    from hilstar.campaign.pool import Pool
 
     count = 0
     with telling(this.cases) as advance:
@@ -115,7 +115,7 @@ def run_cases(
 
         try:
             if scheduler is not None:
-                from hilstar.campaign.workers.cluster import Cluster
+                from hilstar.campaign.cluster import Cluster
 
                 with Cluster(scheduler, this.job, this.identity, say) as cluster:
                     this.run(directory, cluster, on_done)
@@ -151,8 +151,8 @@ def telling(cases: int) -> Iterator[Callable[[int], None]]:
 
 def summarised(this: Campaign, directory: Directory) -> dict[str, Any]:
     """What came of a campaign, from its table."""
-    from hilstar.campaign.results.write import write_results
-    from hilstar.campaign.store.table import failures, file_sha256
+    from hilstar.campaign.results import write_results
+    from hilstar.campaign.store import failures, file_sha256
 
     because = failures(directory.table)
     results = write_results(directory.table, this.maker.file.config, this.plan.seed)

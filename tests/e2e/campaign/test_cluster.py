@@ -16,8 +16,8 @@ from pathlib import Path
 import pytest
 
 import hilstar
-from hilstar.campaign.store.table import read_columns
-from hilstar.campaign.workers import cluster
+from hilstar.campaign import cluster
+from hilstar.campaign.store import read_columns
 from tests.support.benches import ROOT
 from tests.support.campaigns import write_campaign
 from tests.support.commands import HILSTAR, assert_refused, run_hilstar, run_hilstar_here
@@ -36,7 +36,7 @@ def solve(image, tracker):
 FETCH = """
 import os, signal, sys
 import distributed
-from hilstar.campaign.workers import cluster
+from hilstar.campaign import cluster
 cluster.FETCH_S = 1.0
 with distributed.Client(sys.argv[1]) as client:
     client.wait_for_workers(1)

@@ -13,7 +13,7 @@ from hilstar.bench.bench_file import read_bench_file
 from hilstar.bench.build import load
 from hilstar.bench.discs import When
 from hilstar.bench.frame import Bench
-from hilstar.campaign.cases.display import DisplayTracker
+from hilstar.campaign.display_tracker import DisplayTracker
 from hilstar.rotation import from_radec_roll_deg, to_matrix
 from hilstar.scene.trail_discs import DiscTrail, hidden
 from hilstar.sky.bodies.disc import Disc

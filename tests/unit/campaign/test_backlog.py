@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from hilstar.campaign.plan.design import Design
-from hilstar.campaign.store.journal import Journal
-from hilstar.campaign.workers.backlog import MAX_DEATHS, Backlog
+from hilstar.campaign.plan import Design
+from hilstar.campaign.pool import MAX_DEATHS, Backlog
+from hilstar.campaign.store import Journal
 
 
 def backlog(folder: Path, cases: int, done: list[int]) -> Backlog:

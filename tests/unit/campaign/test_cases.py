@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
-from hilstar.campaign.plan.design import Design
-from hilstar.campaign.plan.tables import parse_plan
-from hilstar.campaign.workers.session import Job, Session, files_sha256
+from hilstar.campaign.plan import Design, parse_plan
+from hilstar.campaign.session import Job, Session, files_sha256
 from hilstar.rotation import propagate
 from tests.support.campaigns import write_campaign
 from tests.support.commands import run_hilstar_here

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from hilstar.bench.bench_file import read_bench_file
-from hilstar.campaign.cases.case import CaseMaker
-from hilstar.campaign.plan.design import Design
-from hilstar.campaign.plan.tables import read_plan
+from hilstar.campaign.cases import CaseMaker
+from hilstar.campaign.plan import Design, read_plan
 from hilstar.errors import InputError
 from hilstar.rotation import to_matrix
 from tests.support.campaigns import write_campaign

@@ -9,10 +9,8 @@ import pytest
 from PIL import Image
 
 from hilstar.bench.bench_file import read_bench_file
-from hilstar.campaign.results.columns import Columns, read_cases
-from hilstar.campaign.results.sensitivity import costs
-from hilstar.campaign.results.write import write_results
-from hilstar.campaign.store.table import schema_of, write_table
+from hilstar.campaign.results import Columns, costs, read_cases, write_results
+from hilstar.campaign.store import schema_of, write_table
 from hilstar.rotation import from_radec_roll_deg
 from tests.support.campaigns import write_campaign
 

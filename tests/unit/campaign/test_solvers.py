@@ -10,11 +10,9 @@ import numpy as np
 import pytest
 
 from hilstar.bench.bench_file import read_bench_file
-from hilstar.campaign.cases.row import attitude_error_arcsec
-from hilstar.campaign.plan.tables import Centroiding
-from hilstar.campaign.solvers.answer import SolverFault
-from hilstar.campaign.solvers.choose import choose_solver
-from hilstar.campaign.solvers.command import printed_attitude
+from hilstar.campaign.cases import attitude_error_arcsec
+from hilstar.campaign.plan import Centroiding
+from hilstar.campaign.solvers import SolverFault, choose_solver, printed_attitude
 from hilstar.errors import InputError
 from hilstar.rotation import from_radec_roll_deg, from_rotation_vector, multiply
 from hilstar.twin.simulator import Exposure, Simulator

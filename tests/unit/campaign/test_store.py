@@ -9,10 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from hilstar.campaign.store import journal as journals
-from hilstar.campaign.store.directory import About, Directory
-from hilstar.campaign.store.journal import Journal
-from hilstar.campaign.store.table import file_sha256, read_columns, schema_of, write_table
+from hilstar.campaign import store
+from hilstar.campaign.store import About, Directory, Journal, file_sha256, read_columns, schema_of, write_table
 from hilstar.errors import InputError
 from tests.support.damage import NO_JSON
 
@@ -26,7 +24,7 @@ COLUMNS = {"case": "int64", "why": "text", "value": "float64", "whole": "float64
 
 @pytest.fixture(autouse=True)
 def _small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(journals, "BLOCK_CASES", 8)
+    monkeypatch.setattr(store, "BLOCK_CASES", 8)
 
 
 def test_rows_survive_a_cut_at_any_byte_and_none_is_there_twice(tmp_path: Path) -> None:

@@ -1,4 +1,7 @@
-"""The cluster: a Dask scheduler that somebody started, and its workers, as they come and go."""
+"""What a cluster's worker is asked to do; each of its threads has a session, and a GL context, of its own.
+
+The cluster: a Dask scheduler that somebody started, and its workers, as they come and go.
+"""
 
 from __future__ import annotations
 
@@ -14,14 +17,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from hilstar.arrays import FloatArray
 from hilstar.attitude.wire.endpoint import Endpoint, check_use, parse_endpoint
-from hilstar.campaign.workers.backlog import Backlog, Task
-from hilstar.campaign.workers.identity import Identity, difference
-from hilstar.campaign.workers.pool import Done, Lost
-from hilstar.campaign.workers.remote import examine, run_task
-from hilstar.campaign.workers.session import Answered, Job
-from hilstar.errors import InputError, MachineError, one_line
+from hilstar.campaign.pool import Backlog, Done, Lost, Task
+from hilstar.campaign.session import Answered, Identity, Job, Session, difference
+from hilstar.errors import HilstarError, InputError, MachineError, one_line
 
+_here = threading.local()
 INSTALL = "install it: pip install 'hilstar[dask]'"
 PROTOCOLS = ("tcp", "tls", "ucx")
 GIVE_TLS = "give tls://HOST:PORT with --tls-ca-file, --tls-cert and --tls-key, as Dask's scheduler and workers have them"
@@ -32,6 +34,30 @@ CONNECT_S, ANSWER_S, MAX_SILENCE_S = 30.0, 30.0, 90.0
 FETCH_S = 5.0  # a task's rows come at once, or their worker is gone
 MAX_WITHOUT_WORKER_S = 60.0
 CLOSE_S = 0.3  # a Ctrl-C ends a command within a second
+
+
+def examine(job: Job) -> Identity | str:
+    """What this worker is, or why it cannot do the job."""
+    try:
+        return _session(job).identity()
+    except HilstarError as error:
+        return str(error)
+
+
+def run_task(job: Job, begin: int, points: FloatArray) -> Answered:
+    """The rows of the cases from `begin` on at their points (n, dimensions)."""
+    return _session(job).run(begin, points)
+
+
+def _session(job: Job) -> Session:
+    """This thread's session of a job; the one of an older job is closed."""
+    session: Session | None = getattr(_here, "session", None)
+    if session is None or session.job != job:
+        _here.session = None
+        if session is not None:
+            session.close()
+        session = _here.session = Session(job)
+    return session
 
 
 @dataclass(frozen=True, slots=True)

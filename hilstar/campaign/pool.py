@@ -1,20 +1,28 @@
-"""The pool: processes of this machine, one GL context each; one that dies is replaced, and its cases are run again."""
+"""The cases that are still to be run, in tasks as long as a worker should have, and what becomes of a dead worker's.
+
+The pool: processes of this machine, one GL context each; one that dies is replaced, and its cases are run again.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import math
 import multiprocessing
 import os
 import signal
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from typing import TYPE_CHECKING, Any
 
-from hilstar.campaign.workers.backlog import Backlog, Task
-from hilstar.campaign.workers.identity import Identity, difference
-from hilstar.campaign.workers.session import Answered, Job, Session, peak_bytes
+import numpy as np
+
+from hilstar.arrays import FloatArray
+from hilstar.campaign.plan import Design
+from hilstar.campaign.session import Answered, Identity, Job, Session, difference, peak_bytes
+from hilstar.campaign.store import Journal
 from hilstar.errors import HilstarError, InputError, MachineError
 from hilstar.process.interrupts import end_with_parent
 from hilstar.reading import size_text
@@ -22,10 +30,87 @@ from hilstar.reading import size_text
 if TYPE_CHECKING:
     from multiprocessing.context import SpawnProcess
 
+FIRST_CASES, MAX_TASK_CASES = 1, 1000  # a task
+A_WORKER_S = 0.02  # of a task, so that one driver and one scheduler keep up: 50 tasks a second, whatever the workers' number
+MAX_DEATHS = 3  # of workers over one case alone, which is then taken for the cause
+SMOOTHING = 0.3
 TASK_S = 0.5  # of work in a task: a kill loses about as much a worker
 MAX_STARTS_LOST = 5  # processes that died before they were ready, one after the other
 END_S = 2.0
 ONE_THREAD = ("LP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """Consecutive cases from `begin` on, with their points (n, dimensions)."""
+
+    begin: int
+    points: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+class Backlog:
+    """Hands the missing cases of a journal out in tasks of about `target_s`, shorter at the end: all workers end together."""
+
+    def __init__(self, design: Design, journal: Journal, target_s: float) -> None:
+        self._design, self._target_s = design, target_s
+        self._waiting: deque[Task] = deque()
+        self._runs = self._missing_runs(journal)
+        self._left: tuple[int, int] | None = None
+        self.to_run = design.cases - journal.done
+        self._case_s: float | None = None
+        self._deaths: dict[int, int] = {}
+
+    def _missing_runs(self, journal: Journal) -> Iterator[tuple[int, int]]:
+        """Begin and end of each run of missing cases."""
+        for block in range(journal.blocks):
+            missing = np.array(journal.missing(block), dtype=np.int64)
+            for part in np.split(missing, np.flatnonzero(np.diff(missing) != 1) + 1):
+                if len(part):
+                    yield int(part[0]), int(part[-1]) + 1
+
+    def take(self, workers: int) -> Task | None:
+        """The next task, None where all cases are handed out."""
+        if self._waiting:
+            return self._waiting.popleft()
+        if self._left is None:
+            self._left = next(self._runs, None)
+        if self._left is None:
+            return None
+        begin, end = self._left
+        stop = min(end, begin + self._size(workers))
+        self._left = None if stop == end else (stop, end)
+        return Task(begin, self._design.points(begin, stop))
+
+    def _size(self, workers: int) -> int:
+        if self._case_s is None:
+            return FIRST_CASES
+        fair = math.ceil(self.to_run / (4 * max(1, workers)))
+        task_s = max(self._target_s, A_WORKER_S * workers)
+        return max(1, min(MAX_TASK_CASES, fair, round(task_s / max(self._case_s, 1e-6))))
+
+    def done(self, task: Task, seconds: float) -> None:
+        """A task has come back after so much work."""
+        self.to_run -= len(task)
+        case_s = seconds / max(1, len(task))
+        self._case_s = case_s if self._case_s is None else (1 - SMOOTHING) * self._case_s + SMOOTHING * case_s
+
+    def give_back(self, task: Task) -> None:
+        """A task that nobody has begun is handed out again."""
+        self._waiting.append(task)
+
+    def died(self, task: Task) -> int | None:
+        """A worker died over a task, whose cases are handed out again one by one; or the case that ended too many of them."""
+        if len(task) == 1:
+            self._deaths[task.begin] = self._deaths.get(task.begin, 0) + 1
+            if self._deaths[task.begin] >= MAX_DEATHS:
+                self.to_run -= 1
+                return task.begin
+        self._waiting.extend(Task(task.begin + k, task.points[k : k + 1]) for k in range(len(task)))
+        return None
+
 
 Done = Callable[[Task, Answered], None]
 Lost = Callable[[Task, int | None], None]

@@ -1,4 +1,8 @@
-"""Which parameter costs how much: the error in bins of each parameter, all others as the plan spreads them.
+"""A campaign's table as arrays, of as many cases as a figure needs.
+
+The error budget of a campaign's cases, by the same code as that of a run.
+
+Which parameter costs how much: the error in bins of each parameter, all others as the plan spreads them.
 
 A bin's level is the median of its cases, so that one field with two stars does not hide what a parameter does to all others;
 its standard error is half of what lies between the order statistics sqrt(k) / 2 on either side of the middle. (For answers not
@@ -6,25 +10,184 @@ given it is their mean.) A parameter's **cost** is what the bins, rms over them,
 **share** is the first-order index of Sobol (1993) of the cases' ranks: the variance of the bins' mean ranks in that of all,
 less what bins of so many cases have by chance. Attitude errors are those about their median: a bias that all cases have is
 alignment, which no parameter costs.
+
+What is written beside a campaign's table once it is whole: budget, costs and charts.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from scipy.stats import rankdata
 
 from hilstar.arrays import FloatArray, IntArray
-from hilstar.campaign.results.columns import VARY, Columns
+from hilstar.bench.config import BenchConfig
+from hilstar.campaign.budget.budget import assess_cases
+from hilstar.campaign.budget.scale import Scale
 from hilstar.charts import INK, MUTED, chart, write_csv
+from hilstar.errors import InputError
+from hilstar.rotation import from_rotation_vectors, multiply
+from hilstar.units import ARCSEC_PER_RAD
 
+MAX_READ_CASES = 50_000  # that figures are made from; of a larger table evenly many from each part
+VARY = "vary."
+CSV_COLUMNS = ("quantity", "axis", "value", "unit", "low_95", "high_95")
+PARTS = {"fov": "field-of-view error", "pixel": "pixel error", "noise": "noise", "scatter": "noise within a case"}
+MAX_FITTED_CASES = 20_000  # that the parts are told apart in; the fit's time grows with them
 MAX_BINS, MIN_IN_BIN = 8, 8
 SURE = 4.0  # standard errors between the worst and the best bin; of 8 bins of noise, 1 in 100 are so far apart
 MAX_PANELS = 6
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Columns (n,) by name: numbers as float64 with NaN where there are none, and text. `cases` counts the whole table's."""
+
+    cases: int
+    numbers: dict[str, FloatArray]
+    texts: dict[str, list[str]]
+
+    @property
+    def varied(self) -> list[str]:
+        """The names of the varied columns."""
+        return [name for name in (*self.numbers, *self.texts) if name.startswith(VARY)]
+
+    def vectors(self, form: str, names: str) -> FloatArray:
+        """Columns (n, k) side by side: `form` with each of `names` in it."""
+        return np.stack([self.numbers[form.format(name)] for name in names], axis=1)
+
+
+def read_cases(path: Path, max_cases: int = MAX_READ_CASES) -> Columns:
+    """A campaign's table. Raises InputError where it is none."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    numbers: dict[str, list[FloatArray]] = {}
+    texts: dict[str, list[str]] = {}
+    try:
+        file = pq.ParquetFile(path)
+        step = -(-file.metadata.num_rows // max_cases) or 1
+        for group in range(file.num_row_groups):
+            table = file.read_row_group(group)
+            table = table.take(pa.array(np.arange(0, table.num_rows, step)))
+            for name in table.column_names:
+                column: Any = table.column(name)
+                if pa.types.is_string(column.type):
+                    texts.setdefault(name, []).extend(value or "" for value in column.to_pylist())
+                else:
+                    values = np.array([np.nan if v is None else float(v) for v in column.to_pylist()])
+                    numbers.setdefault(name, []).append(values)
+        return Columns(file.metadata.num_rows, {name: np.concatenate(parts) for name, parts in numbers.items()}, texts)
+    except (OSError, pa.ArrowException, ValueError) as error:
+        raise InputError(f"{path}: is no table of a campaign ({error}); delete it, and run the same command again") from error
+
+
+def reported_attitudes(cases: Columns) -> FloatArray:
+    """The attitudes (n, 4) that the solver reported, NaN where none: a case's mean error put on its commanded attitude."""
+    commanded = cases.vectors("q{}", "wxyz")
+    error = cases.vectors("error_{}_arcsec", "xyz") / ARCSEC_PER_RAD
+    known = np.isfinite(error).all(axis=1)
+    reported = cases.vectors("solved_q{}", "wxyz")
+    reported[known] = multiply(from_rotation_vectors(error[known]), commanded[known])
+    return reported
+
+
+def case_budget(cases: Columns, config: BenchConfig, rng: np.random.Generator) -> dict[str, Any]:
+    """The budget as `hilstar assess` has it, with `scatter_arcsec` within cases of several frames, and notes.
+
+    What too few answers cannot tell is None, and a note says why.
+    """
+    asked = np.nansum(cases.numbers["frames"])
+    solved, wrong = (float(np.nansum(cases.numbers[name])) for name in ("solved", "wrong"))
+    found: dict[str, Any] = {
+        "bias_arcsec": None,
+        "fov_arcsec": None,
+        "pixel_arcsec": None,
+        "noise_arcsec": None,
+        "scatter_arcsec": _scatter(cases),
+        "availability": (solved - wrong) / asked if asked else 0.0,
+        "wrong": int(wrong),
+        "centroids": _centroids(cases),
+        "notes": [],
+        "intervals": {},
+    }
+    tracker = config.tracker
+    scale = Scale(tracker.focal_length_mm * 1e3 / tracker.pixel_pitch_um, tracker.resolution_px)
+    commanded, reported = cases.vectors("q{}", "wxyz"), reported_attitudes(cases)
+    step = -(-len(commanded) // MAX_FITTED_CASES)
+    try:
+        parts = assess_cases(commanded[::step], reported[::step], scale, rng)
+    except InputError as error:
+        found["notes"] = [str(error)]
+        return found
+    found |= {name: asdict(getattr(parts, name)) for name in ("fov_arcsec", "pixel_arcsec", "noise_arcsec")}
+    found |= {"bias_arcsec": parts.bias_arcsec.tolist(), "notes": list(parts.notes)}
+    found["intervals"] = {name: getattr(parts.intervals, name).tolist() for name in ("bias", "fov", "pixel", "noise")}
+    return found
+
+
+def _scatter(cases: Columns) -> dict[str, float] | None:
+    """One sigma across and about the boresight between the frames of a case, arcsec; None where cases have one frame."""
+    scatter = cases.vectors("scatter_{}_arcsec", "xyz")
+    scatter = scatter[np.isfinite(scatter).all(axis=1)]
+    if not len(scatter):
+        return None
+    variance = (scatter**2).mean(axis=0)
+    return {"cross": math.sqrt((variance[0] + variance[1]) / 2), "roll": math.sqrt(variance[2])}
+
+
+def _centroids(cases: Columns) -> dict[str, float] | None:
+    """What the centroider alone did: its mean error and one sigma, px, the share of stars found, and false finds a frame."""
+    numbers = cases.numbers
+    if "measured" not in numbers:
+        return None
+    weight = np.nan_to_num(numbers["measured"])
+    some = weight > 1
+    if not some.any():
+        return None
+
+    def mean(values: FloatArray) -> float:
+        return float(np.average(values[some], weights=weight[some]))
+
+    bias_px = [mean(numbers[f"centroid_d{axis}_px"]) for axis in "xy"]
+    spread = [numbers[f"centroid_sigma_{axis}_px"] ** 2 + numbers[f"centroid_d{axis}_px"] ** 2 for axis in "xy"]
+    sigma_px = [math.sqrt(max(0.0, mean(values) - bias**2)) for values, bias in zip(spread, bias_px, strict=True)]
+    return {
+        "bias_x_px": bias_px[0],
+        "bias_y_px": bias_px[1],
+        "sigma_x_px": sigma_px[0],
+        "sigma_y_px": sigma_px[1],
+        "found_share": float(np.nansum(numbers["matched"]) / max(np.nansum(numbers["stars"]), 1.0)),
+        "false_a_frame": float(np.nansum(numbers["false"]) / max(np.nansum(numbers["frames"]), 1.0)),
+    }
+
+
+def write_budget(path: Path, budget: dict[str, Any]) -> None:
+    """The budget as a table, with the columns of `hilstar assess`. Raises InputError where it cannot be written."""
+    rows: list[tuple[Any, ...]] = []
+    for k, axis in enumerate("xyz"):
+        low, high = _interval(budget, "bias", k)
+        rows.append(("bias", axis, (budget["bias_arcsec"] or [None] * 3)[k], "arcsec", low, high))
+    for part, name in PARTS.items():
+        for k, axis in enumerate(("cross", "roll")):
+            low, high = _interval(budget, part, k)
+            rows.append((name, axis, (budget[f"{part}_arcsec"] or {}).get(axis), "arcsec", low, high))
+    rows.append(("availability", "", budget["availability"], "1", None, None))
+    rows.append(("wrong answers", "", budget["wrong"], "1", None, None))
+    for name, value in (budget["centroids"] or {}).items():
+        unit = name.rpartition("_")[2] if name.endswith("_px") else "1"
+        rows.append((f"centroids: {name}", "", value, unit, None, None))
+    write_csv(path, CSV_COLUMNS, [["" if value is None else value for value in row] for row in rows])
+
+
+def _interval(budget: dict[str, Any], part: str, k: int) -> tuple[float | None, float | None]:
+    ends = budget["intervals"].get(part)
+    return (None, None) if ends is None else (ends[0][k], ends[1][k])
 
 
 @dataclass(frozen=True)
@@ -222,3 +385,23 @@ def draw_costs(path: Path, found: list[Cost]) -> None:
             sure = "" if cost.sure else "  (no more than noise)"
             axis.set_xlabel(f"{cost.parameter}: costs {_figure(cost.cost, cost)}{sure}")
             axis.set_ylabel("share" if cost.unit == "1" else f"{cost.unit}, median")
+
+
+def write_results(table: Path, config: BenchConfig, seed: int) -> dict[str, Any]:
+    """Write `budget.csv`, `sensitivity.csv` and a chart for each measure that varies; the budget, and what was found.
+
+    Raises InputError where the table cannot be read, or a file not be written.
+    """
+    cases = read_cases(table)
+    budget = case_budget(cases, config, np.random.default_rng(seed))
+    write_budget(table.with_name("budget.csv"), budget)
+    found = costs(cases)
+    write_costs(table.with_name("sensitivity.csv"), found)
+    findings = []
+    for measure in dict.fromkeys(cost.measure for cost in found):
+        of_it = [cost for cost in found if cost.measure == measure]
+        if max(float(cost.level.max()) for cost in of_it) > 0:
+            draw_costs(table.with_name(f"sensitivity_{measure}.png"), of_it)
+            findings.append(finding(of_it))
+    del budget["intervals"]
+    return budget | {"findings": findings}

@@ -1,8 +1,12 @@
-"""What a worker does: the campaign's cases, one after the other, with one tracker that changes with them."""
+"""What a worker has to share with the campaign, so that its rows are the same ones, bit for bit.
+
+What a worker does: the campaign's cases, one after the other, with one tracker that changes with them.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 import os
 import time
@@ -11,21 +15,20 @@ from typing import Any, Protocol
 
 import msgspec
 import numpy as np
+import scipy
 
+import hilstar
 from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile, bench_file_of
 from hilstar.bench.config import BenchConfig
-from hilstar.campaign.cases.case import Case, CaseMaker
-from hilstar.campaign.cases.display import DisplayTracker
-from hilstar.campaign.cases.row import Kind, Row, Tally, columns, failed, first_row
-from hilstar.campaign.plan.parameters import SCENARIO
-from hilstar.campaign.plan.tables import Plan, parse_plan
-from hilstar.campaign.solvers.answer import SolverFault
-from hilstar.campaign.solvers.choose import CENTROIDS, choose_solver
-from hilstar.campaign.workers.identity import Identity, own_identity
+from hilstar.campaign.cases import Case, CaseMaker, Kind, Row, Tally, columns, failed, first_row
+from hilstar.campaign.display_tracker import DisplayTracker
+from hilstar.campaign.plan import SCENARIO, Plan, parse_plan
+from hilstar.campaign.solvers import CENTROIDS, SolverFault, choose_solver
 from hilstar.errors import HilstarError, InputError, MachineError, one_line
 from hilstar.files import make_directory
 from hilstar.reading import CHUNK_BYTES, open_regular
+from hilstar.resources import resource_path
 from hilstar.scene.camera import Camera
 from hilstar.scene.exposure_motion import Motion
 from hilstar.twin.exposure_files import write_exposure_fits
@@ -33,6 +36,50 @@ from hilstar.twin.simulator import Exposure, FrameNoise, Simulator
 
 IMAGES = "images"
 IMAGES_A_FOLDER = 1000
+
+
+class Identity(msgspec.Struct, frozen=True):
+    """By what rows could differ: the program, what it computes with, and what draws."""
+
+    hilstar: str
+    code_sha256: str
+    numpy: str
+    scipy: str
+    gl_renderer: str
+
+
+WORDS = {
+    "hilstar": "hilstar {0}, and the campaign is of {1}; install that version there",
+    "code_sha256": "hilstar's code {0:.12} under the same version, and the campaign is of {1:.12}; install the same there",
+    "numpy": "NumPy {0}, and the campaign is of {1}; install that version there",
+    "scipy": "SciPy {0}, and the campaign is of {1}; install that version there",
+    "gl_renderer": "the renderer {0}, and the campaign is of {1}: frames differ in their last bits; use machines of one kind",
+}
+
+
+@functools.cache
+def code_sha256() -> str:
+    """The digest of hilstar's code: its Python files and its shaders."""
+    digest = hashlib.sha256()
+    package, shaders = Path(hilstar.__file__).parent, resource_path("shaders", "star.vert").parent
+    for root, pattern in ((package, "*.py"), (shaders, "*")):
+        for path in sorted(root.rglob(pattern)):
+            if path.is_file():
+                digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()
+
+
+def own_identity(gl_renderer: str) -> Identity:
+    """This process's identity, with the name of the renderer that draws here."""
+    return Identity(hilstar.__version__, code_sha256(), np.__version__, scipy.__version__, gl_renderer)
+
+
+def difference(found: Identity, wanted: Identity) -> str | None:
+    """What a worker has that the campaign has not, in words; None where they are the same."""
+    for name, words in WORDS.items():
+        if getattr(found, name) != getattr(wanted, name):
+            return "has " + words.format(getattr(found, name), getattr(wanted, name))
+    return None
 
 
 class Job(msgspec.Struct, frozen=True):

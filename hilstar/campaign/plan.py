@@ -1,0 +1,382 @@
+"""The plan's file: TOML in, checked and frozen tables out.
+
+What a plan varies: a key of the bench file by its dotted name, or one of the case's own, and its value at a point.
+
+The design: a point of the unit cube for each case, by the plan's sampling and seed alone.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from hilstar.arrays import FloatArray
+from hilstar.bench.bench_file import BenchFile, changed_file
+from hilstar.errors import InputError, shortened
+from hilstar.reading import MAX_TOML_BYTES, parse_toml, read_text
+from hilstar.toml_tables import Kind, Table, explained
+
+if TYPE_CHECKING:
+    from scipy.stats.qmc import Sobol
+
+TYPE_WORDS = {
+    "float": "number",
+    "int": "whole number",
+    "str": "text",
+    "object": "table",
+    "array": "list",
+    "bool": "true or false",
+}
+MAX_CASES = 1_000_000_000
+MAX_FRAMES = 10_000
+MAX_VALUES = 10_000
+MAX_SEED = 2**63 - 1
+
+Sampling = Literal["grid", "latin-hypercube", "sobol"]
+Number = Annotated[float, Meta(ge=-1e12, le=1e12)]
+Ra = Annotated[float, Meta(ge=-360, le=360)]
+Dec = Annotated[float, Meta(ge=-90, le=90)]
+Roll = Annotated[float, Meta(ge=-360, le=720)]
+# What a case has beside its bench file. Rates are of cam with respect to icrs, cam components; `across` is about an axis
+# in the image plane whose direction each case draws. `misalignment_arcsec` turns the display's true mounting about cam's axes.
+OWN_KEYS = (
+    "rate_deg_s.x",
+    "rate_deg_s.y",
+    "rate_deg_s.z",
+    "rate_deg_s.across",
+    "misalignment_arcsec.x",
+    "misalignment_arcsec.y",
+    "misalignment_arcsec.z",
+    "time_s",
+    "noise_seed",
+    "scenario",
+)
+MAX_OWN = {"rate_deg_s": 360.0, "misalignment_arcsec": 36_000.0, "time_s": 9e9, "noise_seed": 2.0**63 - 1}
+WHOLE = ("noise_seed",)
+SCENARIO = "scenario"  # the path of a file of faults, or none where it is empty
+Value = float | int | bool | str
+ATTITUDE_STREAM = 1  # of a case's seed: where a grid's case looks
+SOBOL_BITS = 30
+MAX_HYPERCUBE_VALUES = 200_000_000  # 1.6 GB: a Latin hypercube is made as a whole
+
+
+class Attitudes(Table, frozen=True):
+    """[attitudes]: where the cases look. `field` is a cap of `radius_deg` around `radec_deg`; `log` goes along a log."""
+
+    kind: Literal["all-sky", "field", "log"] = "all-sky"
+    radec_deg: tuple[Ra, Dec] | None = None
+    radius_deg: Annotated[float, Meta(ge=0, le=180)] = 5.0
+    roll_deg: tuple[Roll, Roll] = (0.0, 360.0)
+    log: str | None = None
+
+
+class Varied(Table, frozen=True):
+    """[[vary]]: one key, with the values that it takes, or the range that it is drawn from."""
+
+    key: Annotated[str, Meta(min_length=1, max_length=200)]
+    values: Annotated[list[Any], Meta(min_length=1, max_length=MAX_VALUES)] | None = None
+    minimum: Number | None = None
+    maximum: Number | None = None
+    steps: Annotated[int, Meta(ge=1, le=MAX_VALUES)] | None = None
+    scale: Literal["linear", "log"] = "linear"
+
+
+class Centroiding(Table, frozen=True):
+    """[centroids]: how `--solver centroids` finds stars, and below which separation a star is crowded out of the errors."""
+
+    threshold_sigma: Annotated[float, Meta(ge=0, le=1e6)] = 5.0
+    minimum_pixels: Annotated[int, Meta(ge=1, le=1000)] = 1
+    window: Literal["gaussian", "plain"] = "gaussian"
+    window_sigma_px: Annotated[float, Meta(ge=0.1, le=100)] | None = None
+    remove_s_curve: bool = False
+
+
+class Plan(Table, frozen=True):
+    """A whole plan."""
+
+    bench: Annotated[str, Meta(min_length=1)]
+    seed: Annotated[int, Meta(ge=0, le=MAX_SEED)] = 0
+    cases: Annotated[int, Meta(ge=1, le=MAX_CASES)] | None = None
+    sampling: Sampling = "sobol"
+    through: Literal["tracker", "display"] = "tracker"
+    frames: Annotated[int, Meta(ge=1, le=MAX_FRAMES)] = 1
+    step_s: Annotated[float, Meta(ge=1e-6, le=1e6)] = 0.2
+    noise: Literal["full", "none"] = "full"
+    wrong_above_arcsec: Annotated[float, Meta(ge=0, le=648000)] = 1800.0
+    attitudes: Attitudes = msgspec.field(default_factory=Attitudes)
+    centroids: Centroiding = msgspec.field(default_factory=Centroiding)
+    vary: Annotated[list[Varied], Meta(max_length=64)] = msgspec.field(default_factory=list)
+
+
+KIND = Kind(Plan, "docs/campaign.md", TYPE_WORDS)
+
+
+def read_plan(path: Path) -> Plan:
+    """Read and check a plan. Raises InputError: file, key, what is wrong and what to write."""
+    return parse_plan(path, read_text(path, "give the path of a plan", MAX_TOML_BYTES))
+
+
+def parse_plan(path: Path, text: str) -> Plan:
+    """Check the text of the plan `path`. Raises InputError as `read_plan` does."""
+    tables = parse_toml(path, text)
+    _check_finite(path, tables)
+    try:
+        plan = msgspec.convert(tables, Plan)
+    except RecursionError as error:
+        raise InputError(f"{path}: its tables are nested too deep; see {KIND.reference}") from error
+    except msgspec.ValidationError as error:
+        raise InputError(f"{path}: {explained(str(error), tables, KIND)}") from error
+    try:
+        _check_attitudes(plan.attitudes)
+        _check_varied(plan)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    return plan
+
+
+def plan_bytes(plan: Plan) -> bytes:
+    """All that a plan says, in one form whatever its file looks like."""
+    return msgspec.json.encode(plan, order="sorted", enc_hook=str)
+
+
+def _check_finite(path: Path, value: Any) -> None:
+    if isinstance(value, dict | list):
+        for inner in value.values() if isinstance(value, dict) else value:
+            _check_finite(path, inner)
+    elif isinstance(value, float) and not math.isfinite(value):
+        raise InputError(f"{path}: has the value {value}; a finite number is wanted")
+
+
+def _check_attitudes(attitudes: Attitudes) -> None:
+    if attitudes.kind == "field" and attitudes.radec_deg is None:
+        raise InputError('[attitudes] kind = "field" needs radec_deg = [RA, DEC]; add it')
+    if attitudes.kind == "log" and attitudes.log is None:
+        raise InputError('[attitudes] kind = "log" needs log = "FILE"; add it')
+    if attitudes.kind != "field" and attitudes.radec_deg is not None:
+        raise InputError(
+            f'[attitudes] radec_deg is for kind = "field", and kind is "{attitudes.kind}"; write that, or leave it out'
+        )
+    if attitudes.kind != "log" and attitudes.log is not None:
+        raise InputError(f'[attitudes] log is for kind = "log", and kind is "{attitudes.kind}"; write that, or leave it out')
+
+
+def _check_varied(plan: Plan) -> None:
+    keys = [varied.key for varied in plan.vary]
+    twice = next((key for key in keys if keys.count(key) > 1), None)
+    if twice is not None:
+        raise InputError(f'[[vary]] key = "{twice}" stands there twice; leave one of them out')
+    for varied in plan.vary:
+        _check_range(varied, plan.sampling)
+    if plan.cases is None and plan.sampling != "grid":
+        raise InputError(f'sampling = "{plan.sampling}" needs the number of cases; add cases = 1000')
+
+
+def _check_range(varied: Varied, sampling: Sampling) -> None:
+    where = f'[[vary]] key = "{varied.key}"'
+    ends = varied.minimum, varied.maximum
+    if (varied.values is None) == (ends == (None, None)):
+        raise InputError(f"{where}: write either values = [...], or minimum and maximum")
+    if varied.values is not None:
+        if varied.steps is not None or varied.scale != "linear":
+            raise InputError(f"{where}: steps and scale are for minimum and maximum; leave them out beside values")
+        return
+    low, high = ends
+    if low is None or high is None or not low < high:
+        raise InputError(f"{where}: minimum = {low}, maximum = {high}; write two numbers, the smaller one first")
+    if varied.scale == "log" and low <= 0:
+        raise InputError(f'{where}: minimum = {low:g} with scale = "log"; write a number above 0')
+    if sampling == "grid" and varied.steps is None:
+        raise InputError(f'{where}: sampling = "grid" needs values, or steps beside minimum and maximum; add steps = 5')
+    if sampling != "grid" and varied.steps is not None:
+        raise InputError(f'{where}: steps is for sampling = "grid"; leave it out')
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """One varied key: its values in order, or its range. `whole` ones are rounded to whole numbers."""
+
+    key: str
+    values: tuple[Any, ...] = ()
+    minimum: float = 0.0
+    maximum: float = 1.0
+    log: bool = False
+    whole: bool = False
+
+    def value(self, share: float) -> Any:
+        """The value at a place in [0, 1)."""
+        if self.values:
+            return self.values[min(int(share * len(self.values)), len(self.values) - 1)]
+        low, high = (math.log(end) for end in (self.minimum, self.maximum)) if self.log else (self.minimum, self.maximum)
+        value = low + share * (high - low)
+        value = min(max(math.exp(value), self.minimum), self.maximum) if self.log else value
+        return round(value) if self.whole else value
+
+    @property
+    def own(self) -> bool:
+        """Whether it belongs to the case, and not to the bench file."""
+        return self.key in OWN_KEYS
+
+
+def parameters(plan: Plan, file: BenchFile) -> list[Parameter]:
+    """The plan's parameters, each tried at its ends in the bench file alone. Raises InputError for what that refuses."""
+    tables = parse_toml(file.path, file.text)
+    found = []
+    for varied in plan.vary:
+        parameter = _parameter(varied, file)
+        ends = parameter.values or (parameter.value(0.0), parameter.value(1.0))
+        for value in ends:
+            try:
+                _check_value(parameter, value, file, tables)
+            except InputError as error:
+                raise InputError(f'[[vary]] key = "{shortened(varied.key)}": {error}') from error
+        found.append(parameter)
+    return found
+
+
+def grid_levels(plan: Plan) -> list[int]:
+    """How many values each key of a grid has."""
+    return [len(varied.values or ()) or varied.steps or 1 for varied in plan.vary]
+
+
+def changed_bench(file: BenchFile, tables: dict[str, Any], values: dict[str, Any]) -> BenchFile:
+    """The bench file with some keys (dotted name -> value) changed. Raises InputError as the file itself would."""
+    changes = {key: value for key, value in values.items() if key not in OWN_KEYS}
+    if not changes:
+        return file
+    tables = copy.deepcopy(tables)
+    for key, value in changes.items():
+        _set(tables, key.split("."), value, file.config)
+    return changed_file(file, tables)
+
+
+def _parameter(varied: Varied, file: BenchFile) -> Parameter:
+    whole = varied.key in WHOLE or (varied.values is None and _is_whole(varied.key, file.config))
+    if varied.values is not None:
+        return Parameter(varied.key, tuple(varied.values))
+    if varied.minimum is None or varied.maximum is None:
+        raise AssertionError("the plan has been checked")
+    if varied.steps is None:
+        return Parameter(varied.key, (), varied.minimum, varied.maximum, varied.scale == "log", whole)
+    ends = Parameter(varied.key, (), varied.minimum, varied.maximum, varied.scale == "log", whole)
+    return Parameter(varied.key, tuple(ends.value(step / max(1, varied.steps - 1)) for step in range(varied.steps)))
+
+
+def _check_value(parameter: Parameter, value: Any, file: BenchFile, tables: dict[str, Any]) -> None:
+    if not parameter.own:
+        changed_bench(file, tables, {parameter.key: value})
+        return
+    if parameter.key == SCENARIO:
+        if not isinstance(value, str):
+            raise InputError(f'the value {shortened(value)}; write paths of scenario files, and "" for none')
+        return
+    largest = MAX_OWN[parameter.key.split(".")[0]]
+    low = 0 if parameter.key in WHOLE else -largest
+    if (
+        isinstance(value, bool)
+        or not isinstance(value, int if parameter.key in WHOLE else int | float)
+        or not low <= value <= largest
+    ):
+        raise InputError(f"the value {shortened(value)}; write a number from {low:g} to {largest:g}")
+
+
+def _is_whole(key: str, config: Any) -> bool:
+    value = _now(key.split("."), config)
+    if isinstance(value, tuple) and value:
+        value = value[0]
+    return isinstance(value, int) and not isinstance(value, bool)
+
+
+def _now(names: list[str], config: Any) -> Any:
+    """What the bench file has there, defaults included; None where it has nothing."""
+    for name in names:
+        if isinstance(config, tuple):
+            config = config[int(name)] if name.isdigit() and int(name) < len(config) else None
+        elif isinstance(config, msgspec.Struct):
+            config = getattr(config, name, None)
+        else:
+            return None
+    return config
+
+
+def _set(tables: dict[str, Any], names: list[str], value: Any, config: Any) -> None:
+    """Set the key of dotted `names`; one number for a key of several, such as a sigma along x and y, is given to each."""
+    table: Any = tables
+    for name in names[:-1]:
+        inside = table.get(name) if isinstance(table, dict) else None
+        if inside is None or not isinstance(inside, dict | list):
+            present = _now(names[: names.index(name) + 1], config)
+            inside = list(present) if isinstance(present, tuple) else {}
+            table[name] = inside
+        table = inside
+    last = names[-1]
+    present = _now(names, config)
+    if isinstance(present, tuple) and not isinstance(value, list):
+        value = [value] * len(present)
+    if isinstance(table, list):
+        if not last.isdigit() or int(last) >= len(table):
+            raise InputError(f"{'.'.join(names)}: write a number from 0 to {len(table) - 1} after the last dot")
+        table[int(last)] = value
+    else:
+        table[last] = value
+
+
+class Design:
+    """Points (n, dimensions) in [0, 1) of the cases: first the attitude's, then one of each varied key.
+
+    A grid's keys have `levels` values each; they come in order, the last key fastest, and again from the first case after
+    the last. Raises InputError for a Latin hypercube too large to be held.
+    """
+
+    def __init__(self, sampling: Sampling, seed: int, cases: int, attitude_dimensions: int, levels: Sequence[int]) -> None:
+        self.sampling, self.seed, self.cases = sampling, seed, cases
+        self.attitude_dimensions, self.levels = attitude_dimensions, tuple(levels)
+        self.dimensions = attitude_dimensions + len(levels)
+        self._cube: FloatArray | None = None
+        self._engine: Sobol | None = None
+        if sampling == "latin-hypercube":
+            if cases * self.dimensions > MAX_HYPERCUBE_VALUES:
+                most = MAX_HYPERCUBE_VALUES // self.dimensions
+                raise InputError(
+                    f"cases = {cases}: a Latin hypercube is made as a whole, of at most {most} cases with"
+                    f' {self.dimensions} dimensions; write sampling = "sobol"'
+                )
+            from scipy.stats import qmc
+
+            self._cube = qmc.LatinHypercube(self.dimensions, rng=np.random.default_rng(seed)).random(cases)
+
+    def points(self, begin: int, end: int) -> FloatArray:
+        """The points of the cases from `begin` to before `end`."""
+        if self._cube is not None:
+            return self._cube[begin:end]
+        if self.sampling == "sobol":
+            return self._sobol(begin, end)
+        return np.array([self._grid_point(case) for case in range(begin, end)]).reshape(end - begin, self.dimensions)
+
+    def _sobol(self, begin: int, end: int) -> FloatArray:
+        from scipy.stats import qmc
+
+        if self._engine is None or self._engine.num_generated > begin:
+            rng = np.random.default_rng(self.seed)
+            self._engine = qmc.Sobol(self.dimensions, scramble=True, bits=SOBOL_BITS, rng=rng)
+        if begin > self._engine.num_generated:
+            self._engine.fast_forward(begin - self._engine.num_generated)
+        with warnings.catch_warnings():  # of a number of points that is no power of two: the plan's number counts
+            warnings.simplefilter("ignore", UserWarning)
+            return np.asarray(self._engine.random(end - begin))
+
+    def _grid_point(self, case: int) -> FloatArray:
+        place, rest = [], case % max(1, math.prod(self.levels))
+        for count in reversed(self.levels):
+            place.append((rest % count + 0.5) / count)
+            rest //= count
+        rng = np.random.default_rng((self.seed, case, ATTITUDE_STREAM))
+        return np.concatenate([rng.random(self.attitude_dimensions), place[::-1]])

@@ -1,1 +1,0 @@
-"""What a campaign's table says: the error budget, and what each parameter costs."""

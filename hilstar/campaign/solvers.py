@@ -1,0 +1,376 @@
+"""What a solver is asked, what it answers, and how it fails.
+
+The centroider alone: its errors against the truth, and the attitude of its stars, each of which the truth names.
+
+A solver that is a Python callable: `python:module:function`.
+
+A solver that is a command: it gets an image, and prints a quaternion.
+
+From the words after --solver to a solver.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import json
+import math
+import re
+import shlex
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from hilstar.arrays import FloatArray, IntArray
+from hilstar.bench.config import BenchConfig
+from hilstar.campaign.plan import Centroiding
+from hilstar.errors import InputError, did_you_mean, one_line, shortened
+from hilstar.files import temporary_folder
+from hilstar.process.child import MAX_OUTPUT_BYTES, Child
+from hilstar.rotation import from_matrix, multiply, normalise
+from hilstar.scene.camera import Camera
+from hilstar.tracker.centroids import Centroids, CentroidSettings, find_stars
+from hilstar.twin.exposure_files import write_dn_picture
+from hilstar.twin.simulator import Exposure
+from hilstar.twin.verify.star_finder import crowded, nearest
+
+MAX_NORM_ERROR = 1e-3  # of a quaternion that is unit but for its decimals
+MIN_STARS = 2  # that give an attitude
+FORM = "write --solver python:MODULE:FUNCTION"
+IMAGE, PICTURE = "{image}", "{png}"
+NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
+MAX_OUTPUT_CHARACTERS = 100_000
+CENTROIDS = "centroids"
+
+
+class SolverFault(Exception):
+    """A solver failed: it raised, ended with an error, took too long, or answered what is no attitude."""
+
+
+class Tracker(Protocol):
+    """The tracker whose images are solved."""
+
+    config: BenchConfig
+    camera: Camera
+
+
+@dataclass(frozen=True, slots=True)
+class StarErrors:
+    """Centroids of one image against the truth: counts, and x and y errors (n,), px, measured minus true, of matched stars.
+
+    `stars` are on the detector, `matched` of them found within MATCH_PX, and `false` finds are no star's. The errors are those
+    of stars that are neither clipped, nor at the edge, nor crowded; `x_px`, `y_px` (n,) are their true places and `v_mag`
+    (n,) their magnitudes.
+    """
+
+    stars: int
+    found: int
+    matched: int
+    false: int
+    dx_px: FloatArray
+    dy_px: FloatArray
+    x_px: FloatArray
+    y_px: FloatArray
+    v_mag: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """An attitude, or None and why there is none; with centroids, their errors."""
+
+    q_icrs_to_cam: FloatArray | None
+    why: str = ""
+    star_errors: StarErrors | None = None
+
+
+class Solver(Protocol):
+    """Anything that solves an image. Raises SolverFault."""
+
+    def solve(self, exposure: Exposure, tracker: Tracker) -> Answer:
+        """The attitude of one exposure."""
+        ...
+
+
+def checked_attitude(numbers: object, who: str) -> FloatArray:
+    """An answer as a unit quaternion (4,), scalar first. Raises SolverFault where it is none."""
+    try:
+        q = np.asarray(numbers, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise SolverFault(f"{who}: answered {shortened(numbers)}; four numbers w, x, y, z are wanted") from error
+    if q.shape != (4,) or not np.isfinite(q).all():
+        raise SolverFault(f"{who}: answered {shortened(numbers)}; four numbers w, x, y, z are wanted")
+    norm = float(np.linalg.norm(q))
+    if abs(norm - 1) > MAX_NORM_ERROR:
+        raise SolverFault(f"{who}: answered a quaternion of norm {norm:.6g}; a unit one is wanted")
+    return np.asarray(q / norm)
+
+
+class CentroidSolver:
+    """Finds stars, and takes the nearest one of the truth, the brightest first, within 3 px for each."""
+
+    def __init__(self, settings: Centroiding) -> None:
+        self._wanted = settings
+
+    def solve(self, exposure: Exposure, tracker: Tracker) -> Answer:
+        """Centroid errors, and the attitude by the stars that were matched; no star has to be identified."""
+        settings = self._settings(tracker)
+        found = find_stars(exposure.dn, settings)
+        truth = _on_detector(exposure)
+        index = _matched(found, truth["x_px"], truth["y_px"])
+        is_matched = index >= 0
+        good = is_matched & ~truth["clipped"] & ~found.at_edge[index] if len(found) else is_matched
+        sigma_px = tracker.config.tracker.psf_sigma_px
+        flux = truth["electrons_per_s"]
+        if len(truth):
+            good &= ~crowded(truth["x_px"], truth["y_px"], flux, settings.radius_px, sigma_px)
+        x_px, y_px = truth["x_px"][good], truth["y_px"][good]
+        errors = StarErrors(
+            stars=len(truth),
+            found=len(found),
+            matched=int(is_matched.sum()),
+            false=len(found) - int(is_matched.sum()),
+            dx_px=found.x_px[index[good]] - x_px,
+            dy_px=found.y_px[index[good]] - y_px,
+            x_px=x_px,
+            y_px=y_px,
+            v_mag=truth["v_mag"][good],
+        )
+        if len(x_px) < MIN_STARS:
+            return Answer(None, f"{len(x_px)} stars stand alone, and an attitude takes {MIN_STARS}", errors)
+        turn = _turn(tracker, errors, flux[good])
+        return Answer(multiply(turn, exposure.motion.q_icrs_to_cam), "", errors)
+
+    def _settings(self, tracker: Tracker) -> CentroidSettings:
+        wanted, psf = self._wanted, tracker.config.tracker.psf_sigma_px
+        return CentroidSettings(
+            threshold_sigma=wanted.threshold_sigma,
+            minimum_pixels=wanted.minimum_pixels,
+            window=wanted.window,
+            window_sigma_px=wanted.window_sigma_px or max(1.0, *psf),
+            psf_sigma_px=psf if wanted.remove_s_curve else None,
+        )
+
+
+def _on_detector(exposure: Exposure) -> np.ndarray:
+    """The truth's rows whose places lie on the detector, brightest first."""
+    truth, (height, width) = exposure.truth, exposure.dn.shape
+    with np.errstate(invalid="ignore"):
+        inside = (np.abs(truth["x_px"] - (width - 1) / 2) <= width / 2) & (
+            np.abs(truth["y_px"] - (height - 1) / 2) <= height / 2
+        )
+    return np.asarray(truth[inside & truth["drawn"]])
+
+
+def _matched(found: Centroids, x_px: FloatArray, y_px: FloatArray) -> IntArray:
+    """For each star (n,), brightest first, its find; -1 for none, or where a brighter star has it."""
+    index = nearest(found, x_px, y_px)
+    _, first = np.unique(index, return_index=True)
+    alone = np.zeros(len(index), dtype=np.bool_)
+    alone[first] = True
+    return np.where(alone, index, -1)
+
+
+def _turn(tracker: Tracker, errors: StarErrors, weight: FloatArray) -> FloatArray:
+    """The rotation (4,) from the true attitude's cam to that of the centroids: Wahba's problem by SVD (Markley 1988).
+
+    Weighted by the light, as the variance of photon noise has it.
+    """
+    true, seen = (
+        normalise(tracker.camera.rays(errors.x_px + dx_px, errors.y_px + dy_px))
+        for dx_px, dy_px in ((np.zeros(len(weight)), np.zeros(len(weight))), (errors.dx_px, errors.dy_px))
+    )
+    u, _, vt = np.linalg.svd(np.einsum("n,ni,nj->ij", weight / weight.sum(), seen, true))
+    return from_matrix(u @ np.diag([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)]) @ vt)
+
+
+class FunctionSolver:
+    """Calls `function(image, tracker)`: DN, uint16 (height, width), and what a tracker's software knows of its optics.
+
+    It returns q_icrs_to_cam (w, x, y, z), or None where it finds none. `folder` is searched for the module first.
+    Raises InputError where there is no such function.
+    """
+
+    def __init__(self, name: str, folder: Path, timeout_s: float) -> None:
+        self.name, self._timeout_s = name, timeout_s
+        module, _, function = name.removeprefix("python:").partition(":")
+        if not module or not function:
+            raise InputError(f"--solver {name}: names no function; {FORM}")
+        with _importing_from(folder):
+            try:
+                found: Any = getattr(importlib.import_module(module), function, None)
+            except Exception as error:
+                reason = one_line(f"{type(error).__name__}: {error}")
+                raise InputError(f"--solver {name}: {module} cannot be imported ({reason}); {FORM}") from error
+        if not callable(found):
+            raise InputError(f"--solver {name}: {module} has no function {function}; {FORM}")
+        self._function: Callable[..., Any] = found
+
+    def solve(self, exposure: Exposure, tracker: Tracker) -> Answer:
+        """The function's answer. Raises SolverFault where it raises, takes too long or answers what is no attitude."""
+        try:
+            with time_limit(self._timeout_s):
+                answer = self._function(exposure.dn.copy(), tracker_facts(tracker))
+        except TimeoutError as error:
+            raise SolverFault(f"the solver took longer than {self._timeout_s:g} s") from error
+        except Exception as error:
+            raise SolverFault(one_line(f"the solver raised {type(error).__name__}: {error}")) from error
+        if answer is None:
+            return Answer(None, "the solver found no attitude")
+        return Answer(checked_attitude(answer, "the solver"))
+
+
+def tracker_facts(tracker: Tracker) -> dict[str, Any]:
+    """What a tracker's software knows of its own optics, and nothing of where it looks."""
+    settings = tracker.config.tracker
+    width, height = settings.resolution_px
+    focal_length_px = settings.focal_length_mm * 1e3 / settings.pixel_pitch_um
+    return {
+        "resolution_px": (width, height),
+        "focal_length_px": focal_length_px,
+        "principal_point_px": settings.principal_point_px or ((width - 1) / 2, (height - 1) / 2),
+        "fov_deg": math.degrees(2 * math.atan(width / 2 / focal_length_px)),
+        "psf_sigma_px": settings.psf_sigma_px,
+        "exposure_s": settings.exposure_s,
+        "epoch_jyear": tracker.config.sky.epoch_jyear,
+    }
+
+
+@contextlib.contextmanager
+def time_limit(seconds: float) -> Iterator[None]:
+    """Raises TimeoutError in the main thread after so long; in another thread nothing can be interrupted, and nothing is."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def too_long(*_: object) -> None:
+        raise TimeoutError
+
+    before = signal.signal(signal.SIGALRM, too_long)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+
+@contextlib.contextmanager
+def _importing_from(folder: Path) -> Iterator[None]:
+    sys.path.insert(0, str(folder))
+    try:
+        yield
+    finally:
+        sys.path.remove(str(folder))
+
+
+class CommandSolver:
+    """Runs a command for each image, without a shell: {image} is a FITS file of its DN alone, {png} a 16-bit PNG of them.
+
+    Other words in braces are the tracker's: {fov_deg}, {focal_length_px}, {width_px}, {height_px}. The last line of its output
+    that has four numbers, or a JSON object with "q", is q_icrs_to_cam, scalar first; exit code 0 without one says that there is
+    no attitude, and any other code is a fault. Raises InputError for a template without an image.
+    """
+
+    def __init__(self, template: str, folder: Path, timeout_s: float) -> None:
+        try:
+            self._words = shlex.split(template)
+        except ValueError as error:
+            raise InputError(f"--solver {template}: {error}; write a command with {IMAGE}, or {PICTURE}, in it") from error
+        if not any(IMAGE in word or PICTURE in word for word in self._words):
+            raise InputError(
+                f"--solver {template}: names no image; {did_you_mean(template, ['centroids'])}write centroids, "
+                f"python:MODULE:FUNCTION, or a command with {IMAGE}"
+                f' in it, such as "solve {IMAGE}"'
+            )
+        self._folder, self._timeout_s = folder, timeout_s
+
+    def solve(self, exposure: Exposure, tracker: Tracker) -> Answer:
+        """The command's answer. Raises SolverFault where it fails, takes too long or prints what is no attitude."""
+        with temporary_folder("solver") as folder:
+            image, picture = folder / "image.fits", folder / "image.png"
+            if any(IMAGE in word for word in self._words):
+                write_plain_fits(image, exposure.dn)
+            if any(PICTURE in word for word in self._words):
+                write_dn_picture(picture, exposure.dn)
+            places = _places(tracker) | {IMAGE: str(image), PICTURE: str(picture)}
+            words = [_filled(word, places) for word in self._words]
+            code, out, err = _run(words, self._folder, self._timeout_s)
+        if code:
+            said = err.strip().splitlines()[-1:] or ["it said nothing on stderr"]
+            line = said[0].replace(str(image), IMAGE).replace(str(picture), PICTURE).replace(str(folder), "")
+            raise SolverFault(one_line(f"the solver ended with code {code}: {line}"))
+        q = printed_attitude(out)
+        return Answer(None, "the solver found no attitude") if q is None else Answer(checked_attitude(q, "the solver"))
+
+
+def printed_attitude(text: str) -> object | None:
+    """The quaternion in a program's output: its last line with four numbers, or what its JSON object has as "q"; or None."""
+    for line in reversed(text[-MAX_OUTPUT_CHARACTERS:].splitlines()):
+        if line.lstrip().startswith("{"):
+            with contextlib.suppress(ValueError, RecursionError):
+                said = json.loads(line)
+                if "q" in said:
+                    q: object = said["q"]
+                    return q
+                continue
+        if re.fullmatch(r"[\s,;\[\]()\d.eE+-]+", line):
+            numbers = NUMBER.findall(line)
+            if len(numbers) == 4:
+                return [float(number) for number in numbers]
+    return None
+
+
+def write_plain_fits(path: Path, dn: npt.NDArray[np.uint16]) -> None:
+    """The DN and nothing else: neither where the tracker looks nor what is in view."""
+    from astropy.io import fits
+
+    fits.PrimaryHDU(dn).writeto(path)
+
+
+def _places(tracker: Tracker) -> dict[str, str]:
+    facts = tracker_facts(tracker)
+    width, height = facts["resolution_px"]
+    return {
+        "{fov_deg}": f"{facts['fov_deg']:.9g}",
+        "{focal_length_px}": f"{facts['focal_length_px']:.9g}",
+        "{width_px}": str(width),
+        "{height_px}": str(height),
+    }
+
+
+def _filled(word: str, places: dict[str, str]) -> str:
+    for name, text in places.items():
+        word = word.replace(name, text)
+    return word
+
+
+def _run(words: list[str], folder: Path, timeout_s: float) -> tuple[int, str, str]:
+    """Run a command in a group of its own, which ends with it. Raises SolverFault."""
+    try:
+        child = Child(words, folder)
+    except OSError as error:
+        raise SolverFault(f"the solver cannot be started: {words[0]} ({error.strerror})") from error
+    with child:
+        code = child.wait(timeout_s)
+        if child.too_much:
+            most = f"{MAX_OUTPUT_BYTES // 1_000_000} MB"
+            raise SolverFault(f"the solver printed more than {most} and was ended; let it print the quaternion alone")
+        if code is None:
+            raise SolverFault(f"the solver took longer than {timeout_s:g} s")
+    return code, child.out, child.err
+
+
+def choose_solver(text: str, settings: Centroiding, folder: Path, timeout_s: float) -> Solver:
+    """The solver that `text` names; relative names start in `folder`. Raises InputError for one that there is not."""
+    if text == CENTROIDS:
+        return CentroidSolver(settings)
+    if text.startswith("python:"):
+        return FunctionSolver(text, folder, timeout_s)
+    return CommandSolver(text, folder, timeout_s)

@@ -1,0 +1,340 @@
+"""The campaign's table: Parquet, a row a case in their order, the same bytes for the same rows.
+
+The journal: each row appended as it comes, one line with its checksum, in a file a block of cases.
+
+Laws:
+1. A row counts as done once its line is written whole. A line that a kill, a full disk or a crash cut off is dropped when
+   the journal is opened again, and its case is run again.
+2. A block's file is renamed when all its cases are in it; such a file is not read again before the end.
+3. One process writes at a time; it holds the lock of the campaign's directory.
+
+A campaign's directory: one campaign, one writer, and the files in it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import hashlib
+import os
+import zlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from hilstar.errors import InputError, MachineError, cannot_read, cannot_write, shortened
+from hilstar.files import make_directory, open_lock, whole_file, write_whole
+from hilstar.reading import NOT_JSON, read_bytes
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+COMPRESSION, COMPRESSION_LEVEL = "zstd", 3
+CHUNK_BYTES = 1 << 20
+INSTALL = "install it: pip install 'hilstar[campaign]'"
+BLOCK_CASES = 16_384
+OPEN, FULL = ".jsonl", ".full.jsonl"
+CHECKSUM_CHARACTERS = 8
+
+Row = dict[str, Any]
+ABOUT, LOCK, JOURNAL, TABLE = "campaign.json", "campaign.lock", "journal", "cases.parquet"
+MAX_ABOUT_BYTES = 50_000_000
+ANOTHER = "write another directory after -o, or delete this one"
+
+
+def require_parquet() -> None:
+    """Refuse (MachineError) before the first case what could not be written after the last."""
+    try:
+        import pyarrow.parquet  # noqa: F401
+    except ImportError as error:
+        raise MachineError(f"a campaign's table needs pyarrow; {INSTALL}") from error
+
+
+def schema_of(columns: Mapping[str, str], about: Mapping[str, str]) -> pa.Schema:
+    """The Arrow schema of columns (name -> kind), with what the table is about in its metadata."""
+    import pyarrow as pa
+
+    kinds = {"int64": pa.int64(), "float64": pa.float64(), "bool": pa.bool_(), "text": pa.string()}
+    return pa.schema([pa.field(name, kinds[kind]) for name, kind in columns.items()], metadata=dict(about))
+
+
+def write_table(path: Path, schema: pa.Schema, blocks: Iterator[list[dict[str, Any]]]) -> None:
+    """Write blocks of rows, one a row group, whole or not at all. Raises InputError where it cannot be written."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    with whole_file(path) as file:
+        settings: Any = {"compression": COMPRESSION, "compression_level": COMPRESSION_LEVEL, "version": "2.6"}
+        with pq.ParquetWriter(file, schema, **settings) as writer:
+            for rows in blocks:
+                arrays = [pa.array([_exact(row[field.name], field.type) for row in rows], field.type) for field in schema]
+                writer.write_table(pa.Table.from_arrays(arrays, schema=schema), row_group_size=max(1, len(rows)))
+
+
+def _exact(value: Any, kind: Any) -> Any:
+    """JSON writes a whole float without its point."""
+    import pyarrow as pa
+
+    return float(value) if kind == pa.float64() and value is not None else value
+
+
+def read_columns(path: Path) -> dict[str, Any]:
+    """A campaign's table as columns of Python values. Raises InputError where it is none."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        table = pq.read_table(path)
+    except (OSError, pa.ArrowException) as error:
+        raise InputError(f"{path}: cannot be read as Parquet ({error}); give the table of a campaign") from error
+    return {name: table.column(name).to_pylist() for name in table.column_names}
+
+
+def failures(path: Path) -> dict[str, int]:
+    """How many cases failed, by their reason, in the order of their first cases."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    because: dict[str, int] = {}
+    try:
+        file = pq.ParquetFile(path)
+        for group in range(file.num_row_groups):
+            rows = file.read_row_group(group, columns=["status", "why"]).to_pylist()
+            for row in rows:
+                if row["status"] == "failed":
+                    because[row["why"]] = because.get(row["why"], 0) + 1
+    except (OSError, pa.ArrowException, KeyError) as error:
+        raise InputError(f"{path}: is no table of a campaign ({error}); delete it, and run the same command again") from error
+    return because
+
+
+def file_sha256(path: Path) -> str:
+    """The SHA-256 of a file."""
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while chunk := file.read(CHUNK_BYTES):
+            digest.update(chunk)
+    return digest.hexdigest()
+
+
+class Journal:
+    """The rows of `cases` cases below `folder`. Raises InputError where it cannot be read or written."""
+
+    def __init__(self, folder: Path, cases: int) -> None:
+        self.folder, self.cases = make_directory(folder), cases
+        self._done: dict[int, set[int]] = {}  # of blocks that are not full
+        self._full: set[int] = set()
+        self._files: dict[int, int] = {}
+        for block in range(self.blocks):
+            if self._path(block, FULL).exists():
+                self._full.add(block)
+            elif self._path(block, OPEN).exists():
+                self._done[block] = set(self._mended(block))
+
+    @property
+    def blocks(self) -> int:
+        """How many blocks the cases make."""
+        return -(-self.cases // BLOCK_CASES)
+
+    @property
+    def done(self) -> int:
+        """How many cases have their row."""
+        return sum(len(self._block(block)) for block in self._full) + sum(len(done) for done in self._done.values())
+
+    def missing(self, block: int) -> list[int]:
+        """The cases of a block that have no row yet, in order."""
+        if block in self._full:
+            return []
+        done = self._done.get(block, set())
+        return [case for case in self._block(block) if case not in done]
+
+    def append(self, rows: list[Row]) -> int:
+        """Write rows; returns how many are new. A case that has its row already keeps it."""
+        new = 0
+        for row in rows:
+            case = int(row["case"])
+            block = case // BLOCK_CASES
+            if block in self._full or case in self._done.setdefault(block, set()):
+                continue
+            self._write(block, _line(row))
+            self._done[block].add(case)
+            new += 1
+            if len(self._done[block]) == len(self._block(block)):
+                self._close_block(block)
+        return new
+
+    def rows(self, block: int) -> list[Row]:
+        """The rows of a full block in the order of their cases. Raises InputError where one is missing."""
+        found = self._read(self._path(block, FULL))[0]
+        if len(found) != len(self._block(block)):
+            raise InputError(
+                f"{self._path(block, FULL)}: rows of cases are missing in it; delete it, and run the same command again"
+            )
+        return [found[case] for case in sorted(found)]
+
+    def close(self) -> None:
+        """Close the files."""
+        for fd in self._files.values():
+            os.close(fd)
+        self._files.clear()
+
+    def remove(self) -> None:
+        """Delete the journal, whose rows stand elsewhere."""
+        self.close()
+        for path in self.folder.glob("*.jsonl"):
+            path.unlink()
+        with contextlib.suppress(OSError):  # somebody else's file is in it
+            self.folder.rmdir()
+
+    def _block(self, block: int) -> range:
+        return range(block * BLOCK_CASES, min(self.cases, (block + 1) * BLOCK_CASES))
+
+    def _path(self, block: int, ending: str) -> Path:
+        return self.folder / f"{block:06d}{ending}"
+
+    def _write(self, block: int, line: bytes) -> None:
+        path = self._path(block, OPEN)
+        try:
+            if block not in self._files:
+                self._files[block] = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
+            while line:  # a full disk may take a part; what it left is a cut line, dropped at the next start
+                line = line[os.write(self._files[block], line) :]
+        except OSError as error:
+            raise cannot_write(path, error, "make room, and run the same command again: it goes on") from error
+
+    def _close_block(self, block: int) -> None:
+        os.fsync(self._files[block])
+        os.close(self._files.pop(block))
+        self._path(block, OPEN).replace(self._path(block, FULL))
+        del self._done[block]
+        self._full.add(block)
+
+    def _mended(self, block: int) -> list[int]:
+        """The cases in an unfinished block, after cut lines were dropped from its file."""
+        path = self._path(block, OPEN)
+        found, whole = self._read(path)
+        if not whole:
+            write_whole(path, b"".join(_line(row) for row in found.values()))
+        if len(found) == len(self._block(block)):  # killed between the last row and the new name
+            self._files[block] = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_NOFOLLOW | os.O_CLOEXEC)
+            self._done[block] = set(found)
+            self._close_block(block)
+            return []
+        return list(found)
+
+    def _read(self, path: Path) -> tuple[dict[int, Row], bool]:
+        """The rows in a file by case, and whether all of its lines were whole."""
+        try:
+            data = path.read_bytes()
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read ({error.strerror}); run the same command again") from error
+        found: dict[int, Row] = {}
+        lines = data.split(b"\n")
+        whole = lines.pop() == b""
+        for line in lines:
+            row = _row(line)
+            if row is None or row["case"] in found or row["case"] not in self._block(int(path.name[:6])):
+                whole = False
+            else:
+                found[row["case"]] = row
+        return found, whole
+
+
+def _line(row: Row) -> bytes:
+    text = msgspec.json.encode(row)
+    return b"%08x %s\n" % (zlib.crc32(text), text)
+
+
+def _row(line: bytes) -> Row | None:
+    text = line[CHECKSUM_CHARACTERS + 1 :]
+    if line[: CHECKSUM_CHARACTERS + 1] != b"%08x " % zlib.crc32(text):
+        return None
+    try:
+        row = msgspec.json.decode(text, type=Row)
+    except NOT_JSON:  # with the right checksum: somebody else's line
+        return None
+    return row if isinstance(row.get("case"), int) else None
+
+
+class About(msgspec.Struct, frozen=True):
+    """Whose campaign it is: all that its rows depend on."""
+
+    plan: dict[str, Any]
+    bench_sha256: str
+    files_sha256: str
+    solver: str
+    images: bool
+    identity: dict[str, str]
+
+
+class Directory:
+    """The directory of a campaign, held against a second driver; free it with `close`. Raises InputError where one has it."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = make_directory(path)
+        self._lock = _locked(path / LOCK)
+
+    @property
+    def table(self) -> Path:
+        """The table's path."""
+        return self.path / TABLE
+
+    def claim(self, about: About) -> None:
+        """Be of this campaign from now on. Raises InputError where the directory is another's, or holds another's files."""
+        place = self.path / ABOUT
+        if not place.exists():
+            for name in (TABLE, JOURNAL):
+                if (self.path / name).exists():
+                    raise InputError(f"{self.path / name}: is there already, and no {ABOUT} says whose it is; {ANOTHER}")
+            write_whole(place, msgspec.json.format(msgspec.json.encode(about), indent=1))
+            return
+        try:
+            before = msgspec.json.decode(read_bytes(place, ANOTHER, MAX_ABOUT_BYTES), type=About)
+        except NOT_JSON as error:
+            raise cannot_read(place, "it is no campaign's", ANOTHER) from error
+        now = msgspec.json.decode(msgspec.json.encode(about), type=About)
+        if self.table.exists():  # whose rows are not run again, whatever this machine is
+            now = msgspec.structs.replace(now, identity=before.identity)
+        if before != now:
+            raise InputError(f"{self.path}: holds another campaign: {_changed(before, about)}; {ANOTHER}")
+
+    def journal(self, cases: int) -> Journal:
+        """The journal of rows that have come so far."""
+        return Journal(self.path / JOURNAL, cases)
+
+    def close(self) -> None:
+        """Let the directory go."""
+        os.close(self._lock)
+
+
+def _locked(path: Path) -> int:
+    fd = open_lock(path)
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        os.close(fd)
+        raise InputError(
+            f"{path.parent}: another campaign is running in it; wait for its end, or write another directory"
+        ) from error
+    return fd
+
+
+def _changed(before: About, now: About) -> str:
+    """The first thing that differs, in words."""
+    said = msgspec.to_builtins(before), msgspec.to_builtins(now)
+    tables = [("plan", "the plan's "), ("identity", "this machine's ")]
+    for table, words in tables:
+        for key in sorted(set(said[0][table]) | set(said[1][table])):
+            old, new = (part[table].get(key) for part in said)
+            if old != new:
+                return f"{words}{key} was {shortened(_json(old))} and is {shortened(_json(new))}"
+    for key, words in (("bench_sha256", "its bench file"), ("files_sha256", "its log or scenario"), ("solver", "--solver")):
+        if said[0][key] != said[1][key]:
+            return f"{words} was {shortened(said[0][key])} and is {shortened(said[1][key])}"
+    return "--images was another"
+
+
+def _json(value: Any) -> str:
+    return msgspec.json.encode(value).decode()

@@ -17,8 +17,7 @@ from hilstar.attitude.clock.timeline import Attitude, Timeline
 from hilstar.attitude.logs.entries import Stated
 from hilstar.attitude.logs.gaps import log_joins
 from hilstar.attitude.logs.log_file import NOTHING_STATED, log_timeline, open_log
-from hilstar.attitude.logs.mcap_log import read_attitudes
-from hilstar.attitude.logs.mcap_reader import holds_ros, is_mcap
+from hilstar.attitude.logs.mcap_log import holds_ros, is_mcap, read_attitudes
 from hilstar.attitude.receiver import PacketCounts
 from hilstar.attitude.wire.packet import AttitudeSample, rate_refusal
 from hilstar.attitude.wire.source import PACKETS, Conventions

@@ -8,8 +8,7 @@ from pathlib import Path
 import msgspec
 
 from hilstar.arrays import FloatArray
-from hilstar.attitude.logs.mcap_reader import RUN_METADATA
-from hilstar.attitude.logs.mcap_writer import McapWriter, Topic
+from hilstar.attitude.logs.mcap_log import RUN_METADATA, McapWriter, Topic
 from hilstar.run.record.ledger_records import FRAME_TOPIC, FrameRecord, schema_of
 from tests.support.benches import SMALL_BENCH
 from tests.support.planted_tracker import Planted

@@ -1,28 +1,39 @@
-"""From the ICRS to the local level (north-east-down, east-north-up) of a place on the turning Earth, at a UTC.
+"""Rotations from the ICRS to frames of date, to the turning Earth and to a local level; and the reference frame of a log.
 
     ICRS --C(X, Y, s)--> CIRS --R3(ERA)--> TIRS --W(polar motion)--> ITRS --R2(-latitude - 90 deg) R3(longitude)--> NED
 
-IERS Conventions (2010), chapter 5: the precession and nutation of IAU 2006/2000A, the Earth rotation angle of UT1, and UT1-UTC
-and polar motion from the IERS table that Astropy's package holds: nothing is downloaded. The pole's offsets (0.4 mas), tides
-shorter than a day (0.6 mas) and s' (0.01 mas) are left out. "Level" is normal to the WGS84 ellipsoid at a geodetic latitude: a
-plumb line is off by the deflection of the vertical, some arcsec in plains and an arcmin beside high mountains.
+IERS Conventions (2010), chapter 5: precession and nutation of IAU 2006/2000A, the Earth rotation angle of UT1, and UT1-UTC
+and polar motion from the IERS table in Astropy's package: nothing is downloaded. The pole's offsets (0.4 mas), tides shorter
+than a day (0.6 mas) and s' (0.01 mas) are neglected. "Level" is normal to the WGS84 ellipsoid at a geodetic latitude: a plumb
+line differs by the deflection of the vertical, some arcsec in plains and an arcmin beside high mountains.
+
+MOD and TOD are the mean and the true equator and equinox of date of IAU 2006/2000A; those of 1976/1980 lie within 0.1 arcsec.
+TEME is the true equator of 1980 with the mean equinox: TOD of 1980 turned back by the equation of the equinoxes of 1994
+(Vallado et al. 2006, AIAA 2006-6753). ITRF is the ITRS above; its realisations lie within 1 mas.
+
+A reference frame named `icrs` or `gcrf` says what its axes are; `map`, `world` or `odom` does not, and is never guessed.
 """
 
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from functools import lru_cache
-from typing import NamedTuple
+from itertools import islice
+from pathlib import Path
+from typing import Literal, NamedTuple
 
 import erfa
 import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import FloatArray
-from hilstar.attitude.logs.aem.blocks import AemFaultError
-from hilstar.attitude.logs.aem.epochs import epoch_ns
+from hilstar.attitude.logs.aem_blocks import AemFaultError, epoch_ns
+from hilstar.attitude.logs.entries import Entry, Stated
+from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.errors import InputError
-from hilstar.rotation import multiply
+from hilstar.rotation import conjugate, from_matrix, multiply, normalise
 from hilstar.units import NS_PER_S
 
 IntArray = npt.NDArray[np.int64]
@@ -36,6 +47,17 @@ UT1_S_A_YEAR = 1.1  # UT1-TAI, held at the ends of the table, has moved by this 
 HALF = float(np.sqrt(0.5))
 Q_NED_TO_ENU = (0.0, HALF, HALF, 0.0)
 UTC_FORM = "write a UTC such as 2026-11-22T10:00:00"
+# Seconds from a scale to TAI; TDB is within 2 ms of TT, in which the Earth turns by 0.03 arcsec.
+TO_TAI_S = {"TAI": 0.0, "GPS": 19.0, "TT": -32.184, "TDB": -32.184}
+Kind = Literal["icrs", "enu", "ned"]
+# EME2000's axes lie within 23 mas of the ICRF's. "eci" and "inertial", which simulators write, are taken too, with a notice.
+EXACT = frozenset({"icrs", "icrf", "gcrs", "gcrf", "j2000", "eme2000"})
+LOOSE = frozenset({"eci", "inertial", "eci_j2000", "j2000_eci", "inertial_frame"})
+KINDS: dict[str, Kind] = {**dict.fromkeys(EXACT | LOOSE, "icrs"), "enu": "enu", "ned": "ned"}
+AXES: dict[Kind, str] = {"icrs": "the ICRS", "enu": "east, north, up", "ned": "north, east, down"}
+# Times before 2000 are those of a simulated clock that began at 0, not dates.
+FIRST_DATE_NS = 946_684_800 * NS_PER_S
+BATCH = 4096
 
 
 class _Table(NamedTuple):
@@ -145,3 +167,140 @@ def _chain(*turns: FloatArray) -> FloatArray:
     for turn in turns[1:]:
         q = multiply(turn, q)
     return q
+
+
+def q_icrs_to_date(frame: str, scale: str, t_ns: IntArray) -> tuple[FloatArray, FloatArray, str | None]:
+    """The rotations (n, 4) from ICRS to a frame at times (n,), its own rate (3,), rad/s, in its components, and a notice.
+
+    Times are ns since 1970 in a scale's days of 86400 s. Raises AemFaultError for a scale that does not tell UTC, by
+    which the ITRF turns.
+    """
+    if frame in {"MOD", "TOD", "TEME"}:
+        return _of_hours(frame, t_ns), np.zeros(3), None
+    if scale == "UTC":
+        utc_ns = t_ns
+    elif scale in TO_TAI_S:
+        tai_ns = t_ns + round(TO_TAI_S[scale] * NS_PER_S)
+        days = (tai_ns - 37 * NS_PER_S) // (24 * HOUR_NS)  # within a second of UTC's day since 2017
+        utc_ns = tai_ns - np.round(tai_minus_utc_s(days) * NS_PER_S).astype(np.int64)
+    else:
+        raise AemFaultError(
+            "", f"TIME_SYSTEM = {scale} does not tell UTC, by which the {frame} turns; write UTC, TAI, TT, TDB or GPS"
+        )
+    turning = np.array([0.0, 0.0, EARTH_RATE_RAD_S])
+    return q_icrs_to_itrs(utc_ns), turning, beyond_table(int(utc_ns.min()), int(utc_ns.max()))
+
+
+def _of_hours(frame: str, t_ns: IntArray) -> FloatArray:
+    """Linear over an hour, which is within 5 microarcsec; a scale's offset from TT, 69 s, is 0.1 mas of precession."""
+    hours, place = np.unique(np.concatenate((t_ns // HOUR_NS, t_ns // HOUR_NS + 1)), return_inverse=True)
+    q = np.array([from_matrix(_matrix(frame, hour / 24.0)) for hour in hours.tolist()])
+    before, after = q[place[: len(t_ns)]], q[place[len(t_ns) :]]
+    return normalise(before + ((t_ns % HOUR_NS) / HOUR_NS)[:, None] * (after - before))
+
+
+def _matrix(frame: str, unix_days: float) -> FloatArray:
+    date = (MJD_ZERO_JD, UNIX_MJD + unix_days)
+    if frame == "MOD":
+        return np.asarray(erfa.pmat06(*date))
+    if frame == "TOD":
+        return np.asarray(erfa.pnm06a(*date))
+    bias, _, _ = erfa.bp00(*date)
+    return np.asarray(erfa.rz(erfa.eqeq94(*date), erfa.pnm80(*date) @ bias))
+
+
+class Reference(NamedTuple):
+    """What attitudes refer to; a level frame has a `place` (latitude, longitude, degrees), and its UTC is `t_ns + utc_ns`."""
+
+    kind: Kind
+    place: tuple[float, float] = (0.0, 0.0)
+    utc_ns: int = 0
+
+    def q_icrs_to_reference(self, t_ns: Iterable[int]) -> FloatArray:
+        """The rotations (n, 4) from ICRS at the log's times (n,)."""
+        utc_ns = np.fromiter(t_ns, dtype=np.int64) + self.utc_ns
+        if self.kind == "icrs":
+            return np.tile([1.0, 0.0, 0.0, 0.0], (len(utc_ns), 1))
+        turn = q_icrs_to_enu if self.kind == "enu" else q_icrs_to_ned
+        return turn(utc_ns, np.array(self.place[0]), np.array(self.place[1]))
+
+    @property
+    def earth_rate_rad_s(self) -> FloatArray:
+        """What the reference itself turns by with respect to the stars (3,), in its own components."""
+        if self.kind == "icrs":
+            return np.zeros(3)
+        north, east, down = earth_rate_ned_rad_s(self.place[0])
+        return np.array([east, north, -down] if self.kind == "enu" else [north, east, down])
+
+    @property
+    def words(self) -> str:
+        """For a person."""
+        if self.kind == "icrs":
+            return AXES["icrs"]
+        latitude_deg, longitude_deg = self.place
+        return f"{AXES[self.kind]} at latitude {latitude_deg:g}, longitude {longitude_deg:g}, {TURNED}"
+
+
+def stated_reference(path: Path, kind: Kind, stated: Stated, first_ns: int) -> Reference:
+    """The reference of that kind, once all is stated that it needs; `first_ns` is the log's first time.
+
+    Raises InputError where a level frame has no place, or its times are no dates and their zero is not stated, or is twice.
+    """
+    if kind == "icrs":
+        return Reference(kind)
+    if stated.place is None:
+        raise InputError(f"{path}: its attitudes refer to {AXES[kind]}; give the place with --place LAT,LON,HEIGHT")
+    return Reference(kind, stated.place[:2], zero_utc_ns(path, stated, first_ns))
+
+
+def zero_utc_ns(path: Path, stated: Stated, first_ns: int) -> int:
+    """What makes UTC (ns since 1970) of the log's times. Raises InputError as `stated_reference`."""
+    dated = first_ns >= FIRST_DATE_NS
+    if stated.epoch_utc is None:
+        if not dated:
+            raise InputError(
+                f"{path}: its times begin at {first_ns / NS_PER_S:.9g} s, no date; give --epoch-utc TIME, UTC at 0 s"
+            )
+        return 0
+    if dated:
+        raise InputError(f"{path}: its times are dates already (ns since 1970); leave out --epoch-utc")
+    return utc_ns_of(stated.epoch_utc, "--epoch-utc")
+
+
+def to_icrs(entries: Iterable[Entry], reference: Reference, gyro: bool, told: list[tuple[str, str]]) -> Iterator[Entry]:
+    """Attitudes from the reference to the body become those from ICRS; rates too, unless a gyroscope measured them.
+
+    At their end `told` gets a notice where the dates leave the table of the Earth's orientation.
+    """
+    if reference.kind == "icrs":
+        yield from entries
+        return
+    first_ns, last_ns = None, 0
+    remaining = iter(entries)
+    while batch := list(islice(remaining, BATCH)):
+        samples = [entry.event for entry in batch if isinstance(entry.event, AttitudeSample)]
+        turned = iter(_from_icrs(samples, reference, gyro))
+        if samples:
+            first_ns = samples[0].t_ns if first_ns is None else min(first_ns, samples[0].t_ns)
+            last_ns = max(last_ns, samples[-1].t_ns)
+        for entry in batch:
+            yield Entry(entry.where, next(turned)) if isinstance(entry.event, AttitudeSample) else entry
+    if first_ns is not None:
+        beyond = beyond_table(first_ns + reference.utc_ns, last_ns + reference.utc_ns)
+        told += [] if beyond is None else [("log-earth", beyond)]
+
+
+def _from_icrs(samples: list[AttitudeSample], reference: Reference, gyro: bool) -> list[AttitudeSample]:
+    if not samples:
+        return []
+    q_ref_to_body = np.array([sample.q_icrs_to_cam for sample in samples])
+    q = multiply(q_ref_to_body, reference.q_icrs_to_reference(sample.t_ns for sample in samples))
+    own = np.array([0.0, *reference.earth_rate_rad_s])
+    earths = multiply(multiply(q_ref_to_body, own), conjugate(q_ref_to_body))[:, 1:]
+    turned = []
+    for sample, attitude, earth_rate in zip(samples, q, earths, strict=True):
+        rate = sample.rate_cam_rad_s
+        turned.append(
+            replace(sample, q_icrs_to_cam=attitude, rate_cam_rad_s=rate if rate is None or gyro else rate + earth_rate)
+        )
+    return turned

@@ -1,20 +1,27 @@
-"""Attitude logs of every format: read by what the file holds, written by the ending of its name."""
+"""Attitude logs of every format: the content decides how a file is read, the ending of its name how it is written.
+
+CSV and JSON lines are read and written here. CSV columns, in any order: `t_s,qw,qx,qy,qz` and, where known, `rx,ry,rz` (rad/s),
+`sequence` and `discontinuity`. A JSON line is the wire's JSON form of an attitude. The other formats have a module each.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import csv
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
+from decimal import Decimal
 from pathlib import Path
 from typing import IO
 
+import msgspec
+
 from hilstar.attitude.clock.timeline import Policy, Timeline
-from hilstar.attitude.logs.csv_log import CSV_COLUMNS, read_csv, write_csv
+from hilstar.attitude.logs.aem_blocks import AemFaultError, epoch_ns, epoch_text
 from hilstar.attitude.logs.entries import MAX_QUOTED_CHARACTERS, MAX_SAMPLES, Entry, Log, LogReading, Stated
 from hilstar.attitude.logs.gaps import LogJoins, log_joins
-from hilstar.attitude.logs.json_log import read_json_lines, write_json_lines
-from hilstar.attitude.wire.packet import AttitudeSample, Refusal
+from hilstar.attitude.wire.packet import JSON_FORM, AttitudeSample, Refusal, checked_sample, decode
 from hilstar.attitude.wire.source import PACKETS
 from hilstar.errors import InputError, MachineError
 from hilstar.files import whole_file
@@ -29,12 +36,101 @@ from hilstar.reading import (
     open_regular,
     read_text,
 )
+from hilstar.units import NS_PER_S
 
+CSV_COLUMNS = ("t_s", "qw", "qx", "qy", "qz")
+RATE_COLUMNS = ("rx", "ry", "rz")
+# A JSON number that msgspec takes as an integer: what one format can hold, all can.
+WHOLE_NUMBERS = range(-(2**63), 2**64)
 MAX_NAMED_TOPICS = 12
 MAX_LOG_BYTES = 500_000_000
 MAX_AEM_BYTES = 50_000_000
 NOTHING_STATED = Stated()
 READABLE = "hilstar reads CSV, JSON lines, CCSDS AEM (KVN or XML), MCAP, SPICE CKs, bags of ROS and ULogs of PX4"
+YEAR_NS = 31_557_600 * NS_PER_S
+SECONDS_FORM = "write seconds after its first sample"
+TIME_FORM = f"{SECONDS_FORM}, or a date and time such as 2026-11-21T06:00:00"
+
+
+def read_csv(lines: Iterable[str]) -> Iterator[Entry]:
+    """The entries of a CSV log's lines."""
+    reader = csv.reader(lines)
+    rows = (row for row in reader if row and not row[0].startswith("#"))
+    header = [name.strip() for name in next(rows, [])]
+    if not header:
+        return
+    needed = CSV_COLUMNS + (RATE_COLUMNS if any(name in header for name in RATE_COLUMNS) else ())
+    missing = [name for name in needed if name not in header]
+    if missing:
+        detail = f"column {missing[0]} is missing; the header must have {','.join(needed)}"
+        yield Entry(f":{reader.line_num}", Refusal("format", detail))
+        return
+    places = {name: header.index(name) for name in (*needed, "sequence", "discontinuity") if name in header}
+    for row in rows:
+        yield Entry(f":{reader.line_num}", _sample(row, places))
+
+
+def _sample(row: list[str], places: dict[str, int]) -> AttitudeSample | Refusal:
+    try:
+        cells = {name: row[place].strip() for name, place in places.items()}
+        t_ns = _t_ns(cells["t_s"])
+        q = tuple(float(cells[name]) for name in CSV_COLUMNS[1:])
+        turning = [cells.get(name, "") for name in RATE_COLUMNS]
+        rate = tuple(map(float, turning)) if any(turning) else None
+        sequence = int(cells.get("sequence") or 0)
+        discontinuity = {"": False, "0": False, "1": True}[cells.get("discontinuity", "")]
+        if sequence not in WHOLE_NUMBERS:
+            raise ValueError
+    except (ValueError, LookupError, ArithmeticError):
+        wanted = f"write finite numbers for {','.join(CSV_COLUMNS)}"
+        if len(places) > len(CSV_COLUMNS):
+            wanted += ", all of rx,ry,rz or none, a whole number as sequence, 0 or 1 as discontinuity"
+        return Refusal("format", f"{','.join(row)[:MAX_QUOTED_CHARACTERS]!r}; {wanted}")
+    return checked_sample(t_ns, q, rate, sequence, discontinuity)
+
+
+def _t_ns(seconds: str) -> int:
+    """Decimal seconds as nanoseconds, to the nearest; a float of today's Unix time would be off by 100 ns."""
+    value = Decimal(seconds)
+    if not value.is_finite() or value.adjusted() > 40:
+        raise ValueError
+    return int(value.scaleb(9).to_integral_value())
+
+
+def write_csv(file: IO[bytes], samples: Sequence[AttitudeSample]) -> None:
+    """Write samples with every column; a rate that is not known is an empty cell. Raises OSError."""
+    file.write((",".join((*CSV_COLUMNS, *RATE_COLUMNS, "sequence", "discontinuity")) + "\n").encode())
+    for sample in samples:
+        rate = sample.rate_cam_rad_s
+        numbers = [*map(repr, sample.q_icrs_to_cam.tolist()), *(("", "", "") if rate is None else map(repr, rate.tolist()))]
+        row = (_seconds(sample.t_ns), *numbers, str(sample.sequence), "1" if sample.discontinuity else "0")
+        file.write((",".join(row) + "\n").encode())
+
+
+def _seconds(t_ns: int) -> str:
+    seconds, ns = divmod(abs(t_ns), NS_PER_S)
+    return f"{'-' if t_ns < 0 else ''}{seconds}.{ns:09}"
+
+
+def read_json_lines(lines: Iterable[str]) -> Iterator[Entry]:
+    """The entries of a log's lines; blank ones are ignored."""
+    for number, line in enumerate(lines, start=1):
+        if line.strip():
+            event = decode(line.strip().encode())
+            if not isinstance(event, AttitudeSample | Refusal):
+                event = Refusal("format", f"is not an attitude; write {JSON_FORM}")
+            yield Entry(f":{number}", event)
+
+
+def write_json_lines(file: IO[bytes], samples: Sequence[AttitudeSample]) -> None:
+    """Write one object for each sample; a rate that is not known has no key. Raises OSError."""
+    encoder = msgspec.json.Encoder()
+    for sample in samples:
+        form: dict[str, object] = {"t_ns": sample.t_ns, "q": sample.q_icrs_to_cam.tolist()}
+        if sample.rate_cam_rad_s is not None:
+            form["rate"] = sample.rate_cam_rad_s.tolist()
+        form |= {"sequence": sample.sequence, "discontinuity": sample.discontinuity}
+        file.write(encoder.encode(form) + b"\n")
 
 
 def read_log(path: Path) -> list[AttitudeSample]:
@@ -76,8 +172,7 @@ def _as_it_is(sample: AttitudeSample) -> AttitudeSample:
 
 def _refuse_other_topics(path: Path) -> None:
     """Name the topics of an MCAP file from another program."""
-    from hilstar.attitude.logs.mcap_log import ATTITUDE_TOPIC
-    from hilstar.attitude.logs.mcap_reader import is_mcap, topics_of
+    from hilstar.attitude.logs.mcap_log import ATTITUDE_TOPIC, is_mcap, topics_of
 
     topics = topics_of(path) if is_mcap(path) else []
     if topics and ATTITUDE_TOPIC not in topics:
@@ -165,11 +260,11 @@ def _first_word(lines: Iterable[str]) -> str:
 
 def _is_bag(path: Path, head: bytes) -> bool:
     if head.startswith(MCAP_MAGIC):
-        from hilstar.attitude.logs.mcap_reader import holds_ros
+        from hilstar.attitude.logs.mcap_log import holds_ros
 
         return holds_ros(path)
     if path.is_dir():
-        from hilstar.attitude.logs.ros.bag import is_bag_directory
+        from hilstar.attitude.logs.ros_bags import is_bag_directory
 
         return is_bag_directory(path)
     return head.startswith((ROSBAG_MAGIC, SQLITE_MAGIC))
@@ -181,8 +276,8 @@ def _ros(path: Path, stated: Stated) -> Iterator[LogReading]:
         import rosbags  # noqa: F401
     except ImportError as error:
         raise MachineError(f"{path}: a ROS bag; reading it needs rosbags: pip install 'hilstar[ros]'") from error
-    from hilstar.attitude.logs.ros.bag import open_bag
-    from hilstar.attitude.logs.ros.reader import read_ros
+    from hilstar.attitude.logs.ros import read_ros
+    from hilstar.attitude.logs.ros_bags import open_bag
 
     with open_bag(path) as bag:
         yield read_ros(bag, stated)
@@ -196,9 +291,9 @@ def _mcap(path: Path) -> LogReading:
 
 
 def _aem(path: Path, text: str) -> LogReading:
-    from hilstar.attitude.logs.aem.blocks import AemFaultError
-    from hilstar.attitude.logs.aem.reader import read_aem
-    from hilstar.attitude.logs.of_date import q_icrs_to_date
+    from hilstar.attitude.logs.aem import read_aem
+    from hilstar.attitude.logs.aem_blocks import AemFaultError
+    from hilstar.attitude.logs.earth import q_icrs_to_date
 
     try:
         return read_aem(text, q_icrs_to_date)
@@ -211,19 +306,19 @@ def _ulog(path: Path, stated: Stated) -> LogReading:
         import pyulog  # noqa: F401
     except ImportError as error:
         raise MachineError(f"{path}: a ULog of PX4; reading it needs pyulog: pip install 'hilstar[px4]'") from error
-    from hilstar.attitude.logs.px4.reader import read_ulog
+    from hilstar.attitude.logs.px4 import read_ulog
 
     return read_ulog(path, stated)
 
 
 def _ck(path: Path, stated: Stated) -> LogReading:
-    from hilstar.attitude.logs.ck.reader import read_ck
+    from hilstar.attitude.logs.ck import read_ck
 
     return read_ck(path, stated)
 
 
 def _write_aem(file: IO[bytes], samples: Sequence[AttitudeSample], xml: bool, scale: str | None) -> None:
-    from hilstar.attitude.logs.aem.writer import aem_text
+    from hilstar.attitude.logs.aem import aem_text
 
     file.write(aem_text(samples, xml, scale).encode())
 
@@ -241,3 +336,34 @@ _WRITERS: dict[str, Callable[[IO[bytes], Sequence[AttitudeSample]], None]] = {
     ".mcap": _write_mcap,
 }
 _AEM_IN_XML = {".aem": False, ".kvn": False, ".xml": True}
+
+
+def time_in_log(path: Path, samples: Sequence[AttitudeSample], text: str | None) -> int:
+    """The `t_ns` that `text` names, within the span of the log; its first sample's for None.
+
+    A date and time is read on the log's own scale, from 1970-01-01T00:00:00. Raises InputError outside the span.
+    """
+    first_ns, last_ns = samples[0].t_ns, samples[-1].t_ns
+    if text is None:
+        return first_ns
+    t_ns = _named_ns(text, first_ns)
+    if not first_ns <= t_ns <= last_ns:
+        span = f"{(last_ns - first_ns) / NS_PER_S:.9g} s long"
+        if first_ns < YEAR_NS:
+            raise InputError(f"--at {text}: {path} is {span}, and its times are no dates; {SECONDS_FORM}")
+        span += f", from {epoch_text(first_ns)} to {epoch_text(last_ns)} on its own scale"
+        raise InputError(f"--at {text}: {path} is {span}; {TIME_FORM}")
+    return t_ns
+
+
+def _named_ns(text: str, first_ns: int) -> int:
+    try:
+        seconds = float(text)
+    except ValueError:
+        try:
+            return epoch_ns("", text)
+        except AemFaultError as fault:
+            raise InputError(f"--at {text}: {fault}") from fault
+    if not math.isfinite(seconds) or abs(seconds) > 1e12:
+        raise InputError(f"--at {text}: {TIME_FORM}")
+    return first_ns + round(seconds * NS_PER_S)

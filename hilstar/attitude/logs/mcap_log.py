@@ -1,20 +1,74 @@
-"""Attitudes in an MCAP file: one JSON message each on `/attitude`, which Foxglove and PlotJuggler open."""
+"""MCAP files: attitudes on `/attitude` (JSON, which Foxglove and PlotJuggler open), the reader, and the writer of run ledgers.
+
+Reading is in order and in bounded memory, up to the point where the writer was killed. A chunk states its unpacked size, which
+may be false: it is unpacked to that size and no further, and a whole file to at most MAX_INFLATION times its own size. A
+damaged file is refused in one line.
+
+Writing uses small chunks, for a run that may be killed and a disk that may be full:
+1. A chunk is on the disk whole, with its CRC, or the file ends before it: a failed write leaves the file as it was.
+2. Messages that could not be written are kept for the next attempt, until they are dropped by topic.
+3. Memory does not grow with the file, except for an index of at most MAX_INDEX_BYTES; a longer file has none.
+The library's writer obeys neither 1 nor 2, and its index grows by a megabyte in ten minutes of such chunks.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import contextlib
+import io
+import logging
+import os
+import struct
+import zlib
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import IO
+from typing import IO, NamedTuple, Self
 
+import lz4.frame
 import msgspec
+import zstandard
+from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.exceptions import RecordLengthLimitExceeded
+from mcap.opcode import Opcode
+from mcap.records import (
+    Channel,
+    Chunk,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Header,
+    McapRecord,
+    Message,
+    MessageIndex,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+    SummaryOffset,
+)
+from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 
-from hilstar.attitude.logs.mcap_reader import read_messages
-from hilstar.attitude.logs.mcap_writer import Topic
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal, checked_sample
 from hilstar.errors import InputError
-from hilstar.reading import NOT_JSON
+from hilstar.reading import MCAP_MAGIC, NOT_JSON, open_regular, size_text
 
+RUN_METADATA = "hilstar"  # the name of a ledger's head
+ROS_ENCODINGS = frozenset({"cdr", "ros1"})
+OWN_TOPICS = frozenset({"/attitude", "/frame"})
+log = logging.getLogger(__name__)
+NO_END = "has no end: cut short, or its writer was killed or still writes; what is whole is read"
+ADVICE = "give an MCAP file, such as the ledger of a run"
+MAX_CHUNK_BYTES = 64_000_000  # unpacked; writers make them of about 1 MB
+MAX_RECORD_BYTES = 256_000_000
+MAX_INFLATION, FREE_BYTES = 100, 32_000_000  # of a whole file; logs pack to a tenth
+_record_head = struct.Struct("<BQ")
+_message_head = struct.Struct("<HIQQ")
+MAX_INDEX_BYTES = 16_000_000  # of about six hours of five chunks a second
+LEVEL = 3  # of zstd
+_message_record = struct.Struct("<BQHIQQ")
+_footer_head = struct.Struct("<BQQQ")
 ATTITUDE_TOPIC = "/attitude"
 ATTITUDE_SCHEMA_NAME = "hilstar.Attitude"
 # Plain types only: Foxglove refuses a whole file over ["integer", "null"]. Unknown values are null in the message.
@@ -35,6 +89,363 @@ ATTITUDE_SCHEMA = msgspec.json.encode(
         },
     }
 )
+
+
+class DamageError(Exception):
+    """What is wrong with a file."""
+
+
+class TooLargeError(DamageError):
+    """More than the limits allow."""
+
+
+def part_path(path: Path, part: int) -> Path:
+    """The name of part 1, 2, ... of a run whose ledger begins at `path`: RUN.0001.mcap and on."""
+    return path.with_name(f"{path.stem}.{part:04d}{path.suffix}") if part else path
+
+
+def parts_of(path: Path) -> list[Path]:
+    """The files of a run whose ledger begins at `path`; the file alone where it is not a first part. Raises InputError."""
+    head = read_metadata(path, RUN_METADATA)
+    parts = [path]
+    while head.get("part") == "0" and (following := part_path(path, len(parts))).is_file():
+        own = read_metadata(following, RUN_METADATA)
+        if (own.get("run_id"), own.get("part")) != (head.get("run_id"), str(len(parts))):
+            break
+        parts.append(following)
+    return parts
+
+
+def read_topics(path: Path, *, tell: bool = True) -> Iterator[tuple[str, bytes]]:
+    """Topic and content of every message of a run's files, in their order, up to where its writer was killed.
+
+    A file that ends so is said in one line of the log, once it is read, unless not `tell`. Raises InputError for damage, and
+    for anything but a regular file.
+    """
+    for part in parts_of(path):
+        channels: dict[int, str] = {}
+        for record in records_of(part):
+            if isinstance(record, Channel):
+                channels[record.id] = record.topic
+            elif isinstance(record, Message) and record.channel_id in channels:
+                yield channels[record.channel_id], record.data
+    unfinished = unfinished_part(path) if tell else None
+    if unfinished is not None:
+        log.warning("%s %s", unfinished, NO_END)
+
+
+def unfinished_part(path: Path) -> Path | None:
+    """The first of a run's files that lacks the end which its writer gives it; None where all are whole. Raises InputError."""
+    for part in parts_of(path):
+        with open_regular(part, ADVICE) as file:
+            if not _is_finished(file):
+                return part
+    return None
+
+
+def read_messages(path: Path, topic: str, *, tell: bool = True) -> Iterator[bytes]:
+    """What the messages of one topic hold; a file without its end is said unless not `tell`. Raises InputError for damage."""
+    yield from (data for name, data in read_topics(path, tell=tell) if name == topic)
+
+
+def topics_of(path: Path) -> list[str]:
+    """The topics that a file has channels for. Raises InputError for damage."""
+    return sorted({record.topic for record in records_of(path) if isinstance(record, Channel)})
+
+
+def read_metadata(path: Path, name: str) -> dict[str, str]:
+    """The first metadata of that name, {} where there is none. Raises InputError for damage."""
+    return next((dict(r.metadata) for r in records_of(path) if isinstance(r, Metadata) and r.name == name), {})
+
+
+def is_mcap(path: Path) -> bool:
+    """True for a regular file that begins as MCAP does; False too where it cannot be read."""
+    try:
+        with open_regular(path, ADVICE) as file:
+            return file.read(len(MCAP_MAGIC)) == MCAP_MAGIC
+    except (InputError, OSError):
+        return False
+
+
+def holds_ros(path: Path) -> bool:
+    """Whether the first channel that is hilstar's or ROS's is ROS's. Raises InputError for damage before it."""
+    for record in records_of(path):
+        if isinstance(record, Channel):
+            if record.message_encoding in ROS_ENCODINGS:
+                return True
+            if record.message_encoding == "json" and record.topic in OWN_TOPICS:
+                return False
+    return False
+
+
+def records_of(path: Path) -> Iterator[McapRecord]:
+    """Every record of one file, chunks unpacked into their schemas, channels and messages. Raises InputError for damage."""
+    with open_regular(path, ADVICE) as file:
+        yield from _open_records(path, file)
+
+
+class _Capped:
+    """A file that is never asked for more than it has, whatever length a record states."""
+
+    def __init__(self, file: IO[bytes], size: int) -> None:
+        self._file, self.left = file, size
+
+    def read(self, length: int) -> bytes:
+        """At most `length` bytes. Raises TooLargeError for a record over MAX_RECORD_BYTES."""
+        if MAX_RECORD_BYTES < length <= self.left:
+            raise TooLargeError(f"a record of {size_text(length)}; at most {size_text(MAX_RECORD_BYTES)} are read")
+        data = self._file.read(min(length, self.left))
+        self.left -= len(data)
+        return data
+
+
+def _is_finished(file: IO[bytes]) -> bool:
+    """Whether a file has the end that a writer gives it, and not what a crash leaves."""
+    size = file.seek(0, os.SEEK_END)
+    file.seek(max(0, size - len(MCAP_MAGIC)))
+    return size > 2 * len(MCAP_MAGIC) and file.read() == MCAP_MAGIC
+
+
+def _open_records(path: Path, file: IO[bytes]) -> Iterator[McapRecord]:
+    finished = _is_finished(file)
+    size = file.seek(0, os.SEEK_END)
+    file.seek(0)
+    if not MCAP_MAGIC.startswith(file.read(len(MCAP_MAGIC))):
+        raise InputError(f"{path}: is no MCAP file; {ADVICE}")
+    file.seek(0)
+    capped = _Capped(file, size)
+    reader = StreamReader(capped, emit_chunks=True, validate_crcs=True, record_size_limit=size)  # type: ignore[arg-type]
+    records = reader.records
+    room = FREE_BYTES + MAX_INFLATION * size
+    while True:
+        try:
+            record = next(records, None)
+            inner = []
+            if isinstance(record, Chunk):
+                inner = [_unpacked(record, room)]
+                room -= len(inner[0])
+        except Exception as error:  # the reader passes on what struct, zstd, lz4 and UTF-8 raise
+            cut_off = isinstance(error, RecordLengthLimitExceeded) or not capped.left
+            if cut_off and not finished and not isinstance(error, TooLargeError):
+                return
+            raise _refused(path, file, error) from error
+        if record is None:
+            return
+        if not inner:
+            yield record
+        for data in inner:
+            try:
+                yield from _inside(data)
+            except Exception as error:
+                raise _refused(path, file, error) from error
+
+
+def _refused(path: Path, file: IO[bytes], error: Exception) -> InputError:
+    if isinstance(error, TooLargeError):
+        return InputError(f"{path}: {error}; {ADVICE}")
+    detail = str(error) if isinstance(error, DamageError) else f"{type(error).__name__} {error}".strip()
+    return InputError(f"{path}: is damaged before byte {file.tell()} ({detail}); record the log again")
+
+
+def _unpacked(chunk: Chunk, room: int) -> bytes:
+    """A chunk's content, once its size and CRC are those that it states."""
+    size = chunk.uncompressed_size
+    if size > MAX_CHUNK_BYTES:
+        raise TooLargeError(f"a chunk of {size_text(size)}; at most {size_text(MAX_CHUNK_BYTES)} are unpacked")
+    if size > room:
+        raise TooLargeError(f"unpacks to more than {MAX_INFLATION} times its size")
+    if chunk.compression == "zstd":
+        with zstandard.ZstdDecompressor().stream_reader(chunk.data) as stream:
+            data = stream.read(size + 1)
+    elif chunk.compression == "lz4":
+        data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
+    elif chunk.compression:
+        raise DamageError(f"compression {chunk.compression[:20]!r} is neither zstd nor lz4")
+    else:
+        data = chunk.data
+    if len(data) != size:
+        raise DamageError(f"a chunk contains {'more' if len(data) > size else 'less'} than the {size} bytes that it states")
+    if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
+        raise DamageError("the CRC-32 of a chunk does not match")
+    return data
+
+
+def _inside(data: bytes) -> Iterator[McapRecord]:
+    """The schemas, channels and messages of a chunk."""
+    place = 0
+    while place < len(data):
+        opcode, length = _record_head.unpack_from(data, place)
+        place += _record_head.size
+        if length > len(data) - place:
+            raise DamageError("a record is longer than its chunk")
+        if opcode == Opcode.MESSAGE:
+            if length < _message_head.size:
+                raise DamageError("a message is shorter than its head")
+            channel, sequence, log_ns, publish_ns = _message_head.unpack_from(data, place)
+            yield Message(channel, log_ns, data[place + _message_head.size : place + length], publish_ns, sequence)
+        elif opcode in {Opcode.CHANNEL, Opcode.SCHEMA}:
+            kind = Channel if opcode == Opcode.CHANNEL else Schema
+            yield kind.read(ReadDataStream(io.BytesIO(data[place : place + length])))
+        place += length
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """A channel of JSON messages: its schema's name, and that schema."""
+
+    name: str
+    schema_name: str
+    schema: bytes
+
+
+class _Pending(NamedTuple):
+    """A message that is not written yet."""
+
+    channel: int
+    time_ns: int
+    record: bytes
+
+
+class McapWriter:
+    """Writes to a file descriptor that is open for writing and empty; closing it stays the caller's. Raises OSError."""
+
+    def __init__(self, fd: int, topics: Mapping[str, Topic], metadata_name: str, metadata: Mapping[str, str]) -> None:
+        self.size_bytes = 0
+        self._fd = fd
+        self._ids = {key: number for number, key in enumerate(topics, start=1)}
+        self._schemas = [Schema(i, topic.schema, "jsonschema", topic.schema_name) for i, topic in enumerate(topics.values(), 1)]
+        self._channels = [Channel(i, topic.name, "json", {}, i) for i, topic in enumerate(topics.values(), 1)]
+        self._pending: list[_Pending] = []
+        self.pending_bytes = 0
+        self.crc = 0  # CRC-32 of all that is written
+        self._index = bytearray()
+        self._indexed = True
+        self._counts: Counter[int] = Counter()
+        self._chunks = 0
+        self._times_ns: tuple[int, int] | None = None
+        self._compressor = zstandard.ZstdCompressor(level=LEVEL)
+        head = Metadata(metadata_name, dict(metadata))
+        before = MCAP_MAGIC + _bytes_of(Header("", "hilstar"))
+        whole = _bytes_of(head)
+        self._metadata_index = MetadataIndex(len(before), len(whole), metadata_name)
+        # Outside the first chunk: most readers also look for channels there, and these are never lost with a chunk.
+        self._append(before + whole + _bytes_of(*self._schemas, *self._channels))
+
+    def add(self, key: str, time_ns: int, data: bytes, sequence: int) -> None:
+        """Take a message of the topic named `key`; it is written at the next flush."""
+        record = _message_record.pack(Opcode.MESSAGE, 22 + len(data), self._ids[key], sequence % 2**32, time_ns, time_ns) + data
+        self._pending.append(_Pending(self._ids[key], time_ns, record))
+        self.pending_bytes += len(record)
+
+    @property
+    def written(self) -> int:
+        """How many messages are in the file."""
+        return self._counts.total()
+
+    def take_over(self, other: Self) -> None:
+        """Take the messages that another writer of the same topics has not written yet."""
+        self._pending, self.pending_bytes = other._pending, other.pending_bytes
+        other._pending, other.pending_bytes = [], 0
+
+    def drop(self, key: str | None = None) -> int:
+        """Forget the messages of a topic (None: of all) that are not written yet; returns their number."""
+        kept = [] if key is None else [entry for entry in self._pending if entry.channel != self._ids[key]]
+        dropped = len(self._pending) - len(kept)
+        self._pending, self.pending_bytes = kept, sum(len(entry.record) for entry in kept)
+        return dropped
+
+    def flush(self) -> None:
+        """Write what was added, as one chunk. Raises OSError, and keeps the messages."""
+        if not self._pending:
+            return
+        data = b"".join(entry.record for entry in self._pending)
+        times_ns = [entry.time_ns for entry in self._pending]
+        first_ns, last_ns = min(times_ns), max(times_ns)
+        packed = self._compressor.compress(data)
+        chunk = _bytes_of(Chunk("zstd", packed, last_ns, first_ns, zlib.crc32(data), len(data)))
+        indexes, offsets = self._message_indexes(self.size_bytes + len(chunk))
+        place = self.size_bytes
+        self._append(chunk + indexes)
+        entry = ChunkIndex(len(chunk), place, "zstd", len(packed), last_ns, len(indexes), offsets, first_ns, len(data))
+        self._note(entry, first_ns, last_ns)
+
+    def finish(self) -> None:
+        """Write what was added, the index and the end. Raises OSError; the file is then as if its writer had been killed."""
+        self.flush()
+        end = _bytes_of(DataEnd(self.crc))
+        summary, offset_start = self._summary(self.size_bytes + len(end))
+        start = self.size_bytes + len(end)
+        crc = zlib.crc32(_footer_head.pack(Opcode.FOOTER, 20, start, offset_start), zlib.crc32(summary))
+        self._append(end + summary + _bytes_of(Footer(start, offset_start, crc)) + MCAP_MAGIC)
+
+    def _message_indexes(self, place: int) -> tuple[bytes, dict[int, int]]:
+        """The index of each channel's messages in the chunk, to be written at `place`, and where each begins."""
+        entries: dict[int, list[tuple[int, int]]] = {}
+        offset = 0
+        for channel, time_ns, record in self._pending:
+            entries.setdefault(channel, []).append((time_ns, offset))
+            offset += len(record)
+        written, offsets = b"", {}
+        for channel, records in entries.items():
+            offsets[channel] = place + len(written)
+            written += _bytes_of(MessageIndex(channel, records))
+        return written, offsets
+
+    def _note(self, entry: ChunkIndex, first_ns: int, last_ns: int) -> None:
+        """A chunk is on the disk."""
+        self._counts.update(entry.channel for entry in self._pending)
+        self._pending, self.pending_bytes = [], 0
+        self._chunks += 1
+        self._times_ns = (first_ns, last_ns) if self._times_ns is None else _span(self._times_ns, (first_ns, last_ns))
+        if self._indexed:
+            self._index += _bytes_of(entry)
+        if len(self._index) > MAX_INDEX_BYTES:
+            self._indexed, self._index = False, bytearray()
+
+    def _summary(self, place: int) -> tuple[bytes, int]:
+        """The summary, to be written at `place`, and where the offsets in it begin."""
+        first_ns, last_ns = self._times_ns or (0, 0)
+        counts = dict(self._counts)
+        channels = len(self._channels)
+        totals = (sum(counts.values()), last_ns, first_ns)
+        groups = {
+            Opcode.SCHEMA: _bytes_of(*self._schemas),
+            Opcode.CHANNEL: _bytes_of(*self._channels),
+            Opcode.STATISTICS: _bytes_of(Statistics(0, channels, counts, self._chunks, *totals, 1, len(self._schemas))),
+            Opcode.CHUNK_INDEX: bytes(self._index),
+            Opcode.METADATA_INDEX: _bytes_of(self._metadata_index),
+        }
+        written, offsets = b"", b""
+        for opcode, group in groups.items():
+            if group:
+                offsets += _bytes_of(SummaryOffset(opcode, place + len(written), len(group)))
+            written += group
+        return written + offsets, place + len(written)
+
+    def _append(self, data: bytes) -> None:
+        """Write at the end, all or nothing."""
+        try:
+            rest = memoryview(data)
+            while rest:
+                rest = rest[os.write(self._fd, rest) :]
+        except OSError:
+            with contextlib.suppress(OSError):
+                os.ftruncate(self._fd, self.size_bytes)
+                os.lseek(self._fd, self.size_bytes, os.SEEK_SET)
+            raise
+        self.size_bytes += len(data)
+        self.crc = zlib.crc32(data, self.crc)
+
+
+def _bytes_of(*records: McapRecord) -> bytes:
+    builder = RecordBuilder()
+    for record in records:
+        record.write(builder)
+    return bytes(builder.end())  # type: ignore[no-untyped-call]
+
+
+def _span(one: tuple[int, int], other: tuple[int, int]) -> tuple[int, int]:
+    return min(one[0], other[0]), max(one[1], other[1])
 
 
 class _Form(msgspec.Struct):

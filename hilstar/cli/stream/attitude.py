@@ -110,8 +110,7 @@ def _of_log(path: Path, at: str | None, stated: Stated) -> tuple[AttitudeSample,
     """The attitude of a log at a time, and whether it is held there because the log has a gap."""
     from hilstar.attitude.clock.timeline import Policy
     from hilstar.attitude.logs.gaps import log_joins
-    from hilstar.attitude.logs.log_file import log_timeline, open_log
-    from hilstar.attitude.logs.when import time_in_log
+    from hilstar.attitude.logs.log_file import log_timeline, open_log, time_in_log
     from hilstar.attitude.wire.packet import AttitudeSample
 
     log = open_log(path, stated)

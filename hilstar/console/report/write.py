@@ -6,7 +6,7 @@ from pathlib import Path
 
 import msgspec
 
-from hilstar.attitude.logs.mcap_reader import NO_END, unfinished_part
+from hilstar.attitude.logs.mcap_log import NO_END, unfinished_part
 from hilstar.console.report.bundle import report_page
 from hilstar.console.report.pictures import run_pictures
 from hilstar.console.report.run_data import run_data

@@ -23,9 +23,16 @@ from typing import Self
 
 import msgspec
 
-from hilstar.attitude.logs.mcap_log import ATTITUDE_TOPIC_OF_RUN, attitude_message, log_time_ns, refused_message
-from hilstar.attitude.logs.mcap_reader import RUN_METADATA, part_path
-from hilstar.attitude.logs.mcap_writer import McapWriter, Topic
+from hilstar.attitude.logs.mcap_log import (
+    ATTITUDE_TOPIC_OF_RUN,
+    RUN_METADATA,
+    McapWriter,
+    Topic,
+    attitude_message,
+    log_time_ns,
+    part_path,
+    refused_message,
+)
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal
 from hilstar.bench.frame import Bench
 from hilstar.errors import InputError, cannot_write, printable

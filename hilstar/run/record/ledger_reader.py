@@ -10,8 +10,7 @@ from typing import Any
 
 import msgspec
 
-from hilstar.attitude.logs.mcap_log import ATTITUDE_TOPIC
-from hilstar.attitude.logs.mcap_reader import RUN_METADATA, read_messages, read_metadata, read_topics
+from hilstar.attitude.logs.mcap_log import ATTITUDE_TOPIC, RUN_METADATA, read_messages, read_metadata, read_topics
 from hilstar.attitude.wire.packet import MAX_PLACE_KM, MAX_SPEED_KM_S, MIN_PLACE_KM, Refusal, checked_sample, rate_refusal
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE
 from hilstar.bench.config import BenchConfig

@@ -18,7 +18,7 @@ from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.keys import Keys
 
 import hilstar
-from hilstar.attitude.logs.mcap_reader import read_messages
+from hilstar.attitude.logs.mcap_log import read_messages
 from hilstar.run.record.ledger_records import EventRecord
 from tests.support.browser import Browser, assert_fits_every_size_in_light_and_dark
 from tests.support.senders import ORION, connected, packet

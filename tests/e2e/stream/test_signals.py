@@ -199,7 +199,7 @@ def test_a_second_signal_ends_it_at_once(tmp_path, small_bench_file):
 @best_of_three
 def test_a_disk_that_stands_still_holds_up_neither_the_frames_nor_the_end(tmp_path):
     """The ledger's writer never returns from a write: the summary comes all the same, says it, and the exit code is 1."""
-    still = "import time; from hilstar.attitude.logs import mcap_writer as w; w.McapWriter.flush = lambda *a: time.sleep(100)"
+    still = "import time; from hilstar.attitude.logs import mcap_log as w; w.McapWriter.flush = lambda *a: time.sleep(100)"
     command = ["serve", str(serve_file(tmp_path, free_port())), "--headless", "--json", "--ledger", str(tmp_path / "run.mcap")]
     with running(program(*command, before=still)) as process:
         assert process.stderr is not None

@@ -12,7 +12,7 @@ import pytest
 from mcap.writer import Writer
 from PIL import Image
 
-from hilstar.attitude.logs.mcap_reader import NO_END
+from hilstar.attitude.logs.mcap_log import NO_END
 from hilstar.bench.frame import Bench
 from hilstar.console.report.pictures import run_pictures
 from hilstar.console.report.write import report

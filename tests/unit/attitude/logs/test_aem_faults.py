@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hilstar.attitude.clock.timeline import Policy
-from hilstar.attitude.logs.aem import epochs, overlaps
+from hilstar.attitude.logs import aem, aem_blocks
 from hilstar.attitude.logs.log_file import log_timeline, open_log, write_log
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.errors import InputError
@@ -32,12 +32,12 @@ from tests.support.sources.aem_messages import EPOCHS, kvn, read, refusal, rows_
     ],
 )
 def test_both_forms_of_epoch_are_read_to_the_nanosecond(text, t_ns):
-    assert epochs.epoch_ns("", text) == t_ns
+    assert aem_blocks.epoch_ns("", text) == t_ns
 
 
 def test_epochs_are_written_with_nine_digits():
-    assert epochs.epoch_text(-1) == "1969-12-31T23:59:59.999999999"
-    assert epochs.epoch_text(2**63 - 1) == "2262-04-11T23:47:16.854775807"
+    assert aem_blocks.epoch_text(-1) == "1969-12-31T23:59:59.999999999"
+    assert aem_blocks.epoch_text(2**63 - 1) == "2262-04-11T23:47:16.854775807"
 
 
 @pytest.mark.parametrize(
@@ -190,7 +190,7 @@ def test_useable_times_that_cannot_be_are_refused_where_they_are_needed(tmp_path
 
 def test_thousands_of_segments_that_overlap_are_refused(tmp_path):
     one = overlapping(([0, 20], {}))
-    text = one + one[one.index("META_START") :] * overlaps.MAX_OVERLAPPING
+    text = one + one[one.index("META_START") :] * aem.MAX_OVERLAPPING
     assert "1001 segments overlap, and 1000 may" in refusal(tmp_path, text)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import spiceypy
 
-from hilstar.attitude.logs.ck.child import answer
+from hilstar.attitude.logs.ck_spice import answer
 from hilstar.attitude.logs.entries import Stated
 from hilstar.attitude.logs.log_file import open_log
 from hilstar.errors import InputError, MachineError

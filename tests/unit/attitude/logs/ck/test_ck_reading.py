@@ -8,7 +8,7 @@ import spiceypy
 from scipy.spatial.transform import Rotation
 
 from hilstar.attitude.clock.timeline import Policy
-from hilstar.attitude.logs.ck.child import answer
+from hilstar.attitude.logs.ck_spice import answer
 from hilstar.attitude.logs.entries import Stated
 from hilstar.attitude.logs.gaps import log_joins
 from hilstar.attitude.logs.log_file import log_timeline, open_log

@@ -1,41 +1,72 @@
-"""AEM in XML, read element by element by Python's own parser; what would be passed over is refused.
+"""The text of a CCSDS Attitude Ephemeris Message, 1.0 (504.0-B-1) or 2.0 (504.0-B-2): KVN or XML to blocks of numbers.
 
-The text is bounded by its reader. A DOCTYPE is refused where it begins, so that no entity is expanded and nothing outside the
-text is read; depth and the size of an element are bounded; and of each state only its numbers are kept.
+An unknown keyword is refused, and so is a keyword of the other version: ignoring QUATERNION_TYP, or QUATERNION_TYPE in a
+version 2.0 file, would show another orientation than the writer meant. A file that is cut off is refused.
+
+XML goes through Python's expat parser, element by element. A DOCTYPE is refused where it begins, so no entity is expanded and
+nothing outside the text is read. Depth and element size are bounded, and of each state only the numbers are kept.
 """
 
 from __future__ import annotations
 
+import difflib
+import io
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from functools import cache
+from datetime import date, timedelta
+from functools import cache, lru_cache
 from xml.parsers import expat
 
 import numpy as np
 
-from hilstar.attitude.logs.aem.angles import sequence
-from hilstar.attitude.logs.aem.blocks import (
-    ANGVEL,
-    DERIVATIVE,
-    EULER,
-    EULER_ANGVEL,
-    EULER_DERIVATIVE,
-    EULER_RATE,
-    QUATERNION,
-    RATE,
-    SPIN,
-    SPIN_NUTATION,
-    SPIN_NUTATION_MOM,
-    VERSION_KEY,
-    AemFaultError,
-    Block,
-    check_metadata,
-    check_version,
-    fault_of,
-    plain,
-)
+from hilstar.arrays import FloatArray
+from hilstar.units import NS_PER_S
 
+VERSION_KEY = "CCSDS_AEM_VERS"
+HEADER = (VERSION_KEY, "CLASSIFICATION", "CREATION_DATE", "ORIGINATOR", "MESSAGE_ID")
+METADATA = (
+    *("OBJECT_NAME", "OBJECT_ID", "CENTER_NAME", "REF_FRAME_A", "REF_FRAME_B", "ATTITUDE_DIR", "TIME_SYSTEM"),
+    *("START_TIME", "USEABLE_START_TIME", "USEABLE_STOP_TIME", "STOP_TIME", "ATTITUDE_TYPE", "QUATERNION_TYPE"),
+    *("EULER_ROT_SEQ", "RATE_FRAME", "ANGVEL_FRAME", "INTERPOLATION_METHOD", "INTERPOLATION_DEGREE"),
+)
+SECTIONS = {"header": HEADER, "metadata": METADATA}
+# Keywords that one version alone has (504.0-B-2 annex J), and what the other has in their place.
+ONLY_IN = {
+    "ATTITUDE_DIR": ("1.0", "2.0 always turns from REF_FRAME_A to REF_FRAME_B"),
+    "QUATERNION_TYPE": ("1.0", "2.0 always has the scalar last"),
+    "RATE_FRAME": ("1.0", "2.0 has ANGVEL_FRAME"),
+    "ANGVEL_FRAME": ("2.0", "1.0 has RATE_FRAME"),
+}
+
+QUATERNION, DERIVATIVE, RATE, ANGVEL = "QUATERNION", "QUATERNION/DERIVATIVE", "QUATERNION/RATE", "QUATERNION/ANGVEL"
+EULER, EULER_RATE = "EULER_ANGLE", "EULER_ANGLE/RATE"
+EULER_DERIVATIVE, EULER_ANGVEL = "EULER_ANGLE/DERIVATIVE", "EULER_ANGLE/ANGVEL"
+SPIN, SPIN_NUTATION, SPIN_NUTATION_MOM = "SPIN", "SPIN/NUTATION", "SPIN/NUTATION_MOM"
+QUATERNIONS = frozenset({QUATERNION, DERIVATIVE, RATE, ANGVEL})
+SPINS = frozenset({SPIN, SPIN_NUTATION, SPIN_NUTATION_MOM})
+COMPONENTS = {
+    **{QUATERNION: 4, DERIVATIVE: 8, RATE: 7, ANGVEL: 7},
+    **{EULER: 3, EULER_RATE: 6, EULER_DERIVATIVE: 6, EULER_ANGVEL: 6},
+    **{SPIN: 4, SPIN_NUTATION: 7, SPIN_NUTATION_MOM: 7},
+}
+TYPES = {
+    "1.0": (QUATERNION, DERIVATIVE, RATE, EULER, EULER_RATE, SPIN, SPIN_NUTATION),
+    "2.0": (
+        *(QUATERNION, DERIVATIVE, ANGVEL, EULER, EULER_DERIVATIVE, EULER_ANGVEL),
+        *(SPIN, SPIN_NUTATION, SPIN_NUTATION_MOM),
+    ),
+}
+AXES = {"1": 0, "2": 1, "3": 2, "X": 0, "Y": 1, "Z": 2}
+DAY_NS = 86_400 * NS_PER_S
+UNIX_DAY = date(1970, 1, 1).toordinal()
+EPOCH = re.compile(r"(\d{4}-(?:\d\d-\d\d|\d{3}))T(\d\d):(\d\d):(\d\d)(?:\.(\d+))?Z?", re.ASCII)
+MARKERS = {  # the section that a marker ends, and the one that it begins
+    "META_START": ("header", "metadata"),
+    "META_STOP": ("metadata", "gap before DATA_START"),
+    "DATA_START": ("gap before DATA_START", "data"),
+    "DATA_STOP": ("data", "header"),
+}
 MAX_DEPTH = 12  # in an <ndm> a number stands nine deep
 MAX_ELEMENTS = 100_000  # besides the states, and in one of them
 LONG_ELEMENT = re.compile("<[^<]{1000000}")
@@ -74,6 +105,186 @@ STATES = {
 }
 
 
+class AemFaultError(Exception):
+    """What is wrong in an AEM, and where: a line (":12"), an epoch (", 2024-01-01T00:00:00") or nowhere in particular."""
+
+    def __init__(self, where: str, detail: str) -> None:
+        super().__init__(detail)
+        self.where = where
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """One block of data: its keywords; for each state its place and epoch; and `values` (n, COMPONENTS), scalar first."""
+
+    meta: dict[str, str]
+    where: list[str]
+    epochs: list[str]
+    values: FloatArray
+
+
+def fault_of(key: str, section: str, version: str) -> str | None:
+    """Why a keyword (other than COMMENT) may not stand in the "header" or "metadata", and what to write; None where it may."""
+    if key in SECTIONS[section]:
+        own, instead = ONLY_IN.get(key, (version, ""))
+        if own == version or version not in TYPES:
+            return None
+        return f"{key} is of AEM {own}, and {VERSION_KEY} is {version}; {instead}: delete it, or write {VERSION_KEY} = {own}"
+    other = "metadata" if section == "header" else "header"
+    if key in SECTIONS[other]:
+        return f"{key} is in the {section}; it belongs in the {other}"
+    near = difflib.get_close_matches(key.upper()[:40], SECTIONS[section], n=1)
+    advice = f"did you mean {near[0]}?" if near else f"the keywords are {', '.join(SECTIONS[section])}"
+    return f"{key[:40]} is not a keyword of an AEM's {section}; {advice}"
+
+
+def check_version(version: str) -> None:
+    """Raises AemFaultError for a version that is not read."""
+    if version not in TYPES:
+        raise AemFaultError("", f"{VERSION_KEY} is {version[:40]}; write 1.0 or 2.0")
+
+
+def check_metadata(meta: dict[str, str], where: str) -> None:
+    """Raises AemFaultError for a version or type that is not supported, or a missing keyword."""
+    version = meta.get(VERSION_KEY, "missing")
+    check_version(version)
+    for key in ("REF_FRAME_A", "REF_FRAME_B", "TIME_SYSTEM", "ATTITUDE_TYPE"):
+        if key not in meta:
+            raise AemFaultError(where, f"{key} is missing in the metadata of a block")
+    order = meta.get("QUATERNION_TYPE", "LAST")
+    if order not in {"FIRST", "LAST"}:
+        raise AemFaultError(where, f"QUATERNION_TYPE is {order[:40]}; write FIRST or LAST, where the scalar is")
+    if meta["ATTITUDE_TYPE"] not in TYPES[version]:
+        types = ", ".join(TYPES[version])
+        raise AemFaultError(
+            where, f"ATTITUDE_TYPE = {meta['ATTITUDE_TYPE'][:40]} of AEM {version} is not read; write one of {types}"
+        )
+
+
+def plain(value: str) -> str:
+    """A text value normalised for comparison: 504.0-B-2 6.8 ignores case, and treats blanks as underscores."""
+    return "_".join(value.upper().replace("_", " ").split())
+
+
+def sequence(meta: dict[str, str]) -> tuple[int, int, int]:
+    """The axes (0 to 2) of EULER_ROT_SEQ, such as 321 or ZYX. Raises AemFaultError."""
+    text = meta.get("EULER_ROT_SEQ", "missing")
+    axes = [AXES.get(letter, -1) for letter in text]
+    if len(axes) != 3 or -1 in axes or axes[0] == axes[1] or axes[1] == axes[2]:
+        raise AemFaultError("", f"EULER_ROT_SEQ is {text[:40]}; write three axes such as 321 or ZYX, no two alike side by side")
+    return axes[0], axes[1], axes[2]
+
+
+def epoch_ns(where: str, text: str) -> int:
+    """Nanoseconds from 1970-01-01T00:00:00 to an epoch (calendar or day-of-year form), rounded; every day has 86400 s.
+
+    A leap second 23:59:60 is the next day's 00:00:00. Raises AemFaultError.
+    """
+    match = EPOCH.fullmatch(text)
+    day = _day(match[1]) if match else None
+    if match is None or day is None or not _is_time(*(int(match[i]) for i in (2, 3, 4))):
+        wanted = "write YYYY-MM-DDThh:mm:ss.f or YYYY-DDDThh:mm:ss.f"
+        raise AemFaultError(where, f"the epoch is {text[:40]!r}; {wanted}")
+    digits = (match[5] or "").ljust(10, "0")
+    seconds = 3600 * int(match[2]) + 60 * int(match[3]) + int(match[4])
+    return day * DAY_NS + seconds * NS_PER_S + int(digits[:9]) + (digits[9] >= "5")
+
+
+def _is_time(hours: int, minutes: int, seconds: int) -> bool:
+    return hours < 24 and minutes < 60 and (seconds < 60 or (hours, minutes, seconds) == (23, 59, 60))
+
+
+@lru_cache(maxsize=1024)
+def _day(text: str) -> int | None:
+    """Days from 1970-01-01 to YYYY-MM-DD or YYYY-DDD, or None when the calendar has no such day."""
+    year, first, *second = map(int, text.split("-"))
+    try:
+        day = date(year, first, second[0]) if second else date(year, 1, 1) + timedelta(days=first - 1)
+    except (ValueError, OverflowError):
+        return None
+    return day.toordinal() - UNIX_DAY if day.year == year else None
+
+
+def epoch_text(t_ns: int) -> str:
+    """The calendar form of `t_ns` with all nine digits; exact for every 64-bit value."""
+    day, ns = divmod(t_ns, DAY_NS)
+    seconds, ns = divmod(ns, NS_PER_S)
+    clock = f"{seconds // 3600:02}:{seconds // 60 % 60:02}:{seconds % 60:02}.{ns:09}"
+    return f"{date.fromordinal(UNIX_DAY + day).isoformat()}T{clock}"
+
+
+def kvn_blocks(text: str) -> list[Block]:
+    """The blocks of an AEM's text in KVN. Raises AemFaultError."""
+    header: dict[str, str] = {}
+    meta: dict[str, str] = {}
+    rows: list[tuple[str, list[str]]] = []
+    blocks: list[Block] = []
+    section, number = "header", 0
+    for number, line in enumerate(map(str.strip, io.StringIO(text, newline=None)), start=1):
+        where = f":{number}"
+        if not line or line.split(maxsplit=1)[0] == "COMMENT":
+            continue
+        if line in MARKERS:
+            if section != MARKERS[line][0]:
+                raise AemFaultError(
+                    where, f"{line} in the {section}; the order is META_START, META_STOP, DATA_START, DATA_STOP"
+                )
+            section = MARKERS[line][1]
+            if line == "META_START":
+                meta, rows = dict(header), []
+            elif line == "DATA_STOP":
+                blocks.append(_kvn_block(meta, rows, where))
+        elif section == "data":
+            rows.append((where, line.split()))
+        else:
+            key, value = _keyword(line, section, header.get(VERSION_KEY, ""), where)
+            keywords = header if section == "header" else meta
+            if key in keywords:
+                raise AemFaultError(where, f"{key} appears twice in the {section}; delete one")
+            keywords[key] = value
+    if section != "header" or not blocks:
+        raise AemFaultError(
+            f":{number}", f"the file ends in the {section}, with {len(blocks)} complete blocks of data; is it cut off?"
+        )
+    return blocks
+
+
+def _keyword(line: str, section: str, version: str, where: str) -> tuple[str, str]:
+    key, equals, value = line.partition("=")
+    if not equals or section not in {"header", "metadata"}:
+        raise AemFaultError(where, f"{line[:40]!r} in the {section}; write KEYWORD = value, or a marker such as META_START")
+    fault = fault_of(key.strip(), section, version)
+    if fault is not None:
+        raise AemFaultError(where, fault)
+    return key.strip(), plain(value)
+
+
+def _kvn_block(meta: dict[str, str], rows: list[tuple[str, list[str]]], where: str) -> Block:
+    check_metadata(meta, where)
+    if not rows:
+        raise AemFaultError(where, "the block contains no attitude")
+    count = 1 + COMPONENTS[meta["ATTITUDE_TYPE"]]
+    order = meta.get("QUATERNION_TYPE", "LAST" if meta[VERSION_KEY] == "2.0" else "missing")
+    has_quaternion = meta["ATTITUDE_TYPE"] in QUATERNIONS
+    if has_quaternion and order not in {"FIRST", "LAST"}:
+        raise AemFaultError(where, f"QUATERNION_TYPE is {order}; write FIRST or LAST, where the scalar is")
+    values = []
+    for place, words in rows:
+        try:
+            if len(words) != count:
+                raise ValueError
+            values.append([float(word) for word in words[1:]])
+        except ValueError:
+            wanted = f"write an epoch and {count - 1} numbers for {meta['ATTITUDE_TYPE']}"
+            raise AemFaultError(place, f"{' '.join(words)[:80]!r}; {wanted}") from None
+    table = np.array(values, dtype=np.float64)
+    if has_quaternion and order == "LAST":
+        table[:, :4] = table[:, [3, 0, 1, 2]]
+        if meta["ATTITUDE_TYPE"] == DERIVATIVE:
+            table[:, 4:] = table[:, [7, 4, 5, 6]]
+    return Block(meta, [place for place, _ in rows], [words[0] for _, words in rows], table)
+
+
 @dataclass(slots=True)
 class _Element:
     """An element that is being read, or has been."""
@@ -105,7 +316,7 @@ class _Element:
 
 
 @dataclass(slots=True)
-class _Segment:
+class _XmlSegment:
     """The keywords of a <segment>, and of each of its states the epoch and the numbers."""
 
     meta: dict[str, str]
@@ -137,7 +348,7 @@ class _Reading:
 
     def __init__(self) -> None:
         self.messages = 0
-        self.segments: list[_Segment] = []
+        self.segments: list[_XmlSegment] = []
         self.parser = expat.ParserCreate("utf-8", " ")  # names come with their namespace and a blank before them
         self.parser.buffer_text = True
         self.parser.StartDoctypeDeclHandler = self._doctype
@@ -197,7 +408,7 @@ class _Reading:
     def _begin_segment(self, metadata: _Element) -> None:
         meta = {VERSION_KEY: self._version} | _keywords(metadata, self._version)
         check_metadata(meta, f":{metadata.line}")
-        self.segments.append(_Segment(meta))
+        self.segments.append(_XmlSegment(meta))
 
     def _take_state(self, holder: _Element) -> None:
         segment_element = self._open[-2]

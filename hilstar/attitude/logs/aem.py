@@ -1,0 +1,517 @@
+"""CCSDS Attitude Ephemeris Messages: 1.0 (504.0-B-1) and 2.0 (504.0-B-2) are read, as KVN or XML; 1.0 is written.
+
+Reading:
+1. One of REF_FRAME_A and REF_FRAME_B is ICRF, GCRF or EME2000, taken as the same axes (EME2000's differ by 23 mas). The
+   other is a frame of the spacecraft: a camera by its name (STARTRACKER_1, INSTRUMENT_A, CAM, ...), else a body, which the
+   mounting turns into the camera. MOD, TOD, TEME and ITRF are turned to the ICRS at each epoch. Any other is refused.
+2. The quaternion of 504.0-B-2 annex F turns components from its first frame into its second; it is the conjugate of
+   hilstar's. ATTITUDE_DIR says which frame is first (2.0: always A), QUATERNION_TYPE where the scalar is (2.0: last).
+3. A rate is the angular velocity of the second frame with respect to the first.
+4. EULER_ROT_SEQ names the axes of three successive turns of the frame, from the first frame to the second; each turn is about
+   an axis of the frame that the previous turns made. The angles come in that order.
+5. A spin axis is +z of the second frame, at right ascension alpha and declination delta of the first. The spin angle is the
+   third of the turns ZXZ by alpha + 90, 90 - delta and that angle (as in Orekit). With nutation, the frame turns at its spin
+   rate about +z and at the nutation rate about the angular momentum. The phase p and nutation angle n place the momentum in
+   the second frame, (sin n cos p, -sin n sin p, cos n); the type with _MOM gives it in the first frame.
+6. `t_ns` is nanoseconds from 1970-01-01T00:00:00 of the file's own time system; leap seconds are not counted.
+7. A new block begins with a discontinuity. The TOTAL spans of blocks may overlap: USEABLE_START_TIME and USEABLE_STOP_TIME
+   say where each is meant to be used. Where several blocks have a time, a useable one wins, then the one that begins later
+   (as in Orekit). Interpolation hints are ignored.
+
+Writing: version 1.0, which every AEM reader reads and which states the quaternion's order and direction. Rates are written as
+quaternion derivatives: some readers take QUATERNION/RATE as an angular velocity, others as Euler rates.
+"""
+
+from __future__ import annotations
+
+import re
+from bisect import bisect_left, bisect_right
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from functools import cached_property
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from hilstar.arrays import FloatArray
+from hilstar.attitude.clock.timeline import Policy, Timeline
+from hilstar.attitude.logs.aem_blocks import (
+    DERIVATIVE,
+    EULER_ANGVEL,
+    EULER_DERIVATIVE,
+    EULER_RATE,
+    QUATERNION,
+    QUATERNIONS,
+    RATE,
+    SPIN,
+    SPIN_NUTATION,
+    SPIN_NUTATION_MOM,
+    SPINS,
+    VERSION_KEY,
+    AemFaultError,
+    Block,
+    epoch_ns,
+    epoch_text,
+    kvn_blocks,
+    sequence,
+    xml_blocks,
+)
+from hilstar.attitude.logs.entries import Entry, LogReading
+from hilstar.attitude.logs.gaps import log_joins
+from hilstar.attitude.wire.packet import INT64, AttitudeSample, checked_sample
+from hilstar.attitude.wire.source import Conventions, components
+from hilstar.rotation import conjugate, direction_of, from_rotation_vectors, multiply
+from hilstar.units import NS_PER_S
+
+MAX_OVERLAPPING = 1000
+# 504.0-B-2's own examples write J2000 for EME2000; the realisations of the ICRF share its axes to 0.1 mas.
+INERTIAL_FRAMES = frozenset({"ICRF", "ICRF1", "ICRF2", "ICRF3", "GCRF", "EME2000", "J2000"})
+# SANA's registry of spacecraft body frames, whose names end in a label (SC_BODY_1, INSTRUMENT_A), and CAM.
+CAMERA_FRAME = re.compile("(STARTRACKER|AST|INSTRUMENT|SENSOR|CAM|CAMERA)(_.*|[0-9]+)?")
+BODY_FRAME = re.compile(
+    "(SC_BODY|ACC|ACTUATOR|CSS|DSS|ESA|GYRO|GYRO_FRAME|IMU|IMU_FRAME|MTA|RW|SA|TAM)(_.*|[0-9]+)?|" + CAMERA_FRAME.pattern
+)
+
+OF_DATE_FRAME = re.compile("MOD|TOD|TEME|ITRF-?([0-9]{2}|[0-9]{4})?")
+OfDate = Callable[[str, str, npt.NDArray[np.int64]], tuple[FloatArray, FloatArray, str | None]]
+AMBIGUOUS = (
+    f"{EULER_RATE} of AEM 1.0 does not say whether its rates are those of the angles or an angular velocity; they are not used"
+)
+QUARTER_TURN_DEG = 90.0
+ADVICE = "sort its lines; leap seconds are not counted, so write TAI across one"
+SCALES = frozenset({"UTC", "TAI", "TT", "TDB", "TCB", "GPS", "UT1", "SCLK"})  # of AEM 1.0; other clocks are written as UTC
+COMMENTS = (
+    "STARTRACKER_1 is the camera: +z boresight, +x right and +y down in its image.",
+    "Epochs are the source's clock from 1970-01-01T00:00:00; leap seconds are not counted.",
+)
+ORDER = ("QC", "Q1", "Q2", "Q3")  # in XML; in KVN the scalar comes last
+
+
+def turned(angles_rad: FloatArray, axes: tuple[int, int, int]) -> FloatArray:
+    """The rotations (n, 4) of components from the first frame to the second, by angles (n, 3) about axes."""
+    return multiply(
+        _turn(angles_rad[:, 2], axes[2]), multiply(_turn(angles_rad[:, 1], axes[1]), _turn(angles_rad[:, 0], axes[0]))
+    )
+
+
+def euler(values: FloatArray, meta: dict[str, str]) -> tuple[FloatArray, FloatArray | None]:
+    """Rotations (n, 4) from first to second, and their rates (n, 3), rad/s in the second's components, for EULER_DERIVATIVE.
+
+    `values` (n, 3 or 6) are degrees and degrees per second.
+    """
+    axes, values = sequence(meta), np.radians(values)
+    q = turned(values[:, :3], axes)
+    if meta["ATTITUDE_TYPE"] != EULER_DERIVATIVE:
+        return q, None
+    rate = np.zeros((len(values), 3))
+    for k, axis in enumerate(axes):  # each turn's rate, then carried through the turns after it
+        rate[:, axis] += values[:, 3 + k]
+        if k < 2:
+            rate = rotated(_turn(values[:, k + 1], axes[k + 1]), rate)
+    return q, rate
+
+
+def spin(values: FloatArray, kind: str) -> tuple[FloatArray, FloatArray]:
+    """Rotations (n, 4) from first to second and rates (n, 3), rad/s in the second's components.
+
+    `values` (n, 4 or 7) are alpha, delta, the angle (degrees) and its rate (degrees per second); then, with nutation, the
+    angle of nutation, its period (s) and its phase, or the momentum's alpha and delta and the rate of nutation.
+    """
+    alpha, delta, angle, spin_rate = np.radians(values[:, :4].T)
+    q = turned(np.column_stack((np.pi / 2 + alpha, np.pi / 2 - delta, angle)), (2, 0, 2))
+    rate = np.zeros((len(values), 3))
+    rate[:, 2] = spin_rate
+    if kind == SPIN_NUTATION:
+        nutation, phase = np.radians(values[:, 4]), np.radians(values[:, 6])
+        momentum = np.stack((np.sin(nutation) * np.cos(phase), -np.sin(nutation) * np.sin(phase), np.cos(nutation)), axis=1)
+        rate += (2 * np.pi / values[:, 5])[:, None] * momentum
+    elif kind == SPIN_NUTATION_MOM:
+        momentum = direction_of(values[:, 4], values[:, 5])
+        rate += np.radians(values[:, 6])[:, None] * rotated(q, momentum)
+    elif kind != SPIN:
+        raise AssertionError(kind)
+    return q, rate
+
+
+def rotated(q: FloatArray, vectors: FloatArray) -> FloatArray:
+    """The components (n, 3) of vectors after rotations (n, 4) of unit length."""
+    pure = np.concatenate((np.zeros((len(vectors), 1)), vectors), axis=1)
+    return multiply(multiply(q, pure), conjugate(q))[:, 1:]
+
+
+def _turn(angle_rad: FloatArray, axis: int) -> FloatArray:
+    """Components in a frame that is turned by angles (n,) about an axis of the old one."""
+    vectors = np.zeros((len(angle_rad), 3))
+    vectors[:, axis] = -angle_rad
+    return from_rotation_vectors(vectors)
+
+
+@dataclass(frozen=True)
+class DatedBlock:
+    """One segment: its keywords, and its entries in the order of the file."""
+
+    block: Block
+    times: list[int]
+    entries: list[Entry]
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether every entry is an attitude, in order of time; else reading it ends in a refusal."""
+        return all(isinstance(entry.event, AttitudeSample) for entry in self.entries) and all(
+            before < after for before, after in pairwise(self.times)
+        )
+
+    @cached_property
+    def _timeline(self) -> Timeline:
+        samples = [entry.event for entry in self.entries if isinstance(entry.event, AttitudeSample)]
+        timeline = Timeline(Policy(0, NS_PER_S), capacity=len(samples), joins=log_joins(samples))
+        for sample in samples:
+            timeline.add(sample)
+        return timeline
+
+    def at(self, t_ns: int) -> Entry:
+        """Its attitude at a time within it, as a replay has it between two of its own, with the place of the one before."""
+        where, before = self.entries[bisect_right(self.times, t_ns) - 1]
+        attitude = self._timeline.at(t_ns)
+        if attitude is None or not isinstance(before, AttitudeSample):
+            raise AssertionError("a whole segment has attitudes")
+        rate = None if before.rate_cam_rad_s is None else attitude.rate_cam_rad_s
+        return Entry(where, AttitudeSample(t_ns, attitude.q_icrs_to_cam, rate))
+
+    def useable_ns(self) -> tuple[int, int]:
+        """Where it is meant to be used; without keywords, all of it. Raises AemFaultError."""
+        where, meta = self.block.where[0], self.block.meta
+        first, last = self.times[0], self.times[-1]
+        start = epoch_ns(where, meta["USEABLE_START_TIME"]) if "USEABLE_START_TIME" in meta else first
+        stop = epoch_ns(where, meta["USEABLE_STOP_TIME"]) if "USEABLE_STOP_TIME" in meta else last
+        if stop < start:
+            raise AemFaultError(where, "USEABLE_STOP_TIME is before USEABLE_START_TIME")
+        return min(max(start, first), last), max(min(stop, last), first)
+
+
+def resolved(segments: list[DatedBlock]) -> tuple[list[list[Entry]], str | None]:
+    """The entries of segments, which come in the order of their first epochs, with those that overlap made one run of pieces.
+
+    And what was done, in words; None where no segments overlap. Raises AemFaultError.
+    """
+    groups: list[list[DatedBlock]] = []
+    end_ns = 0
+    for segment in segments:
+        overlaps = bool(groups) and segment.times[0] < end_ns and segment.is_whole and all(each.is_whole for each in groups[-1])
+        if overlaps:
+            groups[-1].append(segment)
+        else:
+            groups.append([segment])
+        end_ns = max(end_ns, segment.times[-1]) if overlaps else segment.times[-1]
+    runs = [group[0].entries if len(group) == 1 else _one_run(group) for group in groups]
+    several = [group for group in groups if len(group) > 1]
+    if not several:
+        return runs, None
+    many = sum(map(len, several))
+    first_ns = several[0][1].times[0]
+    return runs, (
+        f"{many} segments overlap, first at {epoch_text(first_ns)}: where they do, the one that its USEABLE times give is"
+        " taken, and of several the one that begins later"
+    )
+
+
+def _one_run(group: list[DatedBlock]) -> list[Entry]:
+    if len(group) > MAX_OVERLAPPING:
+        where = group[0].block.where[0]
+        raise AemFaultError(where, f"{len(group)} segments overlap, and {MAX_OVERLAPPING} may; write a file for each")
+    useable = [segment.useable_ns() for segment in group]
+    edges = sorted({edge for k, segment in enumerate(group) for edge in (segment.times[0], segment.times[-1], *useable[k])})
+    pieces: list[tuple[int, int, int]] = []  # of which segment, from, to
+    for start, stop in pairwise(edges):
+        having = [k for k, segment in enumerate(group) if segment.times[0] <= start and stop <= segment.times[-1]]
+        meant = [k for k in having if useable[k][0] <= start and stop <= useable[k][1]]
+        taken = max(meant or having)  # the later one: they come in the order of their first epochs
+        if pieces and pieces[-1][0] == taken:
+            pieces[-1] = (taken, pieces[-1][1], stop)
+        else:
+            pieces.append((taken, start, stop))
+    run: list[Entry] = []
+    for number, (k, start, stop) in enumerate(pieces):
+        last = number == len(pieces) - 1
+        piece = _piece(group[k], start, stop if last else stop - 1)
+        if run and isinstance(piece[0].event, AttitudeSample):
+            piece[0] = Entry(piece[0].where, replace(piece[0].event, discontinuity=True))
+        run += piece
+    return run
+
+
+def _piece(segment: DatedBlock, start_ns: int, stop_ns: int) -> list[Entry]:
+    """The attitudes of a segment from a time to another, both among them, made where it has none just then."""
+    piece = segment.entries[bisect_left(segment.times, start_ns) : bisect_right(segment.times, stop_ns)]
+    own = {entry.event.t_ns for entry in (piece[:1] + piece[-1:]) if isinstance(entry.event, AttitudeSample)}
+    if start_ns not in own:
+        piece.insert(0, segment.at(start_ns))
+    if stop_ns not in own and stop_ns > start_ns:
+        piece.append(segment.at(stop_ns))
+    return piece
+
+
+def read_aem(text: str, of_date: OfDate) -> LogReading:
+    """The attitudes of an AEM's text, each with its place, in the order of the blocks' first epochs.
+
+    `of_date` has the frames that move: from a frame's name, a time system and times (n,), ns, the rotations (n, 4) from ICRS
+    the frame's own rate (3,) in its components, and a notice or None.
+
+    Raises AemFaultError for anything that is not an AEM of attitudes between a spacecraft's frame and one of those above.
+    """
+    blocks = xml_blocks(text) if text.lstrip().startswith("<") else kvn_blocks(text)
+    if len({block.meta["TIME_SYSTEM"] for block in blocks}) > 1:
+        raise AemFaultError("", "TIME_SYSTEM changes from block to block; write one file for each time system")
+    frames = [_frames(block.meta) for block in blocks]
+    if len({body for _, body in frames}) > 1:
+        raise AemFaultError("", "the spacecraft's frame changes from block to block; write one file for each")
+    timed = [([epoch_ns(where, epoch) for where, epoch in zip(b.where, b.epochs, strict=True)], b) for b in blocks]
+    timed.sort(key=lambda pair: pair[0][0])
+    entries: list[Entry] = []
+    told: dict[str, str] = {}
+    runs, overlap = resolved([DatedBlock(block, times, list(_entries(block, times, of_date, told))) for times, block in timed])
+    if overlap is not None:
+        told["aem-overlap"] = overlap
+    for following in runs:
+        if entries:
+            _part(entries, following)
+        entries += following
+    if any(block.meta["ATTITUDE_TYPE"] == EULER_RATE for block in blocks):
+        told["aem-rates"] = AMBIGUOUS
+    (first_ns, *_), first = timed[0]
+    return LogReading(entries, _conventions(first, first_ns, of_date), ADVICE, list(told.items()))
+
+
+def _conventions(block: Block, first_ns: int, of_date: OfDate) -> Conventions:
+    """What the numbers of a file mean, in the words of its first block; an attitude as that block has it at its first epoch."""
+    meta = block.meta
+    (reference, body), scale, to_body = _frames(meta), meta["TIME_SYSTEM"], _second_frame_is_cam(meta)
+    scalar_first = meta.get("QUATERNION_TYPE") == "FIRST"
+    names = "QC Q1 Q2 Q3" if scalar_first else "Q1 Q2 Q3 QC"
+    first, second = (reference, body) if to_body else (body, reference)
+    inertial = reference in INERTIAL_FRAMES
+
+    def written(q: FloatArray) -> str:
+        if not inertial:
+            q = multiply(q, conjugate(of_date(reference, scale, np.array([first_ns], dtype=np.int64))[0][0]))
+        own = conjugate(q) if to_body else q
+        when = "" if inertial else f" at {block.epochs[0]}"
+        return f"{names} = {components(own if scalar_first else np.roll(own, -1))}{when}"
+
+    turned = "" if inertial else f" ({reference} by hilstar: the ICRF, at each epoch)"
+    leap = "; leap seconds are not counted" if scale == "UTC" else ""
+    return Conventions(
+        "CCSDS AEM",
+        f"{meta['ATTITUDE_TYPE']} turns components of {first} into those of {second}{turned}",
+        f"quaternions scalar {'first' if scalar_first else 'last'} ({names.replace(' ', ', ')}),"
+        " the conjugate of a Hamilton quaternion (504.0-B-2 annex F)",
+        f"{scale}, from 1970-01-01T00:00:00 {scale}{leap}",
+        of_body=CAMERA_FRAME.fullmatch(body) is None,
+        written=written,
+        scale=scale,
+    )
+
+
+def _part(entries: list[Entry], following: list[Entry]) -> None:
+    """Mark the break between two blocks. 504.0-B-1 allows them a common epoch: the earlier then ends 1 ns before it."""
+    (end_where, end), (where, first) = entries[-1], following[0]
+    if isinstance(end, AttitudeSample) and isinstance(first, AttitudeSample):
+        if end.t_ns == first.t_ns:
+            entries[-1] = Entry(end_where, replace(end, t_ns=end.t_ns - 1))
+        following[0] = Entry(where, replace(first, discontinuity=True))
+
+
+def _entries(block: Block, times: list[int], of_date: OfDate, told: dict[str, str]) -> Iterator[Entry]:
+    q, rate = _attitudes(block)
+    if block.meta["ATTITUDE_TYPE"] == SPIN and not _alias(block, times):
+        rate = None
+    reference, _ = _frames(block.meta)
+    if reference not in INERTIAL_FRAMES:
+        if any(t_ns not in INT64 for t_ns in times):
+            raise AemFaultError(
+                block.where[-1], f"the times of the block do not fit 64 bits, so {reference} has no place there"
+            )
+        q_icrs_to_frame, frame_rate, notice = of_date(reference, block.meta["TIME_SYSTEM"], np.array(times, dtype=np.int64))
+        q, rate = _from_icrs(q, rate, q_icrs_to_frame, frame_rate)
+        if notice is not None:
+            told["earth-orientation"] = notice
+    rates: Sequence[list[float] | None] = [None] * len(q) if rate is None else rate.tolist()
+    for where, t_ns, numbers, turning in zip(block.where, times, q.tolist(), rates, strict=True):
+        yield Entry(where, checked_sample(t_ns, tuple(numbers), None if turning is None else tuple(turning)))
+
+
+def _from_icrs(
+    q: FloatArray, rate: FloatArray | None, q_icrs_to_frame: FloatArray, turning_rad_s: FloatArray
+) -> tuple[FloatArray, FloatArray | None]:
+    """Attitude and rate with respect to the ICRS of those with respect to a frame that moves."""
+    with np.errstate(all="ignore"):
+        unit = q / np.linalg.norm(q, axis=1, keepdims=True)
+        own = rotated(unit, np.tile(turning_rad_s, (len(q), 1)))
+    return multiply(q, q_icrs_to_frame), None if rate is None else rate + own
+
+
+def _alias(block: Block, times: list[int]) -> bool:
+    """Whether a spin turns by more than a quarter between its attitudes, so that only its rate tells by how much.
+
+    Where it does not, the attitudes are better: in the standard's own example (ST5) SPIN_ANGLE_VEL is that of a nutating body
+    with respect to its nutation, a fifth more than the spin angle turns.
+    """
+    turned_deg = np.abs(block.values[:-1, 3]) * np.diff(np.array(times, dtype=object)).astype(np.float64) / NS_PER_S
+    return bool((turned_deg > QUARTER_TURN_DEG).any())
+
+
+def _attitudes(block: Block) -> tuple[FloatArray, FloatArray | None]:
+    """`q_icrs_to_cam` (n, 4) and, where the type has it, the rate (n, 3) in cam components, rad/s."""
+    meta, kind = block.meta, block.meta["ATTITUDE_TYPE"]
+    to_cam = _second_frame_is_cam(meta)
+    with np.errstate(all="ignore"):  # an overflow is refused as not finite
+        if kind not in QUATERNIONS:
+            q, rate = spin(block.values, kind) if kind in SPINS else euler(block.values, meta)
+            if kind == EULER_ANGVEL:
+                q = q if to_cam else conjugate(q)
+                return q, _rate_in_cam(meta, q, np.ones((len(q), 1)), np.radians(block.values[:, 3:]))
+            return (q, rate) if to_cam else (conjugate(q), None if rate is None else -rotated(conjugate(q), rate))
+        q, more = block.values[:, :4], block.values[:, 4:]
+        if to_cam:
+            q = conjugate(q)
+        norm2 = (q * q).sum(axis=1, keepdims=True)
+        if kind == QUATERNION:
+            return q, None
+        if kind == DERIVATIVE:
+            q_dot = conjugate(more) if to_cam else more
+            return q, -2.0 * multiply(q_dot, conjugate(q))[:, 1:] / norm2
+        return q, _rate_in_cam(meta, q, norm2, np.radians(more))
+
+
+def _rate_in_cam(meta: dict[str, str], q: FloatArray, norm2: FloatArray, rate: FloatArray) -> FloatArray:
+    """The rate (n, 3) of cam in its components, of the second frame's with respect to the first, in either frame's."""
+    if not _second_frame_is_cam(meta):
+        rate = -rate
+    return rate if _rate_is_in_cam(meta) else rotated(q, rate) / norm2
+
+
+def _frames(meta: dict[str, str]) -> tuple[str, str]:
+    """The frame among the stars (or of a date), and the spacecraft's. Raises AemFaultError."""
+    a, b = meta["REF_FRAME_A"], meta["REF_FRAME_B"]
+    reference, body = (a, b) if _is_reference(a) else (b, a)
+    if not _is_reference(reference) or not BODY_FRAME.fullmatch(body):
+        wanted = "one must be ICRF, EME2000, MOD, TOD, TEME or ITRF"
+        body_wanted = "the other a spacecraft frame (SC_BODY_1, STARTRACKER_1, INSTRUMENT_A, CAM, ...)"
+        raise AemFaultError("", f"REF_FRAME_A = {a}, REF_FRAME_B = {b}; {wanted}, {body_wanted}")
+    return reference, body
+
+
+def _is_reference(frame: str) -> bool:
+    return frame in INERTIAL_FRAMES or OF_DATE_FRAME.fullmatch(frame) is not None
+
+
+def _second_frame_is_cam(meta: dict[str, str]) -> bool:
+    direction = meta.get("ATTITUDE_DIR", "A2B" if meta[VERSION_KEY] == "2.0" else "missing")
+    if direction not in {"A2B", "B2A"}:
+        raise AemFaultError("", f"ATTITUDE_DIR is {direction}; write A2B or B2A")
+    return _is_reference(meta["REF_FRAME_A"]) == (direction == "A2B")
+
+
+def _rate_is_in_cam(meta: dict[str, str]) -> bool:
+    key = "RATE_FRAME" if meta["ATTITUDE_TYPE"] == RATE else "ANGVEL_FRAME"
+    if "EULER_ROT_SEQ" in meta and meta["ATTITUDE_TYPE"] == RATE:
+        raise AemFaultError("", f"{RATE} with EULER_ROT_SEQ: rates of Euler angles are not read; write {DERIVATIVE}")
+    a, b, given = meta["REF_FRAME_A"], meta["REF_FRAME_B"], meta.get(key, "missing")
+    frame = {"REF_FRAME_A": a, "REF_FRAME_B": b}.get(given, given)
+    if frame not in {a, b}:
+        raise AemFaultError("", f"{key} is {given}; write {a} or {b}")
+    return not _is_reference(frame)
+
+
+class _WrittenBlock(NamedTuple):
+    """The keywords of a block, the epochs of its attitudes, and their components and derivatives (none for 4 columns)."""
+
+    meta: dict[str, str]
+    epochs: list[str]
+    values: list[list[float]]
+
+
+def aem_text(samples: Sequence[AttitudeSample], xml: bool, scale: str | None = None) -> str:
+    """An AEM 1.0 of at least one sample, as KVN or XML: a new block at each discontinuity, ICRF to STARTRACKER_1, scalar last.
+
+    A block whose samples all have a rate contains quaternion derivatives; other blocks drop their rates. Sequence numbers are
+    dropped.
+    """
+    starts = [i for i, sample in enumerate(samples) if i == 0 or sample.discontinuity]
+    blocks = [samples[i:j] for i, j in zip(starts, [*starts[1:], len(samples)], strict=True)]
+    header = {"CREATION_DATE": datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S"), "ORIGINATOR": "HILSTAR"}
+    lines = (_xml if xml else _kvn)(header, [_segment(block, scale) for block in blocks])
+    return "\n".join(lines) + "\n"
+
+
+def _segment(samples: Sequence[AttitudeSample], scale: str | None) -> _WrittenBlock:
+    rates = [sample.rate_cam_rad_s for sample in samples if sample.rate_cam_rad_s is not None]
+    q = np.array([sample.q_icrs_to_cam for sample in samples])
+    values = conjugate(q)
+    if len(rates) == len(samples):
+        q_dot = multiply(np.concatenate((np.zeros((len(q), 1)), np.array(rates)), axis=1), q) / -2.0
+        values = np.concatenate((values, conjugate(q_dot)), axis=1)
+    epochs = [epoch_text(sample.t_ns) for sample in samples]
+    meta = {
+        "OBJECT_NAME": "UNKNOWN",
+        "OBJECT_ID": "UNKNOWN",
+        "REF_FRAME_A": "ICRF",
+        "REF_FRAME_B": "STARTRACKER_1",
+        "ATTITUDE_DIR": "A2B",
+        "TIME_SYSTEM": scale if scale in SCALES else "UTC",
+        "START_TIME": epochs[0],
+        "STOP_TIME": epochs[-1],
+        "ATTITUDE_TYPE": QUATERNION if values.shape[1] == 4 else DERIVATIVE,
+        "QUATERNION_TYPE": "LAST",
+    }
+    return _WrittenBlock(meta, epochs, (values + 0.0).tolist())  # + 0.0: CCSDS has no -0
+
+
+def _kvn(header: dict[str, str], segments: list[_WrittenBlock]) -> Iterator[str]:
+    yield _assigned(VERSION_KEY, "1.0")
+    yield ""
+    yield from (_assigned(key, value) for key, value in header.items())
+    for segment in segments:
+        yield from ("", "META_START", *(f"COMMENT {line}" for line in COMMENTS))
+        yield from (_assigned(key, value) for key, value in segment.meta.items())
+        yield from ("META_STOP", "", "DATA_START")
+        for epoch, values in zip(segment.epochs, segment.values, strict=True):
+            last = [*values[1:4], values[0], *values[5:], *values[4:5]]
+            yield "  ".join([epoch, *map(repr, last)])
+        yield "DATA_STOP"
+
+
+def _assigned(key: str, value: str) -> str:
+    return f"{key:25}= {value}"
+
+
+def _xml(header: dict[str, str], segments: list[_WrittenBlock]) -> Iterator[str]:
+    """The lines; nothing in them needs an entity."""
+    yield '<?xml version="1.0" encoding="UTF-8"?>'
+    yield f'<aem id="{VERSION_KEY}" version="1.0">'
+    yield from ("  <header>", *_elements(4, header), "  </header>", "  <body>")
+    for segment in segments:
+        yield from ("    <segment>", "      <metadata>", *(f"        <COMMENT>{line}</COMMENT>" for line in COMMENTS))
+        yield from (*_elements(8, segment.meta), "      </metadata>", "      <data>")
+        name = "quaternionState" if segment.meta["ATTITUDE_TYPE"] == QUATERNION else "quaternionDerivative"
+        for epoch, values in zip(segment.epochs, segment.values, strict=True):
+            yield from ("        <attitudeState>", f"          <{name}>", f"            <EPOCH>{epoch}</EPOCH>")
+            yield from _quaternion("quaternion", "", values[:4])
+            if len(values) > 4:
+                yield from _quaternion("quaternionRate", "_DOT", values[4:])
+            yield from (f"          </{name}>", "        </attitudeState>")
+        yield from ("      </data>", "    </segment>")
+    yield from ("  </body>", "</aem>")
+
+
+def _elements(indent: int, texts: dict[str, str]) -> Iterator[str]:
+    return (f"{' ' * indent}<{key}>{text}</{key}>" for key, text in texts.items())
+
+
+def _quaternion(name: str, ending: str, values: list[float]) -> Iterator[str]:
+    yield f"            <{name}>"
+    yield from _elements(14, {key + ending: repr(value) for key, value in zip(ORDER, values, strict=True)})
+    yield f"            </{name}>"

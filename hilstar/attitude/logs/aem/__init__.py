@@ -1,1 +1,0 @@
-"""CCSDS Attitude Ephemeris Messages, read as KVN or XML and written as either."""

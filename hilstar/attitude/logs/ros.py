@@ -1,0 +1,599 @@
+"""Attitudes from a ROS bag: which topic, which frames, and what its times are.
+
+The header's stamp is the time of an attitude: ns since 1970 (UTC without leap seconds), or of a simulated clock. Messages
+without a stamp, or with a stamp that never changes from 0, have the time at which they were recorded.
+
+In every message type the quaternion (x, y, z, w) turns components of the body (child) frame into those of the frame that it
+refers to (REP 103, REP 105). The header names that frame, except for an Imu: there it names the body, and the reference of
+the orientation has no name (REP 145).
+
+`--reference MEANING` says what the axes of the bag's frame are: icrs, or enu or ned at --place. `--reference FRAME=MEANING`
+also names the frame; `--reference FRAME` names one whose name says what its axes are.
+
+tf is a tree of frames; a chain of transforms gives the attitude of one frame in another. A transform whose rotation never
+changes is static, whichever topic it comes on. Where several transforms of a chain move, the attitudes have the times of the
+one with the most samples, and the others are interpolated to those (SLERP, as in tf2), never extrapolated.
+
+Type definitions in the bag are compared with those of rosbags and never compiled: rosbags turns a definition into Python code.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from functools import lru_cache
+from itertools import chain, islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from hilstar.arrays import FloatArray
+from hilstar.attitude.logs.earth import AXES, EXACT, FIRST_DATE_NS, KINDS, Kind, Reference, stated_reference, to_icrs
+from hilstar.attitude.logs.entries import Entry, LogReading, Stated, in_order
+from hilstar.attitude.logs.ros_bags import Bag, Encoding, Topic
+from hilstar.attitude.wire.packet import AttitudeSample, Refusal, checked_sample
+from hilstar.attitude.wire.protocol import NORM_TOLERANCE
+from hilstar.attitude.wire.source import Conventions, components
+from hilstar.errors import InputError, shortened
+from hilstar.rotation import conjugate, from_rotation_vectors, multiply, normalise, to_rotation_vector
+from hilstar.units import NS_PER_S
+
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
+
+TF, OLD_TF = "tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"
+TF_TEXT = "geometry_msgs/TransformStamped[] transforms"
+ALIASES = {"Header": "std_msgs/Header"}
+MAX_DEFINITION_CHARACTERS = 100_000
+Sections = dict[str, list[tuple[str, str]]]
+Numbers = tuple[float, ...]
+IntArray = npt.NDArray[np.int64]
+MAX_EDGES = 10_000
+MAX_NAMED = 8
+FORM = "icrs, enu or ned"
+STATE = "state its axes with --reference icrs, or with --reference enu or ned and --place LAT,LON,HEIGHT"
+MAX_NAMED_TOPICS = 12
+STATIC_TF = "tf_static"
+IMU = "sensor_msgs/msg/Imu"
+OPTICAL = ("_optical_frame", "_optical")
+ORDER_ADVICE = "the bag has two attitudes of one time, or its clock was set back; choose one sender, or cut the bag there"
+
+
+@lru_cache(maxsize=2)
+def typestore(encoding: Encoding) -> Typestore:
+    """ROS's own types: of Noetic for ROS 1, of rosbags's latest ROS 2 (these have not changed since the first)."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    if encoding == "cdr":
+        return get_typestore(Stores.LATEST)
+    store = get_typestore(Stores.ROS1_NOETIC)
+    store.register(get_types_from_msg(TF_TEXT, TF))
+    return store
+
+
+def own_name(type_name: str) -> str:
+    """The type's name in rosbags's stores."""
+    return TF if type_name == OLD_TF else type_name
+
+
+def decoded(topic: Topic, data: bytes) -> Any:
+    """The message in some bytes. Raises rosbags.serde.SerdeError."""
+    store = typestore(topic.encoding)
+    read = store.deserialize_cdr if topic.encoding == "cdr" else store.deserialize_ros1
+    return read(data, own_name(topic.type))
+
+
+def check_definition(where: str, topic: Topic) -> None:
+    """Refuse (InputError) a type that only has the name of ROS's own."""
+    if not topic.definition:
+        return
+    version = 1 if topic.encoding == "ros1" else 2
+    name = own_name(topic.type)
+    text, _ = typestore(topic.encoding).generate_msgdef(name, ros_version=version)
+    ours, theirs = _sections(text, name), _sections(topic.definition[:MAX_DEFINITION_CHARACTERS], name)
+    if any(theirs.get(kind, fields) != fields for kind, fields in ours.items()):  # some writers leave out the inner types
+        raise InputError(f"{where}: its {topic.type} is not ROS's own (other fields); publish it as ROS defines it")
+
+
+def _sections(text: str, name: str) -> Sections:
+    """The fields, type and name, of a definition and of those that it has after its lines of equals signs."""
+    sections: Sections = {}
+    current = _short(name)
+    for line in text.splitlines():
+        words = line.partition("#")[0].split()
+        if not words or set(line.strip()) == {"="}:
+            continue
+        if words[0] == "MSG:" and len(words) == 2:
+            current = _short(words[1])
+        elif "=" not in line.partition("#")[0] and len(words) >= 2:
+            sections.setdefault(current, []).append((_field_type(words[0], current), words[1]))
+    return sections
+
+
+def _field_type(text: str, owner: str) -> str:
+    base, bracket, size = text.partition("[")
+    base = _short(ALIASES.get(base, base))
+    if "/" not in base and base[:1].isupper():
+        base = f"{owner.partition('/')[0]}/{base}"
+    return base + bracket + size
+
+
+def _short(name: str) -> str:
+    return name.replace("/msg/", "/")
+
+
+class Turn(NamedTuple):
+    """One orientation: `q` (w, x, y, z) turns components of the body into those of the reference.
+
+    `stamp_ns` is the header's time, None where it has none; frames are None where the message does not name them. `rate` is in
+    components of the body, rad/s, with respect to the reference, or to the stars where `gyro` says so. `fault` is why it is no
+    orientation.
+    """
+
+    stamp_ns: int | None
+    reference: str | None
+    body: str | None
+    q: Numbers
+    rate: Numbers | None = None
+    gyro: bool = False
+    fault: str | None = None
+
+
+def turns(type_name: str, message: Any) -> Iterator[Turn]:
+    """The orientations in a message of one of TYPES; several in a TFMessage."""
+    if type_name in TF_TYPES:
+        yield from map(_transform_stamped, message.transforms)
+    else:
+        yield _TURN[type_name](message)
+
+
+def frame(text: str) -> str:
+    """A frame's name without the slash that the first tf had before it."""
+    return text.lstrip("/")
+
+
+def _plain(q: Any) -> Turn:
+    return Turn(None, None, None, _q(q))
+
+
+def _stamped(message: Any, q: Any) -> Turn:
+    return Turn(_stamp_ns(message), frame(message.header.frame_id), None, _q(q))
+
+
+def _transform_stamped(message: Any) -> Turn:
+    q = _q(message.transform.rotation)
+    return Turn(_stamp_ns(message), frame(message.header.frame_id), frame(message.child_frame_id), q)
+
+
+def _imu(message: Any) -> Turn:
+    unknown = (
+        "orientation_covariance[0] is -1: the IMU gives no orientation" if message.orientation_covariance[0] == -1 else None
+    )
+    rate = None if message.angular_velocity_covariance[0] == -1 else _vector(message.angular_velocity)
+    body = frame(message.header.frame_id)
+    return Turn(_stamp_ns(message), None, body, _q(message.orientation), rate, gyro=True, fault=unknown)
+
+
+def _odometry(message: Any) -> Turn:
+    body, rate = frame(message.child_frame_id), _vector(message.twist.twist.angular)
+    return Turn(_stamp_ns(message), frame(message.header.frame_id), body, _q(message.pose.pose.orientation), rate)
+
+
+def _q(q: Any) -> Numbers:
+    return (q.w, q.x, q.y, q.z)
+
+
+def _vector(vector: Any) -> Numbers:
+    return (vector.x, vector.y, vector.z)
+
+
+def _stamp_ns(message: Any) -> int:
+    stamp = message.header.stamp
+    return int(stamp.sec) * 10**9 + int(stamp.nanosec)
+
+
+TF_TYPES = frozenset({TF, OLD_TF})
+_TURN: dict[str, Callable[[Any], Turn]] = {
+    "geometry_msgs/msg/Quaternion": _plain,
+    "geometry_msgs/msg/QuaternionStamped": lambda m: _stamped(m, m.quaternion),
+    "geometry_msgs/msg/Pose": lambda m: _plain(m.orientation),
+    "geometry_msgs/msg/PoseStamped": lambda m: _stamped(m, m.pose.orientation),
+    "geometry_msgs/msg/PoseWithCovarianceStamped": lambda m: _stamped(m, m.pose.pose.orientation),
+    "geometry_msgs/msg/Transform": lambda m: _plain(m.rotation),
+    "geometry_msgs/msg/TransformStamped": _transform_stamped,
+    "sensor_msgs/msg/Imu": _imu,
+    "nav_msgs/msg/Odometry": _odometry,
+}
+TYPES = frozenset(_TURN) | TF_TYPES
+
+
+@dataclass(slots=True)
+class Edge:
+    """Every transform from one child to one parent: times (header's and recorder's), and (w, x, y, z) from child to parent."""
+
+    parent: str
+    child: str
+    stamps_ns: array[int] = field(default_factory=lambda: array("q"))
+    received_ns: array[int] = field(default_factory=lambda: array("q"))
+    numbers: array[float] = field(default_factory=lambda: array("d"))
+    moves: bool = False
+
+    def add(self, turn: Turn, received_ns: int) -> None:
+        """One more transform."""
+        self.moves |= bool(self.numbers) and tuple(self.numbers[:4]) != turn.q
+        self.stamps_ns.append(turn.stamp_ns or 0)
+        self.received_ns.append(received_ns)
+        self.numbers.extend(turn.q)
+
+    @property
+    def q(self) -> FloatArray:
+        """(n, 4), as recorded."""
+        return np.array(self.numbers, dtype=np.float64).reshape(-1, 4)
+
+    @property
+    def times_ns(self) -> IntArray:
+        """(n,): the stamps, or where they are not set when the transforms were recorded."""
+        stamps = np.array(self.stamps_ns, dtype=np.int64)
+        return stamps if stamps.any() else np.array(self.received_ns, dtype=np.int64)
+
+    def at(self, t_ns: IntArray) -> FloatArray:
+        """The rotations (m, 4) at other times (m,); NaN before its first and after its last."""
+        q = normalise(self.q)
+        if not self.moves:
+            return np.tile(q[0], (len(t_ns), 1))
+        times, first = np.unique(self.times_ns, return_index=True)
+        q = q[first]
+        if len(times) < 2:
+            return np.where((t_ns == times[0])[:, None], q[0], np.nan)
+        after = np.clip(np.searchsorted(times, t_ns), 1, len(times) - 1)
+        share = (t_ns - times[after - 1]) / (times[after] - times[after - 1])
+        turn = to_rotation_vector(multiply(q[after], conjugate(q[after - 1])))
+        found = multiply(from_rotation_vectors(share[:, None] * turn), q[after - 1])
+        found[(t_ns < times[0]) | (t_ns > times[-1])] = np.nan
+        return found
+
+
+class Chain(NamedTuple):
+    """The transforms from a body up to the frame that its attitude refers to, and the one whose times the attitudes have."""
+
+    body: str
+    reference: str
+    edges: tuple[Edge, ...]
+    timed: Edge
+
+    def turns(self, told: list[tuple[str, str]]) -> Iterator[tuple[int, Turn]]:
+        """When each transform of the timed part was recorded, and the orientation of the whole chain then.
+
+        Other parts are unit; the timed one keeps its norm, for its check.
+        """
+        t_ns = self.timed.times_ns
+        whole = np.tile([1.0, 0.0, 0.0, 0.0], (len(t_ns), 1))
+        known = np.ones(len(t_ns), dtype=bool)
+        for edge in self.edges:
+            part = self.timed.q if edge is self.timed else edge.at(t_ns)
+            known &= np.isfinite(part).all(axis=1) | (edge is self.timed)
+            with np.errstate(all="ignore"):  # of the timed part, what is not finite is refused where it is checked
+                whole = multiply(part, whole)
+        others = [edge for edge in self.edges if edge.moves and edge is not self.timed]
+        if others:
+            told.append(("log-tf", f"{_edge_names(others)} interpolated (SLERP) to the times of {_edge_names([self.timed])}"))
+        if not known.all():
+            told.append(
+                ("log-tf", f"{int((~known).sum())} attitudes at times that not all of these transforms have are left out")
+            )
+        rows = zip(known.tolist(), self.timed.received_ns, self.timed.stamps_ns, whole.tolist(), strict=True)
+        for is_known, received_ns, stamp_ns, (w, x, y, z) in rows:
+            if is_known:
+                yield received_ns, Turn(stamp_ns, self.reference, self.body, (w, x, y, z))
+
+
+class Tree:
+    """The transforms of a bag."""
+
+    def __init__(self, path: Path, transforms: Iterable[tuple[int, Turn]]) -> None:
+        self._path = path
+        self._up: dict[str, dict[str, Edge]] = {}
+        count = 0
+        for received_ns, turn in transforms:
+            parents = self._up.setdefault(turn.body or "", {})
+            edge = parents.get(turn.reference or "")
+            if edge is None:
+                count += 1
+                if count > MAX_EDGES:
+                    raise InputError(f"{path}: tf has more than {MAX_EDGES} transforms; record those that are wanted")
+                edge = parents[turn.reference or ""] = Edge(turn.reference or "", turn.body or "")
+            edge.add(turn, received_ns)
+
+    def chain(self, body: str | None, reference: str | None) -> Chain:
+        """From `body` up to `reference`, or as far as the tree goes; the body may be left out where one frame moves.
+
+        Raises InputError where the tree has no such chain, or one of its transforms is no rotation.
+        """
+        body = self._only_body() if body is None else body
+        edges = self._edges(body, reference)
+        timed = max(edges, key=lambda edge: (edge.moves, len(edge.stamps_ns)))
+        for edge in edges:
+            with np.errstate(over="ignore"):
+                worst = float(np.abs(np.linalg.norm(edge.q, axis=1) - 1).max())
+            if edge is not timed and not worst <= NORM_TOLERANCE:
+                raise InputError(
+                    f"{self._path}: the transform {_edge_names([edge])} has a quaternion whose norm is off by {worst:.3g}"
+                )
+        return Chain(body, edges[-1].parent, edges, timed)
+
+    def _only_body(self) -> str:
+        edges = [edge for parents in self._up.values() for edge in parents.values()]
+        moving = [edge for edge in edges if edge.moves] or edges
+        if len(moving) != 1:
+            raise InputError(
+                f"{self._path}: several transforms of tf could be meant: {_edge_names(moving)}; choose with --body FRAME"
+            )
+        return moving[0].child
+
+    def _edges(self, body: str, reference: str | None) -> tuple[Edge, ...]:
+        found: list[Edge] = []
+        frame, seen = body, {body}
+        while frame in self._up and frame != reference:
+            parents = list(self._up[frame].values())
+            if len(parents) > 1:
+                raise InputError(
+                    f"{self._path}: in tf, {frame!r} has several parents: {_edge_names(parents)}; record one of them"
+                )
+            found.append(parents[0])
+            frame = parents[0].parent
+            if frame in seen:
+                raise InputError(f"{self._path}: tf goes in a circle at {frame!r}: {_edge_names(found)}")
+            seen.add(frame)
+        if not found or (reference is not None and frame != reference):
+            wanted = f"from {body!r} up to {reference!r}" if reference is not None and found else f"of {body!r}"
+            edges = _edge_names([edge for parents in self._up.values() for edge in parents.values()])
+            raise InputError(f"{self._path}: tf has no transform {wanted}; it has {edges}")
+        return tuple(found)
+
+
+def _edge_names(edges: list[Edge]) -> str:
+    names = [f"{edge.parent} -> {edge.child}" for edge in edges[:MAX_NAMED]]
+    return shortened(", ".join([*names, *(["..."] if len(edges) > MAX_NAMED else [])]), 400)
+
+
+class Named(NamedTuple):
+    """What `--reference` says: the frame of the bag, and what its axes are; None for what it does not say."""
+
+    frame: str | None = None
+    kind: Kind | None = None
+
+
+def named(reference: str | None) -> Named:
+    """What `--reference` says. Raises InputError for a meaning that is none."""
+    if reference is None:
+        return Named()
+    frame, equals, meaning = reference.rpartition("=")
+    kind = KINDS.get(meaning.lower())
+    if equals and kind is None:
+        raise InputError(
+            f"--reference {reference}: the axes of {frame} are {FORM}; write --reference {frame}=icrs, for example"
+        )
+    if kind is not None:
+        return Named(frame or None, kind)
+    return Named(reference)
+
+
+def kind_of_frame(path: Path, frame: str | None, stated: Stated, why: str, told: list[tuple[str, str]]) -> Kind:
+    """What the axes of the bag's frame are; `why` says which frame that is, where the bag does not name it.
+
+    Raises InputError where neither its name nor the user says, or they differ.
+    """
+    wanted, kind = named(stated.reference)
+    if frame is not None and wanted is not None and wanted != frame:
+        raise InputError(
+            f"{path}: its attitudes refer to the frame {frame!r}, not to {wanted!r}; write --reference {frame}=icrs"
+        )
+    own = KINDS.get((frame or "").lower())
+    if kind is None:
+        if own is None:
+            raise InputError(f"{path}: {f'its attitudes refer to the frame {frame!r}' if frame else why}; {STATE}")
+        if (frame or "").lower() not in EXACT and own == "icrs":
+            told.append(("reference", f"the frame {frame!r} is taken as the ICRS; a frame of date is 0.4 deg off by now"))
+        return own
+    if own is not None and own != kind:
+        raise InputError(
+            f"{path}: its attitudes refer to the frame {frame!r}, which is not {AXES[kind]}; leave out --reference"
+        )
+    if own is None:
+        told.append(
+            ("reference", f"{f'the frame {frame!r}' if frame else 'the reference'} is taken as {AXES[kind]}, as stated")
+        )
+    return kind
+
+
+class Heard(NamedTuple):
+    """An orientation, where it stands in the bag, and when it was recorded."""
+
+    where: str
+    receive_ns: int
+    turn: Turn
+
+
+class Start(NamedTuple):
+    """The first orientation, and whether the messages have times of their own."""
+
+    turn: Turn
+    receive_ns: int
+    stamped: bool
+
+    def t_ns(self, turn: Turn, receive_ns: int) -> int:
+        """The time of an orientation of the same topic."""
+        return (turn.stamp_ns or 0) if self.stamped else receive_ns
+
+    @property
+    def first_ns(self) -> int:
+        """The time of the first."""
+        return self.t_ns(self.turn, self.receive_ns)
+
+
+def read_ros(bag: Bag, stated: Stated) -> LogReading:
+    """The body's attitudes of one topic. Raises InputError where the bag, or what is stated, does not say which they are."""
+    topic = _chosen(bag, stated.topic)
+    check_definition(f"{bag.path}: {topic.name}", topic)
+    told: list[tuple[str, str]] = []
+    every = _of_tf(bag, topic, stated, told) if topic.type in TF_TYPES else _of_topic(bag, topic)
+    start, heard = _begin(bag, topic, every, stated.body)
+    if not start.stamped:
+        told.append(("log-stamp", f"the messages of {topic.name} have no time of their own; when they were recorded is taken"))
+    reference = _reference(bag, topic, start, stated, told)
+    entries = to_icrs(_entries(heard, start), reference, start.turn.gyro, told)
+    _say_optical(start.turn.body, stated, told)
+    return LogReading(
+        _with_notices(in_order(entries, told), bag, told), _conventions(topic, start, reference), ORDER_ADVICE, told
+    )
+
+
+def _begin(bag: Bag, topic: Topic, heard: Iterator[Heard], body: str | None) -> tuple[Start, Iterator[Heard]]:
+    """What the first orientations say, and all of those of the stated body. Raises InputError where there are none."""
+    first = next(heard, None)
+    if first is None:
+        raise InputError(f"{bag.path}: has no message of {topic.name}; record it, or choose another with --topic")
+    if first.turn.body is None and body is not None:
+        raise InputError(f"{bag.path}: the messages of {topic.name} name no body; leave out --body {body}")
+    heard = chain([first], heard)
+    if body is not None:
+        wanted = frame(body)
+        heard = (each for each in heard if each.turn.body == wanted)
+    begin = list(islice(heard, 2))
+    if not begin:
+        raise InputError(f"{bag.path}: {topic.name} has no attitude of {body}; leave out --body to be told what it has")
+    # A simulated clock may begin at 0; one that is still 0 in the second message was never set.
+    stamped = any(each.turn.stamp_ns for each in begin)
+    return Start(begin[0].turn, begin[0].receive_ns, stamped), chain(begin, heard)
+
+
+def _chosen(bag: Bag, wanted: str | None) -> Topic:
+    """The topic that is read. Raises InputError with those that there are."""
+    topics = bag.topics()
+    readable = [topic for topic in topics if topic.type in TYPES]
+    if wanted is not None:
+        for topic in topics:
+            if topic.name.lstrip("/") == wanted.lstrip("/"):
+                if topic not in readable:
+                    types = ", ".join(sorted({kind.rpartition("/")[2] for kind in TYPES}))
+                    raise InputError(f"{bag.path}: {topic.name} is of {topic.type}, which says no attitude; read are {types}")
+                return topic
+        raise InputError(f"{bag.path}: has no topic {wanted}; it has {_topic_names(topics)}")
+    dynamic = [topic for topic in readable if not topic.name.endswith(STATIC_TF)]
+    choice = dynamic or readable
+    if not choice:
+        raise InputError(f"{bag.path}: has no topic with attitudes; it has {_topic_names(topics)}")
+    if len(choice) > 1:
+        raise InputError(f"{bag.path}: has several topics with attitudes: {_topic_names(choice)}; choose one with --topic NAME")
+    return choice[0]
+
+
+def _topic_names(topics: list[Topic]) -> str:
+    names = [f"{topic.name} ({topic.type.replace('/msg/', '/')})" for topic in topics[:MAX_NAMED_TOPICS]]
+    return shortened(", ".join([*names, *(["..."] if len(topics) > MAX_NAMED_TOPICS else [])]) or "no topic of ROS", 600)
+
+
+def _of_topic(bag: Bag, topic: Topic) -> Iterator[Heard]:
+    for number, message in enumerate(bag.messages(topic), start=1):
+        where = f": message {number} of {topic.name}"
+        try:
+            found = list(turns(topic.type, decoded(topic, message.data)))
+        except Exception as error:  # rosbags's generated code raises what its bytes lead to
+            raise InputError(f"{bag.path}{where} is no {topic.type} ({shortened(error)}); record the bag again") from error
+        yield from (Heard(where, message.receive_ns, turn) for turn in found)
+
+
+def _of_tf(bag: Bag, topic: Topic, stated: Stated, told: list[tuple[str, str]]) -> Iterator[Heard]:
+    """The chain of transforms that is stated, from this topic and the static one beside it."""
+    beside = topic.name.rpartition("/")[0] + "/" + STATIC_TF
+    statics = [other for other in bag.topics() if other.type in TF_TYPES and other.name == beside and other != topic]
+    found = chain.from_iterable(_of_topic(bag, each) for each in [*statics, topic])
+    tree = Tree(bag.path, ((heard.receive_ns, heard.turn) for heard in found))
+    body = None if stated.body is None else frame(stated.body)
+    links = tree.chain(body, named(stated.reference).frame)
+    name = f"{links.timed.parent} -> {links.timed.child}"
+    for number, (receive_ns, turn) in enumerate(links.turns(told), start=1):
+        yield Heard(f": transform {number} of {name}", receive_ns, turn)
+
+
+def _reference(bag: Bag, topic: Topic, start: Start, stated: Stated, told: list[tuple[str, str]]) -> Reference:
+    why = f"the messages of {topic.name} do not say which frame their orientation refers to"
+    if topic.type == IMU:
+        why += " (ROS recommends east, north, up: REP 145)"
+    kind: Kind = kind_of_frame(bag.path, start.turn.reference, stated, why, told)
+    return stated_reference(bag.path, kind, stated, start.first_ns)
+
+
+def _entries(heard: Iterator[Heard], start: Start) -> Iterator[Entry]:
+    """Each attitude from the reference to the body, at its time, or why it is none."""
+    for where, receive_ns, turn in heard:
+        yield Entry(where, _fault(turn, start) or _sample(turn, start.t_ns(turn, receive_ns)))
+
+
+def _sample(turn: Turn, t_ns: int) -> AttitudeSample | Refusal:
+    w, x, y, z = turn.q
+    return checked_sample(t_ns, (w, -x, -y, -z), turn.rate)
+
+
+def _fault(turn: Turn, start: Start) -> Refusal | None:
+    first = start.turn
+    if turn.fault is not None:
+        return Refusal("format", turn.fault)
+    if turn.reference != first.reference:
+        return Refusal("format", f"refers to the frame {turn.reference!r}, the first to {first.reference!r}")
+    if turn.body != first.body:
+        return Refusal("format", f"is of the frame {turn.body!r}, the first of {first.body!r}; choose one with --body")
+    if turn.stamp_ns and not start.stamped:
+        return Refusal("time", "some messages have a stamp and some have none (0); set it in all of them")
+    return None
+
+
+def _with_notices(entries: Iterator[Entry], bag: Bag, told: list[tuple[str, str]]) -> Iterator[Entry]:
+    """The entries; what the bag has to say of itself is known at their end."""
+    yield from entries
+    told.extend(bag.told())
+
+
+def _say_optical(body: str | None, stated: Stated, told: list[tuple[str, str]]) -> None:
+    """An optical frame (REP 103: z forward, x right, y down) is the camera's own: a mounting would turn it twice."""
+    if body is not None and body.endswith(OPTICAL) and abs(stated.mounting.q_body_to_cam[0]) < 1:
+        told.append(("mounting", f"{body!r} has the axes of a camera by its name, and is turned by q_body_to_cam all the same"))
+
+
+def _conventions(topic: Topic, start: Start, reference: Reference) -> Conventions:
+    turn = start.turn
+    if not start.stamped:
+        time = "when each message was recorded, ns since 1970"
+    elif start.first_ns >= FIRST_DATE_NS:
+        time = "header.stamp: UTC, ns since 1970-01-01T00:00:00, leap seconds not counted"
+    else:
+        time = "header.stamp: seconds of a simulated clock"
+    rates = "; the gyroscope's rate, with respect to the stars" if turn.gyro and turn.rate is not None else ""
+    frames = f"{_quoted(turn.body, 'the body')} into those of {_quoted(turn.reference, 'the reference')}"
+    return Conventions(
+        f"ROS {topic.name} ({topic.type.replace('/msg/', '/')})",
+        f"turns components of {frames}, taken as {reference.words}{rates}",
+        "scalar last (x, y, z, w), Hamilton",
+        time,
+        of_body=True,
+        written=_written(reference, start.first_ns),
+        scale="UTC" if start.first_ns >= FIRST_DATE_NS else None,
+    )
+
+
+def _quoted(frame: str | None, unnamed: str) -> str:
+    return f"'{frame}'" if frame else unnamed
+
+
+def _written(reference: Reference, t_ns: int) -> Callable[[FloatArray], str]:
+    """An attitude (q_icrs_to_body) as the messages have it, at a time of the log."""
+
+    def words(q: FloatArray) -> str:
+        of_body = multiply(reference.q_icrs_to_reference([t_ns])[0], conjugate(q))
+        when = "" if reference.kind == "icrs" else f" at {t_ns / NS_PER_S:.9f} s"
+        return f"x y z w = {components(np.roll(of_body, -1))}{when}"
+
+    return words

@@ -1,0 +1,478 @@
+"""ROS bags of every storage format: one file, or the directory of a ROS 2 bag with its metadata.yaml.
+
+- ROS 2 in SQLite (.db3): the tables `topics` and `messages`, and `message_definitions` from Iron on.
+- ROS 2 in MCAP, its default, which other programs write with ROS's schemas too.
+- ROS 1, format 2.0 (wiki.ros.org/Bags/Format/2.0), read from the front in bounded memory. A record is a header of NAME=VALUE
+  fields and its data; chunks hold connections (a topic and its type) and messages. A closed bag repeats its connections in an
+  index at its end. A bag whose recorder was killed has no index and is cut anywhere; all its whole records are read.
+
+A bag states the unpacked sizes of its chunks, which may be false: nothing is unpacked beyond the limits below.
+"""
+
+from __future__ import annotations
+
+import bz2
+import contextlib
+import io
+import os
+import re
+import sqlite3
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO, Any, Literal, NamedTuple, Protocol
+from urllib.parse import quote
+
+import lz4.frame
+import zstandard
+from mcap.records import Channel, Schema
+from mcap.records import Message as McapMessage
+
+from hilstar.attitude.logs.mcap_log import ROS_ENCODINGS, records_of
+from hilstar.errors import InputError, shortened
+from hilstar.files import temporary_folder
+from hilstar.reading import HEAD_BYTES, MCAP_MAGIC, ROSBAG_MAGIC, SQLITE_MAGIC, open_regular, read_text, refuse_kind, size_text
+
+BAG_ADVICE = "give a bag of ROS 1 (.bag) or ROS 2 (.db3, .mcap, or the bag's directory)"
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+MAX_CHUNK_BYTES = 256_000_000  # unpacked; recorders make them of about 1 MB
+MAX_MESSAGE_BYTES = 64_000_000
+MAX_INFLATION, FREE_BYTES = 100, 32_000_000  # of a whole file; logs pack to a tenth
+PIECE_BYTES = 1 << 20
+
+Encoding = Literal["ros1", "cdr"]
+MAX_TOPICS = 10_000
+VERSION = b"#ROSBAG V2.0\n"
+MESSAGE, BAG_HEADER, CHUNK, CONNECTION = 2, 3, 5, 7
+MAX_HEADER_BYTES = 1_000_000
+_u32, _u64, _time = struct.Struct("<I"), struct.Struct("<Q"), struct.Struct("<II")
+# What the bytes of a record that is not one raise, in struct, in the fields and in the unpackers.
+FAULTS = (struct.error, KeyError, ValueError, OSError, EOFError, RuntimeError)
+Fields = dict[bytes, bytes]
+METADATA = "metadata.yaml"
+MAX_METADATA_BYTES = 2_000_000
+MAX_FILES = 10_000
+MAX_NAME_CHARACTERS = 255
+FILE_LIST = re.compile(r"^[ ]*relative_file_paths:[ ]*(?:\[([^\]\n]*)\]|\n((?:[ ]*-[ ][^\n]*(?:\n|\Z))+))", re.MULTILINE)
+FILE_NAME = re.compile(r".*\.(db3|mcap)(\.zstd)?")
+
+
+class Topic(NamedTuple):
+    """A topic of a bag: `type` as PACKAGE/msg/NAME; `definition` is the type's text in the bag, "" where it has none."""
+
+    name: str
+    type: str
+    encoding: Encoding
+    definition: str = ""
+
+
+class Message(NamedTuple):
+    """What a bag holds of one message: when it was recorded, ns of the recorder's clock, and its serialised bytes."""
+
+    receive_ns: int
+    data: bytes
+
+
+class Storage(Protocol):
+    """One file of a bag."""
+
+    def topics(self) -> list[Topic]:
+        """Its topics. Raises InputError for damage."""
+
+    def messages(self, topic: Topic) -> Iterator[Message]:
+        """The messages of a topic as recorded. Raises InputError for damage."""
+
+    def told(self) -> list[tuple[str, str]]:
+        """Notices of the file: that it was cut short."""
+
+
+def type_name(text: str) -> str:
+    """A type as PACKAGE/msg/NAME, however a bag writes it."""
+    parts = text.replace("::", "/").split("/")
+    return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else "/".join(parts)
+
+
+def unpacked(data: bytes, compression: str, size: int | None = None) -> bytes:
+    """A chunk or a message, unpacked to the `size` that the bag states. Raises ValueError, and what the unpackers raise."""
+    limit = MAX_CHUNK_BYTES if size is None else size
+    if limit > MAX_CHUNK_BYTES:
+        raise ValueError(f"a chunk of {size_text(limit)}; at most {size_text(MAX_CHUNK_BYTES)} are unpacked")
+    if compression == "bz2":
+        whole = bz2.BZ2Decompressor().decompress(data, max_length=limit + 1)
+    elif compression == "lz4":
+        whole = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=limit + 1)
+    elif compression == "zstd":
+        with zstandard.ZstdDecompressor().stream_reader(data) as stream:
+            whole = stream.read(limit + 1)
+    elif compression == "none":
+        whole = data
+    else:
+        raise ValueError(f"compression {compression[:20]!r} is not one of bz2, lz4 and zstd")
+    if len(whole) > limit or (size is not None and len(whole) != size):
+        raise ValueError(f"a chunk contains {'more' if len(whole) > limit else 'less'} than the {limit} bytes that it states")
+    return whole
+
+
+def message_bytes(data: bytes) -> bytes:
+    """A message's bytes, unpacked where the recorder packed each by itself (no CDR begins as Zstandard does)."""
+    return unpacked(data, "zstd") if data[:4] == ZSTD_MAGIC else data
+
+
+def unpack_file(path: Path, source: IO[bytes], target: IO[bytes]) -> None:
+    """A Zstandard file into another one. Raises InputError."""
+    room = FREE_BYTES + MAX_INFLATION * path.stat().st_size
+    try:
+        with zstandard.ZstdDecompressor().stream_reader(source) as stream:
+            while piece := stream.read(PIECE_BYTES):
+                room -= len(piece)
+                if room < 0:
+                    raise InputError(f"{path}: unpacks to more than {MAX_INFLATION} times its size; {BAG_ADVICE}")
+                target.write(piece)
+    except zstandard.ZstdError as error:
+        raise damaged(path, error) from error
+
+
+def damaged(path: Path, reason: object, where: str = "") -> InputError:
+    """The refusal of a bag that is not whole."""
+    words = shortened(" ".join(str(reason).split()))
+    return InputError(f"{path}: the bag is damaged{where} ({words}); record it again, or repair it with ROS's own tools")
+
+
+class Db3File:
+    """A .db3 file; see Storage."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def topics(self) -> list[Topic]:
+        """The rows of `topics`."""
+        with self._open() as database:
+            texts = {}
+            if self._tables(database, "message_definitions"):
+                rows = database.execute("SELECT topic_type, encoding, encoded_message_definition FROM message_definitions")
+                texts = {name: text for name, encoding, text in rows.fetchmany(MAX_TOPICS) if encoding == "ros2msg"}
+            found = []
+            rows = database.execute("SELECT name, type, serialization_format FROM topics ORDER BY id")
+            for name, kind, serialised in rows.fetchmany(MAX_TOPICS):
+                if serialised == "cdr":
+                    found.append(Topic(str(name), type_name(str(kind)), "cdr", str(texts.get(kind, ""))))
+            return list(dict.fromkeys(found))
+
+    def messages(self, topic: Topic) -> Iterator[Message]:
+        """The messages of a topic, in the order of recording."""
+        with self._open() as database:
+            ids = [
+                number
+                for number, name, kind in database.execute("SELECT id, name, type FROM topics").fetchmany(MAX_TOPICS)
+                if (name, type_name(str(kind))) == (topic.name, topic.type)
+            ]
+            marks = ",".join("?" * len(ids))
+            rows = database.execute(f"SELECT timestamp, data FROM messages WHERE topic_id IN ({marks}) ORDER BY id", ids)
+            for receive_ns, data in rows:
+                if not isinstance(receive_ns, int) or not isinstance(data, bytes):
+                    raise damaged(self._path, "a message without time or bytes")
+                yield Message(receive_ns, message_bytes(data))
+
+    def told(self) -> list[tuple[str, str]]:
+        """That the recorder was killed before all was in the file."""
+        log = self._path.with_name(self._path.name + "-wal")
+        if not log.is_file() or not log.stat().st_size:
+            return []
+        advice = f"merge it with: sqlite3 {self._path.name} 'PRAGMA wal_checkpoint'"
+        return [("log-cut", f"what {log.name} has is not read, since its recorder did not close the bag; {advice}")]
+
+    @contextlib.contextmanager
+    def _open(self) -> Iterator[sqlite3.Connection]:
+        try:
+            with contextlib.closing(
+                sqlite3.connect(f"file:{quote(str(self._path.absolute()))}?mode=ro&immutable=1", uri=True)
+            ) as database:
+                database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_MESSAGE_BYTES)
+                database.execute("PRAGMA trusted_schema = off")
+                if self._tables(database, "topics", "messages") != 2:
+                    raise InputError(f"{self._path}: an SQLite database, but no bag of ROS 2: it lacks topics and messages")
+                yield database
+        except (sqlite3.Error, ValueError, OverflowError, zstandard.ZstdError) as error:
+            raise damaged(self._path, error) from error
+
+    def _tables(self, database: sqlite3.Connection, *names: str) -> int:
+        """How many of the names are tables (a view would run what the file says)."""
+        marks = ",".join("?" * len(names))
+        query = f"SELECT count(*) FROM sqlite_master WHERE type = 'table' AND name IN ({marks})"
+        return int(database.execute(query, names).fetchone()[0])
+
+
+class McapBag:
+    """An .mcap file; see Storage."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def topics(self) -> list[Topic]:
+        """The channels whose messages are ROS's."""
+        return list(dict.fromkeys(topic for _, topic in self._channels()))
+
+    def messages(self, topic: Topic) -> Iterator[Message]:
+        """The messages of a topic, in the order of the file."""
+        wanted: set[int] = set()
+        schemas: dict[int, Schema] = {}
+        for record in records_of(self._path):
+            if isinstance(record, McapMessage):
+                if record.channel_id in wanted:
+                    yield Message(record.log_time, self._unpacked(record.data))
+            elif isinstance(record, Schema):
+                schemas[record.id] = record
+            elif isinstance(record, Channel) and _topic(record, schemas.get(record.schema_id)) == topic:
+                wanted.add(record.id)
+
+    def told(self) -> list[tuple[str, str]]:
+        """That the recorder was killed before the file's end was written."""
+        with self._path.open("rb") as file:
+            file.seek(-min(len(MCAP_MAGIC), self._path.stat().st_size), os.SEEK_END)
+            if file.read() == MCAP_MAGIC:
+                return []
+        return [("log-cut", f"{self._path} was not closed by its recorder; all chunks that are whole are read")]
+
+    def _channels(self) -> Iterator[tuple[int, Topic]]:
+        schemas: dict[int, Schema] = {}
+        for record in records_of(self._path):
+            if isinstance(record, Schema):
+                schemas[record.id] = record
+            elif isinstance(record, Channel) and (topic := _topic(record, schemas.get(record.schema_id))) is not None:
+                yield record.id, topic
+
+    def _unpacked(self, data: bytes) -> bytes:
+        try:
+            return message_bytes(data)
+        except (ValueError, zstandard.ZstdError) as error:
+            raise damaged(self._path, error) from error
+
+
+def _topic(channel: Channel, schema: Schema | None) -> Topic | None:
+    if schema is None or channel.message_encoding not in ROS_ENCODINGS:
+        return None
+    text = schema.data.decode(errors="replace") if schema.encoding in {"ros2msg", "ros1msg"} else ""
+    return Topic(channel.topic, type_name(schema.name), "ros1" if channel.message_encoding == "ros1" else "cdr", text)
+
+
+class CutError(Exception):
+    """The file ends within a record."""
+
+
+class BagFile:
+    """A .bag file; see Storage."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._cut_at: int | None = None
+        self._topics: dict[int, Topic] = {}
+
+    def topics(self) -> list[Topic]:
+        """The connections of the index; without one, those of all chunks."""
+        with open_regular(self._path, BAG_ADVICE) as file:
+            self._check_version(file)
+            index = self._index_at(file)
+        for start in (index, len(VERSION)):
+            if start and not self._topics:  # an index that names nothing is not where the bag says
+                for _ in self._records(start):
+                    pass
+        return list(dict.fromkeys(self._topics.values()))
+
+    def messages(self, topic: Topic) -> Iterator[Message]:
+        """The messages of a topic, in the order of the file."""
+        for connection, message in self._records(len(VERSION)):
+            if self._topics.get(connection) == topic:
+                yield message
+
+    def told(self) -> list[tuple[str, str]]:
+        """That the bag was cut short."""
+        if self._cut_at is None:
+            return []
+        return [("log-cut", f"{self._path} ends within a record at byte {self._cut_at}; all that is whole before it is read")]
+
+    def _check_version(self, file: IO[bytes]) -> None:
+        line = file.readline(len(VERSION))
+        if line != VERSION:
+            raise InputError(f"{self._path}: a ROS 1 bag of another version than 2.0; convert it with rosbag's own tools")
+
+    def _index_at(self, file: IO[bytes]) -> int:
+        """Where the index begins, 0 where the bag has none."""
+        try:
+            record = _record(file, MAX_CHUNK_BYTES)
+            if record is None:
+                return 0
+            fields = record[0]
+            if fields.get(b"encryptor"):
+                raise InputError(f"{self._path}: an encrypted bag; decrypt it with rosbag's own tools")
+            at: int = _u64.unpack(fields[b"index_pos"])[0]
+        except FAULTS as error:
+            raise damaged(self._path, error) from error
+        except CutError:
+            return 0
+        return at if at < self._path.stat().st_size else 0
+
+    def _records(self, start: int) -> Iterator[tuple[int, Message]]:
+        """Every message from byte `start`, with its connection's number; connections are kept as they come."""
+        with open_regular(self._path, BAG_ADVICE) as file:
+            room = FREE_BYTES + MAX_INFLATION * self._path.stat().st_size
+            file.seek(start)
+            try:
+                while (record := _record(file, MAX_CHUNK_BYTES)) is not None:
+                    fields, data = record
+                    if _operation(fields) == CHUNK:
+                        chunk = unpacked(data, fields[b"compression"].decode(), _u32.unpack(fields[b"size"])[0])
+                        room -= len(chunk)
+                        if room < 0:
+                            raise ValueError(f"unpacks to more than {MAX_INFLATION} times its size")
+                        yield from self._inside(io.BytesIO(chunk))
+                    elif _operation(fields) == CONNECTION:
+                        self._connect(fields, data)
+            except CutError:
+                self._cut_at = file.tell()
+            except FAULTS as error:
+                raise damaged(self._path, error, f" before byte {file.tell()}") from error
+
+    def _inside(self, chunk: IO[bytes]) -> Iterator[tuple[int, Message]]:
+        try:
+            while (record := _record(chunk, MAX_CHUNK_BYTES)) is not None:
+                fields, data = record
+                if _operation(fields) == MESSAGE:
+                    seconds, ns = _time.unpack(fields[b"time"])
+                    yield _u32.unpack(fields[b"conn"])[0], Message(seconds * 10**9 + ns, data)
+                elif _operation(fields) == CONNECTION:
+                    self._connect(fields, data)
+        except CutError as error:
+            raise ValueError("a record is longer than its chunk") from error
+
+    def _connect(self, fields: Fields, data: bytes) -> None:
+        more = _fields(data)
+        name, kind = fields[b"topic"].decode(), type_name(more[b"type"].decode())
+        self._topics[_u32.unpack(fields[b"conn"])[0]] = Topic(name, kind, "ros1", more[b"message_definition"].decode())
+
+
+def _record(file: IO[bytes], limit: int) -> tuple[Fields, bytes] | None:
+    """The next record, None at the end. Raises CutError where the file ends within it, ValueError for one over the limits."""
+    head = file.read(_u32.size)
+    if not head:
+        return None
+    fields = _fields(_part(file, head, MAX_HEADER_BYTES))
+    return fields, _part(file, file.read(_u32.size), limit)
+
+
+def _part(file: IO[bytes], length: bytes, limit: int) -> bytes:
+    if len(length) < _u32.size:
+        raise CutError
+    size: int = _u32.unpack(length)[0]
+    if size > limit:
+        raise ValueError(f"a record of {size} bytes; at most {limit} are read")
+    data = file.read(size)
+    if len(data) < size:
+        raise CutError
+    return data
+
+
+def _fields(data: bytes) -> Fields:
+    fields, place = {}, 0
+    while place < len(data):
+        size = _u32.unpack_from(data, place)[0]
+        place += _u32.size
+        name, equals, value = data[place : place + size].partition(b"=")
+        if not equals or place + size > len(data):
+            raise ValueError("a header's field is not NAME=VALUE")
+        fields[name] = value
+        place += size
+    return fields
+
+
+def _operation(fields: Fields) -> int:
+    return fields[b"op"][0] if fields.get(b"op") else 0
+
+
+class Bag:
+    """A bag that is open for reading."""
+
+    def __init__(self, path: Path, files: list[Storage], told: list[tuple[str, str]]) -> None:
+        self.path = path
+        self._files = files
+        self._told = told
+        self._topics: list[Topic] | None = None
+
+    def topics(self) -> list[Topic]:
+        """The topics of all files, each once; the files are looked through once. Raises InputError for damage."""
+        if self._topics is None:
+            self._topics = list(dict.fromkeys(topic for file in self._files for topic in file.topics()))
+        return self._topics
+
+    def messages(self, topic: Topic) -> Iterator[Message]:
+        """The messages of a topic, file by file. Raises InputError for damage."""
+        for file in self._files:
+            yield from file.messages(topic)
+
+    def told(self) -> list[tuple[str, str]]:
+        """Notices of what was read so far."""
+        return [*self._told, *(notice for file in self._files for notice in file.told())]
+
+
+def is_bag_directory(path: Path) -> bool:
+    """Whether a directory has what a bag of ROS 2 has. Raises OSError where it cannot be listed."""
+    return path.is_dir() and any(file.name == METADATA or FILE_NAME.fullmatch(file.name) for file in path.iterdir())
+
+
+@contextlib.contextmanager
+def open_bag(path: Path) -> Iterator[Bag]:
+    """A .bag, .db3 or .mcap file, or a directory of the latter two. Raises InputError."""
+    told: list[tuple[str, str]] = []
+    paths = _files_of(path, told) if is_bag_directory(path) else [path]
+    with temporary_folder("bag") as place:
+        yield Bag(path, [_storage(file, place) for file in paths], told)
+
+
+def _files_of(path: Path, told: list[tuple[str, str]]) -> list[Path]:
+    """The files that the bag's metadata names; without it, all of the directory."""
+    if (path / METADATA).is_file():
+        files = [path / Path(name).name for name in _listed_files(path / METADATA)]
+        missing = [file.name for file in files if not file.is_file()]
+        if missing:
+            raise InputError(f"{path}: lacks {shortened(', '.join(missing))}, which its {METADATA} names; copy the whole bag")
+    else:
+        files = sorted((file for file in path.iterdir() if FILE_NAME.fullmatch(file.name)), key=_number)
+        told.append(("log-cut", f"{path} has no {METADATA} (its recorder was killed?); all of its bag files are read"))
+    return files
+
+
+def _number(file: Path) -> list[Any]:
+    """NAME_2 comes before NAME_10."""
+    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", file.name)]
+
+
+def _listed_files(metadata: Path) -> list[str]:
+    """relative_file_paths, one to a line or in brackets, as ROS 2 writes them; a YAML reader's time has no bound."""
+    text = read_text(metadata, "give a bag of ROS 2", MAX_METADATA_BYTES)
+    found = FILE_LIST.search(text)
+    if found is None:
+        raise InputError(f"{metadata}: has no relative_file_paths; remove the file to read all of the directory")
+    items = found[1].split(",") if found[1] is not None else [line.strip()[1:] for line in found[2].splitlines()]
+    names = [name for item in items if (name := item.strip().strip("'\""))]
+    if not names or len(names) > MAX_FILES or max(map(len, names)) > MAX_NAME_CHARACTERS:
+        raise InputError(f"{metadata}: names no files of a bag; remove it to read all of the directory")
+    return names
+
+
+def _storage(path: Path, place: Path) -> Storage:
+    """The reader of a file, by its first bytes; what is packed is unpacked into `place` first."""
+    with open_regular(path, BAG_ADVICE) as file:
+        head = file.read(HEAD_BYTES)
+        if head.startswith(ZSTD_MAGIC):
+            whole = place / path.stem
+            file.seek(0)
+            with whole.open("wb") as target:
+                unpack_file(path, file, target)
+            return _storage(whole, place)
+    if head.startswith(ROSBAG_MAGIC):
+        return BagFile(path)
+    if head.startswith(SQLITE_MAGIC):
+        return Db3File(path)
+    if head.startswith(MCAP_MAGIC):
+        return McapBag(path)
+    refuse_kind(path, head, BAG_ADVICE)
+    raise InputError(f"{path}: not a file of a bag; {BAG_ADVICE}")

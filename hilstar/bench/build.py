@@ -50,7 +50,7 @@ def assembled(file: BenchFile, stars: Stars, context: Context | None = None, mov
     """The bench of a file whose stars are made already, as `bench_stars` makes them. Raises InputError or MachineError."""
     if context is not None:  # a window's, which ends with the window
         return _assembled(file, stars, context, moving)
-    context = create_context()
+    context = create_context(file.config.render.gpu)
     try:
         return _assembled(file, stars, context, moving)
     except BaseException:

@@ -1,14 +1,16 @@
-"""Headless OpenGL contexts through EGL, and what they can draw."""
+"""Headless OpenGL contexts through EGL, on which GPU, and what they can draw."""
 
 from __future__ import annotations
 
 import contextlib
 import ctypes
+from dataclasses import dataclass
 from typing import Any
 
 import moderngl
+from glcontext import egl
 
-from hilstar.errors import InputError, MachineError
+from hilstar.errors import InputError, MachineError, did_you_mean
 from hilstar.process.cores import drawing_threads_apart
 from hilstar.units import GL_VERSIONS
 
@@ -19,19 +21,84 @@ Context = moderngl.Context
 SOFTWARE = ("llvmpipe", "softpipe")
 # Of llvmpipe: what its shaders write of a buffer, and rounds of all loops of a shader (65 535 end them without a word).
 MAX_WRITTEN_BYTES, MAX_ROUNDS = 2**27, 60_000
+MAX_GPUS = 32
 
 
-def create_context() -> moderngl.Context:
+@dataclass(frozen=True, slots=True)
+class Gpu:
+    """A device of EGL's list: its index, and its GL_RENDERER ("" where no context can be made on it)."""
+
+    index: int
+    renderer: str
+
+    def line(self) -> str:
+        """The GPU for a person."""
+        return f"{self.index}: {self.renderer or 'opens no OpenGL 3.3'}"
+
+
+def gpus() -> list[Gpu]:
+    """EGL's devices in its order, a context made on each; none where EGL has no list of them."""
+    return [Gpu(index, _renderer_of(index)) for index in range(_device_count())]
+
+
+def _device_count() -> int:
+    """How many devices EGL lists (EGL_EXT_device_enumeration)."""
+    found = ctypes.c_int()
+    with contextlib.suppress(OSError, AttributeError):
+        find = ctypes.CDLL(EGL_LIBRARY).eglGetProcAddress
+        find.restype, find.argtypes = ctypes.c_void_p, [ctypes.c_char_p]
+        if address := find(b"eglQueryDevicesEXT"):
+            devices = (ctypes.c_void_p * MAX_GPUS)()
+            query = ctypes.CFUNCTYPE(ctypes.c_uint, ctypes.c_int, ctypes.c_void_p, ctypes.POINTER(ctypes.c_int))(address)
+            query(MAX_GPUS, devices, ctypes.byref(found))
+    return found.value
+
+
+def _renderer_of(index: int) -> str:
+    try:
+        ctx = _context_on(index)
+    except MachineError:
+        return ""
+    try:
+        return str(ctx.info["GL_RENDERER"])
+    finally:
+        ctx.release()
+
+
+def _index_of(wanted: int | str) -> int:
+    """The index of the GPU with an index or a part of a name. Raises InputError."""
+    if isinstance(wanted, int) and wanted < _device_count():
+        return wanted
+    found = gpus()
+    for gpu in found:
+        if isinstance(wanted, str) and wanted.lower() in gpu.renderer.lower():
+            return gpu.index
+    known = "; ".join(gpu.line() for gpu in found) or "none: EGL lists no devices"
+    meant = did_you_mean(wanted, (gpu.renderer for gpu in found))
+    raise InputError(f"[render] gpu = {wanted!r}: no such GPU; {meant}write the index or name of one of {known}")
+
+
+def create_context(gpu: int | str | None = None) -> moderngl.Context:
     """A headless core context of the newest OpenGL, 3.3 at least. Raises MachineError with what to install.
 
-    Every GL function comes through libEGL's own loader: a bare machine has no libGL.so.
+    `gpu` is an index of EGL's list or a part of a GL_RENDERER (InputError where there is no such one), by default EGL's
+    first. Every GL function comes through libEGL's own loader: a bare machine has no libGL.so.
     """
-    settings: Any = {"backend": "egl", "libgl": EGL_LIBRARY, "libegl": EGL_LIBRARY}
+    return _context_on(None if gpu is None else _index_of(gpu))
+
+
+def _context_on(index: int | None) -> moderngl.Context:
+    settings: Any = {"libgl": EGL_LIBRARY, "libegl": EGL_LIBRARY}
     refusal = ""
     with drawing_threads_apart():
         for major, minor in GL_VERSIONS:
+            version = 100 * major + 10 * minor
             try:
-                return moderngl.create_context(require=100 * major + 10 * minor, standalone=True, **settings)
+                if index is None:
+                    return moderngl.create_context(require=version, standalone=True, **settings | {"backend": "egl"})
+                # moderngl's own way to an index gives way to a variable of the environment.
+                on_device = egl.create_context(glversion=version, mode="standalone", device_index=index, **settings)
+                return moderngl.create_context(require=version, standalone=True, context=on_device)
             except Exception as error:  # moderngl and glcontext raise plain Exceptions here
                 refusal = str(error)
     raise MachineError(f"OpenGL 3.3 through EGL is missing ({refusal}); {INSTALL_EGL}")

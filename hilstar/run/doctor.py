@@ -17,9 +17,9 @@ from hilstar.bench.build import bench_calibration, bench_optics
 from hilstar.bench.fields_of_view import FieldsOfView, fields_of_view
 from hilstar.bench.heads_file import read_bench_or_heads
 from hilstar.errors import HilstarError, MachineError
-from hilstar.monitor.window.window import displays
+from hilstar.monitor.window.window import displays, window_renderer
 from hilstar.notices import Notices
-from hilstar.render.context import computes_in_software, create_context, has_compute
+from hilstar.render.context import computes_in_software, create_context, gpus, has_compute, leave_contexts
 from hilstar.resources import resource_path
 from hilstar.sky.catalog import load_catalog
 
@@ -45,7 +45,7 @@ class Examination:
 def examine() -> Examination:
     """Check everything that hilstar uses on this machine."""
     checks = [_check(name, look) for name, look in LOOKS.items()]
-    checks += [_displays(), _serial()]
+    checks += [_gpus(), _displays(), _serial()]
     return Examination(all(check.ok for check in checks if check.required), checks)
 
 
@@ -113,6 +113,21 @@ def _catalogue() -> str:
 def _files() -> str:
     names = [resource_path("shaders", "splat.frag"), resource_path("configs", "demo.toml")]
     return ", ".join(str(path) for path in names)
+
+
+def _gpus() -> Check:
+    """Which GPUs draw headless and in a window."""
+    found = gpus()
+    leave_contexts()
+    try:
+        window = window_renderer()
+    except MachineError:
+        window = ""
+    headless = "; ".join(gpu.line() for gpu in found) or "EGL lists none"
+    detail = f"headless {headless}; window {window or 'none'}"
+    if window and found and window != found[0].renderer:
+        detail += " (another than headless: [render] gpu chooses)"
+    return Check("gpu", any(gpu.renderer for gpu in found), detail, required=False)
 
 
 def _displays() -> Check:

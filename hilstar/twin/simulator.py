@@ -22,7 +22,7 @@ from hilstar.bench.faults.views import tracker_view
 from hilstar.bench.satellites import EXPOSURE_POSES, EXPOSURE_SPRITES, Shot, with_satellites
 from hilstar.bench.truth import truth_table
 from hilstar.errors import InputError
-from hilstar.render.context import Context
+from hilstar.render.context import Context, create_context
 from hilstar.render.renderer import Renderer, Target
 from hilstar.scene.camera import Camera
 from hilstar.scene.exposure_motion import MIDDLE_S, Motion, smeared_sprites
@@ -83,7 +83,8 @@ class Simulator:
         self.config = file.config
         self._load_sky()
         self._load_tracker()
-        self.renderer = Renderer(Target(self.config.tracker.resolution_px, self.config.tracker.psf_sigma_px), context)
+        target = Target(self.config.tracker.resolution_px, self.config.tracker.psf_sigma_px)
+        self.renderer = Renderer(target, context or create_context(self.config.render.gpu))
 
     def _load_sky(self) -> None:
         self.moving = bench_moving(self.config, self.file.folder)
@@ -110,7 +111,7 @@ class Simulator:
         target = Target(self.config.tracker.resolution_px, self.config.tracker.psf_sigma_px)
         if target != self.renderer.target:
             self.renderer.close()
-            self.renderer = Renderer(target)
+            self.renderer = Renderer(target, create_context(self.config.render.gpu))
 
     @property
     def gl_renderer(self) -> str:

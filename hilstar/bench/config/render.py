@@ -108,3 +108,11 @@ class RenderSettings(Table, frozen=True):
             "drawn as points at one moment."
         ),
     ] = 0.01
+    gpu: Annotated[
+        Annotated[int, Meta(ge=0)] | str | None,
+        Meta(
+            description="Which GPU draws headless frames: its index in EGL's list, or a part of its name. `hilstar doctor` "
+            "lists them. A window is drawn by its display's GPU.",
+            extra={"default": "the first of EGL's list"},
+        ),
+    ] = None

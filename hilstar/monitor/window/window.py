@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import logging
 import os
 import time
@@ -22,6 +23,7 @@ from hilstar.units import GL_VERSIONS, NS_PER_S
 
 TITLE = "hilstar"
 USUAL_REFRESH_HZ = 60
+GL_RENDERER = 0x1F01
 RAMP_TOLERANCE = 1 / 512  # half a code of 8 bits
 NO_DISPLAY = "no display to open a window on; set DISPLAY, or run with --headless"
 WAYLAND = (
@@ -67,6 +69,19 @@ def displays() -> list[Display]:
     """The monitors of this machine. Raises MachineError without a display."""
     with _glfw():
         return [_describe(index, monitor) for index, monitor in enumerate(glfw.get_monitors())]
+
+
+def window_renderer() -> str:
+    """The GL_RENDERER that draws a window here; "" where none opens. Raises MachineError without a display."""
+    with _glfw():
+        glfw.window_hint(glfw.VISIBLE, False)
+        window = _newest_window(64, 64, None)
+        if not window:
+            return ""
+        glfw.make_context_current(window)
+        address: Any = glfw.get_proc_address
+        get_string = ctypes.CFUNCTYPE(ctypes.c_char_p, ctypes.c_uint)(address("glGetString"))
+        return str((get_string(GL_RENDERER) or b"").decode(errors="replace"))
 
 
 @contextlib.contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -14,6 +15,8 @@ from hilstar.render.presenter import window_context
 from hilstar.run.screen.gate import pass_gate
 from hilstar.run.screen.screen import Screen
 
+log = logging.getLogger(__name__)
+
 
 @contextmanager
 def open_screen(file: BenchFile, *, windowed: bool, force: bool) -> Iterator[Screen]:
@@ -24,6 +27,9 @@ def open_screen(file: BenchFile, *, windowed: bool, force: bool) -> Iterator[Scr
     sleep_in_waits()
     settings = WindowSettings(size_px, monitor.bits, display, monitor.refresh_hz)
     with Window(settings) as window, open_bench(file, window_context()) as bench:
+        wanted, draws = file.config.render.gpu, bench.renderer.gl_renderer
+        if isinstance(wanted, str) and wanted.lower() not in draws.lower():
+            log.warning("[render] gpu = %r is for headless frames; %s draws this window", wanted, draws)
         screen = Screen(window, bench)
         bench.warm_up()
         pass_gate(screen, force)

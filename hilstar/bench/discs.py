@@ -13,9 +13,8 @@ import numpy as np
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.rotation import propagate, to_matrix
 from hilstar.scene.camera import Camera
-from hilstar.scene.discs import Pose, View, disc_lights
 from hilstar.scene.exposure_motion import MIDDLE_S, Motion
-from hilstar.scene.extended import DiscLight, ExtendedLight, LightMap, Shear
+from hilstar.scene.extended import DiscLight, DiscView, ExtendedLight, LightMap, Pose, Shear, disc_lights
 from hilstar.scene.frame_motion import NODES_PER_SIGMA, POINT_SIGMA, Scan, Turn, slowed
 from hilstar.scene.sprites import Sprites
 from hilstar.sky.bodies.disc import AIR_TOP, Disc, gauss_legendre
@@ -109,13 +108,13 @@ class DiscPainter:
         place, weight = gauss_legendre(count)
         maps = motion.icrs_to_image(place / 2 * motion.exposure_s, camera)
         poses = tuple(Pose(one, float(share / 2)) for one, share in zip(maps, weight, strict=True))
-        return self.painted(sprites, stars, discs, View(camera, self.sigma_px, poses), when)
+        return self.painted(sprites, stars, discs, DiscView(camera, self.sigma_px, poses), when)
 
-    def still(self, icrs_to_image: FloatArray) -> View:
+    def still(self, icrs_to_image: FloatArray) -> DiscView:
         """The view of a camera at rest."""
-        return View(self.camera, self.sigma_px, (Pose(icrs_to_image),))
+        return DiscView(self.camera, self.sigma_px, (Pose(icrs_to_image),))
 
-    def turning(self, turn: Turn, scan: Scan, max_poses: int) -> View:
+    def turning(self, turn: Turn, scan: Scan, max_poses: int) -> DiscView:
         """The view of a camera that turns while a screen's rows light up in turn, each held for a time."""
         camera = self.camera
         turn, _ = slowed(turn, scan, camera)
@@ -130,9 +129,9 @@ class DiscPainter:
         late_s = tuple(down * scan.scanout_s / size for down, size in zip(scan.down, camera.resolution_px, strict=True))
         middle = tuple((size - 1) / 2 for size in camera.resolution_px)
         shear = Shear(camera.cam_to_image @ turn.rate_cam_rad_s, (late_s[0], late_s[1]), (middle[0], middle[1]))
-        return View(camera, self.sigma_px, poses, shear if scan.scanout_s else None)
+        return DiscView(camera, self.sigma_px, poses, shear if scan.scanout_s else None)
 
-    def painted(self, sprites: Sprites, stars: Stars, discs: list[Disc], view: View, when: When) -> Sprites:
+    def painted(self, sprites: Sprites, stars: Stars, discs: list[Disc], view: DiscView, when: When) -> Sprites:
         """Sprites of `stars` without what `discs` hide, and with the discs' light."""
         lights = self._lights(discs, view)
         return replace(
@@ -142,7 +141,7 @@ class DiscPainter:
             over_white=tuple(disc.name for disc, its in zip(reversed(discs), lights, strict=True) if self._clips(its)),
         )
 
-    def _lights(self, discs: list[Disc], view: View) -> list[list[ExtendedLight]]:
+    def _lights(self, discs: list[Disc], view: DiscView) -> list[list[ExtendedLight]]:
         """The light of each of some discs, nearest first, in the order in which they are drawn."""
         ordered = reversed([*enumerate(discs, 1)])
         return [disc_lights(disc, view, covers=k < len(discs)) for k, disc in ordered]

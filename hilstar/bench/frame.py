@@ -27,10 +27,8 @@ from hilstar.monitor.response import Codes, code_dtype
 from hilstar.render.renderer import Renderer
 from hilstar.rotation import normalise, to_matrix
 from hilstar.scene.camera import Camera
-from hilstar.scene.candidates import Candidates
-from hilstar.scene.clipping import clipped_sprites
 from hilstar.scene.frame_motion import Scan, Turn, slowed, swept_sprites
-from hilstar.scene.sprites import Sprites, make_sprites
+from hilstar.scene.sprites import Candidates, Sprites, clipped_sprites, make_sprites
 from hilstar.scene.trails import Brush
 from hilstar.sky.stars import Stars, split_by_rate
 from hilstar.units import magnitude

@@ -17,8 +17,7 @@ from hilstar.rotation import to_matrix
 from hilstar.scene.camera import Camera
 from hilstar.scene.frame_motion import Scan, Turn
 from hilstar.scene.sprites import Sprites
-from hilstar.scene.trail_discs import disc_of, disc_trail, hidden, places_of, wide
-from hilstar.scene.trails import EVERY, Brush, Lit, View, trails, with_trails
+from hilstar.scene.trails import EVERY, Brush, Lit, TrailView, disc_of, disc_trail, hidden, places_of, trails, wide, with_trails
 from hilstar.sky.electrons import Optics, Photometry
 from hilstar.sky.stars import Stars
 
@@ -109,7 +108,7 @@ def with_satellites(
     seen = sky.passing(cone, shot.t_ns, shot.velocity_km_s, shot.place_km)
     if seen is None:
         return sprites
-    view = View(camera, icrs_to_image, camera.cam_to_image @ turn.rate_cam_rad_s, stars.velocity_km_s)
+    view = TrailView(camera, icrs_to_image, camera.cam_to_image @ turn.rate_cam_rad_s, stars.velocity_km_s)
     close = view.in_reach(seen, shot.longest_s, brush.footprint_px / 2 + 1)
     if not len(close):
         return sprites
@@ -126,7 +125,9 @@ def with_satellites(
     return with_trails(sprites, found, len(stars) - len(stars.bodies))
 
 
-def _with_discs(sprites: Sprites, stars: Stars, seen: Pass, how: tuple[View, Shot, Brush], satellites: Satellites) -> Sprites:
+def _with_discs(
+    sprites: Sprites, stars: Stars, seen: Pass, how: tuple[TrailView, Shot, Brush], satellites: Satellites
+) -> Sprites:
     """The sprites of an image with satellites of a pass as discs, the farthest first, and without what they hide."""
     view, shot, brush = how
     lit, drawn = _lit(seen, view, shot), []
@@ -162,7 +163,7 @@ def satellite_discs(sky: MovingSky, stars: Stars, camera: Camera, q_icrs_to_cam:
     return [disc_of(seen.only(np.array([k])), names[seen.index[k]], 0.0, stars.velocity_km_s) for k in broad.tolist()]
 
 
-def _lit(seen: Pass, view: View, shot: Shot) -> Lit:
+def _lit(seen: Pass, view: TrailView, shot: Shot) -> Lit:
     """When each satellite's row is lit."""
     late_s = np.zeros(len(seen))
     for _ in range(ROW_ROUNDS if shot.scan.scanout_s else 0):

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from hilstar.bench.frame import Bench
-from hilstar.scene.clipping import CLIP_TOLERANCE
 from hilstar.scene.psf import peak_share
+from hilstar.scene.sprites import CLIP_TOLERANCE
 
 NAMED_STARS = 5
 

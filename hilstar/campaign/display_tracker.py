@@ -21,8 +21,7 @@ from hilstar.scene.sprites import make_sprites
 from hilstar.tracker.detector import Detector
 from hilstar.twin.optics import TwinOptics
 from hilstar.twin.simulator import Exposure, background_e, exposure_truth, with_discs, with_streaks
-from hilstar.twin.verify.light import true_panel
-from hilstar.twin.verify.twin import true_geometry
+from hilstar.twin.verify.twin import true_geometry, true_panel
 from hilstar.units import NS_PER_S
 
 

@@ -31,7 +31,7 @@ from hilstar.reading import CHUNK_BYTES, open_regular
 from hilstar.resources import resource_path
 from hilstar.scene.camera import Camera
 from hilstar.scene.exposure_motion import Motion
-from hilstar.twin.exposure_files import write_exposure_fits
+from hilstar.twin.pictures import write_exposure_fits
 from hilstar.twin.simulator import Exposure, FrameNoise, Simulator
 
 IMAGES = "images"

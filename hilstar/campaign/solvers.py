@@ -37,7 +37,7 @@ from hilstar.process.child import MAX_OUTPUT_BYTES, Child
 from hilstar.rotation import from_matrix, multiply, normalise
 from hilstar.scene.camera import Camera
 from hilstar.tracker.centroids import Centroids, CentroidSettings, find_stars
-from hilstar.twin.exposure_files import write_dn_picture
+from hilstar.twin.pictures import write_dn_picture
 from hilstar.twin.simulator import Exposure
 from hilstar.twin.verify.star_finder import crowded, nearest
 

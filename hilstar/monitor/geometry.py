@@ -17,8 +17,7 @@ from hilstar.errors import InputError, shortened
 from hilstar.files import write_whole
 from hilstar.reading import parse_toml, read_text
 from hilstar.rotation import normalise, to_matrix
-from hilstar.scene.camera import Camera
-from hilstar.scene.lens import Lens, ResidualField
+from hilstar.scene.camera import Camera, Lens, ResidualField
 
 MAX_FILE_BYTES = 1_000_000
 MAX_TERMS = 21

@@ -11,9 +11,8 @@ import numpy as np
 from hilstar.arrays import Float32Array
 from hilstar.render.encoder import build_program
 from hilstar.render.tiles import Tiles, disc_tiles
-from hilstar.scene.camera import Camera
+from hilstar.scene.camera import Camera, ray_shifts
 from hilstar.scene.extended import DiscLight, ExtendedLight, Glow, LightMap, Rectangle
-from hilstar.scene.rays import ray_shifts
 from hilstar.sky.bodies.disc import AIR_TOP, SOLAR_LIMB, Disc, gauss_legendre
 
 KEPT_TEXTURES = 6  # of lasting maps and lenses: a bench has one lens, and few maps at a time

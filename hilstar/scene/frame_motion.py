@@ -15,8 +15,7 @@ import numpy as np
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.rotation import propagate, to_matrix
 from hilstar.scene.camera import Camera
-from hilstar.scene.paths import Chords, Paths, node_counts, nodes_of, within_budget
-from hilstar.scene.short_paths import ShortPaths, bend_px, points_within
+from hilstar.scene.paths import Chords, Paths, ShortPaths, bend_px, node_counts, nodes_of, points_within, within_budget
 from hilstar.scene.sprites import Sprites, brightest, max_stars, pack_sprites
 from hilstar.sky.stars import Stars
 

@@ -1,7 +1,12 @@
-"""From stars and an attitude to sprites: the only thing that crosses from mathematics to the GPU."""
+"""From stars and an attitude to sprites: the only thing that crosses from mathematics to the GPU.
+
+Candidates, the stars about a field, are kept from frame to frame, because most frames turn the field by a fraction of a degree.
+`clipped_sprites` finds the stars that need more light than one monitor pixel has.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -9,12 +14,16 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.arrays import FloatArray, IntArray
+from hilstar.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from hilstar.scene.camera import Camera
-from hilstar.scene.candidates import Candidates, stars_about
 from hilstar.scene.extended import ExtendedLight
+from hilstar.scene.psf import peak_share, pixel_shares
 from hilstar.sky.stars import Stars
 
+# How far the field may turn before its stars are looked for again. A frame's work grows with it by the stars around the image.
+KEPT_TURN_RAD = math.radians(1.0)
+# The square of the chord between two attitudes is right to 1e-15, so an angle this near to the limit is over it.
+ROUNDING_RAD = 1e-6
 # A whole pixel and a float32 fraction: float32 alone would be off by 1e-4 px at 2000 px and 1e-3 px further out.
 # results/tradeoff.csv, projection: 4e-8 px, where float32 throughout is 6e-4 px off.
 SPRITE_DTYPE = np.dtype([("pixel", "<i4", 2), ("fraction_px", "<f4", 2), ("electrons_per_s", "<f4")])
@@ -22,6 +31,68 @@ SPRITE_DTYPE = np.dtype([("pixel", "<i4", 2), ("fraction_px", "<f4", 2), ("elect
 # The work and memory of a frame are bounded by the pixels that its sprites cover: 250 000 stars of sigma 0.85 px. Of more
 # stars only the brightest are drawn.
 MAX_COVERED_PX = 25_000_000
+# A star over white by no more than this is not called clipped: flux and white pass through float32.
+CLIP_TOLERANCE = 1e-6
+# Of the sprites that may clip with the light of others, only this many are tested, the brightest: the work is bounded.
+MAX_DOUBTFUL = 512
+FEW_PAIRS = 4096  # of pixels and sprites near them: so many are asked all together, sooner than they are sorted
+
+
+@dataclass(frozen=True, slots=True)
+class _Kept:
+    """Stars found about a field at an attitude: their places in `stars`, directions (3, n) and electron rates."""
+
+    stars: Stars
+    camera: Camera
+    margin_px: float
+    icrs_to_image: FloatArray
+    near: IntArray
+    directions: FloatArray
+    electrons_per_s: FloatArray
+
+    def holds(self, stars: Stars, icrs_to_image: FloatArray, camera: Camera, margin_px: float) -> bool:
+        """Whether every star near that field is among these."""
+        kept = self.stars
+        same = stars.vectors is kept.vectors and stars.electrons_per_s is kept.electrons_per_s and stars.grid is kept.grid
+        if not same or camera is not self.camera or margin_px != self.margin_px:
+            return False
+        difference = (icrs_to_image - self.icrs_to_image).ravel()
+        # |R - S| by its elements is sqrt(8) sin(angle / 2), whatever the axis of the turn from R to S: roll counts as well.
+        chord = math.sqrt(float(difference @ difference) / 8)
+        return 2 * math.asin(min(1.0, chord)) <= KEPT_TURN_RAD - ROUNDING_RAD
+
+
+class Candidates:
+    """The stars near a camera's field, looked for again once it has turned by KEPT_TURN_RAD from where they were.
+
+    No direction of the field moves farther than the field turns, so none that comes into view is missed. Stars among which
+    bodies are moved, or whose observer moves, are looked for in every frame.
+    """
+
+    def __init__(self) -> None:
+        self._kept: _Kept | None = None
+
+    def near(
+        self, stars: Stars, icrs_to_image: FloatArray, camera: Camera, margin_px: float
+    ) -> tuple[IntArray, FloatArray, FloatArray]:
+        """The stars within `margin_px` of the image, and some more: places in `stars`, rising, and what `stars` has for them.
+
+        That is directions (3, n), ICRS, and electrons per second (n,). None of it is the caller's to change.
+        """
+        kept, keeps = self._kept, not stars.bodies and stars.velocity_km_s is None
+        if keeps and kept is not None and kept.holds(stars, icrs_to_image, camera, margin_px):
+            return kept.near, kept.directions, kept.electrons_per_s
+        near = stars_about(stars, icrs_to_image, camera, margin_px, KEPT_TURN_RAD if keeps else 0.0)
+        directions, electrons_per_s = stars.directions(near).T, stars.electrons_per_s.take(near)
+        if keeps:
+            self._kept = _Kept(stars, camera, margin_px, icrs_to_image.copy(), near, directions, electrons_per_s)
+        return near, directions, electrons_per_s
+
+
+def stars_about(stars: Stars, icrs_to_image: FloatArray, camera: Camera, margin_px: float, reach_rad: float = 0.0) -> IntArray:
+    """Every star that can come within `margin_px` of the image by a turn of `reach_rad`, and some more; rising."""
+    radius_rad, edges = camera.field(margin_px)
+    return stars.near(icrs_to_image[2], radius_rad, edges @ icrs_to_image, reach_rad)
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,3 +225,89 @@ def join_sprites(parts: Sequence[Sprites], footprint_px: int) -> Sprites:
         np.concatenate([part.x_px for part in parts]),
         np.concatenate([part.y_px for part in parts]),
     )
+
+
+def clipped_sprites(
+    sprites: Sprites,
+    sigma_px: tuple[float, float],
+    flux_at_white_e_per_s: float,
+    resolution_px: tuple[int, int],
+    uniformity: Float32Array | None = None,
+    darkest: float = 1.0,
+) -> IntArray:
+    """Positions of the sprites whose brightest pixel lies on the image and, neighbours' light included, is over white.
+
+    White is `flux_at_white_e_per_s` times a pixel's `uniformity` (height, width), whose minimum is `darkest`.
+
+    Only stars that alone reach half of white in a pixel are tested: two fainter ones on one pixel are not reported.
+    """
+    bright_e_per_s = 0.5 * flux_at_white_e_per_s * darkest / peak_share(sigma_px)
+    if sprites.per_star * sprites.data["electrons_per_s"].max(initial=0.0) <= bright_e_per_s:
+        return np.empty(0, dtype=np.intp)  # most frames: no star is that bright, however its light is divided
+    bright = (_star_rates(sprites) > bright_e_per_s).nonzero()[0]
+    x, y = np.rint(sprites.x_px[bright]).astype(int), np.rint(sprites.y_px[bright]).astype(int)
+    inside = (x >= 0) & (x < resolution_px[0]) & (y >= 0) & (y < resolution_px[1])
+    bright, x, y = bright[inside], x[inside], y[inside]
+    limit = np.full(len(bright), flux_at_white_e_per_s * (1 + CLIP_TOLERANCE))
+    if uniformity is not None:
+        limit *= uniformity[y, x]
+    own = sprites.data["electrons_per_s"][bright] * _share(x - sprites.x_px[bright], y - sprites.y_px[bright], sigma_px)
+    over = own > limit
+    doubtful = (~over).nonzero()[0]
+    if len(doubtful) > MAX_DOUBTFUL:
+        doubtful = doubtful[np.argpartition(-own[doubtful], MAX_DOUBTFUL)[:MAX_DOUBTFUL]]
+    if len(doubtful):
+        over[doubtful] = _light_at(sprites, x[doubtful], y[doubtful], sigma_px) > limit[doubtful]
+    return np.asarray(bright[over], dtype=np.intp)
+
+
+def _star_rates(sprites: Sprites) -> Float32Array | FloatArray:
+    """The rate of each sprite's whole star, electrons per second (n,)."""
+    rates: Float32Array = sprites.data["electrons_per_s"]
+    if sprites.per_star == 1:
+        return rates
+    _, star = np.unique(sprites.star, return_inverse=True)
+    return np.asarray(np.bincount(star, rates)[star], dtype=np.float64)
+
+
+def _share(offset_x: FloatArray, offset_y: FloatArray, sigma_px: tuple[float, float]) -> FloatArray:
+    if sigma_px[0] == sigma_px[1]:
+        both = pixel_shares(np.stack([offset_x, offset_y]), sigma_px[0])
+        return np.asarray(both[0] * both[1])
+    return pixel_shares(offset_x, sigma_px[0]) * pixel_shares(offset_y, sigma_px[1])
+
+
+def _light_at(sprites: Sprites, x: IntArray, y: IntArray, sigma_px: tuple[float, float]) -> FloatArray:
+    """Light of all sprites together in the pixels at x, y (k,), electrons per second (k,)."""
+    close = _close_to(sprites, x, y)
+    reach = sprites.footprint_px / 2
+    if len(x) * len(close) <= FEW_PAIRS:
+        offset_x, offset_y = (places[close] - wanted[:, None] for places, wanted in ((sprites.x_px, x), (sprites.y_px, y)))
+        share = _share(offset_x, offset_y, sigma_px)
+        share[np.maximum(np.abs(offset_x), np.abs(offset_y)) > reach] = 0.0
+        return np.asarray(share @ sprites.data["electrons_per_s"][close].astype(np.float64))
+    order = close[np.argsort(sprites.x_px[close])]
+    rising_px = sprites.x_px[order]
+    first = np.searchsorted(rising_px, x - reach)
+    count = np.searchsorted(rising_px, x + reach, side="right") - first
+    pixel = np.repeat(np.arange(len(x)), count)
+    other = order[np.arange(len(pixel)) + np.repeat(first - (np.cumsum(count) - count), count)]
+    offset_y = sprites.y_px[other] - y[pixel]
+    near = np.abs(offset_y) <= reach
+    pixel, other, offset_y = pixel[near], other[near], offset_y[near]
+    share = _share(sprites.x_px[other] - x[pixel], offset_y, sigma_px)
+    return np.asarray(np.bincount(pixel, sprites.data["electrons_per_s"][other] * share, minlength=len(x)), dtype=np.float64)
+
+
+def _close_to(sprites: Sprites, x: IntArray, y: IntArray) -> IntArray:
+    """Positions of the sprites whose footprints can reach one of the columns `x` and rows `y` (k,), and some more."""
+    pixel = sprites.data["pixel"]
+    return np.flatnonzero(_reach(pixel[:, 0], x, sprites.footprint_px) & _reach(pixel[:, 1], y, sprites.footprint_px))
+
+
+def _reach(pixel: IntArray, wanted: IntArray, size_px: int) -> BoolArray:
+    """Which pixels (n,) of an axis are within a footprint of one of the `wanted` (k,)."""
+    near = np.zeros(int(wanted.max(initial=0)) + 2 * size_px + 2, dtype=np.bool_)
+    for place in set(wanted.tolist()):
+        near[place : place + 2 * size_px + 1] = True
+    return near.take(pixel + size_px, mode="clip")

@@ -2,19 +2,25 @@
 
 The light of such a path is not even: a satellite flashes, and goes into the Earth's shadow or behind the Earth. So a path is
 cut into equal times, each with a sprite in its middle that has the mean light of that time: the sum is exact for any flash.
+
+Satellites wide enough to have a face: diffuse spheres along their paths, which hide the stars behind them.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hilstar.arrays import FloatArray, IntArray
+from hilstar.arrays import BoolArray, FloatArray, IntArray
+from hilstar.rotation import propagate, to_matrix
 from hilstar.scene.camera import Camera
+from hilstar.scene.extended import DiscLight, DiscView, ExtendedLight, LightMap, Pose, disc_lights
 from hilstar.scene.paths import Chords, Paths
 from hilstar.scene.sprites import Sprites, join_sprites, pack_sprites
+from hilstar.sky.bodies.disc import Disc
 
 if TYPE_CHECKING:
     from hilstar.sky.bodies.passes import Pass
@@ -27,10 +33,14 @@ SAMPLES = 9  # of a path, from which its length and its part on the image are fo
 REACH = 2.0  # times the speed at a moment, as a bound for some seconds about it
 BULGE = 2.0  # how much farther than its samples a path may be from the line between its ends
 EVERY = slice(None)
+STEPS_A_RADIUS = 4.0  # of a disc's places along its path: an edge of it is then uneven by 1 % of the radius
+AT_REST = np.array([1.0, 0.0, 0.0, 0.0])
+NORTH = np.array([0.0, 0.0, 1.0])
+M_PER_KM = 1000.0
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class TrailView:
     """A camera that turns: `icrs_to_image` (3, 3) and the rate (3,) in image axes, rad/s, both at the moment of a pass.
 
     `velocity_km_s` (3,) is the observer's against that for which directions are aberrated (see `Stars`), None for the same.
@@ -91,7 +101,7 @@ class Trails:
     middle: FloatArray  # unit vectors (k, 3), ICRS, in the middle of each one's time, as `Pass.directions`
 
 
-def trails(seen: Pass, view: View, lit: Lit, brush: Brush, faintest_e_per_s: float = 0.0) -> Trails:
+def trails(seen: Pass, view: TrailView, lit: Lit, brush: Brush, faintest_e_per_s: float = 0.0) -> Trails:
     """The satellites of a pass along their paths; one whose mean rate is fainter than `faintest_e_per_s` is left out."""
     wanted, (begin, end) = sprite_counts(seen, view, lit, brush)
     counts = _within(wanted, brush.most)
@@ -119,7 +129,7 @@ def _within(wanted: IntArray, most: int) -> IntArray:
     return wanted if total <= most else np.minimum(wanted, np.maximum(1, (wanted * (most / total)).astype(np.intp)))
 
 
-def sprite_counts(seen: Pass, view: View, lit: Lit, brush: Brush) -> tuple[IntArray, tuple[FloatArray, FloatArray]]:
+def sprite_counts(seen: Pass, view: TrailView, lit: Lit, brush: Brush) -> tuple[IntArray, tuple[FloatArray, FloatArray]]:
     """How many sprites each path should have (0: it misses the image), and its part on the image."""
     at = np.linspace(0.0, 1.0, SAMPLES)[:, None]
     which = np.tile(np.arange(len(seen)), SAMPLES)
@@ -151,3 +161,102 @@ def with_trails(sprites: Sprites, found: Trails, first: int) -> Sprites:
         per_star=max(sprites.per_star, own.per_star),
         capped=sprites.capped + own.capped,
     )
+
+
+@dataclass(frozen=True, slots=True)
+class DiscTrail:
+    """One satellite in an image: its place in the list, its mean rate, its discs, one after the other, and the share of each.
+
+    `lights` draw them in this order, `brightest_e_per_s` is about their brightest pixel.
+    """
+
+    index: int
+    electrons_per_s: float
+    middle: FloatArray
+    along: tuple[Disc, ...]
+    shares: FloatArray
+    lights: tuple[ExtendedLight, ...]
+    brightest_e_per_s: float
+
+
+def wide(seen: Pass, px_per_rad: float, wider_px: float) -> BoolArray:
+    """Which satellites (n,) of a pass are wider than so many pixels."""
+    size_km = seen.brightness.size_m[seen.index] / M_PER_KM
+    return np.asarray(size_km * px_per_rad > wider_px * np.linalg.norm(seen.seen_km[0], axis=1))
+
+
+def disc_of(seen: Pass, name: str, second: float, velocity_km_s: FloatArray | None) -> Disc:
+    """The disc of the only satellite of a pass at a time after its moment, without light."""
+    at = np.array([second])
+    radius_km = float(seen.brightness.size_m[seen.index[0]]) / M_PER_KM / 2
+    return Disc(
+        name=name,
+        direction=seen.directions(slice(None), at, velocity_km_s)[0],
+        distance_km=max(float(np.linalg.norm(seen.vectors_km(at)[0])), 1.001 * radius_km),
+        equator_km=radius_km,
+        polar_km=radius_km,
+        pole=NORTH,
+        sun=seen.now.sun_km / np.linalg.norm(seen.now.sun_km),
+        law="lambert",
+        normal_e_per_s_sr=0.0,
+    )
+
+
+def disc_trail(seen: Pass, name: str, view: TrailView, lit: Lit, brush: Brush) -> DiscTrail | None:
+    """The only satellite of a pass along its path; None where it misses the image or has no light."""
+    counts, (begin, end) = sprite_counts(seen, view, lit, brush)
+    radius_sigma = disc_of(seen, name, 0.0, None).radius_rad * view.camera.focal_length_px / min(brush.sigma_px)
+    coarser = max(1.0, radius_sigma / (STEPS_A_RADIUS * SPACING_SIGMA))
+    count = min(math.ceil(int(counts[0]) / coarser), brush.poses)
+    if not count:
+        return None
+    edges_s = lit.begin_s[0] + np.linspace(begin[0], end[0], count + 1) * lit.length_s
+    middles_s, share = (edges_s[1:] + edges_s[:-1]) / 2, float(end[0] - begin[0]) / count
+    rates = seen.rates_e_per_s(np.zeros(count, dtype=np.intp), edges_s[:-1], edges_s[1:])
+    if not rates.any():
+        return None
+    bare = [disc_of(seen, name, second, view.velocity_km_s) for second in middles_s.tolist()]
+    lights: list[ExtendedLight] = []
+    if count > 1:
+        # Together they hide what the one in the middle hides: each after the other would hide the light of those before.
+        lights += _lights(bare[count // 2], view, middles_s[count // 2], brush, 0.0, covers=True)
+    along = tuple(disc.of_rate(float(rate)) for disc, rate in zip(bare, rates, strict=True))
+    for disc, second in zip(along, middles_s.tolist(), strict=True):
+        lights += _lights(disc, view, second, brush, share, covers=count == 1)
+    if not lights:
+        return None
+    middle = seen.directions(slice(None), lit.middle_s)[0]
+    brightest = _brightest_e_per_s(lights, view)
+    return DiscTrail(
+        int(seen.index[0]), float(rates.sum()) * share, middle, along, np.full(count, share), tuple(lights), brightest
+    )
+
+
+def _lights(disc: Disc, view: TrailView, second: float, brush: Brush, share: float, covers: bool) -> list[ExtendedLight]:
+    turned = to_matrix(propagate(AT_REST, view.rate_image_rad_s, second)) @ view.icrs_to_image
+    return disc_lights(disc, DiscView(view.camera, brush.sigma_px, (Pose(turned, share),)), covers)
+
+
+def _brightest_e_per_s(lights: list[ExtendedLight], view: TrailView) -> float:
+    maps = sum(float(light.image.max(initial=0.0)) for light in lights if isinstance(light, LightMap))
+    radiance = sum(light.times * light.disc.normal_e_per_s_sr for light in lights if isinstance(light, DiscLight))
+    return maps + radiance / view.camera.scales_px_rad()[0] ** 2
+
+
+def hidden(sprites: Sprites, directions: FloatArray, found: DiscTrail) -> Sprites:
+    """Sprites of stars seen in `directions` (n, 3), each without the share of its light that a satellite hides."""
+    left = np.ones(len(sprites))
+    for disc, share in zip(found.along, found.shares, strict=True):
+        left -= share * (directions @ disc.direction > np.cos(disc.radius_rad))
+    kept = left > 0
+    data = sprites.data[kept]
+    data["electrons_per_s"] *= left[kept].astype(np.float32)
+    star, x_px, y_px = sprites.star[kept], sprites.x_px[kept], sprites.y_px[kept]
+    return replace(sprites, data=data, star=star, x_px=x_px, y_px=y_px)
+
+
+def places_of(found: list[DiscTrail]) -> tuple[IntArray, FloatArray, FloatArray]:
+    """The places in the list, the directions (k, 3) and the rates (k,) of several."""
+    index = np.array([one.index for one in found], dtype=np.intp)
+    middle = np.array([one.middle for one in found]).reshape(-1, 3)
+    return index, middle, np.array([one.electrons_per_s for one in found])

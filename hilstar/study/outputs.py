@@ -13,7 +13,7 @@ from hilstar.bench.bench_file import read_bench_file
 from hilstar.charts import INK, MUTED, chart, write_csv
 from hilstar.resources import resource_path
 from hilstar.rotation import from_radec_roll_deg
-from hilstar.twin.exposure_files import write_exposure_fits
+from hilstar.twin.pictures import write_exposure_fits
 from hilstar.twin.simulator import Exposure, FrameNoise, Simulator
 
 if TYPE_CHECKING:

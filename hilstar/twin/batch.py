@@ -26,8 +26,8 @@ from hilstar.files import make_directory
 from hilstar.process.interrupts import end_with_parent
 from hilstar.rotation import rate_between_rad_s
 from hilstar.scene.exposure_motion import Motion
-from hilstar.twin.exposure_files import write_exposure_fits
 from hilstar.twin.faulty_exposure import FaultyExposure, Piece, pieces_of
+from hilstar.twin.pictures import write_exposure_fits
 from hilstar.twin.simulator import FrameNoise, Simulator, simulator_view
 from hilstar.units import NS_PER_S
 

@@ -1,4 +1,4 @@
-"""The monitor as the tracker sees it: the light of its pixels through collimator and tracker optics onto the detector.
+"""The monitor as the tracker sees it: its pixels on the tracker's detector and back, and their light through the optics.
 
 A lit monitor pixel is a small square on the tracker's image, about as large as a tracker pixel: SUB x SUB squares, each a
 Gaussian of the square's own variance, spread by the tracker's PSF. The black level is a glow over the whole monitor, by its own
@@ -8,22 +8,57 @@ density on the image.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from types import TracebackType
-from typing import Self
+from typing import Literal, Self
 
 import numpy as np
 
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.monitor.quantise import Panel
 from hilstar.render.renderer import Renderer, Target
+from hilstar.scene.camera import Camera
 from hilstar.scene.sprites import pack_sprites
-from hilstar.twin.bench_geometry import BenchGeometry
 
+Mirror = Literal["none", "x", "y", "swap"]
 # Squares along a pixel's side. Against twelve, a star's centroid is off by 1e-5 px and its flux by 2e-6 mag on the demo's
 # bench (a monitor pixel is 0.9 tracker pixels, the PSF's sigma 0.55), by 4e-5 px with a PSF of 0.3, and by 2e-4 px and 1e-5 mag
 # with monitor pixels of 2.7 tracker pixels. Points instead of Gaussians of the same variance: 1.5e-3, 3e-3 and 9e-3 px.
 SUB = 3
 POINTS_AT_ONCE = 400_000
+
+
+@dataclass(frozen=True, slots=True)
+class BenchGeometry:
+    """Where the monitor stands before the tracker: `monitor` maps cam to its pixels, `tracker` maps cam to the detector's.
+
+    `mirror` is what the screen does to its image, about the middle: columns reversed, rows reversed, or axes swapped.
+    """
+
+    monitor: Camera
+    tracker: Camera
+    mirror: Mirror = "none"
+
+    def to_tracker(self, x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Tracker pixels of monitor pixels, (n,) each; NaN behind the tracker."""
+        return self.tracker.project(self.monitor.rays(*self._shown_at(x_px, y_px)) @ self.tracker.cam_to_image.T)
+
+    def to_monitor(self, x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Monitor pixels that tracker pixels see, (n,) each, without the mirror; NaN behind the monitor."""
+        return self.monitor.project(self.tracker.rays(x_px, y_px) @ self.monitor.cam_to_image.T)
+
+    def _shown_at(self, x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
+        width, height = self.monitor.resolution_px
+        middle_x, middle_y = (width - 1) / 2, (height - 1) / 2
+        match self.mirror:
+            case "x":
+                return 2 * middle_x - x_px, y_px
+            case "y":
+                return x_px, 2 * middle_y - y_px
+            case "swap":
+                return middle_x + (y_px - middle_y), middle_y + (x_px - middle_x)
+            case _:
+                return x_px, y_px
 
 
 class TwinOptics:

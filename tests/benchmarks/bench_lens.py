@@ -18,8 +18,7 @@ from hilstar.arrays import FloatArray
 from hilstar.bench.build import open_bench
 from hilstar.bench.frame import Bench
 from hilstar.rotation import from_radec_roll_deg
-from hilstar.scene.camera import bounded
-from hilstar.scene.lens import Lens, ResidualField
+from hilstar.scene.camera import Lens, ResidualField, bounded
 from hilstar.study.speed.benchmark import RADEC_ROLL_DEG, own_bench_file
 from hilstar.study.speed.result import REFERENCE_PX
 from hilstar.study.speed.scenes import scene

@@ -22,11 +22,9 @@ from hilstar.render.reference import linear_image
 from hilstar.render.renderer import Renderer, Target
 from hilstar.render.tiles import disc_tiles
 from hilstar.rotation import from_radec_roll_deg
-from hilstar.scene.camera import Camera
-from hilstar.scene.discs import Pose, View, disc_lights
-from hilstar.scene.extended import DiscLight, LightMap, Shear
+from hilstar.scene.camera import Camera, Lens
+from hilstar.scene.extended import DiscLight, DiscView, LightMap, Pose, Shear, disc_lights
 from hilstar.scene.frame_motion import Scan, Turn
-from hilstar.scene.lens import Lens
 from hilstar.sky.bodies.disc import Disc
 from hilstar.twin.verify.measure import Comparison
 from hilstar.twin.verify.twin import Twin
@@ -125,7 +123,7 @@ def test_the_sun_in_the_field_is_white_finite_and_told_and_stars_keep_their_ligh
 
 def test_a_nearer_disc_hides_a_farther_one_and_covers_all_of_it():
     near, far = disc(9.0, 20.0, name="near"), disc(20.0, 30.0, (47.0, 40.0), "far")
-    view = View(CAMERA, SIGMA, (Pose(np.eye(3)),))
+    view = DiscView(CAMERA, SIGMA, (Pose(np.eye(3)),))
     with Renderer(Target(SIZE, SIGMA)) as gl:
         none = sprites_at(np.empty((0, 2)), np.empty(0), gl.footprint_px)
         both = replace(none, extended=(*disc_lights(far, view, False), *disc_lights(near, view, True)))
@@ -168,7 +166,7 @@ def test_a_point_behind_a_disc_is_gone_and_one_before_it_stays(bench):
 def test_the_reference_has_the_same_disc(radius_px, lens, late_s):
     one = disc(radius_px, 60.0)
     shear = Shear(np.array([0.02, 0.05, 0.01]), (0.0, late_s / SIZE[1]), (47.5, 39.5)) if late_s else None
-    view = View(replace(CAMERA, lens=lens), SIGMA, (Pose(np.eye(3)),), shear)
+    view = DiscView(replace(CAMERA, lens=lens), SIGMA, (Pose(np.eye(3)),), shear)
     with Renderer(Target(SIZE, SIGMA)) as gl:
         sprites = replace(
             sprites_at(np.array([[60.2, 30.7]]), np.array([2e5]), gl.footprint_px),
@@ -213,7 +211,7 @@ def test_every_quantisation_encodes_discs_and_erases_them(method, radius_px):
     panel = target.panel()
     turned = lambda image, panel: dither_levels(image, panel, mask_turn(3))  # noqa: E731
     oracle = {"round": round_levels, "temporal": turned}.get(method, dither_levels)
-    view = View(CAMERA, SIGMA, (Pose(np.eye(3)),))
+    view = DiscView(CAMERA, SIGMA, (Pose(np.eye(3)),))
     with Renderer(target) as gl:
         star = sprites_at(np.array([[20.2, 20.7]]), np.array([2e5]), gl.footprint_px)
         gl.draw(star, 3)
@@ -232,7 +230,7 @@ def test_maps_of_discs_do_not_push_out_those_that_last(monkeypatch):
     uploaded = []
     upload = ExtendedLayer._upload
     monkeypatch.setattr(ExtendedLayer, "_upload", lambda self, image, n: uploaded.append(image.shape) or upload(self, image, n))
-    view = View(CAMERA, SIGMA, (Pose(np.eye(3)),))
+    view = DiscView(CAMERA, SIGMA, (Pose(np.eye(3)),))
     lasting = LightMap(np.ones(SIZE[::-1], dtype=np.float32))
     with Renderer(Target(SIZE, SIGMA)) as gl:
         none = sprites_at(np.empty((0, 2)), np.empty(0), gl.footprint_px)

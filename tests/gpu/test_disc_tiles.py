@@ -10,9 +10,8 @@ import pytest
 import hilstar.render.extended as layer
 from hilstar.render.renderer import Renderer, Target
 from hilstar.render.tiles import AIR_SMOOTH, LEAST_PX, SMOOTH, disc_tiles
-from hilstar.scene.camera import Camera
+from hilstar.scene.camera import Camera, Lens
 from hilstar.scene.extended import DiscLight, Shear
-from hilstar.scene.lens import Lens
 from hilstar.sky.bodies.disc import EQUATOR_KM, Disc, earth_disc
 from hilstar.sky.bodies.light import KM_PER_AU
 from tests.support.stars import sprites_at

@@ -9,10 +9,8 @@ import pytest
 from scipy.ndimage import maximum_filter, minimum_filter
 
 from hilstar.render.renderer import Renderer, Target
-from hilstar.scene.camera import Camera
-from hilstar.scene.discs import Pose, View, disc_lights
-from hilstar.scene.extended import LightMap
-from hilstar.scene.lens import Lens
+from hilstar.scene.camera import Camera, Lens
+from hilstar.scene.extended import DiscView, LightMap, Pose, disc_lights
 from hilstar.sky.bodies.disc import Air, Disc
 from tests.support.ray_traced.bodies import Body, lambert, limb, lunar_lambert
 from tests.support.ray_traced.image import edge_px, spread_image
@@ -42,7 +40,7 @@ def drawn(gl, *lights) -> np.ndarray:
 
 
 def lights(disc: Disc, cam: Camera, covers: bool = False):
-    return disc_lights(disc, View(cam, SIGMA, (Pose(np.eye(3)),)), covers)
+    return disc_lights(disc, DiscView(cam, SIGMA, (Pose(np.eye(3)),)), covers)
 
 
 def camera(focal_px: float = FOCAL_PX, lens: Lens | None = None) -> Camera:
@@ -154,7 +152,7 @@ def test_the_earth_and_its_air_are_those_of_rays(gl, rng, altitude_km, focal_px,
 def test_any_gaussian_keeps_a_disc_s_light_and_its_place(sigma_px):
     cam = camera()
     disc = moon(4.8, 40.0, cam)
-    view = View(cam, sigma_px, (Pose(np.eye(3)),))
+    view = DiscView(cam, sigma_px, (Pose(np.eye(3)),))
     with Renderer(Target(SIZE, sigma_px)) as gl:
         got = drawn(gl, *disc_lights(disc, view, covers=True))
     truth = spread_image(body_of(disc), cam.rays, SIZE, (1.0, 1.0), np.random.default_rng(1), finer=5)  # of the same middle

@@ -9,7 +9,7 @@ import pytest
 
 from hilstar.render.renderer import Renderer, Target
 from hilstar.scene.camera import Camera
-from hilstar.scene.discs import Pose, View, disc_lights
+from hilstar.scene.extended import DiscView, Pose, disc_lights
 from hilstar.sky.bodies.disc import AIR, EQUATOR_KM, Disc, earth_disc
 from hilstar.sky.bodies.light import KM_PER_AU
 from tests.support.ray_traced.bodies import Body, lambert, limb
@@ -31,7 +31,7 @@ def gl():
 
 def drawn(gl, disc: Disc, cam: Camera) -> np.ndarray:
     none = sprites_at(np.empty((0, 2)), np.empty(0), gl.footprint_px)
-    gl.draw(replace(none, extended=tuple(disc_lights(disc, View(cam, SIGMA, (Pose(np.eye(3)),)), True))))
+    gl.draw(replace(none, extended=tuple(disc_lights(disc, DiscView(cam, SIGMA, (Pose(np.eye(3)),)), True))))
     return gl.linear().astype(float)
 
 

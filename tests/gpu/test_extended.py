@@ -10,9 +10,8 @@ import pytest
 from hilstar.monitor.quantise import dither_levels, mask_turn, round_levels, shown_light
 from hilstar.monitor.response import srgb_response
 from hilstar.render.renderer import Renderer, Target
-from hilstar.scene.camera import Camera
+from hilstar.scene.camera import Camera, Lens
 from hilstar.scene.extended import Glow, LightMap
-from hilstar.scene.lens import Lens
 from tests.support.stars import sprites_at
 
 SIZE, SIGMA, WHITE = (256, 192), (0.85, 0.85), 1e6

@@ -14,8 +14,7 @@ from hilstar.study.economy import Comparison, Outcome, economy_finding
 from hilstar.study.speed import report as benchmark_report
 from hilstar.study.speed.result import Machine, Result, Spread, Timing
 from hilstar.tracker.centroiders import FAMILY
-from hilstar.twin.budget import CENTROID_LIMIT_PX, FLUX_LIMITS_MAG, budget
-from hilstar.twin.budget_report import write_report
+from hilstar.twin.budget import CENTROID_LIMIT_PX, FLUX_LIMITS_MAG, budget, write_report
 from tests.support.figures import assert_legible
 from tests.support.pictures import assert_drawn
 

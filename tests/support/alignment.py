@@ -10,7 +10,7 @@ import numpy as np
 from hilstar.arrays import FloatArray
 from hilstar.bench.frame import Bench
 from hilstar.rotation import from_matrix
-from hilstar.twin.bench_geometry import BenchGeometry
+from hilstar.twin.optics import BenchGeometry
 
 HEADER = "qw,qx,qy,qz,tw,tx,ty,tz"
 

@@ -17,7 +17,7 @@ from hilstar.calibrate.first_light.virtual import VirtualBench
 from hilstar.calibrate.geometric.observed import read_image
 from hilstar.errors import InputError
 from hilstar.files import make_directory
-from hilstar.twin.bench_geometry import BenchGeometry
+from hilstar.twin.optics import BenchGeometry
 
 MAX_FILL = 0.8  # of the tracker's range: brighter pixels are not trusted
 HOT_FILL = 0.5  # a pixel that is fuller in the dark is hot, and tells nothing

@@ -23,7 +23,7 @@ from hilstar.charts import DARK, INK, ORANGE, TEXT_PT, chart
 from hilstar.errors import InputError
 from hilstar.files import make_directory
 from hilstar.tracker.centroids import CentroidSettings, find_stars, noisiest_background
-from hilstar.twin.bench_geometry import BenchGeometry
+from hilstar.twin.optics import BenchGeometry
 
 FIGURE_REACH = 0.25  # of the smaller side of what both screen and tracker have: the figure's corners about the middle
 

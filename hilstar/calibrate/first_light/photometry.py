@@ -25,7 +25,7 @@ from hilstar.errors import InputError
 from hilstar.files import write_whole
 from hilstar.monitor.calibration import BUILT_IN, Calibration, add_uniformity, load_calibration, primary_lights
 from hilstar.monitor.response import Response
-from hilstar.twin.bench_geometry import BenchGeometry
+from hilstar.twin.optics import BenchGeometry
 from hilstar.units import MAG_PER_RELATIVE, magnitude
 
 SHARE = 0.5  # of the smaller side of what both screen and tracker have

@@ -30,8 +30,8 @@ from hilstar.monitor.response import Codes
 from hilstar.rotation import to_matrix
 from hilstar.scene.psf import peak_share
 from hilstar.tracker.centroids import Centroids, CentroidSettings, find_stars, noisiest_background
-from hilstar.twin.verify.run import verify as run_twin
 from hilstar.twin.verify.summary import VerifySummary, summarise
+from hilstar.twin.verify.summary import verify as run_twin
 from hilstar.units import ARCSEC_PER_RAD, ERROR_OF_MEDIAN, MAG_PER_RELATIVE, magnitude
 
 ATTITUDES, SEED = 40, 3  # random ones, of which the fields with the most stars are shown

@@ -22,8 +22,7 @@ from hilstar.monitor.calibration import BUILT_IN, primary_lights
 from hilstar.run.screen.gate import Timing
 from hilstar.run.screen.photodiode import marker_light
 from hilstar.tracker.detector import Detector
-from hilstar.twin.bench_geometry import BenchGeometry
-from hilstar.twin.optics import TwinOptics
+from hilstar.twin.optics import BenchGeometry, TwinOptics
 from hilstar.twin.simulator import background_e
 from hilstar.units import NS_PER_MS, NS_PER_S
 

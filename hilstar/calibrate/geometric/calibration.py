@@ -42,7 +42,7 @@ from hilstar.charts import BLUE, SMALL_PT, chart
 from hilstar.errors import InputError
 from hilstar.monitor.geometry import ErrorTable, MadeTable, Notes, write_geometry
 from hilstar.rotation import to_matrix
-from hilstar.scene.lens import Lens
+from hilstar.scene.camera import Lens
 from hilstar.units import ARCSEC_PER_RAD
 
 SEED = 1  # of the random samples of dots: one calibration gives one file

@@ -10,8 +10,7 @@ from hilstar.arrays import FloatArray, IntArray
 from hilstar.calibrate.geometric.dots import DotPlan
 from hilstar.calibrate.geometric.observed import Observed
 from hilstar.rotation import conjugate, from_rotation_vector, multiply, to_matrix
-from hilstar.scene.camera import Camera
-from hilstar.scene.lens import Lens, ResidualField, field_terms
+from hilstar.scene.camera import Camera, Lens, ResidualField, field_terms
 from hilstar.units import ARCSEC_PER_RAD, MAD_TO_SIGMA
 
 # A parameter is its step times a number of order 1, so that one damping suits all of them.

@@ -33,9 +33,8 @@ def budget(
     from hilstar.bench.white import shares_line
     from hilstar.files import make_directory
     from hilstar.tracker.centroiders import FAMILY
-    from hilstar.twin.budget import By
+    from hilstar.twin.budget import By, budget_lines, write_report
     from hilstar.twin.budget import budget as find_budget
-    from hilstar.twin.budget_report import budget_lines, write_report
 
     check_directory("-o", output)
     choices: tuple[By, ...] = (*FAMILY, "all")

@@ -46,7 +46,7 @@ def simulate(
 
     from hilstar.bench.bench_file import at_moment, read_bench_file
     from hilstar.bench.truth import clipped_in
-    from hilstar.twin import exposure_files as files
+    from hilstar.twin import pictures as files
     from hilstar.twin.batch import faulty_exposure
     from hilstar.twin.simulator import FrameNoise, Simulator
 

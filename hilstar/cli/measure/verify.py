@@ -40,10 +40,9 @@ def verify(
 
     from hilstar.bench.heads_file import HeadsFile, read_bench_or_heads
     from hilstar.files import make_directory
-    from hilstar.twin.verify.proposals.report import check_writable
-    from hilstar.twin.verify.report import write_report
-    from hilstar.twin.verify.run import verify as run_twin
-    from hilstar.twin.verify.summary import summarise, summary_lines
+    from hilstar.twin.verify.proposals import check_writable
+    from hilstar.twin.verify.summary import summarise, summary_lines, write_report
+    from hilstar.twin.verify.summary import verify as run_twin
 
     check_directory("-o", output)
     file = read_bench_or_heads(bench_file)
@@ -96,8 +95,7 @@ def _verify_heads(heads: HeadsFile, fields: int, seed: int, as_json: bool) -> No
 
 def _proposed(file: Bench, verdict: Verdict, seed: int, write: bool, as_json: bool) -> dict[str, Any]:
     """The keys of --propose and --write in the JSON object; the lines are printed unless that is wanted."""
-    from hilstar.twin.verify.proposals.proposal import propose
-    from hilstar.twin.verify.proposals.report import proposal_lines, write_proposal
+    from hilstar.twin.verify.proposals import proposal_lines, propose, write_proposal
 
     if verdict.passed:
         return {"proposal": None, "written": False}

@@ -9,8 +9,7 @@ import numpy as np
 from hilstar.arrays import FloatArray
 from hilstar.render.renderer import Renderer, Target
 from hilstar.scene.camera import Camera
-from hilstar.scene.discs import Pose, View, disc_lights
-from hilstar.scene.extended import ExtendedLight
+from hilstar.scene.extended import DiscView, ExtendedLight, Pose, disc_lights
 from hilstar.scene.sprites import Sprites, pack_sprites
 from hilstar.sky.bodies.disc import Disc, lunar_share
 
@@ -64,7 +63,7 @@ def measure(radius_px: float, phase_deg: float) -> Exactness:
     camera = Camera(size, FOCAL_PX, (half, half), np.eye(3))
     with Renderer(Target(size, SIGMA_PX)) as renderer:
         point = _point(disc, camera, renderer.footprint_px)
-        lights = disc_lights(disc, View(camera, SIGMA_PX, (Pose(np.eye(3)),)), covers=True)
+        lights = disc_lights(disc, DiscView(camera, SIGMA_PX, (Pose(np.eye(3)),)), covers=True)
         renderer.draw(_dark(point, tuple(lights)))
         drawn = renderer.linear().astype(np.float64)
         renderer.draw(point)

@@ -21,8 +21,7 @@ from hilstar.scene.psf import peak_share
 from hilstar.study.chain.motion import PACKET_HZ, Movement, lead_ns
 from hilstar.study.chain.panel import Exposure
 from hilstar.study.chain.true_light import instants, points, sky_light
-from hilstar.twin.bench_geometry import BenchGeometry
-from hilstar.twin.optics import TwinOptics
+from hilstar.twin.optics import BenchGeometry, TwinOptics
 from hilstar.twin.verify.star_finder import (
     MATCH_PX,
     Matched,

@@ -13,8 +13,7 @@ from hilstar.bench.frame import Bench
 from hilstar.render.renderer import Renderer, Target
 from hilstar.render.stages import StagedRenderer
 from hilstar.rotation import to_matrix
-from hilstar.scene.clipping import clipped_sprites
-from hilstar.scene.sprites import Sprites, pack_sprites
+from hilstar.scene.sprites import Sprites, clipped_sprites, pack_sprites
 from hilstar.study.speed.other_methods import OtherMethod
 from hilstar.study.speed.result import Agreement, Cell, PythonTime, Result, Skipped, Spread, Timing
 

@@ -21,8 +21,7 @@ from hilstar.scene.frame_motion import Scan
 from hilstar.scene.sprites import Sprites
 from hilstar.study.shared.bench_text import Table, bench_text
 from hilstar.study.timing.slew import PACKET_HZ, Slew
-from hilstar.twin.bench_geometry import BenchGeometry
-from hilstar.twin.optics import TwinOptics
+from hilstar.twin.optics import BenchGeometry, TwinOptics
 from hilstar.units import NS_PER_S
 
 

@@ -21,9 +21,8 @@ from hilstar.bench.faults.views import display_view
 from hilstar.bench.frame import Frame
 from hilstar.monitor.quantise import MASK_TURNS
 from hilstar.rotation import from_radec_roll_deg, propagate
-from hilstar.twin.verify.light import exposure_lights
 from hilstar.twin.verify.star_finder import StarFinder, star_finder
-from hilstar.twin.verify.twin import Twin
+from hilstar.twin.verify.twin import Twin, exposure_lights
 from hilstar.units import magnitude
 
 OFF_AXIS = 0.4  # of the field's radius: where a fault's place is put, at most

@@ -1,21 +1,30 @@
-"""The comparison: each star of a field against itself in the image of the sky."""
+"""The comparison: each star that the twin sees against itself in the image of the sky, and the geometry that explains the rest.
+
+The smallest model that explains where stars are shown is fitted by least squares. A star of direction d is drawn where the
+assumed lens has it, and seen at d', from where the true lens shows that place. So d is a polynomial of d', in focal lengths
+from the middle of the detector: d = z d' (1 + k1 r'^2 + ...) + shift for a true lens where an ideal one is assumed, whatever
+their size; the screen's tilt (a, b) adds d' (a y' - b x') to first order. Stars too close for the tracker to separate
+(blends) count as one, at the centroid of their light.
+"""
 
 from __future__ import annotations
 
 import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.arrays import FloatArray
+from hilstar.arrays import FloatArray, IntArray
+from hilstar.bench.config import BenchConfig
 from hilstar.bench.moving import wide_bodies
+from hilstar.monitor.calibration import Calibration
+from hilstar.scene.camera import Camera
 from hilstar.tracker.centroiders import FAMILY, Centroider
 from hilstar.tracker.centroids import Centroids, estimate_background, find_stars, noisiest_background
-from hilstar.twin.bench_geometry import BenchGeometry, Mirror
-from hilstar.twin.verify.blends import with_blends_as_one
-from hilstar.twin.verify.displacement import Displaced
-from hilstar.twin.verify.light import true_calibration
-from hilstar.twin.verify.measured import Glow, Measured, Star, Tally
+from hilstar.twin.optics import BenchGeometry, Mirror
 from hilstar.twin.verify.star_finder import (
     WING_SIGMAS,
     Matched,
@@ -26,12 +35,275 @@ from hilstar.twin.verify.star_finder import (
     shared,
     star_finder,
 )
-from hilstar.twin.verify.twin import Field, Twin
+from hilstar.twin.verify.twin import Field, Twin, true_calibration
 from hilstar.units import magnitude
 
+MIN_RESIDUALS = 3  # to an unknown
+MIN_STARS = 6  # for a scale, a rotation and a shift: twelve residuals, four unknowns
+# A model explains a field where no larger one leaves much less: a quarter, and a tenth of the limit, beyond the best.
+ENOUGH, ENOUGH_OF_LIMIT = 1.25, 0.1
+TRIMS, WILD = 3, 6.0  # a star this many medians off, and more than the limit, is another one; 1e-11 of Gaussian ones are
+ALIGNED, LENS, TILT, HIGHER, DECENTRED = "aligned", "lens", "tilt", "higher", "decentred"
+MODELS = (
+    (ALIGNED,),
+    (ALIGNED, LENS),
+    (ALIGNED, TILT),
+    (ALIGNED, TILT, LENS),
+    (ALIGNED, TILT, LENS, HIGHER),
+    (ALIGNED, TILT, LENS, HIGHER, DECENTRED),
+)
+# Two equal Gaussians have one peak up to 2 sigmas, and a faint one disappears beside a bright one farther out. The windowed
+# centroid of a pair is off the centre of its light by 0.02 sigma at 1 sigma, 0.06 at 1.4 (tests/unit/twin/test_blends.py).
+BLEND_SIGMAS = 1.5
 # The glow that a missing black level adds is noticed at this share of the faintest drawn star's light, per pixel of its disc.
 BLACK_SHARE = 0.1
 MIRRORS: tuple[Mirror, ...] = ("x", "y", "swap")
+
+
+@dataclass(frozen=True, slots=True)
+class Displaced:
+    """A star's place on the detector, px, and how far from it, right and down, the display shows it."""
+
+    x_px: float
+    y_px: float
+    dx_px: float
+    dy_px: float
+
+
+@dataclass(frozen=True, slots=True)
+class GeometryFit:
+    """What the smallest sufficient model explains of the displacements, as true minus assumed.
+
+    Scale, rotation about the detector's middle and shift, and where the displacements ask for them the screen's tilt about its
+    x and y axes and the lens, k1 of its tangents; `tilt_px` and `distortion_px` are the largest displacements by these.
+    `left` is the share of the mean square that is not explained, corrected for the number of unknowns, `left_px` what 95 % of
+    the stars are within of the model.
+    """
+
+    scale_error: float
+    rotation_rad: float
+    offset_px: tuple[float, float]
+    tilt_rad: tuple[float, float]
+    tilt_px: float
+    k1: float
+    distortion_px: float
+    left: float
+    left_px: float
+
+
+def fit_geometry(displaced: Sequence[Displaced], tracker: Camera, limit_px: float) -> GeometryFit | None:
+    """The smallest model by least squares; None with too few stars. `limit_px` is what the bench allows a centroid."""
+    rows = np.array([(star.x_px, star.y_px, star.dx_px, star.dy_px) for star in displaced]).reshape(-1, 4)
+    if len(rows) < MIN_STARS:
+        return None
+    focal_px = tracker.focal_length_px
+    seen = (rows[:, :2] + rows[:, 2:] - tracker.principal_point_px) / focal_px
+    back = -rows[:, 2:] / focal_px
+    for _ in range(TRIMS):
+        kept = _consistent(_fits(seen, back)[-1].rest, limit_px / focal_px)
+        if kept.sum() < MIN_STARS:
+            break
+        seen, back = seen[kept], back[kept]
+    fits = _fits(seen, back)
+    good = ENOUGH * min(fit.noise for fit in fits) + ENOUGH_OF_LIMIT * limit_px / focal_px
+    return _summed_up(next(fit for fit in fits if fit.noise <= good), back.T.ravel(), focal_px)
+
+
+def _fits(seen: FloatArray, back: FloatArray) -> list[_Fit]:
+    """Every model that so many stars (n, 2) can determine, the smallest first."""
+    parts, wanted = _parts(*seen.T), back.T.ravel()
+    fits = [_Fit.of({name: parts[name] for name in model}, wanted) for model in MODELS]
+    return [fit for fit in fits if MIN_RESIDUALS * fit.unknowns <= len(wanted)]
+
+
+def _consistent(rest: FloatArray, limit: float) -> npt.NDArray[np.bool_]:
+    """The stars that a model leaves where most are: another one that was found near a star's place is none of them."""
+    off = _lengths(rest)
+    return np.asarray(off <= max(WILD * float(np.median(off)), limit))
+
+
+def _parts(x: FloatArray, y: FloatArray) -> dict[str, FloatArray]:
+    """What a unit of each part's unknowns moves (2 n, unknowns) by: along x, then along y."""
+    one, none, r2 = np.ones_like(x), np.zeros_like(x), x * x + y * y
+    pairs = {
+        ALIGNED: [(x, y), (-y, x), (one, none), (none, one)],
+        TILT: [(x * y, y * y), (-x * x, -x * y)],
+        LENS: [(x * r2, y * r2)],
+        HIGHER: [(x * r2**2, y * r2**2)],
+        DECENTRED: [(2 * x * y, r2 + 2 * y * y), (r2 + 2 * x * x, 2 * x * y)],
+    }
+    return {name: np.column_stack([np.concatenate(pair) for pair in columns]) for name, columns in pairs.items()}
+
+
+@dataclass(frozen=True, slots=True)
+class _Fit:
+    """A model's unknowns by its parts, the displacements (2 n,) by each, and what all of them leave."""
+
+    found: dict[str, FloatArray]
+    moved: dict[str, FloatArray]
+    rest: FloatArray
+    unknowns: int
+
+    @classmethod
+    def of(cls, parts: dict[str, FloatArray], wanted: FloatArray) -> _Fit:
+        design = np.hstack(list(parts.values()))
+        values = np.linalg.lstsq(design, wanted, rcond=None)[0]
+        ends = np.cumsum([part.shape[1] for part in parts.values()])
+        found = dict(zip(parts, np.split(values, ends[:-1]), strict=True))
+        moved = {name: part @ found[name] for name, part in parts.items()}
+        return cls(found, moved, wanted - design @ values, design.shape[1])
+
+    @property
+    def noise(self) -> float:
+        """One sigma of what is left, of a residual."""
+        return math.sqrt(float(self.rest @ self.rest) / (len(self.rest) - self.unknowns))
+
+    def largest(self, *names: str) -> float:
+        """The largest displacement by some parts together."""
+        return float(_lengths(sum((self.moved[name] for name in names if name in self.moved), np.zeros_like(self.rest))).max())
+
+
+def _lengths(residuals: FloatArray) -> FloatArray:
+    return np.asarray(np.hypot(*np.split(residuals, 2)))
+
+
+def _summed_up(fit: _Fit, wanted: FloatArray, focal_px: float) -> GeometryFit:
+    scale, rotation, right, down = fit.found[ALIGNED].tolist()
+    backwards = complex(1.0 + scale, rotation)
+    forwards, shift = 1.0 / backwards, -complex(right, down) / backwards
+    a, b = fit.found.get(TILT, np.zeros(2)).tolist()
+    total = float(wanted @ wanted)
+    return GeometryFit(
+        scale_error=forwards.real - 1.0,
+        rotation_rad=forwards.imag,
+        offset_px=(shift.real * focal_px, shift.imag * focal_px),
+        tilt_rad=(a, b),
+        tilt_px=focal_px * fit.largest(TILT),
+        k1=float(fit.found.get(LENS, np.zeros(1))[0]) / abs(backwards),
+        distortion_px=focal_px * fit.largest(LENS, HIGHER, DECENTRED),
+        left=fit.noise**2 * len(wanted) / total if total else 0.0,
+        left_px=focal_px * float(np.percentile(_lengths(fit.rest), 95)),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Star:
+    """One star at its place on the tracker, px: errors of the display, + too faint, right and down, magnitudes and px.
+
+    `codes_mag`, `codes_px` are what the codes would cost on the monitor that the bench assumes, NaN where that star would
+    be lost; `floor_mag`, `floor_px` are the estimator's own, of the linear image against catalogue and sky. A body has a
+    `name`, and 0 for `hip`.
+    """
+
+    hip: int
+    v_mag: float
+    x_px: float
+    y_px: float
+    flux_mag: float
+    dx_px: float
+    dy_px: float
+    codes_mag: float
+    codes_px: float
+    floor_mag: float
+    floor_px: float
+    name: str = ""
+
+
+@dataclass(slots=True)
+class Tally:
+    """Stars by what became of them, added up over the fields.
+
+    `summed` stars are part of a brighter one that the tracker cannot part from them. `displaced` are the stars that the display
+    really shows, however far off. `vanished` counts how many fewer are found than the sky has, `mirrored` those found where a
+    screen so mirrored would show them; `noisy_mag`, `noisy_px` are the errors with all of the detector's noise.
+    `off_px` has how far off each kind of centroider finds each of `stars`.
+    """
+
+    stars: list[Star] = field(default_factory=list)
+    lost: list[Star] = field(default_factory=list)
+    displaced: list[Displaced] = field(default_factory=list)
+    blended: int = 0
+    summed: int = 0
+    clipped: int = 0
+    not_shown: int = 0
+    at_edge: int = 0
+    vanished: int = 0
+    mirrored: Counter[Mirror] = field(default_factory=Counter)
+    noisy_mag: list[float] = field(default_factory=list)
+    noisy_px: list[float] = field(default_factory=list)
+    off_px: dict[Centroider, list[float]] = field(default_factory=lambda: {kind: [] for kind in FAMILY})
+
+
+@dataclass(frozen=True, slots=True)
+class Glow:
+    """The light of the screen's black level in a tracker pixel, electrons per second: as assumed, as seen, and their limit."""
+
+    assumed_e_per_s_px: float
+    seen_e_per_s_px: float
+    limit_e_per_s_px: float
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """All fields, and what a verdict has to know of the bench; `wide_bodies` says which bodies are drawn as discs.
+
+    `calibration` is the one that the bench assumes; `true_calibration` is the monitor's own, where it is another.
+    """
+
+    field_count: int
+    tally: Tally
+    config: BenchConfig
+    camera: Camera
+    glow: Glow
+    calibration: Calibration
+    true_calibration: Calibration | None
+    gl_renderer: str
+    wide_bodies: list[str]
+
+
+def with_blends_as_one(seen: Field, sigma_px: tuple[float, float]) -> Field:
+    """The field with each star that stands within BLEND_SIGMAS of a brighter one (`sigma_px` of the tracker) added to that.
+
+    The brighter one keeps its name; its light, magnitude and places become those of the sum.
+    """
+    owner = _owners(np.column_stack([seen.x_px, seen.y_px]) / sigma_px, seen.truth["electrons_per_s"])
+    own = np.arange(len(owner))
+    if np.array_equal(owner, own):
+        return seen
+    light = seen.truth["electrons_per_s"]
+    total = np.bincount(owner, light, len(owner))
+    stars = np.flatnonzero(owner == own)
+
+    def centre(places_px: FloatArray) -> FloatArray:
+        moment = np.bincount(owner, light * (places_px - places_px[owner]), len(owner))[stars]
+        return np.asarray(places_px[stars] + moment / total[stars])
+
+    truth = seen.truth[stars].copy()
+    truth["x_px"], truth["y_px"] = centre(seen.truth["x_px"]), centre(seen.truth["y_px"])
+    truth["electrons_per_s"] = total[stars]
+    truth["v_mag"] += magnitude(np.asarray(total[stars] / light[stars]))
+    truth["clipped"] = np.bincount(owner, seen.truth["clipped"], len(owner))[stars] > 0
+    return replace(seen, truth=truth, x_px=centre(seen.x_px), y_px=centre(seen.y_px))
+
+
+def _owners(places: FloatArray, light: FloatArray) -> IntArray:
+    """For each star (n,) at places (n, 2), in sigmas, the one that it is added to: itself, or a brighter one."""
+    from scipy.spatial import cKDTree
+
+    owner = np.arange(len(light))
+    known = np.flatnonzero(np.isfinite(places).all(axis=1))
+    if not len(known):
+        return owner
+    near: dict[int, list[int]] = {}
+    for a, b in known[cKDTree(places[known]).query_pairs(BLEND_SIGMAS, output_type="ndarray")].tolist():
+        near.setdefault(a, []).append(b)
+        near.setdefault(b, []).append(a)
+    for star in sorted(near, key=lambda star: (-light[star], star)):
+        if owner[star] == star:
+            for other in near[star]:
+                if owner[other] == other and (light[other], -other) < (light[star], -star):
+                    owner[other] = star
+    return owner
 
 
 class Comparison:

@@ -1,13 +1,207 @@
-"""The verdict: the display's errors against the limits of the bench file."""
+"""The verdict of a bench: the display's errors without their common zero point, the limits exceeded, and the likely causes."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import math
+from dataclasses import dataclass, field, replace
 
-from hilstar.twin.verify.display_errors import DisplayErrors, display_errors
+import numpy as np
+
+from hilstar.arrays import FloatArray
+from hilstar.error_spread import error_spread
 from hilstar.twin.verify.faulty_fields import FaultSeen
-from hilstar.twin.verify.measured import Measured
-from hilstar.twin.verify.reasons import reasons
+from hilstar.twin.verify.measure import GeometryFit, Measured, Star, fit_geometry
+
+# A fit that leaves more of the residuals' squares than this explains nothing: chance matches leave nearly all.
+MAX_LEFT = 0.5
+# A cause is named where it accounts for more than this share of the stars.
+MIN_SHARE = 0.5
+MIRROR_WORDS = {"x": "its columns reversed", "y": "its rows reversed", "swap": "its axes swapped"}
+
+
+@dataclass(frozen=True, slots=True)
+class DisplayErrors:
+    """The stars with their common zero point subtracted; `codes_zero_point_mag` is the one that the codes alone would have.
+
+    `lost` stars have NaN for errors; `geometry` is None with too few stars.
+    """
+
+    stars: list[Star]
+    lost: list[Star]
+    zero_point_mag: float
+    codes_zero_point_mag: float
+    geometry: GeometryFit | None
+
+    @property
+    def looked_for(self) -> int:
+        """How many stars should have been found."""
+        return len(self.stars) + len(self.lost)
+
+    def flux_mag(self) -> FloatArray:
+        """Flux errors (n,), magnitudes, positive too faint."""
+        return np.array([star.flux_mag for star in self.stars])
+
+    def centroid_px(self) -> FloatArray:
+        """Centroid errors (n,), tracker pixels."""
+        return np.array([math.hypot(star.dx_px, star.dy_px) for star in self.stars])
+
+    def codes_mag(self) -> FloatArray:
+        """Flux errors (n,) of the codes alone, magnitudes, NaN where the codes alone lose the star."""
+        return np.array([star.codes_mag for star in self.stars])
+
+    def codes_px(self) -> FloatArray:
+        """Centroid errors (n,) of the codes alone, tracker pixels."""
+        return np.array([star.codes_px for star in self.stars])
+
+    def floor_mag(self) -> FloatArray:
+        """Flux errors (n,) of the estimator itself, magnitudes, none of them negative."""
+        return np.abs([star.floor_mag for star in self.stars])
+
+    def floor_px(self) -> FloatArray:
+        """Centroid errors (n,) of the estimator itself, tracker pixels."""
+        return np.array([star.floor_px for star in self.stars])
+
+
+def display_errors(measured: Measured) -> DisplayErrors:
+    """The errors of all fields' stars."""
+    stars = measured.tally.stars
+    zero_point, codes_zero_point = median([s.flux_mag for s in stars]), median([s.codes_mag for s in stars])
+    stars = [replace(s, flux_mag=s.flux_mag - zero_point, codes_mag=s.codes_mag - codes_zero_point) for s in stars]
+    geometry = fit_geometry(measured.tally.displaced, measured.camera, measured.config.verify.centroid_px)
+    return DisplayErrors(stars, measured.tally.lost, zero_point, codes_zero_point, geometry)
+
+
+def median(values: list[float]) -> float:
+    """The median of the finite values, 0 without any."""
+    finite_values = [value for value in values if math.isfinite(value)]
+    return float(np.median(finite_values)) if finite_values else 0.0
+
+
+def p95(errors: FloatArray) -> float:
+    """The 95th percentile of some errors (n,), 0 without any."""
+    return error_spread(errors).p95 or 0.0
+
+
+def reasons(measured: Measured, errors: DisplayErrors) -> list[str]:
+    """The reasons against a bench; none where it passes."""
+    if not errors.looked_for:
+        return ["no star could be measured: no field has one that is shown, unclipped and alone"]
+    lost = _lost(measured, errors)
+    centroid = _centroids(measured, errors)
+    geometry = _geometry(measured, errors) if lost or centroid else []
+    # A few stars found by chance, or far from the middle of their windows, say nothing about light.
+    mostly_lost = len(errors.lost) > MIN_SHARE * errors.looked_for
+    light = [] if mostly_lost else [*_light(measured, errors), *_codes(measured, errors)]
+    return [*lost, *centroid, *geometry, *light, *_black(measured), *_floor(measured, errors)]
+
+
+def _lost(measured: Measured, errors: DisplayErrors) -> list[str]:
+    lost, looked_for, tally = len(errors.lost), errors.looked_for, measured.tally
+    limit = measured.config.verify.lost_share
+    if lost <= limit * looked_for:
+        return []
+    cause = "look at focal lengths, pixel pitches and q_cam_to_mon"
+    if tally.vanished > MIN_SHARE * lost:
+        cause = "they are too faint to be seen: look at the monitor's response, and at what the codes leave of faint stars"
+    for mirror, count in tally.mirrored.items():
+        if count > MIN_SHARE * looked_for:
+            cause = (
+                f"{count} are where a mirrored screen with {MIRROR_WORDS[mirror]} would show them: look at how it is mounted"
+            )
+    return [f"{lost} of {looked_for} stars are not where the sky has them (limit {limit:.1%}): {cause}"]
+
+
+def _centroids(measured: Measured, errors: DisplayErrors) -> list[str]:
+    limit, seen = measured.config.verify.centroid_px, p95(errors.centroid_px())
+    return [f"centroids are {seen:.3f} px off at 95 % (limit {limit:g})"] if seen > limit else []
+
+
+def _geometry(measured: Measured, errors: DisplayErrors) -> list[str]:
+    """What part of the geometry is off by more than the centroids' limit somewhere in the field."""
+    fit, limit = errors.geometry, measured.config.verify.centroid_px
+    if fit is None or fit.left > MAX_LEFT:
+        return []
+    reach_px, found, measured_lens = math.hypot(*measured.camera.resolution_px) / 2, [], measured.config.collimator.geometry
+    again = "its geometry file does not say so; run hilstar calibrate geometric again"
+    if abs(fit.scale_error) * reach_px > limit:
+        cure = again if measured_lens else "look at focal_length_mm and pixel_pitch_um"
+        found.append(f"the plate scale is {fit.scale_error:+.2%} off: {cure}")
+    if abs(fit.rotation_rad) * reach_px > limit:
+        cure = again if measured_lens else "look at q_cam_to_mon"
+        found.append(f"the field is turned by {math.degrees(fit.rotation_rad):+.3f} deg: {cure}")
+    if math.hypot(*fit.offset_px) > limit:
+        right, down = fit.offset_px
+        cure = again if measured_lens else "look at q_cam_to_mon and principal_point_px"
+        found.append(f"the field is shifted by ({right:+.2f}, {down:+.2f}) px: {cure}")
+    return [*found, *_lens(fit, limit, again if measured_lens else "hilstar calibrate geometric measures it")]
+
+
+def _lens(fit: GeometryFit, limit_px: float, cure: str) -> list[str]:
+    """What no key of the bench file but `geometry` describes."""
+    found = []
+    if fit.tilt_px > limit_px:
+        a, b = (math.degrees(angle) for angle in fit.tilt_rad)
+        found.append(f"the screen is tilted by ({a:+.2f}, {b:+.2f}) deg about its x and y axes, {fit.tilt_px:.2f} px: {cure}")
+    if fit.distortion_px > limit_px:
+        found.append(f"the lens distorts by {fit.distortion_px:.2f} px (k1 {fit.k1:+.3g}): {cure}")
+    if fit.left_px > limit_px:
+        found.append(f"that leaves {fit.left_px:.2f} px at 95 %, which is neither alignment, tilt nor distortion")
+    return found
+
+
+def _light(measured: Measured, errors: DisplayErrors) -> list[str]:
+    """Errors of the field's stars relative to each other, then the error that all have in common."""
+    verify, found = measured.config.verify, []
+    limit = verify.flux_mag
+    seen, alone = p95(np.abs(errors.flux_mag())), p95(np.abs(errors.codes_mag()))
+    if seen > limit:
+        response = math.sqrt(max(seen**2 - alone**2, 0.0)) > limit
+        cause = ": light does not follow the codes as assumed, look at the monitor's response and uniformity"
+        found.append(f"flux is {seen:.3f} mag off at 95 % (limit {limit:g}){cause if response else ''}")
+    offset, of_codes = errors.zero_point_mag, errors.codes_zero_point_mag
+    if abs(offset) > limit:
+        cause = f"the codes alone make {of_codes:+.3f}" if abs(of_codes) > limit else "look at flux_at_white_e_per_s"
+        # A wrong response moves the median star too: then white may well be right.
+        if not (found and abs(of_codes) <= limit and verify.true_flux_at_white_e_per_s is None):
+            found.append(f"all stars are {offset:+.3f} mag off (limit {limit:g}): {cause}")
+    return found
+
+
+def _black(measured: Measured) -> list[str]:
+    glow = measured.glow
+    if abs(glow.seen_e_per_s_px - glow.assumed_e_per_s_px) <= glow.limit_e_per_s_px:
+        return []
+    return [
+        f"the screen's black gives {glow.seen_e_per_s_px:.4g} e-/s in a tracker pixel where {glow.assumed_e_per_s_px:.4g} are"
+        f" assumed (limit {glow.limit_e_per_s_px:.3g}): calibrate the black level"
+    ]
+
+
+def _floor(measured: Measured, errors: DisplayErrors) -> list[str]:
+    """The linear image against the catalogue: where that exceeds the limits, the differences above say nothing."""
+    limits = measured.config.verify
+    mag, px = p95(errors.floor_mag()), p95(errors.floor_px())
+    if mag <= limits.flux_mag and px <= limits.centroid_px:
+        return []
+    return [
+        f"the linear image itself is measured {mag:.3f} mag and {px:.3f} px off the catalogue at 95 %: the tracker's PSF is too"
+        " narrow or too wide for its pixels, so that nothing can be said about the display"
+    ]
+
+
+def _codes(measured: Measured, errors: DisplayErrors) -> list[str]:
+    """What the codes would cost if everything were as assumed, and what makes them finer."""
+    limits, render = measured.config.verify, measured.config.render
+    mag, px = p95(np.abs(errors.codes_mag())), p95(errors.codes_px())
+    if mag <= limits.flux_mag and px <= limits.centroid_px:
+        return []
+    # What is proposed has to suit the monitor as it is, too.
+    calibrations = [one for one in (measured.calibration, measured.true_calibration) if one is not None]
+    ways = ['quantisation = "exact"'] if render.quantisation != "exact" else []
+    ways += ["bit_stealing = true"] if not render.bit_stealing and all(c.can_steal_bits for c in calibrations) else []
+    ways += ["more bits" if all(c.is_formula for c in calibrations) else "a monitor calibrated on more bits"]
+    ways += ["a larger brightest_v_mag", "a smaller faintest_v_mag"]
+    return [f"the codes alone cost {mag:.3f} mag and {px:.3f} px at 95 %; try {', '.join(ways[:-1])} or {ways[-1]}"]
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,8 +23,8 @@ from hilstar.rotation import (
 )
 from hilstar.run.record.ledger import Ledger
 from hilstar.run.record.ledger_records import FrameRecord
-from hilstar.scene.lens import Lens
-from hilstar.twin.bench_geometry import BenchGeometry
+from hilstar.scene.camera import Lens
+from hilstar.twin.optics import BenchGeometry
 from hilstar.twin.verify.twin import true_geometry
 from hilstar.units import ARCSEC_PER_RAD, NS_PER_S
 from tests.support.alignment import HEADER, reported, write_pairs

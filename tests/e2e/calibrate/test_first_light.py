@@ -22,8 +22,7 @@ from hilstar.monitor.geometry import ErrorTable, MadeTable, Notes, write_geometr
 from hilstar.monitor.response import gamma_response, srgb_response
 from hilstar.resources import resource_path
 from hilstar.rotation import from_rotation_vector, to_matrix
-from hilstar.scene.camera import Camera
-from hilstar.scene.lens import Lens
+from hilstar.scene.camera import Camera, Lens
 from hilstar.units import ARCSEC_PER_RAD
 from tests.support import plain_camera
 from tests.support.benches import TWIN, bench_text

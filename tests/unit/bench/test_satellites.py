@@ -15,7 +15,7 @@ from hilstar.bench.discs import When
 from hilstar.bench.frame import Bench
 from hilstar.campaign.display_tracker import DisplayTracker
 from hilstar.rotation import from_radec_roll_deg, to_matrix
-from hilstar.scene.trail_discs import DiscTrail, hidden
+from hilstar.scene.trails import DiscTrail, hidden
 from hilstar.sky.bodies.disc import Disc
 from hilstar.sky.bodies.passes import Cone
 from hilstar.twin.simulator import Simulator

@@ -14,8 +14,7 @@ from hilstar.bench.frame_files import write_frame_fits
 from hilstar.bench.world_coordinates import MAX_SIP_PX, world_coordinates
 from hilstar.monitor.geometry import monitor_camera
 from hilstar.rotation import from_radec_roll_deg, to_matrix
-from hilstar.scene.camera import bounded
-from hilstar.scene.lens import Lens, ResidualField
+from hilstar.scene.camera import Lens, ResidualField, bounded
 from tests.support.real_lens import SIZE, true_places_px, write_bench
 
 ATTITUDES = [(84.0, -1.2, 30.0), (283.0, 89.2, -170.0), (359.9, -60.0, 100.0)]

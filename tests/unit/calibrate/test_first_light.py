@@ -28,7 +28,7 @@ from hilstar.calibrate.first_light.session import FirstLightSession, SessionStep
 from hilstar.errors import InputError
 from hilstar.monitor.geometry import monitor_camera
 from hilstar.render.presenter import Orientation
-from hilstar.twin.bench_geometry import BenchGeometry
+from hilstar.twin.optics import BenchGeometry
 from tests.support.benches import bench_text
 from tests.support.damage import NO_JSON
 

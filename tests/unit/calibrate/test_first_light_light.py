@@ -26,7 +26,7 @@ from hilstar.errors import InputError
 from hilstar.monitor.calibration import Head, NotesTable, load_calibration, primary_lights, write_calibration
 from hilstar.monitor.geometry import monitor_camera
 from hilstar.monitor.response import gamma_response, srgb_response
-from hilstar.twin.bench_geometry import BenchGeometry
+from hilstar.twin.optics import BenchGeometry
 from tests.support.benches import TWIN, bench_text
 
 NO_TURN = np.array([1.0, 0.0, 0.0, 0.0])

@@ -15,8 +15,7 @@ from hilstar.calibrate.geometric.match import decode
 from hilstar.calibrate.geometric.observed import Observed
 from hilstar.errors import InputError
 from hilstar.monitor.geometry import monitor_camera
-from hilstar.scene.camera import Camera, bounded
-from hilstar.scene.lens import Lens
+from hilstar.scene.camera import Camera, Lens, bounded
 from hilstar.units import ARCSEC_PER_RAD
 from tests.support.traced_bench import TracedBench, observed_dots, turned
 

@@ -9,10 +9,8 @@ import pytest
 
 from hilstar.monitor.geometry import monitor_camera
 from hilstar.rotation import from_radec_roll_deg, propagate, to_matrix
-from hilstar.scene.camera import bounded
-from hilstar.scene.candidates import KEPT_TURN_RAD, Candidates
-from hilstar.scene.lens import Lens
-from hilstar.scene.sprites import Sprites, make_sprites
+from hilstar.scene.camera import Lens, bounded
+from hilstar.scene.sprites import KEPT_TURN_RAD, Candidates, Sprites, make_sprites
 from hilstar.sky.stars import with_bodies
 from tests.support.stars import stars_at
 

@@ -10,9 +10,8 @@ import pytest
 from hilstar.monitor.geometry import monitor_camera
 from hilstar.rotation import normalise, to_matrix
 from hilstar.scene.camera import Camera
-from hilstar.scene.clipping import CLIP_TOLERANCE, clipped_sprites
 from hilstar.scene.psf import footprint_px, peak_share, pixel_shares
-from hilstar.scene.sprites import make_sprites, pack_sprites
+from hilstar.scene.sprites import CLIP_TOLERANCE, clipped_sprites, make_sprites, pack_sprites
 from hilstar.sky.stars import cell_grid
 from tests.support.stars import stars_at
 

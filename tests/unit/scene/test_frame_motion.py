@@ -10,11 +10,10 @@ from hilstar.render.presenter import Orientation
 from hilstar.render.reference import linear_image
 from hilstar.rotation import from_radec_roll_deg, propagate, to_matrix
 from hilstar.scene import sprites as sprites_module
-from hilstar.scene.clipping import clipped_sprites
 from hilstar.scene.frame_motion import EXTRA_SPRITES, Scan, Turn, swept_sprites
 from hilstar.scene.paths import MAX_NODES
 from hilstar.scene.psf import footprint_px
-from hilstar.scene.sprites import make_sprites
+from hilstar.scene.sprites import clipped_sprites, make_sprites
 from tests.support.stars import stars_at
 
 SIZE = (320, 240)

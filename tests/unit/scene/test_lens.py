@@ -9,8 +9,7 @@ import pytest
 
 from hilstar.errors import InputError
 from hilstar.monitor.geometry import monitor_camera
-from hilstar.scene.camera import bounded
-from hilstar.scene.lens import Lens, ResidualField, field_terms
+from hilstar.scene.camera import Lens, ResidualField, bounded, field_terms
 
 SIZE = (1920, 1080)
 PINHOLE = monitor_camera(SIZE, 57.65, 350.0, np.array([1.0, 0.0, 0.0, 0.0]))

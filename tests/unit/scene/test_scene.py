@@ -10,7 +10,6 @@ import pytest
 from hilstar.errors import InputError
 from hilstar.monitor.geometry import monitor_camera
 from hilstar.rotation import from_radec_roll_deg, to_matrix
-from hilstar.scene.clipping import clipped_sprites
 from hilstar.scene.psf import (
     MAX_CUT,
     MAX_SHARE_ERROR,
@@ -21,7 +20,7 @@ from hilstar.scene.psf import (
     pixel_shares,
     share_polynomial,
 )
-from hilstar.scene.sprites import make_sprites
+from hilstar.scene.sprites import clipped_sprites, make_sprites
 from hilstar.sky.stars import Stars
 from tests.support.stars import stars_at
 

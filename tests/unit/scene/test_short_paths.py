@@ -10,11 +10,9 @@ import pytest
 from hilstar.monitor.geometry import monitor_camera
 from hilstar.rotation import from_radec_roll_deg, to_matrix
 from hilstar.scene import frame_motion
-from hilstar.scene.camera import bounded
+from hilstar.scene.camera import Lens, ResidualField, bounded
 from hilstar.scene.frame_motion import Scan, Turn, swept_sprites
-from hilstar.scene.lens import Lens, ResidualField
-from hilstar.scene.paths import Paths
-from hilstar.scene.short_paths import LIMIT_PX, LIMIT_SHARE, ShortPaths, points_within
+from hilstar.scene.paths import LIMIT_PX, LIMIT_SHARE, Paths, ShortPaths, points_within
 from tests.support.stars import stars_at
 
 SIZE = (1920, 1080)

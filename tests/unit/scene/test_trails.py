@@ -9,7 +9,7 @@ from hilstar.rotation import propagate, to_matrix
 from hilstar.scene.camera import Camera
 from hilstar.scene.psf import footprint_px, pixel_shares
 from hilstar.scene.sprites import Sprites
-from hilstar.scene.trails import Brush, Lit, Trails, View, trails, with_trails
+from hilstar.scene.trails import Brush, Lit, Trails, TrailView, trails, with_trails
 from hilstar.sky.bodies.passes import Cone
 from tests.support.satellites import element_set, satellite_sky
 from tests.support.stars import sprites_at
@@ -82,7 +82,7 @@ def moment_by_moment(sky, t_ns: int, q: np.ndarray, rate: np.ndarray, exposure_s
 
 def streak(sky, t_ns: int, q: np.ndarray, rate: np.ndarray, exposure_s: float) -> Trails:
     seen = sky.passing(Cone(to_matrix(q)[2], 0.5, exposure_s / 2), t_ns)
-    view = View(CAMERA, to_matrix(q), rate)
+    view = TrailView(CAMERA, to_matrix(q), rate)
     return trails(seen, view, Lit(np.full(len(seen), -exposure_s / 2), exposure_s), BRUSH)
 
 
@@ -165,7 +165,7 @@ def test_beyond_what_an_image_may_cost_streaks_are_coarser_and_counted():
     sky, t_ns = lit_moment(LIST)
     q = looking_at(sky.passing(Cone(NORTH, np.pi, 0.0), t_ns).directions(slice(None), np.zeros(1))[0])
     seen = sky.passing(Cone(to_matrix(q)[2], 0.5, 1.0), t_ns)
-    lit, view = Lit(np.array([-1.0]), 2.0), View(CAMERA, to_matrix(q), np.zeros(3))
+    lit, view = Lit(np.array([-1.0]), 2.0), TrailView(CAMERA, to_matrix(q), np.zeros(3))
     fine, coarse = (trails(seen, view, lit, Brush(BRUSH.footprint_px, SIGMA_PX, most)) for most in (2000, 5))
     assert (len(coarse.sprites), coarse.sprites.capped, fine.sprites.capped) == (5, 1, 0)
     assert image_of(coarse.sprites).sum() == pytest.approx(image_of(fine.sprites).sum(), rel=0.02)

@@ -7,8 +7,7 @@ import pytest
 
 from hilstar.bench.bench_file import bench_file_of
 from hilstar.rotation import to_matrix
-from hilstar.twin.verify.blends import BLEND_SIGMAS, with_blends_as_one
-from hilstar.twin.verify.measure import Comparison
+from hilstar.twin.verify.measure import BLEND_SIGMAS, Comparison, with_blends_as_one
 from hilstar.twin.verify.twin import Field, Twin
 from tests.support.benches import ORION_Q, TWIN, bench_text
 from tests.support.stars import stars_at

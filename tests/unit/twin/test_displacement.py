@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hilstar.scene.camera import Camera
-from hilstar.twin.verify.displacement import Displaced, fit_geometry
+from hilstar.twin.verify.measure import Displaced, fit_geometry
 
 FOCAL_PX = 1000.0
 TRACKER = Camera((400, 400), FOCAL_PX, (199.5, 199.5), np.eye(3))

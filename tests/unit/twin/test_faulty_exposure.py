@@ -17,8 +17,8 @@ from hilstar.bench.faults.scenario import parse_scenario
 from hilstar.bench.faults.views import effects_at
 from hilstar.rotation import angle_between_rad
 from hilstar.twin.batch import faulty_exposure
+from hilstar.twin.pictures import TrackerPictures
 from hilstar.twin.simulator import Simulator
-from hilstar.twin.tracker_pictures import TrackerPictures
 from hilstar.units import ARCSEC_PER_RAD, NS_PER_S
 from tests.support.benches import ORION_Q, SMALL_BENCH
 

@@ -7,8 +7,7 @@ import pytest
 
 from hilstar.bench.bench_file import bench_file_of
 from hilstar.bench.faults.scenario import parse_scenario
-from hilstar.twin.verify.run import verify
-from hilstar.twin.verify.summary import summarise, summary_lines
+from hilstar.twin.verify.summary import summarise, summary_lines, verify
 from tests.support.benches import TWIN, bench_text
 
 # A 10-bit monitor with exact codes: the bench's own limits for its stars (verify's defaults are 0.05 mag and 0.1 px).

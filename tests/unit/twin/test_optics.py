@@ -13,10 +13,8 @@ from hilstar.monitor.geometry import monitor_camera
 from hilstar.monitor.quantise import Panel
 from hilstar.monitor.response import gamma_response, table_response
 from hilstar.rotation import to_matrix
-from hilstar.scene.camera import bounded
-from hilstar.scene.lens import Lens
-from hilstar.twin.bench_geometry import BenchGeometry
-from hilstar.twin.optics import TwinOptics
+from hilstar.scene.camera import Lens, bounded
+from hilstar.twin.optics import BenchGeometry, TwinOptics
 from hilstar.twin.verify.measure import on_screen_median
 
 TRACKER_PX = (60, 50)

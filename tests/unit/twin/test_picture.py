@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import label
 
-from hilstar.twin.picture import MAX_RADIUS_PX, exposure_picture
+from hilstar.twin.pictures import MAX_RADIUS_PX, exposure_picture
 
 FULL = 2900  # DN at which every one of these stars is full
 

@@ -10,8 +10,8 @@ from scipy.special import ndtr
 
 from hilstar.tracker.centroiders import FAMILY
 from hilstar.tracker.centroids import Background, Centroids, CentroidSettings
-from hilstar.twin.verify.display_errors import median
 from hilstar.twin.verify.star_finder import StarFinder, crowded, nearest, shared
+from hilstar.twin.verify.verdict import median
 
 # Of a star of sigma 1 px in pixels: a window's S-curve, a box's cut wings.
 BIAS_PX = {"moment": 1e-3, "window": 0.03, "wide": 0.03, "fit": 1e-3, "box3": 0.3, "box5": 0.1}

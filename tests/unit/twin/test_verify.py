@@ -12,11 +12,9 @@ from hilstar.bench.bench_file import read_bench_file
 from hilstar.bench.config import read_config
 from hilstar.errors import InputError
 from hilstar.monitor.response import bit_stealing_response, gamma_response, srgb_response
-from hilstar.twin.verify.light import levels_of
 from hilstar.twin.verify.measure import Comparison
-from hilstar.twin.verify.run import verify
-from hilstar.twin.verify.summary import summarise
-from hilstar.twin.verify.twin import Twin, changed_keys, true_geometry
+from hilstar.twin.verify.summary import summarise, verify
+from hilstar.twin.verify.twin import Twin, changed_keys, levels_of, true_geometry
 from hilstar.twin.verify.verdict import Verdict, judge
 from tests.support.benches import TWIN, bench_text
 

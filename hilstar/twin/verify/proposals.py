@@ -3,11 +3,17 @@
 A change is proposed only if the bench file with it is read, drawn and passes over the same fields. Among as many keys, those
 come first that cost time alone (`quantisation`, `bit_stealing`), then the one that clips bright stars, then the one that drops
 faint ones. Of magnitudes the largest change is tried first, and the smallest that passes is proposed.
+
+What a proposal says to a person, and the bench file with it.
 """
 
 from __future__ import annotations
 
+import difflib
+import json
 import math
+import os
+import stat
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import combinations
@@ -18,11 +24,11 @@ from hilstar.bench.bench_file import BenchFile, bench_file_of
 from hilstar.bench.bench_file_edit import with_key
 from hilstar.bench.config import DEFAULT_BRIGHTEST_V_MAG
 from hilstar.error_spread import ErrorSpread
-from hilstar.errors import InputError
-from hilstar.twin.verify.display_errors import p95
-from hilstar.twin.verify.run import verify
-from hilstar.twin.verify.summary import summarise
-from hilstar.twin.verify.verdict import Verdict
+from hilstar.errors import InputError, cannot_write
+from hilstar.files import write_whole
+from hilstar.reading import MAX_TOML_BYTES, read_text
+from hilstar.twin.verify.summary import summarise, verify
+from hilstar.twin.verify.verdict import Verdict, p95
 
 # Further than this a change is another test: full scale 4 times fainter, or a third of the stars.
 BRIGHTER_MAG = (0.5, 1.0, 1.5)
@@ -250,3 +256,53 @@ def _what_fails(verdict: Verdict) -> str:
     if not failing:
         return f"at best: {verdict.reasons[0]}"
     return f"{monitor.bits} bits cannot show stars of V {failing[0].v_from} to {failing[-1].v_to} within the limits"
+
+
+def proposal_lines(file: BenchFile, proposal: Proposal) -> list[str]:
+    """The proposal for a person, with the difference that it makes in the bench file."""
+    verified = proposal.verified
+    if not proposal.changes:
+        lines = [f"{'proposal':20}none: {proposal.cannot}"]
+        if verified is not None:
+            lines.append(f"{'':20}the best is {_words(proposal.best)}: {_figures(verified)}")
+        return lines
+    said = "" if verified is None else f": passes, {_figures(verified)}"
+    return [f"{'proposal':20}{_words(proposal.changes)}{said}", *difference(file, proposal)]
+
+
+def difference(file: BenchFile, proposal: Proposal) -> list[str]:
+    """The lines that a proposal changes in the bench file, as a unified diff."""
+    before, after = file.text.splitlines(), changed_text(file.text, proposal.changes).splitlines()
+    return list(difflib.unified_diff(before, after, str(file.path), str(file.path), n=1, lineterm=""))
+
+
+def check_writable(file: BenchFile) -> None:
+    """Refuse (InputError) a bench file that may not be written, before anything is tried."""
+    try:
+        status = file.path.stat()
+    except OSError as error:
+        raise cannot_write(file.path, error) from error
+    if not stat.S_ISREG(status.st_mode):
+        raise cannot_write(file.path, "it is no regular file", "leave --write out, and change the file yourself")
+    # Root may write what nobody should: a file without any write permission was protected by somebody.
+    protected = not status.st_mode & (stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH)
+    if protected or not os.access(file.path, os.W_OK):
+        raise cannot_write(file.path, "it is read-only", "copy it, and verify the copy")
+
+
+def write_proposal(file: BenchFile, proposal: Proposal) -> None:
+    """Make the changes in the bench file. Raises InputError where it cannot be written, or has changed since it was read."""
+    check_writable(file)
+    if read_text(file.path, "give the path of a bench file", MAX_TOML_BYTES) != file.text:
+        raise InputError(f"{file.path}: has changed since it was read; run verify again")
+    write_whole(file.path, changed_text(file.text, proposal.changes))
+
+
+def _words(changes: tuple[Change, ...]) -> str:
+    return ", ".join(f"[{change.table}] {change.key} = {json.dumps(change.value)}" for change in changes)
+
+
+def _figures(verified: Verified) -> str:
+    flux, centroid = verified.flux_error_mag.p95, verified.centroid_error_px.p95
+    at_95 = f"{flux:.3f} mag and {centroid:.3f} px at 95 %, " if flux is not None and centroid is not None else ""
+    return f"{at_95}{verified.stars} stars, {verified.lost} lost, {verified.clipped} clipped, {verified.not_shown} not shown"

@@ -1,0 +1,170 @@
+"""Exposures of the virtual tracker as files (FITS, 16-bit greyscale, a picture for people), and as pictures for a simulation.
+
+In the picture for people bright stars are discs, because saturated pixels cannot tell them apart.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from hilstar.attitude.wire.packet import AttitudeSample
+from hilstar.bench.bench_file import BenchFile
+from hilstar.bench.config import BenchConfig
+from hilstar.bench.faults.desk import Now
+from hilstar.bench.faults.kinds import Drop, Freeze
+from hilstar.bench.faults.scenario import NO_SCENARIO, Scenario
+from hilstar.bench.frame import Bench
+from hilstar.bench.frame_files import sky_header, write_fits
+from hilstar.files import written
+from hilstar.scene.camera import Camera
+from hilstar.scene.exposure_motion import Motion
+from hilstar.twin.faulty_exposure import FaultyExposure, Piece
+from hilstar.twin.simulator import Exposure, FrameNoise, Simulator, simulator_view
+
+BOX_PX = 5  # side of the square over which a star's light is summed: where the middle is full, the wings still grow
+MAX_RADIUS_PX = 8  # of the brightest star's disc
+# A disc's radius goes with this power of the star's share of the brightest: enough for a sum that saturates, in which five
+# magnitudes are only a factor of ten.
+RADIUS_POWER = 0.77
+STAR_SIGMA = 8.0  # a sum further above the background is a star
+PIXEL_GREY = 0.7  # the brightest grey of a pixel that no disc covers
+MAX_CARD = 60  # characters of text on a card of FITS
+PNG_BITS = 16
+
+
+def exposure_picture(dn: npt.NDArray[np.uint16]) -> npt.NDArray[np.uint8]:
+    """Greys (height, width) of a frame: asinh of the light above the background, and a disc for each star."""
+    from scipy.ndimage import maximum_filter, uniform_filter
+
+    light = dn.astype(np.float32)
+    light -= np.median(light)
+    low, high = np.percentile(light, (16, 84))
+    noise = max(float(high - low) / 2, 1.0)
+    flux = np.maximum(uniform_filter(light, BOX_PX), 0) * BOX_PX**2
+    grey = _stretched(flux, noise * BOX_PX)
+    picture = PIXEL_GREY * _stretched(light, noise)
+    peaks = np.nonzero((flux == maximum_filter(flux, BOX_PX)) & (flux > STAR_SIGMA * noise * BOX_PX))
+    if len(peaks[0]):
+        radius = MAX_RADIUS_PX * (flux[peaks] / flux.max()) ** RADIUS_POWER
+        _draw_discs(picture, peaks, np.rint(radius).astype(np.intp), grey[peaks])
+    return np.rint(255 * np.clip(picture, 0, 1)).astype(np.uint8)
+
+
+def _stretched(light: npt.NDArray[Any], noise: float) -> npt.NDArray[Any]:
+    top = max(float(light.max()) / noise, 1.0)
+    return np.asarray(np.arcsinh(np.maximum(light, 0) / noise) / np.arcsinh(top))
+
+
+def _draw_discs(picture: npt.NDArray[Any], peaks: Any, radius: npt.NDArray[np.intp], grey: npt.NDArray[Any]) -> None:
+    """Draw a disc about each peak (rows, columns); where two overlap the brighter one shows."""
+    reach = np.arange(-MAX_RADIUS_PX, MAX_RADIUS_PX + 1)
+    for down in reach:
+        for across in reach:
+            inside = radius >= np.hypot(down, across)
+            rows, columns = peaks[0][inside] + down, peaks[1][inside] + across
+            on = (rows >= 0) & (rows < picture.shape[0]) & (columns >= 0) & (columns < picture.shape[1])
+            np.maximum.at(picture, (rows[on], columns[on]), grey[inside][on])
+
+
+class Imager(Protocol):
+    """What makes exposures: a bench file, and the tracker's camera."""
+
+    file: BenchFile
+    config: BenchConfig
+    camera: Camera
+
+
+def write_exposure_fits(path: Path, simulator: Imager, exposure: Exposure, noise: FrameNoise) -> None:
+    """The virtual tracker's DN (uint16) and, as second HDU, the truth table; the header says how both were made."""
+    from astropy.io import fits
+
+    tracker = simulator.config.tracker
+    epoch_jyear, q = simulator.config.sky.epoch_jyear, exposure.motion.q_icrs_to_cam
+    header = sky_header(simulator.file.sha256, epoch_jyear, q, simulator.camera)
+    header["BUNIT"] = ("adu", "digital numbers (DN)")
+    header["EXPTIME"] = (tracker.exposure_s, "[s]")
+    for name, rate in zip(("RATEX", "RATEY", "RATEZ"), np.degrees(exposure.motion.rate_cam_rad_s), strict=True):
+        header[name] = (float(rate), "[deg/s] of cam in icrs, cam components")
+    header["NOISE"] = (noise.kind, "full, or none: the mean signal through the ADC")
+    header["SEED"] = (noise.seed, "of the frame's noise")
+    header["DEVSEED"] = (tracker.detector.device_seed, "of the device's fixed patterns")
+    header["GAIN"] = (tracker.detector.gain_e_per_dn, "[electron/adu]")
+    header["OFFSET"] = (tracker.detector.offset_dn, "[adu]")
+    header["FULLWELL"] = (tracker.detector.full_well_e, "[electron]")
+    header["BITS"] = (tracker.detector.bits, "of the ADC")
+    if exposure.faults:
+        header["FAULTS"] = ", ".join(exposure.faults)[:MAX_CARD]
+    header["NSTARS"] = (len(exposure.truth), "stars in view")
+    hdus = fits.HDUList([fits.PrimaryHDU(exposure.dn, header), fits.BinTableHDU(exposure.truth, name="TRUTH")])
+    write_fits(path, hdus)
+
+
+def write_exposure_png(path: Path, dn: npt.NDArray[np.uint16]) -> None:
+    """A picture of a tracker's frame for a person (see `twin.picture`)."""
+    from PIL import Image
+
+    written(path, lambda file: Image.fromarray(exposure_picture(dn)).save(file, "PNG"))
+
+
+def write_dn_picture(path: Path, dn: npt.NDArray[np.uint16]) -> None:
+    """The DN themselves, unscaled, as 16-bit greyscale: TIFF where the name ends in .tif or .tiff, else PNG."""
+    from PIL import Image
+
+    form = "TIFF" if path.suffix.lower() in {".tif", ".tiff"} else "PNG"
+    written(path, lambda file: Image.fromarray(dn).save(file, form))
+
+
+class TrackerPictures:
+    """A PNG for each attitude, drawn in the bench's GL context and freed with the bench.
+
+    The exposure is centred on the attitude; stars smear where the attitude has a rate. Noise is full, and that of the n-th
+    picture of a run is always the same. `now` says which faults of a scenario are on.
+    """
+
+    def __init__(self, bench: Bench, scenario: Scenario = NO_SCENARIO, now: Callable[[], tuple[Now, ...]] = tuple) -> None:
+        self._simulator = Simulator(bench.file, bench.renderer.context)
+        self._noise, self._count = FrameNoise("full"), 0
+        self._now = now
+        self._stood: Motion | None = None
+        self._view = simulator_view(self._simulator, scenario)
+
+    def __call__(self, sample: AttitudeSample) -> bytes:
+        """The picture of the tracker at an attitude."""
+        rate = np.zeros(3) if sample.rate_cam_rad_s is None else sample.rate_cam_rad_s
+        motion = self._simulator.motion(sample.q_icrs_to_cam, rate, sample.t_ns)
+        faults = self._faults(motion)
+        rng = self._noise.rng(self._count)
+        exposure = self._simulator.expose(motion, rng, sample.velocity_km_s, sample.place_km, faults)
+        self._count += 1
+        return dn_png(exposure.dn, self._simulator.config.tracker.detector.bits)
+
+    def _faults(self, motion: Motion) -> FaultyExposure | None:
+        """The exposure with the faults of the display's frame; where that stands still, at the attitude at which it does."""
+        now = self._now()
+        if not any(isinstance(one.fault, Freeze | Drop) for one in now):
+            self._stood = motion
+        elif self._stood is not None:
+            motion = replace(self._stood, rate_cam_rad_s=np.zeros(3))
+        return FaultyExposure(self._view, (Piece(motion, now),)) if now else None
+
+
+def dn_png(dn: npt.NDArray[np.uint16], bits: int) -> bytes:
+    """DN (height, width) of so many bits as a greyscale PNG of 16, which its sBIT says: DN = value >> (16 - bits).
+
+    The leading bits are the DN's, so that a reader that keeps 8 of them still sees a picture.
+    """
+    from PIL import Image, PngImagePlugin
+
+    about: Any = PngImagePlugin.PngInfo()
+    about.add(b"sBIT", bytes([bits]))
+    image = Image.fromarray(np.left_shift(dn, PNG_BITS - bits, dtype=np.uint16))
+    data = io.BytesIO()
+    image.save(data, "PNG", compress_level=1, pnginfo=about)
+    return data.getvalue()

@@ -1,1 +1,0 @@
-"""What `verify --propose` would change in a bench file, and what it says of it."""

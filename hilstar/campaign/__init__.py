@@ -1,1 +1,1 @@
-"""Campaigns: many cases of a bench, over every core and machine, and what the tracker's errors are over all of them."""
+"""Campaigns: many cases of a bench, run over every core and machine, into one table with its error budget."""

@@ -26,9 +26,9 @@ import numpy.typing as npt
 from scipy.stats import rankdata
 
 from hilstar.arrays import FloatArray, IntArray
+from hilstar.assess.budget import assess_cases
+from hilstar.assess.places import Scale
 from hilstar.bench.config import BenchConfig
-from hilstar.campaign.budget.budget import assess_cases
-from hilstar.campaign.budget.scale import Scale
 from hilstar.charts import INK, MUTED, chart, write_csv
 from hilstar.errors import InputError
 from hilstar.rotation import from_rotation_vectors, multiply

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hilstar.assess.bench_effects import display_errors
 from hilstar.bench.bench_file import bench_file_of
-from hilstar.campaign.assessment.display_cost import display_errors
 from hilstar.rotation import from_radec_roll_deg, from_rotation_vector
 from hilstar.units import ARCSEC_PER_RAD
 from tests.support.benches import TWIN, bench_text

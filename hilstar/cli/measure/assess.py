@@ -36,9 +36,8 @@ def assess(
     as_json: Json = False,
 ) -> None:
     """Find a tracker's error budget: bias, field-of-view error, pixel error, noise, clock, availability, wrong answers."""
-    from hilstar.campaign.assessment.assess import Wanted, assess_files
-    from hilstar.campaign.assessment.figures import budget_of, lines_of, write_tables
-    from hilstar.campaign.assessment.page import write_page
+    from hilstar.assess.assessment import Wanted, assess_files
+    from hilstar.assess.report import budget_of, lines_of, write_page, write_tables
     from hilstar.files import check_directory, make_directory
 
     check_directory("-o", output)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hilstar.campaign.budget.components import EDGES, components_of
+from hilstar.assess.components import EDGES, components_of
 from tests.support.planted_tracker import SCALE, attitude, scalar_first, scan, star_px, waves
 
 # From 4000 answers the noise is known to 0.7 %, and a pixel error of 0.6 of it to 1.5 %. A star whose direction

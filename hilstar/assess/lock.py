@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import FloatArray
-from hilstar.campaign.budget.commanded import Commanded
+from hilstar.run.record.commanded import Commanded
 
 MISSED_CYCLES = 1.5  # between right answers: more is an outage
 LOST_CYCLES = 3.0  # of the tracker without a right answer: its lock is lost

@@ -1,4 +1,9 @@
-"""A tracker's telemetry against the ledger of the run that it saw: the whole assessment."""
+"""What a run's ledger says of the commanded attitude, and of the bench that showed it.
+
+Telemetry brought onto a run's clock, or refused with what is wrong with it.
+
+A tracker's telemetry against the ledger of the run that it saw: the whole assessment.
+"""
 
 from __future__ import annotations
 
@@ -10,23 +15,153 @@ from typing import Literal
 import numpy as np
 
 from hilstar.arrays import FloatArray
-from hilstar.campaign.assessment.display_cost import DisplayCost, display_cost, display_errors
-from hilstar.campaign.assessment.lock import Lock, lock_of
-from hilstar.campaign.assessment.matching import matched, tau_of
-from hilstar.campaign.assessment.run_ledger import RunLedger, read_ledger
-from hilstar.campaign.assessment.slices import Slice, field_magnitudes, slices_of
-from hilstar.campaign.assessment.telemetry import Telemetry, read_telemetry
-from hilstar.campaign.budget.budget import Axes, Decomposed, assess_run, axes_of_variance
-from hilstar.campaign.budget.components import MIN_ROWS
+from hilstar.assess.bench_effects import DisplayCost, Slice, display_cost, display_errors, field_magnitudes, slices_of
+from hilstar.assess.budget import Axes, Decomposed, assess_run, axes_of_variance
+from hilstar.assess.clock import CoarseClock, coarse_offset, speed_offsets
+from hilstar.assess.components import MIN_ROWS
+from hilstar.assess.lock import Lock, lock_of
+from hilstar.assess.places import Scale
+from hilstar.attitude.logs.telemetry import Telemetry, read_telemetry
+from hilstar.bench.bench_file import BenchFile, bench_file_of
+from hilstar.bench.config import BenchConfig
+from hilstar.calibrate.alignment.conventions import refuse_conventions
+from hilstar.calibrate.alignment.pairs import COMMANDED, Pairs
 from hilstar.errors import HilstarError, InputError
-from hilstar.units import ARCSEC_PER_RAD
+from hilstar.rotation import to_matrix, to_rotation_vector
+from hilstar.run.record.commanded import Commanded
+from hilstar.run.record.ledger_reader import NO_FRAMES, config_of, frame_records, read_head
+from hilstar.units import ARCSEC_PER_RAD, NS_PER_S
 
+NOT_SHOWN = (np.nan,) * 4
+AGREE_RAD = np.radians(1.0)  # half of the answers of one sky are this near to one rotation
+MAX_TURN_RAD = np.radians(5.0)  # from commanded to reported: more is another frame
+NEAR_AXES_RAD = np.radians(5.0)
+MIN_PAIRS = 8
 SEED = 0  # of the bootstrap: the same files give the same intervals
 SMALL = 0.3  # of the noise: a larger error of the display is said
 BENT_ARCSEC = 0.1
 TOGETHER, SLOW_SHARE = 20, 0.1  # answers, and a share of the noise's variance that is said
 Stamp = Literal["start", "middle", "end"]
 MIDDLE = {"start": 0.5, "middle": 0.0, "end": -0.5}  # of an exposure, from the stamp on
+
+
+@dataclass(frozen=True)
+class RunLedger:
+    """A run: the commanded attitudes, whose times are seconds after `zero_ns` of the sender's clock, and its bench."""
+
+    path: Path
+    head: dict[str, str]
+    config: BenchConfig
+    commanded: Commanded
+    zero_ns: int
+    frames: int
+    not_plain: int
+
+    @property
+    def scale(self) -> Scale:
+        """The tracker's sizes, by the bench file in the ledger."""
+        tracker = self.config.tracker
+        width, height = tracker.resolution_px
+        return Scale(1e3 * tracker.focal_length_mm / tracker.pixel_pitch_um, (width, height))
+
+    def bench_file(self) -> BenchFile:
+        """The bench as it was, by the text in the ledger; what it names has to be where it was. Raises InputError."""
+        return bench_file_of(Path(self.head.get("bench_file", "bench.toml")), self.head.get("bench_text", ""))
+
+
+def read_ledger(path: Path) -> RunLedger:
+    """Read a ledger. Raises InputError for a file that is none, for damage, and for a run without attitudes or bench file."""
+    head = read_head(path)
+    shown: dict[int, tuple[float, ...]] = {}
+    not_plain = 0
+    for record in frame_records(path):
+        plain = record.q is not None and not record.operator and not record.hidden
+        not_plain += record.q is not None and not plain
+        shown[record.light_ns] = record.q if plain and record.q is not None else NOT_SHOWN
+    if not shown:
+        raise InputError(f"{path}: {NO_FRAMES}")
+    light_ns = np.array(sorted(shown), dtype=np.int64)
+    q = np.array([shown[int(t)] for t in light_ns])
+    known = int(np.isfinite(q[:, 0]).sum())
+    if known < 2:
+        why = "operators' keys or a hidden window changed all of them" if not_plain else "none of them has an attitude"
+        raise InputError(f"{path}: {len(light_ns)} frames, and {why}; give the ledger of a run that was sent attitudes")
+    config = config_of(head)
+    if config is None:
+        raise InputError(f"{path}: its head holds no bench file that can be read; give the ledger of serve or replay --ledger")
+    zero_ns = int(light_ns[0])
+    return RunLedger(path, head, config, Commanded((light_ns - zero_ns) / NS_PER_S, q), zero_ns, len(light_ns), not_plain)
+
+
+def tau_of(run: RunLedger, telemetry: Telemetry) -> tuple[FloatArray, float]:
+    """The telemetry's times (n,), s, near the run's where the two overlap as they are, and what was subtracted from them, s."""
+    end_ns = run.zero_ns + round(run.commanded.t_s[-1] * NS_PER_S)
+    overlap = telemetry.t_ns[0] <= end_ns and telemetry.t_ns[-1] >= run.zero_ns
+    base_ns = run.zero_ns if overlap else int(telemetry.t_ns[0])
+    return (telemetry.t_ns - base_ns) / NS_PER_S, (base_ns - run.zero_ns) / NS_PER_S
+
+
+def matched(run: RunLedger, telemetry: Telemetry, tau_s: FloatArray, q: FloatArray) -> CoarseClock:
+    """Where valid answers (n, 4) at times (n,) lie on the run's clock.
+
+    Raises InputError for other conventions than hilstar's, for another frame, and for answers of another run.
+    """
+    commanded = run.commanded
+    coarse = coarse_offset(commanded, tau_s, q)
+    if coarse is not None and coarse.spread_rad <= AGREE_RAD and coarse.turn_rad <= MAX_TURN_RAD:
+        return coarse
+    if coarse is not None and coarse.spread_rad <= AGREE_RAD:
+        named = _other_axes(coarse.rotation)
+        if named:
+            raise InputError(f"{telemetry.path}: {_turned(coarse.rotation)}: {named}")
+    offsets = [] if coarse is None else [coarse.offset_s]
+    for offset in [*offsets, *speed_offsets(commanded, tau_s, q).tolist()]:
+        _refuse(run, telemetry, tau_s + offset, q)
+    if coarse is not None and coarse.spread_rad <= AGREE_RAD:
+        w, x, y, z = (float(value) for value in coarse.rotation * [1, -1, -1, -1])
+        cure = f"turn them back by the quaternion {w:.6f},{x:.6f},{y:.6f},{z:.6f} from the left"
+        raise InputError(f"{telemetry.path}: {_turned(coarse.rotation)}: another frame or mounting; {cure}")
+    raise InputError(
+        f"{telemetry.path}: at no offset of its clock do the reported attitudes follow those of {run.path}, lit for"
+        f" {commanded.t_s[-1]:.6g} s; give the telemetry of this run, of which no more than half may be wild"
+    )
+
+
+def _refuse(run: RunLedger, telemetry: Telemetry, t_s: FloatArray, q: FloatArray) -> None:
+    """Refuse answers that agree with the run at these times by another convention; nothing where none fits."""
+    moments = run.commanded.at(t_s)
+    if moments.known.sum() < max(MIN_PAIRS, 0.1 * len(t_s)):
+        return
+    rows = np.flatnonzero(moments.known)
+    pairs = Pairs(telemetry.path, telemetry.line[telemetry.valid][rows], moments.q[rows], q[rows], names=COMMANDED)
+    try:
+        refuse_conventions(pairs, float(np.arctan(0.5 * np.hypot(*run.scale.resolution_px) / run.scale.focal_px)))
+    except InputError as refusal:
+        if "wild" not in str(refusal) and "out of view" not in str(refusal):
+            raise
+
+
+def _turned(rotation: FloatArray) -> str:
+    turn = to_rotation_vector(rotation)
+    angle = float(np.linalg.norm(turn))
+    axis = ",".join(f"{value:.3f}" for value in turn / max(angle, 1e-12))
+    return f"the reported attitudes are turned by {np.degrees(angle):.4g} degrees about {axis} (cam) from the commanded ones"
+
+
+def _other_axes(rotation: FloatArray) -> str:
+    """Which axes a large constant rotation (4,) stands for, "" where it is none of the 24 ways to name right-handed axes."""
+    matrix = to_matrix(rotation)
+    nearest = np.zeros((3, 3))
+    for row in range(3):
+        column = int(np.argmax(np.abs(matrix[row])))
+        nearest[row, column] = np.sign(matrix[row, column])
+    off = np.arccos(np.clip((np.trace(matrix @ nearest.T) - 1) / 2, -1, 1))
+    if abs(np.linalg.det(nearest) - 1) > 1e-9 or off > NEAR_AXES_RAD:
+        return ""
+    names = ["xyz"[int(np.argmax(np.abs(row)))] for row in nearest]
+    signs = ["-" if row.sum() < 0 else "+" for row in nearest]
+    axes = ", ".join(f"{own} = {sign}{name}" for own, sign, name in zip("xyz", signs, names, strict=True))
+    return f"they fit axes with {axes} of hilstar's; write them for x right, y down in the image, z boresight"
 
 
 @dataclass(frozen=True, slots=True)

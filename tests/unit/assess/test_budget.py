@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hilstar.campaign.budget.budget import Decomposed, assess_cases, assess_run
-from hilstar.campaign.budget.coarse_clock import coarse_offset
-from hilstar.campaign.budget.commanded import Commanded
+from hilstar.assess.budget import Decomposed, assess_cases, assess_run
+from hilstar.assess.clock import coarse_offset
 from hilstar.errors import InputError
+from hilstar.run.record.commanded import Commanded
 from tests.support.planted_tracker import (
     ARCSEC_PER_RAD,
     ROLL,

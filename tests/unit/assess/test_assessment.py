@@ -14,11 +14,10 @@ from scipy.spatial.transform import Rotation
 
 from hilstar import charts
 from hilstar.arrays import FloatArray
-from hilstar.campaign.assessment import page
-from hilstar.campaign.assessment.display_cost import display_cost, turn_between
-from hilstar.campaign.assessment.lock import lock_of
-from hilstar.campaign.assessment.slices import slices_of
-from hilstar.campaign.budget.commanded import Commanded
+from hilstar.assess import report
+from hilstar.assess.bench_effects import display_cost, slices_of, turn_between
+from hilstar.assess.lock import lock_of
+from hilstar.run.record.commanded import Commanded
 from tests.support.commands import run_hilstar_here
 from tests.support.figures import assert_legible
 from tests.support.planted_run import write_ledger, write_run, write_telemetry
@@ -34,7 +33,7 @@ def planted() -> Planted:
 
 def test_a_run_gives_the_budget_on_one_page_and_names_each_wrong_answer(tmp_path: Path, planted: Planted, monkeypatch) -> None:
     drawn: list[Figure] = []
-    monkeypatch.setattr(page, "svg", lambda figure: drawn.append(figure) or charts.svg(figure))
+    monkeypatch.setattr(report, "svg", lambda figure: drawn.append(figure) or charts.svg(figure))
     ledger, telemetry = write_run(tmp_path, planted)
     out = tmp_path / "out"
     run = run_hilstar_here("assess", ledger, telemetry, "-o", out, "--json", "--display-attitudes", "0")

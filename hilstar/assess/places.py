@@ -1,4 +1,6 @@
-"""Where a star field stands in the field of view, and functions of that place.
+"""The sizes of a tracker that turn angles into pixels.
+
+Where a star field stands in the field of view, and functions of that place.
 
 A place is six numbers in pixels: the boresight (ICRS) times the focal length, and the camera's x axis times the distance from
 the boresight at which stars usually stand. Two attitudes are as far apart as they move a star field on the detector, so
@@ -17,10 +19,30 @@ from scipy import linalg, sparse
 from scipy.spatial import cKDTree
 
 from hilstar.arrays import FloatArray, IntArray
+from hilstar.units import ARCSEC_PER_RAD
 
+ROLL_SHARE = 0.3  # of the detector's side: the usual distance of a star from the boresight
 REACH = 2.5  # of a bump, in spacings: a sine of four spacings or longer is then met to 1 %
 CLOSE = 0.7  # of a spacing: nearer bumps are one
 RIDGE = 1e-7  # of the mean diagonal: bumps that few samples tell apart
+
+
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """A tracker's focal length and detector's sides, in pixels."""
+
+    focal_px: float
+    resolution_px: tuple[int, int]
+
+    @property
+    def roll_px(self) -> float:
+        """How far from the boresight stars usually stand."""
+        return ROLL_SHARE * min(self.resolution_px)
+
+    @property
+    def pixel_arcsec(self) -> float:
+        """A pixel in the middle of the field."""
+        return ARCSEC_PER_RAD / self.focal_px
 
 
 def axes_of(q_icrs_to_cam: FloatArray) -> FloatArray:

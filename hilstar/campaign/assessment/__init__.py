@@ -1,1 +1,0 @@
-"""A run assessed: its ledger and the tracker's telemetry in, the error budget on one page out."""

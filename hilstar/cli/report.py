@@ -18,7 +18,7 @@ def report(
     as_json: Json = False,
 ) -> None:
     """Report a run on one page: pictures, timing, attitude age, missed frames, packets, events and memory."""
-    from hilstar.console.report.write import report as write_report
+    from hilstar.console.report import report as write_report
     from hilstar.run.record.report import table_rows
 
     check_directory("-o", output)

@@ -8,9 +8,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from hilstar.arrays import FloatArray
 from hilstar.bench.cameras import tracker_camera
+from hilstar.render.aids import AidLevels
 from hilstar.rotation import direction_of, to_matrix, to_radec_roll_deg
 from hilstar.scene.camera import Camera
 from hilstar.sky.catalog import label_of, load_catalog, star_names
@@ -31,7 +33,7 @@ PX_DIGITS, SKY_DIGITS = 2, 4
 
 
 @dataclass(frozen=True, slots=True)
-class Marks:
+class CameraMarks:
     """What needs no stars: the boresight, the tracker's outline and the lines of RA and Dec, by the two cameras of a bench."""
 
     monitor: Camera
@@ -101,7 +103,7 @@ class Marks:
 class Overlay:
     """The marks of a bench's two cameras, and the stars bright enough for the monitor."""
 
-    marks: Marks
+    marks: CameraMarks
     stars: Stars
 
     @property
@@ -169,7 +171,7 @@ class Overlay:
 
 def overlay_of(bench: Bench) -> Overlay:
     """The overlay of an assembled bench."""
-    return Overlay(Marks(bench.camera, tracker_camera(bench.config.tracker, bench.file.folder)), bench.shown_stars)
+    return Overlay(CameraMarks(bench.camera, tracker_camera(bench.config.tracker, bench.file.folder)), bench.shown_stars)
 
 
 def catalogue_sky() -> dict[str, Any]:
@@ -201,3 +203,24 @@ def _multiples(low: float, high: float, step: float) -> list[float]:
 
 def _digits(step_deg: float) -> int:
     return 0 if step_deg >= 1 else 1 if step_deg >= 0.1 else 2
+
+
+@dataclass(frozen=True, eq=False)
+class OverlayScene:
+    """Plain arrays and small objects, which can be pickled.
+
+    `hip` and `v_mag` (n,) are those of the bench's shown stars, `names` what those without a HIP number are called, by place,
+    and `sky` is the answer of `GET /sky`. `aids_in_levels` says that levels have the operator's aids in them already.
+    """
+
+    marks: CameraMarks
+    hip: npt.NDArray[np.int32]
+    v_mag: npt.NDArray[np.float32]
+    names: dict[int, str]
+    sky: dict[str, Any]
+    aids: AidLevels
+    aids_in_levels: bool
+
+    def label(self, star: int) -> str:
+        """What is written beside a star."""
+        return self.names.get(star) or label_of(int(self.hip[star]))

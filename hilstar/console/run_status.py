@@ -33,7 +33,7 @@ ALIVE_NS, ALIVE_PERIODS = NS_PER_S, 3.0
 
 
 @dataclass(frozen=True, slots=True)
-class Source:
+class RunSource:
     """What a run shows: where its attitudes come from, on what it is drawn, and how many frames there will be."""
 
     attitudes: str
@@ -42,7 +42,7 @@ class Source:
     frames: float = math.inf
 
 
-class Line(NamedTuple):
+class StatusLine(NamedTuple):
     """One line of the status: what of, what it says, and whether that is as it should be."""
 
     label: str
@@ -53,7 +53,7 @@ class Line(NamedTuple):
 class RunStatus:
     """What a run is doing, from the newest frame that `see` was given."""
 
-    def __init__(self, source: Source, ledger: LedgerSwitch | None = None) -> None:
+    def __init__(self, source: RunSource, ledger: LedgerSwitch | None = None) -> None:
         self._source = source
         self._ledger = ledger
         self._begun_ns = time.monotonic_ns()
@@ -88,11 +88,11 @@ class RunStatus:
         told = f"{tally.frames} frames, {tally.missed_frames} missed; {packets.received} packets, {packets.refused} refused"
         return f"attitude {attitude.text}; {told}"
 
-    def lines(self, now_ns: int) -> list[Line]:
+    def lines(self, now_ns: int) -> list[StatusLine]:
         """The status at a host time; rates are since it was last asked for."""
         shown, running = self._shown, self._running
         if shown is None or running is None:
-            return [Line("frames", "none yet"), *self._about()]
+            return [StatusLine("frames", "none yet"), *self._about()]
         tally, packets = running.tally, running.packets
         then_ns, frames, received = self._before
         self._before = (now_ns, tally.frames, packets.received)
@@ -102,32 +102,34 @@ class RunStatus:
         return [
             _attitude_line(shown),
             self._frames_line(shown, tally, (tally.frames - frames) / seconds, now_ns),
-            Line("packets", told + (f" ({refused})" if refused else ""), not refused),
+            StatusLine("packets", told + (f" ({refused})" if refused else ""), not refused),
             *self._about(),
         ]
 
-    def _frames_line(self, shown: Shown, tally: RunTally, per_s: float, now_ns: int) -> Line:
+    def _frames_line(self, shown: Shown, tally: RunTally, per_s: float, now_ns: int) -> StatusLine:
         total = "" if math.isinf(self._source.frames) else f" of {self._source.frames:.0f}"
         text = f"{tally.frames}{total} ({per_s:.1f}/s), {tally.missed_frames} missed, {tally.stale_frames} stale"
         still_ns = now_ns - shown.swap_ns
         if still_ns > STANDS_STILL_NS:
-            return Line("frames", f"{text}; none for {still_ns / NS_PER_S:.1f} s", False)
-        return Line("frames", text, not tally.missed_frames)
+            return StatusLine("frames", f"{text}; none for {still_ns / NS_PER_S:.1f} s", False)
+        return StatusLine("frames", text, not tally.missed_frames)
 
-    def _about(self) -> Iterator[Line]:
+    def _about(self) -> Iterator[StatusLine]:
         ledger = None if self._ledger is None else self._ledger.current
         if ledger is not None:
             failed = f"; failed: {ledger.failure}" if ledger.failure else ""
             text = printable(f"{ledger.path}, {ledger.size_bytes / 1e6:.1f} MB{failed}")
-            yield Line("ledger", text, ledger.failure is None)
-        yield Line("source", self._source.attitudes)
-        yield Line("display", f"{self._source.refresh_hz:g} Hz, {self._source.renderer}")
+            yield StatusLine("ledger", text, ledger.failure is None)
+        yield StatusLine("source", self._source.attitudes)
+        yield StatusLine("display", f"{self._source.refresh_hz:g} Hz, {self._source.renderer}")
 
 
-def _attitude_line(shown: Shown) -> Line:
+def _attitude_line(shown: Shown) -> StatusLine:
     attitude = shown.attitude
     if attitude is None:
-        return Line("attitude", "none yet: the frames are blank" if shown.missing else "hidden: the frames are blank", False)
+        return StatusLine(
+            "attitude", "none yet: the frames are blank" if shown.missing else "hidden: the frames are blank", False
+        )
     from hilstar.rotation import to_radec_roll_deg  # with NumPy 0.1 s, which Tab and --help do not need
 
     ra_deg, dec_deg, roll_deg = to_radec_roll_deg(attitude.q_icrs_to_cam)
@@ -136,7 +138,7 @@ def _attitude_line(shown: Shown) -> Line:
     if rate is not None:
         text += f", {math.degrees(math.hypot(*rate)):.4g} deg/s"
     text += f", {attitude.age_ns / NS_PER_MS:.0f} ms old"
-    return Line("attitude", text + (": STALE" if shown.stale else ""), not shown.stale)
+    return StatusLine("attitude", text + (": STALE" if shown.stale else ""), not shown.stale)
 
 
 @contextmanager
@@ -172,7 +174,7 @@ def _live(status: RunStatus, stop: threading.Event) -> None:
             stop.wait(LIVE_EACH_S)
 
 
-def _table(lines: list[Line]) -> Table:
+def _table(lines: list[StatusLine]) -> Table:
     from rich.table import Table
     from rich.text import Text
 

@@ -10,8 +10,8 @@ import numpy as np
 import hilstar
 from hilstar.attitude.clock.timeline import Attitude
 from hilstar.attitude.receiver import PacketCounts
-from hilstar.console.feed.board import Board, Want
-from hilstar.console.feed.feed import Feed
+from hilstar.console.publisher import FramePublisher
+from hilstar.console.shared_memory import PictureRequest, SharedMemory
 from hilstar.resources import resource_path
 from hilstar.run.shown import Shown
 from hilstar.run.summary import RunTally
@@ -26,7 +26,7 @@ def main() -> None:
     with hilstar.load(resource_path("configs", "demo.toml")) as bench:
         drawn = bench.draw(np.array(ORION_Q))
         levels = drawn.levels
-        feed = Feed(board := Board.make(levels.nbytes))
+        feed = FramePublisher(memory := SharedMemory.make(levels.nbytes))
         feed.follow(SimpleNamespace(loop=SimpleNamespace(tally=RunTally()), packets=PacketCounts(), tally=RunTally()))
         attitude = Attitude(np.array(ORION_Q), 5_000_000, False)
         base_ns = time.monotonic_ns()
@@ -37,7 +37,7 @@ def main() -> None:
             feed.see(frame)
             took_us.append((time.perf_counter_ns() - begin_ns) / 1e3)
         print(f"numbers of a frame: {np.median(took_us):.1f} us median, {np.percentile(took_us, 99):.1f} us p99")
-        board.want = Want(1, 2**62)
+        memory.want = PictureRequest(1, 2**62)
         took_us = []
         for k in range(PICTURES):
             later = Shown(k, 0, attitude, drawn, swap_ns=base_ns + (FRAMES + 10 * k) * PERIOD_NS)

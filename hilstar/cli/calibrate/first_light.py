@@ -12,7 +12,7 @@ import msgspec
 import typer
 
 from hilstar.cli.options import MAX_SEED, BenchFile, Json, check_files
-from hilstar.cli.show.paging import Console, ConsoleName, Control, Token, page_door
+from hilstar.cli.show.paging import Console, ConsoleName, Control, Token, page_listener
 from hilstar.console.terminal import print_json, say
 from hilstar.errors import InputError, did_you_mean
 from hilstar.files import check_directory
@@ -22,7 +22,7 @@ from hilstar.resources import resource_path
 if TYPE_CHECKING:
     from hilstar.bench import bench_file as files
     from hilstar.calibrate.first_light.image_sources import ImageSource, Pattern
-    from hilstar.console.feed.door import Door
+    from hilstar.console.listener import PageListener
 
 PATCHES = 96
 EXAMPLE_TRUTH = "truth-example.toml"  # in configs, wherever hilstar is installed
@@ -103,10 +103,10 @@ def first_light(
     by_hand = grab is None and virtual is None
     readings = (0 if by_hand else PATCHES) if patches is None else patches
     with (
-        page_door(console, control, token, console_name) as door,
+        page_listener(console, control, token, console_name) as listener,
         closing(_image_source(file, _Sources(grab, virtual, dark, diode, seed))) as source,
         alone_in(make_directory(output)),
-        _shown(door, control, file) as (tell, watch),
+        _shown(listener, control, file) as (tell, watch),
     ):
         session = FirstLightSession(output, file, source, readings, watch)
         code = session.run(frozenset(again or []), tell)
@@ -126,15 +126,15 @@ def first_light(
 
 @contextmanager
 def _shown(
-    door: Door | None, control: bool, file: files.BenchFile
+    listener: PageListener | None, control: bool, file: files.BenchFile
 ) -> Iterator[tuple[Callable[[str], None], Callable[[Pattern], object]]]:
     """Who is told of a session's lines and patterns: the terminal, and the page where there is one."""
-    if door is None:
+    if listener is None:
         yield say, lambda pattern: None
         return
-    from hilstar.console.feed.session import session_page
+    from hilstar.console.publisher import session_page
 
-    with session_page(door, control, file) as feed:
+    with session_page(listener, control, file) as feed:
 
         def tell(line: str) -> None:
             say(line)

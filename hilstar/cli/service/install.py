@@ -16,7 +16,7 @@ from hilstar.console.terminal import say
 from hilstar.errors import InputError, cannot_write
 
 if TYPE_CHECKING:
-    from hilstar.console.feed.door import Address
+    from hilstar.console.listener import ListenAddress
 
 SYSTEMD_S = 30.0  # a run ends within TimeoutStopSec
 
@@ -98,11 +98,11 @@ def _systemctl(*words: str) -> bool:
     return done.returncode == 0
 
 
-def _checked(bench_file: Path, options: list[str]) -> tuple[list[str], Address | None]:
+def _checked(bench_file: Path, options: list[str]) -> tuple[list[str], ListenAddress | None]:
     """The options, if `hilstar serve` takes them, and where its page will be. Raises InputError."""
     from hilstar.cli.parsers import with_values
     from hilstar.cli.show.serve import serve
-    from hilstar.console.feed.door import parse_address
+    from hilstar.console.listener import parse_address
 
     words = with_values(options)
     alone = typer.Typer()

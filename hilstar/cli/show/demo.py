@@ -10,16 +10,16 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 import typer
 
 from hilstar.cli.options import MAX_SEED, Json
-from hilstar.cli.show.paging import Console, ConsoleName, Control, Token, followed, page_door
+from hilstar.cli.show.paging import Console, ConsoleName, Control, Token, followed, page_listener
 from hilstar.cli.show.running import optional_ledger
-from hilstar.console.run_status import RunStatus, Source
+from hilstar.console.run_status import RunSource, RunStatus
 from hilstar.console.terminal import progress, report, say
 from hilstar.files import check_directory
 from hilstar.notices import Notices
 
 if TYPE_CHECKING:
     from hilstar.bench.frame import Bench
-    from hilstar.console.feed.door import Door
+    from hilstar.console.listener import PageListener
     from hilstar.run.serve import Outlet
     from hilstar.run.shown import FrameSink
     from hilstar.run.summary import RunSummary
@@ -47,10 +47,10 @@ def demo(
     from hilstar.run.demo import run_demo, write_pictures
 
     check_directory("-o", output)
-    with page_door(console, control, token, console_name) as door, progress("serving", duration * HZ) as advance:
+    with page_listener(console, control, token, console_name) as listener, progress("serving", duration * HZ) as advance:
 
         def watching(bench: Bench, endpoint: str) -> AbstractContextManager[tuple[FrameSink, Outlet]]:
-            return _watching(bench, endpoint, door, control, lambda shown: advance(shown.number + 1))
+            return _watching(bench, endpoint, listener, control, lambda shown: advance(shown.number + 1))
 
         result = run_demo(output, duration, np.random.default_rng(seed), watching)
     if result.kept and caught() is None:  # after Ctrl-C no pictures are wanted
@@ -80,18 +80,17 @@ def _refuse_stale(summary: RunSummary, as_json: bool) -> NoReturn:
 
 @contextmanager
 def _watching(
-    bench: Bench, endpoint: str, door: Door | None, control: bool, advance: FrameSink
+    bench: Bench, endpoint: str, listener: PageListener | None, control: bool, advance: FrameSink
 ) -> Iterator[tuple[FrameSink, Outlet]]:
     """The progress of the demo, and its page."""
-    from hilstar.console.feed.introduction import Told
-    from hilstar.console.feed.opening import Parts
+    from hilstar.console.publisher import PageParts, RunDescription
     from hilstar.run.record.ledger import NO_SPLIT, Ledger
     from hilstar.run.serve import Outlet
 
     notices = Notices()
-    status = RunStatus(Source(f"bound to {endpoint}", bench.renderer.gl_renderer, bench.config.monitor.refresh_hz))
+    status = RunStatus(RunSource(f"bound to {endpoint}", bench.renderer.gl_renderer, bench.config.monitor.refresh_hz))
     with optional_ledger(None, bench, notices, False, NO_SPLIT) as kept:
-        parts = Parts(bench, notices, kept, lambda path: Ledger(path, bench, notices))
-        page = Told("demo", bench.config.attitude.source, endpoint)
-        with followed(door, control, page, parts, status, advance) as (sink, follower, requests):
+        parts = PageParts(bench, notices, kept, lambda path: Ledger(path, bench, notices))
+        page = RunDescription("demo", bench.config.attitude.source, endpoint)
+        with followed(listener, control, page, parts, status, advance) as (sink, follower, requests):
             yield sink, Outlet(None, kept, notices, follower=follower, requests=requests)

@@ -72,17 +72,17 @@ def serve_heads(heads: HeadsFile, asked: HeadsAsked, as_json: bool) -> None:
 
 def _consoles(asked: HeadsAsked, heads: HeadsFile) -> tuple[str, ...]:
     """The address of each head's page. Raises InputError where one cannot be had, before a head is begun."""
-    from hilstar.console.feed.door import MAX_PORT, Address, Door, parse_address
+    from hilstar.console.listener import MAX_PORT, ListenAddress, PageListener, parse_address
 
     if asked.console is None:
         return ()
     first, count = parse_address(asked.console), len(heads.names)
     if first.port and first.port + count - 1 > MAX_PORT:
         raise InputError(f"--console {asked.console}: {count} pages need as many ports from there; choose a lower one")
-    addresses = [Address(first.host, first.port + k if first.port else 0) for k in range(count)]
+    addresses = [ListenAddress(first.host, first.port + k if first.port else 0) for k in range(count)]
     with ExitStack() as doors:
         for address in addresses:
-            doors.enter_context(Door(address, asked.token))
+            doors.enter_context(PageListener(address, asked.token))
     host = f"[{first.host}]" if ":" in first.host else first.host
     return tuple(f"{host}:{address.port}" for address in addresses)
 

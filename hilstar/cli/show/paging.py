@@ -15,10 +15,8 @@ from hilstar.process.notify import Service
 
 if TYPE_CHECKING:
     from hilstar.bench.faults.desk import FaultDesk
-    from hilstar.console.feed.door import Door
-    from hilstar.console.feed.feed import Feed
-    from hilstar.console.feed.introduction import Told
-    from hilstar.console.feed.opening import Parts
+    from hilstar.console.listener import PageListener
+    from hilstar.console.publisher import FramePublisher, PageParts, RunDescription
     from hilstar.run.faults import AnyFaults
     from hilstar.run.operator import SwitchRequests
     from hilstar.run.serve import Follower, Running
@@ -55,9 +53,11 @@ def fault_desk(faults: AnyFaults | None) -> FaultDesk | None:
 
 
 @contextmanager
-def page_door(console: str | None, control: bool, token: str | None, names: list[str] | None) -> Iterator[Door | None]:
+def page_listener(
+    console: str | None, control: bool, token: str | None, names: list[str] | None
+) -> Iterator[PageListener | None]:
     """The page's socket, which listens from here on; None without --console. Raises InputError."""
-    from hilstar.console.feed.door import Door, parse_address
+    from hilstar.console.listener import PageListener, parse_address
 
     if console is None:
         for option, given in (("--control", control), ("--console-name", bool(names))):
@@ -65,32 +65,37 @@ def page_door(console: str | None, control: bool, token: str | None, names: list
                 raise InputError(f"{option}: is the page's; add --console, or leave it out")
         yield None
         return
-    with Door(parse_address(console), token, tuple(names or ())) as door:
-        say(f"the operator's page is at {door.url}")
-        yield door
+    with PageListener(parse_address(console), token, tuple(names or ())) as listener:
+        say(f"the operator's page is at {listener.url}")
+        yield listener
 
 
 @contextmanager
 def followed(
-    door: Door | None, control: bool, told: Told, parts: Parts, status: RunStatus, record: FrameSink | None = None
+    listener: PageListener | None,
+    control: bool,
+    description: RunDescription,
+    parts: PageParts,
+    status: RunStatus,
+    record: FrameSink | None = None,
 ) -> Iterator[tuple[FrameSink, Follower, SwitchRequests | None]]:
     """Connect a run to the terminal, `record`, systemd and the page: its sink, its follower, and the page's requests."""
     sinks: list[FrameSink] = [status.see] if record is None else [record, status.see]
     with Service(status.begun, status.alive, status.line):
-        if door is None:
+        if listener is None:
             yield _all_of(sinks), status.follow, None
             return
-        with _page(door, control, told, parts, status) as (feed, follow, requests):
+        with _page(listener, control, description, parts, status) as (feed, follow, requests):
             yield _all_of([*sinks, feed.see]), follow, requests
 
 
 @contextmanager
 def _page(
-    door: Door, control: bool, told: Told, parts: Parts, status: RunStatus
-) -> Iterator[tuple[Feed, Follower, SwitchRequests]]:
-    from hilstar.console.feed.opening import opened_page
+    listener: PageListener, control: bool, description: RunDescription, parts: PageParts, status: RunStatus
+) -> Iterator[tuple[FramePublisher, Follower, SwitchRequests]]:
+    from hilstar.console.publisher import opened_page
 
-    with opened_page(door, control, told, parts) as (feed, requests):
+    with opened_page(listener, control, description, parts) as (feed, requests):
 
         def follow(running: Running) -> None:
             status.follow(running)

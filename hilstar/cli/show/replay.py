@@ -24,7 +24,7 @@ from hilstar.cli.options import (
     check_files,
 )
 from hilstar.cli.parsers import parse_place, parse_speed, parse_split
-from hilstar.cli.show.paging import Console, ConsoleName, Control, Token, fault_desk, followed, page_door
+from hilstar.cli.show.paging import Console, ConsoleName, Control, Token, fault_desk, followed, page_listener
 from hilstar.cli.show.running import (
     Force,
     LedgerFile,
@@ -41,7 +41,7 @@ from hilstar.cli.show.running import (
     say_of_light,
     shown_bench,
 )
-from hilstar.console.run_status import RunStatus, Source, on_terminal
+from hilstar.console.run_status import RunSource, RunStatus, on_terminal
 from hilstar.files import MCAP, check_directory, check_ending
 from hilstar.notices import Notices
 
@@ -82,8 +82,7 @@ def replay(
     from hilstar.attitude.logs.entries import Stated
     from hilstar.attitude.wire.source import Mounting
     from hilstar.bench.bench_file import dated, read_bench_file
-    from hilstar.console.feed.introduction import Told
-    from hilstar.console.feed.opening import Parts
+    from hilstar.console.publisher import PageParts, RunDescription
     from hilstar.run.record.frame_images import FrameImages
     from hilstar.run.record.ledger import Ledger
     from hilstar.run.replay import Wanted, plan_play
@@ -103,7 +102,7 @@ def replay(
     play = plan_play(log, Wanted(parse_speed(speed), start, stop, step), file.config, stated)
     file = dated(file, play.conventions.scale, play.first_ns)
     with (
-        page_door(console, control, token, console_name) as door,
+        page_listener(console, control, token, console_name) as listener,
         optional_pulse(file, notices) as pulse,
         shown_bench(file, headless, windowed, force) as (bench, screen),
         FrameImages(output, bench) as record,
@@ -116,11 +115,13 @@ def replay(
             explain_bench(bench)
 
         renderer, refresh_hz = bench.renderer.gl_renderer, bench.config.monitor.refresh_hz
-        status = RunStatus(Source(f"replaying {log}", renderer, refresh_hz, play.frame_count), kept)
+        status = RunStatus(RunSource(f"replaying {log}", renderer, refresh_hz, play.frame_count), kept)
 
-        page = Told("replay", "log", str(log), "clock" if play.paced else "asked")
-        parts = Parts(bench, notices, kept, lambda path: Ledger(path, bench, notices, split=split), screen, fault_desk(wrong))
-        with on_terminal(status), followed(door, control, page, parts, status, record) as (sink, follower, requests):
+        page = RunDescription("replay", "log", str(log), "clock" if play.paced else "asked")
+        parts = PageParts(
+            bench, notices, kept, lambda path: Ledger(path, bench, notices, split=split), screen, fault_desk(wrong)
+        )
+        with on_terminal(status), followed(listener, control, page, parts, status, record) as (sink, follower, requests):
             outlet = Outlet(screen, kept, notices, follower=follower, requests=requests, faults=wrong, pulse=pulse)
             summary = replay_log(bench, play, sink, outlet)
     end_of_run(summary, screen, kept, as_json)

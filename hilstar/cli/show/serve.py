@@ -13,7 +13,7 @@ from msgspec.structs import replace as replaced
 from hilstar.cli.options import BenchFile, Explain, Headless, Json, Overwrite, ScenarioFile, check_files
 from hilstar.cli.parsers import parse_split
 from hilstar.cli.show.heads import HeadsAsked, fed_link, serve_heads
-from hilstar.cli.show.paging import Console, ConsoleName, Control, Token, fault_desk, followed, page_door
+from hilstar.cli.show.paging import Console, ConsoleName, Control, Token, fault_desk, followed, page_listener
 from hilstar.cli.show.running import (
     Force,
     LedgerFile,
@@ -32,7 +32,7 @@ from hilstar.cli.show.running import (
     say_units,
     shown_bench,
 )
-from hilstar.console.run_status import RunStatus, Source, on_terminal
+from hilstar.console.run_status import RunSource, RunStatus, on_terminal
 from hilstar.console.terminal import say, without_attitude
 from hilstar.files import MCAP, check_ending
 from hilstar.notices import Notices
@@ -80,8 +80,7 @@ def serve(
         return
     from hilstar.attitude.wire.source import Mounting
     from hilstar.bench.fields_of_view import fields_of_view
-    from hilstar.console.feed.introduction import Told
-    from hilstar.console.feed.opening import Parts
+    from hilstar.console.publisher import PageParts, RunDescription
     from hilstar.run.loop import Limit
     from hilstar.run.open_link import await_reader
     from hilstar.run.record.ledger import Ledger
@@ -96,7 +95,7 @@ def serve(
     split = parse_split(ledger_split)
     notices = Notices()
     with (
-        page_door(console, control, token, console_name) as door,
+        page_listener(console, control, token, console_name) as listener,
         _source(file, fed_by, notices) as link,
         optional_pulse(file, notices) as pulse,
         shown_bench(file, headless, windowed, force) as (bench, screen),
@@ -115,11 +114,15 @@ def serve(
         say_units(fields)
         say_of_light(bench)
         beat = UNSET if file.config.attitude.lockstep else say_beat(bench, screen)
-        told = Source(link.endpoint, bench.renderer.gl_renderer, refresh_hz, min(limit.slots, limit.frames))
+        told = RunSource(link.endpoint, bench.renderer.gl_renderer, refresh_hz, min(limit.slots, limit.frames))
         status = RunStatus(told, kept)
-        page = Told("serve", file.config.attitude.source, link.endpoint, "asked" if file.config.attitude.lockstep else "clock")
-        parts = Parts(bench, notices, kept, lambda path: Ledger(path, bench, notices, split=split), screen, fault_desk(wrong))
-        with on_terminal(status), followed(door, control, page, parts, status) as (sink, follower, requests):
+        page = RunDescription(
+            "serve", file.config.attitude.source, link.endpoint, "asked" if file.config.attitude.lockstep else "clock"
+        )
+        parts = PageParts(
+            bench, notices, kept, lambda path: Ledger(path, bench, notices, split=split), screen, fault_desk(wrong)
+        )
+        with on_terminal(status), followed(listener, control, page, parts, status) as (sink, follower, requests):
             outlet = Outlet(screen, kept, notices, tracker_pictures(link, bench, wrong), follower, requests, wrong, pulse)
             summary = serve_stream(bench, link, limit, sink, outlet)
     end_of_run(replaced(summary, beat=beat, fields_of_view=fields.keys()), screen, kept, as_json)

@@ -1,1 +1,1 @@
-"""The page's own process: reads what a run leaves on its board, and serves it to browsers and monitoring, without OpenGL."""
+"""The page's own process: reads a run's shared memory and serves it to browsers and monitoring, without OpenGL."""

@@ -1,6 +1,6 @@
-"""The page's process, as `console.feed.host` starts it: its arguments are descriptors, of setup, board, wire and listener.
+"""The page's process. `console.page_process` starts it with four file descriptors: setup, shared memory, channel, listener.
 
-It ends with the run: when the other end of the wire is closed, however that comes.
+It ends with the run, when the other end of the channel is closed for whatever reason.
 """
 
 from __future__ import annotations
@@ -21,14 +21,12 @@ from collections.abc import Iterator
 import msgspec
 import uvicorn
 
-from hilstar.console.feed.board import Board, Want
-from hilstar.console.feed.messages import Answer, Order, Setup
-from hilstar.console.feed.scene import Scene
+from hilstar.console.messages import Order, OrderAnswer, Setup
+from hilstar.console.overlay import OverlayScene
 from hilstar.console.server.app import ORDERED_S, Page
-from hilstar.console.server.live import Crowd
-from hilstar.console.server.pictures import PictureRoom
-from hilstar.console.server.protocol import PING_S, PONG_S, BoundedHttp, ReadingWebSocket
-from hilstar.console.server.reader import TICK_S, Reader
+from hilstar.console.server.connections import PING_S, PONG_S, BoundedHttp, OpenPages, ReadingWebSocket
+from hilstar.console.server.reader import TICK_S, PicturePacker, RunReader
+from hilstar.console.shared_memory import PictureRequest, SharedMemory
 from hilstar.errors import one_line
 from hilstar.units import NS_PER_S
 
@@ -51,28 +49,28 @@ class Server(uvicorn.Server):
         yield
 
 
-class Wire:
+class OrderChannel:
     """Orders to the run, and its answers to them."""
 
-    def __init__(self, wire: socket.socket) -> None:
-        wire.setblocking(False)
-        self._wire = wire
+    def __init__(self, channel: socket.socket) -> None:
+        channel.setblocking(False)
+        self._channel = channel
         self._numbers = itertools.count(1)
-        self._waiting: dict[int, asyncio.Future[Answer]] = {}
+        self._waiting: dict[int, asyncio.Future[OrderAnswer]] = {}
 
-    async def give(self, order: Order) -> Answer:
+    async def give(self, order: Order) -> OrderAnswer:
         """Give an order, and wait for what becomes of it."""
         if len(self._waiting) >= MAX_ORDERS:
-            return Answer(id=0, status=503, line="too many orders at once; try again")
+            return OrderAnswer(id=0, status=503, line="too many orders at once; try again")
         order.id = next(self._numbers)
-        answer: asyncio.Future[Answer] = asyncio.get_running_loop().create_future()
+        answer: asyncio.Future[OrderAnswer] = asyncio.get_running_loop().create_future()
         self._waiting[order.id] = answer
         try:
             async with asyncio.timeout(ORDERED_S):
-                await asyncio.get_running_loop().sock_sendall(self._wire, msgspec.json.encode(order))
+                await asyncio.get_running_loop().sock_sendall(self._channel, msgspec.json.encode(order))
                 return await answer
         except TimeoutError:
-            return Answer(id=0, status=504, line=f"no answer of the run within {ORDERED_S:g} s")
+            return OrderAnswer(id=0, status=504, line=f"no answer of the run within {ORDERED_S:g} s")
         finally:
             self._waiting.pop(order.id, None)
 
@@ -80,48 +78,48 @@ class Wire:
         """Take answers until the run closes its end."""
         while True:
             try:
-                data = await asyncio.get_running_loop().sock_recv(self._wire, MAX_ANSWER_BYTES)
+                data = await asyncio.get_running_loop().sock_recv(self._channel, MAX_ANSWER_BYTES)
             except OSError:
                 return
             if not data:
                 return
-            answer = msgspec.json.decode(data, type=Answer)
+            answer = msgspec.json.decode(data, type=OrderAnswer)
             future = self._waiting.get(answer.id)
             if future is not None and not future.done():
                 future.set_result(answer)
 
 
-async def tick(reader: Reader, board: Board, crowd: Crowd) -> None:
-    """Ten times a second: look at the board, and tell all pages."""
+async def tick(reader: RunReader, memory: SharedMemory, pages: OpenPages) -> None:
+    """Ten times a second: look at the shared memory, and tell all pages."""
     loop = asyncio.get_running_loop()
     due_s = loop.time()
     while True:
         for event in reader.look():
-            crowd.tell({"event": event})
-        crowd.tell({"state": reader.state(), "point": reader.points[-1]})
-        hz = crowd.picture_hz
-        board.want = Want(round(NS_PER_S / hz), time.monotonic_ns() + NS_PER_S) if hz else Want()
+            pages.tell({"event": event})
+        pages.tell({"state": reader.state(), "point": reader.points[-1]})
+        hz = pages.picture_hz
+        memory.want = PictureRequest(round(NS_PER_S / hz), time.monotonic_ns() + NS_PER_S) if hz else PictureRequest()
         due_s = max(due_s + TICK_S, loop.time())
         await asyncio.sleep(due_s - loop.time())
 
 
-async def show(room: PictureRoom, reader: Reader, crowd: Crowd) -> None:
+async def show(room: PicturePacker, reader: RunReader, pages: OpenPages) -> None:
     """Pack each new picture once, on another thread, and offer it to all pages."""
     last = 0
     while True:
         await asyncio.sleep(PICTURE_POLL_S)
-        if crowd.picture_hz:
+        if pages.picture_hz:
             packed = await asyncio.to_thread(room.newest, last, reader.seen)
             if packed is not None:
                 last = packed.number
-                crowd.show(packed)
+                pages.show(packed)
 
 
-async def run(setup: Setup, board: Board, wire: Wire, listener: socket.socket) -> None:
+async def run(setup: Setup, memory: SharedMemory, channel: OrderChannel, listener: socket.socket) -> None:
     """Serve until the run has ended."""
-    scene: Scene | None = pickle.loads(setup.scene) if setup.scene else None
-    reader, crowd = Reader(board, setup), Crowd()
-    page = Page(setup, reader, crowd, {} if scene is None else scene.sky, wire.give)
+    scene: OverlayScene | None = pickle.loads(setup.scene) if setup.scene else None
+    reader, pages = RunReader(memory, setup), OpenPages()
+    page = Page(setup, reader, pages, {} if scene is None else scene.sky, channel.give)
     config = uvicorn.Config(
         page.app(),
         http=BoundedHttp,
@@ -142,13 +140,13 @@ async def run(setup: Setup, board: Board, wire: Wire, listener: socket.socket) -
     server = Server(config)
     tasks = [
         asyncio.create_task(work)
-        for work in (server.serve([listener]), tick(reader, board, crowd), show(PictureRoom(board, scene), reader, crowd))
+        for work in (server.serve([listener]), tick(reader, memory, pages), show(PicturePacker(memory, scene), reader, pages))
     ]
-    ended = asyncio.create_task(wire.listen())
+    ended = asyncio.create_task(channel.listen())
     done, _ = await asyncio.wait([ended, *tasks], return_when=asyncio.FIRST_COMPLETED)
     if ended not in done:
         done.pop().result()  # what went wrong
-    await crowd.close_all(GOING_AWAY)
+    await pages.close_all(GOING_AWAY)
 
 
 def main() -> None:
@@ -161,11 +159,11 @@ def main() -> None:
         os.nice(NICE)
     logging.disable(logging.CRITICAL)  # the run says what there is to say
     setup = msgspec.msgpack.decode(os.pread(setup_fd, os.fstat(setup_fd).st_size, 0), type=Setup)
-    board = Board(board_fd, setup.picture_bytes)
+    memory = SharedMemory(board_fd, setup.picture_bytes)
     listener = socket.socket(fileno=listener_fd)
     code = 0
     try:
-        asyncio.run(run(setup, board, Wire(socket.socket(fileno=wire_fd)), listener))
+        asyncio.run(run(setup, memory, OrderChannel(socket.socket(fileno=wire_fd)), listener))
     except Exception as error:  # whatever it is: the run starts the page again
         print(one_line(f"hilstar: the operator's page failed ({type(error).__name__}: {error})"), file=sys.stderr, flush=True)
         code = 1

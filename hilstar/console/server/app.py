@@ -1,16 +1,22 @@
-"""The page's addresses. What each answers, and what a page and its server say to each other, is in `docs/console-server.md`."""
+"""The page's addresses, what each answers, and who may ask. The protocol of the WebSocket is in docs/console-server.md."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import hmac
+import ipaddress
 import time
 import urllib.parse
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import msgspec
+from prometheus_client import CollectorRegistry
+from prometheus_client.metrics_core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily, Metric
+from prometheus_client.openmetrics.exposition import CONTENT_TYPE_LATEST, generate_latest
+from prometheus_client.registry import Collector
 from starlette.applications import Starlette
 from starlette.datastructures import Headers
 from starlette.requests import ClientDisconnect, Request
@@ -19,11 +25,198 @@ from starlette.routing import Route, WebSocketRoute
 from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocket
 
-from hilstar.console.feed.messages import CONTROLS, PATCH_SHARE, Answer, Order, Setup
-from hilstar.console.server.guard import Guard, Refused, headers_of
-from hilstar.console.server.live import Client, Crowd, told
-from hilstar.console.server.metrics import CONTENT_TYPE, Metrics
-from hilstar.console.server.reader import Reader
+from hilstar.console.messages import CONTROLS, PATCH_SHARE, Order, OrderAnswer, RunState, Setup
+from hilstar.console.server.connections import OpenPage, OpenPages, json_text
+from hilstar.console.server.reader import RunReader
+from hilstar.units import NS_PER_S
+
+LOOPBACK = {"localhost", "127.0.0.1", "[::1]"}  # no name server says where they are
+TOKEN_PROTOCOL = "hilstar.token."
+HEADERS = {
+    "Cache-Control": "no-store",
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Permissions-Policy": "camera=(), geolocation=(), microphone=()",
+}
+POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'{sockets}; "
+    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+
+
+class Refused(Exception):
+    """A request that is not answered: HTTP status and a line."""
+
+    def __init__(self, status: int, line: str) -> None:
+        super().__init__(line)
+        self.status, self.line = status, line
+
+
+class Guard:
+    """Judges requests by their headers (lower-case names).
+
+    A page of another site can make a browser send requests here. By a name that it points at this machine (DNS rebinding) it
+    can even read the answers. So the name in `Host` has to be one of this page's, and an `Origin` that of the page itself.
+    """
+
+    def __init__(self, setup: Setup) -> None:
+        self._hosts = set(setup.hosts)
+        self._names = {name for name in setup.names if ":" in name} | {
+            f"{name}{port}" for name in setup.names if ":" not in name for port in ("", ":443", ":80", f":{setup.port}")
+        }
+        self._any_address, self._port, self._token = setup.any_address, setup.port, setup.token
+
+    @property
+    def has_token(self) -> bool:
+        """Whether a token is needed."""
+        return bool(self._token)
+
+    def check_host(self, host: str) -> None:
+        """Raises Refused (421) for a name that is not the page's."""
+        host = host.lower()
+        if host not in self._names and not self._is_own(host):
+            raise Refused(421, "this page is not served under that name; open it as hilstar printed it, or give --console-name")
+
+    def _is_own(self, host: str) -> bool:
+        name, port = _split(host)
+        if name in LOOPBACK and (port.isdecimal() or not port):  # by any port: that of a tunnel, such as ssh -L
+            return True
+        if port not in {"", str(self._port)} or (not port and self._port != 80):
+            return False
+        if name in self._hosts:
+            return True
+        with contextlib.suppress(ValueError):
+            return self._any_address and bool(ipaddress.ip_address(name.strip("[]")))
+        return False
+
+    def check_origin(self, headers: Mapping[str, str]) -> None:
+        """Raises Refused (403) for a request that a page of another site has made."""
+        origin, host = headers.get("origin"), headers.get("host", "").lower()
+        if origin is not None and origin.lower() not in {f"http://{host}", f"https://{host}"}:
+            raise Refused(403, "another site's page may not ask here")
+        if headers.get("sec-fetch-site", "none") in {"cross-site", "same-site"} and headers.get("sec-fetch-mode") != "navigate":
+            raise Refused(403, "another site's page may not ask here")
+
+    def check_token(self, headers: Mapping[str, str], protocols: Iterable[str] = ()) -> None:
+        """Raises Refused (401) without the token, in a header or as a WebSocket's subprotocol; compared in constant time."""
+        if not self._token:
+            return
+        scheme, _, given = headers.get("authorization", "").partition(" ")
+        tokens = [given.strip()] if scheme.lower() == "bearer" else []
+        tokens += [name.removeprefix(TOKEN_PROTOCOL) for name in protocols if name.startswith(TOKEN_PROTOCOL)]
+        wanted = self._token.encode()
+        matches = [hmac.compare_digest(token.encode(), wanted) for token in tokens]  # each, whichever was right
+        if True not in matches:
+            raise Refused(
+                401, "the token is missing or wrong: open the address that hilstar printed, or send Authorization: Bearer"
+            )
+
+
+def _split(host: str) -> tuple[str, str]:
+    """Name and port of a Host header; the name of an IPv6 address keeps its brackets."""
+    if host.startswith("["):
+        name, _, rest = host.partition("]")
+        return name + "]", rest[1:] if rest.startswith(":") else ("x" if rest else "")
+    name, colon, port = host.partition(":")
+    return name, port if port or not colon else "x"
+
+
+def headers_of(host: str) -> dict[str, str]:
+    """The headers of every answer to a request that was allowed under that name; "" for one that was not."""
+    sockets = f" ws://{host} wss://{host}" if host else ""
+    return HEADERS | {"Content-Security-Policy": POLICY.format(sockets=sockets)}
+
+
+CONTENT_TYPE = CONTENT_TYPE_LATEST
+
+
+class RunCollector(Collector):
+    """Makes the metrics of a run when they are asked for."""
+
+    def __init__(self, reader: RunReader) -> None:
+        self._reader = reader
+        self.clients = 0
+
+    def collect(self) -> Iterator[Metric]:
+        """Each metric with its value now."""
+        hello, seen = self._reader.hello(), self._reader.seen or RunState(host_ns=0)
+        told = {key: str(hello[key]) for key in ("version", "command", "bench", "renderer")}
+        yield InfoMetricFamily("hilstar_run", "What runs.", value=told)
+        yield _gauge("hilstar_healthy", "1 while the sky is right, as GET /health has it.", float(self._reader.health.ok))
+        yield _gauge("hilstar_health_since_timestamp_seconds", "Since when that is so.", self._reader.health.since_s)
+        yield _counter("hilstar_frames", "Frames shown.", seen.frames)
+        yield _counter("hilstar_frames_missed", "Refresh periods without a frame of their own.", seen.missed)
+        yield _counter("hilstar_frames_stale", "Frames shown with a stale attitude.", seen.stale_frames)
+        yield _counter("hilstar_frames_given_up", "Frames given up because their moment had passed.", seen.given_up)
+        yield _counter("hilstar_packets_received", "Attitude packets received.", seen.received)
+        refused = CounterMetricFamily("hilstar_packets_refused", "Attitude packets refused.", labels=["reason"])
+        for reason, count in seen.refused.items():
+            refused.add_metric([reason], count)
+        yield refused
+        yield from self._of_attitude(seen)
+        yield from self._of_rest(seen)
+
+    def _of_attitude(self, seen: RunState) -> Iterator[Metric]:
+        yield _gauge("hilstar_attitude_missing", "1 until an attitude has come.", float(seen.missing))
+        yield _gauge("hilstar_attitude_stale", "1 while the attitude is stale.", float(seen.stale))
+        if seen.attitude is not None:
+            yield _gauge(
+                "hilstar_attitude_age_seconds", "Age of the attitude of the newest frame.", seen.attitude.age_ns / NS_PER_S
+            )
+        clock = seen.clock
+        if clock is None:
+            return
+        for name, words, value, scale in (
+            ("offset_seconds", "Host time minus the sender's.", clock.offset_ms, 1e-3),
+            ("uncertainty_seconds", "Of the offset.", clock.uncertainty_ms, 1e-3),
+            ("drift_ratio", "How much faster the sender's clock runs.", clock.drift_ppm, 1e-6),
+        ):
+            if value is not None:
+                yield _gauge(f"hilstar_clock_{name}", words, value * scale)
+
+    def _of_rest(self, seen: RunState) -> Iterator[Metric]:
+        yield _gauge("hilstar_stars", "Stars in the newest frame.", seen.stars)
+        yield _gauge("hilstar_stars_clipped", "Those brighter than the monitor's white.", len(seen.clipped))
+        yield _gauge("hilstar_display_lost", "1 where the display has gone.", float(bool(seen.display_lost)))
+        yield _gauge("hilstar_operator_override", "1 while an operator changes the sky.", float(bool(seen.operator_text)))
+        if seen.ledger is not None:
+            yield _gauge("hilstar_ledger_bytes", "Size of the ledger.", seen.ledger.bytes)
+            yield _gauge("hilstar_ledger_failing", "1 while it cannot be written.", float(bool(seen.ledger.failing)))
+        pacing = self._reader.pacing
+        if pacing is not None:
+            intervals = GaugeMetricFamily(
+                "hilstar_frame_interval_seconds", "Between frames, over the last minute.", labels=["quantile"]
+            )
+            for quantile, key in (("0.5", "p50_ms"), ("0.99", "p99_ms")):
+                intervals.add_metric([quantile], pacing[key] * 1e-3)
+            yield intervals
+            yield _gauge("hilstar_frame_interval_sd_seconds", "Standard deviation of it.", pacing["sd_ms"] * 1e-3)
+        yield _gauge("hilstar_console_clients", "Pages that are open.", self.clients)
+
+
+def _gauge(name: str, words: str, value: float) -> GaugeMetricFamily:
+    return GaugeMetricFamily(name, words, value=value)
+
+
+def _counter(name: str, words: str, value: float) -> CounterMetricFamily:
+    return CounterMetricFamily(name, words, value=value)
+
+
+class Metrics:
+    """The registry with a run in it."""
+
+    def __init__(self, reader: RunReader) -> None:
+        self.collector = RunCollector(reader)
+        self._registry = CollectorRegistry()
+        self._registry.register(self.collector)
+
+    def text(self) -> bytes:
+        """The answer of `GET /metrics`."""
+        return bytes(generate_latest(self._registry))  # type: ignore[no-untyped-call]
+
 
 PAGE_FOLDER = Path(__file__).resolve().parents[1] / "page"
 TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
@@ -34,7 +227,7 @@ OPEN_PATHS = ("/", "/static/")  # the page itself has no secret; it brings the t
 STATE_S = 0.5  # for a state of after an order; there are ten a second
 ORDERED_S = 30.0  # a ledger on a slow disk
 
-Give = Callable[[Order], Awaitable[Answer]]
+Give = Callable[[Order], Awaitable[OrderAnswer]]
 
 
 class OrderBody(msgspec.Struct, forbid_unknown_fields=True):
@@ -49,10 +242,10 @@ class OrderBody(msgspec.Struct, forbid_unknown_fields=True):
 class Page:
     """What the addresses have to hand."""
 
-    def __init__(self, setup: Setup, reader: Reader, crowd: Crowd, sky: dict[str, Any], give: Give) -> None:
-        self.setup, self.reader, self.crowd, self.give = setup, reader, crowd, give
+    def __init__(self, setup: Setup, reader: RunReader, pages: OpenPages, sky: dict[str, Any], give: Give) -> None:
+        self.setup, self.reader, self.pages, self.give = setup, reader, pages, give
         self.guard, self.metrics = Guard(setup), Metrics(reader)
-        self._sky = told(sky)
+        self._sky = json_text(sky)
         self._files = {path.name: path.read_bytes() for path in PAGE_FOLDER.iterdir() if path.suffix in TYPES}
 
     def app(self) -> ASGIApp:
@@ -84,11 +277,11 @@ class Page:
         return JSONResponse(found, 200 if found["ok"] else 503)
 
     async def _metrics(self, _: Request) -> Response:
-        self.metrics.collector.clients = len(self.crowd)
+        self.metrics.collector.clients = len(self.pages)
         return Response(self.metrics.text(), headers={"Content-Type": CONTENT_TYPE})
 
     async def _state(self, _: Request) -> Response:
-        return Response(told({"hello": self.reader.hello(), "state": self.reader.state()}), media_type="application/json")
+        return Response(json_text({"hello": self.reader.hello(), "state": self.reader.state()}), media_type="application/json")
 
     async def _sky_map(self, _: Request) -> Response:
         return Response(self._sky, media_type="application/json")
@@ -122,13 +315,15 @@ class Page:
                     await asyncio.sleep(0.02)
 
     async def _live(self, socket: WebSocket) -> None:
-        self.crowd.make_room()
+        self.pages.make_room()
         await socket.accept("hilstar" if "hilstar" in socket.scope["subprotocols"] else None)
-        client = Client(socket)
-        client.tell(told({"hello": self.reader.hello(), "state": self.reader.state(), "history": list(self.reader.points)}))
+        client = OpenPage(socket)
+        client.tell(
+            json_text({"hello": self.reader.hello(), "state": self.reader.state(), "history": list(self.reader.points)})
+        )
         for event in list(self.reader.events)[-90:]:
-            client.tell(told({"event": event}))
-        await self.crowd.follow(client)
+            client.tell(json_text({"event": event}))
+        await self.pages.follow(client)
 
 
 async def _body(request: Request) -> bytes:

@@ -1,21 +1,121 @@
-"""Reads a run's board ten times a second, and words it for the page: the state, the last minute's points, events."""
+"""A run's shared memory, read ten times a second and worded for the page: state, health, chart points, events, pictures."""
 
 from __future__ import annotations
 
 import contextlib
+import json
+import struct
 import time
+import zlib
 from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime
 from typing import Any
 
 import msgspec
 import numpy as np
 
-from hilstar.console.feed.board import Board
-from hilstar.console.feed.messages import HAS_AGE, EventSeen, FrameNumbers, RunSeen, Setup
-from hilstar.console.server.health import Health, Lately, reasons
-from hilstar.console.server.utc import utc_text
+from hilstar.arrays import FloatArray
+from hilstar.console.messages import HAS_AGE, FrameNumbers, Pace, PictureHead, RunEvent, RunState, Setup
+from hilstar.console.overlay import MAX_STARS, OverlayScene
+from hilstar.console.shared_memory import PICTURE_HEAD_BYTES, SPRITE, SharedMemory
+from hilstar.monitor.response import Codes
 from hilstar.rotation import to_radec_roll_deg
 from hilstar.units import NS_PER_MS, NS_PER_S
+
+
+def utc_text(unix_s: float) -> str:
+    """ "2026-11-22T19:00:00.123Z"."""
+    return f"{datetime.fromtimestamp(unix_s, UTC):%Y-%m-%dT%H:%M:%S.%f}"[:-3] + "Z"
+
+
+SILENT_NS = 6 * NS_PER_S // 10  # the run is seen ten times a second
+HUNG_NS = 4 * NS_PER_S // 10
+HUNG_PERIODS = 2.5
+UNASKED_NS = 2 * NS_PER_S  # in lockstep, without a request
+MANY_MISSED_SHARE = 0.5  # of the last second's frames
+
+
+@dataclass(frozen=True, slots=True)
+class RecentFrames:
+    """What frames said lately: when the newest was shown (host time, ns), and which share of the last second's is missing."""
+
+    swap_ns: int = 0
+    missed_share: float = 0.0
+
+
+def reasons(seen: RunState | None, now_ns: int, lately: RecentFrames, refresh_hz: float, pace: Pace) -> list[str]:
+    """Why the sky is not right; [] where it is. See `Setup.pace`."""
+    if seen is None:
+        return ["the run has not begun"]
+    if now_ns - seen.host_ns > SILENT_NS:
+        return [f"the run's process has been silent for {_s(now_ns - seen.host_ns)}"]
+    if pace == "session":
+        return seen.failed
+    of_display, of_attitude = _of_display(seen, now_ns, refresh_hz), _of_attitude(seen, now_ns, lately, pace)
+    return [*of_display, *of_attitude, *_of_rest(seen, lately)]
+
+
+def _of_display(seen: RunState, now_ns: int, refresh_hz: float) -> Iterator[str]:
+    if seen.display_lost:
+        yield f"the display is lost: {seen.display_lost}"
+    limit_ns = max(HUNG_NS, HUNG_PERIODS / refresh_hz * NS_PER_S)
+    if not seen.alive_ns:
+        yield "the run is being prepared"
+    elif seen.host_ns - seen.alive_ns > limit_ns:
+        yield f"the frame loop has hung for {_s(now_ns - seen.alive_ns)}"
+
+
+def _of_attitude(seen: RunState, now_ns: int, lately: RecentFrames, pace: Pace) -> Iterator[str]:
+    if not seen.alive_ns:
+        return
+    if seen.missing:
+        yield "no attitude has come yet"
+    elif seen.stale:
+        age = "" if seen.attitude is None else f": {_s(seen.attitude.age_ns)} old"
+        yield f"the attitude is stale{age}"
+    elif pace == "asked" and lately.swap_ns and now_ns - lately.swap_ns > UNASKED_NS:
+        yield f"the simulator has asked for no frame for {_s(now_ns - lately.swap_ns)}"
+
+
+def _of_rest(seen: RunState, lately: RecentFrames) -> Iterator[str]:
+    if seen.ledger is not None and seen.ledger.failing:
+        yield f"the ledger fails: {seen.ledger.failing}"
+    if seen.hidden:
+        yield f"the window is {seen.hidden}"
+    if seen.operator_text:
+        yield f"changed by the operator: {seen.operator_text}"
+    if seen.rates:
+        yield seen.rates
+    if seen.faults:
+        yield f"a fault is on: {', '.join(seen.faults)}"
+    if lately.missed_share > MANY_MISSED_SHARE:
+        yield f"frames are missing: {lately.missed_share:.0%} of the last second's"
+
+
+def _s(time_ns: int) -> str:
+    """A duration as the page writes it."""
+    s = time_ns / NS_PER_S
+    if s < 60:
+        return f"{s:.1f} s"
+    return f"{int(s // 60)} min {int(s % 60):02d} s" if s < 3600 else f"{int(s // 3600)} h {int(s % 3600 // 60):02d} min"
+
+
+class Health:
+    """Remembers since when the sky is right, or is not (UTC, seconds)."""
+
+    def __init__(self, unix_s: float) -> None:
+        self.ok = False
+        self.since_s = unix_s
+        self.reasons: list[str] = []
+
+    def update(self, found: list[str], unix_s: float) -> None:
+        """Take the reasons found now."""
+        if (not found) != self.ok:
+            self.ok, self.since_s = not found, unix_s
+        self.reasons = found
+
 
 HISTORY_S = 60
 TICK_S = 0.1
@@ -24,13 +124,13 @@ PACING_EACH_S = 1.0
 MIN_INTERVALS = 10
 
 
-class Reader:
+class RunReader:
     """The run as a page is told of it. `look` brings it up to date."""
 
-    def __init__(self, board: Board, setup: Setup) -> None:
-        self._board, self._setup = board, setup
-        self.seen: RunSeen | None = None
-        self.health = Health(board.wrong_since_s or time.time())  # an earlier page of this run may have died
+    def __init__(self, memory: SharedMemory, setup: Setup) -> None:
+        self._memory, self._setup = memory, setup
+        self.seen: RunState | None = None
+        self.health = Health(memory.wrong_since_s or time.time())  # an earlier page of this run may have died
         self.points: deque[dict[str, Any]] = deque(maxlen=round(HISTORY_S / TICK_S))
         self.events: deque[dict[str, Any]] = deque(maxlen=KEPT_EVENTS)
         self._frame_at = self._event_at = 0
@@ -42,28 +142,28 @@ class Reader:
         self._pacing_ns = 0
 
     def look(self) -> list[dict[str, Any]]:
-        """Look at the board; the events that are new."""
+        """Look at the shared memory; the events that are new."""
         now_ns, unix_s = time.monotonic_ns(), time.time()
-        found = self._board.states.last()
+        found = self._memory.states.last()
         if found is not None:
             with contextlib.suppress(
                 msgspec.MsgspecError, UnicodeDecodeError
             ):  # cut, where it was too long: the one before stays
-                self.seen = msgspec.json.decode(found[1], type=RunSeen)
+                self.seen = msgspec.json.decode(found[1], type=RunState)
         self.points.append(self._point(now_ns))
         if now_ns - self._pacing_ns > PACING_EACH_S * NS_PER_S:
             self._pacing_ns, self.pacing = now_ns, self._pacing_now(now_ns)
-        lately = Lately(0 if self._last is None else self._last.swap_ns, self._missed_share())
+        lately = RecentFrames(0 if self._last is None else self._last.swap_ns, self._missed_share())
         self.health.update(reasons(self.seen, now_ns, lately, self._setup.refresh_hz, self._setup.pace), unix_s)
-        self._board.wrong_since_s = 0.0 if self.health.ok else self.health.since_s
+        self._memory.wrong_since_s = 0.0 if self.health.ok else self.health.since_s
         return self._new_events()
 
     def _new_events(self) -> list[dict[str, Any]]:
         new = []
-        for number, data in self._board.events.after(self._event_at):
+        for number, data in self._memory.events.after(self._event_at):
             self._event_at = number
             with contextlib.suppress(msgspec.MsgspecError, UnicodeDecodeError):
-                event = msgspec.json.decode(data, type=EventSeen)
+                event = msgspec.json.decode(data, type=RunEvent)
                 new.append({"utc": utc_text(event.unix_s), "kind": event.kind, "line": event.line})
         self.events.extend(new)
         return new
@@ -71,7 +171,7 @@ class Reader:
     def _point(self, now_ns: int) -> dict[str, Any]:
         """What the frames since the last look add to the charts; null where there were none."""
         frames = []
-        for number, data in self._board.frames.after(self._frame_at):
+        for number, data in self._memory.frames.after(self._frame_at):
             self._frame_at = number
             frames.append(FrameNumbers.unpack(data))
         point: dict[str, Any] = {"t_s": round((now_ns - self._begun_ns) / NS_PER_S, 3), "missed": 0, "refused": 0}
@@ -131,7 +231,7 @@ class Reader:
 
     def state(self) -> dict[str, Any]:
         """The state of the run, as the page shows it."""
-        seen = RunSeen(host_ns=0) if self.seen is None else self.seen
+        seen = RunState(host_ns=0) if self.seen is None else self.seen
         ledger, clock = seen.ledger, seen.clock
         return {
             "utc": utc_text(time.time()),
@@ -176,7 +276,7 @@ def _raise(point: dict[str, Any], key: str, value: float) -> None:
     point[key] = round(value if before is None else max(value, before), 3)
 
 
-def _attitude(seen: RunSeen) -> dict[str, Any] | None:
+def _attitude(seen: RunState) -> dict[str, Any] | None:
     attitude = seen.attitude
     if attitude is None:
         return None
@@ -190,3 +290,103 @@ def _attitude(seen: RunSeen) -> dict[str, Any] | None:
         "rate_deg_s": None if rate is None else np.degrees(rate).tolist(),
         "age_ms": attitude.age_ns / NS_PER_MS,
     }
+
+
+LEVEL = 1  # of zlib: a night sky is nearly all zeros
+
+
+@dataclass(frozen=True, eq=False)
+class PackedPicture:
+    """A picture's message, and the truth of its frame without and with the grid of RA and Dec."""
+
+    number: int
+    picture: bytes
+    truth: bytes
+    truth_with_grid: bytes
+
+
+class PicturePacker:
+    """Packs what the shared memory has; it takes ten to thirty milliseconds, on a thread of its own."""
+
+    def __init__(self, memory: SharedMemory, scene: OverlayScene | None) -> None:
+        self._memory, self._scene = memory, scene
+
+    def newest(self, after: int, seen: RunState | None) -> PackedPicture | None:
+        """The newest picture, None where there is none after that number."""
+        found = self._memory.pictures.last() if self._memory.pictures.newest > after else None
+        if found is None or found[0] <= after:
+            return None
+        number, data = found
+        head = PictureHead.unpack(data)
+        levels, sprites = _parts(head, data)
+        if self._scene is not None and seen is not None and seen.overlay and not self._scene.aids_in_levels:
+            levels = self._scene.aids.laid_over(levels, seen.overlay, seen.patch_share)
+        truth, with_grid = self._truths(head, sprites, seen)
+        return PackedPicture(number, _message(head, levels), _told(truth), _told(with_grid))
+
+    def _truths(self, head: PictureHead, sprites: np.ndarray, seen: RunState | None) -> tuple[dict[str, Any], dict[str, Any]]:
+        """The truth of a picture, without and with the grid."""
+        if self._scene is None:
+            nothing = {"frame": head.frame, "stars": []}
+            return nothing, nothing
+        marks = self._scene.marks.told(_attitude_of_picture(head), grid=True)
+        grid = marks.pop("grid", [])
+        truth = {"frame": head.frame, "stars": stars_of(self._scene, sprites, seen)} | marks
+        return truth, truth | {"grid": grid}
+
+
+def _parts(head: PictureHead, data: bytes) -> tuple[Codes, np.ndarray]:
+    count = head.width * head.height
+    dtype = np.dtype(f"<u{head.item_bytes}")
+    levels = np.frombuffer(data, dtype=dtype, count=count, offset=PICTURE_HEAD_BYTES).reshape(head.height, head.width)
+    sprites = np.frombuffer(data, dtype=SPRITE, count=head.sprites, offset=PICTURE_HEAD_BYTES + count * head.item_bytes)
+    return levels, sprites
+
+
+def _message(head: PictureHead, levels: Codes) -> bytes:
+    """A length, a head in JSON of that many bytes, and the levels."""
+    told = {"w": head.width, "h": head.height, "frame": head.frame, "dtype": f"u{head.item_bytes}", "deflate": True}
+    text = json.dumps(told).encode()
+    return struct.pack("<I", len(text)) + text + zlib.compress(np.ascontiguousarray(levels).tobytes(), LEVEL)
+
+
+def _told(truth: dict[str, Any]) -> bytes:
+    return json.dumps({"truth": truth}, ensure_ascii=False, separators=(",", ":"), allow_nan=False).encode()
+
+
+def stars_of(scene: OverlayScene, sprites: np.ndarray, seen: RunState | None) -> list[list[Any]]:
+    """Where the stars of a picture were drawn, as `[x_px, y_px, v_mag, hip, label, clipped]`, the brightest first."""
+    stars, x_px, y_px = _one_each(sprites)
+    clipped = set() if seen is None else set(seen.clipped)
+    rows: list[list[Any]] = []
+    for k in np.argsort(scene.v_mag[stars], kind="stable")[:MAX_STARS].tolist():
+        star = int(stars[k])
+        hip, label = int(scene.hip[star]), scene.label(star)
+        rows.append(
+            [
+                round(x_px[k], 2),
+                round(y_px[k], 2),
+                _number(float(scene.v_mag[star])),
+                hip,
+                label,
+                int((hip or label) in clipped),
+            ]
+        )
+    return rows
+
+
+def _number(magnitude: float) -> float | None:
+    return round(magnitude, 2) if np.isfinite(magnitude) else None
+
+
+def _one_each(sprites: np.ndarray) -> tuple[np.ndarray, list[float], list[float]]:
+    """The stars of sprites and the middle of each star's: one that moves has several along its path."""
+    stars, which = np.unique(sprites["star"], return_inverse=True)
+    count = np.bincount(which, minlength=len(stars))
+    x_px, y_px = (np.bincount(which, sprites[axis], len(stars)) / np.maximum(count, 1) for axis in ("x_px", "y_px"))
+    return stars, x_px.tolist(), y_px.tolist()
+
+
+def _attitude_of_picture(head: PictureHead) -> FloatArray | None:
+    q = np.array([head.q_w, head.q_x, head.q_y, head.q_z])
+    return q if np.isfinite(q).all() else None

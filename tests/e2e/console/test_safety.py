@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from hilstar.console.server.protocol import MAX_CONNECTIONS, PONG_S
+from hilstar.console.server.connections import MAX_CONNECTIONS, PONG_S
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.pages import PageAddress, children, live, page_of, raw
 from tests.support.senders import free_port

@@ -8,7 +8,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from hilstar.console.report.bundle import PAGE_DIR
+from hilstar.console.report import PAGE_DIR
 
 TEXT, GRAPHIC = 4.5, 3.0  # WCAG 2.2, 1.4.3 (AA) and 1.4.11
 MIN_CURVES_APART = 12.0  # CIE 1976 dE of two curves in a chart; 2.3 is just seen, side by side

@@ -5,14 +5,14 @@ from __future__ import annotations
 import pytest
 from msgspec.structs import replace
 
-from hilstar.console.feed.messages import AttitudeSeen, LedgerSeen, RunSeen
-from hilstar.console.server.health import Health, Lately, reasons
+from hilstar.console.messages import AttitudeState, LedgerState, RunState
+from hilstar.console.server.reader import Health, RecentFrames, reasons
 
 S = 1_000_000_000
 NOW = 1_000 * S
-ATTITUDE = AttitudeSeen((1.0, 0.0, 0.0, 0.0), None, 1_250_000_000)
-WELL = RunSeen(host_ns=NOW - S // 20, alive_ns=NOW - S // 10, missing=False, blank=False, attitude=ATTITUDE)
-LATELY = Lately(NOW - S // 50)
+ATTITUDE = AttitudeState((1.0, 0.0, 0.0, 0.0), None, 1_250_000_000)
+WELL = RunState(host_ns=NOW - S // 20, alive_ns=NOW - S // 10, missing=False, blank=False, attitude=ATTITUDE)
+LATELY = RecentFrames(NOW - S // 50)
 
 
 def found(pace="clock", lately=LATELY, hz=60.0, **changes) -> list[str]:
@@ -37,7 +37,7 @@ def test_a_run_that_goes_well_has_no_reason():
         ({"host_ns": NOW - S, "alive_ns": NOW - S}, "silent for 1.0 s"),
         ({"display_lost": "the window went away"}, "the display is lost: the window went away"),
         ({"hidden": "covered"}, "the window is covered"),
-        ({"ledger": LedgerSeen("run.mcap", 1, "cannot be written")}, "the ledger fails: cannot be written"),
+        ({"ledger": LedgerState("run.mcap", 1, "cannot be written")}, "the ledger fails: cannot be written"),
         ({"operator_text": "blank"}, "changed by the operator: blank"),
         ({"faults": ["flash"]}, "a fault is on: flash"),
         ({"rates": "the packets' rates are wrong"}, "the packets' rates are wrong"),
@@ -49,9 +49,9 @@ def test_each_thing_that_is_wrong_is_a_reason(changes, words):
 
 
 def test_a_ledger_that_is_written_and_a_few_missed_frames_are_well():
-    assert found(ledger=LedgerSeen("run.mcap", 1)) == []
-    assert found(lately=Lately(NOW, 0.5)) == []
-    assert "60%" in found(lately=Lately(NOW, 0.6))[0]
+    assert found(ledger=LedgerState("run.mcap", 1)) == []
+    assert found(lately=RecentFrames(NOW, 0.5)) == []
+    assert "60%" in found(lately=RecentFrames(NOW, 0.6))[0]
 
 
 def test_a_slow_display_is_not_a_loop_that_hangs():
@@ -61,7 +61,7 @@ def test_a_slow_display_is_not_a_loop_that_hangs():
 
 
 def test_a_simulator_that_asks_for_nothing_is_a_reason_in_lockstep_alone():
-    late = Lately(NOW - 3 * S)
+    late = RecentFrames(NOW - 3 * S)
     assert "no frame for 3.0 s" in found(pace="asked", lately=late)[0]
     assert found(lately=late) == []
 

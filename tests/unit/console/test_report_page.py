@@ -9,8 +9,7 @@ import re
 import numpy as np
 import pytest
 
-from hilstar.console.report.bundle import PAGE_DIR, one_script, report_page
-from hilstar.console.report.run_data import run_data, verdict
+from hilstar.console.report import PAGE_DIR, one_script, report_page, run_data, verdict
 from hilstar.run.record.ledger_records import CountRecord, EventRecord, FrameRecord, PacketForm
 from hilstar.run.record.report import summarise
 from hilstar.run.record.report_figures import MAX_EVENTS, Figures

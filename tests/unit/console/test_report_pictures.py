@@ -14,8 +14,7 @@ from PIL import Image
 
 from hilstar.attitude.logs.mcap_log import NO_END
 from hilstar.bench.frame import Bench
-from hilstar.console.report.pictures import run_pictures
-from hilstar.console.report.write import report
+from hilstar.console.report import report, run_pictures
 from hilstar.rotation import from_rotation_vector, multiply
 from hilstar.run.record.ledger import Ledger
 from hilstar.run.record.ledger_records import FrameRecord

@@ -1,23 +1,143 @@
-"""Who follows the run: pages on WebSockets, each told at its own speed; a slow one loses pictures, then its connection.
-
-A page that comes always has a place. Where all are taken one gives way: one that does not read, before one that has
-asked for nothing, before one that is no browser's, before one of those with the most pages from one address, the oldest.
-"""
+"""Connections to pages: HTTP and WebSockets with bounds, and each open page told at its own speed."""
 
 from __future__ import annotations
 
 import asyncio
 import json
 import math
+import socket
 import time
-from collections import Counter, deque
-from typing import Annotated, Any
+from collections import Counter, OrderedDict, deque
+from typing import Annotated, Any, cast
 
 import msgspec
+from h11 import Request
 from starlette.websockets import WebSocket, WebSocketDisconnect
+from uvicorn.protocols.http.h11_impl import H11Protocol
+from uvicorn.protocols.websockets.wsproto_impl import WSProtocol
+from wsproto import events
 
-from hilstar.console.server.pictures import Packed
-from hilstar.console.server.protocol import LINE, ReadingWebSocket
+from hilstar.console.server.reader import PackedPicture
+
+HEAD_S = 5.0  # for a request's head to be whole
+WHOLE_S = 20.0  # for its body, and for the answer to be read
+MAX_CONNECTIONS = 100  # that are no WebSocket; first those give way that have had an answer, then the oldest
+PING_S, PONG_S = 2.0, 20.0  # each so often a WebSocket is asked for a sign of life, and so long it may take
+UNREAD_S = 4.0  # without that sign a peer counts as one that does not read
+MAX_UNSENT_BYTES = 65_536  # in the kernel
+MAX_PONGS_BYTES = 200_000  # that wait for a peer that sends pings and reads nothing
+LINE = "hilstar.line"  # in a WebSocket's scope: its `ReadingWebSocket`
+
+_connections: OrderedDict[BoundedHttp, None] = OrderedDict()
+
+
+class BoundedHttp(H11Protocol):
+    """One connection. It is closed where the peer says nothing, says it slowly, or does not read.
+
+    uvicorn bounds what a request may hold, but neither how long it may take nor what waits for a peer that does not read.
+    """
+
+    _limit: asyncio.TimerHandle | None = None
+    _timed_cycle: Any = None
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Start the time for a request's head; where there are too many connections, one is dropped."""
+        super().connection_made(transport)
+        _connections[self] = None
+        if len(_connections) > MAX_CONNECTIONS:
+            next(iter(_connections))._drop()
+        self._within(HEAD_S)
+
+    def data_received(self, data: bytes) -> None:
+        """Take bytes; once a head is whole, the rest has its own time."""
+        if self._limit is None:
+            self._within(HEAD_S)
+        super().data_received(data)
+        if self.cycle is not None and self.cycle is not self._timed_cycle and not self.cycle.response_complete:
+            self._timed_cycle = self.cycle
+            self._within(WHOLE_S)
+
+    def on_response_complete(self) -> None:
+        """The answer is out: nobody waits for this connection."""
+        self._end_time()
+        if self in _connections:
+            _connections.move_to_end(self, last=False)
+        super().on_response_complete()
+
+    def handle_websocket_upgrade(self, event: Request) -> None:
+        """A WebSocket has bounds of its own."""
+        self._end_time()
+        _connections.pop(self, None)
+        super().handle_websocket_upgrade(event)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """It is gone."""
+        self._end_time()
+        _connections.pop(self, None)
+        super().connection_lost(exc)
+
+    def _within(self, seconds: float) -> None:
+        self._end_time()
+        self._limit = self.loop.call_later(seconds, self._drop)
+
+    def _end_time(self) -> None:
+        if self._limit is not None:
+            self._limit.cancel()
+            self._limit = None
+
+    def _drop(self) -> None:
+        _connections.pop(self, None)
+        self._end_time()
+        self.transport.abort()
+
+
+class ReadingWebSocket(WSProtocol):
+    """A WebSocket whose peer has to read: it answers pings, and what waits for it is bounded."""
+
+    _heard_s: float | None = None  # when it last answered one
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Let little wait in the kernel: what a slow peer is sent would be old."""
+        super().connection_made(transport)
+        found = transport.get_extra_info("socket")
+        if found is not None:
+            found.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, MAX_UNSENT_BYTES)
+
+    def handle_connect(self, event: events.Request) -> None:
+        """Leave itself in the scope, for who serves the WebSocket."""
+        super().handle_connect(event)
+        cast(dict[str, object], self.scope["extensions"])[LINE] = self
+
+    @property
+    def is_read(self) -> bool:
+        """Whether the peer has lately shown that it reads."""
+        return self._heard_s is not None and time.monotonic() - self._heard_s < UNREAD_S
+
+    def start_keepalive(self) -> None:
+        """Ask at once whether the peer reads."""
+        self.send_keepalive_ping()
+
+    def handle_pong(self, event: events.Pong) -> None:
+        """It has read up to here."""
+        if bytes(event.payload) == self.pending_ping_payload:
+            self._heard_s = time.monotonic()
+        super().handle_pong(event)
+
+    def handle_ping(self, event: events.Ping) -> None:
+        """Answer, unless the answers are not read."""
+        if self.transport.get_write_buffer_size() > MAX_PONGS_BYTES:
+            self.drop()
+        else:
+            super().handle_ping(event)
+
+    def keepalive_timeout(self) -> None:
+        """It does not read: nothing more can be said to it."""
+        self.drop()
+
+    def drop(self) -> None:
+        """Close the connection now, whatever waits to be sent."""
+        self.transport.abort()
+
 
 MAX_CLIENTS = 32
 MAX_WAITING_TEXTS = 100  # ten seconds
@@ -30,7 +150,7 @@ TRY_AGAIN, POLICY = 1013, 1008  # close codes of RFC 6455 and its registry
 GIVES_WAY = 4013  # of our own: the page does not come back at once, or it would take the place of the next
 
 
-class Want(msgspec.Struct):
+class PageWants(msgspec.Struct):
     """What a page wants besides the state."""
 
     picture: bool = False
@@ -43,33 +163,33 @@ class Want(msgspec.Struct):
         return min(max(self.hz, MIN_HZ), MAX_HZ) if self.picture else 0.0
 
 
-class Wish(msgspec.Struct):
+class PageMessage(msgspec.Struct):
     """A page's message."""
 
-    want: Want
+    want: PageWants
 
 
-def wish_of(text: str) -> Want | None:
+def wants_of(text: str) -> PageWants | None:
     """What a page's message wants; None for nonsense."""
     try:
-        return msgspec.json.decode(text, type=Wish).want
+        return msgspec.json.decode(text, type=PageMessage).want
     except (msgspec.MsgspecError, ValueError, RecursionError):  # not its JSON, no UTF-8, deeper than any
         return None
 
 
-class Client:
+class OpenPage:
     """One page."""
 
     def __init__(self, socket: WebSocket) -> None:
         self.socket = socket
         self._line: ReadingWebSocket = socket.scope["extensions"][LINE]
         self.address = "" if socket.client is None else socket.client.host
-        self.want = Want()
+        self.want = PageWants()
         self.asked = False  # has said what it wants, as the page does at once
         self.is_page = "origin" in socket.headers
         self.closing: int | None = None
         self._texts: deque[str] = deque()
-        self._packed: Packed | None = None
+        self._packed: PackedPicture | None = None
         self._picture_s = 0.0
         self._wake = asyncio.Event()
         self._wishes_s: deque[float] = deque(maxlen=MAX_WISHES)
@@ -82,7 +202,7 @@ class Client:
         self._texts.append(text)
         self._wake.set()
 
-    def show(self, packed: Packed) -> None:
+    def show(self, packed: PackedPicture) -> None:
         """Offer a picture: sent if the page wants it now, instead of one that waits."""
         now_s = time.monotonic()
         hz = self.want.picture_hz
@@ -133,18 +253,22 @@ class Client:
                 self.close(POLICY)
                 return
             self._wishes_s.append(now_s)
-            want = wish_of(message.get("text") or "")
+            want = wants_of(message.get("text") or "")
             if want is None:
                 self.close(POLICY)
                 return
             self.want, self.asked = want, True
 
 
-class Crowd:
-    """All pages that are open."""
+class OpenPages:
+    """All pages that are open. A slow one loses pictures, then its connection.
+
+    A page that comes always has a place. Where all are taken one gives way: one that does not read, before one that has
+    asked for nothing, before one that is no browser's, before the oldest of the address with the most pages.
+    """
 
     def __init__(self) -> None:
-        self._clients: dict[Client, None] = {}
+        self._clients: dict[OpenPage, None] = {}
 
     def __len__(self) -> int:
         return len(self._clients)
@@ -157,11 +281,11 @@ class Crowd:
     def tell(self, message: dict[str, Any]) -> None:
         """Tell all of them; the text is made once."""
         if self._clients:
-            text = told(message)
+            text = json_text(message)
             for client in self._clients:
                 client.tell(text)
 
-    def show(self, packed: Packed) -> None:
+    def show(self, packed: PackedPicture) -> None:
         """Offer all of them a picture."""
         for client in self._clients:
             client.show(packed)
@@ -170,13 +294,13 @@ class Crowd:
         """Have one give way where all places are taken."""
         if len(self._clients) < MAX_CLIENTS:
             return
-        pages = Counter(client.address for client in self._clients)
-        worth = {c: (c.is_read, c.asked, c.is_page, -pages[c.address]) for c in self._clients}
+        by_address = Counter(client.address for client in self._clients)
+        worth = {c: (c.is_read, c.asked, c.is_page, -by_address[c.address]) for c in self._clients}
         least = min(worth, key=worth.__getitem__)  # of equals the first, which is the oldest
         self._clients.pop(least)
         least.close(GIVES_WAY)
 
-    async def follow(self, client: Client) -> None:
+    async def follow(self, client: OpenPage) -> None:
         """Serve a page until it goes, or has to."""
         self._clients[client] = None
         tasks = [asyncio.create_task(client.listen()), asyncio.create_task(client.send_all())]
@@ -196,7 +320,7 @@ class Crowd:
         await asyncio.gather(*(_close(client, code) for client in list(self._clients)), return_exceptions=True)
 
 
-async def _close(client: Client, code: int | None = None) -> None:
+async def _close(client: OpenPage, code: int | None = None) -> None:
     try:
         async with asyncio.timeout(1.0):
             await client.socket.close(code or client.closing or TRY_AGAIN)
@@ -204,7 +328,7 @@ async def _close(client: Client, code: int | None = None) -> None:
         pass  # it was gone
 
 
-def told(message: dict[str, Any]) -> str:
+def json_text(message: dict[str, Any]) -> str:
     """A message as JSON text; a number that JSON does not know is null."""
     try:
         return _text(message)

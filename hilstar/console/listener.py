@@ -23,7 +23,7 @@ NAME = re.compile(r"(?=.{1,253}$)[A-Za-z0-9]([A-Za-z0-9-]*[A-Za-z0-9])?(\.[A-Za-
 
 
 @dataclass(frozen=True, slots=True)
-class Address:
+class ListenAddress:
     """A host and a port; port 0 is any free one."""
 
     host: str
@@ -39,7 +39,7 @@ class Address:
         return False
 
 
-def parse_address(text: str) -> Address:
+def parse_address(text: str) -> ListenAddress:
     """ "HOST:PORT", "HOST", ":PORT" or "PORT". Raises InputError."""
     wrong = InputError(f"--console {shortened(text)}: {FORM}")
     if text.isdecimal() and text.isascii():
@@ -58,7 +58,7 @@ def parse_address(text: str) -> Address:
     host = host or HOST
     if not _is_host(host):
         raise wrong
-    return Address(host, int(port) if port else PORT)
+    return ListenAddress(host, int(port) if port else PORT)
 
 
 def _is_host(text: str) -> bool:
@@ -68,14 +68,14 @@ def _is_host(text: str) -> bool:
     return NAME.fullmatch(text) is not None and ":" not in text and not re.fullmatch(r"[\d.]+", text)
 
 
-class Door:
+class PageListener:
     """The listening socket, and what opens it. Raises InputError where the address cannot be had.
 
     A token is made where the page can be reached from elsewhere and none is given; `made` says that it was. `names` are
     further names of the page, those under which a proxy shows it.
     """
 
-    def __init__(self, address: Address, token: str | None = None, names: tuple[str, ...] = ()) -> None:
+    def __init__(self, address: ListenAddress, token: str | None = None, names: tuple[str, ...] = ()) -> None:
         if token is not None and TOKEN.fullmatch(token) is None:
             raise InputError("--token: write 16 to 200 letters, digits or . _ ~ -, as `openssl rand -hex 32` makes them")
         for name in names:
@@ -121,7 +121,7 @@ def _bracketed(host: str) -> str:
     return f"[{host}]" if ":" in host else host
 
 
-def _listen(address: Address) -> socket.socket:
+def _listen(address: ListenAddress) -> socket.socket:
     where = f"{_bracketed(address.host)}:{address.port}"
     try:
         found = socket.getaddrinfo(address.host, address.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)

@@ -22,8 +22,8 @@ from typing import Protocol, Self
 
 import msgspec
 
-from hilstar.console.feed.board import Board
-from hilstar.console.feed.messages import Answer, EventSeen, Order, RunSeen, Setup
+from hilstar.console.messages import Order, OrderAnswer, RunEvent, RunState, Setup
+from hilstar.console.shared_memory import SharedMemory
 from hilstar.errors import one_line
 from hilstar.notices import Listener, Notice
 
@@ -37,13 +37,13 @@ OF_THE_RUN = {"NOTIFY_SOCKET", "WATCHDOG_PID", "WATCHDOG_USEC", "HILSTAR_TOKEN"}
 PAGE = (sys.executable, "-P", "-m", "hilstar.console.server")
 
 
-Do = Callable[[Order], Answer]  # on a thread of its own
+Do = Callable[[Order], OrderAnswer]  # on a thread of its own
 
 
-class Subject(Protocol):
+class PageSubject(Protocol):
     """What the page is of: its state now, its events, and who is told of the page itself."""
 
-    def now(self) -> RunSeen:
+    def now(self) -> RunState:
         """The state now."""
 
     def listen(self, listener: Listener) -> None:
@@ -58,15 +58,15 @@ class _Page:
     """One process of the page, and the socket to it."""
 
     process: subprocess.Popen[bytes]
-    wire: socket.socket
+    channel: socket.socket
     begun_s: float
 
 
-class Host:
+class PageProcess:
     """The page of a run, for as long as this is open."""
 
-    def __init__(self, setup: Setup, board: Board, listener: socket.socket, watched: Subject, do: Do) -> None:
-        self._board, self._listener, self._watched, self._do = board, listener, watched, do
+    def __init__(self, setup: Setup, memory: SharedMemory, listener: socket.socket, watched: PageSubject, do: Do) -> None:
+        self._memory, self._listener, self._watched, self._do = memory, listener, watched, do
         self._setup_fd = _memory_of(msgspec.msgpack.encode(setup))
         self._events: deque[Notice] = deque(maxlen=1000)
         watched.listen(self._events.append)
@@ -103,10 +103,10 @@ class Host:
 
     def _tick(self, now_s: float) -> None:
         try:
-            self._board.states.put(msgspec.json.encode(self._watched.now()))
+            self._memory.states.put(msgspec.json.encode(self._watched.now()))
             self._write_events()
         except Exception as error:  # a container that changed while it was read, or whatever else: there is a next look
-            self._board.states.put(msgspec.json.encode(RunSeen(host_ns=time.monotonic_ns(), note=one_line(repr(error)))))
+            self._memory.states.put(msgspec.json.encode(RunState(host_ns=time.monotonic_ns(), note=one_line(repr(error)))))
         page = self._page
         if page is None:
             if now_s >= self._start_s:
@@ -118,12 +118,12 @@ class Host:
         ahead_s = time.time() - time.monotonic_ns() * 1e-9
         while self._events:
             notice = self._events.popleft()
-            event = EventSeen(round(notice.host_ns * 1e-9 + ahead_s, 3), notice.kind, notice.detail)
-            self._board.events.put(msgspec.json.encode(event))
+            event = RunEvent(round(notice.host_ns * 1e-9 + ahead_s, 3), notice.kind, notice.detail)
+            self._memory.events.put(msgspec.json.encode(event))
 
     def _start_page(self, now_s: float) -> None:
-        wire, its_wire = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        given = (self._setup_fd, self._board.fd, its_wire.fileno(), self._listener.fileno())
+        channel, its_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        given = (self._setup_fd, self._memory.fd, its_end.fileno(), self._listener.fileno())
         try:
             process = subprocess.Popen(
                 [*PAGE, *map(str, given)],
@@ -133,16 +133,16 @@ class Host:
                 env=_environment(),
             )
         except OSError as error:
-            wire.close()
+            channel.close()
             self._put_off(now_s, f"the operator's page cannot be started ({error.strerror})")
             return
         finally:
-            its_wire.close()
-        wire.setblocking(False)
-        self._page = _Page(process, wire, now_s)
+            its_end.close()
+        channel.setblocking(False)
+        self._page = _Page(process, channel, now_s)
 
     def _lost(self, page: _Page, now_s: float) -> None:
-        page.wire.close()
+        page.channel.close()
         self._page = None
         if now_s - page.begun_s > STEADY_S:
             self._wait_s = FIRST_WAIT_S
@@ -158,11 +158,11 @@ class Host:
         if page is None:
             self._stop.wait(seconds)
             return
-        ready, _, _ = select.select([page.wire], [], [], seconds)
+        ready, _, _ = select.select([page.channel], [], [], seconds)
         if not ready:
             return
         with contextlib.suppress(OSError, msgspec.MsgspecError, UnicodeDecodeError):
-            data = page.wire.recv(MAX_ORDER_BYTES)
+            data = page.channel.recv(MAX_ORDER_BYTES)
             if data:
                 self._take(msgspec.json.decode(data, type=Order))
             else:  # its end is told by the next tick
@@ -171,18 +171,18 @@ class Host:
     def _take(self, order: Order) -> None:
         self._workers.submit(self._do, order).add_done_callback(self._answer)
 
-    def _answer(self, done: Future[Answer]) -> None:
+    def _answer(self, done: Future[OrderAnswer]) -> None:
         page = self._page
         if page is None or done.cancelled() or done.exception() is not None:
             return
         with contextlib.suppress(OSError):  # it has gone meanwhile
-            page.wire.send(msgspec.json.encode(done.result()))
+            page.channel.send(msgspec.json.encode(done.result()))
 
     def _end_page(self) -> None:
         page, self._page = self._page, None
         if page is None:
             return
-        page.wire.close()  # which tells it to end
+        page.channel.close()  # which tells it to end
         try:
             page.process.wait(END_WAITS_S)
         except subprocess.TimeoutExpired:

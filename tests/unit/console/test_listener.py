@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from hilstar.cli.parsers import with_values
-from hilstar.console.feed.door import Address, Door, parse_address
+from hilstar.console.listener import ListenAddress, PageListener, parse_address
 from hilstar.errors import InputError
 
 
@@ -25,7 +25,7 @@ from hilstar.errors import InputError
     ],
 )
 def test_an_address_is_read_as_it_is_meant(text, wanted):
-    assert parse_address(text) == Address(*wanted)
+    assert parse_address(text) == ListenAddress(*wanted)
 
 
 @pytest.mark.parametrize(
@@ -50,18 +50,18 @@ def test_what_is_no_address_is_refused(text):
     ],
 )
 def test_loopback_is_told_from_elsewhere(host, loopback):
-    assert Address(host, 1).is_loopback is loopback
+    assert ListenAddress(host, 1).is_loopback is loopback
 
 
 def test_a_token_is_made_beyond_loopback_only_and_in_the_address_only_where_it_was_made():
-    with Door(Address("127.0.0.1", 0)) as own:
+    with PageListener(ListenAddress("127.0.0.1", 0)) as own:
         assert own.token == "" and "#" not in own.url
-    with Door(Address("0.0.0.0", 0)) as first, Door(Address("0.0.0.0", 0)) as second:
+    with PageListener(ListenAddress("0.0.0.0", 0)) as first, PageListener(ListenAddress("0.0.0.0", 0)) as second:
         assert first.token != second.token and len(first.token) >= 40
         assert first.url.endswith(f":{first.port}/#token={first.token}") and "0.0.0.0" not in first.url
     given = "a-token-that-was-given"
-    with Door(Address("0.0.0.0", 0), given) as door:
-        assert door.token == given and given not in door.url
+    with PageListener(ListenAddress("0.0.0.0", 0), given) as listener:
+        assert listener.token == given and given not in listener.url
 
 
 def test_console_may_stand_alone_before_other_words():

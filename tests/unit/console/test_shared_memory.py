@@ -7,7 +7,7 @@ import threading
 
 import numpy as np
 
-from hilstar.console.feed.board import EVENTS, FRAMES, Board, Ring, Want
+from hilstar.console.shared_memory import EVENTS, FRAMES, PictureRequest, Ring, SharedMemory
 
 SLOTS, SLOT_BYTES = 4, 100
 
@@ -68,18 +68,18 @@ def test_a_reader_beside_a_writer_sees_whole_records_alone():
 
 
 def test_a_board_is_seen_by_whoever_has_its_descriptor():
-    board = Board.make(320 * 240)
-    other = Board(os.dup(board.fd), 320 * 240)
-    board.frames.put(b"frame")
-    board.events.put(b"event")
-    other.want = Want(125_000_000, 7)
+    memory = SharedMemory.make(320 * 240)
+    other = SharedMemory(os.dup(memory.fd), 320 * 240)
+    memory.frames.put(b"frame")
+    memory.events.put(b"event")
+    other.want = PictureRequest(125_000_000, 7)
     assert other.frames.last() == (1, b"frame") and other.events.last() == (1, b"event")
     other.wrong_since_s = 12.5
-    assert board.want == Want(125_000_000, 7) and board.wrong_since_s == 12.5
+    assert memory.want == PictureRequest(125_000_000, 7) and memory.wrong_since_s == 12.5
     picture = np.arange(320 * 240, dtype=np.uint8)
-    board.pictures.begin()
-    np.copyto(np.frombuffer(board.pictures.room(picture.nbytes), dtype=np.uint8), picture)
-    board.pictures.end(picture.nbytes, 0)
+    memory.pictures.begin()
+    np.copyto(np.frombuffer(memory.pictures.room(picture.nbytes), dtype=np.uint8), picture)
+    memory.pictures.end(picture.nbytes, 0)
     found = other.pictures.last()
     assert found is not None and found[1] == picture.tobytes()
     assert FRAMES >= 60 and EVENTS >= 100  # a page that comes back has a second of frames and the newest events

@@ -18,7 +18,7 @@ import numpy as np
 
 _HEAD = struct.Struct("<Q")
 _SLOT = struct.Struct("<QQII")  # the number being written, the number that is whole, bytes, CRC-32
-_WANT = struct.Struct("<QQ")  # a picture each so many ns, until so many ns of host time
+_REQUEST = struct.Struct("<QQ")  # a picture each so many ns, until so many ns of host time
 _WRONG_SINCE = struct.Struct("<d")  # UTC, s
 _PAGE = 4096
 FRAMES, FRAME_BYTES = 512, 128  # 8 s at 60 Hz
@@ -106,14 +106,14 @@ class Ring:
 
 
 @dataclass(frozen=True, slots=True)
-class Want:
+class PictureRequest:
     """How often the page wants a picture, and until when (host time), ns; 0 for never."""
 
     each_ns: int = 0
     until_ns: int = 0
 
 
-class Board:
+class SharedMemory:
     """The rings of a run: frames, states, events and pictures, and what the page wants; `fd` is the memory's own."""
 
     def __init__(self, fd: int, picture_bytes: int) -> None:
@@ -130,24 +130,24 @@ class Board:
         self.frames, self.states, self.events, self.pictures = rings
 
     @classmethod
-    def make(cls, picture_bytes: int) -> Board:
-        """A new board for pictures of so many bytes."""
+    def make(cls, picture_bytes: int) -> SharedMemory:
+        """New memory for pictures of so many bytes."""
         return cls(os.memfd_create("hilstar-console"), picture_bytes)
 
     @property
-    def want(self) -> Want:
+    def want(self) -> PictureRequest:
         """What the page wants now."""
-        return Want(*_WANT.unpack_from(self._memory, 0))
+        return PictureRequest(*_REQUEST.unpack_from(self._memory, 0))
 
     @want.setter
-    def want(self, want: Want) -> None:
-        _WANT.pack_into(self._memory, 0, want.each_ns, want.until_ns)
+    def want(self, want: PictureRequest) -> None:
+        _REQUEST.pack_into(self._memory, 0, want.each_ns, want.until_ns)
 
     @property
     def wrong_since_s(self) -> float:
         """Since when the page has found the run wrong (UTC, s), for a page that takes over; 0 where it found it right."""
-        return float(_WRONG_SINCE.unpack_from(self._memory, _WANT.size)[0])
+        return float(_WRONG_SINCE.unpack_from(self._memory, _REQUEST.size)[0])
 
     @wrong_since_s.setter
     def wrong_since_s(self, since_s: float) -> None:
-        _WRONG_SINCE.pack_into(self._memory, _WANT.size, since_s)
+        _WRONG_SINCE.pack_into(self._memory, _REQUEST.size, since_s)

@@ -1,21 +1,201 @@
-"""What a run's page is given: its figures along the run, reduced to minimum and maximum, and what happened in it."""
+"""A run's report: the operator's page as one file with the whole run in it, and its figures as JSON."""
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import math
+import re
+import zlib
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from hilstar import __version__
 from hilstar.arrays import FloatArray
+from hilstar.attitude.logs.mcap_log import NO_END, unfinished_part
+from hilstar.bench.bench_file import BenchFile, bench_file_of
+from hilstar.bench.build import open_bench
 from hilstar.bench.config import BenchConfig
-from hilstar.run.record.ledger_reader import config_of
-from hilstar.run.record.ledger_records import EventRecord
-from hilstar.run.record.report import RunReport, table_rows
+from hilstar.bench.faults.kinds import Freeze
+from hilstar.bench.frame import Bench
+from hilstar.console.overlay import Overlay, catalogue_sky, overlay_of
+from hilstar.errors import InputError, MachineError, printable
+from hilstar.files import make_directory, write_whole
+from hilstar.notices import Notices
+from hilstar.run.faults import Recording, read_recording
+from hilstar.run.record.ledger_reader import config_of, wrong_in_frame
+from hilstar.run.record.ledger_records import EventRecord, FrameRecord
+from hilstar.run.record.report import RunReport, figures_of, summarise, table_rows
 from hilstar.run.record.report_figures import COUNTS, METRICS, Figures
+from hilstar.run.replay import RunPlay, replay
+from hilstar.run.serve import Outlet
+from hilstar.run.shown import Shown
 from hilstar.units import NS_PER_S
+
+PAGE_DIR = Path(__file__).resolve().parent / "page"
+_import = re.compile(r'^import \{ ([^}]+) \} from "\./(\w+)\.js";\n', re.MULTILINE)
+_export = re.compile(r"^export (?=(?:class|const|function) (\w+))", re.MULTILINE)
+LINKS = re.compile(r'^<(?:link rel="(?:icon|stylesheet)"|script type="module").*\n', re.MULTILINE)
+
+
+def one_script(entry: str, folder: Path = PAGE_DIR) -> str:
+    """The module `entry` and all that it imports, as one script. Raises ValueError for an import that it does not know.
+
+    A browser loads no module from a file beside a page that is itself a file, so each module becomes a function. The page's
+    modules keep to what this reads: imports and exports that begin a line, by name, and no default export.
+    """
+    done: dict[str, str] = {}
+    _take(entry, folder, done)
+    return "".join(done.values())
+
+
+def _take(name: str, folder: Path, done: dict[str, str]) -> None:
+    text = (folder / f"{name}.js").read_text(encoding="utf-8")
+    wanted = _import.findall(text)
+    for _, other in wanted:
+        if other not in done:
+            _take(other, folder, done)
+    body, names = _import.sub("", text), _export.findall(text)
+    body = _export.sub("", body)
+    if re.search(r"^(?:import|export)\b", body, re.MULTILINE):
+        raise ValueError(f"{name}.js: an import or export that is not in one line with names in braces")
+    takes = "".join(
+        f"const {{ {', '.join(part.replace(' as ', ': ').split(', '))} }} = of_{other};\n" for part, other in wanted
+    )
+    done[name] = f"const of_{name} = (() => {{\n{takes}{body}return {{ {', '.join(names)} }};\n}})();\n"
+
+
+def _hash(text: str) -> str:
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
+
+
+def _base64(data: bytes) -> str:
+    return base64.b64encode(data).decode()
+
+
+def report_page(data: dict[str, Any]) -> str:
+    """The page with a run's data (see `run_data`), as HTML that needs no other file and no network."""
+    html = (PAGE_DIR / "index.html").read_text(encoding="utf-8")
+    style, script = (PAGE_DIR / "page.css").read_text(encoding="utf-8"), one_script("report")
+    policy = (
+        f"default-src 'none'; script-src {_hash(script)}; style-src {_hash(style)}; img-src data:; base-uri 'none'; "
+        "form-action 'none'"
+    )
+    icon = _base64((PAGE_DIR / "icon.svg").read_bytes())
+    head = (
+        f'<meta http-equiv="Content-Security-Policy" content="{policy}">\n'
+        f'<link rel="icon" href="data:image/svg+xml;base64,{icon}">\n<style>{style}</style>\n'
+    )
+    packed = _base64(zlib.compress(msgspec.json.encode(data), 9))
+    tail = f'<script type="text/plain" id="run-data">{packed}</script>\n<script type="module">{script}</script>\n'
+    html = LINKS.sub("", html).replace('data-mode="live"', 'data-mode="report"')
+    # The data come before the script that reads them, and both after the page's own text.
+    return html.replace("</head>", f"{head}</head>").replace("</body>", f"{tail}</body>")
+
+
+MAX_BYTES = 3_000_000  # of all pictures together, packed
+NO_BENCH = "the ledger's head has no bench file"
+CAUTION = (
+    "Drawn by a bench that is not the run's own: a file that it names has changed since, or another version of hilstar wrote "
+    "the ledger. Codes may differ from those shown."
+)
+
+
+class _Unreported(Notices):
+    """Events of drawing again, which are not the run's."""
+
+    def tell(self, kind: str, detail: str, who: str = "") -> None:
+        """Say nothing."""
+
+
+def run_pictures(run: Figures, ledger: Path) -> dict[str, Any]:
+    """`pictures` in the order of the run, with a `caution` where the bench has changed, or `no_pictures`, why there are none.
+
+    And the whole `sky` about them.
+    """
+    try:
+        file = _bench_file(run.head, ledger)
+        with open_bench(file) as bench:
+            overlay = overlay_of(bench)
+            return {
+                "pictures": _pictures(bench, overlay, run, ledger),
+                "caution": "" if file.sha256 == run.head.get("bench_sha256") else CAUTION,
+                "sky": overlay.sky(),
+                "white_level": len(bench.calibration.response.light) - 1,
+            }
+    except (InputError, MachineError) as error:
+        return {"pictures": [], "no_pictures": str(error), "sky": catalogue_sky()}
+
+
+def _bench_file(head: dict[str, str], ledger: Path) -> BenchFile:
+    """The bench of a run: the text in its head, with the files that it names where they are now, preferably unchanged.
+
+    Raises InputError where the head has none, or one that cannot be read.
+    """
+    text, named = head.get("bench_text"), Path(head.get("bench_file", "bench.toml"))
+    if not text:
+        raise InputError(NO_BENCH)
+    files = [bench_file_of(path, text) for path in (named, ledger.parent / named.name)]
+    return next((file for file in files if file.sha256 == head.get("bench_sha256")), files[0])
+
+
+def _pictures(bench: Bench, overlay: Overlay, run: Figures, ledger: Path) -> list[dict[str, Any]]:
+    """The frames that are worth one, replayed with the faults that they had."""
+    recording = read_recording(ledger)
+    frames = run.keyframes.chosen(run.last)
+    chosen = [(record, why) for record, why in frames if not (_stays(record, recording) or wrong_in_frame(record))]
+    found: list[dict[str, Any]] = []
+
+    def take(shown: Shown) -> None:
+        record, why = chosen[len(found)]
+        picture = _picture(overlay, shown)
+        t_s = (record.swap_ns - run.first_swap_ns) / NS_PER_S
+        told = {"why": why, "operator": record.operator, "stale": record.stale}
+        found.append(picture | told | {"t_s": round(t_s, 3)})
+
+    if chosen:
+        replay(
+            bench,
+            RunPlay([record for record, _ in chosen], 0, paced=False, recording=recording),
+            take,
+            Outlet(notices=_Unreported()),
+        )
+    return _within(found, MAX_BYTES)
+
+
+def _stays(record: FrameRecord, recording: Recording) -> bool:
+    """Whether a fault held the picture, so that it was that of a frame before."""
+    return any(isinstance(recording.faults.get(number), Freeze) for number in record.faults)
+
+
+def _within(pictures: list[dict[str, Any]], size: int) -> list[dict[str, Any]]:
+    """As many of them, evenly over the run, as are not larger together."""
+    while len(pictures) > 1 and sum(len(picture["data"]) for picture in pictures) > size:
+        pictures = pictures[::2]
+    return pictures
+
+
+def _picture(overlay: Overlay, shown: Shown) -> dict[str, Any]:
+    """One frame: its levels, packed, and the truth about them."""
+    levels = shown.drawn.levels
+    truth = None
+    if shown.attitude is not None:
+        truth = overlay.truth(shown.attitude.q_icrs_to_cam, shown.drawn.clipped_hip, grid=True)
+    wide = levels.dtype.itemsize == 2
+    data = np.ascontiguousarray(levels, dtype="<u2" if wide else "u1").tobytes()
+    return {
+        "frame": shown.number,
+        "w": levels.shape[1],
+        "h": levels.shape[0],
+        "dtype": "u2" if wide else "u1",
+        "data": base64.b64encode(zlib.compress(data, 9)).decode(),
+        "truth": truth,
+    }
+
 
 BINS = 60
 HISTOGRAM_SPREAD = 99.9  # percent of the frames that a histogram shows; the worst is in the table
@@ -224,3 +404,21 @@ def beside_steady(rows: FloatArray) -> FloatArray:
     spread = float((at * at).sum())
     slope = (at @ turned_rad) / spread if spread > 0 else np.zeros(3)
     return np.asarray(np.degrees(turned_rad - turned_rad.mean(axis=0) - at[:, None] * slope))
+
+
+def report(path: Path, directory: Path) -> RunReport:
+    """Write `report.html` and `report.json` of a ledger into a directory; the figures.
+
+    Raises InputError for a file that is no ledger, and if it cannot write.
+    """
+    run = figures_of(path)
+    summary = summarise(run)
+    data = run_data(printable(path.name), run, summary) | run_pictures(run, path)
+    unfinished = unfinished_part(path)
+    if unfinished is not None:
+        data["facts"].insert(0, ("no end", f"{printable(unfinished.name)} {NO_END}"))
+    page = report_page(data)
+    make_directory(directory)
+    write_whole(directory / "report.html", page.encode(errors="replace"))
+    write_whole(directory / "report.json", msgspec.json.format(msgspec.json.encode(summary)))
+    return summary

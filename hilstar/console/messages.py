@@ -1,4 +1,4 @@
-"""What a run and its page say to each other: frames, states, events and pictures on the board, orders and their answers."""
+"""Messages between a run and its page's process: frames, states, events and pictures in shared memory; orders and answers."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class FrameNumbers(NamedTuple):
     flags: int
 
     def pack(self) -> bytes:
-        """Its bytes on the board."""
+        """Its bytes in the shared memory."""
         return FRAME.pack(*self)
 
     @classmethod
@@ -44,7 +44,7 @@ class PictureHead(NamedTuple):
     """A picture: its frame, when that was shown (host time, ns), and how much follows.
 
     `q_w` to `q_z` are its attitude, NaN without one. First levels of
-    `item_bytes` each, `width` by `height`, then `sprites` of `board.SPRITE`.
+    `item_bytes` each, `width` by `height`, then `sprites` of `shared_memory.SPRITE`.
     """
 
     frame: int
@@ -60,7 +60,7 @@ class PictureHead(NamedTuple):
     q_z: float = math.nan
 
     def pack(self) -> bytes:
-        """Its bytes on the board."""
+        """Its bytes in the shared memory."""
         return _PICTURE.pack(*self)
 
     @classmethod
@@ -69,7 +69,7 @@ class PictureHead(NamedTuple):
         return cls(*_PICTURE.unpack_from(data))
 
 
-class AttitudeSeen(msgspec.Struct, frozen=True):
+class AttitudeState(msgspec.Struct, frozen=True):
     """The attitude of the newest frame: cam from ICRS, scalar first; the rate in cam, rad/s."""
 
     q: tuple[float, float, float, float]
@@ -77,7 +77,7 @@ class AttitudeSeen(msgspec.Struct, frozen=True):
     age_ns: int
 
 
-class ClockSeen(msgspec.Struct, frozen=True):
+class ClockState(msgspec.Struct, frozen=True):
     """The sender's clock."""
 
     mode: str
@@ -86,7 +86,7 @@ class ClockSeen(msgspec.Struct, frozen=True):
     uncertainty_ms: float | None
 
 
-class LedgerSeen(msgspec.Struct, frozen=True):
+class LedgerState(msgspec.Struct, frozen=True):
     """The ledger: `failing` says why it cannot be written now, "" where it can."""
 
     path: str
@@ -94,7 +94,7 @@ class LedgerSeen(msgspec.Struct, frozen=True):
     failing: str = ""
 
 
-class RunSeen(msgspec.Struct, frozen=True, kw_only=True):
+class RunState(msgspec.Struct, frozen=True, kw_only=True):
     """The run at a moment of host time, ns; `alive_ns` is when the frame loop last moved, 0 before it began."""
 
     host_ns: int
@@ -105,8 +105,8 @@ class RunSeen(msgspec.Struct, frozen=True, kw_only=True):
     blank: bool = True
     stars: int = 0
     clipped: list[int | str] = []
-    attitude: AttitudeSeen | None = None
-    clock: ClockSeen | None = None
+    attitude: AttitudeState | None = None
+    clock: ClockState | None = None
     frames: int = 0
     missed: int = 0
     stale_frames: int = 0
@@ -119,14 +119,14 @@ class RunSeen(msgspec.Struct, frozen=True, kw_only=True):
     patch_share: float = 0.0
     hidden: str = ""
     display_lost: str = ""
-    ledger: LedgerSeen | None = None
+    ledger: LedgerState | None = None
     note: str = ""
     faults: list[str] = []
     rates: str = ""
     failed: list[str] = []
 
 
-class EventSeen(msgspec.Struct, frozen=True):
+class RunEvent(msgspec.Struct, frozen=True):
     """An event of the run, at UTC, seconds."""
 
     unix_s: float
@@ -151,7 +151,7 @@ class Order(msgspec.Struct, kw_only=True):
     fault: str = ""
 
 
-class Answer(msgspec.Struct, kw_only=True):
+class OrderAnswer(msgspec.Struct, kw_only=True):
     """What became of an order: an HTTP status, and a line."""
 
     id: int

@@ -1,0 +1,506 @@
+"""What a run or a first-light session publishes to its page: frames, pictures, its state; and what operators order."""
+
+from __future__ import annotations
+
+import contextlib
+import pickle
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hilstar import __version__
+from hilstar.attitude.clock.rate_check import WRONG
+from hilstar.bench.frame import Bench
+from hilstar.console.listener import PageListener
+from hilstar.console.messages import (
+    BLANK,
+    FRAME,
+    HAS_AGE,
+    MISSING,
+    STALE,
+    SWITCHES,
+    AttitudeState,
+    ClockState,
+    LedgerState,
+    Order,
+    OrderAnswer,
+    Pace,
+    PictureHead,
+    RunState,
+    Setup,
+)
+from hilstar.console.overlay import OverlayScene, overlay_of
+from hilstar.console.page_process import PageProcess
+from hilstar.console.shared_memory import MAX_SPRITES, PICTURE_HEAD_BYTES, SPRITE, SharedMemory
+from hilstar.errors import HilstarError, did_you_mean, one_line, printable
+from hilstar.notices import Listener, Notice
+from hilstar.run.operator import PATCHES, Overrides, SwitchRequest, SwitchRequests, aid_levels_of
+from hilstar.scene.sprites import brightest
+from hilstar.units import NS_PER_S
+
+if TYPE_CHECKING:
+    from hilstar.bench.bench_file import BenchFile
+    from hilstar.bench.faults.desk import FaultDesk
+    from hilstar.calibrate.first_light.image_sources import Pattern
+    from hilstar.notices import Notices
+    from hilstar.run.record.ledger import Ledger
+    from hilstar.run.record.ledger_switch import LedgerSwitch
+    from hilstar.run.screen.screen import Screen
+    from hilstar.run.serve import Running
+    from hilstar.run.shown import Shown
+    from hilstar.scene.sprites import Sprites
+
+MIN_PICTURE_NS = NS_PER_S // 10
+
+
+class FramePublisher:
+    """Writes each frame's numbers, and now and then its picture, into shared memory.
+
+    The frame loop's own thread does it, in microseconds: without a lock and without a call that waits. A picture is copied
+    at most ten times a second, and only while somebody looks at one.
+    """
+
+    def __init__(self, memory: SharedMemory) -> None:
+        self.shown: Shown | None = None
+        self.count = 0  # of frames
+        self.running: Running | None = None
+        self._memory = memory
+        self._picture_due_ns = 0
+
+    def follow(self, running: Running) -> None:
+        """Take the run, which goes on counting."""
+        self.running = running
+
+    def see(self, shown: Shown) -> None:
+        """Take a frame; for the frame loop."""
+        self.shown = shown
+        self.count += 1
+        running, attitude = self.running, shown.attitude
+        if running is None:
+            return
+        tally, packets = running.loop.tally, running.packets
+        flags = STALE * shown.stale | MISSING * shown.missing | BLANK * (attitude is None) | HAS_AGE * (attitude is not None)
+        self._memory.frames.put(
+            FRAME.pack(
+                shown.number,
+                shown.draw_ns,
+                shown.swap_ns,
+                shown.predicted_swap_ns or shown.swap_ns,
+                0 if attitude is None else max(min(attitude.age_ns, 2**62), -(2**62)),
+                shown.missed_before,
+                tally.frames,
+                tally.missed_frames,
+                tally.stale_frames,
+                tally.given_up_frames,
+                packets.received,
+                packets.refused,
+                flags,
+            )
+        )
+        want = self._memory.want
+        if want.each_ns and self._picture_due_ns <= shown.swap_ns < want.until_ns:
+            self._picture_due_ns = shown.swap_ns + max(want.each_ns, MIN_PICTURE_NS)
+            with contextlib.suppress(ValueError):  # levels of another size than the bench's: no picture, and the run goes on
+                self._copy(shown)
+
+    def _copy(self, shown: Shown) -> None:
+        """Copy the picture: its levels, its attitude, and where the stars in it are."""
+        ring, levels, sprites = self._memory.pictures, shown.drawn.levels, shown.drawn.sprites
+        height, width = levels.shape
+        count = 0 if sprites is None else min(len(sprites), MAX_SPRITES)
+        start = PICTURE_HEAD_BYTES
+        end = start + levels.nbytes
+        whole = end + count * SPRITE.itemsize
+        ring.begin()
+        room = ring.room(whole)
+        q = () if shown.attitude is None else shown.attitude.q_icrs_to_cam.tolist()
+        head = PictureHead(shown.number, shown.swap_ns, shown.t_ns, width, height, levels.itemsize, count, *q).pack()
+        room[: len(head)] = head
+        np.copyto(np.frombuffer(room[start:end], dtype=levels.dtype).reshape(height, width), levels)
+        if sprites is not None and count:
+            _copy_sprites(np.frombuffer(room[end:], dtype=SPRITE), sprites)
+        ring.end(whole, 0)
+
+
+def _copy_sprites(target: np.ndarray, sprites: Sprites) -> None:
+    kept = brightest(sprites.data["electrons_per_s"], MAX_SPRITES)
+    which = slice(None) if kept is None else kept
+    target["star"], target["x_px"], target["y_px"] = sprites.star[which], sprites.x_px[which], sprites.y_px[which]
+
+
+MAX_CLIPPED = 300  # by name; a picture has hundreds of stars
+# Events that last and keep a ledger from being written: as `run.record.ledger` tells them.
+LEDGER_TROUBLES = {
+    "ledger-failed": "cannot be written",
+    "ledger-lost": "a file was deleted, truncated or overwritten",
+    "ledger-stalled": "the disk accepts nothing",
+    "ledger-thin": "the disk is full: frames are not recorded",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class WatchedRun:
+    """What there is to look at in a run."""
+
+    feed: FramePublisher
+    notices: Notices
+    ledger: LedgerSwitch
+    screen: Screen | None = None
+    faults: FaultDesk | None = None
+
+    def listen(self, listener: Listener) -> None:
+        """Hand every further event of the run to `listener`."""
+        self.notices.listen(listener)
+
+    def tell(self, kind: str, line: str) -> None:
+        """Tell of an event of the run."""
+        self.notices.tell(kind, line)
+
+    def now(self) -> RunState:
+        """The run now."""
+        running, shown = self.feed.running, self.feed.shown
+        if running is None:
+            return RunState(host_ns=time.monotonic_ns(), ledger=self._ledger())
+        tally, operator = running.tally, running.loop.pacer.operator
+        aids = operator.aids if isinstance(operator, Overrides) else None
+        clock = None if running.clock is None else running.clock()
+        return RunState(
+            host_ns=time.monotonic_ns(),
+            alive_ns=running.loop.watch.alive_ns,
+            frame=-1 if shown is None else shown.number,
+            stale=shown is not None and shown.stale,
+            missing=shown is None or shown.missing,
+            blank=shown is None or shown.attitude is None,
+            stars=0 if shown is None else shown.drawn.star_count,
+            clipped=[] if shown is None else list(shown.drawn.clipped_hip[:MAX_CLIPPED]),
+            attitude=_attitude(shown),
+            clock=None
+            if clock is None or clock.mode == "none"
+            else ClockState(clock.mode, clock.offset_ms, clock.drift_ppm, clock.uncertainty_ms),
+            frames=tally.frames,
+            missed=tally.missed_frames,
+            stale_frames=tally.stale_frames,
+            given_up=tally.given_up_frames,
+            received=running.packets.received,
+            refused={reason: count for reason, count in running.packets.refused_by.items() if count},
+            operator={} if aids is None else aids.states(),
+            operator_text="" if aids is None else aids.text,
+            overlay=0 if aids is None else aids.overlay,
+            patch_share=0.0 if aids is None else aids.patch_share,
+            hidden="" if shown is None else shown.on_screen.hidden,
+            display_lost="" if self.screen is None else self.screen.window.gone or "",
+            ledger=self._ledger(),
+            faults=[] if self.faults is None else self.faults.on(),
+            rates=self.notices.lasting.get(WRONG, ""),
+        )
+
+    def _ledger(self) -> LedgerState | None:
+        ledger = self.ledger.current
+        if ledger is None:
+            return None
+        troubles = [words for kind, words in LEDGER_TROUBLES.items() if kind in self.notices.active]
+        return LedgerState(printable(str(ledger.path)), ledger.size_bytes, "; ".join(troubles))
+
+
+def _attitude(shown: Shown | None) -> AttitudeState | None:
+    attitude = None if shown is None else shown.attitude
+    if attitude is None:
+        return None
+    w, x, y, z = attitude.q_icrs_to_cam.tolist()
+    rate = attitude.rate_cam_rad_s
+    rate_rad_s = None if rate is None else tuple(rate.tolist())
+    return AttitudeState((w, x, y, z), rate_rad_s, attitude.age_ns)
+
+
+LOOP_WAITS_S = 2.0
+POLL_S = 0.004
+MAX_MARK_CHARACTERS = 200
+MAX_WHO_CHARACTERS = 60
+
+
+class OrderHandler:
+    """Checks an operator's order, has it done by the frame loop or beside it, and records it.
+
+    Each call runs on its own thread and returns once the frame loop, or the disk, has taken the order.
+    """
+
+    def __init__(self, requests: SwitchRequests, watched: WatchedRun, make_ledger: Callable[[Path], Ledger]) -> None:
+        self._requests, self._feed, self._faults = requests, watched.feed, watched.faults
+        self._ledger, self._notices = watched.ledger, watched.notices
+        self._make_ledger = make_ledger
+        self._ledger_lock = threading.Lock()
+
+    def do(self, order: Order) -> OrderAnswer:
+        """Do it; what went wrong is in the answer."""
+        who = one_line(order.who)[:MAX_WHO_CHARACTERS]
+        try:
+            answer = self._done(order, who)
+        except HilstarError as error:
+            return OrderAnswer(id=order.id, status=409, line=one_line(str(error)))
+        answer.line = printable(answer.line)  # a ledger may be called anything
+        return answer
+
+    def _done(self, order: Order, who: str) -> OrderAnswer:
+        if order.name in SWITCHES:
+            return self._switch(order, who)
+        if order.name == "ledger":
+            return self._switch_ledger(order, who)
+        return self._mark(order, who) if order.name == "mark" else self._fault(order, who)
+
+    def _switch(self, order: Order, who: str) -> OrderAnswer:
+        if order.name == "patch" and order.on and order.level not in PATCHES:
+            return OrderAnswer(id=order.id, status=400, line=f"no such patch; write a level of {', '.join(map(str, PATCHES))}")
+        request = SwitchRequest(order.name, order.on, who, order.level)
+        self._requests.ask(request)
+        if self._waits_for(lambda: request.done):
+            return OrderAnswer(id=order.id, status=200, line=request.text)
+        request.called_off = True
+        return OrderAnswer(
+            id=order.id, status=504, line=f"the frame loop did not take it within {LOOP_WAITS_S:g} s; nothing changed"
+        )
+
+    def _waits_for(self, holds: Callable[[], bool]) -> bool:
+        """Whether that comes to hold while the frame loop is waited for."""
+        end_s = time.monotonic() + LOOP_WAITS_S
+        while not holds():
+            if time.monotonic() > end_s:
+                return False
+            time.sleep(POLL_S)
+        return True
+
+    def _switch_ledger(self, order: Order, who: str) -> OrderAnswer:
+        with self._ledger_lock:
+            if order.on:
+                path = self._free_path()
+                was_on = self._ledger.on
+                ledger = self._ledger.begin(lambda: self._make_ledger(path))
+                if was_on:
+                    return OrderAnswer(id=order.id, status=200, line=f"ledger on: {ledger.path}")
+                self._notices.tell("operator", f"ledger on, by {who}: {ledger.path}", who)
+                return OrderAnswer(id=order.id, status=200, line=f"ledger on: {ledger.path}")
+            ledger_now = self._ledger.current
+            if ledger_now is None:
+                return OrderAnswer(id=order.id, status=200, line="ledger off")
+            self._notices.tell("operator", f"ledger off, by {who}: {ledger_now.path}", who)
+            self._ledger.end()
+            if ledger_now.failure is not None:
+                return OrderAnswer(id=order.id, status=500, line=f"{ledger_now.path}: {ledger_now.failure}")
+            return OrderAnswer(id=order.id, status=200, line=f"ledger off: {ledger_now.path} is whole")
+
+    def _free_path(self) -> Path:
+        """A new name, beside the newest ledger where there was one."""
+        folder = Path.cwd() if self._ledger.last is None else self._ledger.last.path.parent
+        now = datetime.now(UTC)
+        for k in range(100):
+            path = folder / (f"hilstar-{now:%Y%m%dT%H%M%SZ}" + (f"-{k}" if k else "") + ".mcap")
+            if not path.exists():
+                return path
+        return folder / f"hilstar-{now:%Y%m%dT%H%M%S.%fZ}.mcap"
+
+    def _mark(self, order: Order, who: str) -> OrderAnswer:
+        text = printable(" ".join(order.text.split()))[:MAX_MARK_CHARACTERS]
+        if not text:
+            return OrderAnswer(id=order.id, status=400, line='a mark needs its text: {"text": "..."}')
+        self._notices.tell("mark", f"mark, by {who}: {text}", who)
+        return OrderAnswer(
+            id=order.id, status=200, line="mark written" if self._ledger.on else "mark told; no ledger is being written"
+        )
+
+    def _fault(self, order: Order, who: str) -> OrderAnswer:
+        faults = self._faults
+        if faults is None or not faults.names():
+            return OrderAnswer(id=order.id, status=409, line="this run has no faults to start: give it some with --scenario")
+        if order.fault not in faults.names():
+            meant, known = did_you_mean(order.fault, faults.names()), ", ".join(faults.names())
+            return OrderAnswer(id=order.id, status=404, line=f"no fault of that name; {meant}write one of {known}")
+        before = self._feed.count
+        act = faults.start if order.on else faults.stop
+        act(order.fault, who)
+        if self._waits_for(lambda: self._feed.count > before + 1):
+            return OrderAnswer(id=order.id, status=200, line=f"fault {order.fault} {'on' if order.on else 'off'}")
+        return OrderAnswer(id=order.id, status=504, line=f"asked for, but no frame was drawn within {LOOP_WAITS_S:g} s")
+
+
+@dataclass(frozen=True, slots=True)
+class RunDescription:
+    """What the page says of a run: the command, where attitudes come from, and how frames come."""
+
+    command: str
+    kind: str
+    endpoint: str
+    pace: Pace = "clock"
+
+
+def setup_for(listener: PageListener, control: bool, description: RunDescription, file: BenchFile, picture_bytes: int) -> Setup:
+    """The page of a bench file at an address; a run adds to `hello`."""
+    monitor = file.config.monitor
+    hello = {
+        "version": __version__,
+        "command": f"hilstar {description.command}",
+        "bench": printable(file.path.name),
+        "renderer": "",
+        "started_utc": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        "resolution_px": list(monitor.resolution_px),
+        "white_level": 2**monitor.bits - 1,
+        "bits": monitor.bits,
+        "refresh_hz": monitor.refresh_hz,
+        "faults": [],
+    }
+    return Setup(
+        hello=hello,
+        source={"kind": description.kind, "endpoint": printable(description.endpoint)},
+        hosts=listener.hosts,
+        names=[name.lower() for name in listener.names],
+        any_address=listener.any_address,
+        port=listener.port,
+        token=listener.token,
+        control=control,
+        picture_bytes=picture_bytes,
+        refresh_hz=monitor.refresh_hz,
+        pace=description.pace,
+    )
+
+
+MAX_NAMES = 5000  # of stars without a HIP number, the brightest
+
+
+def scene_of(bench: Bench, aids_in_levels: bool) -> OverlayScene:
+    """The scene of a bench; `aids_in_levels` where the levels have the operator's aids in them already."""
+    stars, overlay = bench.shown_stars, overlay_of(bench)
+    unnamed = np.flatnonzero(stars.hip == 0)
+    unnamed = unnamed[np.argsort(stars.v_mag[unnamed], kind="stable")[:MAX_NAMES]]
+    return OverlayScene(
+        marks=overlay.marks,
+        hip=stars.hip.copy(),
+        v_mag=stars.v_mag.astype(np.float32),
+        names={star: name for star, name in zip(unnamed.tolist(), stars.names(unnamed), strict=True) if name},
+        sky=overlay.sky(),
+        aids=aid_levels_of(bench),
+        aids_in_levels=aids_in_levels,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class PageParts:
+    """What a run is made of; `make_ledger` begins one at a path."""
+
+    bench: Bench
+    notices: Notices
+    ledger: LedgerSwitch
+    make_ledger: Callable[[Path], Ledger]
+    screen: Screen | None = None
+    faults: FaultDesk | None = None
+
+
+@contextmanager
+def opened_page(
+    listener: PageListener, control: bool, description: RunDescription, parts: PageParts
+) -> Iterator[tuple[FramePublisher, SwitchRequests]]:
+    """The page of a run while this is open: what frames are given to, and where its wishes come from."""
+    width, height = parts.bench.config.monitor.resolution_px
+    picture_bytes = width * height * (1 if parts.bench.calibration.response.white < 2**8 else 2)
+    memory = SharedMemory.make(picture_bytes)
+    feed, requests = FramePublisher(memory), SwitchRequests()
+    watched = WatchedRun(feed, parts.notices, parts.ledger, parts.screen, parts.faults)
+    orders = OrderHandler(requests, watched, parts.make_ledger)
+    with PageProcess(
+        setup_of(listener, control, description, parts, picture_bytes), memory, listener.socket, watched, orders.do
+    ):
+        yield feed, requests
+
+
+def setup_of(listener: PageListener, control: bool, description: RunDescription, parts: PageParts, picture_bytes: int) -> Setup:
+    """What the page's process is told at its start."""
+    bench = parts.bench
+    setup = setup_for(listener, control, description, bench.file, picture_bytes)
+    setup.hello |= {
+        "renderer": bench.renderer.gl_renderer,
+        "white_level": bench.calibration.response.white,
+        "faults": [] if parts.faults is None else parts.faults.names(),
+    }
+    setup.scene = pickle.dumps(scene_of(bench, aids_in_levels=parts.screen is None))
+    return setup
+
+
+CODE = np.dtype("<u2")
+FAILED = "failed:"  # as `first-light` says of a step
+
+
+class SessionPublisher:
+    """What a session leaves for its page; its thread writes pictures, and the page's keeper asks for the rest."""
+
+    def __init__(self, memory: SharedMemory) -> None:
+        self._memory = memory
+        self._listeners: list[Listener] = []
+        self._failed: dict[str, str] = {}
+        self._patterns = 0
+
+    def show(self, pattern: Pattern) -> None:
+        """Take the pattern that is shown now; of one with colours its brightest channel."""
+        codes = pattern.codes if pattern.codes.ndim == 2 else pattern.codes.max(axis=2)
+        ring, (height, width) = self._memory.pictures, codes.shape
+        whole = PICTURE_HEAD_BYTES + codes.size * CODE.itemsize
+        if whole > ring.slot_bytes:  # a step has found that the monitor is larger than the bench file said
+            return
+        self._patterns += 1
+        ring.begin()
+        room = ring.room(whole)
+        head = PictureHead(self._patterns, time.monotonic_ns(), 0, width, height, CODE.itemsize, 0).pack()
+        room[: len(head)] = head
+        np.copyto(np.frombuffer(room[PICTURE_HEAD_BYTES:], dtype=CODE).reshape(height, width), codes)
+        ring.end(whole, 0)
+        self.tell("pattern", f"shows {pattern.name}")
+
+    def say(self, line: str) -> None:
+        """Take a line of the session: a step that begins, or ends."""
+        step, _, words = line.partition(" ")
+        if words.strip().startswith(FAILED):
+            self._failed[step] = f"{step} {words.strip()}"
+        else:
+            self._failed.pop(step, None)
+        self.tell("step", line)
+
+    def listen(self, listener: Listener) -> None:
+        """Hand every further event to `listener`."""
+        self._listeners.append(listener)
+
+    def tell(self, kind: str, line: str) -> None:
+        """Tell the page of an event."""
+        for listener in self._listeners:
+            listener(Notice.now(kind, " ".join(line.split())))
+
+    def now(self) -> RunState:
+        """The state now."""
+        now_ns = time.monotonic_ns()
+        failed = list(self._failed.values())
+        return RunState(host_ns=now_ns, alive_ns=now_ns, frame=self._patterns, missing=False, blank=False, failed=failed)
+
+    def do(self, order: Order) -> OrderAnswer:
+        """A mark is told; there is nothing else to order."""
+        if order.name != "mark" or not order.text.strip():
+            return OrderAnswer(
+                id=order.id, status=409, line="a session of first light takes marks with a text, and no other order"
+            )
+        self.tell("mark", f"mark, by {one_line(order.who)}: {one_line(order.text)}")
+        return OrderAnswer(id=order.id, status=200, line="mark told; a session has no ledger")
+
+
+@contextmanager
+def session_page(listener: PageListener, control: bool, file: BenchFile) -> Iterator[SessionPublisher]:
+    """The page of a session while this is open."""
+    monitor = file.config.monitor
+    width, height = monitor.resolution_px
+    picture_bytes = width * height * CODE.itemsize
+    memory = SharedMemory.make(picture_bytes)
+    feed = SessionPublisher(memory)
+    setup = setup_for(listener, control, RunDescription("first-light", "session", "", "session"), file, picture_bytes)
+    setup.hello["session"] = True
+    with PageProcess(setup, memory, listener.socket, feed, feed.do):
+        yield feed

@@ -1,1 +1,0 @@
-"""A run's report: the operator's page with the whole run in it."""

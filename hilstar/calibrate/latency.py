@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from hilstar.arrays import FloatArray, IntArray
-from hilstar.attitude.clock.one_way import OneWayFilter
-from hilstar.attitude.wire.serial_lines import read_lines
+from hilstar.attitude.clock.sender_clock import OneWayFilter
+from hilstar.attitude.wire.serial_link import read_lines
 from hilstar.bench.bench_file_edit import with_key
 from hilstar.bench.config import BenchConfig, Monitor
 from hilstar.charts import BLUE, ORANGE, chart

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hilstar.attitude.wire.serial_link import serial_ports
+from hilstar.attitude.wire.zmq_links import ZmqReceiver, ZmqSender
 from hilstar.attitude.wire.zmq_socket import zmq_version
-from hilstar.attitude.wire.zmq_stream import ZmqReceiver, ZmqSender
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import bench_calibration, bench_optics
 from hilstar.bench.fields_of_view import FieldsOfView, fields_of_view

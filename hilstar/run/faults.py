@@ -18,7 +18,7 @@ from typing import Any
 import msgspec
 
 from hilstar.attitude.wire.keys import NO_KEYS, CurveKeys
-from hilstar.attitude.wire.zmq_stream import ZmqReceiver
+from hilstar.attitude.wire.zmq_links import ZmqReceiver
 from hilstar.bench.config.faults import FaultSettings
 from hilstar.bench.faults.desk import FILE, Change, FaultDesk, Now, share_on
 from hilstar.bench.faults.kinds import Fault, Freeze, MeasuredMap, fault_of, table_of

@@ -9,16 +9,12 @@ from hilstar.attitude.wire.apart.serial_apart import SerialApart
 from hilstar.attitude.wire.apart.zmq_apart import ZmqApart
 from hilstar.attitude.wire.keys import CurveKeys
 from hilstar.attitude.wire.links import StreamLink
-from hilstar.attitude.wire.nasa42.messages import MessageReader
-from hilstar.attitude.wire.nasa42.tcp_link import Nasa42Link, Nasa42Lockstep
+from hilstar.attitude.wire.nasa42 import MessageReader, Nasa42Link, Nasa42Lockstep
 from hilstar.attitude.wire.serial_link import SerialLink
 from hilstar.attitude.wire.source import Mounting
-from hilstar.attitude.wire.udp.udp_link import UdpLink
-from hilstar.attitude.wire.vizard.attitude import DifferenceRates, Follower, Taken
-from hilstar.attitude.wire.vizard.broadcast import VizardBroadcast
-from hilstar.attitude.wire.vizard.live import VizardLive
-from hilstar.attitude.wire.zmq_lockstep import ZmqLockstep
-from hilstar.attitude.wire.zmq_stream import ZmqReceiver
+from hilstar.attitude.wire.udp import UdpLink
+from hilstar.attitude.wire.vizard import DifferenceRates, Follower, StateUse, VizardBroadcast, VizardLive
+from hilstar.attitude.wire.zmq_links import ZmqLockstep, ZmqReceiver
 from hilstar.bench.config import AttitudeSettings, BenchConfig
 from hilstar.bench.config.stream.road import nasa42_road, udp_road
 from hilstar.bench.config.when import from_source
@@ -67,7 +63,7 @@ def _open_vizard(config: BenchConfig, notices: Notices | None, *, apart: bool) -
     rates = DifferenceRates(round(settings.stale_after_ms * NS_PER_MS), math.radians(settings.max_rate_deg_s))
     name = None if settings.spacecraft is None else str(settings.spacecraft)
     mounting = Mounting(config.tracker.q_body_to_cam)
-    taken: Taken = "state" if from_source(config) else "velocity" if settings.use_velocity else "attitude"
+    taken: StateUse = "state" if from_source(config) else "velocity" if settings.use_velocity else "attitude"
     follower = Follower(name, mounting, rates, taken)
     if settings.lockstep:
         return VizardLive(settings.address, follower, bind=settings.bind is not False, notices=notices)

@@ -10,16 +10,14 @@ from dataclasses import dataclass, field
 from msgspec import UNSET, UnsetType
 from msgspec.structs import replace as replaced
 
-from hilstar.attitude.back_channel import Traffic
 from hilstar.attitude.clock.sender_clock import ClockSummary
 from hilstar.attitude.clock.timeline import Timeline
-from hilstar.attitude.receiver import PacketCounts, Receiver
+from hilstar.attitude.receiver import PacketCounts, Receiver, Traffic
 from hilstar.attitude.wire.links import StreamLink
-from hilstar.attitude.wire.nasa42.tcp_link import Nasa42Lockstep
+from hilstar.attitude.wire.nasa42 import Nasa42Lockstep
 from hilstar.attitude.wire.source import Mounting
-from hilstar.attitude.wire.vizard.camera import TrackerCamera
-from hilstar.attitude.wire.vizard.live import VizardLive
-from hilstar.attitude.wire.zmq_lockstep import ZmqLockstep
+from hilstar.attitude.wire.vizard import TrackerCamera, VizardLive
+from hilstar.attitude.wire.zmq_links import ZmqLockstep
 from hilstar.bench.config import AttitudeSettings
 from hilstar.bench.frame import Bench
 from hilstar.notices import Notices

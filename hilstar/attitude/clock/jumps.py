@@ -1,12 +1,14 @@
 """A sender's clock that jumps or runs slow: samples in, the same samples on a clock without jumps out; no I/O.
 
 Laws:
-1. A jump shows in t_ns itself: its step is not the usual one. A message that arrives slightly early or late while t_ns
+1. A jump shows in t_ns itself: its step differs from the usual one. A message that arrives slightly early or late while t_ns
    advances as usual had a shorter or longer delay, and is taken as it is.
-2. Samples in doubt wait for the next ones: three that agree are a jump, and continue from where the old clock stood; an early
-   one that the next contradicts is refused; late ones that do not agree were queued, and are taken as they are.
+2. Samples in doubt wait for the next ones. Three that agree are a jump, and continue where the old clock stood. An early one
+   that the next contradicts is refused. Late ones that do not agree were queued, and are taken as they are.
 3. A message that waited unread may be late by as long as it waited, and teaches nothing.
 4. Until the clock is settled, a message that arrives early shows that those before it were late.
+
+A sender on this machine that stamps with hilstar's own clock needs none of this (`SharedClockFilter`).
 """
 
 from __future__ import annotations
@@ -15,12 +17,19 @@ from collections import deque
 from dataclasses import replace
 from typing import NamedTuple
 
-from hilstar.attitude.clock.pace import Pace, Steps
-from hilstar.attitude.clock.sender_clock import SenderClock
+import numpy as np
+
+from hilstar.attitude.clock.sender_clock import SenderClock, Slots
 from hilstar.attitude.wire.links import SampleArrival
-from hilstar.attitude.wire.packet import Refusal
+from hilstar.attitude.wire.packet import AttitudeSample, Refusal
+from hilstar.notices import Notices
 from hilstar.units import NS_PER_MS, NS_PER_S
 
+PACE_SLOTS = 9
+MIN_ODD_PACE = 0.004  # twice what a crystal is allowed: beyond it, and steadily, t_ns runs slow or fast
+STEPS = 31
+MIN_STEPS = 8
+MAX_MISSING = 1000  # a sequence that advances by more does not count packets
 MIN_AGREEING = 3
 LATE_FOR_NS = 100 * NS_PER_MS  # a queue can be late by a constant time for this long
 SURELY_A_JUMP_NS = NS_PER_S  # and never by as much as this
@@ -39,6 +48,73 @@ CLEARLY_LATE_FOR_NS = 3 * LATE_FOR_NS  # late by a constant time while t_ns itse
 UNKNOWN_DRIFT = 1e-4  # while nothing arrives, the clocks part by this share of the time
 MAX_FOLLOWED_NS = 60 * NS_PER_S  # what a slow clock may fall behind before it is known to be slow; more is surely a jump
 USUAL_SHARE = 0.95
+MAX_OFF_NS = NS_PER_S  # a sender may predict, or be late
+MIN_FUTURE_NS = 5 * NS_PER_MS
+PERSISTENT_NS = NS_PER_S  # a queue may be older for a moment
+MIN_OFF = 3
+UNSHARED = "clock-not-shared"
+
+
+class _Step(NamedTuple):
+    """From one message to the next."""
+
+    ns: int
+    packets: int
+
+
+class Steps:
+    """By how much t_ns usually advances from one message to the next."""
+
+    def __init__(self) -> None:
+        self._last: AttitudeSample | None = None
+        self._usual_ns: deque[float] = deque(maxlen=STEPS)
+        self._newest = _Step(0, 1)
+
+    def add(self, sample: AttitudeSample) -> None:
+        """Take the next message, refused or not."""
+        if self._last is not None:
+            packets = sample.sequence - self._last.sequence
+            self._newest = _Step(sample.t_ns - self._last.t_ns, packets if 1 <= packets <= MAX_MISSING else 1)
+            self._usual_ns.append(self._newest.ns / self._newest.packets)
+        self._last = sample
+
+    def show_no_jump(self, by_ns: float) -> bool:
+        """True where a jump by `by_ns` would show in the newest step of t_ns, and does not."""
+        if len(self._usual_ns) < MIN_STEPS:
+            return False
+        usual_ns = np.array(self._usual_ns)
+        period_ns = float(np.median(usual_ns))
+        if np.median(np.abs(usual_ns - period_ns)) > abs(by_ns) / 4:
+            return False
+        newest = self._newest
+        irregular_ns = min(abs(newest.ns - newest.packets * period_ns), abs(newest.ns - period_ns))
+        return irregular_ns < abs(by_ns) / 2
+
+
+class Pace:
+    """The rate of the sender's clock, from the earliest messages of each slot of the last two seconds."""
+
+    def __init__(self) -> None:
+        self.slowness = 0.0
+        self._slots = Slots(maxlen=PACE_SLOTS)
+
+    def add(self, host_ns: int, offset_ns: int) -> None:
+        """Take one message's arrival and (arrival - t_ns), as sent."""
+        if self._slots.lower(host_ns, offset_ns):
+            return
+        if len(self._slots) == PACE_SLOTS:
+            self._look()
+        self._slots.begin(host_ns, offset_ns)
+
+    def _look(self) -> None:
+        """A slow or a fast clock drifts steadily; a jump or a queue is a step, and decides nothing."""
+        x, y = self._slots.relative_to(self._slots[0])
+        slope = y[-1] / x[-1]
+        uneven_ns = np.abs(y - slope * x).max()
+        if abs(slope) > MIN_ODD_PACE and uneven_ns < abs(y[-1]) / 5:
+            self.slowness = float(slope)
+        elif abs(slope) < MIN_ODD_PACE / 2 and uneven_ns < MIN_ODD_PACE * x[-1]:
+            self.slowness = 0.0
 
 
 def is_timely(arrival: SampleArrival) -> bool:
@@ -210,3 +286,52 @@ class JumpFilter:
 def _too_early(each: _Doubtful) -> SampleArrival:
     detail = f"t_ns {each.arrival.event.t_ns} is {-each.late_ns / NS_PER_S:.3g} s ahead of the sender's clock so far"
     return replace(each.arrival, refusal=Refusal("time", detail))
+
+
+class SharedClockFilter:
+    """Takes the place of a `JumpFilter`: refuses times far ahead, and says once where the clock is not the host's."""
+
+    correction_ns = 0
+    jumps = 0
+    slowness = 0.0
+
+    def __init__(self, notices: Notices) -> None:
+        self._notices = notices
+        self._off_since_ns: int | None = None
+        self._off = 0
+
+    def take(self, arrival: SampleArrival) -> list[SampleArrival]:
+        """The sample itself, refused where its time is more than MAX_OFF_NS ahead of this machine's."""
+        t_ns = arrival.event.t_ns
+        late_ns = arrival.host_ns - t_ns
+        self._look(arrival.host_ns, late_ns)
+        if late_ns >= -MAX_OFF_NS:
+            return [arrival]
+        refusal = Refusal("time", f"t_ns {t_ns} is {-late_ns / NS_PER_S:.3g} s ahead of this machine's clock")
+        return [replace(arrival, refusal=refusal)]
+
+    def _look(self, host_ns: int, late_ns: int) -> None:
+        if -MIN_FUTURE_NS <= late_ns <= MAX_OFF_NS:
+            self._off_since_ns, self._off = None, 0
+            return
+        if self._off_since_ns is None:
+            self._off_since_ns = host_ns
+        self._off += 1
+        if self._off >= MIN_OFF and host_ns - self._off_since_ns >= PERSISTENT_NS:
+            where = f"{late_ns / NS_PER_S:.3f} s behind" if late_ns > 0 else f"{-late_ns / NS_PER_S:.3f} s ahead of"
+            self._notices.begin(
+                UNSHARED,
+                f'[attitude] clock = "shared", but t_ns is {where} CLOCK_MONOTONIC of this machine:'
+                ' stamp with that clock, or write clock = "estimated"',
+            )
+
+    def forgive(self) -> None:
+        """Jumps are never counted."""
+
+    def expire(self, host_ns: int) -> list[SampleArrival]:
+        """Nothing waits."""
+        return []
+
+    def release(self) -> list[SampleArrival]:
+        """Nothing waits."""
+        return []

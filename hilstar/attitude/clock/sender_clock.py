@@ -1,21 +1,37 @@
-"""The sender's clock against the host's: offset, drift and their uncertainty, from what messages carry; no I/O.
+"""The sender's clock against the host's: offset, drift and their uncertainty, from the messages' times alone; no I/O.
 
-Where the sender answers time requests the offset comes from exchanges (`exchanges`), otherwise from the arrivals alone
-(`one_way`). Where the sender stamps with this machine's own clock nothing is estimated ("shared"). An offset is host time
-minus sender time, ns.
+An offset is host time minus sender time, ns, as a line over host time. Three modes:
+- "exchange": the sender answers time requests; four timestamps, as in NTP (RFC 5905, section 8).
+- "one-way": arrivals alone. A message is never early, so the line under all (arrival - t_ns) is nearest the true offset (Moon,
+  Skelly and Towsley 1999). It is too large by the minimum transport delay, which a one-way stream cannot measure. A message
+  that waited unread gives only an upper bound, which counts until one arrives that did not wait.
+- "shared": the sender stamps with this machine's own clock; nothing is estimated.
 """
 
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
-from hilstar.attitude.clock.exchanges import Exchange, ExchangeFilter
-from hilstar.attitude.clock.offset_line import OffsetLine
-from hilstar.attitude.clock.one_way import OneWayFilter
+import numpy as np
+
+from hilstar.arrays import FloatArray
 from hilstar.units import NS_PER_MS, NS_PER_S
 
+WINDOW_NS = 30 * NS_PER_S
+SLOT_NS = NS_PER_S // 4
+MIN_DRIFT_SPAN_NS = 2 * NS_PER_S  # over a shorter span, 50 us of noise would read as more than 25 ppm
+MAX_DRIFT = 0.002  # ten times the worst crystal's; a steeper slope is a step, or t_ns is not a clock
+RECENT_SLOTS = 4  # the last second: the uncertainty comes from it, and is infinite before it is over
+NEWEST = 8
+EXCHANGE_LIFE_NS = 5 * NS_PER_S
+MIN_EXCHANGES = 3
+# Exchanges whose delay is within this of the minimum met no queue.
+QUICK_DELAY_RATIO = 1.25
+QUICK_DELAY_NS = 100_000
+RECENT_EXCHANGES = 3
 # A corrected offset is applied gradually: a turn seems at most this much faster or slower. A larger correction is a step.
 SLEW = 0.01
 MAX_SLEWED_NS = 50 * NS_PER_MS
@@ -25,6 +41,230 @@ SETTLING_NS = 2 * NS_PER_S
 LOCAL_DELAY_NS = 100_000
 
 ClockMode = Literal["none", "one-way", "exchange", "shared"]
+
+
+@dataclass(frozen=True, slots=True)
+class OffsetLine:
+    """offset(host) = offset_ns + drift (host - host_ns), known to `uncertainty_ns`."""
+
+    host_ns: int
+    offset_ns: float
+    drift: float = 0.0
+    uncertainty_ns: float = math.inf
+
+    def at(self, host_ns: int) -> float:
+        """The offset at a host time, ns."""
+        return self.offset_ns + self.drift * (host_ns - self.host_ns)
+
+
+def plausible_drift(slope: float) -> float:
+    """The slope itself, or 0 where it is steeper than any clock drifts."""
+    return slope if abs(slope) <= MAX_DRIFT else 0.0
+
+
+class Slot(NamedTuple):
+    """The message with the smallest offset within SLOT_NS."""
+
+    number: int
+    host_ns: int
+    offset_ns: int
+
+
+class Slots(deque[Slot]):
+    """The smallest offset of each slot, oldest first."""
+
+    def lower(self, host_ns: int, offset_ns: int) -> bool:
+        """Take a message into the newest slot; False, and nothing taken, where it begins a new one."""
+        number = host_ns // SLOT_NS
+        if not self or self[-1].number != number:
+            return False
+        if offset_ns < self[-1].offset_ns:
+            self[-1] = Slot(number, host_ns, offset_ns)
+        return True
+
+    def begin(self, host_ns: int, offset_ns: int) -> None:
+        """Begin a new slot with this message."""
+        self.append(Slot(host_ns // SLOT_NS, host_ns, offset_ns))
+
+    def relative_to(self, origin: Slot) -> tuple[FloatArray, FloatArray]:
+        """Host times and offsets (n,), ns, from those of `origin`."""
+        x = np.array([slot.host_ns - origin.host_ns for slot in self], dtype=np.float64)
+        y = np.array([slot.offset_ns - origin.offset_ns for slot in self], dtype=np.float64)
+        return x, y
+
+
+class OneWayFilter:
+    """The line under the offsets of a one-way stream."""
+
+    def __init__(self) -> None:
+        self._slots = Slots()
+        self._newest_above_ns: deque[float] = deque(maxlen=NEWEST)
+        self.line: OffsetLine | None = None
+
+    @property
+    def all_above_ns(self) -> float:
+        """The smallest excess of the newest messages over the line."""
+        return min(self._newest_above_ns, default=0.0)
+
+    @property
+    def guessed(self) -> bool:
+        """True while every message so far had waited unread."""
+        return not self._slots
+
+    def guess(self, host_ns: int, offset_ns: int) -> None:
+        """Take a message that waited unread: an upper bound, which the first one that did not wait replaces."""
+        if self.guessed and (self.line is None or offset_ns < self.line.at(host_ns)):
+            self.line = OffsetLine(host_ns, offset_ns)
+
+    def observe(self, host_ns: int, offset_ns: int) -> None:
+        """Take one message's arrival and (arrival - t_ns)."""
+        if self.guessed:
+            self.line = None
+        if not self._slots.lower(host_ns, offset_ns):
+            self._fit()
+            self._slots.begin(host_ns, offset_ns)
+            while host_ns - self._slots[0].host_ns > WINDOW_NS:
+                self._slots.popleft()
+        if self.line is None:
+            self.line = OffsetLine(host_ns, offset_ns)
+        elif offset_ns < self.line.at(host_ns):
+            # The line was wrong by at least this much.
+            uncertainty_ns = self.line.uncertainty_ns + self.line.at(host_ns) - offset_ns
+            self.line = OffsetLine(host_ns, offset_ns, self.line.drift, uncertainty_ns)
+        self._newest_above_ns.append(offset_ns - self.line.at(host_ns))
+
+    def _fit(self) -> None:
+        if len(self._slots) < 2:
+            return
+        newest = self._slots[-1]
+        x, y = self._slots.relative_to(newest)
+        drift = 0.0 if -x[0] < MIN_DRIFT_SPAN_NS else supporting_slope(x, y)
+        above = y - drift * x
+        level = float(above.min())
+        self.line = OffsetLine(newest.host_ns, newest.offset_ns + level, drift, _spread_ns(above - level))
+
+
+def _spread_ns(above: FloatArray) -> float:
+    """How far the line may lie below the truth: a slot's smallest offset is never below it.
+
+    The last slots count one by one and are extrapolated, so that the bound also holds for a clock that was set by less than a
+    jump, and for one whose drift is not known yet.
+    """
+    if len(above) < RECENT_SLOTS:
+        return math.inf
+    last = above[-RECENT_SLOTS:]
+    rise = max(0.0, last[-1] - last[0]) * 2 / (RECENT_SLOTS - 1)  # the line is used for two more slots
+    return float(max(np.median(above), last.max(), last[-1] + rise))
+
+
+def supporting_slope(x: FloatArray, y: FloatArray) -> float:
+    """The slope of the line under all points with the smallest sum of distances: the lower hull's edge at their mean x."""
+    hull: list[int] = []
+    for i in range(len(x)):
+        while len(hull) > 1 and _turns_down(x, y, hull[-2], hull[-1], i):
+            hull.pop()
+        hull.append(i)
+    right = int(np.searchsorted(x[hull], x.mean()))
+    a, b = hull[max(right - 1, 0)], hull[max(right, 1)]
+    return plausible_drift(float((y[b] - y[a]) / (x[b] - x[a])))
+
+
+def _turns_down(x: FloatArray, y: FloatArray, a: int, b: int, c: int) -> bool:
+    return bool((y[b] - y[a]) * (x[c] - x[a]) >= (y[c] - y[a]) * (x[b] - x[a]))
+
+
+@dataclass(frozen=True, slots=True)
+class Exchange:
+    """A request leaves the host at t1 and reaches the sender at t2; the reply leaves it at t3 and arrives at t4.
+
+    t1 and t4 are host times, t2 and t3 sender times, ns. `there_ns` and `back_ns` are how long the wire alone takes for
+    request and reply: a reply longer than its request would otherwise shift the offset by half of the difference.
+    """
+
+    t1_ns: int
+    t2_ns: int
+    t3_ns: int
+    t4_ns: int
+    there_ns: int = 0
+    back_ns: int = 0
+
+    @property
+    def delay_ns(self) -> int:
+        """How long request and reply were under way."""
+        return (self.t4_ns - self.t1_ns) - (self.t3_ns - self.t2_ns)
+
+    @property
+    def possible(self) -> bool:
+        """False where a reply leaves before its request arrives, or arrives before it leaves."""
+        return self.delay_ns >= 0 and self.t3_ns >= self.t2_ns
+
+    def offset_ns(self, base_ns: int) -> float:
+        """Host minus sender time, less `base_ns`, with the difference of the two wire times removed."""
+        known = self.delay_ns >= self.there_ns + self.back_ns  # a pty has a baud rate and no wire
+        longer_ns = self.back_ns - self.there_ns if known else 0
+        return ((self.t1_ns - self.t2_ns - base_ns) + (self.t4_ns - self.t3_ns - base_ns) - longer_ns) / 2
+
+
+class _Measured(NamedTuple):
+    host_ns: int
+    offset_ns: float
+    delay_ns: int
+
+
+class ExchangeFilter:
+    """The line through the quickest of the exchanges."""
+
+    def __init__(self) -> None:
+        self._measured: deque[_Measured] = deque()
+        self.count = 0
+        self.line: OffsetLine | None = None
+
+    def observe(self, exchange: Exchange, base_ns: int) -> None:
+        """Take one exchange; the line's offsets are less `base_ns`."""
+        new = _Measured((exchange.t1_ns + exchange.t4_ns) // 2, exchange.offset_ns(base_ns), exchange.delay_ns)
+        self.count += 1
+        if self._contradicts(new):
+            self.restart()
+        self._measured.append(new)
+        while new.host_ns - self._measured[0].host_ns > WINDOW_NS:
+            self._measured.popleft()
+        self.line = self._fit(new)
+
+    def _fit(self, new: _Measured) -> OffsetLine:
+        min_ns = min(each.delay_ns for each in self._measured)
+        limit_ns = max(min_ns * QUICK_DELAY_RATIO, min_ns + QUICK_DELAY_NS)
+        quick = [each for each in self._measured if each.delay_ns <= limit_ns]
+        x = np.array([each.host_ns - new.host_ns for each in quick], dtype=np.float64)
+        y = np.array([each.offset_ns - new.offset_ns for each in quick], dtype=np.float64)
+        drift = 0.0
+        if np.ptp(x) >= MIN_DRIFT_SPAN_NS:
+            drift = plausible_drift(float(np.polyfit(x, y, 1)[0]))
+        level = float(np.mean(y - drift * x))
+        # The truth lies within half the delay of each exchange's own offset, however the delay divides between the two ways.
+        bounds = np.abs(y - drift * x - level) + 0.5 * np.array([each.delay_ns for each in quick])
+        uncertainty_ns = float(bounds[-RECENT_EXCHANGES:].max())
+        if not drift and len(y) > 1:
+            uncertainty_ns += abs(float(y[-1] - y[-2]))  # it may go on like that
+        return OffsetLine(new.host_ns, new.offset_ns + level, drift, uncertainty_ns)
+
+    def _contradicts(self, new: _Measured) -> bool:
+        """True where no drift explains the new exchange: the clock was set, by however little."""
+        line = self.line
+        if line is None:
+            return False
+        drifted_ns = MAX_DRIFT * (new.host_ns - line.host_ns)
+        return abs(new.offset_ns - line.at(new.host_ns)) > new.delay_ns / 2 + line.uncertainty_ns + drifted_ns
+
+    def current_line(self, host_ns: int) -> OffsetLine | None:
+        """The line while enough exchanges are recent, else None."""
+        if len(self._measured) < MIN_EXCHANGES or host_ns - self._measured[-1].host_ns > EXCHANGE_LIFE_NS:
+            return None
+        return self.line
+
+    def restart(self) -> None:
+        """Forget every exchange."""
+        self._measured.clear()
+        self.line = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,10 +1,19 @@
-"""The packets of the wire, and the attitude's JSON form: bytes in, frozen events out, no I/O.
+"""The packets of the wire, the attitude's JSON form, and COBS frames on a serial line: bytes in, frozen events out, no I/O.
 
-Laws:
+Laws of a message:
 1. Every message gives exactly one event: a packet or a `Refusal`. Nothing raises.
 2. A sample is finite, and its quaternion is unit to 1e-15; the sender's was unit to NORM_TOLERANCE.
 3. A message that does not start with "{" is accepted only if its CRC-32 is correct.
 4. `decode(encode(packet))` returns the packet, bit for bit where the quaternion is already unit.
+
+Laws of the byte stream, whose frames are each followed by 0x00:
+1. However the bytes are cut into chunks, the events are the same.
+2. A frame is accepted only if `decode` accepts its content, so never with a wrong CRC-32.
+3. Whatever came before, the next complete frame after a 0x00 is decoded.
+4. At most MAX_FRAME_BYTES are kept between chunks: a sender that never sends 0x00 costs one refusal for each stretch
+   of garbage, and no memory.
+5. The bytes before the stream's first 0x00 may be the end of a frame: they count only if they are a complete one.
+6. Passing over a frame undecoded loses nothing of the next.
 
 The layout is that of firmware_protocol/protocol.toml.
 """
@@ -19,6 +28,7 @@ from typing import Literal
 
 import msgspec
 import numpy as np
+from cobs import cobs
 
 from hilstar.arrays import FloatArray
 from hilstar.attitude.wire import protocol
@@ -40,6 +50,10 @@ REASONS = MESSAGE_REASONS + STREAM_REASONS
 MAX_SPEED_KM_S = 10_000.0  # of an observer: a thirtieth of that of light
 MIN_PLACE_KM, MAX_PLACE_KM = 6000.0, 1e7  # of one about the Earth: as an orbit's file is held to
 RATE_ROUNDING = 1e-6  # a packet's rate is float32
+DELIMITER = b"\x00"
+# COBS adds one byte to anything shorter than 254. Only packets are framed: JSON goes over ZeroMQ.
+MAX_FRAME_BYTES = max(protocol.PACKET_BYTES.values()) + 1
+FLAGS_AT = 3  # of an attitude's frame: behind the COBS byte, version and kind, of which none is 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,3 +242,80 @@ def _decode_json(message: bytes) -> AttitudeSample | Refusal:
             return Refusal("nan", "a number is NaN or Infinity")
         return Refusal("format", f"{error}; write {JSON_FORM}")
     return checked_sample(form.t_ns, form.q, form.rate, form.sequence, form.discontinuity)
+
+
+def frame(packet: Packet) -> bytes:
+    """A packet as it goes on the wire: COBS, then 0x00."""
+    return framed(encode(packet))
+
+
+def framed(message: bytes) -> bytes:
+    """A packet's bytes as they go on the wire."""
+    return bytes(cobs.encode(message)) + DELIMITER
+
+
+class StreamDecoder:
+    """Bytes in, frames out; `decode_frame` says what one means."""
+
+    def __init__(self) -> None:
+        self._kept = bytearray()
+        self._overlong = False
+        self._synchronised = False
+
+    def feed(self, chunk: bytes) -> list[tuple[Event, bytes]]:
+        """The events that `chunk` completes, in order, each with its bytes as they came."""
+        return [(decode_frame(frame), frame) for frame in self.frames(chunk)]
+
+    def frames(self, chunk: bytes) -> list[bytes]:
+        """The frames that `chunk` completes, undecoded, in order; of garbage without a 0x00 its beginning, once."""
+        first, *others = chunk.split(DELIMITER)
+        found: list[bytes] = []
+        self._keep(first, found)
+        if not others:
+            return found
+        self._end_frame(found)
+        rest = others.pop()
+        found += [frame[: MAX_FRAME_BYTES + 1] for frame in others if frame]
+        self._keep(rest, found)
+        return found
+
+    def _keep(self, part: bytes, found: list[bytes]) -> None:
+        if self._overlong:
+            return
+        self._kept += part[: MAX_FRAME_BYTES + 1 - len(self._kept)]
+        if len(self._kept) > MAX_FRAME_BYTES:
+            self._overlong = True
+            if self._synchronised:
+                found.append(bytes(self._kept))
+            self._kept.clear()
+
+    def _end_frame(self, found: list[bytes]) -> None:
+        body, overlong, whole = bytes(self._kept), self._overlong, self._synchronised
+        self._kept.clear()
+        self._overlong = False
+        self._synchronised = True
+        if body and not overlong and (whole or not isinstance(decode_frame(body), Refusal)):
+            found.append(body)
+
+
+def decode_frame(body: bytes) -> Event:
+    """What a frame says, or why it says nothing."""
+    if len(body) > MAX_FRAME_BYTES:
+        return Refusal("format", f"no 0x00 within {MAX_FRAME_BYTES} bytes; send COBS frames, each followed by 0x00")
+    try:
+        message = cobs.decode(body)
+    except cobs.DecodeError as error:
+        return Refusal("format", f"not COBS ({error})")
+    if message.lstrip()[:1] == b"{":
+        return Refusal("format", f"a frame that starts with {message[:1]!r}; send JSON over ZeroMQ")
+    return decode(message)
+
+
+def frame_declares_discontinuity(body: bytes) -> bool:
+    """Whether a frame is an attitude that must not be interpolated to; quick where it is not."""
+    if len(body) != protocol.ATTITUDE_BYTES + 1 or not body[FLAGS_AT] & protocol.FLAG_DISCONTINUITY:
+        return False
+    try:
+        return declares_discontinuity(cobs.decode(body))
+    except cobs.DecodeError:
+        return False

@@ -1,4 +1,4 @@
-"""The serial line: COBS frames both ways, and a device that may be unplugged and come back."""
+"""Serial ports: the link of COBS frames on a device that may be unplugged and come back, lines of text, and the RTS output."""
 
 from __future__ import annotations
 
@@ -8,16 +8,25 @@ import re
 import select
 import termios
 import time
+import warnings
+from collections.abc import Iterator
 from types import TracebackType
 from typing import NamedTuple, Self
 
 import serial
 from serial.tools import list_ports
 
-from hilstar.attitude.wire.cobs import DELIMITER, StreamDecoder, decode_frame, frame, frame_declares_discontinuity
-from hilstar.attitude.wire.flood_limits import FloodGate, LinkCounts
-from hilstar.attitude.wire.links import Arrival
-from hilstar.attitude.wire.packet import Event, Packet, encode
+from hilstar.attitude.wire.links import Arrival, FloodGate, LinkCounts
+from hilstar.attitude.wire.packet import (
+    DELIMITER,
+    Event,
+    Packet,
+    StreamDecoder,
+    decode_frame,
+    encode,
+    frame,
+    frame_declares_discontinuity,
+)
 from hilstar.attitude.wire.source import PACKETS
 from hilstar.errors import InputError, one_line
 from hilstar.notices import Notices
@@ -30,6 +39,10 @@ MAX_READ_BYTES = 65_536  # in one go
 MAX_DRAIN_S = 0.5
 BITS_PER_BYTE = 10  # 8N1
 FRAMING_BYTES = 2  # the COBS byte and the 0x00
+READ_S = 0.05
+MAX_LINE_BYTES = 256
+# What pyserial raises for a port that is gone: OSError from the system, the others from its own port over a network.
+LOST = (OSError, TypeError, ValueError)
 
 
 def serial_target(text: str) -> tuple[str, int] | None:
@@ -249,3 +262,95 @@ def _instead(error: BaseException, port: str) -> str:
     if isinstance(error, ValueError):
         return "write a baud rate that the port supports, such as 115200 or 921600"
     return f"write the serial port, such as /dev/ttyUSB0 (ls /dev/serial/by-id lists them), not {port!r}"
+
+
+def read_lines(port: str, baud: int, seconds: float) -> Iterator[tuple[int, bytes]]:
+    """Host time (monotonic ns, less the time on the wire) and text of each line that arrives within `seconds`.
+
+    Raises InputError where the port cannot be opened, or disappears.
+    """
+    name = f"serial:{port}@{baud}"
+    try:
+        device = serial.Serial(port, baud, timeout=READ_S, exclusive=True)
+    except (OSError, ValueError, OverflowError) as error:
+        raise InputError(f"{name}: {opening_fault(error, port)}") from error
+    with device:
+        device.reset_input_buffer()
+        end_s = time.monotonic() + seconds
+        line = b""
+        while time.monotonic() < end_s:
+            try:
+                byte = device.read(1)
+            except (OSError, TypeError) as error:
+                raise InputError(f"{name}: disconnected ({error}); plug it in and start again") from error
+            if byte == b"\n":
+                wire_ns = (len(line) + 1) * BITS_PER_BYTE * NS_PER_S // baud
+                yield time.monotonic_ns() - wire_ns, line.strip()
+                line = b""
+            else:
+                line = (line + byte)[-MAX_LINE_BYTES:]
+
+
+class RtsLine:
+    """RTS of a port, such as "/dev/ttyUSB0" or a URL of pyserial; at rest it is cleared, or set where `active_high` is false.
+
+    Raises InputError where the port cannot be opened, or has no such line. The system itself may set RTS for a moment while it
+    opens a port.
+    """
+
+    def __init__(self, port: str, active_high: bool) -> None:
+        self.port = port
+        self._active_high = active_high
+        self._device: serial.SerialBase | None = None
+        try:
+            self.open()
+        except (*LOST, OverflowError) as error:
+            raise InputError(f"[sync] port = {port}: {self._fault(error)}") from error
+
+    def _fault(self, error: BaseException) -> str:
+        if self._device is not None:
+            self.close()
+            return f"has no line RTS ({one_line(str(error))}); write a serial port with modem lines, such as /dev/ttyUSB0"
+        return opening_fault(error, self.port)
+
+    @property
+    def is_open(self) -> bool:
+        """Whether there is a port to pulse."""
+        return self._device is not None
+
+    def open(self) -> None:
+        """Open the port, with the line at rest. Raises one of LOST."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # pyserial's own, of threads
+            device = serial.serial_for_url(self.port, do_not_open=True, exclusive=True)
+            device.rts = not self._active_high
+            try:
+                device.open()
+            except LOST:
+                _shut(device)
+                raise
+        self._device = device
+        device.rts = not self._active_high  # opening suppresses that a port has no such line
+
+    def set(self, active: bool) -> None:
+        """Bring the line to its active level, or to rest. Raises one of LOST."""
+        if self._device is None:
+            raise OSError("the port is closed")
+        self._device.rts = active == self._active_high
+
+    def close(self) -> None:
+        """Close the port with the line at rest."""
+        device, self._device = self._device, None
+        if device is not None:
+            with contextlib.suppress(*LOST):
+                device.rts = not self._active_high
+            _shut(device)
+
+
+def _shut(device: serial.SerialBase) -> None:
+    """Close a port, and the socket that pyserial leaves open where its other side has gone."""
+    behind = getattr(device, "_socket", None)
+    with contextlib.suppress(*LOST):
+        device.close()
+    if behind is not None:
+        behind.close()

@@ -1,19 +1,31 @@
-"""The ZeroMQ socket under every ZeroMQ link: its context, its keys, its limits against floods, and how it is reopened."""
+"""The ZeroMQ socket under every ZeroMQ link: its context, its keys, its limits against floods, and how it is reopened.
+
+libzmq reports connections on a monitor socket and limits nothing: it accepts until the process has no file descriptors left.
+`Doorkeeper` closes connections over MAX_CONNECTIONS at once, the newest first, so that the established ones stay. libzmq itself
+closes a peer that does not finish its handshake within HANDSHAKE_MS. `MemoryWatch` bounds what libzmq keeps of a message
+that never ends.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import errno
 import math
+import os
+import resource
+import socket
+import struct
 import time
+from collections.abc import Iterator
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
 import zmq
 
-from hilstar.attitude.wire.doorkeeper import HANDSHAKE_MS, Doorkeeper
 from hilstar.attitude.wire.endpoint import ENDPOINT_FORM, PATH_FORM, check_use, parse_endpoint
-from hilstar.attitude.wire.flood_limits import MAX_GROWTH_BYTES, LinkCounts, MemoryWatch, raise_file_limit
 from hilstar.attitude.wire.keys import AllowList, CurveKeys, check_reach, load_public, load_secret
+from hilstar.attitude.wire.links import PAUSE_S, LinkCounts
 from hilstar.attitude.wire.source import PACKETS
 from hilstar.errors import InputError
 from hilstar.notices import Notices
@@ -21,10 +33,26 @@ from hilstar.notices import Notices
 if TYPE_CHECKING:
     from zmq.auth.thread import ThreadAuthenticator
 
+MAX_GROWTH_BYTES = 256_000_000
+LOOK_S = 0.01
+FREED_WITHIN_S = 2.0
+PAGE_BYTES = resource.getpagesize()
+WANTED_FILES = 65_536
+MAX_CONNECTIONS = 64
+MAX_EVENTS = 500  # in one go; more wait in the monitor, and then libzmq waits
+FEW_EVENTS = 50
+EVENT = struct.Struct("=Hi")  # of zmq_socket_monitor(3): event, value; pyzmq's parser of it would bring asyncio
+HANDSHAKE_MS = 2000
+FAILED = {
+    zmq.EVENT_HANDSHAKE_FAILED_AUTH: "its key is not among those allowed",
+    zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL: "it is another type of ZeroMQ socket, or it has no keys",
+    zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL: f"it left, or did not finish its handshake within {HANDSHAKE_MS / 1000:g} s",
+}
+EVENTS = zmq.EVENT_ACCEPTED | zmq.EVENT_CONNECTED | zmq.EVENT_DISCONNECTED | zmq.EVENT_HANDSHAKE_SUCCEEDED | sum(FAILED)
 # At most QUEUE_MESSAGES of a flood wait here; the rest wait at the sender or are lost there. A part over MAX_PART_BYTES drops
 # its connection, which is then made anew. Of a message of more than MAX_PARTS the rest is passed over, for other senders' wait
 # behind it; one of more than MAX_PASSED_OVER drops every connection. A message that never ends is limited only by the memory
-# of the process (flood_limits.MemoryWatch).
+# of the process (MemoryWatch).
 QUEUE_MESSAGES = 1000
 MAX_PART_BYTES = 1 << 18
 MAX_PARTS, MAX_PASSED_OVER = 64, 10_000
@@ -34,6 +62,194 @@ HEARTBEAT_TIMEOUT_MS = 3000
 MAX_RECONNECT_MS = 500
 REBIND_S = 2.0  # a port is free again some milliseconds after its socket was closed
 BIND_RETRY_S = 0.002
+
+
+class MemoryWatch:
+    """Whether this process has grown by more than MAX_GROWTH_BYTES since `begin`.
+
+    libzmq keeps a message until its last part arrives, with no limit on parts, and does not report what it keeps: only the
+    memory of the process shows it. Without /proc nothing is watched.
+    """
+
+    def __init__(self) -> None:
+        self._file = -1
+        with contextlib.suppress(OSError):  # kept open: a process out of descriptors must still see its memory
+            self._file = os.open("/proc/self/statm", os.O_RDONLY | os.O_CLOEXEC)
+        self._base_bytes = self._used_bytes()
+        self._looked_s = 0.0
+
+    def begin(self) -> None:
+        """Count from what is used now."""
+        self._base_bytes = self._used_bytes()
+
+    def grown_bytes(self) -> int:
+        """The growth since `begin`; looked up at most every LOOK_S, 0 in between."""
+        now_s = time.monotonic()
+        if now_s - self._looked_s < LOOK_S:
+            return 0
+        self._looked_s = now_s
+        return self._used_bytes() - self._base_bytes
+
+    def await_release(self) -> None:
+        """Wait a moment for freed memory to be returned; what remains was not the link's, and becomes the new baseline."""
+        deadline_s = time.monotonic() + FREED_WITHIN_S
+        while (used_bytes := self._used_bytes()) > self._base_bytes + MAX_GROWTH_BYTES / 2:
+            if time.monotonic() > deadline_s:
+                self._base_bytes = used_bytes
+                return
+            time.sleep(LOOK_S)
+            _give_back_what_is_free()
+
+    def _used_bytes(self) -> int:
+        if self._file < 0:
+            return 0
+        with contextlib.suppress(OSError, ValueError, IndexError):
+            return int(os.pread(self._file, 256, 0).split()[1]) * PAGE_BYTES
+        return 0
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._file >= 0:
+            os.close(self._file)
+        self._file = -1
+
+
+def _give_back_what_is_free() -> None:
+    """Otherwise glibc keeps freed memory, which would count as growth."""
+    with contextlib.suppress(AttributeError, OSError):
+        ctypes.CDLL(None).malloc_trim(0)
+
+
+def raise_file_limit() -> None:
+    """Raise the limit of open files up to WANTED_FILES: each connection needs one, and so do ledger and display."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = WANTED_FILES if hard == resource.RLIM_INFINITY else min(hard, WANTED_FILES)
+    if soft != resource.RLIM_INFINITY and soft < wanted:
+        with contextlib.suppress(OSError, ValueError):
+            resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+
+
+class Doorkeeper:
+    """Reads the monitor of one socket, made before it is bound or connected.
+
+    `lost` says that a connection has ended; the code that acts on it resets it. `place` is the port or path that was bound.
+    """
+
+    def __init__(self, watched: zmq.Socket[bytes], *, bound: bool, counts: LinkCounts, notices: Notices) -> None:
+        self.lost = False
+        self.place: int | str = ""
+        self._watched = watched
+        self._bound = bound
+        self._counts = counts
+        self._notices = notices
+        self._open: dict[int, str] = {}  # file descriptor: peer, in the order of arrival
+        self._shut: set[int] = set()
+        self._failure = ""
+        self._monitor = watched.get_monitor_socket(EVENTS)
+
+    @property
+    def monitor(self) -> zmq.Socket[bytes]:
+        """The socket to poll for events."""
+        return self._monitor
+
+    def tend(self) -> None:
+        """Take the events so far."""
+        events = 0
+        with contextlib.suppress(zmq.ZMQError):
+            while events < MAX_EVENTS:
+                what, _peer_endpoint = self._monitor.recv_multipart(zmq.NOBLOCK)
+                self._take(*EVENT.unpack(what))
+                events += 1
+        if self._bound and len(self._open) > MAX_CONNECTIONS:
+            self._shut_newest()
+        if events > FEW_EVENTS:
+            time.sleep(PAUSE_S)
+
+    def _take(self, event: int, value: int) -> None:
+        if event == zmq.EVENT_ACCEPTED:
+            self._counts.connections += 1
+            self._open.pop(value, None)
+            self._open[value] = _peer(value)
+        elif event == zmq.EVENT_DISCONNECTED:
+            self._leave(value)
+        elif event == zmq.EVENT_HANDSHAKE_SUCCEEDED and not self._bound:
+            self._arrive()
+        elif event in FAILED:
+            self._failure = FAILED[zmq.Event(event)]
+
+    def _arrive(self) -> None:
+        """A connecting socket's peer has answered, for the first time or again."""
+        self._counts.connections += 1
+        if self._counts.connections > 1:
+            self._notices.tell("back", "reconnected to the sender")
+        else:
+            self._notices.mention("connected", "connected to the sender")
+
+    def _leave(self, file: int) -> None:
+        self.lost = True
+        who, failure = self._open.pop(file, ""), self._failure
+        self._failure = ""
+        if file in self._shut:
+            self._shut.remove(file)
+        elif failure and self._bound:
+            self._counts.rejected += 1
+            self._notices.tell("client-rejected", f"a connection from {who or 'an unknown peer'} was rejected: {failure}")
+        elif failure:
+            self._counts.rejected += 1
+            self._notices.tell(
+                "link-rejected",
+                "the other side rejected us: check its allowed_clients, and our curve_server_key",
+            )
+        elif not self._bound:
+            self._counts.lost += 1
+            self._notices.tell("lost", "lost the connection to the sender; waiting for it")
+
+    def _shut_newest(self) -> None:
+        newest = [file for file in list(self._open)[MAX_CONNECTIONS:] if file not in self._shut]
+        if not newest:
+            return
+        if not self._shut:
+            who = self._open[newest[0]] or "an unknown peer"
+            self._notices.tell(
+                "connections-refused", f"over {MAX_CONNECTIONS} connections at once; closing further ones, from {who}"
+            )
+        for file in newest:
+            self._counts.refused += 1
+            self._shut.add(file)
+            with _connection(file) as connection:
+                if connection is not None and self._is_ours(connection):
+                    connection.shutdown(socket.SHUT_RDWR)
+
+    def _is_ours(self, connection: socket.socket) -> bool:
+        """The descriptor may belong to another file by now."""
+        name = connection.getsockname()
+        return bool((name[1] if isinstance(name, tuple) else name) == self.place)
+
+    def close(self) -> None:
+        """Stop watching; before its socket is closed."""
+        self.tend()  # libzmq blocks on a full monitor, and would block for ever on a closed one
+        with contextlib.suppress(zmq.ZMQError):
+            self._watched.disable_monitor()
+        self._monitor.close(linger=0)
+
+
+@contextlib.contextmanager
+def _connection(file: int) -> Iterator[socket.socket | None]:
+    """libzmq's own connection for a moment, through a duplicate of its descriptor; None where it is gone."""
+    try:
+        connection = socket.socket(fileno=os.dup(file))
+    except OSError:
+        yield None
+        return
+    with connection, contextlib.suppress(OSError):
+        yield connection
+
+
+def _peer(file: int) -> str:
+    with _connection(file) as connection:
+        name = () if connection is None else connection.getpeername()
+        return f"{name[0]}:{name[1]}" if isinstance(name, tuple) and len(name) > 1 else ""
+    return ""
 
 
 def zmq_version() -> str:

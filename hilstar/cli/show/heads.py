@@ -15,7 +15,7 @@ from hilstar.errors import InputError
 from hilstar.notices import Notices
 
 if TYPE_CHECKING:
-    from hilstar.attitude.wire.heads.feed import FedReceiver
+    from hilstar.attitude.wire.zmq_links import FedReceiver
     from hilstar.bench.bench_file import BenchFile
     from hilstar.bench.heads_file import HeadsFile
 
@@ -44,8 +44,8 @@ class HeadsAsked:
 
 def serve_heads(heads: HeadsFile, asked: HeadsAsked, as_json: bool) -> None:
     """Show every head's stars up to its end, and print what each said; exit code 4 where none ever had an attitude."""
-    from hilstar.attitude.wire.vizard.live import VizardLive
-    from hilstar.attitude.wire.zmq_lockstep import ZmqLockstep
+    from hilstar.attitude.wire.vizard import VizardLive
+    from hilstar.attitude.wire.zmq_links import ZmqLockstep
     from hilstar.run.heads.supervisor import HeadsRun, head_ledger, run_heads, source_config
     from hilstar.run.open_link import await_reader, open_link
 
@@ -101,8 +101,8 @@ def _report(told: dict[str, dict[str, object]], as_json: bool) -> None:
 
 def fed_link(file: BenchFile, fed_by: str, notices: Notices) -> FedReceiver:
     """A head's link to the process that has the source, with which it ends; `fed_by` is its endpoint and its number."""
-    from hilstar.attitude.wire.heads.feed import FedReceiver
     from hilstar.attitude.wire.source import PACKETS, Mounting
+    from hilstar.attitude.wire.zmq_links import FedReceiver
     from hilstar.process.parent import end_with_parent
 
     endpoint, _, parent = fed_by.rpartition(",")

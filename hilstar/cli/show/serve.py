@@ -142,7 +142,7 @@ def _source(file: ReadFile, fed_by: str | None, notices: Notices) -> AnyLink:
 
 def tracker_pictures(link: AnyLink, bench: Bench, faults: Any = None) -> Pictures | None:
     """The virtual tracker's pictures for a link whose other side asks for them."""
-    from hilstar.attitude.wire.vizard.live import VizardLive
+    from hilstar.attitude.wire.vizard import VizardLive
     from hilstar.twin.pictures import TrackerPictures
 
     if not isinstance(link, VizardLive):

@@ -92,8 +92,8 @@ def attitude(
 
 def _live(file: BenchFile, at: str | None, patience_s: float) -> tuple[AttitudeSample, Conventions]:
     """The first attitude of the stream that a bench file names."""
-    from hilstar.attitude.wire.vizard.live import VizardLive
-    from hilstar.attitude.wire.zmq_lockstep import ZmqLockstep
+    from hilstar.attitude.wire.vizard import VizardLive
+    from hilstar.attitude.wire.zmq_links import ZmqLockstep
     from hilstar.errors import InputError
     from hilstar.run.listen import first_attitude
     from hilstar.run.open_link import open_link

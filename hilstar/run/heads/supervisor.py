@@ -13,10 +13,10 @@ from typing import Any
 import msgspec
 from msgspec.structs import replace
 
-from hilstar.attitude.back_channel import BackChannel, Traffic
-from hilstar.attitude.wire.heads.feed import Feed
+from hilstar.attitude.receiver import BackChannel, Traffic
 from hilstar.attitude.wire.links import StreamLink
 from hilstar.attitude.wire.packet import TimeRequest
+from hilstar.attitude.wire.zmq_links import Feed
 from hilstar.bench.config import BenchConfig
 from hilstar.bench.heads_file import HeadsFile
 from hilstar.files import temporary_folder

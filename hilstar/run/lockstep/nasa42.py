@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 
-from hilstar.attitude.wire.nasa42.tcp_link import Nasa42Lockstep
+from hilstar.attitude.wire.nasa42 import Nasa42Lockstep
 from hilstar.run.lockstep.steps import POLL_MS, Steps
 from hilstar.run.loop import FrameLoop
 from hilstar.run.summary import RunSummary

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 
 from hilstar.attitude.wire.packet import TimeReply, TimeRequest
-from hilstar.attitude.wire.zmq_lockstep import ZmqLockstep
+from hilstar.attitude.wire.zmq_links import ZmqLockstep
 from hilstar.run.frame_status import StatusMaker
 from hilstar.run.lockstep.steps import POLL_MS, Steps
 from hilstar.run.loop import FrameLoop

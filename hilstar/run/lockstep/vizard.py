@@ -6,9 +6,8 @@ import time
 from collections.abc import Callable
 
 from hilstar.attitude.wire.packet import AttitudeSample
-from hilstar.attitude.wire.vizard.camera import TrackerCamera, disagreement
-from hilstar.attitude.wire.vizard.live import ImageRequest, Step, VizardLive
-from hilstar.attitude.wire.vizard.message import VizCamera
+from hilstar.attitude.wire.vizard import ImageRequest, Step, TrackerCamera, VizardLive, disagreement
+from hilstar.attitude.wire.vizard_message import VizCamera
 from hilstar.notices import Notices
 from hilstar.run.lockstep.steps import POLL_MS, Steps
 from hilstar.run.loop import FrameLoop

@@ -9,14 +9,12 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Protocol, Self
 
-from hilstar.attitude.wire.cobs import DELIMITER, framed
-from hilstar.attitude.wire.flood_limits import LinkCounts
 from hilstar.attitude.wire.keys import NO_KEYS, CurveKeys
-from hilstar.attitude.wire.links import Arrival
-from hilstar.attitude.wire.packet import Event, Packet, Status, TimeReply, TimeRequest, decode, encode
+from hilstar.attitude.wire.links import Arrival, LinkCounts
+from hilstar.attitude.wire.packet import DELIMITER, Event, Packet, Status, TimeReply, TimeRequest, decode, encode, framed
 from hilstar.attitude.wire.serial_link import SerialLink, serial_target
-from hilstar.attitude.wire.udp.datagrams import Datagrams
-from hilstar.attitude.wire.zmq_stream import ZmqSender
+from hilstar.attitude.wire.udp import Datagrams
+from hilstar.attitude.wire.zmq_links import ZmqSender
 from hilstar.errors import InputError, shortened
 from hilstar.process.interrupts import caught
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Self
 
-from hilstar.attitude.wire.rts_line import LOST, RtsLine
+from hilstar.attitude.wire.serial_link import LOST, RtsLine
 from hilstar.bench.config import SyncSettings
 from hilstar.errors import one_line
 from hilstar.notices import Notices

@@ -19,7 +19,7 @@ import pytest
 import zmq
 import zmq.auth
 
-from hilstar.attitude.wire.flood_limits import MAX_BURST, MAX_PACKETS_PER_S
+from hilstar.attitude.wire.links import MAX_BURST, MAX_PACKETS_PER_S
 from tests.support.benches import LIVE_BENCH
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.senders import connected, packet

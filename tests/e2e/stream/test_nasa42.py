@@ -13,11 +13,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hilstar.attitude.wire.flood_limits import LinkCounts
-from hilstar.attitude.wire.nasa42.messages import MessageReader, MessageSplitter
-from hilstar.attitude.wire.nasa42.tcp_link import Nasa42Link, Nasa42Lockstep
+from hilstar.attitude.wire.endpoint import AllowedSenders
+from hilstar.attitude.wire.links import LinkCounts
+from hilstar.attitude.wire.nasa42 import MessageReader, MessageSplitter, Nasa42Link, Nasa42Lockstep
 from hilstar.attitude.wire.source import Mounting
-from hilstar.attitude.wire.udp.addresses import AllowedSenders
 from hilstar.bench.build import load
 from hilstar.errors import InputError
 from hilstar.rotation import angle_between_rad, propagate

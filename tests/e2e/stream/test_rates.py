@@ -15,7 +15,7 @@ import pytest
 import zmq
 
 from hilstar.attitude.logs.mcap_log import read_messages
-from hilstar.attitude.wire.zmq_stream import ZmqReceiver
+from hilstar.attitude.wire.zmq_links import ZmqReceiver
 from hilstar.bench.build import load
 from hilstar.rotation import angle_between_rad, propagate
 from hilstar.run.record.ledger_records import EventRecord

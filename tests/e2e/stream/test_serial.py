@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from cobs import cobs
 
-from hilstar.attitude.wire.flood_limits import MAX_PACKETS_PER_S
+from hilstar.attitude.wire.links import MAX_PACKETS_PER_S
 from hilstar.attitude.wire.serial_link import SerialLink
 from hilstar.bench.build import load
 from hilstar.rotation import angle_between_rad, from_radec_roll_deg, propagate

@@ -11,7 +11,7 @@ import msgspec
 import pytest
 import zmq
 
-from hilstar.attitude.wire.zmq_stream import ZmqReceiver
+from hilstar.attitude.wire.zmq_links import ZmqReceiver
 from hilstar.bench.build import load
 from hilstar.run.loop import Limit
 from hilstar.run.serve import Running, serve

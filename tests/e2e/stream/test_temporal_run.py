@@ -6,8 +6,8 @@ import threading
 
 import numpy as np
 
-from hilstar.attitude.wire.udp.addresses import AllowedSenders, bound_place
-from hilstar.attitude.wire.udp.udp_link import UdpLink
+from hilstar.attitude.wire.endpoint import AllowedSenders, bound_place
+from hilstar.attitude.wire.udp import UdpLink
 from hilstar.bench.build import load
 from hilstar.notices import Notices
 from hilstar.run.loop import Limit

@@ -15,9 +15,9 @@ import msgspec
 import numpy as np
 import pytest
 
+from hilstar.attitude.wire.endpoint import AllowedSenders, bound_place
 from hilstar.attitude.wire.packet import AttitudeSample, TimeRequest, decode, encode
-from hilstar.attitude.wire.udp.addresses import AllowedSenders, bound_place
-from hilstar.attitude.wire.udp.udp_link import UdpLink
+from hilstar.attitude.wire.udp import UdpLink
 from hilstar.bench.build import load
 from hilstar.notices import Notices
 from hilstar.rotation import angle_between_rad, propagate

@@ -8,10 +8,9 @@ import time
 import numpy as np
 import pytest
 
-from hilstar.attitude.back_channel import ASK_NS, FIRST_ASKS, QUICK_ASK_NS, QUIET, BackChannel, Traffic
-from hilstar.attitude.clock.exchanges import MIN_EXCHANGES, Exchange
+from hilstar.attitude.clock.sender_clock import MIN_EXCHANGES, Exchange
 from hilstar.attitude.clock.timeline import Policy, Timeline
-from hilstar.attitude.receiver import Receiver
+from hilstar.attitude.receiver import ASK_NS, FIRST_ASKS, QUICK_ASK_NS, QUIET, BackChannel, Receiver, Traffic
 from hilstar.attitude.wire.links import Arrival
 from hilstar.attitude.wire.packet import AttitudeSample, Event, Packet, Status, TimeReply, TimeRequest, encode
 from hilstar.attitude.wire.protocol import HEALTH_MISSED, HEALTH_REFUSED, HEALTH_STALE

@@ -11,9 +11,8 @@ from itertools import takewhile
 import numpy as np
 import pytest
 
-from hilstar.attitude.back_channel import Traffic
 from hilstar.attitude.clock.timeline import Policy, Timeline
-from hilstar.attitude.receiver import QUEUED_NS, Receiver
+from hilstar.attitude.receiver import QUEUED_NS, Receiver, Traffic
 from hilstar.attitude.wire.links import Arrival
 from hilstar.attitude.wire.packet import AttitudeSample, Packet, encode
 from hilstar.notices import Notice, Notices

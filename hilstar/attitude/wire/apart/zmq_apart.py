@@ -13,7 +13,7 @@ from hilstar.attitude.wire.apart.records import Kind, Record, unpack_message
 from hilstar.attitude.wire.apart.zmq_child import order
 from hilstar.attitude.wire.links import Arrival
 from hilstar.attitude.wire.packet import Event, Packet
-from hilstar.attitude.wire.zmq_stream import Taken, ZmqReceiver
+from hilstar.attitude.wire.zmq_links import Taken, ZmqReceiver
 from hilstar.notices import Notices
 
 CHILD = "hilstar.attitude.wire.apart.zmq_child"

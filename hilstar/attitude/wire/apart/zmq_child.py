@@ -14,9 +14,9 @@ from typing import Any
 
 from hilstar.attitude.wire.apart.child import Wire, run_child
 from hilstar.attitude.wire.apart.records import Kind, pack_message, pack_object
-from hilstar.attitude.wire.flood_limits import LinkCounts
 from hilstar.attitude.wire.keys import CurveKeys
-from hilstar.attitude.wire.zmq_stream import ZmqReceiver
+from hilstar.attitude.wire.links import LinkCounts
+from hilstar.attitude.wire.zmq_links import ZmqReceiver
 from hilstar.notices import Notices
 from hilstar.process.priority import PromptWhileLight
 

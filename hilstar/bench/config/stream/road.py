@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from hilstar.attitude.wire.endpoint import parse_endpoint
-from hilstar.attitude.wire.nasa42.messages import spacecraft_number
-from hilstar.attitude.wire.udp.addresses import ALLOW_FORM, AllowedSenders, Place, bound_place
+from hilstar.attitude.wire.endpoint import ALLOW_FORM, AllowedSenders, Place, bound_place, parse_endpoint
+from hilstar.attitude.wire.nasa42 import spacecraft_number
 from hilstar.bench.config.stream.attitude import AttitudeSettings
 from hilstar.errors import InputError
 

@@ -7,9 +7,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from hilstar.attitude.clock.exchanges import EXCHANGE_LIFE_NS, MIN_EXCHANGES, Exchange
 from hilstar.attitude.clock.jumps import JumpFilter
-from hilstar.attitude.clock.sender_clock import SLEW, SenderClock
+from hilstar.attitude.clock.sender_clock import EXCHANGE_LIFE_NS, MIN_EXCHANGES, SLEW, Exchange, SenderClock
 from hilstar.attitude.wire.links import Arrival
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.units import NS_PER_MS, NS_PER_S

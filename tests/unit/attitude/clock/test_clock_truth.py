@@ -11,9 +11,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from hilstar.attitude.clock.exchanges import Exchange
 from hilstar.attitude.clock.jumps import LATE_FOR_NS, WAITED_UNKNOWN_NS, JumpFilter
-from hilstar.attitude.clock.sender_clock import SenderClock
+from hilstar.attitude.clock.sender_clock import Exchange, SenderClock
 from hilstar.attitude.wire.links import Arrival, SampleArrival
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.units import NS_PER_MS, NS_PER_S

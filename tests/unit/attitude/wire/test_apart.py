@@ -24,16 +24,14 @@ from hilstar.attitude.wire.apart.reader import Reader
 from hilstar.attitude.wire.apart.records import Kind, RecordStream, pack, pack_message, unpack_message
 from hilstar.attitude.wire.apart.serial_apart import SerialApart
 from hilstar.attitude.wire.apart.zmq_apart import ZmqApart
+from hilstar.attitude.wire.endpoint import AllowedSenders, bound_place
 from hilstar.attitude.wire.links import Arrival
-from hilstar.attitude.wire.nasa42.messages import MessageReader
-from hilstar.attitude.wire.nasa42.tcp_link import Nasa42Link
+from hilstar.attitude.wire.nasa42 import MessageReader, Nasa42Link
 from hilstar.attitude.wire.packet import AttitudeSample, TimeRequest, decode
 from hilstar.attitude.wire.source import Mounting
-from hilstar.attitude.wire.udp.addresses import AllowedSenders, bound_place
-from hilstar.attitude.wire.udp.udp_link import UdpLink
-from hilstar.attitude.wire.vizard.attitude import DifferenceRates, Follower
-from hilstar.attitude.wire.vizard.broadcast import VizardBroadcast
-from hilstar.attitude.wire.zmq_stream import ZmqReceiver
+from hilstar.attitude.wire.udp import UdpLink
+from hilstar.attitude.wire.vizard import DifferenceRates, Follower, VizardBroadcast
+from hilstar.attitude.wire.zmq_links import ZmqReceiver
 from hilstar.notices import Notices
 from tests.support.senders import connected, free_port, packet, publisher
 from tests.support.sources.nasa42 import message
@@ -192,7 +190,7 @@ def test_the_reader_ends_with_a_process_that_is_killed():
     program = """
 import sys, time
 from hilstar.attitude.wire.apart.zmq_apart import ZmqApart
-from hilstar.attitude.wire.zmq_stream import ZmqReceiver
+from hilstar.attitude.wire.zmq_links import ZmqReceiver
 link = ZmqApart(ZmqReceiver("tcp://127.0.0.1:*", bind=True))
 link.receive(1)
 print(link._reader._process.pid, flush=True)

@@ -1,4 +1,4 @@
-"""The byte stream's laws (head of hilstar/attitude/wire/cobs.py), on any cut and any garbage."""
+"""The byte stream's laws (head of hilstar/attitude/wire/packet.py), on any cut and any garbage."""
 
 from __future__ import annotations
 
@@ -10,8 +10,16 @@ from cobs import cobs
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hilstar.attitude.wire.cobs import MAX_FRAME_BYTES, StreamDecoder, frame
-from hilstar.attitude.wire.packet import AttitudeSample, Refusal, TimeRequest, decode, encode
+from hilstar.attitude.wire.packet import (
+    MAX_FRAME_BYTES,
+    AttitudeSample,
+    Refusal,
+    StreamDecoder,
+    TimeRequest,
+    decode,
+    encode,
+    frame,
+)
 from tests.support.wire.samples import sample
 
 # On demand: HILSTAR_FUZZ=1000000 pytest tests/unit/attitude/wire/test_cobs.py

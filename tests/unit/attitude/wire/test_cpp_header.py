@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilstar.attitude.wire.cobs import framed
-from hilstar.attitude.wire.packet import AttitudeSample, TimeReply, decode, encode
+from hilstar.attitude.wire.packet import AttitudeSample, TimeReply, decode, encode, framed
 from tests.support.benches import ROOT
 from tests.support.waiting import PATIENCE_S
 

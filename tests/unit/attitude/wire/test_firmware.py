@@ -15,8 +15,7 @@ import numpy as np
 import pytest
 from cobs import cobs
 
-from hilstar.attitude.wire.cobs import DELIMITER, MAX_FRAME_BYTES, frame
-from hilstar.attitude.wire.packet import TimeRequest
+from hilstar.attitude.wire.packet import DELIMITER, MAX_FRAME_BYTES, TimeRequest, frame
 from tests.support.benches import ROOT
 from tests.support.waiting import PATIENCE_S
 

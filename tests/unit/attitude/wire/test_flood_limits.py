@@ -10,9 +10,8 @@ from dataclasses import replace
 
 import pytest
 
-from hilstar.attitude.wire.cobs import StreamDecoder, framed
-from hilstar.attitude.wire.flood_limits import MAX_BURST, MAX_PACKETS_PER_S, OVER_S, FloodGate, LinkCounts
-from hilstar.attitude.wire.packet import AttitudeSample, declares_discontinuity, decode, encode
+from hilstar.attitude.wire.links import MAX_BURST, MAX_PACKETS_PER_S, OVER_S, FloodGate, LinkCounts
+from hilstar.attitude.wire.packet import AttitudeSample, StreamDecoder, declares_discontinuity, decode, encode, framed
 from hilstar.attitude.wire.serial_link import Chunk, SerialLink
 from hilstar.errors import InputError
 from hilstar.notices import Notices
@@ -74,7 +73,7 @@ class Line(SerialLink):
 def test_of_a_line_that_brings_more_the_newest_are_taken_in_one_go(monkeypatch):
     """Frame by frame each one that was too many cost a pause of 5 ms, and the oldest were taken: ages of seconds, no end."""
     pauses: list[float] = []
-    monkeypatch.setattr("hilstar.attitude.wire.flood_limits.time.sleep", pauses.append)
+    monkeypatch.setattr("hilstar.attitude.wire.links.time.sleep", pauses.append)
     with Line(flooded_messages(set())) as line:
         taken = [arrival.event.sequence for arrival in line.receive(0)]
         assert taken == list(range(2 * MAX_BURST, 3 * MAX_BURST))

@@ -17,8 +17,16 @@ from cobs import cobs
 
 from hilstar.attitude.clock.timeline import Policy, Timeline
 from hilstar.attitude.wire import packet, protocol
-from hilstar.attitude.wire.cobs import DELIMITER, StreamDecoder, frame
-from hilstar.attitude.wire.packet import MESSAGE_REASONS, AttitudeSample, Refusal, decode, encode
+from hilstar.attitude.wire.packet import (
+    DELIMITER,
+    MESSAGE_REASONS,
+    AttitudeSample,
+    Refusal,
+    StreamDecoder,
+    decode,
+    encode,
+    frame,
+)
 from hilstar.rotation import from_radec_roll_deg
 from tests.support.benches import ROOT
 from tests.support.waiting import PATIENCE_S

@@ -7,8 +7,8 @@ import time
 
 import pytest
 
-from hilstar.attitude.wire.vizard.live import VizardLive
-from hilstar.attitude.wire.zmq_lockstep import ZmqLockstep
+from hilstar.attitude.wire.vizard import VizardLive
+from hilstar.attitude.wire.zmq_links import ZmqLockstep
 from tests.support.waiting import PATIENCE_S
 from tests.unit.attitude.wire.test_vizard import follower
 

@@ -7,10 +7,9 @@ import time
 
 import pytest
 
+from hilstar.attitude.wire.endpoint import MAX_KNOWN, AllowedSenders, bound_place
 from hilstar.attitude.wire.packet import AttitudeSample, Status, TimeReply, TimeRequest, encode
-from hilstar.attitude.wire.udp.addresses import MAX_KNOWN, AllowedSenders, bound_place
-from hilstar.attitude.wire.udp.datagrams import Datagrams
-from hilstar.attitude.wire.udp.udp_link import MAX_CREDIT_BYTES, MAX_PEERS, MAX_STRANGERS, Credit, UdpLink
+from hilstar.attitude.wire.udp import MAX_CREDIT_BYTES, MAX_PEERS, MAX_STRANGERS, Credit, Datagrams, UdpLink
 from hilstar.notices import Notices
 from hilstar.units import NS_PER_S
 from tests.support.senders import packet

@@ -17,13 +17,23 @@ from hilstar.attitude.clock.timeline import Policy, Timeline
 from hilstar.attitude.wire.links import Arrival
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal
 from hilstar.attitude.wire.source import CHECK_RADEC_DEG, Mounting
-from hilstar.attitude.wire.vizard.attitude import CONVENTIONS, DifferenceRates, Follower, quaternion_of_mrp
-from hilstar.attitude.wire.vizard.broadcast import MAX_HELD_NS, Opening
-from hilstar.attitude.wire.vizard.camera import TrackerCamera, disagreement, q_body_to_cam
-from hilstar.attitude.wire.vizard.live import ImageRequest, Step, VizardLive
-from hilstar.attitude.wire.vizard.message import decode_update
-from hilstar.attitude.wire.vizard.parts import check_loopback, update_of
-from hilstar.attitude.wire.vizard.wire_format import MAX_FIELDS
+from hilstar.attitude.wire.vizard import (
+    CONVENTIONS,
+    MAX_HELD_NS,
+    DifferenceRates,
+    Follower,
+    ImageRequest,
+    Opening,
+    Step,
+    TrackerCamera,
+    VizardLive,
+    check_loopback,
+    disagreement,
+    q_body_to_cam,
+    quaternion_of_mrp,
+    update_of,
+)
+from hilstar.attitude.wire.vizard_message import MAX_FIELDS, decode_update
 from hilstar.errors import InputError
 from hilstar.notices import Notices
 from hilstar.rotation import to_radec_roll_deg

@@ -7,8 +7,8 @@ import time
 
 import pytest
 
-from hilstar.attitude.wire import rts_line
-from hilstar.attitude.wire.rts_line import RtsLine
+from hilstar.attitude.wire import serial_link
+from hilstar.attitude.wire.serial_link import RtsLine
 from hilstar.bench.config import SyncSettings
 from hilstar.errors import InputError
 from hilstar.notices import Notices
@@ -50,7 +50,7 @@ def kept(monkeypatch):
         made[-1].port = url
         return made[-1]
 
-    monkeypatch.setattr(rts_line.serial, "serial_for_url", make)
+    monkeypatch.setattr(serial_link.serial, "serial_for_url", make)
     return made
 
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from hilstar.attitude.wire.nasa42.messages import (
+from hilstar.attitude.wire.nasa42 import (
     CONVENTIONS,
     END,
     MAX_MESSAGE_BYTES,
@@ -178,7 +178,7 @@ def test_a_message_that_comes_byte_by_byte_is_looked_through_once(monkeypatch):
             looked_at += len(kept) - begin
             return END.search(kept, begin)
 
-    monkeypatch.setattr("hilstar.attitude.wire.nasa42.messages.END", Counted())
+    monkeypatch.setattr("hilstar.attitude.wire.nasa42.END", Counted())
     stream = b"SC[0].B[0].wn = [0 0 0]\n" * 500 + b"[ENDMSG]\n"
     splitter = MessageSplitter()
     assert [message for byte in stream for message in splitter.feed(bytes([byte]))] == [stream]

@@ -1,19 +1,32 @@
-"""Free-running ZeroMQ: attitudes come in through a SUB socket, and go out through an XPUB socket."""
+"""Links over ZeroMQ: a free-running stream (SUB in, XPUB out), lockstep (REP), and the feed from one source to its heads."""
 
 from __future__ import annotations
 
 import contextlib
+import struct
 import time
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import NamedTuple
+from types import TracebackType
+from typing import NamedTuple, Self
 
+import msgspec
 import zmq
 
-from hilstar.attitude.wire.flood_limits import FloodGate
 from hilstar.attitude.wire.keys import NO_KEYS, CurveKeys
-from hilstar.attitude.wire.links import Arrival
-from hilstar.attitude.wire.packet import Event, Packet, declares_discontinuity, decode
+from hilstar.attitude.wire.links import Arrival, FloodGate
+from hilstar.attitude.wire.packet import (
+    AttitudeSample,
+    Event,
+    Packet,
+    Refusal,
+    Status,
+    TimeReply,
+    declares_discontinuity,
+    decode,
+    encode,
+)
+from hilstar.attitude.wire.source import Conventions, Mounting
 from hilstar.attitude.wire.zmq_socket import QUEUE_MESSAGES, ZmqSocket
 from hilstar.notices import Notices
 from hilstar.process.interrupts import caught
@@ -23,6 +36,7 @@ SEND_QUEUE_MESSAGES = 10_000
 MAX_SUBSCRIPTION_BYTES = 1024
 RECONNECT_S = 0.25
 TEND_S = 0.05
+STAMP = struct.Struct("<q")  # host time of arrival, ns: one clock for all processes of a machine
 
 
 class Taken(NamedTuple):
@@ -155,3 +169,85 @@ class ZmqSender(ZmqSocket):
 
     def _linger_ms(self) -> int:
         return self.LINGER_MS if caught() is None else self.STOPPED_LINGER_MS
+
+
+class ZmqLockstep(ZmqSocket):
+    """A REP socket: one request is one attitude and gets one reply; it binds, or connects with `bind=False`."""
+
+    def __init__(self, endpoint: str, *, bind: bool = True, keys: CurveKeys = NO_KEYS, notices: Notices | None = None) -> None:
+        super().__init__(zmq.REP, endpoint, bind=bind, keys=keys, notices=notices)
+        self._json = False
+
+    def receive(self, timeout_ms: int) -> Arrival[Event] | None:
+        """The next request, or None; each must be answered before the next can arrive.
+
+        libzmq announces a request without its delimiter and then drops it: it is not waited for.
+        """
+        message = self._take() if self._waits(timeout_ms) else None
+        if message is None:
+            return None
+        self._json = message[:64].lstrip()[:1] == b"{"
+        return Arrival(time.monotonic_ns(), decode(message), message)
+
+    def reply(self, status: Status, shown_ns: int, refusal: Refusal | None) -> None:
+        """Answer the request: with a status packet for a packet, with an object for JSON."""
+        if not self._json:
+            self._answer(encode(status))
+            return
+        fields = {name: getattr(status, name) for name in status.__dataclass_fields__}
+        trouble = None if refusal is None else {"reason": refusal.reason, "detail": refusal.detail}
+        self._answer(msgspec.json.encode({**fields, "shown_ns": shown_ns, "refused": trouble}))
+
+    def reply_time(self, reply: TimeReply) -> None:
+        """Answer a time request."""
+        self._answer(encode(reply))
+
+    def _answer(self, message: bytes) -> None:
+        """A peer that is gone, or does not read, gets no answer."""
+        with contextlib.suppress(zmq.Again):
+            self._ready().send(message, zmq.NOBLOCK)
+
+
+class Feed:
+    """A PUB socket that hands on what a source brings; a head that is slow or gone delays no other."""
+
+    def __init__(self, endpoint: str) -> None:
+        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self._socket = self._context.socket(zmq.PUB)
+        self._socket.setsockopt(zmq.LINGER, 0)
+        self._socket.setsockopt(zmq.SNDHWM, QUEUE_MESSAGES)
+        self._socket.bind(endpoint)
+
+    def give(self, arrival: Arrival[Event]) -> None:
+        """Hand on a message: its bytes, or where those are the source's own words a packet of the same attitude."""
+        raw = arrival.raw
+        if isinstance(arrival.event, AttitudeSample) and not isinstance(decode(raw), AttitudeSample):
+            raw = encode(arrival.event)
+        with contextlib.suppress(zmq.Again):
+            self._socket.send_multipart([STAMP.pack(arrival.host_ns), raw], zmq.NOBLOCK)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self._socket.close()
+        self._context.term()
+
+
+class FedReceiver(ZmqReceiver):
+    """A head's end of a Feed: the body's attitudes become its camera's, with the time at which they reached the feed."""
+
+    def __init__(self, endpoint: str, mounting: Mounting, conventions: Conventions, notices: Notices | None = None) -> None:
+        super().__init__(endpoint, notices=notices)
+        self._mounting = mounting
+        self.conventions = conventions
+
+    def _arrival(self, host_ns: int, parts: list[bytes]) -> Arrival[Event]:
+        if len(parts) != 2 or len(parts[0]) != STAMP.size:
+            return super()._arrival(host_ns, parts)
+        (came_ns,) = STAMP.unpack(parts[0])
+        event = decode(parts[1])
+        if not isinstance(event, AttitudeSample):
+            return Arrival(came_ns, event, parts[1], stamped=True)
+        camera = self._mounting.sample(event)
+        return Arrival(came_ns, camera, encode(camera), stamped=True)

@@ -1,1 +1,0 @@
-"""42, the spacecraft simulator: its text messages, and the TCP connection that they come on."""

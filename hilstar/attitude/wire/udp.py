@@ -1,0 +1,362 @@
+"""UDP: one packet or JSON object a datagram, from listed addresses only, and answers that never amount to more.
+
+Laws:
+1. A datagram from an address that is not allowed is counted and never answered; the kernel drops a flood of them, by a socket
+   filter (classic BPF; Linux, Documentation/networking/filter.rst), before it costs buffer space or a read.
+2. To an address go at most as many bytes of time requests and replies as came from it; statuses besides, at their own rate.
+3. A flood costs the reading of MAX_TAKEN datagrams every PAUSE_S, and the decoding of what `FloodGate` admits.
+
+The kernel stamps the arrival (SO_TIMESTAMPNS), however late a datagram is read; `KernelStamps` does the same for TCP.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import errno
+import select
+import socket
+import struct
+import time
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from types import TracebackType
+from typing import Any, Self
+
+from hilstar.attitude.wire.endpoint import AllowedSenders, Network, Place
+from hilstar.attitude.wire.links import PAUSE_S, Arrival, FloodGate, LinkCounts
+from hilstar.attitude.wire.packet import MAX_JSON_BYTES, Event, Packet, Status, declares_discontinuity, decode, encode
+from hilstar.attitude.wire.source import PACKETS
+from hilstar.errors import InputError
+from hilstar.notices import Notices
+from hilstar.units import NS_PER_S
+
+SO_ATTACH_FILTER = 26  # asm-generic/socket.h
+SKF_NET_OFF = 0xFFF00000
+SOURCE_AT = {4: 12, 6: 8}  # in the IP header
+WORD_BYTES = 4
+LOAD_WORD, AND, JUMP_IF_EQUAL, RETURN = 0x20, 0x54, 0x15, 0x06
+WHOLE, NOTHING = 0xFFFF, 0
+INSTRUCTION = struct.Struct("=HBBI")
+MAX_INSTRUCTIONS = 4096
+SO_TIMESTAMPNS = 35  # Linux's number (asm-generic/socket.h); the stamp is a timespec of CLOCK_REALTIME
+TIMESPEC = struct.Struct("@ll")
+ANCILLARY_BYTES = socket.CMSG_SPACE(TIMESPEC.size)
+CLOCK_TRIES = 3
+NEAR_NS = 20_000
+MAX_DATAGRAM_BYTES = MAX_JSON_BYTES + 1  # the rest of a longer one is cut off, and `packet.decode` refuses what is left
+WANTED_BUFFER_BYTES = 1 << 20  # the kernel gives what it allows; a small datagram takes some 800 bytes of it
+SO_MEMINFO = 55  # Linux's number, which Python does not name (asm-generic/socket.h)
+MEMINFO = struct.Struct("=9I")  # linux/sock_diag.h; the last is SK_MEMINFO_DROPS
+
+SocketAddress = tuple[Any, ...]
+MAX_TAKEN = 1000  # in one go
+MAX_STRANGERS = 1000  # datagrams a second of senders that are not allowed, before the kernel is asked
+LOOK_S = 1.0
+MAX_CREDIT_BYTES = 4096
+MAX_PEERS = 64  # whose credit is kept
+
+
+def program(networks: Sequence[Network], version: int) -> bytes:
+    """The program that keeps what comes from these networks, all of that IP version, and drops the rest."""
+    code = b"".join(_keep(network, SOURCE_AT[version]) for network in networks if network.version == version)
+    return code + INSTRUCTION.pack(RETURN, 0, 0, NOTHING)
+
+
+def _keep(network: Network, source_at: int) -> bytes:
+    """Return the whole datagram where the source address lies in the network; go on after this otherwise."""
+    address, mask = network.network_address.packed, network.netmask.packed
+    words = range(0, len(address), WORD_BYTES)
+    left = 3 * len(words) + 1
+    code = []
+    for at in words:
+        wanted, bits = (int.from_bytes(each[at : at + WORD_BYTES], "big") for each in (address, mask))
+        left -= 3
+        code.append(INSTRUCTION.pack(LOAD_WORD, 0, 0, SKF_NET_OFF + source_at + at))
+        code.append(INSTRUCTION.pack(AND, 0, 0, bits))
+        code.append(INSTRUCTION.pack(JUMP_IF_EQUAL, 0, left, wanted))
+    return b"".join([*code, INSTRUCTION.pack(RETURN, 0, 0, WHOLE)])
+
+
+def keep_only(receiving: socket.socket, networks: Sequence[Network]) -> bool:
+    """Have the kernel drop what comes from anywhere else; False where it does not take the filter."""
+    code = program(networks, 6 if receiving.family == socket.AF_INET6 else 4)
+    count = len(code) // INSTRUCTION.size
+    if count > MAX_INSTRUCTIONS:
+        return False
+    kept = ctypes.create_string_buffer(code, len(code))
+    try:
+        receiving.setsockopt(socket.SOL_SOCKET, SO_ATTACH_FILTER, struct.pack("@HP", count, ctypes.addressof(kept)))
+    except OSError:
+        return False
+    return True
+
+
+class KernelStamps:
+    """Has the kernel stamp what `receiving` gets; where it cannot, the time of reading counts.
+
+    `empty_ns` is when nothing waited last, host time: what is read arrived later than that. Of a TCP stream the stamp is that
+    of the last byte read.
+    """
+
+    def __init__(self, receiving: socket.socket) -> None:
+        self.empty_ns = time.monotonic_ns()
+        with contextlib.suppress(OSError):
+            receiving.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+
+    def arrived_ns(self, ancillary: list[tuple[int, int, bytes]], now_ns: int, offset_ns: int | None = None) -> int:
+        """When something came, from what `recvmsg` told at `now_ns`.
+
+        A realtime clock that was set meanwhile moves it by no more than it waited.
+        `offset_ns` is `monotonic_minus_realtime_ns()`, where it was asked for already.
+        """
+        for _, kind, stamp in ancillary:
+            if kind == SO_TIMESTAMPNS and len(stamp) == TIMESPEC.size:
+                seconds, ns = TIMESPEC.unpack(stamp)
+                offset_ns = monotonic_minus_realtime_ns() if offset_ns is None else offset_ns
+                stamped_ns: int = seconds * NS_PER_S + ns + offset_ns
+                return min(max(stamped_ns, self.empty_ns), now_ns)
+        return now_ns
+
+
+def monotonic_minus_realtime_ns() -> int:
+    """The offset between the two clocks of this machine, both read within a few microseconds where that succeeds."""
+    best_ns, offset_ns = None, 0
+    for _ in range(CLOCK_TRIES):
+        before_ns, realtime_ns, after_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
+        took_ns = after_ns - before_ns
+        if best_ns is None or took_ns < best_ns:
+            best_ns, offset_ns = took_ns, (before_ns + after_ns) // 2 - realtime_ns
+        if took_ns < NEAR_NS:
+            break
+    return offset_ns
+
+
+@dataclass(frozen=True, slots=True)
+class Datagram:
+    """When it arrived (host time), its bytes, and who sent it."""
+
+    host_ns: int
+    data: bytes
+    sender: SocketAddress
+
+
+class Datagrams:
+    """A socket, bound to a place of this machine or connected to a peer, that never waits but in `wait`."""
+
+    def __init__(self, made: socket.socket) -> None:
+        self._socket = made
+        self._poll = select.poll()
+        self._poll.register(made, select.POLLIN)
+        made.setblocking(False)
+        made.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, WANTED_BUFFER_BYTES)
+        self._stamps = KernelStamps(made)
+
+    @classmethod
+    def bound(cls, place: Place) -> Datagrams:
+        """Bound to a place. Raises InputError where it cannot be."""
+        made = socket.socket(socket.AF_INET6 if place.host.version == 6 else socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            if place.host.version == 6:
+                made.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
+            made.bind(_first_address(str(place.host), place.port))
+        except OSError as error:
+            made.close()
+            raise InputError(f"{place}: {_trouble(error)}") from error
+        return cls(made)
+
+    @classmethod
+    def connected(cls, host: str, port: int) -> Datagrams:
+        """Connected to a peer: only its datagrams arrive. Raises OSError where the host is unknown."""
+        found = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
+        made = socket.socket(found[0][0], socket.SOCK_DGRAM)
+        try:
+            made.connect(found[0][4])
+        except OSError:
+            made.close()
+            raise
+        return cls(made)
+
+    @property
+    def port(self) -> int:
+        """The port of this end."""
+        return int(self._socket.getsockname()[1])
+
+    def wait(self, timeout_ms: float) -> bool:
+        """True once a datagram waits."""
+        asked_ns = time.monotonic_ns()
+        if self._poll.poll(timeout_ms):
+            return True
+        self._stamps.empty_ns = asked_ns
+        return False
+
+    def take(self, count: int) -> list[Datagram]:
+        """The datagrams that wait, oldest first, `count` at most."""
+        offset_ns = monotonic_minus_realtime_ns()
+        taken: list[Datagram] = []
+        for _ in range(count):
+            asked_ns = time.monotonic_ns()
+            try:
+                data, ancillary, _, sender = self._socket.recvmsg(MAX_DATAGRAM_BYTES, ANCILLARY_BYTES)
+            except BlockingIOError:
+                self._stamps.empty_ns = asked_ns
+                break
+            except OSError:  # a connected socket hears that nobody listens at its peer's port
+                continue
+            taken.append(Datagram(self._stamps.arrived_ns(ancillary, asked_ns, offset_ns), data, sender))
+        return taken
+
+    def put(self, data: bytes, to: SocketAddress | None = None) -> bool:
+        """Send without waiting; False where it did not leave."""
+        for _ in range(2):  # a connected socket's send may report what became of an earlier datagram, and sends nothing
+            try:
+                sent = self._socket.send(data) if to is None else self._socket.sendto(data, to)
+            except ConnectionRefusedError:
+                continue
+            except OSError:
+                return False
+            return sent == len(data)
+        return False
+
+    def keep_only(self, networks: Sequence[Network]) -> bool:
+        """Have the kernel drop what comes from anywhere else; False where it cannot."""
+        return keep_only(self._socket, networks)
+
+    def dropped(self) -> int:
+        """How many datagrams the kernel dropped so far: by that filter, or for want of room."""
+        with contextlib.suppress(OSError, struct.error):
+            told = self._socket.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, MEMINFO.size)
+            return int(MEMINFO.unpack(told)[-1])
+        return 0
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+
+
+def _first_address(host: str, port: int) -> SocketAddress:
+    return socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM, flags=socket.AI_NUMERICHOST)[0][4]
+
+
+def _trouble(error: OSError) -> str:
+    if error.errno == errno.EADDRINUSE:
+        return "the port is in use; stop the program that has it, or choose another port"
+    if error.errno == errno.EADDRNOTAVAIL:
+        return "not an address of this machine; write one that `ip addr` lists, or 0.0.0.0 for all"
+    if error.errno == errno.EACCES:
+        return "not permitted; write a port from 1024 to 65535"
+    return f"cannot bind ({error.strerror}); write an address of this machine"
+
+
+class Credit:
+    """How many bytes may go back to each address: what came from it, less what went."""
+
+    def __init__(self) -> None:
+        self._bytes: OrderedDict[SocketAddress, int] = OrderedDict()
+
+    def earn(self, peer: SocketAddress, count: int) -> None:
+        """So many bytes came from there."""
+        self._bytes[peer] = min(self._bytes.pop(peer, 0) + count, MAX_CREDIT_BYTES)
+        if len(self._bytes) > MAX_PEERS:
+            self._bytes.popitem(last=False)
+
+    def spend(self, peer: SocketAddress, count: int) -> bool:
+        """Whether so many bytes may go there; they are taken off."""
+        left = self._bytes.get(peer, 0) - count
+        if left < 0:
+            return False
+        self._bytes[peer] = left
+        return True
+
+
+class UdpLink:
+    """A bound socket. Raises InputError where it cannot be bound.
+
+    Each arrival says how to answer its sender (`Arrival.back`); the link itself has nobody to send to.
+    """
+
+    two_way = True
+    verb = "bound to"
+    conventions = PACKETS
+    reconnects = 0
+
+    def __init__(self, place: Place, allowed: AllowedSenders, notices: Notices | None = None) -> None:
+        self.link_counts = LinkCounts()
+        self._notices = Notices() if notices is None else notices
+        self._allowed = allowed
+        self._gate = FloodGate(self.link_counts, self._notices)
+        self._credit = Credit()
+        self._strangers = self._dropped = 0
+        self._filtered = False
+        self._looked_s = 0.0
+        self._datagrams = Datagrams.bound(place)
+        self.endpoint = str(Place(place.host, self._datagrams.port))
+
+    def receive(self, timeout_ms: int) -> list[Arrival[Event]]:
+        """The waiting datagrams of allowed senders, oldest first, and only the newest of a flood."""
+        if not self._datagrams.wait(timeout_ms):
+            return []
+        taken = self._datagrams.take(MAX_TAKEN)
+        waiting = [datagram for datagram in taken if self._admits(datagram)]
+        self._look(len(taken) - len(waiting))
+        admitted = self._gate.newest(waiting, lambda datagram: declares_discontinuity(datagram.data))
+        if len(taken) == MAX_TAKEN:
+            time.sleep(PAUSE_S)
+        return [self._arrival(datagram) for datagram in admitted]
+
+    def _admits(self, datagram: Datagram) -> bool:
+        host = datagram.sender[0]
+        if self._allowed.admits(host):
+            return True
+        self.link_counts.rejected += 1
+        said = f"datagrams from {host} are dropped: it is not in [attitude] allow; further ones are only counted"
+        self._notices.begin("sender-not-allowed", said)
+        return False
+
+    def _look(self, strangers: int) -> None:
+        """Count what the kernel dropped, and have it drop the strangers where they are many."""
+        self._strangers += strangers
+        now_s = time.monotonic()
+        if self._strangers > MAX_STRANGERS and not self._filtered:
+            self._filtered = True
+            if self._datagrams.keep_only(self._allowed.networks):
+                said = f"over {MAX_STRANGERS} datagrams a second from senders that are not allowed: the kernel drops them now"
+                self._notices.tell("flood", said)
+        if now_s - self._looked_s > LOOK_S:
+            self._looked_s, self._strangers = now_s, 0
+            dropped = self._datagrams.dropped()
+            self.link_counts.flooded += dropped - self._dropped
+            self._dropped = dropped
+
+    def _arrival(self, datagram: Datagram) -> Arrival[Event]:
+        self._credit.earn(datagram.sender, len(datagram.data))
+        back = partial(self._answer, datagram.sender)
+        return Arrival(datagram.host_ns, decode(datagram.data), datagram.data, back=back, stamped=True)
+
+    def _answer(self, peer: SocketAddress, packet: Packet) -> None:
+        data = encode(packet)
+        if isinstance(packet, Status) or self._credit.spend(peer, len(data)):
+            self._datagrams.put(data, peer)
+
+    def wait_for_message(self, timeout_ms: int) -> bool:
+        """True once a datagram waits."""
+        return self._datagrams.wait(timeout_ms)
+
+    def send(self, packet: Packet) -> None:
+        """To nobody: until an attitude has come, no sender is known."""
+
+    def wire_ns(self, packet: Packet) -> int:
+        """Negligible."""
+        return 0
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._datagrams.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()

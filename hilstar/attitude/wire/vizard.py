@@ -1,0 +1,405 @@
+"""Basilisk's Vizard stream as a source of attitudes: live (Basilisk waits for each frame) or broadcast (it waits for nobody).
+
+Basilisk's sigma_BN = e tan(Phi/4) stands for the matrix [BN], which turns components of its inertial frame N into those of
+the body B (Schaub and Junkins, Analytical Mechanics of Space Systems, section 3.5). N is taken as ICRS.
+
+Live: Basilisk's REQ socket connects, and hilstar's REP socket takes Vizard's place. Basilisk asks and waits: PING until
+somebody answers, then for each step SIM_UPDATE (four parts: the word, two empty ones, a VizMessage), REQUEST_INPUT where it
+shows a display, and REQUEST_IMAGE_<id> for each camera whose time has come. Every request has exactly one answer, and Basilisk
+stops where a SIM_UPDATE is not answered with OK.
+
+Broadcast: Basilisk's PUB socket binds, and hilstar's SUB socket connects.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+import zmq
+
+from hilstar.arrays import FloatArray
+from hilstar.attitude.wire.endpoint import parse_endpoint
+from hilstar.attitude.wire.keys import NO_KEYS
+from hilstar.attitude.wire.links import Arrival
+from hilstar.attitude.wire.packet import (
+    MAX_PLACE_KM,
+    MAX_SPEED_KM_S,
+    MIN_PLACE_KM,
+    U32,
+    AttitudeSample,
+    Event,
+    Refusal,
+    checked_sample,
+)
+from hilstar.attitude.wire.source import Conventions, Mounting
+from hilstar.attitude.wire.vizard_message import (
+    CelestialBody,
+    Components,
+    SimUpdate,
+    Spacecraft,
+    VizCamera,
+    WireFormatError,
+    decode_update,
+)
+from hilstar.attitude.wire.zmq_links import Taken, ZmqReceiver
+from hilstar.attitude.wire.zmq_socket import ZmqSocket
+from hilstar.errors import InputError, printable, shortened
+from hilstar.notices import Notices
+from hilstar.rotation import angle_between_rad, conjugate, multiply, rate_between_rad_s
+from hilstar.units import ARCSEC_PER_RAD, NS_PER_S
+
+SIM_UPDATE = b"SIM_UPDATE"
+MAX_UPDATE_BYTES = 1 << 22  # settings, models and maps of a large scenario go along with its spacecraft
+MAX_NAMES = 8  # of spacecraft, in a refusal
+# Basilisk turns its camera (+z boresight, x right, y down, as `cam`) into Unity's before it sends it: sigma_CuC.
+SIGMA_CAM_TO_UNITY = (1 / 3, 1 / 3, -1 / 3)
+MAX_TURN_ARCSEC = 1.0
+MAX_FIELD_SHARE = 0.01  # of the field of view: Basilisk's camera has no distortion
+M_PER_KM = 1000.0
+EARTHS = ("earth", "earth_planet_data")  # as gravBodyFactory and its SPICE messages name it
+REQUEST_IMAGE, MAX_DIGITS = b"REQUEST_IMAGE_", 20
+# What is the same at every request: a pulse, and what a person has typed into Vizard (an empty VizInput: nothing).
+PLAIN_ANSWERS = {b"PING": [b"PONG"], b"REQUEST_INPUT": [b"VIZARD_INPUT", b""]}
+OK, ERROR = b"OK", b"ERROR"
+HELD = 2
+MAX_HELD_NS = NS_PER_S // 4
+
+
+def update_of(parts: list[bytes]) -> bytes | None:
+    """The VizMessage of a SIM_UPDATE: its last part, with nothing but empty ones between; None where it is not that."""
+    whole = len(parts) > 1 and parts[0] == SIM_UPDATE and not any(parts[1:-1])
+    return parts[-1] if whole else None
+
+
+def check_loopback(endpoint: str) -> None:
+    """Refuse (InputError) an endpoint that other machines reach: Basilisk has no keys."""
+    place = parse_endpoint(endpoint)
+    if place.loopback:
+        return
+    port = place.address.rpartition(":")[2]
+    forward = f"ssh -L {port}:127.0.0.1:{port} HOST"
+    raise InputError(
+        f"{endpoint}: not an address of this machine alone, and Basilisk knows no keys; forward its port ({forward}) and"
+        f" write tcp://127.0.0.1:{port}"
+    )
+
+
+def quaternion_of_mrp(sigma: tuple[float, ...]) -> tuple[float, float, float, float]:
+    """The quaternion (w, x, y, z) that turns N's components into the body's; an MRP and its shadow give q and -q."""
+    x, y, z = sigma
+    square = x * x + y * y + z * z
+    share = -2.0 / (1.0 + square)  # 0 where the square overflows: then the shadow is 0
+    w = (1.0 - square) / (1.0 + square) if math.isfinite(square) else -1.0
+    return w, share * x, share * y, share * z
+
+
+def mrp_of_quaternion(q: FloatArray) -> FloatArray:
+    """The MRP (3,) of at most length 1 of a quaternion that turns N's components into the body's."""
+    return np.asarray(-q[1:] / (1.0 + q[0]) if q[0] >= 0 else q[1:] / (1.0 - q[0]))
+
+
+def _written(q: FloatArray) -> str:
+    return f"sigma_BN = ({', '.join(f'{c:.7f}' for c in mrp_of_quaternion(q))})"
+
+
+TURNS = "sigma_BN turns components of Basilisk's inertial frame N, taken as ICRS (J2000), into body components"
+VELOCITY = "the spacecraft's velocity, added to [sky] observer_velocity_km_s, aberrates the stars"
+PLACE = "its place and velocity about the Earth (at N's origin, where the message has none) are those of the observer"
+StateUse = Literal["attitude", "velocity", "state"]  # what is used of a message, besides the attitude
+TOLD: dict[StateUse, tuple[str, ...]] = {"attitude": (), "velocity": (VELOCITY,), "state": (PLACE,)}
+
+CONVENTIONS = Conventions(
+    "Basilisk's Vizard stream",
+    TURNS,
+    "modified Rodrigues parameters; the shadow set is the same attitude",
+    "nanoseconds since the simulation began; it has no date",
+    of_body=True,
+    written=_written,
+)
+
+
+class DifferenceRates:
+    """The rate and the acceleration at each sample from the attitudes of the last three.
+
+    The mean rates of the last two intervals, carried on linearly to the newest sample: for steps h and a rate whose second
+    derivative is j, the rate is short of the true one by j h^2 / 3 and the acceleration by j h. (The mean of the last interval
+    alone would lag by half a step's change.) None for the first two of a row; a row ends where time goes back or stands, where
+    a step is longer than `max_step_ns`, and where the turn exceeds `max_rate_rad_s`, which is a jump.
+    """
+
+    def __init__(self, max_step_ns: int, max_rate_rad_s: float) -> None:
+        self._max_step_ns, self._max_rate_rad_s = max_step_ns, max_rate_rad_s
+        self._last: AttitudeSample | None = None
+        self._mean: tuple[FloatArray, float] | None = None
+
+    def moving(self, sample: AttitudeSample) -> AttitudeSample:
+        """The sample with its rate (3,), rad/s, and acceleration (3,), rad/s^2, in the components of its own frame."""
+        before, self._last = self._last, sample
+        earlier, self._mean = self._mean, None
+        if before is None or not 0 < sample.t_ns - before.t_ns <= self._max_step_ns:
+            return sample
+        step_s = (sample.t_ns - before.t_ns) / NS_PER_S
+        mean = rate_between_rad_s(before.q_icrs_to_cam, sample.q_icrs_to_cam, step_s)
+        if math.hypot(*mean) > self._max_rate_rad_s:
+            return sample
+        self._mean = mean, step_s
+        if earlier is None:
+            return sample
+        earlier_mean, earlier_s = earlier
+        acceleration = (mean - earlier_mean) / ((step_s + earlier_s) / 2)
+        rate = mean + acceleration * (step_s / 2)
+        if math.hypot(*rate) > self._max_rate_rad_s:
+            return sample
+        return replace(sample, rate_cam_rad_s=rate, acceleration_cam_rad_s2=acceleration)
+
+
+class Follower:
+    """The attitudes of one spacecraft from messages: that of the `name`, or the only one there is.
+
+    Each has the spacecraft's velocity with respect to the origin of Basilisk's frame, of `taken` "velocity"; or its place and
+    velocity about the Earth, of "state".
+    """
+
+    def __init__(self, name: str | None, mounting: Mounting, rates: DifferenceRates, taken: StateUse = "attitude") -> None:
+        self._name, self._mounting, self._rates = name, mounting, rates
+        self._taken = taken
+        self.conventions = replace(CONVENTIONS, turns="; ".join((TURNS, *TOLD[taken])))
+
+    def take(self, message: bytes) -> tuple[AttitudeSample | Refusal, SimUpdate | None]:
+        """The camera's attitude in a VizMessage, or why there is none; and the message itself where it is one."""
+        try:
+            update = decode_update(message)
+        except WireFormatError as error:
+            return Refusal("format", f"not Basilisk's VizMessage: {error}"), None
+        chosen = self._chosen(update.spacecraft)
+        if isinstance(chosen, Refusal):
+            return chosen, update
+        if len(chosen.sigma_bn) != 3:
+            what = f"spacecraft {named(chosen)}: {len(chosen.sigma_bn)} components of its rotation (sigma_BN), not 3"
+            return Refusal("format", what), update
+        sample = checked_sample(update.t_ns, quaternion_of_mrp(chosen.sigma_bn), None, update.frame % U32)
+        state = self._state(update, chosen)
+        if isinstance(state, Refusal):
+            return state, update
+        if isinstance(sample, AttitudeSample):
+            sample = replace(sample, place_km=state[0], velocity_km_s=state[1])
+            sample = self._mounting.sample(self._rates.moving(sample))
+        return sample, update
+
+    def _state(self, update: SimUpdate, craft: Spacecraft) -> tuple[FloatArray | None, FloatArray | None] | Refusal:
+        """Place and velocity, as far as they are taken."""
+        if self._taken == "state":
+            return state_about_earth(update, craft)
+        velocity = velocity_km_s(craft) if self._taken == "velocity" else None
+        return velocity if isinstance(velocity, Refusal) else (None, velocity)
+
+    def _chosen(self, spacecraft: tuple[Spacecraft, ...]) -> Spacecraft | Refusal:
+        """The spacecraft that is followed; parts of others (a parent is named) are taken only by their own name."""
+        if self._name is None:
+            found = [craft for craft in spacecraft if craft.parent in {"", craft.name}]
+        else:
+            found = [craft for craft in spacecraft if craft.name == self._name]
+        if len(found) == 1:
+            return found[0]
+        names = ", ".join(map(named, (found if self._name is None else spacecraft)[:MAX_NAMES])) or "none"
+        if self._name is None:
+            return Refusal("format", f'spacecraft: {names}; write the one that is meant, [attitude] spacecraft = "NAME"')
+        wanted = shortened(printable(self._name))
+        return Refusal("format", f"[attitude] spacecraft = {wanted}: {len(found)} have that name; there: {names}")
+
+
+@dataclass(frozen=True, slots=True)
+class TrackerCamera:
+    """The bench's tracker: its mounting, its size, and its field of view along y, degrees."""
+
+    q_body_to_cam: FloatArray
+    resolution_px: tuple[int, int]
+    field_of_view_deg: float
+
+
+def q_body_to_cam(camera: VizCamera) -> FloatArray | None:
+    """How Basilisk has mounted a camera: its sigma_CB as a quaternion from body to camera; None where it is not said."""
+    if len(camera.sigma) != 3 or not all(map(math.isfinite, camera.sigma)):
+        return None
+    cam_to_unity, body_to_unity = (np.array(quaternion_of_mrp(s)) for s in (SIGMA_CAM_TO_UNITY, camera.sigma))
+    return multiply(conjugate(cam_to_unity), body_to_unity)
+
+
+def disagreement(camera: VizCamera, tracker: TrackerCamera) -> str | None:
+    """A line about where Basilisk's camera is not the bench's tracker; None where they are the same."""
+    differences = []
+    mounted = q_body_to_cam(camera)
+    if mounted is not None:
+        turn_arcsec = angle_between_rad(mounted, tracker.q_body_to_cam) * ARCSEC_PER_RAD
+        if turn_arcsec > MAX_TURN_ARCSEC:
+            q = ", ".join(f"{c:.7f}" for c in mounted)
+            differences.append(f"its sigma_CB is q_body_to_cam = ({q}), {turn_arcsec / 3600:.4g} deg from the bench's")
+    if camera.resolution_px and camera.resolution_px != tracker.resolution_px:
+        differences.append("it has {} x {} px, not {} x {}".format(*(*camera.resolution_px, 0)[:2], *tracker.resolution_px))
+    field_deg = camera.field_of_view_deg
+    if abs(field_deg - tracker.field_of_view_deg) > MAX_FIELD_SHARE * tracker.field_of_view_deg:
+        differences.append(f"its field along y is {field_deg:.4g} deg, not {tracker.field_of_view_deg:.4g}")
+    if not differences:
+        return None
+    return f"Basilisk's camera {camera.identity} is not the bench's [tracker], whose pictures it gets: {'; '.join(differences)}"
+
+
+def velocity_km_s(craft: Spacecraft) -> FloatArray | Refusal:
+    """The spacecraft's velocity (3,) against N's origin, or why it is not taken."""
+    return _checked_velocity(craft, craft.velocity_m_s)
+
+
+def state_about_earth(update: SimUpdate, craft: Spacecraft) -> tuple[FloatArray, FloatArray] | Refusal:
+    """Place (3,), km, and velocity (3,), km/s, about the Earth's centre, or why they are not taken.
+
+    The Earth is where the message has it; without one it stands at N's origin.
+    """
+    earth = next((body for body in update.bodies if body.name.lower() in EARTHS), CelestialBody())
+    velocity = _checked_velocity(craft, _against(craft.velocity_m_s, earth.velocity_m_s))
+    if isinstance(velocity, Refusal):
+        return velocity
+    place_m = _against(craft.position_m, earth.position_m)
+    if len(place_m) == 3 and MIN_PLACE_KM < math.hypot(*place_m) / M_PER_KM < MAX_PLACE_KM:
+        return np.array(place_m) / M_PER_KM, velocity
+    told = f"{math.hypot(*place_m) / M_PER_KM:.4g} km from the Earth's centre" if place_m else "nowhere"
+    advice = f'[spacecraft] orbit = "source" takes {MIN_PLACE_KM:g} to {MAX_PLACE_KM:g} km'
+    return Refusal("format", f"spacecraft {named(craft)}: it is {told}, and {advice}")
+
+
+def named(craft: Spacecraft) -> str:
+    """A spacecraft's name for a person."""
+    return shortened(printable(craft.name)) or "one without a name"
+
+
+def _against(own: Components, other: Components) -> Components:
+    return tuple(a - b for a, b in zip(own, other, strict=True)) if len(own) == len(other) == 3 else own
+
+
+def _checked_velocity(craft: Spacecraft, found_m_s: Components) -> FloatArray | Refusal:
+    speed_m_s = math.hypot(*found_m_s)
+    if len(found_m_s) == 3 and speed_m_s <= MAX_SPEED_KM_S * M_PER_KM:
+        return np.array(found_m_s) / M_PER_KM
+    told = f"{speed_m_s:.3g} m/s" if found_m_s else "nothing"
+    advice = f"it is {MAX_SPEED_KM_S:g} km/s at most; [attitude] use_velocity = false leaves it out"
+    return Refusal("format", f"spacecraft {named(craft)}: its velocity is {told}, and {advice}")
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """A step of the simulation: the camera's attitude or why there is none, and the whole message where it is one."""
+
+    host_ns: int
+    event: AttitudeSample | Refusal
+    update: SimUpdate | None
+    raw: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class ImageRequest:
+    """Basilisk asks for the picture of a camera, by its number."""
+
+    camera: int
+
+
+class VizardLive(ZmqSocket):
+    """A REP socket in Vizard's place; it binds, or connects with `bind=False`."""
+
+    max_part_bytes = MAX_UPDATE_BYTES
+
+    def __init__(self, endpoint: str, follower: Follower, *, bind: bool = True, notices: Notices | None = None) -> None:
+        check_loopback(endpoint)
+        super().__init__(zmq.REP, endpoint, bind=bind, keys=NO_KEYS, notices=notices)
+        self._follower, self.conventions = follower, follower.conventions
+
+    def receive(self, timeout_ms: int) -> Step | ImageRequest | None:
+        """The next request that needs more than a plain answer, or None; it must be answered before the next can arrive."""
+        parts = self._take_parts() if self._waits(timeout_ms) else None
+        if parts is None:
+            return None
+        host_ns, word = time.monotonic_ns(), parts[0]
+        if word == SIM_UPDATE:
+            message = update_of(parts)
+            if message is None:
+                refusal = Refusal("format", f"SIM_UPDATE of {len(parts)} parts; Basilisk sends four")
+                return Step(host_ns, refusal, None, parts[-1])
+            return Step(host_ns, *self._follower.take(message), message)
+        if word.startswith(REQUEST_IMAGE) and (number := word[len(REQUEST_IMAGE) :][:MAX_DIGITS]).isdigit():
+            return ImageRequest(int(number))
+        if word not in PLAIN_ANSWERS:
+            self._notices.tell("unknown-request", f"{shortened(repr(word[:40]))} is none of Basilisk's requests")
+        self._answer(PLAIN_ANSWERS.get(word, [ERROR]))
+        return None
+
+    def answer_step(self, taken: bool) -> None:
+        """Let the simulation go on; or, where its step was refused, end it."""
+        self._answer([OK if taken else ERROR])
+
+    def answer_image(self, image: bytes) -> None:
+        """Hand over a picture; an empty one says that there is none. Its length goes ahead, 4 bytes, big-endian."""
+        self._answer([len(image).to_bytes(4, "big"), image])
+
+    def _answer(self, parts: list[bytes]) -> None:
+        """A simulation that is gone, or does not read, gets no answer."""
+        with contextlib.suppress(zmq.Again):
+            self._ready().send_multipart(parts, zmq.NOBLOCK)
+
+
+class Opening:
+    """Holds the very first two attitudes back until a third says how they turn: shown alone they would stand still.
+
+    For MAX_HELD_NS at most. Where another simulation begins later, `clock.jumps` is in doubt about its first ones anyway.
+    """
+
+    def __init__(self) -> None:
+        self._held: list[Arrival[Event]] = []
+        self._opens = True
+
+    def passed(self, arrivals: list[Arrival[Event]], now_ns: int) -> list[Arrival[Event]]:
+        """What goes on now, of what arrived and what was held."""
+        out: list[Arrival[Event]] = []
+        for arrival in arrivals:
+            sample = arrival.event
+            if not isinstance(sample, AttitudeSample):
+                out.append(arrival)
+                continue
+            if self._opens and sample.rate_cam_rad_s is None and len(self._held) < HELD:
+                self._held.append(arrival)
+            else:
+                out += [*self._released(), arrival]
+        if self._held and now_ns - self._held[0].host_ns > MAX_HELD_NS:
+            out += self._released()
+        return out
+
+    def _released(self) -> list[Arrival[Event]]:
+        released, self._held, self._opens = self._held, [], False
+        return released
+
+
+class VizardBroadcast(ZmqReceiver):
+    """A SUB socket for SIM_UPDATE messages; other topics (SYNC_SETTINGS) do not arrive. It connects, or binds with `bind`."""
+
+    topic = SIM_UPDATE
+    max_part_bytes = MAX_UPDATE_BYTES
+
+    def __init__(self, endpoint: str, follower: Follower, *, bind: bool = False, notices: Notices | None = None) -> None:
+        check_loopback(endpoint)
+        super().__init__(endpoint, bind=bind, notices=notices)
+        self._follower, self.conventions = follower, follower.conventions
+        self._opening = Opening()
+
+    def arrivals(self, taken: Iterable[Taken]) -> list[Arrival[Event]]:
+        """What messages say; the very first ones are held back for a moment."""
+        return self._opening.passed(super().arrivals(taken), time.monotonic_ns())
+
+    def _arrival(self, host_ns: int, parts: list[bytes]) -> Arrival[Event]:
+        message = update_of(parts)
+        if message is None:
+            refusal = Refusal("format", f"a message of {len(parts)} parts; Basilisk sends SIM_UPDATE and a VizMessage")
+            return Arrival(host_ns, refusal, parts[-1])
+        return Arrival(host_ns, self._follower.take(message)[0], message)

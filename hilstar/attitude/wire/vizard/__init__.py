@@ -1,1 +1,0 @@
-"""Basilisk's Vizard stream: protobuf bytes in, the attitude of one spacecraft out."""

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from hilstar.attitude.wire.source import Mounting
     from hilstar.bench.config import BenchConfig
     from hilstar.calibrate.scale import Reading
-    from hilstar.run.record.ledger import Split
+    from hilstar.run.record.ledger import SplitLimits
 
 SPIN_AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 MAX_SPIN_RAD_S = 1e6
@@ -169,9 +169,9 @@ def parse_speed(text: str) -> float:
     return factor
 
 
-def parse_split(text: str | None) -> Split:
+def parse_split(text: str | None) -> SplitLimits:
     """The split of "1GB" or "1h". Raises InputError."""
-    from hilstar.run.record.ledger import NO_SPLIT, Split
+    from hilstar.run.record.ledger import NO_SPLIT, SplitLimits
 
     if text is None:
         return NO_SPLIT
@@ -179,7 +179,7 @@ def parse_split(text: str | None) -> Split:
     value = float(match[1]) * SPLIT_UNITS[match[2]] if match else 0.0
     if match is None or value < (MIN_SPLIT_BYTES if match[2].endswith("B") else MIN_SPLIT_S):
         raise InputError(f"--ledger-split {text}: {SPLIT_FORM}")
-    return Split(bytes=value) if match[2].endswith("B") else Split(seconds=value)
+    return SplitLimits(bytes=value) if match[2].endswith("B") else SplitLimits(seconds=value)
 
 
 def parse_memory(text: str) -> int:

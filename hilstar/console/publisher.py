@@ -50,8 +50,7 @@ if TYPE_CHECKING:
     from hilstar.bench.faults.desk import FaultDesk
     from hilstar.calibrate.first_light.image_sources import Pattern
     from hilstar.notices import Notices
-    from hilstar.run.record.ledger import Ledger
-    from hilstar.run.record.ledger_switch import LedgerSwitch
+    from hilstar.run.record.ledger import Ledger, LedgerSwitch
     from hilstar.run.screen.screen import Screen
     from hilstar.run.serve import Running
     from hilstar.run.shown import Shown

@@ -29,8 +29,7 @@ from hilstar.notices import Notices
 from hilstar.run.faults import Recording, read_recording
 from hilstar.run.record.ledger_reader import config_of, wrong_in_frame
 from hilstar.run.record.ledger_records import EventRecord, FrameRecord
-from hilstar.run.record.report import RunReport, figures_of, summarise, table_rows
-from hilstar.run.record.report_figures import COUNTS, METRICS, Figures
+from hilstar.run.record.report import COUNTS, METRICS, RunFigures, RunReport, figures_of, summarise, table_rows
 from hilstar.run.replay import RunPlay, replay
 from hilstar.run.serve import Outlet
 from hilstar.run.shown import Shown
@@ -112,7 +111,7 @@ class _Unreported(Notices):
         """Say nothing."""
 
 
-def run_pictures(run: Figures, ledger: Path) -> dict[str, Any]:
+def run_pictures(run: RunFigures, ledger: Path) -> dict[str, Any]:
     """`pictures` in the order of the run, with a `caution` where the bench has changed, or `no_pictures`, why there are none.
 
     And the whole `sky` about them.
@@ -143,7 +142,7 @@ def _bench_file(head: dict[str, str], ledger: Path) -> BenchFile:
     return next((file for file in files if file.sha256 == head.get("bench_sha256")), files[0])
 
 
-def _pictures(bench: Bench, overlay: Overlay, run: Figures, ledger: Path) -> list[dict[str, Any]]:
+def _pictures(bench: Bench, overlay: Overlay, run: RunFigures, ledger: Path) -> list[dict[str, Any]]:
     """The frames that are worth one, replayed with the faults that they had."""
     recording = read_recording(ledger)
     frames = run.keyframes.chosen(run.last)
@@ -216,13 +215,13 @@ DISTRIBUTIONS = {
 }
 
 
-def run_data(name: str, run: Figures, summary: RunReport) -> dict[str, Any]:
+def run_data(name: str, run: RunFigures, summary: RunReport) -> dict[str, Any]:
     """The figures of a run as the page reads them: lists of numbers, None for no value; times in s from the first swap."""
     with np.errstate(all="ignore"):  # absurd figures of a foreign file become no value
         return _run_data(name, run, summary)
 
 
-def _run_data(name: str, run: Figures, summary: RunReport) -> dict[str, Any]:
+def _run_data(name: str, run: RunFigures, summary: RunReport) -> dict[str, Any]:
     config = config_of(run.head)
     rows = table_rows(summary)
     return {
@@ -245,7 +244,7 @@ def _run_data(name: str, run: Figures, summary: RunReport) -> dict[str, Any]:
     }
 
 
-def _about(name: str, run: Figures, config: BenchConfig | None) -> dict[str, Any]:
+def _about(name: str, run: RunFigures, config: BenchConfig | None) -> dict[str, Any]:
     monitor = None if config is None else config.monitor
     return {
         "run": name,
@@ -281,7 +280,7 @@ def _share(part: int, whole: int) -> str:
     return f"{math.floor(percent * 10**digits) / 10**digits:.{digits}f} %"
 
 
-def _utc(run: Figures, host_ns: int) -> str | None:
+def _utc(run: RunFigures, host_ns: int) -> str | None:
     """A moment of the run's host clock as UTC; None where the ledger's head does not say."""
     try:
         unix_ns = int(run.head["unix_ns"]) + host_ns - int(run.head["monotonic_ns"])
@@ -294,7 +293,7 @@ def _numbers(values: FloatArray, digits: int) -> list[float | None]:
     return [value if math.isfinite(value) else None for value in np.round(values, digits).tolist()]
 
 
-def _spans(run: Figures) -> dict[str, Any]:
+def _spans(run: RunFigures) -> dict[str, Any]:
     told: dict[str, Any] = {"t_s": _numbers(run.spans.begin, S_DIGITS), "frames": run.spans.length}
     for number, name in enumerate((*METRICS, *COUNTS)):
         low, high, total = run.spans.column(number)
@@ -305,14 +304,14 @@ def _spans(run: Figures) -> dict[str, Any]:
     return told
 
 
-def _packets(run: Figures) -> dict[str, Any]:
+def _packets(run: RunFigures) -> dict[str, Any]:
     begin_s, rates_hz = run.packet_times.rates_hz(run.first_swap_ns)
     accepted, refused = (_numbers(rates_hz[:, kind], MS_DIGITS) for kind in range(2))
     width_s = run.packet_times.width_ns / NS_PER_S
     return {"t_s": _numbers(begin_s, S_DIGITS), "width_s": width_s, "accepted_hz": accepted, "refused_hz": refused}
 
 
-def _process(run: Figures) -> dict[str, Any]:
+def _process(run: RunFigures) -> dict[str, Any]:
     host_s, resident_mb, cpu_s = run.process.rows.T
     t_s = host_s - run.first_swap_ns / NS_PER_S
     step_s = np.diff(host_s, prepend=np.nan)
@@ -320,7 +319,7 @@ def _process(run: Figures) -> dict[str, Any]:
     return {"t_s": _numbers(t_s, S_DIGITS), "resident_mb": _numbers(resident_mb, 2), "cpu_percent": _numbers(share, 1)}
 
 
-def _histograms(run: Figures) -> list[dict[str, Any]]:
+def _histograms(run: RunFigures) -> list[dict[str, Any]]:
     found = []
     for name, title in DISTRIBUTIONS.items():
         values = run.samples.rows[:, METRICS.index(name)]
@@ -336,7 +335,7 @@ def _histograms(run: Figures) -> list[dict[str, Any]]:
     return found
 
 
-def _event(record: EventRecord, run: Figures) -> dict[str, Any]:
+def _event(record: EventRecord, run: RunFigures) -> dict[str, Any]:
     t_s = (record.host_ns - run.first_swap_ns) / NS_PER_S
     who = f" ({record.who[:MAX_WHO_CHARACTERS]})" if record.who and record.who not in record.detail else ""
     return {

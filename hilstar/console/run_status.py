@@ -21,7 +21,7 @@ from hilstar.units import NS_PER_MS, NS_PER_S
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from hilstar.run.record.ledger_switch import LedgerSwitch
+    from hilstar.run.record.ledger import LedgerSwitch
     from hilstar.run.serve import Running
     from hilstar.run.shown import Shown
     from hilstar.run.summary import RunTally

@@ -30,10 +30,9 @@ from hilstar.errors import InputError, printable, shortened
 from hilstar.notices import Notices
 from hilstar.reading import NOT_JSON
 from hilstar.run.faulty_frames import FaultyFrames
-from hilstar.run.record.flood_sieve import Allowance
+from hilstar.run.record.ledger import Allowance, LedgerSwitch
 from hilstar.run.record.ledger_reader import fault_records
 from hilstar.run.record.ledger_records import FaultRecord, FrameRecord
-from hilstar.run.record.ledger_switch import LedgerSwitch
 from hilstar.units import NS_PER_S
 
 STREAM = "stream"

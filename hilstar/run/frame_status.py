@@ -7,8 +7,7 @@ from hilstar.attitude.wire import protocol
 from hilstar.attitude.wire.packet import Status
 from hilstar.notices import Notices
 from hilstar.run.loop import FrameLoop
-from hilstar.run.record.ledger import Ledger
-from hilstar.run.record.ledger_switch import LedgerSwitch
+from hilstar.run.record.ledger import Ledger, LedgerSwitch
 from hilstar.run.shown import Shown
 
 

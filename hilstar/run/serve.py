@@ -32,8 +32,8 @@ from hilstar.run.loop import FrameLoop, Limit, policy_of
 from hilstar.run.open_link import AnyLink
 from hilstar.run.operator import HeadlessOverrides, SwitchRequests
 from hilstar.run.pacer import ClockPacer, Moment, Pacer
+from hilstar.run.record.ledger import LedgerSwitch
 from hilstar.run.record.ledger_records import below_step, frame_record
-from hilstar.run.record.ledger_switch import LedgerSwitch
 from hilstar.run.screen.display_pacer import DisplayPacer
 from hilstar.run.screen.screen import Screen
 from hilstar.run.shown import FrameSink, Shown, ignore

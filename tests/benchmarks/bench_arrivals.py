@@ -34,7 +34,7 @@ from hilstar.bench.build import load
 from hilstar.process.priority import PromptWhileLight
 from hilstar.run.loop import Limit
 from hilstar.run.open_link import open_link
-from hilstar.run.record.ledger_switch import LedgerSwitch
+from hilstar.run.record.ledger import LedgerSwitch
 from hilstar.run.serve import Outlet, serve
 from tests.support.benches import ROOT
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from hilstar.bench.faults.scenario import Scenario
     from hilstar.bench.fields_of_view import FieldsOfView
     from hilstar.run.faults import AnyFaults, Recording
-    from hilstar.run.record.ledger_switch import LedgerSwitch
+    from hilstar.run.record.ledger import LedgerSwitch
     from hilstar.run.summary import RunSummary
     from hilstar.run.sync.advice import BeatSummary
     from hilstar.run.sync.frame_pulse import FramePulse
@@ -136,8 +136,7 @@ def dated_ledger(path: Path | None) -> Path | None:
 @contextmanager
 def optional_ledger(path: Path | None, bench: Any, notices: Notices, overwrite: bool, split: Any) -> Iterator[LedgerSwitch]:
     """The run's ledger, which keeps the run's events too; none at the start where none was asked for."""
-    from hilstar.run.record.ledger import Ledger
-    from hilstar.run.record.ledger_switch import LedgerSwitch
+    from hilstar.run.record.ledger import Ledger, LedgerSwitch
 
     ledger = LedgerSwitch(None if path is None else Ledger(path, bench, notices, overwrite, split))
     notices.listen(ledger.notice)

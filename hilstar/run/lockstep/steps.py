@@ -14,8 +14,8 @@ from hilstar.attitude.receiver import PacketCounts
 from hilstar.attitude.wire.packet import AttitudeSample, Event, Refusal, rate_refusal
 from hilstar.bench.frame import Bench
 from hilstar.run.loop import FrameLoop, Limit
+from hilstar.run.record.ledger import LedgerSwitch
 from hilstar.run.record.ledger_records import below_step, frame_record
-from hilstar.run.record.ledger_switch import LedgerSwitch
 from hilstar.run.shown import Shown
 from hilstar.run.summary import RunSummary
 from hilstar.running_statistics import RunningStatistics

@@ -12,14 +12,16 @@ import contextlib
 import itertools
 import math
 import os
+import resource
 import threading
 import time
 import uuid
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Literal, Self
 
 import msgspec
 
@@ -38,9 +40,7 @@ from hilstar.bench.frame import Bench
 from hilstar.errors import InputError, cannot_write, printable
 from hilstar.files import NewFile
 from hilstar.notices import Notice, Notices
-from hilstar.process.interrupts import caught
-from hilstar.run.record.backlog import Backlog, Entry, Kind, ReceivedPacket
-from hilstar.run.record.flood_sieve import Sieve
+from hilstar.process.interrupts import caught, stop_on_signal
 from hilstar.run.record.ledger_records import (
     COUNT_TOPIC,
     EVENT_TOPIC,
@@ -54,7 +54,150 @@ from hilstar.run.record.ledger_records import (
     ProcessRecord,
     schema_of,
 )
-from hilstar.run.record.process_probe import ProcessProbe
+from hilstar.units import NS_PER_S
+
+Kind = Literal["packet", "frame", "event", "fault"]
+MAX_WAITING_BYTES = 32_000_000  # half a minute of a plain run, if the disk stalls
+FRAMES_SHARE = 0.5  # of it; the rest is for packets
+# A message of JSON and the objects that it is made of, roughly; the raw bytes of a packet come on top.
+ENTRY_BYTES = {"packet": 1500, "frame": 2500, "event": 1000, "fault": 4000}
+
+
+@dataclass(frozen=True, slots=True)
+class ReceivedPacket:
+    """A packet's bytes, with the attitude in them or the reason for their refusal."""
+
+    raw: bytes
+    sample: AttitudeSample | None
+    refusal: Refusal | None
+
+
+@dataclass(frozen=True, slots=True)
+class QueueEntry:
+    """Something to be recorded: its host time, a sequence number, and its content."""
+
+    kind: Kind
+    time_ns: int
+    sequence: int
+    content: ReceivedPacket | FrameRecord | EventRecord | FaultRecord
+
+    @property
+    def size_bytes(self) -> int:
+        """Approximate memory."""
+        raw_bytes = len(self.content.raw) if isinstance(self.content, ReceivedPacket) else 0
+        return ENTRY_BYTES[self.kind] + raw_bytes
+
+
+class LedgerQueue:
+    """Entries in order of arrival; never blocks, and drops frames first when there is no room."""
+
+    def __init__(self) -> None:
+        self.dropped: Counter[str] = Counter()
+        self._entries: list[QueueEntry] = []
+        self._bytes = 0
+        self._lock = threading.Lock()
+
+    def put(self, entry: QueueEntry) -> bool:
+        """Queue an entry; False, and counted, if there is no room."""
+        room = MAX_WAITING_BYTES * (FRAMES_SHARE if entry.kind == "frame" else 1)
+        with self._lock:
+            if self._bytes + entry.size_bytes > room:
+                self.dropped[entry.kind] += 1
+                return False
+            self._entries.append(entry)
+            self._bytes += entry.size_bytes
+            return True
+
+    def take(self) -> list[QueueEntry]:
+        """Take all entries."""
+        with self._lock:
+            taken, self._entries, self._bytes = self._entries, [], 0
+        return taken
+
+
+Counted = Kind | Literal["pulse"]  # pulses are only counted
+
+
+class Allowance:
+    """How many of a kind are recorded in full: at most `burst` at once, and `per_s` each second after that."""
+
+    def __init__(self, burst: float, per_s: float) -> None:
+        self._burst, self._per_s = burst, per_s
+        self._left = burst
+        self._last_ns = 0
+
+    def take(self, now_ns: int) -> bool:
+        """Whether one more is recorded in full."""
+        passed_s = max(0, now_ns - self._last_ns) / NS_PER_S if self._last_ns else 0.0
+        self._last_ns = now_ns
+        self._left = min(self._burst, self._left + passed_s * self._per_s)
+        if self._left < 1:
+            return False
+        self._left -= 1
+        return True
+
+
+class FloodFilter:
+    """Passes the first of each kind and reason, and counts the others."""
+
+    # Refused packets tell little after the first ones; no sender means to send more than 2000 good ones a second.
+    ALLOWED = {"accepted": (4000, 2000), "refused": (20, 1), "event": (100, 10)}  # noqa: RUF012 - never changed
+
+    def __init__(self) -> None:
+        self._allowances: dict[tuple[Kind, str], Allowance] = {}
+        self._counts: Counter[tuple[Counted, str]] = Counter()
+        self._lock = threading.Lock()
+
+    def keeps(self, kind: Kind, reason: str, now_ns: int) -> bool:
+        """Whether a message that arrives now is recorded in full; it is counted if not."""
+        with self._lock:
+            allowance = self._allowances.get((kind, reason))
+            if allowance is None:
+                rule = "event" if kind == "event" else "accepted" if reason == "accepted" else "refused"
+                allowance = self._allowances[kind, reason] = Allowance(*self.ALLOWED[rule])
+            kept = allowance.take(now_ns)
+            if not kept:
+                self._counts[kind, reason] += 1
+        return kept
+
+    def count(self, kind: Counted, reason: str, number: int = 1) -> None:
+        """Count messages that are not recorded for another reason."""
+        with self._lock:
+            self._counts[kind, reason] += number
+
+    def counted(self) -> list[tuple[Counted, str, int]]:
+        """The counts since the last call."""
+        with self._lock:
+            counts, self._counts = self._counts, Counter()
+        return [(kind, reason, number) for (kind, reason), number in counts.items()]
+
+
+class ProcessProbe:
+    """Measures this process; opens its file once, because later no descriptor may be free."""
+
+    def __init__(self) -> None:
+        self._fd: int | None = None
+        with contextlib.suppress(OSError):
+            self._fd = os.open("/proc/self/statm", os.O_RDONLY | os.O_CLOEXEC)
+
+    def record(self) -> ProcessRecord | None:
+        """The state now; None if the system does not say."""
+        if self._fd is None:
+            return None
+        try:
+            pages = int(os.pread(self._fd, 128, 0).split()[1])
+        except (OSError, ValueError, IndexError):
+            return None
+        used = resource.getrusage(resource.RUSAGE_SELF)
+        size = os.sysconf("SC_PAGE_SIZE")
+        return ProcessRecord(host_ns=time.monotonic_ns(), resident_bytes=pages * size, cpu_s=used.ru_utime + used.ru_stime)
+
+    def close(self) -> None:
+        """Close its file."""
+        if self._fd is not None:
+            os.close(self._fd)
+            self._fd = None
+
 
 NO_ROOM = "no room"  # the reason given for lost messages
 FLUSH_S = 0.2
@@ -70,14 +213,14 @@ FRAMES_RESERVE_BYTES, FRAMES_RESERVE_SHARE = 64_000_000, 0.02  # reserved for pa
 
 
 @dataclass(frozen=True, slots=True)
-class Split:
+class SplitLimits:
     """When a ledger continues in another file."""
 
     bytes: float = math.inf
     seconds: float = math.inf
 
 
-NO_SPLIT = Split()
+NO_SPLIT = SplitLimits()
 
 
 class Ledger:
@@ -89,14 +232,14 @@ class Ledger:
         bench: Bench,
         notices: Notices | None = None,
         overwrite: bool = False,
-        split: Split = NO_SPLIT,
+        split: SplitLimits = NO_SPLIT,
     ) -> None:
         self.path = self._asked = path
         self.failure: str | None = None
         self._notices = Notices() if notices is None else notices
         self._overwrite, self._split = overwrite, split
         self._head = _head_of(bench) | {"run_id": uuid.uuid4().hex}
-        self._backlog, self._sieve = Backlog(), Sieve()
+        self._queue, self._filter = LedgerQueue(), FloodFilter()
         self._lost = self._counted = 0
         self._thin = False
         self._part = 0
@@ -138,14 +281,14 @@ class Ledger:
         """Record a packet; see `attitude.receiver.Watch`."""
         if refusal is None and sample is None:
             refusal = Refusal("format", "")
-        if not self._sieve.keeps("packet", "accepted" if refusal is None else refusal.reason, host_ns):
+        if not self._filter.keeps("packet", "accepted" if refusal is None else refusal.reason, host_ns):
             return
         sequence = 0 if sample is None else sample.sequence
-        self._backlog.put(Entry("packet", host_ns, sequence, ReceivedPacket(raw[:MAX_RAW_BYTES], sample, refusal)))
+        self._queue.put(QueueEntry("packet", host_ns, sequence, ReceivedPacket(raw[:MAX_RAW_BYTES], sample, refusal)))
 
     def frame(self, record: FrameRecord) -> None:
         """Record a frame."""
-        self._backlog.put(Entry("frame", record.swap_ns, record.frame, record))
+        self._queue.put(QueueEntry("frame", record.swap_ns, record.frame, record))
         if time.monotonic() - self._alive_s > STALLED_S:
             self._notices.begin(
                 "ledger-stalled", f"{self.path}: the disk has accepted nothing for {STALLED_S:g} s; the display goes on"
@@ -153,17 +296,17 @@ class Ledger:
 
     def notice(self, notice: Notice) -> None:
         """Record an event of the run."""
-        if self._sieve.keeps("event", notice.kind, notice.host_ns):
+        if self._filter.keeps("event", notice.kind, notice.host_ns):
             record = EventRecord(host_ns=notice.host_ns, kind=notice.kind, detail=notice.detail, who=notice.who)
-            self._backlog.put(Entry("event", notice.host_ns, 0, record))
+            self._queue.put(QueueEntry("event", notice.host_ns, 0, record))
 
     def fault(self, record: FaultRecord) -> None:
         """Record the beginning or the end of a fault; a replay needs each."""
-        self._backlog.put(Entry("fault", record.host_ns, record.number, record))
+        self._queue.put(QueueEntry("fault", record.host_ns, record.number, record))
 
     def pulse(self, what: str) -> None:
         """Count what became of a pulse: "sent", "skipped" or "lost"."""
-        self._sieve.count("pulse", what)
+        self._filter.count("pulse", what)
 
     # The writer's thread
 
@@ -177,7 +320,7 @@ class Ledger:
     def _turn(self, last: bool) -> None:
         try:
             self._look_at_file(last)
-            for entry in self._backlog.take():
+            for entry in self._queue.take():
                 self._take(entry)
             now_s = time.monotonic()
             if last or now_s - self._each_s >= EACH_S:
@@ -196,7 +339,7 @@ class Ledger:
         self._alive_s = time.monotonic()
         self._notices.end("ledger-stalled", "ledger-back", f"{self.path}: the disk accepts the ledger again")
 
-    def _take(self, entry: Entry) -> None:
+    def _take(self, entry: QueueEntry) -> None:
         if entry.kind == "frame" and self._thin:
             self._lose("frame", 1)
             return
@@ -211,10 +354,10 @@ class Ledger:
 
     def _each_second(self) -> None:
         now_ns = time.monotonic_ns()
-        dropped, self._backlog.dropped = self._backlog.dropped, type(self._backlog.dropped)()
+        dropped, self._queue.dropped = self._queue.dropped, type(self._queue.dropped)()
         for kind, number in dropped.items():
             self._lose(kind, number)
-        for kind, reason, number in self._sieve.counted():
+        for kind, reason, number in self._filter.counted():
             self._counted += 0 if reason == NO_ROOM or kind == "pulse" else number
             record = CountRecord(host_ns=now_ns, kind=kind, reason=reason, count=number)
             self._add("count", now_ns, msgspec.json.encode(record))
@@ -277,7 +420,7 @@ class Ledger:
     def _lose(self, kind: Kind | str, number: int) -> None:
         """Count messages that were lost for lack of room."""
         self._lost += number
-        self._sieve.count("frame" if kind == "frame" else "packet" if kind == "packet" else "event", NO_ROOM, number)
+        self._filter.count("frame" if kind == "frame" else "packet" if kind == "packet" else "event", NO_ROOM, number)
 
     def _look_at_disk(self) -> None:
         disk = os.fstatvfs(self._file.fd)
@@ -344,7 +487,7 @@ class Ledger:
 
     def summary(self) -> dict[str, str | int | None]:
         """Its path, what went wrong, how many messages were lost, and how many of a flood were only counted."""
-        lost = self._lost + sum(self._backlog.dropped.values())
+        lost = self._lost + sum(self._queue.dropped.values())
         told: dict[str, str | int | None] = {"path": str(self.path), "failure": self.failure, "unrecorded": lost}
         if self._counted:
             told["only_counted"] = self._counted
@@ -400,3 +543,94 @@ def _packet_message(host_ns: int, packet: ReceivedPacket) -> bytes:
         reason, detail = ("format", "") if refusal is None else (refusal.reason, refusal.detail[:MAX_DETAIL_CHARACTERS])
         return refused_message(reason, detail, host_ns, packet.raw)
     return attitude_message(sample, host_ns, packet.raw)
+
+
+class LedgerSwitch:
+    """Hands a run's records to the ledger of the moment, and drops them while there is none.
+
+    Frames and packets come from any thread and wait for nothing; `begin` and `end` are for one thread, which may wait for a
+    disk.
+    """
+
+    def __init__(self, ledger: Ledger | None = None) -> None:
+        self.current = ledger
+        self.last = ledger  # the newest there was
+        self._ending = threading.Lock()  # the end of a run waits for one that an operator has begun
+        self._scenario: list[FaultRecord] = []
+        self._faults_on: dict[int, FaultRecord] = {}
+        if ledger is not None:
+            ledger.standing = self._standing
+
+    @property
+    def on(self) -> bool:
+        """Whether there is a ledger now."""
+        return self.current is not None
+
+    @property
+    def failure(self) -> str | None:
+        """Why the newest ledger could not be written, None where it could."""
+        return None if self.last is None else self.last.failure
+
+    def packet(self, host_ns: int, raw: bytes, sample: AttitudeSample | None, refusal: Refusal | None) -> None:
+        """Record a packet; see `attitude.receiver.Watch`."""
+        ledger = self.current
+        if ledger is not None:
+            ledger.packet(host_ns, raw, sample, refusal)
+
+    def frame(self, record: FrameRecord) -> None:
+        """Record a frame."""
+        ledger = self.current
+        if ledger is not None:
+            ledger.frame(record)
+
+    def notice(self, notice: Notice) -> None:
+        """Record an event of the run."""
+        ledger = self.current
+        if ledger is not None:
+            ledger.notice(notice)
+
+    def pulse(self, what: str) -> None:
+        """Count what became of a pulse: "sent", "skipped" or "lost"."""
+        ledger = self.current
+        if ledger is not None:
+            ledger.pulse(what)
+
+    def fault(self, record: FaultRecord) -> None:
+        """Record what becomes of a fault; a ledger that begins later has the scenario too, and what is on then."""
+        if record.event == "scenario":
+            self._scenario.append(record)
+        elif record.event == "start":
+            self._faults_on[record.number] = record
+        else:
+            self._faults_on.pop(record.number, None)
+        ledger = self.current
+        if ledger is not None:
+            ledger.fault(record)
+
+    def begin(self, make: Callable[[], Ledger]) -> Ledger:
+        """Begin a ledger, if there is none; the one there is then. Raises InputError where it cannot be made."""
+        ledger = self.current
+        if ledger is None:
+            ledger = make()
+            ledger.standing = self._standing
+            for record in self._standing():
+                ledger.fault(record)
+            self.last = self.current = ledger
+        return ledger
+
+    def _standing(self) -> list[FaultRecord]:
+        return [*self._scenario, *list(self._faults_on.values())]
+
+    def end(self) -> Ledger | None:
+        """End the ledger, and wait until it is whole on the disk; the one that was ended."""
+        with self._ending, stop_on_signal(threading.Event()):  # a signal that comes now does not interrupt this
+            ledger, self.current = self.current, None
+            if ledger is not None:
+                ledger.close()
+        return ledger
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+        self.end()

@@ -1,20 +1,357 @@
-"""The figures of a run's report: timing, age, missed frames, packets and events, from its ledger."""
+"""The figures of a run's report, from its ledger: added record by record, in memory that does not grow with the run."""
 
 from __future__ import annotations
 
+import math
+from collections import deque
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import msgspec
+import numpy as np
 
+from hilstar.arrays import FloatArray
 from hilstar.errors import InputError
-from hilstar.run.record.ledger_reader import NO_FRAMES, config_of, read_head, run_records
-from hilstar.run.record.report_figures import Figures
-from hilstar.running_statistics import Percentiles
+from hilstar.notices import MAX_DETAIL_CHARACTERS
+from hilstar.run.record.ledger_reader import (
+    MAX_REASON_CHARACTERS,
+    MAX_REASONS,
+    NO_FRAMES,
+    PacketTally,
+    config_of,
+    read_head,
+    run_records,
+)
+from hilstar.run.record.ledger_records import (
+    PULSES,
+    CountRecord,
+    EventRecord,
+    FrameRecord,
+    PacketForm,
+    ProcessRecord,
+    RunRecord,
+)
+from hilstar.running_statistics import Percentiles, RunningStatistics
+from hilstar.units import NS_PER_MS, NS_PER_S
+
+SAMPLES = 1 << 16  # frames of which each figure is kept: all of a run of a quarter of an hour
+SPANS = 8192  # in which a run is drawn along its time
+BLOCK = 1024  # frames that are summed up at once
 
 
-def figures_of(path: Path) -> Figures:
+class ThinnedRows:
+    """Every n-th row of a stream, n doubling as the stream grows."""
+
+    def __init__(self, columns: int, capacity: int = SAMPLES) -> None:
+        self._rows = np.zeros((capacity, columns))
+        self._kept = 0
+        self.stride = 1
+        self._seen = 0
+
+    def add(self, row: tuple[float, ...]) -> None:
+        """Add a row, or skip it."""
+        if self._seen % self.stride == 0:
+            if self._kept == len(self._rows):
+                half = len(self._rows) // 2
+                self._rows[:half] = self._rows[::2]
+                self._kept, self.stride = half, 2 * self.stride
+            if self._seen % self.stride == 0:
+                self._rows[self._kept] = row
+                self._kept += 1
+        self._seen += 1
+
+    @property
+    def rows(self) -> FloatArray:
+        """The rows that are kept, (n, columns)."""
+        return self._rows[: self._kept]
+
+
+class SpanTable:
+    """The minimum, maximum and sum of each column over equal numbers of frames: at most `capacity` spans."""
+
+    def __init__(self, columns: int, capacity: int = SPANS) -> None:
+        shape = (capacity, columns)
+        self._low, self._high, self._sum = np.full(shape, np.inf), np.full(shape, -np.inf), np.zeros(shape)
+        self._begin = np.zeros(capacity)
+        self._waiting: list[tuple[float, ...]] = []
+        self._used = self._in_last = 0
+        self.length = 1
+
+    def add(self, at: float, row: tuple[float, ...]) -> None:
+        """Add a frame; NaN is no value."""
+        self._waiting.append((at, *row))
+        if len(self._waiting) == BLOCK:
+            self._take()
+
+    def _take(self) -> None:
+        """Sum up the frames that wait."""
+        rows, self._waiting = np.array(self._waiting).reshape(-1, 1 + self._low.shape[1]), []
+        while len(rows):
+            if self._used == 0 or self._in_last == self.length:
+                if self._used == len(self._begin):
+                    self._halve()
+                    continue
+                self._begin[self._used] = rows[0, 0]
+                self._used, self._in_last = self._used + 1, 0
+            whole = 0 if self._in_last else min(len(rows) // self.length, len(self._begin) - self._used + 1)
+            count = max(whole, 1) * self.length - self._in_last
+            self._add(rows[:count], max(whole, 1))
+            rows = rows[count:]
+
+    def _add(self, rows: FloatArray, spans: int) -> None:
+        """Frames of the last span, or of so many whole ones from it on."""
+        values = rows[:, 1:].reshape(spans, -1, rows.shape[1] - 1)
+        place = slice(self._used - 1, self._used - 1 + spans)
+        self._begin[self._used : place.stop] = rows[:: max(len(rows) // spans, 1), 0][1:spans]
+        self._low[place] = np.fmin(self._low[place], np.fmin.reduce(values, axis=1))
+        self._high[place] = np.fmax(self._high[place], np.fmax.reduce(values, axis=1))
+        self._sum[place] += np.nansum(values, axis=1)
+        self._used, self._in_last = place.stop, self._in_last + values.shape[1]
+
+    def _halve(self) -> None:
+        half = self._used // 2
+        self._low[:half] = np.minimum(self._low[::2], self._low[1::2])
+        self._high[:half] = np.maximum(self._high[::2], self._high[1::2])
+        self._sum[:half] = self._sum[::2] + self._sum[1::2]
+        self._begin[:half] = self._begin[::2]
+        self._low[half:], self._high[half:], self._sum[half:] = np.inf, -np.inf, 0.0
+        self._used, self._in_last, self.length = half, 2 * self.length, 2 * self.length
+
+    @property
+    def begin(self) -> FloatArray:
+        """When each span begins, (n,)."""
+        self._take()
+        return self._begin[: self._used]
+
+    def column(self, number: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Minimum and maximum, NaN where a span has no value, and the sum of a column, each (n,)."""
+        self._take()
+        low, high, total = (table[: self._used, number] for table in (self._low, self._high, self._sum))
+        some = np.isfinite(low)
+        return np.where(some, low, np.nan), np.where(some, high, np.nan), total
+
+
+class TimeBins:
+    """Counts of some kinds over time, in bins of a width that doubles as the run grows."""
+
+    def __init__(self, kinds: int, capacity: int = SPANS) -> None:
+        self._counts = np.zeros((capacity, kinds), dtype=np.int64)
+        self._first_ns: int | None = None
+        self._used = 0
+        self.width_ns = NS_PER_S
+
+    def add(self, at_ns: int, kind: int, number: int = 1) -> None:
+        """Count what came at a host time; before the first it counts with the first."""
+        if self._first_ns is None:
+            self._first_ns = at_ns
+        while (place := max(at_ns - self._first_ns, 0) // self.width_ns) >= len(self._counts):
+            half = len(self._counts) // 2
+            self._counts[:half] = self._counts[::2] + self._counts[1::2]
+            self._counts[half:] = 0
+            self._used, self.width_ns = (self._used + 1) // 2, 2 * self.width_ns
+        self._counts[place, kind] += number
+        self._used = max(self._used, place + 1)
+
+    def rates_hz(self, zero_ns: int) -> tuple[FloatArray, FloatArray]:
+        """When each bin begins, s after a host time, (n,), and how many of each kind came in it, per second, (n, kinds)."""
+        if self._first_ns is None:
+            return np.zeros(0), np.zeros((0, self._counts.shape[1]))
+        begin_s = (self._first_ns - zero_ns) / NS_PER_S + np.arange(self._used, dtype=np.float64) * (self.width_ns / NS_PER_S)
+        return begin_s, self._counts[: self._used].astype(np.float64) * (NS_PER_S / self.width_ns)
+
+
+MEGABYTE = 1e6
+WARM_UP_S = 60.0  # after this the process has allocated all the memory that it needs
+KEYFRAMES = 16
+MAX_EVENTS = 1000  # of which the first and as many of the last are kept
+SMALL_RAD = 1e-8
+
+
+class Keyframes:
+    """Frames of a run that are worth a picture: evenly over it, and the first or worst of each kind."""
+
+    def __init__(self, capacity: int = KEYFRAMES) -> None:
+        self._even: list[FrameRecord] = []
+        self._capacity, self._stride, self._seen = capacity, 1, 0
+        self._best: dict[str, tuple[float, FrameRecord]] = {}
+
+    def add(self, frame: FrameRecord) -> None:
+        """Look at a frame."""
+        if self._seen % self._stride == 0:
+            if len(self._even) == self._capacity:
+                self._even, self._stride = self._even[::2], 2 * self._stride
+            if self._seen % self._stride == 0:
+                self._even.append(frame)
+        self._seen += 1
+        self._keep("first stale", frame, float(frame.stale and frame.q is not None))
+        self._keep("most clipped stars", frame, float(frame.clipped))
+        self._keep("most stars", frame, float(frame.stars_drawn))
+
+    def _keep(self, why: str, frame: FrameRecord, worth: float) -> None:
+        if worth > self._best.get(why, (0.0,))[0]:
+            self._best[why] = (worth, frame)
+
+    def chosen(self, last: FrameRecord | None) -> list[tuple[FrameRecord, str]]:
+        """The frames in order, each with what is special of it, "" for nothing."""
+        found = {id(frame): (frame, "") for frame in self._even}
+        for why, (_, frame) in self._best.items():
+            before = found.get(id(frame), (frame, ""))[1]
+            found[id(frame)] = (frame, ", ".join(part for part in (before, why) if part))
+        if last is not None:
+            found.setdefault(id(last), (last, ""))
+        return sorted(found.values(), key=lambda each: each[0].swap_ns)
+
+
+METRICS = ("interval", "late", "draw", "age", "prediction", "packet")  # ms
+# The columns of the spans: METRICS, then these.
+COUNTS = ("missed", "stars", "clipped", "below_step", "stale", "blank")
+ACCEPTED, REFUSED = range(2)
+
+
+@dataclass(slots=True)
+class RunFigures:
+    """The figures of a run's report."""
+
+    head: dict[str, str]
+    packets: PacketTally = field(default_factory=PacketTally)
+    events: dict[str, int] = field(default_factory=dict)
+    pulses: dict[str, int] = field(default_factory=dict)  # by PULSES; {} where none was due
+    frames: int = 0
+    stale: int = 0
+    blank: int = 0
+    late: int = 0  # stale, with an attitude
+    capped: int = 0
+    operator: int = 0
+    hidden: int = 0
+    right: int = 0  # frames that nothing of these was wrong with
+    most: dict[str, int] = field(default_factory=lambda: dict.fromkeys(("clipped", "below_step", "stars_drawn"), 0))
+    last: FrameRecord | None = None
+    first_swap_ns: int = 0
+    spreads: dict[str, RunningStatistics] = field(default_factory=lambda: {name: RunningStatistics() for name in METRICS})
+    samples: ThinnedRows = field(default_factory=lambda: ThinnedRows(len(METRICS)))
+    spans: SpanTable = field(default_factory=lambda: SpanTable(len(METRICS) + len(COUNTS)))
+    # run_s, t_s, q, turned about x, y, z (rad)
+    path: ThinnedRows = field(default_factory=lambda: ThinnedRows(9, SAMPLES // 8))
+    process: ThinnedRows = field(default_factory=lambda: ThinnedRows(3, SAMPLES // 16))  # host time in s, MB, CPU time in s
+    keyframes: Keyframes = field(default_factory=Keyframes)
+    packet_times: TimeBins = field(default_factory=lambda: TimeBins(2))
+    first_events: list[EventRecord] = field(default_factory=list)
+    last_events: deque[EventRecord] = field(default_factory=lambda: deque(maxlen=MAX_EVENTS))
+    first_process: ProcessRecord | None = None
+    warm: ProcessRecord | None = None
+    last_process: ProcessRecord | None = None
+    _turned: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+    _q: tuple[float, float, float, float] | None = None
+    _first_t_ns: int | None = None
+
+    @property
+    def duration_s(self) -> float:
+        """From the first swap to the last."""
+        return 0.0 if self.last is None else (self.last.swap_ns - self.first_swap_ns) / NS_PER_S
+
+    @property
+    def memory_growth_mb(self) -> float | None:
+        """How much the process's memory has grown since its first minute; None for a shorter run."""
+        if self.warm is None or self.last_process is None or self.warm is self.last_process:
+            return None
+        return (self.last_process.resident_bytes - self.warm.resident_bytes) / MEGABYTE
+
+    def add(self, record: RunRecord) -> None:
+        """Add a record of the ledger."""
+        if isinstance(record, FrameRecord):
+            self._add_frame(record)
+        elif isinstance(record, ProcessRecord):
+            self._add_process(record)
+        elif isinstance(record, EventRecord):
+            kind = record.kind[:MAX_REASON_CHARACTERS]
+            if kind in self.events or len(self.events) < MAX_REASONS:
+                self.events[kind] = self.events.get(kind, 0) + 1
+            record.detail = record.detail[:MAX_DETAIL_CHARACTERS]
+            (self.last_events if len(self.first_events) == MAX_EVENTS else self.first_events).append(record)
+        else:
+            self.packets.add(record)
+            self._add_packets(record)
+
+    def _add_packets(self, record: PacketForm | CountRecord) -> None:
+        if isinstance(record, PacketForm):
+            if record.receive_ns is not None:
+                self.packet_times.add(record.receive_ns, ACCEPTED if record.accepted else REFUSED)
+        elif record.kind == "pulse" and record.reason in PULSES:
+            self.pulses = dict.fromkeys(PULSES, 0) | self.pulses
+            self.pulses[record.reason] += record.count
+        elif record.kind == "packet":
+            self.packet_times.add(record.host_ns, ACCEPTED if record.reason == "accepted" else REFUSED, record.count)
+
+    def _add_frame(self, frame: FrameRecord) -> None:
+        before = self.last
+        if before is None:
+            self.first_swap_ns = frame.swap_ns
+        self.last = frame
+        self.frames += 1
+        self.stale += frame.stale
+        self.blank += frame.q is None
+        self.late += frame.stale and frame.q is not None
+        self.capped += frame.capped > 0
+        self.operator += bool(frame.operator)
+        self.hidden += bool(frame.hidden)
+        self.right += not (frame.stale or frame.q is None or frame.operator or frame.hidden)
+        for name in self.most:
+            self.most[name] = max(self.most[name], getattr(frame, name))
+        values = _times_ms(frame, before)
+        for name, value in zip(METRICS, values, strict=True):
+            if not math.isnan(value):
+                self.spreads[name].add(value)
+        self.samples.add(values)
+        run_s = (frame.swap_ns - self.first_swap_ns) / NS_PER_S
+        counts = (frame.missed_before, frame.stars_drawn, frame.clipped, frame.below_step, frame.stale, frame.q is None)
+        self.spans.add(run_s, (*values, *map(float, counts)))
+        self.keyframes.add(frame)
+        if frame.q is not None:
+            if self._q is not None:
+                self._turned = [a + b for a, b in zip(self._turned, _turn_rad(self._q, frame.q), strict=True)]
+            self._q = frame.q
+            self._first_t_ns = frame.t_ns if self._first_t_ns is None else self._first_t_ns
+            self.path.add((run_s, (frame.t_ns - self._first_t_ns) / NS_PER_S, *frame.q, *self._turned))
+
+    def _add_process(self, process: ProcessRecord) -> None:
+        first = self.first_process = self.first_process or process
+        run_s = (process.host_ns - first.host_ns) / NS_PER_S
+        if self.warm is None and run_s >= WARM_UP_S:
+            self.warm = process
+        self.last_process = process
+        self.process.add((process.host_ns / NS_PER_S, process.resident_bytes / MEGABYTE, process.cpu_s))
+
+
+def _times_ms(frame: FrameRecord, before: FrameRecord | None) -> tuple[float, ...]:
+    """The METRICS of a frame; NaN where there is none. An interval over missed frames is none."""
+
+    def ms(value: int | None) -> float:
+        return math.nan if value is None else value / NS_PER_MS
+
+    return (
+        ms(None if before is None or frame.missed_before else frame.swap_ns - before.swap_ns),
+        ms(None if frame.predicted_swap_ns is None else frame.swap_ns - frame.predicted_swap_ns),
+        ms(frame.swap_ns - frame.draw_ns),
+        ms(frame.age_ns),
+        ms(frame.prediction_ns),
+        ms(None if frame.receive_ns is None else frame.swap_ns - frame.receive_ns),
+    )
+
+
+def _turn_rad(a: tuple[float, ...], b: tuple[float, ...]) -> tuple[float, float, float]:
+    """The turn from one attitude to the next about the camera's axes: as `rotation.rate_between_rad_s`, fast for one."""
+    w = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]
+    x = -b[0] * a[1] + b[1] * a[0] - b[2] * a[3] + b[3] * a[2]
+    y = -b[0] * a[2] + b[1] * a[3] + b[2] * a[0] - b[3] * a[1]
+    z = -b[0] * a[3] - b[1] * a[2] + b[2] * a[1] + b[3] * a[0]
+    sine = math.sqrt(x * x + y * y + z * z)
+    scale = -2.0 * math.copysign(1.0, w) * (math.atan2(sine, abs(w)) / sine if sine > SMALL_RAD else 1.0)
+    return scale * x, scale * y, scale * z
+
+
+def figures_of(path: Path) -> RunFigures:
     """Read a ledger. Raises InputError for a file that is no ledger, has no frame, or is damaged."""
-    figures = Figures(read_head(path))
+    figures = RunFigures(read_head(path))
     for record in run_records(path):
         figures.add(record)
     if not figures.frames:
@@ -59,7 +396,7 @@ class RunReport(msgspec.Struct, frozen=True, kw_only=True):
     render_path: str | None
 
 
-def summarise(run: Figures) -> RunReport:
+def summarise(run: RunFigures) -> RunReport:
     """The figures of a run, from those of its frames."""
     config, last, spreads = config_of(run.head), run.last, run.spreads
     refresh_hz = None if config is None else config.monitor.refresh_hz

@@ -11,8 +11,7 @@ from hilstar.attitude.wire.udp import UdpLink
 from hilstar.bench.build import load
 from hilstar.notices import Notices
 from hilstar.run.loop import Limit
-from hilstar.run.record.ledger import Ledger
-from hilstar.run.record.ledger_switch import LedgerSwitch
+from hilstar.run.record.ledger import Ledger, LedgerSwitch
 from hilstar.run.replay import Wanted, plan_play, replay
 from hilstar.run.send.ends import UdpSender
 from hilstar.run.send.faults import BadCable, Faults

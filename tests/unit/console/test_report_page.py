@@ -11,9 +11,7 @@ import pytest
 
 from hilstar.console.report import PAGE_DIR, one_script, report_page, run_data, verdict
 from hilstar.run.record.ledger_records import CountRecord, EventRecord, FrameRecord, PacketForm
-from hilstar.run.record.report import summarise
-from hilstar.run.record.report_figures import MAX_EVENTS, Figures
-from hilstar.run.record.series import Bins, Spans
+from hilstar.run.record.report import MAX_EVENTS, RunFigures, SpanTable, TimeBins, summarise
 from tests.support.run_page import run_data_of
 
 PERIOD_NS = 16_666_667
@@ -30,8 +28,8 @@ def frame(k: int, **more: object) -> FrameRecord:
 
 
 @pytest.fixture(scope="module")
-def run() -> Figures:
-    figures = Figures({"unix_ns": str(1_800_000_000 * 10**9), "monotonic_ns": str(10**12), "bench_text": "</script>"})
+def run() -> RunFigures:
+    figures = RunFigures({"unix_ns": str(1_800_000_000 * 10**9), "monotonic_ns": str(10**12), "bench_text": "</script>"})
     for k in range(FRAMES):
         figures.add(frame(k, **({"age_ns": 900_000_000, "stale": True, "missed_before": 3} if k == 31_415 else {})))
         figures.add(PacketForm(True, None, 10**12 + k * PERIOD_NS))
@@ -83,7 +81,7 @@ def test_packets_are_counted_at_their_time(run):
 
 
 def test_the_verdict_names_everything_that_was_wrong():
-    figures = Figures({})
+    figures = RunFigures({})
     for k, more in enumerate(
         [{}, {"stale": True}, {"q": None, "stale": True}, {"missed_before": 2, "missed": 2}, {"hidden": "covered", "missed": 2}]
     ):
@@ -99,7 +97,7 @@ def test_the_verdict_names_everything_that_was_wrong():
     assert (
         told["headline"] == "Sky was not right throughout" and told["share"] == "28.5 %"
     )  # 2 of 5 frames and 2 periods without one
-    well = Figures({})
+    well = RunFigures({})
     well.add(frame(0))
     assert verdict(summarise(well), 0)["ok"]
 
@@ -109,7 +107,7 @@ def test_spans_are_the_extremes_and_sums_of_equal_numbers_of_frames():
     for count in (1, 7, 1023, 1024, 5000, 20_001):
         values = rng.normal(size=(count, 2))
         values[rng.random(count) < 0.2, 1] = np.nan
-        spans = Spans(2, capacity=16)
+        spans = SpanTable(2, capacity=16)
         for k, row in enumerate(values):
             spans.add(float(k), tuple(row))
         begin, length = spans.begin, spans.length
@@ -123,7 +121,7 @@ def test_spans_are_the_extremes_and_sums_of_equal_numbers_of_frames():
 
 
 def test_bins_keep_every_count_whatever_the_times():
-    bins = Bins(1, capacity=8)
+    bins = TimeBins(1, capacity=8)
     for at_ns in (5 * 10**9, 0, 6 * 10**9, 2**62, 40 * 10**9):
         bins.add(at_ns, 0)
     begin_s, rates_hz = bins.rates_hz(0)
@@ -132,7 +130,7 @@ def test_bins_keep_every_count_whatever_the_times():
 
 
 def test_of_a_flood_of_events_the_first_and_the_last_are_told():
-    figures = Figures({})
+    figures = RunFigures({})
     figures.add(frame(0))
     for k in range(3 * MAX_EVENTS):
         figures.add(EventRecord(host_ns=k, kind="stale", detail="x" * 10_000))

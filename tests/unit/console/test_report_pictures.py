@@ -18,7 +18,7 @@ from hilstar.console.report import report, run_pictures
 from hilstar.rotation import from_rotation_vector, multiply
 from hilstar.run.record.ledger import Ledger
 from hilstar.run.record.ledger_records import FrameRecord
-from hilstar.run.record.report_figures import Figures
+from hilstar.run.record.report import RunFigures
 from tests.support.benches import ORION_Q, SMALL_BENCH
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.run_page import levels_of, run_data_of
@@ -89,7 +89,7 @@ def test_a_bench_that_has_changed_since_draws_with_a_caution_and_one_that_is_gon
     report(tmp_path / "run.mcap", tmp_path)
     data = run_data_of((tmp_path / "report.html").read_text())
     assert len(data["pictures"]) == 1 and "Codes may differ" in data["caution"]
-    figures = Figures({"bench_text": "[monitor]\n"})
+    figures = RunFigures({"bench_text": "[monitor]\n"})
     none = run_pictures(figures, tmp_path / "run.mcap")
     assert none["pictures"] == [] and "bench.toml" in none["no_pictures"]
     assert none["sky"]["stars"][0][3] == "α CMa"

@@ -24,11 +24,17 @@ from hilstar.attitude.wire.packet import AttitudeSample, Refusal, encode
 from hilstar.cli.parsers import parse_split
 from hilstar.errors import InputError
 from hilstar.notices import Notices
-from hilstar.run.record.backlog import MAX_WAITING_BYTES, Backlog, Entry, ReceivedPacket
-from hilstar.run.record.ledger import Ledger, Split
+from hilstar.run.record.ledger import (
+    MAX_WAITING_BYTES,
+    Ledger,
+    LedgerQueue,
+    LedgerSwitch,
+    QueueEntry,
+    ReceivedPacket,
+    SplitLimits,
+)
 from hilstar.run.record.ledger_reader import drawable_frames
 from hilstar.run.record.ledger_records import FAULT_TOPIC, FaultRecord, FrameRecord
-from hilstar.run.record.ledger_switch import LedgerSwitch
 from hilstar.run.record.report import figures_of, summarise
 from tests.support.full_disk import files_of_at_most
 from tests.support.waiting import wait_for
@@ -54,7 +60,7 @@ def keep(ledger: Ledger, first: int, last: int) -> None:
 
 def test_a_ledger_goes_on_in_other_files_and_is_read_as_one(tmp_path, bench):
     path = tmp_path / "run.mcap"
-    with Ledger(path, bench, split=Split(bytes=1)) as ledger:
+    with Ledger(path, bench, split=SplitLimits(bytes=1)) as ledger:
         keep(ledger, 0, 50)
         wait_for((tmp_path / "run.0001.mcap").exists, "the next file")
         keep(ledger, 50, 100)
@@ -114,7 +120,7 @@ def write_over(path, _):
         file.write(b"over what was there")
 
 
-@pytest.mark.parametrize("split", [Split(), Split(bytes=1)])
+@pytest.mark.parametrize("split", [SplitLimits(), SplitLimits(bytes=1)])
 @pytest.mark.parametrize("harm", [delete, replace_by_another, cut, write_anew, write_longer, write_over])
 def test_a_ledger_that_is_harmed_is_said_and_goes_on_in_another_file(tmp_path, bench, harm, split):
     notices, path = Notices(), tmp_path / "run.mcap"
@@ -188,12 +194,12 @@ def test_a_ledger_begun_in_the_place_of_another_knows_the_faults_that_are_on(tmp
 
 
 def test_what_waits_is_bounded_by_bytes_and_frames_go_first():
-    backlog = Backlog()
-    frames = sum(backlog.put(Entry("frame", 0, 0, None)) for _ in range(50_000))
-    packets = sum(backlog.put(Entry("packet", 0, 0, ReceivedPacket(bytes(1000), None, None))) for _ in range(50_000))
+    backlog = LedgerQueue()
+    frames = sum(backlog.put(QueueEntry("frame", 0, 0, None)) for _ in range(50_000))
+    packets = sum(backlog.put(QueueEntry("packet", 0, 0, ReceivedPacket(bytes(1000), None, None))) for _ in range(50_000))
     assert 0 < frames < 50_000 and 0 < packets < 50_000
     assert sum(entry.size_bytes for entry in backlog.take()) <= MAX_WAITING_BYTES
-    assert backlog.put(Entry("frame", 0, 0, None))
+    assert backlog.put(QueueEntry("frame", 0, 0, None))
 
 
 def test_a_ledger_needs_no_new_file_once_it_has_begun(tmp_path, bench):

@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import Any, cast
 
 from hilstar.notices import Notice
-from hilstar.run.record.ledger import Ledger
+from hilstar.run.record.ledger import Ledger, LedgerSwitch
 from hilstar.run.record.ledger_records import FaultRecord
-from hilstar.run.record.ledger_switch import LedgerSwitch
 
 
 class Kept:

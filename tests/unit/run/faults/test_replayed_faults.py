@@ -10,9 +10,8 @@ from hilstar.bench.faults.scenario import parse_scenario
 from hilstar.errors import InputError
 from hilstar.notices import Notices
 from hilstar.run.faults import RunFaults, read_recording
-from hilstar.run.record.ledger import Ledger
+from hilstar.run.record.ledger import Ledger, LedgerSwitch
 from hilstar.run.record.ledger_reader import fault_records, frame_records
-from hilstar.run.record.ledger_switch import LedgerSwitch
 from hilstar.run.replay import Wanted, plan_play, replay
 from hilstar.run.serve import Outlet
 from tests.support.benches import ATTITUDE, bench_text

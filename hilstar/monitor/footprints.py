@@ -43,8 +43,10 @@ class PixelOrder:
         self.bias = 0.5 if self.size % 2 else 0.0
         distance = self._distances(sigma_px)
         self._least_spread_px = float(_spread_px(sigma_px).min())
-        self.near = int((distance <= self.reach_sigmas()).sum(axis=0).max())
+        reach_sigmas = max(REACH_SIGMA, MIN_REACH_PX / self._least_spread_px)
+        self.near = int((distance <= reach_sigmas).sum(axis=0).max())
         order = np.argsort(distance, axis=0, kind="stable")
+        self._farthest_sigmas = float(np.take_along_axis(distance, order[self.near - 1 : self.near], axis=0).max())
         self.area_px2 = 2 * np.pi * float(_spread_px(sigma_px).prod())
         self.row, self.column = (part.astype(np.int32) for part in np.divmod(order, self.size))
 
@@ -55,9 +57,12 @@ class PixelOrder:
         x, y = (((steps[:, None] - phase) / s) ** 2 for s in _spread_px(sigma_px))
         return np.asarray(np.sqrt(y[:, None, :, None] + x[None, :, None, :]).reshape(self.size**2, PHASES**2))
 
-    def reach_sigmas(self, more_px: float = 0.0) -> float:
-        """Radius of reach in sigmas (a pixel's width included), plus `more_px`."""
-        return max(REACH_SIGMA, MIN_REACH_PX / self._least_spread_px) + more_px / self._least_spread_px
+    def near_sigmas(self, more_px: float = 0.0) -> float:
+        """Distance of the farthest near pixel of any phase in sigmas (a pixel's width included), plus `more_px`.
+
+        All phases have as many near pixels: where few lie within reach, some lie beyond it.
+        """
+        return self._farthest_sigmas + more_px / self._least_spread_px
 
     def reach(self, steps: Float32Array) -> IntArray:
         """Number of nearest pixels (n,) that hold enough light to choose among, for stars of `steps` (n,) steps of light."""

@@ -55,9 +55,10 @@ MAX_ERASED_LEVELS, MAX_ERASED_LIGHT = 0.02, 0.03
 IMAGES_VERSION = 420  # of OpenGL, for images in shaders
 # A level is missed only where the wings of more stars than this meet outside all of their own squares (see `lit_sides`).
 MEETING_WINGS = 16
-# Where stars are apart, `round` leaves out the light of each beyond a square: in no pixel more than this part of what lights
-# one, a 64th of the first step. A star alone has the same levels; of 10 000 on 1080p three in a thousand have a pixel (in all
-# twelve of 82 000 lit ones) that is a level lower, where wings meet, and all have 0.002 mag rms.
+# In frames that are not in units (see `LightUnits`) and whose stars are apart, `round` cuts each star's light at a square.
+# No pixel beyond it has more than 1 / CUT_WINGS of the light that lights one, 1 / 64 of the first step. A lone star has the
+# same levels; of 10 000 on 1080p three in a thousand have a pixel (twelve of 82 000 lit ones in all) that is one level lower,
+# where wings meet, and all have 0.002 mag rms.
 CUT_WINGS = 32
 
 
@@ -261,6 +262,11 @@ class Encoder:
     def shrink(self, sides: SpriteSides) -> None:
         """Encode fainter stars' smaller sprites only."""
         set_sides(self._sprites, sides)
+
+    @property
+    def sprite_program(self) -> moderngl.Program:
+        """The program of star.vert that encodes sprites."""
+        return self._sprites
 
     def draw(
         self,

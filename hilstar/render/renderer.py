@@ -37,7 +37,7 @@ from hilstar.render.exact_pass import ExactPass
 from hilstar.render.extended import ExtendedLayer
 from hilstar.render.host_image import HostImage
 from hilstar.render.splat import splat_program
-from hilstar.render.star_passes import StarPasses
+from hilstar.render.star_passes import LightUnits, StarPasses
 from hilstar.scene.extended import ExtendedLight, Rectangle
 from hilstar.scene.psf import footprint_px
 from hilstar.scene.sprites import SPRITE_DTYPE, Sprites
@@ -152,7 +152,9 @@ class Renderer:
         self._levels_black = True  # but for the last frame
         self._encoder: Encoder | None = None
         self._exact_pass: ExactPass | None = None
+        self._units: LightUnits | None = None
         self._passes: StarPasses | None = None
+        self._unit_splat: moderngl.Program | None = None  # where points are in units
         # `exact` in NumPy is made by the first frame that needs it: its arrays are as large as the image.
         self._exact: ExactQuantiser | None = None
         self._floor_encoder: Encoder | None = None
@@ -171,8 +173,20 @@ class Renderer:
             self._encoder.shrink(self._lit_sides)
             if not dithered and not target.sides:
                 self._cut_sides = lit_sides(panel, target.sigma_px, self.footprint_px, CUT_WINGS)
-            if not dithered and StarPasses.runs_on(self._ctx, panel, target.resolution_px, self.footprint_px):
-                self._passes = StarPasses(self._levels, panel, target.sigma_px, self._star_by_star, target.sides)
+            if not dithered and LightUnits.takes(panel, target.resolution_px, self.footprint_px):
+                self._build_units(self._levels, panel, self._encoder)
+
+    def _build_units(self, levels: LevelTexture, panel: Panel, encoder: Encoder) -> None:
+        """What draws light in whole units: the passes of a software OpenGL, else sprites."""
+        target = self.target
+        units = self._units = LightUnits(panel, target.resolution_px, target.sigma_px, target.sides)
+        if StarPasses.runs_on(self._ctx):
+            self._passes = StarPasses(levels, panel, target.sigma_px, self._star_by_star, units)
+            return
+        self._unit_splat = splat_program(self._ctx, target.resolution_px, target.sigma_px, self.footprint_px, in_units=True)
+        self._unit_splat["most_e_per_s"] = units.white_e_per_s
+        for program in (self._unit_splat, encoder.sprite_program):
+            program["reach_px2"], program["largest_px"] = units.axes_px2, units.side_px
 
     def _reserve(self, sprites: int) -> None:
         """Make room for `sprites` sprites on the GPU; it grows by doubling and never shrinks."""
@@ -180,6 +194,7 @@ class Renderer:
         self._buffer = self._ctx.buffer(reserve=sprites * SPRITE_DTYPE.itemsize, dynamic=True)
         layout = [(self._buffer, "2i 2f 1f", "pixel", "fraction_px", "electrons_per_s")]
         self._splat_vao = self._ctx.vertex_array(self._splat, layout)
+        self._unit_vao = None if self._unit_splat is None else self._ctx.vertex_array(self._unit_splat, layout)
         self._last_count: int | None = None  # of the sprites that are in the buffer and on the images
         for eraser in (self._eraser, self._level_eraser):
             eraser.take_places_from(self._buffer, self.footprint_px)
@@ -197,9 +212,10 @@ class Renderer:
             self._last_frame = frame
             extended = sprites is not None and bool(sprites.extended)
             self._by_numpy = self._star_by_star and (self._exact_pass is None or extended)
-            passes = None if self._by_numpy or extended else self._passes
-            if passes is not None and (unit := passes.unit_for(sprites)) is not None:
-                self._draw_by_passes(passes, sprites, unit)
+            units = None if self._by_numpy or extended else self._units
+            unit_e_per_s = None if units is None else units.unit_for(sprites)
+            if self._passes is not None and unit_e_per_s is not None:
+                self._draw_by_passes(self._passes, sprites, unit_e_per_s)
                 return
             if self._passes is not None:
                 self._passes.forget()
@@ -208,7 +224,7 @@ class Renderer:
                 self._undrawn = (sprites, False)
                 self._last_count = None
             else:
-                self._draw_by_points(sprites)
+                self._draw_by_points(sprites, unit_e_per_s)
 
     def draw_linear(self, sprites: Sprites) -> None:
         """Draw the linear image of `sprites` alone, no sprite smaller than the footprint; the next `codes` are undefined.
@@ -225,19 +241,32 @@ class Renderer:
             if chooser is not None:
                 chooser.left = None
 
-    def _draw_by_points(self, sprites: Sprites | None) -> None:
-        """The linear image and its levels by rasterised sprites."""
+    def _draw_by_points(self, sprites: Sprites | None, unit_e_per_s: float | None) -> None:
+        """The linear image and its levels by rasterised sprites, in units where one is given."""
         few_px = self.target.resolution_px[0] * self.target.resolution_px[1] // SPRITE_PIXEL_COST
         sides = self._lit_sides if self._encoder is not None else ()
         covered_px = 0 if sprites is None else most_covered_px(sprites, self.footprint_px, sides, few_px)
-        cut = bool(self._cut_sides) and sprites is not None and covered_px < few_px
-        self._draw_linear(sprites, whole=not (self.target.sides or cut))
+        in_units = self._set_units(sprites, unit_e_per_s)
+        cut = in_units or (bool(self._cut_sides) and sprites is not None and covered_px < few_px)
+        self._draw_linear(sprites, whole=not (self.target.sides or cut), in_units=in_units)
         if self._encoder is not None:
             with self._stage("encode"):
                 self._encode(self._encoder, sprites, covered_px)
-        if cut and not self.target.sides:
+        if in_units or (cut and not self.target.sides):
             self._undrawn = (sprites, True)  # without what is left out, when somebody asks
         self._choose(sprites, None)
+
+    def _set_units(self, sprites: Sprites | None, unit_e_per_s: float | None) -> bool:
+        """Set the frame's unit and ellipses where it is drawn in units; whether it is."""
+        units, encoder, splat = self._units, self._encoder, self._unit_splat
+        if units is None or encoder is None or splat is None:
+            return False
+        in_units = sprites is not None and unit_e_per_s is not None
+        reach_per_e = units.reach_per_e(sprites) if sprites is not None and unit_e_per_s is not None else 0.0
+        encoder.sprite_program["reach_per_e"] = splat["reach_per_e"] = reach_per_e
+        if in_units:
+            splat["unit_e_per_s"] = unit_e_per_s
+        return in_units
 
     def _draw_by_passes(self, passes: StarPasses, sprites: Sprites | None, unit_e_per_s: float) -> None:
         """Levels star by star; the linear image is drawn only when it is read."""
@@ -309,12 +338,14 @@ class Renderer:
     def _upload(self, sprites: Sprites) -> None:
         if len(sprites) > self._capacity:
             self._splat_vao.release()
+            if self._unit_vao is not None:
+                self._unit_vao.release()
             self._buffer.release()
             self._reserve(max(2 * self._capacity, len(sprites)))
         self._buffer.orphan()
         self._buffer.write(sprites.data)
 
-    def _draw_linear(self, sprites: Sprites | None, whole: bool, levels: bool = True) -> None:
+    def _draw_linear(self, sprites: Sprites | None, whole: bool, levels: bool = True, in_units: bool = False) -> None:
         """Draw the linear image; `levels` says whether the last frame's are erased."""
         self._undrawn = None
         self._on_host = self._host is not None and whole and not (sprites is not None and sprites.extended)
@@ -330,7 +361,7 @@ class Renderer:
                 self._upload(sprites)
             self._last_count = len(sprites)
             with self._stage("splat"):
-                self._splat_stars(sprites, whole)
+                self._splat_stars(sprites, whole, in_units)
 
     def _erase(self, levels: bool = True) -> None:
         """Make black what the last frame drew."""
@@ -351,16 +382,18 @@ class Renderer:
         """Add extended light to the linear image."""
         self._regions = self._extended.draw(self._linear_fbo, lights)
 
-    def _splat_stars(self, sprites: Sprites, whole: bool) -> None:
+    def _splat_stars(self, sprites: Sprites, whole: bool, in_units: bool) -> None:
         """Add the light of the sprites that are in the buffer to the linear image."""
-        self._splat["sides"] = 0 if whole else len(self._cut_sides)
-        self._splat["sprites_per_star"] = float(sprites.per_star)
+        if not in_units:
+            self._splat["sides"] = 0 if whole else len(self._cut_sides)
+            self._splat["sprites_per_star"] = float(sprites.per_star)
         width, height = self.target.resolution_px
         margin = self.footprint_px
         self._linear_fbo.use()
         self._linear_fbo.viewport = (-margin, -margin, width + 2 * margin, height + 2 * margin)
         self._ctx.enable(moderngl.BLEND)
-        self._splat_vao.render(moderngl.POINTS, vertices=len(sprites))
+        vao = self._unit_vao if in_units and self._unit_vao is not None else self._splat_vao
+        vao.render(moderngl.POINTS, vertices=len(sprites))
         self._ctx.disable(moderngl.BLEND)
 
     def codes(self) -> Codes:

@@ -17,12 +17,14 @@ def splat_program(
     sigma_px: tuple[float, float],
     footprint_px: int,
     by_erf: bool = False,
+    in_units: bool = False,
 ) -> moderngl.Program:
     """The program of star.vert and splat.frag for sprites of one sigma, up to `footprint_px` a side.
 
-    `by_erf` has error functions where polynomials would do, for the study of trade-offs.
+    `by_erf` has error functions where polynomials would do, for the study of trade-offs. `in_units` draws light in the whole
+    units of a LightUnits.
     """
-    define = () if by_erf else share_define(sigma_px, footprint_px)
+    define = (() if by_erf else share_define(sigma_px, footprint_px)) + (("UNITS",) if in_units else ())
     program = build_program(ctx, "star.vert", "splat.frag", define, "shares.glsl")
     set_sigma(program, sigma_px)
     program["resolution_px"] = resolution_px

@@ -1,6 +1,7 @@
-"""Frames drawn star by star in compute passes: on a software OpenGL in a quarter of the time of sprites that are rasterised.
+"""Light in whole units, and the compute passes that add it up star by star.
 
-Each pixel's light is a sum of whole units, which is the same in whatever order several threads add to it.
+Each pixel's light is a sum of whole units, which is the same in whatever order several threads add to it. A software OpenGL
+draws star by star, in a quarter of the time of rasterised sprites; a graphics card blends sprites of the same units.
 """
 
 from __future__ import annotations
@@ -37,29 +38,69 @@ ANY_RATE = 1e-6  # the largest side of all, for stars of any rate, has fewer win
 PHASE_PX = 0.1  # a star is at most so far from the middle of its phase
 
 
+class LightUnits:
+    """The whole units in which a panel's pixels add up stars, and the ellipse within which a star lights them.
+
+    Whatever draws in these units chooses the same levels. `sides` (see `Target.sides`) say how large sprites are at most, and
+    what light of a star alone they may leave out.
+    """
+
+    def __init__(self, panel: Panel, size_px: tuple[int, int], sigma_px: tuple[float, float], sides: SpriteSides = ()) -> None:
+        self._size_px, self._footprint_px = size_px, footprint_px(sigma_px)
+        gain = panel.gain()
+        low, high = (1.0, 1.0) if gain is None else (float(gain.min()), float(gain.max()))
+        thresholds = panel.response.thresholds_e_per_s(panel.flux_at_white_e_per_s)
+        self._lit_e_per_s, self.white_e_per_s = float(thresholds[0]) / high, panel.flux_at_white_e_per_s / low
+        self._peak_share = peak_share(sigma_px)
+        self.axes_px2, self._share_bound = share_bound(sigma_px, self._footprint_px)
+        self.wings = WINGS if not sides else _wings_of(sides, self._lit_e_per_s, sigma_px)
+        self.side_px = max((side.side_px for side in sides), default=self._footprint_px)
+
+    @staticmethod
+    def takes(panel: Panel, size_px: tuple[int, int], footprint_px: int) -> bool:
+        """Whether such an image, such sprites and such a panel are drawn in units: those that StarPasses can draw.
+
+        The panel's table may have no bin with several thresholds.
+        """
+        if 4 * size_px[0] * size_px[1] > MAX_WRITTEN_BYTES or footprint_px * (footprint_px + 2) > MAX_ROUNDS:
+            return False
+        return code_table(panel.response.thresholds_e_per_s(panel.flux_at_white_e_per_s)).steps() is not None
+
+    def unit_for(self, sprites: Sprites | None) -> float | None:
+        """The unit (e-/s) in which no pixel's sum of these sprites can be too large; None where it is too coarse for the panel.
+
+        A power of two, from the sum of all stars' brightest pixels, of white at most each.
+        """
+        if sprites is None or not len(sprites):
+            return self.white_e_per_s
+        rates = np.minimum(sprites.data["electrons_per_s"], np.float32(self.white_e_per_s / self._peak_share))
+        most_e_per_s = max(float(rates.sum(dtype=np.float64)) * self._peak_share * 1.000001, self.white_e_per_s)
+        unit = 2.0 ** math.ceil(math.log2(most_e_per_s / (MAX_SUM - len(sprites))))
+        return unit if unit <= self._lit_e_per_s * MAX_UNIT else None
+
+    def reach_per_e(self, sprites: Sprites) -> float:
+        """The factor of a star's rate whose logarithm, times `axes_px2`, gives the squared half axes of its ellipse (px2)."""
+        width, height = self._size_px
+        wings = self.wings * (DENSER_WINGS if len(sprites) * self._footprint_px**2 > width * height else 1)
+        return self._share_bound * sprites.per_star * wings / self._lit_e_per_s
+
+
 class StarPasses:
     """Draws sprites into pixels' sums and a LevelTexture; it lives in its renderer's context, which is current in every call.
 
-    With `keep` the sums stay for `exact` to look at. `sides` (see `Target.sides`) say how large sprites are at most, and what
-    light of a star alone they may leave out.
+    With `keep` the sums stay for `exact` to look at.
     """
 
     def __init__(
-        self, levels: LevelTexture, panel: Panel, sigma_px: tuple[float, float], keep: bool, sides: SpriteSides = ()
+        self, levels: LevelTexture, panel: Panel, sigma_px: tuple[float, float], keep: bool, units: LightUnits
     ) -> None:
         ctx = self._ctx = levels.texture.ctx
-        self._levels, self._keep = levels, keep
+        self._levels, self._keep, self._units = levels, keep, units
         self._size_px = levels.texture.size
         self._footprint_px = footprint_px(sigma_px)
         gain = panel.gain()
         self._gain = None if gain is None else ctx.texture(self._size_px, 1, np.ascontiguousarray(gain), dtype="f4")
-        low, high = (1.0, 1.0) if gain is None else (float(gain.min()), float(gain.max()))
         thresholds = panel.response.thresholds_e_per_s(panel.flux_at_white_e_per_s)
-        self._lit_e_per_s, self._white_e_per_s = float(thresholds[0]) / high, panel.flux_at_white_e_per_s / low
-        self._peak_share = peak_share(sigma_px)
-        self._axes_px2, self._share_bound = share_bound(sigma_px, self._footprint_px)
-        self._wings = WINGS if not sides else _wings_of(sides, self._lit_e_per_s, sigma_px)
-        self._side_px = max((side.side_px for side in sides), default=self._footprint_px)
         self._sums = ctx.buffer(np.zeros(self._size_px[0] * self._size_px[1], dtype=np.int32))
         self._unit_e_per_s = 0.0  # of the sums
         self.sprites = ctx.buffer(reserve=SPRITE_DTYPE.itemsize, dynamic=True)
@@ -67,16 +108,9 @@ class StarPasses:
         self._build(code_table(thresholds), sigma_px)
 
     @staticmethod
-    def runs_on(ctx: moderngl.Context, panel: Panel, size_px: tuple[int, int], footprint_px: int) -> bool:
-        """Whether this GL is a processor's, with compute shaders, and takes such an image, such sprites and such a panel.
-
-        The panel's table may have no bin with several thresholds.
-        """
-        if not computes_in_software(ctx):  # a graphics card is left idle by a star a lane
-            return False
-        if 4 * size_px[0] * size_px[1] > MAX_WRITTEN_BYTES or footprint_px * (footprint_px + 2) > MAX_ROUNDS:
-            return False
-        return code_table(panel.response.thresholds_e_per_s(panel.flux_at_white_e_per_s)).steps() is not None
+    def runs_on(ctx: moderngl.Context) -> bool:
+        """Whether this GL is a processor's, with compute shaders; a graphics card is left idle by a star a lane."""
+        return computes_in_software(ctx)
 
     def _build(self, table: CodeTable, sigma_px: tuple[float, float]) -> None:
         steps = table.steps()
@@ -87,31 +121,19 @@ class StarPasses:
         defines = [f"LEVELS_FORMAT {texel}", f"BIN_SHIFT {table.bin_shift}"]
         defines += [*share_define(sigma_px, self._footprint_px), *["KEEP"] * self._keep]
         defines += ["UNIFORMITY"] * (self._gain is not None) + self._steps.define
-        side, all_px = f"FOOTPRINT {self._side_px}", f"FOOTPRINT {self._footprint_px}"
+        side, all_px = f"FOOTPRINT {self._units.side_px}", f"FOOTPRINT {self._footprint_px}"
         self._light, self._encode, self._black = (
             build_compute(self._ctx, "light.comp", [*part, *defines], ("shares", "sums"))
             for part in (["LIGHT", side], ["LEVELS", side], [all_px])
         )
         for program in (self._light, self._encode, self._black):
-            program["resolution_px"], program["reach_px2"] = self._size_px, self._axes_px2
+            program["resolution_px"], program["reach_px2"] = self._size_px, self._units.axes_px2
         if self._keep:
-            self._black["least_reach"] = 0.5 * PixelOrder(sigma_px).reach_sigmas(PHASE_PX) ** 2
+            self._black["least_reach"] = 0.5 * PixelOrder(sigma_px).near_sigmas(PHASE_PX) ** 2
         set_sigma(self._light, sigma_px)
-        self._light["most_e_per_s"] = self._white_e_per_s
+        self._light["most_e_per_s"] = self._units.white_e_per_s
         self._encode["lowest"] = (table.first_bin - 1) << table.bin_shift
         self._encode["highest"] = ((table.first_bin + len(table.first_code)) << table.bin_shift) - 1
-
-    def unit_for(self, sprites: Sprites | None) -> float | None:
-        """The unit (e-/s) in which no pixel's sum of these sprites can be too large; None where it is too coarse for the panel.
-
-        A power of two, from the sum of all stars' brightest pixels, of white at most each.
-        """
-        if sprites is None or not len(sprites):
-            return self._white_e_per_s
-        rates = np.minimum(sprites.data["electrons_per_s"], np.float32(self._white_e_per_s / self._peak_share))
-        most_e_per_s = max(float(rates.sum(dtype=np.float64)) * self._peak_share * 1.000001, self._white_e_per_s)
-        unit = 2.0 ** math.ceil(math.log2(most_e_per_s / (MAX_SUM - len(sprites))))
-        return unit if unit <= self._lit_e_per_s * MAX_UNIT else None
 
     def forget(self) -> None:
         """Something else has drawn on the levels: the next `erase` makes all of them black."""
@@ -138,10 +160,9 @@ class StarPasses:
         self.sprites.orphan()
         self.sprites.write(sprites.data)
         self._drawn = len(sprites)
-        width, height = self._size_px
-        wings = self._wings * (DENSER_WINGS if len(sprites) * self._footprint_px**2 > width * height else 1)
+        reach_per_e = self._units.reach_per_e(sprites)
         for program in (self._light, self._encode, self._black):
-            program["reach_per_e"] = self._share_bound * sprites.per_star * wings / self._lit_e_per_s
+            program["reach_per_e"] = reach_per_e
 
     def add_light(self, unit_e_per_s: float) -> None:
         """Add the light of the sprites to their pixels' sums, which are of that unit."""

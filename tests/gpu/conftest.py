@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import pytest
 
-from hilstar.render.star_passes import StarPasses
+from hilstar.render.star_passes import LightUnits, StarPasses
 
 
 @pytest.fixture
 def by_points(monkeypatch: pytest.MonkeyPatch) -> None:
     """Sprites are rasterised and blended."""
-    monkeypatch.setattr(StarPasses, "runs_on", staticmethod(lambda *target: False))
+    monkeypatch.setattr(StarPasses, "runs_on", staticmethod(lambda context: False))
+
+
+@pytest.fixture
+def in_no_units(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sprites are blended as they are, as in frames with extended light: the image that is read is the one that is encoded."""
+    monkeypatch.setattr(LightUnits, "takes", staticmethod(lambda *target: False))
 
 
 @pytest.fixture(params=["star by star", "by points"])

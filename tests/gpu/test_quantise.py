@@ -65,7 +65,7 @@ def assert_same_but_for_ties(found, expected, linear, panel):
 @pytest.mark.parametrize("count", [150, 8000])
 @pytest.mark.parametrize("mapped", [False, True], ids=["even", "uneven"])
 @pytest.mark.parametrize("method", ["round", "dither"])
-@pytest.mark.usefixtures("by_points")
+@pytest.mark.usefixtures("in_no_units")
 def test_levels_are_those_of_the_oracle_pixel_for_pixel(response, count, mapped, method, rng):
     """150 stars take the footprint pass, 8000 the full-screen pass: the levels of one linear image are one thing."""
     target = target_of(response, method, uneven(rng) if mapped else None)

@@ -114,7 +114,7 @@ def test_the_footprint_cuts_no_more_than_it_says():
 
 @pytest.mark.parametrize("bits", [6, 8, 10, 12, 16])
 @pytest.mark.parametrize("count", [150, 8000])
-@pytest.mark.usefixtures("by_points")
+@pytest.mark.usefixtures("in_no_units")
 def test_codes_are_those_of_the_oracle_pixel_for_pixel(bits, count, rng):
     """150 stars take the footprint pass, 8000 the full-screen pass: the codes of one linear image are one thing."""
     pixels = rng.uniform([-5, -5], [260, 197], size=(count, 2))

@@ -84,7 +84,7 @@ def test_where_units_are_too_coarse_sprites_are_blended(rng, monkeypatch):
     for response, sprites in ((srgb_response(16), stars(300, rng)), (gamma_response(8, 3.0), bright)):
         target = Target(SIZE, SIGMA, response, WHITE)
         with Renderer(target) as gl:
-            assert gl._passes is None or gl._passes.unit_for(sprites) is None
+            assert gl._units is None or gl._units.unit_for(sprites) is None
             gl.draw(sprites)
             assert np.array_equal(gl.codes(), round_levels(gl.linear(), target.panel()))
 
@@ -99,8 +99,8 @@ def test_frames_of_all_kinds_follow_each_other(quantisation, rng):
     frames = [few, many, few, bright, few, None, bright, many, lit, few, lit, bright, lit, None, few]
     with Renderer(target) as gl:
         assert gl._passes is not None
-        assert gl._passes.unit_for(bright) is None
-        assert gl._passes.unit_for(many) is not None
+        assert gl._units.unit_for(bright) is None
+        assert gl._units.unit_for(many) is not None
         for place, sprites in enumerate(frames):
             gl.draw(sprites)
             found = gl.codes().copy()

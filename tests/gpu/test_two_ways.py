@@ -1,0 +1,122 @@
+"""The codes of both ways to draw: star by star, as a software OpenGL does, and by points, as a graphics card does."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hilstar.monitor.response import gamma_response, srgb_response
+from hilstar.render.context import computes_in_software
+from hilstar.render.encoder import SpriteSide
+from hilstar.render.renderer import Renderer, Target
+from hilstar.render.star_passes import StarPasses
+from hilstar.scene.extended import LightMap
+from hilstar.scene.psf import footprint_px, outside_share
+from hilstar.scene.sprites import Sprites, pack_sprites
+
+SIZE, WHITE, FRAMES = (640, 480), 1e6, 3
+USUAL = (0.85, 0.85)
+SRGB8 = srgb_response(8)
+# Of lit pixels, on one driver: both ways add the same whole units and do the same operations. Measured: none of 2 273 578.
+# Where three stars or more share a pixel of over 2^24 units, a blended float32 sum may be off by its last bit.
+OTHER = 1e-4
+
+
+def stars(count: int, sigma_px, rng, per_star: int = 1) -> Sprites:
+    """Stars all over the image and its edges, many faint ones and few that clip, or paths of `per_star` sprites."""
+    place = rng.uniform([-5, -5], [SIZE[0] + 5, SIZE[1] + 5], size=(count, 2))
+    rate = 10**6.5 * 10 ** (-0.4 * 8 * rng.uniform(0, 1, count) ** 0.4)
+    along = np.arange(per_star)
+    x, y = (place[:, :1] + 0.6 * along).ravel(), (place[:, 1:] + 0.35 * along).ravel()
+    number = np.repeat(np.arange(count), per_star)
+    packed = pack_sprites(x, y, np.repeat(rate / per_star, per_star), number, SIZE, footprint_px(sigma_px))
+    return replace(packed, per_star=per_star)
+
+
+def drawn(target: Target, frames: list[Sprites]) -> list[np.ndarray]:
+    with Renderer(target) as gl:
+        found = []
+        for number, sprites in enumerate(frames):
+            gl.draw(sprites, number)
+            found.append(gl.codes().copy())
+        assert gl.gl_error() == "GL_NO_ERROR"
+    return found
+
+
+def both_ways(target: Target, frames: list[Sprites], monkeypatch) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """The codes of frames star by star, and by points."""
+    with Renderer(target) as gl:
+        if not computes_in_software(gl.context):
+            pytest.skip(f"{gl.gl_renderer}, OpenGL {gl.gl_version}, draws by points only")
+        assert gl.path == "compute shaders"
+    star_by_star = drawn(target, frames)
+    with monkeypatch.context() as patched:
+        patched.setattr(StarPasses, "runs_on", staticmethod(lambda context: False))
+        with Renderer(target) as gl:
+            assert gl.path.startswith("points")
+        return star_by_star, drawn(target, frames)
+
+
+def assert_same(star_by_star: list[np.ndarray], by_points: list[np.ndarray]) -> None:
+    other = sum(np.count_nonzero(a != b) for a, b in zip(star_by_star, by_points, strict=True))
+    lit = sum(np.count_nonzero(codes) for codes in star_by_star)
+    assert lit > 1000
+    assert other <= OTHER * lit
+
+
+def shrunk(sigma_px) -> tuple[SpriteSide, ...]:
+    """Sides as `effort` chooses them: a quarter of what lights a pixel may be left out."""
+    size, lit = footprint_px(sigma_px), SRGB8.threshold[0] * WHITE
+    sides = [SpriteSide(0.25 * lit / outside_share(side, sigma_px), side) for side in range(size - 4, 1, -2)]
+    return (SpriteSide(3e38, size - 2), *sides)
+
+
+@pytest.mark.parametrize("quantisation", ["round", "exact", "temporal"])
+@pytest.mark.parametrize(
+    ("response", "sigma_px", "count", "per_star"),
+    [
+        (SRGB8, USUAL, 300, 1),
+        (SRGB8, USUAL, 3000, 1),
+        (SRGB8, USUAL, 100, 8),
+        (SRGB8, (0.4, 0.4), 300, 1),
+        (SRGB8, (1.7, 1.7), 200, 1),
+        (srgb_response(10), USUAL, 300, 1),
+        (gamma_response(8), (1.2, 0.8), 300, 1),
+    ],
+    ids=["usual", "dense", "paths", "narrow", "wide", "10 bits", "gamma"],
+)
+def test_both_ways_choose_the_same_codes(quantisation, response, sigma_px, count, per_star, rng, monkeypatch):
+    frames = [stars(count, sigma_px, rng, per_star) for _ in range(FRAMES)]
+    assert_same(*both_ways(Target(SIZE, sigma_px, response, WHITE, quantisation), frames, monkeypatch))
+
+
+@pytest.mark.parametrize("quantisation", ["round", "exact"])
+@pytest.mark.parametrize("changed", ["uneven", "smaller sprites"])
+def test_so_they_do_on_an_uneven_panel_and_with_smaller_sprites(quantisation, changed, rng, monkeypatch):
+    uneven = rng.uniform(0.8, 1.2, SIZE[::-1]).astype(np.float32) if changed == "uneven" else None
+    sides = shrunk(USUAL) if changed == "smaller sprites" else ()
+    target = Target(SIZE, USUAL, SRGB8, WHITE, quantisation, uneven, sides)
+    assert_same(*both_ways(target, [stars(300, USUAL, rng) for _ in range(FRAMES)], monkeypatch))
+
+
+def test_so_they_do_where_light_beside_stars_comes_and_goes(rng, monkeypatch):
+    """Frames with extended light are blended in both ways, those between them drawn in each one's own."""
+    glow = LightMap(np.full((40, 50), 3e4, dtype=np.float32), (30, 20))
+    frames = [stars(count, USUAL, rng) for count in (200, 300, 20, 0, 200)]
+    frames[1] = replace(frames[1], extended=(glow,))
+    assert_same(*both_ways(Target(SIZE, USUAL, SRGB8, WHITE), frames, monkeypatch))
+
+
+@pytest.mark.parametrize("sigma_px", [(0.4, 0.4), USUAL, (1.2, 0.8)])
+@pytest.mark.usefixtures("each_way")
+def test_no_frame_of_temporal_leaves_a_pixel_behind(sigma_px, rng):
+    """`temporal` chooses among all near pixels, some of which lie a little beyond its reach: they are erased too."""
+    frames = [stars(600, sigma_px, rng) for _ in range(12)]
+    side = footprint_px(sigma_px)
+    for codes, sprites in zip(drawn(Target(SIZE, sigma_px, SRGB8, WHITE, "temporal"), frames), frames, strict=True):
+        under = np.zeros(SIZE[::-1], dtype=bool)
+        for x, y in sprites.data["pixel"] - (side - 1) // 2:
+            under[max(y, 0) : max(y + side, 0), max(x, 0) : max(x + side, 0)] = True
+        assert not codes[~under].any()

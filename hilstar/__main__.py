@@ -26,7 +26,7 @@ def main() -> NoReturn:
 def import_and_run() -> NoReturn:
     """Import the commands and run them; Ctrl-C may come at any step."""
     from hilstar.process import interrupts
-    from hilstar.process.stderr import finish_stderr
+    from hilstar.process.interrupts import finish_stderr
 
     try:
         interrupts.install()

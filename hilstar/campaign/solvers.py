@@ -33,7 +33,7 @@ from hilstar.bench.config import BenchConfig
 from hilstar.campaign.plan import Centroiding
 from hilstar.errors import InputError, did_you_mean, one_line, shortened
 from hilstar.files import temporary_folder
-from hilstar.process.child import MAX_OUTPUT_BYTES, Child
+from hilstar.process.programs import MAX_OUTPUT_BYTES, Child
 from hilstar.rotation import from_matrix, multiply, normalise
 from hilstar.scene.camera import Camera
 from hilstar.tracker.centroids import Centroids, CentroidSettings, find_stars

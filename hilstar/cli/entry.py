@@ -17,7 +17,7 @@ from hilstar.cli.parsers import with_values
 from hilstar.console.terminal import fail
 from hilstar.errors import HilstarError, InputError, MachineError, did_you_mean, shortened
 from hilstar.process import interrupts
-from hilstar.process.stderr import finish_stderr, queue_stderr
+from hilstar.process.interrupts import finish_stderr, queue_stderr
 
 INTERRUPTED = 130
 LOG_FORMAT = "hilstar: %(message)s"

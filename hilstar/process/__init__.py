@@ -1,1 +1,1 @@
-"""The process itself: signals, priority, and writing to stderr without waiting."""
+"""This process and those around it: how it ends, when it is scheduled, and what it runs."""

@@ -1,15 +1,19 @@
-"""Signals: the first ends a command in order, and whatever the command is doing, the process has ended within a second.
+"""How this process ends: signals, the end of its parent, and the last lines on stderr.
 
-Python's own handlers run in the main thread, between two steps of the interpreter: a long draw or a call that waits in C
-holds them up. So the number of a signal goes to a socket too, from within C, and two watchers look at it: a thread, which
-ends the process with the usual exit code, and a process, which does it where a call in C keeps Python's lock (as OpenGL's
-do) and no thread can.
+The first signal ends a command in order, and whatever the command is doing, the process has ended within a second. Python's own
+handlers run in the main thread, between two steps of the interpreter: a long draw or a call that waits in C delays them. So
+the number of a signal also goes to a socket, from within C, and two watchers look at it: a thread, which ends the process with
+the usual exit code, and a process, which does it where a call in C keeps Python's lock (as OpenGL's do) and no thread can run.
+
+Writing to stderr never waits: if nobody reads it, neither a frame nor the end of the process is delayed.
 """
 
 from __future__ import annotations
 
 import _thread
+import atexit
 import contextlib
+import io
 import os
 import select
 import signal
@@ -17,10 +21,11 @@ import socket
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 if TYPE_CHECKING:
     from multiprocessing.process import BaseProcess
@@ -30,7 +35,12 @@ THREAD_WAITS_S = 0.75  # for an end in order
 GUARD_WAITS_S = 0.9
 ECHO_S = 0.1  # a terminal and a wrapper both pass one Ctrl-C on: what comes so soon after a signal is no second one
 POLL_S = 0.02
+PR_SET_PDEATHSIG = 1  # of prctl(2)
 SIGNALLED = 128  # and the signal's number: the exit code of a process that a signal ended
+MAX_WAITING_BYTES = 1 << 20
+PIECE_BYTES = 4096
+DESCRIPTOR = 2
+LAST_WORDS_S = 1.0  # for a traceback at the very end
 
 
 class _Ending:
@@ -263,15 +273,113 @@ def _let_go_of_all_but(kept: int) -> None:
     os.closerange(kept + 1, 1024)
 
 
-def end_with_parent() -> None:
-    """In a process of a pool: end when the process that started it does, however that ends."""
+def end_with_parent(parent: int | None = None) -> None:
+    """End this process when the process that began it ends, however that ends.
+
+    With `parent`, the number of the process that began this one directly, the kernel kills this process, even where it hangs.
+    Without, in a process of a pool, a thread waits for the pool's owner, which may not be the direct parent (forkserver).
+    """
+    if parent is not None:
+        import ctypes  # 3 ms, and every command imports this module
+
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+        if os.getppid() != parent:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return
     import multiprocessing
 
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        threading.Thread(target=_end_after, args=(parent,), name="hilstar-parent", daemon=True).start()
+    owner = multiprocessing.parent_process()
+    if owner is not None:
+        threading.Thread(target=_end_after, args=(owner,), name="hilstar-parent", daemon=True).start()
 
 
-def _end_after(parent: BaseProcess) -> None:
-    parent.join()
+def _end_after(owner: BaseProcess) -> None:
+    owner.join()
     os._exit(1)
+
+
+class QueuedStderr(io.RawIOBase):
+    """Writes go to stderr from a thread, in order; beyond MAX_WAITING_BYTES they are dropped and counted."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._waiting: deque[bytes] = deque()
+        self._waiting_bytes = 0
+        self._dropped = 0
+        self._changed = threading.Condition()
+        threading.Thread(target=self._run, name="hilstar-stderr", daemon=True).start()
+
+    def writable(self) -> bool:
+        """True."""
+        return True
+
+    def fileno(self) -> int:
+        """The descriptor of stderr itself."""
+        return DESCRIPTOR
+
+    def isatty(self) -> bool:
+        """Whether stderr itself is a terminal."""
+        return os.isatty(DESCRIPTOR)
+
+    def write(self, data: Any) -> int:
+        """Queue bytes; returns their number."""
+        piece = bytes(data)
+        with self._changed:
+            if self._waiting_bytes + len(piece) > MAX_WAITING_BYTES:
+                self._dropped += 1
+            else:
+                self._waiting.append(piece)
+                self._waiting_bytes += len(piece)
+                self._changed.notify_all()
+        return len(piece)
+
+    def finish(self, patience_s: float) -> None:
+        """Wait until everything has been written, for at most `patience_s`."""
+        end_s = time.monotonic() + patience_s
+        with self._changed:
+            while self._waiting_bytes and (rest_s := end_s - time.monotonic()) > 0:
+                self._changed.wait(rest_s)
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                while not self._waiting:
+                    self._changed.wait()
+                piece = self._waiting.popleft()
+                dropped, self._dropped = self._dropped, 0
+            note = f"hilstar: {dropped} lines were dropped: nothing read them\n".encode() if dropped else b""
+            for data in (piece, note):
+                _write_all(data)
+            with self._changed:
+                self._waiting_bytes -= len(piece)
+                self._changed.notify_all()
+
+
+def _write_all(data: bytes) -> None:
+    with contextlib.suppress(OSError):  # there is no reader to tell
+        while data:
+            try:
+                data = data[os.write(DESCRIPTOR, data[:PIECE_BYTES]) :]
+            except BlockingIOError:  # another process that shares it has made it non-blocking
+                time.sleep(0.01)
+
+
+_queued: QueuedStderr | None = None
+
+
+def queue_stderr() -> None:
+    """From here on, writing to `sys.stderr` does not wait."""
+    global _queued  # noqa: PLW0603 - a process has one stderr
+    if _queued is None and sys.stderr is not None:
+        _queued = QueuedStderr()
+        encoding = getattr(sys.stderr, "encoding", None) or "utf-8"
+        sys.stderr = io.TextIOWrapper(io.BufferedWriter(_queued), encoding, "backslashreplace", line_buffering=True)
+        atexit.register(finish_stderr, LAST_WORDS_S)
+
+
+def finish_stderr(patience_s: float) -> None:
+    """Wait until everything queued has been written, for at most `patience_s`."""
+    if _queued is not None:
+        with contextlib.suppress(OSError, ValueError):
+            sys.stderr.flush()
+        _queued.finish(patience_s)

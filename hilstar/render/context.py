@@ -11,7 +11,7 @@ import moderngl
 from glcontext import egl
 
 from hilstar.errors import InputError, MachineError, did_you_mean
-from hilstar.process.cores import drawing_threads_apart
+from hilstar.process.scheduling import drawing_threads_apart
 from hilstar.units import GL_VERSIONS
 
 EGL_LIBRARY = "libEGL.so.1"

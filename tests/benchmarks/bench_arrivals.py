@@ -31,7 +31,7 @@ import zmq
 
 from hilstar.attitude.wire.packet import AttitudeSample, encode
 from hilstar.bench.build import load
-from hilstar.process.priority import PromptWhileLight
+from hilstar.process.scheduling import PromptWhileLight
 from hilstar.run.loop import Limit
 from hilstar.run.open_link import open_link
 from hilstar.run.record.ledger import LedgerSwitch

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from hilstar.process.priority import FIFO_PRIORITY
+from hilstar.process.scheduling import FIFO_PRIORITY
 
 # Ten times what anything here takes on an idle machine, for one that has ten times the work of its cores to do; what never
 # comes costs a failing test this long.

@@ -25,7 +25,7 @@ from hilstar.bench.orientation import orientation_of
 from hilstar.calibrate.latency import Edges, capture_edges, edges_of
 from hilstar.calibrate.measurements import PRIMARIES
 from hilstar.errors import HilstarError, InputError, MachineError, shortened
-from hilstar.process.child import MAX_OUTPUT_BYTES, Child
+from hilstar.process.programs import MAX_OUTPUT_BYTES, Child
 from hilstar.render.context import leave_contexts
 from hilstar.render.presenter import Orientation, Presenter, View, level_texture, window_context
 from hilstar.run.screen.gate import Timing, pass_gate

@@ -103,7 +103,7 @@ def fed_link(file: BenchFile, fed_by: str, notices: Notices) -> FedReceiver:
     """A head's link to the process that has the source, with which it ends; `fed_by` is its endpoint and its number."""
     from hilstar.attitude.wire.source import PACKETS, Mounting
     from hilstar.attitude.wire.zmq_links import FedReceiver
-    from hilstar.process.parent import end_with_parent
+    from hilstar.process.interrupts import end_with_parent
 
     endpoint, _, parent = fed_by.rpartition(",")
     end_with_parent(int(parent))

@@ -11,7 +11,7 @@ import typer
 from hilstar.console.run_status import RunStatus
 from hilstar.console.terminal import say
 from hilstar.errors import InputError
-from hilstar.process.notify import Service
+from hilstar.process.programs import Service
 
 if TYPE_CHECKING:
     from hilstar.bench.faults.desk import FaultDesk

@@ -17,7 +17,7 @@ from hilstar.cli.parsers import parse_mounting, parse_radec, parse_share, parse_
 from hilstar.console.terminal import print_json, progress, say
 from hilstar.errors import InputError
 from hilstar.process.interrupts import is_command, stop_on_signal
-from hilstar.process.priority import PromptWhileLight
+from hilstar.process.scheduling import PromptWhileLight
 from hilstar.units import NS_PER_S
 
 LISTEN_SLICE_S = 0.1  # between looks at whether a signal has come

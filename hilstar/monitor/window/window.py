@@ -18,7 +18,7 @@ from hilstar.monitor.window.awake import Awake
 from hilstar.monitor.window.library import glfw
 from hilstar.monitor.window.visibility import ScreenArea, Visibility
 from hilstar.monitor.window.x11 import BackBuffer, Survival, SwapStamps, back_buffer, has_extension, is_composited, sync_control
-from hilstar.process.cores import drawing_threads_apart
+from hilstar.process.scheduling import drawing_threads_apart
 from hilstar.units import GL_VERSIONS, NS_PER_S
 
 TITLE = "hilstar"

@@ -10,7 +10,7 @@ from typing import Any
 
 from hilstar.bench.frame import Drawn
 from hilstar.notices import Notices
-from hilstar.process.priority import steady_loop
+from hilstar.process.scheduling import steady_loop
 from hilstar.run.host_clock import HOST_CLOCK, HostClock
 from hilstar.run.operator import Overrides, SwitchRequests
 from hilstar.run.pacer import Moment, Presented

@@ -13,7 +13,7 @@ from hilstar.attitude.wire.serial_link import LOST, RtsLine
 from hilstar.bench.config import SyncSettings
 from hilstar.errors import one_line
 from hilstar.notices import Notices
-from hilstar.process.priority import raise_priority
+from hilstar.process.scheduling import raise_priority
 from hilstar.run.sync.pulse_summary import SyncSummary
 from hilstar.running_statistics import RunningStatistics
 from hilstar.units import NS_PER_MS, NS_PER_S

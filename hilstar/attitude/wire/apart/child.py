@@ -13,7 +13,7 @@ from collections.abc import Callable
 from typing import NoReturn
 
 from hilstar.attitude.wire.apart.records import Kind, pack
-from hilstar.process.parent import end_with_parent
+from hilstar.process.interrupts import end_with_parent
 
 WANTED_BUFFER_BYTES = 1 << 20  # the kernel gives what it allows: some hundred messages, while nobody reads them
 LIFE_S = 0.1

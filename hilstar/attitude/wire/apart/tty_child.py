@@ -14,7 +14,7 @@ import time
 
 from hilstar.attitude.wire.apart.child import Wire, run_child
 from hilstar.attitude.wire.apart.records import Kind, pack, pack_message
-from hilstar.process.priority import PromptWhileLight
+from hilstar.process.scheduling import PromptWhileLight
 
 READ, CLOSE = b"R", b"C"
 COMMAND_BYTES = 2

@@ -18,7 +18,7 @@ from hilstar.attitude.wire.keys import CurveKeys
 from hilstar.attitude.wire.links import LinkCounts
 from hilstar.attitude.wire.zmq_links import ZmqReceiver
 from hilstar.notices import Notices
-from hilstar.process.priority import PromptWhileLight
+from hilstar.process.scheduling import PromptWhileLight
 
 MAX_ORDER_BYTES = 65_536
 POLL_MS = 20

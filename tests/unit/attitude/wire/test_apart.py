@@ -271,7 +271,7 @@ def test_a_reader_that_cannot_begin_is_tried_again_and_ends_nothing(caplog):
 def test_a_process_that_works_for_long_loses_its_priority_until_it_rests():
     program = """
 import os, time
-from hilstar.process.priority import PromptWhileLight
+from hilstar.process.scheduling import PromptWhileLight
 def scheduled(): return os.sched_getscheduler(0)
 prompt = PromptWhileLight()
 print(scheduled())

@@ -12,7 +12,7 @@ from PIL import Image
 
 from tests.support.benches import ROOT, attitude_table
 from tests.support.commands import run_hilstar, run_hilstar_here
-from tests.support.readme import blocks
+from tests.support.readme import README, blocks
 from tests.support.senders import free_port
 
 
@@ -52,10 +52,20 @@ def test_the_user_s_regression_test_passes(tmp_path):
     assert result.returncode == 0, result.stdout
 
 
-@pytest.mark.parametrize("command", sorted(set(re.findall(r"(?m)^hilstar (\w+) ", blocks("text")[2]))))
-def test_every_command_of_the_readme_is_there(command):
+COMMANDS = sorted(set(re.findall(r"(?m)^\| [^|]+ \| `hilstar ([^`]+)` \|$", README)))
+
+
+def test_readme_shows_the_ten_commands_of_a_first_month():
+    assert len(COMMANDS) == 10
+
+
+@pytest.mark.parametrize("words", COMMANDS)
+def test_every_command_of_the_readme_is_there_with_its_options(words):
+    command = words.split()[0]
     result = run_hilstar_here(command, "--help")
     assert result.returncode == 0, result.stderr
+    for option in re.findall(r"--[\w-]+", words):
+        assert option in result.stdout
 
 
 def test_a_row_that_justifies_a_default_is_there():

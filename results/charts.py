@@ -9,10 +9,9 @@ import csv
 from pathlib import Path
 
 from hilstar.charts import read_records
-from hilstar.study.shared import over_frames
-from hilstar.study.timing import run as timing
+from hilstar.study import codes, timing
 from hilstar.study.tradeoff import run as tradeoff
-from hilstar.study.tradeoff.psf import ROUNDING_MAG
+from hilstar.study.tradeoff.light import ROUNDING_MAG
 from hilstar.study.tradeoff.table import Figure, Row, Step
 
 HERE = Path(__file__).parent
@@ -43,5 +42,5 @@ def tradeoff_step(name: str) -> Step:
 
 if __name__ == "__main__":
     timing.draw(DOCS / "timing.svg", read_records(HERE / "timing.csv", timing.Outcome))
-    over_frames.draw(DOCS / "over_frames.svg", read_records(HERE / "over_frames.csv", over_frames.Left))
+    codes.draw(DOCS / "over_frames.svg", read_records(HERE / "over_frames.csv", codes.Left))
     tradeoff.draw(DOCS / "tradeoff.svg", tradeoff_step(TRADEOFF_STEP), MACHINE)

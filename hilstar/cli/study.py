@@ -29,7 +29,7 @@ Study = Literal[
     "chain",
 ]
 
-ROOMS = {"bodies", "chain", "geometry", "models", "stability", "timing", "tradeoff"}  # the studies of more than one file
+ROOMS = {"chain", "stability", "tradeoff"}  # the studies of more than one file
 CHAIN_SCENES = 5
 
 

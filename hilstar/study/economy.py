@@ -16,8 +16,7 @@ from hilstar.monitor.quantise import shown_light
 from hilstar.render.reference import linear_image
 from hilstar.rotation import from_radec_roll_deg
 from hilstar.scene.frame_motion import Scan, Turn, swept_sprites
-from hilstar.study.shared.bench_text import Table, bench_text
-from hilstar.study.shared.lone_stars import Isolation, lone_windows, squares, star_error
+from hilstar.study.settings import Isolation, Table, bench_text, lone_windows, squares, star_error
 from hilstar.tracker.centroiders import FAMILY
 from hilstar.tracker.star_errors import stamp_errors
 

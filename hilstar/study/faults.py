@@ -24,9 +24,8 @@ from hilstar.monitor.quantise import shown_light
 from hilstar.rotation import from_radec_roll_deg, propagate
 from hilstar.scene.extended import Glow
 from hilstar.scene.sprites import Sprites, join_sprites
-from hilstar.study.shared.bench_text import Table as Keys
-from hilstar.study.shared.bench_text import bench_text
-from hilstar.study.shared.lone_stars import Isolation, lone_windows
+from hilstar.study.settings import Isolation, bench_text, lone_windows
+from hilstar.study.settings import Table as Keys
 from hilstar.units import NS_PER_S, magnitude
 
 REFRESH_HZ = 60

@@ -23,7 +23,7 @@ from hilstar.attitude.clock.timeline import Policy, Prediction, Timeline
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.charts import BLUE, GREEN, MUTED, ORANGE, SERIES, chart, label_ends, plain_ticks, write_records
 from hilstar.rotation import angle_between_rad, conjugate, multiply, propagate, to_rotation_vector
-from hilstar.study.shared.predictors import (
+from hilstar.study.predictors import (
     JITTER,
     NEAR,
     ORION,

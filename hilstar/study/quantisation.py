@@ -16,9 +16,21 @@ from hilstar.monitor.quantise import EXPOSURE_FRAMES
 from hilstar.monitor.response import srgb_response
 from hilstar.render.renderer import Renderer, Target
 from hilstar.scene.psf import footprint_px, peak_share
-from hilstar.study.shared.code_errors import ERROR_COLUMNS, JUDGE, code_errors, error_cells
-from hilstar.study.shared.codes import AIM_PX, AIMS, BITS, FRAME_PX, STARS, WAYS, response_of, star_field
-from hilstar.study.shared.over_frames import study_frames
+from hilstar.study.codes import (
+    AIM_PX,
+    AIMS,
+    BITS,
+    ERROR_COLUMNS,
+    FRAME_PX,
+    JUDGE,
+    STARS,
+    WAYS,
+    code_errors,
+    error_cells,
+    response_of,
+    star_field,
+    study_frames,
+)
 from hilstar.tracker.centroiders import FAMILY
 from hilstar.tracker.star_errors import StarErrors
 from hilstar.units import flux_ratio

@@ -10,8 +10,7 @@ import argparse
 import numpy as np
 
 from hilstar.study.speed.benchmark import Plan, run
-from hilstar.study.speed.report import lines
-from hilstar.study.speed.result import REFERENCE_PX
+from hilstar.study.speed.report import REFERENCE_PX, lines
 
 
 def main() -> None:

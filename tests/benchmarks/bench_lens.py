@@ -19,9 +19,8 @@ from hilstar.bench.build import open_bench
 from hilstar.bench.frame import Bench
 from hilstar.rotation import from_radec_roll_deg
 from hilstar.scene.camera import Lens, ResidualField, bounded
-from hilstar.study.speed.benchmark import RADEC_ROLL_DEG, own_bench_file
-from hilstar.study.speed.result import REFERENCE_PX
-from hilstar.study.speed.scenes import scene
+from hilstar.study.speed.benchmark import RADEC_ROLL_DEG, own_bench_file, scene
+from hilstar.study.speed.report import REFERENCE_PX
 
 DEGREE, TERMS = 6, 28
 MARGIN_PX = 10.0

@@ -6,10 +6,9 @@ import os
 import subprocess
 import sys
 
-from hilstar.study.chain.verdict import headline
-from hilstar.study.shared.other_work import BUSY_SHARE, OtherWork, busy_line, is_busy
-from hilstar.study.speed.report import lines
-from hilstar.study.speed.result import Aim, Machine, Result
+from hilstar.study.chain.run import headline
+from hilstar.study.settings import BUSY_SHARE, OtherWork, busy_line, is_busy
+from hilstar.study.speed.report import Aim, Machine, Result, lines
 from tests.support.waiting import wait_for
 
 CORES = os.cpu_count() or 1

@@ -16,14 +16,10 @@ from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.rotation import direction_of
 from hilstar.scene.camera import Camera
 from hilstar.sky.electrons import tabulate
-from hilstar.study.stability import attitude as stability_attitude
-from hilstar.study.stability import codes as stability_codes
 from hilstar.study.stability import field as stability_field
 from hilstar.study.stability import image as stability_image
-from hilstar.study.stability import popping as stability_popping
 from hilstar.study.stability import run as stability
 from hilstar.study.stability import sky as stability_sky
-from hilstar.study.stability import tracker as stability_tracker
 from hilstar.study.stability.failure_case import FailureCase, Figures
 from tests.support.commands import run_hilstar_here
 from tests.support.pictures import assert_drawn, table
@@ -103,7 +99,7 @@ def averaged(_model, optics, photometry):
     return tabulate("ags", optics, photometry)
 
 
-code_fluxes = stability_popping.moving_code_fluxes
+code_fluxes = stability_field.moving_code_fluxes
 
 
 def rounded(_quantisation):
@@ -111,42 +107,42 @@ def rounded(_quantisation):
 
 
 def rounded_codes(scene):
-    return stability_codes.codes_of(scene, "round")
+    return stability_image.codes_of(scene, "round")
 
 
 JUDGED_CODES = (
-    stability_codes.stars_half_off,
-    stability_codes.stars_a_pixel_apart,
-    stability_codes.narrow_codes,
-    stability_codes.uneven_panel,
-    stability_codes.two_bits,
-    stability_codes.sixteen_bits,
+    stability_image.stars_half_off,
+    stability_image.stars_a_pixel_apart,
+    stability_image.narrow_codes,
+    stability_image.uneven_panel,
+    stability_image.two_bits,
+    stability_image.sixteen_bits,
 )
 
 
 def taken_as_it_is(_message):
-    return AttitudeSample(1, stability_attitude.START)
+    return AttitudeSample(1, stability_field.START)
 
 
 # What a place would say if hilstar did as the method that fails there: the module's road is replaced by it.
 WRONG_ROADS = (
-    (stability_attitude.two_signs, "slerp", stability_attitude.arccos_slerp),
-    (stability_attitude.antipodal, "slerp", stability_attitude.arccos_slerp),
-    (stability_attitude.half_turn, "slerp", stability_attitude.straight_line),
-    (stability_attitude.not_a_number, "decode", taken_as_it_is),
+    (stability_field.two_signs, "slerp", stability_field.arccos_slerp),
+    (stability_field.antipodal, "slerp", stability_field.arccos_slerp),
+    (stability_field.half_turn, "slerp", stability_field.straight_line),
+    (stability_field.not_a_number, "decode", taken_as_it_is),
     (stability_field.motion_at_pole, "unit_vectors_icrs", by_right_ascension),
     (stability_field.stars_behind, "monitor_camera", weak_camera),
     (stability_field.weak_perspective, "monitor_camera", weak_camera),
     (stability_image.narrow_star, "by_renderer", rendered_by(stability_image.point_sampled)),
-    (stability_popping.popping, "by_renderer", rendered_by(stability_image.point_sampled)),
+    (stability_field.popping, "by_renderer", rendered_by(stability_image.point_sampled)),
     (stability_image.wide_star, "by_renderer", rendered_by(stability_image.half_float)),
     (stability_image.negative_wings, "by_renderer", rendered_by(stability_image.bare_polynomial)),
     (stability_image.star_on_pixel_edge, "by_renderer", rendered_by(stability_image.nearest_pixel)),
     (stability_image.star_on_image_edge, "by_renderer", rendered_by(stability_image.nearest_pixel)),
-    (stability_popping.popping_codes, "moving_code_fluxes", rounded),
+    (stability_field.popping_codes, "moving_code_fluxes", rounded),
     *((visit, "exact_codes", rounded_codes) for visit in JUDGED_CODES),
     (stability_sky.temperature_range, "tabulate", averaged),
-    (stability_tracker.nan_pixel, "find_stars", len),
+    (stability_sky.nan_pixel, "find_stars", len),
 )
 
 
@@ -165,11 +161,11 @@ def test_the_polynomial_of_the_shader_is_the_shader_s():
 
 def test_the_chart_of_popping_shows_what_its_title_says(study):
     rows = table(study[0] / "popping.csv")
-    assert len(rows) == stability_popping.STEPS
+    assert len(rows) == stability_field.STEPS
     spread = {
         name: np.ptp([float(row[f"{name} [mag]"]) for row in rows]) for name in ("linear image", "codes, exact", "codes, round")
     }
-    assert spread["linear image"] <= stability_popping.RIPPLE < spread["codes, exact"] < spread["codes, round"]
+    assert spread["linear image"] <= stability_field.RIPPLE < spread["codes, exact"] < spread["codes, round"]
 
 
 def test_weak_perspective_errs_by_half_the_angle_cubed():

@@ -6,9 +6,7 @@ import csv
 
 import pytest
 
-from hilstar.study.bodies.cost import SCENES
-from hilstar.study.bodies.run import QUICK_BENCHES, run
-from hilstar.study.bodies.size import PHASES_DEG, QUICK_RADII_PX
+from hilstar.study.bodies import PHASES_DEG, QUICK_BENCHES, QUICK_RADII_PX, SCENES, run
 
 
 @pytest.fixture(scope="module")

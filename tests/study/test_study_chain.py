@@ -15,18 +15,11 @@ from hilstar import charts
 from hilstar.bench.bench_file import bench_file_of
 from hilstar.errors import InputError
 from hilstar.render.reference import linear_image
-from hilstar.study.chain import chart, motion, panel, run, scenes
-from hilstar.study.chain.bench_parts import Parts
-from hilstar.study.chain.budget import error_budget
-from hilstar.study.chain.combinations import Combination
-from hilstar.study.chain.front import Point, beaters, front
-from hilstar.study.chain.measuring import Plan, SceneMeasurement
-from hilstar.study.chain.motion import lead_ns
-from hilstar.study.chain.scenes import Scene, five_scenes
-from hilstar.study.chain.table import Row
-from hilstar.study.chain.tracker import MATCH_PX, Tracker, off
-from hilstar.study.chain.true_light import add_light, points
-from hilstar.study.chain.verdict import NOT_JUDGED
+from hilstar.study.chain import choices, run
+from hilstar.study.chain.choices import Combination, Parts, Scene, five_scenes, lead_ns
+from hilstar.study.chain.measuring import Plan, SceneMeasurement, error_budget
+from hilstar.study.chain.run import NOT_JUDGED, Point, Row, beaters, front
+from hilstar.study.chain.tracker import MATCH_PX, Tracker, add_light, off, points
 from hilstar.units import ARCSEC_PER_RAD, MAG_PER_RELATIVE, NS_PER_S
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.figures import assert_legible
@@ -75,7 +68,7 @@ def parts(tmp_path_factory):
 
 
 def scene_of(parts, number: int) -> SceneMeasurement:
-    """One of the small bench's scenes."""
+    """One of the small bench's choices."""
     benches, tracker = parts
     return SceneMeasurement(benches, tracker, five_scenes(benches.own)[number], PLAN)
 
@@ -147,7 +140,7 @@ def test_the_budget_adds_up_to_the_whole_error_of_auto(study):
 
 
 def test_the_sky_itself_is_measured_where_the_stars_are(parts, monkeypatch):
-    monkeypatch.setattr(motion, "JITTER", ())
+    monkeypatch.setattr(choices, "JITTER", ())
     for number, limit_px in ((1, FLOOR_PX), (3, PATH_FLOOR_PX)):
         (judge,) = scene_of(parts, number).judges
         true = judge.true[judge.judged]
@@ -158,7 +151,7 @@ def test_the_sky_itself_is_measured_where_the_stars_are(parts, monkeypatch):
 
 def test_light_of_all_sprites_at_once_is_the_oracle_s(parts):
     bench = parts[0].own
-    sprites, sigma_px = points(bench, scenes.five_scenes(bench)[1].q_icrs_to_cam), bench.config.render.sprite_sigma_px
+    sprites, sigma_px = points(bench, choices.five_scenes(bench)[1].q_icrs_to_cam), bench.config.render.sprite_sigma_px
     image = np.zeros(bench.camera.resolution_px[::-1])
     add_light(image, sprites, sigma_px)
     expected = linear_image(sprites, bench.camera.resolution_px, sigma_px)
@@ -166,25 +159,25 @@ def test_light_of_all_sprites_at_once_is_the_oracle_s(parts):
 
 
 def test_a_held_attitude_is_late_by_its_age_its_row_and_half_a_frame(parts, monkeypatch):
-    monkeypatch.setattr(motion, "JITTER", ())
+    monkeypatch.setattr(choices, "JITTER", ())
     scene, bench = scene_of(parts, 3), parts[0].own
     (judge,) = scene.judges
-    sample_ns, lead = NS_PER_S // motion.PACKET_HZ, lead_ns(bench.config)
+    sample_ns, lead = NS_PER_S // choices.PACKET_HZ, lead_ns(bench.config)
     ages_ns = [light - (light - lead) // sample_ns * sample_ns for light in judge.seen.light_ns]
     age_s = np.average(ages_ns, weights=judge.seen.weights.mean(axis=(1, 2))) / NS_PER_S
     true = judge.true[judge.judged]
     row_s = bench.scan.late_s(*bench.camera.project(true @ bench.camera.cam_to_image.T), bench.camera.resolution_px)
     late_s = age_s + row_s + bench.scan.hold_s / 2
-    expected = np.sqrt(np.mean((3600 * late_s * np.linalg.norm(np.cross(true, motion.AXIS), axis=1)) ** 2))
+    expected = np.sqrt(np.mean((3600 * late_s * np.linalg.norm(np.cross(true, choices.AXIS), axis=1)) ** 2))
     held = Combination("exact", False, parts[0].faintest_v_mag, "full", "point", "held")
     assert scene.error(held).arcsec == pytest.approx(expected, rel=LATE_SHARE)
 
 
 def test_a_star_that_runs_with_the_scan_loses_no_light(parts, monkeypatch):
-    monkeypatch.setattr(motion, "JITTER", ())
+    monkeypatch.setattr(choices, "JITTER", ())
     scene, bench = scene_of(parts, 4), parts[0].own
     (judge,) = scene.judges
-    moved_px = math.radians(10.0) * motion.AXIS[0] * bench.camera.focal_length_px
+    moved_px = math.radians(10.0) * choices.AXIS[0] * bench.camera.focal_length_px
     share = moved_px * bench.scan.scanout_s / bench.camera.resolution_px[1]
     # A star of equal light in each frame would be too faint by that share; what is left is its part of the ends' frames.
     ends = share * bench.scan.hold_s / judge.seen.length_s
@@ -205,8 +198,8 @@ def test_a_star_that_is_lost_is_no_nearer_than_one_that_is_found_late(parts):
 
 def test_a_long_exposure_is_said_to_be_measured_in_part(study, tmp_path):
     with Parts(small_file(tmp_path, SMALL.replace("aperture_mm", "exposure_s = 3.5\naperture_mm"))) as long:
-        said = panel.shortened_line(long.own)
-        seen = panel.exposure(long.own, 20)
+        said = choices.shortened_line(long.own)
+        seen = choices.exposure(long.own, 20)
     assert said == "exposures of 16 refreshes, 0.267 s, in the place of [tracker] exposure_s = 3.5"
     assert seen.length_s == pytest.approx(16 / 60)
     told, out = study
@@ -236,7 +229,7 @@ def test_the_chart_names_its_front_and_what_is_chosen(monkeypatch, tmp_path, pla
     rows += [planted(time_ms=time_ms * k, error_arcsec=error, chosen=name) for name, k in (("default", 1), ("auto", 1.01))]
     kept = []
     monkeypatch.setattr(charts, "save", lambda figure, path: kept.append(figure))
-    chart.draw(tmp_path / "c", rows, "A finding", "a machine")
+    run.draw(tmp_path / "c", rows, "A finding", "a machine")
     (figure,) = kept
     assert_legible(figure)
     names = [text.get_text() for text in figure.axes[0].texts]
@@ -248,7 +241,7 @@ def test_the_chart_names_its_front_and_what_is_chosen(monkeypatch, tmp_path, pla
 def test_scenes_that_are_alike_are_drawn_once():
     rates = {"average field": (0.0, 0.23), "dense field": (0.0, 0.24), "faint field": (0.0, 0.9), "1 deg/s": (1.0, 0.25)}
     rows = [planted(scene=name, rate_deg_s=rate, error_arcsec=error, chosen="auto") for name, (rate, error) in rates.items()]
-    assert chart.differing(rows) == {"average field": ["dense field"], "faint field": [], "1 deg/s": []}
+    assert run.differing(rows) == {"average field": ["dense field"], "faint field": [], "1 deg/s": []}
 
 
 def test_a_point_is_beaten_by_one_that_is_no_worse_and_no_slower():

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from hilstar import charts
 from hilstar.study.economy import Comparison, Outcome, economy_finding
 from hilstar.study.speed import report as benchmark_report
-from hilstar.study.speed.result import Machine, Result, Spread, Timing
+from hilstar.study.speed.report import Machine, Result, Spread, Timing
 from hilstar.tracker.centroiders import FAMILY
 from hilstar.twin.budget import CENTROID_LIMIT_PX, FLUX_LIMITS_MAG, budget, write_report
 from tests.support.figures import assert_legible

@@ -16,11 +16,8 @@ from hilstar.sky import electrons
 from hilstar.sky.catalog import load_catalog
 from hilstar.sky.electrons import Photometry, load_library, tabulate, tabulate_pickles
 from hilstar.sky.spectrum import DATA_DIR
-from hilstar.study.models.choices import running_percentiles
-from hilstar.study.models.rapp import rapp_ratios
-from hilstar.study.models.temperatures import torres2010_k
-from hilstar.study.models.zero_points import zero_points
-from hilstar.study.shared.brightness import held_out_errors, study_optics
+from hilstar.study.models import rapp_ratios, running_percentiles, torres2010_k, zero_points
+from hilstar.study.settings import held_out_errors, study_optics
 from tests.support.commands import run_hilstar_here
 from tests.support.waiting import PATIENCE_S
 
@@ -306,8 +303,8 @@ def test_a_title_is_whole_in_even_lines():
 
 def test_matplotlib_is_imported_by_a_drawing_and_pyplot_by_none():
     code = (
-        "import sys, tempfile; from pathlib import Path; from hilstar.study.models import run;"
+        "import sys, tempfile; from pathlib import Path; from hilstar.study import models;"
         "assert 'matplotlib' not in sys.modules;"
-        "run.zero_points(Path(tempfile.mkdtemp())); assert 'matplotlib.pyplot' not in sys.modules"
+        "models.zero_points(Path(tempfile.mkdtemp())); assert 'matplotlib.pyplot' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=PATIENCE_S)

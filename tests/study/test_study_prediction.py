@@ -12,7 +12,7 @@ from PIL import Image
 
 from hilstar.charts import read_records
 from hilstar.study.prediction import LATENCIES_MS, RATES_HZ, USUAL_HZ, USUAL_MS, Outcome, Shaken, crossing_hz, run
-from hilstar.study.shared.predictors import SLEW_DEG, SLEW_S
+from hilstar.study.predictors import SLEW_DEG, SLEW_S
 
 
 @pytest.fixture(scope="module")

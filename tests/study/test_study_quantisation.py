@@ -10,8 +10,8 @@ from PIL import Image
 
 from hilstar.monitor.phases import SIGMA_PX, fainter, measure, phase_grid
 from hilstar.render.reference import linear_image
+from hilstar.study.codes import AIMS, BITS, WAYS
 from hilstar.study.quantisation import run
-from hilstar.study.shared.codes import AIMS, BITS, WAYS
 from hilstar.tracker.centroiders import FAMILY
 
 # Of the error of `round` that `exact` leaves, by each centroider: 0.18 to 0.48 on 8 x 8 phases, 64 stars.

@@ -10,11 +10,8 @@ from PIL import Image
 
 from hilstar.run.sync.beat import ARCSEC_PER_DEG, Exposures, seen_at
 from hilstar.scene.frame_motion import Scan
-from hilstar.study.timing import run as timing
-from hilstar.study.timing.beat import QUICK_CASES
-from hilstar.study.timing.panel import WAYS, ScanningPanel, Sky, frame_weights
-from hilstar.study.timing.run import QUICK_RATES_DEG_S, compare, measure
-from hilstar.study.timing.slew import Slew
+from hilstar.study import timing
+from hilstar.study.timing import QUICK_CASES, QUICK_RATES_DEG_S, WAYS, ScanningPanel, Sky, Slew, compare, frame_weights, measure
 from tests.support.pictures import assert_drawn, table
 
 GAIN = 20  # compensated against not: the issue's own figure

@@ -17,12 +17,11 @@ from hilstar.scene.psf import MAX_CUT
 from hilstar.sky.electrons import TABLE_DEGREE
 from hilstar.sky.spectrum import Curve
 from hilstar.sky.stars import CELL_DEG
-from hilstar.study.shared.codes import star_field
+from hilstar.study.codes import star_field
 from hilstar.study.tradeoff import run as tradeoff
 from hilstar.study.tradeoff import table as tradeoff_table
-from hilstar.study.tradeoff.brightness import trapezoid
-from hilstar.study.tradeoff.demo import SIGMA_PX
-from hilstar.study.tradeoff.depth import LIMITS_V_MAG
+from hilstar.study.tradeoff.light import LIMITS_V_MAG, trapezoid
+from hilstar.study.tradeoff.places import SIGMA_PX
 from hilstar.study.tradeoff.run import STEPS, draw, table_lines
 from hilstar.study.tradeoff.table import MIN_ROUNDS, Figure, Trial, Trials, interleaved, measured, pareto_front
 

@@ -1,4 +1,4 @@
-"""What a tracker sees of dots on a bench of traced rays (hilstar.study.geometry.doublet), in any pose, with any loss."""
+"""What a tracker sees of dots on a bench of traced rays (hilstar.study.geometry), in any pose, with any loss."""
 
 from __future__ import annotations
 
@@ -10,9 +10,8 @@ from hilstar.arrays import FloatArray
 from hilstar.calibrate.geometric.dots import DotPlan
 from hilstar.calibrate.geometric.observed import Observed
 from hilstar.scene.camera import Camera
-from hilstar.study.geometry.doublet import TracedBench, turned
-from hilstar.study.geometry.observed_dots import Faults
-from hilstar.study.geometry.observed_dots import observed_dots as dots_seen
+from hilstar.study.geometry import Faults, TracedBench, turned
+from hilstar.study.geometry import observed_dots as dots_seen
 
 __all__ = ["TracedBench", "observed_dots", "turned"]
 

@@ -1,30 +1,138 @@
-"""Every combination of a scene measured: its error over some exposures, and its time in turn with all others."""
+"""The study of the chain measured: each combination's error over some exposures, its time in turn with all others, its budget.
+
+A frame goes from the sender's samples to codes, and an exposure gathers their light. For the budget, steps are added one by
+one to a display that does everything exactly, in the order of the chain. Each is charged with what it changes in the measured
+stars; together they are the whole error, star by star. Cut sprites come last, because codes leave their cut dark: earlier it
+would be charged to both.
+"""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hilstar.rotation import propagate
-from hilstar.study.chain.bench_parts import Marks, Parts
-from hilstar.study.chain.combinations import Combination, combinations
-from hilstar.study.chain.drawing import STAGES, Chain, Stopwatch
-from hilstar.study.chain.motion import Movement
-from hilstar.study.chain.panel import exposure
-from hilstar.study.chain.scenes import Scene
-from hilstar.study.chain.tracker import Judge, Off, Tracker, attitude_off_arcsec, off
-from hilstar.units import ERROR_OF_MEDIAN
+from hilstar.arrays import FloatArray
+from hilstar.attitude.clock.timeline import Attitude, Timeline
+from hilstar.bench.frame import Bench, Drawn
+from hilstar.rotation import propagate, to_matrix
+from hilstar.scene.frame_motion import Turn, swept_sprites
+from hilstar.scene.sprites import Sprites, make_sprites
+from hilstar.sky.stars import Stars
+from hilstar.study.chain.choices import (
+    Combination,
+    Exposure,
+    Lit,
+    Marks,
+    Movement,
+    Parts,
+    Scene,
+    attitude_at,
+    combinations,
+    exposure,
+    filled_timeline,
+    lead_ns,
+)
+from hilstar.study.chain.tracker import Judge, Measured, Off, Tracker, attitude_off_arcsec, linear_light, off
+from hilstar.units import ERROR_OF_MEDIAN, NS_PER_S
 
+STAGES = ("prediction", "sprites", "drawing and codes", "read-back")
+# Each frame that is timed has an attitude of its own, as a sender's have: nothing can be kept from the frame before.
+NUDGE_RAD = np.array([1e-7, 1e-7, 0.0])
 FIRST_FRAMES = (20, 151, 325)  # of the exposures: apart by no whole number of cycles of `temporal` or of the jitter
 PHASE_STEP_PX = (3.37, 4.71)  # of the tracker, from exposure to exposure
 SIGMAS_IN_IQR = 1.349  # of a normal distribution
 FRAMES_A_VISIT = 2
 MIN_ROUNDS, MAX_ROUNDS = 4, 60
 SEED = 1
+STEPS = ("refresh", "prediction", "smear", "depth", "codes", "sprites")
+RSS, WHOLE = "rss", "whole"
+
+
+@dataclass(frozen=True, slots=True)
+class Chain:
+    """A combination on its bench, before a moving sky."""
+
+    combination: Combination
+    bench: Bench
+    movement: Movement
+
+    def attitude(self, light_ns: int) -> Attitude:
+        """The attitude for a frame's light, by the samples that are there when the frame is begun."""
+        samples = self.movement.samples(light_ns - lead_ns(self.bench.config))
+        timeline = filled_timeline(samples, self.combination.prediction, self.bench.config.attitude)
+        return attitude_at(timeline, light_ns)
+
+    def rate(self, attitude: Attitude) -> FloatArray | None:
+        """The rate by which stars are drawn along their paths, None for points."""
+        return attitude.rate_cam_rad_s if self.combination.smear == "path" else None
+
+    def draw(self, number: int, light_ns: int) -> Drawn:
+        """Draw the frame of a moment of light."""
+        attitude = self.attitude(light_ns)
+        return self.bench.draw(attitude.q_icrs_to_cam, number, self.rate(attitude))
+
+    def lit(self, number: int, light_ns: int) -> Lit:
+        """The pixels that a frame's codes light, and their light."""
+        levels, panel = self.draw(number, light_ns).levels.ravel(), self.bench.panel
+        place = np.flatnonzero(levels)
+        light = panel.response.light[levels[place]] * panel.flux_at_white_e_per_s
+        return place, light if panel.uniformity is None else light * panel.uniformity.ravel()[place]
+
+    def exposed(self, seen: Exposure) -> FloatArray:
+        """The mean light (H, W) over an exposure; one frame of a sky at rest stands for all that are like it."""
+        alike = not self.movement.turns and self.combination.quantisation != "temporal"
+        return (seen.at_rest if alike else seen.mean)(self.lit, self.bench.camera.resolution_px)
+
+
+class Stopwatch:
+    """Times a chain's frames one after the other, from the samples to the codes in memory."""
+
+    def __init__(self, chain: Chain) -> None:
+        self._chain = chain
+        self._lead_ns = lead_ns(chain.bench.config)
+        self._period_ns = round(NS_PER_S / chain.bench.config.monitor.refresh_hz)
+        self._number = 0
+
+    def frame_ms(self) -> tuple[float, float]:
+        """Wall and processor time of the next frame, ms."""
+        chain, (timeline, light_ns, number) = self._chain, self._next()
+        begin, begin_cpu = time.perf_counter(), time.process_time()
+        attitude = attitude_at(timeline, light_ns)
+        _ = chain.bench.draw(attitude.q_icrs_to_cam, number, chain.rate(attitude)).levels
+        return (time.perf_counter() - begin) * 1e3, (time.process_time() - begin_cpu) * 1e3
+
+    def stages_ms(self) -> tuple[float, ...]:
+        """The next frame's time by STAGES, with a wait for the GPU before its codes are read."""
+        chain, (timeline, light_ns, number) = self._chain, self._next()
+        bench = chain.bench
+        marks = [time.perf_counter()]
+        attitude = attitude_at(timeline, light_ns)
+        marks.append(time.perf_counter())
+        sprites = bench.frame_sprites(attitude.q_icrs_to_cam, chain.rate(attitude))
+        marks.append(time.perf_counter())
+        drawn = bench.draw_sprites(sprites, number)
+        bench.renderer.context.finish()
+        marks.append(time.perf_counter())
+        _ = drawn.levels
+        marks.append(time.perf_counter())
+        return tuple((np.diff(marks) * 1e3).tolist())
+
+    def _next(self) -> tuple[Timeline, int, int]:
+        """The timeline of the next frame, its moment of light, and its number."""
+        self._number += 1
+        chain = self._chain
+        light_ns = NS_PER_S + self._number * self._period_ns
+        own = propagate(chain.movement.q_icrs_to_cam, NUDGE_RAD, self._number)
+        samples = replace(chain.movement, q_icrs_to_cam=own).samples(light_ns - self._lead_ns)
+        return (
+            filled_timeline(samples, chain.combination.prediction, chain.bench.config.attitude),
+            light_ns,
+            self._number,
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,3 +290,70 @@ def _times(spent: np.ndarray) -> Times:
     low, middle, high = np.percentile(spent[:, 0], (25, 50, 75))
     noise = ERROR_OF_MEDIAN * (high - low) / SIGMAS_IN_IQR / math.sqrt(len(spent))
     return Times(float(middle), float(high - low), float(noise), float(np.median(spent[:, 1])), len(spent))
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """What a step adds to the error, rms arcsec and mag; the last two are the steps' root sum of squares, and the whole."""
+
+    step: str
+    arcsec: float
+    mag: float
+
+
+def error_budget(scene: SceneMeasurement, combination: Combination) -> list[Part]:
+    """The parts of a combination's error by STEPS, then RSS and WHOLE."""
+    found = [[judge.sky, *_measured(scene, combination, number)] for number, judge in enumerate(scene.judges)]
+    parts = []
+    for k, step in enumerate(STEPS):
+        off_by = [off(judge, one[k + 1], one[k]) for judge, one in zip(scene.judges, found, strict=True)]
+        parts.append(Part(step, *pooled(off_by)))
+    rss = [float(np.sqrt(sum(getattr(part, name) ** 2 for part in parts))) for name in ("arcsec", "mag")]
+    whole = pooled([off(judge, one[-1], one[0]) for judge, one in zip(scene.judges, found, strict=True)])
+    return [*parts, Part(RSS, *rss), Part(WHOLE, *whole)]
+
+
+def _measured(scene: SceneMeasurement, combination: Combination, number: int) -> Iterator[Measured]:
+    """The stars of an exposure after each of STEPS."""
+    judge = scene.judges[number]
+    for light in _lights(scene, combination, number):
+        yield judge.measure(scene.tracker.image_e(light, judge.seen))
+
+
+def _lights(scene: SceneMeasurement, combination: Combination, number: int) -> Iterator[FloatArray]:
+    """The mean light (H, W) of an exposure after each of STEPS."""
+    chain, seen = scene.chain(combination, number), scene.judges[number].seen
+    movement = chain.movement
+    bench, every = chain.bench, scene.parts.own.stars
+
+    def exposed(light_of: Callable[[int, int], Lit]) -> FloatArray:
+        return (seen.mean if movement.turns else seen.at_rest)(light_of, bench.camera.resolution_px)
+
+    def true(_: int, light_ns: int) -> Lit:
+        turn = Turn(movement.at(light_ns), movement.rate_rad_s(light_ns))
+        return linear_light(bench, _sprites(bench, every, turn, movement.turns))
+
+    def shown_as(stars: Stars, along_paths: bool) -> FloatArray:
+        def light_of(_: int, light_ns: int) -> Lit:
+            attitude = chain.attitude(light_ns)
+            rate = attitude.rate_cam_rad_s
+            turn = Turn(attitude.q_icrs_to_cam, np.zeros(3) if rate is None else rate)
+            return linear_light(bench, _sprites(bench, stars, turn, along_paths and rate is not None))
+
+        return exposed(light_of)
+
+    along_paths = movement.turns and combination.smear == "path"
+    yield exposed(true)
+    yield shown_as(every, movement.turns)
+    yield shown_as(every, along_paths)
+    yield shown_as(bench.shown_stars, along_paths)
+    yield scene.chain(replace(combination, sprite="full"), number).exposed(seen)
+    yield chain.exposed(seen)
+
+
+def _sprites(bench: Bench, stars: Stars, turn: Turn, along_paths: bool) -> Sprites:
+    """Whole sprites of stars in a frame, along their paths or as points."""
+    footprint_px, sigma_px = bench.renderer.footprint_px, bench.config.render.sprite_sigma_px
+    if along_paths:
+        return swept_sprites(stars, turn, bench.scan, bench.camera, footprint_px, sigma_px)
+    return make_sprites(stars, bench.camera.cam_to_image @ to_matrix(turn.q_icrs_to_cam), bench.camera, footprint_px)

@@ -1,31 +1,467 @@
-"""The whole frame's error against its time: each combination of a bench's choices, in five scenes of its own sky."""
+"""The study of the whole chain: a frame's error against its time for each combination of a bench's choices, in five scenes.
+
+A combination is on the front unless another of its scene has time and error no larger, and one of them smaller; two that are
+equal in both are both on it. Figures are the table's, rounded as they stand there. `auto` is judged by the run's own noise.
+"""
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+import numpy as np
+
+from hilstar.arrays import BoolArray, FloatArray
 from hilstar.bench.bench_file import BenchFile
+from hilstar.charts import (
+    BLUE,
+    GREEN,
+    INK,
+    ORANGE,
+    PURPLE,
+    RED,
+    capital,
+    chart,
+    name_at_side,
+    two_digits,
+    value_bars,
+    write_records,
+)
 from hilstar.errors import InputError
 from hilstar.files import make_directory
-from hilstar.study.chain.bench_parts import Parts
-from hilstar.study.chain.budget import error_budget
-from hilstar.study.chain.chart import draw, draw_budget
-from hilstar.study.chain.measuring import QUICK, Plan, SceneMeasurement
-from hilstar.study.chain.panel import shortened_line
-from hilstar.study.chain.scenes import five_scenes
-from hilstar.study.chain.table import BudgetRow, Row, StageRow, budget_rows, rows_of, stage_rows, write_tables
+from hilstar.study.chain.choices import QUANTISATIONS, Parts, five_scenes, shortened_line
+from hilstar.study.chain.measuring import QUICK, RSS, WHOLE, Outcome, Part, Plan, SceneMeasurement, StageTime, error_budget
 from hilstar.study.chain.tracker import Tracker
-from hilstar.study.chain.verdict import headline, is_right, scene_line
-from hilstar.study.shared.other_work import OtherWork, busy_line, is_busy
+from hilstar.study.settings import OtherWork, busy_line, is_busy
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+DIGITS, MS_PLACES = 4, 4
+AUTO, DEFAULT = "auto", "default"
+MAX_REASONS = 2
+NOT_JUDGED = "the times were taken on a busy machine: no combination is named the faster"
+COLOURS: dict[str, str] = dict(zip(QUANTISATIONS, (PURPLE, ORANGE, GREEN, BLUE), strict=True))
+PANEL_INCH, BARS_INCH, TITLE_INCH = 2.7, 1.5, 1.2
+FLOOR_SHARE = 1e-3  # of the smallest error: what is 0 has a place on a logarithmic axis
+LESS = 0.9  # of the error of the one that was named last: what is worth a name on the front
+ALIKE = 1.5  # scenes of one rate are drawn once where auto's error differs by less than this factor
+WORDS = {"refresh": "panel's refresh", "codes": "quantisation", "sprites": "cut sprites", WHOLE: "all of it"}
+CHOSEN = {DEFAULT: INK, AUTO: RED}
 OUTPUTS = (
     *(f"{name}{ending}" for name in ("chain", "chain_budget") for ending in (".png", ".svg")),
     "chain.csv",
     "chain_budget.csv",
     "chain_time.csv",
 )
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """A combination's time and error, and one sigma of its median time."""
+
+    time_ms: float
+    error: float
+    time_noise_ms: float = 0.0
+
+
+def beaten_by(points: Sequence[Point]) -> BoolArray:
+    """(n, n): whether the point of a row is beaten by that of a column."""
+    time: FloatArray = np.array([point.time_ms for point in points])
+    error: FloatArray = np.array([point.error for point in points])
+    as_good = (time <= time[:, None]) & (error <= error[:, None])
+    better = (time < time[:, None]) | (error < error[:, None])
+    return np.asarray(as_good & better)
+
+
+def front(points: Sequence[Point]) -> list[bool]:
+    """Whether each point is on the front."""
+    return [not row.any() for row in beaten_by(points)]
+
+
+def beyond_noise(point: Point, other: Point) -> bool:
+    """Whether `other`, which beats `point`, is faster by more than three sigmas of the difference of their medians.
+
+    Else their times cannot be told apart, and which of them is on the front is chance, as far as this run knows.
+    """
+    noise_ms = 3 * float(np.hypot(point.time_noise_ms, other.time_noise_ms))
+    return point.time_ms - other.time_ms > noise_ms or not noise_ms
+
+
+def beaters(points: Sequence[Point], which: int) -> tuple[list[int], list[int]]:
+    """The points that beat one of them: those beyond the noise, and those within it."""
+    found = np.flatnonzero(beaten_by(points)[which]).tolist()
+    beyond = [k for k in found if beyond_noise(points[which], points[k])]
+    return beyond, [k for k in found if k not in beyond]
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A combination in a scene; its fields are the columns of `chain.csv`.
+
+    `exposure_s` is what is measured of the tracker's exposure. `error_arcsec`, `error_mag`: rms over the `stars` of all
+    exposures, `lost` of them not found. The fronts are those of `time_ms` against `error_arcsec` and `error_mag`;
+    `on_front_as_filed` that of what effort may choose, against `error_arcsec`: the rows whose `bit_stealing`,
+    `faintest_v_mag` and `prediction` are those of the bench file.
+    """
+
+    scene: str
+    rate_deg_s: float
+    exposure_s: float
+    bits: int
+    bit_stealing: str
+    faintest_v_mag: float
+    sprite: str
+    sprite_px: str
+    smear: str
+    prediction: str
+    quantisation: str
+    stars: int
+    lost: int
+    error_arcsec: float
+    error_mag: float
+    attitude_arcsec: float
+    roll_arcsec: float
+    time_ms: float
+    iqr_ms: float
+    noise_ms: float
+    cpu_ms: float
+    frames: int
+    on_front: str = ""
+    on_front_mag: str = ""
+    on_front_as_filed: str = ""
+    chosen: str = ""
+    as_filed: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class BudgetRow:
+    """A step's part of the error at a scene's `chosen` point; its fields are the columns of `chain_budget.csv`."""
+
+    scene: str
+    chosen: str
+    step: str
+    error_arcsec: float
+    error_mag: float
+
+
+@dataclass(frozen=True, slots=True)
+class StageRow:
+    """A stage's part of the time at a scene's `chosen` point; its fields are the columns of `chain_time.csv`."""
+
+    scene: str
+    chosen: str
+    stage: str
+    time_ms: float
+
+
+def said(flag: bool) -> str:
+    """A flag as the table has it."""
+    return "true" if flag else "false"
+
+
+def rounded(value: float) -> float:
+    """A figure with the table's digits."""
+    return float(f"{value:.{DIGITS}g}") if math.isfinite(value) else value
+
+
+def rows_of(scene: SceneMeasurement, outcomes: Sequence[Outcome]) -> list[Row]:
+    """The rows of a scene, the fastest first."""
+    rows = sorted((_row(scene, one) for one in outcomes), key=lambda row: (row.time_ms, row.error_arcsec))
+    by_arcsec, by_mag = (front(points(rows, name)) for name in ("error_arcsec", "error_mag"))
+    filed = [k for k, row in enumerate(rows) if left_to_effort(row, rows[auto_of(rows)])]
+    as_filed = dict(zip(filed, front(points([rows[k] for k in filed], "error_arcsec")), strict=True))
+    return [
+        replace(row, on_front=said(a), on_front_mag=said(m), on_front_as_filed=said(as_filed.get(k, False)))
+        for k, (row, a, m) in enumerate(zip(rows, by_arcsec, by_mag, strict=True))
+    ]
+
+
+def points(rows: Sequence[Row], error: str) -> list[Point]:
+    """The rows as points, by `error_arcsec` or `error_mag`."""
+    return [Point(row.time_ms, getattr(row, error), row.noise_ms) for row in rows]
+
+
+def auto_of(rows: Sequence[Row]) -> int:
+    """The place of the row that `effort = "auto"` takes."""
+    return next(k for k, row in enumerate(rows) if AUTO in row.chosen)
+
+
+def left_to_effort(row: Row, own: Row) -> bool:
+    """Whether a row has what the bench file and its sender say as `auto` has it."""
+    given = ("bit_stealing", "faintest_v_mag", "prediction")
+    return all(getattr(row, name) == getattr(own, name) for name in given)
+
+
+def beating(rows: Sequence[Row], as_filed: bool = False) -> tuple[list[Row], list[Row]]:
+    """The rows that beat `auto` by arcsec and time, beyond the noise and within it; only those that effort may choose."""
+    own = rows[auto_of(rows)]
+    kept = [row for row in rows if not as_filed or left_to_effort(row, own)]
+    beyond, within = beaters(points(kept, "error_arcsec"), kept.index(own))
+    return [kept[k] for k in beyond], [kept[k] for k in within]
+
+
+def write_tables(directory: Path, rows: Sequence[Row], budgets: Sequence[BudgetRow], stages: Sequence[StageRow]) -> None:
+    """Write `chain.csv`, `chain_budget.csv` and `chain_time.csv`. Raises InputError."""
+    for name, records in (("chain", rows), ("chain_budget", budgets), ("chain_time", stages)):
+        write_records(directory / f"{name}.csv", records)
+
+
+def budget_rows(scene: str, parts: Sequence[Part]) -> list[BudgetRow]:
+    """An error budget's rows."""
+    return [BudgetRow(scene, AUTO, part.step, rounded(part.arcsec), rounded(part.mag)) for part in parts]
+
+
+def stage_rows(scene: str, times: Sequence[StageTime]) -> list[StageRow]:
+    """A time budget's rows."""
+    return [StageRow(scene, AUTO, one.stage, round(one.ms, MS_PLACES)) for one in times]
+
+
+def _row(scene: SceneMeasurement, one: Outcome) -> Row:
+    own, marks, error, times = one.combination, scene.marks, one.error, one.times
+    marked = [name for name, at in ((DEFAULT, marks.default), (AUTO, marks.auto)) if own == at]
+    return Row(
+        scene=scene.scene.name,
+        rate_deg_s=scene.scene.rate_deg_s,
+        exposure_s=rounded(scene.judges[0].seen.length_s),
+        bits=scene.parts.own.config.monitor.bits,
+        bit_stealing=said(own.bit_stealing),
+        faintest_v_mag=own.faintest_v_mag,
+        sprite=own.sprite,
+        sprite_px=one.sprite_px,
+        smear=own.smear,
+        prediction=own.prediction,
+        quantisation=own.quantisation,
+        stars=error.stars,
+        lost=error.lost,
+        error_arcsec=rounded(error.arcsec),
+        error_mag=rounded(error.mag),
+        attitude_arcsec=rounded(error.attitude_arcsec),
+        roll_arcsec=rounded(error.roll_arcsec),
+        time_ms=round(times.median_ms, MS_PLACES),
+        iqr_ms=round(times.iqr_ms, MS_PLACES),
+        noise_ms=round(times.noise_ms, MS_PLACES),
+        cpu_ms=round(times.cpu_ms, MS_PLACES),
+        frames=times.frames,
+        chosen=" ".join(marked),
+        as_filed=said(own == marks.as_filed),
+    )
+
+
+def scene_line(rows: Sequence[Row], budget: Sequence[BudgetRow], stages: Sequence[StageRow], busy: bool = False) -> str:
+    """What `auto` takes in a scene and is off by, whether it is on the front, and what its error and time are made of."""
+    own, stands = rows[auto_of(rows)], NOT_JUDGED if busy else standing(rows)
+    steps = [part for part in budget if part.step not in (RSS, WHOLE)]
+    largest, longest = max(steps, key=lambda part: part.error_arcsec), max(stages, key=lambda one: one.time_ms)
+    share = longest.time_ms / max(sum(one.time_ms for one in stages), 1e-9)
+    return (
+        f"{own.scene}: {AUTO} ({words(own)}) is {own.error_arcsec:.3g} arcsec and {own.error_mag:.2g} mag off over"
+        f" {own.stars} stars{f', {own.lost} of them lost' if own.lost else ''}, in {own.time_ms:.3g} ms; {stands};"
+        f" error: {largest.step} {largest.error_arcsec:.2g} arcsec; time: {longest.stage} {share:.0%}"
+    )
+
+
+def headline(rows: Sequence[Row], busy: bool = False) -> str:
+    """What the whole table says of `auto`; nothing on a `busy` machine."""
+    if busy:
+        return f"The errors hold; {NOT_JUDGED}"
+    scenes = [[row for row in rows if row.scene == name] for name in dict.fromkeys(row.scene for row in rows)]
+    beaten = [own[0].scene for own in scenes if beating(own)[0]]
+    where = f"in {len(scenes) - len(beaten)} of {len(scenes)} scenes"
+    said = f", not in {', '.join(beaten)}" if beaten else ""
+    return f'The choice of effort = "auto" is on the front of error against time, or within its noise, {where}{said}'
+
+
+def is_right(rows: Sequence[Row]) -> bool:
+    """Whether `auto` is on the front of what effort may choose, or within the noise of it."""
+    return not beating(rows, as_filed=True)[0]
+
+
+def standing(rows: Sequence[Row]) -> str:
+    """Whether `auto` is on the front of all, or within the noise of it; else what beats it, why, and how it is without that."""
+    beyond, within = beating(rows)
+    own = rows[auto_of(rows)]
+    if not beyond:
+        return f"on the front within the noise: {_compared(own, _nearest(within))}" if within else "on the front"
+    best = _nearest(beyond)
+    said = f"not on the front: {_compared(own, best)}: {why_not(own, best)}"
+    if best in (own_beyond := beating(rows, as_filed=True)[0]):
+        return said
+    if own_beyond:
+        nearest = _nearest(own_beyond)
+        return f"{said}; nor of what effort may choose: {_compared(own, nearest)}: {why_not(own, nearest)}"
+    return f"{said}; on the front of what effort may choose{', within the noise' if beating(rows, as_filed=True)[1] else ''}"
+
+
+def words(row: Row) -> str:
+    """A row's combination in a few words."""
+    stealing = " with bit stealing" if row.bit_stealing == "true" else ""
+    moving = f", {row.smear}s, {row.prediction}" if row.rate_deg_s else ""
+    return f"{row.quantisation}{stealing}, {row.sprite} sprites{moving}"
+
+
+def why_not(own: Row, other: Row) -> str:
+    """Why `effort = "auto"` does not take what beats it."""
+    reasons = []
+    if other.bit_stealing != own.bit_stealing:
+        reasons.append(
+            "bit stealing is the bench file's choice, for a panel whose primaries are known as the tracker sees them"
+        )
+    if other.prediction != own.prediction and own.prediction == "held":
+        reasons.append("[attitude] max_extrapolation_ms = 0 is the bench file's choice")
+    elif other.prediction != own.prediction:
+        reasons.append(f"prediction by {other.prediction} is the sender's choice (whether its packets have rates)")
+    if other.faintest_v_mag != own.faintest_v_mag:
+        reasons.append("the catalogue's depth is the bench file's choice")
+    if other.quantisation == "temporal":
+        reasons.append("temporal is right over an exposure, and effort asks for light that is right in each frame")
+    elif other.quantisation != own.quantisation:
+        reasons.append(
+            f"effort compares {own.quantisation} and {other.quantisation} by their worst star at any sub-pixel phase, not by a"
+            " field's rms"
+        )
+    if other.sprite != own.sprite:
+        reasons.append(
+            "coarse sprites are beyond the tolerance" if other.sprite == "coarse" else "cut sprites save nothing here"
+        )
+    if other.smear != own.smear:
+        reasons.append(f"{other.smear}s instead of {own.smear}s")
+    return "; ".join(reasons)
+
+
+def _nearest(rows: Sequence[Row]) -> Row:
+    """Of what beats `auto`, that with the smallest error, and of these the fastest."""
+    return min(rows, key=lambda row: (row.error_arcsec, row.time_ms))
+
+
+def _compared(own: Row, other: Row) -> str:
+    faster = own.time_ms - other.time_ms
+    noise = (own.noise_ms**2 + other.noise_ms**2) ** 0.5
+    return f"{words(other)} is {other.error_arcsec:.3g} arcsec off and {faster:.2g} ms faster (noise {noise:.2g} ms)"
+
+
+def differing(rows: Sequence[Row]) -> dict[str, list[str]]:
+    """The scenes to be drawn, each with those of its rate in which `auto` is as far off."""
+    kept: dict[str, list[str]] = {}
+    autos: dict[str, Row] = {}
+    for scene in dict.fromkeys(row.scene for row in rows):
+        mine = [row for row in rows if row.scene == scene]
+        own = mine[auto_of(mine)]
+        like = [s for s, o in autos.items() if o.rate_deg_s == own.rate_deg_s and _alike(o.error_arcsec, own.error_arcsec)]
+        if like:
+            kept[like[0]].append(scene)
+        else:
+            kept[scene], autos[scene] = [], own
+    return kept
+
+
+def _alike(a: float, b: float) -> bool:
+    return max(a, b) <= ALIKE * min(a, b)
+
+
+def draw(path: Path, rows: Sequence[Row], finding: str, machine: str) -> None:
+    """Error against time, a panel for each scene that differs. Raises InputError where it cannot be written."""
+    scenes = differing(rows)
+    note = f"The line is the front: nothing else is as right and as fast. Pale: all other choices. {capital(machine)}."
+    with chart(path, finding, len(scenes), note=note, share_x=False, height_inch=TITLE_INCH + PANEL_INCH * len(scenes)) as grid:
+        for axes, (scene, alike) in zip(grid, scenes.items(), strict=True):
+            own = [row for row in rows if row.scene == scene]
+            axes.set_title(f"{scene}, {own[0].stars} stars" + (f" (the same in: {', '.join(alike)})" if alike else ""))
+            axes.set(xscale="log", yscale="log", ylabel="star's place, rms [arcsec]")
+            _scatter(axes, own)
+        grid[-1].set_xlabel("median time of a frame [ms]")
+
+
+def _scatter(axes: Axes, rows: Sequence[Row]) -> None:
+    floor = FLOOR_SHARE * min((row.error_arcsec for row in rows if row.error_arcsec > 0), default=1.0)
+    at = [(row.time_ms, max(row.error_arcsec, floor)) for row in rows]
+    front = [(row, place) for row, place in zip(rows, at, strict=True) if row.on_front == "true"]
+    axes.step(*zip(*(place for _, place in front), strict=True), where="post", color=INK, lw=1.2, zorder=2)
+    for row, place in zip(rows, at, strict=True):
+        colour, on_front = COLOURS[row.quantisation], row.on_front == "true"
+        early, late = max(place[0] - row.noise_ms, place[0] / 2), place[0] + row.noise_ms
+        axes.plot([early, late], [place[1]] * 2, color=colour, lw=1.0, alpha=0.4)
+        axes.plot(*place, "o", color=colour, ms=6 if on_front else 4, alpha=1 if on_front else 0.35, zorder=3)
+    axes.margins(0.06, 0.12)
+    for row, place in zip(rows, at, strict=True):
+        for name in row.chosen.split():
+            axes.plot(*place, "o", color=CHOSEN[name], ms=13 if name == AUTO else 17, mfc="none", mew=1.6, zorder=4)
+    named, last, own = [], math.inf, rows[auto_of(rows)]
+    for row, place in front:
+        if place[1] < LESS * last and not row.chosen:
+            named.append((short_words(row, own), place, COLOURS[row.quantisation]))
+            last = place[1]
+    for row, place in zip(rows, at, strict=True):
+        if row.chosen:
+            figures = f"{two_digits(row.error_arcsec)} arcsec, {two_digits(row.time_ms)} ms"
+            named.append(
+                (f"{row.chosen.replace(' ', ', ')}: {figures}", place, CHOSEN[AUTO if AUTO in row.chosen else DEFAULT])
+            )
+    for name, colour in COLOURS.items():
+        if not any(colour == other for *_, other in named):  # the best of what has no place on the front
+            best = min(
+                (each for each in zip(rows, at, strict=True) if each[0].quantisation == name),
+                key=lambda each: each[1][1],
+                default=None,
+            )
+            named += [(short_words(best[0], own), best[1], colour)] if best else []
+    name_at_side(axes, named)
+
+
+def short_words(row: Row, own: Row) -> str:
+    """A row's combination where its sprites go without saying, and its depth where it is that of `own`."""
+    shallow = ", fewer stars" if row.faintest_v_mag < own.faintest_v_mag else ""
+    moving = f", {row.smear}s by {row.prediction}".replace("by held", "held") if row.rate_deg_s else ""
+    return f"{row.quantisation}{' + bit stealing' if row.bit_stealing == 'true' else ''}{moving}{shallow}"
+
+
+def draw_budget(path: Path, rows: Sequence[Row], budget: Sequence[BudgetRow], stages: Sequence[StageRow]) -> None:
+    """Where `auto`'s error and time come from, a row of panels for each scene that differs. Raises InputError."""
+    scenes = differing(rows)
+    last = list(scenes)[-1]
+    steps = [part.step for part in budget if part.scene == next(iter(scenes)) and part.step != RSS]
+    shown = [step for step in steps if any(p.error_arcsec or p.error_mag for p in budget if p.step == step)]
+    none = [WORDS.get(step, step) for step in steps if step not in shown]
+    note = "Each step is charged with what it changes when it is added to an exact display" + (
+        f"; {' and '.join(none)} change nothing here." if none else "."
+    )
+    height = TITLE_INCH + BARS_INCH * len(scenes)
+    with chart(
+        path, _budget_finding(scenes, budget, stages), len(scenes), 3, note=note, share_x=False, height_inch=height
+    ) as grid:
+        for k, scene in enumerate(scenes):
+            parts = {part.step: part for part in budget if part.scene == scene}
+            place, light, times = grid[3 * k : 3 * k + 3]
+            place.set_title(scene)
+            for axes, error, unit in ((place, "error_arcsec", "arcsec"), (light, "error_mag", "mag")):
+                values = [getattr(parts[step], error) for step in shown]
+                colours = [RED if step == WHOLE else BLUE for step in shown]
+                value_bars(axes, [WORDS.get(step, step) for step in shown], values, colours)
+                axes.set_xlabel(f"error, rms [{unit}]" if scene == last else "")
+            light.set_yticklabels([])
+            mine = [one for one in stages if one.scene == scene]
+            value_bars(times, [one.stage for one in mine], [one.time_ms for one in mine], PURPLE)
+            times.set_xlabel("time of a frame [ms]" if scene == last else "")
+
+
+def _budget_finding(
+    scenes: Sequence[str] | dict[str, list[str]], budget: Sequence[BudgetRow], stages: Sequence[StageRow]
+) -> str:
+    said = []
+    for scene in scenes:
+        parts = [part for part in budget if part.scene == scene and part.step not in (RSS, WHOLE)]
+        largest = max(parts, key=lambda part: part.error_arcsec if math.isfinite(part.error_arcsec) else math.inf)
+        said.append(
+            f"{WORDS.get(largest.step, largest.step)} in the {scene}"
+            if "field" in scene
+            else f"{WORDS.get(largest.step, largest.step)} at {scene}"
+        )
+    longest = max(stages, key=lambda one: one.time_ms)
+    return f"Of auto's error most is {', '.join(said)}; of its time most is {longest.stage}"
 
 
 def run(

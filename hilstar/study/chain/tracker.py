@@ -1,8 +1,8 @@
 """What the bench's virtual tracker measures of its stars: of the sky itself, and of what the display makes of it.
 
-At rest the stars are found by the bench's own centroider (`[verify] centroider`). Where they leave paths, each is the centre of
-mass of the pixels about its path, which is long enough for an attitude that is late. Light is without noise: that of the
-detector is not the display's.
+At rest the stars are found by the bench's own centroider (`[verify] centroider`). Stars that leave paths are measured as the
+centre of mass of the pixels about the path, which is long enough for a late attitude. Light is float64 and without noise: the
+detector's noise is not the display's.
 """
 
 from __future__ import annotations
@@ -17,27 +17,82 @@ from hilstar.bench.cameras import tracker_camera
 from hilstar.bench.frame import Bench
 from hilstar.rotation import to_matrix
 from hilstar.scene.camera import Camera
-from hilstar.scene.psf import peak_share
-from hilstar.study.chain.motion import PACKET_HZ, Movement, lead_ns
-from hilstar.study.chain.panel import Exposure
-from hilstar.study.chain.true_light import instants, points, sky_light
+from hilstar.scene.psf import peak_share, pixel_shares
+from hilstar.scene.sprites import Sprites, make_sprites
+from hilstar.study.chain.choices import PACKET_HZ, Exposure, Lit, Movement, lead_ns
 from hilstar.twin.optics import BenchGeometry, TwinOptics
-from hilstar.twin.verify.star_finder import (
-    MATCH_PX,
-    Matched,
-    StarFinder,
-    crowded,
-    seen_sigma_px,
-    shared,
-    star_finder,
-)
+from hilstar.twin.verify.star_finder import MATCH_PX, Matched, StarFinder, crowded, seen_sigma_px, shared, star_finder
 from hilstar.units import ARCSEC_PER_RAD, MAG_PER_RELATIVE, NS_PER_S, magnitude
 
+# Gauss-Legendre over the exposure: 1.02 nodes to a sigma of path and three more are right to 1e-6 of a star in every pixel
+# (scene/exposure_motion.py); JITTER's 37 Hz over the longest exposure are well within the minimum.
+NODES_PER_SIGMA, MIN_NODES = 1.02, 24
+SPRITES_AT_ONCE = 20_000
 REACH_SIGMAS = 4.0
 LOST_SHARE = 0.1  # of a star's light: with less of it in its pixels it is lost
 LOST_MAG = MAG_PER_RELATIVE  # a lost star's flux is off by all of it
 PATH_STEP_PX = 0.5
 OTHERS_SHARE = 1e-3  # of a star's light, that others bring to its path: 50 px from its middle it moves that by 0.05 px
+
+
+@dataclass(frozen=True, slots=True)
+class Instants:
+    """The moments (k,) of an exposure that its light is summed over, ns, and their shares."""
+
+    t_ns: tuple[int, ...]
+    share: FloatArray
+
+
+def instants(bench: Bench, movement: Movement, seen: Exposure) -> Instants:
+    """So many that every star's path is exact; one at rest."""
+    if not movement.turns:
+        return Instants((seen.middle_ns(),), np.ones(1))
+    path_rad = math.radians(abs(movement.rate_deg_s)) * seen.length_s
+    sigmas = path_rad * bench.camera.scales_px_rad()[1] / min(bench.config.render.sprite_sigma_px)
+    nodes, weights = np.polynomial.legendre.leggauss(max(MIN_NODES, math.ceil(NODES_PER_SIGMA * sigmas) + 3))
+    t_s = seen.begin_s + seen.length_s * (nodes + 1) / 2
+    return Instants(tuple(round(t * NS_PER_S) for t in t_s), weights / 2)
+
+
+def points(bench: Bench, q_icrs_to_cam: FloatArray) -> Sprites:
+    """All of the bench's stars as whole sprites at an attitude."""
+    icrs_to_image = bench.camera.cam_to_image @ to_matrix(q_icrs_to_cam)
+    return make_sprites(bench.stars, icrs_to_image, bench.camera, bench.renderer.footprint_px)
+
+
+def sky_light(bench: Bench, movement: Movement, at: Instants) -> FloatArray:
+    """The mean light (H, W) that the sky itself has over the exposure, electrons per second."""
+    total = np.zeros(bench.camera.resolution_px[::-1])
+    for t_ns, share in zip(at.t_ns, at.share, strict=True):
+        add_light(total, points(bench, movement.at(t_ns)), bench.config.render.sprite_sigma_px, float(share))
+    return total
+
+
+def linear_light(bench: Bench, sprites: Sprites) -> Lit:
+    """The pixels that a frame's sprites light, and their light, rounded to nothing."""
+    image = np.zeros(bench.camera.resolution_px[::-1])
+    add_light(image, sprites, bench.config.render.sprite_sigma_px)
+    place = np.flatnonzero(image)
+    return place, image.ravel()[place]
+
+
+def add_light(image: FloatArray, sprites: Sprites, sigma_px: tuple[float, float], share: float = 1.0) -> None:
+    """Add the light of sprites to an image (H, W): `render.reference.linear_image`, all sprites at once."""
+    height, width = image.shape
+    steps = np.arange(sprites.footprint_px) - (sprites.footprint_px - 1) // 2
+    flat = image.reshape(-1)
+    for begin in range(0, len(sprites), SPRITES_AT_ONCE):
+        part = slice(begin, begin + SPRITES_AT_ONCE)
+        columns = sprites.data["pixel"][part, 0, None] + steps
+        rows = sprites.data["pixel"][part, 1, None] + steps
+        across = pixel_shares(columns - sprites.x_px[part, None], sigma_px[0])
+        down = pixel_shares(rows - sprites.y_px[part, None], sigma_px[1])
+        across *= (columns >= 0) & (columns < width)
+        down *= (rows >= 0) & (rows < height)
+        light = share * sprites.data["electrons_per_s"][part].astype(np.float64)
+        parts = (light[:, None, None] * down[:, :, None] * across[:, None, :]).ravel()
+        places = np.clip(rows, 0, height - 1)[:, :, None] * width + np.clip(columns, 0, width - 1)[:, None, :]
+        np.add.at(flat, places.ravel(), parts)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,20 +1,46 @@
-"""Where methods fail between directions and pixels: the poles, the wrap of right ascension, the edge of a field."""
+"""Where methods fail with directions and attitudes: poles, the wrap of right ascension, field edges, popping, quaternions.
+
+Popping is one star's light from frame to frame while the camera turns slowly. Attitudes: two signs of one quaternion, half
+turns, fast turns, NaN and infinity.
+"""
 
 from __future__ import annotations
 
+import json
+import math
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
+from itertools import product
 
 import numpy as np
 
 from hilstar.arrays import FloatArray
+from hilstar.attitude.clock.timeline import Policy, Timeline
+from hilstar.attitude.wire.packet import AttitudeSample, Refusal, decode, encode
+from hilstar.attitude.wire.protocol import NORM_TOLERANCE
 from hilstar.monitor.geometry import monitor_camera
-from hilstar.rotation import direction_of, from_radec_roll_deg, to_matrix, to_radec_roll_deg
+from hilstar.monitor.quantise import Quantisation
+from hilstar.monitor.response import srgb_response
+from hilstar.render.renderer import Renderer, Target
+from hilstar.rotation import (
+    angle_between_rad,
+    direction_of,
+    from_radec_roll_deg,
+    propagate,
+    slerp,
+    to_matrix,
+    to_radec_roll_deg,
+)
 from hilstar.scene.camera import Camera
-from hilstar.scene.sprites import pack_sprites
+from hilstar.scene.psf import footprint_px, peak_share
+from hilstar.scene.sprites import Sprites, make_sprites, pack_sprites
 from hilstar.sky.catalog import HIPPARCOS_EPOCH_JYEAR, load_catalog
-from hilstar.sky.stars import RAD_PER_MAS, cell_grid, unit_vectors_icrs
+from hilstar.sky.stars import RAD_PER_MAS, cell_grid, make_stars, unit_vectors_icrs
+from hilstar.study.codes import AIMS
 from hilstar.study.stability.failure_case import FailureCase, Figures
-from hilstar.units import ARCSEC_PER_RAD
+from hilstar.study.stability.image import POINT_SAMPLED, SIGMA_PX, Draw, by_renderer, point_sampled, target
+from hilstar.units import ARCSEC_PER_RAD, NS_PER_S, flux_ratio, magnitude
 
 # float64 knows a direction to 2e-16 rad, 5e-8 mas: 200 times that for the few operations on it.
 DIRECTION_MAS = 1e-5
@@ -27,6 +53,24 @@ ALIGNED = np.array([1.0, 0.0, 0.0, 0.0])
 FOCAL_LENGTH_MM, PITCH_UM = 350.0, 57.65
 CORNER_DEG = 10.0
 CENTROID_PX = 1.1e-5
+STEPS, PATH_PX = 1000, (3.0, 1.7)
+IMAGE_PX = (32, 32)
+# 1e-4 mag: a two-hundredth of the finest aim for codes, so that what ripples is the monitor's doing alone.
+RIPPLE = 1e-4
+CODES_MAG_UNDER_WHITE, CODES_BITS = 6.0, 8
+CODES_RIPPLE_MAG = AIMS[CODES_BITS][0]
+START = from_radec_roll_deg(84.057, -1.2, 30.0)
+AXIS = np.array([0.36, -0.48, 0.8])
+PERIOD_S = 0.1
+FRACTIONS = np.linspace(0.05, 0.95, 19)
+# float64 knows an angle to 2e-16 rad, 5e-11 arcsec; times 200 for the some twenty operations from rate to attitude.
+ANGLE_ARCSEC = 1e-8
+NONE_TAKEN = 0.0
+POLICY = Policy(max_extrapolation_ns=NS_PER_S, stale_after_ns=NS_PER_S)
+TURNS_DEG = (170.0, 179.999, 180.001, 190.0, 270.0, 350.0)
+
+
+Between = Callable[[FloatArray, FloatArray, float], FloatArray]
 
 
 def motion_at_pole() -> FailureCase:
@@ -188,4 +232,193 @@ def weak_perspective() -> FailureCase:
         f"{error:.1e} px off at most",
         "each star's own Z; eq. 4.3 and 4.4 divide by it too, and so are not a weak perspective",
         Figures(error, float(np.abs(off_px).max()), CENTROID_PX),
+    )
+
+
+def moving_star(on: Target, electrons_per_s: float = 1.0) -> Iterator[Sprites]:
+    """Sirius at a given flux in STEPS frames of the demo's camera, which turns until the star has moved by PATH_PX."""
+    sirius = load_catalog().brighter_than(-1.0)
+    vectors = unit_vectors_icrs(sirius, HIPPARCOS_EPOCH_JYEAR)
+    stars = make_stars(sirius, vectors, np.full(1, np.nan), np.full(1, electrons_per_s))
+    camera = monitor_camera(on.resolution_px, PITCH_UM, FOCAL_LENGTH_MM, ALIGNED)
+    start = from_radec_roll_deg(float(sirius.ra_deg[0]), float(sirius.dec_deg[0]), 20.0)
+    # A turn about x moves stars up the image, one about -y to the right.
+    turn_rad = np.array([-PATH_PX[1], -PATH_PX[0], 0.0]) / camera.focal_length_px
+    for share in np.linspace(0, 1, STEPS):
+        yield make_sprites(stars, to_matrix(propagate(start, share * turn_rad, 1.0)), camera, footprint_px(on.sigma_px))
+
+
+def moving_fluxes(draw: Draw, on: Target) -> FloatArray:
+    """Its light (steps,) in each image."""
+    return np.array([draw(sprites).sum() for sprites in moving_star(on)])
+
+
+def moving_code_fluxes(quantisation: Quantisation) -> FloatArray:
+    """The light (steps,) that an sRGB monitor makes of it, relative to the light wanted.
+
+    It is CODES_MAG_UNDER_WHITE fainter than a star whose peak is white.
+    """
+    sigma, response = (SIGMA_PX, SIGMA_PX), srgb_response(CODES_BITS)
+    flux = flux_ratio(CODES_MAG_UNDER_WHITE) / peak_share(sigma)
+    on, light = Target(IMAGE_PX, sigma, response, 1.0, quantisation), []
+    with Renderer(on) as gl:
+        for sprites in moving_star(on, flux):
+            gl.draw(sprites)
+            light.append(response.light[gl.codes()].sum())
+    return np.array(light) / flux
+
+
+def ripple(fluxes: FloatArray) -> float:
+    """From the faintest to the brightest of a star's fluxes, relative to their mean."""
+    return float((fluxes.max() - fluxes.min()) / fluxes.mean())
+
+
+def popping() -> FailureCase:
+    """A star's light in the linear image while the camera turns by parts of a pixel."""
+    on = target(0.5, IMAGE_PX)
+    with by_renderer(on) as draw:
+        error, fault = (ripple(moving_fluxes(by, on)) for by in (draw, partial(point_sampled, on)))
+    return FailureCase(
+        f"a star over {STEPS} sub-pixel steps, sigma 0.5 px",
+        POINT_SAMPLED,
+        f"its light varies by {100 * fault:.1f} %",
+        f"varies by {error:.1e} in the linear image",
+        "integrated over pixels, and cut where 1e-6 of the light remains",
+        Figures(error, fault, RIPPLE),
+    )
+
+
+def popping_codes() -> FailureCase:
+    """The same star's light through 8-bit codes."""
+    fluxes = [moving_code_fluxes("round"), moving_code_fluxes("exact")]
+    fault, error = (magnitude(float(f.min() / f.max())) for f in fluxes)
+    return FailureCase(
+        f"the same, {CODES_MAG_UNDER_WHITE:g} mag under white on {CODES_BITS} bits, sigma {SIGMA_PX:g} px",
+        'quantisation = "round"',
+        f"its light varies by {fault:.3f} mag",
+        f'quantisation = "exact", what `auto` takes there: {error:.3f} mag',
+        "round adds up the errors of its pixels; exact chooses a star's codes together",
+        Figures(error, fault, CODES_RIPPLE_MAG),
+    )
+
+
+def arccos_slerp(a: FloatArray, b: FloatArray, fraction: float) -> FloatArray:
+    """SLERP as it stands in the books: the angle by arccos, no look at the sign."""
+    angle = np.arccos(np.clip(np.dot(a, b), -1, 1))
+    return np.asarray((np.sin((1 - fraction) * angle) * a + np.sin(fraction * angle) * b) / np.sin(angle))
+
+
+def straight_line(a: FloatArray, b: FloatArray, fraction: float) -> FloatArray:
+    """The normalised straight line from `a` to `b`, by the shorter way."""
+    mean = (1 - fraction) * a + fraction * (b if np.dot(a, b) >= 0 else -b)
+    return np.asarray(mean / np.linalg.norm(mean))
+
+
+def turned(turn_deg: float, fraction: float = 1.0) -> FloatArray:
+    """START after a part of a turn about AXIS."""
+    return propagate(START, np.radians(turn_deg) * fraction * AXIS, 1.0)
+
+
+def way_error_arcsec(between: Between, sign: float, turn_deg: float) -> float:
+    """The largest error of `between` (`slerp`, or one that fails) on a turn whose end has this sign, arcsec; NaN if any is."""
+    with np.errstate(invalid="ignore"):
+        ways = [between(START, sign * turned(turn_deg), float(f)) for f in FRACTIONS]
+    errors = [angle_between_rad(q, turned(turn_deg, f)) for q, f in zip(ways, FRACTIONS, strict=True)]
+    return float(np.max(errors) * ARCSEC_PER_RAD)
+
+
+def two_signs() -> FailureCase:
+    """A sender that writes -q for the next sample, one degree on."""
+    error, fault = (way_error_arcsec(between, -1.0, 1.0) for between in (slerp, arccos_slerp))
+    return FailureCase(
+        "q, then -q one degree on",
+        "SLERP from one to the other as they are",
+        f"goes round the long way: {fault / 3600:.0f} degrees off",
+        f"{error:.0e} arcsec off",
+        "q and -q are one attitude: the nearer of them is taken",
+        Figures(error, fault, ANGLE_ARCSEC),
+    )
+
+
+def antipodal() -> FailureCase:
+    """The same attitude twice, with either sign."""
+    error, fault = (
+        float(np.max([way_error_arcsec(between, sign, 0.0) for sign in (1.0, -1.0)])) for between in (slerp, arccos_slerp)
+    )
+    return FailureCase(
+        "SLERP from q to q and to -q",
+        "SLERP by arccos",
+        f"{fault:.0f}: sin(angle) is 0",
+        f"{error:.0e} arcsec off",
+        "the angle comes from both chords, and a small one is a straight line",
+        Figures(error, fault, ANGLE_ARCSEC),
+    )
+
+
+def half_turn() -> FailureCase:
+    """Samples nearly half a turn apart."""
+    error, fault = (way_error_arcsec(between, 1.0, 179.999) for between in (slerp, straight_line))
+    return FailureCase(
+        "SLERP over 179.999 degrees",
+        "the normalised straight line",
+        f"up to {fault / 3600:.1f} degrees off, and still on the great circle",
+        f"{error:.0e} arcsec off",
+        "SLERP turns at a constant rate, right up to the half turn where two ways are equally short",
+        Figures(error, fault, ANGLE_ARCSEC),
+    )
+
+
+def sampled_error_arcsec(turn_deg: float, with_rates: bool) -> float:
+    """The largest error of a timeline between samples that are `turn_deg` of a steady turn apart, arcsec."""
+    rate = np.radians(turn_deg) / PERIOD_S * AXIS if with_rates else None
+    timeline = Timeline(POLICY)
+    for k in range(3):
+        timeline.add(AttitudeSample(round(k * PERIOD_S * NS_PER_S), turned(turn_deg, k), rate))
+    worst = 0.0
+    for fraction in FRACTIONS:
+        t_ns = round((1 + fraction) * PERIOD_S * NS_PER_S)
+        attitude = timeline.at(t_ns)
+        if attitude is None:
+            raise AssertionError("a timeline with samples has an attitude")
+        worst = max(worst, angle_between_rad(attitude.q_icrs_to_cam, turned(turn_deg, t_ns / NS_PER_S / PERIOD_S)))
+    return worst * ARCSEC_PER_RAD
+
+
+def fast_turns() -> FailureCase:
+    """Turns of about pi, and more, from sample to sample."""
+    error, fault = (max(sampled_error_arcsec(turn, rates) for turn in TURNS_DEG) for rates in (True, False))
+    just_under, just_over = (sampled_error_arcsec(turn, False) / 3600 for turn in TURNS_DEG[1:3])
+    return FailureCase(
+        f"{TURNS_DEG[0]:g} to {TURNS_DEG[-1]:g} degrees from sample to sample",
+        "samples without rates",
+        f"{just_under:.0e} degrees off at {TURNS_DEG[1]:g}, {just_over:.0f} at {TURNS_DEG[2]:g}: the other way is shorter",
+        f"with rates: {error:.0e} arcsec off",
+        "the rates say which way, and how often round; send them, or more than two samples a turn",
+        Figures(error, fault, ANGLE_ARCSEC),
+    )
+
+
+def norm_alone(q: tuple[float, ...]) -> bool:
+    """Whether a quaternion passes that is refused where abs(norm - 1) is too large: NaN is never larger."""
+    return not abs(math.sqrt(sum(c * c for c in q)) - 1.0) > NORM_TOLERANCE
+
+
+def not_a_number() -> FailureCase:
+    """NaN and infinity in each number of a packet and of JSON."""
+    taken, passed, sent = 0, 0, 0
+    for place, value in product(range(7), (math.nan, math.inf, -math.inf)):
+        numbers = [*START, 0.0, 0.0, 0.0]
+        numbers[place] = value
+        text = json.dumps({"t_ns": 1, "q": list(numbers[:4]), "rate": numbers[4:]})
+        for message in (encode(AttitudeSample(1, np.array(numbers[:4]), np.array(numbers[4:]))), text.encode()):
+            taken += not isinstance(decode(message), Refusal)
+            passed += norm_alone(tuple(numbers[:4]))
+            sent += 1
+    return FailureCase(
+        "NaN or infinity in an attitude",
+        "a check of abs(norm - 1) > 1e-3 alone",
+        f"{passed} of {sent} pass: NaN is not larger, and a rate has no norm to check",
+        f"{taken} taken",
+        "every number has to be finite before anything is computed from it",
+        Figures(float(taken), float(passed), NONE_TAKEN),
     )

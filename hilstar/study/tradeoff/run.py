@@ -12,16 +12,8 @@ import numpy as np
 
 from hilstar.charts import BLUE, MUTED, RED, capital, chart, name_at_side, title_lines, two_digits, write_csv
 from hilstar.render.renderer import Renderer, Target
-from hilstar.study.tradeoff.brightness import brightness
-from hilstar.study.tradeoff.culling import culling
-from hilstar.study.tradeoff.demo import SIGMA_PX
-from hilstar.study.tradeoff.depth import depth
-from hilstar.study.tradeoff.prediction import prediction
-from hilstar.study.tradeoff.projection import projection
-from hilstar.study.tradeoff.psf import psf
-from hilstar.study.tradeoff.quantisation import quantisation
-from hilstar.study.tradeoff.smear import smear
-from hilstar.study.tradeoff.spectrum import spectrum
+from hilstar.study.tradeoff.light import brightness, depth, psf, quantisation, spectrum
+from hilstar.study.tradeoff.places import SIGMA_PX, culling, prediction, projection, smear
 from hilstar.study.tradeoff.table import Figure, Row, Step, Trials, measured
 from hilstar.tracker.centroiders import FAMILY
 

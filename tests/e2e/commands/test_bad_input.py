@@ -303,7 +303,7 @@ def test_a_full_disk_is_one_line(words):
     assert_refused(result, 2, "cannot be written")
 
 
-@pytest.mark.parametrize("module", ["study/models/spectra.py", "cli/app.py", "errors.py"])
+@pytest.mark.parametrize("module", ["study/models.py", "cli/app.py", "errors.py"])
 @pytest.mark.parametrize("kept", [200, 16])
 def test_a_compiled_module_that_a_full_disk_cut_short_is_named(tmp_path, module, kept):
     """Marshal reads past its end: an EOFError, which click takes for Ctrl-C."""

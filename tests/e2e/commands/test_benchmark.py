@@ -10,12 +10,9 @@ import pytest
 from PIL import Image
 
 from hilstar.rotation import from_radec_roll_deg
-from hilstar.study.shared.other_work import is_busy
-from hilstar.study.speed import cells
-from hilstar.study.speed.benchmark import RADEC_ROLL_DEG
-from hilstar.study.speed.cells import STAGES
-from hilstar.study.speed.other_methods import numpy_linear
-from hilstar.study.speed.scenes import scene
+from hilstar.study.settings import is_busy
+from hilstar.study.speed import benchmark
+from hilstar.study.speed.benchmark import RADEC_ROLL_DEG, STAGES, numpy_linear, scene
 from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
 
 Q = from_radec_roll_deg(*RADEC_ROLL_DEG)
@@ -158,9 +155,9 @@ def test_slow_works_take_fewer_turns_evenly(monkeypatch):
         taken.append(work())
         return {"fast": 0.001, "slow": 1.0, "slowest": 9.0}[taken[-1]]
 
-    monkeypatch.setattr(cells, "_seconds", seconds)
+    monkeypatch.setattr(benchmark, "_seconds", seconds)
     works = {name: lambda name=name: name for name in ("fast", "slow", "slowest")}
-    times = cells.interleaved(works, rounds=8, budget_s=5.0)
+    times = benchmark.interleaved(works, rounds=8, budget_s=5.0)
     # One turn of the slow work's five goes ahead; the slowest has no other turn, so that one counts.
     assert {name: len(values) for name, values in times.items()} == {"fast": 8, "slow": 4, "slowest": 1}
     assert taken[3:] == ["fast", "fast", "slow"] * 4

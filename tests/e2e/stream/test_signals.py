@@ -154,12 +154,12 @@ def test_a_signal_while_a_shader_is_built_ends_it_in_order(tmp_path, small_bench
 def test_a_signal_while_a_peer_s_library_calls_python_ends_it_without_a_word_of_python_s(tmp_path):
     """numba's LLVM does: ctypes prints an exception that comes of a callback, and goes on. Here qsort does, with no numba."""
     before = (
-        "import ctypes, os, signal\nfrom hilstar.study.speed import other_methods\n"
+        "import ctypes, os, signal\nfrom hilstar.study.speed import benchmark\n"
         "kind = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p)\n"
         "def told(*pair):\n    os.kill(os.getpid(), signal.SIGINT)\n    return 0\n"
         "def draw(*arguments):\n    ctypes.CDLL(None).qsort((ctypes.c_int * 2)(2, 1), 2, 4, kind(told))\n"
         "    print('drawn', flush=True)\n"
-        "other_methods.METHODS = (('callback', 'calls Python', lambda: draw),)"
+        "benchmark.METHODS = (('callback', 'calls Python', lambda: draw),)"
     )
     with running(program("benchmark", "-o", tmp_path / "times", before=before), text=True) as process:
         out, err = process.communicate(timeout=2 * PATIENCE_S)

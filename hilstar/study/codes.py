@@ -1,7 +1,8 @@
-"""What `temporal` leaves over an exposure of N frames, on panels of many levels and of few, and what `dither` would."""
+"""Ways from light to code values: what each does to a star, as centroiders see it, alone and over an exposure."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,17 +10,103 @@ import numpy as np
 
 from hilstar.arrays import FloatArray
 from hilstar.charts import BLUE, GREEN, ORANGE, PURPLE, TEAL, chart, label_ends, plain_ticks, write_records
-from hilstar.monitor.balance import AS_USUAL
-from hilstar.monitor.phases import SIGMA_PX, WHITE, fainter, line_places, phase_grid, phase_image
-from hilstar.monitor.quantise import Panel, dither_levels, mask_turn, shown_light
-from hilstar.monitor.response import Response, gamma_response, srgb_response, table_response
+from hilstar.monitor.balance import AS_USUAL, Balance
+from hilstar.monitor.phases import SIGMA_PX, WHITE, fainter, line_places, phase_grid, phase_image, shown_by
+from hilstar.monitor.quantise import EXPOSURE_FRAMES, Panel, Quantisation, dither_levels, mask_turn, shown_light
+from hilstar.monitor.response import Response, Weights, bit_stealing_response, gamma_response, srgb_response, table_response
 from hilstar.monitor.temporal import TemporalQuantiser
+from hilstar.scene.psf import peak_share
+from hilstar.scene.sprites import Sprites, pack_sprites
+from hilstar.tracker.centroiders import FAMILY, Centroider
 from hilstar.tracker.star_errors import Judge, StarErrors
 from hilstar.units import flux_ratio
 
+BITS = (8, 10, 12)
+# By bits: the largest flux error allowed, mag, and the magnitudes under white over which it is allowed.
+AIMS = {8: (0.05, 6.0), 10: (0.02, 8.0), 12: (0.02, 8.0)}
+AIM_PX = 0.01
+# Rec. 709's shares of white stand in for the primaries as a tracker sees them.
+STEALING_WEIGHTS: Weights = (0.2126, 0.7152, 0.0722)
+FRAME_PX = (1920, 1080)
+STARS = 1000
+SEED = 1
+STEALING = ", bit stealing"
+JUDGE: Centroider = "fit"  # what most trackers do
+ERROR_COLUMNS = (
+    "flux_rms_mag",
+    "flux_max_mag",
+    "centroid_rms_px",
+    "centroid_max_px",
+    *(f"axis_rms_px_{kind}" for kind in FAMILY),
+    *(f"max_px_{kind}" for kind in FAMILY),
+)
 FRAMES = (1, 2, 4, 6, 8, 16, 32, 64)
 BEGINS = (2.0, 3.4, 5.7, 7.1)  # refreshes: exposures begin within frames too
 AIM_FRAMES = 6
+
+
+@dataclass(frozen=True, slots=True)
+class Way:
+    """One way from light to levels: its name, the renderer's method, its colour, and in how many frames it is seen."""
+
+    name: str
+    method: Quantisation
+    colour: str
+    stealing: bool = False
+    frames: int = 1
+
+
+WAYS = (
+    Way("round", "round", PURPLE),
+    Way("dither", "dither", ORANGE),
+    Way(f"temporal, mean of {EXPOSURE_FRAMES} frames", "temporal", GREEN, frames=EXPOSURE_FRAMES),
+    Way("exact", "exact", BLUE),
+    Way("round" + STEALING, "round", PURPLE, stealing=True),
+    Way("exact" + STEALING, "exact", BLUE, stealing=True),
+)
+
+
+def response_of(bits: int, way: Way) -> Response:
+    """The sRGB response of a way; with bit stealing, of three equal channels."""
+    grey = srgb_response(bits)
+    return bit_stealing_response((grey, grey, grey), STEALING_WEIGHTS) if way.stealing else grey
+
+
+def star_field(frame_px: tuple[int, int], footprint_px: int) -> Sprites:
+    """STARS sprites anywhere on the frame, over eight magnitudes, three times as many in each as in the one before."""
+    rng = np.random.default_rng(SEED)
+    mag = 2 * np.log10(1 + rng.uniform(size=STARS) * (10 ** (8 / 2) - 1))
+    flux = WHITE / peak_share(SIGMA_PX) * flux_ratio(mag)
+    x_px, y_px = rng.uniform(0, 1, (2, STARS)) * np.array(frame_px)[:, None]
+    return pack_sprites(x_px, y_px, flux, np.arange(STARS), frame_px, footprint_px)
+
+
+def code_errors(bits: int, way: Way, phases: int, mags: Iterable[float]) -> list[StarErrors]:
+    """The errors of phases^2 stars, so many magnitudes under white, on an sRGB panel; the tracker is as usual."""
+    panel, balance = Panel(response_of(bits, way), WHITE), Balance(SIGMA_PX, AS_USUAL)
+    sprites, _ = phase_grid(phases, SIGMA_PX)
+    bright = phase_image(sprites, SIGMA_PX)
+    judge = Judge(bright, line_places(sprites), SIGMA_PX, AS_USUAL.blur_px, AS_USUAL.pixel_px)
+    errors = []
+    for mag in mags:
+        wanted = (bright * flux_ratio(mag)).astype(np.float32)
+        errors.append(
+            judge.errors(shown_by(way.method, way.frames, panel, wanted, fainter(sprites, mag), balance), flux_ratio(mag))
+        )
+    return errors
+
+
+def error_cells(errors: StarErrors) -> tuple[float, ...]:
+    """The values of ERROR_COLUMNS; `centroid_...` are distances by the plain moment, `axis_rms_...` along one axis."""
+    distance_px = np.sqrt(2) * errors.axis_rms_px("moment")
+    return (
+        errors.flux_rms_mag,
+        errors.flux_max_mag,
+        float(distance_px),
+        errors.max_px("moment"),
+        *(errors.axis_rms_px(kind) for kind in FAMILY),
+        *(errors.max_px(kind) for kind in FAMILY),
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,467 @@
+"""The study of bodies: what each costs in a frame, how exact its disc is at each size, and what happens as it fills the field.
+
+Cost is the time of a frame against the same frame of a bench that knows no bodies: one screen, one date, each body alone. A
+disc is compared with rays in float64, and with a point in its place. A body that comes near is judged by frame time and finite
+light.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from hilstar.arrays import FloatArray
+from hilstar.bench.build import load
+from hilstar.bench.discs import When
+from hilstar.bench.frame import Bench
+from hilstar.charts import BLUE, INK, MUTED, SERIES, capital, chart, label_ends, plain_ticks, value_bars, write_records
+from hilstar.render.renderer import Renderer, Target
+from hilstar.rotation import from_radec_roll_deg
+from hilstar.scene.camera import Camera
+from hilstar.scene.extended import DiscView, ExtendedLight, Pose, disc_lights
+from hilstar.scene.sprites import Sprites, pack_sprites
+from hilstar.sky.bodies.disc import Disc, lunar_share
+from hilstar.study.settings import Table, bench_text
+from hilstar.units import NS_PER_S
+
+REFRESH_HZ = 60.0
+EPOCH: Table = {"epoch_utc": "2026-11-21T00:00:00Z"}
+# 400 km over a circle, made for that date
+TLE = """\
+1 99999U          26325.00000000  .00000000  00000-0  00000+0 0    05
+2 99999  51.6000 150.0000 0001000   0.0000   0.0000 15.55820000    02
+"""
+DAY_SIDE_NS = 24 * 60 * NS_PER_S  # the Sun is 72 degrees from its zenith then
+LOW_ORBIT: Table = {"orbit": "low.tle"}
+GEOCENTRE: Table = {"orbit": "geocentre"}
+# By the name of a bench: its bodies and its observer
+BODIES: dict[str, tuple[Table, Table]] = {
+    "nothing": ({}, {}),
+    "observer": ({}, GEOCENTRE),
+    "low orbit": ({}, LOW_ORBIT),
+    "planets": ({"planets": True}, GEOCENTRE),
+    "Moon": ({"moon": True}, GEOCENTRE),
+    "Sun": ({"sun": True}, GEOCENTRE),
+    "Earth": ({"earth": True}, LOW_ORBIT),
+    "all": ({"planets": True, "moon": True, "sun": True, "earth": True}, LOW_ORBIT),
+}
+FRAME_NS = round(NS_PER_S / REFRESH_HZ)
+SIGMA_PX = (0.85, 0.85)
+MIDDLE_PX = (0.2, -0.3)  # of the disc, from the middle pixel's centre: no symmetry helps
+FOCAL_PX = 6000.0
+RADII_PX = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 4.0, 6.0, 8.0, 12.0, 20.0, 40.0, 80.0)
+QUICK_RADII_PX = (0.1, 2.0, 12.0)
+PHASES_DEG = (0.0, 60.0, 120.0, 150.0)
+FEWEST_RAYS, RAYS_A_PX, MOST_RAYS = 600, 16, 2400  # along each side: at most 0.07 px apart, under a tenth of sigma
+LIMB_PX = 4.0  # a smaller disc has no edge that falls from a middle
+PLACES = 60
+MARGIN_PX = 8
+# Degrees from the boresight to the body's middle, of the Earth beyond its limb (negative: on it)
+NEAR_DEG: dict[str, tuple[float, ...]] = {
+    "Moon": (40.0, 20.0, 12.0, 8.0, 5.0, 3.0, 1.0, 0.5, 0.25, 0.0),
+    "Sun": (40.0, 20.0, 12.0, 8.0, 5.0, 3.0, 1.0, 0.5, 0.25, 0.0),
+    "Earth": (40.0, 20.0, 12.0, 8.0, 5.0, 3.0, 1.0, 0.0, -1.0, -3.0, -8.0, -20.0, -40.0, -70.0),
+}
+QUICK_DEG = {"Moon": (40.0, 0.5), "Sun": (40.0, 0.5), "Earth": (40.0, 0.0, -70.0)}
+ROUNDS, QUICK_ROUNDS = 40, 3
+QUICK_BENCHES = ("nothing", "Moon", "Sun", "Earth", "all")
+FREE_MS = 0.3  # what the fastest of one frame and of the same one again differ by
+FLUX_LIMIT, LIMB_LIMIT_PX, DISC_PX = 0.01, 0.1, 0.2
+FLOOR = 1e-6  # of the chart's axis
+
+
+@dataclass(frozen=True, slots=True)
+class Aim:
+    """Where a bench looks: so far from a body's middle, or beyond the Earth's limb, or the other way."""
+
+    body: str
+    off_deg: float
+    t_ns: int = 0
+
+
+@contextmanager
+def opened(names: tuple[str, ...]) -> Iterator[dict[str, Bench]]:
+    """The benches of these names, which end with the context. Raises InputError or MachineError."""
+    with TemporaryDirectory() as folder, ExitStack() as stack:
+        (Path(folder) / "low.tle").write_text(TLE)
+        yield {name: stack.enter_context(_open(Path(folder), name)) for name in names}
+
+
+def _open(folder: Path, name: str) -> Bench:
+    bodies, observer = BODIES[name]
+    tables: dict[str, Table] = {
+        "tracker": {"resolution_px": (1024, 1024)},
+        "monitor": {"resolution_px": (1920, 1080), "pixel_pitch_um": 57.65, "refresh_hz": REFRESH_HZ, "bits": 12},
+        "collimator": {"focal_length_mm": 350.0},
+        "sky": EPOCH,
+        "render": {"quantisation": "round", "motion": "off", "brightest_v_mag": 2.0},
+    }
+    if bodies:
+        tables["sky.bodies"] = bodies
+    if observer:
+        tables["spacecraft"] = observer
+    path = folder / f"{name.replace(' ', '_')}.toml"
+    path.write_text(bench_text(tables))
+    return load(path)
+
+
+def attitude(bench: Bench, aim: Aim) -> FloatArray:
+    """The attitude (unit quaternion, scalar first) with the boresight at an aim, of a bench that has the body."""
+    if bench.moving is None:
+        raise AssertionError("a bench with bodies moves")
+    disc = next(d for d in bench.moving.discs(np.array([0.0, 0.0, 1.0]), np.pi, 0.0, aim.t_ns) if d.name == aim.body)
+    off_rad = np.radians(aim.off_deg) + (disc.radius_rad if aim.body == "Earth" else 0.0)
+    # Along declination, away from the near pole; the Earth towards the Sun, where its limb is lit
+    beside = disc.sun if aim.body == "Earth" else np.array([0.0, 0.0, -np.sign(disc.direction[2]) or 1.0])
+    beside = beside - (beside @ disc.direction) * disc.direction
+    beside /= np.linalg.norm(beside)
+    x, y, z = np.cos(off_rad) * disc.direction + np.sin(off_rad) * beside
+    return from_radec_roll_deg(float(np.degrees(np.arctan2(y, x))), float(np.degrees(np.arcsin(z))), 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """A bench by its name, where it looks, and how far its clock goes from frame to frame."""
+
+    name: str
+    bench: str
+    aim: Aim
+    step_ns: int = FRAME_NS
+
+
+@dataclass(frozen=True, slots=True)
+class Cost:
+    """One scene: the fastest frame of the rounds, ms, with the body and without any, and the difference.
+
+    `cpu_ms` is the difference in processor time, all cores together, the driver's threads too: what a busy machine changes
+    least, and in software rendering the whole cost. `discs` are the bodies drawn as such, `stars` counts the stars drawn.
+    """
+
+    scene: str
+    frame_ms: float
+    without_ms: float
+    cost_ms: float
+    cpu_ms: float
+    discs: str
+    stars: int
+
+
+SCENES = (
+    Scene("from the Earth's centre, no body", "observer", Aim("Moon", 60.0)),
+    Scene("planets, none in view", "planets", Aim("Jupiter", 60.0)),
+    Scene("Uranus in view, a point", "planets", Aim("Uranus", 0.3)),
+    Scene("Jupiter in view, 1.1 px", "planets", Aim("Jupiter", 0.3)),
+    Scene("Moon, not in view", "Moon", Aim("Moon", 60.0)),
+    Scene("Moon in view, 55 px", "Moon", Aim("Moon", 0.3)),
+    Scene("Sun, not in view", "Sun", Aim("Sun", 60.0)),
+    Scene("Sun in view, 57 px", "Sun", Aim("Sun", 0.3)),
+    Scene("from a low orbit, no body", "low orbit", Aim("Earth", 80.0, DAY_SIDE_NS)),
+    Scene("Earth, not in view", "Earth", Aim("Earth", 80.0, DAY_SIDE_NS)),
+    Scene("Earth's limb across the middle", "Earth", Aim("Earth", 0.0, DAY_SIDE_NS)),
+    Scene("Earth fills the field", "Earth", Aim("Earth", -60.0, DAY_SIDE_NS)),
+    Scene("all of them, none in view", "all", Aim("Earth", 80.0, DAY_SIDE_NS)),
+    Scene("the same, at a step of the orbit", "all", Aim("Earth", 80.0, DAY_SIDE_NS), 2 * NS_PER_S),
+)
+
+
+def measure_cost(benches: Mapping[str, Bench], scene: Scene, rounds: int) -> Cost:
+    """A scene and the same frame without bodies, timed in turn. `benches` has "nothing", "all" and the scene's."""
+    bench, nothing = benches[scene.bench], benches["nothing"]
+    knows = bench.moving is not None and scene.aim.body in bench.moving.names
+    q = attitude(bench if knows else benches["all"], scene.aim)
+    times = []
+    for k in range(rounds + 1):
+        t_ns = scene.aim.t_ns + k * scene.step_ns
+        times.append((*frame_ms(nothing, q, None), *frame_ms(bench, q, t_ns)))
+    stars = bench.draw(q, t_ns=scene.aim.t_ns).star_count
+    discs = " ".join(disc.name for disc in bench.discs(q, When(scene.aim.t_ns)))
+    without_ms, without_cpu_ms, with_ms, with_cpu_ms = np.min(np.array(times[1:]), axis=0).tolist()
+    return Cost(scene.name, with_ms, without_ms, with_ms - without_ms, with_cpu_ms - without_cpu_ms, discs, stars)
+
+
+def frame_ms(bench: Bench, q: FloatArray, t_ns: int | None) -> tuple[float, float]:
+    """The time of drawing one frame and reading its levels back, ms, and the processor time."""
+    begin, begin_cpu = time.perf_counter(), time.process_time()
+    _ = bench.draw(q, t_ns=t_ns).levels
+    return (time.perf_counter() - begin) * 1e3, (time.process_time() - begin_cpu) * 1e3
+
+
+@dataclass(frozen=True, slots=True)
+class Exactness:
+    """A body of one radius at one phase: its light, the place of its limb (NaN: none) or of its middle, single pixels.
+
+    `flux_off` and `pixel_off` are relative to all its light and to its brightest pixel; `point_pixel_off` is that of a point.
+    """
+
+    body: str
+    phase_deg: float
+    radius_px: float
+    flux_off: float
+    middle_off_px: float
+    limb_off_px: float
+    pixel_off: float
+    point_pixel_off: float
+
+
+def moon(radius_px: float, phase_deg: float) -> Disc:
+    """A Moon of that radius off the middle of an image."""
+    ahead = np.array([MIDDLE_PX[0] / FOCAL_PX, MIDDLE_PX[1] / FOCAL_PX, 1.0])
+    ahead /= np.linalg.norm(ahead)
+    side = np.cross(ahead, [0.3, 1.0, 0.0])
+    side /= np.linalg.norm(side)
+    phase = np.radians(phase_deg)
+    sun = -np.cos(phase) * ahead + np.sin(phase) * side
+    far = 1 / np.sin(radius_px / FOCAL_PX)
+    disc = Disc("Moon", ahead, far, 1.0, 1.0, np.array([0.0, 1.0, 0.0]), sun, "lunar-lambert", 1.0, lunar_share(phase_deg))
+    return disc.of_rate(1e6)
+
+
+def exactness(radius_px: float, phase_deg: float) -> Exactness:
+    """A Moon as it is drawn, against rays."""
+    disc = moon(radius_px, phase_deg)
+    half = int(np.ceil(radius_px)) + MARGIN_PX
+    size = (2 * half + 1, 2 * half + 1)
+    camera = Camera(size, FOCAL_PX, (half, half), np.eye(3))
+    with Renderer(Target(size, SIGMA_PX)) as renderer:
+        point = _point(disc, camera, renderer.footprint_px)
+        lights = disc_lights(disc, DiscView(camera, SIGMA_PX, (Pose(np.eye(3)),)), covers=True)
+        renderer.draw(_dark(point, tuple(lights)))
+        drawn = renderer.linear().astype(np.float64)
+        renderer.draw(point)
+        as_point = renderer.linear().astype(np.float64)
+    truth = traced(disc, camera)
+    off_px = np.array(_middle(drawn)) - np.array(_middle(truth))
+    limb = np.nan
+    if radius_px >= LIMB_PX and phase_deg <= 90:
+        limb = float(np.nanmax(np.abs(_edges(drawn, radius_px, phase_deg) - _edges(truth, radius_px, phase_deg))))
+    brightest = truth.max()
+    return Exactness(
+        body=disc.name,
+        phase_deg=phase_deg,
+        radius_px=radius_px,
+        flux_off=float(drawn.sum() / truth.sum() - 1),
+        middle_off_px=float(np.abs(off_px).max()),
+        limb_off_px=limb,
+        pixel_off=float(np.abs(drawn - truth).max() / brightest),
+        point_pixel_off=float(np.abs(as_point - truth).max() / brightest),
+    )
+
+
+def traced(disc: Disc, camera: Camera) -> FloatArray:
+    """The image of a disc by rays on a lattice about it, float64, each ray's light spread by the Gaussian over the pixels."""
+    from scipy.special import ndtr
+
+    radius_px = np.tan(disc.radius_rad) * camera.focal_length_px * 1.001
+    count = int(np.clip(RAYS_A_PX * 2 * radius_px, FEWEST_RAYS, MOST_RAYS))
+    step_px = 2 * radius_px / count
+    (x_mid,), (y_mid,) = camera.project(disc.direction[None])
+    along = (np.arange(count) + 0.5) * step_px - radius_px
+    x_px, y_px = np.meshgrid(x_mid + along, y_mid + along)
+    rays = camera.rays(x_px.ravel(), y_px.ravel())
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    # The solid angle of a square of the image plane: the cube of the ray's cosine to the axis
+    light = disc.radiance(rays) * (step_px / camera.focal_length_px) ** 2 * rays[:, 2] ** 3
+    width, height = camera.resolution_px
+    across = np.diff(ndtr((np.arange(width + 1) - 0.5 - (x_mid + along)[:, None]) / SIGMA_PX[0]), axis=1)
+    down = np.diff(ndtr((np.arange(height + 1) - 0.5 - (y_mid + along)[:, None]) / SIGMA_PX[1]), axis=1)
+    return np.asarray(down.T @ light.reshape(count, count) @ across)
+
+
+def _dark(point: Sprites, lights: tuple[ExtendedLight, ...]) -> Sprites:
+    return replace(point, data=point.data[:0], star=point.star[:0], x_px=point.x_px[:0], y_px=point.y_px[:0], extended=lights)
+
+
+def _point(disc: Disc, camera: Camera, footprint_px: int) -> Sprites:
+    x_px, y_px = camera.project(disc.direction[None])
+    return pack_sprites(x_px, y_px, np.array([1e6]), np.zeros(1, dtype=np.intp), camera.resolution_px, footprint_px)
+
+
+def _middle(image: FloatArray) -> tuple[float, float]:
+    """The centroid of an image, px."""
+    y_px, x_px = np.indices(image.shape)
+    return float((image * x_px).sum() / image.sum()), float((image * y_px).sum() / image.sum())
+
+
+def _edges(image: FloatArray, radius_px: float, phase_deg: float) -> FloatArray:
+    """Where an image falls to half of what it has 3 px inside the limb, on its lit side, px outward of it."""
+    from scipy.ndimage import map_coordinates
+
+    half = image.shape[0] // 2
+    lit = 1.0 if phase_deg else np.pi  # radians to either side of the Sun's
+    ahead = np.array([MIDDLE_PX[0] / FOCAL_PX, MIDDLE_PX[1] / FOCAL_PX, 1.0])
+    sun = np.cross(ahead, [0.3, 1.0, 0.0])
+    angle = np.arctan2(sun[1], sun[0]) + np.linspace(-lit, lit, PLACES)
+    steps = np.linspace(-3.0, 3.0, 241)
+    way = radius_px + steps[None, :]
+    x_px = half + MIDDLE_PX[0] + way * np.cos(angle)[:, None]
+    y_px = half + MIDDLE_PX[1] + way * np.sin(angle)[:, None]
+    profile = map_coordinates(image, [y_px, x_px], order=3, mode="nearest")
+    level = profile[:, :1] / 2
+    below = profile < level
+    first = np.maximum(np.argmax(below, axis=1), 1)
+    rows = np.arange(PLACES)
+    high, low = profile[rows, first - 1], profile[rows, first]
+    place = steps[first - 1] + (steps[1] - steps[0]) * (high - level[:, 0]) / (high - low)
+    return np.asarray(np.where(below.any(axis=1), place, np.nan))
+
+
+@dataclass(frozen=True, slots=True)
+class Near:
+    """A frame with a body so near its middle: the fastest of some, ms, and in processor time, and without any body.
+
+    `over_white_mag` is how many magnitudes brighter than white the brightest pixel is (below 0: fainter), `finite` says that
+    every pixel's light is a number, `white_is_white` that each with more than white has white's code; `stars` those drawn.
+    """
+
+    body: str
+    off_deg: float
+    frame_ms: float
+    cpu_ms: float
+    without_ms: float
+    over_white_mag: float
+    finite: bool
+    white_is_white: bool
+    stars: int
+
+
+def approach(benches: Mapping[str, Bench], body: str, off_deg: float, rounds: int) -> Near:
+    """A body at one place. `benches` has "nothing" and the body's own."""
+    bench, nothing = benches[body], benches["nothing"]
+    start_ns = DAY_SIDE_NS if body == "Earth" else 0
+    q = attitude(bench, Aim(body, off_deg, start_ns))
+    times = [(*frame_ms(nothing, q, None), *frame_ms(bench, q, start_ns + k * FRAME_NS)) for k in range(rounds + 1)]
+    without_ms, _, with_ms, cpu_ms = np.min(np.array(times[1:]), axis=0).tolist()
+    drawn = bench.draw(q, t_ns=start_ns)
+    levels = drawn.levels.copy()
+    light = bench.renderer.linear()
+    brightest, white = float(light.max()), bench.flux_at_white_e_per_s
+    return Near(
+        body=body,
+        off_deg=off_deg,
+        frame_ms=with_ms,
+        cpu_ms=cpu_ms,
+        without_ms=without_ms,
+        over_white_mag=2.5 * math.log10(max(brightest, 1e-9) / white),
+        finite=bool(np.isfinite(light).all()),
+        white_is_white=bool((levels[light > white] == bench.calibration.response.white).all()),
+        stars=drawn.star_count,
+    )
+
+
+def run(directory: Path, quick: bool = False) -> list[str]:
+    """Write `bodies_cost`, `bodies_size` and `bodies_limits` (PNG and CSV); a line for each finding. Raises InputError."""
+    rounds = QUICK_ROUNDS if quick else ROUNDS
+    scenes = [scene for scene in SCENES if scene.bench in QUICK_BENCHES] if quick else SCENES
+    with opened(QUICK_BENCHES if quick else tuple(BODIES)) as benches:
+        costs = [measure_cost(benches, scene, rounds) for scene in scenes]
+        nears = [
+            approach(benches, body, off_deg, max(QUICK_ROUNDS, rounds // 4))
+            for body, angles in (QUICK_DEG if quick else NEAR_DEG).items()
+            for off_deg in angles
+        ]
+    sizes = [exactness(radius, phase) for phase in PHASES_DEG for radius in (QUICK_RADII_PX if quick else RADII_PX)]
+    findings = [_cost_line(costs), _size_line(sizes), _limits_line(nears)]
+    for name, records in (("bodies_cost", costs), ("bodies_size", sizes), ("bodies_limits", nears)):
+        write_records(directory / f"{name}.csv", records)
+    draw_costs(directory / "bodies_cost", costs)
+    draw_sizes(directory / "bodies_size", sizes)
+    draw_limits(directory / "bodies_limits", nears)
+    return findings
+
+
+def _cost_line(costs: Sequence[Cost]) -> str:
+    dearest, step = max(costs, key=lambda cost: cost.cpu_ms), costs[-1]
+    unseen = max((c for c in costs[:-1] if not c.discs), key=lambda cost: cost.cpu_ms)
+    return (
+        f"bodies that are not in view, or points, take at most {max(unseen.cpu_ms, 0.0):.1f} ms of processor time a frame, and"
+        f" all of them {max(step.cpu_ms, 0.0):.1f} ms once in 2 s; the dearest: {dearest.scene}, {dearest.cpu_ms:.0f} ms"
+    )
+
+
+def _size_line(sizes: Sequence[Exactness]) -> str:
+    limb_px = float(np.nanmax([size.limb_off_px for size in sizes]))
+    worst = max(sizes, key=lambda size: abs(size.flux_off))
+    return (
+        f"discs of {sizes[0].radius_px:g} to {max(s.radius_px for s in sizes):g} px in radius have their light within"
+        f" {100 * abs(worst.flux_off):.2g} % and their limb within {limb_px:.3f} px of rays in float64"
+    )
+
+
+def _limits_line(nears: Sequence[Near]) -> str:
+    slowest = max(nears, key=lambda near: near.cpu_ms)
+    sound = all(near.finite and near.white_is_white for near in nears)
+    light = "finite, and white where it is over white" if sound else "NOT finite, or over white and not white"
+    return (
+        f"a body in view takes at most {slowest.cpu_ms:.0f} ms of processor time a frame ({slowest.body} at {slowest.off_deg:g}"
+        f" degrees); every pixel's light is {light}"
+    )
+
+
+def draw_costs(path: Path, costs: Sequence[Cost]) -> None:
+    """What each scene costs."""
+    dearest, unseen = (max(some, key=lambda cost: cost.cpu_ms) for some in (costs, [c for c in costs[:-1] if not c.discs]))
+    note = "Processor time of a frame, less that of the same frame on a bench without bodies; 1920 x 1080, drawn in software."
+    points = f"Bodies that are no discs cost at most {max(unseen.cpu_ms, 0):.1f} ms"
+    finding = f"{points}; the dearest, {dearest.scene}, {dearest.cpu_ms:.0f} ms"
+    with chart(path, finding, note=note, height_inch=4.4) as (axes,):
+        value_bars(axes, [capital(cost.scene) for cost in costs], [round(max(cost.cpu_ms, 0.0), 2) for cost in costs], BLUE)
+        axes.set_xlabel("processor time on top [ms]")
+
+
+def draw_sizes(path: Path, sizes: Sequence[Exactness]) -> None:
+    """The errors of discs against their radius."""
+    note = f"A Moon at {len(PHASES_DEG)} phases, against rays in float64. Left of the dashed line it is drawn as a point."
+    with chart(path, _size_line(sizes), panels=3, note=note, height_inch=8.4) as panels:
+        light, place, pixel = panels
+        for phase_deg, colour in zip(PHASES_DEG, SERIES, strict=False):
+            rows = [size for size in sizes if size.phase_deg == phase_deg]
+            radius, label = [size.radius_px for size in rows], f"{phase_deg:g} deg"
+            for axes, name, style, shown in (
+                (light, "flux_off", "o-", label),
+                (place, "limb_off_px", "s-", "_"),
+                (place, "middle_off_px", "o:", label),
+                (pixel, "pixel_off", "o-", label),
+                (pixel, "point_pixel_off", "x:", "_"),
+            ):
+                values = [max(abs(getattr(size, name)), FLOOR) for size in rows]
+                axes.loglog(radius, values, style, color=colour, ms=4, label=shown)
+        light.set(title="Light of the whole disc", ylabel="error [share]")
+        place.set(title="Place of its limb (squares, solid) and of its middle (dotted)", ylabel="error [px]")
+        pixel.set(
+            title="Its worst pixel, drawn as a disc (solid) and as a point (crosses, dotted)", ylabel="error [of the brightest]"
+        )
+        pixel.axvline(DISC_PX / 2, color=MUTED, linestyle="--", lw=1.2, label="_")
+        for axes, limit in ((light, FLUX_LIMIT), (place, LIMB_LIMIT_PX)):
+            axes.axhline(limit, color=INK, linestyle="--", lw=1.2, label="limit")
+        plain_ticks(pixel.xaxis, sorted({size.radius_px for size in sizes}))
+        pixel.set_xlabel("radius of the Moon's disc [px]")
+        for axes in panels:
+            label_ends(axes)
+
+
+def draw_limits(path: Path, nears: Sequence[Near]) -> None:
+    """Processor time and light as bodies come near."""
+    note = "Earth by its limb, negative on the Earth; Moon and Sun by their middles. 1920 x 1080, drawn in software."
+    with chart(path, _limits_line(nears), panels=2, note=note) as (times, light):
+        for body, colour in zip(dict.fromkeys(near.body for near in nears), SERIES, strict=False):
+            rows = [near for near in nears if near.body == body]
+            off_deg = [near.off_deg for near in rows]
+            times.plot(off_deg, [near.cpu_ms for near in rows], "o-", ms=4, color=colour, label=body)
+            light.plot(off_deg, [near.over_white_mag for near in rows], "o-", ms=4, color=colour, label=body)
+        times.axhline(1e3 / REFRESH_HZ, color=INK, linestyle="--", lw=1.2, label=f"{REFRESH_HZ:g} Hz")
+        light.axhline(0, color=INK, linestyle="--", lw=1.2, label="white")
+        times.set_ylim(bottom=0)
+        times.set_ylabel("processor time of a frame [ms]")
+        light.set_ylabel("brightest pixel over white [mag]")
+        light.set_xlabel("angle from the boresight [deg]")
+        light.set_xscale("symlog", linthresh=1.0)
+        plain_ticks(light.xaxis, (-70, -20, -8, -3, -1, 0, 1, 3, 8, 20, 40))
+        for axes in (times, light):
+            label_ends(axes)

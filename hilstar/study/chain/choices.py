@@ -1,0 +1,366 @@
+"""What the study of the chain varies: five scenes, their motion and packets, the panel, and the combinations of choices.
+
+At rest every prediction is the same, and so are points and paths: one of each is measured. Where the camera turns, what is
+crude in one respect is combined with small sprites alone: whole sprites would only add time to an error that is not theirs.
+An exposure gathers each row's share of each frame from a panel that lights row by row. There is one bench for each
+quantisation, bit stealing and sprite size, all with the same stars.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from types import TracebackType
+from typing import Any, Literal, Self
+
+import msgspec
+import numpy as np
+
+from hilstar.arrays import FloatArray, IntArray
+from hilstar.attitude.clock.timeline import Attitude, Policy, Timeline
+from hilstar.attitude.wire.packet import AttitudeSample
+from hilstar.bench.bench_file import BenchFile
+from hilstar.bench.build import assembled, bench_stars
+from hilstar.bench.config import AttitudeSettings, BenchConfig, RenderSettings, SkySettings
+from hilstar.bench.config.spacecraft import Spacecraft
+from hilstar.bench.frame import Bench
+from hilstar.errors import InputError
+from hilstar.monitor.quantise import Quantisation
+from hilstar.rotation import multiply, normalise, propagate, rate_between_rad_s
+from hilstar.scene.frame_motion import Scan
+from hilstar.sky.stars import split_by_rate
+from hilstar.study.predictors import JITTER, RATE_STEP_NS
+from hilstar.units import NS_PER_MS, NS_PER_S
+
+# `held`: the newest sample's attitude. `rate`: carried on by the sample's rate. `two samples`: by the last two, from a sender
+# that tells no rates.
+Prediction = Literal["held", "rate", "two samples"]
+PREDICTIONS: tuple[Prediction, ...] = ("rate", "two samples", "held")
+AXIS = np.array([0.6, 0.8, 0.0])  # across rows and columns
+PACKET_HZ = 100
+KEPT = 4  # of the newest samples
+Sprite = Literal["full", "cut", "coarse"]
+Smear = Literal["path", "point"]
+QUANTISATIONS: tuple[Quantisation, ...] = ("round", "dither", "temporal", "exact")
+SPRITES: tuple[Sprite, ...] = ("full", "cut", "coarse")
+COARSER = 10.0
+SHALLOWER_MAG = 1.0
+FIELDS = 200
+SEED = 1
+ENOUGH = 0.5  # of an average field's stars, for the faint field
+# The pixels that a frame lights, as places in its flattened image (n,), and the light of each, electrons per second.
+Lit = tuple[IntArray, FloatArray]
+START_S = 0.0037  # of the exposure after a frame's first light, within a refresh
+MAX_FRAMES = 16
+DEG_PER_RAD = math.degrees(1.0)
+OWN = {"effort": "auto", "quantisation": "auto"}
+
+
+@dataclass(frozen=True, slots=True)
+class Movement:
+    """A camera's true attitude: `q_icrs_to_cam` at t = 0, a constant turn about AXIS, and jitter on it where it turns."""
+
+    q_icrs_to_cam: FloatArray
+    rate_deg_s: float
+
+    @property
+    def turns(self) -> bool:
+        """Whether it is not at rest."""
+        return self.rate_deg_s != 0
+
+    def at(self, t_ns: int) -> FloatArray:
+        """The true q_icrs_to_cam."""
+        if not self.turns:
+            return self.q_icrs_to_cam
+        t_s = t_ns / NS_PER_S
+        q = propagate(self.q_icrs_to_cam, math.radians(self.rate_deg_s) * AXIS, t_s)
+        for axis in range(3):
+            angle = sum(math.radians(arcsec / 3600) * math.sin(2 * math.pi * hz * t_s + 2 * axis * hz) for arcsec, hz in JITTER)
+            turn = np.zeros(4)
+            turn[0], turn[1 + axis] = math.cos(angle / 2), math.sin(angle / 2)
+            q = multiply(turn, q)
+        return q
+
+    def rate_rad_s(self, t_ns: int) -> FloatArray:
+        """The true rate (3,) of cam in icrs, cam components, jitter included."""
+        if not self.turns:
+            return np.zeros(3)
+        before, after = self.at(t_ns - RATE_STEP_NS), self.at(t_ns + RATE_STEP_NS)
+        return rate_between_rad_s(before, after, 2 * RATE_STEP_NS / NS_PER_S)
+
+    def samples(self, until_ns: int) -> list[AttitudeSample]:
+        """The newest samples that are there at a moment."""
+        last = until_ns * PACKET_HZ // NS_PER_S
+        times_ns = [round(k * NS_PER_S / PACKET_HZ) for k in range(last + 1 - KEPT, last + 1)]
+        return [AttitudeSample(t_ns, self.at(t_ns), self.rate_rad_s(t_ns)) for t_ns in times_ns]
+
+
+def lead_ns(config: BenchConfig) -> int:
+    """From a frame's begin to the first light of its middle row: a refresh to draw it in, then the panel."""
+    monitor = config.monitor
+    return round((monitor.period_ms + monitor.panel_delay_ms + monitor.panel_scanout_ms / 2) * NS_PER_MS)
+
+
+def filled_timeline(samples: list[AttitudeSample], prediction: Prediction, settings: AttitudeSettings) -> Timeline:
+    """The timeline of a bench file's settings with these samples, as a way of prediction has it."""
+    ahead_ms = settings.max_extrapolation_ms or AttitudeSettings().max_extrapolation_ms
+    stale_ns = round(settings.stale_after_ms * NS_PER_MS)
+    timeline = Timeline(Policy(0 if prediction == "held" else round(ahead_ms * NS_PER_MS), stale_ns))
+    for sample in samples:
+        timeline.add(replace(sample, rate_cam_rad_s=None) if prediction == "two samples" else sample)
+    return timeline
+
+
+def attitude_at(timeline: Timeline, t_ns: int) -> Attitude:
+    """The attitude at a moment, of a timeline that has samples."""
+    attitude = timeline.at(t_ns)
+    if attitude is None:
+        raise AssertionError("the timeline has samples")
+    return attitude
+
+
+@dataclass(frozen=True, slots=True)
+class Combination:
+    """One choice for each step.
+
+    Depth: `bit_stealing`, and the catalogue's `faintest_v_mag`. `sprite`: `full`, `cut` as `effort = "auto"` does within the
+    bench file's tolerance, or `coarse`: the same within COARSER times that. `smear`: stars along their paths, or points.
+    """
+
+    quantisation: Quantisation
+    bit_stealing: bool
+    faintest_v_mag: float
+    sprite: Sprite
+    smear: Smear = "path"
+    prediction: Prediction = "rate"
+
+
+def combinations(turns: bool, can_steal_bits: bool, faintest_v_mag: float) -> list[Combination]:
+    """All combinations that are measured, for a scene that turns or one at rest."""
+    found: list[Combination] = []
+    shallow = faintest_v_mag - SHALLOWER_MAG
+    for stealing in (False, True) if can_steal_bits else (False,):
+        for method in QUANTISATIONS:
+            found += [Combination(method, stealing, faintest_v_mag, sprite) for sprite in SPRITES]
+            if turns:
+                crude: list[tuple[Smear, Prediction]] = [("point", "rate"), ("path", "two samples"), ("point", "held")]
+                found += [Combination(method, stealing, faintest_v_mag, "cut", *ways) for ways in crude]
+        found += [Combination(method, stealing, shallow, "cut") for method in ("round", "exact")]
+        if turns:
+            found.append(Combination("round", stealing, shallow, "cut", "point", "held"))
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """A field and how fast it is crossed, and why it is one of the five."""
+
+    name: str
+    why: str
+    q_icrs_to_cam: FloatArray
+    rate_deg_s: float = 0.0
+
+
+def five_scenes(bench: Bench) -> tuple[Scene, ...]:
+    """The scenes for a bench, by FIELDS random fields of its sky. Raises InputError where it has no stars."""
+    fields = normalise(np.random.default_rng(SEED).normal(size=(FIELDS, 4)))
+    seen = [bench.sprites(q).data["electrons_per_s"] for q in fields]
+    counts = np.array([len(rates) for rates in seen])
+    if not counts.any():
+        raise InputError(f"{bench.file.path}: [sky] leaves no star that the monitor shows; write a larger faintest_v_mag")
+    typical = float(np.median(counts[counts > 0]))
+    average = fields[np.argmin(np.abs(counts - typical))]
+    brightest = np.array([rates.max() if len(rates) >= ENOUGH * typical else np.inf for rates in seen])
+    faint, dense = fields[np.argmin(brightest)], fields[np.argmax(counts)]
+    return (
+        Scene("average field", "what most frames are", average),
+        Scene("dense field", "the most stars: time", dense),
+        Scene("faint field", "no bright star: codes have the fewest steps", faint),
+        Scene("1 deg/s", "a slow turn: prediction and paths begin to matter", average, 1.0),
+        Scene("10 deg/s", "a fast slew: each star is a long path", average, 10.0),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Exposure:
+    """An exposure before a panel: its begin and length, and the frames in it by number and moment of light, ns.
+
+    `weights` (frames, H, 1), of a panel that is turned (frames, 1, W), are what each row of a frame's light is multiplied by.
+    """
+
+    begin_s: float
+    length_s: float
+    numbers: tuple[int, ...]
+    light_ns: tuple[int, ...]
+    weights: FloatArray
+
+    def middle_ns(self) -> int:
+        """The middle of the exposure."""
+        return round((self.begin_s + self.length_s / 2) * NS_PER_S)
+
+    def mean(self, light_of: Callable[[int, int], Lit], size_px: tuple[int, int]) -> FloatArray:
+        """The mean light (H, W) of an image of `size_px` by what each frame lights, by its number and moment of light."""
+        width, height = size_px
+        total = np.zeros(height * width)
+        for number, light_ns, weight in zip(self.numbers, self.light_ns, self.weights, strict=True):
+            place, light = light_of(number, light_ns)
+            at = place // width if weight.shape[1] == 1 else place % width
+            total[place] += weight.ravel()[at] * light
+        return total.reshape(height, width)
+
+    def at_rest(self, light_of: Callable[[int, int], Lit], size_px: tuple[int, int]) -> FloatArray:
+        """The same where all frames are alike: by the first of them."""
+        whole = self.weights.sum(axis=0, keepdims=True)
+        return replace(self, numbers=self.numbers[:1], light_ns=self.light_ns[:1], weights=whole).mean(light_of, size_px)
+
+
+def exposure_s(bench: Bench) -> float:
+    """The tracker's exposure, or MAX_FRAMES refreshes of a longer one."""
+    return min(bench.config.tracker.exposure_s, MAX_FRAMES / bench.config.monitor.refresh_hz)
+
+
+def shortened_line(bench: Bench) -> str | None:
+    """What is said where an exposure is longer than what is measured of it; None where it is not."""
+    whole_s, measured_s = bench.config.tracker.exposure_s, exposure_s(bench)
+    if measured_s == whole_s:
+        return None
+    return f"exposures of {MAX_FRAMES} refreshes, {measured_s:.3g} s, in the place of [tracker] exposure_s = {whole_s:g}"
+
+
+def exposure(bench: Bench, first_frame: int) -> Exposure:
+    """An exposure that begins START_S after the first light of a frame's middle row."""
+    period_s, length_s, scan = 1 / bench.config.monitor.refresh_hz, exposure_s(bench), bench.scan
+    begin_s = first_frame * period_s + START_S % period_s
+    late_s = row_delays_s(scan, bench.camera.resolution_px)
+    before = math.ceil((scan.scanout_s / 2 + scan.hold_s) / period_s) + 1
+    numbers = range(first_frame - before, first_frame + math.ceil(length_s / period_s) + before + 1)
+    weights = np.stack([row_share(number * period_s + late_s, scan, period_s, (begin_s, length_s)) for number in numbers])
+    used = [bool(weight.any()) for weight in weights]
+    kept = tuple(number for number, is_used in zip(numbers, used, strict=True) if is_used)
+    return Exposure(begin_s, length_s, kept, tuple(round(n * period_s * NS_PER_S) for n in kept), weights[used])
+
+
+def row_delays_s(scan: Scan, resolution_px: tuple[int, int]) -> FloatArray:
+    """How long after the middle row each row lights, (H, 1); each column of a panel that is turned, (1, W)."""
+    width, height = resolution_px
+    if scan.down[0]:
+        x_px = np.arange(width, dtype=np.float64)
+        return scan.late_s(x_px, np.full(width, (height - 1) / 2), resolution_px)[None, :]
+    y_px = np.arange(height, dtype=np.float64)
+    return scan.late_s(np.full(height, (width - 1) / 2), y_px, resolution_px)[:, None]
+
+
+def row_share(lit_s: FloatArray, scan: Scan, period_s: float, span_s: tuple[float, float]) -> FloatArray:
+    """What a frame's rows that light at `lit_s` add to the mean over an exposure (begin, length).
+
+    1 over all frames where the exposure is a whole number of refreshes: a panel that flashes gives a refresh's light at once.
+    """
+    begin_s, length_s = span_s
+    if not scan.hold_s:
+        return np.asarray(((lit_s >= begin_s) & (lit_s < begin_s + length_s)) * (period_s / length_s))
+    lit = np.minimum(lit_s + scan.hold_s, begin_s + length_s) - np.maximum(lit_s, begin_s)
+    return np.asarray(np.maximum(lit, 0.0) / scan.hold_s * (period_s / length_s))
+
+
+@dataclass(frozen=True, slots=True)
+class Marks:
+    """The combinations that stand for something: hilstar's defaults, `effort = "auto"`, and the bench file as it is."""
+
+    default: Combination
+    auto: Combination
+    as_filed: Combination
+
+
+class Parts:
+    """The benches of a bench file's combinations, without bodies. Free them with `close`.
+
+    Raises InputError for a bench file that cannot be studied, MachineError without OpenGL.
+    """
+
+    def __init__(self, file: BenchFile) -> None:
+        if not file.config.tracker.exposure_s:
+            raise InputError(f"{file.path}: [tracker] exposure_s = 0 gathers no light; write a longer one")
+        sky = msgspec.structs.replace(file.config.sky, bodies=SkySettings().bodies)
+        config = msgspec.structs.replace(file.config, sky=sky, spacecraft=Spacecraft())
+        self._file = BenchFile(file.path, file.text, config, file.sha256)
+        self._benches: dict[tuple[tuple[str, Any], ...], Bench] = {}
+        stars = bench_stars(config, file.folder)
+        if not len(stars):
+            raise InputError(f"{file.path}: [sky] faintest_v_mag leaves no star; write a larger one")
+        self.faintest_v_mag = min(sky.faintest_v_mag, float(stars.v_mag.max().round(2)))
+        self._stars = stars
+        self._shallow: dict[tuple[float, float], Bench] = {}
+        self.own = self._with(OWN)
+        self.can_steal_bits = self.own.calibration.can_steal_bits
+
+    def bench(self, combination: Combination) -> Bench:
+        """The bench that draws a combination."""
+        bench = self._with(self._keys(combination))
+        if combination.faintest_v_mag >= self.faintest_v_mag:
+            return bench
+        key = id(bench), combination.faintest_v_mag
+        if key not in self._shallow:
+            sky = msgspec.structs.replace(self._file.config.sky, faintest_v_mag=combination.faintest_v_mag)
+            stars = bench_stars(msgspec.structs.replace(self._file.config, sky=sky), self._file.folder)
+            self._shallow[key] = bench.with_stars(split_by_rate(stars, bench.faintest_shown_e_per_s)[0])
+        return self._shallow[key]
+
+    def _keys(self, combination: Combination) -> dict[str, Any]:
+        """The keys of [render] of a combination."""
+        render = self._file.config.render
+        keys: dict[str, Any] = {
+            "quantisation": combination.quantisation,
+            "bit_stealing": combination.bit_stealing,
+            "effort": "full" if combination.sprite == "full" else "auto",
+            "motion_above_px": 0.0,
+        }
+        if combination.sprite == "coarse":
+            keys |= {"tolerance_mag": COARSER * render.tolerance_mag, "tolerance_px": COARSER * render.tolerance_px}
+        return keys
+
+    def marks(self, movement: Movement) -> Marks:
+        """What the marked combinations choose for a scene."""
+        defaults = RenderSettings()
+        plain = {name: getattr(defaults, name) for name in ("effort", "quantisation", "bit_stealing", "motion_above_px")}
+        ahead = self._file.config.attitude.max_extrapolation_ms > 0
+        return Marks(
+            self._chosen(self._with(plain), movement, True),
+            self._chosen(self.own, movement, ahead),
+            self._chosen(self._with({}), movement, ahead),
+        )
+
+    def _chosen(self, bench: Bench, movement: Movement, ahead: bool) -> Combination:
+        render = bench.config.render
+        motion_px = abs(movement.rate_deg_s) * bench.scan.longest_s * bench.camera.scales_px_rad()[1] / DEG_PER_RAD
+        prediction: Prediction = "rate" if ahead or not movement.turns else "held"
+        drawn = motion_px > render.motion_above_px and render.motion != "off" and prediction != "held"
+        smear: Smear = "path" if drawn or not movement.turns else "point"
+        if render.quantisation == "auto":
+            raise AssertionError("the effort's plan has chosen")
+        sprite: Sprite = "cut" if render.effort == "auto" else "full"
+        return Combination(render.quantisation, render.bit_stealing, self.faintest_v_mag, sprite, smear, prediction)
+
+    def _with(self, keys: dict[str, Any]) -> Bench:
+        """The bench with other keys of [render]."""
+        key = tuple(sorted(keys.items()))
+        if key not in self._benches:
+            render = msgspec.structs.replace(self._file.config.render, **keys)
+            config = msgspec.structs.replace(self._file.config, render=render)
+            file = BenchFile(self._file.path, self._file.text, config, self._file.sha256)
+            bench = assembled(file, self._stars)
+            # One camera for all: what its paths need is found once for each camera.
+            camera = next((other.camera for other in self._benches.values()), bench.camera)
+            self._benches[key] = replace(bench, camera=camera)
+        return self._benches[key]
+
+    def close(self) -> None:
+        """Free the GL contexts."""
+        for bench in self._benches.values():
+            bench.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()

@@ -1,1 +1,0 @@
-"""What a geometric calibration reaches, against rays traced through a real lens."""

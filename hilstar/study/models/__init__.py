@@ -1,1 +1,0 @@
-"""What the brightness models make of a star, a file for each chart."""

@@ -1,0 +1,163 @@
+"""What studies share: bench files, the tracker of the brightness studies, isolated stars, and how busy the machine is.
+
+On a busy machine no time says which method is faster, so each study notes what else ran.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import resource
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hilstar.arrays import FloatArray
+from hilstar.scene.sprites import Sprites
+from hilstar.sky.electrons import Optics, fit_table, load_library
+from hilstar.sky.spectrum import load_curve
+from hilstar.units import magnitude
+
+Value = str | float | tuple[int, int]
+Table = Mapping[str, Value]
+
+TRACKER: Table = {"aperture_mm": 30, "focal_length_mm": 70, "pixel_pitch_um": 13, "quantum_efficiency": "ccd47-20"}
+APERTURE_MM = 30.0
+GLASS = "n-bk7-10mm"
+MAX_RELIABLE_VI_MAG = 2.5
+Window = tuple[slice, slice]
+BUSY_SHARE = 0.15  # of the machine's cores: a background process of a third of a core, of two; times are then 5 % and more off
+STAT = Path("/proc/stat")
+
+
+def bench_text(tables: Mapping[str, Table]) -> str:
+    """The text of a bench file with `tables` by name; [tracker] extends TRACKER."""
+    lines = []
+    for name, table in tables.items():
+        whole = {**TRACKER, **table} if name == "tracker" else table
+        # Text, numbers and pairs are written alike in JSON and TOML.
+        lines += [f"[{name}]", *(f"{key} = {json.dumps(value)}" for key, value in whole.items())]
+    return "\n".join(lines) + "\n"
+
+
+def study_optics(sensor: str) -> Optics:
+    """A sensor behind an aperture of 30 mm and 10 mm of N-BK7."""
+    return Optics(APERTURE_MM, load_curve(sensor, sensor), load_curve(GLASS, GLASS))
+
+
+def held_out_errors(rates: FloatArray) -> FloatArray:
+    """Relative error (m,) of each library star's rate by a table fitted to the others, each star held out in turn."""
+    library = load_library()
+    errors = np.empty(len(rates))
+    for k in range(len(rates)):
+        rest = np.arange(len(rates)) != k
+        table = fit_table(library.bv_mag[rest], library.vi_mag[rest], rates[rest])
+        one = table.electrons_per_s(np.zeros(1), library.bv_mag[k : k + 1], library.vi_mag[k : k + 1])
+        errors[k] = one[0] / rates[k] - 1
+    return errors
+
+
+@dataclass(frozen=True, slots=True)
+class Isolation:
+    """How far a window reaches beyond a star's sprites, px, and what share of the star's light others may bring into it."""
+
+    margin_px: float
+    max_share: float
+
+
+def lone_windows(
+    sprites: Sprites, x_px: FloatArray, y_px: FloatArray, size_px: tuple[int, int], isolation: Isolation
+) -> Iterator[tuple[int, Window]]:
+    """Each star whose window lies on an image of `size_px` (width, height) and holds hardly any other's light, and the window.
+
+    `x_px` and `y_px` (n,) are the places of the sprites on that image. A window is rows and columns.
+    """
+    light, (width, height), margin = sprites.data["electrons_per_s"], size_px, isolation.margin_px
+    for star in np.unique(sprites.star):
+        own = sprites.star == star
+        left, right = x_px[own].min() - margin, x_px[own].max() + margin
+        top, bottom = y_px[own].min() - margin, y_px[own].max() + margin
+        if left < 0 or top < 0 or right > width - 1 or bottom > height - 1:
+            continue
+        near = (x_px > left - margin) & (x_px < right + margin) & (y_px > top - margin) & (y_px < bottom + margin) & ~own
+        if light[near].sum() <= isolation.max_share * light[own].sum():
+            yield int(star), (slice(int(top), int(bottom) + 1), slice(int(left), int(right) + 1))
+
+
+def squares(image: FloatArray, windows: Sequence[Window]) -> FloatArray:
+    """The windows of an image, each alone in the middle of a square as wide as the widest: (n, side, side), side odd."""
+    side = max(part.stop - part.start for window in windows for part in window) | 1
+    found = np.zeros((len(windows), side, side))
+    for square, window in zip(found, windows, strict=True):
+        height, width = image[window].shape
+        top, left = (side - height) // 2, (side - width) // 2
+        square[top : top + height, left : left + width] = image[window]
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class StarError:
+    """How much fainter a star is shown than it is, magnitudes, and how far its centroid is off, px; NaN where it is dark."""
+
+    flux_mag: float
+    centroid_px: float
+
+
+def star_error(shown: FloatArray, true: FloatArray, window: Window) -> StarError:
+    """The error of the star in a window of `shown`, against the same window of `true`."""
+    light, true_light = float(shown[window].sum()), float(true[window].sum())
+    (x_px, y_px), (true_x_px, true_y_px) = centroid_px(shown, window), centroid_px(true, window)
+    return StarError(magnitude(light / true_light), math.hypot(x_px - true_x_px, y_px - true_y_px))
+
+
+def centroid_px(image: FloatArray, window: Window) -> tuple[float, float]:
+    """The centre of gravity (x, y) of a window of an image (h, w), px; NaN where it is dark."""
+    part = image[window]
+    y_px, x_px = np.mgrid[window]
+    total = float(part.sum())
+    if total <= 0:
+        return math.nan, math.nan
+    return float((part * x_px).sum() / total), float((part * y_px).sum() / total)
+
+
+class OtherWork:
+    """The cores that other processes take from now on; the children of this one are its own."""
+
+    def __init__(self) -> None:
+        self._before = self._times_s()
+
+    def cores(self) -> float:
+        """How many cores the others took, in the mean since the beginning; 0 where the system does not say."""
+        (all_before, busy_before, own_before), (all_now, busy_now, own_now) = self._before, self._times_s()
+        passed_s = all_now - all_before  # of all cores together
+        others_s = (busy_now - busy_before) - (own_now - own_before)
+        return max(others_s, 0.0) / passed_s * (os.cpu_count() or 1) if passed_s > 0 else 0.0
+
+    @staticmethod
+    def _times_s() -> tuple[float, float, float]:
+        """All time of all cores, the busy part of it, and this process's part of that, s."""
+        try:
+            ticks = [int(word) for word in STAT.read_text(encoding="ascii").split("\n", 1)[0].split()[1:9]]
+        except (OSError, ValueError):
+            return 0.0, 0.0, 0.0
+        each_s = 1 / os.sysconf("SC_CLK_TCK")
+        user, nice, system, idle, waiting, *interrupts = ticks
+        busy = user + nice + system + sum(interrupts)
+        own = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+        return (busy + idle + waiting) * each_s, busy * each_s, sum(used.ru_utime + used.ru_stime for used in own)
+
+
+def is_busy(others_cores: float) -> bool:
+    """Whether times are worth nothing beside so much other work."""
+    return others_cores > BUSY_SHARE * (os.cpu_count() or 1)
+
+
+def busy_line(others_cores: float) -> str:
+    """What a person has to know of times that were taken beside other work."""
+    return (
+        f"a busy machine: other processes took {others_cores:.1f} of its {os.cpu_count()} cores meanwhile, so these times name"
+        " no winner; run it again when the machine is idle"
+    )

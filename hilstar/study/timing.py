@@ -1,0 +1,428 @@
+"""The study of timing: what a screen's timing does to a tracker on a slew, and what each compensation is worth and costs.
+
+The virtual tracker integrates over several frames of a simulated panel that lights row by row and holds each row until it is
+written again. Its image is compared with that of the sky in the same exposure, star by star. Each row is at its own phase, so
+the stars of one exposure see the whole beat; the beat is compared with what `run.sync` predicts.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from hilstar.arrays import FloatArray
+from hilstar.attitude.clock.timeline import Attitude, Policy, Timeline
+from hilstar.attitude.wire.packet import AttitudeSample
+from hilstar.bench.build import load
+from hilstar.bench.cameras import tracker_camera
+from hilstar.charts import SERIES, chart, label_ends, plain_ticks, write_records
+from hilstar.monitor.quantise import shown_light
+from hilstar.render.renderer import Renderer, Target
+from hilstar.rotation import from_radec_roll_deg, propagate
+from hilstar.run.sync.beat import ARCSEC_PER_DEG, Exposures, beat, seen_at
+from hilstar.scene.camera import Camera
+from hilstar.scene.exposure_motion import Motion, smeared_sprites
+from hilstar.scene.frame_motion import Scan
+from hilstar.scene.sprites import Sprites
+from hilstar.study.settings import Isolation, Table, bench_text, centroid_px, lone_windows, star_error
+from hilstar.twin.optics import BenchGeometry, TwinOptics
+from hilstar.units import ARCSEC_PER_RAD, NS_PER_S, magnitude
+
+AXIS = np.array([0.6, 0.8, 0.0])  # across rows and columns
+RADEC_ROLL_DEG = (84.0, 0.0, 15.0)  # Orion: enough bright stars
+PACKET_HZ = 200.0
+RATE_DEG_S = 1.0
+PLACE_TICKS = (-100, -30, -10, -3, -1, 0, 1, 3, 10, 30, 100)
+STARTS = 3  # of exposures within a refresh, for phases between the rows of stars
+STEP_S = 0.5e-3  # to either side, for a star's speed on the detector
+ISOLATION = Isolation(margin_px=8.0, max_share=1e-3)
+RATES_DEG_S = (0.01, 0.03, 0.1, 0.3, 1.0, 2.0, 4.0)
+QUICK_RATES_DEG_S = (2.0,)
+# A window reaches the largest error here and the PSF beyond a star's path.
+
+
+@dataclass(frozen=True, slots=True)
+class Slew:
+    """A turn at a constant rate from t = 0 on, and the packets that tell of it."""
+
+    rate_deg_s: float
+
+    @property
+    def rate_cam_rad_s(self) -> FloatArray:
+        """Of cam in icrs, cam components."""
+        return np.asarray(math.radians(self.rate_deg_s) * AXIS)
+
+    def at(self, seconds: float) -> FloatArray:
+        """The true attitude."""
+        return propagate(from_radec_roll_deg(*RADEC_ROLL_DEG), self.rate_cam_rad_s, seconds)
+
+    def packets_until(self, seconds: float) -> Timeline:
+        """The packets received by then."""
+        timeline = Timeline(Policy(NS_PER_S, NS_PER_S))
+        last = math.floor(seconds * PACKET_HZ)
+        for number in range(last - 3, last + 1):
+            t_s = number / PACKET_HZ
+            timeline.add(AttitudeSample(round(t_s * NS_PER_S), self.at(t_s), self.rate_cam_rad_s, number))
+        return timeline
+
+
+@dataclass(frozen=True, slots=True)
+class Compensation:
+    """What a bench compensates: further keys of [monitor], and `motion` of [render]."""
+
+    monitor_keys: Table
+    motion: str
+
+    def bench_text(self, exposure_s: float) -> str:
+        """The bench file with this compensation."""
+        tables: dict[str, Table] = {
+            "tracker": {"resolution_px": (800, 640), "exposure_s": exposure_s, "transmission": "n-bk7-10mm"},
+            "sky": {"faintest_v_mag": 6.0},
+            "monitor": {"resolution_px": (1920, 1080), "pixel_pitch_um": 57.65, "bits": 10, **self.monitor_keys},
+            "collimator": {"focal_length_mm": 350},
+            "render": {"quantisation": "exact", "motion": self.motion, "brightest_v_mag": 1.5},
+        }
+        return bench_text(tables)
+
+
+WAYS = {
+    "no prediction": Compensation({}, "off"),
+    "prediction": Compensation({}, "off"),
+    "+ scan-out": Compensation({"hold_ms": 0}, "on"),
+    "+ smear": Compensation({}, "on"),
+}
+DRAW_TO_SWAP_S = 0.010
+EXPOSURE_S = 0.1
+START_S = 0.0037  # of the exposure, within a refresh period
+REFRESH_MS = 1e3 / 60  # the default of a bench file
+FRAME_BEFORE = 1  # the first rows of an exposure still show the frame before
+COST_ROUNDS = 9
+
+
+def frame_weights(rows: FloatArray, swaps_s: Sequence[float], scan: Scan, span_s: tuple[float, float]) -> FloatArray:
+    """The share of an exposure (begin, end) for which each row (r,) shows each frame (k,), (k, r); `rows` from 0 to 1.
+
+    A row lights `rows` of the scan-out after the swap, and shows the frame until the next one reaches it.
+    """
+    begins = np.asarray(swaps_s)[:, None] + rows * scan.scanout_s
+    ends = begins + scan.hold_s
+    lit = np.minimum(ends, span_s[1]) - np.maximum(begins, span_s[0])
+    return np.asarray(np.maximum(lit, 0.0) / (span_s[1] - span_s[0]))
+
+
+class ScanningPanel:
+    """A bench that shows on a panel that scans, with one compensation, and a tracker in front of it. Free it with `close`.
+
+    Rows stay lit for `lit` of a refresh, which the bench knows where it compensates smear.
+    """
+
+    def __init__(self, way: str, path: Path, exposure_s: float = EXPOSURE_S, lit: float = 1.0) -> None:
+        compensation = WAYS[way]
+        if lit < 1:
+            compensation = replace(compensation, monitor_keys={**compensation.monitor_keys, "hold_ms": lit * REFRESH_MS})
+        path.write_text(compensation.bench_text(exposure_s))
+        self.way = way
+        self.start_s = START_S
+        self.bench = load(path)
+        config = self.bench.config
+        self.period_s = 1 / config.monitor.refresh_hz
+        self.panel_scan = replace(self.bench.scan, scanout_s=self.period_s, hold_s=lit * self.period_s)
+        tracker = config.tracker
+        self.exposure_s = tracker.exposure_s
+        self.camera = tracker_camera(tracker, self.bench.file.folder)
+        self.optics = TwinOptics(BenchGeometry(self.bench.camera, self.camera), tracker.psf_sigma_px)
+        self.panel = self.bench.panel
+
+    def attitude(self, slew: Slew, swap_s: float) -> Attitude:
+        """The attitude that the display derives from the packets received when it starts the frame of a swap."""
+        timeline = slew.packets_until(swap_s - DRAW_TO_SWAP_S)
+        light_s = swap_s + self.period_s / 2
+        if self.way == "no prediction":
+            light_s = math.floor((swap_s - DRAW_TO_SWAP_S) * PACKET_HZ) / PACKET_HZ
+        attitude = timeline.at(round(light_s * NS_PER_S))
+        if attitude is None:
+            raise AssertionError("the timeline has packets")
+        return attitude
+
+    def draw(self, attitude: Attitude, number: int) -> FloatArray:
+        """The light of one frame, (H, W)."""
+        rate = attitude.rate_cam_rad_s if self.bench.config.render.motion == "on" else None
+        return shown_light(self.bench.draw(attitude.q_icrs_to_cam, number, rate).levels, self.panel)
+
+    def exposed_e_per_s(self, slew: Slew) -> FloatArray:
+        """The tracker's image (h, w) of the screen, mean over an exposure."""
+        height = self.bench.config.monitor.resolution_px[1]
+        span_s = (self.start_s, self.start_s + self.exposure_s)
+        first = math.floor((span_s[0] - 2 * self.period_s) / self.period_s) - FRAME_BEFORE
+        numbers = range(first, math.ceil(span_s[1] / self.period_s) + 1)
+        swaps_s = [number * self.period_s for number in numbers]
+        weights = frame_weights((np.arange(height) + 0.5) / height, swaps_s, self.panel_scan, span_s)
+        light = np.zeros((height, self.bench.config.monitor.resolution_px[0]))
+        for number, swap_s, weight in zip(numbers, swaps_s, weights, strict=True):
+            if weight.any():
+                light += weight[:, None] * self.draw(self.attitude(slew, swap_s), number)
+        return self.optics.image_e_per_s(light)
+
+    def cost_ms(self, slew: Slew) -> float:
+        """Median time of drawing a frame, from its attitude to its codes, ms."""
+        attitude = self.attitude(slew, 0.0)
+        rate = attitude.rate_cam_rad_s if self.bench.config.render.motion == "on" else None
+        times = []
+        for number in range(COST_ROUNDS):
+            begin_s = time.perf_counter()
+            _ = self.bench.draw(attitude.q_icrs_to_cam, number, rate).levels
+            times.append((time.perf_counter() - begin_s) * 1e3)
+        return float(np.median(times))
+
+    def close(self) -> None:
+        """Free the GL contexts."""
+        self.bench.close()
+        self.optics.close()
+
+
+class Sky:
+    """The same tracker's image of the sky itself, spread by the sprites' width. Free it with `close`."""
+
+    def __init__(self, shown: ScanningPanel) -> None:
+        self._shown = shown
+        render = shown.bench.config.render
+        self._sigma_px = render.sprite_sigma_px
+        self._renderer = Renderer(Target(shown.bench.config.monitor.resolution_px, self._sigma_px))
+
+    def paths(self, slew: Slew) -> Sprites:
+        """Each star's path over the exposure, in monitor pixels."""
+        middle_s = self._shown.start_s + self._shown.exposure_s / 2
+        motion = Motion(slew.at(middle_s), slew.rate_cam_rad_s, self._shown.exposure_s)
+        bench = self._shown.bench
+        return smeared_sprites(bench.stars, motion, bench.camera, self._renderer.footprint_px, self._sigma_px)
+
+    def exposed_e_per_s(self, slew: Slew) -> FloatArray:
+        """The tracker's image (h, w), mean over the exposure."""
+        self._renderer.draw(self.paths(slew))
+        return self._shown.optics.image_e_per_s(self._renderer.linear().astype(np.float64))
+
+    def close(self) -> None:
+        """Free the GL context."""
+        self._renderer.close()
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """Refreshes in an exposure, and for how much of a refresh a row stays lit."""
+
+    refreshes: float
+    lit: float = 1.0
+
+    @property
+    def words(self) -> str:
+        """For a legend."""
+        return f"{self.refreshes:g} refreshes" + ("" if self.lit == 1 else f", lit {self.lit:g} of each")
+
+
+CASES = (Case(6.0), Case(6.3), Case(2.4), Case(6.0, 0.25), Case(2.4, 0.25))
+QUICK_CASES = (Case(6.0), Case(6.3), Case(2.4, 0.25))
+
+
+@dataclass(frozen=True, slots=True)
+class BeatPoint:
+    """One star of one exposure: what was seen, and foretold of an exposure that begins `phase` refreshes after its row lights.
+
+    `off_arcsec` is along the star's motion, `light_mag` against the mean light of the panel.
+    """
+
+    refreshes: float
+    lit: float
+    phase: float
+    off_arcsec: float
+    foretold_arcsec: float
+    light_mag: float
+    foretold_mag: float
+
+
+def measure_beat(quick: bool = False) -> list[BeatPoint]:
+    """Every case at 1 deg/s, by the virtual tracker."""
+    slew = Slew(RATE_DEG_S)
+    with TemporaryDirectory() as folder:
+        return [point for case in (QUICK_CASES if quick else CASES) for point in _case_points(case, slew, Path(folder))]
+
+
+def _case_points(case: Case, slew: Slew, folder: Path) -> Iterator[BeatPoint]:
+    opened = ScanningPanel("+ smear", folder / "beat.toml", case.refreshes / 60.0, case.lit)
+    with closing(opened) as panel, closing(Sky(opened)) as sky:
+        for number in range(STARTS):
+            panel.start_s = (number + 0.2) / STARTS * panel.period_s
+            yield from _exposure_points(case, panel, sky, slew)
+
+
+def _exposure_points(case: Case, panel: ScanningPanel, sky: Sky, slew: Slew) -> Iterator[BeatPoint]:
+    shown, true = panel.exposed_e_per_s(slew), sky.exposed_e_per_s(slew)
+    paths = sky.paths(slew)
+    places = panel.optics.geometry.to_tracker(paths.x_px, paths.y_px)
+    windows = list(lone_windows(paths, *places, panel.camera.resolution_px, ISOLATION))
+    rows, speed_px_s = _rows_and_speeds(panel, slew, np.array([star for star, _ in windows]))
+    exposures = Exposures(1 / panel.period_s, panel.exposure_s, lit_s=case.lit * panel.period_s)
+    phase = (panel.start_s / panel.period_s - rows) % 1.0
+    foretold = seen_at(exposures, phase)
+    for index, (_, window) in enumerate(windows):
+        off_px = np.subtract(centroid_px(shown, window), centroid_px(true, window))
+        speed = speed_px_s[:, index]
+        along_s = float(off_px @ speed / (speed @ speed))
+        light = float(shown[window].sum() / true[window].sum()) / case.lit
+        yield BeatPoint(
+            case.refreshes,
+            case.lit,
+            float(phase[index]),
+            along_s * RATE_DEG_S * ARCSEC_PER_DEG,
+            float(foretold.off_s[index]) * RATE_DEG_S * ARCSEC_PER_DEG,
+            magnitude(light),
+            magnitude(float(foretold.light[index])),
+        )
+
+
+def _rows_and_speeds(panel: ScanningPanel, slew: Slew, stars: np.ndarray) -> tuple[FloatArray, FloatArray]:
+    """Each star's row on the monitor, of its height, and its speed on the detector, px/s (2, n), mid-exposure."""
+    middle = Motion(slew.at(panel.start_s + panel.exposure_s / 2), slew.rate_cam_rad_s, panel.exposure_s)
+    camera, vectors = panel.bench.camera, panel.bench.stars.vectors[stars]
+    images = vectors @ middle.icrs_to_image(np.array([-STEP_S, 0.0, STEP_S]), camera).transpose(0, 2, 1)
+    before, now, after = (camera.project(image) for image in images)
+    to_tracker = panel.optics.geometry.to_tracker
+    speed = np.subtract(to_tracker(*after), to_tracker(*before)) / (2 * STEP_S)
+    return (now[1] + 0.5) / panel.bench.config.monitor.resolution_px[1], speed
+
+
+def beat_findings(points: list[BeatPoint], directory: Path) -> list[str]:
+    """Write `beat.csv` and its chart; a line for each case. Raises InputError."""
+    write_records(directory / "beat.csv", points)
+    cases = list(dict.fromkeys(Case(p.refreshes, p.lit) for p in points))
+    lines = [_beat_line(case, [p for p in points if Case(p.refreshes, p.lit) == case]) for case in cases]
+    off = np.array([p.off_arcsec - p.foretold_arcsec for p in points])
+    finding = (
+        f"The beat of exposure and refresh moves a star at {RATE_DEG_S:g} deg/s as foretold from their phase,"
+        f" within {np.sqrt(np.mean(off**2)):.2g} arcsec rms"
+    )
+    _draw(directory / "beat", finding, cases, points)
+    return [finding, *lines]
+
+
+def _beat_line(case: Case, points: list[BeatPoint]) -> str:
+    found = beat(Exposures(60.0, case.refreshes / 60.0, lit_s=case.lit / 60.0))
+    seen, light = np.array([p.off_arcsec for p in points]), np.array([p.light_mag for p in points])
+    off = seen - [p.foretold_arcsec for p in points]
+    foretold_arcsec = (found.worst_arcsec_per_deg_s or 0.0) * RATE_DEG_S
+    return (
+        f"{case.words}: up to {np.abs(seen).max():.3g} arcsec ({foretold_arcsec:.3g} foretold over all phases) and"
+        f" {np.abs(light).max():.2g} mag ({found.worst_mag:.2g}); {np.sqrt(np.mean(off**2)):.2g} arcsec rms off that"
+        f" ({len(points)} stars)"
+    )
+
+
+def _draw(path: Path, finding: str, cases: list[Case], points: list[BeatPoint]) -> None:
+    phases = np.linspace(0, 1, 801)
+    note = "Lines: foretold. Dots: stars of the virtual tracker. Whole refreshes of rows that stay lit have no beat."
+    with chart(path, finding, panels=2, note=note) as (place, light):
+        for case, colour in zip(cases, SERIES, strict=False):
+            mine = [p for p in points if Case(p.refreshes, p.lit) == case]
+            foretold = seen_at(Exposures(60.0, case.refreshes / 60.0, lit_s=case.lit / 60.0), phases)
+            place.plot(phases, foretold.off_s * RATE_DEG_S * ARCSEC_PER_DEG, color=colour, label=case.words)
+            light.plot(phases, [magnitude(float(part)) for part in foretold.light], color=colour, label=case.words)
+            for axes, seen in ((place, "off_arcsec"), (light, "light_mag")):
+                axes.plot([p.phase for p in mine], [getattr(p, seen) for p in mine], "o", ms=3.5, color=colour, label="_seen")
+        place.set_ylabel("shift of its place [arcsec]")
+        place.set_yscale("symlog", linthresh=1.0)
+        plain_ticks(place.yaxis, [tick for tick in PLACE_TICKS if abs(tick) <= max(map(abs, place.get_ylim()))])
+        light.set_ylabel("change of its light [mag]")
+        light.set_xlabel("start of the exposure after a row lights [refreshes]")
+        for axes in (place, light):
+            label_ends(axes)
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """One compensation at one rate: rms and largest error of centroids, arcsec, rms flux error, mag, and drawing time, ms."""
+
+    way: str
+    rate_deg_s: float
+    stars: int
+    rms_arcsec: float
+    worst_arcsec: float
+    flux_rms_mag: float
+    draw_ms: float
+
+
+def compare(panel: ScanningPanel, sky: Sky, slew: Slew) -> Outcome:
+    """One compensation on one slew, against the sky."""
+    shown, true = panel.exposed_e_per_s(slew), sky.exposed_e_per_s(slew)
+    camera: Camera = panel.camera
+    paths = sky.paths(slew)
+    places = panel.optics.geometry.to_tracker(paths.x_px, paths.y_px)
+    windows = lone_windows(paths, *places, camera.resolution_px, ISOLATION)
+    errors = [star_error(shown, true, window) for _, window in windows]
+    flux_mag = np.array([error.flux_mag for error in errors])
+    off_arcsec = np.array([error.centroid_px for error in errors]) * ARCSEC_PER_RAD / camera.focal_length_px
+    rms_arcsec, rms_mag = (float(np.sqrt(np.mean(np.square(v)))) for v in (off_arcsec, flux_mag))
+    return Outcome(panel.way, slew.rate_deg_s, len(errors), rms_arcsec, float(off_arcsec.max()), rms_mag, panel.cost_ms(slew))
+
+
+@contextmanager
+def _opened() -> Iterator[tuple[list[ScanningPanel], Sky]]:
+    with TemporaryDirectory() as folder, ExitStack() as stack:
+        panels = []
+        for number, way in enumerate(WAYS):
+            panels.append(ScanningPanel(way, Path(folder) / f"{number}.toml"))
+            stack.callback(panels[-1].close)
+        sky = Sky(panels[0])
+        stack.callback(sky.close)
+        yield panels, sky
+
+
+def measure(quick: bool = False) -> list[Outcome]:
+    """Every compensation at every rate."""
+    with _opened() as (panels, sky):
+        rates = QUICK_RATES_DEG_S if quick else RATES_DEG_S
+        return [compare(panel, sky, Slew(rate)) for rate in rates for panel in panels]
+
+
+def run(directory: Path, quick: bool = False) -> list[str]:
+    """Measure, and write `timing` and `beat`, each as csv and png; the findings, a line each. Raises InputError."""
+    outcomes = measure(quick)
+    write_records(directory / "timing.csv", outcomes)
+    at = {(o.way, o.rate_deg_s): o for o in outcomes}
+    finding = draw(directory / "timing", outcomes)
+    return [finding, *(_line(at[way, 2.0]) for way in WAYS), *beat_findings(measure_beat(quick), directory)]
+
+
+def _line(outcome: Outcome) -> str:
+    errors = f"{outcome.rms_arcsec:.3g} arcsec rms, {outcome.worst_arcsec:.3g} maximum, {outcome.flux_rms_mag:.2g} mag rms"
+    return f"{outcome.way}: {errors}, {outcome.draw_ms:.1f} ms a frame ({outcome.stars} stars)"
+
+
+def draw(path: Path, outcomes: list[Outcome]) -> str:
+    """The chart of the outcomes; its finding."""
+    at = {(o.way, o.rate_deg_s): o for o in outcomes}
+    plain, best = (at[way, QUICK_RATES_DEG_S[0]] for way in ("prediction", "+ smear"))
+    finding = (
+        f"At 2 deg/s star positions are off by {plain.rms_arcsec:.0f} arcsec rms with prediction alone,"
+        f" and by {best.rms_arcsec:.2g} with scan-out and smear compensated"
+    )
+    note = "60 Hz panel that lights row by row and holds; exposure 0.1 s; 10 bits, exact; each way adds to the one above it."
+    with chart(path, finding, panels=2, note=note, heights=(1.5, 1)) as (error, cost):
+        for way, marker in zip(WAYS, "osd^", strict=True):
+            mine = [o for o in outcomes if o.way == way]
+            rates = [o.rate_deg_s for o in mine]
+            error.loglog(rates, [o.rms_arcsec for o in mine], marker=marker, label=way)
+            cost.semilogx(rates, [o.draw_ms for o in mine], marker=marker, label=way)
+        error.set_ylabel("error of star positions, rms [arcsec]")
+        cost.set_ylabel("time of a frame [ms]")
+        cost.set_ylim(bottom=0)
+        cost.set_xlabel("slew rate [deg/s]")
+        plain_ticks(cost.xaxis, sorted({o.rate_deg_s for o in outcomes}))
+        for axes in (error, cost):
+            label_ends(axes)
+    return finding

@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 
 from hilstar.arrays import FloatArray
-from hilstar.assess.assessment import Assessment, Wrong
+from hilstar.assess.assessment import Assessment, WrongAnswer
 from hilstar.assess.bench_effects import Slice
 from hilstar.assess.budget import Axes
 from hilstar.assess.places import axes_of
@@ -48,13 +48,6 @@ COLOURS |= {f"dark_{name}": DARK[colour] for name, colour in COLOURS.items()}
 AXES = ("x", "y", "about the boresight")
 
 
-class BothAxes(msgspec.Struct, frozen=True):
-    """One sigma across the boresight, an axis, and about it; null where the run does not tell."""
-
-    cross: float | None
-    roll: float | None
-
-
 class Clock(msgspec.Struct, frozen=True):
     """The tracker's clock less the run's at the run's start, and how much faster it is; null where the motion does not tell."""
 
@@ -67,25 +60,23 @@ class Budget(msgspec.Struct, frozen=True):
     """The JSON object of `hilstar assess`."""
 
     bias_arcsec: tuple[float, float, float]
-    fov_arcsec: BothAxes
-    pixel_arcsec: BothAxes
-    noise_arcsec: BothAxes
+    fov_arcsec: Axes
+    pixel_arcsec: Axes
+    noise_arcsec: Axes
     clock: Clock
     availability: float
-    wrong: tuple[Wrong, ...]
+    wrong: tuple[WrongAnswer, ...]
 
 
 def budget_of(found: Assessment) -> Budget:
     """The figures of an assessment."""
     clock = found.found.clock
-    if clock is None:
-        raise AssertionError("a run has a clock")
     x, y, z = found.found.bias_arcsec.tolist()
     return Budget(
         bias_arcsec=(x, y, z),
-        fov_arcsec=_both(found.found.fov_arcsec),
-        pixel_arcsec=_both(found.found.pixel_arcsec),
-        noise_arcsec=_both(found.noise_arcsec),
+        fov_arcsec=found.found.fov_arcsec,
+        pixel_arcsec=found.found.pixel_arcsec,
+        noise_arcsec=found.noise_arcsec,
         clock=Clock(
             offset_ms=1e3 * found.offset_s if clock.offset_told else None,
             drift_ppm=1e6 * clock.drift if clock.drift_told else None,
@@ -94,10 +85,6 @@ def budget_of(found: Assessment) -> Budget:
         availability=found.lock.availability,
         wrong=found.wrong,
     )
-
-
-def _both(axes: Axes) -> BothAxes:
-    return BothAxes(axes.cross, axes.roll)
 
 
 Row = tuple[str, str, float | int | None, str, float | None, float | None]
@@ -116,12 +103,11 @@ def rows_of(found: Assessment) -> Iterator[Row]:
     ):
         yield from _of_axes(name, axes, interval)
     clock = parts.clock
-    if clock is not None:
-        for name, value, sigma, unit, told in (
-            ("clock offset", 1e3 * found.offset_s, 1e3 * clock.sigma_offset_s, "ms", clock.offset_told),
-            ("clock drift", 1e6 * clock.drift, 1e6 * clock.sigma_drift, "ppm", clock.drift_told),
-        ):
-            yield name, "", value if told else None, unit, value - 1.96 * sigma, value + 1.96 * sigma
+    for name, value, sigma, unit, told in (
+        ("clock offset", 1e3 * found.offset_s, 1e3 * clock.sigma_offset_s, "ms", clock.offset_told),
+        ("clock drift", 1e6 * clock.drift, 1e6 * clock.sigma_drift, "ppm", clock.drift_told),
+    ):
+        yield name, "", value if told else None, unit, value - 1.96 * sigma, value + 1.96 * sigma
     lock = found.lock
     yield "availability", "", lock.availability, COUNT, None, None
     yield "answers due", "", lock.due, COUNT, None, None
@@ -192,7 +178,7 @@ def lines_of(found: Assessment) -> list[tuple[str, str]]:
 def clock_text(found: Assessment) -> str:
     """The clock in words."""
     clock = found.found.clock
-    if clock is None or not clock.drift_told:
+    if not clock.drift_told:
         return "cannot be told: the run does not turn enough"
     offset = f"{1e3 * found.offset_s:.3f} +- {1e3 * clock.sigma_offset_s:.2g} ms" if clock.offset_told else "unknown"
     return f"offset {offset}, fast by {1e6 * clock.drift:.2f} +- {1e6 * clock.sigma_drift:.2g} ppm"

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import FloatArray, IntArray
+from hilstar.attitude.logs.log_file import read_log
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE
 from hilstar.csv_tables import finite_numbers, is_valid, read_rows
 from hilstar.errors import InputError, shortened
@@ -27,9 +28,9 @@ MAX_T_NS = 9 * 10**18
 
 @dataclass(frozen=True, slots=True)
 class Telemetry:
-    """Times (n,), ns of the tracker's clock, rising, with attitudes (n, 4), unit q_icrs_to_cam, NaN where not `valid` (n,).
+    """Times (n,), ns of the tracker's clock, with attitudes (n, 4), unit q_icrs_to_cam, NaN where not `valid` (n,).
 
-    `line` (n,) is each row's line in its file, or which attitude of it (from 1) where `of_lines` is False.
+    `line` (n,) is each row's line in its file, or its number from 1 where `of_lines` is False.
     """
 
     path: Path
@@ -39,15 +40,10 @@ class Telemetry:
     line: IntArray
     of_lines: bool = True
 
-    @property
-    def source(self) -> str:
-        """The file's name, as messages say it."""
-        return str(self.path)
 
-
-def read_telemetry(path: Path) -> Telemetry:
-    """Read telemetry. Raises InputError with the line of what is no attitude, and of times that do not increase."""
-    telemetry = _read_csv(path) if _is_csv(path) else _read_log(path)
+def read_telemetry(path: Path, rising: bool = True) -> Telemetry:
+    """Read telemetry. Raises InputError with the line of what is no attitude and, if `rising`, of a time that does not rise."""
+    telemetry = _read_csv(path, rising) if _is_csv(path) else _read_log(path)
     if not telemetry.valid.any():
         rows = f"{len(telemetry.t_ns)} rows, none of them valid" if len(telemetry.t_ns) else "no row"
         raise InputError(f"{path}: has {rows}; {ADVICE}")
@@ -55,7 +51,7 @@ def read_telemetry(path: Path) -> Telemetry:
 
 
 def _is_csv(path: Path) -> bool:
-    """True unless the file's beginning is that of a log that says what it is."""
+    """False where the file begins as a log of attitudes does (MCAP, AEM, JSON lines)."""
     if path.is_dir():
         return False
     with open_regular(path, ADVICE) as file:
@@ -68,8 +64,6 @@ def _is_csv(path: Path) -> bool:
 
 
 def _read_log(path: Path) -> Telemetry:
-    from hilstar.attitude.logs.log_file import read_log
-
     samples = read_log(path)
     count = len(samples)
     return Telemetry(
@@ -82,14 +76,14 @@ def _read_log(path: Path) -> Telemetry:
     )
 
 
-def _read_csv(path: Path) -> Telemetry:
+def _read_csv(path: Path, rising: bool) -> Telemetry:
     t_ns: list[int] = []
     q: list[tuple[float, ...]] = []
     valid: list[bool] = []
     line: list[int] = []
     for number, cells in read_rows(path, COLUMNS, ADVICE, MAX_BYTES):
         t_ns.append(_time(path, number, cells[0]))
-        if len(t_ns) > 1 and t_ns[-1] <= t_ns[-2]:
+        if rising and len(t_ns) > 1 and t_ns[-1] <= t_ns[-2]:
             said = f"t_s = {shortened(cells[0])} after {t_ns[-2] / NS_PER_S:.9g}"
             raise InputError(f"{path}:{number}: time does not increase ({said}); sort the rows, and give one recording")
         valid.append(is_valid(path, number, cells[5]))

@@ -42,8 +42,7 @@ def alignment(
 ) -> None:
     """Find how the tracker stands before the screen from the attitudes that it reports, for one that gives nothing else."""
     from hilstar.bench.bench_file import read_bench_file
-    from hilstar.calibrate.alignment.calibration import align_files
-    from hilstar.calibrate.alignment.summary import lines_of, write_alignment
+    from hilstar.calibrate.alignment import align_files, lines_of, write_alignment
 
     check_ending("-o", output, TOML)
     if offset_s is not None and ledger is None:

@@ -36,7 +36,7 @@ def assess(
     as_json: Json = False,
 ) -> None:
     """Find a tracker's error budget: bias, field-of-view error, pixel error, noise, clock, availability, wrong answers."""
-    from hilstar.assess.assessment import Wanted, assess_files
+    from hilstar.assess.assessment import AssessSettings, assess_files
     from hilstar.assess.report import budget_of, lines_of, write_page, write_tables
     from hilstar.files import check_directory, make_directory
 
@@ -45,7 +45,7 @@ def assess(
         raise InputError(f"--latency-ms {latency_ms:g}: write milliseconds, less than {MAX_LATENCY_MS:g} either way")
     names = ("budget.html", "budget.csv", "slices.csv", "wrong.csv", "outages.csv")
     check_files([ledger, telemetry], [output / name for name in names])
-    found = assess_files(ledger, telemetry, Wanted(stamp, latency_ms / 1e3, display_attitudes))
+    found = assess_files(ledger, telemetry, AssessSettings(stamp, latency_ms / 1e3, display_attitudes))
     make_directory(output)
     write_tables(output, found)
     write_page(output / "budget.html", found)

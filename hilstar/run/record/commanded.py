@@ -1,22 +1,27 @@
-"""What the bench commanded at any moment: attitude and rate between the frames of a run."""
+"""The attitudes that a run commanded: read from its ledger, and interpolated between its frames."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.arrays import FloatArray
+from hilstar.arrays import FloatArray, IntArray
+from hilstar.errors import InputError
 from hilstar.rotation import conjugate, from_rotation_vectors, multiply, normalise, to_rotation_vector
+from hilstar.run.record.ledger_reader import NO_FRAMES, frame_records
+from hilstar.units import NS_PER_S
 
-MAX_GAP_S = 0.5  # between two frames: beyond it, and beyond three usual intervals, nothing says what was shown in between
-USUAL_INTERVALS = 3.0
-MAX_STEP_RAD = np.radians(2.0)  # between two frames: more is a jump
-# And so is a step between two frames that both stand nearly still beside it.
+# Two frames further apart than MAX_GAP_S and USUAL_INTERVALS median intervals do not say what was shown between them.
+MAX_GAP_S, USUAL_INTERVALS = 0.5, 3.0
+# A jump: a larger step than MAX_STEP_RAD, or one over JUMP_RAD that is JUMP_RATIO times as fast as both of its neighbours.
+MAX_STEP_RAD = np.radians(2.0)
 JUMP_RAD, JUMP_RATIO = np.radians(0.02), 4.0
-SAME_RAD = 1e-9
-UNEVEN = 1.6  # the ratio of neighbouring intervals up to which a cubic goes through four frames
+SAME_RAD = 1e-9  # two frames of one attitude are joined whatever lies between them
+UNEVEN = 1.6  # largest ratio of neighbouring intervals for a cubic through four frames
+NOT_SHOWN = (np.nan,) * 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,9 +65,8 @@ class Commanded:
         known = (t_s >= self.t_s[0]) & (t_s <= self.t_s[-1]) & self.joined[before]
         gap_s, step = self._gap_s[before, None], self._step[before]
         share = np.clip((t_s - self.t_s[before]) / gap_s[:, 0], 0, 1)[:, None]
-        bend_before, bend_after = self._bends(before)
-        # Hermite's cubic of the rotation vector from the frame before, whose ends turn by (step + bend) per interval.
-        start, end = step + bend_before, step + bend_after
+        # Hermite's cubic of the rotation vector from the frame before; at its ends it turns by (step + bend) per interval.
+        start, end = step + self._bend(before, -1), step + self._bend(before, 1)
         squared, cubed = share**2, share**3
         moved = (cubed - 2 * squared + share) * start + (3 * squared - 2 * cubed) * step + (cubed - squared) * end
         speed = (3 * squared - 4 * share + 1) * start + (6 * share - 6 * squared) * step + (3 * squared - 2 * share) * end
@@ -70,18 +74,19 @@ class Commanded:
         q = normalise(multiply(from_rotation_vectors(np.where(known[:, None], moved, 0.0)), self.q[before]))
         return Moments(np.where(known[:, None], q, np.nan), np.where(known[:, None], rate, np.nan), known)
 
-    def _bends(self, before: npt.NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
-        """How far the turn at each end of an interval, rad, differs from its own: half the change to the neighbour's."""
+    def _bend(self, interval: IntArray, side: int) -> FloatArray:
+        """How far the turn at one end of each interval, rad per interval, differs from the interval's own (n, 3).
+
+        `side` is -1 for the beginning and 1 for the end. Finite differences at the frame that the interval shares with its
+        neighbour, weighted for unequal lengths; 0 where the neighbour is missing, not joined, or of another length.
+        """
         last = len(self._step) - 1
-        bends = []
-        for other in (before - 1, before + 1):
-            near = np.clip(other, 0, last)
-            ratio = self._gap_s[near] / self._gap_s[before]
-            even = (ratio < UNEVEN) & (ratio > 1 / UNEVEN) & (other >= 0) & (other <= last) & self.joined[near]
-            # Finite differences at the common frame, weighted for unequal intervals.
-            change = (self._step[near] / ratio[:, None] - self._step[before]) / (1 + ratio[:, None])
-            bends.append(np.where(even[:, None], change, 0.0))
-        return bends[0], bends[1]
+        other = interval + side
+        near = np.clip(other, 0, last)
+        ratio = self._gap_s[near] / self._gap_s[interval]
+        even = (ratio < UNEVEN) & (ratio > 1 / UNEVEN) & (other >= 0) & (other <= last) & self.joined[near]
+        change = (self._step[near] / ratio[:, None] - self._step[interval]) / (1 + ratio[:, None])
+        return np.where(even[:, None], change, 0.0)
 
 
 def _jumps(turned_rad: FloatArray, gap_s: FloatArray) -> npt.NDArray[np.bool_]:
@@ -89,3 +94,35 @@ def _jumps(turned_rad: FloatArray, gap_s: FloatArray) -> npt.NDArray[np.bool_]:
     rate = np.nan_to_num(turned_rad) / gap_s
     before, after = np.append(0.0, rate[:-1]), np.append(rate[1:], 0.0)
     return np.asarray((np.nan_to_num(turned_rad) > JUMP_RAD) & (rate > JUMP_RATIO * np.maximum(before, after)))
+
+
+@dataclass(frozen=True, slots=True)
+class CommandedRun:
+    """A run's commanded attitudes by the moment of light, in seconds after `zero_ns` of the sender's clock.
+
+    `changed` counts the frames that the operator's keys or a hidden window changed: these show no commanded attitude.
+    """
+
+    commanded: Commanded
+    zero_ns: int
+    changed: int
+
+    def seconds(self, t_ns: IntArray) -> FloatArray:
+        """Times (n,) of the sender's clock, ns, as the run's seconds."""
+        return np.asarray((t_ns - self.zero_ns) / NS_PER_S)
+
+
+def read_commanded(ledger: Path) -> CommandedRun:
+    """The commanded attitudes in a ledger. Raises InputError for what is no ledger, for damage, for under two frames."""
+    shown: dict[int, tuple[float, ...]] = {}
+    changed = 0
+    for record in frame_records(ledger):
+        plain = record.q is not None and not record.operator and not record.hidden
+        changed += record.q is not None and not plain
+        shown[record.light_ns] = record.q if plain and record.q is not None else NOT_SHOWN
+    if len(shown) < 2:
+        raise InputError(f"{ledger}: {NO_FRAMES if not shown else 'has one frame; give the ledger of a longer run'}")
+    light_ns = np.array(sorted(shown), dtype=np.int64)
+    zero_ns = int(light_ns[0])
+    q = np.array([shown[int(t)] for t in light_ns])
+    return CommandedRun(Commanded((light_ns - zero_ns) / NS_PER_S, q), zero_ns, changed)

@@ -7,10 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilstar.calibrate.alignment.calibration import align
-from hilstar.calibrate.alignment.pairs import COMMANDED, Pairs
-from hilstar.calibrate.alignment.residual import groups_of
-from hilstar.calibrate.alignment.summary import summary_of
+from hilstar.calibrate.alignment import align, groups_of, summary_of
+from hilstar.calibrate.attitude_pairs import COMMANDED, Pairs
 from hilstar.errors import InputError
 from hilstar.monitor.geometry import monitor_camera
 from hilstar.rotation import conjugate, from_rotation_vector, from_rotation_vectors, multiply, normalise, to_rotation_vector

@@ -1,0 +1,352 @@
+"""From pairs of attitudes to a geometry file: the rotation between them, taken out of `q_cam_to_mon`.
+
+The screen shows the star at v (ICRS) where the camera Q C v has it, with C the commanded attitude and Q the file's
+q_cam_to_mon; the tracker, which truly stands at Q', sees it in the direction Q'* Q C v, and so reports T = Q'* Q C. The
+rotation M = T C* of all pairs is then Q'* Q, and Q' = Q M*.
+
+The residual is judged by attitudes that were repeated: their scatter is noise, and what exceeds it no rotation explains.
+"""
+
+from __future__ import annotations
+
+import datetime
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from msgspec.structs import replace
+
+import hilstar
+from hilstar.arrays import FloatArray, IntArray
+from hilstar.bench.bench_file import BenchFile
+from hilstar.bench.cameras import bench_camera
+from hilstar.calibrate.attitude_pairs import Pairs, RotationFit, fit_rotation, pair_with_ledger, read_pairs, refuse_conventions
+from hilstar.errors import InputError
+from hilstar.monitor.geometry import ErrorTable, MadeTable, Notes, load_geometry, load_notes, write_geometry
+from hilstar.rotation import conjugate, from_matrix, multiply, normalise, to_matrix, to_rotation_vector
+from hilstar.scene.camera import Camera
+from hilstar.units import ARCSEC_PER_RAD
+
+MIN_PAIRS = 3
+# Two attitudes whose quaternions agree to this, 10 arcsec, show the same stars at the same places.
+SAME_ATTITUDE = 5e-5
+MIN_REPEATS = 3  # degrees of freedom of the repeats' scatter
+FALSE_ALARM = 1e-3
+FLOOR_RAD = 1e-3 / ARCSEC_PER_RAD  # smallest noise: quaternions are rounded
+MIN_EXPLAINED = 0.5  # share of the residual's squares that a named cause explains
+MIN_ATTITUDES = 6  # a cause is sought from so many on
+MAX_NAMED = 10  # wild rows
+ONE_ATTITUDE = (
+    "one attitude: it determines the rotation, but does not tell what changes with attitude; take several, all over the sky"
+)
+NO_REPEATS = "no attitude was repeated: the residual cannot be told from the tracker's noise; take some attitudes several times"
+
+
+@dataclass(frozen=True, slots=True)
+class AxesArcsec:
+    """Rms across the boresight, per axis (x and y together), and about it, arcsec."""
+
+    cross: float
+    roll: float
+
+
+@dataclass(frozen=True, slots=True)
+class Residual:
+    """The residual of the pairs used: the whole, the scatter of repeated attitudes (None without any), and the excess over it.
+
+    `unexplained` is 0 where the repeats' scatter explains the whole; `causes` are lines that name a likely cause.
+    """
+
+    rms: AxesArcsec
+    repeat: AxesArcsec | None
+    unexplained: AxesArcsec | None
+    attitudes: int
+    causes: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Aligned:
+    """The rotation from the commanded to the reported attitudes, and the alignment that takes it out.
+
+    `camera` is the bench's present geometry. `wild` are the lines of the file whose pairs do not fit the rotation.
+    """
+
+    pairs: Pairs
+    fit: RotationFit
+    residual: Residual
+    camera: Camera
+    q_cam_to_mon: FloatArray
+    sigma_arcsec: tuple[float, float, float]
+    wild: tuple[int, ...]
+
+    @property
+    def rotation_arcsec(self) -> tuple[float, float, float]:
+        """The rotation vector from the commanded to the reported attitude, cam axes: x, y, and z about the boresight."""
+        x, y, z = (ARCSEC_PER_RAD * to_rotation_vector(self.fit.q)).tolist()
+        return x, y, z
+
+
+def align_files(file: BenchFile, table: Path, ledger: Path | None, offset_s: float) -> Aligned:
+    """Align a bench by a table of pairs, or by the telemetry of a run with its ledger. Raises InputError."""
+    pairs = read_pairs(table) if ledger is None else pair_with_ledger(table, ledger, offset_s)
+    return align(pairs, bench_camera(file.config, file.folder))
+
+
+def align(pairs: Pairs, camera: Camera) -> Aligned:
+    """Find the alignment of a tracker behind the monitor's `camera`.
+
+    Raises InputError, with the cure, for too few pairs, other conventions, and half or more of wild ones.
+    """
+    if len(pairs) < MIN_PAIRS:
+        skipped = f" ({pairs.skipped} more are not valid)" if pairs.skipped else ""
+        raise InputError(f"{pairs.source}: {len(pairs)} pairs{skipped} and {MIN_PAIRS} are needed; measure more attitudes")
+    refuse_conventions(pairs, camera.field_radius_rad(0.0))
+    fit = fit_rotation(multiply(pairs.reported, conjugate(pairs.commanded)))
+    used = fit.used
+    if 2 * used.sum() <= len(pairs):
+        raise InputError(
+            f"{pairs.source}: half or more of the reported attitudes are wild: {used.sum()} of {len(pairs)} agree; look for"
+            " lost stars, and rows of other times"
+        )
+    kept = Pairs(
+        pairs.source,
+        pairs.line[used],
+        pairs.commanded[used],
+        pairs.reported[used],
+        pairs.skipped,
+        None if pairs.rate_rad_s is None else pairs.rate_rad_s[used],
+        pairs.names,
+    )
+    x, y, z = (ARCSEC_PER_RAD * fit.sigma_rad(groups_of(pairs.commanded))).tolist()
+    return Aligned(
+        pairs=pairs,
+        fit=fit,
+        residual=residual_of(kept, fit.residual_rad[used], fit.q),
+        camera=camera,
+        q_cam_to_mon=corrected(from_matrix(camera.cam_to_image), fit.q),
+        sigma_arcsec=(x, y, z),
+        wild=tuple(pairs.line[~used].tolist()),
+    )
+
+
+def corrected(q_cam_to_mon: FloatArray, q_commanded_to_reported: FloatArray) -> FloatArray:
+    """The alignment (4,), w >= 0, with which the tracker reports what is commanded: Q' = Q M*."""
+    q = normalise(multiply(q_cam_to_mon, conjugate(q_commanded_to_reported)))
+    return np.asarray(-q if q[0] < 0 else q)
+
+
+def groups_of(commanded: FloatArray) -> IntArray:
+    """The group (n,) of each commanded attitude (n, 4); attitudes within SAME_ATTITUDE have one group."""
+    largest = np.argmax(np.abs(commanded), axis=1)
+    sign = np.sign(np.take_along_axis(commanded, largest[:, None], axis=1))
+    rounded = np.round(commanded * sign / SAME_ATTITUDE).astype(np.int64)
+    return np.asarray(np.unique(rounded, axis=0, return_inverse=True)[1]).reshape(-1)
+
+
+def residual_of(pairs: Pairs, residual_rad: FloatArray, q: FloatArray) -> Residual:
+    """Judge the residuals (n, 3), rad, of pairs without wild ones; `q` is the fitted rotation."""
+    group = groups_of(pairs.commanded)
+    cross, roll = residual_rad[:, :2], residual_rad[:, 2:]
+    judged = [_against_repeats(part, group) for part in (cross, roll)]
+    dof = max(1.0 - 1.0 / len(pairs), 0.5)
+    rms = AxesArcsec(*(ARCSEC_PER_RAD * float(np.sqrt((part**2).mean() / dof)) for part in (cross, roll)))
+    found = [each for each in judged if each is not None]
+    repeat = unexplained = None
+    if len(found) == 2:
+        repeat = AxesArcsec(found[0][0], found[1][0])
+        unexplained = AxesArcsec(found[0][1], found[1][1])
+    return Residual(rms, repeat, unexplained, int(group.max()) + 1, _causes(pairs, residual_rad, q, group))
+
+
+def _against_repeats(part: FloatArray, group: IntArray) -> tuple[float, float] | None:
+    """The scatter of repeats, and the excess scatter of the attitudes' means over it, arcsec; None for too few repeats."""
+    count = np.bincount(group)
+    pairs, groups, axes = len(group), len(count), part.shape[1]
+    if pairs - groups < MIN_REPEATS:
+        return None
+    means = _means(part, group)
+    within = float(((part - means[group]) ** 2).sum()) / (axes * (pairs - groups))
+    repeat = ARCSEC_PER_RAD * float(np.sqrt(within))
+    within = max(within, FLOOR_RAD**2)
+    if groups < 2:
+        return repeat, 0.0
+    between = float((count[:, None] * (means - part.mean(axis=0)) ** 2).sum()) / (axes * (groups - 1))
+    if between / within <= _f_limit(axes * (groups - 1), axes * (pairs - groups)):
+        return repeat, 0.0
+    usual = (pairs - float((count**2).sum()) / pairs) / (groups - 1)
+    return repeat, ARCSEC_PER_RAD * float(np.sqrt((between - within) / usual))
+
+
+def _causes(pairs: Pairs, residual_rad: FloatArray, q: FloatArray, group: IntArray) -> tuple[str, ...]:
+    """Causes that explain most of the residual: a turned reference frame, a clock's offset, a drift.
+
+    They are fitted to the mean of each attitude's pairs, so that an attitude counts once however often it was repeated.
+    """
+    row = np.linspace(-0.5, 0.5, len(pairs))[:, None]
+    if group.max() == 0:
+        group = np.arange(len(pairs))
+    if group.max() + 1 < MIN_ATTITUDES:
+        return ()
+    means = _means(residual_rad, group)
+    causes = []
+    # A turn n of the reference frame: C R(n) C* is a turn by C n in cam.
+    frames = np.stack([to_matrix(each) for each in pairs.commanded[np.unique(group, return_index=True)[1]]])
+    turn = _explained(means, frames)
+    if turn is not None:
+        size = ARCSEC_PER_RAD * float(np.linalg.norm(turn))
+        causes.append(
+            f"a reference frame turned by {size:.3g} arcsec explains most of it: does the tracker report in ICRS, not of date?"
+        )
+    if pairs.rate_rad_s is not None:
+        late = _explained(means, -_means(pairs.rate_rad_s @ to_matrix(q).T, group)[:, :, None])
+        if late is not None:
+            causes.append(f"times that are {late[0]:+.4f} s off explain most of it: add that to --offset-s")
+    drift = _explained(means, _means(row, group)[:, :, None] * np.eye(3))
+    if drift is not None:
+        size = ARCSEC_PER_RAD * float(np.linalg.norm(drift))
+        causes.append(f"a drift by {size:.3g} arcsec from the first row to the last explains most of it: did the mount move?")
+    return tuple(causes)
+
+
+def _means(values: FloatArray, group: IntArray) -> FloatArray:
+    """The means (g, k) of each group's rows of (n, k)."""
+    return np.stack([np.bincount(group, column) for column in values.T], axis=1) / np.bincount(group)[:, None]
+
+
+def _explained(residual_rad: FloatArray, columns: FloatArray) -> FloatArray | None:
+    """The amounts (p,) of the columns (n, 3, p) that, beside a constant turn, explain most of residuals (n, 3); else None."""
+    pairs, _, amounts = columns.shape
+    scale = np.sqrt((residual_rad**2).mean(axis=0))
+    cross = max(float(np.sqrt((scale[0] ** 2 + scale[1] ** 2) / 2)), FLOOR_RAD)
+    weight = 1 / np.array([cross, cross, max(float(scale[2]), FLOOR_RAD)])
+    wanted = (residual_rad - residual_rad.mean(axis=0)) * weight
+    design = ((columns - columns.mean(axis=0)) * weight[:, None]).reshape(3 * pairs, amounts)
+    found, _, rank, _ = np.linalg.lstsq(design, wanted.ravel(), rcond=1e-6)
+    free = 3 * pairs - 3 - rank
+    whole, left = float((wanted**2).sum()), float(((wanted.ravel() - design @ found) ** 2).sum())
+    if rank < amounts or free < 3 or left > (1 - MIN_EXPLAINED) * whole or whole < pairs * (FLOOR_RAD / cross) ** 2:
+        return None
+    ratio = (whole - left) / amounts / max(left / free, 1e-30)
+    return np.asarray(found) if ratio > _f_limit(amounts, free) else None
+
+
+def _f_limit(above: float, below: float) -> float:
+    from scipy.special import fdtri  # F's quantile; scipy.stats has the same one and takes half a second to import
+
+    return float(fdtri(above, below, 1 - FALSE_ALARM))
+
+
+@dataclass(frozen=True, slots=True)
+class AlignmentSummary:
+    """The alignment in figures, and the files written; the field names are the keys of --json.
+
+    `rotation_arcsec` is the rotation vector from the commanded to the reported attitude, cam axes, with `sigma_arcsec` of each
+    axis. `wild_rows` are lines of the file. `repeat_arcsec` and `unexplained_arcsec` are None where too few attitudes repeat.
+    """
+
+    pairs: int
+    used: int
+    wild: int
+    wild_rows: tuple[int, ...]
+    skipped: int
+    attitudes: int
+    rotation_arcsec: tuple[float, float, float]
+    sigma_arcsec: tuple[float, float, float]
+    residual_arcsec: AxesArcsec
+    repeat_arcsec: AxesArcsec | None
+    unexplained_arcsec: AxesArcsec | None
+    q_cam_to_mon: tuple[float, ...]
+    notes: tuple[str, ...]
+    written: tuple[str, ...] = ()
+
+
+def write_alignment(path: Path, found: Aligned, file: BenchFile) -> AlignmentSummary:
+    """Write the bench's present geometry with the alignment that was found. Raises InputError where it cannot be written."""
+    name = file.config.collimator.geometry
+    if name is None:
+        camera, notes, lens_of = found.camera, Notes({}, ErrorTable(model="ideal lens"), MadeTable()), "the bench file"
+    else:
+        # As the file has it: the bench's own camera is bounded to what this screen needs.
+        camera = load_geometry(file.folder / name, found.camera.resolution_px)
+        notes = load_notes(file.folder / name)
+        lens_of = f"{Path(name).name}, {notes.made.when or 'no date'}"
+    write_geometry(path, camera, found.q_cam_to_mon, _notes(found, notes, lens_of))
+    return summary_of(found, (str(path),))
+
+
+def summary_of(found: Aligned, written: tuple[str, ...] = ()) -> AlignmentSummary:
+    """An alignment in figures."""
+    return AlignmentSummary(
+        pairs=len(found.pairs),
+        used=int(found.fit.used.sum()),
+        wild=len(found.wild),
+        wild_rows=found.wild,
+        skipped=found.pairs.skipped,
+        attitudes=found.residual.attitudes,
+        rotation_arcsec=found.rotation_arcsec,
+        sigma_arcsec=found.sigma_arcsec,
+        residual_arcsec=found.residual.rms,
+        repeat_arcsec=found.residual.repeat,
+        unexplained_arcsec=found.residual.unexplained,
+        q_cam_to_mon=tuple(found.q_cam_to_mon.tolist()),
+        notes=_remarks(found),
+        written=written,
+    )
+
+
+def _notes(found: Aligned, lens: Notes, lens_of: str) -> Notes:
+    """The notes of the present lens, with the alignment's own."""
+    axes = ("rotation_x_arcsec", "rotation_y_arcsec", "rotation_z_arcsec")
+    made = MadeTable(
+        by=f"hilstar {hilstar.__version__}",
+        when=datetime.datetime.now(datetime.UTC).date().isoformat(),
+        poses=lens.made.poses,
+        pairs=len(found.pairs),
+        pairs_used=int(found.fit.used.sum()),
+        wild_rows=list(found.wild),
+        rotation_arcsec=found.rotation_arcsec,
+        lens_of=lens_of,
+    )
+    rms = found.residual.rms
+    error = replace(lens.error, alignment_cross_arcsec=rms.cross, alignment_roll_arcsec=rms.roll)
+    return Notes(lens.sigma | dict(zip(axes, found.sigma_arcsec, strict=True)), error, made)
+
+
+def _remarks(found: Aligned) -> tuple[str, ...]:
+    residual = found.residual
+    remarks = []
+    unexplained = residual.unexplained
+    if residual.attitudes == 1:
+        remarks.append(ONE_ATTITUDE)
+    elif unexplained is None:
+        remarks.append(NO_REPEATS)
+    elif unexplained.cross > 0 or unexplained.roll > 0:
+        parts = (("across", unexplained.cross), ("about", unexplained.roll))
+        excess = " and ".join(f"{value:.3g} arcsec rms {where} the boresight" for where, value in parts if value > 0)
+        remarks.append(f"a rotation does not explain {excess}: calibrate the geometry with dots (hilstar calibrate geometric)")
+    return (*remarks, *residual.causes)
+
+
+def lines_of(summary: AlignmentSummary) -> list[str]:
+    """The alignment for a person."""
+    x, y, z = (
+        f"{value:.2f} +- {sigma:.2f}" for value, sigma in zip(summary.rotation_arcsec, summary.sigma_arcsec, strict=True)
+    )
+    named = ", ".join(map(str, summary.wild_rows[:MAX_NAMED])) + (", ..." if summary.wild > MAX_NAMED else "")
+    skipped = f", {summary.skipped} skipped" if summary.skipped else ""
+    of = "all of one attitude" if summary.attitudes == 1 else f"of {summary.attitudes} attitudes"
+    rows = [
+        ("pairs", f"{summary.used} of {summary.pairs} used, {of}{skipped}"),
+        ("wild", f"{summary.wild}, on lines {named}" if summary.wild else "none"),
+        ("reported - commanded", f"x {x}, y {y}, about the boresight {z} arcsec"),
+        ("residual", _both(summary.residual_arcsec)),
+    ]
+    if summary.repeat_arcsec is not None and summary.unexplained_arcsec is not None:
+        rows.append(("repeats of an attitude", _both(summary.repeat_arcsec)))
+        rows.append(("not a rotation", _both(summary.unexplained_arcsec)))
+    width = max(len(name) for name, _ in rows) + 2
+    return [f"{name:{width}}{text}" for name, text in rows] + list(summary.notes)
+
+
+def _both(axes: AxesArcsec) -> str:
+    return f"{axes.cross:.3g} arcsec rms across the boresight, {axes.roll:.3g} about it"

@@ -1,1 +1,0 @@
-"""The alignment of a tracker that gives only quaternions: commanded attitudes against reported ones."""

@@ -23,12 +23,14 @@ from hilstar.attitude.wire.packet import AttitudeSample, rate_refusal
 from hilstar.attitude.wire.source import PACKETS, Conventions
 from hilstar.bench.config import BenchConfig
 from hilstar.bench.frame import Bench
-from hilstar.errors import InputError
+from hilstar.errors import InputError, printable
+from hilstar.monitor.quantise import Quantisation
+from hilstar.notices import Notices
 from hilstar.process.interrupts import stop_on_signal
 from hilstar.run.faults import NO_RECORDING, Recording, read_recording, replayed_faults
 from hilstar.run.loop import FrameLoop, Limit, policy_of
 from hilstar.run.pacer import Moment
-from hilstar.run.record.ledger_reader import drawable_frames
+from hilstar.run.record.ledger_reader import drawable_frames, read_head
 from hilstar.run.record.ledger_records import FrameRecord, below_step, frame_record
 from hilstar.run.serve import Outlet, Running
 from hilstar.run.shown import FrameSink, Shown, ignore
@@ -36,6 +38,12 @@ from hilstar.run.summary import RunSummary
 from hilstar.units import NS_PER_S
 
 MAX_FRAMES = 100_000_000
+# Largest share of a frame's lit pixels whose codes may be one off where another renderer draws the same light. Measured with
+# light that is off by 2.4e-7, as by another driver's exp2, over ten skies: 3e-6 of `round`, 1.1e-3 of `exact`, 1.9e-3 of
+# `temporal`. A choice of `exact` has ties that the last bit decides, and takes a star's other pixels with it.
+OTHER_CODES: dict[Quantisation, float] = {"round": 1e-4, "dither": 1e-4, "exact": 5e-3, "temporal": 5e-3}
+# `exact` in NumPy is another program than its shader: of two choices that are as good it may take the other.
+OTHER_CODES_BY_NUMPY = 0.35
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +94,10 @@ class Play(Protocol):
         """The frame of an earlier run; None of a log."""
 
     @property
+    def drawn_by(self) -> DrawnBy | None:
+        """Who drew an earlier run; None of a log, and where its ledger does not say."""
+
+    @property
     def told(self) -> list[tuple[str, str]]:
         """Events to report before it begins: kinds and lines."""
 
@@ -95,6 +107,26 @@ class Play(Protocol):
 
     def frame(self, slot: int) -> tuple[int, int, Attitude | None]:
         """Number, time and attitude of a frame; None is blank."""
+
+
+@dataclass(frozen=True, slots=True)
+class DrawnBy:
+    """Who draws a run's codes: the GL renderer and version as the driver names them, and the path (see `Renderer.path`)."""
+
+    gl_renderer: str
+    gl_version: str
+    path: str
+
+    def __str__(self) -> str:
+        """As a person reads it."""
+        return f"{self.gl_renderer}, OpenGL {self.gl_version}, by {self.path}"
+
+    def other_codes(self, other: DrawnBy, quantisation: Quantisation) -> float:
+        """The largest share of lit pixels whose codes the two may draw one off; 0: the same bit for bit."""
+        if self == other:
+            return 0.0
+        by_numpy = (self.path == "NumPy") != (other.path == "NumPy")
+        return OTHER_CODES_BY_NUMPY if by_numpy else OTHER_CODES[quantisation]
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,6 +143,7 @@ class LogPlay:
     conventions: Conventions = PACKETS
     zero_ns: int = 0
     recording: Recording = NO_RECORDING
+    drawn_by: None = None
 
     @property
     def packet_count(self) -> int:
@@ -129,7 +162,10 @@ class LogPlay:
 
 @dataclass(frozen=True, slots=True)
 class RunPlay:
-    """An earlier run, from its ledger: the same frames with the same attitudes, so the same light bit for bit."""
+    """An earlier run, from its ledger: the same frames with the same attitudes, so the same light.
+
+    The same renderer draws the same codes bit for bit; another draws them within `DrawnBy.other_codes`.
+    """
 
     frames: list[FrameRecord]
     packet_count: int
@@ -139,6 +175,7 @@ class RunPlay:
     conventions: Conventions = PACKETS
     zero_ns: int = 0
     recording: Recording = NO_RECORDING
+    drawn_by: DrawnBy | None = None
 
     @property
     def first_ns(self) -> int:
@@ -214,7 +251,28 @@ def _plan_run(log: Path, wanted: Wanted, factor: float, frames: list[FrameRecord
     if not kept:
         raise InputError(f"{log}: has no frame from --start {start_s:g} to --stop {stop_s:g}; write a longer span")
     play = RunPlay(kept, sum(1 for _ in read_attitudes(log)), not math.isinf(factor))
-    return replace(play, zero_ns=frames[0].t_ns, recording=read_recording(log))
+    return replace(play, zero_ns=frames[0].t_ns, recording=read_recording(log), drawn_by=_drawn_by(log))
+
+
+def _drawn_by(log: Path) -> DrawnBy | None:
+    """Who drew a ledger's run; None where its head does not say all."""
+    head = read_head(log)
+    if not {"gl_renderer", "gl_version", "render_path"} <= head.keys():
+        return None
+    return DrawnBy(printable(head["gl_renderer"]), printable(head["gl_version"]), printable(head["render_path"]))
+
+
+def _tell_other_renderer(before: DrawnBy | None, bench: Bench, notices: Notices) -> None:
+    """Say where another renderer drew the run, and how far its codes may be from these."""
+    renderer = bench.renderer
+    now = DrawnBy(printable(renderer.gl_renderer), printable(renderer.gl_version), renderer.path)
+    if before is None or before == now:
+        return
+    share = before.other_codes(now, renderer.target.quantisation)
+    notices.tell(
+        "other-renderer",
+        f"the run was drawn by {before}, and is now by {now}: at most {share:.2g} of a frame's lit pixels may be one code off",
+    )
 
 
 def _span(log: Path, wanted: Wanted, length_s: float) -> tuple[float, float]:
@@ -239,6 +297,7 @@ def replay(bench: Bench, play: Play, sink: FrameSink = ignore, outlet: Outlet | 
     loop = outlet.on(FrameLoop(bench, sink, outlet.pacer(bench), play.moving, outlet.notices, frames))
     for kind, line in play.told:
         outlet.notices.tell(kind, line)
+    _tell_other_renderer(play.drawn_by, bench, outlet.notices)
 
     def draw_slot(moment: Moment) -> Shown | None:
         if faults is not None:

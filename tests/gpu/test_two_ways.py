@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from hilstar.bench.build import load
 from hilstar.monitor.response import gamma_response, srgb_response
+from hilstar.notices import Notices
 from hilstar.render.context import computes_in_software
 from hilstar.render.encoder import SpriteSide
 from hilstar.render.renderer import Renderer, Target
 from hilstar.render.star_passes import StarPasses
+from hilstar.run.record.ledger import Ledger, LedgerSwitch
+from hilstar.run.replay import OTHER_CODES, DrawnBy, Wanted, plan_play, replay
+from hilstar.run.serve import Outlet
 from hilstar.scene.extended import LightMap
 from hilstar.scene.psf import footprint_px, outside_share
 from hilstar.scene.sprites import Sprites, pack_sprites
+from tests.support.benches import bench_text
 
 SIZE, WHITE, FRAMES = (640, 480), 1e6, 3
 USUAL = (0.85, 0.85)
@@ -120,3 +127,50 @@ def test_no_frame_of_temporal_leaves_a_pixel_behind(sigma_px, rng):
         for x, y in sprites.data["pixel"] - (side - 1) // 2:
             under[max(y, 0) : max(y + side, 0), max(x, 0) : max(x + side, 0)] = True
         assert not codes[~under].any()
+
+
+def replayed(path, log, ledger=None) -> tuple[dict[int, np.ndarray], list[str], DrawnBy]:
+    """The codes of each frame of a replay, what was told of another renderer, and who drew it."""
+    codes, told = {}, []
+
+    class Told(Notices):
+        def tell(self, kind, detail, who=""):
+            told.extend([detail] * (kind == "other-renderer"))
+            super().tell(kind, detail, who)
+
+    with load(path) as bench:
+        notices = Told()
+        kept = LedgerSwitch(None if ledger is None else Ledger(ledger, bench, notices))
+        play = plan_play(log, Wanted(math.inf), bench.config)
+        replay(
+            bench,
+            play,
+            lambda shown: codes.update({shown.number: shown.drawn.levels.copy()}),
+            Outlet(ledger=kept, notices=notices),
+        )
+        kept.end()
+        renderer = bench.renderer
+    return codes, told, DrawnBy(renderer.gl_renderer, renderer.gl_version, renderer.path)
+
+
+@pytest.mark.parametrize("quantisation", ["round", "exact", "temporal"])
+def test_a_run_of_another_path_is_said_to_be_one_and_its_codes_are_within_what_is_said(tmp_path, quantisation, monkeypatch):
+    path, log, ledger = tmp_path / "bench.toml", tmp_path / "log.csv", tmp_path / "run.mcap"
+    path.write_text(bench_text({"render": {"quantisation": quantisation}}))
+    turn = [(k / 10, math.cos(0.01 * k), math.sin(0.01 * k)) for k in range(6)]
+    log.write_text("t_s,qw,qx,qy,qz\n" + "".join(f"{t},{w},{x},0,0\n" for t, w, x in turn))
+    first, told, before = replayed(path, log, ledger)
+    assert not told
+    again, told, _ = replayed(path, ledger)
+    assert not told
+    assert all(np.array_equal(first[number], again[number]) for number in first)
+    if before.path != "compute shaders":
+        pytest.skip(f"{before} draws one way only")
+    monkeypatch.setattr(StarPasses, "runs_on", staticmethod(lambda context: False))
+    by_points, told, now = replayed(path, ledger)
+    assert len(told) == 1 and str(before) in told[0] and str(now) in told[0]
+    assert before.other_codes(now, quantisation) == OTHER_CODES[quantisation]
+    for number, codes in first.items():
+        assert np.abs(codes.astype(int) - by_points[number]).max() <= 1
+        assert np.count_nonzero(codes != by_points[number]) <= OTHER_CODES[quantisation] * np.count_nonzero(codes)
+    assert max(codes.max() for codes in first.values()) > 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,7 +14,7 @@ from hilstar.bench.config import parse_config
 from hilstar.errors import InputError
 from hilstar.run.record.ledger import Ledger
 from hilstar.run.record.ledger_records import FrameRecord
-from hilstar.run.replay import Wanted, plan_play
+from hilstar.run.replay import OTHER_CODES, OTHER_CODES_BY_NUMPY, DrawnBy, Wanted, plan_play
 from tests.support.benches import SMALL_BENCH
 
 MAX = math.inf
@@ -136,3 +137,17 @@ def test_stars_that_were_aberrated_are_so_again_and_no_faster_than_a_spacecraft(
     too_fast = earlier_run(tmp_path / "fast.mcap", small_bench_file, speed_km_s=3e5)
     with pytest.raises(InputError, match="message 7 of /frame: a velocity over 10000 km/s"):
         plan_play(too_fast, Wanted(speed=MAX), config)
+
+
+def test_a_ledger_says_who_drew_it_and_a_log_does_not(ledger, log, config):
+    assert plan_play(ledger, Wanted(MAX), config).drawn_by == DrawnBy("none", "none", "NumPy")
+    assert plan_play(log, Wanted(MAX), config).drawn_by is None
+
+
+def test_another_renderer_s_codes_may_be_others_and_the_same_one_s_may_not():
+    here = DrawnBy("llvmpipe", "4.5", "compute shaders")
+    assert here.other_codes(DrawnBy("llvmpipe", "4.5", "compute shaders"), "exact") == 0
+    for other in (replace(here, gl_renderer="zink"), replace(here, gl_version="4.6"), replace(here, path="points")):
+        assert here.other_codes(other, "round") == OTHER_CODES["round"]
+        assert here.other_codes(other, "exact") == OTHER_CODES["exact"]
+    assert here.other_codes(replace(here, path="NumPy"), "exact") == OTHER_CODES_BY_NUMPY

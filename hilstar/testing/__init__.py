@@ -11,11 +11,9 @@ import numpy.typing as npt
 from hilstar.arrays import FloatArray
 from hilstar.bench.frame import Frame
 from hilstar.errors import InputError
-from hilstar.testing.compare_skies import check_skies, compare_skies
-from hilstar.testing.sky_comparison import SkyComparison, finding, star_lines
-from hilstar.testing.sky_files import read_frame_fits, read_truth_csv
-from hilstar.testing.star_difference import CENTROID_PX, FLUX_MAG, Limits
-from hilstar.testing.star_seeds import Truth, describes
+from hilstar.testing.compare_skies import check_skies, compare_skies, read_frame_fits, read_truth_csv
+from hilstar.testing.sky_comparison import CENTROID_PX, FLUX_MAG, Limits, SkyComparison, finding, star_lines
+from hilstar.testing.star_fit import Truth, describes
 
 __all__ = ["assert_same_sky", "compare"]
 

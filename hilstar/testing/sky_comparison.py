@@ -1,15 +1,345 @@
-"""How two skies differ: every star, what all of them have in common, and the verdict."""
+"""How two skies differ: each star, what most stars change together (shift, turn, scale, dimming), and the verdict.
+
+The common motion is a shift, with turn and scale, or a homography, fitted so that outliers do not matter. Missing stars are
+matched with extra ones first: after a shift by more than a star's width no star is in its place.
+"""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import Any
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Literal
 
 import numpy as np
+from scipy.spatial import cKDTree
 
+from hilstar.arrays import FloatArray
 from hilstar.error_spread import ErrorSpread, error_spread
-from hilstar.testing.common_change import CommonChange
-from hilstar.testing.star_difference import Limits, StarDifference, worst_first
+from hilstar.errors import InputError
+from hilstar.units import magnitude
+
+MORE_STARS = 0.1  # of all: how many more stars a motion with more parameters has to explain
+ROUNDS = 40  # of reweighted least squares, which converge to the minimum sum of absolute residuals
+FINEST_PX = 1e-4  # smaller residuals all weigh the same
+MIN_SHARE = 0.5  # of the median star's displacement, which a motion must explain
+
+# Displacements (n, 2), px, of places (n, 2), px from the middle of the image.
+Motion = Callable[[FloatArray], FloatArray]
+# A tenth or less of the smallest fault that must be seen (0.01 mag, 0.02 px); 500 times the largest difference between two
+# correct drivers (2e-6 mag, 1.5e-6 px), for a star that no brighter one overlaps. tests/unit/testing measures both.
+FLUX_MAG = 1e-3
+CENTROID_PX = 1e-3
+MIN_STARS, MIN_STAR_SHARE = 4, 0.5  # that must differ alike
+MAX_VOTERS, VOTE_PX, PAIR_PX = 80, 2.0, 3.0  # the brightest missing and extra ones; displacements closer than this are one
+PAIR_ROUNDS = 3
+EDGE_PX = 5.0  # a star so near to the edge, or beyond it, may come into view or leave it by a common shift
+
+
+@dataclass(frozen=True, slots=True)
+class MotionFigures:
+    """A motion in the middle of the image: shift, px, turn and scale; 0 for what moves no star by more than its limit."""
+
+    shift_px: tuple[float, float]
+    rotation_deg: float
+    scale_error: float
+
+
+def common_motion(places: FloatArray, moves: FloatArray, limits_px: FloatArray) -> Motion | None:
+    """The simplest motion that explains the moves (n, 2) of stars at `places` (n, 2) from the middle; None for none."""
+    before = np.hypot(*moves.T)
+    if np.median(before) <= np.median(limits_px):
+        return None
+    best = fitted_motion(places, moves, 1)
+    left = _left(best, places, moves)
+    for rank in range(2, rank_for(len(places)) + 1):
+        richer = fitted_motion(places, moves, rank)
+        then = _left(richer, places, moves)
+        more = (then <= limits_px).mean() > (left <= limits_px).mean() + MORE_STARS
+        nearer = np.median(left) > np.median(limits_px) and np.median(then) < MIN_SHARE * np.median(left)
+        if more or nearer:
+            best, left = richer, then
+    return best if np.median(left) <= MIN_SHARE * np.median(before) else None
+
+
+def _left(motion: Motion, places: FloatArray, moves: FloatArray) -> FloatArray:
+    return np.asarray(np.hypot(*(moves - motion(places)).T))
+
+
+def rank_for(stars: int) -> int:
+    """The rank of the richest motion that `stars` stars determine: 1 a shift, 2 with turn and scale, 3 a homography."""
+    return 3 if stars >= 16 else 2 if stars >= 6 else 1
+
+
+def fitted_motion(places: FloatArray, moves: FloatArray, rank: int) -> Motion:
+    """The motion of a rank that has the minimum sum of absolute residuals."""
+    scale = float(np.abs(places).max()) or 1.0
+    (x, y), (u, v) = (places / scale).T, ((places + moves) / scale).T
+    ones, zeros = np.ones_like(x), np.zeros_like(x)
+    if rank == 1:
+        columns = [(ones, zeros), (zeros, ones)]
+    elif rank == 2:
+        columns = [(ones, zeros), (zeros, ones), (x, y), (-y, x)]
+    else:  # a homography, as of a camera that turns: u (1 + g x + h y) = a x + b y + c is linear in its eight numbers
+        columns = [
+            (ones, zeros),
+            (zeros, ones),
+            (x, zeros),
+            (y, zeros),
+            (zeros, x),
+            (zeros, y),
+            (-u * x, -v * x),
+            (-u * y, -v * y),
+        ]
+    design = np.stack([np.stack(column, axis=-1) for column in columns], axis=-1)
+    wanted = np.stack([u - x, v - y], axis=-1)
+    found = _least_absolute(design, wanted, FINEST_PX / scale)
+    return lambda at: _moved(at / scale, found) * scale
+
+
+def _moved(at: FloatArray, found: FloatArray) -> FloatArray:
+    """The displacements (n, 2) of places (n, 2) by a motion of 2, 4 or 8 numbers."""
+    x, y = at.T
+    if len(found) == 2:
+        return np.broadcast_to(found, at.shape).copy()
+    if len(found) == 4:
+        right, down, grow, turn = found
+        return np.stack([right + grow * x - turn * y, down + grow * y + turn * x], axis=-1)
+    c, f, a, b, d, e, g, h = found
+    wide = 1 + g * x + h * y
+    return np.stack([(a * x + b * y + c + x) / wide - x, (d * x + e * y + f + y) / wide - y], axis=-1)
+
+
+def _least_absolute(design: FloatArray, wanted: FloatArray, finest: float) -> FloatArray:
+    """Coefficients (k,) of design (n, 2, k) to wanted (n, 2) with the minimum sum of distances."""
+    weight, found = np.ones(len(wanted)), np.zeros(design.shape[2])
+    for _ in range(ROUNDS):
+        root = np.sqrt(weight)[:, None]
+        weighted = (design * root[..., None]).reshape(-1, design.shape[2])
+        found = np.asarray(np.linalg.lstsq(weighted, (wanted * root).ravel(), rcond=None)[0], dtype=np.float64)
+        weight = 1 / np.maximum(np.hypot(*(wanted - design @ found).T), finest)
+    return np.asarray(found)
+
+
+def figures_of(motion: Motion, middle: FloatArray, limit_px: float) -> MotionFigures:
+    """The figures of a motion of an image whose middle is at `middle` (2,), px; a star's limit is `limit_px`."""
+    reach = float(np.hypot(*middle))
+    step = 1.0
+    here, right, down = motion(np.array([[0.0, 0.0], [step, 0.0], [0.0, step]]))
+    (xx, yx), (xy, yy) = (right - here) / step, (down - here) / step
+    turn, grow = math.atan2(yx - xy, 2 + xx + yy), math.sqrt((1 + xx) * (1 + yy) - xy * yx) - 1
+    shift = float(here[0]), float(here[1])
+    return MotionFigures(
+        shift if math.hypot(*shift) > limit_px else (0.0, 0.0),
+        math.degrees(turn) if abs(turn) * reach > limit_px else 0.0,
+        grow if abs(grow) * reach > limit_px else 0.0,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """By how much a star may differ: magnitudes and pixels. Raises InputError where one is not above 0."""
+
+    flux_mag: float = FLUX_MAG
+    centroid_px: float = CENTROID_PX
+
+    def __post_init__(self) -> None:
+        for name in ("flux_mag", "centroid_px"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise InputError(f"compare: {name} = {getattr(self, name):g}; write a number above 0")
+
+
+@dataclass(frozen=True, slots=True)
+class StarDifference:
+    """One star of the golden image (an extra one: of the other image), and the other image minus the golden one.
+
+    `flux_error_mag` is positive where the star is too faint, infinite where it is missing, minus infinity where it is extra;
+    `hip` has every star of a blend, a body by its name.
+    """
+
+    hip: tuple[int | str, ...]
+    x_px: float
+    y_px: float
+    flux_e_per_s: float
+    flux_error_mag: float
+    dx_px: float
+    dy_px: float
+    limits: Limits
+
+    @property
+    def centroid_error_px(self) -> float:
+        """The distance of the star from its place, px."""
+        return math.hypot(self.dx_px, self.dy_px)
+
+    @property
+    def kind(self) -> Literal["same", "changed", "missing", "extra"]:
+        """What became of the star."""
+        if math.isinf(self.flux_error_mag):
+            return "missing" if self.flux_error_mag > 0 else "extra"
+        return "same" if self.error_over_limit <= 1 else "changed"
+
+    @property
+    def error_over_limit(self) -> float:
+        """The larger of its two errors, each divided by its limit."""
+        return max(abs(self.flux_error_mag) / self.limits.flux_mag, self.centroid_error_px / self.limits.centroid_px)
+
+    @property
+    def name(self) -> str:
+        """Its HIP number, those of its blend, or its place."""
+        if self.hip:
+            hips, bodies = ([one for one in self.hip if isinstance(one, kind)] for kind in (int, str))
+            return " + ".join([*(f"HIP {one}" if k == 0 else str(one) for k, one in enumerate(hips)), *map(str, bodies)])
+        return f"star at ({self.x_px:.1f}, {self.y_px:.1f})"
+
+    def line(self) -> str:
+        """What is wrong with the star, for a person."""
+        place = f" at ({self.x_px:.2f}, {self.y_px:.2f}) px" if self.hip else ""
+        if self.kind in ("missing", "extra"):
+            return f"{self.name}{place}: {self.kind}, {self.flux_e_per_s:.4g} electrons/s"
+        return (
+            f"{self.name}{place}: {self.flux_error_mag:+z.4f} mag, {self.centroid_error_px:.4f} px"
+            f" ({self.dx_px:+z.4f}, {self.dy_px:+z.4f}) off"
+        )
+
+
+def worst_first(stars: list[StarDifference]) -> list[StarDifference]:
+    """The stars in the order in which a person looks at them; of those missing and extra the brightest first."""
+    return sorted(stars, key=lambda star: (-star.error_over_limit, -star.flux_e_per_s))
+
+
+@dataclass(frozen=True, slots=True)
+class CommonChange:
+    """What is common: shift in the middle of the image, px, turn and scale there, and magnitudes (positive: too faint).
+
+    A figure is 0 where the stars do not have it in common.
+    `beyond` are the stars of both images once that is subtracted, `alone` those that only one image has. Stars that the shift
+    brought into view or took out of it are in neither.
+    """
+
+    shift_px: tuple[float, float]
+    rotation_deg: float
+    scale_error: float
+    flux_mag: float
+    beyond: list[StarDifference]
+    alone: list[StarDifference]
+
+    @property
+    def differing(self) -> list[StarDifference]:
+        """The stars that differ from what is common."""
+        return [star for star in self.beyond if star.kind != "same"] + self.alone
+
+    def line(self) -> str:
+        """What is common, for a person."""
+        right, down = self.shift_px
+        digits = 2 if math.hypot(right, down) >= 0.1 else 4
+        found = [f"shifted by ({right:z.{digits}f}, {down:z.{digits}f}) px"] if any(self.shift_px) else []
+        found += [f"turned by {self.rotation_deg:+.4f} deg"] if self.rotation_deg else []
+        found += [f"scaled by {self.scale_error:+.4%}"] if self.scale_error else []
+        dimmer, digits = "dimmer" if self.flux_mag > 0 else "brighter", 2 if abs(self.flux_mag) >= 0.1 else 4
+        found += [f"{dimmer} by {abs(self.flux_mag):.{digits}f} mag"] if self.flux_mag else []
+        odd = len(self.differing)
+        rest = "" if not odd else "; 1 star differs from that" if odd == 1 else f"; {odd} stars differ from that"
+        return f"all {', '.join(found) or 'moved alike'}{rest}"
+
+    def summary(self) -> dict[str, Any]:
+        """The figures as JSON has them."""
+        return {
+            "shift_px": self.shift_px,
+            "rotation_deg": self.rotation_deg,
+            "scale_error": self.scale_error,
+            "flux_mag": self.flux_mag,
+            "stars": sum(star.kind == "same" for star in self.beyond),
+            "differ": len(self.differing),
+        }
+
+
+def common_change(stars: list[StarDifference], size_px: tuple[int, int]) -> CommonChange | None:
+    """What most stars of images of `size_px` (width, height) differ by; None where that is nothing."""
+    both, alone = matched(stars)
+    golden = len(both) + sum(star.kind == "missing" for star in alone)
+    if len(both) < max(MIN_STARS, MIN_STAR_SHARE * golden):
+        return None
+    middle = (np.array(size_px) - 1) / 2
+    places = _places(both) - middle
+    moves = np.array([(star.dx_px, star.dy_px) for star in both])
+    limits_px = np.array([star.limits.centroid_px for star in both])
+    motion = common_motion(places, moves, limits_px)
+    flux_mag = _common_flux_mag(both)
+    if motion is None and not flux_mag:
+        return None
+    model = motion or np.zeros_like
+    beyond = [
+        replace(star, flux_error_mag=star.flux_error_mag - flux_mag, dx_px=dx, dy_px=dy)
+        for star, (dx, dy) in zip(both, (moves - model(places)).tolist(), strict=True)
+    ]
+    left = [star for star in alone if not _by_the_edge(star, model, middle)]
+    figures = figures_of(model, middle, float(np.median(limits_px)))
+    return CommonChange(figures.shift_px, figures.rotation_deg, figures.scale_error, flux_mag, beyond, left)
+
+
+def matched(stars: list[StarDifference]) -> tuple[list[StarDifference], list[StarDifference]]:
+    """The stars of both images, those that moved far among them, and the stars that only one image has."""
+    both = [star for star in stars if star.kind in ("same", "changed")]
+    missing, extra = ([star for star in stars if star.kind == kind] for kind in ("missing", "extra"))
+    pairs = _pairs(missing, extra)
+    for here, there in pairs:
+        old, new = missing[here], extra[there]
+        error_mag = magnitude(new.flux_e_per_s / old.flux_e_per_s)
+        both.append(replace(old, flux_error_mag=error_mag, dx_px=new.x_px - old.x_px, dy_px=new.y_px - old.y_px))
+    used = {here for here, _ in pairs}, {there for _, there in pairs}
+    alone = [star for kind, taken in ((missing, used[0]), (extra, used[1])) for k, star in enumerate(kind) if k not in taken]
+    return both, alone
+
+
+def _pairs(missing: list[StarDifference], extra: list[StarDifference]) -> list[tuple[int, int]]:
+    """Which missing star is which extra one, by one common motion; none where they have none."""
+    old, new = _places(missing), _places(extra)
+    voters = min(MAX_VOTERS, len(old), len(new))
+    if voters < MIN_STARS:
+        return []
+    brightest = [np.argsort([-star.flux_e_per_s for star in kind], kind="stable")[:MAX_VOTERS] for kind in (missing, extra)]
+    votes = (new[brightest[1]][None, :] - old[brightest[0]][:, None]).reshape(-1, 2)
+    near = cKDTree(votes).query_ball_point(votes, VOTE_PX)
+    winner = max(near, key=len)
+    if len(winner) < max(MIN_STARS, MIN_STAR_SHARE * voters):
+        return []
+    predicted = old + np.median(votes[winner], axis=0)
+    pairs: list[tuple[int, int]] = []
+    for _ in range(PAIR_ROUNDS):
+        pairs = _mutual(predicted, new)
+        here, there = (np.array([pair[k] for pair in pairs], dtype=np.intp) for k in (0, 1))
+        middle = old.mean(axis=0)
+        motion = fitted_motion(old[here] - middle, new[there] - old[here], rank_for(len(pairs)))
+        predicted = old + motion(old - middle)
+    return pairs
+
+
+def _mutual(predicted: FloatArray, new: FloatArray) -> list[tuple[int, int]]:
+    """The pairs that are each other's nearest, within PAIR_PX."""
+    distance, nearest = (np.asarray(found) for found in cKDTree(new).query(predicted))
+    back = np.asarray(cKDTree(predicted).query(new)[1])
+    return [(k, int(n)) for k, n in enumerate(nearest) if distance[k] <= PAIR_PX and back[n] == k]
+
+
+def _places(stars: list[StarDifference]) -> FloatArray:
+    return np.array([(star.x_px, star.y_px) for star in stars]).reshape(-1, 2)
+
+
+def _common_flux_mag(both: list[StarDifference]) -> float:
+    """The median flux error, where it exceeds the limit and makes up more than half of the median star's error; else 0."""
+    flux_mag = np.array([star.flux_error_mag for star in both])
+    common = float(np.median(flux_mag))
+    left = float(np.median(np.abs(flux_mag - common)))
+    limit = np.median([star.limits.flux_mag for star in both])
+    return common if abs(common) > limit and left <= MIN_SHARE * abs(common) else 0.0
+
+
+def _by_the_edge(star: StarDifference, motion: Motion, middle: FloatArray) -> bool:
+    """Whether a star that one image has is, in the other, near the edge or beyond it."""
+    here = np.array([[star.x_px, star.y_px]]) - middle
+    there = here + motion(here) if star.kind == "missing" else here - motion(here)
+    moved = bool(np.any(motion(here)))
+    return moved and bool((np.abs(there) > middle - EDGE_PX).any())
 
 
 @dataclass(frozen=True, slots=True)

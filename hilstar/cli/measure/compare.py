@@ -29,8 +29,7 @@ def compare(
     from hilstar.files import make_directory
     from hilstar.testing import compare as compare_files
     from hilstar.testing.report import write_report
-    from hilstar.testing.sky_comparison import star_lines
-    from hilstar.testing.star_difference import CENTROID_PX, FLUX_MAG
+    from hilstar.testing.sky_comparison import CENTROID_PX, FLUX_MAG, star_lines
 
     check_directory("-o", output)
     limits = FLUX_MAG if flux_mag is None else flux_mag, CENTROID_PX if centroid_px is None else centroid_px

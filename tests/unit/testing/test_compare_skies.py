@@ -16,8 +16,8 @@ from hilstar.rotation import from_radec_roll_deg
 from hilstar.scene.psf import footprint_px
 from hilstar.scene.sprites import pack_sprites
 from hilstar.testing import MAX_LINES, assert_same_sky, compare
-from hilstar.testing.chart import Panel
-from hilstar.testing.star_difference import CENTROID_PX, FLUX_MAG
+from hilstar.testing.report import Panel
+from hilstar.testing.sky_comparison import CENTROID_PX, FLUX_MAG
 from hilstar.testing.star_fit import star_sigma_px
 from tests.support.benches import SMALL_BENCH
 

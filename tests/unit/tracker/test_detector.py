@@ -10,9 +10,8 @@ from msgspec.structs import replace
 from scipy import ndimage
 
 from hilstar.errors import InputError
-from hilstar.tracker.detector import Detector, bloom
+from hilstar.tracker.detector import RAY_DEPTH_UM, RAY_E_PER_UM, Detector, bloom, cosmic_rays_e, false_stars_e
 from hilstar.tracker.settings import MAX_E, DetectorSettings, ccd47_20_dark
-from hilstar.tracker.strays import RAY_DEPTH_UM, RAY_E_PER_UM, cosmic_rays_e, false_stars_e
 
 SIZE_PX = (160, 128)
 SHAPE = (128, 160)

@@ -3,12 +3,8 @@
 from __future__ import annotations
 
 import math
-import multiprocessing
 import os
-import signal
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,18 +17,15 @@ from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.faults.scenario import Scenario
 from hilstar.bench.faults.timetable import Timetable
-from hilstar.bench.faults.view import FaultView
+from hilstar.errors import MachineError
 from hilstar.files import make_directory
-from hilstar.process.interrupts import end_with_parent
+from hilstar.process.pool import ProcessPool
 from hilstar.rotation import rate_between_rad_s
 from hilstar.scene.exposure_motion import Motion
 from hilstar.twin.faulty_exposure import FaultyExposure, Piece, pieces_of
 from hilstar.twin.pictures import write_exposure_fits
 from hilstar.twin.simulator import FrameNoise, Simulator, simulator_view
 from hilstar.units import NS_PER_S
-
-_simulator: Simulator | None = None
-_faults: FaultView | None = None
 
 
 def log_motions(
@@ -105,51 +98,41 @@ def simulate_motions(
 ) -> None:
     """Write `exposure_000000.fits` and on into `directory`, each with its own noise: seeds (seed, number)."""
     with Simulator(file) as first:  # an error in the bench file is reported once, here
-        pieces = [()] * len(motions) if faults is None else faults.pieces(first, motions)
+        pieces: list[tuple[Piece, ...]] = [()] * len(motions) if faults is None else faults.pieces(first, motions)
     make_directory(directory)
     scenario = None if faults is None else faults.scenario
-    workers = min(len(motions), len(os.sched_getaffinity(0)))
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, context, _start_worker, (file, scenario)) as pool:
-        try:
-            with _without_ctrl_c():
-                tasks = [
-                    pool.submit(_expose_to_file, motion, noise, number, directory, pieces[number])
-                    for number, motion in enumerate(motions)
-                ]
-            for done, task in enumerate(as_completed(tasks), start=1):
-                task.result()
-                on_done(done)
-        except BaseException:
-            for worker in multiprocessing.active_children():
-                worker.terminate()
-            pool.shutdown(cancel_futures=True)
-            raise
+    tasks = iter(enumerate(zip(motions, pieces, strict=True)))
+    with ProcessPool(_start_exposing, (file, noise, directory, scenario), (Exception,)) as pool:
+        for _ in range(min(len(motions), len(os.sched_getaffinity(0)))):
+            pool.start()
+        done = 0
+        while done < len(motions):
+            for worker, news, said in pool.heard():
+                if news == "error":
+                    raise said
+                if news == "died":
+                    raise MachineError(f"a process of the pool ended with code {said}; is there enough memory?")
+                if news == "answer":
+                    done += 1
+                    on_done(done)
+                task = next(tasks, None)
+                if task is not None:
+                    number, (motion, cuts) = task
+                    worker.give(number, number, motion, cuts)
 
 
-@contextmanager
-def _without_ctrl_c() -> Iterator[None]:
-    """What is started here does not receive the Ctrl-C that a terminal sends to all; this process ends it."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+def _start_exposing(
+    file: BenchFile, noise: FrameNoise, directory: Path, scenario: Scenario | None
+) -> tuple[None, Callable[[int, Motion, tuple[Piece, ...]], None]]:
+    """In a worker: no greeting, and the work, which writes one exposure."""
+    simulator = Simulator(file)
+    view = None if scenario is None else simulator_view(simulator, scenario)
+    if view is not None and scenario is not None:
+        view.prepared(scenario)
 
+    def expose(number: int, motion: Motion, pieces: tuple[Piece, ...]) -> None:
+        faults = None if view is None else FaultyExposure(view, pieces)
+        exposure = simulator.expose(motion, noise.rng(number), faults=faults)
+        write_exposure_fits(directory / f"exposure_{number:06d}.fits", simulator, exposure, noise)
 
-def _start_worker(file: BenchFile, scenario: Scenario | None) -> None:
-    global _simulator, _faults  # noqa: PLW0603 - a process of the pool has one simulator, made at its start
-    end_with_parent()
-    os.environ.setdefault("LP_NUM_THREADS", "1")  # the pool itself fills the cores
-    _simulator = Simulator(file)
-    if scenario is not None:
-        _faults = simulator_view(_simulator, scenario)
-        _faults.prepared(scenario)
-
-
-def _expose_to_file(motion: Motion, noise: FrameNoise, number: int, directory: Path, pieces: tuple[Piece, ...] = ()) -> None:
-    if _simulator is None:
-        raise RuntimeError("the worker was not started with a bench")
-    faults = None if _faults is None else FaultyExposure(_faults, pieces)
-    exposure = _simulator.expose(motion, noise.rng(number), faults=faults)
-    write_exposure_fits(directory / f"exposure_{number:06d}.fits", _simulator, exposure, noise)
+    return None, expose

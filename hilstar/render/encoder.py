@@ -124,8 +124,21 @@ class Eraser:
         self._most_px = size_px[0] * size_px[1] * (MAX_ERASED_LEVELS if of_levels else MAX_ERASED_LIGHT)
         self._program = build_program(ctx, "star.vert", "erase.frag", ("LEVELS",) if of_levels else ())
         self._program["resolution_px"] = size_px
+        self._triangle = ctx.vertex_array(build_program(ctx, "full.vert", "erase.frag", ("LEVELS",) if of_levels else ()), [])
         self._vao: moderngl.VertexArray | None = None
         self._footprint_px = 0
+
+    def erase_regions(self, fbo: moderngl.Framebuffer, regions: Sequence[Rectangle]) -> None:
+        """Make rectangles of `fbo` black, by a pass: Mesa 22.3's zink loses a clear of a part before which nothing is drawn."""
+        if not regions:
+            return
+        fbo.use()
+        if (0, 0, *self._size_px) in regions:
+            fbo.clear()
+            return
+        for region in regions:
+            fbo.viewport = region
+            self._triangle.render(moderngl.TRIANGLES, vertices=3)
 
     def take_places_from(self, buffer: moderngl.Buffer, footprint_px: int) -> None:
         """Read the places of sprites from a buffer of SPRITE_DTYPE."""

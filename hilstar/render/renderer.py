@@ -370,11 +370,9 @@ class Renderer:
             self._levels_black = self._levels_black and not self._level_eraser.clears(self._last_count)
             if self._levels_black:
                 self._level_eraser.erase(self._levels.fbo, self._last_count)
-                for region in self._regions:
-                    self._levels.fbo.clear(viewport=region)
+                self._level_eraser.erase_regions(self._levels.fbo, self._regions)
         self._eraser.erase(self._linear_fbo, self._last_count)
-        for region in self._regions:
-            self._linear_fbo.clear(viewport=region)
+        self._eraser.erase_regions(self._linear_fbo, self._regions)
         self._regions = ()
         self._last_count = 0
 

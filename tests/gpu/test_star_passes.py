@@ -98,9 +98,9 @@ def test_frames_of_all_kinds_follow_each_other(quantisation, rng):
     lit = replace(few, extended=(glow,))
     frames = [few, many, few, bright, few, None, bright, many, lit, few, lit, bright, lit, None, few]
     with Renderer(target) as gl:
-        assert gl._passes is not None
-        assert gl._units.unit_for(bright) is None
-        assert gl._units.unit_for(many) is not None
+        if gl.path != "NumPy":  # without compute shaders, `exact` and `temporal`
+            assert gl._units.unit_for(bright) is None
+            assert gl._units.unit_for(many) is not None
         for place, sprites in enumerate(frames):
             gl.draw(sprites)
             found = gl.codes().copy()
@@ -153,7 +153,7 @@ def test_the_largest_sprites_are_whole(sigma):
     """A shader's loops may end early without a word: the largest sprites drawn star by star, and the smallest that are not."""
     target = Target((400, 300), sigma, PANELS["srgb8"], WHITE)
     with Renderer(target) as gl:
-        assert (gl._passes is not None) == (sigma[0] < 24.5)
+        assert (gl._units is not None) == (sigma[0] < 24.5)
         gl.draw(sprites_at(np.array([[200.2, 150.3]]), np.array([1e9]), gl.footprint_px))
         found, light, panel = gl.codes().copy(), gl.linear(), gl.target.panel()
     assert np.count_nonzero(found != round_levels(light, panel)) <= 3

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -22,6 +25,7 @@ from hilstar.scene.extended import LightMap
 from hilstar.scene.psf import footprint_px, outside_share
 from hilstar.scene.sprites import Sprites, pack_sprites
 from tests.support.benches import bench_text
+from tests.support.waiting import PATIENCE_S
 
 SIZE, WHITE, FRAMES = (640, 480), 1e6, 3
 USUAL = (0.85, 0.85)
@@ -174,3 +178,39 @@ def test_a_run_of_another_path_is_said_to_be_one_and_its_codes_are_within_what_i
         assert np.abs(codes.astype(int) - by_points[number]).max() <= 1
         assert np.count_nonzero(codes != by_points[number]) <= OTHER_CODES[quantisation] * np.count_nonzero(codes)
     assert max(codes.max() for codes in first.values()) > 0
+
+
+ZINK = {"MESA_LOADER_DRIVER_OVERRIDE": "zink", "LIBGL_ALWAYS_SOFTWARE": "1"}  # over lavapipe, of Debian's mesa-vulkan-drivers
+DRAW = """
+import sys
+import hilstar, numpy as np
+from hilstar.rotation import from_radec_roll_deg
+with hilstar.load("bench.toml") as bench:
+    frames = [bench.frame(from_radec_roll_deg(84.0, -1.0 + k, 2.0 * k), number=k).levels.copy() for k in range(6)]
+    np.savez(sys.argv[1], *frames)
+    print(bench.renderer.gl_renderer, bench.renderer.path, sep=", ")
+"""
+
+
+@pytest.mark.parametrize("quantisation", ["round", "dither", "exact", "temporal"])
+def test_another_driver_s_codes_are_within_what_replay_says(tmp_path, quantisation):
+    (tmp_path / "bench.toml").write_text(bench_text({"render": {"quantisation": quantisation}}))
+    usual = {name: value for name, value in os.environ.items() if name not in ZINK and name != "MESA_GL_VERSION_OVERRIDE"}
+    names = []
+    for file, environment in (("llvmpipe.npz", usual), ("zink.npz", usual | ZINK)):
+        command = [sys.executable, "-c", DRAW, file]
+        ran = subprocess.run(
+            command, capture_output=True, text=True, cwd=tmp_path, env=environment, timeout=PATIENCE_S, check=False
+        )
+        if environment is not usual and "MachineError" in ran.stderr:
+            pytest.skip("no zink here: Debian's mesa-vulkan-drivers has it")
+        assert not ran.returncode, ran.stderr
+        names.append(ran.stdout)
+    assert names[0].startswith("llvmpipe")
+    if not names[1].startswith("zink"):
+        pytest.skip(f"no zink here: {names[1]}")
+    first, second = np.load(tmp_path / "llvmpipe.npz"), np.load(tmp_path / "zink.npz")
+    for number in first.files:
+        assert np.count_nonzero(first[number]) > 100
+        assert np.abs(first[number].astype(int) - second[number]).max() <= 1
+        assert np.count_nonzero(first[number] != second[number]) <= OTHER_CODES[quantisation] * np.count_nonzero(first[number])

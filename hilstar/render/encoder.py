@@ -194,14 +194,14 @@ class Table:
         rows = table_rows(values, ctx)
         self.define = [] if rows is None else [f"{name} {len(rows)}"]
         self._binding, self._in_block = binding, rows is not None
-        self._buffer = ctx.buffer((values if rows is None else rows).tobytes())
+        self.buffer = ctx.buffer((values if rows is None else rows).tobytes())
 
     def bind(self) -> None:
         """Bind it for the next pass."""
         if self._in_block:
-            self._buffer.bind_to_uniform_block(self._binding)
+            self.buffer.bind_to_uniform_block(self._binding)
         else:
-            self._buffer.bind_to_storage_buffer(self._binding)
+            self.buffer.bind_to_storage_buffer(self._binding)
 
 
 class Encoder:
@@ -264,6 +264,12 @@ class Encoder:
         texture = self._ctx.texture(values.shape[::-1], 1, np.ascontiguousarray(values), dtype=dtype)
         texture.filter = (moderngl.NEAREST, moderngl.NEAREST)
         return texture
+
+    @property
+    def tables(self) -> list[moderngl.Texture | moderngl.Buffer]:
+        """What turns light into levels here."""
+        textures = [texture for name, texture in self._textures.items() if name != "linear_e_per_s"]
+        return [*textures, *([] if self._steps is None else [self._steps])]
 
     def take_places_from(self, buffer: moderngl.Buffer, footprint_px: int) -> None:
         """Read the places and rates of sprites from a buffer of SPRITE_DTYPE."""

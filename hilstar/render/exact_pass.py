@@ -115,6 +115,11 @@ class ExactPass:
         if self._memory is not None:
             self._memory.left = left
 
+    @property
+    def tables(self) -> list[moderngl.Texture | moderngl.Buffer]:
+        """What levels are chosen by."""
+        return [self._order.buffer, self._light.buffer, *([] if self._gain is None else [self._gain])]
+
     def _levels_bytes(self) -> int:
         return 1 if self._levels.dtype == "u1" else 2
 

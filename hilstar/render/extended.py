@@ -165,6 +165,12 @@ class ExtendedLayer:
         self._textures[id(owner)] = kept  # the last used is the last to go
         return kept[1]
 
+    def forget(self) -> None:
+        """Upload what is kept on the GPU again when it is next drawn."""
+        for _, texture in self._textures.values():
+            texture.release()
+        self._textures.clear()
+
     def _upload(self, image: Any, components: int) -> moderngl.Texture:
         values = np.ascontiguousarray(image, dtype=np.float32)
         texture = self._ctx.texture(values.shape[1::-1], components, values, dtype="f4")

@@ -144,6 +144,11 @@ class Presenter:
         texture.filter = (moderngl.NEAREST, moderngl.NEAREST)
         return texture
 
+    @property
+    def table(self) -> moderngl.Texture:
+        """The codes of each level."""
+        return self._triples
+
     def wait(self) -> None:
         """Wait until the last swap is done: a driver that queues swaps has to give the next back buffer for this pixel.
 

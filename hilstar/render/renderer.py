@@ -5,6 +5,7 @@ This room is the only user of moderngl.
 
 from __future__ import annotations
 
+import zlib
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from types import TracebackType
@@ -148,6 +149,9 @@ class Renderer:
 
     def _build_levels(self) -> None:
         target, panel = self.target, self.target.panel()
+        # What turns light into codes; a window adds its own.
+        self.tables: list[moderngl.Texture | moderngl.Buffer] = []
+        self._checksums: list[tuple[moderngl.Texture | moderngl.Buffer, int]] = []
         self._levels: LevelTexture | None = None
         self._levels_black = True  # but for the last frame
         self._encoder: Encoder | None = None
@@ -175,6 +179,8 @@ class Renderer:
                 self._cut_sides = lit_sides(panel, target.sigma_px, self.footprint_px, CUT_WINGS)
             if not dithered and LightUnits.takes(panel, target.resolution_px, self.footprint_px):
                 self._build_units(self._levels, panel, self._encoder)
+        for made in (self._encoder, self._exact_pass, self._passes):
+            self.tables += [] if made is None else made.tables
 
     def _build_units(self, levels: LevelTexture, panel: Panel, encoder: Encoder) -> None:
         """What draws light in whole units: the passes of a software OpenGL, else sprites."""
@@ -218,7 +224,7 @@ class Renderer:
                 self._draw_by_passes(self._passes, sprites, unit_e_per_s)
                 return
             if self._passes is not None:
-                self._passes.forget()
+                self._passes.forget(sums=False)
             if self._by_numpy:
                 self._draw_by_numpy(sprites, frame)
                 self._undrawn = (sprites, False)
@@ -434,6 +440,26 @@ class Renderer:
         with self._ctx:
             return self._driver.fault()
 
+    def remember_tables(self) -> None:
+        """Take the checksums of what turns light into codes, for `changed_tables`."""
+        with self._ctx:
+            self._checksums = [(table, _checksum(table)) for table in self.tables]
+
+    def changed_tables(self) -> int:
+        """How many of the tables that were remembered have other bytes now."""
+        with self._ctx:
+            return sum(_checksum(table) != checksum for table, checksum in self._checksums)
+
+    def forget_images(self) -> None:
+        """Draw the next frame on black, with nothing kept from those before it: the GPU's memory may have been lost."""
+        self._last_count, self._levels_black = None, False
+        self._floor_encoder, self._floor_levels = None, None
+        with self._ctx:
+            if self._passes is not None:
+                self._passes.forget(sums=True)
+            self._extended.forget()
+        self.begin_anew()
+
     def gl_error(self) -> str:
         """The GL error since the last call, "GL_NO_ERROR" when there is none."""
         with self._ctx:
@@ -448,3 +474,8 @@ class Renderer:
 
     def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
         self.close()
+
+
+def _checksum(table: moderngl.Texture | moderngl.Buffer) -> int:
+    data = table.read() if isinstance(table, moderngl.Buffer) else table.read(alignment=1)
+    return zlib.crc32(data)

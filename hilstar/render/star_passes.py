@@ -135,9 +135,16 @@ class StarPasses:
         self._encode["lowest"] = (table.first_bin - 1) << table.bin_shift
         self._encode["highest"] = ((table.first_bin + len(table.first_code)) << table.bin_shift) - 1
 
-    def forget(self) -> None:
-        """Something else has drawn on the levels: the next `erase` makes all of them black."""
+    @property
+    def tables(self) -> list[moderngl.Texture | moderngl.Buffer]:
+        """What turns light into levels here."""
+        return [self._steps.buffer, *([] if self._gain is None else [self._gain])]
+
+    def forget(self, sums: bool) -> None:
+        """The next `erase` makes all levels black: something else has drawn on them. With `sums`, those may be lost too."""
         self._drawn = None
+        if sums:
+            self._sums.clear()
 
     def erase(self) -> None:
         """Make black what the last frame drew."""

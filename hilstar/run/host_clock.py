@@ -19,6 +19,10 @@ class HostClock:
         """The time now."""
         return time.monotonic_ns()
 
+    def asleep_ns(self) -> int:
+        """How long the machine has slept since it was switched on; CLOCK_MONOTONIC stands still meanwhile."""
+        return time.clock_gettime_ns(time.CLOCK_BOOTTIME) - time.clock_gettime_ns(time.CLOCK_MONOTONIC)
+
     def wait_until(self, due_ns: int, stop: threading.Event) -> bool:
         """Wait until the clock reaches `due_ns`; True if stopped before that."""
         while (wait_ns := due_ns - self.now_ns() - COARSE_NS) > 0:

@@ -18,12 +18,13 @@ from hilstar.attitude.clock.timeline import Attitude, Policy, StaleGate
 from hilstar.bench.config import AttitudeSettings
 from hilstar.bench.faults.effects import Effects
 from hilstar.bench.frame import Bench
+from hilstar.errors import MachineError
 from hilstar.notices import Notices
 from hilstar.run.faulty_frames import FaultyFrames
 from hilstar.run.pacer import AT_ONCE, ClockPacer, Moment, Pacer
 from hilstar.run.shown import FrameSink, OnScreen, Shown, ignore
 from hilstar.run.summary import RunTally
-from hilstar.run.watchdog import AttitudeWatch, FrameWatch
+from hilstar.run.watchdog import AttitudeWatch, FrameWatch, GpuWatch
 from hilstar.scene.sprites import Sprites
 from hilstar.units import NS_PER_MS, NS_PER_S
 
@@ -78,17 +79,23 @@ class FrameLoop:
         self._presence = AttitudeWatch(self.notices, self.pacer.clock)
         self._faults = faults
         self.watch = FrameWatch(self._period_ns, self.notices, self.pacer.clock)
+        self._gpu = GpuWatch(bench.renderer, self.notices, self.stop, self.pacer.clock)
 
     def draw(self, number: int, t_ns: int, attitude: Attitude | None, moment: Moment = AT_ONCE) -> Shown | None:
         """Draw the frame for `t_ns` of the timeline's clock; without an attitude it is blank.
 
         None for a frame that is given up because its moment passed while its sprites were computed, or that a fault drops.
         """
+        if moment.due_ns is None:  # else `paced` looks, between the frames
+            self._gpu.look()
         self.watch.begin(number)
         if moment.starts_ns is not None:
             self.on_frame(number, moment.starts_ns)
         try:
             return self._draw(number, t_ns, attitude, moment)
+        except MachineError as error:
+            self._gpu.lost(str(error))
+            raise
         finally:
             self.watch.end(timed=moment.due_ns is not None)
 
@@ -186,6 +193,7 @@ class FrameLoop:
         """Keep the window alive while no frame is due."""
         self._presence.see(None, True)
         self.watch.idle()
+        self._gpu.look()
         self.pacer.idle()
 
     def screen_summary(self) -> dict[str, Any] | UnsetType:
@@ -208,6 +216,7 @@ class FrameLoop:
                     return
                 gave_up = draw_slot(moment) is None
                 last = moment
+                self._gpu.look()
 
     def lead_in(self, draw_blank: Callable[[Moment], object], over: Callable[[], bool]) -> None:
         """Call `draw_blank` at each of the pacer's moments until `over` is true; none of these frames is counted."""
@@ -216,6 +225,7 @@ class FrameLoop:
                 if over() or self.pacer.clock.wait_until(moment.begin_ns, self.stop):
                     break
                 draw_blank(moment)
+                self._gpu.look()
         self.tally = RunTally()
 
     def _goes_on(self, slot: int, limit: Limit) -> bool:

@@ -1,4 +1,4 @@
-"""Reports whether an attitude is there: none yet, the first, stale, fresh again."""
+"""What a run watches: whether an attitude is there, how long each stage of a frame takes, and whether the GPU is well."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Self
 
 from hilstar.attitude.clock.timeline import Attitude
 from hilstar.notices import Notices
+from hilstar.render.renderer import Renderer
 from hilstar.run.host_clock import HOST_CLOCK, HostClock
 from hilstar.units import NS_PER_MS, NS_PER_S
 
@@ -119,3 +120,48 @@ class FrameWatch:
 def _told(stages: list[tuple[str, int]], end_ns: int) -> str:
     ends_ns = [begin for _, begin in stages[1:]] + [end_ns]
     return ", ".join(f"{name} {(end - begin) / NS_PER_MS:.1f}" for (name, begin), end in zip(stages, ends_ns, strict=True))
+
+
+GPU_LOST = "gpu-lost"
+GPU_LOOK_NS = NS_PER_S
+SLEPT_NS = 200 * NS_PER_MS  # two clocks read one after the other, with the process interrupted between them, differ by less
+
+
+class GpuWatch:
+    """Looks once a second, in the loop's thread and between its frames, whether the GPU is lost; then the run is stopped.
+
+    After the machine has slept it also compares the tables that turn light into codes, and has the next frame drawn on black:
+    a driver may lose what was in the GPU's memory, and says nothing of it.
+    """
+
+    def __init__(self, renderer: Renderer, notices: Notices, stop: threading.Event, clock: HostClock = HOST_CLOCK) -> None:
+        self._renderer, self._notices, self._stop, self._clock = renderer, notices, stop, clock
+        renderer.remember_tables()
+        if fault := renderer.fault():  # of what was done before the run
+            notices.tell("gpu-error", f"before the first frame {fault}")
+        self._asleep_ns = clock.asleep_ns()
+        self._next_ns = clock.now_ns() + GPU_LOOK_NS
+
+    def look(self) -> None:
+        """Look, if a second has passed since the last time; microseconds, but after the machine has slept."""
+        now_ns = self._clock.now_ns()
+        if now_ns < self._next_ns:
+            return
+        self._next_ns = now_ns + GPU_LOOK_NS
+        fault = self._renderer.fault()
+        before_ns, self._asleep_ns = self._asleep_ns, self._clock.asleep_ns()
+        if not fault and (slept_ns := self._asleep_ns - before_ns) > SLEPT_NS:
+            fault = self._after_sleep(slept_ns / NS_PER_S)
+        if fault:
+            self.lost(fault)
+
+    def lost(self, fault: str) -> None:
+        """Stop the run."""
+        self._notices.begin(GPU_LOST, f"{fault}: the run ends")
+        self._stop.set()
+
+    def _after_sleep(self, slept_s: float) -> str:
+        self._notices.tell("resumed", f"the machine slept for {slept_s:.1f} s; the GPU's tables are compared")
+        changed = self._renderer.changed_tables()
+        self._renderer.forget_images()
+        return f"the GPU's memory was lost in sleep, {changed} of the tables that make codes" if changed else ""

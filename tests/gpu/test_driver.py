@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
+from hilstar.monitor.response import gamma_response
 from hilstar.render.context import create_context
 from hilstar.render.driver import Driver
+from hilstar.render.renderer import Renderer, Target
+from hilstar.scene.psf import footprint_px
+from tests.support.stars import sprites_at
 
 NO_SUCH_CAPABILITY = 0x1234
 TRIANGLE = "void main() { gl_Position = vec4(gl_VertexID / 2 * 4.0 - 1.0, gl_VertexID % 2 * 4.0 - 1.0, 0.0, 1.0); }"
@@ -38,3 +43,40 @@ def test_a_gl_error_is_told_once_and_by_its_name(context):
 
 def test_the_reset_status_is_asked_for(context):
     assert Driver(context).tells_resets
+
+
+SIZE, SIGMA, WHITE = (96, 64), (0.85, 0.85), 1e6
+
+
+def stars(count, rng):
+    return sprites_at(rng.uniform([0, 0], SIZE, size=(count, 2)), 10.0 ** rng.uniform(4, 6, count), footprint_px(SIGMA))
+
+
+@pytest.mark.parametrize("quantisation", ["round", "dither", "exact", "temporal"])
+def test_a_frame_after_the_images_were_lost_is_as_if_nothing_had_been_drawn(quantisation, rng):
+    few, many = stars(3, rng), stars(40, rng)
+    with Renderer(Target(SIZE, SIGMA, gamma_response(8), WHITE, quantisation)) as renderer:
+        renderer.draw(few)
+        wanted = renderer.codes().copy()
+        renderer.draw(many)
+        with renderer.context:
+            renderer.codes_texture.write(np.full(SIZE[::-1], 7, np.uint8))
+        renderer.draw(few, 1)
+        assert (renderer.codes() == 7).any()  # images are kept from frame to frame
+        renderer.forget_images()
+        renderer.draw(few)
+        assert (renderer.codes() == wanted).all()
+
+
+@pytest.mark.parametrize("quantisation", ["round", "dither", "exact"])
+def test_a_byte_of_each_table_is_noticed(quantisation):
+    uneven = np.full(SIZE[::-1], 0.9, np.float32)
+    with Renderer(Target(SIZE, SIGMA, gamma_response(8), WHITE, quantisation, uneven)) as renderer:
+        renderer.remember_tables()
+        assert renderer.tables and renderer.changed_tables() == 0
+        for number, table in enumerate(renderer.tables, 1):
+            with renderer.context:
+                data = bytearray(table.read())
+                data[-1] ^= 1
+                table.write(bytes(data))
+            assert renderer.changed_tables() == number

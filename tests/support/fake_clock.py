@@ -29,3 +29,19 @@ class FakeClock(HostClock):
         if due_ns > self.ns:
             self.ns = due_ns + self.wakes_late_ns
         return False
+
+
+class WellGpu:
+    """What a screen and a frame loop ask of a renderer whose GPU is well."""
+
+    codes_texture = context = None
+
+    def __init__(self) -> None:
+        self.tables: list[object] = []
+
+    def remember_tables(self) -> None:
+        """Nothing to remember."""
+
+    def fault(self) -> str:
+        """All is well."""
+        return ""

@@ -14,7 +14,7 @@ from hilstar.monitor.window.x11 import BackBuffer, SwapStamps
 from hilstar.run.screen import screen as screen_room
 from hilstar.run.screen.screen import Screen
 from tests.support.benches import SMALL_BENCH
-from tests.support.fake_clock import FakeClock
+from tests.support.fake_clock import FakeClock, WellGpu
 
 FIRST_NS = 1_000_000_000
 DRAW_NS = 1_000_000  # of a frame
@@ -46,7 +46,7 @@ def model_screen(
     """The small bench on a model display, before the gate: all but the window and what is drawn on it is real."""
     clock = FakeClock(FIRST_NS + 123_456)
     model = ModelDisplay(clock, round(1e9 / hz), **display)
-    presenter = SimpleNamespace(present=lambda *values: None, wait=model.wait)
+    presenter = SimpleNamespace(present=lambda *values: None, wait=model.wait, table=None)
     monkeypatch.setattr(screen_room, "Presenter", lambda texture, view: presenter)
     monkeypatch.setattr(screen_room, "changed_codes", lambda context, screen_px, bits: "")
     config = parse_config(folder / "bench.toml", SMALL_BENCH.replace("[collimator]", f"refresh_hz = {hz}\n[collimator]"))
@@ -55,7 +55,7 @@ def model_screen(
         scan=scan_of(config.monitor),
         camera=SimpleNamespace(boresight_px=(0.0, 0.0)),
         calibration=SimpleNamespace(response=SimpleNamespace(rgb=None)),
-        renderer=SimpleNamespace(codes_texture=None, context=None),
+        renderer=WellGpu(),
         draw=lambda q: None,
         frame_sprites=lambda *values, **named: clock.work(DRAW_NS),
         draw_sprites=lambda sprites, number: SimpleNamespace(levels=None, star_count=0, clipped_hip=(), capped=0),

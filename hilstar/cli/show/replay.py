@@ -124,4 +124,4 @@ def replay(
         with on_terminal(status), followed(listener, control, page, parts, status, record) as (sink, follower, requests):
             outlet = Outlet(screen, kept, notices, follower=follower, requests=requests, faults=wrong, pulse=pulse)
             summary = replay_log(bench, play, sink, outlet)
-    end_of_run(summary, screen, kept, as_json)
+    end_of_run(summary, screen, kept, notices, as_json)

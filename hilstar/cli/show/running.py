@@ -176,15 +176,19 @@ def run_with_faults(
         yield faults
 
 
-def end_of_run(summary: RunSummary, screen: Any, ledger: LedgerSwitch, as_json: bool) -> None:
+def end_of_run(summary: RunSummary, screen: Any, ledger: LedgerSwitch, notices: Notices, as_json: bool) -> None:
     """The summary of a run whose ledger is closed; exit code 1 where that has failed.
 
-    Raises MachineError where its window went away.
+    Raises MachineError where its window went away, or its GPU was lost.
     """
+    from hilstar.run.watchdog import GPU_LOST
+
     if ledger.last is not None:
         summary = msgspec.structs.replace(summary, ledger=ledger.last.summary())
     report(summary, as_json)
     if screen is not None and screen.window.gone is not None:
         raise MachineError(f"the run ended early: {screen.window.gone}")
+    if lost := notices.lasting.get(GPU_LOST):
+        raise MachineError(f"{lost}; begin it again, and see dmesg where that happens again")
     if ledger.failure is not None:
         raise typer.Exit(1)

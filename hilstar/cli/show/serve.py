@@ -125,7 +125,7 @@ def serve(
         with on_terminal(status), followed(listener, control, page, parts, status) as (sink, follower, requests):
             outlet = Outlet(screen, kept, notices, tracker_pictures(link, bench, wrong), follower, requests, wrong, pulse)
             summary = serve_stream(bench, link, limit, sink, outlet)
-    end_of_run(replaced(summary, beat=beat, fields_of_view=fields.keys()), screen, kept, as_json)
+    end_of_run(replaced(summary, beat=beat, fields_of_view=fields.keys()), screen, kept, notices, as_json)
     if not summary.packets.accepted:
         say(without_attitude(link.endpoint, summary.packets))
         raise typer.Exit(NO_ATTITUDE)

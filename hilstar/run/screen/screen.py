@@ -43,6 +43,7 @@ class Screen:
             triples=bench.calibration.response.rgb,
         )
         self._presenter = Presenter(bench.renderer.codes_texture, view)
+        bench.renderer.tables.append(self._presenter.table)
 
     def keep_time(self, period_ms: float, by_screen: bool, swap_ns: int) -> None:
         """Predict swaps from the one at `swap_ns`, by the screen's own period where the screen keeps time."""

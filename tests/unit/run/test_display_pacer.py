@@ -17,7 +17,7 @@ from hilstar.run.screen.display_pacer import DisplayPacer
 from hilstar.run.screen.swap_clock import DrawBudget, SwapClock
 from hilstar.run.shown import Shown
 from tests.support.benches import SMALL_BENCH
-from tests.support.fake_clock import FakeClock
+from tests.support.fake_clock import FakeClock, WellGpu
 
 PERIOD_NS = 16_666_667
 FIRST_SWAP_NS = 1_000_000_000
@@ -71,7 +71,7 @@ class Run:
         self.rates: list[object] = []
         self._cost = cost
         config = parse_config(tmp_path / "bench.toml", SMALL_BENCH)
-        bench = SimpleNamespace(config=config, frame_sprites=self._sprites, draw_sprites=self._draw)
+        bench = SimpleNamespace(config=config, renderer=WellGpu(), frame_sprites=self._sprites, draw_sprites=self._draw)
         self.loop = FrameLoop(bench, self.shown.append, self.pacer, notices=self.notices)
         self.loop.paced(limit, self._draw_slot)
 

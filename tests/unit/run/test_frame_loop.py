@@ -13,7 +13,7 @@ from hilstar.run.loop import FrameLoop, Limit
 from hilstar.run.pacer import ClockPacer, Moment
 from hilstar.run.shown import Shown
 from tests.support.benches import SMALL_BENCH
-from tests.support.fake_clock import FakeClock
+from tests.support.fake_clock import FakeClock, WellGpu
 
 PERIOD_NS = 16_666_667  # 60 Hz, as the small bench's monitor has it
 STILL = Attitude(np.array([1.0, 0.0, 0.0, 0.0]), 0, False)
@@ -25,6 +25,7 @@ class SlowBench:
 
     def __init__(self, tmp_path, clock: FakeClock, cost, more: str = "") -> None:
         self.config = parse_config(tmp_path / "bench.toml", SMALL_BENCH + more)
+        self.renderer = WellGpu()
         self.asked: list[object] = []
         self._clock, self._cost, self._number = clock, cost, 0
 

@@ -21,7 +21,7 @@ from hilstar.arrays import Float32Array, FloatArray, IntArray
 from hilstar.errors import InputError
 from hilstar.monitor.response import Codes, Response, encode
 
-MASK_FILE = Path(__file__).parent / "data" / "blue-noise.npy"  # by data/make_blue_noise.py
+MASK_FILE = Path(__file__).parent / "data" / "blue-noise.npy"  # made by tools/make_blue_noise.py
 
 
 Quantisation = Literal["round", "dither", "temporal", "exact"]

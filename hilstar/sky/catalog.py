@@ -276,7 +276,7 @@ class StarName(NamedTuple):
 
 @cache
 def star_names() -> dict[int, StarName]:
-    """The designations and names of 3300 stars by HIP number (see `data/make_star_names.py`)."""
+    """The designations and names of 3300 stars by HIP number (see `tools/make_star_names.py`)."""
     with STAR_NAMES.open(encoding="utf-8", newline="") as file:
         rows = csv.DictReader(line for line in file if not line.startswith("#"))
         return {int(row["hip"]): StarName(row["designation"], row["name"]) for row in rows}

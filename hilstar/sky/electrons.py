@@ -253,7 +253,7 @@ class PicklesTable:
 
 @cache
 def load_library() -> Library:
-    """The packaged library: 106 stars, 250 to 1600 nm every 0.5 nm (data/make_pickles.py made it)."""
+    """The packaged library: 106 stars, 250 to 1600 nm every 0.5 nm (tools/make_pickles.py made it)."""
     with np.load(PACKAGED_LIBRARY) as packed:
         return Library(
             wavelength_nm=packed["wavelength_nm"].astype(np.float64),

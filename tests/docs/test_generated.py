@@ -14,7 +14,7 @@ from tests.support.readme import blocks
 
 @pytest.fixture
 def pages(monkeypatch):
-    monkeypatch.syspath_prepend(ROOT / "docs")
+    monkeypatch.syspath_prepend(ROOT / "tools")
     return importlib.import_module("make_pages").PAGES
 
 
@@ -25,10 +25,10 @@ def tables(monkeypatch):
 
 
 def test_a_generated_page_is_what_the_generator_makes(pages):
-    """`python docs/make_pages.py` has nothing to change."""
+    """`python tools/make_pages.py` has nothing to change."""
     assert pages
     for name, make in pages.items():
-        assert (ROOT / "docs" / name).read_text() == make(), f"docs/{name} is old; run python docs/make_pages.py"
+        assert (ROOT / "docs" / name).read_text() == make(), f"docs/{name} is old; run python tools/make_pages.py"
 
 
 def test_the_tables_are_those_of_the_results(tables):

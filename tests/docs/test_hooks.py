@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import importlib
 import re
 from types import SimpleNamespace
 
 import pytest
 
 from tests.support.benches import ROOT
+from tools import docs_hooks
 
 
 @pytest.mark.parametrize(
@@ -21,16 +21,14 @@ from tests.support.benches import ROOT
         ("see [changes](../CHANGELOG.md), [examples](../examples)", "see [changes](changes.md), [examples](examples.md)"),
     ],
 )
-def test_a_link_out_of_the_documentation_names_the_file(monkeypatch, page, built):
-    monkeypatch.syspath_prepend(ROOT / "docs")
-    assert importlib.import_module("hooks").on_page_markdown(page) == built
+def test_a_link_out_of_the_documentation_names_the_file(page, built):
+    assert docs_hooks.on_page_markdown(page) == built
 
 
-def test_a_page_from_elsewhere_links_into_the_documentation(monkeypatch):
-    monkeypatch.syspath_prepend(ROOT / "docs")
+def test_a_page_from_elsewhere_links_into_the_documentation():
     page = SimpleNamespace(file=SimpleNamespace(src_uri="examples.md"))
     text = "see [campaigns](../docs/campaign.md#cases) and [a header](../firmware_protocol/hilstar_protocol.h)"
-    built = importlib.import_module("hooks").on_page_markdown(text, page=page)
+    built = docs_hooks.on_page_markdown(text, page=page)
     assert built == "see [campaigns](campaign.md#cases) and a header (`firmware_protocol/hilstar_protocol.h`)"
 
 

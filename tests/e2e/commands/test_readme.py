@@ -17,7 +17,7 @@ from tests.support.senders import free_port
 
 
 def test_the_picture_is_what_the_program_makes(tmp_path):
-    script = [sys.executable, ROOT / "docs" / "make_picture.py", tmp_path / "p.png"]
+    script = [sys.executable, ROOT / "tools" / "make_picture.py", tmp_path / "p.png"]
     made = subprocess.run(script, capture_output=True, text=True, check=False)
     assert made.returncode == 0, made.stderr
     ours, theirs = (np.array(Image.open(path).convert("L")).astype(int) for path in (tmp_path / "p.png", ROOT / "readme.png"))

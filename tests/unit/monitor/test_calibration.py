@@ -7,7 +7,7 @@ import pytest
 
 from hilstar.errors import InputError
 from hilstar.monitor.calibration import load_calibration
-from hilstar.monitor.data import make_lcd_example
+from tools import make_lcd_example
 
 HEAD = """[calibration]
 kind = "photometric"
@@ -59,8 +59,8 @@ def test_the_example_is_an_invention_with_1000_to_1_and_dark_corners():
 
 
 def test_the_example_is_what_its_script_writes(monkeypatch, tmp_path):
-    shipped = make_lcd_example.HERE
-    monkeypatch.setattr(make_lcd_example, "HERE", tmp_path)
+    shipped = make_lcd_example.DATA
+    monkeypatch.setattr(make_lcd_example, "DATA", tmp_path)
     make_lcd_example.main()
     for path in tmp_path.iterdir():
         assert path.read_bytes() == (shipped / path.name).read_bytes()

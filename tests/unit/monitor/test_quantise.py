@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from hilstar.errors import InputError
-from hilstar.monitor.data.make_blue_noise import SEED, void_and_cluster
 from hilstar.monitor.quantise import (
     MASK_TURNS,
     Panel,
@@ -18,6 +17,7 @@ from hilstar.monitor.quantise import (
     shown_light,
 )
 from hilstar.monitor.response import encode, gamma_response, srgb_response
+from tools.make_blue_noise import SEED, void_and_cluster
 
 WHITE = 1e6
 # The mask's thresholds are the middles of 4096 equal parts, so a mean over them is half a part off at most.

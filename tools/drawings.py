@@ -1,6 +1,6 @@
 """The drawings of the documentation as SVG, in the colours of the charts, light or dark as the reader's page is.
 
-`python docs/make_pages.py` writes them; tests/docs fails where one is not what this makes.
+`python tools/make_pages.py` writes them; tests/docs fails where one is not what this makes.
 """
 
 from __future__ import annotations
@@ -159,10 +159,10 @@ def packet_life() -> str:
         (3, "wait\nfor the next frame"),
         (4, "draw\n2.2 ms for 1000 stars, CPU"),
     ):
-        x = 6 + k * (w + gap) + w + gap / 2 + 20 * (k == 4)
+        middle = 6 + k * (w + gap) + w + gap / 2 + 20 * (k == 4)
         head, note = words.split("\n")
-        d.text(max(x, 108), 28, head, "middle head")
-        d.text(max(x, 108), 28 + LINE_PX, note, "middle note")
+        d.text(max(middle, 108), 28, head, "middle head")
+        d.text(max(middle, 108), 28 + LINE_PX, note, "middle note")
     d.span(
         6,
         742,

@@ -1,6 +1,6 @@
 """README's picture, Orion's belt three times: code values, stretched, and the virtual tracker's image.
 
-`python docs/make_picture.py [OUT.png]` writes readme.png, or OUT.png.
+`python tools/make_picture.py [OUT.png]` writes readme.png, or OUT.png.
 """
 
 from __future__ import annotations

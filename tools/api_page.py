@@ -8,8 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-HERE = Path(__file__).parent
-MARK = "<!-- what follows is generated: python docs/make_pages.py -->\n"
+DOCS = Path(__file__).resolve().parents[1] / "docs"
+MARK = "<!-- what follows is generated: python tools/make_pages.py -->\n"
 LINE_CHARACTERS = 100
 # Each section's objects, and of a class the members that users call.
 SECTIONS: dict[str, dict[str, tuple[str, ...]]] = {
@@ -39,7 +39,7 @@ FROM_LOAD = {"hilstar.Bench"}  # made by a function: how it is put together is n
 
 def page() -> str:
     """The page: its text as it stands, and the reference as it is now."""
-    text = (HERE / "python-api.md").read_text(encoding="utf-8").partition(MARK)[0]
+    text = (DOCS / "python-api.md").read_text(encoding="utf-8").partition(MARK)[0]
     return text + MARK + "\n" + "\n".join(_reference())
 
 

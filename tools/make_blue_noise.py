@@ -1,21 +1,20 @@
-"""Make blue-noise.npy, the threshold mask of `dither` and `temporal`: `python -m hilstar.monitor.data.make_blue_noise`.
+"""Make blue-noise.npy, the threshold mask of `dither` and `temporal`: `python tools/make_blue_noise.py`.
 
 Void and cluster (R. Ulichney, Proc. SPIE 1913, 1993). All energies are whole numbers, so every machine makes the same file.
 """
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import numpy.typing as npt
+
+from hilstar.monitor.quantise import MASK_FILE
 
 SIDE = 64
 SIGMA_PX = 1.5  # Ulichney's choice
 SEED = 1993
 FIRST_SHARE = 0.1  # of the pixels, in the first pattern
 UNIT = 2**40  # energies are counted in 1 / UNIT: 4096 of them stay under 2^63
-PLACE = Path(__file__).with_name("blue-noise.npy")
 
 Ranks = npt.NDArray[np.uint16]
 
@@ -77,8 +76,8 @@ def void_and_cluster(rng: np.random.Generator) -> Ranks:
 
 
 def main() -> None:
-    """Write the file beside this script."""
-    np.save(PLACE, void_and_cluster(np.random.default_rng(SEED)))
+    """Write the packaged mask."""
+    np.save(MASK_FILE, void_and_cluster(np.random.default_rng(SEED)))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The generated pages and drawings: `python docs/make_pages.py` writes them; tests/docs fails where one is old."""
+"""The generated pages and drawings: `python tools/make_pages.py` writes them; tests/docs fails where one is old."""
 
 from __future__ import annotations
 
@@ -6,14 +6,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 import api_page
+import bench_page
 import command_page
 import drawings
 
-from hilstar.bench.config import reference
-
-HERE = Path(__file__).parent
+DOCS = Path(__file__).resolve().parents[1] / "docs"
 PAGES: dict[str, Callable[[], str]] = {
-    "bench-file.md": reference.page,
+    "bench-file.md": bench_page.page,
     "commands.md": command_page.page,
     "python-api.md": api_page.page,
     **drawings.DRAWINGS,
@@ -22,4 +21,4 @@ PAGES: dict[str, Callable[[], str]] = {
 
 if __name__ == "__main__":
     for name, make in PAGES.items():
-        (HERE / name).write_text(make(), encoding="utf-8")
+        (DOCS / name).write_text(make(), encoding="utf-8")

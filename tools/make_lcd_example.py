@@ -1,6 +1,6 @@
 """Make the example calibration `lcd-example`: an invented liquid-crystal monitor, not a measurement of any.
 
-    python -m hilstar.monitor.data.make_lcd_example
+    python tools/make_lcd_example.py
 
 What is typical and what was chosen: a contrast of 1000:1; gamma near 2.2, a little different in each channel, bent towards
 the S-curve that a twisted-nematic cell has against voltage; a ripple of 0.5 % as the driver's own table leaves;
@@ -15,7 +15,7 @@ import numpy as np
 
 from hilstar.arrays import FloatArray
 
-HERE = Path(__file__).resolve().parent
+DATA = Path(__file__).resolve().parents[1] / "hilstar" / "monitor" / "data"
 SEED = 20260101
 BITS = 8
 WHITE_CD_M2 = {"r": 53.0, "g": 179.0, "b": 18.0}  # 250 cd/m2 in the proportions of Rec. 709
@@ -31,7 +31,7 @@ NOISE = 0.005
 TOML = """# An invented example of a calibration file. It is NOT a measurement: see make_lcd_example.py, which made it.
 [calibration]
 kind = "photometric"
-who = "nobody: made by hilstar.monitor.data.make_lcd_example, seed {seed}"
+who = "nobody: made by tools/make_lcd_example.py, seed {seed}"
 when = 2026-01-01
 instrument = "none: an invented example, not a measurement"
 unit = "cd/m2"
@@ -78,16 +78,16 @@ def uniformity() -> FloatArray:
 
 
 def main() -> None:
-    """Write the three files beside this script."""
+    """Write the three packaged files."""
     rng = np.random.default_rng(SEED)
     black = sum(WHITE_CD_M2.values()) / CONTRAST
     light = np.stack([black + channel_light(name, rng) for name in WHITE_CD_M2], axis=1)
     rows = "".join(f"{code},{','.join(f'{value:.6g}' for value in row)}\n" for code, row in enumerate(light))
     title = "# An invented example, NOT a measurement (make_lcd_example.py): "
-    (HERE / "lcd-example.csv").write_text(f"{title}cd/m2, black level included\ncode,r,g,b\n{rows}", encoding="ascii")
+    (DATA / "lcd-example.csv").write_text(f"{title}cd/m2, black level included\ncode,r,g,b\n{rows}", encoding="ascii")
     fields = "".join(",".join(f"{value:.4f}" for value in row) + "\n" for row in uniformity())
-    (HERE / "lcd-example-uniformity.csv").write_text(f"{title}relative light, top row first\n{fields}", encoding="ascii")
-    (HERE / "lcd-example.toml").write_text(TOML.format(seed=SEED, bits=BITS, noise=NOISE), encoding="ascii")
+    (DATA / "lcd-example-uniformity.csv").write_text(f"{title}relative light, top row first\n{fields}", encoding="ascii")
+    (DATA / "lcd-example.toml").write_text(TOML.format(seed=SEED, bits=BITS, noise=NOISE), encoding="ascii")
 
 
 if __name__ == "__main__":

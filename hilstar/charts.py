@@ -30,7 +30,7 @@ Record = TypeVar("Record")
 Share = Literal["row", "col"]
 
 WIDTH_INCH = 7.6  # 730 CSS pixels: a column of text
-PANEL_INCH, MARGIN_INCH = 2.6, 1.1  # of height: each row of panels, and title and labels
+PANEL_INCH, MARGIN_INCH = 2.6, 1.1  # height of each row of panels, and of title and labels
 PNG_DPI = 150
 TITLE_PT, TEXT_PT, SMALL_PT = 11.5, 10, 9
 TITLE_COLUMNS, NOTE_COLUMNS = 80, 105
@@ -44,7 +44,7 @@ DARK = {
     INK: "#e6e8eb",
     MUTED: "#a3acb8",
     GRID: "#3b414d",
-    PAPER: "#1e2129",  # of the documentation's dark pages
+    PAPER: "#1e2129",  # background of the documentation's dark pages
     BLUE: "#6cb6ff",
     ORANGE: "#ff9e5e",
     GREEN: "#5fd17e",

@@ -21,7 +21,7 @@ from hilstar.errors import printable
 MAX_SAID = 3
 SAID_WINDOW_S = 10.0
 MAX_QUIET_S = 640.0
-MAX_RECORDED = 20  # of a kind, before what is only counted is not recorded either
+MAX_RECORDED = 20  # events of a kind that are recorded; further ones are only counted
 ALWAYS_RECORDED = frozenset({"fault"})
 MAX_DETAIL_CHARACTERS = 400
 log = logging.getLogger(__name__)

@@ -109,5 +109,5 @@ def _fields(root: type[Table], names: list[str]) -> tuple[msgspec.structs.FieldI
     table: Any = root
     for name in names:
         hint = plain({field.name: field.type for field in msgspec.structs.fields(table)}[name])
-        table = (get_args(hint) or (hint,))[0]  # of `X | None`: X
+        table = (get_args(hint) or (hint,))[0]  # X in `X | None`
     return msgspec.structs.fields(table)

@@ -42,5 +42,5 @@ def magnitude(ratio: float | FloatArray) -> float | FloatArray:
     return -2.5 * math.log10(ratio) if ratio > 0 else math.inf
 
 
-# Of OpenGL, as asked for, newest first: NVIDIA's driver gives the version that is asked for, and no newer one.
+# OpenGL versions to ask for, newest first: NVIDIA's driver gives the version that is asked for, and no newer one.
 GL_VERSIONS = ((4, 6), (4, 5), (4, 3), (3, 3))

@@ -12,7 +12,7 @@ from hilstar.charts import read_records
 from hilstar.study import codes, timing
 from hilstar.study.tradeoff import run as tradeoff
 from hilstar.study.tradeoff.light import ROUNDING_MAG
-from hilstar.study.tradeoff.table import Figure, Row, Step
+from hilstar.study.tradeoff.table import Figure, MethodRow, TradeoffStep
 
 HERE = Path(__file__).parent
 DOCS = HERE.parent / "docs"
@@ -21,13 +21,13 @@ TRADEOFF_STEP = "psf"
 TRUE = "True"
 
 
-def tradeoff_step(name: str) -> Step:
+def tradeoff_step(name: str) -> TradeoffStep:
     """A step of tradeoff.csv as the study measured it, whose errors below ROUNDING_MAG are none."""
     with (HERE / "tradeoff.csv").open(encoding="utf-8", newline="") as file:
         table = [row for row in csv.DictReader(file) if row["step"] == name]
     error, second = (Figure(table[0][f"{key}_is"], table[0][f"{key}_unit"], ROUNDING_MAG) for key in ("error", "second"))
     rows = [
-        Row(
+        MethodRow(
             row["method"],
             float(row["error"]),
             float(row["second"]),
@@ -37,10 +37,10 @@ def tradeoff_step(name: str) -> Step:
         )
         for row in table
     ]
-    return Step(name, table[0]["work"], error, second, tuple(rows))
+    return TradeoffStep(name, table[0]["work"], error, second, tuple(rows))
 
 
 if __name__ == "__main__":
-    timing.draw(DOCS / "timing.svg", read_records(HERE / "timing.csv", timing.Outcome))
-    codes.draw(DOCS / "over_frames.svg", read_records(HERE / "over_frames.csv", codes.Left))
+    timing.draw(DOCS / "timing.svg", read_records(HERE / "timing.csv", timing.TimingOutcome))
+    codes.draw(DOCS / "over_frames.svg", read_records(HERE / "over_frames.csv", codes.OverFrames))
     tradeoff.draw(DOCS / "tradeoff.svg", tradeoff_step(TRADEOFF_STEP), MACHINE)

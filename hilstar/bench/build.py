@@ -28,7 +28,7 @@ from hilstar.scene.camera import Camera
 from hilstar.scene.psf import peak_share
 from hilstar.sky.electrons import Optics, Photometry, star_temperatures_k, tabulate, tabulate_pickles
 from hilstar.sky.spectrum import load_curve
-from hilstar.sky.star_table import Choice, choose_catalog
+from hilstar.sky.star_table import TableChoice, choose_catalog
 from hilstar.sky.stars import Stars, aberrate, make_stars, split_by_rate, unit_vectors_icrs
 
 if TYPE_CHECKING:
@@ -171,7 +171,7 @@ def bench_stars(config: BenchConfig, folder: Path, moving: MovingSky | None = No
     sky = config.sky
     epoch_utc_ns(config)  # which refuses one that a source was to give
     source = sky.catalogue if sky.catalogue == "hipparcos" else folder / sky.catalogue
-    chosen = choose_catalog(Choice(source, sky.with_hipparcos, sky.catalogue_epoch_jyear))
+    chosen = choose_catalog(TableChoice(source, sky.with_hipparcos, sky.catalogue_epoch_jyear))
     catalog = chosen.brighter_than(sky.faintest_v_mag)
     vectors = unit_vectors_icrs(catalog, sky.epoch_jyear)
     if moving is not None:

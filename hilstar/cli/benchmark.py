@@ -37,7 +37,7 @@ def benchmark(
     from hilstar.study.speed import benchmark as speed
     from hilstar.study.speed import report as speed_report
 
-    plan = speed.QUICK if quick else speed.Plan()
+    plan = speed.QUICK if quick else speed.BenchmarkPlan()
     if stars is not None:
         plan = replace(plan, counts=parse_counts(stars, speed.MAX_STARS))
     if bench_file is not None:

@@ -109,7 +109,7 @@ class Balance:
         away = offset_px - nearest
         d = (offset_px - fraction).astype(np.float32)
         off = fraction - nearest
-        # Of eighth power for exp(-u), within 0.03: the shader's time is what it is for.
+        # An eighth power stands for exp(-u), within 0.03, to save the shader's time.
         u = 0.5 * (np.square(d[0] / np.float32(self.window_px[0])) + np.square(d[1] / np.float32(self.window_px[1])))
         window = (1 + u / 8) ** -8
         arms = np.empty((SUMS, *window.shape), dtype=np.float32)

@@ -27,7 +27,7 @@ from hilstar.scene.sprites import Sprites
 
 KEPT = 8  # choices side by side, a power of two: 4 leave the centroid a fifth more error, 16 a tenth less
 CHUNK = 256  # stars at a time: their arrays stay in a core's cache
-OFF = 0.6  # of a step, where steps are equal: then one more pixel is turned
+OFF = 0.6  # in steps, where steps are equal: beyond it one more pixel is turned
 SAME_STEP = 1e-4  # steps that differ by less, relatively, are equal
 CARRIED = 32  # sprites of a path that hand on their errors; the next ones begin anew, beside them
 NONE = np.float32(1e30)  # the square of a choice that does not exist yet

@@ -18,8 +18,8 @@ from hilstar.units import flux_ratio, magnitude
 
 SIGMA_PX = (0.85, 0.85)
 WHITE = 1.0
-MARGIN_PX = 2  # of dark between two stars
-FRAMES_BEFORE = 2  # of `temporal` before an exposure: it is no better for being the first of a sequence
+MARGIN_PX = 2  # dark pixels between two stars
+FRAMES_BEFORE = 2  # frames of `temporal` before an exposure: the first of a sequence is no special case
 MIDDLES = (0.5, 0.5)
 UNLIKE = (0.25, 0.375)  # no star is another's mirror image: with MIDDLES only one of eight is like no other
 

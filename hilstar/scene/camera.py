@@ -24,10 +24,10 @@ ANY_TANGENT = (-1e9, 1e9)  # finite, so that products stay finite
 NODE_STEP_PX = 8
 SPEED_PLACES = 9  # along each side of the image: a speed's components are quadratic in the place
 BORDER_PLACES = 33  # along each side of the image
-BOW = 1 / BORDER_PLACES**2  # of the box around all sides: twice what a parabola bows between two places, whatever its sag
+BOW = 1 / BORDER_PLACES**2  # margin around all sides: twice the sag of a parabola between two places, whatever its curvature
 FOLD_PLACES = 41  # across the disc in which a lens must not fold
 NEWTON_ROUNDS, STEPS_A_ROUND = 10, 5  # slopes are found once a round: a mild lens needs one
-# Of a focal length, 1e-8 px on any screen; slopes by differences of SLOPE_STEP are right to 1e-10, which is enough for that.
+# In focal lengths, 1e-8 px on any screen; slopes by differences of SLOPE_STEP are right to 1e-10, which is enough.
 NEWTON_DONE = 1e-13
 SLOPE_STEP = 1e-6
 BEYOND_BORDER = 1 + 1e-9  # the farthest corner is within the lens

@@ -17,7 +17,7 @@ from hilstar.scene.psf import footprint_px
 from hilstar.sky.bodies.disc import AIR_TOP, Disc
 
 REACH_SIGMAS = 4.0  # as in disc.frag
-PIXEL_VARIANCE = 1 / 12  # of a square pixel, px squared
+PIXEL_VARIANCE = 1 / 12  # variance of a square pixel, px squared
 LIMB_PLACES = 128
 BEHIND = 0.05  # minimum z of a unit direction: a limb nearer to the camera's plane has no useful outline
 BOW = 1.01  # margin for the outline's curvature between its places

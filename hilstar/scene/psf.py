@@ -19,7 +19,7 @@ from hilstar.errors import InputError
 # results/tradeoff.csv, psf: 10 px at sigma 0.85 are on the front; 8 px save a tenth and cut 4e-5 mag.
 MAX_CUT = 1e-6
 SQRT2 = math.sqrt(2.0)
-# Of a star's flux: what a polynomial may be off in a pixel along one axis. The float32 erf is 4.4e-7 off.
+# Error of the polynomial in a pixel along one axis, relative to a star's flux. The float32 erf is 4.4e-7 off.
 MAX_SHARE_ERROR = 1e-7
 MIN_DEGREE, MAX_DEGREE = 3, 8  # beyond it a polynomial costs as much as erf
 FIT_PLACES, FIT_ROUNDS = 120, 15

@@ -33,9 +33,9 @@ SPRITE_DTYPE = np.dtype([("pixel", "<i4", 2), ("fraction_px", "<f4", 2), ("elect
 MAX_COVERED_PX = 25_000_000
 # A star over white by no more than this is not called clipped: flux and white pass through float32.
 CLIP_TOLERANCE = 1e-6
-# Of the sprites that may clip with the light of others, only this many are tested, the brightest: the work is bounded.
+# Number of sprites (the brightest) that are tested for clipping with the light of others: the work is bounded.
 MAX_DOUBTFUL = 512
-FEW_PAIRS = 4096  # of pixels and sprites near them: so many are asked all together, sooner than they are sorted
+FEW_PAIRS = 4096  # pairs of pixels and sprites near them: up to so many are tested all at once, without sorting
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,15 +25,15 @@ from hilstar.sky.bodies.disc import Disc
 if TYPE_CHECKING:
     from hilstar.sky.bodies.passes import Pass
 
-# Sprites so far apart make no pixel of a streak wrong by more than 1e-3 of the satellite's light (spacing^2 / 24 of the slope
-# of its end; tests/unit/scene/test_trails.py holds it).
+# At this spacing no pixel of a streak is wrong by more than 1e-3 of the satellite's light: spacing^2 / 24 times the slope at
+# its end (held by tests/unit/scene/test_trails.py).
 SPACING_SIGMA = 0.3
-LIGHT_S = 0.25  # the longest time of one sprite: of the 8 s in which a low orbit enters the shadow, for one
-SAMPLES = 9  # of a path, from which its length and its part on the image are found
+LIGHT_S = 0.25  # the longest time of one sprite; a low orbit enters the shadow in 8 s
+SAMPLES = 9  # samples of a path that give its length and its part on the image
 REACH = 2.0  # times the speed at a moment, as a bound for some seconds about it
 BULGE = 2.0  # how much farther than its samples a path may be from the line between its ends
 EVERY = slice(None)
-STEPS_A_RADIUS = 4.0  # of a disc's places along its path: an edge of it is then uneven by 1 % of the radius
+STEPS_A_RADIUS = 4.0  # places of a disc along its path: its edge is then uneven by 1 % of the radius
 AT_REST = np.array([1.0, 0.0, 0.0, 0.0])
 NORTH = np.array([0.0, 0.0, 1.0])
 M_PER_KM = 1000.0

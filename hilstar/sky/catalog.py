@@ -50,7 +50,7 @@ VARIABLE_TYPES = b"PUM"
 
 # A Tycho number TYC1-TYC2-TYC3 as one integer: TYC1 to 9537, TYC2 to 12121, TYC3 to 3.
 TYCHO, TYC_REGION = "TYC", 1_000_000
-MAX_DIGITS = 19  # of a 64-bit identifier
+MAX_DIGITS = 19  # a 64-bit identifier
 
 Letters = npt.NDArray[np.bytes_]
 STAR_NAMES = Path(__file__).resolve().parent / "data" / "star_names.csv"

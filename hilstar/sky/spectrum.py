@@ -21,7 +21,7 @@ STEFAN_BOLTZMANN_W_M2_K4 = 5.670374419e-8
 
 DATA_DIR = Path(__file__).resolve().parent / "data"
 MAX_CURVE_BYTES = 1_000_000
-MIN_CONSTANT = 1e-6  # of a curve that is one number: no sensor or lens is below, and products stay within float64
+MIN_CONSTANT = 1e-6  # smallest constant curve: no sensor or lens is below, and products stay within float64
 MAX_CURVE_ROWS = 10_000
 RANGE_NM = (1.0, 100_000.0)  # beyond any sensor; each MAX_INTERVAL_NM costs nodes
 BUILT_IN_CURVES = ("ccd47-20", "kai-4021", "n-bk7-10mm", "johnson-v")
@@ -160,7 +160,7 @@ def integration_nodes(*curves: Curve) -> tuple[FloatArray, FloatArray]:
     if len(knots) < 2:
         raise InputError("the quantum efficiency and the transmission share no wavelength; check that both are in nm")
     pieces = np.maximum(1, np.ceil(np.diff(knots) / MAX_INTERVAL_NM)).astype(int)
-    piece = np.arange(pieces.sum()) - np.repeat(np.cumsum(pieces) - pieces, pieces)  # of its interval, from 0
+    piece = np.arange(pieces.sum()) - np.repeat(np.cumsum(pieces) - pieces, pieces)  # number within its interval, from 0
     edges = np.append(np.repeat(knots[:-1], pieces) + piece * np.repeat(np.diff(knots) / pieces, pieces), knots[-1])
     half = np.diff(edges)[:, None] / 2
     wavelength_nm = (edges[:-1, None] + half * (1 + NODES)).ravel()

@@ -41,12 +41,12 @@ GAIA_DR2_JYEAR, GAIA_DR3_JYEAR = 2015.5, 2016.0
 EPOCHS_JYEAR = (1800.0, 2200.0)
 # Right ascensions within 24 and declinations that span more than this, of so many stars, are hours: no field is so narrow.
 HOURS_SPAN_DEG, HOURS_STARS = 60.0, 100
-# Of a thousand stars the fastest moves by some 100 mas a year; no star of the sky moves by 12 arcsec a year.
+# The fastest of a thousand stars moves by some 100 mas a year; no star in the sky moves by 12 arcsec a year.
 SLOWEST_MAS_YR, MOTION_STARS = 12.0, 1000
 MAX_STEM = 16  # characters of a file's name in the name of its stars, which has 32 in a truth table
 ADVICE = "give the column its unit in a FITS, ECSV or VOTable, or convert it"
-# Of one star at a common epoch, two catalogues' places differ by far less, but for orbits. Hipparcos' photometry has the light
-# of both components of a pair that it did not part.
+# Two catalogues' places of one star at a common epoch differ by far less, but for orbits. Hipparcos' photometry has the light
+# from both components of an unresolved pair.
 SAME_ARCSEC = 2.0
 # A star that is left alone there is looked for this far, where the magnitude has to agree as well.
 FAR_ARCSEC, FAR_MAG = 10.0, 0.5
@@ -54,10 +54,10 @@ FAR_ARCSEC, FAR_MAG = 10.0, 0.5
 # more than this.
 PAIR_ARCSEC, PAIR_MAG = 2.0, 1.0
 ODD_MAG = 1.0
-OVERLAP_LIMIT_MAG = 0.03  # of the median
+OVERLAP_LIMIT_MAG = 0.03  # limit for the median
 FEW_MATCHES, BRIGHT_STARS, BRIGHT_V_MAG = 0.5, 20, 7.0
 RAD_PER_ARCSEC = np.pi / (180 * 3600)
-VERSION = 1  # of what a table is made into: count up with each change of its result
+VERSION = 1  # version of the cached result: count up whenever it changes
 KEPT_FILES = 6  # the newest; 250 MB each for 2.5 million stars
 HASH_BYTES = 1 << 22
 MAX_STORED_BYTES = 3_000_000_000
@@ -439,7 +439,7 @@ def keep(path: Path, made: Kept) -> None:
 
 
 @dataclass(frozen=True, slots=True)
-class Choice:
+class TableChoice:
     """A bench's catalogue as its file names it; `epoch_jyear` is that of a table's places, where the file states it."""
 
     source: str | Path = "hipparcos"
@@ -447,7 +447,7 @@ class Choice:
     epoch_jyear: float | None = None
 
 
-def choose_catalog(choice: Choice) -> Catalog:
+def choose_catalog(choice: TableChoice) -> Catalog:
     """The stars of a choice, with notes on what became of a table's rows.
 
     A table is read once; then what was made of it comes from the user's cache directory. Rows that are no star, and an overlap
@@ -478,7 +478,7 @@ def choose_catalog(choice: Choice) -> Catalog:
     return made.catalog
 
 
-def _made(path: Path, choice: Choice) -> Kept:
+def _made(path: Path, choice: TableChoice) -> Kept:
     found = assemble(path, read_table(path), choice.epoch_jyear, choice.with_hipparcos)
     doubts = [found.line] if found.dropped else []
     if not choice.with_hipparcos:

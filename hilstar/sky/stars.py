@@ -17,9 +17,9 @@ from hilstar.arrays import FloatArray, IntArray
 from hilstar.sky.catalog import Catalog
 from hilstar.units import LIGHT_KM_S
 
-MAX_SHIFT = 1.1  # of a direction by aberration, times v/c; for speeds up to a tenth of light's
+MAX_SHIFT = 1.1  # largest aberration in units of v/c, for speeds up to 0.1 c
 
-BODY_CELL_RAD = 1e-6  # of a cell with one body in it: rounding
+BODY_CELL_RAD = 1e-6  # radius of a cell with one body: rounding
 # Measured over 116 812 stars and an 18 by 10 degree monitor: cells of 2 to 10 degrees take 23 to 11 us
 # and pass on 1200 to 2700 stars; 4 degrees (13 us, 1500 stars) minimises the time of both steps.
 # results/tradeoff.csv, culling: 1 to 6 degrees take the same time, a scan twenty times as long.

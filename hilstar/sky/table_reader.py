@@ -86,10 +86,10 @@ UNIT_OF = {role: unit for unit, roles in UNITS.items() for role in roles}
 FILE_WANTED = "give a table of stars as FITS, ECSV, CSV or VOTable, or the CDS I/239 hip_main.dat"
 MAX_TABLE_BYTES = 4_000_000_000
 MAX_XML_BYTES = 500_000_000  # a VOTable is parsed as a whole
-MAX_HEAD_BYTES = 1_000_000  # of the lines before a text's rows
+MAX_HEAD_BYTES = 1_000_000  # lines before a text's rows
 MAX_COLUMNS, MAX_LINE = 1000, 50_000
 MAX_ROWS = 10_000_000
-CHUNK_BYTES = 64_000_000  # of a text that is parsed at once
+CHUNK_BYTES = 64_000_000  # parsed at once
 BLANKS = ("", "null", "NULL", "nan", "NaN", "--", "---")
 DELIMITERS = (",", "\t", "|", ";")
 ELSEWHERE = re.compile(rb"<STREAM\b[^>]*\bhref\s*=", re.IGNORECASE)

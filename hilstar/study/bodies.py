@@ -54,7 +54,7 @@ BODIES: dict[str, tuple[Table, Table]] = {
 }
 FRAME_NS = round(NS_PER_S / REFRESH_HZ)
 SIGMA_PX = (0.85, 0.85)
-MIDDLE_PX = (0.2, -0.3)  # of the disc, from the middle pixel's centre: no symmetry helps
+MIDDLE_PX = (0.2, -0.3)  # disc centre from the middle pixel's centre: off any symmetry
 FOCAL_PX = 6000.0
 RADII_PX = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 4.0, 6.0, 8.0, 12.0, 20.0, 40.0, 80.0)
 QUICK_RADII_PX = (0.1, 2.0, 12.0)
@@ -74,11 +74,11 @@ ROUNDS, QUICK_ROUNDS = 40, 3
 QUICK_BENCHES = ("nothing", "Moon", "Sun", "Earth", "all")
 FREE_MS = 0.3  # what the fastest of one frame and of the same one again differ by
 FLUX_LIMIT, LIMB_LIMIT_PX, DISC_PX = 0.01, 0.1, 0.2
-FLOOR = 1e-6  # of the chart's axis
+FLOOR = 1e-6  # lower end of the chart's axis
 
 
 @dataclass(frozen=True, slots=True)
-class Aim:
+class Boresight:
     """Where a bench looks: so far from a body's middle, or beyond the Earth's limb, or the other way."""
 
     body: str
@@ -112,7 +112,7 @@ def _open(folder: Path, name: str) -> Bench:
     return load(path)
 
 
-def attitude(bench: Bench, aim: Aim) -> FloatArray:
+def attitude(bench: Bench, aim: Boresight) -> FloatArray:
     """The attitude (unit quaternion, scalar first) with the boresight at an aim, of a bench that has the body."""
     if bench.moving is None:
         raise AssertionError("a bench with bodies moves")
@@ -127,17 +127,17 @@ def attitude(bench: Bench, aim: Aim) -> FloatArray:
 
 
 @dataclass(frozen=True, slots=True)
-class Scene:
+class BodyScene:
     """A bench by its name, where it looks, and how far its clock goes from frame to frame."""
 
     name: str
     bench: str
-    aim: Aim
+    aim: Boresight
     step_ns: int = FRAME_NS
 
 
 @dataclass(frozen=True, slots=True)
-class Cost:
+class BodyCost:
     """One scene: the fastest frame of the rounds, ms, with the body and without any, and the difference.
 
     `cpu_ms` is the difference in processor time, all cores together, the driver's threads too: what a busy machine changes
@@ -154,24 +154,24 @@ class Cost:
 
 
 SCENES = (
-    Scene("from the Earth's centre, no body", "observer", Aim("Moon", 60.0)),
-    Scene("planets, none in view", "planets", Aim("Jupiter", 60.0)),
-    Scene("Uranus in view, a point", "planets", Aim("Uranus", 0.3)),
-    Scene("Jupiter in view, 1.1 px", "planets", Aim("Jupiter", 0.3)),
-    Scene("Moon, not in view", "Moon", Aim("Moon", 60.0)),
-    Scene("Moon in view, 55 px", "Moon", Aim("Moon", 0.3)),
-    Scene("Sun, not in view", "Sun", Aim("Sun", 60.0)),
-    Scene("Sun in view, 57 px", "Sun", Aim("Sun", 0.3)),
-    Scene("from a low orbit, no body", "low orbit", Aim("Earth", 80.0, DAY_SIDE_NS)),
-    Scene("Earth, not in view", "Earth", Aim("Earth", 80.0, DAY_SIDE_NS)),
-    Scene("Earth's limb across the middle", "Earth", Aim("Earth", 0.0, DAY_SIDE_NS)),
-    Scene("Earth fills the field", "Earth", Aim("Earth", -60.0, DAY_SIDE_NS)),
-    Scene("all of them, none in view", "all", Aim("Earth", 80.0, DAY_SIDE_NS)),
-    Scene("the same, at a step of the orbit", "all", Aim("Earth", 80.0, DAY_SIDE_NS), 2 * NS_PER_S),
+    BodyScene("from the Earth's centre, no body", "observer", Boresight("Moon", 60.0)),
+    BodyScene("planets, none in view", "planets", Boresight("Jupiter", 60.0)),
+    BodyScene("Uranus in view, a point", "planets", Boresight("Uranus", 0.3)),
+    BodyScene("Jupiter in view, 1.1 px", "planets", Boresight("Jupiter", 0.3)),
+    BodyScene("Moon, not in view", "Moon", Boresight("Moon", 60.0)),
+    BodyScene("Moon in view, 55 px", "Moon", Boresight("Moon", 0.3)),
+    BodyScene("Sun, not in view", "Sun", Boresight("Sun", 60.0)),
+    BodyScene("Sun in view, 57 px", "Sun", Boresight("Sun", 0.3)),
+    BodyScene("from a low orbit, no body", "low orbit", Boresight("Earth", 80.0, DAY_SIDE_NS)),
+    BodyScene("Earth, not in view", "Earth", Boresight("Earth", 80.0, DAY_SIDE_NS)),
+    BodyScene("Earth's limb across the middle", "Earth", Boresight("Earth", 0.0, DAY_SIDE_NS)),
+    BodyScene("Earth fills the field", "Earth", Boresight("Earth", -60.0, DAY_SIDE_NS)),
+    BodyScene("all of them, none in view", "all", Boresight("Earth", 80.0, DAY_SIDE_NS)),
+    BodyScene("the same, at a step of the orbit", "all", Boresight("Earth", 80.0, DAY_SIDE_NS), 2 * NS_PER_S),
 )
 
 
-def measure_cost(benches: Mapping[str, Bench], scene: Scene, rounds: int) -> Cost:
+def measure_cost(benches: Mapping[str, Bench], scene: BodyScene, rounds: int) -> BodyCost:
     """A scene and the same frame without bodies, timed in turn. `benches` has "nothing", "all" and the scene's."""
     bench, nothing = benches[scene.bench], benches["nothing"]
     knows = bench.moving is not None and scene.aim.body in bench.moving.names
@@ -183,7 +183,7 @@ def measure_cost(benches: Mapping[str, Bench], scene: Scene, rounds: int) -> Cos
     stars = bench.draw(q, t_ns=scene.aim.t_ns).star_count
     discs = " ".join(disc.name for disc in bench.discs(q, When(scene.aim.t_ns)))
     without_ms, without_cpu_ms, with_ms, with_cpu_ms = np.min(np.array(times[1:]), axis=0).tolist()
-    return Cost(scene.name, with_ms, without_ms, with_ms - without_ms, with_cpu_ms - without_cpu_ms, discs, stars)
+    return BodyCost(scene.name, with_ms, without_ms, with_ms - without_ms, with_cpu_ms - without_cpu_ms, discs, stars)
 
 
 def frame_ms(bench: Bench, q: FloatArray, t_ns: int | None) -> tuple[float, float]:
@@ -335,7 +335,7 @@ def approach(benches: Mapping[str, Bench], body: str, off_deg: float, rounds: in
     """A body at one place. `benches` has "nothing" and the body's own."""
     bench, nothing = benches[body], benches["nothing"]
     start_ns = DAY_SIDE_NS if body == "Earth" else 0
-    q = attitude(bench, Aim(body, off_deg, start_ns))
+    q = attitude(bench, Boresight(body, off_deg, start_ns))
     times = [(*frame_ms(nothing, q, None), *frame_ms(bench, q, start_ns + k * FRAME_NS)) for k in range(rounds + 1)]
     without_ms, _, with_ms, cpu_ms = np.min(np.array(times[1:]), axis=0).tolist()
     drawn = bench.draw(q, t_ns=start_ns)
@@ -376,7 +376,7 @@ def run(directory: Path, quick: bool = False) -> list[str]:
     return findings
 
 
-def _cost_line(costs: Sequence[Cost]) -> str:
+def _cost_line(costs: Sequence[BodyCost]) -> str:
     dearest, step = max(costs, key=lambda cost: cost.cpu_ms), costs[-1]
     unseen = max((c for c in costs[:-1] if not c.discs), key=lambda cost: cost.cpu_ms)
     return (
@@ -404,7 +404,7 @@ def _limits_line(nears: Sequence[Near]) -> str:
     )
 
 
-def draw_costs(path: Path, costs: Sequence[Cost]) -> None:
+def draw_costs(path: Path, costs: Sequence[BodyCost]) -> None:
     """What each scene costs."""
     dearest, unseen = (max(some, key=lambda cost: cost.cpu_ms) for some in (costs, [c for c in costs[:-1] if not c.discs]))
     note = "Processor time of a frame, less that of the same frame on a bench without bodies; 1920 x 1080, drawn in software."

@@ -110,7 +110,7 @@ def error_cells(errors: StarErrors) -> tuple[float, ...]:
 
 
 @dataclass(frozen=True, slots=True)
-class Shown:
+class ShownStars:
     """A panel, and a star so many magnitudes under white on it."""
 
     name: str
@@ -119,7 +119,7 @@ class Shown:
 
 
 @dataclass(frozen=True, slots=True)
-class Left:
+class OverFrames:
     """A row of over_frames.csv: rms errors over phases and beginnings of exposures of so many frames, places along an axis.
 
     `steps` is the star's light in steps from black; errors are infinite where a star may show nothing.
@@ -136,15 +136,15 @@ class Left:
     axis_rms_px_fit: float
 
 
-def panels() -> list[Shown]:
+def panels() -> list[ShownStars]:
     """The panels: monitors of 8 bits, and microdisplays whose levels are equal."""
     equal = {bits: table_response(bits, np.linspace(0, 1, 2**bits)) for bits in (8, 2, 1)}
     return [
-        Shown("sRGB, 8 bits", srgb_response(8), 6.0),
-        Shown("gamma 2.2, 8 bits", gamma_response(8), 6.0),
-        Shown("linear, 8 bits", equal[8], 6.0),
-        Shown("linear, 2 bits", equal[2], 2.0),
-        Shown("1 bit", equal[1], 2.0),
+        ShownStars("sRGB, 8 bits", srgb_response(8), 6.0),
+        ShownStars("gamma 2.2, 8 bits", gamma_response(8), 6.0),
+        ShownStars("linear, 8 bits", equal[8], 6.0),
+        ShownStars("linear, 2 bits", equal[2], 2.0),
+        ShownStars("1 bit", equal[1], 2.0),
     ]
 
 
@@ -157,7 +157,7 @@ def study_frames(directory: Path, quick: bool) -> str:
     return _finding(left)
 
 
-def _left_by(shown: Shown, phases: int, counts: tuple[int, ...]) -> list[Left]:
+def _left_by(shown: ShownStars, phases: int, counts: tuple[int, ...]) -> list[OverFrames]:
     panel, share = Panel(shown.response, WHITE), flux_ratio(shown.mag)
     sprites, tile = phase_grid(phases)
     bright = phase_image(sprites, SIGMA_PX)
@@ -175,7 +175,7 @@ def _left_by(shown: Shown, phases: int, counts: tuple[int, ...]) -> list[Left]:
         for count in counts:
             means = ((_up_to(whole, begin + count) - _up_to(whole, begin)) / count for begin in BEGINS)
             errors = [judge.errors(mean, share, ("moment", "window", "fit")) for mean in means]
-            rows.append(Left(shown.name, shown.mag, steps, method, count, *_rms(errors)))
+            rows.append(OverFrames(shown.name, shown.mag, steps, method, count, *_rms(errors)))
     return rows
 
 
@@ -190,7 +190,7 @@ def _rms(errors: list[StarErrors]) -> tuple[float, ...]:
     return tuple(np.sqrt(np.mean(np.square(each), axis=0)).tolist())
 
 
-def _finding(left: list[Left]) -> str:
+def _finding(left: list[OverFrames]) -> str:
     at = {(row.panel, row.method): row for row in left if row.frames == AIM_FRAMES}
     each = (
         f"{name} {at[name, 'temporal'].flux_rms_mag:.2g} mag, {at[name, 'temporal'].axis_rms_px_fit:.2g} px"
@@ -199,7 +199,7 @@ def _finding(left: list[Left]) -> str:
     return f"temporal over any {AIM_FRAMES} frames, rms, places by a PSF fit: {'; '.join(each)}"
 
 
-def draw(path: Path, left: list[Left]) -> None:
+def draw(path: Path, left: list[OverFrames]) -> None:
     """What is left over the frames of an exposure, each panel in its colour."""
     names = list(dict.fromkeys(row.panel for row in left))
     at = {row.panel: row.axis_rms_px_fit for row in left if row.frames == AIM_FRAMES and row.method == "temporal"}

@@ -30,7 +30,7 @@ ROUNDS, QUICK_ROUNDS = 60, 5
 
 
 @dataclass(frozen=True, slots=True)
-class Scene:
+class EffortScene:
     """Where a bench points, how faint it goes and how fast it turns, and the tolerance, in magnitudes and in pixels alike."""
 
     name: str
@@ -43,16 +43,16 @@ class Scene:
 
 
 SCENES = (
-    Scene("narrow, sparse", (192.9, 27.1, 0.0), 600.0, 8.0, 12, 0.1),
-    Scene("wide, sparse", (192.9, 27.1, 0.0), 120.0, 6.5, 10, 0.1),
-    Scene("narrow, Milky Way", (305.0, 40.0, 20.0), 350.0, 8.0, 12, 0.1),
-    Scene("wide, Milky Way", (305.0, 40.0, 20.0), 120.0, 8.0, 12, 0.1),
-    Scene("wide, Milky Way, 1 deg/s", (305.0, 40.0, 20.0), 120.0, 7.0, 12, 0.1, (0.6, 0.8, 0.0)),
+    EffortScene("narrow, sparse", (192.9, 27.1, 0.0), 600.0, 8.0, 12, 0.1),
+    EffortScene("wide, sparse", (192.9, 27.1, 0.0), 120.0, 6.5, 10, 0.1),
+    EffortScene("narrow, Milky Way", (305.0, 40.0, 20.0), 350.0, 8.0, 12, 0.1),
+    EffortScene("wide, Milky Way", (305.0, 40.0, 20.0), 120.0, 8.0, 12, 0.1),
+    EffortScene("wide, Milky Way, 1 deg/s", (305.0, 40.0, 20.0), 120.0, 7.0, 12, 0.1, (0.6, 0.8, 0.0)),
 )
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class EffortOutcome:
     """A scene at one effort: the time of a frame, the largest errors of stars that stand alone, and the tolerance.
 
     `centroid_max_px` is by the plain moment of the light on the monitor, `max_px_...` as each centroider finds them on the
@@ -87,11 +87,11 @@ class Outcome:
 
 
 @dataclass(frozen=True, slots=True)
-class Comparison:
+class EffortComparison:
     """A scene at full effort and at the effort that it needs."""
 
-    full: Outcome
-    auto: Outcome
+    full: EffortOutcome
+    auto: EffortOutcome
 
     @property
     def speed_up(self) -> float:
@@ -107,19 +107,19 @@ def run(directory: Path, quick: bool = False) -> list[str]:
     return [_line(comparison) for comparison in comparisons]
 
 
-def compare(scene: Scene, rounds: int) -> Comparison:
+def compare(scene: EffortScene, rounds: int) -> EffortComparison:
     """A scene at full effort and at the effort that it needs, timed in turn."""
     with TemporaryDirectory() as folder:
         benches = {name: _open(scene, keys, Path(folder) / f"{name}.toml") for name, keys in EFFORTS.items()}
         try:
             times = _times_ms(scene, benches, rounds)
-            return Comparison(**{name: _outcome(scene, name, bench, times[name]) for name, bench in benches.items()})
+            return EffortComparison(**{name: _outcome(scene, name, bench, times[name]) for name, bench in benches.items()})
         finally:
             for bench in benches.values():
                 bench.close()
 
 
-def _open(scene: Scene, effort: Table, path: Path) -> Bench:
+def _open(scene: EffortScene, effort: Table, path: Path) -> Bench:
     tolerances = {"tolerance_mag": scene.tolerance, "tolerance_px": scene.tolerance}
     tables: dict[str, Table] = {
         "tracker": {"resolution_px": (1024, 1024), "transmission": "n-bk7-10mm"},
@@ -132,11 +132,11 @@ def _open(scene: Scene, effort: Table, path: Path) -> Bench:
     return load(path)
 
 
-def _turn(scene: Scene) -> Turn:
+def _turn(scene: EffortScene) -> Turn:
     return Turn(from_radec_roll_deg(*scene.radec_roll_deg), np.radians(scene.rate_deg_s))
 
 
-def _times_ms(scene: Scene, benches: dict[str, Bench], rounds: int) -> dict[str, float]:
+def _times_ms(scene: EffortScene, benches: dict[str, Bench], rounds: int) -> dict[str, float]:
     turn = _turn(scene)
     times: dict[str, list[float]] = {name: [] for name in benches}
     for number in range(rounds + 1):
@@ -148,7 +148,7 @@ def _times_ms(scene: Scene, benches: dict[str, Bench], rounds: int) -> dict[str,
     return {name: float(np.median(values)) for name, values in times.items()}
 
 
-def _outcome(scene: Scene, name: str, bench: Bench, frame_ms: float) -> Outcome:
+def _outcome(scene: EffortScene, name: str, bench: Bench, frame_ms: float) -> EffortOutcome:
     turn, size = _turn(scene), bench.camera.resolution_px
     drawn = bench.draw(turn.q_icrs_to_cam, 0, turn.rate_cam_rad_s)
     shown = shown_light(drawn.levels, bench.panel)
@@ -166,7 +166,7 @@ def _outcome(scene: Scene, name: str, bench: Bench, frame_ms: float) -> Outcome:
     seen = bench.renderer.target.seen
     lit, wanted = (squares(image, windows) for image in (shown, true))
     off_px = stamp_errors(lit, wanted, sigma_px, seen.blur_px, seen.pixel_px)
-    return Outcome(
+    return EffortOutcome(
         scene=scene.name,
         effort=name,
         quantisation=bench.config.render.quantisation,
@@ -180,7 +180,7 @@ def _outcome(scene: Scene, name: str, bench: Bench, frame_ms: float) -> Outcome:
     )
 
 
-def _line(comparison: Comparison) -> str:
+def _line(comparison: EffortComparison) -> str:
     full, auto = comparison.full, comparison.auto
     errors = f"largest errors of {auto.measured_stars} stars {auto.flux_max_mag:.4f} mag and {auto.worst_px:.4f} px"
     errors += f" by the worst of six centroiders ({auto.max_px_fit:.4f} by a PSF fit)"
@@ -191,7 +191,7 @@ def _line(comparison: Comparison) -> str:
     )
 
 
-def economy_finding(comparisons: list[Comparison]) -> str:
+def economy_finding(comparisons: list[EffortComparison]) -> str:
     """What is true of every scene, in one sentence: the range of the speed-up, and whether errors are within tolerance."""
     slowest, quickest = (extreme(comparison.speed_up for comparison in comparisons) for extreme in (min, max))
     over = sum(not comparison.auto.within for comparison in comparisons)
@@ -204,12 +204,12 @@ def economy_finding(comparisons: list[Comparison]) -> str:
     return f"Auto effort {slower} and is up to {quickest:.1f} times as fast in another, {verdict}"
 
 
-def _compared(comparison: Comparison) -> str:
+def _compared(comparison: EffortComparison) -> str:
     ratio = comparison.speed_up
     return f"{ratio:.1f} times as fast" if ratio >= 1 else f"{1 / ratio:.1f} times as SLOW"
 
 
-def draw(path: Path, comparisons: list[Comparison]) -> None:
+def draw(path: Path, comparisons: list[EffortComparison]) -> None:
     """The time of each scene at both efforts, and the errors at the effort that it needs, as shares of the tolerance."""
     note = "Errors of stars that stand alone; places by the worst of six centroiders."
     with chart(path, economy_finding(comparisons), panels=2, note=note, heights=(1, 1)) as (cost, error):

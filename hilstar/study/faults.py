@@ -62,7 +62,7 @@ CASES: dict[str, list[Table]] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Cost:
+class FaultCost:
     """One case: median times of a frame, ms, with the fault and without any, in turn in the same run."""
 
     quantisation: str
@@ -98,7 +98,7 @@ def bench_of(folder: Path, quantisation: str) -> Bench:
     return load(path)
 
 
-def cost_of(bench: Bench, folder: Path, case: str, rounds: int) -> Cost:
+def cost_of(bench: Bench, folder: Path, case: str, rounds: int) -> FaultCost:
     """The time of a frame with the faults of a case and without any, in turn."""
     faults = tuple(fault_of({"name": f"fault {k}", **table}) for k, table in enumerate(CASES[case]))
     scenario = Scenario(folder / "faults.toml", "", 1, faults, folder)
@@ -120,7 +120,7 @@ def cost_of(bench: Bench, folder: Path, case: str, rounds: int) -> Cost:
 
         times.append((_ms(plain), _ms(faulty)))
     without_ms, with_ms = np.median(np.array(times[1:]), axis=0).tolist()
-    return Cost(bench.config.render.quantisation, case, with_ms, without_ms, with_ms - without_ms)
+    return FaultCost(bench.config.render.quantisation, case, with_ms, without_ms, with_ms - without_ms)
 
 
 def _frame(bench: Bench, q: FloatArray, effects: Effects, faults: list[Fault]) -> object:
@@ -166,7 +166,7 @@ def _shown(bench: Bench, sprites: Sprites) -> FloatArray:
 
 def run(directory: Path, quick: bool = False) -> list[str]:
     """Measure; write `faults-cost.csv`, `faults-stray.csv` and their charts; the findings, a line each. Raises InputError."""
-    costs: list[Cost] = []
+    costs: list[FaultCost] = []
     strays: list[Stray] = []
     rounds, shares = (QUICK_ROUNDS, QUICK_SHARES) if quick else (ROUNDS, SHARES)
     with TemporaryDirectory() as name:
@@ -183,7 +183,7 @@ def run(directory: Path, quick: bool = False) -> list[str]:
     return findings
 
 
-def _findings(costs: list[Cost], strays: list[Stray]) -> list[str]:
+def _findings(costs: list[FaultCost], strays: list[Stray]) -> list[str]:
     found = []
     for quantisation in QUANTISATIONS:
         mine = {cost.case: cost for cost in costs if cost.quantisation == quantisation}
@@ -228,7 +228,7 @@ def draw_stray(path: Path, strays: list[Stray]) -> None:
         label_ends(axes)
 
 
-def draw_costs(path: Path, costs: list[Cost]) -> None:
+def draw_costs(path: Path, costs: list[FaultCost]) -> None:
     """The time of a frame with each fault and without it."""
     dearest = max(costs, key=lambda cost: cost.frame_ms)
     star = max((cost for cost in costs if "false star" in cost.case), key=lambda cost: cost.frame_ms)

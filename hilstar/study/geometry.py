@@ -43,7 +43,7 @@ DESIGN_FOCAL_MM = 100.0
 
 
 @dataclass(frozen=True, slots=True)
-class Faults:
+class DotFaults:
     """The noise of a centroid (one sigma, one axis), the share of lit dots that are lost, and that of false ones."""
 
     noise_px: float = 0.02
@@ -52,7 +52,12 @@ class Faults:
 
 
 def observed_dots(
-    plan: DotPlan, x_px: FloatArray, y_px: FloatArray, resolution_px: tuple[int, int], faults: Faults, rng: np.random.Generator
+    plan: DotPlan,
+    x_px: FloatArray,
+    y_px: FloatArray,
+    resolution_px: tuple[int, int],
+    faults: DotFaults,
+    rng: np.random.Generator,
 ) -> Observed:
     """Centroids of the lit dots that are at (x, y) (n,) in a tracker's image of `resolution_px`, frame by frame."""
     width, height = resolution_px
@@ -178,7 +183,7 @@ SHORT = {"the same with a field of degree 4": "with a field, degree 4", "Brown-C
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class CalibrationOutcome:
     """One model on one set of frames: what dots that were held out say, and where stars all over the screen really are."""
 
     frames: int
@@ -219,23 +224,23 @@ def _nominal() -> Nominal:
     return Nominal(monitor_camera(BENCH.resolution_px, BENCH.pitch_mm * 1e3, BENCH.focal_mm, aligned), aligned, TRACKER)
 
 
-def _outcomes(frames: Frames) -> list[Outcome]:
+def _outcomes(frames: Frames) -> list[CalibrationOutcome]:
     """Every model on the same centroids."""
     rng = np.random.default_rng(SEED)
     plan = plan_dots(BENCH.resolution_px, frames.count, frames.dots, rng)
     x_px, y_px = TRACKER.project(BENCH.directions(plan.x_px, plan.y_px))
-    seen = observed_dots(plan, x_px, y_px, TRACKER.resolution_px, Faults(frames.noise_px), rng)
+    seen = observed_dots(plan, x_px, y_px, TRACKER.resolution_px, DotFaults(frames.noise_px), rng)
     nominal = _nominal()
     problem, data = matched(plan, nominal, seen, first_look(plan, nominal, seen, rng))
     return [_outcome(problem, data, frames, model) for model in MODELS]
 
 
-def _outcome(problem: Problem, data: MatchedDots, frames: Frames, model: LensModel) -> Outcome:
+def _outcome(problem: Problem, data: MatchedDots, frames: Frames, model: LensModel) -> CalibrationOutcome:
     free = Model(model.parameters)
     candidate = held_out(problem, model.name, free, model.field_degree, data)
     errors = _star_errors(fit(problem, free, model.field_degree, data).geometry)
     rms = float(np.sqrt((errors**2).mean()))
-    return Outcome(
+    return CalibrationOutcome(
         frames=frames.count,
         dots_per_frame=frames.dots,
         noise_px=frames.noise_px,
@@ -257,13 +262,13 @@ def _star_errors(geometry: Geometry) -> np.ndarray[tuple[int], np.dtype[np.float
     return np.asarray(np.hypot(shown_x - x, shown_y - y) * ARCSEC_PER_RAD / monitor.focal_length_px)
 
 
-def _line(outcome: Outcome) -> str:
+def _line(outcome: CalibrationOutcome) -> str:
     fails = "" if outcome.stars_max_arcsec < FAIL_ARCSEC else f"; FAILS: over {FAIL_ARCSEC:g} arcsec"
     stars = f"stars {outcome.stars_rms_arcsec:.3g} arcsec rms, {outcome.stars_max_arcsec:.3g} maximum"
     return f"{outcome.model}: {stars}; held-out dots {outcome.held_out_arcsec:.3g} rms{fails}"
 
 
-def _draw(path: Path, finding: str, outcomes: list[Outcome]) -> None:
+def _draw(path: Path, finding: str, outcomes: list[CalibrationOutcome]) -> None:
     note = f"Solid: stars all over the screen. Dotted: dots that were held out. {USUAL_SIZE[0]} frames of {USUAL_SIZE[1]} dots"
     note += f" with {USUAL_NOISE_PX:g} px of noise, one of the two varied."
     with chart(path, finding, panels=2, share_x=False, note=note) as (dots, noise):

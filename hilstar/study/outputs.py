@@ -24,7 +24,7 @@ ZOOM_PX = 160
 
 
 @dataclass(frozen=True, slots=True)
-class Scene:
+class OutputScene:
     """One of the thesis's simulations: its bench, where it points, and the star in the middle of its zoom."""
 
     name: str
@@ -34,9 +34,11 @@ class Scene:
 
 
 SCENES = (
-    Scene("orion", "Orion, 25 degrees, zodiacal light (thesis figures 5.3 to 5.7)", (84.057, -1.200, 0.0), 26311),
-    Scene("lyra", "Lyra, 10.8 degrees, 3000 e-/px of background (figures 5.8 to 5.12)", (283.021, 35.349, 0.0), 92420),
-    Scene("rosetta", "zeta Cas, Rosetta NAVCAM, 28000 e-/px of stray light (figures 5.14 to 5.18)", (9.122, 53.817, 0.0), 2920),
+    OutputScene("orion", "Orion, 25 degrees, zodiacal light (thesis figures 5.3 to 5.7)", (84.057, -1.200, 0.0), 26311),
+    OutputScene("lyra", "Lyra, 10.8 degrees, 3000 e-/px of background (figures 5.8 to 5.12)", (283.021, 35.349, 0.0), 92420),
+    OutputScene(
+        "rosetta", "zeta Cas, Rosetta NAVCAM, 28000 e-/px of stray light (figures 5.14 to 5.18)", (9.122, 53.817, 0.0), 2920
+    ),
 )
 
 
@@ -45,7 +47,7 @@ def run(directory: Path) -> list[str]:
     return [_draw_scene(directory, scene) for scene in SCENES]
 
 
-def _draw_scene(directory: Path, scene: Scene) -> str:
+def _draw_scene(directory: Path, scene: OutputScene) -> str:
     with Simulator(read_bench_file(resource_path("configs", f"thesis-{scene.name}.toml"))) as simulator:
         motion = simulator.motion(from_radec_roll_deg(*scene.radec_roll_deg), np.zeros(3))
         clean = simulator.expose(motion, None)
@@ -63,7 +65,7 @@ def _draw_scene(directory: Path, scene: Scene) -> str:
     )
 
 
-def _figure(path: Path, scene: Scene, clean: Exposure, noisy: Exposure) -> None:
+def _figure(path: Path, scene: OutputScene, clean: Exposure, noisy: Exposure) -> None:
     truth, saturated = noisy.truth, int(noisy.truth["clipped"].sum())
     finding = f"{scene.title}: {len(truth)} stars to V = {truth['v_mag'].max():.1f}, {saturated or 'none'} saturated"
     note = "Stars are counted with the brightest first; lines: means. All three images have one stretch."
@@ -90,7 +92,7 @@ def _star_plots(axes: list[Axes], truth: npt.NDArray[np.void], shape: tuple[int,
     temperatures.set(yscale="log", title=f"T, mean {truth['temperature_k'].mean():.0f} K")
 
 
-def _images(axes: list[Axes], scene: Scene, clean: Exposure, noisy: Exposure) -> None:
+def _images(axes: list[Axes], scene: OutputScene, clean: Exposure, noisy: Exposure) -> None:
     star = noisy.truth[noisy.truth["hip"] == scene.zoom_hip]
     height, width = noisy.dn.shape
     x, y = (float(star["x_px"][0]), float(star["y_px"][0])) if len(star) else (width / 2, height / 2)

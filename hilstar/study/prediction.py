@@ -48,7 +48,7 @@ Way = Literal["rate", "auto", "newest"]
 WAYS: dict[Way, str] = {"rate": ORANGE, "auto": BLUE, "newest": GREEN}
 SHAKEN_HZ = (1, 2, 3, 5, 7, 10, 14, 20, 27, 35, 45)
 QUICK_SHAKEN_HZ = (2, 5, 10, 14, 20, 45)
-# Of packets, Hz, and the mean age of the newest one at light, ms: half a period of the packets at least.
+# Packet rate, Hz, and mean age of the newest packet at light, ms: at least half a packet period.
 SHAKEN_CELLS = ((20, 40), (50, 20), (100, 5), (100, 10), (100, 20), (100, 40), (200, 10), (200, 20))
 QUICK_SHAKEN_CELLS = ((100, 20),)
 SHAKEN_ARCSEC, SHAKEN_TURN_RAD_S = 2.0, math.radians(0.5)
@@ -58,7 +58,7 @@ Z = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class PredictionOutcome:
     """One predictor at one rate and latency: errors over all frames, arcsec, and the time of one attitude, us."""
 
     method: str
@@ -88,7 +88,7 @@ def run(directory: Path, quick: bool = False) -> list[str]:
     return [finding, *(_line(outcome) for outcome in usual), told]
 
 
-def measure(span_s: float) -> list[Outcome]:
+def measure(span_s: float) -> list[PredictionOutcome]:
     """Every predictor over latency at the usual rate, and over rate at the usual latency."""
     cells = {(USUAL_HZ, ms) for ms in LATENCIES_MS} | {(hz, USUAL_MS) for hz in RATES_HZ}
     outcomes = []
@@ -176,7 +176,7 @@ def shaken_finding(found: list[Shaken], packet_hz: int, age_ms: int) -> str:
     )
 
 
-def _outcome(predictor: Predictor, samples: list[AttitudeSample], rate_hz: int, latency_ms: int) -> Outcome:
+def _outcome(predictor: Predictor, samples: list[AttitudeSample], rate_hz: int, latency_ms: int) -> PredictionOutcome:
     taken_ns = [sample.t_ns for sample in samples]
     errors = []
     first_ns = taken_ns[NEAR] + latency_ms * NS_PER_MS
@@ -186,7 +186,9 @@ def _outcome(predictor: Predictor, samples: list[AttitudeSample], rate_hz: int, 
         shown = predictor.load(samples[count - NEAR : count])(t_ns)
         errors.append(angle_between_rad(slew_attitude(t_ns), shown) * ARCSEC_PER_RAD)
     rms = float(np.sqrt(np.mean(np.square(errors))))
-    return Outcome(predictor.name, rate_hz, latency_ms, rms, max(errors), _attitude_us(predictor, samples, latency_ms))
+    return PredictionOutcome(
+        predictor.name, rate_hz, latency_ms, rms, max(errors), _attitude_us(predictor, samples, latency_ms)
+    )
 
 
 def _attitude_us(predictor: Predictor, samples: list[AttitudeSample], latency_ms: int) -> float:
@@ -201,12 +203,12 @@ def _attitude_us(predictor: Predictor, samples: list[AttitudeSample], latency_ms
     return float(np.median(times))
 
 
-def _line(outcome: Outcome) -> str:
+def _line(outcome: PredictionOutcome) -> str:
     errors = f"{outcome.rms_arcsec:.3g} arcsec rms, {outcome.worst_arcsec:.3g} maximum"
     return f"{outcome.method}: {errors}, {outcome.attitude_us:.0f} us per attitude"
 
 
-def _draw(path: Path, finding: str, outcomes: list[Outcome]) -> None:
+def _draw(path: Path, finding: str, outcomes: list[PredictionOutcome]) -> None:
     shaken = ", ".join(f"{size:g} arcsec at {hz:g} Hz" for size, hz in JITTER)
     note = f"A swing of {SLEW_DEG:g} degrees in {SLEW_S:g} s, shaken by {shaken}. In brackets: the time of one attitude."
     with chart(path, finding, panels=2, share_x=False, note=note) as (latency, rate):

@@ -19,7 +19,7 @@ from hilstar.units import NS_PER_MS, NS_PER_S
 
 ORION = from_radec_roll_deg(84.057, -1.2, 10.0)
 SLEW_DEG, SLEW_S = 3.0, 20.0
-# Of each axis: amplitude, arcsec, and frequency, Hz, as wheels and structure shake a small satellite.
+# Jitter per axis: amplitude, arcsec, and frequency, Hz, as wheels and structure shake a small satellite.
 JITTER = ((2.0, 3.1), (1.0, 11.0), (0.3, 37.0))
 RATE_STEP_NS = 100_000
 NEAR = 4

@@ -29,7 +29,7 @@ APERTURE_MM = 30.0
 GLASS = "n-bk7-10mm"
 MAX_RELIABLE_VI_MAG = 2.5
 Window = tuple[slice, slice]
-BUSY_SHARE = 0.15  # of the machine's cores: a background process of a third of a core, of two; times are then 5 % and more off
+BUSY_SHARE = 0.15  # share of all cores: a third of one core on a machine of two; times are then 5 % and more off
 STAT = Path("/proc/stat")
 
 
@@ -132,7 +132,7 @@ class OtherWork:
     def cores(self) -> float:
         """How many cores the others took, in the mean since the beginning; 0 where the system does not say."""
         (all_before, busy_before, own_before), (all_now, busy_now, own_now) = self._before, self._times_s()
-        passed_s = all_now - all_before  # of all cores together
+        passed_s = all_now - all_before  # summed over all cores
         others_s = (busy_now - busy_before) - (own_now - own_before)
         return max(others_s, 0.0) / passed_s * (os.cpu_count() or 1) if passed_s > 0 else 0.0
 

@@ -40,7 +40,7 @@ RADEC_ROLL_DEG = (84.0, 0.0, 15.0)  # Orion: enough bright stars
 PACKET_HZ = 200.0
 RATE_DEG_S = 1.0
 PLACE_TICKS = (-100, -30, -10, -3, -1, 0, 1, 3, 10, 30, 100)
-STARTS = 3  # of exposures within a refresh, for phases between the rows of stars
+STARTS = 3  # exposure starts within a refresh, for phases between the rows of stars
 STEP_S = 0.5e-3  # to either side, for a star's speed on the detector
 ISOLATION = Isolation(margin_px=8.0, max_share=1e-3)
 RATES_DEG_S = (0.01, 0.03, 0.1, 0.3, 1.0, 2.0, 4.0)
@@ -100,7 +100,7 @@ WAYS = {
 }
 DRAW_TO_SWAP_S = 0.010
 EXPOSURE_S = 0.1
-START_S = 0.0037  # of the exposure, within a refresh period
+START_S = 0.0037  # exposure start within a refresh period
 REFRESH_MS = 1e3 / 60  # the default of a bench file
 FRAME_BEFORE = 1  # the first rows of an exposure still show the frame before
 COST_ROUNDS = 9
@@ -187,7 +187,7 @@ class ScanningPanel:
         self.optics.close()
 
 
-class Sky:
+class TimingSky:
     """The same tracker's image of the sky itself, spread by the sprites' width. Free it with `close`."""
 
     def __init__(self, shown: ScanningPanel) -> None:
@@ -214,7 +214,7 @@ class Sky:
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
+class TimingCase:
     """Refreshes in an exposure, and for how much of a refresh a row stays lit."""
 
     refreshes: float
@@ -226,8 +226,8 @@ class Case:
         return f"{self.refreshes:g} refreshes" + ("" if self.lit == 1 else f", lit {self.lit:g} of each")
 
 
-CASES = (Case(6.0), Case(6.3), Case(2.4), Case(6.0, 0.25), Case(2.4, 0.25))
-QUICK_CASES = (Case(6.0), Case(6.3), Case(2.4, 0.25))
+CASES = (TimingCase(6.0), TimingCase(6.3), TimingCase(2.4), TimingCase(6.0, 0.25), TimingCase(2.4, 0.25))
+QUICK_CASES = (TimingCase(6.0), TimingCase(6.3), TimingCase(2.4, 0.25))
 
 
 @dataclass(frozen=True, slots=True)
@@ -253,15 +253,15 @@ def measure_beat(quick: bool = False) -> list[BeatPoint]:
         return [point for case in (QUICK_CASES if quick else CASES) for point in _case_points(case, slew, Path(folder))]
 
 
-def _case_points(case: Case, slew: Slew, folder: Path) -> Iterator[BeatPoint]:
+def _case_points(case: TimingCase, slew: Slew, folder: Path) -> Iterator[BeatPoint]:
     opened = ScanningPanel("+ smear", folder / "beat.toml", case.refreshes / 60.0, case.lit)
-    with closing(opened) as panel, closing(Sky(opened)) as sky:
+    with closing(opened) as panel, closing(TimingSky(opened)) as sky:
         for number in range(STARTS):
             panel.start_s = (number + 0.2) / STARTS * panel.period_s
             yield from _exposure_points(case, panel, sky, slew)
 
 
-def _exposure_points(case: Case, panel: ScanningPanel, sky: Sky, slew: Slew) -> Iterator[BeatPoint]:
+def _exposure_points(case: TimingCase, panel: ScanningPanel, sky: TimingSky, slew: Slew) -> Iterator[BeatPoint]:
     shown, true = panel.exposed_e_per_s(slew), sky.exposed_e_per_s(slew)
     paths = sky.paths(slew)
     places = panel.optics.geometry.to_tracker(paths.x_px, paths.y_px)
@@ -300,8 +300,8 @@ def _rows_and_speeds(panel: ScanningPanel, slew: Slew, stars: np.ndarray) -> tup
 def beat_findings(points: list[BeatPoint], directory: Path) -> list[str]:
     """Write `beat.csv` and its chart; a line for each case. Raises InputError."""
     write_records(directory / "beat.csv", points)
-    cases = list(dict.fromkeys(Case(p.refreshes, p.lit) for p in points))
-    lines = [_beat_line(case, [p for p in points if Case(p.refreshes, p.lit) == case]) for case in cases]
+    cases = list(dict.fromkeys(TimingCase(p.refreshes, p.lit) for p in points))
+    lines = [_beat_line(case, [p for p in points if TimingCase(p.refreshes, p.lit) == case]) for case in cases]
     off = np.array([p.off_arcsec - p.foretold_arcsec for p in points])
     finding = (
         f"The beat of exposure and refresh moves a star at {RATE_DEG_S:g} deg/s as foretold from their phase,"
@@ -311,7 +311,7 @@ def beat_findings(points: list[BeatPoint], directory: Path) -> list[str]:
     return [finding, *lines]
 
 
-def _beat_line(case: Case, points: list[BeatPoint]) -> str:
+def _beat_line(case: TimingCase, points: list[BeatPoint]) -> str:
     found = beat(Exposures(60.0, case.refreshes / 60.0, lit_s=case.lit / 60.0))
     seen, light = np.array([p.off_arcsec for p in points]), np.array([p.light_mag for p in points])
     off = seen - [p.foretold_arcsec for p in points]
@@ -323,12 +323,12 @@ def _beat_line(case: Case, points: list[BeatPoint]) -> str:
     )
 
 
-def _draw(path: Path, finding: str, cases: list[Case], points: list[BeatPoint]) -> None:
+def _draw(path: Path, finding: str, cases: list[TimingCase], points: list[BeatPoint]) -> None:
     phases = np.linspace(0, 1, 801)
     note = "Lines: foretold. Dots: stars of the virtual tracker. Whole refreshes of rows that stay lit have no beat."
     with chart(path, finding, panels=2, note=note) as (place, light):
         for case, colour in zip(cases, SERIES, strict=False):
-            mine = [p for p in points if Case(p.refreshes, p.lit) == case]
+            mine = [p for p in points if TimingCase(p.refreshes, p.lit) == case]
             foretold = seen_at(Exposures(60.0, case.refreshes / 60.0, lit_s=case.lit / 60.0), phases)
             place.plot(phases, foretold.off_s * RATE_DEG_S * ARCSEC_PER_DEG, color=colour, label=case.words)
             light.plot(phases, [magnitude(float(part)) for part in foretold.light], color=colour, label=case.words)
@@ -344,7 +344,7 @@ def _draw(path: Path, finding: str, cases: list[Case], points: list[BeatPoint]) 
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class TimingOutcome:
     """One compensation at one rate: rms and largest error of centroids, arcsec, rms flux error, mag, and drawing time, ms."""
 
     way: str
@@ -356,7 +356,7 @@ class Outcome:
     draw_ms: float
 
 
-def compare(panel: ScanningPanel, sky: Sky, slew: Slew) -> Outcome:
+def compare(panel: ScanningPanel, sky: TimingSky, slew: Slew) -> TimingOutcome:
     """One compensation on one slew, against the sky."""
     shown, true = panel.exposed_e_per_s(slew), sky.exposed_e_per_s(slew)
     camera: Camera = panel.camera
@@ -367,22 +367,24 @@ def compare(panel: ScanningPanel, sky: Sky, slew: Slew) -> Outcome:
     flux_mag = np.array([error.flux_mag for error in errors])
     off_arcsec = np.array([error.centroid_px for error in errors]) * ARCSEC_PER_RAD / camera.focal_length_px
     rms_arcsec, rms_mag = (float(np.sqrt(np.mean(np.square(v)))) for v in (off_arcsec, flux_mag))
-    return Outcome(panel.way, slew.rate_deg_s, len(errors), rms_arcsec, float(off_arcsec.max()), rms_mag, panel.cost_ms(slew))
+    return TimingOutcome(
+        panel.way, slew.rate_deg_s, len(errors), rms_arcsec, float(off_arcsec.max()), rms_mag, panel.cost_ms(slew)
+    )
 
 
 @contextmanager
-def _opened() -> Iterator[tuple[list[ScanningPanel], Sky]]:
+def _opened() -> Iterator[tuple[list[ScanningPanel], TimingSky]]:
     with TemporaryDirectory() as folder, ExitStack() as stack:
         panels = []
         for number, way in enumerate(WAYS):
             panels.append(ScanningPanel(way, Path(folder) / f"{number}.toml"))
             stack.callback(panels[-1].close)
-        sky = Sky(panels[0])
+        sky = TimingSky(panels[0])
         stack.callback(sky.close)
         yield panels, sky
 
 
-def measure(quick: bool = False) -> list[Outcome]:
+def measure(quick: bool = False) -> list[TimingOutcome]:
     """Every compensation at every rate."""
     with _opened() as (panels, sky):
         rates = QUICK_RATES_DEG_S if quick else RATES_DEG_S
@@ -398,12 +400,12 @@ def run(directory: Path, quick: bool = False) -> list[str]:
     return [finding, *(_line(at[way, 2.0]) for way in WAYS), *beat_findings(measure_beat(quick), directory)]
 
 
-def _line(outcome: Outcome) -> str:
+def _line(outcome: TimingOutcome) -> str:
     errors = f"{outcome.rms_arcsec:.3g} arcsec rms, {outcome.worst_arcsec:.3g} maximum, {outcome.flux_rms_mag:.2g} mag rms"
     return f"{outcome.way}: {errors}, {outcome.draw_ms:.1f} ms a frame ({outcome.stars} stars)"
 
 
-def draw(path: Path, outcomes: list[Outcome]) -> str:
+def draw(path: Path, outcomes: list[TimingOutcome]) -> str:
     """The chart of the outcomes; its finding."""
     at = {(o.way, o.rate_deg_s): o for o in outcomes}
     plain, best = (at[way, QUICK_RATES_DEG_S[0]] for way in ("prediction", "+ smear"))

@@ -38,11 +38,11 @@ from hilstar.testing.star_fit import (
 )
 from hilstar.units import MAG_PER_RELATIVE, magnitude
 
-# Of a star's flux: what float32 may do to any pixel that the star reaches. Measured 7e-8 on llvmpipe against float64.
+# Error of float32 in any pixel that a star reaches, relative to its flux. Measured 7e-8 on llvmpipe against float64.
 PIXEL_ERROR = 2e-7
-MIN_IN_VIEW = 0.01  # of a star's light; the wing of a star off the image has no place
-MAX_ERROR = 0.25  # of a star's flux, by rounding of brighter light on it: such a star is not compared
-MISSING_SHARE = 0.01  # of its flux: 5 mag fainter is gone
+MIN_IN_VIEW = 0.01  # smallest share of a star's light on the image; the wing of a star off the image has no centroid
+MAX_ERROR = 0.25  # a star whose relative error by rounding of brighter light is larger is not compared
+MISSING_SHARE = 0.01  # share of its flux: a star 5 mag fainter is gone
 MOVE_STEPS, SMALL_MOVE_PX = 4, 0.003  # a shift of this is first order within 1e-5 of the star's flux
 MAX_MOVE_SIGMAS = 3.0  # a star that moved farther is missing here and extra there
 UNIT = "electron/s"
@@ -69,7 +69,7 @@ def compare_skies(
     seeds, unmeasured = _measurable(golden, find_seeds(golden, truth, sigma_px), sigma_px)
     if not seeds.hip:
         raise InputError("compare: no star of the golden image has enough light in view; give one that has")
-    fit = _Fit(golden, seeds.places_px, sigma_px)
+    fit = _SkyFit(golden, seeds.places_px, sigma_px)
     moved = fit.follow(frame)
     stars = _differences(seeds, fit, moved, limits)
     more, less = moved.residual - fit.residual, fit.residual - moved.residual
@@ -113,7 +113,7 @@ def _in_view(seeds: Seeds, sigma_px: tuple[float, float], shape: tuple[int, int]
     return seeds.only(StarTemplates(seeds.places_px, sigma_px, shape).in_view >= MIN_IN_VIEW)
 
 
-class _Fit:
+class _SkyFit:
     """All stars of one image, fitted at `places_px`: what they are, and the light (height, width) that they leave."""
 
     def __init__(self, image: FloatArray, places_px: FloatArray, sigma_px: tuple[float, float]) -> None:
@@ -126,21 +126,21 @@ class _Fit:
         self.model = self.templates.image(fitted)
         self.residual = image - self.model
 
-    def follow(self, frame: FloatArray) -> _Fit:
+    def follow(self, frame: FloatArray) -> _SkyFit:
         """The same stars in another image: the same templates, except for those that moved."""
         start = self.templates.places_px
-        fit = _Fit(frame, start, self.sigma_px)
+        fit = _SkyFit(frame, start, self.sigma_px)
         for _ in range(MOVE_STEPS):
             shift = np.hypot(*(fit.places_px - self.places_px).T)
             there = fit.flux > MISSING_SHARE * self.flux
             moved = there & (shift > SMALL_MOVE_PX) & (shift <= MAX_MOVE_SIGMAS * max(self.sigma_px))
             if not moved.any():
                 break
-            fit = _Fit(frame, start + np.where(moved[:, None], fit.places_px - self.places_px, 0.0), self.sigma_px)
+            fit = _SkyFit(frame, start + np.where(moved[:, None], fit.places_px - self.places_px, 0.0), self.sigma_px)
         return fit
 
 
-def _differences(seeds: Seeds, fit: _Fit, moved: _Fit, limits: Limits) -> list[StarDifference]:
+def _differences(seeds: Seeds, fit: _SkyFit, moved: _SkyFit, limits: Limits) -> list[StarDifference]:
     flux_error, place_error_px = fit.templates.errors(fit.flux, PIXEL_ERROR)
     limit_mag = np.maximum(MAG_PER_RELATIVE * flux_error / fit.flux, limits.flux_mag)
     limit_px = np.maximum(place_error_px, limits.centroid_px)
@@ -156,7 +156,7 @@ def _differences(seeds: Seeds, fit: _Fit, moved: _Fit, limits: Limits) -> list[S
     ]
 
 
-def _unexplained(light: FloatArray, fit: _Fit, moved: _Fit) -> tuple[FloatArray, FloatArray]:
+def _unexplained(light: FloatArray, fit: _SkyFit, moved: _SkyFit) -> tuple[FloatArray, FloatArray]:
     """Places (n, 2), px, and fluxes of stars in light that no star of either fit explains.
 
     A changed star is not exactly a Gaussian: its residual is under half of its change. A star off the image may be as bright as
@@ -171,7 +171,7 @@ def _unexplained(light: FloatArray, fit: _Fit, moved: _Fit) -> tuple[FloatArray,
     column, row = seeds.astype(np.intp).T
     return places, np.maximum(
         flux, light[row, column]
-    )  # of two at one place the fit may give one too much and the other less than 0
+    )  # two stars at one place: the fit may give one too much and the other less than 0
 
 
 def read_frame_fits(path: Path) -> FloatArray:
@@ -182,7 +182,7 @@ def read_frame_fits(path: Path) -> FloatArray:
     raw = _inflated(path, read_bytes(path, wanted, MAX_FITS_BYTES), wanted)
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of astropy, about cards; what matters is checked below
+            warnings.simplefilter("ignore")  # astropy warns about cards; what matters is checked below
             image, header = fits.getdata(io.BytesIO(raw), header=True)
     except Exception as error:  # astropy raises whatever a broken header causes in its layers
         raise InputError(f"{path}: not a FITS image; {wanted}") from error

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.text import Annotation
     from matplotlib.transforms import Bbox
 
-MAX_NAMES = 6  # of stars, in each panel; the table has all
+MAX_NAMES = 6  # stars named in each panel; the table has all
 MAX_TRIED = 60  # names that are tried for room
 ROOM_PX = 3.0  # between two names
 MIN_ERROR = 1e-8  # as drawn: a tenth of float32's rounding
@@ -44,7 +44,7 @@ def draw(path: Path, comparison: SkyComparison) -> None:
     with chart(path, said, 2, height_inch=7.4) as axes:
         names: list[list[Annotation]] = []
         for axis, what, unit in ((axes[0], "flux error", "mag"), (axes[1], "place error", "px")):
-            panel = Panel(comparison, unit)
+            panel = ChartPanel(comparison, unit)
             panel.draw(axis)
             names.append(panel.name_stars(axis))
             less = " beyond what is common" if panel.common else ""
@@ -54,7 +54,7 @@ def draw(path: Path, comparison: SkyComparison) -> None:
         _make_room(axes[0], names)
 
 
-class Panel:
+class ChartPanel:
     """Errors and limits of one kind; stars that only one image has are in rows above."""
 
     def __init__(self, comparison: SkyComparison, unit: str) -> None:

@@ -19,10 +19,10 @@ from hilstar.error_spread import ErrorSpread, error_spread
 from hilstar.errors import InputError
 from hilstar.units import magnitude
 
-MORE_STARS = 0.1  # of all: how many more stars a motion with more parameters has to explain
-ROUNDS = 40  # of reweighted least squares, which converge to the minimum sum of absolute residuals
+MORE_STARS = 0.1  # share of all stars that a motion with more parameters has to explain in addition
+ROUNDS = 40  # rounds of reweighted least squares, which converge to the minimum sum of absolute residuals
 FINEST_PX = 1e-4  # smaller residuals all weigh the same
-MIN_SHARE = 0.5  # of the median star's displacement, which a motion must explain
+MIN_SHARE = 0.5  # share of the median star's displacement that a motion must explain
 
 # Displacements (n, 2), px, of places (n, 2), px from the middle of the image.
 Motion = Callable[[FloatArray], FloatArray]

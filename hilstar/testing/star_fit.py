@@ -29,12 +29,12 @@ from hilstar.scene.psf import footprint_px
 RIPPLE_SHARE = 1e-5
 SIGMA_STARS = 30  # the brightest ones give the sigma; their median is no blend's
 SIGMA_STEPS = 12
-MAX_SIGMA_STEP = 0.3  # of sigma: Newton's step from a poor start stays a positive sigma
+MAX_SIGMA_STEP = 0.3  # largest relative step of sigma: Newton's step from a poor start stays positive
 MAX_PLACE_STEPS, MAX_STEP_PX, MIN_STEP_PX = 12, 1.0, 1e-5
 MAX_OFFSET_PX = 1.0  # a star lies within sqrt(1/2) px of the middle of its brightest pixel, unless a neighbour pulls it
 BEYOND_SIGMAS = 4.0  # ... and one whose brightest pixel is the image's first or last may be this far outside
 COLUMNS = (("share", "share"), ("share", "slope"), ("slope", "share"))  # along y and x: light, derivative by x, by y
-RIDGE = 1e-12  # of a unit column: two equal columns share the light, where the solver would otherwise fail
+RIDGE = 1e-12  # ridge on unit columns: two equal columns share the light, where the solver would otherwise fail
 # Two stars nearer than this are one blend: apart they would be known 10 times worse than alone (at 0.4 px; 5 at 0.85 px).
 BLEND_SIGMAS, BLEND_PX = 1.5, 1.25
 KNOWN_STARS = 20  # the brightest, at least half of which a truth table must have

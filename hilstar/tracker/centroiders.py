@@ -18,14 +18,14 @@ from hilstar.arrays import FloatArray, IntArray
 
 Centroider = Literal["moment", "window", "wide", "fit", "box3", "box5"]
 FAMILY: tuple[Centroider, ...] = get_args(Centroider)
-WIDE = 1.5  # of the star's sigma
+WIDE = 1.5  # in units of the star's sigma
 MIN_WINDOW_PX = 1.0  # a narrower one sees the one pixel that it stands on
 FIT_STEPS, WINDOW_STEPS = 8, 20
-FIRST_STEPS = 3  # of a window, before a fit
+FIRST_STEPS = 3  # steps with a window before a fit
 # A window as wide as the star moves the mean half of the way, one on a single pixel all of it: both come to rest by this.
 PACE = 1.5
 SETTLED_PX = 1e-6
-MAX_STEP_PX = 0.3  # of a fit: its model is nearly linear within that
+MAX_STEP_PX = 0.3  # largest step of a fit: its model is nearly linear within that
 BOX_SHARE = 0.02
 MIN_LIGHT = 1e-30
 
@@ -113,7 +113,7 @@ def _fit_step(seen: FloatArray, across: FloatArray, down: FloatArray, flux: Floa
     (xx, xd, dd), (yy, yd, ee) = (
         [np.einsum("ns,ns->n", part[:, i], part[:, j]) for i, j in ((0, 0), (0, 1), (1, 1))] for part in (across, down)
     )
-    one = flux * yy * xd, flux * yd * xx  # of the star with its slopes
+    one = flux * yy * xd, flux * yd * xx  # the star with its slopes
     normal = np.stack(
         [xx * yy, *one, one[0], flux**2 * yy * dd, flux**2 * yd * xd, one[1], flux**2 * yd * xd, flux**2 * ee * xx], axis=-1
     ).reshape(-1, 3, 3)

@@ -34,7 +34,7 @@ BLOCK_PX, NOISIER_PERCENT = 32, 90
 CLIPPED_SIGMA = 0.986578  # the sigma of a normal distribution cut at 3 sigma: sqrt(1 - 6 pdf(3) / (2 cdf(3) - 1))
 MIN_STEP_PX = 1e-7
 EIGHT_NEIGHBOURS = np.ones((3, 3), dtype=np.int8)
-# Of s^2, the share by which the window can narrow the star's second moment: Newton's step is at most 10 times the
+# Share of s^2 by which the window can narrow the star's second moment: Newton's step is at most 10 times the
 # plain one, so that noise in the moment cannot throw the centre out of the window.
 MIN_SLOPE = 0.1
 COUNTED_TYPES = (np.uint8, np.uint16)

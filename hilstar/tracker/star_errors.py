@@ -18,7 +18,7 @@ from hilstar.units import magnitude
 
 SQUARES_VARIANCE = 1 / 6  # a pixel's width twice: a star is sampled by squares, and shown by squares
 REACH_SIGMAS = 5.0
-BOX_SIDE = 9  # of tracker pixels: a box of 5, two to either side for its middle
+BOX_SIDE = 9  # tracker pixels: a box of 5, and two on either side for its centre
 # Pixels finer than this show windows and fits the same star: its sigma is 0.85 px and more.
 FINEST_PX = 0.5
 BOXES = ("box3", "box5")
@@ -172,7 +172,7 @@ def _collected(star_px: FloatArray, side: int, pixel_px: float, blur_px: float, 
     middles = star_px[:, None] + pixel_px * (np.arange(-half, half + 1) + phase[:, None])
     edges = np.arange(side + 1) - 0.5
     to_left, to_right = (middles[:, :, None] + way * pixel_px / 2 - edges for way in (-1, 1))
-    # Of a point's light blurred, the integral up to a place; and that integral's own over a monitor pixel.
+    # Cumulative light of a blurred point up to a place, and the integral of that over a monitor pixel.
     within = [_ramp(to, blur_px) for to in (to_left, to_right)]
     return -np.diff(within[1] - within[0], axis=-1)
 

@@ -20,7 +20,7 @@ from hilstar.twin.verify.star_finder import Matched, crowded, shared, star_finde
 from hilstar.twin.verify.twin import Field, Twin
 from hilstar.units import ARCSEC_PER_RAD
 
-MIN_STARS = 3  # of a solved attitude
+MIN_STARS = 3  # for a solved attitude
 WIDER = 1.5
 EDGE_PX = 1.5  # beyond the centroider's window
 
@@ -69,7 +69,7 @@ class _Head:
         if len(stars) < MIN_STARS:
             return None
         wanted = self._directions(seen.x_px[stars], seen.y_px[stars])
-        # Of linear light all stars are placed alike, of codes the better the brighter they are.
+        # Linear light places all stars alike; codes place bright stars better.
         alike, light = np.ones(len(stars)), seen.truth["electrons_per_s"][stars].astype(np.float64)
         linear, codes = (
             self._body(q_icrs_to_body, self._found(one, stars), wanted, weights)

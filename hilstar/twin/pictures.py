@@ -29,7 +29,7 @@ from hilstar.twin.faulty_exposure import FaultyExposure, Piece
 from hilstar.twin.simulator import Exposure, FrameNoise, Simulator, simulator_view
 
 BOX_PX = 5  # side of the square over which a star's light is summed: where the middle is full, the wings still grow
-MAX_RADIUS_PX = 8  # of the brightest star's disc
+MAX_RADIUS_PX = 8  # radius of the brightest star's disc
 # A disc's radius goes with this power of the star's share of the brightest: enough for a sum that saturates, in which five
 # magnitudes are only a factor of ten.
 RADIUS_POWER = 0.77

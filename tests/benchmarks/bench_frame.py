@@ -9,7 +9,7 @@ import argparse
 
 import numpy as np
 
-from hilstar.study.speed.benchmark import Plan, run
+from hilstar.study.speed.benchmark import BenchmarkPlan, run
 from hilstar.study.speed.report import REFERENCE_PX, lines
 
 
@@ -18,7 +18,7 @@ def main() -> None:
     parser.add_argument("--stars", type=int, default=1000)
     parser.add_argument("--rounds", type=int, default=300)
     options = parser.parse_args()
-    plan = Plan(sizes=(REFERENCE_PX,), counts=(options.stars,), rounds=options.rounds)
+    plan = BenchmarkPlan(sizes=(REFERENCE_PX,), counts=(options.stars,), rounds=options.rounds)
     print("\n".join(lines(run(plan, np.random.default_rng(1), lambda done: None))))
 
 

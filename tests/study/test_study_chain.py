@@ -16,10 +16,10 @@ from hilstar.bench.bench_file import bench_file_of
 from hilstar.errors import InputError
 from hilstar.render.reference import linear_image
 from hilstar.study.chain import choices, run
-from hilstar.study.chain.choices import Combination, Parts, Scene, five_scenes, lead_ns
-from hilstar.study.chain.measuring import Plan, SceneMeasurement, error_budget
-from hilstar.study.chain.run import NOT_JUDGED, Point, Row, beaters, front
-from hilstar.study.chain.tracker import MATCH_PX, Tracker, add_light, off, points
+from hilstar.study.chain.choices import ChainScene, Combination, Parts, five_scenes, lead_ns
+from hilstar.study.chain.measuring import Rounds, SceneMeasurement, error_budget
+from hilstar.study.chain.run import NOT_JUDGED, CombinationRow, Point, beaters, front
+from hilstar.study.chain.tracker import MATCH_PX, StudyTracker, add_light, off, points
 from hilstar.units import ARCSEC_PER_RAD, MAG_PER_RELATIVE, NS_PER_S
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.figures import assert_legible
@@ -42,7 +42,7 @@ focal_length_mm = 350
 [render]
 brightest_v_mag = 4
 """
-PLAN = Plan(exposures=1, time_s=0.05)
+PLAN = Rounds(exposures=1, time_s=0.05)
 # The centroider's own error for stars of sigma 1.05 px is 0.0012 px in the median (0.05 arcsec); a display's is ten times that.
 FLOOR_PX = 0.005
 # A long path's middle is its mean to the second order of the field: 1 deg/s over 0.1 s in a field of 3 degrees.
@@ -62,7 +62,7 @@ def small_file(folder: Path, text: str = SMALL):
 @pytest.fixture(scope="module")
 def parts(tmp_path_factory):
     with Parts(small_file(tmp_path_factory.mktemp("parts"))) as found:
-        tracker = Tracker(found.own)
+        tracker = StudyTracker(found.own)
         yield found, tracker
         tracker.close()
 
@@ -207,8 +207,8 @@ def test_a_long_exposure_is_said_to_be_measured_in_part(study, tmp_path):
     assert {row["exposure_s"] for row in table(out / "chain.csv")} == {"0.1"}
 
 
-def planted(**figures) -> Row:
-    known = {field.name: 1.0 for field in fields(Row)}
+def planted(**figures) -> CombinationRow:
+    known = {field.name: 1.0 for field in fields(CombinationRow)}
     words = {
         "scene": "s",
         "smear": "path",
@@ -218,7 +218,7 @@ def planted(**figures) -> Row:
         "chosen": "",
         "rate_deg_s": 0.0,
     }
-    return Row(**(known | words | {"on_front": "true", "on_front_mag": "true", "noise_ms": 0.01} | figures))
+    return CombinationRow(**(known | words | {"on_front": "true", "on_front_mag": "true", "noise_ms": 0.01} | figures))
 
 
 @pytest.mark.parametrize("place", [(0, 0), (-1, 0), (0, -1), (-1, -1)])
@@ -275,7 +275,7 @@ def test_a_directory_without_the_right_to_write_is_refused_before_the_study(tmp_
 
 
 def test_a_bench_of_which_no_star_stays_in_view_is_refused(parts, monkeypatch, tmp_path):
-    fast = Scene("300 deg/s", "no star stays", five_scenes(parts[0].own)[0].q_icrs_to_cam, 300.0)
+    fast = ChainScene("300 deg/s", "no star stays", five_scenes(parts[0].own)[0].q_icrs_to_cam, 300.0)
     monkeypatch.setattr(run, "five_scenes", lambda bench: (fast,))
     with pytest.raises(InputError, match="no star stands alone in view"):
         run.run(small_file(tmp_path), tmp_path, quick=True)

@@ -10,9 +10,9 @@ import pytest
 from matplotlib.figure import Figure
 
 from hilstar import charts
-from hilstar.study.economy import Comparison, Outcome, economy_finding
+from hilstar.study.economy import EffortComparison, EffortOutcome, economy_finding
 from hilstar.study.speed import report as benchmark_report
-from hilstar.study.speed.report import Machine, Result, Spread, Timing
+from hilstar.study.speed.report import Machine, MethodTiming, Result, Spread
 from hilstar.tracker.centroiders import FAMILY
 from hilstar.twin.budget import CENTROID_LIMIT_PX, FLUX_LIMITS_MAG, budget, write_report
 from tests.support.figures import assert_legible
@@ -129,8 +129,8 @@ def test_figures_of_an_axis_are_a_persons():
     assert [charts.capital(text) for text in ("rate [Hz]", "x [px]", "V [mag]")] == ["Rate [Hz]", "x [px]", "V [mag]"]
 
 
-def outcome(frame_ms: float, worst_mag: float = 0.01) -> Outcome:
-    return Outcome("a scene", "auto", "round", 10, frame_ms, worst_mag, 0.01, 5, 0.1, *[0.01] * len(FAMILY))
+def outcome(frame_ms: float, worst_mag: float = 0.01) -> EffortOutcome:
+    return EffortOutcome("a scene", "auto", "round", 10, frame_ms, worst_mag, 0.01, 5, 0.1, *[0.01] * len(FAMILY))
 
 
 @pytest.mark.parametrize(
@@ -145,12 +145,12 @@ def outcome(frame_ms: float, worst_mag: float = 0.01) -> Outcome:
     ],
 )
 def test_economy_says_longer_where_it_took_longer(times_ms, said):
-    comparisons = [Comparison(outcome(full), outcome(auto)) for full, auto in times_ms]
+    comparisons = [EffortComparison(outcome(full), outcome(auto)) for full, auto in times_ms]
     assert economy_finding(comparisons).endswith(said)
 
 
 def test_economy_does_not_call_within_tolerance_what_is_over_it():
-    assert economy_finding([Comparison(outcome(2.0), outcome(1.0, 0.5))]).endswith("1 of 1 scenes OVER tolerance")
+    assert economy_finding([EffortComparison(outcome(2.0), outcome(1.0, 0.5))]).endswith("1 of 1 scenes OVER tolerance")
 
 
 @pytest.mark.parametrize("sizes", [((1920, 1080),), ((640, 480), (1920, 1080))])
@@ -159,7 +159,7 @@ def test_the_legend_of_the_benchmark_is_whole(figures, tmp_path, sizes, methods)
     ours = [("hilstar", kind) for kind in ("whole_frame", "turning", "linear_only")]
     kinds = [*ours, *((method, "linear_only") for method in methods)]
     rows = [
-        Timing(w, h, stars, method, kind, Spread(median=1.0, min=0.9, max=1.2))
+        MethodTiming(w, h, stars, method, kind, Spread(median=1.0, min=0.9, max=1.2))
         for w, h in sizes
         for stars in (100, 1000)
         for method, kind in kinds

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from hilstar.charts import read_records
-from hilstar.study.prediction import LATENCIES_MS, RATES_HZ, USUAL_HZ, USUAL_MS, Outcome, Shaken, crossing_hz, run
+from hilstar.study.prediction import LATENCIES_MS, RATES_HZ, USUAL_HZ, USUAL_MS, PredictionOutcome, Shaken, crossing_hz, run
 from hilstar.study.predictors import SLEW_DEG, SLEW_S
 
 
@@ -24,7 +24,7 @@ def study(tmp_path_factory):
 @pytest.fixture(scope="module")
 def outcomes(study):
     with (study[0] / "prediction.csv").open() as file:
-        rows = [Outcome(**row) for row in csv.DictReader(file)]
+        rows = [PredictionOutcome(**row) for row in csv.DictReader(file)]
     kinds = {"method": str, "rate_hz": int, "latency_ms": int}
     typed = [replace(o, **{f.name: kinds.get(f.name, float)(getattr(o, f.name)) for f in fields(o)}) for o in rows]
     return {(o.method, o.rate_hz, o.latency_ms): o for o in typed}

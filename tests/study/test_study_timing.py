@@ -11,7 +11,17 @@ from PIL import Image
 from hilstar.run.sync.beat import ARCSEC_PER_DEG, Exposures, seen_at
 from hilstar.scene.frame_motion import Scan
 from hilstar.study import timing
-from hilstar.study.timing import QUICK_CASES, QUICK_RATES_DEG_S, WAYS, ScanningPanel, Sky, Slew, compare, frame_weights, measure
+from hilstar.study.timing import (
+    QUICK_CASES,
+    QUICK_RATES_DEG_S,
+    WAYS,
+    ScanningPanel,
+    Slew,
+    TimingSky,
+    compare,
+    frame_weights,
+    measure,
+)
 from tests.support.pictures import assert_drawn, table
 
 GAIN = 20  # compensated against not: the issue's own figure
@@ -63,7 +73,7 @@ def test_each_step_takes_away_what_physics_says_it_should(outcomes):
 def test_a_scan_that_is_assumed_wrong_is_seen(tmp_path, outcomes, wrong):
     panel = ScanningPanel("+ smear", tmp_path / "bench.toml")
     panel.bench = replace(panel.bench, scan=replace(panel.bench.scan, **wrong))
-    sky = Sky(panel)
+    sky = TimingSky(panel)
     try:
         outcome = compare(panel, sky, Slew(RATE_DEG_S))
     finally:

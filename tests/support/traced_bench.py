@@ -10,7 +10,7 @@ from hilstar.arrays import FloatArray
 from hilstar.calibrate.geometric.dots import DotPlan
 from hilstar.calibrate.geometric.observed import Observed
 from hilstar.scene.camera import Camera
-from hilstar.study.geometry import Faults, TracedBench, turned
+from hilstar.study.geometry import DotFaults, TracedBench, turned
 from hilstar.study.geometry import observed_dots as dots_seen
 
 __all__ = ["TracedBench", "observed_dots", "turned"]
@@ -30,5 +30,5 @@ def observed_dots(
     """What a tracker, turned by `pose_matrix`, sees of a plan's dots: a share lost, as many false ones, Gaussian noise."""
     directions = bench.directions(plan.x_px, plan.y_px)
     x, y = tracker.project(directions if pose_matrix is None else directions @ pose_matrix.T)
-    seen = dots_seen(plan, x, y, tracker.resolution_px, Faults(noise_px, lost, false), rng)
+    seen = dots_seen(plan, x, y, tracker.resolution_px, DotFaults(noise_px, lost, false), rng)
     return replace(seen, pose=np.full(len(seen), pose))

@@ -35,13 +35,13 @@ from hilstar.units import LIGHT_KM_S, flux_ratio
 
 Law = Literal["uniform", "lambert", "lunar-lambert", "limb-darkened"]
 SOLAR_LIMB = (0.30, 0.93, -0.23)
-# Of the Moon by phase, degrees: McEwen 1996, Lunar Planet. Sci. 27, 841; within 0 and 1 beyond where it was fitted.
+# The Moon by phase, degrees: McEwen 1996, Lunar Planet. Sci. 27, 841; clipped to 0 and 1 beyond the fitted range.
 LUNAR_SHARE = (1.0, -0.019, 2.42e-4, -1.46e-6)
 QUADRATURE = 40  # Gauss-Legendre nodes along each axis of the lit face: 1e-5 of the flux, tests/unit/sky/bodies/test_disc.py
 AIR_TOP = 20.0  # scale heights over the limb: beyond, the Earth's air is 1e-8 deep along the ray, which no code shows
 EARTH = "Earth"
 EQUATOR_KM, POLAR_KM = 6378.1366, 6356.7519  # IERS Conventions 2010, table 1.1
-MEAN_KM = math.sqrt(EQUATOR_KM * POLAR_KM)  # of the outline seen from the equator
+MEAN_KM = math.sqrt(EQUATOR_KM * POLAR_KM)  # mean radius of the outline seen from the equator
 # Equatorial, Archinal et al. 2018 and, the Sun's, IAU 2015 Resolution B3
 RADII_KM = {
     "Sun": 695_700.0,
@@ -244,7 +244,7 @@ class Disc:
         reach = np.arccos(np.minimum(1.0, 1 / (self.distance_radii * np.cos(latitude))))
         first = -reach
         if self.law in ("lambert", "lunar-lambert"):
-            sun = np.arctan2(self.sun_sphere[0], -self.sun_sphere[2])  # of longitude; x is the Sun's side, -z the observer's
+            sun = np.arctan2(self.sun_sphere[0], -self.sun_sphere[2])  # Sun's longitude; +x is its side, -z the observer's
             first = np.clip(sun - np.pi / 2, -reach, reach)
         half = (reach - first) / 2
         longitude = first[:, None] + half[:, None] * (node + 1)

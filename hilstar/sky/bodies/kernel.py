@@ -41,7 +41,7 @@ CHAINS: dict[str, tuple[tuple[int, int], ...]] = {
     "Uranus": ((0, 7),),
     "Neptune": ((0, 8),),
 }
-LIGHT_TIME_ROUNDS = 3  # of a fixed point that gains a factor of 1e4 (speed over that of light) a round
+LIGHT_TIME_ROUNDS = 3  # each fixed-point round gains a factor of 1e4 (light's speed over the body's)
 SUN_MASSES = 1.0
 MAS_PER_DEG = 3_600_000.0
 # ERFA's own at 1 au (`ldsun`), 4 arcmin from the Sun's centre: within its disc the formula has no meaning.

@@ -146,7 +146,7 @@ def reflected(names: tuple[str, ...]) -> Library:
     stars = load_library()
     sunlight = stars.flux[stars.spectral_type.index(SUNLIGHT)]
     lit = [sunlight * albedo(name, stars.wavelength_nm) for name in names]
-    flux = np.array(lit).reshape(len(names), len(stars.wavelength_nm))  # of no bodies too
+    flux = np.array(lit).reshape(len(names), len(stars.wavelength_nm))  # also without bodies
     colour = bodies_bv_mag(names)
     unscaled = Library(stars.wavelength_nm, flux, names, colour, np.full(len(names), np.nan))
     mean = band_mean(unscaled, load_curve("johnson-v", "johnson-v"))

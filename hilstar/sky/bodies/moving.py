@@ -34,7 +34,7 @@ from hilstar.sky.bodies.disc import (
 from hilstar.sky.bodies.kernel import DAY_S, Kernel, Viewpoint, apparent_bodies, apparent_stars, tdb_of_utc
 from hilstar.sky.bodies.light import SUN_BV_MAG, body_v_mag, phase_angle_deg
 from hilstar.sky.bodies.orbit import Orbit
-from hilstar.sky.bodies.passes import Circumstances, Cone, Pass, Satellites, Sky
+from hilstar.sky.bodies.passes import Circumstances, Cone, Pass, Satellites, SkyAt
 from hilstar.sky.stars import Stars, aberrate, with_bodies
 from hilstar.units import ARCSEC_PER_RAD, LIGHT_KM_S, NS_PER_S, flux_ratio
 
@@ -178,7 +178,7 @@ class MovingSky:
             return None
         since_ns = self._within(t_ns)
         now = partial(self._circumstances, since_ns // MINUTE_NS)
-        return self.satellites.near(cone, Sky(self._utc_ns + since_ns, now, self._fixed_km_s, *velocity_and_place))
+        return self.satellites.near(cone, SkyAt(self._utc_ns + since_ns, now, self._fixed_km_s, *velocity_and_place))
 
     def satellites_placed(self, t_ns: int | None) -> int:
         """How many of the satellites have a place by their elements at a moment."""

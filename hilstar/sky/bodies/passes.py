@@ -28,7 +28,7 @@ from hilstar.units import LIGHT_KM_S, NS_PER_S, magnitude
 log = logging.getLogger(__name__)
 
 EARTH_GM_KM3_S2 = 398_600.4418  # IERS Conventions 2010
-FASTEST_KM_S = 11.2  # of what stays about the Earth
+FASTEST_KM_S = 11.2  # escape speed: whatever stays about the Earth is slower
 OWN_KM = 5.0  # what is nearer is taken for the observer itself; elements are off by 1 to 3 km a day
 OLD_DAYS = 14.0
 # Those that can come near the axis within this time, or before it turns by this angle, are looked for at once: 1 ms for 20 000.
@@ -37,7 +37,7 @@ COS_WATCH = np.cos(WATCH_RAD)
 HIDDEN_KM = 1.0  # in 3 s an arc is 40 m off a straight line
 JUMP_KM = 10.0  # an observer that is elsewhere by more has jumped
 MOST_SUN = 1.04  # sunlight over that at 1 au: the Earth is at most 1.7 % nearer
-STEEPEST_PHASE = 1.82  # of the phase factor, per radian
+STEEPEST_PHASE = 1.82  # steepest slope of the phase factor, per radian
 SHIFT_RAD = 4e-4  # aberration of what the Earth's motion shifts, and light time
 
 
@@ -50,7 +50,7 @@ class Circumstances:
 
 
 @dataclass(frozen=True, slots=True)
-class Sky:
+class SkyAt:
     """What a sky knows of a moment: its UTC, the circumstances when they are asked for, what aberrates its bodies.
 
     `place_km` and `velocity_km_s` (3,) are the observer's about the Earth where the orbit does not say it, else None.
@@ -164,7 +164,7 @@ class Satellites:
     def __len__(self) -> int:
         return len(self.names)
 
-    def near(self, cone: Cone, sky: Sky) -> Pass | None:
+    def near(self, cone: Cone, sky: SkyAt) -> Pass | None:
         """Those in a cone at a moment, and some more; None for none."""
         self.place(sky.utc_ns)
         observer = self._observer(sky)
@@ -183,7 +183,7 @@ class Satellites:
         since_s = (sky.utc_ns - self._zero_ns) / NS_PER_S
         return Pass(which, self.brightness, seen, place, observer, since_s, now, sky.fixed_km_s)
 
-    def _observer(self, sky: Sky) -> FloatArray:
+    def _observer(self, sky: SkyAt) -> FloatArray:
         """The cubic (4, 3) of the observer's places about the Earth, seconds after the moment."""
         place_km, velocity_km_s = self._orbit.state(sky.utc_ns)
         if sky.place_km is not None:
@@ -191,14 +191,14 @@ class Satellites:
             velocity_km_s = velocity_km_s if sky.velocity_km_s is None else velocity_km_s + sky.velocity_km_s
         return _falling(place_km, velocity_km_s)
 
-    def _watched(self, cone: Cone, sky: Sky, observer: FloatArray) -> IntArray:
+    def _watched(self, cone: Cone, sky: SkyAt, observer: FloatArray) -> IntArray:
         """Those that can be in a cone, by the list that is kept for a while."""
         watch = self._watch
         if watch is None or not watch.covers(cone, sky.utc_ns, observer[0]):
             self._watch = watch = _Watch(cone, sky.utc_ns, observer, self._search(cone, sky, observer))
         return watch.found
 
-    def _search(self, cone: Cone, sky: Sky, observer: FloatArray) -> IntArray:
+    def _search(self, cone: Cone, sky: SkyAt, observer: FloatArray) -> IntArray:
         seen = self._swarm.places_km(slice(None), sky.utc_ns) - observer[0]
         range_km = np.sqrt(np.einsum("ij,ij->i", seen, seen))
         self._tell_own(range_km)

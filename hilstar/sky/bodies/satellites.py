@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 LINE_LENGTH = 69  # with its checksum
 MAX_NAME = 24  # characters, as CelesTrak has them
 LIST_FORM = "give a list of two-line element sets, with name lines or without"
-# Of each line the columns (from 0) that are numbers, and what they are.
+# Numeric columns of each line (from 0), and what they hold.
 NUMBERS = {
     "1": {"epoch's year": (18, 20), "epoch's day": (20, 32), "first derivative of the mean motion": (33, 43)},
     "2": {

@@ -39,7 +39,7 @@ Prediction = Literal["held", "rate", "two samples"]
 PREDICTIONS: tuple[Prediction, ...] = ("rate", "two samples", "held")
 AXIS = np.array([0.6, 0.8, 0.0])  # across rows and columns
 PACKET_HZ = 100
-KEPT = 4  # of the newest samples
+KEPT = 4  # newest samples kept
 Sprite = Literal["full", "cut", "coarse"]
 Smear = Literal["path", "point"]
 QUANTISATIONS: tuple[Quantisation, ...] = ("round", "dither", "temporal", "exact")
@@ -48,10 +48,10 @@ COARSER = 10.0
 SHALLOWER_MAG = 1.0
 FIELDS = 200
 SEED = 1
-ENOUGH = 0.5  # of an average field's stars, for the faint field
+ENOUGH = 0.5  # a faint field has at most this share of an average field's stars
 # The pixels that a frame lights, as places in its flattened image (n,), and the light of each, electrons per second.
 Lit = tuple[IntArray, FloatArray]
-START_S = 0.0037  # of the exposure after a frame's first light, within a refresh
+START_S = 0.0037  # exposure start after a frame's first light, within a refresh
 MAX_FRAMES = 16
 DEG_PER_RAD = math.degrees(1.0)
 OWN = {"effort": "auto", "quantisation": "auto"}
@@ -153,7 +153,7 @@ def combinations(turns: bool, can_steal_bits: bool, faintest_v_mag: float) -> li
 
 
 @dataclass(frozen=True, slots=True)
-class Scene:
+class ChainScene:
     """A field and how fast it is crossed, and why it is one of the five."""
 
     name: str
@@ -162,7 +162,7 @@ class Scene:
     rate_deg_s: float = 0.0
 
 
-def five_scenes(bench: Bench) -> tuple[Scene, ...]:
+def five_scenes(bench: Bench) -> tuple[ChainScene, ...]:
     """The scenes for a bench, by FIELDS random fields of its sky. Raises InputError where it has no stars."""
     fields = normalise(np.random.default_rng(SEED).normal(size=(FIELDS, 4)))
     seen = [bench.sprites(q).data["electrons_per_s"] for q in fields]
@@ -174,16 +174,16 @@ def five_scenes(bench: Bench) -> tuple[Scene, ...]:
     brightest = np.array([rates.max() if len(rates) >= ENOUGH * typical else np.inf for rates in seen])
     faint, dense = fields[np.argmin(brightest)], fields[np.argmax(counts)]
     return (
-        Scene("average field", "what most frames are", average),
-        Scene("dense field", "the most stars: time", dense),
-        Scene("faint field", "no bright star: codes have the fewest steps", faint),
-        Scene("1 deg/s", "a slow turn: prediction and paths begin to matter", average, 1.0),
-        Scene("10 deg/s", "a fast slew: each star is a long path", average, 10.0),
+        ChainScene("average field", "what most frames are", average),
+        ChainScene("dense field", "the most stars: time", dense),
+        ChainScene("faint field", "no bright star: codes have the fewest steps", faint),
+        ChainScene("1 deg/s", "a slow turn: prediction and paths begin to matter", average, 1.0),
+        ChainScene("10 deg/s", "a fast slew: each star is a long path", average, 10.0),
     )
 
 
 @dataclass(frozen=True, slots=True)
-class Exposure:
+class PanelExposure:
     """An exposure before a panel: its begin and length, and the frames in it by number and moment of light, ns.
 
     `weights` (frames, H, 1), of a panel that is turned (frames, 1, W), are what each row of a frame's light is multiplied by.
@@ -228,7 +228,7 @@ def shortened_line(bench: Bench) -> str | None:
     return f"exposures of {MAX_FRAMES} refreshes, {measured_s:.3g} s, in the place of [tracker] exposure_s = {whole_s:g}"
 
 
-def exposure(bench: Bench, first_frame: int) -> Exposure:
+def exposure(bench: Bench, first_frame: int) -> PanelExposure:
     """An exposure that begins START_S after the first light of a frame's middle row."""
     period_s, length_s, scan = 1 / bench.config.monitor.refresh_hz, exposure_s(bench), bench.scan
     begin_s = first_frame * period_s + START_S % period_s
@@ -238,7 +238,7 @@ def exposure(bench: Bench, first_frame: int) -> Exposure:
     weights = np.stack([row_share(number * period_s + late_s, scan, period_s, (begin_s, length_s)) for number in numbers])
     used = [bool(weight.any()) for weight in weights]
     kept = tuple(number for number, is_used in zip(numbers, used, strict=True) if is_used)
-    return Exposure(begin_s, length_s, kept, tuple(round(n * period_s * NS_PER_S) for n in kept), weights[used])
+    return PanelExposure(begin_s, length_s, kept, tuple(round(n * period_s * NS_PER_S) for n in kept), weights[used])
 
 
 def row_delays_s(scan: Scan, resolution_px: tuple[int, int]) -> FloatArray:

@@ -23,28 +23,28 @@ from hilstar.scene.frame_motion import Turn, swept_sprites
 from hilstar.scene.sprites import Sprites, make_sprites
 from hilstar.sky.stars import Stars
 from hilstar.study.chain.choices import (
+    ChainScene,
     Combination,
-    Exposure,
     Lit,
     Marks,
     Movement,
+    PanelExposure,
     Parts,
-    Scene,
     attitude_at,
     combinations,
     exposure,
     filled_timeline,
     lead_ns,
 )
-from hilstar.study.chain.tracker import Judge, Measured, Off, Tracker, attitude_off_arcsec, linear_light, off
+from hilstar.study.chain.tracker import MeasuredStars, Off, StarJudge, StudyTracker, attitude_off_arcsec, linear_light, off
 from hilstar.units import ERROR_OF_MEDIAN, NS_PER_S
 
 STAGES = ("prediction", "sprites", "drawing and codes", "read-back")
 # Each frame that is timed has an attitude of its own, as a sender's have: nothing can be kept from the frame before.
 NUDGE_RAD = np.array([1e-7, 1e-7, 0.0])
-FIRST_FRAMES = (20, 151, 325)  # of the exposures: apart by no whole number of cycles of `temporal` or of the jitter
-PHASE_STEP_PX = (3.37, 4.71)  # of the tracker, from exposure to exposure
-SIGMAS_IN_IQR = 1.349  # of a normal distribution
+FIRST_FRAMES = (20, 151, 325)  # first frames of the exposures: no whole number of cycles of `temporal` or of the jitter apart
+PHASE_STEP_PX = (3.37, 4.71)  # tracker pixels, from exposure to exposure
+SIGMAS_IN_IQR = 1.349  # normal distribution
 FRAMES_A_VISIT = 2
 MIN_ROUNDS, MAX_ROUNDS = 4, 60
 SEED = 1
@@ -53,7 +53,7 @@ RSS, WHOLE = "rss", "whole"
 
 
 @dataclass(frozen=True, slots=True)
-class Chain:
+class DrawingChain:
     """A combination on its bench, before a moving sky."""
 
     combination: Combination
@@ -82,7 +82,7 @@ class Chain:
         light = panel.response.light[levels[place]] * panel.flux_at_white_e_per_s
         return place, light if panel.uniformity is None else light * panel.uniformity.ravel()[place]
 
-    def exposed(self, seen: Exposure) -> FloatArray:
+    def exposed(self, seen: PanelExposure) -> FloatArray:
         """The mean light (H, W) over an exposure; one frame of a sky at rest stands for all that are like it."""
         alike = not self.movement.turns and self.combination.quantisation != "temporal"
         return (seen.at_rest if alike else seen.mean)(self.lit, self.bench.camera.resolution_px)
@@ -91,7 +91,7 @@ class Chain:
 class Stopwatch:
     """Times a chain's frames one after the other, from the samples to the codes in memory."""
 
-    def __init__(self, chain: Chain) -> None:
+    def __init__(self, chain: DrawingChain) -> None:
         self._chain = chain
         self._lead_ns = lead_ns(chain.bench.config)
         self._period_ns = round(NS_PER_S / chain.bench.config.monitor.refresh_hz)
@@ -136,14 +136,14 @@ class Stopwatch:
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class Rounds:
     """How many exposures each combination is judged by, and for how long a scene's combinations are timed, s."""
 
     exposures: int = len(FIRST_FRAMES)
     time_s: float = 12.0
 
 
-QUICK = Plan(exposures=1, time_s=2.0)
+QUICK = Rounds(exposures=1, time_s=2.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,7 +178,7 @@ class StageTime:
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class CombinationOutcome:
     """A combination as measured."""
 
     combination: Combination
@@ -190,7 +190,7 @@ class Outcome:
 class SceneMeasurement:
     """A scene on a study's benches: what is judged in it, and its combinations."""
 
-    def __init__(self, parts: Parts, tracker: Tracker, scene: Scene, plan: Plan) -> None:
+    def __init__(self, parts: Parts, tracker: StudyTracker, scene: ChainScene, plan: Rounds) -> None:
         self.parts, self.tracker, self.scene, self.plan = parts, tracker, scene, plan
         self.movement = Movement(scene.q_icrs_to_cam, scene.rate_deg_s)
         self.marks: Marks = parts.marks(self.movement)
@@ -198,7 +198,7 @@ class SceneMeasurement:
         marked = (self.marks.default, self.marks.auto, self.marks.as_filed)
         self.combinations = list(dict.fromkeys([*found, *marked]))
         self.judges = [
-            Judge(tracker, self._moved(k), exposure(parts.own, number))
+            StarJudge(tracker, self._moved(k), exposure(parts.own, number))
             for k, number in enumerate(FIRST_FRAMES[: plan.exposures])
         ]
 
@@ -207,9 +207,9 @@ class SceneMeasurement:
         """The stars that are judged, over all exposures."""
         return sum(len(judge) for judge in self.judges)
 
-    def chain(self, combination: Combination, exposure_number: int = 0) -> Chain:
+    def chain(self, combination: Combination, exposure_number: int = 0) -> DrawingChain:
         """A combination, ready to draw what an exposure sees."""
-        return Chain(combination, self.parts.bench(combination), self.judges[exposure_number].movement)
+        return DrawingChain(combination, self.parts.bench(combination), self.judges[exposure_number].movement)
 
     def _moved(self, number: int) -> Movement:
         """The movement that an exposure sees: at rest each has its stars at other sub-pixel phases."""
@@ -218,12 +218,12 @@ class SceneMeasurement:
         step_rad = np.array([*PHASE_STEP_PX, 0.0]) / self.tracker.camera.focal_length_px
         return replace(self.movement, q_icrs_to_cam=propagate(self.movement.q_icrs_to_cam, step_rad, number))
 
-    def outcomes(self) -> tuple[list[Outcome], list[StageTime]]:
+    def outcomes(self) -> tuple[list[CombinationOutcome], list[StageTime]]:
         """Every combination's error and time, and what the stages of `auto` take."""
         chains = [self.chain(combination) for combination in self.combinations]
         times, stages = timed(chains, self.plan.time_s, self.combinations.index(self.marks.auto))
         found = [
-            Outcome(chain.combination, sprite_px(chain), self.error(chain.combination), spent)
+            CombinationOutcome(chain.combination, sprite_px(chain), self.error(chain.combination), spent)
             for chain, spent in zip(chains, times, strict=True)
         ]
         return found, stages
@@ -253,14 +253,14 @@ def pooled(found: Sequence[Off]) -> tuple[float, float]:
     return math.sqrt(float(np.mean(arcsec**2))), math.sqrt(float(np.mean(mag**2)))
 
 
-def sprite_px(chain: Chain) -> str:
+def sprite_px(chain: DrawingChain) -> str:
     """The sides of a chain's sprites, px."""
     sides = [side.side_px for side in chain.bench.renderer.target.sides]
     low, high = min(sides, default=chain.bench.renderer.footprint_px), max(sides, default=chain.bench.renderer.footprint_px)
     return f"{low}" if low == high else f"{low} to {high}"
 
 
-def timed(chains: Sequence[Chain], time_s: float, staged: int) -> tuple[list[Times], list[StageTime]]:
+def timed(chains: Sequence[DrawingChain], time_s: float, staged: int) -> tuple[list[Times], list[StageTime]]:
     """The times of all chains, and those of the stages of one of them.
 
     In rounds, each with an order of its own, so that other load on the machine affects all. A visit's first frame is not
@@ -313,7 +313,7 @@ def error_budget(scene: SceneMeasurement, combination: Combination) -> list[Part
     return [*parts, Part(RSS, *rss), Part(WHOLE, *whole)]
 
 
-def _measured(scene: SceneMeasurement, combination: Combination, number: int) -> Iterator[Measured]:
+def _measured(scene: SceneMeasurement, combination: Combination, number: int) -> Iterator[MeasuredStars]:
     """The stars of an exposure after each of STEPS."""
     judge = scene.judges[number]
     for light in _lights(scene, combination, number):

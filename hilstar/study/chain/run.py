@@ -34,8 +34,18 @@ from hilstar.charts import (
 from hilstar.errors import InputError
 from hilstar.files import make_directory
 from hilstar.study.chain.choices import QUANTISATIONS, Parts, five_scenes, shortened_line
-from hilstar.study.chain.measuring import QUICK, RSS, WHOLE, Outcome, Part, Plan, SceneMeasurement, StageTime, error_budget
-from hilstar.study.chain.tracker import Tracker
+from hilstar.study.chain.measuring import (
+    QUICK,
+    RSS,
+    WHOLE,
+    CombinationOutcome,
+    Part,
+    Rounds,
+    SceneMeasurement,
+    StageTime,
+    error_budget,
+)
+from hilstar.study.chain.tracker import StudyTracker
 from hilstar.study.settings import OtherWork, busy_line, is_busy
 
 if TYPE_CHECKING:
@@ -47,8 +57,8 @@ MAX_REASONS = 2
 NOT_JUDGED = "the times were taken on a busy machine: no combination is named the faster"
 COLOURS: dict[str, str] = dict(zip(QUANTISATIONS, (PURPLE, ORANGE, GREEN, BLUE), strict=True))
 PANEL_INCH, BARS_INCH, TITLE_INCH = 2.7, 1.5, 1.2
-FLOOR_SHARE = 1e-3  # of the smallest error: what is 0 has a place on a logarithmic axis
-LESS = 0.9  # of the error of the one that was named last: what is worth a name on the front
+FLOOR_SHARE = 1e-3  # share of the smallest error at which 0 is drawn on a logarithmic axis
+LESS = 0.9  # a point on the front is named if its error is below this share of the last named one's
 ALIKE = 1.5  # scenes of one rate are drawn once where auto's error differs by less than this factor
 WORDS = {"refresh": "panel's refresh", "codes": "quantisation", "sprites": "cut sprites", WHOLE: "all of it"}
 CHOSEN = {DEFAULT: INK, AUTO: RED}
@@ -100,7 +110,7 @@ def beaters(points: Sequence[Point], which: int) -> tuple[list[int], list[int]]:
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class CombinationRow:
     """A combination in a scene; its fields are the columns of `chain.csv`.
 
     `exposure_s` is what is measured of the tracker's exposure. `error_arcsec`, `error_mag`: rms over the `stars` of all
@@ -169,7 +179,7 @@ def rounded(value: float) -> float:
     return float(f"{value:.{DIGITS}g}") if math.isfinite(value) else value
 
 
-def rows_of(scene: SceneMeasurement, outcomes: Sequence[Outcome]) -> list[Row]:
+def rows_of(scene: SceneMeasurement, outcomes: Sequence[CombinationOutcome]) -> list[CombinationRow]:
     """The rows of a scene, the fastest first."""
     rows = sorted((_row(scene, one) for one in outcomes), key=lambda row: (row.time_ms, row.error_arcsec))
     by_arcsec, by_mag = (front(points(rows, name)) for name in ("error_arcsec", "error_mag"))
@@ -181,23 +191,23 @@ def rows_of(scene: SceneMeasurement, outcomes: Sequence[Outcome]) -> list[Row]:
     ]
 
 
-def points(rows: Sequence[Row], error: str) -> list[Point]:
+def points(rows: Sequence[CombinationRow], error: str) -> list[Point]:
     """The rows as points, by `error_arcsec` or `error_mag`."""
     return [Point(row.time_ms, getattr(row, error), row.noise_ms) for row in rows]
 
 
-def auto_of(rows: Sequence[Row]) -> int:
+def auto_of(rows: Sequence[CombinationRow]) -> int:
     """The place of the row that `effort = "auto"` takes."""
     return next(k for k, row in enumerate(rows) if AUTO in row.chosen)
 
 
-def left_to_effort(row: Row, own: Row) -> bool:
+def left_to_effort(row: CombinationRow, own: CombinationRow) -> bool:
     """Whether a row has what the bench file and its sender say as `auto` has it."""
     given = ("bit_stealing", "faintest_v_mag", "prediction")
     return all(getattr(row, name) == getattr(own, name) for name in given)
 
 
-def beating(rows: Sequence[Row], as_filed: bool = False) -> tuple[list[Row], list[Row]]:
+def beating(rows: Sequence[CombinationRow], as_filed: bool = False) -> tuple[list[CombinationRow], list[CombinationRow]]:
     """The rows that beat `auto` by arcsec and time, beyond the noise and within it; only those that effort may choose."""
     own = rows[auto_of(rows)]
     kept = [row for row in rows if not as_filed or left_to_effort(row, own)]
@@ -205,7 +215,9 @@ def beating(rows: Sequence[Row], as_filed: bool = False) -> tuple[list[Row], lis
     return [kept[k] for k in beyond], [kept[k] for k in within]
 
 
-def write_tables(directory: Path, rows: Sequence[Row], budgets: Sequence[BudgetRow], stages: Sequence[StageRow]) -> None:
+def write_tables(
+    directory: Path, rows: Sequence[CombinationRow], budgets: Sequence[BudgetRow], stages: Sequence[StageRow]
+) -> None:
     """Write `chain.csv`, `chain_budget.csv` and `chain_time.csv`. Raises InputError."""
     for name, records in (("chain", rows), ("chain_budget", budgets), ("chain_time", stages)):
         write_records(directory / f"{name}.csv", records)
@@ -221,10 +233,10 @@ def stage_rows(scene: str, times: Sequence[StageTime]) -> list[StageRow]:
     return [StageRow(scene, AUTO, one.stage, round(one.ms, MS_PLACES)) for one in times]
 
 
-def _row(scene: SceneMeasurement, one: Outcome) -> Row:
+def _row(scene: SceneMeasurement, one: CombinationOutcome) -> CombinationRow:
     own, marks, error, times = one.combination, scene.marks, one.error, one.times
     marked = [name for name, at in ((DEFAULT, marks.default), (AUTO, marks.auto)) if own == at]
-    return Row(
+    return CombinationRow(
         scene=scene.scene.name,
         rate_deg_s=scene.scene.rate_deg_s,
         exposure_s=rounded(scene.judges[0].seen.length_s),
@@ -252,7 +264,9 @@ def _row(scene: SceneMeasurement, one: Outcome) -> Row:
     )
 
 
-def scene_line(rows: Sequence[Row], budget: Sequence[BudgetRow], stages: Sequence[StageRow], busy: bool = False) -> str:
+def scene_line(
+    rows: Sequence[CombinationRow], budget: Sequence[BudgetRow], stages: Sequence[StageRow], busy: bool = False
+) -> str:
     """What `auto` takes in a scene and is off by, whether it is on the front, and what its error and time are made of."""
     own, stands = rows[auto_of(rows)], NOT_JUDGED if busy else standing(rows)
     steps = [part for part in budget if part.step not in (RSS, WHOLE)]
@@ -265,7 +279,7 @@ def scene_line(rows: Sequence[Row], budget: Sequence[BudgetRow], stages: Sequenc
     )
 
 
-def headline(rows: Sequence[Row], busy: bool = False) -> str:
+def headline(rows: Sequence[CombinationRow], busy: bool = False) -> str:
     """What the whole table says of `auto`; nothing on a `busy` machine."""
     if busy:
         return f"The errors hold; {NOT_JUDGED}"
@@ -276,12 +290,12 @@ def headline(rows: Sequence[Row], busy: bool = False) -> str:
     return f'The choice of effort = "auto" is on the front of error against time, or within its noise, {where}{said}'
 
 
-def is_right(rows: Sequence[Row]) -> bool:
+def is_right(rows: Sequence[CombinationRow]) -> bool:
     """Whether `auto` is on the front of what effort may choose, or within the noise of it."""
     return not beating(rows, as_filed=True)[0]
 
 
-def standing(rows: Sequence[Row]) -> str:
+def standing(rows: Sequence[CombinationRow]) -> str:
     """Whether `auto` is on the front of all, or within the noise of it; else what beats it, why, and how it is without that."""
     beyond, within = beating(rows)
     own = rows[auto_of(rows)]
@@ -297,14 +311,14 @@ def standing(rows: Sequence[Row]) -> str:
     return f"{said}; on the front of what effort may choose{', within the noise' if beating(rows, as_filed=True)[1] else ''}"
 
 
-def words(row: Row) -> str:
+def words(row: CombinationRow) -> str:
     """A row's combination in a few words."""
     stealing = " with bit stealing" if row.bit_stealing == "true" else ""
     moving = f", {row.smear}s, {row.prediction}" if row.rate_deg_s else ""
     return f"{row.quantisation}{stealing}, {row.sprite} sprites{moving}"
 
 
-def why_not(own: Row, other: Row) -> str:
+def why_not(own: CombinationRow, other: CombinationRow) -> str:
     """Why `effort = "auto"` does not take what beats it."""
     reasons = []
     if other.bit_stealing != own.bit_stealing:
@@ -333,21 +347,21 @@ def why_not(own: Row, other: Row) -> str:
     return "; ".join(reasons)
 
 
-def _nearest(rows: Sequence[Row]) -> Row:
+def _nearest(rows: Sequence[CombinationRow]) -> CombinationRow:
     """Of what beats `auto`, that with the smallest error, and of these the fastest."""
     return min(rows, key=lambda row: (row.error_arcsec, row.time_ms))
 
 
-def _compared(own: Row, other: Row) -> str:
+def _compared(own: CombinationRow, other: CombinationRow) -> str:
     faster = own.time_ms - other.time_ms
     noise = (own.noise_ms**2 + other.noise_ms**2) ** 0.5
     return f"{words(other)} is {other.error_arcsec:.3g} arcsec off and {faster:.2g} ms faster (noise {noise:.2g} ms)"
 
 
-def differing(rows: Sequence[Row]) -> dict[str, list[str]]:
+def differing(rows: Sequence[CombinationRow]) -> dict[str, list[str]]:
     """The scenes to be drawn, each with those of its rate in which `auto` is as far off."""
     kept: dict[str, list[str]] = {}
-    autos: dict[str, Row] = {}
+    autos: dict[str, CombinationRow] = {}
     for scene in dict.fromkeys(row.scene for row in rows):
         mine = [row for row in rows if row.scene == scene]
         own = mine[auto_of(mine)]
@@ -363,7 +377,7 @@ def _alike(a: float, b: float) -> bool:
     return max(a, b) <= ALIKE * min(a, b)
 
 
-def draw(path: Path, rows: Sequence[Row], finding: str, machine: str) -> None:
+def draw(path: Path, rows: Sequence[CombinationRow], finding: str, machine: str) -> None:
     """Error against time, a panel for each scene that differs. Raises InputError where it cannot be written."""
     scenes = differing(rows)
     note = f"The line is the front: nothing else is as right and as fast. Pale: all other choices. {capital(machine)}."
@@ -376,7 +390,7 @@ def draw(path: Path, rows: Sequence[Row], finding: str, machine: str) -> None:
         grid[-1].set_xlabel("median time of a frame [ms]")
 
 
-def _scatter(axes: Axes, rows: Sequence[Row]) -> None:
+def _scatter(axes: Axes, rows: Sequence[CombinationRow]) -> None:
     floor = FLOOR_SHARE * min((row.error_arcsec for row in rows if row.error_arcsec > 0), default=1.0)
     at = [(row.time_ms, max(row.error_arcsec, floor)) for row in rows]
     front = [(row, place) for row, place in zip(rows, at, strict=True) if row.on_front == "true"]
@@ -412,14 +426,14 @@ def _scatter(axes: Axes, rows: Sequence[Row]) -> None:
     name_at_side(axes, named)
 
 
-def short_words(row: Row, own: Row) -> str:
+def short_words(row: CombinationRow, own: CombinationRow) -> str:
     """A row's combination where its sprites go without saying, and its depth where it is that of `own`."""
     shallow = ", fewer stars" if row.faintest_v_mag < own.faintest_v_mag else ""
     moving = f", {row.smear}s by {row.prediction}".replace("by held", "held") if row.rate_deg_s else ""
     return f"{row.quantisation}{' + bit stealing' if row.bit_stealing == 'true' else ''}{moving}{shallow}"
 
 
-def draw_budget(path: Path, rows: Sequence[Row], budget: Sequence[BudgetRow], stages: Sequence[StageRow]) -> None:
+def draw_budget(path: Path, rows: Sequence[CombinationRow], budget: Sequence[BudgetRow], stages: Sequence[StageRow]) -> None:
     """Where `auto`'s error and time come from, a row of panels for each scene that differs. Raises InputError."""
     scenes = differing(rows)
     last = list(scenes)[-1]
@@ -472,15 +486,15 @@ def run(
     A line for each scene, and whether `auto` is on the front of all, or within the noise of it: None on a busy machine.
     `advance` hears how many scenes are done. Raises InputError, MachineError.
     """
-    rows: list[Row] = []
+    rows: list[CombinationRow] = []
     budget: list[BudgetRow] = []
     stages: list[StageRow] = []
     lines, judged, others = [], [], OtherWork()
     with Parts(file) as parts:
-        tracker = Tracker(parts.own)
+        tracker = StudyTracker(parts.own)
         try:
             for number, scene in enumerate(five_scenes(parts.own)):
-                measurement = SceneMeasurement(parts, tracker, scene, QUICK if quick else Plan())
+                measurement = SceneMeasurement(parts, tracker, scene, QUICK if quick else Rounds())
                 if not measurement.star_count:
                     lines.append(f"{scene.name}: not measured: no star stands alone and stays in view over the exposure")
                     continue

@@ -19,7 +19,7 @@ from hilstar.rotation import to_matrix
 from hilstar.scene.camera import Camera
 from hilstar.scene.psf import peak_share, pixel_shares
 from hilstar.scene.sprites import Sprites, make_sprites
-from hilstar.study.chain.choices import PACKET_HZ, Exposure, Lit, Movement, lead_ns
+from hilstar.study.chain.choices import PACKET_HZ, Lit, Movement, PanelExposure, lead_ns
 from hilstar.twin.optics import BenchGeometry, TwinOptics
 from hilstar.twin.verify.star_finder import MATCH_PX, Matched, StarFinder, crowded, seen_sigma_px, shared, star_finder
 from hilstar.units import ARCSEC_PER_RAD, MAG_PER_RELATIVE, NS_PER_S, magnitude
@@ -29,10 +29,10 @@ from hilstar.units import ARCSEC_PER_RAD, MAG_PER_RELATIVE, NS_PER_S, magnitude
 NODES_PER_SIGMA, MIN_NODES = 1.02, 24
 SPRITES_AT_ONCE = 20_000
 REACH_SIGMAS = 4.0
-LOST_SHARE = 0.1  # of a star's light: with less of it in its pixels it is lost
+LOST_SHARE = 0.1  # a star with a smaller share of its light in its pixels is lost
 LOST_MAG = MAG_PER_RELATIVE  # a lost star's flux is off by all of it
 PATH_STEP_PX = 0.5
-OTHERS_SHARE = 1e-3  # of a star's light, that others bring to its path: 50 px from its middle it moves that by 0.05 px
+OTHERS_SHARE = 1e-3  # limit for others' light on a star's path, as a share of its own: at 50 px it moves the centre by 0.05 px
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +43,7 @@ class Instants:
     share: FloatArray
 
 
-def instants(bench: Bench, movement: Movement, seen: Exposure) -> Instants:
+def instants(bench: Bench, movement: Movement, seen: PanelExposure) -> Instants:
     """So many that every star's path is exact; one at rest."""
     if not movement.turns:
         return Instants((seen.middle_ns(),), np.ones(1))
@@ -96,7 +96,7 @@ def add_light(image: FloatArray, sprites: Sprites, sigma_px: tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True)
-class Measured:
+class MeasuredStars:
     """The judged stars (n,) of one exposure: unit directions (n, 3) in cam, NaN where lost, and light, electrons."""
 
     directions: FloatArray
@@ -117,7 +117,7 @@ class Off:
     lost: BoolArray
 
 
-class Tracker:
+class StudyTracker:
     """A bench's virtual tracker. Free it with `close`."""
 
     def __init__(self, bench: Bench) -> None:
@@ -132,7 +132,7 @@ class Tracker:
         self.monitor_px_per_px = scale
         self.arcsec_per_px = ARCSEC_PER_RAD / self.camera.scales_px_rad()[1]
 
-    def image_e(self, light_e_per_s: FloatArray, seen: Exposure) -> FloatArray:
+    def image_e(self, light_e_per_s: FloatArray, seen: PanelExposure) -> FloatArray:
         """Electrons (h, w) of an exposure to the mean light of a monitor (H, W)."""
         return self.optics.image_e_per_s(light_e_per_s) * seen.length_s
 
@@ -141,10 +141,10 @@ class Tracker:
         self.optics.close()
 
 
-class Judge:
+class StarJudge:
     """One exposure of a scene: its stars that stand alone, and what the tracker measures of them in the sky itself."""
 
-    def __init__(self, tracker: Tracker, movement: Movement, seen: Exposure) -> None:
+    def __init__(self, tracker: StudyTracker, movement: Movement, seen: PanelExposure) -> None:
         self.tracker, self.movement, self.seen = tracker, movement, seen
         bench = tracker.bench
         q = movement.at(seen.middle_ns())
@@ -155,7 +155,7 @@ class Judge:
         self.true = bench.stars.directions(self._star) @ to_matrix(q).T
         self._x_px, self._y_px = tracker.camera.project(self.true @ tracker.camera.cam_to_image.T)
         self.judged = np.zeros(0, dtype=np.intp)
-        self.sky = Measured(np.zeros((0, 3)), np.zeros(0))
+        self.sky = MeasuredStars(np.zeros((0, 3)), np.zeros(0))
         self.lost_arcsec = max(MATCH_PX, self._path_px) * tracker.arcsec_per_px
         places_px = self._paths() if movement.turns else (self._x_px, self._y_px)
         inside = np.atleast_2d(self._inside(*places_px, self._margin_px())).all(axis=0)
@@ -172,7 +172,7 @@ class Judge:
     def __len__(self) -> int:
         return len(self.judged)
 
-    def measure(self, image_e: FloatArray) -> Measured:
+    def measure(self, image_e: FloatArray) -> MeasuredStars:
         """The judged stars in an image of the tracker (h, w), electrons."""
         if self.movement.turns:
             return self._measure_paths(image_e)
@@ -194,15 +194,15 @@ class Judge:
         wanted &= ~crowded(self._x_px, self._y_px, self._e, radius_px, tracker.sigma_px)
         self.judged = np.flatnonzero(wanted)
 
-    def _measured(self, match: Matched, which: IntArray) -> Measured:
+    def _measured(self, match: Matched, which: IntArray) -> MeasuredStars:
         index = match.index[which]
         found = index >= 0
         index = np.where(found, index, 0)
         if not found.any():
-            return Measured(np.full((len(which), 3), np.nan), np.zeros(len(which)))
+            return MeasuredStars(np.full((len(which), 3), np.nan), np.zeros(len(which)))
         places = match.found.x_px[index], match.found.y_px[index]
         light_e = np.where(found, match.found.flux[index], 0.0)
-        return Measured(np.where(found[:, None], self._directions(*places), np.nan), light_e)
+        return MeasuredStars(np.where(found[:, None], self._directions(*places), np.nan), light_e)
 
     def _margin_px(self) -> float:
         """How far from the edge of the detector a star is whole."""
@@ -252,16 +252,16 @@ class Judge:
         places = [tracker.camera.project(vectors @ turn.T) for turn in turns]
         return np.stack([x for x, _ in places]), np.stack([y for _, y in places])
 
-    def _measure_paths(self, image_e: FloatArray) -> Measured:
+    def _measure_paths(self, image_e: FloatArray) -> MeasuredStars:
         if not len(self.judged):
-            return Measured(np.zeros((0, 3)), np.zeros(0))
+            return MeasuredStars(np.zeros((0, 3)), np.zeros(0))
         width, light = image_e.shape[1], image_e.ravel()[self._pixels]
         row, column = np.divmod(self._pixels, width)
         total, by_x, by_y = (np.add.reduceat(part, self._begins) for part in (light, light * column, light * row))
         found = total > LOST_SHARE * self._e[self.judged]
         divisor = np.where(found, total, 1.0)
         directions = self._directions(by_x / divisor, by_y / divisor)
-        return Measured(np.where(found[:, None], directions, np.nan), np.where(found, total, 0.0))
+        return MeasuredStars(np.where(found[:, None], directions, np.nan), np.where(found, total, 0.0))
 
     def _directions(self, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
         rays = self.tracker.camera.rays(x_px, y_px)
@@ -279,7 +279,7 @@ class Judge:
         return np.asarray(inside & (seen_y >= reach) & (seen_y < height - 1 - reach))
 
 
-def off(judge: Judge, shown: Measured, wanted: Measured) -> Off:
+def off(judge: StarJudge, shown: MeasuredStars, wanted: MeasuredStars) -> Off:
     """How far the stars of a measurement are from where and what they should be.
 
     A lost one is off by all its light, and by 3 px or its path, whichever is longer: to lose a star is no better than to
@@ -292,7 +292,7 @@ def off(judge: Judge, shown: Measured, wanted: Measured) -> Off:
     return Off(arcsec, np.where(lost, LOST_MAG, mag), lost)
 
 
-def attitude_off_arcsec(shown: Measured, wanted: Measured) -> tuple[float, float]:
+def attitude_off_arcsec(shown: MeasuredStars, wanted: MeasuredStars) -> tuple[float, float]:
     """By how much the camera is turned across the boresight and about it, by least squares of the stars found; NaN for few."""
     found = ~(shown.lost | wanted.lost)
     true, seen = wanted.directions[found], shown.directions[found]

@@ -42,14 +42,14 @@ from hilstar.study.speed.report import (
     Aim,
     Cell,
     Machine,
+    MethodTiming,
+    ProcessStart,
     PythonTime,
     Result,
     SceneOrigin,
     Size,
     Skipped,
     Spread,
-    Start,
-    Timing,
 )
 
 # A cap this much wider than the monitor's own: culling must have something to throw away.
@@ -92,14 +92,14 @@ START_AIM_MS = 1500.0
 
 
 @dataclass(frozen=True, slots=True)
-class Scene:
+class BenchmarkScene:
     """Stars, and how many of those in view are the catalogue's."""
 
     stars: Stars
     catalogue_count: int
 
 
-def scene(bench: Bench, every: Stars, q_icrs_to_cam: FloatArray, count: int, rng: np.random.Generator) -> Scene:
+def scene(bench: Bench, every: Stars, q_icrs_to_cam: FloatArray, count: int, rng: np.random.Generator) -> BenchmarkScene:
     """A scene with exactly `count` stars in view: the brightest of `every`, and past those random ones in and around the view.
 
     The random ones are as bright as random stars of the fainter half of `every`. Raises InputError where `every` is empty.
@@ -111,11 +111,11 @@ def scene(bench: Bench, every: Stars, q_icrs_to_cam: FloatArray, count: int, rng
     if len(ranked) >= count:
         kept = every.v_mag <= every.v_mag[ranked[count - 1]]
         kept[ranked[count:]] = False
-        return Scene(_sorted(every, np.flatnonzero(kept), every.vectors[kept]), count)
+        return BenchmarkScene(_sorted(every, np.flatnonzero(kept), every.vectors[kept]), count)
     vectors = _directions(bench, q_icrs_to_cam, count - len(ranked), rng)
     faint = np.flatnonzero(every.v_mag >= np.median(every.v_mag))
     sources = np.concatenate([np.arange(len(every)), rng.choice(faint, len(vectors))])
-    return Scene(_sorted(every, sources, np.concatenate([every.vectors, vectors])), len(ranked))
+    return BenchmarkScene(_sorted(every, sources, np.concatenate([every.vectors, vectors])), len(ranked))
 
 
 def _sorted(every: Stars, sources: IntArray, vectors: FloatArray) -> Stars:
@@ -261,12 +261,12 @@ METHODS: tuple[tuple[str, str, Callable[[], Draw]], ...] = (
 )
 
 
-def fresh_start(path: Path, q_icrs_to_cam: FloatArray, size: Size) -> Start:
+def fresh_start(path: Path, q_icrs_to_cam: FloatArray, size: Size) -> ProcessStart:
     """Start a process that imports hilstar and draws one frame of the bench file."""
     command = [sys.executable, "-c", FRESH, str(path), *map(repr, q_icrs_to_cam.tolist())]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     import_ms, first_frame_ms, memory_mb = map(float, done.stdout.split())
-    return Start(*size, import_ms, first_frame_ms, memory_mb)
+    return ProcessStart(*size, import_ms, first_frame_ms, memory_mb)
 
 
 def this_machine() -> Machine:
@@ -330,7 +330,7 @@ class CellMeasurement:
                 rows.append(("hilstar", kind, stage_ms[1:] or stage_ms))  # without the first turn, as in `interleaved`
         rows += [(name, "linear_only", times) for name, times in times_ms.items()]
         for method, kind, times in rows:
-            self.result.rows.append(Timing(*self.cell_key, method, kind, _spread(times)))
+            self.result.rows.append(MethodTiming(*self.cell_key, method, kind, _spread(times)))
 
     def _too_long(self, other: OtherMethod, budget_s: float) -> str | None:
         """Why a method is skipped here: its time for all stars, estimated from that for one star and for a hundred more."""
@@ -411,7 +411,7 @@ def _first(sprites: Sprites, count: int) -> Sprites:
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class BenchmarkPlan:
     """What to measure: image sizes (px), star counts, and the maximum rounds and seconds of a method in one cell.
 
     `file` replaces the benchmark's own bench file; `sizes` is then that file's image size.
@@ -425,10 +425,10 @@ class Plan:
     file: BenchFile | None = None
 
 
-QUICK = Plan(sizes=(REFERENCE_PX,), counts=COUNTS[:3], rounds=30, budget_s=2.0)
+QUICK = BenchmarkPlan(sizes=(REFERENCE_PX,), counts=COUNTS[:3], rounds=30, budget_s=2.0)
 
 
-def run(plan: Plan, rng: np.random.Generator, advance: Callable[[int], object]) -> Result:
+def run(plan: BenchmarkPlan, rng: np.random.Generator, advance: Callable[[int], object]) -> Result:
     """Measure every cell of a plan; `advance` hears how many are done. Raises InputError, MachineError."""
     methods, missing = other_methods()
     others = OtherWork()

@@ -48,7 +48,7 @@ class Cell:
 
 
 @dataclass(frozen=True, slots=True)
-class Timing(Cell):
+class MethodTiming(Cell):
     """How long a method takes in a cell; `kind` is the whole frame, the linear image alone or a stage of hilstar's."""
 
     method: str
@@ -91,7 +91,7 @@ class Skipped:
 
 
 @dataclass(frozen=True, slots=True)
-class Start:
+class ProcessStart:
     """Times of import and first frame in a process of its own, and its peak memory."""
 
     width: int
@@ -133,10 +133,10 @@ class Result:
 
     machine: Machine
     gl_renderer: str = ""
-    rows: list[Timing] = field(default_factory=list)
+    rows: list[MethodTiming] = field(default_factory=list)
     scenes: list[SceneOrigin] = field(default_factory=list)
     agreement: list[Agreement] = field(default_factory=list)
-    startup: list[Start] = field(default_factory=list)
+    startup: list[ProcessStart] = field(default_factory=list)
     python_ms: list[PythonTime] = field(default_factory=list)
     does: dict[str, str] = field(default_factory=dict)
     skipped: list[Skipped] = field(default_factory=list)
@@ -230,7 +230,7 @@ def _finding(result: Result) -> str:
     return f"A whole frame takes {parts[0]} and {parts[1]} ({where}{busy})"
 
 
-def _named(rows: Sequence[Timing]) -> dict[str, dict[int, float]]:
+def _named(rows: Sequence[MethodTiming]) -> dict[str, dict[int, float]]:
     """Medians by star count of each line of the table, hilstar's stages indented under the whole frame."""
     named: dict[str, dict[int, float]] = {}
     for wanted in (True, False):

@@ -340,7 +340,7 @@ def flux_range() -> FailureCase:
 
 
 @dataclass(frozen=True, slots=True)
-class Scene:
+class CodeScene:
     """Groups of `stars` stars, each group alone in its part of the image, on a panel."""
 
     sprites: Sprites
@@ -354,7 +354,7 @@ class Scene:
         return np.asarray(np.minimum(linear_image(self.sprites, (SIDE_PX, SIDE_PX), (self.sigma_px,) * 2), WHITE * even))
 
 
-def codes_of(scene: Scene, quantisation: Quantisation) -> Codes:
+def codes_of(scene: CodeScene, quantisation: Quantisation) -> Codes:
     """The codes (h, w) as hilstar draws them."""
     panel, sigma_px = scene.panel, (scene.sigma_px, scene.sigma_px)
     on = Target((SIDE_PX, SIDE_PX), sigma_px, panel.response, WHITE, quantisation, panel.uniformity)
@@ -363,12 +363,12 @@ def codes_of(scene: Scene, quantisation: Quantisation) -> Codes:
         return gl.codes().copy()
 
 
-def exact_codes(scene: Scene) -> Codes:
+def exact_codes(scene: CodeScene) -> Codes:
     """The codes (h, w) of `exact`."""
     return codes_of(scene, "exact")
 
 
-def error_steps(codes: Codes, scene: Scene) -> float:
+def error_steps(codes: Codes, scene: CodeScene) -> float:
     """The error of the groups' light, rms, in the panel's smallest steps."""
     wanted = scene.wanted()
     parts = [
@@ -394,32 +394,32 @@ def middles() -> tuple[FloatArray, FloatArray]:
 
 def lone_stars(
     under_white_mag: float, response: Response, sigma_px: float = SIGMA_PX, uniformity: Float32Array | None = None
-) -> Scene:
+) -> CodeScene:
     """A star in each part of the image."""
     x_px, y_px = middles()
     mags = np.full(len(x_px), under_white_mag)
-    return Scene(sprites_of(x_px, y_px, mags, sigma_px), sigma_px, Panel(response, WHITE, uniformity))
+    return CodeScene(sprites_of(x_px, y_px, mags, sigma_px), sigma_px, Panel(response, WHITE, uniformity))
 
 
-def neighbours(mags: tuple[float, float], apart_px: float) -> Scene:
+def neighbours(mags: tuple[float, float], apart_px: float) -> CodeScene:
     """Two stars in each part, in all directions from each other."""
     x_px, y_px = middles()
     angle = np.linspace(0, 2 * np.pi, len(x_px), endpoint=False)
     both = np.append(x_px, x_px + apart_px * np.cos(angle)), np.append(y_px, y_px + apart_px * np.sin(angle))
-    return Scene(sprites_of(*both, np.repeat(mags, len(x_px)), SIGMA_PX), SIGMA_PX, Panel(srgb_response(8), WHITE), 2)
+    return CodeScene(sprites_of(*both, np.repeat(mags, len(x_px)), SIGMA_PX), SIGMA_PX, Panel(srgb_response(8), WHITE), 2)
 
 
-def half_off() -> Scene:
+def half_off() -> CodeScene:
     """Stars whose middles lie on the screen's edges, at every phase along them and across."""
     along = middles()[0][1 : COUNT - 1]
     across = (np.roll(np.arange(COUNT - 2), 2) + 0.5) / (COUNT - 2) - 1.0
     x_px = np.concatenate([across, SIDE_PX - 1 - across, along, along])
     y_px = np.concatenate([along, along, across, SIDE_PX - 1 - across])
     sprites = sprites_of(x_px, y_px, np.full(len(x_px), FAINT_MAG), SIGMA_PX)
-    return Scene(sprites, SIGMA_PX, Panel(srgb_response(8), WHITE))
+    return CodeScene(sprites, SIGMA_PX, Panel(srgb_response(8), WHITE))
 
 
-def _judged(case: str, scene: Scene, why: str = TOGETHER, steps_a_star: float = STEPS_A_STAR) -> FailureCase:
+def _judged(case: str, scene: CodeScene, why: str = TOGETHER, steps_a_star: float = STEPS_A_STAR) -> FailureCase:
     """Rounding against `exact`, by the light of each group of stars."""
     fault, error = error_steps(codes_of(scene, "round"), scene), error_steps(exact_codes(scene), scene)
     return FailureCase(
@@ -478,7 +478,7 @@ def all_clipped() -> FailureCase:
     return _spilled("every star 4 mag over white", lone_stars(-4.0, srgb_response(8)))
 
 
-def _spilled(case: str, scene: Scene) -> FailureCase:
+def _spilled(case: str, scene: CodeScene) -> FailureCase:
     """The most light that a pixel has beyond what is wanted: what is over white there, its neighbours may be given."""
     wanted = scene.wanted()
     linear = linear_image(scene.sprites, (SIDE_PX, SIDE_PX), (scene.sigma_px,) * 2)[: 2 * TILE_PX, : 2 * TILE_PX]
@@ -513,7 +513,7 @@ def diffused_light(linear: FloatArray, response: Response) -> FloatArray:
 def no_stars() -> FailureCase:
     """Nothing in view."""
     nothing = np.zeros(0)
-    none = Scene(sprites_of(nothing, nothing, nothing, SIGMA_PX), SIGMA_PX, Panel(srgb_response(8), WHITE))
+    none = CodeScene(sprites_of(nothing, nothing, nothing, SIGMA_PX), SIGMA_PX, Panel(srgb_response(8), WHITE))
     with np.errstate(invalid="ignore"):
         scaled = none.wanted() / none.wanted().max()
     error = float((exact_codes(none) != 0).mean())

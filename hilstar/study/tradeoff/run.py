@@ -14,13 +14,13 @@ from hilstar.charts import BLUE, MUTED, RED, capital, chart, name_at_side, title
 from hilstar.render.renderer import Renderer, Target
 from hilstar.study.tradeoff.light import brightness, depth, psf, quantisation, spectrum
 from hilstar.study.tradeoff.places import SIGMA_PX, culling, prediction, projection, smear
-from hilstar.study.tradeoff.table import Figure, Row, Step, Trials, measured
+from hilstar.study.tradeoff.table import Figure, MethodRow, TradeoffStep, Trials, measured
 from hilstar.tracker.centroiders import FAMILY
 
 if TYPE_CHECKING:
     pass
 
-LABEL_COLUMNS = 40  # of an axis as high as a panel
+LABEL_COLUMNS = 40  # characters along an axis as high as a panel
 # In the order of the chain.
 STEPS: tuple[Callable[[ExitStack, bool], Trials], ...] = (
     brightness,
@@ -53,7 +53,7 @@ COLUMNS = (
     "front",
     "beaten_by",
 )
-# Of the step `quantisation`: what centroiders of every kind find; empty in the others.
+# Columns of the step `quantisation` alone: what centroiders of every kind find.
 MORE_COLUMNS = tuple(f"max_px_{kind}" for kind in FAMILY)
 
 
@@ -76,7 +76,7 @@ def this_machine() -> str:
         return f"{renderer.gl_renderer}, {os.cpu_count()} cores"
 
 
-def cells(step: Step, row: Row) -> tuple[str | float | bool, ...]:
+def cells(step: TradeoffStep, row: MethodRow) -> tuple[str | float | bool, ...]:
     """A row of the CSV: COLUMNS and MORE_COLUMNS."""
     figures = (
         row.error,
@@ -92,7 +92,7 @@ def cells(step: Step, row: Row) -> tuple[str | float | bool, ...]:
     return step.name, step.work, row.method, *figures, row.is_default, row.is_exact, row.on_front, row.beaten, *more
 
 
-def table_lines(step: Step) -> list[str]:
+def table_lines(step: TradeoffStep) -> list[str]:
     """A step's table for a person, the fastest method first."""
     wide = max(len(row.method) for row in step.rows)
     columns = (f"{step.error.name} [{step.error.unit}]", f"{step.second.name} [{step.second.unit}]", "ms")
@@ -105,7 +105,7 @@ def table_lines(step: Step) -> list[str]:
     return [*lines, *([f"   the default: {beaten}"] if beaten else []), *([f"   {step.remark}"] if step.remark else [])]
 
 
-def finding(step: Step) -> str:
+def finding(step: TradeoffStep) -> str:
     """What a chart says in its title."""
     own, exact = step.default, next((row for row in step.rows if row.is_exact), None)
     off = "has no error" if own.error <= step.error.floor else f"is off by {said(own.error, step.error)}"
@@ -119,7 +119,7 @@ def said(value: float, figure: Figure) -> str:
     return two_digits(value) + ("" if figure.unit == "1" else f" {figure.unit}")
 
 
-def draw(path: Path, step: Step, machine: str) -> None:
+def draw(path: Path, step: TradeoffStep, machine: str) -> None:
     """Draw error against time on logarithmic axes: the front as a line, the default ringed, every method named at the side."""
     floor, own = step.error.floor, step.default
     shown = {row.method: (row.time_ms, max(row.error, floor)) for row in step.rows}

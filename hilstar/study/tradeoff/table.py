@@ -57,7 +57,7 @@ class Trials:
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class MethodRow:
     """A method as measured: median time and its quartiles, ms; `on_front` where no other is both as accurate and as fast.
 
     `beaten` says what beats the default and why it stays the default; it is empty for all others.
@@ -76,34 +76,36 @@ class Row:
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class TradeoffStep:
     """A step of the chain with a row for each method, the fastest first."""
 
     name: str
     work: str
     error: Figure
     second: Figure
-    rows: tuple[Row, ...]
+    rows: tuple[MethodRow, ...]
     remark: str = ""
 
     @property
-    def default(self) -> Row:
+    def default(self) -> MethodRow:
         """The row of the method that hilstar takes."""
         return next(row for row in self.rows if row.is_default)
 
 
-def measured(trials: Trials, budget_s: float) -> Step:
+def measured(trials: Trials, budget_s: float) -> TradeoffStep:
     """Time the methods of a step in interleaved rounds, and mark the front."""
     times = interleaved([trial.work for trial in trials.trials], budget_s)
     low, middle, high = np.array([np.percentile(values, (25, 50, 75)) for values in times]).T
     front = pareto_front([max(trial.error, trials.error.floor) for trial in trials.trials], middle)
     rows = [
-        Row(t.method, t.error, t.second, float(ms), (float(q1), float(q3)), t.is_default, t.is_exact, bool(on), more=t.more)
+        MethodRow(
+            t.method, t.error, t.second, float(ms), (float(q1), float(q3)), t.is_default, t.is_exact, bool(on), more=t.more
+        )
         for t, q1, ms, q3, on in zip(trials.trials, low, middle, high, front, strict=True)
     ]
     rows = [_with_reason(row, rows, trials) if row.is_default and not row.on_front else row for row in rows]
     rows.sort(key=lambda row: row.time_ms)
-    return Step(trials.name, trials.work, trials.error, trials.second, tuple(rows), trials.remark)
+    return TradeoffStep(trials.name, trials.work, trials.error, trials.second, tuple(rows), trials.remark)
 
 
 def interleaved(works: Sequence[Callable[[], object]], budget_s: float) -> list[list[float]]:
@@ -134,7 +136,7 @@ def pareto_front(errors: Sequence[float], times_ms: Sequence[float] | npt.NDArra
     return np.asarray(~(as_good & better).any(axis=1))
 
 
-def _with_reason(row: Row, rows: Sequence[Row], trials: Trials) -> Row:
+def _with_reason(row: MethodRow, rows: Sequence[MethodRow], trials: Trials) -> MethodRow:
     """The default's row, with the fastest method that beats it and why it stays."""
     floor = trials.error.floor
     beating = [r for r in rows if max(r.error, floor) <= max(row.error, floor) and r.time_ms <= row.time_ms and r is not row]

@@ -25,7 +25,7 @@ from hilstar.twin.verify.star_finder import StarFinder, star_finder
 from hilstar.twin.verify.twin import Twin, exposure_lights
 from hilstar.units import magnitude
 
-OFF_AXIS = 0.4  # of the field's radius: where a fault's place is put, at most
+OFF_AXIS = 0.4  # a fault is placed within this share of the field's radius
 OFF_FIELD = 1.2  # where a glow's is
 WINDOW_SIGMAS = 6.0
 

@@ -109,10 +109,10 @@ def fit_geometry(displaced: Sequence[Displaced], tracker: Camera, limit_px: floa
     return _summed_up(next(fit for fit in fits if fit.noise <= good), back.T.ravel(), focal_px)
 
 
-def _fits(seen: FloatArray, back: FloatArray) -> list[_Fit]:
+def _fits(seen: FloatArray, back: FloatArray) -> list[_MotionFit]:
     """Every model that so many stars (n, 2) can determine, the smallest first."""
     parts, wanted = _parts(*seen.T), back.T.ravel()
-    fits = [_Fit.of({name: parts[name] for name in model}, wanted) for model in MODELS]
+    fits = [_MotionFit.of({name: parts[name] for name in model}, wanted) for model in MODELS]
     return [fit for fit in fits if MIN_RESIDUALS * fit.unknowns <= len(wanted)]
 
 
@@ -136,7 +136,7 @@ def _parts(x: FloatArray, y: FloatArray) -> dict[str, FloatArray]:
 
 
 @dataclass(frozen=True, slots=True)
-class _Fit:
+class _MotionFit:
     """A model's unknowns by its parts, the displacements (2 n,) by each, and what all of them leave."""
 
     found: dict[str, FloatArray]
@@ -145,7 +145,7 @@ class _Fit:
     unknowns: int
 
     @classmethod
-    def of(cls, parts: dict[str, FloatArray], wanted: FloatArray) -> _Fit:
+    def of(cls, parts: dict[str, FloatArray], wanted: FloatArray) -> _MotionFit:
         design = np.hstack(list(parts.values()))
         values = np.linalg.lstsq(design, wanted, rcond=None)[0]
         ends = np.cumsum([part.shape[1] for part in parts.values()])
@@ -167,7 +167,7 @@ def _lengths(residuals: FloatArray) -> FloatArray:
     return np.asarray(np.hypot(*np.split(residuals, 2)))
 
 
-def _summed_up(fit: _Fit, wanted: FloatArray, focal_px: float) -> GeometryFit:
+def _summed_up(fit: _MotionFit, wanted: FloatArray, focal_px: float) -> GeometryFit:
     scale, rotation, right, down = fit.found[ALIGNED].tolist()
     backwards = complex(1.0 + scale, rotation)
     forwards, shift = 1.0 / backwards, -complex(right, down) / backwards

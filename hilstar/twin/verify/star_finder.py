@@ -18,7 +18,7 @@ from hilstar.units import magnitude
 
 USUAL: Centroider = "window"
 MATCH_PX = 3.0
-# Of a star's light, how much others may bring into its window. Both images have it, so its effect is of second order: at
+# Others' light in a star's window, as a share of its own. Both images have it, so its effect is of second order: at
 # 0.02, a neighbour 0.1 mag off adds 0.002 mag.
 CROWDED_SHARE = 0.02
 WING_SIGMAS = 6.0  # how far a neighbour's light reaches: 1e-9 of it, and Sirius is 4e3 times a star of the seventh magnitude

@@ -25,8 +25,8 @@ from hilstar.twin.verify.twin import Twin
 from hilstar.twin.verify.verdict import DisplayErrors, Verdict, judge, p95
 from hilstar.units import ARCSEC_PER_RAD
 
-MIN_SHARE = 1e-4  # of the limit: as drawn
-ARROW_SHARE = 0.06  # of the chart's width, for the residual that 95 % of stars are within
+MIN_SHARE = 1e-4  # share of the limit at which smaller errors are drawn
+ARROW_SHARE = 0.06  # share of the chart's width, for the residual that 95 % of stars are within
 
 
 def verify(

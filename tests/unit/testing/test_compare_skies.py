@@ -16,7 +16,7 @@ from hilstar.rotation import from_radec_roll_deg
 from hilstar.scene.psf import footprint_px
 from hilstar.scene.sprites import pack_sprites
 from hilstar.testing import MAX_LINES, assert_same_sky, compare
-from hilstar.testing.report import Panel
+from hilstar.testing.report import ChartPanel
 from hilstar.testing.sky_comparison import CENTROID_PX, FLUX_MAG
 from hilstar.testing.star_fit import star_sigma_px
 from tests.support.benches import SMALL_BENCH
@@ -197,7 +197,7 @@ def test_the_legend_counts_what_the_terminal_counts(field):
     found = compare(field.frame(), field.golden)
     assert found.common is not None
     assert found.summary()["missing"] > 0
-    panel = Panel(found, "mag")
+    panel = ChartPanel(found, "mag")
     for kind in ("missing", "extra"):
         drawn = len(panel.of(kind))
         assert panel.label(kind, drawn).startswith(f"{kind}: {found.summary()[kind]}")

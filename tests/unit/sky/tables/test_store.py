@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from hilstar.sky.catalog import column_names
-from hilstar.sky.star_table import KEPT_FILES, Choice, choose_catalog
+from hilstar.sky.star_table import KEPT_FILES, TableChoice, choose_catalog
 from tests.support.waiting import PATIENCE_S
 
 TEXT = "ra,dec,vmag,b-v\n1,2,3,0.1\n4,5,6,\n7,8,9,0.5\n"
@@ -39,30 +39,30 @@ def same(a, b):
 
 
 def test_the_second_time_the_cache_is_read_and_says_the_same(table, caplog):
-    first = choose_catalog(Choice(table))
+    first = choose_catalog(TableChoice(table))
     assert "1 without a magnitude" in caplog.text
     caplog.clear()
     (path,) = stored(table)
     rewritten(path, v_mag=np.array([1.0, 2.0]))
-    second = choose_catalog(Choice(table))
+    second = choose_catalog(TableChoice(table))
     assert second.v_mag.tolist() == [1.0, 2.0]  # the cache's, which shows that it was read
     assert "1 without a magnitude" in caplog.text
     assert (second.notes, second.rows_read, second.designation) == (first.notes, 3, "t row")
 
 
 def test_another_content_epoch_or_company_is_another_catalogue(table):
-    choose_catalog(Choice(table))
-    choose_catalog(Choice(table, epoch_jyear=2000.0))
-    assert len(choose_catalog(Choice(table, with_hipparcos=True, epoch_jyear=2000.0))) > 100_000
+    choose_catalog(TableChoice(table))
+    choose_catalog(TableChoice(table, epoch_jyear=2000.0))
+    assert len(choose_catalog(TableChoice(table, with_hipparcos=True, epoch_jyear=2000.0))) > 100_000
     before = table.stat()
     table.write_text(TEXT.replace("0.5", "0.7"))
     os.utime(table, ns=(before.st_atime_ns, before.st_mtime_ns + 1))
-    assert 0.7 in choose_catalog(Choice(table)).bv_mag
+    assert 0.7 in choose_catalog(TableChoice(table)).bv_mag
     assert len(stored(table)) == 4
 
 
 def test_a_damaged_or_hostile_cache_is_made_anew(table):
-    whole = choose_catalog(Choice(table))
+    whole = choose_catalog(TableChoice(table))
     (path,) = stored(table)
     good = path.read_bytes()
 
@@ -89,7 +89,7 @@ def test_a_damaged_or_hostile_cache_is_made_anew(table):
     ]
     for k, harm in enumerate(damage):
         harm()
-        assert same(choose_catalog(Choice(table)), whole), k
+        assert same(choose_catalog(TableChoice(table)), whole), k
         if path.is_file():
             assert path.read_bytes() == good, k
 
@@ -99,13 +99,13 @@ def test_nothing_depends_on_a_place_for_the_cache(table, monkeypatch, tmp_path):
     for named in (str(tmp_path / "file"), "/proc/none", "relative"):
         monkeypatch.setenv("XDG_CACHE_HOME", named)
         monkeypatch.setenv("HOME", "/proc/none")
-        assert len(choose_catalog(Choice(table))) == 2
+        assert len(choose_catalog(TableChoice(table))) == 2
     assert not (tmp_path / "relative").exists()
 
 
 def test_only_the_newest_files_are_kept(table):
     for k in range(KEPT_FILES + 2):
-        choose_catalog(Choice(table, epoch_jyear=2000.0 + k))
+        choose_catalog(TableChoice(table, epoch_jyear=2000.0 + k))
     assert len(stored(table)) == KEPT_FILES
 
 
@@ -120,4 +120,4 @@ def test_two_processes_at_once_both_have_the_catalogue(table):
     assert counts == [b"2"] * 2
     (path,) = stored(table)
     rewritten(path, v_mag=np.array([1.0, 2.0]))
-    assert choose_catalog(Choice(table)).v_mag.tolist() == [1.0, 2.0]  # what they left is whole
+    assert choose_catalog(TableChoice(table)).v_mag.tolist() == [1.0, 2.0]  # what they left is whole

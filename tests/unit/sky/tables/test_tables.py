@@ -12,7 +12,7 @@ from astropy.table import MaskedColumn, Table
 
 from hilstar.errors import InputError
 from hilstar.sky.catalog import load_catalog
-from hilstar.sky.star_table import Choice, choose_catalog
+from hilstar.sky.star_table import TableChoice, choose_catalog
 from hilstar.sky.table_reader import from_gaia
 
 # CSV, ECSV and VOTable have float64 in 17 digits.
@@ -25,7 +25,7 @@ def cache(tmp_path, monkeypatch):
 
 
 def read(path, **choice):
-    return choose_catalog(Choice(path, **choice))
+    return choose_catalog(TableChoice(path, **choice))
 
 
 def gaia_table() -> Table:
@@ -255,6 +255,6 @@ def test_a_table_beside_hipparcos_has_to_have_an_epoch(tmp_path):
 
 
 def test_keys_of_a_table_are_refused_for_hipparcos(tmp_path):
-    for choice in (Choice(with_hipparcos=True), Choice(epoch_jyear=2000.0)):
+    for choice in (TableChoice(with_hipparcos=True), TableChoice(epoch_jyear=2000.0)):
         with pytest.raises(InputError, match=r"\[sky\] (with_hipparcos|catalogue_epoch_jyear)"):
             choose_catalog(choice)

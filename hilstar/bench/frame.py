@@ -23,7 +23,7 @@ from hilstar.errors import InputError
 from hilstar.monitor.calibration import Calibration
 from hilstar.monitor.footprints import FootprintMap, star_losses_mag
 from hilstar.monitor.quantise import Panel, shown_light
-from hilstar.monitor.response import Codes, code_dtype
+from hilstar.monitor.response import Codes, Levels, code_dtype
 from hilstar.render.renderer import Renderer
 from hilstar.rotation import normalise, to_matrix
 from hilstar.scene.camera import Camera
@@ -56,7 +56,7 @@ class Frame:
 
     q_icrs_to_cam: FloatArray
     linear: Float32Array
-    levels: Codes
+    levels: Levels
     codes: Codes
     truth: npt.NDArray[np.void]
     star: IntArray
@@ -100,9 +100,9 @@ class Drawn:
         return None if self.sprites is None else self.sprites.rate_cam_rad_s
 
     @cached_property
-    def levels(self) -> Codes:
+    def levels(self) -> Levels:
         """The levels (see `Bench.code_values`), read back when they are first asked for; the next draw overwrites them."""
-        return self._renderer.codes()
+        return self._renderer.levels()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -290,7 +290,7 @@ class Bench:
         shown = self._still(q, self.shown_stars, t_ns, faults)
         self.renderer.begin_anew()
         self.renderer.draw(shown, number)
-        levels = self.renderer.codes().copy()
+        levels = Levels(self.renderer.levels().copy())
         if len(self.faint_stars) or self.renderer.target.sides or len(sprites) != len(shown):
             self.renderer.draw_linear(sprites)
         linear = self.renderer.linear().copy()
@@ -363,7 +363,7 @@ class Bench:
                     losses[disc.name] = float(magnitude(shown[own].sum() / wanted[own].sum(dtype=np.float64)))
         return losses
 
-    def code_values(self, levels: Codes) -> Codes:
+    def code_values(self, levels: Levels) -> Codes:
         """The monitor's code values of levels (height, width): the same, or (height, width, 3) with bit stealing."""
         rgb = self.calibration.response.rgb
         if rgb is None:

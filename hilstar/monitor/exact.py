@@ -22,7 +22,7 @@ from hilstar.arrays import Float32Array, IntArray
 from hilstar.monitor.balance import AS_USUAL, SUMS, Balance, Seen
 from hilstar.monitor.footprints import FootprintMap, Footprints, PlaceArray
 from hilstar.monitor.quantise import Panel, ThresholdCounter, level_dtype
-from hilstar.monitor.response import Codes
+from hilstar.monitor.response import Levels
 from hilstar.scene.sprites import Sprites
 
 KEPT = 8  # choices side by side, a power of two: 4 leave the centroid a fifth more error, 16 a tenth less
@@ -105,7 +105,7 @@ class ExactQuantiser:
         uniformity = panel.uniformity
         self._output = None if uniformity is None else np.append(uniformity.ravel(), np.float32(1))
 
-    def levels(self, sprites: Sprites | None, floor: Codes | None = None) -> Codes:
+    def levels(self, sprites: Sprites | None, floor: Levels | None = None) -> Levels:
         """The levels of `sprites` (None: black), (height, width); the next call overwrites the same array.
 
         Their light is added to that of the levels `floor` (height, width), None for black.
@@ -130,7 +130,7 @@ class ExactQuantiser:
             self._lit = found.place.ravel()
             self._flat[self._lit] = levels.ravel()
             self._flat[-1] = 0
-        return self._flat[:-1].reshape(height, width)
+        return Levels(self._flat[:-1].reshape(height, width))
 
     def _reach(self, of_star_e_per_s: Float32Array) -> IntArray:
         """How many pixels of stars of so much light (n,) are chosen, (n,)."""

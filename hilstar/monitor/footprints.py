@@ -14,7 +14,7 @@ from hilstar.arrays import Float32Array, FloatArray, IntArray
 from hilstar.errors import InputError
 from hilstar.monitor.balance import PIXEL_VARIANCE
 from hilstar.monitor.quantise import Panel
-from hilstar.monitor.response import Codes
+from hilstar.monitor.response import Levels
 from hilstar.scene.psf import footprint_px
 from hilstar.scene.sprites import Sprites
 from hilstar.units import magnitude
@@ -177,7 +177,7 @@ class FootprintMap:
         flat_light[winner], flat_place[winner] = total, flat_place_of_winner
 
 
-def star_losses_mag(sprites: Sprites, panel: Panel, footprints: FootprintMap, levels: Codes) -> FloatArray:
+def star_losses_mag(sprites: Sprites, panel: Panel, footprints: FootprintMap, levels: Levels) -> FloatArray:
     """How many magnitudes fainter than wanted each of n sprites is in `levels` (height, width), (n,).
 
     Infinite for a star that shows nothing, NaN for one without a pixel on the image. A pixel that several stars light
@@ -200,7 +200,7 @@ def star_losses_mag(sprites: Sprites, panel: Panel, footprints: FootprintMap, le
         return np.asarray(magnitude(shown / wanted))
 
 
-def _shown(place: PlaceArray, panel: Panel, levels: Codes) -> FloatArray:
+def _shown(place: PlaceArray, panel: Panel, levels: Levels) -> FloatArray:
     """Light of `levels` at places in the flat image, electrons per second; 0 at the place past its end."""
     level = np.append(levels.ravel(), levels.dtype.type(0))[place]
     share = np.asarray(panel.response.light[level], dtype=np.float64)

@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from hilstar.arrays import Float32Array, FloatArray, IntArray
 from hilstar.errors import InputError
-from hilstar.monitor.response import Codes, Response, encode
+from hilstar.monitor.response import Levels, Response, encode
 
 MASK_FILE = Path(__file__).parent / "data" / "blue-noise.npy"  # made by tools/make_blue_noise.py
 
@@ -72,12 +72,12 @@ def _wanted(linear_e_per_s: Float32Array, panel: Panel) -> Float32Array:
     return linear_e_per_s if gain is None else linear_e_per_s * gain
 
 
-def round_levels(linear_e_per_s: Float32Array, panel: Panel) -> Codes:
+def round_levels(linear_e_per_s: Float32Array, panel: Panel) -> Levels:
     """The nearest level of each pixel, (height, width) as `linear_e_per_s`; light over white becomes white."""
     return encode(_wanted(linear_e_per_s, panel), panel.response, panel.flux_at_white_e_per_s)
 
 
-def dither_levels(linear_e_per_s: Float32Array, panel: Panel, shift: float = 0.0) -> Codes:
+def dither_levels(linear_e_per_s: Float32Array, panel: Panel, shift: float = 0.0) -> Levels:
     """One of the two levels about each pixel's light, as a blue-noise mask turned by `shift` (0 to 1) decides.
 
     The mean light over all thresholds of the mask is the wanted light within 1/8192 of a step of levels.
@@ -91,7 +91,7 @@ def dither_levels(linear_e_per_s: Float32Array, panel: Panel, shift: float = 0.0
     more = (lower < panel.response.white) & (wanted - light[lower] > threshold * step)
     levels = np.zeros(linear_e_per_s.shape, dtype=level_dtype(panel.response))
     levels[rows, columns] = lower + more
-    return levels
+    return Levels(levels)
 
 
 @lru_cache(maxsize=1)
@@ -122,7 +122,7 @@ def mask_turn(frame: int) -> float:
     return turn
 
 
-def shown_light(levels: Codes, panel: Panel) -> FloatArray:
+def shown_light(levels: Levels, panel: Panel) -> FloatArray:
     """What the monitor makes of levels (height, width): electrons per second above the black level, float64."""
     light = panel.response.light[levels] * panel.flux_at_white_e_per_s
     return light if panel.uniformity is None else light * panel.uniformity

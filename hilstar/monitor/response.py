@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import product
-from typing import Any
+from typing import Any, NewType
 
 import numpy as np
 import numpy.typing as npt
@@ -12,7 +12,10 @@ import numpy.typing as npt
 from hilstar.arrays import Float32Array, FloatArray
 from hilstar.errors import InputError
 
+# What the monitor is given: (height, width), or (height, width, 3) where the primaries differ.
 Codes = npt.NDArray[np.unsignedinteger[Any]]
+# Indices into a response's levels (height, width). A level is a code only without bit stealing.
+Levels = NewType("Levels", np.ndarray[Any, np.dtype[np.unsignedinteger[Any]]])
 Weights = tuple[float, float, float]
 
 # Lights closer than this to each other (relative) are one level: a step of the renderer's float32 is 6e-8.
@@ -126,8 +129,8 @@ def code_dtype(bits: int) -> type[np.uint8] | type[np.uint16]:
     return np.uint8 if bits <= 8 else np.uint16
 
 
-def encode(linear_e_per_s: Float32Array, response: Response, flux_at_white_e_per_s: float) -> Codes:
+def encode(linear_e_per_s: Float32Array, response: Response, flux_at_white_e_per_s: float) -> Levels:
     """Nearest levels of a linear image, same shape, uint8 up to 256 levels; light over white becomes white."""
     thresholds = response.thresholds_e_per_s(flux_at_white_e_per_s)
     levels = np.searchsorted(thresholds, linear_e_per_s, side="right")
-    return levels.astype(np.uint8) if len(response.light) <= 256 else levels.astype(np.uint16)
+    return Levels(levels.astype(np.uint8 if len(response.light) <= 256 else np.uint16))

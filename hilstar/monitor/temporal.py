@@ -16,7 +16,7 @@ import numpy as np
 
 from hilstar.arrays import Float32Array, IntArray
 from hilstar.monitor.exact import Carried, ExactQuantiser, Left, nothing_carried
-from hilstar.monitor.response import Codes
+from hilstar.monitor.response import Levels
 from hilstar.scene.sprites import Sprites
 
 # What a star is given to make up for, in its largest steps: more than the 3 that occur, little enough for one that cannot (its
@@ -31,7 +31,7 @@ class TemporalQuantiser(ExactQuantiser):
 
     over_frames: ClassVar[bool] = True
 
-    def levels(self, sprites: Sprites | None, floor: Codes | None = None) -> Codes:
+    def levels(self, sprites: Sprites | None, floor: Levels | None = None) -> Levels:
         """The levels of the next frame, as `exact`'s."""
         if sprites is None or not len(sprites):
             self.left = None

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilstar.monitor.response import Codes, Response
+from hilstar.monitor.response import Levels, Response
 
 CROSSHAIR, GRID, BLANK, PATCH = 1, 2, 4, 8
 GRID_PX = 100
@@ -21,7 +21,7 @@ def level_of_code(response: Response, code: int) -> int:
     return int(np.argmin(away))
 
 
-def lay_over(levels: Codes, overlay: int, patch_level: int, line_level: int, cross_px: tuple[int, int]) -> None:
+def lay_over(levels: Levels, overlay: int, patch_level: int, line_level: int, cross_px: tuple[int, int]) -> None:
     """Change levels (height, width) in place as the monitor's last pass does; `cross_px` is the crosshair's pixel."""
     blank = bool(overlay & BLANK)
     on_patch = bool(overlay & PATCH) and not blank
@@ -48,7 +48,7 @@ class AidLevels:
     bits: int
     cross_px: tuple[int, int]
 
-    def laid_over(self, levels: Codes, overlay: int, patch_share: float) -> Codes:
+    def laid_over(self, levels: Levels, overlay: int, patch_share: float) -> Levels:
         """Levels with what is on over them, a patch of so much of white: the same array where nothing is, else a copy."""
         if not overlay:
             return levels

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from hilstar.errors import InputError
 from hilstar.monitor.quantise import CodeTable, Panel, blue_noise, code_table, level_dtype
-from hilstar.monitor.response import Codes
+from hilstar.monitor.response import Levels
 from hilstar.process.interrupts import held
 from hilstar.resources import resource_path
 from hilstar.scene.extended import Rectangle
@@ -171,17 +171,17 @@ class LevelTexture:
 
     def __init__(self, ctx: moderngl.Context, resolution_px: tuple[int, int], panel: Panel) -> None:
         width, height = resolution_px
-        self._image: Codes = np.zeros((height, width), dtype=level_dtype(panel.response))
+        self._image = Levels(np.zeros((height, width), dtype=level_dtype(panel.response)))
         self._dtype = f"u{self._image.itemsize}"
         self.texture = ctx.texture(resolution_px, 1, dtype=self._dtype)
         self.fbo = ctx.framebuffer([self.texture])
         self.fbo.clear()
 
-    def write(self, levels: Codes) -> None:
+    def write(self, levels: Levels) -> None:
         """Upload `levels` (height, width)."""
         self.texture.write(levels, alignment=1)
 
-    def read(self) -> Codes:
+    def read(self) -> Levels:
         """The levels (height, width); the next call overwrites the same array."""
         self.fbo.read_into(self._image, components=1, dtype=self._dtype, alignment=1)
         return self._image

@@ -19,7 +19,7 @@ from hilstar.errors import InputError
 from hilstar.monitor.balance import AS_USUAL, Balance, Seen
 from hilstar.monitor.exact import ExactQuantiser
 from hilstar.monitor.quantise import Panel, Quantisation, mask_turn
-from hilstar.monitor.response import Codes, Response
+from hilstar.monitor.response import Levels, Response
 from hilstar.monitor.temporal import TemporalQuantiser
 from hilstar.render.context import Context, check_limits, create_context
 from hilstar.render.driver import Driver
@@ -163,7 +163,7 @@ class Renderer:
         self._exact: ExactQuantiser | None = None
         self._floor_encoder: Encoder | None = None
         self._floor_key: tuple[tuple[ExtendedLight, ...], float] = ((), 0.0)
-        self._floor_levels: Codes | None = None
+        self._floor_levels: Levels | None = None
         if panel is None:
             return
         self._levels = LevelTexture(self._ctx, target.resolution_px, panel)
@@ -208,7 +208,7 @@ class Renderer:
             self._encoder.take_places_from(self._buffer, self.footprint_px)
 
     def draw(self, sprites: Sprites | None, frame: int = 0) -> None:
-        """Draw the linear image and the codes of `sprites` (None: blank); read them with `linear` and `codes`.
+        """Draw the linear image and the codes of `sprites` (None: blank); read them with `linear` and `levels`.
 
         `frame` counts the frames shown, for `temporal` alone: a frame whose number is not above the last one's begins anew.
         """
@@ -233,7 +233,7 @@ class Renderer:
                 self._draw_by_points(sprites, unit_e_per_s)
 
     def draw_linear(self, sprites: Sprites) -> None:
-        """Draw the linear image of `sprites` alone, no sprite smaller than the footprint; the next `codes` are undefined.
+        """Draw the linear image of `sprites` alone, no sprite smaller than the footprint; the next `levels` are undefined.
 
         What `temporal` carries from frame to frame stays as it is.
         """
@@ -325,7 +325,7 @@ class Renderer:
         encoder.draw(count, per_star, covered_px, 0.0, self._regions, self._levels_black)
         self._levels_black = True  # but for what this frame has
 
-    def _floor(self, lights: tuple[ExtendedLight, ...], turn: float, panel: Panel, levels: LevelTexture) -> Codes:
+    def _floor(self, lights: tuple[ExtendedLight, ...], turn: float, panel: Panel, levels: LevelTexture) -> Levels:
         """The levels of extended light alone, dithered by a turned mask: stars are added to them in light.
 
         The same lights and turn again give the same levels, which are kept.
@@ -400,16 +400,15 @@ class Renderer:
         vao.render(moderngl.POINTS, vertices=len(sprites))
         self._ctx.disable(moderngl.BLEND)
 
-    def codes(self) -> Codes:
-        """The levels of the last draw, (height, width), code values without bit stealing; the next draw or call overwrites
-        the same array.
+    def levels(self) -> Levels:
+        """The levels of the last draw (height, width), in an array that the next draw or call overwrites.
 
         uint8 up to 256 levels, uint16 beyond. A target without a response has none: TypeError.
         """
         if self._by_numpy:
             return self._exact_levels
         if self._levels is None:
-            raise TypeError("this target has no monitor response, so no codes")
+            raise TypeError("this target has no monitor response, so no levels")
         with self._ctx:
             self._driver.wait()
             return self._levels.read()
@@ -421,11 +420,11 @@ class Renderer:
         A target without a response has none: TypeError.
         """
         if self._levels is None:
-            raise TypeError("this target has no monitor response, so no codes")
+            raise TypeError("this target has no monitor response, so no levels")
         return self._levels.texture
 
     def linear(self) -> Float32Array:
-        """The linear image of the last draw, electrons per second, float32 (height, width), to read; overwritten as `codes`."""
+        """The linear image of the last draw, electrons per second, float32 (height, width); overwritten by the next."""
         if self._host is not None and self._on_host:
             return self._host.image
         with self._ctx:

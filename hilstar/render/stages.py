@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from hilstar.monitor.response import Codes
+from hilstar.monitor.response import Levels
 from hilstar.render.renderer import Renderer, Target
 from hilstar.units import NS_PER_MS
 
@@ -24,10 +24,10 @@ class StagedRenderer(Renderer):
         with self._ctx:
             self._queries = {stage: self._ctx.query(time=True) for stage in ("splat", "encode")}
 
-    def codes(self) -> Codes:
+    def levels(self) -> Levels:
         """As Renderer.codes."""
         begin = time.perf_counter()
-        codes = super().codes()
+        codes = super().levels()
         self.stage_ms["read_back"] = (time.perf_counter() - begin) * 1e3
         return codes
 

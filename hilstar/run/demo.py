@@ -123,7 +123,7 @@ def run_demo(directory: Path, duration_s: float, rng: np.random.Generator, watch
                 sender.tend()
             elif wanted and shown.number >= min(wanted):
                 wanted.remove(min(wanted))
-                kept[shown.number] = shown.drawn.levels.copy()
+                kept[shown.number] = bench.code_values(shown.drawn.levels).copy()
             watch(shown)
 
         link.await_ready()

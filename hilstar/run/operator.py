@@ -12,7 +12,7 @@ from typing import Any
 
 from hilstar.attitude.clock.timeline import Attitude
 from hilstar.bench.frame import Bench
-from hilstar.monitor.response import Codes
+from hilstar.monitor.response import Levels
 from hilstar.notices import Notices
 from hilstar.render.aids import BLANK, CROSSHAIR, GRID, PATCH, AidLevels
 from hilstar.run.pacer import Operator
@@ -211,6 +211,6 @@ class HeadlessOverrides(Overrides):
         super().__init__(Aids(), notices, always_seen, requests)
         self._levels = aid_levels_of(bench)
 
-    def laid_over(self, levels: Codes) -> Codes:
+    def laid_over(self, levels: Levels) -> Levels:
         """Levels with the operator's aids over them."""
         return self._levels.laid_over(levels, self.aids.overlay, self.aids.patch_share)

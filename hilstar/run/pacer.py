@@ -14,7 +14,7 @@ from typing import Any, Protocol
 
 from hilstar.attitude.clock.timeline import Attitude
 from hilstar.bench.frame import Drawn
-from hilstar.monitor.response import Codes
+from hilstar.monitor.response import Levels
 from hilstar.run.host_clock import HOST_CLOCK, HostClock
 from hilstar.run.shown import HEADLESS, OnScreen
 
@@ -74,7 +74,7 @@ class Operator:
         """The attitude to show at `t_ns` of the timeline."""
         return attitude
 
-    def laid_over(self, levels: Codes) -> Codes:
+    def laid_over(self, levels: Levels) -> Levels:
         """The levels of a frame that no screen changes, with what lies over them."""
         return levels
 

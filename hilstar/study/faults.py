@@ -126,7 +126,7 @@ def cost_of(bench: Bench, folder: Path, case: str, rounds: int) -> FaultCost:
 def _frame(bench: Bench, q: FloatArray, effects: Effects, faults: list[Fault]) -> object:
     """What the frame loop does with a frame of such faults."""
     if any(isinstance(fault, Freeze) for fault in faults):
-        return bench.renderer.codes()
+        return bench.renderer.levels()
     if effects.blank:
         return bench.draw_sprites(None).levels
     q = effects.turned(q)

@@ -78,7 +78,7 @@ def _frames_ms(bits: int, rounds: int) -> dict[str, float]:
             for name, renderer in renderers.items():
                 begin = time.perf_counter()
                 renderer.draw(sprites, frame)
-                renderer.codes()
+                renderer.levels()
                 times[name].append((time.perf_counter() - begin) * 1e3)
     return {name: float(np.median(each[1:])) for name, each in times.items()}
 

@@ -215,15 +215,15 @@ def test_every_quantisation_encodes_discs_and_erases_them(method, radius_px):
     with Renderer(target) as gl:
         star = sprites_at(np.array([[20.2, 20.7]]), np.array([2e5]), gl.footprint_px)
         gl.draw(star, 3)
-        plain = gl.codes().copy()
+        plain = gl.levels().copy()
         for _ in range(2):
             gl.draw(replace(star, extended=tuple(disc_lights(disc(radius_px, 40.0), view, covers=True))), 3)
-            levels = gl.codes().copy()
+            levels = gl.levels().copy()
             wanted = oracle(gl.linear(), panel)
             assert np.mean(levels[30:] != wanted[30:]) < 1e-3  # ties alone
             assert (levels[30:] == 1023).any() == (radius_px == 3.0) and levels[30:].max() > 300
             gl.draw(star, 3)
-            assert (gl.codes() == plain).all()
+            assert (gl.levels() == plain).all()
 
 
 def test_maps_of_discs_do_not_push_out_those_that_last(monkeypatch):

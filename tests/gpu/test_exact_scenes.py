@@ -39,7 +39,7 @@ def test_no_scene_is_worse_than_rounded_nor_other_than_the_oracle_s(name):
     scene = SCENES[name]()
     with Renderer(target_of(scene)) as gl:
         gl.draw(scene.sprites)
-        levels = gl.codes().copy()
+        levels = gl.levels().copy()
         assert gl.gl_error() == "GL_NO_ERROR"
     assert levels.max() <= scene.response.white
     assert_no_worse(levels, name, scene)
@@ -54,7 +54,7 @@ def test_streaks_are_as_right_where_they_might_fail(name):
     scene = STREAKS[name]()
     with Renderer(target_of(scene)) as gl:
         gl.draw(scene.sprites)
-        levels = gl.codes().copy()
+        levels = gl.levels().copy()
         assert gl.gl_error() == "GL_NO_ERROR"
     assert_streaks_are_right(levels, scene)
     assert_streaks_are_right(ExactQuantiser(scene.panel, (SIDE, SIDE), scene.sigma_px).levels(scene.sprites), scene)
@@ -76,7 +76,7 @@ def test_over_frames_no_scene_is_near_rounded_and_a_part_of_a_refresh_costs_noth
     with Renderer(target_of(scene, "temporal")) as gl:
         for number in range(FRAMES):
             gl.draw(scene.sprites, number)
-            frames.append(shown_light(gl.codes(), scene.panel))
+            frames.append(shown_light(gl.levels(), scene.panel))
         assert gl.gl_error() == "GL_NO_ERROR"
     assert_right_over_frames(frames, scene)
 
@@ -87,5 +87,5 @@ def test_no_stars_are_black_also_after_some(uniformity):
     with Renderer(target_of(scene)) as gl:
         for sprites, lit in ((None, False), (scene.sprites, True), (None, False)):
             gl.draw(sprites)
-            assert (gl.codes().max() > 0) == lit
+            assert (gl.levels().max() > 0) == lit
         assert gl.gl_error() == "GL_NO_ERROR"

@@ -49,17 +49,17 @@ def test_a_map_is_added_to_the_stars_encoded_whole_and_gone_in_the_next_frame(me
     with Renderer(target) as gl:
         plain, light = stars(gl, rng), map_of(rng)
         gl.draw(plain, 3)
-        alone, alone_levels = gl.linear().copy(), gl.codes().copy()
+        alone, alone_levels = gl.linear().copy(), gl.levels().copy()
         gl.draw(replace(plain, extended=(light,)), 3)
         both = gl.linear().copy()
         wanted = alone.copy()
         wanted[40:100, 70:160] += 2 * light.image
         assert np.abs(both - wanted).max() <= FLOAT32 * wanted.max()
-        assert np.mean(gl.codes() != oracle(both, panel)) < 1e-4  # ties alone
+        assert np.mean(gl.levels() != oracle(both, panel)) < 1e-4  # ties alone
         gl.draw(plain, 3)
-        assert (gl.linear() == alone).all() and (gl.codes() == alone_levels).all()
+        assert (gl.linear() == alone).all() and (gl.levels() == alone_levels).all()
         gl.draw(replace(plain, extended=(LightMap(light.image, (400, 400)),)), 3)
-        assert (gl.linear() == alone).all() and (gl.codes() == alone_levels).all()
+        assert (gl.linear() == alone).all() and (gl.levels() == alone_levels).all()
         assert gl.gl_error() == "GL_NO_ERROR"
 
 
@@ -74,19 +74,19 @@ def test_exact_adds_each_star_in_light_to_the_dithered_floor(rng):
     with Renderer(target) as gl:
         some = sprites_at(places, np.full(x.size, 200 * step_e), gl.footprint_px)
         gl.draw(some)
-        plain = gl.codes().copy()
+        plain = gl.levels().copy()
         gl.draw(replace(some, extended=(light,)))
-        both = shown_light(gl.codes(), panel)
+        both = shown_light(gl.levels(), panel)
         assert np.allclose(gl.linear().sum(), 0.3 * step_e * light.image.size + 200 * step_e * x.size, rtol=1e-4)
         gl.draw(replace(some, data=some.data[:0], star=some.star[:0], extended=(light,)))
-        floor = gl.codes().copy()
+        floor = gl.levels().copy()
         assert (floor == dither_levels(light.image, panel)).mean() > 1 - 1e-4
         difference = both - shown_light(floor, panel)
         for px, py in np.rint(places).astype(int):
             # Half a step of light: the method's own limit where steps are equal.
             assert abs(difference[py - 9 : py + 10, px - 9 : px + 10].sum() - 200 * step_e) < 0.6 * step_e
         gl.draw(some)
-        assert (gl.codes() == plain).all()
+        assert (gl.levels() == plain).all()
 
 
 def test_temporal_s_floor_is_dithered_with_a_mask_that_turns(rng):
@@ -98,10 +98,10 @@ def test_temporal_s_floor_is_dithered_with_a_mask_that_turns(rng):
         shown = []
         for frame in range(4):
             gl.draw(none, frame)
-            assert np.mean(gl.codes() != dither_levels(gl.linear(), panel, mask_turn(frame))) < 1e-4  # ties alone
-            shown.append(shown_light(gl.codes(), panel))
+            assert np.mean(gl.levels() != dither_levels(gl.linear(), panel, mask_turn(frame))) < 1e-4  # ties alone
+            shown.append(shown_light(gl.levels(), panel))
             gl.draw(replace(few, extended=(light,)), frame)
-            assert shown_light(gl.codes(), panel).sum() > shown[-1].sum() + 0.9 * few.data["electrons_per_s"].sum()
+            assert shown_light(gl.levels(), panel).sum() > shown[-1].sum() + 0.9 * few.data["electrons_per_s"].sum()
         gl.draw(none, 9)
         error = [np.abs(image - gl.linear()).mean() for image in (shown[0], np.mean(shown, axis=0))]
         assert error[1] < error[0] / 3

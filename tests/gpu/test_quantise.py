@@ -73,12 +73,12 @@ def test_levels_are_those_of_the_oracle_pixel_for_pixel(response, count, mapped,
     with Renderer(target) as gl:
         sprites = stars(count, rng, gl.footprint_px)
         gl.draw(sprites)
-        linear, levels = gl.linear(), gl.codes().copy()
+        linear, levels = gl.linear(), gl.levels().copy()
         oracle = {"round": round_levels, "dither": dither_levels}[method](linear, panel)
         assert levels.dtype == oracle.dtype == (np.uint8 if len(response.light) <= 256 else np.uint16)
         assert_same_but_for_ties(levels, oracle, linear, panel)
         gl.draw(sprites, 6)
-        assert np.array_equal(gl.codes(), levels)
+        assert np.array_equal(gl.levels(), levels)
         assert gl.gl_error() == "GL_NO_ERROR"
     assert levels.max() == response.white
 
@@ -93,8 +93,8 @@ def test_where_wings_meet_round_leaves_out_no_more_than_it_says(rng):
     light[:: 4 * each] *= 1e3
     with Renderer(replace(target_of(GREY, "round"), resolution_px=size)) as gl:
         gl.draw(sprites_at(pixels, light, gl.footprint_px))
-        panel, found, whole = gl.target.panel(), gl.codes().copy(), gl.linear().copy()
-        assert np.array_equal(found, gl.codes())  # to read the whole light leaves the levels
+        panel, found, whole = gl.target.panel(), gl.levels().copy(), gl.linear().copy()
+        assert np.array_equal(found, gl.levels())  # to read the whole light leaves the levels
     expected = round_levels(whole, panel)
     left_out = each / CUT_WINGS * GREY.threshold[0] * WHITE
     assert (found <= expected).all()
@@ -112,7 +112,7 @@ def test_a_star_alone_has_the_levels_of_its_whole_light(sigma):
     pixels = np.column_stack([columns * step + columns / 12, rows * step + rows / 12])
     with Renderer(Target((60 * step, 15 * step), sigma, GREY, WHITE)) as gl:
         gl.draw(sprites_at(pixels, 10.0 ** np.linspace(1.5, 7.5, 144), gl.footprint_px))
-        found = gl.codes().copy()
+        found = gl.levels().copy()
         light, panel = gl.linear(), gl.target.panel()
         assert (found >= round_levels(light * np.float32(1 - UNIT), panel)).all()
         assert (found <= round_levels(light * np.float32(1 + UNIT), panel)).all()
@@ -144,7 +144,7 @@ def test_exact_levels_are_those_of_its_quantiser(response, mapped, rng):
         for count in (130, 20):
             sprites = apart(count, rng, gl.footprint_px)
             gl.draw(sprites)
-            found, oracle = gl.codes(), ExactQuantiser(panel, SIZE, SIGMA).levels(sprites)
+            found, oracle = gl.levels(), ExactQuantiser(panel, SIZE, SIGMA).levels(sprites)
             assert (found != oracle).sum() <= OTHER_PIXELS * (oracle > 0).sum() + A_STAR
             light = panel.light_e_per_s().astype(float)
             other = np.nonzero(found != oracle)
@@ -152,7 +152,7 @@ def test_exact_levels_are_those_of_its_quantiser(response, mapped, rng):
             assert (np.abs(light[found] - light[oracle])[other] <= 1.01 * step + ERF * 1e7).all()
             whole = [shown_light(levels, panel).sum() for levels in (found, oracle)]
             assert abs(2.5 * np.log10(whole[0] / whole[1])) < OTHER_FLUX_MAG
-        assert gl.codes().max() > 0
+        assert gl.levels().max() > 0
         assert gl.gl_error() == "GL_NO_ERROR"
 
 
@@ -172,7 +172,7 @@ def test_exact_paths_are_those_of_its_quantiser(rng):
         sprites = replace(data, star=star, per_star=int(nodes.max()))
         gl.draw(sprites)
         wanted = gl.linear().astype(float)
-        for levels in (gl.codes().copy(), ExactQuantiser(panel, SIZE, SIGMA).levels(sprites)):
+        for levels in (gl.levels().copy(), ExactQuantiser(panel, SIZE, SIGMA).levels(sprites)):
             assert abs(shown_light(levels, panel).sum() - wanted.sum()) < 12 * step
             assert np.abs(shown_light(levels, panel) - np.minimum(wanted, WHITE)).max() < np.diff(panel.light_e_per_s()).max()
         assert gl.gl_error() == "GL_NO_ERROR"
@@ -186,7 +186,7 @@ def test_overlapping_stars_are_exact_together(rng):
     sprites = sprites_at(rng.uniform([0, 0], SIZE, (2000, 2)), 10.0 ** rng.uniform(3.5, 5, 2000), footprint_px(SIGMA))
     with Renderer(target) as gl:
         gl.draw(sprites)
-        wanted, found = gl.linear().astype(float), gl.codes().copy()
+        wanted, found = gl.linear().astype(float), gl.levels().copy()
     oracle = ExactQuantiser(panel, SIZE, SIGMA).levels(sprites)
     rounded = round_levels(wanted.astype(np.float32), panel)
     blocks = [
@@ -206,7 +206,7 @@ def test_temporal_goes_on_while_the_frames_numbers_rise(rng):
 
         def seen(frame):
             gl.draw(sprites, frame)
-            return gl.codes().copy()
+            return gl.levels().copy()
 
         first, second, third = (seen(frame) for frame in (3, 4, 9))
         assert not np.array_equal(first, second)
@@ -217,7 +217,7 @@ def test_temporal_goes_on_while_the_frames_numbers_rise(rng):
         gl.begin_anew()
         assert np.array_equal(seen(11), first)
         gl.draw(None, 12)
-        assert gl.codes().max() == 0
+        assert gl.levels().max() == 0
         assert [np.array_equal(seen(frame), codes) for frame, codes in ((13, first), (14, second), (15, third))] == [True] * 3
         assert gl.gl_error() == "GL_NO_ERROR"
 
@@ -233,7 +233,7 @@ def test_without_compute_shaders_exact_is_numpy_s(monkeypatch, rng):
         for count in (300, 20):
             sprites = stars(count, rng, gl.footprint_px)
             gl.draw(sprites)
-            assert np.array_equal(gl.codes(), ExactQuantiser(target.panel(), SIZE, SIGMA).levels(sprites))
+            assert np.array_equal(gl.levels(), ExactQuantiser(target.panel(), SIZE, SIGMA).levels(sprites))
 
 
 def test_exact_and_round_draw_one_sky(rng):
@@ -243,7 +243,7 @@ def test_exact_and_round_draw_one_sky(rng):
         sprites = stars(60, rng, gl.footprint_px)
         gl.draw(sprites)
         rounded = round_levels(gl.linear(), Panel(response, WHITE))
-        assert np.abs(gl.codes().astype(int) - rounded).max() <= 1
+        assert np.abs(gl.levels().astype(int) - rounded).max() <= 1
 
 
 def on_the_gpu(gl, dtype):
@@ -258,12 +258,12 @@ def test_the_texture_on_the_gpu_holds_the_codes(method, name, rng):
     with Renderer(target_of(RESPONSES[name], method)) as gl:
         for count in (200, 3):
             gl.draw(stars(count, rng, gl.footprint_px), 5)
-            codes = gl.codes().copy()
+            codes = gl.levels().copy()
             texture = on_the_gpu(gl, codes.dtype).reshape(codes.shape)
             assert np.array_equal(texture, codes)
             assert codes.max() > 0
         gl.draw(None)
-        assert gl.codes().max() == 0
+        assert gl.levels().max() == 0
         assert not on_the_gpu(gl, np.uint8).any()
         assert gl.gl_error() == "GL_NO_ERROR"
 
@@ -271,7 +271,7 @@ def test_the_texture_on_the_gpu_holds_the_codes(method, name, rng):
 def test_beyond_the_footprints_dither_leaves_black(rng):
     with Renderer(target_of(RESPONSES["srgb8"], "dither")) as gl:
         gl.draw(sprites_at(np.array([[100.3, 50.2]]), np.array([1e9]), gl.footprint_px))
-        y, x = np.nonzero(gl.codes())
+        y, x = np.nonzero(gl.levels())
         assert np.abs(x - 100).max() <= gl.footprint_px // 2
         assert np.abs(y - 50).max() <= gl.footprint_px // 2
 

@@ -37,7 +37,7 @@ def draw(target: Target, pixels: np.ndarray, electrons_per_s: np.ndarray) -> tup
         assert gl.gl_error() == "GL_NO_ERROR"
         sprites = sprites_at(pixels, electrons_per_s, gl.footprint_px)
         gl.draw(sprites)
-        linear, codes = gl.linear().copy(), None if target.response is None else gl.codes().copy()
+        linear, codes = gl.linear().copy(), None if target.response is None else gl.levels().copy()
         assert gl.gl_error() == "GL_NO_ERROR"
     return linear, codes, sprites
 
@@ -158,17 +158,17 @@ def test_nothing_remains_of_the_frame_before(rng):
         many = sprites_at(rng.uniform(0, 190, size=(6000, 2)), np.full(6000, 1e6), gl.footprint_px)
         few = sprites_at(np.array([[30.3, 40.4]]), np.array([1e6]), gl.footprint_px)
         gl.draw(few)
-        alone = gl.linear().copy(), gl.codes().copy()
+        alone = gl.linear().copy(), gl.levels().copy()
         gl.draw(many)
         gl.draw(few)
         assert np.array_equal(gl.linear(), alone[0])
-        assert np.array_equal(gl.codes(), alone[1])
+        assert np.array_equal(gl.levels(), alone[1])
         gl.draw(None)
         assert gl.linear().max() == 0
-        assert gl.codes().max() == 0
+        assert gl.levels().max() == 0
         gl.draw(few)
         gl.draw(replace(few, data=few.data[:0]))
-        assert gl.codes().max() == 0
+        assert gl.levels().max() == 0
         assert gl.gl_error() == "GL_NO_ERROR"
 
 
@@ -188,7 +188,7 @@ def test_frames_of_any_number_of_stars_follow_each_other(read, rng):
             if fresh._passes is not None:
                 fresh._passes.forget()
             fresh.draw(sprites)
-            assert np.array_equal(gl.codes(), fresh.codes())
+            assert np.array_equal(gl.levels(), fresh.levels())
             if read:
                 assert np.array_equal(gl.linear(), fresh.linear())
 
@@ -201,8 +201,8 @@ def test_two_renderers_live_side_by_side():
             b.draw(sprites_at(pixels, np.array([2e6]), b.footprint_px))
             assert a.linear().sum() == pytest.approx(1e6, rel=FLUX_LIMIT)
             assert b.linear().sum() == pytest.approx(2e6, rel=FLUX_LIMIT)
-            assert a.codes().shape == (192, 256)
-            assert b.codes().shape == (64, 64)
+            assert a.levels().shape == (192, 256)
+            assert b.levels().shape == (64, 64)
 
 
 def test_a_sprite_larger_than_the_driver_s_points_is_refused():

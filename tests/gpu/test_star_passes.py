@@ -45,7 +45,7 @@ def test_levels_are_those_of_the_light_but_for_what_lies_beyond_reach(name, unev
     with Renderer(Target(SIZE, SIGMA, response, WHITE, uniformity=map_)) as gl:
         sprites = stars(count, rng)
         gl.draw(sprites)
-        found, whole, panel = gl.codes().copy(), gl.linear().astype(np.float64), gl.target.panel()
+        found, whole, panel = gl.levels().copy(), gl.linear().astype(np.float64), gl.target.panel()
         assert gl.gl_error() == "GL_NO_ERROR"
     lit = response.threshold[0] * WHITE
     over = covering(sprites, SIZE)
@@ -61,11 +61,11 @@ def test_the_order_of_stars_changes_nothing(rng):
     with Renderer(Target(SIZE, SIGMA, PANELS["srgb10"], WHITE)) as gl:
         sprites = stars(3000, rng)
         gl.draw(sprites)
-        first = gl.codes().copy()
+        first = gl.levels().copy()
         for _ in range(3):
             order = rng.permutation(len(sprites))
             gl.draw(replace(sprites, data=sprites.data[order], star=sprites.star[order]))
-            assert np.array_equal(gl.codes(), first)
+            assert np.array_equal(gl.levels(), first)
 
 
 @pytest.mark.parametrize("count", [1, 100, 20_000])
@@ -73,7 +73,7 @@ def test_no_sum_is_too_large_for_its_pixel(count):
     """Any number of stars far brighter than white, on one pixel."""
     with Renderer(Target(SIZE, SIGMA, PANELS["srgb8"], WHITE)) as gl:
         gl.draw(sprites_at(np.full((count, 2), 100.0), np.full(count, 1e12), gl.footprint_px))
-        found = gl.codes()
+        found = gl.levels()
         assert (found[97:104, 97:104] == 255).all()
         assert np.count_nonzero(found) <= gl.footprint_px**2
 
@@ -86,7 +86,7 @@ def test_where_units_are_too_coarse_sprites_are_blended(rng, monkeypatch):
         with Renderer(target) as gl:
             assert gl._units is None or gl._units.unit_for(sprites) is None
             gl.draw(sprites)
-            assert np.array_equal(gl.codes(), round_levels(gl.linear(), target.panel()))
+            assert np.array_equal(gl.levels(), round_levels(gl.linear(), target.panel()))
 
 
 @pytest.mark.parametrize("quantisation", ["round", "exact", "temporal"])
@@ -103,12 +103,12 @@ def test_frames_of_all_kinds_follow_each_other(quantisation, rng):
             assert gl._units.unit_for(many) is not None
         for place, sprites in enumerate(frames):
             gl.draw(sprites)
-            found = gl.codes().copy()
+            found = gl.levels().copy()
             if place % 2:
                 gl.linear()
             with Renderer(target) as fresh:
                 fresh.draw(sprites)
-                assert np.array_equal(found, fresh.codes()), place
+                assert np.array_equal(found, fresh.levels()), place
         assert gl.gl_error() == "GL_NO_ERROR"
 
 
@@ -138,11 +138,11 @@ def test_smaller_sprites_leave_out_no_more_than_they_say(rng):
         sprites = stars(400, rng)
         gl.draw(sprites)
         all_.draw(sprites)
-        found, whole, panel = gl.codes().copy(), all_.linear().astype(np.float64), gl.target.panel()
-        assert np.count_nonzero(found) <= np.count_nonzero(all_.codes())
+        found, whole, panel = gl.levels().copy(), all_.linear().astype(np.float64), gl.target.panel()
+        assert np.count_nonzero(found) <= np.count_nonzero(all_.levels())
         alone = sprites_at(np.array([[100.0, 90.0]]), np.array([1e12]), size)
         gl.draw(alone)
-        assert np.count_nonzero(gl.codes()) == (size - 2) ** 2
+        assert np.count_nonzero(gl.levels()) == (size - 2) ** 2
     wings = covering(sprites, SIZE) * 0.25 * lit + CUT * whole
     assert (found <= round_levels((whole * (1 + FLOAT32)).astype(np.float32), panel)).all()
     assert (found >= round_levels(np.maximum(whole * (1 - FLOAT32) - wings, 0).astype(np.float32), panel)).all()
@@ -155,6 +155,6 @@ def test_the_largest_sprites_are_whole(sigma):
     with Renderer(target) as gl:
         assert (gl._units is not None) == (sigma[0] < 24.5)
         gl.draw(sprites_at(np.array([[200.2, 150.3]]), np.array([1e9]), gl.footprint_px))
-        found, light, panel = gl.codes().copy(), gl.linear(), gl.target.panel()
+        found, light, panel = gl.levels().copy(), gl.linear(), gl.target.panel()
     assert np.count_nonzero(found != round_levels(light, panel)) <= 3
     assert np.count_nonzero(found) > 1000

@@ -57,7 +57,7 @@ def test_over_any_six_frames_every_centroider_finds_the_light_and_the_place(make
         frames = []
         for frame in range(12):
             gl.draw(sprites, frame)
-            frames.append(tiles(shown_light(gl.codes(), target.panel())))
+            frames.append(tiles(shown_light(gl.levels(), target.panel())))
         assert gl.gl_error() == "GL_NO_ERROR"
     for first in (0, 2, 5):
         for part in (0.0, 0.4):
@@ -82,7 +82,7 @@ def test_a_frame_is_the_oracle_s_after_the_same_frame_before(bits, uniformity):
             keep = rng.random(len(every)) < 0.8
             some = replace(every, data=every.data[keep], star=every.star[keep], x_px=every.x_px[keep], y_px=every.y_px[keep])
             gl.draw(some, frame)
-            found, wanted = gl.codes().copy(), oracle.levels(some)
+            found, wanted = gl.levels().copy(), oracle.levels(some)
             assert (found != wanted).sum() <= OTHER_PIXELS * (wanted > 0).sum() + 4
             with gl.context:
                 left = gl._exact_pass.left
@@ -99,7 +99,7 @@ def test_without_compute_shaders_it_is_numpy_s(monkeypatch):
     with Renderer(target) as gl:
         for frame in range(3):
             gl.draw(sprites, frame)
-            assert np.array_equal(gl.codes(), oracle.levels(sprites))
+            assert np.array_equal(gl.levels(), oracle.levels(sprites))
 
 
 def test_paths_keep_their_light_over_the_frames():
@@ -116,7 +116,7 @@ def test_paths_keep_their_light_over_the_frames():
             sprites = stars(np.repeat(x, 5) + at * np.cos(way), np.repeat(y, 5) + at * np.sin(way), SIX_MAG / 5, numbers)
             sprites = replace(sprites, per_star=5)
             gl.draw(sprites, frame)
-            shown[0] += shown_light(gl.codes(), panel)
+            shown[0] += shown_light(gl.levels(), panel)
             shown[1] += shown_light(oracle.levels(sprites), panel)
             sky += linear_image(sprites, SIZE, SIGMA)
         errors = [flux_mag(tiles(image), tiles(sky)) for image in shown]
@@ -136,7 +136,7 @@ def test_frames_with_extended_light_go_on_where_others_stopped():
             lights = (light,) if frame % 2 else ()
             gl.draw(replace(sprites, extended=lights), frame)
             floor.draw(replace(none, extended=lights), frame)
-            added = shown_light(gl.codes(), panel) - shown_light(floor.codes(), panel)
+            added = shown_light(gl.levels(), panel) - shown_light(floor.levels(), panel)
             total += tiles(added).sum((1, 2)) / (WHITE / 3) - 1.3
             assert np.abs(total).max() < 1.0 + 1e-3
         assert gl.gl_error() == "GL_NO_ERROR"

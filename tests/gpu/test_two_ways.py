@@ -51,7 +51,7 @@ def drawn(target: Target, frames: list[Sprites]) -> list[np.ndarray]:
         found = []
         for number, sprites in enumerate(frames):
             gl.draw(sprites, number)
-            found.append(gl.codes().copy())
+            found.append(gl.levels().copy())
         assert gl.gl_error() == "GL_NO_ERROR"
     return found
 

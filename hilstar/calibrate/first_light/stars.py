@@ -26,7 +26,7 @@ from hilstar.charts import BLUE, INK, MUTED, SMALL_PT, chart
 from hilstar.errors import InputError
 from hilstar.monitor.calibration import BUILT_IN
 from hilstar.monitor.quantise import shown_light
-from hilstar.monitor.response import Codes
+from hilstar.monitor.response import Levels
 from hilstar.rotation import to_matrix
 from hilstar.scene.psf import peak_share
 from hilstar.tracker.centroids import Centroids, CentroidSettings, find_stars, noisiest_background
@@ -164,11 +164,11 @@ def see_stars(context: StepContext) -> StarsSeen:
     return seen
 
 
-def _levels(bench: Bench, frame: Frame) -> tuple[Codes, ...]:
+def _levels(bench: Bench, frame: Frame) -> tuple[Levels, ...]:
     """The levels of an attitude: one frame, or with `temporal` those of an exposure."""
     if bench.config.render.quantisation != "temporal":
         return (frame.levels,)
-    return tuple(bench.draw(frame.q_icrs_to_cam, k).levels.copy() for k in range(bench.config.exposure_frames))
+    return tuple(Levels(bench.draw(frame.q_icrs_to_cam, k).levels.copy()) for k in range(bench.config.exposure_frames))
 
 
 def _together(fields: list[StarsSeen], dark: Path) -> StarsSeen:
@@ -193,7 +193,7 @@ def _fullest(bench: Bench) -> list[Frame]:
     return [bench.frame(q) for q in fullest]
 
 
-def _alone(bench: Bench, context: StepContext, frame: Frame, levels: tuple[Codes, ...]) -> ExpectedStars:
+def _alone(bench: Bench, context: StepContext, frame: Frame, levels: tuple[Levels, ...]) -> ExpectedStars:
     """The stars of a frame that are drawn whole and stand alone, where the tracker should see them."""
     camera = tracker_camera(context.file.config.tracker, context.file.folder)
     truth, vectors = frame.truth, bench.stars.directions(frame.star)
@@ -219,7 +219,7 @@ def _alone(bench: Bench, context: StepContext, frame: Frame, levels: tuple[Codes
 
 
 def _codes_mag(
-    bench: Bench, context: StepContext, frame: Frame, levels: tuple[Codes, ...], screen_px: FloatArray
+    bench: Bench, context: StepContext, frame: Frame, levels: tuple[Levels, ...], screen_px: FloatArray
 ) -> FloatArray:
     """How much fainter than wanted the codes are (n,), magnitudes, in what the tracker's window sees of the screen."""
     shown = np.mean([shown_light(each, bench.panel) for each in levels], axis=0)

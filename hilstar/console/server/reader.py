@@ -20,7 +20,7 @@ from hilstar.arrays import FloatArray
 from hilstar.console.messages import HAS_AGE, FrameNumbers, Pace, PictureHead, RunEvent, RunState, Setup
 from hilstar.console.overlay import MAX_STARS, OverlayScene
 from hilstar.console.shared_memory import PICTURE_HEAD_BYTES, SPRITE, SharedMemory
-from hilstar.monitor.response import Codes
+from hilstar.monitor.response import Levels
 from hilstar.rotation import to_radec_roll_deg
 from hilstar.units import NS_PER_MS, NS_PER_S
 
@@ -335,15 +335,15 @@ class PicturePacker:
         return truth, truth | {"grid": grid}
 
 
-def _parts(head: PictureHead, data: bytes) -> tuple[Codes, np.ndarray]:
+def _parts(head: PictureHead, data: bytes) -> tuple[Levels, np.ndarray]:
     count = head.width * head.height
     dtype = np.dtype(f"<u{head.item_bytes}")
     levels = np.frombuffer(data, dtype=dtype, count=count, offset=PICTURE_HEAD_BYTES).reshape(head.height, head.width)
     sprites = np.frombuffer(data, dtype=SPRITE, count=head.sprites, offset=PICTURE_HEAD_BYTES + count * head.item_bytes)
-    return levels, sprites
+    return Levels(levels), sprites
 
 
-def _message(head: PictureHead, levels: Codes) -> bytes:
+def _message(head: PictureHead, levels: Levels) -> bytes:
     """A length, a head in JSON of that many bytes, and the levels."""
     told = {"w": head.width, "h": head.height, "frame": head.frame, "dtype": f"u{head.item_bytes}", "deflate": True}
     text = json.dumps(told).encode()

@@ -362,7 +362,7 @@ class CellMeasurement:
         sprites = pack_sprites(x_px, y_px, rates_e_per_s, near, camera.resolution_px, footprint_px)
         projected = time.perf_counter()
         self.staged.draw(sprites)
-        self.staged.codes()
+        self.staged.levels()
         cull_ms, project_ms = (culled - begin) * 1e3, (projected - culled) * 1e3
         for kind, ms in {"cull": cull_ms, "project": project_ms, **self.staged.stage_ms}.items():
             self.stage_ms.setdefault(kind, []).append(ms)

@@ -264,7 +264,7 @@ def moving_code_fluxes(quantisation: Quantisation) -> FloatArray:
     with Renderer(on) as gl:
         for sprites in moving_star(on, flux):
             gl.draw(sprites)
-            light.append(response.light[gl.codes()].sum())
+            light.append(response.light[gl.levels()].sum())
     return np.array(light) / flux
 
 

@@ -13,7 +13,7 @@ from scipy.special import erf, ndtr
 from hilstar.arrays import Float32Array, FloatArray
 from hilstar.errors import InputError
 from hilstar.monitor.quantise import Panel, Quantisation, shown_light
-from hilstar.monitor.response import Codes, Response, srgb_response
+from hilstar.monitor.response import Levels, Response, srgb_response
 from hilstar.render.context import create_context
 from hilstar.render.reference import linear_image
 from hilstar.render.renderer import Renderer, Target
@@ -354,21 +354,21 @@ class CodeScene:
         return np.asarray(np.minimum(linear_image(self.sprites, (SIDE_PX, SIDE_PX), (self.sigma_px,) * 2), WHITE * even))
 
 
-def codes_of(scene: CodeScene, quantisation: Quantisation) -> Codes:
+def codes_of(scene: CodeScene, quantisation: Quantisation) -> Levels:
     """The codes (h, w) as hilstar draws them."""
     panel, sigma_px = scene.panel, (scene.sigma_px, scene.sigma_px)
     on = Target((SIDE_PX, SIDE_PX), sigma_px, panel.response, WHITE, quantisation, panel.uniformity)
     with Renderer(on) as gl:
         gl.draw(scene.sprites)
-        return gl.codes().copy()
+        return gl.levels().copy()
 
 
-def exact_codes(scene: CodeScene) -> Codes:
+def exact_codes(scene: CodeScene) -> Levels:
     """The codes (h, w) of `exact`."""
     return codes_of(scene, "exact")
 
 
-def error_steps(codes: Codes, scene: CodeScene) -> float:
+def error_steps(codes: Levels, scene: CodeScene) -> float:
     """The error of the groups' light, rms, in the panel's smallest steps."""
     wanted = scene.wanted()
     parts = [

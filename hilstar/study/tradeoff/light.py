@@ -354,7 +354,7 @@ def _quantised(stack: ExitStack, way: Way, bits: int) -> Trial:
 
     def work() -> None:
         renderer.draw(field, next(numbers))
-        renderer.codes()
+        renderer.levels()
 
     is_default = (way.method, way.stealing) == (TAKEN, RenderSettings().bit_stealing)
     each = {f"max_px_{kind}": found.max_px(kind) for kind in FAMILY}
@@ -389,4 +389,4 @@ def depth(stack: ExitStack, quick: bool) -> Trials:
 
 def _frame(renderer: Renderer, stars: Stars, icrs_to_image: FloatArray, camera: Camera) -> None:
     renderer.draw(make_sprites(stars, icrs_to_image, camera, renderer.footprint_px))
-    renderer.codes()
+    renderer.levels()

@@ -68,7 +68,7 @@ def drawn_errors(bench, rng):
     rates = brightest * 10 ** (-0.4 * rng.choice(np.linspace(0, deepest, 5), x_px.size))
     sprites = pack_sprites(x_px, y_px, rates, np.arange(x_px.size), SIZE, bench.renderer.footprint_px)
     bench.renderer.draw(sprites, 0)
-    images = shown_light(bench.renderer.codes(), bench.panel), linear_image(sprites, SIZE, sigma_px)
+    images = shown_light(bench.renderer.levels(), bench.panel), linear_image(sprites, SIZE, sigma_px)
     near = np.arange(-HALF_PX, HALF_PX + 1)
     rows, columns = whole[1][:, None, None] + near[:, None], whole[0][:, None, None] + near
     shown, wanted = (image[rows, columns] for image in images)

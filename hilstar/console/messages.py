@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 import struct
-from typing import Any, Literal, NamedTuple, Self
+from typing import Literal, NamedTuple, Self
 
 import msgspec
+
+from hilstar.console.protocol import PATCH_SHARE, AttitudeSource, Hello, LedgerState
 
 FRAME = struct.Struct("<12qI")
 _PICTURE = struct.Struct("<3q4I4d")
@@ -86,14 +88,6 @@ class ClockState(msgspec.Struct, frozen=True):
     uncertainty_ms: float | None
 
 
-class LedgerState(msgspec.Struct, frozen=True):
-    """The ledger: `failing` says why it cannot be written now, "" where it can."""
-
-    path: str
-    bytes: int
-    failing: str = ""
-
-
 class RunState(msgspec.Struct, frozen=True, kw_only=True):
     """The run at a moment of host time, ns; `alive_ns` is when the frame loop last moved, 0 before it began."""
 
@@ -134,11 +128,6 @@ class RunEvent(msgspec.Struct, frozen=True):
     line: str
 
 
-SWITCHES = ("blank", "pause", "patch", "crosshair", "grid")  # as `run.aids` has them
-CONTROLS = (*SWITCHES, "ledger", "mark", "fault")
-PATCH_SHARE = 0.5  # of white, where an order does not say
-
-
 class Order(msgspec.Struct, kw_only=True):
     """What a page asks for: a name of CONTROLS, what is to be, and by whom."""
 
@@ -169,15 +158,13 @@ class Setup(msgspec.Struct, kw_only=True):
     ("asked"), or not at all, in a session of first light ("session"). A page without a `token` is for anyone who reaches it.
     """
 
-    hello: dict[str, Any]
-    source: dict[str, str]
+    hello: Hello
+    source: AttitudeSource
     hosts: list[str]
     names: list[str]
     any_address: bool
     port: int
     token: str
-    control: bool
     picture_bytes: int
-    refresh_hz: float
     pace: Pace
-    scene: bytes = b""  # a pickled `overlay.Scene`
+    scene: bytes = b""  # a pickled `overlay.OverlayScene`

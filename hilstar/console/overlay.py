@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
+from msgspec import UNSET
 
 from hilstar.arrays import FloatArray
 from hilstar.bench.cameras import tracker_camera
+from hilstar.console.protocol import GridLine, SkyMap, SkyPlace, StarMark, Truth
 from hilstar.render.aids import AidLevels
 from hilstar.rotation import direction_of, to_matrix, to_radec_roll_deg
 from hilstar.scene.camera import Camera
@@ -39,18 +41,18 @@ class CameraMarks:
     monitor: Camera
     tracker: Camera
 
-    def told(self, q_icrs_to_cam: FloatArray | None, grid: bool = False) -> dict[str, Any]:
-        """`boresight_px`, the tracker's outline `tracker_px`, and with `grid` lines as `{label, px}`; pixels of the monitor.
-
-        Without an attitude there are no lines.
-        """
-        told: dict[str, Any] = {
-            "boresight_px": [round(at, PX_DIGITS) for at in self.monitor.boresight_px],
-            "tracker_px": self._tracker_px(),
-        }
+    def truth(self, frame: int, stars: list[StarMark], q_icrs_to_cam: FloatArray | None, grid: bool = False) -> Truth:
+        """The truth of a picture: its stars and the marks; with `grid` and an attitude lines of RA and Dec, too."""
+        lines: list[GridLine] = []
         if grid and q_icrs_to_cam is not None:
-            told["grid"] = list(self._grid(q_icrs_to_cam, self.monitor.cam_to_image @ to_matrix(q_icrs_to_cam)))
-        return told
+            lines = list(self._grid(q_icrs_to_cam, self.monitor.cam_to_image @ to_matrix(q_icrs_to_cam)))
+        return Truth(
+            frame=frame,
+            stars=stars,
+            boresight_px=[round(at, PX_DIGITS) for at in self.monitor.boresight_px],
+            tracker_px=self._tracker_px(),
+            grid=lines if grid else UNSET,
+        )
 
     def on_screen(self, x_px: FloatArray, y_px: FloatArray, beyond: float) -> np.ndarray[Any, Any]:
         """Which places (n,) are on the monitor, or outside by at most that share of its size."""
@@ -66,7 +68,7 @@ class CameraMarks:
         known = np.isfinite(x_px) & np.isfinite(y_px)
         return [[x, y] for x, y in np.column_stack((x_px, y_px))[known].round(PX_DIGITS).tolist()]
 
-    def _grid(self, q_icrs_to_cam: FloatArray, turn: FloatArray) -> Iterator[dict[str, Any]]:
+    def _grid(self, q_icrs_to_cam: FloatArray, turn: FloatArray) -> Iterator[GridLine]:
         """Lines of RA and of Dec that cross the image."""
         ra_deg, dec_deg, _ = to_radec_roll_deg(q_icrs_to_cam)
         radius_deg = math.degrees(self.monitor.field_radius_rad(0.0))
@@ -86,7 +88,7 @@ class CameraMarks:
         for ra in _multiples(ra_deg - wide_deg, ra_deg + wide_deg - 1e-9, ra_step_deg):
             yield from self._line(f"RA {ra % 360:.{_digits(ra_step_deg)}f}\N{DEGREE SIGN}", np.full_like(up, ra), up, turn)
 
-    def _line(self, label: str, ra_deg: FloatArray, dec_deg: FloatArray, turn: FloatArray) -> Iterator[dict[str, Any]]:
+    def _line(self, label: str, ra_deg: FloatArray, dec_deg: FloatArray, turn: FloatArray) -> Iterator[GridLine]:
         """A line over the sky, in pieces where it leaves the image."""
         x_px, y_px = self.monitor.project(direction_of(ra_deg, dec_deg) @ turn.T)
         inside = self.on_screen(x_px, y_px, BEYOND)
@@ -96,7 +98,7 @@ class CameraMarks:
         for begin, end in zip(bounds[::2], bounds[1::2], strict=True):
             if end - begin > 1:
                 places = np.column_stack((x_px[begin:end], y_px[begin:end]))
-                yield {"label": label.replace("-", "\N{MINUS SIGN}"), "px": places.round(1).tolist()}
+                yield GridLine(label.replace("-", "\N{MINUS SIGN}"), places.round(1).tolist())
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,11 +113,8 @@ class Overlay:
         """The monitor's camera."""
         return self.marks.monitor
 
-    def sky(self) -> dict[str, Any]:
-        """Stars and bodies of the whole sky as `[ra_deg, dec_deg, v_mag, label]`, the brightest first, and the screen.
-
-        The screen's corners are directions in cam; `[]` where a lens does not reach them.
-        """
+    def sky(self) -> SkyMap:
+        """Stars and bodies of the whole sky, the brightest first, and the screen's corners."""
         bodies = len(self.stars.bodies)
         order = np.argsort(self.stars.v_mag, kind="stable")
         bright = order[self.stars.v_mag[order] < SKY_FAINTEST_MAG]
@@ -123,13 +122,9 @@ class Overlay:
         rays = self.monitor.rays(*_border(self.monitor.resolution_px, 2))
         known = np.isfinite(rays).all()
         corners = rays / np.linalg.norm(rays, axis=1, keepdims=True) if known else rays[:0]
-        return {
-            "stars": self._places(bright[~is_body]),
-            "moving": self._places(bright[is_body]),
-            "screen_cam": np.round(corners, 6).tolist(),
-        }
+        return SkyMap(self._places(bright[~is_body]), self._places(bright[is_body]), np.round(corners, 6).tolist())
 
-    def _places(self, which: np.ndarray[Any, Any]) -> list[list[Any]]:
+    def _places(self, which: np.ndarray[Any, Any]) -> list[SkyPlace]:
         x, y, z = self.stars.directions(which).T
         ra_deg, dec_deg = np.degrees(np.arctan2(y, x)) % 360.0, np.degrees(np.arctan2(z, np.hypot(x, y)))
         columns = (
@@ -137,7 +132,7 @@ class Overlay:
             dec_deg.round(SKY_DIGITS).tolist(),
             self.stars.v_mag[which].round(2).tolist(),
         )
-        return [list(row) for row in zip(*columns, self._labels(which, ""), strict=True)]
+        return [SkyPlace(*row) for row in zip(*columns, self._labels(which, ""), strict=True)]
 
     def _labels(self, which: np.ndarray[Any, Any], none: str | None = None) -> list[str]:
         """What stands beside a star: a body's name, else its designation; without one `none`, or its HIP number."""
@@ -145,11 +140,8 @@ class Overlay:
         labels = [name or label_of(hip) for name, hip in found]
         return labels if none is None else [none if label.startswith("HIP ") else label for label in labels]
 
-    def truth(self, q_icrs_to_cam: FloatArray, clipped: tuple[int | str, ...] = (), grid: bool = False) -> dict[str, Any]:
-        """What is where in a picture at an attitude: stars as `[x_px, y_px, v_mag, hip, label, clipped]`, the brightest first.
-
-        And the marks (see `Marks.told`). `clipped` are HIP numbers, and names of what has none.
-        """
+    def truth(self, frame: int, q_icrs_to_cam: FloatArray, clipped: tuple[int | str, ...] = ()) -> Truth:
+        """What is where in a picture at an attitude, with the grid; `clipped` are HIP numbers, and names of what has none."""
         turn = self.monitor.cam_to_image @ to_matrix(q_icrs_to_cam)
         near = self.stars.near(turn[2], self.monitor.field_radius_rad(0.0))
         x_px, y_px = self.monitor.project(self.stars.directions(near) @ turn.T)
@@ -166,7 +158,8 @@ class Overlay:
             self._labels(which),
             [int((name or hip) in marked) for name, hip in zip(names, hips, strict=True)],
         )
-        return {"stars": [list(row) for row in zip(*columns, strict=True)]} | self.marks.told(q_icrs_to_cam, grid)
+        stars = [StarMark(*row) for row in zip(*columns, strict=True)]
+        return self.marks.truth(frame, stars, q_icrs_to_cam, grid=True)
 
 
 def overlay_of(bench: Bench) -> Overlay:
@@ -174,14 +167,14 @@ def overlay_of(bench: Bench) -> Overlay:
     return Overlay(CameraMarks(bench.camera, tracker_camera(bench.config.tracker, bench.file.folder)), bench.shown_stars)
 
 
-def catalogue_sky() -> dict[str, Any]:
+def catalogue_sky() -> SkyMap:
     """As `Overlay.sky` without a bench: Hipparcos' bright stars, where they were in 1991."""
     catalog = load_catalog()
     bright = np.argsort(catalog.v_mag, kind="stable")
     bright = bright[catalog.v_mag[bright] < SKY_FAINTEST_MAG]
     columns = (catalog.ra_deg[bright], catalog.dec_deg[bright], catalog.v_mag[bright])
     rows = zip(*(column.round(SKY_DIGITS).tolist() for column in columns), catalog.hip[bright].tolist(), strict=True)
-    return {"stars": [[*numbers, star_names().get(hip, ("", ""))[0]] for *numbers, hip in rows], "moving": [], "screen_cam": []}
+    return SkyMap([SkyPlace(ra, dec, v_mag, star_names().get(hip, ("", ""))[0]) for ra, dec, v_mag, hip in rows])
 
 
 def _border(resolution_px: tuple[int, int], places: int) -> tuple[FloatArray, FloatArray]:
@@ -210,14 +203,14 @@ class OverlayScene:
     """Plain arrays and small objects, which can be pickled.
 
     `hip` and `v_mag` (n,) are those of the bench's shown stars, `names` what those without a HIP number are called, by place,
-    and `sky` is the answer of `GET /sky`. `aids_in_levels` says that levels have the operator's aids in them already.
+    and `sky` is the map of the whole sky. `aids_in_levels` says that levels have the operator's aids in them already.
     """
 
     marks: CameraMarks
     hip: npt.NDArray[np.int32]
     v_mag: npt.NDArray[np.float32]
     names: dict[int, str]
-    sky: dict[str, Any]
+    sky: SkyMap
     aids: AidLevels
     aids_in_levels: bool
 

@@ -25,10 +25,8 @@ from hilstar.console.messages import (
     HAS_AGE,
     MISSING,
     STALE,
-    SWITCHES,
     AttitudeState,
     ClockState,
-    LedgerState,
     Order,
     OrderAnswer,
     Pace,
@@ -38,6 +36,7 @@ from hilstar.console.messages import (
 )
 from hilstar.console.overlay import OverlayScene, overlay_of
 from hilstar.console.page_process import PageProcess
+from hilstar.console.protocol import SWITCHES, AttitudeSource, Hello, LedgerState
 from hilstar.console.shared_memory import MAX_SPRITES, PICTURE_HEAD_BYTES, SPRITE, SharedMemory
 from hilstar.errors import HilstarError, did_you_mean, one_line, printable
 from hilstar.notices import Listener, Notice
@@ -340,29 +339,26 @@ class RunDescription:
 def setup_for(listener: PageListener, control: bool, description: RunDescription, file: BenchFile, picture_bytes: int) -> Setup:
     """The page of a bench file at an address; a run adds to `hello`."""
     monitor = file.config.monitor
-    hello = {
-        "version": __version__,
-        "command": f"hilstar {description.command}",
-        "bench": printable(file.path.name),
-        "renderer": "",
-        "started_utc": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-        "resolution_px": list(monitor.resolution_px),
-        "white_level": 2**monitor.bits - 1,
-        "bits": monitor.bits,
-        "refresh_hz": monitor.refresh_hz,
-        "faults": [],
-    }
+    hello = Hello(
+        version=__version__,
+        command=f"hilstar {description.command}",
+        bench=printable(file.path.name),
+        started_utc=time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        resolution_px=monitor.resolution_px,
+        white_level=2**monitor.bits - 1,
+        bits=monitor.bits,
+        refresh_hz=monitor.refresh_hz,
+        control=control,
+    )
     return Setup(
         hello=hello,
-        source={"kind": description.kind, "endpoint": printable(description.endpoint)},
+        source=AttitudeSource(description.kind, printable(description.endpoint)),
         hosts=listener.hosts,
         names=[name.lower() for name in listener.names],
         any_address=listener.any_address,
         port=listener.port,
         token=listener.token,
-        control=control,
         picture_bytes=picture_bytes,
-        refresh_hz=monitor.refresh_hz,
         pace=description.pace,
     )
 
@@ -419,11 +415,8 @@ def setup_of(listener: PageListener, control: bool, description: RunDescription,
     """What the page's process is told at its start."""
     bench = parts.bench
     setup = setup_for(listener, control, description, bench.file, picture_bytes)
-    setup.hello |= {
-        "renderer": bench.renderer.gl_renderer,
-        "white_level": bench.calibration.response.white,
-        "faults": [] if parts.faults is None else parts.faults.names(),
-    }
+    setup.hello.renderer, setup.hello.white_level = bench.renderer.gl_renderer, bench.calibration.response.white
+    setup.hello.faults = [] if parts.faults is None else parts.faults.names()
     setup.scene = pickle.dumps(scene_of(bench, aids_in_levels=parts.screen is None))
     return setup
 
@@ -500,6 +493,6 @@ def session_page(listener: PageListener, control: bool, file: BenchFile) -> Iter
     memory = SharedMemory.make(picture_bytes)
     feed = SessionPublisher(memory)
     setup = setup_for(listener, control, RunDescription("first-light", "session", "", "session"), file, picture_bytes)
-    setup.hello["session"] = True
+    setup.hello.session = True
     with PageProcess(setup, memory, listener.socket, feed, feed.do):
         yield feed

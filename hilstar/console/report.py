@@ -181,9 +181,8 @@ def _within(pictures: list[dict[str, Any]], size: int) -> list[dict[str, Any]]:
 def _picture(overlay: Overlay, shown: Shown) -> dict[str, Any]:
     """One frame: its levels, packed, and the truth about them."""
     levels = shown.drawn.levels
-    truth = None
-    if shown.attitude is not None:
-        truth = overlay.truth(shown.attitude.q_icrs_to_cam, shown.drawn.clipped_hip, grid=True)
+    attitude = shown.attitude
+    truth = None if attitude is None else overlay.truth(shown.number, attitude.q_icrs_to_cam, shown.drawn.clipped_hip)
     wide = levels.dtype.itemsize == 2
     data = np.ascontiguousarray(levels, dtype="<u2" if wide else "u1").tobytes()
     return {

@@ -1,15 +1,19 @@
 // What an operator may change: each asks the server, says what it answered, and shows the state that comes back, never the wish.
 
 import { byId, make, write } from "./format.js";
+import { SWITCHES } from "./protocol.js";
 
-const SWITCHES = { blank: "Blank", pause: "Pause", patch: "Patch", crosshair: "Crosshair", grid: "Grid", ledger: "Ledger" };
 const CONFIRM_MS = 3000;
 const NAME_KEY = "hilstar.operator";
+
+function titleOf(name) {
+  return name[0].toUpperCase() + name.slice(1);
+}
 
 export class Controls {
   constructor(link) {
     Object.assign(this, { link, on: {}, faultsOn: [], armed: null, allowed: false });
-    for (const name of Object.keys(SWITCHES)) byId(`control-${name}`).addEventListener("click", () => this.press(name));
+    for (const name of SWITCHES) byId(`control-${name}`).addEventListener("click", () => this.press(name));
     byId("mark-form").addEventListener("submit", (event) => this.mark(event));
     byId("fault-form").addEventListener("submit", (event) => this.fault(event));
     byId("fault-name").addEventListener("change", () => this.tellFault());
@@ -45,10 +49,10 @@ export class Controls {
     this.faultsOn = faults || [];
     this.tellFault();
     this.on = { ...operator, ledger: ledger !== null };
-    for (const [name, words] of Object.entries(SWITCHES)) {
+    for (const name of SWITCHES) {
       const button = byId(`control-${name}`);
       button.setAttribute("aria-pressed", String(Boolean(this.on[name])));
-      if (this.armed?.name !== name) write(button, this.wordsOf(name, words));
+      if (this.armed?.name !== name) write(button, this.wordsOf(name));
     }
     const said = byId("ledger-said");
     write(said, ledger === null ? "off: nothing of this run is kept" : ledger.failing ? "cannot be written" : "records this run");
@@ -56,8 +60,8 @@ export class Controls {
   }
 
   // A switch has its name on it, the ledger's button what it does.
-  wordsOf(name, words = SWITCHES[name]) {
-    return name === "ledger" ? (this.on.ledger ? "Stop" : "Start") : words;
+  wordsOf(name) {
+    return name === "ledger" ? (this.on.ledger ? "Stop" : "Start") : titleOf(name);
   }
 
   // Blanking, and ending a ledger, take a second press within three seconds.
@@ -70,7 +74,7 @@ export class Controls {
       return;
     }
     this.disarm();
-    this.send(name, { on }, `${SWITCHES[name]} ${on ? "on" : "off"}`);
+    this.send(name, { on }, `${titleOf(name)} ${on ? "on" : "off"}`);
   }
 
   arm(name) {
@@ -119,7 +123,7 @@ export class Controls {
 
   async send(name, body, done) {
     const { ok, line } = await this.link.control(name, body, byId("operator-name").value.trim());
-    this.say(ok ? `${done}.` : `${SWITCHES[name] || name}: ${line}`, ok);
+    this.say(ok ? `${done}.` : `${SWITCHES.includes(name) ? titleOf(name) : name}: ${line}`, ok);
     return ok;
   }
 

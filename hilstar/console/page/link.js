@@ -1,9 +1,10 @@
 // The connection to the run: one WebSocket that comes back by itself, and requests with the token.
 
+import { GIVES_WAY, SUBPROTOCOL, TOKEN_PROTOCOL } from "./protocol.js";
+
 const RETRY_MS = [200, 400, 800, 1500];
 const SILENT_MS = 3000; // without any message: the socket is given up and opened anew
-const GAVE_WAY = 4013; // the server's code: as many pages are open as it has places for, and another one came
-const GAVE_WAY_MS = 10000;
+const GAVE_WAY_MS = 10000; // as many pages were open as there are places for, and another one came
 const TOKEN_KEY = "hilstar.token";
 
 // The token comes in the address once, and is taken out of it: it would stay in the history and in what is copied.
@@ -26,7 +27,7 @@ export class Link {
   }
 
   connect() {
-    const protocols = ["hilstar", ...(this.token ? [`hilstar.token.${this.token}`] : [])];
+    const protocols = [SUBPROTOCOL, ...(this.token ? [TOKEN_PROTOCOL + this.token] : [])];
     const socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/live`, protocols);
     socket.binaryType = "arraybuffer";
     this.socket = socket;
@@ -39,7 +40,7 @@ export class Link {
       this.onChange();
     });
     socket.addEventListener("message", (event) => this.hear(event.data));
-    socket.addEventListener("close", ({ code }) => this.again(socket, code === GAVE_WAY));
+    socket.addEventListener("close", ({ code }) => this.again(socket, code === GIVES_WAY));
   }
 
   hear(data) {

@@ -8,6 +8,7 @@ import { Link } from "./link.js";
 import { OVERLAYS, Overlays, pictureText, seenStars } from "./overlays.js";
 import { Rows, addEvent, writeAttitude, writeRefusals, writeRun, writeSource } from "./panels.js";
 import { Picture } from "./picture.js";
+import { HISTORY_S, MESSAGE_KEYS } from "./protocol.js";
 import { Sky } from "./sky.js";
 import { ink, startTheme } from "./theme.js";
 
@@ -99,7 +100,7 @@ const HEARD = {
   },
   point(said) {
     points.push(said);
-    const from = said.t_s - (hello?.history_s || 60);
+    const from = said.t_s - (hello?.history_s || HISTORY_S);
     while (points.length && points[0].t_s < from) points.shift();
     redraw("charts");
   },
@@ -116,7 +117,7 @@ const HEARD = {
 };
 
 function onMessage(message) {
-  for (const [kind, said] of Object.entries(message)) HEARD[kind]?.(said);
+  for (const key of MESSAGE_KEYS) if (key in message) HEARD[key](message[key]);
 }
 
 // A picture that comes while the one before is still being unpacked is dropped: the page never falls behind.
@@ -185,7 +186,7 @@ function times() {
 }
 
 function drawCharts() {
-  const span = -(hello?.history_s || 60);
+  const span = -(hello?.history_s || HISTORY_S);
   const t = times();
   health.lately = column("missed").reduce((sum, n) => sum + (n || 0), 0);
   charts.age.set([series("age", "age_ms", "one", 1)], [], span, 0);

@@ -1,6 +1,7 @@
 // What is drawn over the picture: the truth of the same frame, from the bench's own stars and lens.
 
 import { make } from "./format.js";
+import { STAR } from "./protocol.js";
 
 // Key, words on the button, on at first, and the key on the keyboard.
 export const OVERLAYS = [
@@ -231,7 +232,7 @@ export class Overlays {
       for (const dy of [-14, 14]) tries.push([u + gap, v + dy * unit], [u - gap - wide, v + dy * unit]); // beside the boresight's cross
       const found = tries.find(([left, top]) => this.place(text, left, top, 12));
       if (!found) continue;
-      this.write(text, ...found, star[5] && this.on.clipped ? "#ff9a9a" : INK.name);
+      this.write(text, ...found, star[STAR.clipped] && this.on.clipped ? "#ff9a9a" : INK.name);
       written += 1;
     }
   }
@@ -245,7 +246,7 @@ export class Overlays {
     const near = stars.reduce((best, star) => (away(star) < (best ? away(best) : POINTED_PX * unit) ? star : best), null);
     if (!near) return;
     const text = labelAll(near);
-    const [x, y] = view.toCanvas(near[0], near[1]);
+    const [x, y] = view.toCanvas(near[STAR.x_px], near[STAR.y_px]);
     const gap = this.gapOf(near);
     context.font = `${13 * unit}px system-ui, sans-serif`;
     const wide = context.measureText(text).width + 12 * unit;
@@ -265,8 +266,8 @@ function nameOf([, , , hip, label]) {
 }
 
 function labelAll(star) {
-  const magnitude = star[2] === null ? "" : `V ${star[2].toFixed(2).replace("-", "\u2212")}`;
-  return [nameOf(star), magnitude, star[5] ? "clipped" : ""].filter(Boolean).join("  ");
+  const magnitude = star[STAR.v_mag] === null ? "" : `V ${star[STAR.v_mag].toFixed(2).replace("-", "\u2212")}`;
+  return [nameOf(star), magnitude, star[STAR.clipped] ? "clipped" : ""].filter(Boolean).join("  ");
 }
 
 // The names of the stars in the part of the picture that is seen, the brightest first.

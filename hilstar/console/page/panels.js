@@ -1,8 +1,7 @@
 // The numbers beside the picture: attitude, clock, counts, refusals, ledger and events. Names from outside are only ever text.
 
 import { NONE, byId, bytes, clock, count, degreesMinutes, fixed, hours, make, quantity, signed, withUnit, write } from "./format.js";
-
-const MAX_EVENTS = 200;
+import { KEPT_EVENTS } from "./protocol.js";
 
 // Rows of names and values that are made once and then only written into.
 export class Rows {
@@ -91,7 +90,7 @@ export function writeRefusals(refused) {
   );
 }
 
-export function addEvent({ utc, kind, line }, onPick = null, most = MAX_EVENTS) {
+export function addEvent({ utc, kind, line }, onPick = null, most = KEPT_EVENTS) {
   const list = byId("events");
   const row = make("li", "", "");
   const time = make("time", "figure", utc.length > 12 ? clock(utc) : utc);

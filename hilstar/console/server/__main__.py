@@ -23,6 +23,7 @@ import uvicorn
 
 from hilstar.console.messages import Order, OrderAnswer, Setup
 from hilstar.console.overlay import OverlayScene
+from hilstar.console.protocol import PageText
 from hilstar.console.server.app import ORDERED_S, Page
 from hilstar.console.server.connections import PING_S, PONG_S, BoundedHttp, OpenPages, ReadingWebSocket
 from hilstar.console.server.reader import TICK_S, PicturePacker, RunReader
@@ -95,8 +96,8 @@ async def tick(reader: RunReader, memory: SharedMemory, pages: OpenPages) -> Non
     due_s = loop.time()
     while True:
         for event in reader.look():
-            pages.tell({"event": event})
-        pages.tell({"state": reader.state(), "point": reader.points[-1]})
+            pages.tell(PageText(event=event))
+        pages.tell(PageText(state=reader.state(), point=reader.points[-1]))
         hz = pages.picture_hz
         memory.want = PictureRequest(round(NS_PER_S / hz), time.monotonic_ns() + NS_PER_S) if hz else PictureRequest()
         due_s = max(due_s + TICK_S, loop.time())
@@ -119,7 +120,7 @@ async def run(setup: Setup, memory: SharedMemory, channel: OrderChannel, listene
     """Serve until the run has ended."""
     scene: OverlayScene | None = pickle.loads(setup.scene) if setup.scene else None
     reader, pages = RunReader(memory, setup), OpenPages()
-    page = Page(setup, reader, pages, {} if scene is None else scene.sky, channel.give)
+    page = Page(setup, reader, pages, None if scene is None else scene.sky, channel.give)
     config = uvicorn.Config(
         page.app(),
         http=BoundedHttp,

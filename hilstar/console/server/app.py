@@ -25,13 +25,13 @@ from starlette.routing import Route, WebSocketRoute
 from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocket
 
-from hilstar.console.messages import CONTROLS, PATCH_SHARE, Order, OrderAnswer, RunState, Setup
-from hilstar.console.server.connections import OpenPage, OpenPages, json_text
+from hilstar.console.messages import Order, OrderAnswer, RunState, Setup
+from hilstar.console.protocol import CONTROLS, SUBPROTOCOL, TOKEN_PROTOCOL, OrderBody, PageText, SkyMap
+from hilstar.console.server.connections import OpenPage, OpenPages
 from hilstar.console.server.reader import RunReader
 from hilstar.units import NS_PER_S
 
 LOOPBACK = {"localhost", "127.0.0.1", "[::1]"}  # no name server says where they are
-TOKEN_PROTOCOL = "hilstar.token."
 HEADERS = {
     "Cache-Control": "no-store",
     "X-Content-Type-Options": "nosniff",
@@ -142,9 +142,9 @@ class RunCollector(Collector):
 
     def collect(self) -> Iterator[Metric]:
         """Each metric with its value now."""
-        hello, seen = self._reader.hello(), self._reader.seen or RunState(host_ns=0)
-        told = {key: str(hello[key]) for key in ("version", "command", "bench", "renderer")}
-        yield InfoMetricFamily("hilstar_run", "What runs.", value=told)
+        hello, seen = self._reader.setup.hello, self._reader.seen or RunState(host_ns=0)
+        info = {key: str(getattr(hello, key)) for key in ("version", "command", "bench", "renderer")}
+        yield InfoMetricFamily("hilstar_run", "What runs.", value=info)
         yield _gauge("hilstar_healthy", "1 while the sky is right, as GET /health has it.", float(self._reader.health.ok))
         yield _gauge("hilstar_health_since_timestamp_seconds", "Since when that is so.", self._reader.health.since_s)
         yield _counter("hilstar_frames", "Frames shown.", seen.frames)
@@ -190,10 +190,10 @@ class RunCollector(Collector):
             intervals = GaugeMetricFamily(
                 "hilstar_frame_interval_seconds", "Between frames, over the last minute.", labels=["quantile"]
             )
-            for quantile, key in (("0.5", "p50_ms"), ("0.99", "p99_ms")):
-                intervals.add_metric([quantile], pacing[key] * 1e-3)
+            for quantile, interval_ms in (("0.5", pacing.p50_ms), ("0.99", pacing.p99_ms)):
+                intervals.add_metric([quantile], interval_ms * 1e-3)
             yield intervals
-            yield _gauge("hilstar_frame_interval_sd_seconds", "Standard deviation of it.", pacing["sd_ms"] * 1e-3)
+            yield _gauge("hilstar_frame_interval_sd_seconds", "Standard deviation of it.", pacing.sd_ms * 1e-3)
         yield _gauge("hilstar_console_clients", "Pages that are open.", self.clients)
 
 
@@ -230,22 +230,13 @@ ORDERED_S = 30.0  # a ledger on a slow disk
 Give = Callable[[Order], Awaitable[OrderAnswer]]
 
 
-class OrderBody(msgspec.Struct, forbid_unknown_fields=True):
-    """The body of `POST /control/NAME`; a key that is misspelt must not act as if it had not been there."""
-
-    on: bool = True
-    level: float = PATCH_SHARE
-    text: str = ""
-    name: str = ""
-
-
 class Page:
     """What the addresses have to hand."""
 
-    def __init__(self, setup: Setup, reader: RunReader, pages: OpenPages, sky: dict[str, Any], give: Give) -> None:
+    def __init__(self, setup: Setup, reader: RunReader, pages: OpenPages, sky: SkyMap | None, give: Give) -> None:
         self.setup, self.reader, self.pages, self.give = setup, reader, pages, give
         self.guard, self.metrics = Guard(setup), Metrics(reader)
-        self._sky = json_text(sky)
+        self._sky = b"{}" if sky is None else msgspec.json.encode(sky)
         self._files = {path.name: path.read_bytes() for path in PAGE_FOLDER.iterdir() if path.suffix in TYPES}
 
     def app(self) -> ASGIApp:
@@ -274,14 +265,14 @@ class Page:
 
     async def _health(self, _: Request) -> Response:
         found = self.reader.health_now()
-        return JSONResponse(found, 200 if found["ok"] else 503)
+        return Response(msgspec.json.encode(found), 200 if found.ok else 503, media_type="application/json")
 
     async def _metrics(self, _: Request) -> Response:
         self.metrics.collector.clients = len(self.pages)
         return Response(self.metrics.text(), headers={"Content-Type": CONTENT_TYPE})
 
     async def _state(self, _: Request) -> Response:
-        return Response(json_text({"hello": self.reader.hello(), "state": self.reader.state()}), media_type="application/json")
+        return Response(PageText(hello=self.setup.hello, state=self.reader.state()).json(), media_type="application/json")
 
     async def _sky_map(self, _: Request) -> Response:
         return Response(self._sky, media_type="application/json")
@@ -294,7 +285,7 @@ class Page:
         if kind != "application/json":
             return _refusal(415, "send JSON, with Content-Type: application/json")
         data = await _body(request)
-        if not self.setup.control:
+        if not self.setup.hello.control:
             return _refusal(403, "read-only: start hilstar with --control to act from here")
         try:
             body = msgspec.json.decode(data or b"{}", type=OrderBody)
@@ -316,13 +307,11 @@ class Page:
 
     async def _live(self, socket: WebSocket) -> None:
         self.pages.make_room()
-        await socket.accept("hilstar" if "hilstar" in socket.scope["subprotocols"] else None)
+        await socket.accept(SUBPROTOCOL if SUBPROTOCOL in socket.scope["subprotocols"] else None)
         client = OpenPage(socket)
-        client.tell(
-            json_text({"hello": self.reader.hello(), "state": self.reader.state(), "history": list(self.reader.points)})
-        )
+        client.tell(PageText(hello=self.setup.hello, state=self.reader.state(), history=list(self.reader.points)).json())
         for event in list(self.reader.events)[-90:]:
-            client.tell(json_text({"event": event}))
+            client.tell(PageText(event=event).json())
         await self.pages.follow(client)
 
 

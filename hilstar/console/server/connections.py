@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-import json
-import math
 import socket
 import time
 from collections import Counter, OrderedDict, deque
-from typing import Annotated, Any, cast
+from typing import Any, cast
 
 import msgspec
 from h11 import Request
@@ -17,6 +15,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.protocols.websockets.wsproto_impl import WSProtocol
 from wsproto import events
 
+from hilstar.console.protocol import GIVES_WAY, PageMessage, PageText, PageWants
 from hilstar.console.server.reader import PackedPicture
 
 HEAD_S = 5.0  # for a request's head to be whole
@@ -145,28 +144,7 @@ SEND_S = 10.0
 CLOSING_S = 5.0  # for a close to be read
 MAX_WISHES = 40  # in WISHES_S
 WISHES_S = 2.0
-MIN_HZ, MAX_HZ = 0.1, 10.0
 TRY_AGAIN, POLICY = 1013, 1008  # close codes of RFC 6455 and its registry
-GIVES_WAY = 4013  # of our own: the page does not come back at once, or it would take the place of the next
-
-
-class PageWants(msgspec.Struct):
-    """What a page wants besides the state."""
-
-    picture: bool = False
-    hz: Annotated[float, msgspec.Meta(gt=0)] = 8.0
-    grid: bool = False
-
-    @property
-    def picture_hz(self) -> float:
-        """How often it wants pictures, within bounds; 0 for never."""
-        return min(max(self.hz, MIN_HZ), MAX_HZ) if self.picture else 0.0
-
-
-class PageMessage(msgspec.Struct):
-    """A page's message."""
-
-    want: PageWants
 
 
 def wants_of(text: str) -> PageWants | None:
@@ -235,7 +213,7 @@ class OpenPage:
                 await self._send(self._texts.popleft())
             packed, self._packed = self._packed, None
             if packed is not None and self.closing is None:
-                await self._send((packed.truth_with_grid if self.want.grid else packed.truth).decode())
+                await self._send(packed.truth_with_grid if self.want.grid else packed.truth)
                 await self._send(packed.picture)
 
     async def _send(self, data: str | bytes) -> None:
@@ -278,10 +256,10 @@ class OpenPages:
         """How often the one that wants pictures most often wants them; 0 where nobody does."""
         return max((client.want.picture_hz for client in self._clients), default=0.0)
 
-    def tell(self, message: dict[str, Any]) -> None:
+    def tell(self, message: PageText) -> None:
         """Tell all of them; the text is made once."""
         if self._clients:
-            text = json_text(message)
+            text = message.json()
             for client in self._clients:
                 client.tell(text)
 
@@ -326,23 +304,3 @@ async def _close(client: OpenPage, code: int | None = None) -> None:
             await client.socket.close(code or client.closing or TRY_AGAIN)
     except (RuntimeError, TimeoutError, WebSocketDisconnect):
         pass  # it was gone
-
-
-def json_text(message: dict[str, Any]) -> str:
-    """A message as JSON text; a number that JSON does not know is null."""
-    try:
-        return _text(message)
-    except ValueError:
-        return _text(_known(message))
-
-
-def _text(message: Any) -> str:
-    return json.dumps(message, ensure_ascii=False, separators=(",", ":"), allow_nan=False)
-
-
-def _known(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _known(part) for key, part in value.items()}
-    if isinstance(value, list | tuple):
-        return [_known(part) for part in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import json
+import math
 import struct
 import time
 import zlib
@@ -11,14 +11,29 @@ from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Any
 
 import msgspec
 import numpy as np
 
-from hilstar.arrays import FloatArray
 from hilstar.console.messages import HAS_AGE, FrameNumbers, Pace, PictureHead, RunEvent, RunState, Setup
 from hilstar.console.overlay import MAX_STARS, OverlayScene
+from hilstar.console.protocol import (
+    HISTORY_S,
+    KEPT_EVENTS,
+    ChartPoint,
+    EventLine,
+    NewestFrame,
+    Pacing,
+    PageState,
+    PageText,
+    PictureFormat,
+    RunCounts,
+    SenderClock,
+    ShownAttitude,
+    SkyHealth,
+    StarMark,
+    Truth,
+)
 from hilstar.console.shared_memory import PICTURE_HEAD_BYTES, SPRITE, SharedMemory
 from hilstar.monitor.response import Levels
 from hilstar.rotation import to_radec_roll_deg
@@ -117,9 +132,7 @@ class Health:
         self.reasons = found
 
 
-HISTORY_S = 60
 TICK_S = 0.1
-KEPT_EVENTS = 200
 PACING_EACH_S = 1.0
 MIN_INTERVALS = 10
 
@@ -128,70 +141,64 @@ class RunReader:
     """The run as a page is told of it. `look` brings it up to date."""
 
     def __init__(self, memory: SharedMemory, setup: Setup) -> None:
-        self._memory, self._setup = memory, setup
+        self._memory, self.setup = memory, setup
         self.seen: RunState | None = None
         self.health = Health(memory.wrong_since_s or time.time())  # an earlier page of this run may have died
-        self.points: deque[dict[str, Any]] = deque(maxlen=round(HISTORY_S / TICK_S))
-        self.events: deque[dict[str, Any]] = deque(maxlen=KEPT_EVENTS)
+        self.points: deque[ChartPoint] = deque(maxlen=round(HISTORY_S / TICK_S))
+        self.events: deque[EventLine] = deque(maxlen=KEPT_EVENTS)
         self._frame_at = self._event_at = 0
         self._last: FrameNumbers | None = None
         self._intervals_ms: deque[tuple[int, float]] = deque()
         self._received: deque[tuple[int, int, int, int]] = deque()  # host time, packets, frames, missed
         self._begun_ns = time.monotonic_ns()
-        self.pacing: dict[str, float] | None = None
+        self.pacing: Pacing | None = None
         self._pacing_ns = 0
 
-    def look(self) -> list[dict[str, Any]]:
+    def look(self) -> list[EventLine]:
         """Look at the shared memory; the events that are new."""
         now_ns, unix_s = time.monotonic_ns(), time.time()
         found = self._memory.states.last()
         if found is not None:
-            with contextlib.suppress(
-                msgspec.MsgspecError, UnicodeDecodeError
-            ):  # cut, where it was too long: the one before stays
+            with contextlib.suppress(msgspec.MsgspecError, UnicodeDecodeError):  # cut, being too long: the one before stays
                 self.seen = msgspec.json.decode(found[1], type=RunState)
         self.points.append(self._point(now_ns))
         if now_ns - self._pacing_ns > PACING_EACH_S * NS_PER_S:
             self._pacing_ns, self.pacing = now_ns, self._pacing_now(now_ns)
         lately = RecentFrames(0 if self._last is None else self._last.swap_ns, self._missed_share())
-        self.health.update(reasons(self.seen, now_ns, lately, self._setup.refresh_hz, self._setup.pace), unix_s)
+        self.health.update(reasons(self.seen, now_ns, lately, self.setup.hello.refresh_hz, self.setup.pace), unix_s)
         self._memory.wrong_since_s = 0.0 if self.health.ok else self.health.since_s
         return self._new_events()
 
-    def _new_events(self) -> list[dict[str, Any]]:
+    def _new_events(self) -> list[EventLine]:
         new = []
         for number, data in self._memory.events.after(self._event_at):
             self._event_at = number
             with contextlib.suppress(msgspec.MsgspecError, UnicodeDecodeError):
                 event = msgspec.json.decode(data, type=RunEvent)
-                new.append({"utc": utc_text(event.unix_s), "kind": event.kind, "line": event.line})
+                new.append(EventLine(utc_text(event.unix_s), event.kind, event.line))
         self.events.extend(new)
         return new
 
-    def _point(self, now_ns: int) -> dict[str, Any]:
-        """What the frames since the last look add to the charts; null where there were none."""
-        frames = []
+    def _point(self, now_ns: int) -> ChartPoint:
+        """What the frames since the last look add to the charts."""
+        point = ChartPoint(t_s=round((now_ns - self._begun_ns) / NS_PER_S, 3))
         for number, data in self._memory.frames.after(self._frame_at):
             self._frame_at = number
-            frames.append(FrameNumbers.unpack(data))
-        point: dict[str, Any] = {"t_s": round((now_ns - self._begun_ns) / NS_PER_S, 3), "missed": 0, "refused": 0}
-        point |= dict.fromkeys(("age_ms", "interval_ms", "frame_ms"))
-        for frame in frames:
-            self._add(point, frame)
-        point["packets_hz"] = self._rate_hz(now_ns)
+            self._add(point, FrameNumbers.unpack(data))
+        point.packets_hz = self._rate_hz(now_ns)
         return point
 
-    def _add(self, point: dict[str, Any], frame: FrameNumbers) -> None:
+    def _add(self, point: ChartPoint, frame: FrameNumbers) -> None:
         last, self._last = self._last, frame
         if frame.flags & HAS_AGE:
-            _raise(point, "age_ms", frame.age_ns / NS_PER_MS)
-        _raise(point, "frame_ms", (frame.swap_ns - frame.draw_ns) / NS_PER_MS)
+            point.take("age_ms", frame.age_ns / NS_PER_MS)
+        point.take("frame_ms", (frame.swap_ns - frame.draw_ns) / NS_PER_MS)
         if last is None or frame.frames != last.frames + 1:
             return
         interval_ms = (frame.swap_ns - last.swap_ns) / NS_PER_MS
-        _raise(point, "interval_ms", interval_ms)
-        point["missed"] += frame.missed - last.missed
-        point["refused"] += frame.refused - last.refused
+        point.take("interval_ms", interval_ms)
+        point.missed += frame.missed - last.missed
+        point.refused += frame.refused - last.refused
         if not frame.missed_before:
             self._intervals_ms.append((frame.swap_ns, interval_ms))
 
@@ -212,84 +219,75 @@ class RunReader:
         shown, lost = frames_now - frames, missed_now - missed
         return lost / (shown + lost) if shown + lost else 0.0
 
-    def _pacing_now(self, now_ns: int) -> dict[str, float] | None:
+    def _pacing_now(self, now_ns: int) -> Pacing | None:
         while self._intervals_ms and now_ns - self._intervals_ms[0][0] > HISTORY_S * NS_PER_S:
             self._intervals_ms.popleft()
         if len(self._intervals_ms) < MIN_INTERVALS:
             return None
         intervals_ms = np.array([interval for _, interval in self._intervals_ms])
         p50, p99 = np.percentile(intervals_ms, [50, 99])
-        return {"p50_ms": round(p50, 3), "p99_ms": round(p99, 3), "sd_ms": round(float(np.std(intervals_ms, ddof=1)), 4)}
+        return Pacing(round(float(p50), 3), round(float(p99), 3), round(float(np.std(intervals_ms, ddof=1)), 4))
 
-    def hello(self) -> dict[str, Any]:
-        """What a page is told first."""
-        return self._setup.hello | {"history_s": HISTORY_S, "control": self._setup.control}
-
-    def health_now(self) -> dict[str, Any]:
+    def health_now(self) -> SkyHealth:
         """The answer of `GET /health`."""
-        return {"ok": self.health.ok, "since": utc_text(self.health.since_s), "reasons": self.health.reasons}
+        return SkyHealth(self.health.ok, utc_text(self.health.since_s), self.health.reasons)
 
-    def state(self) -> dict[str, Any]:
+    def state(self) -> PageState:
         """The state of the run, as the page shows it."""
         seen = RunState(host_ns=0) if self.seen is None else self.seen
-        ledger, clock = seen.ledger, seen.clock
-        return {
-            "utc": utc_text(time.time()),
-            "health": self.health_now(),
-            "attitude": _attitude(seen),
-            "source": self._setup.source,
-            "clock": None
+        clock = seen.clock
+        return PageState(
+            utc=utc_text(time.time()),
+            health=self.health_now(),
+            attitude=_attitude(seen),
+            source=self.setup.source,
+            clock=None
             if clock is None
-            else {
-                "offset_ms": clock.offset_ms,
-                "sigma_ms": clock.uncertainty_ms,
-                "drift_ppm": clock.drift_ppm,
-                "synchronised": clock.mode in {"exchange", "shared"},
-                "mode": clock.mode,
-            },
-            "counts": {
-                "frames": seen.frames,
-                "missed": seen.missed,
-                "stale": seen.stale_frames,
-                "given_up": seen.given_up,
-                "received": seen.received,
-                "accepted": seen.received - sum(seen.refused.values()),
-                "refused": seen.refused,
-            },
-            "pacing": self.pacing,
-            "frame": {
-                "number": seen.frame,
-                "missing": seen.missing,
-                "stale": seen.stale,
-                "blank": seen.blank,
-                "stars": seen.stars,
-                "clipped": seen.clipped,
-            },
-            "operator": seen.operator,
-            "faults": seen.faults,
-            "ledger": None if ledger is None else {"path": ledger.path, "bytes": ledger.bytes, "failing": ledger.failing},
-        }
+            else SenderClock(
+                offset_ms=clock.offset_ms,
+                sigma_ms=clock.uncertainty_ms,
+                drift_ppm=clock.drift_ppm,
+                synchronised=clock.mode in {"exchange", "shared"},
+                mode=clock.mode,
+            ),
+            counts=RunCounts(
+                frames=seen.frames,
+                missed=seen.missed,
+                stale=seen.stale_frames,
+                given_up=seen.given_up,
+                received=seen.received,
+                accepted=seen.received - sum(seen.refused.values()),
+                refused=seen.refused,
+            ),
+            pacing=self.pacing,
+            frame=NewestFrame(
+                number=seen.frame,
+                missing=seen.missing,
+                stale=seen.stale,
+                blank=seen.blank,
+                stars=seen.stars,
+                clipped=seen.clipped,
+            ),
+            operator=seen.operator,
+            faults=seen.faults,
+            ledger=seen.ledger,
+        )
 
 
-def _raise(point: dict[str, Any], key: str, value: float) -> None:
-    before = point[key]
-    point[key] = round(value if before is None else max(value, before), 3)
-
-
-def _attitude(seen: RunState) -> dict[str, Any] | None:
+def _attitude(seen: RunState) -> ShownAttitude | None:
     attitude = seen.attitude
     if attitude is None:
         return None
     ra_deg, dec_deg, roll_deg = to_radec_roll_deg(np.array(attitude.q))
     rate = attitude.rate_rad_s
-    return {
-        "q": attitude.q,
-        "ra_deg": ra_deg,
-        "dec_deg": dec_deg,
-        "roll_deg": roll_deg,
-        "rate_deg_s": None if rate is None else np.degrees(rate).tolist(),
-        "age_ms": attitude.age_ns / NS_PER_MS,
-    }
+    return ShownAttitude(
+        q=attitude.q,
+        ra_deg=ra_deg,
+        dec_deg=dec_deg,
+        roll_deg=roll_deg,
+        rate_deg_s=None if rate is None else np.degrees(rate).tolist(),
+        age_ms=attitude.age_ns / NS_PER_MS,
+    )
 
 
 LEVEL = 1  # of zlib: a night sky is nearly all zeros
@@ -301,8 +299,8 @@ class PackedPicture:
 
     number: int
     picture: bytes
-    truth: bytes
-    truth_with_grid: bytes
+    truth: str
+    truth_with_grid: str
 
 
 class PicturePacker:
@@ -321,18 +319,17 @@ class PicturePacker:
         levels, sprites = _parts(head, data)
         if self._scene is not None and seen is not None and seen.overlay and not self._scene.aids_in_levels:
             levels = self._scene.aids.laid_over(levels, seen.overlay, seen.patch_share)
-        truth, with_grid = self._truths(head, sprites, seen)
-        return PackedPicture(number, _message(head, levels), _told(truth), _told(with_grid))
+        return PackedPicture(number, _message(head, levels), *self._truths(head, sprites, seen))
 
-    def _truths(self, head: PictureHead, sprites: np.ndarray, seen: RunState | None) -> tuple[dict[str, Any], dict[str, Any]]:
-        """The truth of a picture, without and with the grid."""
-        if self._scene is None:
-            nothing = {"frame": head.frame, "stars": []}
-            return nothing, nothing
-        marks = self._scene.marks.told(_attitude_of_picture(head), grid=True)
-        grid = marks.pop("grid", [])
-        truth = {"frame": head.frame, "stars": stars_of(self._scene, sprites, seen)} | marks
-        return truth, truth | {"grid": grid}
+    def _truths(self, head: PictureHead, sprites: np.ndarray, seen: RunState | None) -> tuple[str, str]:
+        """The truth of a picture as messages, without and with the grid."""
+        truth = Truth(frame=head.frame, stars=[])
+        if self._scene is not None:
+            q = np.array([head.q_w, head.q_x, head.q_y, head.q_z])
+            stars = stars_of(self._scene, sprites, seen)
+            truth = self._scene.marks.truth(head.frame, stars, q if np.isfinite(q).all() else None, grid=True)
+        without_grid = msgspec.structs.replace(truth, grid=msgspec.UNSET)
+        return PageText(truth=without_grid).json(), PageText(truth=truth).json()
 
 
 def _parts(head: PictureHead, data: bytes) -> tuple[Levels, np.ndarray]:
@@ -345,38 +342,22 @@ def _parts(head: PictureHead, data: bytes) -> tuple[Levels, np.ndarray]:
 
 def _message(head: PictureHead, levels: Levels) -> bytes:
     """A length, a head in JSON of that many bytes, and the levels."""
-    told = {"w": head.width, "h": head.height, "frame": head.frame, "dtype": f"u{head.item_bytes}", "deflate": True}
-    text = json.dumps(told).encode()
+    form = PictureFormat(w=head.width, h=head.height, frame=head.frame, dtype=f"u{head.item_bytes}")
+    text = msgspec.json.encode(form)
     return struct.pack("<I", len(text)) + text + zlib.compress(np.ascontiguousarray(levels).tobytes(), LEVEL)
 
 
-def _told(truth: dict[str, Any]) -> bytes:
-    return json.dumps({"truth": truth}, ensure_ascii=False, separators=(",", ":"), allow_nan=False).encode()
-
-
-def stars_of(scene: OverlayScene, sprites: np.ndarray, seen: RunState | None) -> list[list[Any]]:
-    """Where the stars of a picture were drawn, as `[x_px, y_px, v_mag, hip, label, clipped]`, the brightest first."""
+def stars_of(scene: OverlayScene, sprites: np.ndarray, seen: RunState | None) -> list[StarMark]:
+    """Where the stars of a picture were drawn, the brightest first."""
     stars, x_px, y_px = _one_each(sprites)
     clipped = set() if seen is None else set(seen.clipped)
-    rows: list[list[Any]] = []
+    marks = []
     for k in np.argsort(scene.v_mag[stars], kind="stable")[:MAX_STARS].tolist():
-        star = int(stars[k])
+        star, v_mag = int(stars[k]), float(scene.v_mag[stars[k]])
         hip, label = int(scene.hip[star]), scene.label(star)
-        rows.append(
-            [
-                round(x_px[k], 2),
-                round(y_px[k], 2),
-                _number(float(scene.v_mag[star])),
-                hip,
-                label,
-                int((hip or label) in clipped),
-            ]
-        )
-    return rows
-
-
-def _number(magnitude: float) -> float | None:
-    return round(magnitude, 2) if np.isfinite(magnitude) else None
+        known_mag = round(v_mag, 2) if math.isfinite(v_mag) else None
+        marks.append(StarMark(round(x_px[k], 2), round(y_px[k], 2), known_mag, hip, label, int((hip or label) in clipped)))
+    return marks
 
 
 def _one_each(sprites: np.ndarray) -> tuple[np.ndarray, list[float], list[float]]:
@@ -385,8 +366,3 @@ def _one_each(sprites: np.ndarray) -> tuple[np.ndarray, list[float], list[float]
     count = np.bincount(which, minlength=len(stars))
     x_px, y_px = (np.bincount(which, sprites[axis], len(stars)) / np.maximum(count, 1) for axis in ("x_px", "y_px"))
     return stars, x_px.tolist(), y_px.tolist()
-
-
-def _attitude_of_picture(head: PictureHead) -> FloatArray | None:
-    q = np.array([head.q_w, head.q_x, head.q_y, head.q_z])
-    return q if np.isfinite(q).all() else None

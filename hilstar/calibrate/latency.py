@@ -128,8 +128,8 @@ def edges_of(swap_ns: IntArray, level: IntArray) -> Edges:
 MAX_LATENCY_NS = 500 * NS_PER_MS
 MAX_EARLY_NS = 5 * NS_PER_MS  # a clock that is read after the swap may give a time later than that of the light
 BIN_NS = NS_PER_MS
-LIKELY_SHARE = 0.9  # of the best peak: with a square that toggles, the latency repeats every two frames
-AGREEING_SHARE = 0.5  # of the edges that must find their frames
+LIKELY_SHARE = 0.9  # relative to the best peak: with a square that toggles, the latency repeats every two frames
+AGREEING_SHARE = 0.5  # share of the edges that must find their frames
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,7 +27,7 @@ MIN_CODES = 10  # at 1 % noise: 2.2 % of error (95th percentile of the worst cod
 FALSE_ALARM_SIGMA = 4.0  # one run in a few hundred is refused because of noise alone, with 32 levels
 MIN_DRIFT = 0.005  # over the run; less is harmless beside 1 % of noise
 BRIGHT_DOF = 8
-FAINT_ALARM = 0.999  # of the F distribution, before additive noise is believed
+FAINT_ALARM = 0.999  # quantile of the F distribution beyond which additive noise is believed
 NOISE_FLOOR = 1e-4  # relative; no photometer repeats better
 CLIPPED_VALUES = 3  # equal largest readings, over two codes or more
 

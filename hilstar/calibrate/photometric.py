@@ -48,17 +48,17 @@ if TYPE_CHECKING:
 Curve = Callable[[FloatArray], FloatArray]
 
 MIN_KNOTS, MAX_KNOTS = 8, 48
-PRIOR_SIGMA = 1.0  # of the spline's coefficients: e-fold away from the base
-PRIOR_SLOPE_SIGMA = 0.5  # of the exponent, for the shape that has it separately
+PRIOR_SIGMA = 1.0  # sigma of the spline's coefficients: one e-fold away from the base
+PRIOR_SLOPE_SIGMA = 0.5  # sigma of the exponent, for the shape that has it separately
 LOG_STIFFNESS = np.arange(-26.0, 15.0, 2.0)
 MAX_STEPS = 20
-SETTLED = 1e-6  # of log light
+SETTLED = 1e-6  # change of log light
 STIFFNESS_STEPS = 8  # in each of the first ones the stiffness is chosen anew
 ASSUMED_NOISE = 0.01  # where nothing was repeated, until the residuals tell
-BLACK_FLOOR = 1e-6  # of white: how well a black level of zero is known
+BLACK_FLOOR = 1e-6  # relative to white: how well a black level of zero is known
 MIN_RISE = 1e-6  # relative, between neighbouring codes: see `strictly_rising`
-MIN_LIGHT = 1e-9  # of white, at code 1
-MIN_STEP = 1e-12  # of white: it survives a black level a thousand times as bright as white, in float64
+MIN_LIGHT = 1e-9  # relative to white, at code 1
+MIN_STEP = 1e-12  # relative to white: in float64 it survives a black level a thousand times as bright
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +130,7 @@ class _Solution:
     theta: FloatArray
     black: float
     minus_log_evidence: float  # twice
-    covariance: FloatArray  # of theta and of black in units of its sigma
+    covariance: FloatArray  # for theta, and for black in units of its sigma
     design: FloatArray  # (levels - 1, parameters), rows in units of sigma
     misfit: FloatArray  # (levels - 1,), in units of sigma
     above: FloatArray  # (levels - 1,) light above black
@@ -450,7 +450,7 @@ def held_out(fit: ChannelFit) -> HeldOutLevels:
     return HeldOutLevels(100 * rms, 100 * p95, 100 * largest, MAG_PER_RELATIVE * rms, MAG_PER_RELATIVE * largest)
 
 
-MIN_DRAWN_LIGHT = 1e-5  # of white, as drawn
+MIN_DRAWN_LIGHT = 1e-5  # relative to white, as drawn
 COLOURS = {"w": INK, "r": RED, "g": GREEN, "b": BLUE}
 NAMES = {"w": "white", "r": "red", "g": "green", "b": "blue"}
 

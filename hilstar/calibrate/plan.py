@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from hilstar.monitor.window.window import Window
 
 MAX_PLAN_BYTES = 100_000_000
-MIN_PLANNED_LIGHT = 10**-3.2  # of white: a little beyond three decades, so that nothing is extrapolated there
-FAINT_LIGHT = 1e-2  # of white; levels below it are planned twice as often, because the black level drowns them
+MIN_PLANNED_LIGHT = 10**-3.2  # relative to white: a little beyond three decades, so that nothing is extrapolated there
+FAINT_LIGHT = 1e-2  # relative to white; levels below it are planned twice as often, because the black level drowns them
 PATCHES_PER_REFERENCE = 8  # between two rounds of black, half and white
 
 
@@ -109,7 +109,7 @@ def is_filled_in(path: Path) -> bool:
 
 
 KEY_POLL_S = 0.02
-PATCH_SHARE = 1 / 3  # of the screen's smaller side
+PATCH_SHARE = 1 / 3  # relative to the screen's smaller side
 log = logging.getLogger(__name__)
 
 

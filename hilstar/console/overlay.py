@@ -23,14 +23,14 @@ from hilstar.sky.stars import Stars
 if TYPE_CHECKING:
     from hilstar.bench.frame import Bench
 
-MAX_STARS = 400  # of a picture's truth, the brightest
+MAX_STARS = 400  # the brightest of a picture
 SKY_FAINTEST_MAG = 5.5
-SIDE_PLACES = 9  # of the tracker's outline, along each side: a lens bends it
-LINE_PLACES = 49  # of a line of the grid
-LINES_ACROSS = 3  # of the grid, at least, from the image's middle to its corner
+SIDE_PLACES = 9  # points along each side of the tracker's outline, which a lens bends
+LINE_PLACES = 49  # points on a line of the grid
+LINES_ACROSS = 3  # minimum number of grid lines from the image's middle to its corner
 STEPS_DEG = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 15.0, 30.0)
 RA_STEPS_DEG = (*STEPS_DEG, 45.0, 90.0)
-BEYOND = 0.1  # of the image's size: how far lines go on outside of it
+BEYOND = 0.1  # relative to the image's size: how far lines go on outside it
 PX_DIGITS, SKY_DIGITS = 2, 4
 
 

@@ -11,14 +11,14 @@ from typing import Annotated
 import msgspec
 from msgspec import UNSET, UnsetType
 
-SUBPROTOCOL, TOKEN_PROTOCOL = "hilstar", "hilstar.token."  # of the WebSocket; the token comes after the second
+SUBPROTOCOL, TOKEN_PROTOCOL = "hilstar", "hilstar.token."  # the WebSocket's subprotocols; the token follows the second
 GIVES_WAY = 4013  # close code: the page comes back after a while, or it would take the place of the next one
-HISTORY_S = 60  # of points on the charts
+HISTORY_S = 60  # length of the charts
 KEPT_EVENTS = 200
-MIN_HZ, MAX_HZ = 0.1, 10.0  # of pictures
+MIN_HZ, MAX_HZ = 0.1, 10.0  # bounds on a page's rate of pictures
 SWITCHES = ("blank", "pause", "patch", "crosshair", "grid")  # as `run.aids` has them
 CONTROLS = (*SWITCHES, "ledger", "mark", "fault")
-PATCH_SHARE = 0.5  # of white, where an order has no level
+PATCH_SHARE = 0.5  # relative to white, where an order has no level
 
 
 class Hello(msgspec.Struct, kw_only=True):

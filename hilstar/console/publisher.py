@@ -67,7 +67,7 @@ class FramePublisher:
 
     def __init__(self, memory: SharedMemory) -> None:
         self.shown: Shown | None = None
-        self.count = 0  # of frames
+        self.count = 0  # frames so far
         self.running: Running | None = None
         self._memory = memory
         self._picture_due_ns = 0
@@ -363,7 +363,7 @@ def setup_for(listener: PageListener, control: bool, description: RunDescription
     )
 
 
-MAX_NAMES = 5000  # of stars without a HIP number, the brightest
+MAX_NAMES = 5000  # the brightest stars without a HIP number
 
 
 def scene_of(bench: Bench, aids_in_levels: bool) -> OverlayScene:

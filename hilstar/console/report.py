@@ -9,7 +9,7 @@ import re
 import zlib
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -96,7 +96,7 @@ def report_page(data: dict[str, Any]) -> str:
     return html.replace("</head>", f"{head}</head>").replace("</body>", f"{tail}</body>")
 
 
-MAX_BYTES = 3_000_000  # of all pictures together, packed
+MAX_BYTES = 3_000_000  # all pictures together, packed
 NO_BENCH = "the ledger's head has no bench file"
 CAUTION = (
     "Drawn by a bench that is not the run's own: a file that it names has changed since, or another version of hilstar wrote "
@@ -197,7 +197,7 @@ def _picture(overlay: Overlay, shown: Shown) -> dict[str, Any]:
 
 BINS = 60
 HISTOGRAM_SPREAD = 99.9  # percent of the frames that a histogram shows; the worst is in the table
-MIN_RANGE_MS, NARROWEST = 1e-3, 1e-9  # of a histogram, and of its values
+MIN_RANGE_MS, NARROWEST = 1e-3, 1e-9  # smallest range of a histogram, and relative to its values
 MS_DIGITS, S_DIGITS, Q_DIGITS, ANGLE_DIGITS = 3, 3, 8, 6
 MAX_WHO_CHARACTERS = 60
 IN_ARCSEC_DEG = 0.2  # a motion over less is drawn in arcsec
@@ -268,7 +268,8 @@ def verdict(found: RunReport, late: int) -> dict[str, Any]:
     if found.missed_frames:
         reasons.append(f"{found.missed_frames} refresh periods without a frame of their own")
     headline = "Sky was right throughout" if not reasons else "Sky was not right throughout"
-    share = _share(found.right_frames, found.frames + found.missed_frames)  # of the refresh periods in which a frame was due
+    due = found.frames + found.missed_frames  # refresh periods in which a frame was due
+    share = _share(found.right_frames, due)
     return {"ok": not reasons, "headline": headline, "share": share, "reasons": reasons}
 
 
@@ -384,7 +385,15 @@ def _angles(q: FloatArray, turned_rad: FloatArray) -> tuple[FloatArray, tuple[st
     return np.column_stack(((ra_deg - ra_deg.mean()) * np.cos(np.radians(dec_deg)), dec_deg, roll_deg)), NAMES
 
 
-def _radec_roll_deg(q: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+class RadecRoll(NamedTuple):
+    """Pointings, deg, (n,) each."""
+
+    ra_deg: FloatArray
+    dec_deg: FloatArray
+    roll_deg: FloatArray
+
+
+def _radec_roll_deg(q: FloatArray) -> RadecRoll:
     """As `rotation.to_radec_roll_deg`, for an array (n, 4)."""
     w, x, y, z = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
     boresight = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
@@ -393,7 +402,7 @@ def _radec_roll_deg(q: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     right = (1 - 2 * (y * y + z * z)), 2 * (x * y - w * z)
     down = 2 * (x * y + w * z), (1 - 2 * (x * x + z * z))
     east = tuple(-np.sin(ra) * axis[0] + np.cos(ra) * axis[1] for axis in (right, down))
-    return np.degrees(ra), np.degrees(dec), np.degrees(np.arctan2(east[1], -east[0]))
+    return RadecRoll(np.degrees(ra), np.degrees(dec), np.degrees(np.arctan2(east[1], -east[0])))
 
 
 def beside_steady(rows: FloatArray) -> FloatArray:

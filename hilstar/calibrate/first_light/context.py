@@ -19,7 +19,7 @@ from hilstar.errors import InputError
 from hilstar.files import make_directory
 from hilstar.twin.optics import BenchGeometry
 
-MAX_FILL = 0.8  # of the tracker's range: brighter pixels are not trusted
+MAX_FILL = 0.8  # relative to the tracker's range: brighter pixels are not trusted
 HOT_FILL = 0.5  # a pixel that is fuller in the dark is hot, and tells nothing
 LIGHT_STEP = 4.0  # by which the light is lowered while a pattern is too bright
 

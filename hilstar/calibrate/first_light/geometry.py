@@ -7,6 +7,7 @@ import math
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import ndtr
@@ -25,7 +26,7 @@ from hilstar.files import make_directory
 from hilstar.tracker.centroids import CentroidSettings, find_stars, noisiest_background
 from hilstar.twin.optics import BenchGeometry
 
-FIGURE_REACH = 0.25  # of the smaller side of what both screen and tracker have: the figure's corners about the middle
+FIGURE_REACH = 0.25  # half the figure's side, relative to the smaller side of what both screen and tracker have
 
 
 SQUARE_TRACKER_PX = 2.5  # side of its smallest square as the tracker sees it
@@ -70,7 +71,7 @@ def figure_for(geometry: BenchGeometry) -> OrientationFigure:
 
 THRESHOLD_SIGMA = 8.0
 MIN_PIXELS = 3
-MAX_MISFIT = 0.5  # of the nearest of the eight ways round: half way to another one is 1
+MAX_MISFIT = 0.5  # from the nearest of the eight orientations; half way to another one is 1
 MAX_SCALE = 2.0
 MIN_SIZE_STEP = 1.3  # between the pixels of one square and the next
 UPRIGHT = (1, 0, 0, 1)
@@ -195,7 +196,7 @@ START_SIGMA_PX = 1.5
 MIN_SIGMA_PX, MAX_SIGMA_PX = 0.25, 5.0
 MODEL_SIGMAS_PX = np.geomspace(0.15, 6.0, 28)
 MODEL_PHASES = 4  # places of a dot within a tracker pixel, along each axis
-MODEL_POINTS = 9  # of a dot, along each axis
+MODEL_POINTS = 9  # in a dot, along each axis
 
 
 @dataclass(frozen=True, slots=True)
@@ -356,7 +357,15 @@ def focus(context: StepContext) -> StepOutcome:
     return StepOutcome("done", line, figures, files, (picture,))
 
 
-def sharp_dots(context: StepContext) -> tuple[int, Sharpness, DarkSubtracted]:
+class SharpDots(NamedTuple):
+    """The brightest code that does not saturate the tracker, how sharp dots of it are, and their image."""
+
+    code: int
+    sharpness: Sharpness
+    looked: DarkSubtracted
+
+
+def sharp_dots(context: StepContext) -> SharpDots:
     """The brightest code whose dots do not saturate the tracker, and how sharp they are. Raises InputError."""
     geometry, plan, code = context.geometry(), dots_for(context), context.white
     dark = context.read(context.dark())
@@ -367,7 +376,7 @@ def sharp_dots(context: StepContext) -> tuple[int, Sharpness, DarkSubtracted]:
             break
         code = context.darker(code)
     side = DOT_PX * geometry.tracker.focal_length_px / geometry.monitor.focal_length_px
-    return code, sharpness(looked.image, side), looked
+    return SharpDots(code, sharpness(looked.image, side), looked)
 
 
 SQUARE_NAMES = ("corner", "right", "below")
@@ -402,7 +411,7 @@ def draw_focus(path: Path, found: Sharpness, finding: str) -> None:
 
 def geometry(context: StepContext) -> StepOutcome:
     """Fit the lens, the tilt and the alignment to dots, and name the file in the bench file. Raises InputError."""
-    code = int(context.known.get("focus.dot_code", 0)) or sharp_dots(context)[0]
+    code = int(context.known.get("focus.dot_code", 0)) or sharp_dots(context).code
     plan = dots_for(context)
     make_directory(context.folder)
     write_plan(context.folder / "plan.csv", plan)

@@ -224,7 +224,7 @@ class PatternDisplay:
         pause_s = 0.5 / file.config.monitor.refresh_hz if pattern.later else POLL_S
         shown = [_presenter(file, window, codes) for codes in pattern.frames]
         start_s, number = time.monotonic(), 0
-        window.keys.clear()  # of the pattern before
+        window.keys.clear()  # keys pressed during the pattern before
         try:
             while time.monotonic() - start_s < SETTLE_S or not done():
                 shown[number % len(shown)][0].present()
@@ -267,7 +267,7 @@ class PatternDisplay:
 
         monitor = file.config.monitor
         screen_px = orientation_of(monitor).screen_px(monitor.resolution_px)
-        leave_contexts()  # of what drew without a window since
+        leave_contexts()  # contexts made without a window since
         if self._window is None or self._screen_px != screen_px:
             self.close()
             self._window = Window(WindowSettings(screen_px, monitor.bits, monitor.display))
@@ -325,7 +325,7 @@ class GrabCommand:
         shown = stem.parent / PATTERN_FILE
         values = {"{output}": str(output), "{pattern}": str(shown), "{exposure_s}": f"{exposure_s:.9g}"}
         words = [_filled(word, values) for word in self._words]
-        output.unlink(missing_ok=True)  # of an attempt that was interrupted: a command that writes nothing shall not pass
+        output.unlink(missing_ok=True)  # an interrupted attempt may have left one, and a command that writes nothing must fail
         if self._shows and pattern.later:
             raise InputError("a frame of `temporal` is many pictures: leave {pattern} out of --grab, and show them here")
         if self._shows:

@@ -28,9 +28,9 @@ from hilstar.monitor.response import Response
 from hilstar.twin.optics import BenchGeometry
 from hilstar.units import MAG_PER_RELATIVE, magnitude
 
-SHARE = 0.5  # of the smaller side of what both screen and tracker have
+SHARE = 0.5  # relative to the smaller side of what both screen and tracker have
 MAX_SIDE_TRACKER_PX = 200.0
-APART_TRACKER_PX = 8.0  # of the sparsest lattice's dots: their wings do not add up
+APART_TRACKER_PX = 8.0  # distance of the sparsest lattice's dots: their wings do not add up
 MIN_DOTS = 4  # along a side of the sparsest lattice
 MARGIN_SIGMAS, MARGIN_PX = 6.0, 3.0
 PHASES = 24
@@ -122,7 +122,7 @@ def peak_shares(periods: tuple[int, ...], ratio: float, sigma_px: float) -> Floa
     return np.array(shares)
 
 
-FILL = 0.5  # of the tracker's range: what a lattice is chosen for
+FILL = 0.5  # peak that a lattice is chosen for, relative to the tracker's range
 LESS = 4.0  # by which the exposure is shortened while white saturates
 MAX_PROBES = 10
 BLACK = Patch(0, "w")
@@ -264,7 +264,7 @@ class Photometer:
         periods = [chosen.get(patch, self.periods[-1]) for patch in planned]
         lit = [self.field.lit(p) * factor[patch.channel, p] for patch, p in zip(planned, periods, strict=True)]
         light = (sums - under) / (np.array(lit) * self.exposure_s)
-        # Of a black screen each pixel has its light; its repeats tell how well it is known.
+        # On a black screen every pixel glows alike; the repeats tell how well that is known.
         light[dark] = (sums[dark] - sums[dark].mean()) / (self.field.monitor_px * self.exposure_s)
         glow = self._glow()
         if glow is not None:
@@ -298,7 +298,7 @@ class Photometer:
 SEED = 0
 PHOTOMETRY_FILES = ("measured.csv", "response.toml", "response.png", "response-before.png")
 MIN_LEVELS = 10  # as `calibrate photometric` needs
-DIM_LIGHT = 1e-3  # of white: how far down responses are compared
+DIM_LIGHT = 1e-3  # relative to white: how far down responses are compared
 
 
 def photometry(context: StepContext) -> StepOutcome:

@@ -160,7 +160,7 @@ def rewrite(file: BenchFile, changes: Iterable[KeyChange]) -> BenchFile:
 
 
 MAX_PICTURE_BYTES = 50_000_000
-MAX_FILES_LISTED = 12  # of a step; the others are counted, and stand in session.json
+MAX_FILES_LISTED = 12  # per step; the others are counted here, and listed in session.json
 COLOURS = {"done": "#2e7d32", "skipped": "#8a6d00", "failed": "#c62828"}
 PAGE = """<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8"><title>{title}</title>

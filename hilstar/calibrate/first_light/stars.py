@@ -37,7 +37,7 @@ from hilstar.units import ARCSEC_PER_RAD, ERROR_OF_MEDIAN, MAG_PER_RELATIVE, mag
 ATTITUDES, SEED = 40, 3  # random ones, of which the fields with the most stars are shown
 FIELDS = 3
 MIN_STARS = 5
-REACH_PX = 3.0  # of the tracker, as `verify` looks for a star
+REACH_PX = 3.0  # tracker px, as in `verify`
 ALONE_PX = 10.0
 EDGE_PX = 12.0
 THRESHOLD_SIGMA = 8.0
@@ -47,7 +47,7 @@ WINDOW_PX = (2 * RADIUS_PX + 1) ** 2
 SURE_MAG = 0.01  # the noise of a star whose light is judged
 # Beside noise and codes: what the window's sum, the response and the map of uniformity leave on a bench that is measured right.
 KNOWN_TO_MAG = 0.004
-MOST = 0.5  # of the scatter's square: what explains so much is named as its cause
+MOST = 0.5  # a share of the variance this large is named as its cause
 FAR = 3.0  # times their errors: stars that scatter by more do so for a reason
 
 
@@ -248,7 +248,7 @@ def _compared(context: StepContext, looked: DarkSubtracted, wanted: ExpectedStar
     chosen = nearest[matched]
     dn, gain = found.flux[chosen], context.file.config.tracker.detector.gain_e_per_dn
     noise = np.sqrt(np.maximum(dn, 0.0) / gain + WINDOW_PX * noise_dn**2) / np.maximum(dn, 1e-9)
-    # Of a gain that changes from pixel to pixel a star has the mean over its own.
+    # The gain changes from pixel to pixel; a star averages it over its own pixels.
     prnu = context.file.config.tracker.detector.prnu / math.sqrt(4 * math.pi * math.prod(_spot_sigma_px(context)))
     noise = np.hypot(noise, prnu)
     saturated = found.peak[chosen] > MAX_FILL * context.full_dn - looked.floor_dn
@@ -443,7 +443,7 @@ def _against_truth(context: StepContext) -> dict[str, Figure]:
 AGREE_SIGMAS = 3.0  # less is no reason to change the bench file
 
 
-# Of full scale, beside the stars' scatter: nine sessions on six planted benches were 0.002 mag rms from the truth.
+# Error of full scale beside the stars' scatter: nine sessions on six planted benches were 0.002 mag rms from the truth.
 SYSTEMATIC_MAG = 0.002
 
 
@@ -524,7 +524,7 @@ def trend(e_per_s: FloatArray, off_mag: FloatArray) -> tuple[float, float]:
     return slope * span, sigma / np.sqrt(leverage) * span
 
 
-MAX_ARROW_SHARE = 0.06  # of the image's width
+MAX_ARROW_SHARE = 0.06  # relative to the image's width
 
 
 def draw_light(

@@ -6,7 +6,7 @@ import math
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,18 +23,18 @@ from hilstar.tracker.centroids import noisiest_background
 from hilstar.units import MAD_TO_SIGMA, MAG_PER_RELATIVE, magnitude
 
 APART_TRACKER_PX, APART_SIGMAS = 10.0, 16.0  # from dot to dot
-# Of the circle about a dot whose light is summed; at most a quarter of a period, so that no two of the four lattices share a
-# pixel: the dark frame's noise, which all of them have, would else be a pattern from dot to dot, and be taken for the screen's.
+# Radius of the circle about a dot whose light is summed. At most a quarter of a period, so that no two of the four lattices
+# share a pixel: else the dark frame's noise, common to all, would make a pattern that looks like the screen's.
 REACH_SIGMAS, REACH = 4.5, 0.25
-MAX_DOTS = 64  # of a lattice, along the screen's longer side
-SHIFTS = ((0, 0), (1, 0), (0, 1), (1, 1))  # of the four lattices, halves of a period: each dot meets other pixels
+MAX_DOTS = 64  # in a lattice, along the screen's longer side
+SHIFTS = ((0, 0), (1, 0), (0, 1), (1, 1))  # the four lattices' offsets, in half periods: each dot meets other pixels
 MIN_DOTS = 40
-ROWS = (2, 3, 5, 7, 9, 13, 18, 26)  # of the grids that are tried; as many columns as make their fields square
+ROWS = (2, 3, 5, 7, 9, 13, 18, 26)  # rows of the grids that are tried; the columns make their fields square
 DOTS_A_FIELD = 6
 FOLDS, SEED = 5, 0
 SURE = 2.0  # standard errors by which a finer grid has to be better at the dots that were held out
 WILD_SIGMAS = 5.0  # a dot on a dead pixel, or behind dust
-JOINED = 1e-3  # of a dot's weight: what holds fields together that have few
+JOINED = 1e-3  # relative to a dot's weight: smooths fields that have few dots
 WORTH_MAG = 0.002  # rms over the field: less is within what a star's light is known to
 FAR_SIGMAS, FAR_MAG = 3.0, 0.01  # beyond both, dots differ for another reason than their noise
 FILE = "light.toml"
@@ -145,7 +145,7 @@ def _figures(context: StepContext, dots: DotLight, found: UniformityMap, against
 
 def see_dots(context: StepContext) -> tuple[DotLight, tuple[Path, ...]]:
     """The light of dots on lattices over the whole screen, and the images. Raises InputError where too few are seen whole."""
-    geometry, code = context.real_geometry(), int(context.known.get("focus.dot_code", 0)) or sharp_dots(context)[0]
+    geometry, code = context.real_geometry(), int(context.known.get("focus.dot_code", 0)) or sharp_dots(context).code
     ratio = geometry.tracker.focal_length_px / geometry.monitor.focal_length_px
     psf_px = float(context.known.get("focus.psf_sigma_px", np.mean(context.file.config.tracker.psf_sigma_px)))
     sigma_px = math.hypot(psf_px, DOT_PX * ratio / math.sqrt(12))
@@ -190,6 +190,14 @@ def _shown(firsts: list[int], period: int, code: int, resolution_px: tuple[int, 
     return codes
 
 
+class DotSums(NamedTuple):
+    """Column and row of dots, monitor px, and the light of each, DN, (n,) each."""
+
+    column: IntArray
+    row: IntArray
+    light: FloatArray
+
+
 @dataclass(frozen=True, slots=True)
 class _Lattice:
     """The first dot (x, y), how far apart they are, and how far the light of one is summed: monitor px."""
@@ -199,10 +207,8 @@ class _Lattice:
     reach: float
 
 
-def _sums(
-    lattice: _Lattice, resolution_px: tuple[int, int], seen: FloatArray, image: FloatArray, bad: BoolArray
-) -> tuple[IntArray, IntArray, FloatArray]:
-    """Column and row (n,) of each dot without a bad pixel in reach, and the sum of the image in reach of it (n,).
+def _sums(lattice: _Lattice, resolution_px: tuple[int, int], seen: FloatArray, image: FloatArray, bad: BoolArray) -> DotSums:
+    """The dots without a bad pixel in reach, and the sum of the image in reach of each.
 
     `seen` (2, h * w) is where each pixel of the tracker looks, monitor px.
     """
@@ -218,7 +224,7 @@ def _sums(
     whole = np.bincount(index, minlength=total) > 0
     whole &= np.bincount(index, bad.ravel()[inside], minlength=total) == 0
     which = np.flatnonzero(whole)
-    return firsts[0] + which % counts[0] * period, firsts[1] + which // counts[0] * period, light[which]
+    return DotSums(firsts[0] + which % counts[0] * period, firsts[1] + which // counts[0] * period, light[which])
 
 
 def map_of(dots: DotLight, light: FloatArray, resolution_px: tuple[int, int]) -> UniformityMap:

@@ -27,7 +27,7 @@ from hilstar.twin.simulator import background_e
 from hilstar.units import NS_PER_MS, NS_PER_S
 
 SWAP_JITTER_NS, DIODE_JITTER_NS = 20_000, 100_000
-MASKS_KEPT = 8  # of patterns: as many as one step repeats in other codes
+MASKS_KEPT = 8  # masks of patterns: one step repeats this many in other codes
 
 
 class VirtualBench:

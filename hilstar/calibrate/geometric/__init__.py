@@ -1,1 +1,1 @@
-"""Geometric calibration: dots on the monitor, their places in the tracker's image, and the lens between them."""
+"""Geometric calibration: the lens between monitor and tracker, from dots on the monitor and their centroids."""

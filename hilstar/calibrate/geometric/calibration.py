@@ -1,4 +1,4 @@
-"""A geometric calibration from centroids to a file: matched, fitted, chosen, judged."""
+"""A geometric calibration from centroids to a file: matching, fit, checks, summary, notes and chart."""
 
 from __future__ import annotations
 
@@ -7,14 +7,15 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 import hilstar
-from hilstar.arrays import FloatArray, IntArray
+from hilstar.arrays import BoolArray, FloatArray, IntArray
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.cameras import ideal_monitor, tracker_camera
-from hilstar.calibrate.geometric.dots import BoolArray, DotPlan, read_plan
+from hilstar.calibrate.geometric.dots import DotPlan, read_plan
 from hilstar.calibrate.geometric.fit import (
     BROWN_CONRADY,
     PINHOLE,
@@ -45,12 +46,12 @@ from hilstar.rotation import to_matrix
 from hilstar.scene.camera import Lens
 from hilstar.units import ARCSEC_PER_RAD
 
-SEED = 1  # of the random samples of dots: one calibration gives one file
+SEED = 1  # for the random samples of dots: one calibration gives one file
 MIN_DOTS = 12
-KNOWN_MARGIN = 1.01  # of the angle to the corner of the tracker's field
-MIN_CELL_SHARE = 0.33  # of the dots that should be seen in a part of the screen
+KNOWN_MARGIN = 1.01  # relative to the angle to the corner of the tracker's field
+MIN_CELL_SHARE = 0.33  # share of the dots that should be seen in a part of the screen
 CELLS = (("left", "middle", "right"), ("upper", "middle", "lower"))
-REACH_PX = 0.5  # of the tracker: a centroid this close to where the fit puts a dot is that dot
+REACH_PX = 0.5  # tracker px: a centroid this close to a dot's fitted place is that dot
 REACH_SIGMAS = 8.0
 MATCH_ROUNDS = 2
 DEFAULT_NOISE_PX = 0.05
@@ -61,7 +62,7 @@ MISFIT_FLOOR_ARCSEC = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Calibrated:
-    """What was found: the fit, the models it was chosen from, how well it is known, and what became of the centroids."""
+    """The result of a geometric calibration: the fit, the models compared, its uncertainty, and the centroids' fate."""
 
     plan: DotPlan
     problem: Problem
@@ -85,12 +86,12 @@ class Calibrated:
 
     @property
     def noise_arcsec(self) -> float:
-        """The error of one centroid, one axis."""
+        """The error of one centroid along one axis."""
         return self.problem.noise_px * ARCSEC_PER_RAD / self.problem.nominal.tracker.focal_length_px
 
     @property
     def held_out_noise_arcsec(self) -> float:
-        """What noise alone would make of the held-out dots' rms."""
+        """The rms that noise alone would give held-out dots."""
         count = np.bincount(self.data.dot)
         return float(np.sqrt(2 * np.mean(1 / count[count > 0])) * self.noise_arcsec)
 
@@ -153,7 +154,7 @@ def calibrate_geometry(
 
 
 def bounded_to_field(problem: Problem, fit: Fit) -> Fit:
-    """The fit with its lens used no farther than the tracker's field, where that leaves part of the screen unseen."""
+    """The fit with its lens limited to the tracker's field, where part of the screen lies outside of it."""
     geometry, plan = fit.geometry, problem.plan
     monitor = geometry.monitor
     if monitor.lens is None or all(inside.all() for inside in _in_view(plan, problem, fit)):
@@ -171,7 +172,7 @@ def bounded_to_field(problem: Problem, fit: Fit) -> Fit:
 def matched(
     plan: DotPlan, nominal: Nominal, seen: Observed, look: FirstLook, tracker_names: tuple[str, ...] = ()
 ) -> tuple[Problem, MatchedDots]:
-    """The centroids with their dots, by the codes' map first and by a fitted lens then; and what is to be fitted to them.
+    """Match centroids to dots, first by the codes' map and then by a fitted lens; the problem to fit, and its data.
 
     Raises InputError where the image moved between frames.
     """
@@ -189,7 +190,7 @@ def matched(
 
 
 def _names_for(centroids: int) -> tuple[str, ...]:
-    """The largest model that this number of centroids can determine."""
+    """The largest model that so many centroids can determine."""
     for names in (BROWN_CONRADY, RADIAL):
         if centroids > 2 * len(names):
             return names
@@ -197,12 +198,12 @@ def _names_for(centroids: int) -> tuple[str, ...]:
 
 
 def _expected(plan: DotPlan, problem: Problem, fit: Fit) -> int:
-    """How many centroids there would be if none were lost."""
+    """The number of centroids if none were lost."""
     return sum(int(plan.lit[inside].sum()) for inside in _in_view(plan, problem, fit))
 
 
 def _in_view(plan: DotPlan, problem: Problem, fit: Fit) -> list[BoolArray]:
-    """For each pose, which dots (n,) are in the tracker's field."""
+    """For each pose, a mask of the dots (n,) in the tracker's field."""
     geometry = fit.geometry
     directions = geometry.monitor.rays(plan.x_px, plan.y_px)
     width, height = geometry.tracker.resolution_px
@@ -214,7 +215,7 @@ def _in_view(plan: DotPlan, problem: Problem, fit: Fit) -> list[BoolArray]:
 
 
 def _refuse_gaps(calibrated: Calibrated) -> None:
-    """Refuse (InputError) a part of the screen that the tracker should see, and whose dots it did not see."""
+    """Refuse (InputError) a part of the screen in the tracker's field whose dots were not seen."""
     plan, problem = calibrated.plan, calibrated.problem
     wanted = np.any(_in_view(plan, problem, calibrated.fit), axis=0)
     found = np.zeros(len(plan), dtype=bool)
@@ -245,13 +246,13 @@ def _refuse_misfit(calibrated: Calibrated) -> None:
 ONE_POSE = "one pose: the tracker's own distortion and the collimator's cannot be told apart; this file holds both"
 COLLIMATOR_ALONE = "one pose, with the tracker's lens as its flight model says: this file holds the collimator alone"
 ROUND = "poses turned about the boresight do not tell apart distortions that are round about it; they are in the stated error"
-WIDE_INCH = 5.6  # of a panel
-ARROW_SHARE = 0.03  # of the screen's width: the median residual's arrow
+WIDE_INCH = 5.6  # width of a panel
+ARROW_SHARE = 0.03  # length of the median residual's arrow, relative to the screen's width
 
 
 @dataclass(frozen=True, slots=True)
 class DotCounts:
-    """How many dots the plan has, and how many were recognised."""
+    """Dots in the plan, and those recognised."""
 
     planned: int
     recognised: int
@@ -259,7 +260,7 @@ class DotCounts:
 
 @dataclass(frozen=True, slots=True)
 class CentroidCounts:
-    """Centroids given, those that are dots, lit dots in the tracker's field without one, and centroids that are no dot."""
+    """Centroids given and matched, lit dots in the tracker's field without one, and centroids that are no dot."""
 
     given: int
     matched: int
@@ -321,7 +322,7 @@ class GeometricSummary:
 
 
 def summary_of(found: Calibrated, written: tuple[str, ...]) -> GeometricSummary:
-    """A calibration in figures; its field names are the keys of --json."""
+    """The figures of a calibration; their names are the keys of --json."""
     chosen = found.chosen
     return GeometricSummary(
         model=chosen.name,
@@ -382,7 +383,7 @@ def _tracker_value(found: Calibrated, name: str) -> float:
 
 
 def notes_of(found: Calibrated) -> Notes:
-    """What the geometry file says of how well it is known, and of what it was made."""
+    """The geometry file's notes: its errors, and how it was made."""
     error = ErrorTable(
         model=found.chosen.name,
         held_out_rms_arcsec=found.chosen.rms_arcsec,
@@ -407,7 +408,7 @@ def write_calibrated(path: Path, found: Calibrated, plot: Path | None) -> Geomet
 
 
 def lines_of(summary: GeometricSummary) -> list[str]:
-    """The calibration for a person."""
+    """The calibration as lines of text."""
     held, dots, centroids, error = summary.held_out, summary.dots, summary.centroids, summary.error
     rows = [
         ("dots", f"{dots.recognised} of {dots.planned} recognised in {summary.poses} pose(s)"),
@@ -426,7 +427,7 @@ def lines_of(summary: GeometricSummary) -> list[str]:
 
 
 def draw_geometry(path: Path, found: Calibrated) -> None:
-    """The error of a star's place over the screen, and the residuals of the dots as arrows."""
+    """Draw the error of a star's place over the screen, and the dots' residuals as arrows."""
     error, width = found.uncertainty.map_arcsec, found.problem.nominal.monitor.resolution_px[0]
     height = found.problem.nominal.monitor.resolution_px[1]
     finding = (
@@ -452,8 +453,15 @@ def draw_geometry(path: Path, found: Calibrated) -> None:
             axes.grid(visible=False)
 
 
-def _mean_residuals(found: Calibrated) -> tuple[IntArray, FloatArray, FloatArray]:
-    """The dots that were seen, and the mean residual of each, tracker px."""
+class MeanResiduals(NamedTuple):
+    """Dots that were seen, and the mean residual of each along x and y, tracker px; (n,) each."""
+
+    dot: IntArray
+    right_px: FloatArray
+    down_px: FloatArray
+
+
+def _mean_residuals(found: Calibrated) -> MeanResiduals:
     right, down = residuals_px(found.problem, found.fit.geometry, found.data)
     dots, place, count = np.unique(found.data.dot, return_inverse=True, return_counts=True)
-    return dots, np.bincount(place, right) / count, np.bincount(place, down) / count
+    return MeanResiduals(dots, np.bincount(place, right) / count, np.bincount(place, down) / count)

@@ -1,7 +1,7 @@
-"""Frames of dots, each of which blinks its own code, so that a dot in the tracker's image says by itself which it is.
+"""Frames of dots, each of which blinks its own code: a dot in the tracker's image identifies itself.
 
-Each dot is lit in the same number of the frames (its code has that weight, a parity check against a lost or a false one), and
-any two codes differ in as many frames as the number of dots leaves room for.
+Every dot is lit in the same number of frames, which checks for lost and false centroids. Any two codes differ in as many frames
+as the number of dots allows.
 """
 
 from __future__ import annotations
@@ -10,19 +10,18 @@ import csv
 import logging
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.arrays import FloatArray, IntArray
+from hilstar.arrays import BoolArray, FloatArray, IntArray
 from hilstar.bench.config import Monitor
 from hilstar.errors import InputError
 from hilstar.files import as_text, whole_file
 from hilstar.reading import open_lines
 
-BoolArray = npt.NDArray[np.bool_]
-
-LIT_SHARE = 0.4  # of the frames that a dot is lit in
+LIT_SHARE = 0.4  # share of the frames that a dot is lit in
 MIN_LIT, MAX_LIT = 3, 10  # frames that a dot is lit in
 MIN_FRAMES = 8
 MAX_PLAN_BYTES = 20_000_000
@@ -35,7 +34,7 @@ PLAN_ADVICE = "give the plan.csv that `hilstar calibrate dots` wrote"
 
 @dataclass(frozen=True, slots=True)
 class DotPlan:
-    """Dots on the monitor: places (n,) in px, whole numbers, and in which of the frames each is lit (n, frames)."""
+    """Dots on the monitor: places (n,), whole px, and the frames in which each is lit (n, frames)."""
 
     x_px: FloatArray
     y_px: FloatArray
@@ -43,7 +42,7 @@ class DotPlan:
 
     @property
     def frames(self) -> int:
-        """How many frames there are."""
+        """Number of frames."""
         return int(self.lit.shape[1])
 
     def __len__(self) -> int:
@@ -51,7 +50,7 @@ class DotPlan:
 
 
 def plan_dots(resolution_px: tuple[int, int], frames: int, dots_per_frame: int, rng: np.random.Generator) -> DotPlan:
-    """Dots over the whole screen, about `dots_per_frame` lit in each frame. Raises InputError for numbers that give none."""
+    """Plan dots over the whole screen, about `dots_per_frame` lit in each frame. Raises InputError where that is impossible."""
     if frames < MIN_FRAMES:
         raise InputError(f"--frames {frames}: the dots' codes need {MIN_FRAMES} frames or more")
     weight = int(np.clip(round(LIT_SHARE * frames), MIN_LIT, MAX_LIT))
@@ -75,7 +74,7 @@ def _codes_apart(count: int, frames: int, weight: int, distance: int, rng: np.ra
     load = np.zeros(frames)
     for k in range(count):
         for _ in range(TRIES):
-            # The frames with the fewest dots so far come first, by and large.
+            # Frames with few dots so far are more likely to be chosen.
             chosen = np.argsort(load + rng.uniform(0.0, 2.0 + k / frames, frames))[:weight]
             code = np.zeros(frames, dtype=bool)
             code[chosen] = True
@@ -89,7 +88,7 @@ def _codes_apart(count: int, frames: int, weight: int, distance: int, rng: np.ra
 
 
 def _places(resolution_px: tuple[int, int], count: int) -> tuple[FloatArray, FloatArray]:
-    """Whole pixels spread evenly over the screen, its corners first: nothing is extrapolated into a corner."""
+    """Whole pixels spread evenly over the screen, its corners first, so that no corner is extrapolated."""
     k = np.arange(max(count - 4, 0))
     spread = np.column_stack([(0.5 + k / GOLDEN) % 1.0, (0.5 + k / GOLDEN**2) % 1.0])
     corners = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
@@ -111,7 +110,7 @@ def dot_image(plan: DotPlan, frame: int, resolution_px: tuple[int, int], white: 
 
 
 def write_plan(path: Path, plan: DotPlan) -> None:
-    """A row for each lit dot of each frame."""
+    """Write plan.csv, a row for each lit dot of each frame."""
     with whole_file(path) as whole, as_text(whole) as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(PLAN_COLUMNS)
@@ -120,9 +119,16 @@ def write_plan(path: Path, plan: DotPlan) -> None:
                 writer.writerow((frame, int(dot), int(plan.x_px[dot]), int(plan.y_px[dot])))
 
 
+class _PlanRow(NamedTuple):
+    frame: int
+    dot: int
+    x_px: float
+    y_px: float
+
+
 def read_plan(path: Path) -> DotPlan:
-    """A plan as it was written. Raises InputError with the line of what is no plan."""
-    rows: list[tuple[int, int, float, float]] = []
+    """Read plan.csv. Raises InputError with the line that is wrong."""
+    rows: list[_PlanRow] = []
     with open_lines(path, PLAN_ADVICE, MAX_PLAN_BYTES) as lines:
         reader = csv.reader(lines)
         header = tuple(name.strip() for name in next(reader, []))
@@ -136,17 +142,17 @@ def read_plan(path: Path) -> DotPlan:
             except (ValueError, IndexError) as error:
                 wanted = "whole numbers frame and dot, and x_px and y_px are wanted"
                 raise InputError(f"{path}:{reader.line_num}: {','.join(row)[:80]!r}; {wanted}") from error
-            rows.append((frame, dot, x_px, y_px))
+            rows.append(_PlanRow(frame, dot, x_px, y_px))
     if not rows:
         raise InputError(f"{path}: has no dot; {PLAN_ADVICE}")
     return _plan_of(path, rows)
 
 
-def _plan_of(path: Path, rows: list[tuple[int, int, float, float]]) -> DotPlan:
-    dots: IntArray = np.array(sorted({row[1] for row in rows}), dtype=np.intp)
+def _plan_of(path: Path, rows: list[_PlanRow]) -> DotPlan:
+    dots: IntArray = np.array(sorted({row.dot for row in rows}), dtype=np.intp)
     place = {int(dot): k for k, dot in enumerate(dots)}
     x_px, y_px = np.full(len(dots), np.nan), np.full(len(dots), np.nan)
-    lit = np.zeros((len(dots), max(row[0] for row in rows) + 1), dtype=bool)
+    lit = np.zeros((len(dots), max(row.frame for row in rows) + 1), dtype=bool)
     for frame, dot, x, y in rows:
         k = place[dot]
         if lit[k].any() and (x_px[k], y_px[k]) != (x, y):

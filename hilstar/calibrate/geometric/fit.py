@@ -1,4 +1,4 @@
-"""The parameters of a bench's geometry, and the cameras that they make."""
+"""A bench's geometry fitted to centroids of dots: parameters, robust least squares, choice of a model, uncertainty."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ STEPS = {
     "p1": 0.1,
     "p2": 0.1,
 }
-# A turn about the boresight leaves a round lens as it is: what no pose tells apart is taken as the collimator's.
+# A turn about the boresight leaves a radial distortion as it is: what no pose tells apart is taken as the collimator's.
 TRACKER_STEPS = {"tracker_k1": 0.1, "tracker_k2": 1.0, "tracker_p1": 0.1, "tracker_p2": 0.1}
 TRACKER_ROUND = ("tracker_k1", "tracker_k2")
 POSE_STEP_RAD = 0.01
@@ -40,7 +40,7 @@ BROWN_CONRADY = tuple(STEPS)
 
 @dataclass(frozen=True, slots=True)
 class Nominal:
-    """What the bench file says: the ideal camera of the monitor, its rotation, and the tracker's own camera."""
+    """The bench file's geometry: the ideal camera of the monitor, its rotation, and the tracker's own camera."""
 
     monitor: Camera
     q_cam_to_mon: FloatArray
@@ -49,7 +49,7 @@ class Nominal:
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """Which parameters are free, in how many poses of the tracker; poses beyond the first have a rotation each."""
+    """The free parameters and the number of tracker poses; each pose beyond the first has its own rotation."""
 
     names: tuple[str, ...]
     tracker_names: tuple[str, ...] = ()
@@ -63,7 +63,7 @@ class Model:
 
 @dataclass(frozen=True, slots=True)
 class Geometry:
-    """One set of parameters made into cameras: the monitor's, its rotation, the tracker's, and the tracker's poses.
+    """The cameras of one set of parameters.
 
     `q_poses` (poses, 4) turns components in the tracker's axes of the first pose (cam) into those of each pose.
     """
@@ -75,10 +75,10 @@ class Geometry:
 
 
 def geometry_of(model: Model, nominal: Nominal, q_poses: FloatArray, numbers: FloatArray) -> Geometry:
-    """The cameras of parameters (size,); `q_poses` (poses, 4) are those that the poses' rotations are added to."""
+    """The cameras of parameters (size,); the poses' rotations are applied after `q_poses` (poses, 4)."""
     values = dict.fromkeys(STEPS, 0.0)
     values |= {name: STEPS[name] * float(number) for name, number in zip(model.names, numbers, strict=False)}
-    # The foot of the axis moves along with a turn, so that the middle of the image stays: else the two are one long valley.
+    # The principal point moves with a turn, so that the image's middle stays: else the loss has one long valley in the two.
     follow = np.array([values["centre_y"], -values["centre_x"], 0.0]) / nominal.monitor.focal_length_px
     turn = np.array([values["rotation_x"], values["rotation_y"], values["rotation_z"]]) + follow
     q = multiply(from_rotation_vector(turn), nominal.q_cam_to_mon)
@@ -110,7 +110,7 @@ def _tracker_of(model: Model, tracker: Camera, numbers: FloatArray) -> Camera:
 
 
 def directions_in_cam(geometry: Geometry, pose: IntArray, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
-    """Directions (n, 3), cam, of places in the tracker's image, each in its own pose."""
+    """Directions (n, 3) in cam of pixels in the tracker's image, each seen in its own pose."""
     u, v = geometry.tracker.tangents(x_px, y_px)
     rays = np.stack([u, v, np.ones_like(u)], axis=-1)
     back = np.stack([to_matrix(conjugate(q)) for q in geometry.q_poses])
@@ -118,21 +118,21 @@ def directions_in_cam(geometry: Geometry, pose: IntArray, x_px: FloatArray, y_px
 
 
 HUBER = 2.5  # sigmas: beyond it a residual counts by its size, not by its square
-PRIOR = 0.3  # of a parameter's number: so weak that it decides only what the data leave open
-# Of the tracker's round terms, which the collimator's can stand for: free, they run away with what neither lens can follow.
+PRIOR = 0.3  # weight on a parameter's number: so weak that it decides only what the data leave open
+# Weight on the tracker's radial terms, which the collimator's can replace. Free, they follow what neither lens can follow.
 # How well they are known is a matter of PRIOR all the same.
 ROUND_PRIOR = 30.0
 FIELD_PRIOR_PX = 2.0  # sigma of the field's coefficients
-FAR_SIGMA = 1e6  # of a centroid that a trial puts behind the lens
+FAR_SIGMA = 1e6  # residual of a centroid that a trial puts behind the lens
 MAX_STEPS, MAX_DAMPINGS = 60, 12
 FIRST_DAMPING, MIN_DAMPING = 1e-3, 1e-12
 MIN_GAIN = 0.02  # a step that lowers the loss by less, in half squares of a sigma, is the last
-DIFFERENCE = 1e-5  # of a parameter's number
+DIFFERENCE = 1e-5  # step of a parameter's number for its numerical derivative
 
 
 @dataclass(frozen=True, slots=True)
 class MatchedDots:
-    """Centroids (n,) and the dot that each is."""
+    """Centroids (n,) and the number of each one's dot (n,)."""
 
     seen: Observed
     dot: IntArray
@@ -141,13 +141,13 @@ class MatchedDots:
         return len(self.dot)
 
     def at(self, chosen: IntArray) -> MatchedDots:
-        """Those at places `chosen`, or where a mask is true."""
+        """The matches at indices `chosen`."""
         return MatchedDots(self.seen.at(chosen), self.dot[chosen])
 
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """What is fitted: the plan's dots, what the bench file says, and a centroid's error in tracker px."""
+    """The data of a fit: the plan's dots, the bench file's geometry, and a centroid's error in tracker px."""
 
     plan: DotPlan
     nominal: Nominal
@@ -156,13 +156,13 @@ class Problem:
 
     @property
     def monitor_px_per_px(self) -> float:
-        """Monitor pixels to a tracker pixel, in the middle."""
+        """Monitor pixels per tracker pixel, on the axis."""
         return self.nominal.monitor.focal_length_px / self.nominal.tracker.focal_length_px
 
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """A fitted model: its numbers (then the coefficients of its field in x and in y), and the geometry that they make."""
+    """A fitted model: its parameters, followed by the residual field's coefficients in x and in y, and its geometry."""
 
     model: Model
     field_degree: int
@@ -172,10 +172,10 @@ class Fit:
 
 @dataclass(frozen=True, slots=True)
 class _Loss:
-    """What is made smallest: Huber's loss of the residuals of `data` and a weak prior, over the model's numbers and, after
-    them, the coefficients of its field in x and in y.
+    """The function that is minimised: Huber's loss of the residuals plus a weak prior, over the model's parameters and the
+    residual field's coefficients together.
 
-    Both at once: a lens that is fitted alone leans over to what only the field can follow, and leaves it more than there was.
+    Fitted alone, a lens would lean towards what only the field can follow, and leave it more than there was.
     """
 
     problem: Problem
@@ -199,9 +199,9 @@ class _Loss:
         return np.where(np.isfinite(off), off, FAR_SIGMA)
 
     def slopes(self, numbers: FloatArray, off: FloatArray) -> FloatArray:
-        """By each number (2 n, numbers): differences for the lens; for the field, which is linear, its own terms.
+        """Derivatives of the residuals by each number (2 n, numbers).
 
-        The field itself hardly changes along a step of the lens: the differences are taken without it.
+        For the lens they are finite differences without the field, which hardly changes along a step; the field is linear.
         """
         lens = numbers[: self.model.size]
         trials = (lens + step for step in DIFFERENCE * np.eye(len(lens)))
@@ -212,8 +212,7 @@ class _Loss:
             return columns
         terms = np.nan_to_num(field_terms(*_places_px(bare, self.data), bare.monitor.resolution_px, self.field_degree))
         terms /= (self.problem.monitor_px_per_px * self.data.seen.sigma_px * self.problem.noise_px)[:, None]
-        nothing = np.zeros_like(terms)
-        return np.hstack([columns, np.block([[terms, nothing], [nothing, terms]])])
+        return np.hstack([columns, _blocks(terms)])
 
     def prior(self, count: int) -> FloatArray:
         weight = np.where(np.arange(count) < self.model.size, PRIOR, 1 / FIELD_PRIOR_PX)
@@ -228,7 +227,7 @@ class _Loss:
 
 
 def fit(problem: Problem, model: Model, field_degree: int, data: MatchedDots, start: FloatArray | None = None) -> Fit:
-    """The model with its residual field of a total degree (0 for none) that suits `data` best, searched from `start`."""
+    """Fit a model with a residual field of a total degree (0 for none) to `data`, starting at `start`."""
     loss = _Loss(problem, model, field_degree, data)
     if start is None and field_degree:
         lens = fit(problem, model, 0, data).numbers
@@ -264,7 +263,7 @@ def _smallest(loss: _Loss, numbers: FloatArray) -> FloatArray:
 
 
 def residuals_px(problem: Problem, geometry: Geometry, data: MatchedDots) -> tuple[FloatArray, FloatArray]:
-    """How far each centroid is from its dot, x and y (n,), on the monitor but in tracker px."""
+    """Distance of each centroid from its dot along x and y (n,), on the monitor, scaled to tracker px."""
     plan, scale = problem.plan, problem.monitor_px_per_px
     x_px, y_px = _places_px(geometry, data)
     return (x_px - plan.x_px[data.dot]) / scale, (y_px - plan.y_px[data.dot]) / scale
@@ -277,7 +276,7 @@ def residuals_sigma(problem: Problem, geometry: Geometry, data: MatchedDots) -> 
 
 
 def _places_px(geometry: Geometry, data: MatchedDots) -> tuple[FloatArray, FloatArray]:
-    """Where on the monitor, px, the centroids (n,) are by a geometry."""
+    """Places of the centroids (n,) on the monitor by a geometry, px."""
     directions = directions_in_cam(geometry, data.seen.pose, data.seen.x_px, data.seen.y_px)
     return geometry.monitor.project(directions @ geometry.monitor.cam_to_image.T)
 
@@ -288,9 +287,9 @@ def _with_field(geometry: Geometry, field: ResidualField) -> Geometry:
 
 
 def noise_of_repeats(data: MatchedDots) -> float | None:
-    """The error of one centroid, px, one axis, by how dots repeat in several frames; None where none repeats.
+    """The error of one centroid along one axis, px, from the scatter of dots seen in several frames; None where none is.
 
-    It knows nothing of the model. By the median of the absolute deviations: a false match or two do not count.
+    It needs no model. It uses the median absolute deviation, so a few false matches do not count.
     """
     key = data.seen.pose * (int(data.dot.max(initial=0)) + 1) + data.dot
     order = np.argsort(key, kind="stable")
@@ -313,9 +312,9 @@ CENTROIDS_PER_NUMBER = 3.0
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """A model, what it is called, and how far off it is on dots that were held out of its fit.
+    """A model, its name, and its error on dots that were held out of its fit.
 
-    `off_arcsec` (dots, 2) is the mean error of each dot in `dot` (dots,); lengths of it include the centroids' noise.
+    `off_arcsec` (dots, 2) is the mean error of each dot in `dot` (dots,); it includes the centroids' noise.
     """
 
     name: str
@@ -326,17 +325,17 @@ class Candidate:
 
     @property
     def rms_arcsec(self) -> float:
-        """Root of the mean square."""
+        """Root mean square of the held-out error."""
         return float(np.sqrt((self.off_arcsec**2).sum(axis=1).mean()))
 
     @property
     def max_arcsec(self) -> float:
-        """The farthest dot."""
+        """Largest held-out error."""
         return float(np.hypot(*self.off_arcsec.T).max())
 
 
 def candidates(problem: Problem, data: MatchedDots, tracker_names: tuple[str, ...]) -> list[Candidate]:
-    """Every model that the number of centroids allows, simplest first, each held against dots that it was not fitted to."""
+    """Every model that the number of centroids allows, simplest first, each with its error on held-out dots."""
     poses = len(problem.q_poses)
     wanted = [("pinhole", PINHOLE, 0), ("pinhole + k1", RADIAL, 0), ("Brown-Conrady + tilt", BROWN_CONRADY, 0)]
     wanted += [(f"Brown-Conrady + tilt + field of degree {n}", BROWN_CONRADY, n) for n in FIELD_DEGREES]
@@ -347,12 +346,12 @@ def candidates(problem: Problem, data: MatchedDots, tracker_names: tuple[str, ..
         if 2 * len(data) >= CENTROIDS_PER_NUMBER * numbers and len(np.unique(data.dot)) > numbers / 2:
             found.append(held_out(problem, name, model, degree, data))
         if len(found) > 4 and found[-1].rms_arcsec > found[-2].rms_arcsec > found[-3].rms_arcsec:
-            break  # larger fields follow the noise
+            break  # larger fields only follow the noise
     return found
 
 
 def held_out(problem: Problem, name: str, model: Model, degree: int, data: MatchedDots) -> Candidate:
-    """A model held against each dot by a fit to the others, a fifth of the dots at a time."""
+    """The error of a model on each dot by a fit to the others, a fifth of the dots at a time."""
     dots = np.unique(data.dot)
     fold = np.zeros(int(dots.max()) + 1, dtype=np.intp)
     fold[dots] = np.arange(len(dots)) % FOLDS
@@ -370,7 +369,7 @@ def held_out(problem: Problem, name: str, model: Model, degree: int, data: Match
 
 
 def best_of(found: list[Candidate]) -> Candidate:
-    """The simplest whose held-out error no larger model brings clearly down."""
+    """The simplest model whose held-out error no larger model clearly reduces."""
     best = found[0]
     for candidate in found[1:]:
         if candidate.rms_arcsec < GAIN * best.rms_arcsec:
@@ -388,11 +387,11 @@ MAP_PLACES = (17, 11)
 
 @dataclass(frozen=True, slots=True)
 class Uncertainty:
-    """One sigma of each parameter, and of a star's place: `map_arcsec` (rows, columns) over the screen, edges included,
+    """One sigma of each parameter and of a star's place: `map_arcsec` (rows, columns) covers the screen, edges included, with
     NaN where the tracker saw no dots.
 
-    By the covariance of the fit, scaled by its residuals where they are larger than the centroids' noise. What no parameter
-    can follow is not in it: the error on dots that were held out is.
+    From the covariance of the fit, scaled up where its residuals exceed the centroids' noise. Errors that no parameter can
+    follow are not in it; they are in the error of held-out dots.
     """
 
     sigma: dict[str, float]
@@ -400,17 +399,17 @@ class Uncertainty:
 
     @property
     def rms_arcsec(self) -> float:
-        """Over the screen."""
+        """Root mean square over the screen."""
         return float(np.sqrt(np.nanmean(self.map_arcsec**2)))
 
     @property
     def max_arcsec(self) -> float:
-        """At the place that is known worst."""
+        """Largest value on the screen."""
         return float(np.nanmax(self.map_arcsec))
 
 
 def uncertainty_of(problem: Problem, fit: Fit, data: MatchedDots) -> Uncertainty:
-    """The covariance of a fit to `data`, carried to its parameters and over the screen."""
+    """The uncertainty of a fit to `data`, by its covariance."""
     monitor = fit.geometry.monitor
     rows = _slopes_of_residuals(problem, fit, data)
     left = np.abs(residuals_sigma(problem, fit.geometry, data))
@@ -436,7 +435,7 @@ def _map_px(monitor: Camera) -> tuple[FloatArray, FloatArray]:
 
 
 def _varied(problem: Problem, fit: Fit, number: int) -> Geometry:
-    """The geometry with one number a little larger, and the same field."""
+    """The geometry with one parameter slightly larger, and the same residual field."""
     step = np.zeros(fit.model.size)
     step[number] = DIFFERENCE
     varied = geometry_of(fit.model, problem.nominal, problem.q_poses, fit.numbers[: fit.model.size] + step)
@@ -446,7 +445,7 @@ def _varied(problem: Problem, fit: Fit, number: int) -> Geometry:
 
 
 def _slopes_of_residuals(problem: Problem, fit: Fit, data: MatchedDots) -> FloatArray:
-    """By each number of the model and each coefficient of the field: (2 n, numbers)."""
+    """Derivatives of the residuals by each parameter and each coefficient of the field (2 n, numbers)."""
     base = residuals_sigma(problem, fit.geometry, data)
     varied = [residuals_sigma(problem, _varied(problem, fit, k), data) for k in range(fit.model.size)]
     slopes = np.stack([(each - base) / DIFFERENCE for each in varied], axis=1)
@@ -459,7 +458,7 @@ def _slopes_of_residuals(problem: Problem, fit: Fit, data: MatchedDots) -> Float
 
 
 def _slopes_of_places(problem: Problem, fit: Fit, x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """How the places of the directions that now are at (x, y) move by each number, monitor px: (n, numbers) each."""
+    """Derivatives of the places of the directions now at (x, y) by each number, monitor px (n, numbers), along x and y."""
     monitor = fit.geometry.monitor
     directions = monitor.rays(x_px, y_px)
     moved = []

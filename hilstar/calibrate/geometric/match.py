@@ -1,14 +1,15 @@
-"""Which dot each centroid is: by the code that it blinks, with no guess of where it should be.
+"""Matches centroids to dots by the codes that the dots blink, without a guess of where they should be.
 
-A dot stands still, so centroids of different frames at one place are one dot; the frames that it was seen in are its code. The
-codes that match one dot's and no other's give a first map; by that map every centroid is then asked which lit dot it lies on.
+A dot stands still, so centroids of different frames at one place are one dot, and the frames it was seen in are its code. Codes
+that match one dot clearly give a first map; by that map every centroid is matched to the nearest lit dot. An image that is
+mirrored, turned, or moved between frames is refused, with the cure.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -25,17 +26,17 @@ from hilstar.rotation import from_matrix
 from hilstar.units import MAD_TO_SIGMA
 
 MAX_LINK_PX = 3.0  # a dot's centroids lie closer together than this in the tracker's image
-LINK_SHARE = 0.2  # of the distance between dots, if that is less
+LINK_SHARE = 0.2  # relative to the distance between dots, if that is less
 CODE_LEAD = 2  # by how many frames the next code must be farther than the best
 MAX_CODE_ERRORS = 3
-TRIALS = 600  # of four dots each
-INLIER_SHARE = 0.03  # of the screen's width: what a lens may bend a homography by
+TRIALS = 600  # samples of four dots each
+INLIER_SHARE = 0.03  # relative to the screen's width: a lens may bend a homography by this
 MIN_DECODED = 6
 
 
 @dataclass(frozen=True, slots=True)
 class Decoded:
-    """Dots of one pose that their codes name: the dot, and where the tracker saw it (mean of its centroids), (n,) each."""
+    """Dots of one pose that were recognised by their codes: the dot, and the mean of its centroids, (n,) each."""
 
     dot: IntArray
     x_px: FloatArray
@@ -43,7 +44,7 @@ class Decoded:
 
 
 def decode(plan: DotPlan, seen: Observed) -> Decoded:
-    """The dots of one pose whose code is nearest one dot's and clearly farther from every other's; each dot once."""
+    """The dots of one pose whose code is close to one dot's and clearly farther from every other's; each dot once."""
     group = _groups(seen, plan)
     pattern = np.zeros((int(group.max()) + 1 if len(group) else 0, plan.frames), dtype=bool)
     inside = seen.frame < plan.frames
@@ -55,7 +56,7 @@ def decode(plan: DotPlan, seen: Observed) -> Decoded:
     rows = np.arange(len(far))
     best, next_best = far[rows, order[:, 0]], far[rows, order[:, 1]]
     sure = np.flatnonzero((best <= MAX_CODE_ERRORS) & (next_best >= best + CODE_LEAD) | (best == 0))
-    # Of several places that blink one dot's code the one with the fewest errors is it, if there is one such.
+    # Where several places blink one dot's code, the one with the fewest errors is taken.
     by_dot: dict[int, list[int]] = {}
     for k in sure:
         by_dot.setdefault(int(order[k, 0]), []).append(int(k))
@@ -67,7 +68,7 @@ def decode(plan: DotPlan, seen: Observed) -> Decoded:
 
 
 def _groups(seen: Observed, plan: DotPlan) -> IntArray:
-    """A number for each centroid: those close to each other share one."""
+    """A group number for each centroid; centroids close to each other share one."""
     places = np.column_stack([seen.x_px, seen.y_px])
     area = float(np.prod(np.ptp(places, axis=0))) if len(places) else 0.0
     link_px = min(MAX_LINK_PX, LINK_SHARE * np.sqrt(area / max(len(plan), 1)))
@@ -94,7 +95,7 @@ def homography(u: FloatArray, v: FloatArray, x: FloatArray, y: FloatArray) -> Fl
 
 
 def _normal(x: FloatArray, y: FloatArray) -> FloatArray:
-    """A similarity (3, 3) that brings points to the origin, at a mean square distance of 2."""
+    """A similarity (3, 3) that centres points on the origin with a mean square distance of 2."""
     scale = np.sqrt(2.0) / max(float(np.sqrt(np.var(x) + np.var(y))), 1e-300)
     return np.array([[scale, 0.0, -scale * x.mean()], [0.0, scale, -scale * y.mean()], [0.0, 0.0, 1.0]])
 
@@ -117,7 +118,7 @@ class FirstMap:
 def first_map(
     tangents: tuple[FloatArray, FloatArray], dots_px: tuple[FloatArray, FloatArray], width_px: float, rng: np.random.Generator
 ) -> FirstMap | None:
-    """The map that most decoded dots agree with (random samples of four, Fischler and Bolles 1981); None where few do."""
+    """The map that most decoded dots fit (RANSAC with samples of four, Fischler and Bolles 1981); None where few fit any."""
     (u, v), (x, y) = tangents, dots_px
     if len(u) < MIN_DECODED:
         return None
@@ -144,11 +145,11 @@ def _inliers(
         return np.asarray(np.hypot(x - dots_px[0], y - dots_px[1]) < INLIER_SHARE * width_px)
 
 
-FIRST_REACH = 0.03  # of the screen's width, by the first map, which knows no lens
-MIN_MOTION_PX = 0.05  # of the tracker
+FIRST_REACH = 0.03  # relative to the screen's width; the first map knows no lens
+MIN_MOTION_PX = 0.05  # tracker px
 POLISH_ROUNDS = 10
 MAX_CHANCE = 12.0  # sigmas of a frame's mean: the largest of some 30 differences of medians, with room
-MOTION_NOISE = 3.0  # of a centroid: less is no matter, since every frame has many
+MOTION_NOISE = 3.0  # times a centroid's noise: less does not matter, since every frame has many
 ORIENTATIONS = {
     (1, 0, 0, 1): None,
     (-1, 0, 0, 1): "mirrored left to right: set [monitor] flip_x the other way",
@@ -169,7 +170,7 @@ ORDERS: dict[str, Callable[[IntArray, int], IntArray]] = {
 
 @dataclass(frozen=True, slots=True)
 class FirstLook:
-    """What the codes alone say: each pose's map from the tracker's tangents to monitor px, and its rotation (poses, 4)."""
+    """The result of the codes alone: each pose's map from tracker tangents to monitor px, and its rotation (poses, 4)."""
 
     maps: tuple[FloatArray, ...]
     q_poses: FloatArray
@@ -249,7 +250,7 @@ def _refuse_orientation(nominal: Nominal, matrix: FloatArray) -> None:
 
 
 def match_by_maps(plan: DotPlan, nominal: Nominal, seen: Observed, look: FirstLook) -> MatchedDots:
-    """Each centroid with the lit dot that the first maps put it nearest to, within what a lens may do."""
+    """Match each centroid to the lit dot nearest to it by the first maps, within what a lens may bend."""
     x_px, y_px = np.full(len(seen), np.nan), np.full(len(seen), np.nan)
     u, v = nominal.tracker.tangents(seen.x_px, seen.y_px)
     for pose, matrix in enumerate(look.maps):
@@ -259,7 +260,7 @@ def match_by_maps(plan: DotPlan, nominal: Nominal, seen: Observed, look: FirstLo
 
 
 def match_by_geometry(plan: DotPlan, seen: Observed, geometry: Geometry, reach_px: float) -> MatchedDots:
-    """Each centroid with the lit dot that a fitted geometry puts it nearest to, within `reach_px` of the monitor."""
+    """Match each centroid to the lit dot nearest to it by a fitted geometry, within `reach_px` on the monitor."""
     directions = directions_in_cam(geometry, seen.pose, seen.x_px, seen.y_px)
     x_px, y_px = geometry.monitor.project(directions @ geometry.monitor.cam_to_image.T)
     return _nearest(plan, seen, x_px, y_px, reach_px)
@@ -274,7 +275,6 @@ def _nearest(plan: DotPlan, seen: Observed, x_px: FloatArray, y_px: FloatArray, 
             if not len(here) or not len(lit):
                 continue
             far = np.hypot(x_px[here, None] - plan.x_px[lit], y_px[here, None] - plan.y_px[lit])
-            # Each dot has one centroid, the nearest.
             best = far.argmin(axis=1)
             nearest = far.argmin(axis=0)
             mutual = nearest[best] == np.arange(len(here))
@@ -290,7 +290,7 @@ def refuse_motion(data: MatchedDots) -> None:
         here = data.at(np.flatnonzero(data.seen.pose == pose))
         for axis, places in (("x", here.seen.x_px), ("y", here.seen.y_px)):
             frames, shift, noise = frame_shifts(here, places)
-            by_chance = MAX_CHANCE * noise / np.sqrt(len(here) / len(frames))  # the medians of so few dots scatter themselves
+            by_chance = MAX_CHANCE * noise / np.sqrt(len(here) / len(frames))  # the median of few dots scatters by itself
             if np.ptp(shift) > max(MIN_MOTION_PX, MOTION_NOISE * noise, by_chance):
                 first, last = sorted((frames[shift.argmin()], frames[shift.argmax()]))
                 raise InputError(
@@ -299,8 +299,16 @@ def refuse_motion(data: MatchedDots) -> None:
                 )
 
 
-def frame_shifts(data: MatchedDots, places: FloatArray) -> tuple[IntArray, FloatArray, float]:
-    """The frames, how far the image of each stands from the others', and the noise of what is left (Tukey's median polish)."""
+class FrameShifts(NamedTuple):
+    """Frames (n,), how far the image of each stands from the others' (n,), and the noise of what is left; tracker px."""
+
+    frames: IntArray
+    shift: FloatArray
+    noise: float
+
+
+def frame_shifts(data: MatchedDots, places: FloatArray) -> FrameShifts:
+    """The shift of each frame along one axis, by Tukey's median polish over frames and dots."""
     frames, frame = np.unique(data.seen.frame, return_inverse=True)
     dots, dot = np.unique(data.dot, return_inverse=True)
     shift, middle = np.zeros(len(frames)), np.zeros(len(dots))
@@ -311,4 +319,4 @@ def frame_shifts(data: MatchedDots, places: FloatArray) -> tuple[IntArray, Float
         shift = np.array([np.median(places[each] - middle[dot[each]]) for each in by_frame])
         shift -= np.median(shift)
     left = np.abs(places - middle[dot] - shift[frame])
-    return frames, shift, MAD_TO_SIGMA * float(np.median(left))
+    return FrameShifts(frames, shift, MAD_TO_SIGMA * float(np.median(left)))

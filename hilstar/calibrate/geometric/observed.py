@@ -30,7 +30,7 @@ ADVICE = "write a CSV with the columns frame,x_px,y_px and, where known, flux, s
 class Observed:
     """Centroids in the tracker's image: frame, pose (0 by default) and place in tracker px, (n,) each.
 
-    `sigma_px` (n,) is each one's own error where the table has it, else 1 throughout: then only ratios count.
+    `sigma_px` (n,) is each one's own error where the table has it, else 1: only ratios count then.
     """
 
     frame: IntArray
@@ -43,12 +43,12 @@ class Observed:
         return len(self.frame)
 
     def at(self, chosen: IntArray) -> Observed:
-        """Those at places `chosen`, or where a mask is true."""
+        """The centroids at indices `chosen`."""
         return Observed(self.frame[chosen], self.pose[chosen], self.x_px[chosen], self.y_px[chosen], self.sigma_px[chosen])
 
 
 def read_observed(path: Path) -> Observed:
-    """The centroids of a table. Raises InputError with the line of what is no centroid."""
+    """Read a table of centroids. Raises InputError with the line that is wrong."""
     rows: list[tuple[float, ...]] = []
     with open_lines(path, ADVICE, MAX_OBSERVED_BYTES) as lines:
         reader = csv.reader(lines)
@@ -84,7 +84,7 @@ def _row(path: Path, line: int, row: list[str], places: dict[str, int]) -> tuple
 FITS_ENDINGS = (".fits", ".fit", ".fts")
 FITS_MAGIC = b"SIMPLE  ="
 MAX_IMAGE_BYTES = 500_000_000
-SATURATED_SHARE = 1e-5  # of the pixels at the image's largest possible value: a few hot pixels are no matter
+SATURATED_SHARE = 1e-5  # share of pixels at the image's largest possible value: a few hot pixels do not matter
 THRESHOLD_SIGMA = 8.0
 IMAGE_ADVICE = "give the tracker's image of frame N as frame_N.fits or frame_N.png, 8 to 16 bits of grey"
 NUMBER = re.compile(r"(\d+)(?!.*\d)")
@@ -92,7 +92,7 @@ POSE = re.compile(r"pose_?(\d+)", re.IGNORECASE)
 
 
 def measure_images(paths: Sequence[Path], dark: Path | None, resolution_px: tuple[int, int]) -> Observed:
-    """Centroids of all images; the frame is the last number in a file's name, the pose that of `poseN` in its path, else 0.
+    """Centroids of all images. The frame is the last number in a file's name, the pose that of `poseN` in its folder, else 0.
 
     Raises InputError for an image that cannot be read, has another size than the tracker's, or is saturated.
     """
@@ -132,7 +132,7 @@ def _numbers_of(path: Path) -> tuple[int, int]:
 def read_image(path: Path, resolution_px: tuple[int, int]) -> FloatArray:
     """A grey image (h, w) as float64, first row at the top. Raises InputError."""
     data = read_bytes(path, IMAGE_ADVICE, MAX_IMAGE_BYTES)
-    # A snapshot script may write FITS under whatever name it is given.
+    # A grabbing script may write FITS under any name.
     is_fits = path.suffix.lower() in FITS_ENDINGS or data.startswith(FITS_MAGIC)
     image = _fits(path, data) if is_fits else _picture(path, data)
     if image.ndim != 2:
@@ -152,7 +152,7 @@ def _fits(path: Path, data: bytes) -> npt.NDArray[Any]:
 
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of astropy, about a cut file: one line says so
+            warnings.simplefilter("ignore")  # astropy warns about a cut file; one line says so
             hdus = fits.open(BytesIO(data))
             planes = [hdu.data for hdu in hdus if isinstance(hdu, fits.PrimaryHDU | fits.ImageHDU) and hdu.data is not None]
     except (OSError, ValueError, TypeError, IndexError) as error:
@@ -175,7 +175,7 @@ def _picture(path: Path, data: bytes) -> npt.NDArray[Any]:
 
 
 def _refuse_saturated(path: Path, image: FloatArray) -> None:
-    """Refuse (InputError) an image whose highest value many pixels share: its dots have flat tops."""
+    """Refuse (InputError) an image in which many pixels share the highest value: its dots are saturated."""
     top = float(image.max())
     ends = {float(2**bits - 1) for bits in (8, 10, 12, 14, 16)}
     if top in ends and (image == top).mean() > SATURATED_SHARE and (image == top).sum() > 20:

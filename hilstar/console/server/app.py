@@ -221,7 +221,7 @@ class Metrics:
 PAGE_FOLDER = Path(__file__).resolve().parents[1] / "page"
 TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
 MAX_BODY_BYTES = 4_000
-MAX_DRAINED_BYTES = 64_000_000  # of a body that is too long, so that its sender comes to read why
+MAX_DRAINED_BYTES = 64_000_000  # a body that is too long is read this far, so that its sender comes to read why
 BODY_S = 5.0
 OPEN_PATHS = ("/", "/static/")  # the page itself has no secret; it brings the token that its address has
 STATE_S = 0.5  # for a state of after an order; there are ten a second

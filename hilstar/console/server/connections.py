@@ -274,7 +274,7 @@ class OpenPages:
             return
         by_address = Counter(client.address for client in self._clients)
         worth = {c: (c.is_read, c.asked, c.is_page, -by_address[c.address]) for c in self._clients}
-        least = min(worth, key=worth.__getitem__)  # of equals the first, which is the oldest
+        least = min(worth, key=worth.__getitem__)  # the first of equals is the oldest
         self._clients.pop(least)
         least.close(GIVES_WAY)
 

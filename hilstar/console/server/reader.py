@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -49,7 +50,7 @@ SILENT_NS = 6 * NS_PER_S // 10  # the run is seen ten times a second
 HUNG_NS = 4 * NS_PER_S // 10
 HUNG_PERIODS = 2.5
 UNASKED_NS = 2 * NS_PER_S  # in lockstep, without a request
-MANY_MISSED_SHARE = 0.5  # of the last second's frames
+MANY_MISSED_SHARE = 0.5  # share of the last second's frames
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,6 +138,13 @@ PACING_EACH_S = 1.0
 MIN_INTERVALS = 10
 
 
+class _Received(NamedTuple):
+    host_ns: int
+    packets: int
+    frames: int
+    missed: int
+
+
 class RunReader:
     """The run as a page is told of it. `look` brings it up to date."""
 
@@ -149,7 +157,7 @@ class RunReader:
         self._frame_at = self._event_at = 0
         self._last: FrameNumbers | None = None
         self._intervals_ms: deque[tuple[int, float]] = deque()
-        self._received: deque[tuple[int, int, int, int]] = deque()  # host time, packets, frames, missed
+        self._received: deque[_Received] = deque()  # over the last second
         self._begun_ns = time.monotonic_ns()
         self.pacing: Pacing | None = None
         self._pacing_ns = 0
@@ -206,17 +214,17 @@ class RunReader:
         seen = self.seen
         if seen is None:
             return None
-        self._received.append((now_ns, seen.received, seen.frames, seen.missed))
-        while len(self._received) > 1 and now_ns - self._received[0][0] > NS_PER_S:
+        self._received.append(_Received(now_ns, seen.received, seen.frames, seen.missed))
+        while len(self._received) > 1 and now_ns - self._received[0].host_ns > NS_PER_S:
             self._received.popleft()
-        first_ns, first = self._received[0][:2]
-        return round((seen.received - first) / (now_ns - first_ns) * NS_PER_S, 2) if now_ns > first_ns else None
+        first, passed_ns = self._received[0], now_ns - self._received[0].host_ns
+        return round((seen.received - first.packets) / passed_ns * NS_PER_S, 2) if passed_ns else None
 
     def _missed_share(self) -> float:
         if len(self._received) < 2:
             return 0.0
-        (_, _, frames, missed), (_, _, frames_now, missed_now) = self._received[0], self._received[-1]
-        shown, lost = frames_now - frames, missed_now - missed
+        first, last = self._received[0], self._received[-1]
+        shown, lost = last.frames - first.frames, last.missed - first.missed
         return lost / (shown + lost) if shown + lost else 0.0
 
     def _pacing_now(self, now_ns: int) -> Pacing | None:
@@ -290,7 +298,7 @@ def _attitude(seen: RunState) -> ShownAttitude | None:
     )
 
 
-LEVEL = 1  # of zlib: a night sky is nearly all zeros
+LEVEL = 1  # zlib's fastest: a night sky is nearly all zeros
 
 
 @dataclass(frozen=True, eq=False)

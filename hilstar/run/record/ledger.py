@@ -21,7 +21,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Literal, Self
+from typing import Literal, NamedTuple, Self
 
 import msgspec
 
@@ -58,7 +58,7 @@ from hilstar.units import NS_PER_S
 
 Kind = Literal["packet", "frame", "event", "fault"]
 MAX_WAITING_BYTES = 32_000_000  # half a minute of a plain run, if the disk stalls
-FRAMES_SHARE = 0.5  # of it; the rest is for packets
+FRAMES_SHARE = 0.5  # frames may use this share of it; the rest is for packets
 # A message of JSON and the objects that it is made of, roughly; the raw bytes of a packet come on top.
 ENTRY_BYTES = {"packet": 1500, "frame": 2500, "event": 1000, "fault": 4000}
 
@@ -137,6 +137,14 @@ class Allowance:
         return True
 
 
+class FloodCount(NamedTuple):
+    """How many messages of a kind were only counted, and why."""
+
+    kind: Counted
+    reason: str
+    number: int
+
+
 class FloodFilter:
     """Passes the first of each kind and reason, and counts the others."""
 
@@ -165,11 +173,11 @@ class FloodFilter:
         with self._lock:
             self._counts[kind, reason] += number
 
-    def counted(self) -> list[tuple[Counted, str, int]]:
+    def counted(self) -> list[FloodCount]:
         """The counts since the last call."""
         with self._lock:
             counts, self._counts = self._counts, Counter()
-        return [(kind, reason, number) for (kind, reason), number in counts.items()]
+        return [FloodCount(kind, reason, number) for (kind, reason), number in counts.items()]
 
 
 class ProcessProbe:
@@ -203,12 +211,12 @@ NO_ROOM = "no room"  # the reason given for lost messages
 FLUSH_S = 0.2
 EACH_S = 1.0  # how often counts, the process and the disk are looked at
 MAX_CHUNK_BYTES = 1_000_000
-MAX_RAW_BYTES = 1024  # of a message; every packet is shorter, a simulator's own messages may be cut
+MAX_RAW_BYTES = 1024  # kept of a message; every packet is shorter, a simulator's own messages may be cut
 MAX_DETAIL_CHARACTERS = 200
 DISK_WAITS_S, STOPPED_DISK_WAITS_S = 20.0, 0.4  # for a disk that stalls at the end, without and with a signal
 MAX_REST_S = 60.0  # between two files begun because one was deleted, truncated or overwritten
 STALLED_S = 5.0  # since the writer's last pass
-LOW_SHARE, WELL_SHARE = 0.10, 0.12  # of the disk
+LOW_SHARE, WELL_SHARE = 0.10, 0.12  # shares of the disk
 FRAMES_RESERVE_BYTES, FRAMES_RESERVE_SHARE = 64_000_000, 0.02  # reserved for packets, the smaller of the two
 
 

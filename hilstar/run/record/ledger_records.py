@@ -13,8 +13,8 @@ from hilstar.run.shown import Shown
 FRAME_TOPIC, PROCESS_TOPIC, EVENT_TOPIC, COUNT_TOPIC, FAULT_TOPIC = "/frame", "/process", "/event", "/not_kept", "/fault"
 # What becomes of the pulse of a frame: a pulse that the line was lost in is "lost", and its frame "skipped" too.
 PULSES = ("sent", "skipped", "lost")
-HostNs = Annotated[int, msgspec.Meta(ge=0, le=2**62)]  # of this host's clock, which began at its start
-AnyNs = Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)]  # of a sender's clock, or between it and the host's
+HostNs = Annotated[int, msgspec.Meta(ge=0, le=2**62)]  # this host's clock, which began at its start
+AnyNs = Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)]  # a sender's clock, or the difference to the host's
 Marker = Annotated[int, msgspec.Meta(ge=0, le=1)]
 Count = Annotated[int, msgspec.Meta(ge=0, le=2**53)]
 

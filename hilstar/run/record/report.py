@@ -6,6 +6,7 @@ import math
 from collections import deque
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -66,6 +67,14 @@ class ThinnedRows:
         return self._rows[: self._kept]
 
 
+class SpanColumn(NamedTuple):
+    """Minimum and maximum, NaN where a span has no value, and the sum, (n,) each."""
+
+    low: FloatArray
+    high: FloatArray
+    total: FloatArray
+
+
 class SpanTable:
     """The minimum, maximum and sum of each column over equal numbers of frames: at most `capacity` spans."""
 
@@ -123,12 +132,12 @@ class SpanTable:
         self._take()
         return self._begin[: self._used]
 
-    def column(self, number: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Minimum and maximum, NaN where a span has no value, and the sum of a column, each (n,)."""
+    def column(self, number: int) -> SpanColumn:
+        """One column over all spans."""
         self._take()
         low, high, total = (table[: self._used, number] for table in (self._low, self._high, self._sum))
         some = np.isfinite(low)
-        return np.where(some, low, np.nan), np.where(some, high, np.nan), total
+        return SpanColumn(np.where(some, low, np.nan), np.where(some, high, np.nan), total)
 
 
 class TimeBins:
@@ -163,7 +172,7 @@ class TimeBins:
 MEGABYTE = 1e6
 WARM_UP_S = 60.0  # after this the process has allocated all the memory that it needs
 KEYFRAMES = 16
-MAX_EVENTS = 1000  # of which the first and as many of the last are kept
+MAX_EVENTS = 1000  # the first ones, and as many of the last, are kept
 SMALL_RAD = 1e-8
 
 

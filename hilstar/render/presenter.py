@@ -164,9 +164,10 @@ class Presenter:
         with self._ctx:
             screen = self._ctx.screen
             screen.use()
-            if self._draws_wait:  # for the passes that write the levels, with the lock held
+            if self._draws_wait:  # llvmpipe's, with the lock held, for the passes that write the levels
                 self._driver.wait()
-            self._driver.take_back_buffer()
+            else:
+                self._driver.take_back_buffer()
             self._ctx.viewport = (0, 0, *self._view.screen_px)
             self._texture.use(0)
             self._triples.use(1)

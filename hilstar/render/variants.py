@@ -1,18 +1,23 @@
-"""Variants of drawing the linear image, for the study of trade-offs: the renderer with one part changed."""
+"""Renderers for measurements only: one with another splat, for the study of trade-offs, and one that times its stages."""
 
 from __future__ import annotations
 
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Literal
 
 import moderngl
 import numpy as np
 
+from hilstar.monitor.response import Levels
 from hilstar.render.encoder import build_program
 from hilstar.render.renderer import FIRST_CAPACITY, Renderer, Target
 from hilstar.render.splat import splat_program
 from hilstar.scene.psf import pixel_shares
 from hilstar.scene.sprites import Sprites
+from hilstar.units import NS_PER_MS
 
 Profile = Literal["renderer", "erf", "exp erf", "table", "centre"]
 
@@ -79,3 +84,38 @@ class VariantRenderer(Renderer):
         self.draw(sprites)
         with self._ctx:
             self._ctx.finish()
+
+
+class StagedRenderer(Renderer):
+    """A renderer that waits after each stage. `stage_ms` is the last frame's wall time (ms) of erase, upload, splat, encode,
+    choose and read_back.
+
+    `gpu_splat` and `gpu_encode` are measured by the driver's own timers, where it has them.
+    """
+
+    def __init__(self, target: Target) -> None:
+        super().__init__(target)
+        self.stage_ms: dict[str, float] = {}
+        with self._ctx:
+            self._queries = {stage: self._ctx.query(time=True) for stage in ("splat", "encode")}
+
+    def levels(self) -> Levels:
+        """As Renderer.levels."""
+        begin = time.perf_counter()
+        levels = super().levels()
+        self.stage_ms["read_back"] = (time.perf_counter() - begin) * 1e3
+        return levels
+
+    @contextmanager
+    def _stage(self, name: str) -> Iterator[None]:
+        query = self._queries.get(name)
+        begin = time.perf_counter()
+        if query is None:
+            yield
+        else:
+            with query:
+                yield
+        self._ctx.finish()
+        self.stage_ms[name] = (time.perf_counter() - begin) * 1e3
+        if query is not None and query.elapsed:
+            self.stage_ms[f"gpu_{name}"] = query.elapsed / NS_PER_MS

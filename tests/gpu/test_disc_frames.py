@@ -17,10 +17,9 @@ from hilstar.bench.frame import Bench
 from hilstar.bench.in_view import brightest_in_view
 from hilstar.monitor.quantise import dither_levels, mask_turn, round_levels
 from hilstar.monitor.response import srgb_response
-from hilstar.render.extended import ExtendedLayer
+from hilstar.render.extended import ExtendedLayer, disc_tiles
 from hilstar.render.reference import linear_image
 from hilstar.render.renderer import Renderer, Target
-from hilstar.render.tiles import disc_tiles
 from hilstar.rotation import from_radec_roll_deg
 from hilstar.scene.camera import Camera, Lens
 from hilstar.scene.extended import DiscLight, DiscView, LightMap, Pose, Shear, disc_lights

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import hilstar.render.extended as layer
+from hilstar.render.extended import AIR_SMOOTH, MIN_TILED_PX, SMOOTH, disc_tiles
 from hilstar.render.renderer import Renderer, Target
-from hilstar.render.tiles import AIR_SMOOTH, LEAST_PX, SMOOTH, disc_tiles
 from hilstar.scene.camera import Camera, Lens
 from hilstar.scene.extended import DiscLight, Shear
 from hilstar.sky.bodies.disc import EQUATOR_KM, Disc, earth_disc
@@ -21,7 +21,7 @@ MIDDLE_PX = (149.5, 129.5)
 LENS = Lens(radial=(0.2, 0.05, 0.0), tangential=(1e-3, -2e-3))
 # Straight lines in place of the air's light, and of the face's, which across a terminator are off by four times SMOOTH.
 TILE_LIMIT = max(AIR_SMOOTH, 4 * SMOOTH)
-assert SIZE[0] * SIZE[1] > LEAST_PX
+assert SIZE[0] * SIZE[1] > MIN_TILED_PX
 
 
 @pytest.fixture(scope="module")

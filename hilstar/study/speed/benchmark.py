@@ -30,7 +30,7 @@ from hilstar.bench.frame import Bench
 from hilstar.errors import InputError
 from hilstar.process.interrupts import held
 from hilstar.render.renderer import Renderer, Target
-from hilstar.render.stages import StagedRenderer
+from hilstar.render.variants import StagedRenderer
 from hilstar.rotation import from_radec_roll_deg, to_matrix
 from hilstar.scene.psf import SQRT2
 from hilstar.scene.sprites import Sprites, clipped_sprites, pack_sprites

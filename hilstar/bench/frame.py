@@ -113,6 +113,7 @@ class Bench:
     nothing). Of `stars` those from `faintest_shown_e_per_s` on can light a pixel: `shown_stars`; the others are
     `faint_stars`. `uniformity`, float32 (height, width), is each pixel's share of white, None where that is 1 everywhere, and
     `darkest` its minimum. `moving` places bodies among `stars` and `shown_stars`, None where the sky stands still.
+    `output` says how the display's output is set that its frames are shown on; {} without one.
     """
 
     file: BenchFile
@@ -131,6 +132,7 @@ class Bench:
     renderer: Renderer
     moving: MovingSky | None = None
     candidates: Candidates = field(default_factory=Candidates, repr=False)
+    output: dict[str, object] = field(default_factory=dict, repr=False)
 
     def with_stars(self, stars: Stars) -> Bench:
         """The same bench, and renderer, with other stars, all of which are shown."""

@@ -47,6 +47,10 @@ def doctor(bench_file: OwnBench = None, as_json: Json = False, report: Report = 
         for check in result.checks:
             mark = "ok" if check.ok else "MISSING" if check.required else "none"
             typer.echo(f"{mark:8}{check.name:12}{check.detail}")
+        for output in result.outputs:
+            typer.echo(f"{'check' if output.faults else 'ok':8}{'output':12}{output.line}")
+            for fault in output.faults:
+                typer.echo(f"{'':20}{fault}")
         for name, fields in benches.items():
             typer.echo(f"{'ok' if fields.warning is None else 'check':8}{name:12}{fields.line()}")
     if not result.ok:

@@ -113,6 +113,7 @@ class RunState(msgspec.Struct, frozen=True, kw_only=True):
     patch_share: float = 0.0
     hidden: str = ""
     display_lost: str = ""
+    gamma: str = ""
     ledger: LedgerState | None = None
     note: str = ""
     faults: list[str] = []

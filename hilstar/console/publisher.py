@@ -40,7 +40,7 @@ from hilstar.console.protocol import SWITCHES, AttitudeSource, Hello, LedgerStat
 from hilstar.console.shared_memory import MAX_SPRITES, PICTURE_HEAD_BYTES, SPRITE, SharedMemory
 from hilstar.errors import HilstarError, did_you_mean, one_line, printable
 from hilstar.notices import Listener, Notice
-from hilstar.run.operator import PATCHES, Overrides, SwitchRequest, SwitchRequests, aid_levels_of
+from hilstar.run.operator import GAMMA, PATCHES, Overrides, SwitchRequest, SwitchRequests, aid_levels_of
 from hilstar.scene.sprites import brightest
 from hilstar.units import NS_PER_S
 
@@ -194,6 +194,7 @@ class WatchedRun:
             patch_share=0.0 if aids is None else aids.patch_share,
             hidden="" if shown is None else shown.on_screen.hidden,
             display_lost="" if self.screen is None else self.screen.window.gone or "",
+            gamma=self.notices.lasting.get(GAMMA, ""),
             ledger=self._ledger(),
             faults=[] if self.faults is None else self.faults.on(),
             rates=self.notices.lasting.get(WRONG, ""),

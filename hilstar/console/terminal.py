@@ -83,10 +83,13 @@ def report(summary: RunSummary, as_json: bool) -> None:
         if summary.receive_latency_ms:
             lines["receive latency"] = f"{spread(summary.receive_latency_ms)} ms (p50 / p99 / max){absolute}"
         lines["sender's clock"] = clock_line(summary.clock)
-    for name in ("operator", "hidden"):
+    for name, what in (
+        ("operator", "changed by an operator's keys"),
+        ("hidden", "not fully visible"),
+        ("gamma", "under another program's gamma ramp"),
+    ):
         lasted = (summary.screen or {}).get(name, {"frames": 0})
         if lasted["frames"]:
-            what = "changed by an operator's keys" if name == "operator" else "not fully visible"
             lines[name] = f"{lasted['frames']} frames, {lasted['s']:.1f} s, {what}"
     if summary.sync:
         lines["pulses"] = summary.sync.line()

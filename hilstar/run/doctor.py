@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Self
 
 from hilstar.attitude.wire.serial_link import serial_ports
 from hilstar.attitude.wire.zmq_links import ZmqReceiver, ZmqSender
@@ -17,11 +18,15 @@ from hilstar.bench.build import bench_calibration, bench_optics
 from hilstar.bench.fields_of_view import FieldsOfView, fields_of_view
 from hilstar.bench.heads_file import read_bench_or_heads
 from hilstar.errors import HilstarError, MachineError
+from hilstar.monitor.window.output_settings import OutputState, findings
+from hilstar.monitor.window.randr import lit_outputs
 from hilstar.monitor.window.window import displays, window_renderer
 from hilstar.notices import Notices
 from hilstar.render.context import computes_in_software, create_context, gpus, has_compute, leave_contexts
 from hilstar.resources import resource_path
 from hilstar.sky.catalog import load_catalog
+
+USUAL_BITS = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,18 +40,34 @@ class Check:
 
 
 @dataclass(frozen=True, slots=True)
+class OutputReport:
+    """An output of the X server: its line, what is wrong with it and what mends that, and all that RandR says of it."""
+
+    line: str
+    faults: list[str]
+    state: dict[str, object]
+
+    @classmethod
+    def of(cls, state: OutputState) -> Self:
+        """The report of an output that is to show codes of 8 bits."""
+        return cls(state.line(), [finding.text for finding in findings(state, USUAL_BITS)], state.fields())
+
+
+@dataclass(frozen=True, slots=True)
 class Examination:
-    """The JSON object of `hilstar doctor`: whether everything required is there, and the checks."""
+    """The JSON object of `hilstar doctor`: whether everything required is there, the checks, and the displays' outputs."""
 
     ok: bool
     checks: list[Check]
+    outputs: list[OutputReport]
 
 
 def examine() -> Examination:
     """Check everything that hilstar uses on this machine."""
     checks = [_check(name, look) for name, look in LOOKS.items()]
     checks += [_gpus(), _displays(), _serial()]
-    return Examination(all(check.ok for check in checks if check.required), checks)
+    outputs = [OutputReport.of(state) for state in lit_outputs()]
+    return Examination(all(check.ok for check in checks if check.required), checks, outputs)
 
 
 def examine_bench(path: Path) -> dict[str, FieldsOfView]:

@@ -120,6 +120,7 @@ class SwitchRequests:
             request.done = True
 
 
+GAMMA = "gamma"  # the kind of event while another program's gamma ramp lies on the display
 SKY_AGAIN = "the sky of the attitude again"
 
 

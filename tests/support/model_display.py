@@ -34,6 +34,9 @@ def plain_window(hz: float = 60.0, **changes: object) -> SimpleNamespace:
         "screen_bits": 8,
         "ramp_size": 256,
         "modes_hz": (50, 60),
+        "output": None,
+        "ramp_changed": False,
+        "presented": {},
         "gone": None,
         "display": SimpleNamespace(refresh_hz=hz),
     }
@@ -68,7 +71,8 @@ class ModelDisplay:
 
     A frame is flipped at the first blank that is `deadline_ns` after its swap, one frame a blank. The driver has `buffers`
     with the one on the screen: with two of them whoever asks for the next one waits for the flip. `stamp_ns` is how far the
-    driver's time stamp of a flip lies after its blank, None where it gives none; `stampless` are flips without one.
+    driver's time stamp of a flip lies after its blank, None where it gives none; `stampless` are flips without one. A
+    `variable` display has no grid: it shows a frame at once, a period after the last one at the earliest.
     """
 
     def __init__(
@@ -80,10 +84,12 @@ class ModelDisplay:
         deadline_ns: int = 0,
         stamp_ns: int | None = None,
         stampless: Callable[[int], bool] = lambda number: False,
+        variable: bool = False,
         **window: object,
     ) -> None:
         self.clock, self.period_ns, self.deadline_ns = clock, period_ns, deadline_ns
         self.flips_ns: list[int] = []
+        self._variable = variable
         self._held, self._stamp_ns, self._stampless = buffers - 2, stamp_ns, stampless
         sync = None if stamp_ns is None else SimpleNamespace(swap_ns=self._stamp)
         self._stamps = SwapStamps(sync, period_ns, clock.now_ns)
@@ -98,7 +104,10 @@ class ModelDisplay:
         """Queue the frame, and wait as `Window.swap` does."""
         earliest = -(-(self.clock.ns + self.deadline_ns - FIRST_NS) // self.period_ns)
         after_last = (self.flips_ns[-1] - FIRST_NS) // self.period_ns + 1 if self.flips_ns else earliest
-        self.flips_ns.append(FIRST_NS + max(earliest, after_last) * self.period_ns)
+        flip_ns = FIRST_NS + max(earliest, after_last) * self.period_ns
+        if self._variable:
+            flip_ns = max(self.clock.ns + self.deadline_ns, self.flips_ns[-1] + self.period_ns if self.flips_ns else 0)
+        self.flips_ns.append(flip_ns)
         self.window.timestamp_source = self.timestamp_source
         swapped_ns = self._stamps.after_swap(wait)
         self.window.timestamp_source = self.timestamp_source

@@ -100,6 +100,8 @@ def _of_rest(seen: RunState, lately: RecentFrames) -> Iterator[str]:
         yield f"the ledger fails: {seen.ledger.failing}"
     if seen.hidden:
         yield f"the window is {seen.hidden}"
+    if seen.gamma:
+        yield seen.gamma
     if seen.operator_text:
         yield f"changed by the operator: {seen.operator_text}"
     if seen.rates:

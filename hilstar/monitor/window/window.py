@@ -16,7 +16,10 @@ from typing import Any, Self
 from hilstar.errors import InputError, MachineError, did_you_mean
 from hilstar.monitor.window.awake import Awake
 from hilstar.monitor.window.library import glfw
+from hilstar.monitor.window.output_settings import OutputState
+from hilstar.monitor.window.randr import output_named
 from hilstar.monitor.window.visibility import ScreenArea, Visibility
+from hilstar.monitor.window.watch import DisplayWatch
 from hilstar.monitor.window.x11 import BackBuffer, Survival, SwapStamps, back_buffer, has_extension, is_composited, sync_control
 from hilstar.process.scheduling import drawing_threads_apart
 from hilstar.units import GL_VERSIONS, NS_PER_S
@@ -137,6 +140,7 @@ class Window:
         self.gone: str | None = None
         self._survival: Survival | None = None
         self._visibility: Visibility | None = None
+        self._watch: DisplayWatch | None = None
         self._minimised = False
         self._awake = Awake()
         try:
@@ -190,6 +194,9 @@ class Window:
         self._stamps = SwapStamps(sync, NS_PER_S / (refresh_hz or settings.refresh_hz or USUAL_REFRESH_HZ))
         if monitor is not None:
             self._set_identity_ramp(monitor)
+        if self._survival is not None:
+            name = None if self.display is None else self.display.name
+            self._watch = DisplayWatch(name, glfw.get_x11_window(self._window), self._survival)
 
     def _set_identity_ramp(self, monitor: Any) -> None:
         """Set the identity: a correction by the system would change what the calibration measured."""
@@ -218,6 +225,8 @@ class Window:
     def _on_end(self, why: str) -> None:
         if self.gone is None:
             self.gone = why
+        if self._watch is not None:
+            self._watch.stop()
 
     def _on_monitor(self, monitor: Any, event: int) -> None:
         self._changed = True
@@ -324,6 +333,23 @@ class Window:
         return () if not monitor or display is None else _modes_hz(display, monitor)
 
     @property
+    def output(self) -> OutputState | None:
+        """How the display's output is set; None in an ordinary window, and where RandR does not say."""
+        if self.display is None or self.gone is not None:
+            return None
+        return output_named(self.display.name, self._survival)
+
+    @property
+    def ramp_changed(self) -> bool:
+        """True while another program's gamma ramp lies on the display: looked at once a second."""
+        return self._watch is not None and self._watch.ramp_changed
+
+    @property
+    def presented(self) -> dict[str, int]:
+        """Frames that the X server flipped, copied or skipped up to now; empty where it does not say."""
+        return {} if self._watch is None or self.gone is not None else self._watch.presented
+
+    @property
     def timestamp_source(self) -> str:
         """Where the times of `swap` come from."""
         return self._stamps.source
@@ -352,6 +378,8 @@ class Window:
             return
         if self._visibility is not None:
             self._visibility.close()
+        if self._watch is not None:
+            self._watch.close()
         if self._ramp is not None:
             monitor, ramp = self._ramp
             self._ramp = None

@@ -70,11 +70,15 @@ class Survival:
     """Xlib ends the process when the server or a window goes away; while this object lives, it calls `on_end(why)` instead."""
 
     def __init__(self, on_end: Callable[[str], None]) -> None:
+        self._undecided: set[int] = set()  # connections whose errors say nothing of the window
+
         def io_error(display: int) -> int:
             on_end(SERVER_GONE)
             return 0
 
         def error(display: int, event: Any) -> int:
+            if display in self._undecided:
+                return 0
             code = event.contents.error
             if code in {BAD_WINDOW, BAD_DRAWABLE} or code >= FIRST_EXTENSION_ERROR:
                 on_end(WINDOW_GONE)
@@ -83,11 +87,18 @@ class Survival:
         self._library: Any = ctypes.CDLL(X11_LIBRARY)
         self._handlers = _IoHandler(io_error), _ErrorHandler(error), _ExitHandler(lambda display, data: None)
         self._library.XSetIOErrorHandler.argtypes, self._library.XSetErrorHandler.argtypes = [_IoHandler], [_ErrorHandler]
-        self._library.XSetIOErrorHandler(self._handlers[0])
-        self._library.XSetErrorHandler(self._handlers[1])
+        self._library.XSetIOErrorHandler.restype, self._library.XSetErrorHandler.restype = _IoHandler, _ErrorHandler
+        self._before = self._library.XSetIOErrorHandler(self._handlers[0]), self._library.XSetErrorHandler(self._handlers[1])
 
-    def cover(self, x_display: int) -> None:
-        """Survive the end of this connection."""
+    def close(self) -> None:
+        """Let Xlib handle errors as before."""
+        self._library.XSetIOErrorHandler(self._before[0])
+        self._library.XSetErrorHandler(self._before[1])
+
+    def cover(self, x_display: int, decides: bool = True) -> None:
+        """Survive the end of this connection; unless it `decides`, errors of its requests say nothing of the window."""
+        if not decides:
+            self._undecided.add(x_display)
         if hasattr(self._library, "XSetIOErrorExitHandler"):  # libX11 1.7 of 2020; with an older one the process ends
             self._library.XSetIOErrorExitHandler.argtypes = [ctypes.c_void_p, _ExitHandler, ctypes.c_void_p]
             self._library.XSetIOErrorExitHandler(x_display, self._handlers[2], None)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import json
 import math
 import os
 import resource
@@ -540,6 +541,7 @@ def _head_of(bench: Bench) -> dict[str, str]:
         "gl_renderer": bench.renderer.gl_renderer,
         "gl_version": bench.renderer.gl_version,
         "render_path": bench.renderer.path,
+        "output": json.dumps(bench.output),
         "monotonic_ns": str(time.monotonic_ns()),
         "unix_ns": str(time.time_ns()),
     }

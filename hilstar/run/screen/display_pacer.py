@@ -9,14 +9,16 @@ from contextlib import contextmanager
 from typing import Any
 
 from hilstar.bench.frame import Drawn
+from hilstar.monitor.window.watch import presented_as
 from hilstar.notices import Notices
 from hilstar.process.scheduling import steady_loop
 from hilstar.run.host_clock import HOST_CLOCK, HostClock
-from hilstar.run.operator import Overrides, SwitchRequests
+from hilstar.run.operator import GAMMA, Overrides, SwitchRequests
 from hilstar.run.pacer import Moment, Presented
 from hilstar.run.screen.screen import Screen
-from hilstar.units import NS_PER_MS
+from hilstar.units import NS_PER_MS, NS_PER_S
 
+CHANGED = "another program changed the display's gamma ramp: codes make other light; stop it (night light, colord, redshift)"
 log = logging.getLogger(__name__)
 
 
@@ -34,6 +36,7 @@ class DisplayPacer:
         self.scheduling = "normal"
         self._screen = screen
         self._notices = notices
+        self._gamma_frames, self._gamma_ns, self._last_swap_ns = 0, 0, 0
 
     def moments(self) -> Iterator[Moment]:
         """One for each swap that can still be reached."""
@@ -68,8 +71,19 @@ class DisplayPacer:
         if self._screen.clock.paced_by_screen and due_ns is not None and budget.add_flip(due_ns - ready_ns, swap_ns - due_ns):
             guard_ms = budget.guard_ns / NS_PER_MS
             self._notices.tell("guard-raised", f"the display's driver flips late: frames are ready {guard_ms:.2f} ms before")
+        self._look_at_ramp(swap_ns)
         self._end_with_window()
         return Presented(swap_ns, self._screen.timestamp_source, marker)
+
+    def _look_at_ramp(self, swap_ns: int) -> None:
+        """Count a frame under another program's gamma ramp; tell of its beginning and its end."""
+        if self._screen.window.ramp_changed:
+            self._gamma_frames += 1
+            self._gamma_ns += swap_ns - self._last_swap_ns if self._last_swap_ns else 0
+            self._notices.begin(GAMMA, CHANGED)
+        elif self._gamma_frames:
+            self._notices.end(GAMMA, "gamma-straight", "the display's gamma ramp is straight again")
+        self._last_swap_ns = swap_ns
 
     def _end_with_window(self) -> None:
         if self._screen.closing:
@@ -85,7 +99,11 @@ class DisplayPacer:
         self._end_with_window()
 
     def summary(self, swaps: dict[str, Any]) -> dict[str, Any]:
-        """Where the times of swaps come from, the loop's scheduling, the swaps, and how long the sky was changed or hidden."""
+        """Where the times of swaps come from, scheduling, swaps, how long the sky was changed or hidden, and the output."""
         named: dict[str, Any] = {"timestamp_source": self._screen.timestamp_source, "scheduling": self.scheduling}
         named |= {"guard_ms": self._screen.budget.guard_ns / NS_PER_MS, "queued_frames": self._screen.queued}
-        return named | swaps | self.operator.summary()
+        named |= swaps | self.operator.summary()
+        named["gamma"] = {"frames": self._gamma_frames, "s": self._gamma_ns / NS_PER_S}
+        shown = self._screen.window.presented
+        output = self._screen.output
+        return named | {"presented": presented_as(shown), "presented_frames": shown, "output": output and output.fields()}

@@ -13,6 +13,7 @@ from hilstar.arrays import FloatArray
 from hilstar.bench.config import Monitor
 from hilstar.bench.orientation import orientation_of
 from hilstar.errors import MachineError
+from hilstar.monitor.window.output_settings import findings
 from hilstar.monitor.window.window import Window
 from hilstar.run.host_clock import HOST_CLOCK, HostClock
 from hilstar.run.screen.screen import Screen
@@ -25,11 +26,14 @@ DROPPED = 1.5  # periods
 MAX_DROPPED = 2  # of GATE_FRAMES: a desktop that is still busy with the new window
 BURSTS, BURST = 3, 8  # of swaps, to find how many are queued
 BURST_AT = 0.25  # of a period after a swap: far from the next one
+OFF_GRID = (0.125, 0.75)  # of a period: where a burst ends on a variable refresh, from the grid of a fixed one
 DRAINED = 6  # periods after which no queue has a frame
 # The first is today's and serves most drivers; a 4K display or a slow X server needs more.
 GUARDS_MS = (1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0)
 GUARD_TRIALS = 4
 PLAIN_BITS = 8
+VRR_FRAMES = 5
+VRR_AT, VRR_UNDER = 1.5, 1.75  # periods after a swap: when the next frame is submitted, and the latest that it is shown with
 UNPACED = 0.1  # of the period that the system knows of: swaps faster by more do not wait for it
 log = logging.getLogger(__name__)
 
@@ -40,7 +44,7 @@ class Timing:
 
     `paced_by_screen` is true where the screen itself keeps time, and `waits` false where it could, but swaps do not wait.
     `modes_hz` are the refresh rates that the display has. The driver holds `queued` finished frames back, a refresh each, and
-    takes a frame for a swap up to `guard_ms` before it.
+    takes a frame for a swap up to `guard_ms` before it. With `variable` the display shows a frame when it comes.
     """
 
     period_ms: float
@@ -50,6 +54,7 @@ class Timing:
     modes_hz: tuple[int, ...] = ()
     queued: int = 0
     guard_ms: float = DrawBudget.GUARD_NS / NS_PER_MS
+    variable: bool = False
 
 
 def pass_gate(screen: Screen, force: bool, clock: HostClock = HOST_CLOCK) -> Timing:
@@ -64,28 +69,40 @@ def pass_gate(screen: Screen, force: bool, clock: HostClock = HOST_CLOCK) -> Tim
     timing = replace(timing, modes_hz=window.modes_hz)
     screen.keep_time(timing.period_ms, timing.paced_by_screen, int(swaps_ns[-1]))
     if timing.paced_by_screen and window.gone is None:
-        queued = queued_frames(screen, clock)
-        timing = replace(timing, queued=queued, guard_ms=timing.guard_ms if queued else needed_guard_ms(screen, clock))
+        queued, variable = queue_of(screen, clock)
+        timing = replace(timing, queued=queued, variable=variable)
+        if not queued and not variable:
+            timing = replace(timing, guard_ms=needed_guard_ms(screen, clock))
         screen.keep_ahead(timing.guard_ms, timing.queued)
     if not timing.paced_by_screen:
         ms = timing.period_ms
         log.warning("the display has no refresh of its own (swaps take %.2f ms): frames are paced by software", ms)
     if window.gone is not None:
         raise MachineError(window.gone)
+    screen.output = window.output
+    changed = screen.changed_codes()
+    if changed:
+        changed += "; switch dithering, colour transforms and antialiasing off in the display's driver"
+    told = () if screen.output is None else tuple(findings(screen.output, monitor.bits, monitor.pixel_pitch_um))
+    _warn(window, [finding.text for finding in told if not finding.refused])
+    wrong = [finding.text for finding in told if finding.refused]
+    for fault in (*wrong, *faults(window, monitor, timing), *[changed] * bool(changed)):
+        if not force:
+            raise MachineError(f"{fault}; or add --force")
+        log.warning("%s: shown anyway (--force)", fault)
+    return timing
+
+
+def _warn(window: Window, doubts: list[str]) -> None:
+    """Say what may be wrong with a display."""
     if window.others:
         log.warning(
             "the X screen has other displays, %s: frames may be copied instead of flipped, or follow another's refresh; "
             "switch them off, or give this one an X screen of its own",
             ", ".join(window.others),
         )
-    changed = screen.changed_codes()
-    if changed:
-        changed += "; switch dithering, colour transforms and antialiasing off in the display's driver"
-    for fault in (*faults(window, monitor, timing), *[changed] * bool(changed)):
-        if not force:
-            raise MachineError(f"{fault}; or add --force")
-        log.warning("%s: shown anyway (--force)", fault)
-    return timing
+    for doubt in doubts:
+        log.warning("%s", doubt)
 
 
 def _swapped_ns(screen: Screen, number: int) -> int:
@@ -93,13 +110,14 @@ def _swapped_ns(screen: Screen, number: int) -> int:
     return screen.swap()
 
 
-def queued_frames(screen: Screen, clock: HostClock) -> int:
-    """How many finished frames the driver holds back: swaps in a row that return before their frame is on the screen.
+def burst_periods(screen: Screen, clock: HostClock) -> float:
+    """How long BURST swaps in a row take, in periods, from a quarter of a period after a swap on with no frame queued.
 
-    The burst begins when the queue is empty, a quarter of a period after a swap: its last one returns when the frame before
-    it by as many as are queued is shown.
+    The last swap returns when the frame before it by as many as are queued is shown: on the grid of a fixed refresh after
+    BURST - 0.25 periods without a queue, and a period earlier for each frame that is. A variable refresh shows the first
+    frame at once, and its last swap returns off that grid.
     """
-    found = []
+    took = []
     for _ in range(BURSTS):
         period_ns = screen.clock.period_ns
         begin_ns = round(screen.clock.next_after(clock.now_ns() + DRAINED * period_ns) + BURST_AT * period_ns)
@@ -107,9 +125,29 @@ def queued_frames(screen: Screen, clock: HostClock) -> int:
         for number in range(BURST):
             screen.present(number)
             screen.swap(timed=False)
-        took = (clock.now_ns() - begin_ns) / period_ns
-        found.append(BURST - round(took + BURST_AT))
-    return max(0, sorted(found)[BURSTS // 2])
+        took.append((clock.now_ns() - begin_ns) / period_ns)
+    return sorted(took)[BURSTS // 2]
+
+
+def queue_of(screen: Screen, clock: HostClock) -> tuple[int, bool]:
+    """How many finished frames the driver holds back, and whether the refresh is variable."""
+    took = burst_periods(screen, clock)
+    off_grid = OFF_GRID[0] < (took + BURST_AT) % 1 < OFF_GRID[1]
+    if off_grid and follows_frames(screen, clock):
+        return max(0, BURST - 1 - round(took)), True
+    return max(0, BURST - round(took + BURST_AT)), False
+
+
+def follows_frames(screen: Screen, clock: HostClock) -> bool:
+    """Whether the refresh is variable: a frame submitted 1.5 periods after a swap is shown at once, and not after 2 periods."""
+    early = 0
+    for _ in range(VRR_FRAMES):
+        screen.present(0)
+        before_ns = screen.swap(timed=False)
+        screen.present(0)
+        clock.wait_until(round(before_ns + VRR_AT * screen.clock.period_ns), threading.Event())
+        early += screen.swap(timed=False) - before_ns < VRR_UNDER * screen.clock.period_ns
+    return early > VRR_FRAMES // 2
 
 
 def needed_guard_ms(screen: Screen, clock: HostClock) -> float:
@@ -192,6 +230,11 @@ def _timing_faults(monitor: Monitor, timing: Timing) -> Iterator[str]:
         yield f"the display refreshes at {hz}; set [monitor] refresh_hz, or the display's mode"
     if timing.dropped > MAX_DROPPED:
         yield f"the display dropped {timing.dropped} of {GATE_FRAMES} frames; close other programs that draw on it"
+    if timing.variable:
+        ways = (
+            'Option "VariableRefresh" "false", adaptive_sync=false (Mesa), __GL_VRR_ALLOWED=0 (NVIDIA), or the monitor\'s menu'
+        )
+        yield f"the display has a variable refresh: it shows a frame when it comes; switch that off ({ways})"
     if timing.queued:
         held = f"{timing.queued} finished frame{'s' * (timing.queued > 1)}"
         late = f"light comes {timing.queued * timing.period_ms:.1f} ms after the swap"

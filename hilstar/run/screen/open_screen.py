@@ -33,4 +33,5 @@ def open_screen(file: BenchFile, *, windowed: bool, force: bool) -> Iterator[Scr
         screen = Screen(window, bench)
         bench.warm_up()
         pass_gate(screen, force)
+        bench.output.update({} if screen.output is None else screen.output.fields())
         yield screen

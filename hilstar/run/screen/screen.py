@@ -7,6 +7,7 @@ import time
 
 from hilstar.bench.frame import Bench
 from hilstar.bench.orientation import orientation_of
+from hilstar.monitor.window.output_settings import OutputState
 from hilstar.monitor.window.window import Window
 from hilstar.render.presenter import Presenter, View, changed_codes
 from hilstar.run.operator import Aids
@@ -23,13 +24,15 @@ class Screen:
     """A window with a bench's frames on it.
 
     `clock` predicts its swaps, `budget` how early a frame has to be begun, and `swap_to_light_ns` is the time from a swap to
-    the middle row's first light: half of the scan-out, the panel's own delay, and the frames `queued` in the driver.
+    the middle row's first light: half of the scan-out, the panel's own delay, and the frames `queued` in the driver. `output`
+    is how the display's output was set when the gate was passed, None where that is not known.
     """
 
     def __init__(self, window: Window, bench: Bench) -> None:
         monitor = bench.config.monitor
         self.window = window
         self.bench = bench
+        self.output: OutputState | None = None
         self.aids = Aids()
         self.swap_to_light_ns = round((bench.scan.scanout_s / 2 * 1e3 + monitor.panel_delay_ms) * NS_PER_MS)
         self.keep_time(1000.0 / monitor.refresh_hz, False, time.monotonic_ns())

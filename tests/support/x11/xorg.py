@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import re
 import subprocess
@@ -13,6 +14,7 @@ from pathlib import Path
 
 from tests.support.waiting import PATIENCE_S
 
+XA_ATOM, XA_INTEGER = 4, 19  # Xatom.h
 SERVER_CONFIG = """
 Section "ServerFlags"
   Option "AutoAddDevices" "false"
@@ -74,6 +76,37 @@ class Xorg:
         match = re.search(r"([\d.]+)\*", part)
         assert match is not None, part
         return float(match[1])
+
+    @contextmanager
+    def property(self, output: str, name: str, value: str | bytes | tuple[int, ...]) -> Iterator[None]:
+        """An output with a property, as a driver gives it: a word (an atom), bytes, or integers of 32 bits."""
+        x11, xrandr = ctypes.CDLL("libX11.so.6"), ctypes.CDLL("libXrandr.so.2")
+        pointer, number = ctypes.c_void_p, ctypes.c_ulong
+        x11.XOpenDisplay.restype, x11.XOpenDisplay.argtypes = pointer, [ctypes.c_char_p]
+        x11.XInternAtom.restype, x11.XInternAtom.argtypes = number, [pointer, ctypes.c_char_p, ctypes.c_int]
+        x11.XSync.argtypes, x11.XCloseDisplay.argtypes = [pointer, ctypes.c_int], [pointer]
+        xrandr.XRRConfigureOutputProperty.argtypes = [pointer, number, number, *[ctypes.c_int] * 3, pointer]
+        xrandr.XRRChangeOutputProperty.argtypes = [pointer, number, number, number, *[ctypes.c_int] * 2, pointer, ctypes.c_int]
+        xrandr.XRRDeleteOutputProperty.argtypes = [pointer, number, number]
+        identifier = int(self.xrandr("--verbose").split(f"{output} connected")[1].split("Identifier:")[1].split()[0], 16)
+        display = x11.XOpenDisplay(self.display.encode())
+        atom = x11.XInternAtom(display, name.encode(), 0)
+        match value:
+            case str():
+                kind, form, items = XA_ATOM, 32, (ctypes.c_long * 1)(x11.XInternAtom(display, value.encode(), 0))
+            case bytes():
+                kind, form, items = XA_INTEGER, 8, (ctypes.c_ubyte * len(value))(*value)
+            case _:
+                kind, form, items = XA_INTEGER, 32, (ctypes.c_long * len(value))(*value)
+        xrandr.XRRConfigureOutputProperty(display, identifier, atom, 0, 0, 0, None)
+        xrandr.XRRChangeOutputProperty(display, identifier, atom, kind, form, 0, items, len(items))
+        x11.XSync(display, 0)
+        try:
+            yield
+        finally:
+            xrandr.XRRDeleteOutputProperty(display, identifier, atom)
+            x11.XSync(display, 0)
+            x11.XCloseDisplay(display)
 
     def gamma(self, output: str) -> tuple[float, ...]:
         """The exponents of an output's ramp, as xrandr reads them back from the server."""

@@ -37,7 +37,8 @@ class FakeScreen:
         self.queued = 0
         self.swap_to_light_ns = TO_LIGHT_NS
         self.timestamp_source = "a fake"
-        self.window = SimpleNamespace(hidden="", gone=None)
+        self.window = SimpleNamespace(hidden="", gone=None, ramp_changed=False, presented={})
+        self.output = None
         self.aids = Aids()
         self.presented: list[int] = []
         self._host, self._by_screen, self._closes_at = clock, by_screen, closes_at

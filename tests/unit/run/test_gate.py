@@ -7,6 +7,7 @@ import pytest
 
 from hilstar.bench.config import parse_config
 from hilstar.errors import MachineError
+from hilstar.monitor.window.output_settings import OutputState
 from hilstar.monitor.window.x11 import BackBuffer
 from hilstar.run.screen.gate import GATE_FRAMES, Timing, faults, pass_gate, timing_of
 from tests.support.benches import SMALL_BENCH
@@ -69,6 +70,31 @@ def test_a_display_as_the_bench_file_has_it_has_no_fault(monitor):
 def test_each_fault_of_a_display_is_said_with_what_to_do(monitor, changes, timing, words):
     (fault,) = faults(plain_window(**changes), monitor, timing)
     assert words in fault
+
+
+@pytest.mark.parametrize("buffers", [2, 3])
+@pytest.mark.parametrize("hz", [60, 120])
+def test_a_fixed_refresh_is_not_taken_for_a_variable_one(tmp_path, monkeypatch, buffers, hz):
+    screen, display = model_screen(tmp_path, monkeypatch, hz=hz, buffers=buffers, stamp_ns=200_000, deadline_ns=400_000)
+    assert not pass_gate(screen, force=False, clock=display.clock).variable
+
+
+@pytest.mark.parametrize("stamp_ns", [None, 200_000])
+def test_a_variable_refresh_is_recognised_and_refused(tmp_path, monkeypatch, stamp_ns):
+    screen, display = model_screen(tmp_path, monkeypatch, variable=True, stamp_ns=stamp_ns)
+    with pytest.raises(MachineError, match=r"variable refresh.*VariableRefresh.*or add --force"):
+        pass_gate(screen, force=False, clock=display.clock)
+    assert pass_gate(screen, force=True, clock=display.clock).variable
+
+
+def test_a_wrong_setting_of_the_output_is_refused_and_a_doubtful_one_is_told(tmp_path, monkeypatch, caplog):
+    output = OutputState("DP-1", (320, 240), properties={"Broadcast RGB": "Limited 16:235", "TearFree": "on"})
+    screen, display = model_screen(tmp_path, monkeypatch, output=output)
+    with pytest.raises(MachineError, match=r"Broadcast RGB of DP-1.*xrandr --output DP-1 --set.*or add --force"):
+        pass_gate(screen, force=False, clock=display.clock)
+    assert "TearFree of DP-1 is on" in caplog.text
+    pass_gate(screen, force=True, clock=display.clock)
+    assert screen.output is output
 
 
 def test_a_good_display_passes_and_its_swaps_are_predicted_from_the_last_one(tmp_path, monkeypatch):

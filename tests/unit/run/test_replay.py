@@ -44,6 +44,7 @@ def earlier_run(path, small_bench_file, speed_km_s=0.0, away_km=0.0):
     bench = SimpleNamespace(
         file=SimpleNamespace(path=small_bench_file, text=SMALL_BENCH, sha256="0" * 64),
         calibration=SimpleNamespace(name="srgb", sha256="1" * 64),
+        output={},
         renderer=SimpleNamespace(gl_renderer="none", gl_version="none", path="NumPy"),
     )
     with Ledger(path, bench) as kept:

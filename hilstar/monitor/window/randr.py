@@ -1,0 +1,357 @@
+"""RandR by libXrandr, on a connection of its own: how an output is set, and its gamma ramp. Nothing is changed.
+
+Only what the server already knows is asked for, so that no request makes it probe a monitor.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import shutil
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from types import TracebackType
+from typing import Any, Self
+
+from hilstar.monitor.window.output_settings import IDENTITY, NVIDIA, NVIDIA_ATTRIBUTES, OutputState, Pair, Value, property_value
+from hilstar.monitor.window.x11 import X11_LIBRARY, Survival, has_extension
+
+XRANDR_LIBRARY = "libXrandr.so.2"
+ROTATE_0 = 1  # randr.h
+FIXED_ONE = 65536.0  # XFixed
+MAX_ITEMS = 4096  # of four bytes
+NVIDIA_S = 3.0
+BYTE_BITS = 8
+_Pointer, _Id, _Ids = ctypes.c_void_p, ctypes.c_ulong, ctypes.POINTER(ctypes.c_ulong)
+
+
+class _Mode(ctypes.Structure):
+    """XRRModeInfo."""
+
+    _fields_ = (
+        ("id", _Id),
+        ("width", ctypes.c_uint),
+        ("height", ctypes.c_uint),
+        ("dot_clock", ctypes.c_ulong),
+        ("sync", ctypes.c_uint * 7),
+        ("name", _Pointer),
+        ("name_length", ctypes.c_uint),
+        ("flags", ctypes.c_ulong),
+    )
+
+
+class _Resources(ctypes.Structure):
+    """XRRScreenResources."""
+
+    _fields_ = (
+        ("times", ctypes.c_ulong * 2),
+        ("ncrtc", ctypes.c_int),
+        ("crtcs", _Ids),
+        ("noutput", ctypes.c_int),
+        ("outputs", _Ids),
+        ("nmode", ctypes.c_int),
+        ("modes", ctypes.POINTER(_Mode)),
+    )
+
+
+class _Output(ctypes.Structure):
+    """XRROutputInfo."""
+
+    _fields_ = (
+        ("time", ctypes.c_ulong),
+        ("crtc", _Id),
+        ("name", ctypes.c_char_p),
+        ("name_length", ctypes.c_int),
+        ("size_mm", ctypes.c_ulong * 2),
+        ("connection", ctypes.c_ushort),
+        ("subpixels", ctypes.c_ushort),
+        ("ncrtc", ctypes.c_int),
+        ("crtcs", _Ids),
+        ("nclone", ctypes.c_int),
+        ("clones", _Ids),
+        ("nmode", ctypes.c_int),
+        ("npreferred", ctypes.c_int),
+        ("modes", _Ids),
+    )
+
+
+class _Crtc(ctypes.Structure):
+    """XRRCrtcInfo, its beginning."""
+
+    _fields_ = (
+        ("time", ctypes.c_ulong),
+        ("corner", ctypes.c_int * 2),
+        ("size", ctypes.c_uint * 2),
+        ("mode", _Id),
+        ("rotation", ctypes.c_ushort),
+    )
+
+
+class _Transform(ctypes.Structure):
+    """XRRCrtcTransformAttributes."""
+
+    _fields_ = (
+        ("pending", ctypes.c_int * 9),
+        ("pending_filter", _Pointer),
+        ("pending_count", ctypes.c_int),
+        ("pending_parameters", _Pointer),
+        ("current", ctypes.c_int * 9),
+        ("current_filter", _Pointer),
+    )
+
+
+class _Gamma(ctypes.Structure):
+    """XRRCrtcGamma."""
+
+    _fields_ = (("size", ctypes.c_int), *((name, _Pointer) for name in ("red", "green", "blue")))
+
+
+class _Providers(ctypes.Structure):
+    """XRRProviderResources."""
+
+    _fields_ = (("time", ctypes.c_ulong), ("count", ctypes.c_int), ("ids", _Ids))
+
+
+class _Provider(ctypes.Structure):
+    """XRRProviderInfo, its beginning."""
+
+    _fields_ = (
+        ("capabilities", ctypes.c_uint),
+        ("ncrtcs", ctypes.c_int),
+        ("crtcs", _Ids),
+        ("noutputs", ctypes.c_int),
+        ("outputs", _Ids),
+        ("name", ctypes.c_char_p),
+    )
+
+
+class Randr:
+    """A connection to the X server of DISPLAY. Free it with `close`. Raises OSError without a server or libXrandr.
+
+    Requests for an output that has just gone fail in silence: `survival` is a window's, by default one of its own.
+    """
+
+    def __init__(self, survival: Survival | None = None) -> None:
+        self._x11, self._xrandr = _libraries()
+        self._display: Any = self._x11.XOpenDisplay(None)
+        if not self._display:
+            raise OSError("no X server")
+        self._own = Survival(lambda why: None) if survival is None else None
+        for errors in (survival, self._own):
+            if errors is not None:
+                errors.cover(self._display, decides=False)
+        if not has_extension(self._display, b"RANDR"):
+            self.close()
+            raise OSError("the X server has no RandR")
+        self._root = self._x11.XDefaultRootWindow(self._display)
+
+    def close(self) -> None:
+        """End the connection."""
+        self._x11.XCloseDisplay(self._display)
+        if self._own is not None:
+            self._own.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+    def outputs(self) -> list[OutputState]:
+        """The outputs that are lit."""
+        lit: list[OutputState] = []
+        with self._resources() as resources:
+            if resources is None:
+                return []
+            modes = {mode.id: (mode.width, mode.height) for mode in resources.modes[: resources.nmode]}
+            for number in resources.outputs[: resources.noutput]:
+                with self._output(resources, number) as output:
+                    state = None if output is None or not output.crtc else self._state(resources, number, output, modes)
+                lit += [] if state is None else [state]
+        providers = self._providers()
+        names = [state.name for state in lit]
+        others = [tuple(name for name in names if name != state.name) for state in lit]
+        return [replace(state, others=rest, providers=providers) for state, rest in zip(lit, others, strict=True)]
+
+    def ramp(self, name: str) -> bytes:
+        """The gamma ramp of an output: 16 bits for each step of red, then green, then blue; b"" where it is not lit."""
+        with self._resources() as resources:
+            for number in () if resources is None else resources.outputs[: resources.noutput]:
+                with self._output(resources, number) as output:
+                    crtc = output.crtc if output is not None and _name(output) == name else 0
+                if crtc:
+                    return self._ramp_of(crtc)
+        return b""
+
+    def _ramp_of(self, crtc: int) -> bytes:
+        with self._got(_Gamma, self._xrandr.XRRFreeGamma, self._xrandr.XRRGetCrtcGamma(self._display, crtc)) as gamma:
+            if gamma is None:
+                return b""
+            return b"".join(ctypes.string_at(part, 2 * gamma.size) for part in (gamma.red, gamma.green, gamma.blue))
+
+    def _state(self, resources: Any, number: int, output: Any, modes: dict[int, Pair]) -> OutputState | None:
+        crtc = self._xrandr.XRRGetCrtcInfo(self._display, ctypes.byref(resources), output.crtc)
+        with self._got(_Crtc, self._xrandr.XRRFreeCrtcInfo, crtc) as now:
+            if now is None or now.mode not in modes:
+                return None
+            mode_px, rotated = modes[now.mode], now.rotation != ROTATE_0
+        properties = dict(self._properties(number))
+        edid = properties.pop("EDID", b"")
+        name = _name(output)
+        return OutputState(
+            name=name,
+            mode_px=mode_px,
+            preferred_px=tuple(dict.fromkeys(modes[k] for k in output.modes[: output.npreferred] if k in modes)),
+            transform=self._transform(output.crtc),
+            rotated=rotated,
+            properties={key: value for key, value in properties.items() if not isinstance(value, bytes)}
+            | self._of_nvidia(name),
+            edid=edid if isinstance(edid, bytes) else b"",
+        )
+
+    def _transform(self, crtc: int) -> tuple[float, ...]:
+        pointer = ctypes.POINTER(_Transform)()
+        if not self._xrandr.XRRGetCrtcTransform(self._display, crtc, ctypes.byref(pointer)) or not pointer:
+            return IDENTITY
+        current = tuple(value / FIXED_ONE for value in pointer.contents.current)
+        self._x11.XFree(ctypes.cast(pointer, _Pointer))
+        return current if any(current) else IDENTITY
+
+    def _properties(self, output: int) -> Iterator[tuple[str, Value | bytes]]:
+        """Each property with its value, the EDID as bytes."""
+        count = ctypes.c_int()
+        atoms = self._xrandr.XRRListOutputProperties(self._display, output, ctypes.byref(count))
+        for atom in atoms[: count.value] if atoms else ():
+            name = self._atom(atom)
+            value = self._property(output, atom, name == "EDID")
+            if value is not None:
+                yield name, value
+        if atoms:
+            self._x11.XFree(ctypes.cast(atoms, _Pointer))
+
+    def _property(self, output: int, atom: int, raw: bool) -> Value | bytes | None:
+        kind, form = ctypes.c_ulong(), ctypes.c_int()
+        count, rest, data = ctypes.c_ulong(), ctypes.c_ulong(), _Pointer()
+        results = (ctypes.byref(part) for part in (kind, form, count, rest, data))
+        failed = self._xrandr.XRRGetOutputProperty(self._display, output, atom, 0, MAX_ITEMS, 0, 0, 0, *results)
+        if failed or not data.value:
+            return None
+        item = {8: ctypes.c_ubyte, 16: ctypes.c_ushort}.get(form.value, ctypes.c_ulong)  # Xlib gives 32 bits as long
+        items = tuple(ctypes.cast(data, ctypes.POINTER(item))[: count.value])
+        self._x11.XFree(data)
+        if raw and form.value == BYTE_BITS:
+            return bytes(items)
+        return property_value(self._atom(kind.value) if kind.value else "", form.value, items, self._atom)
+
+    def _atom(self, atom: int) -> str:
+        name = self._x11.XGetAtomName(self._display, atom)
+        if not name:
+            return ""
+        text = ctypes.string_at(name).decode(errors="replace")
+        self._x11.XFree(name)
+        return text
+
+    def _providers(self) -> tuple[str, ...]:
+        found = self._xrandr.XRRGetProviderResources(self._display, self._root)
+        with self._got(_Providers, self._xrandr.XRRFreeProviderResources, found) as providers:
+            numbers = [] if providers is None else providers.ids[: providers.count]
+        with self._resources() as resources:
+            return () if resources is None else tuple(self._provider_name(resources, number) for number in numbers)
+
+    def _provider_name(self, resources: Any, number: int) -> str:
+        found = self._xrandr.XRRGetProviderInfo(self._display, ctypes.byref(resources), number)
+        with self._got(_Provider, self._xrandr.XRRFreeProviderInfo, found) as provider:
+            return "" if provider is None else _name(provider)
+
+    def _of_nvidia(self, output: str) -> dict[str, Value]:
+        """What nvidia-settings says of an output, where NVIDIA's driver runs: RandR has none of it."""
+        tool = shutil.which("nvidia-settings") if has_extension(self._display, b"NV-CONTROL") else None
+        return {} if tool is None else dict(_nvidia_values(tool, output))
+
+    @contextmanager
+    def _resources(self) -> Iterator[Any]:
+        found = self._xrandr.XRRGetScreenResourcesCurrent(self._display, self._root)
+        with self._got(_Resources, self._xrandr.XRRFreeScreenResources, found) as resources:
+            yield resources
+
+    @contextmanager
+    def _output(self, resources: Any, number: int) -> Iterator[Any]:
+        found = self._xrandr.XRRGetOutputInfo(self._display, ctypes.byref(resources), number)
+        with self._got(_Output, self._xrandr.XRRFreeOutputInfo, found) as output:
+            yield output
+
+    @contextmanager
+    def _got(self, kind: type[ctypes.Structure], free: Any, address: int | None) -> Iterator[Any]:
+        """What Xlib returned, None where it failed; freed afterwards."""
+        if not address:
+            yield None
+            return
+        try:
+            yield kind.from_address(address)
+        finally:
+            free(address)
+
+
+def output_named(name: str, survival: Survival | None = None) -> OutputState | None:
+    """The output of that name; None where RandR does not have it."""
+    try:
+        with Randr(survival) as randr:
+            return next((state for state in randr.outputs() if state.name == name), None)
+    except OSError:
+        return None
+
+
+def lit_outputs() -> list[OutputState]:
+    """The outputs of DISPLAY's X server that are lit; none without a server or RandR."""
+    try:
+        with Randr() as randr:
+            return randr.outputs()
+    except OSError:
+        return []
+
+
+def _name(info: Any) -> str:
+    return str((info.name or b"").decode(errors="replace"))
+
+
+def _nvidia_values(tool: str, output: str) -> Iterator[tuple[str, Value]]:
+    for attribute in NVIDIA_ATTRIBUTES:
+        command = [tool, "-t", "-q", f"[DPY:{output}]/{attribute}"]
+        try:
+            said = subprocess.run(command, capture_output=True, text=True, timeout=NVIDIA_S, check=False).stdout.strip()
+        except (OSError, subprocess.TimeoutExpired):
+            return
+        if said.removeprefix("-").isdecimal():
+            yield NVIDIA + attribute, int(said)
+
+
+def _libraries() -> tuple[Any, Any]:
+    x11: Any = ctypes.CDLL(X11_LIBRARY)
+    xrandr: Any = ctypes.CDLL(XRANDR_LIBRARY)
+    for library, name, result, arguments in (
+        (x11, "XOpenDisplay", _Pointer, [ctypes.c_char_p]),
+        (x11, "XCloseDisplay", ctypes.c_int, [_Pointer]),
+        (x11, "XDefaultRootWindow", _Id, [_Pointer]),
+        (x11, "XGetAtomName", _Pointer, [_Pointer, _Id]),
+        (x11, "XFree", ctypes.c_int, [_Pointer]),
+        (xrandr, "XRRGetScreenResourcesCurrent", _Pointer, [_Pointer, _Id]),
+        (xrandr, "XRRGetOutputInfo", _Pointer, [_Pointer, _Pointer, _Id]),
+        (xrandr, "XRRGetCrtcInfo", _Pointer, [_Pointer, _Pointer, _Id]),
+        (xrandr, "XRRGetCrtcGamma", _Pointer, [_Pointer, _Id]),
+        (xrandr, "XRRGetCrtcTransform", ctypes.c_int, [_Pointer, _Id, _Pointer]),
+        (xrandr, "XRRListOutputProperties", _Ids, [_Pointer, _Id, _Pointer]),
+        (
+            xrandr,
+            "XRRGetOutputProperty",
+            ctypes.c_int,
+            [_Pointer, _Id, _Id, *[ctypes.c_long] * 2, *[ctypes.c_int] * 2, _Id, *[_Pointer] * 5],
+        ),
+        (xrandr, "XRRGetProviderResources", _Pointer, [_Pointer, _Id]),
+        (xrandr, "XRRGetProviderInfo", _Pointer, [_Pointer, _Pointer, _Id]),
+        *((xrandr, f"XRRFree{what}", None, [_Pointer]) for what in ("ScreenResources", "OutputInfo", "CrtcInfo", "Gamma")),
+        *((xrandr, f"XRRFree{what}", None, [_Pointer]) for what in ("ProviderResources", "ProviderInfo")),
+    ):
+        function = getattr(library, name)
+        function.restype, function.argtypes = result, arguments
+    return x11, xrandr

@@ -1,11 +1,9 @@
-"""The error by how fast the field moves, and by how bright it is.
+"""How the error depends on what the bench shows: the field's rate, its brightness, and the display's own error.
 
-What the display itself costs: how far the attitude of the stars as shown is from that of the stars as they are.
-
-The twin lets a noiseless tracker look at the display and at the sky itself, at attitudes of the run. Star by star their
-places differ, by codes that are not fine enough for a place between pixels, and by a true lens that is not the assumed one.
-The small rotation e that turns the sky's directions v into the shown ones, v + e x v, weighted by light, is the attitude error
-that the display makes.
+For the display's own error, the twin lets a noiseless tracker look at the display and at the sky itself, at attitudes of the
+run. A star's place differs between the two, because codes are too coarse for a place between pixels, or because the true lens
+is not the assumed one. The display's attitude error is the small rotation e that turns the sky's directions v into the shown
+ones, v + e x v, weighted by light.
 """
 
 from __future__ import annotations
@@ -25,14 +23,14 @@ from hilstar.twin.verify.twin import Twin
 from hilstar.units import ARCSEC_PER_RAD, flux_ratio, magnitude
 
 BINS, MIN_IN_BIN = 5, 20
-FIELDS = 400  # attitudes at which the field's light is summed; answers between take the nearest one's
+FIELDS = 400  # attitudes at which the field's light is summed; other answers take the nearest of them
 MIN_STARS = 3
 SURE = 3.0
 
 
 @dataclass(frozen=True, slots=True)
 class Slice:
-    """Answers between two values: their number, noise (one sigma) and whole error (rms about the bias), arcsec."""
+    """Answers between two values of a quantity: count, noise (one sigma) and whole error (rms about the bias), arcsec."""
 
     low: float
     high: float
@@ -44,9 +42,9 @@ class Slice:
 
 
 def slices_of(value: FloatArray, left: FloatArray, error: FloatArray, freedom: float) -> tuple[Slice, ...]:
-    """Up to five slices of equal numbers of answers by a value (n,), with noise (n, 3) and errors about the bias (n, 3).
+    """Up to five slices with equal numbers of answers, by a value (n,), of noise (n, 3) and errors about the bias (n, 3).
 
-    `freedom` is what the fits took of the answers'.
+    `freedom` is the number of degrees of freedom that the fits took.
     """
     known = np.isfinite(value)
     value, left, error = value[known], left[known], error[known]
@@ -71,9 +69,9 @@ def slices_of(value: FloatArray, left: FloatArray, error: FloatArray, freedom: f
 
 
 def field_magnitudes(file: BenchFile, q_icrs_to_cam: FloatArray) -> FloatArray:
-    """The V magnitude of all catalogued light in the field at attitudes (n, 4), sampled along them; NaN for no star.
+    """The V magnitude of all catalogued light in the field, sampled along attitudes (n, 4); NaN without a star.
 
-    How well an attitude is known grows with the light of all stars together. Raises InputError for a catalogue that is wrong.
+    The precision of an attitude grows with the light of all stars together. Raises InputError for a wrong catalogue.
     """
     stars = bench_stars(file.config, file.folder)
     camera = tracker_camera(file.config.tracker, file.folder)
@@ -117,7 +115,7 @@ def _error(twin: Twin, finder: StarFinder, q_icrs_to_cam: FloatArray, number: in
 
 
 def turn_between(true: FloatArray, seen: FloatArray, weight: FloatArray) -> FloatArray:
-    """The small rotation (3,), rad, that takes unit vectors (n, 3) nearest to others, by weights (n,)."""
+    """The small rotation (3,), rad, that turns unit vectors (n, 3) into others with the smallest weighted error."""
     cross = np.zeros((len(true), 3, 3))  # e x v = -[v] e
     x, y, z = true.T
     cross[:, 0, 1], cross[:, 0, 2], cross[:, 1, 2] = z, -y, x
@@ -135,8 +133,7 @@ def _unit(vectors: FloatArray) -> FloatArray:
 class DisplayCost:
     """The display's own error, one sigma across and about the boresight, arcsec, at `attitudes` of the run.
 
-    `seen` is the share of it that the tracker's answers show, with one sigma: 1 where the tracker looked at this display,
-    0 where its answers know nothing of it.
+    `seen` is the share of it in the tracker's answers, with one sigma: 1 if the tracker looked at this display, 0 if not.
     """
 
     cross_arcsec: float
@@ -147,12 +144,12 @@ class DisplayCost:
 
     @property
     def subtracted(self) -> float:
-        """The share of the display's variance that is taken from the noise: what the answers show for sure, up to all of it."""
+        """The share of the display's variance that is subtracted from the noise; 0 unless `seen` exceeds three sigma."""
         return min(self.seen, 1.0) ** 2 if self.seen > SURE * self.sigma_seen else 0.0
 
 
 def display_cost(error_arcsec: FloatArray, left_arcsec: FloatArray) -> DisplayCost | None:
-    """The cost from errors (n, 3) of the display, NaN for none, and what noise (n, 3) the tracker had at the same attitudes."""
+    """The cost from the display's errors (n, 3), NaN for none, and the tracker's noise (n, 3) at the same attitudes."""
     known = np.isfinite(error_arcsec).all(axis=1)
     if known.sum() < MIN_STARS:
         return None

@@ -1,26 +1,25 @@
-"""Where telemetry lies on a run's clock, to some tenths of a second, whatever its own clock says.
+"""The tracker's clock against the run's: a coarse offset from angular speeds, then clock and bias together.
 
-How fast an attitude turns is the same in every convention of axes and quaternions. So the angular speeds of the run and of the
-telemetry are correlated at every offset at once, by Fourier transforms; where the speed does not vary, attitudes
-themselves are compared. Of the best offsets the one is taken at which the rotation from the commanded to the reported
-attitudes is most nearly constant; of those that are as good, none at all, or the one with the smallest rotation.
+**Coarse**, to some tenths of a second. The angular speed of an attitude is the same in every convention of axes and
+quaternions. So the speeds of the run and of the telemetry are correlated at every offset at once, by Fourier transforms; where
+the speed does not vary, the attitudes themselves are compared. The best offset is the one at which the rotation from commanded
+to reported attitudes is most nearly constant. Of offsets as good as that, zero is preferred, then the smallest rotation.
 
-The tracker's clock against the run's, and the bias, by the motion itself.
-
-With tau the telemetry's time and t the run's, tau = t + o + d (t - t_0). A time t' = t + delta at which the run is asked turns
-the residual e of T C(t')* by omega delta, so that
+**Fine.** With tau the telemetry's time and t the run's, tau = t + o + d (t - t_0). Reading the run at t' = t + delta adds omega
+delta to the residual e of T C(t')*, so that
 
     e_i = b + omega_i (delta_0 + delta_1 s_i) + f(place_i) + n_i,        s = (t - t_0) / T
 
-is linear in bias and clock. First robustly without f (Tukey's weights: Beaton and Tukey 1974). Then f is a random function of
-the place, a sum of bumps of variance kappa sigma^2, whose kappa and spacing make the residuals most likely; bias and clock are
-the generalised least squares estimate (Aitken 1935) under its covariance. So what repeats with the place is not taken for a
-clock, and a clock not for what repeats.
+is linear in bias and clock. They are first fitted robustly without f (Tukey's weights: Beaton and Tukey 1974). Then f is a
+random function of the place, a sum of bumps of variance kappa sigma^2, with the kappa and the spacing under which the residuals
+are most likely. Bias and clock are the generalised least squares estimate (Aitken 1935) under its covariance. So an error that
+repeats with the place is not taken for a clock, and a clock not for such an error.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -33,25 +32,23 @@ from hilstar.rotation import conjugate, from_rotation_vector, multiply, normalis
 from hilstar.run.record.commanded import Commanded, Moments
 from hilstar.units import ARCSEC_PER_RAD, MAD_TO_SIGMA
 
-STEP_S = 0.5  # of the grid on which speeds are compared; coarser for slow telemetry
-MAX_BINS = 2_000_000
-MIN_OVERLAP = 0.1  # of the shorter of the two
-MIN_BINS = 8
-TRIED = 12  # offsets
-COMPARED = 400  # attitudes
-SCANNED = 3000  # offsets at which attitudes are compared
-AS_GOOD = 1.2  # a spread within this factor of the smallest is as good
-SMALL_RAD = 1e-4
-MOST = 0.8  # of the attitudes that overlap where most do
-TURN_RAD = np.radians(0.5)  # a tracker stands nearly as commanded: a run that repeats itself elsewhere is not taken for it
+# Coarse.
+STEP_S = 0.5  # of the grid on which speeds are compared; larger for slow telemetry
+MAX_BINS, MIN_BINS = 2_000_000, 8
+MIN_OVERLAP = 0.1  # smallest overlap, as a share of the shorter recording
+TRIED = 12  # offsets tried
+COMPARED = 400  # attitudes compared at each
+SCANNED = 3000  # offsets of the scan by attitudes
+AS_GOOD, SMALL_RAD = 1.2, 1e-4  # a spread up to this factor and this angle above the smallest is as good
+MOST = 0.8  # offsets with a smaller share of the largest overlap are dropped
+TURN_RAD = np.radians(0.5)  # a tracker reports nearly the commanded attitude; a run that repeats itself elsewhere does not
+# Fine.
 CUT_SIGMAS = 8.0
-AGREE_ARCSEC = 3600.0  # further from the others than a degree is no answer of this sky, however the errors are spread
+AGREE_ARCSEC = 3600.0  # an answer further from the others is of another sky, whatever their spread
 ROUNDS, REFINED = 40, 3
-PART_PX = 150.0  # of the field, over which an error that repeats with the place pulls a clock the same way
-# What is known of a clock before anything is measured: where the motion says less, the clock cannot be told.
-OFFSET_PRIOR_S = 10.0
-DRIFT_PRIOR = 2e-3
-TOLD = 0.3  # of the prior
+PART_PX = 150.0  # size of the parts of the field whose errors are compared for the clock's sigma
+# Prior sigmas of the clock; it is told once its sigma is below TOLD of them.
+OFFSET_PRIOR_S, DRIFT_PRIOR, TOLD = 10.0, 2e-3, 0.3
 DONE_ARCSEC = 1e-4
 FLOOR_ARCSEC = 1e-3
 MAX_BUMPS = 1000
@@ -61,9 +58,10 @@ KAPPAS = np.logspace(-5, 4, 37)
 
 @dataclass(frozen=True, slots=True)
 class CoarseClock:
-    """Seconds to add to the telemetry's times, and the median angle, rad, of its attitudes from one rotation then.
+    """Seconds to add to the telemetry's times, and how nearly its attitudes then follow the commanded ones.
 
-    `rotation` (4,) leads from the commanded to the reported attitudes; `compared` are the attitudes that had one.
+    `rotation` (4,) leads from the commanded to the reported attitudes, half of which lie within `spread_rad` of it.
+    `compared` counts the attitudes with a commanded one.
     """
 
     offset_s: float
@@ -78,7 +76,7 @@ class CoarseClock:
 
 
 def coarse_offset(commanded: Commanded, t_s: FloatArray, reported: FloatArray) -> CoarseClock | None:
-    """The offset of telemetry times (n,) with attitudes (n, 4); None where no offset gives an overlap."""
+    """The coarse offset of telemetry with times (n,) and attitudes (n, 4); None where no offset gives an overlap."""
     few = np.unique(np.linspace(0, len(t_s) - 1, COMPARED).astype(int))
     t, q = t_s[few], reported[few]
     found = [_nearby(commanded, t, q, offset, reach) for offset, reach in _candidates(commanded, t_s, reported)]
@@ -97,12 +95,12 @@ def coarse_offset(commanded: Commanded, t_s: FloatArray, reported: FloatArray) -
 
 
 def speed_offsets(commanded: Commanded, t_s: FloatArray, reported: FloatArray) -> FloatArray:
-    """The offsets (k,), best first, at which the angular speeds agree, and none at all: they hold in every convention."""
+    """Offsets (k,), s, at which the angular speeds agree, best first, and zero. They hold in every convention."""
     return np.append(_by_speed(commanded, t_s, reported)[0], 0.0)
 
 
 def _nearby(commanded: Commanded, t_s: FloatArray, reported: FloatArray, offset_s: float, reach_s: float) -> CoarseClock | None:
-    """The best offset within `reach_s` of one."""
+    """The best offset within `reach_s` of `offset_s`."""
     first = _spread_at(commanded, t_s, reported, offset_s)
     if first is None or reach_s == 0:
         return first
@@ -118,7 +116,7 @@ def _nearby(commanded: Commanded, t_s: FloatArray, reported: FloatArray, offset_
 
 
 def _candidates(commanded: Commanded, t_s: FloatArray, reported: FloatArray) -> list[tuple[float, float]]:
-    """Offsets worth a look, and how far around each: starts or ends together, and where speeds or attitudes agree."""
+    """Offsets to try, with a reach around each: starts or ends together, and where speeds or attitudes agree."""
     ends = np.array([commanded.t_s[0] - t_s[0], commanded.t_s[-1] - t_s[-1]])
     found = [(float(offset), 0.0) for offset in ends]
     for peaks, reach in (_by_speed(commanded, t_s, reported), _by_attitude(commanded, t_s, reported)):
@@ -136,7 +134,7 @@ def _spread_at(commanded: Commanded, t_s: FloatArray, reported: FloatArray, offs
 
 
 def nearest_to_half(rotations: FloatArray, starts: int = 40) -> tuple[FloatArray, float]:
-    """The rotation among (n, 4) to which half of all are nearest, and how near, rad."""
+    """The rotation among (n, 4) with half of all nearest to it, and the angle within which they lie, rad."""
     chosen = np.unique(np.linspace(0, len(rotations) - 1, starts).astype(int))
     cosine = np.abs(rotations @ rotations[chosen].T)
     # The chord is exact for tiny angles, where the cosine is not.
@@ -147,7 +145,7 @@ def nearest_to_half(rotations: FloatArray, starts: int = 40) -> tuple[FloatArray
 
 
 def _by_attitude(commanded: Commanded, t_s: FloatArray, reported: FloatArray) -> tuple[FloatArray, float]:
-    """The offsets at which attitudes are nearest to the commanded ones, and the step between those tried."""
+    """The offsets at which attitudes are nearest to the commanded ones, and the step of the scan."""
     few = np.unique(np.linspace(0, len(t_s) - 1, COMPARED // 4).astype(int))
     t, q = t_s[few], reported[few]
     reach = np.linspace(commanded.t_s[0] - t_s[-1], commanded.t_s[-1] - t_s[0], SCANNED)
@@ -179,7 +177,7 @@ def _by_speed(commanded: Commanded, t_s: FloatArray, reported: FloatArray) -> tu
 
 
 def _speeds(t_s: FloatArray, q: FloatArray, step_s: float, start_s: float, span_s: float) -> FloatArray:
-    """The median angular speed, rad/s, in each bin of a grid, over turns that last about one step; NaN without any."""
+    """The median angular speed, rad/s, in each bin of a grid, over turns of about one step; NaN in an empty bin."""
     bins = int(span_s / step_s) + 1
     after = np.searchsorted(t_s, t_s + step_s)
     inside = after < len(t_s)
@@ -202,10 +200,10 @@ def _speeds(t_s: FloatArray, q: FloatArray, step_s: float, start_s: float, span_
 
 
 def _correlation(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """How well b explains a when it begins `lag` bins after it: bins in common times the information in each of them."""
+    """How well b, begun `lag` bins after a, explains it: common bins times the information per bin; and the lags."""
     size = fft.next_fast_len(len(a) + len(b), real=True)
     weight_a, weight_b = np.isfinite(a).astype(float), np.isfinite(b).astype(float)
-    # A wild pair of answers turns at any speed: what no run does is cut off.
+    # A wild pair of answers turns at any speed: speeds above twice the run's largest are clipped.
     limit = 2 * float(np.nanmax(a, initial=0.0)) + 1e-12
     a, b = np.nan_to_num(a), np.minimum(np.nan_to_num(b), limit)
     mean = float(a.sum() / max(weight_a.sum(), 1))
@@ -229,7 +227,7 @@ def _correlation(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _peaks(score: FloatArray, at: FloatArray) -> FloatArray:
-    """Where a score is largest, best first, and no two of them neighbours."""
+    """The places of a score's highest peaks, best first."""
     order = np.argsort(at)
     score, at = score[order], at[order]
     inner = np.r_[-np.inf, score, -np.inf]
@@ -241,9 +239,9 @@ def _peaks(score: FloatArray, at: FloatArray) -> FloatArray:
 class ClockFit:
     """The clock, the bias (a rotation (4,) from commanded to reported), and which answers (n,) are of this sky.
 
-    `offset_s` is the telemetry's time minus the run's at the run's start, `drift` how much faster its clock is; `sigma_*`
-    one sigma; `*_told` whether the motion says it. `residual_arcsec` (n, 3), cam, is what bias and clock leave, at the
-    commanded `moments`; NaN where those are not known.
+    `offset_s` is the telemetry's time minus the run's at the run's start, `drift` the excess rate of its clock, `sigma_*` one
+    sigma. `residual_arcsec` (n, 3), cam, is the error beyond bias and clock at the commanded `moments`; NaN where those are
+    not known.
     """
 
     offset_s: float
@@ -259,26 +257,34 @@ class ClockFit:
 
     @property
     def offset_told(self) -> bool:
-        """Whether the motion tells the offset."""
+        """Whether the motion determines the offset."""
         return self.sigma_offset_s < TOLD * OFFSET_PRIOR_S
 
     @property
     def drift_told(self) -> bool:
-        """Whether the motion tells the drift."""
+        """Whether the motion determines the drift."""
         return self.sigma_drift < TOLD * DRIFT_PRIOR
 
 
 @dataclass(frozen=True)
 class _State:
-    """A clock and a bias while they are sought: t = t_s - delay_s - stretch_s s."""
+    """A clock and a bias during the fit: t = tau - delay_s - stretch_s share, with the share of the run in [0, 1]."""
 
     rotation: FloatArray
     delay_s: float
     stretch_s: float
 
 
+class _Refined(NamedTuple):
+    """A clock and a bias after a step, their covariance (5, 5), and the answers (n,) that the step used."""
+
+    state: _State
+    covariance: FloatArray
+    used: npt.NDArray[np.bool_]
+
+
 class ClockSolver:
-    """Fits bias and clock of telemetry times (n,), s, with attitudes (n, 4) to what was commanded."""
+    """Fits bias and clock of telemetry with times (n,), s, and attitudes (n, 4) to the commanded attitudes."""
 
     def __init__(self, commanded: Commanded, tau_s: FloatArray, reported: FloatArray, scale: Scale) -> None:
         self.commanded, self.tau_s, self.reported, self.scale = commanded, tau_s, reported, scale
@@ -286,31 +292,26 @@ class ClockSolver:
         self.span_s = max(float(commanded.t_s[-1]) - self.start_s, 1e-9)
 
     def fit(self, coarse: CoarseClock) -> ClockFit:
-        """The fit from a coarse one."""
+        """The fit, begun at a coarse clock."""
         state, used = self._robust(_State(coarse.rotation, -coarse.offset_s, 0.0))
         for _ in range(REFINED):
             state, covariance, used = self._refined(state, used, -coarse.offset_s)
-        t_s, moments, residual = self._residual(state)
+        moments, residual = self._residual(state)
         stretch = state.stretch_s / self.span_s
         drift = stretch / (1 - stretch)
         sigma = np.sqrt(np.diag(covariance))
-        offset_s = self._offset_at_start(state)
         return ClockFit(
-            offset_s=offset_s,
+            offset_s=state.delay_s,  # tau - delay - stretch (tau - delay - start) / span = start gives tau = start + delay
             drift=drift,
             sigma_offset_s=float(sigma[3]),
             sigma_drift=float(sigma[4]) / self.span_s,
             sigma_bias_arcsec=sigma[:3],
             rotation=state.rotation,
             moments=moments,
-            t_s=t_s,
+            t_s=self._times(state)[0],
             residual_arcsec=residual,
             used=used,
         )
-
-    def _offset_at_start(self, state: _State) -> float:
-        """tau - t at t = start: tau - delay - stretch (tau - delay - start) / span = start gives tau = start + delay."""
-        return state.delay_s
 
     def _times(self, state: _State) -> tuple[FloatArray, FloatArray]:
         """The run's times (n,) and their share of the run."""
@@ -318,16 +319,16 @@ class ClockSolver:
         share = (plain - self.start_s) / self.span_s
         return plain - state.stretch_s * share, share
 
-    def _residual(self, state: _State) -> tuple[FloatArray, Moments, FloatArray]:
+    def _residual(self, state: _State) -> tuple[Moments, FloatArray]:
         t_s, _ = self._times(state)
         moments = self.commanded.at(t_s)
         turn = multiply(multiply(self.reported, conjugate(moments.q)), conjugate(state.rotation))
         residual = np.full((len(t_s), 3), np.nan)
         residual[moments.known] = ARCSEC_PER_RAD * to_rotation_vector(turn[moments.known])
-        return t_s, moments, residual
+        return moments, residual
 
     def _design(self, state: _State, moments: Moments, rows: npt.NDArray[np.bool_]) -> FloatArray:
-        """What a unit of bias (arcsec), delay and stretch (s) adds to the residuals: (3, rows, 5), arcsec."""
+        """The change of the residuals per unit of bias (arcsec), delay and stretch (s): (3, rows, 5), arcsec."""
         _, share = self._times(state)
         omega = ARCSEC_PER_RAD * moments.rate_rad_s[rows]
         design = np.zeros((3, int(rows.sum()), 5))
@@ -343,15 +344,15 @@ class ClockSolver:
         return _State(rotation, state.delay_s + float(step[3]), state.stretch_s + float(step[4]))
 
     def _prior(self, state: _State, delay_s: float) -> tuple[FloatArray, FloatArray]:
-        """Precision (5,) and pull (5,) of what is known before."""
+        """The prior's precision (5,), and its pull (5,) towards it."""
         precision = np.array([0, 0, 0, 1 / OFFSET_PRIOR_S**2, 1 / (DRIFT_PRIOR * self.span_s) ** 2])
         return precision, precision * np.array([0, 0, 0, delay_s - state.delay_s, -state.stretch_s])
 
     def _robust(self, state: _State) -> tuple[_State, npt.NDArray[np.bool_]]:
-        """Bias and clock by Tukey's weights, across and about the boresight apart."""
+        """Bias and clock by Tukey's weights, scaled for each axis, and which answers (n,) are not wild."""
         begun = state.delay_s
         for _ in range(ROUNDS):
-            _, moments, residual = self._residual(state)
+            moments, residual = self._residual(state)
             rows = moments.known
             sigma, weight = weights_of(residual[rows])
             design = self._design(state, moments, rows)
@@ -364,16 +365,14 @@ class ClockSolver:
             state = self._moved(state, step)
             if max(np.abs(step[:3]).max(), 1e3 * np.abs(step[3:]).max()) < DONE_ARCSEC:
                 break
-        _, moments, residual = self._residual(state)
+        moments, residual = self._residual(state)
         used = moments.known.copy()
         used[moments.known] = weights_of(residual[moments.known])[1] > 0
         return state, used
 
-    def _refined(
-        self, state: _State, used: npt.NDArray[np.bool_], begun_s: float
-    ) -> tuple[_State, FloatArray, npt.NDArray[np.bool_]]:
-        """One generalised least squares step, its covariance, and the answers that are of this sky by the present residuals."""
-        _, moments, residual = self._residual(state)
+    def _refined(self, state: _State, used: npt.NDArray[np.bool_], begun_s: float) -> _Refined:
+        """One generalised least squares step."""
+        moments, residual = self._residual(state)
         used = used & moments.known
         design, left = self._design(state, moments, used), residual[used]
         place = places_of(axes_of(moments.q[used]), self.scale.focal_px, self.scale.roll_px)
@@ -388,14 +387,14 @@ class ClockSolver:
             pulls += whitened[:, :5] * left[:, axis : axis + 1]
         covariance = np.asarray(np.linalg.inv(normal), dtype=np.float64)
         step = covariance @ right
-        return self._moved(state, step), honest(covariance, pulls, place), used
+        return _Refined(self._moved(state, step), honest(covariance, pulls, place), used)
 
 
 def honest(covariance: FloatArray, pulls: FloatArray, place: FloatArray) -> FloatArray:
-    """A covariance (5, 5), with sigmas no smaller than parts of the field differ by.
+    """A covariance (5, 5) whose sigmas are at least those by which parts of the field differ.
 
-    `pulls` (n, 5) are what each answer adds to the normal equations. An error that goes on for longer than the random function
-    is meant to pulls neighbours the same way (Liang and Zeger 1986).
+    `pulls` (n, 5) are the answers' terms in the normal equations. An error that lasts longer than the random function allows
+    pulls neighbours the same way (Liang and Zeger 1986).
     """
     centre = centres_of(place, PART_PX)
     _, part = cKDTree(centre).query(place)
@@ -407,7 +406,7 @@ def honest(covariance: FloatArray, pulls: FloatArray, place: FloatArray) -> Floa
 
 
 def weights_of(residual_arcsec: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """One sigma (3,) by the median deviation, and Tukey's weights (n,) of residuals (n, 3); 0 is no answer of this sky."""
+    """One sigma (3,) by the median deviation, and Tukey's weights (n,) of residuals (n, 3); 0 for a wild answer."""
     off = residual_arcsec - np.median(residual_arcsec, axis=0)
     sigma = np.maximum(MAD_TO_SIGMA * np.median(np.abs(off), axis=0), FLOOR_ARCSEC)
     squared = ((off / sigma) ** 2).sum(axis=1)
@@ -417,9 +416,9 @@ def weights_of(residual_arcsec: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 @dataclass(frozen=True)
 class Smooth:
-    """A random function of the place and white noise: bumps turned into `basis` (n, p) with squares `square` (p,).
+    """A random function of the place and white noise, with `kappa` (3,) and `variance` (3,), arcsec^2, of each axis.
 
-    `kappa` (3,) and `variance` (3,), arcsec^2, are of each axis.
+    `turn` (p, p) and `square` (p,) are the eigenvectors and eigenvalues of the bumps' normal matrix.
     """
 
     bumps: Bumps | None
@@ -429,7 +428,7 @@ class Smooth:
     variance: FloatArray
 
     def whiten(self, columns: FloatArray, axis: int) -> FloatArray:
-        """The inverse covariance of an axis times columns (n, k)."""
+        """An axis's inverse covariance times columns (n, k)."""
         if self.bumps is None or self.kappa[axis] == 0:
             return np.asarray(columns / self.variance[axis])
         share = self.kappa[axis] / (1 + self.kappa[axis] * self.square)
@@ -458,7 +457,7 @@ def most_likely(place: FloatArray, residual: FloatArray) -> Smooth:
 
 
 def _variances(bumps: Bumps, left: FloatArray) -> tuple[Smooth, float]:
-    """The most likely variances with some bumps, and the logarithm of the likelihood."""
+    """The most likely variances with these bumps, and the logarithm of their likelihood."""
     square, turn = linalg.eigh(bumps.gram, check_finite=False)
     square = np.maximum(square, 0.0)
     projected = (turn.T @ (bumps.value.T @ left)) ** 2  # (p, 3)

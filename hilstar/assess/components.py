@@ -1,34 +1,32 @@
-"""The direction in the sky whose phase within a pixel an error follows, where nobody says which star counts.
+"""The parts of residuals: field-of-view error, pixel error, and noise.
 
-The phase of one direction makes a wave; another direction, eta px away, has the wave of another frequency as soon as the camera
-rolls. So short stretches of the run, in which the roll changes little, are correlated with the waves of a coarse grid of
-directions, and their powers are added; then both are refined by halves, until the whole run is one stretch.
-
-Where a star field stands within a pixel, and functions that repeat with it.
-
-A star of direction r is at f (R r)_x / (R r)_z on the detector, px from its middle. All stars near it move alike, so one
-direction gives the phase of the field, as far as the camera does not roll. Two families of functions are tried, and the one
-that explains more for what it costs is kept: harmonics of one direction's phase, the same over the whole run (the usual
-directions: where the boresight was at the start, in the middle, on average; and the turn from the start as angles), or
-harmonics of the phase of the place's own direction, with amplitudes that change from place to place, as they do where
-stars enter and leave the field.
-
-What residuals consist of: field-of-view error, pixel error, and noise.
-
-Of residuals e_i (3 axes, arcsec) about their mean, those that repeat with the star field's place in the field of view are
-a sum of bumps F c (see `places`), those that repeat with its place within a pixel a sum of waves P d (see `phases`), fitted
-by turns until both hold. Noise is the rest. With r what is left, and p_F, p_P the degrees of freedom of the fits,
+Of residuals e_i (3 axes, arcsec) about their mean, the part that repeats with the star field's place in the field of view is
+a sum of bumps F c (see `places`). The part that repeats with its place within a pixel is a sum of waves P d. Both are fitted in
+turns until they hold, and the rest is noise. With r the rest, and p_F, p_P the degrees of freedom of the fits,
 
     sigma^2 = |r|^2 / (n - 1 - p_F - p_P),    fov^2 = (|F c|^2 - p_F sigma^2) / n,    pixel^2 = (|P d|^2 - p_P sigma^2) / n:
 
-a fit takes up its degrees of freedom's share of the noise, which is subtracted, so that none of the three depends on how many
-functions were tried.
+a fit takes up its degrees of freedom's share of the noise. That share is subtracted, so that none of the three depends on how
+many functions were tried.
+
+**Waves.** A star of direction r is at f (R r)_x / (R r)_z on the detector, px from its middle. All stars near it move alike, so
+one direction gives the phase of the field, as far as the camera does not roll. Two families of functions are tried, and the one
+that explains more for its degrees of freedom is kept. The first is the harmonics of one direction's phase, the same over the
+whole run. Directions tried are the boresight at the start, in the middle and on average, the turn from the start as angles, and
+one that is searched for. The second is the harmonics of the phase of each place's own direction, with amplitudes that change
+from place to place, as they do where stars enter and leave the field.
+
+**Search for the direction.** The phase of one direction makes a wave; that of another direction, eta px away, has another
+frequency as soon as the camera rolls. So short stretches of the run, in which the roll changes little, are correlated with the
+waves of a coarse grid of directions, and their powers are added. Grid and stretches are then refined by halves, until the whole
+run is one stretch.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
@@ -37,44 +35,311 @@ from hilstar.arrays import FloatArray, IntArray
 from hilstar.assess.places import Projector, Scale, axes_of, bumps_at, centres_of, places_of, weights_at
 from hilstar.rotation import conjugate, multiply, to_rotation_vector
 
-MIN_FORWARD = 0.3  # of a direction along the boresight, for its place on the detector's plane
-GRID = 40  # directions along each side
-PHASE_CYCLES = 0.25  # that a stretch may lose at the edge of a grid's cell
-MIN_STRETCH, MAX_STRETCH = 16, 256  # answers
-COARSE_ANSWERS, FINE_ANSWERS = 3000, 8000  # that are looked at, spread over the run
-KEPT = 4  # directions, from one grid to the next
-LEVELS = 14
-FOUND_TO_PX = 0.02
-HARMONICS = ((1, 0), (0, 1), (1, 1), (1, -1), (2, 0), (0, 2))  # cycles per pixel along x and y
-SHARP_HARMONICS = (*HARMONICS, (3, 0), (0, 3), (4, 0), (0, 4), (5, 0), (0, 5))  # of a saw's power, 89 %; two have 76 %
-LOCAL_HARMONICS = ((1, 0), (0, 1))
-MAX_EDGES = 12
-EDGE_STEPS = 1024  # of a pixel, at which an edge is sought
-# What an edge has to explain, in units of the noise's variance: in 300 runs of noise alone the best of all places explained 33.
-SURE_OF_EDGE = 50.0
 MIN_ROWS = 30
-FINEST_PX = 20.0  # between bumps: what repeats over four of them is met
-MAX_BUMPS = 1500
+TURNS = 3  # fits of bumps and waves by turns
+SURE = 6.0  # standard deviations above what noise alone would explain
+SURE_OF_MANY = 12.0  # the same for the best of thousands of directions
 ROWS_A_BUMP = 8
-COARSEST_SHARE = 0.25  # of the detector's side
+NOTHING = np.zeros(3)
+# Bumps.
+FINEST_PX = 20.0  # between bumps: what repeats over four of them is fitted
+COARSEST_SHARE = 0.25  # largest spacing, in sides of the detector
+MAX_BUMPS = 1500
 MIN_EXTENT_PX = 40.0
-MIN_EXTENT_OF_PIXEL_PX = 2.0
+# Waves.
+HARMONICS = ((1, 0), (0, 1), (1, 1), (1, -1), (2, 0), (0, 2))  # cycles per pixel along x and y
+SHARP_HARMONICS = (*HARMONICS, (3, 0), (0, 3), (4, 0), (0, 4), (5, 0), (0, 5))  # 89 % of a saw's power; two harmonics have 76 %
+LOCAL_HARMONICS = ((1, 0), (0, 1))
 LOCAL_SPACINGS_PX = (160.0, 80.0, 40.0, 20.0)
 MAX_LOCAL = 3000
+MIN_EXTENT_OF_PIXEL_PX = 2.0
+APART = 0.5  # share of the waves' power that bumps must not explain, for pixel and field-of-view error to be told apart
+HOPELESS = 0.5  # local waves below this share of the best are not refined
 SOUGHT = "the phase of the direction that the error follows best"
 SHARP = ", to its fifth harmonic"
 EDGES = "jumps within a pixel"
-SURE = 6.0  # standard deviations of what noise alone would explain
-SURE_OF_MANY = 12.0  # of thousands of directions the best
-APART = 0.5  # of the power of the waves that no bump explains, for pixel and field-of-view error to be told apart
-HOPELESS = 0.5  # of the best: finer local waves explain no more then
-TURNS = 3
 LOCAL = "phases from place to place"
-NOTHING = np.zeros(3)
+MAX_EDGES = 12
+EDGE_STEPS = 1024  # places within a pixel at which an edge is tried
+# Power that an edge must explain, in units of the noise's variance: the best of all places explained 33 in 300 runs of noise.
+SURE_OF_EDGE = 50.0
+# Search for a direction.
+MIN_FORWARD = 0.3  # smallest component along the boresight, for a place on the detector's plane
+GRID = 40  # directions along each side
+KEPT = 4  # directions kept from one grid to the next
+LEVELS, FOUND_TO_PX = 14, 0.02  # the search ends after so many grids, or at this spacing
+PHASE_CYCLES = 0.25  # largest change of phase in a stretch, at the edge of a grid's cell
+MIN_STRETCH, MAX_STRETCH = 16, 256  # answers
+COARSE_ANSWERS, FINE_ANSWERS = 3000, 8000  # answers used, spread over the run
+
+
+@dataclass(frozen=True)
+class Component:
+    """A part of the error: its variance (3,), arcsec^2, the fit (n, 3), arcsec, and the fit's degrees of freedom.
+
+    `reason` says why the part cannot be told, `detail` how it was found.
+    """
+
+    variance: FloatArray
+    fitted: FloatArray
+    freedom: float
+    reason: str = ""
+    detail: str = ""
+
+
+@dataclass(frozen=True)
+class Components:
+    """The parts of residuals (n, 3), arcsec: mean (3,), two parts that repeat, noise variance (3,), the rest `left` (n, 3)."""
+
+    mean: FloatArray
+    fov: Component
+    pixel: Component
+    noise_variance: FloatArray
+    left: FloatArray
+    extent_px: float
+
+
+def components_of(residual_arcsec: FloatArray, q_icrs_to_cam: FloatArray, scale: Scale) -> Components:
+    """The parts of residuals (n, 3), cam, at the commanded attitudes (n, 4)."""
+    mean = residual_arcsec.mean(axis=0)
+    about = residual_arcsec - mean
+    axes = axes_of(q_icrs_to_cam)
+    place = places_of(axes, scale.focal_px, scale.roll_px)
+    extent = float(np.linalg.norm(np.ptp(place, axis=0)))
+    nothing = Component(NOTHING, np.zeros_like(about), 0.0)
+    bumps, spacing, reason = _bumps(place, extent, scale)
+    fov, waves, pixel = replace(nothing, reason=reason), None, nothing
+    for turn in range(TURNS):
+        if bumps is not None:
+            fov = _component(bumps, about - pixel.fitted, pixel.freedom)
+            fov = replace(fov, detail=f"what repeats over {4 * spacing:.0f} px or more of the field")
+        if turn == 0:
+            waves, pixel = _waves(about - fov.fitted, _Seen(q_icrs_to_cam, axes, scale), extent, bumps)
+        if waves is None:
+            break
+        pixel = replace(_component(waves, about - fov.fitted, fov.freedom), detail=pixel.detail)
+    left = about - fov.fitted - pixel.fitted
+    noise = (left**2).sum(axis=0) / max(len(left) - 1 - fov.freedom - pixel.freedom, 1.0)
+    return Components(mean, fov, pixel, noise, left, extent)
+
+
+def _component(functions: Projector, wanted: FloatArray, other_freedom: float) -> Component:
+    """The fit of functions to (n, 3), and its variance less the noise in it."""
+    n, fitted = len(wanted), functions.fit(wanted)
+    noise = ((wanted - fitted) ** 2).sum(axis=0) / max(n - 1 - functions.freedom - other_freedom, 1.0)
+    variance = ((fitted**2).sum(axis=0) - functions.freedom * noise) / n
+    return Component(np.maximum(variance, 0.0), fitted, functions.freedom)
+
+
+class _FieldBumps(NamedTuple):
+    """Bumps and their spacing, px, or the reason why there are none."""
+
+    projector: Projector | None
+    spacing_px: float = 0.0
+    reason: str = ""
+
+
+def _bumps(place: FloatArray, extent_px: float, scale: Scale) -> _FieldBumps:
+    """The finest bumps that the samples can tell apart."""
+    n = len(place)
+    if extent_px < MIN_EXTENT_PX:
+        moved = f"the star field moved by {extent_px:.3g} px only: field-of-view error cannot be told from bias"
+        return _FieldBumps(None, reason=moved)
+    spacing = FINEST_PX
+    while spacing <= COARSEST_SHARE * min(scale.resolution_px):
+        centre = centres_of(place, spacing)
+        if 2 < len(centre) <= min(MAX_BUMPS, n // ROWS_A_BUMP):
+            return _FieldBumps(Projector(bumps_at(place, centre, spacing).value), spacing)
+        spacing *= 1.25
+    return _FieldBumps(None, reason="the attitudes are too far apart: field-of-view error cannot be told from noise")
+
+
+class _Seen(NamedTuple):
+    """The commanded attitudes (n, 4), their axes (n, 3, 3), and the tracker's sizes."""
+
+    q_icrs_to_cam: FloatArray
+    axes: FloatArray
+    scale: Scale
+
+
+class _Family(NamedTuple):
+    """Waves (n, p) that may repeat with the place within a pixel. `phases` are those of one direction, None for local ones."""
+
+    name: str
+    columns: sparse.csr_matrix
+    phases: Phases | None
+
+
+def _waves(about: FloatArray, seen: _Seen, extent_px: float, bumps: Projector | None) -> tuple[Projector | None, Component]:
+    """The waves that explain most of residuals (n, 3) beyond noise, or the reason why none can be told."""
+    none = Component(NOTHING, np.zeros_like(about), 0.0)
+    if extent_px < MIN_EXTENT_OF_PIXEL_PX:
+        reason = f"the star field moved by {extent_px:.3g} px only: pixel error cannot be told from bias"
+        return None, replace(none, reason=reason)
+    freedom = 0.0 if bumps is None else bumps.freedom
+    best_power, chosen, component = 0.0, None, none
+    phases: Phases | None = None
+    apart = 0.0 if bumps is not None else 1.0
+    for family in _families(about, seen):
+        waves, is_local = Projector(family.columns), family.phases is None
+        if bumps is not None and not is_local and not family.name.endswith(SHARP):
+            apart = max(apart, _apart(family.columns, bumps))
+        if is_local and family.columns.shape[1] > len(about) // ROWS_A_BUMP:
+            break
+        found = _component(waves, about, freedom)
+        power = _surely(found, about, freedom, SURE_OF_MANY if family.name.startswith(SOUGHT) else SURE)
+        if power > best_power:
+            best_power, chosen, component, phases = power, waves, replace(found, detail=family.name), family.phases
+        elif is_local and power < HOPELESS * best_power:
+            break
+    if apart < APART:
+        reason = "each place within a pixel was seen at one place in the field only: pixel error cannot be told from it"
+        return None, replace(none, reason=reason)
+    if chosen is None:
+        return None, replace(none, detail="nothing repeats with the place within a pixel")
+    return (chosen, component) if phases is None else _with_edges(chosen, component, phases, about, freedom)
+
+
+def _with_edges(
+    waves: Projector, found: Component, phases: Phases, about: FloatArray, freedom: float
+) -> tuple[Projector, Component]:
+    """The waves, with the jumps within a pixel that they leave unexplained, if there are any."""
+    base = np.asarray(waves.value.todense())
+    edges = edges_of(phases, base, about)
+    if not edges.shape[1]:
+        return waves, found
+    both = Projector(sparse.csr_matrix(np.concatenate([base, edges], axis=1)))
+    return both, replace(_component(both, about, freedom), detail=f"{found.detail}, with {edges.shape[1]} {EDGES}")
+
+
+def _surely(found: Component, about: FloatArray, other_freedom: float, sure: float) -> float:
+    """The power explained beyond noise, in units of the noise's variance; 0 where noise alone may explain as much."""
+    n, freedom = len(about), max(found.freedom, 1.0)
+    noise = ((about - found.fitted) ** 2).sum(axis=0) / max(n - freedom - other_freedom, 1.0)
+    excess = n * float((found.variance / np.maximum(noise, 1e-12)).sum())
+    chance = float(np.sqrt(2 * 3 * freedom))
+    if excess <= sure * chance:
+        return 0.0
+    return excess - 2 * float(np.sqrt(chance**2 + 4 * excess))
+
+
+def _families(about: FloatArray, seen: _Seen) -> Iterator[_Family]:
+    """The families of waves: those of one direction, then those from place to place, ever finer."""
+    q_icrs_to_cam, axes, scale = seen
+    for each in global_phases(q_icrs_to_cam, axes, scale):
+        yield from _with_sharp(f"the phase of {each.name}", each)
+    direction = best_direction(about, axes, scale)
+    if direction is not None:
+        yield from _with_sharp(SOUGHT, phases_of(direction, axes, scale))
+    for spacing in LOCAL_SPACINGS_PX:
+        columns = local_columns(q_icrs_to_cam, scale, spacing)
+        if columns.shape[1] > MAX_LOCAL:
+            break
+        yield _Family(f"{LOCAL}, {spacing:.0f} px apart", columns, None)
+
+
+def _with_sharp(name: str, phases: Phases) -> Iterator[_Family]:
+    """The smooth waves of a phase and, if there are answers enough, those of an error that jumps from pixel to pixel."""
+    yield _Family(name, sparse.csr_matrix(phases.columns()), phases)
+    if len(phases.place_px) >= 2 * len(SHARP_HARMONICS) * ROWS_A_BUMP:
+        yield _Family(f"{name}{SHARP}", sparse.csr_matrix(phases.columns(SHARP_HARMONICS)), phases)
+
+
+def _apart(columns: sparse.csr_matrix, bumps: Projector) -> float:
+    """The share of the power of some waves that no bump explains."""
+    dense = np.asarray(columns.todense())
+    dense = dense - dense.mean(axis=0)
+    power = float((dense**2).sum())
+    return float(((dense - bumps.fit(dense)) ** 2).sum()) / power if power > 0 else 0.0
+
+
+@dataclass(frozen=True)
+class Phases:
+    """The place (n, 2), px, of a direction that stands for the field's place within a pixel; `name` says which direction."""
+
+    name: str
+    place_px: FloatArray
+
+    def columns(self, harmonics: tuple[tuple[int, int], ...] = HARMONICS) -> FloatArray:
+        """Cosines and sines (n, 2 k) of the harmonics."""
+        angle = 2 * np.pi * (self.place_px @ np.array(harmonics, dtype=float).T)
+        return np.concatenate([np.cos(angle), np.sin(angle)], axis=1)
+
+
+def edges_of(phases: Phases, base: FloatArray, about: FloatArray) -> FloatArray:
+    """Saws (n, m) of the place within a pixel that explain most of residuals (n, 3) beyond a base (n, k) of harmonics.
+
+    They are added one after another (orthogonal matching pursuit: Pati et al. 1993) while each is above SURE_OF_EDGE. A jump
+    is a saw and something smooth, so a few saws and harmonics make any function that is smooth but for a few jumps.
+    """
+    columns = base
+    n = len(about)
+    spectrum = np.fft.rfft((np.arange(EDGE_STEPS) + 0.5) / EDGE_STEPS - 0.5)
+    highest = max(SHARP_HARMONICS if base.shape[1] == 2 * len(SHARP_HARMONICS) else HARMONICS)[0]
+    spectrum[: highest + 1] = 0.0  # these are in the base
+    power = float((np.fft.irfft(spectrum, EDGE_STEPS) ** 2).mean())
+    bin_of = [np.minimum((EDGE_STEPS * (u % 1)).astype(np.int64), EDGE_STEPS - 1) for u in phases.place_px.T]
+    for _ in range(MAX_EDGES):
+        fitted = columns @ np.linalg.lstsq(columns, about, rcond=None)[0]
+        left = (about - fitted) / np.maximum((about - fitted).std(axis=0), 1e-12)
+        best = (SURE_OF_EDGE, 0, 0)
+        for axis, bins in enumerate(bin_of):
+            sums = np.stack([np.bincount(bins, value, minlength=EDGE_STEPS) for value in left.T])
+            met = np.fft.irfft(np.fft.rfft(sums) * np.conj(spectrum), EDGE_STEPS)
+            gain = (met**2).sum(axis=0) / (n * power)
+            place = int(np.argmax(gain))
+            best = max(best, (float(gain[place]), axis, place))
+        gain_there, axis, place = best
+        if gain_there <= SURE_OF_EDGE:
+            break
+        edge = (phases.place_px[:, axis] - place / EDGE_STEPS) % 1 - 0.5
+        columns = np.concatenate([columns, edge[:, None]], axis=1)
+    return columns[:, base.shape[1] :]
+
+
+def phases_of(direction: FloatArray, axes: FloatArray, scale: Scale, name: str = "") -> Phases:
+    """The phases of a direction (3,), ICRS."""
+    seen = axes @ direction
+    return Phases(name, scale.focal_px * seen[:, :2] / seen[:, 2:])
+
+
+def global_phases(q_icrs_to_cam: FloatArray, axes: FloatArray, scale: Scale) -> Iterator[Phases]:
+    """The phases tried for the whole run, of attitudes (n, 4) with axes (n, 3, 3)."""
+    mean = axes[:, 2].mean(axis=0)
+    directions = [("the mean boresight", mean / max(float(np.linalg.norm(mean)), 1e-9))]
+    directions += [("the first boresight", axes[0, 2]), ("the boresight in the middle of the run", axes[len(axes) // 2, 2])]
+    for name, direction in directions:
+        if (axes[:, 2] @ direction).min() > MIN_FORWARD:
+            yield phases_of(direction, axes, scale, name)
+    turn = to_rotation_vector(multiply(q_icrs_to_cam, conjugate(q_icrs_to_cam[0])))
+    yield Phases("the turn from the start", scale.focal_px * np.stack([-turn[:, 1], turn[:, 0]], axis=1))
+    yield Phases("the boresight's right ascension and declination", _on_the_sky(axes, scale))
+
+
+def _on_the_sky(axes: FloatArray, scale: Scale) -> FloatArray:
+    """Right ascension times the cosine of the mean declination, and declination, px (n, 2)."""
+    boresight = axes[:, 2]
+    ra = np.unwrap(np.arctan2(boresight[:, 1], boresight[:, 0]))
+    dec = np.arcsin(np.clip(boresight[:, 2], -1, 1))
+    return scale.focal_px * np.stack([(ra - ra[0]) * np.cos(dec.mean()), dec], axis=1)
+
+
+def local_columns(q_icrs_to_cam: FloatArray, scale: Scale, spacing_px: float) -> sparse.csr_matrix:
+    """Each bump times the harmonics of the phase of its own direction: (n, 4 p)."""
+    axes = axes_of(q_icrs_to_cam)
+    place = places_of(axes, scale.focal_px, scale.roll_px)
+    centre = centres_of(place, spacing_px)
+    direction = centre[:, :3] / np.linalg.norm(centre[:, :3], axis=1, keepdims=True)
+    near = weights_at(place, centre, spacing_px)
+    seen = np.einsum("nij,nj->ni", axes[near.sample], direction[near.bump])
+    phase = Phases("", scale.focal_px * seen[:, :2] / seen[:, 2:]).columns(LOCAL_HARMONICS)
+    where, shape = (near.sample, near.bump), (len(place), len(centre))
+    parts = [sparse.csr_matrix((near.value * column, where), shape=shape) for column in phase.T]
+    return sparse.csr_matrix(sparse.hstack(parts))
 
 
 def best_direction(residual_arcsec: FloatArray, axes: FloatArray, scale: Scale) -> FloatArray | None:
-    """The direction (3,), ICRS, whose waves explain most of residuals (n, 3); None where the run sees no common half sky."""
+    """The direction (3,), ICRS, whose waves explain most of residuals (n, 3); None if the boresights share no half sky."""
     boresight = axes[:, 2]
     mean = boresight.mean(axis=0)
     size = float(np.linalg.norm(mean))
@@ -111,20 +376,20 @@ def _frame(z: FloatArray) -> FloatArray:
 
 
 class _Search:
-    """Residuals (n, 3) in units of their spread, and the camera's axes (n, 3, 3), in which waves are sought."""
+    """The power of a direction's waves in residuals (n, 3), in units of their spread, with camera axes (n, 3, 3)."""
 
     def __init__(self, value: FloatArray, axes: FloatArray, frame: FloatArray, scale: Scale) -> None:
         self.value, self.axes, self.frame, self.scale = value, axes, frame, scale
         steps = axes[1:] @ np.swapaxes(axes[:-1], 1, 2)
-        self.roll = np.concatenate([[0.0], np.cumsum(np.abs(steps[:, 0, 1]))])  # rad, the way that it goes
+        self.roll = np.concatenate([[0.0], np.cumsum(np.abs(steps[:, 0, 1]))])  # rad, accumulated
 
     def directions(self, tangent: FloatArray) -> FloatArray:
-        """Unit vectors (k, 3), ICRS, of points (k, 2) of the plane about the frame's third axis."""
+        """Unit vectors (k, 3), ICRS, of points (k, 2) in the tangent plane of the frame's third axis."""
         vector = np.concatenate([tangent, np.ones((len(tangent), 1))], axis=1) @ self.frame
         return np.asarray(vector / np.linalg.norm(vector, axis=1, keepdims=True))
 
     def score(self, tangent: FloatArray, step: FloatArray, answers: int) -> FloatArray:
-        """The power (k,) of each direction's waves in stretches that its cell of the grid allows."""
+        """The power (k,) of each direction's waves, summed over stretches as long as the grid's cells allow."""
         start = self._stretches(float(np.max(step)) * self.scale.focal_px)
         if answers < len(self.value):
             start, rows = _some(start, len(self.value), answers)
@@ -141,7 +406,7 @@ class _Search:
         return scores
 
     def _stretches(self, cell_px: float) -> IntArray:
-        """Where stretches (m,) begin whose phase holds over a cell."""
+        """The first answers (m,) of stretches whose phase holds over a cell."""
         turn = PHASE_CYCLES / cell_px
         by_roll = np.floor(self.roll / turn).astype(np.int64)
         longest = len(self.roll) if cell_px < 1 else MAX_STRETCH
@@ -155,252 +420,10 @@ class _Search:
 
 
 def _some(start: IntArray, total: int, answers: int) -> tuple[IntArray, IntArray]:
-    """Stretches spread over the run that have about so many answers together: their beginnings, and all their rows."""
+    """Stretches spread over the run with about so many answers together: their first answers, and all their rows."""
     end = np.append(start[1:], total)
     many = max(4, round(len(start) * answers / total))
     chosen = np.unique(np.linspace(0, len(start) - 1, many).astype(int))
     length = (end - start)[chosen]
     rows = np.concatenate([np.arange(start[k], end[k]) for k in chosen])
     return np.concatenate([[0], np.cumsum(length)[:-1]]), rows
-
-
-@dataclass(frozen=True)
-class Phases:
-    """A star's place (n, 2), px, by which the field's place within a pixel is told; `name` says which star's."""
-
-    name: str
-    place_px: FloatArray
-
-    def columns(self, harmonics: tuple[tuple[int, int], ...] = HARMONICS) -> FloatArray:
-        """Cosines and sines (n, 2 k) of the harmonics."""
-        angle = 2 * np.pi * (self.place_px @ np.array(harmonics, dtype=float).T)
-        return np.concatenate([np.cos(angle), np.sin(angle)], axis=1)
-
-
-def edges_of(phases: Phases, base: FloatArray, about: FloatArray) -> FloatArray:
-    """Saws (n, m) of the place within a pixel that explain most of residuals (n, 3) beyond a base (n, k) of harmonics.
-
-    One after another (orthogonal matching pursuit: Pati et al. 1993), as long as each is sure. A jump anywhere is a saw and
-    something smooth, so a few saws and harmonics make every function that is smooth but for a few jumps.
-    """
-    columns = base
-    n = len(about)
-    spectrum = np.fft.rfft((np.arange(EDGE_STEPS) + 0.5) / EDGE_STEPS - 0.5)
-    highest = max(SHARP_HARMONICS if base.shape[1] == 2 * len(SHARP_HARMONICS) else HARMONICS)[0]
-    spectrum[: highest + 1] = 0.0  # the base has these
-    power = float((np.fft.irfft(spectrum, EDGE_STEPS) ** 2).mean())
-    bin_of = [np.minimum((EDGE_STEPS * (u % 1)).astype(np.int64), EDGE_STEPS - 1) for u in phases.place_px.T]
-    for _ in range(MAX_EDGES):
-        fitted = columns @ np.linalg.lstsq(columns, about, rcond=None)[0]
-        left = (about - fitted) / np.maximum((about - fitted).std(axis=0), 1e-12)
-        best = (SURE_OF_EDGE, 0, 0)
-        for axis, bins in enumerate(bin_of):
-            sums = np.stack([np.bincount(bins, value, minlength=EDGE_STEPS) for value in left.T])
-            met = np.fft.irfft(np.fft.rfft(sums) * np.conj(spectrum), EDGE_STEPS)
-            gain = (met**2).sum(axis=0) / (n * power)
-            place = int(np.argmax(gain))
-            best = max(best, (float(gain[place]), axis, place))
-        gain_there, axis, place = best
-        if gain_there <= SURE_OF_EDGE:
-            break
-        edge = (phases.place_px[:, axis] - place / EDGE_STEPS) % 1 - 0.5
-        columns = np.concatenate([columns, edge[:, None]], axis=1)
-    return columns[:, base.shape[1] :]
-
-
-def phases_of(direction: FloatArray, axes: FloatArray, scale: Scale, name: str = "") -> Phases:
-    """The phases of a direction (3,), ICRS."""
-    seen = axes @ direction
-    return Phases(name, scale.focal_px * seen[:, :2] / seen[:, 2:])
-
-
-def global_phases(q_icrs_to_cam: FloatArray, axes: FloatArray, scale: Scale) -> Iterator[Phases]:
-    """The phases that hold over the whole run, of attitudes (n, 4) with axes (n, 3, 3)."""
-    mean = axes[:, 2].mean(axis=0)
-    directions = [("the mean boresight", mean / max(float(np.linalg.norm(mean)), 1e-9))]
-    directions += [("the first boresight", axes[0, 2]), ("the boresight in the middle of the run", axes[len(axes) // 2, 2])]
-    for name, direction in directions:
-        if (axes[:, 2] @ direction).min() > MIN_FORWARD:
-            yield phases_of(direction, axes, scale, name)
-    turn = to_rotation_vector(multiply(q_icrs_to_cam, conjugate(q_icrs_to_cam[0])))
-    yield Phases("the turn from the start", scale.focal_px * np.stack([-turn[:, 1], turn[:, 0]], axis=1))
-    yield Phases("the boresight's right ascension and declination", _on_the_sky(axes, scale))
-
-
-def _on_the_sky(axes: FloatArray, scale: Scale) -> FloatArray:
-    """Right ascension times the cosine of the mean declination, and declination, px (n, 2)."""
-    boresight = axes[:, 2]
-    ra = np.unwrap(np.arctan2(boresight[:, 1], boresight[:, 0]))
-    dec = np.arcsin(np.clip(boresight[:, 2], -1, 1))
-    return scale.focal_px * np.stack([(ra - ra[0]) * np.cos(dec.mean()), dec], axis=1)
-
-
-def local_columns(q_icrs_to_cam: FloatArray, scale: Scale, spacing_px: float) -> sparse.csr_matrix:
-    """Bumps times the harmonics of the phase of each bump's own direction: (n, 4 p)."""
-    axes = axes_of(q_icrs_to_cam)
-    place = places_of(axes, scale.focal_px, scale.roll_px)
-    centre = centres_of(place, spacing_px)
-    direction = centre[:, :3] / np.linalg.norm(centre[:, :3], axis=1, keepdims=True)
-    i, j, value = weights_at(place, centre, spacing_px)
-    seen = np.einsum("nij,nj->ni", axes[i], direction[j])
-    phase = Phases("", scale.focal_px * seen[:, :2] / seen[:, 2:]).columns(LOCAL_HARMONICS)
-    parts = [sparse.csr_matrix((value * column, (i, j)), shape=(len(place), len(centre))) for column in phase.T]
-    return sparse.csr_matrix(sparse.hstack(parts))
-
-
-@dataclass(frozen=True)
-class Component:
-    """A part of the error: its variance (3,), arcsec^2, what was fitted (n, 3) and what that took of the freedom.
-
-    `reason` says why it cannot be told, and `detail` how it was found.
-    """
-
-    variance: FloatArray
-    fitted: FloatArray
-    freedom: float
-    reason: str = ""
-    detail: str = ""
-
-
-@dataclass(frozen=True)
-class Components:
-    """The parts of residuals (n, 3), arcsec: their mean, two that repeat, and noise (`variance` (3,), `left` (n, 3))."""
-
-    mean: FloatArray
-    fov: Component
-    pixel: Component
-    noise_variance: FloatArray
-    left: FloatArray
-    extent_px: float
-
-
-def components_of(residual_arcsec: FloatArray, q_icrs_to_cam: FloatArray, scale: Scale) -> Components:
-    """The parts of residuals (n, 3), cam, at the commanded attitudes (n, 4)."""
-    mean = residual_arcsec.mean(axis=0)
-    about = residual_arcsec - mean
-    axes = axes_of(q_icrs_to_cam)
-    place = places_of(axes, scale.focal_px, scale.roll_px)
-    extent = float(np.linalg.norm(np.ptp(place, axis=0)))
-    nothing = Component(NOTHING, np.zeros_like(about), 0.0)
-    bumps, spacing, reason = _bumps(place, extent, scale)
-    fov, waves, pixel = replace(nothing, reason=reason), None, nothing
-    for turn in range(TURNS):
-        if bumps is not None:
-            fov = _component(bumps, about - pixel.fitted, pixel.freedom)
-            fov = replace(fov, detail=f"what repeats over {4 * spacing:.0f} px or more of the field")
-        if turn == 0:
-            waves, pixel = _waves(about - fov.fitted, (q_icrs_to_cam, axes, scale), extent, bumps)
-        if waves is None:
-            break
-        pixel = replace(_component(waves, about - fov.fitted, fov.freedom), detail=pixel.detail)
-    left = about - fov.fitted - pixel.fitted
-    noise = (left**2).sum(axis=0) / max(len(left) - 1 - fov.freedom - pixel.freedom, 1.0)
-    return Components(mean, fov, pixel, noise, left, extent)
-
-
-def _component(functions: Projector, wanted: FloatArray, other_freedom: float) -> Component:
-    """The variance of what functions explain of (n, 3), less the noise in it."""
-    n, fitted = len(wanted), functions.fit(wanted)
-    noise = ((wanted - fitted) ** 2).sum(axis=0) / max(n - 1 - functions.freedom - other_freedom, 1.0)
-    variance = ((fitted**2).sum(axis=0) - functions.freedom * noise) / n
-    return Component(np.maximum(variance, 0.0), fitted, functions.freedom)
-
-
-def _bumps(place: FloatArray, extent_px: float, scale: Scale) -> tuple[Projector | None, float, str]:
-    """The finest bumps that the samples can tell apart, their spacing, or why there are none."""
-    n = len(place)
-    if extent_px < MIN_EXTENT_PX:
-        return None, 0.0, f"the star field moved by {extent_px:.3g} px only: field-of-view error cannot be told from bias"
-    spacing = FINEST_PX
-    while spacing <= COARSEST_SHARE * min(scale.resolution_px):
-        centre = centres_of(place, spacing)
-        if 2 < len(centre) <= min(MAX_BUMPS, n // ROWS_A_BUMP):
-            return Projector(bumps_at(place, centre, spacing).value), spacing, ""
-        spacing *= 1.25
-    return None, 0.0, "the attitudes are too far apart: field-of-view error cannot be told from noise"
-
-
-def _waves(
-    about: FloatArray, seen: tuple[FloatArray, FloatArray, Scale], extent_px: float, bumps: Projector | None
-) -> tuple[Projector | None, Component]:
-    """The waves that explain most of residuals (n, 3) for sure, or why none can be told."""
-    none = Component(NOTHING, np.zeros_like(about), 0.0)
-    if extent_px < MIN_EXTENT_OF_PIXEL_PX:
-        reason = f"the star field moved by {extent_px:.3g} px only: pixel error cannot be told from bias"
-        return None, replace(none, reason=reason)
-    freedom = 0.0 if bumps is None else bumps.freedom
-    best: tuple[float, Projector | None, Component, Phases | None] = (0.0, None, none, None)
-    apart = 0.0 if bumps is not None else 1.0
-    for name, columns, phases in _families(about, *seen):
-        waves = Projector(columns)
-        if bumps is not None and not name.startswith(LOCAL) and not name.endswith(SHARP):
-            apart = max(apart, _apart(columns, bumps))
-        if name.startswith(LOCAL) and columns.shape[1] > len(about) // ROWS_A_BUMP:
-            break
-        found = _component(waves, about, freedom)
-        power = _surely(found, about, freedom, SURE_OF_MANY if name.startswith(SOUGHT) else SURE)
-        if power > best[0]:
-            best = (power, waves, replace(found, detail=name), phases)
-        elif name.startswith(LOCAL) and power < HOPELESS * best[0]:
-            break
-    if apart < APART:
-        reason = "each place within a pixel was seen at one place in the field only: pixel error cannot be told from it"
-        return None, replace(none, reason=reason)
-    _, chosen, found, phases = best
-    if chosen is not None and phases is not None:
-        return _with_edges(chosen, found, phases, about, freedom)
-    return chosen, replace(found, detail=found.detail or "nothing repeats with the place within a pixel")
-
-
-def _with_edges(
-    waves: Projector, found: Component, phases: Phases, about: FloatArray, freedom: float
-) -> tuple[Projector, Component]:
-    """Waves, and the jumps that they leave, where there are any."""
-    base = np.asarray(waves.value.todense())
-    edges = edges_of(phases, base, about)
-    if not edges.shape[1]:
-        return waves, found
-    both = Projector(sparse.csr_matrix(np.concatenate([base, edges], axis=1)))
-    return both, replace(_component(both, about, freedom), detail=f"{found.detail}, with {edges.shape[1]} {EDGES}")
-
-
-def _surely(found: Component, about: FloatArray, other_freedom: float, sure: float) -> float:
-    """What is explained for sure beyond noise, in units of the noise's variance; 0 where noise alone may explain as much."""
-    n, freedom = len(about), max(found.freedom, 1.0)
-    noise = ((about - found.fitted) ** 2).sum(axis=0) / max(n - freedom - other_freedom, 1.0)
-    excess = n * float((found.variance / np.maximum(noise, 1e-12)).sum())
-    chance = float(np.sqrt(2 * 3 * freedom))
-    if excess <= sure * chance:
-        return 0.0
-    return excess - 2 * float(np.sqrt(chance**2 + 4 * excess))
-
-
-def _families(
-    about: FloatArray, q_icrs_to_cam: FloatArray, axes: FloatArray, scale: Scale
-) -> Iterator[tuple[str, sparse.csr_matrix, Phases | None]]:
-    """What may repeat with the place within a pixel, by name: the same over the run, then from place to place, ever finer."""
-    for each in global_phases(q_icrs_to_cam, axes, scale):
-        yield from _with_sharp(f"the phase of {each.name}", each)
-    direction = best_direction(about, axes, scale)
-    if direction is not None:
-        yield from _with_sharp(SOUGHT, phases_of(direction, axes, scale))
-    for spacing in LOCAL_SPACINGS_PX:
-        columns = local_columns(q_icrs_to_cam, scale, spacing)
-        if columns.shape[1] > MAX_LOCAL:
-            break
-        yield f"{LOCAL}, {spacing:.0f} px apart", columns, None
-
-
-def _with_sharp(name: str, phases: Phases) -> Iterator[tuple[str, sparse.csr_matrix, Phases]]:
-    """Its smooth waves, and, of answers enough, those with the harmonics of an error that jumps from pixel to pixel."""
-    yield name, sparse.csr_matrix(phases.columns()), phases
-    if len(phases.place_px) >= 2 * len(SHARP_HARMONICS) * ROWS_A_BUMP:
-        yield f"{name}{SHARP}", sparse.csr_matrix(phases.columns(SHARP_HARMONICS)), phases
-
-
-def _apart(columns: sparse.csr_matrix, bumps: Projector) -> float:
-    """The share of the power of some waves that no bump explains."""
-    dense = np.asarray(columns.todense())
-    dense = dense - dense.mean(axis=0)
-    power = float((dense**2).sum())
-    return float(((dense - bumps.fit(dense)) ** 2).sum()) / power if power > 0 else 0.0

@@ -1,4 +1,4 @@
-"""Whether the tracker answered: availability, acquisition, and where it lost its lock."""
+"""Availability, acquisition and loss of lock: which of the answers that were due came."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ import numpy.typing as npt
 from hilstar.arrays import FloatArray
 from hilstar.run.record.commanded import Commanded
 
-MISSED_CYCLES = 1.5  # between right answers: more is an outage
-LOST_CYCLES = 3.0  # of the tracker without a right answer: its lock is lost
+MISSED_CYCLES = 1.5  # a longer time between right answers is an outage
+LOST_CYCLES = 3.0  # in a longer outage the lock is lost
 MAX_CYCLES = 20_000_000
 
 
 @dataclass(frozen=True, slots=True)
 class Outage:
-    """A time without right answers: run time, s, and its length; `lost` where it is longer than LOST_CYCLES."""
+    """A time without right answers: its start in run time and its length, s; `lost` if longer than LOST_CYCLES."""
 
     start_s: float
     length_s: float
@@ -29,7 +29,7 @@ class Outage:
 
 @dataclass(frozen=True, slots=True)
 class Acquisition:
-    """When a sky appeared, run time, s, and how long until the first right answer; None where none came before it went."""
+    """The run time, s, at which a sky appeared, and the wait for the first right answer; None if none came before it went."""
 
     start_s: float
     wait_s: float | None
@@ -37,7 +37,7 @@ class Acquisition:
 
 @dataclass(frozen=True)
 class Lock:
-    """The answers that were due, and those that came: `availability` is right answers over those due."""
+    """The answers that were due and the right ones among them; `availability` is right over due."""
 
     cycle_s: float
     due: int
@@ -48,12 +48,12 @@ class Lock:
 
     @property
     def lost(self) -> tuple[Outage, ...]:
-        """The times when the lock was lost."""
+        """The outages in which the lock was lost."""
         return tuple(each for each in self.outages if each.lost)
 
     @property
     def acquisition_probability(self) -> float | None:
-        """The share of appearances and losses after which a right answer came."""
+        """The share of appearances of a sky and losses of lock after which a right answer came."""
         if not self.acquisitions:
             return None
         return sum(each.wait_s is not None for each in self.acquisitions) / len(self.acquisitions)
@@ -66,7 +66,7 @@ class Lock:
 
 
 def lock_of(commanded: Commanded, t_s: FloatArray, right: npt.NDArray[np.bool_], wrong: npt.NDArray[np.bool_]) -> Lock:
-    """What came of rows at run times (n,), rising, of which some are right answers, some wrong, and the others none."""
+    """The lock over rows at rising run times (n,): right answers, wrong ones, and rows without an answer."""
     cycle_s = max(float(np.median(np.diff(t_s))), 1e-6)
     cycle_s = max(cycle_s, float(t_s[-1] - t_s[0]) / MAX_CYCLES)
     due = commanded.at(np.arange(t_s[0], t_s[-1] + cycle_s / 2, cycle_s)).known
@@ -115,7 +115,7 @@ def _acquisitions(
     for first, last in zip(commanded.t_s[shown], commanded.t_s[ends], strict=True):
         if last <= t_s[0] or first >= t_s[-1]:
             continue
-        first = max(first, t_s[0])  # before its first row nobody knows what the tracker did
+        first = max(first, t_s[0])  # what the tracker did before its first row is unknown
         inside = answers[(answers >= first) & (answers <= last)]
         found.append(Acquisition(float(first), float(inside[0] - first) if len(inside) else None))
     found += [Acquisition(each.start_s, each.length_s) for each in outages if each.lost]

@@ -1,17 +1,16 @@
-"""The sizes of a tracker that turn angles into pixels.
+"""The place of a star field in the field of view, and smooth functions of that place.
 
-Where a star field stands in the field of view, and functions of that place.
-
-A place is six numbers in pixels: the boresight (ICRS) times the focal length, and the camera's x axis times the distance from
-the boresight at which stars usually stand. Two attitudes are as far apart as they move a star field on the detector, so
-that coming back to an attitude, from anywhere and whenever, is coming back to its place. A smooth function of the place is
-a sum of bumps (Wendland 1995), which stand a `spacing` apart wherever the run has been, and nowhere else.
+A place is six numbers in pixels: the boresight (ICRS) times the focal length, and the camera's x axis times the usual distance
+of a star from the boresight. The distance of two places is how far the field moves on the detector between the two attitudes,
+so that the same attitude is the same place however the run got there. A smooth function of the place is a sum of bumps
+(Wendland 1995), a `spacing` apart wherever the run has been.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -21,10 +20,10 @@ from scipy.spatial import cKDTree
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.units import ARCSEC_PER_RAD
 
-ROLL_SHARE = 0.3  # of the detector's side: the usual distance of a star from the boresight
-REACH = 2.5  # of a bump, in spacings: a sine of four spacings or longer is then met to 1 %
-CLOSE = 0.7  # of a spacing: nearer bumps are one
-RIDGE = 1e-7  # of the mean diagonal: bumps that few samples tell apart
+ROLL_SHARE = 0.3  # usual distance of a star from the boresight, in sides of the detector
+REACH = 2.5  # radius of a bump, in spacings: a sine of four spacings or longer is then fitted to 1 %
+CLOSE = 0.7  # bumps nearer than this, in spacings, are one
+RIDGE = 1e-7  # share of the mean diagonal, for bumps that few samples tell apart
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,12 +35,12 @@ class Scale:
 
     @property
     def roll_px(self) -> float:
-        """How far from the boresight stars usually stand."""
+        """The usual distance of a star from the boresight."""
         return ROLL_SHARE * min(self.resolution_px)
 
     @property
     def pixel_arcsec(self) -> float:
-        """A pixel in the middle of the field."""
+        """The angle of a pixel in the middle of the field."""
         return ARCSEC_PER_RAD / self.focal_px
 
 
@@ -57,13 +56,13 @@ def axes_of(q_icrs_to_cam: FloatArray) -> FloatArray:
 
 
 def places_of(axes: FloatArray, focal_px: float, roll_px: float) -> FloatArray:
-    """The places (n, 6), px, of attitudes by their axes (n, 3, 3)."""
+    """The places (n, 6), px, of attitudes with axes (n, 3, 3)."""
     return np.concatenate([focal_px * axes[:, 2], roll_px * axes[:, 0]], axis=1)
 
 
 @dataclass(frozen=True)
 class Bumps:
-    """The bumps (n, p) at n samples, and where they stand (p, 6)."""
+    """The values (n, p) of p bumps at n samples, and their centres (p, 6)."""
 
     value: sparse.csr_matrix
     centre: FloatArray
@@ -74,8 +73,16 @@ class Bumps:
         return np.asarray((self.value.T @ self.value).todense())
 
 
+class Weights(NamedTuple):
+    """Entries (m,) of the sparse matrix of bumps: the sample, the bump, and the bump's value there."""
+
+    sample: IntArray
+    bump: IntArray
+    value: FloatArray
+
+
 def centres_of(place: FloatArray, spacing_px: float) -> FloatArray:
-    """Places (p, 6) about a spacing apart that cover some (n, 6)."""
+    """Centres (p, 6) about a spacing apart that cover the places (n, 6)."""
     cell = np.floor(place / spacing_px).astype(np.int64)
     _, first, inverse = np.unique(_numbers(cell), return_index=True, return_inverse=True)
     inverse = np.argsort(np.argsort(first))[inverse]  # cells in the order in which they were first seen
@@ -89,7 +96,7 @@ def centres_of(place: FloatArray, spacing_px: float) -> FloatArray:
 
 
 def _numbers(cell: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """One number (n,) for each cell (n, 6): a hash by multiplication, which does not meet itself among thousands of cells."""
+    """A number (n,) for each cell (n, 6): a multiplicative hash without collisions among thousands of cells."""
     mixed = np.zeros(len(cell), dtype=np.uint64)
     for column in (cell - cell.min(axis=0)).T.astype(np.uint64):
         mixed = (mixed ^ column) * np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio (Knuth 1998, 6.4)
@@ -98,24 +105,24 @@ def _numbers(cell: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
 
 
 def bumps_at(place: FloatArray, centre: FloatArray, spacing_px: float) -> Bumps:
-    """The bumps of some centres (p, 6) at places (n, 6)."""
-    i, j, value = weights_at(place, centre, spacing_px)
-    return Bumps(sparse.csr_matrix((value, (i, j)), shape=(len(place), len(centre))), centre)
+    """The bumps with these centres (p, 6) at places (n, 6)."""
+    near = weights_at(place, centre, spacing_px)
+    return Bumps(sparse.csr_matrix((near.value, (near.sample, near.bump)), shape=(len(place), len(centre))), centre)
 
 
-def weights_at(place: FloatArray, centre: FloatArray, spacing_px: float) -> tuple[IntArray, IntArray, FloatArray]:
-    """Which sample and which centre, and the bump there; all bumps of a sample add to 1, and a constant is met to the edge."""
+def weights_at(place: FloatArray, centre: FloatArray, spacing_px: float) -> Weights:
+    """The values of bumps at samples within their reach. The bumps of a sample add to 1, so a constant fits up to the edge."""
     near = cKDTree(place).sparse_distance_matrix(cKDTree(centre), REACH * spacing_px, output_type="ndarray")
     r = near["v"] / (REACH * spacing_px)
     value = (1 - r) ** 4 * (4 * r + 1)
     total = np.bincount(near["i"], value, minlength=len(place))
-    return near["i"], near["j"], value / total[near["i"]]
+    return Weights(near["i"], near["j"], value / total[near["i"]])
 
 
 class Projector:
-    """Least squares fits of the columns of a sparse matrix (n, p), with a ridge too small to matter.
+    """Least squares fits by the columns of a sparse matrix (n, p), with a ridge too small to matter.
 
-    `freedom` is how many degrees of freedom a fit takes.
+    `freedom` is the number of degrees of freedom that a fit takes.
     """
 
     def __init__(self, value: sparse.csr_matrix) -> None:
@@ -129,6 +136,6 @@ class Projector:
         self.freedom = size - ridge * float(np.trace(inverse))
 
     def fit(self, wanted: FloatArray) -> FloatArray:
-        """What the columns explain (n, k) of values (n, k)."""
+        """The fit (n, k) to values (n, k)."""
         coefficient = linalg.cho_solve(self._factor, self.value.T @ wanted, check_finite=False)
         return np.asarray(self.value @ coefficient)

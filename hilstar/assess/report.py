@@ -1,7 +1,4 @@
-"""An assessment in figures: the JSON object, the tables, and lines for a person.
-
-The error budget on one page: figures, charts within it, tables, and what is to be known of them.
-"""
+"""An assessment for its readers: the JSON object, tables, lines on the terminal, and one page with charts."""
 
 from __future__ import annotations
 
@@ -10,7 +7,7 @@ import html
 from collections.abc import Iterator, Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -24,7 +21,6 @@ from hilstar.charts import BLUE, DARK, GRID, INK, MUTED, PAPER, label_ends, pane
 from hilstar.files import write_whole
 
 COUNT = "1"  # the unit of counts and shares in the tables
-COLUMNS = ("quantity", "axis", "value", "unit", "low_95", "high_95")
 MAX_NAMED = 10
 MAX_POINTS = 4000
 MAX_ROWS = 200
@@ -49,7 +45,7 @@ AXES = ("x", "y", "about the boresight")
 
 
 class Clock(msgspec.Struct, frozen=True):
-    """The tracker's clock less the run's at the run's start, and how much faster it is; null where the motion does not tell."""
+    """The tracker's clock minus the run's at the run's start, and its excess rate; null where the motion does not tell."""
 
     offset_ms: float | None
     drift_ppm: float | None
@@ -87,51 +83,54 @@ def budget_of(found: Assessment) -> Budget:
     )
 
 
-Row = tuple[str, str, float | int | None, str, float | None, float | None]
+class BudgetRow(NamedTuple):
+    """A row of budget.csv, here and in a campaign's directory: None is an empty cell."""
+
+    quantity: str
+    axis: str
+    value: float | int | None
+    unit: str = COUNT
+    low_95: float | None = None
+    high_95: float | None = None
 
 
-def rows_of(found: Assessment) -> Iterator[Row]:
+def rows_of(found: Assessment) -> Iterator[BudgetRow]:
     """The rows of budget.csv."""
     parts, intervals = found.found, found.found.intervals
     for k, axis in enumerate("xyz"):
-        low, high = intervals.bias[:, k].tolist()
-        yield "bias", axis, float(parts.bias_arcsec[k]), "arcsec", low, high
+        yield BudgetRow("bias", axis, float(parts.bias_arcsec[k]), "arcsec", *intervals.bias[:, k].tolist())
     for name, axes, interval in (
         ("field-of-view error", parts.fov_arcsec, intervals.fov),
         ("pixel error", parts.pixel_arcsec, intervals.pixel),
         ("noise", found.noise_arcsec, intervals.noise),
     ):
-        yield from _of_axes(name, axes, interval)
+        for k, axis in enumerate(("cross", "roll")):
+            value = getattr(axes, axis)
+            low, high = interval[:, k].tolist() if value is not None else (None, None)
+            yield BudgetRow(name, axis, value, "arcsec", low, high)
     clock = parts.clock
     for name, value, sigma, unit, told in (
         ("clock offset", 1e3 * found.offset_s, 1e3 * clock.sigma_offset_s, "ms", clock.offset_told),
         ("clock drift", 1e6 * clock.drift, 1e6 * clock.sigma_drift, "ppm", clock.drift_told),
     ):
-        yield name, "", value if told else None, unit, value - 1.96 * sigma, value + 1.96 * sigma
+        yield BudgetRow(name, "", value if told else None, unit, value - 1.96 * sigma, value + 1.96 * sigma)
     lock = found.lock
-    yield "availability", "", lock.availability, COUNT, None, None
-    yield "answers due", "", lock.due, COUNT, None, None
-    yield "right answers", "", lock.right, COUNT, None, None
-    yield "wrong answers", "", len(found.wrong), COUNT, None, None
-    yield "lock lost", "", len(lock.lost), COUNT, None, None
-    yield "acquisition probability", "", lock.acquisition_probability, COUNT, None, None
-    yield "acquisition time, median", "", lock.acquisition_s, "s", None, None
+    yield BudgetRow("availability", "", lock.availability)
+    yield BudgetRow("answers due", "", lock.due)
+    yield BudgetRow("right answers", "", lock.right)
+    yield BudgetRow("wrong answers", "", len(found.wrong))
+    yield BudgetRow("lock lost", "", len(lock.lost))
+    yield BudgetRow("acquisition probability", "", lock.acquisition_probability)
+    yield BudgetRow("acquisition time, median", "", lock.acquisition_s, "s")
     if found.display is not None:
-        yield "display's own error", "cross", found.display.cross_arcsec, "arcsec", None, None
-        yield "display's own error", "roll", found.display.roll_arcsec, "arcsec", None, None
-        yield "display's own error, share seen", "", found.display.seen, COUNT, None, None
-
-
-def _of_axes(name: str, axes: Axes, interval: FloatArray) -> Iterator[Row]:
-    for k, axis in enumerate(("cross", "roll")):
-        value = getattr(axes, axis)
-        low, high = interval[:, k].tolist() if value is not None else (None, None)
-        yield name, axis, value, "arcsec", low, high
+        yield BudgetRow("display's own error", "cross", found.display.cross_arcsec, "arcsec")
+        yield BudgetRow("display's own error", "roll", found.display.roll_arcsec, "arcsec")
+        yield BudgetRow("display's own error, share seen", "", found.display.seen)
 
 
 def write_tables(directory: Path, found: Assessment) -> None:
     """Write budget.csv, slices.csv, wrong.csv and outages.csv. Raises InputError."""
-    write_csv(directory / "budget.csv", COLUMNS, [_plain(row) for row in rows_of(found)])
+    write_csv(directory / "budget.csv", BudgetRow._fields, [_plain(row) for row in rows_of(found)])
     names = [field.name for field in fields(Slice)]
     slices = [("rate_deg_s", each) for each in found.by_rate] + [("field_v_mag", each) for each in found.by_magnitude]
     write_csv(
@@ -154,7 +153,7 @@ def _plain(row: tuple[object, ...]) -> list[object]:
 
 
 def lines_of(found: Assessment) -> list[tuple[str, str]]:
-    """The assessment for a person: name and text."""
+    """The lines of the assessment on the terminal: name and text."""
     parts, lock = found.found, found.lock
     x, y, z = parts.bias_arcsec.tolist()
     named = ", ".join(str(each.row) for each in found.wrong[:MAX_NAMED]) + (", ..." if len(found.wrong) > MAX_NAMED else "")
@@ -205,7 +204,7 @@ def _number(value: float | None) -> str:
 
 
 def write_page(path: Path, found: Assessment) -> None:
-    """Write the page of an assessment; it needs no other file. Raises InputError."""
+    """Write the page of an assessment as one file that needs no other. Raises InputError."""
     title = f"Error budget: {found.telemetry.path.name} against {found.run.path.name}"
     notes = "".join(f'<p class="note">{html.escape(note)}</p>' for note in found.notes)
     text = PAGE.format(title=html.escape(title), notes=notes, body="".join(_sections(found)), **COLOURS)

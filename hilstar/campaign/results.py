@@ -1,47 +1,49 @@
-"""A campaign's table as arrays, of as many cases as a figure needs.
+"""The results of a campaign's table: the error budget of its cases, and what each parameter costs.
 
-The error budget of a campaign's cases, by the same code as that of a run.
+**Budget.** The same decomposition as that of a run (`hilstar.assess`), over cases that are independent of each other.
 
-Which parameter costs how much: the error in bins of each parameter, all others as the plan spreads them.
-
-A bin's level is the median of its cases, so that one field with two stars does not hide what a parameter does to all others;
-its standard error is half of what lies between the order statistics sqrt(k) / 2 on either side of the middle. (For answers not
-given it is their mean.) A parameter's **cost** is what the bins, rms over them, exceed the best one by, in quadrature. Its
-**share** is the first-order index of Sobol (1993) of the cases' ranks: the variance of the bins' mean ranks in that of all,
-less what bins of so many cases have by chance. Attitude errors are those about their median: a bias that all cases have is
+**Costs.** Each measure (attitude error, centroid error, missing answers) is compared in bins of each parameter, with all others
+spread as the plan has them. A bin's level is the median of its cases, so that one field with two stars does not hide the effect
+in all others. Its standard error is half the distance between the order statistics sqrt(k) / 2 either side of the middle. (For
+missing answers the level is the mean.) A parameter's **cost** is the excess of the bins' rms over the best bin, in quadrature.
+Its **share** is the first-order index of Sobol (1993) of the cases' ranks: the variance of the bins' mean ranks over that of
+all, less what bins of that size have by chance. Attitude errors are taken about their median: a bias common to all cases is
 alignment, which no parameter costs.
-
-What is written beside a campaign's table once it is whole: budget, costs and charts.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 from scipy.stats import rankdata
 
 from hilstar.arrays import FloatArray, IntArray
-from hilstar.assess.budget import assess_cases
+from hilstar.assess.budget import Axes, Decomposed, assess_cases
 from hilstar.assess.places import Scale
+from hilstar.assess.report import BudgetRow
 from hilstar.bench.config import BenchConfig
+from hilstar.campaign.store import failures, file_sha256
 from hilstar.charts import INK, MUTED, chart, write_csv
 from hilstar.errors import InputError
 from hilstar.rotation import from_rotation_vectors, multiply
 from hilstar.units import ARCSEC_PER_RAD
 
-MAX_READ_CASES = 50_000  # that figures are made from; of a larger table evenly many from each part
+MAX_READ_CASES = 50_000  # cases read for the figures, spread evenly over a larger table
 VARY = "vary."
-CSV_COLUMNS = ("quantity", "axis", "value", "unit", "low_95", "high_95")
-PARTS = {"fov": "field-of-view error", "pixel": "pixel error", "noise": "noise", "scatter": "noise within a case"}
-MAX_FITTED_CASES = 20_000  # that the parts are told apart in; the fit's time grows with them
+PARTS = {"fov": "field-of-view error", "pixel": "pixel error", "noise": "noise"}
+SCATTER = "noise within a case"
+MAX_FITTED_CASES = 20_000  # cases in the fit of the budget, whose time grows with them
 MAX_BINS, MIN_IN_BIN = 8, 8
-SURE = 4.0  # standard errors between the worst and the best bin; of 8 bins of noise, 1 in 100 are so far apart
+SURE = 4.0  # standard errors between the worst and the best bin; in 1 of 100 sets of 8 bins, noise alone has so many
 MAX_PANELS = 6
+MAX_REASONS = 5
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,7 @@ class Columns:
 
 
 def read_cases(path: Path, max_cases: int = MAX_READ_CASES) -> Columns:
-    """A campaign's table. Raises InputError where it is none."""
+    """A campaign's table, or an even share of its cases. Raises InputError for what is no such table."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -87,8 +89,62 @@ def read_cases(path: Path, max_cases: int = MAX_READ_CASES) -> Columns:
         raise InputError(f"{path}: is no table of a campaign ({error}); delete it, and run the same command again") from error
 
 
+@dataclass(frozen=True, slots=True)
+class CentroidFigures:
+    """The centroider alone: mean error and one sigma, px, the share of stars found, and false finds per frame."""
+
+    bias_x_px: float
+    bias_y_px: float
+    sigma_x_px: float
+    sigma_y_px: float
+    found_share: float
+    false_a_frame: float
+
+
+@dataclass(frozen=True, slots=True)
+class CaseBudget:
+    """The budget of the cases, as `hilstar assess` has it; `scatter_arcsec` is that within cases of several frames.
+
+    A figure that too few answers determine is None, and a note says why.
+    """
+
+    scatter_arcsec: Axes | None
+    availability: float
+    wrong: int
+    centroids: CentroidFigures | None
+    notes: tuple[str, ...]
+    parts: Decomposed | None = None
+
+    @property
+    def bias_arcsec(self) -> tuple[float, ...] | None:
+        """The mean error, cam axes."""
+        return None if self.parts is None else tuple(self.parts.bias_arcsec.tolist())
+
+
+def case_budget(cases: Columns, config: BenchConfig, rng: np.random.Generator) -> CaseBudget:
+    """The budget of a campaign's cases."""
+    asked = float(np.nansum(cases.numbers["frames"]))
+    solved, wrong = (float(np.nansum(cases.numbers[name])) for name in ("solved", "wrong"))
+    budget = CaseBudget(
+        scatter_arcsec=_scatter(cases),
+        availability=(solved - wrong) / asked if asked else 0.0,
+        wrong=int(wrong),
+        centroids=_centroids(cases),
+        notes=(),
+    )
+    tracker = config.tracker
+    scale = Scale(tracker.focal_length_mm * 1e3 / tracker.pixel_pitch_um, tracker.resolution_px)
+    commanded, reported = cases.vectors("q{}", "wxyz"), reported_attitudes(cases)
+    step = -(-len(commanded) // MAX_FITTED_CASES)
+    try:
+        parts = assess_cases(commanded[::step], reported[::step], scale, rng)
+    except InputError as error:
+        return replace(budget, notes=(str(error),))
+    return replace(budget, parts=parts, notes=parts.notes)
+
+
 def reported_attitudes(cases: Columns) -> FloatArray:
-    """The attitudes (n, 4) that the solver reported, NaN where none: a case's mean error put on its commanded attitude."""
+    """The solver's attitudes (n, 4), NaN where there is none: a case's mean error applied to its commanded attitude."""
     commanded = cases.vectors("q{}", "wxyz")
     error = cases.vectors("error_{}_arcsec", "xyz") / ARCSEC_PER_RAD
     known = np.isfinite(error).all(axis=1)
@@ -97,52 +153,17 @@ def reported_attitudes(cases: Columns) -> FloatArray:
     return reported
 
 
-def case_budget(cases: Columns, config: BenchConfig, rng: np.random.Generator) -> dict[str, Any]:
-    """The budget as `hilstar assess` has it, with `scatter_arcsec` within cases of several frames, and notes.
-
-    What too few answers cannot tell is None, and a note says why.
-    """
-    asked = np.nansum(cases.numbers["frames"])
-    solved, wrong = (float(np.nansum(cases.numbers[name])) for name in ("solved", "wrong"))
-    found: dict[str, Any] = {
-        "bias_arcsec": None,
-        "fov_arcsec": None,
-        "pixel_arcsec": None,
-        "noise_arcsec": None,
-        "scatter_arcsec": _scatter(cases),
-        "availability": (solved - wrong) / asked if asked else 0.0,
-        "wrong": int(wrong),
-        "centroids": _centroids(cases),
-        "notes": [],
-        "intervals": {},
-    }
-    tracker = config.tracker
-    scale = Scale(tracker.focal_length_mm * 1e3 / tracker.pixel_pitch_um, tracker.resolution_px)
-    commanded, reported = cases.vectors("q{}", "wxyz"), reported_attitudes(cases)
-    step = -(-len(commanded) // MAX_FITTED_CASES)
-    try:
-        parts = assess_cases(commanded[::step], reported[::step], scale, rng)
-    except InputError as error:
-        found["notes"] = [str(error)]
-        return found
-    found |= {name: asdict(getattr(parts, name)) for name in ("fov_arcsec", "pixel_arcsec", "noise_arcsec")}
-    found |= {"bias_arcsec": parts.bias_arcsec.tolist(), "notes": list(parts.notes)}
-    found["intervals"] = {name: getattr(parts.intervals, name).tolist() for name in ("bias", "fov", "pixel", "noise")}
-    return found
-
-
-def _scatter(cases: Columns) -> dict[str, float] | None:
-    """One sigma across and about the boresight between the frames of a case, arcsec; None where cases have one frame."""
+def _scatter(cases: Columns) -> Axes | None:
+    """One sigma between the frames of a case; None where cases have one frame."""
     scatter = cases.vectors("scatter_{}_arcsec", "xyz")
     scatter = scatter[np.isfinite(scatter).all(axis=1)]
     if not len(scatter):
         return None
     variance = (scatter**2).mean(axis=0)
-    return {"cross": math.sqrt((variance[0] + variance[1]) / 2), "roll": math.sqrt(variance[2])}
+    return Axes(math.sqrt((variance[0] + variance[1]) / 2), math.sqrt(variance[2]))
 
 
-def _centroids(cases: Columns) -> dict[str, float] | None:
-    """What the centroider alone did: its mean error and one sigma, px, the share of stars found, and false finds a frame."""
+def _centroids(cases: Columns) -> CentroidFigures | None:
     numbers = cases.numbers
     if "measured" not in numbers:
         return None
@@ -157,42 +178,45 @@ def _centroids(cases: Columns) -> dict[str, float] | None:
     bias_px = [mean(numbers[f"centroid_d{axis}_px"]) for axis in "xy"]
     spread = [numbers[f"centroid_sigma_{axis}_px"] ** 2 + numbers[f"centroid_d{axis}_px"] ** 2 for axis in "xy"]
     sigma_px = [math.sqrt(max(0.0, mean(values) - bias**2)) for values, bias in zip(spread, bias_px, strict=True)]
-    return {
-        "bias_x_px": bias_px[0],
-        "bias_y_px": bias_px[1],
-        "sigma_x_px": sigma_px[0],
-        "sigma_y_px": sigma_px[1],
-        "found_share": float(np.nansum(numbers["matched"]) / max(np.nansum(numbers["stars"]), 1.0)),
-        "false_a_frame": float(np.nansum(numbers["false"]) / max(np.nansum(numbers["frames"]), 1.0)),
-    }
+    return CentroidFigures(
+        bias_x_px=bias_px[0],
+        bias_y_px=bias_px[1],
+        sigma_x_px=sigma_px[0],
+        sigma_y_px=sigma_px[1],
+        found_share=float(np.nansum(numbers["matched"]) / max(np.nansum(numbers["stars"]), 1.0)),
+        false_a_frame=float(np.nansum(numbers["false"]) / max(np.nansum(numbers["frames"]), 1.0)),
+    )
 
 
-def write_budget(path: Path, budget: dict[str, Any]) -> None:
+def write_budget(path: Path, budget: CaseBudget) -> None:
     """The budget as a table, with the columns of `hilstar assess`. Raises InputError where it cannot be written."""
-    rows: list[tuple[Any, ...]] = []
+    write_csv(path, BudgetRow._fields, [["" if value is None else value for value in row] for row in _rows(budget)])
+
+
+def _rows(budget: CaseBudget) -> Iterator[BudgetRow]:
+    parts, unknown = budget.parts, (None, None)
     for k, axis in enumerate("xyz"):
-        low, high = _interval(budget, "bias", k)
-        rows.append(("bias", axis, (budget["bias_arcsec"] or [None] * 3)[k], "arcsec", low, high))
+        value = None if parts is None else float(parts.bias_arcsec[k])
+        ends = unknown if parts is None else parts.intervals.bias[:, k].tolist()
+        yield BudgetRow("bias", axis, value, "arcsec", *ends)
     for part, name in PARTS.items():
+        axes = None if parts is None else getattr(parts, f"{part}_arcsec")
         for k, axis in enumerate(("cross", "roll")):
-            low, high = _interval(budget, part, k)
-            rows.append((name, axis, (budget[f"{part}_arcsec"] or {}).get(axis), "arcsec", low, high))
-    rows.append(("availability", "", budget["availability"], "1", None, None))
-    rows.append(("wrong answers", "", budget["wrong"], "1", None, None))
-    for name, value in (budget["centroids"] or {}).items():
-        unit = name.rpartition("_")[2] if name.endswith("_px") else "1"
-        rows.append((f"centroids: {name}", "", value, unit, None, None))
-    write_csv(path, CSV_COLUMNS, [["" if value is None else value for value in row] for row in rows])
-
-
-def _interval(budget: dict[str, Any], part: str, k: int) -> tuple[float | None, float | None]:
-    ends = budget["intervals"].get(part)
-    return (None, None) if ends is None else (ends[0][k], ends[1][k])
+            ends = unknown if parts is None else getattr(parts.intervals, part)[:, k].tolist()
+            yield BudgetRow(name, axis, axes and getattr(axes, axis), "arcsec", *ends)
+    scatter = budget.scatter_arcsec or Axes(None, None)
+    yield BudgetRow(SCATTER, "cross", scatter.cross, "arcsec")
+    yield BudgetRow(SCATTER, "roll", scatter.roll, "arcsec")
+    yield BudgetRow("availability", "", budget.availability)
+    yield BudgetRow("wrong answers", "", budget.wrong)
+    if budget.centroids is not None:
+        for name, value in asdict(budget.centroids).items():
+            yield BudgetRow(f"centroids: {name}", "", value, "px" if name.endswith("_px") else "1")
 
 
 @dataclass(frozen=True)
 class Measure:
-    """A figure of each case (n,), NaN where it has none; of a bin its median is taken, or its mean where `mean` says so."""
+    """A figure of each case (n,), NaN where it has none. A bin's level is its median, with `mean` its mean."""
 
     name: str
     unit: str
@@ -202,7 +226,7 @@ class Measure:
 
 @dataclass(frozen=True)
 class Cost:
-    """A parameter's effect on a measure: in each bin the parameter's place (b,), the measure, and its standard error."""
+    """A parameter's effect on a measure: the bins' places (b,), levels and standard errors."""
 
     measure: str
     unit: str
@@ -227,7 +251,7 @@ class Cost:
 
 
 def measures(cases: Columns) -> list[Measure]:
-    """What is measured of each case: attitude errors across and about the boresight, centroids, and answers not given."""
+    """The measures of the cases: attitude errors across and about the boresight, centroid errors, and missing answers."""
     numbers = cases.numbers
     x, y, z = (_about_median(numbers[f"error_{axis}_arcsec"]) for axis in "xyz")
     found = [Measure("cross", "arcsec", np.sqrt((x**2 + y**2) / 2)), Measure("roll", "arcsec", np.abs(z))]
@@ -246,7 +270,7 @@ def _about_median(values: FloatArray) -> FloatArray:
 
 
 def costs(cases: Columns) -> list[Cost]:
-    """The cost of each varied parameter in each measure, the dearest first within a measure."""
+    """The cost of each varied parameter in each measure, the largest first within a measure."""
     found = []
     for measure in measures(cases):
         each = [cost for name in cases.varied if (cost := _cost(measure, name, cases)) is not None]
@@ -300,7 +324,7 @@ def _share(values: FloatArray, index: IntArray, bins: int) -> float:
 
 
 def _bins(name: str, cases: Columns, good: npt.NDArray[np.bool_]) -> tuple[tuple[float | str, ...], IntArray]:
-    """Where a parameter's bins lie, and which one each good case is in; values of a list are bins themselves."""
+    """The places of a parameter's bins, and the bin of each good case. Few distinct values are bins themselves."""
     if name in cases.texts:
         texts = np.array(cases.texts[name])[good]
         values, index = np.unique(texts, return_inverse=True)
@@ -317,7 +341,7 @@ def _bins(name: str, cases: Columns, good: npt.NDArray[np.bool_]) -> tuple[tuple
 
 
 def _full(places: tuple[float | str, ...], index: IntArray) -> tuple[tuple[float | str, ...], IntArray]:
-    """The bins, or none where one of them has too few cases to say anything."""
+    """The bins, or none where one of them has too few cases."""
     enough = len(places) < 2 or np.bincount(index).min() >= MIN_IN_BIN // 2
     return (places, index) if enough else ((), index)
 
@@ -336,7 +360,7 @@ def write_costs(path: Path, found: list[Cost]) -> None:
 
 
 def finding(found: list[Cost]) -> str:
-    """The dearest parameter of a measure in one line."""
+    """The parameter that costs most of a measure, in one line."""
     first = found[0]
     if not first.sure:
         return (
@@ -367,7 +391,7 @@ def _place(place: float | str) -> str:
 
 
 def draw_costs(path: Path, found: list[Cost]) -> None:
-    """A chart of one measure's costs, a panel for each of the dearest parameters. Raises InputError."""
+    """A chart of one measure's costs, with a panel for each of the parameters that cost most. Raises InputError."""
     shown = found[:MAX_PANELS]
     with chart(path, finding(shown), panels=len(shown), share_x=False) as axes:
         top = 1.15 * max(float((cost.level + cost.error).max()) for cost in shown) or 1.0
@@ -387,11 +411,32 @@ def draw_costs(path: Path, found: list[Cost]) -> None:
             axis.set_ylabel("share" if cost.unit == "1" else f"{cost.unit}, median")
 
 
-def write_results(table: Path, config: BenchConfig, seed: int) -> dict[str, Any]:
-    """Write `budget.csv`, `sensitivity.csv` and a chart for each measure that varies; the budget, and what was found.
+class CampaignSummary(msgspec.Struct, frozen=True):
+    """The JSON object of `hilstar campaign`."""
+
+    cases: int
+    failed: int
+    failed_because: dict[str, int]
+    table: str
+    sha256: str
+    bias_arcsec: tuple[float, ...] | None
+    fov_arcsec: Axes | None
+    pixel_arcsec: Axes | None
+    noise_arcsec: Axes | None
+    scatter_arcsec: Axes | None
+    availability: float
+    wrong: int
+    centroids: CentroidFigures | None
+    notes: tuple[str, ...]
+    findings: tuple[str, ...]
+
+
+def write_results(table: Path, config: BenchConfig, seed: int) -> CampaignSummary:
+    """Write `budget.csv`, `sensitivity.csv` and a chart for each measure that varies beside a campaign's table.
 
     Raises InputError where the table cannot be read, or a file not be written.
     """
+    because = failures(table)
     cases = read_cases(table)
     budget = case_budget(cases, config, np.random.default_rng(seed))
     write_budget(table.with_name("budget.csv"), budget)
@@ -403,5 +448,42 @@ def write_results(table: Path, config: BenchConfig, seed: int) -> dict[str, Any]
         if max(float(cost.level.max()) for cost in of_it) > 0:
             draw_costs(table.with_name(f"sensitivity_{measure}.png"), of_it)
             findings.append(finding(of_it))
-    del budget["intervals"]
-    return budget | {"findings": findings}
+    parts = budget.parts
+    return CampaignSummary(
+        cases=cases.cases,
+        failed=sum(because.values()),
+        failed_because=because,
+        table=str(table),
+        sha256=file_sha256(table),
+        bias_arcsec=budget.bias_arcsec,
+        fov_arcsec=None if parts is None else parts.fov_arcsec,
+        pixel_arcsec=None if parts is None else parts.pixel_arcsec,
+        noise_arcsec=None if parts is None else parts.noise_arcsec,
+        scatter_arcsec=budget.scatter_arcsec,
+        availability=budget.availability,
+        wrong=budget.wrong,
+        centroids=budget.centroids,
+        notes=budget.notes,
+        findings=tuple(findings),
+    )
+
+
+def lines_of(summary: CampaignSummary) -> list[str]:
+    """The summary's lines on the terminal."""
+    lines = [f"{summary.cases} cases in {summary.table}, sha256 {summary.sha256}"]
+    lines += [f"{count} failed: {line}" for line, count in list(summary.failed_because.items())[:MAX_REASONS]]
+    lines.append(f"{'availability':20}{100 * summary.availability:.4g} %, {summary.wrong} wrong answers")
+    if summary.bias_arcsec is not None:
+        lines.append(f"{'bias':20}{', '.join(f'{value:.3g}' for value in summary.bias_arcsec)} arcsec about x, y, z")
+        for part, name in (*PARTS.items(), ("scatter", SCATTER)):
+            axes: Axes | None = getattr(summary, f"{part}_arcsec")
+            if axes is not None:
+                values = ("-" if value is None else f"{value:.3g} arcsec {axis}" for axis, value in asdict(axes).items())
+                lines.append(f"{name:20}{', '.join(values)}")
+    if summary.centroids is not None:
+        found = summary.centroids
+        lines.append(
+            f"{'centroids':20}{found.sigma_x_px:.3g}, {found.sigma_y_px:.3g} px one sigma,"
+            f" {100 * found.found_share:.3g} % of stars found, {found.false_a_frame:.3g} false a frame"
+        )
+    return [*lines, *summary.notes, *summary.findings]

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from hilstar.campaign.run import Campaign
     from hilstar.campaign.store import Directory
 
-MAX_REASONS = 5
 LINE_S = 10.0  # between lines of progress where stderr is no terminal
 
 
@@ -77,7 +76,9 @@ def campaign(
         directory.claim(this.about())
         if not directory.table.exists():
             run_cases(this, directory, cluster, workers or len(os.sched_getaffinity(0)), memory_bytes)
-        summary = summarised(this, directory)
+        from hilstar.campaign.results import lines_of, write_results  # charts and statistics, once there is a table
+
+        summary = write_results(directory.table, this.maker.file.config, this.plan.seed)
     finally:
         directory.close()
     if as_json:
@@ -147,43 +148,3 @@ def telling(cases: int) -> Iterator[Callable[[int], None]]:
             say(f"hilstar: {done} of {cases} cases, {a_second:.3g} a second, {(cases - done) / a_second:.0f} s left")
 
     yield line
-
-
-def summarised(this: Campaign, directory: Directory) -> dict[str, Any]:
-    """What came of a campaign, from its table."""
-    from hilstar.campaign.results import write_results
-    from hilstar.campaign.store import failures, file_sha256
-
-    because = failures(directory.table)
-    results = write_results(directory.table, this.maker.file.config, this.plan.seed)
-    return {
-        "cases": this.cases,
-        "failed": sum(because.values()),
-        "failed_because": because,
-        "table": str(directory.table),
-        "sha256": file_sha256(directory.table),
-    } | results
-
-
-def lines_of(summary: dict[str, Any]) -> list[str]:
-    """The summary for a person."""
-
-    def axes(name: str) -> str:
-        found = summary[f"{name}_arcsec"] or {"cross": None, "roll": None}
-        return ", ".join("-" if value is None else f"{value:.3g} arcsec {axis}" for axis, value in found.items())
-
-    bias = summary["bias_arcsec"]
-    lines = [f"{summary['cases']} cases in {summary['table']}, sha256 {summary['sha256']}"]
-    lines += [f"{count} failed: {line}" for line, count in list(summary["failed_because"].items())[:MAX_REASONS]]
-    lines.append(f"{'availability':20}{100 * summary['availability']:.4g} %, {summary['wrong']} wrong answers")
-    if bias is not None:
-        lines.append(f"{'bias':20}{', '.join(f'{value:.3g}' for value in bias)} arcsec about x, y, z")
-        names = {"fov": "field-of-view error", "pixel": "pixel error", "noise": "noise", "scatter": "noise within a case"}
-        lines += [f"{words:20}{axes(name)}" for name, words in names.items() if summary[f"{name}_arcsec"] is not None]
-    if summary["centroids"] is not None:
-        found = summary["centroids"]
-        lines.append(
-            f"{'centroids':20}{found['sigma_x_px']:.3g}, {found['sigma_y_px']:.3g} px one sigma,"
-            f" {100 * found['found_share']:.3g} % of stars found, {found['false_a_frame']:.3g} false a frame"
-        )
-    return [*lines, *summary["notes"], *summary["findings"]]

@@ -15,7 +15,7 @@ from hilstar.attitude.clock.rate_check import RateCheck, WrongRates
 from hilstar.attitude.clock.sender_clock import ClockSummary, Exchange, SenderClock
 from hilstar.attitude.clock.senders import Repeats, Senders
 from hilstar.attitude.clock.timeline import Timeline
-from hilstar.attitude.wire.links import Arrival, Link, SampleArrival
+from hilstar.attitude.wire.links import Arrival, SampleArrival, StreamLink
 from hilstar.attitude.wire.packet import REASONS, AttitudeSample, Event, Packet, Reason, Refusal, Status, TimeReply, TimeRequest
 from hilstar.attitude.wire.protocol import HEALTH_MISSED, HEALTH_REFUSED
 from hilstar.notices import Notices
@@ -52,7 +52,7 @@ class BackChannel:
     The receiver's thread calls it, but for `post`.
     """
 
-    def __init__(self, link: Link, traffic: Traffic) -> None:
+    def __init__(self, link: StreamLink, traffic: Traffic) -> None:
         self._link = link
         self._send: Callable[[Packet], None] = link.send
         self._traffic = traffic
@@ -144,7 +144,7 @@ class Receiver:
 
     def __init__(
         self,
-        link: Link,
+        link: StreamLink,
         timeline: Timeline,
         traffic: Traffic = QUIET,
         watch: Watch = nobody_watches,
@@ -242,7 +242,7 @@ class Receiver:
             # The newest of those that arrived while this thread slept woke it; the others had to wait.
             timely = not waits and k == len(arrivals) - 1
             waited_ns = 0 if timely else arrival.host_ns - self._empty_ns
-            self._take(arrival, arrival.waited_ns if arrival.stamped else waited_ns)
+            self._take(arrival, arrival.waited_ns if self._link.stamped else waited_ns)
         now_ns = time.monotonic_ns()
         if not arrivals:  # else the sender shown may have spoken, and is not read yet
             self._take_decided(self._senders.expire(now_ns))

@@ -16,7 +16,7 @@ import platform
 import struct
 import sys
 import time
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -36,6 +36,8 @@ RASTERISERS = "llvmpipe-"
 NAMING_LOOK_S = 1e-3
 # A thread names itself, a little after it has begun: on a busy machine, when it is first given a core.
 NAMING_S, BUSY_NAMING_S = 0.02, 0.5
+
+Clock = Callable[[], float]
 
 
 @contextmanager
@@ -81,18 +83,19 @@ class PromptWhileLight:
     core, as in a flood, its priority is the normal one, so that it takes no frame's time.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, now_s: Clock = time.monotonic, used_s: Clock = time.process_time) -> None:
         _ask_for_short_slices()
         self._prompt = _set_all_threads(os.SCHED_FIFO, PROMPT_PRIORITY)
         self._allowed = self._prompt
-        self._looked_s, self._used_s = time.monotonic(), time.process_time()
+        self._clocks = now_s, used_s
+        self._looked_s, self._used_s = now_s(), used_s()
 
     def tend(self) -> None:
         """Look how much the process has done; quick, so that it may be called often."""
-        now_s = time.monotonic()
+        now_s = self._clocks[0]()
         if not self._allowed or now_s - self._looked_s < LOOK_S:
             return
-        used_s = time.process_time()
+        used_s = self._clocks[1]()
         heavy = used_s - self._used_s > HEAVY * (now_s - self._looked_s)
         self._looked_s, self._used_s = now_s, used_s
         if heavy and self._prompt:

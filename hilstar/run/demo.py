@@ -15,9 +15,8 @@ import msgspec
 import numpy as np
 
 from hilstar.arrays import FloatArray
-from hilstar.attitude.wire.apart.zmq_apart import ZmqApart
 from hilstar.attitude.wire.packet import AttitudeSample
-from hilstar.attitude.wire.zmq_links import ZmqReceiver
+from hilstar.attitude.wire.zmq_links import ZmqApart, ZmqReceiver
 from hilstar.bench.build import load
 from hilstar.bench.frame import Bench
 from hilstar.bench.frame_files import write_codes_png, write_preview_png

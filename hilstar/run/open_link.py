@@ -1,27 +1,29 @@
-"""The link that a bench file names: one source of attitudes, one class."""
+"""The link that a bench file names, and the first attitude that comes over it."""
 
 from __future__ import annotations
 
 import math
+import time
 from pathlib import Path
 
-from hilstar.attitude.wire.apart.serial_apart import SerialApart
-from hilstar.attitude.wire.apart.zmq_apart import ZmqApart
 from hilstar.attitude.wire.keys import CurveKeys
-from hilstar.attitude.wire.links import StreamLink
+from hilstar.attitude.wire.links import LockstepLink, StreamLink
 from hilstar.attitude.wire.nasa42 import MessageReader, Nasa42Link, Nasa42Lockstep
-from hilstar.attitude.wire.serial_link import SerialLink
+from hilstar.attitude.wire.packet import AttitudeSample, Refusal, TimeReply, TimeRequest
+from hilstar.attitude.wire.serial_link import SerialApart, SerialLink
 from hilstar.attitude.wire.source import Mounting
 from hilstar.attitude.wire.udp import UdpLink
-from hilstar.attitude.wire.vizard import DifferenceRates, Follower, StateUse, VizardBroadcast, VizardLive
-from hilstar.attitude.wire.zmq_links import ZmqLockstep, ZmqReceiver
+from hilstar.attitude.wire.vizard import DifferenceRates, Follower, StateUse, VizardLive, vizard_broadcast
+from hilstar.attitude.wire.zmq_links import ZmqApart, ZmqLockstep, ZmqReceiver
 from hilstar.bench.config import AttitudeSettings, BenchConfig
 from hilstar.bench.config.stream.road import nasa42_road, udp_road
 from hilstar.bench.config.when import from_source
+from hilstar.errors import InputError
 from hilstar.notices import Notices
 from hilstar.units import NS_PER_MS
 
-AnyLink = StreamLink | ZmqLockstep | VizardLive
+AnyLink = StreamLink | LockstepLink
+POLL_MS = 50
 
 
 def link_keys(settings: AttitudeSettings, folder: Path) -> CurveKeys:
@@ -52,12 +54,6 @@ def open_link(config: BenchConfig, folder: Path, notices: Notices | None = None,
     return ZmqApart(receiver, notices) if apart else receiver
 
 
-def await_reader(link: AnyLink) -> None:
-    """Wait until the process that reads a link, if there is one, can begin at once: from then on a sender is heard."""
-    if isinstance(link, ZmqApart | SerialApart):
-        link.await_ready()
-
-
 def _open_vizard(config: BenchConfig, notices: Notices | None, *, apart: bool) -> AnyLink:
     settings = config.attitude
     rates = DifferenceRates(round(settings.stale_after_ms * NS_PER_MS), math.radians(settings.max_rate_deg_s))
@@ -67,13 +63,30 @@ def _open_vizard(config: BenchConfig, notices: Notices | None, *, apart: bool) -
     follower = Follower(name, mounting, rates, taken)
     if settings.lockstep:
         return VizardLive(settings.address, follower, bind=settings.bind is not False, notices=notices)
-    broadcast = VizardBroadcast(settings.address, follower, bind=settings.bind is True, notices=notices)
+    broadcast = vizard_broadcast(settings.address, follower, bind=settings.bind is True, notices=notices)
     return ZmqApart(broadcast, notices) if apart else broadcast
 
 
-def _open_42(config: BenchConfig, notices: Notices | None) -> Nasa42Link:
+def _open_42(config: BenchConfig, notices: Notices | None) -> AnyLink:
     settings = config.attitude
     spacecraft, allowed = nasa42_road(settings)
     reader = MessageReader(spacecraft, Mounting(config.tracker.q_body_to_cam))
     kind = Nasa42Lockstep if settings.lockstep else Nasa42Link
     return kind(settings.address, reader, bind=settings.bind is True, allowed=allowed, notices=notices)
+
+
+def first_attitude(link: StreamLink, patience_s: float) -> AttitudeSample:
+    """The first attitude that arrives within `patience_s`. Raises InputError where none does, with the last refusal."""
+    deadline_s = time.monotonic() + patience_s
+    refused = ""
+    while time.monotonic() < deadline_s:
+        for arrival in link.receive(POLL_MS):
+            match arrival.event:
+                case AttitudeSample() as sample:
+                    return sample
+                case TimeRequest(sequence, t1_ns) if link.two_way:  # a sender may wait for the answer before it sends
+                    back = arrival.back or link.send
+                    back(TimeReply(sequence, t1_ns, arrival.host_ns, time.monotonic_ns()))
+                case Refusal(reason, detail):
+                    refused = f"; the last message was refused ({reason}: {detail})"
+    raise InputError(f"{link.endpoint}: no attitude within {patience_s:g} s{refused}; start the sender, or give --wait S")

@@ -13,21 +13,15 @@ from msgspec.structs import replace as replaced
 from hilstar.attitude.clock.sender_clock import ClockSummary
 from hilstar.attitude.clock.timeline import Timeline
 from hilstar.attitude.receiver import PacketCounts, Receiver, Traffic
-from hilstar.attitude.wire.links import StreamLink
-from hilstar.attitude.wire.nasa42 import Nasa42Lockstep
+from hilstar.attitude.wire.links import LockstepLink, Pictures, StreamLink, TrackerCamera
 from hilstar.attitude.wire.source import Mounting
-from hilstar.attitude.wire.vizard import TrackerCamera, VizardLive
-from hilstar.attitude.wire.zmq_links import ZmqLockstep
 from hilstar.bench.config import AttitudeSettings
 from hilstar.bench.frame import Bench
 from hilstar.notices import Notices
 from hilstar.process.interrupts import stop_on_signal
 from hilstar.run.faults import AnyFaults
 from hilstar.run.frame_status import StatusMaker
-from hilstar.run.lockstep.nasa42 import serve_nasa42
-from hilstar.run.lockstep.packets import serve_lockstep
-from hilstar.run.lockstep.steps import Steps
-from hilstar.run.lockstep.vizard import Cameras, Pictures, serve_vizard
+from hilstar.run.lockstep import Steps, serve_lockstep
 from hilstar.run.loop import FrameLoop, Limit, policy_of
 from hilstar.run.open_link import AnyLink
 from hilstar.run.operator import HeadlessOverrides, SwitchRequests
@@ -114,7 +108,7 @@ def serve(bench: Bench, link: AnyLink, limit: Limit, sink: FrameSink = ignore, o
         for kind, line in Mounting(bench.config.tracker.q_body_to_cam).told:
             outlet.notices.tell(kind, line)
     with stop_on_signal(loop.stop), loop.watch:
-        if isinstance(link, ZmqLockstep | VizardLive | Nasa42Lockstep):
+        if link.steps:
             summary = _serve_lockstep(bench, link, limit, loop, outlet)
         else:
             summary = _serve_stream(bench, link, limit, loop, outlet)
@@ -126,17 +120,12 @@ def serve(bench: Bench, link: AnyLink, limit: Limit, sink: FrameSink = ignore, o
     )
 
 
-def _serve_lockstep(
-    bench: Bench, link: ZmqLockstep | VizardLive | Nasa42Lockstep, limit: Limit, loop: FrameLoop, outlet: Outlet
-) -> RunSummary:
+def _serve_lockstep(bench: Bench, link: LockstepLink, limit: Limit, loop: FrameLoop, outlet: Outlet) -> RunSummary:
     bench.warm_up()
     steps = Steps(bench, limit, loop, outlet.ledger)
     outlet.follower(Running(loop, steps.counts))
-    if isinstance(link, ZmqLockstep):
-        return serve_lockstep(link, steps, loop, StatusMaker(outlet.ledger))
-    if isinstance(link, Nasa42Lockstep):
-        return serve_nasa42(link, steps, loop)
-    return serve_vizard(link, steps, loop, Cameras(_tracker_camera(bench), outlet.pictures, outlet.notices))
+    link.show_camera(_tracker_camera(bench), outlet.pictures)
+    return serve_lockstep(link, steps, loop, StatusMaker(outlet.ledger))
 
 
 def _tracker_camera(bench: Bench) -> TrackerCamera:

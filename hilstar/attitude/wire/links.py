@@ -1,15 +1,22 @@
-"""The contract of every link into hilstar: messages with their time of arrival, a way back, and limits against floods."""
+"""The contract of every link into hilstar: what it can do, messages with their time of arrival, limits against floods.
+
+A packet has two names on its way in: an `Arrival`, which is what came and when, and the `AttitudeSample` that it says. A link
+whose messages are passed over in a flood keeps them as `RawMessage` until they are decoded.
+"""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, astuple, dataclass
+from operator import add, sub
 from types import TracebackType
-from typing import Generic, Protocol, Self, TypeAlias, TypeVar
+from typing import ClassVar, Generic, Literal, NamedTuple, Self, TypeAlias, TypeVar
 
-from hilstar.attitude.wire.packet import AttitudeSample, Event, Packet, Refusal
-from hilstar.attitude.wire.source import Conventions
+from hilstar.arrays import FloatArray
+from hilstar.attitude.wire.packet import AttitudeSample, Event, Packet, Refusal, Status
+from hilstar.attitude.wire.source import PACKETS, Conventions
 from hilstar.notices import Notices
 
 MAX_PACKETS_PER_S = 3000  # decoded: some 10 % of one core, and more than any serial line carries
@@ -40,6 +47,12 @@ class LinkCounts:
     def summary(self) -> dict[str, int]:
         """The counts by name."""
         return asdict(self)
+
+    def __add__(self, other: LinkCounts) -> LinkCounts:
+        return LinkCounts(*map(add, astuple(self), astuple(other)))
+
+    def __sub__(self, other: LinkCounts) -> LinkCounts:
+        return LinkCounts(*map(sub, astuple(self), astuple(other)))
 
 
 class FloodGate:
@@ -88,13 +101,29 @@ class FloodGate:
         time.sleep(PAUSE_S)
 
 
+class RawMessage(NamedTuple):
+    """A message as it arrived, not decoded: host time in ns, its parts, and how long it may have waited unread.
+
+    `empty_ns` is when nothing waited last. A `timely` message woke its reader and did not wait.
+    """
+
+    host_ns: int
+    parts: Sequence[bytes]
+    empty_ns: int = 0
+    timely: bool = True
+
+    @property
+    def waited_ns(self) -> int:
+        """How long it may have waited before it was stamped, ns."""
+        return 0 if self.timely else self.host_ns - self.empty_ns
+
+
 @dataclass(frozen=True, slots=True)
 class Arrival(Generic[E_co]):
     """One message: host time of its arrival, what it says, its bytes as received, and how long it may have waited unread.
 
-    `refusal` says why a packet that is an attitude is not used. `back` sends to whoever sent this, where a link has several
-    senders. A `stamped` arrival's time and its wait are the kernel's, or of a process that does nothing else, however late it
-    is read here.
+    `refusal` says why a packet that is an attitude is not used. `back` sends to the sender of this message, where a link has
+    several senders.
     """
 
     host_ns: int
@@ -103,47 +132,93 @@ class Arrival(Generic[E_co]):
     waited_ns: int = 0
     refusal: Refusal | None = None
     back: Callable[[Packet], None] | None = None
-    stamped: bool = False
 
 
 SampleArrival: TypeAlias = Arrival[AttitudeSample]
 
 
-class Link(Protocol):
-    """A link into hilstar."""
+@dataclass(frozen=True, slots=True)
+class TrackerCamera:
+    """The bench's tracker: its mounting, its size, and its field of view along y, degrees."""
 
-    two_way: bool
+    q_body_to_cam: FloatArray
+    resolution_px: tuple[int, int]
+    field_of_view_deg: float
 
+
+# The picture (a PNG) of the tracker at an attitude, for a simulation that asks for it.
+Pictures = Callable[[AttitudeSample], bytes]
+
+
+class Link(ABC):
+    """A link into hilstar, closed when its `with` ends.
+
+    `verb` and `endpoint` say where it is ("connected to", "tcp://127.0.0.1:5560"), `conventions` what its numbers mean.
+    `steps`: its simulation waits for a frame after each attitude (lockstep). `two_way`: packets can go back to the sender.
+    `stamped`: times of arrival are the kernel's, or of a process that only reads; else they are of the thread that reads here.
+    """
+
+    steps: ClassVar[bool]
+    two_way: bool = False
+    stamped: bool = False
+    asks_for_pictures: ClassVar[bool] = False
+    verb: str
+    endpoint: str
+    link_counts: LinkCounts
+    conventions: Conventions = PACKETS
+
+    @abstractmethod
+    def close(self) -> None:
+        """Close the link."""
+
+    def await_ready(self) -> None:  # noqa: B027 - most links are ready once they are open
+        """Wait until a sender is heard from the first read on: for a process that reads, and not for long."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+
+class StreamLink(Link):
+    """A link whose sender runs freely."""
+
+    steps: ClassVar[Literal[False]] = False
+
+    @property
+    def reconnects(self) -> int:
+        """How often the sender came back."""
+        return max(0, self.link_counts.connections - 1)
+
+    @abstractmethod
     def receive(self, timeout_ms: int) -> list[Arrival[Event]]:
-        """What has arrived; waits at most `timeout_ms` for the first, and for no other. A lost peer raises nothing."""
+        """The messages so far, oldest first; waits at most `timeout_ms` for the first. A lost peer raises nothing."""
 
+    @abstractmethod
     def wait_for_message(self, timeout_ms: int) -> bool:
-        """True once something has arrived that was not read."""
+        """True once something unread has arrived."""
 
     def send(self, packet: Packet) -> None:
         """Send to the other side, never waiting; lost if there is no listener."""
 
     def wire_ns(self, packet: Packet) -> int:
-        """How long the wire alone takes for a packet, ns."""
+        """How long the wire alone takes for a packet, ns; negligible on most."""
+        return 0
 
 
-class StreamLink(Link, Protocol):
-    """A link that runs freely: what `serve` asks of one, besides its messages.
+class LockstepLink(Link):
+    """A link whose sender asks for one frame at a time, and waits for the answer."""
 
-    `verb` and `endpoint` say where it is ("connected to", "tcp://127.0.0.1:5560"), `conventions` what its numbers mean.
-    """
+    steps: ClassVar[Literal[True]] = True
 
-    verb: str
-    endpoint: str
-    link_counts: LinkCounts
-    conventions: Conventions
+    @abstractmethod
+    def receive(self, timeout_ms: int) -> Arrival[Event] | None:
+        """The next request for a frame, or None; it must be answered before the next can arrive."""
 
-    @property
-    def reconnects(self) -> int:
-        """How often the sender reconnected."""
+    @abstractmethod
+    def answer(self, status: Status, shown_ns: int, refusal: Refusal | None) -> None:
+        """Answer the request, shown at a host time; a refused one left the last frame."""
 
-    def __enter__(self) -> Self: ...
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /
-    ) -> None: ...
+    def show_camera(self, tracker: TrackerCamera, pictures: Pictures | None) -> None:
+        """What to answer a simulation that asks for its camera's pictures."""

@@ -19,16 +19,15 @@ import re
 import select
 import socket
 import time
+from collections.abc import Sequence
 from datetime import date
-from types import TracebackType
-from typing import Self
 
 import numpy as np
 
 from hilstar.arrays import FloatArray
 from hilstar.attitude.wire.endpoint import AllowedSenders, Endpoint, check_use, parse_endpoint
-from hilstar.attitude.wire.links import Arrival, FloodGate, LinkCounts
-from hilstar.attitude.wire.packet import AttitudeSample, Event, Packet, Refusal, checked_sample
+from hilstar.attitude.wire.links import Arrival, FloodGate, Link, LinkCounts, LockstepLink, RawMessage, StreamLink
+from hilstar.attitude.wire.packet import AttitudeSample, Event, Refusal, Status, checked_sample
 from hilstar.attitude.wire.source import Conventions, Mounting, components
 from hilstar.attitude.wire.udp import ANCILLARY_BYTES, KernelStamps
 from hilstar.errors import InputError, shortened
@@ -152,10 +151,10 @@ def _time_ns(text: str) -> int | None:
     return seconds * NS_PER_S + int((match[6] or "").ljust(9, "0"))
 
 
-class Nasa42Link:
+class _Connection(Link):
     """One connection at a time; a second one is closed at once. Raises InputError where it cannot be bound."""
 
-    two_way = False
+    stamped = True
     conventions = CONVENTIONS
 
     def __init__(
@@ -182,11 +181,6 @@ class Nasa42Link:
         self._retry_s = 0.0
         self._listener = self._listen() if bind else None
 
-    @property
-    def reconnects(self) -> int:
-        """How often 42 came back."""
-        return max(0, self.link_counts.connections - 1)
-
     def _listen(self) -> socket.socket:
         try:
             made = socket.create_server(
@@ -199,8 +193,8 @@ class Nasa42Link:
         self.endpoint = f"tcp://{host}:{made.getsockname()[1]}"
         return made
 
-    def receive(self, timeout_ms: int) -> list[Arrival[Event]]:
-        """The messages that have arrived; each is acknowledged."""
+    def messages(self, timeout_ms: int) -> list[RawMessage]:
+        """The messages that have arrived, oldest first."""
         if self._connection is None and self._listener is None:
             self._connect(timeout_ms)
         if not self.wait_for_message(timeout_ms):
@@ -209,15 +203,13 @@ class Nasa42Link:
         if not chunk:  # the connection says no more for now, or ever
             self._accept()
             return []
-        messages = self._splitter.feed(chunk)
-        self._read_messages(len(messages))
-        admitted = self._gate.newest(messages, lambda message: False)  # 42 declares none
-        arrivals: list[Arrival[Event]] = []
-        for k, message in enumerate(admitted, 1):
-            # The kernel's stamp is that of the last.
-            waited_ns = 0 if k == len(admitted) else host_ns - self._stamps.empty_ns
-            arrivals.append(Arrival(host_ns, self._reader.decode(message), message, waited_ns=waited_ns, stamped=True))
-        return arrivals
+        whole = self._splitter.feed(chunk)
+        # The kernel's stamp is that of the last.
+        return [RawMessage(host_ns, [each], self._stamps.empty_ns, k == len(whole)) for k, each in enumerate(whole, 1)]
+
+    def arrival(self, message: RawMessage) -> Arrival[Event]:
+        """What a message says."""
+        return Arrival(message.host_ns, self._reader.decode(message.parts[0]), message.parts[0], message.waited_ns)
 
     def _read(self) -> tuple[bytes, int]:
         """What has come, and when the last of it did."""
@@ -232,10 +224,6 @@ class Nasa42Link:
                 return chunk, self._stamps.arrived_ns(ancillary, time.monotonic_ns())
         self._lose()
         return b"", 0
-
-    def _read_messages(self, count: int) -> None:
-        """So many messages were read: 42 may compute on."""
-        self.acknowledge(count)
 
     def acknowledge(self, count: int = 1) -> None:
         """Let 42 compute on: it waits after each message."""
@@ -302,13 +290,6 @@ class Nasa42Link:
             self._stamps.empty_ns = asked_ns
         return waits
 
-    def send(self, packet: Packet) -> None:
-        """42 hears acknowledgements and nothing else."""
-
-    def wire_ns(self, packet: Packet) -> int:
-        """Negligible."""
-        return 0
-
     def _shut(self) -> None:
         connection, self._connection = self._connection, None
         if connection is not None:
@@ -320,18 +301,33 @@ class Nasa42Link:
         if self._listener is not None:
             self._listener.close()
 
-    def __enter__(self) -> Self:
-        return self
 
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
-        self.close()
+class Nasa42Link(_Connection, StreamLink):
+    """42 runs freely: each message is acknowledged as it is read."""
+
+    def receive(self, timeout_ms: int) -> list[Arrival[Event]]:
+        """The messages that have arrived, and only the newest of a flood; each is acknowledged."""
+        messages = self.messages(timeout_ms)
+        self.acknowledge(len(messages))
+        return [self.arrival(message) for message in self._gate.newest(messages, lambda message: False)]  # 42 declares none
 
 
-class Nasa42Lockstep(Nasa42Link):
-    """42 waits for each frame: whoever shows it acknowledges its message."""
+class Nasa42Lockstep(_Connection, LockstepLink):
+    """42 waits for each frame: its message is acknowledged once the frame is shown."""
 
-    def _read_messages(self, count: int) -> None:
-        """Nothing is acknowledged yet."""
+    _waiting: Sequence[RawMessage] = ()
+
+    def receive(self, timeout_ms: int) -> Arrival[Event] | None:
+        """The next message, or None."""
+        self._waiting = self._waiting or self.messages(timeout_ms)
+        if not self._waiting:
+            return None
+        first, *self._waiting = self._waiting
+        return self.arrival(first)
+
+    def answer(self, status: Status, shown_ns: int, refusal: Refusal | None) -> None:
+        """Let 42 compute on."""
+        self.acknowledge()
 
 
 def _host_and_port(place: Endpoint) -> tuple[str, int]:

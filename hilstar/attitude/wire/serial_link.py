@@ -10,13 +10,13 @@ import termios
 import time
 import warnings
 from collections.abc import Iterator
-from types import TracebackType
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import serial
 from serial.tools import list_ports
 
-from hilstar.attitude.wire.links import Arrival, FloodGate, LinkCounts
+from hilstar.attitude.wire.apart import GoneRecord, MessageRecord, ReaderProcess
+from hilstar.attitude.wire.links import Arrival, FloodGate, LinkCounts, RawMessage, StreamLink
 from hilstar.attitude.wire.packet import (
     DELIMITER,
     Event,
@@ -27,7 +27,6 @@ from hilstar.attitude.wire.packet import (
     frame,
     frame_declares_discontinuity,
 )
-from hilstar.attitude.wire.source import PACKETS
 from hilstar.errors import InputError, one_line
 from hilstar.notices import Notices
 from hilstar.units import NS_PER_S
@@ -67,23 +66,11 @@ def adapters() -> list[str]:
     return [f"{words.count(word)} x {word}" if words.count(word) > 1 else word for word in dict.fromkeys(words)]
 
 
-class Chunk(NamedTuple):
-    """Bytes that were read at once: when, and if a process that only reads did it, how long they may have waited unread.
-
-    `empty_ns` is when nothing waited last.
-    """
-
-    host_ns: int
-    data: bytes
-    waited_ns: int | None = None
-    empty_ns: int = 0
-
-
 class Framed(NamedTuple):
-    """A frame that a chunk completed, and whether it was the chunk's last."""
+    """A frame, and the bytes as they came that completed it; `last` of their frames or not."""
 
     body: bytes
-    chunk: Chunk
+    chunk: RawMessage
     last: bool
 
     def declares_discontinuity(self) -> bool:
@@ -92,14 +79,12 @@ class Framed(NamedTuple):
 
     def arrival(self) -> Arrival[Event]:
         """What it says; frames before the chunk's last were there earlier, and waited for it."""
-        chunk, event = self.chunk, decode_frame(self.body)
-        if chunk.waited_ns is None:
-            return Arrival(chunk.host_ns, event, self.body)
+        chunk = self.chunk
         waited_ns = chunk.waited_ns if self.last else chunk.host_ns - chunk.empty_ns
-        return Arrival(chunk.host_ns, event, self.body, waited_ns=waited_ns, stamped=True)
+        return Arrival(chunk.host_ns, decode_frame(self.body), self.body, waited_ns)
 
 
-class SerialLink:
+class SerialLink(StreamLink):
     """A serial port that is reopened, with back-off, whenever it disappears.
 
     Raises InputError where the port cannot be opened at the start.
@@ -107,12 +92,11 @@ class SerialLink:
 
     two_way = True
     verb = "reading"
-    conventions = PACKETS
 
     def __init__(self, port: str, baud: int, notices: Notices | None = None) -> None:
         self.link_counts = LinkCounts()
         self.endpoint = f"serial:{port}@{baud}"
-        self.reconnects = 0
+        self._reopened = 0
         self._port = port
         self._baud = baud
         self._notices = Notices() if notices is None else notices
@@ -124,6 +108,11 @@ class SerialLink:
             self._device: serial.Serial | None = self._open()
         except (OSError, ValueError, OverflowError) as error:  # SerialException is an OSError
             raise InputError(f"{self.endpoint}: {opening_fault(error, port)}") from error
+
+    @property
+    def reconnects(self) -> int:
+        """How often the device came back."""
+        return self._reopened
 
     def _open(self) -> serial.Serial:
         device = serial.Serial(self._port, self._baud, timeout=0, exclusive=True)
@@ -146,16 +135,17 @@ class SerialLink:
         waiting = [framed for chunk in chunks for framed in self._framed(chunk)]
         return [framed.arrival() for framed in self._gate.newest(waiting, Framed.declares_discontinuity)]
 
-    def _read(self, device: serial.Serial, timeout_ms: int) -> list[Chunk]:
+    def _read(self, device: serial.Serial, timeout_ms: int) -> list[RawMessage]:
         """What has come, read now."""
         if device.timeout != timeout_ms / 1000:  # setting it costs a tcsetattr
             device.timeout = timeout_ms / 1000
         data = device.read(1)
         data += device.read(min(device.in_waiting, MAX_READ_BYTES)) if data else b""
-        return [Chunk(time.monotonic_ns(), data)] if data else []
+        now_ns = time.monotonic_ns()
+        return [RawMessage(now_ns, [data], now_ns)] if data else []
 
-    def _framed(self, chunk: Chunk) -> list[Framed]:
-        bodies = self._decoder.frames(chunk.data)
+    def _framed(self, chunk: RawMessage) -> list[Framed]:
+        bodies = self._decoder.frames(chunk.parts[0])
         return [Framed(body, chunk, k == len(bodies)) for k, body in enumerate(bodies, 1)]
 
     def wait_for_message(self, timeout_ms: int) -> bool:
@@ -222,7 +212,7 @@ class SerialLink:
             self._back_off_s = min(2 * self._back_off_s, MAX_BACK_OFF_S)
             self._retry_s = time.monotonic() + self._back_off_s
             return
-        self.reconnects += 1
+        self._reopened += 1
         self._notices.tell("back", f"{self.endpoint} is back")
         self.send_bytes(DELIMITER)
 
@@ -236,11 +226,50 @@ class SerialLink:
         """Close the port."""
         self._shut()
 
-    def __enter__(self) -> Self:
-        return self
 
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
-        self.close()
+class SerialApart(SerialLink):
+    """A SerialLink whose bytes a process of its own reads and stamps; it is opened, written to and decoded here.
+
+    Raises InputError where the port cannot be opened at the start.
+    """
+
+    stamped = True
+    _given: serial.Serial | None = None  # the device that the process reads
+
+    def __init__(self, port: str, baud: int, notices: Notices | None = None) -> None:
+        super().__init__(port, baud, notices)
+        self._reader = ReaderProcess(self._notices)
+
+    def await_ready(self) -> None:
+        """Wait until the device can be read, or for a moment."""
+        self._reader.await_ready()
+
+    def _read(self, device: serial.Serial, timeout_ms: int) -> list[RawMessage]:
+        if self._given is not device:
+            self._given = device
+            self._reader.read_device(device.fileno())
+        chunks = []
+        for record in self._reader.take() if self._reader.wait(timeout_ms) else ():
+            if isinstance(record, MessageRecord):
+                chunks.append(record.message)
+            elif isinstance(record, GoneRecord):
+                self._lose(record.why)
+        return chunks
+
+    def wait_for_message(self, timeout_ms: int) -> bool:
+        """True once something has come that was not read."""
+        return self._device is not None and self._reader.wait(timeout_ms)
+
+    def _shut(self) -> None:
+        if self._given is not None:
+            self._given = None
+            self._reader.read_nothing()
+        super()._shut()
+
+    def close(self) -> None:
+        """Close the port, and end the process."""
+        super().close()
+        self._reader.close()
 
 
 def opening_fault(error: BaseException, port: str) -> str:

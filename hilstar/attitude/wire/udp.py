@@ -22,13 +22,11 @@ from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 from hilstar.attitude.wire.endpoint import AllowedSenders, Network, Place
-from hilstar.attitude.wire.links import PAUSE_S, Arrival, FloodGate, LinkCounts
+from hilstar.attitude.wire.links import PAUSE_S, Arrival, FloodGate, LinkCounts, StreamLink
 from hilstar.attitude.wire.packet import MAX_JSON_BYTES, Event, Packet, Status, declares_discontinuity, decode, encode
-from hilstar.attitude.wire.source import PACKETS
 from hilstar.errors import InputError
 from hilstar.notices import Notices
 from hilstar.units import NS_PER_S
@@ -271,16 +269,14 @@ class Credit:
         return True
 
 
-class UdpLink:
+class UdpLink(StreamLink):
     """A bound socket. Raises InputError where it cannot be bound.
 
-    Each arrival says how to answer its sender (`Arrival.back`); the link itself has nobody to send to.
+    Each arrival says how to answer its sender (`Arrival.back`); the link itself knows no sender to send to.
     """
 
-    two_way = True
+    two_way = stamped = True
     verb = "bound to"
-    conventions = PACKETS
-    reconnects = 0
 
     def __init__(self, place: Place, allowed: AllowedSenders, notices: Notices | None = None) -> None:
         self.link_counts = LinkCounts()
@@ -333,7 +329,7 @@ class UdpLink:
     def _arrival(self, datagram: Datagram) -> Arrival[Event]:
         self._credit.earn(datagram.sender, len(datagram.data))
         back = partial(self._answer, datagram.sender)
-        return Arrival(datagram.host_ns, decode(datagram.data), datagram.data, back=back, stamped=True)
+        return Arrival(datagram.host_ns, decode(datagram.data), datagram.data, back=back)
 
     def _answer(self, peer: SocketAddress, packet: Packet) -> None:
         data = encode(packet)
@@ -344,19 +340,6 @@ class UdpLink:
         """True once a datagram waits."""
         return self._datagrams.wait(timeout_ms)
 
-    def send(self, packet: Packet) -> None:
-        """To nobody: until an attitude has come, no sender is known."""
-
-    def wire_ns(self, packet: Packet) -> int:
-        """Negligible."""
-        return 0
-
     def close(self) -> None:
         """Close the socket."""
         self._datagrams.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
-        self.close()

@@ -17,7 +17,7 @@ import contextlib
 import math
 import time
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -26,7 +26,7 @@ import zmq
 from hilstar.arrays import FloatArray
 from hilstar.attitude.wire.endpoint import parse_endpoint
 from hilstar.attitude.wire.keys import NO_KEYS
-from hilstar.attitude.wire.links import Arrival
+from hilstar.attitude.wire.links import Arrival, LockstepLink, Pictures, RawMessage, TrackerCamera
 from hilstar.attitude.wire.packet import (
     MAX_PLACE_KM,
     MAX_SPEED_KM_S,
@@ -35,6 +35,7 @@ from hilstar.attitude.wire.packet import (
     AttitudeSample,
     Event,
     Refusal,
+    Status,
     checked_sample,
 )
 from hilstar.attitude.wire.source import Conventions, Mounting
@@ -47,7 +48,7 @@ from hilstar.attitude.wire.vizard_message import (
     WireFormatError,
     decode_update,
 )
-from hilstar.attitude.wire.zmq_links import Taken, ZmqReceiver
+from hilstar.attitude.wire.zmq_links import PacketDecoder, ZmqReceiver
 from hilstar.attitude.wire.zmq_socket import ZmqSocket
 from hilstar.errors import InputError, printable, shortened
 from hilstar.notices import Notices
@@ -214,15 +215,6 @@ class Follower:
         return Refusal("format", f"[attitude] spacecraft = {wanted}: {len(found)} have that name; there: {names}")
 
 
-@dataclass(frozen=True, slots=True)
-class TrackerCamera:
-    """The bench's tracker: its mounting, its size, and its field of view along y, degrees."""
-
-    q_body_to_cam: FloatArray
-    resolution_px: tuple[int, int]
-    field_of_view_deg: float
-
-
 def q_body_to_cam(camera: VizCamera) -> FloatArray | None:
     """How Basilisk has mounted a camera: its sigma_CB as a quaternion from body to camera; None where it is not said."""
     if len(camera.sigma) != 3 or not all(map(math.isfinite, camera.sigma)):
@@ -290,59 +282,66 @@ def _checked_velocity(craft: Spacecraft, found_m_s: Components) -> FloatArray | 
     return Refusal("format", f"spacecraft {named(craft)}: its velocity is {told}, and {advice}")
 
 
-@dataclass(frozen=True, slots=True)
-class Step:
-    """A step of the simulation: the camera's attitude or why there is none, and the whole message where it is one."""
+class VizardLive(ZmqSocket, LockstepLink):
+    """A REP socket in Vizard's place; it binds, or connects with `bind=False`. Pictures of cameras are answered here."""
 
-    host_ns: int
-    event: AttitudeSample | Refusal
-    update: SimUpdate | None
-    raw: bytes
-
-
-@dataclass(frozen=True, slots=True)
-class ImageRequest:
-    """Basilisk asks for the picture of a camera, by its number."""
-
-    camera: int
-
-
-class VizardLive(ZmqSocket):
-    """A REP socket in Vizard's place; it binds, or connects with `bind=False`."""
-
-    max_part_bytes = MAX_UPDATE_BYTES
+    asks_for_pictures = True
 
     def __init__(self, endpoint: str, follower: Follower, *, bind: bool = True, notices: Notices | None = None) -> None:
         check_loopback(endpoint)
-        super().__init__(zmq.REP, endpoint, bind=bind, keys=NO_KEYS, notices=notices)
+        super().__init__(zmq.REP, endpoint, bind=bind, keys=NO_KEYS, notices=notices, max_part_bytes=MAX_UPDATE_BYTES)
         self._follower, self.conventions = follower, follower.conventions
+        self._tracker: TrackerCamera | None = None
+        self._pictures: Pictures | None = None
+        self._sample: AttitudeSample | None = None  # of the last step
+        self._described: dict[int, VizCamera] = {}
+        self._compared: set[int] = set()
 
-    def receive(self, timeout_ms: int) -> Step | ImageRequest | None:
-        """The next request that needs more than a plain answer, or None; it must be answered before the next can arrive."""
+    def show_camera(self, tracker: TrackerCamera, pictures: Pictures | None) -> None:
+        """What to answer for the pictures of Basilisk's cameras: those of the tracker at the last step, or none."""
+        self._tracker, self._pictures = tracker, pictures
+
+    def receive(self, timeout_ms: int) -> Arrival[Event] | None:
+        """The next step, or None; it must be answered before the next request can arrive."""
         parts = self._take_parts() if self._waits(timeout_ms) else None
         if parts is None:
             return None
         host_ns, word = time.monotonic_ns(), parts[0]
         if word == SIM_UPDATE:
-            message = update_of(parts)
-            if message is None:
-                refusal = Refusal("format", f"SIM_UPDATE of {len(parts)} parts; Basilisk sends four")
-                return Step(host_ns, refusal, None, parts[-1])
-            return Step(host_ns, *self._follower.take(message), message)
+            return self._step(host_ns, parts)
         if word.startswith(REQUEST_IMAGE) and (number := word[len(REQUEST_IMAGE) :][:MAX_DIGITS]).isdigit():
-            return ImageRequest(int(number))
+            image = self._picture(int(number))
+            self._answer([len(image).to_bytes(4, "big"), image])  # the length goes ahead, big-endian; 0 where there is none
+            return None
         if word not in PLAIN_ANSWERS:
             self._notices.tell("unknown-request", f"{shortened(repr(word[:40]))} is none of Basilisk's requests")
         self._answer(PLAIN_ANSWERS.get(word, [ERROR]))
         return None
 
-    def answer_step(self, taken: bool) -> None:
-        """Let the simulation go on; or, where its step was refused, end it."""
-        self._answer([OK if taken else ERROR])
+    def _step(self, host_ns: int, parts: list[bytes]) -> Arrival[Event]:
+        self._sample = None
+        message = update_of(parts)
+        if message is None:
+            return Arrival(host_ns, Refusal("format", f"SIM_UPDATE of {len(parts)} parts; Basilisk sends four"), parts[-1])
+        event, update = self._follower.take(message)
+        if isinstance(event, AttitudeSample):
+            self._sample = event
+        if update is not None:
+            self._described |= {camera.identity: camera for camera in update.cameras}
+        return Arrival(host_ns, event, message)
 
-    def answer_image(self, image: bytes) -> None:
-        """Hand over a picture; an empty one says that there is none. Its length goes ahead, 4 bytes, big-endian."""
-        self._answer([len(image).to_bytes(4, "big"), image])
+    def _picture(self, camera: int) -> bytes:
+        """The tracker's picture at the last step, for a camera's number; empty where there is none."""
+        if camera in self._described and camera not in self._compared and self._tracker is not None:
+            self._compared.add(camera)
+            trouble = disagreement(self._described[camera], self._tracker)
+            if trouble is not None:
+                self._notices.tell("other-camera", trouble)
+        return b"" if self._sample is None or self._pictures is None else self._pictures(self._sample)
+
+    def answer(self, status: Status, shown_ns: int, refusal: Refusal | None) -> None:
+        """Let the simulation go on; or, where its step was refused, end it."""
+        self._answer([OK if refusal is None else ERROR])
 
     def _answer(self, parts: list[bytes]) -> None:
         """A simulation that is gone, or does not read, gets no answer."""
@@ -381,25 +380,28 @@ class Opening:
         return released
 
 
-class VizardBroadcast(ZmqReceiver):
-    """A SUB socket for SIM_UPDATE messages; other topics (SYNC_SETTINGS) do not arrive. It connects, or binds with `bind`."""
+class BroadcastDecoder(PacketDecoder):
+    """What SIM_UPDATE messages mean; the very first ones are held back for a moment."""
 
-    topic = SIM_UPDATE
-    max_part_bytes = MAX_UPDATE_BYTES
-
-    def __init__(self, endpoint: str, follower: Follower, *, bind: bool = False, notices: Notices | None = None) -> None:
-        check_loopback(endpoint)
-        super().__init__(endpoint, bind=bind, notices=notices)
+    def __init__(self, follower: Follower) -> None:
         self._follower, self.conventions = follower, follower.conventions
         self._opening = Opening()
 
-    def arrivals(self, taken: Iterable[Taken]) -> list[Arrival[Event]]:
-        """What messages say; the very first ones are held back for a moment."""
-        return self._opening.passed(super().arrivals(taken), time.monotonic_ns())
+    def arrivals(self, messages: Iterable[RawMessage]) -> list[Arrival[Event]]:
+        """What messages say, and those that were held back."""
+        return self._opening.passed(super().arrivals(messages), time.monotonic_ns())
 
-    def _arrival(self, host_ns: int, parts: list[bytes]) -> Arrival[Event]:
-        message = update_of(parts)
-        if message is None:
+    def _arrival(self, message: RawMessage) -> Arrival[Event]:
+        parts = list(message.parts)
+        update = update_of(parts)
+        if update is None:
             refusal = Refusal("format", f"a message of {len(parts)} parts; Basilisk sends SIM_UPDATE and a VizMessage")
-            return Arrival(host_ns, refusal, parts[-1])
-        return Arrival(host_ns, self._follower.take(message)[0], message)
+            return Arrival(message.host_ns, refusal, parts[-1], message.waited_ns)
+        return Arrival(message.host_ns, self._follower.take(update)[0], update, message.waited_ns)
+
+
+def vizard_broadcast(endpoint: str, follower: Follower, *, bind: bool = False, notices: Notices | None = None) -> ZmqReceiver:
+    """A SUB socket for SIM_UPDATE messages; other topics (SYNC_SETTINGS) do not arrive. It connects, or binds with `bind`."""
+    check_loopback(endpoint)
+    decoder = BroadcastDecoder(follower)
+    return ZmqReceiver(endpoint, bind=bind, notices=notices, topic=SIM_UPDATE, max_part_bytes=MAX_UPDATE_BYTES, decoder=decoder)

@@ -3,31 +3,32 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import struct
 import time
 from collections.abc import Iterable
-from dataclasses import replace
 from types import TracebackType
-from typing import NamedTuple, Self
+from typing import Self
 
 import msgspec
 import zmq
 
+from hilstar.attitude.wire.apart import CountsRecord, LinkRecord, MessageRecord, NoticeRecord, ReaderProcess, ZmqStream
 from hilstar.attitude.wire.keys import NO_KEYS, CurveKeys
-from hilstar.attitude.wire.links import Arrival, FloodGate
+from hilstar.attitude.wire.links import Arrival, FloodGate, LockstepLink, RawMessage, StreamLink
 from hilstar.attitude.wire.packet import (
     AttitudeSample,
     Event,
-    Packet,
     Refusal,
     Status,
     TimeReply,
+    TimeRequest,
     declares_discontinuity,
     decode,
     encode,
 )
-from hilstar.attitude.wire.source import Conventions, Mounting
-from hilstar.attitude.wire.zmq_socket import QUEUE_MESSAGES, ZmqSocket
+from hilstar.attitude.wire.source import PACKETS, Conventions, Mounting
+from hilstar.attitude.wire.zmq_socket import MAX_PART_BYTES, QUEUE_MESSAGES, ZmqSocket
 from hilstar.notices import Notices
 from hilstar.process.interrupts import caught
 
@@ -39,26 +40,45 @@ TEND_S = 0.05
 STAMP = struct.Struct("<q")  # host time of arrival, ns: one clock for all processes of a machine
 
 
-class Taken(NamedTuple):
-    """A message: when it came, host time in ns, its parts, and how long it may have waited unread, where that is known."""
+class PacketDecoder:
+    """Says what the messages of a free stream mean: packets or JSON, of which only the last part counts."""
 
-    host_ns: int
-    parts: list[bytes]
-    waited_ns: int | None = None
+    conventions = PACKETS
+    stamped = False  # whether messages carry their own times of arrival
 
-    def declares_discontinuity(self) -> bool:
-        """Whether it is a packet or JSON object whose attitude must not be interpolated to."""
-        return declares_discontinuity(self.parts[-1])
+    def arrivals(self, messages: Iterable[RawMessage]) -> list[Arrival[Event]]:
+        """What messages say."""
+        return [self._arrival(message) for message in messages]
+
+    def _arrival(self, message: RawMessage) -> Arrival[Event]:
+        raw = message.parts[-1]
+        return Arrival(message.host_ns, decode(raw), raw, message.waited_ns)
 
 
-class ZmqReceiver(ZmqSocket):
-    """A SUB socket that takes every message that begins with its `topic`; it connects, or binds with `bind`."""
+PACKET_DECODER = PacketDecoder()
 
-    two_way = False
-    topic = b""
 
-    def __init__(self, endpoint: str, *, bind: bool = False, keys: CurveKeys = NO_KEYS, notices: Notices | None = None) -> None:
-        super().__init__(zmq.SUB, endpoint, bind=bind, keys=keys, notices=notices)
+def _discontinuous(message: RawMessage) -> bool:
+    return declares_discontinuity(message.parts[-1])
+
+
+class ZmqReceiver(ZmqSocket, StreamLink):
+    """A SUB socket that takes every message that begins with `topic`; it connects, or binds with `bind`."""
+
+    def __init__(
+        self,
+        endpoint: str,
+        *,
+        bind: bool = False,
+        keys: CurveKeys = NO_KEYS,
+        notices: Notices | None = None,
+        topic: bytes = b"",
+        max_part_bytes: int = MAX_PART_BYTES,
+        decoder: PacketDecoder = PACKET_DECODER,
+    ) -> None:
+        self.topic, self.decoder = topic, decoder
+        self.conventions, self.stamped = decoder.conventions, decoder.stamped
+        super().__init__(zmq.SUB, endpoint, bind=bind, keys=keys, notices=notices, max_part_bytes=max_part_bytes)
         if not bind:  # who connects is told of nothing until a sender binds there
             self.verb = "waiting for a sender at"
         self._shut()
@@ -68,53 +88,36 @@ class ZmqReceiver(ZmqSocket):
     @property
     def reconnects(self) -> int:
         """How often the sender reconnected."""
-        return 0 if self._bind else max(0, self.link_counts.connections - 1)
+        return 0 if self._bind else super().reconnects
+
+    def stream(self) -> ZmqStream:
+        """What another process needs to open the same socket."""
+        files = (self._keys.secret_key, self._keys.server_key, self._keys.allowed_clients)
+        paths = (None if each is None else str(each.absolute()) for each in files)
+        return ZmqStream(self.endpoint, self._bind, self.topic, self._max_part_bytes, *paths)
 
     def _configure(self, made: zmq.Socket[bytes]) -> None:
         super()._configure(made)
         made.setsockopt(zmq.SUBSCRIBE, self.topic)
 
     def receive(self, timeout_ms: int) -> list[Arrival[Event]]:
-        """The waiting messages, oldest first, and only the newest of a flood; of packets only the last part counts.
+        """The waiting messages, oldest first, and only the newest of a flood; waits at most `timeout_ms` for the first."""
+        return self.decoder.arrivals(self.taken(timeout_ms))
 
-        Waits at most `timeout_ms` for the first, and for no other.
-        """
-        return self.arrivals(self.taken(timeout_ms))
-
-    def taken(self, timeout_ms: int) -> list[Taken]:
-        """What `receive` makes its arrivals of."""
+    def taken(self, timeout_ms: int) -> list[RawMessage]:
+        """The same, not decoded."""
         if not self._waits(timeout_ms):
             return []
-        waiting: list[Taken] = []
+        waiting: list[RawMessage] = []
         taken_bytes = 0
         while len(waiting) < QUEUE_MESSAGES and taken_bytes < MAX_TAKEN_BYTES and (parts := self._take_parts()) is not None:
-            waiting.append(Taken(time.monotonic_ns(), parts))
+            waiting.append(RawMessage(time.monotonic_ns(), parts))
             taken_bytes += sum(map(len, parts))
-        return self._gate.newest(waiting, Taken.declares_discontinuity)
-
-    def arrivals(self, taken: Iterable[Taken]) -> list[Arrival[Event]]:
-        """What messages say."""
-        out = []
-        for each in taken:
-            arrival = self._arrival(each.host_ns, each.parts)
-            if each.waited_ns is not None:
-                arrival = replace(arrival, waited_ns=each.waited_ns, stamped=True)
-            out.append(arrival)
-        return out
-
-    def _arrival(self, host_ns: int, parts: list[bytes]) -> Arrival[Event]:
-        return Arrival(host_ns, decode(parts[-1]), parts[-1])
+        return self._gate.newest(waiting, _discontinuous)
 
     def wait_for_message(self, timeout_ms: int) -> bool:
         """True once a message waits."""
         return self._waits(timeout_ms)
-
-    def send(self, packet: Packet) -> None:
-        """A subscriber cannot reply."""
-
-    def wire_ns(self, packet: Packet) -> int:
-        """Negligible."""
-        return 0
 
     def _tend(self) -> None:
         super()._tend()
@@ -134,6 +137,72 @@ class ZmqReceiver(ZmqSocket):
         with contextlib.suppress(zmq.ZMQError):  # the ended session may be gone already
             self._socket.disconnect(self._address)
         self._socket.connect(self._address)
+
+
+class ZmqApart(StreamLink):
+    """A ZeroMQ stream whose socket a process of its own reads.
+
+    `link` was opened to see that it can be; it is closed here, and the other process opens the same socket at the first read,
+    so that no old messages collect in it.
+    """
+
+    stamped = True
+
+    def __init__(self, link: ZmqReceiver, notices: Notices | None = None) -> None:
+        link.close()
+        self.verb, self.endpoint, self.conventions = link.verb, link.endpoint, link.conventions
+        self.link_counts = link.link_counts
+        self._decoder, self._stream = link.decoder, link.stream()
+        self._notices = Notices() if notices is None else notices
+        self._waiting: list[RawMessage] = []
+        self._ordered = False
+        self._reader = ReaderProcess(self._notices)
+
+    @property
+    def reconnects(self) -> int:
+        """How often the sender reconnected."""
+        return 0 if self._stream.bind else super().reconnects
+
+    def await_ready(self) -> None:
+        """Wait until the socket can be opened at once, or for a moment."""
+        self._reader.await_ready()
+
+    def receive(self, timeout_ms: int) -> list[Arrival[Event]]:
+        """The messages that came, oldest first, with their stamps; waits at most `timeout_ms` for the first."""
+        self.wait_for_message(timeout_ms)
+        waiting, self._waiting = self._waiting, []
+        return self._decoder.arrivals(waiting)
+
+    def wait_for_message(self, timeout_ms: int) -> bool:
+        """True once a message has come."""
+        if not self._ordered:
+            self._ordered = True
+            self._reader.read_stream(self._stream)
+        deadline_s = time.monotonic() + timeout_ms / 1000
+        while not self._waiting:
+            left_ms = math.ceil(max(0.0, deadline_s - time.monotonic()) * 1000)
+            if self._reader.wait(left_ms):
+                for record in self._reader.take():
+                    self._take(record)
+            elif not left_ms:
+                break
+        return bool(self._waiting)
+
+    def _take(self, record: LinkRecord) -> None:
+        match record:
+            case MessageRecord(_, message):
+                self._waiting.append(message)
+            case CountsRecord(_, counts):
+                self.link_counts += counts
+            case NoticeRecord(_, kind, detail, who, lasting):
+                if lasting:
+                    self._notices.tell(kind, detail, who)
+                else:
+                    self._notices.mention(kind, detail)
+
+    def close(self) -> None:
+        """End the process, and with it the socket."""
+        self._reader.close()
 
 
 class ZmqSender(ZmqSocket):
@@ -171,7 +240,7 @@ class ZmqSender(ZmqSocket):
         return self.LINGER_MS if caught() is None else self.STOPPED_LINGER_MS
 
 
-class ZmqLockstep(ZmqSocket):
+class ZmqLockstep(ZmqSocket, LockstepLink):
     """A REP socket: one request is one attitude and gets one reply; it binds, or connects with `bind=False`."""
 
     def __init__(self, endpoint: str, *, bind: bool = True, keys: CurveKeys = NO_KEYS, notices: Notices | None = None) -> None:
@@ -179,17 +248,21 @@ class ZmqLockstep(ZmqSocket):
         self._json = False
 
     def receive(self, timeout_ms: int) -> Arrival[Event] | None:
-        """The next request, or None; each must be answered before the next can arrive.
+        """The next request for a frame, or None; it must be answered before the next can arrive.
 
-        libzmq announces a request without its delimiter and then drops it: it is not waited for.
+        Time requests are answered here. libzmq announces a request without its delimiter, then drops it: none is waited for.
         """
         message = self._take() if self._waits(timeout_ms) else None
         if message is None:
             return None
+        host_ns, event = time.monotonic_ns(), decode(message)
+        if isinstance(event, TimeRequest):
+            self._answer(encode(TimeReply(event.sequence, event.t1_ns, host_ns, time.monotonic_ns())))
+            return None
         self._json = message[:64].lstrip()[:1] == b"{"
-        return Arrival(time.monotonic_ns(), decode(message), message)
+        return Arrival(host_ns, event, message)
 
-    def reply(self, status: Status, shown_ns: int, refusal: Refusal | None) -> None:
+    def answer(self, status: Status, shown_ns: int, refusal: Refusal | None) -> None:
         """Answer the request: with a status packet for a packet, with an object for JSON."""
         if not self._json:
             self._answer(encode(status))
@@ -197,10 +270,6 @@ class ZmqLockstep(ZmqSocket):
         fields = {name: getattr(status, name) for name in status.__dataclass_fields__}
         trouble = None if refusal is None else {"reason": refusal.reason, "detail": refusal.detail}
         self._answer(msgspec.json.encode({**fields, "shown_ns": shown_ns, "refused": trouble}))
-
-    def reply_time(self, reply: TimeReply) -> None:
-        """Answer a time request."""
-        self._answer(encode(reply))
 
     def _answer(self, message: bytes) -> None:
         """A peer that is gone, or does not read, gets no answer."""
@@ -234,20 +303,22 @@ class Feed:
         self._context.term()
 
 
-class FedReceiver(ZmqReceiver):
-    """A head's end of a Feed: the body's attitudes become its camera's, with the time at which they reached the feed."""
+class FedDecoder(PacketDecoder):
+    """What a Feed hands on: the body's attitudes become a head's camera's, with the time at which they reached the feed."""
 
-    def __init__(self, endpoint: str, mounting: Mounting, conventions: Conventions, notices: Notices | None = None) -> None:
-        super().__init__(endpoint, notices=notices)
+    stamped = True
+
+    def __init__(self, mounting: Mounting, conventions: Conventions) -> None:
         self._mounting = mounting
         self.conventions = conventions
 
-    def _arrival(self, host_ns: int, parts: list[bytes]) -> Arrival[Event]:
-        if len(parts) != 2 or len(parts[0]) != STAMP.size:
-            return super()._arrival(host_ns, parts)
-        (came_ns,) = STAMP.unpack(parts[0])
-        event = decode(parts[1])
+    def _arrival(self, message: RawMessage) -> Arrival[Event]:
+        if len(message.parts) != 2 or len(message.parts[0]) != STAMP.size:
+            return super()._arrival(message)
+        (came_ns,) = STAMP.unpack(message.parts[0])
+        raw = message.parts[1]
+        event = decode(raw)
         if not isinstance(event, AttitudeSample):
-            return Arrival(came_ns, event, parts[1], stamped=True)
+            return Arrival(came_ns, event, raw)
         camera = self._mounting.sample(event)
-        return Arrival(came_ns, camera, encode(camera), stamped=True)
+        return Arrival(came_ns, camera, encode(camera))

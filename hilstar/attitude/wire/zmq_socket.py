@@ -26,7 +26,6 @@ import zmq
 from hilstar.attitude.wire.endpoint import ENDPOINT_FORM, PATH_FORM, check_use, parse_endpoint
 from hilstar.attitude.wire.keys import AllowList, CurveKeys, check_reach, load_public, load_secret
 from hilstar.attitude.wire.links import PAUSE_S, LinkCounts
-from hilstar.attitude.wire.source import PACKETS
 from hilstar.errors import InputError
 from hilstar.notices import Notices
 
@@ -265,10 +264,17 @@ class ZmqSocket:
     request that is lost with the first socket would leave its sender waiting for ever.
     """
 
-    conventions = PACKETS
-    max_part_bytes = MAX_PART_BYTES
-
-    def __init__(self, kind: int, endpoint: str, *, bind: bool, keys: CurveKeys, notices: Notices | None) -> None:
+    def __init__(
+        self,
+        kind: int,
+        endpoint: str,
+        *,
+        bind: bool,
+        keys: CurveKeys,
+        notices: Notices | None,
+        max_part_bytes: int = MAX_PART_BYTES,
+    ) -> None:
+        self._max_part_bytes = max_part_bytes
         self._place = parse_endpoint(endpoint)
         check_reach(self._place, endpoint, bind=bind, keys=keys)
         check_use(self._place, endpoint, bind=bind)
@@ -297,10 +303,6 @@ class ZmqSocket:
         except InputError:
             self.close()
             raise
-
-    def opened_as(self) -> tuple[str, bool, CurveKeys]:
-        """Endpoint, whether it is bound, and keys: what another process needs to open the same."""
-        return self.endpoint, self._bind, self._keys
 
     def _authenticate(self, allowed: AllowList) -> None:
         from zmq.auth.thread import ThreadAuthenticator  # brings asyncio
@@ -351,7 +353,7 @@ class ZmqSocket:
         """Set the options that must come before bind or connect."""
         made.setsockopt(zmq.LINGER, 0)
         made.setsockopt(zmq.IPV6, "[" in self._address)
-        made.setsockopt(zmq.MAXMSGSIZE, self.max_part_bytes)
+        made.setsockopt(zmq.MAXMSGSIZE, self._max_part_bytes)
         made.setsockopt(zmq.RCVHWM, QUEUE_MESSAGES)
         made.setsockopt(zmq.HANDSHAKE_IVL, HANDSHAKE_MS)
         made.setsockopt(zmq.HEARTBEAT_IVL, HEARTBEAT_MS)

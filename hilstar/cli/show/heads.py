@@ -15,7 +15,7 @@ from hilstar.errors import InputError
 from hilstar.notices import Notices
 
 if TYPE_CHECKING:
-    from hilstar.attitude.wire.zmq_links import FedReceiver
+    from hilstar.attitude.wire.zmq_links import ZmqReceiver
     from hilstar.bench.bench_file import BenchFile
     from hilstar.bench.heads_file import HeadsFile
 
@@ -44,10 +44,8 @@ class HeadsAsked:
 
 def serve_heads(heads: HeadsFile, asked: HeadsAsked, as_json: bool) -> None:
     """Show every head's stars up to its end, and print what each said; exit code 4 where none ever had an attitude."""
-    from hilstar.attitude.wire.vizard import VizardLive
-    from hilstar.attitude.wire.zmq_links import ZmqLockstep
     from hilstar.run.heads.supervisor import HeadsRun, head_ledger, run_heads, source_config
-    from hilstar.run.open_link import await_reader, open_link
+    from hilstar.run.open_link import open_link
 
     if asked.ledger is not None and not asked.switches.get("--overwrite"):
         taken = [file for name in heads.names if (file := head_ledger(asked.ledger, name)).exists()]
@@ -56,9 +54,9 @@ def serve_heads(heads: HeadsFile, asked: HeadsAsked, as_json: bool) -> None:
     notices = Notices()
     consoles = _consoles(asked, heads)
     with open_link(source_config(heads), heads.folder, notices, apart=True) as link:
-        await_reader(link)
+        link.await_ready()
         say(f"{link.verb} {link.endpoint}, {len(heads.names)} heads: {', '.join(heads.names)}")
-        assert not isinstance(link, ZmqLockstep | VizardLive)  # read_heads refuses lockstep
+        assert not link.steps  # read_heads refuses lockstep
         run = HeadsRun(heads, asked.options(), asked.duration_s, asked.ledger, consoles, asked.token)
         told = run_heads(run, link, say)
     _report(told, as_json)
@@ -99,13 +97,14 @@ def _report(told: dict[str, dict[str, object]], as_json: bool) -> None:
         typer.echo(f"{name:20s}{counted}, exit code {head['exit_code']}{again}")
 
 
-def fed_link(file: BenchFile, fed_by: str, notices: Notices) -> FedReceiver:
+def fed_link(file: BenchFile, fed_by: str, notices: Notices) -> ZmqReceiver:
     """A head's link to the process that has the source, with which it ends; `fed_by` is its endpoint and its number."""
     from hilstar.attitude.wire.source import PACKETS, Mounting
-    from hilstar.attitude.wire.zmq_links import FedReceiver
+    from hilstar.attitude.wire.zmq_links import FedDecoder, ZmqReceiver
     from hilstar.process.interrupts import end_with_parent
 
     endpoint, _, parent = fed_by.rpartition(",")
     end_with_parent(int(parent))
     conventions = replace(PACKETS, source="the source of several heads", of_body=True)
-    return FedReceiver(endpoint, Mounting(file.config.tracker.q_body_to_cam), conventions, notices)
+    decoder = FedDecoder(Mounting(file.config.tracker.q_body_to_cam), conventions)
+    return ZmqReceiver(endpoint, notices=notices, decoder=decoder)

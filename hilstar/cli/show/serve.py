@@ -38,9 +38,9 @@ from hilstar.files import MCAP, check_ending
 from hilstar.notices import Notices
 
 if TYPE_CHECKING:
+    from hilstar.attitude.wire.links import Pictures
     from hilstar.bench.bench_file import BenchFile as ReadFile
     from hilstar.bench.frame import Bench
-    from hilstar.run.lockstep.vizard import Pictures
     from hilstar.run.open_link import AnyLink
 
 HeadOf = Annotated[Path | None, typer.Option("--head-of", hidden=True)]  # of a head's process: the file with `heads`,
@@ -82,7 +82,6 @@ def serve(
     from hilstar.bench.fields_of_view import fields_of_view
     from hilstar.console.publisher import PageParts, RunDescription
     from hilstar.run.loop import Limit
-    from hilstar.run.open_link import await_reader
     from hilstar.run.record.ledger import Ledger
     from hilstar.run.serve import Outlet
     from hilstar.run.serve import serve as serve_stream
@@ -108,7 +107,7 @@ def serve(
         refresh_hz = bench.config.monitor.refresh_hz
         slots = math.inf if duration is None else round(duration * refresh_hz)
         limit = Limit(slots, math.inf if frames is None else frames)
-        await_reader(link)
+        link.await_ready()
         say(f"{link.verb} {link.endpoint}, {refresh_hz:g} Hz, {bench.renderer.gl_renderer}")
         say(fields.line())
         say_units(fields)
@@ -142,10 +141,9 @@ def _source(file: ReadFile, fed_by: str | None, notices: Notices) -> AnyLink:
 
 def tracker_pictures(link: AnyLink, bench: Bench, faults: Any = None) -> Pictures | None:
     """The virtual tracker's pictures for a link whose other side asks for them."""
-    from hilstar.attitude.wire.vizard import VizardLive
     from hilstar.twin.pictures import TrackerPictures
 
-    if not isinstance(link, VizardLive):
+    if not link.asks_for_pictures:
         return None
     if faults is None:
         return TrackerPictures(bench)

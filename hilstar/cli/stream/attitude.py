@@ -92,16 +92,13 @@ def attitude(
 
 def _live(file: BenchFile, at: str | None, patience_s: float) -> tuple[AttitudeSample, Conventions]:
     """The first attitude of the stream that a bench file names."""
-    from hilstar.attitude.wire.vizard import VizardLive
-    from hilstar.attitude.wire.zmq_links import ZmqLockstep
     from hilstar.errors import InputError
-    from hilstar.run.listen import first_attitude
-    from hilstar.run.open_link import open_link
+    from hilstar.run.open_link import first_attitude, open_link
 
     if at is not None:
         raise InputError(f"--at {at}: a live stream has only its present; leave --at out, or give a log")
     with open_link(file.config, file.folder) as link:
-        if isinstance(link, ZmqLockstep | VizardLive):
+        if link.steps:
             raise InputError(f"{file.path}: [attitude] lockstep wants a frame for each attitude; use hilstar serve --explain")
         return first_attitude(link, patience_s), link.conventions
 

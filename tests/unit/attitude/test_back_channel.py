@@ -25,6 +25,7 @@ class Wire:
     """A two-way link that keeps what is sent; a packet takes 1 ms a byte."""
 
     two_way = True
+    stamped = False
 
     def __init__(self) -> None:
         self.sent: list[Packet] = []

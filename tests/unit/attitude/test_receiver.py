@@ -35,6 +35,7 @@ class Script:
     after: Callable[[Arrival], None] = lambda arrival: None
     fails: list[BaseException] = field(default_factory=list)
     two_way: bool = False
+    stamped: bool = False
 
     def __post_init__(self) -> None:
         self.done = threading.Event()

@@ -10,9 +10,9 @@ from dataclasses import replace
 
 import pytest
 
-from hilstar.attitude.wire.links import MAX_BURST, MAX_PACKETS_PER_S, OVER_S, FloodGate, LinkCounts
+from hilstar.attitude.wire.links import MAX_BURST, MAX_PACKETS_PER_S, OVER_S, FloodGate, LinkCounts, RawMessage
 from hilstar.attitude.wire.packet import AttitudeSample, StreamDecoder, declares_discontinuity, decode, encode, framed
-from hilstar.attitude.wire.serial_link import Chunk, SerialLink
+from hilstar.attitude.wire.serial_link import SerialLink
 from hilstar.errors import InputError
 from hilstar.notices import Notices
 from hilstar.run.send.ends import SerialSender
@@ -57,10 +57,10 @@ class Line(SerialLink):
         frames = [framed(encode(each)) for each in samples]
         for k in damaged:
             frames[k] = frames[k][:20] + bytes([frames[k][20] % 255 + 1]) + frames[k][21:]
-        self._chunks = [Chunk(k, data, 0, k) for k, data in enumerate([b"\0", *frames])]
+        self._chunks = [RawMessage(k, [data], k) for k, data in enumerate([b"\0", *frames])]
         super().__init__(os.ttyname(self._slave), 921_600)
 
-    def _read(self, device, timeout_ms: int) -> list[Chunk]:
+    def _read(self, device, timeout_ms: int) -> list[RawMessage]:
         chunks, self._chunks = self._chunks, []
         return chunks
 

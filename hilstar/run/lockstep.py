@@ -1,4 +1,4 @@
-"""What every run in lockstep does: one attitude, one frame. The simulator's time is its own, and may run at any speed."""
+"""Lockstep: one frame for each attitude that a simulation asks for. Its time is its own, and may run at any speed."""
 
 from __future__ import annotations
 
@@ -11,8 +11,10 @@ import msgspec
 from hilstar.attitude.clock.rate_check import RateCheck
 from hilstar.attitude.clock.timeline import Attitude
 from hilstar.attitude.receiver import PacketCounts
+from hilstar.attitude.wire.links import LockstepLink
 from hilstar.attitude.wire.packet import AttitudeSample, Event, Refusal, rate_refusal
 from hilstar.bench.frame import Bench
+from hilstar.run.frame_status import StatusMaker
 from hilstar.run.loop import FrameLoop, Limit
 from hilstar.run.record.ledger import LedgerSwitch
 from hilstar.run.record.ledger_records import below_step, frame_record
@@ -85,3 +87,17 @@ class Steps:
             place_km=sample.place_km,
         )
         return self._loop.draw(self._loop.tally.frames, sample.t_ns, attitude)
+
+
+def serve_lockstep(link: LockstepLink, run: Steps, loop: FrameLoop, statuses: StatusMaker) -> RunSummary:
+    """Answer requests up to the limit, or until a signal; returns the summary. A refused request leaves the last frame."""
+    while run.goes_on():
+        arrival = link.receive(POLL_MS)
+        if arrival is None:
+            loop.idle()
+            continue
+        refusal = run.take(arrival.host_ns, arrival.event, arrival.raw)
+        shown_ns = time.monotonic_ns()
+        link.answer(statuses.status(run.last, run.last.t_ns, loop, run.counts, False), shown_ns, refusal)
+        run.answered(arrival.host_ns, shown_ns)
+    return run.summary()

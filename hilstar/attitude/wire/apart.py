@@ -1,0 +1,291 @@
+"""A process of its own that reads a link, so that no stamp waits for Python's lock: this process's end, and what both say.
+
+The contract:
+1. This process gives an `Order`: a ZeroMQ stream to open, an open device to read (its descriptor goes along), or nothing to
+   read any more. A new order replaces the last one.
+2. The other process (`apart_child`) stamps each message and hands it over in a record that carries the order's number. What
+   is still told of an earlier order is dropped here.
+3. It says each 0.1 s that it lives. Where it ends, or hangs, that is told, and it is begun again with the same order.
+4. It ends with this process, however this one ends.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import socket
+import struct
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+
+from hilstar.attitude.wire.links import LinkCounts, RawMessage
+from hilstar.notices import Notices
+
+CHILD = "hilstar.attitude.wire.apart_child"
+LENGTH = struct.Struct("<I")  # bytes of the record that follows
+MAX_RECORD_BYTES = 1 << 27  # 64 parts (zmq_socket) of a few MB
+MAX_TAKEN_BYTES = 1 << 20  # in one go
+MIN_BACK_OFF_S = 0.05
+MAX_BACK_OFF_S = 1.0
+STEADY_S = 10 * MAX_BACK_OFF_S
+HUNG_S = 0.4  # asleep for so long without a sign of life, it hangs
+STALLED_S = 3.0  # one that would run waits for a core for so long
+STARTS_S = 30.0  # and on a machine whose cores are all busy it begins within this
+READY_WITHIN_S = 5.0
+ENDS_WITHIN_S = 0.3  # in order; a signal leaves a command a second for all its ends
+
+
+class ZmqStream(msgspec.Struct, frozen=True):
+    """A SUB socket to open: what `ZmqReceiver` takes, with the key files as absolute paths."""
+
+    endpoint: str
+    bind: bool
+    topic: bytes
+    max_part_bytes: int
+    secret_key: str | None = None
+    server_key: str | None = None
+    allowed_clients: str | None = None
+
+
+class Order(msgspec.Struct, frozen=True):
+    """What to read from now on: a stream; or the device whose descriptor goes along; or nothing."""
+
+    number: int
+    stream: ZmqStream | None = None
+    device: bool = False
+
+
+class MessageRecord(msgspec.Struct, frozen=True, tag=True):
+    """A message that came."""
+
+    order: int
+    message: RawMessage
+
+
+class GoneRecord(msgspec.Struct, frozen=True, tag=True):
+    """The device does not answer any more, and why."""
+
+    order: int
+    why: str
+
+
+class CountsRecord(msgspec.Struct, frozen=True, tag=True):
+    """What the counts of the link have grown by since the last such record."""
+
+    order: int
+    counts: LinkCounts
+
+
+class NoticeRecord(msgspec.Struct, frozen=True, tag=True):
+    """A notice of the link; `lasting` ones are told, others only mentioned."""
+
+    order: int
+    kind: str
+    detail: str
+    who: str = ""
+    lasting: bool = True
+
+
+class EndRecord(msgspec.Struct, frozen=True, tag=True):
+    """The process ends, and why."""
+
+    why: str
+
+
+class SignRecord(msgspec.Struct, frozen=True, tag=True):
+    """The process is ready, and lives."""
+
+
+LinkRecord = MessageRecord | GoneRecord | CountsRecord | NoticeRecord
+Record = LinkRecord | EndRecord | SignRecord
+_encoder, _decoder = msgspec.msgpack.Encoder(), msgspec.msgpack.Decoder(Record)
+
+
+def pack(record: Record) -> bytes:
+    """A record's bytes, its length ahead."""
+    body = _encoder.encode(record)
+    return LENGTH.pack(len(body)) + body
+
+
+class RecordStream:
+    """Puts records together again from what a stream brings, in order, however they were cut on their way."""
+
+    def __init__(self) -> None:
+        self._kept = bytearray()
+
+    def feed(self, chunk: bytes) -> Iterator[Record]:
+        """The records that `chunk` completes. Raises ValueError for what `pack` does not write."""
+        self._kept += chunk
+        at = 0
+        while len(self._kept) - at >= LENGTH.size:
+            (count,) = LENGTH.unpack_from(self._kept, at)
+            if count > MAX_RECORD_BYTES:
+                raise ValueError(f"a record of {count} bytes")
+            begin = at + LENGTH.size
+            if len(self._kept) - begin < count:
+                break
+            at = begin + count
+            try:
+                yield _decoder.decode(self._kept[begin:at])
+            except msgspec.DecodeError as error:
+                raise ValueError(f"not a record: {error}") from error
+        del self._kept[:at]
+
+
+class ReaderProcess:
+    """The process that reads a link: begun, given its order, read, and begun again where it ended.
+
+    `generation` counts its begins. Its end raises nothing.
+    """
+
+    def __init__(self, notices: Notices, module: str = CHILD) -> None:
+        self.generation = 0
+        self._notices, self._module = notices, module
+        self._order, self._file = Order(0), -1
+        self._process: subprocess.Popen[bytes] | None = None
+        self._wire: socket.socket | None = None
+        self._stream = RecordStream()
+        self._why, self._ready = "", False
+        self._begun_s = self._again_s = self._silent_s = 0.0
+        self._back_off_s = MIN_BACK_OFF_S
+        self._begin()
+
+    def _begin(self) -> None:
+        self.generation += 1
+        self._begun_s, self._why, self._stream = time.monotonic(), "", RecordStream()
+        self._ready, self._silent_s = False, 0.0
+        wire, its_wire = socket.socketpair()
+        wire.setblocking(False)
+        self._wire = wire
+        command = [sys.executable, "-m", self._module, str(its_wire.fileno()), str(os.getpid())]
+        try:
+            # In a session of its own: a Ctrl-C is for the process that shows stars.
+            self._process = subprocess.Popen(
+                command,
+                pass_fds=[its_wire.fileno()],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+                start_new_session=True,
+            )
+        except OSError as error:
+            self._ended(str(error))
+        finally:
+            its_wire.close()
+        self._give()
+
+    def _give(self) -> None:
+        """Send the order; it is lost where the process has ended, which `take` notices."""
+        if self._wire is not None and self._order.number:
+            line = msgspec.json.encode(self._order) + b"\n"
+            with contextlib.suppress(OSError):
+                socket.send_fds(self._wire, [line], [self._file] if self._order.device else [])
+
+    def read_stream(self, stream: ZmqStream) -> None:
+        """Have a ZeroMQ stream opened and read."""
+        self._order = Order(self._order.number + 1, stream)
+        self._give()
+
+    def read_device(self, file: int) -> None:
+        """Have an open device read; it stays this process's to write to and to close."""
+        self._order, self._file = Order(self._order.number + 1, device=True), file
+        self._give()
+
+    def read_nothing(self) -> None:
+        """Have the device let go, before it is closed here: else its line stays open, and locked."""
+        self._order = Order(self._order.number + 1)
+        self._give()
+
+    def wait(self, timeout_ms: float) -> bool:
+        """True once the process has said something that was not taken, or has ended; begins it again where that is due."""
+        if self._wire is None and time.monotonic() >= self._again_s:
+            self._begin()
+        if self._wire is None:
+            time.sleep(max(0.0, min(self._again_s - time.monotonic(), timeout_ms / 1000)))
+            return False
+        poll = select.poll()
+        poll.register(self._wire, select.POLLIN)
+        begun_s = time.monotonic()
+        said = bool(poll.poll(timeout_ms))
+        # Only what was waited here counts: this process may have been stopped itself.
+        self._silent_s = 0.0 if said else self._silent_s + min(time.monotonic() - begun_s, timeout_ms / 1000)
+        limit_s = (STALLED_S if self._would_run() else HUNG_S) if self._ready and self._silent_s > HUNG_S else STARTS_S
+        if self._silent_s > limit_s:
+            self._ended(f"no sign of life for {limit_s:g} s")
+        return said
+
+    def _would_run(self) -> bool:
+        """Whether the process runs, or waits for a core; one that is stopped or asleep does not."""
+        with contextlib.suppress(OSError, IndexError):
+            if self._process is not None:
+                status = Path(f"/proc/{self._process.pid}/stat").read_text()
+                return status.rpartition(")")[2].split()[0] == "R"
+        return True
+
+    def await_ready(self) -> None:
+        """Wait until the process has imported what it needs; not for long, and not for one that failed."""
+        deadline_s = time.monotonic() + READY_WITHIN_S
+        while not self._ready and self._wire is not None and time.monotonic() < deadline_s:
+            if self.wait(READY_WITHIN_S * 1000):
+                self.take()
+
+    def take(self) -> list[LinkRecord]:
+        """What has come of the order, without waiting."""
+        if self._wire is None:
+            return []
+        try:
+            chunk = self._wire.recv(MAX_TAKEN_BYTES)
+        except BlockingIOError:
+            return []
+        except OSError:  # it ended before it had read all that it was given
+            chunk = b""
+        if not chunk:
+            self._ended("")
+            return []
+        taken: list[LinkRecord] = []
+        try:
+            for record in self._stream.feed(chunk):
+                match record:
+                    case SignRecord():
+                        self._ready = True
+                    case EndRecord(why):
+                        self._why = why
+                    case _ if record.order == self._order.number:
+                        taken.append(record)
+        except ValueError as error:
+            self._ended(str(error))
+        return taken
+
+    def _ended(self, why: str) -> None:
+        code = self._stop(0.0)
+        now_s = time.monotonic()
+        if now_s - self._begun_s > STEADY_S:
+            self._back_off_s = MIN_BACK_OFF_S
+        self._again_s = now_s + self._back_off_s
+        self._back_off_s = min(2 * self._back_off_s, MAX_BACK_OFF_S)
+        why = self._why or why or (f"signal {-code}" if code < 0 else f"exit code {code}")
+        self._notices.tell("receiver-failed", f"the attitude receiver stopped ({why}); restarting it")
+
+    def _stop(self, patience_s: float) -> int:
+        """Let the process end, within `patience_s` in order; its exit code."""
+        wire, self._wire = self._wire, None
+        if wire is not None:
+            wire.close()
+        process, self._process = self._process, None
+        if process is None:
+            return 0
+        try:
+            return process.wait(patience_s or MIN_BACK_OFF_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            return process.wait()
+
+    def close(self) -> None:
+        """End the process."""
+        self._stop(ENDS_WITHIN_S)

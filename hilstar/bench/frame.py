@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Protocol, Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -15,32 +15,33 @@ from hilstar.arrays import Float32Array, FloatArray, IntArray
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.config import BenchConfig, Vector
-from hilstar.bench.discs import DiscPainter, When, disc_stars
 from hilstar.bench.effort import Effort
-from hilstar.bench.satellites import FRAME_SPRITES, Shot, satellite_discs, with_satellites
-from hilstar.bench.truth import clipped_in, designations, sprite_names, sprite_truth, truth_table
 from hilstar.errors import InputError
+from hilstar.frame.bodies import BodyLayer, disc_stars
+from hilstar.frame.layers import light_of, seen_in, sky_layers
+from hilstar.frame.satellites import SatelliteLayer
+from hilstar.frame.truth import clipped_in, designations, sprite_names, sprite_truth, truth_table
+from hilstar.frame.view import STILL, Canvas, Layer, View
 from hilstar.monitor.calibration import Calibration
 from hilstar.monitor.footprints import FootprintMap, star_losses_mag
 from hilstar.monitor.quantise import Panel, shown_light
 from hilstar.monitor.response import Codes, Levels, code_dtype
 from hilstar.render.renderer import Renderer
-from hilstar.rotation import normalise, to_matrix
+from hilstar.rotation import normalise
 from hilstar.scene.camera import Camera
-from hilstar.scene.frame_motion import Scan, Turn, slowed, swept_sprites
-from hilstar.scene.sprites import Candidates, Sprites, clipped_sprites, make_sprites
-from hilstar.scene.trails import Brush
+from hilstar.scene.frame_motion import Scan
+from hilstar.scene.sprites import Sprites, clipped_sprites
 from hilstar.sky.stars import Stars, split_by_rate
 from hilstar.units import magnitude
 
 if TYPE_CHECKING:
+    from hilstar.frame.faults import FaultLayer
     from hilstar.sky.bodies.disc import Disc
     from hilstar.sky.bodies.moving import MovingSky
 
 WARM_UP_ATTITUDE = np.array([1.0, 0.0, 0.0, 0.0])
 WARM_UP_RATE_RAD_S = np.array([0.1, 0.0, 0.0])
-STILL = np.zeros(3)
-MOST = 0.5  # of a pixel's light: with less it is not the disc's
+MOST = 0.5  # a pixel is a disc's if more than this share of its light is the disc's
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,23 +62,6 @@ class Frame:
     truth: npt.NDArray[np.void]
     star: IntArray
     t_ns: int | None = None
-
-
-class FrameFaults(Protocol):
-    """What is wrong in a frame on request (see `bench.faults`)."""
-
-    def turned(self, q_icrs_to_cam: FloatArray) -> FloatArray:
-        """The attitude that is shown in place of another."""
-
-    def over(
-        self,
-        sprites: Sprites,
-        stars: Stars,
-        q_icrs_to_cam: FloatArray,
-        draw: Callable[[Stars], Sprites],
-        scan: Scan | None = None,
-    ) -> Sprites:
-        """The frame's sprites with its faults."""
 
 
 class Drawn:
@@ -131,7 +115,6 @@ class Bench:
     faint_stars: Stars
     renderer: Renderer
     moving: MovingSky | None = None
-    candidates: Candidates = field(default_factory=Candidates, repr=False)
     output: dict[str, object] = field(default_factory=dict, repr=False)
 
     def with_stars(self, stars: Stars) -> Bench:
@@ -148,12 +131,63 @@ class Bench:
     def _sigma_px(self) -> tuple[float, float]:
         return self.config.render.sprite_sigma_px
 
+    @property
+    def canvas(self) -> Canvas:
+        """The monitor as layers draw on it; white is that of its darkest pixel."""
+        white_e_per_s = self.flux_at_white_e_per_s * self.darkest
+        return Canvas(self.camera, self.renderer.footprint_px, self._sigma_px, white_e_per_s)
+
+    @cached_property
+    def layers(self) -> tuple[Layer, ...]:
+        """The layers of what the monitor can show: `shown_stars`, bodies, and satellites as bright."""
+        return sky_layers(self.canvas, self.moving, self.faintest_shown_e_per_s, self.shown_stars)
+
+    @cached_property
+    def _all_layers(self) -> tuple[Layer, ...]:
+        return sky_layers(self.canvas, self.moving)
+
+    @cached_property
+    def _bodies(self) -> BodyLayer | None:
+        return next((layer for layer in self.layers if isinstance(layer, BodyLayer)), None)
+
+    def view(
+        self,
+        q_icrs_to_cam: FloatArray,
+        rate_cam_rad_s: Vector | FloatArray | None = None,
+        t_ns: int | None = None,
+        velocity_km_s: FloatArray | None = None,
+        place_km: FloatArray | None = None,
+    ) -> View:
+        """The view of a frame (see `View`), as the monitor's rows light up.
+
+        A rate that moves no star by more than `[render] motion_above_px` is 0 in it.
+        """
+        rate = None if rate_cam_rad_s is None else np.asarray(rate_cam_rad_s, dtype=np.float64)
+        if rate is not None:
+            motion_px = float(np.linalg.norm(rate)) * self.scan.longest_s * self._px_per_rad
+            rate = rate if motion_px > self.config.render.motion_above_px else STILL
+        return View(q_icrs_to_cam, rate, t_ns, velocity_km_s, place_km, self.scan)
+
+    @cached_property
+    def _px_per_rad(self) -> float:
+        return self.camera.scales_px_rad()[1]
+
+    def seen(self, stars: Stars, view: View) -> Stars:
+        """`stars` or `shown_stars` as a view has them, bodies among them."""
+        return seen_in(view, stars, self.moving)
+
+    def light(self, view: View, faults: FaultLayer | None = None) -> Sprites:
+        """The light of a frame as the monitor can show it, before anything is drawn."""
+        return self._light(self.layers, self.shown_stars, view, faults)
+
+    def _light(self, layers: tuple[Layer, ...], stars: Stars, view: View, faults: FaultLayer | None) -> Sprites:
+        layers = layers if faults is None else (*layers, faults)
+        return light_of(self.canvas, layers, self.seen(stars, view), view)
+
     def sprites(self, q_icrs_to_cam: FloatArray, stars: Stars | None = None) -> Sprites:
-        """The sprites of `stars` (by default those bright enough to show) at an attitude (unit quaternion, scalar first)."""
-        icrs_to_image = self.camera.cam_to_image @ to_matrix(q_icrs_to_cam)
+        """The sprites of `stars` (by default those bright enough to show) as points, at an attitude (unit quaternion)."""
         stars = self.shown_stars if stars is None else stars
-        candidates = self.candidates if stars is self.shown_stars else None
-        return make_sprites(stars, icrs_to_image, self.camera, self.renderer.footprint_px, candidates)
+        return light_of(self.canvas, self.layers[:1], stars, View(q_icrs_to_cam))
 
     def draw(
         self,
@@ -169,65 +203,18 @@ class Bench:
         then that at the middle row's first light. Bodies are where they are at `t_ns`, by default at the start; without a
         rate satellites' paths have their middle there.
         """
-        return self.draw_sprites(self.frame_sprites(q_icrs_to_cam, rate_cam_rad_s, t_ns=t_ns), frame)
+        light = None if q_icrs_to_cam is None else self.light(self.view(q_icrs_to_cam, rate_cam_rad_s, t_ns))
+        return self.draw_sprites(light, frame)
 
-    def frame_sprites(
-        self,
-        q_icrs_to_cam: FloatArray | None,
-        rate_cam_rad_s: Vector | FloatArray | None = None,
-        velocity_km_s: FloatArray | None = None,
-        t_ns: int | None = None,
-        place_km: FloatArray | None = None,
-        faults: FrameFaults | None = None,
-    ) -> Sprites | None:
-        """The sprites of a frame (see `draw`), before anything is drawn; None for a blank one.
-
-        A velocity (3,), ICRS, is that of an observer against the one of `[sky] observer_velocity_km_s`, a place (3,) its own
-        about the Earth's centre, ICRS axes.
-        """
-        if q_icrs_to_cam is None:
-            return None
-        stars = self.seen(self.shown_stars, t_ns, velocity_km_s, place_km)
-        turn = self._turn(q_icrs_to_cam, rate_cam_rad_s)
-        sprites = self.sprites(q_icrs_to_cam, stars) if turn is None else self._swept(stars, turn)
-        if self._painter is not None:
-            sprites = self._painter.over(sprites, stars, q_icrs_to_cam, When(t_ns, velocity_km_s, place_km), turn)
-        if self.moving is not None:
-            shot = Shot(self.camera, self.scan, turn or Turn(q_icrs_to_cam, STILL), t_ns, velocity_km_s, place_km)
-            shot = shot.at_rest() if rate_cam_rad_s is None else shot
-            sprites = self._with_satellites(sprites, stars, shot, self.faintest_shown_e_per_s)
-        if faults is None:
-            return sprites
-        scan, draw = None if rate_cam_rad_s is None else self.scan, self.star_sprites
-        return faults.over(sprites, stars, q_icrs_to_cam, lambda few: draw(few, q_icrs_to_cam, rate_cam_rad_s), scan)
-
-    def star_sprites(
-        self, stars: Stars, q_icrs_to_cam: FloatArray, rate_cam_rad_s: Vector | FloatArray | None = None
-    ) -> Sprites:
-        """The sprites of stars as they are seen, at an attitude and a rate (see `draw`)."""
-        turn = self._turn(q_icrs_to_cam, rate_cam_rad_s)
-        return self.sprites(q_icrs_to_cam, stars) if turn is None else self._swept(stars, turn)
-
-    @cached_property
-    def _painter(self) -> DiscPainter | None:
-        if self.moving is None or not self.moving.names:
-            return None
-        return DiscPainter(
-            self.moving,
-            self.camera,
-            self.renderer.footprint_px,
-            self._sigma_px,
-            white_e_per_s=self.flux_at_white_e_per_s * self.darkest,
-            scan=self.scan,
-        )
-
-    def discs(self, q_icrs_to_cam: FloatArray, when: When) -> list[Disc]:
-        """The bodies on the image at an attitude at rest that are drawn as discs, nearest first."""
-        bodies = [] if self._painter is None else self._painter.on_image(q_icrs_to_cam, when)
-        if self.moving is None or self.moving.satellites is None or not self.moving.satellites.sized:
-            return bodies
-        stars = self.seen(self.stars, when.t_ns, when.velocity_km_s, when.place_km)
-        return [*satellite_discs(self.moving, stars, self.camera, q_icrs_to_cam, when), *bodies]
+    def discs(self, view: View) -> list[Disc]:
+        """The bodies and satellites on the image that are drawn as discs, at rest: bodies nearest first, after satellites."""
+        found: list[Disc] = []
+        for layer in reversed(self.layers):
+            if isinstance(layer, SatelliteLayer):
+                found += layer.discs(self.seen(self.stars, view), view)
+            elif isinstance(layer, BodyLayer):
+                found += layer.on_image(view)
+        return found
 
     def draw_sprites(self, sprites: Sprites | None, frame: int = 0) -> Drawn:
         """Draw the levels of a frame's sprites."""
@@ -237,38 +224,14 @@ class Bench:
             return Drawn(self.renderer, sprites, () if sprites is None else sprites.over_white)
         return Drawn(self.renderer, sprites, (*designations(self.shown_stars, sprites, clipped), *sprites.over_white))
 
-    def _turn(self, q_icrs_to_cam: FloatArray, rate_cam_rad_s: Vector | FloatArray | None) -> Turn | None:
-        """The motion within a frame; None if no star moves far enough to be seen."""
-        if rate_cam_rad_s is None:
-            return None
-        turn = Turn(q_icrs_to_cam, np.asarray(rate_cam_rad_s, dtype=np.float64))
-        motion_px = turn.speed_rad_s * self.scan.longest_s * self._px_per_rad
-        return turn if motion_px > self.config.render.motion_above_px else None
-
-    @cached_property
-    def _px_per_rad(self) -> float:
-        return self.camera.scales_px_rad()[1]
-
-    def _swept(self, stars: Stars, turn: Turn) -> Sprites:
-        sprites = swept_sprites(stars, turn, self.scan, self.camera, self.renderer.footprint_px, self._sigma_px)
-        return replace(sprites, rate_cam_rad_s=turn.rate_cam_rad_s)
-
-    def _with_satellites(self, sprites: Sprites, stars: Stars, shot: Shot, faintest_e_per_s: float) -> Sprites:
-        if self.moving is None or self.moving.satellites is None:
-            return sprites
-        white_e_per_s = self.flux_at_white_e_per_s * self.darkest
-        shot = replace(shot, turn=slowed(shot.turn, self.scan, self.camera)[0], white_e_per_s=white_e_per_s)
-        brush = Brush(self.renderer.footprint_px, self._sigma_px, FRAME_SPRITES)
-        return with_satellites(sprites, stars, self.moving, shot, brush, faintest_e_per_s)
-
     def count_faint(self, q_icrs_to_cam: FloatArray) -> int:
         """How many stars in view at an attitude are too faint for the monitor."""
         return len(self.sprites(q_icrs_to_cam, self.faint_stars)) if len(self.faint_stars) else 0
 
     def warm_up(self) -> None:
         """Draw once with paths, with stars and with none: a driver compiles its shaders at first use, 60 ms on llvmpipe."""
-        if self._painter is not None:
-            self.renderer.draw(replace(self.sprites(WARM_UP_ATTITUDE), extended=self._painter.any_lights()))
+        if self._bodies is not None:
+            self.renderer.draw(replace(self.sprites(WARM_UP_ATTITUDE), extended=self._bodies.any_lights()))
         for q, rate in ((WARM_UP_ATTITUDE, WARM_UP_RATE_RAD_S), (WARM_UP_ATTITUDE, None), (None, None)):
             _ = self.draw(q, 0, rate).levels
         self.renderer.begin_anew()
@@ -278,7 +241,7 @@ class Bench:
         q_icrs_to_cam: Sequence[float] | FloatArray,
         number: int = 0,
         t_ns: int | None = None,
-        faults: FrameFaults | None = None,
+        faults: FaultLayer | None = None,
     ) -> Frame:
         """Draw one frame and read all of it back; the arrays are copies.
 
@@ -286,56 +249,34 @@ class Bench:
         `temporal` this is the first frame of a sequence. Bodies are where they are at `t_ns`. Raises InputError for a
         quaternion that is not unit within 1e-3.
         """
-        q = checked_quaternion(q_icrs_to_cam)
-        q = q if faults is None else faults.turned(q)
-        sprites = self._still(q, self.stars, t_ns, faults)
-        shown = self._still(q, self.shown_stars, t_ns, faults)
+        view = self.view(checked_quaternion(q_icrs_to_cam), None, t_ns)
+        view = view if faults is None else faults.turned(view)
+        sprites = self._light(self._all_layers, self.stars, view, faults)
+        shown = self.light(view, faults)
         self.renderer.begin_anew()
         self.renderer.draw(shown, number)
         levels = Levels(self.renderer.levels().copy())
         if len(self.faint_stars) or self.renderer.target.sides or len(sprites) != len(shown):
             self.renderer.draw_linear(sprites)
         linear = self.renderer.linear().copy()
-        truth, star = self._truth(q, sprites, t_ns)
+        truth, star = self._truth(view, sprites)
         order = np.argsort(truth["v_mag"], kind="stable")
-        return Frame(q, linear, levels, self.code_values(levels), truth[order], star[order], t_ns)
+        return Frame(view.q_icrs_to_cam, linear, levels, self.code_values(levels), truth[order], star[order], t_ns)
 
-    def _truth(self, q: FloatArray, sprites: Sprites, t_ns: int | None) -> tuple[npt.NDArray[np.void], IntArray]:
+    def _truth(self, view: View, sprites: Sprites) -> tuple[npt.NDArray[np.void], IntArray]:
         """Rows of TRUTH_DTYPE for what sprites and discs are of, and its indices (n,)."""
         truth, star = sprite_truth(self.stars, sprites, self._clipped(sprites))
         if sprites.discs:
-            discs = [disc for disc in self.discs(q, When(t_ns)) if disc.name in sprites.discs]
+            discs = [disc for disc in self.discs(view) if disc.name in sprites.discs]
             found = disc_stars(self.stars, (disc.name for disc in discs))
-            middles = np.array([disc.direction for disc in discs]) @ (self.camera.cam_to_image @ to_matrix(q)).T
+            middles = np.array([disc.direction for disc in discs]) @ view.icrs_to_image(self.camera).T
             rows = truth_table(self.stars, found, *self.camera.project(middles))
             rows["clipped"] = np.isin(rows["name"], sprites.over_white)
             truth, star = np.append(truth, rows), np.append(star, found)
         truth["drawn"] = truth["electrons_per_s"] >= self.faintest_shown_e_per_s
         return truth, star
 
-    def _still(self, q: FloatArray, stars: Stars, t_ns: int | None, faults: FrameFaults | None) -> Sprites:
-        """The sprites of `stars` or `shown_stars` as points, discs, and satellites' paths, at an attitude and a moment."""
-        seen, faintest_e_per_s = self.seen(stars, t_ns), 0.0 if stars is self.stars else self.faintest_shown_e_per_s
-        sprites = self.sprites(q, seen)
-        if self._painter is not None:
-            sprites = self._painter.over(sprites, seen, q, When(t_ns))
-        shot = Shot(self.camera, self.scan, Turn(q, STILL), t_ns).at_rest()
-        sprites = self._with_satellites(sprites, seen, shot, faintest_e_per_s)
-        return sprites if faults is None else faults.over(sprites, seen, q, lambda few: self.sprites(q, few))
-
-    def seen(
-        self,
-        stars: Stars,
-        t_ns: int | None = None,
-        velocity_km_s: FloatArray | None = None,
-        place_km: FloatArray | None = None,
-    ) -> Stars:
-        """`stars` or `shown_stars` as they are seen at `t_ns`, bodies among them; velocity and place as in `frame_sprites`."""
-        if self.moving is None:
-            return stars.seen_at(velocity_km_s)
-        return self.moving.seen(stars, t_ns, velocity_km_s, place_km)
-
-    def losses_mag(self, frame: Frame, faults: FrameFaults | None = None) -> dict[int | str, float]:
+    def losses_mag(self, frame: Frame, faults: FaultLayer | None = None) -> dict[int | str, float]:
         """For each clipped star of a frame (by HIP number, or a body's name), how many magnitudes too faint it is.
 
         That is summed over its own pixels. `faults` are those of the frame.
@@ -343,22 +284,23 @@ class Bench:
         clipped = clipped_in(frame.truth)
         if not clipped:
             return {}
-        sprites = self._still(frame.q_icrs_to_cam, self.shown_stars, frame.t_ns, faults)
+        view = self.view(frame.q_icrs_to_cam, None, frame.t_ns)
+        sprites = self.light(view, faults)
         footprints = FootprintMap(self.camera.resolution_px, self._sigma_px)
         loss_mag = star_losses_mag(sprites, self.panel, footprints, frame.levels)
         names = sprite_names(self.shown_stars, sprites)
-        losses = dict(zip(names, loss_mag.tolist(), strict=True)) | self._disc_losses_mag(frame, sprites)
+        losses = dict(zip(names, loss_mag.tolist(), strict=True)) | self._disc_losses_mag(frame, view, sprites)
         return {name: losses[name] for name in clipped if name in losses}
 
-    def _disc_losses_mag(self, frame: Frame, sprites: Sprites) -> dict[int | str, float]:
+    def _disc_losses_mag(self, frame: Frame, view: View, sprites: Sprites) -> dict[int | str, float]:
         """The same for each disc brighter than white, in the pixels of which it has most of the light."""
-        if not sprites.over_white or self._painter is None:
+        if not sprites.over_white or self._bodies is None:
             return {}
         wanted, shown = frame.linear, shown_light(frame.levels, self.panel)
         losses: dict[int | str, float] = {}
-        for disc in self.discs(frame.q_icrs_to_cam, When(frame.t_ns)):
+        for disc in self.discs(view):
             if disc.name in sprites.over_white:
-                alone = self._painter.alone(disc, frame.q_icrs_to_cam)
+                alone = self._bodies.alone(disc, view)
                 self.renderer.draw_linear(replace(sprites, data=sprites.data[:0], extended=alone))
                 own = self.renderer.linear() > MOST * wanted
                 if own.any():

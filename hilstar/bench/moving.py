@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from hilstar.bench.config import GEOCENTRE, SOURCE, BenchConfig
 from hilstar.bench.config.when import DAY_NS, UNIX, epoch_utc_ns, from_source, jyear
-from hilstar.bench.discs import POINT_PX
-from hilstar.bench.satellites import bench_satellites
+from hilstar.frame.bodies import POINT_PX
 from hilstar.reading import read_text
 from hilstar.scene.camera import Camera
 from hilstar.sky.bodies.disc import EARTH
@@ -19,9 +19,13 @@ from hilstar.sky.bodies.orbit import TLE_ADVICE, VERSION_KEY, Geocentre, OemOrbi
 from hilstar.sky.electrons import Optics, Photometry
 from hilstar.units import ARCSEC_PER_RAD
 
+if TYPE_CHECKING:
+    from hilstar.sky.bodies.passes import Satellites
+
 log = logging.getLogger(__name__)
 
 MAX_ORBIT_BYTES = 20_000_000  # a year of minutes
+MAX_LIST_BYTES, MAX_TABLE_BYTES = 20_000_000, 5_000_000  # 120 000 sets: several times as many as there are in orbit
 MAX_TLE_AGE_DAYS = 7.0
 MAX_ARCSEC, MANY_PX = 7200.0, 1000.0  # a wider body is told in degrees; across a field that wide no scale holds
 
@@ -72,6 +76,36 @@ def orbit_file(path: Path, utc_ns: int, day: bool) -> Orbit:
     return orbit
 
 
+def bench_satellites(
+    config: BenchConfig, folder: Path, orbit: Orbit, zero_and_start_ns: tuple[int, int], optics: Optics
+) -> Satellites | None:
+    """The satellites that a bench file names, None where it names none; UTCs of t_ns = 0 and of the start.
+
+    Raises InputError for a list or a table that is wrong, MachineError without SGP4.
+    """
+    from hilstar.sky.bodies.light import bodies_electrons_per_s
+    from hilstar.sky.bodies.passes import Satellites
+    from hilstar.sky.bodies.satellites import LIST_FORM, TABLE_FORM, brightness_of, read_satellites, read_table
+
+    sky, bodies, (zero_ns, start_ns) = config.sky, config.sky.bodies, zero_and_start_ns
+    if bodies.satellites is None:
+        return None
+    path = folder / bodies.satellites
+    found = read_satellites(read_text(path, LIST_FORM, MAX_LIST_BYTES), str(path), start_ns)
+    rows = {}
+    if bodies.satellite_magnitudes is not None:
+        table = folder / bodies.satellite_magnitudes
+        rows = read_table(read_text(table, TABLE_FORM, MAX_TABLE_BYTES), str(table))
+    photometry = Photometry(sky.zero_point, sky.passband_weighting)
+    v0_e_per_s = float(bodies_electrons_per_s(("Sun",), sky.brightness, optics, photometry)[0])
+    brightness = brightness_of(found, rows, bodies.satellite_standard_mag, v0_e_per_s)
+    satellites = Satellites(found, brightness, v0_e_per_s, orbit, zero_ns)
+    satellites.listed = sum(one.number in rows for one in found)
+    satellites.file = str(path)
+    satellites.place(start_ns)
+    return satellites
+
+
 def body_names(config: BenchConfig) -> tuple[str, ...]:
     """The bodies that a bench file asks for."""
     bodies = config.sky.bodies
@@ -109,3 +143,11 @@ def _angle(arcsec: float) -> str:
 
 def _pixels(px: float) -> str:
     return f"{px:.2f} px" if px < MANY_PX else f"more than {MANY_PX:.0f} px"
+
+
+def satellite_lines(sky: MovingSky | None, t_ns: int | None) -> list[str]:
+    """What there is to say of a bench's satellites at a moment, a line; none where it has none."""
+    if sky is None or sky.satellites is None:
+        return []
+    placed, known, every = sky.satellites_placed(t_ns), sky.satellites.listed, len(sky.satellites)
+    return [f"satellites: {placed} of {every} have a place by their elements; {known} are in [sky.bodies] satellite_magnitudes"]

@@ -22,10 +22,11 @@ from hilstar.attitude.logs.entries import Stated
 from hilstar.attitude.logs.log_file import log_timeline, open_log
 from hilstar.attitude.wire.source import Mounting
 from hilstar.bench.bench_file import BenchFile, dated
-from hilstar.bench.faults.scenario import Scenario, read_scenario
+from hilstar.bench.scenario import Scenario, read_scenario
 from hilstar.campaign.plan import SCENARIO, Attitudes, Parameter, Plan, changed_bench, parameters
 from hilstar.campaign.solvers import Answer, StarErrors
 from hilstar.errors import InputError
+from hilstar.frame.view import View
 from hilstar.reading import parse_toml
 from hilstar.rotation import (
     conjugate,
@@ -37,8 +38,7 @@ from hilstar.rotation import (
     to_radec_roll_deg,
     to_rotation_vector,
 )
-from hilstar.scene.exposure_motion import Motion
-from hilstar.twin.batch import faulty_exposure, motion_at
+from hilstar.twin.batch import faulty_exposure, view_at
 from hilstar.twin.faulty_exposure import FaultyExposure
 from hilstar.twin.simulator import Exposure, Simulator
 from hilstar.units import ARCSEC_PER_RAD, NS_PER_S
@@ -101,12 +101,12 @@ CENTROIDS: tuple[tuple[str, Kind], ...] = (
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """A case before its bench is made: its values by key, the seed of its noise, and the motion of its first exposure."""
+    """A case before its bench is made: its values by key, the seed of its noise, and the view of its first exposure."""
 
     number: int
     values: dict[str, Any]
     noise_seed: int
-    first: Motion
+    first: View
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,33 +152,37 @@ class CaseMaker:
         turn_arcsec = [float(case.values.get(f"misalignment_arcsec.{axis}", 0.0)) for axis in "xyz"]
         return _misaligned(file, np.array(turn_arcsec)) if any(turn_arcsec) else file
 
-    def motion(self, case: Case, frame: int, exposure_s: float) -> Motion:
-        """The motion of one of the case's exposures, `step_s` apart: at the case's rate, or along the log."""
+    def view(self, case: Case, frame: int, exposure_s: float) -> View:
+        """The view of one of the case's exposures, `step_s` apart: at the case's rate, or along the log."""
         first = case.first
         step_ns = round(frame * self.plan.step_s * NS_PER_S)
         if self._log is not None and first.t_ns is not None:
             t_ns = min(first.t_ns + step_ns, self._log.span_ns[1])
-            along = motion_at(self._log.timeline, self._log.span_ns, t_ns, exposure_s)
-            return along if not _has_rate(case.values) else Motion(along.q_icrs_to_cam, first.rate_cam_rad_s, exposure_s, t_ns)
-        q = propagate(first.q_icrs_to_cam, first.rate_cam_rad_s, step_ns / NS_PER_S) if step_ns else first.q_icrs_to_cam
-        return Motion(q, first.rate_cam_rad_s, exposure_s, (first.t_ns or 0) + step_ns)
+            along = view_at(self._log.timeline, self._log.span_ns, t_ns, exposure_s)
+            return (
+                along
+                if not _has_rate(case.values)
+                else View.exposure(along.q_icrs_to_cam, first.turn.rate_cam_rad_s, exposure_s, t_ns)
+            )
+        q = propagate(first.q_icrs_to_cam, first.turn.rate_cam_rad_s, step_ns / NS_PER_S) if step_ns else first.q_icrs_to_cam
+        return View.exposure(q, first.turn.rate_cam_rad_s, exposure_s, (first.t_ns or 0) + step_ns)
 
-    def faults(self, case: Case, motion: Motion, simulator: Simulator) -> FaultyExposure | None:
+    def faults(self, case: Case, view: View, simulator: Simulator) -> FaultyExposure | None:
         """What the case's scenario does to an exposure; its time is that of the case, or the log's since its beginning."""
         scenario = self._scenarios.get(str(case.values.get(SCENARIO, "")))
         if scenario is None:
             return None
         begin_ns = 0 if self._log is None else self._log.span_ns[0]
-        return faulty_exposure(simulator, motion, scenario, (motion.t_ns or 0) - begin_ns)
+        return faulty_exposure(simulator, view, scenario, (view.t_ns or 0) - begin_ns)
 
-    def _first(self, number: int, look: FloatArray, values: dict[str, Any]) -> Motion:
+    def _first(self, number: int, look: FloatArray, values: dict[str, Any]) -> View:
         rate_rad_s = self._rate_rad_s(number, values)
         if self._log is not None:
             begin_ns, end_ns = self._log.span_ns
             t_ns = begin_ns + round(float(look[0]) * (end_ns - begin_ns))
-            return Motion(motion_at(self._log.timeline, self._log.span_ns, t_ns, 0.0).q_icrs_to_cam, rate_rad_s, 0.0, t_ns)
+            return View.exposure(view_at(self._log.timeline, self._log.span_ns, t_ns, 0.0).q_icrs_to_cam, rate_rad_s, 0.0, t_ns)
         t_ns = round(float(values.get("time_s", 0.0)) * NS_PER_S)
-        return Motion(looking_q(self.plan.attitudes, look), rate_rad_s, 0.0, t_ns)
+        return View.exposure(looking_q(self.plan.attitudes, look), rate_rad_s, 0.0, t_ns)
 
     def _rate_rad_s(self, number: int, values: dict[str, Any]) -> FloatArray:
         rate = np.radians([float(values.get(f"rate_deg_s.{axis}", 0.0)) for axis in "xyz"])
@@ -323,7 +327,7 @@ class Tally:
         if answer.q_icrs_to_cam is None:
             self.why = self.why or answer.why
             return
-        error = attitude_error_arcsec(exposure.motion.q_icrs_to_cam, answer.q_icrs_to_cam)
+        error = attitude_error_arcsec(exposure.view.q_icrs_to_cam, answer.q_icrs_to_cam)
         if self.frames == 1:
             self.first_q = answer.q_icrs_to_cam
         if np.linalg.norm(error) > self.wrong_above_arcsec:

@@ -12,15 +12,13 @@ from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import open_bench
 from hilstar.bench.cameras import tracker_camera
 from hilstar.bench.config import BenchConfig
-from hilstar.bench.discs import When
+from hilstar.frame.layers import light_of, sky_layers
+from hilstar.frame.view import View
 from hilstar.monitor.quantise import shown_light
 from hilstar.rotation import propagate
-from hilstar.scene.exposure_motion import MIDDLE_S, Motion
-from hilstar.scene.psf import footprint_px
-from hilstar.scene.sprites import make_sprites
 from hilstar.tracker.detector import Detector
 from hilstar.twin.optics import TwinOptics
-from hilstar.twin.simulator import Exposure, background_e, exposure_truth, with_discs, with_streaks
+from hilstar.twin.simulator import Exposure, background_e, detector_canvas, exposure_truth
 from hilstar.twin.verify.twin import true_geometry, true_panel
 from hilstar.units import NS_PER_S
 
@@ -73,35 +71,33 @@ class DisplayTracker:
         self._optics = TwinOptics(true_geometry(self._bench, self.camera), self.config.tracker.psf_sigma_px)
         self._glow_e_per_s = self._optics.glow_e_per_s(self._panel)
 
-    def expose(self, motion: Motion, rng: np.random.Generator | None) -> Exposure:
+    def expose(self, view: View, rng: np.random.Generator | None) -> Exposure:
         """One exposure of the display; without a generator, without noise. Raises InputError as the detector does."""
-        exposure_s = motion.exposure_s
-        light_e = self._optics.image_e_per_s(self._light_e_per_s(motion)) * exposure_s
+        exposure_s = view.exposure_s
+        light_e = self._optics.image_e_per_s(self._light_e_per_s(view)) * exposure_s
         mean_e = light_e + self._glow_e_per_s * exposure_s + self._background_e
         if rng is None:
             dn = self._detector.expose_noiseless(mean_e, exposure_s)
         else:
             dn = self._detector.expose(mean_e, exposure_s, rng)
-        stars = self._bench.seen(self._bench.stars, motion.t_ns)
-        icrs_to_image = motion.icrs_to_image(MIDDLE_S, self.camera)[0]
-        sprites = make_sprites(stars, icrs_to_image, self.camera, footprint_px(self.config.tracker.psf_sigma_px))
-        sprites = with_discs(self, self._bench.moving, sprites, stars, motion, When(motion.t_ns))
-        sprites = with_streaks(self, self._bench.moving, sprites, stars, motion, When(motion.t_ns))
-        truth = exposure_truth(self, motion, stars, sprites, mean_e)
+        stars = self._bench.seen(self._bench.stars, view)
+        canvas = detector_canvas(self.config.tracker, self.camera)
+        light = light_of(canvas, sky_layers(canvas, self._bench.moving, paths=False), stars, view)
+        truth = exposure_truth(canvas, view, stars, light, mean_e)
         truth["drawn"] = truth["electrons_per_s"] >= self._bench.faintest_shown_e_per_s
-        return Exposure(motion, dn, mean_e, truth)
+        return Exposure(view, dn, mean_e, truth)
 
-    def _light_e_per_s(self, motion: Motion) -> FloatArray:
+    def _light_e_per_s(self, view: View) -> FloatArray:
         """The mean light (H, W) of the display over the exposure."""
         count, moving = 1, self._bench.moving
         streaks = moving is not None and moving.satellites is not None
-        if streaks or motion.rate_cam_rad_s.any() or self.config.render.quantisation == "temporal":
-            count = max(1, round(motion.exposure_s * self.config.monitor.refresh_hz))
+        if streaks or view.turn.rate_cam_rad_s.any() or self.config.render.quantisation == "temporal":
+            count = max(1, round(view.exposure_s * self.config.monitor.refresh_hz))
         total: FloatArray | None = None
         for frame in range(count):
-            seconds = ((frame + 0.5) / count - 0.5) * motion.exposure_s
-            q = propagate(motion.q_icrs_to_cam, motion.rate_cam_rad_s, seconds)
-            t_ns = motion.t_ns
+            seconds = ((frame + 0.5) / count - 0.5) * view.exposure_s
+            q = propagate(view.q_icrs_to_cam, view.turn.rate_cam_rad_s, seconds)
+            t_ns = view.t_ns
             if streaks and t_ns is not None:
                 t_ns += round(seconds * NS_PER_S)
             light = shown_light(self._bench.draw(q, frame, t_ns=t_ns).levels, self._panel)

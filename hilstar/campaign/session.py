@@ -27,10 +27,10 @@ from hilstar.campaign.plan import SCENARIO, Plan, parse_plan
 from hilstar.campaign.solvers import CENTROIDS, SolverFault, choose_solver
 from hilstar.errors import HilstarError, InputError, MachineError, one_line
 from hilstar.files import make_directory
+from hilstar.frame.view import View
 from hilstar.reading import CHUNK_BYTES, open_regular
 from hilstar.resources import resource_path
 from hilstar.scene.camera import Camera
-from hilstar.scene.exposure_motion import Motion
 from hilstar.twin.pictures import write_exposure_fits
 from hilstar.twin.simulator import Exposure, FrameNoise, Simulator
 
@@ -122,7 +122,7 @@ class Imaging(Protocol):
         """Be the tracker of another bench file."""
         ...
 
-    def expose(self, motion: Motion, rng: np.random.Generator | None) -> Exposure:
+    def expose(self, view: View, rng: np.random.Generator | None) -> Exposure:
         """One exposure."""
         ...
 
@@ -183,14 +183,14 @@ class Session:
         tally = Tally("stars" in self.columns, self.plan.wrong_above_arcsec)
         noise = FrameNoise(self.plan.noise, case.noise_seed)
         for frame in range(self.plan.frames):
-            motion = self.maker.motion(case, frame, tracker.config.tracker.exposure_s)
+            view = self.maker.view(case, frame, tracker.config.tracker.exposure_s)
             # A case of one frame is what `hilstar simulate --seed` makes of the same bench and attitude.
             rng = noise.rng() if self.plan.frames == 1 else noise.rng(frame)
-            faults = self.maker.faults(case, motion, tracker) if isinstance(tracker, Simulator) else None
+            faults = self.maker.faults(case, view, tracker) if isinstance(tracker, Simulator) else None
             if isinstance(tracker, Simulator) and faults is not None:
-                exposure = tracker.expose(motion, rng, faults=faults)
+                exposure = tracker.expose(view, rng, faults=faults)
             else:
-                exposure = tracker.expose(motion, rng)
+                exposure = tracker.expose(view, rng)
             if self.job.images:
                 name = image_name(case.number, frame, self.plan.frames)
                 row["image"] = image_name(case.number, 0, self.plan.frames)

@@ -145,7 +145,7 @@ class CentroidSolver:
         if len(x_px) < MIN_STARS:
             return Answer(None, f"{len(x_px)} stars stand alone, and an attitude takes {MIN_STARS}", errors)
         turn = _turn(tracker, errors, flux[good])
-        return Answer(multiply(turn, exposure.motion.q_icrs_to_cam), "", errors)
+        return Answer(multiply(turn, exposure.view.q_icrs_to_cam), "", errors)
 
     def _settings(self, tracker: Tracker) -> CentroidSettings:
         wanted, psf = self._wanted, tracker.config.tracker.psf_sigma_px

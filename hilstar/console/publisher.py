@@ -46,7 +46,7 @@ from hilstar.units import NS_PER_S
 
 if TYPE_CHECKING:
     from hilstar.bench.bench_file import BenchFile
-    from hilstar.bench.faults.desk import FaultDesk
+    from hilstar.bench.fault_desk import FaultDesk
     from hilstar.calibrate.first_light.image_sources import Pattern
     from hilstar.notices import Notices
     from hilstar.run.record.ledger import Ledger, LedgerSwitch

@@ -20,11 +20,11 @@ from hilstar.attitude.logs.mcap_log import NO_END, unfinished_part
 from hilstar.bench.bench_file import BenchFile, bench_file_of
 from hilstar.bench.build import open_bench
 from hilstar.bench.config import BenchConfig
-from hilstar.bench.faults.kinds import Freeze
 from hilstar.bench.frame import Bench
 from hilstar.console.overlay import Overlay, catalogue_sky, overlay_of
 from hilstar.errors import InputError, MachineError, printable
 from hilstar.files import make_directory, write_whole
+from hilstar.frame.fault_kinds import Freeze
 from hilstar.notices import Notices
 from hilstar.run.faults import Recording, read_recording
 from hilstar.run.record.ledger_reader import config_of, wrong_in_frame

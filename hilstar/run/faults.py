@@ -20,13 +20,13 @@ import msgspec
 from hilstar.attitude.wire.keys import NO_KEYS, CurveKeys
 from hilstar.attitude.wire.zmq_links import ZmqReceiver
 from hilstar.bench.config.faults import FaultSettings
-from hilstar.bench.faults.desk import FILE, Change, FaultDesk, Now, share_on
-from hilstar.bench.faults.kinds import Fault, Freeze, MeasuredMap, fault_of, table_of
-from hilstar.bench.faults.scenario import NO_SCENARIO, Scenario
-from hilstar.bench.faults.surfaces import map_sha256
-from hilstar.bench.faults.views import display_view
+from hilstar.bench.fault_desk import FILE, Change, FaultDesk, share_on
+from hilstar.bench.fault_views import display_view
 from hilstar.bench.frame import Bench
+from hilstar.bench.scenario import NO_SCENARIO, Scenario
 from hilstar.errors import InputError, printable, shortened
+from hilstar.frame.fault_kinds import Fault, Freeze, MeasuredMap, Now, fault_of, table_of
+from hilstar.frame.stray_light import map_sha256
 from hilstar.notices import Notices
 from hilstar.reading import NOT_JSON
 from hilstar.run.faulty_frames import FaultyFrames

@@ -9,11 +9,11 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 from hilstar.attitude.clock.timeline import Attitude
-from hilstar.bench.faults.desk import Now
-from hilstar.bench.faults.effects import Effects
-from hilstar.bench.faults.kinds import Freeze
-from hilstar.bench.faults.view import FaultView
 from hilstar.bench.frame import Bench, Drawn
+from hilstar.frame.fault_kinds import Freeze, Now
+from hilstar.frame.fault_light import FaultView
+from hilstar.frame.faults import FaultLayer
+from hilstar.frame.view import View
 
 
 class Source(Protocol):
@@ -42,21 +42,21 @@ class FaultyFrames:
         self._source, self._view = source, view
         self._held: Held | None = None
 
-    def at(self, t_ns: int, attitude: Attitude | None) -> Effects | None:
+    def at(self, t_ns: int, attitude: Attitude | None) -> FaultLayer | None:
         """What is wrong in a frame; None where nothing is, and before the run's first attitude, from which time counts."""
         if attitude is None and self._held is None:
             return None
         now = self.now = self._source.at(t_ns)
-        return Effects(self._view, now) if now else None
+        return FaultLayer(self._view, now) if now else None
 
-    def drops(self, effects: Effects | None, number: int) -> bool:
+    def drops(self, effects: FaultLayer | None, number: int) -> bool:
         """Whether a frame is never shown; it is counted."""
         if effects is None or self._held is None or not effects.drops(number):
             return False
         self.dropped += 1
         return True
 
-    def attitude(self, effects: Effects | None, t_ns: int, attitude: Attitude | None) -> Attitude | None:
+    def attitude(self, effects: FaultLayer | None, t_ns: int, attitude: Attitude | None) -> Attitude | None:
         """The attitude that is shown in place of a frame's own."""
         if effects is None or attitude is None:
             return attitude
@@ -65,10 +65,10 @@ class FaultyFrames:
             return None if held is None else replace(held, age_ns=max(0, held.age_ns + t_ns - self._held.t_ns))
         if effects.blank:
             return None
-        rate = None if attitude.rate_cam_rad_s is None else effects.turned_rate(attitude.rate_cam_rad_s)
-        return replace(attitude, q_icrs_to_cam=effects.turned(attitude.q_icrs_to_cam), rate_cam_rad_s=rate)
+        turned = effects.turned(View(attitude.q_icrs_to_cam, attitude.rate_cam_rad_s))
+        return replace(attitude, q_icrs_to_cam=turned.q_icrs_to_cam, rate_cam_rad_s=turned.rate_cam_rad_s)
 
-    def frozen_frame(self, effects: Effects | None, bench: Bench) -> Drawn | None:
+    def frozen_frame(self, effects: FaultLayer | None, bench: Bench) -> Drawn | None:
         """What is on the display already, for a frame that is frozen."""
         if effects is None or not effects.frozen or self._held is None:
             return None
@@ -76,7 +76,7 @@ class FaultyFrames:
         return Drawn(bench.renderer, self._held.drawn.sprites, self._held.drawn.clipped_hip)
 
     def shown(
-        self, effects: Effects | None, drawn: Drawn, attitude: Attitude | None, t_ns: int, stays: bool
+        self, effects: FaultLayer | None, drawn: Drawn, attitude: Attitude | None, t_ns: int, stays: bool
     ) -> tuple[Now, ...]:
         """Take note of a frame; its faults, which of one that `stays` are those of its light and what freezes it."""
         now = () if effects is None else effects.now

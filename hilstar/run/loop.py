@@ -16,9 +16,9 @@ from msgspec import UNSET, UnsetType
 
 from hilstar.attitude.clock.timeline import Attitude, Policy, StaleGate
 from hilstar.bench.config import AttitudeSettings
-from hilstar.bench.faults.effects import Effects
 from hilstar.bench.frame import Bench
 from hilstar.errors import MachineError
+from hilstar.frame.faults import FaultLayer
 from hilstar.notices import Notices
 from hilstar.run.faulty_frames import FaultyFrames
 from hilstar.run.pacer import AT_ONCE, ClockPacer, Moment, Pacer
@@ -111,11 +111,11 @@ class FrameLoop:
             if faults.drops(effects, number):
                 return None
             attitude, stays = faults.attitude(effects, t_ns, attitude), faults.frozen_frame(effects, self._bench)
-        sprites = None if stays is not None else self._sprites(attitude, t_ns, effects)
+        light = None if stays is not None else self._light(attitude, t_ns, effects)
         if self._gives_up(number, moment):
             return None
         self.watch.enter("draw")
-        drawn = self._bench.draw_sprites(sprites, number) if stays is None else stays
+        drawn = self._bench.draw_sprites(light, number) if stays is None else stays
         now = () if faults is None else faults.shown(effects, drawn, attitude, t_ns, stays is not None)
         presented = self.pacer.show(number, drawn, moment, begun_ns, self.watch.enter)
         if moment.starts_ns is None:
@@ -147,12 +147,12 @@ class FrameLoop:
         attitude = operator.attitude(t_ns, attitude)
         return None if stale and self._blank_when_stale and not operator.paused else attitude
 
-    def _sprites(self, attitude: Attitude | None, t_ns: int, effects: Effects | None) -> Sprites | None:
+    def _light(self, attitude: Attitude | None, t_ns: int, faults: FaultLayer | None) -> Sprites | None:
         if attitude is None:
             return None
         rate = attitude.rate_cam_rad_s if self._moving else None
-        velocity, place = attitude.velocity_km_s, attitude.place_km
-        return self._bench.frame_sprites(attitude.q_icrs_to_cam, rate, velocity, t_ns, place, effects)
+        view = self._bench.view(attitude.q_icrs_to_cam, rate, t_ns, attitude.velocity_km_s, attitude.place_km)
+        return self._bench.light(view, faults)
 
     def _gives_up(self, number: int, moment: Moment) -> bool:
         """Whether the frame's moment has passed so far that the next is begun instead.

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from hilstar.attitude.clock.timeline import Attitude
-from hilstar.bench.faults.desk import Now
 from hilstar.bench.frame import Drawn
+from hilstar.frame.fault_kinds import Now
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from hilstar.arrays import Float32Array, FloatArray, IntArray
+from hilstar.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from hilstar.errors import InputError
 
 FIELD_EDGE = 1.1  # in half images: beyond it the residual field is held constant, because its polynomials diverge
@@ -310,6 +310,18 @@ class Camera:
         """Places (count^2,) over the whole image, its edges among them."""
         x, y = np.meshgrid(*(np.linspace(-0.5, size - 0.5, count) for size in self.resolution_px))
         return x.ravel(), y.ravel()
+
+    def pixels_from(self, other: Camera, x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """This camera's pixels at pixels (n,) of another; NaN behind this camera, and beyond a lens."""
+        if other is self:
+            return np.asarray(x_px, dtype=np.float64), np.asarray(y_px, dtype=np.float64)
+        return self.project(other.rays(x_px, y_px) @ self.cam_to_image.T)
+
+    def contains_px(self, x_px: FloatArray, y_px: FloatArray) -> BoolArray:
+        """Whether places in pixels are on the image; not so at NaN."""
+        width, height = self.resolution_px
+        with np.errstate(invalid="ignore"):
+            return np.asarray((np.abs(x_px - (width - 1) / 2) <= width / 2) & (np.abs(y_px - (height - 1) / 2) <= height / 2))
 
     def in_view(self, seen: FloatArray, margin_px: float, reach_rad: float) -> IntArray:
         """Positions of the directions (n, 3) in image axes that can come within `margin_px` of the image, and some more.

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -225,6 +225,12 @@ def join_sprites(parts: Sequence[Sprites], footprint_px: int) -> Sprites:
         np.concatenate([part.x_px for part in parts]),
         np.concatenate([part.y_px for part in parts]),
     )
+
+
+def with_sprites(sprites: Sprites, parts: Sequence[Sprites]) -> Sprites:
+    """Sprites and those of `parts`, which have the same footprint, end to end; the rest stays that of the first."""
+    joined = join_sprites([sprites, *parts], sprites.footprint_px)
+    return replace(sprites, data=joined.data, star=joined.star, x_px=joined.x_px, y_px=joined.y_px)
 
 
 def clipped_sprites(

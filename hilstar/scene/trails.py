@@ -19,7 +19,7 @@ from hilstar.rotation import propagate, to_matrix
 from hilstar.scene.camera import Camera
 from hilstar.scene.extended import DiscLight, DiscView, ExtendedLight, LightMap, Pose, disc_lights
 from hilstar.scene.paths import Chords, Paths
-from hilstar.scene.sprites import Sprites, join_sprites, pack_sprites
+from hilstar.scene.sprites import Sprites, pack_sprites, with_sprites
 from hilstar.sky.bodies.disc import Disc
 
 if TYPE_CHECKING:
@@ -151,16 +151,8 @@ def sprite_counts(seen: Pass, view: TrailView, lit: Lit, brush: Brush) -> tuple[
 def with_trails(sprites: Sprites, found: Trails, first: int) -> Sprites:
     """Stars' sprites and after them those of satellites, whose places in `Stars` begin at `first`."""
     own = found.sprites
-    joined = join_sprites([sprites, replace(own, star=own.star + first)], sprites.footprint_px)
-    return replace(
-        sprites,
-        data=joined.data,
-        star=joined.star,
-        x_px=joined.x_px,
-        y_px=joined.y_px,
-        per_star=max(sprites.per_star, own.per_star),
-        capped=sprites.capped + own.capped,
-    )
+    whole = with_sprites(sprites, [replace(own, star=own.star + first)])
+    return replace(whole, per_star=max(sprites.per_star, own.per_star), capped=sprites.capped + own.capped)
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,7 +19,6 @@ import numpy as np
 
 from hilstar.arrays import FloatArray
 from hilstar.bench.build import load
-from hilstar.bench.discs import When
 from hilstar.bench.frame import Bench
 from hilstar.charts import BLUE, INK, MUTED, SERIES, capital, chart, label_ends, plain_ticks, value_bars, write_records
 from hilstar.render.renderer import Renderer, Target
@@ -181,7 +180,7 @@ def measure_cost(benches: Mapping[str, Bench], scene: BodyScene, rounds: int) ->
         t_ns = scene.aim.t_ns + k * scene.step_ns
         times.append((*frame_ms(nothing, q, None), *frame_ms(bench, q, t_ns)))
     stars = bench.draw(q, t_ns=scene.aim.t_ns).star_count
-    discs = " ".join(disc.name for disc in bench.discs(q, When(scene.aim.t_ns)))
+    discs = " ".join(disc.name for disc in bench.discs(bench.view(q, None, scene.aim.t_ns)))
     without_ms, without_cpu_ms, with_ms, with_cpu_ms = np.min(np.array(times[1:]), axis=0).tolist()
     return BodyCost(scene.name, with_ms, without_ms, with_ms - without_ms, with_cpu_ms - without_cpu_ms, discs, stars)
 

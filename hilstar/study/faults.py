@@ -13,13 +13,13 @@ import numpy as np
 
 from hilstar.arrays import FloatArray
 from hilstar.bench.build import load
-from hilstar.bench.faults.desk import FaultDesk, Now
-from hilstar.bench.faults.effects import Effects
-from hilstar.bench.faults.kinds import Fault, Freeze, fault_of
-from hilstar.bench.faults.scenario import Scenario
-from hilstar.bench.faults.views import display_view
+from hilstar.bench.fault_desk import FaultDesk
+from hilstar.bench.fault_views import display_view
 from hilstar.bench.frame import Bench
+from hilstar.bench.scenario import Scenario
 from hilstar.charts import BLUE, GREEN, INK, MUTED, chart, label_ends, write_records
+from hilstar.frame.fault_kinds import Fault, Freeze, Now, fault_of
+from hilstar.frame.faults import FaultLayer
 from hilstar.monitor.quantise import shown_light
 from hilstar.rotation import from_radec_roll_deg, propagate
 from hilstar.scene.extended import Glow
@@ -112,25 +112,25 @@ def cost_of(bench: Bench, folder: Path, case: str, rounds: int) -> FaultCost:
         now = tuple(Now(n, fault, round(k / REFRESH_HZ * NS_PER_S)) for n, fault in enumerate(ready, start=1))
 
         def plain(q: FloatArray = q) -> object:
-            return bench.draw_sprites(bench.frame_sprites(q)).levels
+            return bench.draw(q).levels
 
         def faulty(q: FloatArray = q, k: int = k, now: tuple[Now, ...] = now) -> object:
             desk.at(round(k / REFRESH_HZ * NS_PER_S))
-            return _frame(bench, q, Effects(view, now), ready)
+            return _frame(bench, q, FaultLayer(view, now), ready)
 
         times.append((_ms(plain), _ms(faulty)))
     without_ms, with_ms = np.median(np.array(times[1:]), axis=0).tolist()
     return FaultCost(bench.config.render.quantisation, case, with_ms, without_ms, with_ms - without_ms)
 
 
-def _frame(bench: Bench, q: FloatArray, effects: Effects, faults: list[Fault]) -> object:
+def _frame(bench: Bench, q: FloatArray, effects: FaultLayer, faults: list[Fault]) -> object:
     """What the frame loop does with a frame of such faults."""
     if any(isinstance(fault, Freeze) for fault in faults):
         return bench.renderer.levels()
     if effects.blank:
         return bench.draw_sprites(None).levels
-    q = effects.turned(q)
-    return bench.draw_sprites(bench.frame_sprites(q, faults=effects if effects.now else None)).levels
+    view = effects.turned(bench.view(q))
+    return bench.draw_sprites(bench.light(view, effects if effects.now else None)).levels
 
 
 def _ms(draw: Callable[[], object]) -> float:
@@ -142,7 +142,7 @@ def _ms(draw: Callable[[], object]) -> float:
 def stray_light(bench: Bench, share: float) -> Stray:
     """What the codes leave of each star's light over even stray light: with the stars, less the same without them."""
     white = bench.flux_at_white_e_per_s
-    sprites = bench.frame_sprites(FIELD)
+    sprites = bench.light(bench.view(FIELD))
     if sprites is None:
         raise AssertionError("a frame with an attitude has sprites")
     glow = Glow(np.array([0.0, 0.0, 1.0]), share * white, 100.0, 1.0, bench.camera)  # 100 rad wide: even

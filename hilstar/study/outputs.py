@@ -49,10 +49,10 @@ def run(directory: Path) -> list[str]:
 
 def _draw_scene(directory: Path, scene: OutputScene) -> str:
     with Simulator(read_bench_file(resource_path("configs", f"thesis-{scene.name}.toml"))) as simulator:
-        motion = simulator.motion(from_radec_roll_deg(*scene.radec_roll_deg), np.zeros(3))
-        clean = simulator.expose(motion, None)
+        view = simulator.view(from_radec_roll_deg(*scene.radec_roll_deg), np.zeros(3))
+        clean = simulator.expose(view, None)
         noise = FrameNoise(seed=SEED)
-        noisy = simulator.expose(motion, noise.rng())
+        noisy = simulator.expose(view, noise.rng())
         write_exposure_fits(directory / f"{scene.name}.fits", simulator, noisy, noise)
     truth = noisy.truth
     write_csv(directory / f"{scene.name}.csv", truth.dtype.names or (), truth.tolist())

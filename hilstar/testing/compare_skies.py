@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 
 from hilstar.arrays import FloatArray
-from hilstar.bench.truth import TRUTH_DTYPE
 from hilstar.errors import InputError, cannot_read
+from hilstar.frame.truth import TRUTH_DTYPE
 from hilstar.reading import read_bytes, read_text, size_text
 from hilstar.testing.sky_comparison import Limits, SkyComparison, StarDifference, common_change
 from hilstar.testing.star_fit import (

@@ -39,7 +39,7 @@ RIDGE = 1e-12  # ridge on unit columns: two equal columns share the light, where
 BLEND_SIGMAS, BLEND_PX = 1.5, 1.25
 KNOWN_STARS = 20  # the brightest, at least half of which a truth table must have
 
-# Rows of bench.truth.TRUTH_DTYPE.
+# Rows of frame.truth.TRUTH_DTYPE.
 Truth = npt.NDArray[np.void]
 
 

@@ -10,18 +10,15 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import FloatArray
-from hilstar.bench.faults.desk import Now
-from hilstar.bench.faults.effects import Effects
-from hilstar.bench.faults.kinds import CosmicRays
-from hilstar.bench.faults.timetable import Timetable
-from hilstar.bench.faults.view import FaultView
-from hilstar.bench.truth import TRUTH_DTYPE, added_truth
+from hilstar.bench.scenario import Timetable
+from hilstar.frame.fault_kinds import CosmicRays, Now
+from hilstar.frame.fault_light import FaultView
+from hilstar.frame.faults import FaultLayer
+from hilstar.frame.truth import TRUTH_DTYPE, added_truth
+from hilstar.frame.view import STILL, View
 from hilstar.rotation import propagate
-from hilstar.scene.camera import Camera
-from hilstar.scene.exposure_motion import Motion, smeared_sprites
 from hilstar.scene.frame_motion import Scan
 from hilstar.scene.sprites import Sprites, join_sprites
-from hilstar.sky.stars import Stars
 from hilstar.units import NS_PER_S
 
 # The attitude at a time of the run, ns.
@@ -29,80 +26,75 @@ AttitudeAt = Callable[[int], FloatArray]
 
 
 @dataclass(frozen=True, slots=True)
-class Piece:
-    """A part of an exposure in which the same faults are on: its own motion, and what is on when it begins."""
+class ExposurePiece:
+    """A part of an exposure in which the same faults are on: its own view, and what is on when it begins."""
 
-    motion: Motion
+    view: View
     now: tuple[Now, ...]
 
 
-def pieces_of(motion: Motion, run_ns: int, timetable: Timetable, attitude_at: AttitudeAt | None = None) -> tuple[Piece, ...]:
+def pieces_of(
+    view: View, run_ns: int, timetable: Timetable, attitude_at: AttitudeAt | None = None
+) -> tuple[ExposurePiece, ...]:
     """The pieces of an exposure whose middle is at `run_ns` of a scenario.
 
-    `attitude_at` says where a display that stands still has stopped; by default it had the exposure's own rate.
+    `attitude_at` gives the attitude at which a display that stands still has stopped; by default it had the exposure's rate.
     """
+    rate = view.turn.rate_cam_rad_s
 
     def at_constant_rate(t_ns: int) -> FloatArray:
         if t_ns == run_ns:
-            return motion.q_icrs_to_cam
-        return propagate(motion.q_icrs_to_cam, motion.rate_cam_rad_s, (t_ns - run_ns) / NS_PER_S)
+            return view.q_icrs_to_cam
+        return propagate(view.q_icrs_to_cam, rate, (t_ns - run_ns) / NS_PER_S)
 
     where = attitude_at or at_constant_rate
-    half_ns = round(motion.exposure_s * NS_PER_S / 2)
+    half_ns = round(view.exposure_s * NS_PER_S / 2)
     edges = timetable.edges_ns(run_ns - half_ns, run_ns + half_ns)
     found = []
     for begin_ns, end_ns in itertools.pairwise(edges):
         middle_ns = (begin_ns + end_ns) // 2
         since_ns, now = timetable.stands_since_ns(middle_ns), timetable.on(middle_ns, begin_ns)
-        q, rate = at_constant_rate(middle_ns), motion.rate_cam_rad_s
-        if since_ns is not None:
-            q, rate = where(since_ns), np.zeros(3)
-        t_ns = None if motion.t_ns is None else motion.t_ns + middle_ns - run_ns
-        found.append(Piece(Motion(q, rate, (end_ns - begin_ns) / NS_PER_S, t_ns), now))
+        part = replace(
+            view,
+            q_icrs_to_cam=at_constant_rate(middle_ns) if since_ns is None else where(since_ns),
+            rate_cam_rad_s=rate if since_ns is None else STILL,
+            t_ns=None if view.t_ns is None else view.t_ns + middle_ns - run_ns,
+            scan=Scan(hold_s=(end_ns - begin_ns) / NS_PER_S),
+        )
+        found.append(ExposurePiece(part, now))
     return tuple(found)
-
-
-@dataclass(frozen=True, slots=True)
-class Lens:
-    """What draws on a tracker's detector: its camera, the footprint and the sigmas of its PSF."""
-
-    camera: Camera
-    footprint_px: int
-    sigma_px: tuple[float, float]
 
 
 class FaultyExposure:
     """One exposure with its faults, as `Simulator.expose` draws it, piece by piece."""
 
-    def __init__(self, view: FaultView, pieces: Sequence[Piece]) -> None:
+    def __init__(self, view: FaultView, pieces: Sequence[ExposurePiece]) -> None:
         self._view, self.pieces = view, pieces
         self._seen: list[Sprites] = []
         self._rows: list[tuple[npt.NDArray[np.void], float]] = []
 
     def light_e(
-        self, stars: Stars, lens: Lens, sprites_of: Callable[[Motion], Sprites], linear: Callable[[Sprites], FloatArray]
+        self, light_of: Callable[[View, FaultLayer], Sprites], linear: Callable[[Sprites], FloatArray]
     ) -> tuple[FloatArray, float]:
         """Electrons (h, w) of the whole exposure, and the seconds of it in which the field is not blank.
 
-        `sprites_of` makes the sprites of `stars` in a motion, `linear` the image of sprites.
+        `light_of` makes the light of a view with faults, `linear` its image, electrons per second.
         """
         total: FloatArray | None = None
         open_s = 0.0
-        exposure_s = sum(piece.motion.exposure_s for piece in self.pieces)
+        exposure_s = sum(piece.view.exposure_s for piece in self.pieces)
         for piece in self.pieces:
-            effects, motion = Effects(self._view, piece.now), piece.motion
-            q, rate = effects.turned(motion.q_icrs_to_cam), effects.turned_rate(motion.rate_cam_rad_s)
-            motion = replace(motion, q_icrs_to_cam=q, rate_cam_rad_s=rate)
-            sprites = effects.over(sprites_of(motion), stars, q, _drawer(motion, lens), Scan(hold_s=motion.exposure_s))
-            light = linear(sprites) * motion.exposure_s
+            layer, piece_s = FaultLayer(self._view, piece.now), piece.view.exposure_s
+            sprites = light_of(layer.turned(piece.view), layer)
+            light = linear(sprites) * piece_s
             total = light if total is None else total + light
-            open_s += 0.0 if effects.blank else motion.exposure_s
-            self._note(sprites, effects, motion.exposure_s / exposure_s)
+            open_s += 0.0 if layer.blank else piece_s
+            self._note(sprites, piece_s / exposure_s)
         if total is None:
             raise AssertionError("an exposure has a piece")
         return total, open_s
 
-    def _note(self, sprites: Sprites, effects: Effects, share: float) -> None:
+    def _note(self, sprites: Sprites, share: float) -> None:
         self._seen.append(sprites)
         if sprites.added:
             self._rows.append((added_truth(sprites, np.zeros(len(sprites), dtype=bool)), share))
@@ -141,15 +133,11 @@ class FaultyExposure:
 
 
 def _merge(into: npt.NDArray[np.void], row: npt.NDArray[np.void]) -> None:
-    """Add the light of a point in another piece of the exposure."""
+    """Add the light of the same point in another piece of the exposure."""
     before, more = float(into["electrons_per_s"]), float(row["electrons_per_s"])
     for place in ("x_px", "y_px"):
         into[place] = (into[place] * before + row[place] * more) / (before + more)
     into["electrons_per_s"] = before + more
-
-
-def _drawer(motion: Motion, lens: Lens) -> Callable[[Stars], Sprites]:
-    return lambda few: smeared_sprites(few, motion, lens.camera, lens.footprint_px, lens.sigma_px)
 
 
 def _own(sprites: Sprites) -> Sprites:

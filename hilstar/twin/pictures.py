@@ -17,15 +17,14 @@ import numpy.typing as npt
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.config import BenchConfig
-from hilstar.bench.faults.desk import Now
-from hilstar.bench.faults.kinds import Drop, Freeze
-from hilstar.bench.faults.scenario import NO_SCENARIO, Scenario
 from hilstar.bench.frame import Bench
 from hilstar.bench.frame_files import sky_header, write_fits
+from hilstar.bench.scenario import NO_SCENARIO, Scenario
 from hilstar.files import written
+from hilstar.frame.fault_kinds import Drop, Freeze, Now
+from hilstar.frame.view import STILL, View
 from hilstar.scene.camera import Camera
-from hilstar.scene.exposure_motion import Motion
-from hilstar.twin.faulty_exposure import FaultyExposure, Piece
+from hilstar.twin.faulty_exposure import ExposurePiece, FaultyExposure
 from hilstar.twin.simulator import Exposure, FrameNoise, Simulator, simulator_view
 
 BOX_PX = 5  # side of the square over which a star's light is summed: where the middle is full, the wings still grow
@@ -86,11 +85,11 @@ def write_exposure_fits(path: Path, simulator: Imager, exposure: Exposure, noise
     from astropy.io import fits
 
     tracker = simulator.config.tracker
-    epoch_jyear, q = simulator.config.sky.epoch_jyear, exposure.motion.q_icrs_to_cam
+    epoch_jyear, q = simulator.config.sky.epoch_jyear, exposure.view.q_icrs_to_cam
     header = sky_header(simulator.file.sha256, epoch_jyear, q, simulator.camera)
     header["BUNIT"] = ("adu", "digital numbers (DN)")
     header["EXPTIME"] = (tracker.exposure_s, "[s]")
-    for name, rate in zip(("RATEX", "RATEY", "RATEZ"), np.degrees(exposure.motion.rate_cam_rad_s), strict=True):
+    for name, rate in zip(("RATEX", "RATEY", "RATEZ"), np.degrees(exposure.view.turn.rate_cam_rad_s), strict=True):
         header[name] = (float(rate), "[deg/s] of cam in icrs, cam components")
     header["NOISE"] = (noise.kind, "full, or none: the mean signal through the ADC")
     header["SEED"] = (noise.seed, "of the frame's noise")
@@ -132,27 +131,26 @@ class TrackerPictures:
         self._simulator = Simulator(bench.file, bench.renderer.context)
         self._noise, self._count = FrameNoise("full"), 0
         self._now = now
-        self._stood: Motion | None = None
+        self._stood: View | None = None
         self._view = simulator_view(self._simulator, scenario)
 
     def __call__(self, sample: AttitudeSample) -> bytes:
         """The picture of the tracker at an attitude."""
-        rate = np.zeros(3) if sample.rate_cam_rad_s is None else sample.rate_cam_rad_s
-        motion = self._simulator.motion(sample.q_icrs_to_cam, rate, sample.t_ns)
-        faults = self._faults(motion)
-        rng = self._noise.rng(self._count)
-        exposure = self._simulator.expose(motion, rng, sample.velocity_km_s, sample.place_km, faults)
+        rate = STILL if sample.rate_cam_rad_s is None else sample.rate_cam_rad_s
+        view = self._simulator.view(sample.q_icrs_to_cam, rate, sample.t_ns, sample.velocity_km_s, sample.place_km)
+        exposure = self._simulator.expose(view, self._noise.rng(self._count), self._faults(view))
         self._count += 1
         return dn_png(exposure.dn, self._simulator.config.tracker.detector.bits)
 
-    def _faults(self, motion: Motion) -> FaultyExposure | None:
+    def _faults(self, view: View) -> FaultyExposure | None:
         """The exposure with the faults of the display's frame; where that stands still, at the attitude at which it does."""
         now = self._now()
         if not any(isinstance(one.fault, Freeze | Drop) for one in now):
-            self._stood = motion
+            self._stood = view
         elif self._stood is not None:
-            motion = replace(self._stood, rate_cam_rad_s=np.zeros(3))
-        return FaultyExposure(self._view, (Piece(motion, now),)) if now else None
+            stood = self._stood
+            view = replace(view, q_icrs_to_cam=stood.q_icrs_to_cam, rate_cam_rad_s=STILL, t_ns=stood.t_ns)
+        return FaultyExposure(self._view, (ExposurePiece(view, now),)) if now else None
 
 
 def dn_png(dn: npt.NDArray[np.uint16], bits: int) -> bytes:

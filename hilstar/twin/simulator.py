@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Literal, Protocol, Self
+from typing import Literal, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -14,31 +14,27 @@ from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import bench_moving, bench_optics, bench_stars, moved
 from hilstar.bench.cameras import tracker_camera
-from hilstar.bench.config import BenchConfig
-from hilstar.bench.discs import DiscPainter, When, disc_stars
-from hilstar.bench.faults.scenario import Scenario
-from hilstar.bench.faults.view import FaultView
-from hilstar.bench.faults.views import tracker_view
-from hilstar.bench.satellites import EXPOSURE_POSES, EXPOSURE_SPRITES, Shot, with_satellites
-from hilstar.bench.truth import truth_table
+from hilstar.bench.config import BenchConfig, Tracker
+from hilstar.bench.fault_views import tracker_view
+from hilstar.bench.scenario import Scenario
 from hilstar.errors import InputError
+from hilstar.frame.bodies import disc_stars
+from hilstar.frame.fault_light import FaultView
+from hilstar.frame.layers import light_of, seen_in, sky_layers
+from hilstar.frame.truth import truth_table
+from hilstar.frame.view import Canvas, View
 from hilstar.render.context import Context, create_context
 from hilstar.render.renderer import Renderer, Target
 from hilstar.scene.camera import Camera
-from hilstar.scene.exposure_motion import MIDDLE_S, Motion, smeared_sprites
-from hilstar.scene.frame_motion import Scan, Turn
+from hilstar.scene.exposure_motion import MIDDLE_S
 from hilstar.scene.psf import footprint_px
 from hilstar.scene.sprites import Sprites
-from hilstar.scene.trails import Brush
 from hilstar.sky.electrons import Photometry, zodiacal_electrons_per_s_arcsec2
 from hilstar.sky.stars import Stars
 from hilstar.tracker.detector import Detector
 from hilstar.tracker.settings import MAX_E, DetectorSettings
-from hilstar.twin.faulty_exposure import FaultyExposure, Lens
+from hilstar.twin.faulty_exposure import FaultyExposure
 from hilstar.units import ARCSEC_PER_RAD
-
-if TYPE_CHECKING:
-    from hilstar.sky.bodies.moving import MovingSky
 
 BODY_MAX_E = 0.5 * MAX_E  # room for dark current and cosmic rays
 Noise = Literal["full", "none"]
@@ -64,7 +60,7 @@ class Exposure:
     `clipped` stars reach full well or the ADC's last code. `capped` stars have paths coarser than they should be.
     """
 
-    motion: Motion
+    view: View
     dn: npt.NDArray[np.uint16]
     mean_e: FloatArray
     truth: npt.NDArray[np.void]
@@ -93,6 +89,7 @@ class Simulator:
     def _load_tracker(self) -> None:
         tracker = self.config.tracker
         self.camera = tracker_camera(tracker, self.file.folder)
+        self.canvas = detector_canvas(tracker, self.camera)
         self.background_e = background_e(self.config, self.file.folder)
         self.detector = Detector(tracker.detector, tracker.resolution_px, tracker.pixel_pitch_um)
 
@@ -118,48 +115,36 @@ class Simulator:
         """The name of the GL renderer, as the driver gives it."""
         return self.renderer.gl_renderer
 
-    def motion(self, q_icrs_to_cam: FloatArray, rate_cam_rad_s: FloatArray, t_ns: int | None = None) -> Motion:
-        """An exposure of this tracker, by the attitude in its middle (unit quaternion) and a constant rate."""
-        return Motion(q_icrs_to_cam, rate_cam_rad_s, self.config.tracker.exposure_s, t_ns)
-
-    def expose(
+    def view(
         self,
-        motion: Motion,
-        rng: np.random.Generator | None,
+        q_icrs_to_cam: FloatArray,
+        rate_cam_rad_s: FloatArray,
+        t_ns: int | None = None,
         velocity_km_s: FloatArray | None = None,
         place_km: FloatArray | None = None,
-        faults: FaultyExposure | None = None,
-    ) -> Exposure:
-        """One frame; without a generator, without noise. Raises InputError for what a detector cannot take.
+    ) -> View:
+        """An exposure of this tracker, by the attitude in its middle (unit quaternion) and a constant rate (see `View`)."""
+        return View.exposure(q_icrs_to_cam, rate_cam_rad_s, self.config.tracker.exposure_s, t_ns, velocity_km_s, place_km)
 
-        A velocity (3,), ICRS, is that of an observer against the one of `[sky] observer_velocity_km_s`, a place (3,) its own
-        about the Earth's centre.
-        """
-        tracker = self.config.tracker
-        stars = self.stars.seen_at(velocity_km_s)
-        if self.moving is not None:
-            stars = self.moving.seen(self.stars, motion.t_ns, velocity_km_s, place_km)
-
-        def sprites_of(part: Motion) -> Sprites:
-            found = smeared_sprites(stars, part, self.camera, self.renderer.footprint_px, tracker.psf_sigma_px)
-            found = with_discs(self, self.moving, found, stars, part, When(part.t_ns, velocity_km_s, place_km))
-            return with_streaks(self, self.moving, found, stars, part, When(part.t_ns, velocity_km_s, place_km))
-
+    def expose(self, view: View, rng: np.random.Generator | None, faults: FaultyExposure | None = None) -> Exposure:
+        """One frame; without a generator, without noise. Raises InputError for what a detector cannot take."""
+        exposure_s, canvas = self.config.tracker.exposure_s, self.canvas
+        stars = seen_in(view, self.stars, self.moving)
+        layers = sky_layers(canvas, self.moving)
         if faults is None:
-            sprites = sprites_of(motion)
-            mean_e = self._linear(sprites) * tracker.exposure_s + self.background_e
+            light = light_of(canvas, layers, stars, view)
+            mean_e = self._linear(light) * exposure_s + self.background_e
         else:
-            lens = Lens(self.camera, self.renderer.footprint_px, tracker.psf_sigma_px)
-            mean_e, open_s = faults.light_e(stars, lens, sprites_of, self._linear)
-            mean_e += self.background_e * (open_s / tracker.exposure_s)
-            sprites = faults.sprites()
+            mean_e, open_s = faults.light_e(lambda part, layer: light_of(canvas, (*layers, layer), stars, part), self._linear)
+            mean_e += self.background_e * (open_s / exposure_s)
+            light = faults.sprites()
         if self.moving is not None:  # the Sun has more than a detector can be asked for; its wells are full long before
             mean_e = np.minimum(mean_e, BODY_MAX_E)
-        dn, truth = self._digitised(mean_e, rng), exposure_truth(self, motion, stars, sprites, mean_e)
+        dn, truth = self._digitised(mean_e, rng), exposure_truth(canvas, view, stars, light, mean_e)
         if faults is None:
-            return Exposure(motion, dn, mean_e, truth, sprites.capped)
+            return Exposure(view, dn, mean_e, truth, light.capped)
         truth = np.concatenate([truth, faults.added_truth()])
-        return Exposure(motion, dn, mean_e, truth, sprites.capped, faults.names)
+        return Exposure(view, dn, mean_e, truth, light.capped, faults.names)
 
     def _digitised(self, mean_e: FloatArray, rng: np.random.Generator | None) -> npt.NDArray[np.uint16]:
         exposure_s = self.config.tracker.exposure_s
@@ -185,55 +170,28 @@ class Simulator:
 
 def simulator_view(simulator: Simulator, scenario: Scenario) -> FaultView:
     """The faults of a scenario as a simulator's tracker sees them."""
-    footprint_px = simulator.renderer.footprint_px
-    return tracker_view(simulator.file, simulator.camera, footprint_px, simulator.stars, simulator.moving, scenario)
+    return tracker_view(simulator.file, simulator.canvas, simulator.stars, simulator.moving, scenario)
 
 
-class Looking(Protocol):
-    """A tracker as a truth table needs it."""
+def detector_canvas(tracker: Tracker, camera: Camera) -> Canvas:
+    """The detector of a tracker as layers draw on it."""
+    sigma_px = tracker.psf_sigma_px
+    return Canvas(camera, footprint_px(sigma_px), sigma_px, full_e=full_e(tracker.detector))
 
-    config: BenchConfig
-    camera: Camera
 
-
-def exposure_truth(
-    tracker: Looking, motion: Motion, stars: Stars, sprites: Sprites, mean_e: FloatArray
-) -> npt.NDArray[np.void]:
-    """The truth of an exposure (see `Exposure`) with those of `stars` that have sprites, and the discs."""
-    star = np.append(np.unique(sprites.star), disc_stars(stars, sprites.discs))
-    x_px, y_px = tracker.camera.project(stars.directions(star) @ motion.icrs_to_image(MIDDLE_S, tracker.camera)[0].T)
+def exposure_truth(canvas: Canvas, view: View, stars: Stars, light: Sprites, mean_e: FloatArray) -> npt.NDArray[np.void]:
+    """The truth of an exposure (see `Exposure`): a row for each of `stars` that has a sprite in its light, and for discs."""
+    star = np.append(np.unique(light.star), disc_stars(stars, light.discs))
+    icrs_to_image = view.motion.icrs_to_image(MIDDLE_S, canvas.camera)[0]
+    x_px, y_px = canvas.camera.project(stars.directions(star) @ icrs_to_image.T)
     truth = truth_table(stars, star, x_px, y_px)
     height, width = mean_e.shape
     inside = np.isfinite(x_px) & (np.rint(x_px) >= 0) & (np.rint(x_px) < width)
     inside &= (np.rint(y_px) >= 0) & (np.rint(y_px) < height)
     place = np.rint(y_px[inside]).astype(np.intp), np.rint(x_px[inside]).astype(np.intp)
-    truth["clipped"][inside] = mean_e[place] > full_e(tracker.config.tracker.detector)
-    truth["clipped"] |= np.isin(truth["name"], sprites.over_white)
+    truth["clipped"][inside] = mean_e[place] > canvas.full_e
+    truth["clipped"] |= np.isin(truth["name"], light.over_white)
     return truth[np.argsort(truth["v_mag"], kind="stable")]
-
-
-def with_discs(
-    tracker: Looking, moving: MovingSky | None, sprites: Sprites, stars: Stars, motion: Motion, when: When
-) -> Sprites:
-    """The sprites of an exposure's `stars` without what discs of the moving sky hide, and with the discs' mean light."""
-    if moving is None or not moving.names:
-        return sprites
-    sigma_px, white_e_per_s = tracker.config.tracker.psf_sigma_px, full_e(tracker.config.tracker.detector) / motion.exposure_s
-    painter = DiscPainter(moving, tracker.camera, footprint_px(sigma_px), sigma_px, white_e_per_s=white_e_per_s)
-    return painter.exposed(sprites, stars, motion, when)
-
-
-def with_streaks(
-    tracker: Looking, moving: MovingSky | None, sprites: Sprites, stars: Stars, motion: Motion, when: When
-) -> Sprites:
-    """The sprites of an exposure and those of satellites, each along its path over the exposure."""
-    settings = tracker.config.tracker
-    scan, turn = Scan(hold_s=motion.exposure_s), Turn(motion.q_icrs_to_cam, motion.rate_cam_rad_s)
-    shot = Shot(tracker.camera, scan, turn, when.t_ns, when.velocity_km_s, when.place_km)
-    white_e_per_s = full_e(settings.detector) / (motion.exposure_s or 1.0)
-    shot = replace(shot, begin_s=-motion.exposure_s / 2, white_e_per_s=white_e_per_s)
-    brush = Brush(footprint_px(settings.psf_sigma_px), settings.psf_sigma_px, EXPOSURE_SPRITES, EXPOSURE_POSES)
-    return with_satellites(sprites, stars, moving, shot, brush)
 
 
 def full_e(detector: DetectorSettings) -> float:

@@ -104,7 +104,7 @@ def test_stars_of_a_frame_stand_where_erfa_sees_them_from_a_spacecraft_about_the
     q = from_radec_roll_deg(200.0, 35.0, 10.0)
     rotation = bench.camera.cam_to_image @ to_matrix(q)
     for velocity_km_s in (orbit_km_s, -orbit_km_s):
-        sprites = bench.frame_sprites(q, None, velocity_km_s)
+        sprites = bench.light(bench.view(q, velocity_km_s=velocity_km_s))
         assert sprites is not None
         rows = {int(hip): row for row, hip in enumerate(still.shown_stars.hip)}
         natural = np.array([still.shown_stars.vectors[rows[int(hip)]] for hip in bench.shown_stars.hip[sprites.star]])
@@ -114,7 +114,7 @@ def test_stars_of_a_frame_stand_where_erfa_sees_them_from_a_spacecraft_about_the
         assert len(sprites) > 30
         assert np.hypot(x_px - sprites.x_px, y_px - sprites.y_px).max() < ORBIT_LIMIT_PX
     # The orbit's own 5 arcsec are 0.025 px.
-    plain = bench.frame_sprites(q)
+    plain = bench.light(bench.view(q))
     assert plain is not None
     assert np.abs(plain.x_px[:30] - sprites.x_px[:30]).max() > 0.01
 
@@ -123,7 +123,7 @@ def test_a_spacecraft_s_velocity_joins_that_of_the_earth_by_the_ephemeris(bench_
     """As Basilisk's does about the Earth: from its centre, and from there aberrated once more."""
     bench = bench_with('[sky]\nepoch_utc = "2026-11-21T00:00:00Z"\n[spacecraft]\norbit = "geocentre"\n')
     velocity_km_s, q = np.array([3.0, -6.5, 2.5]), from_radec_roll_deg(200.0, 35.0, 10.0)
-    sprites = bench.frame_sprites(q, None, velocity_km_s)
+    sprites = bench.light(bench.view(q, velocity_km_s=velocity_km_s))
     assert sprites is not None
     beta = velocity_km_s / LIGHT_KM_S
     seen = erfa.ab(bench.shown_stars.vectors[sprites.star], beta, FAR_FROM_THE_SUN_AU, np.sqrt(1 - beta @ beta))

@@ -56,7 +56,7 @@ def test_twenty_random_stars_on_random_benches_are_right_in_absolute_electrons(t
         (tmp_path / "bench.toml").write_text(text + '[sky]\nspectrum = "blackbody"\nfaintest_v_mag = 8.0\n')
         with Simulator(read_bench_file(tmp_path / "bench.toml")) as simulator:
             q = from_radec_roll_deg(*rng.uniform([0, -80, 0], [360, 80, 360]))
-            star = simulator.expose(simulator.motion(q, np.zeros(3)), None).truth
+            star = simulator.expose(simulator.view(q, np.zeros(3)), None).truth
         row = star[rng.integers(len(star))] if len(star) else None
         assert row is not None, f"bench {number} saw no star"
         temperature = 4600 * (1 / (0.92 * row["bv"] + 1.7) + 1 / (0.92 * row["bv"] + 0.62))
@@ -67,7 +67,7 @@ def test_twenty_random_stars_on_random_benches_are_right_in_absolute_electrons(t
 def test_a_v_0_a0_star_gives_its_electrons_to_the_image():
     """Through the thesis's bench, by quadrature, and as the sum of the image's pixels."""
     with Simulator(read_bench_file(ROOT / "configs" / "thesis-lyra.toml")) as simulator:
-        vega = simulator.motion(from_radec_roll_deg(279.2347, 38.7837, 0.0), np.zeros(3))
+        vega = simulator.view(from_radec_roll_deg(279.2347, 38.7837, 0.0), np.zeros(3))
         exposure = simulator.expose(vega, None)
         star = exposure.truth[exposure.truth["hip"] == 91262][0]  # V = 0.03, B-V = -0.001
         glass = read("n-bk7-10mm")
@@ -92,12 +92,12 @@ def test_a_v_0_a0_star_gives_its_electrons_to_the_image():
 @pytest.mark.parametrize("rate_deg_s", [(0.0, 0.0, 0.0), (0.05, -0.02, 0.2)])
 def test_the_gpu_and_the_oracle_agree_to_float32(rate_deg_s):
     with Simulator(read_bench_file(ROOT / "configs" / "thesis-orion.toml")) as simulator:
-        motion = simulator.motion(from_radec_roll_deg(84.057, -1.2, 0.0), np.radians(rate_deg_s))
+        view = simulator.view(from_radec_roll_deg(84.057, -1.2, 0.0), np.radians(rate_deg_s))
         tracker = simulator.config.tracker
         size = simulator.renderer.footprint_px
-        sprites = smeared_sprites(simulator.stars, motion, simulator.camera, size, tracker.psf_sigma_px)
+        sprites = smeared_sprites(simulator.stars, view.motion, simulator.camera, size, tracker.psf_sigma_px)
         oracle_e = linear_image(sprites, tracker.resolution_px, tracker.psf_sigma_px) * tracker.exposure_s
-        gpu_e = simulator.expose(motion, None).mean_e - simulator.background_e
+        gpu_e = simulator.expose(view, None).mean_e - simulator.background_e
         assert np.abs(gpu_e - oracle_e).max() / (simulator.stars.electrons_per_s.max() * tracker.exposure_s) < FLOAT32
         assert gpu_e.sum() == pytest.approx(oracle_e.sum(), rel=1e-6)
 

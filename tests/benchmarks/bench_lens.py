@@ -39,7 +39,7 @@ def with_lens(bench: Bench) -> Bench:
 def times_ms(bench: Bench, q: FloatArray, number: int, rate: FloatArray | None) -> tuple[float, float, int]:
     """The time of a frame's sprites, of the whole frame, and the number of the sprites."""
     begin = time.perf_counter()
-    sprites = bench.frame_sprites(q, rate)
+    sprites = bench.light(bench.view(q, rate))
     made = time.perf_counter()
     drawn = bench.draw_sprites(sprites, number)
     _ = drawn.levels

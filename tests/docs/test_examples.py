@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 from hilstar.bench.config import read_config
-from hilstar.bench.faults.scenario import parse_scenario
+from hilstar.bench.scenario import parse_scenario
 from hilstar.campaign.plan import parse_plan
 from hilstar.cli.app import app
 from hilstar.cli.parsers import with_values

@@ -12,9 +12,11 @@ from skyfield.api import Star
 
 from hilstar.bench.bench_file import read_bench_file
 from hilstar.bench.build import load
-from hilstar.bench.discs import DiscPainter, When
 from hilstar.bench.frame import Bench
-from hilstar.bench.in_view import brightest_in_view
+from hilstar.frame.bodies import BodyLayer
+from hilstar.frame.layers import light_of, sky_layers
+from hilstar.frame.truth import brightest_in_view
+from hilstar.frame.view import Canvas, View
 from hilstar.monitor.quantise import dither_levels, mask_turn, round_levels
 from hilstar.monitor.response import srgb_response
 from hilstar.render.extended import ExtendedLayer, disc_tiles
@@ -23,7 +25,7 @@ from hilstar.render.renderer import Renderer, Target
 from hilstar.rotation import from_radec_roll_deg
 from hilstar.scene.camera import Camera, Lens
 from hilstar.scene.extended import DiscLight, DiscView, LightMap, Pose, Shear, disc_lights
-from hilstar.scene.frame_motion import Scan, Turn
+from hilstar.scene.frame_motion import Scan
 from hilstar.sky.bodies.disc import Disc
 from hilstar.twin.verify.measure import Comparison
 from hilstar.twin.verify.twin import Twin
@@ -33,12 +35,12 @@ from tests.support.stars import sprites_at
 
 # The Moon before the Beehive.
 NIGHT, BEEHIVE = "2026-11-29T00:00:00Z", (42485, 42516, 42523, 42549, 42578)
+AT_START = View(np.array([1.0, 0.0, 0.0, 0.0]))
 SIZE, SIGMA, WHITE = (96, 80), (0.85, 0.85), 4e5
 CAMERA = Camera(SIZE, 900.0, (47.5, 39.5), np.eye(3))
 LENS = Lens(radial=(0.2, 0.05, 0.0), tangential=(1e-3, -2e-3))
 # The reference's own rays, five across a pixel, leave 0.3 % of a small crescent's light and 3 % of its brightest pixel.
 FLUX_LIMIT, PIXEL_LIMIT = 0.01, 0.05
-NOW = When()
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +55,8 @@ def bench(tmp_path_factory) -> Iterator[Bench]:
 
 def aim(bench: Bench, name: str, off_deg: float = 0.0) -> np.ndarray:
     """The attitude with a body that far above the middle."""
-    vector = bench.seen(bench.stars).vectors[len(bench.stars) - len(bench.stars.bodies) + bench.stars.bodies.index(name)]
+    stars = bench.seen(bench.stars, AT_START)
+    vector = stars.vectors[len(stars) - len(stars.bodies) + stars.bodies.index(name)]
     ra, dec = np.degrees(np.arctan2(vector[1], vector[0])), np.degrees(np.arcsin(vector[2]))
     return from_radec_roll_deg(ra, dec - off_deg, 0.0)
 
@@ -88,16 +91,16 @@ def test_stars_behind_the_moon_are_neither_drawn_nor_in_the_table(bench):
     assert shot.truth["name"][0] == "Moon"
     assert shot.linear.sum() == pytest.approx(shot.truth["electrons_per_s"].sum(), rel=FLUX_LIMIT)
     assert bench.losses_mag(shot)["Moon"] > 3
-    stars = bench.seen(bench.stars)
-    through = DiscPainter(bench.moving, bench.camera, 1, SIGMA).seen_through(stars, q, NOW)
-    found = brightest_in_view(stars, bench.camera, q, 500, through)
-    assert {star.hip for star in found} & set(BEEHIVE) == set()
-    assert {star.hip for star in brightest_in_view(stars, bench.camera, q, 500)} & set(BEEHIVE) == set(BEEHIVE)
+    view, canvas = View(q), Canvas(bench.camera, 1, SIGMA)
+    stars, layers = bench.seen(bench.stars, view), sky_layers(canvas, bench.moving)
+    for seen, behind in ((layers, set()), (layers[:1], set(BEEHIVE))):
+        found = brightest_in_view(light_of(canvas, seen, stars, view), stars, bench.camera, q, 500)
+        assert {star.hip for star in found} & set(BEEHIVE) == behind
 
 
 def test_the_moon_a_degree_beside_the_field_changes_nothing_and_half_of_it_is_half(bench):
     half_deg = np.degrees(np.arctan(bench.camera.resolution_px[1] / 2 / bench.camera.focal_length_px))
-    beside = bench.frame_sprites(aim(bench, "Moon", half_deg + 1.0))
+    beside = bench.light(bench.view(aim(bench, "Moon", half_deg + 1.0)))
     assert beside.extended == () and beside.over_white == ()
     whole, half = (bench.frame(aim(bench, "Moon", off)) for off in (0.0, half_deg))
     named = {row["name"]: row for row in half.truth}
@@ -114,8 +117,8 @@ def test_the_sun_in_the_field_is_white_finite_and_told_and_stars_keep_their_ligh
     row = shot.truth[shot.truth["name"] == "Sun"][0]
     assert row["clipped"] and bench.losses_mag(shot)["Sun"] > 15
     assert "Sun" in bench.draw(q).clipped_hip
-    sprites = bench.frame_sprites(q)
-    points = bench.sprites(q, bench.seen(bench.shown_stars))
+    sprites = bench.light(bench.view(q))
+    points = bench.sprites(q, bench.seen(bench.shown_stars, View(q)))
     kept = np.isin(points.star, sprites.star)
     assert len(sprites) > 10 and np.array_equal(sprites.data, points.data[kept])
 
@@ -138,25 +141,25 @@ def test_a_disc_that_others_hide_as_a_whole_is_none():
     """The Sun in a total eclipse is neither drawn nor listed, and comes back at its last contact."""
     moon = disc(20.0, 170.0, (45.0, 41.0))
     for sun, seen in ((disc(19.0, 0.0, (45.5, 41.0), "Sun"), 1), (disc(19.0, 0.0, (47.0, 41.0), "Sun"), 2)):
-        painter = DiscPainter(SimpleNamespace(discs=lambda *_, sun=sun: [moon, sun]), CAMERA, 10, SIGMA)
-        assert len(painter.on_image(np.array([1.0, 0.0, 0.0, 0.0]), NOW)) == seen
+        layer = BodyLayer(SimpleNamespace(discs=lambda *_, sun=sun: [moon, sun]), Canvas(CAMERA, 10, SIGMA))
+        assert len(layer.on_image(AT_START)) == seen
 
 
 def test_a_point_behind_a_disc_is_gone_and_one_before_it_stays(bench):
     q = aim(bench, "Moon")
-    painter = DiscPainter(bench.moving, bench.camera, bench.renderer.footprint_px, SIGMA)
-    stars = bench.seen(bench.shown_stars)
+    layer = BodyLayer(bench.moving, Canvas(bench.camera, bench.renderer.footprint_px, SIGMA))
+    stars = bench.seen(bench.shown_stars, View(q))
     points = bench.sprites(q, stars)
     first = len(stars) - len(bench.moving.names)
     moon = int(np.flatnonzero(points.star == first + bench.moving.names.index("Moon"))[0])
-    (face,) = painter.on_image(q, NOW)
+    (face,) = layer.on_image(View(q))
     jupiter = first + bench.moving.names.index("Jupiter")
     behind = replace(points, star=np.where(np.arange(len(points)) == moon, jupiter, points.star))
     stars.vectors[jupiter] = face.direction
-    kept = painter.unhidden(behind, stars, [face], NOW).star
+    kept = layer.unhidden(behind, stars, [face], View(q)).star
     assert jupiter not in kept
     nearer = replace(face, distance_km=1e12)
-    assert jupiter in painter.unhidden(behind, stars, [nearer], NOW).star
+    assert jupiter in layer.unhidden(behind, stars, [nearer], View(q)).star
 
 
 @pytest.mark.parametrize("radius_px", [3.0, 25.0])
@@ -247,14 +250,12 @@ def test_a_disc_under_a_turn_keeps_its_light_and_lies_along_the_way_of_its_star(
     """A turn of 3 degrees/s, 17 ms for a row: 0.9 px of this screen; a star at the Moon's middle is the truth for its place."""
     q, rate = aim(bench, "Moon"), np.array([0.0, np.radians(3.0), 0.0])
     scan = Scan(scanout_s=1 / 60, hold_s=1 / 60)
-    painter = DiscPainter(
-        bench.moving, bench.camera, bench.renderer.footprint_px, bench.config.render.sprite_sigma_px, scan=scan
-    )
-    stars = bench.seen(bench.shown_stars)
+    layer = BodyLayer(bench.moving, bench.canvas)
+    stars = bench.seen(bench.shown_stars, View(q))
     none = sprites_at(np.empty((0, 2)), np.empty(0), bench.renderer.footprint_px)
     middles = []
-    for turn in (None, Turn(q, rate), Turn(q, 4 * rate)):
-        bench.renderer.draw(painter.over(none, stars, q, NOW, turn))
+    for turn in (None, rate, 4 * rate):
+        bench.renderer.draw(layer.add(none, stars, View(q, turn, scan=scan)))
         light = bench.renderer.linear().astype(float)
         y, x = np.mgrid[: light.shape[0], : light.shape[1]]
         middles.append((light.sum(), (light * x).sum() / light.sum(), (light * y).sum() / light.sum()))

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from hilstar.bench.build import load
-from hilstar.bench.discs import When
 from hilstar.bench.frame import Bench
 from hilstar.rotation import from_radec_roll_deg
 from hilstar.sky.bodies.disc import AIR, EQUATOR_KM, POLAR_KM
@@ -62,7 +61,7 @@ def body_direction(bench: Bench, name: str, place_km: np.ndarray) -> np.ndarray:
 
 def light(bench: Bench, direction: np.ndarray, place_km: np.ndarray) -> np.ndarray:
     """The linear image about a direction from a place."""
-    sprites = bench.frame_sprites(towards(direction), None, np.zeros(3), T_NS, place_km)
+    sprites = bench.light(bench.view(towards(direction), None, T_NS, np.zeros(3), place_km))
     levels = bench.draw_sprites(sprites).levels
     linear = bench.renderer.linear().astype(float)
     assert np.isfinite(linear).all()
@@ -77,7 +76,7 @@ def test_a_star_fades_in_the_air_as_rays_do_and_is_gone_behind_the_ground(bench)
     shares = []
     for height_rad in np.linspace(-0.02, 0.03, 40):
         place = above(direction, height_rad, np.array([0.0, 0.3, 1.0]))
-        sprites = bench.frame_sprites(towards(direction), None, np.zeros(3), T_NS, place)
+        sprites = bench.light(bench.view(towards(direction), None, T_NS, np.zeros(3), place))
         mine = sprites.data["electrons_per_s"][sprites.star == star].sum() / whole
         earth = Body(
             -place, EQUATOR_KM, POLAR_KM, np.array([0.0, 0.0, 1.0]), direction, lambert, 1.0, (AIR.scale_km, AIR.depth)
@@ -102,7 +101,7 @@ def test_the_moon_sets_behind_the_earth(bench):
         place = above(moon, np.radians(height_deg), side)
         moon = body_direction(bench, "Moon", place)
         picture = light(bench, moon, place)
-        listed = [disc.name for disc in bench.discs(towards(moon), When(T_NS, np.zeros(3), place))]
+        listed = [disc.name for disc in bench.discs(bench.view(towards(moon), None, T_NS, np.zeros(3), place))]
         assert ("Moon" in listed) == (height_deg > 0)
         faces = {disc.name: disc for disc in bench.moving.discs(moon, 0.0, 0.0, T_NS, np.zeros(3), place)}
         whole = faces["Moon"].normal_e_per_s_sr * faces["Moon"].law_integral_sr()
@@ -127,6 +126,6 @@ def test_from_low_above_the_day_side_the_earth_fills_the_field(bench):
     place = (EQUATOR_KM + ALTITUDE_KM) * sun
     picture = light(bench, -sun, place)
     assert (picture > bench.flux_at_white_e_per_s).all()
-    drawn = bench.draw_sprites(bench.frame_sprites(towards(-sun), None, np.zeros(3), T_NS, place))
+    drawn = bench.draw_sprites(bench.light(bench.view(towards(-sun), None, T_NS, np.zeros(3), place)))
     assert drawn.star_count == 0
     assert drawn.clipped_hip == ("Earth",)

@@ -7,7 +7,7 @@ import csv
 import pytest
 from PIL import Image
 
-from hilstar.bench.faults.kinds import KINDS
+from hilstar.frame.fault_kinds import KINDS
 from hilstar.study import faults
 from hilstar.study.faults import CASES, NOWHERE, QUANTISATIONS
 

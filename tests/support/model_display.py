@@ -10,6 +10,7 @@ import pytest
 
 from hilstar.bench.config import parse_config
 from hilstar.bench.orientation import scan_of
+from hilstar.frame.view import View
 from hilstar.monitor.window.x11 import BackBuffer, SwapStamps
 from hilstar.run.screen import screen as screen_room
 from hilstar.run.screen.screen import Screen
@@ -60,7 +61,8 @@ def model_screen(
         calibration=SimpleNamespace(response=SimpleNamespace(rgb=None)),
         renderer=WellGpu(),
         draw=lambda q: None,
-        frame_sprites=lambda *values, **named: clock.work(DRAW_NS),
+        view=View,
+        light=lambda view, faults: clock.work(DRAW_NS),
         draw_sprites=lambda sprites, number: SimpleNamespace(levels=None, star_count=0, clipped_hip=(), capped=0),
     )
     return Screen(model.window, bench), model

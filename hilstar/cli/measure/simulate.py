@@ -45,7 +45,7 @@ def simulate(
     import numpy as np
 
     from hilstar.bench.bench_file import at_moment, read_bench_file
-    from hilstar.bench.truth import clipped_in
+    from hilstar.frame.truth import clipped_in
     from hilstar.twin import pictures as files
     from hilstar.twin.batch import faulty_exposure
     from hilstar.twin.simulator import FrameNoise, Simulator
@@ -69,9 +69,9 @@ def simulate(
     file, rate_rad_s = at_moment(file, t_ns), parse_rate(rate) if rate else np.zeros(3)
     with Simulator(file) as simulator:
         frame_noise = FrameNoise(noise, seed)
-        motion = simulator.motion(q, rate_rad_s, t_ns)
-        faults = None if wrong is None else faulty_exposure(simulator, motion, wrong, t_ns or 0)
-        exposure = simulator.expose(motion, frame_noise.rng(), faults=faults)
+        view = simulator.view(q, rate_rad_s, t_ns)
+        faults = None if wrong is None else faulty_exposure(simulator, view, wrong, t_ns or 0)
+        exposure = simulator.expose(view, frame_noise.rng(), faults=faults)
         if output is not None:
             files.write_exposure_fits(output, simulator, exposure, frame_noise)
         if png is not None:
@@ -104,7 +104,7 @@ def simulate_log(
     from hilstar.attitude.logs.log_file import open_log
     from hilstar.attitude.wire.source import Mounting
     from hilstar.bench.bench_file import dated, read_bench_file
-    from hilstar.twin.batch import LogFaults, log_motions, simulate_motions
+    from hilstar.twin.batch import LogFaults, log_views, simulate_views
 
     wrong = optional_scenario(scenario)
     file = read_bench_file(bench_file)
@@ -115,8 +115,8 @@ def simulate_log(
     for _, line in [*read.told, *log_joins(samples).told]:
         say(line)
     max_rate_rad_s = math.radians(config.attitude.max_rate_deg_s)
-    motions = log_motions(samples, frames, config.tracker.exposure_s, max_rate_rad_s)
+    views = log_views(samples, frames, config.tracker.exposure_s, max_rate_rad_s)
     faults = None if wrong is None else LogFaults(wrong, samples, max_rate_rad_s)
-    with progress("exposing", len(motions)) as advance:
-        simulate_motions(file, motions, noise, output, advance, faults)
-    typer.echo(f"{len(motions)} exposures in {output}")
+    with progress("exposing", len(views)) as advance:
+        simulate_views(file, views, noise, output, advance, faults)
+    typer.echo(f"{len(views)} exposures in {output}")

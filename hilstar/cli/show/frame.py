@@ -38,9 +38,9 @@ def frame(
     from hilstar.bench import frame_files as files
     from hilstar.bench.bench_file import at_moment, read_bench_file
     from hilstar.bench.build import open_bench
-    from hilstar.bench.faults.views import effects_at
+    from hilstar.bench.fault_views import faults_at
     from hilstar.bench.fields_of_view import fields_of_view
-    from hilstar.bench.truth import clipped_in
+    from hilstar.frame.truth import clipped_in
 
     q = parse_attitude("frame", radec, quaternion)
     targets = [path for path in (output, truth, codes, preview) if path is not None]
@@ -58,7 +58,7 @@ def frame(
     with open_bench(file) as bench:
         if explain:
             explain_bench(bench, t_ns)
-        effects = None if wrong is None else effects_at(bench, wrong, t_ns or 0)
+        effects = None if wrong is None else faults_at(bench, wrong, t_ns or 0)
         shot = bench.frame(q, t_ns=t_ns, faults=effects)
         if output is not None:
             files.write_frame_fits(output, bench, shot)

@@ -14,7 +14,7 @@ from hilstar.errors import InputError
 from hilstar.process.programs import Service
 
 if TYPE_CHECKING:
-    from hilstar.bench.faults.desk import FaultDesk
+    from hilstar.bench.fault_desk import FaultDesk
     from hilstar.console.listener import PageListener
     from hilstar.console.publisher import FramePublisher, PageParts, RunDescription
     from hilstar.run.faults import AnyFaults

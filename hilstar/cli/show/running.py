@@ -19,8 +19,8 @@ from hilstar.units import NS_PER_S
 if TYPE_CHECKING:
     from hilstar.attitude.wire.source import Conventions, Mounting
     from hilstar.bench.bench_file import BenchFile
-    from hilstar.bench.faults.scenario import Scenario
     from hilstar.bench.fields_of_view import FieldsOfView
+    from hilstar.bench.scenario import Scenario
     from hilstar.run.faults import AnyFaults, Recording
     from hilstar.run.record.ledger import LedgerSwitch
     from hilstar.run.summary import RunSummary
@@ -50,8 +50,7 @@ LedgerSplit = Annotated[
 def explain_bench(bench: Any, t_ns: int | None = None) -> None:
     """Say where the stars come from, what was chosen within the tolerance, and which bodies are more than points at a time."""
     from hilstar.bench.effort import explain
-    from hilstar.bench.moving import observer_lines, wide_bodies
-    from hilstar.bench.satellites import satellite_lines
+    from hilstar.bench.moving import observer_lines, satellite_lines, wide_bodies
 
     for note in bench.stars.catalog.notes:
         say(note)
@@ -146,7 +145,7 @@ def optional_ledger(path: Path | None, bench: Any, notices: Notices, overwrite: 
 
 def optional_scenario(path: Path | None) -> Scenario | None:
     """The scenario of `--scenario`, None without one. Raises InputError."""
-    from hilstar.bench.faults.scenario import read_scenario
+    from hilstar.bench.scenario import read_scenario
 
     return None if path is None else read_scenario(path)
 

@@ -128,22 +128,19 @@ def _pointing(sample: AttitudeSample, file: BenchFile) -> dict[str, Any]:
 
     from hilstar.bench.build import bench_moving, bench_stars, moved
     from hilstar.bench.cameras import tracker_camera
-    from hilstar.bench.discs import DiscPainter, When
-    from hilstar.bench.in_view import brightest_in_view
-    from hilstar.bench.satellites import satellites_now
+    from hilstar.frame.layers import light_of, seen_in, sky_layers
+    from hilstar.frame.truth import brightest_in_view
+    from hilstar.frame.view import Canvas, View
     from hilstar.rotation import to_radec_roll_deg
 
     ra_deg, dec_deg, roll_deg = to_radec_roll_deg(sample.q_icrs_to_cam)
     camera = tracker_camera(file.config.tracker, file.folder)
     moving = bench_moving(file.config, file.folder)
-    sky = moved(bench_stars(file.config, file.folder, moving), moving)
-    through = None
-    if moving is not None:
-        sky = moving.seen(sky, sample.t_ns)
-        satellites_now(sky, moving, sample.t_ns)
-        painter = DiscPainter(moving, camera, 1, file.config.tracker.psf_sigma_px)
-        through = painter.seen_through(sky, sample.q_icrs_to_cam, When(sample.t_ns))
-    stars = brightest_in_view(sky, camera, sample.q_icrs_to_cam, SHOWN_STARS, through)
+    view = View(sample.q_icrs_to_cam, t_ns=sample.t_ns)
+    sky = seen_in(view, moved(bench_stars(file.config, file.folder, moving), moving), moving)
+    canvas = Canvas(camera, 1, file.config.tracker.psf_sigma_px)
+    light = light_of(canvas, sky_layers(canvas, moving), sky, view)
+    stars = brightest_in_view(light, sky, camera, view.q_icrs_to_cam, SHOWN_STARS)
     rate = sample.rate_cam_rad_s
     return {
         "t_ns": sample.t_ns,

@@ -112,7 +112,7 @@ class Stopwatch:
         marks = [time.perf_counter()]
         attitude = attitude_at(timeline, light_ns)
         marks.append(time.perf_counter())
-        sprites = bench.frame_sprites(attitude.q_icrs_to_cam, chain.rate(attitude))
+        sprites = bench.light(bench.view(attitude.q_icrs_to_cam, chain.rate(attitude)))
         marks.append(time.perf_counter())
         drawn = bench.draw_sprites(sprites, number)
         bench.renderer.context.finish()

@@ -33,7 +33,7 @@ from hilstar.render.renderer import Renderer, Target
 from hilstar.render.variants import StagedRenderer
 from hilstar.rotation import from_radec_roll_deg, to_matrix
 from hilstar.scene.psf import SQRT2
-from hilstar.scene.sprites import Sprites, clipped_sprites, pack_sprites
+from hilstar.scene.sprites import Candidates, Sprites, clipped_sprites, pack_sprites
 from hilstar.sky.stars import Stars, cell_grid
 from hilstar.study.settings import OtherWork, Table, Value, bench_text, is_busy
 from hilstar.study.speed.report import (
@@ -294,6 +294,7 @@ class CellMeasurement:
         self.cell_key = cell.width, cell.height, cell.stars
         self.shape = cell.height, cell.width
         self.sigma_px = bench.config.render.sprite_sigma_px
+        self.candidates = Candidates()
         self.sprites = bench.sprites(self.q)
         self.icrs_to_image = bench.camera.cam_to_image @ to_matrix(self.q)
         self.staged = StagedRenderer(bench.renderer.target)
@@ -355,7 +356,7 @@ class CellMeasurement:
         stars, camera, footprint_px = self.bench.shown_stars, self.bench.camera, self.staged.footprint_px
         begin = time.perf_counter()
         margin_px = footprint_px / 2 + 1
-        near, directions, rates_e_per_s = self.bench.candidates.near(stars, self.icrs_to_image, camera, margin_px)
+        near, directions, rates_e_per_s = self.candidates.near(stars, self.icrs_to_image, camera, margin_px)
         culled = time.perf_counter()
         # make_sprites in its two halves.
         x_px, y_px = camera.project((self.icrs_to_image @ directions).T)

@@ -248,8 +248,8 @@ def simulated_dn(exposure_s: float, background_e: float, faintest_v_mag: float) 
         }
         path.write_text(bench_text(tables))
         with Simulator(read_bench_file(path)) as simulator:
-            motion = simulator.motion(from_radec_roll_deg(84.057, -1.2, 0.0), np.zeros(3))
-            exposure = simulator.expose(motion, np.random.default_rng(SEED))
+            view = simulator.view(from_radec_roll_deg(84.057, -1.2, 0.0), np.zeros(3))
+            exposure = simulator.expose(view, np.random.default_rng(SEED))
     return exposure.dn.astype(np.float64), len(exposure.truth)
 
 

@@ -12,13 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from hilstar.arrays import FloatArray
-from hilstar.bench.faults.desk import Now
-from hilstar.bench.faults.effects import Effects
-from hilstar.bench.faults.kinds import AttitudeStep, Blank, Drop, Fault, Flash, Freeze, Glow, Place, PointLight, StarGone
-from hilstar.bench.faults.scenario import Scenario, lasts_ns
-from hilstar.bench.faults.view import FaultView, icrs_direction
-from hilstar.bench.faults.views import display_view
+from hilstar.bench.fault_views import display_view
 from hilstar.bench.frame import Frame
+from hilstar.bench.scenario import Scenario, lasts_ns
+from hilstar.frame.fault_kinds import AttitudeStep, Blank, Drop, Fault, Flash, Freeze, Glow, Now, Place, PointLight, StarGone
+from hilstar.frame.fault_light import FaultView, icrs_direction
+from hilstar.frame.faults import FaultLayer
 from hilstar.monitor.quantise import MASK_TURNS
 from hilstar.rotation import from_radec_roll_deg, propagate
 from hilstar.twin.verify.star_finder import StarFinder, star_finder
@@ -62,7 +61,7 @@ class FaultyFields:
     def __init__(self, twin: Twin, scenario: Scenario, rng: np.random.Generator) -> None:
         self._twin, self._rng = twin, rng
         self._view: FaultView = display_view(twin.bench, scenario)
-        self._faults = self._view.prepared(scenario)
+        self._faults = scenario.prepared(self._view.prepare)
         self._finder: StarFinder = star_finder(twin.bench, twin.monitor_px_per_px)
         self._view_rad = twin.camera.field_radius_rad(0.0)
 
@@ -75,7 +74,7 @@ class FaultyFields:
             return FaultSeen(fault.name, fault.KIND, note="of the run's frames: a field that stands still has none")
         q, first_frame = self._attitude(fault), int(self._rng.integers(0, MASK_TURNS))
         since_ns = (lasts_ns(fault) or 0) // 2
-        effects = Effects(self._view, (Now(1, fault, since_ns),))
+        effects = FaultLayer(self._view, (Now(1, fault, since_ns),))
         plain, faulty = self._shot(q, first_frame, None), self._shot(q, first_frame, effects)
         if isinstance(fault, AttitudeStep):
             return FaultSeen(fault.name, fault.KIND, off_px=self._stars_off_px(faulty))
@@ -102,7 +101,7 @@ class FaultyFields:
             off_px = float(np.hypot(*(_middle(shown) - _middle(asked))))
         return FaultSeen(fault.name, fault.KIND, asked_e, seen_e, flux_mag, off_px)
 
-    def _shot(self, q: FloatArray, first_frame: int, effects: Effects | None) -> _Shot:
+    def _shot(self, q: FloatArray, first_frame: int, effects: FaultLayer | None) -> _Shot:
         twin, exposure_s = self._twin, self._twin.config.tracker.exposure_s
         frame = twin.bench.frame(q, first_frame, faults=effects)
         lights = exposure_lights(twin.bench, frame, first_frame, [twin.true_panel], effects)

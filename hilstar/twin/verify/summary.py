@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from hilstar.bench.bench_file import BenchFile
-from hilstar.bench.faults.scenario import Scenario
+from hilstar.bench.scenario import Scenario
 from hilstar.charts import BLUE, MUTED, RED, SMALL_PT, chart, label_ends, write_csv
 from hilstar.error_spread import ErrorSpread, error_spread
 from hilstar.monitor.quantise import MASK_TURNS

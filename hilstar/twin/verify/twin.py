@@ -21,9 +21,9 @@ from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import open_bench
 from hilstar.bench.cameras import ideal_monitor, real_monitor, tracker_camera
 from hilstar.bench.config import Verify
-from hilstar.bench.discs import When
-from hilstar.bench.frame import Bench, Frame, FrameFaults
+from hilstar.bench.frame import Bench, Frame
 from hilstar.errors import InputError
+from hilstar.frame.faults import FaultLayer
 from hilstar.monitor.calibration import BUILT_IN, Calibration, load_calibration
 from hilstar.monitor.geometry import monitor_camera
 from hilstar.monitor.quantise import Panel, shown_light
@@ -38,7 +38,7 @@ PHASES = 4  # frames of a sequence with which an exposure may begin
 
 
 def exposure_lights(
-    bench: Bench, frame: Frame, first_frame: int, panels: Sequence[Panel], faults: FrameFaults | None = None
+    bench: Bench, frame: Frame, first_frame: int, panels: Sequence[Panel], faults: FaultLayer | None = None
 ) -> list[FloatArray]:
     """The mean light (H, W), electrons per second, of each panel over an exposure that begins with frame `first_frame`.
 
@@ -51,7 +51,7 @@ def exposure_lights(
     for number in range(before + count):
         levels = frame.levels
         if number:
-            sprites = bench.frame_sprites(frame.q_icrs_to_cam, t_ns=frame.t_ns, faults=faults)
+            sprites = bench.light(bench.view(frame.q_icrs_to_cam, None, frame.t_ns), faults)
             levels = bench.draw_sprites(sprites, first_frame + number).levels
         if number >= before:
             for light, panel in zip(lights, panels, strict=True):
@@ -149,7 +149,7 @@ class Twin:
         shown = self.true_optics.image_e_per_s(lights[0]) * exposure_s
         assumed = self.sky_optics.image_e_per_s(lights[1]) * exposure_s if self.differs else shown
         icrs_to_cam = to_matrix(frame.q_icrs_to_cam)
-        discs = self.bench.discs(frame.q_icrs_to_cam, When())
+        discs = self.bench.discs(self.bench.view(frame.q_icrs_to_cam))
         points = ~np.isin(frame.truth["name"], [disc.name for disc in discs])
         x_px, y_px = self.camera.project(self.bench.stars.directions(frame.star[points]) @ icrs_to_cam.T)
         found = tuple((icrs_to_cam @ disc.direction, disc.radius_rad) for disc in discs)

@@ -106,7 +106,7 @@ def test_exact_codes_put_a_star_in_a_bent_corner_where_it_belongs(bench, folder,
 def test_paths_are_those_of_the_bent_stars_while_their_rows_are_lit(bench, folder, rng, rate):
     """Each star's light on the screen, and its centroid, by small steps of time; none is lost that only cuts a corner."""
     q, rate = attitude(rng), np.array(rate)
-    found = bench.frame_sprites(q, rate)
+    found = bench.light(bench.view(q, rate))
     scan = bench.scan
     near = np.flatnonzero((bench.shown_stars.vectors @ to_matrix(q).T)[:, 2] > np.cos(np.radians(25)))
     stars, rates_e = bench.shown_stars.vectors[near], bench.shown_stars.electrons_per_s[near]

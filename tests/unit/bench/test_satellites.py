@@ -11,7 +11,6 @@ import pytest
 
 from hilstar.bench.bench_file import read_bench_file
 from hilstar.bench.build import load
-from hilstar.bench.discs import When
 from hilstar.bench.frame import Bench
 from hilstar.campaign.display_tracker import DisplayTracker
 from hilstar.rotation import from_radec_roll_deg, to_matrix
@@ -75,7 +74,7 @@ def test_a_frame_its_truth_and_a_run_s_frame_have_the_same_satellite(bench_file)
         assert wide.sum() >= 0.999 * row["electrons_per_s"]
         drawn = bench.draw(q, t_ns=t_ns)
         assert np.array_equal(drawn.levels, shot.levels)
-        sprites = bench.frame_sprites(q, np.array([0.0, 0.02, 0.0]), None, t_ns)
+        sprites = bench.light(bench.view(q, np.array([0.0, 0.02, 0.0]), t_ns))
         first = len(bench.shown_stars) - len(bench.shown_stars.bodies)
         assert bench.shown_stars.names(np.unique(sprites.star[sprites.star >= first])).count(name) == 1
 
@@ -100,7 +99,7 @@ def test_a_camera_that_follows_a_satellite_has_it_as_a_point_and_stars_as_streak
         ways = [np.array([np.cos(d) * np.cos(r), np.cos(d) * np.sin(r), np.sin(d)]) for r, d in np.radians([before, after])]
         turn = np.cross(ways[0], ways[1]) * 2  # rad/s about ICRS axes
         rate = to_matrix(q) @ turn
-        found = [tracker.expose(tracker.motion(q, one, t_ns), None) for one in (rate, np.zeros(3))]
+        found = [tracker.expose(tracker.view(q, one, t_ns), None) for one in (rate, np.zeros(3))]
         rows = [shot.truth[shot.truth["name"] == name][0] for shot in found]
         assert rows[0]["electrons_per_s"] == pytest.approx(rows[1]["electrons_per_s"], rel=1e-3)
         peaks = [shot.mean_e[509:515, 509:515].sum() for shot in found]
@@ -125,7 +124,7 @@ def test_one_with_a_size_is_a_disc_with_its_light_which_hides_stars(bench_file):
     q = from_radec_roll_deg(*place, 0.0)
     with load(bench_file) as bench:
         shot = bench.frame(q, t_ns=t_ns)
-        (disc,) = bench.discs(q, When(t_ns))
+        (disc,) = bench.discs(bench.view(q, None, t_ns))
         assert disc.name == name
         (row,) = shot.truth[shot.truth["name"] == name]
         lit = shot.linear.astype(np.float64)
@@ -141,7 +140,7 @@ def test_one_with_a_size_is_a_disc_with_its_light_which_hides_stars(bench_file):
         assert np.abs(np.ptp(seen, axis=0) - width_px).min() < 3  # of 24, along the terminator, blurred
         assert (row["x_px"], row["y_px"]) == pytest.approx((as_point["x_px"], as_point["y_px"]), abs=1.5)
     with Simulator(read_bench_file(bench_file)) as tracker:
-        found = tracker.expose(tracker.motion(q, np.zeros(3), t_ns), None)
+        found = tracker.expose(tracker.view(q, np.zeros(3), t_ns), None)
         (of_exposure,) = found.truth[found.truth["name"] == name]
         whole_e = found.mean_e.sum()
         assert whole_e > 0.45 * of_exposure["electrons_per_s"]
@@ -227,7 +226,7 @@ def test_a_tracker_before_the_display_sees_the_streak_that_one_before_the_sky_se
     q, file = from_radec_roll_deg(*place, 0.0), read_bench_file(bench_file)
     display = DisplayTracker(file)
     with Simulator(file) as tracker:
-        of_sky, of_display = (one.expose(tracker.motion(q, np.zeros(3), t_ns), None) for one in (tracker, display))
+        of_sky, of_display = (one.expose(tracker.view(q, np.zeros(3), t_ns), None) for one in (tracker, display))
     display.close()
     rows = [shot.truth[shot.truth["name"] == name][0] for shot in (of_sky, of_display)]
     assert (rows[0]["x_px"], rows[0]["y_px"]) == pytest.approx((rows[1]["x_px"], rows[1]["y_px"]), abs=0.01)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from hilstar.bench.truth import truth_table
+from hilstar.frame.truth import truth_table
 from hilstar.sky.catalog import load_catalog
 from hilstar.sky.stars import make_stars, unit_vectors_icrs
 

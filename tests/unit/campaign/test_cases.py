@@ -75,7 +75,7 @@ def test_a_run_of_frames_turns_at_its_rate_and_its_scatter_is_its_noise(tmp_path
     this = session(tmp_path)
     where = points(this, 1)[0]
     case = this.maker.case(0, where)
-    last = this.maker.motion(case, 3, 0.1)
+    last = this.maker.view(case, 3, 0.1)
     assert last.q_icrs_to_cam == pytest.approx(propagate(case.first.q_icrs_to_cam, np.radians([0, 0, 2.0]), 1.5), abs=1e-12)
     assert last.t_ns == 1_500_000_000
     row = this.row(0, where)

@@ -32,7 +32,7 @@ def seen(tmp_path_factory: pytest.TempPathFactory):
     folder = tmp_path_factory.mktemp("solvers")
     write_campaign(folder)
     simulator = Simulator(read_bench_file(folder / "bench.toml"))
-    motion = simulator.motion(from_radec_roll_deg(84.057, -1.2, 30.0), np.zeros(3))
+    motion = simulator.view(from_radec_roll_deg(84.057, -1.2, 30.0), np.zeros(3))
     yield simulator, simulator.expose(motion, np.random.default_rng(1))
     simulator.close()
 
@@ -53,7 +53,7 @@ def test_a_solver_finds_the_commanded_attitude_in_the_pixels(seen: tuple[Simulat
     simulator, exposure = seen
     answer = solver(text).solve(exposure, simulator)
     assert answer.q_icrs_to_cam is not None
-    error_arcsec = attitude_error_arcsec(exposure.motion.q_icrs_to_cam, answer.q_icrs_to_cam)
+    error_arcsec = attitude_error_arcsec(exposure.view.q_icrs_to_cam, answer.q_icrs_to_cam)
     assert np.abs(error_arcsec[:2]).max() < CROSS_LIMIT_ARCSEC and abs(error_arcsec[2]) < ROLL_LIMIT_ARCSEC
     assert np.abs(error_arcsec).max() > 0
 
@@ -67,7 +67,7 @@ def test_an_error_is_the_rotation_vector_from_the_commanded_to_the_reported_atti
 def test_noise_alone_has_no_attitude_and_centroids_say_so(seen: tuple[Simulator, Exposure]) -> None:
     simulator, exposure = seen
     dark = np.random.default_rng(2).normal(100, 5, exposure.dn.shape).astype(np.uint16)
-    blind = Exposure(exposure.motion, dark, exposure.mean_e, exposure.truth)
+    blind = Exposure(exposure.view, dark, exposure.mean_e, exposure.truth)
     for text in ("centroids", "python:star_solver:solve"):
         answer = solver(text).solve(blind, simulator)
         assert answer.q_icrs_to_cam is None and answer.why

@@ -9,6 +9,7 @@ import pytest
 
 from hilstar.attitude.clock.timeline import Attitude
 from hilstar.bench.config import parse_config
+from hilstar.frame.view import View
 from hilstar.notices import Notices
 from hilstar.run.loop import FrameLoop, Limit
 from hilstar.run.operator import Aids
@@ -72,12 +73,12 @@ class Run:
         self.rates: list[object] = []
         self._cost = cost
         config = parse_config(tmp_path / "bench.toml", SMALL_BENCH)
-        bench = SimpleNamespace(config=config, renderer=WellGpu(), frame_sprites=self._sprites, draw_sprites=self._draw)
+        bench = SimpleNamespace(config=config, renderer=WellGpu(), view=View, light=self._light, draw_sprites=self._draw)
         self.loop = FrameLoop(bench, self.shown.append, self.pacer, notices=self.notices)
         self.loop.paced(limit, self._draw_slot)
 
-    def _sprites(self, q_icrs_to_cam, rate_cam_rad_s, velocity_km_s, t_ns, place_km, faults=None):
-        self.rates.append(rate_cam_rad_s)
+    def _light(self, view, faults=None):
+        self.rates.append(view.rate_cam_rad_s)
         self.host.work(self._cost(self.moments[-1].slot))
 
     def _draw(self, sprites, number):

@@ -9,6 +9,7 @@ import pytest
 
 from hilstar.attitude.clock.timeline import Attitude
 from hilstar.bench.config import parse_config
+from hilstar.frame.view import View
 from hilstar.run.loop import FrameLoop, Limit
 from hilstar.run.pacer import ClockPacer, Moment
 from hilstar.run.shown import Shown
@@ -32,10 +33,12 @@ class SlowBench:
     def begin(self, number: int) -> None:
         self._number = number
 
-    def frame_sprites(self, q_icrs_to_cam, rate_cam_rad_s, velocity_km_s, t_ns, place_km, faults=None):
-        self.asked.append(rate_cam_rad_s)
+    view = View
+
+    def light(self, view, faults=None):
+        self.asked.append(view.rate_cam_rad_s)
         self._clock.work(self._cost(self._number))
-        return q_icrs_to_cam
+        return view.q_icrs_to_cam
 
     def draw_sprites(self, sprites, number):
         self._clock.work(1e6)

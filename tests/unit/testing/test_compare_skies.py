@@ -9,8 +9,8 @@ import pytest
 
 import hilstar
 from hilstar.bench.frame_files import write_frame_fits, write_truth_csv
-from hilstar.bench.truth import TRUTH_DTYPE
 from hilstar.errors import InputError
+from hilstar.frame.truth import TRUTH_DTYPE
 from hilstar.render.reference import linear_image
 from hilstar.rotation import from_radec_roll_deg
 from hilstar.scene.psf import footprint_px

@@ -12,9 +12,9 @@ import hilstar
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.bench.bench_file import bench_file_of
 from hilstar.bench.cameras import bench_camera, tracker_camera
-from hilstar.bench.faults.desk import Now
-from hilstar.bench.faults.scenario import parse_scenario
-from hilstar.bench.faults.views import effects_at
+from hilstar.bench.fault_views import faults_at
+from hilstar.bench.scenario import parse_scenario
+from hilstar.frame.fault_kinds import Now
 from hilstar.rotation import angle_between_rad
 from hilstar.twin.batch import faulty_exposure
 from hilstar.twin.pictures import TrackerPictures
@@ -47,9 +47,9 @@ def simulator(tmp_path_factory):
 
 def exposed(simulator, text, at_s, rate=(0.0, 0.0, 0.0)):
     scenario = parse_scenario(simulator.file.path.with_name("faults.toml"), HEAD + text)
-    motion = simulator.motion(np.array(ORION_Q), np.array(rate))
-    faults = faulty_exposure(simulator, motion, scenario, round(at_s * NS_PER_S))
-    return simulator.expose(motion, None, faults=faults), faults
+    view = simulator.view(np.array(ORION_Q), np.array(rate))
+    faults = faulty_exposure(simulator, view, scenario, round(at_s * NS_PER_S))
+    return simulator.expose(view, None, faults=faults), faults
 
 
 def light_e(exposure):
@@ -57,14 +57,14 @@ def light_e(exposure):
 
 
 def test_a_fault_that_is_not_on_leaves_the_exposure_as_it_is(simulator):
-    plain = simulator.expose(simulator.motion(np.array(ORION_Q), np.zeros(3)), None)
+    plain = simulator.expose(simulator.view(np.array(ORION_Q), np.zeros(3)), None)
     off, _ = exposed(simulator, GHOST, 5.0)
     assert np.array_equal(off.mean_e, plain.mean_e) and off.faults == ()
 
 
 @pytest.mark.parametrize(("at_s", "share"), [(1.5, 1.0), (1.0, 0.5), (0.97, 0.2), (2.04, 0.1)])
 def test_an_exposure_has_a_fault_s_light_for_the_part_that_it_lasts(simulator, at_s, share):
-    plain = simulator.expose(simulator.motion(np.array(ORION_Q), np.zeros(3)), None)
+    plain = simulator.expose(simulator.view(np.array(ORION_Q), np.zeros(3)), None)
     seen, _ = exposed(simulator, GHOST, at_s)
     assert light_e(seen) - light_e(plain) == pytest.approx(share * 4e4, rel=1e-3)
     row = seen.truth[seen.truth["name"] == "ghost"][0]
@@ -73,7 +73,7 @@ def test_an_exposure_has_a_fault_s_light_for_the_part_that_it_lasts(simulator, a
 
 
 def test_a_moving_false_star_leaves_a_streak_of_its_light(simulator):
-    plain = simulator.expose(simulator.motion(np.array(ORION_Q), np.zeros(3)), None)
+    plain = simulator.expose(simulator.view(np.array(ORION_Q), np.zeros(3)), None)
     seen, _ = exposed(simulator, GHOST.replace("[480, 530]", "[480, 530]\nrate_px_s = [300, 0]"), 1.5)
     added = seen.mean_e - plain.mean_e
     assert added.sum() == pytest.approx(4e4, rel=1e-3)
@@ -86,13 +86,13 @@ def test_a_moving_false_star_leaves_a_streak_of_its_light(simulator):
 
 def test_blank_freeze_and_step(simulator):
     dark, _ = exposed(simulator, '[[fault]]\nkind = "blank"\nname = "cover"\nat_s = 1.0', 1.0)
-    plain = simulator.expose(simulator.motion(np.array(ORION_Q), np.zeros(3)), None)
+    plain = simulator.expose(simulator.view(np.array(ORION_Q), np.zeros(3)), None)
     assert light_e(dark) == pytest.approx(light_e(plain) / 2, rel=LIGHT_SHARE)
     turning = (0.0, 0.02, 0.0)
     _, stuck = exposed(simulator, '[[fault]]\nkind = "freeze"\nname = "stuck"\nat_s = 0.9\nfor_s = 1', 1.0, turning)
     (piece,) = stuck.pieces
-    assert not piece.motion.rate_cam_rad_s.any()
-    turned_rad = angle_between_rad(piece.motion.q_icrs_to_cam, np.array(ORION_Q))
+    assert not piece.view.rate_cam_rad_s.any()
+    turned_rad = angle_between_rad(piece.view.q_icrs_to_cam, np.array(ORION_Q))
     assert turned_rad == pytest.approx(0.02 * 0.1, rel=1e-6)  # as at 0.9 s
     moved, _ = exposed(simulator, '[[fault]]\nkind = "attitude-step"\nname = "s"\nat_s = 0\nturn_arcsec = [0, 600, 0]', 1.0)
     star = plain.truth[plain.truth["hip"] == 26727][0]
@@ -130,9 +130,9 @@ def test_display_and_tracker_have_the_same_light_at_the_same_places(simulator, t
     path.write_text(SMALL_BENCH)
     scenario = parse_scenario(tmp_path / "faults.toml", ALIKE)
     with hilstar.load(path) as bench:
-        shown = bench.frame(ORION_Q, faults=effects_at(bench, scenario, round(1.25 * NS_PER_S))).truth
-    motion = simulator.motion(np.array(ORION_Q), np.zeros(3))
-    seen = simulator.expose(motion, None, faults=faulty_exposure(simulator, motion, scenario, round(1.25 * NS_PER_S))).truth
+        shown = bench.frame(ORION_Q, faults=faults_at(bench, scenario, round(1.25 * NS_PER_S))).truth
+    view = simulator.view(np.array(ORION_Q), np.zeros(3))
+    seen = simulator.expose(view, None, faults=faulty_exposure(simulator, view, scenario, round(1.25 * NS_PER_S))).truth
     config = simulator.config
     monitor, tracker = bench_camera(config, tmp_path), tracker_camera(config.tracker, tmp_path)
     ours = shown[np.isin(shown["name"], ["ghost", "rays", "flare"])]

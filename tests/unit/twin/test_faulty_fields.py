@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hilstar.bench.bench_file import bench_file_of
-from hilstar.bench.faults.scenario import parse_scenario
+from hilstar.bench.scenario import parse_scenario
 from hilstar.twin.verify.summary import summarise, summary_lines, verify
 from tests.support.benches import TWIN, bench_text
 

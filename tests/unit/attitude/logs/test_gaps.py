@@ -13,7 +13,7 @@ from hilstar.attitude.logs.log_file import log_timeline
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.rotation import angle_between_rad, from_radec_roll_deg, propagate, to_matrix
 from hilstar.run.send.sender import log_samples
-from hilstar.twin.batch import log_motions
+from hilstar.twin.batch import log_views
 
 S = 1_000_000_000
 START = from_radec_roll_deg(84, -1.2, 30)
@@ -59,7 +59,7 @@ def test_a_slow_log_with_rates_is_blended_and_not_cut_at_the_corners(step_s, spi
 def test_the_display_and_the_twin_and_the_sender_take_a_log_alike():
     samples = log(np.arange(0, 60, 4.0))
     display = log_timeline(samples, STREAM)
-    for motion, t_ns in zip(log_motions(samples, 57, 0.1), np.linspace(0, samples[-1].t_ns, 57), strict=True):
+    for motion, t_ns in zip(log_views(samples, 57, 0.1), np.linspace(0, samples[-1].t_ns, 57), strict=True):
         attitude = display.at(round(t_ns))
         assert attitude is not None
         assert angle_between_rad(attitude.q_icrs_to_cam, motion.q_icrs_to_cam) < 1e-12

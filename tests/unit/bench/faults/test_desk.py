@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from hilstar.bench.faults.desk import MAX_ON, FaultDesk
-from hilstar.bench.faults.kinds import fault_of
-from hilstar.bench.faults.scenario import Scenario
+from hilstar.bench.fault_desk import MAX_ON, FaultDesk
+from hilstar.bench.scenario import Scenario
 from hilstar.errors import InputError
+from hilstar.frame.fault_kinds import fault_of
 
 FRAME_NS = 10_000_000  # 100 Hz
 

@@ -10,12 +10,11 @@ import pytest
 from astropy.io import fits
 
 import hilstar
-from hilstar.bench.faults.desk import Now
-from hilstar.bench.faults.effects import Effects
-from hilstar.bench.faults.kinds import fault_of
-from hilstar.bench.faults.scenario import Scenario
-from hilstar.bench.faults.views import display_view
+from hilstar.bench.fault_views import display_view
+from hilstar.bench.scenario import Scenario
 from hilstar.errors import InputError
+from hilstar.frame.fault_kinds import Now, fault_of
+from hilstar.frame.faults import FaultLayer
 from hilstar.rotation import angle_between_rad, from_radec_roll_deg
 from hilstar.units import ARCSEC_PER_RAD
 from tests.support.benches import ORION_Q, SMALL_BENCH, bench_text
@@ -45,7 +44,7 @@ def shown(bench, *tables, since_ns=0, share=1.0, folder=None, **more):
     scenario = Scenario(folder or ".", "", 7, tuple(faults), folder) if folder else Scenario(".", "", 7)
     view = display_view(bench, scenario)
     now = [Now(k, view.prepare(fault), since_ns, share) for k, fault in enumerate(faults, start=1)]
-    frame = bench.frame(ORION_Q, faults=Effects(view, tuple(now)), **more)
+    frame = bench.frame(ORION_Q, faults=FaultLayer(view, tuple(now)), **more)
     return frame, frame.truth[np.char.startswith(frame.truth["name"], "fault")]
 
 
@@ -168,10 +167,10 @@ def test_a_blank_field_has_no_light_and_a_step_turns_the_attitude(bench):
 
 def test_dropped_frames_are_the_seed_s(bench):
     view = display_view(bench, Scenario(".", "", 3))
-    effects = Effects(view, (Now(1, fault_of({"kind": "drop", "name": "loss", "share": 0.3}), 0),))
+    effects = FaultLayer(view, (Now(1, fault_of({"kind": "drop", "name": "loss", "share": 0.3}), 0),))
     lost = [effects.drops(frame) for frame in range(500)]
     assert 0.22 < np.mean(lost) < 0.38  # 0.3, and 4 sigma of 500 draws
-    assert lost == [Effects(display_view(bench, Scenario(".", "", 3)), effects.now).drops(frame) for frame in range(500)]
+    assert lost == [FaultLayer(display_view(bench, Scenario(".", "", 3)), effects.now).drops(frame) for frame in range(500)]
 
 
 @pytest.mark.parametrize(
@@ -214,12 +213,12 @@ def test_a_body_that_is_gone_has_neither_disc_nor_row(tmp_path):
     path = tmp_path / "moon.toml"
     path.write_text(bench_text({"sky": {"epoch_utc": "2026-11-21T00:00:00Z"}, "sky.bodies": {"moon": True}}))
     with hilstar.load(path) as bench:
-        x, y, z = bench.seen(bench.stars, 0).vectors[-1]
+        x, y, z = bench.seen(bench.stars, bench.view(ORION_Q, None, 0)).vectors[-1]
         q = from_radec_roll_deg(np.degrees(np.arctan2(y, x)), np.degrees(np.arcsin(z)), 0.0)
         there = bench.frame(q, t_ns=0)
         view = display_view(bench)
         fault = view.prepare(fault_of({"kind": "star-gone", "name": "no Moon", "star": "Moon"}))
-        gone = bench.frame(q, t_ns=0, faults=Effects(view, (Now(1, fault, 0),)))
+        gone = bench.frame(q, t_ns=0, faults=FaultLayer(view, (Now(1, fault, 0),)))
     assert "Moon" in there.truth["name"] and "Moon" not in gone.truth["name"]
     assert gone.linear.max() < 1e-3 * there.linear.max()
 
@@ -227,7 +226,7 @@ def test_a_body_that_is_gone_has_neither_disc_nor_row(tmp_path):
 def test_a_false_star_over_white_is_named_with_its_loss(bench):
     view = display_view(bench)
     fault = view.prepare(fault_of({"kind": "false-star", "name": "nova", "screen_px": [40, 50], "electrons_per_s": 1e8}))
-    effects = Effects(view, (Now(1, fault, 0),))
+    effects = FaultLayer(view, (Now(1, fault, 0),))
     frame = bench.frame(ORION_Q, faults=effects)
     losses = bench.losses_mag(frame, effects)
     # A hundred million electrons a second against white, in each pixel of its own.

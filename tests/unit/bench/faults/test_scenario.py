@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from hilstar.bench.faults.kinds import KINDS, fault_of, table_of
-from hilstar.bench.faults.scenario import parse_scenario, read_scenario
+from hilstar.bench.scenario import parse_scenario, read_scenario
 from hilstar.errors import InputError
+from hilstar.frame.fault_kinds import KINDS, fault_of, table_of
 from tests.support.benches import ROOT
 
 FILE = Path("faults.toml")

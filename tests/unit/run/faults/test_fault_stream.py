@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 import zmq
 
-from hilstar.bench.faults.desk import FaultDesk
-from hilstar.bench.faults.scenario import parse_scenario
+from hilstar.bench.fault_desk import FaultDesk
+from hilstar.bench.scenario import parse_scenario
 from hilstar.errors import InputError
 from hilstar.notices import Notices
 from hilstar.run.faults import MAX_BURST, MAX_MESSAGE_BYTES, MAX_PER_S, FaultStream, act

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import hilstar
-from hilstar.bench.faults.scenario import parse_scenario
+from hilstar.bench.scenario import parse_scenario
 from hilstar.errors import InputError
 from hilstar.notices import Notices
 from hilstar.run.faults import RunFaults, read_recording

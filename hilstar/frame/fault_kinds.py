@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import re
+from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal
 
 import msgspec
@@ -249,6 +250,19 @@ class AttitudeStep(Fault, frozen=True, kw_only=True):
     def size_rad(self) -> float:
         """The angle of the turn."""
         return math.hypot(*self.turn_rad)
+
+
+@dataclass(frozen=True, slots=True)
+class Now:
+    """A fault that is on in a frame: its number in the run, and how long it has been on when the frame's light begins, ns.
+
+    `share` is the part of the frame that it lasts: less than 1 only in its first frame and its last.
+    """
+
+    number: int
+    fault: Fault
+    since_ns: int
+    share: float = 1.0
 
 
 KINDS: dict[str, type[Fault]] = {

@@ -1,20 +1,19 @@
-"""What the faults of one frame do to it: attitude, sprites, and whether it is shown at all."""
+"""The faults that are on in one image: what they do to its view and to its light, and whether it is shown at all."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from hilstar.arrays import FloatArray
-from hilstar.bench.faults.desk import Now
-from hilstar.bench.faults.kinds import AttitudeStep, Blank, Drop, Fault, Freeze
-from hilstar.bench.faults.view import FaultView
+from hilstar.frame.fault_kinds import AttitudeStep, Blank, Drop, Fault, Freeze, Now
+from hilstar.frame.fault_light import FaultView
+from hilstar.frame.view import View
 from hilstar.rotation import propagate, to_matrix
 from hilstar.scene.extended import DiscLight, LightMap
-from hilstar.scene.frame_motion import Scan
-from hilstar.scene.sprites import AddedLight, Sprites, join_sprites
+from hilstar.scene.sprites import AddedLight, Sprites, join_sprites, with_sprites
 from hilstar.sky.stars import BODY_CELL_RAD, CellGrid, Stars
 
 NO_TURN = np.array([1.0, 0.0, 0.0, 0.0])
@@ -22,8 +21,8 @@ FRAME_SEED = 1  # beside the number of a frame
 
 
 @dataclass(frozen=True, slots=True)
-class Effects:
-    """The faults that are on in one frame, for one camera."""
+class FaultLayer:
+    """The faults that are on in one image of one camera: the last layer."""
 
     view: FaultView
     now: tuple[Now, ...] = ()
@@ -49,55 +48,38 @@ class Effects:
             if isinstance(one.fault, Drop)
         )
 
-    def turned(self, q_icrs_to_cam: FloatArray) -> FloatArray:
-        """The attitude that is shown in place of `q_icrs_to_cam`."""
+    def turned(self, view: View) -> View:
+        """The view that is shown in place of another: its attitude, and its rate in the axes of the camera as turned."""
+        if not self._has(AttitudeStep):
+            return view
+        q, step = view.q_icrs_to_cam, NO_TURN
         for one in self.now:
             if isinstance(one.fault, AttitudeStep):
-                q_icrs_to_cam = propagate(q_icrs_to_cam, np.array(one.fault.turn_rad), 1.0)
-        return q_icrs_to_cam
+                turn_rad = np.array(one.fault.turn_rad)
+                q, step = propagate(q, turn_rad, 1.0), propagate(step, turn_rad, 1.0)
+        rate = view.rate_cam_rad_s
+        return replace(view, q_icrs_to_cam=q, rate_cam_rad_s=None if rate is None else to_matrix(step) @ rate)
 
-    def turned_rate(self, rate_cam_rad_s: FloatArray) -> FloatArray:
-        """A rate in the axes of the camera as it is shown."""
-        return to_matrix(self.turned(NO_TURN)) @ rate_cam_rad_s if self._has(AttitudeStep) else rate_cam_rad_s
-
-    def over(
-        self,
-        sprites: Sprites,
-        stars: Stars,
-        q_icrs_to_cam: FloatArray,
-        draw: Callable[[Stars], Sprites],
-        scan: Scan | None = None,
-    ) -> Sprites:
-        """A frame's sprites with its faults; without them they are `sprites` of `stars` as seen, at that attitude.
-
-        `draw` makes the sprites of other stars in the same way; `scan` is how the image lights up, None where stars are points.
-        """
-        view, now = self.view, self.now
+    def add(self, light: Sprites, stars: Stars, view: View) -> Sprites:
+        """The light before without the stars that faults take away, and with the light that they add."""
+        by, now = self.view, self.now
         if self.blank:
-            return replace(join_sprites([], sprites.footprint_px), rate_cam_rad_s=sprites.rate_cam_rad_s)
-        gone = view.gone(now, stars)
+            return replace(join_sprites([], light.footprint_px), rate_cam_rad_s=light.rate_cam_rad_s)
+        gone = by.gone(now, stars)
         if gone:
-            sprites = _without_discs(_dimmed(sprites, gone), view.gone_bodies(now))
-        directions, named = view.sky_points(now, stars)
-        chains, lines = view.camera_points(now, scan)
-        surfaces = view.surfaces(now, q_icrs_to_cam)
-        parts = view.footprints(chains)
+            light = _without_discs(_dimmed(light, gone), by.gone_bodies(now))
+        directions, named = by.sky_points(now, stars)
+        chains, lines = by.camera_points(now, None if view.rate_cam_rad_s is None else view.scan)
+        surfaces = by.surfaces(now, view.q_icrs_to_cam)
+        parts = by.footprints(chains)
         if named:
-            drawn = draw(few_stars(directions, named, stars))
+            nothing = join_sprites([], light.footprint_px)
+            drawn = by.by.points.add(nothing, few_stars(directions, named, stars), view)
             parts = [replace(drawn, star=-1 - len(lines) - drawn.star), *parts]
         if parts:
-            joined = join_sprites([sprites, *parts], sprites.footprint_px)
-            per_star = max(sprites.per_star, *(_most_per_star(part) for part in parts))
-            sprites = replace(
-                sprites,
-                data=joined.data,
-                star=joined.star,
-                x_px=joined.x_px,
-                y_px=joined.y_px,
-                per_star=per_star,
-                added=(*lines, *named),
-            )
-        return replace(sprites, extended=(*sprites.extended, *surfaces)) if surfaces else sprites
+            per_star = max(light.per_star, *(_most_per_star(part) for part in parts))
+            light = replace(with_sprites(light, parts), per_star=per_star, added=(*lines, *named))
+        return replace(light, extended=(*light.extended, *surfaces)) if surfaces else light
 
 
 def _most_per_star(part: Sprites) -> int:

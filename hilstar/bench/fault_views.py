@@ -1,4 +1,4 @@
-"""The views of a bench: the display's, and its tracker's."""
+"""The faults of a bench as its two cameras see them: the monitor, and the virtual tracker."""
 
 from __future__ import annotations
 
@@ -12,11 +12,13 @@ from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import star_rates
 from hilstar.bench.cameras import bench_camera, tracker_camera
-from hilstar.bench.faults.desk import FaultDesk
-from hilstar.bench.faults.effects import Effects
-from hilstar.bench.faults.scenario import NO_SCENARIO, Scenario
-from hilstar.bench.faults.view import FaultView, Sight
+from hilstar.bench.fault_desk import FaultDesk
 from hilstar.bench.frame import Bench
+from hilstar.bench.scenario import NO_SCENARIO, Scenario
+from hilstar.frame.fault_light import FaultCamera, FaultView
+from hilstar.frame.faults import FaultLayer
+from hilstar.frame.layers import StarLayer
+from hilstar.frame.view import Canvas
 from hilstar.scene.camera import Camera
 from hilstar.sky.stars import Stars, aberrate
 
@@ -27,38 +29,31 @@ if TYPE_CHECKING:
 def display_view(bench: Bench, scenario: Scenario = NO_SCENARIO) -> FaultView:
     """The faults of a scenario as the monitor shows them."""
     tracker = tracker_camera(bench.config.tracker, bench.file.folder)
-    sigma_px, footprint_px = bench.config.render.sprite_sigma_px, bench.renderer.footprint_px
-    sight = _sight(bench.file, (bench.camera, bench.camera, tracker), (footprint_px, sigma_px), bench.stars, bench.moving)
-    return FaultView(sight, scenario)
+    return _view(scenario, _fault_camera(bench.file, bench.canvas, bench.camera, tracker, bench.stars, bench.moving))
 
 
 def tracker_view(
-    file: BenchFile,
-    camera: Camera,
-    footprint_px: int,
-    stars: Stars,
-    moving: MovingSky | None,
-    scenario: Scenario = NO_SCENARIO,
+    file: BenchFile, canvas: Canvas, stars: Stars, moving: MovingSky | None, scenario: Scenario = NO_SCENARIO
 ) -> FaultView:
-    """The faults of a scenario as they fall on the virtual tracker's detector, whose `camera` it is."""
+    """The faults of a scenario as they fall on the virtual tracker's detector, which is `canvas`."""
     monitor = bench_camera(file.config, file.folder)
-    spread = footprint_px, file.config.tracker.psf_sigma_px
-    return FaultView(_sight(file, (camera, monitor, camera), spread, stars, moving), scenario)
+    return _view(scenario, _fault_camera(file, canvas, monitor, canvas.camera, stars, moving))
 
 
-def _sight(
-    file: BenchFile,
-    cameras: tuple[Camera, Camera, Camera],
-    spread: tuple[int, tuple[float, float]],
-    stars: Stars,
-    moving: MovingSky | None,
-) -> Sight:
-    """What a camera sees; `cameras` are itself, the monitor and the tracker, `spread` is its footprint and sigmas."""
-    config = file.config
-    return Sight(
-        *cameras,
-        *spread,
-        exposure_s=config.tracker.exposure_s,
+def _view(scenario: Scenario, camera: FaultCamera) -> FaultView:
+    folder = scenario.folder if scenario.faults else None
+    return FaultView(camera, scenario.seed, folder, frozenset(scenario.faults))
+
+
+def _fault_camera(
+    file: BenchFile, canvas: Canvas, monitor: Camera, tracker: Camera, stars: Stars, moving: MovingSky | None
+) -> FaultCamera:
+    return FaultCamera(
+        canvas=canvas,
+        monitor=monitor,
+        tracker=tracker,
+        exposure_s=file.config.tracker.exposure_s,
+        points=StarLayer(canvas),
         apparent=_apparent(file, moving),
         v0_e_per_s=_v0_e_per_s(file),
         stars=stars,
@@ -85,9 +80,9 @@ def _v0_e_per_s(file: BenchFile) -> Callable[[float], float]:
     return rate
 
 
-def effects_at(bench: Bench, scenario: Scenario, t_ns: int) -> Effects:
+def faults_at(bench: Bench, scenario: Scenario, t_ns: int) -> FaultLayer:
     """The faults of one frame of the display that is shown at a moment of a scenario. Raises InputError (see `FaultDesk`)."""
     view = display_view(bench, scenario)
     desk = FaultDesk(scenario, 1 / bench.config.monitor.refresh_hz, view.prepare)
     desk.begin(0)
-    return Effects(view, desk.at(t_ns))
+    return FaultLayer(view, desk.at(t_ns))

@@ -12,9 +12,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
-from hilstar.bench.faults.kinds import Fault, Glow, Gradient, MeasuredMap
-from hilstar.bench.faults.scenario import NO_SCENARIO, Scenario, lasts_ns
+from hilstar.bench.scenario import NO_SCENARIO, Scenario, lasts_ns
 from hilstar.errors import InputError, did_you_mean
+from hilstar.frame.fault_kinds import Fault, Glow, Gradient, MeasuredMap, Now
 from hilstar.units import NS_PER_S
 
 MAX_ON = 64
@@ -22,19 +22,6 @@ MAX_ASKED = 256
 SURFACES = (Glow, Gradient, MeasuredMap)  # each is drawn over the whole image
 MAX_SURFACES_ON = 8
 FILE = "file"  # who starts what a scenario has a time for
-
-
-@dataclass(frozen=True, slots=True)
-class Now:
-    """A fault that is on in a frame: the manieth of the run, and how long it has been on when the frame's light begins, ns.
-
-    `share` is the part of the frame that it lasts, 1 but for its first and its last one.
-    """
-
-    number: int
-    fault: Fault
-    since_ns: int
-    share: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,11 +81,8 @@ class FaultDesk:
         self._planned: list[_Planned] = []
         self._on: list[_Planned] = []
         self._listed: dict[str, Fault] = {}
-        for fault in scenario.faults:
-            try:
-                self._listed[fault.name] = ready = prepare(fault)
-            except InputError as error:
-                raise InputError(f"{scenario.path}: [[fault]] ({fault.name}): {error}") from error
+        for fault, ready in zip(scenario.faults, scenario.prepared(prepare), strict=True):
+            self._listed[fault.name] = ready
             if ready.at_s is not None:
                 self._planned.append(_Planned(ready, FILE, round(ready.at_s * NS_PER_S)))
 

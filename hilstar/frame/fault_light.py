@@ -1,22 +1,24 @@
-"""Faults as one camera sees them: what they add to a frame's sprites, and what they take away.
+"""What faults add to the light of one camera, and the stars that they take away.
 
-The display and the virtual tracker have a view each; nothing else differs between them.
+The display and the virtual tracker have a `FaultView` each; nothing else differs between them.
 """
 
 from __future__ import annotations
 
 import math
+import re
 import threading
 import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import msgspec
 import numpy as np
 
-from hilstar.arrays import Float32Array, FloatArray
-from hilstar.bench.faults.desk import Now
-from hilstar.bench.faults.kinds import (
+from hilstar.arrays import Float32Array, FloatArray, IntArray
+from hilstar.errors import InputError
+from hilstar.frame.fault_kinds import (
     CosmicRays,
     FalseStar,
     Fault,
@@ -24,54 +26,60 @@ from hilstar.bench.faults.kinds import (
     Glow,
     Gradient,
     MeasuredMap,
+    Now,
     Place,
     PointLight,
     StarGone,
 )
-from hilstar.bench.faults.lines import Chain, Lines, moved, tracks
-from hilstar.bench.faults.scenario import NO_SCENARIO, Scenario
-from hilstar.bench.faults.surfaces import gradient_image, map_image, read_map
-from hilstar.bench.faults.targets import Targets
-from hilstar.errors import InputError
+from hilstar.frame.layers import StarLayer
+from hilstar.frame.stray_light import gradient_image, map_image, read_map
+from hilstar.frame.view import Canvas
 from hilstar.rotation import direction_of, to_matrix
 from hilstar.scene import extended
 from hilstar.scene.camera import Camera
 from hilstar.scene.frame_motion import Scan
 from hilstar.scene.sprites import AddedLight, Sprites, pack_sprites
+from hilstar.sky.catalog import star_names
 from hilstar.sky.stars import Stars
 from hilstar.units import NS_PER_S, flux_ratio, magnitude
 
 TRACK_SEED = 2  # beside the number of an exposure
 TRACK_BV_MAG = 0.0  # a track has no colour; its magnitude is that of a white star of as many electrons
-KEPT_MAPS, KEPT_BURSTS = 16, 64
+KEPT_MAPS, KEPT_BURSTS, KEPT_STARS = 16, 64, 512  # a stream may ask for any star
+# Sprites this many sigmas apart make a line whose brightness ripples by 2 exp(-2 pi^2 / 1.5^2) = 3e-4.
+STEP_SIGMA = 1.5
+MAX_STEPS = 20_000  # on one line
 
 
 @dataclass(frozen=True, slots=True)
-class Sight:
-    """A camera and what a fault has to know to be drawn by it: the bench's two cameras, and its light.
+class FaultCamera:
+    """A camera's canvas and what a fault has to know to be drawn on it: the bench's two cameras, and its light.
 
-    `apparent` turns directions (n, 3) of ICRS into those that the bench's observer sees, and `v0_e_per_s` gives the electrons
-    per second of a star of V = 0 by its B-V.
+    `points` draws a few stars as the camera's own are drawn, `apparent` turns directions (n, 3), ICRS, into those that the
+    bench's observer sees, and `v0_e_per_s` gives the electrons per second of a star of V = 0 by its B-V.
     """
 
-    camera: Camera
+    canvas: Canvas
     monitor: Camera
     tracker: Camera
-    footprint_px: int
-    sigma_px: tuple[float, float]
     exposure_s: float
+    points: StarLayer
     apparent: Callable[[FloatArray], FloatArray]
     v0_e_per_s: Callable[[float], float]
     stars: Stars
 
 
 class FaultView:
-    """The faults of a scenario for one camera. A fault of the stream may be prepared while another thread draws."""
+    """The faults of one camera. A fault of the stream may be prepared while another thread draws.
 
-    def __init__(self, sight: Sight, scenario: Scenario = NO_SCENARIO) -> None:
-        self._sight, self._seed = sight, scenario.seed
-        self._folder = scenario.folder if scenario.faults else None
-        self._lasting = frozenset(scenario.faults)
+    `seed` is that of everything random in them. Maps are files in `folder` (None: a message names no file); those of the
+    `lasting` faults are kept.
+    """
+
+    def __init__(
+        self, by: FaultCamera, seed: int = 0, folder: Path | None = None, lasting: frozenset[Fault] = frozenset()
+    ) -> None:
+        self.by, self._seed, self._folder, self._lasting = by, seed, folder, lasting
         self._glow_kept: tuple[Fault, float, extended.Glow] | None = None
         self._lock = threading.Lock()
         self._targets = Targets()
@@ -81,25 +89,15 @@ class FaultView:
     def prepare(self, fault: Fault) -> Fault:
         """The fault as it is drawn, with everything ready that a frame has no time for. Raises InputError (see `FaultDesk`)."""
         if isinstance(fault, CosmicRays) and fault.for_s is None:
-            fault = msgspec.structs.replace(fault, for_s=self._sight.exposure_s)
-        self._targets.check(self._sight.stars, fault)
+            fault = msgspec.structs.replace(fault, for_s=self.by.exposure_s)
+        self._targets.check(self.by.stars, fault)
         if isinstance(fault, PointLight | CosmicRays):
-            self._sight.v0_e_per_s(getattr(fault, "bv_mag", TRACK_BV_MAG))
+            self.by.v0_e_per_s(getattr(fault, "bv_mag", TRACK_BV_MAG))
         if isinstance(fault, Gradient | MeasuredMap):
             self._map(fault)
         if isinstance(fault, Place) and (fault.tracker_px is not None or fault.screen_px is not None):
             self._check_place(fault)
         return fault
-
-    def prepared(self, scenario: Scenario) -> list[Fault]:
-        """The faults of a scenario as they are drawn. Raises InputError with the file and the fault."""
-        found = []
-        for fault in scenario.faults:
-            try:
-                found.append(self.prepare(fault))
-            except InputError as error:
-                raise InputError(f"{scenario.path}: [[fault]] ({fault.name}): {error}") from error
-        return found
 
     def _check_place(self, fault: Place) -> None:
         camera, place = self._source(fault)
@@ -113,9 +111,9 @@ class FaultView:
         if per_s is not None:
             return float(per_s)
         if in_exposure is not None:
-            return float(in_exposure) / self._sight.exposure_s
+            return float(in_exposure) / self.by.exposure_s
         if isinstance(fault, PointLight) and fault.v_mag is not None:
-            return float(flux_ratio(fault.v_mag)) * self._sight.v0_e_per_s(fault.bv_mag)
+            return float(flux_ratio(fault.v_mag)) * self.by.v0_e_per_s(fault.bv_mag)
         return 1.0
 
     def rng(self, name: str, *numbers: int) -> np.random.Generator:
@@ -137,9 +135,9 @@ class FaultView:
         return known
 
     def _laid_out(self, fault: Gradient | MeasuredMap) -> Float32Array:
-        sight = self._sight
+        by = self.by
         if isinstance(fault, Gradient):
-            return gradient_image(fault, sight.camera, sight.tracker)
+            return gradient_image(fault, by.canvas.camera, by.tracker)
         if self._folder is None:
             raise InputError(
                 f"file = {fault.file!r}: a message names no files; write the fault in the scenario, and start it by name"
@@ -147,13 +145,13 @@ class FaultView:
         values = read_map(self._folder / fault.file)
         if fault.electrons_per_s is not None or fault.electrons is not None:
             values = values / values.max()
-        return map_image(values, fault, sight.camera, sight.tracker if fault.frame == "tracker" else sight.monitor)
+        return map_image(values, fault, by.canvas.camera, by.tracker if fault.frame == "tracker" else by.monitor)
 
     def _source(self, fault: Place) -> tuple[Camera, tuple[float, float]]:
         """The camera in whose pixels a place is, and those."""
         if fault.tracker_px is not None:
-            return self._sight.tracker, fault.tracker_px
-        return self._sight.monitor, fault.screen_px or (0.0, 0.0)
+            return self.by.tracker, fault.tracker_px
+        return self.by.monitor, fault.screen_px or (0.0, 0.0)
 
     # What a frame asks for
 
@@ -172,21 +170,21 @@ class FaultView:
 
     def _direction(self, fault: FalseStar | Flash, stars: Stars) -> FloatArray | None:
         if isinstance(fault, Flash) and (fault.hip is not None or fault.star is not None):
-            for known in (stars, self._sight.stars):  # a star that is too faint to show is among the bench's all the same
+            for known in (stars, self.by.stars):  # a star that is too faint to show is among the bench's all the same
                 found = self._targets.find(known, fault)
                 if len(found):
                     return np.asarray(known.vectors[found[0]])
             return None
-        return np.asarray(self._sight.apparent(icrs_direction(fault)[None])[0])
+        return np.asarray(self.by.apparent(icrs_direction(fault)[None])[0])
 
     def star_direction(self, fault: Fault) -> FloatArray | None:
         """Where the star of a fault is on the sky (3,); None of a fault that is about none."""
-        found = self._targets.find(self._sight.stars, fault)
-        return np.asarray(self._sight.stars.vectors[found[0]]) if len(found) else None
+        found = self._targets.find(self.by.stars, fault)
+        return np.asarray(self.by.stars.vectors[found[0]]) if len(found) else None
 
     def _added(self, fault: PointLight, share: float = 1.0) -> AddedLight:
         rate = self.light_e_per_s(fault) * share
-        return AddedLight(fault.name, float(magnitude(rate / self._sight.v0_e_per_s(fault.bv_mag))), fault.bv_mag, rate)
+        return AddedLight(fault.name, float(magnitude(rate / self.by.v0_e_per_s(fault.bv_mag))), fault.bv_mag, rate)
 
     def camera_points(self, now: Sequence[Now], scan: Scan | None) -> tuple[list[Chain], list[AddedLight]]:
         """False stars and flashes that move with the camera, and tracks: chains, and what each line of them is called."""
@@ -199,34 +197,34 @@ class FaultView:
             elif isinstance(fault, CosmicRays):
                 burst = self._burst(fault, max(0, one.since_ns))
                 chains.append(replace(burst, electrons_per_s=burst.electrons_per_s * one.share))
-                rate = fault.electrons / self._sight.exposure_s * one.share
-                v_mag = float(magnitude(rate / self._sight.v0_e_per_s(TRACK_BV_MAG)))
+                rate = fault.electrons / self.by.exposure_s * one.share
+                v_mag = float(magnitude(rate / self.by.v0_e_per_s(TRACK_BV_MAG)))
                 lights += [AddedLight(fault.name, v_mag, TRACK_BV_MAG, rate)] * fault.number
         return chains, lights
 
     def _moving(self, fault: FalseStar | Flash, one: Now, scan: Scan | None) -> Chain:
         """A point's way over its pixels while they are lit."""
-        sight, (source, place) = self._sight, self._source(fault)
+        by, (source, place) = self.by, self._source(fault)
         rate, since_s = np.array(fault.rate_px_s), one.since_ns / NS_PER_S
         begin_s, hold_s = since_s, 0.0
         if scan is not None and rate.any():
-            x_px, y_px = moved(sight.camera, source, *(np.array([place]) + rate * since_s).T)
-            late_s = scan.late_s(x_px, y_px, sight.camera.resolution_px)[0]
+            x_px, y_px = by.canvas.camera.pixels_from(source, *(np.array([place]) + rate * since_s).T)
+            late_s = scan.late_s(x_px, y_px, by.canvas.camera.resolution_px)[0]
             begin_s, hold_s = since_s + (float(late_s) if math.isfinite(late_s) else 0.0), scan.hold_s
         ends = [(np.array(place) + rate * seconds)[None] for seconds in (begin_s, begin_s + hold_s)]
         light = np.array([self.light_e_per_s(fault) * one.share])
-        return Lines(ends[0], ends[1], light).seen_by(sight.camera, source, sight.sigma_px)
+        return Lines(ends[0], ends[1], light).seen_by(by.canvas.camera, source, by.canvas.sigma_px)
 
     def _burst(self, fault: CosmicRays, since_ns: int) -> Chain:
         """The tracks of the exposure that a moment is in, counted from the burst's beginning."""
-        sight = self._sight
-        number = int(since_ns // round(sight.exposure_s * NS_PER_S))
+        by = self.by
+        number = int(since_ns // round(by.exposure_s * NS_PER_S))
         key = (fault.name, number)
         if key not in self._tracks:
             if len(self._tracks) >= KEPT_BURSTS:
                 self._tracks.clear()
-            made = tracks(fault, sight.tracker.resolution_px, sight.exposure_s, self.rng(fault.name, TRACK_SEED, number))
-            self._tracks[key] = made.seen_by(sight.camera, sight.tracker, sight.sigma_px)
+            made = tracks(fault, by.tracker.resolution_px, by.exposure_s, self.rng(fault.name, TRACK_SEED, number))
+            self._tracks[key] = made.seen_by(by.canvas.camera, by.tracker, by.canvas.sigma_px)
         return self._tracks[key]
 
     def gone(self, now: Sequence[Now], stars: Stars) -> list[tuple[int, float]]:
@@ -261,25 +259,25 @@ class FaultView:
         return made
 
     def _new_glow(self, fault: Glow, share: float, q_icrs_to_cam: FloatArray) -> extended.Glow:
-        sight = self._sight
+        by = self.by
         if fault.tracker_px is not None or fault.screen_px is not None:
             source, (x_px, y_px) = self._source(fault)
             cam = source.rays(np.array([x_px]), np.array([y_px]))[0]
         else:
-            cam = to_matrix(q_icrs_to_cam) @ sight.apparent(icrs_direction(fault)[None])[0]
-        direction = sight.camera.cam_to_image @ cam
+            cam = to_matrix(q_icrs_to_cam) @ by.apparent(icrs_direction(fault)[None])[0]
+        direction = by.canvas.camera.cam_to_image @ cam
         # A monitor pixel collects as much of a tracker pixel's light as it covers of it.
-        covered = (sight.tracker.focal_length_px / sight.camera.focal_length_px) ** 2
+        covered = (by.tracker.focal_length_px / by.canvas.camera.focal_length_px) ** 2
         peak = self.light_e_per_s(fault) * share * covered
         unit = direction / np.linalg.norm(direction)
-        return extended.Glow(unit, peak, math.radians(fault.scale_deg), fault.exponent, sight.camera)
+        return extended.Glow(unit, peak, math.radians(fault.scale_deg), fault.exponent, by.canvas.camera)
 
     def footprints(self, chains: list[Chain]) -> list[Sprites]:
         """The sprites of chains; the lines count on from one to the next, as stars from -1 down."""
         made, first = [], 0
         for chain in chains:
             star = -1 - first - chain.line
-            size_px, footprint_px = self._sight.camera.resolution_px, self._sight.footprint_px
+            size_px, footprint_px = self.by.canvas.camera.resolution_px, self.by.canvas.footprint_px
             made.append(pack_sprites(chain.x_px, chain.y_px, chain.electrons_per_s, star, size_px, footprint_px))
             first += chain.lines
         return made
@@ -291,3 +289,98 @@ def icrs_direction(fault: Place) -> FloatArray:
         vector = np.array(fault.icrs)
         return np.asarray(vector / np.linalg.norm(vector))
     return direction_of(*(fault.radec_deg or (0.0, 0.0)))
+
+
+class Targets:
+    """Places of stars in a bench's arrays; found once for each of them, which keep their order for a whole run."""
+
+    def __init__(self) -> None:
+        self._found: dict[tuple[int, int | str], tuple[object, IntArray]] = {}
+
+    def find(self, stars: Stars, fault: Fault) -> IntArray:
+        """Where a fault's star is in `stars`; empty where it is not among them."""
+        if not isinstance(fault, Flash | StarGone):
+            return np.empty(0, dtype=np.intp)
+        wanted = fault.hip if fault.hip is not None else fault.star
+        if wanted is None:
+            return np.empty(0, dtype=np.intp)
+        key = (id(stars.hip), wanted)
+        known = self._found.get(key)
+        if known is None or known[0] is not stars.hip:  # the array is kept, so that no other one has its id
+            if len(self._found) >= KEPT_STARS:
+                self._found.clear()
+            known = self._found[key] = (stars.hip, _places(stars, wanted))
+        return known[1]
+
+    def check(self, stars: Stars, fault: Fault) -> None:
+        """Refuse (InputError) a star that the bench does not have."""
+        if not isinstance(fault, Flash | StarGone) or (fault.hip is None and fault.star is None):
+            return
+        if not len(self.find(stars, fault)):
+            said = f"hip = {fault.hip}" if fault.hip is not None else f'star = "{fault.star}"'
+            raise InputError(
+                f"{said}: not among the {len(stars)} stars and bodies of this bench; write one that is, or look at"
+                " [sky] faintest_v_mag"
+            )
+
+
+def _places(stars: Stars, wanted: int | str) -> IntArray:
+    if isinstance(wanted, int):
+        return np.flatnonzero(stars.hip == wanted)
+    first = len(stars) - len(stars.bodies)
+    if wanted in stars.bodies:
+        return np.array([first + stars.bodies.index(wanted)])
+    number = re.fullmatch(r"HIP (\d{1,9})", wanted)
+    if number is not None:
+        return np.flatnonzero(stars.hip == int(number[1]))
+    hip = next((hip for hip, names in star_names().items() if wanted in (names.name, names.designation)), None)
+    if hip is not None:
+        return np.flatnonzero(stars.hip == hip)
+    identifier = stars.catalog.identifier_of(wanted)
+    if identifier is None:
+        return np.empty(0, dtype=np.intp)
+    nameless = np.flatnonzero(stars.hip[:first] == 0)
+    return np.asarray(nameless[stars.catalog.identifier[stars.row[nameless]] == identifier], dtype=np.intp)
+
+
+@dataclass(frozen=True, slots=True)
+class Chain:
+    """Points of light (n,): pixels of a camera, electrons per second, and which of `lines` lines each is of."""
+
+    x_px: FloatArray
+    y_px: FloatArray
+    electrons_per_s: FloatArray
+    line: IntArray
+    lines: int
+
+
+@dataclass(frozen=True, slots=True)
+class Lines:
+    """Straight lines (n, 2) in pixels of a camera, each with its light, electrons per second (n,), evenly along it."""
+
+    begin_px: FloatArray
+    end_px: FloatArray
+    electrons_per_s: FloatArray
+
+    def seen_by(self, camera: Camera, source: Camera, sigma_px: tuple[float, float]) -> Chain:
+        """The lines in pixels of `source` as `camera` sees them; lines behind it or beyond its lens have no points."""
+        ends = [np.stack(camera.pixels_from(source, *place.T)) for place in (self.begin_px, self.end_px)]
+        length_sigma = np.hypot(*((ends[1] - ends[0]) / np.array(sigma_px)[:, None]))
+        known = np.nan_to_num(length_sigma, nan=-1.0, posinf=-1.0)
+        counts = np.where(known < 0, 0, np.minimum(np.ceil(known / STEP_SIGMA), MAX_STEPS - 1).astype(np.intp) + 1)
+        line = np.repeat(np.arange(len(counts)), counts)
+        first = np.repeat(np.cumsum(counts) - counts, counts)
+        # One point of a line that is none lies at its place; those of a longer one in the middles of its equal parts.
+        share = ((np.arange(len(line)) - first + 0.5) / counts[line])[:, None]
+        places = self.begin_px[line] * (1 - share) + self.end_px[line] * share
+        x_px, y_px = camera.pixels_from(source, *places.T)
+        return Chain(x_px, y_px, self.electrons_per_s[line] / counts[line], line, len(counts))
+
+
+def tracks(burst: CosmicRays, resolution_px: tuple[int, int], exposure_s: float, rng: np.random.Generator) -> Lines:
+    """The tracks of one exposure in tracker pixels: their middles anywhere on the detector, in any direction."""
+    width, height = resolution_px
+    middle = rng.random((burst.number, 2)) * (width, height) - 0.5
+    angle = rng.uniform(0.0, 2 * np.pi, burst.number)
+    half = burst.length_px / 2 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return Lines(middle - half, middle + half, np.full(burst.number, burst.electrons / exposure_s))

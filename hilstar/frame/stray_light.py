@@ -1,6 +1,6 @@
 """Stray light over an image: a gradient and a measured map, as one camera sees them.
 
-Both are laid out once in the camera's own pixels, with the light that each collects of a tracker pixel's.
+Both are computed once, in the camera's own pixels: what each collects of the light of a tracker pixel.
 """
 
 from __future__ import annotations
@@ -16,13 +16,12 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import Float32Array, FloatArray
-from hilstar.bench.faults.kinds import Gradient, MeasuredMap
-from hilstar.bench.faults.lines import moved
 from hilstar.errors import InputError, cannot_read
+from hilstar.frame.fault_kinds import Gradient, MeasuredMap
 from hilstar.reading import read_bytes
 from hilstar.scene.camera import Camera
 
-GRID_PX = 8  # the places of a camera's pixels in another's are smooth: cubics between every eighth are within 1e-4 px
+GRID_PX = 8  # a camera's pixels lie smoothly in another's: splines between every eighth are right to 1e-4 px
 MAX_FILE_BYTES = 200_000_000
 MAX_SIDE_PX = 16_384
 MAP_ADVICE = "give a FITS image, a greyscale PNG or an npy array of the whole detector"
@@ -45,7 +44,7 @@ def map_image(values: FloatArray, fault: MeasuredMap, camera: Camera, source: Ca
     x_px, y_px, area = pixels_in(camera, source)
     width, height = source.resolution_px
     rows, columns = values.shape
-    inside = (np.abs(x_px - (width - 1) / 2) <= width / 2) & (np.abs(y_px - (height - 1) / 2) <= height / 2)
+    inside = source.contains_px(x_px, y_px)
     place = np.stack([(y_px + 0.5) * rows / height - 0.5, (x_px + 0.5) * columns / width - 0.5])
     found = map_coordinates(values, np.where(inside, place, 0.0), order=1, mode="nearest")
     return as_light(np.where(inside, found * area, 0.0))
@@ -65,7 +64,7 @@ def pixels_in(camera: Camera, other: Camera) -> tuple[FloatArray, FloatArray, Fl
     coarse = _grid_in(camera, other)
     if coarse is None:
         y, x = np.mgrid[0:height, 0:width].astype(np.float64)
-        seen_x, seen_y = (part.reshape(height, width) for part in moved(other, camera, x.ravel(), y.ravel()))
+        seen_x, seen_y = (part.reshape(height, width) for part in other.pixels_from(camera, x.ravel(), y.ravel()))
         (x_down, x_right), (y_down, y_right) = np.gradient(seen_x), np.gradient(seen_y)
         return seen_x, seen_y, np.abs(x_right * y_down - x_down * y_right)
     x, y, area = (spline(np.arange(height), np.arange(width)) for spline in coarse)
@@ -73,15 +72,12 @@ def pixels_in(camera: Camera, other: Camera) -> tuple[FloatArray, FloatArray, Fl
 
 
 def _grid_in(camera: Camera, other: Camera) -> tuple[Any, Any, Any] | None:
-    """Cubics through the places of some of a camera's pixels in another's, and through what they cover.
-
-    None where some have no place.
-    """
+    """Splines for the places in another camera's pixels, x and y, and for the pixels covered; None if a place has none."""
     from scipy.interpolate import RectBivariateSpline
 
     across, down = (np.linspace(0, size - 1, max(5, size // GRID_PX)) for size in camera.resolution_px)
     x, y = np.meshgrid(across, down)
-    places = [part.reshape(x.shape) for part in moved(other, camera, x.ravel(), y.ravel())]
+    places = [part.reshape(x.shape) for part in other.pixels_from(camera, x.ravel(), y.ravel())]
     if not all(np.isfinite(place).all() for place in places):
         return None
     along_x, along_y = (RectBivariateSpline(down, across, place) for place in places)
@@ -124,7 +120,7 @@ def _decoded(path: Path, raw: bytes) -> npt.NDArray[Any]:
             from astropy.io import fits
 
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # of astropy, about a cut file: one line says so
+                warnings.simplefilter("ignore")  # astropy's about a cut file, which gets one line from us
                 units = fits.open(io.BytesIO(raw), memmap=False)
                 return next(np.asarray(unit.data) for unit in units if getattr(unit, "data", None) is not None)
     except Exception as error:  # each library raises its own for a damaged file

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import BoolArray, FloatArray, IntArray
+from hilstar.frame.bodies import disc_stars
+from hilstar.rotation import to_matrix
+from hilstar.scene.camera import Camera
 from hilstar.scene.sprites import Sprites
 from hilstar.sky.stars import Stars
 
@@ -114,3 +119,59 @@ def added_truth(sprites: Sprites, over: npt.NDArray[np.bool_]) -> npt.NDArray[np
     rows["drawn"] = True
     rows["clipped"] = np.bincount(line, over[of_added], minlength=len(star)) > 0
     return rows
+
+
+@dataclass(frozen=True, slots=True)
+class StarInView:
+    """A star in the field: its place in the sky (ICRS, apparent), in the image, and its angle from the boresight.
+
+    A body has a `name`, and 0 for `hip`.
+    """
+
+    hip: int
+    v_mag: float
+    ra_deg: float
+    dec_deg: float
+    constellation: str
+    x_px: float
+    y_px: float
+    from_boresight_deg: float
+    name: str
+
+
+def brightest_in_view(light: Sprites, stars: Stars, camera: Camera, q_icrs_to_cam: FloatArray, count: int) -> list[StarInView]:
+    """The `count` brightest stars and bodies of a view's light that are on the camera's pixels, the brightest first.
+
+    `stars` are those of the light, as seen at the attitude.
+    """
+    found = np.union1d(light.star[light.star >= 0], disc_stars(stars, light.discs))
+    vectors = stars.directions(found)
+    cam = vectors @ to_matrix(q_icrs_to_cam).T
+    x_px, y_px = camera.project(cam @ camera.cam_to_image.T)
+    inside = np.flatnonzero(camera.contains_px(x_px, y_px))
+    kept = inside[np.argsort(stars.v_mag[found[inside]], kind="stable")][:count]
+    found, cam, vectors, x_px, y_px = found[kept], cam[kept], vectors[kept], x_px[kept], y_px[kept]
+    off_rad = np.arctan2(np.hypot(cam[:, 0], cam[:, 1]), cam[:, 2])
+    x, y, z = vectors.T
+    ra_deg, dec_deg = np.degrees(np.arctan2(y, x)) % 360.0, np.degrees(np.arctan2(z, np.hypot(x, y)))
+    columns = (
+        stars.hip[found].tolist(),
+        stars.v_mag[found].tolist(),
+        ra_deg.tolist(),
+        dec_deg.tolist(),
+        _constellations(ra_deg, dec_deg),
+        x_px.tolist(),
+        y_px.tolist(),
+        np.degrees(off_rad).tolist(),
+        stars.names(found),
+    )
+    return [StarInView(*row) for row in zip(*columns, strict=True)]
+
+
+def _constellations(ra_deg: FloatArray, dec_deg: FloatArray) -> list[str]:
+    """The constellations of places in the sky (IAU boundaries of 1930, through Astropy)."""
+    from astropy.coordinates import SkyCoord, get_constellation  # takes half a second, which only this needs
+
+    if not len(ra_deg):
+        return []
+    return [str(name) for name in get_constellation(SkyCoord(ra_deg, dec_deg, unit="deg"))]

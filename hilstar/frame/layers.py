@@ -1,0 +1,80 @@
+"""The light of a view: stars, then bodies, then satellites, then faults."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+from hilstar.frame.bodies import BodyLayer
+from hilstar.frame.satellites import SatelliteLayer
+from hilstar.frame.view import Canvas, Layer, View
+from hilstar.scene.exposure_motion import MIDDLE_S, smeared_sprites
+from hilstar.scene.frame_motion import swept_sprites
+from hilstar.scene.sprites import Candidates, Sprites, join_sprites, make_sprites, with_sprites
+from hilstar.sky.stars import Stars
+
+if TYPE_CHECKING:
+    from hilstar.sky.bodies.moving import MovingSky
+
+
+def seen_in(view: View, stars: Stars, moving: MovingSky | None) -> Stars:
+    """A bench's stars as a view has them; bodies are moved to their places in the arrays of `stars`."""
+    return stars.seen_at(view.velocity_km_s) if moving is None else moving.seen(stars, *view.observer)
+
+
+def sky_layers(
+    canvas: Canvas,
+    moving: MovingSky | None = None,
+    faintest_e_per_s: float = 0.0,
+    frequent: Stars | None = None,
+    *,
+    paths: bool = True,
+) -> tuple[Layer, ...]:
+    """The layers of the sky: a bench's stars, bodies, and satellites of at least `faintest_e_per_s`.
+
+    For `frequent` and `paths` see `StarLayer`.
+    """
+    layers: list[Layer] = [StarLayer(canvas, frequent, paths)]
+    if moving is not None and moving.names:
+        layers.append(BodyLayer(moving, canvas))
+    if moving is not None and moving.satellites is not None:
+        layers.append(SatelliteLayer(moving, canvas, faintest_e_per_s))
+    return tuple(layers)
+
+
+def light_of(canvas: Canvas, layers: Iterable[Layer], stars: Stars, view: View) -> Sprites:
+    """The light of a view, layer by layer; `stars` are as seen in it (see `seen_in`)."""
+    light = join_sprites([], canvas.footprint_px)
+    for layer in layers:
+        light = layer.add(light, stars, view)
+    return light
+
+
+@dataclass(frozen=True, slots=True)
+class StarLayer:
+    """Stars: points where the camera is at rest or without `paths`, otherwise each along its path while light arrives.
+
+    The stars `frequent` are drawn in most frames: those near the field are kept from one frame to the next.
+    """
+
+    canvas: Canvas
+    frequent: Stars | None = None
+    paths: bool = True
+    candidates: Candidates = field(default_factory=Candidates, repr=False)
+
+    def add(self, light: Sprites, stars: Stars, view: View) -> Sprites:
+        """The light before, with a sprite or a chain of sprites for each star on the image."""
+        made = self._sprites(stars, view)
+        return with_sprites(light, [made]) if len(light) or light.extended else made
+
+    def _sprites(self, stars: Stars, view: View) -> Sprites:
+        canvas, camera = self.canvas, self.canvas.camera
+        if view.exposed and self.paths:
+            return smeared_sprites(stars, view.motion, camera, canvas.footprint_px, canvas.sigma_px)
+        if view.turns and self.paths:
+            made = swept_sprites(stars, view.turn, view.scan, camera, canvas.footprint_px, canvas.sigma_px)
+            return replace(made, rate_cam_rad_s=view.rate_cam_rad_s)
+        icrs_to_image = view.motion.icrs_to_image(MIDDLE_S, camera)[0] if view.exposed else view.icrs_to_image(camera)
+        candidates = self.candidates if stars is self.frequent else None
+        return make_sprites(stars, icrs_to_image, camera, canvas.footprint_px, candidates)

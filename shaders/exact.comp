@@ -1,26 +1,25 @@
 #version 430 core
-// `exact`: for each star, or stretch of a path, which of the two levels about its light each pixel takes. hilstar/monitor/exact.py
-// is the same in NumPy and says how; the ten sums are those of hilstar/monitor/balance.py.
-// It comes after the linear image and its nearest levels, and changes those levels. A pixel is the star's that gives more than half
-// of its light, so no pixel is written by two.
-// With TEMPORAL a star begins with what it left in the frame before (hilstar/monitor/temporal.py).
-// Defined before this text: LEVELS (r8ui or r16ui), NEAR, the most pixels that are chosen, SIZE and FIRST, a footprint's pixels along
-// an axis and the first of them from the star's; and exact/inputs.glsl, exact/stars.glsl, exact/pixels.glsl and
-// exact/choices.glsl.
-// On a CPU what is read costs most: a word for a pixel's place, once, and images rather than textures. And a branch costs both its
-// sides there, since eight stars go together: so nothing is decided by the number of a pixel, and loops end where a star's do.
+// `exact`: chooses, for each pixel of a star or of a stretch of a path, one of the two levels around its light.
+// hilstar/monitor/exact.py is the same method in NumPy and explains it; the ten sums are those of hilstar/monitor/balance.py.
+// The pass runs after the linear image and its nearest levels are drawn, and changes those levels. A pixel belongs to the star that
+// gives more than half of its light, so no pixel is written by two stars.
+// With TEMPORAL a star begins with the errors that it left in the frame before (hilstar/monitor/temporal.py).
+// Defined before this text: LEVELS (r8ui or r16ui); NEAR, the maximum number of pixels chosen; SIZE, a footprint's side in pixels;
+// FIRST, its first pixel relative to the star's own; and exact/inputs.glsl, exact/stars.glsl, exact/pixels.glsl, exact/choices.glsl.
+// On a CPU memory reads cost most: a pixel's place is one word, read once, and images are read faster than textures. A branch costs
+// both its sides there, because eight stars run in one vector: no decision depends on a pixel's number, and loops end with the star.
 
 layout(local_size_x = 32) in;
 
-// Decide the star's pixels one after another, eight choices side by side; the best of them. It begins with `error` of light and
-// moments, and `carried` of the rest.
+// Decide the star's pixels one after another, with eight choices side by side, and return the best. The sums begin with `error` for
+// light and moments, and with `carried` for the rest.
 Choice decide(Near near, vec3 error, Sums carried) {
     vec3 begin = error * vec3(near.light_weight, weights.yy);
     float begin_square = dot(begin, begin) + carried.a.w * carried.a.w + dot(carried.b, carried.b) + dot(carried.c, carried.c);
     Choice kept[KEPT];
 #define BEGIN(M) kept[M] = Choice(vec4(begin, carried.a.w), carried.b, carried.c, M == 0 ? begin_square : NONE, BITS(0u));
     EIGHT(BEGIN)
-    // Three pixels at a time, the last of which may be none: those change nothing.
+    // Three pixels at a time. The last two may be padding, which changes nothing.
     for (int k = near.pixels; k < near.pixels + 2; k++) {
 #ifdef PATHS
         place[k] = 0u;
@@ -41,7 +40,7 @@ Choice decide(Near near, vec3 error, Sums carried) {
     return best;
 }
 
-// Where all steps are equal: turn the one pixel that brings the light a step nearer and costs the other sums least.
+// Where all steps are equal: turn the one pixel that brings the light a step nearer at the smallest cost in the other sums.
 Choice turn_one(Near near, Choice best) {
     bool rise = best.a.x < 0.0;
     float least = NONE;
@@ -65,7 +64,7 @@ Choice turn_one(Near near, Choice best) {
     return best;
 }
 
-// Only the pixels that are not as they were rounded.
+// Write only the pixels whose level is not the nearest one.
 void store(Near near, BITS up) {
 #define STORE(BITS_OF, FROM) \
     for (uint turned = up BITS_OF ^ near.rounded_up BITS_OF; turned != 0u; turned &= turned - 1u) { \
@@ -83,12 +82,12 @@ void store(Near near, BITS up) {
 #endif
 }
 
-// Choose the levels of one sprite; `carried` is what it has to make up for, and what is returned is what it leaves. Where all
-// steps are equal it has `phase` of one in hand. `of_light` is the light of the whole star.
+// Choose the levels of one sprite and return the errors that it leaves. `carried` are the errors that it has to make up for;
+// where all steps are equal, `phase` is the part of one that its light has in hand. `of_light` is the whole star's light, e-/s.
 Sums choose(Star star, float of_light, Sums carried, float phase) {
     Near near = pixels_of(star, of_light);
 #ifdef TEMPORAL
-    float limit = MAX_CARRIED_STEPS * near.largest;  // a star that cannot make up for it saves nothing up
+    float limit = MAX_CARRIED_STEPS * near.largest;  // so that a star that cannot make up for its errors does not accumulate them
     carried = Sums(clamp(carried.a, -limit, limit), clamp(carried.b, -limit, limit), clamp(carried.c, -limit, limit));
 #endif
     vec3 error = carried.a.xyz;
@@ -96,7 +95,7 @@ Sums choose(Star star, float of_light, Sums carried, float phase) {
     error = error_beyond(near, error);
 #endif
     bool equal = near.largest > 0.0 && near.largest <= near.smallest * (1.0 + SAME_STEP);
-    float hidden = 0.0;  // of the light, what no choice can show
+    float hidden = 0.0;  // the part of the light that no choice can show
     if (equal) {
         error.x += phase * near.largest;
         float all_down = near.lowest + error.x;

@@ -1,9 +1,10 @@
 #version 430 core
-// A frame's stars to light and levels, a star a lane, within the reach of each. With LIGHT each adds to the sums of its pixels;
-// with LEVELS those become levels, the nearest; with neither levels become black again.
-// On llvmpipe this takes a quarter of the time of points that are rasterised and blended (hilstar/render/star_passes.py).
-// Defined before this text: LEVELS_FORMAT (r8ui or r16ui), FOOTPRINT; with KEEP sums stay as they are for exact.comp, else they are
-// nothing again when they have become levels. It comes after shares.glsl and sums.glsl.
+// Draws a frame's stars, one per lane, each within the ellipse that it lights. With LIGHT a star adds its light to the sums of its
+// pixels; with LEVELS the sums become the nearest levels; with neither the levels become black again.
+// On llvmpipe this takes a quarter of the time of rasterised and blended points (hilstar/render/star_passes.py).
+// splat.frag repeats this arithmetic operation by operation, so that points make the same levels.
+// Defined before this text: LEVELS_FORMAT (r8ui or r16ui), FOOTPRINT. With KEEP the sums stay for exact.comp, else they are set to 0
+// when they become levels. It comes after shares.glsl and sums.glsl.
 
 layout(local_size_x = 32) in;
 
@@ -27,10 +28,10 @@ uniform sampler2D gain;
 
 uniform int count;
 uniform ivec2 resolution_px;
-uniform float most_e_per_s;  // of one star in one pixel: more is white in any case
+uniform float most_e_per_s;  // maximum light of one star in one pixel: more is white in any case
 uniform float reach_per_e;   // a star lights an ellipse: the logarithm of this times its rate, times these squares of its axes
 uniform vec2 reach_px2;
-uniform float least_reach;   // of that logarithm
+uniform float least_reach;   // minimum of that logarithm
 
 const int FIRST = -((FOOTPRINT - 1) / 2);
 
@@ -68,7 +69,7 @@ void main() {
             int sum = sums[here];
 #else
             int sum = atomicExchange(sums[here], 0);
-            if (sum == 0) continue;  // another star's too, and done
+            if (sum == 0) continue;  // shared with another star, and already done
 #endif
             float light = float(sum) * unit_e_per_s;
 #ifdef UNIFORMITY

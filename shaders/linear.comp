@@ -1,8 +1,8 @@
 #version 430 core
-// The linear image, added up in a buffer (hilstar/render/host_image.py): the pixels of stars that were there become black, then
-// those that are there add their light. A work group has a band of rows, and each of its lanes every eighth row: no two
-// lanes write the same pixel, and each takes stars in their order, so that the same stars give the same bits whatever runs side by
-// side. Lanes in rows of their own wait for memory at once: two columns and four rows take a seventh more time.
+// Adds up the linear image in a buffer (hilstar/render/host_image.py): the pixels of the last frame's stars become black, then this
+// frame's stars add their light. A work group draws a band of rows, and each lane every eighth row of it. No two lanes write the
+// same pixel, and each takes the stars in their order, so the same stars give the same bits however many threads run. Lanes in rows
+// of their own wait for memory together: two columns and four rows of lanes take a seventh more time.
 // Defined before this text: FOOTPRINT, BANDS; and shares.glsl.
 
 layout(local_size_x = 8) in;
@@ -10,19 +10,19 @@ layout(local_size_x = 8) in;
 layout(std430, binding = 0) readonly buffer Sprites { int sprite[]; };  // five words each, as SPRITE_DTYPE
 layout(std430, binding = 1) buffer Light { float linear_e_per_s[]; };
 
-uniform ivec4 stars[BANDS];  // of each band: the first star that was there, the end of them, the same of those that are there
+uniform ivec4 stars[BANDS];  // for each band: first and end of the last frame's stars, first and end of this frame's
 uniform int bands;           // one, or an even number
-uniform int done;            // stars of each band that earlier passes have taken
+uniform int done;            // number of stars of each band taken by earlier passes
 uniform int at_once;
 uniform ivec2 resolution_px;
 
 const int FIRST = -((FOOTPRINT - 1) / 2);
 const int STEP = 8;  // rows from one of a lane's to the next: a power of two
 
-int top, bottom;  // of the band's rows
-int own;          // the first row of this lane's
+int top, bottom;  // the band's rows
+int own;          // this lane's first row
 
-// Make a star's pixels black, or add its light. It is written out for either: a choice in each pixel takes a sixth more time.
+// Make a star's pixels black, or add its light.
 void take(int i, bool black) {
     ivec2 pixel = ivec2(sprite[5 * i], sprite[5 * i + 1]);
     vec2 fraction = vec2(intBitsToFloat(sprite[5 * i + 2]), intBitsToFloat(sprite[5 * i + 3]));

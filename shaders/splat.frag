@@ -10,7 +10,7 @@ flat in float star_electrons_per_s;
 flat in vec2 star_reach_px;
 
 uniform float unit_e_per_s;
-uniform float most_e_per_s;  // of one star in one pixel: more is white in any case
+uniform float most_e_per_s;  // maximum light of one star in one pixel: more is white in any case
 
 // As the loops of light.comp, operation by operation: codes are compared with its codes.
 bool within_reach(ivec2 offset) {

@@ -212,10 +212,161 @@ def separated() -> str:
     return d.svg()
 
 
+def theory_bench() -> str:
+    """theory-bench.md: the bench with its frames' axes and pixels."""
+    d = Drawing("The bench and its frames: monitor pixels, cam and mon axes, the tracker's pixels, the sky at infinity", 372)
+    d.text(20, 24, "monitor", "head")
+    d.text(20, 24 + LINE_PX, "pixel (0, 0) is the centre of the top left one", "note")
+    d.parts.append('<rect x="40" y="64" width="176" height="112" rx="2" class="box"/>')
+    d.parts.append('<rect x="40" y="64" width="10" height="10" class="own"/>')
+    d.arrow((45, 69), (118, 69))
+    d.text(122, 74, "x right", "note")
+    d.arrow((45, 69), (45, 128))
+    d.text(52, 134, "y down", "note")
+    d.parts.append('<circle cx="150" cy="128" r="4" class="light"/>')
+    d.text(140, 154, "a star’s pixels", "middle note")
+    d.text(20, 202, "seen as the tracker sees it", "note")
+    d.line((262, 120), (740, 120), kind="line dash")
+    d.parts.append('<rect x="262" y="72" width="10" height="96" class="box"/>')
+    d.text(267, 62, "monitor", "middle head")
+    d.parts.append('<ellipse cx="452" cy="120" rx="11" ry="58" class="box"/>')
+    d.text(452, 52, "collimator", "middle head")
+    d.parts.append('<rect x="620" y="82" width="84" height="76" rx="8" class="box"/>')
+    d.parts.append('<rect x="606" y="96" width="14" height="48" class="box"/>')
+    d.text(665, 62, "tracker", "middle head")
+    for y1 in (84, 120, 156):
+        d.line((272, 100), (452, y1), kind="ray")
+    slope = 20 / 180
+    for y1 in (96, 108, 120):
+        d.arrow((452, y1), (604, y1 + slope * 152), kind="ray", tip="raytip")
+    d.arrow((665, 120), (560, 120), kind="line", tip="tip")
+    d.text(496, 176, "+z boresight", "note")
+    d.line((530, 164), (566, 124), kind="line dash")
+    d.arrow((665, 120), (665, 196))
+    d.text(672, 194, "+y down", "note")
+    d.parts.append('<circle cx="665" cy="120" r="6" class="box"/>')
+    d.line((661, 116), (669, 124))
+    d.line((661, 124), (669, 116))
+    d.text(714, 92, "+x into", "note")
+    d.text(714, 92 + 15, "page", "note")
+    d.span(272, 452, 190, "focal length f")
+    rows = (
+        ("icrs", "stars at the epoch", "box"),
+        ("cam", "+z boresight, +x right, +y down", "own"),
+        ("mon", "the monitor’s own, at the lens", "own"),
+        ("pixel", "x = x₀ + (f / pitch) · X / Z; y alike", "light"),
+    )
+    for k, (name, words, kind) in enumerate(rows):
+        x = 12 + 186 * k
+        d.box((x, 262), (150, 40), name, kind)
+        d.text(x + 75, 322 + LINE_PX * (k % 2), words, "middle note")
+        if k < len(rows) - 1:
+            d.arrow((x + 150, 282), (x + 186, 282))
+    for k, words in enumerate(("q_icrs_to_cam", "q_cam_to_mon", "lens, tilt")):
+        d.text(180 + 186 * k, 252, words, "middle note")
+    d.text(180, 236, "the stream", "middle")
+    d.text(366, 236, "misalignment", "middle")
+    d.text(552, 236, "geometry", "middle")
+    return d.svg()
+
+
+def theory_light() -> str:
+    """theory-light.md: from a catalogue's magnitude to the light that the tracker receives."""
+    d = Drawing("The light chain: magnitude and colour, electron rate, sprite, linear image, level, code, light, tracker", 300)
+    rows = (
+        (
+            ("V, B-V, V-I", "Hipparcos, or\nyour table"),
+            ("Spectrum", "by colour,\nscaled to V"),
+            ("Electron rate", "optics, QE:\none number a star"),
+            ("Sprite", "pixel, fraction,\nelectrons/s"),
+            ("Linear image", "electrons/s that\na pixel must cause"),
+        ),
+        (
+            ("Level", "index into the\nresponse"),
+            ("Code", "what the monitor\nis given"),
+            ("Light", "response, black,\nuniformity"),
+            ("Collimator", "a direction\nfor each pixel"),
+            ("Tracker", "its own PSF,\nnoise and ADC"),
+        ),
+    )
+    w, gap = 128, 27
+    for row, steps in enumerate(rows):
+        y = 40 + 142 * row
+        for k, (head, note) in enumerate(steps):
+            x = 6 + k * (w + gap)
+            kind = ("box" if k == 0 else "own") if row == 0 else ("own" if k < 2 else "light")
+            d.box((x, y), (w, 74), f"{head}\n{note}", kind)
+            if k < len(steps) - 1:
+                d.arrow(
+                    (x + w, y + 37),
+                    (x + w + gap, y + 37),
+                    kind="ray" if row and k > 1 else "line",
+                    tip="raytip" if row and k > 1 else "tip",
+                )
+    d.arrow((690, 114), (690, 148), (70, 148), (70, 182))
+    d.text(380, 141, "quantiser: round, dither, exact or temporal", "middle note")
+    d.text(6, 24, "blue: computed by hilstar in electrons per second of the tracker", "note")
+    d.text(6, 288, "orange: hardware; the twin and the virtual tracker model it, the display adds none of it", "note")
+    return d.svg()
+
+
+def theory_frame() -> str:
+    """theory-frame.md: packets, clocks and frames on one axis of time."""
+    d = Drawing(
+        "The frame loop in time: packets, offset, prediction, drawing, swap, scan-out, light, over three refreshes", 392
+    )
+    left, period = 128.0, 190.0
+
+    def at(refreshes: float) -> float:
+        return left + period * refreshes
+
+    for k in range(4):
+        d.line((at(k), 34), (at(k), 342), kind="line dash")
+        d.text(at(k), 26, f"refresh {k}" if k < 3 else "t", "middle note")
+    for y, head, note in (
+        (58, "sender", "its clock, t_ns"),
+        (118, "host", "arrival, stamped"),
+        (178, "frame loop", "CPU and GPU"),
+        (238, "swap", "vertical blank"),
+        (298, "panel", "rows, top to bottom"),
+    ):
+        d.text(8, y, head, "head")
+        d.text(8, y + LINE_PX - 2, note, "note")
+    for k in range(9):
+        x = at(0.05 + 0.31 * k)
+        d.line((x, 48), (x, 66))
+        d.line((x, 66), (x + 14 + 5 * (k % 3), 108), kind="ray")
+        d.line((x + 14 + 5 * (k % 3), 108), (x + 14 + 5 * (k % 3), 126))
+    for k in range(2):
+        begin, end = at(k + 0.62), at(k + 0.78)
+        d.parts.append(f'<rect x="{begin:g}" y="166" width="{end - begin:g}" height="28" class="own"/>')
+        d.text((begin + end) / 2, 184, "draw", "middle note")
+        d.arrow((end, 180), (at(k + 1), 226))
+        d.arrow((at(k + 1), 240), (at(k + 1) + 18, 268), kind="ray", tip="raytip")
+        x0, top, bottom = at(k + 1) + 18, 272.0, 332.0
+        slant, edge = 0.86 * period, 744.0
+        corners = [(x0, top), (x0 + period, top), (x0 + period + slant, bottom), (x0 + slant, bottom)]
+        if corners[2][0] > edge:
+            cut = top + (edge - corners[1][0]) / slant * (bottom - top)
+            corners[2:3] = [(edge, cut), (edge, bottom)]
+        points = " ".join(f"{x:g},{y:g}" for x, y in corners)
+        d.parts.append(f'<polygon points="{points}" class="light"/>')
+        d.text(x0 + 92, 308, f"light of frame {k + 1}", "note")
+    d.parts.append(f'<circle cx="{at(1) + 18 + 0.43 * period:g}" cy="302" r="4" class="raytip"/>')
+    d.line((at(1) + 18 + 0.43 * period, 306), (at(1) + 18 + 0.43 * period, 352))
+    d.text(at(1) + 18 + 0.43 * period, 366, "the attitude is predicted to here: the middle row’s first light", "middle")
+    d.text(at(1) + 18 + 0.43 * period, 382, "swap + panel_delay_ms + scanout_ms / 2", "middle note")
+    d.text(at(0.62), 212, "latest packets in", "middle note")
+    return d.svg()
+
+
 DRAWINGS = {
     "drawing-chain.svg": chain,
     "drawing-bench.svg": bench,
     "drawing-packet.svg": packet_life,
     "drawing-heads.svg": heads,
     "drawing-errors.svg": separated,
+    "drawing-theory-bench.svg": theory_bench,
+    "drawing-theory-light.svg": theory_light,
+    "drawing-theory-frame.svg": theory_frame,
 }

@@ -36,17 +36,31 @@ def test_every_page_stands_in_one_group_of_the_site():
     """As the contents of a book: no page without a group, none twice, and no group of one."""
     lines = (ROOT / "mkdocs.yml").read_text().partition("\nnav:\n")[2].partition("\n\n")[0].splitlines()
     groups = [line.strip(" -:") for line in lines if line.endswith(":")]
-    assert groups == ["Start", "Bench", "Sky", "Run", "Prove", "Reference"]
+    assert groups == ["Start", "Theory", "Bench", "Sky", "Run", "Prove", "Reference"]
     named = [line.rpartition(" ")[2] for line in lines if line.endswith(".md")]
     pages = {page.name for page in (ROOT / "docs").glob("*.md")} | {"changes.md", "examples.md"}
     assert len(named) == len(set(named)) and set(named) == pages
 
 
-@pytest.mark.parametrize("page", ["index", "first-day", "attitude-in", "heads", "error-budget"])
+PAGES_WITH_DRAWINGS = [
+    "index",
+    "first-day",
+    "attitude-in",
+    "heads",
+    "error-budget",
+    "theory-bench",
+    "theory-light",
+    "theory-frame",
+]
+
+
+@pytest.mark.parametrize("page", PAGES_WITH_DRAWINGS)
 def test_a_drawing_is_light_and_dark(page):
-    (name,) = re.findall(r"\((drawing-\w+\.svg)\)", (ROOT / "docs" / f"{page}.md").read_text())
-    drawing = (ROOT / "docs" / name).read_text()
-    assert "prefers-color-scheme:dark" in drawing and "<title>" in drawing
+    names = re.findall(r"\((drawing-[\w-]+\.svg)\)", (ROOT / "docs" / f"{page}.md").read_text())
+    assert names
+    for name in names:
+        drawing = (ROOT / "docs" / name).read_text()
+        assert "prefers-color-scheme:dark" in drawing and "<title>" in drawing
 
 
 def test_a_plain_view_of_the_repository_shows_the_python_api_too():

@@ -38,7 +38,7 @@ from hilstar.calibrate.measurements import (
 )
 from hilstar.charts import BLUE, GREEN, INK, MUTED, RED, chart, label_ends
 from hilstar.errors import InputError
-from hilstar.monitor.calibration import Head, NotesTable, load_calibration, write_calibration
+from hilstar.monitor.calibration import CalibrationHead, NotesTable, load_calibration, write_calibration
 from hilstar.monitor.response import srgb_light
 from hilstar.units import MAG_PER_RELATIVE
 
@@ -390,8 +390,8 @@ def calibrate_photometric(
     )
 
 
-def _head(bits: int, output: Path, provenance: Provenance) -> Head:
-    return Head(
+def _head(bits: int, output: Path, provenance: Provenance) -> CalibrationHead:
+    return CalibrationHead(
         kind="photometric",
         who=provenance.who or NOT_STATED,
         when=provenance.when or datetime.date.today().isoformat(),

@@ -19,7 +19,7 @@ from hilstar.errors import InputError, MachineError
 from hilstar.files import make_directory, write_whole
 from hilstar.monitor.response import code_dtype
 from hilstar.reading import read_text
-from hilstar.render.presenter import Presenter, View, level_texture, window_context
+from hilstar.render.presenter import Presenter, ScreenView, level_texture, window_context
 
 if TYPE_CHECKING:
     from hilstar.monitor.window.window import Window
@@ -151,7 +151,7 @@ def show_patches(planned: Sequence[Patch], bits: int, display: int | str, second
         size_px = window.size_px
         square = (patch_image(Patch(1, "w"), size_px, 8) > 0).astype(np.uint8)
         nothing = np.zeros((2, 3), dtype=np.uint16)
-        view = View(size_px, size_px, bits, triples=nothing)
+        view = ScreenView(size_px, size_px, bits, triples=nothing)
         presenter = Presenter(level_texture(window_context(), square), view)
         for shown, patch in enumerate(planned):
             triples = nothing.copy()

@@ -160,7 +160,7 @@ def with_uniformity(source: str | Path, bits: int, path: Path, grid: FloatArray 
     response, weights, noise, notes = f"{path.stem}.csv", None, 0.0, NotesTable()
     if str(source) in FORMULAS:
         light = srgb_response(bits) if str(source) == "srgb" else gamma_response(bits)
-        head = Head("photometric", "", "", f"none: the formula {source}", "relative", bits, response)
+        head = CalibrationHead("photometric", "", "", f"none: the formula {source}", "relative", bits, response)
         columns, weights = {"w": light.light}, WeightsTable(*REC709_WEIGHTS)
     else:
         origin, digest = EXAMPLE if str(source) == "lcd-example" else Path(source), hashlib.sha256()
@@ -232,7 +232,7 @@ class Digest(Protocol):
         """The hash so far."""
 
 
-class Head(Table, frozen=True):
+class CalibrationHead(Table, frozen=True):
     """[calibration]: who measured what."""
 
     kind: Literal["photometric"]
@@ -275,7 +275,7 @@ class NotesTable(Table, frozen=True):
 class CalibrationFile(Table, frozen=True):
     """A whole calibration file."""
 
-    calibration: Head
+    calibration: CalibrationHead
     weights: WeightsTable | None = None
     uniformity: UniformityTable | None = None
     noise: NoiseTable | None = None
@@ -393,7 +393,7 @@ def read_grid(path: Path, digest: Digest) -> FloatArray:
 
 def write_calibration(
     path: Path,
-    head: Head,
+    head: CalibrationHead,
     columns: dict[str, FloatArray],
     noise: float,
     notes: NotesTable,

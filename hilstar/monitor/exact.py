@@ -274,7 +274,7 @@ def _between_steps(lowest: Float32Array, grid: Float32Array) -> Float32Array:
 
 
 @dataclass(frozen=True, slots=True)
-class _Kept:
+class _KeptStars:
     """The choices kept side by side: their sums (SUMS, KEPT, n), the pixels that are up (near, KEPT, n), and who is missing."""
 
     error: Float32Array
@@ -330,7 +330,7 @@ def _decide(pixels: _Pixels, grid: Float32Array) -> tuple[npt.NDArray[np.bool_],
     near, count = pixels.step.shape
     missing = np.zeros((KEPT, count), dtype=np.float32)
     missing[1:] = NONE
-    kept = _Kept(np.repeat(pixels.error[:, None], KEPT, axis=1), np.zeros((near, KEPT, count), dtype=np.bool_), missing)
+    kept = _KeptStars(np.repeat(pixels.error[:, None], KEPT, axis=1), np.zeros((near, KEPT, count), dtype=np.bool_), missing)
     error = kept.error
     for pixel in range(near):
         arm, step = pixels.arm[:, pixel, None], pixels.step[pixel]

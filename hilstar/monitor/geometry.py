@@ -27,7 +27,7 @@ Finite = Annotated[float, Meta(ge=-1e9, le=1e9)]
 Sizes = tuple[Annotated[int, Meta(ge=1, le=32768)], Annotated[int, Meta(ge=1, le=32768)]]
 
 
-class Field(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class FieldTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """[field]: Chebyshev coefficients in px; entry [i][j] belongs to T_i of the column and T_j of the row."""
 
     x_px: list[list[Finite]]
@@ -100,7 +100,7 @@ class GeometryFile(LensTable, frozen=True, forbid_unknown_fields=True, kw_only=T
     q_cam_to_mon: tuple[Finite, Finite, Finite, Finite]
     tilt_deg: tuple[Annotated[float, Meta(gt=-60, lt=60)], Annotated[float, Meta(gt=-60, lt=60)]] = (0.0, 0.0)
     max_field_deg: Annotated[float, Meta(gt=0, lt=90)] | None = None
-    field: Field | None = None
+    field: FieldTable | None = None
     sigma: dict[str, float] = {}
     error: ErrorTable | None = None
     made: MadeTable | None = None
@@ -145,7 +145,7 @@ def _read(path: Path) -> GeometryFile:
         raise InputError(f"{path}: {shortened(str(error))}; {ADVICE}") from error
 
 
-def _field(path: Path, field: Field, resolution_px: tuple[int, int]) -> ResidualField:
+def _field(path: Path, field: FieldTable, resolution_px: tuple[int, int]) -> ResidualField:
     sizes = {len(field.x_px), len(field.y_px), *map(len, field.x_px), *map(len, field.y_px)}
     if len(sizes) != 1 or not 0 < len(field.x_px) <= MAX_TERMS:
         raise InputError(f"{path}: [field] has no two squares of one size, up to {MAX_TERMS}; {ADVICE}")
@@ -174,7 +174,7 @@ def write_geometry(path: Path, camera: Camera, q_cam_to_mon: FloatArray, notes: 
     lens = camera.lens or Lens()
     field = None
     if lens.field is not None:
-        field = Field(x_px=lens.field.x.tolist(), y_px=lens.field.y.tolist())
+        field = FieldTable(x_px=lens.field.x.tolist(), y_px=lens.field.y.tolist())
     w, x, y, z = q_cam_to_mon.tolist()
     k1, k2, k3 = lens.radial
     p1, p2 = lens.tangential

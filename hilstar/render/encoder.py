@@ -187,7 +187,7 @@ class LevelTexture:
         return self._image
 
 
-class Table:
+class LookupTable:
     """Values (n,) of four bytes that a shader looks up: in a uniform block where there is room, else in a storage buffer."""
 
     def __init__(self, ctx: moderngl.Context, name: str, binding: int, values: npt.NDArray[Any]) -> None:

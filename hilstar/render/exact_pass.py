@@ -20,7 +20,7 @@ from hilstar.monitor.footprints import FEWEST, LEAST_LIGHT, PixelOrder
 from hilstar.monitor.quantise import Panel
 from hilstar.monitor.temporal import NONE_BEFORE, first_phases, places_before
 from hilstar.render.context import has_compute
-from hilstar.render.encoder import LevelTexture, Table, build_compute
+from hilstar.render.encoder import LevelTexture, LookupTable, build_compute
 from hilstar.render.splat import set_sigma, share_define
 from hilstar.render.star_passes import StarPasses
 from hilstar.scene.sprites import Sprites
@@ -46,8 +46,8 @@ class ExactPass:
         self._linear, self._levels = linear, levels.texture
         self._pixels = PixelOrder(balance.sigma_px)
         light = panel.light_e_per_s()
-        self._order = Table(ctx, "ORDER_ROWS", 1, _places(self._pixels, balance).ravel())
-        self._light = Table(ctx, "LIGHT_ROWS", 2, np.append(light, light[-1]))
+        self._order = LookupTable(ctx, "ORDER_ROWS", 1, _places(self._pixels, balance).ravel())
+        self._light = LookupTable(ctx, "LIGHT_ROWS", 2, np.append(light, light[-1]))
         gain = panel.gain()
         self._gain = None if gain is None else ctx.texture(linear.size, 1, np.ascontiguousarray(gain), dtype="f4")
         self._memory = Memory(ctx) if balance.over_frames else None

@@ -57,7 +57,7 @@ def window_context() -> moderngl.Context:
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class ScreenView:
     """What a window shows: an image of `resolution_px`, on a screen of `screen_px`, codes of `bits` bits.
 
     `cross_px` is where the crosshair goes, image pixels; `triples` (levels, 3) the codes of each level, None where level k
@@ -85,7 +85,7 @@ def changed_codes(context: moderngl.Context, screen_px: tuple[int, int], bits: i
         levels = (np.arange(width * height, dtype=np.uint32) % len(part)).astype(np.uint16).reshape(height, width)
         with context:
             texture = level_texture(context, levels)
-            Presenter(texture, View(screen_px, screen_px, bits, triples=part)).present()
+            Presenter(texture, ScreenView(screen_px, screen_px, bits, triples=part)).present()
             read = context.screen.read(viewport=(0, 0, width, height), components=3, dtype="f4")
             texture.release()
         drawn = np.rint(np.frombuffer(read, dtype=np.float32).reshape(height, width, 3)[::-1] * codes[-1])
@@ -99,7 +99,7 @@ def changed_codes(context: moderngl.Context, screen_px: tuple[int, int], bits: i
 class Presenter:
     """Draws a texture of levels on the screen of its context."""
 
-    def __init__(self, levels: moderngl.Texture, view: View) -> None:
+    def __init__(self, levels: moderngl.Texture, view: ScreenView) -> None:
         self._texture = levels
         self._ctx = levels.ctx
         self._view = view

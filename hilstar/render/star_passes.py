@@ -14,7 +14,7 @@ import numpy as np
 from hilstar.monitor.footprints import PixelOrder
 from hilstar.monitor.quantise import CodeTable, Panel, code_table
 from hilstar.render.context import MAX_ROUNDS, MAX_WRITTEN_BYTES, computes_in_software
-from hilstar.render.encoder import LevelTexture, SpriteSides, Table, build_compute
+from hilstar.render.encoder import LevelTexture, LookupTable, SpriteSides, build_compute
 from hilstar.render.splat import set_sigma, share_define
 from hilstar.scene.psf import footprint_px, outside_share, peak_share, share_bound
 from hilstar.scene.sprites import SPRITE_DTYPE, Sprites
@@ -116,7 +116,7 @@ class StarPasses:
         steps = table.steps()
         if steps is None:
             raise ValueError("several thresholds in a bin; ask `runs_on` first")
-        self._steps = Table(self._ctx, "STEPS", STEPS_BINDING, steps)
+        self._steps = LookupTable(self._ctx, "STEPS", STEPS_BINDING, steps)
         texel = {"u1": "r8ui", "u2": "r16ui"}[self._levels.texture.dtype]
         defines = [f"LEVELS_FORMAT {texel}", f"BIN_SHIFT {table.bin_shift}"]
         defines += [*share_define(sigma_px, self._footprint_px), *["KEEP"] * self._keep]

@@ -110,7 +110,7 @@ def run_demo(directory: Path, duration_s: float, rng: np.random.Generator, watch
     with (
         load(resource_path("configs", "demo.toml")) as bench,
         ZmqApart(ZmqReceiver(bench.config.attitude.address, bind=True)) as link,
-        _Sender(["send", str(log_path), "--to", link.endpoint, "--connect", "--wait", f"{LISTENER_WITHIN_S:g}"]) as sender,
+        _DemoSender(["send", str(log_path), "--to", link.endpoint, "--connect", "--wait", f"{LISTENER_WITHIN_S:g}"]) as sender,
         watching(bench, link.endpoint) as (watch, outlet),
     ):
         frame_count = round(duration_s * bench.config.monitor.refresh_hz)
@@ -130,7 +130,7 @@ def run_demo(directory: Path, duration_s: float, rng: np.random.Generator, watch
     return Demo(summary, kept, bench.config.monitor.bits)
 
 
-class _Sender:
+class _DemoSender:
     """A process of hilstar's that begins when it is first tended, and ends with this."""
 
     def __init__(self, arguments: list[str]) -> None:

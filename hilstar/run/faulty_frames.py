@@ -16,7 +16,7 @@ from hilstar.frame.faults import FaultLayer
 from hilstar.frame.view import View
 
 
-class Source(Protocol):
+class FaultSource(Protocol):
     """Says which faults are on."""
 
     def at(self, t_ns: int) -> tuple[Now, ...]:
@@ -36,7 +36,7 @@ class Held:
 class FaultyFrames:
     """The faults of a run, frame by frame."""
 
-    def __init__(self, source: Source, view: FaultView) -> None:
+    def __init__(self, source: FaultSource, view: FaultView) -> None:
         self.dropped = self.frozen = 0
         self.now: tuple[Now, ...] = ()  # of the last frame that was asked about
         self._source, self._view = source, view

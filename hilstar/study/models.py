@@ -71,14 +71,14 @@ MIN_STARS = 20
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class ChartFinding:
     """A chart, by the stem of its files, and what it says."""
 
     figure: str
     text: str
 
 
-def spectra(directory: Path) -> Finding:
+def spectra(directory: Path) -> ChartFinding:
     """Black bodies and the Pickles relation, each star held out in turn, against the Pickles spectra over V-I."""
     library = load_library()
     errors = method_errors(library)
@@ -99,7 +99,7 @@ def spectra(directory: Path) -> Finding:
     columns = ("spectral_type", "bv_mag", "vi_mag", *(f"{s}: {n} [%]" for s, n in errors))
     table = zip(library.spectral_type, library.bv_mag, library.vi_mag, *(100 * e for e in errors.values()), strict=True)
     write_csv(directory / "spectra.csv", columns, table)
-    return Finding("spectra", text)
+    return ChartFinding("spectra", text)
 
 
 def method_errors(library: Library) -> Errors:
@@ -132,7 +132,7 @@ def _draw_spectra(path: Path, finding: str, library: Library, errors: Errors) ->
         panels[0].legend(loc="upper right")
 
 
-def zero_points(directory: Path) -> Finding:
+def zero_points(directory: Path) -> ChartFinding:
     """Electrons of a V = 0 star of 9602 K by zero point and weighting."""
     rates = {
         sensor: np.array([dgs_electrons_per_s(REFERENCE_TEMPERATURE_K, study_optics(sensor), p) for p in SETTINGS])
@@ -152,7 +152,7 @@ def zero_points(directory: Path) -> Finding:
     ]
     columns = ("sensor", "zero_point", "weighting", "electrons_per_s", "mag_against_default")
     write_csv(directory / "zero_points.csv", columns, rows)
-    return Finding("zero_points", text)
+    return ChartFinding("zero_points", text)
 
 
 def _draw_zero_points(path: Path, text: str, rates: dict[str, FloatArray], mag: dict[str, FloatArray]) -> None:
@@ -183,7 +183,7 @@ class Scales:
     mag: dict[str, FloatArray]
 
 
-def temperature_scales(directory: Path) -> Finding:
+def temperature_scales(directory: Path) -> ChartFinding:
     """The scales that a bench file can choose, beside Torres 2010, and what they cost in electrons."""
     scales = compared_scales()
     stars_bv = load_catalog().brighter_than(BRIGHT_V_MAG).bv_mag
@@ -207,7 +207,7 @@ def temperature_scales(directory: Path) -> Finding:
     columns = ("bv_mag", "torres2010_k", *(f"{name}_{unit}" for unit, values in groups for name in values))
     table = np.column_stack((bv, scales.torres_k, *(value for _, values in groups for value in values.values())))
     write_csv(directory / "temperature_scales.csv", columns, table.tolist())
-    return Finding("temperature_scales", text)
+    return ChartFinding("temperature_scales", text)
 
 
 def compared_scales() -> Scales:
@@ -247,7 +247,7 @@ def _draw_temperatures(path: Path, finding: str, scales: Scales) -> None:
             label_ends(axes)
 
 
-def rapp(directory: Path, sensor: str) -> Finding:
+def rapp(directory: Path, sensor: str) -> ChartFinding:
     """The three ratios of a sensor, 3000 to 50 000 K, for both passband weightings."""
     kelvin = np.union1d(np.geomspace(3000, 50_000, 400)[1:-1], QUOTED_K)
     optics = study_optics(sensor)
@@ -258,7 +258,7 @@ def rapp(directory: Path, sensor: str) -> Finding:
         f" {cool:.2f} at 5000 K; at 9000 K they differ by {100 * (hot - 1):+.1f} %, at 50000 K by {100 * (hottest - 1):+.1f} %"
         + THESIS_HOT_STARS.get(sensor, "")
     )
-    finding = Finding(f"rapp_{sensor}", text)
+    finding = ChartFinding(f"rapp_{sensor}", text)
     title = (
         f"{SENSORS[sensor]}: a black body of 3000 K gives {coolest:.2f} times the electrons of the average model,"
         f" one of 5000 K {cool:.2f} times"
@@ -304,7 +304,7 @@ def _draw_rapp(path: Path, title: str, kelvin: FloatArray, ratios: Ratios, range
         label_ends(axes)
 
 
-def choices(directory: Path) -> Finding:
+def choices(directory: Path) -> ChartFinding:
     """What each choice costs in magnitudes over B-V, and what it costs the stars of Hipparcos."""
     optics = study_optics("ccd47-20")
     cost = choice_costs_mag(BV_MAG, optics)
@@ -325,7 +325,7 @@ def choices(directory: Path) -> Finding:
     columns = ("bv_mag", *(f"{n.replace(' ', '_')}_mag" for n in cost))
     columns += ("pickles_p5_mag", "pickles_median_mag", "pickles_p95_mag", "stars_in_window")
     write_csv(directory / "choices.csv", columns, np.column_stack((BV_MAG, *cost.values(), *percentiles)).tolist())
-    return Finding("choices", text)
+    return ChartFinding("choices", text)
 
 
 def choice_costs_mag(bv_mag: FloatArray, optics: Optics) -> dict[str, FloatArray]:
@@ -381,7 +381,7 @@ def _draw_choices(path: Path, finding: str, cost: dict[str, FloatArray], percent
             label_ends(axes)
 
 
-def run(directory: Path) -> list[Finding]:
+def run(directory: Path) -> list[ChartFinding]:
     """Write every chart (PNG) and its table (CSV) into `directory`, and `findings.csv`. Raises InputError."""
     findings = [rapp(directory, sensor) for sensor in SENSORS]
     findings += [chart_of(directory) for chart_of in (temperature_scales, zero_points, choices, spectra)]

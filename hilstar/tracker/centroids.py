@@ -42,7 +42,7 @@ S_CURVE_PHASES = 201  # where the bias is steepest, 2 pi 0.05 px a pixel, interp
 
 
 @dataclass(frozen=True, slots=True)
-class Background:
+class LocalBackground:
     """The background under the stars, in the image's unit: its level, and the sigma of a pixel's noise."""
 
     level: float
@@ -114,13 +114,13 @@ class _Blobs:
     pixels: IntArray
 
 
-def estimate_background(image: npt.NDArray[Any], step: float | None = None) -> Background:
+def estimate_background(image: npt.NDArray[Any], step: float | None = None) -> LocalBackground:
     """The background of a whole image: median and MAD, then mean and sigma of the pixels within 3 sigma of the median.
 
     The second step resolves a fraction of a DN where the median, and the MAD, are whole ones. One level for the image:
     a gradient counts as noise. `step` is what the image was rounded to (default: 1 for whole numbers, else 0), and the noise
     at least rounding's, step / sqrt 12. That of a noiseless float image is 0, and then every pixel over the level belongs to
-    a star: give a `Background` for such an image.
+    a star: give a `LocalBackground` for such an image.
     """
     checked = _checked(image)
     if step is None:
@@ -133,7 +133,7 @@ def estimate_background(image: npt.NDArray[Any], step: float | None = None) -> B
     shares = None if counts is None else counts[kept]
     level = float(np.average(values[kept], weights=shares))
     noise = math.sqrt(float(np.average((values[kept] - level) ** 2, weights=shares))) / CLIPPED_SIGMA
-    return Background(level, max(noise, step / math.sqrt(12)))
+    return LocalBackground(level, max(noise, step / math.sqrt(12)))
 
 
 def _counted(image: npt.NDArray[Any]) -> tuple[FloatArray, IntArray]:
@@ -153,7 +153,7 @@ def _median(values: FloatArray, counts: IntArray | None) -> float:
     return float(values[order][middle].mean())
 
 
-def noisiest_background(image: FloatArray, step: float = 1.0) -> Background:
+def noisiest_background(image: FloatArray, step: float = 1.0) -> LocalBackground:
     """The level of an image (h, w) in steps of `step`, such as DN, and the noise of its noisier parts, at least rounding's.
 
     A screen's black glows over a part of the detector; beyond it many an ADC clips at 0, and has no noise at all.
@@ -167,11 +167,11 @@ def noisiest_background(image: FloatArray, step: float = 1.0) -> Background:
     sigma = MAD_TO_SIGMA * (np.median(np.abs(values), axis=1, keepdims=True) + step / 2)
     kept = np.abs(values) <= CLIP_SIGMAS * sigma
     noise = np.sqrt((values**2 * kept).sum(axis=1) / kept.sum(axis=1)) / CLIPPED_SIGMA
-    return Background(float(np.median(image)), max(float(np.percentile(noise, NOISIER_PERCENT)), step / math.sqrt(12)))
+    return LocalBackground(float(np.median(image)), max(float(np.percentile(noise, NOISIER_PERCENT)), step / math.sqrt(12)))
 
 
 def find_stars(
-    image: npt.NDArray[Any], settings: CentroidSettings | None = None, background: Background | None = None
+    image: npt.NDArray[Any], settings: CentroidSettings | None = None, background: LocalBackground | None = None
 ) -> Centroids:
     """The stars of an image (height, width) of DN or electrons. Raises InputError for NaN, infinity or another shape.
 

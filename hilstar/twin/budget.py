@@ -64,7 +64,7 @@ class NotDrawn:
 
 
 @dataclass(frozen=True, slots=True)
-class Budget:
+class LightBudget:
     """What a bench can show; its fields are the keys of the JSON object of `hilstar budget`.
 
     Magnitudes are those of a star of the Sun's colour: it clips in the middle of a pixel where the screen is darkest
@@ -89,7 +89,7 @@ class Budget:
     centroid_rms_px: dict[str, float | None]
 
 
-def budget(bench: Bench, centroider: By | None = None) -> Budget:
+def budget(bench: Bench, centroider: By | None = None) -> LightBudget:
     """The budget of a bench, places as `centroider` finds them in the tracker's pixels after its blur.
 
     None takes the bench's own. Raises InputError for a bench without stars.
@@ -102,7 +102,7 @@ def budget(bench: Bench, centroider: By | None = None) -> Budget:
     clips = zero_mag + magnitude(white * bench.darkest / peak_share(render.sprite_sigma_px))
     nothing = zero_mag + magnitude(nothing_below_e_per_s(bench))
     rows = [_row(bench, mag, errors, by, clips) for mag, errors in found]
-    return Budget(
+    return LightBudget(
         method=render.quantisation + (" with bit stealing" if render.bit_stealing else ""),
         bits=bench.config.monitor.bits,
         clips_v_mag=clips,
@@ -201,7 +201,7 @@ def _within(rows: list[MagnitudeRow]) -> dict[str, float | None]:
     return limits | {f"{CENTROID_LIMIT_PX:g}_px": reach(centroid, CENTROID_LIMIT_PX)}
 
 
-def write_report(directory: Path, found: Budget) -> None:
+def write_report(directory: Path, found: LightBudget) -> None:
     """budget.csv, and its chart as budget.png and budget.svg. Raises InputError where one cannot be written."""
     rows = [_flat(row) for row in found.rows]
     write_csv(directory / "budget.csv", list(rows[0]), [["" if v is None else v for v in row.values()] for row in rows])
@@ -242,7 +242,7 @@ def _flat(row: MagnitudeRow) -> dict[str, float | None]:
     return values | {f"axis_rms_px_{kind}": value for kind, value in values.pop("axis_rms_px").items()}
 
 
-def budget_lines(found: Budget) -> list[str]:
+def budget_lines(found: LightBudget) -> list[str]:
     """The budget for a person."""
     within = ", ".join(f"{_number(value, 'g')} mag within {limit.replace('_', ' ')}" for limit, value in found.within.items())
     each = ", ".join(f"{kind} {_number(value, '.4f')}" for kind, value in found.centroid_rms_px.items())
@@ -261,7 +261,7 @@ def budget_lines(found: Budget) -> list[str]:
     ]
 
 
-def _by_one(found: Budget) -> Iterator[str]:
+def _by_one(found: LightBudget) -> Iterator[str]:
     yield f"{'V':>6}{'flux rms':>12}{'max mag':>10}{'centroid rms':>14}{'max px':>9}{'max arcsec':>12}"
     for row in found.rows:
         yield (
@@ -271,7 +271,7 @@ def _by_one(found: Budget) -> Iterator[str]:
         )
 
 
-def _by_each(found: Budget) -> Iterator[str]:
+def _by_each(found: LightBudget) -> Iterator[str]:
     yield f"{'V':>6}{'flux rms':>12}{'max mag':>10}{'':4}{''.join(f'{kind:>9}' for kind in FAMILY)}{'max px':>9}"
     for row in found.rows:
         each = "".join(f"{_number(row.axis_rms_px[kind], '.4f'):>9}" for kind in FAMILY)

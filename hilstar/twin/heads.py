@@ -17,7 +17,7 @@ from hilstar.bench.heads_file import HeadsFile
 from hilstar.monitor.quantise import MASK_TURNS
 from hilstar.rotation import conjugate, from_matrix, multiply, to_rotation_vector
 from hilstar.twin.verify.star_finder import Matched, crowded, shared, star_finder
-from hilstar.twin.verify.twin import Field, Twin
+from hilstar.twin.verify.twin import Twin, TwinField
 from hilstar.units import ARCSEC_PER_RAD
 
 MIN_STARS = 3  # for a solved attitude
@@ -77,7 +77,7 @@ class _Head:
         )
         return linear, codes
 
-    def _usable(self, seen: Field, sky: Matched, shown: Matched) -> npt.NDArray[np.bool_]:
+    def _usable(self, seen: TwinField, sky: Matched, shown: Matched) -> npt.NDArray[np.bool_]:
         truth, (width, height) = seen.truth, self.twin.camera.resolution_px
         radius_px = self.finder.settings.radius_px
         margin = radius_px + EDGE_PX

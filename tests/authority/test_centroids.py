@@ -16,7 +16,7 @@ from scipy.stats import norm
 
 from hilstar.arrays import FloatArray
 from hilstar.errors import InputError
-from hilstar.tracker.centroids import Background, CentroidSettings, estimate_background, find_stars, s_curves
+from hilstar.tracker.centroids import CentroidSettings, LocalBackground, estimate_background, find_stars, s_curves
 from hilstar.tracker.detector import Detector
 from hilstar.tracker.settings import DetectorSettings
 
@@ -100,7 +100,7 @@ def measure(sigma_px: float, snr: float, settings: CentroidSettings, seed: int) 
     rng = np.random.default_rng(seed)
     field = star_field(sigma_px, flux_for(snr, sigma_px), rng, 2 * settings.radius_px + 5)
     image = rng.poisson(field.mean_e) + READ_NOISE_E * rng.standard_normal(field.mean_e.shape)
-    found = find_stars(image, settings, Background(0.0, READ_NOISE_E))
+    found = find_stars(image, settings, LocalBackground(0.0, READ_NOISE_E))
     distance_px = np.hypot(found.x_px - field.x_px[:, None], found.y_px - field.y_px[:, None])
     nearest = distance_px.argmin(axis=1)
     near = distance_px.min(axis=1) < 1 + sigma_px
@@ -127,7 +127,7 @@ def bias_px(sigma_px: float, settings: CentroidSettings) -> FloatArray:
     """Error of noiseless stars in x, at PHASES_PX; the y place is another one."""
     biases = []
     for phase in PHASES_PX:
-        found = find_stars(1e6 * star(30 + phase, 30.3, sigma_px), settings, Background(0.0, 20.0))
+        found = find_stars(1e6 * star(30 + phase, 30.3, sigma_px), settings, LocalBackground(0.0, 20.0))
         assert len(found) == 1
         biases.append(found.x_px[0] - 30 - phase)
     return np.array(biases)
@@ -182,7 +182,9 @@ def test_a_known_star_size_takes_the_s_curve_out(sigma_px, window):
 def test_an_elliptical_stars_axes_have_an_s_curve_each():
     settings = replace(window_for(0.5), psf_sigma_px=(0.8, 0.5))
     image = 1e6 * np.outer(profile(np.array(30.21), 0.5, 61), profile(np.array(30.21), 0.8, 61))
-    plain, corrected = (find_stars(image, s, Background(0.0, 20.0)) for s in (replace(settings, psf_sigma_px=None), settings))
+    plain, corrected = (
+        find_stars(image, s, LocalBackground(0.0, 20.0)) for s in (replace(settings, psf_sigma_px=None), settings)
+    )
     assert abs(plain.y_px[0] - 30.21) > 10 * abs(plain.x_px[0] - 30.21) > 10 * CORRECTED_PX
     assert abs(corrected.x_px[0] - 30.21) < CORRECTED_PX
     assert abs(corrected.y_px[0] - 30.21) < CORRECTED_PX
@@ -202,10 +204,10 @@ def test_the_scatter_is_the_pixels_noise_propagated(sigma_px, snr):
 def test_the_first_column_is_x_and_the_first_pixels_centre_is_nought():
     image = np.zeros((11, 21))
     image[3, 7] = 100.0
-    found = find_stars(image, CentroidSettings(window_radius_px=2), Background(0.0, 1.0))
+    found = find_stars(image, CentroidSettings(window_radius_px=2), LocalBackground(0.0, 1.0))
     assert (found.x_px[0], found.y_px[0]) == (7.0, 3.0)
     # A whole pixel to the right and half a pixel down.
-    found = find_stars(100 * star(12.0, 8.5, 1.0, 21), CentroidSettings(), Background(0.0, 1.0))
+    found = find_stars(100 * star(12.0, 8.5, 1.0, 21), CentroidSettings(), LocalBackground(0.0, 1.0))
     assert found.x_px[0] == pytest.approx(12.0, abs=NUMERICAL_PX)
     assert found.y_px[0] == pytest.approx(8.5, abs=NUMERICAL_PX)
 
@@ -214,8 +216,8 @@ def test_the_first_column_is_x_and_the_first_pixels_centre_is_nought():
 def test_a_mirrored_image_has_mirrored_stars(window):
     image = 1e5 * (star(20.3, 25.1, 0.8) + 0.5 * star(40.7, 33.2, 0.8))
     settings = CentroidSettings(window=window)
-    found = find_stars(image, settings, Background(0.0, 10.0))
-    mirrored = find_stars(np.ascontiguousarray(image[::-1, ::-1]), settings, Background(0.0, 10.0))
+    found = find_stars(image, settings, LocalBackground(0.0, 10.0))
+    mirrored = find_stars(np.ascontiguousarray(image[::-1, ::-1]), settings, LocalBackground(0.0, 10.0))
     np.testing.assert_allclose(60 - mirrored.x_px, found.x_px, atol=NUMERICAL_PX)
     np.testing.assert_allclose(60 - mirrored.y_px, found.y_px, atol=NUMERICAL_PX)
 
@@ -224,7 +226,7 @@ def test_stars_come_brightest_first_with_their_flux_peak_and_pixels():
     fluxes = (2e4, 9e4, 5e4)
     places = ((15.2, 15.4), (45.1, 15.3), (30.2, 44.9))
     image = sum(flux * star(*place, 0.8) for flux, place in zip(fluxes, places, strict=True))
-    found = find_stars(image + 300.0, CentroidSettings(), Background(300.0, 10.0))
+    found = find_stars(image + 300.0, CentroidSettings(), LocalBackground(300.0, 10.0))
     # The window is 4 px on each side: at 0.8 px of sigma and 0.45 px off its middle it cuts 4 sigmas off, under 1e-5.
     np.testing.assert_allclose(found.flux, sorted(fluxes, reverse=True), rtol=1e-5)
     np.testing.assert_allclose(found.x_px, [45.1, 30.2, 15.2], atol=0.0025)  # the S-curve at 0.8 px
@@ -236,7 +238,7 @@ def test_stars_come_brightest_first_with_their_flux_peak_and_pixels():
 def test_small_blobs_can_be_left_out():
     image = 1e5 * star(30.3, 30.3, 1.0)
     image[10, 10] = 5000.0
-    background = Background(0.0, 10.0)
+    background = LocalBackground(0.0, 10.0)
     assert len(find_stars(image, CentroidSettings(minimum_pixels=1), background)) == 2
     assert len(find_stars(image, CentroidSettings(minimum_pixels=2), background)) == 1
 
@@ -244,13 +246,13 @@ def test_small_blobs_can_be_left_out():
 def test_pixels_that_touch_by_a_corner_are_one_star():
     image = np.zeros((20, 20))
     image[10, 10] = image[11, 11] = 50.0
-    found = find_stars(image, CentroidSettings(window="plain", window_radius_px=3), Background(0.0, 1.0))
+    found = find_stars(image, CentroidSettings(window="plain", window_radius_px=3), LocalBackground(0.0, 1.0))
     assert (found.x_px.tolist(), found.y_px.tolist(), found.pixels.tolist()) == ([10.5], [10.5], [2])
 
 
 def test_stars_whose_windows_leave_the_image_say_so():
     image = 1e5 * (star(1.0, 30.0, 0.8) + star(30.0, 30.0, 0.8) + 0.5 * star(30.0, 58.0, 0.8))
-    found = find_stars(image, CentroidSettings(), Background(0.0, 10.0))
+    found = find_stars(image, CentroidSettings(), LocalBackground(0.0, 10.0))
     assert found.at_edge[np.argsort(found.x_px)].tolist().count(True) == 2
     assert not found.at_edge[(np.abs(found.x_px - 30) < 1) & (np.abs(found.y_px - 30) < 1)].any()
 
@@ -265,7 +267,7 @@ def test_an_empty_image_has_no_stars(image):
 def test_noise_passes_the_threshold_as_often_as_a_normal_law_does():
     noise = np.random.default_rng(5).standard_normal((512, 512))
     expected = norm.sf(3.0) * noise.size
-    found = len(find_stars(noise, CentroidSettings(threshold_sigma=3.0), Background(0.0, 1.0)))
+    found = len(find_stars(noise, CentroidSettings(threshold_sigma=3.0), LocalBackground(0.0, 1.0)))
     # Of 354 pixels, 4 * 0.00135 touch another one: 2 blobs fewer.
     assert found == pytest.approx(expected - 2, abs=SIGMAS * math.sqrt(expected))
 

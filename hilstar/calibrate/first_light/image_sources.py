@@ -27,7 +27,7 @@ from hilstar.calibrate.measurements import PRIMARIES
 from hilstar.errors import HilstarError, InputError, MachineError, shortened
 from hilstar.process.programs import MAX_OUTPUT_BYTES, Child
 from hilstar.render.context import leave_contexts
-from hilstar.render.presenter import Orientation, Presenter, View, level_texture, window_context
+from hilstar.render.presenter import Orientation, Presenter, ScreenView, level_texture, window_context
 from hilstar.run.screen.gate import Timing, pass_gate
 from hilstar.run.screen.screen import Screen
 
@@ -191,7 +191,7 @@ def _presenter(file: BenchFile, window: Window, codes: CodeImage) -> tuple[Prese
         colours, levels = np.unique(packed, return_inverse=True)
         triples = np.stack([colours >> 32, colours >> 16 & 0xFFFF, colours & 0xFFFF], axis=1).astype(np.uint16)
         codes = levels.reshape(codes.shape[:2]).astype(np.uint16)
-    view = View(monitor.resolution_px, window.size_px, monitor.bits, orientation_of(monitor), triples=triples)
+    view = ScreenView(monitor.resolution_px, window.size_px, monitor.bits, orientation_of(monitor), triples=triples)
     texture = level_texture(window_context(), codes)
     return Presenter(texture, view), texture.release
 

@@ -175,14 +175,14 @@ def show_dots(plan: DotPlan, monitor: Monitor, seconds: float | None, *, windowe
     from hilstar.bench.orientation import orientation_of
     from hilstar.calibrate.plan import stays_until_key
     from hilstar.monitor.window.window import Window, WindowSettings
-    from hilstar.render.presenter import Presenter, View, level_texture, window_context
+    from hilstar.render.presenter import Presenter, ScreenView, level_texture, window_context
 
     orientation = orientation_of(monitor)
     screen_px = orientation.screen_px(monitor.resolution_px)
     white = 2**monitor.bits - 1
     triples = np.array([[0, 0, 0], [white, white, white]], dtype=np.uint16)
     with Window(WindowSettings(screen_px, monitor.bits, None if windowed else monitor.display)) as window:
-        view = View(monitor.resolution_px, window.size_px, monitor.bits, orientation, triples=triples)
+        view = ScreenView(monitor.resolution_px, window.size_px, monitor.bits, orientation, triples=triples)
         context = window_context()
         for frame in range(plan.frames):
             levels = dot_image(plan, frame, monitor.resolution_px, 1).astype(np.uint8)

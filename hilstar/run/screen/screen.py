@@ -9,7 +9,7 @@ from hilstar.bench.frame import Bench
 from hilstar.bench.orientation import orientation_of
 from hilstar.monitor.window.output_settings import OutputState
 from hilstar.monitor.window.window import Window
-from hilstar.render.presenter import Presenter, View, changed_codes
+from hilstar.render.presenter import Presenter, ScreenView, changed_codes
 from hilstar.run.operator import Aids
 from hilstar.run.screen.photodiode import marker_light
 from hilstar.run.screen.swap_clock import DrawBudget, SwapClock
@@ -37,7 +37,7 @@ class Screen:
         self.swap_to_light_ns = round((bench.scan.scanout_s / 2 * 1e3 + monitor.panel_delay_ms) * NS_PER_MS)
         self.keep_time(1000.0 / monitor.refresh_hz, False, time.monotonic_ns())
         self._quit = False
-        view = View(
+        view = ScreenView(
             resolution_px=monitor.resolution_px,
             screen_px=window.size_px,
             bits=monitor.bits,

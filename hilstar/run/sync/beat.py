@@ -74,7 +74,7 @@ class Beat:
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class SeenBeat:
     """What exposures see, by the phase at which each begins, (n,).
 
     `off_s`: the middle of the light seen after the middle of the exposure, NaN without any. `light`: relative to the mean.
@@ -84,7 +84,7 @@ class Seen:
     light: FloatArray
 
 
-def seen_at(exposures: Exposures, phase: FloatArray) -> Seen:
+def seen_at(exposures: Exposures, phase: FloatArray) -> SeenBeat:
     """What is seen by an exposure that begins `phase` (n,) refreshes after a row lights, any number.
 
     The integrals of a row's light, and of its light times the middle of its frame, are closed forms of whole refreshes and a
@@ -97,7 +97,7 @@ def seen_at(exposures: Exposures, phase: FloatArray) -> Seen:
     with np.errstate(divide="ignore", invalid="ignore"):
         middle = np.where(light > EDGE * lit, (moment - moment_0) / light, np.nan)
         relative = light / (length * lit)
-    return Seen((middle - begin - length / 2) / exposures.refresh_hz, relative)
+    return SeenBeat((middle - begin - length / 2) / exposures.refresh_hz, relative)
 
 
 def _integrals(time: FloatArray, lit: float) -> tuple[FloatArray, FloatArray]:

@@ -149,7 +149,7 @@ class CombinationRow:
 
 
 @dataclass(frozen=True, slots=True)
-class BudgetRow:
+class ChainBudgetRow:
     """A step's part of the error at a scene's `chosen` point; its fields are the columns of `chain_budget.csv`."""
 
     scene: str
@@ -216,16 +216,16 @@ def beating(rows: Sequence[CombinationRow], as_filed: bool = False) -> tuple[lis
 
 
 def write_tables(
-    directory: Path, rows: Sequence[CombinationRow], budgets: Sequence[BudgetRow], stages: Sequence[StageRow]
+    directory: Path, rows: Sequence[CombinationRow], budgets: Sequence[ChainBudgetRow], stages: Sequence[StageRow]
 ) -> None:
     """Write `chain.csv`, `chain_budget.csv` and `chain_time.csv`. Raises InputError."""
     for name, records in (("chain", rows), ("chain_budget", budgets), ("chain_time", stages)):
         write_records(directory / f"{name}.csv", records)
 
 
-def budget_rows(scene: str, parts: Sequence[Part]) -> list[BudgetRow]:
+def budget_rows(scene: str, parts: Sequence[Part]) -> list[ChainBudgetRow]:
     """An error budget's rows."""
-    return [BudgetRow(scene, AUTO, part.step, rounded(part.arcsec), rounded(part.mag)) for part in parts]
+    return [ChainBudgetRow(scene, AUTO, part.step, rounded(part.arcsec), rounded(part.mag)) for part in parts]
 
 
 def stage_rows(scene: str, times: Sequence[StageTime]) -> list[StageRow]:
@@ -265,7 +265,7 @@ def _row(scene: SceneMeasurement, one: CombinationOutcome) -> CombinationRow:
 
 
 def scene_line(
-    rows: Sequence[CombinationRow], budget: Sequence[BudgetRow], stages: Sequence[StageRow], busy: bool = False
+    rows: Sequence[CombinationRow], budget: Sequence[ChainBudgetRow], stages: Sequence[StageRow], busy: bool = False
 ) -> str:
     """What `auto` takes in a scene and is off by, whether it is on the front, and what its error and time are made of."""
     own, stands = rows[auto_of(rows)], NOT_JUDGED if busy else standing(rows)
@@ -433,7 +433,9 @@ def short_words(row: CombinationRow, own: CombinationRow) -> str:
     return f"{row.quantisation}{' + bit stealing' if row.bit_stealing == 'true' else ''}{moving}{shallow}"
 
 
-def draw_budget(path: Path, rows: Sequence[CombinationRow], budget: Sequence[BudgetRow], stages: Sequence[StageRow]) -> None:
+def draw_budget(
+    path: Path, rows: Sequence[CombinationRow], budget: Sequence[ChainBudgetRow], stages: Sequence[StageRow]
+) -> None:
     """Where `auto`'s error and time come from, a row of panels for each scene that differs. Raises InputError."""
     scenes = differing(rows)
     last = list(scenes)[-1]
@@ -463,7 +465,7 @@ def draw_budget(path: Path, rows: Sequence[CombinationRow], budget: Sequence[Bud
 
 
 def _budget_finding(
-    scenes: Sequence[str] | dict[str, list[str]], budget: Sequence[BudgetRow], stages: Sequence[StageRow]
+    scenes: Sequence[str] | dict[str, list[str]], budget: Sequence[ChainBudgetRow], stages: Sequence[StageRow]
 ) -> str:
     said = []
     for scene in scenes:
@@ -487,7 +489,7 @@ def run(
     `advance` hears how many scenes are done. Raises InputError, MachineError.
     """
     rows: list[CombinationRow] = []
-    budget: list[BudgetRow] = []
+    budget: list[ChainBudgetRow] = []
     stages: list[StageRow] = []
     lines, judged, others = [], [], OtherWork()
     with Parts(file) as parts:

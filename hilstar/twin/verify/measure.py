@@ -35,7 +35,7 @@ from hilstar.twin.verify.star_finder import (
     shared,
     star_finder,
 )
-from hilstar.twin.verify.twin import Field, Twin, true_calibration
+from hilstar.twin.verify.twin import Twin, TwinField, true_calibration
 from hilstar.units import magnitude
 
 MIN_RESIDUALS = 3  # to an unknown
@@ -210,7 +210,7 @@ class Star:
 
 
 @dataclass(slots=True)
-class Tally:
+class MatchTally:
     """Stars by what became of them, added up over the fields.
 
     `summed` stars are part of a brighter one that the tracker cannot part from them. `displaced` are the stars that the display
@@ -235,7 +235,7 @@ class Tally:
 
 
 @dataclass(frozen=True, slots=True)
-class Glow:
+class GlowFit:
     """The light of the screen's black level in a tracker pixel, electrons per second: as assumed, as seen, and their limit."""
 
     assumed_e_per_s_px: float
@@ -251,17 +251,17 @@ class Measured:
     """
 
     field_count: int
-    tally: Tally
+    tally: MatchTally
     config: BenchConfig
     camera: Camera
-    glow: Glow
+    glow: GlowFit
     calibration: Calibration
     true_calibration: Calibration | None
     gl_renderer: str
     wide_bodies: list[str]
 
 
-def with_blends_as_one(seen: Field, sigma_px: tuple[float, float]) -> Field:
+def with_blends_as_one(seen: TwinField, sigma_px: tuple[float, float]) -> TwinField:
     """The field with each star that stands within BLEND_SIGMAS of a brighter one (`sigma_px` of the tracker) added to that.
 
     The brighter one keeps its name; its light, magnitude and places become those of the sum.
@@ -312,10 +312,10 @@ class Comparison:
     def __init__(self, twin: Twin) -> None:
         self.twin = twin
         self.finder: StarFinder = star_finder(twin.bench, twin.monitor_px_per_px)
-        self.tally = Tally()
+        self.tally = MatchTally()
         self.field_count = 0
 
-    def add(self, seen: Field, rng: np.random.Generator) -> None:
+    def add(self, seen: TwinField, rng: np.random.Generator) -> None:
         """Compare the stars of one field; the generator is for the detector's noise."""
         self.field_count += 1
         tally, stars_listed = self.tally, len(seen.truth)
@@ -357,17 +357,17 @@ class Comparison:
             wide_bodies=wide_bodies(bench.moving, bench.camera),
         )
 
-    def _glow(self) -> Glow:
+    def _glow(self) -> GlowFit:
         given = self.twin.config.verify.black_e_per_s_px
         sigma_x, sigma_y = self.finder.sigma_px
         disc_px = 4 * math.pi * sigma_x * sigma_y
-        return Glow(
+        return GlowFit(
             assumed_e_per_s_px=on_screen_median(self.twin.sky_optics.glow_e_per_s(self.twin.bench.panel)),
             seen_e_per_s_px=on_screen_median(self.twin.glow_e_per_s),
             limit_e_per_s_px=BLACK_SHARE * faintest_e_per_s(self.twin.bench) / disc_px if given is None else given,
         )
 
-    def _star(self, seen: Field, k: int, sky: Matched, shown: Matched, assumed: Matched) -> Star:
+    def _star(self, seen: TwinField, k: int, sky: Matched, shown: Matched, assumed: Matched) -> Star:
         row, truth = seen.truth[k], self._catalogue(seen)
         flux_mag, dx_px, dy_px = shown.against(sky, k)
         codes_mag, *codes_px = assumed.against(sky, k)
@@ -387,24 +387,24 @@ class Comparison:
             name=str(row["name"]),
         )
 
-    def _placed(self, seen: Field, windowed: list[Matched], kind: Centroider) -> list[Matched]:
+    def _placed(self, seen: TwinField, windowed: list[Matched], kind: Centroider) -> list[Matched]:
         """The stars of the sky's image and of the display's where a centroider finds them."""
         images_e = seen.sky_e, seen.shown_e
         true_px = seen.x_px, seen.y_px
         return [self.finder.placed(of, image_e, true_px, kind) for of, image_e in zip(windowed, images_e, strict=True)]
 
-    def _catalogue(self, seen: Field) -> Matched:
+    def _catalogue(self, seen: TwinField) -> Matched:
         """The catalogue as if it had been found in an image."""
         flux_e, count = seen.truth["electrons_per_s"] * self.twin.config.tracker.exposure_s, len(seen.truth)
         ones = np.ones(count, dtype=np.intp)
         return Matched(Centroids(seen.x_px, seen.y_px, flux_e, flux_e, ones, ones < 1), np.arange(count, dtype=np.intp))
 
-    def _blended(self, seen: Field, sky: Matched) -> npt.NDArray[np.bool_]:
+    def _blended(self, seen: TwinField, sky: Matched) -> npt.NDArray[np.bool_]:
         flux, radius_px = seen.truth["electrons_per_s"], self.finder.settings.radius_px
         by_disc = seen.near_disc(self.twin.camera, radius_px + WING_SIGMAS * max(self.finder.sigma_px))
         return np.asarray(shared(sky.index) | crowded(seen.x_px, seen.y_px, flux, radius_px, self.finder.sigma_px) | by_disc)
 
-    def _follow(self, seen: Field, shown: Centroids, wanted: npt.NDArray[np.bool_]) -> None:
+    def _follow(self, seen: TwinField, shown: Centroids, wanted: npt.NDArray[np.bool_]) -> None:
         """Find each star where the true lens shows it, and note how far that is from where the sky has it."""
         geometry = BenchGeometry(self.twin.true_camera, self.twin.camera)
         match = nearest(shown, *geometry.to_tracker(seen.truth["x_px"], seen.truth["y_px"]))
@@ -413,14 +413,14 @@ class Comparison:
             off_px = float(shown.x_px[match[k]]) - x_px, float(shown.y_px[match[k]]) - y_px
             self.tally.displaced.append(Displaced(x_px, y_px, *off_px))
 
-    def _count_mirrored(self, seen: Field, shown: Centroids, wanted: npt.NDArray[np.bool_]) -> None:
+    def _count_mirrored(self, seen: TwinField, shown: Centroids, wanted: npt.NDArray[np.bool_]) -> None:
         """Count the stars that are where a mirrored screen would have them."""
         for mirror in MIRRORS if self.twin.differs else ():
             geometry = BenchGeometry(self.twin.true_camera, self.twin.camera, mirror)
             places = geometry.to_tracker(seen.truth["x_px"], seen.truth["y_px"])
             self.tally.mirrored[mirror] += int((wanted & (nearest(shown, *places) >= 0)).sum())
 
-    def _measure_noisy(self, seen: Field, detected_e: FloatArray, wanted: npt.NDArray[np.bool_]) -> None:
+    def _measure_noisy(self, seen: TwinField, detected_e: FloatArray, wanted: npt.NDArray[np.bool_]) -> None:
         """The same stars in a noisy exposure (h, w), electrons: what the tracker itself adds."""
         step_e = self.twin.config.tracker.detector.gain_e_per_dn
         under = estimate_background(detected_e, step_e)
@@ -438,7 +438,7 @@ class Comparison:
                 off_px = found.x_px[match[k]] - seen.x_px[k], found.y_px[match[k]] - seen.y_px[k]
                 self.tally.noisy_px.append(math.hypot(*off_px))
 
-    def _inside(self, seen: Field) -> npt.NDArray[np.bool_]:
+    def _inside(self, seen: TwinField) -> npt.NDArray[np.bool_]:
         """Stars whose window is whole on the detector and whose sprite is whole on the monitor."""
         margin = self.finder.settings.radius_px + 1.5
         bench = self.twin.bench
@@ -448,7 +448,7 @@ class Comparison:
         inside = (x >= reach) & (x < width - 1 - reach) & (y >= reach) & (y < height - 1 - reach)
         return np.asarray(inside & self._on_detector(seen, margin))
 
-    def _on_detector(self, seen: Field, margin_px: float) -> npt.NDArray[np.bool_]:
+    def _on_detector(self, seen: TwinField, margin_px: float) -> npt.NDArray[np.bool_]:
         """Stars on the detector, `margin_px` or farther from its edge; one at NaN is not on it."""
         width, height = self.twin.camera.resolution_px
         inside = (seen.x_px >= margin_px - 0.5) & (seen.x_px < width - 0.5 - margin_px)

@@ -38,7 +38,7 @@ MIN_STARS = 6  # fewer of those that were measured would say little
 
 
 @dataclass(frozen=True, slots=True)
-class Change:
+class KeyChange:
     """One key of a bench file with another value."""
 
     table: str
@@ -69,9 +69,9 @@ class Proposal:
     that one, and `cannot` says what cannot be met.
     """
 
-    changes: tuple[Change, ...]
+    changes: tuple[KeyChange, ...]
     verified: Verified | None
-    best: tuple[Change, ...]
+    best: tuple[KeyChange, ...]
     tried: int
     cannot: str | None
 
@@ -84,8 +84,8 @@ class _Key:
     key: str
     values: tuple[float | str | bool, ...]
 
-    def at(self, place: int) -> Change:
-        return Change(self.table, self.key, self.values[place])
+    def at(self, place: int) -> KeyChange:
+        return KeyChange(self.table, self.key, self.values[place])
 
 
 def propose(
@@ -111,7 +111,7 @@ def propose(
     return _none_passes(verdict, trials)
 
 
-def changed_text(text: str, changes: tuple[Change, ...]) -> str:
+def changed_text(text: str, changes: tuple[KeyChange, ...]) -> str:
     """The text of a bench file with changes; comments and all else stay."""
     for change in changes:
         text = with_key(text, change.table, change.key, change.value)
@@ -151,9 +151,9 @@ class _Trials:
     def __init__(self, file: BenchFile, fields: int, seed: int, on_try: Callable[[int], None]) -> None:
         self.file, self.fields, self.seed, self.on_try = file, fields, seed, on_try
         self.tried = 0
-        self.verdicts: dict[tuple[Change, ...], Verdict] = {}
+        self.verdicts: dict[tuple[KeyChange, ...], Verdict] = {}
 
-    def passes(self, changes: tuple[Change, ...]) -> bool:
+    def passes(self, changes: tuple[KeyChange, ...]) -> bool:
         """Whether the bench passes with the changes; False where its file is refused with them."""
         if changes not in self.verdicts:
             self.tried += 1
@@ -165,7 +165,7 @@ class _Trials:
                 self.on_try(self.tried)
         return self.verdicts[changes].passed
 
-    def _verdict(self, changes: tuple[Change, ...]) -> Verdict:
+    def _verdict(self, changes: tuple[KeyChange, ...]) -> Verdict:
         file = bench_file_of(self.file.path, changed_text(self.file.text, changes))
         for change in changes:  # a table that is not in plain form takes no key
             if getattr(getattr(file.config, change.table), change.key) != change.value:
@@ -197,11 +197,11 @@ def _faintest_v_mag(verdict: Verdict) -> tuple[float, ...]:
     return tuple(limit for limit in limits if (v_mag <= limit).sum() >= MIN_STARS)
 
 
-def _strongest(keys: tuple[_Key, ...]) -> tuple[Change, ...]:
+def _strongest(keys: tuple[_Key, ...]) -> tuple[KeyChange, ...]:
     return tuple(key.at(-1) for key in keys)
 
 
-def _mildest(keys: tuple[_Key, ...], trials: _Trials) -> tuple[Change, ...]:
+def _mildest(keys: tuple[_Key, ...], trials: _Trials) -> tuple[KeyChange, ...]:
     """The changes of keys that pass at their strongest, each brought to its mildest value that passes, the last key first."""
     changes = _strongest(keys)
     for place in reversed(range(len(keys))):
@@ -298,7 +298,7 @@ def write_proposal(file: BenchFile, proposal: Proposal) -> None:
     write_whole(file.path, changed_text(file.text, proposal.changes))
 
 
-def _words(changes: tuple[Change, ...]) -> str:
+def _words(changes: tuple[KeyChange, ...]) -> str:
     return ", ".join(f"[{change.table}] {change.key} = {json.dumps(change.value)}" for change in changes)
 
 

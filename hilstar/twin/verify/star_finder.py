@@ -13,7 +13,7 @@ from hilstar.bench.config import BenchConfig
 from hilstar.bench.frame import Bench
 from hilstar.scene.psf import peak_share
 from hilstar.tracker.centroiders import Centroider, star_places
-from hilstar.tracker.centroids import Background, Centroids, CentroidSettings, find_stars
+from hilstar.tracker.centroids import Centroids, CentroidSettings, LocalBackground, find_stars
 from hilstar.units import magnitude
 
 USUAL: Centroider = "window"
@@ -47,7 +47,7 @@ class StarFinder:
 
     settings: CentroidSettings
     sigma_px: tuple[float, float]
-    background: Background
+    background: LocalBackground
     centroider: Centroider = USUAL
 
     def match(self, image_e: FloatArray, x_px: FloatArray, y_px: FloatArray) -> Matched:
@@ -92,7 +92,7 @@ def star_finder(bench: Bench, monitor_px_per_px: float) -> StarFinder:
     sigma_px = seen_sigma_px(bench.config, monitor_px_per_px)
     settings = CentroidSettings(window_sigma_px=max(1.0, *sigma_px))
     peak_e = faintest_e_per_s(bench) * bench.config.tracker.exposure_s * peak_share(sigma_px)
-    under = Background(0.0, MIN_PEAK * peak_e / settings.threshold_sigma)
+    under = LocalBackground(0.0, MIN_PEAK * peak_e / settings.threshold_sigma)
     return StarFinder(settings, sigma_px, under, bench.config.verify.centroider or USUAL)
 
 

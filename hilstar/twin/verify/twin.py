@@ -91,7 +91,7 @@ def levels_of(assumed: Response, true: Response) -> Response:
 
 
 @dataclass(frozen=True, slots=True)
-class Field:
+class TwinField:
     """One attitude: mean electrons, (h, w) each, and its stars at their places (n,) in tracker pixels, as the sky has them.
 
     `shown_e` is what the monitor as it is makes, `assumed_e` what it would make if everything were as assumed (the same
@@ -139,7 +139,7 @@ class Twin:
         self.glow_e_per_s = self.true_optics.glow_e_per_s(self.true_panel)
         self._under_stars_e = self.glow_e_per_s * tracker.exposure_s + background_e(self.config, file.folder)
 
-    def field(self, q_icrs_to_cam: FloatArray, first_frame: int) -> Field:
+    def field(self, q_icrs_to_cam: FloatArray, first_frame: int) -> TwinField:
         """Show one attitude (unit quaternion) for one exposure, from frame `first_frame` of the run on."""
         frame = self.bench.frame(q_icrs_to_cam, first_frame)
         exposure_s = self.config.tracker.exposure_s
@@ -153,9 +153,9 @@ class Twin:
         points = ~np.isin(frame.truth["name"], [disc.name for disc in discs])
         x_px, y_px = self.camera.project(self.bench.stars.directions(frame.star[points]) @ icrs_to_cam.T)
         found = tuple((icrs_to_cam @ disc.direction, disc.radius_rad) for disc in discs)
-        return Field(shown, assumed, sky, frame.truth[points], x_px, y_px, found)
+        return TwinField(shown, assumed, sky, frame.truth[points], x_px, y_px, found)
 
-    def detected_e(self, seen: Field, rng: np.random.Generator) -> FloatArray:
+    def detected_e(self, seen: TwinField, rng: np.random.Generator) -> FloatArray:
         """Electrons of one noisy exposure (h, w) as the DN give them, the mean of glow and background subtracted."""
         dn = self.detector.expose(seen.shown_e + self._under_stars_e, self.config.tracker.exposure_s, rng)
         return dn * self.config.tracker.detector.gain_e_per_dn - self._under_stars_e

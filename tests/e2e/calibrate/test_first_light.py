@@ -17,7 +17,7 @@ import pytest
 from hilstar.bench.bench_file import read_bench_file
 from hilstar.bench.cameras import bench_camera
 from hilstar.calibrate.first_light.photometry import response_error_mag
-from hilstar.monitor.calibration import Head, NotesTable, load_calibration, write_calibration
+from hilstar.monitor.calibration import CalibrationHead, NotesTable, load_calibration, write_calibration
 from hilstar.monitor.geometry import ErrorTable, MadeTable, Notes, write_geometry
 from hilstar.monitor.response import gamma_response, srgb_response
 from hilstar.resources import resource_path
@@ -48,7 +48,7 @@ SEEN_SHARE = 0.6  # of the screen's width and height, about its middle: what the
 def plant(folder, **monitor):
     """A bench file, and a truth of which it knows nothing: mirror, lens, tilt, centre, focal length, light, and delay."""
     (folder / "bench.toml").write_text(bench_text(TWIN, GAMMA_22))
-    head = Head("photometric", "planted", "2026-11-22", "none", "relative", 10, "true-response.csv")
+    head = CalibrationHead("photometric", "planted", "2026-11-22", "none", "relative", 10, "true-response.csv")
     light = {"w": BLACK + gamma_response(10, GAMMA).light}
     write_calibration(folder / "true-response.toml", head, light, 0.0, NotesTable())
     changed = {

@@ -23,7 +23,7 @@ from hilstar.calibrate.first_light.stars import scale, trend
 from hilstar.calibrate.first_light.virtual import VirtualBench
 from hilstar.calibrate.plan import Patch
 from hilstar.errors import InputError
-from hilstar.monitor.calibration import Head, NotesTable, load_calibration, primary_lights, write_calibration
+from hilstar.monitor.calibration import CalibrationHead, NotesTable, load_calibration, primary_lights, write_calibration
 from hilstar.monitor.geometry import monitor_camera
 from hilstar.monitor.response import gamma_response, srgb_response
 from hilstar.twin.optics import BenchGeometry
@@ -192,7 +192,7 @@ def test_bit_stealing_needs_the_primaries_and_finds_their_shares(tmp_path):
     """Three channels of their own powers and shares of white: a triple's light is right only when all six are."""
     light = gamma_response(8, 2.35).light
     planted = {"r": 0.3 * light, "g": 0.5 * light**1.02, "b": 0.2 * light**0.97}
-    head = Head("photometric", "planted", "2026-11-22", "none", "relative", 8, "true-response.csv")
+    head = CalibrationHead("photometric", "planted", "2026-11-22", "none", "relative", 8, "true-response.csv")
     columns = {name: 0.001 + value for name, value in planted.items()}
     write_calibration(tmp_path / "true-response.toml", head, columns, 0.0, NotesTable())
     bench = {"monitor": {"bits": 8}, "render": {"bit_stealing": True}}
@@ -217,7 +217,7 @@ def test_stars_of_temporal_frames_are_seen_over_their_whole_turn(tmp_path):
 
 
 def test_a_truth_whose_primaries_are_not_known_cannot_stand_in_for_bit_stealing(tmp_path):
-    head = Head("photometric", "planted", "2026-11-22", "none", "relative", 8, "true-response.csv")
+    head = CalibrationHead("photometric", "planted", "2026-11-22", "none", "relative", 8, "true-response.csv")
     write_calibration(tmp_path / "true-response.toml", head, {"w": gamma_response(8).light}, 0.0, NotesTable())
     with pytest.raises(InputError, match=r"\[weights\]"):
         on_the_twin(

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hilstar.tracker.centroids import Background, CentroidSettings, estimate_background, find_stars, noisiest_background
+from hilstar.tracker.centroids import CentroidSettings, LocalBackground, estimate_background, find_stars, noisiest_background
 
 SIZE_PX = 40
-BACKGROUND = Background(0.0, 1.0)
+BACKGROUND = LocalBackground(0.0, 1.0)
 SAME_PX = 1e-6  # the sums of a turned window run the other way round; Newton's iteration ends within 1e-7
 
 

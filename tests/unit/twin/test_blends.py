@@ -8,7 +8,7 @@ import pytest
 from hilstar.bench.bench_file import bench_file_of
 from hilstar.rotation import to_matrix
 from hilstar.twin.verify.measure import BLEND_SIGMAS, Comparison, with_blends_as_one
-from hilstar.twin.verify.twin import Field, Twin
+from hilstar.twin.verify.twin import Twin, TwinField
 from tests.support.benches import ORION_Q, TWIN, bench_text
 from tests.support.stars import stars_at
 
@@ -28,7 +28,7 @@ def twin(tmp_path_factory):
         yield twin
 
 
-def pairs_of(twin: Twin, parted: float = 1.0) -> Field:
+def pairs_of(twin: Twin, parted: float = 1.0) -> TwinField:
     """A field of pairs, each separation with each ratio of light, on a grid of the tracker."""
     sigma_px = max(Comparison(twin).finder.sigma_px)
     x, y = (axis.ravel() for axis in np.meshgrid(np.linspace(110, 290, len(SEPARATIONS)), np.linspace(110, 290, len(RATIOS))))
@@ -84,7 +84,7 @@ def test_a_chain_of_stars_is_not_one_blend(twin):
     x_px, y_px = 100 + 0.9 * BLEND_SIGMAS * sigma_px[0] * np.arange(n), np.full(n, 100.0)
     y_px[-1] = np.nan
     seen.truth["electrons_per_s"] = np.arange(n, 0, -1)
-    chain = Field(seen.shown_e, seen.assumed_e, seen.sky_e, seen.truth, x_px, y_px)
+    chain = TwinField(seen.shown_e, seen.assumed_e, seen.sky_e, seen.truth, x_px, y_px)
     summed = with_blends_as_one(chain, sigma_px)
     assert len(summed.truth) == n // 2 + 1
     assert np.isnan(summed.y_px).sum() == 1

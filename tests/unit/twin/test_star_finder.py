@@ -9,7 +9,7 @@ import pytest
 from scipy.special import ndtr
 
 from hilstar.tracker.centroiders import FAMILY
-from hilstar.tracker.centroids import Background, Centroids, CentroidSettings
+from hilstar.tracker.centroids import Centroids, CentroidSettings, LocalBackground
 from hilstar.twin.verify.star_finder import StarFinder, crowded, nearest, shared
 from hilstar.twin.verify.verdict import median
 
@@ -47,7 +47,7 @@ def test_nothing_measured_has_no_zero_point():
 @pytest.mark.parametrize("kind", FAMILY)
 def test_each_centroider_places_stars_where_they_are_also_aside_and_at_the_edge(kind):
     """One star where it should be, one 2 px aside, one cut by the image's edge; nothing at the fourth place."""
-    finder = StarFinder(CentroidSettings(window_sigma_px=1.0), (1.0, 1.0), Background(0.0, 0.01), kind)
+    finder = StarFinder(CentroidSettings(window_sigma_px=1.0), (1.0, 1.0), LocalBackground(0.0, 0.01), kind)
     x_px, y_px = np.array([20.3, 42.1, 0.4, 60.0]), np.array([21.8, 40.0, 30.2, 15.0])
     places = [(20.3, 21.8), (40.1, 40.0), (0.4, 30.2)]
     share = [[np.diff(ndtr(np.arange(65) - 0.5 - at)) for at in place] for place in places]

@@ -57,15 +57,15 @@ def test_a_frame_after_the_images_were_lost_is_as_if_nothing_had_been_drawn(quan
     few, many = stars(3, rng), stars(40, rng)
     with Renderer(Target(SIZE, SIGMA, gamma_response(8), WHITE, quantisation)) as renderer:
         renderer.draw(few)
-        wanted = renderer.codes().copy()
+        wanted = renderer.levels().copy()
         renderer.draw(many)
         with renderer.context:
             renderer.codes_texture.write(np.full(SIZE[::-1], 7, np.uint8))
         renderer.draw(few, 1)
-        assert (renderer.codes() == 7).any()  # images are kept from frame to frame
+        assert (renderer.levels() == 7).any()  # images are kept from frame to frame
         renderer.forget_images()
         renderer.draw(few)
-        assert (renderer.codes() == wanted).all()
+        assert (renderer.levels() == wanted).all()
 
 
 @pytest.mark.parametrize("quantisation", ["round", "dither", "exact"])

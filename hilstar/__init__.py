@@ -6,7 +6,7 @@ if TYPE_CHECKING:
     from hilstar.bench.build import load
     from hilstar.bench.frame import Bench, Drawn, Frame
     from hilstar.errors import HilstarError, InputError, MachineError
-    from hilstar.run.send.python_sender import Sender
+    from hilstar.run.sender import Sender
 
 __version__ = "0.2.0"
 __all__ = ["Bench", "Drawn", "Frame", "HilstarError", "InputError", "MachineError", "Sender", "load"]
@@ -21,7 +21,7 @@ def __getattr__(name: str) -> Any:
     if hasattr(errors, name):
         return getattr(errors, name)
     if name == "Sender":  # a simulator draws nothing
-        from hilstar.run.send.python_sender import Sender
+        from hilstar.run.sender import Sender
 
         return Sender
     from hilstar.bench import build, frame

@@ -52,8 +52,8 @@ class BackChannel:
     The receiver's thread calls it, but for `post`.
     """
 
-    def __init__(self, link: StreamLink, traffic: Traffic) -> None:
-        self._link = link
+    def __init__(self, link: StreamLink, traffic: Traffic, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
+        self._link, self._now_ns = link, now_ns
         self._send: Callable[[Packet], None] = link.send
         self._traffic = traffic
         self._posting = threading.Lock()
@@ -89,7 +89,7 @@ class BackChannel:
 
     def _ask(self, now_ns: int) -> None:
         self._asks += 1
-        request = TimeRequest(self._asks, time.monotonic_ns())
+        request = TimeRequest(self._asks, self._now_ns())
         self._asked = {sequence: asked for sequence, asked in self._asked.items() if self._asks - sequence < FIRST_ASKS}
         self._asked[self._asks] = request
         self._quick_asks -= 1
@@ -104,7 +104,7 @@ class BackChannel:
     def answer(self, request: TimeRequest, arrival: Arrival[Event]) -> None:
         """Answer a sender's own time request."""
         send = self._link.send if arrival.back is None else arrival.back
-        send(TimeReply(request.sequence, request.t1_ns, arrival.host_ns, time.monotonic_ns()))
+        send(TimeReply(request.sequence, request.t1_ns, arrival.host_ns, self._now_ns()))
 
     def exchange(self, reply: TimeReply, t4_ns: int, correction_ns: int) -> Exchange | None:
         """The exchange that a reply completes, its sender times made continuous; None for a reply to nothing."""
@@ -137,9 +137,9 @@ def nobody_watches(host_ns: int, raw: bytes, sample: AttitudeSample | None, refu
 
 
 class Receiver:
-    """Runs `link` into `timeline` until closed. Nothing that arrives ends it.
+    """Runs `link` into `timeline` until closed, on a thread of its own. Nothing that arrives ends it.
 
-    What arrives before `learn` is called fills the timeline, and teaches the clock little.
+    What arrives before `learn` is called fills the timeline, and teaches the clock little. `now_ns` is the host's clock.
     """
 
     def __init__(
@@ -149,16 +149,19 @@ class Receiver:
         traffic: Traffic = QUIET,
         watch: Watch = nobody_watches,
         notices: Notices | None = None,
+        *,
         wrong_rates: WrongRates = "use-quaternions",
+        now_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         self.counts = PacketCounts()
+        self._now_ns = now_ns
         self._notices = Notices() if notices is None else notices
         self.clock = SenderClock(shared=traffic.shared_clock)
         self.jumps = SharedClockFilter(self._notices) if traffic.shared_clock else JumpFilter(self.clock)
         self.latency_ms = RunningStatistics()
         self._link = link
         self._timeline = timeline
-        self._back = BackChannel(link, traffic)
+        self._back = BackChannel(link, traffic, now_ns)
         self._watch = watch
         self._repeats = Repeats(self._notices)
         self._rates = RateCheck(wrong_rates, self._notices)
@@ -175,18 +178,18 @@ class Receiver:
 
     def start(self) -> None:
         """Begin to listen."""
-        self._started_ns = time.monotonic_ns()
+        self._started_ns = self._now_ns()
         self._thread.start()
 
     def learn(self) -> None:
         """The frames begin: what arrives from now on teaches the clock."""
-        self._begun_ns = time.monotonic_ns()
+        self._begun_ns = self._now_ns()
 
     def tend(self) -> None:
         """Restart the thread where it ended, and say so; for the frame loop, with each frame."""
         if self._thread.is_alive() or self._stop.is_set():
             return
-        now_ns = time.monotonic_ns()
+        now_ns = self._now_ns()
         if not self._retry_ns:
             if now_ns - self._started_ns > 10 * MAX_BACK_OFF_NS:
                 self._back_off_ns = MIN_BACK_OFF_NS
@@ -225,15 +228,20 @@ class Receiver:
     def _run(self) -> None:
         try:
             while not self._stop.is_set():
-                self._listen()
-            self._take_decided(self._senders.release())
-            self._settle(self.jumps.release())
+                self.listen()
+            self.release()
         except BaseException as error:  # whatever it is: the display continues, and `tend` restarts this
             self._failure = f"{type(error).__name__}: {error}"
 
-    def _listen(self) -> None:
+    def release(self) -> None:
+        """Take the samples that were in doubt, for no more will come."""
+        self._take_decided(self._senders.release())
+        self._settle(self.jumps.release())
+
+    def listen(self) -> None:
+        """Take what the link brings within POLL_MS; what the thread does all the time."""
         waits = self._link.wait_for_message(0)
-        now_ns = time.monotonic_ns()
+        now_ns = self._now_ns()
         if not waits:
             self._empty_ns = now_ns
         self._begin_to_learn(now_ns, waits)
@@ -243,7 +251,7 @@ class Receiver:
             timely = not waits and k == len(arrivals) - 1
             waited_ns = 0 if timely else arrival.host_ns - self._empty_ns
             self._take(arrival, arrival.waited_ns if self._link.stamped else waited_ns)
-        now_ns = time.monotonic_ns()
+        now_ns = self._now_ns()
         if not arrivals:  # else the sender shown may have spoken, and is not read yet
             self._take_decided(self._senders.expire(now_ns))
         self._settle(self.jumps.expire(now_ns))

@@ -24,8 +24,7 @@ from hilstar.files import make_directory, write_whole
 from hilstar.reading import MAX_TOML_BYTES, read_text
 from hilstar.run.record.ledger_reader import NO_FRAMES, config_of, read_head, run_records
 from hilstar.run.record.ledger_records import FrameRecord, RunRecord
-from hilstar.run.sync.advice import exposures_of
-from hilstar.run.sync.beat import Beat, beat
+from hilstar.run.sync import Beat, beat, exposures_of
 from hilstar.units import NS_PER_MS, NS_PER_S, NS_PER_US
 
 INT64 = range(-(2**63), 2**63)

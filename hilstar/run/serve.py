@@ -20,6 +20,7 @@ from hilstar.bench.frame import Bench
 from hilstar.notices import Notices
 from hilstar.process.interrupts import stop_on_signal
 from hilstar.run.faults import AnyFaults
+from hilstar.run.frame_pulse import FramePulse
 from hilstar.run.frame_status import StatusMaker
 from hilstar.run.lockstep import Steps, serve_lockstep
 from hilstar.run.loop import FrameLoop, Limit, policy_of
@@ -32,8 +33,7 @@ from hilstar.run.screen.display_pacer import DisplayPacer
 from hilstar.run.screen.screen import Screen
 from hilstar.run.shown import FrameSink, Shown, ignore
 from hilstar.run.summary import RunSummary, RunTally
-from hilstar.run.sync.frame_pulse import FramePulse
-from hilstar.run.sync.pulse_summary import SyncSummary
+from hilstar.run.sync import SyncSummary
 from hilstar.units import NS_PER_S
 
 
@@ -183,4 +183,4 @@ def _serve_stream(bench: Bench, link: StreamLink, limit: Limit, loop: FrameLoop,
 def _receiver(settings: AttitudeSettings, link: StreamLink, timeline: Timeline, outlet: Outlet) -> Receiver:
     shared = settings.clock == "shared"
     traffic = Traffic(settings.status_hz, settings.time_requests and not shared, shared)
-    return Receiver(link, timeline, traffic, outlet.ledger.packet, outlet.notices, settings.check_rates)
+    return Receiver(link, timeline, traffic, outlet.ledger.packet, outlet.notices, wrong_rates=settings.check_rates)

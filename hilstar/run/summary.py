@@ -11,8 +11,7 @@ from hilstar.attitude.clock.sender_clock import ClockSummary
 from hilstar.attitude.receiver import PacketCounts
 from hilstar.attitude.wire.packet import MESSAGE_REASONS, Reason
 from hilstar.render.renderer import Renderer
-from hilstar.run.sync.advice import BeatSummary
-from hilstar.run.sync.pulse_summary import SyncSummary
+from hilstar.run.sync import BeatSummary, SyncSummary
 from hilstar.running_statistics import Percentiles, RunningStatistics
 from hilstar.units import NS_PER_MS
 

@@ -26,7 +26,7 @@ from hilstar.charts import SERIES, chart, label_ends, plain_ticks, write_records
 from hilstar.monitor.quantise import shown_light
 from hilstar.render.renderer import Renderer, Target
 from hilstar.rotation import from_radec_roll_deg, propagate
-from hilstar.run.sync.beat import ARCSEC_PER_DEG, Exposures, beat, seen_at
+from hilstar.run.sync import ARCSEC_PER_DEG, Exposures, beat, seen_at
 from hilstar.scene.camera import Camera
 from hilstar.scene.exposure_motion import Motion, smeared_sprites
 from hilstar.scene.frame_motion import Scan

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hilstar.run.sync.beat import ARCSEC_PER_DEG, Exposures, seen_at
+from hilstar.run.sync import ARCSEC_PER_DEG, Exposures, seen_at
 from hilstar.scene.frame_motion import Scan
 from hilstar.study import timing
 from hilstar.study.timing import (

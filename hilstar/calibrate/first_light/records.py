@@ -18,7 +18,7 @@ from hilstar.bench.bench_file_edit import with_key
 from hilstar.errors import InputError, shortened
 from hilstar.files import write_whole
 from hilstar.reading import MAX_TOML_BYTES, NOT_JSON, exists, read_bytes, read_text
-from hilstar.run.sync.advice import BeatSummary, beat_line
+from hilstar.run.sync import BeatSummary, beat_line
 
 Verdict = Literal["done", "skipped", "failed"]
 Figure = float | int | str

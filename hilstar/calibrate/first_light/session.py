@@ -41,7 +41,7 @@ from hilstar.calibrate.latency import LatencySummary, checked_delay_ms, draw_lat
 from hilstar.errors import HilstarError, InputError, MachineError, one_line
 from hilstar.files import clear_parts, open_lock, write_whole
 from hilstar.run.doctor import examine
-from hilstar.run.sync.advice import BeatSummary, beat_of
+from hilstar.run.sync import BeatSummary, beat_of
 from hilstar.units import ERROR_OF_MEDIAN, NS_PER_S
 
 WATCHED_S = 5.0  # some 150 edges at 60 Hz

@@ -90,7 +90,7 @@ def first_light(
     from hilstar.calibrate.first_light.records import write_page
     from hilstar.calibrate.first_light.session import BEFORE_FILE, NAMES, FirstLightSession, alone_in
     from hilstar.files import make_directory
-    from hilstar.run.sync.advice import beat_line
+    from hilstar.run.sync import beat_line
 
     wrong = [name for name in again or [] if name not in NAMES]
     if wrong:

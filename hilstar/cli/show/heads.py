@@ -44,7 +44,7 @@ class HeadsAsked:
 
 def serve_heads(heads: HeadsFile, asked: HeadsAsked, as_json: bool) -> None:
     """Show every head's stars up to its end, and print what each said; exit code 4 where none ever had an attitude."""
-    from hilstar.run.heads.supervisor import HeadsRun, head_ledger, run_heads, source_config
+    from hilstar.run.heads import HeadsRun, head_ledger, run_heads, source_config
     from hilstar.run.open_link import open_link
 
     if asked.ledger is not None and not asked.switches.get("--overwrite"):

@@ -22,10 +22,10 @@ if TYPE_CHECKING:
     from hilstar.bench.fields_of_view import FieldsOfView
     from hilstar.bench.scenario import Scenario
     from hilstar.run.faults import AnyFaults, Recording
+    from hilstar.run.frame_pulse import FramePulse
     from hilstar.run.record.ledger import LedgerSwitch
     from hilstar.run.summary import RunSummary
-    from hilstar.run.sync.advice import BeatSummary
-    from hilstar.run.sync.frame_pulse import FramePulse
+    from hilstar.run.sync import BeatSummary
 
 UTC_MARK = "{utc}"  # in a ledger's name
 Windowed = Annotated[bool, typer.Option("--windowed", help="A window on the desktop instead of the full display.")]
@@ -102,7 +102,7 @@ def say_units(fields: FieldsOfView) -> None:
 
 def say_beat(bench: Any, screen: Any) -> BeatSummary:
     """What the tracker's exposures make of the refresh of a bench's screen; a line where that matters, with what to write."""
-    from hilstar.run.sync.advice import beat_line, beat_of
+    from hilstar.run.sync import beat_line, beat_of
 
     measured_hz = NS_PER_S / screen.clock.period_ns if screen is not None and screen.clock.paced_by_screen else None
     found = beat_of(bench.config, measured_hz, () if screen is None else screen.window.modes_hz)
@@ -115,7 +115,7 @@ def say_beat(bench: Any, screen: Any) -> BeatSummary:
 @contextmanager
 def optional_pulse(file: BenchFile, notices: Notices) -> Iterator[FramePulse | None]:
     """The pulse at each frame that a bench file asks for; None without one. Raises InputError where its port cannot be had."""
-    from hilstar.run.sync.frame_pulse import FramePulse
+    from hilstar.run.frame_pulse import FramePulse
 
     settings = file.config.sync
     if settings.port is None:

@@ -62,9 +62,9 @@ def send(
     import numpy as np
 
     from hilstar.attitude.wire.keys import CurveKeys
-    from hilstar.run.send.ends import open_sender
-    from hilstar.run.send.faults import BadCable, Faults
-    from hilstar.run.send.sender import send as send_samples
+    from hilstar.run.send_log import BadCable, Faults
+    from hilstar.run.send_log import send as send_samples
+    from hilstar.run.sender import open_sender
 
     shares = (parse_share(lose, "--lose"), parse_share(corrupt, "--corrupt"), parse_share(reorder, "--reorder"))
     if sum(shares) > 1:
@@ -104,7 +104,7 @@ def wanted_samples(
     from hilstar.attitude.logs.entries import Stated
     from hilstar.attitude.logs.gaps import log_joins
     from hilstar.attitude.logs.log_file import open_log
-    from hilstar.run.send.sender import log_samples, spin_samples
+    from hilstar.run.send_log import log_samples, spin_samples
 
     if (log is None) == (spin is None):
         raise InputError("send: give either a LOG or --spin AXIS,DEG_PER_S")

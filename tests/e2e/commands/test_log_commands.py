@@ -106,7 +106,7 @@ def test_fault_options_stand_alone_or_take_a_share(tmp_path):
 
 def test_a_resampled_log_keeps_its_breaks_and_its_rates(tmp_path):
     from hilstar.attitude.logs.log_file import read_log
-    from hilstar.run.send.sender import log_samples
+    from hilstar.run.send_log import log_samples
 
     lines = [
         {"t_ns": 0, "q": [1, 0, 0, 0], "rate": [0, 0, 0.1]},

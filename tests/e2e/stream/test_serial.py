@@ -22,9 +22,8 @@ from hilstar.attitude.wire.serial_link import SerialLink
 from hilstar.bench.build import load
 from hilstar.rotation import angle_between_rad, from_radec_roll_deg, propagate
 from hilstar.run.loop import Limit
-from hilstar.run.send.ends import SerialSender
-from hilstar.run.send.faults import BadCable, Faults
-from hilstar.run.send.sender import send, spin_samples
+from hilstar.run.send_log import BadCable, Faults, send, spin_samples
+from hilstar.run.sender import SerialSender
 from hilstar.run.serve import serve
 from tests.support.benches import LIVE_BENCH
 from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here

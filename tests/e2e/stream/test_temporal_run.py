@@ -13,9 +13,8 @@ from hilstar.notices import Notices
 from hilstar.run.loop import Limit
 from hilstar.run.record.ledger import Ledger, LedgerSwitch
 from hilstar.run.replay import Wanted, plan_play, replay
-from hilstar.run.send.ends import UdpSender
-from hilstar.run.send.faults import BadCable, Faults
-from hilstar.run.send.sender import send, spin_samples
+from hilstar.run.send_log import BadCable, Faults, send, spin_samples
+from hilstar.run.sender import UdpSender
 from hilstar.run.serve import Outlet, serve
 from tests.support.benches import bench_text
 from tests.support.senders import free_port

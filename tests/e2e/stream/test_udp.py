@@ -21,9 +21,8 @@ from hilstar.attitude.wire.udp import UdpLink
 from hilstar.bench.build import load
 from hilstar.notices import Notices
 from hilstar.rotation import angle_between_rad, propagate
-from hilstar.run.send.ends import UdpSender
-from hilstar.run.send.faults import BadCable, Faults
-from hilstar.run.send.sender import send, spin_samples
+from hilstar.run.send_log import BadCable, Faults, send, spin_samples
+from hilstar.run.sender import UdpSender
 from hilstar.run.serve import Outlet, Running
 from hilstar.run.shown import Shown
 from tests.support.benches import LIVE_BENCH

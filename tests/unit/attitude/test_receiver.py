@@ -21,6 +21,7 @@ from hilstar.units import NS_PER_MS, NS_PER_S
 from tests.support.waiting import PATIENCE_S
 
 PERIOD_NS = 5 * NS_PER_MS
+LEAD_NS = NS_PER_S  # from when the frames begin to the first message
 ORION = from_radec_roll_deg(84.0, -1.0, 0.0)
 LYRA = from_radec_roll_deg(283.0, 35.0, 30.0)
 STALE_AFTER_NS = 250 * NS_PER_MS
@@ -28,10 +29,21 @@ Q = np.array([1.0, 0.0, 0.0, 0.0])
 
 
 @dataclass
+class Clock:
+    """The host's clock, which stands at the newest arrival."""
+
+    now_ns: int = 10**15
+
+    def __call__(self) -> int:
+        return self.now_ns
+
+
+@dataclass
 class Script:
     """A link that hands out what it was given, what was read at the same time at once; and what its user does after each."""
 
     arrivals: list[Arrival]
+    clock: Clock
     after: Callable[[Arrival], None] = lambda arrival: None
     fails: list[BaseException] = field(default_factory=list)
     two_way: bool = False
@@ -52,9 +64,9 @@ class Script:
             raise self.fails.pop()
         if not self.arrivals:
             self.done.set()
-            time.sleep(0.002)
             return []
         host_ns = self.arrivals[0].host_ns
+        self.clock.now_ns = max(self.clock.now_ns, host_ns)
         together = list(takewhile(lambda arrival: arrival.host_ns == host_ns, self.arrivals))
         del self.arrivals[: len(together)]
         self._last = together[-1]
@@ -94,13 +106,9 @@ class Run:
     """A whole script through a receiver; `ages_ms` and `shown` are of the attitude shown just after each message."""
 
     def __init__(self, make: Callable[[int], list[Arrival]], traffic: Traffic | None = None, **script) -> None:
-        lead_ns = NS_PER_S // 2
-        while True:  # until the script was written before its time: what comes just after the beginning may have queued
-            lead_ns *= 2
-            self.host0_ns = time.monotonic_ns() + lead_ns
-            arrivals = sorted(make(self.host0_ns), key=lambda arrival: (arrival.host_ns, arrival.event.t_ns))
-            if time.monotonic_ns() < self.host0_ns - lead_ns // 2:
-                break
+        clock = Clock()
+        self.host0_ns = clock.now_ns + LEAD_NS
+        arrivals = sorted(make(self.host0_ns), key=lambda arrival: (arrival.host_ns, arrival.event.t_ns))
         self.notices = Notices()
         self.told: list[Notice] = []
         self.received_when_told = 0
@@ -108,15 +116,23 @@ class Run:
         self.timeline = Timeline(Policy(STALE_AFTER_NS, STALE_AFTER_NS))
         self.ages_ms: list[float] = []
         self.shown: list[np.ndarray] = []
-        self.link = Script(arrivals, self._look, **script)
-        self.receiver = Receiver(self.link, self.timeline, traffic or Traffic(), notices=self.notices)
+        self.link = Script(arrivals, clock, self._look, **script)
+        self.receiver = Receiver(self.link, self.timeline, traffic or Traffic(), notices=self.notices, now_ns=clock)
         self.receiver.learn()
+        if self.link.fails:
+            self._run_on_its_thread(clock)
+        while not self.link.done.is_set():
+            self.receiver.listen()
+        self.receiver.release()
+        self.counts, self.events = self.receiver.counts, self.notices.counts()
+
+    def _run_on_its_thread(self, clock: Clock) -> None:
         self.receiver.start()
         deadline_s = time.monotonic() + PATIENCE_S
-        while not self.link.done.wait(0.005) and time.monotonic() < deadline_s:
+        while not self.link.done.wait(0.001) and time.monotonic() < deadline_s:
+            clock.now_ns += 10 * NS_PER_MS
             self.receiver.tend()
         self.receiver.close()
-        self.counts, self.events = self.receiver.counts, self.notices.counts()
 
     def _hear(self, notice: Notice) -> None:
         self.told.append(notice)
@@ -425,7 +441,7 @@ def test_a_receiver_that_breaks_is_started_again_and_said():
 
 
 def test_a_receiver_that_is_stopped_while_it_is_broken_ends():
-    link = Script([], fails=[MemoryError()] * 5)
+    link = Script([], Clock(), fails=[MemoryError()] * 5)
     receiver = Receiver(link, Timeline(Policy(0, NS_PER_S)))
     receiver.start()
     receiver.close()
@@ -471,7 +487,7 @@ def test_what_was_queued_before_the_frames_teaches_nothing():
 
     def make(t0: int) -> list[Arrival]:
         queued = Sender().packets(t0 - 3 * NS_PER_S, seconds(0, 2))
-        read = [Arrival(time.monotonic_ns(), arrival.event, arrival.raw) for arrival in queued]
+        read = [Arrival(t0 - LEAD_NS, arrival.event, arrival.raw) for arrival in queued]
         return read + Sender(first=600).packets(t0, seconds(0, 3))
 
     run = Run(make)

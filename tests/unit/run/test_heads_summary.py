@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from hilstar.run.heads.supervisor import _told
+from hilstar.run.heads import _told
 from tests.support.damage import NO_JSON
 
 

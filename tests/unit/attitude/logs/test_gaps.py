@@ -12,7 +12,7 @@ from hilstar.attitude.logs.gaps import GAP_INTERVALS, log_joins
 from hilstar.attitude.logs.log_file import log_timeline
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.rotation import angle_between_rad, from_radec_roll_deg, propagate, to_matrix
-from hilstar.run.send.sender import log_samples
+from hilstar.run.send_log import log_samples
 from hilstar.twin.batch import log_views
 
 S = 1_000_000_000

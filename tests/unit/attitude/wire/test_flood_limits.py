@@ -15,7 +15,7 @@ from hilstar.attitude.wire.packet import AttitudeSample, StreamDecoder, declares
 from hilstar.attitude.wire.serial_link import SerialLink
 from hilstar.errors import InputError
 from hilstar.notices import Notices
-from hilstar.run.send.ends import SerialSender
+from hilstar.run.sender import SerialSender
 from tests.support.waiting import PATIENCE_S
 from tests.support.wire.samples import sample
 

@@ -9,8 +9,7 @@ import pytest
 
 from hilstar.bench.config import parse_config
 from hilstar.errors import InputError
-from hilstar.run.sync.advice import beat_line, beat_of
-from hilstar.run.sync.beat import ARCSEC_PER_DEG, Exposures, beat, seen_at
+from hilstar.run.sync import ARCSEC_PER_DEG, Exposures, beat, beat_line, beat_of, seen_at
 from tests.support.benches import bench_text
 
 STEPS = 40_000  # of the simulated exposures: a row's edge falls within 1 of them, at both ends

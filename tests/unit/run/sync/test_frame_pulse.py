@@ -12,7 +12,7 @@ from hilstar.attitude.wire.serial_link import RtsLine
 from hilstar.bench.config import SyncSettings
 from hilstar.errors import InputError
 from hilstar.notices import Notices
-from hilstar.run.sync.frame_pulse import FramePulse
+from hilstar.run.frame_pulse import FramePulse
 from tests.support.rts_server import KeptLine
 from tests.support.waiting import PATIENCE_S, best_of_three, in_time, wait_for
 

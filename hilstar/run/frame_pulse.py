@@ -14,7 +14,7 @@ from hilstar.bench.config import SyncSettings
 from hilstar.errors import one_line
 from hilstar.notices import Notices
 from hilstar.process.scheduling import raise_priority
-from hilstar.run.sync.pulse_summary import SyncSummary
+from hilstar.run.sync import SyncSummary
 from hilstar.running_statistics import RunningStatistics
 from hilstar.units import NS_PER_MS, NS_PER_S
 

@@ -1,1 +1,0 @@
-"""Several heads beside one source: a process a head, started again where it ends or stalls."""

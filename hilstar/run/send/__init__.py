@@ -1,1 +1,0 @@
-"""The sender of test streams, and the faults that it can inject."""

@@ -1,4 +1,4 @@
-"""What a step works with: the bench file as it now stands, its own folder, the tracker's images, and earlier figures."""
+"""The context of a step: the bench file as it stands, the step's folder, the source of images, and figures of earlier steps."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ LIGHT_STEP = 4.0  # by which the light is lowered while a pattern is too bright
 
 
 def nobody_watches(pattern: Pattern) -> None:
-    """For a session that nobody follows."""
+    """The watcher of a session that nobody follows."""
 
 
 @dataclass(frozen=True, slots=True)
 class DarkSubtracted:
     """An image of the tracker: its file, and its light above the dark frame (h, w), DN.
 
-    `raw_peak` is with the dark frame, hot pixels left out, and `floor_dn` the median of that.
+    `raw_peak` is the peak before subtraction, without hot pixels; `floor_dn` is the median of the dark frame.
     """
 
     path: Path
@@ -43,11 +43,11 @@ class DarkSubtracted:
 
 @dataclass(frozen=True, slots=True)
 class StepContext:
-    """Where a step works.
+    """What a step has to work with.
 
-    `folder` takes its images, `session` its results. `kept` are the images of an attempt that was interrupted: they are not
-    taken again. `known` are figures of the steps before; `patches` is how many readings the response is worth. `watch` is
-    called with each pattern before it is shown.
+    Images go to `folder`, results to `session`. `kept` has the images of an interrupted attempt, which are not taken again.
+    `known` has the figures of earlier steps; `patches` is the maximum number of readings of the response. `watch` is called
+    with each pattern before it is shown.
     """
 
     file: BenchFile
@@ -61,7 +61,7 @@ class StepContext:
 
     @property
     def resolution_px(self) -> tuple[int, int]:
-        """Of the monitor's image."""
+        """Size of the monitor's image."""
         return self.file.config.monitor.resolution_px
 
     @property
@@ -71,7 +71,7 @@ class StepContext:
 
     @property
     def truth(self) -> BenchFile | None:
-        """The bench as it really is, in a virtual session."""
+        """The true bench of a virtual session, None otherwise."""
         return self.source.truth if isinstance(self.source, VirtualBench) else None
 
     def geometry(self) -> BenchGeometry:
@@ -79,20 +79,20 @@ class StepContext:
         return BenchGeometry(ideal_monitor(self.file.config), tracker_camera(self.file.config.tracker, self.file.folder))
 
     def real_geometry(self) -> BenchGeometry:
-        """The same with the lens that was measured."""
+        """Monitor and tracker with the measured lens."""
         return BenchGeometry(bench_camera(self.file.config, self.file.folder), self.geometry().tracker)
 
     def with_file(self, file: BenchFile) -> StepContext:
-        """The same with another bench file."""
+        """A copy with another bench file."""
         return replace(self, file=file)
 
     @property
     def exposure_s(self) -> float:
-        """The tracker's, as the bench file has it."""
+        """The tracker's exposure, from the bench file."""
         return self.file.config.tracker.exposure_s
 
     def take(self, pattern: Pattern, exposure_s: float | None = None) -> Path:
-        """The tracker's image of a pattern, at the bench file's exposure or another."""
+        """Take the tracker's image of a pattern, by default at the bench file's exposure."""
         if pattern.name in self.kept:
             return self.kept[pattern.name]
         make_directory(self.folder)
@@ -101,7 +101,7 @@ class StepContext:
         return self.source.look(self.file, pattern, stem, self.exposure_s if exposure_s is None else exposure_s)
 
     def take_or_key(self, pattern: Pattern, keys: Mapping[str, str]) -> Path | str:
-        """The tracker's image of a pattern, or, by hand, the key that tells how it was seen: `keys` has what each means."""
+        """Take the tracker's image of a pattern, or by hand the key that says how it looks; `keys` has their meanings."""
         if isinstance(self.source, ByHand) and pattern.name not in self.kept:
             stem = make_directory(self.folder) / pattern.name
             self.watch(pattern)
@@ -114,7 +114,7 @@ class StepContext:
         return self.kept[name] if name in self.kept else self.source.unlit(make_directory(self.folder) / name)
 
     def dark(self) -> Path:
-        """The tracker's image of a black screen."""
+        """Take the tracker's image of a black screen."""
         return self.take(Pattern("dark_000", black(self.resolution_px)))
 
     def look(self, pattern: Pattern, dark: FloatArray) -> DarkSubtracted:
@@ -133,7 +133,7 @@ class StepContext:
 
     @property
     def full_dn(self) -> float:
-        """Where the tracker saturates: its ADC's last code, or its full well."""
+        """The level at which the tracker saturates: its ADC's last code, or its full well, DN."""
         detector = self.file.config.tracker.detector
         return min(2.0**detector.bits - 1, detector.offset_dn + detector.full_well_e / detector.gain_e_per_dn)
 

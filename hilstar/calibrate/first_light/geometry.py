@@ -1,4 +1,4 @@
-"""Steps until every pixel's direction is known: orientation, focus, geometry."""
+"""The steps that find where the tracker sees each pixel: orientation, focus, geometry."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ NOT_SEEN = "show the monitor to the whole of the tracker's field, expose longer,
 
 @dataclass(frozen=True, slots=True)
 class SeenFigure:
-    """How the tracker saw the figure: the right-angled way round (4,) row by row, its scale and its turn beyond that."""
+    """How the tracker saw the figure: its orientation (a 2 x 2 matrix, row by row), its scale, and the remaining turn."""
 
     way: tuple[int, int, int, int]
     scale: float
@@ -102,12 +102,12 @@ class SeenFigure:
 
     @property
     def words(self) -> str:
-        """The way round for a person."""
+        """The orientation in words."""
         return WAYS[self.way]
 
 
 def see_figure(image: FloatArray, figure: OrientationFigure, geometry: BenchGeometry) -> SeenFigure:
-    """The figure in a tracker's image (h, w) above its dark frame, by the bench file's own lens.
+    """Find the figure in a tracker's image (h, w) above its dark frame, by the bench file's lens.
 
     Raises InputError where it is not there, or not as large as the focal lengths say.
     """
@@ -138,12 +138,12 @@ def see_figure(image: FloatArray, figure: OrientationFigure, geometry: BenchGeom
 
 
 def keys_of_ways() -> dict[str, tuple[int, int, int, int]]:
-    """The key for each way round; the first is upright."""
+    """The key to press for each orientation; the first is upright."""
     return {str(number): way for number, way in enumerate(WAYS, start=1)}
 
 
 def look_of(way: tuple[int, int, int, int]) -> str:
-    """Where a person sees the figure's squares when it stands this way round."""
+    """Where the figure's squares appear in this orientation, in words."""
     right, below = (way[0], way[2]), (way[1], way[3])
     corner = CORNERS[-right[0] - below[0], -right[1] - below[1]]
     return f"the largest square {corner}, the next one {SIDES[right]}, the smallest {SIDES[below]} ({WAYS[way]})"
@@ -151,7 +151,7 @@ def look_of(way: tuple[int, int, int, int]) -> str:
 
 @dataclass(frozen=True, slots=True)
 class ScreenMounting:
-    """The keys of [monitor] that say how the screen is mounted."""
+    """How the screen is mounted: keys of [monitor]."""
 
     flip_x: bool
     flip_y: bool
@@ -159,12 +159,12 @@ class ScreenMounting:
 
     @property
     def matrix(self) -> FloatArray:
-        """From the image's axes to the screen's (2, 2), x right and y down."""
+        """The matrix (2, 2) from the image's axes to the screen's, x right and y down."""
         turn = np.linalg.matrix_power(np.array([[0, -1], [1, 0]]), self.rotate_deg // 90)
         return np.asarray(np.diag([-1.0 if self.flip_x else 1.0, -1.0 if self.flip_y else 1.0]) @ turn)
 
     def changed(self, other: ScreenMounting) -> int:
-        """How many keys differ."""
+        """The number of keys that differ."""
         return sum(
             a != b
             for a, b in (
@@ -176,12 +176,12 @@ class ScreenMounting:
 
 
 def mounting_of(monitor: Monitor) -> ScreenMounting:
-    """The mounting that a bench file has."""
+    """The mounting in a bench file."""
     return ScreenMounting(monitor.flip_x, monitor.flip_y, monitor.rotate_deg)
 
 
 def corrected(mounting: ScreenMounting, way: tuple[int, int, int, int]) -> ScreenMounting:
-    """The mounting under which an image that was seen `way` round is upright, with the fewest keys changed."""
+    """The mounting that turns an image seen in orientation `way` upright, with the fewest keys changed."""
     wanted = mounting.matrix @ np.linalg.inv(np.array(way, dtype=np.float64).reshape(2, 2))
     flips = (False, True)
     all_ways = [ScreenMounting(x, y, turn) for x, y, turn in itertools.product(flips, flips, (0, 90, 180, 270))]
@@ -201,9 +201,9 @@ MODEL_POINTS = 9  # in a dot, along each axis
 
 @dataclass(frozen=True, slots=True)
 class Sharpness:
-    """Dots as the tracker saw them: places (n,), the sigma of each (n,), px, that of the PSF (n,) with the dot's own width out.
+    """Dots in the tracker's image: places (n,), the sigma of each (n,), and the PSF's sigma by each (n,), tracker px.
 
-    `psf_sigma_px` is the median of the last.
+    The dot's own width is removed from the PSF's sigma; `psf_sigma_px` is the median.
     """
 
     x_px: FloatArray
@@ -214,7 +214,7 @@ class Sharpness:
 
 
 def sharpness(image: FloatArray, dot_side_px: float) -> Sharpness:
-    """The sharpness of an image (h, w) of dots above its dark frame; a dot is a square of `dot_side_px` tracker px.
+    """Measure the sharpness of dots in an image (h, w) above its dark frame; a dot is a square of `dot_side_px` tracker px.
 
     Raises InputError where too few dots are there.
     """
@@ -232,7 +232,7 @@ def sharpness(image: FloatArray, dot_side_px: float) -> Sharpness:
 
 
 def _model_sigma(psf_sigma_px: float, dot_side_px: float) -> float:
-    """The sigma that is measured of a square dot under a PSF of that sigma, integrated over pixels, at places within one."""
+    """The sigma measured of a square dot under a PSF of `psf_sigma_px`, averaged over places within a pixel."""
     side = 4 * RADIUS_PX + 1
     phase = (np.arange(MODEL_PHASES) + 0.5) / MODEL_PHASES - 0.5
     point = ((np.arange(MODEL_POINTS) + 0.5) / MODEL_POINTS - 0.5) * dot_side_px
@@ -258,7 +258,7 @@ def _sigmas(padded: FloatArray, x_px: FloatArray, y_px: FloatArray) -> FloatArra
     for _ in range(ROUNDS):
         weighted = values * np.exp(-0.5 * r2 / variance[:, None, None])
         total = np.maximum(weighted.sum(axis=(1, 2)), 1e-9)
-        # Half of the sum over both axes is the moment of one, and that half of the variance.
+        # The windowed moment over both axes is twice that of one axis, which is half of the variance.
         found = (weighted * r2).sum(axis=(1, 2)) / total
         variance = np.clip(found, MIN_SIGMA_PX**2, MAX_SIGMA_PX**2)
     return np.asarray(np.sqrt(variance))
@@ -274,7 +274,7 @@ BLURRED_BY_PX = 0.1
 
 
 def orientation(context: StepContext) -> StepOutcome:
-    """Find how the screen is mounted, set the bench file so, and see the figure upright. Raises InputError."""
+    """Find how the screen is mounted, set the bench file's keys, and check that the figure is upright. Raises InputError."""
     before = mounting_of(context.file.config.monitor)
     seen = first = _way(context, "figure_000")
     changes = _mounting_changes(context.file, before, corrected(before, first.way))
@@ -298,7 +298,7 @@ def orientation(context: StepContext) -> StepOutcome:
 
 @dataclass(frozen=True, slots=True)
 class _SeenWay:
-    """Which way round the figure stands; as it was measured, None where a person told it by a key."""
+    """The figure's orientation, and its measurement; None where a person pressed a key instead."""
 
     way: tuple[int, int, int, int]
     measured: tuple[SeenFigure, DarkSubtracted] | None
@@ -326,7 +326,7 @@ def _mounting_changes(file: BenchFile, before: ScreenMounting, after: ScreenMoun
 
 
 def dots_for(context: StepContext) -> DotPlan:
-    """The dots that this screen shows this tracker: as many as stand apart. Raises InputError."""
+    """Plan as many dots as this tracker can tell apart on this screen. Raises InputError."""
     geometry = context.geometry()
     ratio = geometry.tracker.focal_length_px / geometry.monitor.focal_length_px
     seen = [min(ratio * wide, size) for wide, size in zip(context.resolution_px, geometry.tracker.resolution_px, strict=True)]
@@ -335,7 +335,7 @@ def dots_for(context: StepContext) -> DotPlan:
 
 
 def focus(context: StepContext) -> StepOutcome:
-    """Measure how sharp the dots are, and at which code they do not saturate the tracker. Raises InputError."""
+    """Measure the PSF by dots of the brightest code that does not saturate the tracker. Raises InputError."""
     code, found, looked = sharp_dots(context)
     wanted = float(np.hypot(*context.file.config.tracker.psf_sigma_px) / np.sqrt(2))
     picture = context.session / "focus.png"
@@ -366,7 +366,7 @@ class SharpDots(NamedTuple):
 
 
 def sharp_dots(context: StepContext) -> SharpDots:
-    """The brightest code whose dots do not saturate the tracker, and how sharp they are. Raises InputError."""
+    """Lower the dots' code until they do not saturate the tracker, and measure them. Raises InputError."""
     geometry, plan, code = context.geometry(), dots_for(context), context.white
     dark = context.read(context.dark())
     for number in range(context.file.config.monitor.bits * 2):
@@ -383,7 +383,7 @@ SQUARE_NAMES = ("corner", "right", "below")
 
 
 def draw_spots(path: Path, image: FloatArray, x_px: FloatArray, y_px: FloatArray, finding: str) -> None:
-    """An image of the tracker (h, w) with a ring about each spot that was found."""
+    """Draw an image of the tracker (h, w) with a ring about each spot found."""
     with chart(path, finding, height_inch=6.4) as (axes,):
         low, high = (float(value) for value in np.percentile(image, (5, 99.9)))
         axes.imshow(np.sqrt(np.clip(image - low, 0, None)), cmap="gray", vmax=np.sqrt(max(high - low, 1.0)))
@@ -401,7 +401,7 @@ def draw_spots(path: Path, image: FloatArray, x_px: FloatArray, y_px: FloatArray
 
 
 def draw_focus(path: Path, found: Sharpness, finding: str) -> None:
-    """The PSF's sigma at each dot over the tracker's field."""
+    """Draw the PSF's sigma at each dot over the tracker's field."""
     with chart(path, finding, height_inch=6.0) as (axes,):
         dots = axes.scatter(found.x_px, found.y_px, c=found.each_psf_sigma_px, cmap="viridis", s=60)
         axes.figure.colorbar(dots, ax=axes, label="PSF sigma [tracker px]")
@@ -410,7 +410,7 @@ def draw_focus(path: Path, found: Sharpness, finding: str) -> None:
 
 
 def geometry(context: StepContext) -> StepOutcome:
-    """Fit the lens, the tilt and the alignment to dots, and name the file in the bench file. Raises InputError."""
+    """Fit lens, tilt and alignment to dots, and name the geometry file in the bench file. Raises InputError."""
     code = int(context.known.get("focus.dot_code", 0)) or sharp_dots(context).code
     plan = dots_for(context)
     make_directory(context.folder)

@@ -39,9 +39,9 @@ CodeImage = npt.NDArray[np.uint16]
 
 @dataclass(frozen=True, slots=True)
 class Pattern:
-    """Code values (h, w), or (h, w, 3), over the monitor's image, and the name of the tracker's image of them.
+    """Codes (h, w) or (h, w, 3) over the monitor's image, before it is turned as the screen is mounted, and a name.
 
-    `later` are frames that follow, one a refresh, before it begins again.
+    `later` has further frames, one per refresh, before the pattern repeats.
     """
 
     name: str
@@ -50,7 +50,7 @@ class Pattern:
 
     @property
     def frames(self) -> tuple[CodeImage, ...]:
-        """All frames of one turn."""
+        """All frames of one repetition."""
         return (self.codes, *self.later)
 
 
@@ -61,7 +61,7 @@ def black(resolution_px: tuple[int, int]) -> CodeImage:
 
 
 def in_channel(codes: CodeImage, channel: str) -> CodeImage:
-    """Codes (h, w) in one primary (h, w, 3); in all of them, as they are, for w."""
+    """Codes (h, w) in one primary (h, w, 3); unchanged for w."""
     if channel == "w":
         return codes
     colours = np.zeros((*codes.shape, 3), dtype=np.uint16)
@@ -70,14 +70,14 @@ def in_channel(codes: CodeImage, channel: str) -> CodeImage:
 
 
 def on_screen(codes: CodeImage, orientation: Orientation) -> CodeImage:
-    """An image as it lies on the screen (as shaders/present.frag turns it)."""
+    """Turn an image as the screen is mounted, as shaders/present.frag does."""
     screen = np.rot90(codes, -orientation.quarter_turns)
     screen = screen[:, ::-1] if orientation.flip_x else screen
     return screen[::-1] if orientation.flip_y else screen
 
 
 def off_screen(screen: CodeImage, orientation: Orientation) -> CodeImage:
-    """The image that lies on the screen so: the inverse of `on_screen`."""
+    """The inverse of `on_screen`."""
     screen = screen[::-1] if orientation.flip_y else screen
     screen = screen[:, ::-1] if orientation.flip_x else screen
     return np.rot90(screen, orientation.quarter_turns)
@@ -88,15 +88,15 @@ PATTERN_FILE = "pattern.png"
 
 
 class NoImage(InputError):
-    """The image did not come: what was taken before it is good, and need not be taken again."""
+    """An image did not come. Those taken before it are good and need not be taken again."""
 
 
 class ImageSource(Protocol):
-    """Shows patterns to the tracker and brings back its images."""
+    """Shows patterns to the tracker and returns its images."""
 
     @property
     def identity(self) -> str:
-        """What the images come from, in words that change when it does."""
+        """A text that identifies the source; it changes when the source does."""
 
     def gate(self, file: BenchFile) -> Timing | None:
         """The display's timing, None where this program has no display. Raises MachineError."""
@@ -115,14 +115,14 @@ class ImageSource(Protocol):
         """The tracker's image with the monitor switched off, at the bench file's exposure; None where there is none."""
 
     def diode(self, file: BenchFile, seconds: float) -> DiodeRecording | None:
-        """What a photodiode sees of the square on the display; None where there is none. Raises InputError, MachineError."""
+        """Record the display's square by a photodiode; None where there is none. Raises InputError, MachineError."""
 
     def close(self) -> None:
         """Let go of the display."""
 
 
 def complete_images(folder: Path) -> dict[str, Path]:
-    """The images in a directory by their names without ending, but for the newest, which may have been cut short."""
+    """The images in a directory by name without ending, except the newest, which may be incomplete."""
     found = [path for path in folder.glob("*") if path.suffix in ENDINGS and path.name != PATTERN_FILE]
     found.sort(key=lambda path: path.stat().st_mtime_ns)
     return {path.stem: path for path in found[:-1]}
@@ -133,7 +133,7 @@ KIND = "code"  # a square that toggles leaves pairs of frames open
 
 @dataclass(frozen=True, slots=True)
 class DiodeRecording:
-    """The changes of the square, at their swaps, and the edges that the photodiode saw."""
+    """The square's changes at their swaps, and the edges that the photodiode saw."""
 
     shown: Edges
     seen: Edges
@@ -147,7 +147,7 @@ class SerialDiode:
     baud: int
 
     def watch(self, display: PatternDisplay, file: BenchFile, seconds: float) -> DiodeRecording:
-        """Show the square for so long and listen. Raises InputError without edges, MachineError, Stopped."""
+        """Show the square for `seconds` and record. Raises InputError without edges, MachineError, Stopped."""
         with ThreadPoolExecutor(1) as pool:
             listening: list[Future[Edges]] = []
 
@@ -160,7 +160,7 @@ class SerialDiode:
 
 
 def with_code(file: BenchFile) -> BenchFile:
-    """The same bench with a square whose frames tell themselves apart."""
+    """The bench with a photodiode square that encodes the frame's number."""
     monitor = replace(file.config.monitor, photodiode=KIND)
     return dataclasses.replace(file, config=replace(file.config, monitor=monitor))
 
@@ -171,7 +171,7 @@ SHOW_YOURSELF = "or show the patterns yourself: name {pattern} in --grab"
 
 
 class Stopped(HilstarError):
-    """The person at the display has closed the window: the session goes on there when it is run again."""
+    """Somebody closed the window. The session continues there when it is run again."""
 
     exit_code = 1
 
@@ -184,7 +184,7 @@ def _go_on(window: Window, stopped: bool) -> None:
 
 
 def _presenter(file: BenchFile, window: Window, codes: CodeImage) -> tuple[Presenter, Callable[[], None]]:
-    """What shows codes (h, w) or (h, w, 3) in the window, and what frees its texture after it."""
+    """A presenter of codes (h, w) or (h, w, 3) for the window, and the function that frees its texture."""
     monitor, triples = file.config.monitor, None
     if codes.ndim == 3:
         packed = codes.astype(np.int64) @ np.array([1 << 32, 1 << 16, 1])
@@ -216,7 +216,7 @@ class PatternDisplay:
     def show_until(
         self, file: BenchFile, pattern: Pattern, done: Callable[[], bool], on_key: Callable[[str], object] = lambda key: None
     ) -> None:
-        """Show a pattern until `done`, which is first asked when the panel has settled; `on_key` is told of keys.
+        """Show a pattern until `done()`, first called when the panel has settled; `on_key` gets the keys pressed.
 
         Raises Stopped where the window is closed, MachineError where the display goes away.
         """
@@ -240,9 +240,9 @@ class PatternDisplay:
                 release()
 
     def blink(self, file: BenchFile, begin: Callable[[], Callable[[], bool]]) -> Edges:
-        """Show the photodiode's square on black, frame by frame: its changes. Raises Stopped, MachineError.
+        """Show the photodiode's square on black; the square's changes. Raises Stopped, MachineError.
 
-        `begin` is called once the display has been timed, and gives back what tells that it is enough.
+        `begin` is called once the display has been timed, and returns a function that says when to stop.
         """
         window = self._window_for(file)
         period_s = 1.0 / file.config.monitor.refresh_hz
@@ -292,10 +292,10 @@ GRAB_TIMEOUT_S = 120.0
 
 
 class GrabCommand:
-    """Images by a command: {output} is the file that it has to write, {pattern} a picture of what the screen has to show.
+    """Images by a command. It writes the file {output}; {pattern} is a picture of what the screen has to show.
 
-    Without {pattern} the session shows it itself; with {exposure_s} it may choose the exposure. `dark` is the image with the
-    monitor switched off. Raises InputError for a command that has no {output}.
+    Without {pattern} the session shows the pattern itself; with {exposure_s} it may choose the exposure. `dark` is an image
+    with the monitor switched off. Raises InputError for a command without {output}.
     """
 
     def __init__(self, command: str, dark: Path | None = None, diode: SerialDiode | None = None) -> None:
@@ -337,7 +337,7 @@ class GrabCommand:
         return output
 
     def diode(self, file: BenchFile, seconds: float) -> DiodeRecording | None:
-        """By the photodiode that the user named, on this program's own display."""
+        """Record the user's photodiode before this program's own display."""
         return None if self._diode is None or self._shows else self._diode.watch(self._display, file, seconds)
 
     def close(self) -> None:
@@ -356,7 +356,7 @@ def _run(words: list[str], output: Path, meanwhile: Callable[[Callable[[], bool]
     end_s = time.monotonic() + GRAB_TIMEOUT_S
 
     def done() -> bool:
-        # Begun when it is first asked: by then the panel shows the pattern.
+        # The command starts at the first call: by then the panel shows the pattern.
         if not started:
             started.append(ended.enter_context(_start(words)))
         return started[0].poll() is not None or time.monotonic() > end_s
@@ -368,7 +368,7 @@ def _run(words: list[str], output: Path, meanwhile: Callable[[Callable[[], bool]
 
 
 def _check(words: list[str], output: Path, child: Child, code: int | None) -> None:
-    """Refuse (NoImage) a command that did not end, failed, or wrote no image."""
+    """Raise NoImage for a command that did not end, failed, or wrote no image."""
     command = shortened(shlex.join(words))
     if child.too_much:
         raise NoImage(f"--grab: {command} printed more than {MAX_OUTPUT_BYTES // 1_000_000} MB on stderr; let it say less")
@@ -399,7 +399,7 @@ log = logging.getLogger(__name__)
 
 
 class ByHand:
-    """Images that a person saves: each pattern stays on the display until its file is there."""
+    """Images that a person saves. Each pattern stays on the display until its file is complete."""
 
     identity = "by hand"
     sets_exposure = True
@@ -416,14 +416,14 @@ class ByHand:
         return self._dark
 
     def look(self, file: BenchFile, pattern: Pattern, stem: Path, exposure_s: float) -> Path:
-        """Wait for the image of the pattern, complete."""
+        """Wait for a complete image of the pattern."""
         exposed = "" if exposure_s == file.config.tracker.exposure_s else f", exposed for {exposure_s:.4g} s,"
         asked = f"now save the tracker's image{exposed} as {stem}.png (or .fits); q on the display ends"
         self._display.show_until(file, pattern, _once_asked(asked, lambda: _saved(stem) is not None))
         return _saved(stem) or stem
 
     def look_or_key(self, file: BenchFile, pattern: Pattern, stem: Path, keys: Mapping[str, str]) -> Path | str:
-        """The image of the pattern, or the key that tells how it was seen: `keys` has what each of them means."""
+        """The image of the pattern, or the key that says how it looks; `keys` has their meanings."""
         legend = "\n".join(f"    {key}  {meaning}" for key, meaning in keys.items())
         asked = f"now press on the display what the tracker sees, or save its image as {stem}.png (or .fits):\n{legend}"
         pressed: list[str] = []
@@ -439,7 +439,7 @@ class ByHand:
         return pressed[0] if pressed else _saved(stem) or stem
 
     def diode(self, file: BenchFile, seconds: float) -> DiodeRecording | None:
-        """By the photodiode that the user named."""
+        """Record the user's photodiode."""
         return None if self._diode is None else self._diode.watch(self._display, file, seconds)
 
     def close(self) -> None:
@@ -448,7 +448,7 @@ class ByHand:
 
 
 def _once_asked(words: str, done: Callable[[], bool]) -> Callable[[], bool]:
-    """`done`, which says what is wanted when it is first asked: by then the panel shows the pattern."""
+    """`done` with a message at its first call: by then the panel shows the pattern."""
     asked = False
 
     def asked_and_done() -> bool:

@@ -38,9 +38,9 @@ PHASES = 24
 
 @dataclass(frozen=True, slots=True)
 class DotField:
-    """A square of the monitor (left, top, side; px) and the part of the tracker's image that has its light (slices).
+    """A square of the monitor (left, top, side; px) and the part of the tracker's image with its light (slices).
 
-    `monitor_px` is how many of the monitor's pixels stand in that part.
+    `monitor_px` is the number of monitor pixels seen in that part.
     """
 
     left: int
@@ -51,7 +51,7 @@ class DotField:
     monitor_px: float
 
     def lattice(self, resolution_px: tuple[int, int], period: int, patch: Patch) -> CodeImage:
-        """Each `period`-th pixel of the square, across and down, in a patch's code and channel; from its cell's middle on."""
+        """Every `period`-th pixel of the square, across and down, in a patch's code and channel."""
         codes = black(resolution_px)
         first = period // 2
         inside = codes[self.top : self.top + self.side, self.left : self.left + self.side]
@@ -59,12 +59,12 @@ class DotField:
         return in_channel(codes, patch.channel)
 
     def lit(self, period: int) -> int:
-        """How many pixels such a lattice has."""
+        """The number of lit pixels of such a lattice."""
         return (self.side // period) ** 2
 
 
 def field_for(geometry: BenchGeometry, sigma_px: float) -> tuple[DotField, tuple[int, ...]]:
-    """Where lattices are shown, and their periods, dense to sparse; `sigma_px` is the tracker's PSF.
+    """The square for lattices, and their periods from dense to sparse; `sigma_px` is the tracker's PSF.
 
     Raises InputError where too little of the monitor is seen.
     """
@@ -86,13 +86,13 @@ def field_for(geometry: BenchGeometry, sigma_px: float) -> tuple[DotField, tuple
 
 
 def _within(middle: float, side: int, size: int) -> int:
-    """The first pixel of a side about the middle of what is seen, within the screen."""
+    """The first pixel of a side centred on what is seen, kept on the screen."""
     wanted = middle if math.isfinite(middle) else (size - 1) / 2
     return int(np.clip(round(wanted - (side - 1) / 2), 0, size - side))
 
 
 def _seen(geometry: BenchGeometry, corner: tuple[int, int], side: int, margin: float) -> tuple[slice, slice]:
-    """The rows and columns of the tracker's image that the square's border and its wings fall on."""
+    """The rows and columns of the tracker's image that the square and its wings cover."""
     along = np.linspace(0, side - 1, 33)
     low, high = np.zeros_like(along), np.full_like(along, side - 1)
     x = corner[0] + np.concatenate([along, along, low, high])
@@ -110,7 +110,7 @@ def _seen(geometry: BenchGeometry, corner: tuple[int, int], side: int, margin: f
 
 
 def peak_shares(periods: tuple[int, ...], ratio: float, sigma_px: float) -> FloatArray:
-    """Of one lit pixel's light, what the brightest tracker pixel has under each lattice; `ratio` tracker px a monitor px."""
+    """The share of a lit pixel's light in the brightest tracker pixel, per lattice; `ratio` is tracker px per monitor px."""
     sigma = math.hypot(sigma_px, ratio / math.sqrt(12))
     shares = []
     for period in periods:
@@ -130,7 +130,7 @@ BLACK = Patch(0, "w")
 
 @dataclass(frozen=True, slots=True)
 class LatticeRatio:
-    """How much brighter a lit pixel is by its dense lattice than by its sparse one, both of one code: 1 where light adds up."""
+    """A lit pixel's light on a dense lattice relative to a sparse one, both of one code: 1 where light is additive."""
 
     patch: Patch
     dense: int
@@ -140,9 +140,9 @@ class LatticeRatio:
 
 @dataclass(frozen=True, slots=True)
 class Readings:
-    """Light (n,) of a lit pixel of each patch with the black level, DN/s, the exposure, and how lattices agree.
+    """Light (n,) of a lit pixel for each patch, black level included, DN/s; the exposure; how lattices agree.
 
-    `black_known` says that the black level was measured; else it is the bench file's share of white.
+    `black_known` says whether the black level was measured; else it is the bench file's.
     """
 
     patches: list[Patch]
@@ -169,14 +169,14 @@ class Readings:
 
 @dataclass(frozen=True, slots=True)
 class Assumed:
-    """Light above black by channel and code (2^bits,), relative to white, and the black level: as the bench file has them."""
+    """The bench file's light above black by channel and code (2^bits,), relative to white, and its black level."""
 
     light: dict[str, FloatArray]
     black: float
 
 
 class Photometer:
-    """Lattices before the tracker. Raises InputError where they cannot be seen whole."""
+    """The tracker as a photometer. Raises InputError where the lattices are not whole in its field."""
 
     def __init__(self, context: StepContext, sigma_px: float, assumed: Assumed) -> None:
         geometry = context.real_geometry()
@@ -189,7 +189,7 @@ class Photometer:
         self._cold = self._part(self._dark_screen) < HOT_FILL * context.full_dn
 
     def read(self, planned: list[Patch]) -> Readings:
-        """Show the planned patches and read them. Raises InputError where the tracker cannot take white."""
+        """Show and read the planned patches. Raises InputError where white saturates the tracker."""
         white_dn = self._expose()
         chosen = {patch: self._period(patch, white_dn) for patch in planned if patch.code}
         sums: list[float] = []
@@ -199,14 +199,14 @@ class Photometer:
                 total, fill = self._look(f"patch_{order:03}_{period}", period, patch)
                 if fill <= MAX_FILL or period == self.periods[-1]:
                     break
-                chosen[patch] = 2 * period  # brighter than the bench file has it
+                chosen[patch] = 2 * period  # brighter than the bench file says
             sums.append(total)
         links = [link for channel in self.assumed.light for link in self._links(channel, chosen)]
         light, black_known = self._light(planned, np.array(sums), chosen, links)
         return Readings(planned, light, self.exposure_s, links, black_known, tuple(self.images))
 
     def _expose(self) -> float:
-        """Choose the exposure: the bench file's, or one in which white does not saturate; the peak of a white dot, DN."""
+        """Choose an exposure in which white does not saturate, first the bench file's; returns a white dot's peak, DN."""
         white = self._brightest()
         for probe in range(MAX_PROBES):
             fill = self._look(f"white_{probe:02}", self.periods[-1], white)[1]
@@ -232,13 +232,13 @@ class Photometer:
         return Patch(self.context.white, max(self.assumed.light, key=lambda name: float(self.assumed.light[name][-1])))
 
     def _period(self, patch: Patch, white_dn: float) -> int:
-        """The densest lattice that a patch may have, by the response that the bench file assumes."""
+        """The period of a patch's densest lattice that does not saturate, by the bench file's response."""
         peaks = white_dn * self.assumed.light[patch.channel][patch.code] * self.shares / self.shares[-1]
         fits = np.flatnonzero(peaks <= FILL * self.context.full_dn)
         return self.periods[int(fits[0])] if len(fits) else self.periods[-1]
 
     def _links(self, channel: str, chosen: dict[Patch, int]) -> Iterator[LatticeRatio]:
-        """A code's dot by two lattices, for each two that follow each other in a channel."""
+        """Compare each two successive lattices of a channel by one code shown on both."""
         periods = {patch: period for patch, period in chosen.items() if patch.channel == channel}
         dark = self._look(f"black_link_{channel}", 1, BLACK)[0]
         for dense, sparse in itertools.pairwise(sorted({*periods.values(), self.periods[-1]})):
@@ -254,7 +254,7 @@ class Photometer:
     def _light(
         self, planned: list[Patch], sums: FloatArray, chosen: dict[Patch, int], links: list[LatticeRatio]
     ) -> tuple[FloatArray, bool]:
-        """Light (n,) of a pixel of each patch, black level included, DN/s, by the sparsest lattice; if black was measured."""
+        """Light (n,) of a pixel of each patch on the sparsest lattice's scale, DN/s, and whether black was measured."""
         order, dark = np.arange(len(planned)), np.array([patch.code == 0 for patch in planned])
         under = np.interp(order, order[dark], sums[dark])
         factor = {(channel, self.periods[-1]): 1.0 for channel in self.assumed.light}
@@ -273,7 +273,7 @@ class Photometer:
         return np.maximum(light + self.assumed.black * float(np.sum(whites)), 0.0), False
 
     def _glow(self) -> float | None:
-        """The light of a black pixel, DN/s: a black screen against one that is switched off, at the bench file's exposure."""
+        """The light of a black pixel, DN/s: a black screen minus one that is switched off; None without the latter."""
         unlit = self.context.unlit()
         if unlit is None:
             return None
@@ -282,7 +282,7 @@ class Photometer:
         return max(more / (self.field.monitor_px * self.context.exposure_s), 0.0)
 
     def _look(self, name: str, period: int, patch: Patch) -> tuple[float, float]:
-        """The sum over the field of a lattice, DN, and how full its brightest pixel is."""
+        """The sum over a lattice's field, DN, and its brightest pixel relative to full scale."""
         part = self._part(self._take(name, period, patch))
         return float(part.sum()), float(part[self._cold].max(initial=0.0)) / self.context.full_dn
 
@@ -331,7 +331,7 @@ def photometry(context: StepContext) -> StepOutcome:
 
 
 def _assumed(context: StepContext, calibration: Calibration, channels: str) -> Assumed:
-    """What the bench file says of each channel."""
+    """The bench file's light of each channel."""
     if channels == "w":
         return Assumed({"w": calibration.response.light}, calibration.response.black)
     lights = primary_lights(calibration_source(context.file), context.file.config.monitor.bits)
@@ -339,7 +339,7 @@ def _assumed(context: StepContext, calibration: Calibration, channels: str) -> A
 
 
 def plan_for(bits: int, patches: int, channels: str = "w") -> list[Patch]:
-    """The plan of the most levels that has no more than so many patches. Raises InputError where they are too few."""
+    """The plan with the most levels that has at most `patches` patches. Raises InputError where they are too few."""
     best: list[Patch] = []
     for levels in range(MIN_LEVELS, min(patches, 2**bits) + 1):
         planned = plan_patches(PlanSettings(bits, levels, 1, channels), np.random.default_rng(SEED))
@@ -352,7 +352,7 @@ def plan_for(bits: int, patches: int, channels: str = "w") -> list[Patch]:
 
 
 def calibration_of(context: StepContext) -> Calibration:
-    """The monitor's light as the bench file has it, code by code."""
+    """The calibration that the bench file names."""
     return load_calibration(calibration_source(context.file), context.file.config.monitor.bits)
 
 
@@ -397,7 +397,7 @@ def _response_figures(
 def _judged(
     context: StepContext, figures: dict[str, Figure], files: tuple[Path, ...], pictures: tuple[Path, ...]
 ) -> StepOutcome:
-    """Done, with the response named in the bench file, unless it is not known as well as [verify] needs it."""
+    """The step's outcome: done, with the response named in the bench file, unless it misses the limits of [verify]."""
     limit_mag = context.file.config.verify.flux_mag
     monitor = context.file.config.monitor
     line = (
@@ -425,13 +425,13 @@ def _judged(
 
 
 def response_error_mag(assumed: Response, true: Response) -> FloatArray:
-    """How much fainter the codes really are (n,), magnitudes, from three decades below white up to it; both code by code."""
+    """How much fainter each code is than assumed (n,), magnitudes, from three decades below white to white."""
     seen = true.light[1:] >= DIM_LIGHT
     return np.asarray(magnitude(true.light[1:][seen] / assumed.light[1:][seen]))
 
 
 def exponent(response: Response) -> float:
-    """The power of the signal that the light follows, fitted to its logarithm over three decades."""
+    """The exponent of a power law fitted to the response over three decades."""
     light = response.light[1:]
     used = light >= DIM_LIGHT
     signal = np.arange(1, len(response.light))[used] / response.white

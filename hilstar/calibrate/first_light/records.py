@@ -1,4 +1,4 @@
-"""What a session keeps: session.json, the keys it sets in the bench file, and the page first-light.html."""
+"""A session's records: session.json, the keys set in the bench file, and the page first-light.html."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ ADVICE = "give the directory of a first-light session, or a new one"
 
 
 class KeyChange(msgspec.Struct, frozen=True, kw_only=True):
-    """A key of the bench file that a step has set; `before` is None where it had not been written."""
+    """A key of the bench file that a step sets; `before` is None where it was not written."""
 
     table: str
     key: str
@@ -49,7 +49,7 @@ class KeyChange(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, slots=True)
 class StepOutcome:
-    """What a step came to: one line, its figures, the files that it made, pictures for the page, and keys to set."""
+    """The result of a step: one line, figures, files made, pictures for the page, and keys to set."""
 
     verdict: Verdict
     line: str
@@ -96,7 +96,7 @@ class SessionFile(msgspec.Struct, frozen=True, kw_only=True):
     beat: BeatSummary | None = None
 
     def step(self, name: str) -> StepRecord | None:
-        """The record of a step, None before it ran."""
+        """A step's record, None before it ran."""
         return next((record for record in self.steps if record.name == name), None)
 
 
@@ -128,7 +128,7 @@ INSTEAD_OF = {"flux_at_white_e_per_s": ("brightest_v_mag",)}
 
 
 def with_changes(file: BenchFile, changes: Iterable[KeyChange]) -> BenchFile:
-    """The bench file as it would be with the changes, written nowhere.
+    """The bench file with the changes, without writing it.
 
     Raises InputError where a key cannot be set in this file.
     """
@@ -139,7 +139,7 @@ def with_changes(file: BenchFile, changes: Iterable[KeyChange]) -> BenchFile:
 
 
 def _checked(file: BenchFile, text: str, changes: Iterable[KeyChange]) -> BenchFile:
-    """The bench of `text`. Raises InputError where it does not say what was to be set."""
+    """The bench file of `text`. Raises InputError where a change is not in it."""
     from hilstar.bench.config import parse_config
 
     config = parse_config(file.path, text)
@@ -151,7 +151,7 @@ def _checked(file: BenchFile, text: str, changes: Iterable[KeyChange]) -> BenchF
 
 
 def rewrite(file: BenchFile, changes: Iterable[KeyChange]) -> BenchFile:
-    """Write the changed bench file in the old one's place. Raises InputError."""
+    """Write the changed bench file over the old one. Raises InputError."""
     changes = tuple(changes)
     if not changes:
         return file
@@ -242,7 +242,7 @@ def _picture(path: Path) -> str:
 
 
 def _difference(before: Path, after: Path) -> str:
-    """The bench file's lines that changed, with their neighbours."""
+    """The bench file's changed lines with their context."""
     old, new = (read_text(path, "", MAX_TOML_BYTES).splitlines() for path in (before, after))
     lines = list(difflib.unified_diff(old, new, "before", "now", lineterm=""))
     return "\n".join(lines) or "nothing was changed"

@@ -44,8 +44,8 @@ from hilstar.run.doctor import examine
 from hilstar.run.sync import BeatSummary, beat_of
 from hilstar.units import ERROR_OF_MEDIAN, NS_PER_S
 
-WATCHED_S = 5.0  # some 150 edges at 60 Hz
-AGREE_MS = 0.05  # less is no reason to change the bench file, nor to doubt a scan-out
+WATCHED_S = 5.0  # about 150 edges at 60 Hz
+AGREE_MS = 0.05  # a smaller difference neither changes the bench file nor casts doubt on a scan-out
 
 
 def latency(context: StepContext) -> StepOutcome:
@@ -96,7 +96,7 @@ MS_PER_S = 1000.0
 
 
 def machine(context: StepContext) -> StepOutcome:
-    """Ask the machine what it has. Raises MachineError for what it lacks."""
+    """Check the machine. Raises MachineError for what it lacks."""
     found = examine()
     missing = [check for check in found.checks if check.required and not check.ok]
     if missing:
@@ -125,9 +125,9 @@ LOCK_FILE = ".lock"
 
 @dataclass(frozen=True, slots=True)
 class SessionStep:
-    """One step: what it shows, what it wants back, the steps that have to be done before it, and the tables it depends on.
+    """One step: what it shows, what it wants back, the steps it needs, and the tables of the bench file it depends on.
 
-    `writes` are the keys of the bench file that it may set.
+    `writes` has the keys of the bench file that it may set.
     """
 
     name: str
@@ -208,9 +208,9 @@ NAMES = tuple(step.name for step in STEPS)
 
 
 class FirstLightSession:
-    """A session in a directory, with so many readings (`patches`) for the response; `watch` sees each pattern.
+    """A session in a directory, with at most `patches` readings of the response; `watch` is called with each pattern.
 
-    Raises InputError for a directory that is another bench's.
+    Raises InputError for a directory with another bench's session.
     """
 
     def __init__(
@@ -231,7 +231,7 @@ class FirstLightSession:
         self.unfinished = {} if found is None else dict(found.unfinished)
 
     def run(self, again: frozenset[str], say: Callable[[str], None]) -> int:
-        """Run what is not done; the exit code: 0, 1 where a step failed, or that of the machine's lack.
+        """Run the steps that are not done; the exit code is 0, 1 where a step failed, or that of a MachineError.
 
         Raises Stopped where the display is closed.
         """
@@ -250,19 +250,19 @@ class FirstLightSession:
         return max(record.exit_code for record in self.records.values())
 
     def _is_done(self, number: int) -> bool:
-        """Whether a step need not run: done, or skipped for good, and nothing that it depends on has changed since."""
+        """Whether a step need not run: it is done, or skipped for good, and nothing it depends on has changed."""
         step = STEPS[number]
         record = self.records.get(step.name)
         if record is None or record.verdict == "failed" or step.name in self.unfinished or self._unmet(step) is not None:
             return False
         if record.verdict == "skipped" and step.needs:
-            return False  # for want of a step that has been done by now
+            return False  # it lacked a step that has been done by now
         if record.state_sha256 != self._state(number):
             return False
         return all(_is_same(self.folder / name, digest) for name, digest in record.files.items())
 
     def _unmet(self, step: SessionStep) -> str | None:
-        """The first step that this one needs and that is not there."""
+        """The first missing step that this one needs."""
         for name in step.needs:
             record = self.records.get(name)
             if record is None or record.verdict == "failed" or (record.verdict == "skipped" and name != "display"):
@@ -296,14 +296,14 @@ class FirstLightSession:
         )
 
     def _tried(self, step: SessionStep, context: StepContext) -> tuple[StepOutcome, int]:
-        """What a step came to, with the bench file written; a refusal is a failed step."""
+        """Run a step and write its keys into the bench file; a refusal makes it a failed step."""
         try:
             outcome = step.run(context)
             self.file = rewrite(self.file, outcome.changes)
         except Stopped:
             raise
         except HilstarError as error:
-            # A refusal of this step's data is no wrong command: the session goes on, and ends with 1.
+            # Bad data for one step is not a wrong command: the session continues and ends with exit code 1.
             code = 1 if isinstance(error, InputError) else error.exit_code
             if not isinstance(error, NoImage | MachineError):
                 del self.unfinished[step.name]
@@ -312,11 +312,11 @@ class FirstLightSession:
         return outcome, 1 if outcome.verdict == "failed" else 0
 
     def _begun(self, number: int) -> bool:
-        """Whether images of an attempt that was interrupted can be used: nothing that they depend on has changed since."""
+        """Whether an interrupted attempt's images can be used: nothing they depend on has changed."""
         return self.unfinished.get(STEPS[number].name) == self._attempt(number)
 
     def _attempt(self, number: int) -> str:
-        # What is shown depends on where the screen stands, whatever a step's result does.
+        # Every pattern depends on the collimator, even where the step's result does not.
         return f"{self._state(number, (*STEPS[number].tables, 'collimator'))} {self.patches}"
 
     def _context(self, step: SessionStep, goes_on: bool) -> StepContext:
@@ -331,7 +331,7 @@ class FirstLightSession:
         )
 
     def _state(self, number: int, tables: tuple[str, ...] = ()) -> str:
-        """The SHA-256 of what a step depends on: its tables but for what later steps write, the files they name, the source."""
+        """The SHA-256 of what a step depends on: its tables without later steps' keys, files they name, the source."""
         step = STEPS[number]
         later = {key for other in STEPS[number + 1 :] for key in other.writes}
         config = msgspec.to_builtins(self.file.config)
@@ -347,7 +347,7 @@ class FirstLightSession:
         write_session(self.folder, self.as_file(running))
 
     def as_file(self, running: str | None = None) -> SessionFile:
-        """The session as session.json has it."""
+        """The contents of session.json."""
         return SessionFile(
             kind=KIND,
             hilstar=__version__,
@@ -361,7 +361,7 @@ class FirstLightSession:
         )
 
     def beat(self) -> BeatSummary:
-        """How the tracker's exposures beat with the display, by its own rate and modes where the session has seen them."""
+        """The beat of the tracker's exposures with the display, at its measured rate and modes where they are known."""
         record = self.records.get("display")
         figures = {} if record is None else record.figures
         refresh_hz, modes = figures.get("refresh_hz"), str(figures.get("modes_hz", "")).split()
@@ -369,10 +369,10 @@ class FirstLightSession:
 
 
 def _finite(value: Figure) -> Figure:
-    """The figure, in words where it is none that JSON holds."""
+    """The figure, or "not known" where JSON has no such number."""
     if not isinstance(value, float):
         return value
-    return float(value) if math.isfinite(value) else "not known"  # NumPy's floats are floats, but not to JSON
+    return float(value) if math.isfinite(value) else "not known"  # msgspec does not encode NumPy's floats
 
 
 def _texts(value: Any) -> Iterator[str]:
@@ -396,7 +396,7 @@ def _is_same(path: Path, digest: str) -> bool:
 
 @contextmanager
 def alone_in(folder: Path) -> Iterator[None]:
-    """Keep a second session out of a directory (InputError) while this one works there; a kill lets it go."""
+    """Lock a directory against a second session (InputError); a kill releases the lock."""
     lock = open_lock(folder / LOCK_FILE)
     try:
         try:

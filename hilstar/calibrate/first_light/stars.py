@@ -1,4 +1,4 @@
-"""Steps with stars on the screen: the scale of the light, and the final comparison with sky and twin."""
+"""The steps with stars on the screen: the scale of the light, and the comparison with sky and twin."""
 
 from __future__ import annotations
 
@@ -45,17 +45,17 @@ BRIGHT_SIGMAS = 60.0  # a star's peak over the noise of a pixel: its own noise i
 WINDOW_SIGMA_PX, RADIUS_PX = 1.0, 4
 WINDOW_PX = (2 * RADIUS_PX + 1) ** 2
 SURE_MAG = 0.01  # the noise of a star whose light is judged
-# Beside noise and codes: what the window's sum, the response and the map of uniformity leave on a bench that is measured right.
+# Error beside noise and codes: what the window's sum, the response and the uniformity map leave on a well measured bench.
 KNOWN_TO_MAG = 0.004
 MOST = 0.5  # a share of the variance this large is named as its cause
-FAR = 3.0  # times their errors: stars that scatter by more do so for a reason
+FAR = 3.0  # times their errors: more scatter than this has another cause
 
 
 @dataclass(frozen=True, slots=True)
 class ExpectedStars:
-    """Stars that are drawn whole and stand alone: places (n, 2), tracker px, and light (n,), e-/s.
+    """Stars drawn whole and isolated: places (n, 2), tracker px, and light (n,), e-/s.
 
-    `screen` (n, 2) is where on the screen, from -1 to 1 along each axis; `codes_mag` (n,) how much too faint its codes are.
+    `screen` (n, 2) is the place on the screen, -1 to 1 along each axis; `codes_mag` (n,) how much too faint the codes are.
     """
 
     place_px: FloatArray
@@ -66,9 +66,9 @@ class ExpectedStars:
 
 @dataclass(frozen=True, slots=True)
 class StarsSeen:
-    """Bright stars that stand alone: where the sky has them (n, 2), tracker px, and how far off they were seen (n, 2).
+    """Bright isolated stars: their places by the sky (n, 2), tracker px, and the residuals of their images (n, 2).
 
-    `dn` is the light of each (n,), `e_per_s` what was asked for, `noise_mag` its error; infinite where the tracker saturated.
+    `dn` is the light of each (n,), `e_per_s` the light asked for, `noise_mag` its error, infinite where the tracker saturated.
     `screen` (n, 2) is the place on the screen, -1 to 1; `codes_mag` (n,) how much too faint the codes are.
     """
 
@@ -84,11 +84,11 @@ class StarsSeen:
 
     @property
     def sure(self) -> npt.NDArray[np.bool_]:
-        """The stars whose light is known well enough to be judged (n,)."""
+        """A mask of the stars whose light is known well enough (n,)."""
         return self.noise_mag < SURE_MAG
 
     def scatter(self, off_mag: FloatArray, used: npt.NDArray[np.bool_]) -> Scatter:
-        """How the light of the stars in use, `off_mag` (used,) fainter than asked for, scatters beside its errors."""
+        """The scatter of the used stars' light, `off_mag` (used,) fainter than asked for, and its errors."""
         left = off_mag - self.codes_mag[used]
         left = left - np.median(left)
         error = np.sqrt(self.noise_mag[used] ** 2 + KNOWN_TO_MAG**2)
@@ -103,9 +103,9 @@ class StarsSeen:
 
 @dataclass(frozen=True, slots=True)
 class Scatter:
-    """How much stars differ in light, rms, beside what they are known to; codes and common zero point aside.
+    """The rms scatter of stars' light and its expected error, without codes and common zero point.
 
-    `by_place` and `by_light` are the shares of its square that follow the place on the screen and the light asked for.
+    `by_place` and `by_light` are the shares of the variance that follow the place on the screen and the light asked for.
     """
 
     rms_mag: float
@@ -115,7 +115,7 @@ class Scatter:
 
     @property
     def finding(self) -> str:
-        """What is wrong where it is far above the errors, and what to do; "" where it is not."""
+        """What is wrong and what to do where the scatter is far above its error; else ""."""
         if self.rms_mag <= FAR * self.error_mag:
             return ""
         told = f"the light of stars scatters by {self.rms_mag:.3f} mag rms where they are known to {self.error_mag:.3f}"
@@ -131,7 +131,7 @@ class Scatter:
 
 
 def _explained(off: FloatArray, *shapes: FloatArray) -> float:
-    """The share of the variance of `off` (n,) that a sum of shapes (n,) explains, less what chance would explain."""
+    """The share of the variance of `off` (n,) that a linear fit of `shapes` (n,) explains, corrected for chance."""
     design = np.stack([np.ones_like(off), *shapes], axis=1)
     free = len(off) - design.shape[1]
     total = float(((off - off.mean()) ** 2).sum())
@@ -165,7 +165,7 @@ def see_stars(context: StepContext) -> StarsSeen:
 
 
 def _levels(bench: Bench, frame: Frame) -> tuple[Levels, ...]:
-    """The levels of an attitude: one frame, or with `temporal` those of an exposure."""
+    """The levels of a frame, or with `temporal` of all frames of an exposure."""
     if bench.config.render.quantisation != "temporal":
         return (frame.levels,)
     return tuple(Levels(bench.draw(frame.q_icrs_to_cam, k).levels.copy()) for k in range(bench.config.exposure_frames))
@@ -186,7 +186,7 @@ def _together(fields: list[StarsSeen], dark: Path) -> StarsSeen:
 
 
 def _fullest(bench: Bench) -> list[Frame]:
-    """Of some random attitudes those with the most stars on the screen."""
+    """The frames with the most stars among random attitudes."""
     rng = np.random.default_rng(SEED)
     attitudes = [q / np.linalg.norm(q) for q in rng.normal(size=(ATTITUDES, 4))]
     fullest = sorted(attitudes, key=lambda q: -len(bench.sprites(q)))[:FIELDS]
@@ -194,14 +194,14 @@ def _fullest(bench: Bench) -> list[Frame]:
 
 
 def _alone(bench: Bench, context: StepContext, frame: Frame, levels: tuple[Levels, ...]) -> ExpectedStars:
-    """The stars of a frame that are drawn whole and stand alone, where the tracker should see them."""
+    """The isolated stars of a frame that are drawn whole, with their expected places in the tracker's image."""
     camera = tracker_camera(context.file.config.tracker, context.file.folder)
     truth, vectors = frame.truth, bench.stars.directions(frame.star)
     place = np.stack(camera.project(vectors @ to_matrix(frame.q_icrs_to_cam).T), axis=1)
     width, height = camera.resolution_px
     screen = np.stack([truth["x_px"], truth["y_px"]], axis=1)
     limits = np.array(context.resolution_px) - 1 - EDGE_PX
-    # Not by a planet: its light is known to 0.05 mag, and its disc may be wide.
+    # No planets: their light is known to 0.05 mag only, and a disc may be wide.
     kept = truth["drawn"] & ~truth["clipped"] & np.isfinite(place).all(axis=1)
     kept &= bench.stars.row[frame.star] >= 0
     kept &= (place > EDGE_PX).all(axis=1) & (place < np.array([width, height]) - 1 - EDGE_PX).all(axis=1)
@@ -221,7 +221,7 @@ def _alone(bench: Bench, context: StepContext, frame: Frame, levels: tuple[Level
 def _codes_mag(
     bench: Bench, context: StepContext, frame: Frame, levels: tuple[Levels, ...], screen_px: FloatArray
 ) -> FloatArray:
-    """How much fainter than wanted the codes are (n,), magnitudes, in what the tracker's window sees of the screen."""
+    """How much fainter the codes are than the light asked for (n,), magnitudes, within the tracker's window."""
     shown = np.mean([shown_light(each, bench.panel) for each in levels], axis=0)
     geometry = context.geometry()
     reach = math.ceil((RADIUS_PX + 0.5) * geometry.monitor.focal_length_px / geometry.tracker.focal_length_px)
@@ -230,7 +230,7 @@ def _codes_mag(
         part = slice(max(y - reach, 0), y + reach + 1), slice(max(x - reach, 0), x + reach + 1)
         wanted = float(frame.linear[part].sum(dtype=np.float64))
         off.append(magnitude(float(shown[part].sum()) / wanted) if wanted > 0 else 0.0)
-    return np.asarray(np.nan_to_num(np.array(off), posinf=0.0))  # nothing of it is shown: it will not be found either
+    return np.asarray(np.nan_to_num(np.array(off), posinf=0.0))  # such a star is not shown, and will not be found
 
 
 def _compared(context: StepContext, looked: DarkSubtracted, wanted: ExpectedStars) -> StarsSeen:
@@ -243,7 +243,7 @@ def _compared(context: StepContext, looked: DarkSubtracted, wanted: ExpectedStar
     near = far < REACH_PX
     matched = near.copy()
     matched[near] = found.peak[nearest[near]] > BRIGHT_SIGMAS * noise_dn
-    # A star as bright as those that were found bright has to be there.
+    # A star as bright as the matched ones counts as lost where it is not found.
     faintest = np.median(wanted.e_per_s[matched]) if matched.any() else 0.0
     chosen = nearest[matched]
     dn, gain = found.flux[chosen], context.file.config.tracker.detector.gain_e_per_dn
@@ -289,7 +289,7 @@ GRID = 21  # places along each side of the screen at which a truth is compared
 
 
 def verify(context: StepContext) -> StepOutcome:
-    """Show stars through what was found, compare them with the sky, and run the twin. Raises InputError."""
+    """Show stars with the calibrated bench, compare them with the sky, and run the twin. Raises InputError."""
     seen = see_stars(context)
     figures, reasons = _star_figures(context, seen), []
     picture, light = context.session / "verify.png", context.session / "verify-light.png"
@@ -323,7 +323,7 @@ def verify(context: StepContext) -> StepOutcome:
 
 
 def _twin_file(context: StepContext) -> BenchFile:
-    """The bench as the session has it; in a virtual session what is true is the truth."""
+    """The bench file for the twin; in a virtual session with the truth's calibration and geometry as true."""
     truth, file = context.truth, context.file
     if truth is None:
         return file
@@ -353,7 +353,7 @@ def _twin_file(context: StepContext) -> BenchFile:
 
 
 def _twin_figures(twin: VerifySummary) -> dict[str, Figure]:
-    """Of the twin, in a virtual session against the truth."""
+    """The twin's figures."""
     spreads = {"flux": (twin.flux_error_mag, "mag"), "centroid": (twin.centroid_error_px, "px")}
     return {
         "twin_passed": str(twin.passed).lower(),
@@ -364,10 +364,7 @@ def _twin_figures(twin: VerifySummary) -> dict[str, Figure]:
 
 
 def _light_figures(context: StepContext, seen: StarsSeen, picture: Path) -> tuple[dict[str, Figure], str]:
-    """How far the light of stars is from the sky's, by the tracker's gain and exposure, their common zero point aside.
-
-    And what is wrong where they scatter far beyond their errors.
-    """
+    """The errors of the stars' light without their common zero point, and what is wrong where they scatter too far."""
     gain, exposure_s = context.file.config.tracker.detector.gain_e_per_dn, context.exposure_s
     off = np.asarray(magnitude(seen.dn * gain / (seen.e_per_s * exposure_s)))[seen.sure]
     zero_point = float(np.median(off))
@@ -391,7 +388,7 @@ def _light_figures(context: StepContext, seen: StarsSeen, picture: Path) -> tupl
 
 
 def _star_reasons(context: StepContext, figures: dict[str, Figure]) -> list[str]:
-    """What is wrong with the stars that were seen."""
+    """The limits of [verify] that the stars miss, with advice."""
     limits, found = context.file.config.verify, []
     if float(figures["star_p95_px"]) > limits.centroid_px:
         off = f"stars are {figures['star_p95_px']:.3f} px off at 95 % (limit {limits.centroid_px:g})"
@@ -422,7 +419,7 @@ def _star_figures(context: StepContext, seen: StarsSeen) -> dict[str, Figure]:
 
 
 def _against_truth(context: StepContext) -> dict[str, Figure]:
-    """How far the directions of the screen's places, as the bench file has them now, are from the truth's.
+    """The error of the directions of places on the screen against the truth.
 
     Only places that the tracker sees were calibrated; the others have no direction.
     """
@@ -504,7 +501,7 @@ def _scale_figures(context: StepContext, found: MeasuredScale, e_per_s: FloatArr
 
 
 def _disagreement(figures: dict[str, Figure]) -> str:
-    """Why the stars tell no one scale; "" where they do."""
+    """Why the stars do not agree on one scale; "" where they do."""
     scatter, trend_mag, error = (float(figures[name]) for name in ("scatter_mag", "trend_mag", "trend_error_mag"))
     wrong = [f"they disagree by {scatter:.3f} mag"] if scatter > UNSURE_MAG else []
     if abs(trend_mag) > max(UNSURE_MAG, AGREE_SIGMAS * error):
@@ -513,7 +510,7 @@ def _disagreement(figures: dict[str, Figure]) -> str:
 
 
 def trend(e_per_s: FloatArray, off_mag: FloatArray) -> tuple[float, float]:
-    """How much more stars are off at the brightest than at the faintest, magnitudes, and its error, of light (n,)."""
+    """The change of `off_mag` (n,) from the faintest to the brightest star, magnitudes, and its error."""
     x = np.log(e_per_s) - np.log(e_per_s).mean()
     leverage, span = float((x**2).sum()), float(np.ptp(x))
     if leverage <= 0:
@@ -535,9 +532,9 @@ def draw_light(
     finding: str,
     from_middle: FloatArray | None = None,
 ) -> None:
-    """How much too faint stars were seen (n,), magnitudes, over the light that was asked for (n,), electrons per second.
+    """Draw how much too faint stars are (n,), magnitudes, over the light asked for (n,), electrons per second.
 
-    With `from_middle` (n,), in half sides of the screen, over that as well.
+    With `from_middle` (n,), in half sides of the screen, a second panel shows it over that.
     """
     panels = [("light asked for [e-/s]", e_per_s)]
     panels += [] if from_middle is None else [("from the middle of the screen [half sides]", from_middle)]
@@ -551,7 +548,7 @@ def draw_light(
 
 
 def draw_residuals(path: Path, place: FloatArray, residual: FloatArray, width_px: int, finding: str) -> None:
-    """Places (n, 2) of stars on the tracker, and how far from there they were seen (n, 2), as arrows."""
+    """Draw places (n, 2) of stars on the tracker, and their residuals (n, 2) as arrows."""
     with chart(path, finding, height_inch=6.4) as (axes,):
         largest = max(float(np.hypot(*residual.T).max()), 1e-9)
         look = {"angles": "xy", "scale_units": "xy", "width": 0.003, "color": BLUE}

@@ -1,4 +1,4 @@
-"""The step of uniformity: how much of a dot's light comes from each place of the screen, and the map that evens it out."""
+"""The step of uniformity: light against place on the screen by dots, and the map that corrects it."""
 
 from __future__ import annotations
 
@@ -32,17 +32,17 @@ MIN_DOTS = 40
 ROWS = (2, 3, 5, 7, 9, 13, 18, 26)  # rows of the grids that are tried; the columns make their fields square
 DOTS_A_FIELD = 6
 FOLDS, SEED = 5, 0
-SURE = 2.0  # standard errors by which a finer grid has to be better at the dots that were held out
+SURE = 2.0  # standard errors by which a finer grid has to be better on held-out dots
 WILD_SIGMAS = 5.0  # a dot on a dead pixel, or behind dust
 JOINED = 1e-3  # relative to a dot's weight: smooths fields that have few dots
-WORTH_MAG = 0.002  # rms over the field: less is within what a star's light is known to
-FAR_SIGMAS, FAR_MAG = 3.0, 0.01  # beyond both, dots differ for another reason than their noise
+WORTH_MAG = 0.002  # rms over the field: less is within the error of a star's light
+FAR_SIGMAS, FAR_MAG = 3.0, 0.01  # beyond both, noise does not explain how dots differ
 FILE = "light.toml"
 
 
 @dataclass(frozen=True, slots=True)
 class DotLight:
-    """Dots seen whole: middles (n,), monitor px, and their light (n,), DN; `noise_mag` is what one is uncertain by."""
+    """Dots seen whole: centres (n,), monitor px, and light (n,), DN; `noise_mag` is the error of one."""
 
     x: IntArray
     y: IntArray
@@ -52,9 +52,9 @@ class DotLight:
 
 @dataclass(frozen=True, slots=True)
 class UniformityMap:
-    """Light against place: a grid (rows, columns), one field where it is even, and its value at each dot (n,), median 1.
+    """Light against place: a grid (rows, columns), one field where light is even, and its value at each dot (n,), median 1.
 
-    `left_mag` is what dots that were held out differ from it by, rms; `used` the dots that are not wild.
+    `left_mag` is the rms error on held-out dots; `used` marks the dots that are no outliers.
     """
 
     grid: FloatArray
@@ -64,17 +64,17 @@ class UniformityMap:
 
     @property
     def is_even(self) -> bool:
-        """Whether a star is as bright everywhere, as well as stars can tell."""
+        """Whether the light is even to within a star's error."""
         return self.grid.size == 1 or self.rms_mag < WORTH_MAG
 
     @property
     def rms_mag(self) -> float:
-        """How much the light changes over the dots."""
+        """Standard deviation of the map over the dots, magnitudes."""
         return float(np.std(magnitude(self.at_dots[self.used])))
 
 
 def uniformity(context: StepContext) -> StepOutcome:
-    """Measure light against place, and give the bench's calibration the map where it lacks it. Raises InputError."""
+    """Measure light against place, and write a calibration with the map where the bench's is wrong. Raises InputError."""
     dots, images = see_dots(context)
     size_px, assumed = context.resolution_px, calibration_of(context)
     known = assumed.uniformity_map(size_px)
@@ -112,7 +112,7 @@ def _said(found: UniformityMap, assumed: bool) -> str:
 
 
 def _mag(found: UniformityMap, dots: DotLight) -> tuple[FloatArray, FloatArray]:
-    """Of the dots that count: how much fainter each is than the brightest place, and than the map has it, magnitudes."""
+    """How much fainter each used dot is than the brightest place, and than the map, magnitudes."""
     light, mapped = (dots.light / np.median(dots.light))[found.used], found.at_dots[found.used]
     return np.asarray(magnitude(light / mapped.max())), np.asarray(magnitude(light / mapped))
 
@@ -144,7 +144,7 @@ def _figures(context: StepContext, dots: DotLight, found: UniformityMap, against
 
 
 def see_dots(context: StepContext) -> tuple[DotLight, tuple[Path, ...]]:
-    """The light of dots on lattices over the whole screen, and the images. Raises InputError where too few are seen whole."""
+    """Measure dots on lattices over the whole screen; their light, and the images. Raises InputError for too few whole dots."""
     geometry, code = context.real_geometry(), int(context.known.get("focus.dot_code", 0)) or sharp_dots(context).code
     ratio = geometry.tracker.focal_length_px / geometry.monitor.focal_length_px
     psf_px = float(context.known.get("focus.psf_sigma_px", np.mean(context.file.config.tracker.psf_sigma_px)))
@@ -175,7 +175,7 @@ def see_dots(context: StepContext) -> tuple[DotLight, tuple[Path, ...]]:
     detector = context.file.config.tracker.detector
     dn = float(np.median(light[lit]))
     pixels = math.pi * (reach * ratio) ** 2
-    # A dark frame has the noise of an image; PRNU counts by how many pixels share a dot.
+    # The dark frame adds an image's noise; PRNU averages over the pixels of a dot.
     shared = detector.prnu**2 / (4 * math.pi * sigma_px**2)
     noise = math.sqrt((dn / detector.gain_e_per_dn + 2 * pixels * noise_dn**2) / dn**2 + shared)
     return DotLight(columns[lit], rows[lit], light[lit], MAG_PER_RELATIVE * noise), tuple(paths)
@@ -200,7 +200,7 @@ class DotSums(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class _Lattice:
-    """The first dot (x, y), how far apart they are, and how far the light of one is summed: monitor px."""
+    """The first dot (x, y), the period, and the radius over which a dot's light is summed; monitor px."""
 
     firsts: list[int]
     period: int
@@ -228,7 +228,7 @@ def _sums(lattice: _Lattice, resolution_px: tuple[int, int], seen: FloatArray, i
 
 
 def map_of(dots: DotLight, light: FloatArray, resolution_px: tuple[int, int]) -> UniformityMap:
-    """The simplest map that light (n,) at the dots needs: one field, or the grid after which no finer one is surely better."""
+    """The simplest map of light (n,) at the dots: the coarsest grid that no finer one beats significantly."""
     width, height = resolution_px
     shapes = [(1, 1), *((rows, max(round(rows * width / height), 1)) for rows in ROWS)]
     shapes = [shape for shape in shapes if math.prod(shape) * DOTS_A_FIELD <= len(light)] or shapes[:1]
@@ -246,7 +246,7 @@ def map_of(dots: DotLight, light: FloatArray, resolution_px: tuple[int, int]) ->
 
 
 def _design(dots: DotLight, shape: tuple[int, int], resolution_px: tuple[int, int]) -> Any:
-    """The weight of each field at each dot (n, fields), sparse: as a calibration's map has it."""
+    """The weight of each field at each dot (n, fields), sparse, interpolated as in a calibration's map."""
     from scipy.sparse import csr_array
 
     across = _two(weights_of_grid(resolution_px[0], shape[1])[dots.x])
@@ -258,14 +258,14 @@ def _design(dots: DotLight, shape: tuple[int, int], resolution_px: tuple[int, in
 
 
 def _two(weights: FloatArray) -> list[tuple[IntArray, FloatArray]]:
-    """The one or two fields of each row of weights (n, fields) that are not 0: their numbers and weights (n,) each."""
+    """The one or two non-zero fields of each row of weights (n, fields): their numbers and weights, (n,) each."""
     row, last = np.arange(len(weights)), weights.shape[1] - 1
     left = np.minimum((weights != 0).argmax(axis=1), max(last - 1, 0))
     return [(field, weights[row, field]) for field in (left, left + 1)[: last + 1]]
 
 
 def _fitted(light: FloatArray, design: Any, shape: tuple[int, int]) -> FloatArray:
-    """The fields (rows * columns,) by least squares; those without dots continue their neighbours."""
+    """The fields (rows * columns,) by least squares; a field without dots follows its neighbours."""
     number = np.arange(math.prod(shape)).reshape(shape)
     joined = [(number[1:], number[:-1]), (number[:, 1:], number[:, :-1])]
     normal = (design.T @ design).toarray()
@@ -277,7 +277,7 @@ def _fitted(light: FloatArray, design: Any, shape: tuple[int, int]) -> FloatArra
 
 
 def _tame(light: FloatArray, design: Any, shape: tuple[int, int]) -> BoolArray:
-    """The dots (n,) that are no further from the finest map than others are."""
+    """A mask of the dots (n,) that are no outliers from the finest map."""
     used = np.ones(len(light), dtype=np.bool_)
     for _ in range(3):
         off = light / (design @ _fitted(light[used], design[used], shape)) - 1
@@ -286,7 +286,7 @@ def _tame(light: FloatArray, design: Any, shape: tuple[int, int]) -> BoolArray:
 
 
 def _held_out(light: FloatArray, design: Any, shape: tuple[int, int], used: BoolArray, fold: IntArray) -> FloatArray:
-    """How far each dot is from a map made without it, relative and squared (n,)."""
+    """The squared relative error of each dot (n,) in a map made without it."""
     squares = np.zeros(len(light))
     for each in range(FOLDS):
         out, kept = fold == each, used & (fold != each)
@@ -295,7 +295,7 @@ def _held_out(light: FloatArray, design: Any, shape: tuple[int, int], used: Bool
 
 
 def draw_uniformity(path: Path, place: FloatArray, mag: tuple[FloatArray, FloatArray], finding: str) -> None:
-    """Dots at places (n, 2) of the screen: how much fainter each is than the brightest place, and than the map has it (n,)."""
+    """Draw dots at (n, 2) on the screen: how much fainter each is than the brightest place, and than the map (n,)."""
     names = "fainter than the brightest place [mag]", "fainter than the map has it [mag]"
     with chart(path, finding, panels=2) as both:
         for axes, off_mag, name in zip(both, mag, names, strict=True):

@@ -1,4 +1,4 @@
-"""The twin in the bench's place: what a tracker would see of each pattern on a bench that is as TRUTH.toml says."""
+"""A virtual bench: what a tracker would see of each pattern on the bench that TRUTH.toml describes."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ MASKS_KEPT = 8  # masks of patterns: one step repeats this many in other codes
 
 
 class VirtualBench:
-    """A bench that is as a bench file tells: its lens, its mounting, its light, its tracker's focus and noise.
+    """A bench as a truth file describes it: lens, mounting, light, and the tracker's focus and noise.
 
     Free it with `close`. Raises InputError for a truth that cannot stand in for the bench.
     """
@@ -72,7 +72,7 @@ class VirtualBench:
         return self._exposed(np.zeros_like(self._glow_e_per_s), self.truth.config.tracker.exposure_s, stem)
 
     def diode(self, file: BenchFile, seconds: float) -> DiodeRecording | None:
-        """A photodiode of the twin's: the delay of the truth's panel and its scan-out, and a little jitter."""
+        """A simulated photodiode: the true panel's delay and scan-out, with a little jitter."""
         rng = np.random.default_rng((self._seed, zlib.crc32(b"diode")))
         frames = int(seconds * file.config.monitor.refresh_hz)
         period_ns = NS_PER_S / file.config.monitor.refresh_hz
@@ -94,7 +94,7 @@ class VirtualBench:
         return path
 
     def _image_e_per_s(self, frames: list[CodeImage]) -> FloatArray:
-        """Electrons per second (h, w) of frames in the mean; a pattern of one light is drawn once, whatever light it is."""
+        """Mean electrons per second (h, w) of frames. A pattern with one level is drawn once and scaled for others."""
         light = np.mean([self._light(codes) for codes in frames], axis=0)
         lit, brightest = light > 0, float(light.max())
         if not brightest:
@@ -126,7 +126,7 @@ class VirtualBench:
 
 
 def _refuse_other_bench(bench: BenchFile, truth: BenchFile) -> None:
-    """Refuse (InputError) a truth whose screen or tracker could not be taken for the bench's own."""
+    """Refuse (InputError) a truth whose screen or tracker does not match the bench file's."""
     mine, its = bench.config, truth.config
     screens = [orientation_of(c.monitor).screen_px(c.monitor.resolution_px) for c in (mine, its)]
     if screens[0] != screens[1]:

@@ -36,16 +36,16 @@ DEVICE_FORM = "send a line 0 or 1 at each edge, or 0,MICROSECONDS by the device'
 
 @dataclass(frozen=True, slots=True)
 class Edges:
-    """What a photodiode saw: host time, ns, and the level after it, 0 or 1, (n,) each."""
+    """Edges of a photodiode: host time, ns, and the level after each, 0 or 1, (n,) each."""
 
     host_ns: IntArray
     level: IntArray
 
 
 def parse_edges(lines: Iterable[tuple[int, bytes]], name: str) -> Edges:
-    """Edges from a device's lines with the host time, ns, of their arrival (see DEVICE_FORM); noise between them is skipped.
+    """Edges from a device's lines and their host times of arrival, ns (see DEVICE_FORM); other lines are skipped.
 
-    Device times are carried to the host's clock by the lower hull of their delays: the minimum delay stays in the latency.
+    Device times are converted to the host's clock by the lower hull of their delays, so the minimum delay stays in the latency.
     Raises InputError where there are too few.
     """
     found = [(host_ns, match) for host_ns, line in lines if (match := re.fullmatch(rb"([01])(?:,(\d{1,18}))?", line))]
@@ -69,12 +69,12 @@ def _by_device(host_ns: IntArray, device_ns: IntArray) -> IntArray:
 
 
 def capture_edges(port: str, baud: int, seconds: float) -> Edges:
-    """The edges that a device on a serial port reports within `seconds`. Raises InputError."""
+    """Record the edges that a device on a serial port reports within `seconds`. Raises InputError."""
     return parse_edges(read_lines(port, baud, seconds), f"serial:{port}@{baud}")
 
 
 def read_edges(path: Path) -> Edges:
-    """Edges of a CSV file with the columns host_ns and level. Raises InputError."""
+    """Read edges from a CSV file with the columns host_ns and level. Raises InputError."""
     text = read_text(path, "give a file of edges", MAX_EDGE_BYTES)
     rows, reader = [], csv.DictReader(io.StringIO(text, newline=""))
     try:
@@ -98,7 +98,7 @@ def save_edges(path: Path, edges: Edges) -> None:
 
 
 def square_edges(records: Iterable[RunRecord]) -> Edges:
-    """The frames of a run whose photodiode square differs from that of the frame before: swap times and levels.
+    """Swap times and levels of the frames of a run whose photodiode square differs from the frame before.
 
     Raises InputError for a run without a frame, or without a square.
     """
@@ -119,7 +119,7 @@ def square_edges(records: Iterable[RunRecord]) -> Edges:
 
 
 def edges_of(swap_ns: IntArray, level: IntArray) -> Edges:
-    """Of frames, their swaps and the square's levels (n,) each, those that differ from the frame before."""
+    """The changes of the square, from the swaps and levels of frames (n,)."""
     changed = np.flatnonzero(np.diff(level)) + 1
     return Edges(swap_ns[changed], level[changed])
 
@@ -133,10 +133,9 @@ AGREEING_SHARE = 0.5  # share of the edges that must find their frames
 
 @dataclass(frozen=True, slots=True)
 class Paired:
-    """Latencies from swap to edge, ns, of the edges that found their frames, and those edges' levels; (n,) each.
+    """Latencies from swap to edge, ns, of the edges matched to frames, and their levels; (n,) each.
 
-    `unmatched` counts the other edges of the run's time, and `ambiguous` says that the latency is known only up to
-    whole pairs of frames.
+    `unmatched` counts the other edges during the run. `ambiguous`: the latency is known only up to whole pairs of frames.
     """
 
     latency_ns: FloatArray
@@ -146,7 +145,7 @@ class Paired:
 
 
 def pair(seen: Edges, shown: Edges, period_ns: float) -> Paired:
-    """Each edge with the frame that caused it: the latency that most edges agree on, within half a refresh period.
+    """Match each edge to the frame that caused it: by the most frequent latency, within half a refresh period.
 
     Raises InputError where too few agree.
     """
@@ -169,7 +168,7 @@ def pair(seen: Edges, shown: Edges, period_ns: float) -> Paired:
 
 
 def nearest_of(moments: IntArray, wanted: FloatArray) -> IntArray:
-    """The member of sorted `moments` (m,) that is nearest to each of `wanted` (n,)."""
+    """The member of sorted `moments` (m,) nearest to each of `wanted` (n,)."""
     after = np.minimum(np.searchsorted(moments, wanted), len(moments) - 1)
     before = np.maximum(after - 1, 0)
     closer = np.abs(moments[after] - wanted) < np.abs(moments[before] - wanted)
@@ -177,7 +176,7 @@ def nearest_of(moments: IntArray, wanted: FloatArray) -> IntArray:
 
 
 def _likely_latency_ns(seen: Edges, shown: Edges) -> tuple[float, bool]:
-    """The most frequent delay from a change to an edge of its level, and whether others are about as frequent."""
+    """The most frequent delay from a change to an edge of the same level, and whether others are about as frequent."""
     bins = (MAX_LATENCY_NS + MAX_EARLY_NS) // BIN_NS
     counts = np.zeros(bins, dtype=np.int64)
     for value in (0, 1):
@@ -225,8 +224,7 @@ class LatencySummary:
 def summarise(paired: Paired, config: BenchConfig) -> LatencySummary:
     """The figures of a latency measurement.
 
-    The square is at the foot of the screen, so it lights nearly a scan-out after the swap: that is subtracted from the
-    panel's delay.
+    The square is at the foot of the screen and lights almost a scan-out after the swap, which is subtracted from the delay.
     """
     ms = paired.latency_ns / NS_PER_MS
     monitor = config.monitor
@@ -248,13 +246,13 @@ def summarise(paired: Paired, config: BenchConfig) -> LatencySummary:
 
 
 def swap_to_square_ms(monitor: Monitor) -> float:
-    """From the first row's light to that of the square's middle, at the foot of the screen, by the scan-out."""
+    """Time from the first row's light to that of the square's middle, at the foot of the screen, by the scan-out."""
     rows = monitor.resolution_px[0 if monitor.rotate_deg % 180 else 1]
     return monitor.panel_scanout_ms * (1 - monitor.photodiode_px / 2 / rows)
 
 
 def checked_delay_ms(panel_delay_ms: float) -> float:
-    """The delay as a bench file has it. Raises InputError where the light came before the scan-out that the file assumes."""
+    """The delay rounded for a bench file. Raises InputError where light came before the scan-out that the file assumes."""
     if panel_delay_ms < 0:
         raise InputError(
             f"the square lit {-panel_delay_ms:.2f} ms before the scan-out could reach it; set [monitor] scanout_ms to what the "
@@ -306,7 +304,7 @@ def measure_latency(ledger: Path, edges: Edges, directory: Path | None) -> Laten
 
 
 def latency_lines(summary: LatencySummary) -> list[str]:
-    """The figures for a person."""
+    """The figures as lines of text."""
     latency, turn = summary.latency_ms, summary.beat
     every = "none" if turn.period_s is None else f"every {turn.period_s:.3g} s"
     cost = "-" if turn.worst_arcsec_per_deg_s is None else f"at most {turn.worst_arcsec_per_deg_s:.2g} arcsec at 1 deg/s"
@@ -326,7 +324,7 @@ def latency_lines(summary: LatencySummary) -> list[str]:
 
 
 def draw_latency(path: Path, paired: Paired, summary: LatencySummary) -> None:
-    """The latencies of the edges, by their level."""
+    """Draw a histogram of the latencies by level."""
     middle, jitter = summary.latency_ms.p50, summary.jitter_ms
     with chart(path, f"From swap to light: {middle:.2f} ms, jitter {jitter:.3f} ms") as (axes,):
         ms = paired.latency_ns / NS_PER_MS

@@ -1,4 +1,4 @@
-"""Measured patches: the file, and why a set of measurements is refused."""
+"""Measured patches: reading MEASURED.csv, and the checks that refuse a set of measurements."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ MAX_BYTES = 10_000_000
 ADVICE = "give a CSV file with code,channel,value"
 MIN_CODES = 10  # at 1 % noise: 2.2 % of error (95th percentile of the worst code) on gamma, sRGB and S-curves; 8 leave 4.4 %
 FALSE_ALARM_SIGMA = 4.0  # one run in a few hundred is refused because of noise alone, with 32 levels
-MIN_DRIFT = 0.005  # over the run; less is harmless beside 1 % of noise
+MIN_DRIFT = 0.005  # over the run; less does not matter beside 1 % of noise
 BRIGHT_DOF = 8
 FAINT_ALARM = 0.999  # quantile of the F distribution beyond which additive noise is believed
 NOISE_FLOOR = 1e-4  # relative; no photometer repeats better
@@ -34,9 +34,9 @@ CLIPPED_VALUES = 3  # equal largest readings, over two codes or more
 
 @dataclass(frozen=True, slots=True)
 class Measurements:
-    """Light (n,) of patches in one linear unit, their codes and channels, and when each was taken (s, or the row's number).
+    """Light (n,) of patches in one linear unit, their codes and channels, and the time of each (s, or the row's number).
 
-    `clipped` names the codes that share the instrument's largest reading, where that looks like its limit.
+    `clipped` has by channel the codes that share the largest reading, where that looks like the instrument's limit.
     """
 
     source: str
@@ -61,9 +61,9 @@ class Measurements:
 
 @dataclass(frozen=True, slots=True)
 class MeasuredLevels:
-    """Repeats combined: for each distinct code (n,), rising, the mean light, the count, and the mean's standard error.
+    """Repeats combined: for each distinct code (n,), rising, the mean light and the number of readings.
 
-    `relative_noise` is one patch's; nan where nothing was repeated.
+    `relative_noise` is that of one reading, nan where nothing was repeated; `additive_noise` is in the unit of measurement.
     """
 
     code: IntArray
@@ -73,7 +73,7 @@ class MeasuredLevels:
     additive_noise: float
 
     def standard_error(self, relative_noise: float) -> FloatArray:
-        """Of the mean (n,), in its unit, for a given noise of one patch."""
+        """Standard error of the mean (n,), in its unit, for a given relative noise of one reading."""
         variance = (relative_noise * self.mean) ** 2 + self.additive_noise**2
         return np.asarray(np.sqrt(variance / self.count), dtype=np.float64)
 
@@ -178,14 +178,14 @@ def _number(place: str, name: str, text: str) -> float:
 
 
 def _clipped(code: IntArray, reading: FloatArray) -> list[int]:
-    """The codes that share the largest reading, if there are several and it was read often: an instrument at its limit."""
+    """The codes that share the largest reading, if several do and it is frequent: the instrument is at its limit."""
     at_limit = reading == reading.max()
     codes = np.unique(code[at_limit])
     return [int(c) for c in codes] if len(codes) > 1 and at_limit.sum() >= CLIPPED_VALUES else []
 
 
 def group_levels(measured: Measurements, channel: str) -> MeasuredLevels:
-    """The levels of one channel; code 0 is the same black in every channel, so all its readings count."""
+    """Combine the repeats of one channel; code 0 is the same black in every channel, so all its readings count."""
     chosen = (measured.channel == channel) | (measured.code == 0)
     value = measured.value[chosen]
     code, place, count = np.unique(measured.code[chosen], return_inverse=True, return_counts=True)
@@ -198,7 +198,7 @@ def group_levels(measured: Measurements, channel: str) -> MeasuredLevels:
 
 
 def _pooled(squares: FloatArray, mean: FloatArray, count: IntArray, bright: npt.NDArray[np.bool_], fewest: int) -> float:
-    """The relative noise of the bright half, where an instrument's own floor does not show; of all if too few repeat there."""
+    """The relative noise of the bright half, where the instrument's floor is negligible; of all levels if too few repeat."""
     for chosen in (bright, mean > 0):
         dof = int((count[chosen] - 1).sum())
         if dof >= fewest:
@@ -207,7 +207,7 @@ def _pooled(squares: FloatArray, mean: FloatArray, count: IntArray, bright: npt.
 
 
 def _additive(squares: FloatArray, mean: FloatArray, count: IntArray, relative: float) -> float:
-    """The instrument's floor, in its unit, where the faintest third (black too) scatters more than `relative` explains."""
+    """The instrument's floor, in its unit, if the faintest third, black included, scatters more than `relative` explains."""
     from scipy.special import fdtri  # F's quantile; scipy.stats has the same one and takes half a second to import
 
     faint = (np.arange(len(mean)) <= len(mean) // 3) & (count > 1)
@@ -221,7 +221,7 @@ def _additive(squares: FloatArray, mean: FloatArray, count: IntArray, relative: 
 
 
 def check_levels(measured: Measurements, channel: str, levels: MeasuredLevels) -> None:
-    """Refuse what no response can be fitted to. Raises InputError with the reason and what to do."""
+    """Refuse (InputError) levels that no response can be fitted to, with the reason and the cure."""
     place = f"{measured.source}: channel {channel}"
     if levels.code[0] != 0:
         raise InputError(f"{place}: code 0 is not measured; without it the black level is unknown, so add it, several times")
@@ -251,7 +251,7 @@ def check_levels(measured: Measurements, channel: str, levels: MeasuredLevels) -
 
 
 def _check_saturation(measured: Measurements, channel: str, levels: MeasuredLevels, error: FloatArray) -> None:
-    """An S-curve is flat at white too: what counts is flatter than sin^2, which falls by 3 (1 - code / white)^2."""
+    """Refuse (InputError) a saturated top: one flatter than the S-curve sin^2, which falls by 3 (1 - code / white)^2 there."""
     clipped = measured.clipped.get(channel, [])
     white = levels.mean[-1]
     noise = float(np.hypot(error, error[-1])[-1] / white)
@@ -267,9 +267,9 @@ def _check_saturation(measured: Measurements, channel: str, levels: MeasuredLeve
 
 
 def drift_over_run(measured: Measurements) -> tuple[float, float]:
-    """The trend of repeated patches from the first to the last measurement, and its standard error, both relative.
+    """The trend of repeated patches from the first to the last measurement and its standard error, both relative.
 
-    nan where nothing was repeated. Code 0 has no part: its own noise is not that of light.
+    Both are nan where nothing was repeated. Code 0 is left out: its noise is not that of light.
     """
     lit = (measured.code > 0) & (measured.value > 0)
     key = measured.code[lit] * len(CHANNELS) + np.array([CHANNELS.index(str(name)) for name in measured.channel[lit]])

@@ -53,7 +53,7 @@ PRIOR_SLOPE_SIGMA = 0.5  # sigma of the exponent, for the shape that has it sepa
 LOG_STIFFNESS = np.arange(-26.0, 15.0, 2.0)
 MAX_STEPS = 20
 SETTLED = 1e-6  # change of log light
-STIFFNESS_STEPS = 8  # in each of the first ones the stiffness is chosen anew
+STIFFNESS_STEPS = 8  # the stiffness is chosen anew in each of the first steps
 ASSUMED_NOISE = 0.01  # where nothing was repeated, until the residuals tell
 BLACK_FLOOR = 1e-6  # relative to white: how well a black level of zero is known
 MIN_RISE = 1e-6  # relative, between neighbouring codes: see `strictly_rising`
@@ -63,7 +63,7 @@ MIN_STEP = 1e-12  # relative to white: in float64 it survives a black level a th
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """The base that the spline corrects, its coordinate, and the order of the derivative that is penalised."""
+    """The base that the spline corrects, its coordinate, and the order of the penalised derivative."""
 
     name: str
     base: Curve
@@ -89,11 +89,11 @@ SHAPES = (
 
 @dataclass(frozen=True, slots=True)
 class ChannelFit:
-    """The response of one channel, and how well it is known.
+    """The response of one channel and its errors.
 
-    `light` (2^bits,) is above black, 0 to 1 at white, strictly rising; `white` and `black` are in the unit of measurement
-    (`white` above black). `error` (2^bits,) is the relative standard error of `light`. `residual` (levels - 1,) is what
-    each level but code 0 has left of its light above black when the response is fitted without it, relative.
+    `light` (2^bits,) is above black, 0 to 1 at white, strictly rising; `white` (above black) and `black` are in the unit of
+    measurement. `error` (2^bits,) is the relative standard error of `light`. `residual` (levels - 1,) is the relative error
+    of each level except code 0 in a fit without it.
     """
 
     light: FloatArray
@@ -179,9 +179,9 @@ def fit_levels(levels: MeasuredLevels, white: int) -> ChannelFit:
 
 
 def strictly_rising(light: FloatArray) -> FloatArray:
-    """`light` (n,), 0 to 1, with each code at least 1e-6 above the one before it (and code 1 at 1e-9 of white), 1 at white.
+    """`light` (n,), 0 to 1, with each code at least 1e-6 (relative) above the code before, and code 1 at least 1e-9.
 
-    A response that is flat at its dark end, as that of a link in limited range, has equal codes there.
+    A response may be flat at its dark end, as over a link in limited range.
     """
     rising = light.copy()
     for code in range(1, len(rising)):
@@ -233,7 +233,7 @@ def _spline(place: FloatArray, knots: FloatArray, derivative: int = 0) -> FloatA
 
 
 def _solve(shape: Shape, problem: _Problem) -> _Solution:
-    """Gauss-Newton; the stiffness of the largest evidence in each of the first steps."""
+    """Gauss-Newton steps; each of the first ones takes the stiffness with the largest evidence."""
     black, stiffness = problem.black, math.nan
     theta = _start(problem)
     for step in range(MAX_STEPS):
@@ -262,7 +262,7 @@ def _start(problem: _Problem) -> FloatArray:
 
 
 def _evidence(problem: _Problem, design: FloatArray, target: FloatArray, stiffness: float) -> tuple[float, FloatArray]:
-    """Minus twice the log marginal likelihood of the linearised problem (up to a constant), and the posterior's precision."""
+    """Minus twice the log marginal likelihood of the linearised problem, up to a constant, and the posterior precision."""
     prior = math.exp(stiffness) * problem.penalty + problem.prior
     precision = design.T @ design
     precision[:-1, :-1] += prior
@@ -290,7 +290,7 @@ NOT_STATED = "not stated"
 
 @dataclass(frozen=True, slots=True)
 class Provenance:
-    """Who measured, when (today by default), with what, and in which unit."""
+    """Who measured, when (by default today), the instrument, and the unit."""
 
     who: str = ""
     when: str = ""
@@ -300,7 +300,7 @@ class Provenance:
 
 @dataclass(frozen=True, slots=True)
 class RepeatCounts:
-    """How often the levels were measured."""
+    """Minimum and maximum number of readings of a level."""
 
     min: int
     max: int
@@ -308,7 +308,7 @@ class RepeatCounts:
 
 @dataclass(frozen=True, slots=True)
 class FittedBlack:
-    """The light of code 0, relative to white and in the unit of measurement."""
+    """The light of code 0, relative to white, and in the unit of measurement."""
 
     relative: float
     unit: float
@@ -316,7 +316,7 @@ class FittedBlack:
 
 @dataclass(frozen=True, slots=True)
 class HeldOutLevels:
-    """The errors of levels held out of the fit, of light above black, from white to three decades below it."""
+    """The errors of levels held out of the fit, from white to three decades below; light is above black."""
 
     rms_percent: float
     p95_percent: float
@@ -413,14 +413,14 @@ def fit_all(data: Measurements) -> dict[str, ChannelFit]:
 
 
 def response_columns(fits: dict[str, ChannelFit]) -> dict[str, FloatArray]:
-    """Light (2^bits,) by channel as the calibration file has it: r, g and b where they are known, else w; one black for all."""
+    """Light (2^bits,) by channel for the calibration file: r, g and b where known, else w, all with the mean black."""
     names = PRIMARIES if "r" in fits else ("w",)
     black = float(np.mean([fits[name].black for name in names]))
     return {name: black + fits[name].white * fits[name].light for name in names}
 
 
 def additivity_percent(fits: dict[str, ChannelFit]) -> float | None:
-    """How far r + g + b is from w at white, both above black, in % of w; None where they were not all measured."""
+    """The difference of r + g + b from w at white, above black, in % of w; None where not all were measured."""
     if len(fits) < len(CHANNELS):
         return None
     return 100 * (sum(fits[name].white for name in PRIMARIES) / fits["w"].white - 1)
@@ -443,7 +443,7 @@ def _channel_summary(fit: ChannelFit) -> ChannelSummary:
 
 
 def held_out(fit: ChannelFit) -> HeldOutLevels:
-    """The errors of the levels of a fit, each held out of it."""
+    """The errors of a fit's levels, each held out of the fit."""
     shown = fit.light[fit.levels.code[1:]] >= 10.0 ** -DECADES[-1]
     residual = np.abs(fit.residual[shown])
     rms, p95, largest = float(np.sqrt((residual**2).mean())), float(np.percentile(residual, 95)), float(residual.max())
@@ -456,7 +456,7 @@ NAMES = {"w": "white", "r": "red", "g": "green", "b": "blue"}
 
 
 def draw_calibration(measured: Path, path: Path, bits: int | None = None) -> str:
-    """Draw the response and the held-out residuals of MEASURED.csv into a PNG; returns its finding in one sentence.
+    """Draw the response and the held-out residuals of MEASURED.csv into a PNG; returns the finding as a sentence.
 
     Raises InputError for the same data as the fit does, and where the PNG cannot be written.
     """

@@ -1,4 +1,4 @@
-"""Patches of a monitor's response: which to measure and in which order, written as pictures or shown on a display."""
+"""Patches for a monitor's response: the plan of codes in order, written as pictures or shown on a display."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ PATCHES_PER_REFERENCE = 8  # between two rounds of black, half and white
 
 @dataclass(frozen=True, slots=True, order=True)
 class Patch:
-    """One patch to be measured: its code, and which of w, r, g, b it lights."""
+    """One patch to measure: its code and channel (w, r, g or b)."""
 
     code: int
     channel: str
@@ -40,7 +40,7 @@ class Patch:
 
 @dataclass(frozen=True, slots=True)
 class PlanSettings:
-    """What to plan: bits of a code, levels from black to white, repeats of each, and channels.
+    """The plan's size: bits of a code, levels from black to white, repeats of each, and channels.
 
     Raises InputError for a plan that cannot be measured.
     """
@@ -87,8 +87,8 @@ def planned_codes(bits: int, levels: int) -> list[int]:
     signal = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)  # IEC 61966-2-1
     codes = [0]
     for place, code in enumerate(np.rint(signal * white).astype(int)):
-        room = white - (levels - 2 - place)  # for those that follow
-        codes.append(int(min(max(code, codes[-1] + 1), room)))
+        largest = white - (levels - 2 - place)  # leaves a code for each level that follows
+        codes.append(int(min(max(code, codes[-1] + 1), largest)))
     codes[-1] = white
     return codes
 
@@ -100,7 +100,7 @@ def write_plan(path: Path, patches: list[Patch]) -> None:
 
 
 def is_filled_in(path: Path) -> bool:
-    """Whether somebody has written measurements into a plan."""
+    """Whether a plan has measurements in it."""
     try:
         lines = read_text(path, "", MAX_PLAN_BYTES).splitlines()
     except InputError:
@@ -164,7 +164,7 @@ def show_patches(planned: Sequence[Patch], bits: int, display: int | str, second
 
 
 def stays_until_key(window: Window, presenter: Presenter, seconds: float | None) -> bool:
-    """Present until space is pressed, or for `seconds`; False for q. Raises MachineError where the display goes away."""
+    """Present until space is pressed or `seconds` are over; False if q was pressed. Raises MachineError without the display."""
     end_s = math.inf if seconds is None else time.monotonic() + seconds
     while time.monotonic() < end_s:
         presenter.present()

@@ -1,4 +1,4 @@
-"""The scale of the light by the tracker itself: one star shown, its DN read, and what white is then worth."""
+"""Full scale of the light by the tracker: stars shown, their DN read, and the light of white that follows."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ UNSURE_MAG = 0.05  # readings that disagree by more are wrong for another reason
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """A star that was shown, and the sum of its DN over background."""
+    """A star shown, and the sum of its DN above background."""
 
     hip: int
     dn: float
@@ -30,7 +30,7 @@ class Reading:
 
 @dataclass(frozen=True, slots=True)
 class MeasuredScale:
-    """What white is worth by the tracker, and how well readings agree."""
+    """The light of white by the tracker, and the ratio of measured to wanted light of each reading (n,)."""
 
     flux_at_white_e_per_s: float
     assumed_e_per_s: float
@@ -43,9 +43,9 @@ class MeasuredScale:
 
 
 def scale_by_tracker(bench: Bench, readings: list[Reading], exposure_s: float) -> MeasuredScale:
-    """White by the median of the readings: where the tracker saw r times the light asked for, white is worth r times more.
+    """The light of white from the median ratio of measured to wanted light.
 
-    Raises InputError for a star that the bench does not have or cannot show whole, and for one over the tracker's full well.
+    Raises InputError for a star that the bench does not have, that clips, or that is too faint to be shown.
     """
     detector = bench.config.tracker.detector
     if exposure_s <= 0:
@@ -71,7 +71,7 @@ def _rate_of(bench: Bench, hip: int) -> float:
 
 
 def with_flux_at_white(file: BenchFile, flux_at_white_e_per_s: float, output: Path) -> None:
-    """A copy of a bench file, comments and all, with the key set. Raises InputError where the copy would not say the same."""
+    """Write a copy of a bench file with the key set and comments kept. Raises InputError where that cannot be done."""
     if output.resolve().parent != file.path.resolve().parent:
         raise InputError(f"{output}: the bench file's paths are relative to it; write the copy beside {file.path}")
     key = "flux_at_white_e_per_s"

@@ -1,4 +1,4 @@
-"""Where the page is reached: its address, the socket that listens there, and the token that lets somebody in."""
+"""The page's address, the socket that listens there, and the token that admits a browser."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class ListenAddress:
 
     @property
     def is_loopback(self) -> bool:
-        """Whether only this machine reaches it."""
+        """Whether only this machine can reach it."""
         if self.host == "localhost":
             return True
         with contextlib.suppress(ValueError):
@@ -69,10 +69,10 @@ def _is_host(text: str) -> bool:
 
 
 class PageListener:
-    """The listening socket, and what opens it. Raises InputError where the address cannot be had.
+    """The page's listening socket, its names and its token. Raises InputError where the address cannot be used.
 
-    A token is made where the page can be reached from elsewhere and none is given; `made` says that it was. `names` are
-    further names of the page, those under which a proxy shows it.
+    Where the page can be reached from other machines and no token is given, one is made (`made`). `names` has further names
+    of the page, under which a proxy shows it.
     """
 
     def __init__(self, address: ListenAddress, token: str | None = None, names: tuple[str, ...] = ()) -> None:
@@ -91,7 +91,7 @@ class PageListener:
 
     @property
     def hosts(self) -> list[str]:
-        """The names under which a browser may ask for the page, besides numeric addresses where `any_address`."""
+        """The host names under which a browser may ask for the page, besides numeric addresses where `any_address`."""
         own = ["localhost", "127.0.0.1", "[::1]", _bracketed(self.host)]
         if self.any_address:
             own += [socket.gethostname(), socket.getfqdn()]
@@ -99,7 +99,7 @@ class PageListener:
 
     @property
     def url(self) -> str:
-        """What to open; with the token where that was made here, never one that was given."""
+        """The address to open. It has the token if that was made here, never one that was given."""
         host = self.host
         with contextlib.suppress(ValueError):
             if ipaddress.ip_address(host).is_unspecified:
@@ -142,7 +142,7 @@ def _listen(address: ListenAddress) -> socket.socket:
 
 
 def _own_address(family: socket.AddressFamily) -> str:
-    """The address by which others most likely reach this machine: that of its route out; nothing is sent."""
+    """This machine's address on its route out, by which others most likely reach it. Nothing is sent."""
     beyond = "2001:db8::1" if family == socket.AF_INET6 else "192.0.2.1"  # for documentation: RFC 5737, RFC 3849
     with contextlib.suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as probe:
         probe.connect((beyond, 9))

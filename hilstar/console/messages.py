@@ -16,7 +16,7 @@ STALE, MISSING, BLANK, HAS_AGE = 1, 2, 4, 8
 
 
 class FrameNumbers(NamedTuple):
-    """One frame and the counts up to it; host times, ns. `flags` are of STALE, MISSING, BLANK and HAS_AGE."""
+    """One frame and the counts up to it; host times, ns. `flags` combines STALE, MISSING, BLANK and HAS_AGE."""
 
     number: int
     draw_ns: int
@@ -43,10 +43,9 @@ class FrameNumbers(NamedTuple):
 
 
 class PictureHead(NamedTuple):
-    """A picture: its frame, when that was shown (host time, ns), and how much follows.
+    """The head of a picture: its frame, its swap (host time, ns), and its attitude `q_w` to `q_z`, NaN without one.
 
-    `q_w` to `q_z` are its attitude, NaN without one. First levels of
-    `item_bytes` each, `width` by `height`, then `sprites` of `shared_memory.SPRITE`.
+    Levels of `item_bytes` each follow, `width` by `height`, then `sprites` records of `shared_memory.SPRITE`.
     """
 
     frame: int
@@ -89,7 +88,7 @@ class ClockState(msgspec.Struct, frozen=True):
 
 
 class RunState(msgspec.Struct, frozen=True, kw_only=True):
-    """The run at a moment of host time, ns; `alive_ns` is when the frame loop last moved, 0 before it began."""
+    """The run at a host time, ns; `alive_ns` is when the frame loop last moved, 0 before it began."""
 
     host_ns: int
     alive_ns: int = 0
@@ -130,7 +129,7 @@ class RunEvent(msgspec.Struct, frozen=True):
 
 
 class Order(msgspec.Struct, kw_only=True):
-    """What a page asks for: a name of CONTROLS, what is to be, and by whom."""
+    """An operator's order: a name of CONTROLS, the wanted state, and who gave it."""
 
     id: int
     name: str
@@ -142,7 +141,7 @@ class Order(msgspec.Struct, kw_only=True):
 
 
 class OrderAnswer(msgspec.Struct, kw_only=True):
-    """What became of an order: an HTTP status, and a line."""
+    """The answer to an order: an HTTP status and a line."""
 
     id: int
     status: int
@@ -153,10 +152,10 @@ Pace = Literal["clock", "asked", "session"]
 
 
 class Setup(msgspec.Struct, kw_only=True):
-    """What the page's process knows from the start; `hello` is what it tells every page first.
+    """What the page's process is given at its start; `hello` is the first message to every page.
 
-    `pace` says how frames come: when they are due ("clock"), when a simulator asks or as fast as they can
-    ("asked"), or not at all, in a session of first light ("session"). A page without a `token` is for anyone who reaches it.
+    `pace` says when frames come: at their due time ("clock"), when a simulator asks or as fast as possible ("asked"), or not
+    at all, in a first-light session ("session"). Without a `token` anybody who reaches the page may see it.
     """
 
     hello: Hello

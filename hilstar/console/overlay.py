@@ -1,4 +1,4 @@
-"""What the page draws over a picture of a bench, from the bench's stars and its two cameras: no pixel of the picture itself."""
+"""What the page draws over a picture: stars, outline and grid, from the bench's stars and its two cameras."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ PX_DIGITS, SKY_DIGITS = 2, 4
 
 @dataclass(frozen=True, slots=True)
 class CameraMarks:
-    """What needs no stars: the boresight, the tracker's outline and the lines of RA and Dec, by the two cameras of a bench."""
+    """Marks that need no stars: boresight, tracker's outline, lines of RA and Dec, by the two cameras of a bench."""
 
     monitor: Camera
     tracker: Camera
 
     def truth(self, frame: int, stars: list[StarMark], q_icrs_to_cam: FloatArray | None, grid: bool = False) -> Truth:
-        """The truth of a picture: its stars and the marks; with `grid` and an attitude lines of RA and Dec, too."""
+        """The truth of a picture: its stars, the marks, and with `grid` and an attitude the lines of RA and Dec."""
         lines: list[GridLine] = []
         if grid and q_icrs_to_cam is not None:
             lines = list(self._grid(q_icrs_to_cam, self.monitor.cam_to_image @ to_matrix(q_icrs_to_cam)))
@@ -55,7 +55,7 @@ class CameraMarks:
         )
 
     def on_screen(self, x_px: FloatArray, y_px: FloatArray, beyond: float) -> np.ndarray[Any, Any]:
-        """Which places (n,) are on the monitor, or outside by at most that share of its size."""
+        """A mask of places (n,) on the monitor, or outside by at most `beyond` of its size."""
         width, height = self.monitor.resolution_px
         with np.errstate(invalid="ignore"):  # NaN: behind the camera, or beyond the lens
             inside = np.abs(x_px - (width - 1) / 2) <= width * (0.5 + beyond)
@@ -92,7 +92,7 @@ class CameraMarks:
         """A line over the sky, in pieces where it leaves the image."""
         x_px, y_px = self.monitor.project(direction_of(ra_deg, dec_deg) @ turn.T)
         inside = self.on_screen(x_px, y_px, BEYOND)
-        # A piece has a place more on each side, so that it reaches over the image's edge; one alone is nothing.
+        # A piece extends one point beyond the image's edge on each side; a single point is no line.
         near = np.isfinite(x_px) & (inside | np.append(inside[1:], False) | np.append(False, inside[:-1]))
         bounds = np.flatnonzero(np.diff(np.concatenate(([False], near, [False])).astype(np.int8)))
         for begin, end in zip(bounds[::2], bounds[1::2], strict=True):
@@ -135,7 +135,7 @@ class Overlay:
         return [SkyPlace(*row) for row in zip(*columns, self._labels(which, ""), strict=True)]
 
     def _labels(self, which: np.ndarray[Any, Any], none: str | None = None) -> list[str]:
-        """What stands beside a star: a body's name, else its designation; without one `none`, or its HIP number."""
+        """A star's label: a body's name, else its designation, else its HIP number, or `none` where that is given."""
         found = zip(self.stars.names(which), self.stars.hip[which].tolist(), strict=True)
         labels = [name or label_of(hip) for name, hip in found]
         return labels if none is None else [none if label.startswith("HIP ") else label for label in labels]
@@ -168,7 +168,7 @@ def overlay_of(bench: Bench) -> Overlay:
 
 
 def catalogue_sky() -> SkyMap:
-    """As `Overlay.sky` without a bench: Hipparcos' bright stars, where they were in 1991."""
+    """The map of the sky without a bench: Hipparcos' bright stars at their places of 1991."""
     catalog = load_catalog()
     bright = np.argsort(catalog.v_mag, kind="stable")
     bright = bright[catalog.v_mag[bright] < SKY_FAINTEST_MAG]
@@ -178,7 +178,7 @@ def catalogue_sky() -> SkyMap:
 
 
 def _border(resolution_px: tuple[int, int], places: int) -> tuple[FloatArray, FloatArray]:
-    """Places on an image's edge, in order around it, so many along each side."""
+    """Points around an image's edge in order, `places` along each side."""
     width, height = resolution_px
     along = np.linspace(0.0, 1.0, places)[:-1]
     share_x = np.concatenate((along, np.ones_like(along), 1 - along, np.zeros_like(along)))

@@ -1,6 +1,6 @@
-"""Keeps the page's process alive beside a run: starts it, restarts it when it ends, tells it of the run, and takes its orders.
+"""Keeps the page's process alive beside a run: starts and restarts it, publishes the run's state, and takes its orders.
 
-All of this is done by one thread, ten times a second; the frame loop has no part in it.
+One thread does this ten times a second; the frame loop takes no part in it.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from hilstar.notices import Listener, Notice
 
 TICK_S = 0.1
 FIRST_WAIT_S, MAX_WAIT_S = 0.1, 5.0  # before the page's process is started again
-STEADY_S = 10.0  # alive for so long, it is as good as new
+STEADY_S = 10.0  # a process that lived this long is restarted at once
 END_WAITS_S = 1.0
 MAX_ORDERS = 8  # at once
 MAX_ORDER_BYTES = 8_000
@@ -41,21 +41,21 @@ Do = Callable[[Order], OrderAnswer]  # on a thread of its own
 
 
 class PageSubject(Protocol):
-    """What the page is of: its state now, its events, and who is told of the page itself."""
+    """The run or session that the page shows: its state, its events, and its record of events."""
 
     def now(self) -> RunState:
-        """The state now."""
+        """The current state."""
 
     def listen(self, listener: Listener) -> None:
-        """Hand every further event to `listener`."""
+        """Pass every further event to `listener`."""
 
     def tell(self, kind: str, line: str) -> None:
-        """Tell of an event."""
+        """Record an event."""
 
 
 @dataclass(slots=True)
 class _Page:
-    """One process of the page, and the socket to it."""
+    """A page's process, and the channel to it."""
 
     process: subprocess.Popen[bytes]
     channel: socket.socket
@@ -63,7 +63,7 @@ class _Page:
 
 
 class PageProcess:
-    """The page of a run, for as long as this is open."""
+    """The page of a run while this is open."""
 
     def __init__(self, setup: Setup, memory: SharedMemory, listener: socket.socket, watched: PageSubject, do: Do) -> None:
         self._memory, self._listener, self._watched, self._do = memory, listener, watched, do
@@ -88,7 +88,7 @@ class PageProcess:
 
     @property
     def pid(self) -> int | None:
-        """The number of the page's process, None while there is none."""
+        """The process ID of the page's process, None while there is none."""
         return None if self._page is None else self._page.process.pid
 
     def _run(self) -> None:
@@ -105,7 +105,7 @@ class PageProcess:
         try:
             self._memory.states.put(msgspec.json.encode(self._watched.now()))
             self._write_events()
-        except Exception as error:  # a container that changed while it was read, or whatever else: there is a next look
+        except Exception as error:  # such as a container that changed while it was read: the next tick reads it again
             self._memory.states.put(msgspec.json.encode(RunState(host_ns=time.monotonic_ns(), note=one_line(repr(error)))))
         page = self._page
         if page is None:
@@ -191,13 +191,13 @@ class PageProcess:
 
 
 def _environment() -> dict[str, str]:
-    """This process's own, in which Python finds what it finds here; without what is the run's alone."""
+    """This process's environment with its module path, without the variables meant for the run alone."""
     own = {name: value for name, value in os.environ.items() if name not in OF_THE_RUN}
     return own | {"PYTHONPATH": os.pathsep.join(place for place in sys.path if place)}
 
 
 def _memory_of(data: bytes) -> int:
-    """A descriptor of memory with these bytes, to be read by a process that is given it."""
+    """A file descriptor of memory with these bytes, for a child process to read."""
     fd = os.memfd_create("hilstar-console-setup")
     with os.fdopen(os.dup(fd), "wb") as file:
         file.write(data)

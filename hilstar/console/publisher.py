@@ -73,11 +73,11 @@ class FramePublisher:
         self._picture_due_ns = 0
 
     def follow(self, running: Running) -> None:
-        """Take the run, which goes on counting."""
+        """Follow a run, whose counters go on changing."""
         self.running = running
 
     def see(self, shown: Shown) -> None:
-        """Take a frame; for the frame loop."""
+        """Publish a frame. Called by the frame loop."""
         self.shown = shown
         self.count += 1
         running, attitude = self.running, shown.attitude
@@ -109,7 +109,7 @@ class FramePublisher:
                 self._copy(shown)
 
     def _copy(self, shown: Shown) -> None:
-        """Copy the picture: its levels, its attitude, and where the stars in it are."""
+        """Copy a picture: levels, attitude, and the places of its stars."""
         ring, levels, sprites = self._memory.pictures, shown.drawn.levels, shown.drawn.sprites
         height, width = levels.shape
         count = 0 if sprites is None else min(len(sprites), MAX_SPRITES)
@@ -134,7 +134,7 @@ def _copy_sprites(target: np.ndarray, sprites: Sprites) -> None:
 
 
 MAX_CLIPPED = 300  # by name; a picture has hundreds of stars
-# Events that last and keep a ledger from being written: as `run.record.ledger` tells them.
+# Lasting events that keep the ledger from being written, as `run.record.ledger` names them.
 LEDGER_TROUBLES = {
     "ledger-failed": "cannot be written",
     "ledger-lost": "a file was deleted, truncated or overwritten",
@@ -145,7 +145,7 @@ LEDGER_TROUBLES = {
 
 @dataclass(frozen=True, slots=True)
 class WatchedRun:
-    """What there is to look at in a run."""
+    """The parts of a run that its state is read from."""
 
     feed: FramePublisher
     notices: Notices
@@ -154,15 +154,15 @@ class WatchedRun:
     faults: FaultDesk | None = None
 
     def listen(self, listener: Listener) -> None:
-        """Hand every further event of the run to `listener`."""
+        """Pass every further event of the run to `listener`."""
         self.notices.listen(listener)
 
     def tell(self, kind: str, line: str) -> None:
-        """Tell of an event of the run."""
+        """Record an event of the run."""
         self.notices.tell(kind, line)
 
     def now(self) -> RunState:
-        """The run now."""
+        """The run's current state, read beside the frame loop."""
         running, shown = self.feed.running, self.feed.shown
         if running is None:
             return RunState(host_ns=time.monotonic_ns(), ledger=self._ledger())
@@ -237,7 +237,7 @@ class OrderHandler:
         self._ledger_lock = threading.Lock()
 
     def do(self, order: Order) -> OrderAnswer:
-        """Do it; what went wrong is in the answer."""
+        """Carry out an order; the answer says what went wrong."""
         who = one_line(order.who)[:MAX_WHO_CHARACTERS]
         try:
             answer = self._done(order, who)
@@ -266,7 +266,7 @@ class OrderHandler:
         )
 
     def _waits_for(self, holds: Callable[[], bool]) -> bool:
-        """Whether that comes to hold while the frame loop is waited for."""
+        """Wait for a condition for at most LOOP_WAITS_S; whether it came to hold."""
         end_s = time.monotonic() + LOOP_WAITS_S
         while not holds():
             if time.monotonic() > end_s:
@@ -294,7 +294,7 @@ class OrderHandler:
             return OrderAnswer(id=order.id, status=200, line=f"ledger off: {ledger_now.path} is whole")
 
     def _free_path(self) -> Path:
-        """A new name, beside the newest ledger where there was one."""
+        """A new file name, beside the newest ledger if there was one."""
         folder = Path.cwd() if self._ledger.last is None else self._ledger.last.path.parent
         now = datetime.now(UTC)
         for k in range(100):
@@ -329,7 +329,7 @@ class OrderHandler:
 
 @dataclass(frozen=True, slots=True)
 class RunDescription:
-    """What the page says of a run: the command, where attitudes come from, and how frames come."""
+    """What the page says of a run: the command, the source of attitudes, and the pace of frames."""
 
     command: str
     kind: str
@@ -338,7 +338,7 @@ class RunDescription:
 
 
 def setup_for(listener: PageListener, control: bool, description: RunDescription, file: BenchFile, picture_bytes: int) -> Setup:
-    """The page of a bench file at an address; a run adds to `hello`."""
+    """The setup of a page for a bench file; a run adds to `hello`."""
     monitor = file.config.monitor
     hello = Hello(
         version=__version__,
@@ -368,7 +368,7 @@ MAX_NAMES = 5000  # the brightest stars without a HIP number
 
 
 def scene_of(bench: Bench, aids_in_levels: bool) -> OverlayScene:
-    """The scene of a bench; `aids_in_levels` where the levels have the operator's aids in them already."""
+    """The overlay's scene for a bench; `aids_in_levels`: the levels contain the operator's aids already."""
     stars, overlay = bench.shown_stars, overlay_of(bench)
     unnamed = np.flatnonzero(stars.hip == 0)
     unnamed = unnamed[np.argsort(stars.v_mag[unnamed], kind="stable")[:MAX_NAMES]]
@@ -385,7 +385,7 @@ def scene_of(bench: Bench, aids_in_levels: bool) -> OverlayScene:
 
 @dataclass(frozen=True, slots=True)
 class PageParts:
-    """What a run is made of; `make_ledger` begins one at a path."""
+    """The parts of a run; `make_ledger` begins a ledger at a path."""
 
     bench: Bench
     notices: Notices
@@ -399,7 +399,7 @@ class PageParts:
 def opened_page(
     listener: PageListener, control: bool, description: RunDescription, parts: PageParts
 ) -> Iterator[tuple[FramePublisher, SwitchRequests]]:
-    """The page of a run while this is open: what frames are given to, and where its wishes come from."""
+    """The page of a run while this is open: the publisher of its frames, and the queue of its requests."""
     width, height = parts.bench.config.monitor.resolution_px
     picture_bytes = width * height * (1 if parts.bench.calibration.response.white < 2**8 else 2)
     memory = SharedMemory.make(picture_bytes)
@@ -413,7 +413,7 @@ def opened_page(
 
 
 def setup_of(listener: PageListener, control: bool, description: RunDescription, parts: PageParts, picture_bytes: int) -> Setup:
-    """What the page's process is told at its start."""
+    """What the page's process is given at its start."""
     bench = parts.bench
     setup = setup_for(listener, control, description, bench.file, picture_bytes)
     setup.hello.renderer, setup.hello.white_level = bench.renderer.gl_renderer, bench.calibration.response.white
@@ -427,7 +427,7 @@ FAILED = "failed:"  # as `first-light` says of a step
 
 
 class SessionPublisher:
-    """What a session leaves for its page; its thread writes pictures, and the page's keeper asks for the rest."""
+    """Publishes a first-light session: the session's thread writes pictures, the page's keeper reads the state."""
 
     def __init__(self, memory: SharedMemory) -> None:
         self._memory = memory
@@ -436,7 +436,7 @@ class SessionPublisher:
         self._patterns = 0
 
     def show(self, pattern: Pattern) -> None:
-        """Take the pattern that is shown now; of one with colours its brightest channel."""
+        """Publish the pattern now shown; of a coloured one the brightest channel."""
         codes = pattern.codes if pattern.codes.ndim == 2 else pattern.codes.max(axis=2)
         ring, (height, width) = self._memory.pictures, codes.shape
         whole = PICTURE_HEAD_BYTES + codes.size * CODE.itemsize
@@ -452,7 +452,7 @@ class SessionPublisher:
         self.tell("pattern", f"shows {pattern.name}")
 
     def say(self, line: str) -> None:
-        """Take a line of the session: a step that begins, or ends."""
+        """Publish a line of the session: a step begins or ends."""
         step, _, words = line.partition(" ")
         if words.strip().startswith(FAILED):
             self._failed[step] = f"{step} {words.strip()}"
@@ -465,18 +465,18 @@ class SessionPublisher:
         self._listeners.append(listener)
 
     def tell(self, kind: str, line: str) -> None:
-        """Tell the page of an event."""
+        """Record an event."""
         for listener in self._listeners:
             listener(Notice.now(kind, " ".join(line.split())))
 
     def now(self) -> RunState:
-        """The state now."""
+        """The session's current state."""
         now_ns = time.monotonic_ns()
         failed = list(self._failed.values())
         return RunState(host_ns=now_ns, alive_ns=now_ns, frame=self._patterns, missing=False, blank=False, failed=failed)
 
     def do(self, order: Order) -> OrderAnswer:
-        """A mark is told; there is nothing else to order."""
+        """Record a mark; a session takes no other order."""
         if order.name != "mark" or not order.text.strip():
             return OrderAnswer(
                 id=order.id, status=409, line="a session of first light takes marks with a text, and no other order"

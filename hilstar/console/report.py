@@ -105,16 +105,16 @@ CAUTION = (
 
 
 class _Unreported(Notices):
-    """Events of drawing again, which are not the run's."""
+    """Notices that are dropped: those of redrawing are not the run's."""
 
     def tell(self, kind: str, detail: str, who: str = "") -> None:
         """Say nothing."""
 
 
 def run_pictures(run: RunFigures, ledger: Path) -> dict[str, Any]:
-    """`pictures` in the order of the run, with a `caution` where the bench has changed, or `no_pictures`, why there are none.
+    """The run's `pictures` in order, with a `caution` where the bench has changed, or `no_pictures`, the reason for none.
 
-    And the whole `sky` about them.
+    `sky` is the map of the whole sky.
     """
     try:
         file = _bench_file(run.head, ledger)
@@ -131,7 +131,7 @@ def run_pictures(run: RunFigures, ledger: Path) -> dict[str, Any]:
 
 
 def _bench_file(head: dict[str, str], ledger: Path) -> BenchFile:
-    """The bench of a run: the text in its head, with the files that it names where they are now, preferably unchanged.
+    """The bench file of a run: the text in the ledger's head with the files that it names, preferably unchanged.
 
     Raises InputError where the head has none, or one that cannot be read.
     """
@@ -143,7 +143,7 @@ def _bench_file(head: dict[str, str], ledger: Path) -> BenchFile:
 
 
 def _pictures(bench: Bench, overlay: Overlay, run: RunFigures, ledger: Path) -> list[dict[str, Any]]:
-    """The frames that are worth one, replayed with the faults that they had."""
+    """Pictures of the chosen frames, replayed with the faults that they had."""
     recording = read_recording(ledger)
     frames = run.keyframes.chosen(run.last)
     chosen = [(record, why) for record, why in frames if not (_stays(record, recording) or wrong_in_frame(record))]
@@ -167,19 +167,19 @@ def _pictures(bench: Bench, overlay: Overlay, run: RunFigures, ledger: Path) -> 
 
 
 def _stays(record: FrameRecord, recording: Recording) -> bool:
-    """Whether a fault held the picture, so that it was that of a frame before."""
+    """Whether a fault held an earlier frame's picture."""
     return any(isinstance(recording.faults.get(number), Freeze) for number in record.faults)
 
 
 def _within(pictures: list[dict[str, Any]], size: int) -> list[dict[str, Any]]:
-    """As many of them, evenly over the run, as are not larger together."""
+    """As many pictures, evenly over the run, as fit into `size` bytes."""
     while len(pictures) > 1 and sum(len(picture["data"]) for picture in pictures) > size:
         pictures = pictures[::2]
     return pictures
 
 
 def _picture(overlay: Overlay, shown: Shown) -> dict[str, Any]:
-    """One frame: its levels, packed, and the truth about them."""
+    """One frame: its packed levels and its truth."""
     levels = shown.drawn.levels
     attitude = shown.attitude
     truth = None if attitude is None else overlay.truth(shown.number, attitude.q_icrs_to_cam, shown.drawn.clipped_hip)
@@ -215,7 +215,7 @@ DISTRIBUTIONS = {
 
 
 def run_data(name: str, run: RunFigures, summary: RunReport) -> dict[str, Any]:
-    """The figures of a run as the page reads them: lists of numbers, None for no value; times in s from the first swap."""
+    """The figures of a run for the page: lists of numbers, None for no value; times in s from the first swap."""
     with np.errstate(all="ignore"):  # absurd figures of a foreign file become no value
         return _run_data(name, run, summary)
 
@@ -257,7 +257,7 @@ def _about(name: str, run: RunFigures, config: BenchConfig | None) -> dict[str, 
 
 
 def verdict(found: RunReport, late: int) -> dict[str, Any]:
-    """Whether the sky was right all along, in how many of the refresh periods it was, and why not in the others."""
+    """Whether the sky was right throughout, in which share of the refresh periods it was, and why not in the others."""
     counted = (
         (found.blank_frames, "without an attitude"),
         (late, "with a stale attitude"),
@@ -274,14 +274,14 @@ def verdict(found: RunReport, late: int) -> dict[str, Any]:
 
 
 def _share(part: int, whole: int) -> str:
-    """A share of a run, rounded down: 100 % is said of all of it alone."""
+    """A share of a run in %, rounded down: only all of it is 100 %."""
     percent = 100 * part / max(whole, 1)
     digits = 3 if percent > 99.9 else 2 if percent > 99 else 1
     return f"{math.floor(percent * 10**digits) / 10**digits:.{digits}f} %"
 
 
 def _utc(run: RunFigures, host_ns: int) -> str | None:
-    """A moment of the run's host clock as UTC; None where the ledger's head does not say."""
+    """A host time of the run as UTC; None where the ledger's head lacks it."""
     try:
         unix_ns = int(run.head["unix_ns"]) + host_ns - int(run.head["monotonic_ns"])
         return (datetime(1970, 1, 1, tzinfo=UTC) + timedelta(microseconds=unix_ns // 1000)).isoformat(timespec="milliseconds")
@@ -358,7 +358,7 @@ def _path(rows: FloatArray) -> dict[str, Any]:
 
 
 def _motion(rows: FloatArray) -> dict[str, Any] | None:
-    """Three angles about their mean, and what is left of the turns about the camera's axes beside a steady one."""
+    """Three angles about their mean, and the turns about the camera's axes minus a steady motion."""
     if not len(rows):
         return None
     turned_rad = rows[:, 6:9]
@@ -406,7 +406,7 @@ def _radec_roll_deg(q: FloatArray) -> RadecRoll:
 
 
 def beside_steady(rows: FloatArray) -> FloatArray:
-    """The turns of a path's rows minus a straight line in the attitude's time fitted to each, deg (n, 3)."""
+    """The turns of a path's rows minus a line fitted to each over the attitude's time, deg (n, 3)."""
     turned_rad, at = rows[:, 6:9], rows[:, 1] - rows[:, 1].mean()
     spread = float((at * at).sum())
     slope = (at @ turned_rad) / spread if spread > 0 else np.zeros(3)

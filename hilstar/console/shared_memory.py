@@ -1,8 +1,8 @@
-"""The memory that a run and its page share: numbered records in rings, written without a wait and read without a lock.
+"""Memory shared by a run and its page: rings of numbered records, written without waiting and read without a lock.
 
-A record's slot says which number is being written and which is whole (a seqlock), and has a CRC: a reader that was overtaken,
-or looked too early, sees that and tries again or leaves it. Each ring has one writer. The memory has no name (memfd): it is
-gone with the last process that has it open, however that ends.
+Each slot holds the number being written, the number that is complete (a seqlock) and a CRC, so that a reader notices a record
+that is incomplete or was overwritten. Each ring has one writer. The memory has no name (memfd): it is gone with the last
+process that has it open.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ PICTURE_HEAD_BYTES = 128
 
 
 class Ring:
-    """Records numbered from 1 in a ring of `slots`, each of at most `slot_bytes`."""
+    """A ring of `slots` records numbered from 1, each of at most `slot_bytes`."""
 
     def __init__(self, memory: memoryview, slots: int, slot_bytes: int) -> None:
         self._memory = memory
@@ -41,7 +41,7 @@ class Ring:
 
     @staticmethod
     def size(slots: int, slot_bytes: int) -> int:
-        """The bytes of memory that it takes."""
+        """The memory that a ring takes, bytes."""
         return _HEAD.size + slots * (_SLOT.size + slot_bytes)
 
     @property
@@ -50,31 +50,31 @@ class Ring:
         return int(_HEAD.unpack_from(self._memory, 0)[0])
 
     def put(self, data: bytes) -> None:
-        """Write a record; one that is too long is cut."""
+        """Write a record, cut to the slot's length."""
         data = data[: self.slot_bytes]
         place = self.begin()
         self._memory[place : place + len(data)] = data
         self.end(len(data), zlib.crc32(data))
 
     def begin(self) -> int:
-        """Open the next slot; where its bytes begin."""
+        """Open the next slot; the offset of its bytes."""
         place = self._place(self._next)
         _SLOT.pack_into(self._memory, place, self._next, 0, 0, 0)
         return place + _SLOT.size
 
     def end(self, length: int, crc: int) -> None:
-        """Close the slot with so many bytes in it."""
+        """Close the slot, which has `length` bytes."""
         _SLOT.pack_into(self._memory, self._place(self._next), self._next, self._next, length, crc)
         _HEAD.pack_into(self._memory, 0, self._next)
         self._next += 1
 
     def room(self, length: int) -> memoryview:
-        """The first bytes of the slot that `begin` opened."""
+        """The first `length` bytes of the slot that `begin` opened."""
         place = self._place(self._next) + _SLOT.size
         return self._memory[place : place + length]
 
     def read(self, number: int) -> bytes | None:
-        """The record of that number; None where it is not whole, or has been overwritten."""
+        """The record of that number; None where it is incomplete or overwritten."""
         place = self._place(number)
         begun, whole, length, crc = _SLOT.unpack_from(self._memory, place)
         if not number or begun != number or whole != number or length > self.slot_bytes:
@@ -85,7 +85,7 @@ class Ring:
         return data if not crc or zlib.crc32(data) == crc else None
 
     def last(self) -> tuple[int, bytes] | None:
-        """The newest whole record with its number; None where there is none yet."""
+        """The newest complete record with its number; None where there is none yet."""
         newest = self.newest
         for number in range(newest, max(newest - self._slots + 1, 0), -1):
             data = self.read(number)
@@ -94,7 +94,7 @@ class Ring:
         return None
 
     def after(self, number: int) -> Iterator[tuple[int, bytes]]:
-        """The whole records after `number` that are still there, oldest first."""
+        """The complete records after `number` that are still there, oldest first."""
         newest = self.newest
         for k in range(max(number + 1, newest - self._slots + 2, 1), newest + 1):
             data = self.read(k)
@@ -107,14 +107,14 @@ class Ring:
 
 @dataclass(frozen=True, slots=True)
 class PictureRequest:
-    """How often the page wants a picture, and until when (host time), ns; 0 for never."""
+    """The interval at which the page wants pictures, and until when (host time), ns; 0 for never."""
 
     each_ns: int = 0
     until_ns: int = 0
 
 
 class SharedMemory:
-    """The rings of a run: frames, states, events and pictures, and what the page wants; `fd` is the memory's own."""
+    """The rings of a run (frames, states, events, pictures) and the page's request for pictures; `fd` is the memory's."""
 
     def __init__(self, fd: int, picture_bytes: int) -> None:
         self.fd = fd
@@ -136,7 +136,7 @@ class SharedMemory:
 
     @property
     def want(self) -> PictureRequest:
-        """What the page wants now."""
+        """The page's request for pictures."""
         return PictureRequest(*_REQUEST.unpack_from(self._memory, 0))
 
     @want.setter
@@ -145,7 +145,7 @@ class SharedMemory:
 
     @property
     def wrong_since_s(self) -> float:
-        """Since when the page has found the run wrong (UTC, s), for a page that takes over; 0 where it found it right."""
+        """Since when the page has judged the run wrong (UTC, s), for a page that takes over; 0 while it is right."""
         return float(_WRONG_SINCE.unpack_from(self._memory, _REQUEST.size)[0])
 
     @wrong_since_s.setter

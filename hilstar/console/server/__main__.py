@@ -42,7 +42,7 @@ GOING_AWAY = 1001
 
 
 class Server(uvicorn.Server):
-    """uvicorn's, whose end is this process's own matter."""
+    """uvicorn's server without its signal handlers: this process ends by itself."""
 
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:
@@ -51,7 +51,7 @@ class Server(uvicorn.Server):
 
 
 class OrderChannel:
-    """Orders to the run, and its answers to them."""
+    """Sends orders to the run and receives its answers."""
 
     def __init__(self, channel: socket.socket) -> None:
         channel.setblocking(False)
@@ -60,7 +60,7 @@ class OrderChannel:
         self._waiting: dict[int, asyncio.Future[OrderAnswer]] = {}
 
     async def give(self, order: Order) -> OrderAnswer:
-        """Give an order, and wait for what becomes of it."""
+        """Send an order and wait for its answer."""
         if len(self._waiting) >= MAX_ORDERS:
             return OrderAnswer(id=0, status=503, line="too many orders at once; try again")
         order.id = next(self._numbers)
@@ -76,7 +76,7 @@ class OrderChannel:
             self._waiting.pop(order.id, None)
 
     async def listen(self) -> None:
-        """Take answers until the run closes its end."""
+        """Receive answers until the run closes its end."""
         while True:
             try:
                 data = await asyncio.get_running_loop().sock_recv(self._channel, MAX_ANSWER_BYTES)
@@ -91,7 +91,7 @@ class OrderChannel:
 
 
 async def tick(reader: RunReader, memory: SharedMemory, pages: OpenPages) -> None:
-    """Ten times a second: look at the shared memory, and tell all pages."""
+    """Read the shared memory and tell all pages, ten times a second."""
     loop = asyncio.get_running_loop()
     due_s = loop.time()
     while True:

@@ -48,7 +48,7 @@ POLICY = (
 
 
 class Refused(Exception):
-    """A request that is not answered: HTTP status and a line."""
+    """A refused request: HTTP status and a line."""
 
     def __init__(self, status: int, line: str) -> None:
         super().__init__(line)
@@ -71,7 +71,7 @@ class Guard:
 
     @property
     def has_token(self) -> bool:
-        """Whether a token is needed."""
+        """Whether a token is required."""
         return bool(self._token)
 
     def check_host(self, host: str) -> None:
@@ -93,7 +93,7 @@ class Guard:
         return False
 
     def check_origin(self, headers: Mapping[str, str]) -> None:
-        """Raises Refused (403) for a request that a page of another site has made."""
+        """Raises Refused (403) for a request that another site's page made."""
         origin, host = headers.get("origin"), headers.get("host", "").lower()
         if origin is not None and origin.lower() not in {f"http://{host}", f"https://{host}"}:
             raise Refused(403, "another site's page may not ask here")
@@ -125,7 +125,7 @@ def _split(host: str) -> tuple[str, str]:
 
 
 def headers_of(host: str) -> dict[str, str]:
-    """The headers of every answer to a request that was allowed under that name; "" for one that was not."""
+    """The headers of every answer, by the host name of an allowed request; "" for a refused one."""
     sockets = f" ws://{host} wss://{host}" if host else ""
     return HEADERS | {"Content-Security-Policy": POLICY.format(sockets=sockets)}
 
@@ -134,14 +134,14 @@ CONTENT_TYPE = CONTENT_TYPE_LATEST
 
 
 class RunCollector(Collector):
-    """Makes the metrics of a run when they are asked for."""
+    """Makes a run's metrics on request."""
 
     def __init__(self, reader: RunReader) -> None:
         self._reader = reader
         self.clients = 0
 
     def collect(self) -> Iterator[Metric]:
-        """Each metric with its value now."""
+        """The metrics with their current values."""
         hello, seen = self._reader.setup.hello, self._reader.seen or RunState(host_ns=0)
         info = {key: str(getattr(hello, key)) for key in ("version", "command", "bench", "renderer")}
         yield InfoMetricFamily("hilstar_run", "What runs.", value=info)
@@ -206,7 +206,7 @@ def _counter(name: str, words: str, value: float) -> CounterMetricFamily:
 
 
 class Metrics:
-    """The registry with a run in it."""
+    """The registry of a run's metrics."""
 
     def __init__(self, reader: RunReader) -> None:
         self.collector = RunCollector(reader)
@@ -224,14 +224,14 @@ MAX_BODY_BYTES = 4_000
 MAX_DRAINED_BYTES = 64_000_000  # a body that is too long is read this far, so that its sender comes to read why
 BODY_S = 5.0
 OPEN_PATHS = ("/", "/static/")  # the page itself has no secret; it brings the token that its address has
-STATE_S = 0.5  # for a state of after an order; there are ten a second
+STATE_S = 0.5  # maximum wait for the state after an order; there are ten a second
 ORDERED_S = 30.0  # a ledger on a slow disk
 
 Give = Callable[[Order], Awaitable[OrderAnswer]]
 
 
 class Page:
-    """What the addresses have to hand."""
+    """The application's handlers, one per address."""
 
     def __init__(self, setup: Setup, reader: RunReader, pages: OpenPages, sky: SkyMap | None, give: Give) -> None:
         self.setup, self.reader, self.pages, self.give = setup, reader, pages, give
@@ -299,7 +299,7 @@ class Page:
         return JSONResponse({key: answer.line}, answer.status)
 
     async def _state_after(self, host_ns: int) -> None:
-        """Wait until the state is one of after a moment: who asks for it next sees what an order has changed."""
+        """Wait until the state is newer than `host_ns`, so that the next request sees what an order changed."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(STATE_S):
                 while self.reader.seen is not None and self.reader.seen.host_ns <= host_ns:
@@ -316,7 +316,7 @@ class Page:
 
 
 async def _body(request: Request) -> bytes:
-    """The body. Raises Refused (413, 408): what is too long is read, and thrown away, up to a bound."""
+    """Read the body. Raises Refused (413, 408, 400). A body that is too long is read and dropped, up to a bound."""
     if int(request.headers.get("content-length", "0")) > MAX_BODY_BYTES and "expect" in request.headers:
         raise Refused(413, f"a control has at most {MAX_BODY_BYTES} bytes")
     data, seen = b"", 0
@@ -342,7 +342,7 @@ def _refused(_: Request, error: Exception) -> Response:
 
 
 def _who(request: Request) -> str:
-    """Who asks, as the page says, and from where unless that is this machine."""
+    """The operator's name as the page gives it, with the address unless that is this machine."""
     name = urllib.parse.unquote(request.headers.get("x-operator", "")[:400], errors="replace").strip()
     address = request.client.host if request.client else ""
     place = "" if address in {"127.0.0.1", "::1", ""} else f" ({address})"
@@ -355,7 +355,7 @@ def _refusal(status: int, line: str) -> JSONResponse:
 
 
 class Guarded:
-    """The application behind its guard: every request is judged first, and every answer has the same headers."""
+    """The application behind its guard: every request is checked first, and every answer has the same headers."""
 
     def __init__(self, app: ASGIApp, guard: Guard) -> None:
         self._app, self._guard = app, guard

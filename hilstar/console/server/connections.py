@@ -1,4 +1,4 @@
-"""Connections to pages: HTTP and WebSockets with bounds, and each open page told at its own speed."""
+"""Connections to pages: HTTP and WebSockets with bounds; every open page gets messages at its own speed."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class BoundedHttp(H11Protocol):
     _timed_cycle: Any = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Start the time for a request's head; where there are too many connections, one is dropped."""
+        """Start the time limit of a request's head; drop a connection where there are too many."""
         super().connection_made(transport)
         _connections[self] = None
         if len(_connections) > MAX_CONNECTIONS:
@@ -48,7 +48,7 @@ class BoundedHttp(H11Protocol):
         self._within(HEAD_S)
 
     def data_received(self, data: bytes) -> None:
-        """Take bytes; once a head is whole, the rest has its own time."""
+        """Take bytes; once the head is complete, the rest has its own time limit."""
         if self._limit is None:
             self._within(HEAD_S)
         super().data_received(data)
@@ -57,7 +57,7 @@ class BoundedHttp(H11Protocol):
             self._within(WHOLE_S)
 
     def on_response_complete(self) -> None:
-        """The answer is out: nobody waits for this connection."""
+        """The answer is sent: this connection may give way first."""
         self._end_time()
         if self in _connections:
             _connections.move_to_end(self, last=False)
@@ -70,7 +70,7 @@ class BoundedHttp(H11Protocol):
         super().handle_websocket_upgrade(event)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """It is gone."""
+        """Forget the connection."""
         self._end_time()
         _connections.pop(self, None)
         super().connection_lost(exc)
@@ -96,14 +96,14 @@ class ReadingWebSocket(WSProtocol):
     _heard_s: float | None = None  # when it last answered one
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Let little wait in the kernel: what a slow peer is sent would be old."""
+        """Bound the bytes that wait in the kernel: a slow peer would get old data."""
         super().connection_made(transport)
         found = transport.get_extra_info("socket")
         if found is not None:
             found.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, MAX_UNSENT_BYTES)
 
     def handle_connect(self, event: events.Request) -> None:
-        """Leave itself in the scope, for who serves the WebSocket."""
+        """Put itself into the scope, for the application."""
         super().handle_connect(event)
         cast(dict[str, object], self.scope["extensions"])[LINE] = self
 
@@ -117,20 +117,20 @@ class ReadingWebSocket(WSProtocol):
         self.send_keepalive_ping()
 
     def handle_pong(self, event: events.Pong) -> None:
-        """It has read up to here."""
+        """The peer has read up to here."""
         if bytes(event.payload) == self.pending_ping_payload:
             self._heard_s = time.monotonic()
         super().handle_pong(event)
 
     def handle_ping(self, event: events.Ping) -> None:
-        """Answer, unless the answers are not read."""
+        """Answer, unless the peer does not read the answers."""
         if self.transport.get_write_buffer_size() > MAX_PONGS_BYTES:
             self.drop()
         else:
             super().handle_ping(event)
 
     def keepalive_timeout(self) -> None:
-        """It does not read: nothing more can be said to it."""
+        """Drop a peer that does not read."""
         self.drop()
 
     def drop(self) -> None:
@@ -148,7 +148,7 @@ TRY_AGAIN, POLICY = 1013, 1008  # close codes of RFC 6455 and its registry
 
 
 def wants_of(text: str) -> PageWants | None:
-    """What a page's message wants; None for nonsense."""
+    """The request in a page's message; None for nonsense."""
     try:
         return msgspec.json.decode(text, type=PageMessage).want
     except (msgspec.MsgspecError, ValueError, RecursionError):  # not its JSON, no UTF-8, deeper than any
@@ -189,10 +189,10 @@ class OpenPage:
             self._wake.set()
 
     def close(self, code: int) -> None:
-        """Have the connection closed."""
+        """Close the connection with a code, after what is being sent."""
         self.closing = code
         self._wake.set()
-        if code != POLICY and not self.is_read:  # it would not take the code either
+        if code != POLICY and not self.is_read:  # it would not read the code either
             self.drop()
 
     def drop(self) -> None:
@@ -221,7 +221,7 @@ class OpenPage:
             await (self.socket.send_text(data) if isinstance(data, str) else self.socket.send_bytes(data))
 
     async def listen(self) -> None:
-        """Take what the page says until it goes; nonsense, or too much of it, closes it."""
+        """Read the page's messages until it goes; nonsense or too many messages close it."""
         while True:
             message = await self.socket.receive()
             if message["type"] == "websocket.disconnect":
@@ -257,19 +257,19 @@ class OpenPages:
         return max((client.want.picture_hz for client in self._clients), default=0.0)
 
     def tell(self, message: PageText) -> None:
-        """Tell all of them; the text is made once."""
+        """Queue a message for all pages; the text is made once."""
         if self._clients:
             text = message.json()
             for client in self._clients:
                 client.tell(text)
 
     def show(self, packed: PackedPicture) -> None:
-        """Offer all of them a picture."""
+        """Offer a picture to all pages."""
         for client in self._clients:
             client.show(packed)
 
     def make_room(self) -> None:
-        """Have one give way where all places are taken."""
+        """Close one page where all places are taken."""
         if len(self._clients) < MAX_CLIENTS:
             return
         by_address = Counter(client.address for client in self._clients)
@@ -279,7 +279,7 @@ class OpenPages:
         least.close(GIVES_WAY)
 
     async def follow(self, client: OpenPage) -> None:
-        """Serve a page until it goes, or has to."""
+        """Serve a page until it goes or is closed."""
         self._clients[client] = None
         tasks = [asyncio.create_task(client.listen()), asyncio.create_task(client.send_all())]
         try:
@@ -294,7 +294,7 @@ class OpenPages:
                 await _close(client)
 
     async def close_all(self, code: int) -> None:
-        """Close all of them: the run ends."""
+        """Close all pages at the end of the run."""
         await asyncio.gather(*(_close(client, code) for client in list(self._clients)), return_exceptions=True)
 
 

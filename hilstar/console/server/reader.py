@@ -55,14 +55,14 @@ MANY_MISSED_SHARE = 0.5  # share of the last second's frames
 
 @dataclass(frozen=True, slots=True)
 class RecentFrames:
-    """What frames said lately: when the newest was shown (host time, ns), and which share of the last second's is missing."""
+    """The newest frame's swap (host time, ns), and the missing share of the last second's frames."""
 
     swap_ns: int = 0
     missed_share: float = 0.0
 
 
 def reasons(seen: RunState | None, now_ns: int, lately: RecentFrames, refresh_hz: float, pace: Pace) -> list[str]:
-    """Why the sky is not right; [] where it is. See `Setup.pace`."""
+    """The reasons why the sky is not right, [] where it is. See `Setup.pace`."""
     if seen is None:
         return ["the run has not begun"]
     if now_ns - seen.host_ns > SILENT_NS:
@@ -121,7 +121,7 @@ def _s(time_ns: int) -> str:
 
 
 class Health:
-    """Remembers since when the sky is right, or is not (UTC, seconds)."""
+    """Whether the sky is right, and since when that is so (UTC, seconds)."""
 
     def __init__(self, unix_s: float) -> None:
         self.ok = False
@@ -129,7 +129,7 @@ class Health:
         self.reasons: list[str] = []
 
     def update(self, found: list[str], unix_s: float) -> None:
-        """Take the reasons found now."""
+        """Set the current reasons."""
         if (not found) != self.ok:
             self.ok, self.since_s = not found, unix_s
         self.reasons = found
@@ -148,7 +148,7 @@ class _Received(NamedTuple):
 
 
 class RunReader:
-    """The run as a page is told of it. `look` brings it up to date."""
+    """A run for its page. `look` brings it up to date."""
 
     def __init__(self, memory: SharedMemory, setup: Setup) -> None:
         self._memory, self.setup = memory, setup
@@ -165,7 +165,7 @@ class RunReader:
         self._pacing_ns = 0
 
     def look(self) -> list[EventLine]:
-        """Look at the shared memory; the events that are new."""
+        """Read the shared memory; the new events."""
         now_ns, unix_s = time.monotonic_ns(), time.time()
         found = self._memory.states.last()
         if found is not None:
@@ -314,7 +314,7 @@ class PackedPicture:
 
 
 class PicturePacker:
-    """Packs what the shared memory has; it takes ten to thirty milliseconds, on a thread of its own."""
+    """Packs the newest picture for pages, which takes 10 to 30 ms; called on another thread."""
 
     def __init__(self, memory: SharedMemory, scene: OverlayScene | None) -> None:
         self._memory, self._scene = memory, scene
@@ -351,7 +351,7 @@ def _parts(head: PictureHead, data: bytes) -> tuple[Levels, np.ndarray]:
 
 
 def _message(head: PictureHead, levels: Levels) -> bytes:
-    """A length, a head in JSON of that many bytes, and the levels."""
+    """A picture's binary message: a length, a JSON head of that many bytes, and the deflated levels."""
     form = PictureFormat(w=head.width, h=head.height, frame=head.frame, dtype=f"u{head.item_bytes}")
     text = msgspec.json.encode(form)
     return struct.pack("<I", len(text)) + text + zlib.compress(np.ascontiguousarray(levels).tobytes(), LEVEL)
@@ -371,7 +371,7 @@ def stars_of(scene: OverlayScene, sprites: np.ndarray, seen: RunState | None) ->
 
 
 def _one_each(sprites: np.ndarray) -> tuple[np.ndarray, list[float], list[float]]:
-    """The stars of sprites and the middle of each star's: one that moves has several along its path."""
+    """The stars of sprites, and the mean place of each: a moving star has several sprites along its path."""
     stars, which = np.unique(sprites["star"], return_inverse=True)
     count = np.bincount(which, minlength=len(stars))
     x_px, y_px = (np.bincount(which, sprites[axis], len(stars)) / np.maximum(count, 1) for axis in ("x_px", "y_px"))

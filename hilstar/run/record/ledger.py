@@ -1,9 +1,9 @@
 """The ledger of a run: every packet as received and every frame as drawn, in an MCAP file that survives a kill.
 
-A thread of its own writes a chunk five times a second, whole and with its CRC, so that no disk stops a frame. In a flood
-the first are kept whole and the others counted second by second. When a disk fills up, frames are dropped first and packets
-last; a disk that fails is tried again, and never ends the display. Where somebody deletes, truncates or overwrites the file,
-that is said and the run goes on in another, for nobody could read the rest of the first.
+A separate thread writes a complete chunk with its CRC five times a second, so that no disk delays a frame. In a flood the first
+messages are kept whole and the others counted second by second. When a disk fills up, frames are dropped first and packets
+last. A disk that fails is tried again and never ends the display. Where somebody deletes, truncates or overwrites the file, an
+event says so and the ledger continues in another file, because the rest of the first could not be read.
 """
 
 from __future__ import annotations
@@ -60,13 +60,13 @@ from hilstar.units import NS_PER_S
 Kind = Literal["packet", "frame", "event", "fault"]
 MAX_WAITING_BYTES = 32_000_000  # half a minute of a plain run, if the disk stalls
 FRAMES_SHARE = 0.5  # frames may use this share of it; the rest is for packets
-# A message of JSON and the objects that it is made of, roughly; the raw bytes of a packet come on top.
+# Approximate size of a JSON message and its objects; a packet's raw bytes are added.
 ENTRY_BYTES = {"packet": 1500, "frame": 2500, "event": 1000, "fault": 4000}
 
 
 @dataclass(frozen=True, slots=True)
 class ReceivedPacket:
-    """A packet's bytes, with the attitude in them or the reason for their refusal."""
+    """A packet's bytes with its attitude, or the reason for its refusal."""
 
     raw: bytes
     sample: AttitudeSample | None
@@ -75,7 +75,7 @@ class ReceivedPacket:
 
 @dataclass(frozen=True, slots=True)
 class QueueEntry:
-    """Something to be recorded: its host time, a sequence number, and its content."""
+    """A record to be written: its host time, a sequence number, and its content."""
 
     kind: Kind
     time_ns: int
@@ -84,13 +84,13 @@ class QueueEntry:
 
     @property
     def size_bytes(self) -> int:
-        """Approximate memory."""
+        """Approximate size in memory."""
         raw_bytes = len(self.content.raw) if isinstance(self.content, ReceivedPacket) else 0
         return ENTRY_BYTES[self.kind] + raw_bytes
 
 
 class LedgerQueue:
-    """Entries in order of arrival; never blocks, and drops frames first when there is no room."""
+    """Entries in order of arrival, bounded by bytes. Never blocks; drops frames first when it is full."""
 
     def __init__(self) -> None:
         self.dropped: Counter[str] = Counter()
@@ -99,7 +99,7 @@ class LedgerQueue:
         self._lock = threading.Lock()
 
     def put(self, entry: QueueEntry) -> bool:
-        """Queue an entry; False, and counted, if there is no room."""
+        """Queue an entry; where it is full, count the entry and return False."""
         room = MAX_WAITING_BYTES * (FRAMES_SHARE if entry.kind == "frame" else 1)
         with self._lock:
             if self._bytes + entry.size_bytes > room:
@@ -120,7 +120,7 @@ Counted = Kind | Literal["pulse"]  # pulses are only counted
 
 
 class Allowance:
-    """How many of a kind are recorded in full: at most `burst` at once, and `per_s` each second after that."""
+    """A token bucket: `burst` messages at once, then `per_s` each second, are recorded in full."""
 
     def __init__(self, burst: float, per_s: float) -> None:
         self._burst, self._per_s = burst, per_s
@@ -128,7 +128,7 @@ class Allowance:
         self._last_ns = 0
 
     def take(self, now_ns: int) -> bool:
-        """Whether one more is recorded in full."""
+        """Whether one more message is recorded in full."""
         passed_s = max(0, now_ns - self._last_ns) / NS_PER_S if self._last_ns else 0.0
         self._last_ns = now_ns
         self._left = min(self._burst, self._left + passed_s * self._per_s)
@@ -147,7 +147,7 @@ class FloodCount(NamedTuple):
 
 
 class FloodFilter:
-    """Passes the first of each kind and reason, and counts the others."""
+    """In a flood, passes the first messages of each kind and reason and counts the others."""
 
     # Refused packets tell little after the first ones; no sender means to send more than 2000 good ones a second.
     ALLOWED = {"accepted": (4000, 2000), "refused": (20, 1), "event": (100, 10)}  # noqa: RUF012 - never changed
@@ -170,7 +170,7 @@ class FloodFilter:
         return kept
 
     def count(self, kind: Counted, reason: str, number: int = 1) -> None:
-        """Count messages that are not recorded for another reason."""
+        """Count messages that are not recorded for other reasons."""
         with self._lock:
             self._counts[kind, reason] += number
 
@@ -182,7 +182,7 @@ class FloodFilter:
 
 
 class ProcessProbe:
-    """Measures this process; opens its file once, because later no descriptor may be free."""
+    """Measures this process's memory and CPU time. Opens /proc once, because later no descriptor may be free."""
 
     def __init__(self) -> None:
         self._fd: int | None = None
@@ -190,7 +190,7 @@ class ProcessProbe:
             self._fd = os.open("/proc/self/statm", os.O_RDONLY | os.O_CLOEXEC)
 
     def record(self) -> ProcessRecord | None:
-        """The state now; None if the system does not say."""
+        """The current figures; None if the system has none."""
         if self._fd is None:
             return None
         try:
@@ -223,7 +223,7 @@ FRAMES_RESERVE_BYTES, FRAMES_RESERVE_SHARE = 64_000_000, 0.02  # reserved for pa
 
 @dataclass(frozen=True, slots=True)
 class SplitLimits:
-    """When a ledger continues in another file."""
+    """The size or age at which a ledger continues in another file."""
 
     bytes: float = math.inf
     seconds: float = math.inf
@@ -408,14 +408,14 @@ class Ledger:
         old.close()
 
     def _say_lost(self, line: str) -> None:
-        """Say it each time; it lasts until another ledger is begun."""
+        """Report each loss; the condition lasts until another ledger is begun."""
         if "ledger-lost" in self._notices.active:
             self._notices.tell("ledger-lost", line)
         else:
             self._notices.begin("ledger-lost", line)
 
     def _look_at_place(self) -> None:
-        """Say once that the file has another name now: all of it is there."""
+        """Report once that the file was moved: it is still complete."""
         if self._moved:
             return
         place = part_path(self.path, self._part)
@@ -485,7 +485,7 @@ class Ledger:
     # The end
 
     def close(self) -> None:
-        """Write what is waiting and the end of the file; a disk that does not accept it in time has failed."""
+        """Write what is queued and the end of the file; a disk that does not accept it in time has failed."""
         self._closing.set()
         patience_s = DISK_WAITS_S if caught() is None else STOPPED_DISK_WAITS_S
         self._thread.join(patience_s)
@@ -556,16 +556,15 @@ def _packet_message(host_ns: int, packet: ReceivedPacket) -> bytes:
 
 
 class LedgerSwitch:
-    """Hands a run's records to the ledger of the moment, and drops them while there is none.
+    """Passes a run's records to the current ledger, which can be begun and ended during the run; drops them without one.
 
-    Frames and packets come from any thread and wait for nothing; `begin` and `end` are for one thread, which may wait for a
-    disk.
+    Frames and packets come from any thread and never wait. `begin` and `end` are for one thread, which may wait for a disk.
     """
 
     def __init__(self, ledger: Ledger | None = None) -> None:
         self.current = ledger
-        self.last = ledger  # the newest there was
-        self._ending = threading.Lock()  # the end of a run waits for one that an operator has begun
+        self.last = ledger  # the newest one
+        self._ending = threading.Lock()  # the end of a run waits for an end that an operator asked for
         self._scenario: list[FaultRecord] = []
         self._faults_on: dict[int, FaultRecord] = {}
         if ledger is not None:
@@ -578,7 +577,7 @@ class LedgerSwitch:
 
     @property
     def failure(self) -> str | None:
-        """Why the newest ledger could not be written, None where it could."""
+        """Why the newest ledger could not be written, else None."""
         return None if self.last is None else self.last.failure
 
     def packet(self, host_ns: int, raw: bytes, sample: AttitudeSample | None, refusal: Refusal | None) -> None:
@@ -606,7 +605,7 @@ class LedgerSwitch:
             ledger.pulse(what)
 
     def fault(self, record: FaultRecord) -> None:
-        """Record what becomes of a fault; a ledger that begins later has the scenario too, and what is on then."""
+        """Record a fault's event; a ledger that begins later repeats the scenario and the faults that are on."""
         if record.event == "scenario":
             self._scenario.append(record)
         elif record.event == "start":
@@ -618,7 +617,7 @@ class LedgerSwitch:
             ledger.fault(record)
 
     def begin(self, make: Callable[[], Ledger]) -> Ledger:
-        """Begin a ledger, if there is none; the one there is then. Raises InputError where it cannot be made."""
+        """Begin a ledger if there is none; the current ledger. Raises InputError where it cannot be made."""
         ledger = self.current
         if ledger is None:
             ledger = make()
@@ -632,7 +631,7 @@ class LedgerSwitch:
         return [*self._scenario, *list(self._faults_on.values())]
 
     def end(self) -> Ledger | None:
-        """End the ledger, and wait until it is whole on the disk; the one that was ended."""
+        """End the ledger and wait until it is complete on the disk; the ended ledger."""
         with self._ending, stop_on_signal(threading.Event()):  # a signal that comes now does not interrupt this
             ledger, self.current = self.current, None
             if ledger is not None:

@@ -41,7 +41,7 @@ BLOCK = 1024  # frames that are summed up at once
 
 
 class ThinnedRows:
-    """Every n-th row of a stream, n doubling as the stream grows."""
+    """Every n-th row of a stream; n doubles as the stream grows."""
 
     def __init__(self, columns: int, capacity: int = SAMPLES) -> None:
         self._rows = np.zeros((capacity, columns))
@@ -108,7 +108,7 @@ class SpanTable:
             rows = rows[count:]
 
     def _add(self, rows: FloatArray, spans: int) -> None:
-        """Frames of the last span, or of so many whole ones from it on."""
+        """Add frames to the last span, or as `spans` whole spans from it on."""
         values = rows[:, 1:].reshape(spans, -1, rows.shape[1] - 1)
         place = slice(self._used - 1, self._used - 1 + spans)
         self._begin[self._used : place.stop] = rows[:: max(len(rows) // spans, 1), 0][1:spans]
@@ -150,7 +150,7 @@ class TimeBins:
         self.width_ns = NS_PER_S
 
     def add(self, at_ns: int, kind: int, number: int = 1) -> None:
-        """Count what came at a host time; before the first it counts with the first."""
+        """Count `number` arrivals at a host time; a time before the first counts in the first bin."""
         if self._first_ns is None:
             self._first_ns = at_ns
         while (place := max(at_ns - self._first_ns, 0) // self.width_ns) >= len(self._counts):
@@ -162,7 +162,7 @@ class TimeBins:
         self._used = max(self._used, place + 1)
 
     def rates_hz(self, zero_ns: int) -> tuple[FloatArray, FloatArray]:
-        """When each bin begins, s after a host time, (n,), and how many of each kind came in it, per second, (n, kinds)."""
+        """The start of each bin, s after a host time, (n,), and the rate of each kind in it, 1/s, (n, kinds)."""
         if self._first_ns is None:
             return np.zeros(0), np.zeros((0, self._counts.shape[1]))
         begin_s = (self._first_ns - zero_ns) / NS_PER_S + np.arange(self._used, dtype=np.float64) * (self.width_ns / NS_PER_S)
@@ -177,7 +177,7 @@ SMALL_RAD = 1e-8
 
 
 class Keyframes:
-    """Frames of a run that are worth a picture: evenly over it, and the first or worst of each kind."""
+    """Frames of a run to be drawn in its report: some evenly over the run, and the first or worst of each kind."""
 
     def __init__(self, capacity: int = KEYFRAMES) -> None:
         self._even: list[FrameRecord] = []
@@ -201,7 +201,7 @@ class Keyframes:
             self._best[why] = (worth, frame)
 
     def chosen(self, last: FrameRecord | None) -> list[tuple[FrameRecord, str]]:
-        """The frames in order, each with what is special of it, "" for nothing."""
+        """The frames in order, each with what is special about it, or ""."""
         found = {id(frame): (frame, "") for frame in self._even}
         for why, (_, frame) in self._best.items():
             before = found.get(id(frame), (frame, ""))[1]
@@ -232,7 +232,7 @@ class RunFigures:
     capped: int = 0
     operator: int = 0
     hidden: int = 0
-    right: int = 0  # frames that nothing of these was wrong with
+    right: int = 0  # frames with none of these faults
     most: dict[str, int] = field(default_factory=lambda: dict.fromkeys(("clipped", "below_step", "stars_drawn"), 0))
     last: FrameRecord | None = None
     first_swap_ns: int = 0
@@ -260,7 +260,7 @@ class RunFigures:
 
     @property
     def memory_growth_mb(self) -> float | None:
-        """How much the process's memory has grown since its first minute; None for a shorter run."""
+        """Growth of the process's memory since its first minute; None for a shorter run."""
         if self.warm is None or self.last_process is None or self.warm is self.last_process:
             return None
         return (self.last_process.resident_bytes - self.warm.resident_bytes) / MEGABYTE
@@ -332,7 +332,7 @@ class RunFigures:
 
 
 def _times_ms(frame: FrameRecord, before: FrameRecord | None) -> tuple[float, ...]:
-    """The METRICS of a frame; NaN where there is none. An interval over missed frames is none."""
+    """The METRICS of a frame; NaN where there is none. An interval across missed frames does not count."""
 
     def ms(value: int | None) -> float:
         return math.nan if value is None else value / NS_PER_MS
@@ -348,7 +348,7 @@ def _times_ms(frame: FrameRecord, before: FrameRecord | None) -> tuple[float, ..
 
 
 def _turn_rad(a: tuple[float, ...], b: tuple[float, ...]) -> tuple[float, float, float]:
-    """The turn from one attitude to the next about the camera's axes: as `rotation.rate_between_rad_s`, fast for one."""
+    """The turn from one attitude to the next about the camera's axes, as `rotation.rate_between_rad_s` but faster for one."""
     w = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]
     x = -b[0] * a[1] + b[1] * a[0] - b[2] * a[3] + b[3] * a[2]
     y = -b[0] * a[2] + b[1] * a[3] + b[2] * a[0] - b[3] * a[1]
@@ -445,7 +445,7 @@ def summarise(run: RunFigures) -> RunReport:
 
 
 def pulses_line(pulses: dict[str, int]) -> str:
-    """The pulses of a run for a person."""
+    """The pulses of a run as a line of text."""
     if not pulses:
         return "none"
     lost = f", the line lost {pulses['lost']} times" if pulses["lost"] else ""

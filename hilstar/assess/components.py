@@ -114,7 +114,7 @@ def components_of(residual_arcsec: FloatArray, q_icrs_to_cam: FloatArray, scale:
             fov = _component(bumps, about - pixel.fitted, pixel.freedom)
             fov = replace(fov, detail=f"what repeats over {4 * spacing:.0f} px or more of the field")
         if turn == 0:
-            waves, pixel = _waves(about - fov.fitted, _Seen(q_icrs_to_cam, axes, scale), extent, bumps)
+            waves, pixel = _waves(about - fov.fitted, _Attitudes(q_icrs_to_cam, axes, scale), extent, bumps)
         if waves is None:
             break
         pixel = replace(_component(waves, about - fov.fitted, fov.freedom), detail=pixel.detail)
@@ -154,7 +154,7 @@ def _bumps(place: FloatArray, extent_px: float, scale: Scale) -> _FieldBumps:
     return _FieldBumps(None, reason="the attitudes are too far apart: field-of-view error cannot be told from noise")
 
 
-class _Seen(NamedTuple):
+class _Attitudes(NamedTuple):
     """The commanded attitudes (n, 4), their axes (n, 3, 3), and the tracker's sizes."""
 
     q_icrs_to_cam: FloatArray
@@ -170,7 +170,9 @@ class _Family(NamedTuple):
     phases: Phases | None
 
 
-def _waves(about: FloatArray, seen: _Seen, extent_px: float, bumps: Projector | None) -> tuple[Projector | None, Component]:
+def _waves(
+    about: FloatArray, seen: _Attitudes, extent_px: float, bumps: Projector | None
+) -> tuple[Projector | None, Component]:
     """The waves that explain most of residuals (n, 3) beyond noise, or the reason why none can be told."""
     none = Component(NOTHING, np.zeros_like(about), 0.0)
     if extent_px < MIN_EXTENT_OF_PIXEL_PX:
@@ -223,7 +225,7 @@ def _surely(found: Component, about: FloatArray, other_freedom: float, sure: flo
     return excess - 2 * float(np.sqrt(chance**2 + 4 * excess))
 
 
-def _families(about: FloatArray, seen: _Seen) -> Iterator[_Family]:
+def _families(about: FloatArray, seen: _Attitudes) -> Iterator[_Family]:
     """The families of waves: those of one direction, then those from place to place, ever finer."""
     q_icrs_to_cam, axes, scale = seen
     for each in global_phases(q_icrs_to_cam, axes, scale):

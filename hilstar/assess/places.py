@@ -73,7 +73,7 @@ class Bumps:
         return np.asarray((self.value.T @ self.value).todense())
 
 
-class Weights(NamedTuple):
+class BumpValues(NamedTuple):
     """Entries (m,) of the sparse matrix of bumps: the sample, the bump, and the bump's value there."""
 
     sample: IntArray
@@ -110,13 +110,13 @@ def bumps_at(place: FloatArray, centre: FloatArray, spacing_px: float) -> Bumps:
     return Bumps(sparse.csr_matrix((near.value, (near.sample, near.bump)), shape=(len(place), len(centre))), centre)
 
 
-def weights_at(place: FloatArray, centre: FloatArray, spacing_px: float) -> Weights:
+def weights_at(place: FloatArray, centre: FloatArray, spacing_px: float) -> BumpValues:
     """The values of bumps at samples within their reach. The bumps of a sample add to 1, so a constant fits up to the edge."""
     near = cKDTree(place).sparse_distance_matrix(cKDTree(centre), REACH * spacing_px, output_type="ndarray")
     r = near["v"] / (REACH * spacing_px)
     value = (1 - r) ** 4 * (4 * r + 1)
     total = np.bincount(near["i"], value, minlength=len(place))
-    return Weights(near["i"], near["j"], value / total[near["i"]])
+    return BumpValues(near["i"], near["j"], value / total[near["i"]])
 
 
 class Projector:

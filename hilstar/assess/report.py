@@ -52,7 +52,7 @@ class Clock(msgspec.Struct, frozen=True):
     sigma_ms: float
 
 
-class Budget(msgspec.Struct, frozen=True):
+class AssessmentFigures(msgspec.Struct, frozen=True):
     """The JSON object of `hilstar assess`."""
 
     bias_arcsec: tuple[float, float, float]
@@ -64,11 +64,11 @@ class Budget(msgspec.Struct, frozen=True):
     wrong: tuple[WrongAnswer, ...]
 
 
-def budget_of(found: Assessment) -> Budget:
+def budget_of(found: Assessment) -> AssessmentFigures:
     """The figures of an assessment."""
     clock = found.found.clock
     x, y, z = found.found.bias_arcsec.tolist()
-    return Budget(
+    return AssessmentFigures(
         bias_arcsec=(x, y, z),
         fov_arcsec=found.found.fov_arcsec,
         pixel_arcsec=found.found.pixel_arcsec,
@@ -83,7 +83,7 @@ def budget_of(found: Assessment) -> Budget:
     )
 
 
-class BudgetRow(NamedTuple):
+class FigureRow(NamedTuple):
     """A row of budget.csv, here and in a campaign's directory: None is an empty cell."""
 
     quantity: str
@@ -94,11 +94,11 @@ class BudgetRow(NamedTuple):
     high_95: float | None = None
 
 
-def rows_of(found: Assessment) -> Iterator[BudgetRow]:
+def rows_of(found: Assessment) -> Iterator[FigureRow]:
     """The rows of budget.csv."""
     parts, intervals = found.found, found.found.intervals
     for k, axis in enumerate("xyz"):
-        yield BudgetRow("bias", axis, float(parts.bias_arcsec[k]), "arcsec", *intervals.bias[:, k].tolist())
+        yield FigureRow("bias", axis, float(parts.bias_arcsec[k]), "arcsec", *intervals.bias[:, k].tolist())
     for name, axes, interval in (
         ("field-of-view error", parts.fov_arcsec, intervals.fov),
         ("pixel error", parts.pixel_arcsec, intervals.pixel),
@@ -107,30 +107,30 @@ def rows_of(found: Assessment) -> Iterator[BudgetRow]:
         for k, axis in enumerate(("cross", "roll")):
             value = getattr(axes, axis)
             low, high = interval[:, k].tolist() if value is not None else (None, None)
-            yield BudgetRow(name, axis, value, "arcsec", low, high)
+            yield FigureRow(name, axis, value, "arcsec", low, high)
     clock = parts.clock
     for name, value, sigma, unit, told in (
         ("clock offset", 1e3 * found.offset_s, 1e3 * clock.sigma_offset_s, "ms", clock.offset_told),
         ("clock drift", 1e6 * clock.drift, 1e6 * clock.sigma_drift, "ppm", clock.drift_told),
     ):
-        yield BudgetRow(name, "", value if told else None, unit, value - 1.96 * sigma, value + 1.96 * sigma)
+        yield FigureRow(name, "", value if told else None, unit, value - 1.96 * sigma, value + 1.96 * sigma)
     lock = found.lock
-    yield BudgetRow("availability", "", lock.availability)
-    yield BudgetRow("answers due", "", lock.due)
-    yield BudgetRow("right answers", "", lock.right)
-    yield BudgetRow("wrong answers", "", len(found.wrong))
-    yield BudgetRow("lock lost", "", len(lock.lost))
-    yield BudgetRow("acquisition probability", "", lock.acquisition_probability)
-    yield BudgetRow("acquisition time, median", "", lock.acquisition_s, "s")
+    yield FigureRow("availability", "", lock.availability)
+    yield FigureRow("answers due", "", lock.due)
+    yield FigureRow("right answers", "", lock.right)
+    yield FigureRow("wrong answers", "", len(found.wrong))
+    yield FigureRow("lock lost", "", len(lock.lost))
+    yield FigureRow("acquisition probability", "", lock.acquisition_probability)
+    yield FigureRow("acquisition time, median", "", lock.acquisition_s, "s")
     if found.display is not None:
-        yield BudgetRow("display's own error", "cross", found.display.cross_arcsec, "arcsec")
-        yield BudgetRow("display's own error", "roll", found.display.roll_arcsec, "arcsec")
-        yield BudgetRow("display's own error, share seen", "", found.display.seen)
+        yield FigureRow("display's own error", "cross", found.display.cross_arcsec, "arcsec")
+        yield FigureRow("display's own error", "roll", found.display.roll_arcsec, "arcsec")
+        yield FigureRow("display's own error, share seen", "", found.display.seen)
 
 
 def write_tables(directory: Path, found: Assessment) -> None:
     """Write budget.csv, slices.csv, wrong.csv and outages.csv. Raises InputError."""
-    write_csv(directory / "budget.csv", BudgetRow._fields, [_plain(row) for row in rows_of(found)])
+    write_csv(directory / "budget.csv", FigureRow._fields, [_plain(row) for row in rows_of(found)])
     names = [field.name for field in fields(Slice)]
     slices = [("rate_deg_s", each) for each in found.by_rate] + [("field_v_mag", each) for each in found.by_magnitude]
     write_csv(
@@ -213,7 +213,7 @@ def write_page(path: Path, found: Assessment) -> None:
 
 def _sections(found: Assessment) -> Iterator[str]:
     yield _table(("", ""), lines_of(found))
-    yield "<h2>Budget</h2><p>One sigma an axis, with 95 % intervals by the block bootstrap.</p>"
+    yield "<h2>AssessmentFigures</h2><p>One sigma an axis, with 95 % intervals by the block bootstrap.</p>"
     rows: list[tuple[object, ...]] = [(*row[:3], "" if row[3] == COUNT else row[3], *row[4:]) for row in rows_of(found)]
     yield _table(("quantity", "axis", "value", "unit", "low", "high"), rows)
     yield "<h2>Errors over the run</h2>" + _over_time(found)

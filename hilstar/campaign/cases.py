@@ -1,7 +1,4 @@
-"""From a case's number and its point in the design to its values, its attitude and its bench file.
-
-The row of a case: its columns by name and type, and how its exposures and answers become one.
-"""
+"""A case: from its number and its point in the design to its attitude and bench file, and from its answers to its row."""
 
 from __future__ import annotations
 
@@ -24,7 +21,7 @@ from hilstar.attitude.wire.source import Mounting
 from hilstar.bench.bench_file import BenchFile, dated
 from hilstar.bench.scenario import Scenario, read_scenario
 from hilstar.campaign.plan import SCENARIO, Attitudes, Parameter, Plan, changed_bench, parameters
-from hilstar.campaign.solvers import Answer, StarErrors
+from hilstar.campaign.solvers import Answer, CentroidErrors
 from hilstar.errors import InputError
 from hilstar.frame.view import View
 from hilstar.reading import parse_toml
@@ -44,8 +41,8 @@ from hilstar.twin.simulator import Exposure, Simulator
 from hilstar.units import ARCSEC_PER_RAD, NS_PER_S
 
 ATTITUDE_DIMENSIONS = {"all-sky": 3, "field": 3, "log": 1}
-AXIS_STREAM = 2  # of a case's seed: the axis of a rate across the boresight
-SEED_BITS = 63  # what a FITS header, a Parquet column of int64 and `simulate --seed` hold
+AXIS_STREAM = 2  # of a case's seed, for the axis of a rate across the boresight
+SEED_BITS = 63  # of a FITS header, a Parquet column of int64 and `simulate --seed`
 Kind = Literal["int64", "float64", "bool", "text"]
 Row = dict[str, Any]
 
@@ -131,7 +128,7 @@ class CaseMaker:
 
     @property
     def attitude_dimensions(self) -> int:
-        """How many of a point's coordinates say where the case looks; they come first."""
+        """How many of a point's coordinates, its first, set the attitude."""
         return ATTITUDE_DIMENSIONS[self.plan.attitudes.kind]
 
     def case(self, number: int, point: FloatArray) -> Case:
@@ -159,16 +156,14 @@ class CaseMaker:
         if self._log is not None and first.t_ns is not None:
             t_ns = min(first.t_ns + step_ns, self._log.span_ns[1])
             along = view_at(self._log.timeline, self._log.span_ns, t_ns, exposure_s)
-            return (
-                along
-                if not _has_rate(case.values)
-                else View.exposure(along.q_icrs_to_cam, first.turn.rate_cam_rad_s, exposure_s, t_ns)
-            )
+            if not _has_rate(case.values):
+                return along
+            return View.exposure(along.q_icrs_to_cam, first.turn.rate_cam_rad_s, exposure_s, t_ns)
         q = propagate(first.q_icrs_to_cam, first.turn.rate_cam_rad_s, step_ns / NS_PER_S) if step_ns else first.q_icrs_to_cam
         return View.exposure(q, first.turn.rate_cam_rad_s, exposure_s, (first.t_ns or 0) + step_ns)
 
     def faults(self, case: Case, view: View, simulator: Simulator) -> FaultyExposure | None:
-        """What the case's scenario does to an exposure; its time is that of the case, or the log's since its beginning."""
+        """The faults of the case's scenario in an exposure, at the case's time or the log's since its beginning."""
         scenario = self._scenarios.get(str(case.values.get(SCENARIO, "")))
         if scenario is None:
             return None
@@ -194,7 +189,7 @@ class CaseMaker:
 
 
 def looking_q(attitudes: Attitudes, look: FloatArray) -> FloatArray:
-    """`q_icrs_to_cam` (4,) at three coordinates in [0, 1): evenly over the sphere or the field's cap, and over the rolls."""
+    """`q_icrs_to_cam` (4,) at three coordinates in [0, 1): uniform over the sphere or the field's cap, and over the rolls."""
     low_deg, high_deg = attitudes.roll_deg
     roll_deg = low_deg + float(look[2]) * (high_deg - low_deg)
     if attitudes.kind == "all-sky" or attitudes.radec_deg is None:
@@ -227,7 +222,7 @@ def _read_log(path: Path, file: BenchFile) -> _Log:
 
 
 def _misaligned(file: BenchFile, turn_arcsec: FloatArray) -> BenchFile:
-    """The file with the display's true mounting turned about cam's axes by small angles (3,), from the one that it assumes."""
+    """The file with the display's true mounting turned from the assumed one by small angles (3,) about cam's axes."""
     config = file.config
     assumed = np.array(config.verify.true_q_cam_to_mon or config.collimator.q_cam_to_mon)
     true = normalise(multiply(assumed, from_rotation_vector(turn_arcsec / ARCSEC_PER_RAD)))
@@ -237,7 +232,7 @@ def _misaligned(file: BenchFile, turn_arcsec: FloatArray) -> BenchFile:
 
 
 def _check_through(plan: Plan, varied: list[Parameter], file: BenchFile) -> None:
-    """Refuse (InputError) what would change nothing."""
+    """Refuse (InputError) parameters that would change nothing."""
     for parameter in varied:
         table = parameter.key.split(".")[0]
         if plan.through == "tracker" and table in {"monitor", "collimator", "render", "verify", "misalignment_arcsec"}:
@@ -277,7 +272,7 @@ def value_kind(parameter: Parameter) -> Kind:
 
 
 def first_row(case: Case, plan_columns: dict[str, Kind]) -> Row:
-    """A row with what the case is, before anything is exposed: all else is missing."""
+    """The row of a case before its exposures: columns of results are None."""
     row: Row = dict.fromkeys(plan_columns)
     q = case.first.q_icrs_to_cam
     ra_deg, dec_deg, roll_deg = to_radec_roll_deg(q)
@@ -300,8 +295,8 @@ def _as_text(value: Any) -> str:
 
 
 @dataclass(slots=True)
-class Tally:
-    """What a case's exposures came to so far."""
+class CaseTally:
+    """The exposures and answers of a case so far."""
 
     with_centroids: bool
     wrong_above_arcsec: float
@@ -309,19 +304,19 @@ class Tally:
     stars_in_view: int = 0
     errors_arcsec: list[FloatArray] = field(default_factory=list)
     why: str = ""
-    star_errors: list[StarErrors] = field(default_factory=list)
+    star_errors: list[CentroidErrors] = field(default_factory=list)
     wrong: int = 0
     first_q: FloatArray | None = None
     _digest: Any = field(default_factory=hashlib.sha256)
 
     def see(self, exposure: Exposure) -> None:
-        """One more exposure."""
+        """Count an exposure."""
         self.frames += 1
         self.stars_in_view += len(exposure.truth)
         self._digest.update(exposure.dn.tobytes())
 
     def hear(self, exposure: Exposure, answer: Answer) -> None:
-        """The answer to an exposure."""
+        """Count the answer to an exposure."""
         if answer.star_errors is not None:
             self.star_errors.append(answer.star_errors)
         if answer.q_icrs_to_cam is None:
@@ -336,7 +331,7 @@ class Tally:
             self.errors_arcsec.append(error)
 
     def into(self, row: Row) -> Row:
-        """The case's row with what was seen and answered; errors are those of answers that are not wrong."""
+        """The case's row with its results. Errors are those of answers that are not wrong."""
         row = row | {"why": self.why, "image_sha256": self._digest.hexdigest(), "frames": self.frames}
         row |= {"stars_in_view": self.stars_in_view, "solved": self.wrong + len(self.errors_arcsec), "wrong": self.wrong}
         if self.first_q is not None:

@@ -1,6 +1,6 @@
-"""What a cluster's worker is asked to do; each of its threads has a session, and a GL context, of its own.
+"""A campaign on a cluster: a Dask scheduler that somebody started, and its workers, which come and go.
 
-The cluster: a Dask scheduler that somebody started, and its workers, as they come and go.
+Each thread of a worker has a session, and a GL context, of its own.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ INSTALL = "install it: pip install 'hilstar[dask]'"
 PROTOCOLS = ("tcp", "tls", "ucx")
 GIVE_TLS = "give tls://HOST:PORT with --tls-ca-file, --tls-cert and --tls-key, as Dask's scheduler and workers have them"
 TASK_S = 1.0  # of work in a task; handing one out costs the scheduler milliseconds (docs/campaign.md)
-SPARE_TASKS = 1  # that wait at a worker, beyond those that its threads are at
+SPARE_TASKS = 1  # that wait at a worker beside those that its threads work on
 POLL_S, LOOK_S = 0.25, 0.5
 CONNECT_S, ANSWER_S, MAX_SILENCE_S = 30.0, 30.0, 90.0
 FETCH_S = 5.0  # a task's rows come at once, or their worker is gone
@@ -37,7 +37,7 @@ CLOSE_S = 0.3  # a Ctrl-C ends a command within a second
 
 
 def examine(job: Job) -> Identity | str:
-    """What this worker is, or why it cannot do the job."""
+    """On a worker: its identity, or the reason why it cannot do the job."""
     try:
         return _session(job).identity()
     except HilstarError as error:
@@ -45,7 +45,7 @@ def examine(job: Job) -> Identity | str:
 
 
 def run_task(job: Job, begin: int, points: FloatArray) -> Answered:
-    """The rows of the cases from `begin` on at their points (n, dimensions)."""
+    """On a worker: the rows of the cases from `begin` on at their points (n, dimensions)."""
     return _session(job).run(begin, points)
 
 
@@ -62,9 +62,9 @@ def _session(job: Job) -> Session:
 
 @dataclass(frozen=True, slots=True)
 class Scheduler:
-    """Where a scheduler is ("tcp://HOST:PORT", "tls://HOST:PORT"), and the files of Dask's TLS, whose names these are.
+    """A scheduler's address ("tcp://HOST:PORT", "tls://HOST:PORT"), and TLS files under Dask's names.
 
-    `tls_key` may be left out where the certificate's file has the key, and all three where Dask's own configuration has them.
+    `tls_key` may be missing where the certificate's file has the key, and all three where Dask's own configuration has them.
     """
 
     address: str
@@ -74,13 +74,13 @@ class Scheduler:
 
     @property
     def given(self) -> bool:
-        """Whether a file of TLS is named."""
+        """Whether a TLS file is named."""
         return any((self.tls_ca_file, self.tls_cert, self.tls_key))
 
     def check(self) -> None:
-        """Refuse (InputError) what is no address, one off loopback without TLS, and TLS that is not whole.
+        """Refuse (InputError) what is no address, an address off loopback without TLS, and incomplete TLS.
 
-        A scheduler runs whatever it is sent: who reaches it without a certificate runs code on every worker.
+        A scheduler runs whatever it is sent: anyone who reaches it without a certificate runs code on every worker.
         """
         named, protocol = f"--scheduler {self.address}", self.address.partition("://")[0]
         if protocol not in PROTOCOLS:
@@ -111,7 +111,7 @@ class Scheduler:
         return f"{protocol}://{self._endpoint().address.removeprefix('tcp://')}"
 
     def security(self) -> Any:
-        """Dask's. Raises InputError for files that are no certificates, and tls:// without any."""
+        """Dask's security object. Raises InputError for files that are no certificates, and for tls:// without any."""
         from distributed.security import Security
 
         if not self.address.startswith("tls://"):
@@ -121,7 +121,7 @@ class Scheduler:
         try:
             security = made(require_encryption=True, **{name: str(path) for name, path in names.items() if path is not None})
             context = security.get_connection_args("client").get("ssl_context")
-        except (OSError, ValueError) as error:  # of ssl, too
+        except (OSError, ValueError) as error:  # ssl's errors are among them
             files = ", ".join(str(path) for path in names.values() if path is not None) or "Dask's configuration"
             raise InputError(f"--scheduler {self.address}: {files}: {one_line(str(error))}; {GIVE_TLS}") from error
         if context is None:
@@ -131,7 +131,7 @@ class Scheduler:
 
 @dataclass(slots=True)
 class _Worker:
-    """A worker by its address: how many threads it has, whether it may have tasks, and those that it has, oldest first."""
+    """A worker: its threads, whether its identity is checked or refused, and its tasks, oldest first."""
 
     threads: int
     checked: bool = False
@@ -142,7 +142,7 @@ class _Worker:
 class Cluster:
     """The workers of a scheduler. Use it as a context manager.
 
-    One of another version, bench or renderer is refused with a line through `say`, and gets no case. Raises InputError for
+    A worker of another version, bench or renderer is refused with a line through `say` and gets no case. Raises InputError for
     what `Scheduler.check` refuses, and MachineError where no scheduler answers.
     """
 
@@ -161,7 +161,7 @@ class Cluster:
         self._alone_since_s: float | None = None
         self._looked_s, self._answered_s = 0.0, time.monotonic()
         self._something = threading.Event()  # a future is done
-        logging.getLogger("distributed").setLevel(logging.CRITICAL)  # it tells of each worker that goes
+        logging.getLogger("distributed").setLevel(logging.CRITICAL)  # it logs each worker that goes
         security = scheduler.security()
         try:
             client: Any = distributed.Client
@@ -178,13 +178,13 @@ class Cluster:
         self._say_where_it_listens()
 
     def _dask_words(self) -> str:
-        """What a scheduler or a worker that goes with the address is started with."""
+        """The options with which a scheduler or worker for this address is started."""
         if self._address.startswith("tls://"):
             return "--tls-ca-file CA.pem --tls-cert CERT.pem --tls-key KEY.pem"
         return "--host 127.0.0.1"
 
     def _say_where_it_listens(self) -> None:
-        """Say it where a scheduler without TLS, reached over loopback, listens to the network as well."""
+        """Warn of a scheduler without TLS that is reached over loopback but listens to the network as well."""
         address: str = self._client.scheduler_info()["address"]
         if address.startswith("tls://"):
             return
@@ -196,11 +196,11 @@ class Cluster:
                 )
 
     def run(self, backlog: Backlog, done: Done, lost: Lost) -> None:
-        """Run all cases (see `Pool.run`). Raises MachineError where the scheduler, or every worker, is gone for long."""
+        """Run all cases (see `Pool.run`). Raises MachineError where the scheduler, or every worker, is gone for too long."""
         while True:
             if self._client.status == "closed":
                 raise self._gone()
-            if self._client.status == "running":  # it may be looking for a scheduler that it has lost
+            if self._client.status == "running":  # else it looks for a scheduler that it has lost
                 self._look(backlog, lost)
                 self._hand_out(backlog)
             if backlog.to_run <= 0:
@@ -212,7 +212,7 @@ class Cluster:
             self._hear_tasks(backlog, done, lost)
 
     def _look(self, backlog: Backlog, lost: Lost) -> None:
-        """See which workers have come, and which are gone, with what they had."""
+        """Look for workers that have come or gone."""
         if time.monotonic() - self._looked_s < LOOK_S:
             return
         self._looked_s = time.monotonic()
@@ -237,7 +237,7 @@ class Cluster:
         )
 
     def _bury(self, address: str, backlog: Backlog, lost: Lost) -> None:
-        """A worker is gone: the task that it was at may be why, the others are handed out again."""
+        """Drop a worker that is gone: a task that it worked on may be the cause, its other tasks are handed out again."""
         worker = self._workers.pop(address)
         gone = [future for future, at in self._examined.items() if at == address]
         for future in gone:
@@ -276,7 +276,7 @@ class Cluster:
                 said = future.result(timeout=FETCH_S)
                 why = difference(said, self._identity) if isinstance(said, Identity) else str(said)
             except Exception as error:  # an older hilstar without campaigns, or none at all
-                if future.status != "error":  # it is gone, or the scheduler; if it is still there it is asked again
+                if future.status != "error":  # worker or scheduler is gone; a worker that is still there is asked again
                     del self._workers[address]
                     continue
                 why = f"cannot run campaigns of this hilstar ({type(error).__name__}: {error}); install the same version there"
@@ -308,7 +308,7 @@ class Cluster:
                     lost(task, backlog.died(task))
 
     def _check_alone(self) -> None:
-        """Refuse to wait for ever for workers."""
+        """Raise MachineError after a long wait for workers."""
         if any(not worker.refused for worker in self._workers.values()):
             self._alone_since_s = None
             return
@@ -333,7 +333,7 @@ class Cluster:
 
 
 def _fetched(future: Any) -> Answered | None:
-    """What a task answered; None where it failed, or where its worker has died before it gave the answer away."""
+    """A task's answer; None where it failed, or where its worker died before the answer was fetched."""
     if future.status != "finished":
         return None
     with contextlib.suppress(OSError, CancelledError):

@@ -1,4 +1,4 @@
-"""The display as the virtual tracker sees it: each frame that is shown during an exposure, through the twin, to DN."""
+"""The virtual tracker before the display: each frame shown during an exposure, through the twin, to DN."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from hilstar.units import NS_PER_S
 
 
 class DisplayTracker:
-    """The bench's tracker before the bench's display as it truly is (`[verify] true_*`). Free it with `close`.
+    """The bench's tracker before the bench's true display (`[verify] true_*`). Free it with `close`.
 
-    Frames follow one another at `[monitor] refresh_hz`, and each is held until the next: an exposure is the mean of those that
-    it lasts over, each at the attitude in the middle of its time. At rest they are one, unless they are dithered in time or
-    have satellites.
+    Frames follow one another at `[monitor] refresh_hz`, and each is held until the next. An exposure is the mean of the frames
+    that it spans, each at the attitude in the middle of its time. At rest one frame is drawn for all of them, unless they are
+    dithered in time or have satellites.
     """
 
     def __init__(self, file: BenchFile) -> None:
@@ -43,14 +43,14 @@ class DisplayTracker:
         return self._bench.renderer.gl_renderer
 
     def change(self, file: BenchFile) -> None:
-        """Be the bench of another file of the same folder: only what the change touches is made anew."""
+        """Switch to another bench file of the same folder, rebuilding only what changed."""
         if file.config == self.config:
             return
         before, self.file, self.config = self.config, file, file.config
         if _shown_keys(before) != _shown_keys(self.config) or self._bench.moving is not None:
             self._bench.close()
             self._bench = open_bench(file)
-        else:  # what the bench chose for its tolerance stays chosen
+        else:  # the quantisation chosen for the tolerance stays
             config = msgspec.structs.replace(file.config, render=self._bench.config.render)
             self._bench = replace(self._bench, file=file, config=config)
         self._load()
@@ -72,7 +72,7 @@ class DisplayTracker:
         self._glow_e_per_s = self._optics.glow_e_per_s(self._panel)
 
     def expose(self, view: View, rng: np.random.Generator | None) -> Exposure:
-        """One exposure of the display; without a generator, without noise. Raises InputError as the detector does."""
+        """One exposure of the display, without noise if there is no generator. Raises InputError as the detector does."""
         exposure_s = view.exposure_s
         light_e = self._optics.image_e_per_s(self._light_e_per_s(view)) * exposure_s
         mean_e = light_e + self._glow_e_per_s * exposure_s + self._background_e
@@ -111,14 +111,14 @@ class DisplayTracker:
 
 
 def _shown_keys(config: BenchConfig) -> tuple[object, ...]:
-    """All by which the bench chooses and draws its frames: of the tracker, what gathers light and how long."""
+    """The keys that decide the bench's frames; of the tracker those of its light gathering and exposure."""
     tracker = config.tracker
     gathers = tracker.aperture_mm, tracker.quantum_efficiency, tracker.transmission, tracker.exposure_s
     return config.sky, config.spacecraft, config.monitor, config.collimator, config.render, gathers
 
 
 def _optics_keys(config: BenchConfig) -> tuple[object, ...]:
-    """All by which the display's light falls onto the detector."""
+    """The keys that decide how the display's light falls onto the detector."""
     tracker = config.tracker
     lens = (
         tracker.focal_length_mm,

@@ -1,8 +1,7 @@
-"""The plan's file: TOML in, checked and frozen tables out.
+"""The plan of a campaign: its file, the parameters that it varies, and its design.
 
-What a plan varies: a key of the bench file by its dotted name, or one of the case's own, and its value at a point.
-
-The design: a point of the unit cube for each case, by the plan's sampling and seed alone.
+The file is TOML, read into checked and frozen tables. A parameter is a key of the bench file by its dotted name, or one of the
+case's own keys. The design gives each case a point of the unit cube, by the plan's sampling and seed alone.
 """
 
 from __future__ import annotations
@@ -46,8 +45,8 @@ Number = Annotated[float, Meta(ge=-1e12, le=1e12)]
 Ra = Annotated[float, Meta(ge=-360, le=360)]
 Dec = Annotated[float, Meta(ge=-90, le=90)]
 Roll = Annotated[float, Meta(ge=-360, le=720)]
-# What a case has beside its bench file. Rates are of cam with respect to icrs, cam components; `across` is about an axis
-# in the image plane whose direction each case draws. `misalignment_arcsec` turns the display's true mounting about cam's axes.
+# Keys of a case that are not in its bench file. Rates are those of cam with respect to icrs, in cam components; `across` is
+# about an axis in the image plane that each case draws. `misalignment_arcsec` turns the display's true mounting, cam axes.
 OWN_KEYS = (
     "rate_deg_s.x",
     "rate_deg_s.y",
@@ -62,9 +61,9 @@ OWN_KEYS = (
 )
 MAX_OWN = {"rate_deg_s": 360.0, "misalignment_arcsec": 36_000.0, "time_s": 9e9, "noise_seed": 2.0**63 - 1}
 WHOLE = ("noise_seed",)
-SCENARIO = "scenario"  # the path of a file of faults, or none where it is empty
+SCENARIO = "scenario"  # the path of a file of faults; empty for none
 Value = float | int | bool | str
-ATTITUDE_STREAM = 1  # of a case's seed: where a grid's case looks
+ATTITUDE_STREAM = 1  # of a case's seed, for the attitudes of a grid
 SOBOL_BITS = 30
 MAX_HYPERCUBE_VALUES = 200_000_000  # 1.6 GB: a Latin hypercube is made as a whole
 
@@ -91,7 +90,7 @@ class Varied(Table, frozen=True):
 
 
 class Centroiding(Table, frozen=True):
-    """[centroids]: how `--solver centroids` finds stars, and below which separation a star is crowded out of the errors."""
+    """[centroids]: how `--solver centroids` finds stars."""
 
     threshold_sigma: Annotated[float, Meta(ge=0, le=1e6)] = 5.0
     minimum_pixels: Annotated[int, Meta(ge=1, le=1000)] = 1
@@ -141,11 +140,6 @@ def parse_plan(path: Path, text: str) -> Plan:
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     return plan
-
-
-def plan_bytes(plan: Plan) -> bytes:
-    """All that a plan says, in one form whatever its file looks like."""
-    return msgspec.json.encode(plan, order="sorted", enc_hook=str)
 
 
 def _check_finite(path: Path, value: Any) -> None:
@@ -222,12 +216,12 @@ class Parameter:
 
     @property
     def own(self) -> bool:
-        """Whether it belongs to the case, and not to the bench file."""
+        """Whether it is one of the case's own keys, not one of the bench file."""
         return self.key in OWN_KEYS
 
 
 def parameters(plan: Plan, file: BenchFile) -> list[Parameter]:
-    """The plan's parameters, each tried at its ends in the bench file alone. Raises InputError for what that refuses."""
+    """The plan's parameters, each tried alone in the bench file at its ends. Raises InputError for what the file refuses."""
     tables = parse_toml(file.path, file.text)
     found = []
     for varied in plan.vary:
@@ -296,7 +290,7 @@ def _is_whole(key: str, config: Any) -> bool:
 
 
 def _now(names: list[str], config: Any) -> Any:
-    """What the bench file has there, defaults included; None where it has nothing."""
+    """The bench file's value at dotted `names`, defaults included; None where it has none."""
     for name in names:
         if isinstance(config, tuple):
             config = config[int(name)] if name.isdigit() and int(name) < len(config) else None
@@ -308,7 +302,7 @@ def _now(names: list[str], config: Any) -> Any:
 
 
 def _set(tables: dict[str, Any], names: list[str], value: Any, config: Any) -> None:
-    """Set the key of dotted `names`; one number for a key of several, such as a sigma along x and y, is given to each."""
+    """Set the key of dotted `names`. A single number for a key of several, such as a sigma along x and y, goes to each."""
     table: Any = tables
     for name in names[:-1]:
         inside = table.get(name) if isinstance(table, dict) else None
@@ -330,10 +324,10 @@ def _set(tables: dict[str, Any], names: list[str], value: Any, config: Any) -> N
 
 
 class Design:
-    """Points (n, dimensions) in [0, 1) of the cases: first the attitude's, then one of each varied key.
+    """Points (n, dimensions) of the cases in [0, 1): the coordinates of the attitude, then one for each varied key.
 
-    A grid's keys have `levels` values each; they come in order, the last key fastest, and again from the first case after
-    the last. Raises InputError for a Latin hypercube too large to be held.
+    A grid's keys have `levels` values each, in order, the last key fastest, and repeat after the last combination. Raises
+    InputError for a Latin hypercube that does not fit into memory.
     """
 
     def __init__(self, sampling: Sampling, seed: int, cases: int, attitude_dimensions: int, levels: Sequence[int]) -> None:
@@ -369,7 +363,7 @@ class Design:
             self._engine = qmc.Sobol(self.dimensions, scramble=True, bits=SOBOL_BITS, rng=rng)
         if begin > self._engine.num_generated:
             self._engine.fast_forward(begin - self._engine.num_generated)
-        with warnings.catch_warnings():  # of a number of points that is no power of two: the plan's number counts
+        with warnings.catch_warnings():  # that the number of points is no power of two: the plan decides it
             warnings.simplefilter("ignore", UserWarning)
             return np.asarray(self._engine.random(end - begin))
 

@@ -27,7 +27,7 @@ from scipy.stats import rankdata
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.assess.budget import Axes, Decomposed, assess_cases
 from hilstar.assess.places import Scale
-from hilstar.assess.report import BudgetRow
+from hilstar.assess.report import FigureRow
 from hilstar.bench.config import BenchConfig
 from hilstar.campaign.store import failures, file_sha256
 from hilstar.charts import INK, MUTED, chart, write_csv
@@ -190,28 +190,28 @@ def _centroids(cases: Columns) -> CentroidFigures | None:
 
 def write_budget(path: Path, budget: CaseBudget) -> None:
     """The budget as a table, with the columns of `hilstar assess`. Raises InputError where it cannot be written."""
-    write_csv(path, BudgetRow._fields, [["" if value is None else value for value in row] for row in _rows(budget)])
+    write_csv(path, FigureRow._fields, [["" if value is None else value for value in row] for row in _rows(budget)])
 
 
-def _rows(budget: CaseBudget) -> Iterator[BudgetRow]:
+def _rows(budget: CaseBudget) -> Iterator[FigureRow]:
     parts, unknown = budget.parts, (None, None)
     for k, axis in enumerate("xyz"):
         value = None if parts is None else float(parts.bias_arcsec[k])
         ends = unknown if parts is None else parts.intervals.bias[:, k].tolist()
-        yield BudgetRow("bias", axis, value, "arcsec", *ends)
+        yield FigureRow("bias", axis, value, "arcsec", *ends)
     for part, name in PARTS.items():
         axes = None if parts is None else getattr(parts, f"{part}_arcsec")
         for k, axis in enumerate(("cross", "roll")):
             ends = unknown if parts is None else getattr(parts.intervals, part)[:, k].tolist()
-            yield BudgetRow(name, axis, axes and getattr(axes, axis), "arcsec", *ends)
+            yield FigureRow(name, axis, axes and getattr(axes, axis), "arcsec", *ends)
     scatter = budget.scatter_arcsec or Axes(None, None)
-    yield BudgetRow(SCATTER, "cross", scatter.cross, "arcsec")
-    yield BudgetRow(SCATTER, "roll", scatter.roll, "arcsec")
-    yield BudgetRow("availability", "", budget.availability)
-    yield BudgetRow("wrong answers", "", budget.wrong)
+    yield FigureRow(SCATTER, "cross", scatter.cross, "arcsec")
+    yield FigureRow(SCATTER, "roll", scatter.roll, "arcsec")
+    yield FigureRow("availability", "", budget.availability)
+    yield FigureRow("wrong answers", "", budget.wrong)
     if budget.centroids is not None:
         for name, value in asdict(budget.centroids).items():
-            yield BudgetRow(f"centroids: {name}", "", value, "px" if name.endswith("_px") else "1")
+            yield FigureRow(f"centroids: {name}", "", value, "px" if name.endswith("_px") else "1")
 
 
 @dataclass(frozen=True)

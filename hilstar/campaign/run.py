@@ -1,4 +1,4 @@
-"""A campaign from its plan to its table: what is done stays done, whatever ends the run before its end."""
+"""A campaign from its plan to its table. Finished cases stay finished, however the run ends."""
 
 from __future__ import annotations
 
@@ -18,12 +18,9 @@ from hilstar.campaign.store import About, Directory, Journal, require_parquet, s
 from hilstar.errors import InputError
 from hilstar.reading import MAX_TOML_BYTES, read_text
 
-MAX_LOG_BYTES = 10_000_000_000
-Say = Callable[[str], None]
-
 
 class Workers(Protocol):
-    """Whoever runs cases, in tasks of about `task_s`: the pool, or a cluster."""
+    """A runner of cases in tasks of about `task_s` seconds: the pool, or a cluster."""
 
     task_s: float
 
@@ -34,7 +31,7 @@ class Workers(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """What a campaign is asked for beside its plan."""
+    """The options of a campaign beside its plan."""
 
     solver: str
     timeout_s: float
@@ -42,7 +39,7 @@ class Asked:
 
 
 class Campaign:
-    """A campaign that is ready to run: everything checked, nothing written. Raises InputError or MachineError."""
+    """A campaign that is checked and ready to run; nothing is written yet. Raises InputError or MachineError."""
 
     def __init__(self, path: Path, directory: Path, asked: Asked) -> None:
         require_parquet()
@@ -64,7 +61,7 @@ class Campaign:
             images=asked.images,
         )
         try:
-            session = Session(self.job)  # what is wrong with the plan, the bench or the solver is said once, here
+            session = Session(self.job)  # errors of plan, bench and solver are reported once, here
         except InputError as error:
             raise InputError(f"{path}: {error}" if "[[vary]]" in str(error) else str(error)) from error
         try:
@@ -78,15 +75,15 @@ class Campaign:
         self.design = Design(self.plan.sampling, self.plan.seed, self.cases, self.maker.attitude_dimensions, levels)
 
     def about(self) -> About:
-        """What the rows depend on."""
+        """Everything that the rows depend on."""
         plan = msgspec.json.decode(msgspec.json.encode(self.plan, enc_hook=str))
         identity = msgspec.to_builtins(self.identity)
         return About(plan, self.file.sha256, self.job.files_sha256, self.asked.solver, self.asked.images, identity)
 
     def run(self, directory: Directory, workers: Workers, on_done: Callable[[int], None]) -> None:
-        """Run what is missing, and write the table when nothing is. `on_done` gets the number of cases that are done.
+        """Run the missing cases, and write the table once none is missing. `on_done` gets the number of finished cases.
 
-        Raises InputError where nothing can be written, and what the workers raise; the same again goes on from there.
+        Raises InputError where nothing can be written, and what the workers raise. The same call resumes from there.
         """
         journal = directory.journal(self.cases)
         try:

@@ -1,6 +1,7 @@
-"""What a worker has to share with the campaign, so that its rows are the same ones, bit for bit.
+"""A worker's session: it checks that it computes what the campaign computes, and runs cases, one after the other.
 
-What a worker does: the campaign's cases, one after the other, with one tracker that changes with them.
+Rows are the same bit for bit on every worker that has the campaign's `Identity`. One tracker serves all cases of a session, and
+changes with their bench files.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ import hilstar
 from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile, bench_file_of
 from hilstar.bench.config import BenchConfig
-from hilstar.campaign.cases import Case, CaseMaker, Kind, Row, Tally, columns, failed, first_row
+from hilstar.campaign.cases import Case, CaseMaker, CaseTally, Kind, Row, columns, failed, first_row
 from hilstar.campaign.display_tracker import DisplayTracker
 from hilstar.campaign.plan import SCENARIO, Plan, parse_plan
 from hilstar.campaign.solvers import CENTROIDS, SolverFault, choose_solver
@@ -39,7 +40,7 @@ IMAGES_A_FOLDER = 1000
 
 
 class Identity(msgspec.Struct, frozen=True):
-    """By what rows could differ: the program, what it computes with, and what draws."""
+    """Everything by which rows could differ between machines: program, libraries and renderer."""
 
     hilstar: str
     code_sha256: str
@@ -75,7 +76,7 @@ def own_identity(gl_renderer: str) -> Identity:
 
 
 def difference(found: Identity, wanted: Identity) -> str | None:
-    """What a worker has that the campaign has not, in words; None where they are the same."""
+    """The first difference of a worker's identity, in words; None where there is none."""
     for name, words in WORDS.items():
         if getattr(found, name) != getattr(wanted, name):
             return "has " + words.format(getattr(found, name), getattr(wanted, name))
@@ -83,7 +84,7 @@ def difference(found: Identity, wanted: Identity) -> str | None:
 
 
 class Job(msgspec.Struct, frozen=True):
-    """All that a worker is sent once: the plan and the bench as they were read, the solver, and where images go."""
+    """The message that starts a worker: the plan and the bench as they were read, the solver, and the place of images."""
 
     plan_path: str
     plan_text: str
@@ -99,7 +100,7 @@ class Job(msgspec.Struct, frozen=True):
 
 
 class Answered(msgspec.Struct, frozen=True):
-    """The rows of some cases, the seconds that they took, and the most memory that the worker has had."""
+    """The rows of some cases, the seconds that they took, and the worker's peak of memory."""
 
     rows: list[dict[str, Any]]
     seconds: float
@@ -119,7 +120,7 @@ class Imaging(Protocol):
         ...
 
     def change(self, file: BenchFile) -> None:
-        """Be the tracker of another bench file."""
+        """Switch to another bench file."""
         ...
 
     def expose(self, view: View, rng: np.random.Generator | None) -> Exposure:
@@ -154,7 +155,7 @@ class Session:
         self._tracker: Imaging | None = self._new_tracker(self.maker.file)
 
     def identity(self) -> Identity:
-        """What this worker is."""
+        """This worker's identity."""
         return own_identity(self._at(self.maker.file).gl_renderer)
 
     def run(self, begin: int, points: FloatArray) -> Answered:
@@ -164,7 +165,7 @@ class Session:
         return Answered(rows, time.perf_counter() - start_s, peak_bytes())
 
     def row(self, number: int, point: FloatArray) -> Row:
-        """The row of one case; one that fails says why."""
+        """The row of one case; a failed one says why."""
         case = self.maker.case(number, point)
         row = first_row(case, self.columns)
         try:
@@ -180,7 +181,7 @@ class Session:
             return failed(row, one_line(f"{type(error).__name__}: {error}"))
 
     def _exposed(self, case: Case, tracker: Imaging, row: Row) -> Row:
-        tally = Tally("stars" in self.columns, self.plan.wrong_above_arcsec)
+        tally = CaseTally("stars" in self.columns, self.plan.wrong_above_arcsec)
         noise = FrameNoise(self.plan.noise, case.noise_seed)
         for frame in range(self.plan.frames):
             view = self.maker.view(case, frame, tracker.config.tracker.exposure_s)
@@ -205,7 +206,7 @@ class Session:
         return tally.into(row)
 
     def _at(self, file: BenchFile) -> Imaging:
-        """The tracker of a bench file; one that cannot be made leaves none behind."""
+        """The tracker, switched to a bench file; where that fails, the next case gets a new one."""
         tracker, self._tracker = self._tracker, None
         if tracker is None:
             tracker = self._new_tracker(file)
@@ -213,7 +214,7 @@ class Session:
             try:
                 tracker.change(file)
             except BaseException:
-                with contextlib.suppress(Exception):  # what it had may be closed already
+                with contextlib.suppress(Exception):  # parts of it may be closed already
                     tracker.close()
                 raise
         self._tracker = tracker
@@ -246,7 +247,7 @@ def image_name(case: int, frame: int, frames: int) -> str:
 
 
 def peak_bytes() -> int:
-    """The most memory that this process has had at once (Linux: VmHWM)."""
+    """This process's peak of memory (Linux: VmHWM)."""
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith("VmHWM"):
             return int(line.split()[1]) * 1024

@@ -1,12 +1,7 @@
-"""What a solver is asked, what it answers, and how it fails.
+"""Solvers: an image in, an attitude out.
 
-The centroider alone: its errors against the truth, and the attitude of its stars, each of which the truth names.
-
-A solver that is a Python callable: `python:module:function`.
-
-A solver that is a command: it gets an image, and prints a quaternion.
-
-From the words after --solver to a solver.
+There are three: the centroider alone, whose stars the truth identifies; a Python function (`python:MODULE:FUNCTION`); and a
+command that gets an image and prints a quaternion.
 """
 
 from __future__ import annotations
@@ -41,8 +36,8 @@ from hilstar.twin.pictures import write_dn_picture
 from hilstar.twin.simulator import Exposure
 from hilstar.twin.verify.star_finder import crowded, nearest
 
-MAX_NORM_ERROR = 1e-3  # of a quaternion that is unit but for its decimals
-MIN_STARS = 2  # that give an attitude
+MAX_NORM_ERROR = 1e-3  # a quaternion is unit but for its decimals
+MIN_STARS = 2  # for an attitude
 FORM = "write --solver python:MODULE:FUNCTION"
 IMAGE, PICTURE = "{image}", "{png}"
 NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
@@ -54,7 +49,7 @@ class SolverFault(Exception):
     """A solver failed: it raised, ended with an error, took too long, or answered what is no attitude."""
 
 
-class Tracker(Protocol):
+class SolvedTracker(Protocol):
     """The tracker whose images are solved."""
 
     config: BenchConfig
@@ -62,11 +57,11 @@ class Tracker(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class StarErrors:
+class CentroidErrors:
     """Centroids of one image against the truth: counts, and x and y errors (n,), px, measured minus true, of matched stars.
 
-    `stars` are on the detector, `matched` of them found within MATCH_PX, and `false` finds are no star's. The errors are those
-    of stars that are neither clipped, nor at the edge, nor crowded; `x_px`, `y_px` (n,) are their true places and `v_mag`
+    `stars` are on the detector, `matched` of them were found within MATCH_PX, and `false` finds belong to no star. Errors are
+    those of stars that are neither clipped, nor at the edge, nor crowded; `x_px`, `y_px` (n,) are their true places, `v_mag`
     (n,) their magnitudes.
     """
 
@@ -83,17 +78,17 @@ class StarErrors:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """An attitude, or None and why there is none; with centroids, their errors."""
+    """An attitude, or None and the reason; from the centroider also the centroids' errors."""
 
     q_icrs_to_cam: FloatArray | None
     why: str = ""
-    star_errors: StarErrors | None = None
+    star_errors: CentroidErrors | None = None
 
 
 class Solver(Protocol):
     """Anything that solves an image. Raises SolverFault."""
 
-    def solve(self, exposure: Exposure, tracker: Tracker) -> Answer:
+    def solve(self, exposure: Exposure, tracker: SolvedTracker) -> Answer:
         """The attitude of one exposure."""
         ...
 
@@ -113,13 +108,13 @@ def checked_attitude(numbers: object, who: str) -> FloatArray:
 
 
 class CentroidSolver:
-    """Finds stars, and takes the nearest one of the truth, the brightest first, within 3 px for each."""
+    """Finds stars, and matches each star of the truth, brightest first, with the nearest find within 3 px."""
 
     def __init__(self, settings: Centroiding) -> None:
         self._wanted = settings
 
-    def solve(self, exposure: Exposure, tracker: Tracker) -> Answer:
-        """Centroid errors, and the attitude by the stars that were matched; no star has to be identified."""
+    def solve(self, exposure: Exposure, tracker: SolvedTracker) -> Answer:
+        """Centroid errors, and the attitude by the matched stars."""
         settings = self._settings(tracker)
         found = find_stars(exposure.dn, settings)
         truth = _on_detector(exposure)
@@ -131,7 +126,7 @@ class CentroidSolver:
         if len(truth):
             good &= ~crowded(truth["x_px"], truth["y_px"], flux, settings.radius_px, sigma_px)
         x_px, y_px = truth["x_px"][good], truth["y_px"][good]
-        errors = StarErrors(
+        errors = CentroidErrors(
             stars=len(truth),
             found=len(found),
             matched=int(is_matched.sum()),
@@ -147,7 +142,7 @@ class CentroidSolver:
         turn = _turn(tracker, errors, flux[good])
         return Answer(multiply(turn, exposure.view.q_icrs_to_cam), "", errors)
 
-    def _settings(self, tracker: Tracker) -> CentroidSettings:
+    def _settings(self, tracker: SolvedTracker) -> CentroidSettings:
         wanted, psf = self._wanted, tracker.config.tracker.psf_sigma_px
         return CentroidSettings(
             threshold_sigma=wanted.threshold_sigma,
@@ -159,7 +154,7 @@ class CentroidSolver:
 
 
 def _on_detector(exposure: Exposure) -> np.ndarray:
-    """The truth's rows whose places lie on the detector, brightest first."""
+    """The truth's rows of stars on the detector, brightest first."""
     truth, (height, width) = exposure.truth, exposure.dn.shape
     with np.errstate(invalid="ignore"):
         inside = (np.abs(truth["x_px"] - (width - 1) / 2) <= width / 2) & (
@@ -169,7 +164,7 @@ def _on_detector(exposure: Exposure) -> np.ndarray:
 
 
 def _matched(found: Centroids, x_px: FloatArray, y_px: FloatArray) -> IntArray:
-    """For each star (n,), brightest first, its find; -1 for none, or where a brighter star has it."""
+    """The index of each star's find (n,), brightest first; -1 for none, or where a brighter star has it."""
     index = nearest(found, x_px, y_px)
     _, first = np.unique(index, return_index=True)
     alone = np.zeros(len(index), dtype=np.bool_)
@@ -177,10 +172,10 @@ def _matched(found: Centroids, x_px: FloatArray, y_px: FloatArray) -> IntArray:
     return np.where(alone, index, -1)
 
 
-def _turn(tracker: Tracker, errors: StarErrors, weight: FloatArray) -> FloatArray:
+def _turn(tracker: SolvedTracker, errors: CentroidErrors, weight: FloatArray) -> FloatArray:
     """The rotation (4,) from the true attitude's cam to that of the centroids: Wahba's problem by SVD (Markley 1988).
 
-    Weighted by the light, as the variance of photon noise has it.
+    Weights are the stars' light, the inverse of photon noise's variance.
     """
     true, seen = (
         normalise(tracker.camera.rays(errors.x_px + dx_px, errors.y_px + dy_px))
@@ -212,7 +207,7 @@ class FunctionSolver:
             raise InputError(f"--solver {name}: {module} has no function {function}; {FORM}")
         self._function: Callable[..., Any] = found
 
-    def solve(self, exposure: Exposure, tracker: Tracker) -> Answer:
+    def solve(self, exposure: Exposure, tracker: SolvedTracker) -> Answer:
         """The function's answer. Raises SolverFault where it raises, takes too long or answers what is no attitude."""
         try:
             with time_limit(self._timeout_s):
@@ -226,8 +221,8 @@ class FunctionSolver:
         return Answer(checked_attitude(answer, "the solver"))
 
 
-def tracker_facts(tracker: Tracker) -> dict[str, Any]:
-    """What a tracker's software knows of its own optics, and nothing of where it looks."""
+def tracker_facts(tracker: SolvedTracker) -> dict[str, Any]:
+    """The facts of its optics that a tracker's software knows, and none of where it looks."""
     settings = tracker.config.tracker
     width, height = settings.resolution_px
     focal_length_px = settings.focal_length_mm * 1e3 / settings.pixel_pitch_um
@@ -244,7 +239,7 @@ def tracker_facts(tracker: Tracker) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def time_limit(seconds: float) -> Iterator[None]:
-    """Raises TimeoutError in the main thread after so long; in another thread nothing can be interrupted, and nothing is."""
+    """Raise TimeoutError in the main thread after `seconds`; another thread cannot be interrupted."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -273,9 +268,9 @@ def _importing_from(folder: Path) -> Iterator[None]:
 class CommandSolver:
     """Runs a command for each image, without a shell: {image} is a FITS file of its DN alone, {png} a 16-bit PNG of them.
 
-    Other words in braces are the tracker's: {fov_deg}, {focal_length_px}, {width_px}, {height_px}. The last line of its output
-    that has four numbers, or a JSON object with "q", is q_icrs_to_cam, scalar first; exit code 0 without one says that there is
-    no attitude, and any other code is a fault. Raises InputError for a template without an image.
+    Other words in braces are the tracker's: {fov_deg}, {focal_length_px}, {width_px}, {height_px}. The last line of output with
+    four numbers, or with a JSON object that has "q", is q_icrs_to_cam, scalar first. Exit code 0 without such a line means no
+    attitude; any other code is a fault. Raises InputError for a template without an image.
     """
 
     def __init__(self, template: str, folder: Path, timeout_s: float) -> None:
@@ -291,7 +286,7 @@ class CommandSolver:
             )
         self._folder, self._timeout_s = folder, timeout_s
 
-    def solve(self, exposure: Exposure, tracker: Tracker) -> Answer:
+    def solve(self, exposure: Exposure, tracker: SolvedTracker) -> Answer:
         """The command's answer. Raises SolverFault where it fails, takes too long or prints what is no attitude."""
         with temporary_folder("solver") as folder:
             image, picture = folder / "image.fits", folder / "image.png"
@@ -328,13 +323,13 @@ def printed_attitude(text: str) -> object | None:
 
 
 def write_plain_fits(path: Path, dn: npt.NDArray[np.uint16]) -> None:
-    """The DN and nothing else: neither where the tracker looks nor what is in view."""
+    """Write the DN alone: no pointing, and no truth."""
     from astropy.io import fits
 
     fits.PrimaryHDU(dn).writeto(path)
 
 
-def _places(tracker: Tracker) -> dict[str, str]:
+def _places(tracker: SolvedTracker) -> dict[str, str]:
     facts = tracker_facts(tracker)
     width, height = facts["resolution_px"]
     return {
@@ -352,7 +347,7 @@ def _filled(word: str, places: dict[str, str]) -> str:
 
 
 def _run(words: list[str], folder: Path, timeout_s: float) -> tuple[int, str, str]:
-    """Run a command in a group of its own, which ends with it. Raises SolverFault."""
+    """Run a command in a process group of its own, which ends with it. Raises SolverFault."""
     try:
         child = Child(words, folder)
     except OSError as error:
@@ -368,7 +363,7 @@ def _run(words: list[str], folder: Path, timeout_s: float) -> tuple[int, str, st
 
 
 def choose_solver(text: str, settings: Centroiding, folder: Path, timeout_s: float) -> Solver:
-    """The solver that `text` names; relative names start in `folder`. Raises InputError for one that there is not."""
+    """The solver that `text` names, with relative names in `folder`. Raises InputError for an unknown one."""
     if text == CENTROIDS:
         return CentroidSolver(settings)
     if text.startswith("python:"):

@@ -1,14 +1,13 @@
-"""The campaign's table: Parquet, a row a case in their order, the same bytes for the same rows.
+"""A campaign's directory: the journal of rows as they come, and the Parquet table of all rows at the end.
 
-The journal: each row appended as it comes, one line with its checksum, in a file a block of cases.
+The journal appends each row as one line with its checksum, to one file per block of cases. Laws:
 
-Laws:
 1. A row counts as done once its line is written whole. A line that a kill, a full disk or a crash cut off is dropped when
    the journal is opened again, and its case is run again.
 2. A block's file is renamed when all its cases are in it; such a file is not read again before the end.
 3. One process writes at a time; it holds the lock of the campaign's directory.
 
-A campaign's directory: one campaign, one writer, and the files in it.
+The table has one row per case, in their order. The same rows give the same bytes.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ ANOTHER = "write another directory after -o, or delete this one"
 
 
 def require_parquet() -> None:
-    """Refuse (MachineError) before the first case what could not be written after the last."""
+    """Refuse (MachineError) a machine that could not write the table after the last case."""
     try:
         import pyarrow.parquet  # noqa: F401
     except ImportError as error:
@@ -61,7 +60,7 @@ def schema_of(columns: Mapping[str, str], about: Mapping[str, str]) -> pa.Schema
 
 
 def write_table(path: Path, schema: pa.Schema, blocks: Iterator[list[dict[str, Any]]]) -> None:
-    """Write blocks of rows, one a row group, whole or not at all. Raises InputError where it cannot be written."""
+    """Write blocks of rows, each as a row group, whole or not at all. Raises InputError where it cannot be written."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -74,26 +73,14 @@ def write_table(path: Path, schema: pa.Schema, blocks: Iterator[list[dict[str, A
 
 
 def _exact(value: Any, kind: Any) -> Any:
-    """JSON writes a whole float without its point."""
+    """A float of the journal: JSON writes a whole one without its point."""
     import pyarrow as pa
 
     return float(value) if kind == pa.float64() and value is not None else value
 
 
-def read_columns(path: Path) -> dict[str, Any]:
-    """A campaign's table as columns of Python values. Raises InputError where it is none."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    try:
-        table = pq.read_table(path)
-    except (OSError, pa.ArrowException) as error:
-        raise InputError(f"{path}: cannot be read as Parquet ({error}); give the table of a campaign") from error
-    return {name: table.column(name).to_pylist() for name in table.column_names}
-
-
 def failures(path: Path) -> dict[str, int]:
-    """How many cases failed, by their reason, in the order of their first cases."""
+    """The number of failed cases by reason, in the order of their first cases."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -124,7 +111,7 @@ class Journal:
 
     def __init__(self, folder: Path, cases: int) -> None:
         self.folder, self.cases = make_directory(folder), cases
-        self._done: dict[int, set[int]] = {}  # of blocks that are not full
+        self._done: dict[int, set[int]] = {}  # in blocks that are not full
         self._full: set[int] = set()
         self._files: dict[int, int] = {}
         for block in range(self.blocks):
@@ -185,7 +172,7 @@ class Journal:
         self.close()
         for path in self.folder.glob("*.jsonl"):
             path.unlink()
-        with contextlib.suppress(OSError):  # somebody else's file is in it
+        with contextlib.suppress(OSError):  # another program's file is in it
             self.folder.rmdir()
 
     def _block(self, block: int) -> range:
@@ -199,7 +186,7 @@ class Journal:
         try:
             if block not in self._files:
                 self._files[block] = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
-            while line:  # a full disk may take a part; what it left is a cut line, dropped at the next start
+            while line:  # a full disk may take a part: that is a cut line, dropped at the next start
                 line = line[os.write(self._files[block], line) :]
         except OSError as error:
             raise cannot_write(path, error, "make room, and run the same command again: it goes on") from error
@@ -225,7 +212,7 @@ class Journal:
         return list(found)
 
     def _read(self, path: Path) -> tuple[dict[int, Row], bool]:
-        """The rows in a file by case, and whether all of its lines were whole."""
+        """The rows of a file by case, and whether all its lines were whole."""
         try:
             data = path.read_bytes()
         except OSError as error:
@@ -253,13 +240,13 @@ def _row(line: bytes) -> Row | None:
         return None
     try:
         row = msgspec.json.decode(text, type=Row)
-    except NOT_JSON:  # with the right checksum: somebody else's line
+    except NOT_JSON:  # with the right checksum: another program's line
         return None
     return row if isinstance(row.get("case"), int) else None
 
 
 class About(msgspec.Struct, frozen=True):
-    """Whose campaign it is: all that its rows depend on."""
+    """The identity of a campaign: all that its rows depend on."""
 
     plan: dict[str, Any]
     bench_sha256: str
@@ -270,7 +257,7 @@ class About(msgspec.Struct, frozen=True):
 
 
 class Directory:
-    """The directory of a campaign, held against a second driver; free it with `close`. Raises InputError where one has it."""
+    """The directory of a campaign, locked against a second driver until `close`. Raises InputError where one has it."""
 
     def __init__(self, path: Path) -> None:
         self.path = make_directory(path)
@@ -282,7 +269,7 @@ class Directory:
         return self.path / TABLE
 
     def claim(self, about: About) -> None:
-        """Be of this campaign from now on. Raises InputError where the directory is another's, or holds another's files."""
+        """Claim the directory for this campaign. Raises InputError where it is another's, or holds another's files."""
         place = self.path / ABOUT
         if not place.exists():
             for name in (TABLE, JOURNAL):
@@ -295,7 +282,7 @@ class Directory:
         except NOT_JSON as error:
             raise cannot_read(place, "it is no campaign's", ANOTHER) from error
         now = msgspec.json.decode(msgspec.json.encode(about), type=About)
-        if self.table.exists():  # whose rows are not run again, whatever this machine is
+        if self.table.exists():  # its rows are not run again, so this machine may differ
             now = msgspec.structs.replace(now, identity=before.identity)
         if before != now:
             raise InputError(f"{self.path}: holds another campaign: {_changed(before, about)}; {ANOTHER}")
@@ -305,7 +292,7 @@ class Directory:
         return Journal(self.path / JOURNAL, cases)
 
     def close(self) -> None:
-        """Let the directory go."""
+        """Release the directory."""
         os.close(self._lock)
 
 

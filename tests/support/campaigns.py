@@ -6,6 +6,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+import pyarrow.parquet as pq
+
 from tests.support.benches import bench_text
 
 SMALL_TRACKER = {"focal_length_mm": 20, "resolution_px": [128, 128], "transmission": None}
@@ -38,3 +40,9 @@ def plan_text(*vary: dict[str, Any], attitudes: dict[str, Any] | None = None, **
 
 def _lines(table: dict[str, Any]) -> list[str]:
     return [f"{key} = {json.dumps(value)}" for key, value in table.items() if value is not None]
+
+
+def read_columns(path: Path) -> dict[str, Any]:
+    """A campaign's table as columns of Python values."""
+    table = pq.read_table(path)
+    return {name: table.column(name).to_pylist() for name in table.column_names}

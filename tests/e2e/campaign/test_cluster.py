@@ -17,9 +17,8 @@ import pytest
 
 import hilstar
 from hilstar.campaign import cluster
-from hilstar.campaign.store import read_columns
 from tests.support.benches import ROOT
-from tests.support.campaigns import write_campaign
+from tests.support.campaigns import read_columns, write_campaign
 from tests.support.commands import HILSTAR, assert_refused, run_hilstar, run_hilstar_here
 from tests.support.waiting import PATIENCE_S, wait_for
 

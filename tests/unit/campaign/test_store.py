@@ -10,8 +10,9 @@ from pathlib import Path
 import pytest
 
 from hilstar.campaign import store
-from hilstar.campaign.store import About, Directory, Journal, file_sha256, read_columns, schema_of, write_table
+from hilstar.campaign.store import About, Directory, Journal, file_sha256, schema_of, write_table
 from hilstar.errors import InputError
+from tests.support.campaigns import read_columns
 from tests.support.damage import NO_JSON
 
 

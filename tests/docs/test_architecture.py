@@ -10,7 +10,7 @@ import pytest
 from tests.support.benches import ROOT
 
 PAGE = (ROOT / "docs" / "architecture.md").read_text()
-MAX_FILES_OF_A_WALK = 24
+MAX_FILES = {"One packet to a pixel": 14, "One magnitude to a code value": 23}
 
 
 def walk(heading: str) -> list[str]:
@@ -19,13 +19,13 @@ def walk(heading: str) -> list[str]:
     return list(dict.fromkeys(re.findall(r"`((?:[a-z0-9_]+/)+[a-z0-9_]+\.(?:py|vert|frag))`", section)))
 
 
-@pytest.mark.parametrize("heading", ["One packet to a pixel", "One magnitude to a code value"])
+@pytest.mark.parametrize("heading", MAX_FILES)
 def test_a_walk_passes_files_that_are_there_and_few(heading):
     files = walk(heading)
     assert len(files) > 5
     for name in files:
         assert (ROOT / name).is_file() or (ROOT / "hilstar" / name).is_file(), f"architecture.md names {name}"
-    assert len(files) < MAX_FILES_OF_A_WALK
+    assert len(files) <= MAX_FILES[heading]
 
 
 def rooms(names: list[str]) -> set[str]:

@@ -2,13 +2,14 @@
 
 from typing import TYPE_CHECKING, Any
 
+from hilstar.version import __version__ as __version__
+
 if TYPE_CHECKING:
     from hilstar.bench.build import load
     from hilstar.bench.frame import Bench, Drawn, Frame
     from hilstar.errors import HilstarError, InputError, MachineError
     from hilstar.run.sender import Sender
 
-__version__ = "0.2.0"
 __all__ = ["Bench", "Drawn", "Frame", "HilstarError", "InputError", "MachineError", "Sender", "load"]
 
 

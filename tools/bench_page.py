@@ -13,7 +13,7 @@ import msgspec
 from msgspec import NODEFAULT, Meta
 from msgspec.structs import FieldInfo
 
-from hilstar.bench.config.bench import TYPE_WORDS, BenchConfig
+from hilstar.bench.config.bench_config import TYPE_WORDS, BenchConfig
 from hilstar.bench.config.values import MAX_NUMBER, MIN_POSITIVE
 from hilstar.toml_tables import plain
 

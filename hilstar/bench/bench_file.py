@@ -1,23 +1,39 @@
-"""The bench file of a run: read once, so that the whole run uses the bytes that were checked."""
+"""The bench file of a run: read once, so that the whole run uses the bytes that were checked; and one key of it set.
+
+A file may also name several bench files, one for each head of an attitude determination unit:
+
+    heads = ["a.toml", "b.toml"]
+    [attitude]
+    endpoint = "tcp://127.0.0.1:5560"
+
+The source's attitude is the body's; each head's `[tracker] q_body_to_cam` makes it its camera's. `[attitude]` holds for all
+heads, in place of their own.
+"""
 
 from __future__ import annotations
 
 import hashlib
+import json
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from hilstar.bench.config import GEOCENTRE, SOURCE, BenchConfig, config_of, parse_config
-from hilstar.bench.config.when import UNIX, today, with_dates
-from hilstar.errors import InputError
+from hilstar.bench.config import GEOCENTRE, SOURCE, AttitudeSettings, BenchConfig, config_of, parse_config
+from hilstar.bench.config.bench_config import HEADS, UNIX, today, with_dates
+from hilstar.errors import InputError, did_you_mean, shortened
+from hilstar.files import place_of
 from hilstar.monitor.calibration import BUILT_IN
-from hilstar.reading import MAX_TOML_BYTES, read_bytes, read_text
+from hilstar.reading import MAX_TOML_BYTES, parse_toml, read_bytes, read_text
 from hilstar.sky.spectrum import BUILT_IN_CURVES
 from hilstar.sky.star_table import file_sha256
 
 MAX_NAMED_BYTES = 100_000_000
+MIN_HEADS, MAX_HEADS = 2, 8
+EXAMPLE = 'write heads = ["a.toml", "b.toml"], a bench file for each'
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,3 +118,101 @@ def _named_bytes(path: Path) -> bytes:
         return read_bytes(path, "", MAX_NAMED_BYTES)
     except InputError:
         return b""
+
+
+@dataclass(frozen=True, slots=True)
+class HeadsFile:
+    """A file with `heads`: each head's name, that of its bench file, and its bench, with the common source's settings."""
+
+    path: Path
+    names: tuple[str, ...]
+    files: tuple[BenchFile, ...]
+
+    @property
+    def attitude(self) -> AttitudeSettings:
+        """The common source."""
+        return self.files[0].config.attitude
+
+    @property
+    def folder(self) -> Path:
+        """The folder to which the source's paths are relative."""
+        return self.path.parent
+
+
+def read_bench_or_heads(path: Path) -> BenchFile | HeadsFile:
+    """A bench file, or a file with `heads`, opened once. Raises InputError as `read_bench_file` and `read_heads` do."""
+    text = read_text(path, "give the path of a bench file", MAX_TOML_BYTES)
+    tables = parse_toml(path, text)
+    return _heads_of(path, tables) if HEADS in tables else bench_file_of(path, text)
+
+
+def _tables(path: Path) -> dict[str, Any]:
+    return parse_toml(path, read_text(path, "give the path of a bench file", MAX_TOML_BYTES))
+
+
+def read_heads(path: Path) -> HeadsFile:
+    """Read and check a file with `heads` and the bench files it names. Raises InputError: file, key, what to write instead."""
+    return _heads_of(path, _tables(path))
+
+
+def _heads_of(path: Path, tables: dict[str, Any]) -> HeadsFile:
+    other = sorted(set(tables) - {HEADS, "attitude"})
+    if other:
+        meant = did_you_mean(other[0], ["attitude"])
+        raise InputError(
+            f"{path}: {shortened(other[0])}: {meant}beside heads stands only [attitude]; write it in the heads' own files"
+        )
+    listed = tables.get(HEADS)
+    if not isinstance(listed, list) or not all(isinstance(name, str) and name for name in listed):
+        raise InputError(f"{path}: heads = {shortened(repr(listed))}: no list of files; {EXAMPLE}")
+    if not MIN_HEADS <= len(listed) <= MAX_HEADS:
+        raise InputError(f"{path}: heads names {len(listed)} files; {EXAMPLE}, from {MIN_HEADS} to {MAX_HEADS}")
+    paths = [path.parent / name for name in listed]
+    names = tuple(head.stem for head in paths)
+    twice = next((name for k, name in enumerate(names) if name in names[:k]), None)
+    if twice is not None:
+        raise InputError(f"{path}: heads: two are called {twice}; give each a file of its own name")
+    files = tuple(_head(head, tables.get("attitude", {})) for head in paths)
+    _refuse_one_twice(path, paths)
+    if files[0].config.attitude.lockstep:
+        raise InputError(f"{path}: [attitude] lockstep = true: several heads follow a stream that runs freely; take it out")
+    return HeadsFile(path, names, files)
+
+
+def _refuse_one_twice(path: Path, heads: list[Path]) -> None:
+    """Two names of one file, by a link, would show one bench twice and write over each other's ledger."""
+    places = [place_of(head) for head in heads]
+    for k, place in enumerate(places):
+        if place in places[:k]:
+            first = heads[places.index(place)]
+            raise InputError(f"{path}: heads: {heads[k].name} is the same file as {first.name}; give each a file of its own")
+
+
+def _head(head: Path, attitude: dict[str, Any]) -> BenchFile:
+    file = read_bench_file(head)
+    return changed_file(file, parse_toml(head, file.text) | {"attitude": attitude})
+
+
+def as_head(head: Path, heads: Path) -> BenchFile:
+    """A head's bench file with the common source of the file `heads`. Raises InputError as `read_heads` does."""
+    return _head(head, _tables(heads).get("attitude", {}))
+
+
+def with_key(
+    text: str, table: str, key: str, value: float | str | bool | Sequence[float], instead_of: tuple[str, ...] = ()
+) -> str:
+    """TOML `text` with `key` of a plain `[table]` set: its line replaced, or that of a key in `instead_of`, or one added.
+
+    Where the table is written in another TOML form, the result means something else: parse it again to see.
+    """
+    line = f"{key} = {json.dumps(value)}"  # of numbers, truth values and plain text, TOML writes the same
+    header = re.search(rf"^[ \t]*\[{table}\][^\n]*\n?", text, re.MULTILINE)
+    if header is None:
+        return f"{text.rstrip()}\n\n[{table}]\n{line}\n".lstrip()
+    following = re.search(r"^[ \t]*\[", text[header.end() :], re.MULTILINE)
+    end = header.end() + following.start() if following else len(text)
+    names = "|".join((key, *instead_of))
+    there = re.compile(rf"^([ \t]*)(?:{names})[ \t]*=[^\n#]*?([ \t]*#[^\n]*)?$", re.MULTILINE)
+    body, count = there.subn(rf"\g<1>{line}\g<2>", text[header.end() : end], count=1)
+    head = text[: header.end()].removesuffix("\n") + "\n"
+    return head + (body if count else f"{line}\n{body}") + text[end:]

@@ -12,19 +12,20 @@ from msgspec.structs import replace
 from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile, read_bench_file
 from hilstar.bench.cameras import bench_camera
-from hilstar.bench.config import DEFAULT_BRIGHTEST_V_MAG, BenchConfig, RenderSettings, Tracker
+from hilstar.bench.config import DEFAULT_BRIGHTEST_V_MAG, BenchConfig, Monitor, RenderSettings, Tracker
+from hilstar.bench.config.bench_config import epoch_utc_ns, has_observer
 from hilstar.bench.config.values import MAX_NUMBER, MIN_POSITIVE
-from hilstar.bench.config.when import epoch_utc_ns, has_observer
 from hilstar.bench.effort import Effort, Light, faintest_shown_e_per_s, plan_effort
 from hilstar.bench.frame import Bench
-from hilstar.bench.orientation import scan_of
 from hilstar.errors import InputError
 from hilstar.monitor.balance import Seen
 from hilstar.monitor.calibration import BUILT_IN, Calibration, load_calibration
 from hilstar.monitor.quantise import Panel
 from hilstar.render.context import Context, create_context, has_compute
+from hilstar.render.presenter import Orientation
 from hilstar.render.renderer import Renderer, Target
 from hilstar.scene.camera import Camera
+from hilstar.scene.frame_motion import Scan
 from hilstar.scene.psf import peak_share
 from hilstar.sky.electrons import Optics, Photometry, star_temperatures_k, tabulate, tabulate_pickles
 from hilstar.sky.spectrum import load_curve
@@ -33,6 +34,8 @@ from hilstar.sky.stars import Stars, aberrate, make_stars, split_by_rate, unit_v
 
 if TYPE_CHECKING:
     from hilstar.sky.bodies.moving import MovingSky
+
+S_PER_MS = 1e-3
 
 
 def load(path: str | Path) -> Bench:
@@ -231,3 +234,13 @@ def brightest_peak_e_per_s(
             f" electrons per second; write those of a lens that gives it {MIN_POSITIVE:g} to {MAX_NUMBER:g}"
         )
     return peak_e_per_s
+
+
+def orientation_of(monitor: Monitor) -> Orientation:
+    """How the image lies on the screen, as the bench file has it."""
+    return Orientation(monitor.flip_x, monitor.flip_y, monitor.rotate_deg // 90)
+
+
+def scan_of(monitor: Monitor) -> Scan:
+    """When the rows light, and for how long."""
+    return Scan(orientation_of(monitor).down, monitor.panel_scanout_ms * S_PER_MS, monitor.panel_hold_ms * S_PER_MS)

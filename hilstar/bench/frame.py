@@ -1,4 +1,4 @@
-"""From an attitude to a frame: sprites, the linear image, code values."""
+"""From an attitude to a frame: sprites, the linear image, code values; and the lines about a bench's light at a run's start."""
 
 from __future__ import annotations
 
@@ -30,7 +30,8 @@ from hilstar.render.renderer import Renderer
 from hilstar.rotation import normalise
 from hilstar.scene.camera import Camera
 from hilstar.scene.frame_motion import Scan
-from hilstar.scene.sprites import Sprites, clipped_sprites
+from hilstar.scene.psf import peak_share
+from hilstar.scene.sprites import CLIP_TOLERANCE, Sprites, clipped_sprites
 from hilstar.sky.stars import Stars, split_by_rate
 from hilstar.units import magnitude
 
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
 WARM_UP_ATTITUDE = np.array([1.0, 0.0, 0.0, 0.0])
 WARM_UP_RATE_RAD_S = np.array([0.1, 0.0, 0.0])
 MOST = 0.5  # a pixel is a disc's if more than this share of its light is the disc's
+NAMED_STARS = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -338,3 +340,46 @@ def checked_quaternion(q: Sequence[float] | FloatArray) -> FloatArray:
     if not abs(norm - 1.0) <= NORM_TOLERANCE:
         raise InputError(f"quaternion {array.tolist()}: its norm is {norm:.6g}; write a unit quaternion w, x, y, z")
     return normalise(array)
+
+
+def clipping_hip(bench: Bench) -> list[int | str]:
+    """Stars and bodies that clip when centred on the darkest pixel, brightest first: HIP numbers, and names of bodies."""
+    peak_e_per_s = bench.stars.electrons_per_s * peak_share(bench.config.render.sprite_sigma_px)
+    order = np.argsort(-peak_e_per_s, kind="stable")
+    clips = peak_e_per_s[order] > bench.flux_at_white_e_per_s * bench.darkest * (1 + CLIP_TOLERANCE)
+    return bench.stars.designations(order[clips])
+
+
+def named(found: list[int | str], count: int) -> str:
+    """ "Moon, HIP 32349, 27989 and 3 more", or "none"."""
+    if not found:
+        return "none"
+    bodies, hips = ([one for one in found if isinstance(one, kind)] for kind in (str, int))
+    shown = [*bodies, *hips][:count]
+    more = "" if len(found) <= count else f" and {len(found) - count} more"
+    first_hip = len(bodies)
+    return ", ".join(f"HIP {one}" if k == first_hip else str(one) for k, one in enumerate(shown)) + more
+
+
+def clipping_line(bench: Bench) -> str | None:
+    """One line that names the stars that clip, for the start of a run; None if none does."""
+    found, render = clipping_hip(bench), bench.config.render
+    if not found:
+        return None
+    bodies = bool(bench.stars.bodies)
+    one, many = ("star or body", "stars and bodies") if bodies else ("star", "stars")
+    stars = f"1 {one} of the sky is" if len(found) == 1 else f"{len(found)} {many} of the sky are"
+    key = "flux_at_white_e_per_s" if render.brightest_v_mag is None else f"brightest_v_mag = {render.brightest_v_mag:g}"
+    return f"{stars} brighter than white and clip in view: {named(found, NAMED_STARS)} ([render] {key})"
+
+
+def shares_line(bench: Bench) -> str | None:
+    """One line where bit stealing weighs the primaries by a formula's shares of white, not the tracker's; otherwise None."""
+    calibration = bench.calibration
+    if not bench.config.render.bit_stealing or not calibration.is_formula or calibration.weights is None:
+        return None
+    shares = ", ".join(f"{share:g}" for share in calibration.weights)
+    return (
+        f'[render] bit_stealing with calibration = "{calibration.name}" assumes that the tracker sees white as {shares} of red,'
+        " green and blue, as a photometer does; measure it (hilstar first-light), or write a calibration file with [weights]"
+    )

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hilstar.bench.config import GEOCENTRE, SOURCE, BenchConfig
-from hilstar.bench.config.when import DAY_NS, UNIX, epoch_utc_ns, from_source, jyear
+from hilstar.bench.config.bench_config import DAY_NS, UNIX, epoch_utc_ns, from_source, jyear
 from hilstar.frame.bodies import POINT_PX
 from hilstar.reading import read_text
 from hilstar.scene.camera import Camera

@@ -16,7 +16,7 @@ import numpy as np
 from hilstar.arrays import FloatArray, IntArray
 from hilstar.attitude.clock.sender_clock import OneWayFilter
 from hilstar.attitude.wire.serial_link import read_lines
-from hilstar.bench.bench_file_edit import with_key
+from hilstar.bench.bench_file import with_key
 from hilstar.bench.config import BenchConfig, Monitor
 from hilstar.charts import BLUE, ORANGE, chart
 from hilstar.errors import InputError, shortened

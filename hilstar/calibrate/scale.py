@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from hilstar.arrays import FloatArray
-from hilstar.bench.bench_file import BenchFile
-from hilstar.bench.bench_file_edit import with_key
+from hilstar.bench.bench_file import BenchFile, with_key
 from hilstar.bench.config import read_config
 from hilstar.bench.frame import Bench
 from hilstar.errors import InputError

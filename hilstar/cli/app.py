@@ -8,7 +8,6 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from hilstar import __version__
 from hilstar.cli.benchmark import benchmark
 from hilstar.cli.calibrate.alignment import alignment
 from hilstar.cli.calibrate.dots import dots
@@ -36,6 +35,7 @@ from hilstar.cli.stream.convert import convert
 from hilstar.cli.stream.keys import keys
 from hilstar.cli.stream.send import send
 from hilstar.cli.study import study
+from hilstar.version import __version__
 
 COMMANDS: dict[str, tuple[Callable[..., None], ...]] = {
     "Show stars": (demo, frame, serve, replay),

@@ -64,7 +64,7 @@ def parse_at(command: str, at_s: float | None, config: BenchConfig, timed: bool 
 
     Raises InputError where nothing moves and no scenario is `timed`.
     """
-    from hilstar.bench.config.when import has_observer
+    from hilstar.bench.config.bench_config import has_observer
 
     if at_s is None:
         return None

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hilstar import __version__
 from hilstar.attitude.clock.rate_check import WRONG
 from hilstar.bench.frame import Bench
 from hilstar.console.listener import PageListener
@@ -43,6 +42,7 @@ from hilstar.notices import Listener, Notice
 from hilstar.run.operator import GAMMA, PATCHES, Overrides, SwitchRequest, SwitchRequests, aid_levels_of
 from hilstar.scene.sprites import brightest
 from hilstar.units import NS_PER_S
+from hilstar.version import __version__
 
 if TYPE_CHECKING:
     from hilstar.bench.bench_file import BenchFile

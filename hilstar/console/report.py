@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from hilstar import __version__
 from hilstar.arrays import FloatArray
 from hilstar.attitude.logs.mcap_log import NO_END, unfinished_part
 from hilstar.bench.bench_file import BenchFile, bench_file_of
@@ -34,6 +33,7 @@ from hilstar.run.replay import RunPlay, replay
 from hilstar.run.serve import Outlet
 from hilstar.run.shown import Shown
 from hilstar.units import NS_PER_S
+from hilstar.version import __version__
 
 PAGE_DIR = Path(__file__).resolve().parent / "page"
 _import = re.compile(r'^import \{ ([^}]+) \} from "\./(\w+)\.js";\n', re.MULTILINE)

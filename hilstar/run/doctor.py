@@ -13,10 +13,9 @@ from typing import Self
 from hilstar.attitude.wire.serial_link import serial_ports
 from hilstar.attitude.wire.zmq_links import ZmqReceiver, ZmqSender
 from hilstar.attitude.wire.zmq_socket import zmq_version
-from hilstar.bench.bench_file import BenchFile
+from hilstar.bench.bench_file import BenchFile, read_bench_or_heads
 from hilstar.bench.build import bench_calibration, bench_optics
-from hilstar.bench.fields_of_view import FieldsOfView, fields_of_view
-from hilstar.bench.heads_file import read_bench_or_heads
+from hilstar.bench.cameras import FieldsOfView, fields_of_view
 from hilstar.errors import HilstarError, MachineError
 from hilstar.monitor.window.output_settings import OutputState, findings
 from hilstar.monitor.window.randr import lit_outputs

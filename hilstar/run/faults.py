@@ -19,7 +19,7 @@ import msgspec
 
 from hilstar.attitude.wire.keys import NO_KEYS, CurveKeys
 from hilstar.attitude.wire.zmq_links import ZmqReceiver
-from hilstar.bench.config.faults import FaultSettings
+from hilstar.bench.config.attitude import FaultSettings
 from hilstar.bench.fault_desk import FILE, Change, FaultDesk, share_on
 from hilstar.bench.fault_views import display_view
 from hilstar.bench.frame import Bench

@@ -25,8 +25,8 @@ from hilstar.attitude.receiver import BackChannel, Traffic
 from hilstar.attitude.wire.links import StreamLink
 from hilstar.attitude.wire.packet import TimeRequest
 from hilstar.attitude.wire.zmq_links import Feed
+from hilstar.bench.bench_file import HeadsFile
 from hilstar.bench.config import BenchConfig
-from hilstar.bench.heads_file import HeadsFile
 from hilstar.files import temporary_folder
 from hilstar.process.interrupts import stop_on_signal
 from hilstar.reading import NOT_JSON

@@ -14,13 +14,13 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
-from hilstar import __version__
 from hilstar.attitude.wire.serial_link import adapters
 from hilstar.attitude.wire.zmq_socket import zmq_version
 from hilstar.errors import HilstarError, MachineError
 from hilstar.monitor.window.window import displays
 from hilstar.monitor.window.x11 import server_of
 from hilstar.render.context import create_context
+from hilstar.version import __version__
 
 COLUMNS = ("hilstar", "machine", "OpenGL", "display server", "monitors", "links", "what was measured, and what came out")
 TO_FILL = "(write it here)"

@@ -16,8 +16,8 @@ from hilstar.attitude.wire.udp import UdpLink
 from hilstar.attitude.wire.vizard import DifferenceRates, Follower, StateUse, VizardLive, vizard_broadcast
 from hilstar.attitude.wire.zmq_links import ZmqApart, ZmqLockstep, ZmqReceiver
 from hilstar.bench.config import AttitudeSettings, BenchConfig
-from hilstar.bench.config.stream.road import nasa42_road, udp_road
-from hilstar.bench.config.when import from_source
+from hilstar.bench.config.attitude import nasa42_road, udp_road
+from hilstar.bench.config.bench_config import from_source
 from hilstar.errors import InputError
 from hilstar.notices import Notices
 from hilstar.units import NS_PER_MS

@@ -13,8 +13,7 @@ from typing import Literal
 
 import numpy as np
 
-from hilstar.bench.frame import Bench
-from hilstar.bench.white import clipping_hip, named
+from hilstar.bench.frame import Bench, clipping_hip, named
 from hilstar.charts import BLUE, MUTED, ORANGE, RED, SERIES, chart, label_ends, write_csv
 from hilstar.monitor.balance import Balance
 from hilstar.monitor.phases import WHITE, fainter, line_places, phase_grid, phase_image, shown_by

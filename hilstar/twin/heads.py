@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from hilstar.arrays import FloatArray
 from hilstar.attitude.wire.source import Mounting
-from hilstar.bench.heads_file import HeadsFile
+from hilstar.bench.bench_file import HeadsFile
 from hilstar.monitor.quantise import MASK_TURNS
 from hilstar.rotation import conjugate, from_matrix, multiply, to_rotation_vector
 from hilstar.twin.verify.star_finder import Matched, crowded, shared, star_finder

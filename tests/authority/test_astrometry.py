@@ -10,7 +10,7 @@ from astropy.coordinates import SkyCoord
 from astropy.time import Time
 from astropy.wcs import WCS
 
-from hilstar.bench.world_coordinates import world_coordinates
+from hilstar.bench.frame_files import world_coordinates
 from hilstar.rotation import from_radec_roll_deg, to_matrix
 from hilstar.sky.catalog import Catalog, load_catalog, plain_catalog
 from hilstar.sky.stars import aberrate, unit_vectors_icrs

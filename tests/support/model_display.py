@@ -8,8 +8,8 @@ from types import SimpleNamespace
 
 import pytest
 
+from hilstar.bench.build import scan_of
 from hilstar.bench.config import parse_config
-from hilstar.bench.orientation import scan_of
 from hilstar.frame.view import View
 from hilstar.monitor.window.x11 import BackBuffer, SwapStamps
 from hilstar.run.screen import screen as screen_room

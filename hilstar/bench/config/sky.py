@@ -1,4 +1,4 @@
-"""[sky]."""
+"""The tables of the sky: [sky] and [sky.bodies], [spacecraft] from which it is seen, and [background]."""
 
 from __future__ import annotations
 
@@ -7,8 +7,11 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from hilstar.bench.config.values import EpochJyear, IcrsVector, Magnitude
+from hilstar.bench.config.values import EpochJyear, IcrsVector, Magnitude, NotNegative, Signed
 from hilstar.toml_tables import Table
+
+GEOCENTRE = "geocentre"
+SOURCE = "source"
 
 
 class Bodies(Table, frozen=True):
@@ -143,3 +146,47 @@ class SkySettings(Table, frozen=True):
         ),
     ] = (0.0, 0.0, 0.0)
     bodies: Bodies = msgspec.field(default_factory=Bodies)
+
+
+class Spacecraft(Table, frozen=True):
+    """From where the sky is seen. With this table, or bodies, places are apparent: parallax, light bending and aberration.
+
+    `[sky] observer_velocity_km_s` is then left out: the velocity is that of the Earth about the barycentre, and the satellite's
+    about the Earth.
+    """
+
+    orbit: Annotated[
+        str | None,
+        Meta(
+            description='`"geocentre"`, or the path of a file: one two-line element set (TLE), propagated by SGP4, or a CCSDS'
+            ' OEM (KVN; ICRF, GCRF or EME2000 about the Earth); `"source"`: where the messages of'
+            ' `[attitude] source = "vizard"` (Basilisk) have the spacecraft.',
+            extra={"default": 'none; `"geocentre"` with `[sky.bodies]`'},
+        ),
+    ] = None
+
+
+class Background(Table, frozen=True):
+    """Light between the stars. Only the virtual tracker sees it; the monitor shows none.
+
+    Give at most one of the first two keys.
+    """
+
+    electrons_per_px: Annotated[
+        NotNegative | None,
+        Meta(description="Electrons that the background makes in each tracker pixel per exposure.", extra={"default": "`0`"}),
+    ] = None
+    zodiacal_v_mag_arcsec2: Annotated[
+        Magnitude | None,
+        Meta(
+            description="Surface brightness of sunlight through the tracker's optics; the thesis takes 22.1.",
+            extra={"default": "none"},
+        ),
+    ] = None
+    gradient_electrons_across: Annotated[
+        tuple[Signed, Signed],
+        Meta(
+            description="By how many electrons per exposure the background grows from one edge of the detector to the other.",
+            extra={"form": "[right, down]"},
+        ),
+    ] = (0.0, 0.0)

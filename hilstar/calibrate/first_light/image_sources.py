@@ -19,9 +19,8 @@ import numpy.typing as npt
 from msgspec.structs import replace
 
 from hilstar.bench.bench_file import BenchFile
-from hilstar.bench.build import open_bench
+from hilstar.bench.build import open_bench, orientation_of
 from hilstar.bench.frame_files import write_codes_png
-from hilstar.bench.orientation import orientation_of
 from hilstar.calibrate.latency import Edges, capture_edges, edges_of
 from hilstar.calibrate.measurements import PRIMARIES
 from hilstar.errors import HilstarError, InputError, MachineError, shortened

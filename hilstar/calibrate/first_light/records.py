@@ -13,8 +13,7 @@ from typing import Literal
 
 import msgspec
 
-from hilstar.bench.bench_file import BenchFile, read_bench_file
-from hilstar.bench.bench_file_edit import with_key
+from hilstar.bench.bench_file import BenchFile, read_bench_file, with_key
 from hilstar.errors import InputError, shortened
 from hilstar.files import write_whole
 from hilstar.reading import MAX_TOML_BYTES, NOT_JSON, exists, read_bytes, read_text

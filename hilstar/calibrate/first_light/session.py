@@ -17,7 +17,6 @@ from typing import Any
 
 import msgspec
 
-from hilstar import __version__
 from hilstar.bench.bench_file import BenchFile
 from hilstar.calibrate.first_light.context import StepContext, nobody_watches
 from hilstar.calibrate.first_light.geometry import focus, geometry, orientation
@@ -43,6 +42,7 @@ from hilstar.files import clear_parts, open_lock, write_whole
 from hilstar.run.doctor import examine
 from hilstar.run.sync import BeatSummary, beat_of
 from hilstar.units import ERROR_OF_MEDIAN, NS_PER_S
+from hilstar.version import __version__
 
 WATCHED_S = 5.0  # about 150 edges at 60 Hz
 AGREE_MS = 0.05  # a smaller difference neither changes the bench file nor casts doubt on a scan-out

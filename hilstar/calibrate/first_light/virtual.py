@@ -11,9 +11,8 @@ from msgspec.structs import replace
 
 from hilstar.arrays import FloatArray
 from hilstar.bench.bench_file import BenchFile
-from hilstar.bench.build import open_bench
+from hilstar.bench.build import open_bench, orientation_of
 from hilstar.bench.cameras import tracker_camera
-from hilstar.bench.orientation import orientation_of
 from hilstar.calibrate.first_light.image_sources import KIND, CodeImage, DiodeRecording, Pattern, off_screen, on_screen
 from hilstar.calibrate.latency import Edges, edges_of, swap_to_square_ms
 from hilstar.errors import InputError

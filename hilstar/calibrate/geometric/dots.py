@@ -172,7 +172,7 @@ def show_dots(plan: DotPlan, monitor: Monitor, seconds: float | None, *, windowe
     Raises MachineError without a display or where that goes away, InputError for one that is not there.
     """
     # Here, for `calibrate dots` without --show draws nothing and starts without OpenGL.
-    from hilstar.bench.orientation import orientation_of
+    from hilstar.bench.build import orientation_of
     from hilstar.calibrate.plan import stays_until_key
     from hilstar.monitor.window.window import Window, WindowSettings
     from hilstar.render.presenter import Presenter, ScreenView, level_texture, window_context

@@ -30,7 +30,7 @@ def budget(
 ) -> None:
     """Find which magnitudes this monitor, sprite and quantisation can show, and how accurately."""
     from hilstar.bench.build import load
-    from hilstar.bench.white import shares_line
+    from hilstar.bench.frame import shares_line
     from hilstar.files import make_directory
     from hilstar.tracker.centroiders import FAMILY
     from hilstar.twin.budget import By, budget_lines, write_report

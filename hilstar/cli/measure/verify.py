@@ -16,7 +16,7 @@ from hilstar.files import check_directory
 
 if TYPE_CHECKING:
     from hilstar.bench.bench_file import BenchFile as Bench
-    from hilstar.bench.heads_file import HeadsFile
+    from hilstar.bench.bench_file import HeadsFile
     from hilstar.twin.verify.verdict import Verdict
 
 
@@ -38,7 +38,7 @@ def verify(
     """Run the digital twin: what the tracker would measure of the stars shown, against the sky."""
     import numpy as np
 
-    from hilstar.bench.heads_file import HeadsFile, read_bench_or_heads
+    from hilstar.bench.bench_file import HeadsFile, read_bench_or_heads
     from hilstar.files import make_directory
     from hilstar.twin.verify.proposals import check_writable
     from hilstar.twin.verify.summary import summarise, summary_lines, write_report

@@ -38,8 +38,8 @@ def frame(
     from hilstar.bench import frame_files as files
     from hilstar.bench.bench_file import at_moment, read_bench_file
     from hilstar.bench.build import open_bench
+    from hilstar.bench.cameras import fields_of_view
     from hilstar.bench.fault_views import faults_at
-    from hilstar.bench.fields_of_view import fields_of_view
     from hilstar.frame.truth import clipped_in
 
     q = parse_attitude("frame", radec, quaternion)

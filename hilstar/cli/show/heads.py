@@ -16,8 +16,7 @@ from hilstar.notices import Notices
 
 if TYPE_CHECKING:
     from hilstar.attitude.wire.zmq_links import ZmqReceiver
-    from hilstar.bench.bench_file import BenchFile
-    from hilstar.bench.heads_file import HeadsFile
+    from hilstar.bench.bench_file import BenchFile, HeadsFile
 
 NO_ATTITUDE = 4
 

@@ -19,7 +19,7 @@ from hilstar.units import NS_PER_S
 if TYPE_CHECKING:
     from hilstar.attitude.wire.source import Conventions, Mounting
     from hilstar.bench.bench_file import BenchFile
-    from hilstar.bench.fields_of_view import FieldsOfView
+    from hilstar.bench.cameras import FieldsOfView
     from hilstar.bench.scenario import Scenario
     from hilstar.run.faults import AnyFaults, Recording
     from hilstar.run.frame_pulse import FramePulse
@@ -87,7 +87,7 @@ def shown_bench(file: BenchFile, headless: bool, windowed: bool, force: bool) ->
 
 def say_of_light(bench: Any) -> None:
     """Name the stars that this bench cannot show as bright as they are, and what is assumed of its primaries."""
-    from hilstar.bench.white import clipping_line, shares_line
+    from hilstar.bench.frame import clipping_line, shares_line
 
     for line in (clipping_line(bench), shares_line(bench)):
         if line is not None:

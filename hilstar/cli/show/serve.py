@@ -69,7 +69,7 @@ def serve(
     fed_by: FedBy = None,
 ) -> None:
     """Show the live attitude stream on the monitor; of a file with `heads`, on the monitor of each."""
-    from hilstar.bench.heads_file import HeadsFile, as_head, read_bench_or_heads
+    from hilstar.bench.bench_file import HeadsFile, as_head, read_bench_or_heads
 
     file = read_bench_or_heads(bench_file) if head_of is None else as_head(bench_file, head_of)
     if isinstance(file, HeadsFile):
@@ -79,7 +79,7 @@ def serve(
         serve_heads(file, asked, as_json)
         return
     from hilstar.attitude.wire.source import Mounting
-    from hilstar.bench.fields_of_view import fields_of_view
+    from hilstar.bench.cameras import fields_of_view
     from hilstar.console.publisher import PageParts, RunDescription
     from hilstar.run.loop import Limit
     from hilstar.run.record.ledger import Ledger

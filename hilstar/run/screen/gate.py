@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hilstar.arrays import FloatArray
+from hilstar.bench.build import orientation_of
 from hilstar.bench.config import Monitor
-from hilstar.bench.orientation import orientation_of
 from hilstar.errors import MachineError
 from hilstar.monitor.window.output_settings import findings
 from hilstar.monitor.window.window import Window

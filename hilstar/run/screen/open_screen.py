@@ -7,8 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from hilstar.bench.bench_file import BenchFile
-from hilstar.bench.build import open_bench
-from hilstar.bench.orientation import orientation_of
+from hilstar.bench.build import open_bench, orientation_of
 from hilstar.monitor.window.window import Window, WindowSettings
 from hilstar.render.driver import sleep_in_waits
 from hilstar.render.presenter import window_context

@@ -5,8 +5,8 @@ from __future__ import annotations
 import logging
 import time
 
+from hilstar.bench.build import orientation_of
 from hilstar.bench.frame import Bench
-from hilstar.bench.orientation import orientation_of
 from hilstar.monitor.window.output_settings import OutputState
 from hilstar.monitor.window.window import Window
 from hilstar.render.presenter import Presenter, ScreenView, changed_codes

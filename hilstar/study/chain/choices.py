@@ -23,7 +23,7 @@ from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.bench.bench_file import BenchFile
 from hilstar.bench.build import assembled, bench_stars
 from hilstar.bench.config import AttitudeSettings, BenchConfig, RenderSettings, SkySettings
-from hilstar.bench.config.spacecraft import Spacecraft
+from hilstar.bench.config.sky import Spacecraft
 from hilstar.bench.frame import Bench
 from hilstar.errors import InputError
 from hilstar.monitor.quantise import Quantisation

@@ -20,8 +20,7 @@ from itertools import combinations
 
 import numpy as np
 
-from hilstar.bench.bench_file import BenchFile, bench_file_of
-from hilstar.bench.bench_file_edit import with_key
+from hilstar.bench.bench_file import BenchFile, bench_file_of, with_key
 from hilstar.bench.config import DEFAULT_BRIGHTEST_V_MAG
 from hilstar.error_spread import ErrorSpread
 from hilstar.errors import InputError, cannot_write

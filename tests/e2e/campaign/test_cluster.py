@@ -67,8 +67,8 @@ def other_version(folder: Path) -> Path:
     """A folder to import another hilstar from: the same but for its version."""
     (folder / "other" / "hilstar").mkdir(parents=True)
     for entry in Path(hilstar.__file__).parent.iterdir():
-        if entry.name == "__init__.py":
-            (folder / "other/hilstar/__init__.py").write_text(
+        if entry.name == "version.py":
+            (folder / "other/hilstar/version.py").write_text(
                 re.sub(r'__version__ = ".*"', '__version__ = "99.0"', entry.read_text())
             )
         elif entry.name != "__pycache__":

@@ -14,7 +14,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 import hilstar
-from hilstar.bench.white import clipping_hip
+from hilstar.bench.frame import clipping_hip
 from hilstar.monitor.calibration import load_calibration
 from hilstar.scene.psf import peak_share, pixel_share
 from hilstar.twin.budget import budget, zero_point_mag

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from hilstar.bench.bench_file_edit import with_key
+from hilstar.bench.bench_file import with_key
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from hilstar.bench.bench_file import read_bench_file
-from hilstar.bench.fields_of_view import fields_of_view
+from hilstar.bench.cameras import fields_of_view
 from tests.support.benches import ROOT
 from tests.support.commands import run_hilstar_here
 

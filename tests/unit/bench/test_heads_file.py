@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from hilstar.bench.heads_file import HeadsFile, as_head, read_bench_or_heads, read_heads
+from hilstar.bench.bench_file import HeadsFile, as_head, read_bench_or_heads, read_heads
 from hilstar.errors import InputError
 from tests.support.benches import SMALL_BENCH
 from tests.support.heads import MOUNTINGS, heads_file

@@ -10,8 +10,7 @@ from astropy.io import fits
 from astropy.wcs import WCS
 
 from hilstar.bench.build import load
-from hilstar.bench.frame_files import write_frame_fits
-from hilstar.bench.world_coordinates import MAX_SIP_PX, world_coordinates
+from hilstar.bench.frame_files import MAX_SIP_PX, world_coordinates, write_frame_fits
 from hilstar.monitor.geometry import monitor_camera
 from hilstar.rotation import from_radec_roll_deg, to_matrix
 from hilstar.scene.camera import Lens, ResidualField, bounded

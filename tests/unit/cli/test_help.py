@@ -49,4 +49,4 @@ def test_the_version_is_the_package_s(capsys):
 def test_the_version_stands_in_one_place():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
     assert project["project"]["dynamic"] == ["version"]
-    assert project["tool"]["hatch"]["version"]["path"] == "hilstar/__init__.py"
+    assert project["tool"]["hatch"]["version"]["path"] == "hilstar/version.py"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hilstar.bench.heads_file import read_heads
+from hilstar.bench.bench_file import read_heads
 from hilstar.rotation import from_rotation_vector, to_matrix
 from hilstar.twin.heads import rotation_between, verify_heads
 from tests.support.heads import heads_file

@@ -1,0 +1,293 @@
+"""The whole bench file: read, its keys checked together, and refused in one line where it is wrong."""
+
+from __future__ import annotations
+
+import math
+import time
+import warnings
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from hilstar.attitude.wire.packet import MAX_SPEED_KM_S
+from hilstar.attitude.wire.protocol import NORM_TOLERANCE
+from hilstar.bench.config.attitude import AttitudeSettings, FaultSettings, check_road
+from hilstar.bench.config.hardware import Collimator, Monitor, SyncSettings, Tracker, Verify, check_sync
+from hilstar.bench.config.render import DEFAULT_BRIGHTEST_V_MAG, MAX_JUDGED_FRAMES, RenderSettings
+from hilstar.bench.config.sky import GEOCENTRE, SOURCE, Background, SkySettings, Spacecraft
+from hilstar.errors import InputError, shortened
+from hilstar.reading import MAX_TOML_BYTES, parse_toml, read_text
+from hilstar.toml_tables import Kind, Table, explained
+from hilstar.units import LIGHT_KM_S, NS_PER_S
+
+TYPE_WORDS = {"float": "number", "int": "whole number", "str": "text", "object": "table", "bool": "true or false"}
+UNIX_JD, DAY_NS = 2_440_587.5, 86_400 * NS_PER_S
+EPOCH_KEY = "[sky] epoch_utc ="
+FROM_SOURCE, UNIX = "source", "unix"
+TT_FROM_TAI_NS, TAI_FROM_GPS_NS = 32_184_000_000, 19 * NS_PER_S  # TDB is TT within 2 ms
+SCALES = ("UTC", "TAI", "TT", "TDB", "GPS")
+MAX_AREA_PX = 2**26  # twice an 8K monitor: half a gigabyte for each float64 image of it
+HEADS = "heads"  # the key of a file that names bench files (see `HeadsFile`)
+
+
+class BenchConfig(Table, frozen=True):
+    """A whole bench file."""
+
+    tracker: Tracker
+    monitor: Monitor
+    collimator: Collimator
+    sky: SkySettings = msgspec.field(default_factory=SkySettings)
+    spacecraft: Spacecraft = msgspec.field(default_factory=Spacecraft)
+    attitude: AttitudeSettings = msgspec.field(default_factory=AttitudeSettings)
+    render: RenderSettings = msgspec.field(default_factory=RenderSettings)
+    background: Background = msgspec.field(default_factory=Background)
+    verify: Verify = msgspec.field(default_factory=Verify)
+    sync: SyncSettings = msgspec.field(default_factory=SyncSettings)
+    faults: FaultSettings = msgspec.field(default_factory=FaultSettings)
+
+    @property
+    def exposure_frames(self) -> int:
+        """The frames of the tracker's exposure by which `temporal` is judged."""
+        if self.render.cycle_frames is not None:
+            return self.render.cycle_frames
+        return min(max(1, round(self.tracker.exposure_s * self.monitor.refresh_hz)), MAX_JUDGED_FRAMES)
+
+
+def epoch_utc_ns(config: BenchConfig) -> int | None:
+    """The UTC of t = 0, ns since 1970 where every day has 86400 s; None where the file has none. Raises InputError."""
+    if config.sky.epoch_utc is None:
+        return None
+    if config.sky.epoch_utc == UNIX:
+        return 0
+    if config.sky.epoch_utc == FROM_SOURCE:
+        raise InputError(
+            f'{EPOCH_KEY} "{FROM_SOURCE}" is for a log that has dates (replay, simulate --log, attitude LOG);'
+            " write the UTC of t_ns = 0"
+        )
+    from hilstar.attitude.logs.earth import utc_ns_of  # with ERFA 30 ms, which a bench without a date does not need
+
+    return utc_ns_of(config.sky.epoch_utc, EPOCH_KEY)
+
+
+def has_observer(config: BenchConfig) -> bool:
+    """Whether the sky is seen from a known place: a spacecraft's, or for its bodies the Earth's centre."""
+    bodies = config.sky.bodies
+    shown = bodies.planets or bodies.moon or bodies.sun or bodies.earth or bodies.satellites is not None
+    return shown or config.spacecraft.orbit is not None
+
+
+def from_source(config: BenchConfig) -> bool:
+    """Whether the source of the attitudes says where the spacecraft is."""
+    return config.spacecraft.orbit == SOURCE
+
+
+def with_epoch(config: BenchConfig, path: Path, tables: dict[str, Any]) -> BenchConfig:
+    """The same with the Julian year of `epoch_utc`, which a bench's hash covers. Raises InputError for keys that disagree."""
+    if config.sky.epoch_utc is not None and "epoch_jyear" in tables.get("sky", {}):
+        raise InputError(f"{path}: [sky] has epoch_utc and epoch_jyear; write one of them")
+    if config.sky.bodies.satellite_magnitudes is not None and config.sky.bodies.satellites is None:
+        raise InputError(f'{path}: [sky.bodies] satellite_magnitudes is of no satellites; write satellites = "tles.txt" too')
+    if has_observer(config):
+        if config.sky.epoch_utc is None:
+            raise InputError(
+                f'{path}: [sky.bodies] and [spacecraft] need a date; write [sky] epoch_utc = "2026-11-21T00:00:00Z"'
+            )
+        if any(config.sky.observer_velocity_km_s):
+            raise InputError(
+                f"{path}: [sky] observer_velocity_km_s: with [sky.bodies] or [spacecraft] the velocity follows from the"
+                " ephemeris; leave it out"
+            )
+    _check_orbit(config, path)
+    attitude, orbit = config.attitude, config.spacecraft.orbit
+    if orbit not in {None, GEOCENTRE, SOURCE} and attitude.source == "vizard" and attitude.use_velocity:
+        raise InputError(
+            f"{path}: [attitude] use_velocity = true adds Basilisk's velocity to that of [spacecraft] orbit; write"
+            ' use_velocity = false, or orbit = "geocentre"'
+        )
+    if config.sky.epoch_utc in {FROM_SOURCE, UNIX}:
+        return config
+    try:
+        utc_ns = epoch_utc_ns(config)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    if utc_ns is None:
+        return config
+    return msgspec.structs.replace(config, sky=msgspec.structs.replace(config.sky, epoch_jyear=jyear(utc_ns)))
+
+
+def _check_orbit(config: BenchConfig, path: Path) -> None:
+    """Refuse (InputError) a place that nobody gives, and the Earth from its own centre."""
+    attitude, orbit = config.attitude, config.spacecraft.orbit
+    if config.sky.bodies.earth and orbit in {None, GEOCENTRE}:
+        raise InputError(
+            f"{path}: [sky.bodies] earth = true: from its centre no Earth is seen; write [spacecraft] orbit = the path of a TLE"
+            f' or an OEM, or "{SOURCE}"'
+        )
+    if not from_source(config):
+        return
+    if attitude.source != "vizard":
+        raise InputError(
+            f'{path}: [spacecraft] orbit = "{SOURCE}": of the sources of attitudes only "vizard" (Basilisk) sends the'
+            f' spacecraft\'s place, and [attitude] source = "{attitude.source}"; write the path of a TLE or an OEM'
+        )
+    if not attitude.use_velocity:
+        raise InputError(
+            f'{path}: [attitude] use_velocity = false, and [spacecraft] orbit = "{SOURCE}" takes the source\'s place and'
+            " velocity; leave use_velocity out"
+        )
+
+
+def with_dates(config: BenchConfig, scale: str | None, first_ns: int) -> BenchConfig:
+    """The same for a source that gives the dates: its first time, ns since 1970 on a time scale (see `Conventions`).
+
+    `epoch_utc` is then the UTC of its t_ns = 0 by the leap seconds of that day, and `epoch_jyear` the beginning of the day: for
+    it stars are placed. Unchanged where the file has a date of its own. Raises InputError for a source without dates, and for
+    one whose times are none of Unix where the file says that they are.
+    """
+    if config.sky.epoch_utc == UNIX:
+        if scale in SCALES and scale != "UTC":
+            raise InputError(f'{EPOCH_KEY} "{UNIX}": the times of this log are {scale}; write "{FROM_SOURCE}"')
+        return _on_day(config, UNIX, first_ns)
+    if config.sky.epoch_utc != FROM_SOURCE:
+        return config
+    if scale not in SCALES:
+        raise InputError(
+            f'{EPOCH_KEY} "{FROM_SOURCE}": the times of this log are no dates in {", ".join(SCALES[:-1])} or {SCALES[-1]};'
+            " write the UTC of t_ns = 0"
+        )
+    if scale == "UTC":
+        return _on_day(config, UNIX, first_ns)
+    ahead_ns = _ahead_of_utc_ns(scale, first_ns)
+    return _on_day(config, str(np.datetime64(-ahead_ns, "ns")), first_ns - ahead_ns)
+
+
+def today(config: BenchConfig) -> BenchConfig:
+    """The same with stars of the present day, by this machine's clock, where t_ns counts from 1970."""
+    return _on_day(config, UNIX, time.time_ns()) if config.sky.epoch_utc == UNIX else config
+
+
+def _on_day(config: BenchConfig, epoch_utc: str, utc_ns: int) -> BenchConfig:
+    """The same with this `epoch_utc`, and stars placed for the beginning of a UTC's day."""
+    day = jyear(utc_ns // DAY_NS * DAY_NS)
+    return msgspec.structs.replace(config, sky=msgspec.structs.replace(config.sky, epoch_utc=epoch_utc, epoch_jyear=day))
+
+
+def jyear(utc_ns: int) -> float:
+    """The Julian year of a UTC."""
+    import erfa
+
+    return float(erfa.epj(UNIX_JD, utc_ns / DAY_NS))
+
+
+def _ahead_of_utc_ns(scale: str, t_ns: int) -> int:
+    """How far a time scale is ahead of UTC at a time of it, ns since 1970."""
+    import erfa
+
+    tai_from_ns = {"TAI": 0, "GPS": -TAI_FROM_GPS_NS}.get(scale, TT_FROM_TAI_NS)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", erfa.ErfaWarning)  # years after the last known leap second
+        tai = UNIX_JD, (t_ns - tai_from_ns) / DAY_NS
+        utc = erfa.taiutc(*tai)
+        year, month, day, _ = erfa.jd2cal(*utc)
+        return tai_from_ns + round(float(erfa.dat(year, month, day, 0.0)) * NS_PER_S)
+
+
+KIND = Kind(BenchConfig, "configs/README.md", TYPE_WORDS)
+
+
+def read_config(path: Path) -> BenchConfig:
+    """Read and check a bench file. Raises InputError: file, key, what is wrong and what to write."""
+    return parse_config(path, read_text(path, "give the path of a bench file", MAX_TOML_BYTES))
+
+
+def parse_config(path: Path, text: str) -> BenchConfig:
+    """Parse and check the text of the bench file `path`. Raises InputError: file, key, what is wrong and what to write."""
+    return config_of(path, parse_toml(path, text))
+
+
+def config_of(path: Path, tables: dict[str, Any]) -> BenchConfig:
+    """Check the tables of the bench file `path`, as TOML gives them. Raises InputError as `parse_config` does."""
+    if HEADS in tables:
+        raise InputError(f"{path}: names several heads, and one bench file is wanted here; give one of its heads' files")
+    _check_finite(tables, path)
+    try:
+        config = msgspec.convert(tables, BenchConfig)
+    except InputError as error:  # what the detector's keys mean together
+        raise InputError(f"{path}: [tracker.detector] {error}") from error
+    except RecursionError as error:
+        raise InputError(f"{path}: its tables are nested too deep; see {KIND.reference}") from error
+    except msgspec.ValidationError as error:
+        raise InputError(f"{path}: {explained(str(error), tables, KIND)}") from error
+    _check_meaning(config, path)
+    return with_epoch(_with_white(config), path, tables)
+
+
+def _with_white(config: BenchConfig) -> BenchConfig:
+    """The same with the default white where the file gives none: a bench's hash covers it."""
+    render = config.render
+    if render.flux_at_white_e_per_s is not None or render.brightest_v_mag is not None:
+        return config
+    return msgspec.structs.replace(config, render=msgspec.structs.replace(render, brightest_v_mag=DEFAULT_BRIGHTEST_V_MAG))
+
+
+def _check_finite(value: Any, path: Path, where: str = "") -> None:
+    """Refuse (InputError) nan and inf, which TOML allows and no key here does."""
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            _check_finite(inner, path, f"{where}.{key}" if where else key)
+    elif isinstance(value, list):
+        for inner in value:
+            _check_finite(inner, path, where)
+    elif isinstance(value, float) and not math.isfinite(value):
+        raise InputError(f"{path}: {shortened(where)} = {value}; a finite number is wanted")
+
+
+def _check_meaning(config: BenchConfig, path: Path) -> None:
+    """What a type cannot say."""
+    _check_unit(path, "[collimator] q_cam_to_mon", config.collimator.q_cam_to_mon)
+    if config.tracker.q_body_to_cam is not None:
+        _check_unit(path, "[tracker] q_body_to_cam", config.tracker.q_body_to_cam)
+    _check_areas(path, config)
+    room_km_s = MAX_SPEED_KM_S if config.attitude.source == "vizard" else 0.0
+    if math.hypot(*config.sky.observer_velocity_km_s) + room_km_s >= LIGHT_KM_S:
+        raise InputError(f"{path}: [sky] observer_velocity_km_s is not slower than light; write km/s, ICRS x, y, z")
+    if config.background.electrons_per_px is not None and config.background.zodiacal_v_mag_arcsec2 is not None:
+        raise InputError(f"{path}: [background] has electrons_per_px and zodiacal_v_mag_arcsec2; write one of them")
+    if config.render.flux_at_white_e_per_s is not None and config.render.brightest_v_mag is not None:
+        raise InputError(f"{path}: [render] has flux_at_white_e_per_s and brightest_v_mag; write one of them")
+    ideal = [
+        name
+        for name in ("true_focal_length_mm", "true_pixel_pitch_um", "true_q_cam_to_mon")
+        if getattr(config.verify, name) is not None
+    ]
+    if config.verify.true_geometry is not None and ideal:
+        raise InputError(f"{path}: [verify] true_geometry takes the place of {ideal[0]}; leave one of them out")
+    if config.faults.endpoint is not None and config.faults.endpoint == config.attitude.address:
+        raise InputError(
+            f"{path}: [faults] endpoint = {config.faults.endpoint}: the attitude comes from there; write another port"
+        )
+    try:
+        check_sync(config.sync, config.tracker, config.monitor, config.attitude)
+    except InputError as error:  # it names the tables itself
+        raise InputError(f"{path}: {error}") from error
+    try:
+        check_road(config.attitude)
+    except InputError as error:
+        raise InputError(f"{path}: [attitude] {error}") from error
+
+
+def _check_areas(path: Path, config: BenchConfig) -> None:
+    for table, (width, height) in (("tracker", config.tracker.resolution_px), ("monitor", config.monitor.resolution_px)):
+        if width * height > MAX_AREA_PX:
+            raise InputError(
+                f"{path}: [{table}] resolution_px = [{width}, {height}]: {width * height / 1e6:.0f} million pixels; write"
+                f" {MAX_AREA_PX / 1e6:.0f} million at most, such as [8192, 8192]"
+            )
+
+
+def _check_unit(path: Path, where: str, q: tuple[float, ...]) -> None:
+    norm = math.hypot(*q)
+    if abs(norm - 1) > NORM_TOLERANCE:
+        raise InputError(f"{path}: {where}: its norm is {norm:.6g}; write a unit quaternion w, x, y, z")

@@ -1,0 +1,349 @@
+"""The tables of the bench's hardware: [tracker], [monitor], [collimator], [sync], and [verify], their true state."""
+
+from __future__ import annotations
+
+import re
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+from hilstar.bench.config.attitude import AttitudeSettings
+from hilstar.bench.config.values import Frequency, NotNegative, Point, Positive, Rotation, Sigma, Size
+from hilstar.errors import InputError
+from hilstar.toml_tables import Table
+from hilstar.tracker.settings import DetectorSettings, PixelPitch
+
+MS_PER_S = 1000.0
+ONE_PERIOD = {"default": "one refresh period"}
+NETWORK_PORT = "rfc2217://"
+ROUNDING = 1e-6  # relative: 0.1 s at 10 Hz is one exposure after the other
+AS_ASSUMED = {"default": "as the bench assumes"}
+
+
+class Tracker(Table, frozen=True):
+    """The star tracker under test.
+
+    Its aperture, quantum efficiency and transmission turn a star's light into electrons. Focal length, pixels, exposure,
+    point spread function and detector describe the *virtual* tracker of `simulate` and `verify`; the display adds nothing of
+    them, because the real tracker brings its own.
+
+    A curve (`quantum_efficiency`, `transmission`) is interpolated linearly between its points and is zero outside them. Where
+    both curves are plain numbers, light from 300 to 1100 nm counts.
+    """
+
+    aperture_mm: Annotated[Positive, Meta(description="Diameter of the entrance pupil.")]
+    focal_length_mm: Annotated[Positive, Meta(description="Focal length of the tracker's lens.")]
+    pixel_pitch_um: Annotated[PixelPitch, Meta(description="Distance between the centres of adjacent pixels.")]
+    resolution_px: Annotated[Size, Meta(description="Size of the detector.")]
+    quantum_efficiency: Annotated[
+        str | float,
+        Meta(
+            description='`"ccd47-20"` (back-illuminated, as measured), `"kai-4021"` (approximate), the path of a CSV file with '
+            "the header `wavelength_nm,value`, or one number for all wavelengths."
+        ),
+    ]
+    transmission: Annotated[
+        str | float,
+        Meta(
+            description='Of the tracker\'s optics: `"n-bk7-10mm"` (10 mm of uncoated glass), the path of a CSV file as above, '
+            "or one number."
+        ),
+    ] = 1.0
+    exposure_s: Annotated[NotNegative, Meta(description="Exposure time.")] = 0.1
+    frame_hz: Annotated[
+        Frequency | None,
+        Meta(
+            description="How many exposures the tracker takes in a second: with `refresh_hz` it makes the period of their beat "
+            "(see [sync](#sync)).",
+            extra={"default": "one exposure after the other"},
+        ),
+    ] = None
+    trigger: Annotated[
+        Literal["free", "external"],
+        Meta(
+            description='`"free"`: the tracker exposes by its own clock. `"external"`: each exposure begins with a frame of '
+            "the monitor (see [sync](#sync)): nothing beats."
+        ),
+    ] = "free"
+    psf_sigma_px: Annotated[
+        Sigma,
+        Meta(
+            description="Gaussian sigma of the tracker's own point spread function, in tracker pixels. It never widens the "
+            "stars on the monitor."
+        ),
+    ] = (0.55, 0.55)
+    principal_point_px: Annotated[
+        Point | None,
+        Meta(
+            description="Where the boresight meets the detector, in tracker pixels.",
+            extra={"default": "the middle of the detector"},
+        ),
+    ] = None
+    distortion: Annotated[
+        str | None,
+        Meta(
+            description="The path of the tracker's flight model: a TOML file with the Brown-Conrady coefficients `k1`, `k2`, "
+            "`k3`, `p1` and `p2` of tangents of field angles, from direction to pixel; those not given are 0.",
+            extra={"default": "an ideal lens"},
+        ),
+    ] = None
+    q_body_to_cam: Annotated[
+        Rotation | None,
+        Meta(
+            description="How the tracker sits in the spacecraft: turns body components into camera components. Applied to each "
+            "source whose attitude is the body's (see [attitude in](attitude-in.md)); packets, JSON and CSV hold the camera's.",
+            extra={"default": "the body's axes, with a notice"},
+        ),
+    ] = None
+    detector: Annotated[DetectorSettings, Meta(description="See below.")] = msgspec.field(default_factory=DetectorSettings)
+
+
+class Monitor(Table, frozen=True):
+    """The screen behind the collimator.
+
+    The window opens for `serve` and `replay` unless `--headless` is given; `--windowed` keeps it on the desktop. At the start
+    120 frames are measured. A display is refused (exit code 3), unless `--force` is given, when its size or refresh rate
+    differs from the bench file, when it has fewer bits, when it is scaled, composited or mirrored by another display, when it
+    drops frames, or when it does not wait for its refresh. A display that is unplugged is filled again when it returns.
+
+    Keys in the window: q quit, b blank, space pause, c crosshair, g grid, t next test pattern, h help. Frames whose sky was
+    changed with these keys are counted as `operator`; frames while the window was minimised, covered, moved off its display,
+    or on a display that slept are counted as `hidden`. The status, the ledger's frames and events, and `--json` have both
+    counts, in frames and in seconds.
+
+    A frame is drawn for the moment at which the middle row lights: the buffer swap plus `panel_delay_ms` plus half of
+    `scanout_ms`. A star on another row is drawn where it is when that row lights, and along its path for `hold_ms`.
+
+    To measure `panel_delay_ms`, put a photodiode in front of the square that `photodiode_px` draws, run
+    `serve --ledger RUN.mcap`, and meanwhile `hilstar latency RUN.mcap --diode serial:/dev/ttyACM0@115200 --write BENCH.toml`.
+    The photodiode's device sends a line `1` at each edge from dark to light and `0` at each edge back, or `1,MICROSECONDS`
+    by its own clock. `--edges FILE.csv` takes recorded edges instead (`host_ns,level`, on the host's monotonic clock).
+    """
+
+    resolution_px: Annotated[Size, Meta(description="Size of the screen.")]
+    pixel_pitch_um: Annotated[Positive, Meta(description="Distance between the centres of adjacent pixels.")]
+    refresh_hz: Annotated[float, Meta(ge=0.01, le=1000, description="Refresh rate; headless, the frame rate.")] = 60.0
+    bits: Annotated[int, Meta(ge=1, le=16, description="Bits of a code value.")] = 8
+    calibration: Annotated[
+        str,
+        Meta(
+            description='Light as a function of the code value: `"srgb"`, `"gamma2.2"`, `"lcd-example"` (invented, with a '
+            "black level and vignetting), or the path of a file that `hilstar calibrate photometric` wrote (see "
+            "[CALIBRATION.md](../configs/CALIBRATION.md))."
+        ),
+    ] = "srgb"
+    display: Annotated[
+        int | str,
+        Meta(description="Which display the window fills: its index, or a part of its name. `hilstar doctor` lists them."),
+    ] = 0
+    flip_x: Annotated[bool, Meta(description="The optics mirror left and right: the columns of the screen are reversed.")] = (
+        False
+    )
+    flip_y: Annotated[bool, Meta(description="The optics mirror up and down: the rows of the screen are reversed.")] = False
+    rotate_deg: Annotated[Literal[0, 90, 180, 270], Meta(description="Turns the image clockwise on the screen.")] = 0
+    panel_delay_ms: Annotated[
+        NotNegative, Meta(description="From the buffer swap to the light of the first row. `hilstar latency` measures it.")
+    ] = 0.0
+    scanout_ms: Annotated[
+        NotNegative | None,
+        Meta(
+            description="How long the panel takes to light its rows, first to last; 0 where all rows light at once.",
+            extra=ONE_PERIOD,
+        ),
+    ] = None
+    hold_ms: Annotated[
+        NotNegative | None,
+        Meta(description="How long a row stays lit; 0 for a panel that flashes.", extra=ONE_PERIOD),
+    ] = None
+    photodiode_px: Annotated[
+        int, Meta(ge=0, le=1000, description="Side of a square for a photodiode in the lower left corner; 0 for none.")
+    ] = 0
+    photodiode: Annotated[
+        Literal["toggle", "code"],
+        Meta(
+            description='`"toggle"`: the square is white in every other frame. `"code"`: it follows a sequence in which any '
+            "7 consecutive frames identify themselves."
+        ),
+    ] = "toggle"
+
+    @property
+    def period_ms(self) -> float:
+        """One refresh period, in milliseconds."""
+        return MS_PER_S / self.refresh_hz
+
+    @property
+    def panel_scanout_ms(self) -> float:
+        """`scanout_ms`, or its default."""
+        return self.period_ms if self.scanout_ms is None else self.scanout_ms
+
+    @property
+    def panel_hold_ms(self) -> float:
+        """`hold_ms`, or its default."""
+        return self.period_ms if self.hold_ms is None else self.hold_ms
+
+
+class Collimator(Table, frozen=True):
+    """The lens between monitor and tracker, and the tracker's alignment with it."""
+
+    focal_length_mm: Annotated[Positive, Meta(description="Focal length of the collimating lens.")]
+    q_cam_to_mon: Annotated[
+        Rotation,
+        Meta(description="Misalignment: the unit quaternion that turns cam components into mon components."),
+    ] = (1.0, 0.0, 0.0, 0.0)
+    principal_point_px: Annotated[
+        Point | None,
+        Meta(
+            description="Where the optical axis of the collimator meets the monitor, in monitor pixels.",
+            extra={"default": "the middle of the screen"},
+        ),
+    ] = None
+    geometry: Annotated[
+        str | None,
+        Meta(
+            description="The path of a file that `hilstar calibrate geometric` or `alignment` wrote: the lens and "
+            "the real alignment. It takes the place of the other keys of this table.",
+            extra={"default": "an ideal lens"},
+        ),
+    ] = None
+
+
+class SyncSettings(Table, frozen=True):
+    """The tracker's exposures and the monitor's refresh: how they beat, and a pulse for a tracker that takes a trigger.
+
+    An exposure of whole refreshes sees whole frames; of one that is not, the parts at both ends are counted where their frames'
+    middles are, and a star of a turning camera is off by an amount that depends on the phase between the two. A panel that
+    flashes (`[monitor] hold_ms`) is seen at its flashes alone, and whole refreshes cure its light, not its places.
+    `serve`, when it starts, and `first-light` say how much that is where it is over `[render] tolerance_px` or `tolerance_mag`,
+    and the nearest refresh rate and exposure without it.
+
+    With `port`, `serve` and `replay` raise the line RTS of a serial port at each frame: on a screen after its swap, headless at
+    the frame's moment. The host's scheduling and a USB adapter's own time are in the pulse's delay; `--json` has its mean and
+    standard deviation against the frames' time stamps as far as this machine sees them. A line that is lost is tried again and
+    never stops the display. Write `[tracker] trigger = "external"` for a tracker that exposes by it.
+    """
+
+    port: Annotated[
+        str | None,
+        Meta(
+            description='The serial port whose RTS is pulsed, such as `"/dev/ttyUSB0"`, or `"rfc2217://HOST:PORT"`. Not the '
+            "attitude's.",
+            extra={"default": "none"},
+        ),
+    ] = None
+    pulse_ms: Annotated[Positive, Meta(description="Width of the pulse, at least.")] = 1.0
+    active: Annotated[
+        Literal["high", "low"],
+        Meta(
+            description='`"high"`: RTS is set (positive on RS-232) in the pulse and cleared between. `"low"`: the other way '
+            "round. Adapters with TTL levels have their lines inverted: set is 0 V."
+        ),
+    ] = "high"
+    every_frames: Annotated[int, Meta(ge=1, le=1_000_000, description="A pulse at every so many frames.")] = 1
+    turn_deg_s: Annotated[
+        Positive, Meta(description="Rate of turn at which `serve` and `first-light` judge what a beat costs.")
+    ] = 1.0
+
+
+def check_sync(sync: SyncSettings, tracker: Tracker, monitor: Monitor, attitude: AttitudeSettings) -> None:
+    """Refuse (InputError) exposures that overlap, a pulse that lasts until the next, and a port that is the attitude's."""
+    if tracker.frame_hz is not None and tracker.frame_hz * tracker.exposure_s > 1 + ROUNDING:
+        most = f"{1 / tracker.exposure_s:.6g} or less"
+        raise InputError(
+            f"[tracker] frame_hz = {tracker.frame_hz:g}: exposures of {tracker.exposure_s:g} s overlap; write {most}"
+        )
+    if sync.port is None:
+        return
+    if not (sync.port.strip() and sync.port.isprintable()) or (
+        "://" in sync.port and not re.fullmatch(NETWORK_PORT + r"[^/?]+:\d{1,5}([/?].*)?", sync.port)
+    ):
+        advice = f'write "/dev/ttyUSB0" or the like, or "{NETWORK_PORT}HOST:PORT"; leave it out for no pulse'
+        raise InputError(f"[sync] port = {sync.port!r}: {advice}")
+    between_ms = sync.every_frames * monitor.period_ms
+    if sync.pulse_ms >= between_ms:
+        what = f"[sync] pulse_ms = {sync.pulse_ms:g}: the next pulse is due after {between_ms:.4g} ms"
+        raise InputError(f"{what}; write a shorter pulse, or a larger every_frames")
+    if attitude.source == "serial" and sync.port == attitude.port:
+        raise InputError(f"[sync] port = {sync.port}: the attitude comes over it; write another port")
+
+
+class Verify(Table, frozen=True):
+    """The digital twin: what `hilstar verify` takes as true where the bench assumes otherwise, and the limits within which
+    the bench passes.
+
+    The bench draws random attitudes as it believes itself to be; the monitor as it truly is turns the codes into light, and
+    the tracker measures each star without noise. `flux_error_mag` and `centroid_error_px` compare that with the same
+    measurement of the tracker's image of the linear image, so that the errors of the estimator itself (`estimator_floor`,
+    against the catalogue) are not charged to the display.
+
+    A star is **lost** when nothing is found within 3 px of its true place. Counted, but not part of the errors: `blended`
+    (others put more than 2 % of its light into its window), `clipped`, `not_shown` (too faint for the monitor), `at_edge` (of
+    the detector or the monitor). Stars that the tracker cannot part, within 1.5 sigmas of what it sees of a star, are measured
+    as one of the sum at the centre of their light; `summed` counts those added to a brighter one. `codes_alone` is what the
+    codes would cost were everything else as assumed; `noisy` is the same with all of `[tracker.detector]`. `scale_error`,
+    `rotation_arcsec`, `offset_px`, `tilt_deg`, `k1` and `distortion_px` (by the lens, the largest in the field) are those of
+    the smallest model that explains the centroids, true minus assumed; what it does not need is 0. `reasons` names what failed
+    and its likely cause.
+
+    `-o DIR` writes `errors.png`, `field.png` and `stars.csv` (a row per star, with `nan` for the errors of a lost one). The
+    exit code is 0 whatever the verdict; with `--strict` it is 1 when the bench does not pass.
+    """
+
+    true_calibration: Annotated[
+        str | None,
+        Meta(description="The monitor's true light: a built-in name or a calibration file.", extra=AS_ASSUMED),
+    ] = None
+    true_flux_at_white_e_per_s: Annotated[Positive | None, Meta(description="The true full scale.", extra=AS_ASSUMED)] = None
+    true_focal_length_mm: Annotated[
+        Positive | None, Meta(description="The collimator's true focal length.", extra=AS_ASSUMED)
+    ] = None
+    true_pixel_pitch_um: Annotated[Positive | None, Meta(description="The monitor's true pixel pitch.", extra=AS_ASSUMED)] = (
+        None
+    )
+    true_q_cam_to_mon: Annotated[Rotation | None, Meta(description="The true misalignment.", extra=AS_ASSUMED)] = None
+    true_geometry: Annotated[
+        str | None,
+        Meta(
+            description="The true lens and the true alignment: a file as `hilstar calibrate geometric` writes it. Not beside "
+            "`true_focal_length_mm`, `true_pixel_pitch_um` or `true_q_cam_to_mon`, which are of an ideal lens.",
+            extra=AS_ASSUMED,
+        ),
+    ] = None
+    true_mirror: Annotated[
+        Literal["none", "x", "y", "swap"],
+        Meta(
+            description='What the screen truly does: `"none"`, reverses columns (`"x"`), reverses rows (`"y"`), or swaps its '
+            'axes (`"swap"`).'
+        ),
+    ] = "none"
+    centroider: Annotated[
+        Literal["window", "wide", "moment", "fit", "box3", "box5"] | None,
+        Meta(
+            description='What the tracker finds its stars by: `"window"`, a Gaussian that follows the star and is as wide; '
+            '`"wide"`, one half as wide again; `"moment"`, the plain first moment; `"fit"`, the least squares of a PSF; '
+            '`"box3"` or `"box5"`, the centre of mass of so many pixels a side. '
+            '`quantisation = "auto"` judges codes by it, too.',
+            extra={"default": '`"window"`; to judge codes, all of them'},
+        ),
+    ] = None
+    flux_mag: Annotated[
+        Positive,
+        Meta(
+            description="Limit for the flux error of 95 % of stars, with their common zero point taken out; also the limit of "
+            "that zero point."
+        ),
+    ] = 0.05
+    centroid_px: Annotated[Positive, Meta(description="Limit for the centroid error of 95 % of stars, in tracker pixels.")] = (
+        0.1
+    )
+    lost_share: Annotated[
+        NotNegative,
+        Meta(description="Limit for the share of lost stars among those that stand alone, are shown, and are not clipped."),
+    ] = 0.02
+    black_e_per_s_px: Annotated[
+        NotNegative | None,
+        Meta(
+            description="Limit for the screen's black level in a tracker pixel, seen minus assumed.",
+            extra={"default": "a tenth of the faintest star's light over its disc (4 pi sigma^2)"},
+        ),
+    ] = None

@@ -1,1 +1,0 @@
-"""`[attitude]`: where attitudes come from, and by which road."""

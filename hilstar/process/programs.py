@@ -19,7 +19,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, Self
 
-MAX_OUTPUT_BYTES = 4_000_000  # of stdout and of stderr: a chatty solver prints some 100 kB
+MAX_OUTPUT_BYTES = 4_000_000  # each of stdout and stderr: a chatty solver prints some 100 kB
 CHUNK_BYTES = 65_536
 ENDED_WAIT_S = 1.0
 EACH_S = 1.0  # the status, and the watchdog where it asks for less

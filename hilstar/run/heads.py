@@ -43,7 +43,7 @@ Command = Callable[[int, float], Sequence[str]]
 Say = Callable[[str], None]
 POLL_MS = 10
 TEND_NS = NS_PER_S // 20
-MIN_DURATION_S = 0.05  # of a head that is begun again at the end
+MIN_DURATION_S = 0.05  # for a head that is restarted at the end
 ENDS_S = 5.0  # what a head may take to end in order
 SOCKET = "body"
 BODY = (1.0, 0.0, 0.0, 0.0)
@@ -61,7 +61,7 @@ class HeadProcess:
     def __init__(self, name: str, command: Command, say: Say, life: Path, secrets: Mapping[str, str] = NOTHING) -> None:
         self.name = name
         self.restarts = 0
-        self.code: int | None = None  # of its end, None before that
+        self.code: int | None = None  # None before its end
         self.output = b""  # what it wrote to stdout, the last time
         self._command, self._say, self._secrets = command, say, secrets  # not on a command line, which all users see
         self._address = str(life)

@@ -26,7 +26,7 @@ from hilstar.units import NS_PER_MS, NS_PER_S
 POLL_MS = 50
 
 
-class Steps:
+class LockstepRun:
     """The frames of a run up to its limit: each attitude is drawn at once, counted, and kept in the ledger."""
 
     def __init__(self, bench: Bench, limit: Limit, loop: FrameLoop, ledger: LedgerSwitch) -> None:
@@ -55,7 +55,7 @@ class Steps:
                 line = f"message refused ({refusal.reason}): {refusal.detail}; further ones are only counted"
                 self._loop.notices.mention("refused", line)
         shown = None if refusal is not None or sample is None else self._show(sample, host_ns)
-        self.last = shown or self.last  # of a frame that a fault drops, the one before stays
+        self.last = shown or self.last  # where a fault drops a frame, the previous one stays
         if self._ledger.on:
             self._ledger.packet(host_ns, raw, sample, refusal)
             if shown is not None:
@@ -89,7 +89,7 @@ class Steps:
         return self._loop.draw(self._loop.tally.frames, sample.t_ns, attitude)
 
 
-def serve_lockstep(link: LockstepLink, run: Steps, loop: FrameLoop, statuses: StatusMaker) -> RunSummary:
+def serve_lockstep(link: LockstepLink, run: LockstepRun, loop: FrameLoop, statuses: StatusMaker) -> RunSummary:
     """Answer requests up to the limit, or until a signal; returns the summary. A refused request leaves the last frame."""
     while run.goes_on():
         arrival = link.receive(POLL_MS)

@@ -22,7 +22,7 @@ from hilstar.process.interrupts import stop_on_signal
 from hilstar.run.faults import AnyFaults
 from hilstar.run.frame_pulse import FramePulse
 from hilstar.run.frame_status import StatusMaker
-from hilstar.run.lockstep import Steps, serve_lockstep
+from hilstar.run.lockstep import LockstepRun, serve_lockstep
 from hilstar.run.loop import FrameLoop, Limit, policy_of
 from hilstar.run.open_link import AnyLink
 from hilstar.run.operator import HeadlessOverrides, SwitchRequests
@@ -122,7 +122,7 @@ def serve(bench: Bench, link: AnyLink, limit: Limit, sink: FrameSink = ignore, o
 
 def _serve_lockstep(bench: Bench, link: LockstepLink, limit: Limit, loop: FrameLoop, outlet: Outlet) -> RunSummary:
     bench.warm_up()
-    steps = Steps(bench, limit, loop, outlet.ledger)
+    steps = LockstepRun(bench, limit, loop, outlet.ledger)
     outlet.follower(Running(loop, steps.counts))
     link.show_camera(_tracker_camera(bench), outlet.pictures)
     return serve_lockstep(link, steps, loop, StatusMaker(outlet.ledger))

@@ -23,7 +23,7 @@ ARCSEC_PER_DEG = 3600.0
 NO_BEAT = 1e-6
 PHASES = 1024
 EDGE = 1e-9  # refreshes: phases to either side of a jump
-SHORTEST_LIT = 1e-6  # of a refresh, for a panel that flashes
+SHORTEST_LIT = 1e-6  # share of a refresh, for a panel that flashes
 MIN_REFRESH_HZ, MAX_REFRESH_HZ = 0.01, 1000.0  # as [monitor] refresh_hz
 MAX_CHANGE = 2.0  # a refresh rate farther off than this factor is no proposal
 MM_PER_UM = 1e-3
@@ -109,7 +109,7 @@ def seen_at(exposures: Exposures, phase: FloatArray) -> SeenBeat:
 
 
 def _integrals(time: FloatArray, lit: float) -> tuple[FloatArray, FloatArray]:
-    """Of a row's light up to a time (n,) in refreshes, and of that times the middle of its frame's light."""
+    """Cumulative light of a row up to each time (n,), in refreshes, and its first moment."""
     whole = np.floor(time)
     part = np.minimum(time - whole, lit)
     return whole * lit + part, lit * whole * (whole - 1 + lit) / 2 + part * (whole + lit / 2)
@@ -154,7 +154,7 @@ def _period_s(exposures: Exposures) -> float | None:
     return None if abs(rest) < NO_BEAT else 1 / (abs(rest) * frame_hz)
 
 
-class Proposal(msgspec.Struct, frozen=True, kw_only=True):
+class BeatProposal(msgspec.Struct, frozen=True, kw_only=True):
     """The nearest settings without a beat, each to be changed alone; None where there is none.
 
     `frame_hz`, for a panel that flashes, is the nearest rate of the tracker at which its phase stands.
@@ -181,7 +181,7 @@ class BeatSummary(msgspec.Struct, frozen=True, kw_only=True):
     tolerance_arcsec: float
     tolerance_mag: float
     matters: bool
-    proposal: Proposal | None
+    proposal: BeatProposal | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,7 +236,7 @@ def beat_of(config: BenchConfig, refresh_hz: float | None = None, modes_hz: Sequ
     )
 
 
-def propose(exposures: Exposures, tolerance: Tolerance, modes_hz: Sequence[float] = ()) -> Proposal:
+def propose(exposures: Exposures, tolerance: Tolerance, modes_hz: Sequence[float] = ()) -> BeatProposal:
     """The nearest refresh rate, exposure and rate of the tracker that keep the beat within a tolerance, each alone.
 
     With `modes_hz` the refresh rate is the nearest of those.
@@ -247,7 +247,7 @@ def propose(exposures: Exposures, tolerance: Tolerance, modes_hz: Sequence[float
     refresh = [hz for hz in refresh if not tolerance.is_broken_by(beat(replace(exposures, refresh_hz=hz)))]
     exposure_s = _longest_whole(exposures, whole)
     cured = exposure_s is not None and not tolerance.is_broken_by(beat(replace(exposures, exposure_s=exposure_s)))
-    return Proposal(
+    return BeatProposal(
         refresh_hz=refresh[0] if refresh else None,
         exposure_s=exposure_s if cured else None,
         frame_hz=None if cured else _standing_hz(exposures),
@@ -289,10 +289,10 @@ def beat_line(found: BeatSummary) -> str | None:
     subject = (
         f"exposures of {found.exposure_s:g} s are {found.refreshes_per_exposure:.4g} refreshes of {found.refresh_hz:.6g} Hz"
     )
-    return f"{subject}: a star is off by up to {' and '.join(costs)}, {how}; {_cure(found.proposal or Proposal())}"
+    return f"{subject}: a star is off by up to {' and '.join(costs)}, {how}; {_cure(found.proposal or BeatProposal())}"
 
 
-def _cure(proposal: Proposal) -> str:
+def _cure(proposal: BeatProposal) -> str:
     ways = []
     if proposal.refresh_hz is not None:
         ways.append(f"[monitor] refresh_hz = {proposal.refresh_hz:.6g}")

@@ -8,7 +8,7 @@ from pathlib import Path
 import msgspec
 
 from hilstar.arrays import FloatArray
-from hilstar.attitude.logs.mcap_log import RUN_METADATA, McapWriter, Topic
+from hilstar.attitude.logs.mcap_log import RUN_METADATA, JsonTopic, McapWriter
 from hilstar.run.record.ledger_records import FRAME_TOPIC, FrameRecord, schema_of
 from tests.support.benches import SMALL_BENCH
 from tests.support.planted_tracker import Planted
@@ -20,7 +20,7 @@ def write_ledger(path: Path, frames_s: FloatArray, frames_q: FloatArray | None, 
     """A ledger with a frame at each time (n,), s after `start_ns` of the sender's clock, of the attitudes (n, 4), or none."""
     head = {"bench_text": SMALL_BENCH, "bench_file": str(path.parent / "bench.toml"), "bench_sha256": "of a test"}
     with path.open("wb") as file:
-        topic = Topic(FRAME_TOPIC, "hilstar.Frame", schema_of(FrameRecord, "hilstar.Frame"))
+        topic = JsonTopic(FRAME_TOPIC, "hilstar.Frame", schema_of(FrameRecord, "hilstar.Frame"))
         writer = McapWriter(file.fileno(), {"frame": topic}, RUN_METADATA, head)
         for number, t_s in enumerate(frames_s.tolist()):
             t_ns = start_ns + round(t_s * NS_PER_S)

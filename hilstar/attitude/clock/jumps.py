@@ -62,7 +62,7 @@ class _Step(NamedTuple):
     packets: int
 
 
-class Steps:
+class TimeSteps:
     """By how much t_ns usually advances from one message to the next."""
 
     def __init__(self) -> None:
@@ -138,7 +138,7 @@ class JumpFilter:
         self.jumps = 0
         self._clock = clock
         self._pace = Pace()
-        self._steps = Steps()
+        self._steps = TimeSteps()
         self._usual_ns: deque[float] = deque(maxlen=256)  # delays that raise no doubt
         self._limit_ns: float = UNSETTLED_NS
         self._agreement_ns: float = AGREEMENT_NS

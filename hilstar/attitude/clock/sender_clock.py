@@ -205,7 +205,7 @@ class Exchange:
         return ((self.t1_ns - self.t2_ns - base_ns) + (self.t4_ns - self.t3_ns - base_ns) - longer_ns) / 2
 
 
-class _Measured(NamedTuple):
+class _MeasuredExchange(NamedTuple):
     host_ns: int
     offset_ns: float
     delay_ns: int
@@ -215,13 +215,13 @@ class ExchangeFilter:
     """The line through the quickest of the exchanges."""
 
     def __init__(self) -> None:
-        self._measured: deque[_Measured] = deque()
+        self._measured: deque[_MeasuredExchange] = deque()
         self.count = 0
         self.line: OffsetLine | None = None
 
     def observe(self, exchange: Exchange, base_ns: int) -> None:
         """Take one exchange; the line's offsets are less `base_ns`."""
-        new = _Measured((exchange.t1_ns + exchange.t4_ns) // 2, exchange.offset_ns(base_ns), exchange.delay_ns)
+        new = _MeasuredExchange((exchange.t1_ns + exchange.t4_ns) // 2, exchange.offset_ns(base_ns), exchange.delay_ns)
         self.count += 1
         if self._contradicts(new):
             self.restart()
@@ -230,7 +230,7 @@ class ExchangeFilter:
             self._measured.popleft()
         self.line = self._fit(new)
 
-    def _fit(self, new: _Measured) -> OffsetLine:
+    def _fit(self, new: _MeasuredExchange) -> OffsetLine:
         min_ns = min(each.delay_ns for each in self._measured)
         limit_ns = max(min_ns * QUICK_DELAY_RATIO, min_ns + QUICK_DELAY_NS)
         quick = [each for each in self._measured if each.delay_ns <= limit_ns]
@@ -247,7 +247,7 @@ class ExchangeFilter:
             uncertainty_ns += abs(float(y[-1] - y[-2]))  # it may go on like that
         return OffsetLine(new.host_ns, new.offset_ns + level, drift, uncertainty_ns)
 
-    def _contradicts(self, new: _Measured) -> bool:
+    def _contradicts(self, new: _MeasuredExchange) -> bool:
         """True where no drift explains the new exchange: the clock was set, by however little."""
         line = self.line
         if line is None:

@@ -34,14 +34,14 @@ ANOTHER_COURSE_WITHIN_NS = 5 * NS_PER_S
 MAX_STRANGERS = 4
 EARLY_NS = 50 * NS_PER_MS  # from message to message t_ns may run ahead of the host's clock, or go back, by this and be one's
 MIN_FAR_RAD = 5e-5  # 10 arcsec
-FAR_RATIO = 3.0  # of what the attitudes lately came off their course
+FAR_RATIO = 3.0  # times the recent deviation of the attitudes from their course
 PLAUSIBLE_RAD_S = math.radians(60.0)
 STEADY = (0.7, 1.4)  # times the usual step of t_ns
 MAX_FIRST_LOSSES = 16  # packets missing, while their period is not known yet
 MAX_STEP_NS = 10 * NS_PER_S
 MIN_KNOWN, MIN_KNOWN_NS = 8, NS_PER_S  # before a sender's usual silences are known
 USUAL_SILENCES, SLACK_NS = 3, 20 * NS_PER_MS
-FORGETS, LEARNS = 0.98, 1 / 32  # of a silence or an error, with each message
+FORGETS, LEARNS = 0.98, 1 / 32  # decay and gain with each message, for silences and errors
 MIN_COURSES = 8  # attitudes alone are weaker evidence than clocks and counters
 
 Turn = tuple[float, float, float]
@@ -108,7 +108,7 @@ def _turn_rad(a: Sequence[float], b: Sequence[float]) -> Turn:
 
 
 @dataclass(frozen=True, slots=True)
-class _Agreement:
+class _CourseAgreement:
     """In what a message agrees with a sender; `far_rad` is how far its attitude lies from the course."""
 
     clock: bool
@@ -125,7 +125,7 @@ class _Agreement:
 
 
 @dataclass(slots=True)
-class _Sender:
+class _KnownSender:
     """What is known of one: its newest message, when that arrived, and how its messages advance."""
 
     sample: AttitudeSample
@@ -135,7 +135,7 @@ class _Sender:
     since_ns: int = 0
     count: int = 0  # its newest `sequence`, and the time of that
     count_t_ns: int = 0
-    period_ns: float | None = None  # of t_ns for each count, or for each message
+    period_ns: float | None = None  # step of t_ns for each count, or for each message
     still: bool = True  # it does not count: its sequence never changes
     turning_rad_s: Turn | None = None
     far_rad: float = 0.0  # how far its attitudes lately came off their course
@@ -143,13 +143,13 @@ class _Sender:
     q: list[float] = field(default_factory=list)
 
     @classmethod
-    def of(cls, arrival: SampleArrival) -> _Sender:
+    def of(cls, arrival: SampleArrival) -> _KnownSender:
         sample = arrival.event
         made = cls(sample, arrival.host_ns, arrival.waited_ns, since_ns=arrival.host_ns, count=sample.sequence)
         made.count_t_ns, made.q, made.turning_rad_s = sample.t_ns, sample.q_icrs_to_cam.tolist(), _rate_of(sample)
         return made
 
-    def agrees(self, arrival: SampleArrival) -> _Agreement:
+    def agrees(self, arrival: SampleArrival) -> _CourseAgreement:
         """In what a message agrees with this sender."""
         sample = arrival.event
         later_ns, gap_ns = sample.t_ns - self.sample.t_ns, arrival.host_ns - self.host_ns
@@ -163,7 +163,7 @@ class _Sender:
         if not clock:
             far_rad = min(far_rad, self._far_rad(turned, max(gap_ns, 0)))
         seconds = max(abs(later_ns) if clock else gap_ns, 0) / NS_PER_S
-        return _Agreement(
+        return _CourseAgreement(
             clock,
             self._counts_on(step, later_ns, gap_ns),
             far_rad <= MIN_FAR_RAD + FAR_RATIO * self.far_rad,
@@ -198,7 +198,7 @@ class _Sender:
         seconds = max(-NS_PER_S, min(meanwhile_ns, NS_PER_S)) / NS_PER_S
         return min(stood_rad, math.dist(turned, [seconds * rate for rate in self.turning_rad_s]))
 
-    def move(self, arrival: SampleArrival, agreed: _Agreement) -> None:
+    def move(self, arrival: SampleArrival, agreed: _CourseAgreement) -> None:
         """Take the next message of this sender."""
         sample = arrival.event
         later_ns, step = sample.t_ns - self.sample.t_ns, _steps(self.count, sample.sequence)
@@ -243,7 +243,7 @@ class _Waiting(NamedTuple):
     """A stranger's message that nothing has decided yet."""
 
     arrival: SampleArrival
-    sender: _Sender
+    sender: _KnownSender
 
 
 class Senders:
@@ -252,9 +252,9 @@ class Senders:
     def __init__(self, silent_after_ns: int, notices: Notices) -> None:
         self._silent_after_ns = silent_after_ns
         self._notices = notices
-        self._main: _Sender | None = None
-        self._left: _Sender | None = None  # the sender shown as it was before it went elsewhere, or another took its place
-        self._strangers: list[_Sender] = []
+        self._main: _KnownSender | None = None
+        self._left: _KnownSender | None = None  # the sender shown as it was before it went elsewhere, or another took its place
+        self._strangers: list[_KnownSender] = []
         self._waiting: list[_Waiting] = []
         self._courses = 0  # between which the sender shown went to and fro
         self._two = False
@@ -263,7 +263,7 @@ class Senders:
         """The messages that this one decides, in order, those of another sender than the one shown with a refusal."""
         main, host_ns = self._main, arrival.host_ns
         if main is None:
-            self._main = _Sender.of(arrival)
+            self._main = _KnownSender.of(arrival)
             return [arrival]
         self._strangers = [each for each in self._strangers if host_ns - each.host_ns < ANOTHER_COURSE_WITHIN_NS]
         if self._two and not self._strangers:
@@ -291,9 +291,9 @@ class Senders:
         waiting, self._waiting = self._waiting, []
         return [each.arrival for each in waiting]
 
-    def _rival(self, arrival: SampleArrival, agreed: _Agreement) -> _Sender | None:
+    def _rival(self, arrival: SampleArrival, agreed: _CourseAgreement) -> _KnownSender | None:
         """The stranger that a message is rather from, if there is one."""
-        best: _Sender | None = None
+        best: _KnownSender | None = None
         score, far_rad = agreed.score, agreed.far_rad if agreed.sky else FAR_RATIO * agreed.far_rad
         for each in self._strangers:
             its = each.agrees(arrival)
@@ -301,7 +301,7 @@ class Senders:
                 best, score, far_rad = each, its.score, its.far_rad
         return best
 
-    def _is_its_own(self, main: _Sender, sample: AttitudeSample, agreed: _Agreement) -> bool:
+    def _is_its_own(self, main: _KnownSender, sample: AttitudeSample, agreed: _CourseAgreement) -> bool:
         """Two of three agree; a turn to a new target is said, or could have been made, or comes by the usual step."""
         if agreed.sky:
             return agreed.clock or agreed.count
@@ -311,7 +311,7 @@ class Senders:
         counts = agreed.count or (main.still and sample.sequence == main.count)
         return agreed.clock and (counts and turned)
 
-    def _speaks(self, main: _Sender, arrival: SampleArrival, agreed: _Agreement) -> list[SampleArrival]:
+    def _speaks(self, main: _KnownSender, arrival: SampleArrival, agreed: _CourseAgreement) -> list[SampleArrival]:
         if not agreed.sky or not agreed.clock:
             self._left = replace(main)
         elif self._left is not None and arrival.host_ns - self._left.host_ns > self._left.patience_ns(self._silent_after_ns):
@@ -320,7 +320,7 @@ class Senders:
         main.move(arrival, agreed)
         return [*decided, arrival]
 
-    def _decide(self, main: _Sender, arrival: SampleArrival) -> list[SampleArrival]:
+    def _decide(self, main: _KnownSender, arrival: SampleArrival) -> list[SampleArrival]:
         """The sender shown has spoken: what strangers said meanwhile is refused, unless it continues in one count."""
         waiting, self._waiting = self._waiting, []
         if not waiting:
@@ -336,13 +336,13 @@ class Senders:
         self._two = True
         self._notices.begin(SECOND, "two senders on one link: showing the first, refusing the other (source)")
 
-    def _is_too_often(self, main: _Sender, sample: AttitudeSample) -> bool:
+    def _is_too_often(self, main: _KnownSender, sample: AttitudeSample) -> bool:
         """Whether one sender would not go to and fro like that: it has hardly begun to count, or it never counts."""
         if sample.sequence:
             return main.heard <= 2
         return main.still and self._courses >= MIN_COURSES and self._courses % 2 == 0
 
-    def _comes_back(self, arrival: SampleArrival, agreed: _Agreement) -> bool:
+    def _comes_back(self, arrival: SampleArrival, agreed: _CourseAgreement) -> bool:
         """Whether the sender that was left is there again, and goes on as if nothing had been between."""
         left = self._left
         if left is None or arrival.host_ns - left.host_ns > max(left.patience_ns(self._silent_after_ns), self._silent_after_ns):
@@ -350,7 +350,7 @@ class Senders:
         its = left.agrees(arrival)
         return its.sky and its.score > agreed.score and (its.clock or its.count)
 
-    def _return(self, main: _Sender, arrival: SampleArrival) -> list[SampleArrival]:
+    def _return(self, main: _KnownSender, arrival: SampleArrival) -> list[SampleArrival]:
         """Show the first sender again; who took its place is a stranger."""
         left = self._left
         if left is None:
@@ -361,10 +361,10 @@ class Senders:
             self._tell_two()
         return self._speaks(left, arrival, left.agrees(arrival))
 
-    def _take_strange(self, main: _Sender, arrival: SampleArrival, rival: _Sender | None) -> list[SampleArrival]:
+    def _take_strange(self, main: _KnownSender, arrival: SampleArrival, rival: _KnownSender | None) -> list[SampleArrival]:
         sender = rival or self._known(arrival)
         if sender is None:
-            sender = _Sender.of(arrival)
+            sender = _KnownSender.of(arrival)
             self._add_stranger(sender)
         elif arrival.event.t_ns == sender.sample.t_ns:
             refusal = Refusal("time", f"t_ns {arrival.event.t_ns} repeats that of an earlier packet")
@@ -383,7 +383,7 @@ class Senders:
             return [_refused(each.arrival) for each in self._emptied()]
         return []
 
-    def _known(self, arrival: SampleArrival) -> _Sender | None:
+    def _known(self, arrival: SampleArrival) -> _KnownSender | None:
         """The stranger that this message continues in two of three, or that repeats itself in it."""
         for each in self._strangers:
             its = each.agrees(arrival)
@@ -391,7 +391,7 @@ class Senders:
                 return each
         return None
 
-    def _give_way(self, main: _Sender, sender: _Sender, *, for_good: bool = False) -> list[SampleArrival]:
+    def _give_way(self, main: _KnownSender, sender: _KnownSender, *, for_good: bool = False) -> list[SampleArrival]:
         """The sender shown is silent: another one is shown, or the same one begun anew."""
         if self._two:
             self._part("the first sender is silent; showing the other one")
@@ -405,7 +405,7 @@ class Senders:
         waiting, self._waiting = self._waiting, []
         return waiting
 
-    def _add_stranger(self, sender: _Sender) -> None:
+    def _add_stranger(self, sender: _KnownSender) -> None:
         self._strangers = [*self._strangers[-MAX_STRANGERS + 1 :], sender]
 
     def _part(self, why: str) -> None:

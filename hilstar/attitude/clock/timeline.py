@@ -24,11 +24,11 @@ from hilstar.rotation import angle_between_rad, propagate, rate_between_rad_s, s
 from hilstar.units import NS_PER_S
 
 STEADY_S = 0.3  # time constant of the steady part
-MEMORY_S = 0.5  # of the regression: what is a second old counts an eighth
+MEMORY_S = 0.5  # time constant of the regression: a second-old sample counts an eighth
 MIN_SAMPLES = 10
 MAX_KEPT = 256  # samples to look back on: a quarter of a second at 1000 Hz
-MAX_SIGMAS = 3.0  # of the jitter: what exceeds it is a turn that begins, and is carried on whole
-AGE_SHARE = 0.1  # of each frame in the usual time ahead
+MAX_SIGMAS = 3.0  # larger jitter is the beginning of a turn, and is not damped
+AGE_SHARE = 0.1  # weight of each frame in the usual prediction time
 
 Vector = tuple[float, float, float]
 NOTHING: Vector = (0.0, 0.0, 0.0)
@@ -60,7 +60,7 @@ class Damped(NamedTuple):
 UNDAMPED = Damped(NOTHING, 1.0)
 
 
-class _Seen(NamedTuple):
+class _SeenSample(NamedTuple):
     t_ns: int
     turned: Vector  # since the beginning, the sum of the samples' own turns, rad
     steady: Vector
@@ -76,7 +76,7 @@ class Damping:
 
     def restart(self) -> None:
         """Forget the samples so far: what follows does not continue them."""
-        self._seen: deque[_Seen] = deque(maxlen=MAX_KEPT)
+        self._seen: deque[_SeenSample] = deque(maxlen=MAX_KEPT)
         self._trend = [0.0, 0.0, 0.0]
         self._weight = 0.0
         self._ahead_s = 0.0
@@ -90,7 +90,7 @@ class Damping:
         """Take the next sample, which turned by `turn` (rad) since the one before it; what to take from its rate."""
         if turn is None or not self._seen:
             self.restart()
-            self._seen.append(_Seen(t_ns, NOTHING, rate, NOTHING))
+            self._seen.append(_SeenSample(t_ns, NOTHING, rate, NOTHING))
             return UNDAMPED
         last = self._seen[-1]
         new = self._follow(last, t_ns, rate, turn)
@@ -101,7 +101,7 @@ class Damping:
         x, y, z = (self._excess(axis, new.jitter[axis]) for axis in range(3))
         return Damped((x, y, z), self._ahead_s)
 
-    def _follow(self, last: _Seen, t_ns: int, rate: Vector, turn: Vector) -> _Seen:
+    def _follow(self, last: _SeenSample, t_ns: int, rate: Vector, turn: Vector) -> _SeenSample:
         """The steady part and its trend, by the critically damped filter of second order (Brookner 1998, 1.2)."""
         step_s = (t_ns - last.t_ns) / NS_PER_S
         keeps = math.exp(-step_s / STEADY_S)
@@ -114,9 +114,9 @@ class Damping:
             self._trend[axis] += beta * off / step_s
             turned[axis] += turn[axis]
         jitter = rate[0] - steady[0], rate[1] - steady[1], rate[2] - steady[2]
-        return _Seen(t_ns, (turned[0], turned[1], turned[2]), (steady[0], steady[1], steady[2]), jitter)
+        return _SeenSample(t_ns, (turned[0], turned[1], turned[2]), (steady[0], steady[1], steady[2]), jitter)
 
-    def _learn(self, new: _Seen, step_s: float) -> None:
+    def _learn(self, new: _SeenSample, step_s: float) -> None:
         """How a sample's jitter went on until the newest one, as far ahead as frames predict."""
         from_ns = new.t_ns - round(self.usual_s * NS_PER_S)
         for before in reversed(self._seen):
@@ -188,9 +188,9 @@ class Timeline:
         self._capacity = capacity
         self._t_ns: list[int] = []
         self._samples: list[AttitudeSample] = []
-        self._received_ns: int | None = None  # of the newest
+        self._received_ns: int | None = None  # when the newest sample arrived
         self._damping = Damping() if policy.prediction == "auto" else None
-        self._damped = UNDAMPED  # of the newest
+        self._damped = UNDAMPED  # for the newest sample
         self._lock = threading.Lock()
 
     def __len__(self) -> int:

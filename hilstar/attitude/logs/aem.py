@@ -59,7 +59,7 @@ from hilstar.attitude.logs.aem_blocks import (
     sequence,
     xml_blocks,
 )
-from hilstar.attitude.logs.entries import Entry, LogReading
+from hilstar.attitude.logs.entries import LogEntry, LogReading
 from hilstar.attitude.logs.gaps import log_joins
 from hilstar.attitude.wire.packet import INT64, AttitudeSample, checked_sample
 from hilstar.attitude.wire.source import Conventions, components
@@ -82,7 +82,7 @@ AMBIGUOUS = (
 )
 QUARTER_TURN_DEG = 90.0
 ADVICE = "sort its lines; leap seconds are not counted, so write TAI across one"
-SCALES = frozenset({"UTC", "TAI", "TT", "TDB", "TCB", "GPS", "UT1", "SCLK"})  # of AEM 1.0; other clocks are written as UTC
+SCALES = frozenset({"UTC", "TAI", "TT", "TDB", "TCB", "GPS", "UT1", "SCLK"})  # AEM 1.0; other clocks are written as UTC
 COMMENTS = (
     "STARTRACKER_1 is the camera: +z boresight, +x right and +y down in its image.",
     "Epochs are the source's clock from 1970-01-01T00:00:00; leap seconds are not counted.",
@@ -155,7 +155,7 @@ class DatedBlock:
 
     block: Block
     times: list[int]
-    entries: list[Entry]
+    entries: list[LogEntry]
 
     @property
     def is_whole(self) -> bool:
@@ -172,14 +172,14 @@ class DatedBlock:
             timeline.add(sample)
         return timeline
 
-    def at(self, t_ns: int) -> Entry:
+    def at(self, t_ns: int) -> LogEntry:
         """Its attitude at a time within it, as a replay has it between two of its own, with the place of the one before."""
         where, before = self.entries[bisect_right(self.times, t_ns) - 1]
         attitude = self._timeline.at(t_ns)
         if attitude is None or not isinstance(before, AttitudeSample):
             raise AssertionError("a whole segment has attitudes")
         rate = None if before.rate_cam_rad_s is None else attitude.rate_cam_rad_s
-        return Entry(where, AttitudeSample(t_ns, attitude.q_icrs_to_cam, rate))
+        return LogEntry(where, AttitudeSample(t_ns, attitude.q_icrs_to_cam, rate))
 
     def useable_ns(self) -> tuple[int, int]:
         """Where it is meant to be used; without keywords, all of it. Raises AemFaultError."""
@@ -192,7 +192,7 @@ class DatedBlock:
         return min(max(start, first), last), max(min(stop, last), first)
 
 
-def resolved(segments: list[DatedBlock]) -> tuple[list[list[Entry]], str | None]:
+def resolved(segments: list[DatedBlock]) -> tuple[list[list[LogEntry]], str | None]:
     """The entries of segments, which come in the order of their first epochs, with those that overlap made one run of pieces.
 
     And what was done, in words; None where no segments overlap. Raises AemFaultError.
@@ -218,13 +218,13 @@ def resolved(segments: list[DatedBlock]) -> tuple[list[list[Entry]], str | None]
     )
 
 
-def _one_run(group: list[DatedBlock]) -> list[Entry]:
+def _one_run(group: list[DatedBlock]) -> list[LogEntry]:
     if len(group) > MAX_OVERLAPPING:
         where = group[0].block.where[0]
         raise AemFaultError(where, f"{len(group)} segments overlap, and {MAX_OVERLAPPING} may; write a file for each")
     useable = [segment.useable_ns() for segment in group]
     edges = sorted({edge for k, segment in enumerate(group) for edge in (segment.times[0], segment.times[-1], *useable[k])})
-    pieces: list[tuple[int, int, int]] = []  # of which segment, from, to
+    pieces: list[tuple[int, int, int]] = []  # block number, from, to
     for start, stop in pairwise(edges):
         having = [k for k, segment in enumerate(group) if segment.times[0] <= start and stop <= segment.times[-1]]
         meant = [k for k in having if useable[k][0] <= start and stop <= useable[k][1]]
@@ -233,17 +233,17 @@ def _one_run(group: list[DatedBlock]) -> list[Entry]:
             pieces[-1] = (taken, pieces[-1][1], stop)
         else:
             pieces.append((taken, start, stop))
-    run: list[Entry] = []
+    run: list[LogEntry] = []
     for number, (k, start, stop) in enumerate(pieces):
         last = number == len(pieces) - 1
         piece = _piece(group[k], start, stop if last else stop - 1)
         if run and isinstance(piece[0].event, AttitudeSample):
-            piece[0] = Entry(piece[0].where, replace(piece[0].event, discontinuity=True))
+            piece[0] = LogEntry(piece[0].where, replace(piece[0].event, discontinuity=True))
         run += piece
     return run
 
 
-def _piece(segment: DatedBlock, start_ns: int, stop_ns: int) -> list[Entry]:
+def _piece(segment: DatedBlock, start_ns: int, stop_ns: int) -> list[LogEntry]:
     """The attitudes of a segment from a time to another, both among them, made where it has none just then."""
     piece = segment.entries[bisect_left(segment.times, start_ns) : bisect_right(segment.times, stop_ns)]
     own = {entry.event.t_ns for entry in (piece[:1] + piece[-1:]) if isinstance(entry.event, AttitudeSample)}
@@ -270,7 +270,7 @@ def read_aem(text: str, of_date: OfDate) -> LogReading:
         raise AemFaultError("", "the spacecraft's frame changes from block to block; write one file for each")
     timed = [([epoch_ns(where, epoch) for where, epoch in zip(b.where, b.epochs, strict=True)], b) for b in blocks]
     timed.sort(key=lambda pair: pair[0][0])
-    entries: list[Entry] = []
+    entries: list[LogEntry] = []
     told: dict[str, str] = {}
     runs, overlap = resolved([DatedBlock(block, times, list(_entries(block, times, of_date, told))) for times, block in timed])
     if overlap is not None:
@@ -315,16 +315,16 @@ def _conventions(block: Block, first_ns: int, of_date: OfDate) -> Conventions:
     )
 
 
-def _part(entries: list[Entry], following: list[Entry]) -> None:
+def _part(entries: list[LogEntry], following: list[LogEntry]) -> None:
     """Mark the break between two blocks. 504.0-B-1 allows them a common epoch: the earlier then ends 1 ns before it."""
     (end_where, end), (where, first) = entries[-1], following[0]
     if isinstance(end, AttitudeSample) and isinstance(first, AttitudeSample):
         if end.t_ns == first.t_ns:
-            entries[-1] = Entry(end_where, replace(end, t_ns=end.t_ns - 1))
-        following[0] = Entry(where, replace(first, discontinuity=True))
+            entries[-1] = LogEntry(end_where, replace(end, t_ns=end.t_ns - 1))
+        following[0] = LogEntry(where, replace(first, discontinuity=True))
 
 
-def _entries(block: Block, times: list[int], of_date: OfDate, told: dict[str, str]) -> Iterator[Entry]:
+def _entries(block: Block, times: list[int], of_date: OfDate, told: dict[str, str]) -> Iterator[LogEntry]:
     q, rate = _attitudes(block)
     if block.meta["ATTITUDE_TYPE"] == SPIN and not _alias(block, times):
         rate = None
@@ -340,7 +340,7 @@ def _entries(block: Block, times: list[int], of_date: OfDate, told: dict[str, st
             told["earth-orientation"] = notice
     rates: Sequence[list[float] | None] = [None] * len(q) if rate is None else rate.tolist()
     for where, t_ns, numbers, turning in zip(block.where, times, q.tolist(), rates, strict=True):
-        yield Entry(where, checked_sample(t_ns, tuple(numbers), None if turning is None else tuple(turning)))
+        yield LogEntry(where, checked_sample(t_ns, tuple(numbers), None if turning is None else tuple(turning)))
 
 
 def _from_icrs(

@@ -330,7 +330,7 @@ def xml_blocks(text: str) -> list[Block]:
     if long is not None:
         line = text.count("\n", 0, long.start()) + 1
         raise AemFaultError(f":{line}", "is not an AEM in XML (an element has a million characters)")
-    reading = _Reading()
+    reading = _XmlReading()
     try:
         reading.parser.Parse(text.encode(), True)
     except expat.ExpatError as error:
@@ -343,7 +343,7 @@ def xml_blocks(text: str) -> list[Block]:
     ]
 
 
-class _Reading:
+class _XmlReading:
     """The elements as the parser meets them. A state is made numbers, and let go, where it ends."""
 
     def __init__(self) -> None:

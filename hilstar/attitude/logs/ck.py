@@ -31,7 +31,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.arrays import FloatArray
-from hilstar.attitude.logs.entries import Entry, LogReading, Stated
+from hilstar.attitude.logs.entries import LogEntry, LogReading, Stated
 from hilstar.attitude.wire.packet import checked_sample
 from hilstar.attitude.wire.source import Conventions, components
 from hilstar.errors import InputError, MachineError, shortened
@@ -94,11 +94,11 @@ def read_daf(path: Path, limit_bytes: int) -> Daf:
         words = doubles + (integers + 1) // 2
         if not (0 <= doubles <= 124 and 2 <= integers <= 250 and words <= 125):
             raise InputError(f"{path}: is a damaged DAF: its summaries have {doubles} doubles and {integers} integers")
-        return Daf(path, order, _summaries(file, _Layout(path, order, doubles, integers, size), first, last))
+        return Daf(path, order, _summaries(file, _DafLayout(path, order, doubles, integers, size), first, last))
 
 
 @dataclass(frozen=True, slots=True)
-class _Layout:
+class _DafLayout:
     path: Path
     order: str
     doubles: int
@@ -109,7 +109,7 @@ class _Layout:
         return InputError(f"{self.path}: is a damaged DAF: {what}; is it cut off?")
 
 
-def _summaries(file: IO[bytes], layout: _Layout, first: int, last: int) -> list[Summary]:
+def _summaries(file: IO[bytes], layout: _DafLayout, first: int, last: int) -> list[Summary]:
     """The summaries of the list of records from `first` to `last`; each record names the next and the previous one."""
     found: list[Summary] = []
     seen: set[int] = set()
@@ -133,7 +133,7 @@ def _summaries(file: IO[bytes], layout: _Layout, first: int, last: int) -> list[
     return found
 
 
-def _summary(raw: bytes, layout: _Layout) -> Summary:
+def _summary(raw: bytes, layout: _DafLayout) -> Summary:
     doubles = struct.unpack_from(f"{layout.order}{layout.doubles}d", raw)
     integers = struct.unpack_from(f"{layout.order}{layout.integers}i", raw, layout.doubles * WORD_BYTES)
     begin, end = integers[-2:]
@@ -261,11 +261,11 @@ def _asked(path: Path, kernels: list[Path], body: str | None) -> tuple[Arrays, d
     return arrays, said
 
 
-def _entries(arrays: Arrays) -> Iterator[Entry]:
+def _entries(arrays: Arrays) -> Iterator[LogEntry]:
     known: list[bool] = (~np.isnan(arrays["rate"][:, 0])).tolist()
     rows = zip(*(arrays[name].tolist() for name in ("t_ns", "q", "rate", "breaks", "tick")), strict=True)
     for has_rate, (t_ns, q, rate, breaks, tick) in zip(known, rows, strict=True):
-        yield Entry(f", tick {tick:.17g}", checked_sample(t_ns, q, rate if has_rate else None, discontinuity=breaks))
+        yield LogEntry(f", tick {tick:.17g}", checked_sample(t_ns, q, rate if has_rate else None, discontinuity=breaks))
 
 
 def _conventions(said: dict[str, Any]) -> Conventions:

@@ -41,7 +41,7 @@ from hilstar.units import NS_PER_S
 CK_DOUBLES, CK_INTEGERS = 2, 6
 DIRECTORY = 100  # every hundredth time stands in a directory too
 QUATERNION_WORDS, RATE_WORDS = 4, 3
-TYPE_5_WORDS = {0: 8, 1: 4, 2: 14, 3: 7}  # of a packet, by subtype
+TYPE_5_WORDS = {0: 8, 1: 4, 2: 14, 3: 7}  # words in a packet, by subtype
 TYPES = range(1, 7)
 Span = tuple[float, float]
 # J2000 is 2000-01-01T12:00:00 TDB; days of 86400 s since 1970-01-01T00:00:00 TDB.
@@ -50,16 +50,16 @@ SAME_MATRIX = 1e-12  # ckgp and ckgpav turn a frame by two routes, a few roundin
 FRAME = "J2000"  # SPICE's name of the axes of the ICRF
 SMOOTH = frozenset({2, 4, 5, 6})
 TARGET_RAD = math.radians(1e-3 / 3600)  # 1 mas, a hundredth of the best tracker's error
-FIRST_STEPS, MAX_STEPS = 128, 100_000  # of all smooth pieces together: 10 s at 0.1 ms each
+FIRST_STEPS, MAX_STEPS = 128, 100_000  # for all smooth pieces together: 10 s at 0.1 ms each
 PROBES = 200  # places between samples at which the error is looked at
-PROBED = (math.sqrt(5) - 1) / 2  # of a step: no symmetry of an interpolation hides its error there
+PROBED = (math.sqrt(5) - 1) / 2  # share of a step: no symmetry of an interpolation hides its error there
 DIFFERENCE_STEPS = 1 / 16  # a rate by difference, whose error h^2 w''/6 is then 1/256 of that over the step
 BESIDE_S = 2e-6  # beside a boundary: twenty times what ephemeris time resolves
 JUMP_RAD = math.radians(1e-2 / 3600)  # a boundary's attitudes agree within this, and three times the turn in BESIDE_S
 ALL = Policy(max_extrapolation_ns=0, stale_after_ns=0)
 MAX_CK_BYTES = 500_000_000
 MAX_NAMED_BODIES = 12
-CK_CLASS = 3  # of a frame whose attitude is in CKs
+CK_CLASS = 3  # SPICE's class of frames whose attitude is in CKs
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,7 +30,7 @@ import numpy.typing as npt
 
 from hilstar.arrays import FloatArray
 from hilstar.attitude.logs.aem_blocks import AemFaultError, epoch_ns
-from hilstar.attitude.logs.entries import Entry, Stated
+from hilstar.attitude.logs.entries import LogEntry, Stated
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.errors import InputError
 from hilstar.rotation import conjugate, from_matrix, multiply, normalise
@@ -40,7 +40,7 @@ IntArray = npt.NDArray[np.int64]
 HOUR_NS = 3600 * NS_PER_S
 UNIX_MJD, MJD_ZERO_JD = 40587, 2400000.5
 TT_FROM_TAI_S = 32.184
-EARTH_RATE_RAD_S = 7.292115146706979e-5  # of the Earth rotation angle: 2 pi 1.00273781191135448 a day of UT1 (IAU 2000)
+EARTH_RATE_RAD_S = 7.292115146706979e-5  # rate of the Earth rotation angle: 2 pi 1.00273781191135448 a day of UT1 (IAU 2000)
 UT1_ARCSEC_PER_S = 15.041
 TURNED = "turned to the ICRS with the Earth (IAU 2006/2000A; 15 arcsec for each second that its UTC is off)"
 UT1_S_A_YEAR = 1.1  # UT1-TAI, held at the ends of the table, has moved by this in a year since 1973 at most (days 3 ms long)
@@ -60,7 +60,7 @@ FIRST_DATE_NS = 946_684_800 * NS_PER_S
 BATCH = 4096
 
 
-class _Table(NamedTuple):
+class _EarthTable(NamedTuple):
     """Earth orientation by day (n,): MJD of UTC, UT1-TAI in seconds, and the pole's coordinates in radians."""
 
     mjd: FloatArray
@@ -135,7 +135,7 @@ def utc_ns_of(text: str, option: str) -> int:
 
 
 @lru_cache(maxsize=1)
-def _table() -> _Table:
+def _table() -> _EarthTable:
     """The IERS table of Astropy's package (finals2000A), with its predictions of a year."""
     from astropy.utils import iers
 
@@ -143,7 +143,7 @@ def _table() -> _Table:
     mjd = np.array(rows["MJD"].value, dtype=np.float64)
     ut1_utc_s, x_arcsec, y_arcsec = (np.array(rows[name].value, dtype=np.float64) for name in ("UT1_UTC", "PM_x", "PM_y"))
     ut1_tai_s = ut1_utc_s - tai_minus_utc_s(mjd.astype(np.int64) - UNIX_MJD)
-    return _Table(mjd, ut1_tai_s, np.radians(x_arcsec / 3600), np.radians(y_arcsec / 3600))
+    return _EarthTable(mjd, ut1_tai_s, np.radians(x_arcsec / 3600), np.radians(y_arcsec / 3600))
 
 
 def tai_minus_utc_s(unix_days: IntArray) -> FloatArray:
@@ -267,7 +267,7 @@ def zero_utc_ns(path: Path, stated: Stated, first_ns: int) -> int:
     return utc_ns_of(stated.epoch_utc, "--epoch-utc")
 
 
-def to_icrs(entries: Iterable[Entry], reference: Reference, gyro: bool, told: list[tuple[str, str]]) -> Iterator[Entry]:
+def to_icrs(entries: Iterable[LogEntry], reference: Reference, gyro: bool, told: list[tuple[str, str]]) -> Iterator[LogEntry]:
     """Attitudes from the reference to the body become those from ICRS; rates too, unless a gyroscope measured them.
 
     At their end `told` gets a notice where the dates leave the table of the Earth's orientation.
@@ -284,7 +284,7 @@ def to_icrs(entries: Iterable[Entry], reference: Reference, gyro: bool, told: li
             first_ns = samples[0].t_ns if first_ns is None else min(first_ns, samples[0].t_ns)
             last_ns = max(last_ns, samples[-1].t_ns)
         for entry in batch:
-            yield Entry(entry.where, next(turned)) if isinstance(entry.event, AttitudeSample) else entry
+            yield LogEntry(entry.where, next(turned)) if isinstance(entry.event, AttitudeSample) else entry
     if first_ns is not None:
         beyond = beyond_table(first_ns + reference.utc_ns, last_ns + reference.utc_ns)
         told += [] if beyond is None else [("log-earth", beyond)]

@@ -25,7 +25,7 @@ MAX_SAMPLES = 6_000_000  # 16 hours at 100 Hz; all are held, at 350 bytes each, 
 REORDER_NS = NS_PER_S  # queues between a driver and a recorder hold less; a clock that was set back jumps by more
 
 
-class Entry(NamedTuple):
+class LogEntry(NamedTuple):
     """`where` is a line (":12"), an epoch or a count, as it follows the file's name in a message."""
 
     where: str
@@ -56,14 +56,14 @@ class LogReading:
     `advice` is what to do when times do not increase; `told` are notices for the user, kinds and lines.
     """
 
-    entries: Iterable[Entry]
+    entries: Iterable[LogEntry]
     conventions: Conventions
     advice: str = "sort the log by time"
     told: list[tuple[str, str]] = field(default_factory=list)
 
 
 @dataclass(frozen=True, slots=True)
-class Log:
+class AttitudeLog:
     """A log as read: samples of the camera's attitude in order of time, what the file means by its numbers, and notices."""
 
     samples: list[AttitudeSample]
@@ -71,9 +71,9 @@ class Log:
     told: list[tuple[str, str]]
 
 
-def in_order(entries: Iterable[Entry], told: list[tuple[str, str]]) -> Iterator[Entry]:
+def in_order(entries: Iterable[LogEntry], told: list[tuple[str, str]]) -> Iterator[LogEntry]:
     """The entries by time, without exact repeats; at their end `told` gets a notice of each kind of change."""
-    waiting: list[tuple[int, int, Entry]] = []
+    waiting: list[tuple[int, int, LogEntry]] = []
     newest_ns, late, latest_ns, repeats = None, 0, 0, 0
     last: AttitudeSample | None = None
     for number, entry in enumerate(_with_end(entries)):
@@ -101,7 +101,7 @@ def in_order(entries: Iterable[Entry], told: list[tuple[str, str]]) -> Iterator[
         told.append(("log-repeats", f"{repeats} attitudes are exact repeats of the one before, and are dropped"))
 
 
-def _with_end(entries: Iterable[Entry]) -> Iterator[Entry | None]:
+def _with_end(entries: Iterable[LogEntry]) -> Iterator[LogEntry | None]:
     yield from entries
     yield None
 

@@ -19,7 +19,7 @@ import msgspec
 
 from hilstar.attitude.clock.timeline import Policy, Timeline
 from hilstar.attitude.logs.aem_blocks import AemFaultError, epoch_ns, epoch_text
-from hilstar.attitude.logs.entries import MAX_QUOTED_CHARACTERS, MAX_SAMPLES, Entry, Log, LogReading, Stated
+from hilstar.attitude.logs.entries import MAX_QUOTED_CHARACTERS, MAX_SAMPLES, AttitudeLog, LogEntry, LogReading, Stated
 from hilstar.attitude.logs.gaps import LogJoins, log_joins
 from hilstar.attitude.wire.packet import JSON_FORM, AttitudeSample, Refusal, checked_sample, decode
 from hilstar.attitude.wire.source import PACKETS
@@ -52,7 +52,7 @@ SECONDS_FORM = "write seconds after its first sample"
 TIME_FORM = f"{SECONDS_FORM}, or a date and time such as 2026-11-21T06:00:00"
 
 
-def read_csv(lines: Iterable[str]) -> Iterator[Entry]:
+def read_csv(lines: Iterable[str]) -> Iterator[LogEntry]:
     """The entries of a CSV log's lines."""
     reader = csv.reader(lines)
     rows = (row for row in reader if row and not row[0].startswith("#"))
@@ -63,11 +63,11 @@ def read_csv(lines: Iterable[str]) -> Iterator[Entry]:
     missing = [name for name in needed if name not in header]
     if missing:
         detail = f"column {missing[0]} is missing; the header must have {','.join(needed)}"
-        yield Entry(f":{reader.line_num}", Refusal("format", detail))
+        yield LogEntry(f":{reader.line_num}", Refusal("format", detail))
         return
     places = {name: header.index(name) for name in (*needed, "sequence", "discontinuity") if name in header}
     for row in rows:
-        yield Entry(f":{reader.line_num}", _sample(row, places))
+        yield LogEntry(f":{reader.line_num}", _sample(row, places))
 
 
 def _sample(row: list[str], places: dict[str, int]) -> AttitudeSample | Refusal:
@@ -112,14 +112,14 @@ def _seconds(t_ns: int) -> str:
     return f"{'-' if t_ns < 0 else ''}{seconds}.{ns:09}"
 
 
-def read_json_lines(lines: Iterable[str]) -> Iterator[Entry]:
+def read_json_lines(lines: Iterable[str]) -> Iterator[LogEntry]:
     """The entries of a log's lines; blank ones are ignored."""
     for number, line in enumerate(lines, start=1):
         if line.strip():
             event = decode(line.strip().encode())
             if not isinstance(event, AttitudeSample | Refusal):
                 event = Refusal("format", f"is not an attitude; write {JSON_FORM}")
-            yield Entry(f":{number}", event)
+            yield LogEntry(f":{number}", event)
 
 
 def write_json_lines(file: IO[bytes], samples: Sequence[AttitudeSample]) -> None:
@@ -138,7 +138,7 @@ def read_log(path: Path) -> list[AttitudeSample]:
     return open_log(path).samples
 
 
-def open_log(path: Path, stated: Stated = NOTHING_STATED) -> Log:
+def open_log(path: Path, stated: Stated = NOTHING_STATED) -> AttitudeLog:
     """The attitudes of a log in order of time, whatever its name, with what the file means by its numbers.
 
     Raises InputError with the line (AEM in XML: the epoch) for anything that is not an attitude: nothing is skipped unless
@@ -163,7 +163,7 @@ def open_log(path: Path, stated: Stated = NOTHING_STATED) -> Log:
         _refuse_other_topics(path)
         raise InputError(f"{path}: contains no attitude; write a CSV with the header {','.join(CSV_COLUMNS)}, or JSON lines")
     mounting = stated.mounting.told if reading.conventions.of_body else []
-    return Log(samples, reading.conventions, [*reading.told, *mounting])
+    return AttitudeLog(samples, reading.conventions, [*reading.told, *mounting])
 
 
 def _as_it_is(sample: AttitudeSample) -> AttitudeSample:
@@ -286,7 +286,7 @@ def _ros(path: Path, stated: Stated) -> Iterator[LogReading]:
 def _mcap(path: Path) -> LogReading:
     from hilstar.attitude.logs.mcap_log import read_attitudes
 
-    entries = (Entry(f", attitude {number}", sample) for number, sample in enumerate(read_attitudes(path), start=1))
+    entries = (LogEntry(f", attitude {number}", sample) for number, sample in enumerate(read_attitudes(path), start=1))
     return LogReading(entries, replace(PACKETS, source="MCAP"), "the sender restarted here; give a log of one run")
 
 

@@ -62,11 +62,11 @@ NO_END = "has no end: cut short, or its writer was killed or still writes; what 
 ADVICE = "give an MCAP file, such as the ledger of a run"
 MAX_CHUNK_BYTES = 64_000_000  # unpacked; writers make them of about 1 MB
 MAX_RECORD_BYTES = 256_000_000
-MAX_INFLATION, FREE_BYTES = 100, 32_000_000  # of a whole file; logs pack to a tenth
+MAX_INFLATION, FREE_BYTES = 100, 32_000_000  # limits for a whole file; logs pack to a tenth
 _record_head = struct.Struct("<BQ")
 _message_head = struct.Struct("<HIQQ")
-MAX_INDEX_BYTES = 16_000_000  # of about six hours of five chunks a second
-LEVEL = 3  # of zstd
+MAX_INDEX_BYTES = 16_000_000  # about six hours at five chunks a second
+LEVEL = 3  # zstd compression level
 _message_record = struct.Struct("<BQHIQQ")
 _footer_head = struct.Struct("<BQQQ")
 ATTITUDE_TOPIC = "/attitude"
@@ -290,7 +290,7 @@ def _inside(data: bytes) -> Iterator[McapRecord]:
 
 
 @dataclass(frozen=True, slots=True)
-class Topic:
+class JsonTopic:
     """A channel of JSON messages: its schema's name, and that schema."""
 
     name: str
@@ -309,7 +309,7 @@ class _Pending(NamedTuple):
 class McapWriter:
     """Writes to a file descriptor that is open for writing and empty; closing it stays the caller's. Raises OSError."""
 
-    def __init__(self, fd: int, topics: Mapping[str, Topic], metadata_name: str, metadata: Mapping[str, str]) -> None:
+    def __init__(self, fd: int, topics: Mapping[str, JsonTopic], metadata_name: str, metadata: Mapping[str, str]) -> None:
         self.size_bytes = 0
         self._fd = fd
         self._ids = {key: number for number, key in enumerate(topics, start=1)}
@@ -460,7 +460,7 @@ class _Form(msgspec.Struct):
     raw: str | None = None
 
 
-ATTITUDE_TOPIC_OF_RUN = Topic(ATTITUDE_TOPIC, ATTITUDE_SCHEMA_NAME, ATTITUDE_SCHEMA)
+ATTITUDE_TOPIC_OF_RUN = JsonTopic(ATTITUDE_TOPIC, ATTITUDE_SCHEMA_NAME, ATTITUDE_SCHEMA)
 
 _decoder = msgspec.json.Decoder(_Form)
 _encoder = msgspec.json.Encoder()

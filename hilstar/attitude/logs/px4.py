@@ -31,7 +31,7 @@ import numpy.typing as npt
 from hilstar.arrays import FloatArray
 from hilstar.attitude.logs import earth
 from hilstar.attitude.logs.aem_blocks import epoch_text
-from hilstar.attitude.logs.entries import Entry, LogReading, Stated, in_order
+from hilstar.attitude.logs.entries import LogEntry, LogReading, Stated, in_order
 from hilstar.attitude.wire.packet import checked_sample
 from hilstar.attitude.wire.source import Conventions, components
 from hilstar.errors import InputError, shortened
@@ -52,7 +52,7 @@ _head = struct.Struct("<HB")
 _u16 = struct.Struct("<H")
 IntArray = npt.NDArray[np.int64]
 MAX_TIME_US = 2**53  # 285 years: what a boot clock never shows
-GAP_INTERVALS = 5  # of the usual interval: farther from both neighbours, a value is unknown
+GAP_INTERVALS = 5  # usual intervals: farther than this from both neighbours, a value is unknown
 GLOBAL_POSITION = "vehicle_global_position"
 GPS = ("vehicle_gps_position", "sensor_gps")
 GROUND_TRUTH = "_groundtruth"
@@ -67,7 +67,7 @@ OLD_RATES = ("rollspeed", "pitchspeed", "yawspeed")  # in vehicle_attitude itsel
 ORDER_ADVICE = "the log has two attitudes of one time, or is damaged there"
 
 
-class Topic(NamedTuple):
+class ULogTopic(NamedTuple):
     """A topic of the log, and which of its instances."""
 
     name: str
@@ -79,7 +79,7 @@ class Sieved:
     """What is left of a log: `ulog` is a whole file of the wanted topics; `topics` are all that the log has."""
 
     ulog: bytes = b""
-    topics: set[Topic] = field(default_factory=set)
+    topics: set[ULogTopic] = field(default_factory=set)
     lost_ms: int = 0
     damaged_bytes: int = 0
     cut_at: int | None = None
@@ -121,7 +121,7 @@ def sieve(path: Path, wanted: frozenset[str]) -> Sieved:
     return result
 
 
-def _is_wanted(path: Path, kind: int, content: bytes, wanted: frozenset[str], found: tuple[set[int], set[Topic]]) -> bool:
+def _is_wanted(path: Path, kind: int, content: bytes, wanted: frozenset[str], found: tuple[set[int], set[ULogTopic]]) -> bool:
     ids, topics = found
     if kind == ord("D"):
         return len(content) > _u16.size and _u16.unpack_from(content)[0] in ids
@@ -136,7 +136,7 @@ def _is_wanted(path: Path, kind: int, content: bytes, wanted: frozenset[str], fo
             )
         return True
     if kind == ord("A") and len(content) > 3:
-        topic = Topic(content[3:].decode("ascii", "replace"), content[0])
+        topic = ULogTopic(content[3:].decode("ascii", "replace"), content[0])
         if len(topics) < MAX_SUBSCRIPTIONS:
             topics.add(topic)
         if topic.name in wanted and len(ids) < MAX_SUBSCRIPTIONS:
@@ -222,7 +222,7 @@ class Series(NamedTuple):
         return Series(self.t_us[good], {name: column[good] for name, column in self.columns.items()})
 
 
-def read_series(path: Path, sieved: Sieved) -> dict[Topic, Series]:
+def read_series(path: Path, sieved: Sieved) -> dict[ULogTopic, Series]:
     """Every topic that the sieved log has messages of. Raises InputError where pyulog reads none of it."""
     import pyulog
 
@@ -237,7 +237,7 @@ def read_series(path: Path, sieved: Sieved) -> dict[Topic, Series]:
     series = {}
     for data in log.data_list:
         if "timestamp" in data.data:
-            series[Topic(data.name, data.multi_id)] = Series(_times_us(path, data.data), data.data)
+            series[ULogTopic(data.name, data.multi_id)] = Series(_times_us(path, data.data), data.data)
     return series
 
 
@@ -271,7 +271,7 @@ class Utc(NamedTuple):
     words: str
 
 
-class Place(NamedTuple):
+class VehiclePlace(NamedTuple):
     """Geodetic latitude and longitude, degrees, each (n,), and where they are from."""
 
     latitude_deg: FloatArray
@@ -279,7 +279,7 @@ class Place(NamedTuple):
     words: str
 
 
-def boot_utc(path: Path, stated: Stated, topics: dict[Topic, Series], told: list[tuple[str, str]]) -> Utc:
+def boot_utc(path: Path, stated: Stated, topics: dict[ULogTopic, Series], told: list[tuple[str, str]]) -> Utc:
     """From `--epoch-utc`, else the median over the receiver's times. Raises InputError where there is neither."""
     offsets_us = _offsets_us(topics)
     gps_ns = round(float(np.median(offsets_us - offsets_us[0]))) * 1000 + int(offsets_us[0]) * 1000 if len(offsets_us) else None
@@ -300,7 +300,7 @@ def boot_utc(path: Path, stated: Stated, topics: dict[Topic, Series], told: list
     return Utc(gps_ns, f"{epoch_text(gps_ns)} by {len(offsets_us)} GPS times, 90 % of them within {spread_s:.3g} s")
 
 
-def _offsets_us(topics: dict[Topic, Series]) -> IntArray:
+def _offsets_us(topics: dict[ULogTopic, Series]) -> IntArray:
     """UTC less the boot clock (n,), microseconds, of the first receiver that has dates."""
     for series in _of(topics, GPS):
         utc_us = series.columns.get("time_utc_usec")
@@ -318,18 +318,20 @@ def _fixed_us(series: Series) -> IntArray:
     return series.t_us if late_us is None else series.t_us + late_us.astype(np.int64)
 
 
-def place_at(path: Path, stated: Stated, topics: dict[Topic, Series], t_us: IntArray, suffix: str) -> Place:
+def place_at(path: Path, stated: Stated, topics: dict[ULogTopic, Series], t_us: IntArray, suffix: str) -> VehiclePlace:
     """From `--place`, else the estimated position, else a receiver's. Raises InputError where there is none."""
     if stated.place is not None:
         latitude_deg, longitude_deg = (np.full(len(t_us), value) for value in stated.place[:2])
-        return Place(latitude_deg, longitude_deg, f"at latitude {stated.place[0]:g}, longitude {stated.place[1]:g}, as stated")
+        return VehiclePlace(
+            latitude_deg, longitude_deg, f"at latitude {stated.place[0]:g}, longitude {stated.place[1]:g}, as stated"
+        )
     for name in (GLOBAL_POSITION + suffix, *GPS):
         for series in _of(topics, (name,)):
             found = _degrees(series)
             if found is not None:
                 times, latitude_deg, longitude_deg = found
                 longitude_deg = np.unwrap(longitude_deg, period=360.0)
-                return Place(
+                return VehiclePlace(
                     np.interp(t_us, times, latitude_deg), np.interp(t_us, times, longitude_deg), f"at the place of {name}"
                 )
     raise InputError(f"{path}: has no position; give the place with --place LAT,LON,HEIGHT")
@@ -358,7 +360,7 @@ def _degrees(series: Series) -> tuple[IntArray, FloatArray, FloatArray] | None:
     return times_us[order], latitude_deg[good][order], longitude_deg[good][order]
 
 
-def _of(topics: dict[Topic, Series], names: tuple[str, ...]) -> list[Series]:
+def _of(topics: dict[ULogTopic, Series], names: tuple[str, ...]) -> list[Series]:
     """The series of topics by name, the first instance first."""
     return [topics[topic] for name in names for topic in sorted(topics) if topic.name == name]
 
@@ -367,7 +369,7 @@ class Turning(NamedTuple):
     """What turns north, east, down to the ICRS: UTC at boot, and the place at each attitude."""
 
     utc: Utc
-    place: Place
+    place: VehiclePlace
 
     def q_icrs_to_ned(self, t_us: IntArray) -> FloatArray:
         """The rotations (n, 4) at times of the boot clock (n,)."""
@@ -409,7 +411,7 @@ def _wanted(text: str | None) -> tuple[str, int | None]:
     return name, int(number) if number.isdecimal() and len(number) < 4 else None
 
 
-def _chosen(path: Path, topics: set[Topic], name: str, instance: int | None) -> Topic:
+def _chosen(path: Path, topics: set[ULogTopic], name: str, instance: int | None) -> ULogTopic:
     found = sorted(topic for topic in topics if topic.name == name and instance in {None, topic.instance})
     if not found:
         others = sorted(f"{topic.name}:{topic.instance}" for topic in topics if topic.name in ATTITUDES)
@@ -434,7 +436,7 @@ def _ready(path: Path, series: Series, q: FloatArray, told: list[tuple[str, str]
     return series.where(np.arange(len(q)) >= begin), q[begin:]
 
 
-def _rates(series: Series, topics: dict[Topic, Series], suffix: str) -> FloatArray | None:
+def _rates(series: Series, topics: dict[ULogTopic, Series], suffix: str) -> FloatArray | None:
     """Body rates (n, 3), rad/s, at the attitudes' times; NaN where the log has none, None where it has none at all."""
     for topic in sorted(topics):
         if topic.name == RATES + suffix:
@@ -445,7 +447,7 @@ def _rates(series: Series, topics: dict[Topic, Series], suffix: str) -> FloatArr
     return None
 
 
-def _entries(series: Series, q: FloatArray, rates: FloatArray | None, turning: Turning) -> Iterator[Entry]:
+def _entries(series: Series, q: FloatArray, rates: FloatArray | None, turning: Turning) -> Iterator[LogEntry]:
     counter = series.columns.get("quat_reset_counter", np.zeros(len(q)))
     resets = [False, *np.diff(counter.astype(np.int64)).astype(bool).tolist()]
     with np.errstate(all="ignore"):  # too
@@ -456,10 +458,10 @@ def _entries(series: Series, q: FloatArray, rates: FloatArray | None, turning: T
         rate = tuple(rows[number].tolist())
         known = None if any(map(math.isnan, rate)) else rate
         sample = checked_sample(t_us * 1000, (w, x, y, z), known, discontinuity=resets[number])
-        yield Entry(f": attitude {number + 1}", sample)
+        yield LogEntry(f": attitude {number + 1}", sample)
 
 
-def _conventions(topic: Topic, series: Series, turning: Turning, rates: FloatArray | None) -> Conventions:
+def _conventions(topic: ULogTopic, series: Series, turning: Turning, rates: FloatArray | None) -> Conventions:
     words = "turns components of the body (front, right, down) into north, east, down"
     gyro = "" if rates is None else "; the gyroscopes' rate, with respect to the stars"
     return Conventions(
@@ -475,7 +477,7 @@ def _conventions(topic: Topic, series: Series, turning: Turning, rates: FloatArr
 def _written(series: Series, turning: Turning) -> Callable[[FloatArray], str]:
     """An attitude (q_icrs_to_body) as the log has it, at its first time."""
     t_us = series.t_us[:1]
-    place = Place(turning.place.latitude_deg[:1], turning.place.longitude_deg[:1], "")
+    place = VehiclePlace(turning.place.latitude_deg[:1], turning.place.longitude_deg[:1], "")
     q_icrs_to_ned = Turning(turning.utc, place).q_icrs_to_ned(t_us)[0]
 
     def words(q: FloatArray) -> str:

@@ -32,8 +32,8 @@ import numpy.typing as npt
 
 from hilstar.arrays import FloatArray
 from hilstar.attitude.logs.earth import AXES, EXACT, FIRST_DATE_NS, KINDS, Kind, Reference, stated_reference, to_icrs
-from hilstar.attitude.logs.entries import Entry, LogReading, Stated, in_order
-from hilstar.attitude.logs.ros_bags import Bag, Encoding, Topic
+from hilstar.attitude.logs.entries import LogEntry, LogReading, Stated, in_order
+from hilstar.attitude.logs.ros_bags import Bag, BagTopic, Encoding
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal, checked_sample
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE
 from hilstar.attitude.wire.source import Conventions, components
@@ -79,14 +79,14 @@ def own_name(type_name: str) -> str:
     return TF if type_name == OLD_TF else type_name
 
 
-def decoded(topic: Topic, data: bytes) -> Any:
+def decoded(topic: BagTopic, data: bytes) -> Any:
     """The message in some bytes. Raises rosbags.serde.SerdeError."""
     store = typestore(topic.encoding)
     read = store.deserialize_cdr if topic.encoding == "cdr" else store.deserialize_ros1
     return read(data, own_name(topic.type))
 
 
-def check_definition(where: str, topic: Topic) -> None:
+def check_definition(where: str, topic: BagTopic) -> None:
     """Refuse (InputError) a type that only has the name of ROS's own."""
     if not topic.definition:
         return
@@ -125,7 +125,7 @@ def _short(name: str) -> str:
     return name.replace("/msg/", "/")
 
 
-class Turn(NamedTuple):
+class RosTurn(NamedTuple):
     """One orientation: `q` (w, x, y, z) turns components of the body into those of the reference.
 
     `stamp_ns` is the header's time, None where it has none; frames are None where the message does not name them. `rate` is in
@@ -142,7 +142,7 @@ class Turn(NamedTuple):
     fault: str | None = None
 
 
-def turns(type_name: str, message: Any) -> Iterator[Turn]:
+def turns(type_name: str, message: Any) -> Iterator[RosTurn]:
     """The orientations in a message of one of TYPES; several in a TFMessage."""
     if type_name in TF_TYPES:
         yield from map(_transform_stamped, message.transforms)
@@ -155,31 +155,31 @@ def frame(text: str) -> str:
     return text.lstrip("/")
 
 
-def _plain(q: Any) -> Turn:
-    return Turn(None, None, None, _q(q))
+def _plain(q: Any) -> RosTurn:
+    return RosTurn(None, None, None, _q(q))
 
 
-def _stamped(message: Any, q: Any) -> Turn:
-    return Turn(_stamp_ns(message), frame(message.header.frame_id), None, _q(q))
+def _stamped(message: Any, q: Any) -> RosTurn:
+    return RosTurn(_stamp_ns(message), frame(message.header.frame_id), None, _q(q))
 
 
-def _transform_stamped(message: Any) -> Turn:
+def _transform_stamped(message: Any) -> RosTurn:
     q = _q(message.transform.rotation)
-    return Turn(_stamp_ns(message), frame(message.header.frame_id), frame(message.child_frame_id), q)
+    return RosTurn(_stamp_ns(message), frame(message.header.frame_id), frame(message.child_frame_id), q)
 
 
-def _imu(message: Any) -> Turn:
+def _imu(message: Any) -> RosTurn:
     unknown = (
         "orientation_covariance[0] is -1: the IMU gives no orientation" if message.orientation_covariance[0] == -1 else None
     )
     rate = None if message.angular_velocity_covariance[0] == -1 else _vector(message.angular_velocity)
     body = frame(message.header.frame_id)
-    return Turn(_stamp_ns(message), None, body, _q(message.orientation), rate, gyro=True, fault=unknown)
+    return RosTurn(_stamp_ns(message), None, body, _q(message.orientation), rate, gyro=True, fault=unknown)
 
 
-def _odometry(message: Any) -> Turn:
+def _odometry(message: Any) -> RosTurn:
     body, rate = frame(message.child_frame_id), _vector(message.twist.twist.angular)
-    return Turn(_stamp_ns(message), frame(message.header.frame_id), body, _q(message.pose.pose.orientation), rate)
+    return RosTurn(_stamp_ns(message), frame(message.header.frame_id), body, _q(message.pose.pose.orientation), rate)
 
 
 def _q(q: Any) -> Numbers:
@@ -196,7 +196,7 @@ def _stamp_ns(message: Any) -> int:
 
 
 TF_TYPES = frozenset({TF, OLD_TF})
-_TURN: dict[str, Callable[[Any], Turn]] = {
+_TURN: dict[str, Callable[[Any], RosTurn]] = {
     "geometry_msgs/msg/Quaternion": _plain,
     "geometry_msgs/msg/QuaternionStamped": lambda m: _stamped(m, m.quaternion),
     "geometry_msgs/msg/Pose": lambda m: _plain(m.orientation),
@@ -221,7 +221,7 @@ class Edge:
     numbers: array[float] = field(default_factory=lambda: array("d"))
     moves: bool = False
 
-    def add(self, turn: Turn, received_ns: int) -> None:
+    def add(self, turn: RosTurn, received_ns: int) -> None:
         """One more transform."""
         self.moves |= bool(self.numbers) and tuple(self.numbers[:4]) != turn.q
         self.stamps_ns.append(turn.stamp_ns or 0)
@@ -256,7 +256,7 @@ class Edge:
         return found
 
 
-class Chain(NamedTuple):
+class FrameChain(NamedTuple):
     """The transforms from a body up to the frame that its attitude refers to, and the one whose times the attitudes have."""
 
     body: str
@@ -264,7 +264,7 @@ class Chain(NamedTuple):
     edges: tuple[Edge, ...]
     timed: Edge
 
-    def turns(self, told: list[tuple[str, str]]) -> Iterator[tuple[int, Turn]]:
+    def turns(self, told: list[tuple[str, str]]) -> Iterator[tuple[int, RosTurn]]:
         """When each transform of the timed part was recorded, and the orientation of the whole chain then.
 
         Other parts are unit; the timed one keeps its norm, for its check.
@@ -275,7 +275,7 @@ class Chain(NamedTuple):
         for edge in self.edges:
             part = self.timed.q if edge is self.timed else edge.at(t_ns)
             known &= np.isfinite(part).all(axis=1) | (edge is self.timed)
-            with np.errstate(all="ignore"):  # of the timed part, what is not finite is refused where it is checked
+            with np.errstate(all="ignore"):  # numbers of the timed part that are not finite are refused where they are checked
                 whole = multiply(part, whole)
         others = [edge for edge in self.edges if edge.moves and edge is not self.timed]
         if others:
@@ -287,13 +287,13 @@ class Chain(NamedTuple):
         rows = zip(known.tolist(), self.timed.received_ns, self.timed.stamps_ns, whole.tolist(), strict=True)
         for is_known, received_ns, stamp_ns, (w, x, y, z) in rows:
             if is_known:
-                yield received_ns, Turn(stamp_ns, self.reference, self.body, (w, x, y, z))
+                yield received_ns, RosTurn(stamp_ns, self.reference, self.body, (w, x, y, z))
 
 
 class Tree:
     """The transforms of a bag."""
 
-    def __init__(self, path: Path, transforms: Iterable[tuple[int, Turn]]) -> None:
+    def __init__(self, path: Path, transforms: Iterable[tuple[int, RosTurn]]) -> None:
         self._path = path
         self._up: dict[str, dict[str, Edge]] = {}
         count = 0
@@ -307,7 +307,7 @@ class Tree:
                 edge = parents[turn.reference or ""] = Edge(turn.reference or "", turn.body or "")
             edge.add(turn, received_ns)
 
-    def chain(self, body: str | None, reference: str | None) -> Chain:
+    def chain(self, body: str | None, reference: str | None) -> FrameChain:
         """From `body` up to `reference`, or as far as the tree goes; the body may be left out where one frame moves.
 
         Raises InputError where the tree has no such chain, or one of its transforms is no rotation.
@@ -322,7 +322,7 @@ class Tree:
                 raise InputError(
                     f"{self._path}: the transform {_edge_names([edge])} has a quaternion whose norm is off by {worst:.3g}"
                 )
-        return Chain(body, edges[-1].parent, edges, timed)
+        return FrameChain(body, edges[-1].parent, edges, timed)
 
     def _only_body(self) -> str:
         edges = [edge for parents in self._up.values() for edge in parents.values()]
@@ -414,17 +414,17 @@ class Heard(NamedTuple):
 
     where: str
     receive_ns: int
-    turn: Turn
+    turn: RosTurn
 
 
 class Start(NamedTuple):
     """The first orientation, and whether the messages have times of their own."""
 
-    turn: Turn
+    turn: RosTurn
     receive_ns: int
     stamped: bool
 
-    def t_ns(self, turn: Turn, receive_ns: int) -> int:
+    def t_ns(self, turn: RosTurn, receive_ns: int) -> int:
         """The time of an orientation of the same topic."""
         return (turn.stamp_ns or 0) if self.stamped else receive_ns
 
@@ -451,7 +451,7 @@ def read_ros(bag: Bag, stated: Stated) -> LogReading:
     )
 
 
-def _begin(bag: Bag, topic: Topic, heard: Iterator[Heard], body: str | None) -> tuple[Start, Iterator[Heard]]:
+def _begin(bag: Bag, topic: BagTopic, heard: Iterator[Heard], body: str | None) -> tuple[Start, Iterator[Heard]]:
     """What the first orientations say, and all of those of the stated body. Raises InputError where there are none."""
     first = next(heard, None)
     if first is None:
@@ -470,7 +470,7 @@ def _begin(bag: Bag, topic: Topic, heard: Iterator[Heard], body: str | None) -> 
     return Start(begin[0].turn, begin[0].receive_ns, stamped), chain(begin, heard)
 
 
-def _chosen(bag: Bag, wanted: str | None) -> Topic:
+def _chosen(bag: Bag, wanted: str | None) -> BagTopic:
     """The topic that is read. Raises InputError with those that there are."""
     topics = bag.topics()
     readable = [topic for topic in topics if topic.type in TYPES]
@@ -491,12 +491,12 @@ def _chosen(bag: Bag, wanted: str | None) -> Topic:
     return choice[0]
 
 
-def _topic_names(topics: list[Topic]) -> str:
+def _topic_names(topics: list[BagTopic]) -> str:
     names = [f"{topic.name} ({topic.type.replace('/msg/', '/')})" for topic in topics[:MAX_NAMED_TOPICS]]
     return shortened(", ".join([*names, *(["..."] if len(topics) > MAX_NAMED_TOPICS else [])]) or "no topic of ROS", 600)
 
 
-def _of_topic(bag: Bag, topic: Topic) -> Iterator[Heard]:
+def _of_topic(bag: Bag, topic: BagTopic) -> Iterator[Heard]:
     for number, message in enumerate(bag.messages(topic), start=1):
         where = f": message {number} of {topic.name}"
         try:
@@ -506,7 +506,7 @@ def _of_topic(bag: Bag, topic: Topic) -> Iterator[Heard]:
         yield from (Heard(where, message.receive_ns, turn) for turn in found)
 
 
-def _of_tf(bag: Bag, topic: Topic, stated: Stated, told: list[tuple[str, str]]) -> Iterator[Heard]:
+def _of_tf(bag: Bag, topic: BagTopic, stated: Stated, told: list[tuple[str, str]]) -> Iterator[Heard]:
     """The chain of transforms that is stated, from this topic and the static one beside it."""
     beside = topic.name.rpartition("/")[0] + "/" + STATIC_TF
     statics = [other for other in bag.topics() if other.type in TF_TYPES and other.name == beside and other != topic]
@@ -519,7 +519,7 @@ def _of_tf(bag: Bag, topic: Topic, stated: Stated, told: list[tuple[str, str]]) 
         yield Heard(f": transform {number} of {name}", receive_ns, turn)
 
 
-def _reference(bag: Bag, topic: Topic, start: Start, stated: Stated, told: list[tuple[str, str]]) -> Reference:
+def _reference(bag: Bag, topic: BagTopic, start: Start, stated: Stated, told: list[tuple[str, str]]) -> Reference:
     why = f"the messages of {topic.name} do not say which frame their orientation refers to"
     if topic.type == IMU:
         why += " (ROS recommends east, north, up: REP 145)"
@@ -527,18 +527,18 @@ def _reference(bag: Bag, topic: Topic, start: Start, stated: Stated, told: list[
     return stated_reference(bag.path, kind, stated, start.first_ns)
 
 
-def _entries(heard: Iterator[Heard], start: Start) -> Iterator[Entry]:
+def _entries(heard: Iterator[Heard], start: Start) -> Iterator[LogEntry]:
     """Each attitude from the reference to the body, at its time, or why it is none."""
     for where, receive_ns, turn in heard:
-        yield Entry(where, _fault(turn, start) or _sample(turn, start.t_ns(turn, receive_ns)))
+        yield LogEntry(where, _fault(turn, start) or _sample(turn, start.t_ns(turn, receive_ns)))
 
 
-def _sample(turn: Turn, t_ns: int) -> AttitudeSample | Refusal:
+def _sample(turn: RosTurn, t_ns: int) -> AttitudeSample | Refusal:
     w, x, y, z = turn.q
     return checked_sample(t_ns, (w, -x, -y, -z), turn.rate)
 
 
-def _fault(turn: Turn, start: Start) -> Refusal | None:
+def _fault(turn: RosTurn, start: Start) -> Refusal | None:
     first = start.turn
     if turn.fault is not None:
         return Refusal("format", turn.fault)
@@ -551,7 +551,7 @@ def _fault(turn: Turn, start: Start) -> Refusal | None:
     return None
 
 
-def _with_notices(entries: Iterator[Entry], bag: Bag, told: list[tuple[str, str]]) -> Iterator[Entry]:
+def _with_notices(entries: Iterator[LogEntry], bag: Bag, told: list[tuple[str, str]]) -> Iterator[LogEntry]:
     """The entries; what the bag has to say of itself is known at their end."""
     yield from entries
     told.extend(bag.told())
@@ -563,7 +563,7 @@ def _say_optical(body: str | None, stated: Stated, told: list[tuple[str, str]]) 
         told.append(("mounting", f"{body!r} has the axes of a camera by its name, and is turned by q_body_to_cam all the same"))
 
 
-def _conventions(topic: Topic, start: Start, reference: Reference) -> Conventions:
+def _conventions(topic: BagTopic, start: Start, reference: Reference) -> Conventions:
     turn = start.turn
     if not start.stamped:
         time = "when each message was recorded, ns since 1970"

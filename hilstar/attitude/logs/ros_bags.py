@@ -37,7 +37,7 @@ BAG_ADVICE = "give a bag of ROS 1 (.bag) or ROS 2 (.db3, .mcap, or the bag's dir
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 MAX_CHUNK_BYTES = 256_000_000  # unpacked; recorders make them of about 1 MB
 MAX_MESSAGE_BYTES = 64_000_000
-MAX_INFLATION, FREE_BYTES = 100, 32_000_000  # of a whole file; logs pack to a tenth
+MAX_INFLATION, FREE_BYTES = 100, 32_000_000  # limits for a whole file; logs pack to a tenth
 PIECE_BYTES = 1 << 20
 
 Encoding = Literal["ros1", "cdr"]
@@ -57,7 +57,7 @@ FILE_LIST = re.compile(r"^[ ]*relative_file_paths:[ ]*(?:\[([^\]\n]*)\]|\n((?:[ 
 FILE_NAME = re.compile(r".*\.(db3|mcap)(\.zstd)?")
 
 
-class Topic(NamedTuple):
+class BagTopic(NamedTuple):
     """A topic of a bag: `type` as PACKAGE/msg/NAME; `definition` is the type's text in the bag, "" where it has none."""
 
     name: str
@@ -76,10 +76,10 @@ class Message(NamedTuple):
 class Storage(Protocol):
     """One file of a bag."""
 
-    def topics(self) -> list[Topic]:
+    def topics(self) -> list[BagTopic]:
         """Its topics. Raises InputError for damage."""
 
-    def messages(self, topic: Topic) -> Iterator[Message]:
+    def messages(self, topic: BagTopic) -> Iterator[Message]:
         """The messages of a topic as recorded. Raises InputError for damage."""
 
     def told(self) -> list[tuple[str, str]]:
@@ -144,7 +144,7 @@ class Db3File:
     def __init__(self, path: Path) -> None:
         self._path = path
 
-    def topics(self) -> list[Topic]:
+    def topics(self) -> list[BagTopic]:
         """The rows of `topics`."""
         with self._open() as database:
             texts = {}
@@ -155,10 +155,10 @@ class Db3File:
             rows = database.execute("SELECT name, type, serialization_format FROM topics ORDER BY id")
             for name, kind, serialised in rows.fetchmany(MAX_TOPICS):
                 if serialised == "cdr":
-                    found.append(Topic(str(name), type_name(str(kind)), "cdr", str(texts.get(kind, ""))))
+                    found.append(BagTopic(str(name), type_name(str(kind)), "cdr", str(texts.get(kind, ""))))
             return list(dict.fromkeys(found))
 
-    def messages(self, topic: Topic) -> Iterator[Message]:
+    def messages(self, topic: BagTopic) -> Iterator[Message]:
         """The messages of a topic, in the order of recording."""
         with self._open() as database:
             ids = [
@@ -208,11 +208,11 @@ class McapBag:
     def __init__(self, path: Path) -> None:
         self._path = path
 
-    def topics(self) -> list[Topic]:
+    def topics(self) -> list[BagTopic]:
         """The channels whose messages are ROS's."""
         return list(dict.fromkeys(topic for _, topic in self._channels()))
 
-    def messages(self, topic: Topic) -> Iterator[Message]:
+    def messages(self, topic: BagTopic) -> Iterator[Message]:
         """The messages of a topic, in the order of the file."""
         wanted: set[int] = set()
         schemas: dict[int, Schema] = {}
@@ -233,7 +233,7 @@ class McapBag:
                 return []
         return [("log-cut", f"{self._path} was not closed by its recorder; all chunks that are whole are read")]
 
-    def _channels(self) -> Iterator[tuple[int, Topic]]:
+    def _channels(self) -> Iterator[tuple[int, BagTopic]]:
         schemas: dict[int, Schema] = {}
         for record in records_of(self._path):
             if isinstance(record, Schema):
@@ -248,11 +248,11 @@ class McapBag:
             raise damaged(self._path, error) from error
 
 
-def _topic(channel: Channel, schema: Schema | None) -> Topic | None:
+def _topic(channel: Channel, schema: Schema | None) -> BagTopic | None:
     if schema is None or channel.message_encoding not in ROS_ENCODINGS:
         return None
     text = schema.data.decode(errors="replace") if schema.encoding in {"ros2msg", "ros1msg"} else ""
-    return Topic(channel.topic, type_name(schema.name), "ros1" if channel.message_encoding == "ros1" else "cdr", text)
+    return BagTopic(channel.topic, type_name(schema.name), "ros1" if channel.message_encoding == "ros1" else "cdr", text)
 
 
 class CutError(Exception):
@@ -265,9 +265,9 @@ class BagFile:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._cut_at: int | None = None
-        self._topics: dict[int, Topic] = {}
+        self._topics: dict[int, BagTopic] = {}
 
-    def topics(self) -> list[Topic]:
+    def topics(self) -> list[BagTopic]:
         """The connections of the index; without one, those of all chunks."""
         with open_regular(self._path, BAG_ADVICE) as file:
             self._check_version(file)
@@ -278,7 +278,7 @@ class BagFile:
                     pass
         return list(dict.fromkeys(self._topics.values()))
 
-    def messages(self, topic: Topic) -> Iterator[Message]:
+    def messages(self, topic: BagTopic) -> Iterator[Message]:
         """The messages of a topic, in the order of the file."""
         for connection, message in self._records(len(VERSION)):
             if self._topics.get(connection) == topic:
@@ -347,7 +347,7 @@ class BagFile:
     def _connect(self, fields: Fields, data: bytes) -> None:
         more = _fields(data)
         name, kind = fields[b"topic"].decode(), type_name(more[b"type"].decode())
-        self._topics[_u32.unpack(fields[b"conn"])[0]] = Topic(name, kind, "ros1", more[b"message_definition"].decode())
+        self._topics[_u32.unpack(fields[b"conn"])[0]] = BagTopic(name, kind, "ros1", more[b"message_definition"].decode())
 
 
 def _record(file: IO[bytes], limit: int) -> tuple[Fields, bytes] | None:
@@ -395,15 +395,15 @@ class Bag:
         self.path = path
         self._files = files
         self._told = told
-        self._topics: list[Topic] | None = None
+        self._topics: list[BagTopic] | None = None
 
-    def topics(self) -> list[Topic]:
+    def topics(self) -> list[BagTopic]:
         """The topics of all files, each once; the files are looked through once. Raises InputError for damage."""
         if self._topics is None:
             self._topics = list(dict.fromkeys(topic for file in self._files for topic in file.topics()))
         return self._topics
 
-    def messages(self, topic: Topic) -> Iterator[Message]:
+    def messages(self, topic: BagTopic) -> Iterator[Message]:
         """The messages of a topic, file by file. Raises InputError for damage."""
         for file in self._files:
             yield from file.messages(topic)

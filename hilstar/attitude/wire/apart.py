@@ -1,7 +1,7 @@
 """A process of its own that reads a link, so that no stamp waits for Python's lock: this process's end, and what both say.
 
 The contract:
-1. This process gives an `Order`: a ZeroMQ stream to open, an open device to read (its descriptor goes along), or nothing to
+1. This process gives an `ReadOrder`: a ZeroMQ stream to open, an open device to read (its descriptor goes along), or nothing to
    read any more. A new order replaces the last one.
 2. The other process (`apart_child`) stamps each message and hands it over in a record that carries the order's number. What
    is still told of an earlier order is dropped here.
@@ -53,7 +53,7 @@ class ZmqStream(msgspec.Struct, frozen=True):
     allowed_clients: str | None = None
 
 
-class Order(msgspec.Struct, frozen=True):
+class ReadOrder(msgspec.Struct, frozen=True):
     """What to read from now on: a stream; or the device whose descriptor goes along; or nothing."""
 
     number: int
@@ -147,7 +147,7 @@ class ReaderProcess:
     def __init__(self, notices: Notices, module: str = CHILD) -> None:
         self.generation = 0
         self._notices, self._module = notices, module
-        self._order, self._file = Order(0), -1
+        self._order, self._file = ReadOrder(0), -1
         self._process: subprocess.Popen[bytes] | None = None
         self._wire: socket.socket | None = None
         self._stream = RecordStream()
@@ -189,17 +189,17 @@ class ReaderProcess:
 
     def read_stream(self, stream: ZmqStream) -> None:
         """Have a ZeroMQ stream opened and read."""
-        self._order = Order(self._order.number + 1, stream)
+        self._order = ReadOrder(self._order.number + 1, stream)
         self._give()
 
     def read_device(self, file: int) -> None:
         """Have an open device read; it stays this process's to write to and to close."""
-        self._order, self._file = Order(self._order.number + 1, device=True), file
+        self._order, self._file = ReadOrder(self._order.number + 1, device=True), file
         self._give()
 
     def read_nothing(self) -> None:
         """Have the device let go, before it is closed here: else its line stays open, and locked."""
-        self._order = Order(self._order.number + 1)
+        self._order = ReadOrder(self._order.number + 1)
         self._give()
 
     def wait(self, timeout_ms: float) -> bool:

@@ -24,7 +24,7 @@ from hilstar.attitude.wire.apart import (
     GoneRecord,
     MessageRecord,
     NoticeRecord,
-    Order,
+    ReadOrder,
     Record,
     SignRecord,
     ZmqStream,
@@ -67,7 +67,7 @@ class Wire:
         except OSError as error:
             raise EOFError from error
 
-    def order(self, timeout_ms: float) -> tuple[Order, int | None] | None:
+    def order(self, timeout_ms: float) -> tuple[ReadOrder, int | None] | None:
         """The newest order, if there is one within the time, and the device's descriptor."""
         if not self._poll.poll(timeout_ms):
             return None
@@ -80,7 +80,7 @@ class Wire:
                 said += more
         except OSError as error:
             raise EOFError from error
-        newest = msgspec.json.decode(said.splitlines()[-1], type=Order)
+        newest = msgspec.json.decode(said.splitlines()[-1], type=ReadOrder)
         return newest, files[0] if newest.device and files else None
 
 
@@ -190,7 +190,7 @@ class ZmqSource:
         self._link.close()
 
 
-def _source(wire: Wire, order: Order, file: int | None) -> Source | None:
+def _source(wire: Wire, order: ReadOrder, file: int | None) -> Source | None:
     if order.stream is not None:
         return ZmqSource(order.stream, ForwardedNotices(wire, order.number))
     return None if file is None else DeviceSource(file)

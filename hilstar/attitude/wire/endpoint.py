@@ -33,7 +33,7 @@ LABEL = "(?!-)[A-Za-z0-9-]{1,63}(?<!-)"
 HOST_NAME = re.compile(rf"(?:{LABEL}\.)*(?!0[xX])(?=[A-Za-z0-9-]*[A-Za-z]){LABEL}")
 TCP = re.compile(r"tcp://(\[[0-9A-Fa-f:.%A-Za-z]+\]|[^\[\]:/;@%\s]+):([0-9]{1,5}|\*)")
 MAX_HOST_CHARACTERS = 253
-MAX_PATH_BYTES = 107  # of sockaddr_un
+MAX_PATH_BYTES = 107  # the limit of sockaddr_un
 FREE_PORTS = ("*", "0")
 DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 5560
 BIND_FORM = 'write bind = "ADDRESS:PORT", such as "127.0.0.1:5560" or "[::1]:5560"'
@@ -143,7 +143,7 @@ def is_served(path: Path) -> bool:
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class UdpPlace:
     """An address of this machine and a port, 0 for a free one."""
 
     host: Address
@@ -185,7 +185,7 @@ class AllowedSenders:
         return known
 
 
-def bound_place(bind: bool | str | None, port: str | int, endpoint: str | None) -> Place:
+def bound_place(bind: bool | str | None, port: str | int, endpoint: str | None) -> UdpPlace:
     """Where to bind, from three keys that may say the same. Raises InputError where one is wrong, or two disagree."""
     if bind is False:
         raise InputError(f"bind = false: over UDP hilstar binds and the simulator sends to it; {BIND_FORM}")
@@ -200,7 +200,9 @@ def bound_place(bind: bool | str | None, port: str | int, endpoint: str | None) 
             raise InputError(f"{word}: not a UDP endpoint; write udp://ADDRESS:PORT, or {BIND_FORM.removeprefix('write ')}")
         said[word] = _parts(endpoint.removeprefix("udp://"), word)
     host = _agreed({word: host for word, (host, _) in said.items() if host is not None}, DEFAULT_HOST)
-    return Place(ipaddress.ip_address(host), _agreed({word: n for word, (_, n) in said.items() if n is not None}, DEFAULT_PORT))
+    return UdpPlace(
+        ipaddress.ip_address(host), _agreed({word: n for word, (_, n) in said.items() if n is not None}, DEFAULT_PORT)
+    )
 
 
 def _agreed(said: dict[str, T], otherwise: T) -> T:

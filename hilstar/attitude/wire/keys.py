@@ -25,7 +25,7 @@ from hilstar.reading import exists, read_bytes
 MAKE_KEYS = "make keys with `hilstar keys -o DIR`"
 MAX_KEY_FILE_BYTES = 16_384
 KEY_BYTES = 32
-OTHERS = 0o077  # of a file's mode: the rights of its group and of everybody else
+OTHERS = 0o077  # file mode bits: the rights of its group and of everybody else
 log = logging.getLogger(__name__)
 
 

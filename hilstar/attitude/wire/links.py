@@ -21,9 +21,9 @@ from hilstar.notices import Notices
 
 MAX_PACKETS_PER_S = 3000  # decoded: some 10 % of one core, and more than any serial line carries
 MAX_BURST = 1000  # as many as may have waited while the receiver was stopped
-PAUSE_S = 0.005  # of a flooded receiver: the frame loop needs the interpreter lock
+PAUSE_S = 0.005  # a flooded receiver rests: the frame loop needs the interpreter lock
 OVER_S = 1.0  # a flood is over once no packet was dropped for this long
-MAX_LOOKED_AT = 1000  # of what is passed over: a discontinuity is declared once, and not in each packet that is damaged
+MAX_LOOKED_AT = 1000  # passed-over packets searched for a discontinuity, which is declared once
 T = TypeVar("T")
 E_co = TypeVar("E_co", bound=Event, covariant=True)
 

@@ -47,13 +47,13 @@ Reason = Literal["crc", "norm", "nan", "time", "format", "rate", "source"]
 MESSAGE_REASONS: tuple[Reason, ...] = ("crc", "norm", "nan", "time", "format")
 STREAM_REASONS: tuple[Reason, ...] = ("rate", "source")
 REASONS = MESSAGE_REASONS + STREAM_REASONS
-MAX_SPEED_KM_S = 10_000.0  # of an observer: a thirtieth of that of light
-MIN_PLACE_KM, MAX_PLACE_KM = 6000.0, 1e7  # of one about the Earth: as an orbit's file is held to
+MAX_SPEED_KM_S = 10_000.0  # speed of an observer: a thirtieth of that of light
+MIN_PLACE_KM, MAX_PLACE_KM = 6000.0, 1e7  # distance from the Earth's centre: the limits of an orbit file, too
 RATE_ROUNDING = 1e-6  # a packet's rate is float32
 DELIMITER = b"\x00"
 # COBS adds one byte to anything shorter than 254. Only packets are framed: JSON goes over ZeroMQ.
 MAX_FRAME_BYTES = max(protocol.PACKET_BYTES.values()) + 1
-FLAGS_AT = 3  # of an attitude's frame: behind the COBS byte, version and kind, of which none is 0
+FLAGS_AT = 3  # in an attitude's frame, behind the COBS byte, version and kind, of which none is 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,7 +24,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from hilstar.attitude.wire.endpoint import AllowedSenders, Network, Place
+from hilstar.attitude.wire.endpoint import AllowedSenders, Network, UdpPlace
 from hilstar.attitude.wire.links import PAUSE_S, Arrival, FloodGate, LinkCounts, StreamLink
 from hilstar.attitude.wire.packet import MAX_JSON_BYTES, Event, Packet, Status, declares_discontinuity, decode, encode
 from hilstar.errors import InputError
@@ -153,7 +153,7 @@ class Datagrams:
         self._stamps = KernelStamps(made)
 
     @classmethod
-    def bound(cls, place: Place) -> Datagrams:
+    def bound(cls, place: UdpPlace) -> Datagrams:
         """Bound to a place. Raises InputError where it cannot be."""
         made = socket.socket(socket.AF_INET6 if place.host.version == 6 else socket.AF_INET, socket.SOCK_DGRAM)
         try:
@@ -278,7 +278,7 @@ class UdpLink(StreamLink):
     two_way = stamped = True
     verb = "bound to"
 
-    def __init__(self, place: Place, allowed: AllowedSenders, notices: Notices | None = None) -> None:
+    def __init__(self, place: UdpPlace, allowed: AllowedSenders, notices: Notices | None = None) -> None:
         self.link_counts = LinkCounts()
         self._notices = Notices() if notices is None else notices
         self._allowed = allowed
@@ -288,7 +288,7 @@ class UdpLink(StreamLink):
         self._filtered = False
         self._looked_s = 0.0
         self._datagrams = Datagrams.bound(place)
-        self.endpoint = str(Place(place.host, self._datagrams.port))
+        self.endpoint = str(UdpPlace(place.host, self._datagrams.port))
 
     def receive(self, timeout_ms: int) -> list[Arrival[Event]]:
         """The waiting datagrams of allowed senders, oldest first, and only the newest of a flood."""

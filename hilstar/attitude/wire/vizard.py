@@ -43,8 +43,8 @@ from hilstar.attitude.wire.vizard_message import (
     CelestialBody,
     Components,
     SimUpdate,
-    Spacecraft,
     VizCamera,
+    VizSpacecraft,
     WireFormatError,
     decode_update,
 )
@@ -57,11 +57,11 @@ from hilstar.units import ARCSEC_PER_RAD, NS_PER_S
 
 SIM_UPDATE = b"SIM_UPDATE"
 MAX_UPDATE_BYTES = 1 << 22  # settings, models and maps of a large scenario go along with its spacecraft
-MAX_NAMES = 8  # of spacecraft, in a refusal
+MAX_NAMES = 8  # spacecraft named in a refusal
 # Basilisk turns its camera (+z boresight, x right, y down, as `cam`) into Unity's before it sends it: sigma_CuC.
 SIGMA_CAM_TO_UNITY = (1 / 3, 1 / 3, -1 / 3)
 MAX_TURN_ARCSEC = 1.0
-MAX_FIELD_SHARE = 0.01  # of the field of view: Basilisk's camera has no distortion
+MAX_FIELD_SHARE = 0.01  # relative difference of the fields of view: Basilisk's camera has no distortion
 M_PER_KM = 1000.0
 EARTHS = ("earth", "earth_planet_data")  # as gravBodyFactory and its SPICE messages name it
 REQUEST_IMAGE, MAX_DIGITS = b"REQUEST_IMAGE_", 20
@@ -193,14 +193,14 @@ class Follower:
             sample = self._mounting.sample(self._rates.moving(sample))
         return sample, update
 
-    def _state(self, update: SimUpdate, craft: Spacecraft) -> tuple[FloatArray | None, FloatArray | None] | Refusal:
+    def _state(self, update: SimUpdate, craft: VizSpacecraft) -> tuple[FloatArray | None, FloatArray | None] | Refusal:
         """Place and velocity, as far as they are taken."""
         if self._taken == "state":
             return state_about_earth(update, craft)
         velocity = velocity_km_s(craft) if self._taken == "velocity" else None
         return velocity if isinstance(velocity, Refusal) else (None, velocity)
 
-    def _chosen(self, spacecraft: tuple[Spacecraft, ...]) -> Spacecraft | Refusal:
+    def _chosen(self, spacecraft: tuple[VizSpacecraft, ...]) -> VizSpacecraft | Refusal:
         """The spacecraft that is followed; parts of others (a parent is named) are taken only by their own name."""
         if self._name is None:
             found = [craft for craft in spacecraft if craft.parent in {"", craft.name}]
@@ -242,12 +242,12 @@ def disagreement(camera: VizCamera, tracker: TrackerCamera) -> str | None:
     return f"Basilisk's camera {camera.identity} is not the bench's [tracker], whose pictures it gets: {'; '.join(differences)}"
 
 
-def velocity_km_s(craft: Spacecraft) -> FloatArray | Refusal:
+def velocity_km_s(craft: VizSpacecraft) -> FloatArray | Refusal:
     """The spacecraft's velocity (3,) against N's origin, or why it is not taken."""
     return _checked_velocity(craft, craft.velocity_m_s)
 
 
-def state_about_earth(update: SimUpdate, craft: Spacecraft) -> tuple[FloatArray, FloatArray] | Refusal:
+def state_about_earth(update: SimUpdate, craft: VizSpacecraft) -> tuple[FloatArray, FloatArray] | Refusal:
     """Place (3,), km, and velocity (3,), km/s, about the Earth's centre, or why they are not taken.
 
     The Earth is where the message has it; without one it stands at N's origin.
@@ -264,7 +264,7 @@ def state_about_earth(update: SimUpdate, craft: Spacecraft) -> tuple[FloatArray,
     return Refusal("format", f"spacecraft {named(craft)}: it is {told}, and {advice}")
 
 
-def named(craft: Spacecraft) -> str:
+def named(craft: VizSpacecraft) -> str:
     """A spacecraft's name for a person."""
     return shortened(printable(craft.name)) or "one without a name"
 
@@ -273,7 +273,7 @@ def _against(own: Components, other: Components) -> Components:
     return tuple(a - b for a, b in zip(own, other, strict=True)) if len(own) == len(other) == 3 else own
 
 
-def _checked_velocity(craft: Spacecraft, found_m_s: Components) -> FloatArray | Refusal:
+def _checked_velocity(craft: VizSpacecraft, found_m_s: Components) -> FloatArray | Refusal:
     speed_m_s = math.hypot(*found_m_s)
     if len(found_m_s) == 3 and speed_m_s <= MAX_SPEED_KM_S * M_PER_KM:
         return np.array(found_m_s) / M_PER_KM
@@ -293,7 +293,7 @@ class VizardLive(ZmqSocket, LockstepLink):
         self._follower, self.conventions = follower, follower.conventions
         self._tracker: TrackerCamera | None = None
         self._pictures: Pictures | None = None
-        self._sample: AttitudeSample | None = None  # of the last step
+        self._sample: AttitudeSample | None = None  # at the last step
         self._described: dict[int, VizCamera] = {}
         self._compared: set[int] = set()
 

@@ -29,10 +29,10 @@ INT64_SIGN = 1 << 63
 
 Value = int | memoryview
 Field = tuple[int, int, Value]
-CURRENT_TIME, CELESTIAL_BODIES, SPACECRAFT, CAMERAS = 1, 2, 3, 4  # of a VizMessage
-FRAME_NUMBER, SIM_TIME_ELAPSED = 1, 2  # of a TimeStamp
-NAME, POSITION, VELOCITY, ROTATION, PARENT_NAME = 1, 2, 3, 4, 19  # of a Spacecraft; of a CelestialBody the first three
-CAMERA_ID, FIELD_OF_VIEW, RESOLUTION, CAMERA_DIR_B = 1, 3, 4, 8  # of a CameraConfig
+CURRENT_TIME, CELESTIAL_BODIES, SPACECRAFT, CAMERAS = 1, 2, 3, 4  # fields of a VizMessage
+FRAME_NUMBER, SIM_TIME_ELAPSED = 1, 2  # fields of a TimeStamp
+NAME, POSITION, VELOCITY, ROTATION, PARENT_NAME = 1, 2, 3, 4, 19  # fields of a Spacecraft; a CelestialBody has the first three
+CAMERA_ID, FIELD_OF_VIEW, RESOLUTION, CAMERA_DIR_B = 1, 3, 4, 8  # fields of a CameraConfig
 
 Components = tuple[float, ...]
 T = TypeVar("T")
@@ -146,7 +146,7 @@ def _packed(kind: int, value: Value) -> memoryview:
 
 
 @dataclass(frozen=True, slots=True)
-class Spacecraft:
+class VizSpacecraft:
     """One spacecraft: position (m), velocity (m/s) and `sigma_bn` (MRP) in and from Basilisk's inertial frame N.
 
     Each has three components, or none where the message has none. A part of another spacecraft names it as its `parent`.
@@ -184,7 +184,7 @@ class SimUpdate:
 
     t_ns: int
     frame: int
-    spacecraft: tuple[Spacecraft, ...]
+    spacecraft: tuple[VizSpacecraft, ...]
     cameras: tuple[VizCamera, ...]
     bodies: tuple[CelestialBody, ...] = ()
 
@@ -192,7 +192,7 @@ class SimUpdate:
 def decode_update(message: bytes) -> SimUpdate:
     """A VizMessage. Raises WireFormatError for bytes that are none, and for one without a time."""
     stamp: dict[int, float] | None = None
-    spacecraft: list[Spacecraft] = []
+    spacecraft: list[VizSpacecraft] = []
     cameras: list[VizCamera] = []
     bodies: list[CelestialBody] = []
     reader = FieldReader()
@@ -219,7 +219,7 @@ def _time_stamp(fields: Iterator[Field]) -> dict[int, float]:
     return {number: readers[number](kind, value) for number, kind, value in fields if number in readers}
 
 
-def _spacecraft(fields: Iterator[Field], wanted: tuple[int, ...] = (POSITION, VELOCITY, ROTATION)) -> Spacecraft:
+def _spacecraft(fields: Iterator[Field], wanted: tuple[int, ...] = (POSITION, VELOCITY, ROTATION)) -> VizSpacecraft:
     texts: dict[int, str] = {}
     vectors: dict[int, Components] = {}
     for number, kind, value in fields:
@@ -228,7 +228,7 @@ def _spacecraft(fields: Iterator[Field], wanted: tuple[int, ...] = (POSITION, VE
         elif number in wanted:
             vectors[number] = _extended(vectors.get(number, ()), as_doubles(kind, value), 3)
     position, velocity, rotation = (vectors.get(number, ()) for number in (POSITION, VELOCITY, ROTATION))
-    return Spacecraft(texts.get(NAME, ""), texts.get(PARENT_NAME, ""), position, velocity, rotation)
+    return VizSpacecraft(texts.get(NAME, ""), texts.get(PARENT_NAME, ""), position, velocity, rotation)
 
 
 def _camera(fields: Iterator[Field]) -> VizCamera:

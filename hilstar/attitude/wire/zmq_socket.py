@@ -40,7 +40,7 @@ WANTED_FILES = 65_536
 MAX_CONNECTIONS = 64
 MAX_EVENTS = 500  # in one go; more wait in the monitor, and then libzmq waits
 FEW_EVENTS = 50
-EVENT = struct.Struct("=Hi")  # of zmq_socket_monitor(3): event, value; pyzmq's parser of it would bring asyncio
+EVENT = struct.Struct("=Hi")  # zmq_socket_monitor(3): event, value; pyzmq's parser of it would bring asyncio
 HANDSHAKE_MS = 2000
 FAILED = {
     zmq.EVENT_HANDSHAKE_FAILED_AUTH: "its key is not among those allowed",
@@ -50,8 +50,8 @@ FAILED = {
 EVENTS = zmq.EVENT_ACCEPTED | zmq.EVENT_CONNECTED | zmq.EVENT_DISCONNECTED | zmq.EVENT_HANDSHAKE_SUCCEEDED | sum(FAILED)
 # At most QUEUE_MESSAGES of a flood wait here; the rest wait at the sender or are lost there. A part over MAX_PART_BYTES drops
 # its connection, which is then made anew. Of a message of more than MAX_PARTS the rest is passed over, for other senders' wait
-# behind it; one of more than MAX_PASSED_OVER drops every connection. A message that never ends is limited only by the memory
-# of the process (MemoryWatch).
+# behind it; one of more than MAX_PASSED_OVER drops every connection. A message that never ends is limited only by
+# MemoryWatch.
 QUEUE_MESSAGES = 1000
 MAX_PART_BYTES = 1 << 18
 MAX_PARTS, MAX_PASSED_OVER = 64, 10_000

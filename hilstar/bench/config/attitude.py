@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from hilstar.attitude.wire.endpoint import ALLOW_FORM, AllowedSenders, Place, bound_place, parse_endpoint
+from hilstar.attitude.wire.endpoint import ALLOW_FORM, AllowedSenders, UdpPlace, bound_place, parse_endpoint
 from hilstar.attitude.wire.nasa42 import spacecraft_number
 from hilstar.bench.config.values import NotNegative
 from hilstar.errors import InputError
@@ -210,7 +210,7 @@ def _check_simulation(settings: AttitudeSettings, name: str) -> None:
         raise InputError(f'clock = "shared": {name} sends the time of its simulation; write clock = "estimated"')
 
 
-def udp_road(settings: AttitudeSettings) -> tuple[Place, AllowedSenders]:
+def udp_road(settings: AttitudeSettings) -> tuple[UdpPlace, AllowedSenders]:
     """Where UDP is bound, and who may send. Raises InputError, also where an open address has no list of senders."""
     place, allowed = bound_place(settings.bind, settings.port, settings.endpoint), AllowedSenders(settings.allow)
     if not allowed and not place.loopback:

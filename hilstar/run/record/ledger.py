@@ -29,8 +29,8 @@ import msgspec
 from hilstar.attitude.logs.mcap_log import (
     ATTITUDE_TOPIC_OF_RUN,
     RUN_METADATA,
+    JsonTopic,
     McapWriter,
-    Topic,
     attitude_message,
     log_time_ns,
     part_path,
@@ -517,8 +517,8 @@ def _free_path(path: Path) -> Path:
     return next(name for name in names if not os.path.lexists(name))
 
 
-def _topic(name: str, schema_name: str, record: type[msgspec.Struct]) -> Topic:
-    return Topic(name, schema_name, schema_of(record, schema_name))
+def _topic(name: str, schema_name: str, record: type[msgspec.Struct]) -> JsonTopic:
+    return JsonTopic(name, schema_name, schema_of(record, schema_name))
 
 
 TOPICS = {

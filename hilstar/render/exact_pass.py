@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+import math
+
 import moderngl
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +18,7 @@ from hilstar.monitor.balance import (
     Balance,
 )
 from hilstar.monitor.exact import CARRIED, Left
-from hilstar.monitor.footprints import FEWEST, LEAST_LIGHT, PixelOrder
+from hilstar.monitor.footprints import FEWEST, LEAST_LIGHT, REACH_SIGMA, PixelOrder
 from hilstar.monitor.quantise import Panel
 from hilstar.monitor.temporal import NONE_BEFORE, first_phases, places_before
 from hilstar.render.context import has_compute
@@ -30,6 +32,7 @@ MAX_SIZE = 63  # of a footprint whose places fit into their six bits
 IN_BOX = 1023  # what a pixel's part in a box is counted in: ten bits
 # Narrower sprites have moments of their pixels: exp(-2 pi^2 sigma^2) / pi px, here 5e-6, of thousands of steps of light.
 NARROW_PX = 0.75
+OVERRATED = 1.0001  # rounding
 RUN, MAX_RUNS, HALF_OCTAVES = 256, 2048, 32  # of stars that are sorted by light; runs times half octaves fill 16 bits
 PARTS = ("sums", "exact/inputs", "shares", "exact/stars", "exact/pixels", "exact/choices")  # of the shader, before exact.comp
 LOCAL_SIZE = 32  # as in exact.comp
@@ -85,6 +88,7 @@ class ExactPass:
         window, weights = balance.window_px, balance.weights
         values = {
             "footprint": order.size**2,
+            "overrated": overrated(balance.sigma_px) if paths else OVERRATED,
             "reach_px2": order.area_px2,
             "reach_per_e": 1 / (order.area_px2 * LEAST_LIGHT * float(panel.light_e_per_s()[1])),
             "fewest": order.near if balance.over_frames else min(FEWEST, order.near),
@@ -219,6 +223,28 @@ def _places(order: PixelOrder, balance: Balance) -> npt.NDArray[np.uint32]:
     box_3, box_5 = (np.rint(balance.in_box(side, *away) * IN_BOX).astype(np.intp) for side in (3, 5))
     words = x + 32 | (y + 32) << 6 | box_3 << 12 | box_5 << 22
     return np.asarray(words, dtype=np.uint32)
+
+
+def overrated(sigma_px: tuple[float, float]) -> float:
+    """Largest ratio of a path's light as the shader takes it to the true light in a pixel within reach.
+
+    The shader takes a Gaussian of the sigma and a pixel's variance together; where stars are narrow, the true light. Two stars
+    must never own the same pixel, or the order in which threads reach it would choose its level.
+    """
+    if min(sigma_px) < NARROW_PX:
+        return OVERRATED
+    away = np.linspace(0.0, REACH_SIGMA, 200)  # in sigmas, a pixel's width included
+    along_x, along_y = (np.maximum.accumulate([_ratio(float(place), sigma) for place in away]) for sigma in sigma_px)
+    rest = np.sqrt(REACH_SIGMA**2 - away**2)
+    return OVERRATED * float((along_x * along_y[np.searchsorted(away, rest, side="right") - 1]).max())
+
+
+def _ratio(place: float, sigma_px: float) -> float:
+    """A Gaussian's density of the sigma and a pixel together, over the light in the pixel, `place` wide sigmas off."""
+    wide = math.sqrt(sigma_px**2 + PIXEL_VARIANCE)
+    edges = [(place * wide + side) / (sigma_px * math.sqrt(2)) for side in (-0.5, 0.5)]
+    light = (math.erf(edges[1]) - math.erf(edges[0])) / 2
+    return math.exp(-(place**2) / 2) / (math.sqrt(math.tau) * wide * light)
 
 
 def turns_of(electrons_per_s: Float32Array, step_e_per_s: float) -> IntArray:

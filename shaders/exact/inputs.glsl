@@ -47,11 +47,12 @@ uniform sampler2D gain;
 
 uniform int count;
 uniform int footprint;  // pixels in all
-uniform float reach_px2, reach_per_e; // how many of them are chosen: as PixelOrder.reach in pixel_order.py
+uniform float reach_px2, reach_per_e; // how many of them are chosen: as PixelOrder.reach in footprints.py
 uniform int fewest;
 uniform int white;
 uniform float first_threshold_e_per_s;
 uniform ivec2 resolution_px;
+uniform float overrated; // the largest ratio of a star's light, as the shader takes it, to its true light in a pixel
 uniform float odd;      // 0.5 for footprints with a middle
 uniform vec2 half_inverse_window2;
 #ifdef PATHS

@@ -102,8 +102,13 @@ bool nearest_in_path(vec2 offset) {
 // The light of a path in a pixel nearest to its sprite; a tenth or so is of sprites farther along.
 float path_light_at(vec2 offset) {
     float light = 0.0;
+#ifdef NARROW
+    for (int j = 0; j < 2 * BESIDE + 1; j++) light += exp(beside[j].z) * share_at(offset - beside[j].xy);
+    return light;
+#else
     for (int j = 0; j < 2 * BESIDE + 1; j++) light += exp(exponent_of(j, offset));
     return light * sqrt(half_inverse_spread2.x * half_inverse_spread2.y) / PI;
+#endif
 }
 #endif
 
@@ -115,6 +120,7 @@ float asked_of(ivec2 at, float own) {
 #else
     float drawn = imageLoad(linear_e_per_s, at).r;
 #endif
+    // Two stars never own one pixel: `overrated` is the largest ratio of `own` to the star's true light in a pixel.
     // A faint star's sprite may end before its near pixels do.
-    return 2.0 * own > drawn * 1.0001 ? (drawn > 0.0 ? drawn : own) : -1.0;
+    return 2.0 * own > drawn * overrated ? (drawn > 0.0 ? drawn : own) : -1.0;
 }

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,16 +11,21 @@ from hilstar.monitor.exact import ExactQuantiser
 from hilstar.monitor.quantise import shown_light
 from hilstar.monitor.response import srgb_response
 from hilstar.render.renderer import Renderer, Target
+from hilstar.scene.psf import footprint_px
+from hilstar.scene.sprites import pack_sprites
 from tests.support.exact_scenes import (
     FRAMES,
+    NARROW,
     SCENES,
     SIDE,
     STREAKS,
+    TILE,
     USUAL,
     WHITE,
     assert_no_worse,
     assert_right_over_frames,
     assert_streaks_are_right,
+    flux_of,
     single,
     uneven,
 )
@@ -89,3 +96,30 @@ def test_no_stars_are_black_also_after_some(uniformity):
             gl.draw(sprites)
             assert (gl.levels().max() > 0) == lit
         assert gl.gl_error() == "GL_NO_ERROR"
+
+
+PAIRS = 400
+
+
+@pytest.mark.parametrize("sigma_px", [USUAL, NARROW])
+def test_codes_of_moving_neighbours_do_not_depend_on_the_order_of_stars(sigma_px):
+    """No pixel is two stars' own: threads that reach it in another order would choose another level."""
+    rng, size = np.random.default_rng(7), 20 * TILE
+    middle = rng.uniform(10, size - 10, (2, PAIRS))
+    apart = rng.uniform(2, 7, PAIRS) * np.exp(1j * rng.uniform(0, 2 * np.pi, PAIRS)) / 2
+    x, y = (np.stack([at - half, at + half], axis=1).ravel() for at, half in zip(middle, (apart.real, apart.imag), strict=True))
+    along = np.array([-0.15, 0.15])
+    rates = np.repeat(flux_of(rng.uniform(2, 5, PAIRS), sigma_px), 2) * rng.uniform(0.97, 1.03, 2 * PAIRS)
+
+    def paths(order):
+        star = np.repeat(np.arange(len(order)), len(along))
+        places = ((at[order][:, None] + along).ravel() for at in (x, y))
+        sprites = pack_sprites(*places, np.repeat(rates[order] / 2, 2), star, (size, size), footprint_px(sigma_px))
+        return replace(sprites, per_star=len(along))
+
+    found = []
+    with Renderer(Target((size, size), sigma_px, srgb_response(8), WHITE, "exact")) as gl:
+        for order in (np.arange(2 * PAIRS), np.arange(2 * PAIRS)[::-1], rng.permutation(2 * PAIRS)):
+            gl.draw(paths(order))
+            found.append(gl.levels().copy())
+    assert all(np.array_equal(found[0], other) for other in found[1:])

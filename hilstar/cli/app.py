@@ -1,4 +1,4 @@
-"""The commands by what they are for, as `hilstar --help` shows them."""
+"""The table of commands, grouped as `hilstar --help` shows them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,10 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from hilstar.cli.assess import assess
+from hilstar.cli.attitude import attitude
 from hilstar.cli.benchmark import benchmark
+from hilstar.cli.budget import budget
 from hilstar.cli.calibrate.alignment import alignment
 from hilstar.cli.calibrate.dots import dots
 from hilstar.cli.calibrate.first_light import first_light
@@ -17,24 +20,21 @@ from hilstar.cli.calibrate.latency import latency
 from hilstar.cli.calibrate.photometric import photometric
 from hilstar.cli.calibrate.plan import plan
 from hilstar.cli.calibrate.scale import scale
+from hilstar.cli.campaign import campaign
+from hilstar.cli.compare import compare
+from hilstar.cli.convert import convert
+from hilstar.cli.demo import demo
 from hilstar.cli.doctor import doctor
-from hilstar.cli.measure.assess import assess
-from hilstar.cli.measure.budget import budget
-from hilstar.cli.measure.campaign import campaign
-from hilstar.cli.measure.compare import compare
-from hilstar.cli.measure.simulate import simulate
-from hilstar.cli.measure.verify import verify
+from hilstar.cli.frame import frame
+from hilstar.cli.keys import keys
+from hilstar.cli.replay import replay
 from hilstar.cli.report import report
-from hilstar.cli.service.install import install, uninstall
-from hilstar.cli.show.demo import demo
-from hilstar.cli.show.frame import frame
-from hilstar.cli.show.replay import replay
-from hilstar.cli.show.serve import serve
-from hilstar.cli.stream.attitude import attitude
-from hilstar.cli.stream.convert import convert
-from hilstar.cli.stream.keys import keys
-from hilstar.cli.stream.send import send
+from hilstar.cli.send import send
+from hilstar.cli.serve import serve
+from hilstar.cli.service import install, uninstall
+from hilstar.cli.simulate import simulate
 from hilstar.cli.study import study
+from hilstar.cli.verify import verify
 from hilstar.version import __version__
 
 COMMANDS: dict[str, tuple[Callable[..., None], ...]] = {
@@ -49,7 +49,7 @@ COMMANDS: dict[str, tuple[Callable[..., None], ...]] = {
 
 
 class EarlyEnd(Exception):
-    """An EOFError on its way through typer, which takes one for Ctrl-D, prints an empty line and drops it."""
+    """Carries an EOFError through typer, which would take it for Ctrl-D, print an empty line and drop it."""
 
     def __init__(self, error: EOFError) -> None:
         super().__init__(str(error))
@@ -57,7 +57,7 @@ class EarlyEnd(Exception):
 
 
 class Commands(TyperGroup):
-    """The commands, whose EOFErrors stay what they are."""
+    """The group of commands, which hands their EOFErrors on."""
 
     def make_context(self, *arguments: Any, **named: Any) -> Any:
         """Parse the command line. Raises EarlyEnd."""
@@ -86,7 +86,7 @@ service = typer.Typer()
 
 
 def print_version(wanted: bool) -> None:
-    """Print the version and end, where it is asked for."""
+    """Print the version and exit, if `wanted`."""
     if wanted:
         typer.echo(f"hilstar {__version__}")
         raise typer.Exit

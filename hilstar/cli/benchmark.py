@@ -8,8 +8,7 @@ from typing import Annotated
 
 import typer
 
-from hilstar.cli.options import MAX_SEED, Json
-from hilstar.cli.parsers import parse_counts, parse_sizes
+from hilstar.cli.options import MAX_SEED, Json, parse_counts, parse_sizes
 from hilstar.console.terminal import print_json, progress
 from hilstar.errors import InputError
 from hilstar.files import check_directory

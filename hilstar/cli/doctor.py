@@ -1,4 +1,4 @@
-"""hilstar doctor: what this machine has, and what it lacks; and whether a bench file can be right."""
+"""hilstar doctor: what this machine has and lacks, and whether a bench file is plausible."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from hilstar.cli.options import Json
-from hilstar.cli.show.running import say_units
+from hilstar.cli.running import say_units
 from hilstar.console.terminal import print_json
 
 OwnBench = Annotated[

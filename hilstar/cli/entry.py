@@ -1,4 +1,4 @@
-"""The door of the command line: what runs a command, and turns each refusal into one line and an exit code."""
+"""The entry point of the command line: runs a command, and turns each refusal into one line and an exit code."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Any, NoReturn
 import typer
 
 from hilstar.cli.app import EarlyEnd, app
-from hilstar.cli.parsers import with_values
+from hilstar.cli.options import with_values
 from hilstar.console.terminal import fail
 from hilstar.errors import HilstarError, InputError, MachineError, did_you_mean, shortened
 from hilstar.process import interrupts
@@ -21,35 +21,35 @@ from hilstar.process.interrupts import finish_stderr, queue_stderr
 
 INTERRUPTED = 130
 LOG_FORMAT = "hilstar: %(message)s"
-READER_WAITS_S, STOPPED_READER_WAITS_S = 1.0, 0.1  # how long a slow reader of stderr is waited for, without and with a signal
-NUMBER_OPTIONS = ("--radec", "--quaternion", "--rate", "--place", "--mounting", "--reading")  # several, with commas
+READER_WAITS_S, STOPPED_READER_WAITS_S = 1.0, 0.1  # longest wait for a slow reader of stderr, without and with a signal
+NUMBER_OPTIONS = ("--radec", "--quaternion", "--rate", "--place", "--mounting", "--reading")  # several numbers, with commas
 NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
-NUMBERS = re.compile(rf",|,?{NUMBER}(?:,{NUMBER})*,?")  # a word of them, as a shell hands on what has spaces
+NUMBERS = re.compile(rf",|,?{NUMBER}(?:,{NUMBER})*,?")  # a word that a shell makes of numbers with spaces between them
 ELSEWHERE = dict.fromkeys(("display", "displays", "monitors", "screens"), "`hilstar doctor` lists the displays")
 
 
 def main() -> NoReturn:
-    """Run the command line; every refusal is one line on stderr and the exit code of the design's section 5."""
+    """Run the command line. Every refusal is one line on stderr and an exit code."""
     interrupts.install()
     queue_stderr()
     logging.basicConfig(format=LOG_FORMAT, stream=sys.stderr)
     if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="surrogateescape")  # a file's name goes out as the bytes that came in
+        sys.stdout.reconfigure(errors="surrogateescape")  # a file's name is printed with the bytes that it came with
     code = run_command(sys.argv[1:])
     finish_stderr(READER_WAITS_S if interrupts.caught() is None else STOPPED_READER_WAITS_S)
     interrupts.leave(code)
 
 
 def run_command(words: list[str]) -> int:
-    """Run a command line in this process; its exit code, a refusal's one line on stderr."""
+    """Run a command line in this process. Returns its exit code; a refusal is one line on stderr."""
     try:
         return _run(with_values(words))
-    except SystemExit as end:  # of `fail`
+    except SystemExit as end:  # raised by `fail`
         return end.code if isinstance(end.code, int) else 1
 
 
 def _run(words: list[str]) -> int:
-    """The exit code of a command; SystemExit where it is refused."""
+    """The exit code of a command. Raises SystemExit where it is refused."""
     try:
         code = int(app(words, standalone_mode=False) or 0)
         sys.stdout.flush()
@@ -63,7 +63,7 @@ def _run(words: list[str]) -> int:
     except EarlyEnd as end:
         raise end.error from None
     except BrokenPipeError:
-        # Whoever read our output has gone: nothing is left to say.
+        # The reader of our output is gone: there is nobody to tell.
         _let_go_of_stdout()
         return 1
     except Exception as error:
@@ -75,7 +75,7 @@ def _run(words: list[str]) -> int:
 
 
 def usage_line(error: Any, words: list[str]) -> str:
-    """What is wrong with a command line, by typer's `error`, and what to write."""
+    """The line for a wrong command line: typer's `error`, and what to write instead."""
     said = str(error.format_message()).replace("Value error, ", "").rstrip(".")
     at = getattr(error, "ctx", None)
     see = f"(see {'hilstar' if at is None else at.command_path} --help)"
@@ -96,7 +96,7 @@ def usage_line(error: Any, words: list[str]) -> str:
 
 
 def _spaced_numbers(words: list[str]) -> str | None:
-    """What to write where the numbers of one option stand apart, such as --radec 84.057 -1.2 0; None where none do."""
+    """The line for an option whose numbers have spaces between them, such as --radec 84.057 -1.2 0; None if there is none."""
     for k, word in enumerate(words):
         option, is_joined, first = word.partition("=")
         rest = ([first] if is_joined else []) + words[k + 1 :]
@@ -108,7 +108,7 @@ def _spaced_numbers(words: list[str]) -> str | None:
 
 
 def _fail_for_the_machine(error: Exception) -> None:
-    """Refuse what the machine refuses: an output that takes no more, a file that went away, memory that is not there."""
+    """Refuse in one line what the machine refuses: a full disk, a file that went away, not enough memory."""
     if isinstance(error, OSError) and error.strerror:
         what = "stdout, or a file that it names"
         if isinstance(error.filename, str | bytes):
@@ -121,5 +121,5 @@ def _fail_for_the_machine(error: Exception) -> None:
 
 
 def _let_go_of_stdout() -> None:
-    """Python must not try once more at exit."""
+    """Replace stdout, so that Python does not write to it again at exit."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -1,15 +1,28 @@
-"""Options that several commands have, and the check of the files that a command names."""
+"""Options that several commands share, and parsers of options that hold more than one word or number.
+
+A parser takes a text and returns a value. Each refusal shows the form to write.
+"""
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from hilstar.errors import InputError, did_you_mean
+from hilstar.units import NS_PER_S
+
 if TYPE_CHECKING:
+    from hilstar.arrays import FloatArray
+    from hilstar.attitude.wire.source import Mounting
     from hilstar.bench import bench_file
+    from hilstar.bench.config import BenchConfig
+    from hilstar.calibrate.scale import Reading
+    from hilstar.run.record.ledger import SplitLimits
 
 BenchFile = Annotated[Path, typer.Argument(metavar="BENCH.toml", help="The bench file (docs: Bench file).")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout, and nothing else there.")]
@@ -65,8 +78,22 @@ MountingText = Annotated[
         "--mounting", metavar="W,X,Y,Z", help="q_body_to_cam, for a log of the body's attitude.", rich_help_panel=UNSAID
     ),
 ]
-MAX_SEED = 2**63 - 1  # what a FITS header holds
+MAX_SEED = 2**63 - 1  # largest number in a FITS header
 LOG_HELP = "CSV (t_s,qw,qx,qy,qz), JSON lines, CCSDS AEM, MCAP (a ledger), a SPICE CK, a ROS bag or a PX4 ULog."
+SPIN_AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+MAX_SPIN_RAD_S = 1e6
+SPIN_FORM = "--spin AXIS,DEG_PER_S, AXIS being x, y, z or three numbers (cam axes), such as --spin z,0.5"
+SPEED_FORM = "write --speed realtime, max, or a number such as 2 or 0.5"
+SPLIT_FORM = "write a size or a time, such as 1GB, 200MB, 1h or 30min; 1 MB or 10 s at minimum"
+SPLIT_UNITS = {"kB": 1e3, "MB": 1e6, "GB": 1e9, "s": 1.0, "min": 60.0, "h": 3600.0}
+READING_FORM = "write --reading HIP,DN: a star's Hipparcos number, and the sum of its DN over the background"
+MIN_SPLIT_BYTES, MIN_SPLIT_S = 1e6, 10.0
+MAX_SIZE_PX = 32768
+MAX_AT_S = 1e10
+ADDRESS = re.compile(r"(\[?[0-9A-Za-z.:-]*\]?:)?\d{1,6}|localhost|\d+(\.\d+){3}|\[[0-9A-Fa-f:.]+\]")  # after --console
+SHARE_OPTIONS = ("--lose", "--corrupt", "--reorder")  # may stand alone
+USUAL_SHARE = "5%"
+USUAL_ADDRESS = "127.0.0.1:8765"
 
 
 def check_files(
@@ -76,9 +103,9 @@ def check_files(
     kept: Path | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Refuse (InputError), before anything is done, outputs that are inputs, or one file, and `kept` where it is there.
+    """Refuse (InputError) outputs that are inputs or one and the same file, and `kept` if it exists, before anything is done.
 
-    Inputs are also the bench file and all that it names; `kept` is the output that cannot be made again.
+    The bench file and all files that it names count as inputs; `kept` is an output that cannot be made again.
     """
     from hilstar.files import check_outputs, files_named_in, refuse_existing, refuse_writer
 
@@ -87,3 +114,191 @@ def check_files(
     if kept is not None:
         refuse_writer(kept)
     refuse_existing(kept, overwrite)
+
+
+def with_values(words: list[str]) -> list[str]:
+    """The command line with a share after each fault option that stands alone, and an address after --console."""
+    complete: list[str] = []
+    for k, word in enumerate(words):
+        following = "".join(words[k + 1 : k + 2])
+        complete.append(word)
+        if word in SHARE_OPTIONS and not re.match(r"[\d.]+%?$", following):
+            complete.append(USUAL_SHARE)
+        if word == "--console" and not ADDRESS.fullmatch(following):
+            complete.append(USUAL_ADDRESS)
+    return complete
+
+
+def parse_attitude(command: str, radec: str | None, quaternion: str | None) -> Any:
+    """The one attitude that the command line gives."""
+    from hilstar.bench.frame import checked_quaternion
+    from hilstar.rotation import from_radec_roll_deg
+
+    if (radec is None) == (quaternion is None):
+        raise InputError(f"{command}: give the attitude with either --radec RA,DEC,ROLL or --quaternion W,X,Y,Z")
+    if radec is not None:
+        return from_radec_roll_deg(*parse_radec(radec))
+    return checked_quaternion(parse_numbers(quaternion or "", 4, "--quaternion", "W,X,Y,Z"))
+
+
+def parse_at(command: str, at_s: float | None, config: BenchConfig, timed: bool = False) -> int | None:
+    """The moment of one frame, ns after `epoch_utc`; None for that one.
+
+    Raises InputError where nothing moves and no scenario is `timed`.
+    """
+    from hilstar.bench.config.bench_config import has_observer
+
+    if at_s is None:
+        return None
+    if not abs(at_s) <= MAX_AT_S:
+        raise InputError(f"{command} --at {at_s:g}: write seconds, 1e10 at most")
+    if not timed and not has_observer(config):
+        raise InputError(
+            f"{command} --at {at_s:g}: nothing moves in this sky; write [sky.bodies] or [spacecraft], give a --scenario, or"
+            " leave it out"
+        )
+    return round(at_s * NS_PER_S)
+
+
+def parse_numbers(text: str, count: int, option: str, form: str) -> list[float]:
+    """`count` finite numbers with commas between them. Raises InputError that shows `form`."""
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError as error:
+        apart = text.replace(",", " ").split()
+        if len(apart) == count:
+            form = f"{form}, with commas and without spaces"
+        raise InputError(f"{option} {text}: write {form}") from error
+    if len(numbers) != count or not all(map(math.isfinite, numbers)):
+        raise InputError(f"{option} {text}: write {count} finite numbers, {form}")
+    return numbers
+
+
+def parse_radec(text: str) -> tuple[float, float, float]:
+    """Right ascension, declination and roll in degrees."""
+    ra_deg, dec_deg, roll_deg = parse_numbers(text, 3, "--radec", "RA,DEC,ROLL in degrees")
+    if not -90 <= dec_deg <= 90:
+        raise InputError(f"--radec {text}: write a declination from -90 to 90")
+    return ra_deg, dec_deg, roll_deg
+
+
+def parse_rate(text: str) -> FloatArray:
+    """A rate in rad/s, cam components (3,), of "X,Y,Z" in deg/s."""
+    import numpy as np
+
+    return np.radians(parse_numbers(text, 3, "--rate", "X,Y,Z in deg/s"))
+
+
+def parse_spin(text: str) -> FloatArray:
+    """The rate in rad/s, cam components (3,), of "AXIS,DEG_PER_S"."""
+    import numpy as np
+
+    *axis, rate_text = [part.strip() for part in text.split(",")]
+    try:
+        rate = math.radians(float(rate_text))
+        vector = np.array(SPIN_AXES[axis[0].lower()] if len(axis) == 1 else [float(part) for part in axis])
+    except (ValueError, KeyError, IndexError) as error:
+        raise InputError(f"--spin {text}: write {SPIN_FORM}") from error
+    length = math.hypot(*vector)
+    if len(vector) != 3 or not (abs(rate) <= MAX_SPIN_RAD_S and 0 < length < math.inf):
+        raise InputError(f"--spin {text}: write {SPIN_FORM}")
+    return np.asarray(vector / length * rate)
+
+
+def parse_place(text: str | None) -> tuple[float, float, float] | None:
+    """Latitude and longitude in degrees, and height in metres. Raises InputError."""
+    if text is None:
+        return None
+    latitude_deg, longitude_deg, height_m = parse_numbers(text, 3, "--place", "LAT,LON,HEIGHT in degrees and metres")
+    if not (-90 <= latitude_deg <= 90 and -180 <= longitude_deg <= 360):
+        raise InputError(f"--place {text}: write a latitude from -90 to 90 and a longitude from -180 to 360")
+    return latitude_deg, longitude_deg, height_m
+
+
+def parse_mounting(text: str | None) -> Mounting:
+    """The mounting of `--mounting`. Raises InputError."""
+    from hilstar.attitude.wire.protocol import NORM_TOLERANCE
+    from hilstar.attitude.wire.source import Mounting
+
+    if text is None:
+        return Mounting()
+    w, x, y, z = parse_numbers(text, 4, "--mounting", "W,X,Y,Z")
+    if abs(math.hypot(w, x, y, z) - 1) > NORM_TOLERANCE:
+        raise InputError(f"--mounting {text}: its norm is {math.hypot(w, x, y, z):.6g}; write a unit quaternion W,X,Y,Z")
+    return Mounting((w, x, y, z))
+
+
+def parse_share(text: str, option: str) -> float:
+    """A share from "5%" or "0.05". Raises InputError."""
+    match = re.fullmatch(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*(%?)\s*", text)
+    share = float(match[1]) / (100.0 if match[2] else 1.0) if match else 2.0
+    if share > 1.0:
+        raise InputError(f"{option} {text}: write a fraction of the packets, such as 5% or 0.05")
+    return share
+
+
+def parse_speed(text: str) -> float:
+    """The factor of real time of `--speed`: 1 for realtime, infinite for max. Raises InputError."""
+    named = {"realtime": 1.0, "max": math.inf}
+    if text in named:
+        return named[text]
+    try:
+        factor = float(text)
+    except ValueError as error:
+        raise InputError(f"--speed {text}: {did_you_mean(text, named)}{SPEED_FORM}") from error
+    if not 1e-3 <= factor <= 1e3:
+        raise InputError(f"--speed {text}: {SPEED_FORM}, from 0.001 to 1000")
+    return factor
+
+
+def parse_split(text: str | None) -> SplitLimits:
+    """The split of "1GB" or "1h". Raises InputError."""
+    from hilstar.run.record.ledger import NO_SPLIT, SplitLimits
+
+    if text is None:
+        return NO_SPLIT
+    match = re.fullmatch(r"(\d{1,9}(?:\.\d{1,9})?)\s*(kB|MB|GB|s|min|h)", text.strip())
+    value = float(match[1]) * SPLIT_UNITS[match[2]] if match else 0.0
+    if match is None or value < (MIN_SPLIT_BYTES if match[2].endswith("B") else MIN_SPLIT_S):
+        raise InputError(f"--ledger-split {text}: {SPLIT_FORM}")
+    return SplitLimits(bytes=value) if match[2].endswith("B") else SplitLimits(seconds=value)
+
+
+def parse_memory(text: str) -> int:
+    """The bytes of "4GB" or "500 MB". Raises InputError."""
+    match = re.fullmatch(r"(\d{1,9}(?:\.\d{1,9})?)\s*(MB|GB)", text.strip())
+    if match is None or float(match[1]) <= 0:
+        raise InputError(f"--memory {text}: write a size such as 4GB or 500MB")
+    return round(float(match[1]) * SPLIT_UNITS[match[2]])
+
+
+def parse_reading(text: str) -> Reading:
+    """A reading from "HIP,DN". Raises InputError."""
+    from hilstar.calibrate.scale import Reading
+
+    parts = text.split(",")
+    try:
+        reading = Reading(int(parts[0]), float(parts[1]))
+    except (ValueError, IndexError) as error:
+        raise InputError(f"--reading {text}: {READING_FORM}") from error
+    if len(parts) != 2 or not 0 < reading.dn < math.inf:
+        raise InputError(f"--reading {text}: {READING_FORM}")
+    return reading
+
+
+def parse_counts(text: str, most: int) -> tuple[int, ...]:
+    """Star counts, each once, from "100,1000". Raises InputError."""
+    parts = text.split(",")
+    if not all(re.fullmatch(r"[1-9]\d{0,8}", part) and int(part) <= most for part in parts):
+        raise InputError(f"--stars {text}: write whole numbers from 1 to {most} with commas between them, such as 100,1000")
+    return tuple(dict.fromkeys(map(int, parts)))
+
+
+def parse_sizes(text: str) -> tuple[tuple[int, int], ...]:
+    """Image sizes, each once, from "640x480,1920x1080". Raises InputError."""
+    found = [re.fullmatch(r"([1-9]\d{0,4})x([1-9]\d{0,4})", part) for part in text.split(",")]
+    if not all(match and max(int(match[1]), int(match[2])) <= MAX_SIZE_PX for match in found):
+        raise InputError(
+            f"--sizes {text}: write WIDTHxHEIGHT, up to {MAX_SIZE_PX} px, with commas between them, such as 640x480,1920x1080"
+        )
+    return tuple(dict.fromkeys((int(match[1]), int(match[2])) for match in found if match))

@@ -54,7 +54,7 @@ def study(
 
 
 def check_bench(what: str, bench: Path | None) -> None:
-    """Refuse (InputError) a bench file for a study that has its own, and `chain` without one."""
+    """Refuse (InputError) a bench file for a study that brings its own, and `chain` without one."""
     from hilstar.errors import InputError
 
     if what == "chain" and bench is None:

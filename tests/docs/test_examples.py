@@ -20,7 +20,7 @@ from hilstar.bench.config import read_config
 from hilstar.bench.scenario import parse_scenario
 from hilstar.campaign.plan import parse_plan
 from hilstar.cli.app import app
-from hilstar.cli.parsers import with_values
+from hilstar.cli.options import with_values
 from tests.docs.pages import Block, blocks_of, differs
 from tests.support.benches import ROOT, SMALL_BENCH
 from tests.support.senders import free_port

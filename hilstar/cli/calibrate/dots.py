@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from hilstar.cli.options import MAX_SEED, BenchFile, Json, check_files
-from hilstar.cli.show.running import Windowed
+from hilstar.cli.running import Windowed
 from hilstar.console.terminal import print_json, say
 from hilstar.files import check_directory, make_directory
 

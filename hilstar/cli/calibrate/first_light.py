@@ -1,4 +1,4 @@
-"""hilstar first-light: the first day on a bench, step by step, and on from where it was."""
+"""hilstar first-light: the first day on a bench, step by step; it resumes where it stopped."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import msgspec
 import typer
 
 from hilstar.cli.options import MAX_SEED, BenchFile, Json, check_files
-from hilstar.cli.show.paging import Console, ConsoleName, Control, Token, page_listener
+from hilstar.cli.running import Console, ConsoleName, Control, Token, page_listener
 from hilstar.console.terminal import print_json, say
 from hilstar.errors import InputError, did_you_mean
 from hilstar.files import check_directory
@@ -25,12 +25,12 @@ if TYPE_CHECKING:
     from hilstar.console.listener import PageListener
 
 PATCHES = 96
-EXAMPLE_TRUTH = "truth-example.toml"  # in configs, wherever hilstar is installed
+EXAMPLE_TRUTH = "truth-example.toml"  # in configs
 
 
 @dataclass(frozen=True, slots=True)
 class _Sources:
-    """The options that say where images come from."""
+    """The options that choose the source of images."""
 
     grab: str | None
     virtual: Path | None
@@ -128,7 +128,7 @@ def first_light(
 def _shown(
     listener: PageListener | None, control: bool, file: files.BenchFile
 ) -> Iterator[tuple[Callable[[str], None], Callable[[Pattern], object]]]:
-    """Who is told of a session's lines and patterns: the terminal, and the page where there is one."""
+    """The audience of a session's lines and patterns: the terminal and, if there is one, the page."""
     if listener is None:
         yield say, lambda pattern: None
         return
@@ -144,7 +144,7 @@ def _shown(
 
 
 def _image_source(file: files.BenchFile, sources: _Sources) -> ImageSource:
-    """Where the images come from. Raises InputError for sources that do not go together."""
+    """The source of images. Raises InputError for options that exclude each other."""
     from hilstar.attitude.wire.serial_link import serial_target
     from hilstar.bench.bench_file import read_bench_file
     from hilstar.calibrate.first_light.image_sources import ByHand, GrabCommand, SerialDiode

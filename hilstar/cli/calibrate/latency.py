@@ -14,7 +14,7 @@ from hilstar.console.terminal import print_json
 from hilstar.errors import InputError
 from hilstar.files import CSV, check_directory, check_ending
 
-LEDGER_BEHIND_S = 0.5  # the end of a run that goes on may not be on the disk yet
+LEDGER_BEHIND_S = 0.5  # the newest part of a running ledger may not be on the disk yet
 
 
 def latency(

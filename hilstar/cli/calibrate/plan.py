@@ -7,8 +7,7 @@ from typing import Annotated
 
 import typer
 
-from hilstar.cli.options import MAX_SEED, Json, Overwrite, check_files
-from hilstar.cli.parsers import parse_numbers
+from hilstar.cli.options import MAX_SEED, Json, Overwrite, check_files, parse_numbers
 from hilstar.console.terminal import print_json, say
 from hilstar.errors import InputError
 from hilstar.files import CSV, check_directory, check_ending

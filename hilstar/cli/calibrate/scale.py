@@ -7,8 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from hilstar.cli.options import BenchFile, Json, check_files
-from hilstar.cli.parsers import parse_reading
+from hilstar.cli.options import BenchFile, Json, check_files, parse_reading
 from hilstar.console.terminal import print_json, say
 from hilstar.files import TOML, check_ending
 

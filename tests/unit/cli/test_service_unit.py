@@ -20,7 +20,7 @@ from tests.support.waiting import PATIENCE_S
 def bench(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
     monkeypatch.delenv("HILSTAR_TOKEN", raising=False)
-    monkeypatch.setattr("hilstar.cli.service.unit.can_confine", lambda: True)  # as on a bench PC, whatever container this is
+    monkeypatch.setattr("hilstar.cli.service.can_confine", lambda: True)  # as on a bench PC, whatever container this is
     (tmp_path / "room 7.toml").write_text(SMALL_BENCH)
     return tmp_path / "room 7.toml"
 
@@ -110,7 +110,7 @@ def test_the_unit_takes_nothing_that_a_run_needs(bench):
 
 
 def test_where_users_have_no_namespace_the_unit_asks_for_none(bench, monkeypatch):
-    monkeypatch.setattr("hilstar.cli.service.unit.can_confine", lambda: False)
+    monkeypatch.setattr("hilstar.cli.service.can_confine", lambda: False)
     result = install(bench, "--print")
     assert "the unit keeps the capabilities" in result.stderr
     keys = keys_of(result.stdout)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from hilstar.cli.parsers import with_values
+from hilstar.cli.options import with_values
 from hilstar.console.listener import ListenAddress, PageListener, parse_address
 from hilstar.errors import InputError
 

@@ -21,7 +21,7 @@ from mcap.writer import MCAP0_MAGIC, Writer
 from hilstar.attitude.logs.log_file import read_log
 from hilstar.attitude.logs.mcap_log import parts_of, read_topics
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal, encode
-from hilstar.cli.parsers import parse_split
+from hilstar.cli.options import parse_split
 from hilstar.errors import InputError
 from hilstar.notices import Notices
 from hilstar.run.record.ledger import (

@@ -1,4 +1,4 @@
-"""hilstar attitude: where a log or a live stream points, for a person to recognise."""
+"""hilstar attitude: where a log or a live stream points, in terms that a person can check."""
 
 from __future__ import annotations
 
@@ -17,8 +17,9 @@ from hilstar.cli.options import (
     PlaceText,
     ReferenceName,
     TopicName,
+    parse_mounting,
+    parse_place,
 )
-from hilstar.cli.parsers import parse_mounting, parse_place
 from hilstar.console.terminal import print_json, say
 
 if TYPE_CHECKING:
@@ -104,7 +105,7 @@ def _live(file: BenchFile, at: str | None, patience_s: float) -> tuple[AttitudeS
 
 
 def _of_log(path: Path, at: str | None, stated: Stated) -> tuple[AttitudeSample, Conventions, bool]:
-    """The attitude of a log at a time, and whether it is held there because the log has a gap."""
+    """The attitude of a log at a time, and whether it is held over a gap of the log."""
     from hilstar.attitude.clock.timeline import Policy
     from hilstar.attitude.logs.gaps import log_joins
     from hilstar.attitude.logs.log_file import log_timeline, open_log, time_in_log
@@ -155,7 +156,7 @@ def _pointing(sample: AttitudeSample, file: BenchFile) -> dict[str, Any]:
 
 
 def _lines(told: dict[str, Any]) -> list[str]:
-    """The same for a person."""
+    """The same as lines of text."""
     q = ", ".join(f"{c:.7f}" for c in told["q_icrs_to_cam"])
     width, height = told["tracker"]["resolution_px"]
     lines = [
@@ -175,5 +176,5 @@ def _lines(told: dict[str, Any]) -> list[str]:
 
 
 def _turn(angle_deg: float) -> str:
-    """An angle from 0 to 360 degrees, which rounding does not make 360."""
+    """An angle in [0, 360) degrees, also after rounding."""
     return f"{round(angle_deg, 4) % 360:.4f}"

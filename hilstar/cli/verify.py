@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from hilstar.cli.options import MAX_SEED, BenchFile, Json, ScenarioFile
-from hilstar.cli.show.running import optional_scenario
+from hilstar.cli.running import optional_scenario
 from hilstar.console.terminal import print_json, progress
 from hilstar.errors import InputError
 from hilstar.files import check_directory
@@ -71,7 +71,7 @@ def verify(
 
 
 def _verify_heads(heads: HeadsFile, fields: int, seed: int, as_json: bool) -> None:
-    """The angles between the heads of a file with `heads`, solved from what their trackers would see."""
+    """Print the angles between the heads of a file with `heads`, solved from what their trackers would see."""
     import numpy as np
 
     from hilstar.twin.heads import verify_heads

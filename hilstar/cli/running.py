@@ -1,4 +1,4 @@
-"""What serve and replay share: the bench on its screen, the ledger, and the end of a run."""
+"""Parts of the commands that run a bench: its screen, its ledger, its page, what is said of it, and the end of a run."""
 
 from __future__ import annotations
 
@@ -11,23 +11,31 @@ from typing import TYPE_CHECKING, Annotated, Any
 import msgspec
 import typer
 
+from hilstar.console.run_status import RunStatus
 from hilstar.console.terminal import report, say
 from hilstar.errors import InputError, MachineError
 from hilstar.notices import Notices
+from hilstar.process.programs import Service
 from hilstar.units import NS_PER_S
 
 if TYPE_CHECKING:
     from hilstar.attitude.wire.source import Conventions, Mounting
     from hilstar.bench.bench_file import BenchFile
     from hilstar.bench.cameras import FieldsOfView
+    from hilstar.bench.fault_desk import FaultDesk
     from hilstar.bench.scenario import Scenario
+    from hilstar.console.listener import PageListener
+    from hilstar.console.publisher import FramePublisher, PageParts, RunDescription
     from hilstar.run.faults import AnyFaults, Recording
     from hilstar.run.frame_pulse import FramePulse
+    from hilstar.run.operator import SwitchRequests
     from hilstar.run.record.ledger import LedgerSwitch
+    from hilstar.run.serve import Follower, Running
+    from hilstar.run.shown import FrameSink, Shown
     from hilstar.run.summary import RunSummary
     from hilstar.run.sync import BeatSummary
 
-UTC_MARK = "{utc}"  # in a ledger's name
+UTC_MARK = "{utc}"  # stands for the time in a ledger's name
 Windowed = Annotated[bool, typer.Option("--windowed", help="A window on the desktop instead of the full display.")]
 Force = Annotated[
     bool, typer.Option("--force", help="Show on a display that the start-up checks refuse; the refusal is logged.")
@@ -45,10 +53,33 @@ LedgerSplit = Annotated[
     str | None,
     typer.Option("--ledger-split", metavar="1GB|1h", help="Continue in RUN.0001.mcap and so on after this size or time."),
 ]
+Console = Annotated[
+    str | None,
+    typer.Option(
+        "--console",
+        metavar="[HOST:PORT]",
+        help="Serve the operator's page there, by default on 127.0.0.1:8765; port 0 is any free one.",
+        show_default=False,
+    ),
+]
+Control = Annotated[bool, typer.Option("--control", help="Let the page act: without it, it only shows.")]
+Token = Annotated[
+    str | None,
+    typer.Option(
+        "--token",
+        metavar="TEXT",
+        envvar="HILSTAR_TOKEN",
+        help="What a browser must give to see the page; beyond 127.0.0.1 one is made where none is given.",
+    ),
+]
+ConsoleName = Annotated[
+    list[str] | None,
+    typer.Option("--console-name", metavar="NAME", help="A further name of the page, as a proxy shows it; may be given often."),
+]
 
 
 def explain_bench(bench: Any, t_ns: int | None = None) -> None:
-    """Say where the stars come from, what was chosen within the tolerance, and which bodies are more than points at a time."""
+    """Explain the source of the stars, the choices within the tolerance, and which bodies are discs at a time."""
     from hilstar.bench.effort import explain
     from hilstar.bench.moving import observer_lines, satellite_lines, wide_bodies
 
@@ -65,14 +96,14 @@ def explain_bench(bench: Any, t_ns: int | None = None) -> None:
 
 
 def explain_source(conventions: Conventions, mounting: Mounting) -> None:
-    """Say what the numbers of a source mean, with an attitude to compare."""
+    """Explain the conventions of a source, with an attitude to compare."""
     for line in conventions.lines(mounting):
         say(line)
 
 
 @contextmanager
 def shown_bench(file: BenchFile, headless: bool, windowed: bool, force: bool) -> Iterator[tuple[Any, Any]]:
-    """The bench, and the screen that it is on; None when headless."""
+    """The bench and its screen; None when headless."""
     if headless:
         from hilstar.bench.build import open_bench
 
@@ -86,7 +117,7 @@ def shown_bench(file: BenchFile, headless: bool, windowed: bool, force: bool) ->
 
 
 def say_of_light(bench: Any) -> None:
-    """Name the stars that this bench cannot show as bright as they are, and what is assumed of its primaries."""
+    """Name the stars that this bench shows too faint, and the assumption about its primaries."""
     from hilstar.bench.frame import clipping_line, shares_line
 
     for line in (clipping_line(bench), shares_line(bench)):
@@ -95,13 +126,13 @@ def say_of_light(bench: Any) -> None:
 
 
 def say_units(fields: FieldsOfView) -> None:
-    """Warn where a length of the bench file cannot be in the unit of its key."""
+    """Warn of a length in the bench file that is probably in another unit than its key."""
     if fields.warning is not None:
         say(f"check the units: {fields.warning}")
 
 
 def say_beat(bench: Any, screen: Any) -> BeatSummary:
-    """What the tracker's exposures make of the refresh of a bench's screen; a line where that matters, with what to write."""
+    """The beat between the tracker's exposures and the screen's refresh, with a line where it matters."""
     from hilstar.run.sync import beat_line, beat_of
 
     measured_hz = NS_PER_S / screen.clock.period_ns if screen is not None and screen.clock.paced_by_screen else None
@@ -114,7 +145,7 @@ def say_beat(bench: Any, screen: Any) -> BeatSummary:
 
 @contextmanager
 def optional_pulse(file: BenchFile, notices: Notices) -> Iterator[FramePulse | None]:
-    """The pulse at each frame that a bench file asks for; None without one. Raises InputError where its port cannot be had."""
+    """The bench file's pulse at each frame; None without one. Raises InputError where its port cannot be opened."""
     from hilstar.run.frame_pulse import FramePulse
 
     settings = file.config.sync
@@ -126,7 +157,7 @@ def optional_pulse(file: BenchFile, notices: Notices) -> Iterator[FramePulse | N
 
 
 def dated_ledger(path: Path | None) -> Path | None:
-    """A ledger's path with the time of this moment where its name asks for it."""
+    """A ledger's path, with the present time in place of UTC_MARK."""
     if path is None or UTC_MARK not in path.name:
         return path
     return path.with_name(path.name.replace(UTC_MARK, f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}"))
@@ -134,7 +165,7 @@ def dated_ledger(path: Path | None) -> Path | None:
 
 @contextmanager
 def optional_ledger(path: Path | None, bench: Any, notices: Notices, overwrite: bool, split: Any) -> Iterator[LedgerSwitch]:
-    """The run's ledger, which keeps the run's events too; none at the start where none was asked for."""
+    """The run's ledger, which also keeps its events; without a path it starts switched off."""
     from hilstar.run.record.ledger import Ledger, LedgerSwitch
 
     ledger = LedgerSwitch(None if path is None else Ledger(path, bench, notices, overwrite, split))
@@ -154,7 +185,7 @@ def optional_scenario(path: Path | None) -> Scenario | None:
 def run_with_faults(
     bench: Any, scenario: Scenario | None, notices: Notices, ledger: LedgerSwitch, recording: Recording | None = None
 ) -> Iterator[AnyFaults | None]:
-    """The faults of a run: of its scenario and its stream, or of the run that is replayed; None where it has none."""
+    """The faults of a run, from its scenario and stream or from the run that is replayed; None for none."""
     from hilstar.run.faults import replayed_faults, run_faults
 
     if recording is not None and recording.faults:
@@ -176,9 +207,9 @@ def run_with_faults(
 
 
 def end_of_run(summary: RunSummary, screen: Any, ledger: LedgerSwitch, notices: Notices, as_json: bool) -> None:
-    """The summary of a run whose ledger is closed; exit code 1 where that has failed.
+    """Print the summary of a run whose ledger is closed; exit code 1 where the ledger failed.
 
-    Raises MachineError where its window went away, or its GPU was lost.
+    Raises MachineError where the window went away or the GPU was lost.
     """
     from hilstar.run.watchdog import GPU_LOST
 
@@ -191,3 +222,71 @@ def end_of_run(summary: RunSummary, screen: Any, ledger: LedgerSwitch, notices: 
         raise MachineError(f"{lost}; begin it again, and see dmesg where that happens again")
     if ledger.failure is not None:
         raise typer.Exit(1)
+
+
+def fault_desk(faults: AnyFaults | None) -> FaultDesk | None:
+    """The desk at which the page requests faults; None for a run without faults, or with those of an earlier run."""
+    return getattr(faults, "desk", None)
+
+
+@contextmanager
+def page_listener(
+    console: str | None, control: bool, token: str | None, names: list[str] | None
+) -> Iterator[PageListener | None]:
+    """The page's listening socket; None without --console. Raises InputError."""
+    from hilstar.console.listener import PageListener, parse_address
+
+    if console is None:
+        for option, given in (("--control", control), ("--console-name", bool(names))):
+            if given:
+                raise InputError(f"{option}: is the page's; add --console, or leave it out")
+        yield None
+        return
+    with PageListener(parse_address(console), token, tuple(names or ())) as listener:
+        say(f"the operator's page is at {listener.url}")
+        yield listener
+
+
+@contextmanager
+def followed(
+    listener: PageListener | None,
+    control: bool,
+    description: RunDescription,
+    parts: PageParts,
+    status: RunStatus,
+    record: FrameSink | None = None,
+) -> Iterator[tuple[FrameSink, Follower, SwitchRequests | None]]:
+    """Connect a run to the terminal, `record`, systemd and the page: its sink, its follower, and the page's requests."""
+    sinks: list[FrameSink] = [status.see] if record is None else [record, status.see]
+    with Service(status.begun, status.alive, status.line):
+        if listener is None:
+            yield _all_of(sinks), status.follow, None
+            return
+        with _page(listener, control, description, parts, status) as (feed, follow, requests):
+            yield _all_of([*sinks, feed.see]), follow, requests
+
+
+@contextmanager
+def _page(
+    listener: PageListener, control: bool, description: RunDescription, parts: PageParts, status: RunStatus
+) -> Iterator[tuple[FramePublisher, Follower, SwitchRequests]]:
+    from hilstar.console.publisher import opened_page
+
+    with opened_page(listener, control, description, parts) as (feed, requests):
+
+        def follow(running: Running) -> None:
+            status.follow(running)
+            feed.follow(running)
+
+        yield feed, follow, requests
+
+
+def _all_of(sinks: list[FrameSink]) -> FrameSink:
+    if len(sinks) == 1:
+        return sinks[0]
+
+    def sink(shown: Shown) -> None:
+        for one in sinks:
+            one(shown)
+
+    return sink

@@ -17,8 +17,9 @@ from hilstar.cli.options import (
     ReferenceName,
     TopicName,
     check_files,
+    parse_mounting,
+    parse_place,
 )
-from hilstar.cli.parsers import parse_mounting, parse_place
 from hilstar.console.terminal import say
 
 

@@ -8,9 +8,20 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from hilstar.cli.options import MAX_SEED, AtSeconds, BenchFile, Json, QuaternionText, RadecText, ScenarioFile, check_files
-from hilstar.cli.parsers import parse_at, parse_attitude, parse_rate
-from hilstar.cli.show.running import optional_scenario
+from hilstar.cli.options import (
+    MAX_SEED,
+    AtSeconds,
+    BenchFile,
+    Json,
+    QuaternionText,
+    RadecText,
+    ScenarioFile,
+    check_files,
+    parse_at,
+    parse_attitude,
+    parse_rate,
+)
+from hilstar.cli.running import optional_scenario
 from hilstar.console.terminal import print_json, progress, say
 from hilstar.errors import InputError
 from hilstar.files import FITS, PNG, PNG_OR_TIFF, check_directory, check_ending

@@ -1,31 +1,38 @@
-"""hilstar serve: the live attitude stream on the monitor."""
+"""hilstar serve: the live attitude stream on the monitor; of a file with `heads`, one process per head beside one source."""
 
 from __future__ import annotations
 
 import math
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import msgspec
 import typer
 from msgspec import UNSET
 from msgspec.structs import replace as replaced
 
-from hilstar.cli.options import BenchFile, Explain, Headless, Json, Overwrite, ScenarioFile, check_files
-from hilstar.cli.parsers import parse_split
-from hilstar.cli.show.heads import HeadsAsked, fed_link, serve_heads
-from hilstar.cli.show.paging import Console, ConsoleName, Control, Token, fault_desk, followed, page_listener
-from hilstar.cli.show.running import (
+from hilstar.cli.options import BenchFile, Explain, Headless, Json, Overwrite, ScenarioFile, check_files, parse_split
+from hilstar.cli.running import (
+    Console,
+    ConsoleName,
+    Control,
     Force,
     LedgerFile,
     LedgerSplit,
+    Token,
     Windowed,
     dated_ledger,
     end_of_run,
     explain_bench,
     explain_source,
+    fault_desk,
+    followed,
     optional_ledger,
     optional_pulse,
     optional_scenario,
+    page_listener,
     run_with_faults,
     say_beat,
     say_of_light,
@@ -34,18 +41,110 @@ from hilstar.cli.show.running import (
 )
 from hilstar.console.run_status import RunSource, RunStatus, on_terminal
 from hilstar.console.terminal import say, without_attitude
+from hilstar.errors import InputError
 from hilstar.files import MCAP, check_ending
 from hilstar.notices import Notices
 
 if TYPE_CHECKING:
     from hilstar.attitude.wire.links import Pictures
+    from hilstar.attitude.wire.zmq_links import ZmqReceiver
     from hilstar.bench.bench_file import BenchFile as ReadFile
+    from hilstar.bench.bench_file import HeadsFile
     from hilstar.bench.frame import Bench
     from hilstar.run.open_link import AnyLink
 
-HeadOf = Annotated[Path | None, typer.Option("--head-of", hidden=True)]  # of a head's process: the file with `heads`,
-FedBy = Annotated[str | None, typer.Option("--fed-by", hidden=True)]  # and where the source's attitudes come from
-NO_ATTITUDE = 4  # the exit code of a run that never had one
+NO_ATTITUDE = 4
+# Options of a head's process: the file with `heads`, and the endpoint of the source's attitudes.
+HeadOf = Annotated[Path | None, typer.Option("--head-of", hidden=True)]
+FedBy = Annotated[str | None, typer.Option("--fed-by", hidden=True)]
+
+
+@dataclass(frozen=True, slots=True)
+class HeadsAsked:
+    """The options of `serve` for all heads. The page of head k is at the port of `console` plus k."""
+
+    duration_s: float | None
+    frames: int | None
+    ledger: Path | None
+    ledger_split: str | None
+    scenario: Path | None
+    switches: dict[str, bool]
+    console: str | None
+    token: str | None
+
+    def options(self) -> tuple[str, ...]:
+        """The options as words of each head's command line."""
+        valued = {"--frames": self.frames, "--ledger-split": self.ledger_split, "--scenario": self.scenario}
+        given = [word for name, value in valued.items() if value is not None for word in (name, str(value))]
+        return (*given, *(name for name, on in self.switches.items() if on))
+
+
+def serve_heads(heads: HeadsFile, asked: HeadsAsked, as_json: bool) -> None:
+    """Serve every head until its end, and print what each reported; exit code 4 if none ever had an attitude."""
+    from hilstar.run.heads import HeadsRun, head_ledger, run_heads, source_config
+    from hilstar.run.open_link import open_link
+
+    if asked.ledger is not None and not asked.switches.get("--overwrite"):
+        taken = [file for name in heads.names if (file := head_ledger(asked.ledger, name)).exists()]
+        if taken:
+            raise InputError(f"--ledger {asked.ledger}: {taken[0]} exists; give another name, or --overwrite")
+    notices = Notices()
+    consoles = _consoles(asked, heads)
+    with open_link(source_config(heads), heads.folder, notices, apart=True) as link:
+        link.await_ready()
+        say(f"{link.verb} {link.endpoint}, {len(heads.names)} heads: {', '.join(heads.names)}")
+        assert not link.steps  # read_heads refuses lockstep
+        run = HeadsRun(heads, asked.options(), asked.duration_s, asked.ledger, consoles, asked.token)
+        told = run_heads(run, link, say)
+    _report(told, as_json)
+    codes = [head["exit_code"] for head in told.values()]
+    if all(code == NO_ATTITUDE for code in codes):
+        raise typer.Exit(NO_ATTITUDE)
+    failed = [code for code in codes if code not in {0, NO_ATTITUDE}]
+    if failed:
+        raise typer.Exit(failed[0] if 0 < failed[0] <= NO_ATTITUDE else 1)
+
+
+def _consoles(asked: HeadsAsked, heads: HeadsFile) -> tuple[str, ...]:
+    """The address of each head's page. Raises InputError where one is taken, before a head is started."""
+    from hilstar.console.listener import MAX_PORT, ListenAddress, PageListener, parse_address
+
+    if asked.console is None:
+        return ()
+    first, count = parse_address(asked.console), len(heads.names)
+    if first.port and first.port + count - 1 > MAX_PORT:
+        raise InputError(f"--console {asked.console}: {count} pages need as many ports from there; choose a lower one")
+    addresses = [ListenAddress(first.host, first.port + k if first.port else 0) for k in range(count)]
+    with ExitStack() as doors:
+        for address in addresses:
+            doors.enter_context(PageListener(address, asked.token))
+    host = f"[{first.host}]" if ":" in first.host else first.host
+    return tuple(f"{host}:{address.port}" for address in addresses)
+
+
+def _report(told: dict[str, dict[str, object]], as_json: bool) -> None:
+    if as_json:
+        typer.echo(msgspec.json.encode({"heads": told}).decode())
+        return
+    for name, head in told.items():
+        summary = head["summary"]
+        frames = summary.get("frames") if isinstance(summary, dict) else None
+        counted = "no summary" if frames is None else f"{frames} frames"
+        again = f", started again {head['restarts']} times" if head["restarts"] else ""
+        typer.echo(f"{name:20s}{counted}, exit code {head['exit_code']}{again}")
+
+
+def fed_link(file: ReadFile, fed_by: str, notices: Notices) -> ZmqReceiver:
+    """A head's link to the process that has the source, with which it ends; `fed_by` is that one's endpoint and process id."""
+    from hilstar.attitude.wire.source import PACKETS, Mounting
+    from hilstar.attitude.wire.zmq_links import FedDecoder, ZmqReceiver
+    from hilstar.process.interrupts import end_with_parent
+
+    endpoint, _, parent = fed_by.rpartition(",")
+    end_with_parent(int(parent))
+    conventions = replace(PACKETS, source="the source of several heads", of_body=True)
+    decoder = FedDecoder(Mounting(file.config.tracker.q_body_to_cam), conventions)
+    return ZmqReceiver(endpoint, notices=notices, decoder=decoder)
 
 
 def serve(
@@ -131,7 +230,7 @@ def serve(
 
 
 def _source(file: ReadFile, fed_by: str | None, notices: Notices) -> AnyLink:
-    """Where the attitudes come from: the bench's own source, or of a head the process that has it."""
+    """The link to the bench's own source or, for a head, to the process that has it."""
     from hilstar.run.open_link import open_link
 
     if fed_by is not None:

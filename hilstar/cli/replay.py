@@ -22,21 +22,29 @@ from hilstar.cli.options import (
     ScenarioFile,
     TopicName,
     check_files,
+    parse_place,
+    parse_speed,
+    parse_split,
 )
-from hilstar.cli.parsers import parse_place, parse_speed, parse_split
-from hilstar.cli.show.paging import Console, ConsoleName, Control, Token, fault_desk, followed, page_listener
-from hilstar.cli.show.running import (
+from hilstar.cli.running import (
+    Console,
+    ConsoleName,
+    Control,
     Force,
     LedgerFile,
     LedgerSplit,
+    Token,
     Windowed,
     dated_ledger,
     end_of_run,
     explain_bench,
     explain_source,
+    fault_desk,
+    followed,
     optional_ledger,
     optional_pulse,
     optional_scenario,
+    page_listener,
     run_with_faults,
     say_of_light,
     shown_bench,

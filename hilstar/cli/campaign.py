@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from hilstar.cli.options import Json
-from hilstar.cli.parsers import parse_memory
+from hilstar.cli.options import Json, parse_memory
 from hilstar.console.terminal import print_json, progress, say
 from hilstar.errors import InputError
 
@@ -88,7 +87,7 @@ def campaign(
 
 
 def _scheduler(address: str | None, *tls: Path | None) -> Scheduler | None:
-    """The scheduler that is asked for, checked. Raises InputError."""
+    """The requested scheduler, checked; None without --scheduler. Raises InputError."""
     from hilstar.campaign.cluster import Scheduler
 
     if address is None:
@@ -103,7 +102,7 @@ def _scheduler(address: str | None, *tls: Path | None) -> Scheduler | None:
 def run_cases(
     this: Campaign, directory: Directory, scheduler: Scheduler | None, workers: int, memory_bytes: int | None
 ) -> None:
-    """Run the cases that are missing, on a cluster or on this machine's cores."""
+    """Run the missing cases on a cluster or on this machine's cores."""
     from hilstar.campaign.pool import Pool
 
     count = 0

@@ -7,9 +7,19 @@ from typing import Annotated, Any
 
 import typer
 
-from hilstar.cli.options import AtSeconds, BenchFile, Explain, Json, QuaternionText, RadecText, ScenarioFile, check_files
-from hilstar.cli.parsers import parse_at, parse_attitude
-from hilstar.cli.show.running import explain_bench, optional_scenario, say_units
+from hilstar.cli.options import (
+    AtSeconds,
+    BenchFile,
+    Explain,
+    Json,
+    QuaternionText,
+    RadecText,
+    ScenarioFile,
+    check_files,
+    parse_at,
+    parse_attitude,
+)
+from hilstar.cli.running import explain_bench, optional_scenario, say_units
 from hilstar.console.terminal import print_json
 from hilstar.errors import InputError
 from hilstar.files import CSV, FITS, PNG, check_ending
@@ -93,7 +103,7 @@ def frame(
             names += f", faults: {', '.join(summary['faults'])}"
         typer.echo(f"{len(shot.truth)} stars{names}; wrote {', '.join(summary['written'])}")
         typer.echo(fields.line())
-    say_units(fields)  # after the refusals: a command that fails says one line
+    say_units(fields)  # after the refusals: a failing command prints one line
 
 
 def clipped_text(loss_mag: dict[int | str, float]) -> str:
@@ -104,7 +114,7 @@ def clipped_text(loss_mag: dict[int | str, float]) -> str:
 
 
 def left_out(truth: Any) -> dict[str, float | int]:
-    """The stars in view that the monitor cannot show: how many, and their part of all stars' light."""
+    """The stars in view that the monitor cannot show: their number, and their share of all stars' light."""
     stars = truth[truth["name"] == ""]
     missing = stars["electrons_per_s"][~stars["drawn"]]
     total = float(stars["electrons_per_s"].sum())

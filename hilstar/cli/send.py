@@ -12,15 +12,24 @@ from typing import Annotated, Any
 
 import typer
 
-from hilstar.cli.options import LOG_HELP, MAX_SEED, Json, MountingText, RadecText
-from hilstar.cli.parsers import parse_mounting, parse_radec, parse_share, parse_spin
+from hilstar.cli.options import (
+    LOG_HELP,
+    MAX_SEED,
+    Json,
+    MountingText,
+    RadecText,
+    parse_mounting,
+    parse_radec,
+    parse_share,
+    parse_spin,
+)
 from hilstar.console.terminal import print_json, progress, say
 from hilstar.errors import InputError
 from hilstar.process.interrupts import is_command, stop_on_signal
 from hilstar.process.scheduling import PromptWhileLight
 from hilstar.units import NS_PER_S
 
-LISTEN_SLICE_S = 0.1  # between looks at whether a signal has come
+LISTEN_SLICE_S = 0.1  # between checks for a signal
 Share = Annotated[
     str, typer.Option(metavar="[SHARE]", help="Fraction of the packets, such as 5% or 0.05; 5% if no value follows.")
 ]
@@ -85,7 +94,7 @@ def send(
 
 
 def in_time(advance: Callable[[int], None]) -> Callable[[int], None]:
-    """`advance`, in a process that is woken in time: it stands for another machine, and does not wait for a display."""
+    """`advance` in a process that is woken on time: it stands for another machine, which no display delays."""
     if not is_command():
         return advance
     priority = PromptWhileLight()
@@ -125,7 +134,7 @@ def until(samples: Any, duration_s: float) -> Any:
 
 
 def tell(tally: Any, link: Any, as_json: bool) -> None:
-    """What left, and what did not."""
+    """Print what was sent and what was lost."""
     told = {
         "packets": tally.total,
         "sent": tally.total - tally.lost,
@@ -147,7 +156,7 @@ def tell(tally: Any, link: Any, as_json: bool) -> None:
 
 
 def heard(sender: Any, wait_s: float, stop: threading.Event) -> bool:
-    """True once somebody listens; also when stopped, which then ends the sending at once."""
+    """True once a receiver listens, and when stopped, which then ends the sending at once."""
     deadline_s = time.monotonic() + wait_s
     while not stop.is_set():
         if sender.wait_for_listener(min(LISTEN_SLICE_S, max(0.0, deadline_s - time.monotonic()))):

@@ -11,7 +11,7 @@ from hilstar.cli.options import Json
 from hilstar.console.terminal import print_json
 from hilstar.files import check_directory
 
-MAX_LINES = 10  # of stars: if the whole sky differs, a list of stars says nothing more
+MAX_LINES = 10  # stars listed: if the whole sky differs, more of them say nothing
 
 
 def compare(
@@ -48,7 +48,7 @@ def compare(
 
 
 def tell(summary: dict[str, Any], lines: list[str]) -> None:
-    """The comparison for a person."""
+    """Print the comparison as text."""
 
     def three(errors: dict[str, float | None]) -> str:
         return " / ".join("-" if value is None else f"{value:.2g}" for value in errors.values())

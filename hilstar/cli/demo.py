@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 import typer
 
 from hilstar.cli.options import MAX_SEED, Json
-from hilstar.cli.show.paging import Console, ConsoleName, Control, Token, followed, page_listener
-from hilstar.cli.show.running import optional_ledger
+from hilstar.cli.running import Console, ConsoleName, Control, Token, followed, optional_ledger, page_listener
 from hilstar.console.run_status import RunSource, RunStatus
 from hilstar.console.terminal import progress, report, say
 from hilstar.files import check_directory
@@ -24,7 +23,7 @@ if TYPE_CHECKING:
     from hilstar.run.shown import FrameSink
     from hilstar.run.summary import RunSummary
 
-HZ = 60  # of the demo's bench
+HZ = 60  # the demo bench's refresh
 
 
 def demo(
@@ -53,7 +52,7 @@ def demo(
             return _watching(bench, endpoint, listener, control, lambda shown: advance(shown.number + 1))
 
         result = run_demo(output, duration, np.random.default_rng(seed), watching)
-    if result.kept and caught() is None:  # after Ctrl-C no pictures are wanted
+    if result.kept and caught() is None:  # no pictures after Ctrl-C
         if not as_json:
             say(f"writing {len(result.kept)} pictures and their previews to {output}")
         with progress("writing pictures", 2 * len(result.kept)) as advance:
@@ -66,7 +65,7 @@ def demo(
 
 
 def _refuse_stale(summary: RunSummary, as_json: bool) -> NoReturn:
-    """The last line of a demo whose sky stood still, and exit code 1."""
+    """Print the last line of a demo whose sky stood still, and exit with code 1."""
     line = (
         f"{summary.stale_frames} of {summary.frames} frames show an old sky: no attitude came in time; "
         "the machine is busy, so close other programs and run it again"
@@ -82,7 +81,7 @@ def _refuse_stale(summary: RunSummary, as_json: bool) -> NoReturn:
 def _watching(
     bench: Bench, endpoint: str, listener: PageListener | None, control: bool, advance: FrameSink
 ) -> Iterator[tuple[FrameSink, Outlet]]:
-    """The progress of the demo, and its page."""
+    """Follow the demo with a progress bar and its page."""
     from hilstar.console.publisher import PageParts, RunDescription
     from hilstar.run.record.ledger import NO_SPLIT, Ledger
     from hilstar.run.serve import Outlet

@@ -1,1 +1,0 @@
-"""hilstar as a service of this machine."""

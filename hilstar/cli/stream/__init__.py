@@ -1,1 +1,0 @@
-"""Commands about attitude streams and logs."""
